@@ -1,0 +1,2 @@
+//! Placeholder while the server takes shape.
+fn main() {}

@@ -1,0 +1,7 @@
+//! Palpate: a server for touching soft tissue over a network. ARCHITECTURE.md is the map.
+
+pub mod limits;
+pub mod refusal;
+pub mod scene;
+pub mod session;
+pub mod sheet;

@@ -1,0 +1,65 @@
+//! The limits of the configuration, in one place: what one scene, session or stream may ask for. Each queue
+//! of the server has its bound here.
+
+use serde::Deserialize;
+
+/// Upper bounds. Every one can be set in the section `[limits]` of the configuration file.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Limits {
+    /// Mass points of a sheet.
+    pub points: usize,
+    /// Substeps of a step.
+    pub substeps: u32,
+    /// Force of a tool on any one point, N: |force|·e^{c′}.
+    pub point_force_n: f64,
+    /// How far a grasped point may be brought from its rest position, as a multiple of the sheet's longer side.
+    pub reach_in_sheets: f64,
+    /// Bytes of a scene or script file.
+    pub file_bytes: u64,
+    /// Bytes of a trace file.
+    pub trace_bytes: u64,
+    /// Tools of a session: their numbers are below this.
+    pub tools: u32,
+    /// Commands that wait for their step, per session.
+    pub queued_commands: usize,
+    /// Samples that wait for a reader before the oldest is dropped.
+    pub queued_samples: usize,
+    /// Probe records that wait for a reader before the oldest is dropped.
+    pub queued_records: usize,
+    /// Sessions of a server.
+    pub sessions: usize,
+    /// Streams that read one session.
+    pub streams_per_session: usize,
+    /// Step rate of a session, Hz.
+    pub session_rate_hz: f64,
+    /// Vertices of a refined frame.
+    pub frame_vertices: usize,
+    /// Points of a probe that is not of all points.
+    pub probe_points: usize,
+    /// Longest lease of a tool, s.
+    pub lease_s: f64,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Limits {
+            points: 1 << 22,
+            substeps: 100_000,
+            point_force_n: 1e4,
+            reach_in_sheets: 10.0,
+            file_bytes: 16 << 20,
+            trace_bytes: 64 << 20,
+            tools: 64,
+            queued_commands: 16_384,
+            queued_samples: 64,
+            queued_records: 64,
+            sessions: 1024,
+            streams_per_session: 256,
+            session_rate_hz: 20_000.0,
+            frame_vertices: 1 << 22,
+            probe_points: 4096,
+            lease_s: 600.0,
+        }
+    }
+}

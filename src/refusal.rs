@@ -1,0 +1,151 @@
+//! An input that was refused: one type for files, commands and requests, so that each is refused in the
+//! same words wherever it enters.
+
+use std::fmt;
+
+macro_rules! reasons {
+    ($($(#[$doc:meta])* $variant:ident = $name:literal,)*) => {
+        /// Why an input was refused: stable names, for programs.
+        #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+        pub enum Reason { $($(#[$doc])* $variant,)* }
+
+        impl Reason {
+            /// All of them.
+            pub const ALL: &[Reason] = &[$(Reason::$variant,)*];
+
+            /// The name that clients see (`google.rpc.ErrorInfo.reason`).
+            pub fn as_str(self) -> &'static str {
+                match self { $(Reason::$variant => $name,)* }
+            }
+        }
+    };
+}
+
+reasons! {
+    /// A file that can't be read or a text that is not TOML, CSV or UTF-8.
+    Unreadable = "UNREADABLE",
+    /// A key that no scene, script or configuration has.
+    UnknownKey = "UNKNOWN_KEY",
+    /// A required field that is not there.
+    Missing = "MISSING",
+    /// A value of the wrong kind, or a name that is none of those allowed.
+    WrongKind = "WRONG_KIND",
+    /// NaN or infinite.
+    NotFinite = "NOT_FINITE",
+    /// Outside the range that makes sense.
+    OutOfRange = "OUT_OF_RANGE",
+    /// Sensible, but above a limit of the configuration.
+    TooLarge = "TOO_LARGE",
+    /// A force above the limit on a point.
+    ForceTooLarge = "FORCE_TOO_LARGE",
+    /// A point or a control point that is not on the sheet.
+    OffSheet = "OFF_SHEET",
+    /// No scene of that name.
+    UnknownScene = "UNKNOWN_SCENE",
+    /// No session of that id.
+    UnknownSession = "UNKNOWN_SESSION",
+    /// The session was there, and has been deleted.
+    SessionDeleted = "SESSION_DELETED",
+    /// The guard has ended the session.
+    SessionHeld = "SESSION_HELD",
+    /// No viewer of that id.
+    UnknownViewer = "UNKNOWN_VIEWER",
+    /// Another holds the tool.
+    ToolHeld = "TOOL_HELD",
+    /// The tool is not held by who commands it, or no longer.
+    NotHolder = "NOT_HOLDER",
+    /// The sequence number is not above the last one.
+    StaleSequence = "STALE_SEQUENCE",
+    /// More commands are waiting than the session keeps.
+    QueueFull = "QUEUE_FULL",
+    /// The moment asked for is over.
+    StepPassed = "STEP_PASSED",
+    /// More sessions, streams or tools than the configuration allows.
+    TooMany = "TOO_MANY",
+    /// The first message of a stream must open it, and only the first.
+    OutOfTurn = "OUT_OF_TURN",
+    /// The server is going down.
+    ShuttingDown = "SHUTTING_DOWN",
+}
+
+/// What was refused and why. It changed nothing.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Refusal {
+    /// For programs.
+    pub reason: Reason,
+    /// The offending field, as a path: `sheet.spacing_m`, `force[0].profile.on_s`. Empty if none is.
+    pub field: String,
+    /// For people: what is wrong, and what would be right.
+    pub message: String,
+    /// Where it was written: `scenes/paper.toml:5`, `--set`. Absent for what came over the network.
+    pub place: Option<String>,
+}
+
+/// What most functions here return.
+pub type Result<T> = std::result::Result<T, Refusal>;
+
+impl Refusal {
+    /// A refusal of `field`.
+    pub fn new(reason: Reason, field: impl Into<String>, message: impl Into<String>) -> Self {
+        Refusal { reason, field: field.into(), message: message.into(), place: None }
+    }
+
+    /// The same, of a field of `parent`.
+    #[must_use]
+    pub fn within(mut self, parent: &str) -> Self {
+        self.field = match (parent, self.field.as_str()) {
+            (parent, "") => parent.to_owned(),
+            ("", field) => field.to_owned(),
+            (parent, field) => format!("{parent}.{field}"),
+        };
+        self
+    }
+}
+
+impl fmt::Display for Refusal {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if let Some(place) = &self.place {
+            write!(f, "{place}: ")?;
+        }
+        if !self.field.is_empty() {
+            write!(f, "{}: ", self.field)?;
+        }
+        f.write_str(&self.message)
+    }
+}
+
+impl std::error::Error for Refusal {}
+
+/// `value`, if it is finite and `holds` says so; `range` says in words what does.
+pub fn number(field: &str, value: f64, range: &str, holds: impl Fn(f64) -> bool) -> Result<f64> {
+    if !value.is_finite() {
+        return Err(Refusal::new(Reason::NotFinite, field, format!("must be a finite number, but is {value}")));
+    }
+    if !holds(value) {
+        return Err(Refusal::new(Reason::OutOfRange, field, format!("must be {range}, but is {value}")));
+    }
+    Ok(value)
+}
+
+/// `value` if it is finite.
+pub fn finite(field: &str, value: f64) -> Result<f64> {
+    number(field, value, "finite", |_| true)
+}
+
+/// `value` if it is finite and above 0.
+pub fn positive(field: &str, value: f64) -> Result<f64> {
+    number(field, value, "above 0", |v| v > 0.0)
+}
+
+/// `value` if it is finite and 0 or more.
+pub fn not_negative(field: &str, value: f64) -> Result<f64> {
+    number(field, value, "0 or more", |v| v >= 0.0)
+}
+
+/// `value` if its three components are finite.
+pub fn finite_vector(field: &str, value: glam::DVec3) -> Result<glam::DVec3> {
+    for component in value.to_array() {
+        finite(field, component)?;
+    }
+    Ok(value)
+}

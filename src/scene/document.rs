@@ -1,0 +1,355 @@
+//! TOML with its line numbers: what a scene or a script is read from, so that every refusal can name the
+//! file, the line and the key. `--set` writes over it before it is read.
+
+use std::collections::BTreeMap;
+use std::io::Read;
+use std::path::Path;
+
+use glam::{DVec2, DVec3};
+use toml::de::{DeTable, DeValue};
+
+use crate::refusal::{Reason, Refusal, Result, finite};
+
+/// A text, parsed.
+#[derive(Debug)]
+pub struct Document {
+    name: String,
+    root: Node,
+}
+
+/// A value and the line where it stands; none if it came by `--set`.
+#[derive(Debug, Clone)]
+struct Node {
+    line: Option<usize>,
+    value: Value,
+}
+
+#[derive(Debug, Clone)]
+enum Value {
+    Text(String),
+    Whole(i64),
+    Number(f64),
+    Flag(bool),
+    List(Vec<Node>),
+    Table(BTreeMap<String, Node>),
+    Other,
+}
+
+impl Value {
+    fn kind(&self) -> &'static str {
+        match self {
+            Value::Text(_) => "a string",
+            Value::Whole(_) => "a whole number",
+            Value::Number(_) => "a number",
+            Value::Flag(_) => "true or false",
+            Value::List(_) => "a list",
+            Value::Table(_) => "a table",
+            Value::Other => "a date",
+        }
+    }
+}
+
+/// Reads at most `limit` bytes of UTF-8, also from what is not a plain file.
+pub fn read_text(path: &Path, limit: u64) -> Result<String> {
+    let place = path.display().to_string();
+    let refuse = |reason, message: String| Refusal { place: Some(place.clone()), ..Refusal::new(reason, "", message) };
+    let file = std::fs::File::open(path).map_err(|e| refuse(Reason::Unreadable, format!("can't be opened: {e}")))?;
+    let too_large = || refuse(Reason::TooLarge, format!("is larger than the limit of {limit} bytes"));
+    if file.metadata().is_ok_and(|meta| meta.len() > limit) {
+        return Err(too_large());
+    }
+    let mut bytes = Vec::new();
+    file.take(limit + 1)
+        .read_to_end(&mut bytes)
+        .map_err(|e| refuse(Reason::Unreadable, format!("can't be read: {e}")))?;
+    if bytes.len() as u64 > limit {
+        return Err(too_large());
+    }
+    String::from_utf8(bytes).map_err(|e| refuse(Reason::Unreadable, format!("is not UTF-8 text: {e}")))
+}
+
+impl Document {
+    /// Parses `text`; `name` is what refusals call it.
+    pub fn parse(name: &str, text: &str) -> Result<Self> {
+        // Lines are found by bisection, so that a long file is read in time linear in its length.
+        let starts: Vec<usize> =
+            std::iter::once(0).chain(text.bytes().enumerate().filter(|b| b.1 == b'\n').map(|b| b.0 + 1)).collect();
+        let line_of = |offset: usize| starts.partition_point(|&start| start <= offset);
+        let table = DeTable::parse(text).map_err(|e| {
+            let place = e.span().map_or(name.to_owned(), |span| format!("{name}:{}", line_of(span.start)));
+            Refusal { place: Some(place), ..Refusal::new(Reason::Unreadable, "", e.message()) }
+        })?;
+        let root = Node { line: Some(1), value: table_of(table.get_ref(), &line_of) };
+        Ok(Document { name: name.to_owned(), root })
+    }
+
+    /// Applies `key.path=value`: a TOML value, or a bare string.
+    pub fn set(&mut self, assignment: &str) -> Result<()> {
+        let refuse = |message: String| Refusal {
+            place: Some("--set".into()),
+            ..Refusal::new(Reason::WrongKind, assignment, message)
+        };
+        let Some((path, text)) = assignment.split_once('=') else {
+            return Err(refuse("must be key=value, as in stepping.integrator=central".into()));
+        };
+        let (path, text) = (path.trim(), text.trim());
+        let value = match DeValue::parse(text) {
+            Ok(value) => value_of(value.get_ref(), &|_| 0),
+            Err(_) => Value::Text(text.to_owned()),
+        };
+        let mut node = &mut self.root;
+        for key in path.split('.') {
+            if key.is_empty() {
+                return Err(refuse("has an empty part in its key".into()));
+            }
+            let Value::Table(entries) = &mut node.value else {
+                return Err(refuse(format!("`{key}` is not within a table")));
+            };
+            let empty = Node { line: None, value: Value::Table(BTreeMap::new()) };
+            node = entries.entry(key.to_owned()).or_insert(empty);
+        }
+        *node = Node { line: None, value };
+        node.forget_lines();
+        Ok(())
+    }
+
+    /// The whole as fields to be read; then every refusal is given its place.
+    pub fn read<'a, T>(&'a self, read: impl FnOnce(&mut Fields<'a>) -> Result<T>) -> Result<T> {
+        Item { path: String::new(), node: &self.root }.table(read).map_err(|refusal| self.locate(refusal))
+    }
+
+    /// Adds file and line to a refusal that names a field.
+    pub fn locate(&self, mut refusal: Refusal) -> Refusal {
+        if refusal.place.is_none() {
+            let mut node = &self.root;
+            for key in refusal.field.split(['.', '[', ']']).filter(|key| !key.is_empty()) {
+                let inner = match &node.value {
+                    Value::Table(entries) => entries.get(key),
+                    Value::List(items) => key.parse::<usize>().ok().and_then(|index| items.get(index)),
+                    _ => None,
+                };
+                // A key that is missing is reported at the table that should have it.
+                let Some(inner) = inner else { break };
+                node = inner;
+            }
+            refusal.place = Some(match node.line {
+                Some(line) => format!("{}:{line}", self.name),
+                None => "--set".to_owned(),
+            });
+        }
+        refusal
+    }
+}
+
+impl Node {
+    fn forget_lines(&mut self) {
+        self.line = None;
+        match &mut self.value {
+            Value::List(items) => items.iter_mut().for_each(Node::forget_lines),
+            Value::Table(entries) => entries.values_mut().for_each(Node::forget_lines),
+            _ => {}
+        }
+    }
+}
+
+fn table_of(table: &DeTable<'_>, line_of: &dyn Fn(usize) -> usize) -> Value {
+    let entry = |(key, value): (&toml::Spanned<_>, &toml::Spanned<DeValue<'_>>)| {
+        let key: &std::borrow::Cow<'_, str> = key.get_ref();
+        let line = Some(line_of(value.span().start));
+        (key.to_string(), Node { line, value: value_of(value.get_ref(), line_of) })
+    };
+    Value::Table(table.iter().map(entry).collect())
+}
+
+fn value_of(value: &DeValue<'_>, line_of: &dyn Fn(usize) -> usize) -> Value {
+    match value {
+        DeValue::String(text) => Value::Text(text.to_string()),
+        DeValue::Integer(whole) => {
+            let digits = whole.as_str().replace('_', "");
+            i64::from_str_radix(&digits, whole.radix())
+                .map_or_else(|_| digits.parse().map_or(Value::Other, Value::Number), Value::Whole)
+        }
+        DeValue::Float(number) => number.as_str().replace('_', "").parse().map_or(Value::Other, Value::Number),
+        DeValue::Boolean(flag) => Value::Flag(*flag),
+        DeValue::Datetime(_) => Value::Other,
+        DeValue::Array(items) => Value::List(
+            items
+                .iter()
+                .map(|item| Node { line: Some(line_of(item.span().start)), value: value_of(item.get_ref(), line_of) })
+                .collect(),
+        ),
+        DeValue::Table(table) => table_of(table, line_of),
+    }
+}
+
+/// The keys of one table. Each is asked for by name; what was never asked for is unknown.
+#[derive(Debug)]
+pub struct Fields<'a> {
+    path: String,
+    entries: &'a BTreeMap<String, Node>,
+    known: Vec<&'static str>,
+}
+
+/// One value, with its path.
+#[derive(Debug)]
+pub struct Item<'a> {
+    path: String,
+    node: &'a Node,
+}
+
+impl<'a> Fields<'a> {
+    /// The full path of `key`.
+    pub fn path(&self, key: &str) -> String {
+        if self.path.is_empty() { key.to_owned() } else { format!("{}.{key}", self.path) }
+    }
+
+    /// A refusal of `key`.
+    pub fn refuse(&self, reason: Reason, key: &str, message: impl Into<String>) -> Refusal {
+        let path = if key.is_empty() { self.path.clone() } else { self.path(key) };
+        Refusal::new(reason, path, message)
+    }
+
+    /// The value of `key`, if it is there.
+    pub fn item(&mut self, key: &'static str) -> Option<Item<'a>> {
+        self.known.push(key);
+        self.entries.get(key).map(|node| Item { path: self.path(key), node })
+    }
+
+    /// The value of `key`, which has to be there.
+    pub fn required(&mut self, key: &'static str) -> Result<Item<'a>> {
+        self.item(key).ok_or_else(|| self.refuse(Reason::Missing, key, "is missing"))
+    }
+
+    /// A finite number, if it is there.
+    pub fn number(&mut self, key: &'static str) -> Result<Option<f64>> {
+        self.item(key).map(|item| item.number()).transpose()
+    }
+
+    /// A finite number.
+    pub fn required_number(&mut self, key: &'static str) -> Result<f64> {
+        self.required(key)?.number()
+    }
+
+    /// A string, if it is there.
+    pub fn text(&mut self, key: &'static str) -> Result<Option<String>> {
+        self.item(key).map(|item| item.text()).transpose()
+    }
+
+    /// Every key that was not asked for is refused.
+    fn done(&self) -> Result<()> {
+        let Some(key) = self.entries.keys().find(|key| !self.known.contains(&key.as_str())) else { return Ok(()) };
+        let message = match self.known.iter().find(|known| known.starts_with(&format!("{key}_"))) {
+            Some(with_unit) => format!("unknown key: the unit belongs to the name, `{with_unit}`"),
+            None => format!("unknown key; known here: {}", self.known.join(", ")),
+        };
+        Err(self.refuse(Reason::UnknownKey, key, message))
+    }
+}
+
+impl<'a> Item<'a> {
+    /// A refusal of this value.
+    pub fn refuse(&self, reason: Reason, message: impl Into<String>) -> Refusal {
+        Refusal::new(reason, &self.path, message)
+    }
+
+    /// This is not what `expected` says.
+    pub fn wrong(&self, expected: &str) -> Refusal {
+        self.refuse(Reason::WrongKind, format!("must be {expected}, but is {}", self.node.value.kind()))
+    }
+
+    /// A finite number.
+    pub fn number(&self) -> Result<f64> {
+        match self.node.value {
+            Value::Number(number) => finite(&self.path, number),
+            #[allow(clippy::cast_precision_loss)]
+            Value::Whole(whole) => Ok(whole as f64),
+            _ => Err(self.wrong("a number")),
+        }
+    }
+
+    /// A whole number, 0 or more.
+    pub fn whole(&self) -> Result<u64> {
+        match self.node.value {
+            Value::Whole(whole) => u64::try_from(whole)
+                .map_err(|_| self.refuse(Reason::OutOfRange, format!("must be 0 or more, but is {whole}"))),
+            _ => Err(self.wrong("a whole number")),
+        }
+    }
+
+    /// A string.
+    pub fn text(&self) -> Result<String> {
+        match &self.node.value {
+            Value::Text(text) => Ok(text.clone()),
+            _ => Err(self.wrong("a string")),
+        }
+    }
+
+    /// Whether this is a string, and which.
+    pub fn as_text(&self) -> Option<&'a str> {
+        match &self.node.value {
+            Value::Text(text) => Some(text),
+            _ => None,
+        }
+    }
+
+    /// True or false.
+    pub fn flag(&self) -> Result<bool> {
+        match self.node.value {
+            Value::Flag(flag) => Ok(flag),
+            _ => Err(self.wrong("true or false")),
+        }
+    }
+
+    /// A list of values.
+    pub fn list(&self) -> Result<Vec<Item<'a>>> {
+        match &self.node.value {
+            Value::List(items) => Ok(items
+                .iter()
+                .enumerate()
+                .map(|(index, node)| Item { path: format!("{}[{index}]", self.path), node })
+                .collect()),
+            _ => Err(self.wrong("a list")),
+        }
+    }
+
+    fn numbers<const N: usize>(&self, expected: &str) -> Result<[f64; N]> {
+        let items = self.list().map_err(|_| self.wrong(expected))?;
+        let numbers = items.iter().map(Item::number).collect::<Result<Vec<_>>>()?;
+        numbers.try_into().map_err(|_| self.refuse(Reason::WrongKind, format!("must be {expected}")))
+    }
+
+    /// `[x, y, z]`.
+    pub fn vector(&self) -> Result<DVec3> {
+        Ok(DVec3::from_array(self.numbers("a list of three numbers")?))
+    }
+
+    /// `[x, y]`.
+    pub fn place(&self) -> Result<DVec2> {
+        Ok(DVec2::from_array(self.numbers("a list of two numbers")?))
+    }
+
+    /// `[i, j]`, both 0 or more.
+    pub fn point(&self) -> Result<[usize; 2]> {
+        let expected = "a list of two whole numbers";
+        let items = self.list().map_err(|_| self.wrong(expected))?;
+        let [i, j] = items.as_slice() else {
+            return Err(self.refuse(Reason::WrongKind, format!("must be {expected}")));
+        };
+        let index = |item: &Item<'_>| {
+            usize::try_from(item.whole()?).map_err(|_| item.refuse(Reason::OutOfRange, "is too large"))
+        };
+        Ok([index(i)?, index(j)?])
+    }
+
+    /// Reads this as a table.
+    pub fn table<T>(&self, read: impl FnOnce(&mut Fields<'a>) -> Result<T>) -> Result<T> {
+        let Value::Table(entries) = &self.node.value else { return Err(self.wrong("a table")) };
+        let mut fields = Fields { path: self.path.clone(), entries, known: Vec::new() };
+        // A misspelt key is reported before the key that is missing for it.
+        match read(&mut fields) {
+            Ok(value) => fields.done().map(|()| value),
+            Err(refusal) if refusal.reason == Reason::Missing => Err(fields.done().err().unwrap_or(refusal)),
+            Err(refusal) => Err(refusal),
+        }
+    }
+}

@@ -1,0 +1,321 @@
+//! What a scene is: the tissue, its springs, and how time advances. Read from TOML (or from a protobuf
+//! message, in `wire`), checked, then never changed.
+
+pub mod document;
+pub mod law;
+pub mod script;
+
+use std::path::Path;
+
+use crate::limits::Limits;
+use crate::refusal::{Reason, Refusal, Result, not_negative, number, positive};
+use document::{Document, Item};
+
+/// The scene of the paper's figures, built in.
+pub const PAPER: &str = include_str!("../../scenes/paper.toml");
+
+/// A tissue sheet and how it is stepped. The fields are those of a scene file; SI units.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Scene {
+    /// Any name, for people.
+    pub name: String,
+    /// The grid of mass points.
+    pub sheet: Sheet,
+    /// Springs between neighbours.
+    pub springs: Springs,
+    /// K″ of the springs of zero rest length that pull each point to its rest position, N/m (the paper's eq. 4).
+    pub virtual_stiffness_n_per_m: f64,
+    /// C of the damping force −C·v, N·s/m.
+    pub damping_n_s_per_m: f64,
+    /// How time advances.
+    pub stepping: Stepping,
+    /// Error that leaving out regions at rest may cost, relative to the largest displacement; 0 leaves out nothing.
+    pub sleep_tolerance: f64,
+}
+
+/// The grid: point [i, j] rests at (i·spacing, j·spacing, 0).
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sheet {
+    /// Points along x and along y.
+    pub points: [usize; 2],
+    /// Distance of structural neighbours at rest, m.
+    pub spacing_m: f64,
+    /// Mass of each point, kg.
+    pub point_mass_kg: f64,
+    /// Points that never move.
+    pub fixed: Fixed,
+}
+
+/// Points that never move.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Fixed {
+    /// Every point of the rim.
+    Edges,
+    /// The four corners.
+    Corners,
+    /// Just these; an empty list fixes none.
+    Points(Vec<[usize; 2]>),
+}
+
+/// Springs between neighbours: the force on a from a spring a–b is k (L − L0)(x_b − x_a)/L.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Springs {
+    /// k of (1,0) and (0,1), N/m.
+    pub stiffness_n_per_m: f64,
+    /// k of (1,1) and (1,−1), N/m.
+    pub shear_stiffness_n_per_m: f64,
+    /// Whether there are springs (2,0) and (0,2), with the structural k.
+    pub flexion: bool,
+}
+
+/// How time advances.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Stepping {
+    /// The fixed rate at which commands enter and samples leave, Hz.
+    pub rate_hz: f64,
+    /// Wanted error of displacement and force, relative to their largest.
+    pub tolerance: f64,
+    /// The scheme.
+    pub integrator: Integrator,
+    /// Substeps a step; chosen from the stability bound if `None`.
+    pub substeps: Option<u32>,
+    /// The number format.
+    pub precision: Precision,
+}
+
+impl Default for Stepping {
+    fn default() -> Self {
+        Stepping {
+            rate_hz: 1000.0,
+            tolerance: 1e-5,
+            integrator: Integrator::Auto,
+            substeps: None,
+            precision: Precision::Auto,
+        }
+    }
+}
+
+/// Default of [`Scene::sleep_tolerance`].
+pub const SLEEP_TOLERANCE: f64 = 1e-6;
+
+/// A value that a scene gives by a name out of a list.
+pub trait Named: Sized + Copy + PartialEq + 'static {
+    /// Every name and what it means.
+    const NAMES: &'static [(&'static str, Self)];
+
+    /// The value of a name.
+    fn named(field: &str, name: &str) -> Result<Self> {
+        Self::NAMES.iter().find(|entry| entry.0 == name).map(|entry| entry.1).ok_or_else(|| {
+            let names: Vec<_> = Self::NAMES.iter().map(|entry| entry.0).collect();
+            Refusal::new(Reason::WrongKind, field, format!("must be one of {}, but is `{name}`", names.join(", ")))
+        })
+    }
+
+    /// The name of a value.
+    fn name(self) -> &'static str {
+        Self::NAMES.iter().find(|entry| entry.1 == self).map_or("", |entry| entry.0)
+    }
+}
+
+/// The schemes (`sheet::integrate`).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Integrator {
+    /// Palpate's choice.
+    Auto,
+    /// Central differences, damping implicit: second order.
+    Central,
+    /// The paper's: damping with the velocity of the last step, first order.
+    Lagged,
+}
+
+impl Named for Integrator {
+    const NAMES: &'static [(&'static str, Self)] =
+        &[("auto", Integrator::Auto), ("central", Integrator::Central), ("lagged", Integrator::Lagged)];
+}
+
+/// The number format of the state.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Precision {
+    /// Palpate's choice.
+    Auto,
+    /// 4 bytes.
+    F32,
+    /// 8 bytes.
+    F64,
+}
+
+impl Named for Precision {
+    const NAMES: &'static [(&'static str, Self)] =
+        &[("auto", Precision::Auto), ("f32", Precision::F32), ("f64", Precision::F64)];
+}
+
+impl Scene {
+    /// Reads a scene file, with `--set` assignments over it.
+    pub fn load(path: &Path, assignments: &[String], limits: &Limits) -> Result<Self> {
+        let text = document::read_text(path, limits.file_bytes)?;
+        Self::parse(&path.display().to_string(), &text, assignments, limits)
+    }
+
+    /// Reads a scene from TOML; `name` is what refusals call the text.
+    pub fn parse(name: &str, text: &str, assignments: &[String], limits: &Limits) -> Result<Self> {
+        let mut document = Document::parse(name, text)?;
+        for assignment in assignments {
+            document.set(assignment)?;
+        }
+        let scene = document.read(|fields| {
+            Ok(Scene {
+                name: fields.text("name")?.unwrap_or_else(|| "unnamed".to_owned()),
+                sheet: fields.required("sheet")?.table(|fields| {
+                    Ok(Sheet {
+                        points: fields.required("points")?.point()?,
+                        spacing_m: fields.required_number("spacing_m")?,
+                        point_mass_kg: fields.required_number("point_mass_kg")?,
+                        fixed: fields.item("fixed").map_or(Ok(Fixed::Points(Vec::new())), |item| read_fixed(&item))?,
+                    })
+                })?,
+                springs: fields.required("springs")?.table(|fields| {
+                    let stiffness_n_per_m = fields.required_number("stiffness_n_per_m")?;
+                    Ok(Springs {
+                        stiffness_n_per_m,
+                        shear_stiffness_n_per_m: fields.number("shear_stiffness_n_per_m")?.unwrap_or(stiffness_n_per_m),
+                        flexion: fields.item("flexion").map_or(Ok(false), |item| item.flag())?,
+                    })
+                })?,
+                virtual_stiffness_n_per_m: fields
+                    .required("virtual_springs")?
+                    .table(|fields| fields.required_number("stiffness_n_per_m"))?,
+                damping_n_s_per_m: fields
+                    .required("damping")?
+                    .table(|fields| fields.required_number("coefficient_n_s_per_m"))?,
+                stepping: fields.item("stepping").map_or(Ok(Stepping::default()), |item| read_stepping(&item))?,
+                sleep_tolerance: match fields.item("sleep") {
+                    Some(item) => item.table(|fields| fields.number("tolerance"))?,
+                    None => None,
+                }
+                .unwrap_or(SLEEP_TOLERANCE),
+            })
+        })?;
+        scene.check(limits).map_err(|refusal| document.locate(refusal))?;
+        Ok(scene)
+    }
+
+    /// Everything that a scene promises, wherever it came from.
+    pub fn check(&self, limits: &Limits) -> Result<()> {
+        let [nx, ny] = self.sheet.points;
+        if nx == 0 || ny == 0 {
+            let message = format!("must be at least 1 along each side, but are {nx} × {ny}");
+            return Err(Refusal::new(Reason::OutOfRange, "sheet.points", message));
+        }
+        if nx.checked_mul(ny).is_none_or(|points| points > limits.points) {
+            let message = format!("are {nx} × {ny}, above the limit of {} points in all", limits.points);
+            return Err(Refusal::new(Reason::TooLarge, "sheet.points", message));
+        }
+        physical("sheet.spacing_m", positive("sheet.spacing_m", self.sheet.spacing_m)?)?;
+        physical("sheet.point_mass_kg", positive("sheet.point_mass_kg", self.sheet.point_mass_kg)?)?;
+        if let Fixed::Points(points) = &self.sheet.fixed {
+            for (index, &point) in points.iter().enumerate() {
+                self.sheet.index(&format!("sheet.fixed[{index}]"), point)?;
+            }
+        }
+        let coefficients = [
+            ("springs.stiffness_n_per_m", self.springs.stiffness_n_per_m),
+            ("springs.shear_stiffness_n_per_m", self.springs.shear_stiffness_n_per_m),
+            ("virtual_springs.stiffness_n_per_m", self.virtual_stiffness_n_per_m),
+            ("damping.coefficient_n_s_per_m", self.damping_n_s_per_m),
+        ];
+        for (field, value) in coefficients {
+            if not_negative(field, value)? > 0.0 {
+                physical(field, value)?;
+            }
+        }
+        let stepping = &self.stepping;
+        number("stepping.rate_hz", stepping.rate_hz, "above 0 and at most 1e7", |v| v > 0.0 && v <= 1e7)?;
+        number("stepping.tolerance", stepping.tolerance, "above 0 and at most 1", |v| v > 0.0 && v <= 1.0)?;
+        if let Some(substeps) = stepping.substeps {
+            let range = format!("from 1 to {}", limits.substeps);
+            let holds = |v| v >= 1.0 && v <= f64::from(limits.substeps);
+            number("stepping.substeps", f64::from(substeps), &range, holds)?;
+        }
+        number("sleep.tolerance", self.sleep_tolerance, "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
+        Ok(())
+    }
+}
+
+/// Squares and products of what a scene holds stay within single precision for values in this range.
+fn physical(field: &str, value: f64) -> Result<f64> {
+    number(field, value, "from 1e-12 to 1e12", |v| (1e-12..=1e12).contains(&v))
+}
+
+impl Sheet {
+    /// The place of point [i, j] in arrays over all points: i·ny + j.
+    pub fn index(&self, field: &str, [i, j]: [usize; 2]) -> Result<usize> {
+        let [nx, ny] = self.points;
+        if i >= nx || j >= ny {
+            let message = format!("[{i}, {j}] is not on the sheet of {nx} × {ny} points");
+            return Err(Refusal::new(Reason::OffSheet, field, message));
+        }
+        Ok(i * ny + j)
+    }
+
+    /// Length along x and along y, m.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn extent_m(&self) -> glam::DVec2 {
+        self.spacing_m * glam::DVec2::new((self.points[0] - 1) as f64, (self.points[1] - 1) as f64)
+    }
+
+    /// The fixed points, as places in arrays over all points, rising.
+    pub fn fixed_indices(&self) -> Vec<usize> {
+        let [nx, ny] = self.points;
+        let is_fixed = |i: usize, j: usize| {
+            let (rim_x, rim_y) = (i == 0 || i + 1 == nx, j == 0 || j + 1 == ny);
+            match &self.fixed {
+                Fixed::Edges => rim_x || rim_y,
+                Fixed::Corners => rim_x && rim_y,
+                Fixed::Points(_) => false,
+            }
+        };
+        let mut indices: Vec<usize> = match &self.fixed {
+            Fixed::Points(points) => points.iter().map(|[i, j]| i * ny + j).collect(),
+            _ => (0..nx * ny).filter(|index| is_fixed(index / ny, index % ny)).collect(),
+        };
+        indices.sort_unstable();
+        indices.dedup();
+        indices
+    }
+}
+
+fn read_fixed(item: &Item<'_>) -> Result<Fixed> {
+    match item.as_text() {
+        Some("edges") => Ok(Fixed::Edges),
+        Some("corners") => Ok(Fixed::Corners),
+        Some(_) => Err(item.wrong("\"edges\", \"corners\" or a list of points")),
+        None => Ok(Fixed::Points(item.list()?.iter().map(Item::point).collect::<Result<_>>()?)),
+    }
+}
+
+fn read_stepping(item: &Item<'_>) -> Result<Stepping> {
+    let standard = Stepping::default();
+    item.table(|fields| {
+        Ok(Stepping {
+            rate_hz: fields.number("rate_hz")?.unwrap_or(standard.rate_hz),
+            tolerance: fields.number("tolerance")?.unwrap_or(standard.tolerance),
+            integrator: match fields.text("integrator")? {
+                Some(name) => Integrator::named(&fields.path("integrator"), &name)?,
+                None => standard.integrator,
+            },
+            substeps: match fields.item("substeps") {
+                Some(item) if item.as_text() == Some("auto") => None,
+                Some(item) if item.as_text().is_some() => return Err(item.wrong("\"auto\" or a whole number")),
+                Some(item) => {
+                    let whole = item.whole()?;
+                    Some(u32::try_from(whole).map_err(|_| item.refuse(Reason::OutOfRange, "is too large"))?)
+                }
+                None => None,
+            },
+            precision: match fields.text("precision")? {
+                Some(name) => Precision::named(&fields.path("precision"), &name)?,
+                None => standard.precision,
+            },
+        })
+    })
+}

@@ -1,0 +1,274 @@
+//! What a client tells a tool, and the desk where it is taken in: leases, sequence numbers, and the queue of
+//! what waits for its step. Time is an argument.
+
+use std::collections::BTreeMap;
+
+use crate::limits::Limits;
+use crate::refusal::{Reason, Refusal, Result, positive};
+use crate::scene::Scene;
+use crate::scene::script::{Action, check_poke, check_reach};
+
+/// One command to one tool.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Command {
+    /// The tool's number.
+    pub tool: u32,
+    /// Rises with each command to the tool.
+    pub sequence: u64,
+    /// The client's clock, handed back with the sample that acknowledges the command.
+    pub client_time_ns: u64,
+    /// The step at whose beginning it acts; the next one if `None`.
+    pub at_step: Option<u64>,
+    /// Simulated time after which what it did is ended.
+    pub time_to_live_s: Option<f64>,
+    /// What to do.
+    pub action: Action,
+    /// When it came, by the server's clock.
+    pub arrival_ns: u64,
+}
+
+/// A command whose step has come.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Due {
+    /// The command.
+    pub command: Command,
+    /// It was to act at an earlier step.
+    pub late: bool,
+    /// Not a client's: the end of a lease, and of all that its holder did with the tool.
+    pub ends_lease: bool,
+}
+
+/// Names a lease. Random, so that it can't be guessed.
+pub type LeaseId = u128;
+
+#[derive(Debug)]
+struct Lease {
+    id: LeaseId,
+    holder: String,
+    duration_ns: u64,
+    expires_ns: u64,
+    last_sequence: Option<u64>,
+    /// Where the tool's newest command waits.
+    last_place: Option<Place>,
+}
+
+/// Place in the queue: step, then order of arrival.
+type Place = (u64, u64);
+
+/// Where commands come in.
+#[derive(Debug)]
+pub struct Intake {
+    scene: Scene,
+    limits: Limits,
+    leases: BTreeMap<u32, Lease>,
+    queue: BTreeMap<Place, Due>,
+    arrivals: u64,
+    next_step: u64,
+    lapsed: u64,
+    superseded: u64,
+    closed: Option<Refusal>,
+}
+
+impl Intake {
+    /// For a session of `scene` that has not begun.
+    pub fn new(scene: &Scene, limits: &Limits) -> Self {
+        Intake {
+            scene: scene.clone(),
+            limits: limits.clone(),
+            leases: BTreeMap::new(),
+            queue: BTreeMap::new(),
+            arrivals: 0,
+            next_step: 0,
+            lapsed: 0,
+            superseded: 0,
+            closed: None,
+        }
+    }
+
+    /// Takes all of `tools` or none. They lapse when nothing came for `lease_s`.
+    pub fn acquire(&mut self, tools: &[u32], holder: &str, lease_s: f64, id: LeaseId, now_ns: u64) -> Result<()> {
+        self.check_open()?;
+        self.lapse(now_ns);
+        let longest_s = self.limits.lease_s;
+        crate::refusal::number("lease_s", lease_s, &format!("above 0 and at most {longest_s}"), |v| {
+            v > 0.0 && v <= longest_s
+        })?;
+        for (index, tool) in tools.iter().enumerate() {
+            if *tool >= self.limits.tools {
+                let message = format!("must be below {}, but is {tool}", self.limits.tools);
+                return Err(Refusal::new(Reason::OutOfRange, "tool", message));
+            }
+            if tools[..index].contains(tool) {
+                return Err(Refusal::new(Reason::OutOfRange, "tools", format!("names tool {tool} twice")));
+            }
+            if let Some(lease) = self.leases.get(tool) {
+                let message = format!("tool {tool} is held by `{}`", lease.holder);
+                return Err(Refusal::new(Reason::ToolHeld, "tool", message));
+            }
+        }
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+        let duration_ns = (lease_s * 1e9) as u64;
+        for tool in tools {
+            let lease = Lease {
+                id,
+                holder: holder.to_owned(),
+                duration_ns,
+                expires_ns: now_ns.saturating_add(duration_ns),
+                last_sequence: None,
+                last_place: None,
+            };
+            self.leases.insert(*tool, lease);
+        }
+        Ok(())
+    }
+
+    /// The holder is alive.
+    pub fn renew(&mut self, id: LeaseId, now_ns: u64) -> Result<()> {
+        self.lapse(now_ns);
+        let mut held = false;
+        for lease in self.leases.values_mut().filter(|lease| lease.id == id) {
+            lease.expires_ns = now_ns.saturating_add(lease.duration_ns);
+            held = true;
+        }
+        if held { Ok(()) } else { Err(not_holder("no tool is held by this lease: it lapsed or was given back".into())) }
+    }
+
+    /// Gives back every tool of a lease. What they did is ended at the next step, what waits is dropped.
+    pub fn release(&mut self, id: LeaseId) -> Result<()> {
+        let tools: Vec<u32> = self.leases.iter().filter(|lease| lease.1.id == id).map(|lease| *lease.0).collect();
+        if tools.is_empty() {
+            return Err(not_holder("no tool is held by this lease: it lapsed or was given back".into()));
+        }
+        for tool in tools {
+            self.end(tool);
+        }
+        Ok(())
+    }
+
+    fn end(&mut self, tool: u32) {
+        self.leases.remove(&tool);
+        self.queue.retain(|_, due| due.command.tool != tool);
+        let command = Command {
+            tool,
+            sequence: 0,
+            client_time_ns: 0,
+            at_step: None,
+            time_to_live_s: None,
+            action: Action::Release,
+            arrival_ns: 0,
+        };
+        self.enqueue(command, true);
+    }
+
+    /// Ends the leases whose time is over.
+    pub fn lapse(&mut self, now_ns: u64) {
+        while let Some(tool) = self.leases.iter().find(|lease| lease.1.expires_ns <= now_ns).map(|lease| *lease.0) {
+            self.lapsed += 1;
+            self.end(tool);
+        }
+    }
+
+    /// Takes in all of `commands`, from the holder of `id`, or none.
+    pub fn submit(&mut self, id: LeaseId, commands: Vec<Command>, now_ns: u64) -> Result<()> {
+        self.check_open()?;
+        self.renew(id, now_ns)?;
+        let mut last: BTreeMap<u32, u64> = BTreeMap::new();
+        for command in &commands {
+            let lease = self.leases.get(&command.tool).filter(|lease| lease.id == id);
+            let lease = lease.ok_or_else(|| not_holder(format!("tool {} is not held by this client", command.tool)))?;
+            let before = last.get(&command.tool).copied().or(lease.last_sequence);
+            if let Some(before) = before.filter(|before| command.sequence <= *before) {
+                let message = format!("must be above {before}, the last one, but is {}", command.sequence);
+                return Err(Refusal::new(Reason::StaleSequence, "sequence", message));
+            }
+            last.insert(command.tool, command.sequence);
+            self.check(command)?;
+        }
+        if self.queue.len() + commands.len() > self.limits.queued_commands {
+            let message = format!("{} commands wait for their step already", self.queue.len());
+            return Err(Refusal::new(Reason::QueueFull, "", message));
+        }
+        for command in commands {
+            self.enqueue(command, false);
+        }
+        Ok(())
+    }
+
+    fn check(&self, command: &Command) -> Result<()> {
+        if let Some(seconds) = command.time_to_live_s {
+            positive("time_to_live_s", seconds)?;
+        }
+        match &command.action {
+            Action::Push(poke) => check_poke(poke, &self.scene.sheet, &self.limits),
+            Action::Grasp { point, displacement_m } => {
+                self.scene.sheet.index("position.point", *point)?;
+                crate::refusal::finite_vector("position.displacement_m", *displacement_m)?;
+                let far_m = displacement_m.length();
+                check_reach("position.displacement_m", &self.scene.sheet, far_m, &self.limits)
+            }
+            Action::Release => Ok(()),
+        }
+    }
+
+    fn enqueue(&mut self, command: Command, ends_lease: bool) {
+        let step = command.at_step.map_or(self.next_step, |at| at.max(self.next_step));
+        let late = command.at_step.is_some_and(|at| at < self.next_step);
+        let place = (step, self.arrivals);
+        self.arrivals += 1;
+        if let Some(lease) = self.leases.get_mut(&command.tool) {
+            lease.last_sequence = Some(command.sequence);
+            let last = lease.last_place.replace(place);
+            // The latest position wins: one that can't act any more makes room.
+            if let (Some(last), Action::Grasp { .. }) = (last.filter(|last| last.0 == step), &command.action)
+                && self.queue.get(&last).is_some_and(|due| matches!(due.command.action, Action::Grasp { .. }))
+            {
+                self.queue.remove(&last);
+                self.superseded += 1;
+            }
+        }
+        self.queue.insert(place, Due { command, late, ends_lease });
+    }
+
+    /// Moves what is due at the beginning of step `step` into `due`, in the order in which it is to act.
+    pub fn take_due(&mut self, step: u64, now_ns: u64, due: &mut Vec<Due>) {
+        self.lapse(now_ns);
+        while let Some(entry) = self.queue.first_entry().filter(|entry| entry.key().0 <= step) {
+            due.push(entry.remove());
+        }
+        self.next_step = step + 1;
+    }
+
+    /// The step that comes next.
+    pub fn next_step(&self) -> u64 {
+        self.next_step
+    }
+
+    /// Who holds what.
+    pub fn holders(&self) -> impl Iterator<Item = (u32, &str)> {
+        self.leases.iter().map(|(tool, lease)| (*tool, lease.holder.as_str()))
+    }
+
+    /// Tools whose lease lapsed, in all.
+    pub fn lapsed(&self) -> u64 {
+        self.lapsed
+    }
+
+    /// Positions that a later one for the same step has replaced, in all.
+    pub fn superseded(&self) -> u64 {
+        self.superseded
+    }
+
+    /// From now on everything is refused with this.
+    pub fn close(&mut self, refusal: Refusal) {
+        self.closed = Some(refusal);
+        self.queue.clear();
+    }
+
+    fn check_open(&self) -> Result<()> {
+        self.closed.clone().map_or(Ok(()), Err)
+    }
+}
+
+fn not_holder(message: String) -> Refusal {
+    Refusal::new(Reason::NotHolder, "lease_id", message)
+}

@@ -1,0 +1,269 @@
+//! One tissue in use: what the tools do to it, what they feel, what is recorded. No clock, no socket: a session
+//! that is given the same commands at the same steps gives the same bits.
+
+pub mod command;
+pub mod record;
+pub mod run;
+
+use std::sync::Arc;
+
+use glam::DVec3;
+
+use crate::scene::law::{ForceLaw, MoveLaw};
+use crate::scene::script::{Action, nearest_point};
+use crate::sheet::{self, Grasp, Model, Push, Tissue};
+use command::Due;
+use record::Record;
+
+/// What one tool felt at the end of a step.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ToolSample {
+    /// The tool's number.
+    pub tool: u32,
+    /// Sequence of the newest command that acted; 0 before the first.
+    pub acknowledged_sequence: u64,
+    /// Its time by the client's clock.
+    pub client_time_ns: u64,
+    /// When it came, by the server's clock; 0 before the first.
+    pub arrival_ns: u64,
+    /// What it does, and feels, if anything.
+    pub contact: Option<Contact>,
+    /// The acknowledged command came too late for its step.
+    pub late: bool,
+    /// What the tool did was ended by its time to live, or with its lease.
+    pub expired: bool,
+}
+
+/// The control point of a tool.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Contact {
+    /// The mass point.
+    pub point: [usize; 2],
+    /// From rest, m.
+    pub displacement_m: DVec3,
+    /// m/s.
+    pub velocity_m_per_s: DVec3,
+    /// Of the tissue on the tool: springs + virtual spring + damping, N.
+    pub force_on_tool_n: DVec3,
+    /// Of all tools on the point, N.
+    pub applied_force_n: DVec3,
+}
+
+/// What all tools felt at the end of a step.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sample {
+    /// Steps done.
+    pub step: u64,
+    /// s.
+    pub simulation_time_s: f64,
+    /// Points computed in the step.
+    pub awake_points: usize,
+    /// Commands that came too late, in all.
+    pub late_commands: u64,
+    /// The guard has ended the session.
+    pub held: bool,
+    /// By the number of the tool, rising.
+    pub tools: Vec<ToolSample>,
+}
+
+#[derive(Debug, Clone, Default)]
+struct Tool {
+    acknowledged_sequence: u64,
+    client_time_ns: u64,
+    arrival_ns: u64,
+    control_point: Option<[usize; 2]>,
+    expires_at: Option<u64>,
+    late: bool,
+    expired: bool,
+}
+
+/// A tissue and its tools.
+pub struct Session {
+    tissue: Box<dyn Tissue>,
+    tools: Vec<Tool>,
+    late_commands: u64,
+    hold_reason: Option<String>,
+}
+
+impl Session {
+    /// A tissue at rest.
+    pub fn new(model: &Arc<Model>) -> Self {
+        Session { tissue: sheet::at_rest(model), tools: Vec::new(), late_commands: 0, hold_reason: None }
+    }
+
+    /// What of the tissue never changes.
+    pub fn model(&self) -> &Arc<Model> {
+        self.tissue.model()
+    }
+
+    /// The tissue, to look at.
+    pub fn tissue(&self) -> &dyn Tissue {
+        &*self.tissue
+    }
+
+    /// Steps done.
+    pub fn step_count(&self) -> u64 {
+        self.tissue.step_count()
+    }
+
+    /// Simulated time, s.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn time_s(&self) -> f64 {
+        self.step_count() as f64 / self.model().scene.stepping.rate_hz
+    }
+
+    /// Why the guard has ended the session, if it has.
+    pub fn hold_reason(&self) -> Option<&str> {
+        self.hold_reason.as_deref()
+    }
+
+    /// Commands that came too late for their step, in all.
+    pub fn late_commands(&self) -> u64 {
+        self.late_commands
+    }
+
+    /// One step: `due` acts at its beginning. `observe` is called at its end, and before the first also at t = 0⁺,
+    /// when what is due acts and nothing has moved.
+    pub fn advance(&mut self, due: &mut Vec<Due>, mut observe: impl FnMut(&Session)) {
+        if self.hold_reason.is_some() {
+            due.clear();
+            return;
+        }
+        for due in due.drain(..) {
+            self.act(due);
+        }
+        self.expire();
+        if self.step_count() == 0 {
+            observe(self);
+        }
+        if let Err(blow_up) = self.tissue.step() {
+            let [i, j] = blow_up.point;
+            self.hold_reason = Some(format!(
+                "point [{i}, {j}] was not finite after step {}; the state is that of step {}",
+                blow_up.step,
+                self.step_count()
+            ));
+        }
+        observe(self);
+    }
+
+    fn tool(&mut self, tool: usize) -> &mut Tool {
+        if self.tools.len() <= tool {
+            self.tools.resize(tool + 1, Tool::default());
+        }
+        &mut self.tools[tool]
+    }
+
+    fn act(&mut self, Due { command, late, ends_lease }: Due) {
+        let step = self.step_count();
+        let rate_hz = self.model().scene.stepping.rate_hz;
+        self.late_commands += u64::from(late);
+        let index = command.tool as usize;
+        let tool = self.tool(index);
+        if ends_lease {
+            *tool = Tool { control_point: tool.control_point, expired: true, ..Tool::default() };
+            return self.tissue.release(index);
+        }
+        if matches!(command.action, Action::Grasp { .. }) && command.sequence < tool.acknowledged_sequence {
+            return;
+        }
+        tool.acknowledged_sequence = command.sequence;
+        tool.client_time_ns = command.client_time_ns;
+        tool.arrival_ns = command.arrival_ns;
+        tool.late = late;
+        tool.expired = false;
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+        let lifetime = command.time_to_live_s.map(|seconds| (seconds * rate_hz).ceil().max(1.0) as u64);
+        tool.expires_at = lifetime.map(|steps| step.saturating_add(steps));
+        match command.action {
+            Action::Push(poke) => {
+                let point = nearest_point(&self.model().scene.sheet, poke.centre_m);
+                self.tool(index).control_point = Some(point);
+                self.tissue.push(index, Some(Push::Held(poke)));
+            }
+            Action::Grasp { point, displacement_m } => {
+                self.tool(index).control_point = Some(point);
+                let place = self.model().index_of(point);
+                self.tissue.grasp(index, place, Grasp::Held(displacement_m));
+            }
+            Action::Release => {
+                self.tool(index).expires_at = None;
+                self.tissue.release(index);
+            }
+        }
+    }
+
+    /// Ends what has outlived its time.
+    fn expire(&mut self) {
+        let step = self.step_count();
+        for index in 0..self.tools.len() {
+            if self.tools[index].expires_at.is_some_and(|at| at <= step) {
+                self.tools[index].expires_at = None;
+                self.tools[index].expired = true;
+                self.tissue.release(index);
+            }
+        }
+    }
+
+    /// A force as a continuous law, exact within the step: what no command can ask for.
+    pub fn play_force(&mut self, tool: usize, law: ForceLaw) {
+        self.tissue.push(tool, Some(Push::Law(law)));
+    }
+
+    /// A movement as a continuous law.
+    pub fn play_move(&mut self, tool: usize, law: MoveLaw) {
+        let index = self.model().index_of(law.point);
+        self.tissue.grasp(tool, index, Grasp::Law(law));
+    }
+
+    /// What the tools feel; only those of `only`, if given.
+    pub fn sample(&self, only: Option<&[u32]>) -> Sample {
+        let sample_of = |number: u32| {
+            let tool = self.tools.get(number as usize).cloned().unwrap_or_default();
+            let contact = tool.control_point.map(|point| {
+                let state = self.tissue.point(self.model().index_of(point));
+                Contact {
+                    point,
+                    displacement_m: state.displacement_m,
+                    velocity_m_per_s: state.velocity_m_per_s,
+                    force_on_tool_n: state.reaction_n(),
+                    applied_force_n: state.applied_n,
+                }
+            });
+            ToolSample {
+                tool: number,
+                acknowledged_sequence: tool.acknowledged_sequence,
+                client_time_ns: tool.client_time_ns,
+                arrival_ns: tool.arrival_ns,
+                contact,
+                late: tool.late,
+                expired: tool.expired,
+            }
+        };
+        let in_use = |number: &u32| self.tools[*number as usize].control_point.is_some();
+        #[allow(clippy::cast_possible_truncation)]
+        let tools = match only {
+            Some(numbers) => numbers.iter().map(|number| sample_of(*number)).collect(),
+            None => (0..self.tools.len() as u32).filter(in_use).map(sample_of).collect(),
+        };
+        Sample {
+            step: self.step_count(),
+            simulation_time_s: self.time_s(),
+            awake_points: self.model().len(),
+            late_commands: self.late_commands,
+            held: self.hold_reason.is_some(),
+            tools,
+        }
+    }
+
+    /// A record of `points`, with the energies of the whole sheet if they are wanted.
+    pub fn record(&self, points: &[[usize; 2]], energy: bool) -> Record {
+        let of = |point: &[usize; 2]| record::Point::new(*point, &self.tissue.point(self.model().index_of(*point)));
+        Record {
+            time_s: self.time_s(),
+            points: points.iter().map(of).collect(),
+            energy_j: energy.then(|| self.tissue.energy().into()),
+            awake_points: self.model().len(),
+        }
+    }
+}

@@ -1,0 +1,155 @@
+//! `palpate run`: a script played offline, in process, as fast as it goes.
+
+use std::io::Write;
+use std::sync::Arc;
+
+use super::Session;
+use super::command::{Command, Intake};
+use super::record::{Line, Run, Summary};
+use crate::limits::Limits;
+use crate::refusal::Result;
+use crate::scene::Named;
+use crate::scene::script::{Action, Script};
+use crate::sheet::Model;
+
+/// How a run can end early.
+#[derive(Debug, thiserror::Error)]
+pub enum Failure {
+    /// The guard has ended the session.
+    #[error("the run was stopped: {0}")]
+    Held(String),
+    /// The output can't be written.
+    #[error("can't write the output: {0}")]
+    Output(#[from] std::io::Error),
+}
+
+/// The first line of a run.
+pub fn header(model: &Model, script: &str) -> Run {
+    Run {
+        scene: model.scene.name.clone(),
+        script: script.to_owned(),
+        integrator: model.plan.integrator.name().to_owned(),
+        substeps: model.plan.substeps,
+        precision: model.precision.name().to_owned(),
+        rate_hz: model.scene.stepping.rate_hz,
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+    }
+}
+
+/// The command of a script's action, as a client streams it.
+pub fn command(tool: usize, step: u64, action: Action) -> Command {
+    Command {
+        #[allow(clippy::cast_possible_truncation)]
+        tool: tool as u32,
+        // One command a step at most, so steps make sequence numbers.
+        sequence: step + 1,
+        client_time_ns: 0,
+        at_step: Some(step),
+        time_to_live_s: None,
+        action,
+        arrival_ns: 0,
+    }
+}
+
+/// What feeds a session.
+enum Feed<'a> {
+    /// Laws, set at the beginning.
+    Laws,
+    /// Commands, one a step, through the same intake as a server's.
+    Held(&'a Script, Intake),
+}
+
+/// Plays `script` and writes its records, as JSON Lines, to `output`. `clock_s` tells the time, for the summary;
+/// `progress` is told the steps done now and then.
+pub fn run(
+    model: &Arc<Model>,
+    script: &Script,
+    held: bool,
+    limits: &Limits,
+    output: &mut dyn Write,
+    clock_s: &dyn Fn() -> f64,
+    progress: &mut dyn FnMut(u64),
+) -> std::result::Result<Summary, Failure> {
+    let mut session = Session::new(model);
+    let mut feed = if held {
+        Feed::Held(script, intake(model, script, limits).map_err(|refusal| Failure::Held(refusal.to_string()))?)
+    } else {
+        for (tool, law) in script.forces.iter().enumerate() {
+            session.play_force(tool, law.clone());
+        }
+        for (index, law) in script.moves.iter().enumerate() {
+            session.play_move(script.forces.len() + index, law.clone());
+        }
+        Feed::Laws
+    };
+    write_line(output, &Line::Run(&header(model, &script.name)))?;
+    let mut due = Vec::new();
+    let mut written: std::io::Result<()> = Ok(());
+    let (mut stepping_s, mut resumed_s) = (0.0, clock_s());
+    for step in 0..script.steps {
+        if let Feed::Held(script, intake) = &mut feed {
+            for (tool, action) in script.actions_at(step) {
+                let commands = vec![command(tool, step, action)];
+                intake.submit(LEASE, commands, 0).map_err(|refusal| Failure::Held(refusal.to_string()))?;
+            }
+            intake.take_due(step, 0, &mut due);
+        }
+        session.advance(&mut due, |session| {
+            if session.hold_reason().is_none() && session.step_count().is_multiple_of(script.sample_every) {
+                // The clock of the summary stands while a record is written.
+                stepping_s += clock_s() - resumed_s;
+                if written.is_ok() {
+                    written = write_line(output, &session.record(&script.sample_points, true));
+                }
+                resumed_s = clock_s();
+            }
+        });
+        std::mem::replace(&mut written, Ok(()))?;
+        if let Some(reason) = session.hold_reason() {
+            return Err(Failure::Held(reason.to_owned()));
+        }
+        if step.is_multiple_of(1024) {
+            progress(step);
+        }
+    }
+    stepping_s += clock_s() - resumed_s;
+    let summary = summary(model, script.steps, stepping_s, session.tissue().state_hash());
+    write_line(output, &Line::Summary(&summary))?;
+    Ok(summary)
+}
+
+/// Any number: in process nobody else asks.
+const LEASE: u128 = 1;
+
+fn intake(model: &Model, script: &Script, limits: &Limits) -> Result<Intake> {
+    let mut intake = Intake::new(&model.scene, limits);
+    #[allow(clippy::cast_possible_truncation)]
+    let tools: Vec<u32> = (0..script.tools() as u32).collect();
+    if !tools.is_empty() {
+        intake.acquire(&tools, "run", limits.lease_s, LEASE, 0)?;
+    }
+    Ok(intake)
+}
+
+/// The last line of a run of `steps` steps.
+#[allow(clippy::cast_precision_loss)]
+pub fn summary(model: &Model, steps: u64, wall_s: f64, hash: u128) -> Summary {
+    let substeps = steps * u64::from(model.plan.substeps);
+    Summary {
+        steps,
+        substeps,
+        points: model.len(),
+        wall_s,
+        ns_per_point_substep: wall_s * 1e9 / (substeps as f64 * model.len() as f64),
+        computed_fraction: 1.0,
+        guard_events: 0,
+        final_hash: format!("{hash:032x}"),
+        network: None,
+    }
+}
+
+/// One JSON object, one line.
+pub fn write_line(output: &mut dyn Write, line: &impl serde::Serialize) -> std::io::Result<()> {
+    serde_json::to_writer(&mut *output, line)?;
+    output.write_all(b"\n")
+}

@@ -1,0 +1,123 @@
+//! Points that do not move freely: fixed ones, and those that a tool has grasped.
+
+use glam::DVec3;
+
+use super::model::Model;
+use super::real::Real;
+use crate::scene::law::{Motion, MoveLaw};
+
+/// How a tool moves the point that it has grasped.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Grasp {
+    /// To this displacement by the end of the step, at constant velocity; then it stays.
+    Held(DVec3),
+    /// A law of time, exact within the step.
+    Law(MoveLaw),
+}
+
+/// One grasped point.
+#[derive(Debug, Clone)]
+struct Grasped {
+    tool: usize,
+    index: usize,
+    grasp: Grasp,
+    /// At the end of the last step.
+    now: Motion,
+}
+
+/// All points that do not move freely.
+#[derive(Debug)]
+pub(super) struct Prescribed {
+    grasped: Vec<Grasped>,
+    /// Points let go, and the velocity that they had, until the coming substep.
+    released: Vec<(usize, DVec3)>,
+}
+
+impl Prescribed {
+    pub(super) fn new() -> Self {
+        Prescribed { grasped: Vec::new(), released: Vec::new() }
+    }
+
+    /// From the coming step on `tool` moves the point at `index`, which is at `displacement_m`, and lets go what it
+    /// had before.
+    pub(super) fn grasp(&mut self, tool: usize, index: usize, grasp: Grasp, displacement_m: DVec3) {
+        if let Some(grasped) = self.grasped.iter_mut().find(|g| g.tool == tool && g.index == index) {
+            grasped.grasp = grasp;
+            return;
+        }
+        self.release(tool);
+        let now = match &grasp {
+            Grasp::Held(_) => Motion { displacement_m, ..Motion::default() },
+            Grasp::Law(law) => law.at(0.0),
+        };
+        self.grasped.push(Grasped { tool, index, grasp, now });
+    }
+
+    /// `tool` lets go. The point goes on with the velocity that it has.
+    pub(super) fn release(&mut self, tool: usize) {
+        let Some(place) = self.grasped.iter().position(|g| g.tool == tool) else { return };
+        let grasped = self.grasped.remove(place);
+        if !self.grasped.iter().any(|g| g.index == grasped.index) {
+            self.released.push((grasped.index, grasped.now.velocity_m_per_s));
+        }
+    }
+
+    /// The points let go since the last call, and their velocities, m/s.
+    pub(super) fn take_released(&mut self) -> Vec<(usize, DVec3)> {
+        std::mem::take(&mut self.released)
+    }
+
+    /// Moves every prescribed point to where it is at `fraction` of step `step`.
+    #[allow(clippy::cast_precision_loss)]
+    pub(super) fn hold<T: Real>(
+        &self,
+        model: &Model,
+        step: u64,
+        fraction: f64,
+        u: &mut [Vec<T>; 3],
+        d: &mut [Vec<T>; 3],
+    ) {
+        for c in 0..3 {
+            for &index in &model.fixed {
+                u[c][index] = T::default();
+                d[c][index] = T::default();
+            }
+        }
+        for grasped in &self.grasped {
+            let displacement_m = match &grasped.grasp {
+                Grasp::Held(target_m) if fraction >= 1.0 => *target_m,
+                Grasp::Held(target_m) => grasped.now.displacement_m.lerp(*target_m, fraction),
+                Grasp::Law(law) => law.at((step as f64 + fraction) / model.scene.stepping.rate_hz).displacement_m,
+            };
+            for (c, target) in displacement_m.to_array().into_iter().enumerate() {
+                // What the scheme has just done is undone: the increment is from where the point was before.
+                let before = u[c][grasped.index] - d[c][grasped.index];
+                u[c][grasped.index] = T::of(target);
+                d[c][grasped.index] = u[c][grasped.index] - before;
+            }
+        }
+    }
+
+    /// Ends a step.
+    #[allow(clippy::cast_precision_loss)]
+    pub(super) fn finish(&mut self, model: &Model, step: u64) {
+        let rate_hz = model.scene.stepping.rate_hz;
+        for grasped in &mut self.grasped {
+            let before = grasped.now;
+            grasped.now = match &grasped.grasp {
+                Grasp::Held(target_m) => {
+                    let velocity_m_per_s = (*target_m - before.displacement_m) * rate_hz;
+                    let acceleration_m_per_s2 = (velocity_m_per_s - before.velocity_m_per_s) * rate_hz;
+                    Motion { displacement_m: *target_m, velocity_m_per_s, acceleration_m_per_s2 }
+                }
+                Grasp::Law(law) => law.at((step + 1) as f64 / rate_hz),
+            };
+        }
+    }
+
+    /// How a point is made to move, if it is: at the end of the last step.
+    pub(super) fn motion(&self, model: &Model, index: usize) -> Option<Motion> {
+        let fixed = || model.fixed.binary_search(&index).is_ok().then(Motion::default);
+        self.grasped.iter().rev().find(|g| g.index == index).map(|g| g.now).or_else(fixed)
+    }
+}
