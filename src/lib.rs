@@ -1,7 +1,11 @@
 //! Palpate: a server for touching soft tissue over a network. ARCHITECTURE.md is the map.
 
 pub mod limits;
+pub mod pace;
 pub mod refusal;
 pub mod scene;
+pub mod server;
 pub mod session;
 pub mod sheet;
+pub mod surface;
+pub mod wire;

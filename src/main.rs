@@ -1,16 +1,19 @@
 //! The program `palpate`: parses arguments and calls one function.
 
-use std::io::{BufWriter, Write};
-use std::path::PathBuf;
+use std::io::{BufWriter, IsTerminal, Write};
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Instant;
 
 use clap::{Parser, Subcommand};
 use palpate::limits::Limits;
-use palpate::refusal::Refusal;
+use palpate::refusal::{Refusal, positive};
 use palpate::scene::{self, Scene, script::Script};
+use palpate::server::{self, config::Config};
 use palpate::session::run;
 use palpate::sheet::Model;
+use tokio_util::sync::CancellationToken;
 
 /// A server for touching soft tissue over a network.
 #[derive(Parser)]
@@ -28,6 +31,38 @@ enum Command {
         palpate run paper scripts/oblique-100.toml --output poke.jsonl --set stepping.integrator=lagged\n\n\
         Exit status: 0; 1 when the run failed; 2 when an input was refused.")]
     Run(RunArguments),
+    /// Serve tissue over gRPC: sessions stepped in real time, commands in, forces and frames out
+    #[command(after_help = "Examples:\n  \
+        palpate serve\n  \
+        palpate serve --listen 127.0.0.1:0 --scenes my-scenes --threads 1\n\n\
+        The address is printed to the standard output when the server is ready. Ctrl-C or SIGTERM ends it: streams\n\
+        are told, and cut when the deadline has passed.")]
+    Serve(ServeArguments),
+}
+
+#[derive(clap::Args)]
+struct ServeArguments {
+    /// Where to listen; port 0 takes a free one [default: 127.0.0.1:7117]
+    #[arg(long, value_name = "ADDRESS:PORT")]
+    listen: Option<SocketAddr>,
+    /// Folder of the scenes that sessions can be made from by name [default: scenes]
+    #[arg(long, value_name = "DIR")]
+    scenes: Option<PathBuf>,
+    /// Configuration file (TOML): the same keys as these options, with _ for -, and a section [limits]
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Stepping threads [default: one less than the machine has cores]
+    #[arg(long, value_name = "N")]
+    threads: Option<usize>,
+    /// How long streams may take to end at shutdown before they are cut, s [default: 5]
+    #[arg(long, value_name = "SECONDS")]
+    shutdown_deadline_s: Option<f64>,
+    /// What is logged to standard error: error, warn, info, debug, or palpate=debug,tonic=warn, … [default: info]
+    #[arg(long, value_name = "FILTER")]
+    log: Option<String>,
+    /// Log as JSON, a line an event
+    #[arg(long)]
+    log_json: bool,
 }
 
 #[derive(clap::Args)]
@@ -42,6 +77,9 @@ struct RunArguments {
     /// Set a key of the scene: a TOML value, or a bare string; may be repeated
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
+    /// Configuration file (TOML) with other limits, in a section [limits]
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
     /// Hold forces and paths for each step, as a client does that streams a command a step
     #[arg(long)]
     held: bool,
@@ -64,6 +102,7 @@ impl From<Refusal> for Failure {
 fn main() -> ExitCode {
     let ended = match Arguments::parse().command {
         Command::Run(arguments) => run_script(&arguments),
+        Command::Serve(arguments) => serve(&arguments),
     };
     let (status, message) = match ended {
         Ok(()) => return ExitCode::SUCCESS,
@@ -74,8 +113,87 @@ fn main() -> ExitCode {
     ExitCode::from(status)
 }
 
+fn load_config(path: Option<&Path>) -> Result<Config, Refusal> {
+    path.map_or_else(|| Ok(Config::default()), Config::load)
+}
+
+fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
+    let mut config = load_config(arguments.config.as_deref())?;
+    if let Some(listen) = arguments.listen {
+        config.listen = listen;
+    }
+    if let Some(scenes) = &arguments.scenes {
+        if !scenes.is_dir() {
+            return Err(Failure::Refused(format!("--scenes {}: is not a folder", scenes.display())));
+        }
+        config.scenes.clone_from(scenes);
+    }
+    if let Some(threads) = arguments.threads {
+        config.threads = threads;
+    }
+    if let Some(deadline_s) = arguments.shutdown_deadline_s {
+        config.shutdown_deadline_s = positive("--shutdown-deadline-s", deadline_s)?;
+    }
+    if let Some(log) = &arguments.log {
+        config.log.clone_from(log);
+    }
+    let filter = tracing_subscriber::EnvFilter::try_new(&config.log)
+        .map_err(|e| Failure::Refused(format!("--log {}: {e}", config.log)))?;
+    let subscriber = tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr)
+        .with_ansi(std::io::stderr().is_terminal());
+    if arguments.log_json {
+        subscriber.json().init();
+    } else {
+        subscriber.init();
+    }
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(config.network_threads.max(1))
+        .thread_name("network")
+        .enable_all()
+        .build()
+        .map_err(|e| Failure::Failed(format!("can't start the network threads: {e}")))?;
+    let ended = runtime.block_on(async {
+        let listen = config.listen;
+        let listener = tokio::net::TcpListener::bind(listen).await.map_err(|e| {
+            Failure::Failed(format!(
+                "can't listen on {listen}: {e}; another --listen, or port 0 for a free one, may do"
+            ))
+        })?;
+        let address = listener.local_addr().map_err(|e| Failure::Failed(e.to_string()))?;
+        let shutdown = CancellationToken::new();
+        tokio::spawn(cancel_on_signal(shutdown.clone()));
+        println!("palpate listens on http://{address}");
+        server::serve(listener, config, shutdown).await.map_err(|e| Failure::Failed(e.to_string()))
+    });
+    runtime.shutdown_background();
+    ended
+}
+
+/// Ctrl-C and SIGTERM end the server; a second one ends it at once.
+async fn cancel_on_signal(shutdown: CancellationToken) {
+    for signals in 0.. {
+        #[cfg(unix)]
+        {
+            use tokio::signal::unix::{SignalKind, signal};
+            let Ok(mut terminate) = signal(SignalKind::terminate()) else { return };
+            tokio::select! {
+                _ = tokio::signal::ctrl_c() => {}
+                _ = terminate.recv() => {}
+            }
+        }
+        #[cfg(not(unix))]
+        let _ = tokio::signal::ctrl_c().await;
+        if signals > 0 {
+            std::process::exit(130);
+        }
+        shutdown.cancel();
+    }
+}
+
 fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
-    let limits = Limits::default();
+    let limits: Limits = load_config(arguments.config.as_deref())?.limits;
     let scene = if arguments.scene.as_os_str() == "paper" && !arguments.scene.exists() {
         Scene::parse("paper (built in)", scene::PAPER, &arguments.set, &limits)?
     } else {

@@ -3,6 +3,7 @@
 
 pub mod document;
 pub mod law;
+pub mod record;
 pub mod script;
 
 use std::path::Path;

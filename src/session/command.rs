@@ -243,6 +243,11 @@ impl Intake {
         self.next_step
     }
 
+    /// The tools of a lease.
+    pub fn tools_of(&self, id: LeaseId) -> impl Iterator<Item = u32> {
+        self.leases.iter().filter(move |lease| lease.1.id == id).map(|lease| *lease.0)
+    }
+
     /// Who holds what.
     pub fn holders(&self) -> impl Iterator<Item = (u32, &str)> {
         self.leases.iter().map(|(tool, lease)| (*tool, lease.holder.as_str()))

@@ -2,7 +2,6 @@
 //! that is given the same commands at the same steps gives the same bits.
 
 pub mod command;
-pub mod record;
 pub mod run;
 
 use std::sync::Arc;
@@ -10,10 +9,10 @@ use std::sync::Arc;
 use glam::DVec3;
 
 use crate::scene::law::{ForceLaw, MoveLaw};
+use crate::scene::record::{EnergyJ, Point, Record};
 use crate::scene::script::{Action, nearest_point};
-use crate::sheet::{self, Grasp, Model, Push, Tissue};
+use crate::sheet::{self, Energy, Grasp, Model, PointState, Push, Tissue};
 use command::Due;
-use record::Record;
 
 /// What one tool felt at the end of a step.
 #[derive(Debug, Clone, PartialEq)]
@@ -258,12 +257,32 @@ impl Session {
 
     /// A record of `points`, with the energies of the whole sheet if they are wanted.
     pub fn record(&self, points: &[[usize; 2]], energy: bool) -> Record {
-        let of = |point: &[usize; 2]| record::Point::new(*point, &self.tissue.point(self.model().index_of(*point)));
+        let of = |point: &[usize; 2]| point_record(*point, &self.tissue.point(self.model().index_of(*point)));
         Record {
             time_s: self.time_s(),
             points: points.iter().map(of).collect(),
-            energy_j: energy.then(|| self.tissue.energy().into()),
+            energy_j: energy.then(|| energy_record(self.tissue.energy())),
             awake_points: self.model().len(),
         }
+    }
+}
+
+fn energy_record(energy: Energy) -> EnergyJ {
+    EnergyJ { kinetic: energy.kinetic_j, spring: energy.spring_j, virtual_springs: energy.virtual_j }
+}
+
+fn point_record(point: [usize; 2], state: &PointState) -> Point {
+    // −0 reads badly.
+    let array = |v: DVec3| (v + DVec3::ZERO).to_array();
+    Point {
+        point,
+        displacement_m: array(state.displacement_m),
+        velocity_m_per_s: array(state.velocity_m_per_s),
+        spring_n: array(state.spring_n),
+        virtual_n: array(state.virtual_n),
+        damping_n: array(state.damping_n),
+        applied_n: array(state.applied_n),
+        reaction_n: array(state.reaction_n()),
+        constraint_n: state.constraint_n.map(array),
     }
 }

@@ -5,10 +5,10 @@ use std::sync::Arc;
 
 use super::Session;
 use super::command::{Command, Intake};
-use super::record::{Line, Run, Summary};
 use crate::limits::Limits;
 use crate::refusal::Result;
 use crate::scene::Named;
+use crate::scene::record::{Line, Run, Summary, write_line};
 use crate::scene::script::{Action, Script};
 use crate::sheet::Model;
 
@@ -146,10 +146,4 @@ pub fn summary(model: &Model, steps: u64, wall_s: f64, hash: u128) -> Summary {
         final_hash: format!("{hash:032x}"),
         network: None,
     }
-}
-
-/// One JSON object, one line.
-pub fn write_line(output: &mut dyn Write, line: &impl serde::Serialize) -> std::io::Result<()> {
-    serde_json::to_writer(&mut *output, line)?;
-    output.write_all(b"\n")
 }

@@ -1,9 +1,8 @@
 //! The records of `palpate run` and of a replay: JSON Lines, one schema.
 
-use glam::DVec3;
-use serde::Serialize;
+use std::io::Write;
 
-use crate::sheet::{Energy, PointState};
+use serde::Serialize;
 
 /// The first line.
 #[derive(Debug, Clone, Serialize)]
@@ -25,7 +24,7 @@ pub struct Run {
 }
 
 /// A line a sample time. Forces are those on the tissue point, N.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Default, Serialize)]
 pub struct Record {
     /// Simulated time.
     pub time_s: f64,
@@ -66,31 +65,6 @@ pub struct EnergyJ {
     pub virtual_springs: f64,
 }
 
-impl From<Energy> for EnergyJ {
-    fn from(energy: Energy) -> Self {
-        EnergyJ { kinetic: energy.kinetic_j, spring: energy.spring_j, virtual_springs: energy.virtual_j }
-    }
-}
-
-impl Point {
-    /// The record of a point.
-    pub fn new(point: [usize; 2], state: &PointState) -> Self {
-        // −0 reads badly.
-        let array = |v: DVec3| (v + DVec3::ZERO).to_array();
-        Point {
-            point,
-            displacement_m: array(state.displacement_m),
-            velocity_m_per_s: array(state.velocity_m_per_s),
-            spring_n: array(state.spring_n),
-            virtual_n: array(state.virtual_n),
-            damping_n: array(state.damping_n),
-            applied_n: array(state.applied_n),
-            reaction_n: array(state.reaction_n()),
-            constraint_n: state.constraint_n.map(array),
-        }
-    }
-}
-
 /// The last line.
 #[derive(Debug, Clone, Serialize)]
 pub struct Summary {
@@ -124,14 +98,16 @@ pub struct Network {
     pub rejected_commands: u64,
     /// Steps that the server dropped.
     pub overruns: u64,
-    /// Least simulated over real time of any second.
+    /// Simulated over real time, from the first sample to the last.
     pub time_dilation: f64,
-    /// From a heartbeat's departure to its sample's arrival.
-    pub round_trip_us: Option<Percentiles>,
+    /// From a message's departure to its answer, which does not wait for a step.
+    pub round_trip_us: Percentiles,
+    /// Time the server had that message.
+    pub server_hold_us: Percentiles,
 }
 
 /// Of a distribution.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Copy, Default, Serialize)]
 #[allow(missing_docs)]
 pub struct Percentiles {
     pub p50: f64,
@@ -147,4 +123,10 @@ pub enum Line<'a> {
     Run(&'a Run),
     /// The last.
     Summary(&'a Summary),
+}
+
+/// One JSON object, one line.
+pub fn write_line(output: &mut dyn Write, line: &impl Serialize) -> std::io::Result<()> {
+    serde_json::to_writer(&mut *output, line)?;
+    output.write_all(b"\n")
 }

@@ -1,0 +1,15 @@
+//! Compiles the protocol in Rust alone: no protoc is needed.
+
+use std::error::Error;
+use std::path::PathBuf;
+
+fn main() -> Result<(), Box<dyn Error>> {
+    const FILES: [&str; 3] = ["palpate/v1/session.proto", "palpate/v1/haptic.proto", "palpate/v1/view.proto"];
+    println!("cargo::rerun-if-changed=proto");
+    let descriptors = protox::compile(FILES, ["proto"])?;
+    let out = PathBuf::from(std::env::var("OUT_DIR")?);
+    std::fs::write(out.join("palpate.bin"), prost::Message::encode_to_vec(&descriptors))?;
+    // Frames are shared between viewers, not copied for each.
+    tonic_prost_build::configure().bytes(".palpate.v1.Patch.displacement").compile_fds(descriptors)?;
+    Ok(())
+}

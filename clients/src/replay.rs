@@ -1,0 +1,442 @@
+//! `palpate-client replay`: a script through a server, exactly.
+
+use std::io::{BufWriter, IsTerminal, Write};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use hdrhistogram::Histogram;
+use indicatif::{ProgressBar, ProgressStyle};
+use palpate::limits::Limits;
+use palpate::refusal::Refusal;
+use palpate::scene::Scene;
+use palpate::scene::record::{Line, Network, Percentiles, Record, Run, Summary, write_line};
+use palpate::scene::script::Script;
+use palpate::wire::error::describe;
+use palpate::wire::pb::create_session_request::Source;
+use palpate::wire::pb::haptic_service_client::HapticServiceClient;
+use palpate::wire::pb::session_service_client::SessionServiceClient;
+use palpate::wire::{self, pb};
+use pb::touch_request::Message as Say;
+use pb::touch_response::Message as Heard;
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::transport::{Channel, Endpoint};
+use tonic::{Status, Streaming};
+
+use crate::{Failure, plot};
+
+/// How far ahead of the server's step commands are sent: as long as a network may stall and none is late.
+const AHEAD_S: f64 = 2.0;
+
+/// Commands on their way at most, below what a session queues.
+const COMMANDS_AHEAD: u64 = 8192;
+
+/// Between two heartbeats.
+const HEARTBEAT: Duration = Duration::from_millis(20);
+
+/// A running session sends a sample each step; this long without one is an end.
+const SILENCE: Duration = Duration::from_secs(10);
+
+#[derive(clap::Args)]
+pub(crate) struct Arguments {
+    /// The script file
+    script: PathBuf,
+    /// The server
+    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7117")]
+    server: String,
+    /// A scene that the server has by that name, or a scene file of your own (ends in .toml)
+    #[arg(long, value_name = "NAME", default_value = "paper")]
+    scene: String,
+    /// Write the records here instead of to the standard output
+    #[arg(short, long, value_name = "FILE")]
+    output: Option<PathBuf>,
+    /// Draw the first control point's displacement and force in the terminal
+    #[arg(long)]
+    plot: bool,
+    /// No progress bar
+    #[arg(short, long)]
+    quiet: bool,
+}
+
+/// The session is deleted also when the replay fails.
+struct Session {
+    client: SessionServiceClient<Channel>,
+    id: String,
+}
+
+pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
+    let endpoint = Endpoint::from_shared(arguments.server.clone())
+        .map_err(|e| Failure::Refused(format!("--server {}: {e}", arguments.server)))?
+        .connect_timeout(Duration::from_secs(10));
+    let source = source(&arguments.scene)?;
+    let channel = endpoint.connect().await.map_err(|e| {
+        let cause = std::error::Error::source(&e).map_or_else(|| e.to_string(), ToString::to_string);
+        Failure::Failed(format!("can't reach {}: {cause}", arguments.server))
+    })?;
+    let mut client = SessionServiceClient::new(channel.clone());
+    let request = pb::CreateSessionRequest { source: Some(source), paused: true };
+    let created = client.create_session(request).await.map_err(refused_or_failed)?.into_inner().session;
+    let created = created.ok_or_else(|| Failure::Failed("the server made no session".into()))?;
+    let mut session = Session { client, id: created.session_id.clone() };
+    let sessions = session.client.clone();
+    let ended = tokio::select! {
+        ended = play(arguments, &created, sessions, channel) => ended,
+        _ = tokio::signal::ctrl_c() => Err(Failure::Failed("interrupted".into())),
+    };
+    // A server that has gone has no sessions any more.
+    let _ = session.client.delete_session(pb::DeleteSessionRequest { session_id: session.id }).await;
+    ended
+}
+
+fn source(scene: &str) -> Result<Source, Failure> {
+    if !Path::new(scene).extension().is_some_and(|extension| extension == "toml") {
+        return Ok(Source::SceneName(scene.to_owned()));
+    }
+    let scene = Scene::load(Path::new(scene), &[], &Limits::default()).map_err(refused)?;
+    Ok(Source::Scene(wire::scene::scene(&scene)))
+}
+
+fn refused(refusal: Refusal) -> Failure {
+    Failure::Refused(refusal.to_string())
+}
+
+fn failed(status: Status) -> Failure {
+    Failure::Failed(format!("the server ended the replay: {}", describe(&status)))
+}
+
+fn refused_or_failed(status: Status) -> Failure {
+    match status.code() {
+        tonic::Code::InvalidArgument | tonic::Code::NotFound => Failure::Refused(describe(&status)),
+        _ => Failure::Failed(describe(&status)),
+    }
+}
+
+/// What a replay has seen.
+struct Seen {
+    round_trip_ns: Histogram<u64>,
+    hold_ns: Histogram<u64>,
+    overruns: u64,
+    late: u64,
+    rejected: u64,
+    largest_displacement_m: f64,
+    peak_reaction_n: f64,
+    /// Step and server time of the first sample and of the last.
+    first: Option<(u64, u64)>,
+    last: (u64, u64),
+    /// Time, displacement and reaction of the first control point, signed by their largest component.
+    displacement: Vec<(f32, f32)>,
+    reaction: Vec<(f32, f32)>,
+}
+
+impl Seen {
+    fn new() -> Result<Self, Failure> {
+        let histogram = || Histogram::new(3).map_err(|e| Failure::Failed(e.to_string()));
+        Ok(Seen {
+            round_trip_ns: histogram()?,
+            hold_ns: histogram()?,
+            overruns: 0,
+            late: 0,
+            rejected: 0,
+            largest_displacement_m: 0.0,
+            peak_reaction_n: 0.0,
+            first: None,
+            last: (0, 0),
+            displacement: Vec::new(),
+            reaction: Vec::new(),
+        })
+    }
+
+    #[allow(clippy::cast_possible_truncation)]
+    fn sample(&mut self, sample: &pb::Sample) {
+        self.overruns = sample.overrun_count;
+        self.late = sample.late_commands;
+        self.last = (sample.step, sample.server_time_ns);
+        self.first.get_or_insert(self.last);
+        for (index, tool) in sample.tools.iter().enumerate() {
+            let displacement_m = wire::from_vector(tool.displacement_m.as_ref());
+            let reaction_n = wire::from_vector(tool.force_on_tool_n.as_ref());
+            self.largest_displacement_m = self.largest_displacement_m.max(displacement_m.length());
+            self.peak_reaction_n = self.peak_reaction_n.max(reaction_n.length());
+            if index == 0 && tool.point.is_some() {
+                // The vertical part: what the paper's figures show.
+                self.displacement.push((sample.simulation_time_s as f32, displacement_m.z as f32));
+                self.reaction.push((sample.simulation_time_s as f32, reaction_n.z as f32));
+            }
+        }
+    }
+
+    fn record(&mut self, record: &Record) {
+        for point in &record.points {
+            let displacement_m = point.displacement_m.iter().map(|v| v * v).sum::<f64>().sqrt();
+            self.largest_displacement_m = self.largest_displacement_m.max(displacement_m);
+        }
+    }
+
+    #[allow(clippy::cast_precision_loss)]
+    fn dilation(&self, rate_hz: f64) -> f64 {
+        let (first, last) = (self.first.unwrap_or(self.last), self.last);
+        let real_s = last.1.saturating_sub(first.1) as f64 * 1e-9;
+        if real_s > 0.0 { (last.0 - first.0) as f64 / rate_hz / real_s } else { 1.0 }
+    }
+}
+
+#[allow(clippy::cast_precision_loss)]
+fn percentiles_us(histogram: &Histogram<u64>) -> Percentiles {
+    let us = |ns: u64| ns as f64 / 1e3;
+    Percentiles {
+        p50: us(histogram.value_at_quantile(0.5)),
+        p99: us(histogram.value_at_quantile(0.99)),
+        max: us(histogram.max()),
+    }
+}
+
+/// The script's side of the haptic stream.
+struct Streamer<'s> {
+    script: &'s Script,
+    outbound: mpsc::Sender<pb::TouchRequest>,
+    clock: Instant,
+    next_step: u64,
+}
+
+impl Streamer<'_> {
+    async fn say(&self, message: Say) -> Result<(), Failure> {
+        let sent = self.outbound.send(pb::TouchRequest { message: Some(message) }).await;
+        sent.map_err(|_| Failure::Failed("the server closed the haptic stream".into()))
+    }
+
+    #[allow(clippy::cast_possible_truncation)]
+    fn now_ns(&self) -> u64 {
+        self.clock.elapsed().as_nanos() as u64
+    }
+
+    /// Sends the commands of all steps before `step`.
+    async fn send_before(&mut self, step: u64) -> Result<(), Failure> {
+        while self.next_step < step.min(self.script.steps) {
+            for (tool, action) in self.script.actions_at(self.next_step) {
+                let command = wire::command::scripted(tool, self.next_step, &action, self.now_ns());
+                self.say(Say::Command(command)).await?;
+            }
+            self.next_step += 1;
+        }
+        Ok(())
+    }
+
+    async fn heartbeat(&self) -> Result<(), Failure> {
+        self.say(Say::Renew(pb::Renew { client_time_ns: self.now_ns() })).await
+    }
+}
+
+async fn next<T>(stream: &mut Streaming<T>) -> Result<T, Failure> {
+    match tokio::time::timeout(SILENCE, stream.message()).await {
+        Ok(Ok(Some(message))) => Ok(message),
+        Ok(Ok(None)) => Err(Failure::Failed("the server ended the replay".into())),
+        Ok(Err(status)) => Err(failed(status)),
+        Err(_) => Err(Failure::Failed(format!("the server was silent for {} s", SILENCE.as_secs()))),
+    }
+}
+
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+async fn play(
+    arguments: &Arguments,
+    created: &pb::Session,
+    mut sessions: SessionServiceClient<Channel>,
+    channel: Channel,
+) -> Result<(), Failure> {
+    let session_id = &created.session_id;
+    let scene = created.scene.as_ref().ok_or_else(|| Failure::Failed("the server sent no scene".into()))?;
+    let scene = wire::scene::from_scene(scene).map_err(refused)?;
+    let limits = Limits::default();
+    let script = Script::load(&arguments.script, &scene, &limits).map_err(refused)?;
+    for warning in &script.warnings {
+        eprintln!("palpate-client: warning: {warning}");
+    }
+    let mut output: Box<dyn Write> = match &arguments.output {
+        Some(path) => Box::new(BufWriter::new(
+            std::fs::File::create(path)
+                .map_err(|e| Failure::Refused(format!("{}: can't be written: {e}", path.display())))?,
+        )),
+        None => Box::new(BufWriter::new(std::io::stdout())),
+    };
+    let written = |e: std::io::Error| Failure::Failed(format!("can't write the output: {e}"));
+    let run = Run {
+        scene: scene.name.clone(),
+        script: script.name.clone(),
+        integrator: created.integrator.clone(),
+        substeps: created.substeps,
+        precision: created.precision.clone(),
+        rate_hz: scene.stepping.rate_hz,
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+    };
+    write_line(&mut output, &Line::Run(&run)).map_err(written)?;
+
+    let mut haptics = HapticServiceClient::new(channel);
+    let probe = pb::ProbeRequest {
+        session_id: session_id.clone(),
+        r#where: Some(pb::probe_request::Where::Points(pb::GridPoints {
+            points: script.sample_points.iter().copied().map(wire::point).collect(),
+        })),
+        every_steps: Some(script.sample_every.try_into().unwrap_or(u32::MAX)),
+        energy: true,
+    };
+    let probe = if script.sample_points.len() == scene.sheet.points[0] * scene.sheet.points[1] {
+        pb::ProbeRequest { r#where: Some(pb::probe_request::Where::AllPoints(true)), ..probe }
+    } else {
+        probe
+    };
+    let mut records = haptics.probe(probe).await.map_err(refused_or_failed)?.into_inner();
+
+    let (outbound, messages) = mpsc::channel(1024);
+    let mut streamer = Streamer { script: &script, outbound, clock: Instant::now(), next_step: 0 };
+    let open = pb::TouchOpen {
+        session_id: session_id.clone(),
+        tools: (0..script.tools() as u32).collect(),
+        sample_every_steps: None,
+        lease_s: Some(SILENCE.as_secs_f64()),
+        holder: "palpate-client replay".to_owned(),
+    };
+    streamer.say(Say::Open(open)).await?;
+    let mut touch = haptics.touch(ReceiverStream::new(messages)).await.map_err(refused_or_failed)?.into_inner();
+
+    let ahead = ((AHEAD_S * scene.stepping.rate_hz) as u64).min(COMMANDS_AHEAD / (script.tools() as u64).max(1)).max(1);
+    let mut seen = Seen::new()?;
+    streamer.send_before(ahead).await?;
+    // Answered in order: what has been sent so far is in the queue before the first step.
+    streamer.heartbeat().await?;
+    loop {
+        match next(&mut touch).await?.message {
+            Some(Heard::Renewed(_)) => break,
+            Some(Heard::Rejection(rejection)) => return Err(rejected(&rejection)),
+            _ => {}
+        }
+    }
+    let mut hasher = sessions.clone();
+    let asked = pb::GetStateHashRequest { session_id: session_id.clone(), at_step: Some(script.steps) };
+    let mut hash = tokio::spawn(async move { hasher.get_state_hash(asked).await });
+    let start = pb::StartSessionRequest { session_id: session_id.clone(), until_step: Some(script.steps) };
+    let started = Instant::now();
+    sessions.start_session(start).await.map_err(refused_or_failed)?;
+
+    let progress = progress_bar(script.steps, arguments.quiet);
+    let mut heartbeat = tokio::time::interval(HEARTBEAT);
+    heartbeat.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
+    let mut record = Record::default();
+    let mut records_left = script.steps / script.sample_every + 1;
+    let mut final_hash = None;
+    let mut wall_s = 0.0;
+    while records_left > 0 || final_hash.is_none() || seen.last.0 < script.steps {
+        tokio::select! {
+            message = next(&mut touch), if seen.last.0 < script.steps => match message?.message {
+                Some(Heard::Sample(sample)) => {
+                    if sample.held {
+                        let asked = pb::GetSessionRequest { session_id: session_id.clone() };
+                        let session = sessions.get_session(asked).await.map_err(failed)?.into_inner().session;
+                        let reason = session.map(|session| session.hold_reason).unwrap_or_default();
+                        return Err(Failure::Failed(format!("the run was stopped: {reason}")));
+                    }
+                    seen.sample(&sample);
+                    wall_s = started.elapsed().as_secs_f64();
+                    progress.set_position(sample.step);
+                    streamer.send_before(sample.step + ahead).await?;
+                }
+                Some(Heard::Renewed(renewed)) => {
+                    let round_trip_ns = streamer.now_ns().saturating_sub(renewed.client_time_ns);
+                    let _ = seen.round_trip_ns.record(round_trip_ns);
+                    let _ = seen.hold_ns.record(renewed.server_hold_ns);
+                }
+                Some(Heard::Rejection(rejection)) => {
+                    seen.rejected += 1;
+                    progress.suspend(|| eprintln!("palpate-client: warning: {}", rejection_text(&rejection)));
+                }
+                Some(Heard::Opened(_)) | None => {}
+            },
+            message = next(&mut records), if records_left > 0 => {
+                let message = message?;
+                if message.dropped_records > 0 {
+                    return Err(Failure::Failed("records were lost: this client is too slow for them".into()));
+                }
+                if wire::sample::add_to_record(&mut record, &message) {
+                    let record = std::mem::take(&mut record);
+                    seen.record(&record);
+                    write_line(&mut output, &record).map_err(written)?;
+                    records_left -= 1;
+                }
+            },
+            answer = &mut hash, if final_hash.is_none() => {
+                let answer = answer.map_err(|e| Failure::Failed(e.to_string()))?.map_err(failed)?;
+                final_hash = Some(answer.into_inner().state_hash);
+            }
+            _ = heartbeat.tick(), if seen.last.0 < script.steps => streamer.heartbeat().await?,
+        }
+    }
+    progress.finish_and_clear();
+
+    let points = scene.sheet.points[0] * scene.sheet.points[1];
+    let substeps = script.steps * u64::from(created.substeps);
+    let network = Network {
+        late_commands: seen.late,
+        rejected_commands: seen.rejected,
+        overruns: seen.overruns,
+        time_dilation: seen.dilation(scene.stepping.rate_hz),
+        round_trip_us: percentiles_us(&seen.round_trip_ns),
+        server_hold_us: percentiles_us(&seen.hold_ns),
+    };
+    let summary = Summary {
+        steps: script.steps,
+        substeps,
+        points,
+        wall_s,
+        ns_per_point_substep: wall_s * 1e9 / (substeps as f64 * points as f64),
+        computed_fraction: 1.0,
+        guard_events: 0,
+        final_hash: final_hash.unwrap_or_default(),
+        network: Some(network.clone()),
+    };
+    write_line(&mut output, &Line::Summary(&summary)).map_err(written)?;
+    output.flush().map_err(written)?;
+    if arguments.plot {
+        plot::draw("Displacement of the control point along z, m", &seen.displacement);
+        plot::draw("Force of the tissue on the tool along z, N", &seen.reaction);
+    }
+    table(arguments, &summary, &network, &seen);
+    if seen.rejected > 0 {
+        return Err(Failure::Failed(format!("{} commands were rejected: this was not the script", seen.rejected)));
+    }
+    Ok(())
+}
+
+fn rejection_text(rejection: &pb::Rejection) -> String {
+    format!("tool {}, command {}: {} ({})", rejection.tool, rejection.sequence, rejection.message, rejection.reason)
+}
+
+fn rejected(rejection: &pb::Rejection) -> Failure {
+    Failure::Refused(rejection_text(rejection))
+}
+
+fn progress_bar(steps: u64, quiet: bool) -> ProgressBar {
+    if quiet || !std::io::stderr().is_terminal() {
+        return ProgressBar::hidden();
+    }
+    let style = ProgressStyle::with_template("{elapsed_precise} [{wide_bar}] step {pos} of {len}");
+    ProgressBar::new(steps).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
+}
+
+/// What people want to know, where the records do not go.
+fn table(arguments: &Arguments, summary: &Summary, network: &Network, seen: &Seen) {
+    let percentiles = |p: &Percentiles| format!("{:.0} / {:.0} / {:.0} µs", p.p50, p.p99, p.max);
+    let rows = [
+        ("steps", format!("{} in {:.2} s", summary.steps, summary.wall_s)),
+        ("overruns", format!("{} (time dilation {:.5})", network.overruns, network.time_dilation)),
+        ("late commands", network.late_commands.to_string()),
+        ("largest displacement", format!("{:.6} m", seen.largest_displacement_m)),
+        ("peak reaction", format!("{:.6} N", seen.peak_reaction_n)),
+        ("round trip p50 / p99 / max", percentiles(&network.round_trip_us)),
+        ("final hash", summary.final_hash.clone()),
+    ];
+    for (name, value) in rows {
+        if arguments.output.is_some() {
+            println!("{name:<28}{value}");
+        } else {
+            eprintln!("{name:<28}{value}");
+        }
+    }
+}

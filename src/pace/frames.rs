@@ -1,0 +1,184 @@
+//! Frames, off the stepping threads: a thread that refines and encodes the newest snapshot of each session, once
+//! for all viewers that ask for the same, and hands it to those that have credit.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
+
+use super::queue::{Reader, Writer, lock, queue};
+use crate::surface::{Encoding, Frame, Refinement, Snapshot, encode};
+
+/// One who looks at a session.
+#[derive(Debug)]
+pub struct Viewer {
+    /// Random, not to be guessed.
+    pub id: String,
+    /// How far refined.
+    pub refinement: Refinement,
+    /// How written.
+    pub encoding: Encoding,
+    /// Frames a second of simulated time.
+    pub rate_hz: f64,
+    /// Frames sent and not yet acknowledged, if acknowledgements are asked for.
+    credit: Option<Mutex<Credit>>,
+    writer: Writer<Delivery>,
+}
+
+#[derive(Debug)]
+struct Credit {
+    most: usize,
+    in_flight: VecDeque<u64>,
+}
+
+/// A frame on its way to one viewer.
+#[derive(Debug, Clone)]
+pub struct Delivery {
+    /// Counts the frames that were due to the viewer.
+    pub frame_id: u64,
+    /// Shared with others.
+    pub frame: Arc<Frame>,
+    /// Steps dropped by the session so far.
+    pub overrun_count: u64,
+    /// Of the last second or so.
+    pub time_dilation: f64,
+}
+
+impl Viewer {
+    /// A viewer, and where it reads its frames.
+    pub fn new(
+        id: String,
+        refinement: Refinement,
+        encoding: Encoding,
+        rate_hz: f64,
+        max_in_flight: Option<u32>,
+    ) -> (Arc<Self>, Reader<Delivery>) {
+        let most = max_in_flight.map(|most| most as usize);
+        // Without credit only the newest frame waits.
+        let (writer, reader) = queue(most.unwrap_or(1));
+        let credit = most.map(|most| Mutex::new(Credit { most, in_flight: VecDeque::with_capacity(most) }));
+        (Arc::new(Viewer { id, refinement, encoding, rate_hz, credit, writer }), reader)
+    }
+
+    /// The number of the frame that belongs to step `step` of a session that steps at `rate_hz`.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+    pub fn frame_id(&self, step: u64, rate_hz: f64) -> u64 {
+        // A little more, so that 60 Hz of 1 kHz is not late by a rounding error.
+        ((step as f64 + 1e-6) * self.rate_hz / rate_hz) as u64
+    }
+
+    /// Frames up to this one are done with.
+    pub fn acknowledge(&self, frame_id: u64) {
+        if let Some(credit) = &self.credit {
+            lock(credit).in_flight.retain(|id| *id > frame_id);
+        }
+    }
+
+    fn has_credit(&self) -> bool {
+        self.credit.as_ref().is_none_or(|credit| {
+            let credit = lock(credit);
+            credit.in_flight.len() < credit.most
+        })
+    }
+
+    fn deliver(&self, delivery: Delivery) {
+        if let Some(credit) = &self.credit {
+            lock(credit).in_flight.push_back(delivery.frame_id);
+        }
+        self.writer.push(delivery);
+    }
+
+    /// The stream has gone.
+    pub fn is_gone(&self) -> bool {
+        self.writer.is_abandoned()
+    }
+
+    /// Ends the stream.
+    pub fn close(&self, why: crate::refusal::Refusal) {
+        self.writer.close(why);
+    }
+}
+
+/// What is to be encoded of one session: only the newest, for everybody who waits.
+#[derive(Debug)]
+pub struct Job {
+    /// The displacements.
+    pub snapshot: Snapshot,
+    /// To whom, as which frame.
+    pub viewers: Vec<(Arc<Viewer>, u64)>,
+    /// Of the session.
+    pub overrun_count: u64,
+    /// Of the session.
+    pub time_dilation: f64,
+}
+
+#[derive(Debug, Default)]
+struct Board {
+    jobs: BTreeMap<u64, Job>,
+    stop: bool,
+}
+
+/// The thread that encodes.
+#[derive(Debug, Default)]
+pub struct Encoder {
+    board: Mutex<Board>,
+    posted: Condvar,
+}
+
+impl Encoder {
+    /// Replaces what waits for session `number`. Never blocks for long.
+    pub fn post(&self, number: u64, mut job: Job) {
+        let mut board = lock(&self.board);
+        if let Some(older) = board.jobs.remove(&number) {
+            let waiting = |viewer: &Arc<Viewer>| job.viewers.iter().any(|(other, _)| Arc::ptr_eq(other, viewer));
+            let missing: Vec<_> = older.viewers.into_iter().filter(|(viewer, _)| !waiting(viewer)).collect();
+            job.viewers.extend(missing);
+        }
+        board.jobs.insert(number, job);
+        drop(board);
+        self.posted.notify_one();
+    }
+
+    /// Ends the thread.
+    pub fn stop(&self) {
+        lock(&self.board).stop = true;
+        self.posted.notify_one();
+    }
+
+    /// The thread's work.
+    pub fn work(&self) {
+        loop {
+            let mut board = lock(&self.board);
+            let job = loop {
+                if board.stop {
+                    return;
+                }
+                if let Some((_, job)) = board.jobs.pop_first() {
+                    break job;
+                }
+                board = self.posted.wait(board).unwrap_or_else(PoisonError::into_inner);
+            };
+            drop(board);
+            serve(&job);
+        }
+    }
+}
+
+fn serve(job: &Job) {
+    let mut encoded: Vec<Arc<Frame>> = Vec::new();
+    for (viewer, frame_id) in &job.viewers {
+        if viewer.is_gone() || !viewer.has_credit() {
+            continue;
+        }
+        let same = |frame: &&Arc<Frame>| frame.refinement == viewer.refinement && frame.encoding == viewer.encoding;
+        let frame = encoded.iter().find(same).cloned().unwrap_or_else(|| {
+            let frame = Arc::new(encode(&job.snapshot, viewer.refinement, viewer.encoding));
+            encoded.push(frame.clone());
+            frame
+        });
+        viewer.deliver(Delivery {
+            frame_id: *frame_id,
+            frame,
+            overrun_count: job.overrun_count,
+            time_dilation: job.time_dilation,
+        });
+    }
+}

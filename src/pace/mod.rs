@@ -1,0 +1,325 @@
+//! Sessions in real time: the only room with a clock. Stepping threads own the sessions; what servers call here
+//! posts a request to one, or goes through the session's intake, and never waits for a step.
+
+pub mod clock;
+pub mod frames;
+pub mod queue;
+mod thread;
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+
+use tokio::sync::oneshot;
+
+use crate::limits::Limits;
+use crate::refusal::{Reason, Refusal, Result, number};
+use crate::scene::Scene;
+use crate::scene::record::Record;
+use crate::session::Sample;
+use crate::session::command::Intake;
+use crate::sheet::Model;
+use clock::now_ns;
+use frames::{Delivery, Encoder, Viewer};
+use queue::{Reader, lock, queue};
+use thread::{Inbox, ProbeTap, Request, Running, SampleTap};
+
+/// A sample, and how the session keeps time.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PacedSample {
+    /// What the tools felt.
+    pub sample: Sample,
+    /// Steps dropped so far.
+    pub overrun_count: u64,
+    /// Of the last second or so.
+    pub time_dilation: f64,
+    /// Steps were dropped just before this one.
+    pub overrun: bool,
+}
+
+/// A record, and its step.
+#[derive(Debug, Clone)]
+pub struct PacedRecord {
+    /// Steps done.
+    pub step: u64,
+    /// What was measured.
+    pub record: Record,
+}
+
+/// Whether a session's time goes on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum State {
+    /// In real time.
+    Running,
+    /// Waits to be started.
+    Paused,
+    /// Ended by the guard.
+    Held,
+}
+
+/// How a session stands.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Status {
+    /// Whether time goes on.
+    pub state: State,
+    /// Steps done.
+    pub step: u64,
+    /// Steps dropped.
+    pub overrun_count: u64,
+    /// Of the last second or so.
+    pub time_dilation: f64,
+    /// Commands that came too late for their step.
+    pub late_commands: u64,
+    /// Why it is held.
+    pub hold_reason: Option<String>,
+}
+
+/// A session as the server sees it.
+pub struct Live {
+    /// Random, not to be guessed.
+    pub id: String,
+    /// What of the tissue never changes.
+    pub model: Arc<Model>,
+    /// Where commands come in.
+    pub intake: Mutex<Intake>,
+    number: u64,
+    limits: Limits,
+    status: Mutex<Status>,
+    streams: Mutex<usize>,
+    inbox: Arc<Inbox>,
+}
+
+/// Counts a stream of a session until it is dropped.
+pub struct StreamGuard(Arc<Live>);
+
+impl Drop for StreamGuard {
+    fn drop(&mut self) {
+        *lock(&self.0.streams) -= 1;
+    }
+}
+
+impl Live {
+    /// How the session stands.
+    pub fn status(&self) -> Status {
+        lock(&self.status).clone()
+    }
+
+    /// Room for one more stream.
+    pub fn open_stream(self: &Arc<Self>) -> Result<StreamGuard> {
+        let mut streams = lock(&self.streams);
+        if *streams >= self.limits.streams_per_session {
+            let message = format!("the session has {streams} streams already");
+            return Err(Refusal::new(Reason::TooMany, "", message));
+        }
+        *streams += 1;
+        Ok(StreamGuard(self.clone()))
+    }
+
+    async fn ask<T>(&self, request: impl FnOnce(oneshot::Sender<Result<T>>) -> Request) -> Result<T> {
+        let (reply, answer) = oneshot::channel();
+        self.inbox.send(self.number, request(reply));
+        answer.await.unwrap_or_else(|_| Err(deleted()))
+    }
+
+    /// Lets time go on, for ever or until so many steps are done; tells the step that comes next.
+    pub async fn start(&self, until: Option<u64>) -> Result<u64> {
+        self.ask(|reply| Request::Start { until, reply }).await
+    }
+
+    /// Stops time at the next step boundary.
+    pub fn pause(&self) {
+        self.inbox.send(self.number, Request::Pause);
+    }
+
+    /// Waits until `at` steps are done (now, if `None`), and tells the step and the state's hash there.
+    pub async fn hash_at(&self, at: Option<u64>) -> Result<(u64, u128)> {
+        self.ask(|reply| Request::Hash { at, reply }).await
+    }
+
+    /// Samples every so many steps, of some tools or of all in use.
+    pub fn samples(&self, every: u64, only: Option<Vec<u32>>) -> Reader<PacedSample> {
+        self.tap(every, only, false)
+    }
+
+    /// The next sample; the present one if time stands.
+    pub async fn next_sample(&self, only: Vec<u32>) -> Result<PacedSample> {
+        Ok(self.tap(1, Some(only), true).pop().await?.0)
+    }
+
+    fn tap(&self, every: u64, only: Option<Vec<u32>>, once: bool) -> Reader<PacedSample> {
+        let (writer, reader) = queue(if once { 1 } else { self.limits.queued_samples });
+        self.inbox.send(self.number, Request::Samples(SampleTap { every, only, once, writer }));
+        reader
+    }
+
+    /// Records of some points, every so many steps.
+    pub fn probe(&self, every: u64, points: Vec<[usize; 2]>, energy: bool) -> Reader<PacedRecord> {
+        let (writer, reader) = queue(self.limits.queued_records);
+        self.inbox.send(self.number, Request::Probe(ProbeTap { every, points, energy, writer }));
+        reader
+    }
+
+    /// Frames for a viewer.
+    pub fn view(&self, viewer: Arc<Viewer>) {
+        self.inbox.send(self.number, Request::View(viewer));
+    }
+}
+
+fn deleted() -> Refusal {
+    Refusal::new(Reason::SessionDeleted, "session_id", "the session has been deleted")
+}
+
+/// All sessions of a server, and the threads that step them.
+pub struct Pacer {
+    limits: Limits,
+    inboxes: Vec<Arc<Inbox>>,
+    encoder: Arc<Encoder>,
+    threads: Mutex<Vec<JoinHandle<()>>>,
+    sessions: Mutex<BTreeMap<String, Arc<Live>>>,
+    viewers: Mutex<BTreeMap<String, std::sync::Weak<Viewer>>>,
+    numbers: Mutex<u64>,
+}
+
+/// 128 random bits, in hexadecimal.
+pub fn random_id() -> Result<String> {
+    Ok(format!("{:032x}", random_bits()?))
+}
+
+/// 128 random bits.
+pub fn random_bits() -> Result<u128> {
+    let mut bytes = [0; 16];
+    getrandom::fill(&mut bytes)
+        .map_err(|e| Refusal::new(Reason::TooMany, "", format!("the system has no random numbers: {e}")))?;
+    Ok(u128::from_le_bytes(bytes))
+}
+
+impl Pacer {
+    /// Starts `threads` stepping threads, and one that encodes frames.
+    pub fn start(threads: usize, limits: &Limits) -> std::io::Result<Arc<Self>> {
+        let encoder = Arc::new(Encoder::default());
+        let mut handles = Vec::new();
+        let mut inboxes = Vec::new();
+        for index in 0..threads.max(1) {
+            let inbox = Arc::new(Inbox::default());
+            inboxes.push(inbox.clone());
+            let encoder = encoder.clone();
+            let builder = std::thread::Builder::new().name(format!("step-{index}"));
+            handles.push(builder.spawn(move || thread::work(&inbox, &encoder))?);
+        }
+        let worker = encoder.clone();
+        handles.push(std::thread::Builder::new().name("frames".into()).spawn(move || worker.work())?);
+        Ok(Arc::new(Pacer {
+            limits: limits.clone(),
+            inboxes,
+            encoder,
+            threads: Mutex::new(handles),
+            sessions: Mutex::new(BTreeMap::new()),
+            viewers: Mutex::new(BTreeMap::new()),
+            numbers: Mutex::new(0),
+        }))
+    }
+
+    /// Makes a session.
+    pub fn create(&self, scene: &Scene, paused: bool) -> Result<Arc<Live>> {
+        let most_hz = self.limits.session_rate_hz;
+        number("stepping.rate_hz", scene.stepping.rate_hz, &format!("at most {most_hz}"), |v| v <= most_hz)?;
+        let model = Model::compile(scene, &self.limits)?;
+        let id = random_id()?;
+        let mut sessions = lock(&self.sessions);
+        if sessions.len() >= self.limits.sessions {
+            let message = format!("the server has {} sessions already", sessions.len());
+            return Err(Refusal::new(Reason::TooMany, "", message));
+        }
+        let number = {
+            let mut numbers = lock(&self.numbers);
+            *numbers += 1;
+            *numbers
+        };
+        #[allow(clippy::cast_possible_truncation)]
+        let inbox = self.inboxes[number as usize % self.inboxes.len()].clone();
+        let status = Status {
+            state: if paused { State::Paused } else { State::Running },
+            step: 0,
+            overrun_count: 0,
+            time_dilation: 1.0,
+            late_commands: 0,
+            hold_reason: None,
+        };
+        let live = Arc::new(Live {
+            id: id.clone(),
+            intake: Mutex::new(Intake::new(&model.scene, &self.limits)),
+            model,
+            number,
+            limits: self.limits.clone(),
+            status: Mutex::new(status),
+            streams: Mutex::new(0),
+            inbox: inbox.clone(),
+        });
+        sessions.insert(id, live.clone());
+        drop(sessions);
+        inbox.send(number, Request::Adopt(Box::new(Running::new(live.clone(), !paused))));
+        Ok(live)
+    }
+
+    /// The session of that id.
+    pub fn get(&self, id: &str) -> Result<Arc<Live>> {
+        lock(&self.sessions).get(id).cloned().ok_or_else(|| unknown_session(id))
+    }
+
+    /// All sessions, oldest first.
+    pub fn list(&self) -> Vec<Arc<Live>> {
+        let mut all: Vec<_> = lock(&self.sessions).values().cloned().collect();
+        all.sort_by_key(|live| live.number);
+        all
+    }
+
+    /// Ends a session and all its streams.
+    pub fn delete(&self, id: &str) -> Result<()> {
+        let live = lock(&self.sessions).remove(id).ok_or_else(|| unknown_session(id))?;
+        lock(&live.intake).close(deleted());
+        live.inbox.send(live.number, Request::Delete(deleted()));
+        Ok(())
+    }
+
+    /// Adds a viewer to a session.
+    pub fn add_viewer(&self, live: &Live, viewer: &Arc<Viewer>) {
+        let mut viewers = lock(&self.viewers);
+        viewers.retain(|_, viewer| viewer.strong_count() > 0);
+        viewers.insert(viewer.id.clone(), Arc::downgrade(viewer));
+        drop(viewers);
+        live.view(viewer.clone());
+    }
+
+    /// The viewer of that id.
+    pub fn viewer(&self, id: &str) -> Result<Arc<Viewer>> {
+        lock(&self.viewers)
+            .get(id)
+            .and_then(std::sync::Weak::upgrade)
+            .ok_or_else(|| Refusal::new(Reason::UnknownViewer, "viewer_id", format!("there is no viewer `{id}`")))
+    }
+
+    /// Ends all sessions and threads.
+    pub fn stop(&self) {
+        let why = Refusal::new(Reason::ShuttingDown, "", "the server is going down");
+        for live in lock(&self.sessions).values() {
+            lock(&live.intake).close(why.clone());
+        }
+        self.inboxes.iter().for_each(|inbox| inbox.stop(why.clone()));
+        self.encoder.stop();
+        for thread in lock(&self.threads).drain(..) {
+            let _ = thread.join();
+        }
+    }
+
+    /// The time by the server's clock.
+    pub fn now_ns(&self) -> u64 {
+        now_ns()
+    }
+}
+
+fn unknown_session(id: &str) -> Refusal {
+    Refusal::new(Reason::UnknownSession, "session_id", format!("there is no session `{id}`"))
+}
+
+/// Frames as a stream reads them.
+pub type FrameReader = Reader<Delivery>;

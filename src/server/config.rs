@@ -1,0 +1,81 @@
+//! The configuration of a server: a TOML file, then the command line over it.
+
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+
+use crate::limits::Limits;
+use crate::refusal::{Reason, Refusal, Result, positive};
+use crate::scene::document::read_text;
+
+/// Everything that can be configured. Absent keys keep these defaults.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Config {
+    /// Where to listen.
+    pub listen: SocketAddr,
+    /// Folder of the scenes that sessions can be made from by name.
+    pub scenes: PathBuf,
+    /// Stepping threads; one less than the machine has cores if 0.
+    pub threads: usize,
+    /// Threads of the network side.
+    pub network_threads: usize,
+    /// How long open streams may take to end at shutdown before they are cut, s.
+    pub shutdown_deadline_s: f64,
+    /// Lease of a tool if the client asks for none, s.
+    pub lease_s: f64,
+    /// What is logged: `info`, `debug`, `palpate=debug,tonic=warn`, …
+    pub log: String,
+    /// Upper bounds.
+    pub limits: Limits,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Config {
+            listen: SocketAddr::from(([127, 0, 0, 1], 7117)),
+            scenes: PathBuf::from("scenes"),
+            threads: 0,
+            network_threads: 2,
+            shutdown_deadline_s: 5.0,
+            lease_s: 2.0,
+            log: "info".to_owned(),
+            limits: Limits::default(),
+        }
+    }
+}
+
+impl Config {
+    /// Reads a configuration file.
+    pub fn load(path: &Path) -> Result<Self> {
+        let text = read_text(path, Limits::default().file_bytes)?;
+        let config: Config = toml::from_str(&text).map_err(|e| {
+            let line = e.span().map_or(0, |span| text[..span.start].lines().count().max(1));
+            let place = Some(format!("{}:{line}", path.display()));
+            Refusal { place, ..Refusal::new(Reason::Unreadable, "", e.message()) }
+        })?;
+        config.check().map_err(|refusal| Refusal { place: Some(path.display().to_string()), ..refusal })?;
+        Ok(config)
+    }
+
+    fn check(&self) -> Result<()> {
+        for (field, value) in [
+            ("shutdown_deadline_s", self.shutdown_deadline_s),
+            ("lease_s", self.lease_s),
+            ("limits.lease_s", self.limits.lease_s),
+            ("limits.point_force_n", self.limits.point_force_n),
+            ("limits.reach_in_sheets", self.limits.reach_in_sheets),
+            ("limits.session_rate_hz", self.limits.session_rate_hz),
+        ] {
+            positive(field, value)?;
+        }
+        Ok(())
+    }
+
+    /// Stepping threads, at least 1.
+    pub fn stepping_threads(&self) -> usize {
+        let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
+        if self.threads > 0 { self.threads } else { cores.saturating_sub(1).max(1) }
+    }
+}

@@ -1,0 +1,322 @@
+//! `HapticService`.
+
+use std::collections::{BTreeSet, VecDeque};
+use std::pin::Pin;
+use std::sync::Arc;
+
+use futures_util::stream::{self, Stream, StreamExt};
+use tokio::sync::oneshot;
+use tonic::{Request, Response, Status, Streaming};
+use tracing::{debug, info};
+
+use super::House;
+use crate::pace::clock::now_ns;
+use crate::pace::queue::{Reader, Writer, lock, queue};
+use crate::pace::{Live, PacedSample, StreamGuard, random_bits};
+use crate::refusal::{Reason, Refusal};
+use crate::session::command::LeaseId;
+use crate::wire::pb::haptic_service_server::HapticService;
+use crate::wire::{self, pb};
+
+#[derive(Clone)]
+pub(super) struct Haptics(pub(super) House);
+
+type Out<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
+
+/// What the output of a haptic stream begins with.
+struct Opened {
+    answer: pb::TouchOpened,
+    samples: Reader<PacedSample>,
+    guard: StreamGuard,
+}
+
+/// What a haptic stream is told besides samples.
+enum Event {
+    Rejected(pb::Rejection),
+    /// The client's time, and when it came.
+    Renewed(u64, u64),
+    /// The client has said all it wanted to say.
+    Finished,
+}
+
+/// The tools of a stream, given back when it ends however it ends.
+struct Hold {
+    live: Arc<Live>,
+    lease: LeaseId,
+    tools: usize,
+}
+
+impl Drop for Hold {
+    fn drop(&mut self) {
+        if self.tools > 0 {
+            // A lease that has lapsed already has nothing to give back.
+            let _ = lock(&self.live.intake).release(self.lease);
+        }
+    }
+}
+
+fn lease_id(text: &str) -> Result<LeaseId, Refusal> {
+    let wrong = |_| Refusal::new(Reason::NotHolder, "lease_id", "is none that this server gave");
+    LeaseId::from_str_radix(text, 16).map_err(wrong)
+}
+
+impl Haptics {
+    /// Answers the first message of a haptic stream.
+    fn open(&self, open: &pb::TouchOpen) -> Result<(Opened, Hold), Refusal> {
+        let live = self.0.pacer.get(&open.session_id)?;
+        let every = wire::every("sample_every_steps", open.sample_every_steps)?;
+        let guard = live.open_stream()?;
+        let lease_s = open.lease_s.unwrap_or(self.0.config.lease_s);
+        let lease = random_bits()?;
+        lock(&live.intake).acquire(&open.tools, &open.holder, lease_s, lease, now_ns())?;
+        let hold = Hold { live: live.clone(), lease, tools: open.tools.len() };
+        let only = (!open.tools.is_empty()).then(|| open.tools.clone());
+        let samples = live.samples(every, only);
+        let rate_hz = live.model.scene.stepping.rate_hz;
+        let answer = pb::TouchOpened { step: lock(&live.intake).next_step(), rate_hz, lease_s };
+        info!(session = %live.id, tools = ?open.tools, holder = %open.holder, "haptic stream opened");
+        Ok((Opened { answer, samples, guard }, hold))
+    }
+
+    /// Reads what the client says until it ends.
+    async fn listen(
+        self,
+        mut inbound: Streaming<pb::TouchRequest>,
+        opening: oneshot::Sender<Result<Opened, Refusal>>,
+        events: Writer<Event>,
+    ) {
+        use pb::touch_request::Message;
+        let first = match inbound.message().await {
+            Ok(Some(pb::TouchRequest { message: Some(Message::Open(open)) })) => self.open(&open),
+            Ok(_) => Err(Refusal::new(Reason::OutOfTurn, "open", "the first message must be `open`")),
+            Err(_) => return,
+        };
+        let hold = match first {
+            Ok((opened, hold)) => {
+                let _ = opening.send(Ok(opened));
+                hold
+            }
+            Err(refusal) => {
+                let _ = opening.send(Err(refusal));
+                return;
+            }
+        };
+        let live = &hold.live;
+        loop {
+            match inbound.message().await {
+                Ok(Some(pb::TouchRequest { message: Some(Message::Command(command)) })) => {
+                    let now = now_ns();
+                    let taken = wire::command::from_command(&command, &live.model.scene.sheet, now)
+                        .and_then(|command| lock(&live.intake).submit(hold.lease, vec![command], now));
+                    if let Err(refusal) = taken {
+                        debug!(session = %live.id, reason = refusal.reason.as_str(), %refusal, "command refused");
+                        events.push(Event::Rejected(wire::sample::rejection(command.tool, command.sequence, &refusal)));
+                    }
+                }
+                Ok(Some(pb::TouchRequest { message: Some(Message::Renew(renew)) })) => {
+                    let now = now_ns();
+                    if hold.tools > 0
+                        && let Err(refusal) = lock(&live.intake).renew(hold.lease, now)
+                    {
+                        events.push(Event::Rejected(wire::sample::rejection(0, 0, &refusal)));
+                    }
+                    events.push(Event::Renewed(renew.client_time_ns, now));
+                }
+                Ok(Some(_)) => {
+                    let refusal = Refusal::new(Reason::OutOfTurn, "message", "must be a command or `renew`");
+                    return events.close(refusal);
+                }
+                Ok(None) => return events.push(Event::Finished),
+                Err(status) => {
+                    debug!(session = %live.id, %status, "a client vanished");
+                    return;
+                }
+            }
+        }
+    }
+}
+
+/// What the output of a haptic stream reads from.
+struct Outlet {
+    events: Reader<Event>,
+    samples: Reader<PacedSample>,
+    _guard: StreamGuard,
+}
+
+impl Outlet {
+    async fn next(&mut self) -> Option<Result<pb::touch_response::Message, Status>> {
+        use pb::touch_response::Message;
+        Some(tokio::select! {
+            biased;
+            event = self.events.pop() => match event {
+                Ok((Event::Rejected(rejection), _)) => Ok(Message::Rejection(rejection)),
+                Ok((Event::Renewed(client_time_ns, arrival_ns), _)) => {
+                    let server_hold_ns = now_ns().saturating_sub(arrival_ns);
+                    Ok(Message::Renewed(pb::Renewed { client_time_ns, server_hold_ns }))
+                }
+                Ok((Event::Finished, _)) => return None,
+                Err(refusal) => Err(refusal.into()),
+            },
+            sample = self.samples.pop() => match sample {
+                Ok((sample, dropped)) => Ok(Message::Sample(wire::sample::sample(&sample, dropped, now_ns()))),
+                Err(refusal) => Err(refusal.into()),
+            },
+        })
+    }
+}
+
+/// The output of a haptic stream: first the answer to `open`, then samples and rejections.
+enum Output {
+    Opening(oneshot::Receiver<Result<Opened, Refusal>>, Reader<Event>),
+    Open(Outlet),
+}
+
+impl Output {
+    async fn next(self) -> Option<(Result<pb::TouchResponse, Status>, Option<Output>)> {
+        use pb::touch_response::Message;
+        let (message, outlet) = match self {
+            Output::Opening(opening, events) => match opening.await {
+                Ok(Ok(Opened { answer, samples, guard })) => {
+                    (Ok(Message::Opened(answer)), Some(Outlet { events, samples, _guard: guard }))
+                }
+                Ok(Err(refusal)) => (Err(refusal.into()), None),
+                // The client vanished before it said anything.
+                Err(_) => return None,
+            },
+            Output::Open(mut outlet) => match outlet.next().await? {
+                Ok(message) => (Ok(message), Some(outlet)),
+                Err(status) => (Err(status), None),
+            },
+        };
+        Some((message.map(|message| pb::TouchResponse { message: Some(message) }), outlet.map(Output::Open)))
+    }
+}
+
+#[tonic::async_trait]
+impl HapticService for Haptics {
+    type TouchStream = Out<pb::TouchResponse>;
+    type WatchSamplesStream = Out<pb::WatchSamplesResponse>;
+    type ProbeStream = Out<pb::ProbeResponse>;
+
+    async fn touch(
+        &self,
+        request: Request<Streaming<pb::TouchRequest>>,
+    ) -> Result<Response<Self::TouchStream>, Status> {
+        let (writer, events) = queue(self.0.config.limits.queued_samples);
+        // The client may wait for our headers before it opens, so its first message is not waited for here.
+        let (opened, opening) = oneshot::channel();
+        tokio::spawn(self.clone().listen(request.into_inner(), opened, writer));
+        let output = Some(Output::Opening(opening, events));
+        let out = stream::unfold(output, |output| async move { output?.next().await });
+        Ok(Response::new(Box::pin(out)))
+    }
+
+    async fn acquire_tool(
+        &self,
+        request: Request<pb::AcquireToolRequest>,
+    ) -> Result<Response<pb::AcquireToolResponse>, Status> {
+        let request = request.into_inner();
+        let live = self.0.pacer.get(&request.session_id)?;
+        let lease_s = request.lease_s.unwrap_or(self.0.config.lease_s);
+        let lease = random_bits()?;
+        lock(&live.intake).acquire(&[request.tool], &request.holder, lease_s, lease, now_ns())?;
+        info!(session = %live.id, tool = request.tool, holder = %request.holder, "tool acquired");
+        Ok(Response::new(pb::AcquireToolResponse { lease_id: format!("{lease:032x}"), lease_s }))
+    }
+
+    async fn release_tool(
+        &self,
+        request: Request<pb::ReleaseToolRequest>,
+    ) -> Result<Response<pb::ReleaseToolResponse>, Status> {
+        let request = request.into_inner();
+        let live = self.0.pacer.get(&request.session_id)?;
+        lock(&live.intake).release(lease_id(&request.lease_id)?)?;
+        Ok(Response::new(pb::ReleaseToolResponse {}))
+    }
+
+    async fn send_commands(
+        &self,
+        request: Request<pb::SendCommandsRequest>,
+    ) -> Result<Response<pb::SendCommandsResponse>, Status> {
+        let now = now_ns();
+        let request = request.into_inner();
+        let live = self.0.pacer.get(&request.session_id)?;
+        let lease = lease_id(&request.lease_id)?;
+        let sheet = &live.model.scene.sheet;
+        let mut commands = Vec::with_capacity(request.commands.len());
+        for (index, command) in request.commands.iter().enumerate() {
+            let command = wire::command::from_command(command, sheet, now);
+            commands.push(command.map_err(|refusal| refusal.within(&format!("commands[{index}]")))?);
+        }
+        let tools = {
+            let mut intake = lock(&live.intake);
+            intake.submit(lease, commands, now)?;
+            intake.tools_of(lease).collect::<BTreeSet<u32>>()
+        };
+        let sample = live.next_sample(tools.into_iter().collect()).await?;
+        let sample = Some(wire::sample::sample(&sample, 0, now_ns()));
+        Ok(Response::new(pb::SendCommandsResponse { sample }))
+    }
+
+    async fn watch_samples(
+        &self,
+        request: Request<pb::WatchSamplesRequest>,
+    ) -> Result<Response<Self::WatchSamplesStream>, Status> {
+        let request = request.into_inner();
+        let live = self.0.pacer.get(&request.session_id)?;
+        let every = wire::every("sample_every_steps", request.sample_every_steps)?;
+        let guard = live.open_stream()?;
+        let samples = live.samples(every, None);
+        let out = stream::unfold(Some((samples, guard)), |state| async move {
+            let (mut samples, guard) = state?;
+            Some(match samples.pop().await {
+                Ok((sample, dropped)) => {
+                    let sample = Some(wire::sample::sample(&sample, dropped, now_ns()));
+                    (Ok(pb::WatchSamplesResponse { sample }), Some((samples, guard)))
+                }
+                Err(refusal) => (Err(refusal.into()), None),
+            })
+        });
+        Ok(Response::new(Box::pin(out)))
+    }
+
+    async fn probe(&self, request: Request<pb::ProbeRequest>) -> Result<Response<Self::ProbeStream>, Status> {
+        use pb::probe_request::Where;
+        let request = request.into_inner();
+        let live = self.0.pacer.get(&request.session_id)?;
+        let every = wire::every("every_steps", request.every_steps)?;
+        let points = match &request.r#where {
+            Some(Where::Points(named)) => {
+                let limit = self.0.config.limits.probe_points;
+                if named.points.len() > limit {
+                    let message = format!("are {}, above the limit of {limit}", named.points.len());
+                    return Err(Refusal::new(Reason::TooLarge, "points", message).into());
+                }
+                let mut points = Vec::with_capacity(named.points.len());
+                for (index, point) in named.points.iter().enumerate() {
+                    let point = wire::from_point(point);
+                    live.model.scene.sheet.index(&format!("points[{index}]"), point)?;
+                    points.push(point);
+                }
+                points
+            }
+            Some(Where::AllPoints(true)) => (0..live.model.len()).map(|index| live.model.point_of(index)).collect(),
+            _ => return Err(Refusal::new(Reason::Missing, "where", "points or all_points is missing").into()),
+        };
+        let guard = live.open_stream()?;
+        let records = live.probe(every, points, request.energy);
+        let state = Some((records, guard, VecDeque::new()));
+        let out = stream::unfold(state, |state| async move {
+            let (mut records, guard, mut messages) = state?;
+            if messages.is_empty() {
+                match records.pop().await {
+                    Ok((record, dropped)) => messages.extend(wire::sample::record(&record, dropped)),
+                    Err(refusal) => return Some((Err(refusal.into()), None)),
+                }
+            }
+            let message: pb::ProbeResponse = messages.pop_front()?;
+            Some((Ok(message), Some((records, guard, messages))))
+        });
+        Ok(Response::new(out.boxed()))
+    }
+}

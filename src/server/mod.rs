@@ -1,0 +1,100 @@
+//! The gRPC server: services over `pace`, health, reflection, and a shutdown with a deadline.
+
+pub mod catalog;
+pub mod config;
+mod haptics;
+mod sessions;
+mod views;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::net::TcpListener;
+use tokio_util::sync::CancellationToken;
+use tonic::transport::Server;
+use tonic::transport::server::TcpIncoming;
+use tracing::{info, warn};
+
+use crate::pace::Pacer;
+use crate::wire::pb;
+use catalog::Catalog;
+use config::Config;
+use pb::haptic_service_server::HapticServiceServer;
+use pb::session_service_server::SessionServiceServer;
+use pb::view_service_server::ViewServiceServer;
+
+/// What every service needs.
+#[derive(Clone)]
+pub(crate) struct House {
+    pub(crate) config: Arc<Config>,
+    pub(crate) catalog: Catalog,
+    pub(crate) pacer: Arc<Pacer>,
+}
+
+/// Why a server could not run.
+#[derive(Debug, thiserror::Error)]
+pub enum ServeError {
+    /// A thread can't be started.
+    #[error("can't start a stepping thread: {0}")]
+    Threads(#[from] std::io::Error),
+    /// The transport failed.
+    #[error("the transport failed: {0}")]
+    Transport(#[from] tonic::transport::Error),
+    /// The reflection service can't read its own descriptors.
+    #[error("the descriptors of the protocol can't be read: {0}")]
+    Reflection(#[from] tonic_reflection::server::Error),
+}
+
+/// Serves on `listener` until `shutdown` is cancelled; then ends all streams, and is over at the latest when the
+/// deadline of the configuration has passed.
+pub async fn serve(listener: TcpListener, config: Config, shutdown: CancellationToken) -> Result<(), ServeError> {
+    let pacer = Pacer::start(config.stepping_threads(), &config.limits)?;
+    let deadline = Duration::from_secs_f64(config.shutdown_deadline_s);
+    let house = House { catalog: Catalog::new(&config.scenes), pacer: pacer.clone(), config: Arc::new(config) };
+
+    let (health, health_service) = tonic_health::server::health_reporter();
+    health.set_serving::<SessionServiceServer<sessions::Sessions>>().await;
+    health.set_serving::<HapticServiceServer<haptics::Haptics>>().await;
+    health.set_serving::<ViewServiceServer<views::Views>>().await;
+    let reflection = || {
+        tonic_reflection::server::Builder::configure()
+            .register_encoded_file_descriptor_set(pb::DESCRIPTORS)
+            .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+    };
+
+    // Nagle's algorithm would hold a sample back for milliseconds.
+    let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
+    let serving = Server::builder()
+        // Finds out about clients whose host has vanished.
+        .http2_keepalive_interval(Some(Duration::from_secs(10)))
+        .http2_keepalive_timeout(Some(Duration::from_secs(10)))
+        .add_service(health_service)
+        .add_service(reflection().build_v1()?)
+        .add_service(reflection().build_v1alpha()?)
+        .add_service(SessionServiceServer::new(sessions::Sessions(house.clone())))
+        .add_service(HapticServiceServer::new(haptics::Haptics(house.clone())))
+        .add_service(ViewServiceServer::new(views::Views(house)))
+        .serve_with_incoming_shutdown(incoming, shutdown.clone().cancelled_owned());
+
+    let ending = async {
+        shutdown.cancelled().await;
+        info!("shutting down");
+        // Blocks for a step at most. Every stream reads its end from its queue.
+        let stopping = pacer.clone();
+        let stopped = tokio::task::spawn_blocking(move || stopping.stop());
+        if tokio::time::timeout(deadline, stopped).await.is_err() {
+            warn!("a step outlasted the deadline");
+        }
+        tokio::time::sleep(deadline).await;
+    };
+    tokio::select! {
+        served = serving => {
+            // Also without a shutdown, when the listener has failed.
+            pacer.stop();
+            served?;
+        }
+        () = ending => warn!("streams were still open at the deadline, and are cut"),
+    }
+    info!("stopped");
+    Ok(())
+}

@@ -1,0 +1,91 @@
+//! `SessionService`.
+
+use std::sync::Arc;
+
+use tonic::{Request, Response, Status};
+use tracing::info;
+
+use super::House;
+use crate::refusal::{Reason, Refusal};
+use crate::wire::pb::session_service_server::SessionService;
+use crate::wire::{self, pb};
+
+pub(super) struct Sessions(pub(super) House);
+
+#[tonic::async_trait]
+impl SessionService for Sessions {
+    async fn list_scenes(&self, _: Request<pb::ListScenesRequest>) -> Result<Response<pb::ListScenesResponse>, Status> {
+        Ok(Response::new(pb::ListScenesResponse { scene_names: self.0.catalog.names() }))
+    }
+
+    async fn create_session(
+        &self,
+        request: Request<pb::CreateSessionRequest>,
+    ) -> Result<Response<pb::CreateSessionResponse>, Status> {
+        use pb::create_session_request::Source;
+        let request = request.into_inner();
+        let scene = match &request.source {
+            Some(Source::SceneName(name)) => self.0.catalog.load(name, &self.0.config.limits)?,
+            Some(Source::Scene(scene)) => wire::scene::from_scene(scene).map_err(|refusal| refusal.within("scene"))?,
+            None => return Err(Refusal::new(Reason::Missing, "source", "scene_name or scene is missing").into()),
+        };
+        let live = self.0.pacer.create(&scene, request.paused)?;
+        let warnings = live.model.warnings.join("; ");
+        info!(session = %live.id, scene = %scene.name, points = live.model.len(), warnings, "session created");
+        Ok(Response::new(pb::CreateSessionResponse { session: Some(wire::sample::session(&live)) }))
+    }
+
+    async fn get_session(
+        &self,
+        request: Request<pb::GetSessionRequest>,
+    ) -> Result<Response<pb::GetSessionResponse>, Status> {
+        let live = self.0.pacer.get(&request.get_ref().session_id)?;
+        Ok(Response::new(pb::GetSessionResponse { session: Some(wire::sample::session(&live)) }))
+    }
+
+    async fn list_sessions(
+        &self,
+        _: Request<pb::ListSessionsRequest>,
+    ) -> Result<Response<pb::ListSessionsResponse>, Status> {
+        let sessions = self.0.pacer.list().iter().map(|live: &Arc<_>| wire::sample::session(live)).collect();
+        Ok(Response::new(pb::ListSessionsResponse { sessions }))
+    }
+
+    async fn delete_session(
+        &self,
+        request: Request<pb::DeleteSessionRequest>,
+    ) -> Result<Response<pb::DeleteSessionResponse>, Status> {
+        let id = &request.get_ref().session_id;
+        self.0.pacer.delete(id)?;
+        info!(session = %id, "session deleted");
+        Ok(Response::new(pb::DeleteSessionResponse {}))
+    }
+
+    async fn start_session(
+        &self,
+        request: Request<pb::StartSessionRequest>,
+    ) -> Result<Response<pb::StartSessionResponse>, Status> {
+        let request = request.into_inner();
+        let live = self.0.pacer.get(&request.session_id)?;
+        let step = live.start(request.until_step).await?;
+        Ok(Response::new(pb::StartSessionResponse { step }))
+    }
+
+    async fn pause_session(
+        &self,
+        request: Request<pb::PauseSessionRequest>,
+    ) -> Result<Response<pb::PauseSessionResponse>, Status> {
+        self.0.pacer.get(&request.get_ref().session_id)?.pause();
+        Ok(Response::new(pb::PauseSessionResponse {}))
+    }
+
+    async fn get_state_hash(
+        &self,
+        request: Request<pb::GetStateHashRequest>,
+    ) -> Result<Response<pb::GetStateHashResponse>, Status> {
+        let request = request.into_inner();
+        let live = self.0.pacer.get(&request.session_id)?;
+        let (step, hash) = live.hash_at(request.at_step).await?;
+        Ok(Response::new(pb::GetStateHashResponse { step, state_hash: format!("{hash:032x}") }))
+    }
+}

@@ -1,0 +1,155 @@
+//! `ViewService`.
+
+use std::collections::VecDeque;
+use std::pin::Pin;
+
+use futures_util::stream::{self, Stream};
+use tonic::{Request, Response, Status};
+use tracing::info;
+
+use super::House;
+use crate::pace::frames::Viewer;
+use crate::pace::{FrameReader, StreamGuard, random_id};
+use crate::refusal::{Reason, Refusal, number};
+use crate::surface::{Encoding, Refinement};
+use crate::wire::pb;
+use crate::wire::pb::view_service_server::ViewService;
+
+pub(super) struct Views(pub(super) House);
+
+type Out<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
+
+/// Frames a second if the viewer does not say.
+const DEFAULT_RATE_HZ: f64 = 60.0;
+
+/// A stream of frames under way.
+struct Frames {
+    viewer_id: String,
+    reader: FrameReader,
+    _guard: StreamGuard,
+    messages: VecDeque<pb::WatchFramesResponse>,
+    last_id: Option<u64>,
+    skipped: u64,
+}
+
+impl Frames {
+    async fn next(mut self) -> Option<(Result<pb::WatchFramesResponse, Status>, Option<Frames>)> {
+        if self.messages.is_empty() {
+            match self.reader.pop().await {
+                Ok((delivery, _)) => {
+                    self.skipped += self.last_id.map_or(0, |last| delivery.frame_id.saturating_sub(last + 1));
+                    self.last_id = Some(delivery.frame_id);
+                    self.messages.extend(crate::wire::sample::frame(&self.viewer_id, &delivery, self.skipped));
+                }
+                Err(refusal) => return Some((Err(refusal.into()), None)),
+            }
+        } else {
+            // Between the parts of a frame the messages of other streams get their turn.
+            tokio::task::yield_now().await;
+        }
+        let message = self.messages.pop_front()?;
+        Some((Ok(message), Some(self)))
+    }
+}
+
+#[tonic::async_trait]
+impl ViewService for Views {
+    type GetMeshStream = Out<pb::GetMeshResponse>;
+    type WatchFramesStream = Out<pb::WatchFramesResponse>;
+
+    async fn get_mesh(&self, request: Request<pb::GetMeshRequest>) -> Result<Response<Self::GetMeshStream>, Status> {
+        let request = request.into_inner();
+        let live = self.0.pacer.get(&request.session_id)?;
+        let grid = Refinement::new(live.model.points, request.refinement, &self.0.config.limits)?;
+        let guard = live.open_stream()?;
+        let spacing_m = grid.spacing_m(live.model.scene.sheet.spacing_m);
+        let out = stream::unfold((0, guard), move |(part, guard)| async move {
+            mesh_part(grid, spacing_m, part).map(|message| (Ok(message), (part + 1, guard)))
+        });
+        Ok(Response::new(Box::pin(out)))
+    }
+
+    async fn watch_frames(
+        &self,
+        request: Request<pb::WatchFramesRequest>,
+    ) -> Result<Response<Self::WatchFramesStream>, Status> {
+        let request = request.into_inner();
+        let live = self.0.pacer.get(&request.session_id)?;
+        let grid = Refinement::new(live.model.points, request.refinement, &self.0.config.limits)?;
+        let encoding = match pb::Encoding::try_from(request.encoding) {
+            Ok(pb::Encoding::Unspecified | pb::Encoding::F32) => Encoding::F32,
+            Ok(pb::Encoding::I16) => Encoding::I16,
+            Err(_) => {
+                let message = format!("{} is no encoding", request.encoding);
+                return Err(Refusal::new(Reason::WrongKind, "encoding", message).into());
+            }
+        };
+        let most_hz = live.model.scene.stepping.rate_hz;
+        let rate_hz = request.rate_hz.unwrap_or(DEFAULT_RATE_HZ.min(most_hz));
+        let range = format!("above 0 and at most the session's {most_hz}");
+        number("rate_hz", rate_hz, &range, |v| v > 0.0 && v <= most_hz)?;
+        if let Some(most) = request.max_frames_in_flight {
+            number("max_frames_in_flight", f64::from(most), "from 1 to 64", |v| (1.0..=64.0).contains(&v))?;
+        }
+        let guard = live.open_stream()?;
+        let viewer_id = random_id()?;
+        let (viewer, reader) = Viewer::new(viewer_id.clone(), grid, encoding, rate_hz, request.max_frames_in_flight);
+        self.0.pacer.add_viewer(&live, &viewer);
+        info!(session = %live.id, refinement = request.refinement, ?encoding, rate_hz, "viewer joined");
+        let frames = Frames { viewer_id, reader, _guard: guard, messages: VecDeque::new(), last_id: None, skipped: 0 };
+        let out = stream::unfold(Some(frames), |frames| async move { frames?.next().await });
+        Ok(Response::new(Box::pin(out)))
+    }
+
+    async fn acknowledge_frames(
+        &self,
+        request: Request<pb::AcknowledgeFramesRequest>,
+    ) -> Result<Response<pb::AcknowledgeFramesResponse>, Status> {
+        let request = request.into_inner();
+        self.0.pacer.viewer(&request.viewer_id)?.acknowledge(request.frame_id);
+        Ok(Response::new(pb::AcknowledgeFramesResponse {}))
+    }
+}
+
+/// Vertices of one message: with positions and texture coordinates 40 KiB.
+const VERTICES_PER_PART: usize = 2048;
+
+/// Cells of one message, two triangles each: at most 60 KiB.
+const CELLS_PER_PART: usize = 2048;
+
+/// Part `part` of a mesh: first the vertices, then the triangles.
+#[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
+fn mesh_part(grid: Refinement, spacing_m: f64, part: usize) -> Option<pb::GetMeshResponse> {
+    let [nx, ny] = grid.vertices();
+    let cells = (nx - 1) * (ny - 1);
+    let vertex_parts = (nx * ny).div_ceil(VERTICES_PER_PART);
+    let parts = vertex_parts + cells.div_ceil(CELLS_PER_PART);
+    if part >= parts {
+        return None;
+    }
+    let mut message = pb::GetMeshResponse {
+        vertices_x: nx as u32,
+        vertices_y: ny as u32,
+        vertex_spacing_m: spacing_m,
+        last: part + 1 == parts,
+        ..Default::default()
+    };
+    if part < vertex_parts {
+        let first = part * VERTICES_PER_PART;
+        let share = |a: usize, points: usize| a as f32 / (points - 1).max(1) as f32;
+        for index in first..(first + VERTICES_PER_PART).min(nx * ny) {
+            let (a, b) = (index / ny, index % ny);
+            message.rest_position_m.extend([(a as f64 * spacing_m) as f32, (b as f64 * spacing_m) as f32, 0.0]);
+            message.texture_coordinates.extend([share(a, nx), share(b, ny)]);
+        }
+    } else {
+        let first = (part - vertex_parts) * CELLS_PER_PART;
+        for cell in first..(first + CELLS_PER_PART).min(cells) {
+            let (a, b) = (cell / (ny - 1), cell % (ny - 1));
+            let corner = (a * ny + b) as u32;
+            let (right, up) = (corner + ny as u32, corner + 1);
+            message.triangles.extend([corner, right, right + 1, corner, right + 1, up]);
+        }
+    }
+    Some(message)
+}

@@ -1,0 +1,79 @@
+//! Refusals as gRPC statuses, with google.rpc.ErrorInfo.
+
+use std::collections::HashMap;
+
+use tonic::{Code, Status};
+use tonic_types::{ErrorDetails, StatusExt};
+
+use crate::refusal::{Reason, Refusal};
+
+/// Domain of every `ErrorInfo`.
+pub const DOMAIN: &str = "palpate";
+
+/// The status code of a reason.
+pub fn code(reason: Reason) -> Code {
+    match reason {
+        Reason::Unreadable
+        | Reason::UnknownKey
+        | Reason::Missing
+        | Reason::WrongKind
+        | Reason::NotFinite
+        | Reason::OutOfRange
+        | Reason::ForceTooLarge
+        | Reason::OffSheet
+        | Reason::OutOfTurn => Code::InvalidArgument,
+        Reason::TooLarge | Reason::QueueFull | Reason::TooMany => Code::ResourceExhausted,
+        Reason::UnknownScene | Reason::UnknownSession | Reason::SessionDeleted | Reason::UnknownViewer => {
+            Code::NotFound
+        }
+        Reason::SessionHeld | Reason::StaleSequence => Code::FailedPrecondition,
+        Reason::ToolHeld => Code::AlreadyExists,
+        Reason::NotHolder => Code::PermissionDenied,
+        Reason::StepPassed => Code::OutOfRange,
+        Reason::ShuttingDown => Code::Unavailable,
+    }
+}
+
+impl From<Refusal> for Status {
+    fn from(refusal: Refusal) -> Self {
+        let mut metadata = HashMap::new();
+        if !refusal.field.is_empty() {
+            metadata.insert("field".to_owned(), refusal.field.clone());
+        }
+        let mut details = ErrorDetails::with_error_info(refusal.reason.as_str(), DOMAIN, metadata);
+        if code(refusal.reason) == Code::InvalidArgument && !refusal.field.is_empty() {
+            details.add_bad_request_violation(&refusal.field, &refusal.message);
+        }
+        Status::with_error_details(code(refusal.reason), refusal.to_string(), details)
+    }
+}
+
+/// What a client shows of a status: its message, and the reason if it has one.
+pub fn describe(status: &Status) -> String {
+    match status.get_details_error_info() {
+        Some(info) => format!("{} ({})", status.message(), info.reason),
+        None => format!("{} ({:?})", status.message(), status.code()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_reason_is_told_in_the_readme() {
+        let readme = include_str!("../../README.md");
+        for reason in Reason::ALL {
+            assert!(readme.contains(&format!("`{}`", reason.as_str())), "the README lacks {}", reason.as_str());
+        }
+    }
+
+    #[test]
+    fn a_refusal_keeps_its_reason_and_field() {
+        let status = Status::from(Refusal::new(Reason::NotFinite, "force.force_n", "must be a finite number"));
+        assert_eq!(status.code(), Code::InvalidArgument);
+        let info = status.get_details_error_info().unwrap();
+        assert_eq!((info.reason.as_str(), info.domain.as_str()), ("NOT_FINITE", DOMAIN));
+        assert_eq!(info.metadata["field"], "force.force_n");
+    }
+}

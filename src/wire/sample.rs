@@ -1,0 +1,201 @@
+//! Samples, records, sessions and frames on their way out; records on their way back in.
+
+use std::sync::Arc;
+
+use super::{from_point, from_vector, pb, point, vector};
+use crate::pace::frames::Delivery;
+use crate::pace::{Live, PacedRecord, PacedSample, State};
+use crate::refusal::Refusal;
+use crate::scene::Named;
+use crate::scene::record::{EnergyJ, Point, Record};
+use crate::session::ToolSample;
+use crate::surface::Encoding;
+
+/// A sample that leaves at `now_ns`.
+pub fn sample(paced: &PacedSample, dropped: u64, now_ns: u64) -> pb::Sample {
+    let sample = &paced.sample;
+    #[allow(clippy::cast_possible_truncation)]
+    pb::Sample {
+        step: sample.step,
+        simulation_time_s: sample.simulation_time_s,
+        server_time_ns: now_ns,
+        overrun_count: paced.overrun_count,
+        time_dilation: paced.time_dilation,
+        awake_points: sample.awake_points as u32,
+        overrun: paced.overrun,
+        asleep: sample.awake_points == 0,
+        held: sample.held,
+        late_commands: sample.late_commands,
+        dropped_samples: dropped,
+        tools: sample.tools.iter().map(|tool| tool_sample(tool, now_ns)).collect(),
+    }
+}
+
+fn tool_sample(tool: &ToolSample, now_ns: u64) -> pb::ToolSample {
+    let contact = tool.contact.as_ref();
+    pb::ToolSample {
+        tool: tool.tool,
+        acknowledged_sequence: tool.acknowledged_sequence,
+        client_time_ns: tool.client_time_ns,
+        server_hold_ns: if tool.arrival_ns == 0 { 0 } else { now_ns.saturating_sub(tool.arrival_ns) },
+        point: contact.map(|contact| point(contact.point)),
+        displacement_m: contact.and_then(|contact| vector(contact.displacement_m)),
+        velocity_m_per_s: contact.and_then(|contact| vector(contact.velocity_m_per_s)),
+        force_on_tool_n: contact.and_then(|contact| vector(contact.force_on_tool_n)),
+        applied_force_n: contact.and_then(|contact| vector(contact.applied_force_n)),
+        late: tool.late,
+        expired: tool.expired,
+    }
+}
+
+/// A refused command.
+pub fn rejection(tool: u32, sequence: u64, refusal: &Refusal) -> pb::Rejection {
+    pb::Rejection {
+        tool,
+        sequence,
+        reason: refusal.reason.as_str().to_owned(),
+        field: refusal.field.clone(),
+        message: refusal.to_string(),
+    }
+}
+
+/// Points of one message of a record.
+const POINTS_PER_MESSAGE: usize = 1000;
+
+/// The messages of a record.
+pub fn record(paced: &PacedRecord, dropped: u64) -> Vec<pb::ProbeResponse> {
+    let PacedRecord { step, record } = paced;
+    let mut messages: Vec<_> = record
+        .points
+        .chunks(POINTS_PER_MESSAGE)
+        .map(|points| pb::ProbeResponse {
+            step: *step,
+            simulation_time_s: record.time_s,
+            points: points.iter().map(point_record).collect(),
+            dropped_records: dropped,
+            ..Default::default()
+        })
+        .collect();
+    if messages.is_empty() {
+        messages.push(pb::ProbeResponse { step: *step, simulation_time_s: record.time_s, ..Default::default() });
+    }
+    #[allow(clippy::cast_possible_truncation)]
+    if let Some(last) = messages.last_mut() {
+        last.last = true;
+        last.awake_points = record.awake_points as u32;
+        last.energy = record.energy_j.map(|energy| pb::Energy {
+            kinetic_j: energy.kinetic,
+            spring_j: energy.spring,
+            virtual_j: energy.virtual_springs,
+        });
+    }
+    messages
+}
+
+fn point_record(record: &Point) -> pb::PointRecord {
+    let vector = |v: [f64; 3]| vector(v.into());
+    pb::PointRecord {
+        point: Some(point(record.point)),
+        displacement_m: vector(record.displacement_m),
+        velocity_m_per_s: vector(record.velocity_m_per_s),
+        spring_n: vector(record.spring_n),
+        virtual_n: vector(record.virtual_n),
+        damping_n: vector(record.damping_n),
+        applied_n: vector(record.applied_n),
+        reaction_n: vector(record.reaction_n),
+        constraint_n: record.constraint_n.and_then(vector),
+    }
+}
+
+/// Adds a message to a record; true when that was its last.
+pub fn add_to_record(record: &mut Record, message: &pb::ProbeResponse) -> bool {
+    let array = |v: &Option<pb::Vector3>| from_vector(v.as_ref()).to_array();
+    record.time_s = message.simulation_time_s;
+    record.points.extend(message.points.iter().map(|point| Point {
+        point: point.point.as_ref().map_or([0, 0], from_point),
+        displacement_m: array(&point.displacement_m),
+        velocity_m_per_s: array(&point.velocity_m_per_s),
+        spring_n: array(&point.spring_n),
+        virtual_n: array(&point.virtual_n),
+        damping_n: array(&point.damping_n),
+        applied_n: array(&point.applied_n),
+        reaction_n: array(&point.reaction_n),
+        constraint_n: point.constraint_n.as_ref().map(|v| from_vector(Some(v)).to_array()),
+    }));
+    if message.last {
+        record.awake_points = message.awake_points as usize;
+        record.energy_j = message.energy.as_ref().map(|energy| EnergyJ {
+            kinetic: energy.kinetic_j,
+            spring: energy.spring_j,
+            virtual_springs: energy.virtual_j,
+        });
+    }
+    message.last
+}
+
+/// A session as it stands.
+pub fn session(live: &Arc<Live>) -> pb::Session {
+    let status = live.status();
+    let intake = crate::pace::queue::lock(&live.intake);
+    let model = &live.model;
+    #[allow(clippy::cast_precision_loss)]
+    let simulation_time_s = status.step as f64 / model.scene.stepping.rate_hz;
+    pb::Session {
+        session_id: live.id.clone(),
+        scene: Some(super::scene::scene(&model.scene)),
+        state: match status.state {
+            State::Running => pb::SessionState::Running,
+            State::Paused => pb::SessionState::Paused,
+            State::Held => pb::SessionState::Held,
+        }
+        .into(),
+        step: status.step,
+        simulation_time_s,
+        integrator: model.plan.integrator.name().to_owned(),
+        substeps: model.plan.substeps,
+        precision: model.precision.name().to_owned(),
+        overrun_count: status.overrun_count,
+        time_dilation: status.time_dilation,
+        late_commands: status.late_commands,
+        hold_reason: status.hold_reason.unwrap_or_default(),
+        held_tools: intake.holders().map(|(tool, holder)| pb::HeldTool { tool, holder: holder.to_owned() }).collect(),
+        lapsed_leases: intake.lapsed(),
+    }
+}
+
+/// The messages of a frame for one viewer.
+pub fn frame(viewer_id: &str, delivery: &Delivery, skipped: u64) -> Vec<pb::WatchFramesResponse> {
+    let frame = &delivery.frame;
+    let [vertices_x, vertices_y] = frame.refinement.vertices();
+    let count = frame.patches.len();
+    #[allow(clippy::cast_possible_truncation)]
+    let message = |(index, patch): (usize, &crate::surface::encode::Patch)| pb::WatchFramesResponse {
+        viewer_id: viewer_id.to_owned(),
+        frame_id: delivery.frame_id,
+        step: frame.step,
+        simulation_time_s: frame.simulation_time_s,
+        refinement: frame.refinement.between as u32,
+        vertices_x: vertices_x as u32,
+        vertices_y: vertices_y as u32,
+        encoding: match frame.encoding {
+            Encoding::F32 => pb::Encoding::F32,
+            Encoding::I16 => pb::Encoding::I16,
+        }
+        .into(),
+        origin_m: vector(frame.origin_m),
+        scale_m: vector(frame.scale_m),
+        full: true,
+        skipped_frames: skipped,
+        overrun_count: delivery.overrun_count,
+        time_dilation: delivery.time_dilation,
+        patches: vec![pb::Patch {
+            first_x: patch.rows[0] as u32,
+            first_y: 0,
+            count_x: patch.rows[1] as u32,
+            count_y: vertices_y as u32,
+            displacement: patch.bytes.clone(),
+        }],
+        last: index + 1 == count,
+    };
+    frame.patches.iter().enumerate().map(message).collect()
+}

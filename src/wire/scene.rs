@@ -1,0 +1,126 @@
+//! Scenes. The same fields and defaults as in a scene file; ranges are checked when the scene is compiled.
+
+use super::{from_point, pb, point, required};
+use crate::refusal::{Reason, Refusal, Result};
+use crate::scene::{Fixed, Integrator, Named, Precision, SLEEP_TOLERANCE, Scene, Sheet, Springs, Stepping};
+
+/// A scene out of a message.
+pub fn from_scene(message: &pb::Scene) -> Result<Scene> {
+    let sheet = required("sheet", message.sheet.as_ref())?;
+    let springs = required("springs", message.springs.as_ref())?;
+    let virtual_springs = required("virtual_springs", message.virtual_springs.as_ref())?;
+    let damping = required("damping", message.damping.as_ref())?;
+    let stiffness_n_per_m = required("springs.stiffness_n_per_m", springs.stiffness_n_per_m)?;
+    Ok(Scene {
+        name: if message.name.is_empty() { "unnamed".to_owned() } else { message.name.clone() },
+        sheet: Sheet {
+            points: [
+                required("sheet.points_x", sheet.points_x)? as usize,
+                required("sheet.points_y", sheet.points_y)? as usize,
+            ],
+            spacing_m: required("sheet.spacing_m", sheet.spacing_m)?,
+            point_mass_kg: required("sheet.point_mass_kg", sheet.point_mass_kg)?,
+            fixed: from_fixed(sheet.fixed.as_ref())?,
+        },
+        springs: Springs {
+            stiffness_n_per_m,
+            shear_stiffness_n_per_m: springs.shear_stiffness_n_per_m.unwrap_or(stiffness_n_per_m),
+            flexion: springs.flexion,
+        },
+        virtual_stiffness_n_per_m: required("virtual_springs.stiffness_n_per_m", virtual_springs.stiffness_n_per_m)?,
+        damping_n_s_per_m: required("damping.coefficient_n_s_per_m", damping.coefficient_n_s_per_m)?,
+        stepping: message.stepping.as_ref().map_or(Ok(Stepping::default()), from_stepping)?,
+        sleep_tolerance: message.sleep.as_ref().and_then(|sleep| sleep.tolerance).unwrap_or(SLEEP_TOLERANCE),
+    })
+}
+
+fn from_fixed(fixed: Option<&pb::sheet::Fixed>) -> Result<Fixed> {
+    Ok(match fixed {
+        None => Fixed::Points(Vec::new()),
+        Some(pb::sheet::Fixed::FixedPoints(points)) => Fixed::Points(points.points.iter().map(from_point).collect()),
+        Some(pb::sheet::Fixed::FixedSet(set)) => match pb::FixedSet::try_from(*set) {
+            Ok(pb::FixedSet::Unspecified) => Fixed::Points(Vec::new()),
+            Ok(pb::FixedSet::Edges) => Fixed::Edges,
+            Ok(pb::FixedSet::Corners) => Fixed::Corners,
+            Err(_) => {
+                return Err(Refusal::new(Reason::WrongKind, "sheet.fixed_set", format!("{set} is no set of points")));
+            }
+        },
+    })
+}
+
+fn from_stepping(message: &pb::Stepping) -> Result<Stepping> {
+    let standard = Stepping::default();
+    let or_auto = |name: &String| if name.is_empty() { "auto".to_owned() } else { name.clone() };
+    Ok(Stepping {
+        rate_hz: message.rate_hz.unwrap_or(standard.rate_hz),
+        tolerance: message.tolerance.unwrap_or(standard.tolerance),
+        integrator: Integrator::named("stepping.integrator", &or_auto(&message.integrator))?,
+        substeps: message.substeps,
+        precision: Precision::named("stepping.precision", &or_auto(&message.precision))?,
+    })
+}
+
+/// A message of a scene, every default filled in.
+pub fn scene(scene: &Scene) -> pb::Scene {
+    #[allow(clippy::cast_possible_truncation)]
+    let [points_x, points_y] = scene.sheet.points.map(|points| Some(points as u32));
+    let fixed = match &scene.sheet.fixed {
+        Fixed::Edges => Some(pb::sheet::Fixed::FixedSet(pb::FixedSet::Edges.into())),
+        Fixed::Corners => Some(pb::sheet::Fixed::FixedSet(pb::FixedSet::Corners.into())),
+        Fixed::Points(points) if points.is_empty() => None,
+        Fixed::Points(points) => {
+            let points = points.iter().copied().map(point).collect();
+            Some(pb::sheet::Fixed::FixedPoints(pb::GridPoints { points }))
+        }
+    };
+    pb::Scene {
+        name: scene.name.clone(),
+        sheet: Some(pb::Sheet {
+            points_x,
+            points_y,
+            spacing_m: Some(scene.sheet.spacing_m),
+            point_mass_kg: Some(scene.sheet.point_mass_kg),
+            fixed,
+        }),
+        springs: Some(pb::Springs {
+            stiffness_n_per_m: Some(scene.springs.stiffness_n_per_m),
+            shear_stiffness_n_per_m: Some(scene.springs.shear_stiffness_n_per_m),
+            flexion: scene.springs.flexion,
+        }),
+        virtual_springs: Some(pb::VirtualSprings { stiffness_n_per_m: Some(scene.virtual_stiffness_n_per_m) }),
+        damping: Some(pb::Damping { coefficient_n_s_per_m: Some(scene.damping_n_s_per_m) }),
+        stepping: Some(pb::Stepping {
+            rate_hz: Some(scene.stepping.rate_hz),
+            tolerance: Some(scene.stepping.tolerance),
+            integrator: scene.stepping.integrator.name().to_owned(),
+            substeps: scene.stepping.substeps,
+            precision: scene.stepping.precision.name().to_owned(),
+        }),
+        sleep: Some(pb::Sleep { tolerance: Some(scene.sleep_tolerance) }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::limits::Limits;
+
+    #[test]
+    fn a_scene_comes_back_as_it_went() {
+        let mut paper = Scene::parse("paper", crate::scene::PAPER, &[], &Limits::default()).unwrap();
+        for fixed in [Fixed::Edges, Fixed::Corners, Fixed::Points(vec![]), Fixed::Points(vec![[1, 2], [30, 0]])] {
+            paper.sheet.fixed = fixed;
+            assert_eq!(from_scene(&scene(&paper)).unwrap(), paper);
+        }
+    }
+
+    #[test]
+    fn a_missing_coefficient_is_named() {
+        let paper = Scene::parse("paper", crate::scene::PAPER, &[], &Limits::default()).unwrap();
+        let mut message = scene(&paper);
+        message.damping = Some(pb::Damping::default());
+        let refusal = from_scene(&message).unwrap_err();
+        assert_eq!((refusal.reason, refusal.field.as_str()), (Reason::Missing, "damping.coefficient_n_s_per_m"));
+    }
+}
