@@ -1,0 +1,61 @@
+# One word each: run, test, lint, bench-roundtrip, bench-duty. Everything is built from crates.io and PyPI.
+
+CARGO ?= cargo
+PYTHON ?= python3
+# Where `make run` listens.
+LISTEN ?= 127.0.0.1:7117
+SCRIPT ?= scripts/vertical-60.toml
+
+VENV := target/venv
+
+.PHONY: help run build test lint bench-roundtrip bench-duty need-rust need-python
+
+help:
+	@echo 'make run             build, serve on $(LISTEN), poke the tissue, draw what it felt, go on serving'
+	@echo 'make test            every test (Rust and Python 3)'
+	@echo 'make lint            formatting, compiler and clippy warnings'
+	@echo 'make bench-roundtrip the haptic round trip beside a bare gRPC echo'
+	@echo 'make bench-duty      a minute of 1 kHz touch and 60 frames a second: time kept, commands lost'
+
+need-rust:
+	@command -v $(CARGO) >/dev/null || { echo 'Rust is missing: install it from https://rustup.rs' >&2; exit 1; }
+
+need-python:
+	@$(PYTHON) -c 'import sys, venv, ensurepip; assert sys.version_info >= (3, 9)' 2>/dev/null || \
+		{ echo 'Python 3.9 or later with venv is missing (Debian: apt-get install python3-venv)' >&2; exit 1; }
+
+build: need-rust
+	$(CARGO) build --release --workspace
+
+# The server runs until Ctrl-C, which reaches it as well as this shell.
+run: build
+	@rm -f target/serving.txt; \
+	./target/release/palpate serve --listen $(LISTEN) --log warn > target/serving.txt & server=$$!; \
+	trap 'kill $$server 2>/dev/null; wait $$server; exit 0' INT TERM; \
+	until grep -q http target/serving.txt; do kill -0 $$server 2>/dev/null || exit 1; sleep 0.05; done; \
+	url=$$(grep -o 'http.*' target/serving.txt); \
+	./target/release/palpate-client replay $(SCRIPT) --server $$url --output target/poke.jsonl --plot \
+		|| { kill $$server; exit 1; }; \
+	echo; echo "The records are in target/poke.jsonl. Serving on $$url until Ctrl-C."; \
+	wait $$server
+
+$(VENV)/ready: tests/python/requirements.txt | need-python
+	$(PYTHON) -m venv $(VENV)
+	$(VENV)/bin/pip install --quiet --disable-pip-version-check -r tests/python/requirements.txt
+	touch $@
+
+test: build $(VENV)/ready
+	$(CARGO) test --release --workspace
+	$(VENV)/bin/python -m unittest discover -s tests/python -v
+
+lint: need-rust
+	$(CARGO) fmt --all --check
+	$(CARGO) clippy --release --workspace --all-targets -- -D warnings
+
+bench-roundtrip: build
+	@echo "Machine: $$(sed -n 's/^model name.*: //p' /proc/cpuinfo 2>/dev/null | sort | uniq -c)"
+	$(CARGO) bench --quiet --bench roundtrip
+
+bench-duty: build
+	@echo "Machine: $$(sed -n 's/^model name.*: //p' /proc/cpuinfo 2>/dev/null | sort | uniq -c)"
+	$(CARGO) bench --quiet --bench duty

@@ -1,0 +1,76 @@
+//! What several test files need.
+#![allow(dead_code, unreachable_pub, clippy::unwrap_used)]
+
+use std::path::Path;
+use std::sync::Arc;
+
+use palpate::limits::Limits;
+use palpate::scene::Scene;
+use palpate::scene::law::Poke;
+use palpate::scene::script::Script;
+use palpate::session::Session;
+use palpate::sheet::{Model, Push};
+
+pub fn scene(text: &str) -> Scene {
+    Scene::parse("test scene", text, &[], &Limits::default()).unwrap()
+}
+
+pub fn scene_with(text: &str, assignments: &[&str]) -> Scene {
+    let assignments: Vec<String> = assignments.iter().map(|assignment| (*assignment).to_owned()).collect();
+    Scene::parse("test scene", text, &assignments, &Limits::default()).unwrap()
+}
+
+pub fn model(scene: &Scene) -> Arc<Model> {
+    Model::compile(scene, &Limits::default()).unwrap()
+}
+
+pub fn script(text: &str, scene: &Scene) -> Script {
+    Script::parse("test script", text, Path::new("scripts"), scene, &Limits::default()).unwrap()
+}
+
+/// A session with a script's laws acting.
+pub fn playing(scene: &Scene, script: &Script) -> Session {
+    let mut session = Session::new(&model(scene));
+    for (tool, law) in script.forces.iter().enumerate() {
+        session.play_force(tool, law.clone());
+    }
+    for (index, law) in script.moves.iter().enumerate() {
+        session.play_move(script.forces.len() + index, law.clone());
+    }
+    session
+}
+
+/// Steps a session without commands.
+pub fn advance(session: &mut Session, steps: u64) {
+    for _ in 0..steps {
+        session.advance(&mut Vec::new(), |_| {});
+        assert_eq!(session.hold_reason(), None);
+    }
+}
+
+/// A force on one point alone.
+pub fn push_on(scene: &Scene, [i, j]: [usize; 2], force_n: [f64; 3]) -> Push {
+    Push::Held(Poke {
+        centre_m: scene.sheet.spacing_m * glam::DVec2::new(i as f64, j as f64),
+        force_n: force_n.into(),
+        falloff_per_m: 100.0 / scene.sheet.spacing_m,
+        falloff_offset: 0.0,
+    })
+}
+
+/// A small sheet; `--set` what differs.
+pub const SMALL: &str = r#"
+name = "small"
+[sheet]
+points = [7, 5]
+spacing_m = 0.05
+point_mass_kg = 0.02
+[springs]
+stiffness_n_per_m = 30.0
+[virtual_springs]
+stiffness_n_per_m = 5.0
+[damping]
+coefficient_n_s_per_m = 0.2
+[stepping]
+precision = "f64"
+"#;

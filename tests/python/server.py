@@ -1,0 +1,26 @@
+"""A real `palpate serve` on a free port, for tests."""
+
+import pathlib
+import subprocess
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+
+
+class Server:
+    """Started by `with`, ended after it; `address` is host:port."""
+
+    def __enter__(self):
+        command = [ROOT / "target/release/palpate", "serve", "--listen", "127.0.0.1:0", "--log", "warn"]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
+        line = self.process.stdout.readline()
+        assert "http://" in line, f"the server did not start: {line!r}"
+        self.address = line.split("http://")[1].strip()
+        return self
+
+    def __exit__(self, *_):
+        self.process.terminate()
+        try:
+            assert self.process.wait(timeout=20) == 0
+        finally:
+            self.process.kill()
+            self.process.stdout.close()

@@ -1,0 +1,210 @@
+//! Accuracy against scenes that were solved to 1e-10 by other means (tests/reference: each file has the scene, the
+//! times, and at each time displacements, velocities, forces and energies).
+#![allow(clippy::unwrap_used)]
+
+mod common;
+
+use common::{playing, scene_with, script};
+use glam::DVec3;
+use palpate::session::Session;
+use serde_json::Value;
+
+const SCENES: [&str; 4] = ["poke31", "ringdown9x14", "overdamped19", "tool15"];
+
+fn load(name: &str) -> Value {
+    let path = format!("{}/tests/reference/{name}.json", env!("CARGO_MANIFEST_DIR"));
+    serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap()
+}
+
+fn number(value: &Value) -> f64 {
+    value.as_f64().unwrap()
+}
+
+fn vector(value: &Value) -> DVec3 {
+    DVec3::new(number(&value[0]), number(&value[1]), number(&value[2]))
+}
+
+fn point(value: &Value) -> [usize; 2] {
+    [value[0].as_u64().unwrap() as usize, value[1].as_u64().unwrap() as usize]
+}
+
+/// The scene of a reference, as a scene file says it.
+fn scene_text(scene: &Value) -> String {
+    format!(
+        "[sheet]\npoints = [{}, {}]\nspacing_m = {}\npoint_mass_kg = {}\n[springs]\nstiffness_n_per_m = {}\n\
+         flexion = {}\n[virtual_springs]\nstiffness_n_per_m = {}\n[damping]\ncoefficient_n_s_per_m = {}\n",
+        scene["nx"], scene["ny"], scene["spacing"], scene["mass"], scene["k"], scene["flexion"], scene["K"], scene["C"]
+    )
+}
+
+/// Its forces and tool, as a script says them.
+fn script_text(scene: &Value) -> String {
+    let times = scene["times"].as_array().unwrap();
+    let mut text = format!("duration_s = {}\nsample_every_s = {}\n", scene["t_end"], times[1]);
+    for force in scene["forces"].as_array().unwrap() {
+        let profile = match force["profile"]["type"].as_str().unwrap() {
+            "constant" => "{ type = \"constant\" }".to_owned(),
+            "pulse" => {
+                let (on, off) = (&force["profile"]["t_on"], &force["profile"]["t_off"]);
+                format!("{{ type = \"pulse\", on_s = {on}, off_s = {off} }}")
+            }
+            other => panic!("{other}"),
+        };
+        text += &format!(
+            "[[force]]\npoint = {}\nforce_n = {}\nfalloff_per_m = {}\nfalloff_offset = {}\nprofile = {profile}\n",
+            force["point"], force["vector"], force["c"], force["c_prime"]
+        );
+    }
+    if let Some(tool) = scene.get("tool") {
+        let moves: Vec<String> = tool["moves"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|m| format!("{{ from_s = {}, to_s = {}, by_m = {} }}", m["t0"], m["t1"], m["by"]))
+            .collect();
+        text += &format!("[[tool]]\npoint = {}\nmoves = [{}]\n", tool["point"], moves.join(", "));
+    }
+    text
+}
+
+/// Largest errors of a run, relative to the largest value of each kind.
+#[derive(Debug, Default)]
+struct Errors {
+    displacement: f64,
+    velocity: f64,
+    force: f64,
+    energy: f64,
+}
+
+/// Runs a reference scene with `assignments` and compares everything that the reference has.
+fn errors(name: &str, assignments: &[&str]) -> Errors {
+    let reference = load(name);
+    let scene = scene_with(&scene_text(&reference["scene"]), assignments);
+    let script = script(&script_text(&reference["scene"]), &scene);
+    let mut session = playing(&scene, &script);
+    let mut frames = reference["frames"].as_array().unwrap().iter();
+    let (mut error, mut largest) = (Errors::default(), Errors::default());
+    let samples: Vec<_> = reference["scene"]["samples"].as_array().unwrap().iter().map(point).collect();
+    let watch: Vec<_> = reference["scene"]["watch"].as_array().unwrap().iter().map(point).collect();
+    let mut compare = |session: &Session| {
+        if !session.step_count().is_multiple_of(script.sample_every) {
+            return;
+        }
+        let frame = frames.next().unwrap();
+        assert!((session.time_s() - number(&frame["t"])).abs() < 1e-9);
+        let at = |place: [usize; 2]| session.tissue().point(session.model().index_of(place));
+        for (index, place) in samples.iter().enumerate() {
+            let (u, v) = (vector(&frame["u"][index]), vector(&frame["v"][index]));
+            error.displacement = error.displacement.max((at(*place).displacement_m - u).length());
+            error.velocity = error.velocity.max((at(*place).velocity_m_per_s - v).length());
+            largest.displacement = largest.displacement.max(u.length());
+            largest.velocity = largest.velocity.max(v.length());
+        }
+        for (index, place) in watch.iter().enumerate() {
+            let expected = &frame["watch"][index];
+            let part = |name: &str| vector(&expected[name]);
+            let state = at(*place);
+            let reaction = part("reaction") + part("damping");
+            let mut pairs = vec![
+                (state.spring_n, part("spring")),
+                (state.virtual_n, part("virtual")),
+                (state.damping_n, part("damping")),
+                (state.applied_n, part("surgical")),
+                (state.reaction_n(), reaction),
+            ];
+            if expected.get("constraint").is_some() {
+                pairs.push((state.constraint_n.unwrap(), part("constraint")));
+            }
+            for (force, expected) in pairs {
+                error.force = error.force.max((force - expected).length());
+            }
+            largest.force = largest.force.max(reaction.length());
+        }
+        let (energy, expected) = (session.tissue().energy(), &frame["energy"]);
+        for (value, name) in
+            [(energy.kinetic_j, "kinetic"), (energy.spring_j, "spring"), (energy.virtual_j, "virtual")]
+        {
+            error.energy = error.energy.max((value - number(&expected[name])).abs());
+            largest.energy = largest.energy.max(number(&expected[name]));
+        }
+    };
+    for _ in 0..script.steps {
+        session.advance(&mut Vec::new(), &mut compare);
+        assert_eq!(session.hold_reason(), None);
+    }
+    assert!(frames.next().is_none(), "the run is shorter than the reference");
+    Errors {
+        displacement: error.displacement / largest.displacement,
+        velocity: error.velocity / largest.velocity,
+        force: error.force / largest.force,
+        energy: error.energy / largest.energy,
+    }
+}
+
+#[test]
+fn default_settings_are_within_a_thousandth() {
+    for name in SCENES {
+        let errors = errors(name, &[]);
+        println!("{name}: {errors:?}");
+        assert!(errors.displacement < 1e-3, "{name}: {errors:?}");
+        assert!(errors.force < 5e-3, "{name}: {errors:?}");
+        assert!(errors.velocity < 5e-3 && errors.energy < 5e-3, "{name}: {errors:?}");
+    }
+}
+
+/// By what each error falls when the step falls by 4.
+fn gains(name: &str, integrator: &str, rate_hz: f64) -> [f64; 4] {
+    let at = |rate_hz: f64| {
+        let integrator = format!("stepping.integrator={integrator}");
+        let rate = format!("stepping.rate_hz={rate_hz}");
+        errors(name, &[&integrator, &rate, "stepping.precision=f64", "stepping.substeps=1"])
+    };
+    let (coarse, fine) = (at(rate_hz), at(4.0 * rate_hz));
+    [
+        coarse.displacement / fine.displacement,
+        coarse.velocity / fine.velocity,
+        coarse.force / fine.force,
+        coarse.energy / fine.energy,
+    ]
+}
+
+#[test]
+fn central_is_second_order() {
+    for name in SCENES {
+        for gain in gains(name, "central", 1000.0) {
+            assert!(gain > 14.0, "{name}: {gain}");
+        }
+    }
+}
+
+#[test]
+fn lagged_is_first_order_within_its_stable_range() {
+    for name in SCENES {
+        for gain in gains(name, "lagged", 4000.0) {
+            assert!((3.5..5.0).contains(&gain), "{name}: {gain}");
+        }
+    }
+}
+
+#[test]
+fn lagged_explodes_where_its_damping_is_too_strong_and_is_held() {
+    let reference = load("overdamped19");
+    let sets = ["stepping.integrator=lagged", "stepping.substeps=1"];
+    let scene = scene_with(&scene_text(&reference["scene"]), &sets);
+    let script = script(&script_text(&reference["scene"]), &scene);
+    let mut session = playing(&scene, &script);
+    let mut last = 0;
+    for _ in 0..script.steps {
+        session.advance(&mut Vec::new(), |session| {
+            for index in 0..session.model().len() {
+                let point = session.tissue().point(index);
+                assert!(point.displacement_m.is_finite() && point.reaction_n().is_finite());
+            }
+        });
+        last = session.step_count();
+    }
+    assert!(last < script.steps);
+    assert!(session.hold_reason().unwrap().contains("not finite"));
+    // Auto substeps keep it stable.
+    assert!(errors("overdamped19", &["stepping.integrator=lagged"]).displacement < 1e-2);
+}
