@@ -51,9 +51,9 @@ impl Config {
     pub fn load(path: &Path) -> Result<Self> {
         let text = read_text(path, Limits::default().file_bytes)?;
         let config: Config = toml::from_str(&text).map_err(|e| {
-            let line = e.span().map_or(0, |span| text[..span.start].lines().count().max(1));
+            let line = e.span().map_or(1, |span| text[..span.start].matches('\n').count() + 1);
             let place = Some(format!("{}:{line}", path.display()));
-            Refusal { place, ..Refusal::new(Reason::Unreadable, "", e.message()) }
+            Refusal { place, ..Refusal::new(Reason::Unreadable, "", e.message().trim_end()) }
         })?;
         config.check().map_err(|refusal| Refusal { place: Some(path.display().to_string()), ..refusal })?;
         Ok(config)

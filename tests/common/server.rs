@@ -1,0 +1,245 @@
+//! A real server, in a process of its own, and short ways to talk to it.
+#![allow(dead_code, unreachable_pub, clippy::unwrap_used)]
+
+use std::io::{BufRead, BufReader, Read};
+use std::path::PathBuf;
+use std::process::{Child, Command, Stdio};
+use std::sync::OnceLock;
+use std::time::Duration;
+
+use palpate::wire::pb;
+use pb::haptic_service_client::HapticServiceClient;
+use pb::session_service_client::SessionServiceClient;
+use pb::touch_request::Message as Say;
+use pb::touch_response::Message as Heard;
+use pb::view_service_client::ViewServiceClient;
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::transport::Channel;
+use tonic::{Code, Status, Streaming};
+use tonic_types::StatusExt;
+
+/// Long enough for any machine; a test that waits so long has failed.
+pub const PATIENCE: Duration = Duration::from_secs(60);
+
+/// The client program, built if it is not there or not new.
+pub fn client_program() -> PathBuf {
+    static BUILT: OnceLock<PathBuf> = OnceLock::new();
+    BUILT
+        .get_or_init(|| {
+            let mut build = Command::new(env!("CARGO"));
+            build.args(["build", "--quiet", "--package", "palpate-client"]).current_dir(env!("CARGO_MANIFEST_DIR"));
+            if !cfg!(debug_assertions) {
+                build.arg("--release");
+            }
+            assert!(build.status().unwrap().success());
+            PathBuf::from(env!("CARGO_BIN_EXE_palpate")).with_file_name("palpate-client")
+        })
+        .clone()
+}
+
+pub struct Server {
+    pub child: Child,
+    pub url: String,
+}
+
+impl Server {
+    pub fn start(arguments: &[&str]) -> Self {
+        let mut child = Command::new(env!("CARGO_BIN_EXE_palpate"))
+            .args(["serve", "--listen", "127.0.0.1:0"])
+            .args(arguments)
+            .current_dir(env!("CARGO_MANIFEST_DIR"))
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut line = String::new();
+        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        let url = line.split_whitespace().last().unwrap_or_default().to_owned();
+        assert!(url.starts_with("http://127.0.0.1:"), "{line:?}");
+        Server { child, url }
+    }
+
+    pub async fn channel(&self) -> Channel {
+        Channel::from_shared(self.url.clone()).unwrap().connect().await.unwrap()
+    }
+
+    pub async fn sessions(&self) -> SessionServiceClient<Channel> {
+        SessionServiceClient::new(self.channel().await)
+    }
+
+    pub async fn haptics(&self) -> HapticServiceClient<Channel> {
+        HapticServiceClient::new(self.channel().await)
+    }
+
+    pub async fn views(&self) -> ViewServiceClient<Channel> {
+        ViewServiceClient::new(self.channel().await)
+    }
+
+    /// A session of the paper's scene.
+    pub async fn paper(&self, paused: bool) -> String {
+        let source = pb::create_session_request::Source::SceneName("paper".into());
+        self.create(source, paused).await.unwrap().session_id
+    }
+
+    pub async fn create(
+        &self,
+        source: pb::create_session_request::Source,
+        paused: bool,
+    ) -> Result<pb::Session, Status> {
+        let request = pb::CreateSessionRequest { source: Some(source), paused };
+        Ok(self.sessions().await.create_session(request).await?.into_inner().session.unwrap())
+    }
+
+    pub async fn start_until(&self, session_id: &str, step: u64) {
+        let request = pb::StartSessionRequest { session_id: session_id.into(), until_step: Some(step) };
+        self.sessions().await.start_session(request).await.unwrap();
+    }
+
+    pub async fn hash_at(&self, session_id: &str, step: u64) -> String {
+        let request = pb::GetStateHashRequest { session_id: session_id.into(), at_step: Some(step) };
+        let mut sessions = self.sessions().await;
+        let answer = tokio::time::timeout(PATIENCE, sessions.get_state_hash(request));
+        answer.await.unwrap().unwrap().into_inner().state_hash
+    }
+
+    pub async fn status(&self, session_id: &str) -> pb::Session {
+        let request = pb::GetSessionRequest { session_id: session_id.into() };
+        self.sessions().await.get_session(request).await.unwrap().into_inner().session.unwrap()
+    }
+
+    /// What it logged; ends it.
+    pub fn log(mut self) -> String {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+        let mut text = String::new();
+        self.child.stderr.take().unwrap().read_to_string(&mut text).unwrap();
+        text
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// A haptic stream.
+pub struct Touch {
+    outbound: Option<mpsc::Sender<pb::TouchRequest>>,
+    inbound: Streaming<pb::TouchResponse>,
+    pub opened: Option<pb::TouchOpened>,
+}
+
+impl Touch {
+    pub async fn open(server: &Server, open: pb::TouchOpen) -> Result<Self, Status> {
+        let (outbound, messages) = mpsc::channel(4096);
+        outbound.send(pb::TouchRequest { message: Some(Say::Open(open)) }).await.unwrap();
+        let inbound = server.haptics().await.touch(ReceiverStream::new(messages)).await?.into_inner();
+        let mut touch = Touch { outbound: Some(outbound), inbound, opened: None };
+        match touch.hear().await? {
+            Some(Heard::Opened(opened)) => touch.opened = Some(opened),
+            other => panic!("{other:?}"),
+        }
+        Ok(touch)
+    }
+
+    /// Holds tool 0 for a minute.
+    pub async fn hold(server: &Server, session_id: &str) -> Self {
+        Touch::open(server, open(session_id, &[0])).await.unwrap()
+    }
+
+    pub async fn say(&self, message: Say) {
+        self.outbound.as_ref().unwrap().send(pb::TouchRequest { message: Some(message) }).await.unwrap();
+    }
+
+    pub async fn command(&self, command: pb::Command) {
+        self.say(Say::Command(command)).await;
+    }
+
+    /// No more from this side.
+    pub fn finish(&mut self) {
+        self.outbound = None;
+    }
+
+    pub async fn hear(&mut self) -> Result<Option<Heard>, Status> {
+        let message = tokio::time::timeout(PATIENCE, self.inbound.message()).await.expect("the server is silent")?;
+        Ok(message.map(|message| message.message.unwrap()))
+    }
+
+    pub async fn sample(&mut self) -> pb::Sample {
+        loop {
+            match self.hear().await.unwrap().unwrap() {
+                Heard::Sample(sample) => return sample,
+                Heard::Rejection(rejection) => panic!("{rejection:?}"),
+                _ => {}
+            }
+        }
+    }
+
+    /// The first sample that satisfies `wanted`.
+    pub async fn sample_with(&mut self, wanted: impl Fn(&pb::Sample) -> bool) -> pb::Sample {
+        loop {
+            let sample = self.sample().await;
+            if wanted(&sample) {
+                return sample;
+            }
+        }
+    }
+
+    pub async fn rejection(&mut self) -> pb::Rejection {
+        loop {
+            if let Heard::Rejection(rejection) = self.hear().await.unwrap().unwrap() {
+                return rejection;
+            }
+        }
+    }
+
+    /// All that was said before has been taken in.
+    pub async fn settle(&mut self) {
+        self.say(Say::Renew(pb::Renew { client_time_ns: 77 })).await;
+        loop {
+            match self.hear().await.unwrap().unwrap() {
+                Heard::Renewed(renewed) => return assert_eq!(renewed.client_time_ns, 77),
+                Heard::Rejection(rejection) => panic!("{rejection:?}"),
+                _ => {}
+            }
+        }
+    }
+}
+
+pub fn open(session_id: &str, tools: &[u32]) -> pb::TouchOpen {
+    pb::TouchOpen {
+        session_id: session_id.into(),
+        tools: tools.to_vec(),
+        lease_s: Some(60.0),
+        holder: "test".into(),
+        ..Default::default()
+    }
+}
+
+pub fn force(tool: u32, sequence: u64, z_n: f64) -> pb::Command {
+    let force = pb::Force {
+        centre: Some(pb::force::Centre::Point(pb::GridPoint { x: 15, y: 15 })),
+        force_n: Some(pb::Vector3 { x: 0.0, y: 0.0, z: z_n }),
+        falloff_per_m: 150.0,
+        falloff_offset: 0.0,
+    };
+    pb::Command { tool, sequence, action: Some(pb::command::Action::Force(force)), ..Default::default() }
+}
+
+pub fn position(tool: u32, sequence: u64, z_m: f64) -> pb::Command {
+    let position = pb::Position {
+        point: Some(pb::GridPoint { x: 15, y: 15 }),
+        target: Some(pb::position::Target::DisplacementM(pb::Vector3 { x: 0.0, y: 0.0, z: z_m })),
+    };
+    pb::Command { tool, sequence, action: Some(pb::command::Action::Position(position)), ..Default::default() }
+}
+
+/// Code, reason and field of an error.
+pub fn told(status: &Status) -> (Code, String, String) {
+    let info = status.get_details_error_info().unwrap_or_else(|| panic!("{status:?}"));
+    assert_eq!(info.domain, "palpate");
+    (status.code(), info.reason, info.metadata.get("field").cloned().unwrap_or_default())
+}

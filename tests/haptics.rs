@@ -1,0 +1,481 @@
+//! Touching over the network: commands, samples, leases, probes.
+#![allow(clippy::unwrap_used)]
+
+#[path = "common/server.rs"]
+mod server;
+
+use palpate::wire::pb;
+use pb::command::Action;
+use pb::touch_response::Message as Heard;
+use server::{PATIENCE, Server, Touch, force, open, position, told};
+use tonic::Code;
+
+#[tokio::test]
+async fn a_force_is_felt_and_acknowledged() {
+    let server = Server::start(&[]);
+    let session = server.paper(false).await;
+    let mut touch = Touch::hold(&server, &session).await;
+    let mut command = force(0, 7, -1.0);
+    command.client_time_ns = 123;
+    touch.command(command).await;
+    let sample = touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == 7).await;
+    assert_eq!(sample.tools[0].client_time_ns, 123);
+    assert!(sample.tools[0].server_hold_ns > 0);
+    let first_step = sample.step;
+    let later = touch.sample_with(|sample| sample.step > first_step + 600).await;
+    let tool = &later.tools[0];
+    assert_eq!(tool.point, Some(pb::GridPoint { x: 15, y: 15 }));
+    let (depth_m, reaction_n) = (tool.displacement_m.unwrap().z, tool.force_on_tool_n.unwrap().z);
+    assert!(depth_m < -0.03 && (0.9..1.1).contains(&reaction_n), "{depth_m} m, {reaction_n} N");
+    assert_eq!(tool.applied_force_n.unwrap().z, -1.0);
+    assert_eq!((later.awake_points, later.held), (961, false));
+}
+
+#[tokio::test]
+async fn bad_commands_are_refused_with_a_reason_and_change_nothing() {
+    let server = Server::start(&[]);
+    let (session, untouched) = (server.paper(true).await, server.paper(true).await);
+    let mut touch = Touch::hold(&server, &session).await;
+    type Change = fn(&mut pb::Command);
+    fn force_of(command: &mut pb::Command) -> &mut pb::Force {
+        let Some(Action::Force(force)) = &mut command.action else { unreachable!() };
+        force
+    }
+    fn to_position(command: &mut pb::Command, position: pb::Position) {
+        command.action = Some(Action::Position(position));
+    }
+    let cases: [(Change, &str, &str); 17] = [
+        (|c| force_of(c).force_n.as_mut().unwrap().x = f64::NAN, "NOT_FINITE", "force.force_n"),
+        (|c| force_of(c).force_n.as_mut().unwrap().z = f64::INFINITY, "NOT_FINITE", "force.force_n"),
+        (|c| force_of(c).force_n.as_mut().unwrap().z = 1.1e4, "FORCE_TOO_LARGE", "force.force_n"),
+        (|c| force_of(c).falloff_offset = 10.0, "FORCE_TOO_LARGE", "force.force_n"),
+        (|c| force_of(c).falloff_offset = 1e9, "FORCE_TOO_LARGE", "force.force_n"),
+        (|c| force_of(c).falloff_offset = f64::NAN, "NOT_FINITE", "force.falloff_offset"),
+        (|c| force_of(c).falloff_per_m = -1.0, "OUT_OF_RANGE", "force.falloff_per_m"),
+        (|c| force_of(c).centre = None, "MISSING", "force.centre"),
+        (
+            |c| force_of(c).centre = Some(pb::force::Centre::Point(pb::GridPoint { x: 31, y: 0 })),
+            "OFF_SHEET",
+            "force.point",
+        ),
+        (
+            |c| force_of(c).centre = Some(pb::force::Centre::CentreM(pb::Vector2 { x: 1.5, y: 0.5 })),
+            "OFF_SHEET",
+            "force.centre_m",
+        ),
+        (
+            |c| force_of(c).centre = Some(pb::force::Centre::CentreM(pb::Vector2 { x: f64::NAN, y: 0.5 })),
+            "NOT_FINITE",
+            "force.centre_m",
+        ),
+        (|c| c.action = None, "MISSING", "action"),
+        (|c| c.time_to_live_s = Some(0.0), "OUT_OF_RANGE", "time_to_live_s"),
+        (|c| c.tool = 1, "NOT_HOLDER", "lease_id"),
+        (|c| to_position(c, pb::Position::default()), "MISSING", "position.point"),
+        (
+            |c| {
+                let point = Some(pb::GridPoint { x: 0, y: 99 });
+                let target = Some(pb::position::Target::DisplacementM(pb::Vector3::default()));
+                to_position(c, pb::Position { point, target });
+            },
+            "OFF_SHEET",
+            "position.point",
+        ),
+        (
+            |c| {
+                let point = Some(pb::GridPoint { x: 1, y: 1 });
+                let target = Some(pb::position::Target::PositionM(pb::Vector3 { x: 1e6, y: 0.0, z: 0.0 }));
+                to_position(c, pb::Position { point, target });
+            },
+            "OUT_OF_RANGE",
+            "position.displacement_m",
+        ),
+    ];
+    for (index, (change, reason, field)) in cases.into_iter().enumerate() {
+        let mut command = force(0, 100 + index as u64, -1.0);
+        change(&mut command);
+        touch.command(command).await;
+        let rejection = touch.rejection().await;
+        assert_eq!((rejection.reason.as_str(), rejection.field.as_str()), (reason, field), "{}", rejection.message);
+        assert_eq!(rejection.sequence, 100 + index as u64);
+        assert!(rejection.message.contains(field) || reason == "NOT_HOLDER", "{}", rejection.message);
+    }
+    // Nothing acted: both sessions are the same after some steps.
+    server.start_until(&session, 50).await;
+    server.start_until(&untouched, 50).await;
+    assert_eq!(server.hash_at(&session, 50).await, server.hash_at(&untouched, 50).await);
+    // And a good command is still taken.
+    touch.command(force(0, 200, -1.0)).await;
+    touch.settle().await;
+}
+
+#[tokio::test]
+async fn stale_sequences_are_refused() {
+    let server = Server::start(&[]);
+    let session = server.paper(false).await;
+    let mut touch = Touch::hold(&server, &session).await;
+    touch.command(force(0, 10, -1.0)).await;
+    for stale in [10, 9, 0] {
+        touch.command(force(0, stale, -2.0)).await;
+        let rejection = touch.rejection().await;
+        assert_eq!((rejection.reason.as_str(), rejection.sequence), ("STALE_SEQUENCE", stale));
+    }
+    touch.command(force(0, 11, -0.5)).await;
+    let sample = touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == 11).await;
+    let later = touch.sample_with(|later| later.step > sample.step).await;
+    assert_eq!(later.tools[0].applied_force_n.unwrap().z, -0.5);
+}
+
+#[tokio::test]
+async fn a_tool_has_one_holder_until_it_is_let_go() {
+    let server = Server::start(&[]);
+    let session = server.paper(false).await;
+    let mut first = Touch::hold(&server, &session).await;
+    let refused = Touch::open(&server, open(&session, &[1, 0])).await.err().unwrap();
+    assert_eq!(told(&refused), (Code::AlreadyExists, "TOOL_HELD".into(), "tool".into()));
+    assert!(refused.message().contains("held by `test`"), "{}", refused.message());
+    let mut haptics = server.haptics().await;
+    let acquire = pb::AcquireToolRequest { session_id: session.clone(), tool: 0, ..Default::default() };
+    assert_eq!(told(&haptics.acquire_tool(acquire.clone()).await.unwrap_err()).1, "TOOL_HELD");
+    // Tool 1 was not taken by the stream that was refused.
+    drop(Touch::open(&server, open(&session, &[1])).await.unwrap());
+
+    first.command(force(0, 1, -1.0)).await;
+    first.sample_with(|sample| sample.tools[0].acknowledged_sequence == 1).await;
+    // The end of a stream lets go, and ends the force.
+    first.finish();
+    while first.hear().await.unwrap().is_some() {}
+    let lease = haptics.acquire_tool(acquire).await.unwrap().into_inner();
+    assert!(lease.lease_s > 0.0);
+    let request = pb::SendCommandsRequest { session_id: session, lease_id: lease.lease_id, commands: vec![] };
+    let sample = haptics.send_commands(request).await.unwrap().into_inner().sample.unwrap();
+    assert_eq!(sample.tools[0].applied_force_n, Some(pb::Vector3::default()));
+}
+
+#[tokio::test]
+async fn a_client_that_vanishes_leaves_no_force_behind() {
+    let server = Server::start(&[]);
+    let session = server.paper(false).await;
+    let mut watcher = Touch::open(&server, open(&session, &[])).await.unwrap();
+    let touch = Touch::hold(&server, &session).await;
+    touch.command(force(0, 1, -1.0)).await;
+    let pushed = |sample: &pb::Sample| sample.tools.iter().any(|tool| tool.applied_force_n.unwrap().z != 0.0);
+    watcher.sample_with(pushed).await;
+    drop(touch);
+    watcher.sample_with(|sample| !pushed(sample)).await;
+    assert!(server.status(&session).await.held_tools.is_empty());
+}
+
+#[tokio::test]
+async fn a_lease_lapses_by_itself_and_ends_what_the_tool_did() {
+    let server = Server::start(&[]);
+    let session = server.paper(false).await;
+    let mut touch = Touch::open(&server, pb::TouchOpen { lease_s: Some(0.2), ..open(&session, &[0]) }).await.unwrap();
+    touch.command(force(0, 1, -1.0)).await;
+    touch.sample_with(|sample| sample.tools[0].applied_force_n.is_some_and(|force| force.z == -1.0)).await;
+    // No word from the holder, though it reads on.
+    let sample = touch.sample_with(|sample| sample.tools[0].expired).await;
+    touch.sample_with(|later| later.step > sample.step && later.tools[0].applied_force_n.unwrap().z == 0.0).await;
+    assert_eq!(server.status(&session).await.lapsed_leases, 1);
+    touch.command(force(0, 2, -1.0)).await;
+    assert_eq!(touch.rejection().await.reason, "NOT_HOLDER");
+}
+
+#[tokio::test]
+async fn a_command_outlives_its_time_by_no_step() {
+    let server = Server::start(&[]);
+    let session = server.paper(true).await;
+    let mut touch = Touch::hold(&server, &session).await;
+    let command = pb::Command { at_step: Some(10), time_to_live_s: Some(0.02), ..force(0, 1, -1.0) };
+    touch.command(command).await;
+    touch.settle().await;
+    server.start_until(&session, 40).await;
+    for _ in 0..40 {
+        let sample = touch.sample().await;
+        // The forces of a sample are those of the step that it ends.
+        let acts = (11..=30).contains(&sample.step);
+        let applied = sample.tools[0].applied_force_n.map_or(0.0, |force| force.z);
+        assert_eq!(applied, if acts { -1.0 } else { 0.0 }, "step {}", sample.step);
+        assert_eq!(sample.tools[0].expired, sample.step > 30);
+        if sample.step == 40 {
+            return;
+        }
+    }
+}
+
+#[tokio::test]
+async fn commands_act_at_their_step_and_late_ones_are_told() {
+    let server = Server::start(&[]);
+    let session = server.paper(true).await;
+    let mut touch = Touch::hold(&server, &session).await;
+    touch.command(pb::Command { at_step: Some(20), ..force(0, 1, -1.0) }).await;
+    touch.settle().await;
+    server.start_until(&session, 30).await;
+    let acknowledged = touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == 1).await;
+    assert_eq!((acknowledged.step, acknowledged.tools[0].late), (21, false));
+    touch.sample_with(|sample| sample.step == 30).await;
+    // Step 5 is over: it acts at the next one, and that is said.
+    touch.command(pb::Command { at_step: Some(5), ..force(0, 2, -0.5) }).await;
+    touch.settle().await;
+    server.start_until(&session, 40).await;
+    let late = touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == 2).await;
+    assert_eq!((late.step, late.tools[0].late, late.late_commands), (31, true, 1));
+    assert_eq!(server.status(&session).await.late_commands, 1);
+}
+
+#[tokio::test]
+async fn a_position_is_reached_by_the_end_of_its_step_and_the_latest_wins() {
+    let server = Server::start(&[]);
+    let session = server.paper(true).await;
+    let mut touch = Touch::hold(&server, &session).await;
+    // Far more than a queue would hold: each replaces the one before.
+    for sequence in 1..=20_000 {
+        touch.command(position(0, sequence, -0.01 * (sequence % 7) as f64)).await;
+    }
+    touch.command(position(0, 20_001, -0.004)).await;
+    touch.settle().await;
+    server.start_until(&session, 10).await;
+    let sample = touch.sample_with(|sample| sample.tools[0].acknowledged_sequence > 0).await;
+    let tool = &sample.tools[0];
+    assert_eq!((sample.step, tool.acknowledged_sequence), (1, 20_001));
+    assert!((tool.displacement_m.unwrap().z + 0.004).abs() < 1e-9);
+    assert!((tool.velocity_m_per_s.unwrap().z + 4.0).abs() < 1e-6);
+    let later = touch.sample_with(|sample| sample.step == 10).await;
+    assert!((later.tools[0].displacement_m.unwrap().z + 0.004).abs() < 1e-9);
+    assert_eq!(later.tools[0].velocity_m_per_s.unwrap().z, 0.0);
+    assert!(later.tools[0].force_on_tool_n.unwrap().z > 0.0);
+}
+
+#[tokio::test]
+async fn a_full_queue_refuses_and_keeps_what_it_has() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = folder.path().join("palpate.toml");
+    std::fs::write(&config, "[limits]\nqueued_commands = 5\n").unwrap();
+    let server = Server::start(&["--config", config.to_str().unwrap()]);
+    let session = server.paper(true).await;
+    let mut touch = Touch::hold(&server, &session).await;
+    for sequence in 1..=8 {
+        touch.command(pb::Command { at_step: Some(sequence), ..force(0, sequence, -(sequence as f64)) }).await;
+    }
+    for sequence in 6..=8 {
+        let rejection = touch.rejection().await;
+        assert_eq!((rejection.reason.as_str(), rejection.sequence), ("QUEUE_FULL", sequence));
+    }
+    server.start_until(&session, 10).await;
+    let sample = touch.sample_with(|sample| sample.step == 10).await;
+    assert_eq!(sample.tools[0].acknowledged_sequence, 5);
+}
+
+#[tokio::test]
+async fn a_unary_batch_is_taken_whole_or_not_at_all() {
+    let server = Server::start(&[]);
+    let session = server.paper(false).await;
+    let mut haptics = server.haptics().await;
+    let acquire = pb::AcquireToolRequest { session_id: session.clone(), tool: 3, ..Default::default() };
+    let lease_id = haptics.acquire_tool(acquire).await.unwrap().into_inner().lease_id;
+    let batch = |commands: Vec<pb::Command>| pb::SendCommandsRequest {
+        session_id: session.clone(),
+        lease_id: lease_id.clone(),
+        commands,
+    };
+    let refused = haptics.send_commands(batch(vec![force(3, 1, -1.0), force(3, 2, f64::NAN)])).await.unwrap_err();
+    assert_eq!(told(&refused), (Code::InvalidArgument, "NOT_FINITE".into(), "force.force_n".into()));
+    let refused = haptics.send_commands(batch(vec![force(3, 5, -1.0), force(3, 4, -1.0)])).await.unwrap_err();
+    assert_eq!(told(&refused).1, "STALE_SEQUENCE");
+    // Sequence 1 is free: nothing of the refused batches was taken.
+    let taken = haptics.send_commands(batch(vec![force(3, 1, -1.0), force(3, 2, -0.25)])).await.unwrap().into_inner();
+    let tool = taken.sample.unwrap().tools[0];
+    assert_eq!((tool.tool, tool.acknowledged_sequence, tool.applied_force_n.unwrap().z), (3, 2, -0.25));
+    let stolen = pb::SendCommandsRequest { lease_id: "1".into(), ..batch(vec![force(3, 9, -1.0)]) };
+    assert_eq!(told(&haptics.send_commands(stolen).await.unwrap_err()).0, Code::PermissionDenied);
+    let release = pb::ReleaseToolRequest { session_id: session.clone(), lease_id: lease_id.clone() };
+    haptics.release_tool(release).await.unwrap();
+    assert_eq!(told(&haptics.send_commands(batch(vec![])).await.unwrap_err()).1, "NOT_HOLDER");
+}
+
+#[tokio::test]
+async fn a_stream_must_begin_with_open_and_only_once() {
+    let server = Server::start(&[]);
+    let session = server.paper(false).await;
+    for (open, code, reason, field) in [
+        (open("nobody", &[0]), Code::NotFound, "UNKNOWN_SESSION", "session_id"),
+        (open(&session, &[64]), Code::InvalidArgument, "OUT_OF_RANGE", "tool"),
+        (open(&session, &[1, 1]), Code::InvalidArgument, "OUT_OF_RANGE", "tools"),
+        (
+            pb::TouchOpen { sample_every_steps: Some(0), ..open(&session, &[0]) },
+            Code::InvalidArgument,
+            "OUT_OF_RANGE",
+            "sample_every_steps",
+        ),
+        (
+            pb::TouchOpen { lease_s: Some(f64::NAN), ..open(&session, &[0]) },
+            Code::InvalidArgument,
+            "NOT_FINITE",
+            "lease_s",
+        ),
+    ] {
+        let refused = Touch::open(&server, open).await.err().unwrap();
+        assert_eq!(told(&refused), (code, reason.into(), field.into()));
+    }
+    let mut touch = Touch::hold(&server, &session).await;
+    touch.say(pb::touch_request::Message::Open(open(&session, &[2]))).await;
+    let refused = loop {
+        match touch.hear().await {
+            Ok(Some(_)) => {}
+            Ok(None) => panic!("the stream ended without a reason"),
+            Err(status) => break status,
+        }
+    };
+    assert_eq!(told(&refused).1, "OUT_OF_TURN");
+}
+
+#[tokio::test]
+async fn every_nth_sample_comes_and_watchers_see_all_tools() {
+    let server = Server::start(&[]);
+    let session = server.paper(false).await;
+    let wanted = pb::TouchOpen { sample_every_steps: Some(5), ..open(&session, &[0, 4]) };
+    let mut touch = Touch::open(&server, wanted).await.unwrap();
+    touch.command(force(4, 1, -1.0)).await;
+    let mut last = 0;
+    for _ in 0..20 {
+        let sample = touch.sample().await;
+        assert!(sample.step.is_multiple_of(5) && sample.step > last);
+        assert_eq!(sample.tools.iter().map(|tool| tool.tool).collect::<Vec<_>>(), [0, 4]);
+        last = sample.step;
+    }
+    let request = pb::WatchSamplesRequest { session_id: session.clone(), sample_every_steps: None };
+    let mut watched = server.haptics().await.watch_samples(request).await.unwrap().into_inner();
+    let sample = watched.message().await.unwrap().unwrap().sample.unwrap();
+    assert_eq!(sample.tools.iter().map(|tool| tool.tool).collect::<Vec<_>>(), [4]);
+    let refused = pb::WatchSamplesRequest { session_id: session, sample_every_steps: Some(0) };
+    assert_eq!(told(&server.haptics().await.watch_samples(refused).await.unwrap_err()).2, "sample_every_steps");
+}
+
+#[tokio::test]
+async fn probes_tell_every_part_of_the_force_from_step_0_on() {
+    let server = Server::start(&[]);
+    let session = server.paper(true).await;
+    let points = [(15, 15), (16, 15), (0, 0)].map(|(x, y)| pb::GridPoint { x, y }).to_vec();
+    let request = pb::ProbeRequest {
+        session_id: session.clone(),
+        r#where: Some(pb::probe_request::Where::Points(pb::GridPoints { points: points.clone() })),
+        every_steps: Some(10),
+        energy: true,
+    };
+    let mut haptics = server.haptics().await;
+    let mut records = haptics.probe(request.clone()).await.unwrap().into_inner();
+    let mut touch = Touch::hold(&server, &session).await;
+    touch.command(pb::Command { at_step: Some(0), ..force(0, 1, -1.0) }).await;
+    touch.settle().await;
+    server.start_until(&session, 100).await;
+    for expected in (0..=100).step_by(10) {
+        let record = tokio::time::timeout(PATIENCE, records.message()).await.unwrap().unwrap().unwrap();
+        assert_eq!((record.step, record.last, record.dropped_records), (expected, true, 0));
+        let named: Vec<_> = record.points.iter().map(|point| point.point.unwrap()).collect();
+        assert_eq!(named, points);
+        let centre = &record.points[0];
+        // Also at step 0: the force acts, and nothing has moved yet.
+        assert_eq!(centre.applied_n.unwrap().z, -1.0);
+        assert_eq!(centre.displacement_m.unwrap().z < 0.0, expected > 0);
+        let z = |v: &Option<pb::Vector3>| v.unwrap().z;
+        let sum = z(&centre.spring_n) + z(&centre.virtual_n) + z(&centre.damping_n);
+        assert!((z(&centre.reaction_n) - sum).abs() < 1e-12);
+        assert_eq!(record.energy.unwrap().virtual_j > 0.0, expected > 0);
+    }
+    for (request, field) in [
+        (pb::ProbeRequest { every_steps: Some(0), ..request.clone() }, "every_steps"),
+        (pb::ProbeRequest { r#where: None, ..request.clone() }, "where"),
+        (
+            pb::ProbeRequest {
+                r#where: Some(pb::probe_request::Where::Points(pb::GridPoints {
+                    points: vec![pb::GridPoint { x: 31, y: 0 }],
+                })),
+                ..request
+            },
+            "points[0]",
+        ),
+    ] {
+        assert_eq!(told(&haptics.probe(request).await.unwrap_err()).2, field);
+    }
+}
+
+#[tokio::test]
+async fn a_record_of_all_points_comes_in_parts() {
+    let server = Server::start(&[]);
+    let mut scene = paper_scene();
+    scene.sheet.as_mut().unwrap().points_x = Some(70);
+    let session = server.create(pb::create_session_request::Source::Scene(scene), true).await.unwrap().session_id;
+    let request = pb::ProbeRequest {
+        session_id: session.clone(),
+        r#where: Some(pb::probe_request::Where::AllPoints(true)),
+        ..Default::default()
+    };
+    let mut records = server.haptics().await.probe(request).await.unwrap().into_inner();
+    server.start_until(&session, 1).await;
+    let (mut points, mut parts) = (Vec::new(), 0);
+    loop {
+        let part = tokio::time::timeout(PATIENCE, records.message()).await.unwrap().unwrap().unwrap();
+        assert_eq!(part.step, 0);
+        parts += 1;
+        points.extend(part.points.iter().map(|point| point.point.unwrap()));
+        if part.last {
+            break;
+        }
+    }
+    assert_eq!((points.len(), parts), (70 * 31, 3));
+    assert_eq!(points[71], pb::GridPoint { x: 2, y: 9 });
+}
+
+fn paper_scene() -> pb::Scene {
+    let limits = palpate::limits::Limits::default();
+    let paper = palpate::scene::Scene::parse("paper", palpate::scene::PAPER, &[], &limits).unwrap();
+    palpate::wire::scene::scene(&paper)
+}
+
+#[tokio::test]
+async fn a_session_that_blows_up_is_held_with_a_reason_and_sends_no_nan() {
+    let server = Server::start(&["--log", "warn"]);
+    let mut scene = paper_scene();
+    scene.springs.as_mut().unwrap().stiffness_n_per_m = Some(1e6);
+    scene.springs.as_mut().unwrap().shear_stiffness_n_per_m = None;
+    scene.stepping.as_mut().unwrap().substeps = Some(1);
+    let session = server.create(pb::create_session_request::Source::Scene(scene), true).await.unwrap().session_id;
+    let mut touch = Touch::hold(&server, &session).await;
+    touch.command(force(0, 1, -1.0)).await;
+    touch.settle().await;
+    server.start_until(&session, 5000).await;
+    let waiting = tokio::spawn({
+        let mut sessions = server.sessions().await;
+        let request = pb::GetStateHashRequest { session_id: session.clone(), at_step: Some(5000) };
+        async move { sessions.get_state_hash(request).await }
+    });
+    let held = loop {
+        let sample = touch.sample().await;
+        for tool in &sample.tools {
+            for v in [tool.displacement_m, tool.velocity_m_per_s, tool.force_on_tool_n].into_iter().flatten() {
+                assert!(v.x.is_finite() && v.y.is_finite() && v.z.is_finite(), "{tool:?}");
+            }
+        }
+        if sample.held {
+            break sample;
+        }
+    };
+    assert!(held.step < 5000);
+    let refused = waiting.await.unwrap().unwrap_err();
+    assert_eq!(told(&refused).1, "SESSION_HELD");
+    let status = server.status(&session).await;
+    assert_eq!(status.state(), pb::SessionState::Held);
+    assert!(status.hold_reason.contains("not finite"), "{}", status.hold_reason);
+    touch.command(force(0, 2, -1.0)).await;
+    let rejection = loop {
+        if let Some(Heard::Rejection(rejection)) = touch.hear().await.unwrap() {
+            break rejection;
+        }
+    };
+    assert_eq!(rejection.reason, "SESSION_HELD");
+    // Others live on.
+    let other = server.paper(true).await;
+    server.start_until(&other, 5).await;
+    server.hash_at(&other, 5).await;
+    assert!(server.log().contains("session held"));
+}

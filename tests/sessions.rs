@@ -1,0 +1,320 @@
+//! The life of sessions and of the server.
+#![allow(clippy::unwrap_used)]
+
+#[path = "common/server.rs"]
+mod server;
+
+use std::process::{Command, Output};
+
+use palpate::wire::pb;
+use pb::create_session_request::Source;
+use server::{PATIENCE, Server, Touch, force, open, told};
+use tonic::Code;
+
+fn paper() -> pb::Scene {
+    let limits = palpate::limits::Limits::default();
+    let paper = palpate::scene::Scene::parse("paper", palpate::scene::PAPER, &[], &limits).unwrap();
+    palpate::wire::scene::scene(&paper)
+}
+
+fn palpate(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_palpate"))
+        .args(arguments)
+        .current_dir(env!("CARGO_MANIFEST_DIR"))
+        .output()
+        .unwrap()
+}
+
+#[tokio::test]
+async fn sessions_are_made_listed_and_deleted() {
+    let server = Server::start(&[]);
+    let mut sessions = server.sessions().await;
+    let names = sessions.list_scenes(pb::ListScenesRequest {}).await.unwrap().into_inner().scene_names;
+    assert!(names.contains(&"paper".to_owned()), "{names:?}");
+    let by_name = server.create(Source::SceneName("paper".into()), false).await.unwrap();
+    assert_eq!(by_name.scene, Some(paper()));
+    let mut own = paper();
+    own.name = "own".into();
+    own.stepping = Some(pb::Stepping { precision: "f64".into(), ..Default::default() });
+    let own = server.create(Source::Scene(own), true).await.unwrap();
+    assert_eq!((own.precision.as_str(), own.integrator.as_str(), own.substeps), ("f64", "central", 1));
+    assert_eq!((by_name.state(), own.state()), (pb::SessionState::Running, pb::SessionState::Paused));
+    let listed = sessions.list_sessions(pb::ListSessionsRequest {}).await.unwrap().into_inner().sessions;
+    let ids: Vec<_> = listed.iter().map(|session| session.session_id.clone()).collect();
+    assert_eq!(ids, [by_name.session_id.clone(), own.session_id.clone()]);
+    // Deleting tells every stream.
+    let mut touch = Touch::hold(&server, &own.session_id).await;
+    let request = pb::DeleteSessionRequest { session_id: own.session_id.clone() };
+    sessions.delete_session(request.clone()).await.unwrap();
+    let ended = loop {
+        if let Err(status) = touch.hear().await {
+            break status;
+        }
+    };
+    assert_eq!(told(&ended), (Code::NotFound, "SESSION_DELETED".into(), "session_id".into()));
+    let again = sessions.delete_session(request).await.unwrap_err();
+    assert_eq!(told(&again), (Code::NotFound, "UNKNOWN_SESSION".into(), "session_id".into()));
+    assert_eq!(sessions.list_sessions(pb::ListSessionsRequest {}).await.unwrap().into_inner().sessions.len(), 1);
+}
+
+#[tokio::test]
+async fn bad_scenes_are_refused_with_the_field() {
+    let server = Server::start(&[]);
+    type Change = fn(&mut pb::Scene);
+    let cases: [(Change, Code, &str, &str); 13] = [
+        (|s| s.sheet.as_mut().unwrap().points_x = Some(0), Code::InvalidArgument, "OUT_OF_RANGE", "sheet.points"),
+        (
+            |s| s.sheet.as_mut().unwrap().points_y = Some(1_000_000_000),
+            Code::ResourceExhausted,
+            "TOO_LARGE",
+            "sheet.points",
+        ),
+        (
+            |s| s.sheet.as_mut().unwrap().spacing_m = Some(f64::NAN),
+            Code::InvalidArgument,
+            "NOT_FINITE",
+            "sheet.spacing_m",
+        ),
+        (
+            |s| s.sheet.as_mut().unwrap().point_mass_kg = Some(0.0),
+            Code::InvalidArgument,
+            "OUT_OF_RANGE",
+            "sheet.point_mass_kg",
+        ),
+        (|s| s.sheet = None, Code::InvalidArgument, "MISSING", "scene.sheet"),
+        (
+            |s| s.springs.as_mut().unwrap().stiffness_n_per_m = Some(-1.0),
+            Code::InvalidArgument,
+            "OUT_OF_RANGE",
+            "springs.stiffness_n_per_m",
+        ),
+        (
+            |s| s.damping.as_mut().unwrap().coefficient_n_s_per_m = Some(f64::INFINITY),
+            Code::InvalidArgument,
+            "NOT_FINITE",
+            "damping.coefficient_n_s_per_m",
+        ),
+        (
+            |s| s.stepping.as_mut().unwrap().rate_hz = Some(0.0),
+            Code::InvalidArgument,
+            "OUT_OF_RANGE",
+            "stepping.rate_hz",
+        ),
+        (
+            |s| s.stepping.as_mut().unwrap().rate_hz = Some(1e6),
+            Code::InvalidArgument,
+            "OUT_OF_RANGE",
+            "stepping.rate_hz",
+        ),
+        (
+            |s| s.stepping.as_mut().unwrap().integrator = "magic".into(),
+            Code::InvalidArgument,
+            "WRONG_KIND",
+            "scene.stepping.integrator",
+        ),
+        (
+            |s| s.stepping.as_mut().unwrap().substeps = Some(0),
+            Code::InvalidArgument,
+            "OUT_OF_RANGE",
+            "stepping.substeps",
+        ),
+        (
+            |s| {
+                let points = vec![pb::GridPoint { x: 40, y: 0 }];
+                s.sheet.as_mut().unwrap().fixed = Some(pb::sheet::Fixed::FixedPoints(pb::GridPoints { points }));
+            },
+            Code::InvalidArgument,
+            "OFF_SHEET",
+            "sheet.fixed[0]",
+        ),
+        (
+            |s| s.springs.as_mut().unwrap().stiffness_n_per_m = Some(1e12),
+            Code::ResourceExhausted,
+            "TOO_LARGE",
+            "stepping.substeps",
+        ),
+    ];
+    for (change, code, reason, field) in cases {
+        let mut scene = paper();
+        change(&mut scene);
+        let status = server.create(Source::Scene(scene), false).await.unwrap_err();
+        assert_eq!(told(&status), (code, reason.into(), field.into()), "{}", status.message());
+    }
+    for name in ["nothing", "../scenes/paper", ""] {
+        let status = server.create(Source::SceneName(name.into()), false).await.unwrap_err();
+        assert_eq!(told(&status), (Code::NotFound, "UNKNOWN_SCENE".into(), "scene_name".into()));
+    }
+    let nothing = pb::CreateSessionRequest { source: None, paused: false };
+    let status = server.sessions().await.create_session(nothing).await.unwrap_err();
+    assert_eq!(told(&status).1, "MISSING");
+    // The server lives on, and made nothing of all this.
+    let listed = server.sessions().await.list_sessions(pb::ListSessionsRequest {}).await.unwrap().into_inner();
+    assert!(listed.sessions.is_empty());
+}
+
+#[tokio::test]
+async fn a_paused_session_stands_and_a_started_one_goes_as_far_as_it_should() {
+    let server = Server::start(&[]);
+    let session = server.paper(true).await;
+    server.start_until(&session, 25).await;
+    let hash = server.hash_at(&session, 25).await;
+    let status = server.status(&session).await;
+    assert_eq!((status.step, status.state()), (25, pb::SessionState::Paused));
+    assert_eq!(status.simulation_time_s, 0.025);
+    assert_eq!(server.hash_at(&session, 25).await, hash);
+    let mut sessions = server.sessions().await;
+    let request = pb::GetStateHashRequest { session_id: session.clone(), at_step: Some(24) };
+    let status = sessions.get_state_hash(request).await.unwrap_err();
+    assert_eq!(told(&status), (Code::OutOfRange, "STEP_PASSED".into(), "at_step".into()));
+    let request = pb::StartSessionRequest { session_id: session.clone(), until_step: Some(25) };
+    assert_eq!(told(&sessions.start_session(request).await.unwrap_err()).2, "until_step");
+    // For ever, until paused.
+    let request = pb::StartSessionRequest { session_id: session.clone(), until_step: None };
+    assert_eq!(sessions.start_session(request).await.unwrap().into_inner().step, 25);
+    server.hash_at(&session, 60).await;
+    sessions.pause_session(pb::PauseSessionRequest { session_id: session.clone() }).await.unwrap();
+    let request = pb::GetStateHashRequest { session_id: session.clone(), at_step: None };
+    let first = sessions.get_state_hash(request.clone()).await.unwrap().into_inner();
+    tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+    assert_eq!(sessions.get_state_hash(request).await.unwrap().into_inner(), first);
+}
+
+#[tokio::test]
+async fn the_same_scene_and_commands_give_the_same_hash_on_any_number_of_threads() {
+    let mut hashes = Vec::new();
+    for threads in ["1", "3"] {
+        let server = Server::start(&["--threads", threads]);
+        // Other sessions make other schedules.
+        for _ in 0..5 {
+            server.paper(false).await;
+        }
+        let session = server.paper(true).await;
+        let mut touch = Touch::hold(&server, &session).await;
+        for step in 0..200 {
+            let command = force(0, step + 1, -1.0 - 0.001 * step as f64);
+            touch.command(pb::Command { at_step: Some(step), ..command }).await;
+        }
+        touch.settle().await;
+        server.start_until(&session, 250).await;
+        hashes.push(server.hash_at(&session, 250).await);
+        assert_eq!(server.status(&session).await.late_commands, 0);
+    }
+    assert_eq!(hashes[0], hashes[1]);
+}
+
+#[tokio::test]
+async fn sessions_and_streams_have_a_limit() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = folder.path().join("palpate.toml");
+    std::fs::write(&config, "threads = 1\n[limits]\nsessions = 2\nstreams_per_session = 1\n").unwrap();
+    let server = Server::start(&["--config", config.to_str().unwrap()]);
+    let session = server.paper(true).await;
+    server.paper(true).await;
+    let status = server.create(Source::SceneName("paper".into()), true).await.unwrap_err();
+    assert_eq!(told(&status), (Code::ResourceExhausted, "TOO_MANY".into(), String::new()));
+    let touch = Touch::hold(&server, &session).await;
+    let refused = Touch::open(&server, open(&session, &[1])).await.err().unwrap();
+    assert_eq!(told(&refused).1, "TOO_MANY");
+    // Room again when a stream has ended.
+    drop(touch);
+    let until = std::time::Instant::now() + PATIENCE;
+    while Touch::open(&server, open(&session, &[1])).await.is_err() {
+        assert!(std::time::Instant::now() < until);
+        tokio::time::sleep(std::time::Duration::from_millis(10)).await;
+    }
+}
+
+#[tokio::test]
+async fn health_is_served() {
+    let server = Server::start(&[]);
+    let mut health = tonic_health::pb::health_client::HealthClient::new(server.channel().await);
+    for service in ["", "palpate.v1.SessionService", "palpate.v1.HapticService", "palpate.v1.ViewService"] {
+        let request = tonic_health::pb::HealthCheckRequest { service: service.into() };
+        assert_eq!(health.check(request).await.unwrap().into_inner().status, 1, "{service}");
+    }
+}
+
+#[cfg(unix)]
+#[tokio::test]
+async fn shutdown_tells_open_streams_and_ends_within_the_deadline() {
+    let mut server = Server::start(&["--shutdown-deadline-s", "20"]);
+    let session = server.paper(false).await;
+    let mut touch = Touch::hold(&server, &session).await;
+    touch.command(force(0, 1, -1.0)).await;
+    touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == 1).await;
+    let started = std::time::Instant::now();
+    let killed = Command::new("kill").arg(server.child.id().to_string()).status().unwrap();
+    assert!(killed.success());
+    let ended = loop {
+        if let Err(status) = touch.hear().await {
+            break status;
+        }
+    };
+    assert_eq!(told(&ended), (Code::Unavailable, "SHUTTING_DOWN".into(), String::new()));
+    drop(touch);
+    let status = tokio::task::spawn_blocking(move || server.child.wait().unwrap()).await.unwrap();
+    assert!(status.success());
+    // Well before the streams would have been cut.
+    assert!(started.elapsed().as_secs() < 15);
+}
+
+#[cfg(unix)]
+#[tokio::test]
+async fn a_stream_that_will_not_end_is_cut_at_the_deadline() {
+    let mut server = Server::start(&["--shutdown-deadline-s", "0.3"]);
+    let session = server.paper(true).await;
+    // A connection that holds a stream open and reads nothing of it.
+    let request = pb::WatchFramesRequest {
+        session_id: session,
+        refinement: 10,
+        rate_hz: Some(1000.0),
+        ..Default::default()
+    };
+    let stalled = server.views().await.watch_frames(request).await.unwrap();
+    Command::new("kill").arg(server.child.id().to_string()).status().unwrap();
+    let waited = tokio::task::spawn_blocking(move || server.child.wait().unwrap());
+    let status = tokio::time::timeout(PATIENCE, waited).await.unwrap().unwrap();
+    assert!(status.success());
+    drop(stalled);
+}
+
+#[tokio::test]
+async fn a_port_in_use_is_told() {
+    let server = Server::start(&[]);
+    let address = server.url.strip_prefix("http://").unwrap();
+    let second = palpate(&["serve", "--listen", address]);
+    let message = String::from_utf8_lossy(&second.stderr).into_owned();
+    assert_eq!(second.status.code(), Some(1), "{message}");
+    assert!(message.contains(address) && message.contains("in use") && message.contains("--listen"), "{message}");
+    server.paper(false).await;
+}
+
+#[test]
+fn bad_configuration_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = folder.path().join("palpate.toml");
+    let path = config.to_str().unwrap();
+    for (text, expected) in [
+        ("listen = \"nowhere\"\n", "palpate.toml:1"),
+        ("threads = 1\nthraeds = 2\n", "palpate.toml:2"),
+        ("[limits]\npoint_force_n = -1.0\n", "limits.point_force_n"),
+        ("lease_s = nan\n", "lease_s"),
+        ("threads = [", "palpate.toml:1"),
+    ] {
+        std::fs::write(&config, text).unwrap();
+        let output = palpate(&["serve", "--config", path]);
+        let message = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(2), "{message}");
+        assert!(message.contains(expected), "{message}");
+    }
+    for arguments in [
+        &["serve", "--config", "no-such-file.toml"][..],
+        &["serve", "--scenes", "no-such-folder"],
+        &["serve", "--listen", "nonsense"],
+        &["serve", "--log", "=,="],
+        &["serve", "--shutdown-deadline-s", "NaN"],
+    ] {
+        let output = palpate(arguments);
+        assert_eq!(output.status.code(), Some(2), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
+    }
+}

@@ -1,0 +1,248 @@
+//! Looking over the network: the mesh, frames, credit.
+#![allow(clippy::unwrap_used)]
+
+#[path = "common/server.rs"]
+mod server;
+
+use palpate::wire::pb;
+use server::{PATIENCE, Server, Touch, force, told};
+use tonic::{Code, Streaming};
+
+fn watch(session_id: &str, refinement: u32, encoding: pb::Encoding) -> pb::WatchFramesRequest {
+    pb::WatchFramesRequest {
+        session_id: session_id.into(),
+        refinement,
+        encoding: encoding.into(),
+        ..Default::default()
+    }
+}
+
+/// A whole frame: its last message, and the displacement of every vertex, m.
+async fn frame(stream: &mut Streaming<pb::WatchFramesResponse>) -> (pb::WatchFramesResponse, Vec<[f64; 3]>) {
+    let mut vertices: Vec<Option<[f64; 3]>> = Vec::new();
+    let mut id = None;
+    loop {
+        let part = tokio::time::timeout(PATIENCE, stream.message()).await.expect("no frame").unwrap().unwrap();
+        vertices.resize((part.vertices_x * part.vertices_y) as usize, None);
+        assert_eq!(*id.get_or_insert(part.frame_id), part.frame_id, "a frame began before the last one was whole");
+        let (origin, scale) = (part.origin_m.unwrap(), part.scale_m.unwrap());
+        let (origin, scale) = ([origin.x, origin.y, origin.z], [scale.x, scale.y, scale.z]);
+        for patch in &part.patches {
+            assert!(patch.displacement.len() <= 64 << 10);
+            let size = if part.encoding() == pb::Encoding::F32 { 4 } else { 2 };
+            assert_eq!(patch.displacement.len(), (patch.count_x * patch.count_y) as usize * 3 * size);
+            for (index, bytes) in patch.displacement.chunks(3 * size).enumerate() {
+                let (a, b) = (index as u32 / patch.count_y, index as u32 % patch.count_y);
+                let vertex = (patch.first_x + a) * part.vertices_y + patch.first_y + b;
+                let component = |c: usize| match &bytes[c * size..(c + 1) * size] {
+                    [a, b] => origin[c] + scale[c] * f64::from(i16::from_le_bytes([*a, *b])),
+                    [a, b, c, d] => f64::from(f32::from_le_bytes([*a, *b, *c, *d])),
+                    _ => unreachable!(),
+                };
+                vertices[vertex as usize] = Some(std::array::from_fn(component));
+            }
+        }
+        if part.last {
+            return (part, vertices.into_iter().map(Option::unwrap).collect());
+        }
+    }
+}
+
+#[tokio::test]
+async fn every_refinement_and_encoding_shows_the_same_tissue() {
+    let server = Server::start(&[]);
+    let session = server.paper(true).await;
+    let mut touch = Touch::hold(&server, &session).await;
+    touch.command(force(0, 1, -1.0)).await;
+    touch.settle().await;
+    server.start_until(&session, 200).await;
+    server.hash_at(&session, 200).await;
+    let depth_m = touch.sample_with(|sample| sample.step == 200).await.tools[0].displacement_m.unwrap().z;
+    for refinement in 0..=10 {
+        for encoding in [pb::Encoding::F32, pb::Encoding::I16] {
+            // Who joins late gets a full frame first, also when time stands.
+            let request = watch(&session, refinement, encoding);
+            let mut frames = server.views().await.watch_frames(request).await.unwrap().into_inner();
+            let (last, vertices) = frame(&mut frames).await;
+            let side = 30 * (refinement + 1) + 1;
+            assert_eq!((last.step, last.full, last.vertices_x, last.vertices_y), (200, true, side, side));
+            let middle = (side / 2 * side + side / 2) as usize;
+            let quantum = if encoding == pb::Encoding::I16 { last.scale_m.unwrap().z } else { 1e-9 };
+            assert!((vertices[middle][2] - depth_m).abs() <= quantum, "{} and {depth_m}", vertices[middle][2]);
+            assert!(quantum < 1e-5);
+        }
+    }
+}
+
+#[tokio::test]
+async fn the_mesh_and_a_frame_fit_together() {
+    let server = Server::start(&[]);
+    let session = server.paper(true).await;
+    for refinement in [0, 3, 10] {
+        let request = pb::GetMeshRequest { session_id: session.clone(), refinement };
+        let mut parts = server.views().await.get_mesh(request).await.unwrap().into_inner();
+        let (mut positions, mut texture, mut triangles, mut whole) = (vec![], vec![], vec![], false);
+        let mut size = (0, 0);
+        while let Some(part) = parts.message().await.unwrap() {
+            assert!(!whole && prost::Message::encoded_len(&part) < 100_000);
+            positions.extend(part.rest_position_m);
+            texture.extend(part.texture_coordinates);
+            triangles.extend(part.triangles);
+            whole = part.last;
+            size = (part.vertices_x as usize, part.vertices_y as usize);
+        }
+        let (nx, ny) = size;
+        assert!(whole);
+        assert_eq!((nx, ny), (30 * (refinement as usize + 1) + 1, 30 * (refinement as usize + 1) + 1));
+        assert_eq!((positions.len(), texture.len()), (3 * nx * ny, 2 * nx * ny));
+        assert_eq!(triangles.len(), 6 * (nx - 1) * (ny - 1));
+        let last = nx * ny - 1;
+        assert!((positions[3 * last] - 1.0).abs() < 1e-6 && (positions[3 * last + 1] - 1.0).abs() < 1e-6);
+        assert_eq!(&texture[2 * last..], [1.0, 1.0]);
+        // Every triangle has the same area, and faces up.
+        let at = |v: u32| (positions[3 * v as usize], positions[3 * v as usize + 1]);
+        let area = 0.5 / ((nx - 1) * (ny - 1)) as f32;
+        for triangle in triangles.chunks(3) {
+            let [a, b, c] = [at(triangle[0]), at(triangle[1]), at(triangle[2])];
+            let twice = (b.0 - a.0) * (c.1 - a.1) - (b.1 - a.1) * (c.0 - a.0);
+            assert!((0.5 * twice / area - 1.0).abs() < 0.01, "{}", 0.5 * twice / area);
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_viewer_without_credit_gets_no_more_frames_until_it_acknowledges() {
+    let server = Server::start(&[]);
+    let session = server.paper(true).await;
+    let request = pb::WatchFramesRequest {
+        max_frames_in_flight: Some(2),
+        rate_hz: Some(100.0),
+        ..watch(&session, 0, pb::Encoding::I16)
+    };
+    let mut views = server.views().await;
+    let mut frames = views.watch_frames(request).await.unwrap().into_inner();
+    let (first, _) = frame(&mut frames).await;
+    server.start_until(&session, 1000).await;
+    let (second, _) = frame(&mut frames).await;
+    assert_eq!((first.frame_id, second.frame_id), (0, 1));
+    server.hash_at(&session, 1000).await;
+    // A hundred frames were due, and none was sent beyond the credit.
+    assert!(tokio::time::timeout(std::time::Duration::from_millis(300), frames.message()).await.is_err());
+    let acknowledge = pb::AcknowledgeFramesRequest { viewer_id: first.viewer_id, frame_id: second.frame_id };
+    views.acknowledge_frames(acknowledge.clone()).await.unwrap();
+    server.start_until(&session, 1010).await;
+    let (third, _) = frame(&mut frames).await;
+    assert_eq!((third.frame_id, third.step), (101, 1010));
+    assert_eq!(third.skipped_frames, 99);
+    drop(frames);
+    let unknown = pb::AcknowledgeFramesRequest { viewer_id: "nobody".into(), ..acknowledge };
+    assert_eq!(told(&views.acknowledge_frames(unknown).await.unwrap_err()).1, "UNKNOWN_VIEWER");
+}
+
+#[tokio::test]
+async fn a_viewer_chooses_its_rate() {
+    let server = Server::start(&[]);
+    let session = server.paper(true).await;
+    let mut streams = Vec::new();
+    for rate_hz in [20.0, 50.0] {
+        let request =
+            pb::WatchFramesRequest { rate_hz: Some(rate_hz), ..watch(&session, 1, pb::Encoding::I16) };
+        streams.push((rate_hz, server.views().await.watch_frames(request).await.unwrap().into_inner()));
+    }
+    server.start_until(&session, 1000).await;
+    for (rate_hz, mut frames) in streams {
+        let mut steps = Vec::new();
+        loop {
+            let (last, _) = frame(&mut frames).await;
+            // A frame's number tells its step: at this rate, whatever was skipped.
+            assert_eq!(last.frame_id, (last.step as f64 * rate_hz / 1000.0) as u64);
+            steps.push(last.step);
+            if last.step == 1000 {
+                break;
+            }
+        }
+        assert!(steps.windows(2).all(|pair| pair[0] < pair[1]));
+        assert!(steps.len() <= 1 + rate_hz as usize, "{steps:?}");
+    }
+}
+
+#[tokio::test]
+async fn a_viewer_that_reads_nothing_delays_nobody() {
+    let server = Server::start(&[]);
+    let session = server.paper(true).await;
+    // Whole frames as often as they go, never read.
+    let mut stalled = Vec::new();
+    for _ in 0..3 {
+        let request = pb::WatchFramesRequest { rate_hz: Some(1000.0), ..watch(&session, 10, pb::Encoding::F32) };
+        stalled.push(server.views().await.watch_frames(request).await.unwrap().into_inner());
+    }
+    let request = watch(&session, 0, pb::Encoding::I16);
+    let mut quick = server.views().await.watch_frames(request).await.unwrap().into_inner();
+    let mut touch = Touch::hold(&server, &session).await;
+    touch.command(force(0, 1, -1.0)).await;
+    touch.settle().await;
+    server.start_until(&session, 1000).await;
+    touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == 1).await;
+    touch.sample_with(|sample| sample.step == 1000).await;
+    loop {
+        let (last, _) = frame(&mut quick).await;
+        if last.step > 950 {
+            break;
+        }
+    }
+    drop(stalled);
+    server.start_until(&session, 1010).await;
+    server.hash_at(&session, 1010).await;
+}
+
+#[tokio::test]
+async fn bad_views_are_refused() {
+    let server = Server::start(&[]);
+    let session = server.paper(true).await;
+    let good = watch(&session, 1, pb::Encoding::F32);
+    let mut views = server.views().await;
+    for (request, code, reason, field) in [
+        (
+            pb::WatchFramesRequest { refinement: 11, ..good.clone() },
+            Code::InvalidArgument,
+            "OUT_OF_RANGE",
+            "refinement",
+        ),
+        (
+            pb::WatchFramesRequest { rate_hz: Some(0.0), ..good.clone() },
+            Code::InvalidArgument,
+            "OUT_OF_RANGE",
+            "rate_hz",
+        ),
+        (
+            pb::WatchFramesRequest { rate_hz: Some(f64::NAN), ..good.clone() },
+            Code::InvalidArgument,
+            "NOT_FINITE",
+            "rate_hz",
+        ),
+        (
+            pb::WatchFramesRequest { rate_hz: Some(1001.0), ..good.clone() },
+            Code::InvalidArgument,
+            "OUT_OF_RANGE",
+            "rate_hz",
+        ),
+        (pb::WatchFramesRequest { encoding: 9, ..good.clone() }, Code::InvalidArgument, "WRONG_KIND", "encoding"),
+        (
+            pb::WatchFramesRequest { max_frames_in_flight: Some(0), ..good.clone() },
+            Code::InvalidArgument,
+            "OUT_OF_RANGE",
+            "max_frames_in_flight",
+        ),
+        (
+            pb::WatchFramesRequest { session_id: "nobody".into(), ..good },
+            Code::NotFound,
+            "UNKNOWN_SESSION",
+            "session_id",
+        ),
+    ] {
+        let status = views.watch_frames(request).await.unwrap_err();
+        assert_eq!(told(&status), (code, reason.into(), field.into()));
+    }
+    let request = pb::GetMeshRequest { session_id: session, refinement: 11 };
+    assert_eq!(told(&views.get_mesh(request).await.unwrap_err()).2, "refinement");
+}
