@@ -4,7 +4,7 @@
 //! client. Both streams carry the same messages: a force command up, a sample with one tool down, a thousand times a
 //! second. The echo is measured twice: at that pace, and back to back, when no core ever falls asleep.
 
-#![allow(clippy::unwrap_used, clippy::disallowed_methods, missing_docs)]
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods, missing_docs)]
 
 use std::io::{BufRead, BufReader};
 use std::process::{Child, Command, Stdio};
@@ -66,19 +66,34 @@ impl HapticService for Echo {
     type TouchStream = Out<pb::TouchResponse>;
     type WatchSamplesStream = Out<pb::WatchSamplesResponse>;
     type ProbeStream = Out<pb::ProbeResponse>;
-    async fn touch(&self, request: Request<Streaming<pb::TouchRequest>>) -> Result<Response<Self::TouchStream>, Status> {
+    async fn touch(
+        &self,
+        request: Request<Streaming<pb::TouchRequest>>,
+    ) -> Result<Response<Self::TouchStream>, Status> {
         Ok(Response::new(Box::pin(request.into_inner().map(|request| request.map(|request| echoed(&request))))))
     }
-    async fn acquire_tool(&self, _: Request<pb::AcquireToolRequest>) -> Result<Response<pb::AcquireToolResponse>, Status> {
+    async fn acquire_tool(
+        &self,
+        _: Request<pb::AcquireToolRequest>,
+    ) -> Result<Response<pb::AcquireToolResponse>, Status> {
         no()
     }
-    async fn release_tool(&self, _: Request<pb::ReleaseToolRequest>) -> Result<Response<pb::ReleaseToolResponse>, Status> {
+    async fn release_tool(
+        &self,
+        _: Request<pb::ReleaseToolRequest>,
+    ) -> Result<Response<pb::ReleaseToolResponse>, Status> {
         no()
     }
-    async fn send_commands(&self, _: Request<pb::SendCommandsRequest>) -> Result<Response<pb::SendCommandsResponse>, Status> {
+    async fn send_commands(
+        &self,
+        _: Request<pb::SendCommandsRequest>,
+    ) -> Result<Response<pb::SendCommandsResponse>, Status> {
         no()
     }
-    async fn watch_samples(&self, _: Request<pb::WatchSamplesRequest>) -> Result<Response<Self::WatchSamplesStream>, Status> {
+    async fn watch_samples(
+        &self,
+        _: Request<pb::WatchSamplesRequest>,
+    ) -> Result<Response<Self::WatchSamplesStream>, Status> {
         no()
     }
     async fn probe(&self, _: Request<pb::ProbeRequest>) -> Result<Response<Self::ProbeStream>, Status> {
@@ -92,9 +107,8 @@ fn serve_echo() {
     runtime.block_on(async {
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
         println!("echo listens on http://{}", listener.local_addr().unwrap());
-        let incoming = TcpListenerStream::new(listener).map(|stream| {
-            stream.inspect(|stream| stream.set_nodelay(true).unwrap())
-        });
+        let incoming =
+            TcpListenerStream::new(listener).map(|stream| stream.inspect(|stream| stream.set_nodelay(true).unwrap()));
         Server::builder().add_service(HapticServiceServer::new(Echo)).serve_with_incoming(incoming).await.unwrap();
     });
 }
@@ -129,7 +143,8 @@ impl Stream_ {
         let (outbound, messages) = mpsc::channel(16);
         let open = pb::TouchOpen { session_id, tools: vec![0], ..Default::default() };
         outbound.send(pb::TouchRequest { message: Some(Say::Open(open)) }).await.unwrap();
-        let inbound = HapticServiceClient::new(channel).touch(ReceiverStream::new(messages)).await.unwrap().into_inner();
+        let inbound =
+            HapticServiceClient::new(channel).touch(ReceiverStream::new(messages)).await.unwrap().into_inner();
         let mut stream = Stream_ { outbound, inbound, sequence: 0, clock: Instant::now() };
         stream.hear().await;
         stream
@@ -241,6 +256,10 @@ fn main() {
         report("bare tonic echo, a message a millisecond", &paced);
         report("bare tonic echo, back to back", &busy);
         let ratio = |echo: &Histogram<u64>| network.value_at_quantile(0.5) as f64 / echo.value_at_quantile(0.5) as f64;
-        println!("\nless hold over echo, medians: {:.2} (same pace), {:.2} (back to back)", ratio(&paced), ratio(&busy));
+        println!(
+            "\nless hold over echo, medians: {:.2} (same pace), {:.2} (back to back)",
+            ratio(&paced),
+            ratio(&busy)
+        );
     });
 }

@@ -4,10 +4,10 @@ use std::io::{BufWriter, IsTerminal, Write};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::time::Instant;
 
 use clap::{Parser, Subcommand};
 use palpate::limits::Limits;
+use palpate::pace::clock::now_ns;
 use palpate::refusal::{Refusal, positive};
 use palpate::scene::{self, Scene, script::Script};
 use palpate::server::{self, config::Config};
@@ -212,8 +212,8 @@ fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
         None => Box::new(std::io::stdout().lock()),
     };
     let mut output = BufWriter::new(output);
-    let start = Instant::now();
-    let clock_s = || start.elapsed().as_secs_f64();
+    #[allow(clippy::cast_precision_loss)]
+    let clock_s = || now_ns() as f64 * 1e-9;
     let ended = run::run(&model, &script, arguments.held, &limits, &mut output, &clock_s, &mut |_| {});
     output.flush().map_err(|e| Failure::Failed(format!("can't write the output: {e}")))?;
     ended.map(|_| ()).map_err(|failure| Failure::Failed(failure.to_string()))

@@ -1,5 +1,5 @@
 //! The same scene, commands and steps give the same bits.
-#![allow(clippy::unwrap_used)]
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 mod common;
 

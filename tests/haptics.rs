@@ -1,5 +1,5 @@
 //! Touching over the network: commands, samples, leases, probes.
-#![allow(clippy::unwrap_used)]
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 #[path = "common/server.rs"]
 mod server;

@@ -1,5 +1,5 @@
 //! Laws of nature that the sheet keeps.
-#![allow(clippy::unwrap_used)]
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 mod common;
 
@@ -480,7 +480,9 @@ fn a_spring_pressed_to_no_length_stays_finite() {
 fn substeps_follow_the_bound_and_a_bound_is_never_below_a_vibration() {
     use palpate::sheet::stability::largest_stiffness_n_per_m;
     // λ over the whole unbounded grid, by brute force.
-    for (k1, k2, flexion) in [(1.0, 1.0, false), (1.0, 1.0, true), (1.0, 0.3, true), (0.2, 1.0, false), (1.0, 0.0, true)] {
+    for (k1, k2, flexion) in
+        [(1.0, 1.0, false), (1.0, 1.0, true), (1.0, 0.3, true), (0.2, 1.0, false), (1.0, 0.0, true)]
+    {
         let mut springs = scene(SMALL).springs;
         (springs.stiffness_n_per_m, springs.shear_stiffness_n_per_m, springs.flexion) = (k1, k2, flexion);
         let mut largest = 0.0_f64;

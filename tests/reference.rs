@@ -1,6 +1,6 @@
 //! Accuracy against scenes that were solved to 1e-10 by other means (tests/reference: each file has the scene, the
 //! times, and at each time displacements, velocities, forces and energies).
-#![allow(clippy::unwrap_used)]
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 mod common;
 
@@ -121,8 +121,7 @@ fn errors(name: &str, assignments: &[&str]) -> Errors {
             largest.force = largest.force.max(reaction.length());
         }
         let (energy, expected) = (session.tissue().energy(), &frame["energy"]);
-        for (value, name) in
-            [(energy.kinetic_j, "kinetic"), (energy.spring_j, "spring"), (energy.virtual_j, "virtual")]
+        for (value, name) in [(energy.kinetic_j, "kinetic"), (energy.spring_j, "spring"), (energy.virtual_j, "virtual")]
         {
             error.energy = error.energy.max((value - number(&expected[name])).abs());
             largest.energy = largest.energy.max(number(&expected[name]));

@@ -1,5 +1,5 @@
 //! Looking over the network: the mesh, frames, credit.
-#![allow(clippy::unwrap_used)]
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 #[path = "common/server.rs"]
 mod server;
@@ -145,8 +145,7 @@ async fn a_viewer_chooses_its_rate() {
     let session = server.paper(true).await;
     let mut streams = Vec::new();
     for rate_hz in [20.0, 50.0] {
-        let request =
-            pb::WatchFramesRequest { rate_hz: Some(rate_hz), ..watch(&session, 1, pb::Encoding::I16) };
+        let request = pb::WatchFramesRequest { rate_hz: Some(rate_hz), ..watch(&session, 1, pb::Encoding::I16) };
         streams.push((rate_hz, server.views().await.watch_frames(request).await.unwrap().into_inner()));
     }
     server.start_until(&session, 1000).await;

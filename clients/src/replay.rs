@@ -89,7 +89,7 @@ pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
 }
 
 fn source(scene: &str) -> Result<Source, Failure> {
-    if !Path::new(scene).extension().is_some_and(|extension| extension == "toml") {
+    if Path::new(scene).extension().is_none_or(|extension| extension != "toml") {
         return Ok(Source::SceneName(scene.to_owned()));
     }
     let scene = Scene::load(Path::new(scene), &[], &Limits::default()).map_err(refused)?;

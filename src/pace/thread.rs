@@ -23,6 +23,9 @@ const CATCH_UP_STEPS: f64 = 2.0;
 /// Over which time dilation is measured.
 const DILATION_WINDOW_NS: u64 = 1_000_000_000;
 
+/// Who waits for the step and the hash of a state.
+type HashReply = oneshot::Sender<Result<(u64, u128)>>;
+
 /// What a stepping thread is asked for.
 pub(super) enum Request {
     Adopt(Box<Running>),
@@ -31,7 +34,7 @@ pub(super) enum Request {
     Samples(SampleTap),
     Probe(ProbeTap),
     View(Arc<Viewer>),
-    Hash { at: Option<u64>, reply: oneshot::Sender<Result<(u64, u128)>> },
+    Hash { at: Option<u64>, reply: HashReply },
     Delete(Refusal),
 }
 
@@ -107,7 +110,7 @@ struct Taps {
     samples: Vec<SampleTap>,
     probes: Vec<ProbeTap>,
     viewers: Vec<Arc<Viewer>>,
-    hashes: Vec<(u64, oneshot::Sender<Result<(u64, u128)>>)>,
+    hashes: Vec<(u64, HashReply)>,
 }
 
 /// The thread's work.

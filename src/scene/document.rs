@@ -217,7 +217,17 @@ impl<'a> Fields<'a> {
 
     /// The value of `key`, which has to be there.
     pub fn required(&mut self, key: &'static str) -> Result<Item<'a>> {
-        self.item(key).ok_or_else(|| self.refuse(Reason::Missing, key, "is missing"))
+        self.item(key).ok_or_else(|| {
+            match self.entries.keys().find(|there| key.strip_prefix(there.as_str()).is_some_and(|r| r.starts_with('_')))
+            {
+                Some(there) => self.without_unit(there, key),
+                None => self.refuse(Reason::Missing, key, "is missing"),
+            }
+        })
+    }
+
+    fn without_unit(&self, there: &str, key: &str) -> Refusal {
+        self.refuse(Reason::UnknownKey, there, format!("unknown key: the unit belongs to the name, `{key}`"))
     }
 
     /// A finite number, if it is there.
@@ -238,11 +248,13 @@ impl<'a> Fields<'a> {
     /// Every key that was not asked for is refused.
     fn done(&self) -> Result<()> {
         let Some(key) = self.entries.keys().find(|key| !self.known.contains(&key.as_str())) else { return Ok(()) };
-        let message = match self.known.iter().find(|known| known.starts_with(&format!("{key}_"))) {
-            Some(with_unit) => format!("unknown key: the unit belongs to the name, `{with_unit}`"),
-            None => format!("unknown key; known here: {}", self.known.join(", ")),
-        };
-        Err(self.refuse(Reason::UnknownKey, key, message))
+        Err(match self.known.iter().find(|known| known.starts_with(&format!("{key}_"))) {
+            Some(with_unit) => self.without_unit(key, with_unit),
+            None => {
+                let message = format!("unknown key; known here: {}", self.known.join(", "));
+                self.refuse(Reason::UnknownKey, key, message)
+            }
+        })
     }
 }
 
@@ -345,11 +357,8 @@ impl<'a> Item<'a> {
     pub fn table<T>(&self, read: impl FnOnce(&mut Fields<'a>) -> Result<T>) -> Result<T> {
         let Value::Table(entries) = &self.node.value else { return Err(self.wrong("a table")) };
         let mut fields = Fields { path: self.path.clone(), entries, known: Vec::new() };
-        // A misspelt key is reported before the key that is missing for it.
-        match read(&mut fields) {
-            Ok(value) => fields.done().map(|()| value),
-            Err(refusal) if refusal.reason == Reason::Missing => Err(fields.done().err().unwrap_or(refusal)),
-            Err(refusal) => Err(refusal),
-        }
+        let value = read(&mut fields)?;
+        fields.done()?;
+        Ok(value)
     }
 }

@@ -394,8 +394,8 @@ fn rising<T>(list: &Item<'_>, key: &str, entries: &mut Vec<(u64, T)>) -> Result<
 fn check_force(field: &str, force_n: DVec3, factor: f64, limit_n: f64) -> Result<()> {
     crate::refusal::finite_vector(field, force_n)?;
     let largest_n = force_n.length() * factor;
-    // Also refuses 0·∞.
-    if force_n != DVec3::ZERO && !(largest_n <= limit_n) {
+    // A force of 0 may have any factor, as 0·∞ is no number.
+    if force_n != DVec3::ZERO && (largest_n.is_nan() || largest_n > limit_n) {
         let message =
             format!("is {largest_n:.6e} N on the control point (|force|·e^offset), above the limit of {limit_n} N");
         return Err(Refusal::new(Reason::ForceTooLarge, field, message));

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use super::Session;
 use super::command::{Command, Intake};
 use crate::limits::Limits;
-use crate::refusal::Result;
+use crate::refusal::{Refusal, Result};
 use crate::scene::Named;
 use crate::scene::record::{Line, Run, Summary, write_line};
 use crate::scene::script::{Action, Script};
@@ -51,14 +51,6 @@ pub fn command(tool: usize, step: u64, action: Action) -> Command {
     }
 }
 
-/// What feeds a session.
-enum Feed<'a> {
-    /// Laws, set at the beginning.
-    Laws,
-    /// Commands, one a step, through the same intake as a server's.
-    Held(&'a Script, Intake),
-}
-
 /// Plays `script` and writes its records, as JSON Lines, to `output`. `clock_s` tells the time, for the summary;
 /// `progress` is told the steps done now and then.
 pub fn run(
@@ -71,26 +63,25 @@ pub fn run(
     progress: &mut dyn FnMut(u64),
 ) -> std::result::Result<Summary, Failure> {
     let mut session = Session::new(model);
-    let mut feed = if held {
-        Feed::Held(script, intake(model, script, limits).map_err(|refusal| Failure::Held(refusal.to_string()))?)
-    } else {
+    // Held forces are commands, through the same intake as a server's; laws are set once.
+    let refused = |refusal: Refusal| Failure::Held(refusal.to_string());
+    let mut intake = held.then(|| intake(model, script, limits)).transpose().map_err(refused)?;
+    if !held {
         for (tool, law) in script.forces.iter().enumerate() {
             session.play_force(tool, law.clone());
         }
         for (index, law) in script.moves.iter().enumerate() {
             session.play_move(script.forces.len() + index, law.clone());
         }
-        Feed::Laws
-    };
+    }
     write_line(output, &Line::Run(&header(model, &script.name)))?;
     let mut due = Vec::new();
     let mut written: std::io::Result<()> = Ok(());
     let (mut stepping_s, mut resumed_s) = (0.0, clock_s());
     for step in 0..script.steps {
-        if let Feed::Held(script, intake) = &mut feed {
+        if let Some(intake) = &mut intake {
             for (tool, action) in script.actions_at(step) {
-                let commands = vec![command(tool, step, action)];
-                intake.submit(LEASE, commands, 0).map_err(|refusal| Failure::Held(refusal.to_string()))?;
+                intake.submit(LEASE, vec![command(tool, step, action)], 0).map_err(refused)?;
             }
             intake.take_due(step, 0, &mut due);
         }

@@ -1,5 +1,12 @@
 //! A real server, in a process of its own, and short ways to talk to it.
-#![allow(dead_code, unreachable_pub, clippy::unwrap_used)]
+#![allow(
+    dead_code,
+    unreachable_pub,
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::disallowed_methods
+)]
 
 use std::io::{BufRead, BufReader, Read};
 use std::path::PathBuf;

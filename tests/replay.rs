@@ -1,0 +1,254 @@
+//! Scripts through a server: the same bits as offline, whatever else happens, and clear ends when it can't be.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
+
+#[path = "common/server.rs"]
+mod server;
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+
+use serde_json::Value;
+use server::{Server, Touch, client_program, force, open};
+
+const ROOT: &str = env!("CARGO_MANIFEST_DIR");
+
+fn replay(server: &Server, script: &Path, more: &[&str]) -> Output {
+    Command::new(client_program())
+        .args(["replay", script.to_str().unwrap(), "--server", &server.url])
+        .args(more)
+        .current_dir(ROOT)
+        .output()
+        .unwrap()
+}
+
+fn run_held(scene: &str, script: &Path) -> Vec<Value> {
+    let output = Command::new(env!("CARGO_BIN_EXE_palpate"))
+        .args(["run", scene, script.to_str().unwrap(), "--held"])
+        .current_dir(ROOT)
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    lines(&output.stdout)
+}
+
+fn lines(bytes: &[u8]) -> Vec<Value> {
+    String::from_utf8_lossy(bytes).lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+}
+
+fn shipped_scripts() -> Vec<PathBuf> {
+    let mut scripts: Vec<_> = std::fs::read_dir(Path::new(ROOT).join("scripts"))
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .filter(|path| path.extension().is_some_and(|extension| extension == "toml"))
+        .collect();
+    scripts.sort();
+    assert!(scripts.len() >= 3);
+    scripts
+}
+
+/// Replays and compares every record, and the hash, with the run offline.
+fn assert_same(server: &Server, scene: &str, script: &Path) {
+    let output = replay(server, script, &["--scene", scene]);
+    let errors = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.success(), "{errors}");
+    let (through, offline) = (lines(&output.stdout), run_held(scene, script));
+    assert_eq!(through.len(), offline.len());
+    assert_eq!(through[0], offline[0]);
+    let last = through.len() - 1;
+    let (summary, expected) = (&through[last]["summary"], &offline[last]["summary"]);
+    assert_eq!(summary["rejected_commands"], 0);
+    if summary["late_commands"] != 0 {
+        // A machine that stood still for two seconds: the replay said so, which is its promise.
+        return eprintln!("{}: {} late commands", script.display(), summary["late_commands"]);
+    }
+    assert_eq!(through[1..last], offline[1..last], "{}", script.display());
+    assert_eq!(summary["final_hash"], expected["final_hash"], "{}", script.display());
+    for key in ["steps", "substeps", "points"] {
+        assert_eq!(summary[key], expected[key]);
+    }
+    for row in ["steps", "overruns", "largest displacement", "peak reaction", "round trip", "final hash"] {
+        assert!(errors.contains(row), "no row `{row}` in:\n{errors}");
+    }
+}
+
+#[test]
+fn every_shipped_script_gives_the_hash_of_the_run_offline() {
+    let server = Server::start(&[]);
+    for script in shipped_scripts() {
+        assert_same(&server, "paper", &script);
+    }
+}
+
+/// Commands and sessions without rest, beside what is tested.
+struct Hammer {
+    stop: Arc<AtomicBool>,
+    sent: Arc<AtomicU64>,
+    thread: std::thread::JoinHandle<()>,
+}
+
+fn hammer(url: String) -> Hammer {
+    let (stop, sent) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU64::new(0)));
+    let (stopped, counter) = (stop.clone(), sent.clone());
+    let thread = std::thread::spawn(move || {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        // Borrows the real server's address; it is not this one's to end.
+        let server = std::mem::ManuallyDrop::new(Server {
+            child: Command::new("true").stdout(Stdio::null()).spawn().unwrap(),
+            url,
+        });
+        runtime.block_on(async {
+            while !stopped.load(Ordering::Relaxed) {
+                let session = server.paper(false).await;
+                let mut touch = Touch::open(&server, open(&session, &[0])).await.unwrap();
+                for sequence in 1..400 {
+                    let strength_n = if sequence % 2 == 0 { -3.0 } else { f64::NAN };
+                    touch.command(force(0, sequence, strength_n)).await;
+                    touch.hear().await.unwrap();
+                    counter.fetch_add(1, Ordering::Relaxed);
+                }
+            }
+        });
+    });
+    Hammer { stop, sent, thread }
+}
+
+#[test]
+fn a_replay_is_exact_while_another_client_hammers_another_session() {
+    let server = Server::start(&["--log", "error"]);
+    let hammer = hammer(server.url.clone());
+    for script in shipped_scripts() {
+        assert_same(&server, "paper", &script);
+    }
+    hammer.stop.store(true, Ordering::Relaxed);
+    hammer.thread.join().unwrap();
+    assert!(hammer.sent.load(Ordering::Relaxed) > 1000);
+}
+
+const EVERYTHING: &str = r#"
+name = "everything"
+duration_s = 0.6
+sample_every_s = 0.02
+sample_points = "all"
+[[force]]
+point = [3, 4]
+force_n = [0.0, 0.2, -0.5]
+falloff_per_m = 40.0
+falloff_offset = 0.0
+profile = { type = "sine", frequency_hz = 5.0 }
+[[force]]
+path = { from_m = [0.02, 0.05], velocity_m_per_s = [0.8, 0.1] }
+force_n = [0.0, 0.0, -0.4]
+falloff_per_m = 60.0
+falloff_offset = 0.2
+profile = { type = "ramp", from_s = 0.0, to_s = 0.15 }
+[[force]]
+hops = [{ at_s = 0.1, point = [1, 2] }, { at_s = 0.2, point = [2, 2] }, { at_s = 0.25, point = [3, 3] }]
+force_n = [0.0, 0.0, -0.3]
+falloff_per_m = 60.0
+falloff_offset = 0.0
+profile = { type = "pulse", on_s = 0.05, off_s = 0.5 }
+[[force]]
+point = [5, 1]
+falloff_per_m = 50.0
+falloff_offset = 0.0
+profile = { type = "trace", file = "trace.csv" }
+[[tool]]
+point = [7, 7]
+moves = [{ from_s = 0.0, to_s = 0.2, by_m = [0.0, 0.0, -0.02] }, { from_s = 0.3, to_s = 0.5, by_m = [0.01, 0.0, 0.02] }]
+"#;
+
+const STIFF: &str = r#"
+name = "stiff"
+[sheet]
+points = [11, 9]
+spacing_m = 0.04
+point_mass_kg = 0.01
+fixed = "corners"
+[springs]
+stiffness_n_per_m = 400.0
+shear_stiffness_n_per_m = 200.0
+flexion = true
+[virtual_springs]
+stiffness_n_per_m = 5.0
+[damping]
+coefficient_n_s_per_m = 0.3
+[stepping]
+precision = "f64"
+"#;
+
+#[test]
+fn every_kind_of_force_and_tool_comes_through_exactly() {
+    let folder = tempfile::tempdir().unwrap();
+    let (scene, script) = (folder.path().join("stiff.toml"), folder.path().join("everything.toml"));
+    std::fs::write(&scene, STIFF).unwrap();
+    std::fs::write(&script, EVERYTHING).unwrap();
+    let rows: Vec<String> =
+        (0..60).map(|k| format!("{},0.0,{},-0.2", 0.01 * f64::from(k), 0.01 * f64::from(k % 9))).collect();
+    std::fs::write(folder.path().join("trace.csv"), format!("time_s,fx_n,fy_n,fz_n\n{}\n", rows.join("\n"))).unwrap();
+    let server = Server::start(&["--scenes", folder.path().to_str().unwrap()]);
+    assert_same(&server, scene.to_str().unwrap(), &script);
+    // By the name under which the server has it, too.
+    let output = replay(&server, &script, &["--scene", "stiff"]);
+    assert!(output.status.success());
+    let (through, offline) = (lines(&output.stdout), run_held(scene.to_str().unwrap(), &script));
+    assert_eq!(through.last().unwrap()["summary"]["final_hash"], offline.last().unwrap()["summary"]["final_hash"]);
+}
+
+#[test]
+fn a_server_that_stops_in_mid_replay_is_told() {
+    let mut server = Server::start(&[]);
+    let folder = tempfile::tempdir().unwrap();
+    let script = folder.path().join("long.toml");
+    let text = std::fs::read_to_string(Path::new(ROOT).join("scripts/vertical-60.toml")).unwrap();
+    std::fs::write(&script, text.replace("duration_s = 1.0", "duration_s = 600.0")).unwrap();
+    let records = folder.path().join("records.jsonl");
+    let mut client = Command::new(client_program())
+        .args(["replay", script.to_str().unwrap(), "--server", &server.url, "--output", records.to_str().unwrap()])
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    // In the middle: records have come.
+    while std::fs::metadata(&records).map_or(0, |meta| meta.len()) < 20_000 {
+        assert!(client.try_wait().unwrap().is_none());
+        std::thread::sleep(std::time::Duration::from_millis(20));
+    }
+    server.child.kill().unwrap();
+    let output = client.wait_with_output().unwrap();
+    let message = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(1), "{message}");
+    assert!(message.contains("the server"), "{message}");
+}
+
+#[test]
+fn what_a_replay_can_not_play_is_refused() {
+    let server = Server::start(&[]);
+    let script = Path::new(ROOT).join("scripts/vertical-60.toml");
+    let refused = |output: Output, status: i32, expected: &str| {
+        let message = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(status), "{message}");
+        assert!(message.contains(expected), "{message}");
+    };
+    refused(replay(&server, &script, &["--scene", "nothing"]), 2, "UNKNOWN_SCENE");
+    refused(replay(&server, Path::new("no-such-script.toml"), &[]), 2, "no-such-script.toml");
+    refused(replay(&server, &script, &["--output", "/no/such/folder/file"]), 2, "/no/such/folder/file");
+    let nobody = Command::new(client_program())
+        .args(["replay", script.to_str().unwrap(), "--server", "http://127.0.0.1:1"])
+        .output()
+        .unwrap();
+    refused(nobody, 1, "can't reach http://127.0.0.1:1");
+}
+
+#[tokio::test]
+async fn a_replay_leaves_no_session_behind() {
+    let server = Server::start(&[]);
+    let folder = tempfile::tempdir().unwrap();
+    let script = folder.path().join("short.toml");
+    std::fs::write(&script, "duration_s = 0.05\nsample_every_s = 0.05\n").unwrap();
+    let output = replay(&server, &script, &[]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let request = palpate::wire::pb::ListSessionsRequest {};
+    let listed = server.sessions().await.list_sessions(request).await.unwrap().into_inner().sessions;
+    assert!(listed.is_empty());
+}
