@@ -8,12 +8,13 @@ SCRIPT ?= scripts/vertical-60.toml
 
 VENV := target/venv
 
-.PHONY: help run build test lint bench-roundtrip bench-duty need-rust need-python
+.PHONY: help run build test lint picture bench-roundtrip bench-duty need-rust need-python
 
 help:
 	@echo 'make run             build, serve on $(LISTEN), poke the tissue, draw what it felt, go on serving'
 	@echo 'make test            every test (Rust and Python 3)'
 	@echo 'make lint            formatting, compiler and clippy warnings'
+	@echo 'make picture         the picture of the README'
 	@echo 'make bench-roundtrip the haptic round trip beside a bare gRPC echo'
 	@echo 'make bench-duty      a minute of 1 kHz touch and 60 frames a second: time kept, commands lost'
 
@@ -51,6 +52,9 @@ test: build $(VENV)/ready
 lint: need-rust
 	$(CARGO) fmt --all --check
 	$(CARGO) clippy --release --workspace --all-targets -- -D warnings
+
+picture: build
+	$(PYTHON) docs/poke.py
 
 bench-roundtrip: build
 	@echo "Machine: $$(sed -n 's/^model name.*: //p' /proc/cpuinfo 2>/dev/null | sort | uniq -c)"
