@@ -9,7 +9,7 @@ use clap::{Parser, Subcommand};
 use palpate::limits::Limits;
 use palpate::pace::clock::now_ns;
 use palpate::refusal::{Refusal, positive};
-use palpate::scene::{self, Scene, script::Script};
+use palpate::scene::{self, Scene, document::find, script::Script};
 use palpate::server::{self, config::Config};
 use palpate::session::run;
 use palpate::sheet::Model;
@@ -27,8 +27,8 @@ struct Arguments {
 enum Command {
     /// Play a script on a scene, offline, as fast as it goes; write its records as JSON Lines
     #[command(after_help = "Examples:\n  \
-        palpate run scenes/paper.toml scripts/vertical-60.toml\n  \
-        palpate run paper scripts/oblique-100.toml --output poke.jsonl --set stepping.integrator=lagged\n\n\
+        palpate run paper vertical-60\n  \
+        palpate run my-scene.toml my-script.toml --output poke.jsonl --set stepping.integrator=lagged\n\n\
         Exit status: 0; 1 when the run failed; 2 when an input was refused.")]
     Run(RunArguments),
     /// Serve tissue over gRPC: sessions stepped in real time, commands in, forces and frames out
@@ -67,10 +67,13 @@ struct ServeArguments {
 
 #[derive(clap::Args)]
 struct RunArguments {
-    /// The scene file, or the name of a built-in scene (`paper`)
+    /// A scene file, or the name of one in --scenes; `paper` is built in
     scene: PathBuf,
-    /// The script file
+    /// A script file, or the name of one in ./scripts
     script: PathBuf,
+    /// Folder of the scenes that have a name
+    #[arg(long, value_name = "DIR", default_value = "scenes")]
+    scenes: PathBuf,
     /// Write the records here instead of to the standard output
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
@@ -194,10 +197,11 @@ async fn cancel_on_signal(shutdown: CancellationToken) {
 
 fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     let limits: Limits = load_config(arguments.config.as_deref())?.limits;
-    let scene = if arguments.scene.as_os_str() == "paper" && !arguments.scene.exists() {
+    let path = find(&arguments.scene, &arguments.scenes);
+    let scene = if path.as_os_str() == "paper" && !path.exists() {
         Scene::parse("paper (built in)", scene::PAPER, &arguments.set, &limits)?
     } else {
-        Scene::load(&arguments.scene, &arguments.set, &limits)?
+        Scene::load(&path, &arguments.set, &limits)?
     };
     let model = Model::compile(&scene, &limits)?;
     let script = Script::load(&arguments.script, &scene, &limits)?;
@@ -214,7 +218,17 @@ fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     let mut output = BufWriter::new(output);
     #[allow(clippy::cast_precision_loss)]
     let clock_s = || now_ns() as f64 * 1e-9;
-    let ended = run::run(&model, &script, arguments.held, &limits, &mut output, &clock_s, &mut |_| {});
+    let (begun_s, watched) = (clock_s(), std::io::stderr().is_terminal());
+    let mut progress = |step: u64| {
+        // Only where somebody looks, and has waited.
+        if watched && clock_s() - begun_s > 1.0 {
+            eprint!("\rstep {step} of {} ", script.steps);
+        }
+    };
+    let ended = run::run(&model, &script, arguments.held, &limits, &mut output, &clock_s, &mut progress);
+    if watched && clock_s() - begun_s > 1.0 {
+        eprintln!();
+    }
     output.flush().map_err(|e| Failure::Failed(format!("can't write the output: {e}")))?;
     ended.map(|_| ()).map_err(|failure| Failure::Failed(failure.to_string()))
 }

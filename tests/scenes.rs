@@ -296,6 +296,24 @@ fn missing_files_and_folders_are_told() {
 }
 
 #[test]
+fn scenes_and_scripts_are_found_by_name() {
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["scenes", "other", "scripts"] {
+        std::fs::create_dir(folder.path().join(name)).unwrap();
+    }
+    std::fs::write(folder.path().join("scenes/mine.toml"), SCENE).unwrap();
+    std::fs::write(folder.path().join("other/mine.toml"), SCENE.replace("\"test\"", "\"other\"")).unwrap();
+    std::fs::write(folder.path().join("scripts/mine.toml"), SCRIPT).unwrap();
+    let palpate = |arguments: &[&str]| {
+        Command::new(env!("CARGO_BIN_EXE_palpate")).args(arguments).current_dir(folder.path()).output().unwrap()
+    };
+    assert_eq!(lines(&palpate(&["run", "mine", "mine"]))[0]["run"]["scene"], "test");
+    assert_eq!(lines(&palpate(&["run", "mine", "mine", "--scenes", "other"]))[0]["run"]["scene"], "other");
+    assert_eq!(lines(&palpate(&["run", "paper", "mine"]))[0]["run"]["scene"], "paper");
+    refused(&palpate(&["run", "yours", "mine"]), &["yours: can't be opened"]);
+}
+
+#[test]
 fn a_sheet_of_one_point_is_a_pendulum_and_a_line_is_a_string() {
     for points in ["[1, 1]", "[1, 9]", "[9, 1]", "[2, 2]"] {
         let scene = SCENE.replace("[9, 7]", points);

@@ -203,6 +203,34 @@ async fn the_same_scene_and_commands_give_the_same_hash_on_any_number_of_threads
 }
 
 #[tokio::test]
+async fn a_session_too_heavy_for_its_rate_slows_its_own_time_and_says_so() {
+    let server = Server::start(&[]);
+    let mut heavy = paper();
+    let sheet = heavy.sheet.as_mut().unwrap();
+    // No machine does 400,000 points 10,000 times a second on one core.
+    (sheet.points_x, sheet.points_y) = (Some(800), Some(500));
+    heavy.stepping.as_mut().unwrap().rate_hz = Some(10_000.0);
+    let session = server.create(Source::Scene(heavy), false).await.unwrap().session_id;
+    let request = pb::WatchSamplesRequest { session_id: session.clone(), sample_every_steps: None };
+    let mut samples = server.haptics().await.watch_samples(request).await.unwrap().into_inner();
+    let mut last: Option<pb::Sample> = None;
+    loop {
+        let sample = tokio::time::timeout(PATIENCE, samples.message()).await.unwrap().unwrap().unwrap().sample.unwrap();
+        if let Some(last) = last {
+            // No step is longer than another, and none is left out: time is what gives way.
+            assert!((sample.simulation_time_s - sample.step as f64 * 1e-4).abs() < 1e-12);
+            assert!(sample.step > last.step && sample.overrun_count >= last.overrun_count);
+        }
+        if sample.overrun && sample.time_dilation < 0.9 && sample.overrun_count > 100 {
+            break;
+        }
+        last = Some(sample);
+    }
+    let status = server.status(&session).await;
+    assert!(status.time_dilation < 0.9 && status.overrun_count > 100);
+}
+
+#[tokio::test]
 async fn sessions_and_streams_have_a_limit() {
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("palpate.toml");

@@ -22,8 +22,8 @@ struct Arguments {
 enum Command {
     /// Play a script through a server, in real time; write the records it streams as JSON Lines
     #[command(after_help = "Examples:\n  \
-        palpate-client replay scripts/vertical-60.toml --server http://127.0.0.1:7117\n  \
-        palpate-client replay scripts/oblique-60.toml --scene my-scene.toml --output poke.jsonl --plot\n\n\
+        palpate-client replay vertical-60 --server http://127.0.0.1:7117\n  \
+        palpate-client replay my-script.toml --scene my-scene.toml --output poke.jsonl --plot\n\n\
         The session is made paused; each command is stamped with the step at which it acts and sent ahead. So the\n\
         final hash is that of `palpate run --held`, whatever the network did, unless late commands are reported.\n\n\
         Exit status: 0; 1 when the replay failed; 2 when an input was refused.")]

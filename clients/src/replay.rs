@@ -39,7 +39,7 @@ const SILENCE: Duration = Duration::from_secs(10);
 
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
-    /// The script file
+    /// A script file, or the name of one in ./scripts
     script: PathBuf,
     /// The server
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7117")]

@@ -36,8 +36,9 @@ pub struct Script {
 }
 
 impl Script {
-    /// Reads a script file and binds it to `scene`.
-    pub fn load(path: &Path, scene: &Scene, limits: &Limits) -> Result<Self> {
+    /// Reads a script, by its file or by its name in ./scripts, and binds it to `scene`.
+    pub fn load(name: &Path, scene: &Scene, limits: &Limits) -> Result<Self> {
+        let path = &document::find(name, Path::new("scripts"));
         let text = document::read_text(path, limits.file_bytes)?;
         let folder = path.parent().unwrap_or(Path::new(""));
         Self::parse(&path.display().to_string(), &text, folder, scene, limits)
