@@ -1,14 +1,13 @@
 //! The program `palpate`: parses arguments and calls one function.
 
 use std::io::{BufWriter, IsTerminal, Write};
-use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use palpate::limits::Limits;
 use palpate::pace::clock::now_ns;
-use palpate::refusal::{Refusal, positive};
+use palpate::refusal::Refusal;
 use palpate::scene::{self, Scene, document::find, script::Script};
 use palpate::server::{self, config::Config};
 use palpate::session::run;
@@ -44,11 +43,11 @@ enum Command {
 struct ServeArguments {
     /// Where to listen; port 0 takes a free one [default: 127.0.0.1:7117]
     #[arg(long, value_name = "ADDRESS:PORT")]
-    listen: Option<SocketAddr>,
+    listen: Option<String>,
     /// Folder of the scenes that sessions can be made from by name [default: scenes]
     #[arg(long, value_name = "DIR")]
     scenes: Option<PathBuf>,
-    /// Configuration file (TOML): the same keys as these options, with _ for -, and a section [limits]
+    /// Configuration file (TOML); its keys are in the README. These options go before it
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Stepping threads [default: one less than the machine has cores]
@@ -122,8 +121,8 @@ fn load_config(path: Option<&Path>) -> Result<Config, Refusal> {
 
 fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     let mut config = load_config(arguments.config.as_deref())?;
-    if let Some(listen) = arguments.listen {
-        config.listen = listen;
+    if let Some(listen) = &arguments.listen {
+        config.listen.clone_from(listen);
     }
     if let Some(scenes) = &arguments.scenes {
         if !scenes.is_dir() {
@@ -135,11 +134,12 @@ fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
         config.threads = threads;
     }
     if let Some(deadline_s) = arguments.shutdown_deadline_s {
-        config.shutdown_deadline_s = positive("--shutdown-deadline-s", deadline_s)?;
+        config.shutdown_deadline_s = deadline_s;
     }
     if let Some(log) = &arguments.log {
         config.log.clone_from(log);
     }
+    config.check()?;
     let filter = tracing_subscriber::EnvFilter::try_new(&config.log)
         .map_err(|e| Failure::Refused(format!("--log {}: {e}", config.log)))?;
     let subscriber = tracing_subscriber::fmt()
@@ -158,8 +158,11 @@ fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
         .build()
         .map_err(|e| Failure::Failed(format!("can't start the network threads: {e}")))?;
     let ended = runtime.block_on(async {
-        let listen = config.listen;
+        let listen = &config.listen;
         let listener = tokio::net::TcpListener::bind(listen).await.map_err(|e| {
+            if e.kind() == std::io::ErrorKind::InvalidInput {
+                return Failure::Refused(format!("--listen {listen}: must be address:port, as in 127.0.0.1:7117"));
+            }
             Failure::Failed(format!(
                 "can't listen on {listen}: {e}; another --listen, or port 0 for a free one, may do"
             ))
@@ -167,7 +170,8 @@ fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
         let address = listener.local_addr().map_err(|e| Failure::Failed(e.to_string()))?;
         let shutdown = CancellationToken::new();
         tokio::spawn(cancel_on_signal(shutdown.clone()));
-        println!("palpate listens on http://{address}");
+        // Who started us may have stopped listening; we serve all the same.
+        let _ = writeln!(std::io::stdout(), "palpate listens on http://{address}");
         server::serve(listener, config, shutdown).await.map_err(|e| Failure::Failed(e.to_string()))
     });
     runtime.shutdown_background();
@@ -203,7 +207,9 @@ fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     } else {
         Scene::load(&path, &arguments.set, &limits)?
     };
-    let model = Model::compile(&scene, &limits)?;
+    // What only the compiled scene shows is of no one line.
+    let in_scene = |refusal: Refusal| Refusal { place: Some(path.display().to_string()), ..refusal };
+    let model = Model::compile(&scene, &limits).map_err(in_scene)?;
     let script = Script::load(&arguments.script, &scene, &limits)?;
     for warning in model.warnings.iter().chain(&script.warnings) {
         eprintln!("palpate: warning: {warning}");
@@ -229,6 +235,10 @@ fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     if watched && clock_s() - begun_s > 1.0 {
         eprintln!();
     }
-    output.flush().map_err(|e| Failure::Failed(format!("can't write the output: {e}")))?;
-    ended.map(|_| ()).map_err(|failure| Failure::Failed(failure.to_string()))
+    let ended = ended.and_then(|_| output.flush().map_err(run::Failure::Output));
+    match ended {
+        // Who reads has seen enough.
+        Err(run::Failure::Output(e)) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
+        ended => ended.map_err(|failure| Failure::Failed(failure.to_string())),
+    }
 }

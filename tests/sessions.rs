@@ -144,7 +144,7 @@ async fn bad_scenes_are_refused_with_the_field() {
         let status = server.create(Source::SceneName(name.into()), false).await.unwrap_err();
         assert_eq!(told(&status), (Code::NotFound, "UNKNOWN_SCENE".into(), "scene_name".into()));
     }
-    let nothing = pb::CreateSessionRequest { source: None, paused: false };
+    let nothing = pb::CreateSessionRequest::default();
     let status = server.sessions().await.create_session(nothing).await.unwrap_err();
     assert_eq!(told(&status).1, "MISSING");
     // The server lives on, and made nothing of all this.
@@ -319,7 +319,10 @@ fn bad_configuration_is_refused() {
     let config = folder.path().join("palpate.toml");
     let path = config.to_str().unwrap();
     for (text, expected) in [
-        ("listen = \"nowhere\"\n", "palpate.toml:1"),
+        ("listen = \"nowhere\"\n", "nowhere: must be address:port"),
+        ("listen = 7\n", "palpate.toml:1"),
+        ("shutdown_deadline_s = 1e300\n", "shutdown_deadline_s"),
+        ("lease_s = 1000.0\n", "lease_s"),
         ("threads = 1\nthraeds = 2\n", "palpate.toml:2"),
         ("[limits]\npoint_force_n = -1.0\n", "limits.point_force_n"),
         ("lease_s = nan\n", "lease_s"),

@@ -36,6 +36,8 @@ pub(crate) enum Failure {
     Failed(String),
     /// Exit status 2.
     Refused(String),
+    /// Who reads our output has seen enough: exit status 0.
+    Unread,
 }
 
 #[tokio::main(flavor = "current_thread")]
@@ -44,7 +46,7 @@ async fn main() -> ExitCode {
         Command::Replay(arguments) => replay::replay(&arguments).await,
     };
     let (status, message) = match ended {
-        Ok(()) => return ExitCode::SUCCESS,
+        Ok(()) | Err(Failure::Unread) => return ExitCode::SUCCESS,
         Err(Failure::Failed(message)) => (1, message),
         Err(Failure::Refused(message)) => (2, message),
     };

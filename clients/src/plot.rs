@@ -2,15 +2,14 @@
 
 use textplots::{Chart, LabelBuilder, LabelFormat, Plot, Shape};
 
-/// Draws `points` (time, value) under a title.
-pub(crate) fn draw(title: &str, points: &[(f32, f32)]) {
-    let (Some(first), Some(last)) = (points.first(), points.last()) else { return };
+/// `points` (time, value) drawn under a title.
+pub(crate) fn draw(title: &str, points: &[(f32, f32)]) -> String {
+    let (Some(first), Some(last)) = (points.first(), points.last()) else { return format!("{title}: nothing") };
     let values = points.iter().map(|point| point.1);
     let (low, high) = values.fold((0.0_f32, 0.0_f32), |(low, high), value| (low.min(value), high.max(value)));
     if low == high || first.0 == last.0 {
-        return println!("{title}: {high} throughout");
+        return format!("{title}: {high} throughout");
     }
-    println!("{title}");
     let curve = Shape::Lines(points);
     let mut chart = Chart::new_with_y_range(140, 50, first.0, last.0, low, high);
     let format = |value: f32| format!("{value:.3}");
@@ -20,5 +19,5 @@ pub(crate) fn draw(title: &str, points: &[(f32, f32)]) {
         .y_label_format(LabelFormat::Custom(Box::new(format)));
     chart.axis();
     chart.figures();
-    println!("{chart}");
+    format!("{title}\n{chart}")
 }

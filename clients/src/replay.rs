@@ -32,7 +32,7 @@ const AHEAD_S: f64 = 2.0;
 const COMMANDS_AHEAD: u64 = 8192;
 
 /// Between two heartbeats.
-const HEARTBEAT: Duration = Duration::from_millis(20);
+const HEARTBEAT: Duration = Duration::from_millis(5);
 
 /// A running session sends a sample each step; this long without one is an end.
 const SILENCE: Duration = Duration::from_secs(10);
@@ -65,16 +65,18 @@ struct Session {
 }
 
 pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
-    let endpoint = Endpoint::from_shared(arguments.server.clone())
-        .map_err(|e| Failure::Refused(format!("--server {}: {e}", arguments.server)))?
-        .connect_timeout(Duration::from_secs(10));
+    let endpoint = endpoint(&arguments.server)?;
     let source = source(&arguments.scene)?;
     let channel = endpoint.connect().await.map_err(|e| {
-        let cause = std::error::Error::source(&e).map_or_else(|| e.to_string(), ToString::to_string);
-        Failure::Failed(format!("can't reach {}: {cause}", arguments.server))
+        let mut cause: &dyn std::error::Error = &e;
+        while let Some(deeper) = cause.source() {
+            cause = deeper;
+        }
+        Failure::Failed(format!("can't reach {}: {cause}; `palpate serve` starts a server", arguments.server))
     })?;
     let mut client = SessionServiceClient::new(channel.clone());
-    let request = pb::CreateSessionRequest { source: Some(source), paused: true };
+    let request =
+        pb::CreateSessionRequest { source: Some(source), paused: true, idle_timeout_s: Some(SILENCE.as_secs_f64()) };
     let created = client.create_session(request).await.map_err(refused_or_failed)?.into_inner().session;
     let created = created.ok_or_else(|| Failure::Failed("the server made no session".into()))?;
     let mut session = Session { client, id: created.session_id.clone() };
@@ -86,6 +88,18 @@ pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
     // A server that has gone has no sessions any more.
     let _ = session.client.delete_session(pb::DeleteSessionRequest { session_id: session.id }).await;
     ended
+}
+
+/// Host and port, with or without http://.
+fn endpoint(server: &str) -> Result<Endpoint, Failure> {
+    let refuse = |why: &str| Failure::Refused(format!("--server {server}: {why}"));
+    let url = match server.split_once("://") {
+        None => format!("http://{server}"),
+        Some(("http", _)) => server.to_owned(),
+        Some(_) => return Err(refuse("must begin with http://")),
+    };
+    let endpoint = Endpoint::from_shared(url).map_err(|e| refuse(&e.to_string()))?;
+    Ok(endpoint.connect_timeout(Duration::from_secs(10)))
 }
 
 fn source(scene: &str) -> Result<Source, Failure> {
@@ -116,6 +130,8 @@ struct Seen {
     round_trip_ns: Histogram<u64>,
     hold_ns: Histogram<u64>,
     overruns: u64,
+    samples: u64,
+    awake_points: u64,
     late: u64,
     rejected: u64,
     largest_displacement_m: f64,
@@ -135,6 +151,8 @@ impl Seen {
             round_trip_ns: histogram()?,
             hold_ns: histogram()?,
             overruns: 0,
+            samples: 0,
+            awake_points: 0,
             late: 0,
             rejected: 0,
             largest_displacement_m: 0.0,
@@ -149,6 +167,8 @@ impl Seen {
     #[allow(clippy::cast_possible_truncation)]
     fn sample(&mut self, sample: &pb::Sample) {
         self.overruns = sample.overrun_count;
+        self.samples += 1;
+        self.awake_points += u64::from(sample.awake_points);
         self.late = sample.late_commands;
         self.last = (sample.step, sample.server_time_ns);
         self.first.get_or_insert(self.last);
@@ -247,7 +267,7 @@ async fn play(
     let scene = wire::scene::from_scene(scene).map_err(refused)?;
     let limits = Limits::default();
     let script = Script::load(&arguments.script, &scene, &limits).map_err(refused)?;
-    for warning in &script.warnings {
+    for warning in created.warnings.iter().chain(&script.warnings) {
         eprintln!("palpate-client: warning: {warning}");
     }
     let mut output: Box<dyn Write> = match &arguments.output {
@@ -257,7 +277,10 @@ async fn play(
         )),
         None => Box::new(BufWriter::new(std::io::stdout())),
     };
-    let written = |e: std::io::Error| Failure::Failed(format!("can't write the output: {e}"));
+    let written = |e: std::io::Error| match e.kind() {
+        std::io::ErrorKind::BrokenPipe => Failure::Unread,
+        _ => Failure::Failed(format!("can't write the output: {e}")),
+    };
     let run = Run {
         scene: scene.name.clone(),
         script: script.name.clone(),
@@ -352,7 +375,7 @@ async fn play(
             message = next(&mut records), if records_left > 0 => {
                 let message = message?;
                 if message.dropped_records > 0 {
-                    return Err(Failure::Failed("records were lost: this client is too slow for them".into()));
+                    return Err(Failure::Failed("records were lost: this client is too slow for so many points so often".into()));
                 }
                 if wire::sample::add_to_record(&mut record, &message) {
                     let record = std::mem::take(&mut record);
@@ -386,7 +409,7 @@ async fn play(
         points,
         wall_s,
         ns_per_point_substep: wall_s * 1e9 / (substeps as f64 * points as f64),
-        computed_fraction: 1.0,
+        computed_fraction: seen.awake_points as f64 / (seen.samples.max(1) * points as u64) as f64,
         guard_events: 0,
         final_hash: final_hash.unwrap_or_default(),
         network: Some(network.clone()),
@@ -394,8 +417,10 @@ async fn play(
     write_line(&mut output, &Line::Summary(&summary)).map_err(written)?;
     output.flush().map_err(written)?;
     if arguments.plot {
-        plot::draw("Displacement of the control point along z, m", &seen.displacement);
-        plot::draw("Force of the tissue on the tool along z, N", &seen.reaction);
+        // Not among the records.
+        let show = |text: String| if arguments.output.is_some() { println!("{text}") } else { eprintln!("{text}") };
+        show(plot::draw("Displacement of the control point along z, m", &seen.displacement));
+        show(plot::draw("Force of the tissue on the tool along z, N", &seen.reaction));
     }
     table(arguments, &summary, &network, &seen);
     if seen.rejected > 0 {

@@ -7,6 +7,7 @@ pub mod queue;
 mod thread;
 
 use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 
@@ -82,6 +83,9 @@ pub struct Live {
     pub model: Arc<Model>,
     /// Where commands come in.
     pub intake: Mutex<Intake>,
+    /// Deleted when so long nobody asked for it, held a tool or had a stream, s.
+    pub idle_timeout_s: f64,
+    asked_ns: AtomicU64,
     number: u64,
     limits: Limits,
     status: Mutex<Status>,
@@ -95,6 +99,7 @@ pub struct StreamGuard(Arc<Live>);
 impl Drop for StreamGuard {
     fn drop(&mut self) {
         *lock(&self.0.streams) -= 1;
+        self.0.asked_ns.store(now_ns(), Ordering::Relaxed);
     }
 }
 
@@ -102,6 +107,16 @@ impl Live {
     /// How the session stands.
     pub fn status(&self) -> Status {
         lock(&self.status).clone()
+    }
+
+    #[allow(clippy::cast_precision_loss)]
+    fn is_idle(&self, now_ns: u64) -> bool {
+        let unused_s = now_ns.saturating_sub(self.asked_ns.load(Ordering::Relaxed)) as f64 * 1e-9;
+        unused_s > self.idle_timeout_s && *lock(&self.streams) == 0 && {
+            let mut intake = lock(&self.intake);
+            intake.lapse(now_ns);
+            intake.holders().next().is_none()
+        }
     }
 
     /// Room for one more stream.
@@ -220,7 +235,7 @@ impl Pacer {
     }
 
     /// Makes a session.
-    pub fn create(&self, scene: &Scene, paused: bool) -> Result<Arc<Live>> {
+    pub fn create(&self, scene: &Scene, paused: bool, idle_timeout_s: f64) -> Result<Arc<Live>> {
         let most_hz = self.limits.session_rate_hz;
         number("stepping.rate_hz", scene.stepping.rate_hz, &format!("at most {most_hz}"), |v| v <= most_hz)?;
         let model = Model::compile(scene, &self.limits)?;
@@ -249,6 +264,8 @@ impl Pacer {
             id: id.clone(),
             intake: Mutex::new(Intake::new(&model.scene, &self.limits)),
             model,
+            idle_timeout_s,
+            asked_ns: AtomicU64::new(now_ns()),
             number,
             limits: self.limits.clone(),
             status: Mutex::new(status),
@@ -263,7 +280,9 @@ impl Pacer {
 
     /// The session of that id.
     pub fn get(&self, id: &str) -> Result<Arc<Live>> {
-        lock(&self.sessions).get(id).cloned().ok_or_else(|| unknown_session(id))
+        let live = lock(&self.sessions).get(id).cloned().ok_or_else(|| unknown_session(id))?;
+        live.asked_ns.store(now_ns(), Ordering::Relaxed);
+        Ok(live)
     }
 
     /// All sessions, oldest first.
@@ -279,6 +298,13 @@ impl Pacer {
         lock(&live.intake).close(deleted());
         live.inbox.send(live.number, Request::Delete(deleted()));
         Ok(())
+    }
+
+    /// Deletes the sessions that nobody uses any more; tells which.
+    pub fn delete_idle(&self) -> Vec<String> {
+        let idle = |live: &&Arc<Live>| live.is_idle(now_ns());
+        let ids: Vec<String> = lock(&self.sessions).values().filter(idle).map(|live| live.id.clone()).collect();
+        ids.into_iter().filter(|id| self.delete(id).is_ok()).collect()
     }
 
     /// Adds a viewer to a session.

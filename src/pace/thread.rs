@@ -282,6 +282,10 @@ impl Running {
 
         let Running { session, taps, due, .. } = self;
         session.advance(due, |session| {
+            // A step that blew up has no record: the state went back to an earlier one.
+            if session.hold_reason().is_some() {
+                return;
+            }
             for tap in taps.probes.iter().filter(|tap| session.step_count().is_multiple_of(tap.every)) {
                 let step = session.step_count();
                 tap.writer.push(PacedRecord { step, record: session.record(&tap.points, tap.energy) });

@@ -225,17 +225,18 @@ impl<'a> Fields<'a> {
 
     /// The value of `key`, which has to be there.
     pub fn required(&mut self, key: &'static str) -> Result<Item<'a>> {
-        self.item(key).ok_or_else(|| {
-            match self.entries.keys().find(|there| key.strip_prefix(there.as_str()).is_some_and(|r| r.starts_with('_')))
-            {
-                Some(there) => self.without_unit(there, key),
-                None => self.refuse(Reason::Missing, key, "is missing"),
-            }
+        self.item(key).ok_or_else(|| match self.entries.keys().find(|there| is_meant(there, key)) {
+            Some(there) => self.misspelt(there, key),
+            None => self.refuse(Reason::Missing, key, "is missing"),
         })
     }
 
-    fn without_unit(&self, there: &str, key: &str) -> Refusal {
-        self.refuse(Reason::UnknownKey, there, format!("unknown key: the unit belongs to the name, `{key}`"))
+    fn misspelt(&self, there: &str, key: &str) -> Refusal {
+        let message = match key.strip_prefix(there) {
+            Some(_) => format!("unknown key: the unit belongs to the name, `{key}`"),
+            None => format!("unknown key; `{key}` is meant?"),
+        };
+        self.refuse(Reason::UnknownKey, there, message)
     }
 
     /// A finite number, if it is there.
@@ -256,14 +257,19 @@ impl<'a> Fields<'a> {
     /// Every key that was not asked for is refused.
     fn done(&self) -> Result<()> {
         let Some(key) = self.entries.keys().find(|key| !self.known.contains(&key.as_str())) else { return Ok(()) };
-        Err(match self.known.iter().find(|known| known.starts_with(&format!("{key}_"))) {
-            Some(with_unit) => self.without_unit(key, with_unit),
+        Err(match self.known.iter().find(|known| !self.entries.contains_key(**known) && is_meant(key, known)) {
+            Some(known) => self.misspelt(key, known),
             None => {
                 let message = format!("unknown key; known here: {}", self.known.join(", "));
                 self.refuse(Reason::UnknownKey, key, message)
             }
         })
     }
+}
+
+/// Whether `there` looks like `key` misspelt, or without its unit.
+fn is_meant(there: &str, key: &str) -> bool {
+    key.strip_prefix(there).is_some_and(|rest| rest.starts_with('_')) || strsim::damerau_levenshtein(there, key) <= 2
 }
 
 impl<'a> Item<'a> {

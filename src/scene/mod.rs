@@ -230,7 +230,7 @@ impl Scene {
             }
         }
         let stepping = &self.stepping;
-        number("stepping.rate_hz", stepping.rate_hz, "above 0 and at most 1e7", |v| v > 0.0 && v <= 1e7)?;
+        number("stepping.rate_hz", stepping.rate_hz, "from 1e-3 to 1e7", |v| (1e-3..=1e7).contains(&v))?;
         number("stepping.tolerance", stepping.tolerance, "above 0 and at most 1", |v| v > 0.0 && v <= 1.0)?;
         if let Some(substeps) = stepping.substeps {
             let range = format!("from 1 to {}", limits.substeps);

@@ -120,6 +120,13 @@ impl Binding<'_> {
             .iter()
             .map(|item| self.force(item, &mut control_points))
             .collect::<Result<Vec<_>>>()?;
+        for (index, law) in forces.iter().enumerate() {
+            let end = law.at(Moment::start_of(steps), self.scene.stepping.rate_hz);
+            if matches!(law.centre, CentreLaw::Path { .. }) && !is_near(&self.scene.sheet, end.centre_m) {
+                let message = "leaves the sheet; where the force is streamed (--held, a replay) it ends there";
+                self.warnings.push(format!("force[{index}].path: {message}"));
+            }
+        }
         let moves = items(fields, "tool")?.iter().map(|item| self.tool(item)).collect::<Result<Vec<_>>>()?;
         control_points.extend(moves.iter().map(|law| law.point));
         for (index, law) in moves.iter().enumerate() {

@@ -1,20 +1,19 @@
 //! The configuration of a server: a TOML file, then the command line over it.
 
-use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
 use crate::limits::Limits;
-use crate::refusal::{Reason, Refusal, Result, positive};
+use crate::refusal::{Reason, Refusal, Result, number, positive};
 use crate::scene::document::read_text;
 
 /// Everything that can be configured. Absent keys keep these defaults.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
-    /// Where to listen.
-    pub listen: SocketAddr,
+    /// Where to listen: address:port.
+    pub listen: String,
     /// Folder of the scenes that sessions can be made from by name.
     pub scenes: PathBuf,
     /// Stepping threads; one less than the machine has cores if 0.
@@ -25,6 +24,8 @@ pub struct Config {
     pub shutdown_deadline_s: f64,
     /// Lease of a tool if the client asks for none, s.
     pub lease_s: f64,
+    /// A session is deleted when so long nobody asked for it, held a tool or had a stream, s.
+    pub idle_session_s: f64,
     /// What is logged: `info`, `debug`, `palpate=debug,tonic=warn`, …
     pub log: String,
     /// Upper bounds.
@@ -34,12 +35,13 @@ pub struct Config {
 impl Default for Config {
     fn default() -> Self {
         Config {
-            listen: SocketAddr::from(([127, 0, 0, 1], 7117)),
+            listen: "127.0.0.1:7117".to_owned(),
             scenes: PathBuf::from("scenes"),
             threads: 0,
             network_threads: 2,
             shutdown_deadline_s: 5.0,
             lease_s: 2.0,
+            idle_session_s: 900.0,
             log: "info".to_owned(),
             limits: Limits::default(),
         }
@@ -53,23 +55,27 @@ impl Config {
         let config: Config = toml::from_str(&text).map_err(|e| {
             let line = e.span().map_or(1, |span| text[..span.start].matches('\n').count() + 1);
             let place = Some(format!("{}:{line}", path.display()));
-            Refusal { place, ..Refusal::new(Reason::Unreadable, "", e.message().trim_end()) }
+            Refusal { place, ..Refusal::new(Reason::Unreadable, "", format!("{}\n{e}", e.message()).trim_end()) }
         })?;
         config.check().map_err(|refusal| Refusal { place: Some(path.display().to_string()), ..refusal })?;
         Ok(config)
     }
 
-    fn check(&self) -> Result<()> {
+    /// Ranges.
+    pub fn check(&self) -> Result<()> {
         for (field, value) in [
-            ("shutdown_deadline_s", self.shutdown_deadline_s),
-            ("lease_s", self.lease_s),
-            ("limits.lease_s", self.limits.lease_s),
             ("limits.point_force_n", self.limits.point_force_n),
             ("limits.reach_in_sheets", self.limits.reach_in_sheets),
             ("limits.session_rate_hz", self.limits.session_rate_hz),
         ] {
             positive(field, value)?;
         }
+        let (most_s, day_s) = (self.limits.lease_s, 86400.0);
+        let within = |most: f64| move |value: f64| value > 0.0 && value <= most;
+        number("lease_s", self.lease_s, &format!("above 0 and at most limits.lease_s, {most_s}"), within(most_s))?;
+        number("limits.lease_s", most_s, "above 0 and at most a day", within(day_s))?;
+        number("shutdown_deadline_s", self.shutdown_deadline_s, "above 0 and at most a day", within(day_s))?;
+        number("idle_session_s", self.idle_session_s, "above 0", |value| value > 0.0)?;
         Ok(())
     }
 

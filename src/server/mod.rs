@@ -50,7 +50,13 @@ pub enum ServeError {
 pub async fn serve(listener: TcpListener, config: Config, shutdown: CancellationToken) -> Result<(), ServeError> {
     let pacer = Pacer::start(config.stepping_threads(), &config.limits)?;
     let deadline = Duration::from_secs_f64(config.shutdown_deadline_s);
-    let house = House { catalog: Catalog::new(&config.scenes), pacer: pacer.clone(), config: Arc::new(config) };
+    let catalog = Catalog::new(&config.scenes);
+    for name in catalog.names() {
+        if let Err(refusal) = catalog.load(&name, &config.limits) {
+            warn!(%refusal, "a scene that no session can be made from");
+        }
+    }
+    let house = House { catalog, pacer: pacer.clone(), config: Arc::new(config) };
 
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<SessionServiceServer<sessions::Sessions>>().await;
@@ -60,6 +66,17 @@ pub async fn serve(listener: TcpListener, config: Config, shutdown: Cancellation
         tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(pb::DESCRIPTORS)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+    };
+
+    let unused = pacer.clone();
+    let sweeping = async move {
+        let mut sweep = tokio::time::interval(Duration::from_secs(1));
+        loop {
+            sweep.tick().await;
+            for session in unused.delete_idle() {
+                info!(session, "session deleted: nobody used it");
+            }
+        }
     };
 
     // Nagle's algorithm would hold a sample back for milliseconds.
@@ -93,6 +110,7 @@ pub async fn serve(listener: TcpListener, config: Config, shutdown: Cancellation
             pacer.stop();
             served?;
         }
+        () = sweeping => {}
         () = ending => warn!("streams were still open at the deadline, and are cut"),
     }
     info!("stopped");

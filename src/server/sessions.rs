@@ -3,10 +3,10 @@
 use std::sync::Arc;
 
 use tonic::{Request, Response, Status};
-use tracing::info;
+use tracing::{info, warn};
 
 use super::House;
-use crate::refusal::{Reason, Refusal};
+use crate::refusal::{Reason, Refusal, number};
 use crate::wire::pb::session_service_server::SessionService;
 use crate::wire::{self, pb};
 
@@ -29,9 +29,15 @@ impl SessionService for Sessions {
             Some(Source::Scene(scene)) => wire::scene::from_scene(scene).map_err(|refusal| refusal.within("scene"))?,
             None => return Err(Refusal::new(Reason::Missing, "source", "scene_name or scene is missing").into()),
         };
-        let live = self.0.pacer.create(&scene, request.paused)?;
-        let warnings = live.model.warnings.join("; ");
-        info!(session = %live.id, scene = %scene.name, points = live.model.len(), warnings, "session created");
+        let most_s = self.0.config.idle_session_s;
+        let idle_timeout_s = request.idle_timeout_s.unwrap_or(most_s);
+        let range = format!("above 0 and at most {most_s}");
+        number("idle_timeout_s", idle_timeout_s, &range, |value| value > 0.0 && value <= most_s)?;
+        let live = self.0.pacer.create(&scene, request.paused, idle_timeout_s)?;
+        info!(session = %live.id, scene = %scene.name, points = live.model.len(), "session created");
+        for warning in &live.model.warnings {
+            warn!(session = %live.id, warning);
+        }
         Ok(Response::new(pb::CreateSessionResponse { session: Some(wire::sample::session(&live)) }))
     }
 

@@ -102,7 +102,8 @@ impl Intake {
                 return Err(Refusal::new(Reason::OutOfRange, "tools", format!("names tool {tool} twice")));
             }
             if let Some(lease) = self.leases.get(tool) {
-                let message = format!("tool {tool} is held by `{}`", lease.holder);
+                let holder = if lease.holder.is_empty() { "somebody" } else { &lease.holder };
+                let message = format!("tool {tool} is held by `{holder}`");
                 return Err(Refusal::new(Reason::ToolHeld, "tool", message));
             }
         }

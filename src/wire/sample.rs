@@ -160,6 +160,8 @@ pub fn session(live: &Arc<Live>) -> pb::Session {
         hold_reason: status.hold_reason.unwrap_or_default(),
         held_tools: intake.holders().map(|(tool, holder)| pb::HeldTool { tool, holder: holder.to_owned() }).collect(),
         lapsed_leases: intake.lapsed(),
+        warnings: model.warnings.clone(),
+        idle_timeout_s: live.idle_timeout_s,
     }
 }
 

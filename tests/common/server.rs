@@ -94,7 +94,7 @@ impl Server {
         source: pb::create_session_request::Source,
         paused: bool,
     ) -> Result<pb::Session, Status> {
-        let request = pb::CreateSessionRequest { source: Some(source), paused };
+        let request = pb::CreateSessionRequest { source: Some(source), paused, idle_timeout_s: None };
         Ok(self.sessions().await.create_session(request).await?.into_inner().session.unwrap())
     }
 
