@@ -21,14 +21,20 @@ pub struct Limits {
     pub trace_bytes: u64,
     /// Tools of a session: their numbers are below this.
     pub tools: u32,
-    /// Commands that wait for their step, per session.
-    pub queued_commands: usize,
+    /// Commands that wait for their step, per tool.
+    pub queued_commands_per_tool: usize,
     /// Samples that wait for a reader before the oldest is dropped.
     pub queued_samples: usize,
     /// Probe records that wait for a reader before the oldest is dropped.
     pub queued_records: usize,
+    /// Bytes that wait for one reader, of records or of frames; at least one record or frame may.
+    pub queued_bytes: usize,
     /// Sessions of a server.
     pub sessions: usize,
+    /// Mass points of all sessions of a server.
+    pub points_in_all: usize,
+    /// Points times substeps of a session: what one step may cost its thread.
+    pub point_substeps_per_step: u64,
     /// Streams that read one session.
     pub streams_per_session: usize,
     /// Step rate of a session, Hz.
@@ -51,14 +57,17 @@ impl Default for Limits {
             file_bytes: 16 << 20,
             trace_bytes: 64 << 20,
             tools: 64,
-            queued_commands: 16_384,
+            queued_commands_per_tool: 4096,
             queued_samples: 64,
             queued_records: 64,
+            queued_bytes: 64 << 20,
             sessions: 1024,
+            points_in_all: 1 << 24,
+            point_substeps_per_step: 1 << 26,
             streams_per_session: 256,
             session_rate_hz: 20_000.0,
             frame_vertices: 1 << 22,
-            probe_points: 4096,
+            probe_points: 1 << 16,
             lease_s: 600.0,
         }
     }

@@ -142,9 +142,11 @@ fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     config.check()?;
     let filter = tracing_subscriber::EnvFilter::try_new(&config.log)
         .map_err(|e| Failure::Refused(format!("--log {}: {e}", config.log)))?;
+    // Nobody waits for a log that is not read: what does not fit is dropped.
+    let (writer, _flush) = tracing_appender::non_blocking(std::io::stderr());
     let subscriber = tracing_subscriber::fmt()
         .with_env_filter(filter)
-        .with_writer(std::io::stderr)
+        .with_writer(writer)
         .with_ansi(std::io::stderr().is_terminal());
     if arguments.log_json {
         subscriber.json().init();

@@ -149,3 +149,13 @@ pub fn finite_vector(field: &str, value: glam::DVec3) -> Result<glam::DVec3> {
     }
     Ok(value)
 }
+
+/// What people read: short, and on one line.
+pub fn label(field: &str, label: &str) -> Result<()> {
+    const MOST_BYTES: usize = 128;
+    if label.len() > MOST_BYTES || label.chars().any(char::is_control) {
+        let message = format!("must be at most {MOST_BYTES} bytes, without control characters");
+        return Err(Refusal::new(Reason::OutOfRange, field, message));
+    }
+    Ok(())
+}

@@ -56,7 +56,7 @@ fn the_golden_hash_of_a_fixed_scene_stays() {
     }
 }
 
-const GOLDEN_F32: &str = "6575853c7cbd3bac895ac39109e709f1";
+const GOLDEN_F32: &str = "4c7e3cc1db49379ffac86ddc98b6fd17";
 const GOLDEN_F64: &str = "706aa1c81a99a128dfe5813825267052";
 
 #[test]

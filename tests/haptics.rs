@@ -247,10 +247,94 @@ async fn a_position_is_reached_by_the_end_of_its_step_and_the_latest_wins() {
 }
 
 #[tokio::test]
+async fn a_late_position_counts_as_late_also_when_another_takes_its_place() {
+    let server = Server::start(&[]);
+    let session = server.paper(true).await;
+    let mut touch = Touch::hold(&server, &session).await;
+    server.start_until(&session, 10).await;
+    touch.sample_with(|sample| sample.step == 10).await;
+    for (sequence, at_step) in [(1, 5), (2, 6), (3, 10)] {
+        touch.command(pb::Command { at_step: Some(at_step), ..position(0, sequence, -0.001) }).await;
+    }
+    touch.settle().await;
+    server.start_until(&session, 12).await;
+    let sample = touch.sample_with(|sample| sample.step == 12).await;
+    assert_eq!((sample.late_commands, sample.tools[0].acknowledged_sequence), (2, 3));
+}
+
+#[tokio::test]
+async fn the_order_in_which_two_clients_commands_arrive_does_not_matter() {
+    let server = Server::start(&[]);
+    let mut hashes = Vec::new();
+    for order in [[0, 1], [1, 0]] {
+        let session = server.paper(true).await;
+        let mut touches = [Touch::open(&server, open(&session, &[0])).await.unwrap(), {
+            Touch::open(&server, open(&session, &[1])).await.unwrap()
+        }];
+        for tool in order {
+            let z_m = if tool == 0 { -0.01 } else { 0.01 };
+            touches[tool].command(pb::Command { at_step: Some(3), ..position(tool as u32, 1, z_m) }).await;
+            touches[tool].settle().await;
+        }
+        server.start_until(&session, 20).await;
+        hashes.push(server.hash_at(&session, 20).await);
+    }
+    assert_eq!(hashes[0], hashes[1]);
+}
+
+#[tokio::test]
+async fn a_batch_is_answered_also_when_time_is_stopped_under_it() {
+    let server = Server::start(&[]);
+    let mut scene = paper_scene();
+    scene.stepping.as_mut().unwrap().rate_hz = Some(0.01);
+    let session = server.create(pb::create_session_request::Source::Scene(scene), false).await.unwrap().session_id;
+    let mut haptics = server.haptics().await;
+    let acquire = pb::AcquireToolRequest { session_id: session.clone(), lease_s: Some(60.0), ..Default::default() };
+    let lease_id = haptics.acquire_tool(acquire).await.unwrap().into_inner().lease_id;
+    // The first step is done at once; the next is due in 100 s.
+    server.hash_at(&session, 1).await;
+    let request = pb::SendCommandsRequest { session_id: session.clone(), lease_id, commands: vec![force(0, 1, -1.0)] };
+    let waiting = tokio::spawn(async move { haptics.send_commands(request).await });
+    tokio::time::sleep(std::time::Duration::from_millis(100)).await;
+    let pause = pb::PauseSessionRequest { session_id: session.clone() };
+    server.sessions().await.pause_session(pause).await.unwrap();
+    assert_eq!(server.status(&session).await.state(), pb::SessionState::Paused);
+    let answer = tokio::time::timeout(PATIENCE, waiting).await.unwrap().unwrap().unwrap().into_inner();
+    assert_eq!(answer.sample.unwrap().step, 1);
+}
+
+#[tokio::test]
+async fn what_people_read_is_short_and_on_one_line() {
+    let server = Server::start(&[]);
+    let session = server.paper(true).await;
+    for holder in ["x".repeat(129), "two\nlines".to_owned()] {
+        let refused = Touch::open(&server, pb::TouchOpen { holder, ..open(&session, &[0]) }).await.err().unwrap();
+        assert_eq!(told(&refused), (Code::InvalidArgument, "OUT_OF_RANGE".into(), "holder".into()));
+    }
+    let refused = Touch::open(&server, open(&"x".repeat(100_000), &[0])).await.err().unwrap();
+    assert_eq!(told(&refused).1, "UNKNOWN_SESSION");
+}
+
+#[tokio::test]
+async fn a_fixed_point_can_not_be_grasped() {
+    let server = Server::start(&[]);
+    let mut scene = paper_scene();
+    scene.sheet.as_mut().unwrap().fixed = Some(pb::sheet::Fixed::FixedSet(pb::FixedSet::Corners.into()));
+    let session = server.create(pb::create_session_request::Source::Scene(scene), true).await.unwrap().session_id;
+    let mut touch = Touch::hold(&server, &session).await;
+    let mut command = position(0, 1, -0.01);
+    let Some(Action::Position(position)) = &mut command.action else { unreachable!() };
+    position.point = Some(pb::GridPoint { x: 30, y: 30 });
+    touch.command(command).await;
+    let rejection = touch.rejection().await;
+    assert_eq!((rejection.reason.as_str(), rejection.field.as_str()), ("OUT_OF_RANGE", "position.point"));
+}
+
+#[tokio::test]
 async fn a_full_queue_refuses_and_keeps_what_it_has() {
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("palpate.toml");
-    std::fs::write(&config, "[limits]\nqueued_commands = 5\n").unwrap();
+    std::fs::write(&config, "[limits]\nqueued_commands_per_tool = 5\n").unwrap();
     let server = Server::start(&["--config", config.to_str().unwrap()]);
     let session = server.paper(true).await;
     let mut touch = Touch::hold(&server, &session).await;

@@ -419,6 +419,85 @@ fn a_let_go_point_goes_on_with_its_velocity() {
 }
 
 #[test]
+fn a_point_let_go_as_a_force_begins_starts_like_any_free_point() {
+    // Held at rest, then let go at the step at which a force begins: the same as a force that begins on a free point.
+    let scene = scene_with(SMALL, &["stepping.substeps=2"]);
+    let index = model(&scene).index_of([3, 2]);
+    let run = |hold: bool| {
+        let mut tissue = sheet::at_rest(&model(&scene));
+        if hold {
+            tissue.grasp(0, index, Grasp::Held(DVec3::ZERO));
+        }
+        for _ in 0..50 {
+            tissue.step().unwrap();
+        }
+        tissue.push(0, Some(push_on(&scene, [3, 2], [0.0, 0.0, -0.5])));
+        for _ in 0..50 {
+            tissue.step().unwrap();
+        }
+        tissue.point(index)
+    };
+    let (held, free) = (run(true), run(false));
+    assert!((held.displacement_m - free.displacement_m).length() < 1e-12, "{held:?}\n{free:?}");
+    assert!((held.velocity_m_per_s - free.velocity_m_per_s).length() < 1e-12);
+}
+
+#[test]
+fn to_grasp_and_let_go_between_two_steps_changes_nothing() {
+    let scene = scene(SMALL);
+    let run = |touch: bool| {
+        let mut tissue = shaken(&scene, 20);
+        if touch {
+            let index = tissue.model().index_of([3, 2]);
+            tissue.grasp(0, index, Grasp::Held(DVec3::ZERO));
+            tissue.release(0);
+        }
+        for _ in 0..20 {
+            tissue.step().unwrap();
+        }
+        tissue.state_hash()
+    };
+    assert_eq!(run(true), run(false));
+}
+
+#[test]
+fn a_grasped_point_taken_over_by_another_tool_follows_that_one() {
+    let scene = scene(SMALL);
+    let mut tissue = sheet::at_rest(&model(&scene));
+    let index = tissue.model().index_of([3, 2]);
+    tissue.grasp(0, index, Grasp::Held(DVec3::new(0.0, 0.0, 0.01)));
+    tissue.step().unwrap();
+    tissue.grasp(1, index, Grasp::Held(DVec3::new(0.0, 0.0, 0.012)));
+    tissue.step().unwrap();
+    let point = tissue.point(index);
+    assert!((point.displacement_m.z - 0.012).abs() < 1e-15);
+    assert!((point.velocity_m_per_s.z - 2.0).abs() < 1e-9);
+    // The first has nothing to let go any more.
+    tissue.release(0);
+    tissue.step().unwrap();
+    assert_eq!(tissue.point(index).displacement_m.z, 0.012);
+    tissue.release(1);
+    tissue.step().unwrap();
+    assert!(tissue.point(index).constraint_n.is_none());
+}
+
+#[test]
+fn a_grasp_that_goes_on_as_the_point_went_needs_little_force() {
+    let scene = scene(SMALL);
+    let mut tissue = shaken(&scene, 20);
+    let index = tissue.model().index_of([3, 2]);
+    let free = tissue.point(index);
+    let target = free.displacement_m + free.velocity_m_per_s * 1e-3;
+    tissue.grasp(0, index, Grasp::Held(target));
+    tissue.step().unwrap();
+    let held = tissue.point(index);
+    let inertia_n = scene.sheet.point_mass_kg * free.velocity_m_per_s.length() * 1000.0;
+    let elastic_n = (held.reaction_n() + held.applied_n).length();
+    let force_n = held.constraint_n.unwrap().length();
+    assert!(force_n < 1.01 * elastic_n + 1e-6 && elastic_n < 0.5 * inertia_n, "{force_n}, {elastic_n}, {inertia_n}");
+}
+
+#[test]
 fn two_forces_add_up_and_a_moving_one_is_where_it_should_be() {
     let scene = scene(SMALL);
     let text = r#"

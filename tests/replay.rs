@@ -221,6 +221,30 @@ fn a_server_that_stops_in_mid_replay_is_told() {
     assert!(message.contains("the server"), "{message}");
 }
 
+#[cfg(unix)]
+#[test]
+fn a_server_that_falls_silent_in_mid_replay_is_told() {
+    let server = Server::start(&[]);
+    let folder = tempfile::tempdir().unwrap();
+    let script = folder.path().join("long.toml");
+    std::fs::write(&script, "duration_s = 600.0\nsample_every_s = 0.001\nsample_points = [[0, 0]]\n").unwrap();
+    let records = folder.path().join("records.jsonl");
+    let client = Command::new(client_program())
+        .args(["replay", script.to_str().unwrap(), "--server", &server.url, "--output", records.to_str().unwrap()])
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    while std::fs::metadata(&records).map_or(0, |meta| meta.len()) < 20_000 {
+        std::thread::sleep(std::time::Duration::from_millis(20));
+    }
+    let frozen = Command::new("kill").args(["-STOP", &server.child.id().to_string()]).status().unwrap();
+    assert!(frozen.success());
+    let output = client.wait_with_output().unwrap();
+    let message = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(1), "{message}");
+    assert!(message.contains("the server was silent for 10 s"), "{message}");
+}
+
 #[test]
 fn what_a_replay_can_not_play_is_refused() {
     let server = Server::start(&[]);
@@ -233,6 +257,13 @@ fn what_a_replay_can_not_play_is_refused() {
     refused(replay(&server, &script, &["--scene", "nothing"]), 2, "UNKNOWN_SCENE");
     refused(replay(&server, Path::new("no-such-script.toml"), &[]), 2, "no-such-script.toml");
     refused(replay(&server, &script, &["--output", "/no/such/folder/file"]), 2, "/no/such/folder/file");
+    for server in ["https://127.0.0.1:1", "ftp://nowhere", "http://"] {
+        let wrong = Command::new(client_program())
+            .args(["replay", script.to_str().unwrap(), "--server", server])
+            .output()
+            .unwrap();
+        refused(wrong, 2, server);
+    }
     let nobody = Command::new(client_program())
         .args(["replay", script.to_str().unwrap(), "--server", "http://127.0.0.1:1"])
         .output()

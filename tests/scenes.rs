@@ -194,6 +194,11 @@ fn a_bad_script_is_refused_with_file_line_and_key() {
         (profile, "profile = { type = \"constant\", on_s = 1.0 }", "force[0].profile.on_s: unknown key"),
         (profile, "profile = { type = \"pulse\", on_s = 0.2, off_s = 0.1 }", "force[0].profile.off_s"),
         (profile, "profile = { type = \"ramp\", from_s = 0.2, to_s = 0.1 }", "force[0].profile.to_s"),
+        (
+            profile,
+            "profile = { type = \"sine\", frequency_hz = 1e308 }",
+            "force[0].profile.frequency_hz: must be from 0",
+        ),
         (profile, "profile = { type = \"sine\", frequency_hz = -1.0 }", "force[0].profile.frequency_hz"),
         (
             profile,
@@ -279,7 +284,7 @@ fn a_run_that_blows_up_fails_and_says_why() {
     let message = String::from_utf8_lossy(&output.stderr).into_owned();
     assert_eq!(output.status.code(), Some(1), "{message}");
     assert!(message.contains("warning: stepping.substeps: 1 is above the stability bound"), "{message}");
-    assert!(message.contains("not finite after step"), "{message}");
+    assert!(message.contains("was not finite"), "{message}");
     let text = String::from_utf8_lossy(&output.stdout).into_owned();
     assert!(!text.contains("NaN") && !text.contains("null") && !text.contains("summary"), "{text}");
 }
@@ -322,5 +327,22 @@ fn a_sheet_of_one_point_is_a_pendulum_and_a_line_is_a_string() {
         let sets = ["--set", "springs.flexion=true"];
         let lines = lines(&run(&scene, &script, &sets));
         assert!(lines[3]["points"][0]["displacement_m"][2].as_f64().unwrap() < -0.01, "{points}");
+    }
+}
+
+#[test]
+fn the_formats_page_tells_the_truth() {
+    // Its scene and its script are read as they stand there.
+    let page = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/formats.md")).unwrap();
+    let blocks: Vec<&str> = page.split("```toml\n").skip(1).map(|rest| rest.split("```").next().unwrap()).collect();
+    let [scene, script] = blocks.as_slice() else { panic!("{} blocks", blocks.len()) };
+    let output = run(scene, script, &[]);
+    assert_eq!(lines(&output).len(), 1 + 21 + 1);
+    // Every key of a record and of a summary is in its tables.
+    let through = lines(&output);
+    let keys = |value: &Value| value.as_object().unwrap().keys().cloned().collect::<Vec<_>>();
+    let point = &through[1]["points"][0];
+    for key in [keys(&through[1]), keys(point), keys(&through[22]["summary"]), keys(&through[0]["run"])].concat() {
+        assert!(page.contains(&format!("`{key}")) || page.contains(&format!(".{key}")) || page.contains(&key), "{key}");
     }
 }

@@ -253,6 +253,49 @@ async fn sessions_and_streams_have_a_limit() {
 }
 
 #[tokio::test]
+async fn a_session_that_nobody_uses_is_deleted_and_one_in_use_stays() {
+    let server = Server::start(&[]);
+    let make = |idle_timeout_s: f64| pb::CreateSessionRequest {
+        source: Some(Source::SceneName("paper".into())),
+        idle_timeout_s: Some(idle_timeout_s),
+        ..Default::default()
+    };
+    let mut sessions = server.sessions().await;
+    for wrong in [0.0, -1.0, f64::NAN, 1e9] {
+        assert_eq!(told(&sessions.create_session(make(wrong)).await.unwrap_err()).2, "idle_timeout_s");
+    }
+    let unused = sessions.create_session(make(0.2)).await.unwrap().into_inner().session.unwrap();
+    let used = sessions.create_session(make(0.2)).await.unwrap().into_inner().session.unwrap();
+    let mut touch = Touch::hold(&server, &used.session_id).await;
+    let until = std::time::Instant::now() + PATIENCE;
+    loop {
+        let listed = sessions.list_sessions(pb::ListSessionsRequest {}).await.unwrap().into_inner().sessions;
+        assert!(listed.iter().any(|session| session.session_id == used.session_id));
+        if !listed.iter().any(|session| session.session_id == unused.session_id) {
+            break;
+        }
+        assert!(std::time::Instant::now() < until);
+        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+    }
+    touch.sample().await;
+}
+
+#[tokio::test]
+async fn a_session_beyond_the_limits_of_the_server_is_refused() {
+    let server = Server::start(&[]);
+    let mut scene = paper();
+    let sheet = scene.sheet.as_mut().unwrap();
+    (sheet.points_x, sheet.points_y) = (Some(1000), Some(1000));
+    scene.stepping.as_mut().unwrap().substeps = Some(1000);
+    let status = server.create(Source::Scene(scene), true).await.unwrap_err();
+    assert_eq!(told(&status), (Code::ResourceExhausted, "TOO_LARGE".into(), "stepping.substeps".into()));
+    let mut scene = paper();
+    scene.name = "two\nlines".into();
+    let status = server.create(Source::Scene(scene), true).await.unwrap_err();
+    assert_eq!(told(&status), (Code::InvalidArgument, "OUT_OF_RANGE".into(), "name".into()));
+}
+
+#[tokio::test]
 async fn health_is_served() {
     let server = Server::start(&[]);
     let mut health = tonic_health::pb::health_client::HealthClient::new(server.channel().await);

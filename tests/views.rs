@@ -195,6 +195,25 @@ async fn a_viewer_that_reads_nothing_delays_nobody() {
 }
 
 #[tokio::test]
+async fn a_greedy_session_leaves_frames_for_others() {
+    let server = Server::start(&[]);
+    let greedy = server.paper(false).await;
+    let request = pb::WatchFramesRequest { rate_hz: Some(1000.0), ..watch(&greedy, 10, pb::Encoding::F32) };
+    let mut flood = server.views().await.watch_frames(request).await.unwrap().into_inner();
+    let reading = tokio::spawn(async move { while flood.message().await.is_ok_and(|part| part.is_some()) {} });
+    let session = server.paper(true).await;
+    let request = pb::WatchFramesRequest { rate_hz: Some(50.0), ..watch(&session, 0, pb::Encoding::I16) };
+    let mut frames = server.views().await.watch_frames(request).await.unwrap().into_inner();
+    server.start_until(&session, 1000).await;
+    let mut count = 0;
+    while frame(&mut frames).await.0.step < 1000 {
+        count += 1;
+    }
+    assert!(count > 10, "{count} frames of 50");
+    reading.abort();
+}
+
+#[tokio::test]
 async fn bad_views_are_refused() {
     let server = Server::start(&[]);
     let session = server.paper(true).await;

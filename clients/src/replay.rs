@@ -2,6 +2,7 @@
 
 use std::io::{BufWriter, IsTerminal, Write};
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use hdrhistogram::Histogram;
@@ -28,8 +29,8 @@ use crate::{Failure, plot};
 /// How far ahead of the server's step commands are sent: as long as a network may stall and none is late.
 const AHEAD_S: f64 = 2.0;
 
-/// Commands on their way at most, below what a session queues.
-const COMMANDS_AHEAD: u64 = 8192;
+/// Commands of a tool on their way at most, below what a session queues.
+const COMMANDS_AHEAD: u64 = 4000;
 
 /// Between two heartbeats.
 const HEARTBEAT: Duration = Duration::from_millis(5);
@@ -58,6 +59,9 @@ pub(crate) struct Arguments {
     quiet: bool,
 }
 
+/// When the server was last heard.
+type LastHeard = Mutex<Instant>;
+
 /// The session is deleted also when the replay fails.
 struct Session {
     client: SessionServiceClient<Channel>,
@@ -81,12 +85,15 @@ pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
     let created = created.ok_or_else(|| Failure::Failed("the server made no session".into()))?;
     let mut session = Session { client, id: created.session_id.clone() };
     let sessions = session.client.clone();
+    let heard = LastHeard::new(Instant::now());
     let ended = tokio::select! {
-        ended = play(arguments, &created, sessions, channel) => ended,
+        ended = play(arguments, &created, sessions, channel, &heard) => ended,
+        failure = silence(&heard) => Err(failure),
         _ = tokio::signal::ctrl_c() => Err(Failure::Failed("interrupted".into())),
     };
     // A server that has gone has no sessions any more.
-    let _ = session.client.delete_session(pb::DeleteSessionRequest { session_id: session.id }).await;
+    let deleted = session.client.delete_session(pb::DeleteSessionRequest { session_id: session.id });
+    let _ = tokio::time::timeout(Duration::from_secs(2), deleted).await;
     ended
 }
 
@@ -246,12 +253,24 @@ impl Streamer<'_> {
     }
 }
 
-async fn next<T>(stream: &mut Streaming<T>) -> Result<T, Failure> {
-    match tokio::time::timeout(SILENCE, stream.message()).await {
-        Ok(Ok(Some(message))) => Ok(message),
-        Ok(Ok(None)) => Err(Failure::Failed("the server ended the replay".into())),
-        Ok(Err(status)) => Err(failed(status)),
-        Err(_) => Err(Failure::Failed(format!("the server was silent for {} s", SILENCE.as_secs()))),
+async fn next<T>(stream: &mut Streaming<T>, heard: &LastHeard) -> Result<T, Failure> {
+    let message = stream.message().await;
+    *heard.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now();
+    match message {
+        Ok(Some(message)) => Ok(message),
+        Ok(None) => Err(Failure::Failed("the server ended the replay".into())),
+        Err(status) => Err(failed(status)),
+    }
+}
+
+/// Ends a replay whose server says nothing any more, whatever the replay waits for.
+async fn silence(heard: &LastHeard) -> Failure {
+    loop {
+        let last = *heard.lock().unwrap_or_else(PoisonError::into_inner);
+        if last.elapsed() >= SILENCE {
+            return Failure::Failed(format!("the server was silent for {} s", SILENCE.as_secs()));
+        }
+        tokio::time::sleep_until((last + SILENCE).into()).await;
     }
 }
 
@@ -261,6 +280,7 @@ async fn play(
     created: &pb::Session,
     mut sessions: SessionServiceClient<Channel>,
     channel: Channel,
+    heard: &LastHeard,
 ) -> Result<(), Failure> {
     let session_id = &created.session_id;
     let scene = created.scene.as_ref().ok_or_else(|| Failure::Failed("the server sent no scene".into()))?;
@@ -301,7 +321,8 @@ async fn play(
         every_steps: Some(script.sample_every.try_into().unwrap_or(u32::MAX)),
         energy: true,
     };
-    let probe = if script.sample_points.len() == scene.sheet.points[0] * scene.sheet.points[1] {
+    let [nx, ny] = scene.sheet.points;
+    let probe = if script.sample_points.iter().copied().eq((0..nx * ny).map(|index| [index / ny, index % ny])) {
         pb::ProbeRequest { r#where: Some(pb::probe_request::Where::AllPoints(true)), ..probe }
     } else {
         probe
@@ -320,13 +341,13 @@ async fn play(
     streamer.say(Say::Open(open)).await?;
     let mut touch = haptics.touch(ReceiverStream::new(messages)).await.map_err(refused_or_failed)?.into_inner();
 
-    let ahead = ((AHEAD_S * scene.stepping.rate_hz) as u64).min(COMMANDS_AHEAD / (script.tools() as u64).max(1)).max(1);
+    let ahead = ((AHEAD_S * scene.stepping.rate_hz) as u64).clamp(1, COMMANDS_AHEAD);
     let mut seen = Seen::new()?;
     streamer.send_before(ahead).await?;
     // Answered in order: what has been sent so far is in the queue before the first step.
     streamer.heartbeat().await?;
     loop {
-        match next(&mut touch).await?.message {
+        match next(&mut touch, heard).await?.message {
             Some(Heard::Renewed(_)) => break,
             Some(Heard::Rejection(rejection)) => return Err(rejected(&rejection)),
             _ => {}
@@ -348,7 +369,7 @@ async fn play(
     let mut wall_s = 0.0;
     while records_left > 0 || final_hash.is_none() || seen.last.0 < script.steps {
         tokio::select! {
-            message = next(&mut touch), if seen.last.0 < script.steps => match message?.message {
+            message = next(&mut touch, heard), if seen.last.0 < script.steps => match message?.message {
                 Some(Heard::Sample(sample)) => {
                     if sample.held {
                         let asked = pb::GetSessionRequest { session_id: session_id.clone() };
@@ -372,7 +393,7 @@ async fn play(
                 }
                 Some(Heard::Opened(_)) | None => {}
             },
-            message = next(&mut records), if records_left > 0 => {
+            message = next(&mut records, heard), if records_left > 0 => {
                 let message = message?;
                 if message.dropped_records > 0 {
                     return Err(Failure::Failed("records were lost: this client is too slow for so many points so often".into()));

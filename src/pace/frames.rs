@@ -1,7 +1,7 @@
 //! Frames, off the stepping threads: a thread that refines and encodes the newest snapshot of each session, once
 //! for all viewers that ask for the same, and hands it to those that have credit.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 
 use super::queue::{Reader, Writer, lock, queue};
@@ -50,8 +50,11 @@ impl Viewer {
         encoding: Encoding,
         rate_hz: f64,
         max_in_flight: Option<u32>,
+        queued_bytes: usize,
     ) -> (Arc<Self>, Reader<Delivery>) {
-        let most = max_in_flight.map(|most| most as usize);
+        let frame_bytes = refinement.vertices().iter().product::<usize>() * encoding.bytes_per_vertex();
+        let room = (queued_bytes / frame_bytes).max(1);
+        let most = max_in_flight.map(|most| (most as usize).min(room));
         // Without credit only the newest frame waits.
         let (writer, reader) = queue(most.unwrap_or(1));
         let credit = most.map(|most| Mutex::new(Credit { most, in_flight: VecDeque::with_capacity(most) }));
@@ -112,7 +115,8 @@ pub struct Job {
 
 #[derive(Debug, Default)]
 struct Board {
-    jobs: BTreeMap<u64, Job>,
+    /// By the number of the session, oldest request first: nobody is served twice before another once.
+    jobs: VecDeque<(u64, Job)>,
     stop: bool,
 }
 
@@ -127,12 +131,15 @@ impl Encoder {
     /// Replaces what waits for session `number`. Never blocks for long.
     pub fn post(&self, number: u64, mut job: Job) {
         let mut board = lock(&self.board);
-        if let Some(older) = board.jobs.remove(&number) {
-            let waiting = |viewer: &Arc<Viewer>| job.viewers.iter().any(|(other, _)| Arc::ptr_eq(other, viewer));
-            let missing: Vec<_> = older.viewers.into_iter().filter(|(viewer, _)| !waiting(viewer)).collect();
-            job.viewers.extend(missing);
+        match board.jobs.iter_mut().find(|waiting| waiting.0 == number) {
+            Some((_, older)) => {
+                let waits = |viewer: &Arc<Viewer>| job.viewers.iter().any(|(other, _)| Arc::ptr_eq(other, viewer));
+                let missing: Vec<_> = older.viewers.drain(..).filter(|(viewer, _)| !waits(viewer)).collect();
+                job.viewers.extend(missing);
+                *older = job;
+            }
+            None => board.jobs.push_back((number, job)),
         }
-        board.jobs.insert(number, job);
         drop(board);
         self.posted.notify_one();
     }
@@ -151,7 +158,7 @@ impl Encoder {
                 if board.stop {
                     return;
                 }
-                if let Some((_, job)) = board.jobs.pop_first() {
+                if let Some((_, job)) = board.jobs.pop_front() {
                     break job;
                 }
                 board = self.posted.wait(board).unwrap_or_else(PoisonError::into_inner);

@@ -16,7 +16,7 @@ use tokio::sync::oneshot;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, number};
 use crate::scene::Scene;
-use crate::scene::record::Record;
+use crate::scene::record::{Point, Record};
 use crate::session::Sample;
 use crate::session::command::Intake;
 use crate::sheet::Model;
@@ -141,9 +141,9 @@ impl Live {
         self.ask(|reply| Request::Start { until, reply }).await
     }
 
-    /// Stops time at the next step boundary.
-    pub fn pause(&self) {
-        self.inbox.send(self.number, Request::Pause);
+    /// Stops time.
+    pub async fn pause(&self) -> Result<()> {
+        self.ask(|reply| Request::Pause { reply }).await
     }
 
     /// Waits until `at` steps are done (now, if `None`), and tells the step and the state's hash there.
@@ -167,9 +167,11 @@ impl Live {
         reader
     }
 
-    /// Records of some points, every so many steps.
-    pub fn probe(&self, every: u64, points: Vec<[usize; 2]>, energy: bool) -> Reader<PacedRecord> {
-        let (writer, reader) = queue(self.limits.queued_records);
+    /// Records of some points, or of all, every so many steps.
+    pub fn probe(&self, every: u64, points: Option<Vec<[usize; 2]>>, energy: bool) -> Reader<PacedRecord> {
+        let count = points.as_ref().map_or(self.model.len(), Vec::len).max(1);
+        let room = self.limits.queued_bytes / (count * size_of::<Point>());
+        let (writer, reader) = queue(room.clamp(1, self.limits.queued_records));
         self.inbox.send(self.number, Request::Probe(ProbeTap { every, points, energy, writer }));
         reader
     }
@@ -240,7 +242,22 @@ impl Pacer {
         number("stepping.rate_hz", scene.stepping.rate_hz, &format!("at most {most_hz}"), |v| v <= most_hz)?;
         let model = Model::compile(scene, &self.limits)?;
         let id = random_id()?;
+        let work = model.len() as u64 * u64::from(model.plan.substeps);
+        if work > self.limits.point_substeps_per_step {
+            let message = format!(
+                "a step would compute {} points {} times, above the limit of {} in all",
+                model.len(),
+                model.plan.substeps,
+                self.limits.point_substeps_per_step
+            );
+            return Err(Refusal::new(Reason::TooLarge, "stepping.substeps", message));
+        }
         let mut sessions = lock(&self.sessions);
+        let points: usize = sessions.values().map(|live| live.model.len()).sum();
+        if points + model.len() > self.limits.points_in_all {
+            let message = format!("the sessions of the server have {points} points already");
+            return Err(Refusal::new(Reason::TooMany, "sheet.points", message));
+        }
         if sessions.len() >= self.limits.sessions {
             let message = format!("the server has {} sessions already", sessions.len());
             return Err(Refusal::new(Reason::TooMany, "", message));
@@ -273,7 +290,7 @@ impl Pacer {
             inbox: inbox.clone(),
         });
         sessions.insert(id, live.clone());
-        drop(sessions);
+        // Before anybody can name the session: what is asked of it comes after this.
         inbox.send(number, Request::Adopt(Box::new(Running::new(live.clone(), !paused))));
         Ok(live)
     }
@@ -318,10 +335,9 @@ impl Pacer {
 
     /// The viewer of that id.
     pub fn viewer(&self, id: &str) -> Result<Arc<Viewer>> {
-        lock(&self.viewers)
-            .get(id)
-            .and_then(std::sync::Weak::upgrade)
-            .ok_or_else(|| Refusal::new(Reason::UnknownViewer, "viewer_id", format!("there is no viewer `{id}`")))
+        lock(&self.viewers).get(id).and_then(std::sync::Weak::upgrade).ok_or_else(|| {
+            Refusal::new(Reason::UnknownViewer, "viewer_id", format!("there is no viewer `{}`", excerpt(id)))
+        })
     }
 
     /// Ends all sessions and threads.
@@ -344,7 +360,13 @@ impl Pacer {
 }
 
 fn unknown_session(id: &str) -> Refusal {
-    Refusal::new(Reason::UnknownSession, "session_id", format!("there is no session `{id}`"))
+    let message = format!("there is no session `{}`", excerpt(id));
+    Refusal::new(Reason::UnknownSession, "session_id", message)
+}
+
+/// The beginning of what a client sent: a message is no place for megabytes.
+pub fn excerpt(text: &str) -> String {
+    text.chars().take(64).collect()
 }
 
 /// Frames as a stream reads them.

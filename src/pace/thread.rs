@@ -3,6 +3,7 @@
 //! Overruns: time steps are fixed. A session that is behind catches up at most [`CATCH_UP_STEPS`] steps; what it is
 //! behind beyond that is dropped from its schedule, and counted. Simulated time then runs slower than real time.
 
+use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -30,7 +31,7 @@ type HashReply = oneshot::Sender<Result<(u64, u128)>>;
 pub(super) enum Request {
     Adopt(Box<Running>),
     Start { until: Option<u64>, reply: oneshot::Sender<Result<u64>> },
-    Pause,
+    Pause { reply: oneshot::Sender<Result<()>> },
     Samples(SampleTap),
     Probe(ProbeTap),
     View(Arc<Viewer>),
@@ -81,7 +82,8 @@ pub(super) struct SampleTap {
 /// A stream of records.
 pub(super) struct ProbeTap {
     pub(super) every: u64,
-    pub(super) points: Vec<[usize; 2]>,
+    /// All, if none are named.
+    pub(super) points: Option<Vec<[usize; 2]>>,
     pub(super) energy: bool,
     pub(super) writer: Writer<PacedRecord>,
 }
@@ -100,6 +102,7 @@ pub(super) struct Running {
     window: (u64, u64),
     time_dilation: f64,
     due: Vec<Due>,
+    hashed: Option<(u64, u128)>,
     taps: Taps,
     deleted: bool,
 }
@@ -113,16 +116,33 @@ struct Taps {
     hashes: Vec<(u64, HashReply)>,
 }
 
+impl Taps {
+    fn forget_the_gone(&mut self) {
+        self.samples.retain(|tap| !tap.writer.is_abandoned());
+        self.probes.retain(|tap| !tap.writer.is_abandoned());
+        self.viewers.retain(|viewer| !viewer.is_gone());
+        self.hashes.retain(|waiting| !waiting.1.is_closed());
+    }
+}
+
 /// The thread's work.
 pub(super) fn work(inbox: &Inbox, encoder: &Encoder) {
     // The default slack of 50 µs would be the larger part of each step's lateness. Where it can't be set, so be it.
     #[cfg(target_os = "linux")]
     let _ = rustix::thread::set_current_timer_slack(std::num::NonZeroU64::new(1));
     let mut sessions: Vec<Running> = Vec::new();
+    let mut requests = VecDeque::new();
     loop {
         let next = sessions.iter().filter(|r| r.running).map(Running::deadline_ns).min();
-        let (requests, stop) = wait(inbox, next);
-        for (number, request) in requests {
+        let stop = wait(inbox, next, &mut requests);
+        if let Some(why) = stop {
+            for running in &mut sessions {
+                running.end(&why);
+            }
+            return;
+        }
+        // One at a time where a step is due: to answer many must not make a step wait.
+        while let Some((number, request)) = requests.pop_front() {
             match request {
                 Request::Adopt(running) => sessions.push(*running),
                 request => {
@@ -131,14 +151,11 @@ pub(super) fn work(inbox: &Inbox, encoder: &Encoder) {
                     }
                 }
             }
+            if next.is_some_and(|next| next <= now_ns()) {
+                break;
+            }
         }
         sessions.retain(|running| !running.deleted);
-        if let Some(why) = stop {
-            for running in &mut sessions {
-                running.end(&why);
-            }
-            return;
-        }
         // The one that is due first: a heavy session is late itself before it makes others late.
         let earliest = sessions.iter_mut().filter(|r| r.running).min_by_key(|r| r.deadline_ns());
         if let Some(running) = earliest
@@ -149,19 +166,21 @@ pub(super) fn work(inbox: &Inbox, encoder: &Encoder) {
     }
 }
 
-/// Waits until `deadline_ns` or until something is asked.
-fn wait(inbox: &Inbox, deadline_ns: Option<u64>) -> (Vec<(u64, Request)>, Option<Refusal>) {
+/// Waits until `deadline_ns` or until something is asked, which is added to `requests`. Tells why to stop, if so.
+fn wait(inbox: &Inbox, deadline_ns: Option<u64>, requests: &mut VecDeque<(u64, Request)>) -> Option<Refusal> {
     let mut state = lock(&inbox.state);
     loop {
-        if !state.requests.is_empty() || state.stop.is_some() {
-            return (std::mem::take(&mut state.requests), state.stop.clone());
+        requests.extend(state.requests.drain(..));
+        if !requests.is_empty() || state.stop.is_some() {
+            return state.stop.clone();
         }
         state = match deadline_ns {
             None => inbox.wake.wait(state).unwrap_or_else(PoisonError::into_inner),
             Some(deadline_ns) => {
-                let Some(rest_ns) = deadline_ns.checked_sub(now_ns()).filter(|rest| *rest > 0) else {
-                    return (Vec::new(), None);
-                };
+                let rest_ns = deadline_ns.saturating_sub(now_ns());
+                if rest_ns == 0 {
+                    return None;
+                }
                 let waited = inbox.wake.wait_timeout(state, Duration::from_nanos(rest_ns));
                 waited.unwrap_or_else(PoisonError::into_inner).0
             }
@@ -184,6 +203,7 @@ impl Running {
             window: (now, 0),
             time_dilation: 1.0,
             due: Vec::new(),
+            hashed: None,
             taps: Taps::default(),
             deleted: false,
             live,
@@ -197,12 +217,17 @@ impl Running {
 
     fn serve(&mut self, request: Request, encoder: &Encoder) {
         let step = self.session.step_count();
+        // Also while time stands, when no step does it.
+        self.taps.forget_the_gone();
         match request {
             Request::Adopt(_) => {}
             Request::Start { until, reply } => {
                 let _ = reply.send(self.start(until));
             }
-            Request::Pause => self.running = false,
+            Request::Pause { reply } => {
+                self.stand();
+                let _ = reply.send(Ok(()));
+            }
             Request::Samples(tap) => {
                 let at_once = !self.running;
                 if at_once {
@@ -224,11 +249,7 @@ impl Running {
                 if at > step && self.session.hold_reason().is_none() {
                     self.taps.hashes.push((at, reply));
                 } else {
-                    let _ = reply.send(if at == step {
-                        Ok((step, self.session.tissue().state_hash()))
-                    } else {
-                        Err(self.passed(at))
-                    });
+                    let _ = reply.send(if at == step { Ok((step, self.hash())) } else { Err(self.passed(at)) });
                 }
             }
             Request::Delete(why) => {
@@ -237,6 +258,23 @@ impl Running {
             }
         }
         self.publish_status();
+    }
+
+    /// The state's hash, computed once a step.
+    fn hash(&mut self) -> u128 {
+        let step = self.session.step_count();
+        let hash = self.hashed.filter(|hashed| hashed.0 == step).map(|hashed| hashed.1);
+        let hash = hash.unwrap_or_else(|| self.session.tissue().state_hash());
+        self.hashed = Some((step, hash));
+        hash
+    }
+
+    /// Time stands from now on. Who waits for the next sample gets the present one.
+    fn stand(&mut self) {
+        self.running = false;
+        for tap in self.taps.samples.extract_if(.., |tap| tap.once).collect::<Vec<_>>() {
+            tap.writer.push(self.paced_sample(&tap, false));
+        }
     }
 
     fn passed(&self, at: u64) -> Refusal {
@@ -282,13 +320,15 @@ impl Running {
 
         let Running { session, taps, due, .. } = self;
         session.advance(due, |session| {
-            // A step that blew up has no record: the state went back to an earlier one.
-            if session.hold_reason().is_some() {
-                return;
-            }
-            for tap in taps.probes.iter().filter(|tap| session.step_count().is_multiple_of(tap.every)) {
-                let step = session.step_count();
-                tap.writer.push(PacedRecord { step, record: session.record(&tap.points, tap.energy) });
+            let step = session.step_count();
+            // A pass over the sheet, once for all who want it.
+            let mut energy = None;
+            for tap in taps.probes.iter().filter(|tap| step.is_multiple_of(tap.every)) {
+                let mut record = session.record(tap.points.as_deref());
+                if tap.energy {
+                    record.energy_j = Some(*energy.get_or_insert_with(|| session.energy()));
+                }
+                tap.writer.push(PacedRecord { step, record });
             }
         });
         self.publish(encoder, overrun);
@@ -299,9 +339,12 @@ impl Running {
             for (at, reply) in std::mem::take(&mut self.taps.hashes) {
                 let _ = reply.send(Err(self.passed(at)));
             }
+            // No further record will come.
+            let held = self.passed(0);
+            self.taps.probes.drain(..).for_each(|tap| tap.writer.close(held.clone()));
         }
         if self.until.is_some_and(|until| self.session.step_count() >= until) {
-            self.running = false;
+            self.stand();
         }
         let elapsed_ns = now - self.window.0.min(now);
         if elapsed_ns >= DILATION_WINDOW_NS {
@@ -330,9 +373,8 @@ impl Running {
                 tap.writer.push(self.paced_sample(tap, overrun));
             }
         }
-        self.taps.samples.retain(|tap| !tap.once && !tap.writer.is_abandoned());
-        self.taps.probes.retain(|tap| !tap.writer.is_abandoned());
-        self.taps.viewers.retain(|viewer| !viewer.is_gone());
+        self.taps.samples.retain(|tap| !tap.once);
+        self.taps.forget_the_gone();
         let rate_hz = self.live.model.scene.stepping.rate_hz;
         let due_frame = |viewer: &Arc<Viewer>| {
             let frame_id = viewer.frame_id(step, rate_hz);
@@ -343,10 +385,9 @@ impl Running {
         if !viewers.is_empty() {
             self.post(encoder, viewers);
         }
-        for (at, reply) in self.taps.hashes.extract_if(.., |waiting| waiting.0 == step) {
-            let _ = reply.send(Ok((at, self.session.tissue().state_hash())));
+        for (at, reply) in self.taps.hashes.extract_if(.., |waiting| waiting.0 == step).collect::<Vec<_>>() {
+            let _ = reply.send(Ok((at, self.hash())));
         }
-        self.taps.hashes.retain(|waiting| !waiting.1.is_closed());
     }
 
     fn post(&self, encoder: &Encoder, viewers: Vec<(Arc<Viewer>, u64)>) {

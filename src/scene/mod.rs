@@ -202,6 +202,7 @@ impl Scene {
 
     /// Everything that a scene promises, wherever it came from.
     pub fn check(&self, limits: &Limits) -> Result<()> {
+        crate::refusal::label("name", &self.name)?;
         let [nx, ny] = self.sheet.points;
         if nx == 0 || ny == 0 {
             let message = format!("must be at least 1 along each side, but are {nx} × {ny}");
@@ -264,20 +265,23 @@ impl Sheet {
         self.spacing_m * glam::DVec2::new((self.points[0] - 1) as f64, (self.points[1] - 1) as f64)
     }
 
+    /// Whether a point never moves.
+    pub fn is_fixed(&self, [i, j]: [usize; 2]) -> bool {
+        let [nx, ny] = self.points;
+        let (rim_x, rim_y) = (i == 0 || i + 1 == nx, j == 0 || j + 1 == ny);
+        match &self.fixed {
+            Fixed::Edges => rim_x || rim_y,
+            Fixed::Corners => rim_x && rim_y,
+            Fixed::Points(points) => points.contains(&[i, j]),
+        }
+    }
+
     /// The fixed points, as places in arrays over all points, rising.
     pub fn fixed_indices(&self) -> Vec<usize> {
         let [nx, ny] = self.points;
-        let is_fixed = |i: usize, j: usize| {
-            let (rim_x, rim_y) = (i == 0 || i + 1 == nx, j == 0 || j + 1 == ny);
-            match &self.fixed {
-                Fixed::Edges => rim_x || rim_y,
-                Fixed::Corners => rim_x && rim_y,
-                Fixed::Points(_) => false,
-            }
-        };
         let mut indices: Vec<usize> = match &self.fixed {
             Fixed::Points(points) => points.iter().map(|[i, j]| i * ny + j).collect(),
-            _ => (0..nx * ny).filter(|index| is_fixed(index / ny, index % ny)).collect(),
+            _ => (0..nx * ny).filter(|index| self.is_fixed([index / ny, index % ny])).collect(),
         };
         indices.sort_unstable();
         indices.dedup();

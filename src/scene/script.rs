@@ -95,6 +95,12 @@ pub enum Action {
     Release,
 }
 
+/// A quicker move would need accelerations that no number holds.
+const SHORTEST_MOVE_S: f64 = 1e-6;
+
+/// Beyond this a phase has no digits left.
+const HIGHEST_HZ: f64 = 1e6;
+
 /// What the reading needs to know.
 struct Binding<'s> {
     folder: &'s Path,
@@ -244,6 +250,8 @@ impl Binding<'_> {
             (None, None, Some(path)) => path.table(|fields| {
                 let from_m = fields.required("from_m")?.place()?;
                 let velocity_m_per_s = fields.required("velocity_m_per_s")?.place()?;
+                let speed = velocity_m_per_s.abs().max_element();
+                number(&fields.path("velocity_m_per_s"), speed, "at most 1e6", |v| v <= 1e6)?;
                 let sheet = &self.scene.sheet;
                 check_centre(&fields.path("from_m"), sheet, from_m)?;
                 control_points.push(nearest_point(sheet, from_m));
@@ -281,9 +289,12 @@ impl Binding<'_> {
                     Profile::Pulse { on: self.steps(&fields.path("from_s"), from_s)?, off: u64::MAX }
                 }
             }
-            "sine" => Profile::Sine {
-                frequency_hz: not_negative(&fields.path("frequency_hz"), fields.required_number("frequency_hz")?)?,
-            },
+            "sine" => {
+                let frequency_hz = fields.required_number("frequency_hz")?;
+                let range = format!("from 0 to {HIGHEST_HZ}");
+                number(&fields.path("frequency_hz"), frequency_hz, &range, |v| (0.0..=HIGHEST_HZ).contains(&v))?;
+                Profile::Sine { frequency_hz }
+            }
             "trace" => {
                 let file = fields.required("file")?;
                 let path = self.folder.join(file.text()?);
@@ -352,14 +363,16 @@ impl Binding<'_> {
     fn tool(&mut self, item: &Item<'_>) -> Result<MoveLaw> {
         item.table(|fields| {
             let (point, _) = self.point(&fields.required("point")?)?;
+            check_free(&fields.path("point"), &self.scene.sheet, point)?;
             let mut moves = Vec::new();
             let list = fields.required("moves")?;
             for entry in list.list()? {
                 moves.push(entry.table(|fields| {
                     let from_s = not_negative(&fields.path("from_s"), fields.required_number("from_s")?)?;
                     let to_s = fields.required_number("to_s")?;
-                    if to_s <= from_s {
-                        return Err(fields.refuse(Reason::OutOfRange, "to_s", "must be after from_s"));
+                    if to_s < from_s + SHORTEST_MOVE_S {
+                        let message = format!("must be at least {SHORTEST_MOVE_S} s after from_s");
+                        return Err(fields.refuse(Reason::OutOfRange, "to_s", message));
                     }
                     Ok(Move { from_s, to_s, by_m: fields.required("by_m")?.vector()? })
                 })?);
@@ -424,6 +437,16 @@ pub fn check_reach(field: &str, sheet: &Sheet, displacement_m: f64, limits: &Lim
     let side_m = sheet.extent_m().max_element().max(sheet.spacing_m);
     let limit_m = side_m * limits.reach_in_sheets;
     number(field, displacement_m, &format!("at most {limit_m} m from the rest position"), |v| v <= limit_m)?;
+    Ok(())
+}
+
+/// Refuses a point that can't be grasped: one that is not on the sheet, or fixed.
+pub fn check_free(field: &str, sheet: &Sheet, point: [usize; 2]) -> Result<()> {
+    sheet.index(field, point)?;
+    if sheet.is_fixed(point) {
+        let message = format!("[{}, {}] is fixed, and can't be grasped", point[0], point[1]);
+        return Err(Refusal::new(Reason::OutOfRange, field, message));
+    }
     Ok(())
 }
 

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use crate::limits::Limits;
+use crate::pace::excerpt;
 use crate::refusal::{Reason, Refusal, Result};
 use crate::scene::{PAPER, Scene};
 
@@ -50,7 +51,8 @@ impl Catalog {
         match BUILT_IN.iter().find(|scene| scene.0 == name) {
             Some((_, text)) => Scene::parse(name, text, &[], limits),
             None => {
-                let message = format!("there is no scene `{name}`; there are {}", self.names().join(", "));
+                let (name, names) = (excerpt(name), self.names().join(", "));
+                let message = format!("there is no scene `{name}`; there are {names}");
                 Err(Refusal::new(Reason::UnknownScene, "scene_name", message))
             }
         }

@@ -35,6 +35,8 @@ enum Event {
     Rejected(pb::Rejection),
     /// The client's time, and when it came.
     Renewed(u64, u64),
+    /// What the client sent can't be read.
+    Failed(Status),
     /// The client has said all it wanted to say.
     Finished,
 }
@@ -74,7 +76,7 @@ impl Haptics {
         let samples = live.samples(every, only);
         let rate_hz = live.model.scene.stepping.rate_hz;
         let answer = pb::TouchOpened { step: lock(&live.intake).next_step(), rate_hz, lease_s };
-        info!(session = %live.id, tools = ?open.tools, holder = %open.holder, "haptic stream opened");
+        info!(session = %live.id, tools = ?open.tools, holder = ?open.holder, "haptic stream opened");
         Ok((Opened { answer, samples, guard }, hold))
     }
 
@@ -82,14 +84,17 @@ impl Haptics {
     async fn listen(
         self,
         mut inbound: Streaming<pb::TouchRequest>,
-        opening: oneshot::Sender<Result<Opened, Refusal>>,
+        opening: oneshot::Sender<Result<Opened, Status>>,
         events: Writer<Event>,
     ) {
         use pb::touch_request::Message;
         let first = match inbound.message().await {
             Ok(Some(pb::TouchRequest { message: Some(Message::Open(open)) })) => self.open(&open),
             Ok(_) => Err(Refusal::new(Reason::OutOfTurn, "open", "the first message must be `open`")),
-            Err(_) => return,
+            Err(status) => {
+                let _ = opening.send(Err(status));
+                return;
+            }
         };
         let hold = match first {
             Ok((opened, hold)) => {
@@ -97,7 +102,7 @@ impl Haptics {
                 hold
             }
             Err(refusal) => {
-                let _ = opening.send(Err(refusal));
+                let _ = opening.send(Err(refusal.into()));
                 return;
             }
         };
@@ -128,8 +133,8 @@ impl Haptics {
                 }
                 Ok(None) => return events.push(Event::Finished),
                 Err(status) => {
-                    debug!(session = %live.id, %status, "a client vanished");
-                    return;
+                    debug!(session = %live.id, %status, "a client vanished, or sent what can't be read");
+                    return events.push(Event::Failed(status));
                 }
             }
         }
@@ -154,6 +159,7 @@ impl Outlet {
                     let server_hold_ns = now_ns().saturating_sub(arrival_ns);
                     Ok(Message::Renewed(pb::Renewed { client_time_ns, server_hold_ns }))
                 }
+                Ok((Event::Failed(status), _)) => Err(status),
                 Ok((Event::Finished, _)) => return None,
                 Err(refusal) => Err(refusal.into()),
             },
@@ -167,7 +173,7 @@ impl Outlet {
 
 /// The output of a haptic stream: first the answer to `open`, then samples and rejections.
 enum Output {
-    Opening(oneshot::Receiver<Result<Opened, Refusal>>, Reader<Event>),
+    Opening(oneshot::Receiver<Result<Opened, Status>>, Reader<Event>),
     Open(Outlet),
 }
 
@@ -179,7 +185,7 @@ impl Output {
                 Ok(Ok(Opened { answer, samples, guard })) => {
                     (Ok(Message::Opened(answer)), Some(Outlet { events, samples, _guard: guard }))
                 }
-                Ok(Err(refusal)) => (Err(refusal.into()), None),
+                Ok(Err(status)) => (Err(status), None),
                 // The client vanished before it said anything.
                 Err(_) => return None,
             },
@@ -220,7 +226,7 @@ impl HapticService for Haptics {
         let lease_s = request.lease_s.unwrap_or(self.0.config.lease_s);
         let lease = random_bits()?;
         lock(&live.intake).acquire(&[request.tool], &request.holder, lease_s, lease, now_ns())?;
-        info!(session = %live.id, tool = request.tool, holder = %request.holder, "tool acquired");
+        info!(session = %live.id, tool = request.tool, holder = ?request.holder, "tool acquired");
         Ok(Response::new(pb::AcquireToolResponse { lease_id: format!("{lease:032x}"), lease_s }))
     }
 
@@ -298,9 +304,9 @@ impl HapticService for Haptics {
                     live.model.scene.sheet.index(&format!("points[{index}]"), point)?;
                     points.push(point);
                 }
-                points
+                Some(points)
             }
-            Some(Where::AllPoints(true)) => (0..live.model.len()).map(|index| live.model.point_of(index)).collect(),
+            Some(Where::AllPoints(true)) => None,
             _ => return Err(Refusal::new(Reason::Missing, "where", "points or all_points is missing").into()),
         };
         let guard = live.open_stream()?;

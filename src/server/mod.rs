@@ -46,7 +46,7 @@ pub enum ServeError {
 }
 
 /// Serves on `listener` until `shutdown` is cancelled; then ends all streams, and is over at the latest when the
-/// deadline of the configuration has passed.
+/// deadline of the configuration has passed. The caller ends its runtime without waiting (`shutdown_background`).
 pub async fn serve(listener: TcpListener, config: Config, shutdown: CancellationToken) -> Result<(), ServeError> {
     let pacer = Pacer::start(config.stepping_threads(), &config.limits)?;
     let deadline = Duration::from_secs_f64(config.shutdown_deadline_s);
@@ -93,25 +93,22 @@ pub async fn serve(listener: TcpListener, config: Config, shutdown: Cancellation
         .add_service(ViewServiceServer::new(views::Views(house)))
         .serve_with_incoming_shutdown(incoming, shutdown.clone().cancelled_owned());
 
-    let ending = async {
-        shutdown.cancelled().await;
+    // One deadline for all that is left to do. A step that outlasts it goes down with the process.
+    let (stopping, begun) = (pacer.clone(), shutdown.clone());
+    let stop = async move {
+        begun.cancelled().await;
         info!("shutting down");
-        // Blocks for a step at most. Every stream reads its end from its queue.
-        let stopping = pacer.clone();
-        let stopped = tokio::task::spawn_blocking(move || stopping.stop());
-        if tokio::time::timeout(deadline, stopped).await.is_err() {
-            warn!("a step outlasted the deadline");
-        }
+        // Waits for the steps under way. Every stream then reads its end from its queue.
+        let _ = tokio::task::spawn_blocking(move || stopping.stop()).await;
+    };
+    let over = async {
+        shutdown.cancelled().await;
         tokio::time::sleep(deadline).await;
     };
     tokio::select! {
-        served = serving => {
-            // Also without a shutdown, when the listener has failed.
-            pacer.stop();
-            served?;
-        }
+        (served, ()) = async { tokio::join!(serving, stop) } => served?,
         () = sweeping => {}
-        () = ending => warn!("streams were still open at the deadline, and are cut"),
+        () = over => warn!("steps or streams outlasted the deadline, and are cut"),
     }
     info!("stopped");
     Ok(())

@@ -33,7 +33,10 @@ impl SessionService for Sessions {
         let idle_timeout_s = request.idle_timeout_s.unwrap_or(most_s);
         let range = format!("above 0 and at most {most_s}");
         number("idle_timeout_s", idle_timeout_s, &range, |value| value > 0.0 && value <= most_s)?;
-        let live = self.0.pacer.create(&scene, request.paused, idle_timeout_s)?;
+        // A large sheet takes a while to lay out.
+        let (pacer, own) = (self.0.pacer.clone(), scene.clone());
+        let made = tokio::task::spawn_blocking(move || pacer.create(&own, request.paused, idle_timeout_s)).await;
+        let live = made.map_err(|e| Status::internal(e.to_string()))??;
         info!(session = %live.id, scene = %scene.name, points = live.model.len(), "session created");
         for warning in &live.model.warnings {
             warn!(session = %live.id, warning);
@@ -53,7 +56,8 @@ impl SessionService for Sessions {
         &self,
         _: Request<pb::ListSessionsRequest>,
     ) -> Result<Response<pb::ListSessionsResponse>, Status> {
-        let sessions = self.0.pacer.list().iter().map(|live: &Arc<_>| wire::sample::session(live)).collect();
+        let without_scene = |live: &Arc<_>| pb::Session { scene: None, ..wire::sample::session(live) };
+        let sessions = self.0.pacer.list().iter().map(without_scene).collect();
         Ok(Response::new(pb::ListSessionsResponse { sessions }))
     }
 
@@ -81,7 +85,7 @@ impl SessionService for Sessions {
         &self,
         request: Request<pb::PauseSessionRequest>,
     ) -> Result<Response<pb::PauseSessionResponse>, Status> {
-        self.0.pacer.get(&request.get_ref().session_id)?.pause();
+        self.0.pacer.get(&request.get_ref().session_id)?.pause().await?;
         Ok(Response::new(pb::PauseSessionResponse {}))
     }
 

@@ -92,8 +92,10 @@ impl ViewService for Views {
             number("max_frames_in_flight", f64::from(most), "from 1 to 64", |v| (1.0..=64.0).contains(&v))?;
         }
         let guard = live.open_stream()?;
+        let room = self.0.config.limits.queued_bytes;
         let viewer_id = random_id()?;
-        let (viewer, reader) = Viewer::new(viewer_id.clone(), grid, encoding, rate_hz, request.max_frames_in_flight);
+        let (viewer, reader) =
+            Viewer::new(viewer_id.clone(), grid, encoding, rate_hz, request.max_frames_in_flight, room);
         self.0.pacer.add_viewer(&live, &viewer);
         info!(session = %live.id, refinement = request.refinement, ?encoding, rate_hz, "viewer joined");
         let frames = Frames { viewer_id, reader, _guard: guard, messages: VecDeque::new(), last_id: None, skipped: 0 };

@@ -34,6 +34,8 @@ pub struct Due {
     pub command: Command,
     /// It was to act at an earlier step.
     pub late: bool,
+    /// Late commands that it stands for: itself, and those that it has superseded.
+    pub late_commands: u64,
     /// Not a client's: the end of a lease, and of all that its holder did with the tool.
     pub ends_lease: bool,
 }
@@ -48,6 +50,8 @@ struct Lease {
     duration_ns: u64,
     expires_ns: u64,
     last_sequence: Option<u64>,
+    /// Commands of the tool in the queue.
+    waiting: usize,
     /// Where the tool's newest command waits.
     last_place: Option<Place>,
 }
@@ -90,9 +94,10 @@ impl Intake {
         self.check_open()?;
         self.lapse(now_ns);
         let longest_s = self.limits.lease_s;
-        crate::refusal::number("lease_s", lease_s, &format!("above 0 and at most {longest_s}"), |v| {
-            v > 0.0 && v <= longest_s
+        crate::refusal::number("lease_s", lease_s, &format!("from 0.01 to {longest_s}"), |v| {
+            v >= 0.01 && v <= longest_s
         })?;
+        crate::refusal::label("holder", holder)?;
         for (index, tool) in tools.iter().enumerate() {
             if *tool >= self.limits.tools {
                 let message = format!("must be below {}, but is {tool}", self.limits.tools);
@@ -116,6 +121,7 @@ impl Intake {
                 duration_ns,
                 expires_ns: now_ns.saturating_add(duration_ns),
                 last_sequence: None,
+                waiting: 0,
                 last_place: None,
             };
             self.leases.insert(*tool, lease);
@@ -172,7 +178,14 @@ impl Intake {
     /// Takes in all of `commands`, from the holder of `id`, or none.
     pub fn submit(&mut self, id: LeaseId, commands: Vec<Command>, now_ns: u64) -> Result<()> {
         self.check_open()?;
-        self.renew(id, now_ns)?;
+        self.lapse(now_ns);
+        if commands.len() > self.limits.queued_commands_per_tool {
+            let message = format!("{} commands are more than a tool may have waiting", commands.len());
+            return Err(Refusal::new(Reason::QueueFull, "", message));
+        }
+        if commands.is_empty() {
+            return self.renew(id, now_ns);
+        }
         let mut last: BTreeMap<u32, u64> = BTreeMap::new();
         for command in &commands {
             let lease = self.leases.get(&command.tool).filter(|lease| lease.id == id);
@@ -185,14 +198,19 @@ impl Intake {
             last.insert(command.tool, command.sequence);
             self.check(command)?;
         }
-        if self.queue.len() + commands.len() > self.limits.queued_commands {
-            let message = format!("{} commands wait for their step already", self.queue.len());
-            return Err(Refusal::new(Reason::QueueFull, "", message));
+        // Per tool, so that no holder fills the queue for the others.
+        for tool in last.keys() {
+            let waiting = self.leases.get(tool).map_or(0, |lease| lease.waiting);
+            let coming = commands.iter().filter(|command| command.tool == *tool).count();
+            if waiting + coming > self.limits.queued_commands_per_tool {
+                let message = format!("{waiting} commands of tool {tool} wait for their step already");
+                return Err(Refusal::new(Reason::QueueFull, "", message));
+            }
         }
         for command in commands {
             self.enqueue(command, false);
         }
-        Ok(())
+        self.renew(id, now_ns)
     }
 
     fn check(&self, command: &Command) -> Result<()> {
@@ -202,7 +220,7 @@ impl Intake {
         match &command.action {
             Action::Push(poke) => check_poke(poke, &self.scene.sheet, &self.limits),
             Action::Grasp { point, displacement_m } => {
-                self.scene.sheet.index("position.point", *point)?;
+                crate::scene::script::check_free("position.point", &self.scene.sheet, *point)?;
                 crate::refusal::finite_vector("position.displacement_m", *displacement_m)?;
                 let far_m = displacement_m.length();
                 check_reach("position.displacement_m", &self.scene.sheet, far_m, &self.limits)
@@ -214,27 +232,35 @@ impl Intake {
     fn enqueue(&mut self, command: Command, ends_lease: bool) {
         let step = command.at_step.map_or(self.next_step, |at| at.max(self.next_step));
         let late = command.at_step.is_some_and(|at| at < self.next_step);
+        let mut late_commands = u64::from(late);
         let place = (step, self.arrivals);
         self.arrivals += 1;
         if let Some(lease) = self.leases.get_mut(&command.tool) {
             lease.last_sequence = Some(command.sequence);
+            lease.waiting += 1;
             let last = lease.last_place.replace(place);
             // The latest position wins: one that can't act any more makes room.
             if let (Some(last), Action::Grasp { .. }) = (last.filter(|last| last.0 == step), &command.action)
                 && self.queue.get(&last).is_some_and(|due| matches!(due.command.action, Action::Grasp { .. }))
+                && let Some(superseded) = self.queue.remove(&last)
             {
-                self.queue.remove(&last);
+                late_commands += superseded.late_commands;
+                lease.waiting -= 1;
                 self.superseded += 1;
             }
         }
-        self.queue.insert(place, Due { command, late, ends_lease });
+        self.queue.insert(place, Due { command, late, late_commands, ends_lease });
     }
 
     /// Moves what is due at the beginning of step `step` into `due`, in the order in which it is to act.
     pub fn take_due(&mut self, step: u64, now_ns: u64, due: &mut Vec<Due>) {
         self.lapse(now_ns);
         while let Some(entry) = self.queue.first_entry().filter(|entry| entry.key().0 <= step) {
-            due.push(entry.remove());
+            let entry = entry.remove();
+            if let Some(lease) = self.leases.get_mut(&entry.command.tool).filter(|_| !entry.ends_lease) {
+                lease.waiting = lease.waiting.saturating_sub(1);
+            }
+            due.push(entry);
         }
         self.next_step = step + 1;
     }

@@ -121,13 +121,15 @@ impl Session {
         self.late_commands
     }
 
-    /// One step: `due` acts at its beginning. `observe` is called at its end, and before the first also at t = 0⁺,
-    /// when what is due acts and nothing has moved.
+    /// One step: `due` acts at its beginning, by the number of the tool. `observe` is called at its end unless the guard
+    /// has ended the session, and before the first also at t = 0⁺, when what is due acts and nothing has moved.
     pub fn advance(&mut self, due: &mut Vec<Due>, mut observe: impl FnMut(&Session)) {
         if self.hold_reason.is_some() {
             due.clear();
             return;
         }
+        // Whose command came first must not matter between tools: a network decides that.
+        due.sort_by_key(|due| due.command.tool);
         for due in due.drain(..) {
             self.act(due);
         }
@@ -138,10 +140,11 @@ impl Session {
         if let Err(blow_up) = self.tissue.step() {
             let [i, j] = blow_up.point;
             self.hold_reason = Some(format!(
-                "point [{i}, {j}] was not finite after step {}; the state is that of step {}",
+                "point [{i}, {j}] was not finite (or a billion sheets away) after step {}; the state is that of step {}",
                 blow_up.step,
                 self.step_count()
             ));
+            return;
         }
         observe(self);
     }
@@ -153,22 +156,22 @@ impl Session {
         &mut self.tools[tool]
     }
 
-    fn act(&mut self, Due { command, late, ends_lease }: Due) {
+    fn act(&mut self, Due { command, late, late_commands, ends_lease }: Due) {
         let step = self.step_count();
         let rate_hz = self.model().scene.stepping.rate_hz;
-        self.late_commands += u64::from(late);
+        self.late_commands += late_commands;
         let index = command.tool as usize;
         let tool = self.tool(index);
         if ends_lease {
             *tool = Tool { control_point: tool.control_point, expired: true, ..Tool::default() };
             return self.tissue.release(index);
         }
-        if matches!(command.action, Action::Grasp { .. }) && command.sequence < tool.acknowledged_sequence {
-            return;
+        // Stamped commands may act in another order than they were sent in.
+        if command.sequence > tool.acknowledged_sequence {
+            tool.acknowledged_sequence = command.sequence;
+            tool.client_time_ns = command.client_time_ns;
+            tool.arrival_ns = command.arrival_ns;
         }
-        tool.acknowledged_sequence = command.sequence;
-        tool.client_time_ns = command.client_time_ns;
-        tool.arrival_ns = command.arrival_ns;
         tool.late = late;
         tool.expired = false;
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
@@ -255,13 +258,21 @@ impl Session {
         }
     }
 
-    /// A record of `points`, with the energies of the whole sheet if they are wanted.
-    pub fn record(&self, points: &[[usize; 2]], energy: bool) -> Record {
+    /// The energies of the whole sheet, for a record: a pass over it.
+    pub fn energy(&self) -> EnergyJ {
+        energy_record(self.tissue.energy())
+    }
+
+    /// A record of `points`, or of all, without energies.
+    pub fn record(&self, points: Option<&[[usize; 2]]>) -> Record {
         let of = |point: &[usize; 2]| point_record(*point, &self.tissue.point(self.model().index_of(*point)));
         Record {
             time_s: self.time_s(),
-            points: points.iter().map(of).collect(),
-            energy_j: energy.then(|| energy_record(self.tissue.energy())),
+            points: match points {
+                Some(points) => points.iter().map(of).collect(),
+                None => (0..self.model().len()).map(|index| of(&self.model().point_of(index))).collect(),
+            },
+            energy_j: None,
             awake_points: self.model().len(),
         }
     }

@@ -8,7 +8,7 @@ use super::command::{Command, Intake};
 use crate::limits::Limits;
 use crate::refusal::{Refusal, Result};
 use crate::scene::Named;
-use crate::scene::record::{Line, Run, Summary, write_line};
+use crate::scene::record::{Line, Record, Run, Summary, write_line};
 use crate::scene::script::{Action, Script};
 use crate::sheet::Model;
 
@@ -86,11 +86,12 @@ pub fn run(
             intake.take_due(step, 0, &mut due);
         }
         session.advance(&mut due, |session| {
-            if session.hold_reason().is_none() && session.step_count().is_multiple_of(script.sample_every) {
+            if session.step_count().is_multiple_of(script.sample_every) {
                 // The clock of the summary stands while a record is written.
                 stepping_s += clock_s() - resumed_s;
                 if written.is_ok() {
-                    written = write_line(output, &session.record(&script.sample_points, true));
+                    let record = session.record(Some(&script.sample_points));
+                    written = write_line(output, &Record { energy_j: Some(session.energy()), ..record });
                 }
                 resumed_s = clock_s();
             }

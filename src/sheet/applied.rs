@@ -187,16 +187,23 @@ impl<T: Real> Applied<T> {
         }
     }
 
-    /// The force on a point at the end of the last step; before the first, just after its beginning.
-    pub(super) fn at(&self, model: &Model, index: usize, begun: bool) -> DVec3 {
-        let (point, sheet) = (model.point_of(index), &model.scene.sheet);
-        self.slots
-            .iter()
-            .filter_map(|slot| match begun {
-                true => slot.before,
-                false => slot.push.as_ref().map(|push| push.at(Moment::start_of(0), model.scene.stepping.rate_hz)),
-            })
-            .map(|poke| poke.force_n * factor(&poke, point, sheet.spacing_m))
-            .sum()
+    /// The force on a point from a moment on.
+    pub(super) fn from(&self, model: &Model, index: usize, moment: Moment) -> DVec3 {
+        let rate_hz = model.scene.stepping.rate_hz;
+        sum_at(
+            model,
+            index,
+            self.slots.iter().filter_map(|slot| slot.push.as_ref().map(|push| push.at(moment, rate_hz))),
+        )
     }
+
+    /// The force on a point at the end of the last step.
+    pub(super) fn until(&self, model: &Model, index: usize) -> DVec3 {
+        sum_at(model, index, self.slots.iter().filter_map(|slot| slot.before))
+    }
+}
+
+fn sum_at(model: &Model, index: usize, pokes: impl Iterator<Item = Poke>) -> DVec3 {
+    let (point, spacing_m) = (model.point_of(index), model.scene.sheet.spacing_m);
+    pokes.map(|poke| poke.force_n * factor(&poke, point, spacing_m)).sum()
 }

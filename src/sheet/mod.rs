@@ -14,7 +14,7 @@ use glam::DVec3;
 use xxhash_rust::xxh3::Xxh3;
 
 use crate::scene::Precision;
-use crate::scene::law::Moment;
+use crate::scene::law::{Moment, Motion};
 use applied::Applied;
 pub use applied::Push;
 pub use model::Model;
@@ -66,7 +66,7 @@ pub struct Energy {
 pub struct BlowUp {
     /// Steps done when it was found.
     pub step: u64,
-    /// A point that is not finite.
+    /// A point that is not finite, or is displaced by a billion sheets.
     pub point: [usize; 2],
 }
 
@@ -116,6 +116,9 @@ struct State<T> {
 /// Steps between two checkpoints, to which a blow-up goes back. A copy costs about a tenth of a step.
 const CHECKPOINT_STEPS: u64 = 64;
 
+/// A displacement of so many sheets is a blow-up: far beyond any tissue, and far below what f32 can square.
+const FARTHEST_IN_SHEETS: f64 = 1e9;
+
 #[derive(Debug)]
 struct Sheet<T> {
     model: Arc<Model>,
@@ -147,7 +150,7 @@ impl<T: Real> Sheet<T> {
 
     fn substep(&mut self, moment: Moment, end: f64) {
         self.applied.prepare(&self.model, moment);
-        let kicks = self.kicks_of_released();
+        let kicks = self.kicks_of_released(moment);
         self.advance();
         for (index, kick) in kicks {
             for (c, kick) in kick.into_iter().enumerate() {
@@ -160,31 +163,42 @@ impl<T: Real> Sheet<T> {
     }
 
     /// d ← p·d + q·F(u), u ← u + d, at every point.
+    ///
+    /// What is far too small to matter is set to 0: fields decay towards the rim of a sheet without end, and arithmetic
+    /// on the subnormal numbers at which they arrive costs tens of times the usual.
     fn advance(&mut self) {
         let plan = &self.model.plan;
         let (p, q) = (T::of(plan.p), T::of(plan.q));
         let stiffness = T::of(self.model.scene.virtual_stiffness_n_per_m);
+        let spacing_m = T::of(self.model.scene.sheet.spacing_m);
+        let (least_u, least_d) = (spacing_m * T::LEAST, spacing_m * T::LEAST * T::LEAST_INCREMENT);
         for c in 0..3 {
             let forces = self.spring_n[c].iter().zip(&self.applied.field[c]);
             let state = self.state.u[c].iter_mut().zip(&mut self.state.d[c]);
             for ((u, d), (spring, applied)) in state.zip(forces) {
-                *d = p * *d + q * (*spring + *applied - stiffness * *u);
-                *u += *d;
+                let next_d = p * *d + q * (*spring + *applied - stiffness * *u);
+                let next_u = *u + next_d;
+                *d = if next_d.magnitude() < least_d { T::default() } else { next_d };
+                *u = if next_u.magnitude() < least_u { T::default() } else { next_u };
             }
         }
     }
 
-    /// To let go is a jump of the force that held the point, from m·a − F + C·v to nothing, and at a jump a two-step
-    /// scheme needs the mean of both (see `applied`). The tool moved at constant velocity, so a = 0: the point gets
-    /// ½(C·v − F) besides. In terms of the increment, q times that.
-    fn kicks_of_released(&mut self) -> Vec<(usize, [T; 3])> {
+    /// To let go is a jump: before it the whole force on the point, damping left out, was m·a + C·v with the a and v
+    /// of the tool; after it, it is F = spring + applied − K″·u. At a jump a two-step scheme needs the mean of both (see
+    /// `applied`), and it uses F with the mean of the applied force. The tool moved at constant velocity, so a = 0: the
+    /// point gets ½(C·v + F) less that. In terms of the increment, q times the difference.
+    fn kicks_of_released(&mut self, moment: Moment) -> Vec<(usize, [T; 3])> {
         let released = self.prescribed.take_released();
         let scene = &self.model.scene;
         let kick = |(index, velocity): (usize, DVec3)| {
+            let applied_n = self.applied.from(&self.model, index, moment);
             let kick = std::array::from_fn(|c| {
-                let force_n = (self.spring_n[c][index] + self.applied.field[c][index]).wide()
-                    - scene.virtual_stiffness_n_per_m * self.state.u[c][index].wide();
-                T::of(self.model.plan.q * 0.5 * (scene.damping_n_s_per_m * velocity[c] - force_n))
+                let elastic_n =
+                    self.spring_n[c][index].wide() - scene.virtual_stiffness_n_per_m * self.state.u[c][index].wide();
+                let used_n = elastic_n + self.applied.field[c][index].wide();
+                let mean_n = 0.5 * (scene.damping_n_s_per_m * velocity[c] + elastic_n + applied_n[c]);
+                T::of(self.model.plan.q * (mean_n - used_n))
             });
             (index, kick)
         };
@@ -210,23 +224,29 @@ impl<T: Real> Sheet<T> {
         }))
     }
 
-    /// A point that is not finite, if there is one.
+    /// A point that is not finite or beyond every bound, if there is one.
     fn broken_point(&self) -> Option<usize> {
-        // A sum is finite only if all its terms are (short of an overflow, which is a blow-up too).
+        // A sum of magnitudes is small and finite only if all its terms are.
         let sum = |values: &Vec<T>| {
             let mut lanes = [T::default(); 16];
             let (blocks, rest) = values.as_chunks::<16>();
             for block in blocks {
-                lanes.iter_mut().zip(block).for_each(|(lane, value)| *lane += *value);
+                lanes.iter_mut().zip(block).for_each(|(lane, value)| *lane += value.magnitude());
             }
-            lanes.iter().chain(rest).fold(T::default(), |sum, value| sum + *value)
+            lanes.iter().chain(rest).fold(T::default(), |sum, value| sum + value.magnitude())
         };
-        let arrays = self.state.u.iter().chain(&self.spring_n);
-        if arrays.clone().all(|values| sum(values).is_finite()) {
+        let sheet = &self.model.scene.sheet;
+        let farthest = T::of(FARTHEST_IN_SHEETS * sheet.extent_m().max_element().max(sheet.spacing_m));
+        let (u, forces) = (&self.state.u, &self.spring_n);
+        if u.iter().all(|u| sum(u) < farthest) && forces.iter().all(|force| sum(force).is_finite()) {
             return None;
         }
-        let broken = |index: &usize| arrays.clone().any(|values| !values[*index].is_finite());
-        Some((0..self.model.len()).find(broken).unwrap_or(0))
+        let broken = |index: &usize| {
+            let is_far = |u: &Vec<T>| !u[*index].is_finite() || u[*index].magnitude() >= farthest;
+            u.iter().any(is_far) || forces.iter().any(|f| !f[*index].is_finite())
+        };
+        // Sums overflow before their terms do; that alone is no blow-up.
+        (0..self.model.len()).find(broken)
     }
 }
 
@@ -246,8 +266,9 @@ impl<T: Real> Tissue for Sheet<T> {
 
     fn grasp(&mut self, tool: usize, index: usize, grasp: Grasp) {
         self.applied.set(tool, None);
-        let displacement_m = self.displacement_m(index);
-        self.prescribed.grasp(tool, index, grasp, displacement_m);
+        let PointState { displacement_m, velocity_m_per_s, .. } = self.point(index);
+        let now = Motion { displacement_m, velocity_m_per_s, ..Motion::default() };
+        self.prescribed.grasp(tool, index, grasp, now);
     }
 
     fn release(&mut self, tool: usize) {
@@ -279,7 +300,10 @@ impl<T: Real> Tissue for Sheet<T> {
     fn point(&self, index: usize) -> PointState {
         let scene = &self.model.scene;
         let displacement_m = self.displacement_m(index);
-        let applied_n = self.applied.at(&self.model, index, self.steps > 0);
+        let applied_n = match self.steps {
+            0 => self.applied.from(&self.model, index, Moment::start_of(0)),
+            _ => self.applied.until(&self.model, index),
+        };
         let motion = self.prescribed.motion(&self.model, index);
         let velocity_m_per_s =
             motion.map_or_else(|| self.free_velocity_m_per_s(index, applied_n), |m| m.velocity_m_per_s);

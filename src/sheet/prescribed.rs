@@ -23,6 +23,8 @@ struct Grasped {
     grasp: Grasp,
     /// At the end of the last step.
     now: Motion,
+    /// A step was done since it was grasped.
+    held: bool,
 }
 
 /// All points that do not move freely.
@@ -38,26 +40,28 @@ impl Prescribed {
         Prescribed { grasped: Vec::new(), released: Vec::new() }
     }
 
-    /// From the coming step on `tool` moves the point at `index`, which is at `displacement_m`, and lets go what it
-    /// had before.
-    pub(super) fn grasp(&mut self, tool: usize, index: usize, grasp: Grasp, displacement_m: DVec3) {
-        if let Some(grasped) = self.grasped.iter_mut().find(|g| g.tool == tool && g.index == index) {
-            grasped.grasp = grasp;
-            return;
+    /// From the coming step on `tool` moves the point at `index`, which now moves like `now`, and lets go what it had
+    /// before. A point that another tool has is taken over.
+    pub(super) fn grasp(&mut self, tool: usize, index: usize, grasp: Grasp, now: Motion) {
+        if let Some(place) = self.grasped.iter().position(|g| g.index == index) {
+            let taken = Grasped { tool, grasp, ..self.grasped.remove(place) };
+            self.release(tool);
+            return self.grasped.push(taken);
         }
         self.release(tool);
         let now = match &grasp {
-            Grasp::Held(_) => Motion { displacement_m, ..Motion::default() },
+            Grasp::Held(_) => now,
             Grasp::Law(law) => law.at(0.0),
         };
-        self.grasped.push(Grasped { tool, index, grasp, now });
+        self.grasped.push(Grasped { tool, index, grasp, now, held: false });
     }
 
     /// `tool` lets go. The point goes on with the velocity that it has.
     pub(super) fn release(&mut self, tool: usize) {
         let Some(place) = self.grasped.iter().position(|g| g.tool == tool) else { return };
         let grasped = self.grasped.remove(place);
-        if !self.grasped.iter().any(|g| g.index == grasped.index) {
+        // What was grasped and let go at the same boundary was never held.
+        if grasped.held {
             self.released.push((grasped.index, grasped.now.velocity_m_per_s));
         }
     }
@@ -104,6 +108,7 @@ impl Prescribed {
         let rate_hz = model.scene.stepping.rate_hz;
         for grasped in &mut self.grasped {
             let before = grasped.now;
+            grasped.held = true;
             grasped.now = match &grasped.grasp {
                 Grasp::Held(target_m) => {
                     let velocity_m_per_s = (*target_m - before.displacement_m) * rate_hz;
@@ -118,6 +123,6 @@ impl Prescribed {
     /// How a point is made to move, if it is: at the end of the last step.
     pub(super) fn motion(&self, model: &Model, index: usize) -> Option<Motion> {
         let fixed = || model.fixed.binary_search(&index).is_ok().then(Motion::default);
-        self.grasped.iter().rev().find(|g| g.index == index).map(|g| g.now).or_else(fixed)
+        self.grasped.iter().find(|g| g.index == index).map(|g| g.now).or_else(fixed)
     }
 }

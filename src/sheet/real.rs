@@ -21,12 +21,19 @@ pub(super) trait Real:
 {
     /// 1.
     const ONE: Self;
+    /// A displacement of less than this part of the spacing is 0. Its square is still a normal number; it is 1e-9 of
+    /// a displacement that is itself 1e-8 of the spacing.
+    const LEAST: Self;
+    /// An increment of less than this part of the least displacement is 0.
+    const LEAST_INCREMENT: Self;
     /// Nearest value of a f64.
     fn of(value: f64) -> Self;
     /// The same value as a f64.
     fn wide(self) -> f64;
     /// Square root, correctly rounded.
     fn root(self) -> Self;
+    /// |x|.
+    fn magnitude(self) -> Self;
     /// Neither infinite nor NaN.
     fn is_finite(self) -> bool;
     /// Appends the bytes of the value, little-endian.
@@ -34,9 +41,11 @@ pub(super) trait Real:
 }
 
 macro_rules! real {
-    ($t:ty) => {
+    ($t:ty, $least:expr, $least_increment:expr) => {
         impl Real for $t {
             const ONE: Self = 1.0;
+            const LEAST: Self = $least;
+            const LEAST_INCREMENT: Self = $least_increment;
             #[allow(clippy::cast_possible_truncation)]
             fn of(value: f64) -> Self {
                 value as $t
@@ -46,6 +55,9 @@ macro_rules! real {
             }
             fn root(self) -> Self {
                 self.sqrt()
+            }
+            fn magnitude(self) -> Self {
+                self.abs()
             }
             fn is_finite(self) -> bool {
                 <$t>::is_finite(self)
@@ -57,5 +69,5 @@ macro_rules! real {
     };
 }
 
-real!(f32);
-real!(f64);
+real!(f32, 1e-17, 1e-9);
+real!(f64, 1e-140, 1e-100);

@@ -15,7 +15,8 @@ pub enum Encoding {
 }
 
 impl Encoding {
-    fn bytes_per_vertex(self) -> usize {
+    /// Three components.
+    pub fn bytes_per_vertex(self) -> usize {
         match self {
             Encoding::F32 => 12,
             Encoding::I16 => 6,
@@ -45,11 +46,13 @@ pub struct Frame {
     pub patches: Vec<Patch>,
 }
 
-/// Some whole rows of vertices.
+/// A rectangle of vertices.
 #[derive(Debug, Clone)]
 pub struct Patch {
-    /// The first row, and how many.
-    pub rows: [usize; 2],
+    /// The first vertex along x and y.
+    pub first: [usize; 2],
+    /// Vertices along x and y.
+    pub count: [usize; 2],
     /// Displacements, three components a vertex, y running fastest.
     pub bytes: Bytes,
 }
@@ -61,21 +64,24 @@ pub fn encode(snapshot: &Snapshot, refinement: Refinement, encoding: Encoding) -
         Encoding::I16 => quantisation(&snapshot.displacement_m),
     };
     let [vertices_x, vertices_y] = refinement.vertices();
-    let rows_per_patch = (PATCH_BYTES / (vertices_y * encoding.bytes_per_vertex())).max(1);
+    // Whole rows, as many as fit; parts of a row where not even one does.
+    let vertices = PATCH_BYTES / encoding.bytes_per_vertex();
+    let columns_per_patch = vertices_y.min(vertices);
+    let rows_per_patch = (vertices / vertices_y).max(1);
     let mut row: [Vec<f32>; 3] = std::array::from_fn(|_| vec![0.0; vertices_y]);
     #[allow(clippy::cast_possible_truncation)]
     let (origin, per_scale): ([f32; 3], [f32; 3]) = (
         origin_m.to_array().map(|v| v as f32),
         scale_m.to_array().map(|v| if v > 0.0 { v.recip() as f32 } else { 0.0 }),
     );
-    let patch = |first: usize| {
-        let count = rows_per_patch.min(vertices_x - first);
-        let mut bytes = vec![0_u8; count * vertices_y * encoding.bytes_per_vertex()];
-        for (a, out) in bytes.chunks_exact_mut(vertices_y * encoding.bytes_per_vertex()).enumerate() {
+    let mut patch = |first: [usize; 2]| {
+        let count = [rows_per_patch.min(vertices_x - first[0]), columns_per_patch.min(vertices_y - first[1])];
+        let mut bytes = vec![0_u8; count[0] * count[1] * encoding.bytes_per_vertex()];
+        for (a, out) in bytes.chunks_exact_mut(count[1] * encoding.bytes_per_vertex()).enumerate() {
             for (values, row) in snapshot.displacement_m.iter().zip(&mut row) {
-                refinement.row(values, first + a, row);
+                refinement.row(values, first[0] + a, row);
             }
-            let [x, y, z] = row.each_ref().map(|row| &row[..vertices_y]);
+            let [x, y, z] = row.each_ref().map(|row| &row[first[1]..first[1] + count[1]]);
             match encoding {
                 Encoding::F32 => {
                     for (b, vertex) in out.as_chunks_mut::<12>().0.iter_mut().enumerate() {
@@ -93,19 +99,21 @@ pub fn encode(snapshot: &Snapshot, refinement: Refinement, encoding: Encoding) -
                 }
             }
         }
-        Patch { rows: [first, count], bytes: Bytes::from(bytes) }
+        Patch { first, count, bytes: Bytes::from(bytes) }
     };
-    let mut patch = patch;
-    let patches = (0..vertices_x).step_by(rows_per_patch).map(&mut patch).collect();
+    let mut patches = Vec::new();
+    for x in (0..vertices_x).step_by(rows_per_patch) {
+        patches.extend((0..vertices_y).step_by(columns_per_patch).map(|y| patch([x, y])));
+    }
     let Snapshot { step, simulation_time_s, .. } = *snapshot;
     Frame { step, simulation_time_s, refinement, encoding, origin_m, scale_m, patches }
 }
 
-/// Nearest integer, by the trick of the magic number: 1.5·2²³ + v has no bits left for the fraction. |v| ≤ 2¹⁵.
+/// Nearest integer within ±32767, by the trick of the magic number: 1.5·2²³ + v has no bits left for the fraction.
 #[allow(clippy::cast_possible_truncation)]
 fn quantum(v: f32) -> i16 {
     const MAGIC: f32 = 12_582_912.0;
-    ((v + MAGIC).to_bits().wrapping_sub(MAGIC.to_bits())) as i16
+    ((v.clamp(-32767.0, 32767.0) + MAGIC).to_bits().wrapping_sub(MAGIC.to_bits())) as i16
 }
 
 /// Middle and quantum of the box around all displacements. Interpolated ones are within it too.
@@ -113,13 +121,12 @@ fn quantisation(displacement_m: &[Vec<f32>; 3]) -> (DVec3, DVec3) {
     let span = |values: &Vec<f32>| {
         let low = values.iter().copied().fold(f32::INFINITY, f32::min);
         let high = values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
-        (f64::from(low), f64::from(high))
+        // A value of f32, which is what encodes; the box then reaches as far as its farther side.
+        let middle = 0.5 * low + 0.5 * high;
+        (f64::from(middle), f64::from((high - middle).max(middle - low)) / f64::from(i16::MAX))
     };
     let spans = displacement_m.each_ref().map(span);
-    (
-        DVec3::from_array(spans.map(|(low, high)| 0.5 * (low + high))),
-        DVec3::from_array(spans.map(|(low, high)| 0.5 * (high - low) / f64::from(i16::MAX))),
-    )
+    (DVec3::from_array(spans.map(|span| span.0)), DVec3::from_array(spans.map(|span| span.1)))
 }
 
 #[cfg(test)]
@@ -178,12 +185,30 @@ mod tests {
         let frame = encode(&snapshot(), grid, Encoding::F32);
         let mut next = 0;
         for patch in &frame.patches {
-            assert_eq!(patch.rows[0], next);
+            assert_eq!(patch.first, [next, 0]);
             assert!(patch.bytes.len() <= PATCH_BYTES);
-            next += patch.rows[1];
+            next += patch.count[0];
         }
         assert_eq!(next, grid.vertices()[0]);
         assert!(frame.patches.len() > 1);
+    }
+
+    #[test]
+    fn a_long_row_is_split_too() {
+        let displacement_m = std::array::from_fn(|c| (0..40_000).map(|k| (k + c) as f32).collect());
+        let snapshot = Snapshot { step: 0, simulation_time_s: 0.0, displacement_m };
+        let grid = Refinement::new([2, 20_000], 0, &Limits::default()).unwrap();
+        let frame = encode(&snapshot, grid, Encoding::F32);
+        assert!(frame.patches.iter().all(|patch| patch.bytes.len() <= PATCH_BYTES));
+        for (vertex, value) in frame.patches.iter().flat_map(|patch| {
+            let vertices = (0..patch.count[0] * patch.count[1]).map(|k| {
+                let (a, b) = (k / patch.count[1], k % patch.count[1]);
+                (patch.first[0] + a) * 20_000 + patch.first[1] + b
+            });
+            vertices.zip(patch.bytes.as_chunks::<12>().0)
+        }) {
+            assert_eq!(f32::from_le_bytes(value[..4].try_into().unwrap()), vertex as f32);
+        }
     }
 
     #[test]

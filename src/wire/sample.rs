@@ -136,7 +136,8 @@ pub fn add_to_record(record: &mut Record, message: &pb::ProbeResponse) -> bool {
 /// A session as it stands.
 pub fn session(live: &Arc<Live>) -> pb::Session {
     let status = live.status();
-    let intake = crate::pace::queue::lock(&live.intake);
+    let mut intake = crate::pace::queue::lock(&live.intake);
+    intake.lapse(crate::pace::clock::now_ns());
     let model = &live.model;
     #[allow(clippy::cast_precision_loss)]
     let simulation_time_s = status.step as f64 / model.scene.stepping.rate_hz;
@@ -191,10 +192,10 @@ pub fn frame(viewer_id: &str, delivery: &Delivery, skipped: u64) -> Vec<pb::Watc
         overrun_count: delivery.overrun_count,
         time_dilation: delivery.time_dilation,
         patches: vec![pb::Patch {
-            first_x: patch.rows[0] as u32,
-            first_y: 0,
-            count_x: patch.rows[1] as u32,
-            count_y: vertices_y as u32,
+            first_x: patch.first[0] as u32,
+            first_y: patch.first[1] as u32,
+            count_x: patch.count[0] as u32,
+            count_y: patch.count[1] as u32,
             displacement: patch.bytes.clone(),
         }],
         last: index + 1 == count,
