@@ -189,3 +189,45 @@ fn serve(job: &Job) {
         });
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::limits::Limits;
+
+    fn job(viewers: Vec<(Arc<Viewer>, u64)>) -> Job {
+        let displacement_m = std::array::from_fn(|_| vec![0.5; 9]);
+        let snapshot = Snapshot { step: 1, simulation_time_s: 0.001, displacement_m };
+        Job { snapshot, viewers, overrun_count: 0, time_dilation: 1.0 }
+    }
+
+    fn viewer(n: u32, encoding: Encoding, credit: Option<u32>) -> (Arc<Viewer>, Reader<Delivery>) {
+        let grid = Refinement::new([3, 3], n, &Limits::default()).unwrap();
+        Viewer::new("viewer".into(), grid, encoding, 60.0, credit, 1 << 20)
+    }
+
+    #[tokio::test]
+    async fn who_asks_for_the_same_shares_one_encoding() {
+        let (a, mut read_a) = viewer(2, Encoding::I16, None);
+        let (b, mut read_b) = viewer(2, Encoding::I16, Some(3));
+        let (c, mut read_c) = viewer(2, Encoding::F32, None);
+        serve(&job(vec![(a, 7), (b, 9), (c, 7)]));
+        let (a, b, c) = (read_a.pop().await.unwrap().0, read_b.pop().await.unwrap().0, read_c.pop().await.unwrap().0);
+        assert!(Arc::ptr_eq(&a.frame, &b.frame) && !Arc::ptr_eq(&a.frame, &c.frame));
+        assert_eq!((a.frame_id, b.frame_id), (7, 9));
+    }
+
+    #[test]
+    fn a_job_that_waits_is_replaced_and_keeps_its_place_and_its_viewers() {
+        let encoder = Encoder::default();
+        let ((a, _read_a), (b, _read_b)) = (viewer(0, Encoding::F32, None), viewer(1, Encoding::F32, None));
+        encoder.post(5, job(vec![(a.clone(), 1)]));
+        encoder.post(3, job(vec![(a.clone(), 1)]));
+        encoder.post(5, job(vec![(b.clone(), 2)]));
+        let board = lock(&encoder.board);
+        let order: Vec<u64> = board.jobs.iter().map(|job| job.0).collect();
+        assert_eq!(order, [5, 3]);
+        let viewers = &board.jobs[0].1.viewers;
+        assert!(Arc::ptr_eq(&viewers[0].0, &b) && Arc::ptr_eq(&viewers[1].0, &a) && viewers.len() == 2);
+    }
+}
