@@ -556,6 +556,32 @@ fn a_spring_pressed_to_no_length_stays_finite() {
 }
 
 #[test]
+fn a_vibration_without_damping_keeps_its_phase() {
+    // A stiff undamped sheet, pushed and let go, against itself at a twentieth of the substep.
+    let sets = ["damping.coefficient_n_s_per_m=0.0", "springs.stiffness_n_per_m=60.0", "sheet.points=[15, 15]"];
+    let shaken_for_a_second = |substeps: Option<u32>| {
+        let substeps = substeps.map_or("stepping.substeps=auto".to_owned(), |n| format!("stepping.substeps={n}"));
+        let scene = scene_with(SMALL, &[&sets[..], &[substeps.as_str()]].concat());
+        let mut tissue = sheet::at_rest(&model(&scene));
+        tissue.push(0, Some(push_on(&scene, [7, 7], [0.1, 0.0, -0.6])));
+        let mut path = Vec::new();
+        for step in 0..1000 {
+            if step == 200 {
+                tissue.release(0);
+            }
+            tissue.step().unwrap();
+            path.push(tissue.point(tissue.model().index_of([7, 7])).displacement_m);
+        }
+        (path, tissue.model().plan.substeps)
+    };
+    let (path, substeps) = shaken_for_a_second(None);
+    let (truth, _) = shaken_for_a_second(Some(20 * substeps));
+    let largest = truth.iter().map(|u| u.length()).fold(0.0, f64::max);
+    let error = path.iter().zip(&truth).map(|(u, v)| (*u - *v).length()).fold(0.0, f64::max);
+    assert!(error < 1e-3 * largest, "{} with {substeps} substeps", error / largest);
+}
+
+#[test]
 fn substeps_follow_the_bound_and_a_bound_is_never_below_a_vibration() {
     use palpate::sheet::stability::largest_stiffness_n_per_m;
     // λ over the whole unbounded grid, by brute force.

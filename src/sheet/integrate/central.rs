@@ -8,6 +8,10 @@ use super::{Oscillator, Scheme};
 
 pub(super) const SCHEME: Scheme = Scheme {
     coefficients: |g, dt2_per_m| ((1.0 - g / 2.0) / (1.0 + g / 2.0), dt2_per_m / (1.0 + g / 2.0)),
-    substeps: |sheet: &Oscillator| stability::substeps(sheet.step_s, sheet.omega_per_s, THETA),
+    substeps: |sheet: &Oscillator| {
+        // Without damping the decay never ends, and the factor is at its largest.
+        let decay_s = 2.0 * sheet.mass_kg / sheet.damping_n_s_per_m;
+        stability::substeps(sheet.step_s, sheet.omega_per_s, THETA / stability::endurance(sheet.omega_per_s, decay_s))
+    },
     is_stable: |w, _| w < 4.0,
 };
