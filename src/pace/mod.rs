@@ -252,16 +252,6 @@ impl Pacer {
             );
             return Err(Refusal::new(Reason::TooLarge, "stepping.substeps", message));
         }
-        let mut sessions = lock(&self.sessions);
-        let points: usize = sessions.values().map(|live| live.model.len()).sum();
-        if points + model.len() > self.limits.points_in_all {
-            let message = format!("the sessions of the server have {points} points already");
-            return Err(Refusal::new(Reason::TooMany, "sheet.points", message));
-        }
-        if sessions.len() >= self.limits.sessions {
-            let message = format!("the server has {} sessions already", sessions.len());
-            return Err(Refusal::new(Reason::TooMany, "", message));
-        }
         let number = {
             let mut numbers = lock(&self.numbers);
             *numbers += 1;
@@ -289,9 +279,21 @@ impl Pacer {
             streams: Mutex::new(0),
             inbox: inbox.clone(),
         });
+        // Laid out before the lock is taken, on which all calls wait.
+        let running = Box::new(Running::new(live.clone(), !paused));
+        let mut sessions = lock(&self.sessions);
+        let points: usize = sessions.values().map(|live| live.model.len()).sum();
+        if points + live.model.len() > self.limits.points_in_all {
+            let message = format!("the sessions of the server have {points} points already");
+            return Err(Refusal::new(Reason::TooMany, "sheet.points", message));
+        }
+        if sessions.len() >= self.limits.sessions {
+            let message = format!("the server has {} sessions already", sessions.len());
+            return Err(Refusal::new(Reason::TooMany, "", message));
+        }
         sessions.insert(id, live.clone());
         // Before anybody can name the session: what is asked of it comes after this.
-        inbox.send(number, Request::Adopt(Box::new(Running::new(live.clone(), !paused))));
+        inbox.send(number, Request::Adopt(running));
         Ok(live)
     }
 

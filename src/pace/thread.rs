@@ -222,7 +222,9 @@ impl Running {
         match request {
             Request::Adopt(_) => {}
             Request::Start { until, reply } => {
-                let _ = reply.send(self.start(until));
+                let started = self.start(until);
+                self.publish_status();
+                let _ = reply.send(started);
             }
             Request::Pause { reply } => {
                 self.stand();
@@ -272,6 +274,7 @@ impl Running {
     /// Time stands from now on. Who waits for the next sample gets the present one.
     fn stand(&mut self) {
         self.running = false;
+        self.publish_status();
         for tap in self.taps.samples.extract_if(.., |tap| tap.once).collect::<Vec<_>>() {
             tap.writer.push(self.paced_sample(&tap, false));
         }
@@ -331,11 +334,11 @@ impl Running {
                 tap.writer.push(PacedRecord { step, record });
             }
         });
-        self.publish(encoder, overrun);
         if let Some(reason) = self.session.hold_reason() {
             tracing::warn!(session = %self.live.id, reason, "session held");
             self.running = false;
             lock(&self.live.intake).close(Refusal::new(Reason::SessionHeld, "", reason));
+            self.publish_status();
             for (at, reply) in std::mem::take(&mut self.taps.hashes) {
                 let _ = reply.send(Err(self.passed(at)));
             }
@@ -352,7 +355,9 @@ impl Running {
             self.time_dilation = steps * self.period_ns / elapsed_ns as f64;
             self.window = (now, self.session.step_count());
         }
+        // The status first: who is told of this step may ask for it at once.
         self.publish_status();
+        self.publish(encoder, overrun);
     }
 
     fn paced_sample(&self, tap: &SampleTap, overrun: bool) -> PacedSample {
