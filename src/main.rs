@@ -8,8 +8,8 @@ use clap::{Parser, Subcommand};
 use palpate::limits::Limits;
 use palpate::pace::clock::now_ns;
 use palpate::refusal::Refusal;
-use palpate::scene::{self, Scene, document::find, script::Script};
-use palpate::server::{self, config::Config};
+use palpate::scene::{Scene, script::Script};
+use palpate::server::{self, catalog::Catalog, config::Config};
 use palpate::session::run;
 use palpate::sheet::Model;
 use tokio_util::sync::CancellationToken;
@@ -203,11 +203,13 @@ async fn cancel_on_signal(shutdown: CancellationToken) {
 
 fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     let limits: Limits = load_config(arguments.config.as_deref())?.limits;
-    let path = find(&arguments.scene, &arguments.scenes);
-    let scene = if path.as_os_str() == "paper" && !path.exists() {
-        Scene::parse("paper (built in)", scene::PAPER, &arguments.set, &limits)?
-    } else {
-        Scene::load(&path, &arguments.set, &limits)?
+    let path = &arguments.scene;
+    let scene = match path.to_str() {
+        // A bare word that is no file is a name.
+        Some(name) if !path.is_file() && path.components().count() == 1 && path.extension().is_none() => {
+            Catalog::new(&arguments.scenes).load(name, &arguments.set, &limits)?
+        }
+        _ => Scene::load(path, &arguments.set, &limits)?,
     };
     // What only the compiled scene shows is of no one line.
     let in_scene = |refusal: Refusal| Refusal { place: Some(path.display().to_string()), ..refusal };

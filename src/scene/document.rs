@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 use std::io::Read;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use glam::{DVec2, DVec3};
 use toml::de::{DeTable, DeValue};
@@ -47,14 +47,6 @@ impl Value {
             Value::Other => "a date",
         }
     }
-}
-
-/// The file that `name` means: itself if it is there, else `NAME.toml` in `folder` if that is.
-pub fn find(name: &Path, folder: &Path) -> PathBuf {
-    let mut file = name.as_os_str().to_owned();
-    file.push(".toml");
-    let within = folder.join(file);
-    if !name.is_file() && within.is_file() { within } else { name.to_owned() }
 }
 
 /// Reads at most `limit` bytes of UTF-8, also from what is not a plain file.

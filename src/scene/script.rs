@@ -38,7 +38,10 @@ pub struct Script {
 impl Script {
     /// Reads a script, by its file or by its name in ./scripts, and binds it to `scene`.
     pub fn load(name: &Path, scene: &Scene, limits: &Limits) -> Result<Self> {
-        let path = &document::find(name, Path::new("scripts"));
+        let mut named = Path::new("scripts").join(name).into_os_string();
+        named.push(".toml");
+        let named = Path::new(&named);
+        let path = if !name.is_file() && named.is_file() { named } else { name };
         let text = document::read_text(path, limits.file_bytes)?;
         let folder = path.parent().unwrap_or(Path::new(""));
         Self::parse(&path.display().to_string(), &text, folder, scene, limits)

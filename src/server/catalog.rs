@@ -38,18 +38,18 @@ impl Catalog {
         names
     }
 
-    /// The scene of that name. The folder's own goes before one built in.
-    pub fn load(&self, name: &str, limits: &Limits) -> Result<Scene> {
+    /// The scene of that name, with `--set` assignments over it. The folder's own goes before one built in.
+    pub fn load(&self, name: &str, assignments: &[String], limits: &Limits) -> Result<Scene> {
         let path = self.folder.join(format!("{name}.toml"));
         if is_name(name) && path.is_file() {
             // Clients learn the file's name, not where the server keeps it.
             let file = format!("{name}.toml");
             let text = crate::scene::document::read_text(&path, limits.file_bytes)
                 .map_err(|refusal| Refusal { place: Some(file.clone()), ..refusal })?;
-            return Scene::parse(&file, &text, &[], limits);
+            return Scene::parse(&file, &text, assignments, limits);
         }
         match BUILT_IN.iter().find(|scene| scene.0 == name) {
-            Some((_, text)) => Scene::parse(name, text, &[], limits),
+            Some((_, text)) => Scene::parse(name, text, assignments, limits),
             None => {
                 let (name, names) = (excerpt(name), self.names().join(", "));
                 let message = format!("there is no scene `{name}`; there are {names}");

@@ -52,7 +52,7 @@ pub async fn serve(listener: TcpListener, config: Config, shutdown: Cancellation
     let deadline = Duration::from_secs_f64(config.shutdown_deadline_s);
     let catalog = Catalog::new(&config.scenes);
     for name in catalog.names() {
-        if let Err(refusal) = catalog.load(&name, &config.limits) {
+        if let Err(refusal) = catalog.load(&name, &[], &config.limits) {
             warn!(%refusal, "a scene that no session can be made from");
         }
     }

@@ -25,7 +25,7 @@ impl SessionService for Sessions {
         use pb::create_session_request::Source;
         let request = request.into_inner();
         let scene = match &request.source {
-            Some(Source::SceneName(name)) => self.0.catalog.load(name, &self.0.config.limits)?,
+            Some(Source::SceneName(name)) => self.0.catalog.load(name, &[], &self.0.config.limits)?,
             Some(Source::Scene(scene)) => wire::scene::from_scene(scene).map_err(|refusal| refusal.within("scene"))?,
             None => return Err(Refusal::new(Reason::Missing, "source", "scene_name or scene is missing").into()),
         };
