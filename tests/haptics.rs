@@ -557,6 +557,18 @@ async fn a_session_that_blows_up_is_held_with_a_reason_and_sends_no_nan() {
         }
     };
     assert_eq!(rejection.reason, "SESSION_HELD");
+    // Who comes now is told at once: the last good state, and that no more follows.
+    let request = pb::WatchSamplesRequest { session_id: session.clone(), sample_every_steps: None };
+    let mut watched = server.haptics().await.watch_samples(request).await.unwrap().into_inner();
+    assert!(watched.message().await.unwrap().unwrap().sample.unwrap().held);
+    assert_eq!(told(&watched.message().await.unwrap_err()).1, "SESSION_HELD");
+    let request = pb::ProbeRequest {
+        session_id: session.clone(),
+        r#where: Some(pb::probe_request::Where::AllPoints(true)),
+        ..Default::default()
+    };
+    let mut records = server.haptics().await.probe(request).await.unwrap().into_inner();
+    assert_eq!(told(&records.message().await.unwrap_err()).1, "SESSION_HELD");
     // Others live on.
     let other = server.paper(true).await;
     server.start_until(&other, 5).await;

@@ -212,7 +212,7 @@ impl Running {
 
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     fn deadline_ns(&self) -> u64 {
-        (self.anchor_ns + (self.session.step_count() - self.anchor_step) as f64 * self.period_ns) as u64
+        (self.anchor_ns + self.session.step_count().saturating_sub(self.anchor_step) as f64 * self.period_ns) as u64
     }
 
     fn serve(&mut self, request: Request, encoder: &Encoder) {
@@ -235,10 +235,13 @@ impl Running {
                 if at_once {
                     tap.writer.push(self.paced_sample(&tap, false));
                 }
-                if !(at_once && tap.once) {
+                if self.session.hold_reason().is_some() {
+                    tap.writer.close(self.passed(0));
+                } else if !(at_once && tap.once) {
                     self.taps.samples.push(tap);
                 }
             }
+            Request::Probe(tap) if self.session.hold_reason().is_some() => tap.writer.close(self.passed(0)),
             Request::Probe(tap) => self.taps.probes.push(tap),
             Request::View(viewer) => {
                 // Who joins late gets a full frame first.
