@@ -8,7 +8,7 @@ mod thread;
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::thread::JoinHandle;
 
 use tokio::sync::oneshot;
@@ -112,11 +112,20 @@ impl Live {
     #[allow(clippy::cast_precision_loss)]
     fn is_idle(&self, now_ns: u64) -> bool {
         let unused_s = now_ns.saturating_sub(self.asked_ns.load(Ordering::Relaxed)) as f64 * 1e-9;
-        unused_s > self.idle_timeout_s && *lock(&self.streams) == 0 && {
-            let mut intake = lock(&self.intake);
-            intake.lapse(now_ns);
-            intake.holders().next().is_none()
-        }
+        unused_s > self.idle_timeout_s
+            && *lock(&self.streams) == 0
+            && self.intake_as_of(now_ns).holders().next().is_none()
+    }
+
+    /// The intake as it stands now: also while time stands, when no step ends the leases that have run out.
+    pub fn intake_now(&self) -> MutexGuard<'_, Intake> {
+        self.intake_as_of(now_ns())
+    }
+
+    fn intake_as_of(&self, now_ns: u64) -> MutexGuard<'_, Intake> {
+        let mut intake = lock(&self.intake);
+        intake.lapse(now_ns);
+        intake
     }
 
     /// Room for one more stream.
@@ -353,11 +362,6 @@ impl Pacer {
         for thread in lock(&self.threads).drain(..) {
             let _ = thread.join();
         }
-    }
-
-    /// The time by the server's clock.
-    pub fn now_ns(&self) -> u64 {
-        now_ns()
     }
 }
 

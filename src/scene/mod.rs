@@ -265,6 +265,17 @@ impl Sheet {
         self.spacing_m * glam::DVec2::new((self.points[0] - 1) as f64, (self.points[1] - 1) as f64)
     }
 
+    /// The longer side; the spacing of a sheet of one point, m.
+    pub fn longer_side_m(&self) -> f64 {
+        self.extent_m().max_element().max(self.spacing_m)
+    }
+
+    /// Where a point rests, in the rest plane, m.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn rest_m(&self, [i, j]: [usize; 2]) -> glam::DVec2 {
+        self.spacing_m * glam::DVec2::new(i as f64, j as f64)
+    }
+
     /// Whether a point never moves.
     pub fn is_fixed(&self, [i, j]: [usize; 2]) -> bool {
         let [nx, ny] = self.points;

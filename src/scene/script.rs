@@ -186,12 +186,11 @@ impl Binding<'_> {
     }
 
     /// A grid point, and where it rests.
-    #[allow(clippy::cast_precision_loss)]
     fn point(&self, item: &Item<'_>) -> Result<([usize; 2], DVec2)> {
         let point = item.point()?;
         let sheet: &Sheet = &self.scene.sheet;
         sheet.index("", point).map_err(|refusal| item.refuse(refusal.reason, refusal.message))?;
-        Ok((point, sheet.spacing_m * DVec2::new(point[0] as f64, point[1] as f64)))
+        Ok((point, sheet.rest_m(point)))
     }
 
     fn force(&mut self, item: &Item<'_>, control_points: &mut Vec<[usize; 2]>) -> Result<ForceLaw> {
@@ -437,8 +436,7 @@ pub fn check_poke(poke: &Poke, sheet: &Sheet, limits: &Limits) -> Result<()> {
 
 /// Refuses a displacement of a grasped point beyond the limit.
 pub fn check_reach(field: &str, sheet: &Sheet, displacement_m: f64, limits: &Limits) -> Result<()> {
-    let side_m = sheet.extent_m().max_element().max(sheet.spacing_m);
-    let limit_m = side_m * limits.reach_in_sheets;
+    let limit_m = sheet.longer_side_m() * limits.reach_in_sheets;
     number(field, displacement_m, &format!("at most {limit_m} m from the rest position"), |v| v <= limit_m)?;
     Ok(())
 }
@@ -473,7 +471,7 @@ pub fn check_centre(field: &str, sheet: &Sheet, centre_m: DVec2) -> Result<()> {
 /// Whether a control point is on the sheet or at most a tenth of its longer side off it.
 pub fn is_near(sheet: &Sheet, centre_m: DVec2) -> bool {
     let extent_m = sheet.extent_m();
-    let margin_m = DVec2::splat(0.1 * extent_m.max_element().max(sheet.spacing_m));
+    let margin_m = DVec2::splat(0.1 * sheet.longer_side_m());
     centre_m.cmpge(-margin_m).all() && centre_m.cmple(extent_m + margin_m).all()
 }
 

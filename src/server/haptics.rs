@@ -1,6 +1,6 @@
 //! `HapticService`.
 
-use std::collections::{BTreeSet, VecDeque};
+use std::collections::VecDeque;
 use std::pin::Pin;
 use std::sync::Arc;
 
@@ -257,9 +257,9 @@ impl HapticService for Haptics {
         let tools = {
             let mut intake = lock(&live.intake);
             intake.submit(lease, commands, now)?;
-            intake.tools_of(lease).collect::<BTreeSet<u32>>()
+            intake.tools_of(lease).collect()
         };
-        let sample = live.next_sample(tools.into_iter().collect()).await?;
+        let sample = live.next_sample(tools).await?;
         let sample = Some(wire::sample::sample(&sample, 0, now_ns()));
         Ok(Response::new(pb::SendCommandsResponse { sample }))
     }

@@ -34,10 +34,10 @@ impl SessionService for Sessions {
         let range = format!("above 0 and at most {most_s}");
         number("idle_timeout_s", idle_timeout_s, &range, |value| value > 0.0 && value <= most_s)?;
         // A large sheet takes a while to lay out.
-        let (pacer, own) = (self.0.pacer.clone(), scene.clone());
-        let made = tokio::task::spawn_blocking(move || pacer.create(&own, request.paused, idle_timeout_s)).await;
+        let pacer = self.0.pacer.clone();
+        let made = tokio::task::spawn_blocking(move || pacer.create(&scene, request.paused, idle_timeout_s)).await;
         let live = made.map_err(|e| Status::internal(e.to_string()))??;
-        info!(session = %live.id, scene = %scene.name, points = live.model.len(), "session created");
+        info!(session = %live.id, scene = %live.model.scene.name, points = live.model.len(), "session created");
         for warning in &live.model.warnings {
             warn!(session = %live.id, warning);
         }

@@ -69,7 +69,6 @@ pub struct Intake {
     arrivals: u64,
     next_step: u64,
     lapsed: u64,
-    superseded: u64,
     closed: Option<Refusal>,
 }
 
@@ -84,7 +83,6 @@ impl Intake {
             arrivals: 0,
             next_step: 0,
             lapsed: 0,
-            superseded: 0,
             closed: None,
         }
     }
@@ -142,7 +140,7 @@ impl Intake {
 
     /// Gives back every tool of a lease. What they did is ended at the next step, what waits is dropped.
     pub fn release(&mut self, id: LeaseId) -> Result<()> {
-        let tools: Vec<u32> = self.leases.iter().filter(|lease| lease.1.id == id).map(|lease| *lease.0).collect();
+        let tools: Vec<u32> = self.tools_of(id).collect();
         if tools.is_empty() {
             return Err(not_holder("no tool is held by this lease: it lapsed or was given back".into()));
         }
@@ -246,7 +244,6 @@ impl Intake {
             {
                 late_commands += superseded.late_commands;
                 lease.waiting -= 1;
-                self.superseded += 1;
             }
         }
         self.queue.insert(place, Due { command, late, late_commands, ends_lease });
@@ -283,11 +280,6 @@ impl Intake {
     /// Tools whose lease lapsed, in all.
     pub fn lapsed(&self) -> u64 {
         self.lapsed
-    }
-
-    /// Positions that a later one for the same step has replaced, in all.
-    pub fn superseded(&self) -> u64 {
-        self.superseded
     }
 
     /// From now on everything is refused with this.

@@ -235,8 +235,7 @@ impl<T: Real> Sheet<T> {
             }
             lanes.iter().chain(rest).fold(T::default(), |sum, value| sum + value.magnitude())
         };
-        let sheet = &self.model.scene.sheet;
-        let farthest = T::of(FARTHEST_IN_SHEETS * sheet.extent_m().max_element().max(sheet.spacing_m));
+        let farthest = T::of(FARTHEST_IN_SHEETS * self.model.scene.sheet.longer_side_m());
         let (u, forces) = (&self.state.u, &self.spring_n);
         if u.iter().all(|u| sum(u) < farthest) && forces.iter().all(|force| sum(force).is_finite()) {
             return None;

@@ -1,6 +1,6 @@
 //! Commands.
 
-use glam::{DVec2, DVec3};
+use glam::DVec3;
 
 use super::{from_place, from_point, from_vector, pb, point, required, vector};
 use crate::refusal::Result;
@@ -8,12 +8,6 @@ use crate::scene::Sheet;
 use crate::scene::law::Poke;
 use crate::scene::script::Action;
 use crate::session::command::Command;
-
-/// Where a point rests, m.
-#[allow(clippy::cast_precision_loss)]
-fn rest_m(sheet: &Sheet, [i, j]: [usize; 2]) -> DVec2 {
-    sheet.spacing_m * DVec2::new(i as f64, j as f64)
-}
 
 /// A command out of a message that came at `arrival_ns`.
 pub fn from_command(message: &pb::Command, sheet: &Sheet, arrival_ns: u64) -> Result<Command> {
@@ -23,7 +17,7 @@ pub fn from_command(message: &pb::Command, sheet: &Sheet, arrival_ns: u64) -> Re
             centre_m: match required("force.centre", force.centre.as_ref())? {
                 pb::force::Centre::Point(at) => {
                     sheet.index("force.point", from_point(at))?;
-                    rest_m(sheet, from_point(at))
+                    sheet.rest_m(from_point(at))
                 }
                 pb::force::Centre::CentreM(place) => from_place(place),
             },
@@ -36,7 +30,7 @@ pub fn from_command(message: &pb::Command, sheet: &Sheet, arrival_ns: u64) -> Re
             sheet.index("position.point", point)?;
             let displacement_m = match required("position.target", position.target.as_ref())? {
                 pb::position::Target::DisplacementM(displacement) => from_vector(Some(displacement)),
-                pb::position::Target::PositionM(place) => from_vector(Some(place)) - rest_m(sheet, point).extend(0.0),
+                pb::position::Target::PositionM(place) => from_vector(Some(place)) - sheet.rest_m(point).extend(0.0),
             };
             Action::Grasp { point, displacement_m }
         }

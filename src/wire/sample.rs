@@ -136,8 +136,7 @@ pub fn add_to_record(record: &mut Record, message: &pb::ProbeResponse) -> bool {
 /// A session as it stands.
 pub fn session(live: &Arc<Live>) -> pb::Session {
     let status = live.status();
-    let mut intake = crate::pace::queue::lock(&live.intake);
-    intake.lapse(crate::pace::clock::now_ns());
+    let intake = live.intake_now();
     let model = &live.model;
     #[allow(clippy::cast_precision_loss)]
     let simulation_time_s = status.step as f64 / model.scene.stepping.rate_hz;
