@@ -3,6 +3,7 @@
 use std::io::{BufWriter, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::sync::Arc;
 
 use clap::{Parser, Subcommand};
 use palpate::limits::Limits;
@@ -10,7 +11,7 @@ use palpate::pace::clock::now_ns;
 use palpate::refusal::Refusal;
 use palpate::scene::{Scene, script::Script};
 use palpate::server::{self, catalog::Catalog, config::Config};
-use palpate::session::run;
+use palpate::session::{check, run};
 use palpate::sheet::Model;
 use tokio_util::sync::CancellationToken;
 
@@ -30,6 +31,12 @@ enum Command {
         palpate run my-scene.toml my-script.toml --output poke.jsonl --set stepping.integrator=lagged\n\n\
         Exit status: 0; 1 when the run failed; 2 when an input was refused.")]
     Run(RunArguments),
+    /// Tell what a scene asks for: frequencies, integrator, substeps, expected error, time of a step, sessions on a core
+    #[command(after_help = "Examples:\n  \
+        palpate check paper\n  \
+        palpate check my-scene.toml --set stepping.tolerance=1e-8\n\n\
+        Exit status: 0; 2 when the scene was refused.")]
+    Check(SceneArguments),
     /// Serve tissue over gRPC: sessions stepped in real time, commands in, forces and frames out
     #[command(after_help = "Examples:\n  \
         palpate serve\n  \
@@ -65,23 +72,29 @@ struct ServeArguments {
 }
 
 #[derive(clap::Args)]
-struct RunArguments {
+struct SceneArguments {
     /// A scene file, or the name of one in --scenes; `paper` is built in
     scene: PathBuf,
-    /// A script file, or the name of one in ./scripts
-    script: PathBuf,
     /// Folder of the scenes that have a name
     #[arg(long, value_name = "DIR", default_value = "scenes")]
     scenes: PathBuf,
-    /// Write the records here instead of to the standard output
-    #[arg(short, long, value_name = "FILE")]
-    output: Option<PathBuf>,
     /// Set a key of the scene: a TOML value, or a bare string; may be repeated
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
     /// Configuration file (TOML) with other limits, in a section [limits]
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
+}
+
+#[derive(clap::Args)]
+struct RunArguments {
+    #[command(flatten)]
+    scene: SceneArguments,
+    /// A script file, or the name of one in ./scripts
+    script: PathBuf,
+    /// Write the records here instead of to the standard output
+    #[arg(short, long, value_name = "FILE")]
+    output: Option<PathBuf>,
     /// Hold forces and paths for each step, as a client does that streams a command a step
     #[arg(long)]
     held: bool,
@@ -104,6 +117,7 @@ impl From<Refusal> for Failure {
 fn main() -> ExitCode {
     let ended = match Arguments::parse().command {
         Command::Run(arguments) => run_script(&arguments),
+        Command::Check(arguments) => check(&arguments),
         Command::Serve(arguments) => serve(&arguments),
     };
     let (status, message) = match ended {
@@ -201,7 +215,8 @@ async fn cancel_on_signal(shutdown: CancellationToken) {
     }
 }
 
-fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
+/// The compiled scene that the arguments name, and the limits that hold.
+fn compile(arguments: &SceneArguments) -> Result<(Arc<Model>, Limits), Failure> {
     let limits: Limits = load_config(arguments.config.as_deref())?.limits;
     let path = &arguments.scene;
     let scene = match path.to_str() {
@@ -213,8 +228,27 @@ fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     };
     // What only the compiled scene shows is of no one line.
     let in_scene = |refusal: Refusal| Refusal { place: Some(path.display().to_string()), ..refusal };
-    let model = Model::compile(&scene, &limits).map_err(in_scene)?;
-    let script = Script::load(&arguments.script, &scene, &limits)?;
+    Ok((Model::compile(&scene, &limits).map_err(in_scene)?, limits))
+}
+
+#[allow(clippy::cast_precision_loss)]
+fn clock_s() -> f64 {
+    now_ns() as f64 * 1e-9
+}
+
+fn check(arguments: &SceneArguments) -> Result<(), Failure> {
+    let (model, limits) = compile(arguments)?;
+    let report = check::check(&model, limits.substeps, &clock_s);
+    match write!(std::io::stdout(), "{report}") {
+        // Who reads has seen enough.
+        Err(e) if e.kind() != std::io::ErrorKind::BrokenPipe => Err(Failure::Failed(e.to_string())),
+        _ => Ok(()),
+    }
+}
+
+fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
+    let (model, limits) = compile(&arguments.scene)?;
+    let script = Script::load(&arguments.script, &model.scene, &limits)?;
     for warning in model.warnings.iter().chain(&script.warnings) {
         eprintln!("palpate: warning: {warning}");
     }
@@ -226,8 +260,6 @@ fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
         None => Box::new(std::io::stdout().lock()),
     };
     let mut output = BufWriter::new(output);
-    #[allow(clippy::cast_precision_loss)]
-    let clock_s = || now_ns() as f64 * 1e-9;
     let (begun_s, watched) = (clock_s(), std::io::stderr().is_terminal());
     let mut progress = |step: u64| {
         // Only where somebody looks, and has waited.

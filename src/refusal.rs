@@ -64,6 +64,8 @@ reasons! {
     TooMany = "TOO_MANY",
     /// The first message of a stream must open it, and only the first.
     OutOfTurn = "OUT_OF_TURN",
+    /// Something that this machine has not got.
+    NotAvailable = "NOT_AVAILABLE",
     /// The server is going down.
     ShuttingDown = "SHUTTING_DOWN",
 }

@@ -140,17 +140,6 @@ fn errors(name: &str, assignments: &[&str]) -> Errors {
     }
 }
 
-#[test]
-fn default_settings_are_within_a_thousandth() {
-    for name in SCENES {
-        let errors = errors(name, &[]);
-        println!("{name}: {errors:?}");
-        assert!(errors.displacement < 1e-3, "{name}: {errors:?}");
-        assert!(errors.force < 5e-3, "{name}: {errors:?}");
-        assert!(errors.velocity < 5e-3 && errors.energy < 5e-3, "{name}: {errors:?}");
-    }
-}
-
 /// By what each error falls when the step falls by 4.
 fn gains(name: &str, integrator: &str, rate_hz: f64) -> [f64; 4] {
     let at = |rate_hz: f64| {
@@ -168,10 +157,22 @@ fn gains(name: &str, integrator: &str, rate_hz: f64) -> [f64; 4] {
 }
 
 #[test]
-fn central_is_second_order() {
-    for name in SCENES {
-        for gain in gains(name, "central", 1000.0) {
-            assert!(gain > 14.0, "{name}: {gain}");
+fn each_scheme_has_its_order() {
+    // At these rates the coarse step is accurate already, and the fine one is not yet at the digits of the references.
+    for (integrator, order, rate_hz) in [
+        ("central", 2.0, 1000.0),
+        ("rk4", 4.0, 2000.0),
+        ("exponential2", 3.0, 1000.0),
+        ("exponential3", 4.0, 1000.0),
+        ("exponential4", 5.0, 1000.0),
+    ] {
+        for name in SCENES {
+            for gain in gains(name, integrator, rate_hz) {
+                println!("{integrator} {name}: {:.2}", gain.log2() / 2.0);
+                // Damping that takes five times a point's momentum in a step leaves the fifth order to finer ones.
+                let order = if name == "overdamped19" { f64::min(order, 4.0) } else { order };
+                assert!(gain.log2() / 2.0 > order - 0.75, "{integrator}, {name}: {gain}");
+            }
         }
     }
 }
@@ -186,13 +187,12 @@ fn lagged_is_first_order_within_its_stable_range() {
 }
 
 #[test]
-fn lagged_explodes_where_its_damping_is_too_strong_and_is_held() {
-    let reference = load("overdamped19");
+fn lagged_explodes_where_its_damping_is_too_strong_and_the_guard_mends_it() {
     let sets = ["stepping.integrator=lagged", "stepping.substeps=1"];
+    let reference = load("overdamped19");
     let scene = scene_with(&scene_text(&reference["scene"]), &sets);
     let script = script(&script_text(&reference["scene"]), &scene);
     let mut session = playing(&scene, &script);
-    let mut last = 0;
     for _ in 0..script.steps {
         session.advance(&mut Vec::new(), |session| {
             for index in 0..session.model().len() {
@@ -200,10 +200,20 @@ fn lagged_explodes_where_its_damping_is_too_strong_and_is_held() {
                 assert!(point.displacement_m.is_finite() && point.reaction_n().is_finite());
             }
         });
-        last = session.step_count();
+        assert_eq!(session.hold_reason(), None);
     }
-    assert!(last < script.steps);
-    assert!(session.hold_reason().unwrap().contains("not finite"));
-    // Auto substeps keep it stable.
+    assert!(session.tissue().guard_events() > 0 && session.tissue().plan().substeps > 1);
+    // Auto substeps are within the bound from the beginning.
     assert!(errors("overdamped19", &["stepping.integrator=lagged"]).displacement < 1e-2);
+}
+
+#[test]
+fn a_tolerance_is_kept() {
+    for name in SCENES {
+        for tolerance in [1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8] {
+            let errors = errors(name, &[&format!("stepping.tolerance={tolerance:e}")]);
+            println!("{name} {tolerance:e}: {errors:?}");
+            assert!(errors.displacement < tolerance && errors.force < tolerance, "{name}, {tolerance:e}: {errors:?}");
+        }
+    }
 }

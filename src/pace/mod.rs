@@ -73,6 +73,8 @@ pub struct Status {
     pub late_commands: u64,
     /// Why it is held.
     pub hold_reason: Option<String>,
+    /// How often the guard went back to a checkpoint.
+    pub guard_events: u64,
 }
 
 /// A session as the server sees it.
@@ -275,6 +277,7 @@ impl Pacer {
             time_dilation: 1.0,
             late_commands: 0,
             hold_reason: None,
+            guard_events: 0,
         };
         let live = Arc::new(Live {
             id: id.clone(),

@@ -416,6 +416,7 @@ impl Running {
         };
         status.step = self.session.step_count();
         status.overrun_count = self.overrun_count;
+        status.guard_events = self.session.tissue().guard_events();
         status.time_dilation = self.time_dilation;
         status.late_commands = self.session.late_commands();
         if status.hold_reason.is_none() {

@@ -82,6 +82,8 @@ pub struct Stepping {
     pub substeps: Option<u32>,
     /// The number format.
     pub precision: Precision,
+    /// How many numbers are worked on at once.
+    pub lanes: Lanes,
 }
 
 impl Default for Stepping {
@@ -92,6 +94,7 @@ impl Default for Stepping {
             integrator: Integrator::Auto,
             substeps: None,
             precision: Precision::Auto,
+            lanes: Lanes::Auto,
         }
     }
 }
@@ -127,11 +130,33 @@ pub enum Integrator {
     Central,
     /// The paper's: damping with the velocity of the last step, first order.
     Lagged,
+    /// The classical scheme of Runge and Kutta: fourth order, four evaluations a substep.
+    Rk4,
+    /// Exponential multistep with the springs' last 2 forces: third order.
+    Exponential2,
+    /// With the last 3: fourth order.
+    Exponential3,
+    /// With the last 4: fifth order.
+    Exponential4,
+}
+
+impl Integrator {
+    /// Whether it is one of the exponential multistep schemes.
+    pub fn is_exponential(self) -> bool {
+        matches!(self, Integrator::Exponential2 | Integrator::Exponential3 | Integrator::Exponential4)
+    }
 }
 
 impl Named for Integrator {
-    const NAMES: &'static [(&'static str, Self)] =
-        &[("auto", Integrator::Auto), ("central", Integrator::Central), ("lagged", Integrator::Lagged)];
+    const NAMES: &'static [(&'static str, Self)] = &[
+        ("auto", Integrator::Auto),
+        ("central", Integrator::Central),
+        ("lagged", Integrator::Lagged),
+        ("rk4", Integrator::Rk4),
+        ("exponential2", Integrator::Exponential2),
+        ("exponential3", Integrator::Exponential3),
+        ("exponential4", Integrator::Exponential4),
+    ];
 }
 
 /// The number format of the state.
@@ -141,13 +166,37 @@ pub enum Precision {
     Auto,
     /// 4 bytes.
     F32,
+    /// 4 bytes, and 4 for what a displacement loses in rounding: for exponential schemes.
+    Compensated,
     /// 8 bytes.
     F64,
 }
 
 impl Named for Precision {
+    const NAMES: &'static [(&'static str, Self)] = &[
+        ("auto", Precision::Auto),
+        ("f32", Precision::F32),
+        ("compensated", Precision::Compensated),
+        ("f64", Precision::F64),
+    ];
+}
+
+/// How many numbers the processor works on at once. The results have the same bits whichever it is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Lanes {
+    /// The most that the machine has.
+    Auto,
+    /// 64 bytes.
+    Avx512,
+    /// 32 bytes.
+    Avx2,
+    /// One by one: on any machine.
+    Plain,
+}
+
+impl Named for Lanes {
     const NAMES: &'static [(&'static str, Self)] =
-        &[("auto", Precision::Auto), ("f32", Precision::F32), ("f64", Precision::F64)];
+        &[("auto", Lanes::Auto), ("avx512", Lanes::Avx512), ("avx2", Lanes::Avx2), ("plain", Lanes::Plain)];
 }
 
 impl Scene {
@@ -331,6 +380,10 @@ fn read_stepping(item: &Item<'_>) -> Result<Stepping> {
             precision: match fields.text("precision")? {
                 Some(name) => Precision::named(&fields.path("precision"), &name)?,
                 None => standard.precision,
+            },
+            lanes: match fields.text("lanes")? {
+                Some(name) => Lanes::named(&fields.path("lanes"), &name)?,
+                None => standard.lanes,
             },
         })
     })

@@ -1,6 +1,7 @@
 //! One tissue in use: what the tools do to it, what they feel, what is recorded. No clock, no socket: a session
 //! that is given the same commands at the same steps gives the same bits.
 
+pub mod check;
 pub mod command;
 pub mod run;
 
@@ -138,10 +139,10 @@ impl Session {
             observe(self);
         }
         if let Err(blow_up) = self.tissue.step() {
-            let [i, j] = blow_up.point;
             self.hold_reason = Some(format!(
-                "point [{i}, {j}] was not finite (or a billion sheets away) after step {}; the state is that of step {}",
+                "after step {} {}; shorter substeps did not help; the state is that of step {}",
                 blow_up.step,
+                blow_up.cause,
                 self.step_count()
             ));
             return;

@@ -10,7 +10,7 @@ use crate::refusal::{Refusal, Result};
 use crate::scene::Named;
 use crate::scene::record::{Line, Record, Run, Summary, write_line};
 use crate::scene::script::{Action, Script};
-use crate::sheet::Model;
+use crate::sheet::{Model, Tissue};
 
 /// How a run can end early.
 #[derive(Debug, thiserror::Error)]
@@ -105,7 +105,7 @@ pub fn run(
         }
     }
     stepping_s += clock_s() - resumed_s;
-    let summary = summary(model, script.steps, stepping_s, session.tissue().state_hash());
+    let summary = summary(session.tissue(), stepping_s);
     write_line(output, &Line::Summary(&summary))?;
     Ok(summary)
 }
@@ -123,10 +123,11 @@ fn intake(model: &Model, script: &Script, limits: &Limits) -> Result<Intake> {
     Ok(intake)
 }
 
-/// The last line of a run of `steps` steps.
+/// The last line of a run that ends here.
 #[allow(clippy::cast_precision_loss)]
-pub fn summary(model: &Model, steps: u64, wall_s: f64, hash: u128) -> Summary {
-    let substeps = steps * u64::from(model.plan.substeps);
+pub fn summary(tissue: &dyn Tissue, wall_s: f64) -> Summary {
+    let (model, steps) = (tissue.model(), tissue.step_count());
+    let substeps = tissue.substeps_done();
     Summary {
         steps,
         substeps,
@@ -134,8 +135,8 @@ pub fn summary(model: &Model, steps: u64, wall_s: f64, hash: u128) -> Summary {
         wall_s,
         ns_per_point_substep: wall_s * 1e9 / (substeps as f64 * model.len() as f64),
         computed_fraction: 1.0,
-        guard_events: 0,
-        final_hash: format!("{hash:032x}"),
+        guard_events: tissue.guard_events(),
+        final_hash: format!("{:032x}", tissue.state_hash()),
         network: None,
     }
 }

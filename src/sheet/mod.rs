@@ -1,12 +1,18 @@
 //! The tissue: an immutable model, a state, and the step that takes one to the next. No clock, no socket.
 
 mod applied;
+pub mod choice;
+mod field;
+pub mod guard;
 pub mod integrate;
+mod lanes;
 pub mod model;
 mod prescribed;
 mod real;
 mod springs;
 pub mod stability;
+mod survey;
+mod sweep;
 
 use std::sync::Arc;
 
@@ -17,11 +23,18 @@ use crate::scene::Precision;
 use crate::scene::law::{Moment, Motion};
 use applied::Applied;
 pub use applied::Push;
-pub use model::Model;
+use field::{Field, Layout, State};
+pub use guard::Cause;
+use guard::{Checkpoint, Input, Work};
+use integrate::{Scheme, central, exponential, rk4};
+use lanes::Plain;
+pub use model::{Model, Plan};
 pub use prescribed::Grasp;
 use prescribed::Prescribed;
 use real::Real;
 use springs::Springs;
+use survey::Survey;
+use sweep::{Bench, MAX_KEPT};
 
 /// One mass point at the end of a step: displacement, velocity, and the forces on the point. Where the applied
 /// force jumps it is the one just before; at step 0, just after.
@@ -61,13 +74,13 @@ pub struct Energy {
     pub virtual_j: f64,
 }
 
-/// What a scheme found that it could not go on with.
+/// What the guard could not mend.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BlowUp {
     /// Steps done when it was found.
     pub step: u64,
-    /// A point that is not finite, or is displaced by a billion sheets.
-    pub point: [usize; 2],
+    /// What it was.
+    pub cause: Cause,
 }
 
 /// A sheet in motion, in whichever precision.
@@ -82,6 +95,12 @@ pub trait Tissue: Send {
     fn grasp(&mut self, tool: usize, index: usize, grasp: Grasp);
     /// `tool` neither pushes nor grasps any more, from the coming step on.
     fn release(&mut self, tool: usize);
+    /// The scheme as it is now: the guard may have halved the substep of the model's.
+    fn plan(&self) -> &Plan;
+    /// How often the guard went back to a checkpoint and on with half the substep.
+    fn guard_events(&self) -> u64;
+    /// Substeps computed, those that the guard repeated as well.
+    fn substeps_done(&self) -> u64;
     /// One step. After a blow-up the state is that of the last checkpoint, which is finite.
     fn step(&mut self) -> Result<(), BlowUp>;
     /// The point at `index`.
@@ -92,7 +111,7 @@ pub trait Tissue: Send {
     fn largest_displacement_m(&self) -> f64;
     /// Writes the displacements, m, x, y and z apart.
     fn displacements_m(&self, into: &mut [Vec<f32>; 3]);
-    /// XXH3-128 of displacement and increment of every point.
+    /// XXH3-128 of the state of every point: displacement, increment, and what the scheme keeps beside.
     fn state_hash(&self) -> u128;
 }
 
@@ -100,152 +119,303 @@ pub trait Tissue: Send {
 pub fn at_rest(model: &Arc<Model>) -> Box<dyn Tissue> {
     match model.precision {
         Precision::F64 => Box::new(Sheet::<f64>::new(model)),
-        Precision::Auto | Precision::F32 => Box::new(Sheet::<f32>::new(model)),
+        Precision::Auto | Precision::F32 | Precision::Compensated => Box::new(Sheet::<f32>::new(model)),
     }
 }
 
-/// Displacement and increment of every point, x, y and z apart: a struct of arrays, point [i, j] at i·ny + j.
-#[derive(Debug, Clone)]
-struct State<T> {
-    /// Displacement from rest, m.
-    u: [Vec<T>; 3],
-    /// Increment of `u` in the last substep, m.
-    d: [Vec<T>; 3],
+/// Does something with the scheme of a plan, in format `$t`: what does not advance it, and needs no compensation.
+macro_rules! with_scheme {
+    ($plan:expr, $t:ty, |$scheme:ident| $body:expr) => {
+        match &$plan.scheme {
+            Scheme::TwoStep(two) => {
+                let $scheme = &central::Advance::<$t>::new(two);
+                $body
+            }
+            Scheme::Multistep(multistep) if multistep.order == 2 => {
+                let $scheme = &exponential::Advance::<$t, 2, false>::new(multistep);
+                $body
+            }
+            Scheme::Multistep(multistep) if multistep.order == 3 => {
+                let $scheme = &exponential::Advance::<$t, 3, false>::new(multistep);
+                $body
+            }
+            Scheme::Multistep(multistep) => {
+                let $scheme = &exponential::Advance::<$t, 4, false>::new(multistep);
+                $body
+            }
+            Scheme::Rk4 { a, g } => {
+                let $scheme = &rk4::Advance::<$t>::new(*a, *g, 0);
+                $body
+            }
+        }
+    };
 }
 
-/// Steps between two checkpoints, to which a blow-up goes back. A copy costs about a tenth of a step.
-const CHECKPOINT_STEPS: u64 = 64;
-
-/// A displacement of so many sheets is a blow-up: far beyond any tissue, and far below what f32 can square.
-const FARTHEST_IN_SHEETS: f64 = 1e9;
-
 #[derive(Debug)]
-struct Sheet<T> {
+struct Sheet<T: Real> {
     model: Arc<Model>,
+    /// The model's, or with a shorter substep.
+    plan: Plan,
+    halvings: u32,
+    bench: Bench<T>,
     state: State<T>,
-    /// Force of all springs at `state.u`, N: always up to date, so that reading it costs nothing.
-    spring_n: [Vec<T>; 3],
-    springs: Springs<T>,
     applied: Applied<T>,
     prescribed: Prescribed,
     steps: u64,
-    checkpoint: (u64, State<T>),
+    work: Work,
+    checkpoint: Checkpoint<T>,
+    /// What the tools were told since the checkpoint: before which step, which tool.
+    inputs: Vec<(u64, usize, Input)>,
+    guard_events: u64,
+    substeps_done: u64,
 }
 
 impl<T: Real> Sheet<T> {
     fn new(model: &Arc<Model>) -> Self {
-        let zero = || std::array::from_fn(|_| vec![T::default(); model.len()]);
-        let state = State { u: zero(), d: zero() };
+        let layout = Layout::new::<T>(model.points);
+        let plan = model.plan.clone();
+        let at_rest = || State::at_rest(&layout, plan.scheme.kept(model.precision == Precision::Compensated));
+        let applied = Applied::new(&layout, &plan);
+        let prescribed = Prescribed::new();
         Sheet {
             model: model.clone(),
-            spring_n: zero(),
-            springs: Springs::new(model),
-            applied: Applied::new(model),
-            prescribed: Prescribed::new(),
+            halvings: 0,
+            bench: Bench::new(model.lanes, layout, springs_of(model, &plan), &model.fixed),
+            state: at_rest(),
             steps: 0,
-            checkpoint: (0, state.clone()),
-            state,
+            work: Work::default(),
+            checkpoint: Checkpoint {
+                steps: 0,
+                halvings: 0,
+                state: at_rest(),
+                applied: applied.clone(),
+                prescribed: prescribed.clone(),
+                work: Work::default(),
+            },
+            applied,
+            prescribed,
+            inputs: Vec::new(),
+            guard_events: 0,
+            substeps_done: 0,
+            plan,
         }
     }
 
+    fn do_step(&mut self) {
+        let substeps = self.plan.substeps;
+        let fraction = |substep: u32| f64::from(substep) / f64::from(substeps);
+        for substep in 0..substeps {
+            self.substep(Moment { step: self.steps, fraction: fraction(substep) }, fraction(substep + 1));
+        }
+        self.applied.finish(&self.model, self.steps);
+        self.prescribed.finish(&self.model, self.steps);
+        self.steps += 1;
+        self.substeps_done += u64::from(substeps);
+    }
+
+    /// From `moment` to the fraction `end` of the same step.
     fn substep(&mut self, moment: Moment, end: f64) {
-        self.applied.prepare(&self.model, moment);
-        let kicks = self.kicks_of_released(moment);
-        self.advance();
-        for (index, kick) in kicks {
-            for (c, kick) in kick.into_iter().enumerate() {
-                self.state.d[c][index] += kick;
-                self.state.u[c][index] += kick;
-            }
-        }
-        self.prescribed.hold(&self.model, moment.step, end, &mut self.state.u, &mut self.state.d);
-        self.springs.forces(&self.state.u, &mut self.spring_n);
-    }
-
-    /// d ← p·d + q·F(u), u ← u + d, at every point.
-    ///
-    /// What is far too small to matter is set to 0: fields decay towards the rim of a sheet without end, and arithmetic
-    /// on the subnormal numbers at which they arrive costs tens of times the usual.
-    fn advance(&mut self) {
-        let plan = &self.model.plan;
-        let (p, q) = (T::of(plan.p), T::of(plan.q));
-        let stiffness = T::of(self.model.scene.virtual_stiffness_n_per_m);
-        let spacing_m = T::of(self.model.scene.sheet.spacing_m);
-        let (least_u, least_d) = (spacing_m * T::LEAST, spacing_m * T::LEAST * T::LEAST_INCREMENT);
-        for c in 0..3 {
-            let forces = self.spring_n[c].iter().zip(&self.applied.field[c]);
-            let state = self.state.u[c].iter_mut().zip(&mut self.state.d[c]);
-            for ((u, d), (spring, applied)) in state.zip(forces) {
-                let next_d = p * *d + q * (*spring + *applied - stiffness * *u);
-                let next_u = *u + next_d;
-                *d = if next_d.magnitude() < least_d { T::default() } else { next_d };
-                *u = if next_u.magnitude() < least_u { T::default() } else { next_u };
-            }
-        }
-    }
-
-    /// To let go is a jump: before it the whole force on the point, damping left out, was m·a + C·v with the a and v
-    /// of the tool; after it, it is F = spring + applied − K″·u. At a jump a two-step scheme needs the mean of both (see
-    /// `applied`), and it uses F with the mean of the applied force. The tool moved at constant velocity, so a = 0: the
-    /// point gets ½(C·v + F) less that. In terms of the increment, q times the difference.
-    fn kicks_of_released(&mut self, moment: Moment) -> Vec<(usize, [T; 3])> {
+        let Sheet { model, plan, bench, state, applied, work, .. } = self;
+        let layout = bench.layout;
+        applied.prepare(model, plan, &layout, moment, end - moment.fraction, |applied, before| {
+            let product_j = guard::force_times_displacement(model, plan, &layout, applied, state);
+            work.add(if before { product_j } else { -product_j });
+        });
         let released = self.prescribed.take_released();
-        let scene = &self.model.scene;
-        let kick = |(index, velocity): (usize, DVec3)| {
-            let applied_n = self.applied.from(&self.model, index, moment);
-            let kick = std::array::from_fn(|c| {
-                let elastic_n =
-                    self.spring_n[c][index].wide() - scene.virtual_stiffness_n_per_m * self.state.u[c][index].wide();
-                let used_n = elastic_n + self.applied.field[c][index].wide();
-                let mean_n = 0.5 * (scene.damping_n_s_per_m * velocity[c] + elastic_n + applied_n[c]);
-                T::of(self.model.plan.q * (mean_n - used_n))
-            });
-            (index, kick)
-        };
-        released.into_iter().map(kick).collect()
-    }
-
-    fn displacement_m(&self, index: usize) -> DVec3 {
-        DVec3::from_array(std::array::from_fn(|c| self.state.u[c][index].wide()))
-    }
-
-    /// Velocity of a free point under the applied force `applied_n`: the mean of the increments of the substep just
-    /// done and of the one that would follow, over its length. Second order, and at the time of the displacement.
-    fn free_velocity_m_per_s(&self, index: usize, applied_n: DVec3) -> DVec3 {
-        if self.steps == 0 {
-            return DVec3::ZERO;
-        }
-        let plan = &self.model.plan;
-        let stiffness = self.model.scene.virtual_stiffness_n_per_m;
-        DVec3::from_array(std::array::from_fn(|c| {
-            let (u, d) = (self.state.u[c][index].wide(), self.state.d[c][index].wide());
-            let force_n = self.spring_n[c][index].wide() + applied_n[c] - stiffness * u;
-            (d + (plan.p * d + plan.q * force_n)) / (2.0 * plan.substep_s)
-        }))
-    }
-
-    /// A point that is not finite or beyond every bound, if there is one.
-    fn broken_point(&self) -> Option<usize> {
-        // A sum of magnitudes is small and finite only if all its terms are.
-        let sum = |values: &Vec<T>| {
-            let mut lanes = [T::default(); 16];
-            let (blocks, rest) = values.as_chunks::<16>();
-            for block in blocks {
-                lanes.iter_mut().zip(block).for_each(|(lane, value)| *lane += value.magnitude());
+        let released: Vec<_> =
+            released.into_iter().map(|(index, v)| (index, self.change_at_release(index, v, moment))).collect();
+        let Sheet { model, plan, bench, state, applied, .. } = self;
+        match &plan.scheme {
+            Scheme::TwoStep(two) => {
+                bench.advance(&central::Advance::new(two), state, applied, [0, 0]);
             }
-            lanes.iter().chain(rest).fold(T::default(), |sum, value| sum + value.magnitude())
-        };
-        let farthest = T::of(FARTHEST_IN_SHEETS * self.model.scene.sheet.longer_side_m());
-        let (u, forces) = (&self.state.u, &self.spring_n);
-        if u.iter().all(|u| sum(u) < farthest) && forces.iter().all(|force| sum(force).is_finite()) {
-            return None;
+            Scheme::Multistep(multistep) => {
+                // The change is to what the substep begins with.
+                for (index, change) in &released {
+                    shift(&layout, state, *index, change);
+                }
+                let compensated = model.precision == Precision::Compensated;
+                macro_rules! advance {
+                    ($(($order:literal, $with:literal))*) => {
+                        match (multistep.order, compensated) {
+                            $(($order, $with) => {
+                                let scheme = exponential::Advance::<T, $order, $with>::new(multistep);
+                                bench.advance(&scheme, state, applied, [0, 1]);
+                            })*
+                            // `Scheme::fit` makes no others.
+                            _ => {}
+                        }
+                    };
+                }
+                advance!((2, false)(3, false)(4, false)(2, true)(3, true)(4, true));
+                // The newest force is where the oldest was.
+                state.kept[..multistep.order].rotate_right(1);
+            }
+            Scheme::Rk4 { a, g } => {
+                let (a, g) = (*a, *g);
+                for stage in 0..rk4::STAGES.len() {
+                    let field = stage.div_ceil(2);
+                    self.bench.advance(&rk4::Advance::new(a, g, stage), &mut self.state, &self.applied, [field; 2]);
+                    if stage < 3 {
+                        let far = rk4::STAGES[stage].0;
+                        self.hold(moment.step, moment.fraction + far * (end - moment.fraction), false);
+                    }
+                }
+            }
         }
-        let broken = |index: &usize| {
-            let is_far = |u: &Vec<T>| !u[*index].is_finite() || u[*index].magnitude() >= farthest;
-            u.iter().any(is_far) || forces.iter().any(|f| !f[*index].is_finite())
+        if self.plan.scheme.takes_means() {
+            // The change is to the substep's increment.
+            for (index, change) in &released {
+                shift(&layout, &mut self.state, *index, change);
+            }
+        }
+        self.hold(moment.step, end, true);
+    }
+
+    /// Puts the grasped points where they are at `fraction` of the step, and counts the work of that if it is `counted`.
+    fn hold(&mut self, step: u64, fraction: f64, counted: bool) {
+        let Sheet { model, plan, bench, state, prescribed, work, .. } = self;
+        let spacing_m = model.scene.sheet.spacing_m;
+        let impulse = match &plan.scheme {
+            Scheme::TwoStep(two) => two.q,
+            Scheme::Multistep(multistep) => multistep.impulse(),
+            Scheme::Rk4 { .. } => 1.0,
         };
-        // Sums overflow before their terms do; that alone is no blow-up.
-        (0..self.model.len()).find(broken)
+        for (index, displacement_m, velocity_m_per_s) in prescribed.at(model, step, fraction) {
+            let mut product = 0.0;
+            for c in 0..3 {
+                let at = c * bench.layout.plane + bench.layout.place(index);
+                let (free_u, free_d) = (state.u[at], state.d[at]);
+                state.u[at] = T::of(displacement_m[c] / spacing_m);
+                state.d[at] = if plan.scheme.takes_means() {
+                    // What the scheme has just done is undone: the increment is from where the point was before.
+                    state.u[at] - (free_u - free_d)
+                } else {
+                    T::of(velocity_m_per_s[c] * plan.substep_s / spacing_m)
+                };
+                product += (state.d[at].wide() - free_d.wide()) * state.d[at].wide();
+            }
+            if counted {
+                work.add(product * spacing_m / (impulse * plan.force_scale(&model.scene)));
+            }
+        }
+    }
+
+    /// What to add to u and d of a point that is let go with `velocity`, so that it goes on smoothly.
+    ///
+    /// To a two-step scheme, that is a jump: before it the whole force on the point, damping left out, was m·a + C·v with
+    /// the a and v of the tool; after it, it is F = spring + applied − K″·u. At a jump such a scheme needs the mean of both
+    /// (see `applied`), and it uses F with the mean of the applied force. The tool moved at constant velocity, so a = 0:
+    /// the point gets ½(C·v + F) less that. In terms of the increment, q times the difference.
+    ///
+    /// To a multistep scheme, u and d are predictions that the next substep corrects; those of the tool are right as they
+    /// are, so the correction is taken off.
+    fn change_at_release(&self, index: usize, velocity_m_per_s: DVec3, moment: Moment) -> [[f64; 2]; 3] {
+        let Sheet { model, plan, bench, state, applied, .. } = self;
+        let springs = bench.springs.gather(&bench.layout, &state.u, model.point_of(index)).map(Real::wide);
+        match &plan.scheme {
+            Scheme::TwoStep(two) => {
+                let (scale, scene) = (plan.force_scale(&model.scene), &model.scene);
+                let applied_n = applied.from(model, index, moment);
+                std::array::from_fn(|c| {
+                    let at = c * bench.layout.plane + bench.layout.place(index);
+                    let elastic = springs[c] - two.q * two.a * state.u[at].wide();
+                    let used = elastic + applied.fields[0][at].wide();
+                    let lost = scene.damping_n_s_per_m * velocity_m_per_s[c] + applied_n[c];
+                    let kick = 0.5 * (two.q * scale * lost + elastic) - used;
+                    [kick, kick]
+                })
+            }
+            Scheme::Multistep(multistep) => std::array::from_fn(|c| {
+                let at = c * bench.layout.plane + bench.layout.place(index);
+                let history: Vec<f64> = std::iter::once(springs[c])
+                    .chain(state.kept[..multistep.order].iter().map(|field| field[at].wide()))
+                    .collect();
+                multistep.correction.map(|weight| -weight * multistep.surprise(&history))
+            }),
+            Scheme::Rk4 { .. } => [[0.0; 2]; 3],
+        }
+    }
+
+    /// Displacement, velocity and springs' force of a free point, under the applied force `applied_n`.
+    fn free_point(&self, index: usize, applied_n: DVec3) -> [DVec3; 3] {
+        let Sheet { model, plan, bench, state, .. } = self;
+        let (spacing_m, scale) = (model.scene.sheet.spacing_m, plan.force_scale(&model.scene));
+        let unit = plan.scheme.spring_scale() * scale;
+        let springs = bench.springs.gather(&bench.layout, &state.u, model.point_of(index));
+        let mut found = [DVec3::ZERO; 3];
+        for (c, n) in springs.into_iter().enumerate() {
+            let at = c * bench.layout.plane + bench.layout.place(index);
+            let one = Plain::<f64, 1>::one;
+            let mut kept = [one(0.0); MAX_KEPT];
+            kept.iter_mut().zip(&state.kept).for_each(|(value, field)| *value = one(field[at].wide()));
+            let (u, d, n) = (one(state.u[at].wide()), one(state.d[at].wide()), one(n.wide()));
+            let force = one(unit * applied_n[c]);
+            use sweep::Scheme as _;
+            let (u, w) = with_scheme!(plan, f64, |scheme| scheme.observe(u, d, n, &kept, Some(force)));
+            found[0][c] = u.value() * spacing_m;
+            found[1][c] = if self.steps == 0 { 0.0 } else { w.value() * spacing_m / plan.substep_s };
+            found[2][c] = n.value() / unit;
+        }
+        found
+    }
+
+    /// Looks at the whole sheet: what a survey sees, the energies, and the energy that the scheme keeps.
+    fn survey(&self) -> (Survey, Energy, f64) {
+        let Sheet { model, plan, bench, state, .. } = self;
+        let force = (plan.scheme.takes_means() && self.steps > 0).then(|| {
+            let unit = plan.scheme.spring_scale() * plan.force_scale(&model.scene);
+            let mut field = Field::zero(&bench.layout);
+            self.applied.add_until(model, &bench.layout, unit, &mut field);
+            field
+        });
+        let survey = with_scheme!(plan, T, |scheme| Survey::of(bench, scheme, state, force.as_ref()));
+        let sheet = &model.scene.sheet;
+        // A grasped point moves as its tool does, whatever the scheme would make of it.
+        let own = self.prescribed.grasped().map(|(index, motion)| {
+            let [_, free, _] = self.free_point(index, self.applied.until(model, index));
+            motion.velocity_m_per_s.length_squared() - free.length_squared()
+        });
+        let grasped_j = 0.5 * sheet.point_mass_kg * own.sum::<f64>();
+        // Of a mass that moves by a spacing in a substep, twice.
+        let unit_j = sheet.point_mass_kg * (sheet.spacing_m / plan.substep_s).powi(2);
+        let stiffness = model.scene.virtual_stiffness_n_per_m * sheet.spacing_m * sheet.spacing_m;
+        let energy = Energy {
+            kinetic_j: 0.5 * unit_j * survey.speed_squared + grasped_j,
+            spring_j: unit_j / plan.scheme.spring_scale() * survey.spring_energy,
+            virtual_j: 0.5 * stiffness * survey.displacement_squared,
+        };
+        let kept_j = 0.5 * unit_j * survey.vigour + grasped_j + energy.spring_j + energy.virtual_j;
+        (survey, energy, kept_j)
+    }
+
+    fn tell(&mut self, tool: usize, input: Input) {
+        match input {
+            Input::Push(push) => {
+                self.prescribed.release(tool);
+                self.applied.set(tool, push);
+            }
+            Input::Grasp(index, grasp) => {
+                self.applied.set(tool, None);
+                let PointState { displacement_m, velocity_m_per_s, .. } = self.point(index);
+                let now = Motion { displacement_m, velocity_m_per_s, ..Motion::default() };
+                self.prescribed.grasp(tool, index, grasp, now);
+            }
+        }
+    }
+}
+
+fn springs_of<T: Real>(model: &Model, plan: &Plan) -> Springs<T> {
+    let unit = plan.substep_s * plan.substep_s / model.scene.sheet.point_mass_kg;
+    Springs::new(model, unit * plan.scheme.spring_scale())
+}
+
+/// Adds to u and d of a point.
+fn shift<T: Real>(layout: &Layout, state: &mut State<T>, index: usize, change: &[[f64; 2]; 3]) {
+    for (c, change) in change.iter().enumerate() {
+        let at = c * layout.plane + layout.place(index);
+        state.u[at] += T::of(change[0]);
+        state.d[at] += T::of(change[1]);
     }
 }
 
@@ -254,20 +424,28 @@ impl<T: Real> Tissue for Sheet<T> {
         &self.model
     }
 
+    fn plan(&self) -> &Plan {
+        &self.plan
+    }
+
     fn step_count(&self) -> u64 {
         self.steps
     }
 
+    fn guard_events(&self) -> u64 {
+        self.guard_events
+    }
+
+    fn substeps_done(&self) -> u64 {
+        self.substeps_done
+    }
+
     fn push(&mut self, tool: usize, push: Option<Push>) {
-        self.prescribed.release(tool);
-        self.applied.set(tool, push);
+        self.input(tool, Input::Push(push));
     }
 
     fn grasp(&mut self, tool: usize, index: usize, grasp: Grasp) {
-        self.applied.set(tool, None);
-        let PointState { displacement_m, velocity_m_per_s, .. } = self.point(index);
-        let now = Motion { displacement_m, velocity_m_per_s, ..Motion::default() };
-        self.prescribed.grasp(tool, index, grasp, now);
+        self.input(tool, Input::Grasp(index, grasp));
     }
 
     fn release(&mut self, tool: usize) {
@@ -275,38 +453,24 @@ impl<T: Real> Tissue for Sheet<T> {
     }
 
     fn step(&mut self) -> Result<(), BlowUp> {
-        let substeps = self.model.plan.substeps;
-        for substep in 0..substeps {
-            let fraction = |substep: u32| f64::from(substep) / f64::from(substeps);
-            self.substep(Moment { step: self.steps, fraction: fraction(substep) }, fraction(substep + 1));
+        self.do_step();
+        match self.check() {
+            Ok(()) => Ok(()),
+            Err(cause) => self.mend(self.steps, cause),
         }
-        self.applied.finish(&self.model, self.steps);
-        self.prescribed.finish(&self.model, self.steps);
-        self.steps += 1;
-        if let Some(index) = self.broken_point() {
-            let blow_up = BlowUp { step: self.steps, point: self.model.point_of(index) };
-            (self.steps, self.state) = self.checkpoint.clone();
-            self.springs.forces(&self.state.u, &mut self.spring_n);
-            return Err(blow_up);
-        }
-        if self.steps.is_multiple_of(CHECKPOINT_STEPS) {
-            self.checkpoint.0 = self.steps;
-            self.checkpoint.1.clone_from(&self.state);
-        }
-        Ok(())
     }
 
     fn point(&self, index: usize) -> PointState {
         let scene = &self.model.scene;
-        let displacement_m = self.displacement_m(index);
         let applied_n = match self.steps {
             0 => self.applied.from(&self.model, index, Moment::start_of(0)),
             _ => self.applied.until(&self.model, index),
         };
+        let [mut displacement_m, mut velocity_m_per_s, spring_n] = self.free_point(index, applied_n);
         let motion = self.prescribed.motion(&self.model, index);
-        let velocity_m_per_s =
-            motion.map_or_else(|| self.free_velocity_m_per_s(index, applied_n), |m| m.velocity_m_per_s);
-        let spring_n = DVec3::from_array(std::array::from_fn(|c| self.spring_n[c][index].wide()));
+        if let Some(motion) = motion {
+            (displacement_m, velocity_m_per_s) = (motion.displacement_m, motion.velocity_m_per_s);
+        }
         let virtual_n = -scene.virtual_stiffness_n_per_m * displacement_m;
         let damping_n = -scene.damping_n_s_per_m * velocity_m_per_s;
         let constraint_n = motion.map(|motion| {
@@ -317,38 +481,38 @@ impl<T: Real> Tissue for Sheet<T> {
     }
 
     fn energy(&self) -> Energy {
-        let scene = &self.model.scene;
-        let (mut speed_squared, mut displacement_squared) = (0.0, 0.0);
-        for index in 0..self.model.len() {
-            let point = self.point(index);
-            speed_squared += point.velocity_m_per_s.length_squared();
-            displacement_squared += point.displacement_m.length_squared();
-        }
-        Energy {
-            kinetic_j: 0.5 * scene.sheet.point_mass_kg * speed_squared,
-            spring_j: self.springs.energy_j(&self.state.u),
-            virtual_j: 0.5 * scene.virtual_stiffness_n_per_m * displacement_squared,
-        }
+        self.survey().1
     }
 
     fn largest_displacement_m(&self) -> f64 {
-        let squared = (0..self.model.len()).map(|index| self.displacement_m(index).length_squared());
-        squared.fold(0.0, f64::max).sqrt()
+        let squared = (0..self.model.len()).map(|index| {
+            let at = self.bench.layout.place(index);
+            (0..3).map(|c| self.state.u[c * self.bench.layout.plane + at].wide().powi(2)).sum()
+        });
+        squared.fold(0.0, f64::max).sqrt() * self.model.scene.sheet.spacing_m
     }
 
     fn displacements_m(&self, into: &mut [Vec<f32>; 3]) {
-        for (into, u) in into.iter_mut().zip(&self.state.u) {
+        let Layout { rows, columns, stride, plane } = self.bench.layout;
+        let spacing = T::of(self.model.scene.sheet.spacing_m);
+        for (c, into) in into.iter_mut().enumerate() {
             into.clear();
-            #[allow(clippy::cast_possible_truncation)]
-            into.extend(u.iter().map(|u| u.wide() as f32));
+            for i in 0..rows {
+                let from = c * plane + i * stride;
+                #[allow(clippy::cast_possible_truncation)]
+                into.extend(self.state.u[from..from + columns].iter().map(|u| (*u * spacing).wide() as f32));
+            }
         }
     }
 
     fn state_hash(&self) -> u128 {
         let mut hasher = Xxh3::new();
         for index in 0..self.model.len() {
-            for values in self.state.u.iter().chain(&self.state.d) {
-                values[index].hash_into(&mut hasher);
+            let at = self.bench.layout.place(index);
+            for field in self.state.fields() {
+                for c in 0..3 {
+                    field[c * self.bench.layout.plane + at].hash_into(&mut hasher);
+                }
             }
         }
         hasher.digest128()

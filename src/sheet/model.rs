@@ -2,11 +2,12 @@
 
 use std::sync::Arc;
 
-use super::integrate::{self, Oscillator, Plan};
-use super::stability;
+use super::choice::{self, Choice};
+use super::integrate::{Node, Oscillator, Scheme};
+use super::{lanes, stability};
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result};
-use crate::scene::{Precision, Scene};
+use crate::scene::{Integrator, Lanes, Named, Precision, Scene};
 
 /// The immutable half of a sheet.
 #[derive(Debug)]
@@ -15,8 +16,6 @@ pub struct Model {
     pub scene: Scene,
     /// Points along x (rows) and along y (within a row).
     pub points: [usize; 2],
-    /// Springs, one entry for all of the same direction.
-    pub links: Vec<Link>,
     /// Places of the fixed points, rising.
     pub fixed: Vec<usize>,
     /// ω_b = √((largest spring stiffness + K″)/m): no vibration is faster, under any deformation, rad/s.
@@ -25,63 +24,86 @@ pub struct Model {
     pub plan: Plan,
     /// What `auto` became.
     pub precision: Precision,
+    /// Expected error of displacement and force, relative to the largest of each (`choice`).
+    pub expected_error: f64,
+    /// What `auto` became on this machine.
+    pub lanes: Lanes,
     /// What a user should know, in words.
     pub warnings: Vec<String>,
 }
 
-/// The springs from each point to the point (di, dj) farther, if that is on the sheet.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Link {
-    /// Rows farther: 0 to 2.
-    pub di: usize,
-    /// Columns farther: −1 to 2.
-    pub dj: isize,
-    /// k, N/m.
-    pub stiffness_n_per_m: f64,
-    /// The rest vector, in the rest plane, m.
-    pub rest_m: [f64; 2],
+/// A scheme with its substep.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Plan {
+    /// What `auto` became.
+    pub integrator: Integrator,
+    /// Substeps a step.
+    pub substeps: u32,
+    /// Length of a substep, s.
+    pub substep_s: f64,
+    /// The scheme, fitted to the substep.
+    pub scheme: Scheme,
+    /// How the tools' force enters a substep.
+    pub nodes: Vec<Node>,
+    /// Whether the substep is within the stability bound. It always is if the number was not given.
+    pub stable: bool,
 }
 
-/// Below this tolerance of a scene f32 is not enough.
-const F32_TOLERANCE: f64 = 1e-6;
+impl Plan {
+    fn new(integrator: Integrator, substeps: u32, step_s: f64, sheet: &Oscillator) -> Self {
+        let substep_s = step_s / f64::from(substeps);
+        let (a, g) = sheet.scaled(substep_s);
+        let scheme = Scheme::fit(integrator, a, g);
+        let stable = stability::is_stable(&scheme, sheet.scaled_spring_stiffness(substep_s));
+        let nodes = scheme.nodes();
+        Plan { integrator, substeps, substep_s, scheme, nodes, stable }
+    }
+
+    /// The same scheme with a shorter substep.
+    pub(super) fn divided(&self, scene: &Scene, by: u32) -> Self {
+        Plan::new(self.integrator, self.substeps * by, scene.stepping.rate_hz.recip(), &Oscillator::of(scene))
+    }
+
+    /// What turns newtons into the scheme's unit of force: dt²/(m·h), 1/N.
+    pub(super) fn force_scale(&self, scene: &Scene) -> f64 {
+        self.substep_s * self.substep_s / (scene.sheet.point_mass_kg * scene.sheet.spacing_m)
+    }
+}
+
+impl Oscillator {
+    /// Of a scene.
+    pub fn of(scene: &Scene) -> Self {
+        Oscillator {
+            mass_kg: scene.sheet.point_mass_kg,
+            damping_n_s_per_m: scene.damping_n_s_per_m,
+            virtual_stiffness_n_per_m: scene.virtual_stiffness_n_per_m,
+            spring_stiffness_n_per_m: stability::largest_stiffness_n_per_m(&scene.springs),
+        }
+    }
+}
 
 impl Model {
     /// Compiles a scene, after checking it.
     pub fn compile(scene: &Scene, limits: &Limits) -> Result<Arc<Self>> {
         scene.check(limits)?;
-        let springs = &scene.springs;
-        let h = scene.sheet.spacing_m;
-        let link = |di: usize, dj: isize, stiffness_n_per_m| {
-            #[allow(clippy::cast_precision_loss)]
-            let rest_m = [di as f64 * h, dj as f64 * h];
-            Link { di, dj, stiffness_n_per_m, rest_m }
-        };
-        let (structural, shear) = (springs.stiffness_n_per_m, springs.shear_stiffness_n_per_m);
-        let mut links = vec![link(0, 1, structural), link(1, 0, structural), link(1, 1, shear), link(1, -1, shear)];
-        if springs.flexion {
-            links.extend([link(0, 2, structural), link(2, 0, structural)]);
+        let sheet = Oscillator::of(scene);
+        let step_s = scene.stepping.rate_hz.recip();
+        let choice = choice::choose(&scene.stepping, &sheet, limits.substeps);
+        let Choice { integrator, substeps, precision, expected_error } = choice;
+        if precision == Precision::Compensated && !integrator.is_exponential() {
+            let message = format!("is for exponential schemes; `{}` has f32 and f64", integrator.name());
+            return Err(Refusal::new(Reason::WrongKind, "stepping.precision", message));
         }
-        // A spring of no stiffness costs nothing.
-        links.retain(|link| link.stiffness_n_per_m > 0.0);
-
-        let mass_kg = scene.sheet.point_mass_kg;
-        let stiffness = stability::largest_stiffness_n_per_m(springs) + scene.virtual_stiffness_n_per_m;
-        let omega_bound_per_s = (stiffness / mass_kg).sqrt();
-        let oscillator = Oscillator {
-            mass_kg,
-            damping_n_s_per_m: scene.damping_n_s_per_m,
-            omega_per_s: omega_bound_per_s,
-            step_s: scene.stepping.rate_hz.recip(),
-        };
-        let plan = integrate::plan(scene.stepping.integrator, scene.stepping.substeps, &oscillator);
-        if plan.substeps > limits.substeps {
+        if substeps > limits.substeps {
             let message = format!(
-                "would need {} substeps a step for stability, above the limit of {}: the springs are too stiff for \
-                 points so light at this rate",
-                plan.substeps, limits.substeps
+                "would need {substeps} substeps a step for stability, above the limit of {}: the springs are too stiff \
+                 for points so light at this rate",
+                limits.substeps
             );
             return Err(Refusal::new(Reason::TooLarge, "stepping.substeps", message));
         }
+        let plan = Plan::new(integrator, substeps, step_s, &sheet);
+        let omega_bound_per_s = sheet.omega_bound_per_s();
         let mut warnings = Vec::new();
         if !plan.stable {
             warnings.push(format!(
@@ -91,14 +113,31 @@ impl Model {
                 plan.substep_s * omega_bound_per_s
             ));
         }
-        let precision = match scene.stepping.precision {
-            Precision::Auto if scene.stepping.tolerance < F32_TOLERANCE => Precision::F64,
-            Precision::Auto => Precision::F32,
-            given => given,
+        if expected_error > scene.stepping.tolerance {
+            warnings.push(format!(
+                "stepping.tolerance: an error of {expected_error:.1e} is expected, above the {:.1e} asked for; leave \
+                 integrator, substeps and precision to `auto`, or raise the limit of substeps",
+                scene.stepping.tolerance
+            ));
+        }
+        let Some(lanes) = lanes::available(scene.stepping.lanes) else {
+            let message = format!("this machine's processor has no `{}`", scene.stepping.lanes.name());
+            return Err(Refusal::new(Reason::NotAvailable, "stepping.lanes", message));
         };
         let fixed = scene.sheet.fixed_indices();
         let points = scene.sheet.points;
-        Ok(Arc::new(Model { scene: scene.clone(), points, links, fixed, omega_bound_per_s, plan, precision, warnings }))
+        let scene = scene.clone();
+        Ok(Arc::new(Model {
+            scene,
+            points,
+            fixed,
+            omega_bound_per_s,
+            plan,
+            precision,
+            expected_error,
+            lanes,
+            warnings,
+        }))
     }
 
     /// Number of points.

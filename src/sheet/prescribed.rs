@@ -3,7 +3,6 @@
 use glam::DVec3;
 
 use super::model::Model;
-use super::real::Real;
 use crate::scene::law::{Motion, MoveLaw};
 
 /// How a tool moves the point that it has grasped.
@@ -28,7 +27,7 @@ struct Grasped {
 }
 
 /// All points that do not move freely.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(super) struct Prescribed {
     grasped: Vec<Grasped>,
     /// Points let go, and the velocity that they had, until the coming substep.
@@ -71,35 +70,24 @@ impl Prescribed {
         std::mem::take(&mut self.released)
     }
 
-    /// Moves every prescribed point to where it is at `fraction` of step `step`.
+    /// The grasped points where they are at `fraction` of step `step`: index, displacement and velocity.
     #[allow(clippy::cast_precision_loss)]
-    pub(super) fn hold<T: Real>(
-        &self,
-        model: &Model,
-        step: u64,
-        fraction: f64,
-        u: &mut [Vec<T>; 3],
-        d: &mut [Vec<T>; 3],
-    ) {
-        for c in 0..3 {
-            for &index in &model.fixed {
-                u[c][index] = T::default();
-                d[c][index] = T::default();
-            }
-        }
-        for grasped in &self.grasped {
-            let displacement_m = match &grasped.grasp {
-                Grasp::Held(target_m) if fraction >= 1.0 => *target_m,
-                Grasp::Held(target_m) => grasped.now.displacement_m.lerp(*target_m, fraction),
-                Grasp::Law(law) => law.at((step as f64 + fraction) / model.scene.stepping.rate_hz).displacement_m,
+    pub(super) fn at(&self, model: &Model, step: u64, fraction: f64) -> impl Iterator<Item = (usize, DVec3, DVec3)> {
+        let rate_hz = model.scene.stepping.rate_hz;
+        self.grasped.iter().map(move |grasped| {
+            let (displacement_m, velocity_m_per_s) = match &grasped.grasp {
+                Grasp::Held(target_m) => {
+                    let now_m = grasped.now.displacement_m;
+                    let place_m = if fraction >= 1.0 { *target_m } else { now_m.lerp(*target_m, fraction) };
+                    (place_m, (*target_m - now_m) * rate_hz)
+                }
+                Grasp::Law(law) => {
+                    let motion = law.at((step as f64 + fraction) / rate_hz);
+                    (motion.displacement_m, motion.velocity_m_per_s)
+                }
             };
-            for (c, target) in displacement_m.to_array().into_iter().enumerate() {
-                // What the scheme has just done is undone: the increment is from where the point was before.
-                let before = u[c][grasped.index] - d[c][grasped.index];
-                u[c][grasped.index] = T::of(target);
-                d[c][grasped.index] = u[c][grasped.index] - before;
-            }
-        }
+            (grasped.index, displacement_m, velocity_m_per_s)
+        })
     }
 
     /// Ends a step.
@@ -118,6 +106,11 @@ impl Prescribed {
                 Grasp::Law(law) => law.at((step + 1) as f64 / rate_hz),
             };
         }
+    }
+
+    /// The grasped points and how they moved at the end of the last step.
+    pub(super) fn grasped(&self) -> impl Iterator<Item = (usize, Motion)> {
+        self.grasped.iter().map(|grasped| (grasped.index, grasped.now))
     }
 
     /// How a point is made to move, if it is: at the end of the last step.

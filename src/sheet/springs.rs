@@ -1,125 +1,167 @@
-//! The elastic force: every spring once, row by row.
+//! The elastic force of a spring, without cancellation and nearly without square roots.
 //!
-//! With D0 the rest vector of a spring a–b, Δ = u_b − u_a and q = (2·D0·Δ + Δ·Δ)/L0², its length is L = s·L0,
-//! s = √(1 + q), and 1 − L0/L = q/(s(1 + s)): the extension without the cancellation that L − L0 has. So
+//! Lengths are counted in spacings. With D0 the rest vector of a spring a–b, Δ = u_b − u_a and
+//! Q = 2·D0·Δ + Δ·Δ = L² − L0², q = Q/L0², its length is L = s·L0, s = √(1 + q), and 1 − L0/L = q/(s(1 + s)):
+//! the extension without the cancellation that L − L0 has. So
 //!
 //! force on a = k(1 − L0/L)(x_b − x_a) = k·q/(s(1 + s))·(D0 + Δ),  energy = ½k(L − L0)² = ½k·L0²·(q/(1 + s))².
+//!
+//! For |q| ≤ 1/8 (strains up to 6 %), q/(s(1 + s)) is q times a polynomial that is exact to the last bits; beyond, it
+//! comes from 1/s ([`Kind::far`]). Which of the two is a matter of the one spring alone, so every width of vectors agrees.
 
-use super::model::{Link, Model};
+use super::field::Layout;
+use super::lanes::{Plain, Vector};
+use super::model::Model;
 use super::real::Real;
 
 /// Least 1 + q = (L/L0)². A spring pressed to no length at all has no direction; below a millionth of its rest
 /// length its force fades to 0 in proportion to its length, so that nothing divides by 0.
 const LEAST_LENGTH_SQUARED: f64 = 1e-12;
 
-/// A link with its constants in the format of the state.
+/// Up to which |q| the polynomial holds.
+const NEAR: f64 = 0.125;
+
+/// Springs of the same rest length and stiffness.
 #[derive(Debug, Clone, Copy)]
-struct Spring<T> {
-    di: usize,
-    dj: isize,
+pub(super) struct Kind<T> {
+    /// k times the factor that makes forces what the scheme adds up.
     stiffness: T,
-    rest: [T; 2],
+    /// Of Q, for the stiffness times (1 − L0/L)/Q.
+    series: [T; 14],
+    /// The largest |Q| of the polynomial.
+    near: T,
+    /// 1/L0².
     per_length_squared: T,
 }
 
-impl<T: Real> Spring<T> {
-    fn of(link: &Link) -> Self {
-        let [x, y] = link.rest_m;
-        Spring {
-            di: link.di,
-            dj: link.dj,
-            stiffness: T::of(link.stiffness_n_per_m),
-            rest: [T::of(x), T::of(y)],
-            per_length_squared: T::of((x * x + y * y).recip()),
+impl<T: Real> Kind<T> {
+    /// `stiffness` is k times any factor; `length_squared` is L0², in spacings squared.
+    fn new(stiffness: f64, length_squared: f64) -> Self {
+        let mut power = stiffness;
+        let series = T::SERIES.map(|coefficient| {
+            power /= length_squared;
+            T::of(coefficient * power)
+        });
+        Kind {
+            stiffness: T::of(stiffness),
+            series,
+            near: T::of(NEAR * length_squared),
+            per_length_squared: T::of(length_squared.recip()),
         }
     }
 
-    /// q and s for Δ.
+    /// The bound of |Q| within which [`Kind::near`] holds.
     #[inline(always)]
-    fn stretch(&self, [x, y, z]: [T; 3]) -> (T, T) {
-        let along = self.rest[0] * x + self.rest[1] * y;
-        let q = (along + along + (x * x + y * y + z * z)) * self.per_length_squared;
-        let (square, least) = (T::ONE + q, T::of(LEAST_LENGTH_SQUARED));
-        (q, if square > least { square } else { least }.root())
+    pub(super) fn bound<V: Vector<Real = T>>(&self) -> V {
+        V::splat(self.near)
     }
 
-    /// The force on a.
+    /// Stiffness × (1 − L0/L) for small Q: even and odd powers apart, which halves the wait of each for the last.
     #[inline(always)]
-    fn force(&self, delta: [T; 3]) -> [T; 3] {
-        let (q, s) = self.stretch(delta);
-        let c = self.stiffness * (q / (s * (T::ONE + s)));
-        [c * (self.rest[0] + delta[0]), c * (self.rest[1] + delta[1]), c * delta[2]]
+    pub(super) fn near<V: Vector<Real = T>>(&self, excess: V) -> V {
+        let square = excess.mul(excess);
+        let (mut even, mut odd) = (V::splat(self.series[T::TERMS - 2]), V::splat(self.series[T::TERMS - 1]));
+        for term in (0..T::TERMS / 2 - 1).rev() {
+            even = even.mul_add(square, V::splat(self.series[2 * term]));
+            odd = odd.mul_add(square, V::splat(self.series[2 * term + 1]));
+        }
+        odd.mul_add(square, even.mul(excess))
+    }
+
+    /// Stiffness × (1 − L0/L) for any Q, best away from 0: with r near 1/s, e = 1 − r²(1 + q) is small, and
+    /// 1 − 1/s = (1 − r) − r·e/2 but for e², where 1 − r is exact for r from ½ to 2. A rough r from the bits of the number
+    /// and a few steps of Newton's method are a quarter of the price of a root and a division, which have no vectors as
+    /// wide as they seem.
+    #[inline(always)]
+    pub(super) fn far<V: Vector<Real = T>>(&self, excess: V) -> V {
+        let (one, half) = (V::splat(T::of(1.0)), V::splat(T::of(0.5)));
+        let q = excess.mul(V::splat(self.per_length_squared));
+        let sum = one.add(q);
+        // What the sum lost.
+        let rest = q.sub(sum.sub(one));
+        let square = sum.larger(V::splat(T::of(LEAST_LENGTH_SQUARED)));
+        let mut r = square.rough_inverse_root();
+        let halved = half.mul(square);
+        for _ in 0..T::NEWTON {
+            r = r.mul(V::splat(T::of(1.5)).minus(halved.mul(r), r));
+        }
+        let e = one.minus(square.mul(r), r).minus(r.mul(r), rest);
+        V::splat(self.stiffness).mul(one.sub(r).minus(half.mul(r), e))
+    }
+
+    /// Stiffness × (1 − L0/L), by whichever holds for the lane.
+    #[inline(always)]
+    pub(super) fn weight<V: Vector<Real = T>>(&self, excess: V) -> V {
+        let far = excess.beyond(self.bound());
+        let near = self.near(excess);
+        if V::any(far) { V::select(far, self.far(excess), near) } else { near }
+    }
+
+    /// Energy: stiffness × ½(L − L0)².
+    #[inline(always)]
+    pub(super) fn energy<V: Vector<Real = T>>(&self, excess: V) -> V {
+        let (q, s) = self.stretch(excess);
+        let extension = q.div(V::splat(T::of(1.0)).add(s));
+        V::splat(T::of(0.5 * self.stiffness.wide() / self.per_length_squared.wide())).mul(extension.mul(extension))
+    }
+
+    /// q and s.
+    #[inline(always)]
+    fn stretch<V: Vector<Real = T>>(&self, excess: V) -> (V, V) {
+        let q = excess.mul(V::splat(self.per_length_squared));
+        let square = V::splat(T::of(1.0)).add(q);
+        (q, square.larger(V::splat(T::of(LEAST_LENGTH_SQUARED))).root())
     }
 }
 
-/// All springs of a sheet, and the room to sum them in.
-#[derive(Debug)]
+/// The springs of a sheet, their forces scaled for a scheme.
+#[derive(Debug, Clone, Copy)]
 pub(super) struct Springs<T> {
-    springs: Vec<Spring<T>>,
-    points: [usize; 2],
-    row: [Vec<T>; 3],
+    pub(super) structural: Kind<T>,
+    pub(super) shear: Kind<T>,
+    pub(super) flexion: Option<Kind<T>>,
 }
 
 impl<T: Real> Springs<T> {
-    pub(super) fn new(model: &Model) -> Self {
+    /// Forces are in newtons × `scale` / spacing.
+    pub(super) fn new(model: &Model, scale: f64) -> Self {
+        let springs = &model.scene.springs;
+        let structural = springs.stiffness_n_per_m * scale;
         Springs {
-            springs: model.links.iter().map(Spring::of).collect(),
-            points: model.points,
-            row: std::array::from_fn(|_| vec![T::default(); model.points[1]]),
+            structural: Kind::new(structural, 1.0),
+            shear: Kind::new(springs.shear_stiffness_n_per_m * scale, 2.0),
+            flexion: springs.flexion.then(|| Kind::new(structural, 4.0)),
         }
     }
 
-    /// The spans of row `i` and of the row that `spring` leads to, which its springs join.
-    fn spans(&self, spring: &Spring<T>, i: usize) -> Option<(usize, usize, usize)> {
-        let [nx, ny] = self.points;
-        let reach = spring.dj.unsigned_abs();
-        if i + spring.di >= nx || reach >= ny {
-            return None;
-        }
-        // Of row i, columns from `a` on; of the other, from `b` on.
-        let (a, b) = if spring.dj < 0 { (reach, 0) } else { (0, reach) };
-        Some((i * ny + a, (i + spring.di) * ny + b, ny - reach))
-    }
-
-    /// Sets `f` to the sum of the forces of all springs at displacement `u`.
-    pub(super) fn forces(&mut self, u: &[Vec<T>; 3], f: &mut [Vec<T>; 3]) {
-        for component in f.iter_mut() {
-            component.fill(T::default());
-        }
-        let mut row = std::mem::take(&mut self.row);
-        for i in 0..self.points[0] {
-            for spring in &self.springs {
-                let Some((a, b, len)) = self.spans(spring, i) else { continue };
-                // Out of the arrays first, and back after: the two spans may share points, which would
-                // keep the compiler from using vectors.
-                let [tx, ty, tz] = row.each_mut().map(|t| &mut t[..len]);
-                let [ax, ay, az] = [&u[0][a..a + len], &u[1][a..a + len], &u[2][a..a + len]];
-                let [bx, by, bz] = [&u[0][b..b + len], &u[1][b..b + len], &u[2][b..b + len]];
-                for j in 0..len {
-                    [tx[j], ty[j], tz[j]] = spring.force([bx[j] - ax[j], by[j] - ay[j], bz[j] - az[j]]);
+    /// The force of all springs on the point [i, j], gathered: for the few points that somebody asks about.
+    pub(super) fn gather(&self, layout: &Layout, u: &[T], [i, j]: [usize; 2]) -> [T; 3] {
+        let mut sum = [T::default(); 3];
+        let at = |i: usize, j: usize, c: usize| u[c * layout.plane + i * layout.stride + j];
+        for (kind, reach) in
+            [(Some(&self.structural), STRUCTURAL), (Some(&self.shear), SHEAR), (self.flexion.as_ref(), FLEXION)]
+        {
+            let Some(kind) = kind else { continue };
+            for [di, dj] in reach {
+                let Some((i1, j1)) = i.checked_add_signed(di).zip(j.checked_add_signed(dj)) else { continue };
+                if i1 >= layout.rows || j1 >= layout.columns {
+                    continue;
                 }
-                for (f, t) in f.iter_mut().zip([tx, ty, tz]) {
-                    f[a..a + len].iter_mut().zip(t.iter()).for_each(|(f, t)| *f += *t);
-                    f[b..b + len].iter_mut().zip(t.iter()).for_each(|(f, t)| *f -= *t);
-                }
-            }
-        }
-        self.row = row;
-    }
-
-    /// The energy of all springs at displacement `u`, J.
-    pub(super) fn energy_j(&self, u: &[Vec<T>; 3]) -> f64 {
-        let mut sum = 0.0;
-        for i in 0..self.points[0] {
-            for spring in &self.springs {
-                let Some((a, b, len)) = self.spans(spring, i) else { continue };
-                for j in 0..len {
-                    let (q, s) = spring.stretch(std::array::from_fn(|c| u[c][b + j] - u[c][a + j]));
-                    let extension = (q / (T::ONE + s)).wide();
-                    sum += 0.5 * spring.stiffness.wide() / spring.per_length_squared.wide() * extension * extension;
+                #[allow(clippy::cast_precision_loss)]
+                let rest = [T::of(di as f64), T::of(dj as f64), T::default()];
+                let delta: [T; 3] = std::array::from_fn(|c| at(i1, j1, c) - at(i, j, c));
+                let along = rest[0] * delta[0] + rest[1] * delta[1];
+                let squares = delta.iter().fold(along + along, |sum, d| d.fused(*d, sum));
+                let weight = kind.weight(Plain::<T, 1>::splat(squares)).value();
+                for c in 0..3 {
+                    sum[c] += weight.fused(delta[c], weight * rest[c]);
                 }
             }
         }
         sum
     }
 }
+
+const STRUCTURAL: [[isize; 2]; 4] = [[-1, 0], [0, -1], [0, 1], [1, 0]];
+const SHEAR: [[isize; 2]; 4] = [[-1, -1], [-1, 1], [1, -1], [1, 1]];
+const FLEXION: [[isize; 2]; 4] = [[-2, 0], [0, -2], [0, 2], [2, 0]];

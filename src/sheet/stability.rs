@@ -1,6 +1,7 @@
 //! How fast the sheet can vibrate, and how many substeps that asks for.
 
-use crate::scene::Springs;
+use super::integrate::{Oscillator, Scheme};
+use crate::scene::{Integrator, Springs};
 
 /// What a substep of central differences may turn the fastest vibration by, rad: dt·ω_b ≤ θ. The scheme is
 /// stable below 2; its error falls with θ². At 0.25 the force of the stiffest scenes is within 5e-3 (ARCHITECTURE.md,
@@ -50,8 +51,50 @@ pub fn largest_stiffness_n_per_m(springs: &Springs) -> f64 {
     candidates.into_iter().filter(inside).map(|(x, y)| eigenvalue(x, y)).fold(0.0, f64::max)
 }
 
+/// Vibrations between the slowest and the fastest at which stability is looked at: it may fail in between.
+const VIBRATIONS: u32 = 48;
+
+/// By which a vibration may grow in a substep and still count as stable: what rounding leaves of 1.
+const NO_GROWTH: f64 = 1.0 + 1e-7;
+
+/// Whether no vibration grows, of springs up to `stiffness` = (ω·dt)².
+pub fn is_stable(scheme: &Scheme, stiffness: f64) -> bool {
+    (0..=VIBRATIONS).all(|k| {
+        // Dense towards the stiff end, where schemes fail first.
+        let part = f64::from(k) / f64::from(VIBRATIONS);
+        scheme.growth(stiffness * part * part) <= NO_GROWTH
+    })
+}
+
+/// Fewest substeps of `step_s` with which a scheme is stable, and as accurate as it promises. Saturates for absurd scenes.
+pub fn substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) -> u32 {
+    match integrator {
+        Integrator::Central | Integrator::Lagged => {
+            let decay_s = 2.0 * sheet.mass_kg / sheet.damping_n_s_per_m;
+            let omega = sheet.omega_bound_per_s();
+            let turn = fewest(step_s, omega, THETA / endurance(omega, decay_s));
+            // `lagged`: half the stable damping, so that light points do not ring with the substep.
+            let lag = fewest(step_s, sheet.damping_n_s_per_m / sheet.mass_kg, 1.0);
+            if integrator == Integrator::Lagged { turn.max(lag) } else { turn }
+        }
+        _ => {
+            let mut substeps = fewest(step_s, sheet.omega_bound_per_s(), 2.0);
+            let stable = |substeps: u32| {
+                let substep_s = step_s / f64::from(substeps);
+                let (a, g) = sheet.scaled(substep_s);
+                is_stable(&Scheme::fit(integrator, a, g), sheet.scaled_spring_stiffness(substep_s))
+            };
+            // The limit of all is above dt·ω = 0.3 even without damping; rounding may tell otherwise for ever.
+            while !stable(substeps) && f64::from(substeps) < step_s * sheet.omega_bound_per_s() / 0.1 {
+                substeps = substeps.saturating_add(substeps / 8 + 1);
+            }
+            substeps
+        }
+    }
+}
+
 /// Fewest substeps with dt·`omega_per_s` ≤ `theta`, dt = `step_s` / substeps. Saturates for absurd scenes.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-pub fn substeps(step_s: f64, omega_per_s: f64, theta: f64) -> u32 {
+fn fewest(step_s: f64, omega_per_s: f64, theta: f64) -> u32 {
     (step_s * omega_per_s / theta).ceil().clamp(1.0, f64::from(u32::MAX)) as u32
 }

@@ -26,7 +26,7 @@ pub fn code(reason: Reason) -> Code {
         Reason::UnknownScene | Reason::UnknownSession | Reason::SessionDeleted | Reason::UnknownViewer => {
             Code::NotFound
         }
-        Reason::SessionHeld | Reason::StaleSequence => Code::FailedPrecondition,
+        Reason::SessionHeld | Reason::StaleSequence | Reason::NotAvailable => Code::FailedPrecondition,
         Reason::ToolHeld => Code::AlreadyExists,
         Reason::NotHolder => Code::PermissionDenied,
         Reason::StepPassed => Code::OutOfRange,

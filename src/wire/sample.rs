@@ -162,6 +162,8 @@ pub fn session(live: &Arc<Live>) -> pb::Session {
         lapsed_leases: intake.lapsed(),
         warnings: model.warnings.clone(),
         idle_timeout_s: live.idle_timeout_s,
+        guard_events: status.guard_events,
+        expected_error: model.expected_error,
     }
 }
 

@@ -2,7 +2,7 @@
 
 use super::{from_point, pb, point, required};
 use crate::refusal::{Reason, Refusal, Result};
-use crate::scene::{Fixed, Integrator, Named, Precision, SLEEP_TOLERANCE, Scene, Sheet, Springs, Stepping};
+use crate::scene::{Fixed, Integrator, Lanes, Named, Precision, SLEEP_TOLERANCE, Scene, Sheet, Springs, Stepping};
 
 /// A scene out of a message.
 pub fn from_scene(message: &pb::Scene) -> Result<Scene> {
@@ -58,6 +58,8 @@ fn from_stepping(message: &pb::Stepping) -> Result<Stepping> {
         integrator: Integrator::named("stepping.integrator", &or_auto(&message.integrator))?,
         substeps: message.substeps,
         precision: Precision::named("stepping.precision", &or_auto(&message.precision))?,
+        // A matter of the server's machine.
+        lanes: Lanes::Auto,
     })
 }
 

@@ -3,15 +3,71 @@
 //! m(u₊ − 2u + u₋)/dt² = F(u) − C(u₊ − u₋)/2dt, with d₊ = u₊ − u, d = u − u₋ and g = C·dt/m:
 //! (1 + g/2)·d₊ = (1 − g/2)·d + (dt²/m)·F(u).
 
-use super::super::stability::{self, THETA};
-use super::{Oscillator, Scheme};
+use super::super::lanes::Vector;
+use super::super::real::Real;
+use super::super::sweep::{self, MAX_KEPT};
+use super::matrix::Matrix;
 
-pub(super) const SCHEME: Scheme = Scheme {
-    coefficients: |g, dt2_per_m| ((1.0 - g / 2.0) / (1.0 + g / 2.0), dt2_per_m / (1.0 + g / 2.0)),
-    substeps: |sheet: &Oscillator| {
-        // Without damping the decay never ends, and the factor is at its largest.
-        let decay_s = 2.0 * sheet.mass_kg / sheet.damping_n_s_per_m;
-        stability::substeps(sheet.step_s, sheet.omega_per_s, THETA / stability::endurance(sheet.omega_per_s, decay_s))
-    },
-    is_stable: |w, _| w < 4.0,
-};
+/// The two-step form d ← p·d + q·(N − a·u + F), u ← u + d, where d is the increment of the last substep.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TwoStep {
+    /// p.
+    pub p: f64,
+    /// q.
+    pub q: f64,
+    /// K″·dt²/m.
+    pub a: f64,
+}
+
+/// Central differences.
+pub(super) fn fit(a: f64, g: f64) -> TwoStep {
+    TwoStep { p: (1.0 - g / 2.0) / (1.0 + g / 2.0), q: 1.0 / (1.0 + g / 2.0), a }
+}
+
+impl TwoStep {
+    pub(super) fn propagator(&self, z: f64) -> Matrix {
+        let pull = -self.q * (z + self.a);
+        Matrix::of(2, |i, j| [[1.0 + pull, self.p], [pull, self.p]][i][j])
+    }
+}
+
+/// The same in the format of the state; q is in the springs' and the tools' scale.
+#[derive(Debug, Clone, Copy)]
+pub(in super::super) struct Advance<T> {
+    p: T,
+    pull: T,
+}
+
+impl<T: Real> Advance<T> {
+    pub(in super::super) fn new(two: &TwoStep) -> Self {
+        Advance { p: T::of(two.p), pull: T::of(-two.q * two.a) }
+    }
+}
+
+impl<T: Real> sweep::Scheme<T> for Advance<T> {
+    const KEPT: usize = 0;
+    const WRITTEN: usize = 0;
+
+    #[inline(always)]
+    fn advance<V: Vector<Real = T>>(&self, x: V, d: V, n: V, _: &mut [V; MAX_KEPT], force: Option<[V; 2]>) -> (V, V) {
+        let n = if let Some(force) = force { n.add(force[0]) } else { n };
+        let d = V::splat(self.p).mul_add(d, V::splat(self.pull).mul_add(x, n));
+        (x.add(d), d)
+    }
+
+    #[inline(always)]
+    fn observe<V: Vector<Real = T>>(&self, x: V, d: V, n: V, kept: &[V; MAX_KEPT], force: Option<V>) -> (V, V) {
+        // The mean of the increments of the substep just done and of the one that would follow: second order, and at
+        // the time of the displacement.
+        let (_, next) = self.advance(x, d, n, &mut kept.clone(), force.map(|force| [force; 2]));
+        (x, V::splat(T::of(0.5)).mul(d.add(next)))
+    }
+
+    #[inline(always)]
+    fn vigour<V: Vector<Real = T>>(&self, x: V, d: V, n: V, kept: &[V; MAX_KEPT], force: Option<V>) -> V {
+        // Without damping and tools, ½·d·d₊ + the elastic energy is what the scheme keeps to the last bit, however large
+        // the substep; with the square of the velocity instead, the sum swings by (dt·ω)²/8.
+        let (_, next) = self.advance(x, d, n, &mut kept.clone(), force.map(|force| [force; 2]));
+        d.mul(next)
+    }
+}

@@ -1,12 +1,19 @@
-//! The schemes that advance the sheet: one file each, and one line each in [`plan`].
+//! The schemes that advance the sheet: one file each, and one line each in [`Scheme::fit`].
 //!
-//! Both are of the two-step form d ← p·d + q·F(u), u ← u + d, where d is the increment of the last substep and F
-//! the force without damping. With the increment as the state, small movements keep their digits.
+//! Everywhere below lengths are in spacings h, time in substeps dt: u is a displacement over h, d what a scheme adds to
+//! it in a substep or nearly so, forces are times dt²/(m·h). The numbers of the equation of motion are then
+//! a = K″·dt²/m and g = C·dt/m: u̇̇ = N − a·u − g·u̇ + F, with N of the springs and F of the tools. Small numbers
+//! stay small, and keep their digits in f32.
 
-mod central;
-mod lagged;
+pub(super) mod central;
+pub(super) mod exponential;
+pub(super) mod lagged;
+mod matrix;
+pub(super) mod rk4;
 
 use crate::scene::Integrator;
+use central::TwoStep;
+use exponential::Multistep;
 
 /// What a scheme needs to know of a sheet.
 #[derive(Debug, Clone, Copy)]
@@ -15,49 +22,168 @@ pub struct Oscillator {
     pub mass_kg: f64,
     /// C, N·s/m.
     pub damping_n_s_per_m: f64,
-    /// ω_b: the fastest vibration under any deformation, rad/s.
-    pub omega_per_s: f64,
-    /// Length of a step, s.
-    pub step_s: f64,
+    /// K″, N/m.
+    pub virtual_stiffness_n_per_m: f64,
+    /// Of the springs' stiffness under any deformation the largest eigenvalue, N/m.
+    pub spring_stiffness_n_per_m: f64,
 }
 
-/// A scheme, fitted to a sheet.
+impl Oscillator {
+    /// a and g for a substep.
+    pub fn scaled(&self, substep_s: f64) -> (f64, f64) {
+        let a = self.virtual_stiffness_n_per_m * substep_s * substep_s / self.mass_kg;
+        (a, self.damping_n_s_per_m * substep_s / self.mass_kg)
+    }
+
+    /// The springs' largest stiffness in a substep's terms, (ω·dt)².
+    pub fn scaled_spring_stiffness(&self, substep_s: f64) -> f64 {
+        self.spring_stiffness_n_per_m * substep_s * substep_s / self.mass_kg
+    }
+
+    /// ω_b: no vibration is faster, under any deformation, rad/s.
+    pub fn omega_bound_per_s(&self) -> f64 {
+        ((self.spring_stiffness_n_per_m + self.virtual_stiffness_n_per_m) / self.mass_kg).sqrt()
+    }
+}
+
+/// A scheme, fitted to a sheet and a substep.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Scheme {
+    /// `central` and `lagged`.
+    TwoStep(TwoStep),
+    /// The exponential multistep schemes.
+    Multistep(Multistep),
+    /// Runge and Kutta's of fourth order.
+    Rk4 {
+        /// K″·dt²/m.
+        a: f64,
+        /// C·dt/m.
+        g: f64,
+    },
+}
+
+impl Scheme {
+    /// Fits a scheme to a = K″·dt²/m and g = C·dt/m.
+    pub fn fit(integrator: Integrator, a: f64, g: f64) -> Self {
+        match integrator {
+            Integrator::Auto | Integrator::Central => Scheme::TwoStep(central::fit(a, g)),
+            Integrator::Lagged => Scheme::TwoStep(lagged::fit(a, g)),
+            Integrator::Rk4 => Scheme::Rk4 { a, g },
+            Integrator::Exponential2 => Scheme::Multistep(exponential::fit(2, a, g)),
+            Integrator::Exponential3 => Scheme::Multistep(exponential::fit(3, a, g)),
+            Integrator::Exponential4 => Scheme::Multistep(exponential::fit(4, a, g)),
+        }
+    }
+
+    /// How the tools' force enters a substep: at which moments of it (0 to 1) a law is asked, and with which weights it
+    /// adds to each of the scheme's force fields.
+    pub fn nodes(&self) -> Vec<Node> {
+        match self {
+            // The scheme sees the beginning only, and takes the mean of both sides where the force jumps.
+            Scheme::TwoStep(two) => vec![Node { fraction: 0.0, weights: [two.q, 0.0, 0.0] }],
+            Scheme::Multistep(multistep) => multistep.nodes(),
+            Scheme::Rk4 { .. } => {
+                let node = |k: usize| {
+                    #[allow(clippy::cast_precision_loss)]
+                    let fraction = k as f64 / 2.0;
+                    Node { fraction, weights: std::array::from_fn(|field| f64::from(u8::from(field == k))) }
+                };
+                (0..3).map(node).collect()
+            }
+        }
+    }
+
+    /// Whether the force of a jump has to be the mean of both sides.
+    pub fn takes_means(&self) -> bool {
+        matches!(self, Scheme::TwoStep(_))
+    }
+
+    /// By which the forces of springs are scaled beyond dt²/(m·h).
+    pub fn spring_scale(&self) -> f64 {
+        match self {
+            Scheme::TwoStep(two) => two.q,
+            _ => 1.0,
+        }
+    }
+
+    /// Fields that the scheme keeps beside u and d.
+    pub fn kept(&self, compensated: bool) -> usize {
+        match self {
+            Scheme::TwoStep(_) => 0,
+            Scheme::Multistep(multistep) => multistep.order + usize::from(compensated),
+            Scheme::Rk4 { .. } => rk4::KEPT,
+        }
+    }
+
+    /// Evaluations of the springs' force in a substep.
+    pub fn evaluations(&self) -> u32 {
+        if matches!(self, Scheme::Rk4 { .. }) { 4 } else { 1 }
+    }
+
+    /// The matrix that advances u, d and what is kept of a single vibration whose springs pull with −z·u: its eigenvalues
+    /// tell all about stability and accuracy.
+    pub fn propagator(&self, z: f64) -> matrix::Matrix {
+        match self {
+            Scheme::TwoStep(two) => two.propagator(z),
+            Scheme::Multistep(multistep) => multistep.propagator(z),
+            Scheme::Rk4 { a, g } => rk4::propagator(*a + z, *g),
+        }
+    }
+
+    /// What a constant force of 1 adds to the state in a substep, in the same terms.
+    fn forced(&self, z: f64) -> Vec<f64> {
+        match self {
+            Scheme::TwoStep(two) => vec![two.q, two.q],
+            Scheme::Multistep(multistep) => multistep.forced(),
+            Scheme::Rk4 { a, g } => rk4::forced(*a + z, *g),
+        }
+    }
+
+    /// A force of 1 that is switched on, and the vibration z that it excites: the largest errors of displacement and of the
+    /// force (of springs, virtual springs and damping) within `substeps`.
+    pub fn error_of_a_switched_force(&self, z: f64, a: f64, g: f64, substeps: u32) -> [f64; 2] {
+        let (step, forced) = (self.propagator(z), self.forced(z));
+        // y′ = A·y + b, with the force as a third that does not change.
+        let exact = matrix::Matrix::of(3, |i, j| [[0.0, 1.0, 0.0], [-z - a, -g, 1.0], [0.0; 3]][i][j]).exponential();
+        let mut state = vec![0.0; forced.len()];
+        let mut truth = vec![0.0, 0.0, 1.0];
+        let mut errors = [0.0_f64; 2];
+        for n in 0..substeps {
+            // A two-step scheme takes the mean of before and after.
+            let part = if n == 0 && self.takes_means() { 0.5 } else { 1.0 };
+            state = step.applied_to(&state);
+            state.iter_mut().zip(&forced).for_each(|(value, force)| *value += part * force);
+            truth = exact.applied_to(&truth);
+            let [u, w] = match self {
+                Scheme::TwoStep(two) => {
+                    let next = two.p * state[1] + two.q * (1.0 - (z + two.a) * state[0]);
+                    [state[0], 0.5 * (state[1] + next)]
+                }
+                Scheme::Multistep(multistep) => {
+                    let mut history = state[1..].to_vec();
+                    history[0] = -z * state[0];
+                    let surprise = multistep.surprise(&history);
+                    [state[0] + multistep.correction[0] * surprise, state[1] + multistep.correction[1] * surprise]
+                }
+                Scheme::Rk4 { .. } => [state[0], state[1]],
+            };
+            let (du, dw) = (u - truth[0], w - truth[1]);
+            errors = [errors[0].max(du.abs()), errors[1].max(((z + a) * du + g * dw).abs())];
+        }
+        errors
+    }
+
+    /// The magnitude by which a vibration z grows at most in a substep.
+    pub fn growth(&self, z: f64) -> f64 {
+        self.propagator(z).spectral_radius()
+    }
+}
+
+/// A moment of a substep at which a tool's law counts.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Plan {
-    /// What `auto` became.
-    pub integrator: Integrator,
-    /// Substeps a step.
-    pub substeps: u32,
-    /// Length of a substep, s.
-    pub substep_s: f64,
-    /// p of the two-step form.
-    pub p: f64,
-    /// q of the two-step form, s²/kg.
-    pub q: f64,
-    /// Whether the substep is within the stability bound. It always is if the number was not given.
-    pub stable: bool,
-}
-
-/// A scheme as this module sees it.
-struct Scheme {
-    /// p and q for g = C·dt/m and dt²/m.
-    coefficients: fn(f64, f64) -> (f64, f64),
-    /// Fewest substeps that are stable and as accurate as the scheme promises.
-    substeps: fn(&Oscillator) -> u32,
-    /// Whether (dt·ω)² = W and g are stable.
-    is_stable: fn(f64, f64) -> bool,
-}
-
-/// Fits `integrator` to a sheet; chooses the substeps if they are not given.
-pub fn plan(integrator: Integrator, substeps: Option<u32>, sheet: &Oscillator) -> Plan {
-    let (integrator, scheme) = match integrator {
-        Integrator::Auto | Integrator::Central => (Integrator::Central, central::SCHEME),
-        Integrator::Lagged => (Integrator::Lagged, lagged::SCHEME),
-    };
-    let substeps = substeps.unwrap_or_else(|| (scheme.substeps)(sheet));
-    let substep_s = sheet.step_s / f64::from(substeps);
-    let g = sheet.damping_n_s_per_m * substep_s / sheet.mass_kg;
-    let (p, q) = (scheme.coefficients)(g, substep_s * substep_s / sheet.mass_kg);
-    let stable = (scheme.is_stable)((substep_s * sheet.omega_per_s).powi(2), g);
-    Plan { integrator, substeps, substep_s, p, q, stable }
+pub struct Node {
+    /// From 0, its beginning, to 1, its end.
+    pub fraction: f64,
+    /// By which the force (times dt²/(m·h)) adds to each field of the scheme.
+    pub weights: [f64; 3],
 }

@@ -1,0 +1,129 @@
+//! `palpate check`: what a scene asks of the program, and what the program makes of it.
+
+use std::f64::consts::TAU;
+use std::fmt;
+use std::sync::Arc;
+
+use glam::DVec3;
+
+use super::Session;
+use crate::scene::Named;
+use crate::scene::law::Poke;
+use crate::sheet::choice::{self, Choice};
+use crate::sheet::integrate::Oscillator;
+use crate::sheet::{Model, Push};
+
+/// What is told of a scene.
+#[derive(Debug)]
+pub struct Report {
+    model: Arc<Model>,
+    /// What the tolerance could have been kept with.
+    candidates: Vec<Choice>,
+    /// Least and median of a step, s; nothing if it could not be done.
+    step_s: Option<[f64; 2]>,
+}
+
+/// Windows in which the step is timed, and how long each is, s.
+const WINDOWS: usize = 50;
+const WINDOW_S: f64 = 0.004;
+
+/// Looks at a scene, and times its step under a poke. `clock_s` tells the time.
+pub fn check(model: &Arc<Model>, most_substeps: u32, clock_s: &dyn Fn() -> f64) -> Report {
+    let stepping = &model.scene.stepping;
+    let candidates = choice::candidates(stepping, &Oscillator::of(&model.scene), most_substeps);
+    Report { model: model.clone(), candidates, step_s: time(model, clock_s) }
+}
+
+/// A poke that moves the middle by about a tenth of a spacing: numbers of the usual size.
+fn time(model: &Arc<Model>, clock_s: &dyn Fn() -> f64) -> Option<[f64; 2]> {
+    let mut session = Session::new(model);
+    let scene = &model.scene;
+    let stiffness = scene.virtual_stiffness_n_per_m + 0.1 * scene.springs.stiffness_n_per_m;
+    session.tissue.push(
+        0,
+        Some(Push::Held(Poke {
+            centre_m: scene.sheet.extent_m() / 2.0,
+            force_n: DVec3::new(0.03, 0.0, -0.1) * stiffness * scene.sheet.spacing_m,
+            falloff_per_m: 4.0 / scene.sheet.spacing_m,
+            falloff_offset: 0.0,
+        })),
+    );
+    let mut window = |steps: u64| {
+        let begun_s = clock_s();
+        for _ in 0..steps {
+            session.advance(&mut Vec::new(), |_| {});
+        }
+        let each_s = (clock_s() - begun_s) / steps as f64;
+        session.hold_reason().is_none().then_some(each_s)
+    };
+    let first_s = window(1)?.max(window(2)?);
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    let steps = (WINDOW_S / first_s).clamp(1.0, 1e6) as u64;
+    let mut times = (0..WINDOWS).map(|_| window(steps)).collect::<Option<Vec<f64>>>()?;
+    times.sort_by(f64::total_cmp);
+    Some([times[0], times[WINDOWS / 2]])
+}
+
+impl fmt::Display for Report {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let model = &self.model;
+        let (scene, plan) = (&model.scene, &model.plan);
+        let sheet = Oscillator::of(scene);
+        let [nx, ny] = scene.sheet.points;
+        writeln!(f, "scene         {}: {nx} × {ny} points, {} steps a second", scene.name, scene.stepping.rate_hz)?;
+        let slowest = (sheet.virtual_stiffness_n_per_m / sheet.mass_kg).sqrt();
+        writeln!(
+            f,
+            "frequencies   {:.3} Hz (a point on its virtual spring alone) to at most {:.3} Hz (ω_b = {:.4} rad/s, under any \
+             deformation)",
+            slowest / TAU,
+            model.omega_bound_per_s / TAU,
+            model.omega_bound_per_s
+        )?;
+        let decay_s = 2.0 * sheet.mass_kg / sheet.damping_n_s_per_m;
+        if decay_s.is_finite() {
+            writeln!(f, "damping       vibrations decay by e in {decay_s:.4} s")?;
+        } else {
+            writeln!(f, "damping       none: vibrations last, and errors of {} s are expected", choice::LASTING_S)?;
+        }
+        let times = if plan.substeps == 1 { "once" } else { "times" };
+        let count = if plan.substeps == 1 { String::new() } else { format!("{} ", plan.substeps) };
+        writeln!(
+            f,
+            "chosen        {}, {count}{times} a step (dt·ω_b = {:.3}), {}, {} lanes",
+            plan.integrator.name(),
+            plan.substep_s * model.omega_bound_per_s,
+            model.precision.name(),
+            model.lanes.name()
+        )?;
+        writeln!(f, "stability     {}", if plan.stable { "within the bound" } else { "BEYOND the bound" })?;
+        writeln!(
+            f,
+            "error         {:.1e} expected, {:.1e} asked for, of displacement and force relative to their largest",
+            model.expected_error, scene.stepping.tolerance
+        )?;
+        if let Some([least_s, median_s]) = self.step_s {
+            let points = (model.len() * plan.substeps as usize) as f64;
+            writeln!(
+                f,
+                "time          {:.2} µs a step at best, {:.2} µs in the median ({:.2} ns a point and substep)",
+                least_s * 1e6,
+                median_s * 1e6,
+                least_s * 1e9 / points
+            )?;
+            let sessions = 1.0 / (median_s * scene.stepping.rate_hz);
+            writeln!(f, "sessions      {sessions:.1} on a core, without clients and frames")?;
+        } else {
+            writeln!(f, "time          not measured: the guard stopped the sheet")?;
+        }
+        writeln!(f, "\nWhat could have been chosen:\n  integrator      substeps  precision    expected error")?;
+        for Choice { integrator, substeps, precision, expected_error } in &self.candidates {
+            let (integrator, precision) = (integrator.name(), precision.name());
+            writeln!(f, "  {integrator:<15} {substeps:>8}  {precision:<11}  {expected_error:.1e}")?;
+        }
+        for warning in &model.warnings {
+            writeln!(f, "\nwarning: {warning}")?;
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,124 @@
+//! Memory of a sheet: numbers for each point, laid out so that rows can be swept by vectors of any width.
+
+use std::ops::{Deref, DerefMut};
+
+use super::real::Real;
+
+/// Lanes of the widest vector: rows are padded to a multiple of it.
+pub(super) const BLOCK: usize = 16;
+
+/// Bytes that every row and plane is aligned to: a cache line.
+const LINE: usize = 64;
+
+/// By how many bytes a plane is longer than a multiple of a page. A processor takes a load for one that waits for an
+/// earlier store if the two agree in the last 12 bits of their addresses; with planes apart by whole pages, each store
+/// to x would seem to be what the next load of y waits for. (Measured at 31²: up to a quarter of a step.)
+const SKEW: usize = 704;
+
+/// Where the numbers of a point are: component c of point [i, j] at c·plane + i·stride + j.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Layout {
+    /// Along x.
+    pub(super) rows: usize,
+    /// Along y.
+    pub(super) columns: usize,
+    /// From a row to the next.
+    pub(super) stride: usize,
+    /// From a component to the next.
+    pub(super) plane: usize,
+}
+
+impl Layout {
+    pub(super) fn new<T: Real>([rows, columns]: [usize; 2]) -> Self {
+        let mut stride = columns.next_multiple_of(BLOCK);
+        // Rows apart by half a page or more would collide like planes.
+        if (stride * size_of::<T>()).is_multiple_of(2048) {
+            stride += BLOCK;
+        }
+        // A vector at the last point may reach two points and a row beyond.
+        let page = 4096 / size_of::<T>();
+        let plane = ((rows.max(4) + 1) * stride + BLOCK).next_multiple_of(page) + SKEW / size_of::<T>();
+        Layout { rows, columns, stride, plane }
+    }
+
+    /// The place of the x component of the point that is number `index` of all, by rows.
+    pub(super) fn place(&self, index: usize) -> usize {
+        index / self.columns * self.stride + index % self.columns
+    }
+}
+
+/// What a step advances. Lengths are in spacings (`integrate`).
+#[derive(Debug)]
+pub(super) struct State<T> {
+    /// Displacement from rest: of a multistep scheme as predicted for now.
+    pub(super) u: Field<T>,
+    /// The increment of the last substep, or the velocity times the substep.
+    pub(super) d: Field<T>,
+    /// What the scheme keeps beside.
+    pub(super) kept: Vec<Field<T>>,
+}
+
+impl<T: Real> State<T> {
+    pub(super) fn at_rest(layout: &Layout, kept: usize) -> Self {
+        let zero = || Field::zero(layout);
+        State { u: zero(), d: zero(), kept: (0..kept).map(|_| zero()).collect() }
+    }
+
+    /// All of it.
+    pub(super) fn fields(&self) -> impl Iterator<Item = &Field<T>> {
+        [&self.u, &self.d].into_iter().chain(&self.kept)
+    }
+
+    fn fields_mut(&mut self) -> impl Iterator<Item = &mut Field<T>> {
+        [&mut self.u, &mut self.d].into_iter().chain(&mut self.kept)
+    }
+
+    /// Takes the values of another of the same layout and scheme.
+    pub(super) fn copy_from(&mut self, other: &Self) {
+        self.fields_mut().zip(other.fields()).for_each(|(to, from)| to.copy_from_slice(from));
+    }
+}
+
+/// Three numbers a point, x, y and z apart. What pads rows and planes is 0.
+#[derive(Debug)]
+pub(super) struct Field<T> {
+    storage: Vec<T>,
+    from: usize,
+    length: usize,
+}
+
+impl<T: Real> Field<T> {
+    pub(super) fn zero(layout: &Layout) -> Self {
+        let length = 3 * layout.plane;
+        let storage = vec![T::default(); length + LINE / size_of::<T>()];
+        // Where no alignment is promised, none is needed: it is for speed alone.
+        let from = storage.as_ptr().align_offset(LINE).min(LINE / size_of::<T>());
+        Field { storage, from, length }
+    }
+}
+
+impl<T: Real> Clone for Field<T> {
+    fn clone(&self) -> Self {
+        let mut storage = vec![T::default(); self.storage.len()];
+        let from = storage.as_ptr().align_offset(LINE).min(LINE / size_of::<T>());
+        storage[from..from + self.length].copy_from_slice(self);
+        Field { storage, from, length: self.length }
+    }
+
+    fn clone_from(&mut self, other: &Self) {
+        self.copy_from_slice(other);
+    }
+}
+
+impl<T> Deref for Field<T> {
+    type Target = [T];
+    fn deref(&self) -> &[T] {
+        &self.storage[self.from..self.from + self.length]
+    }
+}
+
+impl<T> DerefMut for Field<T> {
+    fn deref_mut(&mut self) -> &mut [T] {
+        &mut self.storage[self.from..self.from + self.length]
+    }
+}

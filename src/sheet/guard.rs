@@ -1,0 +1,322 @@
+//! The guard: what must hold of a sheet's motion, looked at now and then, and the checkpoint to go back to.
+//!
+//! Numbers must be finite; energy must not come from nowhere; the springs' force must be near what its history foretold.
+//! Every [`INTERVAL_SUBSTEPS`] substeps a survey of the sheet (a sweep, about twice the price of a substep) looks at
+//! them: E − E₀ ≤ W + [`MARGIN`]·(E₀ + |W|), E₀ the energy at the last survey and W the work of all tools since. Damping
+//! only takes energy, so it is on the safe side. Increments are summed in every substep, which shows at once if one is not
+//! finite.
+//!
+//! If it does not hold, the sheet goes back to the last checkpoint and repeats, with half the substep, what the tools did
+//! since: time does not go back for those who look on. It keeps the shorter substep. After [`MOST_HALVINGS`] halvings it
+//! gives up, at the checkpoint.
+
+use std::fmt;
+
+use super::applied::{Applied, Push};
+use super::field::{Field, Layout, State};
+use super::integrate::Scheme;
+use super::model::{Model, Plan};
+use super::prescribed::{Grasp, Prescribed};
+use super::real::Real;
+use super::springs::Springs;
+use super::{BlowUp, Sheet, springs_of};
+
+/// Substeps between two surveys.
+pub const INTERVAL_SUBSTEPS: u64 = 256;
+
+/// What the sum of energy and work may be off by, as a part of either: errors of the schemes at the stability bound.
+pub const MARGIN: f64 = 0.05;
+
+/// By how much, of the largest displacement, a prediction may be off.
+pub const MOST_SURPRISE: f64 = 0.5;
+
+/// How often a substep is halved before the guard gives up.
+pub const MOST_HALVINGS: u32 = 4;
+
+/// Inputs that are kept since the last checkpoint; more bring the next one on.
+pub(super) const MOST_INPUTS: usize = 1024;
+
+/// Why the guard gave up.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Cause {
+    /// A point is not finite, or is displaced by a billion sheets.
+    NotFinite {
+        /// The point.
+        point: [usize; 2],
+    },
+    /// Energy from nowhere.
+    Energy {
+        /// Of springs, virtual springs and motion, J.
+        energy_j: f64,
+        /// What it was at the last survey, J.
+        before_j: f64,
+        /// Work of all tools since, J.
+        work_j: f64,
+    },
+    /// The springs' force is far from what its history foretold.
+    Surprise {
+        /// The difference that it makes to a displacement, as a part of the largest.
+        part: f64,
+    },
+}
+
+impl fmt::Display for Cause {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Cause::NotFinite { point: [i, j] } => {
+                write!(f, "point [{i}, {j}] was not finite (or a billion sheets away)")
+            }
+            Cause::Energy { energy_j, before_j, work_j } => {
+                write!(
+                    f,
+                    "the energy rose from {before_j:.3e} J to {energy_j:.3e} J, while the tools did {work_j:.3e} J of work"
+                )
+            }
+            Cause::Surprise { part } => {
+                write!(f, "the springs' force was far from its prediction, by {part:.1e} of the largest displacement")
+            }
+        }
+    }
+}
+
+/// What a tool was told.
+#[derive(Debug, Clone)]
+pub(super) enum Input {
+    Push(Option<Push>),
+    Grasp(usize, Grasp),
+}
+
+/// Everything that a sheet goes back to.
+#[derive(Debug)]
+pub(super) struct Checkpoint<T: Real> {
+    pub(super) steps: u64,
+    pub(super) halvings: u32,
+    pub(super) state: State<T>,
+    pub(super) applied: Applied<T>,
+    pub(super) prescribed: Prescribed,
+    pub(super) work: Work,
+}
+
+/// Work of the tools, J, and energies at the last survey.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(super) struct Work {
+    /// Since the last survey, but for what the present force has done since it began (force · displacement).
+    done_j: f64,
+    /// At the last survey.
+    energy_j: f64,
+}
+
+impl Work {
+    /// Adds what was done.
+    pub(super) fn add(&mut self, work_j: f64) {
+        self.done_j += work_j;
+    }
+
+    /// Judges an energy; `present_j`: the present force times the displacement. The account begins anew.
+    pub(super) fn survey(&mut self, energy_j: f64, present_j: f64) -> Result<(), Cause> {
+        let (work_j, before_j) = (self.done_j + present_j, self.energy_j);
+        if energy_j - before_j > work_j + MARGIN * (before_j + work_j.abs()) {
+            return Err(Cause::Energy { energy_j, before_j, work_j });
+        }
+        *self = Work { done_j: -present_j, energy_j };
+        Ok(())
+    }
+}
+
+impl<T: Real> Sheet<T> {
+    /// What is wrong, if anything. Every step whether all is finite; the rest now and then, and then there is a checkpoint.
+    pub(super) fn check(&mut self) -> Result<(), Cause> {
+        let interval = (INTERVAL_SUBSTEPS / u64::from(self.plan.substeps)).max(1);
+        let due = self.steps.is_multiple_of(interval) || self.inputs.len() >= MOST_INPUTS;
+        let farthest = farthest_in_spacings(&self.model);
+        let calm = self.bench.is_calm(farthest);
+        let scan = || match broken_point(&self.model, &self.bench.layout, &self.state) {
+            Some(index) => Err(Cause::NotFinite { point: self.model.point_of(index) }),
+            None => Ok(()),
+        };
+        if !calm {
+            scan()?;
+        }
+        if !due {
+            return Ok(());
+        }
+        let (survey, _, energy_j) = self.survey();
+        if !(survey.largest < farthest && energy_j.is_finite()) {
+            scan()?;
+        }
+        if survey.surprise > MOST_SURPRISE * survey.largest {
+            return Err(Cause::Surprise { part: survey.surprise / survey.largest });
+        }
+        let layout = self.bench.layout;
+        let present_j = force_times_displacement(&self.model, &self.plan, &layout, &self.applied, &self.state);
+        self.work.survey(energy_j, present_j)?;
+        self.checkpoint.steps = self.steps;
+        self.checkpoint.halvings = self.halvings;
+        self.checkpoint.state.copy_from(&self.state);
+        self.checkpoint.applied.clone_from(&self.applied);
+        self.checkpoint.prescribed.clone_from(&self.prescribed);
+        self.checkpoint.work = self.work;
+        self.inputs.clear();
+        Ok(())
+    }
+
+    /// Back to the checkpoint, with the substep of `halvings`.
+    fn go_back(&mut self, halvings: u32) {
+        let layout = self.bench.layout;
+        self.steps = self.checkpoint.steps;
+        self.state.copy_from(&self.checkpoint.state);
+        self.applied.clone_from(&self.checkpoint.applied);
+        self.prescribed.clone_from(&self.checkpoint.prescribed);
+        self.work = self.checkpoint.work;
+        let was = self.model.plan.divided(&self.model.scene, 1 << self.checkpoint.halvings);
+        let plan = self.model.plan.divided(&self.model.scene, 1 << halvings);
+        let springs = springs_of(&self.model, &was);
+        convert(&layout, &springs, &was, &plan, &self.applied, &mut self.state);
+        self.applied.forget();
+        // The force begins anew, and with it what it has done.
+        let present_j =
+            force_times_displacement(&self.model, &was, &layout, &self.checkpoint.applied, &self.checkpoint.state);
+        self.work.add(present_j);
+        self.bench.springs = springs_of(&self.model, &plan);
+        self.bench.is_calm(0.0);
+        self.halvings = halvings;
+        self.plan = plan;
+    }
+
+    pub(super) fn input(&mut self, tool: usize, input: Input) {
+        self.inputs.push((self.steps, tool, input.clone()));
+        self.tell(tool, input);
+    }
+
+    /// From the checkpoint to `steps` again, with shorter substeps, until all is well or they are the shortest.
+    pub(super) fn mend(&mut self, steps: u64, mut cause: Cause) -> Result<(), BlowUp> {
+        let inputs = std::mem::take(&mut self.inputs);
+        let blow_up = |cause| BlowUp { step: steps, cause };
+        for halvings in self.halvings + 1..=MOST_HALVINGS {
+            self.go_back(halvings);
+            // A repetition that went well for a while has left a later checkpoint.
+            let from = self.steps;
+            let mut waiting = inputs.iter().filter(|(step, ..)| *step >= from).peekable();
+            let repeated = loop {
+                if self.steps == steps {
+                    break Ok(());
+                }
+                while let Some((_, tool, input)) = waiting.next_if(|(step, ..)| *step == self.steps) {
+                    self.input(*tool, input.clone());
+                }
+                self.do_step();
+                if let Err(cause) = self.check() {
+                    break Err(cause);
+                }
+            };
+            match repeated {
+                Ok(()) => {
+                    self.guard_events += 1;
+                    return Ok(());
+                }
+                Err(found) => cause = found,
+            }
+        }
+        self.go_back(self.halvings);
+        Err(blow_up(cause))
+    }
+}
+
+/// Σ force · displacement of the fields of a scheme, J.
+pub(super) fn force_times_displacement<T: Real>(
+    model: &Model,
+    plan: &Plan,
+    layout: &Layout,
+    applied: &Applied<T>,
+    state: &State<T>,
+) -> f64 {
+    let (field, weight, back) = match &plan.scheme {
+        // Its force acts from half a substep before the substep's beginning to half a substep after.
+        Scheme::TwoStep(two) => (0, two.q, 0.5),
+        Scheme::Multistep(multistep) => (1, multistep.impulse(), 0.0),
+        Scheme::Rk4 { .. } => (1, 1.0, 0.0),
+    };
+    let field = &applied.fields[field];
+    let mut sum = 0.0;
+    for c in 0..3 {
+        for i in applied.rows.clone() {
+            let row = c * layout.plane + i * layout.stride..c * layout.plane + i * layout.stride + layout.columns;
+            let (f, u, d) = (&field[row.clone()], &state.u[row.clone()], &state.d[row]);
+            for ((f, u), d) in f.iter().zip(u).zip(d) {
+                sum += f.wide() * (u.wide() - back * d.wide());
+            }
+        }
+    }
+    sum * model.scene.sheet.spacing_m / (weight * plan.force_scale(&model.scene))
+}
+
+/// Displacements from here on are a blow-up: far beyond any tissue, and far below what f32 can square.
+pub(super) fn farthest_in_spacings(model: &Model) -> f64 {
+    1e9 * model.scene.sheet.longer_side_m() / model.scene.sheet.spacing_m
+}
+
+/// A point that is not finite or beyond every bound, if there is one: its number.
+pub(super) fn broken_point<T: Real>(model: &Model, layout: &Layout, state: &State<T>) -> Option<usize> {
+    let farthest = T::of(farthest_in_spacings(model));
+    let is_good = |field: &Field<T>, at: usize| field[at].is_finite() && field[at].magnitude() < farthest;
+    (0..model.len()).find(|index| {
+        let places = (0..3).map(|c| c * layout.plane + layout.place(*index));
+        !places.into_iter().all(|at| state.fields().all(|field| is_good(field, at)))
+    })
+}
+
+/// Turns a state of one substep into that of another: `from` and `to` are of the same scheme, `springs` of `from`.
+pub(super) fn convert<T: Real>(
+    layout: &Layout,
+    springs: &Springs<T>,
+    from: &Plan,
+    to: &Plan,
+    applied: &Applied<T>,
+    state: &mut State<T>,
+) {
+    let ratio = to.substep_s / from.substep_s;
+    let points = layout.rows * layout.columns;
+    // All forces first: points are converted one by one, in place.
+    let forces: Vec<[T; 3]> = (0..points)
+        .map(|index| springs.gather(layout, &state.u, [index / layout.columns, index % layout.columns]))
+        .collect();
+    for (index, force) in forces.iter().enumerate() {
+        for (c, n) in force.iter().enumerate() {
+            let at = c * layout.plane + layout.place(index);
+            let (u, d, n) = (state.u[at].wide(), state.d[at].wide(), n.wide());
+            match (&from.scheme, &to.scheme) {
+                (Scheme::TwoStep(two), _) => {
+                    // d = v·dt − ½·acceleration·dt², at the time of u.
+                    let acceleration = (two.p - 1.0) * d - two.q * two.a * u + n + applied.fields[0][at].wide();
+                    let velocity = d + 0.5 * acceleration;
+                    state.d[at] = T::of(velocity * ratio - 0.5 * acceleration * ratio * ratio);
+                }
+                (Scheme::Multistep(old), Scheme::Multistep(new)) => {
+                    let mut history = vec![n];
+                    history.extend(state.kept[..old.order].iter().map(|field| field[at].wide()));
+                    let [du, dw] = old.correction.map(|weight| weight * old.surprise(&history));
+                    #[allow(clippy::cast_precision_loss)]
+                    let shorter: Vec<f64> =
+                        (0..history.len()).map(|i| ratio * ratio * through(&history, -(i as f64) * ratio)).collect();
+                    let foretold = new.correction.map(|weight| weight * new.surprise(&shorter));
+                    state.u[at] = T::of(u + du - foretold[0]);
+                    state.d[at] = T::of((d + dw) * ratio - foretold[1]);
+                    for (field, value) in state.kept.iter_mut().zip(&shorter[1..]) {
+                        field[at] = T::of(*value);
+                    }
+                }
+                _ => state.d[at] = T::of(d * ratio),
+            }
+        }
+    }
+}
+
+/// The value at `s` of the polynomial that is `values[i]` at −i.
+#[allow(clippy::cast_precision_loss)]
+fn through(values: &[f64], s: f64) -> f64 {
+    let weight = |i: usize| -> f64 {
+        let others = (0..values.len()).filter(|j| *j != i);
+        others.map(|j| (s + j as f64) / (j as f64 - i as f64)).product()
+    };
+    values.iter().enumerate().map(|(i, value)| value * weight(i)).sum()
+}

@@ -1,0 +1,93 @@
+//! Small square matrices: the exponential of one, and the largest magnitude among its eigenvalues.
+
+/// A square matrix, by rows.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Matrix {
+    n: usize,
+    values: Vec<f64>,
+}
+
+impl Matrix {
+    /// From the value at each row and column.
+    pub fn of(n: usize, value: impl Fn(usize, usize) -> f64) -> Self {
+        Matrix { n, values: (0..n * n).map(|at| value(at / n, at % n)).collect() }
+    }
+
+    /// The value at a row and column.
+    pub fn at(&self, row: usize, column: usize) -> f64 {
+        self.values[row * self.n + column]
+    }
+
+    fn times(&self, other: &Matrix) -> Matrix {
+        Matrix::of(self.n, |i, j| (0..self.n).map(|k| self.at(i, k) * other.at(k, j)).sum())
+    }
+
+    /// The matrix times a vector.
+    pub fn applied_to(&self, vector: &[f64]) -> Vec<f64> {
+        self.values.chunks_exact(self.n).map(|row| row.iter().zip(vector).map(|(a, b)| a * b).sum()).collect()
+    }
+
+    fn scaled(&self, factor: f64) -> Matrix {
+        Matrix { n: self.n, values: self.values.iter().map(|value| value * factor).collect() }
+    }
+
+    fn largest(&self) -> f64 {
+        self.values.iter().fold(0.0, |largest, value| value.abs().max(largest))
+    }
+
+    /// e to the matrix: a Taylor series of the matrix halved until it is small, squared as often.
+    pub fn exponential(&self) -> Matrix {
+        let mut halvings = 0;
+        let mut small = self.clone();
+        while small.largest() > 0.125 {
+            small = small.scaled(0.5);
+            halvings += 1;
+        }
+        let mut sum = Matrix::of(self.n, |i, j| f64::from(u8::from(i == j)));
+        let mut term = sum.clone();
+        for k in 1..20 {
+            term = term.times(&small).scaled(1.0 / f64::from(k));
+            sum.values.iter_mut().zip(&term.values).for_each(|(sum, term)| *sum += term);
+        }
+        for _ in 0..halvings {
+            sum = sum.times(&sum);
+        }
+        sum
+    }
+
+    /// The largest magnitude among the eigenvalues: the 2ᵏ-th root of the size of the 2ᵏ-th power.
+    pub fn spectral_radius(&self) -> f64 {
+        let (mut power, mut logarithm, mut exponent) = (self.clone(), 0.0, 1.0);
+        for _ in 0..36 {
+            let size = power.largest();
+            if size == 0.0 || !size.is_finite() {
+                return size;
+            }
+            // The power so far is e^logarithm times a matrix of size 1.
+            logarithm += libm::log(size) / exponent;
+            power = power.scaled(1.0 / size);
+            power = power.times(&power);
+            exponent *= 2.0;
+        }
+        libm::exp(logarithm)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_exponential_of_a_rotation_is_a_rotation() {
+        let e = Matrix::of(2, |i, j| [[0.0, 7.0], [-7.0, 0.0]][i][j]).exponential();
+        assert!((e.at(0, 0) - 7.0_f64.cos()).abs() < 1e-14 && (e.at(0, 1) - 7.0_f64.sin()).abs() < 1e-14);
+    }
+
+    #[test]
+    fn the_spectral_radius_is_that_of_the_largest_eigenvalue() {
+        let rotation = Matrix::of(2, |i, j| [[0.3, 0.9], [-0.9, 0.3]][i][j]);
+        assert!((rotation.spectral_radius() - 0.9_f64.sqrt()).abs() < 1e-9);
+        let jordan = Matrix::of(2, |i, j| [[0.5, 1.0], [0.0, 0.5]][i][j]);
+        assert!((jordan.spectral_radius() - 0.5).abs() < 1e-8);
+    }
+}

@@ -1,0 +1,89 @@
+//! The classical scheme of Runge and Kutta: fourth order, four evaluations a substep. A yardstick.
+//!
+//! y′ = f(y), y = (u, w): k₁ = f(y), k₂ = f(y + k₁/2), k₃ = f(y + k₂/2), k₄ = f(y + k₃),
+//! y₊ = y + (k₁ + 2k₂ + 2k₃ + k₄)/6. Each stage is a sweep that evaluates the springs where the last one put u, adds
+//! to the sum, and puts u and w where the next wants them.
+
+use super::super::lanes::Vector;
+use super::super::real::Real;
+use super::super::sweep::{self, MAX_KEPT};
+use super::matrix::Matrix;
+
+/// Kept: u and w at the beginning, and the sums of the slopes so far.
+pub(super) const KEPT: usize = 4;
+
+/// The four stages: how far the next goes with this one's slope, and how much of it counts in the sum.
+pub(in super::super) const STAGES: [(f64, f64); 4] =
+    [(0.5, 1.0 / 6.0), (0.5, 1.0 / 3.0), (1.0, 1.0 / 3.0), (0.0, 1.0 / 6.0)];
+
+/// One substep of a single vibration.
+fn step(pull: f64, g: f64, force: f64, y: [f64; 2]) -> [f64; 2] {
+    let slope = |y: [f64; 2]| [y[1], force - pull * y[0] - g * y[1]];
+    let along = |k: [f64; 2], far: f64| [y[0] + far * k[0], y[1] + far * k[1]];
+    let k1 = slope(y);
+    let k2 = slope(along(k1, 0.5));
+    let k3 = slope(along(k2, 0.5));
+    let k4 = slope(along(k3, 1.0));
+    [0, 1].map(|c: usize| y[c] + (k1[c] + 2.0 * k2[c] + 2.0 * k3[c] + k4[c]) / 6.0)
+}
+
+pub(super) fn propagator(pull: f64, g: f64) -> Matrix {
+    let columns = [step(pull, g, 0.0, [1.0, 0.0]), step(pull, g, 0.0, [0.0, 1.0])];
+    Matrix::of(2, |i, j| columns[j][i])
+}
+
+pub(super) fn forced(pull: f64, g: f64) -> Vec<f64> {
+    step(pull, g, 1.0, [0.0; 2]).to_vec()
+}
+
+/// One stage, in the format of the state.
+#[derive(Debug, Clone, Copy)]
+pub(in super::super) struct Advance<T> {
+    a: T,
+    g: T,
+    far: T,
+    share: T,
+    stage: usize,
+}
+
+impl<T: Real> Advance<T> {
+    pub(in super::super) fn new(a: f64, g: f64, stage: usize) -> Self {
+        let (far, share) = STAGES[stage];
+        Advance { a: T::of(-a), g: T::of(-g), far: T::of(far), share: T::of(share), stage }
+    }
+}
+
+impl<T: Real> sweep::Scheme<T> for Advance<T> {
+    const KEPT: usize = KEPT;
+    const WRITTEN: usize = KEPT;
+
+    #[inline(always)]
+    fn advance<V: Vector<Real = T>>(
+        &self,
+        x: V,
+        d: V,
+        n: V,
+        kept: &mut [V; MAX_KEPT],
+        force: Option<[V; 2]>,
+    ) -> (V, V) {
+        let n = if let Some(force) = force { n.add(force[0]) } else { n };
+        let slope = [d, V::splat(self.g).mul_add(d, V::splat(self.a).mul_add(x, n))];
+        let share = V::splat(self.share);
+        if self.stage == 0 {
+            [kept[0], kept[1], kept[2], kept[3]] = [x, d, share.mul(slope[0]), share.mul(slope[1])];
+        } else {
+            kept[2] = share.mul_add(slope[0], kept[2]);
+            kept[3] = share.mul_add(slope[1], kept[3]);
+        }
+        if self.stage + 1 == STAGES.len() {
+            return (kept[0].add(kept[2]), kept[1].add(kept[3]));
+        }
+        let far = V::splat(self.far);
+        (far.mul_add(slope[0], kept[0]), far.mul_add(slope[1], kept[1]))
+    }
+
+    #[inline(always)]
+    fn observe<V: Vector<Real = T>>(&self, x: V, d: V, _: V, _: &[V; MAX_KEPT], _: Option<V>) -> (V, V) {
+        (x, d)
+    }
+}

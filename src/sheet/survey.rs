@@ -1,0 +1,150 @@
+//! A look at the whole sheet, by a sweep that changes nothing: energies, the largest displacement, and by how much the
+//! springs' force differs from what its history foretold.
+//!
+//! Sums are taken apart for each of 16 columns, row by row, so that they too are the same at every width.
+#![allow(unsafe_code)]
+// Iterators over vectors are not always inlined, and then run without the instructions of their caller: ten times slower.
+#![allow(clippy::needless_range_loop)]
+
+use std::cell::UnsafeCell;
+
+use super::field::{BLOCK, Field, Layout, State};
+use super::lanes::Vector;
+use super::real::Real;
+use super::sweep::{Bench, MAX_KEPT, Scheme, Stage};
+
+/// What was seen, in the scheme's units (`integrate`).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Survey {
+    /// Σ w².
+    pub(super) speed_squared: f64,
+    /// The same, as it enters the energy that the scheme keeps.
+    pub(super) vigour: f64,
+    /// Σ u².
+    pub(super) displacement_squared: f64,
+    /// Of all springs.
+    pub(super) spring_energy: f64,
+    /// The largest component of any displacement.
+    pub(super) largest: f64,
+    /// The largest difference of a corrected displacement and the predicted one.
+    pub(super) surprise: f64,
+}
+
+/// The sums: w², u², spring energy, vigour; and the two maxima.
+#[derive(Debug)]
+struct Sums<T> {
+    row: [[T; BLOCK]; 4],
+    total: [[f64; BLOCK]; 4],
+    largest: [[T; BLOCK]; 2],
+}
+
+struct Look<'a, T, C> {
+    layout: Layout,
+    scheme: &'a C,
+    d: *const T,
+    kept: [*const T; MAX_KEPT],
+    force: *const T,
+    sums: &'a UnsafeCell<Sums<T>>,
+}
+
+impl Survey {
+    /// Looks at a state; `force` is what the tools exert on it, in the springs' units, if a two-step scheme needs it for
+    /// the velocity.
+    pub(super) fn of<T: Real, C: Scheme<T>>(
+        bench: &Bench<T>,
+        scheme: &C,
+        state: &State<T>,
+        force: Option<&Field<T>>,
+    ) -> Survey {
+        let zero = [T::default(); BLOCK];
+        let sums = UnsafeCell::new(Sums { row: [zero; 4], total: [[0.0; BLOCK]; 4], largest: [zero; 2] });
+        let mut kept = [std::ptr::null(); MAX_KEPT];
+        for (pointer, field) in kept.iter_mut().zip(&state.kept) {
+            *pointer = field.as_ptr();
+        }
+        let look = Look {
+            layout: bench.layout,
+            scheme,
+            d: state.d.as_ptr(),
+            kept,
+            force: force.map_or(std::ptr::null(), |force| force.as_ptr()),
+            sums: &sums,
+        };
+        bench.look(&state.u, look);
+        let Sums { total, largest, .. } = sums.into_inner();
+        let sum = |which: usize| total[which].iter().sum();
+        let most = |which: usize| largest[which].iter().map(|value| value.wide()).fold(0.0, f64::max);
+        Survey {
+            speed_squared: sum(0),
+            displacement_squared: sum(1),
+            spring_energy: sum(2),
+            vigour: sum(3),
+            largest: most(0),
+            surprise: most(1),
+        }
+    }
+}
+
+impl<T: Real, C: Scheme<T>> Look<'_, T, C> {
+    /// Adds to a sum of the row.
+    #[inline(always)]
+    unsafe fn add<V: Vector<Real = T>>(&self, which: usize, at: usize, value: V) {
+        // SAFETY: one sweep runs at a time, and its stage alone refers to the sums.
+        unsafe {
+            let sum = (&raw mut (*self.sums.get()).row[which]).cast::<T>().add(at % BLOCK);
+            V::load(sum).add(value).store(sum);
+        }
+    }
+}
+
+impl<T: Real, C: Scheme<T>> Stage<T> for Look<'_, T, C> {
+    const ENERGY: bool = true;
+
+    #[inline(always)]
+    unsafe fn finish<V: Vector<Real = T>>(&self, _: usize, at: usize, x: [V; 3], n: [V; 3], _: &mut V) {
+        // SAFETY: the fields have the layout; the sums as above.
+        unsafe {
+            let column = at % self.layout.stride;
+            let (mut speed, mut place, mut vigour) =
+                (V::splat(T::default()), V::splat(T::default()), V::splat(T::default()));
+            let mut most = [V::splat(T::default()); 2];
+            for c in 0..3 {
+                let at = at + c * self.layout.plane;
+                let d = V::load(self.d.add(at));
+                let mut kept = [d; MAX_KEPT];
+                for k in 0..C::KEPT {
+                    kept[k] = V::load(self.kept[k].add(at));
+                }
+                let force = if self.force.is_null() { None } else { Some(V::load(self.force.add(at))) };
+                let (u, w) = self.scheme.observe(x[c], d, n[c], &kept, force);
+                speed = w.mul_add(w, speed);
+                vigour = vigour.add(self.scheme.vigour(x[c], d, n[c], &kept, force));
+                place = u.mul_add(u, place);
+                most = [most[0].farther(u), most[1].farther(u.sub(x[c]))];
+            }
+            self.add(0, column, speed);
+            self.add(1, column, place);
+            self.add(3, column, vigour);
+            for (which, most) in most.into_iter().enumerate() {
+                let largest = (&raw mut (*self.sums.get()).largest[which]).cast::<T>().add(column % BLOCK);
+                V::load(largest).farther(most).store(largest);
+            }
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn energy<V: Vector<Real = T>>(&self, column: usize, energy: V) {
+        // SAFETY: as above.
+        unsafe { self.add(2, column, energy) }
+    }
+
+    #[inline(always)]
+    unsafe fn end_row<V: Vector<Real = T>>(&self, _: V) {
+        // SAFETY: as above.
+        let sums = unsafe { &mut *self.sums.get() };
+        for (row, total) in sums.row.iter_mut().zip(&mut sums.total) {
+            total.iter_mut().zip(row.iter()).for_each(|(total, value)| *total += value.wide());
+            *row = [T::default(); BLOCK];
+        }
+    }
+}

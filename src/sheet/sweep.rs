@@ -1,0 +1,416 @@
+//! The sweep: one pass over the rows that evaluates every spring once and advances what it has passed, in place.
+//!
+//! Row i has four springs a point: to the right, and from the pair of points j, j + 1 to the pair below, down and both
+//! diagonals. A spring's force on the row below waits in `carry` until that row is reached; one on the next column
+//! reaches it by shifting a vector by one lane. When the sweep leaves a block of row i all its forces are known,
+//! and nothing will read its displacement any more: the stage may overwrite it.
+//!
+//! At column j, with R to the right, D down, A the diagonal from j to j + 1 below, B that from j + 1 to j below:
+//!
+//! force on j = R + D + A − (what the row above left) + (B − R − A of the row above) of column j − 1,
+//! and the row leaves D + B, and A.
+//!
+//! A lane's result depends on the same operations in the same order at every width: the bits are the same.
+#![allow(unsafe_code)]
+// Iterators over vectors are not always inlined, and then run without the instructions of their caller: ten times slower.
+#![allow(clippy::needless_range_loop)]
+
+use std::ops::Range;
+
+use super::applied::Applied;
+use super::field::{BLOCK, Field, Layout, State};
+use super::lanes::{self, Run, Vector};
+use super::real::Real;
+use super::springs::{Kind, Springs};
+use crate::scene::Lanes;
+
+/// What is done with the force on a block of points.
+pub(super) trait Stage<T: Real> {
+    /// Whether the sweep tells the springs' energies as well.
+    const ENERGY: bool = false;
+
+    /// `x`: displacements of the block of row `row` that begins at place `at`; `n`: the springs' forces on it. Adds to
+    /// `probe`, which the stage gets at the row's end.
+    ///
+    /// # Safety
+    /// What the stage points to is as it promised.
+    unsafe fn finish<V: Vector<Real = T>>(&self, row: usize, at: usize, x: [V; 3], n: [V; 3], probe: &mut V);
+
+    /// The energies of springs that begin in the block at `column`.
+    ///
+    /// # Safety
+    /// As for `finish`.
+    unsafe fn energy<V: Vector<Real = T>>(&self, _column: usize, _energy: V) {}
+
+    /// A row is done.
+    ///
+    /// # Safety
+    /// As for `finish`.
+    unsafe fn end_row<V: Vector<Real = T>>(&self, probe: V);
+}
+
+/// A sweep, ready to run at any width.
+pub(super) struct Sweep<'a, T, S> {
+    pub(super) layout: Layout,
+    pub(super) springs: &'a Springs<T>,
+    /// Displacements: three planes, spacings.
+    pub(super) x: *const T,
+    /// What rows leave to those below: [`CARRY_ROWS`] rows of three planes of `carry_plane`.
+    pub(super) carry: *mut T,
+    pub(super) stage: S,
+}
+
+/// Rows of the carry: two of the row before, and two for flexion springs, which reach two rows on.
+pub(super) const CARRY_ROWS: usize = 4;
+
+impl<T: Real, S: Stage<T>> Run<T> for Sweep<'_, T, S> {
+    #[inline(always)]
+    unsafe fn run<V: Vector<Real = T>>(&self) {
+        // SAFETY: the caller's promise.
+        unsafe {
+            match &self.springs.flexion {
+                None => self.rows::<V, false>(&self.springs.structural),
+                Some(flexion) => self.rows::<V, true>(flexion),
+            }
+        }
+    }
+}
+
+/// Q of a spring whose rest vector is `rest` times the unit along it: 2·along + Δ·Δ, `along` being D0·Δ.
+#[inline(always)]
+fn excess<V: Vector>(along: V, delta: &[V; 3], [first, second, third]: [usize; 3]) -> V {
+    let sum = delta[first].mul_add(delta[first], along.add(along));
+    delta[third].mul_add(delta[third], delta[second].mul_add(delta[second], sum))
+}
+
+#[inline(always)]
+fn difference<V: Vector>(to: &[V; 3], from: &[V; 3]) -> [V; 3] {
+    [to[0].sub(from[0]), to[1].sub(from[1]), to[2].sub(from[2])]
+}
+
+/// The three components of a block.
+///
+/// # Safety
+/// They can be read.
+#[inline(always)]
+unsafe fn load<V: Vector>(at: *const V::Real, plane: usize) -> [V; 3] {
+    // SAFETY: the caller's promise.
+    unsafe { [V::load(at), V::load(at.add(plane)), V::load(at.add(2 * plane))] }
+}
+
+impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
+    /// # Safety
+    /// `x` has 3 planes that can be read a row and a block beyond the last point, `carry` has 3 planes of
+    /// [`CARRY_ROWS`] rows.
+    #[inline(always)]
+    unsafe fn rows<V: Vector<Real = T>, const FLEXION: bool>(&self, flexion: &Kind<T>) {
+        // SAFETY: the caller's promise; offsets stay within rows + 1 rows and a block.
+        unsafe {
+            let Layout { rows, columns, stride, plane } = self.layout;
+            let blocks = columns.div_ceil(V::LANES);
+            let zero = V::splat(T::default());
+            for row in 0..if FLEXION { CARRY_ROWS } else { 2 } {
+                for c in 0..3 {
+                    for block in 0..blocks {
+                        zero.store(self.carry.add(c * plane + row * stride + block * V::LANES));
+                    }
+                }
+            }
+            for i in 0..rows {
+                let x = self.x.add(i * stride);
+                if i + 1 < rows {
+                    self.row::<V, FLEXION, true>(flexion, i, x, blocks);
+                } else {
+                    self.row::<V, FLEXION, false>(flexion, i, x, blocks);
+                }
+            }
+        }
+    }
+
+    /// Row `i`, which has a row below or not.
+    #[inline(always)]
+    unsafe fn row<V: Vector<Real = T>, const FLEXION: bool, const BELOW: bool>(
+        &self,
+        flexion: &Kind<T>,
+        i: usize,
+        x: *const T,
+        blocks: usize,
+    ) {
+        // SAFETY: as for `rows`.
+        unsafe {
+            let Layout { rows, columns, stride, plane } = self.layout;
+            let Springs { structural, shear, .. } = self.springs;
+            let zero = V::splat(T::default());
+            let (down, diagonal) = (self.carry, self.carry.add(stride));
+            let two_down = self.carry.add((2 + i % 2) * stride);
+            // Springs to the next column: none from the last.
+            let full = V::first(V::LANES);
+            let tail = V::first(columns - 1 - (blocks - 1) * V::LANES);
+            let (mut passed, mut passed_two) = ([zero; 3], [zero; 3]);
+            // The Qs are formed one block ahead, so that two blocks' chains of operations are under way at once.
+            let mut probe = zero;
+            let mut ahead = excesses::<V, BELOW>(x, stride, plane);
+            for block in 0..blocks {
+                let column = block * V::LANES;
+                let mask = if block + 1 == blocks { tail } else { full };
+                let [qr, qd, qa, qb] = ahead;
+                if block + 1 < blocks {
+                    ahead = excesses::<V, BELOW>(x.add(column + V::LANES), stride, plane);
+                }
+                let mut wr = structural.near(qr);
+                let (mut wd, mut wa, mut wb) = (zero, zero, zero);
+                if BELOW {
+                    (wd, wa, wb) = (structural.near(qd), shear.near(qa), shear.near(qb));
+                    let far = qr.farther(qd).beyond(structural.bound());
+                    if V::any(V::either(far, qa.farther(qb).beyond(shear.bound()))) {
+                        (wr, wd) = (structural.weight(qr), structural.weight(qd));
+                        (wa, wb) = (shear.weight(qa), shear.weight(qb));
+                    }
+                } else {
+                    wr = structural.weight(qr);
+                }
+                if S::ENERGY {
+                    let mut sum = structural.energy(qr).keep(mask);
+                    if BELOW {
+                        sum = sum.add(structural.energy(qd)).add(shear.energy(qa).add(shear.energy(qb)).keep(mask));
+                    }
+                    self.stage.energy(column, sum);
+                }
+                let (wr, wa, wb) = (wr.keep(mask), wa.keep(mask), wb.keep(mask));
+                let at = x.add(column);
+                let (here, right) = (load::<V>(at, plane), load::<V>(at.add(1), plane));
+                let mut n = [zero; 3];
+                for c in 0..3 {
+                    let (down, diagonal) = (down.add(c * plane + column), diagonal.add(c * plane + column));
+                    let r = right[c].sub(here[c]);
+                    let fr = if c == 1 { wr.mul_add(r, wr) } else { wr.mul(r) };
+                    if BELOW {
+                        let (below, beside) =
+                            (V::load(at.add(stride + c * plane)), V::load(at.add(stride + 1 + c * plane)));
+                        let (d, a, b) = (below.sub(here[c]), beside.sub(here[c]), below.sub(right[c]));
+                        let fd = if c == 0 { wd.mul_add(d, wd) } else { wd.mul(d) };
+                        let fa = if c < 2 { wa.mul_add(a, wa) } else { wa.mul(a) };
+                        let fb = [wb.mul_add(b, wb), wb.mul_sub(b, wb), wb.mul(b)][c];
+                        let across = fb.sub(fr).sub(V::load(diagonal));
+                        n[c] = fr.add(fd).add(fa.sub(V::load(down))).add(across.shift(passed[c]));
+                        fd.add(fb).store(down);
+                        fa.store(diagonal);
+                        passed[c] = across;
+                    } else {
+                        let across = fr.add(V::load(diagonal));
+                        n[c] = fr.sub(V::load(down)).sub(across.shift(passed[c]));
+                        passed[c] = across;
+                    }
+                }
+                if FLEXION {
+                    // The last block may have a single column: then the one before is not full either.
+                    let mask = V::first(columns.saturating_sub(2 + column));
+                    let r = difference(&load(at.add(2), plane), &here);
+                    let q = excess(r[1].add(r[1]), &r, [1, 0, 2]);
+                    let w = flexion.weight(q).keep(mask);
+                    let two = w.add(w);
+                    let fr = [w.mul(r[0]), w.mul_add(r[1], two), w.mul(r[2])];
+                    let mut energy = if S::ENERGY { flexion.energy(q).keep(mask) } else { zero };
+                    for c in 0..3 {
+                        let carried = two_down.add(c * plane + column);
+                        n[c] = n[c].add(fr[c].sub(fr[c].shift_two(passed_two[c]))).sub(V::load(carried));
+                        passed_two[c] = fr[c];
+                    }
+                    if i + 2 < rows {
+                        let d = difference(&load(at.add(2 * stride), plane), &here);
+                        let q = excess(d[0].add(d[0]), &d, [0, 1, 2]);
+                        let w = flexion.weight(q);
+                        let two = w.add(w);
+                        let fd = [w.mul_add(d[0], two), w.mul(d[1]), w.mul(d[2])];
+                        for c in 0..3 {
+                            n[c] = n[c].add(fd[c]);
+                            fd[c].store(two_down.add(c * plane + column));
+                        }
+                        if S::ENERGY {
+                            energy = energy.add(flexion.energy(q));
+                        }
+                    }
+                    if S::ENERGY {
+                        self.stage.energy(column, energy);
+                    }
+                }
+                self.stage.finish(i, i * stride + column, here, n, &mut probe);
+            }
+            self.stage.end_row(probe);
+        }
+    }
+}
+
+/// Qs of the four springs of each point of a block: right, down, and the diagonals.
+#[inline(always)]
+unsafe fn excesses<V: Vector, const BELOW: bool>(at: *const V::Real, stride: usize, plane: usize) -> [V; 4] {
+    // SAFETY: the caller's promise: a row and a block beyond the last point can be read.
+    unsafe {
+        let (here, right) = (load::<V>(at, plane), load::<V>(at.add(1), plane));
+        let r = difference(&right, &here);
+        let qr = excess(r[1], &r, [1, 0, 2]);
+        if !BELOW {
+            return [qr; 4];
+        }
+        let (below, beside) = (load(at.add(stride), plane), load(at.add(stride + 1), plane));
+        let (d, a, b) = (difference(&below, &here), difference(&beside, &here), difference(&below, &right));
+        [qr, excess(d[0], &d, [0, 1, 2]), excess(a[0].add(a[1]), &a, [0, 1, 2]), excess(b[0].sub(b[1]), &b, [0, 1, 2])]
+    }
+}
+
+/// How a scheme advances one component of a block, in terms of u (here `x`), d, the springs' force `n` and what it
+/// keeps of steps before: pure arithmetic, in one file each (`integrate`).
+pub(super) trait Scheme<T: Real> {
+    /// Fields that the scheme keeps beside u and d.
+    const KEPT: usize;
+    /// How many of those, the last ones, it writes in a step.
+    const WRITTEN: usize;
+
+    /// u and d after the (sub)step; `kept` is brought up to date. `force`: the tools' part, in the scheme's terms.
+    fn advance<V: Vector<Real = T>>(&self, x: V, d: V, n: V, kept: &mut [V; MAX_KEPT], force: Option<[V; 2]>)
+    -> (V, V);
+
+    /// Displacement and velocity × substep as they are now; `force` is that of the tools, in the springs' units.
+    fn observe<V: Vector<Real = T>>(&self, x: V, d: V, n: V, kept: &[V; MAX_KEPT], force: Option<V>) -> (V, V);
+
+    /// The square of the velocity × substep, as it enters the energy that the scheme itself keeps, if it keeps one.
+    fn vigour<V: Vector<Real = T>>(&self, x: V, d: V, n: V, kept: &[V; MAX_KEPT], force: Option<V>) -> V {
+        let (_, w) = self.observe(x, d, n, kept, force);
+        w.mul(w)
+    }
+}
+
+/// Most fields that any scheme keeps beside u and d.
+pub(super) const MAX_KEPT: usize = 5;
+
+/// What a sweep needs beside the state: of one sheet, made once.
+#[derive(Debug)]
+pub(super) struct Bench<T> {
+    pub(super) lanes: Lanes,
+    pub(super) layout: Layout,
+    pub(super) springs: Springs<T>,
+    /// 1 where a point moves, 0 where it is fixed, if any is.
+    pub(super) free: Option<Field<T>>,
+    carry: Field<T>,
+    probe: [T; BLOCK],
+}
+
+impl<T: Real> Bench<T> {
+    pub(super) fn new(lanes: Lanes, layout: Layout, springs: Springs<T>, fixed: &[usize]) -> Self {
+        let free = (!fixed.is_empty()).then(|| {
+            let mut free = Field::zero(&layout);
+            free.fill(T::of(1.0));
+            for index in fixed {
+                for c in 0..3 {
+                    free[c * layout.plane + layout.place(*index)] = T::default();
+                }
+            }
+            free
+        });
+        Bench { lanes, layout, springs, free, carry: Field::zero(&layout), probe: [T::default(); BLOCK] }
+    }
+
+    /// Advances every point with `scheme`; the tools' force is that of its fields `which`.
+    pub(super) fn advance<C: Scheme<T>>(
+        &mut self,
+        scheme: &C,
+        state: &mut State<T>,
+        tools: &Applied<T>,
+        which: [usize; 2],
+    ) {
+        let mut kept = [std::ptr::null_mut(); MAX_KEPT];
+        for (pointer, field) in kept.iter_mut().zip(&mut state.kept) {
+            *pointer = field.as_mut_ptr();
+        }
+        assert_eq!(state.kept.len(), C::KEPT);
+        let u = state.u.as_mut_ptr();
+        let stage = Advance {
+            plane: self.layout.plane,
+            scheme,
+            u,
+            d: state.d.as_mut_ptr(),
+            kept,
+            forces: which.map(|field| tools.fields[field].as_ptr()),
+            forced: tools.rows.clone(),
+            free: self.free.as_ref().map_or(std::ptr::null(), |free| free.as_ptr()),
+            probe: self.probe.as_mut_ptr(),
+        };
+        let carry = self.carry.as_mut_ptr();
+        let sweep = Sweep { layout: self.layout, springs: &self.springs, x: u.cast_const(), carry, stage };
+        // SAFETY: all fields have the layout's three planes, padded by a row and a block; u is written behind what the
+        // sweep still reads, through the same pointer.
+        unsafe { lanes::run(self.lanes, &sweep) };
+    }
+
+    /// Sweeps over displacements without changing them.
+    pub(super) fn look<S: Stage<T>>(&self, u: &Field<T>, stage: S) {
+        let mut carry = Field::zero(&self.layout);
+        let carry = carry.as_mut_ptr();
+        let sweep = Sweep { layout: self.layout, springs: &self.springs, x: u.as_ptr(), carry, stage };
+        // SAFETY: as above; `stage` is made for fields of the same layout.
+        unsafe { lanes::run(self.lanes, &sweep) };
+    }
+
+    /// Whether the increments since the last call were finite, and none was `farthest`; false may be a sum of many.
+    pub(super) fn is_calm(&mut self, farthest: f64) -> bool {
+        let probe = std::mem::take(&mut self.probe);
+        probe.iter().all(|sum| sum.wide() < farthest * farthest)
+    }
+}
+
+/// The stage that advances every point.
+struct Advance<'a, T, C> {
+    plane: usize,
+    scheme: &'a C,
+    /// u and d, three planes each.
+    u: *mut T,
+    d: *mut T,
+    kept: [*mut T; MAX_KEPT],
+    /// The tools' force, in rows `forced`.
+    forces: [*const T; 2],
+    forced: Range<usize>,
+    /// 1 where a point moves, 0 where it is fixed; null if none is.
+    free: *const T,
+    /// A block that sums up squares of increments: finite and small only if all are.
+    probe: *mut T,
+}
+
+impl<T: Real, C: Scheme<T>> Stage<T> for Advance<'_, T, C> {
+    #[inline(always)]
+    unsafe fn finish<V: Vector<Real = T>>(&self, row: usize, at: usize, x: [V; 3], n: [V; 3], probe: &mut V) {
+        // SAFETY: the caller's promise.
+        unsafe {
+            let forced = self.forced.contains(&row);
+            for c in 0..3 {
+                let at = at + c * self.plane;
+                let d = V::load(self.d.add(at));
+                let mut kept = [d; MAX_KEPT];
+                for k in 0..C::KEPT {
+                    kept[k] = V::load(self.kept[k].add(at));
+                }
+                let (mut x, mut d) = if forced {
+                    let force = [V::load(self.forces[0].add(at)), V::load(self.forces[1].add(at))];
+                    self.scheme.advance(x[c], d, n[c], &mut kept, Some(force))
+                } else {
+                    self.scheme.advance(x[c], d, n[c], &mut kept, None)
+                };
+                if !self.free.is_null() {
+                    let free = V::load(self.free.add(at));
+                    (x, d) = (x.mul(free), d.mul(free));
+                }
+                x.store(self.u.add(at));
+                d.store(self.d.add(at));
+                for k in C::KEPT - C::WRITTEN..C::KEPT {
+                    kept[k].store(self.kept[k].add(at));
+                }
+                *probe = d.mul_add(d, *probe);
+            }
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn end_row<V: Vector<Real = T>>(&self, probe: V) {
+        // SAFETY: a block is as long as the widest vector.
+        unsafe { V::load(self.probe).add(probe).store(self.probe) }
+    }
+}
