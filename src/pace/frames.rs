@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 
 use super::queue::{Reader, Writer, lock, queue};
-use crate::surface::{Encoding, Frame, Refinement, Snapshot, encode};
+use crate::surface::{Encoding, Frame, Refinement, Snapshot, encode, encode_over};
 
 /// One who looks at a session.
 #[derive(Debug)]
@@ -152,6 +152,7 @@ impl Encoder {
 
     /// The thread's work.
     pub fn work(&self) {
+        let mut spent = Spent::default();
         loop {
             let mut board = lock(&self.board);
             let job = loop {
@@ -164,12 +165,38 @@ impl Encoder {
                 board = self.posted.wait(board).unwrap_or_else(PoisonError::into_inner);
             };
             drop(board);
-            serve(&job);
+            serve(&job, &mut spent);
         }
     }
 }
 
-fn serve(job: &Job) {
+/// Bytes of frames kept for their buffers, one of each kind that was asked for lately.
+const SPENT_BYTES: usize = 64 << 20;
+
+/// The last frames of a few kinds, newest first. When the next of a kind is due, the viewers are mostly done with it.
+#[derive(Debug, Default)]
+struct Spent(Vec<Arc<Frame>>);
+
+impl Spent {
+    /// The next frame of a kind, in the buffers of the last one as far as they are free.
+    fn encode(&mut self, snapshot: &Snapshot, refinement: Refinement, encoding: Encoding) -> Arc<Frame> {
+        let same = |frame: &Arc<Frame>| frame.refinement == refinement && frame.encoding == encoding;
+        let last = self.0.iter().position(same).and_then(|index| Arc::into_inner(self.0.remove(index)));
+        let frame = Arc::new(match last {
+            Some(last) => encode_over(snapshot, last),
+            None => encode(snapshot, refinement, encoding),
+        });
+        self.0.insert(0, frame.clone());
+        let mut bytes = 0;
+        self.0.retain(|frame| {
+            bytes += frame.patches.iter().map(|patch| patch.bytes.len()).sum::<usize>();
+            bytes <= SPENT_BYTES
+        });
+        frame
+    }
+}
+
+fn serve(job: &Job, spent: &mut Spent) {
     let mut encoded: Vec<Arc<Frame>> = Vec::new();
     for (viewer, frame_id) in &job.viewers {
         if viewer.is_gone() || !viewer.has_credit() {
@@ -177,7 +204,7 @@ fn serve(job: &Job) {
         }
         let same = |frame: &&Arc<Frame>| frame.refinement == viewer.refinement && frame.encoding == viewer.encoding;
         let frame = encoded.iter().find(same).cloned().unwrap_or_else(|| {
-            let frame = Arc::new(encode(&job.snapshot, viewer.refinement, viewer.encoding));
+            let frame = spent.encode(&job.snapshot, viewer.refinement, viewer.encoding);
             encoded.push(frame.clone());
             frame
         });
@@ -211,7 +238,7 @@ mod tests {
         let (a, mut read_a) = viewer(2, Encoding::I16, None);
         let (b, mut read_b) = viewer(2, Encoding::I16, Some(3));
         let (c, mut read_c) = viewer(2, Encoding::F32, None);
-        serve(&job(vec![(a, 7), (b, 9), (c, 7)]));
+        serve(&job(vec![(a, 7), (b, 9), (c, 7)]), &mut Spent::default());
         let (a, b, c) = (read_a.pop().await.unwrap().0, read_b.pop().await.unwrap().0, read_c.pop().await.unwrap().0);
         assert!(Arc::ptr_eq(&a.frame, &b.frame) && !Arc::ptr_eq(&a.frame, &c.frame));
         assert_eq!((a.frame_id, b.frame_id), (7, 9));

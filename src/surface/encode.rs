@@ -1,8 +1,9 @@
 //! Frames: the refined displacements as bytes, in patches small enough that other streams get in between.
 
-use bytes::Bytes;
+use bytes::{Bytes, BytesMut};
 use glam::DVec3;
 
+use super::refine::{Order, Rows};
 use super::{Refinement, Snapshot};
 
 /// How displacements are written.
@@ -57,76 +58,126 @@ pub struct Patch {
     pub bytes: Bytes,
 }
 
-/// Refines and encodes.
-pub fn encode(snapshot: &Snapshot, refinement: Refinement, encoding: Encoding) -> Frame {
-    let (origin_m, scale_m) = match encoding {
-        Encoding::F32 => (DVec3::ZERO, DVec3::ONE),
-        Encoding::I16 => quantisation(&snapshot.displacement_m),
-    };
-    let [vertices_x, vertices_y] = refinement.vertices();
-    // Whole rows, as many as fit; parts of a row where not even one does.
-    let vertices = PATCH_BYTES / encoding.bytes_per_vertex();
-    let columns_per_patch = vertices_y.min(vertices);
-    let rows_per_patch = (vertices / vertices_y).max(1);
-    let mut row: [Vec<f32>; 3] = std::array::from_fn(|_| vec![0.0; vertices_y]);
-    #[allow(clippy::cast_possible_truncation)]
-    let (origin, per_scale): ([f32; 3], [f32; 3]) = (
-        origin_m.to_array().map(|v| v as f32),
-        scale_m.to_array().map(|v| if v > 0.0 { v.recip() as f32 } else { 0.0 }),
-    );
-    let mut patch = |first: [usize; 2]| {
-        let count = [rows_per_patch.min(vertices_x - first[0]), columns_per_patch.min(vertices_y - first[1])];
-        let mut bytes = vec![0_u8; count[0] * count[1] * encoding.bytes_per_vertex()];
-        for (a, out) in bytes.chunks_exact_mut(count[1] * encoding.bytes_per_vertex()).enumerate() {
-            for (values, row) in snapshot.displacement_m.iter().zip(&mut row) {
-                refinement.row(values, first[0] + a, row);
-            }
-            let [x, y, z] = row.each_ref().map(|row| &row[first[1]..first[1] + count[1]]);
-            match encoding {
-                Encoding::F32 => {
-                    for (b, vertex) in out.as_chunks_mut::<12>().0.iter_mut().enumerate() {
-                        let [p, q, r] = [x[b], y[b], z[b]].map(f32::to_le_bytes);
-                        *vertex = [p[0], p[1], p[2], p[3], q[0], q[1], q[2], q[3], r[0], r[1], r[2], r[3]];
-                    }
-                }
-                Encoding::I16 => {
-                    for (b, vertex) in out.as_chunks_mut::<6>().0.iter_mut().enumerate() {
-                        let values = [x[b], y[b], z[b]];
-                        let [p, q, r] =
-                            std::array::from_fn(|c| quantum((values[c] - origin[c]) * per_scale[c]).to_le_bytes());
-                        *vertex = [p[0], p[1], q[0], q[1], r[0], r[1]];
-                    }
-                }
-            }
+impl Frame {
+    /// A frame with its patches laid out, but without bytes.
+    fn blank(refinement: Refinement, encoding: Encoding) -> Self {
+        let [vertices_x, vertices_y] = refinement.vertices();
+        // Whole rows, as many as fit; parts of a row where not even one does.
+        let vertices = PATCH_BYTES / encoding.bytes_per_vertex();
+        let columns_per_patch = vertices_y.min(vertices);
+        let rows_per_patch = (vertices / vertices_y).max(1);
+        let mut patches = Vec::new();
+        for x in (0..vertices_x).step_by(rows_per_patch) {
+            patches.extend((0..vertices_y).step_by(columns_per_patch).map(|y| Patch {
+                first: [x, y],
+                count: [rows_per_patch.min(vertices_x - x), columns_per_patch.min(vertices_y - y)],
+                bytes: Bytes::new(),
+            }));
         }
-        Patch { first, count, bytes: Bytes::from(bytes) }
-    };
-    let mut patches = Vec::new();
-    for x in (0..vertices_x).step_by(rows_per_patch) {
-        patches.extend((0..vertices_y).step_by(columns_per_patch).map(|y| patch([x, y])));
+        let (origin_m, scale_m) = (DVec3::ZERO, DVec3::ONE);
+        Frame { step: 0, simulation_time_s: 0.0, refinement, encoding, origin_m, scale_m, patches }
     }
-    let Snapshot { step, simulation_time_s, .. } = *snapshot;
-    Frame { step, simulation_time_s, refinement, encoding, origin_m, scale_m, patches }
 }
 
-/// Nearest integer within ±32767, by the trick of the magic number: 1.5·2²³ + v has no bits left for the fraction.
+/// Refines and encodes `snapshot`, whose points are those of `refinement`.
+pub fn encode(snapshot: &Snapshot, refinement: Refinement, encoding: Encoding) -> Frame {
+    encode_over(snapshot, Frame::blank(refinement, encoding))
+}
+
+/// Makes the next frame of the kind of `spent`, in its buffers where nobody else holds them: fresh memory costs more
+/// than what is written into it.
+#[allow(clippy::cast_possible_truncation)]
+pub fn encode_over(snapshot: &Snapshot, spent: Frame) -> Frame {
+    let mut frame = Frame { step: snapshot.step, simulation_time_s: snapshot.simulation_time_s, ..spent };
+    let (grid, values) = (frame.refinement, &snapshot.displacement_m);
+    match frame.encoding {
+        Encoding::F32 => {
+            fill(&mut frame.patches, Rows::new(grid, values, Order::XThenY, |_, v| v), f32::to_le_bytes);
+        }
+        Encoding::I16 => {
+            (frame.origin_m, frame.scale_m) = quantisation(values);
+            let origin = frame.origin_m.to_array().map(|v| v as f32);
+            let per_scale = frame.scale_m.to_array().map(|v| if v > 0.0 { v.recip() as f32 } else { 0.0 });
+            // Points become quanta before they are refined: there are fewer of them than vertices.
+            let quanta = |c: usize, v: f32| ((v - origin[c]) * per_scale[c]).clamp(-32767.0, 32767.0);
+            fill(&mut frame.patches, Rows::new(grid, values, Order::YThenX, quanta), |v| quantum(v).to_le_bytes());
+        }
+    }
+    frame
+}
+
+/// Writes all rows into the patches, `BYTES` a component.
+fn fill<const BYTES: usize>(
+    patches: &mut [Patch],
+    mut rows: Rows<'_, impl Fn(usize, f32) -> f32>,
+    put: impl Fn(f32) -> [u8; BYTES] + Copy,
+) {
+    let mut parted = Vec::new();
+    for band in patches.chunk_by_mut(|a, b| a.first[0] == b.first[0]) {
+        let ([x, _], rows_of_band) = (band[0].first, band[0].count[0]);
+        if let [patch] = band {
+            let row_bytes = 3 * BYTES * patch.count[1];
+            let mut bytes = patch.buffer(rows_of_band * row_bytes);
+            for (a, row) in bytes.chunks_exact_mut(row_bytes).enumerate() {
+                rows.write(x + a, row.as_chunks_mut().0, put);
+            }
+            patch.bytes = bytes.freeze();
+        } else {
+            // One row, in parts.
+            parted.resize(3 * band.iter().map(|patch| patch.count[1]).sum::<usize>(), [0; BYTES]);
+            rows.write(x, &mut parted, put);
+            for patch in band {
+                let part = parted[3 * patch.first[1]..][..3 * patch.count[1]].as_flattened();
+                let mut bytes = patch.buffer(part.len());
+                bytes.copy_from_slice(part);
+                patch.bytes = bytes.freeze();
+            }
+        }
+    }
+}
+
+impl Patch {
+    /// `length` bytes to write to: the patch's own, if nobody else reads them.
+    fn buffer(&mut self, length: usize) -> BytesMut {
+        let mut bytes = std::mem::take(&mut self.bytes).try_into_mut().unwrap_or_default();
+        bytes.resize(length, 0);
+        bytes
+    }
+}
+
+/// Nearest integer, within ±32767 as `v` is, by the trick of the magic number: 1.5·2²³ + v has no bits left for the
+/// fraction, and its last 16 are those of the integer.
 #[allow(clippy::cast_possible_truncation)]
 fn quantum(v: f32) -> i16 {
     const MAGIC: f32 = 12_582_912.0;
-    ((v.clamp(-32767.0, 32767.0) + MAGIC).to_bits().wrapping_sub(MAGIC.to_bits())) as i16
+    (v + MAGIC).to_bits() as i16
 }
 
 /// Middle and quantum of the box around all displacements. Interpolated ones are within it too.
 fn quantisation(displacement_m: &[Vec<f32>; 3]) -> (DVec3, DVec3) {
     let span = |values: &Vec<f32>| {
-        let low = values.iter().copied().fold(f32::INFINITY, f32::min);
-        let high = values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+        let low = -greatest(values, |v| -v);
+        let high = greatest(values, |v| v);
         // A value of f32, which is what encodes; the box then reaches as far as its farther side.
         let middle = 0.5 * low + 0.5 * high;
         (f64::from(middle), f64::from((high - middle).max(middle - low)) / f64::from(i16::MAX))
     };
     let spans = displacement_m.each_ref().map(span);
     (DVec3::from_array(spans.map(|span| span.0)), DVec3::from_array(spans.map(|span| span.1)))
+}
+
+/// The greatest of `of(value)`, in as many lanes as hide the time of a comparison.
+fn greatest(values: &[f32], of: impl Fn(f32) -> f32) -> f32 {
+    let (chunks, rest) = values.as_chunks::<16>();
+    let lanes = chunks.iter().fold([f32::NEG_INFINITY; 16], |mut lanes, chunk| {
+        for (lane, value) in lanes.iter_mut().zip(chunk) {
+            if of(*value) > *lane {
+                *lane = of(*value);
+            }
+        }
+        lanes
+    });
+    rest.iter().map(|value| of(*value)).chain(lanes).fold(f32::NEG_INFINITY, f32::max)
 }
 
 #[cfg(test)]
@@ -176,6 +227,44 @@ mod tests {
                     assert!(error <= 0.5 * coarse.scale_m[c] * 1.02, "{error} against {}", coarse.scale_m[c]);
                 }
             }
+        }
+    }
+
+    #[test]
+    fn f32_frames_are_the_formula_bit_for_bit() {
+        let snapshot = snapshot();
+        for n in 0..=10 {
+            let cells = n as usize + 1;
+            let grid = Refinement::new([31, 17], n, &Limits::default()).unwrap();
+            let frame = encode(&snapshot, grid, Encoding::F32);
+            let bytes = frame.patches.iter().flat_map(|patch| patch.bytes.as_chunks::<12>().0);
+            for (index, bytes) in bytes.enumerate() {
+                let [a, b] = [index / grid.vertices()[1], index % grid.vertices()[1]];
+                for (c, values) in snapshot.displacement_m.iter().enumerate() {
+                    let at = |j: usize| {
+                        let (near, far) = (values[a / cells * 17 + j], values[a.div_ceil(cells) * 17 + j]);
+                        near + (a % cells) as f32 / cells as f32 * (far - near)
+                    };
+                    let (left, right) = (at(b / cells), at(b.div_ceil(cells)));
+                    let value = left + (right - left) / cells as f32 * (b % cells) as f32;
+                    assert_eq!(bytes[4 * c..4 * c + 4], value.to_le_bytes(), "n = {n}, ({a}, {b})");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_spent_frame_lends_the_buffers_that_nobody_reads() {
+        for encoding in [Encoding::F32, Encoding::I16] {
+            let grid = Refinement::new([31, 17], 10, &Limits::default()).unwrap();
+            let first = encode(&snapshot(), grid, encoding);
+            let (held, place) = (first.patches[0].bytes.clone(), first.patches[1].bytes.as_ptr());
+            let before = held.to_vec();
+            let mut moved = snapshot();
+            moved.displacement_m.iter_mut().flatten().for_each(|v| *v = 1.0 - 2.0 * *v);
+            let second = encode_over(&moved, first);
+            assert_eq!((second.patches[1].bytes.as_ptr(), held), (place, before.into()));
+            assert_eq!(decode(&second), decode(&encode(&moved, grid, encoding)));
         }
     }
 

@@ -3,7 +3,7 @@
 pub mod encode;
 pub mod refine;
 
-pub use encode::{Encoding, Frame, encode};
+pub use encode::{Encoding, Frame, encode, encode_over};
 pub use refine::{LARGEST_REFINEMENT, Refinement};
 
 /// The displacements of a sheet at one moment: what frames are made of.
