@@ -1,4 +1,4 @@
-# One word each: run, test, lint, bench-roundtrip, bench-duty. Everything is built from crates.io and PyPI.
+# One word each: run, test, lint, bench-…. Everything is built from crates.io and PyPI.
 
 CARGO ?= cargo
 PYTHON ?= python3
@@ -8,7 +8,7 @@ SCRIPT ?= scripts/vertical-60.toml
 
 VENV := target/venv
 
-.PHONY: help run build test lint picture bench-roundtrip bench-duty need-rust need-python
+.PHONY: help run build test lint picture bench-roundtrip bench-duty bench-error need-rust need-python
 
 help:
 	@echo 'make run             build, serve on $(LISTEN), poke the tissue, draw what it felt, go on serving'
@@ -17,6 +17,7 @@ help:
 	@echo 'make picture         the picture of the README'
 	@echo 'make bench-roundtrip the haptic round trip beside a bare gRPC echo'
 	@echo 'make bench-duty      a minute of 1 kHz touch and 60 frames a second: time kept, commands lost'
+	@echo 'make bench-error     run time against error, every scheme on seven scenes: docs/benchmarks/error.md'
 
 need-rust:
 	@command -v $(CARGO) >/dev/null || { echo 'Rust is missing: install it from https://rustup.rs' >&2; exit 1; }
@@ -63,3 +64,7 @@ bench-roundtrip: build
 bench-duty: build
 	@echo "Machine: $$(sed -n 's/^model name.*: //p' /proc/cpuinfo 2>/dev/null | sort | uniq -c)"
 	$(CARGO) bench --quiet --bench duty
+
+# `make bench-error ARGUMENTS=--quick`.
+bench-error: need-rust
+	$(CARGO) bench --quiet --bench error -- $(ARGUMENTS)
