@@ -8,7 +8,8 @@ SCRIPT ?= scripts/vertical-60.toml
 
 VENV := target/venv
 
-.PHONY: help run build test lint picture bench-roundtrip bench-duty bench-error bench-kernel need-rust need-python
+.PHONY: help run build test lint picture bench-roundtrip bench-duty bench-error bench-kernel \
+	bench-stability need-rust need-python
 
 help:
 	@echo 'make run             build, serve on $(LISTEN), poke the tissue, draw what it felt, go on serving'
@@ -19,6 +20,7 @@ help:
 	@echo 'make bench-duty      a minute of 1 kHz touch and 60 frames a second: time kept, commands lost'
 	@echo 'make bench-error     run time against error, every scheme on seven scenes: docs/benchmarks/error.md'
 	@echo 'make bench-kernel    the time of a step beside the machine'"'"'s limits, numba, Taichi and NumPy'
+	@echo 'make bench-stability the largest stable step, predicted and observed'
 
 need-rust:
 	@command -v $(CARGO) >/dev/null || { echo 'Rust is missing: install it from https://rustup.rs' >&2; exit 1; }
@@ -84,3 +86,6 @@ $(PEERS)/ready: benches/peers/requirements.txt
 
 bench-kernel: need-rust $(PEERS)/ready
 	PEERS=$(PEERS)/bin/python $(CARGO) bench --quiet --bench kernel -- $(ARGUMENTS)
+
+bench-stability: need-rust
+	$(CARGO) bench --quiet --bench stability
