@@ -1,4 +1,4 @@
-# One word each: run, test, lint, bench-roundtrip, bench-duty, bench-frames. Everything is built from crates.io and PyPI.
+# One word each: run, test, lint, bench-…. Everything is built from crates.io and PyPI.
 
 CARGO ?= cargo
 PYTHON ?= python3
@@ -8,7 +8,8 @@ SCRIPT ?= scripts/vertical-60.toml
 
 VENV := target/venv
 
-.PHONY: help run build test lint picture bench-roundtrip bench-duty bench-frames need-rust need-python
+.PHONY: help run build test lint picture bench-roundtrip bench-duty bench-frames bench-error bench-kernel \
+	bench-stability need-rust need-python
 
 help:
 	@echo 'make run             build, serve on $(LISTEN), poke the tissue, draw what it felt, go on serving'
@@ -18,6 +19,9 @@ help:
 	@echo 'make bench-roundtrip the haptic round trip beside a bare gRPC echo'
 	@echo 'make bench-duty      a minute of 1 kHz touch and 60 frames a second: time kept, commands lost'
 	@echo 'make bench-frames    refining and encoding a frame beside a plain copy of its bytes'
+	@echo 'make bench-error     run time against error, every scheme on seven scenes: docs/benchmarks/error.md'
+	@echo 'make bench-kernel    the time of a step beside the machine'"'"'s limits, numba, Taichi and NumPy'
+	@echo 'make bench-stability the largest stable step, predicted and observed'
 
 need-rust:
 	@command -v $(CARGO) >/dev/null || { echo 'Rust is missing: install it from https://rustup.rs' >&2; exit 1; }
@@ -67,3 +71,25 @@ bench-duty: build
 
 bench-frames: need-rust
 	$(CARGO) bench --quiet --bench frames
+
+# `make bench-error ARGUMENTS=--quick`, and bench-kernel likewise.
+bench-error: need-rust
+	$(CARGO) bench --quiet --bench error -- $(ARGUMENTS)
+
+# The kernels that a user would write otherwise, each installed by itself: what does not install is left out.
+PEERS := target/venv-peers
+$(PEERS)/ready: benches/peers/requirements.txt
+	@if $(PYTHON) -c 'import venv, ensurepip' 2>/dev/null; then \
+		$(PYTHON) -m venv $(PEERS); \
+		while read package; do \
+			$(PEERS)/bin/pip install --quiet --disable-pip-version-check $$package \
+				|| echo "left out: $$package does not install with $$($(PYTHON) --version); rm -r $(PEERS) to try again" >&2; \
+		done < $<; \
+		touch $@; \
+	else echo 'left out: the peers need Python 3 with venv (Debian: apt-get install python3-venv)' >&2; fi
+
+bench-kernel: need-rust $(PEERS)/ready
+	PEERS=$(PEERS)/bin/python $(CARGO) bench --quiet --bench kernel -- $(ARGUMENTS)
+
+bench-stability: need-rust
+	$(CARGO) bench --quiet --bench stability

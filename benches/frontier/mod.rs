@@ -1,0 +1,92 @@
+//! Trials of schemes at steps, and which of them nothing beats.
+#![allow(unreachable_pub, missing_docs)]
+
+use serde_json::{Value, json};
+
+use crate::scenes::Case;
+
+/// One scheme at one step on one scene.
+#[derive(Clone)]
+pub struct Trial {
+    pub integrator: &'static str,
+    pub precision: &'static str,
+    /// Length of a substep, s.
+    pub step_s: f64,
+    /// Largest error, relative to the largest displacement.
+    pub displacement: f64,
+    /// Largest error, relative to the largest force.
+    pub force: f64,
+    /// Run time a simulated second, s.
+    pub cost: f64,
+}
+
+/// The trials of one scheme and number format, from the largest step on.
+pub type Curve = Vec<Trial>;
+
+impl Trial {
+    /// The larger error.
+    pub fn error(&self) -> f64 {
+        self.displacement.max(self.force)
+    }
+
+    pub fn figures(&self, is_best: bool) -> Value {
+        json!({
+            "integrator": self.integrator, "precision": self.precision, "step_s": self.step_s,
+            "displacement_error": self.displacement, "force_error": self.force,
+            "run_s_per_simulated_s": self.cost, "is_best": is_best,
+        })
+    }
+}
+
+/// Whether no other trial takes less time for an error that is smaller, or larger by no more than a 50th: f32 and f64 at
+/// one step differ by less, and nobody pays for that.
+pub fn is_best(trial: &Trial, curves: &[Curve]) -> bool {
+    !curves.iter().flatten().any(|other| other.error() < 1.02 * trial.error() && other.cost < trial.cost)
+}
+
+/// Whether a scheme has a trial that nothing beats, on any scene.
+pub fn on_any_frontier(integrator: &str, precision: &str, results: &[(&Case, Vec<Curve>)]) -> bool {
+    results.iter().any(|(_, curves)| {
+        let mut own = curves.iter().flatten().filter(|t| t.integrator == integrator && t.precision == precision);
+        own.any(|trial| is_best(trial, curves))
+    })
+}
+
+/// What an error costs.
+pub struct Offer {
+    /// Run time a simulated second, s.
+    pub cost: f64,
+    /// The scheme and number format.
+    pub by: String,
+    /// Beyond the smallest step tried.
+    pub extrapolated: bool,
+}
+
+/// The least cost at which those trials that `of` lets pass come to `error`. If none does and `extrapolate` is true,
+/// the f64 curves are carried on by first order; rounding would stop those in f32.
+pub fn cheapest(curves: &[Curve], error: f64, of: impl Fn(&Trial) -> bool, extrapolate: bool) -> Option<Offer> {
+    let offers = |extrapolated: bool| {
+        let curves = curves.iter().filter(|curve| of(&curve[0]) && (!extrapolated || curve[0].precision == "f64"));
+        let offer = move |curve: &Curve| {
+            let cost = if extrapolated { carried_on(curve, error) } else { between(curve, error)? };
+            Some(Offer { cost, by: format!("{} {}", curve[0].integrator, curve[0].precision), extrapolated })
+        };
+        curves.filter_map(offer).min_by(|a, b| a.cost.total_cmp(&b.cost))
+    };
+    offers(false).or_else(|| extrapolate.then(|| offers(true)).flatten())
+}
+
+/// The cost of `error` on a curve, between its trials by logarithms. An error larger than that of the largest step costs
+/// what that step does: a larger one is not stable.
+fn between(curve: &Curve, error: f64) -> Option<f64> {
+    let place = curve.iter().position(|trial| trial.error() <= error)?;
+    let fine = &curve[place];
+    let Some(coarse) = place.checked_sub(1).map(|place| &curve[place]) else { return Some(fine.cost) };
+    let share = (coarse.error() / error).ln() / (coarse.error() / fine.error()).ln();
+    Some(coarse.cost * (fine.cost / coarse.cost).powf(share))
+}
+
+/// The cost of `error` if halving the error doubles the cost.
+fn carried_on(curve: &Curve, error: f64) -> f64 {
+    curve.iter().map(|trial| trial.cost * trial.error() / error).fold(f64::INFINITY, f64::min)
+}

@@ -1,0 +1,270 @@
+//! How long does a step take? Every width of the kernel, number format and size, beside what the machine could do and what
+//! a user would write in NumPy, numba or Taichi. Writes docs/benchmarks/kernel.{md,json,svg}. The peers run if PEERS
+//! names a Python that has them; `make bench-kernel` sees to that. `-- --quick` measures two sizes once.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::disallowed_methods,
+    clippy::cast_precision_loss,
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    missing_docs
+)]
+
+mod report;
+mod subject;
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::process::Command;
+
+use glam::{DVec2, DVec3};
+use palpate::scene::law::Poke;
+use palpate::sheet::{Push, Tissue, at_rest};
+use report::chart::{Look, Panel, Series};
+use report::{Report, digits, quick, seconds};
+use serde_json::{Value, json};
+use subject::{INTEGRATOR, LANE_NAMES, LANES, PRECISION, PRECISIONS, known, set};
+
+/// Operations of 16 lanes a point. Of each of its 4 springs: 3 for the difference, 1½ along the spring, 3 for the square,
+/// 2 for the strain, 7 for a polynomial of degree 5 and its range, 4 for the force, 6 to add it to both ends. Of each of
+/// its 3 components: 7 for virtual spring, applied force, damping, the two sums, and to cut off what is too small.
+const OPERATIONS_PER_POINT: f64 = (4.0 * 26.5 + 3.0 * 7.0) / 16.0;
+
+/// A window of this length is long for the clock and short for whatever else the machine does.
+const WINDOW_S: f64 = 3e-3;
+/// All windows of one kernel in a round, if they are at least 5.
+const WINDOWS_S: f64 = 0.15;
+
+/// By what was measured and the side of the sheet: the windows of each round.
+type Rounds = BTreeMap<(String, usize), Vec<Windows>>;
+
+/// Many windows, ns a point and step.
+#[derive(Clone, Copy)]
+struct Windows {
+    least_ns: f64,
+    median_ns: f64,
+}
+
+/// A sheet in motion everywhere: pushed like the paper's, within a few points, and so weakly that it hardly matters as
+/// far as the rim, so that all numbers are ordinary.
+fn tissue(settings: &[String], side: usize) -> Box<dyn Tissue> {
+    let size = set("sheet.points", format!("[{side}, {side}]"));
+    let settings: Vec<String> = settings.iter().cloned().chain([size, set("stepping.substeps", 1)]).collect();
+    let model = subject::model(&settings).unwrap();
+    let spacing_m = model.scene.sheet.spacing_m;
+    let mut tissue = at_rest(&model);
+    let pushes = [(1.0, 0.5 / spacing_m), (0.01, 4.0 / (spacing_m * side as f64))];
+    for (tool, (strength, falloff_per_m)) in pushes.into_iter().enumerate() {
+        let push = Poke {
+            centre_m: DVec2::splat((side / 2) as f64 * spacing_m),
+            force_n: strength * DVec3::new(0.03, 0.0, -0.1),
+            falloff_per_m,
+            falloff_offset: 0.0,
+        };
+        tissue.push(tool, Some(Push::Held(push)));
+    }
+    tissue
+}
+
+fn measure(settings: &[String], side: usize) -> Windows {
+    let mut tissue = tissue(settings, side);
+    let mut run = |steps: usize| seconds(|| (0..steps).for_each(|_| tissue.step().unwrap())).0;
+    // Sets it in motion; the slowest kernels on the largest sheets have to do with little of it.
+    let step_s = run(4) / 4.0;
+    run((WINDOWS_S / step_s).min(50.0) as usize);
+    let steps = ((WINDOW_S / step_s) as usize).max(1);
+    let count = (WINDOWS_S / (steps as f64 * step_s)).clamp(5.0, 100.0) as usize;
+    let windows = (0..count).map(|_| run(steps) * 1e9 / (steps * side * side) as f64);
+    let mut windows: Vec<f64> = windows.collect();
+    windows.sort_by(f64::total_cmp);
+    Windows { least_ns: windows[0], median_ns: windows[count / 2] }
+}
+
+/// Settings of every kernel there is, by name.
+fn kernels() -> Vec<(String, Vec<String>)> {
+    let lanes: Vec<Option<&str>> = match known(LANES, &LANE_NAMES).as_slice() {
+        [] => vec![None],
+        names => names.iter().copied().map(Some).collect(),
+    };
+    let mut kernels = Vec::new();
+    for integrator in known(INTEGRATOR, &["central", "exponential3"]) {
+        for precision in PRECISIONS {
+            for lane in &lanes {
+                let mut settings = vec![set(INTEGRATOR, integrator), set(PRECISION, precision)];
+                settings.extend(lane.map(|lane| set(LANES, lane)));
+                let name = [integrator, precision, lane.unwrap_or("")].join(" ");
+                kernels.push((name.trim_end().to_owned(), settings));
+            }
+        }
+    }
+    kernels
+}
+
+/// What a peer's script prints, line by line; nothing if it does not run.
+fn peer(python: &str, script: &str, sides: &[usize]) -> Vec<Value> {
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/peers").join(script);
+    let mut command = Command::new(python);
+    command.arg(&script).args(sides.iter().map(ToString::to_string));
+    command.env("OMP_NUM_THREADS", "1").env("NUMBA_NUM_THREADS", "1").env("PYTHONDONTWRITEBYTECODE", "1");
+    let output = match command.output() {
+        Ok(output) if output.status.success() => output.stdout,
+        Ok(output) => {
+            let error = String::from_utf8_lossy(&output.stderr);
+            eprintln!("left out: {}: {}", script.display(), error.lines().last().unwrap_or(""));
+            return Vec::new();
+        }
+        Err(error) => {
+            eprintln!("left out: {python}: {error}");
+            return Vec::new();
+        }
+    };
+    String::from_utf8_lossy(&output).lines().filter_map(|line| serde_json::from_str(line).ok()).collect()
+}
+
+/// Compiles the limits for just this processor, and measures them.
+fn machine_limits(sides: &[usize]) -> Option<Value> {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let program = root.join("target/machine-limits");
+    let compiler = std::env::var("RUSTC").unwrap_or_else(|_| "rustc".to_owned());
+    let mut compile = Command::new(compiler);
+    compile.args(["-O", "--edition", "2024", "-C", "target-cpu=native", "-o"]).arg(&program);
+    compile.arg(root.join("benches/machine/limits.rs"));
+    if !compile.status().is_ok_and(|status| status.success()) {
+        eprintln!("left out: the machine's limits, which rustc has to compile");
+        return None;
+    }
+    let output = Command::new(&program).args(sides.iter().map(ToString::to_string)).output().unwrap();
+    serde_json::from_slice(&output.stdout).ok()
+}
+
+/// Of `rounds` rounds; the kernels, the peers and the limits take turns.
+fn measure_all(rounds: usize, sides: &[usize], kernels: &[(String, Vec<String>)]) -> (Rounds, Vec<Value>) {
+    let python = std::env::var("PEERS").ok().filter(|path| Path::new(path).exists());
+    if python.is_none() {
+        eprintln!("left out: the peers, as PEERS names no Python (make bench-kernel installs one)");
+    }
+    let mut measured = Rounds::new();
+    let mut limits = Vec::new();
+    for round in 1..=rounds {
+        for &side in sides {
+            eprintln!("round {round} of {rounds}: {side} × {side} points");
+            for (name, settings) in kernels {
+                measured.entry((name.clone(), side)).or_default().push(measure(settings, side));
+            }
+        }
+        for script in ["numba_sheet.py", "taichi_sheet.py", "numpy_sheet.py"] {
+            let Some(python) = &python else { continue };
+            eprintln!("round {round} of {rounds}: {script}");
+            for line in peer(python, script, sides) {
+                let key = (line["peer"].as_str().unwrap().to_owned(), line["side"].as_u64().unwrap() as usize);
+                let [least_ns, median_ns] = ["least_ns", "median_ns"].map(|name| line[name].as_f64().unwrap());
+                measured.entry(key).or_default().push(Windows { least_ns, median_ns });
+            }
+        }
+        limits.extend(machine_limits(sides));
+    }
+    (measured, limits)
+}
+
+/// The least of all rounds.
+fn least(rounds: &[Windows]) -> f64 {
+    rounds.iter().map(|windows| windows.least_ns).fold(f64::INFINITY, f64::min)
+}
+
+/// The median of the rounds' medians.
+fn median(rounds: &[Windows]) -> f64 {
+    let mut sorted: Vec<f64> = rounds.iter().map(|windows| windows.median_ns).collect();
+    sorted.sort_by(f64::total_cmp);
+    sorted[sorted.len() / 2]
+}
+
+fn main() {
+    let (rounds, sides): (_, &[usize]) = if quick() { (1, &[31, 121]) } else { (3, &[15, 31, 61, 121, 331, 1001]) };
+    let kernels = kernels();
+    let (measured, limits) = measure_all(rounds, sides, &kernels);
+    let of = |name: &str, side: usize| measured.get(&(name.to_owned(), side)).map(Vec::as_slice);
+    let mut names: Vec<String> = kernels.into_iter().map(|(name, _)| name).collect();
+    let peers = ["numba", "Taichi", "NumPy"].map(str::to_owned);
+    let peers: Vec<String> = peers.into_iter().filter(|peer| of(peer, sides[0]).is_some()).collect();
+    let product: Vec<String> = names.iter().filter(|name| name.starts_with("central f32")).cloned().collect();
+    names.extend(peers.iter().cloned());
+    let product_ns =
+        |side: usize| product.iter().map(|name| least(of(name, side).unwrap())).fold(f64::INFINITY, f64::min);
+
+    // The best that the machine did in any round.
+    let best = |read: &dyn Fn(&Value) -> Option<f64>| limits.iter().filter_map(read).reduce(f64::min);
+    let arithmetic_ns = best(&|limit| limit["fma_of_16_lanes_ns"].as_f64()).map(|ns| ns * OPERATIONS_PER_POINT);
+    let memory_ns = |side: usize| best(&|limit| limit["traffic_ns_per_point"][side.to_string()].as_f64());
+    let clock_ghz = limits.iter().filter_map(|limit| limit["clock_ghz"].as_f64()).reduce(f64::max);
+
+    let mut report = Report::new("kernel", "The time of a step", "make bench-kernel");
+    report.say(
+        "ns a point and substep, one substep a step, one thread, with all that a step does (applied force, checks, \
+         checkpoints): the least of many windows of about 3 ms in several rounds, and in brackets their median. The \
+         sheet is the paper's tissue, pushed at its centre so that all of it moves. The peers do the same arithmetic on \
+         the same tissue (benches/peers), without checks.",
+    );
+    let mut header = vec!["points".to_owned()];
+    header.extend(sides.iter().map(|side| format!("{side}²")));
+    let row = |name: &str, cell: &dyn Fn(usize) -> Option<String>| {
+        let cells = sides.iter().map(|side| cell(*side).unwrap_or_else(|| "–".to_owned()));
+        std::iter::once(name.to_owned()).chain(cells).collect::<Vec<_>>()
+    };
+    let time = |name: &str, side: usize| {
+        of(name, side).map(|rounds| format!("{} ({})", digits(least(rounds)), digits(median(rounds))))
+    };
+    let mut rows: Vec<_> = names.iter().map(|name| row(name, &|side| time(name, side))).collect();
+    rows.push(row("arithmetic limit, 16 lanes", &|_| arithmetic_ns.map(digits)));
+    rows.push(row("memory limit, f32", &|side| memory_ns(side).map(digits)));
+    report.table(&header, &rows);
+    report.say(&format!(
+        "The limits, from the same run: arithmetic is {OPERATIONS_PER_POINT:.1} operations of 16 lanes a point (counted in \
+         benches/kernel.rs) at the rate at which the machine multiplies and adds; memory is to read and write back 6 \
+         arrays of f32. Clock, from a chain of multiplications: {} GHz.",
+        clock_ghz.map_or("?".to_owned(), digits)
+    ));
+    if !peers.is_empty() {
+        report.heading("How many times faster");
+        report.say("The peer's least time over that of the fastest `central f32`.");
+        let ratio = |peer: &str, side: usize| of(peer, side).map(|rounds| digits(least(rounds) / product_ns(side)));
+        let rows: Vec<_> = peers.iter().map(|peer| row(peer, &|side| ratio(peer, side))).collect();
+        report.table(&header, &rows);
+    }
+
+    let figures = measured.iter().map(|((name, side), rounds)| {
+        json!({"name": name, "side": side, "least_ns": least(rounds), "median_ns": median(rounds)})
+    });
+    report.figure("ns_per_point_substep", figures.collect());
+    report.figure("limits", json!({"operations_of_16_lanes_per_point": OPERATIONS_PER_POINT, "rounds": limits}));
+
+    let line = |name: &str, hue: usize, look: Look, ns: &dyn Fn(usize) -> Option<f64>| Series {
+        name: name.to_owned(),
+        hue,
+        look,
+        points: sides.iter().filter_map(|side| Some(((side * side) as f64, ns(*side)?))).collect(),
+    };
+    let mut series = vec![
+        line("arithmetic limit", 2, Look::Broad, &|_| arithmetic_ns),
+        line("memory limit", 6, Look::Broad, &memory_ns),
+    ];
+    // One colour for both number formats.
+    let mut families: Vec<String> = Vec::new();
+    for name in &names {
+        let family = PRECISIONS.iter().fold(name.clone(), |name, precision| name.replace(precision, ""));
+        let hue = families.iter().position(|other| *other == family).unwrap_or_else(|| {
+            families.push(family);
+            families.len() - 1
+        });
+        let look = if name.contains("f64") { Look::Hollow } else { Look::Full };
+        series.push(line(name, hue, look, &|side| of(name, side).map(least)));
+    }
+    let panel = Panel::Lines {
+        title: "The time of a step".to_owned(),
+        x: "points of the sheet",
+        y: "ns a point and substep",
+        series,
+    };
+    report.say(&format!("Rounds: {rounds}. Python: the versions of benches/peers/requirements.txt."));
+    report.write(1, &[panel]);
+}

@@ -1,0 +1,61 @@
+"""What the peers share: the paper's tissue in numbers, the forces on it, and how a window is timed.
+
+The physics, at every point: structural and shear springs to 8 neighbours, each k (1 - L0/L)(x_b - x_a); a virtual
+spring -K u to where the point rests; damping -C v; a constant applied force. Central differences with implicit damping:
+d <- p d + q F(u), u <- u + d, u from rest, d the increment of the last step. f32, one thread.
+
+Each peer prints, for each size given as an argument, a JSON line: {"peer", "side", "least_ns", "median_ns"}, per point
+and step, of many windows of some milliseconds.
+"""
+
+import json
+import statistics
+import sys
+import time
+
+import numpy as np
+
+SPACING_M = 1 / 30
+STIFFNESS_N_PER_M = 10.0  # k, structural and shear
+VIRTUAL_N_PER_M = 5.0  # K
+DAMPING_N_S_PER_M = 0.5  # C
+MASS_KG = 0.01
+STEP_S = 1e-3
+
+_g = DAMPING_N_S_PER_M * STEP_S / MASS_KG
+P = np.float32((1 - _g / 2) / (1 + _g / 2))
+Q = np.float32(STEP_S * STEP_S / MASS_KG / (1 + _g / 2))
+K = np.float32(STIFFNESS_N_PER_M)
+VIRTUAL = np.float32(VIRTUAL_N_PER_M)
+H = np.float32(SPACING_M)
+
+# Each neighbour: rows and columns away.
+NEIGHBOURS = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1)]
+
+
+def forces(side):
+    """The held pushes of benches/kernel.rs: 0.1 N, falling off within a few points, and a weak one that reaches the rim."""
+    middle = side // 2
+    i, j = np.mgrid[0:side, 0:side]
+    r = SPACING_M * np.hypot(i - middle, j - middle)
+    strength = np.exp(-r / (2 * SPACING_M)) + 1e-2 * np.exp(-r / (side * SPACING_M / 4))
+    return np.stack([0.03 * strength, 0.0 * strength, -0.1 * strength]).astype(np.float32)
+
+
+def measure(peer, make):
+    """For each size: `make(side)` returns a function that does some steps, all of them before it returns."""
+    for side in [int(argument) for argument in sys.argv[1:]]:
+        run = make(side)
+        run(50)  # compiles, and sets the sheet in motion
+        begin = time.perf_counter()
+        run(10)
+        # Even, for those who swap two grids.
+        steps = 2 * max(1, round(2e-3 / ((time.perf_counter() - begin) / 10)))
+        windows = []
+        end = time.perf_counter() + 1.0
+        while len(windows) < 5 or time.perf_counter() < end:
+            begin = time.perf_counter()
+            run(steps)
+            windows.append((time.perf_counter() - begin) / (steps * side * side) * 1e9)
+        line = {"peer": peer, "side": side, "least_ns": min(windows), "median_ns": statistics.median(windows)}
+        print(json.dumps(line), flush=True)

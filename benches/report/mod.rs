@@ -1,0 +1,130 @@
+//! What a benchmark leaves behind: tables, figures and charts in docs/benchmarks; and how it reads the clock.
+// Each benchmark uses a part of this.
+#![allow(dead_code, unreachable_pub)]
+
+pub mod chart;
+
+use std::path::Path;
+use std::time::Instant;
+
+use chart::Panel;
+use serde_json::{Map, Value, json};
+
+/// A benchmark's results as they come in.
+pub struct Report {
+    name: &'static str,
+    text: String,
+    figures: Map<String, Value>,
+}
+
+impl Report {
+    /// A report that `command` makes again.
+    pub fn new(name: &'static str, title: &str, command: &str) -> Self {
+        let machine = machine();
+        let command = if quick() { format!("{command} ARGUMENTS=--quick") } else { command.to_owned() };
+        let text = format!(
+            "# {title}\n\n`{command}` wrote this page, [{name}.json]({name}.json) and the picture, on {machine}.\n\n\
+             ![{title}]({name}.svg)\n"
+        );
+        let mut figures = Map::new();
+        figures.insert("machine".to_owned(), json!(machine));
+        figures.insert("command".to_owned(), json!(command));
+        Report { name, text, figures }
+    }
+
+    /// A heading.
+    pub fn heading(&mut self, heading: &str) {
+        self.text += &format!("\n## {heading}\n");
+    }
+
+    /// A paragraph.
+    pub fn say(&mut self, paragraph: &str) {
+        self.text += &format!("\n{paragraph}\n");
+    }
+
+    /// A table; numbers are to be text already.
+    pub fn table(&mut self, header: &[String], rows: &[Vec<String>]) {
+        let line = |cells: &[String]| format!("| {} |\n", cells.join(" | "));
+        let rule: String = header.iter().map(|_| "|---").collect();
+        self.text += &format!("\n{}{rule}|\n", line(header));
+        self.text.extend(rows.iter().map(|row| line(row)));
+    }
+
+    /// What a program may read.
+    pub fn figure(&mut self, name: &str, value: Value) {
+        self.figures.insert(name.to_owned(), value);
+    }
+
+    /// Writes the page, the figures and the picture to docs/benchmarks, and the page to standard output.
+    pub fn write(self, columns: usize, panels: &[Panel]) {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/benchmarks");
+        std::fs::create_dir_all(&folder).unwrap();
+        let file = |extension: &str| folder.join(self.name).with_extension(extension);
+        std::fs::write(file("md"), &self.text).unwrap();
+        std::fs::write(file("json"), serde_json::to_string_pretty(&self.figures).unwrap() + "\n").unwrap();
+        std::fs::write(file("svg"), chart::svg(columns, panels)).unwrap();
+        print!("{}", self.text);
+    }
+}
+
+/// What the machine calls its processors.
+fn machine() -> String {
+    let text = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let of = |key: &str| {
+        let line = text.lines().find(|line| line.starts_with(key));
+        line.and_then(|line| line.split_once(": ")).map(|entry| entry.1)
+    };
+    let processors = text.lines().filter(|line| line.starts_with("processor")).count();
+    match of("model name") {
+        Some(model) => {
+            let (family, number) = (of("cpu family").unwrap_or("?"), of("model\t").unwrap_or("?"));
+            format!("{processors} × {model} (family {family}, model {number})")
+        }
+        None => format!("a machine that does not tell its name ({})", std::env::consts::ARCH),
+    }
+}
+
+/// What `work` takes, s.
+pub fn seconds<T>(work: impl FnOnce() -> T) -> (f64, T) {
+    let start = Instant::now();
+    let result = work();
+    (start.elapsed().as_secs_f64(), result)
+}
+
+/// The least of what `run` tells of each job, over `rounds` through all of them: so what slows the machine down for a
+/// while slows all jobs down, and is left out of all.
+pub fn least<J>(rounds: usize, jobs: &[J], mut run: impl FnMut(&J) -> f64) -> Vec<f64> {
+    let mut least = vec![f64::INFINITY; jobs.len()];
+    for _ in 0..rounds {
+        for (job, least) in jobs.iter().zip(&mut least) {
+            *least = least.min(run(job));
+        }
+    }
+    least
+}
+
+/// Whether the benchmark is to be quick and rough: `cargo bench --bench NAME -- --quick`.
+pub fn quick() -> bool {
+    std::env::args().any(|argument| argument == "--quick")
+}
+
+/// Two digits that tell: `1.3e-4`.
+pub fn rough(value: f64) -> String {
+    format!("{value:.1e}")
+}
+
+/// Three digits that tell, or a dash for what could not be had.
+pub fn digits(value: f64) -> String {
+    let power = value.abs().log10().floor();
+    match value.abs() {
+        _ if !value.is_finite() => "–".to_owned(),
+        0.0 => "0".to_owned(),
+        v if v < 1e-3 => format!("{value:.2e}"),
+        _ => format!("{value:.*}", (2.0 - power).max(0.0) as usize),
+    }
+}
+
+/// Text cells of a table.
+pub fn cells<S: ToString>(cells: impl IntoIterator<Item = S>) -> Vec<String> {
+    cells.into_iter().map(|cell| cell.to_string()).collect()
+}

@@ -1,0 +1,378 @@
+//! How large may a step be? The limit that is predicted, and the one that is observed, for every scheme over stiffness and
+//! damping; and what a large force does near it. Writes docs/benchmarks/stability.{md,json,svg}.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::disallowed_methods,
+    clippy::cast_precision_loss,
+    clippy::cast_possible_truncation,
+    missing_docs
+)]
+
+mod report;
+mod subject;
+
+use glam::{DVec2, DVec3};
+use palpate::scene::law::{CentreLaw, ForceLaw, Poke, Profile, StrengthLaw};
+use palpate::session::Session;
+use palpate::sheet::{Model, Push, at_rest};
+use report::chart::Panel;
+use report::{Report, cells, digits};
+use serde_json::{Value, json};
+use subject::{INTEGRATOR, INTEGRATORS, known, set};
+
+/// A small sheet; everything else is varied.
+const SHEET: [&str; 3] = ["sheet.points=[9, 9]", "stepping.substeps=1", "stepping.precision=f64"];
+const SPRINGS_N_PER_M: [f64; 4] = [0.0, 10.0, 100.0, 1000.0];
+const VIRTUAL_N_PER_M: f64 = 5.0;
+const DAMPINGS_N_S_PER_M: [f64; 5] = [0.0, 0.05, 0.5, 2.0, 10.0];
+
+/// What grows by less than this in so many steps is called stable: less than 0.05 % a step.
+const STEPS: u32 = 20_000;
+const GROWTH: f64 = 1e4;
+
+/// What becomes of a sheet, from best to worst, and its colour.
+const FATES: [(&str, f64); 4] = [("stable", 0.0), ("mended", 0.4), ("astray", 0.6), ("held", 1.0)];
+
+/// A scheme and what it has to do with.
+#[derive(Clone, Copy)]
+struct Tissue {
+    integrator: &'static str,
+    spring_n_per_m: f64,
+    damping_n_s_per_m: f64,
+}
+
+impl Tissue {
+    fn model(self, step_s: f64) -> palpate::refusal::Result<std::sync::Arc<Model>> {
+        let varied = [
+            set(INTEGRATOR, self.integrator),
+            set("springs.stiffness_n_per_m", self.spring_n_per_m),
+            set("virtual_springs.stiffness_n_per_m", VIRTUAL_N_PER_M),
+            set("damping.coefficient_n_s_per_m", self.damping_n_s_per_m),
+            set("stepping.rate_hz", 1.0 / step_s),
+        ];
+        let settings: Vec<String> = SHEET.map(str::to_owned).into_iter().chain(varied).collect();
+        subject::model(&settings)
+    }
+
+    /// What the scheme promises for a sheet whose fastest vibration is just `omega_per_s`: for this, springs whose bound
+    /// (12k + K″)/m is ω². `None` if it promises something for every step that a scene may have.
+    fn predicted_s(self, omega_per_s: f64, mass_kg: f64) -> Option<f64> {
+        let spring_n_per_m = (omega_per_s * omega_per_s * mass_kg - VIRTUAL_N_PER_M) / 12.0;
+        // What is left by rounding is no spring.
+        let spring_n_per_m = if spring_n_per_m < 1e-9 { 0.0 } else { spring_n_per_m };
+        let bounded = Tissue { spring_n_per_m, ..self };
+        largest_s(1.0 / omega_per_s, |step_s| bounded.model(step_s).unwrap().plan.stable)
+    }
+
+    /// The largest step at which a small kick, which leaves the motion linear, does not grow.
+    fn observed_s(self, omega_per_s: f64) -> Option<f64> {
+        largest_s(1.0 / omega_per_s, |step_s| self.after_kick(step_s).is_none())
+    }
+
+    /// What goes wrong after a small kick, if anything does.
+    fn after_kick(self, step_s: f64) -> Option<&'static str> {
+        let model = self.model(step_s).unwrap();
+        let sheet = &model.scene.sheet;
+        let small_m = 1e-9 * sheet.spacing_m;
+        let push = Poke {
+            centre_m: sheet.rest_m([3, 4]),
+            force_n: sheet.point_mass_kg * small_m / (step_s * step_s) * DVec3::new(1.0, 0.6, 0.3),
+            falloff_per_m: 0.7 / sheet.spacing_m,
+            falloff_offset: 0.0,
+        };
+        let mut tissue = at_rest(&model);
+        tissue.push(0, Some(Push::Held(push)));
+        let mut largest_m = 0.0;
+        for step in 0..STEPS {
+            if tissue.step().is_err() {
+                return Some("grows");
+            }
+            if step == 0 {
+                tissue.push(0, None);
+            }
+            // Looking costs as much as a step.
+            if step % 16 == 0 {
+                largest_m = tissue.largest_displacement_m();
+            }
+            if largest_m > GROWTH * small_m {
+                return Some("grows");
+            }
+            if tissue.guard_events() > 0 {
+                return Some("guard acts");
+            }
+        }
+        None
+    }
+
+    /// Which of [`FATES`] it is at such a force, if it is to move no farther than about `settled_m`.
+    fn fate(self, step_s: f64, force_n: f64, settled_m: f64) -> usize {
+        match self.pushed(step_s, force_n) {
+            None => 3,
+            Some((largest_m, _)) if largest_m > 3.0 * settled_m => 2,
+            Some((_, guard_events)) => usize::from(guard_events > 0),
+        }
+    }
+
+    /// The largest displacement under a force on the centre, and how often the guard acted; `None` if it ended the session.
+    fn pushed(self, step_s: f64, force_n: f64) -> Option<(f64, u64)> {
+        let model = self.model(step_s).unwrap();
+        let sheet = &model.scene.sheet;
+        let mut session = Session::new(&model);
+        let law = ForceLaw {
+            centre: CentreLaw::Hops(vec![(0, DVec2::splat(4.0 * sheet.spacing_m))]),
+            strength: StrengthLaw::Scaled(force_n * DVec3::new(0.6, 0.0, -0.8), Profile::Constant),
+            falloff_per_m: 1.0 / sheet.spacing_m,
+            falloff_offset: 0.0,
+        };
+        session.play_force(0, law);
+        let mut largest_m: f64 = 0.0;
+        let mut due = Vec::new();
+        for _ in 0..(1.0 / step_s).ceil().max(1000.0) as u32 {
+            session.advance(&mut due, |session| largest_m = largest_m.max(session.tissue().largest_displacement_m()));
+            if session.hold_reason().is_some() {
+                return None;
+            }
+        }
+        Some((largest_m, session.tissue().guard_events()))
+    }
+}
+
+/// The largest step for which `holds`, by bisection between a 64th and 64 times of `about_s`. `None` if it holds for all,
+/// 0 if for none.
+fn largest_s(about_s: f64, holds: impl Fn(f64) -> bool) -> Option<f64> {
+    let (mut low, mut high) = (about_s / 64.0, 64.0 * about_s);
+    if holds(high) {
+        return None;
+    }
+    if !holds(low) {
+        return Some(0.0);
+    }
+    while high / low > 1.0 + 1e-4 {
+        let middle = (low * high).sqrt();
+        if holds(middle) { low = middle } else { high = middle }
+    }
+    Some(low)
+}
+
+/// The fastest vibration of a sheet without fixed points or flexion at rest, rad/s: the largest eigenvalue of its stiffness by the power method. At rest a
+/// spring resists along itself only, so that all is in the plane.
+fn fastest_per_s(model: &Model) -> f64 {
+    let scene = &model.scene;
+    let [nx, ny] = model.points;
+    let (k, shear) = (scene.springs.stiffness_n_per_m, scene.springs.shear_stiffness_n_per_m);
+    let springs = [((0, 1), k), ((1, 0), k), ((1, 1), shear), ((1, -1), shear)];
+    let stiffness_of = |u: &[DVec2]| {
+        let mut force: Vec<DVec2> = u.iter().map(|u| scene.virtual_stiffness_n_per_m * *u).collect();
+        for ((di, dj), stiffness_n_per_m) in springs {
+            let along = DVec2::new(di as f64, dj as f64).normalize();
+            for i in 0..nx - di {
+                for j in 0..ny {
+                    let Some(there) = j.checked_add_signed(dj).filter(|there| *there < ny) else { continue };
+                    let (a, b) = (i * ny + j, (i + di) * ny + there);
+                    let pull = stiffness_n_per_m * along.dot(u[b] - u[a]) * along;
+                    force[a] -= pull;
+                    force[b] += pull;
+                }
+            }
+        }
+        force
+    };
+    let length = |u: &[DVec2]| u.iter().map(|u| u.length_squared()).sum::<f64>().sqrt();
+    // Something of every vibration.
+    let mut u: Vec<DVec2> = (0..model.len()).map(|n| DVec2::new((n as f64).sin(), (1.7 * n as f64).cos())).collect();
+    let mut eigenvalue = 0.0;
+    for _ in 0..20_000 {
+        let scale = 1.0 / length(&u);
+        u.iter_mut().for_each(|u| *u *= scale);
+        u = stiffness_of(&u);
+        eigenvalue = length(&u);
+    }
+    (eigenvalue / scene.sheet.point_mass_kg).sqrt()
+}
+
+/// dt·ω at the limit by the textbook, for the schemes that it has.
+fn textbook(integrator: &str, omega_per_s: f64, damping_per_s: f64) -> Option<f64> {
+    match integrator {
+        "central" => Some(2.0),
+        // (dt·ω)² + 2·C·dt/m = 4.
+        "lagged" => {
+            let half = damping_per_s / omega_per_s;
+            Some((half * half + 4.0).sqrt() - half)
+        }
+        _ => None,
+    }
+}
+
+/// dt·ω at the limit.
+struct Limit {
+    tissue: Tissue,
+    omega_per_s: f64,
+    predicted: Option<f64>,
+    observed: Option<f64>,
+    /// What goes wrong just beyond.
+    beyond: Option<&'static str>,
+    textbook: Option<f64>,
+}
+
+impl Limit {
+    fn find(tissue: Tissue) -> Self {
+        let model = tissue.model(1e-3).unwrap();
+        let mass_kg = model.scene.sheet.point_mass_kg;
+        let omega_per_s = fastest_per_s(&model);
+        let observed_s = tissue.observed_s(omega_per_s);
+        Limit {
+            tissue,
+            omega_per_s,
+            predicted: tissue.predicted_s(omega_per_s, mass_kg).map(|step_s| step_s * omega_per_s),
+            observed: observed_s.map(|step_s| step_s * omega_per_s),
+            beyond: observed_s.and_then(|step_s| tissue.after_kick(1.001 * step_s)),
+            textbook: textbook(tissue.integrator, omega_per_s, tissue.damping_n_s_per_m / mass_kg),
+        }
+    }
+
+    fn difference(&self) -> Option<f64> {
+        let predicted = self.predicted.filter(|turn| *turn > 0.0)?;
+        Some(100.0 * (self.observed? / predicted - 1.0))
+    }
+
+    fn row(&self) -> Vec<String> {
+        let text = |value: Option<f64>| value.map_or("any".to_owned(), |value| format!("{value:.3}"));
+        let tissue = &self.tissue;
+        let difference = self.difference().map_or("–".to_owned(), |percent| format!("{percent:+.2}"));
+        cells([
+            tissue.integrator,
+            &digits(tissue.damping_n_s_per_m),
+            &digits(tissue.spring_n_per_m),
+            &digits(self.omega_per_s),
+            &self.textbook.map_or("–".to_owned(), |turn| format!("{turn:.3}")),
+            &text(self.predicted),
+            &text(self.observed),
+            &difference,
+            self.beyond.unwrap_or(""),
+        ])
+    }
+
+    fn figures(&self) -> Value {
+        json!({
+            "integrator": self.tissue.integrator, "damping_n_s_per_m": self.tissue.damping_n_s_per_m,
+            "spring_n_per_m": self.tissue.spring_n_per_m, "virtual_n_per_m": VIRTUAL_N_PER_M,
+            "omega_per_s": self.omega_per_s, "textbook_turn": self.textbook, "predicted_turn": self.predicted,
+            "observed_turn": self.observed, "difference_percent": self.difference(), "beyond": self.beyond,
+        })
+    }
+}
+
+/// The observed limits of one scheme, over k and C.
+fn limit_panel(integrator: &str, limits: &[Limit]) -> Panel {
+    let of = |damping: f64, spring: f64| {
+        let mut limits = limits.iter().filter(|limit| limit.tissue.integrator == integrator);
+        let limit =
+            limits.find(|l| l.tissue.damping_n_s_per_m == damping && l.tissue.spring_n_per_m == spring).unwrap();
+        let observed = limit.observed.map_or("any".to_owned(), |turn| format!("{turn:.3}"));
+        let text = limit.difference().map_or(observed.clone(), |percent| format!("{observed} ({percent:+.1} %)"));
+        // Green: no smaller than predicted. Red: smaller by a tenth.
+        (text, limit.difference().map_or(0.0, |percent| (-percent / 10.0).clamp(0.0, 1.0)))
+    };
+    Panel::Cells {
+        title: format!("{integrator}: largest dt·ω observed (and against predicted)"),
+        x: ("k, N/m", cells(SPRINGS_N_PER_M)),
+        y: ("C, N·s/m", cells(DAMPINGS_N_S_PER_M)),
+        rows: DAMPINGS_N_S_PER_M.map(|damping| SPRINGS_N_PER_M.map(|spring| of(damping, spring)).to_vec()).to_vec(),
+    }
+}
+
+/// What a large force does, over steps and forces, and whether all within the predicted limit was well.
+fn force_panel(integrator: &'static str) -> (Panel, Vec<Value>) {
+    let tissue = Tissue { integrator, spring_n_per_m: 10.0, damping_n_s_per_m: 0.5 };
+    let omega_per_s = tissue.model(1e-3).unwrap().omega_bound_per_s;
+    let turns = [0.125, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0, 4.0];
+    let forces_n = [0.01, 0.1, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0];
+    let mut figures = Vec::new();
+    let rows = forces_n.map(|force_n| {
+        let (settled_m, _) = tissue.pushed(0.02 / omega_per_s, force_n).unwrap();
+        turns
+            .map(|turn| {
+                let step_s = turn / omega_per_s;
+                let (fate, shade) = FATES[tissue.fate(step_s, force_n, settled_m)];
+                let promised = tissue.model(step_s).unwrap().plan.stable;
+                figures.push(json!({
+                    "integrator": integrator, "turn": turn, "force_n": force_n, "promised": promised,
+                    "fate": fate,
+                }));
+                (if promised { "●".to_owned() } else { String::new() }, shade)
+            })
+            .to_vec()
+    });
+    let panel = Panel::Cells {
+        title: format!("{integrator}: stable, mended, astray, held (● promised)"),
+        x: ("dt·ω_b", cells(turns)),
+        y: ("force, N", cells(forces_n)),
+        rows: rows.to_vec(),
+    };
+    (panel, figures)
+}
+
+fn main() {
+    let mut limits = Vec::new();
+    let mut panels = Vec::new();
+    let mut fates = Vec::new();
+    for integrator in known(INTEGRATOR, &INTEGRATORS) {
+        eprintln!("{integrator}: limits");
+        for damping_n_s_per_m in DAMPINGS_N_S_PER_M {
+            for spring_n_per_m in SPRINGS_N_PER_M {
+                limits.push(Limit::find(Tissue { integrator, spring_n_per_m, damping_n_s_per_m }));
+            }
+        }
+        panels.push(limit_panel(integrator, &limits));
+        eprintln!("{integrator}: large forces");
+        let (panel, figures) = force_panel(integrator);
+        panels.push(panel);
+        fates.extend(figures);
+    }
+
+    let mut report = Report::new("stability", "The largest stable step", "make bench-stability");
+    report.say(&format!(
+        "The sheet: 9 × 9 points of 10 g, K″ = {VIRTUAL_N_PER_M} N/m, f64, one substep a step. ω is its fastest vibration at \
+         rest: the largest eigenvalue of its stiffness, by the power method. *Predicted* is the largest dt·ω that the \
+         scheme's plan calls stable for a sheet whose bound ω_b is that ω; *observed* the largest at which a kick of 1e-9 \
+         spacings grows by less than {GROWTH:.0e} in {STEPS} steps and the guard does not act, both by bisection; *textbook* is 2 for central \
+         differences, and the root of (dt·ω)² + 2·C·dt/m = 4 for the paper's scheme. A positive difference is on the safe \
+         side; strong damping makes what lies just beyond the limit grow too slowly to be seen. *Beyond* is what goes \
+         wrong just above the observed limit: a guard that acts on a motion that does not grow makes a negative \
+         difference."
+    ));
+    let header = [
+        "scheme",
+        "C, N·s/m",
+        "k, N/m",
+        "ω, rad/s",
+        "textbook dt·ω",
+        "predicted",
+        "observed",
+        "difference, %",
+        "beyond",
+    ];
+    report.table(&cells(header), &limits.iter().map(Limit::row).collect::<Vec<_>>());
+    report.heading("Large forces");
+    let promised = fates.iter().filter(|fate| fate["promised"] == true);
+    let broken: Vec<String> = promised
+        .clone()
+        .filter(|fate| fate["fate"] != "stable")
+        .map(|fate| {
+            format!("{} at dt·ω_b = {} and {} N: {}", fate["integrator"], fate["turn"], fate["force_n"], fate["fate"])
+        })
+        .collect();
+    report.say(&format!(
+        "k = 10 N/m, C = 0.5 N·s/m, a force at a slant on the centre at once, for a second and at least 1000 steps. ω_b \
+         bounds the fastest vibration under any deformation. *Mended* is what the guard took on with a shorter \
+         substep; *astray* is finite, yet more than three times as far as with \
+         a small step; *held* is what the guard ended. Of {} runs within the predicted limit, {} were not stable. {}",
+        promised.count(),
+        broken.len(),
+        broken.join("; ")
+    ));
+    report.figure("limits", limits.iter().map(Limit::figures).collect());
+    report.figure("large_forces", json!(fates));
+    report.write(2, &panels);
+}
