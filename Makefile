@@ -8,12 +8,13 @@ SCRIPT ?= scripts/vertical-60.toml
 
 VENV := target/venv
 
-.PHONY: help run build test lint picture bench-roundtrip bench-duty bench-frames bench-error bench-kernel \
+.PHONY: help run build test stress lint picture bench-roundtrip bench-duty bench-frames bench-error bench-kernel \
 	bench-stability need-rust need-python
 
 help:
 	@echo 'make run             build, serve on $(LISTEN), poke the tissue, draw what it felt, go on serving'
 	@echo 'make test            every test (Rust and Python 3)'
+	@echo 'make stress          ten thousand random scenes, ten million steps (some minutes)'
 	@echo 'make lint            formatting, compiler and clippy warnings'
 	@echo 'make picture         the picture of the README'
 	@echo 'make bench-roundtrip the haptic round trip beside a bare gRPC echo'
@@ -71,6 +72,10 @@ bench-duty: build
 
 bench-frames: need-rust
 	$(CARGO) bench --quiet --bench frames
+
+# Ten thousand random scenes, and a soak of ten million steps.
+stress: need-rust
+	PALPATE_STRESS_SCENES=10000 $(CARGO) test --release --test stress -- --include-ignored --nocapture
 
 # `make bench-error ARGUMENTS=--quick`, and bench-kernel likewise.
 bench-error: need-rust

@@ -52,21 +52,23 @@ pub struct Choice {
     pub expected_error: f64,
 }
 
-/// The expected error of a scheme with substeps of `substep_s`, but for rounding: of displacement and of force.
-pub fn expected_error(integrator: Integrator, sheet: &Oscillator, substep_s: f64) -> [f64; 2] {
+/// The expected error of a scheme with so many substeps in a step of `step_s`, but for rounding: of displacement and of
+/// force, at the ends of steps, which is all that anybody sees.
+pub fn expected_error(integrator: Integrator, sheet: &Oscillator, step_s: f64, seen: u32) -> [f64; 2] {
+    let substep_s = step_s / f64::from(seen);
     let (a, g) = sheet.scaled(substep_s);
     let scheme = Scheme::fit(integrator, a, g);
     let stiffest = sheet.scaled_spring_stiffness(substep_s);
     let decay_s = 2.0 * sheet.mass_kg / sheet.damping_n_s_per_m;
     let course_s = COURSE_S.min(4.0 * decay_s);
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    let substeps = (course_s / substep_s).ceil().clamp(16.0, 100_000.0) as u32;
+    let substeps = ((course_s / substep_s).ceil().min(1e5) as u32).max(seen.saturating_mul(16).min(100_000)).max(seen);
     // Damping ends the growth of an error; until then it is in proportion to time.
     let growth = (decay_s.min(LASTING_S) / course_s).max(1.0);
     let (mut errors, mut largest) = ([0.0; 2], [0.0; 2]);
     for k in 0..VIBRATIONS {
         let z = stiffest * (f64::from(k) + 0.5) / f64::from(VIBRATIONS);
-        let [u, force] = scheme.error_of_a_switched_force(z, a, g, substeps);
+        let [u, force] = scheme.error_of_a_switched_force(z, a, g, substeps, seen);
         errors[0] += u;
         errors[1] += force;
         largest[0] += 1.0 / (z + a).max(f64::MIN_POSITIVE);
@@ -129,7 +131,8 @@ pub fn choose(stepping: &Stepping, sheet: &Oscillator, most_substeps: u32) -> Ch
 }
 
 fn with_precision(integrator: Integrator, substeps: u32, stepping: &Stepping, sheet: &Oscillator) -> Choice {
-    let substep_s = stepping.rate_hz.recip() / f64::from(substeps);
+    let step_s = stepping.rate_hz.recip();
+    let substep_s = step_s / f64::from(substeps);
     let may_compensate = integrator.is_exponential();
     let precision = match stepping.precision {
         Precision::Auto => [Precision::F32, Precision::Compensated]
@@ -139,7 +142,7 @@ fn with_precision(integrator: Integrator, substeps: u32, stepping: &Stepping, sh
             .unwrap_or(Precision::F64),
         given => given,
     };
-    let [displacement, force] = expected_error(integrator, sheet, substep_s);
+    let [displacement, force] = expected_error(integrator, sheet, step_s, substeps);
     let expected_error = displacement.max(force) + rounding(precision, sheet, substep_s);
     Choice { integrator, substeps, precision, expected_error }
 }
@@ -153,7 +156,7 @@ fn fewest(integrator: Integrator, order: f64, sheet: &Oscillator, step_s: f64, t
         if substeps >= most {
             return substeps;
         }
-        let [displacement, force] = expected_error(integrator, sheet, step_s / f64::from(substeps));
+        let [displacement, force] = expected_error(integrator, sheet, step_s, substeps);
         let excess = displacement.max(force) / tolerance;
         if excess <= 1.0 {
             return substeps;

@@ -13,7 +13,7 @@ const LINE: usize = 64;
 /// By how many bytes a plane is longer than a multiple of a page. A processor takes a load for one that waits for an
 /// earlier store if the two agree in the last 12 bits of their addresses; with planes apart by whole pages, each store
 /// to x would seem to be what the next load of y waits for. (Measured at 31²: up to a quarter of a step.)
-const SKEW: usize = 704;
+const SKEW: usize = 1408;
 
 /// Where the numbers of a point are: component c of point [i, j] at c·plane + i·stride + j.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

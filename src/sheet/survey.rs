@@ -101,7 +101,14 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Look<'_, T, C> {
     const ENERGY: bool = true;
 
     #[inline(always)]
-    unsafe fn finish<V: Vector<Real = T>>(&self, _: usize, at: usize, x: [V; 3], n: [V; 3], _: &mut V) {
+    unsafe fn finish<V: Vector<Real = T>, const LEAN: bool>(
+        &self,
+        _: usize,
+        at: usize,
+        x: [V; 3],
+        n: [V; 3],
+        _: &mut V,
+    ) {
         // SAFETY: the fields have the layout; the sums as above.
         unsafe {
             let column = at % self.layout.stride;

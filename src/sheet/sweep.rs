@@ -29,12 +29,24 @@ pub(super) trait Stage<T: Real> {
     /// Whether the sweep tells the springs' energies as well.
     const ENERGY: bool = false;
 
+    /// Whether the stage has less to do in a row than in others: `finish` is told so at compile time.
+    fn is_lean(&self, _row: usize) -> bool {
+        true
+    }
+
     /// `x`: displacements of the block of row `row` that begins at place `at`; `n`: the springs' forces on it. Adds to
     /// `probe`, which the stage gets at the row's end.
     ///
     /// # Safety
     /// What the stage points to is as it promised.
-    unsafe fn finish<V: Vector<Real = T>>(&self, row: usize, at: usize, x: [V; 3], n: [V; 3], probe: &mut V);
+    unsafe fn finish<V: Vector<Real = T>, const LEAN: bool>(
+        &self,
+        row: usize,
+        at: usize,
+        x: [V; 3],
+        n: [V; 3],
+        probe: &mut V,
+    );
 
     /// The energies of springs that begin in the block at `column`.
     ///
@@ -118,10 +130,11 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
             }
             for i in 0..rows {
                 let x = self.x.add(i * stride);
-                if i + 1 < rows {
-                    self.row::<V, FLEXION, true>(flexion, i, x, blocks);
-                } else {
-                    self.row::<V, FLEXION, false>(flexion, i, x, blocks);
+                // The usual row has a loop of its own, without what only others need.
+                match (i + 1 < rows, !FLEXION && self.stage.is_lean(i)) {
+                    (true, true) => self.row::<V, FLEXION, true, true>(flexion, i, x, blocks),
+                    (true, false) => self.row::<V, FLEXION, true, false>(flexion, i, x, blocks),
+                    (false, _) => self.row::<V, FLEXION, false, false>(flexion, i, x, blocks),
                 }
             }
         }
@@ -129,7 +142,7 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
 
     /// Row `i`, which has a row below or not.
     #[inline(always)]
-    unsafe fn row<V: Vector<Real = T>, const FLEXION: bool, const BELOW: bool>(
+    unsafe fn row<V: Vector<Real = T>, const FLEXION: bool, const BELOW: bool, const LEAN: bool>(
         &self,
         flexion: &Kind<T>,
         i: usize,
@@ -234,7 +247,7 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                         self.stage.energy(column, energy);
                     }
                 }
-                self.stage.finish(i, i * stride + column, here, n, &mut probe);
+                self.stage.finish::<V, LEAN>(i, i * stride + column, here, n, &mut probe);
             }
             self.stage.end_row(probe);
         }
@@ -376,11 +389,22 @@ struct Advance<'a, T, C> {
 }
 
 impl<T: Real, C: Scheme<T>> Stage<T> for Advance<'_, T, C> {
+    fn is_lean(&self, row: usize) -> bool {
+        self.free.is_null() && !self.forced.contains(&row)
+    }
+
     #[inline(always)]
-    unsafe fn finish<V: Vector<Real = T>>(&self, row: usize, at: usize, x: [V; 3], n: [V; 3], probe: &mut V) {
+    unsafe fn finish<V: Vector<Real = T>, const LEAN: bool>(
+        &self,
+        row: usize,
+        at: usize,
+        x: [V; 3],
+        n: [V; 3],
+        probe: &mut V,
+    ) {
         // SAFETY: the caller's promise.
         unsafe {
-            let forced = self.forced.contains(&row);
+            let forced = !LEAN && self.forced.contains(&row);
             for c in 0..3 {
                 let at = at + c * self.plane;
                 let d = V::load(self.d.add(at));
@@ -394,7 +418,7 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Advance<'_, T, C> {
                 } else {
                     self.scheme.advance(x[c], d, n[c], &mut kept, None)
                 };
-                if !self.free.is_null() {
+                if !LEAN && !self.free.is_null() {
                     let free = V::load(self.free.add(at));
                     (x, d) = (x.mul(free), d.mul(free));
                 }

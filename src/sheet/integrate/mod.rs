@@ -140,8 +140,8 @@ impl Scheme {
     }
 
     /// A force of 1 that is switched on, and the vibration z that it excites: the largest errors of displacement and of the
-    /// force (of springs, virtual springs and damping) within `substeps`.
-    pub fn error_of_a_switched_force(&self, z: f64, a: f64, g: f64, substeps: u32) -> [f64; 2] {
+    /// force (of springs, virtual springs and damping) within `substeps`, seen after every `seen` of them.
+    pub fn error_of_a_switched_force(&self, z: f64, a: f64, g: f64, substeps: u32, seen: u32) -> [f64; 2] {
         let (step, forced) = (self.propagator(z), self.forced(z));
         // y′ = A·y + b, with the force as a third that does not change.
         let exact = matrix::Matrix::of(3, |i, j| [[0.0, 1.0, 0.0], [-z - a, -g, 1.0], [0.0; 3]][i][j]).exponential();
@@ -154,6 +154,9 @@ impl Scheme {
             state = step.applied_to(&state);
             state.iter_mut().zip(&forced).for_each(|(value, force)| *value += part * force);
             truth = exact.applied_to(&truth);
+            if !(n + 1).is_multiple_of(seen) {
+                continue;
+            }
             let [u, w] = match self {
                 Scheme::TwoStep(two) => {
                     let next = two.p * state[1] + two.q * (1.0 - (z + two.a) * state[0]);

@@ -1,0 +1,224 @@
+//! Random scenes under random tools, and adversarial ones: all stays finite, no energy comes from nowhere, nothing panics.
+//!
+//! A hundred in every run of the tests; `make stress` does ten thousand (`PALPATE_STRESS_SCENES`) and a soak of 10⁷ steps.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
+
+mod common;
+
+use common::{SMALL, model, scene_with};
+use glam::DVec3;
+use palpate::limits::Limits;
+use palpate::scene::Scene;
+use palpate::scene::law::Poke;
+use palpate::sheet::{self, Grasp, Model, Push, Tissue};
+use proptest::prelude::*;
+use proptest::test_runner::{Config, TestRunner};
+
+/// What the energy may exceed the work of all tools by, as a part of the largest energy so far and of all work: the
+/// margin of the guard, which looks every 256 substeps, and what the work of held positions is estimated by.
+const MARGIN: f64 = 0.1;
+
+/// Ten to the power of something in a range.
+fn decades(from: f64, to: f64) -> impl Strategy<Value = f64> {
+    (from..to).prop_map(|exponent| 10_f64.powf(exponent))
+}
+
+/// A scene as a file says it: k over twelve decades, all coefficients also 0.
+fn any_scene() -> impl Strategy<Value = String> {
+    let coefficient = |from, to| prop_oneof![6 => decades(from, to), 1 => Just(0.0)];
+    let integrator = prop_oneof![6 => Just("auto"), 1 => Just("central"), 1 => Just("exponential2"), 1 => Just("rk4")];
+    let shape = (1..14_usize, 1..20_usize, decades(-3.0, 0.0), decades(-4.0, 0.0));
+    let elastic = (coefficient(-6.0, 6.0), coefficient(-3.0, 3.0), coefficient(-3.0, 1.0), any::<bool>());
+    let fixed = prop_oneof![3 => Just("[]"), 1 => Just("\"edges\""), 1 => Just("\"corners\"")];
+    let tolerance = decades(-7.0, -2.0);
+    (shape, elastic, fixed, integrator, tolerance).prop_map(
+        |((nx, ny, h, m), (k, virtual_k, c, flexion), fixed, integrator, tolerance)| {
+            format!(
+                "[sheet]\npoints = [{nx}, {ny}]\nspacing_m = {h:e}\npoint_mass_kg = {m:e}\nfixed = {fixed}\n\
+                 [springs]\nstiffness_n_per_m = {k:e}\nflexion = {flexion}\n\
+                 [virtual_springs]\nstiffness_n_per_m = {virtual_k:e}\n[damping]\ncoefficient_n_s_per_m = {c:e}\n\
+                 [stepping]\nintegrator = \"{integrator}\"\ntolerance = {tolerance:e}\n"
+            )
+        },
+    )
+}
+
+/// What a tool does before a step: how strongly (in terms of the scene), where, and in which manner.
+#[derive(Debug, Clone, Copy)]
+struct Act {
+    step: u64,
+    tool: usize,
+    place: [f64; 2],
+    towards: [f64; 3],
+    manner: u8,
+}
+
+fn any_act() -> impl Strategy<Value = Act> {
+    (0..200_u64, 0..3_usize, [0.0..1.0_f64, 0.0..1.0_f64], [-1.0..1.0_f64, -1.0..1.0, -1.0..1.0], 0..8_u8)
+        .prop_map(|(step, tool, place, towards, manner)| Act { step, tool, place, towards, manner })
+}
+
+fn act(tissue: &mut dyn Tissue, Act { tool, place, towards, manner, .. }: Act) {
+    let scene = tissue.model().scene.clone();
+    let [nx, ny] = scene.sheet.points;
+    let point = [(place[0] * nx as f64) as usize, (place[1] * ny as f64) as usize];
+    let (spacing_m, towards) = (scene.sheet.spacing_m, DVec3::from_array(towards));
+    if scene.sheet.is_fixed(point) || manner == 0 {
+        return tissue.release(tool);
+    }
+    if manner < 3 {
+        // Up to through its neighbours and out: springs pressed to nothing and turned inside out.
+        let index = tissue.model().index_of(point);
+        return tissue.grasp(tool, index, Grasp::Held(2.5 * spacing_m * towards));
+    }
+    // What moves a point by up to some spacings.
+    let stiffness = scene.virtual_stiffness_n_per_m + scene.springs.stiffness_n_per_m.min(1e3);
+    tissue.push(
+        tool,
+        Some(Push::Held(Poke {
+            centre_m: scene.sheet.rest_m(point),
+            force_n: 3.0 * stiffness * spacing_m * towards,
+            falloff_per_m: 10_f64.powf(2.0 * place[0] - 1.0) / spacing_m,
+            falloff_offset: 0.0,
+        })),
+    );
+}
+
+fn all_finite(tissue: &dyn Tissue) -> bool {
+    (0..tissue.model().len()).all(|index| {
+        let point = tissue.point(index);
+        let whole = point.displacement_m.is_finite() && point.velocity_m_per_s.is_finite();
+        whole && point.reaction_n().is_finite() && point.constraint_n.is_none_or(DVec3::is_finite)
+    })
+}
+
+fn energy_j(tissue: &dyn Tissue) -> f64 {
+    let energy = tissue.energy();
+    energy.kinetic_j + energy.spring_j + energy.virtual_j
+}
+
+/// Plays the acts for 256 steps, then lets go and waits: all must be finite, and without tools no energy may come.
+fn play(text: &str, acts: &[Act]) -> Result<(), TestCaseError> {
+    let limits = Limits { substeps: 400, ..Limits::default() };
+    let scene = Scene::parse("random", text, &[], &limits).unwrap();
+    // What would need more substeps is refused, which is an answer.
+    let Ok(model) = Model::compile(&scene, &limits) else { return Ok(()) };
+    let mut tissue = sheet::at_rest(&model);
+    let mut acts = acts.to_vec();
+    acts.sort_by_key(|act| act.step);
+    let mut waiting = acts.into_iter().peekable();
+    for step in 0..256 {
+        while let Some(next) = waiting.next_if(|act| act.step == step) {
+            act(&mut *tissue, next);
+        }
+        if tissue.step().is_err() {
+            // Held: the state is a finite one, and stays.
+            prop_assert!(all_finite(&*tissue));
+            return Ok(());
+        }
+        if step % 32 == 0 {
+            prop_assert!(all_finite(&*tissue), "step {step}");
+        }
+    }
+    (0..3).for_each(|tool| tissue.release(tool));
+    tissue.step().ok();
+    let mut before_j = energy_j(&*tissue);
+    for window in 0..4 {
+        for _ in 0..64 {
+            if tissue.step().is_err() {
+                prop_assert!(all_finite(&*tissue));
+                return Ok(());
+            }
+        }
+        prop_assert!(all_finite(&*tissue), "after, window {window}");
+        let now_j = energy_j(&*tissue);
+        prop_assert!(now_j <= before_j * (1.0 + MARGIN) + 1e-18, "energy {before_j:e} to {now_j:e}, without a tool");
+        before_j = before_j.max(now_j);
+    }
+    Ok(())
+}
+
+#[test]
+fn random_scenes_stay_finite_and_take_no_energy_from_nowhere() {
+    let cases = std::env::var("PALPATE_STRESS_SCENES").map_or(100, |scenes| scenes.parse().unwrap());
+    let mut runner =
+        TestRunner::new(Config { cases, failure_persistence: None, max_shrink_iters: 200, ..Config::default() });
+    let done = std::cell::Cell::new(0_u32);
+    let input = (any_scene(), prop::collection::vec(any_act(), 0..12));
+    let ended = runner.run(&input, |(text, acts)| {
+        done.set(done.get() + 1);
+        if done.get().is_multiple_of(1000) {
+            eprintln!("{} scenes", done.get());
+        }
+        play(&text, &acts)
+    });
+    if let Err(failure) = ended {
+        panic!("after {} scenes: {failure}", done.get());
+    }
+}
+
+/// Tools that do their worst, at 1 kHz.
+#[test]
+fn adversarial_commands_leave_the_tissue_finite() {
+    for worst in 0..4 {
+        let scene = scene_with(SMALL, &["stepping.precision=f32"]);
+        let model = model(&scene);
+        let mut tissue = sheet::at_rest(&model);
+        // The sign changes at the frequency of the fastest vibration at rest.
+        let half_period = (std::f64::consts::PI / model.omega_bound_per_s * scene.stepping.rate_hz).max(1.0) as u64;
+        for step in 0..2000_u64 {
+            let sign = if (step / half_period).is_multiple_of(2) { 1.0 } else { -1.0 };
+            let corner = [[0, 0], [6, 4], [0, 4], [6, 0]][(step % 4) as usize];
+            let place = DVec3::new(sign, -sign, sign) * 0.3;
+            match worst {
+                0 => tissue.grasp(0, model.index_of(corner), Grasp::Held(place)),
+                1 => tissue.push(0, Some(common::push_on(&scene, corner, [1e4, 1e4 * sign, -1e4]))),
+                2 => tissue.push(0, Some(common::push_on(&scene, [3, 2], [50.0 * sign, 20.0, 100.0 * sign]))),
+                _ => tissue.grasp((step % 3) as usize, model.index_of([3, 2]), Grasp::Held(place)),
+            }
+            if tissue.step().is_err() {
+                break;
+            }
+            assert!(all_finite(&*tissue), "{worst}, step {step}");
+        }
+        assert!(all_finite(&*tissue));
+    }
+}
+
+#[test]
+fn a_sheet_that_wrinkles_stays_bounded() {
+    let sets = ["springs.stiffness_n_per_m=1e4", "sheet.points=[15, 15]", "sheet.point_mass_kg=0.01"];
+    let scene = scene_with(SMALL, &sets);
+    let mut tissue = sheet::at_rest(&model(&scene));
+    // Both sides pressed towards the middle, and a little out of the plane.
+    tissue.push(0, Some(common::push_on(&scene, [0, 7], [400.0, 0.0, 0.5])));
+    tissue.push(1, Some(common::push_on(&scene, [14, 7], [-400.0, 0.0, -0.3])));
+    for _ in 0..500 {
+        tissue.step().unwrap();
+    }
+    assert!(all_finite(&*tissue) && tissue.largest_displacement_m() < 10.0 * scene.sheet.longer_side_m());
+}
+
+#[test]
+#[ignore = "ten million steps: make stress"]
+fn ten_million_steps_end_where_they_should() {
+    let scene = scene_with(SMALL, &["stepping.precision=auto"]);
+    let mut tissue = sheet::at_rest(&model(&scene));
+    tissue.push(0, Some(common::push_on(&scene, [3, 2], [0.1, 0.0, -0.3])));
+    let mut settled = None;
+    for million in 0..10 {
+        for _ in 0..1_000_000 {
+            tissue.step().unwrap();
+        }
+        let now = tissue.point(tissue.model().index_of([3, 2])).displacement_m;
+        eprintln!("{} million steps: {now}", million + 1);
+        assert!(all_finite(&*tissue));
+        let settled = *settled.get_or_insert(now);
+        assert!((now - settled).length() < 1e-6 * settled.length(), "{settled} crept to {now}");
+    }
+    tissue.release(0);
+    for _ in 0..1_000_000 {
+        tissue.step().unwrap();
+    }
+    assert!(tissue.largest_displacement_m() < 1e-9 * scene.sheet.spacing_m);
+}
