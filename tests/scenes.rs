@@ -74,7 +74,7 @@ fn a_run_writes_a_header_records_and_a_summary() {
     assert_eq!(lines.len(), 5);
     let header = &lines[0]["run"];
     assert_eq!((&header["scene"], &header["script"]), (&"test".into(), &"test".into()));
-    assert_eq!((&header["integrator"], &header["precision"]), (&"exponential4".into(), &"f32".into()));
+    assert_eq!((&header["integrator"], &header["precision"]), (&"exponential3".into(), &"compensated".into()));
     assert_eq!((&header["substeps"], &header["rate_hz"]), (&1.into(), &1000.0.into()));
     assert!(header["version"].is_string());
     for (index, record) in lines[1..4].iter().enumerate() {

@@ -8,14 +8,14 @@
 //! [`SAFETY`] of the tolerance is aimed at. (Measured against expected, on all scenes of `make bench-error`:
 //! docs/benchmarks/error.md.)
 //!
-//! **Rounding.** f32 errs by what [`rounding`] says, from measurements; a third of the tolerance may be that.
+//! **Rounding.** f32 errs by what [`rounding`] says, from measurements; a tenth of the tolerance may be that.
 
 use super::integrate::{Oscillator, Scheme};
 use super::stability;
 use crate::scene::{Integrator, Precision, Stepping};
 
 /// Part of the tolerance that is aimed at.
-const SAFETY: f64 = 0.5;
+const SAFETY: f64 = 0.4;
 
 /// Vibrations that are looked at.
 const VIBRATIONS: u32 = 12;
@@ -138,7 +138,7 @@ fn with_precision(integrator: Integrator, substeps: u32, stepping: &Stepping, sh
         Precision::Auto => [Precision::F32, Precision::Compensated]
             .into_iter()
             .filter(|format| may_compensate || *format == Precision::F32)
-            .find(|format| rounding(*format, sheet, substep_s) <= stepping.tolerance / 3.0)
+            .find(|format| rounding(*format, sheet, substep_s) <= stepping.tolerance / 10.0)
             .unwrap_or(Precision::F64),
         given => given,
     };

@@ -104,7 +104,12 @@ pub(super) struct Work {
     done_j: f64,
     /// At the last survey.
     energy_j: f64,
+    /// The largest that any survey saw.
+    largest_j: f64,
 }
+
+/// A rise of less than this part of the largest energy so far is noise of rounding, in a sheet that has come to rest.
+const NOISE: f64 = 1e-10;
 
 impl Work {
     /// Adds what was done.
@@ -115,10 +120,11 @@ impl Work {
     /// Judges an energy; `present_j`: the present force times the displacement. The account begins anew.
     pub(super) fn survey(&mut self, energy_j: f64, present_j: f64) -> Result<(), Cause> {
         let (work_j, before_j) = (self.done_j + present_j, self.energy_j);
-        if energy_j - before_j > work_j + MARGIN * (before_j + work_j.abs()) {
+        let allowed_j = work_j + MARGIN * (before_j + work_j.abs()) + NOISE * self.largest_j;
+        if energy_j - before_j > allowed_j {
             return Err(Cause::Energy { energy_j, before_j, work_j });
         }
-        *self = Work { done_j: -present_j, energy_j };
+        *self = Work { done_j: -present_j, energy_j, largest_j: self.largest_j.max(energy_j) };
         Ok(())
     }
 }
