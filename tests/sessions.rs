@@ -37,7 +37,7 @@ async fn sessions_are_made_listed_and_deleted() {
     own.name = "own".into();
     own.stepping = Some(pb::Stepping { precision: "f64".into(), ..Default::default() });
     let own = server.create(Source::Scene(own), true).await.unwrap();
-    assert_eq!((own.precision.as_str(), own.integrator.as_str(), own.substeps), ("f64", "central", 1));
+    assert_eq!((own.precision.as_str(), own.integrator.as_str(), own.substeps), ("f64", "exponential4", 1));
     assert_eq!((by_name.state(), own.state()), (pb::SessionState::Running, pb::SessionState::Paused));
     let listed = sessions.list_sessions(pb::ListSessionsRequest {}).await.unwrap().into_inner().sessions;
     let ids: Vec<_> = listed.iter().map(|session| session.session_id.clone()).collect();
