@@ -57,8 +57,8 @@ fn the_golden_hash_of_a_fixed_scene_stays() {
     }
 }
 
-const GOLDEN_F32: &str = "4cf4440b7bcf2d8f9c86576d4e68f374";
-const GOLDEN_F64: &str = "f53463ac7430c730222d75131497b9a0";
+const GOLDEN_F32: &str = "900c0c0fc034ddec3dc81e05bc9c0dd0";
+const GOLDEN_F64: &str = "fdbab0215e33856a373b89df08dc9058";
 
 #[test]
 fn every_width_of_vectors_gives_the_same_bits() {

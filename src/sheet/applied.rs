@@ -1,15 +1,23 @@
-//! Surgical forces: how those of all tools add up to fields over the points.
+//! Surgical forces: how those of all tools act on the points.
 //!
 //! A scheme says at which moments of a substep it asks for a law, and with which weights that adds to its fields. A
 //! two-step scheme sees the substep's beginning only. Where the force jumps there, it must see the mean of the values
 //! just before and just after (as if the substep before had ended, and this one begun, with a half kick each): with
 //! the new value alone the error is first order, with the mean second. The others take the new value.
+//!
+//! A force is a vector times a falloff over the points. The falloff is a table, made when a poke is placed, and only
+//! where it counts; the sweep multiplies. So a force that changes costs as little as one that stays, and only one that
+//! moves needs new tables.
+#![allow(unsafe_code)]
+// Iterators over vectors are not always inlined, and then run without the instructions of their caller: ten times slower.
+#![allow(clippy::needless_range_loop)]
 
 use std::ops::Range;
 
 use glam::DVec3;
 
 use super::field::{Field, Layout};
+use super::lanes::{self, Run, Vector, Width};
 use super::model::{Model, Plan};
 use super::real::Real;
 use crate::scene::law::{ForceLaw, Moment, Poke};
@@ -43,30 +51,35 @@ struct Slot {
 #[derive(Debug, Clone)]
 pub(super) struct Applied<T: Real> {
     slots: Vec<Slot>,
-    /// What acts in the substep under way, in the terms of the scheme: as many fields as it wants.
-    pub(super) fields: Vec<Field<T>>,
-    /// Rows that have a force.
-    pub(super) rows: Range<usize>,
-    /// What `fields` were summed from.
-    terms: Vec<Term>,
-    tables: Vec<Table>,
+    /// What acts in the substep under way.
+    pub(super) terms: Vec<Term<T>>,
+    /// The same before it has tables: kept, so that a step allocates nothing.
+    wanted: Vec<Wanted>,
+    /// The terms hold for the coming steps as well.
+    settled: bool,
 }
 
-/// Forces of the same falloff: of each field a weighted sum, N. The force of `poke` does not matter.
-#[derive(Debug, Clone, PartialEq)]
-struct Term {
+/// Forces of the same falloff: of each of the scheme's fields a weighted sum, N.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Wanted {
+    /// Its force does not matter.
     poke: Poke,
     forces_n: [DVec3; 3],
 }
 
-/// e^{−c·r + c′} over the points where it counts, for one centre. Made when the poke is placed.
+/// A force over the points: a vector times e^{−c·r}.
 #[derive(Debug, Clone)]
-struct Table {
-    /// The poke it is made for; its force does not matter.
-    poke: Poke,
-    rows: [usize; 2],
-    columns: [usize; 2],
-    factors: Vec<f64>,
+pub(super) struct Term<T: Real> {
+    wanted: Wanted,
+    /// e^{c′}.
+    gain: f64,
+    /// Of each of the scheme's fields, in its terms.
+    forces: [[T; 3]; 3],
+    /// Where it counts.
+    rows: Range<usize>,
+    columns: Range<usize>,
+    /// e^{−c·r} of those rows, each as long as a row of the sheet; 0 elsewhere.
+    factors: Field<T>,
 }
 
 /// Whether two pokes differ in the force alone.
@@ -74,8 +87,21 @@ fn same_falloff(a: &Poke, b: &Poke) -> bool {
     Poke { force_n: b.force_n, ..*a } == *b
 }
 
-impl Table {
-    fn new<T: Real>(poke: &Poke, model: &Model) -> Self {
+impl<T: Real> Term<T> {
+    fn new() -> Self {
+        let poke = Poke { centre_m: glam::DVec2::ZERO, force_n: DVec3::ZERO, falloff_per_m: 0.0, falloff_offset: 0.0 };
+        Term {
+            wanted: Wanted { poke, forces_n: [DVec3::ZERO; 3] },
+            gain: 1.0,
+            forces: [[T::default(); 3]; 3],
+            rows: 0..0,
+            columns: 0..0,
+            factors: Field::of_length(0),
+        }
+    }
+
+    /// Puts the falloff of `poke` into the table.
+    fn place(&mut self, poke: &Poke, model: &Model, layout: &Layout) {
         let spacing_m = model.scene.sheet.spacing_m;
         let reach_m = -T::NEGLIGIBLE_EXPONENT / poke.falloff_per_m;
         let span = |centre_m: f64, points: usize| {
@@ -84,14 +110,136 @@ impl Table {
             let [from, to] =
                 [((centre_m - reach_m) / spacing_m).ceil(), ((centre_m + reach_m) / spacing_m).floor() + 1.0]
                     .map(|edge| (edge.max(0.0) as usize).min(points));
-            [from, to.max(from)]
+            from..to.max(from)
         };
-        let [rows, columns] = [span(poke.centre_m.x, model.points[0]), span(poke.centre_m.y, model.points[1])];
-        let factors = (rows[0]..rows[1]).flat_map(|i| {
-            (columns[0]..columns[1]).map(move |j| factor(poke, [i, j], spacing_m, T::NEGLIGIBLE_EXPONENT))
-        });
-        Table { poke: *poke, rows, columns, factors: factors.collect() }
+        (self.rows, self.columns) = (span(poke.centre_m.x, model.points[0]), span(poke.centre_m.y, model.points[1]));
+        // The same bits on every machine: not the platform's exponential.
+        self.gain = libm::exp(poke.falloff_offset);
+        self.factors.resize(self.rows.len() * layout.stride);
+        let falloff = Falloff {
+            centre: (poke.centre_m / spacing_m).to_array(),
+            per_spacing: poke.falloff_per_m * spacing_m,
+            rows: self.rows.clone(),
+            columns: self.columns.clone(),
+            stride: layout.stride,
+            factors: self.factors.as_mut_ptr(),
+        };
+        // SAFETY: `factors` has as many rows, each of whole blocks.
+        unsafe { lanes::run(Width::of(model.lanes), &falloff) };
     }
+
+    fn set(&mut self, wanted: Wanted, scale: f64) {
+        self.forces = wanted.forces_n.map(|force_n| (self.gain * scale * force_n).to_array().map(T::of));
+        self.wanted = wanted;
+    }
+
+    /// e^{−c·r} at a point.
+    fn factor(&self, layout: &Layout, [i, j]: [usize; 2]) -> T {
+        if self.rows.contains(&i) { self.factors[(i - self.rows.start) * layout.stride + j] } else { T::default() }
+    }
+}
+
+/// Fills a table.
+struct Falloff<T> {
+    /// In spacings, from the first point.
+    centre: [f64; 2],
+    per_spacing: f64,
+    rows: Range<usize>,
+    columns: Range<usize>,
+    stride: usize,
+    factors: *mut T,
+}
+
+impl<T: Real> Run<T> for Falloff<T> {
+    #[inline(always)]
+    #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    unsafe fn run<V: Vector<Real = T>>(&self) {
+        let zero = V::splat(T::default());
+        let slope = V::splat(T::of(-self.per_spacing));
+        let farthest = V::splat(T::of(-T::NEGLIGIBLE_EXPONENT));
+        let [_, centre] = self.centre;
+        // Column numbers and what is whole of the centre are exact in any format; only the rest is rounded.
+        let (whole, rest) = (V::splat(T::of(centre.floor())), V::splat(T::of(centre - centre.floor())));
+        for i in self.rows.clone() {
+            let x = T::of(i as f64 - self.centre[0]);
+            let x = V::splat(x * x);
+            for at in (0..self.stride).step_by(V::LANES) {
+                let mut factor = zero;
+                if at < self.columns.end && at + V::LANES > self.columns.start {
+                    let y = V::count(at).sub(whole).sub(rest);
+                    let exponent = slope.mul(y.mul_add(y, x).root());
+                    let far = exponent.beyond(farthest);
+                    factor = V::select(far, zero, exponential(exponent)).keep(V::first(self.columns.end - at));
+                }
+                // SAFETY: the caller's promise.
+                unsafe { factor.store(self.factors.add((i - self.rows.start) * self.stride + at)) };
+            }
+        }
+    }
+}
+
+/// e^x for x from [`Real::NEGLIGIBLE_EXPONENT`] to 0, within two units of the last place: 2^k·e^r, |r| ≤ ½ln 2. The same
+/// bits on every machine, unlike the platform's.
+#[inline(always)]
+fn exponential<V: Vector>(x: V) -> V {
+    let of = |value: f64| V::splat(V::Real::of(value));
+    // Adding and taking off a number whose last digit is 1 rounds to whole numbers.
+    let unit = of(V::Real::UNIT);
+    let k = x.mul_add(of(std::f64::consts::LOG2_E), unit).sub(unit);
+    let [high, low] = V::Real::LN_2;
+    let r = x.minus(k, of(high)).minus(k, of(low));
+    let mut sum = of(INVERSE_FACTORIALS[V::Real::EXPONENTIAL_DEGREE]);
+    for n in (0..V::Real::EXPONENTIAL_DEGREE).rev() {
+        sum = sum.mul_add(r, of(INVERSE_FACTORIALS[n]));
+    }
+    sum.mul(k.power_of_two())
+}
+
+/// 1/n!.
+const INVERSE_FACTORIALS: [f64; 14] = {
+    let mut series = [1.0; 14];
+    let mut n = 1;
+    while n < series.len() {
+        #[allow(clippy::cast_precision_loss)]
+        let next = series[n - 1] / n as f64;
+        series[n] = next;
+        n += 1;
+    }
+    series
+};
+
+/// The force on a block: of each of `FIELDS` fields, beginning with `first`, its components.
+///
+/// # Safety
+/// The tables are of the sheet that the block is of.
+#[inline(always)]
+pub(super) unsafe fn force_on<V: Vector, const FIELDS: usize>(
+    terms: &[Term<V::Real>],
+    first: usize,
+    row: usize,
+    column: usize,
+    stride: usize,
+) -> [[V; FIELDS]; 3] {
+    let mut sum = [[V::splat(V::Real::default()); FIELDS]; 3];
+    for term in terms {
+        if row < term.rows.start || row >= term.rows.end {
+            continue;
+        }
+        // SAFETY: the caller's promise.
+        let factor = unsafe { V::load(term.factors.as_ptr().add((row - term.rows.start) * stride + column)) };
+        for c in 0..3 {
+            for f in 0..FIELDS {
+                sum[c][f] = V::splat(term.forces[first + f][c]).mul_add(factor, sum[c][f]);
+            }
+        }
+    }
+    sum
+}
+
+/// Rows on which any force acts.
+pub(super) fn rows<T: Real>(terms: &[Term<T>]) -> Range<usize> {
+    let rows = terms.iter().map(|term| term.rows.clone());
+    rows.reduce(|a, b| a.start.min(b.start)..a.end.max(b.end)).unwrap_or(0..0)
 }
 
 /// e^{−c·r + c′} at a point, 0 where it is negligible.
@@ -99,15 +247,12 @@ impl Table {
 fn factor(poke: &Poke, [i, j]: [usize; 2], spacing_m: f64, negligible: f64) -> f64 {
     let (x, y) = (i as f64 * spacing_m - poke.centre_m.x, j as f64 * spacing_m - poke.centre_m.y);
     let exponent = -poke.falloff_per_m * (x * x + y * y).sqrt();
-    // The same bits on every machine: not the platform's exponential.
     if exponent < negligible { 0.0 } else { libm::exp(exponent + poke.falloff_offset) }
 }
 
 impl<T: Real> Applied<T> {
-    pub(super) fn new(layout: &Layout, plan: &Plan) -> Self {
-        let used = |field: usize| plan.nodes.iter().any(|node| node.weights[field] != 0.0);
-        let fields = (0..3).filter(|field| used(*field)).map(|_| Field::zero(layout)).collect();
-        Applied { slots: Vec::new(), fields, rows: 0..0, terms: Vec::new(), tables: Vec::new() }
+    pub(super) fn new() -> Self {
+        Applied { slots: Vec::new(), terms: Vec::new(), wanted: Vec::new(), settled: true }
     }
 
     /// From the coming step on `tool` exerts `push`.
@@ -116,47 +261,33 @@ impl<T: Real> Applied<T> {
             self.slots.resize(tool + 1, Slot::default());
         }
         self.slots[tool].push = push;
+        self.settled = false;
     }
 
-    /// Brings the fields to the substep that begins at `moment` and takes `share` of the step. `changing` is told before
-    /// the fields change, and after.
-    pub(super) fn prepare(
-        &mut self,
-        model: &Model,
-        plan: &Plan,
-        layout: &Layout,
-        moment: Moment,
-        share: f64,
-        mut changing: impl FnMut(&Self, bool),
-    ) {
+    /// Brings the forces to the substep that begins at `moment` and takes `share` of the step.
+    pub(super) fn prepare(&mut self, model: &Model, plan: &Plan, layout: &Layout, moment: Moment, share: f64) {
+        if self.settled {
+            return;
+        }
         let rate_hz = model.scene.stepping.rate_hz;
-        let mut terms = std::mem::take(&mut self.terms);
-        let mut count = 0;
-        let mut changed = false;
-        // In place of the last list of terms, so that a step allocates nothing.
-        let mut put = |term: Term| {
-            if terms.get(count) != Some(&term) {
-                changed = true;
-                terms.truncate(count);
-                terms.push(term);
-            }
-            count += 1;
-        };
+        self.wanted.clear();
+        self.settled = true;
         for slot in &self.slots {
-            let mut pending: Option<Term> = None;
+            self.settled &= match (&slot.before, &slot.push) {
+                (None, None) => true,
+                (Some(before), Some(Push::Held(poke))) => before == poke,
+                _ => false,
+            };
+            // Of one tool, what differs in the force alone is one.
+            let own = self.wanted.len();
             let mut add = |weights: [f64; 3], poke: Option<Poke>| {
                 let Some(poke) = poke.filter(|poke| poke.force_n != DVec3::ZERO) else { return };
                 let forces_n = weights.map(|weight| weight * poke.force_n);
-                let poke = Poke { force_n: DVec3::ZERO, ..poke };
-                match &mut pending {
-                    Some(term) if same_falloff(&term.poke, &poke) => {
-                        term.forces_n.iter_mut().zip(forces_n).for_each(|(sum, force)| *sum += force);
+                match self.wanted[own..].last_mut() {
+                    Some(wanted) if same_falloff(&wanted.poke, &poke) => {
+                        wanted.forces_n.iter_mut().zip(forces_n).for_each(|(sum, force)| *sum += force);
                     }
-                    _ => {
-                        if let Some(term) = pending.replace(Term { poke, forces_n }) {
-                            put(term);
-                        }
-                    }
+                    _ => self.wanted.push(Wanted { poke: Poke { force_n: DVec3::ZERO, ..poke }, forces_n }),
                 }
             };
             for node in &plan.nodes {
@@ -169,77 +300,59 @@ impl<T: Real> Applied<T> {
                     add(node.weights, now);
                 }
             }
-            if let Some(term) = pending {
-                put(term);
-            }
         }
-        changed |= count != terms.len();
-        terms.truncate(count);
-        if changed {
-            changing(self, true);
-        }
-        self.terms = terms;
-        if changed {
-            self.sum(model, plan, layout);
-            changing(self, false);
+        if !self.wanted.iter().eq(self.terms.iter().map(|term| &term.wanted)) {
+            self.put(model, layout, plan.force_scale(&model.scene));
         }
     }
 
-    fn sum(&mut self, model: &Model, plan: &Plan, layout: &Layout) {
-        let place = |c: usize, i: usize| c * layout.plane + i * layout.stride;
-        for table in &self.tables {
-            for field in &mut self.fields {
-                for i in table.rows[0]..table.rows[1] {
-                    for c in 0..3 {
-                        field[place(c, i) + table.columns[0]..place(c, i) + table.columns[1]].fill(T::default());
-                    }
-                }
-            }
-        }
-        let scale = plan.force_scale(&model.scene);
-        self.tables.retain(|table| self.terms.iter().any(|term| same_falloff(&table.poke, &term.poke)));
-        for term in &self.terms {
-            let known = self.tables.iter().position(|table| same_falloff(&table.poke, &term.poke));
-            let known = known.unwrap_or_else(|| {
-                self.tables.push(Table::new::<T>(&term.poke, model));
-                self.tables.len() - 1
+    /// Makes `terms` what is wanted. A table whose falloff is wanted again stays, the memory of others is used again.
+    fn put(&mut self, model: &Model, layout: &Layout, scale: f64) {
+        for place in 0..self.wanted.len() {
+            let wanted = self.wanted[place];
+            let known = self.terms[place..].iter().position(|term| same_falloff(&term.wanted.poke, &wanted.poke));
+            let needless = |term: &Term<T>| {
+                !self.wanted[place..].iter().any(|wanted| same_falloff(&wanted.poke, &term.wanted.poke))
+            };
+            let found = known.or_else(|| self.terms[place..].iter().position(needless)).unwrap_or_else(|| {
+                self.terms.push(Term::new());
+                self.terms.len() - 1 - place
             });
-            let table = &self.tables[known];
-            let width = table.columns[1] - table.columns[0];
-            for (field, force_n) in self.fields.iter_mut().zip(term.forces_n) {
-                for (c, force_n) in force_n.to_array().into_iter().enumerate() {
-                    for i in table.rows[0]..table.rows[1] {
-                        let factors = &table.factors[(i - table.rows[0]) * width..][..width];
-                        let row = &mut field[place(c, i) + table.columns[0]..place(c, i) + table.columns[1]];
-                        row.iter_mut().zip(factors).for_each(|(f, factor)| *f += T::of(scale * force_n * factor));
-                    }
-                }
+            self.terms.swap(place, place + found);
+            if known.is_none() {
+                self.terms[place].place(&wanted.poke, model, layout);
             }
+            self.terms[place].set(wanted, scale);
         }
-        let rows = self.tables.iter().map(|table| table.rows);
-        self.rows = rows.reduce(|a, b| [a[0].min(b[0]), a[1].max(b[1])]).map_or(0..0, |[from, to]| from..to);
+        self.terms.truncate(self.wanted.len());
     }
 
-    /// Forgets what the fields were summed from, and in which scale.
+    /// What acts at the end of the last step, in the scale of a scheme, as a field of its own.
+    pub(super) fn until_now(&self, model: &Model, layout: &Layout, scale: f64) -> Vec<Term<T>> {
+        let pokes = self.slots.iter().filter_map(|slot| slot.before).filter(|poke| poke.force_n != DVec3::ZERO);
+        let term = |poke: Poke| {
+            let mut term = Term::new();
+            term.place(&poke, model, layout);
+            term.set(Wanted { poke, forces_n: [poke.force_n; 3] }, scale);
+            term
+        };
+        pokes.map(term).collect()
+    }
+
+    /// Of a field, what the substep under way adds at a point.
+    pub(super) fn force_at(&self, layout: &Layout, field: usize, point: [usize; 2]) -> [f64; 3] {
+        let mut sum = [0.0; 3];
+        for term in &self.terms {
+            let factor = term.factor(layout, point).wide();
+            sum.iter_mut().zip(term.forces[field]).for_each(|(sum, force)| *sum += force.wide() * factor);
+        }
+        sum
+    }
+
+    /// Forgets what acts, and in which scale.
     pub(super) fn forget(&mut self) {
-        self.fields.iter_mut().for_each(|field| field.fill(T::default()));
-        (self.rows, self.terms, self.tables) = (0..0, Vec::new(), Vec::new());
-    }
-
-    /// Adds what acts at the end of the last step, in the scale of a scheme, to `field`.
-    pub(super) fn add_until(&self, model: &Model, layout: &Layout, scale: f64, field: &mut Field<T>) {
-        for poke in self.slots.iter().filter_map(|slot| slot.before) {
-            let table = Table::new::<T>(&poke, model);
-            let width = table.columns[1] - table.columns[0];
-            for (c, force_n) in poke.force_n.to_array().into_iter().enumerate() {
-                for i in table.rows[0]..table.rows[1] {
-                    let factors = &table.factors[(i - table.rows[0]) * width..][..width];
-                    let from = c * layout.plane + i * layout.stride + table.columns[0];
-                    let row = &mut field[from..from + width];
-                    row.iter_mut().zip(factors).for_each(|(f, factor)| *f += T::of(scale * force_n * factor));
-                }
-            }
-        }
+        self.terms.clear();
+        self.settled = false;
     }
 
     /// Ends a step: what acts now is what will have acted before the next.
@@ -253,12 +366,8 @@ impl<T: Real> Applied<T> {
     /// The force on a point from a moment on.
     pub(super) fn from(&self, model: &Model, index: usize, moment: Moment) -> DVec3 {
         let rate_hz = model.scene.stepping.rate_hz;
-        sum_at(
-            model,
-            index,
-            self.slots.iter().filter_map(|slot| slot.push.as_ref().map(|push| push.at(moment, rate_hz))),
-            T::NEGLIGIBLE_EXPONENT,
-        )
+        let pokes = self.slots.iter().filter_map(|slot| slot.push.as_ref().map(|push| push.at(moment, rate_hz)));
+        sum_at(model, index, pokes, T::NEGLIGIBLE_EXPONENT)
     }
 
     /// The force on a point at the end of the last step.

@@ -73,13 +73,18 @@ impl<T: Real> State<T> {
         [&mut self.u, &mut self.d].into_iter().chain(&mut self.kept)
     }
 
+    /// The last values of the springs' force at a place, newest first: `now`, and `count` that a multistep scheme keeps.
+    pub(super) fn history(&self, now: f64, count: usize, at: usize) -> Vec<f64> {
+        std::iter::once(now).chain(self.kept[..count].iter().map(|field| field[at].wide())).collect()
+    }
+
     /// Takes the values of another of the same layout and scheme.
     pub(super) fn copy_from(&mut self, other: &Self) {
         self.fields_mut().zip(other.fields()).for_each(|(to, from)| to.copy_from_slice(from));
     }
 }
 
-/// Three numbers a point, x, y and z apart. What pads rows and planes is 0.
+/// Numbers over the points: three each, x, y and z apart, or (a table) one. What pads rows and planes is 0.
 #[derive(Debug)]
 pub(super) struct Field<T> {
     storage: Vec<T>,
@@ -89,23 +94,36 @@ pub(super) struct Field<T> {
 
 impl<T: Real> Field<T> {
     pub(super) fn zero(layout: &Layout) -> Self {
-        let length = 3 * layout.plane;
+        Field::of_length(3 * layout.plane)
+    }
+
+    /// Zeros.
+    pub(super) fn of_length(length: usize) -> Self {
         let storage = vec![T::default(); length + LINE / size_of::<T>()];
         // Where no alignment is promised, none is needed: it is for speed alone.
         let from = storage.as_ptr().align_offset(LINE).min(LINE / size_of::<T>());
         Field { storage, from, length }
     }
+
+    /// Makes room for another length; what is in it does not matter.
+    pub(super) fn resize(&mut self, length: usize) {
+        if self.from + length <= self.storage.len() {
+            self.length = length;
+        } else {
+            *self = Field::of_length(length);
+        }
+    }
 }
 
 impl<T: Real> Clone for Field<T> {
     fn clone(&self) -> Self {
-        let mut storage = vec![T::default(); self.storage.len()];
-        let from = storage.as_ptr().align_offset(LINE).min(LINE / size_of::<T>());
-        storage[from..from + self.length].copy_from_slice(self);
-        Field { storage, from, length: self.length }
+        let mut field = Field::of_length(self.length);
+        field.copy_from_slice(self);
+        field
     }
 
     fn clone_from(&mut self, other: &Self) {
+        self.resize(other.length);
         self.copy_from_slice(other);
     }
 }

@@ -100,7 +100,7 @@ pub(super) struct Checkpoint<T: Real> {
 /// Work of the tools, J, and energies at the last survey.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct Work {
-    /// Since the last survey, but for what the present force has done since it began (force · displacement).
+    /// Since the last survey.
     done_j: f64,
     /// At the last survey.
     energy_j: f64,
@@ -117,14 +117,14 @@ impl Work {
         self.done_j += work_j;
     }
 
-    /// Judges an energy; `present_j`: the present force times the displacement. The account begins anew.
-    pub(super) fn survey(&mut self, energy_j: f64, present_j: f64) -> Result<(), Cause> {
-        let (work_j, before_j) = (self.done_j + present_j, self.energy_j);
+    /// Judges an energy. The account begins anew.
+    pub(super) fn survey(&mut self, energy_j: f64) -> Result<(), Cause> {
+        let (work_j, before_j) = (self.done_j, self.energy_j);
         let allowed_j = work_j + MARGIN * (before_j + work_j.abs()) + NOISE * self.largest_j;
         if energy_j - before_j > allowed_j {
             return Err(Cause::Energy { energy_j, before_j, work_j });
         }
-        *self = Work { done_j: -present_j, energy_j, largest_j: self.largest_j.max(energy_j) };
+        *self = Work { done_j: 0.0, energy_j, largest_j: self.largest_j.max(energy_j) };
         Ok(())
     }
 }
@@ -153,9 +153,7 @@ impl<T: Real> Sheet<T> {
         if survey.surprise > MOST_SURPRISE * survey.largest {
             return Err(Cause::Surprise { part: survey.surprise / survey.largest });
         }
-        let layout = self.bench.layout;
-        let present_j = force_times_displacement(&self.model, &self.plan, &layout, &self.applied, &self.state);
-        self.work.survey(energy_j, present_j)?;
+        self.work.survey(energy_j)?;
         self.checkpoint.steps = self.steps;
         self.checkpoint.halvings = self.halvings;
         self.checkpoint.state.copy_from(&self.state);
@@ -179,12 +177,9 @@ impl<T: Real> Sheet<T> {
         let springs = springs_of(&self.model, &was);
         convert(&layout, &springs, &was, &plan, &self.applied, &mut self.state);
         self.applied.forget();
-        // The force begins anew, and with it what it has done.
-        let present_j =
-            force_times_displacement(&self.model, &was, &layout, &self.checkpoint.applied, &self.checkpoint.state);
-        self.work.add(present_j);
         self.bench.springs = springs_of(&self.model, &plan);
         self.bench.is_calm(0.0);
+        self.bench.take_work();
         self.halvings = halvings;
         self.plan = plan;
     }
@@ -228,34 +223,6 @@ impl<T: Real> Sheet<T> {
     }
 }
 
-/// Σ force · displacement of the fields of a scheme, J.
-pub(super) fn force_times_displacement<T: Real>(
-    model: &Model,
-    plan: &Plan,
-    layout: &Layout,
-    applied: &Applied<T>,
-    state: &State<T>,
-) -> f64 {
-    let (field, weight, back) = match &plan.scheme {
-        // Its force acts from half a substep before the substep's beginning to half a substep after.
-        Scheme::TwoStep(two) => (0, two.q, 0.5),
-        Scheme::Multistep(multistep) => (1, multistep.impulse(), 0.0),
-        Scheme::Rk4 { .. } => (1, 1.0, 0.0),
-    };
-    let field = &applied.fields[field];
-    let mut sum = 0.0;
-    for c in 0..3 {
-        for i in applied.rows.clone() {
-            let row = c * layout.plane + i * layout.stride..c * layout.plane + i * layout.stride + layout.columns;
-            let (f, u, d) = (&field[row.clone()], &state.u[row.clone()], &state.d[row]);
-            for ((f, u), d) in f.iter().zip(u).zip(d) {
-                sum += f.wide() * (u.wide() - back * d.wide());
-            }
-        }
-    }
-    sum * model.scene.sheet.spacing_m / (weight * plan.force_scale(&model.scene))
-}
-
 /// Displacements from here on are a blow-up: far beyond any tissue, and far below what f32 can square.
 pub(super) fn farthest_in_spacings(model: &Model) -> f64 {
     1e9 * model.scene.sheet.longer_side_m() / model.scene.sheet.spacing_m
@@ -287,19 +254,19 @@ pub(super) fn convert<T: Real>(
         .map(|index| springs.gather(layout, &state.u, [index / layout.columns, index % layout.columns]))
         .collect();
     for (index, force) in forces.iter().enumerate() {
+        let pushed = applied.force_at(layout, 0, [index / layout.columns, index % layout.columns]);
         for (c, n) in force.iter().enumerate() {
             let at = c * layout.plane + layout.place(index);
             let (u, d, n) = (state.u[at].wide(), state.d[at].wide(), n.wide());
             match (&from.scheme, &to.scheme) {
                 (Scheme::TwoStep(two), _) => {
                     // d = v·dt − ½·acceleration·dt², at the time of u.
-                    let acceleration = (two.p - 1.0) * d - two.q * two.a * u + n + applied.fields[0][at].wide();
+                    let acceleration = (two.p - 1.0) * d - two.q * two.a * u + n + pushed[c];
                     let velocity = d + 0.5 * acceleration;
                     state.d[at] = T::of(velocity * ratio - 0.5 * acceleration * ratio * ratio);
                 }
                 (Scheme::Multistep(old), Scheme::Multistep(new)) => {
-                    let mut history = vec![n];
-                    history.extend(state.kept[..old.order].iter().map(|field| field[at].wide()));
+                    let history = state.history(n, old.order, at);
                     let [du, dw] = old.correction.map(|weight| weight * old.surprise(&history));
                     #[allow(clippy::cast_precision_loss)]
                     let shorter: Vec<f64> =

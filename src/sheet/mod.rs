@@ -23,7 +23,7 @@ use crate::scene::Precision;
 use crate::scene::law::{Moment, Motion};
 use applied::Applied;
 pub use applied::Push;
-use field::{Field, Layout, State};
+use field::{Layout, State};
 pub use guard::Cause;
 use guard::{Checkpoint, Input, Work};
 use integrate::{Scheme, central, exponential, rk4};
@@ -175,7 +175,7 @@ impl<T: Real> Sheet<T> {
         let layout = Layout::new::<T>(model.points);
         let plan = model.plan.clone();
         let at_rest = || State::at_rest(&layout, plan.scheme.kept(model.precision == Precision::Compensated));
-        let applied = Applied::new(&layout, &plan);
+        let applied = Applied::new();
         let prescribed = Prescribed::new();
         Sheet {
             model: model.clone(),
@@ -215,19 +215,16 @@ impl<T: Real> Sheet<T> {
 
     /// From `moment` to the fraction `end` of the same step.
     fn substep(&mut self, moment: Moment, end: f64) {
-        let Sheet { model, plan, bench, state, applied, work, .. } = self;
+        let Sheet { model, plan, bench, applied, .. } = self;
         let layout = bench.layout;
-        applied.prepare(model, plan, &layout, moment, end - moment.fraction, |applied, before| {
-            let product_j = guard::force_times_displacement(model, plan, &layout, applied, state);
-            work.add(if before { product_j } else { -product_j });
-        });
+        applied.prepare(model, plan, &layout, moment, end - moment.fraction);
         let released = self.prescribed.take_released();
         let released: Vec<_> =
             released.into_iter().map(|(index, v)| (index, self.change_at_release(index, v, moment))).collect();
         let Sheet { model, plan, bench, state, applied, .. } = self;
         match &plan.scheme {
             Scheme::TwoStep(two) => {
-                bench.advance(&central::Advance::new(two), state, applied, [0, 0]);
+                bench.advance(&central::Advance::new(two), state, &applied.terms, 0);
             }
             Scheme::Multistep(multistep) => {
                 // The change is to what the substep begins with.
@@ -240,7 +237,7 @@ impl<T: Real> Sheet<T> {
                         match (multistep.order, compensated) {
                             $(($order, $with) => {
                                 let scheme = exponential::Advance::<T, $order, $with>::new(multistep);
-                                bench.advance(&scheme, state, applied, [0, 1]);
+                                bench.advance(&scheme, state, &applied.terms, 0);
                             })*
                             // `Scheme::fit` makes no others.
                             _ => {}
@@ -255,7 +252,7 @@ impl<T: Real> Sheet<T> {
                 let (a, g) = (*a, *g);
                 for stage in 0..rk4::STAGES.len() {
                     let field = stage.div_ceil(2);
-                    self.bench.advance(&rk4::Advance::new(a, g, stage), &mut self.state, &self.applied, [field; 2]);
+                    self.bench.advance(&rk4::Advance::new(a, g, stage), &mut self.state, &self.applied.terms, field);
                     if stage < 3 {
                         let far = rk4::STAGES[stage].0;
                         self.hold(moment.step, moment.fraction + far * (end - moment.fraction), false);
@@ -269,18 +266,22 @@ impl<T: Real> Sheet<T> {
                 shift(&layout, &mut self.state, *index, change);
             }
         }
+        let unit_j = self.unit_of_work_j();
+        self.work.add(self.bench.take_work() * unit_j);
         self.hold(moment.step, end, true);
+    }
+
+    /// Of 1 in the fields of the tools' force along 1 in u.
+    fn unit_of_work_j(&self) -> f64 {
+        let Sheet { model, plan, .. } = self;
+        model.scene.sheet.spacing_m / (plan.scheme.impulse() * plan.force_scale(&model.scene))
     }
 
     /// Puts the grasped points where they are at `fraction` of the step, and counts the work of that if it is `counted`.
     fn hold(&mut self, step: u64, fraction: f64, counted: bool) {
+        let unit_j = self.unit_of_work_j();
         let Sheet { model, plan, bench, state, prescribed, work, .. } = self;
         let spacing_m = model.scene.sheet.spacing_m;
-        let impulse = match &plan.scheme {
-            Scheme::TwoStep(two) => two.q,
-            Scheme::Multistep(multistep) => multistep.impulse(),
-            Scheme::Rk4 { .. } => 1.0,
-        };
         for (index, displacement_m, velocity_m_per_s) in prescribed.at(model, step, fraction) {
             let mut product = 0.0;
             for c in 0..3 {
@@ -296,7 +297,7 @@ impl<T: Real> Sheet<T> {
                 product += (state.d[at].wide() - free_d.wide()) * state.d[at].wide();
             }
             if counted {
-                work.add(product * spacing_m / (impulse * plan.force_scale(&model.scene)));
+                work.add(product * unit_j);
             }
         }
     }
@@ -317,10 +318,11 @@ impl<T: Real> Sheet<T> {
             Scheme::TwoStep(two) => {
                 let (scale, scene) = (plan.force_scale(&model.scene), &model.scene);
                 let applied_n = applied.from(model, index, moment);
+                let force = applied.force_at(&bench.layout, 0, model.point_of(index));
                 std::array::from_fn(|c| {
                     let at = c * bench.layout.plane + bench.layout.place(index);
                     let elastic = springs[c] - two.q * two.a * state.u[at].wide();
-                    let used = elastic + applied.fields[0][at].wide();
+                    let used = elastic + force[c];
                     let lost = scene.damping_n_s_per_m * velocity_m_per_s[c] + applied_n[c];
                     let kick = 0.5 * (two.q * scale * lost + elastic) - used;
                     [kick, kick]
@@ -328,10 +330,8 @@ impl<T: Real> Sheet<T> {
             }
             Scheme::Multistep(multistep) => std::array::from_fn(|c| {
                 let at = c * bench.layout.plane + bench.layout.place(index);
-                let history: Vec<f64> = std::iter::once(springs[c])
-                    .chain(state.kept[..multistep.order].iter().map(|field| field[at].wide()))
-                    .collect();
-                multistep.correction.map(|weight| -weight * multistep.surprise(&history))
+                let surprise = multistep.surprise(&state.history(springs[c], multistep.order, at));
+                multistep.correction.map(|weight| -weight * surprise)
             }),
             Scheme::Rk4 { .. } => [[0.0; 2]; 3],
         }
@@ -363,13 +363,13 @@ impl<T: Real> Sheet<T> {
     /// Looks at the whole sheet: what a survey sees, the energies, and the energy that the scheme keeps.
     fn survey(&self) -> (Survey, Energy, f64) {
         let Sheet { model, plan, bench, state, .. } = self;
-        let force = (plan.scheme.takes_means() && self.steps > 0).then(|| {
-            let unit = plan.scheme.spring_scale() * plan.force_scale(&model.scene);
-            let mut field = Field::zero(&bench.layout);
-            self.applied.add_until(model, &bench.layout, unit, &mut field);
-            field
-        });
-        let survey = with_scheme!(plan, T, |scheme| Survey::of(bench, scheme, state, force.as_ref()));
+        let unit = plan.scheme.spring_scale() * plan.force_scale(&model.scene);
+        let terms = if plan.scheme.takes_means() && self.steps > 0 {
+            self.applied.until_now(model, &bench.layout, unit)
+        } else {
+            Vec::new()
+        };
+        let survey = with_scheme!(plan, T, |scheme| Survey::of(bench, scheme, state, &terms));
         let sheet = &model.scene.sheet;
         // A grasped point moves as its tool does, whatever the scheme would make of it.
         let own = self.prescribed.grasped().map(|(index, motion)| {

@@ -47,6 +47,16 @@ pub(super) trait Real:
     const NEWTON: usize;
     /// 1/√self within 4 %.
     fn rough_inverse_root(self) -> Self;
+    /// 1.5 times the number whose last digit is 1.
+    const UNIT: f64;
+    /// The number whose last digit is 1, and the exponent's bias.
+    const POWER: f64;
+    /// 2^self, for whole numbers.
+    fn power_of_two(self) -> Self;
+    /// ln 2 in two parts: the first has zeros enough at its end that a whole number times it is exact.
+    const LN_2: [f64; 2];
+    /// Of the polynomial of e^r, |r| ≤ ½ln 2.
+    const EXPONENTIAL_DEGREE: usize;
     /// Square root, correctly rounded.
     fn root(self) -> Self;
     /// self·b + c, rounded once.
@@ -60,7 +70,8 @@ pub(super) trait Real:
 }
 
 macro_rules! real {
-    ($t:ty, $bits:ty, $magic:literal, $newton:literal, $wide:ident, $narrow:ident, $terms:literal, $series:expr, $negligible:literal) => {
+    ($t:ty, $bits:ty, $magic:literal, $newton:literal, $wide:ident, $narrow:ident, $terms:literal, $series:expr, $negligible:literal, $ln_2:expr,
+     $degree:literal) => {
         impl Real for $t {
             #[cfg(target_arch = "x86_64")]
             type Avx512 = super::lanes::$wide;
@@ -72,6 +83,13 @@ macro_rules! real {
             fn rough_inverse_root(self) -> Self {
                 Self::from_bits(Self::INVERSE_ROOT.wrapping_sub(self.to_bits() >> 1))
             }
+            const UNIT: f64 = 1.5 / (<$t>::EPSILON as f64);
+            const POWER: f64 = 1.0 / (<$t>::EPSILON as f64) + (<$t>::MAX_EXP - 1) as f64;
+            fn power_of_two(self) -> Self {
+                Self::from_bits((self + Self::of(Self::POWER)).to_bits() << (<$t>::MANTISSA_DIGITS - 1))
+            }
+            const LN_2: [f64; 2] = $ln_2;
+            const EXPONENTIAL_DEGREE: usize = $degree;
             const TERMS: usize = $terms;
             const SERIES: [f64; 14] = $series;
             const NEGLIGIBLE_EXPONENT: f64 = $negligible;
@@ -135,5 +153,17 @@ const SERIES_F64: [f64; 14] = [
     -0.157_608_573_440_095_58,
 ];
 
-real!(f32, u32, 0x5f37_5a86, 2, WideF32, NarrowF32, 6, SERIES_F32, -22.0);
-real!(f64, u64, 0x5fe6_eb50_c7b5_37a9, 3, WideF64, NarrowF64, 14, SERIES_F64, -34.5);
+real!(f32, u32, 0x5f37_5a86, 2, WideF32, NarrowF32, 6, SERIES_F32, -22.0, [0.693_359_375, -2.121_944_4e-4], 7);
+real!(
+    f64,
+    u64,
+    0x5fe6_eb50_c7b5_37a9,
+    3,
+    WideF64,
+    NarrowF64,
+    14,
+    SERIES_F64,
+    -34.5,
+    [0.693_147_180_369_123_8, 1.908_214_929_270_587_7e-10],
+    13
+);

@@ -8,7 +8,8 @@
 
 use std::cell::UnsafeCell;
 
-use super::field::{BLOCK, Field, Layout, State};
+use super::applied::{self, Term};
+use super::field::{BLOCK, Layout, State};
 use super::lanes::Vector;
 use super::real::Real;
 use super::sweep::{Bench, MAX_KEPT, Scheme, Stage};
@@ -38,23 +39,24 @@ struct Sums<T> {
     largest: [[T; BLOCK]; 2],
 }
 
-struct Look<'a, T, C> {
+struct Look<'a, T: Real, C> {
     layout: Layout,
     scheme: &'a C,
     d: *const T,
     kept: [*const T; MAX_KEPT],
-    force: *const T,
+    /// Only if there are any.
+    terms: &'a [Term<T>],
     sums: &'a UnsafeCell<Sums<T>>,
 }
 
 impl Survey {
-    /// Looks at a state; `force` is what the tools exert on it, in the springs' units, if a two-step scheme needs it for
-    /// the velocity.
+    /// Looks at a state; `terms` are what the tools exert on it, in the springs' units, if a two-step scheme needs them
+    /// for the velocity.
     pub(super) fn of<T: Real, C: Scheme<T>>(
         bench: &Bench<T>,
         scheme: &C,
         state: &State<T>,
-        force: Option<&Field<T>>,
+        terms: &[Term<T>],
     ) -> Survey {
         let zero = [T::default(); BLOCK];
         let sums = UnsafeCell::new(Sums { row: [zero; 4], total: [[0.0; BLOCK]; 4], largest: [zero; 2] });
@@ -62,14 +64,7 @@ impl Survey {
         for (pointer, field) in kept.iter_mut().zip(&state.kept) {
             *pointer = field.as_ptr();
         }
-        let look = Look {
-            layout: bench.layout,
-            scheme,
-            d: state.d.as_ptr(),
-            kept,
-            force: force.map_or(std::ptr::null(), |force| force.as_ptr()),
-            sums: &sums,
-        };
+        let look = Look { layout: bench.layout, scheme, d: state.d.as_ptr(), kept, terms, sums: &sums };
         bench.look(&state.u, look);
         let Sums { total, largest, .. } = sums.into_inner();
         let sum = |which: usize| total[which].iter().sum();
@@ -103,7 +98,7 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Look<'_, T, C> {
     #[inline(always)]
     unsafe fn finish<V: Vector<Real = T>, const LEAN: bool>(
         &self,
-        _: usize,
+        row: usize,
         at: usize,
         x: [V; 3],
         n: [V; 3],
@@ -111,7 +106,9 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Look<'_, T, C> {
     ) {
         // SAFETY: the fields have the layout; the sums as above.
         unsafe {
-            let column = at % self.layout.stride;
+            let stride = self.layout.stride;
+            let column = at - row * stride;
+            let force = applied::force_on::<V, 1>(self.terms, 0, row, column, stride);
             let (mut speed, mut place, mut vigour) =
                 (V::splat(T::default()), V::splat(T::default()), V::splat(T::default()));
             let mut most = [V::splat(T::default()); 2];
@@ -122,7 +119,7 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Look<'_, T, C> {
                 for k in 0..C::KEPT {
                     kept[k] = V::load(self.kept[k].add(at));
                 }
-                let force = if self.force.is_null() { None } else { Some(V::load(self.force.add(at))) };
+                let force = if self.terms.is_empty() { None } else { Some(force[c][0]) };
                 let (u, w) = self.scheme.observe(x[c], d, n[c], &kept, force);
                 speed = w.mul_add(w, speed);
                 vigour = vigour.add(self.scheme.vigour(x[c], d, n[c], &kept, force));
@@ -146,7 +143,7 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Look<'_, T, C> {
     }
 
     #[inline(always)]
-    unsafe fn end_row<V: Vector<Real = T>>(&self, _: V) {
+    unsafe fn end_row(&self) {
         // SAFETY: as above.
         let sums = unsafe { &mut *self.sums.get() };
         for (row, total) in sums.row.iter_mut().zip(&mut sums.total) {

@@ -17,9 +17,9 @@
 
 use std::ops::Range;
 
-use super::applied::Applied;
+use super::applied::{self, Term};
 use super::field::{BLOCK, Field, Layout, State};
-use super::lanes::{self, Run, Vector};
+use super::lanes::{self, Run, Vector, Width};
 use super::real::Real;
 use super::springs::{Kind, Springs};
 use crate::scene::Lanes;
@@ -35,7 +35,7 @@ pub(super) trait Stage<T: Real> {
     }
 
     /// `x`: displacements of the block of row `row` that begins at place `at`; `n`: the springs' forces on it. Adds to
-    /// `probe`, which the stage gets at the row's end.
+    /// `probe`, which the stage gets at the end.
     ///
     /// # Safety
     /// What the stage points to is as it promised.
@@ -58,7 +58,13 @@ pub(super) trait Stage<T: Real> {
     ///
     /// # Safety
     /// As for `finish`.
-    unsafe fn end_row<V: Vector<Real = T>>(&self, probe: V);
+    unsafe fn end_row(&self) {}
+
+    /// All is done.
+    ///
+    /// # Safety
+    /// As for `finish`.
+    unsafe fn end<V: Vector<Real = T>>(&self, _probe: V) {}
 }
 
 /// A sweep, ready to run at any width.
@@ -128,31 +134,36 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                     }
                 }
             }
+            let mut probe = zero;
+            let mut ahead = excesses(self.x, stride, plane);
             for i in 0..rows {
-                let x = self.x.add(i * stride);
+                let under_way = (&mut ahead, &mut probe);
                 // The usual row has a loop of its own, without what only others need.
                 match (i + 1 < rows, !FLEXION && self.stage.is_lean(i)) {
-                    (true, true) => self.row::<V, FLEXION, true, true>(flexion, i, x, blocks),
-                    (true, false) => self.row::<V, FLEXION, true, false>(flexion, i, x, blocks),
-                    (false, _) => self.row::<V, FLEXION, false, false>(flexion, i, x, blocks),
+                    (true, true) => self.row::<V, FLEXION, true, true>(flexion, i, blocks, under_way),
+                    (true, false) => self.row::<V, FLEXION, true, false>(flexion, i, blocks, under_way),
+                    (false, _) => self.row::<V, FLEXION, false, false>(flexion, i, blocks, under_way),
                 }
             }
+            self.stage.end(probe);
         }
     }
 
-    /// Row `i`, which has a row below or not.
+    /// Row `i`, which has a row below or not. The Qs are formed one block ahead, so that two blocks' chains of operations
+    /// are under way at once.
     #[inline(always)]
     unsafe fn row<V: Vector<Real = T>, const FLEXION: bool, const BELOW: bool, const LEAN: bool>(
         &self,
         flexion: &Kind<T>,
         i: usize,
-        x: *const T,
         blocks: usize,
+        (ahead, probe): (&mut [V; 4], &mut V),
     ) {
         // SAFETY: as for `rows`.
         unsafe {
             let Layout { rows, columns, stride, plane } = self.layout;
             let Springs { structural, shear, .. } = self.springs;
+            let x = self.x.add(i * stride);
             let zero = V::splat(T::default());
             let (down, diagonal) = (self.carry, self.carry.add(stride));
             let two_down = self.carry.add((2 + i % 2) * stride);
@@ -160,15 +171,13 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
             let full = V::first(V::LANES);
             let tail = V::first(columns - 1 - (blocks - 1) * V::LANES);
             let (mut passed, mut passed_two) = ([zero; 3], [zero; 3]);
-            // The Qs are formed one block ahead, so that two blocks' chains of operations are under way at once.
-            let mut probe = zero;
-            let mut ahead = excesses::<V, BELOW>(x, stride, plane);
             for block in 0..blocks {
                 let column = block * V::LANES;
                 let mask = if block + 1 == blocks { tail } else { full };
-                let [qr, qd, qa, qb] = ahead;
-                if block + 1 < blocks {
-                    ahead = excesses::<V, BELOW>(x.add(column + V::LANES), stride, plane);
+                let [qr, qd, qa, qb] = *ahead;
+                let next = if block + 1 < blocks { column + V::LANES } else { stride };
+                if BELOW || block + 1 < blocks {
+                    *ahead = excesses(x.add(next), stride, plane);
                 }
                 let mut wr = structural.near(qr);
                 let (mut wd, mut wa, mut wb) = (zero, zero, zero);
@@ -247,24 +256,22 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                         self.stage.energy(column, energy);
                     }
                 }
-                self.stage.finish::<V, LEAN>(i, i * stride + column, here, n, &mut probe);
+                self.stage.finish::<V, LEAN>(i, i * stride + column, here, n, probe);
             }
-            self.stage.end_row(probe);
+            self.stage.end_row();
         }
     }
 }
 
-/// Qs of the four springs of each point of a block: right, down, and the diagonals.
+/// Qs of the four springs of each point of a block: right, down, and the diagonals. Those of the last row, which has only
+/// the first, reach into what pads the plane.
 #[inline(always)]
-unsafe fn excesses<V: Vector, const BELOW: bool>(at: *const V::Real, stride: usize, plane: usize) -> [V; 4] {
+unsafe fn excesses<V: Vector>(at: *const V::Real, stride: usize, plane: usize) -> [V; 4] {
     // SAFETY: the caller's promise: a row and a block beyond the last point can be read.
     unsafe {
         let (here, right) = (load::<V>(at, plane), load::<V>(at.add(1), plane));
         let r = difference(&right, &here);
         let qr = excess(r[1], &r, [1, 0, 2]);
-        if !BELOW {
-            return [qr; 4];
-        }
         let (below, beside) = (load(at.add(stride), plane), load(at.add(stride + 1), plane));
         let (d, a, b) = (difference(&below, &here), difference(&beside, &here), difference(&below, &right));
         [qr, excess(d[0], &d, [0, 1, 2]), excess(a[0].add(a[1]), &a, [0, 1, 2]), excess(b[0].sub(b[1]), &b, [0, 1, 2])]
@@ -278,10 +285,16 @@ pub(super) trait Scheme<T: Real> {
     const KEPT: usize;
     /// How many of those, the last ones, it writes in a step.
     const WRITTEN: usize;
+    /// Fields of force that it takes, 1 or 2.
+    const FORCES: usize;
 
-    /// u and d after the (sub)step; `kept` is brought up to date. `force`: the tools' part, in the scheme's terms.
+    /// u and d after the (sub)step; `kept` is brought up to date. `force`: the tools' part, in the scheme's terms; if there
+    /// is one field, twice.
     fn advance<V: Vector<Real = T>>(&self, x: V, d: V, n: V, kept: &mut [V; MAX_KEPT], force: Option<[V; 2]>)
     -> (V, V);
+
+    /// The displacement along which the tools' force (the last of its fields) has worked, given u and d before and after.
+    fn travel<V: Vector<Real = T>>(&self, before: [V; 2], after: [V; 2]) -> V;
 
     /// Displacement and velocity × substep as they are now; `force` is that of the tools, in the springs' units.
     fn observe<V: Vector<Real = T>>(&self, x: V, d: V, n: V, kept: &[V; MAX_KEPT], force: Option<V>) -> (V, V);
@@ -299,13 +312,14 @@ pub(super) const MAX_KEPT: usize = 5;
 /// What a sweep needs beside the state: of one sheet, made once.
 #[derive(Debug)]
 pub(super) struct Bench<T> {
-    pub(super) lanes: Lanes,
+    width: Width,
     pub(super) layout: Layout,
     pub(super) springs: Springs<T>,
     /// 1 where a point moves, 0 where it is fixed, if any is.
     pub(super) free: Option<Field<T>>,
     carry: Field<T>,
     probe: [T; BLOCK],
+    work: [T; BLOCK],
 }
 
 impl<T: Real> Bench<T> {
@@ -320,17 +334,12 @@ impl<T: Real> Bench<T> {
             }
             free
         });
-        Bench { lanes, layout, springs, free, carry: Field::zero(&layout), probe: [T::default(); BLOCK] }
+        let zero = [T::default(); BLOCK];
+        Bench { width: Width::of(lanes), layout, springs, free, carry: Field::zero(&layout), probe: zero, work: zero }
     }
 
-    /// Advances every point with `scheme`; the tools' force is that of its fields `which`.
-    pub(super) fn advance<C: Scheme<T>>(
-        &mut self,
-        scheme: &C,
-        state: &mut State<T>,
-        tools: &Applied<T>,
-        which: [usize; 2],
-    ) {
+    /// Advances every point with `scheme`; the tools' force is that of their fields from `field` on.
+    pub(super) fn advance<C: Scheme<T>>(&mut self, scheme: &C, state: &mut State<T>, terms: &[Term<T>], field: usize) {
         let mut kept = [std::ptr::null_mut(); MAX_KEPT];
         for (pointer, field) in kept.iter_mut().zip(&mut state.kept) {
             *pointer = field.as_mut_ptr();
@@ -338,21 +347,23 @@ impl<T: Real> Bench<T> {
         assert_eq!(state.kept.len(), C::KEPT);
         let u = state.u.as_mut_ptr();
         let stage = Advance {
-            plane: self.layout.plane,
+            layout: self.layout,
             scheme,
             u,
             d: state.d.as_mut_ptr(),
             kept,
-            forces: which.map(|field| tools.fields[field].as_ptr()),
-            forced: tools.rows.clone(),
+            terms,
+            field,
+            forced: applied::rows(terms),
             free: self.free.as_ref().map_or(std::ptr::null(), |free| free.as_ptr()),
             probe: self.probe.as_mut_ptr(),
+            work: self.work.as_mut_ptr(),
         };
         let carry = self.carry.as_mut_ptr();
         let sweep = Sweep { layout: self.layout, springs: &self.springs, x: u.cast_const(), carry, stage };
-        // SAFETY: all fields have the layout's three planes, padded by a row and a block; u is written behind what the
-        // sweep still reads, through the same pointer.
-        unsafe { lanes::run(self.lanes, &sweep) };
+        // SAFETY: all fields have the layout's three planes, padded by a row and a block, and the tables are of this
+        // layout; u is written behind what the sweep still reads, through the same pointer.
+        unsafe { lanes::run(self.width, &sweep) };
     }
 
     /// Sweeps over displacements without changing them.
@@ -361,31 +372,41 @@ impl<T: Real> Bench<T> {
         let carry = carry.as_mut_ptr();
         let sweep = Sweep { layout: self.layout, springs: &self.springs, x: u.as_ptr(), carry, stage };
         // SAFETY: as above; `stage` is made for fields of the same layout.
-        unsafe { lanes::run(self.lanes, &sweep) };
+        unsafe { lanes::run(self.width, &sweep) };
     }
 
     /// Whether the increments since the last call were finite, and none was `farthest`; false may be a sum of many.
     pub(super) fn is_calm(&mut self, farthest: f64) -> bool {
-        let probe = std::mem::take(&mut self.probe);
-        probe.iter().all(|sum| sum.wide() < farthest * farthest)
+        std::mem::take(&mut self.probe).iter().all(|sum| sum.wide() < farthest * farthest)
+    }
+
+    /// Σ force · travel of the tools since the last call, in the scheme's terms.
+    pub(super) fn take_work(&mut self) -> f64 {
+        let work = std::mem::take(&mut self.work);
+        // Four chains of additions at once, in an order that does not change.
+        let chains: [f64; 4] = std::array::from_fn(|chain| (0..BLOCK / 4).map(|n| work[4 * n + chain].wide()).sum());
+        (chains[0] + chains[1]) + (chains[2] + chains[3])
     }
 }
 
 /// The stage that advances every point.
-struct Advance<'a, T, C> {
-    plane: usize,
+struct Advance<'a, T: Real, C> {
+    layout: Layout,
     scheme: &'a C,
     /// u and d, three planes each.
     u: *mut T,
     d: *mut T,
     kept: [*mut T; MAX_KEPT],
-    /// The tools' force, in rows `forced`.
-    forces: [*const T; 2],
+    /// The tools' forces, from their field `field` on, in rows `forced`.
+    terms: &'a [Term<T>],
+    field: usize,
     forced: Range<usize>,
     /// 1 where a point moves, 0 where it is fixed; null if none is.
     free: *const T,
     /// A block that sums up squares of increments: finite and small only if all are.
     probe: *mut T,
+    /// One that sums up the work of the tools, for each of 16 columns apart: the same at every width.
+    work: *mut T,
 }
 
 impl<T: Real, C: Scheme<T>> Stage<T> for Advance<'_, T, C> {
@@ -404,20 +425,28 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Advance<'_, T, C> {
     ) {
         // SAFETY: the caller's promise.
         unsafe {
+            let Layout { stride, plane, .. } = self.layout;
             let forced = !LEAN && self.forced.contains(&row);
+            let column = at - row * stride;
+            let mut force = [[V::splat(T::default()); 2]; 3];
+            let mut work = V::splat(T::default());
+            if forced {
+                work = V::load(self.work.add(column % BLOCK));
+                if C::FORCES == 1 {
+                    force = applied::force_on::<V, 1>(self.terms, self.field, row, column, stride).map(|[f]| [f, f]);
+                } else {
+                    force = applied::force_on::<V, 2>(self.terms, self.field, row, column, stride);
+                }
+            }
             for c in 0..3 {
-                let at = at + c * self.plane;
-                let d = V::load(self.d.add(at));
-                let mut kept = [d; MAX_KEPT];
+                let at = at + c * plane;
+                let before = [x[c], V::load(self.d.add(at))];
+                let mut kept = [before[1]; MAX_KEPT];
                 for k in 0..C::KEPT {
                     kept[k] = V::load(self.kept[k].add(at));
                 }
-                let (mut x, mut d) = if forced {
-                    let force = [V::load(self.forces[0].add(at)), V::load(self.forces[1].add(at))];
-                    self.scheme.advance(x[c], d, n[c], &mut kept, Some(force))
-                } else {
-                    self.scheme.advance(x[c], d, n[c], &mut kept, None)
-                };
+                let force = if forced { Some(force[c]) } else { None };
+                let (mut x, mut d) = self.scheme.advance(before[0], before[1], n[c], &mut kept, force);
                 if !LEAN && !self.free.is_null() {
                     let free = V::load(self.free.add(at));
                     (x, d) = (x.mul(free), d.mul(free));
@@ -428,12 +457,18 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Advance<'_, T, C> {
                     kept[k].store(self.kept[k].add(at));
                 }
                 *probe = d.mul_add(d, *probe);
+                if let Some([_, force]) = force {
+                    work = force.mul_add(self.scheme.travel(before, [x, d]), work);
+                }
+            }
+            if forced {
+                work.store(self.work.add(column % BLOCK));
             }
         }
     }
 
     #[inline(always)]
-    unsafe fn end_row<V: Vector<Real = T>>(&self, probe: V) {
+    unsafe fn end<V: Vector<Real = T>>(&self, probe: V) {
         // SAFETY: a block is as long as the widest vector.
         unsafe { V::load(self.probe).add(probe).store(self.probe) }
     }

@@ -49,12 +49,19 @@ impl<T: Real> Advance<T> {
 impl<T: Real> sweep::Scheme<T> for Advance<T> {
     const KEPT: usize = 0;
     const WRITTEN: usize = 0;
+    const FORCES: usize = 1;
 
     #[inline(always)]
     fn advance<V: Vector<Real = T>>(&self, x: V, d: V, n: V, _: &mut [V; MAX_KEPT], force: Option<[V; 2]>) -> (V, V) {
         let n = if let Some(force) = force { n.add(force[0]) } else { n };
         let d = V::splat(self.p).mul_add(d, V::splat(self.pull).mul_add(x, n));
         (x.add(d), d)
+    }
+
+    #[inline(always)]
+    fn travel<V: Vector<Real = T>>(&self, [_, d]: [V; 2], [_, next]: [V; 2]) -> V {
+        // The force acts from half a substep before the substep's beginning to half a substep after.
+        V::splat(T::of(0.5)).mul(d.add(next))
     }
 
     #[inline(always)]

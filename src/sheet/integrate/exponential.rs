@@ -219,6 +219,7 @@ impl<T: Real, const ORDER: usize, const COMPENSATED: bool> sweep::Scheme<T> for 
     const KEPT: usize = ORDER + COMPENSATED as usize;
     /// The oldest becomes the newest; the others change places by their order alone. And what was lost.
     const WRITTEN: usize = 1 + COMPENSATED as usize;
+    const FORCES: usize = 2;
 
     #[inline(always)]
     fn advance<V: Vector<Real = T>>(
@@ -241,6 +242,11 @@ impl<T: Real, const ORDER: usize, const COMPENSATED: bool> sweep::Scheme<T> for 
             kept[ORDER] = u.sub(moved.sub(x));
         }
         (moved, d.add(w))
+    }
+
+    #[inline(always)]
+    fn travel<V: Vector<Real = T>>(&self, [x, _]: [V; 2], [moved, _]: [V; 2]) -> V {
+        moved.sub(x)
     }
 
     #[inline(always)]

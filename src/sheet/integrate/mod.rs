@@ -106,6 +106,15 @@ impl Scheme {
         }
     }
 
+    /// What a constant force of 1 adds to the velocity in a substep, or nearly so: by the last of its fields.
+    pub fn impulse(&self) -> f64 {
+        match self {
+            Scheme::TwoStep(two) => two.q,
+            Scheme::Multistep(multistep) => multistep.impulse(),
+            Scheme::Rk4 { .. } => 1.0,
+        }
+    }
+
     /// Fields that the scheme keeps beside u and d.
     pub fn kept(&self, compensated: bool) -> usize {
         match self {

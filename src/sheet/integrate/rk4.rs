@@ -56,6 +56,7 @@ impl<T: Real> Advance<T> {
 impl<T: Real> sweep::Scheme<T> for Advance<T> {
     const KEPT: usize = KEPT;
     const WRITTEN: usize = KEPT;
+    const FORCES: usize = 1;
 
     #[inline(always)]
     fn advance<V: Vector<Real = T>>(
@@ -80,6 +81,11 @@ impl<T: Real> sweep::Scheme<T> for Advance<T> {
         }
         let far = V::splat(self.far);
         (far.mul_add(slope[0], kept[0]), far.mul_add(slope[1], kept[1]))
+    }
+
+    #[inline(always)]
+    fn travel<V: Vector<Real = T>>(&self, [_, d]: [V; 2], _: [V; 2]) -> V {
+        V::splat(self.share).mul(d)
     }
 
     #[inline(always)]

@@ -1,0 +1,298 @@
+//! The widths of x86-64: AVX-512, and AVX2 with FMA.
+#![allow(unsafe_code)]
+
+use std::arch::x86_64::_CMP_GT_OQ;
+
+use super::{Real, Run, Vector};
+
+/// While one is alive, results and operands below the normal range count as 0 on this thread. Fields decay in time
+/// and towards the rim of a sheet without end, and each operation on the subnormal numbers at which they arrive
+/// costs as much as a hundred others.
+pub(super) struct Flushing {
+    before: u32,
+}
+
+/// Flush to zero, and denormals are zero: bits of the control register.
+const FLUSH: u32 = 0x8040;
+
+impl Flushing {
+    pub(super) fn begin() -> Self {
+        let mut before = 0_u32;
+        // SAFETY: stores the control register to a place of its size.
+        unsafe { std::arch::asm!("stmxcsr [{}]", in(reg) &raw mut before, options(nostack)) };
+        Flushing::set(before | FLUSH);
+        Flushing { before }
+    }
+
+    fn set(control: u32) {
+        // SAFETY: only the two bits change, which alter nothing but numbers below the normal range; they are put
+        // back before anything other than a sweep runs.
+        unsafe { std::arch::asm!("ldmxcsr [{}]", in(reg) &raw const control, options(nostack, readonly)) };
+    }
+}
+
+impl Drop for Flushing {
+    fn drop(&mut self) {
+        Flushing::set(self.before);
+    }
+}
+
+/// # Safety
+/// As [`super::run`], and the processor has these instructions.
+#[target_feature(enable = "avx512f,avx512dq,fma")]
+pub(super) unsafe fn with_avx512<T: Real>(program: &impl Run<T>) {
+    // SAFETY: the caller's promise.
+    unsafe { program.run::<T::Avx512>() }
+}
+
+/// # Safety
+/// As [`super::run`], and the processor has these instructions.
+#[target_feature(enable = "avx2,fma")]
+pub(super) unsafe fn with_avx2<T: Real>(program: &impl Run<T>) {
+    // SAFETY: the caller's promise.
+    unsafe { program.run::<T::Avx2>() }
+}
+
+/// The operations that both widths and both formats have under one name; the others follow in braces.
+macro_rules! vector {
+    ($name:ident, $real:ty, $lanes:literal, $mantissa:literal, $mask:ty, $i:ident, { $($own:tt)* }) => {
+        /// A register.
+        #[derive(Clone, Copy)]
+        pub(in super::super) struct $name($i::Register);
+
+        // SAFETY (of every block below): a value of this type is only made by `Run::run`, for which the processor
+        // has the instructions; memory is the caller's promise.
+        impl Vector for $name {
+            type Real = $real;
+            type Mask = $mask;
+            const LANES: usize = $lanes;
+            #[inline(always)]
+            unsafe fn load(from: *const $real) -> Self {
+                unsafe { $name($i::load(from)) }
+            }
+            #[inline(always)]
+            unsafe fn store(self, to: *mut $real) {
+                unsafe { $i::store(to, self.0) }
+            }
+            #[inline(always)]
+            fn splat(value: $real) -> Self {
+                unsafe { $name($i::splat(value)) }
+            }
+            #[inline(always)]
+            fn add(self, other: Self) -> Self {
+                unsafe { $name($i::add(self.0, other.0)) }
+            }
+            #[inline(always)]
+            fn sub(self, other: Self) -> Self {
+                unsafe { $name($i::sub(self.0, other.0)) }
+            }
+            #[inline(always)]
+            fn mul(self, other: Self) -> Self {
+                unsafe { $name($i::mul(self.0, other.0)) }
+            }
+            #[inline(always)]
+            fn div(self, other: Self) -> Self {
+                unsafe { $name($i::div(self.0, other.0)) }
+            }
+            #[inline(always)]
+            fn root(self) -> Self {
+                unsafe { $name($i::root(self.0)) }
+            }
+            #[inline(always)]
+            fn mul_add(self, b: Self, c: Self) -> Self {
+                unsafe { $name($i::mul_add(self.0, b.0, c.0)) }
+            }
+            #[inline(always)]
+            fn mul_sub(self, b: Self, c: Self) -> Self {
+                unsafe { $name($i::mul_sub(self.0, b.0, c.0)) }
+            }
+            #[inline(always)]
+            fn minus(self, a: Self, b: Self) -> Self {
+                unsafe { $name($i::minus(a.0, b.0, self.0)) }
+            }
+            #[inline(always)]
+            fn rough_inverse_root(self) -> Self {
+                unsafe {
+                    let magic = $i::splat_bits(<$real as Real>::INVERSE_ROOT.cast_signed());
+                    $name($i::real($i::sub_bits(magic, $i::half_bits::<1>($i::bits(self.0)))))
+                }
+            }
+            #[inline(always)]
+            fn power_of_two(self) -> Self {
+                // The last bits of the sum are the exponent's.
+                let sum = self.add(Self::splat(<$real>::of(<$real as Real>::POWER)));
+                unsafe { $name($i::real($i::left::<$mantissa>($i::bits(sum.0)))) }
+            }
+            #[inline(always)]
+            #[allow(clippy::cast_precision_loss)]
+            fn count(first: usize) -> Self {
+                const COUNT: [$real; 16] =
+                    [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0];
+                unsafe { $name($i::load(COUNT.as_ptr())).add(Self::splat(first as $real)) }
+            }
+            #[inline(always)]
+            fn larger(self, other: Self) -> Self {
+                unsafe { $name($i::larger(self.0, other.0)) }
+            }
+            $($own)*
+        }
+    };
+}
+
+/// What AVX-512 has, for a format: masks of its own kind, and shifts across the register.
+macro_rules! avx512 {
+    ($name:ident, $real:ty, $lanes:literal, $mantissa:literal, $mask:ty, $i:ident) => {
+        vector!($name, $real, $lanes, $mantissa, $mask, $i, {
+            #[inline(always)]
+            fn farther(self, other: Self) -> Self {
+                // The larger magnitude, with its sign cleared.
+                unsafe { $name($i::range::<0b1011>(self.0, other.0)) }
+            }
+            #[inline(always)]
+            fn beyond(self, bound: Self) -> $mask {
+                unsafe { $i::compare::<_CMP_GT_OQ>($i::magnitude(self.0), bound.0) }
+            }
+            #[inline(always)]
+            fn any(mask: $mask) -> bool {
+                mask != 0
+            }
+            #[inline(always)]
+            fn either(a: $mask, b: $mask) -> $mask {
+                a | b
+            }
+            #[inline(always)]
+            fn select(mask: $mask, a: Self, b: Self) -> Self {
+                unsafe { $name($i::select(b.0, mask, a.0)) }
+            }
+            #[inline(always)]
+            fn first(count: usize) -> $mask {
+                if count >= $lanes { <$mask>::MAX } else { (1 << count) - 1 }
+            }
+            #[inline(always)]
+            fn keep(self, mask: $mask) -> Self {
+                unsafe { $name($i::keep(mask, self.0)) }
+            }
+            #[inline(always)]
+            fn shift(self, before: Self) -> Self {
+                unsafe { $name($i::real($i::align::<{ $lanes - 1 }>($i::bits(self.0), $i::bits(before.0)))) }
+            }
+            #[inline(always)]
+            fn shift_two(self, before: Self) -> Self {
+                unsafe { $name($i::real($i::align::<{ $lanes - 2 }>($i::bits(self.0), $i::bits(before.0)))) }
+            }
+        });
+    };
+}
+
+/// What AVX2 has, for a format: masks are registers, and a shift first brings both halves together.
+macro_rules! avx2 {
+    ($name:ident, $real:ty, $lanes:literal, $mantissa:literal, $i:ident, |$high:ident, $mid:ident| $shift:expr,
+     |$high2:ident, $mid2:ident| $shift_two:expr) => {
+        vector!($name, $real, $lanes, $mantissa, $i::Register, $i, {
+            #[inline(always)]
+            fn farther(self, other: Self) -> Self {
+                unsafe {
+                    let sign = $i::splat(-0.0);
+                    $name($i::larger($i::and_not(sign, self.0), $i::and_not(sign, other.0)))
+                }
+            }
+            #[inline(always)]
+            fn beyond(self, bound: Self) -> $i::Register {
+                unsafe { $i::compare::<_CMP_GT_OQ>($i::and_not($i::splat(-0.0), self.0), bound.0) }
+            }
+            #[inline(always)]
+            fn any(mask: $i::Register) -> bool {
+                unsafe { $i::signs(mask) != 0 }
+            }
+            #[inline(always)]
+            fn either(a: $i::Register, b: $i::Register) -> $i::Register {
+                unsafe { $i::or(a, b) }
+            }
+            #[inline(always)]
+            fn select(mask: $i::Register, a: Self, b: Self) -> Self {
+                unsafe { $name($i::select(b.0, a.0, mask)) }
+            }
+            #[inline(always)]
+            #[allow(clippy::cast_precision_loss)]
+            fn first(count: usize) -> $i::Register {
+                unsafe { $i::compare::<_CMP_GT_OQ>($i::splat(count.min($lanes) as $real), Self::count(0).0) }
+            }
+            #[inline(always)]
+            fn keep(self, mask: $i::Register) -> Self {
+                unsafe { $name($i::and(mask, self.0)) }
+            }
+            #[inline(always)]
+            fn shift(self, before: Self) -> Self {
+                unsafe {
+                    let ($high, $mid) = (self.0, $i::halves::<0x21>(before.0, self.0));
+                    $name($shift)
+                }
+            }
+            #[inline(always)]
+            fn shift_two(self, before: Self) -> Self {
+                unsafe {
+                    let ($high2, $mid2) = (self.0, $i::halves::<0x21>(before.0, self.0));
+                    $name($shift_two)
+                }
+            }
+        });
+    };
+}
+
+mod wide_f32 {
+    pub(super) use std::arch::x86_64::{
+        __m512 as Register, _mm512_abs_ps as magnitude, _mm512_add_ps as add, _mm512_alignr_epi32 as align,
+        _mm512_castps_si512 as bits, _mm512_castsi512_ps as real, _mm512_cmp_ps_mask as compare, _mm512_div_ps as div,
+        _mm512_fmadd_ps as mul_add, _mm512_fmsub_ps as mul_sub, _mm512_fnmadd_ps as minus, _mm512_loadu_ps as load,
+        _mm512_mask_mov_ps as select, _mm512_maskz_mov_ps as keep, _mm512_max_ps as larger, _mm512_mul_ps as mul,
+        _mm512_range_ps as range, _mm512_set1_epi32 as splat_bits, _mm512_set1_ps as splat, _mm512_slli_epi32 as left,
+        _mm512_sqrt_ps as root, _mm512_srli_epi32 as half_bits, _mm512_storeu_ps as store,
+        _mm512_sub_epi32 as sub_bits, _mm512_sub_ps as sub,
+    };
+}
+mod wide_f64 {
+    pub(super) use std::arch::x86_64::{
+        __m512d as Register, _mm512_abs_pd as magnitude, _mm512_add_pd as add, _mm512_alignr_epi64 as align,
+        _mm512_castpd_si512 as bits, _mm512_castsi512_pd as real, _mm512_cmp_pd_mask as compare, _mm512_div_pd as div,
+        _mm512_fmadd_pd as mul_add, _mm512_fmsub_pd as mul_sub, _mm512_fnmadd_pd as minus, _mm512_loadu_pd as load,
+        _mm512_mask_mov_pd as select, _mm512_maskz_mov_pd as keep, _mm512_max_pd as larger, _mm512_mul_pd as mul,
+        _mm512_range_pd as range, _mm512_set1_epi64 as splat_bits, _mm512_set1_pd as splat, _mm512_slli_epi64 as left,
+        _mm512_sqrt_pd as root, _mm512_srli_epi64 as half_bits, _mm512_storeu_pd as store,
+        _mm512_sub_epi64 as sub_bits, _mm512_sub_pd as sub,
+    };
+}
+mod narrow_f32 {
+    pub(super) use std::arch::x86_64::{
+        __m256 as Register, _mm256_add_ps as add, _mm256_alignr_epi8 as align, _mm256_and_ps as and,
+        _mm256_andnot_ps as and_not, _mm256_blendv_ps as select, _mm256_castps_si256 as bits,
+        _mm256_castsi256_ps as real, _mm256_cmp_ps as compare, _mm256_div_ps as div, _mm256_fmadd_ps as mul_add,
+        _mm256_fmsub_ps as mul_sub, _mm256_fnmadd_ps as minus, _mm256_loadu_ps as load, _mm256_max_ps as larger,
+        _mm256_movemask_ps as signs, _mm256_mul_ps as mul, _mm256_or_ps as or, _mm256_permute2f128_ps as halves,
+        _mm256_set1_epi32 as splat_bits, _mm256_set1_ps as splat, _mm256_slli_epi32 as left, _mm256_sqrt_ps as root,
+        _mm256_srli_epi32 as half_bits, _mm256_storeu_ps as store, _mm256_sub_epi32 as sub_bits, _mm256_sub_ps as sub,
+    };
+}
+mod narrow_f64 {
+    pub(super) use std::arch::x86_64::{
+        __m256d as Register, _mm256_add_pd as add, _mm256_and_pd as and, _mm256_andnot_pd as and_not,
+        _mm256_blendv_pd as select, _mm256_castpd_si256 as bits, _mm256_castsi256_pd as real, _mm256_cmp_pd as compare,
+        _mm256_div_pd as div, _mm256_fmadd_pd as mul_add, _mm256_fmsub_pd as mul_sub, _mm256_fnmadd_pd as minus,
+        _mm256_loadu_pd as load, _mm256_max_pd as larger, _mm256_movemask_pd as signs, _mm256_mul_pd as mul,
+        _mm256_or_pd as or, _mm256_permute2f128_pd as halves, _mm256_set1_epi64x as splat_bits,
+        _mm256_set1_pd as splat, _mm256_shuffle_pd as shuffle, _mm256_slli_epi64 as left, _mm256_sqrt_pd as root,
+        _mm256_srli_epi64 as half_bits, _mm256_storeu_pd as store, _mm256_sub_epi64 as sub_bits, _mm256_sub_pd as sub,
+    };
+}
+
+avx512!(WideF32, f32, 16, 23, u16, wide_f32);
+avx512!(WideF64, f64, 8, 52, u8, wide_f64);
+avx2!(
+    NarrowF32,
+    f32,
+    8,
+    23,
+    narrow_f32,
+    |high, mid| narrow_f32::real(narrow_f32::align::<12>(narrow_f32::bits(high), narrow_f32::bits(mid))),
+    |high, mid| narrow_f32::real(narrow_f32::align::<8>(narrow_f32::bits(high), narrow_f32::bits(mid)))
+);
+avx2!(NarrowF64, f64, 4, 52, narrow_f64, |high, mid| narrow_f64::shuffle::<0b0101>(mid, high), |_high, mid| mid);
