@@ -9,7 +9,7 @@ SCRIPT ?= scripts/vertical-60.toml
 VENV := target/venv
 
 .PHONY: help run build test stress lint picture bench-roundtrip bench-duty bench-frames bench-error bench-kernel \
-	bench-stability need-rust need-python
+	bench-stability bench-skip need-rust need-python
 
 help:
 	@echo 'make run             build, serve on $(LISTEN), poke the tissue, draw what it felt, go on serving'
@@ -23,6 +23,7 @@ help:
 	@echo 'make bench-error     run time against error, every scheme on seven scenes: docs/benchmarks/error.md'
 	@echo 'make bench-kernel    the time of a step beside the machine'"'"'s limits, numba, Taichi and NumPy'
 	@echo 'make bench-stability the largest stable step, predicted and observed'
+	@echo 'make bench-skip      what it saves to leave out what is at rest, and its error'
 
 need-rust:
 	@command -v $(CARGO) >/dev/null || { echo 'Rust is missing: install it from https://rustup.rs' >&2; exit 1; }
@@ -98,3 +99,6 @@ bench-kernel: need-rust $(PEERS)/ready
 
 bench-stability: need-rust
 	$(CARGO) bench --quiet --bench stability
+
+bench-skip: need-rust
+	$(CARGO) bench --quiet --bench skip -- $(ARGUMENTS)

@@ -177,7 +177,8 @@ fn a_centred_poke_keeps_the_symmetry_of_the_sheet() {
 
 #[test]
 fn equilibrium_is_the_solution_of_newtons_method() {
-    let scene = scene_with(SMALL, &["springs.flexion=true", "springs.shear_stiffness_n_per_m=12.0"]);
+    let scene =
+        scene_with(SMALL, &["springs.flexion=true", "springs.shear_stiffness_n_per_m=12.0", "sleep.tolerance=0"]);
     let load = DVec3::new(0.2, -0.1, -0.5);
     let mut tissue = sheet::at_rest(&model(&scene));
     tissue.push(0, Some(push_on(&scene, [3, 2], load.to_array())));
@@ -352,7 +353,7 @@ fn the_force_field_is_minus_the_gradient_of_the_energy() {
 
 #[test]
 fn virtual_springs_alone_leave_every_point_to_itself() {
-    let scene = scene_with(SMALL, &["springs.stiffness_n_per_m=0.0"]);
+    let scene = scene_with(SMALL, &["springs.stiffness_n_per_m=0.0", "sleep.tolerance=0"]);
     let mut tissue = sheet::at_rest(&model(&scene));
     tissue.push(0, Some(push_on(&scene, [3, 2], [0.0, 0.0, -0.5])));
     for _ in 0..5000 {

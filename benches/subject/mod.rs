@@ -30,9 +30,10 @@ pub fn set(key: &str, value: impl std::fmt::Display) -> String {
     format!("{key}={value}")
 }
 
-/// The paper's scene, with assignments over it.
+/// The paper's scene with everything awake, and assignments over it.
 pub fn scene(assignments: &[String]) -> Result<Scene> {
-    Scene::parse("paper", PAPER, assignments, &Limits::default())
+    let all: Vec<String> = std::iter::once(set("sleep.tolerance", 0)).chain(assignments.iter().cloned()).collect();
+    Scene::parse("paper", PAPER, &all, &Limits { points: 10_000_000, ..Limits::default() })
 }
 
 /// The same, compiled.

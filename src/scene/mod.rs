@@ -30,8 +30,9 @@ pub struct Scene {
     pub damping_n_s_per_m: f64,
     /// How time advances.
     pub stepping: Stepping,
-    /// Error that leaving out regions at rest may cost, relative to the largest displacement; 0 leaves out nothing.
-    pub sleep_tolerance: f64,
+    /// Error that leaving out regions at rest may cost, relative to the largest displacement; 0 leaves out nothing. Not
+    /// given, it is a tenth of the error of the rest (`Model`).
+    pub sleep_tolerance: Option<f64>,
 }
 
 /// The grid: point [i, j] rests at (i·spacing, j·spacing, 0).
@@ -98,9 +99,6 @@ impl Default for Stepping {
         }
     }
 }
-
-/// Default of [`Scene::sleep_tolerance`].
-pub const SLEEP_TOLERANCE: f64 = 1e-6;
 
 /// A value that a scene gives by a name out of a list.
 pub trait Named: Sized + Copy + PartialEq + 'static {
@@ -241,8 +239,7 @@ impl Scene {
                 sleep_tolerance: match fields.item("sleep") {
                     Some(item) => item.table(|fields| fields.number("tolerance"))?,
                     None => None,
-                }
-                .unwrap_or(SLEEP_TOLERANCE),
+                },
             })
         })?;
         scene.check(limits).map_err(|refusal| document.locate(refusal))?;
@@ -287,7 +284,9 @@ impl Scene {
             let holds = |v| v >= 1.0 && v <= f64::from(limits.substeps);
             number("stepping.substeps", f64::from(substeps), &range, holds)?;
         }
-        number("sleep.tolerance", self.sleep_tolerance, "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
+        if let Some(tolerance) = self.sleep_tolerance {
+            number("sleep.tolerance", tolerance, "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
+        }
         Ok(())
     }
 }

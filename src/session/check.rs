@@ -102,6 +102,7 @@ impl fmt::Display for Report {
             "error         {:.1e} expected, {:.1e} asked for, of displacement and force relative to their largest",
             model.expected_error, scene.stepping.tolerance
         )?;
+        writeln!(f, "sleep         tiles at rest are left out, for an error of at most {:.1e}", model.sleep_tolerance)?;
         if let Some([least_s, median_s]) = self.step_s {
             let points = (model.len() * plan.substeps as usize) as f64;
             writeln!(

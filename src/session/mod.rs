@@ -252,7 +252,7 @@ impl Session {
         Sample {
             step: self.step_count(),
             simulation_time_s: self.time_s(),
-            awake_points: self.model().len(),
+            awake_points: self.tissue.awake_points(),
             late_commands: self.late_commands,
             held: self.hold_reason.is_some(),
             tools,
@@ -274,7 +274,7 @@ impl Session {
                 None => (0..self.model().len()).map(|index| of(&self.model().point_of(index))).collect(),
             },
             energy_j: None,
-            awake_points: self.model().len(),
+            awake_points: self.tissue.awake_points(),
         }
     }
 }

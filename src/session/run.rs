@@ -134,7 +134,7 @@ pub fn summary(tissue: &dyn Tissue, wall_s: f64) -> Summary {
         points: model.len(),
         wall_s,
         ns_per_point_substep: wall_s * 1e9 / (substeps as f64 * model.len() as f64),
-        computed_fraction: 1.0,
+        computed_fraction: tissue.computed_fraction(),
         guard_events: tissue.guard_events(),
         final_hash: format!("{:032x}", tissue.state_hash()),
         network: None,

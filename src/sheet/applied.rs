@@ -45,6 +45,45 @@ impl Push {
 struct Slot {
     push: Option<Push>,
     before: Option<Poke>,
+    /// What the tiles that sleep were last told of.
+    told: Option<Poke>,
+}
+
+/// A change of a tool's force.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Touch {
+    old: Option<Poke>,
+    new: Option<Poke>,
+}
+
+impl Touch {
+    /// At most how much the force on any point of a rectangle changes, N; `sides`: its ends along x and along y, m.
+    pub(super) fn most_n(&self, sides: [[f64; 2]; 2]) -> f64 {
+        let nearest = |poke: &Poke| {
+            let away: [f64; 2] = std::array::from_fn(|axis| {
+                let [from, to] = sides[axis];
+                let centre = poke.centre_m[axis];
+                (from - centre).max(centre - to).max(0.0)
+            });
+            let exponent = poke.falloff_offset - poke.falloff_per_m * (away[0] * away[0] + away[1] * away[1]).sqrt();
+            libm::exp(exponent)
+        };
+        let each = |poke: &Option<Poke>| poke.as_ref().map_or(0.0, |poke| poke.force_n.length() * nearest(poke));
+        let both = each(&self.old) + each(&self.new);
+        let Some((old, new)) = self.old.as_ref().zip(self.new.as_ref()) else { return both };
+        if !same_falloff(&Poke { centre_m: new.centre_m, ..*old }, new) {
+            return both;
+        }
+        // A centre that moves changes the exponent by c times as much at most.
+        let (p, q) = (nearest(old), nearest(new));
+        let moved = new.falloff_per_m * old.centre_m.distance(new.centre_m);
+        both.min((new.force_n - old.force_n).length() * q + old.force_n.length() * moved * p.max(q))
+    }
+
+    /// The new force at its centre, N.
+    pub(super) fn peak_n(&self) -> f64 {
+        self.new.map_or(0.0, |poke| poke.force_n.length() * libm::exp(poke.falloff_offset))
+    }
 }
 
 /// The forces of all tools.
@@ -262,6 +301,25 @@ impl<T: Real> Applied<T> {
         }
         self.slots[tool].push = push;
         self.settled = false;
+    }
+
+    /// Whether nothing changes until a tool is told something else.
+    pub(super) fn is_settled(&self) -> bool {
+        self.settled
+    }
+
+    /// Changes of force since the last call, up to the end of step `step`.
+    pub(super) fn changes(&mut self, model: &Model, step: u64) -> Vec<Touch> {
+        if self.settled {
+            return Vec::new();
+        }
+        let end = Moment { step, fraction: 1.0 };
+        let change = |slot: &mut Slot| {
+            let new = slot.push.as_ref().map(|push| push.at(end, model.scene.stepping.rate_hz));
+            let old = std::mem::replace(&mut slot.told, new);
+            (old != new).then_some(Touch { old, new })
+        };
+        self.slots.iter_mut().filter_map(change).collect()
     }
 
     /// Brings the forces to the substep that begins at `moment` and takes `share` of the step.

@@ -69,7 +69,7 @@ impl<T: Real> State<T> {
         [&self.u, &self.d].into_iter().chain(&self.kept)
     }
 
-    fn fields_mut(&mut self) -> impl Iterator<Item = &mut Field<T>> {
+    pub(super) fn fields_mut(&mut self) -> impl Iterator<Item = &mut Field<T>> {
         [&mut self.u, &mut self.d].into_iter().chain(&mut self.kept)
     }
 

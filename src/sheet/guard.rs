@@ -108,7 +108,8 @@ pub(super) struct Work {
     largest_j: f64,
 }
 
-/// A rise of less than this part of the largest energy so far is noise of rounding, in a sheet that has come to rest.
+/// A rise of less than this part of the largest energy so far is noise of rounding, in a sheet that has come to rest; or
+/// of less than the square of ten times what tiles may be off by that sleep.
 const NOISE: f64 = 1e-10;
 
 impl Work {
@@ -117,10 +118,10 @@ impl Work {
         self.done_j += work_j;
     }
 
-    /// Judges an energy. The account begins anew.
-    pub(super) fn survey(&mut self, energy_j: f64) -> Result<(), Cause> {
+    /// Judges an energy; a rise by `noise` of the largest is none. The account begins anew.
+    pub(super) fn survey(&mut self, energy_j: f64, noise: f64) -> Result<(), Cause> {
         let (work_j, before_j) = (self.done_j, self.energy_j);
-        let allowed_j = work_j + MARGIN * (before_j + work_j.abs()) + NOISE * self.largest_j;
+        let allowed_j = work_j + MARGIN * (before_j + work_j.abs()) + noise * self.largest_j;
         if energy_j - before_j > allowed_j {
             return Err(Cause::Energy { energy_j, before_j, work_j });
         }
@@ -146,28 +147,34 @@ impl<T: Real> Sheet<T> {
         if !due {
             return Ok(());
         }
-        let (survey, _, energy_j) = self.survey();
+        let (survey, _, energy_j) = self.survey(&self.tiles.region);
+        let energy_j = energy_j + self.tiles.asleep_j;
         if !(survey.largest < farthest && energy_j.is_finite()) {
             scan()?;
         }
         if survey.surprise > MOST_SURPRISE * survey.largest {
             return Err(Cause::Surprise { part: survey.surprise / survey.largest });
         }
-        self.work.survey(energy_j)?;
+        self.work.survey(energy_j, NOISE.max((10.0 * self.model.sleep_tolerance).powi(2)))?;
+        self.take_checkpoint();
+        Ok(())
+    }
+
+    fn take_checkpoint(&mut self) {
         self.checkpoint.steps = self.steps;
         self.checkpoint.halvings = self.halvings;
-        self.checkpoint.state.copy_from(&self.state);
+        self.tiles.copy_touched(self.checkpoint.state.fields_mut().zip(self.state.fields()));
         self.checkpoint.applied.clone_from(&self.applied);
         self.checkpoint.prescribed.clone_from(&self.prescribed);
         self.checkpoint.work = self.work;
         self.inputs.clear();
-        Ok(())
     }
 
     /// Back to the checkpoint, with the substep of `halvings`.
     fn go_back(&mut self, halvings: u32) {
         let layout = self.bench.layout;
         self.steps = self.checkpoint.steps;
+        self.tiles.wake_all();
         self.state.copy_from(&self.checkpoint.state);
         self.applied.clone_from(&self.checkpoint.applied);
         self.prescribed.clone_from(&self.checkpoint.prescribed);
@@ -185,6 +192,10 @@ impl<T: Real> Sheet<T> {
     }
 
     pub(super) fn input(&mut self, tool: usize, input: Input) {
+        // What has slept for long is not to be repeated.
+        if self.is_still() {
+            self.take_checkpoint();
+        }
         self.inputs.push((self.steps, tool, input.clone()));
         self.tell(tool, input);
     }

@@ -1,5 +1,33 @@
 //! The tissue: an immutable model, a state, and the step that takes one to the next. No clock, no socket.
 
+/// Does something with the scheme of a plan, in format `$t`: what does not advance it, and needs no compensation.
+macro_rules! with_scheme {
+    ($plan:expr, $t:ty, |$scheme:ident| $body:expr) => {
+        match &$plan.scheme {
+            Scheme::TwoStep(two) => {
+                let $scheme = &central::Advance::<$t>::new(two);
+                $body
+            }
+            Scheme::Multistep(multistep) if multistep.order == 2 => {
+                let $scheme = &exponential::Advance::<$t, 2, false>::new(multistep);
+                $body
+            }
+            Scheme::Multistep(multistep) if multistep.order == 3 => {
+                let $scheme = &exponential::Advance::<$t, 3, false>::new(multistep);
+                $body
+            }
+            Scheme::Multistep(multistep) => {
+                let $scheme = &exponential::Advance::<$t, 4, false>::new(multistep);
+                $body
+            }
+            Scheme::Rk4 { a, g } => {
+                let $scheme = &rk4::Advance::<$t>::new(*a, *g, 0);
+                $body
+            }
+        }
+    };
+}
+
 mod applied;
 pub mod choice;
 mod field;
@@ -9,10 +37,12 @@ mod lanes;
 pub mod model;
 mod prescribed;
 mod real;
+mod rest;
 mod springs;
 pub mod stability;
 mod survey;
 mod sweep;
+mod tiles;
 
 use std::sync::Arc;
 
@@ -33,8 +63,9 @@ pub use prescribed::Grasp;
 use prescribed::Prescribed;
 use real::Real;
 use springs::Springs;
-use survey::Survey;
+use survey::{Forces, Survey};
 use sweep::{Bench, MAX_KEPT};
+use tiles::{CHECK_STEPS, Region, Tiles};
 
 /// One mass point at the end of a step: displacement, velocity, and the forces on the point. Where the applied
 /// force jumps it is the one just before; at step 0, just after.
@@ -99,8 +130,12 @@ pub trait Tissue: Send {
     fn plan(&self) -> &Plan;
     /// How often the guard went back to a checkpoint and on with half the substep.
     fn guard_events(&self) -> u64;
-    /// Substeps computed, those that the guard repeated as well.
+    /// Substeps done, those that the guard repeated as well.
     fn substeps_done(&self) -> u64;
+    /// Points that the coming step computes; the others are at rest.
+    fn awake_points(&self) -> usize;
+    /// Of all points in all substeps, the part that was computed.
+    fn computed_fraction(&self) -> f64;
     /// One step. After a blow-up the state is that of the last checkpoint, which is finite.
     fn step(&mut self) -> Result<(), BlowUp>;
     /// The point at `index`.
@@ -123,34 +158,6 @@ pub fn at_rest(model: &Arc<Model>) -> Box<dyn Tissue> {
     }
 }
 
-/// Does something with the scheme of a plan, in format `$t`: what does not advance it, and needs no compensation.
-macro_rules! with_scheme {
-    ($plan:expr, $t:ty, |$scheme:ident| $body:expr) => {
-        match &$plan.scheme {
-            Scheme::TwoStep(two) => {
-                let $scheme = &central::Advance::<$t>::new(two);
-                $body
-            }
-            Scheme::Multistep(multistep) if multistep.order == 2 => {
-                let $scheme = &exponential::Advance::<$t, 2, false>::new(multistep);
-                $body
-            }
-            Scheme::Multistep(multistep) if multistep.order == 3 => {
-                let $scheme = &exponential::Advance::<$t, 3, false>::new(multistep);
-                $body
-            }
-            Scheme::Multistep(multistep) => {
-                let $scheme = &exponential::Advance::<$t, 4, false>::new(multistep);
-                $body
-            }
-            Scheme::Rk4 { a, g } => {
-                let $scheme = &rk4::Advance::<$t>::new(*a, *g, 0);
-                $body
-            }
-        }
-    };
-}
-
 #[derive(Debug)]
 struct Sheet<T: Real> {
     model: Arc<Model>,
@@ -166,8 +173,11 @@ struct Sheet<T: Real> {
     checkpoint: Checkpoint<T>,
     /// What the tools were told since the checkpoint: before which step, which tool.
     inputs: Vec<(u64, usize, Input)>,
+    tiles: Tiles<T>,
     guard_events: u64,
     substeps_done: u64,
+    /// Points computed, of all substeps.
+    points_done: u64,
 }
 
 impl<T: Real> Sheet<T> {
@@ -195,14 +205,27 @@ impl<T: Real> Sheet<T> {
             applied,
             prescribed,
             inputs: Vec::new(),
+            tiles: Tiles::new(layout, rest::tolerance(model), if model.scene.springs.flexion { 2 } else { 1 }),
             guard_events: 0,
             substeps_done: 0,
+            points_done: 0,
             plan,
         }
     }
 
+    /// Whether a step changes nothing but the time.
+    fn is_still(&self) -> bool {
+        self.tiles.awake.is_empty() && self.applied.is_settled() && self.prescribed.is_empty()
+    }
+
     fn do_step(&mut self) {
         let substeps = self.plan.substeps;
+        self.substeps_done += u64::from(substeps);
+        if self.is_still() {
+            self.steps += 1;
+            return;
+        }
+        self.wake_what_is_pushed();
         let fraction = |substep: u32| f64::from(substep) / f64::from(substeps);
         for substep in 0..substeps {
             self.substep(Moment { step: self.steps, fraction: fraction(substep) }, fraction(substep + 1));
@@ -210,21 +233,27 @@ impl<T: Real> Sheet<T> {
         self.applied.finish(&self.model, self.steps);
         self.prescribed.finish(&self.model, self.steps);
         self.steps += 1;
-        self.substeps_done += u64::from(substeps);
+        if self.steps.is_multiple_of(CHECK_STEPS) {
+            self.rest();
+        }
     }
 
     /// From `moment` to the fraction `end` of the same step.
     fn substep(&mut self, moment: Moment, end: f64) {
+        let (_, far) = self.tolerances();
+        self.tiles.watch(&self.state.u, far);
+        self.points_done += self.tiles.awake_points as u64;
         let Sheet { model, plan, bench, applied, .. } = self;
         let layout = bench.layout;
         applied.prepare(model, plan, &layout, moment, end - moment.fraction);
         let released = self.prescribed.take_released();
         let released: Vec<_> =
             released.into_iter().map(|(index, v)| (index, self.change_at_release(index, v, moment))).collect();
-        let Sheet { model, plan, bench, state, applied, .. } = self;
+        let Sheet { model, plan, bench, state, applied, tiles, .. } = self;
+        let region = &tiles.region;
         match &plan.scheme {
             Scheme::TwoStep(two) => {
-                bench.advance(&central::Advance::new(two), state, &applied.terms, 0);
+                bench.advance(&central::Advance::new(two), state, &applied.terms, 0, region);
             }
             Scheme::Multistep(multistep) => {
                 // The change is to what the substep begins with.
@@ -237,7 +266,7 @@ impl<T: Real> Sheet<T> {
                         match (multistep.order, compensated) {
                             $(($order, $with) => {
                                 let scheme = exponential::Advance::<T, $order, $with>::new(multistep);
-                                bench.advance(&scheme, state, &applied.terms, 0);
+                                bench.advance(&scheme, state, &applied.terms, 0, region);
                             })*
                             // `Scheme::fit` makes no others.
                             _ => {}
@@ -252,7 +281,9 @@ impl<T: Real> Sheet<T> {
                 let (a, g) = (*a, *g);
                 for stage in 0..rk4::STAGES.len() {
                     let field = stage.div_ceil(2);
-                    self.bench.advance(&rk4::Advance::new(a, g, stage), &mut self.state, &self.applied.terms, field);
+                    let scheme = rk4::Advance::new(a, g, stage);
+                    let terms = &self.applied.terms;
+                    self.bench.advance(&scheme, &mut self.state, terms, field, &self.tiles.region);
                     if stage < 3 {
                         let far = rk4::STAGES[stage].0;
                         self.hold(moment.step, moment.fraction + far * (end - moment.fraction), false);
@@ -343,6 +374,8 @@ impl<T: Real> Sheet<T> {
         let (spacing_m, scale) = (model.scene.sheet.spacing_m, plan.force_scale(&model.scene));
         let unit = plan.scheme.spring_scale() * scale;
         let springs = bench.springs.gather(&bench.layout, &state.u, model.point_of(index));
+        let [i, j] = model.point_of(index);
+        let still = self.steps == 0 || !self.tiles.region.is_awake(i, j);
         let mut found = [DVec3::ZERO; 3];
         for (c, n) in springs.into_iter().enumerate() {
             let at = c * bench.layout.plane + bench.layout.place(index);
@@ -354,14 +387,14 @@ impl<T: Real> Sheet<T> {
             use sweep::Scheme as _;
             let (u, w) = with_scheme!(plan, f64, |scheme| scheme.observe(u, d, n, &kept, Some(force)));
             found[0][c] = u.value() * spacing_m;
-            found[1][c] = if self.steps == 0 { 0.0 } else { w.value() * spacing_m / plan.substep_s };
+            found[1][c] = if still { 0.0 } else { w.value() * spacing_m / plan.substep_s };
             found[2][c] = n.value() / unit;
         }
         found
     }
 
-    /// Looks at the whole sheet: what a survey sees, the energies, and the energy that the scheme keeps.
-    fn survey(&self) -> (Survey, Energy, f64) {
+    /// Looks at part of the sheet: what a survey sees, the energies, and the energy that the scheme keeps.
+    fn survey(&self, over: &Region) -> (Survey, Energy, f64) {
         let Sheet { model, plan, bench, state, .. } = self;
         let unit = plan.scheme.spring_scale() * plan.force_scale(&model.scene);
         let terms = if plan.scheme.takes_means() && self.steps > 0 {
@@ -369,24 +402,32 @@ impl<T: Real> Sheet<T> {
         } else {
             Vec::new()
         };
-        let survey = with_scheme!(plan, T, |scheme| Survey::of(bench, scheme, state, &terms));
-        let sheet = &model.scene.sheet;
+        let forces = Forces { terms: &terms, field: 0, part: 1.0, pull: 0.0 };
+        let survey = with_scheme!(plan, T, |scheme| Survey::of(bench, scheme, state, forces, over));
+        let (mut energy, kept_j) = self.energy_of(&survey);
         // A grasped point moves as its tool does, whatever the scheme would make of it.
         let own = self.prescribed.grasped().map(|(index, motion)| {
             let [_, free, _] = self.free_point(index, self.applied.until(model, index));
             motion.velocity_m_per_s.length_squared() - free.length_squared()
         });
-        let grasped_j = 0.5 * sheet.point_mass_kg * own.sum::<f64>();
+        let grasped_j = 0.5 * model.scene.sheet.point_mass_kg * own.sum::<f64>();
+        energy.kinetic_j += grasped_j;
+        (survey, energy, kept_j + grasped_j)
+    }
+
+    /// The energies of what a survey saw, and the one that the scheme keeps.
+    fn energy_of(&self, survey: &Survey) -> (Energy, f64) {
+        let Sheet { model, plan, .. } = self;
+        let sheet = &model.scene.sheet;
         // Of a mass that moves by a spacing in a substep, twice.
         let unit_j = sheet.point_mass_kg * (sheet.spacing_m / plan.substep_s).powi(2);
         let stiffness = model.scene.virtual_stiffness_n_per_m * sheet.spacing_m * sheet.spacing_m;
         let energy = Energy {
-            kinetic_j: 0.5 * unit_j * survey.speed_squared + grasped_j,
+            kinetic_j: 0.5 * unit_j * survey.speed_squared,
             spring_j: unit_j / plan.scheme.spring_scale() * survey.spring_energy,
             virtual_j: 0.5 * stiffness * survey.displacement_squared,
         };
-        let kept_j = 0.5 * unit_j * survey.vigour + grasped_j + energy.spring_j + energy.virtual_j;
-        (survey, energy, kept_j)
+        (energy, 0.5 * unit_j * survey.vigour + energy.spring_j + energy.virtual_j)
     }
 
     fn tell(&mut self, tool: usize, input: Input) {
@@ -397,6 +438,7 @@ impl<T: Real> Sheet<T> {
             }
             Input::Grasp(index, grasp) => {
                 self.applied.set(tool, None);
+                self.tiles.wake([self.tiles.of(self.model.point_of(index))]);
                 let PointState { displacement_m, velocity_m_per_s, .. } = self.point(index);
                 let now = Motion { displacement_m, velocity_m_per_s, ..Motion::default() };
                 self.prescribed.grasp(tool, index, grasp, now);
@@ -480,8 +522,20 @@ impl<T: Real> Tissue for Sheet<T> {
         PointState { displacement_m, velocity_m_per_s, spring_n, virtual_n, damping_n, applied_n, constraint_n }
     }
 
+    fn awake_points(&self) -> usize {
+        self.tiles.awake_points
+    }
+
+    #[allow(clippy::cast_precision_loss)]
+    fn computed_fraction(&self) -> f64 {
+        match self.substeps_done {
+            0 => 1.0,
+            substeps => self.points_done as f64 / (substeps as f64 * self.model.len() as f64),
+        }
+    }
+
     fn energy(&self) -> Energy {
-        self.survey().1
+        self.survey(&Region::whole(&self.bench.layout)).1
     }
 
     fn largest_displacement_m(&self) -> f64 {

@@ -26,11 +26,16 @@ pub struct Model {
     pub precision: Precision,
     /// Expected error of displacement and force, relative to the largest of each (`choice`).
     pub expected_error: f64,
+    /// Error that leaving out tiles at rest may cost, relative to the largest displacement.
+    pub sleep_tolerance: f64,
     /// What `auto` became on this machine.
     pub lanes: Lanes,
     /// What a user should know, in words.
     pub warnings: Vec<String>,
 }
+
+/// What sleeping tiles may add to the error, by default, as a part of it.
+const SLEEP_PART: f64 = 0.1;
 
 /// A scheme with its substep.
 #[derive(Debug, Clone, PartialEq)]
@@ -124,6 +129,11 @@ impl Model {
             let message = format!("this machine's processor has no `{}`", scene.stepping.lanes.name());
             return Err(Refusal::new(Reason::NotAvailable, "stepping.lanes", message));
         };
+        let sleep_tolerance = scene.sleep_tolerance.unwrap_or_else(|| {
+            // Who chooses the scheme may want it better than the tolerance.
+            let chosen = scene.stepping.integrator != Integrator::Auto || scene.stepping.substeps.is_some();
+            SLEEP_PART * if chosen { expected_error.min(scene.stepping.tolerance) } else { scene.stepping.tolerance }
+        });
         let fixed = scene.sheet.fixed_indices();
         let points = scene.sheet.points;
         let scene = scene.clone();
@@ -135,6 +145,7 @@ impl Model {
             plan,
             precision,
             expected_error,
+            sleep_tolerance,
             lanes,
             warnings,
         }))

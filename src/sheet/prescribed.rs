@@ -39,6 +39,11 @@ impl Prescribed {
         Prescribed { grasped: Vec::new(), released: Vec::new() }
     }
 
+    /// No point is grasped, and none was let go just now.
+    pub(super) fn is_empty(&self) -> bool {
+        self.grasped.is_empty() && self.released.is_empty()
+    }
+
     /// From the coming step on `tool` moves the point at `index`, which now moves like `now`, and lets go what it had
     /// before. A point that another tool has is taken over.
     pub(super) fn grasp(&mut self, tool: usize, index: usize, grasp: Grasp, now: Motion) {

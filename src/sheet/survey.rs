@@ -1,4 +1,4 @@
-//! A look at the whole sheet, by a sweep that changes nothing: energies, the largest displacement, and by how much the
+//! A look at the sheet, by a sweep that advances nothing: energies, the largest displacement, and by how much the
 //! springs' force differs from what its history foretold.
 //!
 //! Sums are taken apart for each of 16 columns, row by row, so that they too are the same at every width.
@@ -13,6 +13,7 @@ use super::field::{BLOCK, Layout, State};
 use super::lanes::Vector;
 use super::real::Real;
 use super::sweep::{Bench, MAX_KEPT, Scheme, Stage};
+use super::tiles::Region;
 
 /// What was seen, in the scheme's units (`integrate`).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -29,43 +30,98 @@ pub(super) struct Survey {
     pub(super) largest: f64,
     /// The largest difference of a corrected displacement and the predicted one.
     pub(super) surprise: f64,
+    /// The largest component of any w.
+    pub(super) speed: f64,
+    /// The largest component of the force that any free point is short of balance: N − a·u + F.
+    pub(super) imbalance: f64,
 }
 
-/// The sums: w², u², spring energy, vigour; and the two maxima.
+/// The sums: w², u², spring energy, vigour; and the maxima.
 #[derive(Debug)]
 struct Sums<T> {
     row: [[T; BLOCK]; 4],
     total: [[f64; BLOCK]; 4],
-    largest: [[T; BLOCK]; 2],
+    largest: [[T; BLOCK]; 4],
+}
+
+/// What acts on a state beside the springs, in their units.
+#[derive(Clone, Copy)]
+pub(super) struct Forces<'a, T: Real> {
+    /// Of the tools.
+    pub(super) terms: &'a [Term<T>],
+    /// Which of their fields.
+    pub(super) field: usize,
+    /// What turns it into the springs' units.
+    pub(super) part: f64,
+    /// a: of the virtual springs.
+    pub(super) pull: f64,
 }
 
 struct Look<'a, T: Real, C> {
     layout: Layout,
     scheme: &'a C,
-    d: *const T,
-    kept: [*const T; MAX_KEPT],
-    /// Only if there are any.
-    terms: &'a [Term<T>],
+    u: *mut T,
+    d: *mut T,
+    kept: [*mut T; MAX_KEPT],
+    /// Brings what it looks at to rest; else nothing is written.
+    rest: bool,
+    forces: Forces<'a, T>,
+    free: *const T,
     sums: &'a UnsafeCell<Sums<T>>,
 }
 
 impl Survey {
-    /// Looks at a state; `terms` are what the tools exert on it, in the springs' units, if a two-step scheme needs them
-    /// for the velocity.
+    /// Looks at a state, at what is awake in `over`.
     pub(super) fn of<T: Real, C: Scheme<T>>(
         bench: &Bench<T>,
         scheme: &C,
         state: &State<T>,
-        terms: &[Term<T>],
+        forces: Forces<'_, T>,
+        over: &Region,
+    ) -> Survey {
+        let pointers = state.fields().map(|field| field.as_ptr().cast_mut());
+        Survey::by(bench, scheme, pointers, forces, over, false)
+    }
+
+    /// The same, and brings it to rest: no motion, and the present force of the springs for a past.
+    pub(super) fn rest<T: Real, C: Scheme<T>>(
+        bench: &Bench<T>,
+        scheme: &C,
+        state: &mut State<T>,
+        forces: Forces<'_, T>,
+        over: &Region,
+    ) {
+        let pointers = state.fields_mut().map(|field| field.as_mut_ptr());
+        Survey::by(bench, scheme, pointers, forces, over, true);
+    }
+
+    /// `pointers`: to u, d and what is kept, written to only if told to `rest`.
+    fn by<T: Real, C: Scheme<T>>(
+        bench: &Bench<T>,
+        scheme: &C,
+        mut pointers: impl Iterator<Item = *mut T>,
+        forces: Forces<'_, T>,
+        over: &Region,
+        rest: bool,
     ) -> Survey {
         let zero = [T::default(); BLOCK];
-        let sums = UnsafeCell::new(Sums { row: [zero; 4], total: [[0.0; BLOCK]; 4], largest: [zero; 2] });
-        let mut kept = [std::ptr::null(); MAX_KEPT];
-        for (pointer, field) in kept.iter_mut().zip(&state.kept) {
-            *pointer = field.as_ptr();
-        }
-        let look = Look { layout: bench.layout, scheme, d: state.d.as_ptr(), kept, terms, sums: &sums };
-        bench.look(&state.u, look);
+        let sums = UnsafeCell::new(Sums { row: [zero; 4], total: [[0.0; BLOCK]; 4], largest: [zero; 4] });
+        let mut next = || pointers.next().unwrap_or(std::ptr::null_mut());
+        let (u, d) = (next(), next());
+        let look = Look {
+            layout: bench.layout,
+            scheme,
+            u,
+            d,
+            kept: std::array::from_fn(|_| next()),
+            rest,
+            forces,
+            free: bench.free.as_ref().map_or(std::ptr::null(), |free| free.as_ptr()),
+            sums: &sums,
+        };
+        // SAFETY: a state has u, d and at least what the scheme keeps, all of the bench's layout; u is written behind what
+        // the sweep still reads.
+        unsafe { bench.look(u, over, look) };
         let Sums { total, largest, .. } = sums.into_inner();
         let sum = |which: usize| total[which].iter().sum();
         let most = |which: usize| largest[which].iter().map(|value| value.wide()).fold(0.0, f64::max);
@@ -76,6 +132,8 @@ impl Survey {
             vigour: sum(3),
             largest: most(0),
             surprise: most(1),
+            speed: most(2),
+            imbalance: most(3),
         }
     }
 }
@@ -108,10 +166,12 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Look<'_, T, C> {
         unsafe {
             let stride = self.layout.stride;
             let column = at - row * stride;
-            let force = applied::force_on::<V, 1>(self.terms, 0, row, column, stride);
+            let Forces { terms, field, part, pull } = self.forces;
+            let force = applied::force_on::<V, 1>(terms, field, row, column, stride);
+            let (part, pull) = (V::splat(T::of(part)), V::splat(T::of(pull)));
             let (mut speed, mut place, mut vigour) =
                 (V::splat(T::default()), V::splat(T::default()), V::splat(T::default()));
-            let mut most = [V::splat(T::default()); 2];
+            let mut most = [V::splat(T::default()); 4];
             for c in 0..3 {
                 let at = at + c * self.layout.plane;
                 let d = V::load(self.d.add(at));
@@ -119,12 +179,26 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Look<'_, T, C> {
                 for k in 0..C::KEPT {
                     kept[k] = V::load(self.kept[k].add(at));
                 }
-                let force = if self.terms.is_empty() { None } else { Some(force[c][0]) };
+                let pushed = part.mul(force[c][0]);
+                let force = if terms.is_empty() { None } else { Some(pushed) };
                 let (u, w) = self.scheme.observe(x[c], d, n[c], &kept, force);
                 speed = w.mul_add(w, speed);
                 vigour = vigour.add(self.scheme.vigour(x[c], d, n[c], &kept, force));
                 place = u.mul_add(u, place);
-                most = [most[0].farther(u), most[1].farther(u.sub(x[c]))];
+                let mut short = n[c].minus(pull, u).add(pushed);
+                let mut place_of_rest = u;
+                if !self.free.is_null() {
+                    let free = V::load(self.free.add(at));
+                    (short, place_of_rest) = (short.mul(free), u.mul(free));
+                }
+                if self.rest {
+                    place_of_rest.store(self.u.add(at));
+                    V::splat(T::default()).store(self.d.add(at));
+                    for k in 0..C::KEPT {
+                        n[c].store(self.kept[k].add(at));
+                    }
+                }
+                most = [most[0].farther(u), most[1].farther(u.sub(x[c])), most[2].farther(w), most[3].farther(short)];
             }
             self.add(0, column, speed);
             self.add(1, column, place);

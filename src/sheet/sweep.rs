@@ -11,6 +11,9 @@
 //! and the row leaves D + B, and A.
 //!
 //! A lane's result depends on the same operations in the same order at every width: the bits are the same.
+//!
+//! Where only part of the sheet is awake (`tiles`), the sweep goes over strips: rectangles of rows and columns that cover
+//! it, and what its forces need of the springs beside and above. The stage is told of awake blocks alone.
 #![allow(unsafe_code)]
 // Iterators over vectors are not always inlined, and then run without the instructions of their caller: ten times slower.
 #![allow(clippy::needless_range_loop)]
@@ -22,6 +25,7 @@ use super::field::{BLOCK, Field, Layout, State};
 use super::lanes::{self, Run, Vector, Width};
 use super::real::Real;
 use super::springs::{Kind, Springs};
+use super::tiles::Region;
 use crate::scene::Lanes;
 
 /// What is done with the force on a block of points.
@@ -73,13 +77,23 @@ pub(super) struct Sweep<'a, T, S> {
     pub(super) springs: &'a Springs<T>,
     /// Displacements: three planes, spacings.
     pub(super) x: *const T,
-    /// What rows leave to those below: [`CARRY_ROWS`] rows of three planes of `carry_plane`.
+    /// What rows leave to those below: three planes of [`CARRY_ROWS`] rows.
     pub(super) carry: *mut T,
+    pub(super) over: &'a Region,
     pub(super) stage: S,
 }
 
 /// Rows of the carry: two of the row before, and two for flexion springs, which reach two rows on.
-pub(super) const CARRY_ROWS: usize = 4;
+const CARRY_ROWS: usize = 4;
+
+/// From a plane of the carry to the next.
+fn carry_plane(layout: &Layout) -> usize {
+    CARRY_ROWS * layout.stride + BLOCK
+}
+
+fn new_carry<T: Real>(layout: &Layout) -> Field<T> {
+    Field::of_length(3 * carry_plane(layout))
+}
 
 impl<T: Real, S: Stage<T>> Run<T> for Sweep<'_, T, S> {
     #[inline(always)]
@@ -118,31 +132,43 @@ unsafe fn load<V: Vector>(at: *const V::Real, plane: usize) -> [V; 3] {
 
 impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
     /// # Safety
-    /// `x` has 3 planes that can be read a row and a block beyond the last point, `carry` has 3 planes of
-    /// [`CARRY_ROWS`] rows.
+    /// `x` has 3 planes that can be read a row and a block beyond the last point, `carry` is that of the layout.
     #[inline(always)]
     unsafe fn rows<V: Vector<Real = T>, const FLEXION: bool>(&self, flexion: &Kind<T>) {
         // SAFETY: the caller's promise; offsets stay within rows + 1 rows and a block.
         unsafe {
             let Layout { rows, columns, stride, plane } = self.layout;
-            let blocks = columns.div_ceil(V::LANES);
+            let carry_plane = carry_plane(&self.layout);
             let zero = V::splat(T::default());
-            for row in 0..if FLEXION { CARRY_ROWS } else { 2 } {
-                for c in 0..3 {
-                    for block in 0..blocks {
-                        zero.store(self.carry.add(c * plane + row * stride + block * V::LANES));
+            let mut probe = zero;
+            for strip in &self.over.strips {
+                // With the block to the left, whose springs pull at the first column.
+                let from = strip.columns.start.saturating_sub(V::LANES);
+                let to = strip.columns.end.min(columns.next_multiple_of(V::LANES));
+                if strip.rows.start == 0 {
+                    for row in 0..if FLEXION { CARRY_ROWS } else { 2 } {
+                        for c in 0..3 {
+                            for column in (from..to).step_by(V::LANES) {
+                                zero.store(self.carry.add(c * carry_plane + row * stride + column));
+                            }
+                        }
                     }
                 }
-            }
-            let mut probe = zero;
-            let mut ahead = excesses(self.x, stride, plane);
-            for i in 0..rows {
-                let under_way = (&mut ahead, &mut probe);
-                // The usual row has a loop of its own, without what only others need.
-                match (i + 1 < rows, !FLEXION && self.stage.is_lean(i)) {
-                    (true, true) => self.row::<V, FLEXION, true, true>(flexion, i, blocks, under_way),
-                    (true, false) => self.row::<V, FLEXION, true, false>(flexion, i, blocks, under_way),
-                    (false, _) => self.row::<V, FLEXION, false, false>(flexion, i, blocks, under_way),
+                let mut ahead = excesses(self.x.add(strip.rows.start * stride + from), stride, plane);
+                for i in strip.rows.clone() {
+                    let under_way = (&mut ahead, &mut probe);
+                    // The usual row has a loop of its own, without what only others need.
+                    match (i + 1 < rows, !FLEXION && strip.whole && self.stage.is_lean(i)) {
+                        (true, true) => {
+                            self.row::<V, FLEXION, true, true>(flexion, i, from..to, strip.whole, under_way)
+                        }
+                        (true, false) => {
+                            self.row::<V, FLEXION, true, false>(flexion, i, from..to, strip.whole, under_way);
+                        }
+                        (false, _) => {
+                            self.row::<V, FLEXION, false, false>(flexion, i, from..to, strip.whole, under_way);
+                        }
+                    }
                 }
             }
             self.stage.end(probe);
@@ -156,29 +182,33 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
         &self,
         flexion: &Kind<T>,
         i: usize,
-        blocks: usize,
+        span: Range<usize>,
+        whole: bool,
         (ahead, probe): (&mut [V; 4], &mut V),
     ) {
         // SAFETY: as for `rows`.
         unsafe {
             let Layout { rows, columns, stride, plane } = self.layout;
             let Springs { structural, shear, .. } = self.springs;
+            let carry_plane = carry_plane(&self.layout);
             let x = self.x.add(i * stride);
             let zero = V::splat(T::default());
             let (down, diagonal) = (self.carry, self.carry.add(stride));
             let two_down = self.carry.add((2 + i % 2) * stride);
             // Springs to the next column: none from the last.
             let full = V::first(V::LANES);
-            let tail = V::first(columns - 1 - (blocks - 1) * V::LANES);
+            let tail = V::first((columns - 1) % V::LANES);
             let (mut passed, mut passed_two) = ([zero; 3], [zero; 3]);
-            for block in 0..blocks {
-                let column = block * V::LANES;
-                let mask = if block + 1 == blocks { tail } else { full };
+            let mut column = span.start;
+            while column < span.end {
+                let mask = if column + V::LANES < columns { full } else { tail };
                 let [qr, qd, qa, qb] = *ahead;
-                let next = if block + 1 < blocks { column + V::LANES } else { stride };
-                if BELOW || block + 1 < blocks {
+                let more = column + V::LANES < span.end;
+                let next = if more { column + V::LANES } else { stride + span.start };
+                if BELOW || more {
                     *ahead = excesses(x.add(next), stride, plane);
                 }
+                let awake = LEAN || whole || self.over.is_awake(i, column);
                 let mut wr = structural.near(qr);
                 let (mut wd, mut wa, mut wb) = (zero, zero, zero);
                 if BELOW {
@@ -191,7 +221,7 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                 } else {
                     wr = structural.weight(qr);
                 }
-                if S::ENERGY {
+                if S::ENERGY && awake {
                     let mut sum = structural.energy(qr).keep(mask);
                     if BELOW {
                         sum = sum.add(structural.energy(qd)).add(shear.energy(qa).add(shear.energy(qb)).keep(mask));
@@ -203,7 +233,7 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                 let (here, right) = (load::<V>(at, plane), load::<V>(at.add(1), plane));
                 let mut n = [zero; 3];
                 for c in 0..3 {
-                    let (down, diagonal) = (down.add(c * plane + column), diagonal.add(c * plane + column));
+                    let (down, diagonal) = (down.add(c * carry_plane + column), diagonal.add(c * carry_plane + column));
                     let r = right[c].sub(here[c]);
                     let fr = if c == 1 { wr.mul_add(r, wr) } else { wr.mul(r) };
                     if BELOW {
@@ -234,7 +264,7 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                     let fr = [w.mul(r[0]), w.mul_add(r[1], two), w.mul(r[2])];
                     let mut energy = if S::ENERGY { flexion.energy(q).keep(mask) } else { zero };
                     for c in 0..3 {
-                        let carried = two_down.add(c * plane + column);
+                        let carried = two_down.add(c * carry_plane + column);
                         n[c] = n[c].add(fr[c].sub(fr[c].shift_two(passed_two[c]))).sub(V::load(carried));
                         passed_two[c] = fr[c];
                     }
@@ -246,17 +276,20 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                         let fd = [w.mul_add(d[0], two), w.mul(d[1]), w.mul(d[2])];
                         for c in 0..3 {
                             n[c] = n[c].add(fd[c]);
-                            fd[c].store(two_down.add(c * plane + column));
+                            fd[c].store(two_down.add(c * carry_plane + column));
                         }
                         if S::ENERGY {
                             energy = energy.add(flexion.energy(q));
                         }
                     }
-                    if S::ENERGY {
+                    if S::ENERGY && awake {
                         self.stage.energy(column, energy);
                     }
                 }
-                self.stage.finish::<V, LEAN>(i, i * stride + column, here, n, probe);
+                if awake {
+                    self.stage.finish::<V, LEAN>(i, i * stride + column, here, n, probe);
+                }
+                column += V::LANES;
             }
             self.stage.end_row();
         }
@@ -335,11 +368,18 @@ impl<T: Real> Bench<T> {
             free
         });
         let zero = [T::default(); BLOCK];
-        Bench { width: Width::of(lanes), layout, springs, free, carry: Field::zero(&layout), probe: zero, work: zero }
+        Bench { width: Width::of(lanes), layout, springs, free, carry: new_carry(&layout), probe: zero, work: zero }
     }
 
     /// Advances every point with `scheme`; the tools' force is that of their fields from `field` on.
-    pub(super) fn advance<C: Scheme<T>>(&mut self, scheme: &C, state: &mut State<T>, terms: &[Term<T>], field: usize) {
+    pub(super) fn advance<C: Scheme<T>>(
+        &mut self,
+        scheme: &C,
+        state: &mut State<T>,
+        terms: &[Term<T>],
+        field: usize,
+        over: &Region,
+    ) {
         let mut kept = [std::ptr::null_mut(); MAX_KEPT];
         for (pointer, field) in kept.iter_mut().zip(&mut state.kept) {
             *pointer = field.as_mut_ptr();
@@ -360,18 +400,20 @@ impl<T: Real> Bench<T> {
             work: self.work.as_mut_ptr(),
         };
         let carry = self.carry.as_mut_ptr();
-        let sweep = Sweep { layout: self.layout, springs: &self.springs, x: u.cast_const(), carry, stage };
+        let sweep = Sweep { layout: self.layout, springs: &self.springs, x: u.cast_const(), carry, over, stage };
         // SAFETY: all fields have the layout's three planes, padded by a row and a block, and the tables are of this
         // layout; u is written behind what the sweep still reads, through the same pointer.
         unsafe { lanes::run(self.width, &sweep) };
     }
 
-    /// Sweeps over displacements without changing them.
-    pub(super) fn look<S: Stage<T>>(&self, u: &Field<T>, stage: S) {
-        let mut carry = Field::zero(&self.layout);
-        let carry = carry.as_mut_ptr();
-        let sweep = Sweep { layout: self.layout, springs: &self.springs, x: u.as_ptr(), carry, stage };
-        // SAFETY: as above; `stage` is made for fields of the same layout.
+    /// Sweeps over the displacements `u`.
+    ///
+    /// # Safety
+    /// `u` and the stage are of fields of this layout.
+    pub(super) unsafe fn look<S: Stage<T>>(&self, u: *const T, over: &Region, stage: S) {
+        let mut carry = new_carry(&self.layout);
+        let sweep = Sweep { layout: self.layout, springs: &self.springs, x: u, carry: carry.as_mut_ptr(), over, stage };
+        // SAFETY: as above.
         unsafe { lanes::run(self.width, &sweep) };
     }
 

@@ -2,7 +2,7 @@
 
 use super::{from_point, pb, point, required};
 use crate::refusal::{Reason, Refusal, Result};
-use crate::scene::{Fixed, Integrator, Lanes, Named, Precision, SLEEP_TOLERANCE, Scene, Sheet, Springs, Stepping};
+use crate::scene::{Fixed, Integrator, Lanes, Named, Precision, Scene, Sheet, Springs, Stepping};
 
 /// A scene out of a message.
 pub fn from_scene(message: &pb::Scene) -> Result<Scene> {
@@ -30,7 +30,7 @@ pub fn from_scene(message: &pb::Scene) -> Result<Scene> {
         virtual_stiffness_n_per_m: required("virtual_springs.stiffness_n_per_m", virtual_springs.stiffness_n_per_m)?,
         damping_n_s_per_m: required("damping.coefficient_n_s_per_m", damping.coefficient_n_s_per_m)?,
         stepping: message.stepping.as_ref().map_or(Ok(Stepping::default()), from_stepping)?,
-        sleep_tolerance: message.sleep.as_ref().and_then(|sleep| sleep.tolerance).unwrap_or(SLEEP_TOLERANCE),
+        sleep_tolerance: message.sleep.as_ref().and_then(|sleep| sleep.tolerance),
     })
 }
 
@@ -99,7 +99,7 @@ pub fn scene(scene: &Scene) -> pb::Scene {
             substeps: scene.stepping.substeps,
             precision: scene.stepping.precision.name().to_owned(),
         }),
-        sleep: Some(pb::Sleep { tolerance: Some(scene.sleep_tolerance) }),
+        sleep: scene.sleep_tolerance.map(|tolerance| pb::Sleep { tolerance: Some(tolerance) }),
     }
 }
 

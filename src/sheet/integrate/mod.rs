@@ -115,6 +115,14 @@ impl Scheme {
         }
     }
 
+    /// Which field of the tools' force adds to the velocity.
+    pub fn last_field(&self) -> usize {
+        match self {
+            Scheme::TwoStep(_) => 0,
+            Scheme::Multistep(_) | Scheme::Rk4 { .. } => 1,
+        }
+    }
+
     /// Fields that the scheme keeps beside u and d.
     pub fn kept(&self, compensated: bool) -> usize {
         match self {

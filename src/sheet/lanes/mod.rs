@@ -238,7 +238,7 @@ pub(super) unsafe fn run<T: Real>(width: Width, program: &impl Run<T>) {
             Lanes::Avx512 => x86::with_avx512(program),
             #[cfg(target_arch = "x86_64")]
             Lanes::Avx2 => x86::with_avx2(program),
-            _ => program.run::<Plain<T, 16>>(),
+            _ => program.run::<Plain<T, 4>>(),
         }
     }
 }

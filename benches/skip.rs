@@ -1,0 +1,193 @@
+//! What does it save to leave out what is at rest, and what does it cost in accuracy? Sizes, springs and kinds of poke
+//! against the tolerance of `[sleep]`; truth is the same run with everything awake. Writes
+//! docs/benchmarks/skip.{md,json,svg}. `-- --quick` measures the small sheets.
+
+#![allow(clippy::unwrap_used, clippy::cast_precision_loss, missing_docs)]
+
+mod report;
+mod subject;
+
+use glam::{DVec2, DVec3};
+use palpate::scene::law::{CentreLaw, ForceLaw, Profile, StrengthLaw};
+use palpate::sheet::{Push, at_rest};
+use report::chart::{Look, Panel, Series};
+use report::{Report, cells, digits, quick, rough, seconds};
+use serde_json::json;
+use subject::set;
+
+const TOLERANCES: [f64; 4] = [1e-3, 1e-4, 1e-5, 1e-6];
+const STEPS: u64 = 2000;
+/// Steps between two looks at the whole field.
+const LOOK_STEPS: u64 = 50;
+
+/// What is done to a sheet of the side `length_m`, at 1 kHz.
+struct Kind {
+    name: &'static str,
+    about: &'static str,
+    pushes: fn(length_m: f64) -> Vec<ForceLaw>,
+}
+
+/// The paper's poke: 3 N, 150 /m, let go after a second.
+fn poke(centre_m: DVec2, force_n: DVec3) -> ForceLaw {
+    ForceLaw {
+        centre: CentreLaw::Hops(vec![(0, centre_m)]),
+        strength: StrengthLaw::Scaled(force_n, Profile::Pulse { on: 0, off: 1000 }),
+        falloff_per_m: 150.0,
+        falloff_offset: 0.0,
+    }
+}
+
+const KINDS: [Kind; 4] = [
+    Kind {
+        name: "local",
+        about: "3 N straight down at the centre for 1 s, then let go",
+        pushes: |length_m| vec![poke(DVec2::splat(length_m / 2.0), DVec3::new(0.0, 0.0, -3.0))],
+    },
+    Kind {
+        name: "stroke",
+        about: "1 N at a slant that moves along y at 0.2 m/s, all the time",
+        pushes: |length_m| {
+            vec![ForceLaw {
+                centre: CentreLaw::Path {
+                    from_m: DVec2::new(length_m / 2.0, length_m / 2.0 - 0.2),
+                    velocity_m_per_s: DVec2::new(0.0, 0.2),
+                },
+                strength: StrengthLaw::Scaled(DVec3::new(0.2, 0.3, -1.0), Profile::Constant),
+                falloff_per_m: 60.0,
+                falloff_offset: 0.0,
+            }]
+        },
+    },
+    Kind {
+        name: "two tools",
+        about: "3 N at a third and at two thirds of the diagonal for 1 s, at a slant and straight down",
+        pushes: |length_m| {
+            let at = |part: f64| DVec2::splat(length_m * part);
+            vec![poke(at(1.0 / 3.0), DVec3::new(0.0, 0.0, -3.0)), poke(at(2.0 / 3.0), DVec3::new(1.0, 1.0, -2.6))]
+        },
+    },
+    Kind {
+        name: "everything",
+        about: "a force on all points that swings at 3 Hz, all the time",
+        pushes: |length_m| {
+            vec![ForceLaw {
+                centre: CentreLaw::Hops(vec![(0, DVec2::splat(length_m / 2.0))]),
+                strength: StrengthLaw::Scaled(DVec3::new(0.01, 0.0, -0.05), Profile::Sine { frequency_hz: 3.0 }),
+                falloff_per_m: 1.0 / length_m,
+                falloff_offset: 0.0,
+            }]
+        },
+    },
+];
+
+/// A run: what a step took on average, the part that was computed, and the fields seen.
+struct Run {
+    step_s: f64,
+    computed: f64,
+    fields: Vec<[Vec<f32>; 3]>,
+}
+
+fn run(settings: &[String], kind: &Kind, rounds: usize) -> Run {
+    let model = subject::model(settings).unwrap();
+    let length_m = model.scene.sheet.longer_side_m();
+    let (mut least_s, mut fields, mut computed) = (f64::INFINITY, Vec::new(), 0.0);
+    for _ in 0..rounds {
+        let mut tissue = at_rest(&model);
+        for (tool, law) in (kind.pushes)(length_m).into_iter().enumerate() {
+            tissue.push(tool, Some(Push::Law(law)));
+        }
+        fields.clear();
+        let mut stepping_s = 0.0;
+        for _ in 0..STEPS / LOOK_STEPS {
+            stepping_s += seconds(|| (0..LOOK_STEPS).for_each(|_| tissue.step().unwrap())).0;
+            let mut field = [Vec::new(), Vec::new(), Vec::new()];
+            tissue.displacements_m(&mut field);
+            fields.push(field);
+        }
+        least_s = least_s.min(stepping_s);
+        computed = tissue.computed_fraction();
+    }
+    Run { step_s: least_s / STEPS as f64, computed, fields }
+}
+
+/// The largest component anywhere at any time, and the largest difference.
+fn compare(truth: &Run, other: &Run) -> [f64; 2] {
+    let mut most = [0.0_f64; 2];
+    for (truth, other) in truth.fields.iter().flatten().zip(other.fields.iter().flatten()) {
+        for (a, b) in truth.iter().zip(other) {
+            most = [most[0].max(f64::from(a.abs())), most[1].max(f64::from((a - b).abs()))];
+        }
+    }
+    most
+}
+
+fn main() {
+    let sides: &[usize] = if quick() { &[31, 121] } else { &[31, 121, 331, 1001] };
+    let mut report = Report::new("skip", "What it saves to leave out what is at rest", "make bench-skip");
+    report.say(
+        "Two seconds at 1 kHz of the paper's tissue (K″ = 5 N/m) with more points and stiffer springs. How many times \
+         faster the steps are than with everything awake, and the error: the largest difference from that run of any \
+         point at any of 40 moments, relative to the largest displacement.",
+    );
+    for kind in &KINDS {
+        report.say(&format!("*{}*: {}.", kind.name, kind.about));
+    }
+    let header: Vec<String> = ["poke", "k/K″", "points", "all awake, µs a step"]
+        .into_iter()
+        .map(str::to_owned)
+        .chain(TOLERANCES.iter().map(|tolerance| format!("{tolerance:.0e}: times faster, error, part computed")))
+        .collect();
+    let (mut rows, mut figures) = (Vec::new(), Vec::new());
+    let mut series: Vec<Series> = Vec::new();
+    for (hue, kind) in KINDS.iter().enumerate() {
+        for ratio in [2.0, 20.0, 200.0] {
+            let mut line = Vec::new();
+            for side in sides {
+                // The largest sheets of stiff springs tell nothing that smaller ones don't.
+                if *side > 500 && ratio > 2.0 {
+                    continue;
+                }
+                eprintln!("{}, k/K″ = {ratio}, {side} × {side} points", kind.name);
+                let rounds = if *side > 200 { 1 } else { 5 };
+                let with = |tolerance: f64| {
+                    let settings = [
+                        set("sheet.points", format!("[{side}, {side}]")),
+                        set("springs.stiffness_n_per_m", 5.0 * ratio),
+                        set("sleep.tolerance", tolerance),
+                    ];
+                    run(&settings, kind, rounds)
+                };
+                let truth = with(0.0);
+                let mut row = cells([kind.name.to_owned(), ratio.to_string(), format!("{side}²")]);
+                row.push(digits(truth.step_s * 1e6));
+                for tolerance in TOLERANCES {
+                    let skipping = with(tolerance);
+                    let [largest, difference] = compare(&truth, &skipping);
+                    let (faster, error) = (truth.step_s / skipping.step_s, difference / largest);
+                    row.push(format!("{}, {}, {}", digits(faster), rough(error), digits(skipping.computed)));
+                    if tolerance == 1e-6 {
+                        line.push(((side * side) as f64, faster));
+                    }
+                    figures.push(json!({
+                        "poke": kind.name, "ratio": ratio, "side": side, "tolerance": tolerance, "times_faster": faster,
+                        "error": error, "computed_fraction": skipping.computed, "all_awake_s": truth.step_s,
+                    }));
+                }
+                rows.push(row);
+            }
+            let look = if ratio > 100.0 { Look::Hollow } else { Look::Full };
+            if ratio != 20.0 {
+                series.push(Series { name: format!("{}, k/K″ = {ratio}", kind.name), hue, look, points: line });
+            }
+        }
+    }
+    report.table(&header, &rows);
+    report.figure("runs", figures.into());
+    let panel = Panel::Lines {
+        title: "With a tolerance of 1e-6".to_owned(),
+        x: "points of the sheet",
+        y: "times faster than all awake",
+        series,
+    };
+    report.write(1, &[panel]);
+}

@@ -1,0 +1,191 @@
+//! What is at rest is not computed: what that may cost, and that nothing sleeps through what it should feel.
+#![allow(clippy::unwrap_used, clippy::cast_precision_loss, missing_docs)]
+
+use glam::{DVec2, DVec3};
+use palpate::limits::Limits;
+use palpate::scene::law::{CentreLaw, ForceLaw, Profile, StrengthLaw};
+use palpate::scene::{PAPER, Scene};
+use palpate::sheet::{Grasp, Model, Push, Tissue, at_rest};
+
+fn sheet(settings: &[&str]) -> Box<dyn Tissue> {
+    let settings: Vec<String> = settings.iter().map(|text| (*text).to_owned()).collect();
+    let scene = Scene::parse("paper", PAPER, &settings, &Limits::default()).unwrap();
+    at_rest(&Model::compile(&scene, &Limits::default()).unwrap())
+}
+
+fn field(tissue: &dyn Tissue) -> [Vec<f32>; 3] {
+    let mut field = [Vec::new(), Vec::new(), Vec::new()];
+    tissue.displacements_m(&mut field);
+    field
+}
+
+/// The largest component of two fields' difference, and of the first.
+fn difference(a: &[Vec<f32>; 3], b: &[Vec<f32>; 3]) -> [f64; 2] {
+    let pairs = a.iter().flatten().zip(b.iter().flatten());
+    pairs.fold([0.0, 0.0], |[most, largest], (a, b)| {
+        [f64::max(most, f64::from((a - b).abs())), f64::max(largest, f64::from(a.abs()))]
+    })
+}
+
+fn law(centre: CentreLaw, force_n: [f64; 3], falloff_per_m: f64, profile: Profile) -> Push {
+    let strength = StrengthLaw::Scaled(DVec3::from_array(force_n), profile);
+    Push::Law(ForceLaw { centre, strength, falloff_per_m, falloff_offset: 0.0 })
+}
+
+fn at(x: f64, y: f64) -> CentreLaw {
+    CentreLaw::Hops(vec![(0, DVec2::new(x, y))])
+}
+
+/// What is done to a sheet of 65 × 97 points, each with the settings that it needs.
+fn cases() -> Vec<(&'static str, Vec<&'static str>, Vec<Push>)> {
+    let pulse = Profile::Pulse { on: 0, off: 400 };
+    let path = CentreLaw::Path { from_m: DVec2::new(1.0, 0.3), velocity_m_per_s: DVec2::new(0.05, 1.2) };
+    vec![
+        ("local", vec![], vec![law(at(1.0, 1.5), [0.0, 0.0, -3.0], 150.0, pulse)]),
+        ("stiff", vec!["springs.stiffness_n_per_m=200"], vec![law(at(1.0, 1.5), [0.3, 0.0, -1.0], 60.0, pulse)]),
+        ("flexion", vec!["springs.flexion=true"], vec![law(at(0.53, 0.53), [1.0, 0.5, -2.0], 100.0, pulse)]),
+        ("stroke", vec![], vec![law(path, [0.2, 0.3, -1.0], 60.0, Profile::Constant)]),
+        (
+            "two tools",
+            vec!["springs.stiffness_n_per_m=100"],
+            vec![
+                law(at(0.5, 0.6), [0.0, 0.0, -3.0], 150.0, pulse),
+                law(at(1.6, 2.4), [1.0, 1.0, -2.6], 150.0, Profile::Pulse { on: 100, off: 600 }),
+            ],
+        ),
+        (
+            "slow creep",
+            vec!["damping.coefficient_n_s_per_m=5"],
+            vec![law(at(1.0, 1.5), [0.0, 0.2, -2.0], 80.0, Profile::Ramp { from_s: 0.0, to_s: 1.0 })],
+        ),
+        ("central", vec!["stepping.integrator=central"], vec![law(at(1.0, 1.5), [0.0, 0.0, -3.0], 150.0, pulse)]),
+        ("f64", vec!["stepping.precision=f64"], vec![law(at(1.0, 1.5), [0.0, 0.0, -3.0], 150.0, pulse)]),
+    ]
+}
+
+#[test]
+fn the_error_of_what_is_left_out_stays_within_the_tolerance_over_the_whole_field() {
+    for (name, settings, pushes) in cases() {
+        for tolerance in [1e-3, 1e-4, 1e-5] {
+            let sleep = format!("sleep.tolerance={tolerance}");
+            let with = |sleep: &str| {
+                let mut all = settings.clone();
+                all.extend(["sheet.points=[65, 97]", sleep]);
+                let mut tissue = sheet(&all);
+                pushes.iter().enumerate().for_each(|(tool, push)| tissue.push(tool, Some(push.clone())));
+                tissue
+            };
+            let (mut truth, mut skipping) = (with("sleep.tolerance=0"), with(&sleep));
+            let (mut most, mut largest) = (0.0, 0.0);
+            for _ in 0..40 {
+                for _ in 0..25 {
+                    truth.step().unwrap();
+                    skipping.step().unwrap();
+                }
+                let [error, size] = difference(&field(&*truth), &field(&*skipping));
+                (most, largest) = (f64::max(most, error), f64::max(largest, size));
+            }
+            assert!(largest > 0.0);
+            assert!(most <= tolerance * largest, "{name} at {tolerance:e}: {:e}", most / largest);
+            assert!(skipping.computed_fraction() < 1.0, "{name} at {tolerance:e}: nothing slept");
+            assert_eq!(truth.computed_fraction(), 1.0);
+            assert_eq!(skipping.guard_events(), 0, "{name}");
+        }
+    }
+}
+
+#[test]
+fn a_sheet_at_rest_computes_nothing_and_wakes_within_the_step_that_touches_it() {
+    let mut tissue = sheet(&[]);
+    assert_eq!(tissue.awake_points(), 0);
+    for _ in 0..1_000_000 {
+        tissue.step().unwrap();
+    }
+    assert_eq!((tissue.step_count(), tissue.computed_fraction()), (1_000_000, 0.0));
+    let push = law(at(0.5, 0.5), [0.0, 0.0, -3.0], 150.0, Profile::Constant);
+    tissue.push(0, Some(push));
+    tissue.step().unwrap();
+    assert!(tissue.awake_points() > 0);
+    assert!(tissue.point(tissue.model().index_of([15, 15])).displacement_m.z < 0.0);
+    // A held poke comes to rest, and rests as it is.
+    for _ in 0..3000 {
+        tissue.step().unwrap();
+    }
+    assert_eq!(tissue.awake_points(), 0);
+    let held = tissue.point(tissue.model().index_of([15, 15]));
+    tissue.step().unwrap();
+    assert_eq!(tissue.point(tissue.model().index_of([15, 15])), held);
+    assert_eq!(held.velocity_m_per_s, DVec3::ZERO);
+    // Balance of all forces, but for what the tolerance leaves.
+    let rest = held.spring_n + held.virtual_n + held.applied_n;
+    assert!(rest.length() < 1e-5 * held.applied_n.length(), "{rest}");
+    tissue.push(0, None);
+    tissue.step().unwrap();
+    assert!(tissue.point(tissue.model().index_of([15, 15])).velocity_m_per_s.z > 0.0);
+}
+
+#[test]
+fn a_tile_wakes_with_the_history_that_it_would_have_had() {
+    // Pressed, at rest, and let go: with zeros for a past the first steps would err by the whole of the springs' force.
+    let with = |sleep: &str| sheet(&["stepping.integrator=exponential3", "stepping.substeps=1", sleep]);
+    let (mut truth, mut skipping) = (with("sleep.tolerance=0"), with("sleep.tolerance=1e-6"));
+    for tissue in [&mut truth, &mut skipping] {
+        tissue.push(0, Some(law(at(0.5, 0.5), [0.0, 0.0, -3.0], 150.0, Profile::Constant)));
+        (0..2000).for_each(|_| tissue.step().unwrap());
+    }
+    assert_eq!(skipping.awake_points(), 0);
+    let mut most = 0.0;
+    let largest = truth.largest_displacement_m();
+    for tissue in [&mut truth, &mut skipping] {
+        tissue.push(0, None);
+    }
+    for _ in 0..20 {
+        truth.step().unwrap();
+        skipping.step().unwrap();
+        most = f64::max(most, difference(&field(&*truth), &field(&*skipping))[0]);
+    }
+    assert!(most < 2e-6 * largest, "{:e}", most / largest);
+}
+
+#[test]
+fn a_creep_too_slow_for_any_one_step_wakes_what_it_reaches() {
+    // A point pulled by a micrometre a step: compared with the step before, nothing beyond its tile would ever wake.
+    let with = |sleep: &str| sheet(&["sheet.points=[64, 64]", "springs.stiffness_n_per_m=50", sleep]);
+    let (mut truth, mut skipping) = (with("sleep.tolerance=0"), with("sleep.tolerance=1e-4"));
+    let index = truth.model().index_of([8, 8]);
+    for step in 0..20_000_u32 {
+        for tissue in [&mut truth, &mut skipping] {
+            let far_m = 1e-6 * f64::from(step);
+            tissue.grasp(0, index, Grasp::Held(DVec3::new(far_m, far_m, -far_m)));
+            tissue.step().unwrap();
+        }
+    }
+    let [most, largest] = difference(&field(&*truth), &field(&*skipping));
+    assert!(most <= 1e-4 * largest, "{:e}", most / largest);
+    assert!(skipping.awake_points() < 64 * 64);
+}
+
+#[test]
+fn sleeping_is_the_same_at_every_width() {
+    for integrator in ["central", "exponential3", "rk4"] {
+        let hash = |lanes: &str| {
+            let (integrator, lanes) = (format!("stepping.integrator={integrator}"), format!("stepping.lanes={lanes}"));
+            let settings = [integrator.as_str(), lanes.as_str(), "sheet.points=[61, 77]", "sleep.tolerance=1e-4"];
+            let settings: Vec<String> = settings.iter().map(|text| (*text).to_owned()).collect();
+            let scene = Scene::parse("paper", PAPER, &settings, &Limits::default()).unwrap();
+            // Lanes that this machine does not have are refused.
+            let model = Model::compile(&scene, &Limits::default()).ok()?;
+            let mut tissue = at_rest(&model);
+            let path = CentreLaw::Path { from_m: DVec2::splat(0.4), velocity_m_per_s: DVec2::new(1.5, 2.0) };
+            tissue.push(0, Some(law(path, [0.2, 0.0, -1.0], 60.0, Profile::Pulse { on: 0, off: 500 })));
+            (0..900).for_each(|_| tissue.step().unwrap());
+            let part = tissue.computed_fraction();
+            assert!(part > 0.0 && part < 1.0);
+            Some(tissue.state_hash())
+        };
+        let plain = hash("plain");
+        for lanes in ["avx2", "avx512"] {
+            assert!(hash(lanes).is_none_or(|hash| Some(hash) == plain), "{integrator} {lanes}");
+        }
+    }
+}
