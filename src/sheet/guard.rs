@@ -156,32 +156,44 @@ impl<T: Real> Sheet<T> {
         let layout = self.bench.layout;
         let present_j = force_times_displacement(&self.model, &self.plan, &layout, &self.applied, &self.state);
         self.work.survey(energy_j, present_j)?;
-        self.checkpoint.steps = self.steps;
-        self.checkpoint.halvings = self.halvings;
-        self.checkpoint.state.copy_from(&self.state);
-        self.checkpoint.applied.clone_from(&self.applied);
-        self.checkpoint.prescribed.clone_from(&self.prescribed);
-        self.checkpoint.work = self.work;
-        self.inputs.clear();
+        self.take_checkpoint();
         Ok(())
+    }
+
+    /// What the sheet is now is what it goes back to.
+    fn take_checkpoint(&mut self) {
+        let Sheet { bench, state, applied, prescribed, .. } = self;
+        let checkpoint = self.checkpoint.get_or_insert_with(|| {
+            let state = State::at_rest(&bench.layout, state.kept.len());
+            let (applied, prescribed) = (applied.clone(), prescribed.clone());
+            Box::new(Checkpoint { steps: 0, halvings: 0, state, applied, prescribed, work: Work::default() })
+        });
+        checkpoint.steps = self.steps;
+        checkpoint.halvings = self.halvings;
+        checkpoint.state.copy_from(&self.state);
+        checkpoint.applied.clone_from(&self.applied);
+        checkpoint.prescribed.clone_from(&self.prescribed);
+        checkpoint.work = self.work;
+        self.inputs.clear();
     }
 
     /// Back to the checkpoint, with the substep of `halvings`.
     fn go_back(&mut self, halvings: u32) {
+        // A sheet that has none has nothing to go back from.
+        let Some(checkpoint) = &self.checkpoint else { return };
         let layout = self.bench.layout;
-        self.steps = self.checkpoint.steps;
-        self.state.copy_from(&self.checkpoint.state);
-        self.applied.clone_from(&self.checkpoint.applied);
-        self.prescribed.clone_from(&self.checkpoint.prescribed);
-        self.work = self.checkpoint.work;
-        let was = self.model.plan.divided(&self.model.scene, 1 << self.checkpoint.halvings);
+        self.steps = checkpoint.steps;
+        self.state.copy_from(&checkpoint.state);
+        self.applied.clone_from(&checkpoint.applied);
+        self.prescribed.clone_from(&checkpoint.prescribed);
+        self.work = checkpoint.work;
+        let was = self.model.plan.divided(&self.model.scene, 1 << checkpoint.halvings);
         let plan = self.model.plan.divided(&self.model.scene, 1 << halvings);
         let springs = springs_of(&self.model, &was);
         convert(&layout, &springs, &was, &plan, &self.applied, &mut self.state);
         self.applied.forget();
         // The force begins anew, and with it what it has done.
-        let present_j =
-            force_times_displacement(&self.model, &was, &layout, &self.checkpoint.applied, &self.checkpoint.state);
+        let present_j = force_times_displacement(&self.model, &was, &layout, &checkpoint.applied, &checkpoint.state);
         self.work.add(present_j);
         self.bench.springs = springs_of(&self.model, &plan);
         self.bench.is_calm(0.0);
@@ -190,6 +202,13 @@ impl<T: Real> Sheet<T> {
     }
 
     pub(super) fn input(&mut self, tool: usize, input: Input) {
+        if self.checkpoint.is_none() {
+            if matches!(input, Input::Push(None)) {
+                // Nothing is let go.
+                return;
+            }
+            self.take_checkpoint();
+        }
         self.inputs.push((self.steps, tool, input.clone()));
         self.tell(tool, input);
     }

@@ -101,6 +101,11 @@ pub trait Tissue: Send {
     fn guard_events(&self) -> u64;
     /// Substeps computed, those that the guard repeated as well.
     fn substeps_done(&self) -> u64;
+    /// Points that a step computes now; 0 when the whole sheet is asleep: then nothing moves until a tool is told something,
+    /// and a step costs nothing.
+    fn awake_points(&self) -> usize;
+    /// So many steps at once, of a sheet that is asleep: the same as to step so often.
+    fn skip_steps(&mut self, steps: u64);
     /// One step. After a blow-up the state is that of the last checkpoint, which is finite.
     fn step(&mut self) -> Result<(), BlowUp>;
     /// The point at `index`.
@@ -163,7 +168,8 @@ struct Sheet<T: Real> {
     prescribed: Prescribed,
     steps: u64,
     work: Work,
-    checkpoint: Checkpoint<T>,
+    /// None: the state as it is. A sheet that nobody has touched needs no second one.
+    checkpoint: Option<Box<Checkpoint<T>>>,
     /// What the tools were told since the checkpoint: before which step, which tool.
     inputs: Vec<(u64, usize, Input)>,
     guard_events: u64,
@@ -174,26 +180,16 @@ impl<T: Real> Sheet<T> {
     fn new(model: &Arc<Model>) -> Self {
         let layout = Layout::new::<T>(model.points);
         let plan = model.plan.clone();
-        let at_rest = || State::at_rest(&layout, plan.scheme.kept(model.precision == Precision::Compensated));
-        let applied = Applied::new(&layout, &plan);
-        let prescribed = Prescribed::new();
         Sheet {
             model: model.clone(),
             halvings: 0,
             bench: Bench::new(model.lanes, layout, springs_of(model, &plan), &model.fixed),
-            state: at_rest(),
+            state: State::at_rest(&layout, plan.scheme.kept(model.precision == Precision::Compensated)),
             steps: 0,
             work: Work::default(),
-            checkpoint: Checkpoint {
-                steps: 0,
-                halvings: 0,
-                state: at_rest(),
-                applied: applied.clone(),
-                prescribed: prescribed.clone(),
-                work: Work::default(),
-            },
-            applied,
-            prescribed,
+            checkpoint: None,
+            applied: Applied::new(&layout, &plan),
+            prescribed: Prescribed::new(),
             inputs: Vec::new(),
             guard_events: 0,
             substeps_done: 0,
@@ -452,7 +448,21 @@ impl<T: Real> Tissue for Sheet<T> {
         self.push(tool, None);
     }
 
+    fn awake_points(&self) -> usize {
+        // Untouched: nothing was ever told to it, which would have asked for a checkpoint.
+        if self.checkpoint.is_none() { 0 } else { self.model.len() }
+    }
+
+    fn skip_steps(&mut self, steps: u64) {
+        self.steps += steps;
+        self.substeps_done += steps * u64::from(self.plan.substeps);
+    }
+
     fn step(&mut self) -> Result<(), BlowUp> {
+        if self.awake_points() == 0 {
+            self.skip_steps(1);
+            return Ok(());
+        }
         self.do_step();
         match self.check() {
             Ok(()) => Ok(()),
