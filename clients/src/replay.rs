@@ -400,6 +400,8 @@ async fn play(
     };
     streamer.say(Say::Open(open)).await?;
     let mut touch = haptics.touch(ReceiverStream::new(messages)).await.map_err(refused_or_failed)?.into_inner();
+    // The answer to `open`, or why it was refused.
+    touch.message().await.map_err(refused_or_failed)?;
 
     let ahead = ((AHEAD_S * scene.stepping.rate_hz) as u64).clamp(1, COMMANDS_AHEAD);
     arguments.sampling.check(scene.stepping.rate_hz, ahead)?;
