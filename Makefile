@@ -9,7 +9,7 @@ SCRIPT ?= scripts/vertical-60.toml
 VENV := target/venv
 
 .PHONY: help run build test stress lint picture bench-roundtrip bench-duty bench-frames bench-error bench-kernel \
-	bench-stability bench-skip need-rust need-python
+	bench-stability bench-skip bench-rest need-rust need-python
 
 help:
 	@echo 'make run             build, serve on $(LISTEN), poke the tissue, draw what it felt, go on serving'
@@ -19,6 +19,7 @@ help:
 	@echo 'make picture         the picture of the README'
 	@echo 'make bench-roundtrip the haptic round trip beside a bare gRPC echo'
 	@echo 'make bench-duty      a minute of 1 kHz touch and 60 frames a second: time kept, commands lost'
+	@echo 'make bench-rest      a thousand sessions at rest: their share of a core, and the memory of each'
 	@echo 'make bench-frames    refining and encoding a frame beside a plain copy of its bytes'
 	@echo 'make bench-error     run time against error, every scheme on seven scenes: docs/benchmarks/error.md'
 	@echo 'make bench-kernel    the time of a step beside the machine'"'"'s limits, numba, Taichi and NumPy'
@@ -70,6 +71,10 @@ bench-roundtrip: build
 bench-duty: build
 	@echo "Machine: $$(sed -n 's/^model name.*: //p' /proc/cpuinfo 2>/dev/null | sort | uniq -c)"
 	$(CARGO) bench --quiet --bench duty
+
+bench-rest: build
+	@echo "Machine: $$(sed -n 's/^model name.*: //p' /proc/cpuinfo 2>/dev/null | sort | uniq -c)"
+	$(CARGO) bench --quiet --bench rest
 
 bench-frames: need-rust
 	$(CARGO) bench --quiet --bench frames

@@ -428,12 +428,92 @@ async fn every_nth_sample_comes_and_watchers_see_all_tools() {
         assert_eq!(sample.tools.iter().map(|tool| tool.tool).collect::<Vec<_>>(), [0, 4]);
         last = sample.step;
     }
-    let request = pb::WatchSamplesRequest { session_id: session.clone(), sample_every_steps: None };
+    let request = pb::WatchSamplesRequest { session_id: session.clone(), ..Default::default() };
     let mut watched = server.haptics().await.watch_samples(request).await.unwrap().into_inner();
     let sample = watched.message().await.unwrap().unwrap().sample.unwrap();
     assert_eq!(sample.tools.iter().map(|tool| tool.tool).collect::<Vec<_>>(), [4]);
-    let refused = pb::WatchSamplesRequest { session_id: session, sample_every_steps: Some(0) };
+    let refused = pb::WatchSamplesRequest { session_id: session, sample_every_steps: Some(0), ..Default::default() };
     assert_eq!(told(&server.haptics().await.watch_samples(refused).await.unwrap_err()).2, "sample_every_steps");
+}
+
+#[tokio::test]
+async fn who_watches_a_still_tissue_gets_heartbeats_at_the_rate_that_was_said() {
+    let server = Server::start(&[]);
+    let session = server.paper(false).await;
+    let mut usual = Touch::open(&server, open(&session, &[])).await.unwrap();
+    assert_eq!(usual.opened.unwrap().heartbeat_s, 0.05);
+    let wanted = pb::TouchOpen { heartbeat_s: Some(0.1), sample_every_steps: Some(30), ..open(&session, &[0]) };
+    let mut seldom = Touch::open(&server, wanted).await.unwrap();
+    for (touch, apart) in [(&mut usual, 50), (&mut seldom, 120)] {
+        let mut last = touch.sample().await;
+        for _ in 0..4 {
+            let sample = touch.sample().await;
+            assert_eq!(sample.step, last.step + apart);
+            assert!((sample.simulation_time_s - sample.step as f64 / 1000.0).abs() < 1e-12);
+            assert_eq!((sample.asleep, sample.awake_points, sample.dropped_samples), (true, 0, 0));
+            last = sample;
+        }
+    }
+    // What moves is told at once, each Nth step.
+    seldom.command(force(0, 1, -1.0)).await;
+    let first = usual.sample_with(|sample| !sample.asleep).await;
+    assert_eq!(usual.sample().await.step, first.step + 1);
+}
+
+#[tokio::test]
+async fn a_deadband_leaves_out_what_changes_too_little() {
+    let server = Server::start(&[]);
+    let session = server.paper(true).await;
+    let deadband = pb::Deadband { displacement_m: Some(0.0025), ..Default::default() };
+    let wanted = pb::TouchOpen { deadband: Some(deadband), heartbeat_s: Some(0.1), ..open(&session, &[0]) };
+    let mut touch = Touch::open(&server, wanted).await.unwrap();
+    for step in 0..100_u64 {
+        // A millimetre a step for ten steps, then held.
+        let z_m = -0.001 * (step + 1).min(10) as f64;
+        touch.command(pb::Command { at_step: Some(step), ..position(0, step + 1, z_m) }).await;
+    }
+    touch.settle().await;
+    let request = pb::WatchSamplesRequest { session_id: session.clone(), ..Default::default() };
+    let mut watched = server.haptics().await.watch_samples(request).await.unwrap().into_inner();
+    server.start_until(&session, 250).await;
+    let mut steps = Vec::new();
+    while steps.last() != Some(&250) {
+        // One of step 0 came before the start.
+        steps.extend(Some(touch.sample().await.step).filter(|step| *step > 0));
+    }
+    // Also the first, at which the tool touched, and the last, at which time stopped.
+    assert_eq!(steps, [1, 4, 7, 10, 110, 210, 250]);
+    // Others get what they asked for.
+    let sample = watched.message().await.unwrap().unwrap().sample.unwrap();
+    assert_eq!(sample.step + 1, watched.message().await.unwrap().unwrap().sample.unwrap().step);
+}
+
+#[tokio::test]
+async fn what_a_stream_can_not_ask_for_is_refused() {
+    let server = Server::start(&[]);
+    let session = server.paper(true).await;
+    let band = |force_n, force_fraction, displacement_m| pb::Deadband { force_n, force_fraction, displacement_m };
+    let cases = [
+        (Some(band(None, None, None)), None, "MISSING", "deadband"),
+        (Some(band(Some(-0.1), None, None)), None, "OUT_OF_RANGE", "deadband.force_n"),
+        (Some(band(Some(f64::NAN), None, None)), None, "NOT_FINITE", "deadband.force_n"),
+        (Some(band(None, Some(1.5), None)), None, "OUT_OF_RANGE", "deadband.force_fraction"),
+        (Some(band(None, None, Some(f64::INFINITY))), None, "NOT_FINITE", "deadband.displacement_m"),
+        (None, Some(0.0), "OUT_OF_RANGE", "heartbeat_s"),
+        (None, Some(11.0), "OUT_OF_RANGE", "heartbeat_s"),
+        (None, Some(f64::NAN), "NOT_FINITE", "heartbeat_s"),
+    ];
+    for (deadband, heartbeat_s, reason, field) in cases {
+        let touch = pb::TouchOpen { deadband, heartbeat_s, ..open(&session, &[0]) };
+        let refused = Touch::open(&server, touch).await.err().unwrap();
+        assert_eq!(told(&refused), (Code::InvalidArgument, reason.into(), field.into()));
+        let watch =
+            pb::WatchSamplesRequest { session_id: session.clone(), deadband, heartbeat_s, ..Default::default() };
+        let refused = server.haptics().await.watch_samples(watch).await.unwrap_err();
+        assert_eq!(told(&refused), (Code::InvalidArgument, reason.into(), field.into()));
+    }
+    // None of them has taken the tool.
+    Touch::hold(&server, &session).await;
 }
 
 #[tokio::test]
@@ -559,7 +639,7 @@ async fn a_session_that_blows_up_is_held_with_a_reason_and_sends_no_nan() {
     };
     assert_eq!(rejection.reason, "SESSION_HELD");
     // Who comes now is told at once: the last good state, and that no more follows.
-    let request = pb::WatchSamplesRequest { session_id: session.clone(), sample_every_steps: None };
+    let request = pb::WatchSamplesRequest { session_id: session.clone(), ..Default::default() };
     let mut watched = server.haptics().await.watch_samples(request).await.unwrap().into_inner();
     assert!(watched.message().await.unwrap().unwrap().sample.unwrap().held);
     assert_eq!(told(&watched.message().await.unwrap_err()).1, "SESSION_HELD");

@@ -196,6 +196,53 @@ fn every_kind_of_force_and_tool_comes_through_exactly() {
     assert_eq!(through.last().unwrap()["summary"]["final_hash"], offline.last().unwrap()["summary"]["final_hash"]);
 }
 
+/// Half a second of nothing, a short push, and another push later.
+const PAUSES: &str = r#"
+name = "pauses"
+duration_s = 1.2
+sample_every_s = 0.4
+sample_points = [[15, 15]]
+[[force]]
+point = [15, 15]
+force_n = [0.0, 0.0, -1.0]
+falloff_per_m = 150.0
+falloff_offset = 0.0
+profile = { type = "pulse", on_s = 0.5, off_s = 0.6 }
+[[force]]
+point = [4, 20]
+force_n = [0.1, 0.0, -0.5]
+falloff_per_m = 150.0
+falloff_offset = 0.0
+profile = { type = "pulse", on_s = 1.1, off_s = 1.15 }
+"#;
+
+#[test]
+fn a_session_that_rests_gives_the_hash_of_the_run_offline_on_any_number_of_threads_and_samples() {
+    let folder = tempfile::tempdir().unwrap();
+    let script = folder.path().join("pauses.toml");
+    std::fs::write(&script, PAUSES).unwrap();
+    let offline = run_held("paper", &script);
+    for threads in ["1", "3"] {
+        let server = Server::start(&["--threads", threads]);
+        assert_same(&server, "paper", &script);
+        for sampling in [
+            &["--every", "20"][..],
+            &["--deadband-force-n", "0.05", "--deadband-force-fraction", "0.1", "--heartbeat-s", "0.3"],
+            &["--deadband-displacement-m", "1e-3"],
+        ] {
+            let output = replay(&server, &script, sampling);
+            let errors = String::from_utf8_lossy(&output.stderr).into_owned();
+            assert!(output.status.success(), "{errors}");
+            let summary = &lines(&output.stdout).pop().unwrap()["summary"];
+            assert_eq!(summary["final_hash"], offline.last().unwrap()["summary"]["final_hash"], "{errors}");
+            // Fewer than steps: that is what was asked for.
+            let row = errors.lines().find(|line| line.starts_with("samples")).unwrap();
+            let samples: u64 = row.split_whitespace().nth(1).unwrap().parse().unwrap();
+            assert!(samples < 400, "{row}");
+        }
+    }
+}
+
 #[test]
 fn a_server_that_stops_in_mid_replay_is_told() {
     let mut server = Server::start(&[]);
@@ -257,6 +304,10 @@ fn what_a_replay_can_not_play_is_refused() {
     refused(replay(&server, &script, &["--scene", "nothing"]), 2, "UNKNOWN_SCENE");
     refused(replay(&server, Path::new("no-such-script.toml"), &[]), 2, "no-such-script.toml");
     refused(replay(&server, &script, &["--output", "/no/such/folder/file"]), 2, "/no/such/folder/file");
+    refused(replay(&server, &script, &["--deadband-force-n=-1"]), 2, "deadband.force_n");
+    refused(replay(&server, &script, &["--every", "0"]), 2, "--every");
+    refused(replay(&server, &script, &["--every", "5000"]), 2, "samples pace the commands");
+    refused(replay(&server, &script, &["--heartbeat-s", "9"]), 2, "--heartbeat-s");
     for server in ["https://127.0.0.1:1", "ftp://nowhere", "http://"] {
         let wrong = Command::new(client_program())
             .args(["replay", script.to_str().unwrap(), "--server", server])

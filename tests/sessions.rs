@@ -211,8 +211,14 @@ async fn a_session_too_heavy_for_its_rate_slows_its_own_time_and_says_so() {
     (sheet.points_x, sheet.points_y) = (Some(800), Some(500));
     heavy.stepping.as_mut().unwrap().rate_hz = Some(10_000.0);
     let session = server.create(Source::Scene(heavy), false).await.unwrap().session_id;
-    let request = pb::WatchSamplesRequest { session_id: session.clone(), sample_every_steps: None };
+    let request = pb::WatchSamplesRequest { session_id: session.clone(), ..Default::default() };
     let mut samples = server.haptics().await.watch_samples(request).await.unwrap().into_inner();
+    // The same force everywhere: all of it moves. At rest it would cost nothing.
+    let touch = Touch::hold(&server, &session).await;
+    let mut everywhere = force(0, 1, -1.0);
+    let Some(pb::command::Action::Force(force)) = &mut everywhere.action else { unreachable!() };
+    force.falloff_per_m = 0.0;
+    touch.command(everywhere).await;
     let mut last: Option<pb::Sample> = None;
     loop {
         let sample = tokio::time::timeout(PATIENCE, samples.message()).await.unwrap().unwrap().unwrap().sample.unwrap();
@@ -228,6 +234,143 @@ async fn a_session_too_heavy_for_its_rate_slows_its_own_time_and_says_so() {
     }
     let status = server.status(&session).await;
     assert!(status.time_dilation < 0.9 && status.overrun_count > 100);
+}
+
+/// Asks until the session rests.
+async fn rested(server: &Server, session: &str) -> pb::Session {
+    let until = std::time::Instant::now() + PATIENCE;
+    loop {
+        let status = server.status(session).await;
+        if status.resting {
+            return status;
+        }
+        assert!(std::time::Instant::now() < until, "does not come to rest");
+        tokio::time::sleep(std::time::Duration::from_millis(5)).await;
+    }
+}
+
+#[tokio::test]
+async fn time_goes_on_at_rest_without_steps_and_without_overruns() {
+    let server = Server::start(&["--threads", "1"]);
+    let session = server.paper(false).await;
+    let first = rested(&server, &session).await;
+    let later = loop {
+        tokio::time::sleep(std::time::Duration::from_millis(20)).await;
+        let status = rested(&server, &session).await;
+        if status.step > first.step + 1500 {
+            break status;
+        }
+    };
+    assert_eq!(later.state(), pb::SessionState::Running);
+    assert!(later.rested_steps > 1400, "{} of {} steps", later.rested_steps, later.step);
+    assert_eq!((later.overrun_count, later.simulation_time_s), (0, later.step as f64 / 1000.0));
+    assert!((later.time_dilation - 1.0).abs() < 0.01, "{}", later.time_dilation);
+    // To be paused ends it: time stands where it is.
+    let mut sessions = server.sessions().await;
+    sessions.pause_session(pb::PauseSessionRequest { session_id: session.clone() }).await.unwrap();
+    let stands = server.status(&session).await;
+    assert!(stands.step >= later.step && !stands.resting);
+    assert_eq!(stands.state(), pb::SessionState::Paused);
+    let asked = pb::GetStateHashRequest { session_id: session.clone(), at_step: Some(stands.step) };
+    assert_eq!(sessions.get_state_hash(asked).await.unwrap().into_inner().step, stands.step);
+    // And a step that somebody waits for is done at its time.
+    server.start_until(&session, stands.step + 300).await;
+    server.hash_at(&session, stands.step + 200).await;
+    server.hash_at(&session, stands.step + 300).await;
+    let stands = server.status(&session).await;
+    assert_eq!((stands.state(), stands.resting, stands.overrun_count), (pb::SessionState::Paused, false, 0));
+}
+
+#[tokio::test]
+async fn the_state_after_rest_is_that_of_a_session_that_was_stepped_all_the_time() {
+    let server = Server::start(&["--threads", "1"]);
+    let mut hashes = Vec::new();
+    for probed in [false, true] {
+        let session = server.paper(true).await;
+        // One who records every step leaves nothing to skip.
+        let points = pb::GridPoints { points: vec![pb::GridPoint { x: 1, y: 1 }] };
+        let r#where = Some(pb::probe_request::Where::Points(points));
+        let probe = pb::ProbeRequest { session_id: session.clone(), r#where, ..Default::default() };
+        let mut haptics = server.haptics().await;
+        let records = if probed { Some(haptics.probe(probe).await.unwrap()) } else { None };
+        let mut touch = Touch::hold(&server, &session).await;
+        touch.command(pb::Command { at_step: Some(400), ..force(0, 1, -1.0) }).await;
+        touch.settle().await;
+        server.start_until(&session, 450).await;
+        hashes.push(server.hash_at(&session, 450).await);
+        let status = server.status(&session).await;
+        assert_eq!((status.step, status.late_commands), (450, 0));
+        assert_eq!(status.rested_steps > 300, !probed, "{} steps rested", status.rested_steps);
+        drop(records);
+    }
+    assert_eq!(hashes[0], hashes[1]);
+}
+
+#[tokio::test]
+async fn a_command_wakes_a_session_at_the_step_that_is_next() {
+    let server = Server::start(&["--threads", "1"]);
+    let session = server.paper(false).await;
+    let mut touch = Touch::hold(&server, &session).await;
+    let mut sequence = 0;
+    for at_step in [None, Some(0)] {
+        let before = rested(&server, &session).await;
+        sequence += 1;
+        // A release changes nothing: the session goes on resting.
+        let release = Some(pb::command::Action::Release(pb::Release {}));
+        touch.command(pb::Command { sequence, at_step, action: release, ..Default::default() }).await;
+        let sample = touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == sequence).await;
+        let after = server.status(&session).await;
+        assert!((before.step..=after.step).contains(&sample.step), "{} {} {}", before.step, sample.step, after.step);
+        assert_eq!((sample.asleep, sample.overrun_count, sample.tools[0].late), (true, 0, at_step.is_some()));
+    }
+    rested(&server, &session).await;
+    touch.command(force(0, sequence + 1, -1.0)).await;
+    let sample = touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == sequence + 1).await;
+    assert!(!sample.asleep && sample.awake_points > 0);
+    assert_eq!(sample.tools[0].applied_force_n.unwrap().z, -1.0);
+}
+
+#[tokio::test]
+async fn a_lease_lapses_at_rest_at_its_step() {
+    let server = Server::start(&["--threads", "1"]);
+    let session = server.paper(false).await;
+    let mut touch = Touch::open(&server, pb::TouchOpen { lease_s: Some(0.1), ..open(&session, &[0]) }).await.unwrap();
+    let opened = touch.opened.unwrap();
+    // Nobody asks for anything. Of the step, not of the time at which a busy machine does it.
+    let expired = touch.sample_with(|sample| sample.tools[0].expired).await;
+    assert!((100..=102).contains(&(expired.step - opened.step)), "{} steps", expired.step - opened.step);
+    assert!(expired.asleep);
+}
+
+#[cfg(target_os = "linux")]
+#[tokio::test]
+async fn with_nothing_awake_the_stepping_threads_sleep() {
+    let server = Server::start(&["--threads", "2"]);
+    for _ in 0..20 {
+        let session = server.paper(false).await;
+        rested(&server, &session).await;
+    }
+    // How often each stepping thread gave up a core of its own accord: a sleep is one, a poll many.
+    let sleeps = || {
+        let tasks = std::fs::read_dir(format!("/proc/{}/task", server.child.id())).unwrap();
+        let steps = tasks.map(|task| std::fs::read_to_string(task.unwrap().path().join("status")).unwrap());
+        let of = |status: &String| {
+            let line = status.lines().find(|line| line.starts_with("voluntary_ctxt_switches:")).unwrap();
+            line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap()
+        };
+        steps.filter(|status| status.starts_with("Name:\tstep-")).map(|status| of(&status)).collect::<Vec<_>>()
+    };
+    let until = std::time::Instant::now() + PATIENCE;
+    loop {
+        // The last of them may be on its way to sleep.
+        let before = sleeps();
+        assert_eq!(before.len(), 2);
+        tokio::time::sleep(std::time::Duration::from_millis(500)).await;
+        if sleeps() == before {
+            break;
+        }
+        assert!(std::time::Instant::now() < until, "the stepping threads do not sleep");
+    }
 }
 
 #[tokio::test]

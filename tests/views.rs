@@ -48,6 +48,17 @@ async fn frame(stream: &mut Streaming<pb::WatchFramesResponse>) -> (pb::WatchFra
     }
 }
 
+/// Something that moves for so many steps: of what is still no frames are due.
+async fn stir(server: &Server, session: &str, steps: u64) -> Touch {
+    let mut touch = Touch::hold(server, session).await;
+    for step in (0..steps).step_by(5) {
+        let strength_n = if step % 10 == 0 { -1.0 } else { 1.0 };
+        touch.command(pb::Command { at_step: Some(step), ..force(0, step + 1, strength_n) }).await;
+    }
+    touch.settle().await;
+    touch
+}
+
 #[tokio::test]
 async fn every_refinement_and_encoding_shows_the_same_tissue() {
     let server = Server::start(&[]);
@@ -124,6 +135,7 @@ async fn a_viewer_without_credit_gets_no_more_frames_until_it_acknowledges() {
     let mut views = server.views().await;
     let mut frames = views.watch_frames(request).await.unwrap().into_inner();
     let (first, _) = frame(&mut frames).await;
+    let _touch = stir(&server, &session, 1010).await;
     server.start_until(&session, 1000).await;
     let (second, _) = frame(&mut frames).await;
     assert_eq!((first.frame_id, second.frame_id), (0, 1));
@@ -150,6 +162,7 @@ async fn a_viewer_chooses_its_rate() {
         let request = pb::WatchFramesRequest { rate_hz: Some(rate_hz), ..watch(&session, 1, pb::Encoding::I16) };
         streams.push((rate_hz, server.views().await.watch_frames(request).await.unwrap().into_inner()));
     }
+    let _touch = stir(&server, &session, 1000).await;
     server.start_until(&session, 1000).await;
     for (rate_hz, mut frames) in streams {
         let mut steps = Vec::new();
@@ -206,6 +219,7 @@ async fn a_greedy_session_leaves_frames_for_others() {
     let session = server.paper(true).await;
     let request = pb::WatchFramesRequest { rate_hz: Some(50.0), ..watch(&session, 0, pb::Encoding::I16) };
     let mut frames = server.views().await.watch_frames(request).await.unwrap().into_inner();
+    let _touch = stir(&server, &session, 1000).await;
     server.start_until(&session, 1000).await;
     let mut count = 0;
     while frame(&mut frames).await.0.step < 1000 {

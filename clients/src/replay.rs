@@ -35,7 +35,7 @@ const COMMANDS_AHEAD: u64 = 4000;
 /// Between two heartbeats.
 const HEARTBEAT: Duration = Duration::from_millis(5);
 
-/// A running session sends a sample each step; this long without one is an end.
+/// A running session answers heartbeats at once; this long without a word is an end.
 const SILENCE: Duration = Duration::from_secs(10);
 
 #[derive(clap::Args)]
@@ -57,6 +57,57 @@ pub(crate) struct Arguments {
     /// No progress bar
     #[arg(short, long)]
     quiet: bool,
+    #[command(flatten)]
+    sampling: Sampling,
+}
+
+/// Which samples the server is asked for. The records do not depend on it.
+#[derive(clap::Args)]
+#[command(
+    next_help_heading = "Samples (what the tools feel, for --plot and the table; a sample a step if nothing is given)"
+)]
+struct Sampling {
+    /// A sample every Nth step
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    every: u32,
+    /// Leave out samples whose force on the tool differs from the last one's by no more than this, N
+    #[arg(long, value_name = "N")]
+    deadband_force_n: Option<f64>,
+    /// The same as a part of the force, 0 to 1: of both the larger counts. People notice a tenth or so
+    #[arg(long, value_name = "FRACTION")]
+    deadband_force_fraction: Option<f64>,
+    /// Leave out samples whose control point moved by no more than this, m. With a force deadband too, a sample comes if
+    /// either is left
+    #[arg(long, value_name = "M")]
+    deadband_displacement_m: Option<f64>,
+    /// The longest between two samples when nothing changes, s: above 0 and at most 10 [default: 0.05]
+    #[arg(long, value_name = "SECONDS")]
+    heartbeat_s: Option<f64>,
+}
+
+impl Sampling {
+    fn deadband(&self) -> Option<pb::Deadband> {
+        let deadband = pb::Deadband {
+            force_n: self.deadband_force_n,
+            force_fraction: self.deadband_force_fraction,
+            displacement_m: self.deadband_displacement_m,
+        };
+        (deadband != pb::Deadband::default()).then_some(deadband)
+    }
+
+    /// Samples pace the commands, which are sent so many steps ahead: they must come twice as often.
+    #[allow(clippy::cast_precision_loss)]
+    fn check(&self, rate_hz: f64, ahead: u64) -> Result<(), Failure> {
+        let most_s = 0.5 * ahead as f64 / rate_hz;
+        let apart_s = f64::from(self.every) / rate_hz;
+        for (option, seconds) in [("--every", apart_s), ("--heartbeat-s", self.heartbeat_s.unwrap_or(0.0) + apart_s)] {
+            if seconds > most_s {
+                let why = "samples pace the commands, and would be up to";
+                return Err(Failure::Refused(format!("{option}: {why} {seconds} s apart, above {most_s} s")));
+            }
+        }
+        Ok(())
+    }
 }
 
 /// When the server was last heard.
@@ -138,7 +189,10 @@ struct Seen {
     hold_ns: Histogram<u64>,
     overruns: u64,
     samples: u64,
+    /// Of the last sample.
     awake_points: u64,
+    /// Points times steps that were computed: a sample stands for the steps since the one before, unless all was asleep.
+    computed: u64,
     late: u64,
     rejected: u64,
     largest_displacement_m: f64,
@@ -160,6 +214,7 @@ impl Seen {
             overruns: 0,
             samples: 0,
             awake_points: 0,
+            computed: 0,
             late: 0,
             rejected: 0,
             largest_displacement_m: 0.0,
@@ -172,10 +227,13 @@ impl Seen {
     }
 
     #[allow(clippy::cast_possible_truncation)]
-    fn sample(&mut self, sample: &pb::Sample) {
+    fn sample(&mut self, sample: &pb::Sample, every: u32) {
         self.overruns = sample.overrun_count;
         self.samples += 1;
-        self.awake_points += u64::from(sample.awake_points);
+        let steps = sample.step.saturating_sub(self.last.0);
+        let awake_steps = if self.awake_points == 0 { steps.min(u64::from(every)) } else { steps };
+        self.awake_points = u64::from(sample.awake_points);
+        self.computed += self.awake_points * awake_steps;
         self.late = sample.late_commands;
         self.last = (sample.step, sample.server_time_ns);
         self.first.get_or_insert(self.last);
@@ -334,14 +392,19 @@ async fn play(
     let open = pb::TouchOpen {
         session_id: session_id.clone(),
         tools: (0..script.tools() as u32).collect(),
-        sample_every_steps: None,
+        sample_every_steps: Some(arguments.sampling.every),
         lease_s: Some(SILENCE.as_secs_f64()),
         holder: "palpate-client replay".to_owned(),
+        deadband: arguments.sampling.deadband(),
+        heartbeat_s: arguments.sampling.heartbeat_s,
     };
     streamer.say(Say::Open(open)).await?;
     let mut touch = haptics.touch(ReceiverStream::new(messages)).await.map_err(refused_or_failed)?.into_inner();
+    // The answer to `open`, or why it was refused.
+    touch.message().await.map_err(refused_or_failed)?;
 
     let ahead = ((AHEAD_S * scene.stepping.rate_hz) as u64).clamp(1, COMMANDS_AHEAD);
+    arguments.sampling.check(scene.stepping.rate_hz, ahead)?;
     let mut seen = Seen::new()?;
     streamer.send_before(ahead).await?;
     // Answered in order: what has been sent so far is in the queue before the first step.
@@ -377,7 +440,7 @@ async fn play(
                         let reason = session.map(|session| session.hold_reason).unwrap_or_default();
                         return Err(Failure::Failed(format!("the run was stopped: {reason}")));
                     }
-                    seen.sample(&sample);
+                    seen.sample(&sample, arguments.sampling.every);
                     wall_s = started.elapsed().as_secs_f64();
                     progress.set_position(sample.step);
                     streamer.send_before(sample.step + ahead).await?;
@@ -430,7 +493,7 @@ async fn play(
         points,
         wall_s,
         ns_per_point_substep: wall_s * 1e9 / (substeps as f64 * points as f64),
-        computed_fraction: seen.awake_points as f64 / (seen.samples.max(1) * points as u64) as f64,
+        computed_fraction: seen.computed as f64 / (script.steps * points as u64) as f64,
         guard_events: 0,
         final_hash: final_hash.unwrap_or_default(),
         network: Some(network.clone()),
@@ -472,6 +535,7 @@ fn table(arguments: &Arguments, summary: &Summary, network: &Network, seen: &See
     let rows = [
         ("steps", format!("{} in {:.2} s", summary.steps, summary.wall_s)),
         ("overruns", format!("{} (time dilation {:.5})", network.overruns, network.time_dilation)),
+        ("samples", format!("{} for {} steps", seen.samples, summary.steps)),
         ("late commands", network.late_commands.to_string()),
         ("largest displacement", format!("{:.6} m", seen.largest_displacement_m)),
         ("peak reaction", format!("{:.6} N", seen.peak_reaction_n)),

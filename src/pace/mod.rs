@@ -4,11 +4,12 @@
 pub mod clock;
 pub mod frames;
 pub mod queue;
+mod taps;
 mod thread;
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 
 use tokio::sync::oneshot;
@@ -19,11 +20,14 @@ use crate::scene::Scene;
 use crate::scene::record::{Point, Record};
 use crate::session::Sample;
 use crate::session::command::Intake;
+use crate::session::sampling::{HEARTBEAT_S, Sampler, Sampling};
+use crate::session::schedule::Schedule;
 use crate::sheet::Model;
 use clock::now_ns;
 use frames::{Delivery, Encoder, Viewer};
 use queue::{Reader, lock, queue};
-use thread::{Inbox, ProbeTap, Request, Running, SampleTap};
+use taps::{ProbeTap, SampleTap};
+use thread::{Inbox, Request, Running};
 
 /// A sample, and how the session keeps time.
 #[derive(Debug, Clone, PartialEq)]
@@ -34,7 +38,7 @@ pub struct PacedSample {
     pub overrun_count: u64,
     /// Of the last second or so.
     pub time_dilation: f64,
-    /// Steps were dropped just before this one.
+    /// Steps were dropped since the stream's last sample.
     pub overrun: bool,
 }
 
@@ -65,10 +69,16 @@ pub struct Status {
     pub state: State,
     /// Steps done.
     pub step: u64,
+    /// Nothing moves and no command waits: the session is not stepped.
+    pub resting: bool,
+    /// Steps skipped at rest.
+    pub rested_steps: u64,
     /// Steps dropped.
     pub overrun_count: u64,
-    /// Of the last second or so.
-    pub time_dilation: f64,
+    /// Simulated over real time.
+    pub dilation: Dilation,
+    /// When steps are due while time goes on.
+    pub schedule: Schedule,
     /// Commands that came too late for their step.
     pub late_commands: u64,
     /// Why it is held.
@@ -77,14 +87,40 @@ pub struct Status {
     pub guard_events: u64,
 }
 
+/// Over which time dilation is measured.
+const DILATION_WINDOW_NS: u64 = 1_000_000_000;
+
+/// Simulated over real time, of the last second or so.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Dilation {
+    /// 1 when on time.
+    pub value: f64,
+    /// When the window of the next measurement began, and steps done then.
+    since: (u64, u64),
+}
+
+impl Dilation {
+    fn new(now_ns: u64, step: u64) -> Self {
+        Dilation { value: 1.0, since: (now_ns, step) }
+    }
+
+    #[allow(clippy::cast_precision_loss)]
+    fn observe(&mut self, now_ns: u64, step: u64, period_ns: f64) {
+        let elapsed_ns = now_ns.saturating_sub(self.since.0);
+        if elapsed_ns >= DILATION_WINDOW_NS {
+            self.value = step.saturating_sub(self.since.1) as f64 * period_ns / elapsed_ns as f64;
+            self.since = (now_ns, step);
+        }
+    }
+}
+
 /// A session as the server sees it.
 pub struct Live {
     /// Random, not to be guessed.
     pub id: String,
     /// What of the tissue never changes.
     pub model: Arc<Model>,
-    /// Where commands come in.
-    pub intake: Mutex<Intake>,
+    intake: Mutex<Intake>,
     /// Deleted when so long nobody asked for it, held a tool or had a stream, s.
     pub idle_timeout_s: f64,
     asked_ns: AtomicU64,
@@ -106,9 +142,17 @@ impl Drop for StreamGuard {
 }
 
 impl Live {
-    /// How the session stands.
+    /// How the session stands now: at rest its steps are done in thought.
     pub fn status(&self) -> Status {
-        lock(&self.status).clone()
+        let now = now_ns();
+        let resting = self.at_intake(|intake, _| intake.is_resting().then(|| intake.next_step()));
+        let mut status = lock(&self.status).clone();
+        if let Some(step) = resting.filter(|step| *step >= status.step) {
+            status.rested_steps += step - status.step;
+            status.dilation.observe(now, step, status.schedule.period_ns());
+            (status.resting, status.step) = (true, step);
+        }
+        status
     }
 
     #[allow(clippy::cast_precision_loss)]
@@ -116,18 +160,22 @@ impl Live {
         let unused_s = now_ns.saturating_sub(self.asked_ns.load(Ordering::Relaxed)) as f64 * 1e-9;
         unused_s > self.idle_timeout_s
             && *lock(&self.streams) == 0
-            && self.intake_as_of(now_ns).holders().next().is_none()
+            && self.at_intake(|intake, _| intake.holders().next().is_none())
     }
 
-    /// The intake as it stands now: also while time stands, when no step ends the leases that have run out.
-    pub fn intake_now(&self) -> MutexGuard<'_, Intake> {
-        self.intake_as_of(now_ns())
-    }
-
-    fn intake_as_of(&self, now_ns: u64) -> MutexGuard<'_, Intake> {
+    /// Where commands come in, as it stands now, and the time: also while no step is done that would end the leases that
+    /// have run out. A session at rest wakes if need be.
+    pub fn at_intake<T>(&self, act: impl FnOnce(&mut Intake, u64) -> T) -> T {
         let mut intake = lock(&self.intake);
-        intake.lapse(now_ns);
-        intake
+        let now = now_ns();
+        intake.lapse(now);
+        let answer = act(&mut intake, now);
+        let wake = intake.take_wake();
+        drop(intake);
+        if wake {
+            self.inbox.send(self.number, Request::Wake);
+        }
+        answer
     }
 
     /// Room for one more stream.
@@ -162,19 +210,21 @@ impl Live {
         self.ask(|reply| Request::Hash { at, reply }).await
     }
 
-    /// Samples every so many steps, of some tools or of all in use.
-    pub fn samples(&self, every: u64, only: Option<Vec<u32>>) -> Reader<PacedSample> {
-        self.tap(every, only, false)
+    /// The samples that are asked for.
+    pub fn samples(&self, sampling: Sampling) -> Reader<PacedSample> {
+        self.tap(sampling, false)
     }
 
     /// The next sample; the present one if time stands.
     pub async fn next_sample(&self, only: Vec<u32>) -> Result<PacedSample> {
-        Ok(self.tap(1, Some(only), true).pop().await?.0)
+        let sampling = Sampling { every: 1, only: Some(only), deadband: None, heartbeat_s: HEARTBEAT_S };
+        Ok(self.tap(sampling, true).pop().await?.0)
     }
 
-    fn tap(&self, every: u64, only: Option<Vec<u32>>, once: bool) -> Reader<PacedSample> {
+    fn tap(&self, sampling: Sampling, once: bool) -> Reader<PacedSample> {
         let (writer, reader) = queue(if once { 1 } else { self.limits.queued_samples });
-        self.inbox.send(self.number, Request::Samples(SampleTap { every, only, once, writer }));
+        let sampler = Sampler::new(sampling, self.model.scene.stepping.rate_hz);
+        self.inbox.send(self.number, Request::Samples(SampleTap { sampler, once, writer, overrun_count: 0 }));
         reader
     }
 
@@ -273,8 +323,11 @@ impl Pacer {
         let status = Status {
             state: if paused { State::Paused } else { State::Running },
             step: 0,
+            resting: false,
+            rested_steps: 0,
             overrun_count: 0,
-            time_dilation: 1.0,
+            dilation: Dilation::new(now_ns(), 0),
+            schedule: Schedule::new(0, now_ns(), scene.stepping.rate_hz),
             late_commands: 0,
             hold_reason: None,
             guard_events: 0,
@@ -333,8 +386,9 @@ impl Pacer {
 
     /// Deletes the sessions that nobody uses any more; tells which.
     pub fn delete_idle(&self) -> Vec<String> {
-        let idle = |live: &&Arc<Live>| live.is_idle(now_ns());
-        let ids: Vec<String> = lock(&self.sessions).values().filter(idle).map(|live| live.id.clone()).collect();
+        let now = now_ns();
+        let all: Vec<_> = lock(&self.sessions).values().cloned().collect();
+        let ids: Vec<String> = all.iter().filter(|live| live.is_idle(now)).map(|live| live.id.clone()).collect();
         ids.into_iter().filter(|id| self.delete(id).is_ok()).collect()
     }
 

@@ -39,7 +39,8 @@ pub struct Reader<T>(Arc<Shared<T>>);
 /// A queue of `capacity` items.
 pub fn queue<T>(capacity: usize) -> (Writer<T>, Reader<T>) {
     let inner = Inner {
-        items: VecDeque::with_capacity(capacity),
+        // Grows if it must: a reader that keeps up needs room for one.
+        items: VecDeque::new(),
         capacity: capacity.max(1),
         dropped: 0,
         end: None,

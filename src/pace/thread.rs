@@ -2,8 +2,15 @@
 //!
 //! Overruns: time steps are fixed. A session that is behind catches up at most [`CATCH_UP_STEPS`] steps; what it is
 //! behind beyond that is dropped from its schedule, and counted. Simulated time then runs slower than real time.
+//!
+//! Rest: while all of a tissue is asleep and no command waits, its steps change nothing but their number. Then only the
+//! steps are done that somebody is to be told of (a heartbeat, a record, a hash); those between are skipped, all at once,
+//! when the next is due. A session of which nobody waits for a step is not in the thread's rota at all, and a thread
+//! whose rota is empty sleeps until it is asked something. What comes in meanwhile is placed where it would be had the
+//! session been stepped ([`Intake::rest`](crate::session::command::Intake::rest)), and wakes the thread.
 
-use std::collections::VecDeque;
+use std::collections::btree_map::Entry;
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -11,31 +18,37 @@ use tokio::sync::oneshot;
 
 use super::clock::now_ns;
 use super::frames::{Encoder, Job, Viewer};
-use super::queue::{Writer, lock};
-use super::{Live, PacedRecord, PacedSample, State};
+use super::queue::lock;
+use super::taps::{HashReply, ProbeTap, SampleTap, Taps, ViewTap};
+use super::{Dilation, Live, PacedRecord, PacedSample, State};
 use crate::refusal::{Reason, Refusal, Result};
 use crate::session::Session;
 use crate::session::command::Due;
+use crate::session::schedule::Schedule;
 use crate::surface::Snapshot;
 
 /// Steps that a session may be behind before the rest is dropped.
 const CATCH_UP_STEPS: f64 = 2.0;
 
-/// Over which time dilation is measured.
-const DILATION_WINDOW_NS: u64 = 1_000_000_000;
-
-/// Who waits for the step and the hash of a state.
-type HashReply = oneshot::Sender<Result<(u64, u128)>>;
-
 /// What a stepping thread is asked for.
 pub(super) enum Request {
     Adopt(Box<Running>),
-    Start { until: Option<u64>, reply: oneshot::Sender<Result<u64>> },
-    Pause { reply: oneshot::Sender<Result<()>> },
+    Start {
+        until: Option<u64>,
+        reply: oneshot::Sender<Result<u64>>,
+    },
+    Pause {
+        reply: oneshot::Sender<Result<()>>,
+    },
+    /// Something came to a session at rest.
+    Wake,
     Samples(SampleTap),
     Probe(ProbeTap),
     View(Arc<Viewer>),
-    Hash { at: Option<u64>, reply: HashReply },
+    Hash {
+        at: Option<u64>,
+        reply: HashReply,
+    },
     Delete(Refusal),
 }
 
@@ -71,57 +84,53 @@ impl Inbox {
     }
 }
 
-/// A stream of samples.
-pub(super) struct SampleTap {
-    pub(super) every: u64,
-    pub(super) only: Option<Vec<u32>>,
-    pub(super) once: bool,
-    pub(super) writer: Writer<PacedSample>,
-}
-
-/// A stream of records.
-pub(super) struct ProbeTap {
-    pub(super) every: u64,
-    /// All, if none are named.
-    pub(super) points: Option<Vec<[usize; 2]>>,
-    pub(super) energy: bool,
-    pub(super) writer: Writer<PacedRecord>,
-}
-
 /// A session and its schedule.
 pub(super) struct Running {
     live: Arc<Live>,
     session: Session,
     running: bool,
     until: Option<u64>,
-    /// Step `anchor_step` is due at `anchor_ns`, and each further one a period later.
-    anchor_ns: f64,
-    anchor_step: u64,
-    period_ns: f64,
+    schedule: Schedule,
+    /// The step to do next. At rest, those before it are skipped; `u64::MAX` if there is none.
+    next_step: u64,
+    /// Steps done when all was asleep first, if it still is.
+    still_since: Option<u64>,
+    rested_steps: u64,
     overrun_count: u64,
-    window: (u64, u64),
-    time_dilation: f64,
+    dilation: Dilation,
     due: Vec<Due>,
     hashed: Option<(u64, u128)>,
     taps: Taps,
     deleted: bool,
 }
 
-/// Who wants to know.
+/// The sessions of a thread, by number, and when each needs it next. One at rest may need it never.
 #[derive(Default)]
-struct Taps {
-    samples: Vec<SampleTap>,
-    probes: Vec<ProbeTap>,
-    viewers: Vec<Arc<Viewer>>,
-    hashes: Vec<(u64, HashReply)>,
+struct Rota {
+    sessions: BTreeMap<u64, Box<Running>>,
+    due: BTreeSet<(u64, u64)>,
 }
 
-impl Taps {
-    fn forget_the_gone(&mut self) {
-        self.samples.retain(|tap| !tap.writer.is_abandoned());
-        self.probes.retain(|tap| !tap.writer.is_abandoned());
-        self.viewers.retain(|viewer| !viewer.is_gone());
-        self.hashes.retain(|waiting| !waiting.1.is_closed());
+impl Rota {
+    /// Does something with session `number`, if it is there still, which may change when it is due.
+    fn with(&mut self, number: u64, act: impl FnOnce(&mut Running)) {
+        let Entry::Occupied(mut session) = self.sessions.entry(number) else { return };
+        let running = session.get_mut();
+        if let Some(due_ns) = running.due_ns() {
+            self.due.remove(&(due_ns, number));
+        }
+        act(running);
+        if let Some(due_ns) = running.due_ns() {
+            self.due.insert((due_ns, number));
+        }
+        if running.deleted {
+            session.remove();
+        }
+    }
+
+    /// The session that is due first, and when.
+    fn first(&self) -> Option<(u64, u64)> {
+        self.due.first().copied()
     }
 }
 
@@ -130,38 +139,31 @@ pub(super) fn work(inbox: &Inbox, encoder: &Encoder) {
     // The default slack of 50 µs would be the larger part of each step's lateness. Where it can't be set, so be it.
     #[cfg(target_os = "linux")]
     let _ = rustix::thread::set_current_timer_slack(std::num::NonZeroU64::new(1));
-    let mut sessions: Vec<Running> = Vec::new();
+    let mut rota = Rota::default();
     let mut requests = VecDeque::new();
     loop {
-        let next = sessions.iter().filter(|r| r.running).map(Running::deadline_ns).min();
-        let stop = wait(inbox, next, &mut requests);
-        if let Some(why) = stop {
-            for running in &mut sessions {
-                running.end(&why);
-            }
+        let next_ns = rota.first().map(|first| first.0);
+        if let Some(why) = wait(inbox, next_ns, &mut requests) {
+            rota.sessions.values_mut().for_each(|running| running.end(&why));
             return;
         }
         // One at a time where a step is due: to answer many must not make a step wait.
         while let Some((number, request)) = requests.pop_front() {
-            match request {
-                Request::Adopt(running) => sessions.push(*running),
-                request => {
-                    if let Some(running) = sessions.iter_mut().find(|r| r.live.number == number) {
-                        running.serve(request, encoder);
-                    }
-                }
+            if let Request::Adopt(running) = request {
+                rota.sessions.insert(number, running);
+                rota.with(number, Running::plan);
+            } else {
+                rota.with(number, |running| running.serve(request, encoder));
             }
-            if next.is_some_and(|next| next <= now_ns()) {
+            if next_ns.is_some_and(|next_ns| next_ns <= now_ns()) {
                 break;
             }
         }
-        sessions.retain(|running| !running.deleted);
         // The one that is due first: a heavy session is late itself before it makes others late.
-        let earliest = sessions.iter_mut().filter(|r| r.running).min_by_key(|r| r.deadline_ns());
-        if let Some(running) = earliest
-            && running.deadline_ns() <= now_ns()
+        if let Some((due_ns, number)) = rota.first()
+            && due_ns <= now_ns()
         {
-            running.step(encoder);
+            rota.with(number, |running| running.step(encoder));
         }
     }
 }
@@ -191,17 +193,17 @@ fn wait(inbox: &Inbox, deadline_ns: Option<u64>, requests: &mut VecDeque<(u64, R
 impl Running {
     pub(super) fn new(live: Arc<Live>, running: bool) -> Self {
         let now = now_ns();
-        #[allow(clippy::cast_precision_loss)]
+        let schedule = Schedule::new(0, now, live.model.scene.stepping.rate_hz);
         Running {
             session: Session::new(&live.model),
             running,
             until: None,
-            anchor_ns: now as f64,
-            anchor_step: 0,
-            period_ns: 1e9 / live.model.scene.stepping.rate_hz,
+            schedule,
+            next_step: 0,
+            still_since: Some(0),
+            rested_steps: 0,
             overrun_count: 0,
-            window: (now, 0),
-            time_dilation: 1.0,
+            dilation: Dilation::new(now, 0),
             due: Vec::new(),
             hashed: None,
             taps: Taps::default(),
@@ -210,19 +212,47 @@ impl Running {
         }
     }
 
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
-    fn deadline_ns(&self) -> u64 {
-        (self.anchor_ns + self.session.step_count().saturating_sub(self.anchor_step) as f64 * self.period_ns) as u64
+    /// When its next step is due, if time goes on and one is wanted.
+    fn due_ns(&self) -> Option<u64> {
+        (self.running && self.next_step < u64::MAX).then(|| self.schedule.due_ns(self.next_step))
+    }
+
+    /// Decides which step comes next: the very next one, or at rest the next one that somebody waits for.
+    fn plan(&mut self) {
+        let step = self.session.step_count();
+        let wanted = || {
+            let wanted = self.taps.next_wanted(step, self.still_since, self.live.model.scene.stepping.rate_hz);
+            self.until.map_or(wanted, |until| wanted.min(until - 1))
+        };
+        let rests_until = self.session.rests_until().filter(|_| self.running);
+        let until = rests_until.map_or(step, |until| until.min(wanted()));
+        self.next_step = lock(&self.live.intake).rest(step, until, &self.schedule);
+    }
+
+    /// At rest, time has gone on without a step: brings the session to where it stands now.
+    fn catch_up(&mut self) {
+        // Something may have come since that must not be skipped.
+        self.plan();
+        if self.running {
+            self.skip_to(self.schedule.next_step(now_ns()).min(self.next_step));
+        }
+    }
+
+    fn skip_to(&mut self, step: u64) {
+        self.rested_steps += step.saturating_sub(self.session.step_count());
+        self.session.skip_to(step);
     }
 
     fn serve(&mut self, request: Request, encoder: &Encoder) {
+        self.catch_up();
         let step = self.session.step_count();
         // Also while time stands, when no step does it.
         self.taps.forget_the_gone();
         match request {
-            Request::Adopt(_) => {}
+            Request::Adopt(_) | Request::Wake => {}
             Request::Start { until, reply } => {
                 let started = self.start(until);
+                self.plan();
                 self.publish_status();
                 let _ = reply.send(started);
             }
@@ -230,14 +260,14 @@ impl Running {
                 self.stand();
                 let _ = reply.send(Ok(()));
             }
-            Request::Samples(tap) => {
-                let at_once = !self.running;
-                if at_once {
-                    tap.writer.push(self.paced_sample(&tap, false));
+            Request::Samples(mut tap) => {
+                tap.overrun_count = self.overrun_count;
+                if !self.running {
+                    self.tell(&mut tap, true);
                 }
                 if self.session.hold_reason().is_some() {
                     tap.writer.close(self.passed(0));
-                } else if !(at_once && tap.once) {
+                } else if self.running || !tap.once {
                     self.taps.samples.push(tap);
                 }
             }
@@ -247,7 +277,7 @@ impl Running {
                 // Who joins late gets a full frame first.
                 let frame_id = viewer.frame_id(step, self.live.model.scene.stepping.rate_hz);
                 self.post(encoder, vec![(viewer.clone(), frame_id)]);
-                self.taps.viewers.push(viewer);
+                self.taps.viewers.push(ViewTap { viewer, shown: step });
             }
             Request::Hash { at, reply } => {
                 let at = at.unwrap_or(step);
@@ -262,6 +292,7 @@ impl Running {
                 self.deleted = true;
             }
         }
+        self.plan();
         self.publish_status();
     }
 
@@ -274,13 +305,12 @@ impl Running {
         hash
     }
 
-    /// Time stands from now on. Who waits for the next sample gets the present one.
+    /// Time stands from now on. Who reads samples gets the present one.
     fn stand(&mut self) {
         self.running = false;
+        self.plan();
         self.publish_status();
-        for tap in self.taps.samples.extract_if(.., |tap| tap.once).collect::<Vec<_>>() {
-            tap.writer.push(self.paced_sample(&tap, false));
-        }
+        self.tell_all(true);
     }
 
     fn passed(&self, at: u64) -> Refusal {
@@ -291,7 +321,6 @@ impl Running {
         }
     }
 
-    #[allow(clippy::cast_precision_loss)]
     fn start(&mut self, until: Option<u64>) -> Result<u64> {
         let step = self.session.step_count();
         if let Some(until) = until.filter(|until| *until <= step) {
@@ -304,25 +333,35 @@ impl Running {
         if !self.running {
             let now = now_ns();
             self.running = true;
-            self.anchor_ns = now as f64 + self.period_ns;
-            self.anchor_step = step;
-            self.window = (now, step);
+            self.schedule = Schedule::new(step, now, self.live.model.scene.stepping.rate_hz);
+            self.schedule.delay(1.0);
+            self.dilation = Dilation::new(now, step);
         }
         Ok(step)
     }
 
-    /// One step, at its time or after it.
+    /// What it is behind beyond what it may catch up is dropped.
     #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    fn step(&mut self, encoder: &Encoder) {
-        let now = now_ns();
-        let behind = ((now - self.deadline_ns()) as f64 / self.period_ns).floor() - CATCH_UP_STEPS;
-        let overrun = behind > 0.0;
-        if overrun {
-            self.anchor_ns += behind * self.period_ns;
+    fn drop_backlog(&mut self) {
+        let late_ns = now_ns().saturating_sub(self.schedule.due_ns(self.next_step));
+        let behind = (late_ns as f64 / self.schedule.period_ns()).floor() - CATCH_UP_STEPS;
+        if behind > 0.0 {
+            self.schedule.delay(behind);
             self.overrun_count += behind as u64;
             tracing::debug!(session = %self.live.id, dropped = behind, "steps dropped");
         }
-        lock(&self.live.intake).take_due(self.session.step_count(), now, &mut self.due);
+    }
+
+    /// The next step, at its time or after it.
+    fn step(&mut self, encoder: &Encoder) {
+        if self.next_step > self.session.step_count() {
+            self.plan();
+            self.skip_to(self.next_step);
+        } else {
+            // Only of steps that cost something can a session be behind.
+            self.drop_backlog();
+        }
+        lock(&self.live.intake).take_due(self.session.step_count(), now_ns(), &mut self.due);
 
         let Running { session, taps, due, .. } = self;
         session.advance(due, |session| {
@@ -350,46 +389,47 @@ impl Running {
             self.taps.probes.drain(..).for_each(|tap| tap.writer.close(held.clone()));
         }
         if self.until.is_some_and(|until| self.session.step_count() >= until) {
-            self.stand();
+            self.running = false;
         }
-        let elapsed_ns = now - self.window.0.min(now);
-        if elapsed_ns >= DILATION_WINDOW_NS {
-            let steps = (self.session.step_count() - self.window.1.min(self.session.step_count())) as f64;
-            self.time_dilation = steps * self.period_ns / elapsed_ns as f64;
-            self.window = (now, self.session.step_count());
-        }
+        let step = self.session.step_count();
+        self.still_since = self.session.rests_until().map(|_| self.still_since.unwrap_or(step));
+        self.dilation.observe(now_ns(), step, self.schedule.period_ns());
         // The status first: who is told of this step may ask for it at once.
         self.publish_status();
-        self.publish(encoder, overrun);
+        self.publish(encoder);
+        self.plan();
     }
 
-    fn paced_sample(&self, tap: &SampleTap, overrun: bool) -> PacedSample {
-        PacedSample {
-            sample: self.session.sample(tap.only.as_deref()),
-            overrun_count: self.overrun_count,
-            time_dilation: self.time_dilation,
-            overrun,
-        }
+    /// Gives a stream the present sample, if it is to get it, or if no other follows for now.
+    fn tell(&self, tap: &mut SampleTap, last: bool) {
+        let Some(sample) = tap.sampler.pick(&self.session, last || tap.once) else { return };
+        let overrun = self.overrun_count > tap.overrun_count;
+        tap.overrun_count = self.overrun_count;
+        let Running { overrun_count, .. } = *self;
+        tap.writer.push(PacedSample { sample, overrun_count, time_dilation: self.dilation.value, overrun });
+    }
+
+    fn tell_all(&mut self, last: bool) {
+        let mut taps = std::mem::take(&mut self.taps.samples);
+        taps.iter_mut().for_each(|tap| self.tell(tap, last));
+        taps.retain(|tap| !tap.once);
+        self.taps.samples = taps;
     }
 
     /// Tells everybody who wants to know of this step.
-    fn publish(&mut self, encoder: &Encoder, overrun: bool) {
+    fn publish(&mut self, encoder: &Encoder) {
         let step = self.session.step_count();
-        let held = self.session.hold_reason().is_some();
-        for tap in &self.taps.samples {
-            if step.is_multiple_of(tap.every) || held || tap.once {
-                tap.writer.push(self.paced_sample(tap, overrun));
-            }
-        }
-        self.taps.samples.retain(|tap| !tap.once);
+        self.tell_all(!self.running);
         self.taps.forget_the_gone();
-        let rate_hz = self.live.model.scene.stepping.rate_hz;
-        let due_frame = |viewer: &Arc<Viewer>| {
-            let frame_id = viewer.frame_id(step, rate_hz);
-            let is_due = held || frame_id != viewer.frame_id(step.saturating_sub(1), rate_hz);
-            is_due.then(|| (viewer.clone(), frame_id))
+        let (still_since, rate_hz) = (self.still_since, self.live.model.scene.stepping.rate_hz);
+        let held = self.session.hold_reason().is_some();
+        let due_frame = |tap: &mut ViewTap| {
+            let last = held.then(|| tap.viewer.frame_id(step, rate_hz));
+            let frame_id = last.or_else(|| tap.due(step, still_since, rate_hz))?;
+            tap.shown = step;
+            Some((tap.viewer.clone(), frame_id))
         };
-        let viewers: Vec<_> = self.taps.viewers.iter().filter_map(due_frame).collect();
+        let viewers: Vec<_> = self.taps.viewers.iter_mut().filter_map(due_frame).collect();
         if !viewers.is_empty() {
             self.post(encoder, viewers);
         }
@@ -403,7 +443,7 @@ impl Running {
         self.session.tissue().displacements_m(&mut displacement_m);
         let snapshot =
             Snapshot { step: self.session.step_count(), simulation_time_s: self.session.time_s(), displacement_m };
-        let Running { overrun_count, time_dilation, .. } = *self;
+        let (overrun_count, time_dilation) = (self.overrun_count, self.dilation.value);
         encoder.post(self.live.number, Job { snapshot, viewers, overrun_count, time_dilation });
     }
 
@@ -415,9 +455,11 @@ impl Running {
             (None, false) => State::Paused,
         };
         status.step = self.session.step_count();
+        status.rested_steps = self.rested_steps;
         status.overrun_count = self.overrun_count;
         status.guard_events = self.session.tissue().guard_events();
-        status.time_dilation = self.time_dilation;
+        status.dilation = self.dilation;
+        status.schedule = self.schedule;
         status.late_commands = self.session.late_commands();
         if status.hold_reason.is_none() {
             status.hold_reason = self.session.hold_reason().map(str::to_owned);
@@ -431,7 +473,7 @@ impl Running {
         let taps = std::mem::take(&mut self.taps);
         taps.samples.iter().for_each(|tap| tap.writer.close(why.clone()));
         taps.probes.iter().for_each(|tap| tap.writer.close(why.clone()));
-        taps.viewers.iter().for_each(|viewer| viewer.close(why.clone()));
+        taps.viewers.iter().for_each(|tap| tap.viewer.close(why.clone()));
         for (_, reply) in taps.hashes {
             let _ = reply.send(Err(why.clone()));
         }

@@ -11,7 +11,7 @@ use tracing::{debug, info};
 
 use super::House;
 use crate::pace::clock::now_ns;
-use crate::pace::queue::{Reader, Writer, lock, queue};
+use crate::pace::queue::{Reader, Writer, queue};
 use crate::pace::{Live, PacedSample, StreamGuard, random_bits};
 use crate::refusal::{Reason, Refusal};
 use crate::session::command::LeaseId;
@@ -52,7 +52,7 @@ impl Drop for Hold {
     fn drop(&mut self) {
         if self.tools > 0 {
             // A lease that has lapsed already has nothing to give back.
-            let _ = lock(&self.live.intake).release(self.lease);
+            let _ = self.live.at_intake(|intake, _| intake.release(self.lease));
         }
     }
 }
@@ -66,16 +66,18 @@ impl Haptics {
     /// Answers the first message of a haptic stream.
     fn open(&self, open: &pb::TouchOpen) -> Result<(Opened, Hold), Refusal> {
         let live = self.0.pacer.get(&open.session_id)?;
-        let every = wire::every("sample_every_steps", open.sample_every_steps)?;
+        let only = (!open.tools.is_empty()).then(|| open.tools.clone());
+        let sampling = wire::sample::sampling(open.sample_every_steps, only, open.deadband.as_ref(), open.heartbeat_s)?;
         let guard = live.open_stream()?;
         let lease_s = open.lease_s.unwrap_or(self.0.config.lease_s);
         let lease = random_bits()?;
-        lock(&live.intake).acquire(&open.tools, &open.holder, lease_s, lease, now_ns())?;
+        let step = live.at_intake(|intake, now| {
+            intake.acquire(&open.tools, &open.holder, lease_s, lease, now).map(|()| intake.next_step())
+        })?;
         let hold = Hold { live: live.clone(), lease, tools: open.tools.len() };
-        let only = (!open.tools.is_empty()).then(|| open.tools.clone());
-        let samples = live.samples(every, only);
-        let rate_hz = live.model.scene.stepping.rate_hz;
-        let answer = pb::TouchOpened { step: lock(&live.intake).next_step(), rate_hz, lease_s };
+        let (rate_hz, heartbeat_s) = (live.model.scene.stepping.rate_hz, sampling.heartbeat_s);
+        let samples = live.samples(sampling);
+        let answer = pb::TouchOpened { step, rate_hz, lease_s, heartbeat_s };
         info!(session = %live.id, tools = ?open.tools, holder = ?open.holder, "haptic stream opened");
         Ok((Opened { answer, samples, guard }, hold))
     }
@@ -111,8 +113,10 @@ impl Haptics {
             match inbound.message().await {
                 Ok(Some(pb::TouchRequest { message: Some(Message::Command(command)) })) => {
                     let now = now_ns();
-                    let taken = wire::command::from_command(&command, &live.model.scene.sheet, now)
-                        .and_then(|command| lock(&live.intake).submit(hold.lease, vec![command], now));
+                    let taken =
+                        wire::command::from_command(&command, &live.model.scene.sheet, now).and_then(|command| {
+                            live.at_intake(|intake, now| intake.submit(hold.lease, vec![command], now))
+                        });
                     if let Err(refusal) = taken {
                         debug!(session = %live.id, reason = refusal.reason.as_str(), %refusal, "command refused");
                         events.push(Event::Rejected(wire::sample::rejection(command.tool, command.sequence, &refusal)));
@@ -121,7 +125,7 @@ impl Haptics {
                 Ok(Some(pb::TouchRequest { message: Some(Message::Renew(renew)) })) => {
                     let now = now_ns();
                     if hold.tools > 0
-                        && let Err(refusal) = lock(&live.intake).renew(hold.lease, now)
+                        && let Err(refusal) = live.at_intake(|intake, now| intake.renew(hold.lease, now))
                     {
                         events.push(Event::Rejected(wire::sample::rejection(0, 0, &refusal)));
                     }
@@ -225,7 +229,7 @@ impl HapticService for Haptics {
         let live = self.0.pacer.get(&request.session_id)?;
         let lease_s = request.lease_s.unwrap_or(self.0.config.lease_s);
         let lease = random_bits()?;
-        lock(&live.intake).acquire(&[request.tool], &request.holder, lease_s, lease, now_ns())?;
+        live.at_intake(|intake, now| intake.acquire(&[request.tool], &request.holder, lease_s, lease, now))?;
         info!(session = %live.id, tool = request.tool, holder = ?request.holder, "tool acquired");
         Ok(Response::new(pb::AcquireToolResponse { lease_id: format!("{lease:032x}"), lease_s }))
     }
@@ -236,7 +240,8 @@ impl HapticService for Haptics {
     ) -> Result<Response<pb::ReleaseToolResponse>, Status> {
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
-        lock(&live.intake).release(lease_id(&request.lease_id)?)?;
+        let lease = lease_id(&request.lease_id)?;
+        live.at_intake(|intake, _| intake.release(lease))?;
         Ok(Response::new(pb::ReleaseToolResponse {}))
     }
 
@@ -254,11 +259,10 @@ impl HapticService for Haptics {
             let command = wire::command::from_command(command, sheet, now);
             commands.push(command.map_err(|refusal| refusal.within(&format!("commands[{index}]")))?);
         }
-        let tools = {
-            let mut intake = lock(&live.intake);
+        let tools = live.at_intake(|intake, now| {
             intake.submit(lease, commands, now)?;
-            intake.tools_of(lease).collect()
-        };
+            Ok::<_, Refusal>(intake.tools_of(lease).collect())
+        })?;
         let sample = live.next_sample(tools).await?;
         let sample = Some(wire::sample::sample(&sample, 0, now_ns()));
         Ok(Response::new(pb::SendCommandsResponse { sample }))
@@ -270,9 +274,10 @@ impl HapticService for Haptics {
     ) -> Result<Response<Self::WatchSamplesStream>, Status> {
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
-        let every = wire::every("sample_every_steps", request.sample_every_steps)?;
+        let (every, deadband) = (request.sample_every_steps, request.deadband.as_ref());
+        let sampling = wire::sample::sampling(every, None, deadband, request.heartbeat_s)?;
         let guard = live.open_stream()?;
-        let samples = live.samples(every, None);
+        let samples = live.samples(sampling);
         let out = stream::unfold(Some((samples, guard)), |state| async move {
             let (mut samples, guard) = state?;
             Some(match samples.pop().await {

@@ -3,6 +3,7 @@
 
 use std::collections::BTreeMap;
 
+use super::schedule::Schedule;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, positive};
 use crate::scene::Scene;
@@ -68,6 +69,11 @@ pub struct Intake {
     queue: BTreeMap<Place, Due>,
     arrivals: u64,
     next_step: u64,
+    /// The session rests: its steps are done in thought, up to this one.
+    resting: Option<(Schedule, u64)>,
+    /// Something came that may have to act before that, and who steps the session was woken.
+    changed: bool,
+    woken: bool,
     lapsed: u64,
     closed: Option<Refusal>,
 }
@@ -82,6 +88,9 @@ impl Intake {
             queue: BTreeMap::new(),
             arrivals: 0,
             next_step: 0,
+            resting: None,
+            changed: false,
+            woken: false,
             lapsed: 0,
             closed: None,
         }
@@ -124,6 +133,7 @@ impl Intake {
             };
             self.leases.insert(*tool, lease);
         }
+        self.changed = true;
         Ok(())
     }
 
@@ -165,8 +175,13 @@ impl Intake {
         self.enqueue(command, true);
     }
 
-    /// Ends the leases whose time is over.
+    /// Time has gone on: ends the leases that have run out. At rest, steps have been done in thought, but none at whose
+    /// beginning something waits.
     pub fn lapse(&mut self, now_ns: u64) {
+        if let Some((schedule, until)) = &self.resting {
+            let until = self.queue.keys().next().map_or(*until, |place| place.0.min(*until));
+            self.next_step = self.next_step.max(schedule.next_step(now_ns).min(until));
+        }
         while let Some(tool) = self.leases.iter().find(|lease| lease.1.expires_ns <= now_ns).map(|lease| *lease.0) {
             self.lapsed += 1;
             self.end(tool);
@@ -247,11 +262,38 @@ impl Intake {
             }
         }
         self.queue.insert(place, Due { command, late, late_commands, ends_lease });
+        self.changed = true;
+    }
+
+    /// The session has done `step` steps, and would rest until step `until`: tells the step that it must do next, which is
+    /// earlier if something waits here. From now until that is taken ([`Intake::take_due`]) it rests, if that is not the
+    /// very next one.
+    pub fn rest(&mut self, step: u64, until: u64, schedule: &Schedule) -> u64 {
+        let waiting = self.queue.keys().next().map(|place| place.0);
+        let lapse = self.leases.values().map(|lease| lease.expires_ns).min().map(|ns| schedule.next_step(ns));
+        let next = [waiting, lapse].into_iter().flatten().fold(until, u64::min).max(step);
+        self.resting = (next > step).then_some((*schedule, next));
+        self.next_step = self.next_step.max(step);
+        (self.changed, self.woken) = (false, false);
+        next
+    }
+
+    /// The session rests.
+    pub fn is_resting(&self) -> bool {
+        self.resting.is_some()
+    }
+
+    /// Whether who steps a session at rest must be woken, to ask again for how long it rests. Told once.
+    pub fn take_wake(&mut self) -> bool {
+        let wake = self.changed && !self.woken && self.is_resting();
+        self.woken |= wake;
+        wake
     }
 
     /// Moves what is due at the beginning of step `step` into `due`, in the order in which it is to act.
     pub fn take_due(&mut self, step: u64, now_ns: u64, due: &mut Vec<Due>) {
         self.lapse(now_ns);
+        self.resting = None;
         while let Some(entry) = self.queue.first_entry().filter(|entry| entry.key().0 <= step) {
             let entry = entry.remove();
             if let Some(lease) = self.leases.get_mut(&entry.command.tool).filter(|_| !entry.ends_lease) {
@@ -295,4 +337,87 @@ impl Intake {
 
 fn not_holder(message: String) -> Refusal {
     Refusal::new(Reason::NotHolder, "lease_id", message)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::PAPER;
+
+    const LEASE: LeaseId = 7;
+    const MS: u64 = 1_000_000;
+
+    /// Tool 0 is held for a second from 0 on; step k is due at k ms.
+    fn intake() -> (Intake, Schedule) {
+        let limits = Limits::default();
+        let scene = Scene::parse("paper", PAPER, &[], &limits).unwrap();
+        let mut intake = Intake::new(&scene, &limits);
+        intake.acquire(&[0], "test", 1.0, LEASE, 0).unwrap();
+        (intake, Schedule::new(0, 0, 1000.0))
+    }
+
+    fn release(sequence: u64, at_step: Option<u64>) -> Command {
+        let (client_time_ns, time_to_live_s, arrival_ns) = (0, None, 0);
+        Command { tool: 0, sequence, client_time_ns, at_step, time_to_live_s, action: Action::Release, arrival_ns }
+    }
+
+    fn steps(intake: &Intake) -> Vec<u64> {
+        intake.queue.keys().map(|place| place.0).collect()
+    }
+
+    #[test]
+    fn a_command_at_rest_acts_at_the_next_step_by_the_clock_and_wakes_once() {
+        let (mut intake, schedule) = intake();
+        // At rest until the lease would lapse.
+        assert_eq!(intake.rest(5, u64::MAX, &schedule), 1001);
+        intake.submit(LEASE, vec![release(1, None)], 500 * MS).unwrap();
+        assert_eq!((steps(&intake), intake.take_wake(), intake.take_wake()), (vec![501], true, false));
+        // Time does not pass what waits: a second one comes after it, or with it.
+        intake.submit(LEASE, vec![release(2, None)], 520 * MS).unwrap();
+        assert_eq!(steps(&intake), [501, 501]);
+        assert!(!intake.take_wake());
+        assert_eq!(intake.rest(5, u64::MAX, &schedule), 501);
+        let mut due = Vec::new();
+        intake.take_due(501, 520 * MS, &mut due);
+        assert_eq!((due.len(), intake.next_step(), intake.is_resting()), (2, 502, false));
+        assert!(due.iter().all(|due| !due.late));
+    }
+
+    #[test]
+    fn stamps_mean_the_same_at_rest() {
+        let (mut intake, schedule) = intake();
+        intake.rest(0, u64::MAX, &schedule);
+        let commands = vec![release(1, Some(400)), release(2, Some(501)), release(3, Some(800))];
+        intake.submit(LEASE, commands, 500 * MS).unwrap();
+        // 400 is over at 500 ms, though no step was computed.
+        assert_eq!(steps(&intake), [501, 501, 800]);
+        assert_eq!(intake.queue.values().map(|due| due.late).collect::<Vec<_>>(), [true, false, false]);
+        assert_eq!(intake.rest(0, u64::MAX, &schedule), 501);
+        intake.take_due(501, 501 * MS, &mut Vec::new());
+        assert_eq!(intake.rest(502, u64::MAX, &schedule), 800);
+    }
+
+    #[test]
+    fn a_lease_lapses_at_rest_and_what_is_wanted_earlier_comes_first() {
+        let (mut intake, schedule) = intake();
+        assert_eq!(intake.rest(3, 50, &schedule), 50);
+        // The clock is late: time stands at the step that is to be done.
+        intake.lapse(90 * MS);
+        assert_eq!(intake.next_step(), 50);
+        assert_eq!(intake.rest(51, u64::MAX, &schedule), 1001);
+        intake.lapse(1000 * MS);
+        assert_eq!((intake.lapsed(), steps(&intake), intake.take_wake()), (1, vec![1001], true));
+        // Whose very next step is wanted does not rest.
+        assert_eq!(intake.rest(1001, u64::MAX, &schedule), 1001);
+        assert!(!intake.is_resting());
+    }
+
+    #[test]
+    fn renewing_wakes_nobody() {
+        let (mut intake, schedule) = intake();
+        intake.rest(0, u64::MAX, &schedule);
+        intake.renew(LEASE, 900 * MS).unwrap();
+        assert!(!intake.take_wake());
+        assert_eq!(intake.rest(1001, u64::MAX, &schedule), 1901);
+    }
 }

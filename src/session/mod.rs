@@ -4,6 +4,8 @@
 pub mod check;
 pub mod command;
 pub mod run;
+pub mod sampling;
+pub mod schedule;
 
 use std::sync::Arc;
 
@@ -120,6 +122,18 @@ impl Session {
     /// Commands that came too late for their step, in all.
     pub fn late_commands(&self) -> u64 {
         self.late_commands
+    }
+
+    /// The step at whose beginning something happens by itself, if not before: nothing if the tissue moves.
+    pub fn rests_until(&self) -> Option<u64> {
+        let expiry = self.tools.iter().filter_map(|tool| tool.expires_at).min();
+        self.tissue.is_still().then(|| expiry.unwrap_or(u64::MAX))
+    }
+
+    /// Goes on to the moment when `step` steps are done, which must not be later than [`Session::rests_until`]: the same
+    /// as to advance so often with nothing due.
+    pub fn skip_to(&mut self, step: u64) {
+        self.tissue.skip_steps(step.saturating_sub(self.step_count()));
     }
 
     /// One step: `due` acts at its beginning, by the number of the tool. `observe` is called at its end unless the guard

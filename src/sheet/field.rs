@@ -36,8 +36,8 @@ impl Layout {
             stride += BLOCK;
         }
         // A vector at the last point may reach two points and a row beyond.
-        let page = 4096 / size_of::<T>();
-        let plane = ((rows.max(4) + 1) * stride + BLOCK).next_multiple_of(page) + SKEW / size_of::<T>();
+        let (page, skew) = (4096 / size_of::<T>(), SKEW / size_of::<T>());
+        let plane = ((rows.max(4) + 1) * stride + BLOCK).saturating_sub(skew).next_multiple_of(page) + skew;
         Layout { rows, columns, stride, plane }
     }
 

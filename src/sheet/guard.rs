@@ -160,26 +160,36 @@ impl<T: Real> Sheet<T> {
         Ok(())
     }
 
+    /// What the sheet is now is what it goes back to.
     fn take_checkpoint(&mut self) {
-        self.checkpoint.steps = self.steps;
-        self.checkpoint.halvings = self.halvings;
-        self.tiles.copy_touched(self.checkpoint.state.fields_mut().zip(self.state.fields()));
-        self.checkpoint.applied.clone_from(&self.applied);
-        self.checkpoint.prescribed.clone_from(&self.prescribed);
-        self.checkpoint.work = self.work;
+        let Sheet { bench, state, applied, prescribed, tiles, .. } = self;
+        let checkpoint = self.checkpoint.get_or_insert_with(|| {
+            tiles.touch_all();
+            let state = State::at_rest(&bench.layout, state.kept.len());
+            let (applied, prescribed) = (applied.clone(), prescribed.clone());
+            Box::new(Checkpoint { steps: 0, halvings: 0, state, applied, prescribed, work: Work::default() })
+        });
+        checkpoint.steps = self.steps;
+        checkpoint.halvings = self.halvings;
+        tiles.copy_touched(checkpoint.state.fields_mut().zip(self.state.fields()));
+        checkpoint.applied.clone_from(&self.applied);
+        checkpoint.prescribed.clone_from(&self.prescribed);
+        checkpoint.work = self.work;
         self.inputs.clear();
     }
 
     /// Back to the checkpoint, with the substep of `halvings`.
     fn go_back(&mut self, halvings: u32) {
+        // A sheet that has none has nothing to go back from.
+        let Some(checkpoint) = &self.checkpoint else { return };
         let layout = self.bench.layout;
-        self.steps = self.checkpoint.steps;
+        self.steps = checkpoint.steps;
         self.tiles.wake_all();
-        self.state.copy_from(&self.checkpoint.state);
-        self.applied.clone_from(&self.checkpoint.applied);
-        self.prescribed.clone_from(&self.checkpoint.prescribed);
-        self.work = self.checkpoint.work;
-        let was = self.model.plan.divided(&self.model.scene, 1 << self.checkpoint.halvings);
+        self.state.copy_from(&checkpoint.state);
+        self.applied.clone_from(&checkpoint.applied);
+        self.prescribed.clone_from(&checkpoint.prescribed);
+        self.work = checkpoint.work;
+        let was = self.model.plan.divided(&self.model.scene, 1 << checkpoint.halvings);
         let plan = self.model.plan.divided(&self.model.scene, 1 << halvings);
         let springs = springs_of(&self.model, &was);
         convert(&layout, &springs, &was, &plan, &self.applied, &mut self.state);
@@ -192,8 +202,7 @@ impl<T: Real> Sheet<T> {
     }
 
     pub(super) fn input(&mut self, tool: usize, input: Input) {
-        // What has slept for long is not to be repeated.
-        if self.is_still() {
+        if self.checkpoint.is_none() {
             self.take_checkpoint();
         }
         self.inputs.push((self.steps, tool, input.clone()));

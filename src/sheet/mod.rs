@@ -132,8 +132,12 @@ pub trait Tissue: Send {
     fn guard_events(&self) -> u64;
     /// Substeps done, those that the guard repeated as well.
     fn substeps_done(&self) -> u64;
-    /// Points that the coming step computes; the others are at rest.
+    /// Points that a step computes now; the others are at rest.
     fn awake_points(&self) -> usize;
+    /// Whether a step changes nothing but the time, until a tool is told something.
+    fn is_still(&self) -> bool;
+    /// So many steps at once, of a sheet that is still: the same as to step so often.
+    fn skip_steps(&mut self, steps: u64);
     /// Of all points in all substeps, the part that was computed.
     fn computed_fraction(&self) -> f64;
     /// One step. After a blow-up the state is that of the last checkpoint, which is finite.
@@ -170,7 +174,8 @@ struct Sheet<T: Real> {
     prescribed: Prescribed,
     steps: u64,
     work: Work,
-    checkpoint: Checkpoint<T>,
+    /// None: the state as it is. A sheet at rest needs no second one.
+    checkpoint: Option<Box<Checkpoint<T>>>,
     /// What the tools were told since the checkpoint: before which step, which tool.
     inputs: Vec<(u64, usize, Input)>,
     tiles: Tiles<T>,
@@ -184,26 +189,16 @@ impl<T: Real> Sheet<T> {
     fn new(model: &Arc<Model>) -> Self {
         let layout = Layout::new::<T>(model.points);
         let plan = model.plan.clone();
-        let at_rest = || State::at_rest(&layout, plan.scheme.kept(model.precision == Precision::Compensated));
-        let applied = Applied::new();
-        let prescribed = Prescribed::new();
         Sheet {
             model: model.clone(),
             halvings: 0,
             bench: Bench::new(model.lanes, layout, springs_of(model, &plan), &model.fixed),
-            state: at_rest(),
+            state: State::at_rest(&layout, plan.scheme.kept(model.precision == Precision::Compensated)),
             steps: 0,
             work: Work::default(),
-            checkpoint: Checkpoint {
-                steps: 0,
-                halvings: 0,
-                state: at_rest(),
-                applied: applied.clone(),
-                prescribed: prescribed.clone(),
-                work: Work::default(),
-            },
-            applied,
-            prescribed,
+            checkpoint: None,
+            applied: Applied::new(),
+            prescribed: Prescribed::new(),
             inputs: Vec::new(),
             tiles: Tiles::new(layout, rest::tolerance(model), if model.scene.springs.flexion { 2 } else { 1 }),
             guard_events: 0,
@@ -213,18 +208,12 @@ impl<T: Real> Sheet<T> {
         }
     }
 
-    /// Whether a step changes nothing but the time.
-    fn is_still(&self) -> bool {
-        self.tiles.awake.is_empty() && self.applied.is_settled() && self.prescribed.is_empty()
-    }
-
     fn do_step(&mut self) {
+        if self.is_still() {
+            return self.skip_steps(1);
+        }
         let substeps = self.plan.substeps;
         self.substeps_done += u64::from(substeps);
-        if self.is_still() {
-            self.steps += 1;
-            return;
-        }
         self.wake_what_is_pushed();
         let fraction = |substep: u32| f64::from(substep) / f64::from(substeps);
         for substep in 0..substeps {
@@ -494,8 +483,23 @@ impl<T: Real> Tissue for Sheet<T> {
         self.push(tool, None);
     }
 
+    fn is_still(&self) -> bool {
+        self.tiles.awake.is_empty() && self.applied.is_settled() && self.prescribed.is_empty()
+    }
+
+    fn skip_steps(&mut self, steps: u64) {
+        self.steps += steps;
+        self.substeps_done += steps * u64::from(self.plan.substeps);
+        // Nothing can go wrong from here on until a tool is told something.
+        self.checkpoint = None;
+        self.inputs.clear();
+    }
+
     fn step(&mut self) -> Result<(), BlowUp> {
         self.do_step();
+        if self.checkpoint.is_none() && self.is_still() {
+            return Ok(());
+        }
         match self.check() {
             Ok(()) => Ok(()),
             Err(cause) => self.mend(self.steps, cause),

@@ -398,6 +398,11 @@ impl<T: Real> Tiles<T> {
         self.set(&awake);
     }
 
+    /// The next copy is of everything.
+    pub(super) fn touch_all(&mut self) {
+        self.touched.fill(true);
+    }
+
     /// Copies what was awake since the last call from `from` to `to`.
     pub(super) fn copy_touched<'a>(&mut self, fields: impl Iterator<Item = (&'a mut Field<T>, &'a Field<T>)>) {
         let all = self.touched.iter().all(|touched| *touched);

@@ -2,14 +2,36 @@
 
 use std::sync::Arc;
 
-use super::{from_point, from_vector, pb, point, vector};
+use super::{every, from_point, from_vector, pb, point, vector};
 use crate::pace::frames::Delivery;
 use crate::pace::{Live, PacedRecord, PacedSample, State};
-use crate::refusal::Refusal;
+use crate::refusal::{Refusal, Result};
 use crate::scene::Named;
 use crate::scene::record::{EnergyJ, Point, Record};
 use crate::session::ToolSample;
+use crate::session::sampling::{Deadband, HEARTBEAT_S, Sampling};
 use crate::surface::Encoding;
+
+/// Which samples a stream asks for.
+pub fn sampling(
+    every_steps: Option<u32>,
+    only: Option<Vec<u32>>,
+    deadband: Option<&pb::Deadband>,
+    heartbeat_s: Option<f64>,
+) -> Result<Sampling> {
+    let sampling = Sampling {
+        every: every("sample_every_steps", every_steps)?,
+        only,
+        deadband: deadband.map(|deadband| Deadband {
+            force_n: deadband.force_n,
+            force_fraction: deadband.force_fraction,
+            displacement_m: deadband.displacement_m,
+        }),
+        heartbeat_s: heartbeat_s.unwrap_or(HEARTBEAT_S),
+    };
+    sampling.check()?;
+    Ok(sampling)
+}
 
 /// A sample that leaves at `now_ns`.
 pub fn sample(paced: &PacedSample, dropped: u64, now_ns: u64) -> pb::Sample {
@@ -136,7 +158,10 @@ pub fn add_to_record(record: &mut Record, message: &pb::ProbeResponse) -> bool {
 /// A session as it stands.
 pub fn session(live: &Arc<Live>) -> pb::Session {
     let status = live.status();
-    let intake = live.intake_now();
+    let (held_tools, lapsed_leases) = live.at_intake(|intake, _| {
+        let held = intake.holders().map(|(tool, holder)| pb::HeldTool { tool, holder: holder.to_owned() });
+        (held.collect(), intake.lapsed())
+    });
     let model = &live.model;
     #[allow(clippy::cast_precision_loss)]
     let simulation_time_s = status.step as f64 / model.scene.stepping.rate_hz;
@@ -155,15 +180,17 @@ pub fn session(live: &Arc<Live>) -> pb::Session {
         substeps: model.plan.substeps,
         precision: model.precision.name().to_owned(),
         overrun_count: status.overrun_count,
-        time_dilation: status.time_dilation,
+        time_dilation: status.dilation.value,
         late_commands: status.late_commands,
         hold_reason: status.hold_reason.unwrap_or_default(),
-        held_tools: intake.holders().map(|(tool, holder)| pb::HeldTool { tool, holder: holder.to_owned() }).collect(),
-        lapsed_leases: intake.lapsed(),
+        held_tools,
+        lapsed_leases,
         warnings: model.warnings.clone(),
         idle_timeout_s: live.idle_timeout_s,
         guard_events: status.guard_events,
         expected_error: model.expected_error,
+        resting: status.resting,
+        rested_steps: status.rested_steps,
     }
 }
 

@@ -1,0 +1,98 @@
+//! Who wants to know of a session's steps, and of which.
+
+use std::sync::Arc;
+
+use tokio::sync::oneshot;
+
+use super::frames::Viewer;
+use super::queue::Writer;
+use super::{PacedRecord, PacedSample};
+use crate::refusal::Result;
+use crate::session::sampling::Sampler;
+
+/// Who waits for the step and the hash of a state.
+pub(super) type HashReply = oneshot::Sender<Result<(u64, u128)>>;
+
+/// A stream of samples.
+pub(super) struct SampleTap {
+    pub(super) sampler: Sampler,
+    pub(super) once: bool,
+    pub(super) writer: Writer<PacedSample>,
+    /// Dropped steps that it knows of.
+    pub(super) overrun_count: u64,
+}
+
+/// A stream of records.
+pub(super) struct ProbeTap {
+    pub(super) every: u64,
+    /// All, if none are named.
+    pub(super) points: Option<Vec<[usize; 2]>>,
+    pub(super) energy: bool,
+    pub(super) writer: Writer<PacedRecord>,
+}
+
+/// A stream of frames.
+pub(super) struct ViewTap {
+    pub(super) viewer: Arc<Viewer>,
+    /// Steps done at the newest frame that was posted for it.
+    pub(super) shown: u64,
+}
+
+impl ViewTap {
+    /// The frame that belongs to step `step`, if one is due there. `still_since`: nothing has moved since that step.
+    pub(super) fn due(&self, step: u64, still_since: Option<u64>, rate_hz: f64) -> Option<u64> {
+        let number = |step| self.viewer.frame_id(step, rate_hz);
+        let is_due = step >= self.earliest(still_since, rate_hz) && number(step) != number(step.saturating_sub(1));
+        is_due.then(|| number(step))
+    }
+
+    /// A still tissue is shown once, at the next frame's time, and then every second: a viewer may have missed it.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn earliest(&self, still_since: Option<u64>, rate_hz: f64) -> u64 {
+        match still_since {
+            Some(since) if self.shown >= since => self.shown + rate_hz.ceil() as u64,
+            _ => self.shown + 1,
+        }
+    }
+
+    /// The next step after `step` that a frame is due at, if nothing moves from now on.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+    fn next_due(&self, step: u64, still_since: Option<u64>, rate_hz: f64) -> u64 {
+        let from = self.earliest(still_since, rate_hz).max(step + 1);
+        let number = self.viewer.frame_id(from - 1, rate_hz) + 1;
+        // Rounding may be off by a step; `frame_id` decides.
+        let near = (number as f64 * rate_hz / self.viewer.rate_hz) as u64;
+        let exact = (near.saturating_sub(2)..near + 2).find(|step| self.viewer.frame_id(*step, rate_hz) >= number);
+        exact.unwrap_or(from).max(from)
+    }
+}
+
+/// Everybody.
+#[derive(Default)]
+pub(super) struct Taps {
+    pub(super) samples: Vec<SampleTap>,
+    pub(super) probes: Vec<ProbeTap>,
+    pub(super) viewers: Vec<ViewTap>,
+    pub(super) hashes: Vec<(u64, HashReply)>,
+}
+
+impl Taps {
+    pub(super) fn forget_the_gone(&mut self) {
+        self.samples.retain(|tap| !tap.writer.is_abandoned());
+        self.probes.retain(|tap| !tap.writer.is_abandoned());
+        self.viewers.retain(|tap| !tap.viewer.is_gone());
+        self.hashes.retain(|waiting| !waiting.1.is_closed());
+    }
+
+    /// Of a session at rest that has done `step` steps: the step to do next, that somebody may be told of its end;
+    /// `u64::MAX` if nobody waits for any.
+    pub(super) fn next_wanted(&self, step: u64, still_since: Option<u64>, rate_hz: f64) -> u64 {
+        // The first record is of the beginning of step 0.
+        let record = |tap: &ProbeTap| if step == 0 { 1 } else { (step + 1).next_multiple_of(tap.every) };
+        let samples = self.samples.iter().map(|tap| tap.sampler.next_due(step));
+        let probes = self.probes.iter().map(record);
+        let views = self.viewers.iter().map(|tap| tap.next_due(step, still_since, rate_hz));
+        let hashes = self.hashes.iter().map(|waiting| waiting.0);
+        samples.chain(probes).chain(views).chain(hashes).min().map_or(u64::MAX, |end| end.saturating_sub(1))
+    }
+}

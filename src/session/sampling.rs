@@ -1,0 +1,250 @@
+//! Which samples a stream gets: every Nth, those of a change beyond a deadband, and heartbeats where nothing changes.
+
+use super::{Sample, Session, ToolSample};
+use crate::refusal::{Reason, Refusal, Result, number};
+
+/// Between two samples of what does not change, s, unless asked otherwise: 20 a second, so that a client can tell
+/// stillness from silence within the 50 ms after which it should no longer trust what it knows.
+pub const HEARTBEAT_S: f64 = 0.05;
+
+/// The longest that can be asked for, s: clients take longer silence for an end.
+pub const MOST_HEARTBEAT_S: f64 = 10.0;
+
+/// How much of a change is not worth a sample. A quantity without a bound is not looked at.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Deadband {
+    /// Of the force on the tool, N.
+    pub force_n: Option<f64>,
+    /// The same as a part of the force; of both the larger counts.
+    pub force_fraction: Option<f64>,
+    /// Of the control point's displacement, m.
+    pub displacement_m: Option<f64>,
+}
+
+impl Deadband {
+    /// Whether it can be used. 0 is any change.
+    pub fn check(&self) -> Result<()> {
+        let Deadband { force_n, force_fraction, displacement_m } = *self;
+        if force_n.or(force_fraction).or(displacement_m).is_none() {
+            let message = "has no bound: give force_n, force_fraction, displacement_m, or no deadband";
+            return Err(Refusal::new(Reason::Missing, "deadband", message));
+        }
+        for (field, value, most) in [
+            ("deadband.force_n", force_n, f64::INFINITY),
+            ("deadband.force_fraction", force_fraction, 1.0),
+            ("deadband.displacement_m", displacement_m, f64::INFINITY),
+        ] {
+            if let Some(value) = value {
+                let range = if most.is_finite() { "from 0 to 1" } else { "at least 0" };
+                number(field, value, range, |v| (0.0..=most).contains(&v))?;
+            }
+        }
+        Ok(())
+    }
+
+    fn is_left(&self, told: &ToolSample, now: &ToolSample) -> bool {
+        if (told.tool, told.late, told.expired) != (now.tool, now.late, now.expired) {
+            return true;
+        }
+        let (told, now) = match (&told.contact, &now.contact) {
+            (Some(told), Some(now)) if told.point == now.point => (told, now),
+            (None, None) => return false,
+            _ => return true,
+        };
+        let force = (self.force_n.is_some() || self.force_fraction.is_some()).then(|| {
+            let fraction = self.force_fraction.unwrap_or(0.0);
+            self.force_n.unwrap_or(0.0).max(fraction * now.force_on_tool_n.length())
+        });
+        force.is_some_and(|bound_n| (now.force_on_tool_n - told.force_on_tool_n).length() > bound_n)
+            || self.displacement_m.is_some_and(|m| (now.displacement_m - told.displacement_m).length() > m)
+    }
+}
+
+/// What a stream asked for.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sampling {
+    /// Samples of steps that are multiples of this.
+    pub every: u64,
+    /// These tools; all in use if none are named.
+    pub only: Option<Vec<u32>>,
+    /// Only what is beyond it, and heartbeats; each, if none.
+    pub deadband: Option<Deadband>,
+    /// Between two samples of what does not change, s.
+    pub heartbeat_s: f64,
+}
+
+impl Sampling {
+    /// Whether it can be used.
+    pub fn check(&self) -> Result<()> {
+        if let Some(deadband) = &self.deadband {
+            deadband.check()?;
+        }
+        let range = format!("above 0 and at most {MOST_HEARTBEAT_S}");
+        number("heartbeat_s", self.heartbeat_s, &range, |v| v > 0.0 && v <= MOST_HEARTBEAT_S).map(|_| ())
+    }
+}
+
+/// Picks the samples of one stream.
+#[derive(Debug)]
+pub struct Sampler {
+    sampling: Sampling,
+    heartbeat_steps: u64,
+    told: Option<Sample>,
+}
+
+impl Sampler {
+    /// For a session that steps at `rate_hz`.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    pub fn new(sampling: Sampling, rate_hz: f64) -> Self {
+        let heartbeat_steps = (sampling.heartbeat_s * rate_hz).round().max(1.0) as u64;
+        Sampler { sampling, heartbeat_steps, told: None }
+    }
+
+    /// The sample of the step that was just done, if the stream is to get it. `last`: it gets it anyhow, because for
+    /// now no other follows.
+    pub fn pick(&mut self, session: &Session, last: bool) -> Option<Sample> {
+        let (step, told) = (session.step_count(), self.told.as_ref());
+        let is_told = told.is_some_and(|told| told.step == step && told.held == session.hold_reason().is_some());
+        if is_told || !(last || step.is_multiple_of(self.sampling.every)) {
+            return None;
+        }
+        let sample = session.sample(self.sampling.only.as_deref());
+        let is_due = |told: &Sample| {
+            last || step.saturating_sub(told.step) >= self.heartbeat_steps || self.is_news(told, &sample)
+        };
+        if !told.is_none_or(is_due) {
+            return None;
+        }
+        self.told = Some(sample.clone());
+        Some(sample)
+    }
+
+    fn is_news(&self, told: &Sample, now: &Sample) -> bool {
+        let asleep = now.awake_points == 0;
+        if asleep != (told.awake_points == 0) {
+            return true;
+        }
+        match &self.sampling.deadband {
+            // What sleeps is still, but a command may have acted that changes nothing else.
+            None => !asleep || told.tools != now.tools,
+            Some(deadband) => {
+                let mut pairs = told.tools.iter().zip(&now.tools);
+                told.tools.len() != now.tools.len() || pairs.any(|(told, now)| deadband.is_left(told, now))
+            }
+        }
+    }
+
+    /// The next step after `step` whose sample the stream gets also if nothing changes from now on.
+    pub fn next_due(&self, step: u64) -> u64 {
+        let told = self.told.as_ref().filter(|told| told.awake_points == 0);
+        let heartbeat = told.map_or(0, |told| told.step + self.heartbeat_steps);
+        heartbeat.max(step + 1).next_multiple_of(self.sampling.every)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::limits::Limits;
+    use crate::scene::script::Action;
+    use crate::scene::{PAPER, Scene};
+    use crate::session::command::{Command, Due};
+    use crate::sheet::Model;
+    use glam::DVec3;
+
+    fn session() -> Session {
+        let limits = Limits::default();
+        let scene = Scene::parse("paper", PAPER, &[], &limits).unwrap();
+        Session::new(&Model::compile(&scene, &limits).unwrap())
+    }
+
+    fn sampler(every: u64, deadband: Option<Deadband>) -> Sampler {
+        Sampler::new(Sampling { every, only: None, deadband, heartbeat_s: 0.02 }, 1000.0)
+    }
+
+    fn grasp(session: &mut Session, sequence: u64, z_m: f64) {
+        let action = Action::Grasp { point: [15, 15], displacement_m: DVec3::new(0.0, 0.0, z_m) };
+        let (at_step, time_to_live_s) = (None, None);
+        let command = Command { tool: 0, sequence, client_time_ns: 0, at_step, time_to_live_s, action, arrival_ns: 1 };
+        session.advance(&mut vec![Due { command, late: false, late_commands: 0, ends_lease: false }], |_| {});
+    }
+
+    /// Steps at which a stream gets a sample while nothing is told to the session.
+    fn picked(session: &mut Session, sampler: &mut Sampler, steps: u64) -> Vec<u64> {
+        let pick = |_| {
+            session.advance(&mut Vec::new(), |_| {});
+            sampler.pick(session, false).map(|sample| sample.step)
+        };
+        (0..steps).filter_map(pick).collect()
+    }
+
+    #[test]
+    fn what_is_still_is_told_by_heartbeats_at_multiples_of_n() {
+        assert_eq!(picked(&mut session(), &mut sampler(1, None), 50), [1, 21, 41]);
+        assert_eq!(picked(&mut session(), &mut sampler(15, None), 100), [15, 45, 75]);
+        // And it is foretold, so that the steps between can be skipped.
+        let (mut session, mut sampler) = (session(), sampler(15, None));
+        for due in [15, 45, 75] {
+            assert_eq!(sampler.next_due(session.step_count()), due);
+            session.skip_to(due);
+            assert_eq!(sampler.pick(&session, false).map(|sample| sample.step), Some(due));
+        }
+    }
+
+    #[test]
+    fn what_moves_is_told_every_nth_step_without_a_deadband() {
+        let mut session = session();
+        grasp(&mut session, 1, -0.01);
+        assert_eq!(picked(&mut session, &mut sampler(7, None), 30), [7, 14, 21, 28]);
+    }
+
+    #[test]
+    fn a_deadband_passes_what_leaves_it_and_heartbeats() {
+        let mut session = session();
+        let deadband = Deadband { displacement_m: Some(0.0025), ..Deadband::default() };
+        let mut sampler = sampler(1, Some(deadband));
+        let mut steps = Vec::new();
+        for step in 1..=60 {
+            // A millimetre a step up to 10 mm, then held.
+            grasp(&mut session, step, -0.001 * step.min(10) as f64);
+            steps.extend(sampler.pick(&session, false).map(|sample| sample.step));
+        }
+        assert_eq!(steps, [1, 4, 7, 10, 30, 50]);
+    }
+
+    #[test]
+    fn of_two_bounds_of_the_force_the_larger_counts() {
+        let contact = |z_n: f64| crate::session::Contact {
+            point: [0, 0],
+            displacement_m: DVec3::ZERO,
+            velocity_m_per_s: DVec3::ZERO,
+            force_on_tool_n: DVec3::new(0.0, 0.0, z_n),
+            applied_force_n: DVec3::ZERO,
+        };
+        let tool = |z_n: f64| ToolSample {
+            tool: 0,
+            acknowledged_sequence: 1,
+            client_time_ns: 0,
+            arrival_ns: 0,
+            contact: Some(contact(z_n)),
+            late: false,
+            expired: false,
+        };
+        let deadband = Deadband { force_n: Some(0.1), force_fraction: Some(0.1), displacement_m: None };
+        for (told_n, now_n, left) in [(0.0, 0.09, false), (0.0, 0.11, true), (10.0, 10.9, false), (10.0, 11.2, true)] {
+            assert_eq!(deadband.is_left(&tool(told_n), &tool(now_n)), left, "{told_n} N to {now_n} N");
+        }
+        // An acknowledgement alone is not news; an end is.
+        let later = ToolSample { acknowledged_sequence: 2, ..tool(0.0) };
+        assert!(!deadband.is_left(&tool(0.0), &later));
+        assert!(deadband.is_left(&tool(0.0), &ToolSample { expired: true, ..tool(0.0) }));
+    }
+
+    #[test]
+    fn the_last_sample_before_time_stops_is_told_once() {
+        let (mut session, mut sampler) = (session(), sampler(5, None));
+        assert_eq!(picked(&mut session, &mut sampler, 7), [5]);
+        assert_eq!(sampler.pick(&session, true).map(|sample| sample.step), Some(7));
+        assert_eq!(sampler.pick(&session, true), None);
+    }
+}
