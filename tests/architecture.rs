@@ -85,6 +85,17 @@ fn only_pace_reads_the_clock_and_only_the_server_opens_sockets() {
 }
 
 #[test]
+fn unsafe_code_is_where_vectors_are() {
+    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
+    for path in rust_files(&source) {
+        let inside = path.strip_prefix(&source).unwrap().to_str().unwrap();
+        let vectors = ["sheet/lanes.rs", "sheet/sweep.rs", "sheet/survey.rs", "sheet/applied.rs", "surface/wide.rs"];
+        let text = std::fs::read_to_string(&path).unwrap();
+        assert!(!text.contains("allow(unsafe_code)") || vectors.contains(&inside), "{inside} has unsafe code");
+    }
+}
+
+#[test]
 fn files_fit_in_the_head() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     for folder in ["src", "clients/src"] {

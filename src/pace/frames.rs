@@ -223,8 +223,7 @@ mod tests {
     use crate::limits::Limits;
 
     fn job(viewers: Vec<(Arc<Viewer>, u64)>) -> Job {
-        let displacement_m = std::array::from_fn(|_| vec![0.5; 9]);
-        let snapshot = Snapshot { step: 1, simulation_time_s: 0.001, displacement_m };
+        let snapshot = Snapshot::new(1, 0.001, std::array::from_fn(|_| vec![0.5; 9]));
         Job { snapshot, viewers, overrun_count: 0, time_dilation: 1.0 }
     }
 

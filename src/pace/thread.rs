@@ -441,8 +441,7 @@ impl Running {
     fn post(&self, encoder: &Encoder, viewers: Vec<(Arc<Viewer>, u64)>) {
         let mut displacement_m = std::array::from_fn(|_| Vec::new());
         self.session.tissue().displacements_m(&mut displacement_m);
-        let snapshot =
-            Snapshot { step: self.session.step_count(), simulation_time_s: self.session.time_s(), displacement_m };
+        let snapshot = Snapshot::new(self.session.step_count(), self.session.time_s(), displacement_m);
         let (overrun_count, time_dilation) = (self.overrun_count, self.dilation.value);
         encoder.post(self.live.number, Job { snapshot, viewers, overrun_count, time_dilation });
     }

@@ -3,7 +3,8 @@
 use bytes::{Bytes, BytesMut};
 use glam::DVec3;
 
-use super::refine::{Order, Rows};
+use super::refine::{COMPONENTS, Rows, Source, Written};
+use super::wide::{LANES, Lanes, Width, Work};
 use super::{Refinement, Snapshot};
 
 /// How displacements are written.
@@ -86,51 +87,63 @@ pub fn encode(snapshot: &Snapshot, refinement: Refinement, encoding: Encoding) -
 
 /// Makes the next frame of the kind of `spent`, in its buffers where nobody else holds them: fresh memory costs more
 /// than what is written into it.
-#[allow(clippy::cast_possible_truncation)]
 pub fn encode_over(snapshot: &Snapshot, spent: Frame) -> Frame {
+    encode_at(Width::widest(), snapshot, spent)
+}
+
+#[allow(clippy::cast_possible_truncation)]
+fn encode_at(width: Width, snapshot: &Snapshot, spent: Frame) -> Frame {
     let mut frame = Frame { step: snapshot.step, simulation_time_s: snapshot.simulation_time_s, ..spent };
-    let (grid, values) = (frame.refinement, &snapshot.displacement_m);
+    if frame.encoding == Encoding::I16 {
+        (frame.origin_m, frame.scale_m) = quantisation(&snapshot.box_m);
+    }
+    let per_scale = |scale_m: f64| Some(scale_m.recip() as f32).filter(|per_scale| per_scale.is_finite());
+    let source = Source::new(
+        snapshot.displacement_m.each_ref().map(Vec::as_slice),
+        frame.origin_m.to_array().map(|v| v as f32),
+        frame.scale_m.to_array().map(|v| per_scale(v).unwrap_or(0.0)),
+    );
+    let (rows, patches) = (Rows::new(frame.refinement, source), &mut frame.patches);
     match frame.encoding {
-        Encoding::F32 => {
-            fill(&mut frame.patches, Rows::new(grid, values, Order::XThenY, |_, v| v), f32::to_le_bytes);
-        }
-        Encoding::I16 => {
-            (frame.origin_m, frame.scale_m) = quantisation(values);
-            let origin = frame.origin_m.to_array().map(|v| v as f32);
-            let per_scale = frame.scale_m.to_array().map(|v| if v > 0.0 { v.recip() as f32 } else { 0.0 });
-            // Points become quanta before they are refined: there are fewer of them than vertices.
-            let quanta = |c: usize, v: f32| ((v - origin[c]) * per_scale[c]).clamp(-32767.0, 32767.0);
-            fill(&mut frame.patches, Rows::new(grid, values, Order::YThenX, quanta), |v| quantum(v).to_le_bytes());
-        }
+        Encoding::F32 => width.run(Fill::<4> { patches, rows }),
+        Encoding::I16 => width.run(Fill::<2> { patches, rows }),
     }
     frame
 }
 
 /// Writes all rows into the patches, `BYTES` a component.
-fn fill<const BYTES: usize>(
-    patches: &mut [Patch],
-    mut rows: Rows<'_, impl Fn(usize, f32) -> f32>,
-    put: impl Fn(f32) -> [u8; BYTES] + Copy,
-) {
-    let mut parted = Vec::new();
-    for band in patches.chunk_by_mut(|a, b| a.first[0] == b.first[0]) {
-        let ([x, _], rows_of_band) = (band[0].first, band[0].count[0]);
-        if let [patch] = band {
-            let row_bytes = 3 * BYTES * patch.count[1];
-            let mut bytes = patch.buffer(rows_of_band * row_bytes);
-            for (a, row) in bytes.chunks_exact_mut(row_bytes).enumerate() {
-                rows.write(x + a, row.as_chunks_mut().0, put);
-            }
-            patch.bytes = bytes.freeze();
-        } else {
-            // One row, in parts.
-            parted.resize(3 * band.iter().map(|patch| patch.count[1]).sum::<usize>(), [0; BYTES]);
-            rows.write(x, &mut parted, put);
-            for patch in band {
-                let part = parted[3 * patch.first[1]..][..3 * patch.count[1]].as_flattened();
-                let mut bytes = patch.buffer(part.len());
-                bytes.copy_from_slice(part);
+struct Fill<'f, 'v, const BYTES: usize> {
+    patches: &'f mut [Patch],
+    rows: Rows<'v>,
+}
+
+impl<const BYTES: usize> Work for Fill<'_, '_, BYTES>
+where
+    [u8; BYTES]: Written,
+{
+    #[inline(always)]
+    fn work<L: Lanes>(self) {
+        let Fill { patches, mut rows } = self;
+        let mut parted = Vec::new();
+        for band in patches.chunk_by_mut(|a, b| a.first[0] == b.first[0]) {
+            let ([x, _], rows_of_band) = (band[0].first, band[0].count[0]);
+            if let [patch] = band {
+                let row_bytes = COMPONENTS * BYTES * patch.count[1];
+                let mut bytes = patch.buffer(rows_of_band * row_bytes);
+                for (a, row) in bytes.chunks_exact_mut(row_bytes).enumerate() {
+                    rows.write::<L, _>(x + a, row.as_chunks_mut::<BYTES>().0);
+                }
                 patch.bytes = bytes.freeze();
+            } else {
+                // One row, in parts.
+                parted.resize(COMPONENTS * band.iter().map(|patch| patch.count[1]).sum::<usize>(), [0; BYTES]);
+                rows.write::<L, _>(x, &mut parted);
+                for patch in band {
+                    let part = parted[COMPONENTS * patch.first[1]..][..COMPONENTS * patch.count[1]].as_flattened();
+                    let mut bytes = patch.buffer(part.len());
+                    bytes.copy_from_slice(part);
+                    patch.bytes = bytes.freeze();
+                }
             }
         }
     }
@@ -145,39 +158,55 @@ impl Patch {
     }
 }
 
-/// Nearest integer, within ±32767 as `v` is, by the trick of the magic number: 1.5·2²³ + v has no bits left for the
-/// fraction, and its last 16 are those of the integer.
-#[allow(clippy::cast_possible_truncation)]
-fn quantum(v: f32) -> i16 {
-    const MAGIC: f32 = 12_582_912.0;
-    (v + MAGIC).to_bits() as i16
-}
-
-/// Middle and quantum of the box around all displacements. Interpolated ones are within it too.
-fn quantisation(displacement_m: &[Vec<f32>; 3]) -> (DVec3, DVec3) {
-    let span = |values: &Vec<f32>| {
-        let low = -greatest(values, |v| -v);
-        let high = greatest(values, |v| v);
+/// Middle and quantum of a box. Values interpolated between those in it are within it too.
+fn quantisation(box_m: &[[f32; 2]; COMPONENTS]) -> (DVec3, DVec3) {
+    let spans = box_m.map(|[low, high]| {
         // A value of f32, which is what encodes; the box then reaches as far as its farther side.
         let middle = 0.5 * low + 0.5 * high;
         (f64::from(middle), f64::from((high - middle).max(middle - low)) / f64::from(i16::MAX))
-    };
-    let spans = displacement_m.each_ref().map(span);
+    });
     (DVec3::from_array(spans.map(|span| span.0)), DVec3::from_array(spans.map(|span| span.1)))
 }
 
-/// The greatest of `of(value)`, in as many lanes as hide the time of a comparison.
-fn greatest(values: &[f32], of: impl Fn(f32) -> f32) -> f32 {
-    let (chunks, rest) = values.as_chunks::<16>();
-    let lanes = chunks.iter().fold([f32::NEG_INFINITY; 16], |mut lanes, chunk| {
-        for (lane, value) in lanes.iter_mut().zip(chunk) {
-            if of(*value) > *lane {
-                *lane = of(*value);
+/// The least and the greatest of some values.
+pub(super) fn range(values: &[f32]) -> [f32; 2] {
+    let mut range = [f32::INFINITY, f32::NEG_INFINITY];
+    Width::widest().run(Range { values, range: &mut range });
+    range
+}
+
+struct Range<'v> {
+    values: &'v [f32],
+    range: &'v mut [f32; 2],
+}
+
+impl Work for Range<'_> {
+    #[inline(always)]
+    fn work<L: Lanes>(self) {
+        // As many as hide the time of a comparison.
+        const AT_ONCE: usize = 4;
+        let mut low = [L::splat(f32::INFINITY); AT_ONCE];
+        let mut high = [L::splat(f32::NEG_INFINITY); AT_ONCE];
+        let (chunks, rest) = self.values.as_chunks::<{ AT_ONCE * LANES }>();
+        for chunk in chunks {
+            let (blocks, _) = chunk.as_chunks();
+            for k in 0..AT_ONCE {
+                let values = L::load(&blocks[k]);
+                low[k] = values.smaller(low[k]);
+                high[k] = values.larger(high[k]);
             }
         }
-        lanes
-    });
-    rest.iter().map(|value| of(*value)).chain(lanes).fold(f32::NEG_INFINITY, f32::max)
+        let mut lanes = [[0.0; LANES]; 2 * AT_ONCE];
+        for k in 0..AT_ONCE {
+            low[k].store(&mut lanes[k]);
+            high[k].store(&mut lanes[AT_ONCE + k]);
+        }
+        let (low, high) = lanes.as_flattened().split_at(AT_ONCE * LANES);
+        *self.range = [
+            low.iter().chain(rest).copied().fold(f32::INFINITY, f32::min),
+            high.iter().chain(rest).copied().fold(f32::NEG_INFINITY, f32::max),
+        ];
+    }
 }
 
 #[cfg(test)]
@@ -187,8 +216,7 @@ mod tests {
 
     fn snapshot() -> Snapshot {
         let wave = |k: usize, c: usize| ((k * (c + 3)) as f32 * 0.37).sin() * 10_f32.powi(-(c as i32));
-        let displacement_m = std::array::from_fn(|c| (0..31 * 17).map(|k| wave(k, c)).collect());
-        Snapshot { step: 7, simulation_time_s: 0.007, displacement_m }
+        Snapshot::new(7, 0.007, std::array::from_fn(|c| (0..31 * 17).map(|k| wave(k, c)).collect()))
     }
 
     /// Every vertex of a frame, decoded as a client does.
@@ -241,13 +269,45 @@ mod tests {
             for (index, bytes) in bytes.enumerate() {
                 let [a, b] = [index / grid.vertices()[1], index % grid.vertices()[1]];
                 for (c, values) in snapshot.displacement_m.iter().enumerate() {
-                    let at = |j: usize| {
-                        let (near, far) = (values[a / cells * 17 + j], values[a.div_ceil(cells) * 17 + j]);
-                        near + (a % cells) as f32 / cells as f32 * (far - near)
+                    let at = |i: usize| {
+                        let (left, right) = (values[i * 17 + b / cells], values[i * 17 + b.div_ceil(cells)]);
+                        left + (b % cells) as f32 / cells as f32 * (right - left)
                     };
-                    let (left, right) = (at(b / cells), at(b.div_ceil(cells)));
-                    let value = left + (right - left) / cells as f32 * (b % cells) as f32;
+                    let (near, far) = (at(a / cells), at(a.div_ceil(cells)));
+                    let value = near + (a % cells) as f32 / cells as f32 * (far - near);
                     assert_eq!(bytes[4 * c..4 * c + 4], value.to_le_bytes(), "n = {n}, ({a}, {b})");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_box_reaches_as_far_as_the_values() {
+        for count in [1, 15, 16, 63, 64, 65, 1000] {
+            let values: Vec<f32> = (0..count).map(|k| (k as f32 * 1.7).sin() + 0.1).collect();
+            let least = values.iter().copied().fold(f32::INFINITY, f32::min);
+            let greatest = values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+            for width in Width::ALL.into_iter().filter(|width| width.is_available()) {
+                let mut range = [f32::INFINITY, f32::NEG_INFINITY];
+                width.run(Range { values: &values, range: &mut range });
+                assert_eq!(range, [least, greatest], "{width:?}, {count}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_frame_has_the_same_bits_at_every_width() {
+        for encoding in [Encoding::F32, Encoding::I16] {
+            for n in 0..=10 {
+                let grid = Refinement::new([31, 17], n, &Limits::default()).unwrap();
+                let at = |width| encode_at(width, &snapshot(), Frame::blank(grid, encoding));
+                let plain = at(Width::Plain);
+                for width in Width::ALL.into_iter().filter(|width| width.is_available()) {
+                    let frame = at(width);
+                    assert_eq!((frame.origin_m, frame.scale_m), (plain.origin_m, plain.scale_m));
+                    for (patch, plain) in frame.patches.iter().zip(&plain.patches) {
+                        assert!(patch.bytes == plain.bytes, "{width:?}, n = {n}, {encoding:?}");
+                    }
                 }
             }
         }
@@ -260,8 +320,8 @@ mod tests {
             let first = encode(&snapshot(), grid, encoding);
             let (held, place) = (first.patches[0].bytes.clone(), first.patches[1].bytes.as_ptr());
             let before = held.to_vec();
-            let mut moved = snapshot();
-            moved.displacement_m.iter_mut().flatten().for_each(|v| *v = 1.0 - 2.0 * *v);
+            let moved = snapshot().displacement_m.map(|values| values.into_iter().map(|v| 1.0 - 2.0 * v).collect());
+            let moved = Snapshot::new(8, 0.008, moved);
             let second = encode_over(&moved, first);
             assert_eq!((second.patches[1].bytes.as_ptr(), held), (place, before.into()));
             assert_eq!(decode(&second), decode(&encode(&moved, grid, encoding)));
@@ -285,7 +345,7 @@ mod tests {
     #[test]
     fn a_long_row_is_split_too() {
         let displacement_m = std::array::from_fn(|c| (0..40_000).map(|k| (k + c) as f32).collect());
-        let snapshot = Snapshot { step: 0, simulation_time_s: 0.0, displacement_m };
+        let snapshot = Snapshot::new(0, 0.0, displacement_m);
         let grid = Refinement::new([2, 20_000], 0, &Limits::default()).unwrap();
         let frame = encode(&snapshot, grid, Encoding::F32);
         assert!(frame.patches.iter().all(|patch| patch.bytes.len() <= PATCH_BYTES));
@@ -302,11 +362,7 @@ mod tests {
 
     #[test]
     fn a_still_tissue_is_encoded_exactly() {
-        let still = Snapshot {
-            step: 0,
-            simulation_time_s: 0.0,
-            displacement_m: std::array::from_fn(|c| vec![c as f32 * 0.25; 9]),
-        };
+        let still = Snapshot::new(0, 0.0, std::array::from_fn(|c| vec![c as f32 * 0.25; 9]));
         let grid = Refinement::new([3, 3], 1, &Limits::default()).unwrap();
         for vertex in decode(&encode(&still, grid, Encoding::I16)) {
             assert_eq!(vertex, [0.0, 0.25, 0.5]);

@@ -2,6 +2,7 @@
 
 pub mod encode;
 pub mod refine;
+mod wide;
 
 pub use encode::{Encoding, Frame, encode, encode_over};
 pub use refine::{LARGEST_REFINEMENT, Refinement};
@@ -14,5 +15,15 @@ pub struct Snapshot {
     /// s.
     pub simulation_time_s: f64,
     /// m, x, y and z apart, point [i, j] at i·ny + j.
-    pub displacement_m: [Vec<f32>; 3],
+    displacement_m: [Vec<f32>; 3],
+    /// The least and the greatest of each component, m.
+    box_m: [[f32; 2]; 3],
+}
+
+impl Snapshot {
+    /// Looks through the displacements once for the box around them, for all encodings.
+    pub fn new(step: u64, simulation_time_s: f64, displacement_m: [Vec<f32>; 3]) -> Self {
+        let box_m = displacement_m.each_ref().map(|values| encode::range(values));
+        Snapshot { step, simulation_time_s, displacement_m, box_m }
+    }
 }

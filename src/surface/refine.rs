@@ -1,6 +1,7 @@
 //! Refinement (the paper's bilinear interpolation): n vertices between neighbouring points, so that a side of m
 //! points has M = (m − 1)·n + m vertices.
 
+use super::wide::{LANES, Lanes};
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result};
 
@@ -45,151 +46,274 @@ impl Refinement {
 }
 
 /// Components of a point or vertex: in a row, x, y and z of one lie together, as they do in a patch.
-const COMPONENTS: usize = 3;
+pub(super) const COMPONENTS: usize = 3;
 
-/// Components of `count` points in a row, and one more: four lanes can then be read at every point, which is one
-/// load where three would be three.
-fn row_of_points(count: usize) -> Vec<f32> {
-    vec![0.0; COMPONENTS * count + 1]
+/// A component as it is written.
+pub(super) trait Written: Copy + Default {
+    /// Writes displacements in quanta.
+    fn write<L: Lanes>(values: L, to: &mut [Self; LANES]);
+    /// Writes x, y and z of points in quanta, point by point.
+    fn weave<L: Lanes>(xyz: [L; COMPONENTS], to: &mut [[Self; LANES]; COMPONENTS]);
 }
 
-/// The rows of vertices of one frame, from the first to the last, each component made into a `T`.
+/// To be refined further.
+impl Written for f32 {
+    #[inline(always)]
+    fn write<L: Lanes>(values: L, to: &mut [Self; LANES]) {
+        values.store(to);
+    }
+    #[inline(always)]
+    fn weave<L: Lanes>(xyz: [L; COMPONENTS], to: &mut [[Self; LANES]; COMPONENTS]) {
+        L::weave(xyz, to);
+    }
+}
+
+/// An IEEE float, little-endian.
+impl Written for [u8; 4] {
+    #[inline(always)]
+    fn write<L: Lanes>(values: L, to: &mut [Self; LANES]) {
+        let mut floats = [0.0; LANES];
+        values.store(&mut floats);
+        for lane in 0..LANES {
+            to[lane] = floats[lane].to_le_bytes();
+        }
+    }
+    #[inline(always)]
+    fn weave<L: Lanes>(xyz: [L; COMPONENTS], to: &mut [[Self; LANES]; COMPONENTS]) {
+        let mut floats = [[0.0; LANES]; COMPONENTS];
+        L::weave(xyz, &mut floats);
+        for c in 0..COMPONENTS {
+            for lane in 0..LANES {
+                to[c][lane] = floats[c][lane].to_le_bytes();
+            }
+        }
+    }
+}
+
+/// A signed integer, little-endian; the values are within ±32767.
+impl Written for [u8; 2] {
+    #[inline(always)]
+    fn write<L: Lanes>(values: L, to: &mut [Self; LANES]) {
+        values.store_rounded(to);
+    }
+    #[inline(always)]
+    fn weave<L: Lanes>(xyz: [L; COMPONENTS], to: &mut [[Self; LANES]; COMPONENTS]) {
+        L::weave_rounded(xyz, to);
+    }
+}
+
+/// What is refined: displacements of points, and how they become quanta, (v − origin)·per_scale.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Source<'v> {
+    /// x, y and z apart, points along y beside each other.
+    pub(super) values: [&'v [f32]; COMPONENTS],
+    /// In each lane the same: what the compiler knows to be so, it shuffles.
+    origin: [[f32; LANES]; COMPONENTS],
+    per_scale: [[f32; LANES]; COMPONENTS],
+}
+
+impl<'v> Source<'v> {
+    pub(super) fn new(values: [&'v [f32]; 3], origin: [f32; 3], per_scale: [f32; 3]) -> Self {
+        Source { values, origin: origin.map(|v| [v; LANES]), per_scale: per_scale.map(|v| [v; LANES]) }
+    }
+}
+
+/// The rows of vertices of one frame, from the first to the last.
 ///
-/// Interpolation along y costs shuffles, interpolation along x does not. `Order::XThenY` interpolates every row of
-/// vertices along y; `Order::YThenX` only every row of points, and is faster. They differ by rounding errors, and f32
-/// frames promise the bits of the first.
-pub(super) struct Rows<'v, P> {
+/// Points become quanta before they are refined: there are fewer of them than vertices. Interpolation along y costs
+/// permutations, interpolation along x does not; so rows of points are refined along y, and rows of vertices are mixed
+/// from them.
+pub(super) struct Rows<'v> {
     grid: Refinement,
-    values: &'v [Vec<f32>; COMPONENTS],
-    prepare: P,
-    order: Order,
-    /// The rows of points on either side of the row of vertices; with `YThenX` they are refined.
-    near: Vec<f32>,
-    far: Vec<f32>,
-    /// A row of points before it is refined.
+    source: Source<'v>,
+    /// The rows of points on either side of the row of vertices, refined along y, in whole periods of `spread`.
+    near: Vec<Block<f32>>,
+    far: Vec<Block<f32>>,
+    /// A row of points before it is refined, and what reads beyond it need.
     points: Vec<f32>,
+    spread: Vec<Spread>,
 }
 
-/// Which interpolation comes first.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Order {
-    XThenY,
-    YThenX,
+/// Lies in one cache line: a load across two costs twice as much.
+#[derive(Clone, Copy)]
+#[repr(align(64))]
+struct Block<T>([T; LANES]);
+
+/// A block of vertices in a row. After as many as one point has components of vertices, they repeat 16 points on.
+struct Spread {
+    /// Where the block of points begins of which they are made.
+    begin: usize,
+    /// The components on either side, in that block.
+    left: Block<i32>,
+    right: Block<i32>,
+    /// How much of the way each vertex is from the left to the right.
+    part: Block<f32>,
 }
 
-impl<'v, P: Fn(usize, f32) -> f32> Rows<'v, P> {
-    /// Rows of `values`, one per point and component; `prepare` is given each component's number and value.
-    pub(super) fn new(grid: Refinement, values: &'v [Vec<f32>; COMPONENTS], order: Order, prepare: P) -> Self {
-        // Where there is nothing to refine along y, both orders are the same, and this one does less.
-        let order = if grid.between == 0 { Order::YThenX } else { order };
-        let side = if order == Order::XThenY { grid.points[1] } else { grid.vertices()[1] };
-        let [near, far, points] = [side, side, grid.points[1]].map(row_of_points);
-        Rows { grid, values, prepare, order, near, far, points }
+impl<'v> Rows<'v> {
+    pub(super) fn new(grid: Refinement, source: Source<'v>) -> Self {
+        let cells = grid.between + 1;
+        let periods = if cells == 1 { 0 } else { grid.points[1].div_ceil(LANES) };
+        let [near, far] = [(); 2].map(|()| vec![Block([0.0; LANES]); periods * COMPONENTS * cells]);
+        let points = vec![0.0; (periods + 1) * COMPONENTS * LANES];
+        let spread = (0..COMPONENTS * cells).map(|block| Spread::new(cells, block)).collect();
+        Rows { grid, source, near, far, points, spread }
     }
 
     /// Writes row `a`, three components a vertex. Rows are asked for one after the other, from 0.
+    #[inline(always)]
     #[allow(clippy::cast_precision_loss)]
-    pub(super) fn write<T: Copy>(&mut self, a: usize, row: &mut [T], put: impl Fn(f32) -> T + Copy) {
+    pub(super) fn write<L: Lanes, W: Written>(&mut self, a: usize, row: &mut [W]) {
         let cells = self.grid.between + 1;
+        if cells == 1 {
+            return weave::<L, W>(&self.source, a * self.grid.points[1], row);
+        }
         let (i, k) = (a / cells, a % cells);
         match k {
-            0 if a > 0 && cells > 1 => std::mem::swap(&mut self.near, &mut self.far),
             0 => {
-                self.load(i);
+                if a == 0 {
+                    self.load::<L>(0);
+                }
+                // A row of points has no row beyond it to be mixed with, and at the rim there is none.
                 std::mem::swap(&mut self.near, &mut self.far);
+                put::<L, W>(&self.near, row);
             }
-            1 => self.load(i + 1),
-            _ => {}
-        }
-        // A row of points has no row beyond it to be mixed with, and at the rim there is none.
-        let far = if k == 0 { &self.near } else { &self.far };
-        let part = k as f32 / cells as f32;
-        match self.order {
-            Order::XThenY => {
-                mix(&self.near, far, part, &mut self.points, |v| v);
-                spread(cells, &self.points, row, put);
+            _ => {
+                if k == 1 {
+                    self.load::<L>(i + 1);
+                }
+                mix::<L, W>(&self.near, &self.far, k as f32 / cells as f32, row);
             }
-            Order::YThenX => mix(&self.near, far, part, row, put),
         }
     }
 
     /// Brings row `i` of the points into `far`.
-    fn load(&mut self, i: usize) {
+    #[inline(always)]
+    fn load<L: Lanes>(&mut self, i: usize) {
         let columns = self.grid.points[1];
-        let refines = self.order == Order::YThenX && self.grid.between > 0;
-        let points = if refines { &mut self.points } else { &mut self.far };
-        let [x, y, z] = self.values.each_ref().map(|values| &values[i * columns..][..columns]);
-        for (((point, x), y), z) in points.as_chunks_mut::<COMPONENTS>().0.iter_mut().zip(x).zip(y).zip(z) {
-            *point = [(self.prepare)(0, *x), (self.prepare)(1, *y), (self.prepare)(2, *z)];
-        }
-        if refines {
-            spread(self.grid.between + 1, &self.points, &mut self.far, |v| v);
+        weave::<L, f32>(&self.source, i * columns, &mut self.points[..COMPONENTS * columns]);
+        for (period, row) in self.far.chunks_exact_mut(self.spread.len()).enumerate() {
+            let points = &self.points[period * COMPONENTS * LANES..];
+            for (spread, vertices) in self.spread.iter().zip(row) {
+                let points = L::load(&points[spread.begin..].as_chunks().0[0]);
+                let (left, right) = (points.permute(&spread.left.0), points.permute(&spread.right.0));
+                between(left, right, L::load(&spread.part.0)).store(&mut vertices.0);
+            }
         }
     }
 }
 
-/// Interpolates between two rows: `part` of the way from `near` to `far`.
-fn mix<T>(near: &[f32], far: &[f32], part: f32, row: &mut [T], put: impl Fn(f32) -> T) {
-    for ((value, near), far) in row.iter_mut().zip(near).zip(far) {
-        *value = put(near + part * (far - near));
+impl Spread {
+    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, clippy::cast_precision_loss)]
+    fn new(cells: usize, block: usize) -> Self {
+        let begin = block * LANES / COMPONENTS / cells * COMPONENTS;
+        let (mut left, mut part) = ([0; LANES], [0.0; LANES]);
+        for lane in 0..LANES {
+            let (vertex, c) = ((block * LANES + lane) / COMPONENTS, (block * LANES + lane) % COMPONENTS);
+            left[lane] = (vertex / cells * COMPONENTS + c - begin) as i32;
+            part[lane] = (vertex % cells) as f32 / cells as f32;
+        }
+        let right = left.map(|left| left + COMPONENTS as i32);
+        Spread { begin, left: Block(left), right: Block(right), part: Block(part) }
     }
 }
 
-/// Interpolates within a row: `cells` vertices for each of the `points` but the last, which ends the row.
-fn spread<T: Copy, P: Fn(f32) -> T>(cells: usize, points: &[f32], row: &mut [T], put: P) {
-    // The loop over the vertices of a cell is unrolled only where their number is known: up to twice as fast.
-    let spread_by = [
-        spread_by::<1, T, P> as fn(&[f32], &mut [T], P),
-        spread_by::<2, T, P>,
-        spread_by::<3, T, P>,
-        spread_by::<4, T, P>,
-        spread_by::<5, T, P>,
-        spread_by::<6, T, P>,
-        spread_by::<7, T, P>,
-        spread_by::<8, T, P>,
-        spread_by::<9, T, P>,
-        spread_by::<10, T, P>,
-        spread_by::<11, T, P>,
-    ];
-    spread_by[cells - 1](points, row, put);
+/// The points from `first` on in quanta, one after the other, as many as `row` has room for.
+#[inline(always)]
+fn weave<L: Lanes, W: Written>(source: &Source<'_>, first: usize, row: &mut [W]) {
+    let row = row.as_chunks_mut::<COMPONENTS>().0;
+    let count = row.len();
+    let [x, y, z] = &source.values;
+    let values = [&x[first..][..count], &y[first..][..count], &z[first..][..count]];
+    if count < LANES {
+        let mut padded = [[0.0; LANES]; COMPONENTS];
+        for c in 0..COMPONENTS {
+            padded[c][..count].copy_from_slice(values[c]);
+        }
+        let mut block = [[W::default(); COMPONENTS]; LANES];
+        source.weave::<L, W>([&padded[0], &padded[1], &padded[2]], &mut block);
+        return row.copy_from_slice(&block[..count]);
+    }
+    let blocks = row.as_chunks_mut::<LANES>().0;
+    let x = &values[0].as_chunks::<LANES>().0[..blocks.len()];
+    let y = &values[1].as_chunks::<LANES>().0[..blocks.len()];
+    let z = &values[2].as_chunks::<LANES>().0[..blocks.len()];
+    for block in 0..blocks.len() {
+        source.weave::<L, W>([&x[block], &y[block], &z[block]], &mut blocks[block]);
+    }
+    // The last block overlaps the one before.
+    let last = (values[0].last_chunk(), values[1].last_chunk(), values[2].last_chunk(), row.last_chunk_mut());
+    if let (Some(x), Some(y), Some(z), Some(block)) = last {
+        source.weave::<L, W>([x, y, z], block);
+    }
 }
 
-#[allow(clippy::cast_precision_loss)]
-fn spread_by<const CELLS: usize, T: Copy, P: Fn(f32) -> T>(points: &[f32], row: &mut [T], put: P) {
-    let cells = points.len() / COMPONENTS - 1;
-    for j in 0..cells {
-        let pair = &points[COMPONENTS * j..][..COMPONENTS + 4];
-        let slope: [f32; 4] = std::array::from_fn(|c| (pair[COMPONENTS + c] - pair[c]) / CELLS as f32);
-        // The fourth lane of a vertex is rubbish, and overwritten by the next vertex.
-        let cell = &mut row[COMPONENTS * CELLS * j..][..COMPONENTS * CELLS + 1];
-        for k in 0..CELLS {
-            let vertex: [T; 4] = std::array::from_fn(|c| put(pair[c] + slope[c] * k as f32));
-            cell[COMPONENTS * k..][..4].copy_from_slice(&vertex);
+impl Source<'_> {
+    /// x, y and z of a block, in quanta.
+    #[inline(always)]
+    fn weave<L: Lanes, W: Written>(&self, xyz: [&[f32; LANES]; COMPONENTS], to: &mut [[W; COMPONENTS]; LANES]) {
+        let mut quanta = [L::splat(0.0); COMPONENTS];
+        for c in 0..COMPONENTS {
+            quanta[c] = L::load(xyz[c]).sub(L::load(&self.origin[c])).mul(L::load(&self.per_scale[c]));
+        }
+        if let Some(to) = to.as_flattened_mut().as_chunks_mut().0.first_chunk_mut() {
+            W::weave(quanta, to);
         }
     }
-    for c in 0..COMPONENTS {
-        row[COMPONENTS * CELLS * cells + c] = put(points[COMPONENTS * cells + c]);
+}
+
+/// `part` of the way from `near` to `far`.
+#[inline(always)]
+fn between<L: Lanes>(near: L, far: L, part: L) -> L {
+    near.add(part.mul(far.sub(near)))
+}
+
+/// Writes a row as it is.
+#[inline(always)]
+fn put<L: Lanes, W: Written>(values: &[Block<f32>], row: &mut [W]) {
+    let (blocks, rest) = row.as_chunks_mut();
+    for (block, values) in blocks.iter_mut().zip(values) {
+        W::write(L::load(&values.0), block);
+    }
+    if !rest.is_empty() {
+        let mut block = [W::default(); LANES];
+        W::write(L::load(&values[blocks.len()].0), &mut block);
+        rest.copy_from_slice(&block[..rest.len()]);
+    }
+}
+
+/// Writes a row that is `part` of the way from `near` to `far`.
+#[inline(always)]
+fn mix<L: Lanes, W: Written>(near: &[Block<f32>], far: &[Block<f32>], part: f32, row: &mut [W]) {
+    let part = L::splat(part);
+    let (blocks, rest) = row.as_chunks_mut();
+    for ((block, near), far) in blocks.iter_mut().zip(near).zip(far) {
+        W::write(between(L::load(&near.0), L::load(&far.0), part), block);
+    }
+    if !rest.is_empty() {
+        let (near, far) = (L::load(&near[blocks.len()].0), L::load(&far[blocks.len()].0));
+        let mut block = [W::default(); LANES];
+        W::write(between(near, far, part), &mut block);
+        rest.copy_from_slice(&block[..rest.len()]);
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use super::super::wide::Plain;
     use super::*;
 
-    impl Refinement {
-        /// Row `a` of one component, in either order.
-        fn row(self, values: &[f32], a: usize, row: &mut [f32]) {
-            let values = [values.to_vec(), vec![0.0; values.len()], vec![0.0; values.len()]];
-            for order in [Order::YThenX, Order::XThenY] {
-                let mut rows = Rows::new(self, &values, order, |_, v| v);
-                let mut vertices = vec![0.0; COMPONENTS * row.len()];
-                (0..=a).for_each(|a| rows.write(a, &mut vertices, |v| v));
-                for (vertex, value) in vertices.chunks(COMPONENTS).zip(&mut *row) {
-                    assert!(order == Order::YThenX || (vertex[0] - *value).abs() < 1e-5);
-                    *value = vertex[0];
-                }
-            }
-        }
+    /// All rows of one component.
+    fn refine(grid: Refinement, values: &[f32]) -> Vec<Vec<f32>> {
+        let source = Source::new([values; COMPONENTS], [0.0; COMPONENTS], [1.0; COMPONENTS]);
+        let mut rows = Rows::new(grid, source);
+        let [x, y] = grid.vertices();
+        let row = |a| {
+            let mut row = vec![[0; 4]; COMPONENTS * y];
+            rows.write::<Plain, _>(a, &mut row);
+            row.chunks(COMPONENTS).map(|vertex| f32::from_le_bytes(vertex[1])).collect()
+        };
+        (0..x).map(row).collect()
     }
 
     #[test]
@@ -202,10 +326,7 @@ mod tests {
             // A bilinear function is its own bilinear interpolation.
             let law = |x: f32, y: f32| 1.0 + 2.0 * x - 3.0 * y + 0.5 * x * y;
             let values: Vec<f32> = (0..nx * ny).map(|k| law((k / ny) as f32, (k % ny) as f32)).collect();
-            let [rows, columns] = grid.vertices();
-            for a in 0..rows {
-                let mut row = vec![f32::NAN; columns];
-                grid.row(&values, a, &mut row);
+            for (a, row) in refine(grid, &values).into_iter().enumerate() {
                 for (b, value) in row.into_iter().enumerate() {
                     let cells = (between + 1) as f32;
                     let expected = law(a as f32 / cells, b as f32 / cells);
