@@ -387,7 +387,7 @@ impl Running {
         let due_frame = |viewer: &Arc<Viewer>| {
             let frame_id = viewer.frame_id(step, rate_hz);
             let is_due = held || frame_id != viewer.frame_id(step.saturating_sub(1), rate_hz);
-            is_due.then(|| (viewer.clone(), frame_id))
+            (is_due && viewer.has_credit()).then(|| (viewer.clone(), frame_id))
         };
         let viewers: Vec<_> = self.taps.viewers.iter().filter_map(due_frame).collect();
         if !viewers.is_empty() {
@@ -401,9 +401,11 @@ impl Running {
     fn post(&self, encoder: &Encoder, viewers: Vec<(Arc<Viewer>, u64)>) {
         let mut displacement_m = std::array::from_fn(|_| Vec::new());
         self.session.tissue().displacements_m(&mut displacement_m);
-        let snapshot = Snapshot::new(self.session.step_count(), self.session.time_s(), displacement_m);
+        let points = self.live.model.points;
+        let snapshot = Snapshot::new(self.session.step_count(), self.session.time_s(), points, displacement_m);
+        let (snapshot, spacing_m) = (Arc::new(snapshot), self.live.model.scene.sheet.spacing_m);
         let Running { overrun_count, time_dilation, .. } = *self;
-        encoder.post(self.live.number, Job { snapshot, viewers, overrun_count, time_dilation });
+        encoder.post(self.live.number, Job { snapshot, spacing_m, viewers, overrun_count, time_dilation });
     }
 
     fn publish_status(&self) {
