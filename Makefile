@@ -20,7 +20,7 @@ help:
 	@echo 'make bench-roundtrip the haptic round trip beside a bare gRPC echo'
 	@echo 'make bench-duty      a minute of 1 kHz touch and 60 frames a second: time kept, commands lost'
 	@echo 'make bench-rest      a thousand sessions at rest: their share of a core, and the memory of each'
-	@echo 'make bench-frames    refining and encoding a frame beside a plain copy of its bytes'
+	@echo 'make bench-frames    a frame beside a plain copy of its bytes, and the bytes of a poke: docs/benchmarks/frames.md'
 	@echo 'make bench-error     run time against error, every scheme on seven scenes: docs/benchmarks/error.md'
 	@echo 'make bench-kernel    the time of a step beside the machine'"'"'s limits, numba, Taichi and NumPy'
 	@echo 'make bench-stability the largest stable step, predicted and observed'
@@ -77,13 +77,13 @@ bench-rest: build
 	$(CARGO) bench --quiet --bench rest
 
 bench-frames: need-rust
-	$(CARGO) bench --quiet --bench frames
+	$(CARGO) bench --quiet --bench frames -- $(ARGUMENTS)
 
 # Ten thousand random scenes, and a soak of ten million steps.
 stress: need-rust
-	PALPATE_STRESS_SCENES=10000 $(CARGO) test --release --test stress -- --include-ignored --nocapture
+	PALPATE_STRESS_SCENES=10000 $(CARGO) test --release --test stress --test sleep -- --include-ignored --nocapture
 
-# `make bench-error ARGUMENTS=--quick`, and bench-kernel likewise.
+# `make bench-error ARGUMENTS=--quick`, and bench-kernel and bench-frames likewise.
 bench-error: need-rust
 	$(CARGO) bench --quiet --bench error -- $(ARGUMENTS)
 

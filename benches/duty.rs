@@ -29,7 +29,12 @@ fn main() {
         let (server, session, over) = (server.clone(), session.clone(), over.clone());
         move || {
             runtime().block_on(async {
-                let request = pb::WatchFramesRequest { session_id: session, refinement: 10, ..Default::default() };
+                let request = pb::WatchFramesRequest {
+                    session_id: session,
+                    refinement: 10,
+                    always_full: true,
+                    ..Default::default()
+                };
                 let mut parts = server.views().await.watch_frames(request).await.unwrap().into_inner();
                 let (mut frames, mut bytes, mut skipped) = (0_u64, 0, 0);
                 while !over.load(Ordering::Relaxed) {

@@ -1,16 +1,23 @@
 //! Refining and encoding a frame beside a plain copy of its bytes: both on one core, in turn, the least time of many
 //! turns. The frame is written into the buffers of the one before, as the server does; the copy goes into a buffer
-//! that has been written before. Writes docs/benchmarks/frames.{md,json,svg}.
+//! that has been written before. And the bytes of a poke whose frames are of what changed. Writes
+//! docs/benchmarks/frames.{md,json,svg}.
 
 #![allow(clippy::unwrap_used, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
 
 mod report;
+mod subject;
 
 use std::hint::black_box;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use glam::{DVec2, DVec3};
 use palpate::limits::Limits;
-use palpate::surface::{Encoding, Frame, Refinement, Snapshot, encode, encode_over};
+use palpate::pace::frames::Delivery;
+use palpate::scene::law::Poke;
+use palpate::sheet::{Push, at_rest};
+use palpate::surface::{Encoding, Frame, Refinement, Snapshot, Tiles, encode, encode_over};
 use report::chart::Panel;
 use report::{Report, cells, digits, quick, seconds};
 use serde_json::json;
@@ -73,7 +80,7 @@ fn measure(side: usize, refinement: u32, encoding: Encoding) -> Case {
     let vertices = grid.vertices().iter().product::<usize>();
     let bytes = vertices * encoding.bytes_per_vertex();
     let displacement_m = waving(side);
-    let snapshot = Snapshot::new(1, 0.001, displacement_m.clone());
+    let snapshot = Snapshot::new(1, 0.001, [side; 2], displacement_m.clone());
     let mut frame = encode(&snapshot, grid, encoding);
     let mut copied = vec![1_u8; bytes];
     let mut least_s = [f64::INFINITY; 3];
@@ -84,7 +91,7 @@ fn measure(side: usize, refinement: u32, encoding: Encoding) -> Case {
         frame = next;
         let (copy_s, ()) = seconds(|| copy(black_box(&frame), black_box(&mut copied)));
         let just_written = displacement_m.clone();
-        let (box_s, _) = seconds(|| black_box(Snapshot::new(1, 0.001, black_box(just_written))));
+        let (box_s, _) = seconds(|| black_box(Snapshot::new(1, 0.001, [side; 2], black_box(just_written))));
         for (least, now_s) in least_s.iter_mut().zip([frame_s, copy_s, box_s]) {
             *least = least.min(now_s);
         }
@@ -128,6 +135,128 @@ fn map(cases: &[Case]) -> Panel {
     }
 }
 
+/// Frames a second.
+const RATE_HZ: u64 = 60;
+
+/// A poke of 331 × 331 points, in phases that end after so many ms; the force acts in the first.
+const PHASES: [(&str, u64); 4] = [("poked", 1000), ("let go", 2000), ("coming to rest", 7000), ("still", 12_000)];
+
+/// Of what changed in one phase.
+struct Sent {
+    bytes: usize,
+    frames: u64,
+    /// Between a vertex and where it should be, in quanta.
+    error: f64,
+}
+
+/// What a viewer is sent of a poke: of each phase, and in all.
+fn poke(force_n: DVec3, refinement: u32, report: &mut Report, rows: &mut Vec<Vec<String>>) {
+    let side = 331;
+    let model = subject::model(&[subject::set("sheet.points", format!("[{side}, {side}]"))]).unwrap();
+    let (mut tissue, spacing_m) = (at_rest(&model), model.scene.sheet.spacing_m);
+    let centre_m = DVec2::splat((side / 2) as f64 * spacing_m);
+    let push = Poke { centre_m, force_n, falloff_per_m: 150.0, falloff_offset: 0.0 };
+    tissue.push(0, Some(Push::Held(push)));
+    let limits = Limits { frame_vertices: usize::MAX, ..Limits::default() };
+    let grid = Refinement::new([side; 2], refinement, &limits).unwrap();
+    let [_, columns] = grid.vertices();
+    let full_bytes = grid.vertices().iter().product::<usize>() * Encoding::I16.bytes_per_vertex();
+    let (mut tiles, mut seen, mut shown) = (None::<Tiles>, None, vec![[0.0; 3]; full_bytes / 6]);
+    let mut sent: Vec<Sent> = Vec::new();
+    let mut frames = 0;
+    for (phase, (name, end)) in PHASES.into_iter().enumerate() {
+        sent.push(Sent { bytes: 0, frames: 0, error: 0.0 });
+        let sent = &mut sent[phase];
+        let begin = tissue.step_count();
+        while tissue.step_count() < end {
+            tissue.step().unwrap();
+            let step = tissue.step_count();
+            if step * RATE_HZ / 1000 == (step - 1) * RATE_HZ / 1000 {
+                continue;
+            }
+            frames += 1;
+            let mut displacement_m = [(); 3].map(|()| Vec::new());
+            tissue.displacements_m(&mut displacement_m);
+            let snapshot = Arc::new(Snapshot::new(step, step as f64 * 1e-3, [side; 2], displacement_m));
+            let tiles = tiles.get_or_insert_with(|| Tiles::new(&snapshot, grid, Encoding::I16, spacing_m));
+            tiles.update(&snapshot);
+            if tiles.is_newer_than(seen) {
+                let frame = tiles.newer_than(seen);
+                seen = Some(tiles.version());
+                show(&frame, columns, &mut shown);
+                let delivery = Delivery {
+                    frame_id: frames,
+                    frame: Arc::new(frame),
+                    since: seen,
+                    unchanged: 0,
+                    overrun_count: 0,
+                    time_dilation: 1.0,
+                };
+                // With what the protocol adds.
+                let messages = palpate::wire::sample::frame(&"0".repeat(32), &delivery, 0);
+                sent.bytes += messages.iter().map(prost::Message::encoded_len).sum::<usize>();
+                sent.frames += 1;
+                // To compare every frame would take a while.
+                if frames.is_multiple_of(8) {
+                    let truth = encode(&snapshot, grid, Encoding::F32);
+                    sent.error = sent.error.max(error(&truth, &delivery.frame, columns, &shown));
+                }
+            }
+        }
+        if phase == 0 {
+            tissue.push(0, None);
+        }
+        let duration_s = (end - begin) as f64 * 1e-3;
+        let share = sent.bytes as f64 / (full_bytes as f64 * RATE_HZ as f64 * duration_s);
+        let force = force_n.to_array().map(|f| f.to_string()).join(", ");
+        rows.push(cells([
+            refinement.to_string(),
+            force.clone(),
+            name.to_owned(),
+            digits(duration_s),
+            sent.frames.to_string(),
+            digits(sent.bytes as f64 / duration_s * 1e-3),
+            format!("{} %", digits(100.0 * share)),
+            digits(sent.error),
+        ]));
+        report.figure(
+            &format!("n={refinement} force=[{force}] {name}"),
+            json!({ "bytes": sent.bytes, "duration_s": duration_s, "share_of_full": share, "error_quanta": sent.error }),
+        );
+    }
+}
+
+/// Vertices of a patch, and their bytes.
+fn vertices(frame: &Frame, columns: usize) -> impl Iterator<Item = (usize, &[u8])> {
+    let size = frame.encoding.bytes_per_vertex();
+    frame.patches.iter().flat_map(move |patch| {
+        let place =
+            move |k: usize| (patch.first[0] + k / patch.count[1]) * columns + patch.first[1] + k % patch.count[1];
+        patch.bytes.chunks(size).enumerate().map(move |(k, bytes)| (place(k), bytes))
+    })
+}
+
+/// Writes a frame over what was shown.
+fn show(frame: &Frame, columns: usize, shown: &mut [[f64; 3]]) {
+    for (vertex, bytes) in vertices(frame, columns) {
+        shown[vertex] = std::array::from_fn(|c| {
+            let q = f64::from(i16::from_le_bytes([bytes[2 * c], bytes[2 * c + 1]]));
+            frame.quanta.origin_m[c] + frame.quanta.scale_m[c] * q
+        });
+    }
+}
+
+/// The largest between what is shown and the truth, in quanta.
+fn error(truth: &Frame, frame: &Frame, columns: usize, shown: &[[f64; 3]]) -> f64 {
+    let errors = vertices(truth, columns).flat_map(|(vertex, bytes)| {
+        (0..3).map(move |c| {
+            let exact = f64::from(f32::from_le_bytes(bytes[4 * c..4 * c + 4].try_into().unwrap()));
+            (shown[vertex][c] - exact).abs() / frame.quanta.scale_m[c]
+        })
+    });
+    errors.fold(0.0, f64::max)
+}
+
 fn main() {
     let mut report = Report::new("frames", "Frames", "make bench-frames");
     let mut cases = Vec::new();
@@ -156,6 +285,21 @@ fn main() {
             "ratio": case.ratio(),
         })
     });
+    report.heading("What changed");
+    report.say(&format!(
+        "A sheet of 331 × 331 points, poked at its centre for a second (falloff 150/m), and one viewer who takes {RATE_HZ} \
+         i16 frames a second of what changed: bytes with all that the protocol adds, beside whole frames at that rate. \
+         A full frame is in the first phase, because the viewer joins, and one in the third, because five seconds have \
+         passed. The error is the largest between a vertex and where it should be, in quanta, of every eighth frame."
+    ));
+    let mut sent = Vec::new();
+    for refinement in if quick() { &[0][..] } else { &[0, 10] } {
+        for force_n in [DVec3::new(0.0, 0.0, -3.0), DVec3::new(2.0, 0.0, -2.0)] {
+            poke(force_n, *refinement, &mut report, &mut sent);
+        }
+    }
+    let header = ["n", "force, N", "phase", "s", "frames", "kB/s", "of whole frames", "error, quanta"];
+    report.table(&cells(header), &sent);
     report.figure("goal_ratio", json!(GOAL));
     report.figure("cases", rows.collect());
     report.write(1, &[map(&cases)]);

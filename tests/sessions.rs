@@ -478,8 +478,13 @@ async fn a_stream_that_will_not_end_is_cut_at_the_deadline() {
     let mut server = Server::start(&["--shutdown-deadline-s", "0.3"]);
     let session = server.paper(true).await;
     // A connection that holds a stream open and reads nothing of it.
-    let request =
-        pb::WatchFramesRequest { session_id: session, refinement: 10, rate_hz: Some(1000.0), ..Default::default() };
+    let request = pb::WatchFramesRequest {
+        session_id: session,
+        refinement: 10,
+        rate_hz: Some(1000.0),
+        always_full: true,
+        ..Default::default()
+    };
     let stalled = server.views().await.watch_frames(request).await.unwrap();
     Command::new("kill").arg(server.child.id().to_string()).status().unwrap();
     let waited = tokio::task::spawn_blocking(move || server.child.wait().unwrap());

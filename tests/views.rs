@@ -13,22 +13,40 @@ fn watch(session_id: &str, refinement: u32, encoding: pb::Encoding) -> pb::Watch
         session_id: session_id.into(),
         refinement,
         encoding: encoding.into(),
+        always_full: true,
         ..Default::default()
     }
 }
 
-/// A whole frame: its last message, and the displacement of every vertex, m.
+/// The same, of what changes.
+fn changes(session_id: &str, refinement: u32, encoding: pb::Encoding) -> pb::WatchFramesRequest {
+    pb::WatchFramesRequest { always_full: false, ..watch(session_id, refinement, encoding) }
+}
+
+type Vertices = Vec<Option<[f64; 3]>>;
+
+/// A full frame: its last message, and the displacement of every vertex, m.
 async fn frame(stream: &mut Streaming<pb::WatchFramesResponse>) -> (pb::WatchFramesResponse, Vec<[f64; 3]>) {
-    let mut vertices: Vec<Option<[f64; 3]>> = Vec::new();
-    let mut id = None;
+    let mut vertices = Vec::new();
+    let (last, _) = show(stream, &mut vertices).await;
+    assert!(last.full);
+    (last, vertices.into_iter().map(Option::unwrap).collect())
+}
+
+/// Writes the next frame over what is shown; its last message, and how many vertices it wrote.
+async fn show(
+    stream: &mut Streaming<pb::WatchFramesResponse>,
+    vertices: &mut Vertices,
+) -> (pb::WatchFramesResponse, usize) {
+    let (mut id, mut count) = (None, 0);
     loop {
         let part = tokio::time::timeout(PATIENCE, stream.message()).await.expect("no frame").unwrap().unwrap();
         vertices.resize((part.vertices_x * part.vertices_y) as usize, None);
         assert_eq!(*id.get_or_insert(part.frame_id), part.frame_id, "a frame began before the last one was whole");
         let (origin, scale) = (part.origin_m.unwrap(), part.scale_m.unwrap());
         let (origin, scale) = ([origin.x, origin.y, origin.z], [scale.x, scale.y, scale.z]);
+        assert!(part.patches.iter().map(|patch| patch.displacement.len()).sum::<usize>() <= 64 << 10);
         for patch in &part.patches {
-            assert!(patch.displacement.len() <= 64 << 10);
             let size = if part.encoding() == pb::Encoding::F32 { 4 } else { 2 };
             assert_eq!(patch.displacement.len(), (patch.count_x * patch.count_y) as usize * 3 * size);
             for (index, bytes) in patch.displacement.chunks(3 * size).enumerate() {
@@ -40,10 +58,27 @@ async fn frame(stream: &mut Streaming<pb::WatchFramesResponse>) -> (pb::WatchFra
                     _ => unreachable!(),
                 };
                 vertices[vertex as usize] = Some(std::array::from_fn(component));
+                count += 1;
             }
         }
         if part.last {
-            return (part, vertices.into_iter().map(Option::unwrap).collect());
+            assert_eq!(part.full, count == vertices.len());
+            return (part, count);
+        }
+    }
+}
+
+/// What is shown is the tissue as it stands, within the quantum.
+async fn check(server: &Server, session: &str, last: &pb::WatchFramesResponse, vertices: &Vertices) {
+    let request = watch(session, last.refinement, pb::Encoding::F32);
+    let (now, exact) = frame(&mut server.views().await.watch_frames(request).await.unwrap().into_inner()).await;
+    assert_eq!(last.step, now.step);
+    let scale = last.scale_m.unwrap();
+    let quantum_m = if last.encoding() == pb::Encoding::F32 { [0.0; 3] } else { [scale.x, scale.y, scale.z] };
+    for (shown, exact) in vertices.iter().zip(&exact) {
+        for c in 0..3 {
+            let error_m = (shown.unwrap()[c] - exact[c]).abs();
+            assert!(error_m <= 1.02 * quantum_m[c], "{error_m} m, but a quantum is {} m", quantum_m[c]);
         }
     }
 }
@@ -151,6 +186,103 @@ async fn a_viewer_without_credit_gets_no_more_frames_until_it_acknowledges() {
     drop(frames);
     let unknown = pb::AcknowledgeFramesRequest { viewer_id: "nobody".into(), ..acknowledge };
     assert_eq!(told(&views.acknowledge_frames(unknown).await.unwrap_err()).1, "UNKNOWN_VIEWER");
+}
+
+#[tokio::test]
+async fn frames_of_changes_make_the_same_picture_as_full_ones() {
+    let server = Server::start(&[]);
+    let session = server.paper(true).await;
+    let mut touch = Touch::hold(&server, &session).await;
+    let mut streams = Vec::new();
+    for (refinement, encoding) in [(0, pb::Encoding::I16), (3, pb::Encoding::I16), (2, pb::Encoding::F32)] {
+        // One that is always ready, one without credit for most of the time.
+        for most in [None, Some(1)] {
+            let request = pb::WatchFramesRequest {
+                rate_hz: Some(100.0),
+                max_frames_in_flight: most,
+                ..changes(&session, refinement, encoding)
+            };
+            let mut frames = server.views().await.watch_frames(request).await.unwrap().into_inner();
+            let mut vertices = Vec::new();
+            let (last, _) = show(&mut frames, &mut vertices).await;
+            assert!(last.full && last.frame_id == 0);
+            streams.push((frames, vertices, last));
+        }
+    }
+    touch.command(at_a_corner(1, -1.0)).await;
+    touch.settle().await;
+    let mut views = server.views().await;
+    let mut some_but_not_all = false;
+    // While the tissue still moves, so that there is a frame at each of these steps.
+    for until in [20, 70, 120] {
+        server.start_until(&session, until - 10).await;
+        server.hash_at(&session, until - 10).await;
+        for (_, _, last) in &streams {
+            let (viewer_id, frame_id) = (last.viewer_id.clone(), last.frame_id);
+            views.acknowledge_frames(pb::AcknowledgeFramesRequest { viewer_id, frame_id }).await.unwrap();
+        }
+        server.start_until(&session, until).await;
+        server.hash_at(&session, until).await;
+        for (frames, vertices, last) in &mut streams {
+            while last.step < until {
+                let (next, count) = show(frames, vertices).await;
+                some_but_not_all |= count < vertices.len();
+                *last = next;
+            }
+            check(&server, &session, last, vertices).await;
+            // Who joins late sees the same at once.
+            let request = changes(&session, last.refinement, last.encoding());
+            let mut late = Vec::new();
+            let (first, _) = show(&mut views.watch_frames(request).await.unwrap().into_inner(), &mut late).await;
+            assert!(first.full && first.step == until);
+            check(&server, &session, &first, &late).await;
+        }
+    }
+    assert!(some_but_not_all);
+    // The ones that had no credit were told so.
+    assert!(streams.iter().any(|(_, _, last)| last.skipped_frames > 0));
+}
+
+/// A force far from three of the four tiles.
+fn at_a_corner(sequence: u64, z_n: f64) -> pb::Command {
+    let command = force(0, sequence, z_n);
+    let Some(pb::command::Action::Force(force)) = command.action else { unreachable!() };
+    let centre = Some(pb::force::Centre::Point(pb::GridPoint { x: 3, y: 3 }));
+    pb::Command { action: Some(pb::command::Action::Force(pb::Force { centre, ..force })), ..command }
+}
+
+#[tokio::test]
+async fn a_still_tissue_sends_nothing_and_five_seconds_of_change_a_full_frame() {
+    let server = Server::start(&[]);
+    let session = server.paper(true).await;
+    let mut touch = Touch::hold(&server, &session).await;
+    let request = pb::WatchFramesRequest { rate_hz: Some(100.0), ..changes(&session, 0, pb::Encoding::I16) };
+    let mut frames = server.views().await.watch_frames(request).await.unwrap().into_inner();
+    let mut vertices = Vec::new();
+    let (first, _) = show(&mut frames, &mut vertices).await;
+    assert_eq!((first.step, first.full), (0, true));
+    server.start_until(&session, 500).await;
+    server.hash_at(&session, 500).await;
+    touch.command(at_a_corner(1, -1.0)).await;
+    touch.settle().await;
+    server.start_until(&session, 510).await;
+    server.hash_at(&session, 510).await;
+    // Fifty frames were due and not sent, because nothing had changed; none was skipped.
+    let (second, count) = show(&mut frames, &mut vertices).await;
+    assert_eq!((second.frame_id, second.step, second.skipped_frames), (51, 510, 0));
+    assert!(count < vertices.len());
+    server.start_until(&session, 5600).await;
+    let last = loop {
+        let (next, _) = show(&mut frames, &mut vertices).await;
+        // Before that, all four tiles may change at once.
+        if next.full && next.step >= 5000 {
+            break next;
+        }
+    };
+    server.hash_at(&session, 5600).await;
+    // At rest under the force; what is left of its motion can't be seen.
+    assert!(tokio::time::timeout(std::time::Duration::from_millis(300), frames.message()).await.is_err());
+    check(&server, &session, &pb::WatchFramesResponse { step: 5600, ..last }, &vertices).await;
 }
 
 #[tokio::test]

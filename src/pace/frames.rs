@@ -2,10 +2,10 @@
 //! for all viewers that ask for the same, and hands it to those that have credit.
 
 use std::collections::VecDeque;
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
 
 use super::queue::{Reader, Writer, lock, queue};
-use crate::surface::{Encoding, Frame, Refinement, Snapshot, encode, encode_over};
+use crate::surface::{Encoding, Frame, Refinement, Snapshot, Tiles, encode, encode_over};
 
 /// One who looks at a session.
 #[derive(Debug)]
@@ -18,9 +18,21 @@ pub struct Viewer {
     pub encoding: Encoding,
     /// Frames a second of simulated time.
     pub rate_hz: f64,
+    /// Is sent every vertex in each frame, not just what changed.
+    pub always_full: bool,
+    progress: Mutex<Progress>,
     /// Frames sent and not yet acknowledged, if acknowledgements are asked for.
     credit: Option<Mutex<Credit>>,
     writer: Writer<Delivery>,
+}
+
+/// How far a viewer has come.
+#[derive(Debug, Default, Clone, Copy)]
+struct Progress {
+    /// The update of the tiles of which it has, or will read, everything.
+    version: Option<u64>,
+    /// Frames that were due and in which nothing had changed.
+    unchanged: u64,
 }
 
 #[derive(Debug)]
@@ -36,6 +48,10 @@ pub struct Delivery {
     pub frame_id: u64,
     /// Shared with others.
     pub frame: Arc<Frame>,
+    /// It holds the tiles that are newer than this update.
+    pub since: Option<u64>,
+    /// Frames that were due to the viewer so far, and in which nothing had changed.
+    pub unchanged: u64,
     /// Steps dropped by the session so far.
     pub overrun_count: u64,
     /// Of the last second or so.
@@ -49,6 +65,7 @@ impl Viewer {
         refinement: Refinement,
         encoding: Encoding,
         rate_hz: f64,
+        always_full: bool,
         max_in_flight: Option<u32>,
         queued_bytes: usize,
     ) -> (Arc<Self>, Reader<Delivery>) {
@@ -58,7 +75,8 @@ impl Viewer {
         // Without credit only the newest frame waits.
         let (writer, reader) = queue(most.unwrap_or(1));
         let credit = most.map(|most| Mutex::new(Credit { most, in_flight: VecDeque::with_capacity(most) }));
-        (Arc::new(Viewer { id, refinement, encoding, rate_hz, credit, writer }), reader)
+        let progress = Mutex::default();
+        (Arc::new(Viewer { id, refinement, encoding, rate_hz, always_full, progress, credit, writer }), reader)
     }
 
     /// The number of the frame that belongs to step `step` of a session that steps at `rate_hz`.
@@ -75,18 +93,41 @@ impl Viewer {
         }
     }
 
-    fn has_credit(&self) -> bool {
+    /// Whether a frame may be sent to it now.
+    pub(super) fn has_credit(&self) -> bool {
         self.credit.as_ref().is_none_or(|credit| {
             let credit = lock(credit);
-            credit.in_flight.len() < credit.most
+            // Who acknowledges what it has not read gets no more than fits.
+            credit.in_flight.len() < credit.most && !self.writer.is_full()
         })
     }
 
-    fn deliver(&self, delivery: Delivery) {
+    fn deliver(&self, job: &Job, frame_id: u64, frame: Arc<Frame>, since: Option<u64>) {
         if let Some(credit) = &self.credit {
-            lock(credit).in_flight.push_back(delivery.frame_id);
+            lock(credit).in_flight.push_back(frame_id);
         }
-        self.writer.push(delivery);
+        let unchanged = lock(&self.progress).unchanged;
+        let Job { overrun_count, time_dilation, .. } = *job;
+        self.writer.push(Delivery { frame_id, frame, since, unchanged, overrun_count, time_dilation });
+    }
+
+    /// Sends the tiles that are newer than what it has, if there are any.
+    fn deliver_newer(&self, job: &Job, frame_id: u64, tiles: &mut Tiles) {
+        let mut since = {
+            let mut progress = lock(&self.progress);
+            if !tiles.is_newer_than(progress.version) {
+                progress.unchanged += 1;
+                return;
+            }
+            progress.version.replace(tiles.version())
+        };
+        // One that it has not read yet gives way to one with all that is in it and more.
+        if self.credit.is_none()
+            && let Some(unread) = self.writer.withdraw()
+        {
+            since = unread.since;
+        }
+        self.deliver(job, frame_id, Arc::new(tiles.newer_than(since)), since);
     }
 
     /// The stream has gone.
@@ -104,7 +145,9 @@ impl Viewer {
 #[derive(Debug)]
 pub struct Job {
     /// The displacements.
-    pub snapshot: Snapshot,
+    pub snapshot: Arc<Snapshot>,
+    /// Of the points, m.
+    pub spacing_m: f64,
     /// To whom, as which frame.
     pub viewers: Vec<(Arc<Viewer>, u64)>,
     /// Of the session.
@@ -152,25 +195,25 @@ impl Encoder {
 
     /// The thread's work.
     pub fn work(&self) {
-        let mut spent = Spent::default();
+        let (mut spent, mut watched) = (Spent::default(), Watched::default());
         loop {
             let mut board = lock(&self.board);
-            let job = loop {
+            let (number, job) = loop {
                 if board.stop {
                     return;
                 }
-                if let Some((_, job)) = board.jobs.pop_front() {
-                    break job;
+                if let Some(next) = board.jobs.pop_front() {
+                    break next;
                 }
                 board = self.posted.wait(board).unwrap_or_else(PoisonError::into_inner);
             };
             drop(board);
-            serve(&job, &mut spent);
+            serve(number, &job, &mut spent, &mut watched);
         }
     }
 }
 
-/// Bytes of frames kept for their buffers, one of each kind that was asked for lately.
+/// Bytes of full frames kept for their buffers, one of each kind that was asked for lately.
 const SPENT_BYTES: usize = 64 << 20;
 
 /// The last frames of a few kinds, newest first. When the next of a kind is due, the viewers are mostly done with it.
@@ -196,10 +239,55 @@ impl Spent {
     }
 }
 
-fn serve(job: &Job, spent: &mut Spent) {
+/// What is known of those who want changes only.
+#[derive(Debug, Default)]
+struct Watched(Vec<Kind>);
+
+/// Viewers of one session who asked for the same.
+#[derive(Debug)]
+struct Kind {
+    session: u64,
+    tiles: Tiles,
+    viewers: Vec<Weak<Viewer>>,
+}
+
+impl Watched {
+    /// Forgets what nobody looks at any more.
+    fn forget_the_gone(&mut self) {
+        let stays = |viewer: &Weak<Viewer>| viewer.upgrade().is_some_and(|viewer| !viewer.is_gone());
+        self.0.iter_mut().for_each(|kind| kind.viewers.retain(stays));
+        self.0.retain(|kind| !kind.viewers.is_empty());
+    }
+
+    /// The tiles for a viewer, up to date.
+    fn tiles(&mut self, session: u64, job: &Job, viewer: &Arc<Viewer>) -> &mut Tiles {
+        let (refinement, encoding) = (viewer.refinement, viewer.encoding);
+        let same = |kind: &Kind| {
+            (kind.session, kind.tiles.refinement(), kind.tiles.encoding()) == (session, refinement, encoding)
+        };
+        let place = self.0.iter().position(same).unwrap_or_else(|| {
+            let tiles = Tiles::new(&job.snapshot, refinement, encoding, job.spacing_m);
+            self.0.push(Kind { session, tiles, viewers: Vec::new() });
+            self.0.len() - 1
+        });
+        let Kind { tiles, viewers, .. } = &mut self.0[place];
+        if !viewers.iter().any(|other| std::ptr::eq(other.as_ptr(), Arc::as_ptr(viewer))) {
+            viewers.push(Arc::downgrade(viewer));
+        }
+        tiles.update(&job.snapshot);
+        tiles
+    }
+}
+
+fn serve(session: u64, job: &Job, spent: &mut Spent, watched: &mut Watched) {
+    watched.forget_the_gone();
     let mut encoded: Vec<Arc<Frame>> = Vec::new();
     for (viewer, frame_id) in &job.viewers {
         if viewer.is_gone() || !viewer.has_credit() {
+            continue;
+        }
+        if !viewer.always_full {
+            viewer.deliver_newer(job, *frame_id, watched.tiles(session, job, viewer));
             continue;
         }
         let same = |frame: &&Arc<Frame>| frame.refinement == viewer.refinement && frame.encoding == viewer.encoding;
@@ -208,12 +296,7 @@ fn serve(job: &Job, spent: &mut Spent) {
             encoded.push(frame.clone());
             frame
         });
-        viewer.deliver(Delivery {
-            frame_id: *frame_id,
-            frame,
-            overrun_count: job.overrun_count,
-            time_dilation: job.time_dilation,
-        });
+        viewer.deliver(job, *frame_id, frame, None);
     }
 }
 
@@ -223,13 +306,13 @@ mod tests {
     use crate::limits::Limits;
 
     fn job(viewers: Vec<(Arc<Viewer>, u64)>) -> Job {
-        let snapshot = Snapshot::new(1, 0.001, std::array::from_fn(|_| vec![0.5; 9]));
-        Job { snapshot, viewers, overrun_count: 0, time_dilation: 1.0 }
+        let snapshot = Snapshot::new(1, 0.001, [3, 3], std::array::from_fn(|_| vec![0.5; 9]));
+        Job { snapshot: Arc::new(snapshot), spacing_m: 0.01, viewers, overrun_count: 0, time_dilation: 1.0 }
     }
 
     fn viewer(n: u32, encoding: Encoding, credit: Option<u32>) -> (Arc<Viewer>, Reader<Delivery>) {
         let grid = Refinement::new([3, 3], n, &Limits::default()).unwrap();
-        Viewer::new("viewer".into(), grid, encoding, 60.0, credit, 1 << 20)
+        Viewer::new("viewer".into(), grid, encoding, 60.0, true, credit, 1 << 20)
     }
 
     #[tokio::test]
@@ -237,10 +320,41 @@ mod tests {
         let (a, mut read_a) = viewer(2, Encoding::I16, None);
         let (b, mut read_b) = viewer(2, Encoding::I16, Some(3));
         let (c, mut read_c) = viewer(2, Encoding::F32, None);
-        serve(&job(vec![(a, 7), (b, 9), (c, 7)]), &mut Spent::default());
+        serve(1, &job(vec![(a, 7), (b, 9), (c, 7)]), &mut Spent::default(), &mut Watched::default());
         let (a, b, c) = (read_a.pop().await.unwrap().0, read_b.pop().await.unwrap().0, read_c.pop().await.unwrap().0);
         assert!(Arc::ptr_eq(&a.frame, &b.frame) && !Arc::ptr_eq(&a.frame, &c.frame));
         assert_eq!((a.frame_id, b.frame_id), (7, 9));
+    }
+
+    #[tokio::test]
+    async fn who_wants_changes_gets_all_of_them_however_it_reads() {
+        let grid = Refinement::new([3, 3], 0, &Limits::default()).unwrap();
+        let changes = |credit| Viewer::new("viewer".into(), grid, Encoding::F32, 60.0, false, credit, 1 << 20);
+        let ((slow, mut read_slow), (thrifty, mut read_thrifty)) = (changes(None), changes(Some(1)));
+        let (mut spent, mut watched) = (Spent::default(), Watched::default());
+        let mut show = |frame_id: u64, z: f32| {
+            let snapshot = Snapshot::new(frame_id, 0.001, [3, 3], [vec![0.0; 9], vec![0.0; 9], vec![z; 9]]);
+            let viewers = vec![(slow.clone(), frame_id), (thrifty.clone(), frame_id)];
+            serve(1, &Job { snapshot: Arc::new(snapshot), ..job(viewers) }, &mut spent, &mut watched);
+        };
+        (0..4).for_each(|frame_id| show(frame_id, frame_id as f32));
+        // Who has not read yet is given all since then; who has no credit, nothing.
+        let (newest, first) = (read_slow.pop().await.unwrap().0, read_thrifty.pop().await.unwrap().0);
+        assert_eq!((newest.frame_id, newest.since, newest.frame.full), (3, None, true));
+        assert_eq!((first.frame_id, first.since, first.frame.step), (0, None, 0));
+        show(4, 3.0);
+        show(5, 3.0);
+        thrifty.acknowledge(0);
+        show(6, 3.0);
+        show(7, 4.0);
+        let (newest, second) = (read_slow.pop().await.unwrap().0, read_thrifty.pop().await.unwrap().0);
+        // Nothing changed in 4, 5 and 6.
+        assert_eq!((newest.frame_id, newest.since.is_some(), newest.unchanged), (7, true, 3));
+        assert_eq!((second.frame_id, second.since.is_some(), second.unchanged), (6, true, 0));
+        thrifty.acknowledge(6);
+        drop((read_slow, read_thrifty));
+        show(8, 5.0);
+        assert!(watched.0.is_empty(), "what nobody looks at is forgotten");
     }
 
     #[test]

@@ -66,6 +66,17 @@ impl<T> Writer<T> {
         self.0.arrived.notify_one();
     }
 
+    /// Takes back the newest item, if it has not been read.
+    pub fn withdraw(&self) -> Option<T> {
+        lock(&self.0.inner).items.pop_back()
+    }
+
+    /// Whether one more item would cost the oldest.
+    pub fn is_full(&self) -> bool {
+        let inner = lock(&self.0.inner);
+        inner.items.len() == inner.capacity
+    }
+
     /// No more items; the reader is told why when it has read the rest.
     pub fn close(&self, why: Refusal) {
         lock(&self.0.inner).end.get_or_insert(why);
@@ -126,6 +137,18 @@ mod tests {
             assert_eq!(reader.pop().await, Ok((item, 7)));
         }
         assert_eq!(reader.pop().await.unwrap_err().reason, Reason::SessionDeleted);
+    }
+
+    #[tokio::test]
+    async fn what_is_not_read_can_be_taken_back() {
+        let (writer, mut reader) = queue(1);
+        assert_eq!(writer.withdraw(), None);
+        writer.push(1);
+        assert!(writer.is_full());
+        assert_eq!(writer.withdraw(), Some(1));
+        assert!(!writer.is_full());
+        writer.push(2);
+        assert_eq!(reader.pop().await, Ok((2, 0)));
     }
 
     #[tokio::test]

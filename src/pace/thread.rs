@@ -427,7 +427,7 @@ impl Running {
             let last = held.then(|| tap.viewer.frame_id(step, rate_hz));
             let frame_id = last.or_else(|| tap.due(step, still_since, rate_hz))?;
             tap.shown = step;
-            Some((tap.viewer.clone(), frame_id))
+            tap.viewer.has_credit().then(|| (tap.viewer.clone(), frame_id))
         };
         let viewers: Vec<_> = self.taps.viewers.iter_mut().filter_map(due_frame).collect();
         if !viewers.is_empty() {
@@ -441,9 +441,11 @@ impl Running {
     fn post(&self, encoder: &Encoder, viewers: Vec<(Arc<Viewer>, u64)>) {
         let mut displacement_m = std::array::from_fn(|_| Vec::new());
         self.session.tissue().displacements_m(&mut displacement_m);
-        let snapshot = Snapshot::new(self.session.step_count(), self.session.time_s(), displacement_m);
+        let points = self.live.model.points;
+        let snapshot = Snapshot::new(self.session.step_count(), self.session.time_s(), points, displacement_m);
+        let (snapshot, spacing_m) = (Arc::new(snapshot), self.live.model.scene.sheet.spacing_m);
         let (overrun_count, time_dilation) = (self.overrun_count, self.dilation.value);
-        encoder.post(self.live.number, Job { snapshot, viewers, overrun_count, time_dilation });
+        encoder.post(self.live.number, Job { snapshot, spacing_m, viewers, overrun_count, time_dilation });
     }
 
     fn publish_status(&self) {

@@ -28,7 +28,8 @@ struct Frames {
     reader: FrameReader,
     _guard: StreamGuard,
     messages: VecDeque<pb::WatchFramesResponse>,
-    last_id: Option<u64>,
+    /// Number of the last frame, and how many had been left out by then because nothing had changed.
+    last: Option<(u64, u64)>,
     skipped: u64,
 }
 
@@ -37,8 +38,11 @@ impl Frames {
         if self.messages.is_empty() {
             match self.reader.pop().await {
                 Ok((delivery, _)) => {
-                    self.skipped += self.last_id.map_or(0, |last| delivery.frame_id.saturating_sub(last + 1));
-                    self.last_id = Some(delivery.frame_id);
+                    let (frame_id, unchanged) = (delivery.frame_id, delivery.unchanged);
+                    self.skipped += self.last.map_or(0, |last| {
+                        frame_id.saturating_sub(last.0 + 1).saturating_sub(unchanged.saturating_sub(last.1))
+                    });
+                    self.last = Some((frame_id, unchanged));
                     self.messages.extend(crate::wire::sample::frame(&self.viewer_id, &delivery, self.skipped));
                 }
                 Err(refusal) => return Some((Err(refusal.into()), None)),
@@ -94,11 +98,18 @@ impl ViewService for Views {
         let guard = live.open_stream()?;
         let room = self.0.config.limits.queued_bytes;
         let viewer_id = random_id()?;
-        let (viewer, reader) =
-            Viewer::new(viewer_id.clone(), grid, encoding, rate_hz, request.max_frames_in_flight, room);
+        let (viewer, reader) = Viewer::new(
+            viewer_id.clone(),
+            grid,
+            encoding,
+            rate_hz,
+            request.always_full,
+            request.max_frames_in_flight,
+            room,
+        );
         self.0.pacer.add_viewer(&live, &viewer);
         info!(session = %live.id, refinement = request.refinement, ?encoding, rate_hz, "viewer joined");
-        let frames = Frames { viewer_id, reader, _guard: guard, messages: VecDeque::new(), last_id: None, skipped: 0 };
+        let frames = Frames { viewer_id, reader, _guard: guard, messages: VecDeque::new(), last: None, skipped: 0 };
         let out = stream::unfold(Some(frames), |frames| async move { frames?.next().await });
         Ok(Response::new(Box::pin(out)))
     }

@@ -36,7 +36,8 @@ pub fn check(model: &Arc<Model>, most_substeps: u32, clock_s: &dyn Fn() -> f64) 
 
 /// A poke that moves the middle by about a tenth of a spacing: numbers of the usual size.
 fn time(model: &Arc<Model>, clock_s: &dyn Fn() -> f64) -> Option<[f64; 2]> {
-    let mut session = Session::new(model);
+    // What a step costs while all of the sheet moves.
+    let mut session = Session::new(&Arc::new(Model { sleep_tolerance: 0.0, ..Model::clone(model) }));
     let scene = &model.scene;
     let stiffness = scene.virtual_stiffness_n_per_m + 0.1 * scene.springs.stiffness_n_per_m;
     session.tissue.push(

@@ -247,7 +247,7 @@ const INVERSE_FACTORIALS: [f64; 14] = {
     series
 };
 
-/// The force on a block: of each of `FIELDS` fields, beginning with `first`, its components.
+/// The force on a block, component by component: of `FIELDS` fields, beginning with `first`; if it is one, twice.
 ///
 /// # Safety
 /// The tables are of the sheet that the block is of.
@@ -258,8 +258,8 @@ pub(super) unsafe fn force_on<V: Vector, const FIELDS: usize>(
     row: usize,
     column: usize,
     stride: usize,
-) -> [[V; FIELDS]; 3] {
-    let mut sum = [[V::splat(V::Real::default()); FIELDS]; 3];
+) -> [[V; 2]; 3] {
+    let mut sum = [[V::splat(V::Real::default()); 2]; 3];
     for term in terms {
         if row < term.rows.start || row >= term.rows.end {
             continue;
@@ -270,6 +270,11 @@ pub(super) unsafe fn force_on<V: Vector, const FIELDS: usize>(
             for f in 0..FIELDS {
                 sum[c][f] = V::splat(term.forces[first + f][c]).mul_add(factor, sum[c][f]);
             }
+        }
+    }
+    if FIELDS == 1 {
+        for c in 0..3 {
+            sum[c][1] = sum[c][0];
         }
     }
     sum

@@ -1,6 +1,7 @@
 //! Memory of a sheet: numbers for each point, laid out so that rows can be swept by vectors of any width.
 
 use std::ops::{Deref, DerefMut};
+use std::sync::Arc;
 
 use super::real::Real;
 
@@ -54,28 +55,36 @@ pub(super) struct State<T> {
     pub(super) u: Field<T>,
     /// The increment of the last substep, or the velocity times the substep.
     pub(super) d: Field<T>,
-    /// What the scheme keeps beside.
-    pub(super) kept: Vec<Field<T>>,
+    /// What the scheme keeps beside; of a sheet at rest, some are one in memory.
+    pub(super) kept: Vec<Arc<Field<T>>>,
 }
 
 impl<T: Real> State<T> {
     pub(super) fn at_rest(layout: &Layout, kept: usize) -> Self {
         let zero = || Field::zero(layout);
-        State { u: zero(), d: zero(), kept: (0..kept).map(|_| zero()).collect() }
+        State { u: zero(), d: zero(), kept: vec![Arc::new(zero()); kept] }
     }
 
     /// All of it.
     pub(super) fn fields(&self) -> impl Iterator<Item = &Field<T>> {
-        [&self.u, &self.d].into_iter().chain(&self.kept)
+        [&self.u, &self.d].into_iter().chain(self.kept.iter().map(|field| &**field))
     }
 
     pub(super) fn fields_mut(&mut self) -> impl Iterator<Item = &mut Field<T>> {
-        [&mut self.u, &mut self.d].into_iter().chain(&mut self.kept)
+        [&mut self.u, &mut self.d].into_iter().chain(self.kept.iter_mut().map(Arc::make_mut))
     }
 
     /// The last values of the springs' force at a place, newest first: `now`, and `count` that a multistep scheme keeps.
     pub(super) fn history(&self, now: f64, count: usize, at: usize) -> Vec<f64> {
         std::iter::once(now).chain(self.kept[..count].iter().map(|field| field[at].wide())).collect()
+    }
+
+    /// Of a sheet at rest the last `count` forces of the springs are the same: they become one in memory, until they are
+    /// written to.
+    pub(super) fn share_history(&mut self, count: usize) {
+        if let Some((first, rest)) = self.kept[..count].split_first_mut() {
+            rest.fill(first.clone());
+        }
     }
 
     /// Takes the values of another of the same layout and scheme.

@@ -11,6 +11,7 @@
 //! gives up, at the checkpoint.
 
 use std::fmt;
+use std::sync::Arc;
 
 use super::applied::{Applied, Push};
 use super::field::{Field, Layout, State};
@@ -100,7 +101,7 @@ pub(super) struct Checkpoint<T: Real> {
 /// Work of the tools, J, and energies at the last survey.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct Work {
-    /// Since the last survey.
+    /// Since the last survey, and what its `present_j` took off.
     done_j: f64,
     /// At the last survey.
     energy_j: f64,
@@ -118,14 +119,15 @@ impl Work {
         self.done_j += work_j;
     }
 
-    /// Judges an energy; a rise by `noise` of the largest is none. The account begins anew.
-    pub(super) fn survey(&mut self, energy_j: f64, noise: f64) -> Result<(), Cause> {
-        let (work_j, before_j) = (self.done_j, self.energy_j);
+    /// Judges an energy; a rise by `noise` of the largest is none. `present_j` is to be taken off what was done so far, and
+    /// belongs to what comes. The account begins anew.
+    pub(super) fn survey(&mut self, energy_j: f64, present_j: f64, noise: f64) -> Result<(), Cause> {
+        let (work_j, before_j) = (self.done_j - present_j, self.energy_j);
         let allowed_j = work_j + MARGIN * (before_j + work_j.abs()) + noise * self.largest_j;
         if energy_j - before_j > allowed_j {
             return Err(Cause::Energy { energy_j, before_j, work_j });
         }
-        *self = Work { done_j: 0.0, energy_j, largest_j: self.largest_j.max(energy_j) };
+        *self = Work { done_j: present_j, energy_j, largest_j: self.largest_j.max(energy_j) };
         Ok(())
     }
 }
@@ -155,7 +157,9 @@ impl<T: Real> Sheet<T> {
         if survey.surprise > MOST_SURPRISE * survey.largest {
             return Err(Cause::Surprise { part: survey.surprise / survey.largest });
         }
-        self.work.survey(energy_j, NOISE.max((10.0 * self.model.sleep_tolerance).powi(2)))?;
+        // Half of the last increment's (`central`).
+        let present_j = if self.plan.scheme.takes_means() { 0.5 * survey.power * self.unit_of_work_j() } else { 0.0 };
+        self.work.survey(energy_j, present_j, NOISE.max((10.0 * self.model.sleep_tolerance).powi(2)))?;
         self.take_checkpoint();
         Ok(())
     }
@@ -176,6 +180,15 @@ impl<T: Real> Sheet<T> {
         checkpoint.prescribed.clone_from(&self.prescribed);
         checkpoint.work = self.work;
         self.inputs.clear();
+    }
+
+    /// A sheet that is still needs less: nothing can go wrong until a tool is told something.
+    pub(super) fn forget_checkpoint(&mut self) {
+        self.checkpoint = None;
+        self.inputs.clear();
+        if let Scheme::Multistep(multistep) = &self.plan.scheme {
+            self.state.share_history(multistep.order);
+        }
     }
 
     /// Back to the checkpoint, with the substep of `halvings`.
@@ -295,7 +308,7 @@ pub(super) fn convert<T: Real>(
                     state.u[at] = T::of(u + du - foretold[0]);
                     state.d[at] = T::of((d + dw) * ratio - foretold[1]);
                     for (field, value) in state.kept.iter_mut().zip(&shorter[1..]) {
-                        field[at] = T::of(*value);
+                        Arc::make_mut(field)[at] = T::of(*value);
                     }
                 }
                 _ => state.d[at] = T::of(d * ratio),

@@ -490,20 +490,17 @@ impl<T: Real> Tissue for Sheet<T> {
     fn skip_steps(&mut self, steps: u64) {
         self.steps += steps;
         self.substeps_done += steps * u64::from(self.plan.substeps);
-        // Nothing can go wrong from here on until a tool is told something.
-        self.checkpoint = None;
-        self.inputs.clear();
     }
 
     fn step(&mut self) -> Result<(), BlowUp> {
         self.do_step();
-        if self.checkpoint.is_none() && self.is_still() {
-            return Ok(());
+        if self.checkpoint.is_some() || !self.is_still() {
+            self.check().or_else(|cause| self.mend(self.steps, cause))?;
         }
-        match self.check() {
-            Ok(()) => Ok(()),
-            Err(cause) => self.mend(self.steps, cause),
+        if self.checkpoint.is_some() && self.is_still() {
+            self.forget_checkpoint();
         }
+        Ok(())
     }
 
     fn point(&self, index: usize) -> PointState {

@@ -10,7 +10,7 @@ use crate::refusal::{Reason, Refusal, Result};
 use crate::scene::{Integrator, Lanes, Named, Precision, Scene};
 
 /// The immutable half of a sheet.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Model {
     /// What it was compiled from.
     pub scene: Scene,

@@ -34,13 +34,15 @@ pub(super) struct Survey {
     pub(super) speed: f64,
     /// The largest component of the force that any free point is short of balance: N − a·u + F.
     pub(super) imbalance: f64,
+    /// Σ F·d of the tools.
+    pub(super) power: f64,
 }
 
-/// The sums: w², u², spring energy, vigour; and the maxima.
+/// The sums: w², u², spring energy, vigour, F·d; and the maxima.
 #[derive(Debug)]
 struct Sums<T> {
-    row: [[T; BLOCK]; 4],
-    total: [[f64; BLOCK]; 4],
+    row: [[T; BLOCK]; 5],
+    total: [[f64; BLOCK]; 5],
     largest: [[T; BLOCK]; 4],
 }
 
@@ -105,7 +107,7 @@ impl Survey {
         rest: bool,
     ) -> Survey {
         let zero = [T::default(); BLOCK];
-        let sums = UnsafeCell::new(Sums { row: [zero; 4], total: [[0.0; BLOCK]; 4], largest: [zero; 4] });
+        let sums = UnsafeCell::new(Sums { row: [zero; 5], total: [[0.0; BLOCK]; 5], largest: [zero; 4] });
         let mut next = || pointers.next().unwrap_or(std::ptr::null_mut());
         let (u, d) = (next(), next());
         let look = Look {
@@ -134,6 +136,7 @@ impl Survey {
             surprise: most(1),
             speed: most(2),
             imbalance: most(3),
+            power: sum(4),
         }
     }
 }
@@ -160,7 +163,7 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Look<'_, T, C> {
         at: usize,
         x: [V; 3],
         n: [V; 3],
-        _: &mut V,
+        _: &mut [V; 2],
     ) {
         // SAFETY: the fields have the layout; the sums as above.
         unsafe {
@@ -168,9 +171,10 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Look<'_, T, C> {
             let column = at - row * stride;
             let Forces { terms, field, part, pull } = self.forces;
             let force = applied::force_on::<V, 1>(terms, field, row, column, stride);
+            let free = if self.free.is_null() { None } else { Some(V::load(self.free.add(at))) };
             let (part, pull) = (V::splat(T::of(part)), V::splat(T::of(pull)));
-            let (mut speed, mut place, mut vigour) =
-                (V::splat(T::default()), V::splat(T::default()), V::splat(T::default()));
+            let zero = V::splat(T::default());
+            let (mut speed, mut place, mut vigour, mut power) = (zero, zero, zero, zero);
             let mut most = [V::splat(T::default()); 4];
             for c in 0..3 {
                 let at = at + c * self.layout.plane;
@@ -185,10 +189,10 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Look<'_, T, C> {
                 speed = w.mul_add(w, speed);
                 vigour = vigour.add(self.scheme.vigour(x[c], d, n[c], &kept, force));
                 place = u.mul_add(u, place);
+                power = pushed.mul_add(d, power);
                 let mut short = n[c].minus(pull, u).add(pushed);
                 let mut place_of_rest = u;
-                if !self.free.is_null() {
-                    let free = V::load(self.free.add(at));
+                if let Some(free) = free {
                     (short, place_of_rest) = (short.mul(free), u.mul(free));
                 }
                 if self.rest {
@@ -203,6 +207,7 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Look<'_, T, C> {
             self.add(0, column, speed);
             self.add(1, column, place);
             self.add(3, column, vigour);
+            self.add(4, column, power);
             for (which, most) in most.into_iter().enumerate() {
                 let largest = (&raw mut (*self.sums.get()).largest[which]).cast::<T>().add(column % BLOCK);
                 V::load(largest).farther(most).store(largest);

@@ -18,7 +18,9 @@
 // Iterators over vectors are not always inlined, and then run without the instructions of their caller: ten times slower.
 #![allow(clippy::needless_range_loop)]
 
+use std::cell::RefCell;
 use std::ops::Range;
+use std::sync::Arc;
 
 use super::applied::{self, Term};
 use super::field::{BLOCK, Field, Layout, State};
@@ -39,7 +41,7 @@ pub(super) trait Stage<T: Real> {
     }
 
     /// `x`: displacements of the block of row `row` that begins at place `at`; `n`: the springs' forces on it. Adds to
-    /// `probe`, which the stage gets at the end.
+    /// `sums`, which the stage gets at the end.
     ///
     /// # Safety
     /// What the stage points to is as it promised.
@@ -49,7 +51,7 @@ pub(super) trait Stage<T: Real> {
         at: usize,
         x: [V; 3],
         n: [V; 3],
-        probe: &mut V,
+        sums: &mut [V; 2],
     );
 
     /// The energies of springs that begin in the block at `column`.
@@ -68,7 +70,7 @@ pub(super) trait Stage<T: Real> {
     ///
     /// # Safety
     /// As for `finish`.
-    unsafe fn end<V: Vector<Real = T>>(&self, _probe: V) {}
+    unsafe fn end<V: Vector<Real = T>>(&self, _sums: [V; 2]) {}
 }
 
 /// A sweep, ready to run at any width.
@@ -85,15 +87,6 @@ pub(super) struct Sweep<'a, T, S> {
 
 /// Rows of the carry: two of the row before, and two for flexion springs, which reach two rows on.
 const CARRY_ROWS: usize = 4;
-
-/// From a plane of the carry to the next.
-fn carry_plane(layout: &Layout) -> usize {
-    CARRY_ROWS * layout.stride + BLOCK
-}
-
-fn new_carry<T: Real>(layout: &Layout) -> Field<T> {
-    Field::of_length(3 * carry_plane(layout))
-}
 
 impl<T: Real, S: Stage<T>> Run<T> for Sweep<'_, T, S> {
     #[inline(always)]
@@ -138,9 +131,8 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
         // SAFETY: the caller's promise; offsets stay within rows + 1 rows and a block.
         unsafe {
             let Layout { rows, columns, stride, plane } = self.layout;
-            let carry_plane = carry_plane(&self.layout);
             let zero = V::splat(T::default());
-            let mut probe = zero;
+            let mut sums = [zero; 2];
             for strip in &self.over.strips {
                 // With the block to the left, whose springs pull at the first column.
                 let from = strip.columns.start.saturating_sub(V::LANES);
@@ -149,48 +141,42 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                     for row in 0..if FLEXION { CARRY_ROWS } else { 2 } {
                         for c in 0..3 {
                             for column in (from..to).step_by(V::LANES) {
-                                zero.store(self.carry.add(c * carry_plane + row * stride + column));
+                                zero.store(self.carry.add(c * plane + row * stride + column));
                             }
                         }
                     }
                 }
                 let mut ahead = excesses(self.x.add(strip.rows.start * stride + from), stride, plane);
                 for i in strip.rows.clone() {
-                    let under_way = (&mut ahead, &mut probe);
-                    // The usual row has a loop of its own, without what only others need.
-                    match (i + 1 < rows, !FLEXION && strip.whole && self.stage.is_lean(i)) {
-                        (true, true) => {
-                            self.row::<V, FLEXION, true, true>(flexion, i, from..to, strip.whole, under_way)
-                        }
-                        (true, false) => {
-                            self.row::<V, FLEXION, true, false>(flexion, i, from..to, strip.whole, under_way);
-                        }
-                        (false, _) => {
-                            self.row::<V, FLEXION, false, false>(flexion, i, from..to, strip.whole, under_way);
-                        }
+                    let (span, under_way) = (from..to, (&mut ahead, &mut sums));
+                    let lean = !FLEXION && self.stage.is_lean(i);
+                    // The usual rows have loops of their own, without what only others need.
+                    match (i + 1 < rows, strip.whole, lean) {
+                        (true, true, true) => self.row::<V, FLEXION, true, true, true>(flexion, i, span, under_way),
+                        (true, true, false) => self.row::<V, FLEXION, true, true, false>(flexion, i, span, under_way),
+                        (true, false, _) => self.row::<V, FLEXION, true, false, false>(flexion, i, span, under_way),
+                        (false, ..) => self.row::<V, FLEXION, false, false, false>(flexion, i, span, under_way),
                     }
                 }
             }
-            self.stage.end(probe);
+            self.stage.end(sums);
         }
     }
 
     /// Row `i`, which has a row below or not. The Qs are formed one block ahead, so that two blocks' chains of operations
     /// are under way at once.
     #[inline(always)]
-    unsafe fn row<V: Vector<Real = T>, const FLEXION: bool, const BELOW: bool, const LEAN: bool>(
+    unsafe fn row<V: Vector<Real = T>, const FLEXION: bool, const BELOW: bool, const WHOLE: bool, const LEAN: bool>(
         &self,
         flexion: &Kind<T>,
         i: usize,
         span: Range<usize>,
-        whole: bool,
-        (ahead, probe): (&mut [V; 4], &mut V),
+        (ahead, sums): (&mut [V; 4], &mut [V; 2]),
     ) {
         // SAFETY: as for `rows`.
         unsafe {
             let Layout { rows, columns, stride, plane } = self.layout;
             let Springs { structural, shear, .. } = self.springs;
-            let carry_plane = carry_plane(&self.layout);
             let x = self.x.add(i * stride);
             let zero = V::splat(T::default());
             let (down, diagonal) = (self.carry, self.carry.add(stride));
@@ -199,6 +185,7 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
             let full = V::first(V::LANES);
             let tail = V::first((columns - 1) % V::LANES);
             let (mut passed, mut passed_two) = ([zero; 3], [zero; 3]);
+            let span = if WHOLE { 0..columns.next_multiple_of(V::LANES) } else { span };
             let mut column = span.start;
             while column < span.end {
                 let mask = if column + V::LANES < columns { full } else { tail };
@@ -208,7 +195,7 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                 if BELOW || more {
                     *ahead = excesses(x.add(next), stride, plane);
                 }
-                let awake = LEAN || whole || self.over.is_awake(i, column);
+                let awake = WHOLE || self.over.is_awake(i, column);
                 let mut wr = structural.near(qr);
                 let (mut wd, mut wa, mut wb) = (zero, zero, zero);
                 if BELOW {
@@ -233,7 +220,7 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                 let (here, right) = (load::<V>(at, plane), load::<V>(at.add(1), plane));
                 let mut n = [zero; 3];
                 for c in 0..3 {
-                    let (down, diagonal) = (down.add(c * carry_plane + column), diagonal.add(c * carry_plane + column));
+                    let (down, diagonal) = (down.add(c * plane + column), diagonal.add(c * plane + column));
                     let r = right[c].sub(here[c]);
                     let fr = if c == 1 { wr.mul_add(r, wr) } else { wr.mul(r) };
                     if BELOW {
@@ -264,7 +251,7 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                     let fr = [w.mul(r[0]), w.mul_add(r[1], two), w.mul(r[2])];
                     let mut energy = if S::ENERGY { flexion.energy(q).keep(mask) } else { zero };
                     for c in 0..3 {
-                        let carried = two_down.add(c * carry_plane + column);
+                        let carried = two_down.add(c * plane + column);
                         n[c] = n[c].add(fr[c].sub(fr[c].shift_two(passed_two[c]))).sub(V::load(carried));
                         passed_two[c] = fr[c];
                     }
@@ -276,7 +263,7 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                         let fd = [w.mul_add(d[0], two), w.mul(d[1]), w.mul(d[2])];
                         for c in 0..3 {
                             n[c] = n[c].add(fd[c]);
-                            fd[c].store(two_down.add(c * carry_plane + column));
+                            fd[c].store(two_down.add(c * plane + column));
                         }
                         if S::ENERGY {
                             energy = energy.add(flexion.energy(q));
@@ -287,7 +274,7 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                     }
                 }
                 if awake {
-                    self.stage.finish::<V, LEAN>(i, i * stride + column, here, n, probe);
+                    self.stage.finish::<V, LEAN>(i, i * stride + column, here, n, sums);
                 }
                 column += V::LANES;
             }
@@ -348,9 +335,10 @@ pub(super) struct Bench<T> {
     width: Width,
     pub(super) layout: Layout,
     pub(super) springs: Springs<T>,
-    /// 1 where a point moves, 0 where it is fixed, if any is.
+    /// 1 where a point moves, 0 where it is fixed, if any is: one plane.
     pub(super) free: Option<Field<T>>,
-    carry: Field<T>,
+    /// Of the planes only the first rows are used: of the layout's length, they need no more registers for addresses.
+    carry: RefCell<Field<T>>,
     probe: [T; BLOCK],
     work: [T; BLOCK],
 }
@@ -358,17 +346,21 @@ pub(super) struct Bench<T> {
 impl<T: Real> Bench<T> {
     pub(super) fn new(lanes: Lanes, layout: Layout, springs: Springs<T>, fixed: &[usize]) -> Self {
         let free = (!fixed.is_empty()).then(|| {
-            let mut free = Field::zero(&layout);
+            let mut free = Field::of_length(layout.plane);
             free.fill(T::of(1.0));
-            for index in fixed {
-                for c in 0..3 {
-                    free[c * layout.plane + layout.place(*index)] = T::default();
-                }
-            }
+            fixed.iter().for_each(|index| free[layout.place(*index)] = T::default());
             free
         });
         let zero = [T::default(); BLOCK];
-        Bench { width: Width::of(lanes), layout, springs, free, carry: new_carry(&layout), probe: zero, work: zero }
+        Bench {
+            width: Width::of(lanes),
+            layout,
+            springs,
+            free,
+            carry: RefCell::new(Field::zero(&layout)),
+            probe: zero,
+            work: zero,
+        }
     }
 
     /// Advances every point with `scheme`; the tools' force is that of their fields from `field` on.
@@ -382,7 +374,7 @@ impl<T: Real> Bench<T> {
     ) {
         let mut kept = [std::ptr::null_mut(); MAX_KEPT];
         for (pointer, field) in kept.iter_mut().zip(&mut state.kept) {
-            *pointer = field.as_mut_ptr();
+            *pointer = Arc::make_mut(field).as_mut_ptr();
         }
         assert_eq!(state.kept.len(), C::KEPT);
         let u = state.u.as_mut_ptr();
@@ -399,7 +391,7 @@ impl<T: Real> Bench<T> {
             probe: self.probe.as_mut_ptr(),
             work: self.work.as_mut_ptr(),
         };
-        let carry = self.carry.as_mut_ptr();
+        let carry = self.carry.get_mut().as_mut_ptr();
         let sweep = Sweep { layout: self.layout, springs: &self.springs, x: u.cast_const(), carry, over, stage };
         // SAFETY: all fields have the layout's three planes, padded by a row and a block, and the tables are of this
         // layout; u is written behind what the sweep still reads, through the same pointer.
@@ -411,7 +403,7 @@ impl<T: Real> Bench<T> {
     /// # Safety
     /// `u` and the stage are of fields of this layout.
     pub(super) unsafe fn look<S: Stage<T>>(&self, u: *const T, over: &Region, stage: S) {
-        let mut carry = new_carry(&self.layout);
+        let mut carry = self.carry.borrow_mut();
         let sweep = Sweep { layout: self.layout, springs: &self.springs, x: u, carry: carry.as_mut_ptr(), over, stage };
         // SAFETY: as above.
         unsafe { lanes::run(self.width, &sweep) };
@@ -463,19 +455,24 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Advance<'_, T, C> {
         at: usize,
         x: [V; 3],
         n: [V; 3],
-        probe: &mut V,
+        sums: &mut [V; 2],
     ) {
         // SAFETY: the caller's promise.
         unsafe {
             let Layout { stride, plane, .. } = self.layout;
             let forced = !LEAN && self.forced.contains(&row);
             let column = at - row * stride;
+            let free = if LEAN || self.free.is_null() { None } else { Some(V::load(self.free.add(at))) };
             let mut force = [[V::splat(T::default()); 2]; 3];
-            let mut work = V::splat(T::default());
+            // A vector as wide as a block has each of its columns in a lane of its own.
+            let apart = V::LANES < BLOCK;
+            let mut work = sums[1];
             if forced {
-                work = V::load(self.work.add(column % BLOCK));
+                if apart {
+                    work = V::load(self.work.add(column % BLOCK));
+                }
                 if C::FORCES == 1 {
-                    force = applied::force_on::<V, 1>(self.terms, self.field, row, column, stride).map(|[f]| [f, f]);
+                    force = applied::force_on::<V, 1>(self.terms, self.field, row, column, stride);
                 } else {
                     force = applied::force_on::<V, 2>(self.terms, self.field, row, column, stride);
                 }
@@ -489,8 +486,7 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Advance<'_, T, C> {
                 }
                 let force = if forced { Some(force[c]) } else { None };
                 let (mut x, mut d) = self.scheme.advance(before[0], before[1], n[c], &mut kept, force);
-                if !LEAN && !self.free.is_null() {
-                    let free = V::load(self.free.add(at));
+                if let Some(free) = free {
                     (x, d) = (x.mul(free), d.mul(free));
                 }
                 x.store(self.u.add(at));
@@ -498,20 +494,27 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Advance<'_, T, C> {
                 for k in C::KEPT - C::WRITTEN..C::KEPT {
                     kept[k].store(self.kept[k].add(at));
                 }
-                *probe = d.mul_add(d, *probe);
+                sums[0] = d.mul_add(d, sums[0]);
                 if let Some([_, force]) = force {
                     work = force.mul_add(self.scheme.travel(before, [x, d]), work);
                 }
             }
-            if forced {
+            if forced && apart {
                 work.store(self.work.add(column % BLOCK));
+            } else {
+                sums[1] = work;
             }
         }
     }
 
     #[inline(always)]
-    unsafe fn end<V: Vector<Real = T>>(&self, probe: V) {
+    unsafe fn end<V: Vector<Real = T>>(&self, [probe, work]: [V; 2]) {
         // SAFETY: a block is as long as the widest vector.
-        unsafe { V::load(self.probe).add(probe).store(self.probe) }
+        unsafe {
+            V::load(self.probe).add(probe).store(self.probe);
+            if V::LANES == BLOCK {
+                work.store(self.work);
+            }
+        }
     }
 }

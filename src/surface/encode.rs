@@ -1,9 +1,11 @@
 //! Frames: the refined displacements as bytes, in patches small enough that other streams get in between.
+// Iterators over vectors are not always inlined, and then run without the instructions of their caller.
+#![allow(clippy::needless_range_loop)]
 
 use bytes::{Bytes, BytesMut};
 use glam::DVec3;
 
-use super::refine::{COMPONENTS, Rows, Source, Written};
+use super::refine::{COMPONENTS, Points, Rows, Source, Written};
 use super::wide::{LANES, Lanes, Width, Work};
 use super::{Refinement, Snapshot};
 
@@ -40,12 +42,50 @@ pub struct Frame {
     pub refinement: Refinement,
     /// How written.
     pub encoding: Encoding,
-    /// Middle of the bounding box for `I16`, else 0; m.
-    pub origin_m: DVec3,
-    /// Quantum for `I16`, else 1; m.
-    pub scale_m: DVec3,
-    /// Together all vertices.
+    /// What the integers of `I16` mean.
+    pub quanta: Quanta,
+    /// Whether every vertex is in the patches.
+    pub full: bool,
+    /// No vertex is in two.
     pub patches: Vec<Patch>,
+}
+
+/// A displacement is origin + scale·q, of each component; m.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Quanta {
+    /// Middle of the bounding box for `I16`, else 0.
+    pub origin_m: DVec3,
+    /// Quantum for `I16`, else 1.
+    pub scale_m: DVec3,
+}
+
+impl Default for Quanta {
+    fn default() -> Self {
+        Quanta { origin_m: DVec3::ZERO, scale_m: DVec3::ONE }
+    }
+}
+
+impl Quanta {
+    /// The finest that integers allow in a box, but none finer than `finest_m`. Values interpolated between those in
+    /// the box are within it too.
+    pub(super) fn over(box_m: &[[f32; 2]; COMPONENTS], finest_m: f64) -> Self {
+        let spans = box_m.map(|[low, high]| {
+            // A value of f32, which is what encodes; the box then reaches as far as its farther side.
+            let middle = 0.5 * low + 0.5 * high;
+            let quantum = f64::from((high - middle).max(middle - low)) / f64::from(i16::MAX);
+            (f64::from(middle), quantum.max(finest_m))
+        });
+        Quanta { origin_m: spans.map(|span| span.0).into(), scale_m: spans.map(|span| span.1).into() }
+    }
+
+    /// Some points to be written in quanta.
+    #[allow(clippy::cast_possible_truncation)]
+    pub(super) fn source<'v>(&self, points: Points<'v>) -> Source<'v> {
+        // Of a box without extent there is nothing but the middle.
+        let per_scale = |scale_m: f64| Some(scale_m.recip() as f32).filter(|per_scale| per_scale.is_finite());
+        let per_scale = self.scale_m.to_array().map(|scale_m| per_scale(scale_m).unwrap_or(0.0));
+        Source::new(points, self.origin_m.to_array().map(|v| v as f32), per_scale)
+    }
 }
 
 /// A rectangle of vertices.
@@ -62,22 +102,26 @@ pub struct Patch {
 impl Frame {
     /// A frame with its patches laid out, but without bytes.
     fn blank(refinement: Refinement, encoding: Encoding) -> Self {
-        let [vertices_x, vertices_y] = refinement.vertices();
-        // Whole rows, as many as fit; parts of a row where not even one does.
-        let vertices = PATCH_BYTES / encoding.bytes_per_vertex();
-        let columns_per_patch = vertices_y.min(vertices);
-        let rows_per_patch = (vertices / vertices_y).max(1);
-        let mut patches = Vec::new();
-        for x in (0..vertices_x).step_by(rows_per_patch) {
-            patches.extend((0..vertices_y).step_by(columns_per_patch).map(|y| Patch {
-                first: [x, y],
-                count: [rows_per_patch.min(vertices_x - x), columns_per_patch.min(vertices_y - y)],
-                bytes: Bytes::new(),
-            }));
-        }
-        let (origin_m, scale_m) = (DVec3::ZERO, DVec3::ONE);
-        Frame { step: 0, simulation_time_s: 0.0, refinement, encoding, origin_m, scale_m, patches }
+        let patches = lay_out([0, 0], refinement.vertices(), encoding);
+        Frame { step: 0, simulation_time_s: 0.0, refinement, encoding, quanta: Quanta::default(), full: true, patches }
     }
+}
+
+/// Patches without bytes for a rectangle of vertices.
+pub(super) fn lay_out(first: [usize; 2], [count_x, count_y]: [usize; 2], encoding: Encoding) -> Vec<Patch> {
+    // Whole rows, as many as fit; parts of a row where not even one does.
+    let vertices = PATCH_BYTES / encoding.bytes_per_vertex();
+    let columns_per_patch = count_y.min(vertices);
+    let rows_per_patch = (vertices / count_y).max(1);
+    let mut patches = Vec::new();
+    for x in (0..count_x).step_by(rows_per_patch) {
+        patches.extend((0..count_y).step_by(columns_per_patch).map(|y| Patch {
+            first: [first[0] + x, first[1] + y],
+            count: [rows_per_patch.min(count_x - x), columns_per_patch.min(count_y - y)],
+            bytes: Bytes::new(),
+        }));
+    }
+    patches
 }
 
 /// Refines and encodes `snapshot`, whose points are those of `refinement`.
@@ -85,36 +129,35 @@ pub fn encode(snapshot: &Snapshot, refinement: Refinement, encoding: Encoding) -
     encode_over(snapshot, Frame::blank(refinement, encoding))
 }
 
-/// Makes the next frame of the kind of `spent`, in its buffers where nobody else holds them: fresh memory costs more
-/// than what is written into it.
+/// Makes the next frame of the kind of `spent`, a full one, in its buffers where nobody else holds them: fresh memory
+/// costs more than what is written into it.
 pub fn encode_over(snapshot: &Snapshot, spent: Frame) -> Frame {
     encode_at(Width::widest(), snapshot, spent)
 }
 
-#[allow(clippy::cast_possible_truncation)]
 fn encode_at(width: Width, snapshot: &Snapshot, spent: Frame) -> Frame {
     let mut frame = Frame { step: snapshot.step, simulation_time_s: snapshot.simulation_time_s, ..spent };
     if frame.encoding == Encoding::I16 {
-        (frame.origin_m, frame.scale_m) = quantisation(&snapshot.box_m);
+        frame.quanta = Quanta::over(&snapshot.box_m, 0.0);
     }
-    let per_scale = |scale_m: f64| Some(scale_m.recip() as f32).filter(|per_scale| per_scale.is_finite());
-    let source = Source::new(
-        snapshot.displacement_m.each_ref().map(Vec::as_slice),
-        frame.origin_m.to_array().map(|v| v as f32),
-        frame.scale_m.to_array().map(|v| per_scale(v).unwrap_or(0.0)),
-    );
-    let (rows, patches) = (Rows::new(frame.refinement, source), &mut frame.patches);
-    match frame.encoding {
+    let grid = frame.refinement;
+    let mut rows = Rows::new(grid.between, grid.vertices()[1], frame.quanta.source(snapshot.points()));
+    fill(width, frame.encoding, &mut frame.patches, &mut rows);
+    frame
+}
+
+/// Refines and encodes the rows into the patches that were laid out for them.
+pub(super) fn fill(width: Width, encoding: Encoding, patches: &mut [Patch], rows: &mut Rows<'_>) {
+    match encoding {
         Encoding::F32 => width.run(Fill::<4> { patches, rows }),
         Encoding::I16 => width.run(Fill::<2> { patches, rows }),
     }
-    frame
 }
 
 /// Writes all rows into the patches, `BYTES` a component.
 struct Fill<'f, 'v, const BYTES: usize> {
     patches: &'f mut [Patch],
-    rows: Rows<'v>,
+    rows: &'f mut Rows<'v>,
 }
 
 impl<const BYTES: usize> Work for Fill<'_, '_, BYTES>
@@ -123,7 +166,8 @@ where
 {
     #[inline(always)]
     fn work<L: Lanes>(self) {
-        let Fill { patches, mut rows } = self;
+        let Fill { patches, rows } = self;
+        let [first_x, first_y] = patches.first().map_or([0, 0], |patch| patch.first);
         let mut parted = Vec::new();
         for band in patches.chunk_by_mut(|a, b| a.first[0] == b.first[0]) {
             let ([x, _], rows_of_band) = (band[0].first, band[0].count[0]);
@@ -131,15 +175,16 @@ where
                 let row_bytes = COMPONENTS * BYTES * patch.count[1];
                 let mut bytes = patch.buffer(rows_of_band * row_bytes);
                 for (a, row) in bytes.chunks_exact_mut(row_bytes).enumerate() {
-                    rows.write::<L, _>(x + a, row.as_chunks_mut::<BYTES>().0);
+                    rows.write::<L, _>(x - first_x + a, row.as_chunks_mut::<BYTES>().0);
                 }
                 patch.bytes = bytes.freeze();
             } else {
                 // One row, in parts.
                 parted.resize(COMPONENTS * band.iter().map(|patch| patch.count[1]).sum::<usize>(), [0; BYTES]);
-                rows.write::<L, _>(x, &mut parted);
+                rows.write::<L, _>(x - first_x, &mut parted);
                 for patch in band {
-                    let part = parted[COMPONENTS * patch.first[1]..][..COMPONENTS * patch.count[1]].as_flattened();
+                    let part =
+                        parted[COMPONENTS * (patch.first[1] - first_y)..][..COMPONENTS * patch.count[1]].as_flattened();
                     let mut bytes = patch.buffer(part.len());
                     bytes.copy_from_slice(part);
                     patch.bytes = bytes.freeze();
@@ -156,16 +201,6 @@ impl Patch {
         bytes.resize(length, 0);
         bytes
     }
-}
-
-/// Middle and quantum of a box. Values interpolated between those in it are within it too.
-fn quantisation(box_m: &[[f32; 2]; COMPONENTS]) -> (DVec3, DVec3) {
-    let spans = box_m.map(|[low, high]| {
-        // A value of f32, which is what encodes; the box then reaches as far as its farther side.
-        let middle = 0.5 * low + 0.5 * high;
-        (f64::from(middle), f64::from((high - middle).max(middle - low)) / f64::from(i16::MAX))
-    });
-    (DVec3::from_array(spans.map(|span| span.0)), DVec3::from_array(spans.map(|span| span.1)))
 }
 
 /// The least and the greatest of some values.
@@ -216,7 +251,7 @@ mod tests {
 
     fn snapshot() -> Snapshot {
         let wave = |k: usize, c: usize| ((k * (c + 3)) as f32 * 0.37).sin() * 10_f32.powi(-(c as i32));
-        Snapshot::new(7, 0.007, std::array::from_fn(|c| (0..31 * 17).map(|k| wave(k, c)).collect()))
+        Snapshot::new(7, 0.007, [31, 17], std::array::from_fn(|c| (0..31 * 17).map(|k| wave(k, c)).collect()))
     }
 
     /// Every vertex of a frame, decoded as a client does.
@@ -230,7 +265,7 @@ mod tests {
                 Encoding::I16 => vertices.extend(patch.bytes.as_chunks::<6>().0.iter().map(|v| {
                     std::array::from_fn(|c| {
                         let q = i16::from_le_bytes(v[2 * c..2 * c + 2].try_into().unwrap());
-                        frame.origin_m[c] + frame.scale_m[c] * f64::from(q)
+                        frame.quanta.origin_m[c] + frame.quanta.scale_m[c] * f64::from(q)
                     })
                 })),
             }
@@ -252,7 +287,11 @@ mod tests {
                 for c in 0..3 {
                     let error = (a[c] - b[c]).abs();
                     // Half a quantum, and what f32 loses in between.
-                    assert!(error <= 0.5 * coarse.scale_m[c] * 1.02, "{error} against {}", coarse.scale_m[c]);
+                    assert!(
+                        error <= 0.5 * coarse.quanta.scale_m[c] * 1.02,
+                        "{error} against {}",
+                        coarse.quanta.scale_m[c]
+                    );
                 }
             }
         }
@@ -304,7 +343,7 @@ mod tests {
                 let plain = at(Width::Plain);
                 for width in Width::ALL.into_iter().filter(|width| width.is_available()) {
                     let frame = at(width);
-                    assert_eq!((frame.origin_m, frame.scale_m), (plain.origin_m, plain.scale_m));
+                    assert_eq!(frame.quanta, plain.quanta);
                     for (patch, plain) in frame.patches.iter().zip(&plain.patches) {
                         assert!(patch.bytes == plain.bytes, "{width:?}, n = {n}, {encoding:?}");
                     }
@@ -321,7 +360,7 @@ mod tests {
             let (held, place) = (first.patches[0].bytes.clone(), first.patches[1].bytes.as_ptr());
             let before = held.to_vec();
             let moved = snapshot().displacement_m.map(|values| values.into_iter().map(|v| 1.0 - 2.0 * v).collect());
-            let moved = Snapshot::new(8, 0.008, moved);
+            let moved = Snapshot::new(8, 0.008, [31, 17], moved);
             let second = encode_over(&moved, first);
             assert_eq!((second.patches[1].bytes.as_ptr(), held), (place, before.into()));
             assert_eq!(decode(&second), decode(&encode(&moved, grid, encoding)));
@@ -345,7 +384,7 @@ mod tests {
     #[test]
     fn a_long_row_is_split_too() {
         let displacement_m = std::array::from_fn(|c| (0..40_000).map(|k| (k + c) as f32).collect());
-        let snapshot = Snapshot::new(0, 0.0, displacement_m);
+        let snapshot = Snapshot::new(0, 0.0, [2, 20_000], displacement_m);
         let grid = Refinement::new([2, 20_000], 0, &Limits::default()).unwrap();
         let frame = encode(&snapshot, grid, Encoding::F32);
         assert!(frame.patches.iter().all(|patch| patch.bytes.len() <= PATCH_BYTES));
@@ -362,7 +401,7 @@ mod tests {
 
     #[test]
     fn a_still_tissue_is_encoded_exactly() {
-        let still = Snapshot::new(0, 0.0, std::array::from_fn(|c| vec![c as f32 * 0.25; 9]));
+        let still = Snapshot::new(0, 0.0, [3, 3], std::array::from_fn(|c| vec![c as f32 * 0.25; 9]));
         let grid = Refinement::new([3, 3], 1, &Limits::default()).unwrap();
         for vertex in decode(&encode(&still, grid, Encoding::I16)) {
             assert_eq!(vertex, [0.0, 0.25, 0.5]);

@@ -1,5 +1,7 @@
 //! Refinement (the paper's bilinear interpolation): n vertices between neighbouring points, so that a side of m
 //! points has M = (m − 1)·n + m vertices.
+// Iterators over vectors are not always inlined, and then run without the instructions of their caller.
+#![allow(clippy::needless_range_loop)]
 
 use super::wide::{LANES, Lanes};
 use crate::limits::Limits;
@@ -105,26 +107,45 @@ impl Written for [u8; 2] {
 /// What is refined: displacements of points, and how they become quanta, (v − origin)·per_scale.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Source<'v> {
-    /// x, y and z apart, points along y beside each other.
-    pub(super) values: [&'v [f32]; COMPONENTS],
+    points: Points<'v>,
     /// In each lane the same: what the compiler knows to be so, it shuffles.
     origin: [[f32; LANES]; COMPONENTS],
     per_scale: [[f32; LANES]; COMPONENTS],
 }
 
-impl<'v> Source<'v> {
-    pub(super) fn new(values: [&'v [f32]; 3], origin: [f32; 3], per_scale: [f32; 3]) -> Self {
-        Source { values, origin: origin.map(|v| [v; LANES]), per_scale: per_scale.map(|v| [v; LANES]) }
+/// A rectangle of points.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Points<'v> {
+    /// x, y and z apart, points along y beside each other, the first one first.
+    pub(super) values: [&'v [f32]; COMPONENTS],
+    /// From a point to the next along x.
+    pub(super) stride: usize,
+    /// Along x and y.
+    pub(super) count: [usize; 2],
+}
+
+impl<'v> Points<'v> {
+    /// Row `i` of component `c`.
+    #[inline(always)]
+    pub(super) fn row(&self, c: usize, i: usize) -> &'v [f32] {
+        &self.values[c][i * self.stride..][..self.count[1]]
     }
 }
 
-/// The rows of vertices of one frame, from the first to the last.
+impl<'v> Source<'v> {
+    pub(super) fn new(points: Points<'v>, origin: [f32; 3], per_scale: [f32; 3]) -> Self {
+        Source { points, origin: origin.map(|v| [v; LANES]), per_scale: per_scale.map(|v| [v; LANES]) }
+    }
+}
+
+/// The rows of vertices between some points, from the first to the last.
 ///
 /// Points become quanta before they are refined: there are fewer of them than vertices. Interpolation along y costs
 /// permutations, interpolation along x does not; so rows of points are refined along y, and rows of vertices are mixed
 /// from them.
 pub(super) struct Rows<'v> {
-    grid: Refinement,
+    /// Vertices for each point, but for the last.
+    cells: usize,
     source: Source<'v>,
     /// The rows of points on either side of the row of vertices, refined along y, in whole periods of `spread`.
     near: Vec<Block<f32>>,
@@ -151,22 +172,29 @@ struct Spread {
 }
 
 impl<'v> Rows<'v> {
-    pub(super) fn new(grid: Refinement, source: Source<'v>) -> Self {
-        let cells = grid.between + 1;
-        let periods = if cells == 1 { 0 } else { grid.points[1].div_ceil(LANES) };
+    /// Rows of at most `most` vertices, `between` of them between neighbouring points.
+    pub(super) fn new(between: usize, most: usize, source: Source<'v>) -> Self {
+        let cells = between + 1;
+        let periods = if cells == 1 { 0 } else { most.div_ceil(cells * LANES) };
         let [near, far] = [(); 2].map(|()| vec![Block([0.0; LANES]); periods * COMPONENTS * cells]);
         let points = vec![0.0; (periods + 1) * COMPONENTS * LANES];
         let spread = (0..COMPONENTS * cells).map(|block| Spread::new(cells, block)).collect();
-        Rows { grid, source, near, far, points, spread }
+        Rows { cells, source, near, far, points, spread }
     }
 
-    /// Writes row `a`, three components a vertex. Rows are asked for one after the other, from 0.
+    /// Goes on with the rows between other points.
+    pub(super) fn turn_to(&mut self, source: Source<'v>) {
+        self.source = source;
+    }
+
+    /// Writes row `a`, three components a vertex, as many as there is room for. Rows are asked for one after the other,
+    /// from 0.
     #[inline(always)]
     #[allow(clippy::cast_precision_loss)]
     pub(super) fn write<L: Lanes, W: Written>(&mut self, a: usize, row: &mut [W]) {
-        let cells = self.grid.between + 1;
+        let cells = self.cells;
         if cells == 1 {
-            return weave::<L, W>(&self.source, a * self.grid.points[1], row);
+            return weave::<L, W>(&self.source, a, row);
         }
         let (i, k) = (a / cells, a % cells);
         match k {
@@ -190,8 +218,7 @@ impl<'v> Rows<'v> {
     /// Brings row `i` of the points into `far`.
     #[inline(always)]
     fn load<L: Lanes>(&mut self, i: usize) {
-        let columns = self.grid.points[1];
-        weave::<L, f32>(&self.source, i * columns, &mut self.points[..COMPONENTS * columns]);
+        weave::<L, f32>(&self.source, i, &mut self.points[..COMPONENTS * self.source.points.count[1]]);
         for (period, row) in self.far.chunks_exact_mut(self.spread.len()).enumerate() {
             let points = &self.points[period * COMPONENTS * LANES..];
             for (spread, vertices) in self.spread.iter().zip(row) {
@@ -218,13 +245,12 @@ impl Spread {
     }
 }
 
-/// The points from `first` on in quanta, one after the other, as many as `row` has room for.
+/// The points of row `i` in quanta, one after the other, as many as `row` has room for.
 #[inline(always)]
-fn weave<L: Lanes, W: Written>(source: &Source<'_>, first: usize, row: &mut [W]) {
+fn weave<L: Lanes, W: Written>(source: &Source<'_>, i: usize, row: &mut [W]) {
     let row = row.as_chunks_mut::<COMPONENTS>().0;
-    let count = row.len();
-    let [x, y, z] = &source.values;
-    let values = [&x[first..][..count], &y[first..][..count], &z[first..][..count]];
+    let (count, points) = (row.len(), &source.points);
+    let values = [&points.row(0, i)[..count], &points.row(1, i)[..count], &points.row(2, i)[..count]];
     if count < LANES {
         let mut padded = [[0.0; LANES]; COMPONENTS];
         for c in 0..COMPONENTS {
@@ -305,9 +331,9 @@ mod tests {
 
     /// All rows of one component.
     fn refine(grid: Refinement, values: &[f32]) -> Vec<Vec<f32>> {
-        let source = Source::new([values; COMPONENTS], [0.0; COMPONENTS], [1.0; COMPONENTS]);
-        let mut rows = Rows::new(grid, source);
+        let points = Points { values: [values; COMPONENTS], stride: grid.points[1], count: grid.points };
         let [x, y] = grid.vertices();
+        let mut rows = Rows::new(grid.between, y, Source::new(points, [0.0; COMPONENTS], [1.0; COMPONENTS]));
         let row = |a| {
             let mut row = vec![[0; 4]; COMPONENTS * y];
             rows.write::<Plain, _>(a, &mut row);

@@ -5,6 +5,7 @@
 //! `#[inline(always)]` and uses neither iterators nor closures over lanes. This is the only file of the room with
 //! unsafe code: an instruction must exist on the processor, which [`Width::run`] makes sure of.
 #![allow(unsafe_code)]
+#![allow(clippy::needless_range_loop)]
 
 /// How many.
 pub(super) const LANES: usize = 16;

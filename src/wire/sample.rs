@@ -11,6 +11,7 @@ use crate::scene::record::{EnergyJ, Point, Record};
 use crate::session::ToolSample;
 use crate::session::sampling::{Deadband, HEARTBEAT_S, Sampling};
 use crate::surface::Encoding;
+use crate::surface::encode::Patch;
 
 /// Which samples a stream asks for.
 pub fn sampling(
@@ -194,13 +195,15 @@ pub fn session(live: &Arc<Live>) -> pb::Session {
     }
 }
 
+/// Bytes of displacements in one message: those of other streams wait no longer than one of these takes.
+const FRAME_BYTES_PER_MESSAGE: usize = 64 << 10;
+
 /// The messages of a frame for one viewer.
 pub fn frame(viewer_id: &str, delivery: &Delivery, skipped: u64) -> Vec<pb::WatchFramesResponse> {
     let frame = &delivery.frame;
     let [vertices_x, vertices_y] = frame.refinement.vertices();
-    let count = frame.patches.len();
     #[allow(clippy::cast_possible_truncation)]
-    let message = |(index, patch): (usize, &crate::surface::encode::Patch)| pb::WatchFramesResponse {
+    let message = || pb::WatchFramesResponse {
         viewer_id: viewer_id.to_owned(),
         frame_id: delivery.frame_id,
         step: frame.step,
@@ -213,20 +216,40 @@ pub fn frame(viewer_id: &str, delivery: &Delivery, skipped: u64) -> Vec<pb::Watc
             Encoding::I16 => pb::Encoding::I16,
         }
         .into(),
-        origin_m: vector(frame.origin_m),
-        scale_m: vector(frame.scale_m),
-        full: true,
+        origin_m: vector(frame.quanta.origin_m),
+        scale_m: vector(frame.quanta.scale_m),
+        full: frame.full,
         skipped_frames: skipped,
         overrun_count: delivery.overrun_count,
         time_dilation: delivery.time_dilation,
-        patches: vec![pb::Patch {
-            first_x: patch.first[0] as u32,
-            first_y: patch.first[1] as u32,
-            count_x: patch.count[0] as u32,
-            count_y: patch.count[1] as u32,
-            displacement: patch.bytes.clone(),
-        }],
-        last: index + 1 == count,
+        patches: Vec::new(),
+        last: false,
     };
-    frame.patches.iter().enumerate().map(message).collect()
+    let mut messages: Vec<pb::WatchFramesResponse> = Vec::new();
+    let mut room = 0;
+    for patch in &frame.patches {
+        if messages.is_empty() || patch.bytes.len() > room {
+            messages.push(message());
+            room = FRAME_BYTES_PER_MESSAGE;
+        }
+        room -= patch.bytes.len().min(room);
+        if let Some(message) = messages.last_mut() {
+            message.patches.push(self::patch(patch));
+        }
+    }
+    if let Some(last) = messages.last_mut() {
+        last.last = true;
+    }
+    messages
+}
+
+#[allow(clippy::cast_possible_truncation)]
+fn patch(patch: &Patch) -> pb::Patch {
+    pb::Patch {
+        first_x: patch.first[0] as u32,
+        first_y: patch.first[1] as u32,
+        count_x: patch.count[0] as u32,
+        count_y: patch.count[1] as u32,
+        displacement: patch.bytes.clone(),
+    }
 }
