@@ -109,8 +109,8 @@ impl Written for [u8; 2] {
 pub(super) struct Source<'v> {
     points: Points<'v>,
     /// In each lane the same: what the compiler knows to be so, it shuffles.
-    origin: [[f32; LANES]; COMPONENTS],
-    per_scale: [[f32; LANES]; COMPONENTS],
+    origin: [Block<f32>; COMPONENTS],
+    per_scale: [Block<f32>; COMPONENTS],
 }
 
 /// A rectangle of points.
@@ -134,7 +134,7 @@ impl<'v> Points<'v> {
 
 impl<'v> Source<'v> {
     pub(super) fn new(points: Points<'v>, origin: [f32; 3], per_scale: [f32; 3]) -> Self {
-        Source { points, origin: origin.map(|v| [v; LANES]), per_scale: per_scale.map(|v| [v; LANES]) }
+        Source { points, origin: origin.map(|v| Block([v; LANES])), per_scale: per_scale.map(|v| Block([v; LANES])) }
     }
 }
 
@@ -156,7 +156,7 @@ pub(super) struct Rows<'v> {
 }
 
 /// Lies in one cache line: a load across two costs twice as much.
-#[derive(Clone, Copy)]
+#[derive(Debug, Clone, Copy)]
 #[repr(align(64))]
 struct Block<T>([T; LANES]);
 
@@ -280,7 +280,7 @@ impl Source<'_> {
     fn weave<L: Lanes, W: Written>(&self, xyz: [&[f32; LANES]; COMPONENTS], to: &mut [[W; COMPONENTS]; LANES]) {
         let mut quanta = [L::splat(0.0); COMPONENTS];
         for c in 0..COMPONENTS {
-            quanta[c] = L::load(xyz[c]).sub(L::load(&self.origin[c])).mul(L::load(&self.per_scale[c]));
+            quanta[c] = L::load(xyz[c]).sub(L::load(&self.origin[c].0)).mul(L::load(&self.per_scale[c].0));
         }
         if let Some(to) = to.as_flattened_mut().as_chunks_mut().0.first_chunk_mut() {
             W::weave(quanta, to);
