@@ -130,6 +130,11 @@ impl Viewer {
         self.deliver(job, frame_id, Arc::new(tiles.newer_than(since)), since);
     }
 
+    /// So many frames were due in which nothing had changed.
+    pub(super) fn count_unchanged(&self, frames: u64) {
+        lock(&self.progress).unchanged += frames;
+    }
+
     /// The stream has gone.
     pub fn is_gone(&self) -> bool {
         self.writer.is_abandoned()

@@ -36,6 +36,8 @@ pub(super) struct ViewTap {
     pub(super) viewer: Arc<Viewer>,
     /// Steps done at the newest frame that was posted for it.
     pub(super) shown: u64,
+    /// The newest frame whose time has passed.
+    pub(super) passed: u64,
 }
 
 impl ViewTap {
@@ -44,6 +46,14 @@ impl ViewTap {
         let number = |step| self.viewer.frame_id(step, rate_hz);
         let is_due = step >= self.earliest(still_since, rate_hz) && number(step) != number(step.saturating_sub(1));
         is_due.then(|| number(step))
+    }
+
+    /// Step `step` is done: what frames had their time since the last call, at rest, were of what had been shown. `is_due`:
+    /// that of this step is not one of them.
+    pub(super) fn pass(&mut self, step: u64, is_due: bool, rate_hz: f64) {
+        let newest = self.viewer.frame_id(step, rate_hz);
+        self.viewer.count_unchanged(newest.saturating_sub(self.passed + u64::from(is_due)));
+        self.passed = self.passed.max(newest);
     }
 
     /// A still tissue is shown once, at the next frame's time, and then every second: a viewer may have missed it.

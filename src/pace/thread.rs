@@ -277,7 +277,7 @@ impl Running {
                 // Who joins late gets a full frame first.
                 let frame_id = viewer.frame_id(step, self.live.model.scene.stepping.rate_hz);
                 self.post(encoder, vec![(viewer.clone(), frame_id)]);
-                self.taps.viewers.push(ViewTap { viewer, shown: step });
+                self.taps.viewers.push(ViewTap { viewer, shown: step, passed: frame_id });
             }
             Request::Hash { at, reply } => {
                 let at = at.unwrap_or(step);
@@ -425,7 +425,9 @@ impl Running {
         let held = self.session.hold_reason().is_some();
         let due_frame = |tap: &mut ViewTap| {
             let last = held.then(|| tap.viewer.frame_id(step, rate_hz));
-            let frame_id = last.or_else(|| tap.due(step, still_since, rate_hz))?;
+            let due = last.or_else(|| tap.due(step, still_since, rate_hz));
+            tap.pass(step, due.is_some(), rate_hz);
+            let frame_id = due?;
             tap.shown = step;
             tap.viewer.has_credit().then(|| (tap.viewer.clone(), frame_id))
         };

@@ -247,28 +247,51 @@ const INVERSE_FACTORIALS: [f64; 14] = {
     series
 };
 
-/// The force on a block, component by component: of `FIELDS` fields, beginning with `first`; if it is one, twice.
+/// A term as a sweep sees it: pointers and numbers, nothing to check.
+#[derive(Clone, Copy)]
+pub(super) struct Pull<T> {
+    /// Where the factors of row 0 would be.
+    factors: *const T,
+    from: usize,
+    to: usize,
+    /// Of one field and, if there is another, the next.
+    forces: [[T; 3]; 2],
+}
+
+impl<T: Real> Pull<T> {
+    pub(super) fn none() -> Self {
+        Pull { factors: std::ptr::null(), from: 0, to: 0, forces: [[T::default(); 3]; 2] }
+    }
+}
+
+impl<T: Real> Term<T> {
+    /// Its fields from `field` on.
+    pub(super) fn pull(&self, field: usize, stride: usize) -> Pull<T> {
+        let factors = self.factors.as_ptr().wrapping_sub(self.rows.start * stride);
+        let forces = [self.forces[field], self.forces[(field + 1).min(2)]];
+        Pull { factors, from: self.rows.start, to: self.rows.end, forces }
+    }
+}
+
+/// The force on a block, component by component: of `FIELDS` fields; if it is one, twice.
 ///
 /// # Safety
-/// The tables are of the sheet that the block is of.
+/// The tables are of the sheet that the block is of, and still there.
 #[inline(always)]
 pub(super) unsafe fn force_on<V: Vector, const FIELDS: usize>(
-    terms: &[Term<V::Real>],
-    first: usize,
+    pulls: &[Pull<V::Real>],
     row: usize,
-    column: usize,
-    stride: usize,
+    at: usize,
 ) -> [[V; 2]; 3] {
     let mut sum = [[V::splat(V::Real::default()); 2]; 3];
-    for term in terms {
-        if row < term.rows.start || row >= term.rows.end {
-            continue;
-        }
-        // SAFETY: the caller's promise.
-        let factor = unsafe { V::load(term.factors.as_ptr().add((row - term.rows.start) * stride + column)) };
-        for c in 0..3 {
-            for f in 0..FIELDS {
-                sum[c][f] = V::splat(term.forces[first + f][c]).mul_add(factor, sum[c][f]);
+    for pull in pulls {
+        if row >= pull.from && row < pull.to {
+            // SAFETY: the caller's promise.
+            let factor = unsafe { V::load(pull.factors.wrapping_add(at)) };
+            for c in 0..3 {
+                for f in 0..FIELDS {
+                    sum[c][f] = V::splat(pull.forces[f][c]).mul_add(factor, sum[c][f]);
+                }
             }
         }
     }

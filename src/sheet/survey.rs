@@ -8,7 +8,7 @@
 
 use std::cell::UnsafeCell;
 
-use super::applied::{self, Term};
+use super::applied::{self, Pull, Term};
 use super::field::{BLOCK, Layout, State};
 use super::lanes::Vector;
 use super::real::Real;
@@ -68,6 +68,8 @@ struct Look<'a, T: Real, C> {
     /// Brings what it looks at to rest; else nothing is written.
     rest: bool,
     forces: Forces<'a, T>,
+    /// The same tools, as the sweep sees them.
+    pulls: &'a [Pull<T>],
     free: *const T,
     sums: &'a UnsafeCell<Sums<T>>,
 }
@@ -108,6 +110,8 @@ impl Survey {
     ) -> Survey {
         let zero = [T::default(); BLOCK];
         let sums = UnsafeCell::new(Sums { row: [zero; 5], total: [[0.0; BLOCK]; 5], largest: [zero; 4] });
+        let pull = |term: &Term<T>| term.pull(forces.field, bench.layout.stride);
+        let pulls: Vec<Pull<T>> = forces.terms.iter().map(pull).collect();
         let mut next = || pointers.next().unwrap_or(std::ptr::null_mut());
         let (u, d) = (next(), next());
         let look = Look {
@@ -118,6 +122,7 @@ impl Survey {
             kept: std::array::from_fn(|_| next()),
             rest,
             forces,
+            pulls: &pulls,
             free: bench.free.as_ref().map_or(std::ptr::null(), |free| free.as_ptr()),
             sums: &sums,
         };
@@ -169,8 +174,8 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Look<'_, T, C> {
         unsafe {
             let stride = self.layout.stride;
             let column = at - row * stride;
-            let Forces { terms, field, part, pull } = self.forces;
-            let force = applied::force_on::<V, 1>(terms, field, row, column, stride);
+            let Forces { terms, part, pull, .. } = self.forces;
+            let force = applied::force_on::<V, 1>(self.pulls, row, at);
             let free = if self.free.is_null() { None } else { Some(V::load(self.free.add(at))) };
             let (part, pull) = (V::splat(T::of(part)), V::splat(T::of(pull)));
             let zero = V::splat(T::default());

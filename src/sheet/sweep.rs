@@ -22,7 +22,7 @@ use std::cell::RefCell;
 use std::ops::Range;
 use std::sync::Arc;
 
-use super::applied::{self, Term};
+use super::applied::{self, Pull, Term};
 use super::field::{BLOCK, Field, Layout, State};
 use super::lanes::{self, Run, Vector, Width};
 use super::real::Real;
@@ -326,6 +326,9 @@ pub(super) trait Scheme<T: Real> {
     }
 }
 
+/// Forces of tools that are usual at most.
+const FEW: usize = 4;
+
 /// Most fields that any scheme keeps beside u and d.
 pub(super) const MAX_KEPT: usize = 5;
 
@@ -377,6 +380,16 @@ impl<T: Real> Bench<T> {
             *pointer = Arc::make_mut(field).as_mut_ptr();
         }
         assert_eq!(state.kept.len(), C::KEPT);
+        // Few tools' forces need no memory from the heap.
+        let (mut few, mut many) = ([Pull::none(); FEW], Vec::new());
+        let pull = |term: &Term<T>| term.pull(field, self.layout.stride);
+        let pulls: &[Pull<T>] = if terms.len() <= FEW {
+            few.iter_mut().zip(terms).for_each(|(to, term)| *to = pull(term));
+            &few[..terms.len()]
+        } else {
+            many.extend(terms.iter().map(pull));
+            &many
+        };
         let u = state.u.as_mut_ptr();
         let stage = Advance {
             layout: self.layout,
@@ -384,8 +397,7 @@ impl<T: Real> Bench<T> {
             u,
             d: state.d.as_mut_ptr(),
             kept,
-            terms,
-            field,
+            pulls,
             forced: applied::rows(terms),
             free: self.free.as_ref().map_or(std::ptr::null(), |free| free.as_ptr()),
             probe: self.probe.as_mut_ptr(),
@@ -431,9 +443,8 @@ struct Advance<'a, T: Real, C> {
     u: *mut T,
     d: *mut T,
     kept: [*mut T; MAX_KEPT],
-    /// The tools' forces, from their field `field` on, in rows `forced`.
-    terms: &'a [Term<T>],
-    field: usize,
+    /// The tools' forces, in rows `forced`.
+    pulls: &'a [Pull<T>],
     forced: Range<usize>,
     /// 1 where a point moves, 0 where it is fixed; null if none is.
     free: *const T,
@@ -472,9 +483,9 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Advance<'_, T, C> {
                     work = V::load(self.work.add(column % BLOCK));
                 }
                 if C::FORCES == 1 {
-                    force = applied::force_on::<V, 1>(self.terms, self.field, row, column, stride);
+                    force = applied::force_on::<V, 1>(self.pulls, row, at);
                 } else {
-                    force = applied::force_on::<V, 2>(self.terms, self.field, row, column, stride);
+                    force = applied::force_on::<V, 2>(self.pulls, row, at);
                 }
             }
             for c in 0..3 {
