@@ -2,7 +2,7 @@
 //! against the tolerance of `[sleep]`; truth is the same run with everything awake. Writes
 //! docs/benchmarks/skip.{md,json,svg}. `-- --quick` measures the small sheets.
 
-#![allow(clippy::unwrap_used, clippy::cast_precision_loss, missing_docs)]
+#![allow(clippy::unwrap_used, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
 
 mod report;
 mod subject;

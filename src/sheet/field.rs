@@ -62,7 +62,9 @@ pub(super) struct State<T> {
 impl<T: Real> State<T> {
     pub(super) fn at_rest(layout: &Layout, kept: usize) -> Self {
         let zero = || Field::zero(layout);
-        State { u: zero(), d: zero(), kept: vec![Arc::new(zero()); kept] }
+        // The past of rest is the same at all times: one in memory, until it is written to.
+        let past = Arc::new(zero());
+        State { u: zero(), d: zero(), kept: vec![past; kept] }
     }
 
     /// All of it.
