@@ -202,7 +202,8 @@ fn a_sheet_that_wrinkles_stays_bounded() {
 #[test]
 #[ignore = "ten million steps: make stress"]
 fn ten_million_steps_end_where_they_should() {
-    let scene = scene_with(SMALL, &["stepping.precision=auto"]);
+    // Every step is to be computed: nothing may sleep.
+    let scene = scene_with(SMALL, &["stepping.precision=auto", "sleep.tolerance=0"]);
     let mut tissue = sheet::at_rest(&model(&scene));
     tissue.push(0, Some(common::push_on(&scene, [3, 2], [0.1, 0.0, -0.3])));
     let mut settled = None;
