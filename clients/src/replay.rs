@@ -337,6 +337,7 @@ async fn play(
         sample_every_steps: None,
         lease_s: Some(SILENCE.as_secs_f64()),
         holder: "palpate-client replay".to_owned(),
+        ..Default::default()
     };
     streamer.say(Say::Open(open)).await?;
     let mut touch = haptics.touch(ReceiverStream::new(messages)).await.map_err(refused_or_failed)?.into_inner();

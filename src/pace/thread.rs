@@ -4,6 +4,7 @@
 //! behind beyond that is dropped from its schedule, and counted. Simulated time then runs slower than real time.
 
 use std::collections::VecDeque;
+use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -13,13 +14,18 @@ use super::clock::now_ns;
 use super::frames::{Encoder, Job, Viewer};
 use super::queue::{Writer, lock};
 use super::{Live, PacedRecord, PacedSample, State};
+use crate::haptics::Law;
 use crate::refusal::{Reason, Refusal, Result};
 use crate::session::Session;
 use crate::session::command::Due;
+use crate::session::local::{Modeller, Refinement};
 use crate::surface::Snapshot;
 
 /// Steps that a session may be behind before the rest is dropped.
 const CATCH_UP_STEPS: f64 = 2.0;
+
+/// How often the stiffness under tools is computed anew, Hz.
+const REFINED_HZ: f64 = 50.0;
 
 /// Over which time dilation is measured.
 const DILATION_WINDOW_NS: u64 = 1_000_000_000;
@@ -35,6 +41,7 @@ pub(super) enum Request {
     Samples(SampleTap),
     Probe(ProbeTap),
     View(Arc<Viewer>),
+    LookAhead { tool: u32, law: Arc<Law> },
     Hash { at: Option<u64>, reply: HashReply },
     Delete(Refusal),
 }
@@ -126,7 +133,7 @@ impl Taps {
 }
 
 /// The thread's work.
-pub(super) fn work(inbox: &Inbox, encoder: &Encoder) {
+pub(super) fn work(inbox: &Inbox, encoder: &Encoder, refiner: &SyncSender<Refinement>) {
     // The default slack of 50 µs would be the larger part of each step's lateness. Where it can't be set, so be it.
     #[cfg(target_os = "linux")]
     let _ = rustix::thread::set_current_timer_slack(std::num::NonZeroU64::new(1));
@@ -161,7 +168,7 @@ pub(super) fn work(inbox: &Inbox, encoder: &Encoder) {
         if let Some(running) = earliest
             && running.deadline_ns() <= now_ns()
         {
-            running.step(encoder);
+            running.step(encoder, refiner);
         }
     }
 }
@@ -241,6 +248,7 @@ impl Running {
                     self.taps.samples.push(tap);
                 }
             }
+            Request::LookAhead { tool, law } => self.session.look_ahead_for(tool, Some(Modeller::new(law))),
             Request::Probe(tap) if self.session.hold_reason().is_some() => tap.writer.close(self.passed(0)),
             Request::Probe(tap) => self.taps.probes.push(tap),
             Request::View(viewer) => {
@@ -313,7 +321,7 @@ impl Running {
 
     /// One step, at its time or after it.
     #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    fn step(&mut self, encoder: &Encoder) {
+    fn step(&mut self, encoder: &Encoder, refiner: &SyncSender<Refinement>) {
         let now = now_ns();
         let behind = ((now - self.deadline_ns()) as f64 / self.period_ns).floor() - CATCH_UP_STEPS;
         let overrun = behind > 0.0;
@@ -361,6 +369,11 @@ impl Running {
         // The status first: who is told of this step may ask for it at once.
         self.publish_status();
         self.publish(encoder, overrun);
+        let every = (self.live.model.scene.stepping.rate_hz / REFINED_HZ).max(1.0) as u64;
+        if self.session.step_count().is_multiple_of(every) {
+            // What finds the refiner busy is left: the next is newer.
+            self.session.refinements().for_each(|refinement| drop(refiner.try_send(refinement)));
+        }
     }
 
     fn paced_sample(&self, tap: &SampleTap, overrun: bool) -> PacedSample {

@@ -1,6 +1,6 @@
 //! `HapticService`.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::pin::Pin;
 use std::sync::Arc;
 
@@ -10,11 +10,16 @@ use tonic::{Request, Response, Status, Streaming};
 use tracing::{debug, info};
 
 use super::House;
+use crate::haptics::Law;
+use crate::haptics::deadband::Deadband;
+use crate::haptics::device::{Device, UNDECLARED_FORCE_N};
 use crate::pace::clock::now_ns;
 use crate::pace::queue::{Reader, Writer, lock, queue};
 use crate::pace::{Live, PacedSample, StreamGuard, random_bits};
-use crate::refusal::{Reason, Refusal};
-use crate::session::command::LeaseId;
+use crate::refusal::{Reason, Refusal, number};
+use crate::scene::script::Action;
+use crate::session::Sample;
+use crate::session::command::{Command, LeaseId};
 use crate::wire::pb::haptic_service_server::HapticService;
 use crate::wire::{self, pb};
 
@@ -28,6 +33,7 @@ struct Opened {
     answer: pb::TouchOpened,
     samples: Reader<PacedSample>,
     guard: StreamGuard,
+    thrift: Option<Thrift>,
 }
 
 /// What a haptic stream is told besides samples.
@@ -46,6 +52,30 @@ struct Hold {
     live: Arc<Live>,
     lease: LeaseId,
     tools: usize,
+    device: Option<Device>,
+}
+
+/// Sends only what a client could tell apart from what it renders.
+struct Thrift {
+    law: Arc<Law>,
+    deadbands: BTreeMap<u32, Deadband>,
+    delta: f64,
+}
+
+impl Thrift {
+    /// Whether a sample is to be sent.
+    fn is_due(&mut self, sample: &Sample) -> bool {
+        let mut models = sample.tools.iter().filter_map(|tool| Some((tool.tool, tool.local.as_ref()?))).peekable();
+        // What has no model can't be foretold.
+        if models.peek().is_none() {
+            return true;
+        }
+        // All are asked: each keeps its own account of what was sent.
+        models.fold(false, |due, (tool, model)| {
+            let deadband = self.deadbands.entry(tool).or_insert_with(|| Deadband::new(self.delta));
+            deadband.is_due(model, &self.law, sample.simulation_time_s) || due
+        })
+    }
 }
 
 impl Drop for Hold {
@@ -62,22 +92,60 @@ fn lease_id(text: &str) -> Result<LeaseId, Refusal> {
     LeaseId::from_str_radix(text, 16).map_err(wrong)
 }
 
+/// A command, unless it leads the tool out of the declared workspace.
+fn within_reach(command: Command, live: &Live, device: Option<&Device>) -> Result<Command, Refusal> {
+    if let (Action::Lead { place_m, .. }, Some(device)) = (&command.action, device) {
+        let middle_m = (live.model.scene.sheet.extent_m() / 2.0).extend(0.0);
+        let away_m = (*place_m - middle_m).length();
+        let range = format!("within {} m of the middle of the sheet, the device's workspace", device.workspace_m);
+        number("pose.position_m", away_m, &range, |away_m| away_m <= device.workspace_m)?;
+    }
+    Ok(command)
+}
+
 impl Haptics {
     /// Answers the first message of a haptic stream.
-    fn open(&self, open: &pb::TouchOpen) -> Result<(Opened, Hold), Refusal> {
+    async fn open(&self, open: &pb::TouchOpen) -> Result<(Opened, Hold), Refusal> {
         let live = self.0.pacer.get(&open.session_id)?;
+        let device = open.device.as_ref().map(wire::local::from_device).transpose()?;
+        let delta = open.deadband.unwrap_or(0.0);
+        number("deadband", delta, "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
+        let tip = wire::command::from_tip(open.tip.as_ref());
+        tip.check("tip", &live.model.scene.sheet)?;
+        let law = match device {
+            None if delta > 0.0 => {
+                return Err(Refusal::new(Reason::Missing, "device", "is missing: a deadband goes by its local models"));
+            }
+            None => None,
+            Some(_) => {
+                let live = live.clone();
+                let law = tokio::task::spawn_blocking(move || live.law(tip.radius_m)).await;
+                let failed = |_| Refusal::new(Reason::NotAvailable, "device", "the force law could not be computed");
+                Some(law.map_err(failed)?)
+            }
+        };
         let every = wire::every("sample_every_steps", open.sample_every_steps)?;
         let guard = live.open_stream()?;
         let lease_s = open.lease_s.unwrap_or(self.0.config.lease_s);
         let lease = random_bits()?;
         lock(&live.intake).acquire(&open.tools, &open.holder, lease_s, lease, now_ns())?;
-        let hold = Hold { live: live.clone(), lease, tools: open.tools.len() };
+        let hold = Hold { live: live.clone(), lease, tools: open.tools.len(), device };
+        if let Some(law) = &law {
+            open.tools.iter().for_each(|tool| live.look_ahead(*tool, law.clone()));
+        }
         let only = (!open.tools.is_empty()).then(|| open.tools.clone());
         let samples = live.samples(every, only);
         let rate_hz = live.model.scene.stepping.rate_hz;
-        let answer = pb::TouchOpened { step: lock(&live.intake).next_step(), rate_hz, lease_s };
+        let answer = pb::TouchOpened {
+            step: lock(&live.intake).next_step(),
+            rate_hz,
+            lease_s,
+            law: law.as_deref().map(wire::local::law),
+            max_force_n: device.map_or(UNDECLARED_FORCE_N, |device| device.most_n()),
+        };
+        let thrift = law.filter(|_| delta > 0.0).map(|law| Thrift { law, deadbands: BTreeMap::new(), delta });
         info!(session = %live.id, tools = ?open.tools, holder = ?open.holder, "haptic stream opened");
-        Ok((Opened { answer, samples, guard }, hold))
+        Ok((Opened { answer, samples, guard, thrift }, hold))
     }
 
     /// Reads what the client says until it ends.
@@ -89,7 +157,7 @@ impl Haptics {
     ) {
         use pb::touch_request::Message;
         let first = match inbound.message().await {
-            Ok(Some(pb::TouchRequest { message: Some(Message::Open(open)) })) => self.open(&open),
+            Ok(Some(pb::TouchRequest { message: Some(Message::Open(open)) })) => self.open(&open).await,
             Ok(_) => Err(Refusal::new(Reason::OutOfTurn, "open", "the first message must be `open`")),
             Err(status) => {
                 let _ = opening.send(Err(status));
@@ -112,6 +180,7 @@ impl Haptics {
                 Ok(Some(pb::TouchRequest { message: Some(Message::Command(command)) })) => {
                     let now = now_ns();
                     let taken = wire::command::from_command(&command, &live.model.scene.sheet, now)
+                        .and_then(|command| within_reach(command, live, hold.device.as_ref()))
                         .and_then(|command| lock(&live.intake).submit(hold.lease, vec![command], now));
                     if let Err(refusal) = taken {
                         debug!(session = %live.id, reason = refusal.reason.as_str(), %refusal, "command refused");
@@ -145,29 +214,34 @@ impl Haptics {
 struct Outlet {
     events: Reader<Event>,
     samples: Reader<PacedSample>,
+    thrift: Option<Thrift>,
     _guard: StreamGuard,
 }
 
 impl Outlet {
     async fn next(&mut self) -> Option<Result<pb::touch_response::Message, Status>> {
         use pb::touch_response::Message;
-        Some(tokio::select! {
-            biased;
-            event = self.events.pop() => match event {
-                Ok((Event::Rejected(rejection), _)) => Ok(Message::Rejection(rejection)),
-                Ok((Event::Renewed(client_time_ns, arrival_ns), _)) => {
-                    let server_hold_ns = now_ns().saturating_sub(arrival_ns);
-                    Ok(Message::Renewed(pb::Renewed { client_time_ns, server_hold_ns }))
-                }
-                Ok((Event::Failed(status), _)) => Err(status),
-                Ok((Event::Finished, _)) => return None,
-                Err(refusal) => Err(refusal.into()),
-            },
-            sample = self.samples.pop() => match sample {
-                Ok((sample, dropped)) => Ok(Message::Sample(wire::sample::sample(&sample, dropped, now_ns()))),
-                Err(refusal) => Err(refusal.into()),
-            },
-        })
+        loop {
+            let message = tokio::select! {
+                biased;
+                event = self.events.pop() => match event {
+                    Ok((Event::Rejected(rejection), _)) => Ok(Message::Rejection(rejection)),
+                    Ok((Event::Renewed(client_time_ns, arrival_ns), _)) => {
+                        let server_hold_ns = now_ns().saturating_sub(arrival_ns);
+                        Ok(Message::Renewed(pb::Renewed { client_time_ns, server_hold_ns }))
+                    }
+                    Ok((Event::Failed(status), _)) => Err(status),
+                    Ok((Event::Finished, _)) => return None,
+                    Err(refusal) => Err(refusal.into()),
+                },
+                sample = self.samples.pop() => match sample {
+                    Ok((sample, _)) if self.thrift.as_mut().is_some_and(|thrift| !thrift.is_due(&sample.sample)) => continue,
+                    Ok((sample, dropped)) => Ok(Message::Sample(wire::sample::sample(&sample, dropped, now_ns()))),
+                    Err(refusal) => Err(refusal.into()),
+                },
+            };
+            return Some(message);
+        }
     }
 }
 
@@ -182,8 +256,8 @@ impl Output {
         use pb::touch_response::Message;
         let (message, outlet) = match self {
             Output::Opening(opening, events) => match opening.await {
-                Ok(Ok(Opened { answer, samples, guard })) => {
-                    (Ok(Message::Opened(answer)), Some(Outlet { events, samples, _guard: guard }))
+                Ok(Ok(Opened { answer, samples, guard, thrift })) => {
+                    (Ok(Message::Opened(answer)), Some(Outlet { events, samples, thrift, _guard: guard }))
                 }
                 Ok(Err(status)) => (Err(status), None),
                 // The client vanished before it said anything.

@@ -3,17 +3,23 @@
 
 pub mod check;
 pub mod command;
+pub mod local;
 pub mod run;
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use glam::DVec3;
 
+use crate::haptics::LocalModel;
+use crate::haptics::path::{Path, Play};
 use crate::scene::law::{ForceLaw, MoveLaw};
 use crate::scene::record::{EnergyJ, Point, Record};
 use crate::scene::script::{Action, nearest_point};
-use crate::sheet::{self, Energy, Grasp, Model, PointState, Push, Tissue};
+use crate::scene::tip::Tip;
+use crate::sheet::{self, Energy, Feel, Grasp, Model, PointState, Push, Tissue};
 use command::Due;
+use local::{Modeller, Refinement};
 
 /// What one tool felt at the end of a step.
 #[derive(Debug, Clone, PartialEq)]
@@ -28,6 +34,12 @@ pub struct ToolSample {
     pub arrival_ns: u64,
     /// What it does, and feels, if anything.
     pub contact: Option<Contact>,
+    /// The same of a tool that is led by its position, from its own point of view.
+    pub feel: Option<Feel>,
+    /// What is sent ahead for a client to render by, if one has asked for it.
+    pub local: Option<LocalModel>,
+    /// No command came for long: the tool is held where it is.
+    pub stale: bool,
     /// The acknowledged command came too late for its step.
     pub late: bool,
     /// What the tool did was ended by its time to live, or with its lease.
@@ -75,12 +87,25 @@ struct Tool {
     expires_at: Option<u64>,
     late: bool,
     expired: bool,
+    led: Option<Led>,
+}
+
+/// A tool that is led by its position.
+#[derive(Debug, Clone)]
+struct Led {
+    tip: Tip,
+    /// Of commands that come with their client's time, and are played by it.
+    path: Option<Path>,
+    /// The client's time of the place where it is, s.
+    client_time_s: f64,
+    local: Option<LocalModel>,
 }
 
 /// A tissue and its tools.
 pub struct Session {
     tissue: Box<dyn Tissue>,
     tools: Vec<Tool>,
+    modellers: BTreeMap<u32, Modeller>,
     late_commands: u64,
     hold_reason: Option<String>,
 }
@@ -88,7 +113,13 @@ pub struct Session {
 impl Session {
     /// A tissue at rest.
     pub fn new(model: &Arc<Model>) -> Self {
-        Session { tissue: sheet::at_rest(model), tools: Vec::new(), late_commands: 0, hold_reason: None }
+        Session {
+            tissue: sheet::at_rest(model),
+            tools: Vec::new(),
+            modellers: BTreeMap::new(),
+            late_commands: 0,
+            hold_reason: None,
+        }
     }
 
     /// What of the tissue never changes.
@@ -135,6 +166,7 @@ impl Session {
             self.act(due);
         }
         self.expire();
+        self.play();
         if self.step_count() == 0 {
             observe(self);
         }
@@ -147,7 +179,51 @@ impl Session {
             ));
             return;
         }
+        self.look_ahead();
         observe(self);
+    }
+
+    /// From now on the samples of a tool have local models, or have none.
+    pub fn look_ahead_for(&mut self, tool: u32, modeller: Option<Modeller>) {
+        match modeller {
+            Some(modeller) => self.modellers.insert(tool, modeller),
+            None => self.modellers.remove(&tool),
+        };
+    }
+
+    /// What computes the stiffness under a tool anew, for each that touches and has local models.
+    pub fn refinements(&self) -> impl Iterator<Item = Refinement> {
+        self.modellers
+            .iter()
+            .filter_map(|(tool, modeller)| Some(modeller.refinement(self.tissue.surroundings(*tool as usize)?)))
+    }
+
+    /// Plays the paths of the tools that have one.
+    fn play(&mut self) {
+        let step_s = self.model().scene.stepping.rate_hz.recip();
+        let end_s = self.time_s() + step_s;
+        for (index, tool) in self.tools.iter_mut().enumerate() {
+            let Some(led) = &mut tool.led else { continue };
+            let Some(path) = &mut led.path else { continue };
+            match path.step(end_s, step_s) {
+                Some(Play::Lead(place_m, client_time_s)) => {
+                    led.client_time_s = client_time_s;
+                    self.tissue.lead(index, place_m, led.tip);
+                }
+                Some(Play::Release) => self.tissue.release(index),
+                None => {}
+            }
+        }
+    }
+
+    /// Makes the local models of the step just done.
+    fn look_ahead(&mut self) {
+        let step = self.step_count();
+        for (number, modeller) in &mut self.modellers {
+            let Some(led) = self.tools.get_mut(*number as usize).and_then(|tool| tool.led.as_mut()) else { continue };
+            led.local =
+                self.tissue.feel(*number as usize).map(|feel| modeller.model(&feel, &led.tip, step, led.client_time_s));
+        }
     }
 
     fn tool(&mut self, tool: usize) -> &mut Tool {
@@ -180,17 +256,36 @@ impl Session {
         tool.expires_at = lifetime.map(|steps| step.saturating_add(steps));
         match command.action {
             Action::Push(poke) => {
+                self.tool(index).led = None;
                 let point = nearest_point(&self.model().scene.sheet, poke.centre_m);
                 self.tool(index).control_point = Some(point);
                 self.tissue.push(index, Some(Push::Held(poke)));
             }
             Action::Grasp { point, displacement_m } => {
+                self.tool(index).led = None;
                 self.tool(index).control_point = Some(point);
                 let place = self.model().index_of(point);
                 self.tissue.grasp(index, place, Grasp::Held(displacement_m));
             }
+            Action::Lead { place_m, tip } => {
+                let point = nearest_point(&self.model().scene.sheet, place_m.truncate());
+                let client_time_s = command.client_time_ns as f64 * 1e-9;
+                let now_s = self.time_s();
+                let tool = self.tool(index);
+                tool.control_point = Some(point);
+                let led = tool.led.get_or_insert(Led { tip, path: None, client_time_s, local: None });
+                led.tip = tip;
+                // What is stamped with its step is played there; what has only its client's time, by that.
+                if command.at_step.is_some() || command.client_time_ns == 0 {
+                    (led.path, led.client_time_s) = (None, client_time_s);
+                    self.tissue.lead(index, place_m, tip);
+                } else {
+                    led.path.get_or_insert_default().receive(client_time_s, place_m, now_s);
+                }
+            }
             Action::Release => {
-                self.tool(index).expires_at = None;
+                let tool = self.tool(index);
+                (tool.expires_at, tool.led) = (None, None);
                 self.tissue.release(index);
             }
         }
@@ -203,6 +298,7 @@ impl Session {
             if self.tools[index].expires_at.is_some_and(|at| at <= step) {
                 self.tools[index].expires_at = None;
                 self.tools[index].expired = true;
+                self.tools[index].led = None;
                 self.tissue.release(index);
             }
         }
@@ -223,15 +319,25 @@ impl Session {
     pub fn sample(&self, only: Option<&[u32]>) -> Sample {
         let sample_of = |number: u32| {
             let tool = self.tools.get(number as usize).cloned().unwrap_or_default();
-            let contact = tool.control_point.map(|point| {
-                let state = self.tissue.point(self.model().index_of(point));
-                Contact {
-                    point,
-                    displacement_m: state.displacement_m,
-                    velocity_m_per_s: state.velocity_m_per_s,
-                    force_on_tool_n: state.reaction_n(),
-                    applied_force_n: state.applied_n,
-                }
+            let feel = self.tissue.feel(number as usize);
+            let led = |feel: Feel| Contact {
+                point: nearest_point(&self.model().scene.sheet, feel.anchor_m),
+                displacement_m: feel.surface_m - feel.anchor_m.extend(0.0),
+                velocity_m_per_s: feel.velocity_m_per_s,
+                force_on_tool_n: feel.force_on_tool_n,
+                applied_force_n: -feel.force_on_tool_n,
+            };
+            let contact = feel.map(led).or_else(|| {
+                tool.control_point.map(|point| {
+                    let state = self.tissue.point(self.model().index_of(point));
+                    Contact {
+                        point,
+                        displacement_m: state.displacement_m,
+                        velocity_m_per_s: state.velocity_m_per_s,
+                        force_on_tool_n: state.reaction_n(),
+                        applied_force_n: state.applied_n,
+                    }
+                })
             });
             ToolSample {
                 tool: number,
@@ -239,6 +345,13 @@ impl Session {
                 client_time_ns: tool.client_time_ns,
                 arrival_ns: tool.arrival_ns,
                 contact,
+                feel,
+                local: tool.led.as_ref().and_then(|led| led.local),
+                stale: tool
+                    .led
+                    .as_ref()
+                    .and_then(|led| led.path.as_ref())
+                    .is_some_and(|path| path.is_held(self.time_s())),
                 late: tool.late,
                 expired: tool.expired,
             }

@@ -12,7 +12,10 @@
 
 use std::fmt;
 
+use glam::DVec3;
+
 use super::applied::{Applied, Push};
+use super::contact::Contacts;
 use super::field::{Field, Layout, State};
 use super::integrate::Scheme;
 use super::model::{Model, Plan};
@@ -20,6 +23,7 @@ use super::prescribed::{Grasp, Prescribed};
 use super::real::Real;
 use super::springs::Springs;
 use super::{BlowUp, Sheet, springs_of};
+use crate::scene::tip::Tip;
 
 /// Substeps between two surveys.
 pub const INTERVAL_SUBSTEPS: u64 = 256;
@@ -84,6 +88,7 @@ impl fmt::Display for Cause {
 pub(super) enum Input {
     Push(Option<Push>),
     Grasp(usize, Grasp),
+    Lead(DVec3, Tip),
 }
 
 /// Everything that a sheet goes back to.
@@ -94,6 +99,7 @@ pub(super) struct Checkpoint<T: Real> {
     pub(super) state: State<T>,
     pub(super) applied: Applied<T>,
     pub(super) prescribed: Prescribed,
+    pub(super) contacts: Contacts,
     pub(super) work: Work,
 }
 
@@ -161,6 +167,7 @@ impl<T: Real> Sheet<T> {
         self.checkpoint.state.copy_from(&self.state);
         self.checkpoint.applied.clone_from(&self.applied);
         self.checkpoint.prescribed.clone_from(&self.prescribed);
+        self.checkpoint.contacts.clone_from(&self.contacts);
         self.checkpoint.work = self.work;
         self.inputs.clear();
         Ok(())
@@ -173,6 +180,7 @@ impl<T: Real> Sheet<T> {
         self.state.copy_from(&self.checkpoint.state);
         self.applied.clone_from(&self.checkpoint.applied);
         self.prescribed.clone_from(&self.checkpoint.prescribed);
+        self.contacts.clone_from(&self.checkpoint.contacts);
         self.work = self.checkpoint.work;
         let was = self.model.plan.divided(&self.model.scene, 1 << self.checkpoint.halvings);
         let plan = self.model.plan.divided(&self.model.scene, 1 << halvings);

@@ -2,7 +2,9 @@
 
 mod applied;
 pub mod choice;
+mod contact;
 mod field;
+mod footprint;
 pub mod guard;
 pub mod integrate;
 mod lanes;
@@ -13,6 +15,7 @@ mod springs;
 pub mod stability;
 mod survey;
 mod sweep;
+pub mod tangent;
 
 use std::sync::Arc;
 
@@ -21,9 +24,13 @@ use xxhash_rust::xxh3::Xxh3;
 
 use crate::scene::Precision;
 use crate::scene::law::{Moment, Motion};
+use crate::scene::tip::Tip;
 use applied::Applied;
 pub use applied::Push;
+use contact::Contacts;
+pub use contact::{Feel, Standing, Surroundings};
 use field::{Field, Layout, State};
+pub use footprint::{Footprint, Reached};
 pub use guard::Cause;
 use guard::{Checkpoint, Input, Work};
 use integrate::{Scheme, central, exponential, rk4};
@@ -93,7 +100,13 @@ pub trait Tissue: Send {
     fn push(&mut self, tool: usize, push: Option<Push>);
     /// From the coming step on `tool` moves the point at `index`.
     fn grasp(&mut self, tool: usize, index: usize, grasp: Grasp);
-    /// `tool` neither pushes nor grasps any more, from the coming step on.
+    /// From the coming step on `tool`, which meets the sheet with `tip`, is at `place_m` at the step's end.
+    fn lead(&mut self, tool: usize, place_m: DVec3, tip: Tip);
+    /// What a tool that is led by its position does and feels.
+    fn feel(&self, tool: usize) -> Option<Feel>;
+    /// A copy of the sheet around such a tool, if it touches or holds: to compute the stiffness there.
+    fn surroundings(&self, tool: usize) -> Option<Surroundings>;
+    /// `tool` neither pushes nor grasps nor touches any more, from the coming step on.
     fn release(&mut self, tool: usize);
     /// The scheme as it is now: the guard may have halved the substep of the model's.
     fn plan(&self) -> &Plan;
@@ -161,6 +174,7 @@ struct Sheet<T: Real> {
     state: State<T>,
     applied: Applied<T>,
     prescribed: Prescribed,
+    contacts: Contacts,
     steps: u64,
     work: Work,
     checkpoint: Checkpoint<T>,
@@ -190,10 +204,12 @@ impl<T: Real> Sheet<T> {
                 state: at_rest(),
                 applied: applied.clone(),
                 prescribed: prescribed.clone(),
+                contacts: Contacts::default(),
                 work: Work::default(),
             },
             applied,
             prescribed,
+            contacts: Contacts::default(),
             inputs: Vec::new(),
             guard_events: 0,
             substeps_done: 0,
@@ -209,6 +225,7 @@ impl<T: Real> Sheet<T> {
         }
         self.applied.finish(&self.model, self.steps);
         self.prescribed.finish(&self.model, self.steps);
+        self.contacts.finish(self.model.scene.stepping.rate_hz);
         self.steps += 1;
         self.substeps_done += u64::from(substeps);
     }
@@ -270,6 +287,8 @@ impl<T: Real> Sheet<T> {
             }
         }
         self.hold(moment.step, end, true);
+        let Sheet { model, plan, bench, state, contacts, work, .. } = self;
+        contacts.act(model, plan, bench, state, work, end);
     }
 
     /// Puts the grasped points where they are at `fraction` of the step, and counts the work of that if it is `counted`.
@@ -393,10 +412,17 @@ impl<T: Real> Sheet<T> {
         match input {
             Input::Push(push) => {
                 self.prescribed.release(tool);
+                self.contacts.release(tool);
                 self.applied.set(tool, push);
+            }
+            Input::Lead(place_m, tip) => {
+                self.prescribed.release(tool);
+                self.applied.set(tool, None);
+                self.contacts.lead(&self.model, tool, place_m, tip);
             }
             Input::Grasp(index, grasp) => {
                 self.applied.set(tool, None);
+                self.contacts.release(tool);
                 let PointState { displacement_m, velocity_m_per_s, .. } = self.point(index);
                 let now = Motion { displacement_m, velocity_m_per_s, ..Motion::default() };
                 self.prescribed.grasp(tool, index, grasp, now);
@@ -446,6 +472,18 @@ impl<T: Real> Tissue for Sheet<T> {
 
     fn grasp(&mut self, tool: usize, index: usize, grasp: Grasp) {
         self.input(tool, Input::Grasp(index, grasp));
+    }
+
+    fn lead(&mut self, tool: usize, place_m: DVec3, tip: Tip) {
+        self.input(tool, Input::Lead(place_m, tip));
+    }
+
+    fn feel(&self, tool: usize) -> Option<Feel> {
+        Sheet::feel(self, tool)
+    }
+
+    fn surroundings(&self, tool: usize) -> Option<Surroundings> {
+        Sheet::surroundings(self, tool)
     }
 
     fn release(&mut self, tool: usize) {

@@ -45,6 +45,8 @@ fn tool_sample(tool: &ToolSample, now_ns: u64) -> pb::ToolSample {
         applied_force_n: contact.and_then(|contact| vector(contact.applied_force_n)),
         late: tool.late,
         expired: tool.expired,
+        local_model: tool.local.as_ref().map(super::local::local_model),
+        stale: tool.stale,
     }
 }
 

@@ -106,6 +106,24 @@ impl Scheme {
         }
     }
 
+    /// What a constant force of 1 adds to u and to d in a substep.
+    pub fn constant(&self) -> [f64; 2] {
+        match self {
+            Scheme::TwoStep(two) => [two.q; 2],
+            Scheme::Multistep(multistep) => multistep.constant(),
+            Scheme::Rk4 { .. } => [0.5, 1.0],
+        }
+    }
+
+    /// What a short blow of impulse 1 at a substep's beginning adds, by its end, to u and to d.
+    pub fn kick(&self) -> [f64; 2] {
+        match self {
+            Scheme::TwoStep(two) => [two.q; 2],
+            Scheme::Multistep(multistep) => multistep.kick(),
+            Scheme::Rk4 { .. } => [1.0; 2],
+        }
+    }
+
     /// Fields that the scheme keeps beside u and d.
     pub fn kept(&self, compensated: bool) -> usize {
         match self {
