@@ -9,7 +9,7 @@ SCRIPT ?= scripts/vertical-60.toml
 VENV := target/venv
 
 .PHONY: help run build test stress lint picture bench-roundtrip bench-duty bench-frames bench-error bench-kernel \
-	bench-stability need-rust need-python
+	bench-stability bench-link need-rust need-python
 
 help:
 	@echo 'make run             build, serve on $(LISTEN), poke the tissue, draw what it felt, go on serving'
@@ -22,6 +22,7 @@ help:
 	@echo 'make bench-frames    refining and encoding a frame beside a plain copy of its bytes'
 	@echo 'make bench-error     run time against error, every scheme on seven scenes: docs/benchmarks/error.md'
 	@echo 'make bench-kernel    the time of a step beside the machine'"'"'s limits, numba, Taichi and NumPy'
+	@echo 'make bench-link      touch over a network in virtual time, by delay, tissue, hand and scheme: docs/benchmarks/link.md'
 	@echo 'make bench-stability the largest stable step, predicted and observed'
 
 need-rust:
@@ -98,3 +99,7 @@ bench-kernel: need-rust $(PEERS)/ready
 
 bench-stability: need-rust
 	$(CARGO) bench --quiet --bench stability
+
+# `make bench-link ARGUMENTS=--quick` for a minute's worth; the whole takes about half an hour.
+bench-link: build
+	$(CARGO) bench --quiet --bench link -- $(ARGUMENTS)
