@@ -39,7 +39,7 @@ pub const ENGAGE_S: f64 = 0.5;
 /// N/s.
 pub const SLEW_N_PER_S: f64 = 100.0;
 /// m/s.
-const LEAST_SPEED_M_PER_S: f64 = 0.05;
+const LEAST_SPEED_M_PER_S: f64 = 0.08;
 /// A hand may speed up while a force falls, and a force that turns falls slower along where it was.
 const SPEED_MARGIN: f64 = 1.5;
 /// What the tank holds at most: later generosity is not paid by friction of long ago, J.
@@ -235,11 +235,7 @@ impl Envelope {
         force_n = self.engage(wanted.now_s, force_n);
         force_n = self.clamp(elapsed_s, force_n);
         force_n = self.keep_passive(wanted.velocity_m_per_s, force_n);
-        let change_n = force_n - self.force_n;
-        if change_n.length() > SLEW_N_PER_S * elapsed_s {
-            self.acted(Reason::Slew);
-            force_n = self.force_n + change_n.clamp_length_max(SLEW_N_PER_S * elapsed_s);
-        }
+        force_n = self.slew(elapsed_s, wanted.velocity_m_per_s, force_n);
         self.force_n = force_n;
         force_n
     }
@@ -299,21 +295,37 @@ impl Envelope {
     }
 
     fn keep_passive(&mut self, velocity_m_per_s: DVec3, force_n: DVec3) -> DVec3 {
-        let length_n = force_n.length();
-        if length_n == 0.0 {
-            return force_n;
-        }
-        let along_m_per_s = velocity_m_per_s.dot(force_n) / length_n;
-        let speed = (SPEED_MARGIN * along_m_per_s).max(LEAST_SPEED_M_PER_S);
-        let mut most_n = (2.0 * SLEW_N_PER_S * self.tank_j.max(0.0) / speed).sqrt();
-        if along_m_per_s < 0.0 {
-            most_n = most_n.max(FIRST_N);
-        }
+        let (length_n, most_n) = (force_n.length(), self.bearable_n(velocity_m_per_s, force_n));
         if length_n <= most_n {
             return force_n;
         }
         self.acted(Reason::Passivity);
         force_n * (most_n / length_n)
+    }
+
+    /// The largest force along `force_n` whose energy the tank can still bear until slew has let it go, N.
+    fn bearable_n(&self, velocity_m_per_s: DVec3, force_n: DVec3) -> f64 {
+        let along_m_per_s = velocity_m_per_s.dot(force_n.normalize_or_zero());
+        let speed = (SPEED_MARGIN * along_m_per_s).max(LEAST_SPEED_M_PER_S);
+        let most_n = (2.0 * SLEW_N_PER_S * self.tank_j.max(0.0) / speed).sqrt();
+        if along_m_per_s < 0.0 { most_n.max(FIRST_N) } else { most_n }
+    }
+
+    /// Goes from the last force to a wanted one, as fast as slew allows. A force that turns is on its way neither the one nor
+    /// the other: where the tank can't bear what it is there, it goes straight to zero.
+    fn slew(&mut self, elapsed_s: f64, velocity_m_per_s: DVec3, force_n: DVec3) -> DVec3 {
+        let step_n = SLEW_N_PER_S * elapsed_s;
+        let change_n = force_n - self.force_n;
+        if change_n.length() <= step_n {
+            return force_n;
+        }
+        self.acted(Reason::Slew);
+        let next_n = self.force_n + change_n.clamp_length_max(step_n);
+        if next_n.length() <= self.bearable_n(velocity_m_per_s, next_n) {
+            return next_n;
+        }
+        self.acted(Reason::Passivity);
+        self.force_n - self.force_n.clamp_length_max(step_n)
     }
 }
 

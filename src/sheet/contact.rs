@@ -96,6 +96,8 @@ struct Tool {
     offset_m: DVec3,
     /// On the sheet in the last substep, N.
     force_n: DVec3,
+    /// What of that goes on in the next: not the blow of meeting.
+    steady_n: DVec3,
     velocity_m_per_s: DVec3,
 }
 
@@ -113,7 +115,7 @@ impl Contacts {
                 tool.footprint = Footprint::new(model, tip.radius_m, tool.footprint.centre_m());
             }
             if tool.tip.grasps != tip.grasps {
-                (tool.standing, tool.force_n) = (Standing::Free, DVec3::ZERO);
+                (tool.standing, tool.steady_n) = (Standing::Free, DVec3::ZERO);
             }
             (tool.to_m, tool.tip) = (to_m, tip);
             return;
@@ -129,6 +131,7 @@ impl Contacts {
             normal: DVec3::Z,
             offset_m: DVec3::ZERO,
             force_n: DVec3::ZERO,
+            steady_n: DVec3::ZERO,
             velocity_m_per_s: DVec3::ZERO,
         };
         self.tools.insert(place, tool);
@@ -158,11 +161,12 @@ impl Contacts {
     ) {
         let layout = &bench.layout;
         for tool in &mut self.tools {
-            let before_n = tool.force_n;
+            let (before_n, met) = (tool.steady_n, tool.standing != Standing::Free);
             if before_n != DVec3::ZERO {
                 push(model, plan, layout, state, &tool.footprint, before_n, plan.scheme.constant());
             }
             tool.force_n = tool.meet(model, plan, layout, state, fraction);
+            tool.steady_n = if met { tool.force_n } else { DVec3::ZERO };
             if tool.force_n == DVec3::ZERO {
                 if before_n != DVec3::ZERO {
                     // It has let go: nothing acted in this substep.
@@ -274,13 +278,13 @@ impl Tool {
         let spacing_m = model.scene.sheet.spacing_m;
         let moves_m_per_n =
             plan.scheme.kick()[0] * plan.force_scale(&model.scene) * spacing_m * self.footprint.mobility();
-        let gap_m = gap_m + moves_m_per_n * self.force_n;
+        let gap_m = gap_m + moves_m_per_n * self.steady_n;
         match self.tip.coupling {
             _ if moves_m_per_n == 0.0 => DVec3::ZERO,
             Coupling::Constraint => gap_m / moves_m_per_n,
             Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } => {
                 let own_m = (self.to_m - self.from_m) * (model.scene.stepping.rate_hz * plan.substep_s);
-                let moved_m = movement_m(model, layout, state, &self.footprint) - moves_m_per_n * self.force_n;
+                let moved_m = movement_m(model, layout, state, &self.footprint) - moves_m_per_n * self.steady_n;
                 let apart_m_per_s = (own_m - moved_m) / plan.substep_s;
                 let held = stiffness_n_per_m + damping_n_s_per_m / plan.substep_s;
                 (stiffness_n_per_m * gap_m + damping_n_s_per_m * apart_m_per_s) / (1.0 + moves_m_per_n * held)

@@ -23,7 +23,11 @@ use super::model::Model;
 use crate::scene::Sheet;
 
 /// Rings of the disc: at least this many, and two a spacing.
-const LEAST_RINGS: f64 = 3.0;
+const LEAST_RINGS: f64 = 6.0;
+
+/// Each ring is turned against the last, so that hardly two places cross a line of the grid at once: the slope of the
+/// surface, which jumps there for each, changes smoothly for all.
+const GOLDEN: f64 = 0.618_033_988_749_895;
 
 /// Most rings: beyond, a spacing has fewer than two, which a disc so large does not notice.
 const MOST_RINGS: f64 = 16.0;
@@ -167,7 +171,7 @@ fn disc(radius: f64) -> Vec<DVec2> {
         let r = radius * ((f64::from(ring) + 0.5) / f64::from(rings)).sqrt();
         let count = 4 * rings;
         (0..count).map(move |k| {
-            let angle = TAU * (f64::from(k) + 0.25 + 0.5 * f64::from(ring % 2)) / f64::from(count);
+            let angle = TAU * (f64::from(k) + GOLDEN * f64::from(ring + 1)) / f64::from(count);
             r * DVec2::new(libm::cos(angle), libm::sin(angle))
         })
     };
