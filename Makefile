@@ -9,7 +9,7 @@ SCRIPT ?= scripts/vertical-60.toml
 VENV := target/venv
 
 .PHONY: help run build test stress lint picture bench-roundtrip bench-duty bench-frames bench-error bench-kernel \
-	bench-stability bench-skip bench-rest need-rust need-python
+	bench-stability bench-skip bench-rest bench-link need-rust need-python
 
 help:
 	@echo 'make run             build, serve on $(LISTEN), poke the tissue, draw what it felt, go on serving'
@@ -23,6 +23,7 @@ help:
 	@echo 'make bench-frames    a frame beside a plain copy of its bytes, and the bytes of a poke: docs/benchmarks/frames.md'
 	@echo 'make bench-error     run time against error, every scheme on seven scenes: docs/benchmarks/error.md'
 	@echo 'make bench-kernel    the time of a step beside the machine'"'"'s limits, numba, Taichi and NumPy'
+	@echo 'make bench-link      touch over a network in virtual time, by delay, tissue, hand and scheme: docs/benchmarks/link.md'
 	@echo 'make bench-stability the largest stable step, predicted and observed'
 	@echo 'make bench-skip      what it saves to leave out what is at rest, and its error'
 
@@ -107,3 +108,6 @@ bench-stability: need-rust
 
 bench-skip: need-rust
 	$(CARGO) bench --quiet --bench skip -- $(ARGUMENTS)
+# `make bench-link ARGUMENTS=--quick` for a minute's worth; the whole takes about half an hour.
+bench-link: build
+	$(CARGO) bench --quiet --bench link -- $(ARGUMENTS)

@@ -1,5 +1,6 @@
 //! Palpate: a server for touching soft tissue over a network. ARCHITECTURE.md is the map.
 
+pub mod haptics;
 pub mod limits;
 pub mod pace;
 pub mod refusal;

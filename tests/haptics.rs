@@ -441,7 +441,7 @@ async fn who_watches_a_still_tissue_gets_heartbeats_at_the_rate_that_was_said() 
     let server = Server::start(&[]);
     let session = server.paper(false).await;
     let mut usual = Touch::open(&server, open(&session, &[])).await.unwrap();
-    assert_eq!(usual.opened.unwrap().heartbeat_s, 0.05);
+    assert_eq!(usual.opened.as_ref().unwrap().heartbeat_s, 0.05);
     let wanted = pb::TouchOpen { heartbeat_s: Some(0.1), sample_every_steps: Some(30), ..open(&session, &[0]) };
     let mut seldom = Touch::open(&server, wanted).await.unwrap();
     for (touch, apart) in [(&mut usual, 50), (&mut seldom, 120)] {
@@ -492,7 +492,12 @@ async fn a_deadband_leaves_out_what_changes_too_little() {
 async fn what_a_stream_can_not_ask_for_is_refused() {
     let server = Server::start(&[]);
     let session = server.paper(true).await;
-    let band = |force_n, force_fraction, displacement_m| pb::Deadband { force_n, force_fraction, displacement_m };
+    let band = |force_n, force_fraction, displacement_m| pb::Deadband {
+        force_n,
+        force_fraction,
+        displacement_m,
+        rendered_fraction: None,
+    };
     let cases = [
         (Some(band(None, None, None)), None, "MISSING", "deadband"),
         (Some(band(Some(-0.1), None, None)), None, "OUT_OF_RANGE", "deadband.force_n"),

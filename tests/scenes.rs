@@ -316,7 +316,10 @@ fn scenes_and_scripts_are_found_by_name() {
     assert_eq!(lines(&palpate(&["run", "mine", "mine"]))[0]["run"]["scene"], "test");
     assert_eq!(lines(&palpate(&["run", "mine", "mine", "--scenes", "other"]))[0]["run"]["scene"], "other");
     assert_eq!(lines(&palpate(&["run", "paper", "mine"]))[0]["run"]["scene"], "paper");
-    refused(&palpate(&["run", "yours", "mine"]), &["there is no scene `yours`; there are mine, paper"]);
+    refused(
+        &palpate(&["run", "yours", "mine"]),
+        &["there is no scene `yours`; there are fibrotic, liver, mine, paper, stomach"],
+    );
 }
 
 #[test]

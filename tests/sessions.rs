@@ -335,7 +335,7 @@ async fn a_lease_lapses_at_rest_at_its_step() {
     let server = Server::start(&["--threads", "1"]);
     let session = server.paper(false).await;
     let mut touch = Touch::open(&server, pb::TouchOpen { lease_s: Some(0.1), ..open(&session, &[0]) }).await.unwrap();
-    let opened = touch.opened.unwrap();
+    let opened = touch.opened.take().unwrap();
     // Nobody asks for anything. Of the step, not of the time at which a busy machine does it.
     let expired = touch.sample_with(|sample| sample.tools[0].expired).await;
     assert!((100..=102).contains(&(expired.step - opened.step)), "{} steps", expired.step - opened.step);

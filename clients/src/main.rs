@@ -3,6 +3,8 @@
 // Clients live in real time; the rule is for what a server computes.
 #![allow(clippy::disallowed_methods)]
 
+mod bridge;
+mod link;
 mod plot;
 mod replay;
 
@@ -28,6 +30,26 @@ enum Command {
         final hash is that of `palpate run --held`, whatever the network did, unless late commands are reported.\n\n\
         Exit status: 0; 1 when the replay failed; 2 when an input was refused.")]
     Replay(replay::Arguments),
+    /// Run hand, device, network and tissue in one loop in virtual time; tell how true and safe the touch is
+    #[command(after_help = "Examples:\n  \
+        palpate-client link --scene fibrotic --hand medium --device omega3 --rtt-ms 50\n  \
+        palpate-client link --scene liver --profile wan --scheme hold --seed 7 --json\n  \
+        palpate-client link --rtt-ms 2 --deadband 0.1\n  \
+        palpate-client link --boundary\n  \
+        palpate-client link --random 1000\n\n\
+        A simulated hand presses and strokes the tissue (minimum jerk, 5 to 15 mm, drawn by the seed, less deep where the\n\
+        true force would be above 0.8 of what the device is asked for). `true` is the same tissue without a delay at the\n\
+        tool's own place; errors are over the ticks in which either is in contact. Energies are at the device's port:\n\
+        below 0 it has given energy. Unstable: it gave 0.1 J, or the tool left three times the task's amplitude; then the\n\
+        run ends. The loop runs the code of the server and of `bridge`, not a likeness of it.")]
+    Link(Box<link::Arguments>),
+    /// Run a haptic device at a server, at 1 kHz; so far a simulated one in a simulated hand
+    #[command(after_help = "Examples:\n  \
+        palpate-client bridge --server http://127.0.0.1:7117 --scene liver --seconds 10\n  \
+        palpate-client bridge --scene fibrotic --device touch --deadband 0.1\n\n\
+        Connects again by itself when the connection breaks; forces come back when the owner asks for them. A real device is\n\
+        an implementation of `HapticDevice` (clients/src/bridge/device.rs says how).")]
+    Bridge(bridge::Arguments),
 }
 
 /// How a program ends that does not end well.
@@ -40,10 +62,13 @@ pub(crate) enum Failure {
     Unread,
 }
 
-#[tokio::main(flavor = "current_thread")]
+// A device has a thread of its own, beside those of the network.
+#[tokio::main(worker_threads = 2)]
 async fn main() -> ExitCode {
     let ended = match Arguments::parse().command {
         Command::Replay(arguments) => replay::replay(&arguments).await,
+        Command::Link(arguments) => link::link(&arguments).await,
+        Command::Bridge(arguments) => bridge::bridge(&arguments).await,
     };
     let (status, message) = match ended {
         Ok(()) | Err(Failure::Unread) => return ExitCode::SUCCESS,

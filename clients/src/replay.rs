@@ -91,6 +91,7 @@ impl Sampling {
             force_n: self.deadband_force_n,
             force_fraction: self.deadband_force_fraction,
             displacement_m: self.deadband_displacement_m,
+            ..Default::default()
         };
         (deadband != pb::Deadband::default()).then_some(deadband)
     }
@@ -397,6 +398,7 @@ async fn play(
         holder: "palpate-client replay".to_owned(),
         deadband: arguments.sampling.deadband(),
         heartbeat_s: arguments.sampling.heartbeat_s,
+        ..Default::default()
     };
     streamer.say(Say::Open(open)).await?;
     let mut touch = haptics.touch(ReceiverStream::new(messages)).await.map_err(refused_or_failed)?.into_inner();

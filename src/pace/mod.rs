@@ -14,12 +14,14 @@ use std::thread::JoinHandle;
 
 use tokio::sync::oneshot;
 
+use crate::haptics::Law;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, number};
 use crate::scene::Scene;
 use crate::scene::record::{Point, Record};
 use crate::session::Sample;
 use crate::session::command::Intake;
+use crate::session::local::Refinement;
 use crate::session::sampling::{HEARTBEAT_S, Sampler, Sampling};
 use crate::session::schedule::Schedule;
 use crate::sheet::Model;
@@ -128,6 +130,7 @@ pub struct Live {
     limits: Limits,
     status: Mutex<Status>,
     streams: Mutex<usize>,
+    laws: Mutex<Vec<(f64, Arc<Law>)>>,
     inbox: Arc<Inbox>,
 }
 
@@ -217,7 +220,7 @@ impl Live {
 
     /// The next sample; the present one if time stands.
     pub async fn next_sample(&self, only: Vec<u32>) -> Result<PacedSample> {
-        let sampling = Sampling { every: 1, only: Some(only), deadband: None, heartbeat_s: HEARTBEAT_S };
+        let sampling = Sampling { every: 1, only: Some(only), deadband: None, heartbeat_s: HEARTBEAT_S, law: None };
         Ok(self.tap(sampling, true).pop().await?.0)
     }
 
@@ -237,11 +240,32 @@ impl Live {
         reader
     }
 
+    /// The force law under a tip of `radius_m`. Computed once a radius, by who asks first: tenths of a second, and who asks
+    /// for the same meanwhile waits.
+    pub fn law(&self, radius_m: f64) -> Arc<Law> {
+        let mut laws = lock(&self.laws);
+        if let Some((_, law)) = laws.iter().find(|law| law.0 == radius_m) {
+            return law.clone();
+        }
+        let law = Arc::new(Law::of(&self.model, radius_m));
+        if laws.len() == MOST_LAWS {
+            laws.remove(0);
+        }
+        laws.push((radius_m, law.clone()));
+        law
+    }
+
     /// Frames for a viewer.
     pub fn view(&self, viewer: Arc<Viewer>) {
         self.inbox.send(self.number, Request::View(viewer));
     }
 }
+
+/// Stiffnesses that wait to be computed, of all tools of a server.
+const WAITING_REFINEMENTS: usize = 8;
+
+/// Laws that a session keeps.
+const MOST_LAWS: usize = 16;
 
 fn deleted() -> Refusal {
     Refusal::new(Reason::SessionDeleted, "session_id", "the session has been deleted")
@@ -277,12 +301,16 @@ impl Pacer {
         let encoder = Arc::new(Encoder::default());
         let mut handles = Vec::new();
         let mut inboxes = Vec::new();
+        // It ends when the stepping threads have ended, and nobody sends any more.
+        let (refiner, refinements) = std::sync::mpsc::sync_channel::<Refinement>(WAITING_REFINEMENTS);
+        let worker = move || refinements.into_iter().for_each(Refinement::work);
+        handles.push(std::thread::Builder::new().name("stiffness".into()).spawn(worker)?);
         for index in 0..threads.max(1) {
             let inbox = Arc::new(Inbox::default());
             inboxes.push(inbox.clone());
-            let encoder = encoder.clone();
+            let (encoder, refiner) = (encoder.clone(), refiner.clone());
             let builder = std::thread::Builder::new().name(format!("step-{index}"));
-            handles.push(builder.spawn(move || thread::work(&inbox, &encoder))?);
+            handles.push(builder.spawn(move || thread::work(&inbox, &encoder, &refiner))?);
         }
         let worker = encoder.clone();
         handles.push(std::thread::Builder::new().name("frames".into()).spawn(move || worker.work())?);
@@ -342,6 +370,7 @@ impl Pacer {
             limits: self.limits.clone(),
             status: Mutex::new(status),
             streams: Mutex::new(0),
+            laws: Mutex::new(Vec::new()),
             inbox: inbox.clone(),
         });
         // Laid out before the lock is taken, on which all calls wait.

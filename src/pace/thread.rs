@@ -11,6 +11,7 @@
 
 use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -24,11 +25,15 @@ use super::{Dilation, Live, PacedRecord, PacedSample, State};
 use crate::refusal::{Reason, Refusal, Result};
 use crate::session::Session;
 use crate::session::command::Due;
+use crate::session::local::Refinement;
 use crate::session::schedule::Schedule;
 use crate::surface::Snapshot;
 
 /// Steps that a session may be behind before the rest is dropped.
 const CATCH_UP_STEPS: f64 = 2.0;
+
+/// How often the stiffness under tools is computed anew, Hz.
+const REFINED_HZ: f64 = 50.0;
 
 /// What a stepping thread is asked for.
 pub(super) enum Request {
@@ -135,7 +140,7 @@ impl Rota {
 }
 
 /// The thread's work.
-pub(super) fn work(inbox: &Inbox, encoder: &Encoder) {
+pub(super) fn work(inbox: &Inbox, encoder: &Encoder, refiner: &SyncSender<Refinement>) {
     // The default slack of 50 µs would be the larger part of each step's lateness. Where it can't be set, so be it.
     #[cfg(target_os = "linux")]
     let _ = rustix::thread::set_current_timer_slack(std::num::NonZeroU64::new(1));
@@ -163,7 +168,7 @@ pub(super) fn work(inbox: &Inbox, encoder: &Encoder) {
         if let Some((due_ns, number)) = rota.first()
             && due_ns <= now_ns()
         {
-            rota.with(number, |running| running.step(encoder));
+            rota.with(number, |running| running.step(encoder, refiner));
         }
     }
 }
@@ -353,7 +358,7 @@ impl Running {
     }
 
     /// The next step, at its time or after it.
-    fn step(&mut self, encoder: &Encoder) {
+    fn step(&mut self, encoder: &Encoder, refiner: &SyncSender<Refinement>) {
         if self.next_step > self.session.step_count() {
             self.plan();
             self.skip_to(self.next_step);
@@ -397,7 +402,19 @@ impl Running {
         // The status first: who is told of this step may ask for it at once.
         self.publish_status();
         self.publish(encoder);
+        let every = (self.live.model.scene.stepping.rate_hz / REFINED_HZ).max(1.0) as u64;
+        if self.session.step_count().is_multiple_of(every) {
+            self.refine(refiner);
+        }
         self.plan();
+    }
+
+    /// Has the stiffness computed anew under the tools of which it is told.
+    fn refine(&self, refiner: &SyncSender<Refinement>) {
+        for refinement in self.taps.samples.iter().flat_map(|tap| tap.sampler.refinements(&self.session)) {
+            // What finds the refiner busy is left: the next is newer.
+            let _ = refiner.try_send(refinement);
+        }
     }
 
     /// Gives a stream the present sample, if it is to get it, or if no other follows for now.

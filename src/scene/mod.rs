@@ -5,6 +5,7 @@ pub mod document;
 pub mod law;
 pub mod record;
 pub mod script;
+pub mod tip;
 
 use std::path::Path;
 
@@ -14,6 +15,14 @@ use document::{Document, Item};
 
 /// The scene of the paper's figures, built in.
 pub const PAPER: &str = include_str!("../../scenes/paper.toml");
+
+/// Every scene that is built in, by its name.
+pub const BUILT_IN: [(&str, &str); 4] = [
+    ("fibrotic", include_str!("../../scenes/fibrotic.toml")),
+    ("liver", include_str!("../../scenes/liver.toml")),
+    ("paper", PAPER),
+    ("stomach", include_str!("../../scenes/stomach.toml")),
+];
 
 /// A tissue sheet and how it is stepped. The fields are those of a scene file; SI units.
 #[derive(Debug, Clone, PartialEq)]

@@ -8,6 +8,7 @@ use glam::{DVec2, DVec3};
 
 use super::document::{self, Document, Fields, Item};
 use super::law::{CentreLaw, ForceLaw, Moment, Move, MoveLaw, Poke, Profile, StrengthLaw};
+use super::tip::Tip;
 use super::{Scene, Sheet};
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, not_negative, number, positive};
@@ -94,7 +95,14 @@ pub enum Action {
         /// From its rest position, m.
         displacement_m: DVec3,
     },
-    /// Neither.
+    /// Is at this place by the end of the step, and meets what is there with its tip.
+    Lead {
+        /// In the frame of the sheet at rest, z out of the tissue, m.
+        place_m: DVec3,
+        /// What it is there.
+        tip: Tip,
+    },
+    /// None of these.
     Release,
 }
 

@@ -5,9 +5,7 @@ use std::path::{Path, PathBuf};
 use crate::limits::Limits;
 use crate::pace::excerpt;
 use crate::refusal::{Reason, Refusal, Result};
-use crate::scene::{PAPER, Scene};
-
-const BUILT_IN: [(&str, &str); 1] = [("paper", PAPER)];
+use crate::scene::{BUILT_IN, Scene};
 
 /// Scenes by name.
 #[derive(Debug, Clone)]

@@ -10,11 +10,13 @@ use tonic::{Request, Response, Status, Streaming};
 use tracing::{debug, info};
 
 use super::House;
+use crate::haptics::device::{Device, UNDECLARED_FORCE_N};
 use crate::pace::clock::now_ns;
 use crate::pace::queue::{Reader, Writer, queue};
 use crate::pace::{Live, PacedSample, StreamGuard, random_bits};
-use crate::refusal::{Reason, Refusal};
-use crate::session::command::LeaseId;
+use crate::refusal::{Reason, Refusal, number};
+use crate::scene::script::Action;
+use crate::session::command::{Command, LeaseId};
 use crate::wire::pb::haptic_service_server::HapticService;
 use crate::wire::{self, pb};
 
@@ -46,6 +48,7 @@ struct Hold {
     live: Arc<Live>,
     lease: LeaseId,
     tools: usize,
+    device: Option<Device>,
 }
 
 impl Drop for Hold {
@@ -62,22 +65,49 @@ fn lease_id(text: &str) -> Result<LeaseId, Refusal> {
     LeaseId::from_str_radix(text, 16).map_err(wrong)
 }
 
+/// A command, unless it leads the tool out of the declared workspace.
+fn within_reach(command: Command, live: &Live, device: Option<&Device>) -> Result<Command, Refusal> {
+    if let (Action::Lead { place_m, .. }, Some(device)) = (&command.action, device) {
+        let middle_m = (live.model.scene.sheet.extent_m() / 2.0).extend(0.0);
+        let away_m = (*place_m - middle_m).length();
+        let range = format!("within {} m of the middle of the sheet, the device's workspace", device.workspace_m);
+        number("pose.position_m", away_m, &range, |away_m| away_m <= device.workspace_m)?;
+    }
+    Ok(command)
+}
+
 impl Haptics {
     /// Answers the first message of a haptic stream.
-    fn open(&self, open: &pb::TouchOpen) -> Result<(Opened, Hold), Refusal> {
+    async fn open(&self, open: &pb::TouchOpen) -> Result<(Opened, Hold), Refusal> {
         let live = self.0.pacer.get(&open.session_id)?;
+        let device = open.device.as_ref().map(wire::local::from_device).transpose()?;
+        let tip = wire::command::from_tip(open.tip.as_ref());
+        tip.check("tip", &live.model.scene.sheet)?;
         let only = (!open.tools.is_empty()).then(|| open.tools.clone());
-        let sampling = wire::sample::sampling(open.sample_every_steps, only, open.deadband.as_ref(), open.heartbeat_s)?;
+        let (every, deadband) = (open.sample_every_steps, open.deadband.as_ref());
+        let mut sampling = wire::sample::sampling(every, only, deadband, open.heartbeat_s, device.is_some())?;
         let guard = live.open_stream()?;
+        if device.is_some() {
+            let live = live.clone();
+            let law = tokio::task::spawn_blocking(move || live.law(tip.radius_m)).await;
+            let failed = |_| Refusal::new(Reason::NotAvailable, "device", "the force law could not be computed");
+            sampling.law = Some(law.map_err(failed)?);
+        }
         let lease_s = open.lease_s.unwrap_or(self.0.config.lease_s);
         let lease = random_bits()?;
         let step = live.at_intake(|intake, now| {
             intake.acquire(&open.tools, &open.holder, lease_s, lease, now).map(|()| intake.next_step())
         })?;
-        let hold = Hold { live: live.clone(), lease, tools: open.tools.len() };
-        let (rate_hz, heartbeat_s) = (live.model.scene.stepping.rate_hz, sampling.heartbeat_s);
+        let hold = Hold { live: live.clone(), lease, tools: open.tools.len(), device };
+        let answer = pb::TouchOpened {
+            step,
+            rate_hz: live.model.scene.stepping.rate_hz,
+            lease_s,
+            heartbeat_s: sampling.heartbeat_s,
+            law: sampling.law.as_deref().map(wire::local::law),
+            max_force_n: device.map_or(UNDECLARED_FORCE_N, |device| device.most_n()),
+        };
         let samples = live.samples(sampling);
-        let answer = pb::TouchOpened { step, rate_hz, lease_s, heartbeat_s };
         info!(session = %live.id, tools = ?open.tools, holder = ?open.holder, "haptic stream opened");
         Ok((Opened { answer, samples, guard }, hold))
     }
@@ -91,7 +121,7 @@ impl Haptics {
     ) {
         use pb::touch_request::Message;
         let first = match inbound.message().await {
-            Ok(Some(pb::TouchRequest { message: Some(Message::Open(open)) })) => self.open(&open),
+            Ok(Some(pb::TouchRequest { message: Some(Message::Open(open)) })) => self.open(&open).await,
             Ok(_) => Err(Refusal::new(Reason::OutOfTurn, "open", "the first message must be `open`")),
             Err(status) => {
                 let _ = opening.send(Err(status));
@@ -113,8 +143,9 @@ impl Haptics {
             match inbound.message().await {
                 Ok(Some(pb::TouchRequest { message: Some(Message::Command(command)) })) => {
                     let now = now_ns();
-                    let taken =
-                        wire::command::from_command(&command, &live.model.scene.sheet, now).and_then(|command| {
+                    let taken = wire::command::from_command(&command, &live.model.scene.sheet, now)
+                        .and_then(|command| within_reach(command, live, hold.device.as_ref()))
+                        .and_then(|command| {
                             live.at_intake(|intake, now| intake.submit(hold.lease, vec![command], now))
                         });
                     if let Err(refusal) = taken {
@@ -156,21 +187,21 @@ impl Outlet {
     async fn next(&mut self) -> Option<Result<pb::touch_response::Message, Status>> {
         use pb::touch_response::Message;
         Some(tokio::select! {
-            biased;
-            event = self.events.pop() => match event {
-                Ok((Event::Rejected(rejection), _)) => Ok(Message::Rejection(rejection)),
-                Ok((Event::Renewed(client_time_ns, arrival_ns), _)) => {
-                    let server_hold_ns = now_ns().saturating_sub(arrival_ns);
-                    Ok(Message::Renewed(pb::Renewed { client_time_ns, server_hold_ns }))
-                }
-                Ok((Event::Failed(status), _)) => Err(status),
-                Ok((Event::Finished, _)) => return None,
-                Err(refusal) => Err(refusal.into()),
-            },
-            sample = self.samples.pop() => match sample {
-                Ok((sample, dropped)) => Ok(Message::Sample(wire::sample::sample(&sample, dropped, now_ns()))),
-                Err(refusal) => Err(refusal.into()),
-            },
+                biased;
+                event = self.events.pop() => match event {
+                    Ok((Event::Rejected(rejection), _)) => Ok(Message::Rejection(rejection)),
+                    Ok((Event::Renewed(client_time_ns, arrival_ns), _)) => {
+                        let server_hold_ns = now_ns().saturating_sub(arrival_ns);
+                        Ok(Message::Renewed(pb::Renewed { client_time_ns, server_hold_ns }))
+                    }
+                    Ok((Event::Failed(status), _)) => Err(status),
+                    Ok((Event::Finished, _)) => return None,
+                    Err(refusal) => Err(refusal.into()),
+                },
+                sample = self.samples.pop() => match sample {
+                    Ok((sample, dropped)) => Ok(Message::Sample(wire::sample::sample(&sample, dropped, now_ns()))),
+                    Err(refusal) => Err(refusal.into()),
+                },
         })
     }
 }
@@ -275,7 +306,7 @@ impl HapticService for Haptics {
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
         let (every, deadband) = (request.sample_every_steps, request.deadband.as_ref());
-        let sampling = wire::sample::sampling(every, None, deadband, request.heartbeat_s)?;
+        let sampling = wire::sample::sampling(every, None, deadband, request.heartbeat_s, false)?;
         let guard = live.open_stream()?;
         let samples = live.samples(sampling);
         let out = stream::unfold(Some((samples, guard)), |state| async move {

@@ -238,6 +238,12 @@ impl Intake {
                 let far_m = displacement_m.length();
                 check_reach("position.displacement_m", &self.scene.sheet, far_m, &self.limits)
             }
+            Action::Lead { place_m, tip } => {
+                crate::refusal::finite_vector("place_m", *place_m)?;
+                let centre_m = (self.scene.sheet.extent_m() / 2.0).extend(0.0);
+                check_reach("place_m", &self.scene.sheet, (*place_m - centre_m).length(), &self.limits)?;
+                tip.check("tip", &self.scene.sheet)
+            }
             Action::Release => Ok(()),
         }
     }
@@ -253,8 +259,14 @@ impl Intake {
             lease.waiting += 1;
             let last = lease.last_place.replace(place);
             // The latest position wins: one that can't act any more makes room.
-            if let (Some(last), Action::Grasp { .. }) = (last.filter(|last| last.0 == step), &command.action)
-                && self.queue.get(&last).is_some_and(|due| matches!(due.command.action, Action::Grasp { .. }))
+            // Not of those that are played by their client's time (`haptics::path`): there each counts.
+            let is_place = |command: &Command| match command.action {
+                Action::Grasp { .. } => true,
+                Action::Lead { .. } => command.at_step.is_some() || command.client_time_ns == 0,
+                Action::Push(_) | Action::Release => false,
+            };
+            if let Some(last) = last.filter(|last| last.0 == step && is_place(&command))
+                && self.queue.get(&last).is_some_and(|due| is_place(&due.command))
                 && let Some(superseded) = self.queue.remove(&last)
             {
                 late_commands += superseded.late_commands;

@@ -3,6 +3,7 @@
 
 pub mod check;
 pub mod command;
+pub mod local;
 pub mod run;
 pub mod sampling;
 pub mod schedule;
@@ -11,10 +12,13 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
+use crate::haptics::LocalModel;
+use crate::haptics::path::{Path, Play};
 use crate::scene::law::{ForceLaw, MoveLaw};
 use crate::scene::record::{EnergyJ, Point, Record};
 use crate::scene::script::{Action, nearest_point};
-use crate::sheet::{self, Energy, Grasp, Model, PointState, Push, Tissue};
+use crate::scene::tip::Tip;
+use crate::sheet::{self, Energy, Feel, Grasp, Model, PointState, Push, Tissue};
 use command::Due;
 
 /// What one tool felt at the end of a step.
@@ -30,6 +34,14 @@ pub struct ToolSample {
     pub arrival_ns: u64,
     /// What it does, and feels, if anything.
     pub contact: Option<Contact>,
+    /// The same of a tool that is led by its position, from its own point of view.
+    pub feel: Option<Feel>,
+    /// The client's time of the place where such a tool is, s.
+    pub place_time_s: f64,
+    /// What is sent ahead for a client to render by, of a stream that has asked for it.
+    pub local: Option<LocalModel>,
+    /// No command came for long: the tool is held where it is.
+    pub stale: bool,
     /// The acknowledged command came too late for its step.
     pub late: bool,
     /// What the tool did was ended by its time to live, or with its lease.
@@ -77,6 +89,17 @@ struct Tool {
     expires_at: Option<u64>,
     late: bool,
     expired: bool,
+    led: Option<Led>,
+}
+
+/// A tool that is led by its position.
+#[derive(Debug, Clone)]
+struct Led {
+    tip: Tip,
+    /// Of commands that come with their client's time, and are played by it.
+    path: Option<Path>,
+    /// The client's time of the place where it is, s.
+    client_time_s: f64,
 }
 
 /// A tissue and its tools.
@@ -127,7 +150,9 @@ impl Session {
     /// The step at whose beginning something happens by itself, if not before: nothing if the tissue moves.
     pub fn rests_until(&self) -> Option<u64> {
         let expiry = self.tools.iter().filter_map(|tool| tool.expires_at).min();
-        self.tissue.is_still().then(|| expiry.unwrap_or(u64::MAX))
+        // A path may bring a tool at any time.
+        let still = self.tissue.is_still() && self.tools.iter().all(|tool| tool.led.is_none());
+        still.then(|| expiry.unwrap_or(u64::MAX))
     }
 
     /// Goes on to the moment when `step` steps are done, which must not be later than [`Session::rests_until`]: the same
@@ -149,6 +174,7 @@ impl Session {
             self.act(due);
         }
         self.expire();
+        self.play();
         if self.step_count() == 0 {
             observe(self);
         }
@@ -162,6 +188,24 @@ impl Session {
             return;
         }
         observe(self);
+    }
+
+    /// Plays the paths of the tools that have one.
+    fn play(&mut self) {
+        let step_s = self.model().scene.stepping.rate_hz.recip();
+        let end_s = self.time_s() + step_s;
+        for (index, tool) in self.tools.iter_mut().enumerate() {
+            let Some(led) = &mut tool.led else { continue };
+            let Some(path) = &mut led.path else { continue };
+            match path.step(end_s, step_s) {
+                Some(Play::Lead(place_m, client_time_s)) => {
+                    led.client_time_s = client_time_s;
+                    self.tissue.lead(index, place_m, led.tip);
+                }
+                Some(Play::Release) => self.tissue.release(index),
+                None => {}
+            }
+        }
     }
 
     fn tool(&mut self, tool: usize) -> &mut Tool {
@@ -194,17 +238,36 @@ impl Session {
         tool.expires_at = lifetime.map(|steps| step.saturating_add(steps));
         match command.action {
             Action::Push(poke) => {
+                self.tool(index).led = None;
                 let point = nearest_point(&self.model().scene.sheet, poke.centre_m);
                 self.tool(index).control_point = Some(point);
                 self.tissue.push(index, Some(Push::Held(poke)));
             }
             Action::Grasp { point, displacement_m } => {
+                self.tool(index).led = None;
                 self.tool(index).control_point = Some(point);
                 let place = self.model().index_of(point);
                 self.tissue.grasp(index, place, Grasp::Held(displacement_m));
             }
+            Action::Lead { place_m, tip } => {
+                let point = nearest_point(&self.model().scene.sheet, place_m.truncate());
+                let client_time_s = command.client_time_ns as f64 * 1e-9;
+                let now_s = self.time_s();
+                let tool = self.tool(index);
+                tool.control_point = Some(point);
+                let led = tool.led.get_or_insert(Led { tip, path: None, client_time_s });
+                led.tip = tip;
+                // What is stamped with its step is played there; what has only its client's time, by that.
+                if command.at_step.is_some() || command.client_time_ns == 0 {
+                    (led.path, led.client_time_s) = (None, client_time_s);
+                    self.tissue.lead(index, place_m, tip);
+                } else {
+                    led.path.get_or_insert_default().receive(client_time_s, place_m, now_s);
+                }
+            }
             Action::Release => {
-                self.tool(index).expires_at = None;
+                let tool = self.tool(index);
+                (tool.expires_at, tool.led) = (None, None);
                 self.tissue.release(index);
             }
         }
@@ -217,6 +280,7 @@ impl Session {
             if self.tools[index].expires_at.is_some_and(|at| at <= step) {
                 self.tools[index].expires_at = None;
                 self.tools[index].expired = true;
+                self.tools[index].led = None;
                 self.tissue.release(index);
             }
         }
@@ -237,15 +301,25 @@ impl Session {
     pub fn sample(&self, only: Option<&[u32]>) -> Sample {
         let sample_of = |number: u32| {
             let tool = self.tools.get(number as usize).cloned().unwrap_or_default();
-            let contact = tool.control_point.map(|point| {
-                let state = self.tissue.point(self.model().index_of(point));
-                Contact {
-                    point,
-                    displacement_m: state.displacement_m,
-                    velocity_m_per_s: state.velocity_m_per_s,
-                    force_on_tool_n: state.reaction_n(),
-                    applied_force_n: state.applied_n,
-                }
+            let feel = self.tissue.feel(number as usize);
+            let led = |feel: Feel| Contact {
+                point: nearest_point(&self.model().scene.sheet, feel.anchor_m),
+                displacement_m: feel.surface_m - feel.anchor_m.extend(0.0),
+                velocity_m_per_s: feel.velocity_m_per_s,
+                force_on_tool_n: feel.force_on_tool_n,
+                applied_force_n: -feel.force_on_tool_n,
+            };
+            let contact = feel.map(led).or_else(|| {
+                tool.control_point.map(|point| {
+                    let state = self.tissue.point(self.model().index_of(point));
+                    Contact {
+                        point,
+                        displacement_m: state.displacement_m,
+                        velocity_m_per_s: state.velocity_m_per_s,
+                        force_on_tool_n: state.reaction_n(),
+                        applied_force_n: state.applied_n,
+                    }
+                })
             });
             ToolSample {
                 tool: number,
@@ -253,6 +327,14 @@ impl Session {
                 client_time_ns: tool.client_time_ns,
                 arrival_ns: tool.arrival_ns,
                 contact,
+                feel,
+                place_time_s: tool.led.as_ref().map_or(0.0, |led| led.client_time_s),
+                local: None,
+                stale: tool
+                    .led
+                    .as_ref()
+                    .and_then(|led| led.path.as_ref())
+                    .is_some_and(|path| path.is_held(self.time_s())),
                 late: tool.late,
                 expired: tool.expired,
             }

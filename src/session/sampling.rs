@@ -1,6 +1,11 @@
 //! Which samples a stream gets: every Nth, those of a change beyond a deadband, and heartbeats where nothing changes.
 
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use super::local::{Modeller, Refinement};
 use super::{Sample, Session, ToolSample};
+use crate::haptics::{self, Law, LocalModel};
 use crate::refusal::{Reason, Refusal, Result, number};
 
 /// Between two samples of what does not change, s, unless asked otherwise: 20 a second, so that a client can tell
@@ -19,20 +24,24 @@ pub struct Deadband {
     pub force_fraction: Option<f64>,
     /// Of the control point's displacement, m.
     pub displacement_m: Option<f64>,
+    /// Of the force that a client renders by the last local model, as a part of the true one.
+    pub rendered_fraction: Option<f64>,
 }
 
 impl Deadband {
     /// Whether it can be used. 0 is any change.
     pub fn check(&self) -> Result<()> {
-        let Deadband { force_n, force_fraction, displacement_m } = *self;
-        if force_n.or(force_fraction).or(displacement_m).is_none() {
-            let message = "has no bound: give force_n, force_fraction, displacement_m, or no deadband";
+        let Deadband { force_n, force_fraction, displacement_m, rendered_fraction } = *self;
+        if !self.looks_at_samples() && rendered_fraction.is_none() {
+            let message =
+                "has no bound: give force_n, force_fraction, displacement_m, rendered_fraction, or no deadband";
             return Err(Refusal::new(Reason::Missing, "deadband", message));
         }
         for (field, value, most) in [
             ("deadband.force_n", force_n, f64::INFINITY),
             ("deadband.force_fraction", force_fraction, 1.0),
             ("deadband.displacement_m", displacement_m, f64::INFINITY),
+            ("deadband.rendered_fraction", rendered_fraction, 1.0),
         ] {
             if let Some(value) = value {
                 let range = if most.is_finite() { "from 0 to 1" } else { "at least 0" };
@@ -42,6 +51,11 @@ impl Deadband {
         Ok(())
     }
 
+    /// Whether samples are compared with each other, or only with what is rendered.
+    fn looks_at_samples(&self) -> bool {
+        self.force_n.or(self.force_fraction).or(self.displacement_m).is_some()
+    }
+
     fn is_left(&self, told: &ToolSample, now: &ToolSample) -> bool {
         if (told.tool, told.late, told.expired) != (now.tool, now.late, now.expired) {
             return true;
@@ -49,6 +63,7 @@ impl Deadband {
         let (told, now) = match (&told.contact, &now.contact) {
             (Some(told), Some(now)) if told.point == now.point => (told, now),
             (None, None) => return false,
+            (Some(_), Some(_)) if !self.looks_at_samples() => return false,
             _ => return true,
         };
         let force = (self.force_n.is_some() || self.force_fraction.is_some()).then(|| {
@@ -71,6 +86,8 @@ pub struct Sampling {
     pub deadband: Option<Deadband>,
     /// Between two samples of what does not change, s.
     pub heartbeat_s: f64,
+    /// Samples have local models by this law.
+    pub law: Option<Arc<Law>>,
 }
 
 impl Sampling {
@@ -89,7 +106,16 @@ impl Sampling {
 pub struct Sampler {
     sampling: Sampling,
     heartbeat_steps: u64,
+    /// Without local models.
     told: Option<Sample>,
+    foresight: BTreeMap<u32, Foresight>,
+}
+
+/// What is sent ahead of a tool's way, and what is rendered by it.
+#[derive(Debug)]
+struct Foresight {
+    modeller: Modeller,
+    deadband: haptics::Deadband,
 }
 
 impl Sampler {
@@ -97,7 +123,7 @@ impl Sampler {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub fn new(sampling: Sampling, rate_hz: f64) -> Self {
         let heartbeat_steps = (sampling.heartbeat_s * rate_hz).round().max(1.0) as u64;
-        Sampler { sampling, heartbeat_steps, told: None }
+        Sampler { sampling, heartbeat_steps, told: None, foresight: BTreeMap::new() }
     }
 
     /// The sample of the step that was just done, if the stream is to get it. `last`: it gets it anyhow, because for
@@ -108,15 +134,57 @@ impl Sampler {
         if is_told || !(last || step.is_multiple_of(self.sampling.every)) {
             return None;
         }
-        let sample = session.sample(self.sampling.only.as_deref());
+        let mut sample = session.sample(self.sampling.only.as_deref());
         let is_due = |told: &Sample| {
             last || step.saturating_sub(told.step) >= self.heartbeat_steps || self.is_news(told, &sample)
         };
-        if !told.is_none_or(is_due) {
+        let is_due = told.is_none_or(is_due);
+        let Some(law) = self.sampling.law.clone() else {
+            self.told = is_due.then(|| sample.clone()).or(self.told.take());
+            return is_due.then_some(sample);
+        };
+        let (models, is_left) = self.look_ahead(&sample, &law);
+        if !(is_due || is_left) {
             return None;
         }
         self.told = Some(sample.clone());
+        for (tool, model) in models {
+            if let Some(foresight) = self.foresight.get_mut(&tool) {
+                foresight.deadband.send(&model, &law);
+            }
+            sample.tools.iter_mut().filter(|sample| sample.tool == tool).for_each(|sample| sample.local = Some(model));
+        }
         Some(sample)
+    }
+
+    /// The local models of the tools that are led by their position, and whether the client is off by too much.
+    fn look_ahead(&mut self, sample: &Sample, law: &Arc<Law>) -> (Vec<(u32, LocalModel)>, bool) {
+        let fraction = self.sampling.deadband.as_ref().and_then(|deadband| deadband.rendered_fraction);
+        let (mut models, mut is_left) = (Vec::new(), false);
+        for tool in &sample.tools {
+            let Some(feel) = &tool.feel else {
+                self.foresight.remove(&tool.tool);
+                // What has no model can't be foretold.
+                is_left |= fraction.is_some() && tool.contact.is_some();
+                continue;
+            };
+            let foresight = self.foresight.entry(tool.tool).or_insert_with(|| Foresight {
+                modeller: Modeller::new(law.clone()),
+                deadband: haptics::Deadband::new(fraction.unwrap_or(0.0)),
+            });
+            let model = foresight.modeller.model(feel, sample.step, tool.place_time_s);
+            is_left |= fraction.is_some() && foresight.deadband.is_left(&model, law);
+            models.push((tool.tool, model));
+        }
+        (models, is_left)
+    }
+
+    /// What computes the stiffness anew under each tool that touches, of which the stream is told.
+    pub fn refinements(&self, session: &Session) -> impl Iterator<Item = Refinement> {
+        let refinement = |(tool, foresight): (&u32, &Foresight)| {
+            Some(foresight.modeller.refinement(session.tissue().surroundings(*tool as usize)?))
+        };
+        self.foresight.iter().filter_map(refinement)
     }
 
     fn is_news(&self, told: &Sample, now: &Sample) -> bool {
@@ -159,7 +227,7 @@ mod tests {
     }
 
     fn sampler(every: u64, deadband: Option<Deadband>) -> Sampler {
-        Sampler::new(Sampling { every, only: None, deadband, heartbeat_s: 0.02 }, 1000.0)
+        Sampler::new(Sampling { every, only: None, deadband, heartbeat_s: 0.02, law: None }, 1000.0)
     }
 
     fn grasp(session: &mut Session, sequence: u64, z_m: f64) {
@@ -227,10 +295,14 @@ mod tests {
             client_time_ns: 0,
             arrival_ns: 0,
             contact: Some(contact(z_n)),
+            feel: None,
+            place_time_s: 0.0,
+            local: None,
+            stale: false,
             late: false,
             expired: false,
         };
-        let deadband = Deadband { force_n: Some(0.1), force_fraction: Some(0.1), displacement_m: None };
+        let deadband = Deadband { force_n: Some(0.1), force_fraction: Some(0.1), ..Deadband::default() };
         for (told_n, now_n, left) in [(0.0, 0.09, false), (0.0, 0.11, true), (10.0, 10.9, false), (10.0, 11.2, true)] {
             assert_eq!(deadband.is_left(&tool(told_n), &tool(now_n)), left, "{told_n} N to {now_n} N");
         }

@@ -13,7 +13,10 @@
 use std::fmt;
 use std::sync::Arc;
 
+use glam::DVec3;
+
 use super::applied::{Applied, Push};
+use super::contact::Contacts;
 use super::field::{Field, Layout, State};
 use super::integrate::Scheme;
 use super::model::{Model, Plan};
@@ -21,6 +24,7 @@ use super::prescribed::{Grasp, Prescribed};
 use super::real::Real;
 use super::springs::Springs;
 use super::{BlowUp, Sheet, springs_of};
+use crate::scene::tip::Tip;
 
 /// Substeps between two surveys.
 pub const INTERVAL_SUBSTEPS: u64 = 256;
@@ -85,6 +89,7 @@ impl fmt::Display for Cause {
 pub(super) enum Input {
     Push(Option<Push>),
     Grasp(usize, Grasp),
+    Lead(DVec3, Tip),
 }
 
 /// Everything that a sheet goes back to.
@@ -95,6 +100,7 @@ pub(super) struct Checkpoint<T: Real> {
     pub(super) state: State<T>,
     pub(super) applied: Applied<T>,
     pub(super) prescribed: Prescribed,
+    pub(super) contacts: Contacts,
     pub(super) work: Work,
 }
 
@@ -166,18 +172,19 @@ impl<T: Real> Sheet<T> {
 
     /// What the sheet is now is what it goes back to.
     fn take_checkpoint(&mut self) {
-        let Sheet { bench, state, applied, prescribed, tiles, .. } = self;
+        let Sheet { bench, state, applied, prescribed, contacts, tiles, .. } = self;
         let checkpoint = self.checkpoint.get_or_insert_with(|| {
             tiles.touch_all();
             let state = State::at_rest(&bench.layout, state.kept.len());
-            let (applied, prescribed) = (applied.clone(), prescribed.clone());
-            Box::new(Checkpoint { steps: 0, halvings: 0, state, applied, prescribed, work: Work::default() })
+            let (applied, prescribed, contacts) = (applied.clone(), prescribed.clone(), contacts.clone());
+            Box::new(Checkpoint { steps: 0, halvings: 0, state, applied, prescribed, contacts, work: Work::default() })
         });
         checkpoint.steps = self.steps;
         checkpoint.halvings = self.halvings;
         tiles.copy_touched(checkpoint.state.fields_mut().zip(self.state.fields()));
         checkpoint.applied.clone_from(&self.applied);
         checkpoint.prescribed.clone_from(&self.prescribed);
+        checkpoint.contacts.clone_from(&self.contacts);
         checkpoint.work = self.work;
         self.inputs.clear();
     }
@@ -201,6 +208,7 @@ impl<T: Real> Sheet<T> {
         self.state.copy_from(&checkpoint.state);
         self.applied.clone_from(&checkpoint.applied);
         self.prescribed.clone_from(&checkpoint.prescribed);
+        self.contacts.clone_from(&checkpoint.contacts);
         self.work = checkpoint.work;
         let was = self.model.plan.divided(&self.model.scene, 1 << checkpoint.halvings);
         let plan = self.model.plan.divided(&self.model.scene, 1 << halvings);

@@ -30,7 +30,9 @@ macro_rules! with_scheme {
 
 mod applied;
 pub mod choice;
+mod contact;
 mod field;
+mod footprint;
 pub mod guard;
 pub mod integrate;
 mod lanes;
@@ -42,6 +44,7 @@ mod springs;
 pub mod stability;
 mod survey;
 mod sweep;
+pub mod tangent;
 mod tiles;
 
 use std::sync::Arc;
@@ -51,9 +54,13 @@ use xxhash_rust::xxh3::Xxh3;
 
 use crate::scene::Precision;
 use crate::scene::law::{Moment, Motion};
+use crate::scene::tip::Tip;
 use applied::Applied;
 pub use applied::Push;
+use contact::Contacts;
+pub use contact::{Feel, Standing, Surroundings};
 use field::{Layout, State};
+pub use footprint::{Footprint, Reached};
 pub use guard::Cause;
 use guard::{Checkpoint, Input, Work};
 use integrate::{Scheme, central, exponential, rk4};
@@ -124,7 +131,13 @@ pub trait Tissue: Send {
     fn push(&mut self, tool: usize, push: Option<Push>);
     /// From the coming step on `tool` moves the point at `index`.
     fn grasp(&mut self, tool: usize, index: usize, grasp: Grasp);
-    /// `tool` neither pushes nor grasps any more, from the coming step on.
+    /// From the coming step on `tool`, which meets the sheet with `tip`, is at `place_m` at the step's end.
+    fn lead(&mut self, tool: usize, place_m: DVec3, tip: Tip);
+    /// What a tool that is led by its position does and feels.
+    fn feel(&self, tool: usize) -> Option<Feel>;
+    /// A copy of the sheet around such a tool, if it touches or holds: to compute the stiffness there.
+    fn surroundings(&self, tool: usize) -> Option<Surroundings>;
+    /// `tool` neither pushes nor grasps nor touches any more, from the coming step on.
     fn release(&mut self, tool: usize);
     /// The scheme as it is now: the guard may have halved the substep of the model's.
     fn plan(&self) -> &Plan;
@@ -172,6 +185,7 @@ struct Sheet<T: Real> {
     state: State<T>,
     applied: Applied<T>,
     prescribed: Prescribed,
+    contacts: Contacts,
     steps: u64,
     work: Work,
     /// None: the state as it is. A sheet at rest needs no second one.
@@ -199,6 +213,7 @@ impl<T: Real> Sheet<T> {
             checkpoint: None,
             applied: Applied::new(),
             prescribed: Prescribed::new(),
+            contacts: Contacts::default(),
             inputs: Vec::new(),
             tiles: Tiles::new(layout, rest::tolerance(model), if model.scene.springs.flexion { 2 } else { 1 }),
             guard_events: 0,
@@ -221,6 +236,7 @@ impl<T: Real> Sheet<T> {
         }
         self.applied.finish(&self.model, self.steps);
         self.prescribed.finish(&self.model, self.steps);
+        self.contacts.finish(self.model.scene.stepping.rate_hz);
         self.steps += 1;
         if self.steps.is_multiple_of(CHECK_STEPS) {
             self.rest();
@@ -289,6 +305,8 @@ impl<T: Real> Sheet<T> {
         let unit_j = self.unit_of_work_j();
         self.work.add(self.bench.take_work() * unit_j);
         self.hold(moment.step, end, true);
+        let Sheet { model, plan, bench, state, contacts, tiles, work, .. } = self;
+        contacts.act(model, plan, bench, state, tiles, work, end);
     }
 
     /// Of 1 in the fields of the tools' force along 1 in u.
@@ -423,11 +441,18 @@ impl<T: Real> Sheet<T> {
         match input {
             Input::Push(push) => {
                 self.prescribed.release(tool);
+                self.contacts.release(tool);
                 self.applied.set(tool, push);
+            }
+            Input::Lead(place_m, tip) => {
+                self.prescribed.release(tool);
+                self.applied.set(tool, None);
+                self.contacts.lead(&self.model, tool, place_m, tip);
             }
             Input::Grasp(index, grasp) => {
                 self.applied.set(tool, None);
-                self.tiles.wake([self.tiles.of(self.model.point_of(index))]);
+                self.contacts.release(tool);
+                self.tiles.wake_under([self.model.point_of(index)]);
                 let PointState { displacement_m, velocity_m_per_s, .. } = self.point(index);
                 let now = Motion { displacement_m, velocity_m_per_s, ..Motion::default() };
                 self.prescribed.grasp(tool, index, grasp, now);
@@ -479,12 +504,27 @@ impl<T: Real> Tissue for Sheet<T> {
         self.input(tool, Input::Grasp(index, grasp));
     }
 
+    fn lead(&mut self, tool: usize, place_m: DVec3, tip: Tip) {
+        self.input(tool, Input::Lead(place_m, tip));
+    }
+
+    fn feel(&self, tool: usize) -> Option<Feel> {
+        Sheet::feel(self, tool)
+    }
+
+    fn surroundings(&self, tool: usize) -> Option<Surroundings> {
+        Sheet::surroundings(self, tool)
+    }
+
     fn release(&mut self, tool: usize) {
         self.push(tool, None);
     }
 
     fn is_still(&self) -> bool {
-        self.tiles.awake.is_empty() && self.applied.is_settled() && self.prescribed.is_empty()
+        self.tiles.awake.is_empty()
+            && self.applied.is_settled()
+            && self.prescribed.is_empty()
+            && self.contacts.is_empty()
     }
 
     fn skip_steps(&mut self, steps: u64) {

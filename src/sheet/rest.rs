@@ -49,9 +49,11 @@ impl<T: Real> Sheet<T> {
         if !self.tiles.may_sleep() || self.tiles.awake.is_empty() {
             return;
         }
-        let Sheet { model, plan, bench, state, tiles, prescribed, applied, .. } = self;
+        let Sheet { model, plan, bench, state, tiles, prescribed, contacts, applied, .. } = self;
         let spacing_m = model.scene.sheet.spacing_m;
-        let grasped: Vec<usize> = prescribed.grasped().map(|(index, _)| tiles.of(model.point_of(index))).collect();
+        // What a tool holds or touches goes on being computed.
+        let grasped = prescribed.grasped().map(|(index, _)| model.point_of(index));
+        let held: Vec<usize> = grasped.chain(contacts.points()).map(|point| tiles.of(point)).collect();
         for (_, motion) in prescribed.grasped() {
             tiles.largest = tiles.largest.max(motion.displacement_m.length() / spacing_m);
         }
@@ -70,7 +72,7 @@ impl<T: Real> Sheet<T> {
         };
         let mut region = Region::default();
         let mut sleepers = Vec::new();
-        for tile in calm.into_iter().filter(|tile| !grasped.contains(tile)) {
+        for tile in calm.into_iter().filter(|tile| !held.contains(tile)) {
             tiles.region_of_one(tile, &mut region);
             let survey = with_scheme!(plan, T, |scheme| Survey::of(bench, scheme, state, forces, &region));
             if tiles.is_calm(tile, survey.speed <= slow(epsilon) && survey.imbalance <= epsilon * pull * scale) {

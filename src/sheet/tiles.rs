@@ -270,6 +270,12 @@ impl<T: Real> Tiles<T> {
         any
     }
 
+    /// Wakes the tiles of points.
+    pub(super) fn wake_under(&mut self, points: impl IntoIterator<Item = [usize; 2]>) {
+        let columns = self.counts[1];
+        self.wake(points.into_iter().map(|[i, j]| i / TILE * columns + j / TILE));
+    }
+
     pub(super) fn wake_all(&mut self) {
         self.wake(0..self.calm.len());
         self.asleep_j = 0.0;

@@ -1,12 +1,13 @@
 //! Commands.
 
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 
 use super::{from_place, from_point, from_vector, pb, point, required, vector};
-use crate::refusal::Result;
+use crate::refusal::{Result, number};
 use crate::scene::Sheet;
 use crate::scene::law::Poke;
 use crate::scene::script::Action;
+use crate::scene::tip::{Coupling, Tip};
 use crate::session::command::Command;
 
 /// A command out of a message that came at `arrival_ns`.
@@ -34,6 +35,7 @@ pub fn from_command(message: &pb::Command, sheet: &Sheet, arrival_ns: u64) -> Re
             };
             Action::Grasp { point, displacement_m }
         }
+        Message::Pose(pose) => Action::Lead { place_m: from_pose(pose)?, tip: from_tip(pose.tip.as_ref()) },
         Message::Release(_) => Action::Release,
     };
     Ok(Command {
@@ -47,9 +49,52 @@ pub fn from_command(message: &pb::Command, sheet: &Sheet, arrival_ns: u64) -> Re
     })
 }
 
+/// Where a pose has its tip.
+fn from_pose(pose: &pb::Pose) -> Result<DVec3> {
+    let position_m = from_vector(required("pose.position_m", pose.position_m.as_ref()).map(Some)?);
+    let offset_m = from_vector(pose.tip_offset_m.as_ref());
+    let Some(pb::Quaternion { w, x, y, z }) = pose.orientation else { return Ok(position_m + offset_m) };
+    let turn = DQuat::from_xyzw(x, y, z, w);
+    number("pose.orientation", turn.length(), "of length 1", |length| (length - 1.0).abs() <= 1e-3)?;
+    Ok(position_m + turn.normalize() * offset_m)
+}
+
+/// A tip out of a message; what an absent one is.
+pub fn from_tip(tip: Option<&pb::Tip>) -> Tip {
+    tip.map_or_else(Tip::default, |tip| Tip {
+        radius_m: tip.radius_m,
+        friction: tip.friction,
+        grasps: tip.grasps,
+        coupling: tip.spring.as_ref().map_or(Coupling::Constraint, |spring| Coupling::Spring {
+            stiffness_n_per_m: spring.stiffness_n_per_m,
+            damping_n_s_per_m: spring.damping_n_s_per_m,
+        }),
+    })
+}
+
+/// A tip as a message.
+pub fn tip(tip: &Tip) -> pb::Tip {
+    pb::Tip {
+        radius_m: tip.radius_m,
+        friction: tip.friction,
+        grasps: tip.grasps,
+        spring: match tip.coupling {
+            Coupling::Constraint => None,
+            Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } => {
+                Some(pb::Spring { stiffness_n_per_m, damping_n_s_per_m })
+            }
+        },
+    }
+}
+
 /// A message of what a script tells tool `tool`, to act at step `at_step`.
 #[allow(clippy::cast_possible_truncation)]
 pub fn scripted(tool: usize, at_step: u64, action: &Action, client_time_ns: u64) -> pb::Command {
+    pb::Command { at_step: Some(at_step), ..now(tool as u32, at_step + 1, action, client_time_ns) }
+}
+
+/// A message of what a tool is to do when it arrives, or of a pose, by the client's own time.
+pub fn now(tool: u32, sequence: u64, action: &Action, client_time_ns: u64) -> pb::Command {
     use pb::command::Action as Message;
     let action = match action {
         Action::Push(poke) => Message::Force(pb::Force {
@@ -62,14 +107,13 @@ pub fn scripted(tool: usize, at_step: u64, action: &Action, client_time_ns: u64)
             point: Some(point(*at)),
             target: Some(pb::position::Target::DisplacementM(pb::Vector3 { x: *x, y: *y, z: *z })),
         }),
+        Action::Lead { place_m, tip } => Message::Pose(pb::Pose {
+            position_m: vector(*place_m),
+            orientation: None,
+            tip_offset_m: None,
+            tip: Some(self::tip(tip)),
+        }),
         Action::Release => Message::Release(pb::Release {}),
     };
-    pb::Command {
-        tool: tool as u32,
-        sequence: at_step + 1,
-        client_time_ns,
-        at_step: Some(at_step),
-        time_to_live_s: None,
-        action: Some(action),
-    }
+    pb::Command { tool, sequence, client_time_ns, at_step: None, time_to_live_s: None, action: Some(action) }
 }

@@ -2,6 +2,7 @@
 
 pub mod command;
 pub mod error;
+pub mod local;
 pub mod sample;
 pub mod scene;
 

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::{every, from_point, from_vector, pb, point, vector};
 use crate::pace::frames::Delivery;
 use crate::pace::{Live, PacedRecord, PacedSample, State};
-use crate::refusal::{Refusal, Result};
+use crate::refusal::{Reason, Refusal, Result};
 use crate::scene::Named;
 use crate::scene::record::{EnergyJ, Point, Record};
 use crate::session::ToolSample;
@@ -13,13 +13,18 @@ use crate::session::sampling::{Deadband, HEARTBEAT_S, Sampling};
 use crate::surface::Encoding;
 use crate::surface::encode::Patch;
 
-/// Which samples a stream asks for.
+/// Which samples a stream asks for. `renders`: it has declared a device.
 pub fn sampling(
     every_steps: Option<u32>,
     only: Option<Vec<u32>>,
     deadband: Option<&pb::Deadband>,
     heartbeat_s: Option<f64>,
+    renders: bool,
 ) -> Result<Sampling> {
+    if !renders && deadband.is_some_and(|deadband| deadband.rendered_fraction.is_some()) {
+        let message = "is missing: deadband.rendered_fraction goes by its local models";
+        return Err(Refusal::new(Reason::Missing, "device", message));
+    }
     let sampling = Sampling {
         every: every("sample_every_steps", every_steps)?,
         only,
@@ -27,8 +32,10 @@ pub fn sampling(
             force_n: deadband.force_n,
             force_fraction: deadband.force_fraction,
             displacement_m: deadband.displacement_m,
+            rendered_fraction: deadband.rendered_fraction,
         }),
         heartbeat_s: heartbeat_s.unwrap_or(HEARTBEAT_S),
+        law: None,
     };
     sampling.check()?;
     Ok(sampling)
@@ -68,6 +75,8 @@ fn tool_sample(tool: &ToolSample, now_ns: u64) -> pb::ToolSample {
         applied_force_n: contact.and_then(|contact| vector(contact.applied_force_n)),
         late: tool.late,
         expired: tool.expired,
+        local_model: tool.local.as_ref().map(super::local::local_model),
+        stale: tool.stale,
     }
 }
 

@@ -137,8 +137,15 @@ impl Multistep {
     }
 
     /// What a constant force of 1 adds to the velocity in a substep.
-    pub fn impulse(&self) -> f64 {
-        self.moments[0][1]
+
+    /// What a constant force of 1 adds to u and w in a substep.
+    pub(super) fn constant(&self) -> [f64; 2] {
+        self.moments[0]
+    }
+
+    /// E·b: what a blow adds to u and w.
+    pub(super) fn kick(&self) -> [f64; 2] {
+        [self.linear[0][1], 1.0 + self.linear[1][1]]
     }
 
     /// What a constant force of 1 adds in a substep: to u, to w, and to the forces that are kept.

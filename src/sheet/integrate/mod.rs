@@ -108,11 +108,7 @@ impl Scheme {
 
     /// What a constant force of 1 adds to the velocity in a substep, or nearly so: by the last of its fields.
     pub fn impulse(&self) -> f64 {
-        match self {
-            Scheme::TwoStep(two) => two.q,
-            Scheme::Multistep(multistep) => multistep.impulse(),
-            Scheme::Rk4 { .. } => 1.0,
-        }
+        self.constant()[1]
     }
 
     /// Which field of the tools' force adds to the velocity.
@@ -120,6 +116,24 @@ impl Scheme {
         match self {
             Scheme::TwoStep(_) => 0,
             Scheme::Multistep(_) | Scheme::Rk4 { .. } => 1,
+        }
+    }
+
+    /// What a constant force of 1 adds to u and to d in a substep.
+    pub fn constant(&self) -> [f64; 2] {
+        match self {
+            Scheme::TwoStep(two) => [two.q; 2],
+            Scheme::Multistep(multistep) => multistep.constant(),
+            Scheme::Rk4 { .. } => [0.5, 1.0],
+        }
+    }
+
+    /// What a short blow of impulse 1 at a substep's beginning adds, by its end, to u and to d.
+    pub fn kick(&self) -> [f64; 2] {
+        match self {
+            Scheme::TwoStep(two) => [two.q; 2],
+            Scheme::Multistep(multistep) => multistep.kick(),
+            Scheme::Rk4 { .. } => [1.0; 2],
         }
     }
 

@@ -1,0 +1,296 @@
+//! Touch over a network, in virtual time: how true, how steady and how passive is what a simulated hand feels, by delay,
+//! tissue, hand, network and scheme. First the delay at which hand and spring become unstable, which theory knows; and
+//! how stiff the tissues are under a disc, which a flat punch knows. Runs `palpate-client link`, as anybody can.
+
+#![allow(clippy::unwrap_used, clippy::panic, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
+
+mod report;
+
+use std::path::PathBuf;
+use std::process::Command;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use palpate::limits::Limits;
+use palpate::scene::{BUILT_IN, Scene};
+use palpate::sheet::{Model, tangent};
+use report::chart::{Look, Panel, Series};
+use report::{Report, cells, digits, quick, rough};
+use serde_json::{Value, json};
+
+const SCHEMES: [&str; 3] = ["model", "hold", "raw"];
+const ROUND_TRIPS_MS: [f64; 7] = [0.5, 2.0, 10.0, 20.0, 50.0, 100.0, 200.0];
+
+/// The program, which `make bench-link` has built.
+fn program() -> PathBuf {
+    PathBuf::from(env!("CARGO_BIN_EXE_palpate")).with_file_name("palpate-client")
+}
+
+fn link(arguments: &[String]) -> Value {
+    let output = Command::new(program()).arg("link").args(arguments).arg("--json").output().unwrap();
+    let told = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "link {arguments:?}: {told}");
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+/// All runs, on all processors, in order.
+fn links(runs: &[Vec<String>]) -> Vec<Value> {
+    let next = AtomicUsize::new(0);
+    let results = Mutex::new(vec![Value::Null; runs.len()]);
+    std::thread::scope(|scope| {
+        for _ in 0..std::thread::available_parallelism().map_or(1, usize::from) {
+            scope.spawn(|| {
+                while let Some((at, run)) = {
+                    let at = next.fetch_add(1, Ordering::Relaxed);
+                    runs.get(at).map(|run| (at, run))
+                } {
+                    let found = link(run);
+                    results.lock().unwrap()[at] = found;
+                }
+            });
+        }
+    });
+    results.into_inner().unwrap()
+}
+
+fn words(text: &str) -> Vec<String> {
+    text.split_whitespace().map(str::to_owned).collect()
+}
+
+fn number(value: &Value) -> f64 {
+    value.as_f64().unwrap_or(f64::NAN)
+}
+
+/// Of several seeds: means, and the worst where a mean says little.
+fn merged(runs: &[Value], name: &str) -> f64 {
+    let values = runs.iter().map(|run| number(&run[name]));
+    match name {
+        "energy_min_j" => values.fold(f64::INFINITY, f64::min),
+        "jump_max_n" | "peak_ratio" | "model_age_ms_p99" => values.fold(0.0, f64::max),
+        _ => values.sum::<f64>() / runs.len() as f64,
+    }
+}
+
+const COLUMNS: [(&str, &str); 10] = [
+    ("force error, % RMS", "force_error_rms_percent"),
+    ("p99, N", "force_error_p99_n"),
+    ("least energy, J", "energy_min_j"),
+    ("largest jump, N", "jump_max_n"),
+    ("guard acts, share of ticks", "guard_share"),
+    ("rendered / true", "rendered_share"),
+    ("peak / true peak", "peak_ratio"),
+    ("model age p99, ms", "model_age_ms_p99"),
+    ("packets a second", "packets_per_s"),
+    ("kbit/s", "kbit_per_s"),
+];
+
+fn row(label: &[String], runs: &[Value]) -> Vec<String> {
+    let unstable = runs.iter().filter(|run| run["unstable"] == true).count();
+    let mut row = label.to_vec();
+    row.push(if unstable > 0 { format!("in {unstable} of {}", runs.len()) } else { "–".to_owned() });
+    row.extend(COLUMNS.iter().map(|(_, name)| match *name {
+        "energy_min_j" => rough(merged(runs, name)),
+        _ => digits(merged(runs, name)),
+    }));
+    row
+}
+
+fn header(label: &[&str]) -> Vec<String> {
+    let mut header = cells(label);
+    header.push("unstable".to_owned());
+    header.extend(COLUMNS.iter().map(|(title, _)| (*title).to_owned()));
+    header
+}
+
+fn main() {
+    let seeds: u64 = if quick() { 1 } else { 3 };
+    let mut report = Report::new("link", "Touch over a network", "make bench-link");
+    report.say(
+        "Simulated hands, devices and networks, in virtual time (`palpate-client link --help`); runs of 20 s, means over \
+         the seeds 1 to 3, of energies, jumps, peaks and ages the worst. `raw` renders the newest force as it came, `hold` \
+         the same within the safety envelope, `model` the local model along the tool's own way within the envelope. \
+         Energy below 0 was given by the device's port. Where the seeds differ in the scale of a run that became unstable, \
+         its figures are those until then.",
+    );
+    boundary(&mut report);
+    stiffness(&mut report);
+    let panels = delays(&mut report, seeds);
+    others(&mut report, seeds);
+    random(&mut report);
+    report.write(3, &panels);
+}
+
+fn boundary(report: &mut Report) {
+    let found = link(&words("--boundary"));
+    let rows = found.as_array().unwrap();
+    let apart = |row: &Value| (number(&row["predicted_ms"]) - number(&row["observed_ms"])).abs();
+    let most = rows.iter().map(apart).fold(0.0, f64::max);
+    report.heading("The delay at which hand and spring become unstable");
+    report.say(&format!(
+        "m·s² + b·s + k + K·e^(−s·t) = 0 beside the loop of `link` with a spring for a tissue: {} combinations, at most {} \
+         ms apart.",
+        rows.len(),
+        digits(most)
+    ));
+    let table: Vec<_> = rows
+        .iter()
+        .map(|row| {
+            let hand = row["hand"].as_str().unwrap().to_owned();
+            let numbers = ["stiffness_n_per_m", "predicted_ms", "observed_ms"];
+            let numbers = numbers.map(|name| digits(number(&row[name])));
+            std::iter::once(hand).chain(numbers).collect()
+        })
+        .collect();
+    report.table(&cells(["hand", "K, N/m", "predicted, ms", "observed, ms"]), &table);
+    report.figure("boundary", found);
+}
+
+fn stiffness(report: &mut Report) {
+    report.heading("Stiffness under a disc, by spacing");
+    report.say(
+        "A slow press by a disc of 5 mm radius, force over depth, N/m; the same tissue on finer grids, the disc at three \
+         places of a cell (on a point, at a quarter, in the middle). The last column is a flat punch on a half-space of the \
+         same material, 2aE/(1 − ν²), where nothing hardens.",
+    );
+    let punches = [("liver", 5400.0), ("stomach", 1920.0), ("fibrotic", 26_900.0)];
+    let (mut rows, mut figures) = (Vec::new(), Vec::new());
+    for (name, young_pa) in punches {
+        let text = BUILT_IN.iter().find(|scene| scene.0 == name).unwrap().1;
+        let base = Scene::parse(name, text, &[], &Limits::default()).unwrap();
+        let spacings = if quick() { &[0.01, 0.005, 0.0025][..] } else { &[0.01, 0.005, 0.0025, 0.00125] };
+        for &spacing_m in spacings {
+            let share = (spacing_m / base.sheet.spacing_m).powi(2);
+            let points = (0.08 / spacing_m).round() as usize + 1;
+            let mut scene = base.clone();
+            scene.sheet.points = [points; 2];
+            scene.sheet.spacing_m = spacing_m;
+            scene.sheet.point_mass_kg *= share;
+            scene.virtual_stiffness_n_per_m *= share;
+            scene.damping_n_s_per_m *= share;
+            let model = Model::compile(&scene, &Limits::default()).unwrap();
+            let places = [0.0, 0.25, 0.5].map(|part| {
+                let centre_m = scene.sheet.extent_m() / 2.0 + glam::DVec2::splat(part * spacing_m);
+                let pressed = tangent::press(&model, 0.005, centre_m, 0.0005, 3);
+                [1, 2].map(|row: usize| pressed[row].force_n / pressed[row].depth_m)
+            });
+            let cell = |depth: usize| places.map(|place| digits(place[depth])).join(" / ");
+            let punch = 2.0 * 0.005 * young_pa / (1.0 - 0.49 * 0.49);
+            rows.push(cells([name.to_owned(), digits(1e3 * spacing_m), cell(0), cell(1), digits(punch)]));
+            figures
+                .push(json!({"scene": name, "spacing_m": spacing_m, "n_per_m": places, "flat_punch_n_per_m": punch}));
+        }
+    }
+    report.table(&cells(["tissue", "spacing, mm", "at 0.5 mm", "at 1 mm", "flat punch"]), &rows);
+    report.figure("stiffness", Value::Array(figures));
+}
+
+/// The main table: error by delay.
+fn delays(report: &mut Report, seeds: u64) -> Vec<Panel> {
+    report.heading("By delay: medium hand, omega3");
+    let scenes = ["liver", "fibrotic", "stomach"];
+    let mut runs = Vec::new();
+    for scene in scenes {
+        for rtt in ROUND_TRIPS_MS {
+            for scheme in SCHEMES {
+                for seed in 1..=seeds {
+                    runs.push(words(&format!("--scene {scene} --rtt-ms {rtt} --scheme {scheme} --seed {seed}")));
+                }
+            }
+        }
+    }
+    let found = links(&runs);
+    let mut groups = found.chunks(seeds as usize);
+    let (mut rows, mut panels) = (Vec::new(), Vec::new());
+    for scene in scenes {
+        let mut series = SCHEMES.map(|scheme| Series {
+            name: scheme.to_owned(),
+            hue: SCHEMES.iter().position(|other| *other == scheme).unwrap(),
+            look: if scheme == "model" { Look::Full } else { Look::Hollow },
+            points: Vec::new(),
+        });
+        for rtt in ROUND_TRIPS_MS {
+            for (series, scheme) in series.iter_mut().zip(SCHEMES) {
+                let runs = groups.next().unwrap();
+                rows.push(row(&cells([scene.to_owned(), digits(rtt), scheme.to_owned()]), runs));
+                series.points.push((rtt, merged(runs, "force_error_rms_percent")));
+            }
+        }
+        let title = format!("{scene}, medium hand");
+        panels.push(Panel::Lines { title, x: "round trip, ms", y: "force error, % RMS", series: series.to_vec() });
+    }
+    report.table(&header(&["tissue", "round trip, ms", "scheme"]), &rows);
+    report.figure("delays", Value::Array(found));
+    panels
+}
+
+fn others(report: &mut Report, seeds: u64) {
+    let table = |report: &mut Report, name: &str, labels: &[&str], runs: Vec<(Vec<String>, String)>| {
+        let all: Vec<_> = runs
+            .iter()
+            .flat_map(|(_, run)| (1..=seeds).map(move |seed| words(&format!("{run} --seed {seed}"))))
+            .collect();
+        let found = links(&all);
+        let rows: Vec<_> =
+            runs.iter().zip(found.chunks(seeds as usize)).map(|((label, _), runs)| row(label, runs)).collect();
+        report.table(&header(labels), &rows);
+        report.figure(name, Value::Array(found));
+    };
+    report.heading("By network and hand: fibrotic, omega3");
+    let mut runs = Vec::new();
+    for profile in ["lan", "metro", "wan", "bad-wan"] {
+        for hand in ["light", "medium", "firm", "none"] {
+            for scheme in SCHEMES {
+                let run = format!("--scene fibrotic --profile {profile} --hand {hand} --scheme {scheme}");
+                runs.push((cells([profile, hand, scheme]), run));
+            }
+        }
+    }
+    table(report, "networks", &["network", "hand", "scheme"], runs);
+
+    report.heading("By device: fibrotic, medium hand, 50 ms");
+    let devices = ["touch", "omni", "desktop", "falcon", "omega3", "delta3", "sigma7", "lambda7", "inverse3"];
+    let run = |device: &&str| (cells([*device]), format!("--scene fibrotic --rtt-ms 50 --device {device}"));
+    table(report, "devices", &["device"], devices.iter().map(run).collect());
+
+    report.heading("Deadband: 2 ms, medium hand, omega3");
+    report.say("Samples are sent when the force that the client renders is off by more than δ, or after 40 ms.");
+    let mut runs = Vec::new();
+    for scene in ["liver", "fibrotic", "stomach"] {
+        for (scheme, delta) in [("model", 0.0), ("model", 0.1), ("model", 0.2)] {
+            let run = format!("--scene {scene} --rtt-ms 2 --scheme {scheme} --deadband {delta}");
+            runs.push((cells([scene.to_owned(), scheme.to_owned(), delta.to_string()]), run));
+        }
+    }
+    table(report, "deadband", &["tissue", "scheme", "δ"], runs);
+}
+
+fn random(report: &mut Report) {
+    let runs = if quick() { 20 } else { 1000 };
+    report.heading("Random combinations");
+    let found = link(&words(&format!("--random {runs} --seconds 10")));
+    report.say(&format!(
+        "`palpate-client link --random {runs} --seconds 10`: scene, hand, device, network and task drawn by seed, {} \
+         unstable. Worst of each figure, and whose it is:",
+        found["unstable"]
+    ));
+    let mut rows = Vec::new();
+    for (name, entry) in found.as_object().unwrap() {
+        let Some(run) = entry.get("run") else { continue };
+        let text = |key: &str| run[key].as_str().unwrap_or("").to_owned();
+        let worst = number(&entry["worst"]);
+        let worst = if name == "energy_min_j" { rough(worst) } else { digits(worst) };
+        let (rtt, jitter, loss) = (&run["rtt_ms"], &run["jitter_ms"], &run["loss"]);
+        let network = format!("{rtt} ± {jitter} ms, loss {loss}");
+        rows.push(cells([
+            name.clone(),
+            worst,
+            text("scene"),
+            text("hand"),
+            text("device"),
+            network,
+            run["seed"].to_string(),
+        ]));
+    }
+    report.table(&cells(["figure", "worst", "tissue", "hand", "device", "network", "seed"]), &rows);
+    report.figure("random", found);
+}

@@ -1,0 +1,212 @@
+//! `palpate-client bridge`: a haptic device at a server, at 1 kHz.
+
+pub(crate) mod device;
+pub(crate) mod line;
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use glam::DVec3;
+use palpate::haptics::{Envelope, Reason, Renderer, State};
+use palpate::scene::tip::Tip;
+use serde_json::json;
+use tokio::sync::mpsc;
+
+use crate::Failure;
+use crate::link;
+use device::{HapticDevice, Simulated};
+use line::{COMMANDS, Shared, Target};
+
+/// What `bridge` is asked for.
+#[derive(clap::Args)]
+pub(crate) struct Arguments {
+    /// The server
+    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7117")]
+    server: String,
+    /// A session that is there; otherwise one is made of --scene
+    #[arg(long, value_name = "ID")]
+    session: Option<String>,
+    /// A scene that the server has by that name
+    #[arg(long, value_name = "NAME", default_value = "liver")]
+    scene: String,
+    /// The tool's number
+    #[arg(long, default_value_t = 0)]
+    tool: u32,
+    /// A simulated device: touch, omni, desktop, falcon, omega3, delta3, sigma7, lambda7, inverse3 or undeclared
+    #[arg(long, default_value = "omega3")]
+    device: String,
+    /// A simulated hand that holds it: light, medium, firm or none
+    #[arg(long, default_value = "medium")]
+    hand: String,
+    /// Samples only where the rendered force would be off by this part; 0: one a step
+    #[arg(long, value_name = "PART", default_value_t = 0.0)]
+    deadband: f64,
+    /// Ends after so long, s; default: at Ctrl-C
+    #[arg(long, value_name = "S")]
+    seconds: Option<f64>,
+    /// Of what the simulated hand does
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+}
+
+/// A tick of the device, s.
+pub(crate) const TICK_S: f64 = 1e-3;
+
+/// What a device's loop remembers of each tick: place and rendered force.
+pub(crate) type Course = Vec<(DVec3, DVec3)>;
+
+/// What a device's loop has done.
+pub(crate) struct Served {
+    /// Only as long as it was asked to remember.
+    pub(crate) course: Course,
+    /// Of the last renderer.
+    pub(crate) envelope: Option<Envelope>,
+    /// Ticks that began more than a tick late.
+    pub(crate) late_ticks: u64,
+    pub(crate) ages_s: Vec<f64>,
+}
+
+/// Runs a device against a server until `ticks` are done. The device's frame is the sheet's. `remember`: keeps its course.
+pub(crate) fn serve(
+    device: &mut dyn HapticDevice,
+    shared: &Shared,
+    commands: &mpsc::Sender<line::Command>,
+    ticks: Option<u32>,
+    remember: bool,
+) -> std::io::Result<Served> {
+    let descriptor = device.descriptor();
+    let mut renderer: Option<Renderer> = None;
+    let mut served = Served { course: Vec::new(), envelope: None, late_ticks: 0, ages_s: Vec::new() };
+    let (start, mut asked) = (Instant::now(), false);
+    // A clock that does not begin at 0: 0 means no time.
+    let clock_s = |at: Instant| 1.0 + at.duration_since(start).as_secs_f64();
+    let mut tick = 0_u32;
+    while ticks.is_none_or(|ticks| tick < ticks) && !commands.is_closed() {
+        let due = start + Duration::from_secs_f64(f64::from(tick) * TICK_S);
+        wait_until(due);
+        let now = Instant::now();
+        served.late_ticks += u64::from(now.duration_since(due).as_secs_f64() > TICK_S);
+        let reading = device.read()?;
+        let now_s = clock_s(now);
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+        let now_ns = (now_s * 1e9) as u64;
+        let mut force_n = DVec3::ZERO;
+        let (law, model, middle_m) = {
+            let mut inbound = shared.inbound();
+            (inbound.law.take(), inbound.newest.take(), inbound.middle_m)
+        };
+        if let Some(law) = law {
+            match &mut renderer {
+                // The envelope goes on: what was paused stays paused, what was rendered is let go at its rate.
+                Some(renderer) => renderer.begin(law),
+                None => renderer = Some(Renderer::new(law, Envelope::new(descriptor, middle_m))),
+            }
+        }
+        if let Some(renderer) = &mut renderer {
+            if reading.enable && !asked {
+                renderer.envelope.reset();
+                renderer.envelope.enable();
+            }
+            if let Some(model) = model {
+                renderer.receive(model, now_s);
+            }
+            force_n = renderer.tick(now_s, reading.place_m);
+            if remember && let Some(time_s) = renderer.model_time_s() {
+                served.ages_s.push(now_s - time_s);
+            }
+        }
+        asked = reading.enable;
+        device.write(force_n)?;
+        if remember {
+            served.course.push((reading.place_m, force_n));
+        }
+        // A network that does not keep up gets the next one.
+        let _ = commands.try_send((now_ns, reading.place_m));
+        tick += 1;
+    }
+    let _ = device.write(DVec3::ZERO);
+    served.envelope = renderer.map(|renderer| renderer.envelope);
+    Ok(served)
+}
+
+/// Sleeps, and looks at the clock for the last part.
+fn wait_until(due: Instant) {
+    const SPIN: Duration = Duration::from_micros(80);
+    if let Some(rest) = due.checked_duration_since(Instant::now() + SPIN) {
+        std::thread::sleep(rest);
+    }
+    while Instant::now() < due {
+        std::hint::spin_loop();
+    }
+}
+
+/// Runs a simulated device.
+pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
+    let refused = |refusal: palpate::refusal::Refusal| Failure::Refused(refusal.to_string());
+    let (hand, device) =
+        (link::hand_named(&arguments.hand).map_err(refused)?, link::device_named(&arguments.device).map_err(refused)?);
+    let scene = link::scene_named(std::path::Path::new(&arguments.scene), &palpate::limits::Limits::default());
+    let scene = scene.map_err(refused)?;
+    let seconds = arguments.seconds.unwrap_or(3600.0);
+    let middle_m = (scene.sheet.extent_m() / 2.0).extend(0.0);
+    let task = link::Task::new(middle_m, link::LEAD_S, seconds, 0.2, &mut link::Dice::new(arguments.seed, 0));
+    let mut simulated = Simulated::new(device, hand, task, TICK_S);
+    let target = Target {
+        server: arguments.server.clone(),
+        session: arguments.session.clone(),
+        scene: arguments.scene.clone(),
+        tool: arguments.tool,
+        tip: Tip::default(),
+        deadband: arguments.deadband,
+    };
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    let ticks = arguments.seconds.map(|seconds| (seconds / TICK_S) as u32);
+    let (served, shared) = run(&mut simulated, target, ticks, false).await?;
+    let inbound = shared.inbound();
+    let mut told = json!({
+        "connections": inbound.connections, "samples": inbound.samples, "commands_refused": inbound.refused,
+        "late_ticks": served.late_ticks,
+    });
+    if let Some(envelope) = &served.envelope {
+        told["energy_j"] = json!(envelope.energy_j());
+        told["enabled"] = json!(envelope.state() == State::Enabled);
+        let counts = Reason::ALL.iter().map(|(reason, name)| ((*name).to_owned(), json!(envelope.count(*reason).0)));
+        told["interventions_ticks"] = serde_json::Value::Object(counts.collect());
+    }
+    println!("{told}");
+    Ok(())
+}
+
+/// A device's loop on a thread of its own, and the network beside it; until the ticks are done, or Ctrl-C.
+pub(crate) async fn run(
+    device: &mut dyn HapticDevice,
+    target: Target,
+    ticks: Option<u32>,
+    remember: bool,
+) -> Result<(Served, Arc<Shared>), Failure> {
+    let shared = Arc::new(Shared::default());
+    let (commands, received) = mpsc::channel(COMMANDS);
+    let descriptor = device.descriptor();
+    let network = tokio::spawn({
+        let shared = shared.clone();
+        async move {
+            tokio::select! {
+                () = line::keep(target, descriptor, &shared, received) => {}
+                // The loop sees that nobody takes its commands any more.
+                _ = tokio::signal::ctrl_c() => {}
+            }
+        }
+    });
+    let served = std::thread::scope(|scope| {
+        let worker = scope.spawn(|| {
+            let served = serve(device, &shared, &commands, ticks, remember);
+            drop(commands);
+            served
+        });
+        tokio::task::block_in_place(|| worker.join())
+    });
+    let served = served.map_err(|_| Failure::Failed("the device's loop broke down".to_owned()))?;
+    let _ = network.await;
+    let served = served.map_err(|error| Failure::Failed(format!("the device: {error}")))?;
+    Ok((served, shared))
+}

@@ -1,0 +1,138 @@
+//! The delay at which a hand and a spring at the far end of a wire become unstable: found by the loop of `link` itself,
+//! with a spring for a tissue, beside what theory says of it. A loop that misses this is believed nothing else.
+
+use glam::DVec3;
+use palpate::haptics::hand::{HANDS, Hand, Held};
+use serde_json::{Value, json};
+
+use super::network::{Dice, Way, Weather};
+use super::run::TICK_S;
+use crate::Failure;
+
+/// Springs that are tried, N/m.
+pub(super) const STIFFNESSES_N_PER_M: [f64; 9] = [150.0, 250.0, 300.0, 400.0, 500.0, 700.0, 1000.0, 1500.0, 3000.0];
+
+/// Longest delay that is tried, ticks.
+const MOST_TICKS: u32 = 200;
+
+/// How long a loop is watched, s.
+const WATCHED_S: f64 = 4.0;
+
+/// One combination.
+pub(super) struct Boundary {
+    pub(super) hand: &'static str,
+    pub(super) stiffness_n_per_m: f64,
+    /// By theory, s.
+    pub(super) predicted_s: f64,
+    /// By the loop; infinite if none was found below [`MOST_TICKS`].
+    pub(super) observed_s: f64,
+}
+
+/// By how much the energy of the vibration grows in the loop, e-folds a second.
+fn growth_per_s(hand: &Hand, stiffness_n_per_m: f64, ticks: u32) -> f64 {
+    // All on one way: halves of an odd number of ticks would each count as a whole one more.
+    let weather = |ticks: u32| Weather { round_trip_s: 2.0 * f64::from(ticks) * TICK_S, jitter_s: 0.0, loss: 0.0 };
+    let mut up: Way<DVec3> = Way::new(weather(ticks), Dice::new(0, 0));
+    let mut down: Way<DVec3> = Way::new(weather(0), Dice::new(0, 1));
+    let mut held = Held { place_m: DVec3::new(0.0, 0.0, 1e-3), velocity_m_per_s: DVec3::ZERO };
+    let (mut place_m, mut force_n) = (DVec3::ZERO, DVec3::ZERO);
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    let whole = (WATCHED_S / TICK_S) as u32;
+    let mut halves = [0.0; 2];
+    for tick in 0..whole {
+        let now_s = f64::from(tick) * TICK_S;
+        up.send(now_s, held.place_m);
+        while let Some(place) = up.receive(now_s) {
+            place_m = place;
+        }
+        down.send(now_s, -stiffness_n_per_m * place_m);
+        while let Some(force) = down.receive(now_s) {
+            force_n = force;
+        }
+        held = hand.advance(held, DVec3::ZERO, DVec3::ZERO, force_n, TICK_S);
+        // What it was set out with takes a while to forget.
+        let part = 4 * tick / whole;
+        if part >= 2 {
+            let energy_j = hand.stiffness_n_per_m * held.place_m.length_squared()
+                + hand.mass_kg * held.velocity_m_per_s.length_squared();
+            halves[part as usize - 2] += energy_j;
+        }
+        // Decided long ago, and soon no number any more.
+        if !(held.place_m.length() < 1e6) {
+            return f64::INFINITY;
+        }
+    }
+    (halves[1] / halves[0]).ln() / (WATCHED_S / 4.0)
+}
+
+/// The delay between two whole ticks at which the growth is zero. A force that is held for a tick is half a tick older
+/// than it says, in the mean.
+fn observed_s(hand: &Hand, stiffness_n_per_m: f64) -> f64 {
+    let mut before = f64::NEG_INFINITY;
+    for ticks in 0..=MOST_TICKS {
+        let growth = growth_per_s(hand, stiffness_n_per_m, ticks);
+        if growth > 0.0 {
+            let part = if growth.is_finite() && before.is_finite() { before / (before - growth) } else { 1.0 };
+            return (f64::from(ticks) - 1.0 + part + 0.5) * TICK_S;
+        }
+        before = growth;
+    }
+    f64::INFINITY
+}
+
+/// Every hand with every spring for which there is a boundary to find.
+pub(super) fn all() -> Vec<Boundary> {
+    let mut found = Vec::new();
+    for hand in &HANDS {
+        for stiffness_n_per_m in STIFFNESSES_N_PER_M {
+            let predicted_s = hand.critical_delay_s(stiffness_n_per_m);
+            // Below a tick there is nothing between two ticks to find.
+            if predicted_s > TICK_S && predicted_s < f64::from(MOST_TICKS) * TICK_S {
+                let observed_s = observed_s(hand, stiffness_n_per_m);
+                found.push(Boundary { hand: hand.name, stiffness_n_per_m, predicted_s, observed_s });
+            }
+        }
+    }
+    found
+}
+
+/// Prints all.
+pub(super) fn print(as_json: bool) -> Result<(), Failure> {
+    let all = all();
+    if as_json {
+        let rows = all.iter().map(|row| {
+            json!({
+                "hand": row.hand, "stiffness_n_per_m": row.stiffness_n_per_m,
+                "predicted_ms": 1e3 * row.predicted_s, "observed_ms": 1e3 * row.observed_s,
+            })
+        });
+        println!("{}", Value::Array(rows.collect()));
+    } else {
+        println!("{:<8} {:>12} {:>14} {:>13}", "hand", "K (N/m)", "predicted (ms)", "observed (ms)");
+        for row in &all {
+            let (predicted_ms, observed_ms) = (1e3 * row.predicted_s, 1e3 * row.observed_s);
+            println!("{:<8} {:>12} {predicted_ms:>14.2} {observed_ms:>13.2}", row.hand, row.stiffness_n_per_m);
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn the_loop_becomes_unstable_at_the_delay_that_theory_says() {
+        let all = super::all();
+        assert!(all.len() >= 20, "only {} combinations have a boundary", all.len());
+        for row in all {
+            let apart_s = (row.predicted_s - row.observed_s).abs();
+            assert!(
+                apart_s < 1e-3,
+                "{} hand, {} N/m: {} s predicted, {} s observed",
+                row.hand,
+                row.stiffness_n_per_m,
+                row.predicted_s,
+                row.observed_s
+            );
+        }
+    }
+}

@@ -1,0 +1,302 @@
+//! One run: hand, device, network, tissue and its twin, tick by tick in virtual time.
+
+use std::sync::Arc;
+
+use glam::DVec3;
+use palpate::haptics::deadband::{Deadband, HEARTBEAT_S};
+use palpate::haptics::device::Device;
+use palpate::haptics::envelope::{Envelope, Wanted};
+use palpate::haptics::hand::{Hand, Held};
+use palpate::haptics::{Law, LocalModel, Reason, Renderer, State};
+use palpate::scene::tip::Tip;
+use palpate::sheet::Model;
+use palpate::wire::local::sample_bytes;
+
+use super::network::{Dice, Way, Weather};
+use super::task::{self, Task};
+use super::tissue::{Server, Tissue, Twin};
+
+/// What a client makes of samples.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub(super) enum Scheme {
+    /// The newest force, as it came: no model, no envelope
+    Raw,
+    /// The newest force, held, within the safety envelope
+    Hold,
+    /// The local model along the tool's own way, within the safety envelope
+    Model,
+}
+
+/// What a run is of.
+#[derive(Debug, Clone)]
+pub(super) struct Setup {
+    pub(super) model: Arc<Model>,
+    pub(super) law: Arc<Law>,
+    pub(super) tip: Tip,
+    pub(super) hand: Hand,
+    pub(super) device: Device,
+    pub(super) weather: Weather,
+    pub(super) scheme: Scheme,
+    pub(super) deadband: f64,
+    pub(super) duration_s: f64,
+    pub(super) seed: u64,
+}
+
+/// A tick of the device, s.
+pub(super) const TICK_S: f64 = 1e-3;
+
+/// The port has given so much, or the tool has left so many times the task's amplitude: that is unstable.
+const UNSTABLE_J: f64 = -0.1;
+const UNSTABLE_AMPLITUDES: f64 = 3.0;
+
+/// Below, nothing is rendered, N.
+const NOTHING_N: f64 = 1e-6;
+
+/// The simulated owner enables again so long after a pause began, s.
+const PATIENCE_S: f64 = 0.3;
+
+/// What a run found.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Found {
+    pub(super) force_error_rms_percent: Option<f64>,
+    pub(super) force_error_p99_n: f64,
+    pub(super) energy_min_j: f64,
+    pub(super) jump_max_n: f64,
+    pub(super) guard_share: f64,
+    pub(super) rendered_share: Option<f64>,
+    pub(super) packets_per_s: f64,
+    pub(super) kbit_per_s: f64,
+    pub(super) commands_per_s: f64,
+    pub(super) model_age_ms_p99: Option<f64>,
+    pub(super) peak_ratio: Option<f64>,
+    pub(super) true_force_max_n: f64,
+    pub(super) force_max_n: f64,
+    pub(super) unstable_at_s: Option<f64>,
+    pub(super) pauses: u64,
+    pub(super) faults: u64,
+    pub(super) interventions: Vec<(&'static str, u64)>,
+    pub(super) path: [u64; 3],
+    /// Of a run in real time.
+    pub(super) late_ticks: Option<u64>,
+    /// Time, tool's depth below the rest plane, rendered and true force, each tick.
+    pub(super) course: Vec<[f64; 4]>,
+}
+
+/// What stands at the device.
+enum Client {
+    Raw(Option<LocalModel>),
+    Hold(Option<LocalModel>, Option<f64>, Option<DVec3>, Box<Envelope>),
+    Model(Box<Renderer>),
+}
+
+impl Client {
+    fn receive(&mut self, model: LocalModel, now_s: f64) {
+        match self {
+            Client::Raw(newest) => *newest = Some(model),
+            Client::Hold(newest, arrived_s, ..) => (*newest, *arrived_s) = (Some(model), Some(now_s)),
+            Client::Model(renderer) => renderer.receive(model, now_s),
+        }
+    }
+
+    fn tick(&mut self, now_s: f64, place_m: DVec3) -> DVec3 {
+        match self {
+            Client::Raw(newest) => newest.map_or(DVec3::ZERO, |model| model.force_n),
+            Client::Hold(newest, arrived_s, before, envelope) => {
+                let moved_m = before.replace(place_m).map_or(DVec3::ZERO, |before_m| place_m - before_m);
+                envelope.render(&Wanted {
+                    now_s,
+                    place_m,
+                    velocity_m_per_s: moved_m / TICK_S,
+                    force_n: newest.map_or(DVec3::ZERO, |model| model.force_n),
+                    age_s: arrived_s.map_or(0.0, |arrived_s| now_s - arrived_s),
+                })
+            }
+            Client::Model(renderer) => renderer.tick(now_s, place_m),
+        }
+    }
+
+    fn envelope(&mut self) -> Option<&mut Envelope> {
+        match self {
+            Client::Raw(_) => None,
+            Client::Hold(.., envelope) => Some(envelope),
+            Client::Model(renderer) => Some(&mut renderer.envelope),
+        }
+    }
+
+    fn model_time_s(&self) -> Option<f64> {
+        match self {
+            Client::Raw(newest) | Client::Hold(newest, ..) => newest.map(|model| model.client_time_s),
+            Client::Model(renderer) => renderer.model_time_s(),
+        }
+    }
+}
+
+/// Runs it. The task's depth is drawn in further while the true force is above what the device is asked for.
+pub(super) fn run(setup: &Setup) -> Result<Found, String> {
+    let most_n = setup.device.most_n();
+    let mut scale = task::scale(&setup.hand, &setup.law, most_n);
+    loop {
+        let found = run_scaled(setup, scale)?;
+        if found.true_force_max_n <= task::SHARE * most_n || found.unstable_at_s.is_some() {
+            return Ok(found);
+        }
+        scale *= 0.9;
+    }
+}
+
+fn run_scaled(setup: &Setup, scale: f64) -> Result<Found, String> {
+    let Setup { model, law, tip, hand, device, weather, scheme, deadband, duration_s, seed } = setup;
+    let middle_m = (model.scene.sheet.extent_m() / 2.0).extend(0.0);
+    let task = Task::new(middle_m, task::LEAD_S, *duration_s, scale, &mut Dice::new(*seed, 0));
+    let tissue = || Tissue::new(model, *tip, law.clone());
+    let (mut server, mut twin) = (Server::new(tissue()), Twin::new(tissue()));
+    let mut up: Way<(f64, DVec3)> = Way::new(*weather, Dice::new(*seed, 1));
+    let mut down: Way<LocalModel> = Way::new(*weather, Dice::new(*seed, 2));
+    let (mut deadband, mut told_s) = (Deadband::new(*deadband), f64::NEG_INFINITY);
+    let envelope = || {
+        let mut envelope = Envelope::new(*device, middle_m);
+        envelope.enable();
+        envelope
+    };
+    let mut client = match scheme {
+        Scheme::Raw => Client::Raw(None),
+        Scheme::Hold => Client::Hold(None, None, None, Box::new(envelope())),
+        Scheme::Model => Client::Model(Box::new(Renderer::new((**law).clone(), envelope()))),
+    };
+    let mut held = Held { place_m: task.start_m(), velocity_m_per_s: DVec3::ZERO };
+    let mut account = Account::default();
+    let mut paused_s: Option<f64> = None;
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    let ticks = (duration_s / TICK_S).round() as u32;
+    for tick in 0..ticks {
+        let now_s = f64::from(tick) * TICK_S;
+        let place_m = held.place_m;
+        account.moved(place_m);
+        if account.energy_j < UNSTABLE_J || (place_m - task.start_m()).length() > UNSTABLE_AMPLITUDES * task.amplitude_m
+        {
+            account.found.unstable_at_s = Some(now_s);
+            break;
+        }
+        up.send(now_s, (now_s, place_m));
+        while let Some((time_s, place_m)) = up.receive(now_s) {
+            server.path.receive(time_s, place_m, now_s);
+        }
+        if let Some(model) = server.step(now_s, TICK_S)?
+            && (deadband.is_left(&model, law) || now_s - told_s >= HEARTBEAT_S - 1e-9)
+        {
+            deadband.send(&model, law);
+            told_s = now_s;
+            account.bytes += sample_bytes(&model);
+            down.send(now_s, model);
+        }
+        while let Some(model) = down.receive(now_s) {
+            client.receive(model, now_s);
+        }
+        let force_n = client.tick(now_s, place_m);
+        let (true_n, touches) = twin.truth(place_m)?;
+        let age_s = client.model_time_s().map(|time_s| now_s - time_s);
+        account.rendered(now_s, force_n, true_n, touches, age_s);
+        if let Some(envelope) = client.envelope() {
+            owner(envelope, now_s, &mut paused_s, &mut account.found);
+        }
+        let (from_m, to_m) = (task.at(now_s), task.at(now_s + TICK_S));
+        let string_n = hand.string_n(from_m, place_m);
+        held = hand.advance(held, from_m, to_m, force_n + string_n, TICK_S);
+    }
+    let lasted_s = account.found.unstable_at_s.unwrap_or(*duration_s).max(TICK_S);
+    let bytes = account.bytes;
+    let mut found = account.close();
+    found.packets_per_s = down.sent() as f64 / lasted_s;
+    found.kbit_per_s = bytes as f64 * 8e-3 / lasted_s;
+    found.commands_per_s = up.sent() as f64 / lasted_s;
+    found.path = server.path.counts();
+    if let Some(envelope) = client.envelope() {
+        let (acted, ticks) = envelope.count(Reason::Passivity);
+        found.guard_share = acted as f64 / ticks.max(1) as f64;
+        found.interventions = Reason::ALL.iter().map(|(reason, name)| (*name, envelope.count(*reason).0)).collect();
+    }
+    Ok(found)
+}
+
+/// The owner of the simulated hand sees that rendering has paused, and enables it again after a while.
+fn owner(envelope: &mut Envelope, now_s: f64, paused_s: &mut Option<f64>, found: &mut Found) {
+    match (envelope.state(), *paused_s) {
+        (State::Enabled, _) => *paused_s = None,
+        (_, None) => {
+            *paused_s = Some(now_s);
+            found.pauses += 1;
+            if envelope.state() == State::Fault {
+                found.faults += 1;
+            }
+        }
+        (_, Some(since_s)) if now_s - since_s > PATIENCE_S => {
+            envelope.reset();
+            envelope.enable();
+        }
+        _ => {}
+    }
+}
+
+/// What is summed up on the way.
+#[derive(Default)]
+pub(super) struct Account {
+    found: Found,
+    energy_j: f64,
+    before: Option<DVec3>,
+    force_n: DVec3,
+    /// Squares and sums over the ticks in which either is in contact.
+    error_squared: f64,
+    true_squared: f64,
+    rendered_sum: f64,
+    true_sum: f64,
+    bytes: u64,
+    errors_n: Vec<f64>,
+    pub(super) ages_s: Vec<f64>,
+}
+
+impl Account {
+    /// The tool has moved under the force of the last tick.
+    pub(super) fn moved(&mut self, place_m: DVec3) {
+        if let Some(before_m) = self.before.replace(place_m) {
+            self.energy_j -= self.force_n.dot(place_m - before_m);
+            self.found.energy_min_j = self.found.energy_min_j.min(self.energy_j);
+        }
+    }
+
+    pub(super) fn rendered(&mut self, now_s: f64, force_n: DVec3, true_n: DVec3, touches: bool, age_s: Option<f64>) {
+        let found = &mut self.found;
+        found.jump_max_n = found.jump_max_n.max((force_n - self.force_n).length());
+        self.force_n = force_n;
+        let (rendered, truth) = (force_n.length(), true_n.length());
+        found.force_max_n = found.force_max_n.max(rendered);
+        found.true_force_max_n = found.true_force_max_n.max(truth);
+        if touches || rendered > NOTHING_N {
+            let error_n = (force_n - true_n).length();
+            self.error_squared += error_n * error_n;
+            self.true_squared += truth * truth;
+            self.rendered_sum += rendered;
+            self.true_sum += truth;
+            self.errors_n.push(error_n);
+        }
+        self.ages_s.extend(age_s);
+        let depth_m = -self.before.map_or(0.0, |place_m| place_m.z);
+        found.course.push([now_s, depth_m, rendered, truth]);
+    }
+
+    pub(super) fn close(mut self) -> Found {
+        let part = |of: f64, whole: f64| (whole > 0.0).then(|| of / whole);
+        self.found.force_error_rms_percent = part(self.error_squared, self.true_squared).map(|p| 100.0 * p.sqrt());
+        self.found.rendered_share = part(self.rendered_sum, self.true_sum);
+        self.found.peak_ratio = part(self.found.force_max_n, self.found.true_force_max_n);
+        self.found.force_error_p99_n = percentile(&mut self.errors_n, 0.99).unwrap_or(0.0);
+        self.found.model_age_ms_p99 = percentile(&mut self.ages_s, 0.99).map(|age_s| 1e3 * age_s);
+        self.found
+    }
+}
+
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+fn percentile(values: &mut [f64], part: f64) -> Option<f64> {
+    values.sort_by(f64::total_cmp);
+    let place = (part * values.len() as f64).ceil() as usize;
+    values.get(place.saturating_sub(1)).copied()
+}

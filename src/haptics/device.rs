@@ -1,0 +1,83 @@
+//! Haptic devices: what a client says of its own, so that nobody asks more of it.
+
+use crate::refusal::{Result, number};
+
+/// A device's descriptor.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Device {
+    /// Any name.
+    pub name: &'static str,
+    /// Largest force, N.
+    pub force_n: f64,
+    /// Largest force for longer than [`CONTINUOUS_S`], N.
+    pub continuous_n: f64,
+    /// Largest stiffness that its own loop renders without shaking, N/m.
+    pub stiffness_n_per_m: f64,
+    /// Largest damping, N·s/m.
+    pub damping_n_s_per_m: f64,
+    /// Radius of its workspace, m.
+    pub workspace_m: f64,
+}
+
+/// Nobody is asked to bear more, whatever the device can do, N.
+pub const SAFE_FORCE_N: f64 = 3.3;
+
+/// What a device that says nothing of itself gets, N.
+pub const UNDECLARED_FORCE_N: f64 = 2.0;
+
+/// For so long a device may give more than its continuous force, s.
+pub const CONTINUOUS_S: f64 = 2.0;
+
+const fn device(
+    name: &'static str,
+    force_n: f64,
+    continuous_n: f64,
+    stiffness_n_per_m: f64,
+    damping_n_s_per_m: f64,
+    workspace_m: f64,
+) -> Device {
+    Device { name, force_n, continuous_n, stiffness_n_per_m, damping_n_s_per_m, workspace_m }
+}
+
+/// Devices by what their makers say; where no continuous force is given it is the largest. Inverse3: unverified.
+pub const DEVICES: [Device; 9] = [
+    device("touch", 3.3, 3.3, 400.0, 4.0, 0.075),
+    device("omni", 3.3, 0.88, 700.0, 5.0, 0.10),
+    device("desktop", 7.9, 7.9, 1000.0, 5.0, 0.10),
+    device("falcon", 8.0, 8.0, 3000.0, 20.0, 0.04),
+    device("omega3", 12.0, 12.0, 5000.0, 30.0, 0.075),
+    device("delta3", 20.0, 20.0, 5000.0, 30.0, 0.15),
+    device("sigma7", 12.0, 12.0, 4000.0, 30.0, 0.075),
+    device("lambda7", 12.0, 12.0, 8000.0, 30.0, 0.1125),
+    device("inverse3", 10.0, 10.0, 1000.0, 6.0, 0.15),
+];
+
+/// One that says nothing of itself.
+pub const UNDECLARED: Device = device("undeclared", UNDECLARED_FORCE_N, UNDECLARED_FORCE_N, 400.0, 4.0, 0.075);
+
+impl Device {
+    /// By its name.
+    pub fn named(name: &str) -> Option<Self> {
+        DEVICES.iter().find(|device| device.name == name).copied()
+    }
+
+    /// The largest force that it is asked for, N.
+    pub fn most_n(&self) -> f64 {
+        self.force_n.min(SAFE_FORCE_N)
+    }
+
+    /// Whether it makes sense.
+    pub fn check(&self) -> Result<()> {
+        let fields = [
+            ("device.force_n", self.force_n, 1e3),
+            ("device.continuous_n", self.continuous_n, 1e3),
+            ("device.stiffness_n_per_m", self.stiffness_n_per_m, 1e6),
+            ("device.damping_n_s_per_m", self.damping_n_s_per_m, 1e4),
+            ("device.workspace_m", self.workspace_m, 10.0),
+        ];
+        for (field, value, most) in fields {
+            number(field, value, &format!("above 0 and at most {most}"), |v| v > 0.0 && v <= most)?;
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,333 @@
+//! The safety envelope: what stands between a wanted force and a device, and never lets go of it. In this order:
+//!
+//! 1. the model's age, by when the newest *arrived* (a constant delay is not staleness): up to [`FRESH_S`] nothing; up to
+//!    [`STALE_S`] the force fades to a half; beyond, it decays with [`DECAY_S`]; from [`PAUSE_S`] on the state is PAUSED. News
+//!    that come before bring the force back within [`RETURN_S`];
+//! 2. soft engage: after `enable` nothing is rendered until less than [`ENGAGE_BELOW_N`] is wanted, then the force ramps
+//!    in over [`ENGAGE_S`];
+//! 3. the norm of the force (clamping its components would turn it), and the device's continuous force;
+//! 4. passivity: no more energy leaves the port than has come in;
+//! 5. slew: [`SLEW_N_PER_S`], up and down, whatever happens.
+//!
+//! **Passivity.** The port's energy is exact for a held force: E −= f·Δx at each tick. A force f that moves with the
+//! hand at v, and that slew lets fall no faster than S, still gives f²·v/2S before it is zero. So it is limited to
+//! f ≤ √(2·S·E/v): a spring of K, pressed in and let go at v, is left alone as long as its force falls no faster than the
+//! slew allows, K·v ≤ S. A hand at rest may start at any moment: v counts as at least [`LEAST_SPEED_M_PER_S`]. So that
+//! something can be rendered before anything has come in, the tank begins with [`CREDIT_J`], and a hand that presses on
+//! may always be met with [`FIRST_N`].
+
+use glam::DVec3;
+
+use super::device::{CONTINUOUS_S, Device};
+
+/// A model so old is as good as new, s.
+pub const FRESH_S: f64 = 0.05;
+/// From this age on the force decays to zero, s.
+pub const STALE_S: f64 = 0.15;
+/// From this age on rendering pauses until it is enabled, s: a twentieth of half the force is left.
+pub const PAUSE_S: f64 = 0.3;
+/// A force that has faded comes back within this, s.
+const RETURN_S: f64 = 0.25;
+/// Time constant of that decay, s.
+pub const DECAY_S: f64 = 0.05;
+/// What is left of the force at [`STALE_S`].
+const STALE_SHARE: f64 = 0.5;
+/// Rendering begins only when less is wanted, N.
+pub const ENGAGE_BELOW_N: f64 = 0.2;
+/// And then ramps in, s.
+pub const ENGAGE_S: f64 = 0.5;
+/// N/s.
+pub const SLEW_N_PER_S: f64 = 100.0;
+/// m/s.
+const LEAST_SPEED_M_PER_S: f64 = 0.08;
+/// A hand may speed up while a force falls, and a force that turns falls slower along where it was.
+const SPEED_MARGIN: f64 = 1.5;
+/// What the tank holds at most: later generosity is not paid by friction of long ago, J.
+const TANK_J: f64 = 0.05;
+
+/// What the tank begins with, J: less than any hand notices.
+const CREDIT_J: f64 = 2.5e-4;
+/// N.
+const FIRST_N: f64 = 0.2;
+
+/// Whether forces are rendered.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum State {
+    /// Not until `enable`.
+    Disabled,
+    /// Rendering, or ramping in.
+    Enabled,
+    /// Nothing came for too long; not until `enable`.
+    Paused,
+    /// Something was wrong; not until `reset`, and then `enable`.
+    Fault,
+}
+
+/// Why a force is not the wanted one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Reason {
+    /// The newest model is old.
+    Stale,
+    /// Not enabled, or ramping in.
+    Engage,
+    /// The largest force.
+    Force,
+    /// The continuous force.
+    Continuous,
+    /// It would have given energy.
+    Passivity,
+    /// It would have changed too fast.
+    Slew,
+    /// The tool is outside the device's workspace.
+    Workspace,
+    /// A place, a speed or a force was not finite.
+    NotFinite,
+}
+
+impl Reason {
+    /// All, in the order of their counters.
+    pub const ALL: [(Reason, &'static str); 8] = [
+        (Reason::Stale, "stale"),
+        (Reason::Engage, "engage"),
+        (Reason::Force, "force"),
+        (Reason::Continuous, "continuous"),
+        (Reason::Passivity, "passivity"),
+        (Reason::Slew, "slew"),
+        (Reason::Workspace, "workspace"),
+        (Reason::NotFinite, "not_finite"),
+    ];
+}
+
+/// What is wanted at one tick.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Wanted {
+    /// s.
+    pub now_s: f64,
+    /// Where the device is, in its own frame, m.
+    pub place_m: DVec3,
+    /// m/s.
+    pub velocity_m_per_s: DVec3,
+    /// N.
+    pub force_n: DVec3,
+    /// Since the newest model arrived, s.
+    pub age_s: f64,
+}
+
+/// One device's envelope.
+#[derive(Debug, Clone)]
+pub struct Envelope {
+    device: Device,
+    /// Middle of the device's workspace, m.
+    middle_m: DVec3,
+    state: State,
+    /// Since when it ramps in; none while it waits for a small force.
+    engaged_s: Option<f64>,
+    /// Rendered now, N.
+    force_n: DVec3,
+    before: Option<(f64, DVec3)>,
+    /// What the tank holds, J.
+    tank_j: f64,
+    /// Given to the port by the hand, in all, J.
+    energy_j: f64,
+    over_s: f64,
+    /// Of the force, by the model's age.
+    share: f64,
+    counts: [u64; Reason::ALL.len()],
+    ticks: u64,
+}
+
+impl Envelope {
+    /// DISABLED; the device's workspace is around `middle_m`.
+    pub fn new(device: Device, middle_m: DVec3) -> Self {
+        Envelope {
+            device,
+            middle_m,
+            state: State::Disabled,
+            engaged_s: None,
+            force_n: DVec3::ZERO,
+            before: None,
+            tank_j: CREDIT_J,
+            energy_j: 0.0,
+            over_s: 0.0,
+            share: 1.0,
+            counts: [0; Reason::ALL.len()],
+            ticks: 0,
+        }
+    }
+
+    /// Whether forces are rendered.
+    pub fn state(&self) -> State {
+        self.state
+    }
+
+    /// Energy that the hand has given to the port, less what it got back, J.
+    pub fn energy_j(&self) -> f64 {
+        self.energy_j
+    }
+
+    /// Ticks in which a reason changed the force, and ticks in all.
+    pub fn count(&self, reason: Reason) -> (u64, u64) {
+        (self.counts[reason as usize], self.ticks)
+    }
+
+    /// From DISABLED or PAUSED; a FAULT must be reset first.
+    pub fn enable(&mut self) {
+        if matches!(self.state, State::Disabled | State::Paused) {
+            (self.state, self.engaged_s) = (State::Enabled, None);
+        }
+    }
+
+    /// Renders nothing until it is enabled.
+    pub fn disable(&mut self) {
+        if self.state != State::Fault {
+            self.state = State::Disabled;
+        }
+    }
+
+    /// Renders nothing until it is reset and enabled.
+    pub fn fail(&mut self) {
+        self.state = State::Fault;
+    }
+
+    /// Out of a fault, to DISABLED.
+    pub fn reset(&mut self) {
+        if self.state == State::Fault {
+            self.state = State::Disabled;
+        }
+    }
+
+    fn acted(&mut self, reason: Reason) {
+        self.counts[reason as usize] += 1;
+    }
+
+    /// The force to render until the next tick, N.
+    pub fn render(&mut self, wanted: &Wanted) -> DVec3 {
+        self.ticks += 1;
+        let finite = wanted.place_m.is_finite() && wanted.velocity_m_per_s.is_finite() && wanted.now_s.is_finite();
+        if !finite {
+            // Where the device is is not known: nothing to account for but to let go.
+            self.acted(Reason::NotFinite);
+            self.fail();
+            let step_n = SLEW_N_PER_S * NOMINAL_S;
+            self.force_n -= self.force_n.clamp_length_max(step_n);
+            return self.force_n;
+        }
+        let elapsed_s = match self.before.replace((wanted.now_s, wanted.place_m)) {
+            Some((then_s, place_m)) => {
+                let given_j = -self.force_n.dot(wanted.place_m - place_m);
+                self.energy_j += given_j;
+                self.tank_j = (self.tank_j + given_j).min(TANK_J);
+                (wanted.now_s - then_s).clamp(0.0, 10.0 * NOMINAL_S)
+            }
+            None => NOMINAL_S,
+        };
+        let mut force_n = wanted.force_n;
+        if !force_n.is_finite() {
+            self.acted(Reason::NotFinite);
+            self.fail();
+            force_n = DVec3::ZERO;
+        }
+        if (wanted.place_m - self.middle_m).length() > self.device.workspace_m {
+            self.acted(Reason::Workspace);
+            self.fail();
+        }
+        force_n = self.fade(wanted, elapsed_s, force_n);
+        force_n = self.engage(wanted.now_s, force_n);
+        force_n = self.clamp(elapsed_s, force_n);
+        force_n = self.keep_passive(wanted.velocity_m_per_s, force_n);
+        force_n = self.slew(elapsed_s, wanted.velocity_m_per_s, force_n);
+        self.force_n = force_n;
+        force_n
+    }
+
+    /// By the model's age.
+    fn fade(&mut self, wanted: &Wanted, elapsed_s: f64, force_n: DVec3) -> DVec3 {
+        if wanted.age_s > PAUSE_S && self.state == State::Enabled {
+            self.state = State::Paused;
+        }
+        let share = match wanted.age_s {
+            age_s if age_s <= FRESH_S => 1.0,
+            age_s if age_s <= STALE_S => 1.0 - (1.0 - STALE_SHARE) * (age_s - FRESH_S) / (STALE_S - FRESH_S),
+            age_s => STALE_SHARE * ((STALE_S - age_s) / DECAY_S).exp(),
+        };
+        self.share = share.min(self.share + elapsed_s / RETURN_S);
+        if self.share < 1.0 {
+            self.acted(Reason::Stale);
+        }
+        self.share * force_n
+    }
+
+    fn engage(&mut self, now_s: f64, force_n: DVec3) -> DVec3 {
+        match self.state {
+            State::Enabled => {}
+            // What a pause leaves decays by itself, in `fade`, if the models do not come again: then it is let go.
+            State::Disabled | State::Paused | State::Fault => {
+                self.engaged_s = None;
+                self.acted(Reason::Engage);
+                let decay = (-NOMINAL_S / DECAY_S).exp();
+                return self.force_n.clamp_length_max(force_n.length()) * decay;
+            }
+        }
+        if self.engaged_s.is_none() && force_n.length() < ENGAGE_BELOW_N {
+            self.engaged_s = Some(now_s);
+        }
+        let share = self.engaged_s.map_or(0.0, |since_s| ((now_s - since_s) / ENGAGE_S).clamp(0.0, 1.0));
+        if share < 1.0 {
+            self.acted(Reason::Engage);
+        }
+        share * force_n
+    }
+
+    fn clamp(&mut self, elapsed_s: f64, force_n: DVec3) -> DVec3 {
+        let wanted_n = force_n.length();
+        let mut most_n = self.device.most_n();
+        if wanted_n > most_n {
+            self.acted(Reason::Force);
+        }
+        // A motor cools down as fast as it heats up.
+        let over = wanted_n.min(most_n) > self.device.continuous_n;
+        self.over_s = (self.over_s + if over { elapsed_s } else { -elapsed_s }).clamp(0.0, CONTINUOUS_S);
+        if over && self.over_s >= CONTINUOUS_S {
+            self.acted(Reason::Continuous);
+            most_n = self.device.continuous_n;
+        }
+        force_n.clamp_length_max(most_n)
+    }
+
+    fn keep_passive(&mut self, velocity_m_per_s: DVec3, force_n: DVec3) -> DVec3 {
+        let (length_n, most_n) = (force_n.length(), self.bearable_n(velocity_m_per_s, force_n));
+        if length_n <= most_n {
+            return force_n;
+        }
+        self.acted(Reason::Passivity);
+        force_n * (most_n / length_n)
+    }
+
+    /// The largest force along `force_n` whose energy the tank can still bear until slew has let it go, N.
+    fn bearable_n(&self, velocity_m_per_s: DVec3, force_n: DVec3) -> f64 {
+        let along_m_per_s = velocity_m_per_s.dot(force_n.normalize_or_zero());
+        let speed = (SPEED_MARGIN * along_m_per_s).max(LEAST_SPEED_M_PER_S);
+        let most_n = (2.0 * SLEW_N_PER_S * self.tank_j.max(0.0) / speed).sqrt();
+        if along_m_per_s < 0.0 { most_n.max(FIRST_N) } else { most_n }
+    }
+
+    /// Goes from the last force to a wanted one, as fast as slew allows. A force that turns is on its way neither the one nor
+    /// the other: where the tank can't bear what it is there, it goes straight to zero.
+    fn slew(&mut self, elapsed_s: f64, velocity_m_per_s: DVec3, force_n: DVec3) -> DVec3 {
+        let step_n = SLEW_N_PER_S * elapsed_s;
+        let change_n = force_n - self.force_n;
+        if change_n.length() <= step_n {
+            return force_n;
+        }
+        self.acted(Reason::Slew);
+        let next_n = self.force_n + change_n.clamp_length_max(step_n);
+        if next_n.length() <= self.bearable_n(velocity_m_per_s, next_n) {
+            return next_n;
+        }
+        self.acted(Reason::Passivity);
+        self.force_n - self.force_n.clamp_length_max(step_n)
+    }
+}
+
+/// What a tick takes where nothing better is known, s.
+const NOMINAL_S: f64 = 1e-3;

@@ -1,0 +1,145 @@
+//! The force law of a tissue under a disc that is pressed straight in without haste: what the server sends ahead, once,
+//! so that a client knows before it gets there how the force will rise.
+//!
+//! A stiffness at one place says nothing of the next millimetre, and tissue hardens: with 50 ms of delay and 50 mm/s a
+//! hand is 2.5 mm further than what it last felt. A polynomial through past samples tells wildly wrong things there; the
+//! tissue's own law, computed from its model (`sheet::tangent`), does not.
+
+use glam::DVec2;
+
+use crate::sheet::Model;
+use crate::sheet::tangent::{self, Pressed};
+
+/// The law at one depth.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Row {
+    /// Outward, N.
+    pub force_n: f64,
+    /// Along the normal, N/m.
+    pub stiffness_n_per_m: f64,
+    /// Across it, of a disc that sticks, N/m.
+    pub across_n_per_m: f64,
+    /// Along the normal, N·s/m.
+    pub damping_n_s_per_m: f64,
+    /// Across it, of a disc that sticks, N·s/m.
+    pub across_n_s_per_m: f64,
+    /// Across it, of a disc that slides, N·s/m.
+    pub drag_n_s_per_m: f64,
+}
+
+/// Rows at equal distances of depth, from 0 on.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Law {
+    /// From a row to the next, m.
+    pub step_m: f64,
+    /// At least two.
+    pub rows: Vec<Row>,
+}
+
+/// Rows of a law, and how many radii of the disc they reach.
+const ROWS: u32 = 21;
+const REACH_IN_RADII: f64 = 4.0;
+
+impl Law {
+    /// That of a disc of `radius_m` in the middle of a sheet: some tenths of a second of work for a thousand points.
+    pub fn of(model: &Model, radius_m: f64) -> Self {
+        Self::at(model, radius_m, model.scene.sheet.extent_m() / 2.0)
+    }
+
+    fn at(model: &Model, radius_m: f64, centre_m: DVec2) -> Self {
+        let step_m = REACH_IN_RADII * radius_m / f64::from(ROWS - 1);
+        let row = |pressed: Pressed| {
+            let tangent::Tangent { stiffness_n_per_m: s, damping_n_s_per_m: b, drag_n_s_per_m, .. } = pressed.tangent;
+            Row {
+                force_n: pressed.force_n,
+                stiffness_n_per_m: s.z_axis.z,
+                across_n_per_m: 0.5 * (s.x_axis.x + s.y_axis.y),
+                damping_n_s_per_m: b.z_axis.z,
+                across_n_s_per_m: 0.5 * (b.x_axis.x + b.y_axis.y),
+                drag_n_s_per_m,
+            }
+        };
+        Law { step_m, rows: tangent::press(model, radius_m, centre_m, step_m, ROWS).into_iter().map(row).collect() }
+    }
+
+    /// That of a linear spring and damper, which feel the same in every direction.
+    pub fn linear(stiffness_n_per_m: f64, damping_n_s_per_m: f64) -> Self {
+        let step_m = 0.1;
+        let row = |force_n: f64| Row {
+            force_n,
+            stiffness_n_per_m,
+            across_n_per_m: stiffness_n_per_m,
+            damping_n_s_per_m,
+            across_n_s_per_m: damping_n_s_per_m,
+            drag_n_s_per_m: 0.0,
+        };
+        Law { step_m, rows: vec![row(0.0), row(stiffness_n_per_m * step_m)] }
+    }
+
+    /// Whether a client can use it: finite, rising, at least two rows.
+    pub fn is_sound(&self) -> bool {
+        let finite = |row: &Row| {
+            [row.force_n, row.stiffness_n_per_m, row.across_n_per_m, row.damping_n_s_per_m, row.across_n_s_per_m]
+                .iter()
+                .chain([&row.drag_n_s_per_m])
+                .all(|value| value.is_finite() && *value >= 0.0)
+        };
+        self.rows.len() >= 2
+            && self.step_m > 0.0
+            && self.step_m.is_finite()
+            && self.rows.iter().all(finite)
+            && self.rows.windows(2).all(|pair| pair[1].force_n >= pair[0].force_n)
+    }
+
+    /// The law at a depth, m. Forces are cubic between rows, with the rows' stiffness as slopes; beyond the last row they
+    /// go on as straight lines.
+    pub fn at_depth(&self, depth_m: f64) -> Row {
+        let last = self.rows.len() - 1;
+        let place = (depth_m / self.step_m).max(0.0);
+        if place >= last as f64 {
+            let row = self.rows[last];
+            let beyond_m = depth_m - last as f64 * self.step_m;
+            return Row { force_n: row.force_n + row.stiffness_n_per_m * beyond_m, ..row };
+        }
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+        let below = place as usize;
+        let t = place - below as f64;
+        let (a, b) = (self.rows[below], self.rows[below + 1]);
+        let mix = |a: f64, b: f64| a + t * (b - a);
+        let rise = b.force_n - a.force_n;
+        let (sa, sb) = (a.stiffness_n_per_m * self.step_m - rise, rise - b.stiffness_n_per_m * self.step_m);
+        let bend = t * (1.0 - t);
+        Row {
+            force_n: a.force_n + t * rise + bend * ((1.0 - t) * sa + t * sb),
+            stiffness_n_per_m: (rise + (1.0 - 2.0 * t) * ((1.0 - t) * sa + t * sb) + bend * (sb - sa)) / self.step_m,
+            across_n_per_m: mix(a.across_n_per_m, b.across_n_per_m),
+            damping_n_s_per_m: mix(a.damping_n_s_per_m, b.damping_n_s_per_m),
+            across_n_s_per_m: mix(a.across_n_s_per_m, b.across_n_s_per_m),
+            drag_n_s_per_m: mix(a.drag_n_s_per_m, b.drag_n_s_per_m),
+        }
+    }
+
+    /// The depth at which a force is met, m.
+    pub fn depth_of(&self, force_n: f64) -> f64 {
+        if force_n <= 0.0 {
+            return 0.0;
+        }
+        let last = self.rows.len() - 1;
+        let above = self.rows.partition_point(|row| row.force_n < force_n);
+        if above > last {
+            let row = self.rows[last];
+            return last as f64 * self.step_m + (force_n - row.force_n) / row.stiffness_n_per_m.max(f64::MIN_POSITIVE);
+        }
+        let (mut low, mut high) = ((above.max(1) - 1) as f64 * self.step_m, above.max(1) as f64 * self.step_m);
+        for _ in 0..50 {
+            let middle = 0.5 * (low + high);
+            if self.at_depth(middle).force_n < force_n { low = middle } else { high = middle }
+        }
+        0.5 * (low + high)
+    }
+
+    /// The depth that it reaches, m.
+    pub fn reach_m(&self) -> f64 {
+        (self.rows.len() - 1) as f64 * self.step_m
+    }
+}

@@ -1,0 +1,192 @@
+//! The local model: what a sample says of the tissue around the place where the tool was.
+//!
+//! A client is ahead of every sample by the round trip, and knows its own way since. So it repeats, from the sample's
+//! state on, what the tissue will have done along that way ([`Touching`]): the depth below the surface gives the
+//! pressure by the force law, less damping; across, the disc sticks with the law's stiffness until the friction cone is
+//! reached, and slides beyond. The error is that of the law along some millimetres, not that of some milliseconds.
+
+use std::collections::VecDeque;
+
+use glam::{DMat3, DVec3};
+
+use super::law::Law;
+use crate::sheet::Standing;
+
+/// What a sample says. Forces are those on the tool.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LocalModel {
+    /// Rises with each.
+    pub sequence: u64,
+    /// The client's time of the place that the tool had, s.
+    pub client_time_s: f64,
+    /// Steps done.
+    pub step: u64,
+    /// x0: where the tool was, m.
+    pub place_m: DVec3,
+    /// How it moved, m/s.
+    pub velocity_m_per_s: DVec3,
+    /// f0: the force there, N.
+    pub force_n: DVec3,
+    /// K: symmetric, N/m.
+    pub stiffness_n_per_m: DMat3,
+    /// B: symmetric, N·s/m.
+    pub damping_n_s_per_m: DMat3,
+    /// p: a place of the surface under the tool as it would be without the tool, m.
+    pub surface_m: DVec3,
+    /// n: outward there.
+    pub normal: DVec3,
+    /// How far from x0 K may be believed, m.
+    pub valid_m: f64,
+    /// μ.
+    pub friction: f64,
+    /// How the tool stood to the tissue.
+    pub standing: Standing,
+}
+
+impl LocalModel {
+    /// Whether every number is finite and the normal a normal.
+    pub fn is_sound(&self) -> bool {
+        let vectors = [self.place_m, self.velocity_m_per_s, self.force_n, self.surface_m];
+        vectors.iter().all(|v| v.is_finite())
+            && self.stiffness_n_per_m.is_finite()
+            && self.damping_n_s_per_m.is_finite()
+            && self.valid_m >= 0.0
+            && self.friction >= 0.0
+            && self.friction.is_finite()
+            && self.client_time_s.is_finite()
+            && (self.normal.length() - 1.0).abs() < 1e-3
+    }
+}
+
+/// How far K may be believed: where half its change along the way is a tenth of the force, or `least_n`. `change` is
+/// ‖∂K/∂x‖, N/m².
+pub fn valid_m(force_n: f64, least_n: f64, change_n_per_m2: f64) -> f64 {
+    (2.0 * (0.1 * force_n).max(least_n) / change_n_per_m2.max(1e-9)).sqrt()
+}
+
+/// Where a tool was, and when: the newest places of a client's own clock.
+#[derive(Debug, Clone, Default)]
+pub struct Track {
+    places: VecDeque<(f64, DVec3)>,
+}
+
+/// Places that are kept: two seconds at 1 kHz.
+const KEPT: usize = 2048;
+
+impl Track {
+    /// Adds the newest place.
+    pub fn push(&mut self, time_s: f64, place_m: DVec3) {
+        if self.places.len() == KEPT {
+            self.places.pop_front();
+        }
+        self.places.push_back((time_s, place_m));
+    }
+
+    /// All places later than a time, in order.
+    pub fn after(&self, time_s: f64) -> impl Iterator<Item = DVec3> {
+        // Half a microsecond: times come back from the wire in whole nanoseconds.
+        let from = self.places.partition_point(|place| place.0 <= time_s + 5e-7);
+        self.places.range(from..).map(|place| place.1)
+    }
+
+    /// Forgets all.
+    pub fn clear(&mut self) {
+        self.places.clear();
+    }
+}
+
+/// The state of a touch along a tool's way.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Touching {
+    /// How far the tissue under the disc is drawn along, from where it would not pull, m.
+    stretch_m: DVec3,
+    sliding: bool,
+    /// What of the sample's force the law does not explain, N.
+    rest_n: DVec3,
+    place_m: DVec3,
+}
+
+impl Touching {
+    /// As it was when the sample was taken.
+    pub fn at_sample(model: &LocalModel, law: &Law) -> Self {
+        let mut touching =
+            Touching { stretch_m: DVec3::ZERO, sliding: false, rest_n: DVec3::ZERO, place_m: model.place_m };
+        if matches!(model.standing, Standing::Free | Standing::Holding) {
+            return touching;
+        }
+        touching.sliding = model.standing == Standing::Sliding;
+        let (_, row, pressure_n) = touching.pressure(model, law, model.place_m, model.velocity_m_per_s);
+        let across = |v: DVec3| v - v.dot(model.normal) * model.normal;
+        let moved = across(model.velocity_m_per_s);
+        let mut drawn_n = across(model.force_n);
+        drawn_n += if touching.sliding { row.drag_n_s_per_m } else { row.across_n_s_per_m } * moved;
+        if row.across_n_per_m > 0.0 {
+            touching.stretch_m =
+                within(-drawn_n / row.across_n_per_m, model.friction * pressure_n / row.across_n_per_m);
+        }
+        touching.rest_n = model.force_n - touching.force_n(model, law, model.velocity_m_per_s);
+        touching
+    }
+
+    /// Depth below the surface, the law there, and the pressure with damping.
+    fn pressure(
+        &self,
+        model: &LocalModel,
+        law: &Law,
+        place_m: DVec3,
+        velocity_m_per_s: DVec3,
+    ) -> (f64, super::law::Row, f64) {
+        let depth_m = (model.surface_m - place_m).dot(model.normal);
+        let row = law.at_depth(depth_m);
+        if depth_m <= 0.0 {
+            return (depth_m, row, 0.0);
+        }
+        (depth_m, row, (row.force_n - row.damping_n_s_per_m * velocity_m_per_s.dot(model.normal)).max(0.0))
+    }
+
+    /// Goes on to the tool's next place.
+    pub fn move_to(&mut self, model: &LocalModel, law: &Law, place_m: DVec3) {
+        let moved_m = place_m - self.place_m;
+        self.place_m = place_m;
+        let (depth_m, row, _) = self.pressure(model, law, place_m, DVec3::ZERO);
+        if depth_m <= 0.0 || row.across_n_per_m <= 0.0 {
+            (self.stretch_m, self.sliding) = (DVec3::ZERO, false);
+            return;
+        }
+        let most_m = model.friction * row.force_n / row.across_n_per_m;
+        let stretch_m = self.stretch_m + moved_m - moved_m.dot(model.normal) * model.normal;
+        self.stretch_m = within(stretch_m, most_m);
+        self.sliding = self.stretch_m != stretch_m;
+    }
+
+    /// The force on the tool where it is now, N.
+    pub fn force_n(&self, model: &LocalModel, law: &Law, velocity_m_per_s: DVec3) -> DVec3 {
+        if model.standing == Standing::Holding {
+            let away_m = within(self.place_m - model.place_m, model.valid_m);
+            let faster = velocity_m_per_s - model.velocity_m_per_s;
+            return model.force_n - model.stiffness_n_per_m * away_m - model.damping_n_s_per_m * faster;
+        }
+        let (depth_m, row, pressure_n) = self.pressure(model, law, self.place_m, velocity_m_per_s);
+        if depth_m <= 0.0 {
+            return DVec3::ZERO;
+        }
+        let across_m_per_s = velocity_m_per_s - velocity_m_per_s.dot(model.normal) * model.normal;
+        let mut across_n = -row.across_n_per_m * self.stretch_m;
+        if !self.sliding {
+            across_n -= row.across_n_s_per_m * across_m_per_s;
+        }
+        across_n = within(across_n, model.friction * pressure_n);
+        if self.sliding {
+            across_n -= row.drag_n_s_per_m * across_m_per_s;
+        }
+        let force_n = pressure_n * model.normal + across_n + self.rest_n;
+        // A touch never pulls.
+        force_n - force_n.dot(model.normal).min(0.0) * model.normal
+    }
+}
+
+/// A vector, shortened to a length.
+fn within(vector: DVec3, most: f64) -> DVec3 {
+    let length = vector.length();
+    if length <= most { vector } else { vector * (most / length) }
+}

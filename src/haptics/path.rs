@@ -1,0 +1,143 @@
+//! The server's side of a tool's way: what becomes of commands that come through a network in knots and gaps.
+//!
+//! A client says a thousand times a second where its tool is, and when. Played as they come, a knot would make the tool
+//! stand still and then leap, and the tissue would answer leaps. So they are played by their own times: the moment that
+//! is played advances with the steps, stands when nothing newer has come, and catches up by a tenth as long as something
+//! newer was always at hand. With a constant delay that adds nothing.
+//!
+//! What is old is never replayed: of a backlog of more than [`BACKLOG_S`] only the newest place counts, and the tool goes
+//! there no faster than [`SPEED_M_PER_S`]. Nothing new for [`RELEASE_S`]: the tool lets go.
+
+use std::collections::VecDeque;
+
+use glam::DVec3;
+
+/// The tool is moved no faster, m/s.
+pub const SPEED_M_PER_S: f64 = 0.5;
+/// More than this is a backlog, s.
+pub const BACKLOG_S: f64 = 0.1;
+/// Without a command for so long the tool is held where it is; that is told, s.
+pub const HOLD_S: f64 = 0.05;
+/// Without a command for so long the tool lets go, s.
+pub const RELEASE_S: f64 = 0.25;
+/// By which part of a step the played moment catches up.
+const CATCH_UP: f64 = 0.1;
+/// For so long something newer must have been at hand, s.
+const WATCHED_S: f64 = 0.25;
+/// Places that wait, at most.
+const MOST: usize = 1024;
+
+/// What a tool is to do in a step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Play {
+    /// Be here at its end; this was the client's time there, s.
+    Lead(DVec3, f64),
+    /// Let go.
+    Release,
+}
+
+/// Commands of one tool.
+#[derive(Debug, Clone, Default)]
+pub struct Path {
+    waiting: VecDeque<(f64, DVec3)>,
+    played: Option<(f64, DVec3)>,
+    place_m: Option<DVec3>,
+    arrived_s: f64,
+    /// Least that was at hand beyond the played moment, and since when it is watched.
+    spare_s: f64,
+    watched_s: f64,
+    limited: u64,
+    dropped: u64,
+    released: u64,
+}
+
+impl Path {
+    /// Takes a command that has arrived: where the tool was at `time_s` of the client. Not newer, or not finite: refused.
+    pub fn receive(&mut self, time_s: f64, place_m: DVec3, now_s: f64) -> bool {
+        let newest_s = self.waiting.back().or(self.played.as_ref()).map_or(f64::NEG_INFINITY, |place| place.0);
+        if !place_m.is_finite() || !time_s.is_finite() || time_s <= newest_s {
+            self.dropped += 1;
+            return false;
+        }
+        if self.waiting.len() == MOST {
+            self.waiting.pop_front();
+        }
+        self.waiting.push_back((time_s, place_m));
+        self.arrived_s = now_s;
+        true
+    }
+
+    /// Steps in which the speed limit acted; commands that were refused or passed over; releases.
+    pub fn counts(&self) -> [u64; 3] {
+        [self.limited, self.dropped, self.released]
+    }
+
+    /// Whether the newest command is so old that the tool is held, at `now_s`.
+    pub fn is_held(&self, now_s: f64) -> bool {
+        now_s - self.arrived_s > HOLD_S
+    }
+
+    /// What the tool does in the step of `step_s` that ends at `now_s`; nothing before the first command.
+    pub fn step(&mut self, now_s: f64, step_s: f64) -> Option<Play> {
+        let newest = self.waiting.back().copied();
+        if let Some(newest) = newest {
+            self.play(newest, now_s, step_s);
+        } else {
+            self.spare_s = 0.0;
+            self.watched_s = now_s;
+        }
+        let (time_s, target_m) = self.played?;
+        if now_s - self.arrived_s > RELEASE_S {
+            if self.place_m.take().is_some() {
+                self.released += 1;
+            }
+            return Some(Play::Release);
+        }
+        // A tool that comes new, comes from above.
+        let from_m = self.place_m.unwrap_or(DVec3::new(target_m.x, target_m.y, target_m.z.max(ABOVE_M)));
+        let way_m = target_m - from_m;
+        let most_m = SPEED_M_PER_S * step_s;
+        if way_m.length() > most_m {
+            self.limited += 1;
+        }
+        let place_m = from_m + way_m.clamp_length_max(most_m);
+        self.place_m = Some(place_m);
+        Some(Play::Lead(place_m, time_s))
+    }
+
+    fn play(&mut self, newest: (f64, DVec3), now_s: f64, step_s: f64) {
+        let Some((played_s, _)) = self.played.filter(|played| newest.0 - played.0 <= BACKLOG_S) else {
+            self.dropped += self.waiting.len() as u64 - 1;
+            self.waiting.clear();
+            (self.played, self.spare_s, self.watched_s) = (Some(newest), f64::INFINITY, now_s);
+            return;
+        };
+        self.spare_s = self.spare_s.min(newest.0 - played_s - step_s);
+        let mut next_s = played_s + step_s;
+        if now_s - self.watched_s >= WATCHED_S {
+            if self.spare_s > 0.5 * step_s {
+                next_s += (CATCH_UP * step_s).min(self.spare_s);
+                // Watched anew once it has caught up.
+                self.spare_s -= CATCH_UP * step_s;
+            } else {
+                (self.spare_s, self.watched_s) = (f64::INFINITY, now_s);
+            }
+        }
+        let next_s = next_s.min(newest.0);
+        let mut before = self.played.unwrap_or(newest);
+        while let Some(place) = self.waiting.front().copied().filter(|place| place.0 <= next_s + 1e-9) {
+            before = place;
+            self.waiting.pop_front();
+        }
+        self.played = Some(match self.waiting.front() {
+            Some(after) if next_s > before.0 => {
+                let part = (next_s - before.0) / (after.0 - before.0);
+                (next_s, before.1.lerp(after.1, part))
+            }
+            _ => before,
+        });
+    }
+}
+
+/// How high above the sheet at rest a tool begins that was not there before, at least, m.
+const ABOVE_M: f64 = 0.002;

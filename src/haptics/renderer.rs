@@ -1,0 +1,133 @@
+//! The rendering law: a thousand times a second, from the newest local model and the tool's own way, a force.
+//!
+//! When a newer model comes the force would jump by what the old one was wrong. That difference is kept as a bias and
+//! decays with [`BIAS_S`], so the hand feels the news arrive, not a knock.
+
+use glam::DVec3;
+
+use super::envelope::{Envelope, State, Wanted};
+use super::law::Law;
+use super::local::{LocalModel, Touching, Track};
+use crate::sheet::Standing;
+
+/// Time constant with which the error of the last model leaves, s.
+pub const BIAS_S: f64 = 0.02;
+
+/// One tool's renderer.
+#[derive(Debug, Clone)]
+pub struct Renderer {
+    law: Law,
+    /// The newest model, and the touch as it follows from it.
+    newest: Option<(LocalModel, Touching)>,
+    /// One that is newer still.
+    arrived: Option<LocalModel>,
+    arrived_s: Option<f64>,
+    bias_n: DVec3,
+    biased_s: f64,
+    track: Track,
+    before: Option<(f64, DVec3)>,
+    velocity_m_per_s: DVec3,
+    refused: u64,
+    /// What stands between the law and the device.
+    pub envelope: Envelope,
+}
+
+impl Renderer {
+    /// For a tissue with `law`, which must be sound, behind `envelope`.
+    pub fn new(law: Law, envelope: Envelope) -> Self {
+        Renderer {
+            law,
+            newest: None,
+            arrived: None,
+            arrived_s: None,
+            bias_n: DVec3::ZERO,
+            biased_s: 0.0,
+            track: Track::default(),
+            before: None,
+            velocity_m_per_s: DVec3::ZERO,
+            refused: 0,
+            envelope,
+        }
+    }
+
+    /// Begins anew with another far end: its models begin anew too. The envelope goes on as it is.
+    pub fn begin(&mut self, law: Law) {
+        (self.law, self.newest, self.arrived, self.arrived_s) = (law, None, None, None);
+    }
+
+    /// Models that were not taken: out of order, or not finite.
+    pub fn refused(&self) -> u64 {
+        self.refused
+    }
+
+    /// Whether forces are rendered.
+    pub fn state(&self) -> State {
+        self.envelope.state()
+    }
+
+    /// When the newest model was true by the client's clock, s.
+    pub fn model_time_s(&self) -> Option<f64> {
+        self.newest.as_ref().map(|newest| newest.0.client_time_s)
+    }
+
+    /// Takes a model that has just arrived; it counts from the next tick on.
+    pub fn receive(&mut self, model: LocalModel, now_s: f64) {
+        let newest = self.arrived.as_ref().or(self.newest.as_ref().map(|newest| &newest.0));
+        let late = newest.is_some_and(|newest| model.sequence <= newest.sequence);
+        if late || !model.is_sound() {
+            self.refused += 1;
+            return;
+        }
+        (self.arrived, self.arrived_s) = (Some(model), Some(now_s));
+    }
+
+    /// Goes over to a model that has arrived: repeats the tool's way since, and keeps what it is apart from the last.
+    fn adopt(&mut self, model: LocalModel, now_s: f64) {
+        let before_n = self.newest.is_some().then(|| self.wanted_n(now_s));
+        let mut touching = Touching::at_sample(&model, &self.law);
+        for place_m in self.track.after(model.client_time_s) {
+            touching.move_to(&model, &self.law, place_m);
+        }
+        self.newest = Some((model, touching));
+        (self.biased_s, self.bias_n) = (now_s, DVec3::ZERO);
+        if let Some(before_n) = before_n {
+            self.bias_n = before_n - self.wanted_n(now_s);
+        }
+    }
+
+    /// What the law wants, without the envelope, N.
+    fn wanted_n(&self, now_s: f64) -> DVec3 {
+        let Some((model, touching)) = &self.newest else { return DVec3::ZERO };
+        let force_n = touching.force_n(model, &self.law, self.velocity_m_per_s)
+            + self.bias_n * ((self.biased_s - now_s) / BIAS_S).exp();
+        if model.standing == Standing::Holding {
+            return force_n;
+        }
+        force_n - force_n.dot(model.normal).min(0.0) * model.normal
+    }
+
+    /// The force to render until the next tick, for a tool that is at `place_m` now, N.
+    pub fn tick(&mut self, now_s: f64, place_m: DVec3) -> DVec3 {
+        let known = place_m.is_finite() && now_s.is_finite();
+        if let Some((then_s, from_m)) = self.before.filter(|_| known)
+            && now_s > then_s
+        {
+            self.velocity_m_per_s = (place_m - from_m) / (now_s - then_s);
+        }
+        if known {
+            self.before = Some((now_s, place_m));
+            self.track.push(now_s, place_m);
+            if let Some((model, touching)) = &mut self.newest {
+                touching.move_to(model, &self.law, place_m);
+            }
+            if let Some(model) = self.arrived.take() {
+                self.adopt(model, now_s);
+            }
+        }
+        let force_n = self.wanted_n(now_s);
+        // What has not begun is not stale.
+        let age_s = self.arrived_s.map_or(0.0, |arrived_s| now_s - arrived_s);
+        let wanted = Wanted { now_s, place_m, velocity_m_per_s: self.velocity_m_per_s, force_n, age_s };
+        self.envelope.render(&wanted)
+    }
+}

@@ -1,0 +1,117 @@
+//! Local models of one tool: what a sample says of the tissue around it (`haptics::local`).
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use glam::{DMat3, DVec3};
+
+use crate::haptics::local::{self, LocalModel};
+use crate::haptics::{Law, law::Row};
+use crate::sheet::tangent::Tangent;
+use crate::sheet::{Feel, Standing, Surroundings};
+
+/// Forces below need no validity, N.
+const LEAST_N: f64 = 0.05;
+
+/// Makes the local models of one tool.
+#[derive(Debug, Clone)]
+pub struct Modeller {
+    law: Arc<Law>,
+    /// Where the surface was, and its normal, when the tool last did not touch it.
+    surface: Option<(DVec3, DVec3)>,
+    sequence: u64,
+    /// The newest that was computed where the tool is.
+    tangent: Arc<Mutex<Option<Tangent>>>,
+}
+
+/// The stiffness under a tool, to be computed where it makes no step wait.
+#[derive(Debug)]
+pub struct Refinement {
+    surroundings: Surroundings,
+    tangent: Arc<Mutex<Option<Tangent>>>,
+}
+
+impl Refinement {
+    /// Computes it, and hands it to the tool's modeller.
+    pub fn work(self) {
+        let tangent = self.surroundings.tangent();
+        *self.tangent.lock().unwrap_or_else(PoisonError::into_inner) = Some(tangent);
+    }
+}
+
+impl Modeller {
+    /// For a tool on a tissue with this law.
+    pub fn new(law: Arc<Law>) -> Self {
+        Modeller { law, surface: None, sequence: 0, tangent: Arc::default() }
+    }
+
+    /// The law that it goes by.
+    pub fn law(&self) -> &Arc<Law> {
+        &self.law
+    }
+
+    /// What computes the stiffness anew, from the sheet around the tool.
+    pub fn refinement(&self, surroundings: Surroundings) -> Refinement {
+        Refinement { surroundings, tangent: self.tangent.clone() }
+    }
+
+    /// The model after a step. K and B are the newest that were computed where the tool is, or else the law's.
+    pub fn model(&mut self, feel: &Feel, step: u64, client_time_s: f64) -> LocalModel {
+        self.sequence += 1;
+        let touches = matches!(feel.standing, Standing::Sticking | Standing::Sliding);
+        if !touches {
+            self.surface = Some((feel.surface_m, feel.normal));
+        }
+        let (mut surface_m, normal) = self.surface.unwrap_or((feel.surface_m, DVec3::Z));
+        let mut depth_m = (surface_m - feel.place_m).dot(normal);
+        if touches {
+            // The surface is where the law says that this force begins: so the law goes through this sample.
+            let damping = self.law.at_depth(depth_m).damping_n_s_per_m;
+            let pressure_n = feel.force_on_tool_n.dot(normal) + damping * feel.velocity_m_per_s.dot(normal);
+            if pressure_n > 0.0 {
+                depth_m = self.law.depth_of(pressure_n);
+                surface_m = feel.place_m + depth_m * normal;
+            }
+        }
+        let row = self.law.at_depth(depth_m);
+        let mut newest = self.tangent.lock().unwrap_or_else(PoisonError::into_inner);
+        if feel.standing == Standing::Free {
+            *newest = None;
+        }
+        let (stiffness_n_per_m, damping_n_s_per_m) = match newest.as_ref() {
+            Some(tangent) => (tangent.stiffness_n_per_m, tangent.damping_n_s_per_m),
+            None => (
+                around(normal, row.stiffness_n_per_m, row.across_n_per_m),
+                around(normal, row.damping_n_s_per_m, row.across_n_s_per_m),
+            ),
+        };
+        drop(newest);
+        let force_n = feel.force_on_tool_n.length();
+        LocalModel {
+            sequence: self.sequence,
+            client_time_s,
+            step,
+            place_m: feel.place_m,
+            velocity_m_per_s: feel.velocity_m_per_s,
+            force_n: feel.force_on_tool_n,
+            stiffness_n_per_m,
+            damping_n_s_per_m,
+            surface_m,
+            normal,
+            valid_m: local::valid_m(force_n, LEAST_N, self.hardening(depth_m, &row)),
+            friction: feel.friction,
+            standing: feel.standing,
+        }
+    }
+
+    /// By how much the stiffness changes with depth, N/m².
+    fn hardening(&self, depth_m: f64, row: &Row) -> f64 {
+        let further = self.law.at_depth(depth_m + self.law.step_m);
+        (further.stiffness_n_per_m - row.stiffness_n_per_m).abs() / self.law.step_m
+    }
+}
+
+/// A matrix with one value along a direction and another across it.
+fn around(normal: DVec3, along: f64, across: f64) -> DMat3 {
+    let outer = DMat3::from_cols(normal * normal.x, normal * normal.y, normal * normal.z);
+    outer * (along - across) + DMat3::IDENTITY * across
+}

@@ -1,0 +1,399 @@
+//! Tools that are led by their position and have a finite size: a touch, which only pushes, and a grasp, which holds.
+//!
+//! A tool meets the sheet with a disc (`footprint`), whose place s(c) = Σ w·x follows from the material place c that is
+//! under the tool. In each substep the sheet first moves under the force F₀ of the last. Then the force F is found that
+//! takes s to where the tool is (or, coupled by a spring, that the spring then has); the difference is given as a blow at
+//! the substep's beginning. That changes s by A·(F − F₀), A = Σ w²·dt²/m and the scheme's damping, so this is a division
+//! and no iteration, and stable however stiff the coupling:
+//!
+//! gap g = x_tool − s + A·F₀,  F = (Kc·g + Bc·(v_tool − ṡ))/(1 + A·(Kc + Bc/dt)),  a constraint: F = g/A.
+//!
+//! (A steady force all along alone would ring: a mass that is to be at rest at the end of each substep swings within
+//! them for ever. A blow alone leaves a speed of half of it at each end. Of both, an error in F or speed is halved in each
+//! substep.)
+//!
+//! A touch is unilateral: with n the outward normal of the surface under the disc, N = −F·n must be positive, or the
+//! tool is free; |F_t| may be at most μN, or the disc slides: F_t is shortened, and c follows the tool. With μ = 0 it
+//! follows always. So c is the proxy: where the tool is on the surface. n = ∂s/∂c_x × ∂s/∂c_y, which is the only
+//! choice whose work is what the sheet gets when the disc slides over a slope.
+//!
+//! What the tool feels of a constraint is the force of springs, virtual springs and damping on the disc,
+//! Σ w·f/Σ w²: F without the points' own inertia, which a hand would feel as knocks of each command.
+
+use std::sync::Arc;
+
+use glam::{DVec2, DVec3};
+
+use super::Sheet;
+use super::field::{Layout, State};
+use super::footprint::{Footprint, Reached};
+use super::guard::Work;
+use super::model::{Model, Plan};
+use super::real::Real;
+use super::sweep::Bench;
+use super::tangent::{Patch, Tangent, Window};
+use super::tiles::Tiles;
+use crate::scene::tip::{Coupling, Tip};
+
+/// How a tool stands to the sheet.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Standing {
+    /// Not touching.
+    Free,
+    /// Touching, and not sliding.
+    Sticking,
+    /// Touching, at the edge of the friction cone.
+    Sliding,
+    /// Holding.
+    Holding,
+}
+
+/// What a tool does and feels at the end of a step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Feel {
+    /// Where the tool is, m; z is up, out of the tissue.
+    pub place_m: DVec3,
+    /// How it moved in the last step, m/s.
+    pub velocity_m_per_s: DVec3,
+    /// How it stands to the sheet.
+    pub standing: Standing,
+    /// Of the tissue on the tool, N.
+    pub force_on_tool_n: DVec3,
+    /// Where the surface is under the tool, m.
+    pub surface_m: DVec3,
+    /// The material place of that, in the rest plane, m.
+    pub anchor_m: DVec2,
+    /// Out of the tissue, of length 1.
+    pub normal: DVec3,
+    /// μ, of the tool's tip.
+    pub friction: f64,
+}
+
+/// What the stiffness under a tool is computed from: a copy, for another thread.
+#[derive(Debug)]
+pub struct Surroundings {
+    model: Arc<Model>,
+    footprint: Footprint,
+    window: Window,
+    displacement_m: Vec<DVec3>,
+}
+
+impl Surroundings {
+    /// Computes it: some milliseconds for a thousand points.
+    pub fn tangent(self) -> Tangent {
+        Patch::new(&self.model, &self.footprint, self.window, self.displacement_m).tangent()
+    }
+}
+
+#[derive(Debug, Clone)]
+struct Tool {
+    number: usize,
+    tip: Tip,
+    footprint: Footprint,
+    /// Where it is at the step's beginning and is to be at its end, m.
+    from_m: DVec3,
+    to_m: DVec3,
+    standing: Standing,
+    normal: DVec3,
+    /// What a grasp keeps between the tool and the surface, m.
+    offset_m: DVec3,
+    /// On the sheet in the last substep, N.
+    force_n: DVec3,
+    /// What of that goes on in the next: not the blow of meeting.
+    steady_n: DVec3,
+    velocity_m_per_s: DVec3,
+}
+
+/// All tools that are led by their position.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Contacts {
+    tools: Vec<Tool>,
+}
+
+impl Contacts {
+    /// From the coming step on: the tool is at `to_m` at its end. A new tool begins there.
+    pub(super) fn lead(&mut self, model: &Model, number: usize, to_m: DVec3, tip: Tip) {
+        if let Some(tool) = self.tools.iter_mut().find(|tool| tool.number == number) {
+            if tool.tip.radius_m != tip.radius_m {
+                tool.footprint = Footprint::new(model, tip.radius_m, tool.footprint.centre_m());
+            }
+            if tool.tip.grasps != tip.grasps {
+                (tool.standing, tool.steady_n) = (Standing::Free, DVec3::ZERO);
+            }
+            (tool.to_m, tool.tip) = (to_m, tip);
+            return;
+        }
+        let place = self.tools.partition_point(|tool| tool.number < number);
+        let tool = Tool {
+            number,
+            tip,
+            footprint: Footprint::new(model, tip.radius_m, to_m.truncate()),
+            from_m: to_m,
+            to_m,
+            standing: Standing::Free,
+            normal: DVec3::Z,
+            offset_m: DVec3::ZERO,
+            force_n: DVec3::ZERO,
+            steady_n: DVec3::ZERO,
+            velocity_m_per_s: DVec3::ZERO,
+        };
+        self.tools.insert(place, tool);
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.tools.is_empty()
+    }
+
+    /// The points under tools that touch or hold, some of them more than once.
+    pub(super) fn points(&self) -> impl Iterator<Item = [usize; 2]> {
+        self.tools.iter().filter(|tool| tool.standing != Standing::Free).flat_map(Tool::points)
+    }
+
+    pub(super) fn release(&mut self, number: usize) {
+        self.tools.retain(|tool| tool.number != number);
+    }
+
+    /// Ends a step.
+    pub(super) fn finish(&mut self, rate_hz: f64) {
+        for tool in &mut self.tools {
+            tool.velocity_m_per_s = (tool.to_m - tool.from_m) * rate_hz;
+            tool.from_m = tool.to_m;
+        }
+    }
+
+    /// Lets the tools act on the sheet, at the end of a substep that ends at `fraction` of the step.
+    pub(super) fn act<T: Real>(
+        &mut self,
+        model: &Model,
+        plan: &Plan,
+        bench: &Bench<T>,
+        state: &mut State<T>,
+        tiles: &mut Tiles<T>,
+        work: &mut Work,
+        fraction: f64,
+    ) {
+        let layout = &bench.layout;
+        for tool in &mut self.tools {
+            let (before_n, met) = (tool.steady_n, tool.standing != Standing::Free);
+            if before_n != DVec3::ZERO {
+                tiles.wake_under(tool.points());
+                push(model, plan, layout, state, &tool.footprint, before_n, plan.scheme.constant());
+            }
+            tool.force_n = tool.meet(model, plan, layout, state, fraction);
+            tool.steady_n = if met { tool.force_n } else { DVec3::ZERO };
+            if tool.force_n == DVec3::ZERO {
+                if before_n != DVec3::ZERO {
+                    // It has let go: nothing acted in this substep.
+                    push(model, plan, layout, state, &tool.footprint, -before_n, plan.scheme.constant());
+                }
+                continue;
+            }
+            // What slept was at rest in this substep, as if it had been computed.
+            tiles.wake_under(tool.points());
+            push(model, plan, layout, state, &tool.footprint, tool.force_n - before_n, plan.scheme.kick());
+            work.add(tool.force_n.dot(movement_m(model, layout, state, &tool.footprint)));
+            tool.follow(model, layout, state, fraction);
+        }
+    }
+}
+
+/// Where a point is, from rest, m: of a multistep scheme, as predicted.
+fn displacement_m<T: Real>(model: &Model, layout: &Layout, state: &State<T>, [i, j]: [usize; 2]) -> DVec3 {
+    let at = i * layout.stride + j;
+    let component = |c: usize| state.u[c * layout.plane + at].wide() * model.scene.sheet.spacing_m;
+    DVec3::new(component(0), component(1), component(2))
+}
+
+/// Adds to u and d of the disc's points what `force_n` makes of `[of_u, of_d]` (`Scheme::kick`, `Scheme::constant`).
+fn push<T: Real>(
+    model: &Model,
+    plan: &Plan,
+    layout: &Layout,
+    state: &mut State<T>,
+    footprint: &Footprint,
+    force_n: DVec3,
+    [of_u, of_d]: [f64; 2],
+) {
+    let scale = plan.force_scale(&model.scene);
+    for Reached { point: [i, j], weight, .. } in footprint.reached().iter().copied().filter(|point| point.free) {
+        for c in 0..3 {
+            let at = c * layout.plane + i * layout.stride + j;
+            let change = scale * weight * force_n[c];
+            state.u[at] += T::of(of_u * change);
+            state.d[at] += T::of(of_d * change);
+        }
+    }
+}
+
+/// How the disc moves in a substep, Σ w·d, m.
+fn movement_m<T: Real>(model: &Model, layout: &Layout, state: &State<T>, footprint: &Footprint) -> DVec3 {
+    let mut moved = DVec3::ZERO;
+    for Reached { point: [i, j], weight, .. } in footprint.reached().iter().copied() {
+        let at = i * layout.stride + j;
+        for c in 0..3 {
+            moved[c] += weight * state.d[c * layout.plane + at].wide();
+        }
+    }
+    moved * model.scene.sheet.spacing_m
+}
+
+impl Tool {
+    /// The points of the disc.
+    fn points(&self) -> impl Iterator<Item = [usize; 2]> {
+        self.footprint.reached().iter().map(|reached| reached.point)
+    }
+
+    fn place_m(&self, fraction: f64) -> DVec3 {
+        if fraction >= 1.0 { self.to_m } else { self.from_m.lerp(self.to_m, fraction) }
+    }
+
+    /// Finds how the tool stands to the sheet, and the force that it exerts on it, N.
+    fn meet<T: Real>(&mut self, model: &Model, plan: &Plan, layout: &Layout, state: &State<T>, fraction: f64) -> DVec3 {
+        let place_m = self.place_m(fraction);
+        let displacement = |point| displacement_m(model, layout, state, point);
+        if self.standing == Standing::Free {
+            // Where on the sheet the tool is: a contraction, as long as the sheet is not folded.
+            for _ in 0..2 {
+                let (surface_m, _) = self.footprint.surface(displacement);
+                let beside = (place_m - surface_m).truncate();
+                self.footprint.move_to(model, self.footprint.centre_m() + beside);
+            }
+        }
+        let (surface_m, along) = self.footprint.surface(displacement);
+        self.normal = along[0].cross(along[1]).try_normalize().unwrap_or(DVec3::Z);
+        let mut gap_m = place_m - surface_m;
+        match self.standing {
+            Standing::Free => {
+                // What is left beside the sheet's rim does not meet it.
+                if gap_m.truncate().length() > self.tip.radius_m {
+                    return DVec3::ZERO;
+                }
+                if self.tip.grasps {
+                    (self.standing, self.offset_m) = (Standing::Holding, gap_m);
+                    gap_m = DVec3::ZERO;
+                } else if gap_m.dot(self.normal) >= 0.0 {
+                    return DVec3::ZERO;
+                } else {
+                    self.standing = Standing::Sticking;
+                }
+            }
+            Standing::Holding => gap_m -= self.offset_m,
+            Standing::Sticking | Standing::Sliding => {}
+        }
+        let force_n = self.force(model, plan, layout, state, gap_m);
+        if self.standing == Standing::Holding {
+            return force_n;
+        }
+        let pressure_n = -force_n.dot(self.normal);
+        if pressure_n <= 0.0 || self.footprint.mobility() == 0.0 {
+            self.standing = Standing::Free;
+            return DVec3::ZERO;
+        }
+        let (inside, force_n) = within_cone(force_n, self.normal, self.tip.friction);
+        self.standing = if inside { Standing::Sticking } else { Standing::Sliding };
+        force_n
+    }
+
+    /// The force that closes a gap, N.
+    fn force<T: Real>(&self, model: &Model, plan: &Plan, layout: &Layout, state: &State<T>, gap_m: DVec3) -> DVec3 {
+        let spacing_m = model.scene.sheet.spacing_m;
+        let moves_m_per_n =
+            plan.scheme.kick()[0] * plan.force_scale(&model.scene) * spacing_m * self.footprint.mobility();
+        let gap_m = gap_m + moves_m_per_n * self.steady_n;
+        match self.tip.coupling {
+            _ if moves_m_per_n == 0.0 => DVec3::ZERO,
+            Coupling::Constraint => gap_m / moves_m_per_n,
+            Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } => {
+                let own_m = (self.to_m - self.from_m) * (model.scene.stepping.rate_hz * plan.substep_s);
+                let moved_m = movement_m(model, layout, state, &self.footprint) - moves_m_per_n * self.steady_n;
+                let apart_m_per_s = (own_m - moved_m) / plan.substep_s;
+                let held = stiffness_n_per_m + damping_n_s_per_m / plan.substep_s;
+                (stiffness_n_per_m * gap_m + damping_n_s_per_m * apart_m_per_s) / (1.0 + moves_m_per_n * held)
+            }
+        }
+    }
+
+    /// After the force has acted: where the disc slides, it stays under the tool.
+    fn follow<T: Real>(&mut self, model: &Model, layout: &Layout, state: &State<T>, fraction: f64) {
+        if self.standing != Standing::Sliding {
+            return;
+        }
+        let (surface_m, _) = self.footprint.surface(|point| displacement_m(model, layout, state, point));
+        let mut beside_m = self.place_m(fraction) - surface_m;
+        beside_m -= beside_m.dot(self.normal) * self.normal;
+        if let Coupling::Spring { stiffness_n_per_m, .. } = self.tip.coupling {
+            beside_m -= (self.force_n - self.force_n.dot(self.normal) * self.normal) / stiffness_n_per_m;
+        }
+        self.footprint.move_to(model, self.footprint.centre_m() + beside_m.truncate());
+    }
+}
+
+/// A force on the sheet within the cone of friction about −`normal`, and whether it was inside.
+fn within_cone(force_n: DVec3, normal: DVec3, friction: f64) -> (bool, DVec3) {
+    let pressing_n = force_n.dot(normal) * normal;
+    let across_n = force_n - pressing_n;
+    let most_n = friction * pressing_n.length();
+    let length_n = across_n.length();
+    if length_n <= most_n { (true, force_n) } else { (false, pressing_n + across_n * (most_n / length_n)) }
+}
+
+impl<T: Real> Sheet<T> {
+    /// What a tool that is led by its position does and feels.
+    pub(super) fn feel(&self, number: usize) -> Option<Feel> {
+        let model = &self.model;
+        let tool = self.contacts.tools.iter().find(|tool| tool.number == number)?;
+        let (surface_m, _) =
+            tool.footprint.surface(|point| displacement_m(model, &self.bench.layout, &self.state, point));
+        let felt_n = match (tool.standing, tool.tip.coupling) {
+            (Standing::Free, _) => DVec3::ZERO,
+            (_, Coupling::Spring { .. }) => -tool.force_n,
+            (standing, Coupling::Constraint) => {
+                let felt_n = self.without_inertia(tool);
+                if standing == Standing::Holding {
+                    felt_n
+                } else if felt_n.dot(tool.normal) <= 0.0 {
+                    DVec3::ZERO
+                } else {
+                    within_cone(felt_n, tool.normal, tool.tip.friction).1
+                }
+            }
+        };
+        Some(Feel {
+            place_m: tool.from_m,
+            velocity_m_per_s: tool.velocity_m_per_s,
+            standing: tool.standing,
+            force_on_tool_n: felt_n,
+            surface_m,
+            anchor_m: tool.footprint.centre_m(),
+            normal: tool.normal,
+            friction: tool.tip.friction,
+        })
+    }
+
+    /// The disc of such a tool, if it touches or holds, and how the points around it are displaced.
+    pub(super) fn surroundings(&self, number: usize) -> Option<Surroundings> {
+        let tool = self.contacts.tools.iter().find(|tool| tool.number == number)?;
+        if tool.standing == Standing::Free {
+            return None;
+        }
+        let window = Window::around(&self.model, &tool.footprint);
+        let displacement =
+            |index: usize| displacement_m(&self.model, &self.bench.layout, &self.state, self.model.point_of(index));
+        let displacement_m = window.points(&self.model).map(displacement).collect();
+        Some(Surroundings { model: self.model.clone(), footprint: tool.footprint.clone(), window, displacement_m })
+    }
+
+    /// Σ w·f/Σ w², f of springs, virtual springs, damping and tools that exert a given force.
+    fn without_inertia(&self, tool: &Tool) -> DVec3 {
+        let (model, footprint) = (&self.model, &tool.footprint);
+        let scene = &model.scene;
+        let mut sum = DVec3::ZERO;
+        for Reached { point, weight, .. } in footprint.reached().iter().copied().filter(|point| point.free) {
+            let index = model.index_of(point);
+            let applied_n = if self.steps == 0 { DVec3::ZERO } else { self.applied.until(model, index) };
+            let [u, v, spring_n] = self.free_point(index, applied_n);
+            sum += weight * (spring_n - scene.virtual_stiffness_n_per_m * u - scene.damping_n_s_per_m * v + applied_n);
+        }
+        if footprint.mobility() > 0.0 { sum / footprint.mobility() } else { DVec3::ZERO }
+    }
+}

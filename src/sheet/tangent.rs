@@ -1,0 +1,377 @@
+//! How stiff the sheet is under a disc: its tangent stiffness around the present place, and the force law of a slow press.
+//!
+//! With E the weights of the disc (`footprint`), one column a direction, and K the tangent stiffness of the sheet, a
+//! disc that is moved by ds without haste is pushed back by S·ds, S = (Eᵀ K⁻¹ E)⁻¹: three solutions K·φ = E. The shape
+//! φ̂ = φ·S, the displacement of all points for a unit of the disc's, tells the damping and the mass that go with it:
+//! B = C·φ̂ᵀφ̂, the derivative of the disc's impedance at rest, and M = m·φ̂ᵀφ̂. A disc that slides carries its dimple
+//! along, and each point is moved by −∂u/∂x·v: drag D = C·Σ ∂u·∂u.
+//!
+//! K of a spring along n is k[nnᵀ + max(0, 1 − L0/L)(I − nnᵀ)]: without the clamp a pressed spring would make it
+//! indefinite. Conjugate gradients, the three systems side by side, preconditioned by the points' own blocks. Points far
+//! enough away not to notice are held: a press reaches √(k/K″) spacings.
+
+use glam::{DMat3, DVec2, DVec3};
+
+use super::footprint::{Footprint, Reached};
+use super::model::Model;
+
+/// How many times its reach around a disc the sheet is looked at: e⁻⁶ is left.
+const REACHES: f64 = 6.0;
+
+/// Residual at which a solution is good, relative to the right-hand side: of what is told, and on the way there.
+const RESIDUAL: f64 = 1e-5;
+const ROUGH_RESIDUAL: f64 = 1e-3;
+
+/// Newton's method has arrived when no point moves farther, in spacings.
+const ARRIVED: f64 = 1e-5;
+
+/// Most iterations of conjugate gradients.
+const MOST_ITERATIONS: u32 = 400;
+
+/// Three vectors a point: one of each system.
+type Triple = [DVec3; 3];
+
+/// The sheet around a disc, linearised where it is.
+#[derive(Debug)]
+pub struct Patch<'m> {
+    model: &'m Model,
+    size: [usize; 2],
+    /// From rest, m.
+    displacement_m: Vec<DVec3>,
+    /// Whether a point moves.
+    free: Vec<bool>,
+    /// E, by points.
+    weights: Vec<f64>,
+    springs: Vec<Spring>,
+    inverses: Vec<DMat3>,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Spring {
+    ends: [usize; 2],
+    rest_m: DVec3,
+    stiffness_n_per_m: f64,
+    tangent: DMat3,
+    /// On the first end, N.
+    force_n: DVec3,
+}
+
+/// What a disc feels of slow and small movements.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Tangent {
+    /// S, N/m.
+    pub stiffness_n_per_m: DMat3,
+    /// B of movements with the tissue, N·s/m.
+    pub damping_n_s_per_m: DMat3,
+    /// D of sliding, in the rest plane, N·s/m.
+    pub drag_n_s_per_m: f64,
+    /// M, kg.
+    pub mass_kg: f64,
+    /// Iterations that it took.
+    pub iterations: u32,
+}
+
+/// One depth of a slow press by a disc, straight down into a sheet that is otherwise at rest.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Pressed {
+    /// m.
+    pub depth_m: f64,
+    /// Of the tissue on the disc, outward, N.
+    pub force_n: f64,
+    /// What goes with it.
+    pub tangent: Tangent,
+}
+
+/// The points around a disc that notice what it does.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Window {
+    origin: [usize; 2],
+    size: [usize; 2],
+}
+
+impl Window {
+    /// Around a footprint.
+    pub fn around(model: &Model, footprint: &Footprint) -> Self {
+        let scene = &model.scene;
+        let springs = &scene.springs;
+        let stiffest = springs.stiffness_n_per_m.max(springs.shear_stiffness_n_per_m);
+        let reach = (stiffest / scene.virtual_stiffness_n_per_m).sqrt().max(1.0);
+        let centre = footprint.centre_m() / scene.sheet.spacing_m;
+        let half = footprint.radius_m() / scene.sheet.spacing_m + REACHES * reach + 2.0;
+        let (mut origin, mut size) = ([0; 2], [0; 2]);
+        for axis in 0..2 {
+            // Saturating casts: no virtual springs, no end.
+            #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+            let [low, high] = [centre[axis] - half, centre[axis] + half].map(|edge| edge.round().max(0.0) as usize);
+            origin[axis] = low.min(scene.sheet.points[axis] - 1);
+            size[axis] = high.min(scene.sheet.points[axis] - 1) + 1 - origin[axis];
+        }
+        Window { origin, size }
+    }
+
+    /// The numbers of its points, by rows.
+    pub fn points(self, model: &Model) -> impl Iterator<Item = usize> {
+        let Window { origin, size } = self;
+        let columns = model.points[1];
+        (0..size[0] * size[1]).map(move |at| (origin[0] + at / size[1]) * columns + origin[1] + at % size[1])
+    }
+}
+
+impl<'m> Patch<'m> {
+    /// A window around a footprint, its points displaced so, by rows.
+    pub fn new(model: &'m Model, footprint: &Footprint, window: Window, displacement_m: Vec<DVec3>) -> Self {
+        let springs = &model.scene.springs;
+        let Window { origin, size } = window;
+        let layers = if springs.flexion { 2 } else { 1 };
+        let index_of = |at: usize| (origin[0] + at / size[1]) * model.points[1] + origin[1] + at % size[1];
+        let count = size[0] * size[1];
+        let is_free = |at: usize| {
+            let inside = |axis: usize, place: usize| {
+                (origin[axis] == 0 || place >= layers)
+                    && (origin[axis] + size[axis] == model.points[axis] || place + layers < size[axis])
+            };
+            inside(0, at / size[1]) && inside(1, at % size[1]) && model.fixed.binary_search(&index_of(at)).is_err()
+        };
+        let mut weights = vec![0.0; count];
+        for Reached { point: [i, j], weight, .. } in footprint.reached().iter().copied() {
+            let place = (i.wrapping_sub(origin[0]), j.wrapping_sub(origin[1]));
+            if place.0 < size[0] && place.1 < size[1] {
+                weights[place.0 * size[1] + place.1] = weight;
+            }
+        }
+        let mut patch = Patch {
+            model,
+            size,
+            displacement_m,
+            free: (0..count).map(is_free).collect(),
+            weights,
+            springs: Vec::new(),
+            inverses: Vec::new(),
+        };
+        patch.connect();
+        patch.linearise();
+        patch
+    }
+
+    fn connect(&mut self) {
+        let springs = &self.model.scene.springs;
+        let (structural, shear) = (springs.stiffness_n_per_m, springs.shear_stiffness_n_per_m);
+        let flexion = if springs.flexion { structural } else { 0.0 };
+        let kinds = [(structural, [[1, 0], [0, 1]]), (shear, [[1, 1], [1, -1]]), (flexion, [[2, 0], [0, 2]])];
+        for (stiffness_n_per_m, reach) in kinds.into_iter().filter(|kind| kind.0 > 0.0) {
+            for [di, dj] in reach {
+                for i in 0..self.size[0] {
+                    for j in 0..self.size[1] {
+                        let (Some(i1), Some(j1)) = (i.checked_add_signed(di), j.checked_add_signed(dj)) else {
+                            continue;
+                        };
+                        if i1 >= self.size[0] || j1 >= self.size[1] {
+                            continue;
+                        }
+                        let ends = [i * self.size[1] + j, i1 * self.size[1] + j1];
+                        if !(self.free[ends[0]] || self.free[ends[1]]) {
+                            continue;
+                        }
+                        #[allow(clippy::cast_precision_loss)]
+                        let rest_m = self.model.scene.sheet.spacing_m * DVec3::new(di as f64, dj as f64, 0.0);
+                        let (tangent, force_n) = (DMat3::ZERO, DVec3::ZERO);
+                        self.springs.push(Spring { ends, rest_m, stiffness_n_per_m, tangent, force_n });
+                    }
+                }
+            }
+        }
+    }
+
+    /// Forms the springs' tangents and forces where the points are.
+    fn linearise(&mut self) {
+        let own = DMat3::from_diagonal(DVec3::splat(self.model.scene.virtual_stiffness_n_per_m));
+        self.inverses.clear();
+        self.inverses.resize(self.free.len(), own);
+        for spring in &mut self.springs {
+            let [a, b] = spring.ends;
+            let delta = self.displacement_m[b] - self.displacement_m[a];
+            let apart_m = spring.rest_m + delta;
+            let rest_squared = spring.rest_m.length_squared();
+            // 1 − L0/L without cancellation (`springs`).
+            let q = ((2.0 * spring.rest_m + delta).dot(delta) / rest_squared).max(1e-12 - 1.0);
+            let s = (1.0 + q).sqrt();
+            let stretch = q / (s * (1.0 + s));
+            let along = apart_m / (s * rest_squared.sqrt());
+            let outer = DMat3::from_cols(along * along.x, along * along.y, along * along.z);
+            let across = stretch.max(0.0);
+            spring.force_n = spring.stiffness_n_per_m * stretch * apart_m;
+            spring.tangent = spring.stiffness_n_per_m * (outer * (1.0 - across) + DMat3::IDENTITY * across);
+            self.inverses[a] += spring.tangent;
+            self.inverses[b] += spring.tangent;
+        }
+        for block in &mut self.inverses {
+            // A point that nothing holds is left alone.
+            *block = if block.determinant() > 0.0 { block.inverse() } else { DMat3::ZERO };
+        }
+    }
+
+    /// K·x of three vectors at once.
+    fn times(&self, x: &[Triple], product: &mut [Triple]) {
+        let own = self.model.scene.virtual_stiffness_n_per_m;
+        for (product, x) in product.iter_mut().zip(x) {
+            *product = x.map(|x| own * x);
+        }
+        for Spring { ends: [a, b], tangent, .. } in &self.springs {
+            for system in 0..3 {
+                let pull = *tangent * (x[*b][system] - x[*a][system]);
+                product[*a][system] -= pull;
+                product[*b][system] += pull;
+            }
+        }
+        for (product, free) in product.iter_mut().zip(&self.free) {
+            if !free {
+                *product = [DVec3::ZERO; 3];
+            }
+        }
+    }
+
+    /// Solves K·x = `right` for three systems, to a residual of `good` parts. Iterations of the slowest.
+    fn solve(&self, right: &[Triple], good: f64) -> (Vec<Triple>, u32) {
+        let dot = |a: &[Triple], b: &[Triple]| {
+            let mut sum = [0.0; 3];
+            for (a, b) in a.iter().zip(b) {
+                (0..3).for_each(|system| sum[system] += a[system].dot(b[system]));
+            }
+            sum
+        };
+        let masked = |triple: &Triple, free: bool| if free { *triple } else { [DVec3::ZERO; 3] };
+        let mut residual: Vec<Triple> = right.iter().zip(&self.free).map(|(r, free)| masked(r, *free)).collect();
+        let whole = dot(&residual, &residual);
+        let precondition = |residual: &[Triple]| -> Vec<Triple> {
+            residual.iter().zip(&self.inverses).map(|(r, inverse)| r.map(|r| *inverse * r)).collect()
+        };
+        let mut x = vec![[DVec3::ZERO; 3]; residual.len()];
+        let mut z = precondition(&residual);
+        let mut direction = z.clone();
+        let mut product = x.clone();
+        let mut rz = dot(&residual, &z);
+        for iteration in 0..MOST_ITERATIONS {
+            let left = dot(&residual, &residual);
+            if (0..3).all(|system| left[system] <= good * good * whole[system]) {
+                return (x, iteration);
+            }
+            self.times(&direction, &mut product);
+            let curvature = dot(&direction, &product);
+            let step: [f64; 3] = std::array::from_fn(|s| if curvature[s] > 0.0 { rz[s] / curvature[s] } else { 0.0 });
+            for at in 0..x.len() {
+                for s in 0..3 {
+                    x[at][s] += step[s] * direction[at][s];
+                    residual[at][s] -= step[s] * product[at][s];
+                }
+            }
+            z = precondition(&residual);
+            let next = dot(&residual, &z);
+            for (direction, z) in direction.iter_mut().zip(&z) {
+                for s in 0..3 {
+                    let turn = if rz[s] > 0.0 { next[s] / rz[s] } else { 0.0 };
+                    direction[s] = z[s] + turn * direction[s];
+                }
+            }
+            rz = next;
+        }
+        (x, MOST_ITERATIONS)
+    }
+
+    /// Stiffness, damping, drag and mass under the disc.
+    pub fn tangent(&self) -> Tangent {
+        let axes = [DVec3::X, DVec3::Y, DVec3::Z];
+        let right: Vec<Triple> = self.weights.iter().map(|weight| axes.map(|axis| *weight * axis)).collect();
+        let (shapes, iterations) = self.solve(&right, RESIDUAL);
+        let compliance = |a: usize, b: usize| -> f64 {
+            self.weights.iter().zip(&shapes).map(|(weight, shape)| weight * shape[b][a]).sum()
+        };
+        let compliance = symmetric(compliance);
+        let stiffness_n_per_m = if compliance.determinant() > 0.0 { compliance.inverse() } else { DMat3::ZERO };
+        let overlap = symmetric(|a, b| shapes.iter().map(|shape| shape[a].dot(shape[b])).sum());
+        let unit = stiffness_n_per_m * overlap * stiffness_n_per_m;
+        let scene = &self.model.scene;
+        Tangent {
+            stiffness_n_per_m,
+            damping_n_s_per_m: scene.damping_n_s_per_m * unit,
+            drag_n_s_per_m: scene.damping_n_s_per_m * self.slopes(),
+            mass_kg: scene.sheet.point_mass_kg * unit.z_axis.z,
+            iterations,
+        }
+    }
+
+    /// Σ |∂u/∂x|², the mean of both directions.
+    fn slopes(&self) -> f64 {
+        let spacing_m = self.model.scene.sheet.spacing_m;
+        let mut sum = 0.0;
+        for i in 1..self.size[0].saturating_sub(1) {
+            for j in 1..self.size[1].saturating_sub(1) {
+                let at = i * self.size[1] + j;
+                let slope = |step: usize| self.displacement_m[at + step] - self.displacement_m[at - step];
+                sum += slope(1).length_squared() + slope(self.size[1]).length_squared();
+            }
+        }
+        sum / (8.0 * spacing_m * spacing_m)
+    }
+
+    /// Brings the disc's z to `-depth_m` without haste (Newton's method); the force on the disc, N.
+    fn press(&mut self, depth_m: f64) -> f64 {
+        let own = self.model.scene.virtual_stiffness_n_per_m;
+        let mut force_n = 0.0;
+        for _ in 0..MOST_NEWTON {
+            let mut right: Vec<Triple> = self
+                .displacement_m
+                .iter()
+                .zip(&self.weights)
+                .map(|(u, weight)| [-own * *u, *weight * DVec3::Z, DVec3::ZERO])
+                .collect();
+            for spring in &self.springs {
+                right[spring.ends[0]][0] += spring.force_n;
+                right[spring.ends[1]][0] -= spring.force_n;
+            }
+            let (x, _) = self.solve(&right, ROUGH_RESIDUAL);
+            let on_disc = |x: &dyn Fn(usize) -> f64| -> f64 {
+                self.weights.iter().enumerate().map(|(at, weight)| weight * x(at)).sum()
+            };
+            let place = on_disc(&|at| self.displacement_m[at].z);
+            let (free, forced) = (on_disc(&|at| x[at][0].z), on_disc(&|at| x[at][1].z));
+            let applied_n = if forced > 0.0 { (-depth_m - place - free) / forced } else { 0.0 };
+            force_n = -applied_n;
+            let mut largest_m: f64 = 0.0;
+            for (u, x) in self.displacement_m.iter_mut().zip(&x) {
+                let change = x[0] + applied_n * x[1];
+                *u += change;
+                largest_m = largest_m.max(change.abs().max_element());
+            }
+            self.linearise();
+            if largest_m < ARRIVED * self.model.scene.sheet.spacing_m {
+                break;
+            }
+        }
+        force_n
+    }
+}
+
+/// Most steps of Newton's method for one depth.
+const MOST_NEWTON: u32 = 30;
+
+/// A matrix of a symmetric function of two indices.
+fn symmetric(of: impl Fn(usize, usize) -> f64) -> DMat3 {
+    let both = |a: usize, b: usize| 0.5 * (of(a, b) + of(b, a));
+    let column = |b: usize| DVec3::new(both(0, b), both(1, b), both(2, b));
+    DMat3::from_cols(column(0), column(1), column(2))
+}
+
+/// A slow press by a disc of `radius_m` at `centre_m`, at `count` depths, `step_m` apart, from 0 on.
+pub fn press(model: &Model, radius_m: f64, centre_m: DVec2, step_m: f64, count: u32) -> Vec<Pressed> {
+    let footprint = Footprint::new(model, radius_m, centre_m);
+    let window = Window::around(model, &footprint);
+    let at_rest = window.points(model).map(|_| DVec3::ZERO).collect();
+    let mut patch = Patch::new(model, &footprint, window, at_rest);
+    (0..count)
+        .map(|k| {
+            let depth_m = f64::from(k) * step_m;
+            let force_n = if k == 0 { 0.0 } else { patch.press(depth_m) };
+            Pressed { depth_m, force_n, tangent: patch.tangent() }
+        })
+        .collect()
+}

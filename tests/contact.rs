@@ -1,0 +1,255 @@
+//! Touch and grasp: what a tool of finite size must feel of a sheet.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
+
+mod common;
+
+use std::sync::Arc;
+
+use common::{model, scene_with};
+use glam::{DVec2, DVec3};
+use palpate::haptics::Law;
+use palpate::scene::BUILT_IN;
+use palpate::scene::tip::{Coupling, Tip};
+use palpate::sheet::{self, Feel, Model, Standing, Tissue, tangent};
+
+/// Flat punches of 5 mm radius, 2aE/(1 − ν²), N/m.
+const FLAT_PUNCH_N_PER_M: [(&str, f64); 3] = [("stomach", 25.3), ("liver", 71.1), ("fibrotic", 354.0)];
+
+fn tissue(name: &str, sets: &[&str]) -> Arc<Model> {
+    let text = BUILT_IN.iter().find(|scene| scene.0 == name).unwrap().1;
+    model(&scene_with(text, sets))
+}
+
+fn middle(model: &Model) -> DVec3 {
+    (model.scene.sheet.extent_m() / 2.0).extend(0.0)
+}
+
+/// 0 to 1 without jolt.
+fn smooth(x: f64) -> f64 {
+    let x = x.clamp(0.0, 1.0);
+    x * x * x * (10.0 + x * (6.0 * x - 15.0))
+}
+
+/// Leads tool 0 along a way, and looks at what it feels after each step.
+fn lead(sheet: &mut dyn Tissue, tip: Tip, steps: u32, way: impl Fn(f64) -> DVec3, mut look: impl FnMut(f64, &Feel)) {
+    for step in 1..=steps {
+        let time_s = f64::from(step) * 1e-3;
+        sheet.lead(0, way(time_s), tip);
+        sheet.step().unwrap();
+        look(time_s, &sheet.feel(0).unwrap());
+    }
+    assert_eq!(sheet.guard_events(), 0, "the guard had to mend a touch");
+}
+
+/// Down, along and out again: 2 s.
+fn stroke(middle: DVec3, depth_m: f64) -> impl Fn(f64) -> DVec3 {
+    move |t| {
+        let z = 0.002 - (0.002 + depth_m) * (smooth(t / 0.4) - smooth((t - 1.4) / 0.4));
+        middle + DVec3::new(-0.006 + 0.012 * smooth((t - 0.6) / 0.5), 0.0013, z)
+    }
+}
+
+#[test]
+fn a_touch_enters_slides_and_leaves_without_a_jump_and_never_pulls() {
+    for (name, depth_m, friction) in [("liver", 0.008, 0.2), ("fibrotic", 0.003, 0.0), ("stomach", 0.01, 0.5)] {
+        let model = tissue(name, &[]);
+        let mut sheet = sheet::at_rest(&model);
+        let (mut before, mut largest, mut jump, mut slid) = (DVec3::ZERO, 0.0_f64, (0.0_f64, 0.0), false);
+        let tip = Tip { friction, ..Tip::default() };
+        lead(&mut *sheet, tip, 2000, stroke(middle(&model), depth_m), |time_s, feel| {
+            let force = feel.force_on_tool_n;
+            let pressure = force.dot(feel.normal);
+            assert!(pressure >= 0.0, "{name} pulls with {pressure} N at {time_s} s");
+            let across = (force - pressure * feel.normal).length();
+            assert!(across <= friction * pressure * (1.0 + 1e-9) + 1e-12, "{name}: {across} N across {pressure} N");
+            slid |= feel.standing == Standing::Sliding;
+            if (force - before).length() > jump.0 {
+                jump = ((force - before).length(), time_s);
+            }
+            largest = largest.max(force.length());
+            before = force;
+        });
+        assert!(largest > 0.5 && slid, "{name}: {largest} N, slid: {slid}");
+        assert!(jump.0 < 0.03 * largest, "{name}: a jump of {jump:?} (N, s) where {largest} N is the most");
+        assert_eq!(before, DVec3::ZERO, "{name} is still felt in the air");
+        assert_eq!(sheet.feel(0).unwrap().standing, Standing::Free);
+    }
+}
+
+#[test]
+fn stiffness_converges_as_the_grid_gets_finer() {
+    // The same tissue on finer grids: masses, virtual springs and damping go with h², springs stay.
+    let stiffness = |spacing_m: f64, points: usize| {
+        let base = tissue("liver", &[]);
+        let share = (spacing_m / base.scene.sheet.spacing_m).powi(2);
+        let model = tissue(
+            "liver",
+            &[
+                &format!("sheet.points=[{points}, {points}]"),
+                &format!("sheet.spacing_m={spacing_m}"),
+                &format!("sheet.point_mass_kg={}", share * base.scene.sheet.point_mass_kg),
+                &format!("virtual_springs.stiffness_n_per_m={}", share * base.scene.virtual_stiffness_n_per_m),
+                &format!("damping.coefficient_n_s_per_m={}", share * base.scene.damping_n_s_per_m),
+            ],
+        );
+        let pressed = tangent::press(&model, 0.005, middle(&model).truncate(), 0.0005, 2);
+        pressed[1].force_n / pressed[1].depth_m
+    };
+    let found: Vec<f64> =
+        [(0.005, 17), (0.0025, 33), (0.00125, 65)].iter().map(|&(h, points)| stiffness(h, points)).collect();
+    assert!((found[2] - found[1]).abs() < 0.05 * found[2], "{found:?}");
+    assert!((found[2] / 71.1 - 1.0).abs() < 0.15, "{found:?} beside the flat punch's 71.1 N/m");
+}
+
+#[test]
+fn the_tissues_are_as_stiff_as_a_flat_punch_finds_them() {
+    for (name, punch_n_per_m) in FLAT_PUNCH_N_PER_M {
+        let model = tissue(name, &[]);
+        let spacing_m = model.scene.sheet.spacing_m;
+        for beside in [DVec2::ZERO, DVec2::splat(0.5 * spacing_m), DVec2::new(0.3 * spacing_m, 0.0)] {
+            let pressed = tangent::press(&model, 0.005, middle(&model).truncate() + beside, 0.0005, 3);
+            let stiffness = pressed[1].force_n / pressed[1].depth_m;
+            assert!((stiffness / punch_n_per_m - 1.0).abs() < 0.15, "{name}: {stiffness} N/m at 0.5 mm");
+            if name == "fibrotic" {
+                let stiffness = pressed[2].force_n / pressed[2].depth_m;
+                assert!((stiffness / 400.0 - 1.0).abs() < 0.05, "{stiffness} N/m at 1 mm");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_slow_press_feels_the_law_that_was_computed() {
+    let model = tissue("liver", &[]);
+    let law = Law::of(&model, 0.005);
+    assert!(law.is_sound());
+    let mut sheet = sheet::at_rest(&model);
+    let way = |t: f64| middle(&model) + DVec3::new(0.0, 0.0, 0.001 - 0.009 * smooth(t / 1.5));
+    lead(&mut *sheet, Tip::default(), 1700, way, |time_s, feel| {
+        let depth_m = -feel.place_m.z;
+        let row = law.at_depth(depth_m.max(0.0));
+        let expected = row.force_n - row.damping_n_s_per_m * feel.velocity_m_per_s.z;
+        if depth_m > 0.0005 {
+            let found = feel.force_on_tool_n.z;
+            assert!((found - expected).abs() < 0.02 * expected + 0.002, "{time_s} s: {found} N, by law {expected} N");
+        }
+    });
+}
+
+#[test]
+fn a_grasp_pulls_as_well_as_it_pushes_and_a_touch_does_not() {
+    let model = tissue("liver", &[]);
+    let up = |t: f64| middle(&model) + DVec3::new(0.0, 0.0, 0.005 * smooth(t / 0.5));
+    let force = |grasps: bool| {
+        let mut sheet = sheet::at_rest(&model);
+        let tip = Tip { grasps, ..Tip::default() };
+        let mut last = DVec3::ZERO;
+        lead(&mut *sheet, tip, 700, up, |_, feel| last = feel.force_on_tool_n);
+        (last, sheet.feel(0).unwrap().standing)
+    };
+    let (held, standing) = force(true);
+    assert_eq!(standing, Standing::Holding);
+    assert!(held.z < -0.3, "a grasp that lifts is pulled down, but feels {held}");
+    assert_eq!(force(false), (DVec3::ZERO, Standing::Free));
+}
+
+#[test]
+fn a_coupling_spring_is_felt_in_series_with_the_tissue() {
+    let model = tissue("liver", &[]);
+    let down = |t: f64| middle(&model) - DVec3::new(0.0, 0.0, 0.001 * smooth(t / 0.5));
+    let force = |coupling: Coupling| {
+        let mut sheet = sheet::at_rest(&model);
+        let mut last = 0.0;
+        lead(&mut *sheet, Tip { coupling, ..Tip::default() }, 900, down, |_, feel| last = feel.force_on_tool_n.z);
+        (last, -sheet.feel(0).unwrap().surface_m.z)
+    };
+    let (rigid_n, _) = force(Coupling::Constraint);
+    for stiffness_n_per_m in [50.0, 500.0, 50_000.0] {
+        let (coupled_n, depth_m) = force(Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m: 0.1 });
+        // What the spring gives is its stiffness times what the surface is short of the tool.
+        let spring_n = stiffness_n_per_m * (0.001 - depth_m);
+        assert!((coupled_n / spring_n - 1.0).abs() < 0.02, "{coupled_n} N, the spring {spring_n} N");
+        assert!(coupled_n < rigid_n * 1.001, "{coupled_n} N is above {rigid_n} N");
+    }
+    let (stiff_n, _) = force(Coupling::Spring { stiffness_n_per_m: 50_000.0, damping_n_s_per_m: 0.1 });
+    assert!((stiff_n / rigid_n - 1.0).abs() < 0.02, "{stiff_n} N beside {rigid_n} N");
+}
+
+#[test]
+fn two_tools_press_one_tissue_each_for_itself() {
+    let model = tissue("liver", &[]);
+    let mut sheet = sheet::at_rest(&model);
+    for step in 1..=800 {
+        let down = 0.003 * smooth(f64::from(step) * 1e-3 / 0.5);
+        for (tool, x) in [(0, -0.018), (1, 0.018)] {
+            sheet.lead(tool, middle(&model) + DVec3::new(x, 0.0, -down), Tip::default());
+        }
+        sheet.step().unwrap();
+    }
+    let [a, b] = [0, 1].map(|tool| sheet.feel(tool).unwrap().force_on_tool_n);
+    assert!((a.z - b.z).abs() < 1e-3 * a.z && (a.x + b.x).abs() < 1e-3 * a.z, "{a} and {b} are not mirror images");
+    let alone = tangent::press(&model, 0.005, middle(&model).truncate(), 0.003, 2)[1].force_n;
+    assert!((a.z / alone - 1.0).abs() < 0.1, "{} N beside another tool, {alone} N alone", a.z);
+    sheet.release(1);
+    sheet.step().unwrap();
+    assert!(sheet.feel(1).is_none());
+}
+
+/// In plane the lattice of the presets is an isotropic sheet with ν = 1/3: stretched evenly, it stays even, and pulls
+/// with E·t a metre, but for the springs of its two free sides, which belong to half a cell only.
+#[test]
+fn the_lattice_passes_the_patch_test() {
+    let model = tissue(
+        "liver",
+        &["sheet.points=[9, 9]", "sheet.fixed=[]", "virtual_springs.stiffness_n_per_m=0.0", "stepping.precision=f64"],
+    );
+    let (strain, contraction) = (1e-4, -1e-4 / 3.0);
+    let spacing_m = model.scene.sheet.spacing_m;
+    let even =
+        |[i, j]: [usize; 2]| spacing_m * DVec3::new(strain * (i as f64 - 4.0), contraction * (j as f64 - 4.0), 0.0);
+    let mut sheet = sheet::at_rest(&model);
+    let rim = |[i, j]: [usize; 2]| i % 8 == 0 || j % 8 == 0;
+    let mut tool = 0;
+    for index in 0..model.len() {
+        if rim(model.point_of(index)) {
+            sheet.grasp(tool, index, sheet::Grasp::Held(even(model.point_of(index))));
+            tool += 1;
+        }
+    }
+    for _ in 0..3000 {
+        sheet.step().unwrap();
+    }
+    let mut pull_n = 0.0;
+    for index in 0..model.len() {
+        let (point, state) = (model.point_of(index), sheet.point(index));
+        let off = (state.displacement_m - even(point)).length();
+        assert!(off < 1e-3 * strain * spacing_m, "{point:?} is {off} m off");
+        if point[0] == 8 {
+            pull_n += state.constraint_n.unwrap().x;
+        }
+    }
+    let [structural, width_m] = [model.scene.springs.stiffness_n_per_m, 8.0 * spacing_m];
+    let expected_n = 5400.0 * 0.01 * strain * width_m + structural * strain * spacing_m;
+    assert!((pull_n / expected_n - 1.0).abs() < 2e-3, "{pull_n} N, expected {expected_n} N");
+}
+
+#[test]
+fn a_touch_beside_the_sheet_or_far_above_feels_nothing() {
+    let model = tissue("liver", &[]);
+    let extent = model.scene.sheet.extent_m();
+    for place in
+        [DVec3::new(-0.02, 0.02, -0.01), (extent + DVec2::splat(0.02)).extend(-0.01), (extent / 2.0).extend(0.05)]
+    {
+        let mut sheet = sheet::at_rest(&model);
+        lead(
+            &mut *sheet,
+            Tip::default(),
+            50,
+            |_| place,
+            |_, feel| {
+                assert_eq!((feel.force_on_tool_n, feel.standing), (DVec3::ZERO, Standing::Free));
+            },
+        );
+        assert!(sheet.largest_displacement_m() < 1e-12);
+    }
+}

@@ -1,0 +1,133 @@
+//! Tools led by poses over a real server: local models, the force law, deadbands, and what is refused.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
+
+#[path = "common/server.rs"]
+mod server;
+
+use palpate::haptics::device::DEVICES;
+use palpate::haptics::{Device, Touching};
+use palpate::wire::{self, pb};
+use server::{Server, Touch, open, told};
+use tonic::Code;
+
+fn device() -> pb::Device {
+    wire::local::device(&Device::named("omega3").unwrap())
+}
+
+/// A pose above or in the middle of `liver`, by the client's clock.
+fn pose(sequence: u64, time_ms: u64, z_m: f64) -> pb::Command {
+    pb::Command {
+        tool: 0,
+        sequence,
+        client_time_ns: time_ms * 1_000_000,
+        action: Some(pb::command::Action::Pose(pb::Pose {
+            position_m: Some(pb::Vector3 { x: 0.0375, y: 0.0375, z: z_m }),
+            ..Default::default()
+        })),
+        ..Default::default()
+    }
+}
+
+async fn liver(server: &Server) -> String {
+    let request = pb::CreateSessionRequest {
+        source: Some(pb::create_session_request::Source::SceneName("liver".into())),
+        ..Default::default()
+    };
+    server.sessions().await.create_session(request).await.unwrap().into_inner().session.unwrap().session_id
+}
+
+#[tokio::test]
+async fn a_pressed_tool_gets_local_models_that_agree_with_the_law() {
+    let server = Server::start(&[]);
+    let session = liver(&server).await;
+    let mut touch =
+        Touch::open(&server, pb::TouchOpen { device: Some(device()), ..open(&session, &[0]) }).await.unwrap();
+    let opened = touch.opened.take().unwrap();
+    let law = wire::local::from_law(opened.law.as_ref().unwrap()).unwrap();
+    assert!((opened.max_force_n - 3.3).abs() < 1e-12);
+    assert!((law.at_depth(0.0005).force_n / 0.0005 / 71.1 - 1.0).abs() < 0.15);
+    // Down to 4 mm, at 20 mm/s by the client's clock.
+    for k in 0..400_u64 {
+        touch.command(pose(k + 1, 1000 + k, 0.002 - 2e-5 * (k.min(300)) as f64)).await;
+    }
+    let sample = touch.sample_with(|sample| {
+        let model = sample.tools.first().and_then(|tool| tool.local_model.as_ref());
+        model.is_some_and(|model| model.position_m.as_ref().unwrap().z < -0.0039)
+    });
+    let sample = sample.await;
+    let tool = &sample.tools[0];
+    let model = wire::local::from_local_model(tool.local_model.as_ref().unwrap(), sample.step);
+    assert!(model.is_sound() && model.force_n.z > 0.2, "{model:?}");
+    assert_eq!(model.force_n.z, tool.force_on_tool_n.as_ref().unwrap().z);
+    // The law goes through the sample.
+    let repeated_n = Touching::at_sample(&model, &law).force_n(&model, &law, model.velocity_m_per_s);
+    assert!((repeated_n - model.force_n).length() < 1e-6, "{repeated_n} beside {}", model.force_n);
+    let stiffness = model.stiffness_n_per_m;
+    assert!(stiffness.z_axis.z > 70.0 && (stiffness - stiffness.transpose()).abs().x_axis.y < 1e-9);
+}
+
+#[tokio::test]
+async fn without_poses_the_tool_is_held_and_then_lets_go() {
+    let server = Server::start(&[]);
+    let session = liver(&server).await;
+    let mut touch =
+        Touch::open(&server, pb::TouchOpen { device: Some(device()), ..open(&session, &[0]) }).await.unwrap();
+    for k in 0..200_u64 {
+        touch.command(pose(k + 1, 1000 + k, 0.001 - 2e-5 * k as f64)).await;
+    }
+    let pressed =
+        |sample: &pb::Sample| sample.tools.first().is_some_and(|tool| tool.force_on_tool_n.is_some_and(|f| f.z > 0.05));
+    touch.sample_with(pressed).await;
+    touch.sample_with(|sample| sample.tools[0].stale).await;
+    let free = |sample: &pb::Sample| sample.tools[0].stale && sample.tools[0].local_model.is_none();
+    touch.sample_with(free).await;
+}
+
+#[tokio::test]
+async fn what_makes_no_sense_is_refused() {
+    let server = Server::start(&[]);
+    let session = liver(&server).await;
+    let broken = |change: fn(&mut pb::Device)| {
+        let mut device = device();
+        change(&mut device);
+        pb::TouchOpen { device: Some(device), ..open(&session, &[0]) }
+    };
+    let tip = pb::Tip { radius_m: -1.0, ..Default::default() };
+    for (request, reason, field) in [
+        (broken(|device| device.max_force_n = f64::NAN), "NOT_FINITE", "device.force_n"),
+        (broken(|device| device.workspace_radius_m = 0.0), "OUT_OF_RANGE", "device.workspace_m"),
+        (pb::TouchOpen { deadband: Some(foretold()), ..open(&session, &[0]) }, "MISSING", "device"),
+        (pb::TouchOpen { tip: Some(tip), ..open(&session, &[0]) }, "OUT_OF_RANGE", "tip.radius_m"),
+    ] {
+        let refused = Touch::open(&server, request).await.err().unwrap();
+        let (code, told_reason, told_field) = told(&refused);
+        assert_eq!((told_reason.as_str(), told_field.as_str()), (reason, field));
+        assert_ne!(code, Code::Internal);
+    }
+    let mut touch =
+        Touch::open(&server, pb::TouchOpen { device: Some(device()), ..open(&session, &[0]) }).await.unwrap();
+    for (sequence, z_m, reason) in [(1, f64::NAN, "NOT_FINITE"), (2, 0.08, "OUT_OF_RANGE"), (3, 1e9, "OUT_OF_RANGE")] {
+        touch.command(pose(sequence, sequence, z_m)).await;
+        assert_eq!(touch.rejection().await.reason, reason, "z = {z_m}");
+    }
+    assert_eq!(DEVICES.len(), 9);
+}
+
+/// A deadband on what a client renders.
+fn foretold() -> pb::Deadband {
+    pb::Deadband { rendered_fraction: Some(0.1), ..Default::default() }
+}
+
+#[tokio::test]
+async fn a_deadband_sends_heartbeats_and_little_else() {
+    let server = Server::start(&[]);
+    let session = liver(&server).await;
+    let thrifty = pb::TouchOpen { device: Some(device()), deadband: Some(foretold()), ..open(&session, &[0]) };
+    let mut touch = Touch::open(&server, thrifty).await.unwrap();
+    touch.command(pose(1, 1, 0.001)).await;
+    let with_model = |sample: &pb::Sample| sample.tools.first().is_some_and(|tool| tool.local_model.is_some());
+    let first = touch.sample_with(with_model).await.step;
+    touch.command(pose(2, 20, 0.001)).await;
+    let second = touch.sample_with(|sample| sample.step > first).await.step;
+    assert!(second - first >= 40, "steps {first} and {second}: nothing happened between them");
+}
