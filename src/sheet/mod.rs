@@ -245,7 +245,7 @@ impl<T: Real> Sheet<T> {
 
     /// From `moment` to the fraction `end` of the same step.
     fn substep(&mut self, moment: Moment, end: f64) {
-        let (_, far) = self.tolerances();
+        let far = self.farthest_unnoticed();
         self.tiles.watch(&self.state.u, far);
         self.points_done += self.tiles.awake_points as u64;
         let Sheet { model, plan, bench, applied, .. } = self;

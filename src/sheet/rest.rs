@@ -20,13 +20,13 @@ pub(super) fn tolerance(model: &Model) -> f64 {
 }
 
 impl<T: Real> Sheet<T> {
-    /// ε and ε_w, spacings.
-    pub(super) fn tolerances(&self) -> (f64, f64) {
+    /// ε_w, spacings.
+    pub(super) fn farthest_unnoticed(&self) -> f64 {
         let epsilon = self.tiles.epsilon();
         let scene = &self.model.scene;
         let ratio = scene.virtual_stiffness_n_per_m / scene.springs.stiffness_n_per_m;
         // Without springs nothing passes from tile to tile.
-        (epsilon, if ratio.is_nan() { epsilon } else { epsilon * (20.0 * ratio).clamp(0.1, 1.0) })
+        if ratio.is_nan() { epsilon } else { epsilon * (20.0 * ratio).clamp(0.1, 1.0) }
     }
 
     /// Wakes tiles whose force changes in the coming step.
@@ -38,8 +38,7 @@ impl<T: Real> Sheet<T> {
             if stiffness > 0.0 {
                 self.tiles.largest = self.tiles.largest.max(touch.peak_n() / (stiffness * spacing_m));
             }
-            let (_, far) = self.tolerances();
-            let least_n = self.model.scene.virtual_stiffness_n_per_m * far * spacing_m;
+            let least_n = self.model.scene.virtual_stiffness_n_per_m * self.farthest_unnoticed() * spacing_m;
             self.tiles.pushed(&touch, spacing_m, least_n);
         }
     }

@@ -195,7 +195,11 @@ impl<T: Real> Tiles<T> {
 
     /// ε, spacings.
     pub(super) fn epsilon(&self) -> f64 {
-        PART * self.tolerance * self.largest
+        self.epsilon_of(self.largest)
+    }
+
+    fn epsilon_of(&self, largest: f64) -> f64 {
+        PART * self.tolerance * largest
     }
 
     /// The tile of a point.
@@ -251,11 +255,11 @@ impl<T: Real> Tiles<T> {
         (i * stride + j, if x == 0 { stride } else { 1 }, count_x.max(count_y))
     }
 
-    /// Wakes those of `which` that sleep; whether there are any.
-    pub(super) fn wake(&mut self, which: impl IntoIterator<Item = usize>) -> bool {
+    /// Wakes those of `which` that sleep.
+    pub(super) fn wake(&mut self, which: impl IntoIterator<Item = usize>) {
         let mut awake = std::mem::take(&mut self.region.awake);
         let mut any = false;
-        for tile in which.into_iter() {
+        for tile in which {
             if !std::mem::replace(&mut awake[tile], true) {
                 any = true;
                 self.asleep_j -= self.energy_j[tile];
@@ -267,7 +271,6 @@ impl<T: Real> Tiles<T> {
         } else {
             self.region.awake = awake;
         }
-        any
     }
 
     /// Wakes the tiles of points.
@@ -350,7 +353,7 @@ impl<T: Real> Tiles<T> {
             most
         };
         let largest = self.awake.iter().map(|tile| most(u, *tile)).fold(self.largest * FORGET, f64::max);
-        let slow = slow(PART * self.tolerance * largest);
+        let slow = slow(self.epsilon_of(largest));
         let (calm, moving): (Vec<usize>, Vec<usize>) = self.awake.iter().partition(|tile| most(d, **tile) <= slow);
         self.largest = largest;
         moving.into_iter().for_each(|tile| self.calm[tile] = 0);
