@@ -4,7 +4,11 @@
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
 
+#[path = "../tests/common/proxy.rs"]
+mod proxy;
 mod report;
+#[path = "../tests/common/server.rs"]
+mod server;
 
 use std::path::PathBuf;
 use std::process::Command;
@@ -116,6 +120,7 @@ fn main() {
     stiffness(&mut report);
     let panels = delays(&mut report, seeds);
     others(&mut report, seeds);
+    live(&mut report);
     random(&mut report);
     report.write(3, &panels);
 }
@@ -262,6 +267,38 @@ fn others(report: &mut Report, seeds: u64) {
         }
     }
     table(report, "deadband", &["tissue", "scheme", "δ"], runs);
+}
+
+/// The same hand and task in real time, over gRPC and a wire that delays: does virtual time tell the truth?
+fn live(report: &mut Report) {
+    report.heading("In real time: medium hand, omega3");
+    report.say(
+        "`palpate-client link --server URL` through a proxy that delays by half the round trip each way, beside the same \
+         seed in virtual time. In real time the ticks of the simulated device are late now and then, and so is the server.",
+    );
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let server = server::Server::start(&["--log", "warn"]);
+    let seconds = if quick() { 8 } else { 20 };
+    let (mut rows, mut figures) = (Vec::new(), Vec::new());
+    for scene in ["liver", "fibrotic"] {
+        for rtt_ms in [10_u32, 50, 100] {
+            let delay = std::time::Duration::from_micros(u64::from(rtt_ms) * 500);
+            let target = server.url.trim_start_matches("http://").to_owned();
+            let proxy = runtime.block_on(proxy::Proxy::start(target, delay));
+            let ways = [("real", format!("--server {}", proxy.url())), ("virtual", format!("--rtt-ms {rtt_ms}"))];
+            for (time, way) in ways {
+                let found = link(&words(&format!("--scene {scene} --seconds {seconds} --seed 1 {way}")));
+                let mut row = row(&cells([scene.to_owned(), rtt_ms.to_string(), time.to_owned()]), &[found.clone()]);
+                row.push(found["late_ticks"].as_u64().map_or("–".to_owned(), |ticks| ticks.to_string()));
+                rows.push(row);
+                figures.push(json!({"scene": scene, "rtt_ms": rtt_ms, "time": time, "found": found}));
+            }
+        }
+    }
+    let mut header = header(&["tissue", "round trip, ms", "time"]);
+    header.push("late ticks".to_owned());
+    report.table(&header, &rows);
+    report.figure("real time", Value::Array(figures));
 }
 
 fn random(report: &mut Report) {

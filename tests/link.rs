@@ -93,7 +93,7 @@ fn a_wrong_argument_is_refused_and_named() {
         ("--scene nowhere", "--scene"),
         ("--hand iron", "--hand"),
         ("--device hammer", "--device"),
-        ("--rtt-ms -1", "--rtt-ms"),
+        ("--rtt-ms=-1", "--rtt-ms"),
         ("--loss 2", "--loss"),
         ("--seconds nan", "--seconds"),
         ("--radius-m 0", "radius_m"),

@@ -79,7 +79,7 @@ async fn without_poses_the_tool_is_held_and_then_lets_go() {
         |sample: &pb::Sample| sample.tools.first().is_some_and(|tool| tool.force_on_tool_n.is_some_and(|f| f.z > 0.05));
     touch.sample_with(pressed).await;
     touch.sample_with(|sample| sample.tools[0].stale).await;
-    let free = |sample: &pb::Sample| sample.tools[0].stale && sample.tools[0].local_model.is_none();
+    let free = |sample: &pb::Sample| sample.tools[0].expired && sample.tools[0].local_model.is_none();
     touch.sample_with(free).await;
 }
 
@@ -130,4 +130,41 @@ async fn a_deadband_sends_heartbeats_and_little_else() {
     touch.command(pose(2, 20, 0.001)).await;
     let second = touch.sample_with(|sample| sample.step > first).await.step;
     assert!(second - first >= 40, "steps {first} and {second}: nothing happened between them");
+}
+
+#[tokio::test]
+async fn a_tissue_beyond_the_device_is_told_of() {
+    let server = Server::start(&[]);
+    let source = pb::create_session_request::Source::SceneName("fibrotic".into());
+    let request = pb::CreateSessionRequest { source: Some(source), ..Default::default() };
+    let session =
+        server.sessions().await.create_session(request).await.unwrap().into_inner().session.unwrap().session_id;
+    for (tool, device, warnings) in [(0, "touch", 1), (1, "lambda7", 0)] {
+        let device = wire::local::device(&Device::named(device).unwrap());
+        let opened = Touch::open(&server, pb::TouchOpen { device: Some(device), ..open(&session, &[tool]) }).await;
+        let told = opened.unwrap().opened.take().unwrap().warnings;
+        assert_eq!(told.len(), warnings, "{told:?}");
+    }
+}
+
+/// Whoever asks for it and however: no tool leaps.
+#[tokio::test]
+async fn a_pose_across_the_sheet_is_walked_to() {
+    let server = Server::start(&[]);
+    let session = liver(&server).await;
+    let mut touch = Touch::open(&server, open(&session, &[0])).await.unwrap();
+    touch.command(pose(1, 0, 0.001)).await;
+    let there = touch.sample_with(|sample| sample.tools[0].displacement_m.is_some()).await;
+    let mut far = pose(2, 0, -0.01);
+    if let Some(pb::command::Action::Pose(pose)) = &mut far.action {
+        pose.position_m = Some(pb::Vector3 { x: 0.005, y: 0.07, z: -0.01 });
+    }
+    touch.command(far).await;
+    let mut fastest_m_per_s = 0.0_f64;
+    while touch.sample_with(|_| true).await.step < there.step + 150 {
+        let sample = touch.sample_with(|sample| sample.step > there.step).await;
+        let velocity = sample.tools[0].velocity_m_per_s.unwrap();
+        fastest_m_per_s = fastest_m_per_s.max((velocity.x.powi(2) + velocity.y.powi(2) + velocity.z.powi(2)).sqrt());
+    }
+    assert!((0.4..=0.5 + 1e-9).contains(&fastest_m_per_s), "{fastest_m_per_s} m/s");
 }

@@ -1,5 +1,6 @@
 //! Haptic devices: what a client says of its own, so that nobody asks more of it.
 
+use super::law::{Law, Row};
 use crate::refusal::{Result, number};
 
 /// A device's descriptor.
@@ -64,6 +65,23 @@ impl Device {
     /// The largest force that it is asked for, N.
     pub fn most_n(&self) -> f64 {
         self.force_n.min(SAFE_FORCE_N)
+    }
+
+    /// What of a tissue is beyond what it renders without shaking, in words, up to the largest force that it is asked for.
+    /// It is rendered all the same: to make it softer would be another tissue. What shakes gives energy, and that the
+    /// envelope takes away.
+    pub fn misgivings(&self, law: &Law) -> Vec<String> {
+        let reached = law.rows.iter().position(|row| row.force_n >= self.most_n()).unwrap_or(law.rows.len() - 1);
+        let most = |of: fn(&Row) -> f64| law.rows[..=reached].iter().map(of).fold(0.0, f64::max);
+        let stiffness = ("stiffness", "N/m", most(|row| row.stiffness_n_per_m), self.stiffness_n_per_m);
+        let damping = ("damping", "N·s/m", most(|row| row.damping_n_s_per_m), self.damping_n_s_per_m);
+        let beyond = [stiffness, damping].into_iter().filter(|(_, _, tissue, device)| tissue > device);
+        let words = |(name, unit, tissue, device): (&str, &str, f64, f64)| {
+            format!(
+                "the tissue's {name} reaches {tissue:.0} {unit}, above the device's {device:.0} {unit}: it may shake"
+            )
+        };
+        beyond.map(words).collect()
     }
 
     /// Whether it makes sense.

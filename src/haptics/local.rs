@@ -95,6 +95,9 @@ impl Track {
     }
 }
 
+/// A client's usual tick, s.
+const TICK_S: f64 = 1e-3;
+
 /// The state of a touch along a tool's way.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Touching {
@@ -115,14 +118,17 @@ impl Touching {
             return touching;
         }
         touching.sliding = model.standing == Standing::Sliding;
-        let (_, row, pressure_n) = touching.pressure(model, law, model.place_m, model.velocity_m_per_s);
+        let (_, row, _) = touching.pressure(model, law, model.place_m, DVec3::ZERO);
         let across = |v: DVec3| v - v.dot(model.normal) * model.normal;
         let moved = across(model.velocity_m_per_s);
         let mut drawn_n = across(model.force_n);
         drawn_n += if touching.sliding { row.drag_n_s_per_m } else { row.across_n_s_per_m } * moved;
         if row.across_n_per_m > 0.0 {
-            touching.stretch_m =
-                within(-drawn_n / row.across_n_per_m, model.friction * pressure_n / row.across_n_per_m);
+            let most_m = model.friction * row.force_n / row.across_n_per_m;
+            touching.stretch_m = within(-drawn_n / row.across_n_per_m, most_m);
+            // By the rule of `move_to`, not by the sample: else the force would change with the first move.
+            let ahead_m = touching.stretch_m + moved * TICK_S;
+            touching.sliding = within(ahead_m, most_m) != ahead_m;
         }
         touching.rest_n = model.force_n - touching.force_n(model, law, model.velocity_m_per_s);
         touching

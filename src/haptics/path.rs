@@ -6,7 +6,8 @@
 //! newer was always at hand. With a constant delay that adds nothing.
 //!
 //! What is old is never replayed: of a backlog of more than [`BACKLOG_S`] only the newest place counts, and the tool goes
-//! there no faster than [`SPEED_M_PER_S`]. Nothing new for [`RELEASE_S`]: the tool lets go.
+//! there no faster than [`SPEED_M_PER_S`]. Nothing new for [`RELEASE_S`]: the tool lets go. A command that tells no time, or
+//! is stamped with its step, acts at once and is not waited after; but no tool ever leaps.
 
 use std::collections::VecDeque;
 
@@ -65,6 +66,12 @@ impl Path {
         self.waiting.push_back((time_s, place_m));
         self.arrived_s = now_s;
         true
+    }
+
+    /// Takes a command that is to act at once and for good, whatever the time: where the tool was at `time_s` of the client.
+    pub fn go_to(&mut self, time_s: f64, place_m: DVec3) {
+        self.waiting.clear();
+        (self.played, self.arrived_s) = (Some((time_s, place_m)), f64::INFINITY);
     }
 
     /// Steps in which the speed limit acted; commands that were refused or passed over; releases.

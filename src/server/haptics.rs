@@ -105,6 +105,7 @@ impl Haptics {
             lease_s,
             heartbeat_s: sampling.heartbeat_s,
             law: sampling.law.as_deref().map(wire::local::law),
+            warnings: device.zip(sampling.law.as_deref()).map_or(Vec::new(), |(device, law)| device.misgivings(law)),
             max_force_n: device.map_or(UNDECLARED_FORCE_N, |device| device.most_n()),
         };
         let samples = live.samples(sampling);

@@ -12,12 +12,17 @@ use crate::sheet::{Feel, Standing, Surroundings};
 /// Forces below need no validity, N.
 const LEAST_N: f64 = 0.05;
 
+/// For so long after it was met a tissue may be off the tool.
+const KNOCKED_SAMPLES: u32 = 5;
+
 /// Makes the local models of one tool.
 #[derive(Debug, Clone)]
 pub struct Modeller {
     law: Arc<Law>,
     /// Where the surface was, and its normal, when the tool last did not touch it.
     surface: Option<(DVec3, DVec3)>,
+    /// Samples in a row in which the tool was below it and did not touch.
+    knocked: u32,
     sequence: u64,
     /// The newest that was computed where the tool is.
     tangent: Arc<Mutex<Option<Tangent>>>,
@@ -41,7 +46,7 @@ impl Refinement {
 impl Modeller {
     /// For a tool on a tissue with this law.
     pub fn new(law: Arc<Law>) -> Self {
-        Modeller { law, surface: None, sequence: 0, tangent: Arc::default() }
+        Modeller { law, surface: None, knocked: 0, sequence: 0, tangent: Arc::default() }
     }
 
     /// The law that it goes by.
@@ -58,7 +63,10 @@ impl Modeller {
     pub fn model(&mut self, feel: &Feel, step: u64, client_time_s: f64) -> LocalModel {
         self.sequence += 1;
         let touches = matches!(feel.standing, Standing::Sticking | Standing::Sliding);
-        if !touches {
+        let below = self.surface.is_some_and(|(surface_m, normal)| (surface_m - feel.place_m).dot(normal) > 0.0);
+        // A tissue that is met starts away from the tool for a moment: where it is then is not where it will be met.
+        self.knocked = if below && feel.standing == Standing::Free { self.knocked + 1 } else { 0 };
+        if !touches && !(1..=KNOCKED_SAMPLES).contains(&self.knocked) {
             self.surface = Some((feel.surface_m, feel.normal));
         }
         let (mut surface_m, normal) = self.surface.unwrap_or((feel.surface_m, DVec3::Z));

@@ -44,7 +44,7 @@ pub struct ToolSample {
     pub stale: bool,
     /// The acknowledged command came too late for its step.
     pub late: bool,
-    /// What the tool did was ended by its time to live, or with its lease.
+    /// What the tool did was ended by its time to live, with its lease, or because no pose came.
     pub expired: bool,
 }
 
@@ -96,8 +96,7 @@ struct Tool {
 #[derive(Debug, Clone)]
 struct Led {
     tip: Tip,
-    /// Of commands that come with their client's time, and are played by it.
-    path: Option<Path>,
+    path: Path,
     /// The client's time of the place where it is, s.
     client_time_s: f64,
 }
@@ -196,13 +195,15 @@ impl Session {
         let end_s = self.time_s() + step_s;
         for (index, tool) in self.tools.iter_mut().enumerate() {
             let Some(led) = &mut tool.led else { continue };
-            let Some(path) = &mut led.path else { continue };
-            match path.step(end_s, step_s) {
+            match led.path.step(end_s, step_s) {
                 Some(Play::Lead(place_m, client_time_s)) => {
                     led.client_time_s = client_time_s;
                     self.tissue.lead(index, place_m, led.tip);
                 }
-                Some(Play::Release) => self.tissue.release(index),
+                Some(Play::Release) => {
+                    (tool.led, tool.expired) = (None, true);
+                    self.tissue.release(index);
+                }
                 None => {}
             }
         }
@@ -255,14 +256,13 @@ impl Session {
                 let now_s = self.time_s();
                 let tool = self.tool(index);
                 tool.control_point = Some(point);
-                let led = tool.led.get_or_insert(Led { tip, path: None, client_time_s });
+                let led = tool.led.get_or_insert(Led { tip, path: Path::default(), client_time_s });
                 led.tip = tip;
                 // What is stamped with its step is played there; what has only its client's time, by that.
                 if command.at_step.is_some() || command.client_time_ns == 0 {
-                    (led.path, led.client_time_s) = (None, client_time_s);
-                    self.tissue.lead(index, place_m, tip);
+                    led.path.go_to(client_time_s, place_m);
                 } else {
-                    led.path.get_or_insert_default().receive(client_time_s, place_m, now_s);
+                    led.path.receive(client_time_s, place_m, now_s);
                 }
             }
             Action::Release => {
@@ -330,11 +330,7 @@ impl Session {
                 feel,
                 place_time_s: tool.led.as_ref().map_or(0.0, |led| led.client_time_s),
                 local: None,
-                stale: tool
-                    .led
-                    .as_ref()
-                    .and_then(|led| led.path.as_ref())
-                    .is_some_and(|path| path.is_held(self.time_s())),
+                stale: tool.led.as_ref().is_some_and(|led| led.path.is_held(self.time_s())),
                 late: tool.late,
                 expired: tool.expired,
             }

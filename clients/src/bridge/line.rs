@@ -158,6 +158,7 @@ async fn connect(
                 let heard = heard.map_err(|_| "the server says nothing".to_owned())?.map_err(told)?;
                 match heard.ok_or("the server has ended the stream")?.message {
                     Some(Heard::Opened(opened)) => {
+                        opened.warnings.iter().for_each(|warning| eprintln!("palpate-client: warning: {warning}"));
                         let law = opened.law.as_ref().ok_or("the server sent no force law")?;
                         let law = wire::local::from_law(law).map_err(|refusal| refusal.to_string())?;
                         let mut inbound = shared.inbound();

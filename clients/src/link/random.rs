@@ -23,6 +23,9 @@ const TISSUES: [&str; 3] = ["fibrotic", "liver", "stomach"];
 /// Round trips of the random runs, s: each is a constant delay, or one of the four profiles.
 const ROUND_TRIPS_S: [f64; 6] = [0.0, 0.002, 0.01, 0.02, 0.05, 0.1];
 
+/// Runs between two words on how far it is.
+const TOLD_EVERY: usize = 50;
+
 /// Of one figure, the worst and whose it is.
 struct Worst {
     name: &'static str,
@@ -53,12 +56,13 @@ pub(super) fn print(arguments: &Arguments, runs: u64) -> Result<(), Failure> {
         } else {
             Weather { round_trip_s: *dice.one_of(&ROUND_TRIPS_S), jitter_s: 0.0, loss: 0.0 }
         };
+        let (hand, device) = (*dice.one_of(&HANDS), *dice.one_of(&DEVICES));
         Setup {
             model: model.clone(),
             law: law.clone(),
             tip,
-            hand: *dice.one_of(&HANDS),
-            device: *dice.one_of(&DEVICES),
+            hand,
+            device,
             weather,
             scheme: arguments.scheme,
             deadband: arguments.deadband,
@@ -81,6 +85,9 @@ pub(super) fn print(arguments: &Arguments, runs: u64) -> Result<(), Failure> {
                     let found = run(&setup);
                     if let Ok(mut results) = results.lock() {
                         results.push((setup.seed, setup, found));
+                        if results.len().is_multiple_of(TOLD_EVERY) {
+                            eprintln!("palpate-client: {} of {runs} runs", results.len());
+                        }
                     }
                 }
             });
