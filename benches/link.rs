@@ -288,7 +288,8 @@ fn live(report: &mut Report) {
             let ways = [("real", format!("--server {}", proxy.url())), ("virtual", format!("--rtt-ms {rtt_ms}"))];
             for (time, way) in ways {
                 let found = link(&words(&format!("--scene {scene} --seconds {seconds} --seed 1 {way}")));
-                let mut row = row(&cells([scene.to_owned(), rtt_ms.to_string(), time.to_owned()]), &[found.clone()]);
+                let mut row =
+                    row(&cells([scene.to_owned(), rtt_ms.to_string(), time.to_owned()]), std::slice::from_ref(&found));
                 row.push(found["late_ticks"].as_u64().map_or("–".to_owned(), |ticks| ticks.to_string()));
                 rows.push(row);
                 figures.push(json!({"scene": scene, "rtt_ms": rtt_ms, "time": time, "found": found}));

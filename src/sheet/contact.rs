@@ -27,12 +27,9 @@ use glam::{DVec2, DVec3};
 use super::Sheet;
 use super::field::{Layout, State};
 use super::footprint::{Footprint, Reached};
-use super::guard::Work;
 use super::model::{Model, Plan};
 use super::real::Real;
-use super::sweep::Bench;
 use super::tangent::{Patch, Tangent, Window};
-use super::tiles::Tiles;
 use crate::scene::tip::{Coupling, Tip};
 
 /// How a tool stands to the sheet.
@@ -158,41 +155,6 @@ impl Contacts {
         for tool in &mut self.tools {
             tool.velocity_m_per_s = (tool.to_m - tool.from_m) * rate_hz;
             tool.from_m = tool.to_m;
-        }
-    }
-
-    /// Lets the tools act on the sheet, at the end of a substep that ends at `fraction` of the step.
-    pub(super) fn act<T: Real>(
-        &mut self,
-        model: &Model,
-        plan: &Plan,
-        bench: &Bench<T>,
-        state: &mut State<T>,
-        tiles: &mut Tiles<T>,
-        work: &mut Work,
-        fraction: f64,
-    ) {
-        let layout = &bench.layout;
-        for tool in &mut self.tools {
-            let (before_n, met) = (tool.steady_n, tool.standing != Standing::Free);
-            if before_n != DVec3::ZERO {
-                tiles.wake_under(tool.points());
-                push(model, plan, layout, state, &tool.footprint, before_n, plan.scheme.constant());
-            }
-            tool.force_n = tool.meet(model, plan, layout, state, fraction);
-            tool.steady_n = if met { tool.force_n } else { DVec3::ZERO };
-            if tool.force_n == DVec3::ZERO {
-                if before_n != DVec3::ZERO {
-                    // It has let go: nothing acted in this substep.
-                    push(model, plan, layout, state, &tool.footprint, -before_n, plan.scheme.constant());
-                }
-                continue;
-            }
-            // What slept was at rest in this substep, as if it had been computed.
-            tiles.wake_under(tool.points());
-            push(model, plan, layout, state, &tool.footprint, tool.force_n - before_n, plan.scheme.kick());
-            work.add(tool.force_n.dot(movement_m(model, layout, state, &tool.footprint)));
-            tool.follow(model, layout, state, fraction);
         }
     }
 }
@@ -338,6 +300,33 @@ fn within_cone(force_n: DVec3, normal: DVec3, friction: f64) -> (bool, DVec3) {
 }
 
 impl<T: Real> Sheet<T> {
+    /// Lets tools that are led by their position act, at the end of a substep that ends at `fraction` of the step.
+    pub(super) fn meet(&mut self, fraction: f64) {
+        let Sheet { model, plan, bench, state, contacts, tiles, work, .. } = self;
+        let layout = &bench.layout;
+        for tool in &mut contacts.tools {
+            let (before_n, met) = (tool.steady_n, tool.standing != Standing::Free);
+            if before_n != DVec3::ZERO {
+                tiles.wake_under(tool.points());
+                push(model, plan, layout, state, &tool.footprint, before_n, plan.scheme.constant());
+            }
+            tool.force_n = tool.meet(model, plan, layout, state, fraction);
+            tool.steady_n = if met { tool.force_n } else { DVec3::ZERO };
+            if tool.force_n == DVec3::ZERO {
+                if before_n != DVec3::ZERO {
+                    // It has let go: nothing acted in this substep.
+                    push(model, plan, layout, state, &tool.footprint, -before_n, plan.scheme.constant());
+                }
+                continue;
+            }
+            // What slept was at rest in this substep, as if it had been computed.
+            tiles.wake_under(tool.points());
+            push(model, plan, layout, state, &tool.footprint, tool.force_n - before_n, plan.scheme.kick());
+            work.add(tool.force_n.dot(movement_m(model, layout, state, &tool.footprint)));
+            tool.follow(model, layout, state, fraction);
+        }
+    }
+
     /// What a tool that is led by its position does and feels.
     pub(super) fn feel(&self, number: usize) -> Option<Feel> {
         let model = &self.model;

@@ -305,8 +305,7 @@ impl<T: Real> Sheet<T> {
         let unit_j = self.unit_of_work_j();
         self.work.add(self.bench.take_work() * unit_j);
         self.hold(moment.step, end, true);
-        let Sheet { model, plan, bench, state, contacts, tiles, work, .. } = self;
-        contacts.act(model, plan, bench, state, tiles, work, end);
+        self.meet(end);
     }
 
     /// Of 1 in the fields of the tools' force along 1 in u.

@@ -58,7 +58,7 @@ fn growth_per_s(hand: &Hand, stiffness_n_per_m: f64, ticks: u32) -> f64 {
             halves[part as usize - 2] += energy_j;
         }
         // Decided long ago, and soon no number any more.
-        if !(held.place_m.length() < 1e6) {
+        if held.place_m.length() >= 1e6 || held.place_m.is_nan() {
             return f64::INFINITY;
         }
     }

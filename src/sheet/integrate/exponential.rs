@@ -136,8 +136,6 @@ impl Multistep {
         history[0] - self.extrapolation.iter().zip(&history[1..]).map(|(weight, past)| weight * past).sum::<f64>()
     }
 
-    /// What a constant force of 1 adds to the velocity in a substep.
-
     /// What a constant force of 1 adds to u and w in a substep.
     pub(super) fn constant(&self) -> [f64; 2] {
         self.moments[0]
