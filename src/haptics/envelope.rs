@@ -1,6 +1,7 @@
 //! The safety envelope: what stands between a wanted force and a device, and never lets go of it. In this order:
 //!
-//! 1. the model's age, by when the newest *arrived* (a constant delay is not staleness): up to [`FRESH_S`] nothing; up to
+//! 1. the model's age, by when the newest *arrived* (a constant delay is not staleness), and the time since the last tick,
+//!    if that is long: up to [`FRESH_S`] nothing; up to
 //!    [`STALE_S`] the force fades to a half; beyond, it decays with [`DECAY_S`]; from [`PAUSE_S`] on the state is PAUSED. News
 //!    that come before bring the force back within [`RETURN_S`];
 //! 2. soft engage: after `enable` nothing is rendered until less than [`ENGAGE_BELOW_N`] is wanted, then the force ramps
@@ -217,6 +218,11 @@ impl Envelope {
                 let given_j = -self.force_n.dot(wanted.place_m - place_m);
                 self.energy_j += given_j;
                 self.tank_j = (self.tank_j + given_j).min(TANK_J);
+                if wanted.now_s - then_s > PAUSE_S && self.state == State::Enabled {
+                    // Its own loop stood still: the hand is elsewhere, and does not expect a force.
+                    self.acted(Reason::Stale);
+                    self.state = State::Paused;
+                }
                 (wanted.now_s - then_s).clamp(0.0, 10.0 * NOMINAL_S)
             }
             None => NOMINAL_S,

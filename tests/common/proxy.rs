@@ -2,8 +2,8 @@
 #![allow(dead_code, unreachable_pub, clippy::unwrap_used, clippy::disallowed_methods)]
 
 use std::net::SocketAddr;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -12,6 +12,7 @@ use tokio::sync::mpsc;
 
 pub struct Proxy {
     address: SocketAddr,
+    target: Arc<Mutex<String>>,
     whole: Arc<AtomicBool>,
     connections: Arc<AtomicU64>,
 }
@@ -22,14 +23,16 @@ impl Proxy {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();
         let (whole, connections) = (Arc::new(AtomicBool::new(true)), Arc::new(AtomicU64::new(0)));
+        let target = Arc::new(Mutex::new(target));
         tokio::spawn({
-            let (whole, connections) = (whole.clone(), connections.clone());
+            let (target, whole, connections) = (target.clone(), whole.clone(), connections.clone());
             async move {
                 while let Ok((near, _)) = listener.accept().await {
                     if !whole.load(Ordering::Relaxed) {
                         continue;
                     }
-                    let Ok(far) = TcpStream::connect(&target).await else { continue };
+                    let target = target.lock().unwrap().clone();
+                    let Ok(far) = TcpStream::connect(target).await else { continue };
                     connections.fetch_add(1, Ordering::Relaxed);
                     near.set_nodelay(true).unwrap();
                     far.set_nodelay(true).unwrap();
@@ -39,11 +42,16 @@ impl Proxy {
                 }
             }
         });
-        Proxy { address, whole, connections }
+        Proxy { address, target, whole, connections }
     }
 
     pub fn url(&self) -> String {
         format!("http://{}", self.address)
+    }
+
+    /// From now on connections go to another target.
+    pub fn aim(&self, target: String) {
+        *self.target.lock().unwrap() = target;
     }
 
     /// Cuts it: connections break, none are made.

@@ -47,22 +47,41 @@ pub(crate) struct Arguments {
     /// Of what the simulated hand does
     #[arg(long, default_value_t = 1)]
     seed: u64,
+    /// Write time, place, force and state of each tick to this file, as CSV; at most an hour of them
+    #[arg(long, value_name = "FILE")]
+    course: Option<std::path::PathBuf>,
 }
 
 /// A tick of the device, s.
 pub(crate) const TICK_S: f64 = 1e-3;
 
-/// What a device's loop remembers of each tick: place and rendered force.
-pub(crate) type Course = Vec<(DVec3, DVec3)>;
+/// A device so late has been held up, and what it missed is left out: a burst of ticks would be a backlog.
+const HELD_UP: Duration = Duration::from_millis(5);
+
+/// Ticks that are remembered at most.
+const MOST_REMEMBERED: usize = 3_600_000;
+
+/// What a device's loop remembers of a tick.
+pub(crate) struct Tick {
+    /// Since the loop began.
+    pub(crate) time_s: f64,
+    pub(crate) place_m: DVec3,
+    /// Rendered.
+    pub(crate) force_n: DVec3,
+    /// None before there was a server.
+    pub(crate) state: Option<State>,
+}
 
 /// What a device's loop has done.
 pub(crate) struct Served {
     /// Only as long as it was asked to remember.
-    pub(crate) course: Course,
+    pub(crate) course: Vec<Tick>,
     /// Of the last renderer.
     pub(crate) envelope: Option<Envelope>,
     /// Ticks that began more than a tick late.
     pub(crate) late_ticks: u64,
+    /// Ticks that were left out.
+    pub(crate) missed_ticks: u64,
     pub(crate) ages_s: Vec<f64>,
 }
 
@@ -76,16 +95,23 @@ pub(crate) fn serve(
 ) -> std::io::Result<Served> {
     let descriptor = device.descriptor();
     let mut renderer: Option<Renderer> = None;
-    let mut served = Served { course: Vec::new(), envelope: None, late_ticks: 0, ages_s: Vec::new() };
+    let mut served = Served { course: Vec::new(), envelope: None, late_ticks: 0, missed_ticks: 0, ages_s: Vec::new() };
     let (start, mut asked) = (Instant::now(), false);
     // A clock that does not begin at 0: 0 means no time.
     let clock_s = |at: Instant| 1.0 + at.duration_since(start).as_secs_f64();
-    let mut tick = 0_u32;
+    let (mut tick, mut due) = (0_u32, start);
     while ticks.is_none_or(|ticks| tick < ticks) && !commands.is_closed() {
-        let due = start + Duration::from_secs_f64(f64::from(tick) * TICK_S);
         wait_until(due);
         let now = Instant::now();
-        served.late_ticks += u64::from(now.duration_since(due).as_secs_f64() > TICK_S);
+        let late = now.duration_since(due);
+        served.late_ticks += u64::from(late.as_secs_f64() > TICK_S);
+        if late > HELD_UP {
+            #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+            let missed = (late.as_secs_f64() / TICK_S) as u64;
+            served.missed_ticks += missed;
+            due = now;
+        }
+        due += Duration::from_secs_f64(TICK_S);
         let reading = device.read()?;
         let now_s = clock_s(now);
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
@@ -117,8 +143,9 @@ pub(crate) fn serve(
         }
         asked = reading.enable;
         device.write(force_n)?;
-        if remember {
-            served.course.push((reading.place_m, force_n));
+        if remember && served.course.len() < MOST_REMEMBERED {
+            let state = renderer.as_ref().map(Renderer::state);
+            served.course.push(Tick { time_s: now_s - 1.0, place_m: reading.place_m, force_n, state });
         }
         // A network that does not keep up gets the next one.
         let _ = commands.try_send((now_ns, reading.place_m));
@@ -154,6 +181,7 @@ pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
     let target = Target {
         server: arguments.server.clone(),
         session: arguments.session.clone(),
+        made: None,
         scene: arguments.scene.clone(),
         tool: arguments.tool,
         tip: Tip::default(),
@@ -161,11 +189,14 @@ pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
     };
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     let ticks = arguments.seconds.map(|seconds| (seconds / TICK_S) as u32);
-    let (served, shared) = run(&mut simulated, target, ticks, false).await?;
+    let (served, shared) = run(&mut simulated, target, ticks, arguments.course.is_some()).await?;
+    if let Some(path) = &arguments.course {
+        write_course(path, &served.course)?;
+    }
     let inbound = shared.inbound();
     let mut told = json!({
         "connections": inbound.connections, "samples": inbound.samples, "commands_refused": inbound.refused,
-        "late_ticks": served.late_ticks,
+        "late_ticks": served.late_ticks, "missed_ticks": served.missed_ticks,
     });
     if let Some(envelope) = &served.envelope {
         told["energy_j"] = json!(envelope.energy_j());
@@ -175,6 +206,16 @@ pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
     }
     println!("{told}");
     Ok(())
+}
+
+fn write_course(path: &std::path::Path, course: &[Tick]) -> Result<(), Failure> {
+    let mut text = "time_s,x_m,y_m,z_m,force_x_n,force_y_n,force_z_n,state\n".to_owned();
+    for Tick { time_s, place_m, force_n, state } in course {
+        let state = state.map_or("none".to_owned(), |state| format!("{state:?}").to_lowercase());
+        let [place, force] = [place_m, force_n].map(|v| format!("{:.7},{:.7},{:.7}", v.x, v.y, v.z));
+        text += &format!("{time_s:.9},{place},{force},{state}\n");
+    }
+    std::fs::write(path, text).map_err(|error| Failure::Failed(format!("{}: {error}", path.display())))
 }
 
 /// A device's loop on a thread of its own, and the network beside it; until the ticks are done, or Ctrl-C.

@@ -9,9 +9,9 @@ use super::run::{Account, Found, Setup, TICK_S};
 use super::task::{self, Task};
 use super::tissue::{Tissue, Twin};
 use crate::Failure;
-use crate::bridge;
 use crate::bridge::device::Simulated;
 use crate::bridge::line::Target;
+use crate::bridge::{self, Tick};
 
 /// Before the first press, s: the server computes its force law first.
 const LEAD_S: f64 = 3.0;
@@ -26,6 +26,7 @@ pub(super) async fn run(setup: &Setup, server: &str) -> Result<Found, Failure> {
     let target = Target {
         server: server.to_owned(),
         session: None,
+        made: None,
         scene: model.scene.name.clone(),
         tool: 0,
         tip: *tip,
@@ -36,14 +37,14 @@ pub(super) async fn run(setup: &Setup, server: &str) -> Result<Found, Failure> {
     let (mut served, shared) = bridge::run(&mut simulated, target, Some(ticks), true).await?;
     let mut twin = Twin::new(Tissue::new(model, *tip, law.clone()));
     let mut account = Account::default();
-    for (tick, (place_m, force_n)) in served.course.iter().enumerate() {
+    for (tick, Tick { place_m, force_n, .. }) in served.course.iter().enumerate() {
         let (true_n, touches) = twin.truth(*place_m).map_err(Failure::Failed)?;
         account.moved(*place_m);
         #[allow(clippy::cast_precision_loss)]
         account.rendered(tick as f64 * TICK_S, *force_n, true_n, touches, None);
     }
     // The last force was let go.
-    account.moved(served.course.last().map_or(DVec3::ZERO, |last| last.0));
+    account.moved(served.course.last().map_or(DVec3::ZERO, |last| last.place_m));
     account.ages_s.append(&mut served.ages_s);
     let mut found = account.close();
     let inbound = shared.inbound();
