@@ -198,7 +198,7 @@ async fn forces_stay_within_the_envelope_whatever_breaks() {
         match (before.state.as_str(), now.state.as_str()) {
             ("enabled", "paused") => pauses.push(now.time_s),
             ("paused", "paused") => {
-                assert!(length(now.force_n) <= length(before.force_n) + 1e-6, "at {} s", now.time_s)
+                assert!(length(now.force_n) <= length(before.force_n) + 1e-6, "at {} s", now.time_s);
             }
             _ => {}
         }
