@@ -8,7 +8,7 @@ SCRIPT ?= scripts/vertical-60.toml
 
 VENV := target/venv
 
-.PHONY: help run build test stress lint picture bench-roundtrip bench-duty bench-frames bench-error bench-kernel \
+.PHONY: help run build test stress lint picture figures bench-roundtrip bench-duty bench-frames bench-error bench-kernel \
 	bench-stability bench-skip bench-rest bench-link need-rust need-python
 
 help:
@@ -17,6 +17,7 @@ help:
 	@echo 'make stress          ten thousand random scenes, ten million steps (some minutes)'
 	@echo 'make lint            formatting, compiler and clippy warnings'
 	@echo 'make picture         the picture of the README'
+	@echo 'make figures         the paper'"'"'s figures and experiments: docs/figures, shown in docs/paper.md'
 	@echo 'make bench-roundtrip the haptic round trip beside a bare gRPC echo'
 	@echo 'make bench-duty      a minute of 1 kHz touch and 60 frames a second: time kept, commands lost'
 	@echo 'make bench-rest      a thousand sessions at rest: their share of a core, and the memory of each'
@@ -64,6 +65,10 @@ lint: need-rust
 
 picture: build
 	$(PYTHON) docs/poke.py
+
+# The same bytes on every run.
+figures: need-rust
+	$(CARGO) run --release --quiet --example figures
 
 bench-roundtrip: build
 	@echo "Machine: $$(sed -n 's/^model name.*: //p' /proc/cpuinfo 2>/dev/null | sort | uniq -c)"

@@ -10,6 +10,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let out = PathBuf::from(std::env::var("OUT_DIR")?);
     std::fs::write(out.join("palpate.bin"), prost::Message::encode_to_vec(&descriptors))?;
     // Frames are shared between viewers, not copied for each.
-    tonic_prost_build::configure().bytes(".palpate.v1.Patch.displacement").compile_fds(descriptors)?;
+    let shared = [".palpate.v1.Patch.displacement", ".palpate.v1.GetTextureResponse.png"];
+    shared.iter().fold(tonic_prost_build::configure(), |build, path| build.bytes(path)).compile_fds(descriptors)?;
     Ok(())
 }

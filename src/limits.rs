@@ -41,6 +41,8 @@ pub struct Limits {
     pub session_rate_hz: f64,
     /// Vertices of a refined frame.
     pub frame_vertices: usize,
+    /// Pixels along a side of a texture.
+    pub texture_side: u32,
     /// Points of a probe that is not of all points.
     pub probe_points: usize,
     /// Longest lease of a tool, s.
@@ -67,6 +69,7 @@ impl Default for Limits {
             streams_per_session: 256,
             session_rate_hz: 20_000.0,
             frame_vertices: 1 << 22,
+            texture_side: 4096,
             probe_points: 1 << 16,
             lease_s: 600.0,
         }

@@ -9,10 +9,13 @@ use clap::{Parser, Subcommand};
 use palpate::limits::Limits;
 use palpate::pace::clock::now_ns;
 use palpate::refusal::Refusal;
+use palpate::render::{self, Film, View};
 use palpate::scene::{Scene, script::Script};
 use palpate::server::{self, catalog::Catalog, config::Config};
 use palpate::session::{check, run};
 use palpate::sheet::Model;
+use palpate::surface::Refinement;
+use palpate::texture;
 use tokio_util::sync::CancellationToken;
 
 /// A server for touching soft tissue over a network.
@@ -37,6 +40,22 @@ enum Command {
         palpate check my-scene.toml --set stepping.tolerance=1e-8\n\n\
         Exit status: 0; 2 when the scene was refused.")]
     Check(SceneArguments),
+    /// Draw a tissue that a script acts on, without a screen: a PNG image of one moment, or all of it as a GIF
+    #[command(after_help = "Examples:\n  \
+        palpate render paper oblique-100 --output poke.png\n  \
+        palpate render paper vertical-60 --output mesh.png --wireframe --refine 1 --at-s 0.3 --camera 0,25\n  \
+        palpate render liver my-script.toml --output poke.gif --size 480x360 --frames-hz 20\n\n\
+        The texture is the scene's own ([appearance]). A force shows as an arrow at its control point.\n\
+        Exit status: 0; 1 when the run failed or the file can't be written; 2 when an input was refused.")]
+    Render(RenderArguments),
+    /// Make an image for a tissue's surface: the lining of a stomach as an endoscope shows it
+    #[command(after_help = "Examples:\n  \
+        palpate texture --output mucosa.png\n  \
+        palpate texture --seed 7 --size 4096 --output mucosa.png\n\n\
+        The same seed and size give the same bytes, and another size the same tissue at another sharpness. A scene has one\n\
+        by texture_seed and texture_size in its section [appearance], or an image of its own by texture = \"FILE.png\".\n\
+        Exit status: 0; 1 when the file can't be written; 2 when an input was refused.")]
+    Texture(TextureArguments),
     /// Serve tissue over gRPC: sessions stepped in real time, commands in, forces and frames out
     #[command(after_help = "Examples:\n  \
         palpate serve\n  \
@@ -100,6 +119,48 @@ struct RunArguments {
     held: bool,
 }
 
+#[derive(clap::Args)]
+struct RenderArguments {
+    #[command(flatten)]
+    scene: SceneArguments,
+    /// A script file, or the name of one in ./scripts
+    script: PathBuf,
+    /// Where to write it: a .png of one moment, or a .gif of the whole script
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    /// The moment, s; a step's [default: the sample time at which the tissue is displaced most]
+    #[arg(long, value_name = "SECONDS")]
+    at_s: Option<f64>,
+    /// Show the mesh instead of the texture
+    #[arg(long)]
+    wireframe: bool,
+    /// Vertices between neighbouring points, 0 to 10 [default: what makes 300 along a side; 0 for a mesh]
+    #[arg(long, value_name = "N")]
+    refine: Option<u32>,
+    /// From where: turned about the tissue's normal and above it, in degrees, and how far, in sides of the sheet
+    #[arg(long, value_name = "AZIMUTH,ELEVATION[,DISTANCE]", default_value = "25,32,2", allow_hyphen_values = true)]
+    camera: String,
+    /// Pixels
+    #[arg(long, value_name = "WIDTHxHEIGHT", default_value = "800x600")]
+    size: String,
+    /// Pictures a second of a GIF
+    #[arg(long, value_name = "HZ", default_value_t = 20.0)]
+    frames_hz: f64,
+}
+
+#[derive(clap::Args)]
+struct TextureArguments {
+    /// Which: any whole number
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    seed: u64,
+    /// Pixels along each side
+    #[arg(long, value_name = "PIXELS", default_value_t = 1024)]
+    size: u32,
+    /// Where to write it, as a PNG image
+    #[arg(short, long, value_name = "FILE.png")]
+    output: PathBuf,
+}
+
 /// How a program ends that does not end well.
 enum Failure {
     /// Exit status 1.
@@ -118,6 +179,8 @@ fn main() -> ExitCode {
     let ended = match Arguments::parse().command {
         Command::Run(arguments) => run_script(&arguments),
         Command::Check(arguments) => check(&arguments),
+        Command::Render(arguments) => render(&arguments),
+        Command::Texture(arguments) => make_texture(&arguments),
         Command::Serve(arguments) => serve(&arguments),
     };
     let (status, message) = match ended {
@@ -246,6 +309,88 @@ fn check(arguments: &SceneArguments) -> Result<(), Failure> {
     }
 }
 
+/// Does something that tells the steps it has done, and shows them.
+fn with_progress<T>(steps: u64, work: impl FnOnce(&mut dyn FnMut(u64)) -> T) -> T {
+    let (begun_s, watched) = (clock_s(), std::io::stderr().is_terminal());
+    let done = work(&mut |step| {
+        // Only where somebody looks, and has waited.
+        if watched && clock_s() - begun_s > 1.0 {
+            eprint!("\rstep {step} of {steps} ");
+        }
+    });
+    if watched && clock_s() - begun_s > 1.0 {
+        eprintln!();
+    }
+    done
+}
+
+fn write_file(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
+    std::fs::write(path, bytes).map_err(|e| Failure::Failed(format!("{}: can't be written: {e}", path.display())))
+}
+
+fn make_texture(arguments: &TextureArguments) -> Result<(), Failure> {
+    let image = texture::mucosa(arguments.seed, arguments.size, &Limits::default())?;
+    write_file(&arguments.output, &image.png()?)
+}
+
+fn render(arguments: &RenderArguments) -> Result<(), Failure> {
+    let refused = |option: &str, message: String| Failure::Refused(format!("--{option}: {message}"));
+    let extension = arguments.output.extension().and_then(|extension| extension.to_str()).map(str::to_lowercase);
+    let moves = match extension.as_deref() {
+        Some("png") => false,
+        Some("gif") => true,
+        _ => return Err(refused("output", format!("{}: must end in .png or .gif", arguments.output.display()))),
+    };
+    let most = render::LARGEST_SIDE;
+    let size = arguments.size.split_once('x').and_then(|(x, y)| Some([x.parse().ok()?, y.parse().ok()?]));
+    let size = size.filter(|size| size.iter().all(|side| (16..=most).contains(side))).ok_or_else(|| {
+        refused("size", format!("must be WIDTHxHEIGHT, each from 16 to {most} pixels, but is `{}`", arguments.size))
+    })?;
+    if !(1.0..=50.0).contains(&arguments.frames_hz) {
+        return Err(refused("frames-hz", format!("must be from 1 to 50, but is {}", arguments.frames_hz)));
+    }
+    let (model, limits) = compile(&arguments.scene)?;
+    let script = Script::load(&arguments.script, &model.scene, &limits)?;
+    for warning in model.warnings.iter().chain(&script.warnings) {
+        eprintln!("palpate: warning: {warning}");
+    }
+    let rate_hz = model.scene.stepping.rate_hz;
+    let at_step = arguments.at_s.map(|at_s| {
+        let step = (at_s * rate_hz).round();
+        let holds = step >= 0.0 && step <= script.steps as f64;
+        let lasts_s = script.steps as f64 / rate_hz;
+        let message = format!("must be from 0 to {lasts_s}, the script's duration, but is {at_s}");
+        if holds { Ok(step as u64) } else { Err(refused("at-s", message)) }
+    });
+    let at_step = at_step.transpose()?;
+    if moves && at_step.is_some() {
+        return Err(refused("at-s", "is for a .png: a .gif shows the whole script".to_owned()));
+    }
+    let camera = arguments.camera.parse()?;
+    let cells = (model.points[0].max(model.points[1]) - 1).max(1) as u32;
+    let fine = if arguments.wireframe { 0 } else { 300_u32.div_ceil(cells).clamp(1, 11) - 1 };
+    let refinement = Refinement::new(model.points, arguments.refine.unwrap_or(fine), &limits)?;
+    let skin = if arguments.wireframe { None } else { Some(texture::image(&model.scene.appearance, &limits)?) };
+    let view = View { camera, size, refinement, texture: skin };
+    let failed = |failure: render::Failure| match failure {
+        render::Failure::Refused(refusal) => Failure::from(refusal),
+        failure => Failure::Failed(failure.to_string()),
+    };
+    if moves {
+        let mut file = Vec::new();
+        with_progress(script.steps, |progress| {
+            render::gif(&model, &script, &view, &limits, arguments.frames_hz, &mut file, progress).map_err(failed)
+        })?;
+        return write_file(&arguments.output, &file);
+    }
+    let mut film = Film::new(&model, &script, &limits).map_err(failed)?;
+    let still = match at_step {
+        Some(step) => film.at(step),
+        None => film.deepest(),
+    };
+    write_file(&arguments.output, &still.map_err(failed)?.picture(&model, &view).png()?)
+}
+
 fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     let (model, limits) = compile(&arguments.scene)?;
     let script = Script::load(&arguments.script, &model.scene, &limits)?;
@@ -260,21 +405,14 @@ fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
         None => Box::new(std::io::stdout().lock()),
     };
     let mut output = BufWriter::new(output);
-    let (begun_s, watched) = (clock_s(), std::io::stderr().is_terminal());
-    let mut progress = |step: u64| {
-        // Only where somebody looks, and has waited.
-        if watched && clock_s() - begun_s > 1.0 {
-            eprint!("\rstep {step} of {} ", script.steps);
-        }
-    };
-    let ended = run::run(&model, &script, arguments.held, &limits, &mut output, &clock_s, &mut progress);
-    if watched && clock_s() - begun_s > 1.0 {
-        eprintln!();
-    }
+    let ended = with_progress(script.steps, |progress| {
+        run::run(&model, &script, arguments.held, &limits, &mut output, &clock_s, progress)
+    });
     let ended = ended.and_then(|_| output.flush().map_err(run::Failure::Output));
     match ended {
         // Who reads has seen enough.
         Err(run::Failure::Output(e)) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
-        ended => ended.map_err(|failure| Failure::Failed(failure.to_string())),
+        Err(run::Failure::Refused(refusal)) => Err(refusal.into()),
+        ended => ended.map(drop).map_err(|failure| Failure::Failed(failure.to_string())),
     }
 }

@@ -157,6 +157,13 @@ profile = { type = "trace", file = "trace.csv" }
 [[tool]]
 point = [7, 7]
 moves = [{ from_s = 0.0, to_s = 0.2, by_m = [0.0, 0.0, -0.02] }, { from_s = 0.3, to_s = 0.5, by_m = [0.01, 0.0, 0.02] }]
+[[tissue]]
+at_s = 0.123
+stiffness_n_per_m = 55.0
+[[tissue]]
+at_s = 0.2
+damping_n_s_per_m = 0.6
+virtual_stiffness_n_per_m = 11.0
 "#;
 
 const STIFF: &str = r#"
@@ -196,7 +203,7 @@ fn every_kind_of_force_and_tool_comes_through_exactly() {
     assert_eq!(through.last().unwrap()["summary"]["final_hash"], offline.last().unwrap()["summary"]["final_hash"]);
 }
 
-/// Half a second of nothing, a short push, and another push later.
+/// Half a second of nothing but another tissue, a short push, in which it changes again, and another push later.
 const PAUSES: &str = r#"
 name = "pauses"
 duration_s = 1.2
@@ -214,6 +221,13 @@ force_n = [0.1, 0.0, -0.5]
 falloff_per_m = 150.0
 falloff_offset = 0.0
 profile = { type = "pulse", on_s = 1.1, off_s = 1.15 }
+[[tissue]]
+at_s = 0.3
+virtual_stiffness_n_per_m = 7.0
+[[tissue]]
+at_s = 0.55
+stiffness_n_per_m = 30.0
+damping_n_s_per_m = 0.4
 "#;
 
 #[test]

@@ -220,6 +220,24 @@ fn a_bad_script_is_refused_with_file_line_and_key() {
             "tool[0].moves",
         ),
         ("sample_every_s = 0.05", "sample_every_s = 0.05\nsample_points = [[0, 7]]", "script.toml:4: sample_points[0]"),
+        (profile, &format!("{profile}\n[[tissue]]\nat_s = 0.05"), "tissue[0]: names nothing to change"),
+        (
+            profile,
+            &format!("{profile}\n[[tissue]]\nat_s = 0.05\nstiffness_n_per_m = -1.0"),
+            "tissue[0]: springs.stiffness_n_per_m: must be 0 or more",
+        ),
+        (
+            profile,
+            &format!(
+                "{profile}\n[[tissue]]\nat_s = 0.05\ndamping_n_s_per_m = 1.0\n[[tissue]]\nat_s = 0.05\ndamping_n_s_per_m = 2.0"
+            ),
+            "tissue[1].at_s: must be later",
+        ),
+        (
+            profile,
+            &format!("{profile}\n[[tissue]]\nat_s = 0.05\nstiffness_n_per_m = 1e11"),
+            "stepping.substeps: would need",
+        ),
     ] {
         assert!(SCRIPT.contains(from));
         refused(&run(SCENE, &SCRIPT.replacen(from, to, 1), &[]), &[expected]);

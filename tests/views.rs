@@ -123,6 +123,32 @@ async fn every_refinement_and_encoding_shows_the_same_tissue() {
 }
 
 #[tokio::test]
+async fn a_texture_is_sent_once() {
+    let server = Server::start(&[]);
+    let session_id = server.paper(true).await;
+    let mut views = server.views().await;
+    let mut sent = async |session_id: &str, known_etag: &str| {
+        let request = pb::GetTextureRequest { session_id: session_id.into(), known_etag: known_etag.into() };
+        let mut parts = views.get_texture(request).await?.into_inner();
+        let mut png = Vec::new();
+        while let Some(part) = parts.message().await? {
+            png.extend_from_slice(&part.png);
+            if part.last {
+                return Ok((png, part.etag));
+            }
+        }
+        panic!("the image has no end");
+    };
+    let (png, etag) = sent(&session_id, "").await.unwrap();
+    let limits = palpate::limits::Limits::default();
+    let standard = palpate::texture::texture(&palpate::scene::Appearance::default(), &limits).unwrap();
+    assert!(png == standard.png && etag == standard.etag);
+    assert_eq!(sent(&session_id, &etag).await.unwrap(), (Vec::new(), etag));
+    let nobody: tonic::Status = sent("paper", "").await.unwrap_err();
+    assert_eq!(told(&nobody).1, "UNKNOWN_SESSION");
+}
+
+#[tokio::test]
 async fn the_mesh_and_a_frame_fit_together() {
     let server = Server::start(&[]);
     let session = server.paper(true).await;

@@ -1,4 +1,4 @@
-//! Charts as SVG: lines over two logarithmic axes, and maps of coloured cells.
+//! Charts as SVG: lines over two logarithmic or two plain axes, and maps of coloured cells.
 
 use plotters::coord::Shift;
 use plotters::prelude::*;
@@ -14,6 +14,19 @@ pub enum Panel {
         /// Left of the chart.
         y: &'static str,
         /// The lines.
+        series: Vec<Series>,
+    },
+    /// Lines over plain axes.
+    Curves {
+        /// Above the chart.
+        title: String,
+        /// Below the chart.
+        x: &'static str,
+        /// Left of the chart.
+        y: &'static str,
+        /// What is shown along y.
+        up: std::ops::Range<f64>,
+        /// The lines; they may leave the chart.
         series: Vec<Series>,
     },
     /// Cells, the first row at the bottom.
@@ -89,7 +102,7 @@ pub fn svg(columns: usize, panels: &[Panel]) -> String {
     let width = PANEL.0 * columns as u32;
     let mut legend: Vec<&Series> = Vec::new();
     for panel in panels {
-        let Panel::Lines { series, .. } = panel else { continue };
+        let (Panel::Lines { series, .. } | Panel::Curves { series, .. }) = panel else { continue };
         for line in series {
             if !legend.iter().any(|other| other.name == line.name) {
                 legend.push(line);
@@ -112,6 +125,7 @@ pub fn svg(columns: usize, panels: &[Panel]) -> String {
         for (area, panel) in rest.split_evenly((rows, columns)).iter().zip(panels) {
             match panel {
                 Panel::Lines { title, x, y, series } => draw_lines(area, title, x, y, series),
+                Panel::Curves { title, x, y, up, series } => draw_curves(area, title, x, y, up, series),
                 Panel::Cells { title, x, y, rows } => draw_cells(area, title, x, y, rows),
             }
         }
@@ -175,6 +189,31 @@ fn draw_lines(area: &Area<'_>, title: &str, x: &str, y: &str, series: &[Series])
                 chart.draw_series(std::iter::once(marker)).unwrap();
             });
         }
+    }
+}
+
+fn draw_curves(area: &Area<'_>, title: &str, x: &str, y: &str, up: &std::ops::Range<f64>, series: &[Series]) {
+    let across = series.iter().flat_map(|line| &line.points).map(|point| point.0).fold(0.0, f64::max);
+    let mut chart = ChartBuilder::on(area)
+        .caption(title, ("sans-serif", 15))
+        .margin(10)
+        .x_label_area_size(36)
+        .y_label_area_size(56)
+        .build_cartesian_2d(0.0..across, up.clone())
+        .unwrap();
+    chart
+        .configure_mesh()
+        .x_desc(x)
+        .y_desc(y)
+        .x_label_formatter(&|value| format!("{value:.1}"))
+        .y_label_formatter(&|value| format!("{value:.0}"))
+        .bold_line_style(BLACK.mix(0.12))
+        .light_line_style(BLACK.mix(0.04))
+        .draw()
+        .unwrap();
+    for line in series {
+        let shown = line.points.iter().map(|(x, y)| (*x, y.clamp(up.start, up.end)));
+        chart.draw_series(LineSeries::new(shown, line.style())).unwrap();
     }
 }
 

@@ -371,6 +371,10 @@ async fn play(
     };
     write_line(&mut output, &Line::Run(&run)).map_err(written)?;
 
+    for (step, change) in &script.changes {
+        let update = wire::scene::update_tissue(session_id, change, *step);
+        sessions.update_tissue(update).await.map_err(refused_or_failed)?;
+    }
     let mut haptics = HapticServiceClient::new(channel);
     let probe = pb::ProbeRequest {
         session_id: session_id.clone(),

@@ -17,8 +17,8 @@ use tokio::sync::oneshot;
 use crate::haptics::Law;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, number};
-use crate::scene::Scene;
 use crate::scene::record::{Point, Record};
+use crate::scene::{Change, Scene};
 use crate::session::Sample;
 use crate::session::command::Intake;
 use crate::session::local::Refinement;
@@ -65,7 +65,7 @@ pub enum State {
 }
 
 /// How a session stands.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 pub struct Status {
     /// Whether time goes on.
     pub state: State,
@@ -87,6 +87,8 @@ pub struct Status {
     pub hold_reason: Option<String>,
     /// How often the guard went back to a checkpoint.
     pub guard_events: u64,
+    /// The tissue as it is: [`Live::change`] may have made another of it.
+    pub model: Arc<Model>,
 }
 
 /// Over which time dilation is measured.
@@ -120,7 +122,8 @@ impl Dilation {
 pub struct Live {
     /// Random, not to be guessed.
     pub id: String,
-    /// What of the tissue never changes.
+    /// The tissue as the session began with it. Points and rate stay; coefficients, scheme and substeps may be others by
+    /// now ([`Status::model`]).
     pub model: Arc<Model>,
     intake: Mutex<Intake>,
     /// Deleted when so long nobody asked for it, held a tool or had a stream, s.
@@ -130,9 +133,12 @@ pub struct Live {
     limits: Limits,
     status: Mutex<Status>,
     streams: Mutex<usize>,
-    laws: Mutex<Vec<(f64, Arc<Law>)>>,
+    laws: Mutex<Vec<KeptLaw>>,
     inbox: Arc<Inbox>,
 }
+
+/// The law of a tissue under a tip of a radius, m.
+type KeptLaw = (f64, Arc<Model>, Arc<Law>);
 
 /// Counts a stream of a session until it is dropped.
 pub struct StreamGuard(Arc<Live>);
@@ -203,6 +209,20 @@ impl Live {
         self.ask(|reply| Request::Start { until, reply }).await
     }
 
+    /// Changes the tissue from the beginning of step `at_step` on, or of the next. Tells the step, and the tissue from then
+    /// on. It is compiled here, by who asks, some milliseconds: no step waits for that.
+    pub fn change(&self, change: &Change, at_step: Option<u64>) -> Result<(u64, Arc<Model>)> {
+        loop {
+            let base = self.at_intake(|intake, _| intake.changed_to());
+            let model = base.as_ref().unwrap_or(&self.model).changed(change, &self.model.scene, &self.limits)?;
+            check_work(&model, &self.limits)?;
+            // Somebody may have been quicker; then it is made out of theirs.
+            if let Some(step) = self.at_intake(|intake, now| intake.change(base.as_ref(), &model, at_step, now))? {
+                return Ok((step, model));
+            }
+        }
+    }
+
     /// Stops time.
     pub async fn pause(&self) -> Result<()> {
         self.ask(|reply| Request::Pause { reply }).await
@@ -243,15 +263,16 @@ impl Live {
     /// The force law under a tip of `radius_m`. Computed once a radius, by who asks first: tenths of a second, and who asks
     /// for the same meanwhile waits.
     pub fn law(&self, radius_m: f64) -> Arc<Law> {
+        let model = lock(&self.status).model.clone();
         let mut laws = lock(&self.laws);
-        if let Some((_, law)) = laws.iter().find(|law| law.0 == radius_m) {
+        if let Some((.., law)) = laws.iter().find(|law| law.0 == radius_m && Arc::ptr_eq(&law.1, &model)) {
             return law.clone();
         }
-        let law = Arc::new(Law::of(&self.model, radius_m));
+        let law = Arc::new(Law::of(&model, radius_m));
         if laws.len() == MOST_LAWS {
             laws.remove(0);
         }
-        laws.push((radius_m, law.clone()));
+        laws.push((radius_m, model, law.clone()));
         law
     }
 
@@ -331,16 +352,7 @@ impl Pacer {
         number("stepping.rate_hz", scene.stepping.rate_hz, &format!("at most {most_hz}"), |v| v <= most_hz)?;
         let model = Model::compile(scene, &self.limits)?;
         let id = random_id()?;
-        let work = model.len() as u64 * u64::from(model.plan.substeps);
-        if work > self.limits.point_substeps_per_step {
-            let message = format!(
-                "a step would compute {} points {} times, above the limit of {} in all",
-                model.len(),
-                model.plan.substeps,
-                self.limits.point_substeps_per_step
-            );
-            return Err(Refusal::new(Reason::TooLarge, "stepping.substeps", message));
-        }
+        check_work(&model, &self.limits)?;
         let number = {
             let mut numbers = lock(&self.numbers);
             *numbers += 1;
@@ -359,6 +371,7 @@ impl Pacer {
             late_commands: 0,
             hold_reason: None,
             guard_events: 0,
+            model: model.clone(),
         };
         let live = Arc::new(Live {
             id: id.clone(),
@@ -449,6 +462,16 @@ impl Pacer {
             let _ = thread.join();
         }
     }
+}
+
+/// Refuses steps that would keep the server from all others.
+fn check_work(model: &Model, limits: &Limits) -> Result<()> {
+    let (points, substeps, most) = (model.len(), model.plan.substeps, limits.point_substeps_per_step);
+    if points as u64 * u64::from(substeps) <= most {
+        return Ok(());
+    }
+    let message = format!("a step would compute {points} points {substeps} times, above the limit of {most} in all");
+    Err(Refusal::new(Reason::TooLarge, "stepping.substeps", message))
 }
 
 fn unknown_session(id: &str) -> Refusal {

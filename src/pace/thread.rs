@@ -366,7 +366,15 @@ impl Running {
             // Only of steps that cost something can a session be behind.
             self.drop_backlog();
         }
-        lock(&self.live.intake).take_due(self.session.step_count(), now_ns(), &mut self.due);
+        let step = self.session.step_count();
+        let change = {
+            let mut intake = lock(&self.live.intake);
+            intake.take_due(step, now_ns(), &mut self.due);
+            intake.take_change(step)
+        };
+        if let Some(model) = change {
+            self.session.change(&model);
+        }
 
         let Running { session, taps, due, .. } = self;
         session.advance(due, |session| {
@@ -475,6 +483,7 @@ impl Running {
             (None, false) => State::Paused,
         };
         status.step = self.session.step_count();
+        status.model.clone_from(self.session.model());
         status.rested_steps = self.rested_steps;
         status.overrun_count = self.overrun_count;
         status.guard_events = self.session.tissue().guard_events();

@@ -7,7 +7,7 @@ pub mod record;
 pub mod script;
 pub mod tip;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, not_negative, number, positive};
@@ -42,6 +42,53 @@ pub struct Scene {
     /// Error that leaving out regions at rest may cost, relative to the largest displacement; 0 leaves out nothing. Not
     /// given, it is a tenth of the error of the rest (`Model`).
     pub sleep_tolerance: Option<f64>,
+    /// What viewers see.
+    pub appearance: Appearance,
+}
+
+/// Smallest side of a texture that is made, pixels.
+pub const SMALLEST_TEXTURE: u32 = 16;
+
+/// What a tissue looks like. Nothing that a client's own scene can say: a file is one of the server's.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Appearance {
+    /// A PNG image for the surface; one is made if `None`.
+    pub texture: Option<PathBuf>,
+    /// Which one is made.
+    pub texture_seed: u64,
+    /// Pixels along each side of that.
+    pub texture_size: u32,
+}
+
+impl Default for Appearance {
+    fn default() -> Self {
+        Appearance { texture: None, texture_seed: 1, texture_size: 1024 }
+    }
+}
+
+impl Appearance {
+    /// With the image's path from `folder`, where the scene's file is.
+    fn within(mut self, folder: &Path) -> Self {
+        self.texture = self.texture.map(|path| folder.join(path));
+        self
+    }
+}
+
+/// What of a tissue may change while it is in use. What is `None` stays.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Change {
+    /// k of the structural springs, N/m. Those of shear and flexion keep their ratio to it.
+    pub stiffness_n_per_m: Option<f64>,
+    /// C, N·s/m.
+    pub damping_n_s_per_m: Option<f64>,
+    /// K″, N/m.
+    pub virtual_stiffness_n_per_m: Option<f64>,
+}
+
+impl Change {
+    /// Why one that changes nothing is refused.
+    pub const NOTHING: &str =
+        "names nothing to change: stiffness_n_per_m, damping_n_s_per_m or virtual_stiffness_n_per_m";
 }
 
 /// The grid: point [i, j] rests at (i·spacing, j·spacing, 0).
@@ -210,7 +257,13 @@ impl Scene {
     /// Reads a scene file, with `--set` assignments over it.
     pub fn load(path: &Path, assignments: &[String], limits: &Limits) -> Result<Self> {
         let text = document::read_text(path, limits.file_bytes)?;
-        Self::parse(&path.display().to_string(), &text, assignments, limits)
+        let scene = Self::parse(&path.display().to_string(), &text, assignments, limits)?;
+        Ok(scene.found_in(path.parent().unwrap_or(Path::new(""))))
+    }
+
+    /// The same, with the paths of other files from `folder`, where its own is.
+    pub fn found_in(self, folder: &Path) -> Self {
+        Scene { appearance: self.appearance.within(folder), ..self }
     }
 
     /// Reads a scene from TOML; `name` is what refusals call the text.
@@ -249,10 +302,33 @@ impl Scene {
                     Some(item) => item.table(|fields| fields.number("tolerance"))?,
                     None => None,
                 },
+                appearance: fields
+                    .item("appearance")
+                    .map_or(Ok(Appearance::default()), |item| read_appearance(&item, limits))?,
             })
         })?;
         scene.check(limits).map_err(|refusal| document.locate(refusal))?;
         Ok(scene)
+    }
+
+    /// The same with another tissue. `first` is the scene that the session began with: it tells the ratio of shear to
+    /// structural springs, which a k of 0 in between would lose.
+    pub fn changed(&self, change: &Change, first: &Scene) -> Self {
+        let mut scene = self.clone();
+        if let Some(k) = change.stiffness_n_per_m {
+            let Springs { stiffness_n_per_m, shear_stiffness_n_per_m, .. } = first.springs;
+            scene.springs.stiffness_n_per_m = k;
+            scene.springs.shear_stiffness_n_per_m = if shear_stiffness_n_per_m == stiffness_n_per_m {
+                k
+            } else if stiffness_n_per_m > 0.0 {
+                k * (shear_stiffness_n_per_m / stiffness_n_per_m)
+            } else {
+                shear_stiffness_n_per_m
+            };
+        }
+        scene.damping_n_s_per_m = change.damping_n_s_per_m.unwrap_or(scene.damping_n_s_per_m);
+        scene.virtual_stiffness_n_per_m = change.virtual_stiffness_n_per_m.unwrap_or(scene.virtual_stiffness_n_per_m);
+        scene
     }
 
     /// Everything that a scene promises, wherever it came from.
@@ -364,6 +440,29 @@ fn read_fixed(item: &Item<'_>) -> Result<Fixed> {
         Some(_) => Err(item.wrong("\"edges\", \"corners\" or a list of points")),
         None => Ok(Fixed::Points(item.list()?.iter().map(Item::point).collect::<Result<_>>()?)),
     }
+}
+
+fn read_appearance(item: &Item<'_>, limits: &Limits) -> Result<Appearance> {
+    item.table(|fields| {
+        let standard = Appearance::default();
+        let texture = fields.text("texture")?.map(PathBuf::from);
+        let seed = fields.item("texture_seed").map(|item| item.whole()).transpose()?;
+        let size = fields.item("texture_size").map(|item| item.whole()).transpose()?;
+        if texture.is_some() && (seed.is_some() || size.is_some()) {
+            let message = "names an image: texture_seed and texture_size are for one that is made";
+            return Err(fields.refuse(Reason::WrongKind, "texture", message));
+        }
+        let texture_size = match size {
+            Some(size) => {
+                let most = limits.texture_side;
+                let fits = u32::try_from(size).ok().filter(|size| (SMALLEST_TEXTURE..=most).contains(size));
+                let message = format!("must be from {SMALLEST_TEXTURE} to {most} pixels, but is {size}");
+                fits.ok_or_else(|| fields.refuse(Reason::OutOfRange, "texture_size", message))?
+            }
+            None => standard.texture_size,
+        };
+        Ok(Appearance { texture, texture_seed: seed.unwrap_or(standard.texture_seed), texture_size })
+    })
 }
 
 fn read_stepping(item: &Item<'_>) -> Result<Stepping> {

@@ -9,7 +9,7 @@ use glam::{DVec2, DVec3};
 use super::document::{self, Document, Fields, Item};
 use super::law::{CentreLaw, ForceLaw, Moment, Move, MoveLaw, Poke, Profile, StrengthLaw};
 use super::tip::Tip;
-use super::{Scene, Sheet};
+use super::{Change, Scene, Sheet};
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, not_negative, number, positive};
 
@@ -28,6 +28,8 @@ pub struct Script {
     pub forces: Vec<ForceLaw>,
     /// Grasped points.
     pub moves: Vec<MoveLaw>,
+    /// What becomes of the tissue at the beginning of which step, by rising steps.
+    pub changes: Vec<(u64, Change)>,
     /// What had to be rounded, in words.
     pub warnings: Vec<String>,
     /// Steps a second, as the scene says.
@@ -152,6 +154,7 @@ impl Binding<'_> {
                 return Err(Refusal::new(Reason::OutOfRange, format!("tool[{index}].point"), message));
             }
         }
+        let changes = self.changes(&items(fields, "tissue")?)?;
         let tools = forces.len() + moves.len();
         if tools > self.limits.tools as usize {
             let message = format!("{tools} forces and tools are above the limit of {} in all", self.limits.tools);
@@ -174,6 +177,7 @@ impl Binding<'_> {
             sample_points: sample_points.into_iter().filter(|point| seen.insert(*point)).collect(),
             forces,
             moves,
+            changes,
             warnings: self.warnings,
             rate_hz: self.scene.stepping.rate_hz,
             sheet: self.scene.sheet.clone(),
@@ -199,6 +203,39 @@ impl Binding<'_> {
         let sheet: &Sheet = &self.scene.sheet;
         sheet.index("", point).map_err(|refusal| item.refuse(refusal.reason, refusal.message))?;
         Ok((point, sheet.rest_m(point)))
+    }
+
+    /// Changes of the tissue, each checked with those before it.
+    fn changes(&mut self, list: &[Item<'_>]) -> Result<Vec<(u64, Change)>> {
+        let mut scene = self.scene.clone();
+        let mut changes: Vec<(u64, Change)> = Vec::new();
+        for item in list {
+            let (at, change) = item.table(|fields| {
+                let at = self.steps(&fields.path("at_s"), fields.required_number("at_s")?)?;
+                if changes.last().is_some_and(|last| last.0 >= at) {
+                    return Err(fields.refuse(
+                        Reason::OutOfRange,
+                        "at_s",
+                        "must be later than that of the change before",
+                    ));
+                }
+                let change = Change {
+                    stiffness_n_per_m: fields.number("stiffness_n_per_m")?,
+                    damping_n_s_per_m: fields.number("damping_n_s_per_m")?,
+                    virtual_stiffness_n_per_m: fields.number("virtual_stiffness_n_per_m")?,
+                };
+                Ok((at, change))
+            })?;
+            if change == Change::default() {
+                return Err(item.refuse(Reason::Missing, Change::NOTHING));
+            }
+            scene = scene.changed(&change, self.scene);
+            scene
+                .check(self.limits)
+                .map_err(|refusal| item.refuse(refusal.reason, format!("{}: {}", refusal.field, refusal.message)))?;
+            changes.push((at, change));
+        }
+        Ok(changes)
     }
 
     fn force(&mut self, item: &Item<'_>, control_points: &mut Vec<[usize; 2]>) -> Result<ForceLaw> {

@@ -44,7 +44,8 @@ impl Catalog {
             let file = format!("{name}.toml");
             let text = crate::scene::document::read_text(&path, limits.file_bytes)
                 .map_err(|refusal| Refusal { place: Some(file.clone()), ..refusal })?;
-            return Scene::parse(&file, &text, assignments, limits);
+            let scene = Scene::parse(&file, &text, assignments, limits)?;
+            return Ok(scene.found_in(&self.folder));
         }
         match BUILT_IN.iter().find(|scene| scene.0 == name) {
             Some((_, text)) => Scene::parse(name, text, assignments, limits),

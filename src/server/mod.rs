@@ -4,6 +4,7 @@ pub mod catalog;
 pub mod config;
 mod haptics;
 mod sessions;
+mod textures;
 mod views;
 
 use std::sync::Arc;
@@ -22,6 +23,7 @@ use config::Config;
 use pb::haptic_service_server::HapticServiceServer;
 use pb::session_service_server::SessionServiceServer;
 use pb::view_service_server::ViewServiceServer;
+use textures::Textures;
 
 /// What every service needs.
 #[derive(Clone)]
@@ -29,6 +31,7 @@ pub(crate) struct House {
     pub(crate) config: Arc<Config>,
     pub(crate) catalog: Catalog,
     pub(crate) pacer: Arc<Pacer>,
+    pub(crate) textures: Textures,
 }
 
 /// Why a server could not run.
@@ -56,7 +59,8 @@ pub async fn serve(listener: TcpListener, config: Config, shutdown: Cancellation
             warn!(%refusal, "a scene that no session can be made from");
         }
     }
-    let house = House { catalog, pacer: pacer.clone(), config: Arc::new(config) };
+    let textures = Textures::default();
+    let house = House { catalog, pacer: pacer.clone(), config: Arc::new(config), textures };
 
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<SessionServiceServer<sessions::Sessions>>().await;

@@ -81,6 +81,30 @@ impl SessionService for Sessions {
         Ok(Response::new(pb::StartSessionResponse { step }))
     }
 
+    async fn update_tissue(
+        &self,
+        request: Request<pb::UpdateTissueRequest>,
+    ) -> Result<Response<pb::UpdateTissueResponse>, Status> {
+        let request = request.into_inner();
+        let live = self.0.pacer.get(&request.session_id)?;
+        let (change, to_change) = (wire::scene::from_change(&request), live.clone());
+        let changed = tokio::task::spawn_blocking(move || to_change.change(&change, request.at_step)).await;
+        let (step, model) = changed.map_err(|e| Status::internal(e.to_string()))??;
+        info!(
+            session = %live.id,
+            step,
+            stiffness_n_per_m = model.scene.springs.stiffness_n_per_m,
+            damping_n_s_per_m = model.scene.damping_n_s_per_m,
+            virtual_stiffness_n_per_m = model.scene.virtual_stiffness_n_per_m,
+            "tissue changed"
+        );
+        for warning in &model.warnings {
+            warn!(session = %live.id, warning);
+        }
+        let session = Some(wire::sample::with_model(wire::sample::session(&live), &model));
+        Ok(Response::new(pb::UpdateTissueResponse { step, session }))
+    }
+
     async fn pause_session(
         &self,
         request: Request<pb::PauseSessionRequest>,

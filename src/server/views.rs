@@ -3,6 +3,7 @@
 use std::collections::VecDeque;
 use std::pin::Pin;
 
+use bytes::Bytes;
 use futures_util::stream::{self, Stream};
 use tonic::{Request, Response, Status};
 use tracing::info;
@@ -12,6 +13,7 @@ use crate::pace::frames::Viewer;
 use crate::pace::{FrameReader, StreamGuard, random_id};
 use crate::refusal::{Reason, Refusal, number};
 use crate::surface::{Encoding, Refinement};
+use crate::texture::Texture;
 use crate::wire::pb;
 use crate::wire::pb::view_service_server::ViewService;
 
@@ -59,6 +61,7 @@ impl Frames {
 #[tonic::async_trait]
 impl ViewService for Views {
     type GetMeshStream = Out<pb::GetMeshResponse>;
+    type GetTextureStream = Out<pb::GetTextureResponse>;
     type WatchFramesStream = Out<pb::WatchFramesResponse>;
 
     async fn get_mesh(&self, request: Request<pb::GetMeshRequest>) -> Result<Response<Self::GetMeshStream>, Status> {
@@ -69,6 +72,26 @@ impl ViewService for Views {
         let spacing_m = grid.spacing_m(live.model.scene.sheet.spacing_m);
         let out = stream::unfold((0, guard), move |(part, guard)| async move {
             mesh_part(grid, spacing_m, part).map(|message| (Ok(message), (part + 1, guard)))
+        });
+        Ok(Response::new(Box::pin(out)))
+    }
+
+    async fn get_texture(
+        &self,
+        request: Request<pb::GetTextureRequest>,
+    ) -> Result<Response<Self::GetTextureStream>, Status> {
+        let request = request.into_inner();
+        let guard = self.0.pacer.get(&request.session_id)?.open_stream()?;
+        let Texture { png, etag } = self.0.texture(&request.session_id).await?;
+        let png = if etag == request.known_etag { Bytes::new() } else { png };
+        // Even of nothing there is one part.
+        let rest = Some((png, etag, guard));
+        let out = stream::unfold(rest, |rest| async move {
+            let (mut png, etag, guard) = rest?;
+            let part = png.split_to(png.len().min(BYTES_PER_PART));
+            let last = png.is_empty();
+            let message = pb::GetTextureResponse { png: part, etag: etag.clone(), last };
+            Some((Ok(message), (!last).then_some((png, etag, guard))))
         });
         Ok(Response::new(Box::pin(out)))
     }
@@ -126,6 +149,9 @@ impl ViewService for Views {
 
 /// Vertices of one message: with positions and texture coordinates 40 KiB.
 const VERTICES_PER_PART: usize = 2048;
+
+/// Bytes of a texture in one message.
+const BYTES_PER_PART: usize = 64 << 10;
 
 /// Cells of one message, two triangles each: at most 60 KiB.
 const CELLS_PER_PART: usize = 2048;

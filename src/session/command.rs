@@ -1,13 +1,15 @@
 //! What a client tells a tool, and the desk where it is taken in: leases, sequence numbers, and the queue of
 //! what waits for its step. Time is an argument.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
 
 use super::schedule::Schedule;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, positive};
 use crate::scene::Scene;
 use crate::scene::script::{Action, check_poke, check_reach};
+use crate::sheet::Model;
 
 /// One command to one tool.
 #[derive(Debug, Clone, PartialEq)]
@@ -67,6 +69,10 @@ pub struct Intake {
     limits: Limits,
     leases: BTreeMap<u32, Lease>,
     queue: BTreeMap<Place, Due>,
+    /// Other tissues that wait for their step, by steps that rise.
+    changes: VecDeque<(u64, Arc<Model>)>,
+    /// The last that was taken in, if there was one.
+    changed_to: Option<Arc<Model>>,
     arrivals: u64,
     next_step: u64,
     /// The session rests: its steps are done in thought, up to this one.
@@ -86,6 +92,8 @@ impl Intake {
             limits: limits.clone(),
             leases: BTreeMap::new(),
             queue: BTreeMap::new(),
+            changes: VecDeque::new(),
+            changed_to: None,
             arrivals: 0,
             next_step: 0,
             resting: None,
@@ -179,7 +187,7 @@ impl Intake {
     /// beginning something waits.
     pub fn lapse(&mut self, now_ns: u64) {
         if let Some((schedule, until)) = &self.resting {
-            let until = self.queue.keys().next().map_or(*until, |place| place.0.min(*until));
+            let until = self.first_waiting().map_or(*until, |step| step.min(*until));
             self.next_step = self.next_step.max(schedule.next_step(now_ns).min(until));
         }
         while let Some(tool) = self.leases.iter().find(|lease| lease.1.expires_ns <= now_ns).map(|lease| *lease.0) {
@@ -277,11 +285,64 @@ impl Intake {
         self.changed = true;
     }
 
+    /// The first step for which something waits.
+    fn first_waiting(&self) -> Option<u64> {
+        let commands = self.queue.keys().next().map(|place| place.0);
+        let changes = self.changes.front().map(|change| change.0);
+        commands.into_iter().chain(changes).min()
+    }
+
+    /// The tissue as it will be when all changes have acted that were taken in; `None` if there was none.
+    pub fn changed_to(&self) -> Option<Arc<Model>> {
+        self.changed_to.clone()
+    }
+
+    /// Takes in another tissue, made out of `base`, to act at the beginning of step `at_step`, or the next. Tells the
+    /// step; `None` if meanwhile [`Intake::changed_to`] is not `base` any more. Changes act in the order in which they
+    /// come: each is made out of the one before it. Of several for one step the last counts, which has the others in it.
+    pub fn change(
+        &mut self,
+        base: Option<&Arc<Model>>,
+        model: &Arc<Model>,
+        at_step: Option<u64>,
+        now_ns: u64,
+    ) -> Result<Option<u64>> {
+        self.check_open()?;
+        self.lapse(now_ns);
+        if self.changed_to.as_ref().map(Arc::as_ptr) != base.map(Arc::as_ptr) {
+            return Ok(None);
+        }
+        let step = at_step.unwrap_or(0).max(self.next_step);
+        if let Some((last, _)) = self.changes.back() {
+            if *last > step {
+                let message = format!("is {step}, but a change of the tissue waits for step {last}: they act in order");
+                return Err(Refusal::new(Reason::OutOfTurn, "at_step", message));
+            }
+            if *last == step {
+                self.changes.pop_back();
+            }
+        }
+        if self.changes.len() >= self.limits.queued_commands_per_tool {
+            let message = format!("{} changes of the tissue wait for their step already", self.changes.len());
+            return Err(Refusal::new(Reason::QueueFull, "", message));
+        }
+        self.changes.push_back((step, model.clone()));
+        self.changed_to = Some(model.clone());
+        self.changed = true;
+        Ok(Some(step))
+    }
+
+    /// The tissue that is due at the beginning of step `step`, if another is: the last of those that are.
+    pub fn take_change(&mut self, step: u64) -> Option<Arc<Model>> {
+        let due = self.changes.partition_point(|change| change.0 <= step);
+        self.changes.drain(..due).next_back().map(|change| change.1)
+    }
+
     /// The session has done `step` steps, and would rest until step `until`: tells the step that it must do next, which is
     /// earlier if something waits here. From now until that is taken ([`Intake::take_due`]) it rests, if that is not the
     /// very next one.
     pub fn rest(&mut self, step: u64, until: u64, schedule: &Schedule) -> u64 {
-        let waiting = self.queue.keys().next().map(|place| place.0);
+        let waiting = self.first_waiting();
         let lapse = self.leases.values().map(|lease| lease.expires_ns).min().map(|ns| schedule.next_step(ns));
         let next = [waiting, lapse].into_iter().flatten().fold(until, u64::min).max(step);
         self.resting = (next > step).then_some((*schedule, next));

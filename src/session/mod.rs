@@ -160,6 +160,11 @@ impl Session {
         self.tissue.skip_steps(step.saturating_sub(self.step_count()));
     }
 
+    /// From the coming step on the tissue is that of `model`, which is [`Model::changed`] of this one's.
+    pub fn change(&mut self, model: &Arc<Model>) {
+        self.tissue.change(model);
+    }
+
     /// One step: `due` acts at its beginning, by the number of the tool. `observe` is called at its end unless the guard
     /// has ended the session, and before the first also at t = 0⁺, when what is due acts and nothing has moved.
     pub fn advance(&mut self, due: &mut Vec<Due>, mut observe: impl FnMut(&Session)) {

@@ -1,5 +1,6 @@
 //! `palpate run`: a script played offline, in process, as fast as it goes.
 
+use std::collections::VecDeque;
 use std::io::Write;
 use std::sync::Arc;
 
@@ -18,6 +19,9 @@ pub enum Failure {
     /// The guard has ended the session.
     #[error("the run was stopped: {0}")]
     Held(String),
+    /// What a command would be refused for.
+    #[error("{0}")]
+    Refused(#[from] Refusal),
     /// The output can't be written.
     #[error("can't write the output: {0}")]
     Output(#[from] std::io::Error),
@@ -51,6 +55,25 @@ pub fn command(tool: usize, step: u64, action: Action) -> Command {
     }
 }
 
+/// Lets the laws of a script act on a session that has not begun.
+pub fn play(session: &mut Session, script: &Script) {
+    for (tool, law) in script.forces.iter().enumerate() {
+        session.play_force(tool, law.clone());
+    }
+    for (index, law) in script.moves.iter().enumerate() {
+        session.play_move(script.forces.len() + index, law.clone());
+    }
+}
+
+/// Changes the tissue to what it is to be from the coming step on.
+pub fn change(session: &mut Session, changes: &mut VecDeque<(u64, Arc<Model>)>) {
+    while changes.front().is_some_and(|change| change.0 <= session.step_count()) {
+        if let Some((_, model)) = changes.pop_front() {
+            session.change(&model);
+        }
+    }
+}
+
 /// Plays `script` and writes its records, as JSON Lines, to `output`. `clock_s` tells the time, for the summary;
 /// `progress` is told the steps done now and then.
 pub fn run(
@@ -63,16 +86,11 @@ pub fn run(
     progress: &mut dyn FnMut(u64),
 ) -> std::result::Result<Summary, Failure> {
     let mut session = Session::new(model);
+    let mut changes = model.course(&script.changes, limits)?;
     // Held forces are commands, through the same intake as a server's; laws are set once.
-    let refused = |refusal: Refusal| Failure::Held(refusal.to_string());
-    let mut intake = held.then(|| intake(model, script, limits)).transpose().map_err(refused)?;
+    let mut intake = held.then(|| intake(model, script, limits)).transpose()?;
     if !held {
-        for (tool, law) in script.forces.iter().enumerate() {
-            session.play_force(tool, law.clone());
-        }
-        for (index, law) in script.moves.iter().enumerate() {
-            session.play_move(script.forces.len() + index, law.clone());
-        }
+        play(&mut session, script);
     }
     write_line(output, &Line::Run(&header(model, &script.name)))?;
     let mut due = Vec::new();
@@ -81,10 +99,11 @@ pub fn run(
     for step in 0..script.steps {
         if let Some(intake) = &mut intake {
             for (tool, action) in script.actions_at(step) {
-                intake.submit(LEASE, vec![command(tool, step, action)], 0).map_err(refused)?;
+                intake.submit(LEASE, vec![command(tool, step, action)], 0)?;
             }
             intake.take_due(step, 0, &mut due);
         }
+        change(&mut session, &mut changes);
         session.advance(&mut due, |session| {
             if session.step_count().is_multiple_of(script.sample_every) {
                 // The clock of the summary stands while a record is written.

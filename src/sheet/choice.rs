@@ -85,6 +85,9 @@ pub fn rounding(precision: Precision, sheet: &Oscillator, substep_s: f64) -> f64
     // A displacement that creeps by less than half its last digit in a substep stands still: short by so many digits as
     // the damping takes substeps to let go of one.
     let stiffness = sheet.virtual_stiffness_n_per_m + 0.05 * sheet.spring_stiffness_n_per_m;
+    if stiffness == 0.0 {
+        return if precision == Precision::F64 { 1e-12 } else { 4.0 * unit };
+    }
     let creep = 0.5 * sheet.damping_n_s_per_m / (stiffness * substep_s);
     // The stiffest vibrations' forces are differences of nearly equal displacements.
     let stiff = (sheet.spring_stiffness_n_per_m / stiffness).sqrt();

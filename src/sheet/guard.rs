@@ -23,6 +23,7 @@ use super::model::{Model, Plan};
 use super::prescribed::{Grasp, Prescribed};
 use super::real::Real;
 use super::springs::Springs;
+use super::survey::Survey;
 use super::{BlowUp, Sheet, springs_of};
 use crate::scene::tip::Tip;
 
@@ -125,6 +126,11 @@ impl Work {
         self.done_j += work_j;
     }
 
+    /// An account that begins with an energy.
+    pub(super) fn begun(energy_j: f64, present_j: f64) -> Self {
+        Work { done_j: present_j, energy_j, largest_j: energy_j }
+    }
+
     /// Judges an energy; a rise by `noise` of the largest is none. `present_j` is to be taken off what was done so far, and
     /// belongs to what comes. The account begins anew.
     pub(super) fn survey(&mut self, energy_j: f64, present_j: f64, noise: f64) -> Result<(), Cause> {
@@ -163,15 +169,19 @@ impl<T: Real> Sheet<T> {
         if survey.surprise > MOST_SURPRISE * survey.largest {
             return Err(Cause::Surprise { part: survey.surprise / survey.largest });
         }
-        // Half of the last increment's (`central`).
-        let present_j = if self.plan.scheme.takes_means() { 0.5 * survey.power * self.unit_of_work_j() } else { 0.0 };
+        let present_j = self.present_work_j(&survey);
         self.work.survey(energy_j, present_j, NOISE.max((10.0 * self.model.sleep_tolerance).powi(2)))?;
         self.take_checkpoint();
         Ok(())
     }
 
+    /// Of the work done, what belongs to what comes: half of the last increment's (`central`).
+    pub(super) fn present_work_j(&self, survey: &Survey) -> f64 {
+        if self.plan.scheme.takes_means() { 0.5 * survey.power * self.unit_of_work_j() } else { 0.0 }
+    }
+
     /// What the sheet is now is what it goes back to.
-    fn take_checkpoint(&mut self) {
+    pub(super) fn take_checkpoint(&mut self) {
         let Sheet { bench, state, applied, prescribed, contacts, tiles, .. } = self;
         let checkpoint = self.checkpoint.get_or_insert_with(|| {
             tiles.touch_all();

@@ -4,23 +4,23 @@
 macro_rules! with_scheme {
     ($plan:expr, $t:ty, |$scheme:ident| $body:expr) => {
         match &$plan.scheme {
-            Scheme::TwoStep(two) => {
+            $crate::sheet::integrate::Scheme::TwoStep(two) => {
                 let $scheme = &central::Advance::<$t>::new(two);
                 $body
             }
-            Scheme::Multistep(multistep) if multistep.order == 2 => {
+            $crate::sheet::integrate::Scheme::Multistep(multistep) if multistep.order == 2 => {
                 let $scheme = &exponential::Advance::<$t, 2, false>::new(multistep);
                 $body
             }
-            Scheme::Multistep(multistep) if multistep.order == 3 => {
+            $crate::sheet::integrate::Scheme::Multistep(multistep) if multistep.order == 3 => {
                 let $scheme = &exponential::Advance::<$t, 3, false>::new(multistep);
                 $body
             }
-            Scheme::Multistep(multistep) => {
+            $crate::sheet::integrate::Scheme::Multistep(multistep) => {
                 let $scheme = &exponential::Advance::<$t, 4, false>::new(multistep);
                 $body
             }
-            Scheme::Rk4 { a, g } => {
+            $crate::sheet::integrate::Scheme::Rk4 { a, g } => {
                 let $scheme = &rk4::Advance::<$t>::new(*a, *g, 0);
                 $body
             }
@@ -29,6 +29,7 @@ macro_rules! with_scheme {
 }
 
 mod applied;
+mod change;
 pub mod choice;
 mod contact;
 mod field;
@@ -70,7 +71,6 @@ pub use prescribed::Grasp;
 use prescribed::Prescribed;
 use real::Real;
 use springs::Springs;
-use survey::{Forces, Survey};
 use sweep::{Bench, MAX_KEPT};
 use tiles::{CHECK_STEPS, Region, Tiles};
 
@@ -139,6 +139,9 @@ pub trait Tissue: Send {
     fn surroundings(&self, tool: usize) -> Option<Surroundings>;
     /// `tool` neither pushes nor grasps nor touches any more, from the coming step on.
     fn release(&mut self, tool: usize);
+    /// From the coming step on springs, virtual springs and damping are those of `model` ([`Model::changed`] of this
+    /// one's). Displacements and velocities stay; all tiles wake.
+    fn change(&mut self, model: &Arc<Model>);
     /// The scheme as it is now: the guard may have halved the substep of the model's.
     fn plan(&self) -> &Plan;
     /// How often the guard went back to a checkpoint and on with half the substep.
@@ -339,43 +342,6 @@ impl<T: Real> Sheet<T> {
         found
     }
 
-    /// Looks at part of the sheet: what a survey sees, the energies, and the energy that the scheme keeps.
-    fn survey(&self, over: &Region) -> (Survey, Energy, f64) {
-        let Sheet { model, plan, bench, state, .. } = self;
-        let unit = plan.scheme.spring_scale() * plan.force_scale(&model.scene);
-        let terms = if plan.scheme.takes_means() && self.steps > 0 {
-            self.applied.until_now(model, &bench.layout, unit)
-        } else {
-            Vec::new()
-        };
-        let forces = Forces { terms: &terms, field: 0, part: 1.0, pull: 0.0 };
-        let survey = with_scheme!(plan, T, |scheme| Survey::of(bench, scheme, state, forces, over));
-        let (mut energy, kept_j) = self.energy_of(&survey);
-        // A grasped point moves as its tool does, whatever the scheme would make of it.
-        let own = self.prescribed.grasped().map(|(index, motion)| {
-            let [_, free, _] = self.free_point(index, self.applied.until(model, index));
-            motion.velocity_m_per_s.length_squared() - free.length_squared()
-        });
-        let grasped_j = 0.5 * model.scene.sheet.point_mass_kg * own.sum::<f64>();
-        energy.kinetic_j += grasped_j;
-        (survey, energy, kept_j + grasped_j)
-    }
-
-    /// The energies of what a survey saw, and the one that the scheme keeps.
-    fn energy_of(&self, survey: &Survey) -> (Energy, f64) {
-        let Sheet { model, plan, .. } = self;
-        let sheet = &model.scene.sheet;
-        // Of a mass that moves by a spacing in a substep, twice.
-        let unit_j = sheet.point_mass_kg * (sheet.spacing_m / plan.substep_s).powi(2);
-        let stiffness = model.scene.virtual_stiffness_n_per_m * sheet.spacing_m * sheet.spacing_m;
-        let energy = Energy {
-            kinetic_j: 0.5 * unit_j * survey.speed_squared,
-            spring_j: unit_j / plan.scheme.spring_scale() * survey.spring_energy,
-            virtual_j: 0.5 * stiffness * survey.displacement_squared,
-        };
-        (energy, 0.5 * unit_j * survey.vigour + energy.spring_j + energy.virtual_j)
-    }
-
     fn tell(&mut self, tool: usize, input: Input) {
         match input {
             Input::Push(push) => {
@@ -457,6 +423,10 @@ impl<T: Real> Tissue for Sheet<T> {
 
     fn release(&mut self, tool: usize) {
         self.push(tool, None);
+    }
+
+    fn change(&mut self, model: &Arc<Model>) {
+        Sheet::change(self, model);
     }
 
     fn is_still(&self) -> bool {

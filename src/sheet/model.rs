@@ -1,5 +1,6 @@
 //! What of a sheet never changes: compiled from a scene once, checked once, shared by all who read it.
 
+use std::collections::VecDeque;
 use std::sync::Arc;
 
 use super::choice::{self, Choice};
@@ -7,7 +8,7 @@ use super::integrate::{Node, Oscillator, Scheme};
 use super::{lanes, stability};
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result};
-use crate::scene::{Integrator, Lanes, Named, Precision, Scene};
+use crate::scene::{Change, Integrator, Lanes, Named, Precision, Scene};
 
 /// The immutable half of a sheet.
 #[derive(Debug, Clone)]
@@ -149,6 +150,31 @@ impl Model {
             lanes,
             warnings,
         }))
+    }
+
+    /// The same sheet with another tissue: integrator and substeps as its tolerance asks for, in the number format that a
+    /// state of this model has. `first` is the scene that the session began with.
+    pub fn changed(&self, change: &Change, first: &Scene, limits: &Limits) -> Result<Arc<Self>> {
+        if *change == Change::default() {
+            return Err(Refusal::new(Reason::Missing, "", Change::NOTHING));
+        }
+        let asked = self.scene.stepping.precision;
+        let mut scene = self.scene.changed(change, first);
+        scene.stepping.precision = self.precision;
+        // Only exponential schemes have that format, so it is one of them that is open.
+        let mut model = Arc::unwrap_or_clone(Model::compile(&scene, limits)?);
+        model.scene.stepping.precision = asked;
+        Ok(Arc::new(model))
+    }
+
+    /// What a script's changes make of this, each out of the one before it.
+    pub fn course(self: &Arc<Self>, changes: &[(u64, Change)], limits: &Limits) -> Result<VecDeque<(u64, Arc<Self>)>> {
+        let mut newest = self.clone();
+        let compiled = changes.iter().map(|(step, change)| {
+            newest = newest.changed(change, &self.scene, limits)?;
+            Ok((*step, newest.clone()))
+        });
+        compiled.collect()
     }
 
     /// Number of points.

@@ -1,9 +1,9 @@
 //! How a sheet puts tiles to sleep, and what wakes them: the physics of `tiles`.
 
 use super::choice;
-use super::integrate::{Oscillator, Scheme};
+use super::integrate::Oscillator;
 use super::real::Real;
-use super::survey::{Forces, Survey};
+use super::survey::{Forces, Survey, Write};
 use super::tiles::Region;
 use super::{Model, Sheet, central, exponential, rk4};
 
@@ -82,7 +82,7 @@ impl<T: Real> Sheet<T> {
             return;
         }
         let region = tiles.region_of(sleepers.iter().map(|(tile, _)| *tile));
-        with_scheme!(plan, T, |scheme| Survey::rest(bench, scheme, state, forces, &region));
+        with_scheme!(plan, T, |scheme| Survey::write(bench, scheme, state, forces, &region, Write::Rest));
         let sleepers: Vec<_> = sleepers.into_iter().map(|(tile, survey)| (tile, self.energy_of(&survey).1)).collect();
         self.tiles.sleep(&sleepers, &self.state.u);
     }

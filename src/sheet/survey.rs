@@ -14,6 +14,7 @@ use super::lanes::Vector;
 use super::real::Real;
 use super::sweep::{Bench, MAX_KEPT, Scheme, Stage};
 use super::tiles::Region;
+use super::{Energy, Sheet, central, exponential, rk4};
 
 /// What was seen, in the scheme's units (`integrate`).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -59,14 +60,28 @@ pub(super) struct Forces<'a, T: Real> {
     pub(super) pull: f64,
 }
 
+/// What a look leaves behind.
+#[derive(Clone, Copy, PartialEq)]
+pub(super) enum Write {
+    /// All as it was.
+    Nothing,
+    /// Rest: no motion, and the present force of the springs for a past.
+    Rest,
+    /// In place of what the scheme keeps to advance by, u and w as they are seen.
+    Seen,
+    /// Out of u and w as they are seen, what the scheme advances by, as if the present force of the springs had always
+    /// been there. (Of a two-step scheme, w is half a change ahead of d: d = w − (next − w)/2, and what it shows of a state
+    /// is (d + next)/2.)
+    Begin,
+}
+
 struct Look<'a, T: Real, C> {
     layout: Layout,
     scheme: &'a C,
     u: *mut T,
     d: *mut T,
     kept: [*mut T; MAX_KEPT],
-    /// Brings what it looks at to rest; else nothing is written.
-    rest: bool,
+    write: Write,
     forces: Forces<'a, T>,
     /// The same tools, as the sweep sees them.
     pulls: &'a [Pull<T>],
@@ -84,29 +99,30 @@ impl Survey {
         over: &Region,
     ) -> Survey {
         let pointers = state.fields().map(|field| field.as_ptr().cast_mut());
-        Survey::by(bench, scheme, pointers, forces, over, false)
+        Survey::by(bench, scheme, pointers, forces, over, Write::Nothing)
     }
 
-    /// The same, and brings it to rest: no motion, and the present force of the springs for a past.
-    pub(super) fn rest<T: Real, C: Scheme<T>>(
+    /// The same, and changes it.
+    pub(super) fn write<T: Real, C: Scheme<T>>(
         bench: &Bench<T>,
         scheme: &C,
         state: &mut State<T>,
         forces: Forces<'_, T>,
         over: &Region,
+        write: Write,
     ) {
         let pointers = state.fields_mut().map(|field| field.as_mut_ptr());
-        Survey::by(bench, scheme, pointers, forces, over, true);
+        Survey::by(bench, scheme, pointers, forces, over, write);
     }
 
-    /// `pointers`: to u, d and what is kept, written to only if told to `rest`.
+    /// `pointers`: to u, d and what is kept.
     fn by<T: Real, C: Scheme<T>>(
         bench: &Bench<T>,
         scheme: &C,
         mut pointers: impl Iterator<Item = *mut T>,
         forces: Forces<'_, T>,
         over: &Region,
-        rest: bool,
+        write: Write,
     ) -> Survey {
         let zero = [T::default(); BLOCK];
         let sums = UnsafeCell::new(Sums { row: [zero; 5], total: [[0.0; BLOCK]; 5], largest: [zero; 4] });
@@ -120,7 +136,7 @@ impl Survey {
             u,
             d,
             kept: std::array::from_fn(|_| next()),
-            rest,
+            write,
             forces,
             pulls: &pulls,
             free: bench.free.as_ref().map_or(std::ptr::null(), |free| free.as_ptr()),
@@ -186,7 +202,7 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Look<'_, T, C> {
                 let d = V::load(self.d.add(at));
                 let mut kept = [d; MAX_KEPT];
                 for k in 0..C::KEPT {
-                    kept[k] = V::load(self.kept[k].add(at));
+                    kept[k] = if self.write == Write::Begin { n[c] } else { V::load(self.kept[k].add(at)) };
                 }
                 let pushed = part.mul(force[c][0]);
                 let force = if terms.is_empty() { None } else { Some(pushed) };
@@ -196,13 +212,23 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Look<'_, T, C> {
                 place = u.mul_add(u, place);
                 power = pushed.mul_add(d, power);
                 let mut short = n[c].minus(pull, u).add(pushed);
-                let mut place_of_rest = u;
+                let (mut seen, mut speed_seen) = (u, w);
                 if let Some(free) = free {
-                    (short, place_of_rest) = (short.mul(free), u.mul(free));
+                    (short, seen, speed_seen) = (short.mul(free), u.mul(free), w.mul(free));
                 }
-                if self.rest {
-                    place_of_rest.store(self.u.add(at));
-                    V::splat(T::default()).store(self.d.add(at));
+                match self.write {
+                    Write::Nothing => {}
+                    Write::Rest => {
+                        seen.store(self.u.add(at));
+                        zero.store(self.d.add(at));
+                    }
+                    Write::Seen => {
+                        seen.store(self.u.add(at));
+                        speed_seen.store(self.d.add(at));
+                    }
+                    Write::Begin => d.add(d.sub(speed_seen)).store(self.d.add(at)),
+                }
+                if matches!(self.write, Write::Rest | Write::Begin) {
                     for k in 0..C::KEPT {
                         n[c].store(self.kept[k].add(at));
                     }
@@ -234,5 +260,48 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Look<'_, T, C> {
             total.iter_mut().zip(row.iter()).for_each(|(total, value)| *total += value.wide());
             *row = [T::default(); BLOCK];
         }
+    }
+}
+
+impl<T: Real> Sheet<T> {
+    /// The tools' force at the end of the last step, if the scheme needs it to tell a velocity, as the springs' force.
+    pub(super) fn present_terms(&self) -> Vec<Term<T>> {
+        let Sheet { model, plan, bench, .. } = self;
+        if !plan.scheme.takes_means() || self.steps == 0 {
+            return Vec::new();
+        }
+        self.applied.until_now(model, &bench.layout, plan.scheme.spring_scale() * plan.force_scale(&model.scene))
+    }
+
+    /// Looks at part of the sheet: what a survey sees, the energies, and the energy that the scheme keeps.
+    pub(super) fn survey(&self, over: &Region) -> (Survey, Energy, f64) {
+        let Sheet { model, plan, bench, state, .. } = self;
+        let terms = self.present_terms();
+        let forces = Forces { terms: &terms, field: 0, part: 1.0, pull: 0.0 };
+        let survey = with_scheme!(plan, T, |scheme| Survey::of(bench, scheme, state, forces, over));
+        let (mut energy, kept_j) = self.energy_of(&survey);
+        // A grasped point moves as its tool does, whatever the scheme would make of it.
+        let own = self.prescribed.grasped().map(|(index, motion)| {
+            let [_, free, _] = self.free_point(index, self.applied.until(model, index));
+            motion.velocity_m_per_s.length_squared() - free.length_squared()
+        });
+        let grasped_j = 0.5 * model.scene.sheet.point_mass_kg * own.sum::<f64>();
+        energy.kinetic_j += grasped_j;
+        (survey, energy, kept_j + grasped_j)
+    }
+
+    /// The energies of what a survey saw, and the one that the scheme keeps.
+    pub(super) fn energy_of(&self, survey: &Survey) -> (Energy, f64) {
+        let Sheet { model, plan, .. } = self;
+        let sheet = &model.scene.sheet;
+        // Of a mass that moves by a spacing in a substep, twice.
+        let unit_j = sheet.point_mass_kg * (sheet.spacing_m / plan.substep_s).powi(2);
+        let stiffness = model.scene.virtual_stiffness_n_per_m * sheet.spacing_m * sheet.spacing_m;
+        let energy = Energy {
+            kinetic_j: 0.5 * unit_j * survey.speed_squared,
+            spring_j: unit_j / plan.scheme.spring_scale() * survey.spring_energy,
+            virtual_j: 0.5 * stiffness * survey.displacement_squared,
+        };
+        (energy, 0.5 * unit_j * survey.vigour + energy.spring_j + energy.virtual_j)
     }
 }

@@ -284,6 +284,13 @@ impl<T: Real> Tiles<T> {
         self.asleep_j = 0.0;
     }
 
+    /// All awake, and from now on with another tolerance.
+    pub(super) fn begin_anew(&mut self, tolerance: f64) {
+        self.wake_all();
+        self.tolerance = tolerance;
+        self.calm.fill(0);
+    }
+
     /// Wakes tiles whose neighbours have moved by more than `far`.
     pub(super) fn watch(&mut self, u: &Field<T>, far: f64) {
         if self.watched.is_empty() {

@@ -10,6 +10,7 @@ use crate::scene::Named;
 use crate::scene::record::{EnergyJ, Point, Record};
 use crate::session::ToolSample;
 use crate::session::sampling::{Deadband, HEARTBEAT_S, Sampling};
+use crate::sheet::Model;
 use crate::surface::Encoding;
 use crate::surface::encode::Patch;
 
@@ -172,12 +173,11 @@ pub fn session(live: &Arc<Live>) -> pb::Session {
         let held = intake.holders().map(|(tool, holder)| pb::HeldTool { tool, holder: holder.to_owned() });
         (held.collect(), intake.lapsed())
     });
-    let model = &live.model;
+    let model = &status.model;
     #[allow(clippy::cast_precision_loss)]
     let simulation_time_s = status.step as f64 / model.scene.stepping.rate_hz;
-    pb::Session {
+    let session = pb::Session {
         session_id: live.id.clone(),
-        scene: Some(super::scene::scene(&model.scene)),
         state: match status.state {
             State::Running => pb::SessionState::Running,
             State::Paused => pb::SessionState::Paused,
@@ -186,21 +186,31 @@ pub fn session(live: &Arc<Live>) -> pb::Session {
         .into(),
         step: status.step,
         simulation_time_s,
-        integrator: model.plan.integrator.name().to_owned(),
-        substeps: model.plan.substeps,
-        precision: model.precision.name().to_owned(),
         overrun_count: status.overrun_count,
         time_dilation: status.dilation.value,
         late_commands: status.late_commands,
         hold_reason: status.hold_reason.unwrap_or_default(),
         held_tools,
         lapsed_leases,
-        warnings: model.warnings.clone(),
         idle_timeout_s: live.idle_timeout_s,
         guard_events: status.guard_events,
-        expected_error: model.expected_error,
         resting: status.resting,
         rested_steps: status.rested_steps,
+        ..Default::default()
+    };
+    with_model(session, model)
+}
+
+/// A session, with what is known of the tissue from `model`.
+pub fn with_model(session: pb::Session, model: &Model) -> pb::Session {
+    pb::Session {
+        scene: Some(super::scene::scene(&model.scene)),
+        integrator: model.plan.integrator.name().to_owned(),
+        substeps: model.plan.substeps,
+        precision: model.precision.name().to_owned(),
+        warnings: model.warnings.clone(),
+        expected_error: model.expected_error,
+        ..session
     }
 }
 

@@ -2,7 +2,7 @@
 
 use super::{from_point, pb, point, required};
 use crate::refusal::{Reason, Refusal, Result};
-use crate::scene::{Fixed, Integrator, Lanes, Named, Precision, Scene, Sheet, Springs, Stepping};
+use crate::scene::{Appearance, Change, Fixed, Integrator, Lanes, Named, Precision, Scene, Sheet, Springs, Stepping};
 
 /// A scene out of a message.
 pub fn from_scene(message: &pb::Scene) -> Result<Scene> {
@@ -31,6 +31,7 @@ pub fn from_scene(message: &pb::Scene) -> Result<Scene> {
         damping_n_s_per_m: required("damping.coefficient_n_s_per_m", damping.coefficient_n_s_per_m)?,
         stepping: message.stepping.as_ref().map_or(Ok(Stepping::default()), from_stepping)?,
         sleep_tolerance: message.sleep.as_ref().and_then(|sleep| sleep.tolerance),
+        appearance: Appearance::default(),
     })
 }
 
@@ -61,6 +62,26 @@ fn from_stepping(message: &pb::Stepping) -> Result<Stepping> {
         // A matter of the server's machine.
         lanes: Lanes::Auto,
     })
+}
+
+/// A change of a tissue.
+pub fn from_change(message: &pb::UpdateTissueRequest) -> Change {
+    Change {
+        stiffness_n_per_m: message.stiffness_n_per_m,
+        damping_n_s_per_m: message.damping_n_s_per_m,
+        virtual_stiffness_n_per_m: message.virtual_stiffness_n_per_m,
+    }
+}
+
+/// Asks for a change at the beginning of a step.
+pub fn update_tissue(session_id: &str, change: &Change, step: u64) -> pb::UpdateTissueRequest {
+    pb::UpdateTissueRequest {
+        session_id: session_id.to_owned(),
+        stiffness_n_per_m: change.stiffness_n_per_m,
+        damping_n_s_per_m: change.damping_n_s_per_m,
+        virtual_stiffness_n_per_m: change.virtual_stiffness_n_per_m,
+        at_step: Some(step),
+    }
 }
 
 /// A message of a scene, every default filled in.

@@ -1,0 +1,143 @@
+//! A script played for its pictures.
+
+use std::collections::VecDeque;
+use std::io::Write;
+use std::sync::Arc;
+
+use super::{Arrow, View, picture};
+use crate::limits::Limits;
+use crate::refusal::Refusal;
+use crate::scene::law::{Moment, Poke};
+use crate::scene::script::{Script, nearest_point};
+use crate::session::Session;
+use crate::session::run;
+use crate::sheet::Model;
+use crate::surface::Snapshot;
+use crate::texture::Image;
+
+/// Why there is no picture.
+#[derive(Debug, thiserror::Error)]
+pub enum Failure {
+    /// The guard has ended the session.
+    #[error("the run was stopped: {0}")]
+    Held(String),
+    /// The script asks for what can't be.
+    #[error("{0}")]
+    Refused(#[from] Refusal),
+    /// The file can't be written.
+    #[error("can't write the picture: {0}")]
+    Output(String),
+}
+
+/// A script that is being played.
+pub struct Film<'a> {
+    session: Session,
+    script: &'a Script,
+    changes: VecDeque<(u64, Arc<Model>)>,
+}
+
+/// The tissue at one moment, and what acts on it.
+pub struct Still {
+    snapshot: Snapshot,
+    arrows: Vec<Arrow>,
+}
+
+impl<'a> Film<'a> {
+    /// From the beginning.
+    pub fn new(model: &Arc<Model>, script: &'a Script, limits: &Limits) -> Result<Self, Failure> {
+        let changes = model.course(&script.changes, limits)?;
+        let mut session = Session::new(model);
+        run::play(&mut session, script);
+        Ok(Film { session, script, changes })
+    }
+
+    /// Goes on until `step` steps are done.
+    fn advance(&mut self, step: u64) -> Result<(), Failure> {
+        while self.session.step_count() < step {
+            run::change(&mut self.session, &mut self.changes);
+            self.session.advance(&mut Vec::new(), |_| {});
+            if let Some(reason) = self.session.hold_reason() {
+                return Err(Failure::Held(reason.to_owned()));
+            }
+        }
+        Ok(())
+    }
+
+    /// The tissue when `step` steps are done.
+    pub fn at(&mut self, step: u64) -> Result<Still, Failure> {
+        self.advance(step)?;
+        let mut displacement_m = std::array::from_fn(|_| Vec::new());
+        self.session.tissue().displacements_m(&mut displacement_m);
+        let model = self.session.model();
+        // What has acted until now: at a jump, just before it.
+        let before = step.saturating_sub(1);
+        let moment = Moment { step: before, fraction: if step > 0 { 1.0 } else { 0.0 } };
+        let pokes = self.script.forces.iter().map(|law| law.at(moment, model.scene.stepping.rate_hz));
+        let arrow =
+            |poke: Poke| Arrow { point: nearest_point(&model.scene.sheet, poke.centre_m), towards: poke.force_n };
+        let arrows = pokes.filter(|poke| poke.force_n.length() > 0.0).map(arrow).collect();
+        let snapshot = Snapshot::new(step, self.session.time_s(), model.points, displacement_m);
+        Ok(Still { snapshot, arrows })
+    }
+
+    /// The tissue at that of the script's sample times at which it is displaced most.
+    pub fn deepest(&mut self) -> Result<Still, Failure> {
+        let (mut most_m, mut found) = (f64::NEG_INFINITY, None);
+        for step in (0..=self.script.steps).step_by(self.script.sample_every.max(1) as usize) {
+            self.advance(step)?;
+            let far_m = self.session.tissue().largest_displacement_m();
+            if far_m > most_m {
+                (most_m, found) = (far_m, Some(self.at(step)?));
+            }
+        }
+        match found {
+            Some(still) => Ok(still),
+            None => self.at(0),
+        }
+    }
+}
+
+impl Still {
+    /// Simulated time, s.
+    pub fn time_s(&self) -> f64 {
+        self.snapshot.simulation_time_s
+    }
+
+    /// Draws it.
+    pub fn picture(&self, model: &Model, view: &View) -> Image {
+        picture(&model.scene.sheet, &self.snapshot, &self.arrows, view)
+    }
+}
+
+/// Plays the whole script into a GIF of `frames_hz` pictures a second, which is over as fast as it was in simulated time.
+/// `progress` is told the step now and then.
+pub fn gif(
+    model: &Arc<Model>,
+    script: &Script,
+    view: &View,
+    limits: &Limits,
+    frames_hz: f64,
+    output: impl Write,
+    progress: &mut dyn FnMut(u64),
+) -> Result<(), Failure> {
+    let broken = |e: gif::EncodingError| Failure::Output(e.to_string());
+    let [width, height] = view.size.map(|pixels| pixels as u16);
+    let mut encoder = gif::Encoder::new(output, width, height, &[]).map_err(broken)?;
+    encoder.set_repeat(gif::Repeat::Infinite).map_err(broken)?;
+    let mut film = Film::new(model, script, limits)?;
+    // A GIF counts in hundredths of a second.
+    let delay = (100.0 / frames_hz).round().max(1.0);
+    let steps_a_frame = 0.01 * delay * model.scene.stepping.rate_hz;
+    for frame in 0_u64.. {
+        let step = (frame as f64 * steps_a_frame).round() as u64;
+        if step > script.steps {
+            break;
+        }
+        let image = film.at(step)?.picture(model, view);
+        let mut picture = gif::Frame::from_rgb_speed(width, height, &image.rgb, 10);
+        picture.delay = delay as u16;
+        encoder.write_frame(&picture).map_err(broken)?;
+        progress(step);
+    }
+    Ok(())
+}

@@ -1,0 +1,111 @@
+//! The sheet as vertices in space, refined as viewers get it, with normals and places on the texture.
+
+use glam::{DVec2, DVec3};
+
+use crate::scene::Sheet;
+use crate::surface::{Encoding, Refinement, Snapshot, encode};
+
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Vertex {
+    /// m.
+    pub(super) at_m: DVec3,
+    /// Out of the tissue, of length 1.
+    pub(super) normal: DVec3,
+    /// 0 to 1 along x and along y.
+    pub(super) share: DVec2,
+    /// The part of the light from all around that reaches it: less in a dent.
+    pub(super) open: f64,
+}
+
+/// Vertex (a, b) at a·count[1] + b.
+#[derive(Debug)]
+pub(super) struct Surface {
+    pub(super) count: [usize; 2],
+    pub(super) vertices: Vec<Vertex>,
+}
+
+impl Surface {
+    pub(super) fn new(sheet: &Sheet, snapshot: &Snapshot, refinement: Refinement) -> Self {
+        let points = Refinement { between: 0, ..refinement };
+        // Those of the points, smooth: a bilinear patch has creases of its own.
+        let places_m = places(sheet, snapshot, points);
+        let (normals, open) = (normals(sheet.points, &places_m), openness(sheet, &places_m));
+        let count = refinement.vertices();
+        let part = refinement.between + 1;
+        let vertices = places(sheet, snapshot, refinement)
+            .into_iter()
+            .enumerate()
+            .map(|(index, at_m)| {
+                let [a, b] = [index / count[1], index % count[1]];
+                let share = |a: usize, vertices: usize| a as f64 / (vertices - 1).max(1) as f64;
+                let normal = bilinear(sheet.points, &normals, [a, b], part).try_normalize().unwrap_or(DVec3::Z);
+                let share = DVec2::new(share(a, count[0]), share(b, count[1]));
+                Vertex { at_m, normal, share, open: bilinear(sheet.points, &open, [a, b], part).x }
+            })
+            .collect();
+        Surface { count, vertices }
+    }
+}
+
+/// Where the vertices are, m: by what a viewer is sent.
+fn places(sheet: &Sheet, snapshot: &Snapshot, refinement: Refinement) -> Vec<DVec3> {
+    let [nx, ny] = refinement.vertices();
+    let spacing_m = refinement.spacing_m(sheet.spacing_m);
+    let mut places: Vec<DVec3> =
+        (0..nx * ny).map(|index| spacing_m * DVec3::new((index / ny) as f64, (index % ny) as f64, 0.0)).collect();
+    for patch in encode(snapshot, refinement, Encoding::F32).patches {
+        for (k, bytes) in patch.bytes.chunks_exact(12).enumerate() {
+            let (a, b) = (patch.first[0] + k / patch.count[1], patch.first[1] + k % patch.count[1]);
+            let component = |c: usize| {
+                let four = [bytes[4 * c], bytes[4 * c + 1], bytes[4 * c + 2], bytes[4 * c + 3]];
+                f64::from(f32::from_le_bytes(four))
+            };
+            places[a * ny + b] += DVec3::new(component(0), component(1), component(2));
+        }
+    }
+    places
+}
+
+fn normals([nx, ny]: [usize; 2], places: &[DVec3]) -> Vec<DVec3> {
+    let at = |i: usize, j: usize| places[i * ny + j];
+    (0..nx * ny)
+        .map(|index| {
+            let (i, j) = (index / ny, index % ny);
+            let along_x = at((i + 1).min(nx - 1), j) - at(i.saturating_sub(1), j);
+            let along_y = at(i, (j + 1).min(ny - 1)) - at(i, j.saturating_sub(1));
+            along_x.cross(along_y).try_normalize().unwrap_or(DVec3::Z)
+        })
+        .collect()
+}
+
+/// How open to light from all around each point is, from how much higher those around it are at some distances; in x.
+fn openness(sheet: &Sheet, places_m: &[DVec3]) -> Vec<DVec3> {
+    let [nx, ny] = sheet.points;
+    let of = |index: usize| {
+        let (i, j) = (index / ny, index % ny);
+        let mut slopes = 0.0;
+        for reach in [1, 2, 4] {
+            let (mut rise_m, mut count) = (0.0, 0.0);
+            for [di, dj] in [[-1, -1], [-1, 0], [-1, 1], [0, -1], [0, 1], [1, -1], [1, 0], [1, 1_isize]] {
+                let (Some(i), Some(j)) = (i.checked_add_signed(reach * di), j.checked_add_signed(reach * dj)) else {
+                    continue;
+                };
+                if i < nx && j < ny {
+                    rise_m += places_m[i * ny + j].z - places_m[index].z;
+                    count += 1.0;
+                }
+            }
+            slopes += (rise_m / f64::max(count, 1.0)).max(0.0) / (reach as f64 * sheet.spacing_m);
+        }
+        DVec3::splat(1.0 / (1.0 + 0.5 * slopes))
+    };
+    (0..nx * ny).map(of).collect()
+}
+
+/// Between the values of the points, at vertex `[a, b]`, of which there are `part` to a spacing.
+fn bilinear([nx, ny]: [usize; 2], values: &[DVec3], [a, b]: [usize; 2], part: usize) -> DVec3 {
+    let (i, j) = (a / part, b / part);
+    let (s, t) = ((a % part) as f64 / part as f64, (b % part) as f64 / part as f64);
+    let at = |i: usize, j: usize| values[i.min(nx - 1) * ny + j.min(ny - 1)];
+    at(i, j).lerp(at(i + 1, j), s).lerp(at(i, j + 1).lerp(at(i + 1, j + 1), s), t)
+}

@@ -1,0 +1,48 @@
+//! Textures by name: those of sessions, of scenes, and the default one.
+
+use std::sync::{Arc, Mutex};
+
+use tonic::Status;
+
+use super::House;
+use crate::pace::queue::lock;
+use crate::refusal::Refusal;
+use crate::scene::Appearance;
+use crate::texture::{Texture, texture};
+
+/// Textures that a server keeps.
+const MOST_KEPT: usize = 8;
+
+/// The textures last asked for, the newest last.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Textures(Arc<Mutex<Vec<(Appearance, Texture)>>>);
+
+impl House {
+    /// The texture of a session by its id, of a scene that the server has by its name, or the `default` one. Made or read
+    /// once, and kept: a second or so for who asks first.
+    pub(crate) async fn texture(&self, name: &str) -> Result<Texture, Status> {
+        let (house, name) = (self.clone(), name.to_owned());
+        let found = tokio::task::spawn_blocking(move || house.find_texture(&name)).await;
+        Ok(found.map_err(|e| Status::internal(e.to_string()))??)
+    }
+
+    fn find_texture(&self, name: &str) -> Result<Texture, Refusal> {
+        let limits = &self.config.limits;
+        let appearance = match (name, self.pacer.get(name)) {
+            ("default", _) => Appearance::default(),
+            (_, Ok(live)) => live.model.scene.appearance.clone(),
+            _ => self.catalog.load(name, &[], limits)?.appearance,
+        };
+        // Who asks for the same meanwhile waits for it.
+        let mut kept = lock(&self.textures.0);
+        if let Some((_, texture)) = kept.iter().find(|entry| entry.0 == appearance) {
+            return Ok(texture.clone());
+        }
+        let texture = texture(&appearance, limits)?;
+        if kept.len() == MOST_KEPT {
+            kept.remove(0);
+        }
+        kept.push((appearance, texture.clone()));
+        Ok(texture)
+    }
+}

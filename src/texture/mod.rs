@@ -1,0 +1,121 @@
+//! What a tissue looks like: an image for its surface, made out of a seed or the user's own. The same seed and size give
+//! the same bytes anywhere.
+
+mod mucosa;
+mod noise;
+mod vessels;
+
+use std::io::{Cursor, Read};
+use std::path::Path;
+
+use bytes::Bytes;
+
+use crate::limits::Limits;
+use crate::refusal::{Reason, Refusal, Result, number};
+use crate::scene::{Appearance, SMALLEST_TEXTURE};
+
+/// Rows of pixels from the top, sRGB.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Image {
+    /// Pixels in a row.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// Red, green and blue of each.
+    pub rgb: Vec<u8>,
+}
+
+/// An image as it is served.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Texture {
+    /// The file.
+    pub png: Bytes,
+    /// Differs for any two that differ; a quoted string, for HTTP.
+    pub etag: String,
+}
+
+/// The lining of a stomach as an endoscope shows it, `size` × `size` pixels.
+pub fn mucosa(seed: u64, size: u32, limits: &Limits) -> Result<Image> {
+    let range = format!("from {SMALLEST_TEXTURE} to {} pixels", limits.texture_side);
+    let holds = |v| v >= f64::from(SMALLEST_TEXTURE) && v <= f64::from(limits.texture_side);
+    number("texture_size", f64::from(size), &range, holds)?;
+    let side = size as usize;
+    Ok(Image { width: side, height: side, rgb: mucosa::paint(seed, side) })
+}
+
+/// The image of a scene's tissue.
+pub fn image(appearance: &Appearance, limits: &Limits) -> Result<Image> {
+    match &appearance.texture {
+        Some(path) => Image::decode(path, &read(path, limits)?, limits),
+        None => mucosa(appearance.texture_seed, appearance.texture_size, limits),
+    }
+}
+
+/// The same as a file: the user's own as it is, after a look at whether it is one.
+pub fn texture(appearance: &Appearance, limits: &Limits) -> Result<Texture> {
+    let png = match &appearance.texture {
+        Some(path) => {
+            let bytes = read(path, limits)?;
+            Image::decode(path, &bytes, limits)?;
+            bytes
+        }
+        None => image(appearance, limits)?.png()?,
+    };
+    let etag = format!("\"{:032x}\"", xxhash_rust::xxh3::xxh3_128(&png));
+    Ok(Texture { png: png.into(), etag })
+}
+
+fn refuse(path: &Path, reason: Reason, message: String) -> Refusal {
+    let place = Some(path.display().to_string());
+    Refusal { place, ..Refusal::new(reason, "appearance.texture", message) }
+}
+
+fn read(path: &Path, limits: &Limits) -> Result<Vec<u8>> {
+    let file =
+        std::fs::File::open(path).map_err(|e| refuse(path, Reason::Unreadable, format!("can't be opened: {e}")))?;
+    let mut bytes = Vec::new();
+    file.take(limits.file_bytes + 1)
+        .read_to_end(&mut bytes)
+        .map_err(|e| refuse(path, Reason::Unreadable, format!("can't be read: {e}")))?;
+    if bytes.len() as u64 > limits.file_bytes {
+        return Err(refuse(path, Reason::TooLarge, format!("is larger than the limit of {} bytes", limits.file_bytes)));
+    }
+    Ok(bytes)
+}
+
+impl Image {
+    /// Reads a PNG file of any colour type; what is transparent shows as it is painted.
+    fn decode(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Self> {
+        let wrong = |e: png::DecodingError| refuse(path, Reason::Unreadable, format!("is no PNG image: {e}"));
+        let mut decoder = png::Decoder::new(Cursor::new(bytes));
+        decoder.set_transformations(png::Transformations::EXPAND | png::Transformations::STRIP_16);
+        let mut reader = decoder.read_info().map_err(wrong)?;
+        let (width, height, most) = (reader.info().width, reader.info().height, limits.texture_side);
+        if width.max(height) > most {
+            let message = format!("is {width} × {height} pixels, above the limit of {most} a side");
+            return Err(refuse(path, Reason::TooLarge, message));
+        }
+        let mut pixels = vec![0; reader.output_buffer_size().unwrap_or(0)];
+        let frame = reader.next_frame(&mut pixels).map_err(wrong)?;
+        pixels.truncate(frame.buffer_size());
+        let rgb = match frame.color_type {
+            png::ColorType::Grayscale => pixels.iter().flat_map(|grey| [*grey; 3]).collect(),
+            png::ColorType::GrayscaleAlpha => pixels.chunks_exact(2).flat_map(|pixel| [pixel[0]; 3]).collect(),
+            png::ColorType::Rgba => pixels.chunks_exact(4).flat_map(|pixel| [pixel[0], pixel[1], pixel[2]]).collect(),
+            png::ColorType::Rgb | png::ColorType::Indexed => pixels,
+        };
+        Ok(Image { width: width as usize, height: height as usize, rgb })
+    }
+
+    /// As a PNG file.
+    pub fn png(&self) -> Result<Vec<u8>> {
+        let mut file = Vec::new();
+        #[allow(clippy::cast_possible_truncation)]
+        let mut encoder = png::Encoder::new(&mut file, self.width as u32, self.height as u32);
+        encoder.set_color(png::ColorType::Rgb);
+        encoder.set_depth(png::BitDepth::Eight);
+        let written = encoder.write_header().and_then(|mut writer| writer.write_image_data(&self.rgb));
+        written.map_err(|e| Refusal::new(Reason::TooLarge, "", format!("can't be written as a PNG image: {e}")))?;
+        Ok(file)
+    }
+}

@@ -1,0 +1,76 @@
+//! Noise over the plane: numbers that look random, but are those of a place and a seed. Nothing but arithmetic that
+//! IEEE 754 rounds exactly, so the same on every machine.
+
+/// Bits of a lattice point, by multiplying and mixing (the finalizer of MurmurHash3).
+pub(super) fn bits(seed: u32, x: i32, y: i32) -> u32 {
+    let mut h = seed ^ (x as u32).wrapping_mul(0x9e37_79b1) ^ (y as u32).wrapping_mul(0x85eb_ca77).rotate_left(16);
+    h ^= h >> 16;
+    h = h.wrapping_mul(0x85eb_ca6b);
+    h ^= h >> 13;
+    h = h.wrapping_mul(0xc2b2_ae35);
+    h ^ h >> 16
+}
+
+/// From 0 to 1, out of some bits.
+pub(super) fn unit(bits: u32) -> f32 {
+    (bits >> 8) as f32 / (1 << 24) as f32
+}
+
+/// 0 up to `from`, 1 beyond `to`, smooth between; `to` may be below `from`.
+pub(super) fn step(from: f32, to: f32, x: f32) -> f32 {
+    let t = ((x - from) / (to - from)).clamp(0.0, 1.0);
+    t * t * (3.0 - 2.0 * t)
+}
+
+/// Gradient noise (Perlin's), from −1 to 1: smooth, and 0 at whole numbers.
+pub(super) fn gradient(seed: u32, x: f32, y: f32) -> f32 {
+    let (left, top) = (x.floor(), y.floor());
+    let (i, j) = (left as i32, top as i32);
+    let (x, y) = (x - left, y - top);
+    let corner = |di: i32, dj: i32| {
+        let bits = bits(seed, i + di, j + dj);
+        let along = |part: u32| (part & 0xffff) as f32 / 32768.0 - 1.0;
+        along(bits) * (x - di as f32) + along(bits >> 16) * (y - dj as f32)
+    };
+    let fade = |t: f32| t * t * t * (t * (t * 6.0 - 15.0) + 10.0);
+    let (u, v) = (fade(x), fade(y));
+    let mix = |a: f32, b: f32, t: f32| a + (b - a) * t;
+    1.4 * mix(mix(corner(0, 0), corner(1, 0), u), mix(corner(0, 1), corner(1, 1), u), v)
+}
+
+/// Gradient noise in `octaves` of twice the frequency and half the height each.
+pub(super) fn fractal(seed: u32, x: f32, y: f32, octaves: u32) -> f32 {
+    let (mut sum, mut scale, mut height) = (0.0, 1.0, 1.0);
+    for octave in 0..octaves {
+        // Turned, so that the lattices don't show.
+        let (a, b) = (scale * (0.8 * x - 0.6 * y), scale * (0.6 * x + 0.8 * y));
+        sum += height
+            * if octave % 2 == 0 {
+                gradient(seed + octave, x * scale, y * scale)
+            } else {
+                gradient(seed + octave, a, b)
+            };
+        (scale, height) = (2.0 * scale, 0.5 * height);
+    }
+    sum
+}
+
+/// Distances to the nearest and the next of scattered points, one in each square of side 1 (Worley's noise).
+pub(super) fn cells(seed: u32, x: f32, y: f32) -> [f32; 2] {
+    let (i, j) = (x.floor() as i32, y.floor() as i32);
+    let mut nearest = [f32::MAX; 2];
+    for di in -1..=1 {
+        for dj in -1..=1 {
+            let bits = bits(seed, i + di, j + dj);
+            let at = |cell: i32, part: u32| cell as f32 + (part & 0xffff) as f32 / 65536.0;
+            let (dx, dy) = (at(i + di, bits) - x, at(j + dj, bits >> 16) - y);
+            let squared = dx * dx + dy * dy;
+            if squared < nearest[0] {
+                nearest = [squared, nearest[0]];
+            } else if squared < nearest[1] {
+                nearest[1] = squared;
+            }
+        }
+    }
+    nearest.map(f32::sqrt)
+}

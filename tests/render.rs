@@ -1,0 +1,218 @@
+//! Textures and pictures: what `palpate texture` and `palpate render` make.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods, missing_docs)]
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use palpate::limits::Limits;
+use palpate::refusal::Reason;
+use palpate::scene::{Appearance, PAPER, Scene};
+use palpate::texture::{Image, image, mucosa, texture};
+
+fn palpate(arguments: &[&str]) -> Output {
+    let program = env!("CARGO_BIN_EXE_palpate");
+    Command::new(program).args(arguments).current_dir(env!("CARGO_MANIFEST_DIR")).output().unwrap()
+}
+
+/// The file that a command makes, in a folder that goes away.
+fn made(name: &str, arguments: &[&str]) -> Vec<u8> {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join(name);
+    let output = palpate(&[arguments, &["--output", path.to_str().unwrap()]].concat());
+    assert!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
+    std::fs::read(path).unwrap()
+}
+
+fn refused(arguments: &[&str], named: &str) {
+    let output = palpate(arguments);
+    let told = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!((output.status.code(), told.contains(named)), (Some(2), true), "{arguments:?}: {told}");
+}
+
+fn decoded(bytes: &[u8]) -> Image {
+    let mut reader = png::Decoder::new(std::io::Cursor::new(bytes)).read_info().unwrap();
+    let mut rgb = vec![0; reader.output_buffer_size().unwrap()];
+    let frame = reader.next_frame(&mut rgb).unwrap();
+    assert_eq!(frame.color_type, png::ColorType::Rgb);
+    Image { width: frame.width as usize, height: frame.height as usize, rgb }
+}
+
+fn pixel(image: &Image, x: usize, y: usize) -> [u8; 3] {
+    std::array::from_fn(|c| image.rgb[3 * (y * image.width + x) + c])
+}
+
+/// Mean red, green and blue of a square part, one of `parts` × `parts`.
+fn mean(image: &Image, parts: usize, [column, row]: [usize; 2]) -> [f64; 3] {
+    let side = image.width / parts;
+    let mut sum = [0.0; 3];
+    for y in row * side..(row + 1) * side {
+        for x in column * side..(column + 1) * side {
+            let pixel = pixel(image, x, y);
+            (0..3).for_each(|c| sum[c] += f64::from(pixel[c]) / (side * side) as f64);
+        }
+    }
+    sum
+}
+
+#[test]
+fn a_texture_is_made_by_its_seed() {
+    let first = made("a.png", &["texture", "--seed", "5", "--size", "96"]);
+    assert_eq!(first, made("b.png", &["texture", "--seed", "5", "--size", "96"]));
+    assert_ne!(first, made("c.png", &["texture", "--seed", "6", "--size", "96"]));
+    let small = decoded(&first);
+    assert_eq!((small.width, small.height), (96, 96));
+    // The lining of a stomach: red, and neither flat nor noise.
+    let large = mucosa(5, 384, &Limits::default()).unwrap();
+    let mut spread = 0.0_f64;
+    for part in (0..64).map(|k| [k % 8, k / 8]) {
+        let [a, b] = [mean(&small, 8, part), mean(&large, 8, part)];
+        assert!(a[0] > 1.2 * a[1] && a[1] > 0.7 * a[2], "{a:?}");
+        // The same tissue, sharper.
+        assert!((0..3).all(|c| (a[c] - b[c]).abs() < 14.0), "{part:?}: {a:?} and {b:?}");
+        spread = spread.max((a[0] - mean(&small, 1, [0, 0])[0]).abs());
+    }
+    assert!(spread > 12.0, "{spread}");
+    refused(&["texture", "--size", "4097", "--output", "never.png"], "texture_size");
+    refused(&["texture", "--size", "3", "--output", "never.png"], "from 16 to 4096");
+    let nowhere = palpate(&["texture", "--size", "16", "--output", "no/such/folder/a.png"]);
+    assert_eq!(nowhere.status.code(), Some(1));
+}
+
+/// A scene whose own image is of these pixels, rows from the top.
+fn scene_with_image(folder: &Path, width: usize, rgb: &[[u8; 3]]) -> String {
+    let own = Image { width, height: rgb.len() / width, rgb: rgb.concat() };
+    std::fs::write(folder.join("own.png"), own.png().unwrap()).unwrap();
+    let path = folder.join("own.toml");
+    std::fs::write(&path, format!("{PAPER}\n[appearance]\ntexture = \"own.png\"\n")).unwrap();
+    path.to_str().unwrap().to_owned()
+}
+
+#[test]
+fn a_scene_may_have_an_image_of_its_own() {
+    let (folder, limits) = (tempfile::tempdir().unwrap(), Limits::default());
+    let path = scene_with_image(folder.path(), 2, &[[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255]]);
+    let scene = Scene::load(Path::new(&path), &[], &limits).unwrap();
+    let served = texture(&scene.appearance, &limits).unwrap();
+    assert_eq!(served.png, std::fs::read(folder.path().join("own.png")).unwrap());
+    let standard = texture(&Appearance::default(), &limits).unwrap();
+    assert_eq!(standard, texture(&Appearance::default(), &limits).unwrap());
+    assert_ne!(standard.etag, served.etag);
+    assert_eq!(decoded(&standard.png), image(&Appearance::default(), &limits).unwrap());
+
+    std::fs::write(folder.path().join("own.png"), "no image").unwrap();
+    let wrong = texture(&scene.appearance, &limits).unwrap_err();
+    assert_eq!((wrong.reason, wrong.field.as_str()), (Reason::Unreadable, "appearance.texture"));
+    assert!(wrong.to_string().contains("own.png"), "{wrong}");
+    std::fs::remove_file(folder.path().join("own.png")).unwrap();
+    assert_eq!(texture(&scene.appearance, &limits).unwrap_err().reason, Reason::Unreadable);
+    let large = Image { width: 5000, height: 1, rgb: vec![0; 15_000] };
+    std::fs::write(folder.path().join("own.png"), large.png().unwrap()).unwrap();
+    assert_eq!(texture(&scene.appearance, &limits).unwrap_err().reason, Reason::TooLarge);
+
+    for (lines, reason, field) in [
+        ("texture_size = 5", Reason::OutOfRange, "appearance.texture_size"),
+        ("texture_seed = -1", Reason::OutOfRange, "appearance.texture_seed"),
+        ("texture = 7", Reason::WrongKind, "appearance.texture"),
+        ("texture = \"own.png\"\ntexture_seed = 3", Reason::WrongKind, "appearance.texture"),
+        ("colour = \"red\"", Reason::UnknownKey, "appearance.colour"),
+    ] {
+        let text = format!("{PAPER}\n[appearance]\n{lines}\n");
+        let refusal = Scene::parse("test", &text, &[], &limits).unwrap_err();
+        assert_eq!((refusal.reason, refusal.field.as_str()), (reason, field), "{lines}");
+    }
+}
+
+const SMALL: [&str; 4] = ["--size", "96x72", "--set", "appearance.texture_size=64"];
+
+fn poke(more: &[&str]) -> Vec<u8> {
+    made("a.png", &[&["render", "paper", "oblique-100"], &SMALL[..], more].concat())
+}
+
+#[test]
+fn a_picture_is_the_same_on_every_run_and_width_of_vectors() {
+    let first = poke(&[]);
+    assert_eq!(first, poke(&[]));
+    assert_eq!(first, poke(&["--set", "stepping.lanes=plain"]));
+    // The deepest moment is none of rest.
+    assert_ne!(first, poke(&["--at-s", "0"]));
+    assert_ne!(first, poke(&["--camera", "-40,60,2"]));
+    assert_ne!(first, poke(&["--wireframe"]));
+    assert_ne!(poke(&["--wireframe"]), poke(&["--wireframe", "--refine", "1"]));
+}
+
+#[test]
+fn the_image_lies_on_the_sheet_as_it_should() {
+    let folder = tempfile::tempdir().unwrap();
+    let corners = [[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 0]];
+    let scene = scene_with_image(folder.path(), 2, &corners);
+    let at_rest = ["--at-s", "0", "--size", "120x90", "--camera", "0,90"];
+    let seen = decoded(&made("a.png", &[&["render", &scene, "vertical-60"], &at_rest[..]].concat()));
+    // From above, x to the right and y up.
+    let strongest = |x: usize, y: usize| {
+        let pixel = pixel(&seen, x, y);
+        pixel.map(|value| u32::from(value) * 2 > u32::from(*pixel.iter().max().unwrap()))
+    };
+    let (left, right, top, bottom) = (36, 84, 22, 68);
+    assert_eq!(strongest(left, top), [true, false, false], "{:?}", pixel(&seen, left, top));
+    assert_eq!(strongest(right, top), [false, true, false], "{:?}", pixel(&seen, right, top));
+    assert_eq!(strongest(left, bottom), [false, false, true], "{:?}", pixel(&seen, left, bottom));
+    assert_eq!(strongest(right, bottom), [true, true, false], "{:?}", pixel(&seen, right, bottom));
+    // Beside the sheet there is nothing.
+    assert_eq!(pixel(&seen, 1, 1), pixel(&seen, 118, 88));
+}
+
+#[test]
+fn a_dent_shows_where_the_force_is() {
+    let view = ["--camera", "0,90", "--size", "96x72", "--set", "appearance.texture_size=64"];
+    let of = |more: &[&str]| decoded(&made("a.png", &[&["render", "paper", "vertical-60"], &view[..], more].concat()));
+    let (rest, poked) = (of(&["--at-s", "0"]), of(&["--at-s", "0.5"]));
+    let differs = |x: usize, y: usize| {
+        let pairs = pixel(&rest, x, y).into_iter().zip(pixel(&poked, x, y));
+        pairs.map(|(a, b)| a.abs_diff(b)).max().unwrap()
+    };
+    let changed = |x: std::ops::Range<usize>, y: std::ops::Range<usize>| {
+        x.flat_map(|x| y.clone().map(move |y| (x, y))).map(|(x, y)| differs(x, y)).max().unwrap()
+    };
+    assert!(changed(40..56, 28..44) > 40);
+    // The rim is far away.
+    assert!(changed(22..30, 10..18) <= 2);
+}
+
+#[test]
+fn a_film_lasts_as_long_as_its_script() {
+    let film =
+        made("a.gif", &["render", "paper", "vertical-60", "--size", "64x48", "--wireframe", "--frames-hz", "20"]);
+    let mut options = gif::DecodeOptions::new();
+    options.set_color_output(gif::ColorOutput::RGBA);
+    let mut decoder = options.read_info(&film[..]).unwrap();
+    assert_eq!((decoder.width(), decoder.height()), (64, 48));
+    let mut frames = Vec::new();
+    while let Some(frame) = decoder.read_next_frame().unwrap() {
+        assert_eq!(frame.delay, 5);
+        frames.push(frame.buffer.to_vec());
+    }
+    // 0, 0.05, …, 1 s.
+    assert_eq!(frames.len(), 21);
+    assert_ne!(frames[0], frames[6]);
+    let again =
+        made("b.gif", &["render", "paper", "vertical-60", "--size", "64x48", "--wireframe", "--frames-hz", "20"]);
+    assert_eq!(film, again);
+}
+
+#[test]
+fn what_can_not_be_drawn_is_refused_by_its_name() {
+    let with = |more: &[&str], named: &str| {
+        refused(&[&["render", "paper", "vertical-60"], more].concat(), named);
+    };
+    with(&["--output", "poke.jpg"], "--output");
+    with(&["--output", "a.png", "--size", "10x10"], "--size");
+    with(&["--output", "a.png", "--size", "large"], "--size");
+    with(&["--output", "a.png", "--camera", "1"], "camera");
+    with(&["--output", "a.png", "--camera", "0,200"], "camera elevation");
+    with(&["--output", "a.png", "--camera", "0,nan"], "camera elevation");
+    with(&["--output", "a.png", "--at-s", "1.5"], "--at-s");
+    with(&["--output", "a.gif", "--at-s", "0.5"], "--at-s");
+    with(&["--output", "a.gif", "--frames-hz", "0"], "--frames-hz");
+    with(&["--output", "a.png", "--refine", "11"], "refinement");
+    refused(&["render", "paper", "no-such-script", "--output", "a.png"], "no-such-script");
+}
