@@ -20,7 +20,7 @@ const TIME_TO_LIVE_S = 1;
 const REPEAT_MS = 100;
 /** Between two looks whether there is something to say. */
 const TICK_MS = 15;
-const LEASE_S = 2;
+const LEASE_S = 4;
 /** Who has not touched for so long lets the tool go. */
 const IDLE_MS = 5000;
 /** Batches on their way: a round trip does not slow the hand down, and connections are left for others. */
@@ -223,14 +223,10 @@ export class Hand {
   }
 
   private failed(error: unknown): void {
-    const was = this.pressed;
-    if (reasonOf(error) === "NOT_HOLDER" || isGone(error)) {
-      this.pressed = false;
-      this.lost();
-      // The server took the tool back, because nothing came for so long. Whoever still presses takes it again.
-      if (was && !isGone(error)) void this.press(this.placeM, this.onSurfaceM);
-      return;
-    }
-    this.onRefused(describe(error));
+    if (isGone(error)) this.pressed = false;
+    if (reasonOf(error) !== "NOT_HOLDER" && !isGone(error)) return this.onRefused(describe(error));
+    // The server took the tool back, because nothing came for so long. Whoever still presses takes it again.
+    this.lost();
+    if (this.pressed) void this.take().then((holds) => holds && this.tick());
   }
 }

@@ -32,8 +32,11 @@ export const sessions = createClient(SessionService, transport);
 export const haptics = createClient(HapticService, transport);
 export const views = createClient(ViewService, transport);
 
-/** Of every call that is no stream: a server that does not answer by then has gone. */
-export const PATIENCE_MS = 5000;
+/**
+ * Of every call that is no stream: a server that does not answer by then has gone. Long, for a window that was busy sees
+ * answers late; a server that is not there refuses at once.
+ */
+export const PATIENCE_MS = 20_000;
 
 /** The server's own reason (README, "Errors"); empty if it gave none. */
 export function reasonOf(error: unknown): string {

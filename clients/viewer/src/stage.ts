@@ -357,7 +357,7 @@ class ToolMark {
     if (axis.z < 0) axis.negate();
     axis.add(new Vector3(0.55, 0.2, 0)).normalize();
     if (axis.z > 0.2) this.shaft.quaternion.setFromUnitVectors(new Vector3(0, 0, 1), axis);
-    const length = Math.min(strength / mostN, 1.5) * 0.28 * size + 0.03 * size;
+    const length = Math.min(strength / mostN, 1) * 0.28 * size + 0.03 * size;
     this.arrow.setDirection(force.normalize());
     this.arrow.setLength(length, 0.03 * size, 0.018 * size);
   }

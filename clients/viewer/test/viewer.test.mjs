@@ -12,7 +12,7 @@ let browser;
 /** @type {Server} */
 let server;
 
-const VIEWPORT = { viewport: { width: 1000, height: 640 } };
+const VIEWPORT = { viewport: { width: 820, height: 540 } };
 
 /** A page of its own, in a profile of its own: other pages' connections are not counted with its. */
 async function open(url = server.url, options = {}) {
