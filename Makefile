@@ -1,23 +1,36 @@
-# One word each: run, test, lint, bench-…. Everything is built from crates.io and PyPI.
+# One word each: run, test, lint, bench-…. Everything is built from crates.io, PyPI and npm.
 
 CARGO ?= cargo
 PYTHON ?= python3
+NODE ?= node
+NPM ?= npm
 # Where `make run` listens.
 LISTEN ?= 127.0.0.1:7117
 SCRIPT ?= scripts/vertical-60.toml
 
 VENV := target/venv
 
-.PHONY: help run build test stress lint picture figures bench-roundtrip bench-duty bench-frames bench-error bench-kernel \
-	bench-stability bench-skip bench-rest bench-link need-rust need-python
+# The page: its sources, what npm installs for it, and what is built.
+VIEWER := clients/viewer
+PAGE := $(VIEWER)/dist/index.html
+MODULES := $(VIEWER)/node_modules/.package-lock.json
+PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/*.yaml $(VIEWER)/index.html $(VIEWER)/src/*.ts \
+	$(VIEWER)/src/*.css $(VIEWER)/public/* proto/palpate/v1/*.proto)
+
+.PHONY: help run build viewer page-if-node test test-viewer stress lint picture figures screenshot bench-roundtrip bench-duty \
+	bench-frames bench-error bench-kernel bench-stability bench-skip bench-rest bench-link bench-viewer need-rust \
+	need-python need-node
 
 help:
-	@echo 'make run             build, serve on $(LISTEN), poke the tissue, draw what it felt, go on serving'
-	@echo 'make test            every test (Rust and Python 3)'
+	@echo 'make run             build, serve on $(LISTEN), poke the tissue, draw what it felt, go on serving: see it in a browser'
+	@echo 'make viewer          the page that shows the tissue, clients/viewer/dist (Node.js; make run does it by itself)'
+	@echo 'make test            every test (Rust, Python 3, and the page in a browser)'
+	@echo 'make test-viewer     the page alone; its screenshots are in target/viewer'
 	@echo 'make stress          ten thousand random scenes, ten million steps (some minutes)'
 	@echo 'make lint            formatting, compiler and clippy warnings'
-	@echo 'make picture         the picture of the README'
+	@echo 'make picture         the curve of the README'
 	@echo 'make figures         the paper'"'"'s figures and experiments: docs/figures, shown in docs/paper.md'
+	@echo 'make screenshot      the screenshot of the README'
 	@echo 'make bench-roundtrip the haptic round trip beside a bare gRPC echo'
 	@echo 'make bench-duty      a minute of 1 kHz touch and 60 frames a second: time kept, commands lost'
 	@echo 'make bench-rest      a thousand sessions at rest: their share of a core, and the memory of each'
@@ -25,6 +38,7 @@ help:
 	@echo 'make bench-error     run time against error, every scheme on seven scenes: docs/benchmarks/error.md'
 	@echo 'make bench-kernel    the time of a step beside the machine'"'"'s limits, numba, Taichi and NumPy'
 	@echo 'make bench-link      touch over a network in virtual time, by delay, tissue, hand and scheme: docs/benchmarks/link.md'
+	@echo 'make bench-viewer    331 × 331 points at 60 frames a second in a browser, and from a press to its pixel'
 	@echo 'make bench-stability the largest stable step, predicted and observed'
 	@echo 'make bench-skip      what it saves to leave out what is at rest, and its error'
 
@@ -35,11 +49,28 @@ need-python:
 	@$(PYTHON) -c 'import sys, venv, ensurepip; assert sys.version_info >= (3, 9)' 2>/dev/null || \
 		{ echo 'Python 3.9 or later with venv is missing (Debian: apt-get install python3-venv)' >&2; exit 1; }
 
+need-node:
+	@$(NODE) -e 'const [major, minor] = process.versions.node.split("."); process.exit(major > 20 || major == 20 && minor >= 19 ? 0 : 1)' 2>/dev/null || \
+		{ echo 'Node.js 20.19 or later is missing: install it from https://nodejs.org' >&2; exit 1; }
+
 build: need-rust
 	$(CARGO) build --release --workspace
 
+$(MODULES): $(VIEWER)/package-lock.json | need-node
+	cd $(VIEWER) && $(NPM) ci
+	@touch $@
+
+$(PAGE): $(MODULES) $(PAGE_SOURCES)
+	cd $(VIEWER) && $(NPM) run build
+
+viewer: need-node $(PAGE)
+
+# Whoever has no Node.js, or no way to npm, is served all the same.
+page-if-node:
+	@$(MAKE) --no-print-directory viewer || echo 'So there is no page to look at; gRPC is served all the same.' >&2
+
 # The server runs until Ctrl-C, which reaches it as well as this shell.
-run: build
+run: build page-if-node
 	@rm -f target/serving.txt; \
 	./target/release/palpate serve --listen $(LISTEN) --log warn > target/serving.txt & server=$$!; \
 	trap 'kill $$server 2>/dev/null; wait $$server; exit 0' INT TERM; \
@@ -47,7 +78,8 @@ run: build
 	url=$$(grep -o 'http.*' target/serving.txt); \
 	./target/release/palpate-client replay $(SCRIPT) --server $$url --output target/poke.jsonl --plot \
 		|| { kill $$server; exit 1; }; \
-	echo; echo "The records are in target/poke.jsonl. Serving on $$url until Ctrl-C."; \
+	echo; echo "The records are in target/poke.jsonl. Serving until Ctrl-C. To touch the tissue, open"; \
+	echo; echo "    $$url"; echo; \
 	wait $$server
 
 $(VENV)/ready: tests/python/requirements.txt | need-python
@@ -55,13 +87,17 @@ $(VENV)/ready: tests/python/requirements.txt | need-python
 	$(VENV)/bin/pip install --quiet --disable-pip-version-check -r tests/python/requirements.txt
 	touch $@
 
-test: build $(VENV)/ready
+test: build $(VENV)/ready test-viewer
 	$(CARGO) test --release --workspace
 	$(VENV)/bin/python -m unittest discover -s tests/python -v
 
-lint: need-rust
+test-viewer: build viewer
+	cd $(VIEWER) && $(NPM) test
+
+lint: need-rust $(MODULES)
 	$(CARGO) fmt --all --check
 	$(CARGO) clippy --release --workspace --all-targets -- -D warnings
+	cd $(VIEWER) && $(NPM) run lint
 
 picture: build
 	$(PYTHON) docs/poke.py
@@ -69,6 +105,9 @@ picture: build
 # The same bytes on every run.
 figures: need-rust
 	$(CARGO) run --release --quiet --example figures
+
+screenshot: build viewer
+	cd $(VIEWER) && $(NPM) run screenshot
 
 bench-roundtrip: build
 	@echo "Machine: $$(sed -n 's/^model name.*: //p' /proc/cpuinfo 2>/dev/null | sort | uniq -c)"
@@ -113,6 +152,11 @@ bench-stability: need-rust
 
 bench-skip: need-rust
 	$(CARGO) bench --quiet --bench skip -- $(ARGUMENTS)
+
+# `make bench-viewer SECONDS=60 PRESSES=500`: these are the environment's.
+bench-viewer: build viewer
+	@cd $(VIEWER) && $(NPM) --silent run bench
+
 # `make bench-link ARGUMENTS=--quick` for a minute's worth; the whole takes about half an hour.
 bench-link: build
 	$(CARGO) bench --quiet --bench link -- $(ARGUMENTS)

@@ -56,7 +56,7 @@ enum Command {
         by texture_seed and texture_size in its section [appearance], or an image of its own by texture = \"FILE.png\".\n\
         Exit status: 0; 1 when the file can't be written; 2 when an input was refused.")]
     Texture(TextureArguments),
-    /// Serve tissue over gRPC: sessions stepped in real time, commands in, forces and frames out
+    /// Serve tissue over gRPC and in the browser: sessions stepped in real time, commands in, forces and frames out
     #[command(after_help = "Examples:\n  \
         palpate serve\n  \
         palpate serve --listen 127.0.0.1:0 --scenes my-scenes --threads 1\n\n\
@@ -73,6 +73,12 @@ struct ServeArguments {
     /// Folder of the scenes that sessions can be made from by name [default: scenes]
     #[arg(long, value_name = "DIR")]
     scenes: Option<PathBuf>,
+    /// Folder of the scripts that clients can ask for by name [default: scripts]
+    #[arg(long, value_name = "DIR")]
+    scripts: Option<PathBuf>,
+    /// Folder of the page that `/` shows, built by `npm run build` in clients/viewer [default: clients/viewer/dist]
+    #[arg(long, value_name = "DIR")]
+    viewer: Option<PathBuf>,
     /// Configuration file (TOML); its keys are in the README. These options go before it
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
@@ -201,11 +207,16 @@ fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     if let Some(listen) = &arguments.listen {
         config.listen.clone_from(listen);
     }
-    if let Some(scenes) = &arguments.scenes {
-        if !scenes.is_dir() {
-            return Err(Failure::Refused(format!("--scenes {}: is not a folder", scenes.display())));
+    for (option, folder, key) in [
+        ("--scenes", &arguments.scenes, &mut config.scenes),
+        ("--scripts", &arguments.scripts, &mut config.scripts),
+        ("--viewer", &arguments.viewer, &mut config.viewer),
+    ] {
+        let Some(folder) = folder else { continue };
+        if !folder.is_dir() {
+            return Err(Failure::Refused(format!("{option} {}: is not a folder", folder.display())));
         }
-        config.scenes.clone_from(scenes);
+        key.clone_from(folder);
     }
     if let Some(threads) = arguments.threads {
         config.threads = threads;
@@ -285,7 +296,7 @@ fn compile(arguments: &SceneArguments) -> Result<(Arc<Model>, Limits), Failure> 
     let scene = match path.to_str() {
         // A bare word that is no file is a name.
         Some(name) if !path.is_file() && path.components().count() == 1 && path.extension().is_none() => {
-            Catalog::new(&arguments.scenes).load(name, &arguments.set, &limits)?
+            Catalog::new(&arguments.scenes, Path::new("scripts")).load(name, &arguments.set, &limits)?
         }
         _ => Scene::load(path, &arguments.set, &limits)?,
     };

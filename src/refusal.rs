@@ -42,6 +42,8 @@ reasons! {
     OffSheet = "OFF_SHEET",
     /// No scene of that name.
     UnknownScene = "UNKNOWN_SCENE",
+    /// No script of that name.
+    UnknownScript = "UNKNOWN_SCRIPT",
     /// No session of that id.
     UnknownSession = "UNKNOWN_SESSION",
     /// The session was there, and has been deleted.

@@ -13,6 +13,13 @@ use super::{Change, Scene, Sheet};
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, not_negative, number, positive};
 
+/// The scripts that ship, within the program: name and text.
+pub const BUILT_IN: [(&str, &str); 3] = [
+    ("oblique-100", include_str!("../../scripts/oblique-100.toml")),
+    ("oblique-60", include_str!("../../scripts/oblique-60.toml")),
+    ("vertical-60", include_str!("../../scripts/vertical-60.toml")),
+];
+
 /// A script bound to a scene: what to do at which step.
 #[derive(Debug, Clone)]
 pub struct Script {

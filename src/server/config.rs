@@ -16,6 +16,10 @@ pub struct Config {
     pub listen: String,
     /// Folder of the scenes that sessions can be made from by name.
     pub scenes: PathBuf,
+    /// Folder of the scripts that clients can ask for by name.
+    pub scripts: PathBuf,
+    /// Folder of the page that `/` shows, built by `npm run build`.
+    pub viewer: PathBuf,
     /// Stepping threads; one less than the machine has cores if 0.
     pub threads: usize,
     /// Threads of the network side.
@@ -37,6 +41,8 @@ impl Default for Config {
         Config {
             listen: "127.0.0.1:7117".to_owned(),
             scenes: PathBuf::from("scenes"),
+            scripts: PathBuf::from("scripts"),
+            viewer: PathBuf::from("clients/viewer/dist"),
             threads: 0,
             network_threads: 2,
             shutdown_deadline_s: 5.0,

@@ -1,8 +1,10 @@
-//! The gRPC server: services over `pace`, health, reflection, and a shutdown with a deadline.
+//! The server: gRPC services over `pace`, for browsers too (gRPC-web), their page, health, reflection, and a shutdown
+//! with a deadline.
 
 pub mod catalog;
 pub mod config;
 mod haptics;
+mod page;
 mod sessions;
 mod textures;
 mod views;
@@ -12,8 +14,10 @@ use std::time::Duration;
 
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
+use tonic::service::Routes;
 use tonic::transport::Server;
 use tonic::transport::server::TcpIncoming;
+use tonic_web::GrpcWebLayer;
 use tracing::{info, warn};
 
 use crate::pace::Pacer;
@@ -53,7 +57,7 @@ pub enum ServeError {
 pub async fn serve(listener: TcpListener, config: Config, shutdown: CancellationToken) -> Result<(), ServeError> {
     let pacer = Pacer::start(config.stepping_threads(), &config.limits)?;
     let deadline = Duration::from_secs_f64(config.shutdown_deadline_s);
-    let catalog = Catalog::new(&config.scenes);
+    let catalog = Catalog::new(&config.scenes, &config.scripts);
     for name in catalog.names() {
         if let Err(refusal) = catalog.load(&name, &[], &config.limits) {
             warn!(%refusal, "a scene that no session can be made from");
@@ -83,18 +87,29 @@ pub async fn serve(listener: TcpListener, config: Config, shutdown: Cancellation
         }
     };
 
+    let folder = Arc::new(house.config.viewer.clone());
+    let painter = house.clone();
+    let routes = Routes::new(health_service)
+        .add_service(reflection().build_v1()?)
+        .add_service(reflection().build_v1alpha()?)
+        .add_service(SessionServiceServer::new(sessions::Sessions(house.clone())))
+        .add_service(HapticServiceServer::new(haptics::Haptics(house.clone())))
+        .add_service(ViewServiceServer::new(views::Views(house)))
+        .into_axum_router()
+        // Of the services alone: it refuses what is no gRPC.
+        .route_layer(GrpcWebLayer::new())
+        .route("/textures/{file}", axum::routing::get(move |file, headers| textures::file(painter, file, headers)))
+        .fallback(move |request| page::page(folder.clone(), request));
+
     // Nagle's algorithm would hold a sample back for milliseconds.
     let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
     let serving = Server::builder()
         // Finds out about clients whose host has vanished.
         .http2_keepalive_interval(Some(Duration::from_secs(10)))
         .http2_keepalive_timeout(Some(Duration::from_secs(10)))
-        .add_service(health_service)
-        .add_service(reflection().build_v1()?)
-        .add_service(reflection().build_v1alpha()?)
-        .add_service(SessionServiceServer::new(sessions::Sessions(house.clone())))
-        .add_service(HapticServiceServer::new(haptics::Haptics(house.clone())))
-        .add_service(ViewServiceServer::new(views::Views(house)))
+        // Browsers speak HTTP/2 only over TLS.
+        .accept_http1(true)
+        .add_routes(routes.into())
         .serve_with_incoming_shutdown(incoming, shutdown.clone().cancelled_owned());
 
     // One deadline for all that is left to do. A step that outlasts it goes down with the process.

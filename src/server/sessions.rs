@@ -1,12 +1,15 @@
 //! `SessionService`.
 
+use std::pin::Pin;
 use std::sync::Arc;
 
+use futures_util::stream::{self, Stream};
 use tonic::{Request, Response, Status};
 use tracing::{info, warn};
 
 use super::House;
 use crate::refusal::{Reason, Refusal, number};
+use crate::scene::script::Script;
 use crate::wire::pb::session_service_server::SessionService;
 use crate::wire::{self, pb};
 
@@ -14,6 +17,8 @@ pub(super) struct Sessions(pub(super) House);
 
 #[tonic::async_trait]
 impl SessionService for Sessions {
+    type GetScriptStream = Pin<Box<dyn Stream<Item = Result<pb::GetScriptResponse, Status>> + Send>>;
+
     async fn list_scenes(&self, _: Request<pb::ListScenesRequest>) -> Result<Response<pb::ListScenesResponse>, Status> {
         Ok(Response::new(pb::ListScenesResponse { scene_names: self.0.catalog.names() }))
     }
@@ -122,4 +127,57 @@ impl SessionService for Sessions {
         let (step, hash) = live.hash_at(request.at_step).await?;
         Ok(Response::new(pb::GetStateHashResponse { step, state_hash: format!("{hash:032x}") }))
     }
+
+    async fn list_scripts(
+        &self,
+        _: Request<pb::ListScriptsRequest>,
+    ) -> Result<Response<pb::ListScriptsResponse>, Status> {
+        Ok(Response::new(pb::ListScriptsResponse { script_names: self.0.catalog.script_names() }))
+    }
+
+    async fn get_script(
+        &self,
+        request: Request<pb::GetScriptRequest>,
+    ) -> Result<Response<Self::GetScriptStream>, Status> {
+        let request = request.into_inner();
+        let live = self.0.pacer.get(&request.session_id)?;
+        let guard = live.open_stream()?;
+        let (catalog, config) = (self.0.catalog.clone(), self.0.config.clone());
+        // A script may have traces of megabytes.
+        let read = tokio::task::spawn_blocking(move || {
+            catalog.script(&request.script_name, &live.model.scene, &config.limits)
+        });
+        let script = read.await.map_err(|e| Status::internal(e.to_string()))??;
+        let out = stream::unfold(Some((script, 0, guard)), |state| async move {
+            let (script, from, guard) = state?;
+            let (message, next) = script_part(&script, from);
+            Some((Ok(message), next.map(|next| (script, next, guard))))
+        });
+        Ok(Response::new(Box::pin(out)))
+    }
+}
+
+/// Commands of one message: 50 KiB or so.
+const COMMANDS_PER_PART: usize = 500;
+
+/// Steps that are looked at for one message, so that a script of a week does not hold a thread.
+const STEPS_PER_PART: u64 = 100_000;
+
+/// What the script does from step `from` on, and the step from which the next part goes on.
+#[allow(clippy::cast_possible_truncation)]
+fn script_part(script: &Script, from: u64) -> (pb::GetScriptResponse, Option<u64>) {
+    let mut message = pb::GetScriptResponse { steps: script.steps, tools: script.tools() as u32, ..Default::default() };
+    if from == 0 {
+        message.warnings.clone_from(&script.warnings);
+    }
+    let end = script.steps.min(from + STEPS_PER_PART);
+    let mut step = from;
+    while step < end && message.commands.len() < COMMANDS_PER_PART {
+        let commands = script.actions_at(step).map(|(tool, action)| wire::command::scripted(tool, step, &action, 0));
+        message.commands.extend(commands);
+        step += 1;
+    }
+    message.last = step == script.steps;
+    let next = (!message.last).then_some(step);
+    (message, next)
 }

@@ -2,9 +2,12 @@
 
 use std::sync::{Arc, Mutex};
 
+use axum::extract::Path;
+use axum::http::{HeaderMap, StatusCode};
+use axum::response::{IntoResponse, Response};
 use tonic::Status;
 
-use super::House;
+use super::{House, page};
 use crate::pace::queue::lock;
 use crate::refusal::Refusal;
 use crate::scene::Appearance;
@@ -16,6 +19,16 @@ const MOST_KEPT: usize = 8;
 /// The textures last asked for, the newest last.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Textures(Arc<Mutex<Vec<(Appearance, Texture)>>>);
+
+/// `NAME.png` for a browser, which draws a picture of its own where there is none.
+pub(super) async fn file(house: House, Path(file): Path<String>, headers: HeaderMap) -> Response {
+    match house.texture(file.strip_suffix(".png").unwrap_or(&file)).await {
+        // A scene's own image may be another one soon.
+        Ok(texture) => page::cached(texture.png, "image/png", "no-cache", &headers),
+        // Not an error, of which a browser would tell.
+        Err(_) => StatusCode::NO_CONTENT.into_response(),
+    }
+}
 
 impl House {
     /// The texture of a session by its id, of a scene that the server has by its name, or the `default` one. Made or read

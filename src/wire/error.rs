@@ -23,9 +23,11 @@ pub fn code(reason: Reason) -> Code {
         | Reason::OffSheet
         | Reason::OutOfTurn => Code::InvalidArgument,
         Reason::TooLarge | Reason::QueueFull | Reason::TooMany => Code::ResourceExhausted,
-        Reason::UnknownScene | Reason::UnknownSession | Reason::SessionDeleted | Reason::UnknownViewer => {
-            Code::NotFound
-        }
+        Reason::UnknownScene
+        | Reason::UnknownScript
+        | Reason::UnknownSession
+        | Reason::SessionDeleted
+        | Reason::UnknownViewer => Code::NotFound,
         Reason::SessionHeld | Reason::StaleSequence | Reason::NotAvailable => Code::FailedPrecondition,
         Reason::ToolHeld => Code::AlreadyExists,
         Reason::NotHolder => Code::PermissionDenied,

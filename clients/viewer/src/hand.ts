@@ -1,0 +1,232 @@
+// The hand: one tool, held by a lease, led by mouse, finger or keys.
+//
+// Pushing is the paper's surgical force at the place where one began, leaning the way one drags. Stroking takes it along,
+// leaning the way it goes. Pulling grasps a mass point, and brings it where one drags it. Tools that are led by poses
+// would do as well, but need a command every 50 ms, which no browser promises.
+
+import type { MessageInitShape } from "@bufbuild/protobuf";
+import type { CommandSchema, Sample } from "./gen/palpate/v1/haptic_pb";
+import type { Vec3 } from "./samples";
+import { describe, haptics, isGone, PATIENCE_MS, reasonOf } from "./server";
+
+export type Mode = "push" | "pull" | "stroke";
+type Command = MessageInitShape<typeof CommandSchema>;
+
+/** The number of the tool that pages hold. */
+const TOOL = 0;
+/** Of the tissue's own time, without a newer command: a page that vanishes does not go on pressing. */
+const TIME_TO_LIVE_S = 1;
+/** Between two commands that say the same: well within the time to live. */
+const REPEAT_MS = 100;
+/** Between two looks whether there is something to say. */
+const TICK_MS = 15;
+const LEASE_S = 4;
+/** Who has not touched for so long lets the tool go. */
+const IDLE_MS = 5000;
+/** Batches on their way: a round trip does not slow the hand down, and connections are left for others. */
+const IN_FLIGHT = 2;
+
+/** What the tissue makes of a strength of 1. */
+export interface Reach {
+  spacingM: number;
+  /** Of a push. */
+  mostN: number;
+  /** Of a drag that leans a push all the way, and of a pull by keys. */
+  depthM: number;
+}
+
+
+export class Hand {
+  mode: Mode = "push";
+  /** 0 to 1. */
+  strength = 0.5;
+  /** Round trip of the last batch less what the server held it, ms. */
+  networkMs: number | undefined;
+  onChange: () => void = () => {};
+  onRefused: (message: string) => void = () => {};
+  private leaseId: string | undefined;
+  private taking: Promise<boolean> | undefined;
+  private sequence = 0n;
+  private pressed = false;
+  private placeM: [number, number] = [0, 0];
+  private onSurfaceM: Vec3 = [0, 0, 0];
+  private leanM: Vec3 = [0, 0, 0];
+  private released = true;
+  private underWay = 0;
+  private sentMs = 0;
+  private touchedMs = 0;
+  private timer: ReturnType<typeof setInterval> | undefined;
+  private fresh = false;
+
+  constructor(
+    readonly sessionId: string,
+    private readonly name: string,
+    readonly reach: Reach,
+  ) {}
+
+  get holds(): boolean {
+    return this.leaseId !== undefined;
+  }
+
+  get touches(): boolean {
+    return this.pressed;
+  }
+
+  /** Takes the tool if it is free. */
+  take(): Promise<boolean> {
+    if (this.leaseId) return Promise.resolve(true);
+    this.taking ??= this.acquire().finally(() => (this.taking = undefined));
+    return this.taking;
+  }
+
+  private async acquire(): Promise<boolean> {
+    const request = { sessionId: this.sessionId, tool: TOOL, leaseS: LEASE_S, holder: this.name };
+    try {
+      const { leaseId } = await haptics.acquireTool(request, { timeoutMs: PATIENCE_MS });
+      this.leaseId = leaseId;
+      this.sequence = 0n;
+      this.touchedMs = performance.now();
+      this.timer ??= setInterval(() => this.tick(), TICK_MS);
+      this.onChange();
+      return true;
+    } catch (error) {
+      this.pressed = false;
+      this.onRefused(reasonOf(error) === "TOOL_HELD" ? "Somebody else holds the tool: look on." : describe(error));
+      this.onChange();
+      return false;
+    }
+  }
+
+  /** Begins to touch at a place of the rest plane, whose tissue is on the surface there. */
+  async press(placeM: [number, number], onSurfaceM: Vec3): Promise<void> {
+    this.pressed = true;
+    this.released = false;
+    this.placeM = placeM;
+    this.onSurfaceM = onSurfaceM;
+    this.leanM = [0, 0, 0];
+    this.touchedMs = performance.now();
+    this.fresh = true;
+    if (await this.take()) this.tick();
+  }
+
+  /** Goes on to another place, leaning the way it goes. */
+  goOn(placeM: [number, number]): void {
+    const way = [placeM[0] - this.placeM[0], placeM[1] - this.placeM[1]] as const;
+    // What was before fades, as long as a push leans all the way.
+    const kept = Math.exp(-Math.hypot(...way) / this.reach.depthM);
+    this.placeM = placeM;
+    this.lean([kept * this.leanM[0] + way[0], kept * this.leanM[1] + way[1], 0]);
+  }
+
+  /** Leans that far from where it was pressed. */
+  lean(leanM: Vec3): void {
+    if (!this.pressed) return;
+    this.leanM = leanM;
+    this.touchedMs = performance.now();
+    this.fresh = true;
+    this.tick();
+  }
+
+  /** Ends the touch; the tool stays in the hand for a while. */
+  lift(): void {
+    if (!this.pressed) return;
+    this.pressed = false;
+    this.touchedMs = performance.now();
+    this.fresh = true;
+    this.tick();
+  }
+
+  /** Gives the tool back. */
+  async letGo(): Promise<void> {
+    const leaseId = this.leaseId;
+    this.pressed = false;
+    this.lost();
+    if (!leaseId) return;
+    try {
+      await haptics.releaseTool({ sessionId: this.sessionId, leaseId }, { timeoutMs: PATIENCE_MS });
+    } catch {
+      // The lease ends by itself, and what the tool did with it.
+    }
+  }
+
+  private lost(): void {
+    this.leaseId = undefined;
+    clearInterval(this.timer);
+    this.timer = undefined;
+    this.onChange();
+  }
+
+  /** Says what there is to say, if it is time to. */
+  private tick(): void {
+    if (!this.leaseId || this.underWay >= IN_FLIGHT) return;
+    const now = performance.now();
+    const isRest = !this.pressed && this.released;
+    if (isRest && now - this.touchedMs > IDLE_MS) return void this.letGo();
+    // At rest just enough that the lease does not end.
+    if (!this.fresh && now - this.sentMs < (isRest ? (LEASE_S * 1000) / 4 : REPEAT_MS)) return;
+    this.fresh = false;
+    this.sentMs = now;
+    const commands = isRest ? [] : [this.command(now)];
+    this.released = !this.pressed;
+    void this.send(this.leaseId, commands);
+  }
+
+  private command(now: number): Command {
+    this.sequence += 1n;
+    const command = { tool: TOOL, sequence: this.sequence, clientTimeNs: BigInt(Math.round(now * 1e6)) };
+    if (!this.pressed) return { ...command, action: { case: "release", value: {} } };
+    const [x, y] = this.placeM;
+    const { spacingM, mostN } = this.reach;
+    const timeToLiveS = TIME_TO_LIVE_S;
+    if (this.mode === "pull") {
+      const point = { x: Math.round(x / spacingM), y: Math.round(y / spacingM) };
+      const [from, lean] = [this.onSurfaceM, this.leanM];
+      const positionM = { x: from[0] + lean[0], y: from[1] + lean[1], z: from[2] + lean[2] };
+      const target = { case: "positionM" as const, value: positionM };
+      return { ...command, timeToLiveS, action: { case: "position", value: { point, target } } };
+    }
+    const centre = { case: "centreM" as const, value: { x, y } };
+    const value = { centre, forceN: this.forceN(mostN * this.strength), falloffPerM: 1 / spacingM };
+    return { ...command, timeToLiveS, action: { case: "force", value } };
+  }
+
+  /** Down, and the way of the drag: at 45° when that is as far as the reach. */
+  private forceN(strengthN: number): { x: number; y: number; z: number } {
+    const across = [this.leanM[0] / this.reach.depthM, this.leanM[1] / this.reach.depthM] as const;
+    const most = Math.max(1, Math.hypot(...across));
+    const way = [across[0] / most, across[1] / most, -1] as const;
+    const norm = strengthN / Math.hypot(...way);
+    return { x: way[0] * norm, y: way[1] * norm, z: way[2] * norm };
+  }
+
+  private async send(leaseId: string, commands: Command[]): Promise<void> {
+    const begun = performance.now();
+    this.underWay += 1;
+    try {
+      const request = { sessionId: this.sessionId, leaseId, commands };
+      const { sample } = await haptics.sendCommands(request, { timeoutMs: PATIENCE_MS });
+      if (sample && commands.length > 0) this.measure(sample, performance.now() - begun);
+    } catch (error) {
+      // Two batches may overtake one another: the newer counts.
+      if (reasonOf(error) !== "STALE_SEQUENCE" && this.leaseId === leaseId) this.failed(error);
+    } finally {
+      this.underWay -= 1;
+    }
+    this.tick();
+  }
+
+  private measure(sample: Sample, tookMs: number): void {
+    const tool = sample.tools[0];
+    if (tool && tool.acknowledgedSequence === this.sequence) {
+      this.networkMs = Math.max(0, tookMs - Number(tool.serverHoldNs) / 1e6);
+    }
+  }
+
+  private failed(error: unknown): void {
+    if (isGone(error)) this.pressed = false;
+    if (reasonOf(error) !== "NOT_HOLDER" && !isGone(error)) return this.onRefused(describe(error));
+    // The server took the tool back, because nothing came for so long. Whoever still presses takes it again.
+    this.lost();
+    if (this.pressed) void this.take().then((holds) => holds && this.tick());
+  }
+}

@@ -1,0 +1,49 @@
+// From a press to the pixel that shows it: measured in the page, on the picture itself.
+
+import type { Stage } from "./stage";
+
+/** Sum over red, green and blue by which a pixel must differ: above what smoothing edges could do. */
+const SEEN = 6;
+
+interface Watch {
+  x: number;
+  y: number;
+  before: Uint8Array;
+  pressedMs: number | undefined;
+  done: (ms: number) => void;
+}
+
+export class Latency {
+  private watch: Watch | undefined;
+
+  constructor(private readonly stage: Stage) {}
+
+  /** Resolves with the milliseconds from the next press to when the pixel at (x, y) of the window has changed. */
+  next(x: number, y: number): Promise<number> {
+    this.stage.hideTools();
+    return new Promise((done) => {
+      this.watch = { x, y, before: new Uint8Array(), pressedMs: undefined, done };
+      this.stage.draw();
+    });
+  }
+
+  /** A press, at the time that the browser gives it. */
+  pressed(eventMs: number): void {
+    if (this.watch && this.watch.pressedMs === undefined) this.watch.pressedMs = eventMs;
+  }
+
+  /** After each picture. */
+  drawn(): void {
+    const watch = this.watch;
+    if (!watch) return;
+    const now = this.stage.pixel(watch.x, watch.y);
+    if (watch.pressedMs === undefined || watch.before.length === 0) {
+      watch.before = now;
+      return;
+    }
+    const difference = [0, 1, 2].reduce((sum, i) => sum + Math.abs(now[i]! - watch.before[i]!), 0);
+    if (difference < SEEN) return;
+    this.watch = undefined;
+    watch.done(performance.now() - watch.pressedMs);
+  }
+}

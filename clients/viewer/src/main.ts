@@ -1,0 +1,310 @@
+// The page: puts the parts together.
+
+import type { Session } from "./gen/palpate/v1/session_pb";
+import { SessionState } from "./gen/palpate/v1/session_pb";
+import type { Mode } from "./hand";
+import { Input } from "./input";
+import { Latency } from "./latency";
+import { asked, askedNumber, holderName, part, writeAddress } from "./page";
+import { Plots, quantity } from "./plot";
+import { norm, type Vec3 } from "./samples";
+import { playScript } from "./script";
+import { backoffMs, describe, isGone, PATIENCE_MS, reasonOf, received, sessions, sleep } from "./server";
+import { Stage } from "./stage";
+import { Status } from "./status";
+import { tissueTexture } from "./texture";
+import { TissueValues } from "./tissue";
+import { Visit } from "./visit";
+
+/** The scene of a new session, if the server has it and the address asks for no other. */
+const DEFAULT_SCENE = "paper";
+
+const canvas = part("tissue", HTMLCanvasElement);
+const stage = new Stage(canvas, asked.get("quality") === "high");
+const latency = new Latency(stage);
+const status = new Status(part("connection", HTMLElement), part("figures", HTMLElement));
+const plots = new Plots(part("plot-displacement", HTMLCanvasElement), part("plot-force", HTMLCanvasElement));
+const tissue = new TissueValues(heard, notice);
+const holder = holderName();
+let visit: Visit | undefined;
+let playing: AbortController | undefined;
+
+new Input(canvas, stage, latency, () => visit);
+
+let noticed: ReturnType<typeof setTimeout> | undefined;
+/** Says something for a while; for ever if `seconds` is 0. */
+function notice(text: string, seconds = 5): void {
+  const line = part("notice", HTMLElement);
+  clearTimeout(noticed);
+  line.textContent = text;
+  line.hidden = text === "";
+  if (seconds > 0) noticed = setTimeout(() => (line.hidden = true), 1000 * seconds);
+}
+
+/** Goes to a session: one that is there, or a new one of a scene. */
+async function open(sessionId: string | undefined, scene: string | undefined): Promise<void> {
+  visit?.leave();
+  visit = undefined;
+  playing?.abort();
+  for (let failures = 0; ; failures++) {
+    try {
+      const session = sessionId
+        ? (await sessions.getSession({ sessionId }, { timeoutMs: PATIENCE_MS })).session
+        : (await sessions.createSession({ source: { case: "sceneName", value: scene ?? DEFAULT_SCENE } }, {})).session;
+      if (session) return await show(session, sessionId === undefined);
+    } catch (error) {
+      const refused = describe(error);
+      if (isGone(error)) return over("There is no such session any more.");
+      // What the server refuses for a reason it refuses again.
+      if (!["", "SHUTTING_DOWN", "TOO_MANY"].includes(reasonOf(error))) return over(`${refused}.`);
+      const waitMs = backoffMs(failures);
+      status.say(`The server does not answer as it should (${refused}). Trying again in ${(waitMs / 1000).toFixed(1)} s.`);
+      await sleep(waitMs);
+    }
+  }
+}
+
+/** A session has ended: what to do is for the person to say. */
+function over(why: string): void {
+  visit?.leave();
+  visit = undefined;
+  status.say(why);
+  notice(`${why} `, 0);
+  const again = document.createElement("button");
+  again.textContent = "Begin a new one";
+  again.addEventListener("click", () => {
+    notice("", 0);
+    void open(undefined, part("scene", HTMLSelectElement).value || undefined);
+  });
+  part("notice", HTMLElement).append(again);
+}
+
+async function show(session: Session, isNew: boolean): Promise<void> {
+  writeAddress(session.sessionId, isNew && new URLSearchParams(location.search).has("session"));
+  const next = new Visit(session, holder, askedNumber("refinement", 0, 10), {
+    onSession: heard,
+    onTrouble: trouble,
+    onWell: () => visit === next && status.say(wellText(next.session)),
+  });
+  visit = next;
+  next.hand.mode = chosenMode();
+  next.hand.strength = Number(part("strength", HTMLInputElement).value);
+  next.hand.onRefused = notice;
+  next.hand.onChange = holding;
+  next.frames.onFrame = () => stage.draw();
+  next.samples.onSample = () => felt(next);
+  const slider = part("refinement", HTMLInputElement);
+  slider.max = String(next.mostRefinement);
+  slider.value = String(next.refinement);
+  tellControls();
+  tissue.begin(session);
+  stage.show(next.surface, next.extentM, undefined, false);
+  stage.setTools([], 1);
+  next.begin();
+  if (document.hidden) next.lookAway();
+  const texture = await tissueTexture(session.sessionId);
+  if (visit === next) stage.show(next.surface, next.extentM, texture, true);
+}
+
+function wellText(session: Session): string {
+  const name = session.scene?.name ?? "";
+  if (session.state === SessionState.HELD) return `The session is held: ${session.holdReason}`;
+  if (session.state === SessionState.PAUSED) return `Connected to a session of ${name}; its time stands still.`;
+  return `Connected to a session of ${name}.`;
+}
+
+function trouble(error: unknown, waitMs: number): void {
+  if (isGone(error)) return over("The session has ended.");
+  status.say(`Connection lost (${describe(error)}). Trying again in ${(waitMs / 1000).toFixed(1)} s.`);
+}
+
+/** What the session says of itself. */
+function heard(session: Session): void {
+  if (session.sessionId !== visit?.session.sessionId) return;
+  visit.session = session;
+  tissue.show(session);
+  holding();
+}
+
+function holding(): void {
+  if (!visit) return;
+  const mine = visit.hand.holds;
+  const others = visit.session.heldTools.filter((tool) => !mine || tool.tool !== 0);
+  const names = others.map((tool) => `${tool.holder || "Somebody"} holds ${tool.tool === 0 ? "the tool" : `tool ${tool.tool}`}`);
+  part("holder", HTMLElement).textContent = mine ? `You (${holder}) hold the tool` : names.join(", ") || "The tool is free";
+  part("release", HTMLButtonElement).disabled = !mine;
+}
+
+/** Where tools are, and what they feel. */
+function felt(of: Visit): void {
+  if (of !== visit) return;
+  const { spacingM, mostN } = of.reach;
+  const shown = of.samples.tools.map(({ point, displacementM: [x, y, z], forceN }) => {
+    const placeM: Vec3 = [(point?.x ?? 0) * spacingM + x, (point?.y ?? 0) * spacingM + y, z];
+    return { placeM, forceN };
+  });
+  stage.setTools(shown, mostN);
+}
+
+function tellControls(): void {
+  if (!visit) return;
+  const { hand, reach } = visit;
+  const text = hand.mode === "pull" ? "as you drag" : quantity(hand.strength * reach.mostN, "N");
+  part("strength-value", HTMLOutputElement).value = text;
+  part("strength", HTMLInputElement).setAttribute("aria-valuetext", text);
+  part("refinement-value", HTMLOutputElement).value = String(visit.refinement);
+}
+
+function chosenMode(): Mode {
+  const chosen = document.querySelector<HTMLInputElement>("input[name=mode]:checked");
+  return (chosen?.value ?? "push") as Mode;
+}
+
+part("mode", HTMLElement).addEventListener("change", () => {
+  if (!visit) return;
+  visit.hand.lift();
+  visit.hand.mode = chosenMode();
+  tellControls();
+});
+part("strength", HTMLInputElement).addEventListener("input", (event) => {
+  if (visit) visit.hand.strength = Number((event.target as HTMLInputElement).value);
+  tellControls();
+});
+part("release", HTMLButtonElement).addEventListener("click", () => void visit?.hand.letGo());
+part("wireframe", HTMLInputElement).addEventListener("change", (event) => {
+  stage.setWireframe((event.target as HTMLInputElement).checked);
+});
+part("refinement", HTMLInputElement).addEventListener("input", (event) => {
+  if (!visit) return;
+  const surface = visit.refine(Number((event.target as HTMLInputElement).value));
+  stage.show(surface, visit.extentM, undefined, true);
+  tellControls();
+});
+part("scene", HTMLSelectElement).addEventListener("change", (event) => {
+  void open(undefined, (event.target as HTMLSelectElement).value);
+});
+part("share", HTMLButtonElement).addEventListener("click", () => {
+  // Browsers have a clipboard only for pages that came safely, or from this machine.
+  const failed = () => notice("The link is the address of this page.");
+  if (!isSecureContext) return failed();
+  const copied = () => notice("The link is copied: whoever opens it sees this session.");
+  void navigator.clipboard.writeText(location.href).then(copied, failed);
+});
+part("play", HTMLButtonElement).addEventListener("click", () => void play());
+
+async function play(): Promise<void> {
+  const button = part("play", HTMLButtonElement);
+  if (playing) return playing.abort();
+  if (!visit) return;
+  const own = (playing = new AbortController());
+  const { sessionId } = visit.session;
+  button.textContent = "Stop";
+  try {
+    // A script takes the tools itself.
+    await visit.hand.letGo();
+    const name = part("script", HTMLSelectElement).value;
+    const warnings = await playScript(sessionId, name, visit.rateHz, `${holder}, ${name}`, own.signal, (done) => {
+      button.textContent = `Stop (${Math.round(100 * done)} %)`;
+    });
+    if (warnings.length > 0) notice(warnings.join(" "));
+  } catch (error) {
+    if (!own.signal.aborted) notice(`The script was not played: ${describe(error)}`);
+  } finally {
+    playing = undefined;
+    button.textContent = "Play";
+  }
+}
+
+stage.onDrawn = () => latency.drawn();
+
+// Windows that nobody sees give their connections to those that somebody does.
+document.addEventListener("visibilitychange", () => (document.hidden ? visit?.lookAway() : visit?.look()));
+addEventListener("pagehide", () => void visit?.hand.letGo());
+addEventListener("popstate", () => {
+  const sessionId = new URLSearchParams(location.search).get("session") ?? undefined;
+  if (sessionId !== visit?.session.sessionId) void open(sessionId, undefined);
+});
+
+// Ten times a second what is read as it changes, once a second what is read as a figure.
+setInterval(() => {
+  if (!visit || document.hidden) return;
+  const { samples } = visit;
+  plots.draw(samples.history, samples.newest?.simulationTimeS ?? 0);
+  const tool = samples.tools[0];
+  part("felt", HTMLElement).textContent = tool
+    ? `Point (${tool.point?.x}, ${tool.point?.y}): ${quantity(norm(tool.displacementM), "m")} away from rest, ` +
+      `pushes back with ${quantity(norm(tool.forceN), "N")}.`
+    : "Nothing touches the tissue.";
+}, 100);
+setInterval(() => {
+  if (!visit || document.hidden) return;
+  const { session, samples, frames } = visit;
+  const now = visit.nowS();
+  const { newest } = samples;
+  status.show({
+    roundTripMs: visit.roundTripMs,
+    networkMs: visit.hand.networkMs,
+    frameAgeMs: now && frames.newest && Math.max(0, 1000 * (now - frames.newest.timeS)),
+    framesTaken: frames.taken,
+    framesDrawn: stage.drawn,
+    framesSkipped: frames.skipped,
+    overruns: newest?.overrunCount ?? session.overrunCount,
+    dilation: newest?.timeDilation ?? session.timeDilation,
+    awakePoints: newest?.awakePoints,
+    isAsleep: newest?.asleep ?? session.resting,
+  });
+}, 1000);
+
+async function lists(): Promise<void> {
+  for (let failures = 0; ; failures++) {
+    try {
+      const { sceneNames } = await sessions.listScenes({}, { timeoutMs: PATIENCE_MS });
+      const { scriptNames } = await sessions.listScripts({}, { timeoutMs: PATIENCE_MS });
+      const options = (names: string[]) => names.map((name) => new Option(name));
+      part("scene", HTMLSelectElement).replaceChildren(...options(sceneNames));
+      part("script", HTMLSelectElement).replaceChildren(...options(scriptNames));
+      part("scene", HTMLSelectElement).value = visit?.session.scene?.name ?? asked.get("scene") ?? DEFAULT_SCENE;
+      return;
+    } catch {
+      await sleep(backoffMs(failures));
+    }
+  }
+}
+
+/** For tests and measurements: what the page has, as numbers. */
+const inside = {
+  get frames() {
+    return { taken: visit?.frames.taken ?? 0, skipped: Number(visit?.frames.skipped ?? 0), drawn: stage.drawn };
+  },
+  get received() {
+    return received.bytes;
+  },
+  get largestM() {
+    return visit?.surface.largestM() ?? 0;
+  },
+  get forceN() {
+    return visit?.samples.tools.map((tool) => norm(tool.forceN)) ?? [];
+  },
+  get holds() {
+    return visit?.hand.holds ?? false;
+  },
+  /** Where in the window the tissue of a place is, in parts of the sheet. */
+  at(x: number, y: number): [number, number] | undefined {
+    if (!visit) return undefined;
+    const placeM = [x * visit.extentM[0], y * visit.extentM[1]] as const;
+    const [dx, dy, dz] = visit.surface.displacementAtM(...placeM);
+    return stage.inWindow([placeM[0] + dx, placeM[1] + dy, dz]);
+  },
+  pixelAfterPress: (x: number, y: number) => latency.next(x, y),
+};
+Object.assign(window, { palpate: inside });
+
+const wireframe = part("wireframe", HTMLInputElement);
+wireframe.checked = asked.get("wireframe") === "1";
+stage.setWireframe(wireframe.checked);
+const mode = asked.get("tool");
+for (const choice of document.querySelectorAll<HTMLInputElement>("input[name=mode]")) {
+  if (choice.value === mode) choice.checked = true;
+}
+void open(asked.get("session") ?? undefined, asked.get("scene") ?? undefined);
+void lists();

@@ -1,0 +1,37 @@
+// Parts of the page by their names, and what its address asks for (README, "The page").
+
+export function part<T extends HTMLElement>(id: string, kind: new () => T): T {
+  const element = document.getElementById(id);
+  if (!(element instanceof kind)) throw new Error(`the page has no ${id}`);
+  return element;
+}
+
+export const asked = new URLSearchParams(location.search);
+
+/** A whole number of the address, if it is within a range. */
+export function askedNumber(key: string, least: number, most: number): number | undefined {
+  const text = asked.get(key);
+  const value = Number(text);
+  return text !== null && text !== "" && value >= least && value <= most ? value : undefined;
+}
+
+/** Writes the session into the address, so that loading again and sharing work. */
+export function writeAddress(sessionId: string, isNew: boolean): void {
+  const address = new URL(location.href);
+  address.searchParams.set("session", sessionId);
+  address.searchParams.delete("scene");
+  if (isNew) history.pushState(null, "", address);
+  else history.replaceState(null, "", address);
+}
+
+/** A name for others to see: what the address says, or one made up for this window. */
+export function holderName(): string {
+  const given = asked.get("name")?.slice(0, 60);
+  if (given) return given;
+  let name = sessionStorage.getItem("name");
+  if (!name) {
+    name = `viewer ${Math.floor(Math.random() * 9000 + 1000)}`;
+    sessionStorage.setItem("name", name);
+  }
+  return name;
+}

@@ -1,0 +1,200 @@
+// A real server and a real browser.
+
+import { spawn, spawnSync } from "node:child_process";
+import { existsSync, mkdirSync } from "node:fs";
+import { delimiter, join, resolve } from "node:path";
+import { createInterface } from "node:readline";
+import { fileURLToPath } from "node:url";
+import { chromium } from "playwright-core";
+
+export const ROOT = resolve(fileURLToPath(new URL(".", import.meta.url)), "../../..");
+/** Where pictures of tests are kept. */
+export const PICTURES = join(ROOT, "target/viewer");
+mkdirSync(PICTURES, { recursive: true });
+
+/** Long enough for any machine; what waits so long has failed. */
+export const PATIENCE_MS = 120_000;
+
+const NAMES = ["chromium", "chromium-browser", "google-chrome", "google-chrome-stable"];
+
+/** @returns {string | undefined} */
+function installed() {
+  const folders = (process.env.PATH ?? "").split(delimiter);
+  const paths = NAMES.flatMap((name) => folders.map((folder) => join(folder, name)));
+  return [process.env.BROWSER_PROGRAM ?? "", ...paths].find((path) => path !== "" && existsSync(path));
+}
+
+/** The machine's browser; where there is none it is installed if that needs no question. */
+function browserProgram() {
+  const found = installed();
+  if (found) return found;
+  const line = "apt-get install -y chromium";
+  if (process.getuid?.() === 0 && spawnSync("apt-get", ["--version"]).status === 0) {
+    console.error(`There is no browser on this machine: ${line}`);
+    spawnSync("sh", ["-c", `apt-get update -q && ${line}`], { stdio: ["ignore", "ignore", "inherit"] });
+    const now = installed();
+    if (now) return now;
+  }
+  console.error(`The tests of the page need a browser: sudo ${line}   (or set BROWSER_PROGRAM to one)`);
+  process.exit(1);
+}
+
+export function launch() {
+  // A profile of its own, which goes with the browser.
+  return chromium.launch({
+    executablePath: browserProgram(),
+    args: [
+      "--no-sandbox",
+      "--disable-gpu",
+      "--enable-unsafe-swiftshader",
+      "--disable-quic",
+      "--no-first-run",
+      "--disable-background-networking",
+      "--disable-component-update",
+      "--disable-sync",
+    ],
+  });
+}
+
+/** A page that is being loaded can't answer yet. @param {unknown} error */
+function whileLoading(error) {
+  if (/context was destroyed|navigation|Cannot find context/.test(String(error))) return false;
+  throw error;
+}
+
+/** `palpate serve` on a free port, or on `listen`. */
+export class Server {
+  /** @param {string[]} options */
+  static async start(options = [], listen = "127.0.0.1:0") {
+    const program = join(ROOT, "target/release/palpate");
+    const child = spawn(program, ["serve", "--listen", listen, "--log", "warn", ...options], {
+      cwd: ROOT,
+      stdio: ["ignore", "pipe", "inherit"],
+    });
+    // Whatever becomes of the tests, the server goes with them.
+    process.on("exit", () => child.kill("SIGKILL"));
+    for await (const line of createInterface(child.stdout)) {
+      const url = /http:\S+/.exec(line)?.[0];
+      if (url) return new Server(child, url);
+    }
+    throw new Error("the server did not start");
+  }
+
+  /**
+   * @param {import("node:child_process").ChildProcess} child
+   * @param {string} url
+   */
+  constructor(child, url) {
+    this.child = child;
+    this.url = url;
+  }
+
+  async stop() {
+    if (this.child.exitCode !== null) return this.child.exitCode;
+    const ended = new Promise((done) => this.child.once("exit", done));
+    this.child.kill("SIGTERM");
+    return await ended;
+  }
+}
+
+/**
+ * @typedef {{
+ *   frames: { taken: number, skipped: number, drawn: number }, received: number, largestM: number, forceN: number[],
+ *   holds: boolean, at: (x: number, y: number) => [number, number], pixelAfterPress: (x: number, y: number) => Promise<number>,
+ * }} Inside What the page tells of itself (src/main.ts).
+ */
+
+/** A page, and all that its console was told. */
+export class Page {
+  /**
+   * @param {import("playwright-core").BrowserContext} context
+   * @param {string} url
+   */
+  static async open(context, url) {
+    const opened = new Page(await context.newPage());
+    await opened.page.goto(url);
+    await opened.shows();
+    return opened;
+  }
+
+  /** @param {import("playwright-core").Page} page */
+  constructor(page) {
+    this.page = page;
+    /** @type {string[]} */
+    this.complaints = [];
+    page.setDefaultTimeout(PATIENCE_MS);
+    page.on("console", (message) => {
+      // Without a graphics processor the browser itself reads each picture back, and tells the page of it.
+      if (!message.text().endsWith("GPU stall due to ReadPixels") && !message.text().includes("no longer repeat")) {
+        this.complaints.push(`${message.type()}: ${message.text()}`);
+      }
+    });
+    page.on("pageerror", (error) => this.complaints.push(String(error)));
+  }
+
+  /** Waits for the first frame. */
+  shows() {
+    return this.until((inside) => inside.frames.taken > 0 && inside.frames.drawn > 0);
+  }
+
+  /**
+   * Waits until what the page tells of itself satisfies a condition. (Asked from here: the page's own policy lets no text
+   * become a program.)
+   * @template T
+   * @param {(inside: Inside, argument: T) => boolean} condition
+   * @param {T} [argument]
+   */
+  async until(condition, argument) {
+    const source = `window.palpate !== undefined && (${condition.toString()})(window.palpate, ${JSON.stringify(argument)})`;
+    const begun = Date.now();
+    while (!(await this.page.evaluate(source).catch(whileLoading))) {
+      if (Date.now() - begun > PATIENCE_MS) {
+        const told = await this.page.evaluate("JSON.stringify(window.palpate)").catch(String);
+        throw new Error(`waited in vain for ${condition.toString()} with ${JSON.stringify(argument)}: ${told}`);
+      }
+      await new Promise((done) => setTimeout(done, 50));
+    }
+  }
+
+  /**
+   * @template T
+   * @param {(inside: Inside) => T} question
+   * @returns {Promise<T>}
+   */
+  ask(question) {
+    return this.page.evaluate(`(${question.toString()})(window.palpate)`);
+  }
+
+  /**
+   * Where the tissue of a place is, in parts of the sheet.
+   * @param {number} x
+   * @param {number} y
+   * @returns {Promise<[number, number]>}
+   */
+  at(x, y) {
+    return this.page.evaluate(`window.palpate.at(${x}, ${y})`);
+  }
+
+  /** Presses with the mouse in the middle, or elsewhere. */
+  async press(x = 0.5, y = 0.5) {
+    const [left, top] = await this.at(x, y);
+    await this.page.mouse.move(left, top);
+    await this.page.mouse.down();
+    return /** @type {[number, number]} */ ([left, top]);
+  }
+
+  /** @param {string} name */
+  picture(name) {
+    return this.page.screenshot({ path: join(PICTURES, `${name}.png`) });
+  }
+
+  /** @param {string} id */
+  text(id) {
+    return this.page.locator(`#${id}`).innerText();
+  }
+
+  /** @param {string} id @param {RegExp} pattern */
+  async says(id, pattern) {
+    await this.page.locator(`#${id}`, { hasText: pattern }).waitFor();
+  }
+}
