@@ -15,7 +15,7 @@ type Command = MessageInitShape<typeof CommandSchema>;
 /** The number of the tool that pages hold. */
 const TOOL = 0;
 /** Of the tissue's own time, without a newer command: a page that vanishes does not go on pressing. */
-const TIME_TO_LIVE_S = 1;
+const TIME_TO_LIVE_S = 2;
 /** Between two commands that say the same: well within the time to live. */
 const REPEAT_MS = 100;
 /** Between two looks whether there is something to say. */

@@ -150,7 +150,8 @@ export class Stage {
     this.orbit.minDistance = size / 8;
     this.orbit.maxDistance = size * 4;
     if (!keepView) {
-      const middle = new Vector3(extentM[0] / 2, extentM[1] / 2, -0.04 * size);
+      // What is near is large: the middle of the picture is a bit before that of the sheet.
+      const middle = new Vector3(extentM[0] / 2, 0.42 * extentM[1], -0.04 * size);
       this.orbit.target.copy(middle);
       this.camera.position.copy(middle).add(new Vector3(0, -0.86 * size, 0.66 * size));
     }

@@ -1,0 +1,148 @@
+//! The page and gRPC-web on the port of gRPC, spoken to by hand over HTTP/1.1.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
+
+#[path = "common/server.rs"]
+mod server;
+
+use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::path::Path;
+
+use palpate::limits::Limits;
+use palpate::scene::Scene;
+use palpate::scene::script::Script;
+use palpate::wire::{self, pb};
+use prost::Message;
+use server::{PATIENCE, Server, told};
+
+/// Head, in small letters, and body of an answer.
+fn ask(server: &Server, method: &str, path: &str, headers: &str, body: &[u8]) -> (String, Vec<u8>) {
+    let address = server.url.trim_start_matches("http://");
+    let mut stream = TcpStream::connect(address).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    let length = body.len();
+    let head = format!(
+        "{method} {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\nContent-Length: {length}\r\n{headers}\r\n"
+    );
+    stream.write_all(head.as_bytes()).unwrap();
+    stream.write_all(body).unwrap();
+    let mut answer = Vec::new();
+    stream.read_to_end(&mut answer).unwrap();
+    let end = answer.windows(4).position(|four| four == b"\r\n\r\n").unwrap();
+    (String::from_utf8(answer[..end].to_vec()).unwrap().to_lowercase(), answer[end + 4..].to_vec())
+}
+
+fn get(server: &Server, path: &str, headers: &str) -> (String, String) {
+    let (head, body) = ask(server, "GET", path, headers, b"");
+    (head, String::from_utf8_lossy(&body).into_owned())
+}
+
+/// A server whose page is a folder of our own.
+fn with_page() -> (Server, tempfile::TempDir) {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("secret.txt"), "not for you").unwrap();
+    let page = folder.path().join("page");
+    std::fs::create_dir_all(page.join("assets")).unwrap();
+    std::fs::write(page.join("index.html"), "<title>tissue</title>").unwrap();
+    std::fs::write(page.join("assets/index-1a2b.js"), "export {}").unwrap();
+    (Server::start(&["--viewer", page.to_str().unwrap()]), folder)
+}
+
+#[test]
+fn a_page_has_its_type_its_policy_and_a_tag() {
+    let (server, _folder) = with_page();
+    let (head, body) = get(&server, "/?session=1", "");
+    assert!(head.starts_with("http/1.1 200") && body.contains("<title>tissue"), "{head}\n{body}");
+    for line in [
+        "content-type: text/html; charset=utf-8",
+        "cache-control: no-cache",
+        "content-security-policy: default-src 'none'",
+    ] {
+        assert!(head.contains(line), "{head}");
+    }
+    let (head, _) = get(&server, "/assets/index-1a2b.js", "");
+    assert!(head.contains("content-type: text/javascript") && head.contains("immutable"), "{head}");
+    let tag = head.lines().find_map(|line| line.strip_prefix("etag: ")).unwrap().to_owned();
+    let (head, body) = get(&server, "/assets/index-1a2b.js", &format!("If-None-Match: {tag}\r\n"));
+    assert!(head.starts_with("http/1.1 304") && body.is_empty(), "{head}");
+}
+
+#[test]
+fn nothing_leads_out_of_the_pages_folder() {
+    let (server, folder) = with_page();
+    let secret = folder.path().join("secret.txt");
+    for path in ["/../secret.txt", "/assets/../../secret.txt", "/%2e%2e/secret.txt", &format!("/{}", secret.display())]
+    {
+        let (head, body) = get(&server, path, "");
+        assert!(head.starts_with("http/1.1 404") && !body.contains("not for you"), "{path}: {head}\n{body}");
+    }
+    let (head, _) = ask(&server, "POST", "/", "", b"x");
+    assert!(head.starts_with("http/1.1 405") && head.contains("allow: get, head"), "{head}");
+    // A scene without a picture is no error.
+    assert!(get(&server, "/textures/paper.png", "").0.starts_with("http/1.1 204"));
+}
+
+/// Only where the program has no page within.
+#[cfg(not(feature = "viewer"))]
+#[test]
+fn without_a_page_it_says_how_to_get_one_and_serves_all_the_same() {
+    let empty = tempfile::tempdir().unwrap();
+    let server = Server::start(&["--viewer", empty.path().to_str().unwrap()]);
+    let (head, body) = get(&server, "/", "");
+    assert!(head.starts_with("http/1.1 404") && head.contains("text/html"), "{head}");
+    assert!(body.contains("make viewer") && body.contains("Node.js"), "{body}");
+    assert!(body.contains(&empty.path().display().to_string()), "{body}");
+    scenes_over_grpc_web(&server);
+}
+
+#[test]
+fn grpc_web_is_answered_on_the_same_port() {
+    let (server, _folder) = with_page();
+    scenes_over_grpc_web(&server);
+    // What is no service is refused in the words of gRPC.
+    let (head, _) =
+        ask(&server, "POST", "/palpate.v1.Nothing/Call", "Content-Type: application/grpc-web+proto\r\n", b"");
+    assert!(head.contains("grpc-status: 12"), "{head}");
+}
+
+fn scenes_over_grpc_web(server: &Server) {
+    let headers = "Content-Type: application/grpc-web+proto\r\n";
+    let (head, body) = ask(server, "POST", "/palpate.v1.SessionService/ListScenes", headers, &[0; 5]);
+    assert!(head.starts_with("http/1.1 200") && head.contains("application/grpc-web+proto"), "{head}");
+    let text = String::from_utf8_lossy(&body);
+    assert!(text.contains("paper") && text.contains("grpc-status:0"), "{text}");
+}
+
+#[tokio::test]
+async fn a_script_of_the_server_is_the_commands_that_a_replay_sends() {
+    let server = Server::start(&[]);
+    let session_id = server.paper(true).await;
+    let mut sessions = server.sessions().await;
+    let listed = sessions.list_scripts(pb::ListScriptsRequest {}).await.unwrap().into_inner().script_names;
+    assert_eq!(listed, ["oblique-100", "oblique-60", "vertical-60"]);
+    let limits = Limits::default();
+    let scene = Scene::load(Path::new("scenes/paper.toml"), &[], &limits).unwrap();
+    for script_name in listed {
+        let script = Script::load(Path::new(&script_name), &scene, &limits).unwrap();
+        let request = pb::GetScriptRequest { session_id: session_id.clone(), script_name };
+        let mut parts = sessions.get_script(request).await.unwrap().into_inner();
+        let mut commands = Vec::new();
+        let mut is_over = false;
+        while let Some(part) = parts.message().await.unwrap() {
+            assert!(!is_over);
+            assert_eq!((part.steps, part.tools as usize), (script.steps, script.tools()));
+            is_over = part.last;
+            commands.extend(part.commands);
+        }
+        assert!(is_over);
+        let wanted: Vec<_> = (0..script.steps)
+            .flat_map(|step| script.actions_at(step).map(move |(tool, action)| (tool, step, action)))
+            .map(|(tool, step, action)| wire::command::scripted(tool, step, &action, 0))
+            .collect();
+        assert!(commands.len() > 1 && commands == wanted);
+        assert!(commands.iter().all(|command| command.encoded_len() < 200));
+    }
+    let request = pb::GetScriptRequest { session_id, script_name: "../paper".into() };
+    let refused = sessions.get_script(request).await.unwrap_err();
+    assert_eq!(told(&refused).1, "UNKNOWN_SCRIPT");
+}
