@@ -78,8 +78,10 @@ fn nothing_leads_out_of_the_pages_folder() {
     }
     let (head, _) = ask(&server, "POST", "/", "", b"x");
     assert!(head.starts_with("http/1.1 405") && head.contains("allow: get, head"), "{head}");
-    // A scene without a picture is no error.
-    assert!(get(&server, "/textures/paper.png", "").0.starts_with("http/1.1 204"));
+    // A scene's picture; and that there is none of a name is no error.
+    let (head, body) = get(&server, "/textures/paper.png", "");
+    assert!(head.starts_with("http/1.1 200") && head.contains("image/png") && body.contains("IHDR"), "{head}");
+    assert!(get(&server, "/textures/nowhere.png", "").0.starts_with("http/1.1 204"));
 }
 
 /// Only where the program has no page within.

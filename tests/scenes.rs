@@ -233,11 +233,6 @@ fn a_bad_script_is_refused_with_file_line_and_key() {
             ),
             "tissue[1].at_s: must be later",
         ),
-        (
-            profile,
-            &format!("{profile}\n[[tissue]]\nat_s = 0.05\nstiffness_n_per_m = 1e11"),
-            "stepping.substeps: would need",
-        ),
     ] {
         assert!(SCRIPT.contains(from));
         refused(&run(SCENE, &SCRIPT.replacen(from, to, 1), &[]), &[expected]);

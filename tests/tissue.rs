@@ -17,7 +17,7 @@ use palpate::session::command::{Command, Due, Intake};
 use palpate::session::schedule::Schedule;
 use palpate::sheet::{Grasp, Model, Push, Tissue, at_rest};
 use palpate::wire::pb;
-use server::{Server, Touch, force, told};
+use server::{Server, Touch, force, open, told};
 use tonic::Code;
 
 const SCHEMES: [&[&str]; 7] = [
@@ -93,9 +93,10 @@ fn nothing_jumps_but_the_springs() {
             let is = tissue.point(index);
             let moved_m = is.displacement_m.distance(was.displacement_m);
             assert!(moved_m < 1e-7 * tissue.largest_displacement_m(), "{sets:?}: point {index} moved by {moved_m}");
-            // (Second order in the substep for two-step schemes.)
+            // (Second order in the substep for two-step schemes, first for the paper's.)
             let kicked = is.velocity_m_per_s.distance(was.velocity_m_per_s);
-            assert!(kicked < 2e-3 * fastest, "{sets:?}: point {index} was kicked by {kicked} of {fastest} m/s");
+            let most = if sets.contains(&"stepping.integrator=lagged") { 5e-3 } else { 2e-3 };
+            assert!(kicked < most * fastest, "{sets:?}: point {index} was kicked by {kicked} of {fastest} m/s");
             // The same shape, four times the springs; they are linear in k.
             if !sets.iter().any(|set| set.starts_with("sheet.fixed")) {
                 pulled_n = pulled_n.max(was.spring_n.length());
@@ -225,7 +226,9 @@ fn what_is_refused_is_refused_as_in_a_scene() {
     let k = |value| Change { stiffness_n_per_m: Some(value), ..change };
     assert_eq!(refused(k(-1.0)), (Reason::OutOfRange, field("springs.stiffness_n_per_m")));
     assert_eq!(refused(k(f64::NAN)), (Reason::NotFinite, field("springs.stiffness_n_per_m")));
-    assert_eq!(refused(k(1e11)), (Reason::TooLarge, field("stepping.substeps")));
+    let few = Limits { substeps: 10, ..Limits::default() };
+    let refusal = model.changed(&k(1e10), &model.scene, &few).unwrap_err();
+    assert_eq!((refusal.reason, refusal.field), (Reason::TooLarge, field("stepping.substeps")));
     let c = Change { damping_n_s_per_m: Some(f64::INFINITY), ..change };
     assert_eq!(refused(c), (Reason::NotFinite, field("damping.coefficient_n_s_per_m")));
     let both = Change { stiffness_n_per_m: Some(20.0), virtual_stiffness_n_per_m: Some(-2.0), ..change };
@@ -339,7 +342,9 @@ async fn the_same_bits_on_any_number_of_threads_and_offline() {
 async fn a_running_session_changes_at_once_and_logs_it() {
     let server = Server::start(&[]);
     let session_id = server.paper(false).await;
-    let mut touch = Touch::hold(&server, &session_id).await;
+    // It says nothing while the tissue comes to rest.
+    let patient = pb::TouchOpen { lease_s: Some(600.0), ..open(&session_id, &[0]) };
+    let mut touch = Touch::open(&server, patient).await.unwrap();
     touch.command(force(0, 1, -2.0)).await;
     let depth_m = |sample: &pb::Sample| -sample.tools[0].displacement_m.map_or(0.0, |at| at.z);
     touch.sample_with(|sample| depth_m(sample) > 0.01).await;

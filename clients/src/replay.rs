@@ -371,10 +371,15 @@ async fn play(
     };
     write_line(&mut output, &Line::Run(&run)).map_err(written)?;
 
+    // Another tissue may take other substeps.
+    let (mut substeps, mut since, mut a_step) = (0, 0, u64::from(created.substeps));
     for (step, change) in &script.changes {
         let update = wire::scene::update_tissue(session_id, change, *step);
-        sessions.update_tissue(update).await.map_err(refused_or_failed)?;
+        let changed = sessions.update_tissue(update).await.map_err(refused_or_failed)?.into_inner();
+        substeps += (step - since) * a_step;
+        (since, a_step) = (*step, changed.session.map_or(a_step, |session| u64::from(session.substeps)));
     }
+    substeps += (script.steps - since) * a_step;
     let mut haptics = HapticServiceClient::new(channel);
     let probe = pb::ProbeRequest {
         session_id: session_id.clone(),
@@ -484,7 +489,6 @@ async fn play(
     progress.finish_and_clear();
 
     let points = scene.sheet.points[0] * scene.sheet.points[1];
-    let substeps = script.steps * u64::from(created.substeps);
     let network = Network {
         late_commands: seen.late,
         rejected_commands: seen.rejected,

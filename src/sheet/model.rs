@@ -161,8 +161,15 @@ impl Model {
         let asked = self.scene.stepping.precision;
         let mut scene = self.scene.changed(change, first);
         scene.stepping.precision = self.precision;
-        // Only exponential schemes have that format, so it is one of them that is open.
-        let mut model = Arc::unwrap_or_clone(Model::compile(&scene, limits)?);
+        // Compensated is f32 and what its rounding lost: where no exponential scheme will do, f32 goes on alone.
+        let compiled = Model::compile(&scene, limits).or_else(|refusal| {
+            if self.precision != Precision::Compensated || refusal.field != "stepping.precision" {
+                return Err(refusal);
+            }
+            scene.stepping.precision = Precision::F32;
+            Model::compile(&scene, limits)
+        });
+        let mut model = Arc::unwrap_or_clone(compiled?);
         model.scene.stepping.precision = asked;
         Ok(Arc::new(model))
     }
