@@ -160,12 +160,12 @@ describe("the page", () => {
 
 describe("several pages on one session", () => {
   test("see the same, and only one may touch", async () => {
-    const holder = await open(`${server.url}/?name=Ada`);
-    const other = await open(holder.page.url().replace("Ada", "Berta"));
+    const holder = await open(`${server.url}/?name=first`);
+    const other = await open(holder.page.url().replace("first", "second"));
     await holder.press();
     await holder.until(({ largestM, forceN }) => largestM > 0.02 && forceN[0] > 0.3);
     await other.until(({ largestM, forceN }) => largestM > 0.02 && forceN[0] > 0.3);
-    await other.says("holder", /Ada holds the tool/);
+    await other.says("holder", /first holds the tool/);
     const [left, top] = await other.at(0.3, 0.3);
     await other.page.mouse.move(left, top);
     await other.page.mouse.down();
