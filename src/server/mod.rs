@@ -2,7 +2,9 @@
 
 pub mod catalog;
 pub mod config;
+mod connections;
 mod haptics;
+mod rate;
 mod sessions;
 mod views;
 
@@ -12,7 +14,6 @@ use std::time::Duration;
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 use tonic::transport::Server;
-use tonic::transport::server::TcpIncoming;
 use tracing::{info, warn};
 
 use crate::pace::Pacer;
@@ -29,6 +30,8 @@ pub(crate) struct House {
     pub(crate) config: Arc<Config>,
     pub(crate) catalog: Catalog,
     pub(crate) pacer: Arc<Pacer>,
+    /// Sessions are laid out, and force laws computed, one at a time: to ask for many takes no more than a core.
+    pub(crate) heavy_work: Arc<tokio::sync::Semaphore>,
 }
 
 /// Why a server could not run.
@@ -56,7 +59,9 @@ pub async fn serve(listener: TcpListener, config: Config, shutdown: Cancellation
             warn!(%refusal, "a scene that no session can be made from");
         }
     }
-    let house = House { catalog, pacer: pacer.clone(), config: Arc::new(config) };
+    let limits = config.limits.clone();
+    let heavy_work = Arc::new(tokio::sync::Semaphore::new(1));
+    let house = House { catalog, pacer: pacer.clone(), config: Arc::new(config), heavy_work };
 
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<SessionServiceServer<sessions::Sessions>>().await;
@@ -79,18 +84,24 @@ pub async fn serve(listener: TcpListener, config: Config, shutdown: Cancellation
         }
     };
 
-    // Nagle's algorithm would hold a sample back for milliseconds.
-    let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
+    let incoming = connections::incoming(listener, &limits);
+    let silence = Some(Duration::from_secs_f64(limits.keepalive_s));
+    let bytes = limits.message_bytes;
+    let sessions = SessionServiceServer::new(sessions::Sessions(house.clone())).max_decoding_message_size(bytes);
+    let haptics = HapticServiceServer::new(haptics::Haptics(house.clone())).max_decoding_message_size(bytes);
+    let views = ViewServiceServer::new(views::Views(house)).max_decoding_message_size(bytes);
     let serving = Server::builder()
         // Finds out about clients whose host has vanished.
-        .http2_keepalive_interval(Some(Duration::from_secs(10)))
-        .http2_keepalive_timeout(Some(Duration::from_secs(10)))
+        .http2_keepalive_interval(silence)
+        .http2_keepalive_timeout(silence)
+        .max_concurrent_streams(limits.streams_per_connection)
+        .initial_connection_window_size(limits.connection_window_bytes)
         .add_service(health_service)
         .add_service(reflection().build_v1()?)
         .add_service(reflection().build_v1alpha()?)
-        .add_service(SessionServiceServer::new(sessions::Sessions(house.clone())))
-        .add_service(HapticServiceServer::new(haptics::Haptics(house.clone())))
-        .add_service(ViewServiceServer::new(views::Views(house)))
+        .add_service(sessions)
+        .add_service(haptics)
+        .add_service(views)
         .serve_with_incoming_shutdown(incoming, shutdown.clone().cancelled_owned());
 
     // One deadline for all that is left to do. A step that outlasts it goes down with the process.

@@ -59,6 +59,8 @@ pub(crate) struct Target {
     pub(crate) server: String,
     /// A session that is there, or a scene to make one of.
     pub(crate) session: Option<String>,
+    /// The session that it has made.
+    pub(crate) made: Option<String>,
     pub(crate) scene: String,
     pub(crate) tool: u32,
     pub(crate) tip: Tip,
@@ -114,19 +116,23 @@ async fn connect(
     let channel = endpoint.connect().await.map_err(|e| format!("can't connect to {}: {e}", target.server))?;
     let mut sessions = SessionServiceClient::new(channel.clone());
     let told = |status: tonic::Status| describe(&status);
-    let session = match &target.session {
-        Some(id) => {
-            let request = pb::GetSessionRequest { session_id: id.clone() };
-            sessions.get_session(request).await.map(|answer| answer.into_inner().session)
-        }
-        None => {
-            let source = pb::create_session_request::Source::SceneName(target.scene.clone());
-            let request = pb::CreateSessionRequest { source: Some(source), ..Default::default() };
-            sessions.create_session(request).await.map(|answer| answer.into_inner().session)
-        }
-    };
-    let session = session.map_err(told)?.ok_or("the server tells nothing of the session")?;
-    target.session = Some(session.session_id.clone());
+    let mut known = None;
+    if let Some(id) = target.session.as_ref().or(target.made.as_ref()) {
+        let request = pb::GetSessionRequest { session_id: id.clone() };
+        known = match sessions.get_session(request).await {
+            Ok(answer) => answer.into_inner().session,
+            // A server that was started anew has forgotten what we made.
+            Err(status) if status.code() == tonic::Code::NotFound && target.session.is_none() => None,
+            Err(status) => return Err(told(status)),
+        };
+    }
+    if known.is_none() {
+        let source = pb::create_session_request::Source::SceneName(target.scene.clone());
+        let request = pb::CreateSessionRequest { source: Some(source), ..Default::default() };
+        known = sessions.create_session(request).await.map_err(told)?.into_inner().session;
+    }
+    let session = known.ok_or("the server tells nothing of the session")?;
+    target.made = Some(session.session_id.clone());
     let scene = session.scene.as_ref().ok_or("the server does not tell the session's scene")?;
     let sheet = scene.sheet.as_ref().ok_or("the server does not tell the scene's sheet")?;
     let spacing_m = sheet.spacing_m.unwrap_or(0.0);

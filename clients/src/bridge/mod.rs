@@ -154,6 +154,7 @@ pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
     let target = Target {
         server: arguments.server.clone(),
         session: arguments.session.clone(),
+        made: None,
         scene: arguments.scene.clone(),
         tool: arguments.tool,
         tip: Tip::default(),

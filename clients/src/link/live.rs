@@ -26,6 +26,7 @@ pub(super) async fn run(setup: &Setup, server: &str) -> Result<Found, Failure> {
     let target = Target {
         server: server.to_owned(),
         session: None,
+        made: None,
         scene: model.scene.name.clone(),
         tool: 0,
         tip: *tip,
