@@ -9,7 +9,7 @@ SCRIPT ?= scripts/vertical-60.toml
 VENV := target/venv
 
 .PHONY: help run build test stress lint picture bench-roundtrip bench-duty bench-frames bench-error bench-kernel \
-	bench-stability bench-skip bench-rest bench-link need-rust need-python
+	bench-stability bench-skip bench-rest bench-link bench-load soak need-rust need-python
 
 help:
 	@echo 'make run             build, serve on $(LISTEN), poke the tissue, draw what it felt, go on serving'
@@ -26,6 +26,8 @@ help:
 	@echo 'make bench-link      touch over a network in virtual time, by delay, tissue, hand and scheme: docs/benchmarks/link.md'
 	@echo 'make bench-stability the largest stable step, predicted and observed'
 	@echo 'make bench-skip      what it saves to leave out what is at rest, and its error'
+	@echo 'make bench-load      sessions that one core bears, with clients and without, and under attack: docs/benchmarks/load.md'
+	@echo 'make soak            random clients for SECONDS=1800: memory, handles, threads, and every command accounted for'
 
 need-rust:
 	@command -v $(CARGO) >/dev/null || { echo 'Rust is missing: install it from https://rustup.rs' >&2; exit 1; }
@@ -111,3 +113,11 @@ bench-skip: need-rust
 # `make bench-link ARGUMENTS=--quick` for a minute's worth; the whole takes about half an hour.
 bench-link: build
 	$(CARGO) bench --quiet --bench link -- $(ARGUMENTS)
+
+bench-load: build
+	$(CARGO) bench --quiet --bench load -- $(ARGUMENTS)
+
+# How long, s.
+SECONDS ?= 1800
+soak: need-rust
+	PALPATE_SOAK_S=$(SECONDS) $(CARGO) test --release --test soak -- --include-ignored --nocapture
