@@ -29,7 +29,7 @@ impl Bucket {
         if self.left < 1.0 {
             self.refused += 1.0;
             let Bucket { per_s, most, .. } = *self;
-            let message = format!("{what} are more than {per_s:.0} a second, and {most:.0} at once");
+            let message = format!("{what} are more than {:.0} a minute, and {most:.0} at once", 60.0 * per_s);
             return Err(Refusal::new(Reason::RateLimited, "", message));
         }
         self.left -= 1.0;

@@ -181,7 +181,13 @@ async fn connect(
                             inbound.newest = Some(wire::local::from_local_model(model, sample.step));
                         }
                     }
-                    Some(Heard::Rejection(_)) => shared.inbound().refused += 1,
+                    Some(Heard::Rejection(rejection)) => {
+                        shared.inbound().refused += 1;
+                        // We were silent for so long that the tool was let go.
+                        if rejection.reason == "NOT_HOLDER" {
+                            return Err("the lease of the tool has lapsed".to_owned());
+                        }
+                    }
                     Some(Heard::Renewed(_)) | None => {}
                 }
             }
