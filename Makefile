@@ -18,7 +18,7 @@ PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/*.yaml $(VI
 	$(VIEWER)/src/*.css $(VIEWER)/public/* proto/palpate/v1/*.proto)
 
 .PHONY: help run build viewer page-if-node test test-viewer stress lint picture figures screenshot bench-roundtrip bench-duty \
-	bench-frames bench-error bench-kernel bench-stability bench-skip bench-rest bench-link bench-viewer need-rust \
+	bench-frames bench-error bench-kernel bench-stability bench-skip bench-rest bench-link bench-viewer bench-load soak need-rust \
 	need-python need-node
 
 help:
@@ -41,6 +41,8 @@ help:
 	@echo 'make bench-viewer    331 × 331 points at 60 frames a second in a browser, and from a press to its pixel'
 	@echo 'make bench-stability the largest stable step, predicted and observed'
 	@echo 'make bench-skip      what it saves to leave out what is at rest, and its error'
+	@echo 'make bench-load      sessions that one core bears, with clients and without, and under attack: docs/benchmarks/load.md'
+	@echo 'make soak            random clients for SECONDS=1800: memory, handles, threads, and every command accounted for'
 
 need-rust:
 	@command -v $(CARGO) >/dev/null || { echo 'Rust is missing: install it from https://rustup.rs' >&2; exit 1; }
@@ -160,3 +162,11 @@ bench-viewer: build viewer
 # `make bench-link ARGUMENTS=--quick` for a minute's worth; the whole takes about half an hour.
 bench-link: build
 	$(CARGO) bench --quiet --bench link -- $(ARGUMENTS)
+
+bench-load: build
+	$(CARGO) bench --quiet --bench load -- $(ARGUMENTS)
+
+# How long, s.
+SECONDS ?= 1800
+soak: need-rust
+	PALPATE_SOAK_S=$(SECONDS) $(CARGO) test --release --test soak -- --include-ignored --nocapture

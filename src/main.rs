@@ -242,7 +242,7 @@ fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
         subscriber.init();
     }
     let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(config.network_threads.max(1))
+        .worker_threads(config.serving_threads())
         .thread_name("network")
         .enable_all()
         .build()

@@ -64,6 +64,12 @@ reasons! {
     StepPassed = "STEP_PASSED",
     /// More sessions, streams or tools than the configuration allows.
     TooMany = "TOO_MANY",
+    /// A further session would make the steps of others late.
+    Overloaded = "OVERLOADED",
+    /// Commands or calls come faster than the configuration allows.
+    RateLimited = "RATE_LIMITED",
+    /// What was waited for did not come in time.
+    TimedOut = "TIMED_OUT",
     /// The first message of a stream must open it, and only the first.
     OutOfTurn = "OUT_OF_TURN",
     /// Something that this machine has not got.

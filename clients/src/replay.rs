@@ -150,7 +150,7 @@ pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
 }
 
 /// Host and port, with or without http://.
-fn endpoint(server: &str) -> Result<Endpoint, Failure> {
+pub(crate) fn endpoint(server: &str) -> Result<Endpoint, Failure> {
     let refuse = |why: &str| Failure::Refused(format!("--server {server}: {why}"));
     let url = match server.split_once("://") {
         None => format!("http://{server}"),
@@ -161,7 +161,7 @@ fn endpoint(server: &str) -> Result<Endpoint, Failure> {
     Ok(endpoint.connect_timeout(Duration::from_secs(10)))
 }
 
-fn source(scene: &str) -> Result<Source, Failure> {
+pub(crate) fn source(scene: &str) -> Result<Source, Failure> {
     if Path::new(scene).extension().is_none_or(|extension| extension != "toml") {
         return Ok(Source::SceneName(scene.to_owned()));
     }

@@ -22,7 +22,7 @@ pub struct Config {
     pub viewer: PathBuf,
     /// Stepping threads; one less than the machine has cores if 0.
     pub threads: usize,
-    /// Threads of the network side.
+    /// Threads of the network side; as many as the stepping threads leave cores, at least 1, if 0.
     pub network_threads: usize,
     /// How long open streams may take to end at shutdown before they are cut, s.
     pub shutdown_deadline_s: f64,
@@ -44,7 +44,7 @@ impl Default for Config {
             scripts: PathBuf::from("scripts"),
             viewer: PathBuf::from("clients/viewer/dist"),
             threads: 0,
-            network_threads: 2,
+            network_threads: 0,
             shutdown_deadline_s: 5.0,
             lease_s: 2.0,
             idle_session_s: 900.0,
@@ -73,6 +73,9 @@ impl Config {
             ("limits.point_force_n", self.limits.point_force_n),
             ("limits.reach_in_sheets", self.limits.reach_in_sheets),
             ("limits.session_rate_hz", self.limits.session_rate_hz),
+            ("limits.commands_per_step", self.limits.commands_per_step),
+            ("limits.sessions_per_minute", self.limits.sessions_per_minute),
+            ("limits.thread_share", self.limits.thread_share),
         ] {
             positive(field, value)?;
         }
@@ -80,6 +83,13 @@ impl Config {
         let within = |most: f64| move |value: f64| value > 0.0 && value <= most;
         number("lease_s", self.lease_s, &format!("above 0 and at most limits.lease_s, {most_s}"), within(most_s))?;
         number("limits.lease_s", most_s, "above 0 and at most a day", within(day_s))?;
+        for (field, value) in [
+            ("limits.handshake_s", self.limits.handshake_s),
+            ("limits.open_s", self.limits.open_s),
+            ("limits.keepalive_s", self.limits.keepalive_s),
+        ] {
+            number(field, value, "above 0 and at most a day", within(day_s))?;
+        }
         number("shutdown_deadline_s", self.shutdown_deadline_s, "above 0 and at most a day", within(day_s))?;
         number("idle_session_s", self.idle_session_s, "above 0", |value| value > 0.0)?;
         Ok(())
@@ -87,7 +97,16 @@ impl Config {
 
     /// Stepping threads, at least 1.
     pub fn stepping_threads(&self) -> usize {
-        let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
-        if self.threads > 0 { self.threads } else { cores.saturating_sub(1).max(1) }
+        if self.threads > 0 { self.threads } else { cores().saturating_sub(1).max(1) }
     }
+
+    /// Threads of the network side, at least 1.
+    pub fn serving_threads(&self) -> usize {
+        let left = cores().saturating_sub(self.stepping_threads()).max(1);
+        if self.network_threads > 0 { self.network_threads } else { left }
+    }
+}
+
+fn cores() -> usize {
+    std::thread::available_parallelism().map_or(1, std::num::NonZero::get)
 }

@@ -3,8 +3,10 @@
 
 pub mod catalog;
 pub mod config;
+mod connections;
 mod haptics;
 mod page;
+mod rate;
 mod sessions;
 mod textures;
 mod views;
@@ -16,7 +18,6 @@ use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 use tonic::service::Routes;
 use tonic::transport::Server;
-use tonic::transport::server::TcpIncoming;
 use tonic_web::GrpcWebLayer;
 use tracing::{info, warn};
 
@@ -36,6 +37,8 @@ pub(crate) struct House {
     pub(crate) catalog: Catalog,
     pub(crate) pacer: Arc<Pacer>,
     pub(crate) textures: Textures,
+    /// Sessions are laid out, and force laws computed, one at a time: to ask for many takes no more than a core.
+    pub(crate) heavy_work: Arc<tokio::sync::Semaphore>,
 }
 
 /// Why a server could not run.
@@ -63,8 +66,10 @@ pub async fn serve(listener: TcpListener, config: Config, shutdown: Cancellation
             warn!(%refusal, "a scene that no session can be made from");
         }
     }
-    let textures = Textures::default();
-    let house = House { catalog, pacer: pacer.clone(), config: Arc::new(config), textures };
+    let limits = config.limits.clone();
+    let heavy_work = Arc::new(tokio::sync::Semaphore::new(1));
+    let house =
+        House { catalog, pacer: pacer.clone(), config: Arc::new(config), textures: Textures::default(), heavy_work };
 
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<SessionServiceServer<sessions::Sessions>>().await;
@@ -87,26 +92,30 @@ pub async fn serve(listener: TcpListener, config: Config, shutdown: Cancellation
         }
     };
 
-    let folder = Arc::new(house.config.viewer.clone());
-    let painter = house.clone();
+    let incoming = connections::incoming(listener, &limits);
+    let silence = Some(Duration::from_secs_f64(limits.keepalive_s));
+    let bytes = limits.message_bytes;
+    let (folder, painter) = (Arc::new(house.config.viewer.clone()), house.clone());
+    let sessions = SessionServiceServer::new(sessions::Sessions(house.clone())).max_decoding_message_size(bytes);
+    let haptics = HapticServiceServer::new(haptics::Haptics(house.clone())).max_decoding_message_size(bytes);
+    let views = ViewServiceServer::new(views::Views(house)).max_decoding_message_size(bytes);
     let routes = Routes::new(health_service)
         .add_service(reflection().build_v1()?)
         .add_service(reflection().build_v1alpha()?)
-        .add_service(SessionServiceServer::new(sessions::Sessions(house.clone())))
-        .add_service(HapticServiceServer::new(haptics::Haptics(house.clone())))
-        .add_service(ViewServiceServer::new(views::Views(house)))
+        .add_service(sessions)
+        .add_service(haptics)
+        .add_service(views)
         .into_axum_router()
         // Of the services alone: it refuses what is no gRPC.
         .route_layer(GrpcWebLayer::new())
         .route("/textures/{file}", axum::routing::get(move |file, headers| textures::file(painter, file, headers)))
         .fallback(move |request| page::page(folder.clone(), request));
-
-    // Nagle's algorithm would hold a sample back for milliseconds.
-    let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
     let serving = Server::builder()
         // Finds out about clients whose host has vanished.
-        .http2_keepalive_interval(Some(Duration::from_secs(10)))
-        .http2_keepalive_timeout(Some(Duration::from_secs(10)))
+        .http2_keepalive_interval(silence)
+        .http2_keepalive_timeout(silence)
+        .max_concurrent_streams(limits.streams_per_connection)
+        .initial_connection_window_size(limits.connection_window_bytes)
         // Browsers speak HTTP/2 only over TLS.
         .accept_http1(true)
         .add_routes(routes.into())

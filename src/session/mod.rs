@@ -141,6 +141,11 @@ impl Session {
         self.hold_reason.as_deref()
     }
 
+    /// Ends it, as the guard does.
+    pub fn hold(&mut self, reason: String) {
+        self.hold_reason.get_or_insert(reason);
+    }
+
     /// Commands that came too late for their step, in all.
     pub fn late_commands(&self) -> u64 {
         self.late_commands

@@ -22,7 +22,10 @@ pub fn code(reason: Reason) -> Code {
         | Reason::ForceTooLarge
         | Reason::OffSheet
         | Reason::OutOfTurn => Code::InvalidArgument,
-        Reason::TooLarge | Reason::QueueFull | Reason::TooMany => Code::ResourceExhausted,
+        Reason::TooLarge | Reason::QueueFull | Reason::TooMany | Reason::Overloaded | Reason::RateLimited => {
+            Code::ResourceExhausted
+        }
+        Reason::TimedOut => Code::DeadlineExceeded,
         Reason::UnknownScene
         | Reason::UnknownScript
         | Reason::UnknownSession

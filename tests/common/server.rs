@@ -165,6 +165,12 @@ impl Touch {
         self.say(Say::Command(command)).await;
     }
 
+    /// The same, of a stream that may have ended: whether it went out.
+    pub async fn try_command(&self, command: pb::Command) -> bool {
+        let message = pb::TouchRequest { message: Some(Say::Command(command)) };
+        self.outbound.as_ref().unwrap().send(message).await.is_ok()
+    }
+
     /// No more from this side.
     pub fn finish(&mut self) {
         self.outbound = None;
