@@ -4,6 +4,7 @@
 pub mod clock;
 pub mod frames;
 pub mod queue;
+pub mod tally;
 mod taps;
 mod thread;
 
@@ -28,6 +29,7 @@ use crate::sheet::Model;
 use clock::now_ns;
 use frames::{Delivery, Encoder, Viewer};
 use queue::{Reader, lock, queue};
+use tally::Tally;
 use taps::{ProbeTap, SampleTap};
 use thread::{Inbox, Request, Running};
 
@@ -87,6 +89,12 @@ pub struct Status {
     pub hold_reason: Option<String>,
     /// How often the guard went back to a checkpoint.
     pub guard_events: u64,
+    /// Points that the last step computed.
+    pub awake_points: usize,
+    /// As [`crate::session::Session::path_counts`].
+    pub path_counts: [u64; 3],
+    /// Leases that ran out.
+    pub lapsed_leases: u64,
 }
 
 /// Over which time dilation is measured.
@@ -153,7 +161,7 @@ impl Live {
         if let Some(step) = resting.filter(|step| *step >= status.step) {
             status.rested_steps += step - status.step;
             status.dilation.observe(now, step, status.schedule.period_ns());
-            (status.resting, status.step) = (true, step);
+            (status.resting, status.step, status.awake_points) = (true, step, 0);
         }
         status
     }
@@ -190,6 +198,11 @@ impl Live {
         }
         *streams += 1;
         Ok(StreamGuard(self.clone()))
+    }
+
+    /// Streams that read the session.
+    pub fn streams(&self) -> usize {
+        *lock(&self.streams)
     }
 
     async fn ask<T>(&self, request: impl FnOnce(oneshot::Sender<Result<T>>) -> Request) -> Result<T> {
@@ -359,6 +372,9 @@ impl Pacer {
             late_commands: 0,
             hold_reason: None,
             guard_events: 0,
+            awake_points: 0,
+            path_counts: [0; 3],
+            lapsed_leases: 0,
         };
         let live = Arc::new(Live {
             id: id.clone(),
@@ -403,6 +419,16 @@ impl Pacer {
         let mut all: Vec<_> = lock(&self.sessions).values().cloned().collect();
         all.sort_by_key(|live| live.number);
         all
+    }
+
+    /// What each stepping thread counts of itself.
+    pub fn tallies(&self) -> impl Iterator<Item = &Tally> {
+        self.inboxes.iter().map(|inbox| &inbox.tally)
+    }
+
+    /// Those who look at some session.
+    pub fn viewers(&self) -> usize {
+        lock(&self.viewers).values().filter(|viewer| viewer.strong_count() > 0).count()
     }
 
     /// Ends a session and all its streams.

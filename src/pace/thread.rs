@@ -20,6 +20,7 @@ use tokio::sync::oneshot;
 use super::clock::now_ns;
 use super::frames::{Encoder, Job, Viewer};
 use super::queue::lock;
+use super::tally::Tally;
 use super::taps::{HashReply, ProbeTap, SampleTap, Taps, ViewTap};
 use super::{Dilation, Live, PacedRecord, PacedSample, State};
 use crate::refusal::{Reason, Refusal, Result};
@@ -31,6 +32,9 @@ use crate::surface::Snapshot;
 
 /// Steps that a session may be behind before the rest is dropped.
 const CATCH_UP_STEPS: f64 = 2.0;
+
+/// Every so many steps of a session one is a span of the log, at level debug.
+const STEPS_PER_SPAN: u64 = 1024;
 
 /// How often the stiffness under tools is computed anew, Hz.
 const REFINED_HZ: f64 = 50.0;
@@ -62,6 +66,8 @@ pub(super) enum Request {
 pub(super) struct Inbox {
     state: Mutex<InboxState>,
     wake: Condvar,
+    /// Written by the thread that reads here.
+    pub(super) tally: Tally,
 }
 
 #[derive(Default)]
@@ -102,6 +108,7 @@ pub(super) struct Running {
     still_since: Option<u64>,
     rested_steps: u64,
     overrun_count: u64,
+    lapsed_leases: u64,
     dilation: Dilation,
     due: Vec<Due>,
     hashed: Option<(u64, u128)>,
@@ -165,10 +172,13 @@ pub(super) fn work(inbox: &Inbox, encoder: &Encoder, refiner: &SyncSender<Refine
             }
         }
         // The one that is due first: a heavy session is late itself before it makes others late.
+        let begun_ns = now_ns();
         if let Some((due_ns, number)) = rota.first()
-            && due_ns <= now_ns()
+            && due_ns <= begun_ns
         {
             rota.with(number, |running| running.step(encoder, refiner));
+            inbox.tally.lateness.add(begun_ns - due_ns);
+            inbox.tally.step_time.add(now_ns().saturating_sub(begun_ns));
         }
     }
 }
@@ -208,6 +218,7 @@ impl Running {
             still_since: Some(0),
             rested_steps: 0,
             overrun_count: 0,
+            lapsed_leases: 0,
             dilation: Dilation::new(now, 0),
             due: Vec::new(),
             hashed: None,
@@ -231,7 +242,9 @@ impl Running {
         };
         let rests_until = self.session.rests_until().filter(|_| self.running);
         let until = rests_until.map_or(step, |until| until.min(wanted()));
-        self.next_step = lock(&self.live.intake).rest(step, until, &self.schedule);
+        let mut intake = lock(&self.live.intake);
+        self.next_step = intake.rest(step, until, &self.schedule);
+        self.lapsed_leases = intake.lapsed();
     }
 
     /// At rest, time has gone on without a step: brings the session to where it stands now.
@@ -359,6 +372,9 @@ impl Running {
 
     /// The next step, at its time or after it.
     fn step(&mut self, encoder: &Encoder, refiner: &SyncSender<Refinement>) {
+        let sampled = self.next_step.is_multiple_of(STEPS_PER_SPAN);
+        let span = sampled.then(|| tracing::debug_span!("step", session = %self.live.id, step = self.next_step));
+        let _span = span.map(tracing::Span::entered);
         if self.next_step > self.session.step_count() {
             self.plan();
             self.skip_to(self.next_step);
@@ -469,6 +485,20 @@ impl Running {
 
     fn publish_status(&self) {
         let mut status = lock(&self.live.status);
+        let (before, tally) = (&*status, &self.live.inbox.tally);
+        let path_counts = self.session.path_counts();
+        let guard_events = self.session.tissue().guard_events();
+        let is_held = self.session.hold_reason().is_some();
+        tally.rested_steps.add(self.rested_steps - before.rested_steps);
+        tally.overruns.add(self.overrun_count - before.overrun_count);
+        tally.late_commands.add(self.session.late_commands() - before.late_commands);
+        tally.lapsed_leases.add(self.lapsed_leases - before.lapsed_leases);
+        tally.guard_events.add(guard_events - before.guard_events);
+        tally.held_sessions.add(u64::from(is_held && before.state != State::Held));
+        let path_tallies = [&tally.limited_steps, &tally.dropped_poses, &tally.stale_releases];
+        for (index, count) in path_tallies.into_iter().enumerate() {
+            count.add(path_counts[index] - before.path_counts[index]);
+        }
         status.state = match (self.session.hold_reason(), self.running) {
             (Some(_), _) => State::Held,
             (None, true) => State::Running,
@@ -477,7 +507,10 @@ impl Running {
         status.step = self.session.step_count();
         status.rested_steps = self.rested_steps;
         status.overrun_count = self.overrun_count;
-        status.guard_events = self.session.tissue().guard_events();
+        status.guard_events = guard_events;
+        status.awake_points = self.session.tissue().awake_points();
+        status.path_counts = path_counts;
+        status.lapsed_leases = self.lapsed_leases;
         status.dilation = self.dilation;
         status.schedule = self.schedule;
         status.late_commands = self.session.late_commands();

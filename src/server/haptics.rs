@@ -7,7 +7,7 @@ use std::sync::Arc;
 use futures_util::stream::{self, Stream, StreamExt};
 use tokio::sync::oneshot;
 use tonic::{Request, Response, Status, Streaming};
-use tracing::{debug, info};
+use tracing::{Instrument, debug, info};
 
 use super::House;
 use crate::haptics::device::{Device, UNDECLARED_FORCE_N};
@@ -148,7 +148,9 @@ impl Haptics {
                         .and_then(|command| {
                             live.at_intake(|intake, now| intake.submit(hold.lease, vec![command], now))
                         });
+                    self.0.traffic.commanded(usize::from(taken.is_ok()));
                     if let Err(refusal) = taken {
+                        self.0.traffic.refused(refusal.reason);
                         debug!(session = %live.id, reason = refusal.reason.as_str(), %refusal, "command refused");
                         events.push(Event::Rejected(wire::sample::rejection(command.tool, command.sequence, &refusal)));
                     }
@@ -246,7 +248,7 @@ impl HapticService for Haptics {
         let (writer, events) = queue(self.0.config.limits.queued_samples);
         // The client may wait for our headers before it opens, so its first message is not waited for here.
         let (opened, opening) = oneshot::channel();
-        tokio::spawn(self.clone().listen(request.into_inner(), opened, writer));
+        tokio::spawn(self.clone().listen(request.into_inner(), opened, writer).in_current_span());
         let output = Some(Output::Opening(opening, events));
         let out = stream::unfold(output, |output| async move { output?.next().await });
         Ok(Response::new(Box::pin(out)))
@@ -290,10 +292,12 @@ impl HapticService for Haptics {
             let command = wire::command::from_command(command, sheet, now);
             commands.push(command.map_err(|refusal| refusal.within(&format!("commands[{index}]")))?);
         }
+        let count = commands.len();
         let tools = live.at_intake(|intake, now| {
             intake.submit(lease, commands, now)?;
             Ok::<_, Refusal>(intake.tools_of(lease).collect())
         })?;
+        self.0.traffic.commanded(count);
         let sample = live.next_sample(tools).await?;
         let sample = Some(wire::sample::sample(&sample, 0, now_ns()));
         Ok(Response::new(pb::SendCommandsResponse { sample }))

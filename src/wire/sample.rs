@@ -172,6 +172,7 @@ pub fn session(live: &Arc<Live>) -> pb::Session {
         let held = intake.holders().map(|(tool, holder)| pb::HeldTool { tool, holder: holder.to_owned() });
         (held.collect(), intake.lapsed())
     });
+    let count = |count: usize| u32::try_from(count).unwrap_or(u32::MAX);
     let model = &live.model;
     #[allow(clippy::cast_precision_loss)]
     let simulation_time_s = status.step as f64 / model.scene.stepping.rate_hz;
@@ -201,6 +202,10 @@ pub fn session(live: &Arc<Live>) -> pb::Session {
         expected_error: model.expected_error,
         resting: status.resting,
         rested_steps: status.rested_steps,
+        awake_points: count(status.awake_points),
+        streams: count(live.streams()),
+        scene_name: model.scene.name.clone(),
+        points: count(model.len()),
     }
 }
 

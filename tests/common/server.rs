@@ -10,7 +10,7 @@
 
 use std::io::{BufRead, BufReader, Read};
 use std::path::PathBuf;
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, ChildStdout, Command, Stdio};
 use std::sync::OnceLock;
 use std::time::Duration;
 
@@ -48,6 +48,8 @@ pub fn client_program() -> PathBuf {
 pub struct Server {
     pub child: Child,
     pub url: String,
+    /// What it prints after the line with its address.
+    pub out: BufReader<ChildStdout>,
 }
 
 impl Server {
@@ -61,10 +63,11 @@ impl Server {
             .spawn()
             .unwrap();
         let mut line = String::new();
-        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        let mut out = BufReader::new(child.stdout.take().unwrap());
+        out.read_line(&mut line).unwrap();
         let url = line.split_whitespace().last().unwrap_or_default().to_owned();
-        assert!(url.starts_with("http://127.0.0.1:"), "{line:?}");
-        Server { child, url }
+        assert!(url.contains("://127.0.0.1:"), "{line:?}");
+        Server { child, url, out }
     }
 
     pub async fn channel(&self) -> Channel {

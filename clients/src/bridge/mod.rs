@@ -13,6 +13,7 @@ use serde_json::json;
 use tokio::sync::mpsc;
 
 use crate::Failure;
+use crate::connect::{Credentials, Server};
 use crate::link;
 use device::{HapticDevice, Simulated};
 use line::{COMMANDS, Shared, Target};
@@ -47,6 +48,8 @@ pub(crate) struct Arguments {
     /// Of what the simulated hand does
     #[arg(long, default_value_t = 1)]
     seed: u64,
+    #[command(flatten)]
+    credentials: Credentials,
 }
 
 /// A tick of the device, s.
@@ -152,7 +155,7 @@ pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
     let task = link::Task::new(middle_m, link::LEAD_S, seconds, 0.2, &mut link::Dice::new(arguments.seed, 0));
     let mut simulated = Simulated::new(device, hand, task, TICK_S);
     let target = Target {
-        server: arguments.server.clone(),
+        server: Server::new(&arguments.server, &arguments.credentials)?,
         session: arguments.session.clone(),
         scene: arguments.scene.clone(),
         tool: arguments.tool,
