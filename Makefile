@@ -9,12 +9,13 @@ SCRIPT ?= scripts/vertical-60.toml
 VENV := target/venv
 
 .PHONY: help run build test stress lint picture bench-roundtrip bench-duty bench-frames bench-error bench-kernel \
-	bench-stability bench-skip bench-rest bench-link need-rust need-python
+	bench-stability bench-skip bench-rest bench-link fuzz need-rust need-python
 
 help:
 	@echo 'make run             build, serve on $(LISTEN), poke the tissue, draw what it felt, go on serving'
 	@echo 'make test            every test (Rust and Python 3)'
 	@echo 'make stress          ten thousand random scenes, ten million steps (some minutes)'
+	@echo 'make fuzz            a million bent inputs for every decoder (some minutes); fuzz/ has them for libFuzzer'
 	@echo 'make lint            formatting, compiler and clippy warnings'
 	@echo 'make picture         the picture of the README'
 	@echo 'make bench-roundtrip the haptic round trip beside a bare gRPC echo'
@@ -83,6 +84,11 @@ bench-frames: need-rust
 # Ten thousand random scenes, and a soak of ten million steps.
 stress: need-rust
 	PALPATE_STRESS_SCENES=10000 $(CARGO) test --release --test stress --test sleep -- --include-ignored --nocapture
+
+# A million inputs a decoder; FUZZ_INPUTS=… for more.
+FUZZ_INPUTS ?= 1000000
+fuzz: need-rust
+	PALPATE_FUZZ_INPUTS=$(FUZZ_INPUTS) $(CARGO) test --release --test fuzz -- --nocapture
 
 # `make bench-error ARGUMENTS=--quick`, and bench-kernel and bench-frames likewise.
 bench-error: need-rust
