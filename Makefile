@@ -18,7 +18,7 @@ PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/*.yaml $(VI
 	$(VIEWER)/src/*.css $(VIEWER)/public/* proto/palpate/v1/*.proto)
 
 .PHONY: help run build viewer page-if-node test test-viewer stress lint picture figures screenshot bench-roundtrip bench-duty \
-	bench-frames bench-error bench-kernel bench-stability bench-skip bench-rest bench-link bench-viewer bench-load soak need-rust \
+	bench-frames bench-error bench-kernel bench-stability bench-skip bench-rest bench-link bench-viewer bench-load soak fuzz need-rust \
 	need-python need-node
 
 help:
@@ -27,6 +27,7 @@ help:
 	@echo 'make test            every test (Rust, Python 3, and the page in a browser)'
 	@echo 'make test-viewer     the page alone; its screenshots are in target/viewer'
 	@echo 'make stress          ten thousand random scenes, ten million steps (some minutes)'
+	@echo 'make fuzz            a million bent inputs for every decoder (some minutes); fuzz/ has them for libFuzzer'
 	@echo 'make lint            formatting, compiler and clippy warnings'
 	@echo 'make picture         the curve of the README'
 	@echo 'make figures         the paper'"'"'s figures and experiments: docs/figures, shown in docs/paper.md'
@@ -129,6 +130,11 @@ bench-frames: need-rust
 # Ten thousand random scenes, and a soak of ten million steps.
 stress: need-rust
 	PALPATE_STRESS_SCENES=10000 $(CARGO) test --release --test stress --test sleep -- --include-ignored --nocapture
+
+# A million inputs a decoder; FUZZ_INPUTS=… for more.
+FUZZ_INPUTS ?= 1000000
+fuzz: need-rust
+	PALPATE_FUZZ_INPUTS=$(FUZZ_INPUTS) $(CARGO) test --release --test fuzz -- --nocapture
 
 # `make bench-error ARGUMENTS=--quick`, and bench-kernel and bench-frames likewise.
 bench-error: need-rust

@@ -57,7 +57,7 @@ pub struct Limits {
     pub message_bytes: usize,
     /// Bytes of a connection that wait to be read, in all its streams, before the transport holds the client back.
     pub connection_window_bytes: u32,
-    /// A connection that has not said what it wants to speak after so long is closed, s.
+    /// A connection that has not said what it wants to speak after so long is closed, the handshake of TLS included, s.
     pub handshake_s: f64,
     /// A haptic stream without its first message after so long is ended, s.
     pub open_s: f64,

@@ -56,6 +56,12 @@ reasons! {
     ToolHeld = "TOOL_HELD",
     /// The tool is not held by who commands it, or no longer.
     NotHolder = "NOT_HOLDER",
+    /// A call by nobody that the server knows.
+    Unauthenticated = "UNAUTHENTICATED",
+    /// Who calls has not got the role that the call asks for.
+    RoleMissing = "ROLE_MISSING",
+    /// A page of another site.
+    OriginNotAllowed = "ORIGIN_NOT_ALLOWED",
     /// The sequence number is not above the last one.
     StaleSequence = "STALE_SEQUENCE",
     /// More commands are waiting than the session keeps.

@@ -26,15 +26,13 @@ fn limited(limits: &str, arguments: &[&str]) -> Server {
 /// A server as a shell starts it: $0 is the program, $1 where it is to listen.
 #[cfg(unix)]
 fn serve(command: &str, address: &str) -> Server {
-    let mut child = std::process::Command::new("sh")
+    let child = std::process::Command::new("sh")
         .args(["-c", &format!("{command} \"$1\""), env!("CARGO_BIN_EXE_palpate"), address])
         .stdout(std::process::Stdio::piped())
         .stderr(std::process::Stdio::piped())
         .spawn()
         .unwrap();
-    let mut line = String::new();
-    std::io::BufRead::read_line(&mut std::io::BufReader::new(child.stdout.take().unwrap()), &mut line).unwrap();
-    Server { child, url: line.split_whitespace().last().unwrap().to_owned() }
+    Server::of(child)
 }
 
 fn connect(server: &Server) -> TcpStream {

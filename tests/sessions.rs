@@ -513,7 +513,8 @@ fn the_example_of_a_configuration_has_every_key_with_its_default() {
     let text = std::fs::read_to_string(root.join("docs/palpate.toml")).unwrap();
     for key in format!("{example:#?}").lines().filter_map(|line| line.trim().split_once(": ").map(|field| field.0)) {
         let has = |line: &str| line.starts_with(&format!("{key} = ")) || line.starts_with(&format!("[{key}]"));
-        assert!(text.lines().any(has), "docs/palpate.toml lacks {key}");
+        // What is nothing by default is shown in a comment.
+        assert!(text.lines().any(|line| has(line.trim_start_matches("# "))), "docs/palpate.toml lacks {key}");
     }
 }
 

@@ -4,10 +4,13 @@
 #![allow(clippy::disallowed_methods)]
 
 mod bridge;
+mod connect;
+mod health;
 mod link;
 mod load;
 mod plot;
 mod replay;
+mod top;
 
 use std::process::ExitCode;
 
@@ -63,6 +66,20 @@ enum Command {
         cores with a server on the same machine: it tells what it took.\n\n\
         Exit status: 0; 1 when streams broke or the server could not be reached; 2 when an input was refused.")]
     Load(load::Arguments),
+    /// Ask a server whether it serves; for scripts and containers
+    #[command(after_help = "Examples:\n  \
+        palpate-client health\n  \
+        palpate-client health https://localhost:7117 --ca /etc/palpate/ca.pem\n\n\
+        Needs no token. Exit status: 0 if it serves; 1 if not; 2 when an input was refused.")]
+    Health(health::Arguments),
+    /// Show the sessions of a server, once a second: state, step rate, dilation, awake points, who holds what
+    #[command(after_help = "Examples:\n  \
+        palpate top\n  \
+        palpate top https://server:7117 --token-file admin.token\n  \
+        palpate top --once --json | jq '.sessions[] | select(.time_dilation < 0.999)'\n\n\
+        Of a server that knows its clients the token needs the role `administer`.\n\n\
+        Exit status: 0; 1 when the server can't be reached or does not tell; 2 when an input was refused.")]
+    Top(top::Arguments),
 }
 
 /// How a program ends that does not end well.
@@ -83,6 +100,8 @@ async fn main() -> ExitCode {
         Command::Link(arguments) => link::link(&arguments).await,
         Command::Bridge(arguments) => bridge::bridge(&arguments).await,
         Command::Load(arguments) => load::load(&arguments).await,
+        Command::Health(arguments) => health::health(&arguments).await,
+        Command::Top(arguments) => top::top(&arguments).await,
     };
     let (status, message) = match ended {
         Ok(()) | Err(Failure::Unread) => return ExitCode::SUCCESS,

@@ -4,7 +4,9 @@
 pub mod clock;
 mod cost;
 pub mod frames;
+mod inbox;
 pub mod queue;
+pub mod tally;
 mod taps;
 mod thread;
 
@@ -26,12 +28,14 @@ use crate::session::local::Refinement;
 use crate::session::sampling::{HEARTBEAT_S, Sampler, Sampling};
 use crate::session::schedule::Schedule;
 use crate::sheet::Model;
-use clock::now_ns;
+use clock::{Dilation, now_ns};
 use cost::Cost;
 use frames::{Delivery, Encoder, Viewer};
+use inbox::{Inbox, Request};
 use queue::{Reader, lock, queue};
+use tally::Tally;
 use taps::{ProbeTap, SampleTap};
-use thread::{Inbox, Request, Running, beat_ns};
+use thread::{Running, beat_ns};
 
 /// A sample, and how the session keeps time.
 #[derive(Debug, Clone, PartialEq)]
@@ -89,35 +93,14 @@ pub struct Status {
     pub hold_reason: Option<String>,
     /// How often the guard went back to a checkpoint.
     pub guard_events: u64,
+    /// Points that the last step computed.
+    pub awake_points: usize,
+    /// As [`crate::session::Session::path_counts`].
+    pub path_counts: [u64; 3],
+    /// Leases that ran out.
+    pub lapsed_leases: u64,
     /// The tissue as it is: [`Live::change`] may have made another of it.
     pub model: Arc<Model>,
-}
-
-/// Over which time dilation is measured.
-const DILATION_WINDOW_NS: u64 = 1_000_000_000;
-
-/// Simulated over real time, of the last second or so.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Dilation {
-    /// 1 when on time.
-    pub value: f64,
-    /// When the window of the next measurement began, and steps done then.
-    since: (u64, u64),
-}
-
-impl Dilation {
-    fn new(now_ns: u64, step: u64) -> Self {
-        Dilation { value: 1.0, since: (now_ns, step) }
-    }
-
-    #[allow(clippy::cast_precision_loss)]
-    fn observe(&mut self, now_ns: u64, step: u64, period_ns: f64) {
-        let elapsed_ns = now_ns.saturating_sub(self.since.0);
-        if elapsed_ns >= DILATION_WINDOW_NS {
-            self.value = step.saturating_sub(self.since.1) as f64 * period_ns / elapsed_ns as f64;
-            self.since = (now_ns, step);
-        }
-    }
 }
 
 /// A session as the server sees it.
@@ -165,7 +148,7 @@ impl Live {
         if let Some(step) = resting.filter(|step| *step >= status.step) {
             status.rested_steps += step - status.step;
             status.dilation.observe(now, step, status.schedule.period_ns());
-            (status.resting, status.step) = (true, step);
+            (status.resting, status.step, status.awake_points) = (true, step, 0);
         }
         status
     }
@@ -212,6 +195,11 @@ impl Live {
         }
         *streams += 1;
         Ok(StreamGuard(self.clone()))
+    }
+
+    /// Streams that read the session.
+    pub fn streams(&self) -> usize {
+        *lock(&self.streams)
     }
 
     async fn ask<T>(&self, request: impl FnOnce(oneshot::Sender<Result<T>>) -> Request) -> Result<T> {
@@ -386,6 +374,9 @@ impl Pacer {
             late_commands: 0,
             hold_reason: None,
             guard_events: 0,
+            awake_points: 0,
+            path_counts: [0; 3],
+            lapsed_leases: 0,
             model: model.clone(),
         };
         let (cost, thread) = self.place(&model, paused)?;
@@ -479,6 +470,16 @@ impl Pacer {
         let mut all: Vec<_> = lock(&self.sessions).values().cloned().collect();
         all.sort_by_key(|live| live.number);
         all
+    }
+
+    /// What each stepping thread counts of itself.
+    pub fn tallies(&self) -> impl Iterator<Item = &Tally> {
+        self.inboxes.iter().map(|inbox| &inbox.tally)
+    }
+
+    /// Those who look at some session.
+    pub fn viewers(&self) -> usize {
+        lock(&self.viewers).values().filter(|viewer| viewer.strong_count() > 0).count()
     }
 
     /// Ends a session and all its streams.

@@ -18,18 +18,16 @@
 use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
 use std::sync::mpsc::SyncSender;
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
-use std::time::Duration;
 
-use tokio::sync::oneshot;
-
-use super::clock::now_ns;
+use super::clock::{Dilation, now_ns};
 use super::cost::Longest;
 use super::frames::{Encoder, Job, Viewer};
+use super::inbox::{Inbox, Request};
 use super::queue::{Wakes, lock};
-use super::taps::{HashReply, ProbeTap, SampleTap, Taps, ViewTap};
-use super::{Dilation, Live, PacedRecord, PacedSample, State};
+use super::taps::{SampleTap, Taps, ViewTap};
+use super::{Live, PacedRecord, PacedSample, State};
 use crate::refusal::{Reason, Refusal, Result};
 use crate::session::Session;
 use crate::session::command::Due;
@@ -48,65 +46,11 @@ const BEAT_NS: u64 = 1_000_000;
 const MOST_WAKES: usize = 32;
 const MOST_ROUND_NS: u64 = 200_000;
 
+/// Every so many steps of a session one is a span of the log, at level debug.
+const STEPS_PER_SPAN: u64 = 1024;
+
 /// How often the stiffness under tools is computed anew, Hz.
 const REFINED_HZ: f64 = 50.0;
-
-/// What a stepping thread is asked for.
-pub(super) enum Request {
-    Adopt(Box<Running>),
-    Start {
-        until: Option<u64>,
-        reply: oneshot::Sender<Result<u64>>,
-    },
-    Pause {
-        reply: oneshot::Sender<Result<()>>,
-    },
-    /// Something came to a session at rest.
-    Wake,
-    Samples(SampleTap),
-    Probe(ProbeTap),
-    View(Arc<Viewer>),
-    Hash {
-        at: Option<u64>,
-        reply: HashReply,
-    },
-    Delete(Refusal),
-    /// A fault of the program, to see what comes of it.
-    #[cfg(test)]
-    Panic,
-}
-
-/// Where a stepping thread is asked.
-#[derive(Default)]
-pub(super) struct Inbox {
-    state: Mutex<InboxState>,
-    wake: Condvar,
-}
-
-#[derive(Default)]
-struct InboxState {
-    requests: Vec<(u64, Request)>,
-    stop: Option<Refusal>,
-}
-
-impl Inbox {
-    pub(super) fn send(&self, session: u64, request: Request) {
-        let mut state = lock(&self.state);
-        if state.stop.is_none() {
-            state.requests.push((session, request));
-        }
-        drop(state);
-        self.wake.notify_one();
-    }
-
-    pub(super) fn stop(&self, why: Refusal) {
-        let mut state = lock(&self.state);
-        state.stop = Some(why);
-        state.requests.clear();
-        drop(state);
-        self.wake.notify_one();
-    }
-}
 
 /// A session and its schedule.
 pub(super) struct Running {
@@ -123,6 +67,7 @@ pub(super) struct Running {
     still_since: Option<u64>,
     rested_steps: u64,
     overrun_count: u64,
+    lapsed_leases: u64,
     dilation: Dilation,
     due: Vec<Due>,
     hashed: Option<(u64, u128)>,
@@ -189,7 +134,7 @@ pub(super) fn work(inbox: &Inbox, encoder: &Encoder, refiner: &SyncSender<Refine
         if is_round_over || desk.wakes.len() >= MOST_WAKES {
             desk.wakes.wake();
         }
-        if let Some(why) = wait(inbox, next_ns, now, &mut requests) {
+        if let Some(why) = inbox.wait(next_ns, now, &mut requests) {
             desk.wakes.wake();
             rota.sessions.values_mut().for_each(|running| running.end(&why));
             return;
@@ -215,40 +160,16 @@ pub(super) fn work(inbox: &Inbox, encoder: &Encoder, refiner: &SyncSender<Refine
             }
             let awake = rota.due.len();
             rota.with(number, |running| {
+                let late_ns = begun_ns.saturating_sub(running.schedule.due_ns(running.next_step));
                 running.guarded(|running| running.step(begun_ns, &mut desk));
                 let ended_ns = now_ns();
-                desk.longest.observe(ended_ns, ended_ns - begun_ns);
+                let taken_ns = ended_ns.saturating_sub(begun_ns);
+                desk.longest.observe(ended_ns, taken_ns);
+                inbox.tally.lateness.add(late_ns);
+                inbox.tally.step_time.add(taken_ns);
                 running.queue_again(begun_ns, ended_ns, awake);
             });
         }
-    }
-}
-
-/// Waits until `deadline_ns` or until something is asked, which is added to `requests`. Tells why to stop, if so.
-fn wait(
-    inbox: &Inbox,
-    deadline_ns: Option<u64>,
-    mut now: u64,
-    requests: &mut VecDeque<(u64, Request)>,
-) -> Option<Refusal> {
-    let mut state = lock(&inbox.state);
-    loop {
-        requests.extend(state.requests.drain(..));
-        if !requests.is_empty() || state.stop.is_some() {
-            return state.stop.clone();
-        }
-        state = match deadline_ns {
-            None => inbox.wake.wait(state).unwrap_or_else(PoisonError::into_inner),
-            Some(deadline_ns) => {
-                let rest_ns = deadline_ns.saturating_sub(now);
-                if rest_ns == 0 {
-                    return None;
-                }
-                let waited = inbox.wake.wait_timeout(state, Duration::from_nanos(rest_ns));
-                now = now_ns();
-                waited.unwrap_or_else(PoisonError::into_inner).0
-            }
-        };
     }
 }
 
@@ -268,6 +189,7 @@ impl Running {
             still_since: Some(0),
             rested_steps: 0,
             overrun_count: 0,
+            lapsed_leases: 0,
             dilation,
             due: Vec::new(),
             hashed: None,
@@ -316,7 +238,11 @@ impl Running {
         };
         let rests_until = self.session.rests_until().filter(|_| self.running);
         let until = rests_until.map_or(step, |until| until.min(wanted()));
-        self.next_step = lock(&self.live.intake).rest(step, until, &self.schedule);
+        {
+            let mut intake = lock(&self.live.intake);
+            self.next_step = intake.rest(step, until, &self.schedule);
+            self.lapsed_leases = intake.lapsed();
+        }
         self.live.cost.set_awake(self.running && self.next_step == step);
     }
 
@@ -448,6 +374,9 @@ impl Running {
 
     /// The next step, at its time or after it.
     fn step(&mut self, begun_ns: u64, desk: &mut Desk<'_>) {
+        let sampled = self.next_step.is_multiple_of(STEPS_PER_SPAN);
+        let span = sampled.then(|| tracing::debug_span!("step", session = %self.live.id, step = self.next_step));
+        let _span = span.map(tracing::Span::entered);
         if self.next_step == self.session.step_count() {
             // Only of steps that cost something can a session be behind.
             self.drop_backlog(begun_ns, desk.longest.ns());
@@ -567,6 +496,20 @@ impl Running {
 
     fn publish_status(&self) {
         let mut status = lock(&self.live.status);
+        let (before, tally) = (&*status, &self.live.inbox.tally);
+        let path_counts = self.session.path_counts();
+        let guard_events = self.session.tissue().guard_events();
+        let is_held = self.session.hold_reason().is_some();
+        tally.rested_steps.add(self.rested_steps - before.rested_steps);
+        tally.overruns.add(self.overrun_count - before.overrun_count);
+        tally.late_commands.add(self.session.late_commands() - before.late_commands);
+        tally.lapsed_leases.add(self.lapsed_leases - before.lapsed_leases);
+        tally.guard_events.add(guard_events - before.guard_events);
+        tally.held_sessions.add(u64::from(is_held && before.state != State::Held));
+        let path_tallies = [&tally.limited_steps, &tally.dropped_poses, &tally.stale_releases];
+        for (index, count) in path_tallies.into_iter().enumerate() {
+            count.add(path_counts[index] - before.path_counts[index]);
+        }
         status.state = match (self.session.hold_reason(), self.running) {
             (Some(_), _) => State::Held,
             (None, true) => State::Running,
@@ -576,7 +519,10 @@ impl Running {
         status.model.clone_from(self.session.model());
         status.rested_steps = self.rested_steps;
         status.overrun_count = self.overrun_count;
-        status.guard_events = self.session.tissue().guard_events();
+        status.guard_events = guard_events;
+        status.awake_points = self.session.tissue().awake_points();
+        status.path_counts = path_counts;
+        status.lapsed_leases = self.lapsed_leases;
         status.dilation = self.dilation;
         status.schedule = self.schedule;
         status.late_commands = self.session.late_commands();

@@ -12,8 +12,22 @@ use crate::scene::document::read_text;
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
-    /// Where to listen: address:port.
+    /// Where to listen: address:port. At one that other machines can reach, TLS and tokens or client certificates are needed.
     pub listen: String,
+    /// File of the certificate chain that the server shows, PEM. Looked at again when it changes, as the next three.
+    pub tls_cert: Option<PathBuf>,
+    /// File of its private key, PEM.
+    pub tls_key: Option<PathBuf>,
+    /// File of certificates, PEM: a client must show one that was signed by one of them.
+    pub tls_client_ca: Option<PathBuf>,
+    /// File of tokens and the names of client certificates, and what they may do (docs/formats.md).
+    pub tokens: Option<PathBuf>,
+    /// Serve unprotected also where other machines can reach it.
+    pub insecure: bool,
+    /// Origins of pages of other sites that may call, as in `https://example.org`.
+    pub origins: Vec<String>,
+    /// Where Prometheus finds `/metrics`: address:port; nowhere if absent. Nobody is asked who they are there.
+    pub metrics: Option<String>,
     /// Folder of the scenes that sessions can be made from by name.
     pub scenes: PathBuf,
     /// Folder of the scripts that clients can ask for by name.
@@ -40,6 +54,13 @@ impl Default for Config {
     fn default() -> Self {
         Config {
             listen: "127.0.0.1:7117".to_owned(),
+            tls_cert: None,
+            tls_key: None,
+            tls_client_ca: None,
+            tokens: None,
+            insecure: false,
+            origins: Vec::new(),
+            metrics: None,
             scenes: PathBuf::from("scenes"),
             scripts: PathBuf::from("scripts"),
             viewer: PathBuf::from("clients/viewer/dist"),
@@ -57,13 +78,17 @@ impl Default for Config {
 impl Config {
     /// Reads a configuration file.
     pub fn load(path: &Path) -> Result<Self> {
-        let text = read_text(path, Limits::default().file_bytes)?;
-        let config: Config = toml::from_str(&text).map_err(|e| {
+        Config::parse(&path.display().to_string(), &read_text(path, Limits::default().file_bytes)?)
+    }
+
+    /// Parses a configuration; `name` is what refusals call it.
+    pub fn parse(name: &str, text: &str) -> Result<Self> {
+        let config: Config = toml::from_str(text).map_err(|e| {
             let line = e.span().map_or(1, |span| text[..span.start].matches('\n').count() + 1);
-            let place = Some(format!("{}:{line}", path.display()));
+            let place = Some(format!("{name}:{line}"));
             Refusal { place, ..Refusal::new(Reason::Unreadable, "", format!("{}\n{e}", e.message()).trim_end()) }
         })?;
-        config.check().map_err(|refusal| Refusal { place: Some(path.display().to_string()), ..refusal })?;
+        config.check().map_err(|refusal| Refusal { place: Some(name.to_owned()), ..refusal })?;
         Ok(config)
     }
 
@@ -78,6 +103,21 @@ impl Config {
             ("limits.thread_share", self.limits.thread_share),
         ] {
             positive(field, value)?;
+        }
+        let together = |field: &str, given: bool, needs: &str, there: bool| {
+            let missing = || Refusal::new(Reason::Missing, needs, format!("is missing, which goes with {field}"));
+            if given && !there { Err(missing()) } else { Ok(()) }
+        };
+        let (cert, key) = (self.tls_cert.is_some(), self.tls_key.is_some());
+        together("tls_cert", cert, "tls_key", key)?;
+        together("tls_key", key, "tls_cert", cert)?;
+        together("tls_client_ca", self.tls_client_ca.is_some(), "tls_cert", cert)?;
+        for (index, origin) in self.origins.iter().enumerate() {
+            let uri = origin.parse::<http::Uri>().ok().filter(|uri| uri.scheme().is_some() && uri.host().is_some());
+            if uri.is_none() || origin.ends_with('/') {
+                let message = format!("must be a scheme, a host and perhaps a port, as https://example.org: {origin}");
+                return Err(Refusal::new(Reason::WrongKind, format!("origins[{index}]"), message));
+            }
         }
         let (most_s, day_s) = (self.limits.lease_s, 86400.0);
         let within = |most: f64| move |value: f64| value > 0.0 && value <= most;

@@ -9,7 +9,7 @@ use std::time::Duration;
 use futures_util::stream::{self, Stream, StreamExt};
 use tokio::sync::oneshot;
 use tonic::{Request, Response, Status, Streaming};
-use tracing::{debug, info};
+use tracing::{Instrument, debug, info};
 
 use super::House;
 use super::rate::Bucket;
@@ -177,8 +177,10 @@ impl Haptics {
                         .and_then(|command| {
                             live.at_intake(|intake, now| intake.submit(hold.lease, vec![command], now))
                         });
+                    self.0.traffic.commanded(usize::from(taken.is_ok()));
                     if let Err(refusal) = taken {
                         live.count_refused(1);
+                        self.0.traffic.refused(refusal.reason);
                         debug!(session = %live.id, reason = refusal.reason.as_str(), %refusal, "command refused");
                         events.push(Event::Rejected(wire::sample::rejection(command.tool, command.sequence, &refusal)));
                         if bucket.is_abused() {
@@ -292,7 +294,7 @@ impl HapticService for Haptics {
         let (writer, events) = queue(self.0.config.limits.queued_samples);
         // The client may wait for our headers before it opens, so its first message is not waited for here.
         let (opened, opening) = oneshot::channel();
-        tokio::spawn(self.clone().listen(request.into_inner(), opened, writer));
+        tokio::spawn(self.clone().listen(request.into_inner(), opened, writer).in_current_span());
         Ok(Response::new(Box::pin(Output::Opening(opening, Some(events)))))
     }
 
@@ -340,7 +342,11 @@ impl HapticService for Haptics {
                 Ok(intake.tools_of(lease).collect())
             })
         });
-        let tools = taken.inspect_err(|_| live.count_refused(request.commands.len()))?;
+        let tools = taken.inspect_err(|refusal| {
+            live.count_refused(request.commands.len());
+            self.0.traffic.refused(refusal.reason);
+        })?;
+        self.0.traffic.commanded(request.commands.len());
         let sample = live.next_sample(tools).await?;
         let sample = Some(wire::sample::sample(&sample, 0, now_ns()));
         Ok(Response::new(pb::SendCommandsResponse { sample }))

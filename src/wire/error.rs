@@ -33,7 +33,8 @@ pub fn code(reason: Reason) -> Code {
         | Reason::UnknownViewer => Code::NotFound,
         Reason::SessionHeld | Reason::StaleSequence | Reason::NotAvailable => Code::FailedPrecondition,
         Reason::ToolHeld => Code::AlreadyExists,
-        Reason::NotHolder => Code::PermissionDenied,
+        Reason::NotHolder | Reason::RoleMissing | Reason::OriginNotAllowed => Code::PermissionDenied,
+        Reason::Unauthenticated => Code::Unauthenticated,
         Reason::StepPassed => Code::OutOfRange,
         Reason::ShuttingDown => Code::Unavailable,
     }

@@ -173,6 +173,7 @@ pub fn session(live: &Arc<Live>) -> pb::Session {
         let held = intake.holders().map(|(tool, holder)| pb::HeldTool { tool, holder: holder.to_owned() });
         (held.collect(), intake.lapsed(), intake.counts())
     });
+    let count = |count: usize| u32::try_from(count).unwrap_or(u32::MAX);
     let model = &status.model;
     #[allow(clippy::cast_precision_loss)]
     let simulation_time_s = status.step as f64 / model.scene.stepping.rate_hz;
@@ -204,6 +205,10 @@ pub fn session(live: &Arc<Live>) -> pb::Session {
             waiting: counts.waiting,
             refused: live.refused(),
         }),
+        awake_points: count(status.awake_points),
+        streams: count(live.streams()),
+        scene_name: model.scene.name.clone(),
+        points: count(model.len()),
         ..Default::default()
     };
     with_model(session, model)

@@ -17,7 +17,8 @@ use pb::touch_request::Message as Say;
 use pb::touch_response::Message as Heard;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::transport::Endpoint;
+
+use crate::connect::Server;
 
 /// What the device's loop and the network pass to each other. The newest counts: neither waits.
 #[derive(Default)]
@@ -56,7 +57,7 @@ pub(crate) type Command = (u64, DVec3);
 /// What a bridge connects to.
 #[derive(Debug, Clone)]
 pub(crate) struct Target {
-    pub(crate) server: String,
+    pub(crate) server: Server,
     /// A session that is there, or a scene to make one of.
     pub(crate) session: Option<String>,
     /// The session that it has made.
@@ -111,9 +112,7 @@ async fn connect(
     shared: &Shared,
     commands: &mut mpsc::Receiver<Command>,
 ) -> Result<(), String> {
-    let endpoint = Endpoint::from_shared(target.server.clone()).map_err(|e| e.to_string())?;
-    let endpoint = endpoint.tcp_nodelay(true).connect_timeout(SILENCE);
-    let channel = endpoint.connect().await.map_err(|e| format!("can't connect to {}: {e}", target.server))?;
+    let channel = target.server.clone().within(SILENCE).connect().await?;
     let mut sessions = SessionServiceClient::new(channel.clone());
     let told = |status: tonic::Status| describe(&status);
     let mut known = None;

@@ -17,9 +17,9 @@ use pb::touch_response::Message as Heard;
 use tokio::sync::watch;
 use tokio_stream::StreamExt;
 use tokio_stream::wrappers::WatchStream;
-use tonic::transport::Channel;
 
 use super::tally::Tally;
+use crate::connect::Channel;
 
 pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)

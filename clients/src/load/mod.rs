@@ -10,10 +10,10 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use tokio::sync::watch;
-use tonic::transport::Endpoint;
 
 use crate::Failure;
-use crate::replay::{endpoint, source};
+use crate::connect::{Credentials, Server};
+use crate::replay::source;
 use client::{Common, Stage, lock};
 use objective::Objective;
 use palpate::wire::pb::create_session_request::Source;
@@ -65,6 +65,8 @@ pub(crate) struct Arguments {
     /// No progress
     #[arg(short, long)]
     quiet: bool,
+    #[command(flatten)]
+    credentials: Credentials,
 }
 
 fn seconds(text: &str) -> Result<f64, String> {
@@ -92,13 +94,13 @@ const TRIES: usize = 2;
 const MOST_SESSIONS: usize = 1 << 16;
 
 pub(crate) async fn load(arguments: &Arguments) -> Result<(), Failure> {
-    let endpoint = endpoint(&arguments.server)?.tcp_nodelay(true);
+    let server = Server::new(&arguments.server, &arguments.credentials)?;
     let source = source(&arguments.scene)?;
     let sessions = arguments.sessions as usize;
     let ended = async {
         match &arguments.find_limit {
-            None => trial(arguments, &endpoint, &source, sessions).await.map(|outcome| (outcome, None)),
-            Some(objective) => find_limit(arguments, &endpoint, &source, sessions, objective)
+            None => trial(arguments, &server, &source, sessions).await.map(|outcome| (outcome, None)),
+            Some(objective) => find_limit(arguments, &server, &source, sessions, objective)
                 .await
                 .map(|(outcome, limit)| (outcome, Some(limit))),
         }
@@ -125,7 +127,7 @@ pub(crate) async fn load(arguments: &Arguments) -> Result<(), Failure> {
 /// between.
 async fn find_limit(
     arguments: &Arguments,
-    endpoint: &Endpoint,
+    server: &Server,
     source: &Source,
     first: usize,
     objective: &Objective,
@@ -136,7 +138,7 @@ async fn find_limit(
     loop {
         let mut met = None;
         for _ in 0..TRIES {
-            let why = match trial(arguments, endpoint, source, next).await {
+            let why = match trial(arguments, server, source, next).await {
                 Ok(outcome) => {
                     let mut missed = objective.missed(&outcome).join(", ");
                     if outcome.broken > 0 {
@@ -177,12 +179,7 @@ async fn find_limit(
 }
 
 /// Puts `sessions` on the server, measures, and takes them away again.
-async fn trial(
-    arguments: &Arguments,
-    endpoint: &Endpoint,
-    source: &Source,
-    sessions: usize,
-) -> Result<Outcome, Stopped> {
+async fn trial(arguments: &Arguments, server: &Server, source: &Source, sessions: usize) -> Result<Outcome, Stopped> {
     let stage = Arc::new(Stage::new());
     let clock = Instant::now();
     let threads = (arguments.threads as usize).min(sessions);
@@ -202,7 +199,7 @@ async fn trial(
         tallies.push(tally.clone());
         let numbers: Vec<usize> = (index..sessions).step_by(threads).collect();
         let orders = Orders {
-            endpoint: endpoint.clone(),
+            server: server.clone(),
             source: source.clone(),
             pause: Duration::from_secs_f64(arguments.ramp_s / numbers.len() as f64),
             sessions: numbers,
@@ -283,7 +280,7 @@ fn work(
     let failed = |e: std::io::Error| Stopped { message: format!("can't start a thread: {e}"), is_refusal: false };
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(failed)?;
     runtime.block_on(async {
-        let mut swarm = Swarm::new(&orders.endpoint, common).await?;
+        let mut swarm = Swarm::new(&orders.server, common).await?;
         let mut over = told.clone();
         let gathered = tokio::select! {
             gathered = swarm.gather(orders, phases) => gathered,

@@ -14,13 +14,13 @@ use palpate::wire::{self, pb};
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tonic::Status;
-use tonic::transport::{Channel, Endpoint};
 
 use super::client::{Arrivals, Client, Common, Stage, Stroke, lock};
+use crate::connect::{Channel, Server};
 
 /// What a thread is to do.
 pub(crate) struct Orders {
-    pub(crate) endpoint: Endpoint,
+    pub(crate) server: Server,
     pub(crate) source: Source,
     /// The numbers of its sessions among all.
     pub(crate) sessions: Vec<usize>,
@@ -48,13 +48,10 @@ impl From<Status> for Stopped {
     }
 }
 
-impl From<tonic::transport::Error> for Stopped {
-    fn from(error: tonic::transport::Error) -> Self {
-        let mut cause: &dyn std::error::Error = &error;
-        while let Some(deeper) = cause.source() {
-            cause = deeper;
-        }
-        Stopped { message: format!("can't reach the server: {cause}"), is_refusal: false }
+/// The server can't be reached.
+impl From<String> for Stopped {
+    fn from(message: String) -> Self {
+        Stopped { message, is_refusal: false }
     }
 }
 
@@ -79,14 +76,14 @@ struct Connections<'o> {
 }
 
 impl Connections<'_> {
-    async fn next(&mut self) -> Result<Channel, tonic::transport::Error> {
+    async fn next(&mut self) -> Result<Channel, Stopped> {
         match &mut self.newest {
             Some((channel, users)) if *users < self.orders.clients_per_connection => {
                 *users += 1;
                 Ok(channel.clone())
             }
             newest => {
-                let channel = self.orders.endpoint.connect().await?;
+                let channel = self.orders.server.connect().await?;
                 *newest = Some((channel.clone(), 1));
                 Ok(channel)
             }
@@ -103,8 +100,8 @@ pub(crate) struct Swarm {
 }
 
 impl Swarm {
-    pub(crate) async fn new(endpoint: &Endpoint, common: &Common) -> Result<Self, Stopped> {
-        let client = SessionServiceClient::new(endpoint.connect().await?);
+    pub(crate) async fn new(server: &Server, common: &Common) -> Result<Self, Stopped> {
+        let client = SessionServiceClient::new(server.connect().await?);
         Ok(Swarm { client, made: Vec::new(), tasks: JoinSet::new(), common: common.clone() })
     }
 
