@@ -18,7 +18,7 @@ PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/*.yaml $(VI
 	$(VIEWER)/src/*.css $(VIEWER)/public/* proto/palpate/v1/*.proto)
 
 .PHONY: help run build viewer page-if-node test test-viewer stress lint picture figures screenshot bench-roundtrip bench-duty \
-	bench-frames bench-error bench-kernel bench-stability bench-skip bench-rest bench-link bench-viewer need-rust \
+	bench-frames bench-error bench-kernel bench-stability bench-skip bench-rest bench-link bench-viewer bench-load soak fuzz need-rust \
 	need-python need-node
 
 help:
@@ -27,6 +27,7 @@ help:
 	@echo 'make test            every test (Rust, Python 3, and the page in a browser)'
 	@echo 'make test-viewer     the page alone; its screenshots are in target/viewer'
 	@echo 'make stress          ten thousand random scenes, ten million steps (some minutes)'
+	@echo 'make fuzz            a million bent inputs for every decoder (some minutes); fuzz/ has them for libFuzzer'
 	@echo 'make lint            formatting, compiler and clippy warnings'
 	@echo 'make picture         the curve of the README'
 	@echo 'make figures         the paper'"'"'s figures and experiments: docs/figures, shown in docs/paper.md'
@@ -41,6 +42,8 @@ help:
 	@echo 'make bench-viewer    331 × 331 points at 60 frames a second in a browser, and from a press to its pixel'
 	@echo 'make bench-stability the largest stable step, predicted and observed'
 	@echo 'make bench-skip      what it saves to leave out what is at rest, and its error'
+	@echo 'make bench-load      sessions that one core bears, with clients and without, and under attack: docs/benchmarks/load.md'
+	@echo 'make soak            random clients for SECONDS=1800: memory, handles, threads, and every command accounted for'
 
 need-rust:
 	@command -v $(CARGO) >/dev/null || { echo 'Rust is missing: install it from https://rustup.rs' >&2; exit 1; }
@@ -128,6 +131,11 @@ bench-frames: need-rust
 stress: need-rust
 	PALPATE_STRESS_SCENES=10000 $(CARGO) test --release --test stress --test sleep -- --include-ignored --nocapture
 
+# A million inputs a decoder; FUZZ_INPUTS=… for more.
+FUZZ_INPUTS ?= 1000000
+fuzz: need-rust
+	PALPATE_FUZZ_INPUTS=$(FUZZ_INPUTS) $(CARGO) test --release --test fuzz -- --nocapture
+
 # `make bench-error ARGUMENTS=--quick`, and bench-kernel and bench-frames likewise.
 bench-error: need-rust
 	$(CARGO) bench --quiet --bench error -- $(ARGUMENTS)
@@ -160,3 +168,11 @@ bench-viewer: build viewer
 # `make bench-link ARGUMENTS=--quick` for a minute's worth; the whole takes about half an hour.
 bench-link: build
 	$(CARGO) bench --quiet --bench link -- $(ARGUMENTS)
+
+bench-load: build
+	$(CARGO) bench --quiet --bench load -- $(ARGUMENTS)
+
+# How long, s.
+SECONDS ?= 1800
+soak: need-rust
+	PALPATE_SOAK_S=$(SECONDS) $(CARGO) test --release --test soak -- --include-ignored --nocapture

@@ -11,7 +11,6 @@
 #[path = "../tests/common/server.rs"]
 mod server;
 
-use std::io::{BufRead, BufReader};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
@@ -137,10 +136,7 @@ fn serve_echo() {
 /// The echo server, in a process of its own.
 fn spawn_echo() -> Server {
     let mut echo = Command::new(std::env::current_exe().unwrap());
-    let mut child = echo.arg("--echo").stdout(Stdio::piped()).spawn().unwrap();
-    let mut line = String::new();
-    BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
-    Server { child, url: line.split_whitespace().last().unwrap().to_owned() }
+    Server::of(echo.arg("--echo").stdout(Stdio::piped()).spawn().unwrap())
 }
 
 /// A haptic stream that sends a command and waits for its acknowledgement.

@@ -47,6 +47,26 @@ pub struct Limits {
     pub probe_points: usize,
     /// Longest lease of a tool, s.
     pub lease_s: f64,
+    /// Share of a stepping thread's time that sessions may take before no further one is let in, 0 to 1.
+    pub thread_share: f64,
+    /// Connections; what comes above that is closed at once.
+    pub connections: usize,
+    /// Streams and calls at once on a connection.
+    pub streams_per_connection: u32,
+    /// Bytes of a message from a client.
+    pub message_bytes: usize,
+    /// Bytes of a connection that wait to be read, in all its streams, before the transport holds the client back.
+    pub connection_window_bytes: u32,
+    /// A connection that has not said what it wants to speak after so long is closed, the handshake of TLS included, s.
+    pub handshake_s: f64,
+    /// A haptic stream without its first message after so long is ended, s.
+    pub open_s: f64,
+    /// A connection is asked whether it lives when it was silent so long, and closed if it does not answer for as long, s.
+    pub keepalive_s: f64,
+    /// Commands of a haptic stream, per tool and step of the session: what comes faster for long is refused.
+    pub commands_per_step: f64,
+    /// Sessions made over one connection, per minute.
+    pub sessions_per_minute: f64,
 }
 
 impl Default for Limits {
@@ -72,6 +92,16 @@ impl Default for Limits {
             texture_side: 4096,
             probe_points: 1 << 16,
             lease_s: 600.0,
+            thread_share: 0.85,
+            connections: 4096,
+            streams_per_connection: 256,
+            message_bytes: 1 << 20,
+            connection_window_bytes: 1 << 18,
+            handshake_s: 10.0,
+            open_s: 10.0,
+            keepalive_s: 10.0,
+            commands_per_step: 4.0,
+            sessions_per_minute: 600.0,
         }
     }
 }

@@ -11,12 +11,14 @@ use palpate::pace::clock::now_ns;
 use palpate::refusal::Refusal;
 use palpate::render::{self, Film, View};
 use palpate::scene::{Scene, script::Script};
-use palpate::server::{self, catalog::Catalog, config::Config};
+use palpate::server::identity::{self, Role};
+use palpate::server::{self, Doors, ServeError, catalog::Catalog, config::Config};
 use palpate::session::{check, run};
 use palpate::sheet::Model;
 use palpate::surface::Refinement;
 use palpate::texture;
 use tokio_util::sync::CancellationToken;
+use tracing_subscriber::fmt::format::FmtSpan;
 
 /// A server for touching soft tissue over a network.
 #[derive(Parser)]
@@ -59,10 +61,47 @@ enum Command {
     /// Serve tissue over gRPC and in the browser: sessions stepped in real time, commands in, forces and frames out
     #[command(after_help = "Examples:\n  \
         palpate serve\n  \
-        palpate serve --listen 127.0.0.1:0 --scenes my-scenes --threads 1\n\n\
+        palpate serve --listen 127.0.0.1:0 --scenes my-scenes --threads 1\n  \
+        palpate token --name ann --role create,touch --tokens tokens.toml > ann.token\n  \
+        palpate serve --listen 0.0.0.0:7117 --tls-cert server.pem --tls-key server.key --tokens tokens.toml\n  \
+        palpate-client replay vertical-60 --server https://server:7117 --token-file ann.token\n\n\
         The address is printed to the standard output when the server is ready. Ctrl-C or SIGTERM ends it: streams\n\
-        are told, and cut when the deadline has passed.")]
-    Serve(ServeArguments),
+        are told, and cut when the deadline has passed.\n\n\
+        On an address of this machine alone anybody may do everything. On any other the server starts only with TLS and\n\
+        with tokens or client certificates, or with --insecure. A client shows its token with every call, as\n\
+        `authorization: Bearer TOKEN`; roles are watch, touch (hold a tool, change the tissue), create (make,\n\
+        start, stop and delete sessions) and administer (everything; the only one that lists sessions). Health, reflection\n\
+        and the page's files are open; the page takes a token behind its address, as in https://server:7117/#token=TOKEN.\n\
+        Certificates, keys and tokens are looked at every second: new ones hold at once, for new connections and calls;\n\
+        what makes no sense is logged, and the old ones hold.")]
+    Serve(Box<ServeArguments>),
+    /// Make a token for clients of a server: prints the token, once, and keeps only its hash
+    #[command(after_help = "Examples:\n  \
+        palpate token --name ann --role create,touch --tokens tokens.toml > ann.token\n  \
+        palpate token --name screen --role watch\n\n\
+        Roles: watch (who has any role may), touch (hold a tool, change the tissue), create (make, start, stop and delete\n\
+        sessions), administer (everything). To take a token back, delete its entry: the server looks every second.")]
+    Token(TokenArguments),
+    /// Show the sessions of a server, once a second (`palpate-client top`)
+    #[command(disable_help_flag = true)]
+    Top {
+        /// As `palpate-client top --help` tells
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        arguments: Vec<std::ffi::OsString>,
+    },
+}
+
+#[derive(clap::Args)]
+struct TokenArguments {
+    /// Whose it is, for the log
+    #[arg(long)]
+    name: String,
+    /// What it allows: watch, touch, create, administer; separated by commas
+    #[arg(long, value_name = "ROLE", required = true, value_delimiter = ',')]
+    role: Vec<String>,
+    /// Add the entry to this file, instead of printing it too
+    #[arg(long, value_name = "FILE")]
+    tokens: Option<PathBuf>,
 }
 
 #[derive(clap::Args)]
@@ -70,6 +109,27 @@ struct ServeArguments {
     /// Where to listen; port 0 takes a free one [default: 127.0.0.1:7117]
     #[arg(long, value_name = "ADDRESS:PORT")]
     listen: Option<String>,
+    /// The server's certificate chain (PEM), for TLS
+    #[arg(long, value_name = "FILE")]
+    tls_cert: Option<PathBuf>,
+    /// Its private key (PEM)
+    #[arg(long, value_name = "FILE")]
+    tls_key: Option<PathBuf>,
+    /// Clients must show a certificate that was signed by one of these (PEM)
+    #[arg(long, value_name = "FILE")]
+    tls_client_ca: Option<PathBuf>,
+    /// Which tokens and certificates may do what (TOML); `palpate token` makes entries
+    #[arg(long, value_name = "FILE")]
+    tokens: Option<PathBuf>,
+    /// Listen also where other machines can reach the server, though nobody is asked who they are
+    #[arg(long)]
+    insecure: bool,
+    /// A page of another site that may call, as in https://example.org; may be repeated
+    #[arg(long, value_name = "ORIGIN")]
+    origin: Vec<String>,
+    /// Tell Prometheus at http://ADDRESS:PORT/metrics; off unless given
+    #[arg(long, value_name = "ADDRESS:PORT")]
+    metrics: Option<String>,
     /// Folder of the scenes that sessions can be made from by name [default: scenes]
     #[arg(long, value_name = "DIR")]
     scenes: Option<PathBuf>,
@@ -181,6 +241,15 @@ impl From<Refusal> for Failure {
     }
 }
 
+impl From<ServeError> for Failure {
+    fn from(error: ServeError) -> Self {
+        match error {
+            ServeError::Refused(refusal) => refusal.into(),
+            error => Failure::Failed(error.to_string()),
+        }
+    }
+}
+
 fn main() -> ExitCode {
     let ended = match Arguments::parse().command {
         Command::Run(arguments) => run_script(&arguments),
@@ -188,6 +257,8 @@ fn main() -> ExitCode {
         Command::Render(arguments) => render(&arguments),
         Command::Texture(arguments) => make_texture(&arguments),
         Command::Serve(arguments) => serve(&arguments),
+        Command::Token(arguments) => token(&arguments),
+        Command::Top { arguments } => return top(&arguments),
     };
     let (status, message) = match ended {
         Ok(()) => return ExitCode::SUCCESS,
@@ -206,6 +277,22 @@ fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     let mut config = load_config(arguments.config.as_deref())?;
     if let Some(listen) = &arguments.listen {
         config.listen.clone_from(listen);
+    }
+    let files = [
+        (&arguments.tls_cert, &mut config.tls_cert),
+        (&arguments.tls_key, &mut config.tls_key),
+        (&arguments.tls_client_ca, &mut config.tls_client_ca),
+        (&arguments.tokens, &mut config.tokens),
+    ];
+    for (given, configured) in files {
+        if given.is_some() {
+            configured.clone_from(given);
+        }
+    }
+    config.insecure |= arguments.insecure;
+    config.origins.extend(arguments.origin.iter().cloned());
+    if arguments.metrics.is_some() {
+        config.metrics.clone_from(&arguments.metrics);
     }
     for (option, folder, key) in [
         ("--scenes", &arguments.scenes, &mut config.scenes),
@@ -230,11 +317,14 @@ fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     config.check()?;
     let filter = tracing_subscriber::EnvFilter::try_new(&config.log)
         .map_err(|e| Failure::Refused(format!("--log {}: {e}", config.log)))?;
+    let detailed = filter.max_level_hint().is_none_or(|level| level >= tracing::Level::DEBUG);
     // Nobody waits for a log that is not read: what does not fit is dropped.
     let (writer, _flush) = tracing_appender::non_blocking(std::io::stderr());
     let subscriber = tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(writer)
+        // How long a call or a sampled step took is told when it is over, to those who ask for so much.
+        .with_span_events(if detailed { FmtSpan::CLOSE } else { FmtSpan::NONE })
         .with_ansi(std::io::stderr().is_terminal());
     if arguments.log_json {
         subscriber.json().init();
@@ -242,30 +332,59 @@ fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
         subscriber.init();
     }
     let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(config.network_threads.max(1))
+        .worker_threads(config.serving_threads())
         .thread_name("network")
         .enable_all()
         .build()
         .map_err(|e| Failure::Failed(format!("can't start the network threads: {e}")))?;
     let ended = runtime.block_on(async {
-        let listen = &config.listen;
-        let listener = tokio::net::TcpListener::bind(listen).await.map_err(|e| {
-            if e.kind() == std::io::ErrorKind::InvalidInput {
-                return Failure::Refused(format!("--listen {listen}: must be address:port, as in 127.0.0.1:7117"));
-            }
-            Failure::Failed(format!(
-                "can't listen on {listen}: {e}; another --listen, or port 0 for a free one, may do"
-            ))
-        })?;
-        let address = listener.local_addr().map_err(|e| Failure::Failed(e.to_string()))?;
+        let doors = Doors::open(&config).await?;
         let shutdown = CancellationToken::new();
         tokio::spawn(cancel_on_signal(shutdown.clone()));
         // Who started us may have stopped listening; we serve all the same.
-        let _ = writeln!(std::io::stdout(), "palpate listens on http://{address}");
-        server::serve(listener, config, shutdown).await.map_err(|e| Failure::Failed(e.to_string()))
+        let _ = writeln!(std::io::stdout(), "palpate listens on {}", doors.url());
+        if let Some(url) = doors.metrics_url() {
+            let _ = writeln!(std::io::stdout(), "metrics are at {url}");
+        }
+        Ok(server::serve(doors, config, shutdown).await?)
     });
     runtime.shutdown_background();
     ended
+}
+
+/// Runs the client's program, which lies beside this one.
+fn top(arguments: &[std::ffi::OsString]) -> ExitCode {
+    let program = std::env::current_exe().unwrap_or_default().with_file_name("palpate-client");
+    match std::process::Command::new(&program).arg("top").args(arguments).status() {
+        Ok(status) => status.code().and_then(|code| u8::try_from(code).ok()).map_or(ExitCode::FAILURE, ExitCode::from),
+        Err(e) => {
+            eprintln!("palpate: {}: {e}", program.display());
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn token(arguments: &TokenArguments) -> Result<(), Failure> {
+    let roles: Vec<Role> = arguments.role.iter().map(|role| Role::named(role)).collect::<Result<_, _>>()?;
+    let token = identity::new_token()?;
+    let entry = identity::entry(&arguments.name, &roles, &token)?;
+    let Some(path) = &arguments.tokens else {
+        let printed = writeln!(
+            std::io::stdout(),
+            "# For the client: --token-file, or PALPATE_TOKEN. It is kept nowhere.\n{token}\n\n\
+             # For the server's file (--tokens):\n{entry}"
+        );
+        return printed.map_err(|e| Failure::Failed(e.to_string()));
+    };
+    let refuse = |e: std::io::Error| Failure::Refused(format!("{}: can't be written: {e}", path.display()));
+    let mut options = std::fs::OpenOptions::new();
+    options.append(true).create(true);
+    #[cfg(unix)]
+    std::os::unix::fs::OpenOptionsExt::mode(&mut options, 0o600);
+    let mut file = options.open(path).map_err(refuse)?;
+    // In one piece: a server may look at any moment.
+    file.write_all(format!("\n{entry}").as_bytes()).map_err(refuse)?;
+    writeln!(std::io::stdout(), "{token}").map_err(|e| Failure::Failed(e.to_string()))
 }
 
 /// Ctrl-C and SIGTERM end the server; a second one ends it at once.

@@ -56,6 +56,12 @@ reasons! {
     ToolHeld = "TOOL_HELD",
     /// The tool is not held by who commands it, or no longer.
     NotHolder = "NOT_HOLDER",
+    /// A call by nobody that the server knows.
+    Unauthenticated = "UNAUTHENTICATED",
+    /// Who calls has not got the role that the call asks for.
+    RoleMissing = "ROLE_MISSING",
+    /// A page of another site.
+    OriginNotAllowed = "ORIGIN_NOT_ALLOWED",
     /// The sequence number is not above the last one.
     StaleSequence = "STALE_SEQUENCE",
     /// More commands are waiting than the session keeps.
@@ -64,6 +70,12 @@ reasons! {
     StepPassed = "STEP_PASSED",
     /// More sessions, streams or tools than the configuration allows.
     TooMany = "TOO_MANY",
+    /// A further session would make the steps of others late.
+    Overloaded = "OVERLOADED",
+    /// Commands or calls come faster than the configuration allows.
+    RateLimited = "RATE_LIMITED",
+    /// What was waited for did not come in time.
+    TimedOut = "TIMED_OUT",
     /// The first message of a stream must open it, and only the first.
     OutOfTurn = "OUT_OF_TURN",
     /// Something that this machine has not got.

@@ -11,6 +11,7 @@ use std::path::Path;
 use palpate::limits::Limits;
 use palpate::scene::Scene;
 use palpate::scene::script::Script;
+use palpate::server::identity::{self, Role};
 use palpate::wire::{self, pb};
 use prost::Message;
 use server::{PATIENCE, Server, told};
@@ -39,13 +40,20 @@ fn get(server: &Server, path: &str, headers: &str) -> (String, String) {
 
 /// A server whose page is a folder of our own.
 fn with_page() -> (Server, tempfile::TempDir) {
+    with_page_and(|_| Vec::new())
+}
+
+/// The same, with options that may name files of the folder.
+fn with_page_and(options: impl Fn(&Path) -> Vec<String>) -> (Server, tempfile::TempDir) {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("secret.txt"), "not for you").unwrap();
     let page = folder.path().join("page");
     std::fs::create_dir_all(page.join("assets")).unwrap();
     std::fs::write(page.join("index.html"), "<title>tissue</title>").unwrap();
     std::fs::write(page.join("assets/index-1a2b.js"), "export {}").unwrap();
-    (Server::start(&["--viewer", page.to_str().unwrap()]), folder)
+    let options = [vec!["--viewer".to_owned(), page.to_str().unwrap().to_owned()], options(folder.path())].concat();
+    let options: Vec<&str> = options.iter().map(String::as_str).collect();
+    (Server::start(&options), folder)
 }
 
 #[test]
@@ -107,9 +115,47 @@ fn grpc_web_is_answered_on_the_same_port() {
     assert!(head.contains("grpc-status: 12"), "{head}");
 }
 
+#[test]
+fn a_page_is_for_everybody_and_its_calls_for_those_with_a_token() {
+    let token = identity::new_token().unwrap();
+    let (server, _folder) = with_page_and(|folder| {
+        let tokens = folder.join("tokens.toml");
+        std::fs::write(&tokens, identity::entry("screen", &[Role::Watch], &token).unwrap()).unwrap();
+        vec!["--tokens".to_owned(), tokens.to_str().unwrap().to_owned()]
+    });
+    for path in ["/", "/?session=1", "/assets/index-1a2b.js", "/textures/paper.png"] {
+        assert!(get(&server, path, "").0.starts_with("http/1.1 200"), "{path}");
+    }
+    let call = |method: &str, content_type: &str, authorization: &str| {
+        let headers = format!("Content-Type: {content_type}\r\n{authorization}");
+        ask(&server, "POST", &format!("/palpate.v1.SessionService/{method}"), &headers, &[0; 5]).0
+    };
+    let known = format!("Authorization: Bearer {token}\r\n");
+    for content_type in ["application/grpc-web+proto", "application/grpc-web-text", "application/grpc", "text/html"] {
+        for (method, authorization, status) in [
+            ("ListScenes", "", 16),
+            ("ListScenes", "Authorization: Bearer palpate_guess\r\n", 16),
+            ("CreateSession", &known, 7),
+            // What looks like a page is none.
+            ("ListScenes/index.html", "", 7),
+        ] {
+            let head = call(method, content_type, authorization);
+            assert!(head.contains(&format!("grpc-status: {status}")), "{method} as {content_type}: {head}");
+        }
+    }
+    // A page can't get around the question by asking for a call as for a file.
+    let (head, _) = get(&server, "/palpate.v1.SessionService/ListScenes", "");
+    assert!(head.contains("grpc-status: 16"), "{head}");
+    scenes_over_grpc_web_as(&server, &known);
+}
+
 fn scenes_over_grpc_web(server: &Server) {
-    let headers = "Content-Type: application/grpc-web+proto\r\n";
-    let (head, body) = ask(server, "POST", "/palpate.v1.SessionService/ListScenes", headers, &[0; 5]);
+    scenes_over_grpc_web_as(server, "");
+}
+
+fn scenes_over_grpc_web_as(server: &Server, authorization: &str) {
+    let headers = format!("Content-Type: application/grpc-web+proto\r\n{authorization}");
+    let (head, body) = ask(server, "POST", "/palpate.v1.SessionService/ListScenes", &headers, &[0; 5]);
     assert!(head.starts_with("http/1.1 200") && head.contains("application/grpc-web+proto"), "{head}");
     let text = String::from_utf8_lossy(&body);
     assert!(text.contains("paper") && text.contains("grpc-status:0"), "{text}");

@@ -4,6 +4,7 @@
 #[path = "common/server.rs"]
 mod server;
 
+use std::io::BufReader;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::sync::Arc;
@@ -94,10 +95,9 @@ fn hammer(url: String) -> Hammer {
     let thread = std::thread::spawn(move || {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         // Borrows the real server's address; it is not this one's to end.
-        let server = std::mem::ManuallyDrop::new(Server {
-            child: Command::new("true").stdout(Stdio::null()).spawn().unwrap(),
-            url,
-        });
+        let mut child = Command::new("true").stdout(Stdio::piped()).spawn().unwrap();
+        let out = BufReader::new(child.stdout.take().unwrap());
+        let server = std::mem::ManuallyDrop::new(Server { child, url, out });
         runtime.block_on(async {
             while !stopped.load(Ordering::Relaxed) {
                 let session = server.paper(false).await;

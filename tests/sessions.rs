@@ -505,6 +505,20 @@ async fn a_port_in_use_is_told() {
 }
 
 #[test]
+fn the_example_of_a_configuration_has_every_key_with_its_default() {
+    use palpate::server::config::Config;
+    let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
+    let example = Config::load(&root.join("docs/palpate.toml")).unwrap();
+    assert_eq!(format!("{example:#?}"), format!("{:#?}", Config::default()));
+    let text = std::fs::read_to_string(root.join("docs/palpate.toml")).unwrap();
+    for key in format!("{example:#?}").lines().filter_map(|line| line.trim().split_once(": ").map(|field| field.0)) {
+        let has = |line: &str| line.starts_with(&format!("{key} = ")) || line.starts_with(&format!("[{key}]"));
+        // What is nothing by default is shown in a comment.
+        assert!(text.lines().any(|line| has(line.trim_start_matches("# "))), "docs/palpate.toml lacks {key}");
+    }
+}
+
+#[test]
 fn bad_configuration_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("palpate.toml");
@@ -516,6 +530,8 @@ fn bad_configuration_is_refused() {
         ("lease_s = 1000.0\n", "lease_s"),
         ("threads = 1\nthraeds = 2\n", "palpate.toml:2"),
         ("[limits]\npoint_force_n = -1.0\n", "limits.point_force_n"),
+        ("[limits]\nthread_share = 0.0\n", "limits.thread_share"),
+        ("[limits]\nopen_s = -1.0\n", "limits.open_s"),
         ("lease_s = nan\n", "lease_s"),
         ("threads = [", "palpate.toml:1"),
     ] {

@@ -4,9 +4,13 @@
 #![allow(clippy::disallowed_methods)]
 
 mod bridge;
+mod connect;
+mod health;
 mod link;
+mod load;
 mod plot;
 mod replay;
+mod top;
 
 use std::process::ExitCode;
 
@@ -50,6 +54,32 @@ enum Command {
         Connects again by itself when the connection breaks; forces come back when the owner asks for them. A real device is\n\
         an implementation of `HapticDevice` (clients/src/bridge/device.rs says how).")]
     Bridge(bridge::Arguments),
+    /// Put many sessions, haptic clients and viewers on a server at once; tell how it bears them
+    #[command(after_help = "Examples:\n  \
+        palpate-client load --sessions 50 --seconds 10\n  \
+        palpate-client load --sessions 20 --clients-per-session 2 --viewers 3 --scene liver --json\n  \
+        palpate-client load --find-limit 'p99<2ms,dilation>0.999'\n\n\
+        Each client strokes the tissue by a command every tick of its own clock, whatever comes back: nothing rests, and a\n\
+        late answer delays no later command. The round trip is from a command to the first sample that acknowledges it,\n\
+        the wait for the step included. Lost: commands of which nothing was heard within 2 s of the end, and samples that\n\
+        the server dropped. The age of a frame is against the sample of the same step. The generator shares the machine's\n\
+        cores with a server on the same machine: it tells what it took.\n\n\
+        Exit status: 0; 1 when streams broke or the server could not be reached; 2 when an input was refused.")]
+    Load(load::Arguments),
+    /// Ask a server whether it serves; for scripts and containers
+    #[command(after_help = "Examples:\n  \
+        palpate-client health\n  \
+        palpate-client health https://localhost:7117 --ca /etc/palpate/ca.pem\n\n\
+        Needs no token. Exit status: 0 if it serves; 1 if not; 2 when an input was refused.")]
+    Health(health::Arguments),
+    /// Show the sessions of a server, once a second: state, step rate, dilation, awake points, who holds what
+    #[command(after_help = "Examples:\n  \
+        palpate top\n  \
+        palpate top https://server:7117 --token-file admin.token\n  \
+        palpate top --once --json | jq '.sessions[] | select(.time_dilation < 0.999)'\n\n\
+        Of a server that knows its clients the token needs the role `administer`.\n\n\
+        Exit status: 0; 1 when the server can't be reached or does not tell; 2 when an input was refused.")]
+    Top(top::Arguments),
 }
 
 /// How a program ends that does not end well.
@@ -69,6 +99,9 @@ async fn main() -> ExitCode {
         Command::Replay(arguments) => replay::replay(&arguments).await,
         Command::Link(arguments) => link::link(&arguments).await,
         Command::Bridge(arguments) => bridge::bridge(&arguments).await,
+        Command::Load(arguments) => load::load(&arguments).await,
+        Command::Health(arguments) => health::health(&arguments).await,
+        Command::Top(arguments) => top::top(&arguments).await,
     };
     let (status, message) = match ended {
         Ok(()) | Err(Failure::Unread) => return ExitCode::SUCCESS,

@@ -21,9 +21,9 @@ use pb::touch_request::Message as Say;
 use pb::touch_response::Message as Heard;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::transport::{Channel, Endpoint};
 use tonic::{Status, Streaming};
 
+use crate::connect::{Channel, Credentials, Server};
 use crate::{Failure, plot};
 
 /// How far ahead of the server's step commands are sent: as long as a network may stall and none is late.
@@ -59,6 +59,8 @@ pub(crate) struct Arguments {
     quiet: bool,
     #[command(flatten)]
     sampling: Sampling,
+    #[command(flatten)]
+    credentials: Credentials,
 }
 
 /// Which samples the server is asked for. The records do not depend on it.
@@ -121,15 +123,10 @@ struct Session {
 }
 
 pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
-    let endpoint = endpoint(&arguments.server)?;
+    let server = Server::new(&arguments.server, &arguments.credentials)?;
     let source = source(&arguments.scene)?;
-    let channel = endpoint.connect().await.map_err(|e| {
-        let mut cause: &dyn std::error::Error = &e;
-        while let Some(deeper) = cause.source() {
-            cause = deeper;
-        }
-        Failure::Failed(format!("can't reach {}: {cause}; `palpate serve` starts a server", arguments.server))
-    })?;
+    let unreached = |why| Failure::Failed(format!("{why}; `palpate serve` starts a server"));
+    let channel = server.connect().await.map_err(unreached)?;
     let mut client = SessionServiceClient::new(channel.clone());
     let request =
         pb::CreateSessionRequest { source: Some(source), paused: true, idle_timeout_s: Some(SILENCE.as_secs_f64()) };
@@ -149,19 +146,7 @@ pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
     ended
 }
 
-/// Host and port, with or without http://.
-fn endpoint(server: &str) -> Result<Endpoint, Failure> {
-    let refuse = |why: &str| Failure::Refused(format!("--server {server}: {why}"));
-    let url = match server.split_once("://") {
-        None => format!("http://{server}"),
-        Some(("http", _)) => server.to_owned(),
-        Some(_) => return Err(refuse("must begin with http://")),
-    };
-    let endpoint = Endpoint::from_shared(url).map_err(|e| refuse(&e.to_string()))?;
-    Ok(endpoint.connect_timeout(Duration::from_secs(10)))
-}
-
-fn source(scene: &str) -> Result<Source, Failure> {
+pub(crate) fn source(scene: &str) -> Result<Source, Failure> {
     if Path::new(scene).extension().is_none_or(|extension| extension != "toml") {
         return Ok(Source::SceneName(scene.to_owned()));
     }

@@ -2,8 +2,11 @@
 //! posts a request to one, or goes through the session's intake, and never waits for a step.
 
 pub mod clock;
+mod cost;
 pub mod frames;
+mod inbox;
 pub mod queue;
+pub mod tally;
 mod taps;
 mod thread;
 
@@ -25,11 +28,14 @@ use crate::session::local::Refinement;
 use crate::session::sampling::{HEARTBEAT_S, Sampler, Sampling};
 use crate::session::schedule::Schedule;
 use crate::sheet::Model;
-use clock::now_ns;
+use clock::{Dilation, now_ns};
+use cost::Cost;
 use frames::{Delivery, Encoder, Viewer};
+use inbox::{Inbox, Request};
 use queue::{Reader, lock, queue};
+use tally::Tally;
 use taps::{ProbeTap, SampleTap};
-use thread::{Inbox, Request, Running};
+use thread::{Running, beat_ns};
 
 /// A sample, and how the session keeps time.
 #[derive(Debug, Clone, PartialEq)]
@@ -87,35 +93,14 @@ pub struct Status {
     pub hold_reason: Option<String>,
     /// How often the guard went back to a checkpoint.
     pub guard_events: u64,
+    /// Points that the last step computed.
+    pub awake_points: usize,
+    /// As [`crate::session::Session::path_counts`].
+    pub path_counts: [u64; 3],
+    /// Leases that ran out.
+    pub lapsed_leases: u64,
     /// The tissue as it is: [`Live::change`] may have made another of it.
     pub model: Arc<Model>,
-}
-
-/// Over which time dilation is measured.
-const DILATION_WINDOW_NS: u64 = 1_000_000_000;
-
-/// Simulated over real time, of the last second or so.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Dilation {
-    /// 1 when on time.
-    pub value: f64,
-    /// When the window of the next measurement began, and steps done then.
-    since: (u64, u64),
-}
-
-impl Dilation {
-    fn new(now_ns: u64, step: u64) -> Self {
-        Dilation { value: 1.0, since: (now_ns, step) }
-    }
-
-    #[allow(clippy::cast_precision_loss)]
-    fn observe(&mut self, now_ns: u64, step: u64, period_ns: f64) {
-        let elapsed_ns = now_ns.saturating_sub(self.since.0);
-        if elapsed_ns >= DILATION_WINDOW_NS {
-            self.value = step.saturating_sub(self.since.1) as f64 * period_ns / elapsed_ns as f64;
-            self.since = (now_ns, step);
-        }
-    }
 }
 
 /// A session as the server sees it.
@@ -133,7 +118,11 @@ pub struct Live {
     limits: Limits,
     status: Mutex<Status>,
     streams: Mutex<usize>,
+    refused: AtomicU64,
     laws: Mutex<Vec<KeptLaw>>,
+    cost: Cost,
+    /// Of the stepping threads, its own, and where that is asked.
+    thread: usize,
     inbox: Arc<Inbox>,
 }
 
@@ -159,7 +148,7 @@ impl Live {
         if let Some(step) = resting.filter(|step| *step >= status.step) {
             status.rested_steps += step - status.step;
             status.dilation.observe(now, step, status.schedule.period_ns());
-            (status.resting, status.step) = (true, step);
+            (status.resting, status.step, status.awake_points) = (true, step, 0);
         }
         status
     }
@@ -187,6 +176,16 @@ impl Live {
         answer
     }
 
+    /// So many commands were refused.
+    pub fn count_refused(&self, commands: usize) {
+        self.refused.fetch_add(commands as u64, Ordering::Relaxed);
+    }
+
+    /// Commands that were refused, in all.
+    pub fn refused(&self) -> u64 {
+        self.refused.load(Ordering::Relaxed)
+    }
+
     /// Room for one more stream.
     pub fn open_stream(self: &Arc<Self>) -> Result<StreamGuard> {
         let mut streams = lock(&self.streams);
@@ -196,6 +195,11 @@ impl Live {
         }
         *streams += 1;
         Ok(StreamGuard(self.clone()))
+    }
+
+    /// Streams that read the session.
+    pub fn streams(&self) -> usize {
+        *lock(&self.streams)
     }
 
     async fn ask<T>(&self, request: impl FnOnce(oneshot::Sender<Result<T>>) -> Request) -> Result<T> {
@@ -358,21 +362,25 @@ impl Pacer {
             *numbers += 1;
             *numbers
         };
-        #[allow(clippy::cast_possible_truncation)]
-        let inbox = self.inboxes[number as usize % self.inboxes.len()].clone();
+        let begin_ns = beat_ns(now_ns());
         let status = Status {
             state: if paused { State::Paused } else { State::Running },
             step: 0,
             resting: false,
             rested_steps: 0,
             overrun_count: 0,
-            dilation: Dilation::new(now_ns(), 0),
-            schedule: Schedule::new(0, now_ns(), scene.stepping.rate_hz),
+            dilation: Dilation::new(begin_ns, 0),
+            schedule: Schedule::new(0, begin_ns, scene.stepping.rate_hz),
             late_commands: 0,
             hold_reason: None,
             guard_events: 0,
+            awake_points: 0,
+            path_counts: [0; 3],
+            lapsed_leases: 0,
             model: model.clone(),
         };
+        let (cost, thread) = self.place(&model, paused)?;
+        let inbox = self.inboxes[thread].clone();
         let live = Arc::new(Live {
             id: id.clone(),
             intake: Mutex::new(Intake::new(&model.scene, &self.limits)),
@@ -383,7 +391,10 @@ impl Pacer {
             limits: self.limits.clone(),
             status: Mutex::new(status),
             streams: Mutex::new(0),
+            refused: AtomicU64::new(0),
             laws: Mutex::new(Vec::new()),
+            cost,
+            thread,
             inbox: inbox.clone(),
         });
         // Laid out before the lock is taken, on which all calls wait.
@@ -404,6 +415,49 @@ impl Pacer {
         Ok(live)
     }
 
+    /// The thread with the most time to spare for a further session, and what that will take.
+    fn place(&self, model: &Model, paused: bool) -> Result<(Cost, usize)> {
+        let sessions = lock(&self.sessions);
+        let cost = Cost::guess(model, sessions.values().map(|live| &live.cost));
+        let mut taken = vec![(0.0, 0_usize); self.inboxes.len()];
+        for live in sessions.values() {
+            taken[live.thread].0 += live.cost.share();
+            taken[live.thread].1 += 1;
+        }
+        drop(sessions);
+        let spare =
+            |a: &(usize, &(f64, usize)), b: &(usize, &(f64, usize))| a.1.0.total_cmp(&b.1.0).then(a.1.1.cmp(&b.1.1));
+        let (thread, (taken, _)) = taken.iter().enumerate().min_by(spare).unwrap_or((0, &(0.0, 0)));
+        if !paused {
+            self.check_share(*taken, &cost)?;
+        }
+        Ok((cost, thread))
+    }
+
+    /// Refuses what would make others late. Whoever is alone on its thread delays nobody, however heavy; and what rests
+    /// takes nothing.
+    fn check_share(&self, taken: f64, cost: &Cost) -> Result<()> {
+        let (needed, most) = (cost.awake_share(), self.limits.thread_share);
+        if taken == 0.0 || taken + needed <= most {
+            return Ok(());
+        }
+        let message = format!(
+            "the sessions of the stepping thread with the most time to spare take {taken:.3} of it, and this one would take \
+             {needed:.3}: above the {most} that sessions may take (limits.thread_share)"
+        );
+        Err(Refusal::new(Reason::Overloaded, "", message))
+    }
+
+    /// Lets a session's time go on ([`Live::start`]), unless that would make others late.
+    pub async fn start_session(&self, live: &Live, until: Option<u64>) -> Result<u64> {
+        if lock(&live.status).state == State::Paused {
+            let others = |other: &&Arc<Live>| other.thread == live.thread && other.number != live.number;
+            let taken = lock(&self.sessions).values().filter(others).map(|other| other.cost.share()).sum();
+            self.check_share(taken, &live.cost)?;
+        }
+        live.start(until).await
+    }
+
     /// The session of that id.
     pub fn get(&self, id: &str) -> Result<Arc<Live>> {
         let live = lock(&self.sessions).get(id).cloned().ok_or_else(|| unknown_session(id))?;
@@ -416,6 +470,16 @@ impl Pacer {
         let mut all: Vec<_> = lock(&self.sessions).values().cloned().collect();
         all.sort_by_key(|live| live.number);
         all
+    }
+
+    /// What each stepping thread counts of itself.
+    pub fn tallies(&self) -> impl Iterator<Item = &Tally> {
+        self.inboxes.iter().map(|inbox| &inbox.tally)
+    }
+
+    /// Those who look at some session.
+    pub fn viewers(&self) -> usize {
+        lock(&self.viewers).values().filter(|viewer| viewer.strong_count() > 0).count()
     }
 
     /// Ends a session and all its streams.
@@ -486,3 +550,36 @@ pub fn excerpt(text: &str) -> String {
 
 /// Frames as a stream reads them.
 pub type FrameReader = Reader<Delivery>;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::PAPER;
+
+    #[tokio::test]
+    async fn a_fault_in_one_session_ends_that_one_alone() {
+        let limits = Limits::default();
+        let scene = Scene::parse("paper", PAPER, &[], &limits).unwrap();
+        let pacer = Pacer::start(1, &limits).unwrap();
+        let [faulty, sound] = [(); 2].map(|()| pacer.create(&scene, false, 60.0).unwrap());
+        let mut samples =
+            faulty.samples(Sampling { every: 1, only: None, deadband: None, heartbeat_s: 0.01, law: None });
+        samples.pop().await.unwrap();
+        faulty.inbox.send(faulty.number, Request::Panic);
+        let told = faulty.hash_at(Some(1_000_000)).await.unwrap_err();
+        assert_eq!((told.reason, faulty.status().state), (Reason::SessionHeld, State::Held));
+        assert!(told.message.contains("a test"), "{told}");
+        let ended = loop {
+            if let Err(ended) = samples.pop().await {
+                break ended;
+            }
+        };
+        assert_eq!(ended.reason, Reason::SessionHeld);
+        let refused = faulty.at_intake(|intake, now| intake.acquire(&[0], "", 1.0, 1, now));
+        assert_eq!(refused.unwrap_err().reason, Reason::SessionHeld);
+        // On the same thread.
+        let step = sound.status().step;
+        assert_eq!(sound.hash_at(Some(step + 20)).await.unwrap().0, step + 20);
+        pacer.stop();
+    }
+}

@@ -2,9 +2,9 @@
 //! waits, and the reader gets what is new.
 
 use std::collections::VecDeque;
+use std::future::poll_fn;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-
-use tokio::sync::Notify;
+use std::task::{Context, Poll, Waker};
 
 use crate::refusal::{Reason, Refusal};
 
@@ -20,21 +20,38 @@ struct Inner<T> {
     dropped: u64,
     end: Option<Refusal>,
     abandoned: bool,
-}
-
-#[derive(Debug)]
-struct Shared<T> {
-    inner: Mutex<Inner<T>>,
-    arrived: Notify,
+    /// Of the reader, if it waits.
+    waiting: Option<Waker>,
 }
 
 /// The end that a stepping thread writes to.
 #[derive(Debug)]
-pub struct Writer<T>(Arc<Shared<T>>);
+pub struct Writer<T>(Arc<Mutex<Inner<T>>>);
 
 /// The end that a stream reads from. Dropping it tells the writer to stop.
 #[derive(Debug)]
-pub struct Reader<T>(Arc<Shared<T>>);
+pub struct Reader<T>(Arc<Mutex<Inner<T>>>);
+
+/// Readers that are to be woken, together: to wake one may cost more than the step whose sample it gets.
+#[derive(Debug, Default)]
+pub struct Wakes(Vec<Waker>);
+
+impl Wakes {
+    /// How many are to be woken.
+    pub fn len(&self) -> usize {
+        self.0.len()
+    }
+
+    /// Nobody is to be woken.
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    /// Wakes them.
+    pub fn wake(&mut self) {
+        self.0.drain(..).for_each(Waker::wake);
+    }
+}
 
 /// A queue of `capacity` items.
 pub fn queue<T>(capacity: usize) -> (Writer<T>, Reader<T>) {
@@ -45,47 +62,63 @@ pub fn queue<T>(capacity: usize) -> (Writer<T>, Reader<T>) {
         dropped: 0,
         end: None,
         abandoned: false,
+        waiting: None,
     };
-    let shared = Arc::new(Shared { inner: Mutex::new(inner), arrived: Notify::new() });
+    let shared = Arc::new(Mutex::new(inner));
     (Writer(shared.clone()), Reader(shared))
 }
 
 impl<T> Writer<T> {
     /// Adds an item; drops the oldest if there is no room.
     pub fn push(&self, item: T) {
-        let mut inner = lock(&self.0.inner);
+        if let Some(waker) = self.place(item) {
+            waker.wake();
+        }
+    }
+
+    /// The same, but leaves it to the caller to wake the reader.
+    pub fn push_quietly(&self, item: T, wakes: &mut Wakes) {
+        wakes.0.extend(self.place(item));
+    }
+
+    fn place(&self, item: T) -> Option<Waker> {
+        let mut inner = lock(&self.0);
         if inner.end.is_some() || inner.abandoned {
-            return;
+            return None;
         }
         if inner.items.len() == inner.capacity {
             inner.items.pop_front();
             inner.dropped += 1;
         }
         inner.items.push_back(item);
-        drop(inner);
-        self.0.arrived.notify_one();
+        inner.waiting.take()
     }
 
     /// Takes back the newest item, if it has not been read.
     pub fn withdraw(&self) -> Option<T> {
-        lock(&self.0.inner).items.pop_back()
+        lock(&self.0).items.pop_back()
     }
 
     /// Whether one more item would cost the oldest.
     pub fn is_full(&self) -> bool {
-        let inner = lock(&self.0.inner);
+        let inner = lock(&self.0);
         inner.items.len() == inner.capacity
     }
 
     /// No more items; the reader is told why when it has read the rest.
     pub fn close(&self, why: Refusal) {
-        lock(&self.0.inner).end.get_or_insert(why);
-        self.0.arrived.notify_one();
+        let mut inner = lock(&self.0);
+        inner.end.get_or_insert(why);
+        let waiting = inner.waiting.take();
+        drop(inner);
+        if let Some(waker) = waiting {
+            waker.wake();
+        }
     }
 
     /// The reader has gone.
     pub fn is_abandoned(&self) -> bool {
-        lock(&self.0.inner).abandoned
+        lock(&self.0).abandoned
     }
 }
 
@@ -98,24 +131,28 @@ impl<T> Drop for Writer<T> {
 impl<T> Reader<T> {
     /// The oldest item, and how many were dropped so far; the reason when there are no more.
     pub async fn pop(&mut self) -> Result<(T, u64), Refusal> {
-        loop {
-            {
-                let mut inner = lock(&self.0.inner);
-                if let Some(item) = inner.items.pop_front() {
-                    return Ok((item, inner.dropped));
-                }
-                if let Some(why) = &inner.end {
-                    return Err(why.clone());
-                }
-            }
-            self.0.arrived.notified().await;
+        poll_fn(|context| self.poll_pop(context)).await
+    }
+
+    /// The same, if there is one or no more will come; else the task is woken when that is so.
+    pub fn poll_pop(&mut self, context: &mut Context<'_>) -> Poll<Result<(T, u64), Refusal>> {
+        let mut inner = lock(&self.0);
+        if let Some(item) = inner.items.pop_front() {
+            return Poll::Ready(Ok((item, inner.dropped)));
         }
+        if let Some(why) = &inner.end {
+            return Poll::Ready(Err(why.clone()));
+        }
+        if !inner.waiting.as_ref().is_some_and(|waker| waker.will_wake(context.waker())) {
+            inner.waiting = Some(context.waker().clone());
+        }
+        Poll::Pending
     }
 }
 
 impl<T> Drop for Reader<T> {
     fn drop(&mut self) {
-        let mut inner = lock(&self.0.inner);
+        let mut inner = lock(&self.0);
         inner.abandoned = true;
         inner.items.clear();
     }

@@ -3,6 +3,12 @@
 //! Overruns: time steps are fixed. A session that is behind catches up at most [`CATCH_UP_STEPS`] steps; what it is
 //! behind beyond that is dropped from its schedule, and counted. Simulated time then runs slower than real time.
 //!
+//! Fair parts: the session that is due first goes first, so those of any rates are all on time while there is time for
+//! all. If there is not, whoever takes no more than an equal part of the thread still goes by when it is due; whoever
+//! takes more and is late goes after all that are due. So between two steps of a session that is too heavy all others
+//! get theirs, and it gets what they leave. A step can't be interrupted: by the longest one of late everybody may be
+//! behind through no fault of its own, and catches that up however many steps it is.
+//!
 //! Rest: while all of a tissue is asleep and no command waits, its steps change nothing but their number. Then only the
 //! steps are done that somebody is to be told of (a heartbeat, a record, a hash); those between are skipped, all at once,
 //! when the next is due. A session of which nobody waits for a step is not in the thread's rota at all, and a thread
@@ -11,17 +17,17 @@
 
 use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
 use std::sync::mpsc::SyncSender;
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
-use std::time::Duration;
 
-use tokio::sync::oneshot;
-
-use super::clock::now_ns;
+use super::clock::{Dilation, now_ns};
+use super::cost::Longest;
 use super::frames::{Encoder, Job, Viewer};
-use super::queue::lock;
-use super::taps::{HashReply, ProbeTap, SampleTap, Taps, ViewTap};
-use super::{Dilation, Live, PacedRecord, PacedSample, State};
+use super::inbox::{Inbox, Request};
+use super::queue::{Wakes, lock};
+use super::taps::{SampleTap, Taps, ViewTap};
+use super::{Live, PacedRecord, PacedSample, State};
 use crate::refusal::{Reason, Refusal, Result};
 use crate::session::Session;
 use crate::session::command::Due;
@@ -32,62 +38,19 @@ use crate::surface::Snapshot;
 /// Steps that a session may be behind before the rest is dropped.
 const CATCH_UP_STEPS: f64 = 2.0;
 
+/// Sessions begin on the same beat, whose length this is, ns: a thread wakes once for all of a rate, and so does who
+/// carries what they tell.
+const BEAT_NS: u64 = 1_000_000;
+
+/// So many readers wait at most, and so long, ns, for the end of a round of steps before they are woken.
+const MOST_WAKES: usize = 32;
+const MOST_ROUND_NS: u64 = 200_000;
+
+/// Every so many steps of a session one is a span of the log, at level debug.
+const STEPS_PER_SPAN: u64 = 1024;
+
 /// How often the stiffness under tools is computed anew, Hz.
 const REFINED_HZ: f64 = 50.0;
-
-/// What a stepping thread is asked for.
-pub(super) enum Request {
-    Adopt(Box<Running>),
-    Start {
-        until: Option<u64>,
-        reply: oneshot::Sender<Result<u64>>,
-    },
-    Pause {
-        reply: oneshot::Sender<Result<()>>,
-    },
-    /// Something came to a session at rest.
-    Wake,
-    Samples(SampleTap),
-    Probe(ProbeTap),
-    View(Arc<Viewer>),
-    Hash {
-        at: Option<u64>,
-        reply: HashReply,
-    },
-    Delete(Refusal),
-}
-
-/// Where a stepping thread is asked.
-#[derive(Default)]
-pub(super) struct Inbox {
-    state: Mutex<InboxState>,
-    wake: Condvar,
-}
-
-#[derive(Default)]
-struct InboxState {
-    requests: Vec<(u64, Request)>,
-    stop: Option<Refusal>,
-}
-
-impl Inbox {
-    pub(super) fn send(&self, session: u64, request: Request) {
-        let mut state = lock(&self.state);
-        if state.stop.is_none() {
-            state.requests.push((session, request));
-        }
-        drop(state);
-        self.wake.notify_one();
-    }
-
-    pub(super) fn stop(&self, why: Refusal) {
-        let mut state = lock(&self.state);
-        state.stop = Some(why);
-        state.requests.clear();
-        drop(state);
-        self.wake.notify_one();
-    }
-}
 
 /// A session and its schedule.
 pub(super) struct Running {
@@ -98,10 +61,13 @@ pub(super) struct Running {
     schedule: Schedule,
     /// The step to do next. At rest, those before it are skipped; `u64::MAX` if there is none.
     next_step: u64,
+    /// It was late, and takes more than its part: it goes after those that were due by then.
+    not_before_ns: u64,
     /// Steps done when all was asleep first, if it still is.
     still_since: Option<u64>,
     rested_steps: u64,
     overrun_count: u64,
+    lapsed_leases: u64,
     dilation: Dilation,
     due: Vec<Due>,
     hashed: Option<(u64, u128)>,
@@ -139,6 +105,19 @@ impl Rota {
     }
 }
 
+/// What all sessions of a thread use.
+struct Desk<'t> {
+    encoder: &'t Encoder,
+    refiner: &'t SyncSender<Refinement>,
+    wakes: Wakes,
+    longest: Longest,
+}
+
+/// The beat at `now_ns`, or the next.
+pub(super) fn beat_ns(now_ns: u64) -> u64 {
+    now_ns.next_multiple_of(BEAT_NS)
+}
+
 /// The thread's work.
 pub(super) fn work(inbox: &Inbox, encoder: &Encoder, refiner: &SyncSender<Refinement>) {
     // The default slack of 50 µs would be the larger part of each step's lateness. Where it can't be set, so be it.
@@ -146,9 +125,17 @@ pub(super) fn work(inbox: &Inbox, encoder: &Encoder, refiner: &SyncSender<Refine
     let _ = rustix::thread::set_current_timer_slack(std::num::NonZeroU64::new(1));
     let mut rota = Rota::default();
     let mut requests = VecDeque::new();
+    let mut desk = Desk { encoder, refiner, wakes: Wakes::default(), longest: Longest::default() };
+    let mut begun_round_ns = 0;
     loop {
         let next_ns = rota.first().map(|first| first.0);
-        if let Some(why) = wait(inbox, next_ns, &mut requests) {
+        let now = now_ns();
+        let is_round_over = next_ns.is_none_or(|next_ns| next_ns > now) || now > begun_round_ns + MOST_ROUND_NS;
+        if is_round_over || desk.wakes.len() >= MOST_WAKES {
+            desk.wakes.wake();
+        }
+        if let Some(why) = inbox.wait(next_ns, now, &mut requests) {
+            desk.wakes.wake();
             rota.sessions.values_mut().for_each(|running| running.end(&why));
             return;
         }
@@ -158,57 +145,52 @@ pub(super) fn work(inbox: &Inbox, encoder: &Encoder, refiner: &SyncSender<Refine
                 rota.sessions.insert(number, running);
                 rota.with(number, Running::plan);
             } else {
-                rota.with(number, |running| running.serve(request, encoder));
+                rota.with(number, |running| running.guarded(|running| running.serve(request, &mut desk)));
             }
             if next_ns.is_some_and(|next_ns| next_ns <= now_ns()) {
                 break;
             }
         }
-        // The one that is due first: a heavy session is late itself before it makes others late.
+        let begun_ns = now_ns();
         if let Some((due_ns, number)) = rota.first()
-            && due_ns <= now_ns()
+            && due_ns <= begun_ns
         {
-            rota.with(number, |running| running.step(encoder, refiner));
-        }
-    }
-}
-
-/// Waits until `deadline_ns` or until something is asked, which is added to `requests`. Tells why to stop, if so.
-fn wait(inbox: &Inbox, deadline_ns: Option<u64>, requests: &mut VecDeque<(u64, Request)>) -> Option<Refusal> {
-    let mut state = lock(&inbox.state);
-    loop {
-        requests.extend(state.requests.drain(..));
-        if !requests.is_empty() || state.stop.is_some() {
-            return state.stop.clone();
-        }
-        state = match deadline_ns {
-            None => inbox.wake.wait(state).unwrap_or_else(PoisonError::into_inner),
-            Some(deadline_ns) => {
-                let rest_ns = deadline_ns.saturating_sub(now_ns());
-                if rest_ns == 0 {
-                    return None;
-                }
-                let waited = inbox.wake.wait_timeout(state, Duration::from_nanos(rest_ns));
-                waited.unwrap_or_else(PoisonError::into_inner).0
+            if desk.wakes.is_empty() {
+                begun_round_ns = begun_ns;
             }
-        };
+            let awake = rota.due.len();
+            rota.with(number, |running| {
+                let late_ns = begun_ns.saturating_sub(running.schedule.due_ns(running.next_step));
+                running.guarded(|running| running.step(begun_ns, &mut desk));
+                let ended_ns = now_ns();
+                let taken_ns = ended_ns.saturating_sub(begun_ns);
+                desk.longest.observe(ended_ns, taken_ns);
+                inbox.tally.lateness.add(late_ns);
+                inbox.tally.step_time.add(taken_ns);
+                running.queue_again(begun_ns, ended_ns, awake);
+            });
+        }
     }
 }
 
 impl Running {
     pub(super) fn new(live: Arc<Live>, running: bool) -> Self {
-        let now = now_ns();
-        let schedule = Schedule::new(0, now, live.model.scene.stepping.rate_hz);
+        let (schedule, dilation) = {
+            let status = lock(&live.status);
+            (status.schedule, status.dilation)
+        };
         Running {
             session: Session::new(&live.model),
             running,
             until: None,
             schedule,
             next_step: 0,
+            not_before_ns: 0,
             still_since: Some(0),
             rested_steps: 0,
             overrun_count: 0,
-            dilation: Dilation::new(now, 0),
+            lapsed_leases: 0,
+            dilation,
             due: Vec::new(),
             hashed: None,
             taps: Taps::default(),
@@ -219,7 +201,32 @@ impl Running {
 
     /// When its next step is due, if time goes on and one is wanted.
     fn due_ns(&self) -> Option<u64> {
-        (self.running && self.next_step < u64::MAX).then(|| self.schedule.due_ns(self.next_step))
+        let due_ns = (self.running && self.next_step < u64::MAX).then(|| self.schedule.due_ns(self.next_step))?;
+        Some(due_ns.max(self.not_before_ns))
+    }
+
+    /// Finds its place among `awake` sessions of the thread, after a step.
+    #[allow(clippy::cast_precision_loss)]
+    fn queue_again(&mut self, begun_ns: u64, now_ns: u64, awake: usize) {
+        if self.still_since.is_none() {
+            self.live.cost.observe(now_ns.saturating_sub(begun_ns));
+        }
+        let is_late = now_ns.saturating_sub(self.schedule.due_ns(self.next_step)) as f64 > self.schedule.period_ns();
+        let takes_more = self.live.cost.awake_share() * awake as f64 > 1.0;
+        self.not_before_ns = if awake > 1 && is_late && takes_more { now_ns } else { 0 };
+    }
+
+    /// Does something with it. A panic ends this session, and no other.
+    fn guarded(&mut self, act: impl FnOnce(&mut Self)) {
+        let Err(panic) = catch_unwind(AssertUnwindSafe(|| act(self))) else { return };
+        let text = panic.downcast_ref::<String>().map(String::as_str);
+        let text = text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("without a message");
+        let reason = format!("a fault of the program ended it after step {}: {text}", self.session.step_count());
+        tracing::error!(session = %self.live.id, reason, "session held");
+        self.session.hold(reason.clone());
+        self.end(&Refusal::new(Reason::SessionHeld, "", reason));
+        self.live.cost.set_awake(false);
+        self.publish_status();
     }
 
     /// Decides which step comes next: the very next one, or at rest the next one that somebody waits for.
@@ -231,7 +238,12 @@ impl Running {
         };
         let rests_until = self.session.rests_until().filter(|_| self.running);
         let until = rests_until.map_or(step, |until| until.min(wanted()));
-        self.next_step = lock(&self.live.intake).rest(step, until, &self.schedule);
+        {
+            let mut intake = lock(&self.live.intake);
+            self.next_step = intake.rest(step, until, &self.schedule);
+            self.lapsed_leases = intake.lapsed();
+        }
+        self.live.cost.set_awake(self.running && self.next_step == step);
     }
 
     /// At rest, time has gone on without a step: brings the session to where it stands now.
@@ -248,7 +260,7 @@ impl Running {
         self.session.skip_to(step);
     }
 
-    fn serve(&mut self, request: Request, encoder: &Encoder) {
+    fn serve(&mut self, request: Request, desk: &mut Desk<'_>) {
         self.catch_up();
         let step = self.session.step_count();
         // Also while time stands, when no step does it.
@@ -262,13 +274,13 @@ impl Running {
                 let _ = reply.send(started);
             }
             Request::Pause { reply } => {
-                self.stand();
+                self.stand(desk);
                 let _ = reply.send(Ok(()));
             }
             Request::Samples(mut tap) => {
                 tap.overrun_count = self.overrun_count;
                 if !self.running {
-                    self.tell(&mut tap, true);
+                    self.tell(&mut tap, true, &mut desk.wakes);
                 }
                 if self.session.hold_reason().is_some() {
                     tap.writer.close(self.passed(0));
@@ -281,7 +293,7 @@ impl Running {
             Request::View(viewer) => {
                 // Who joins late gets a full frame first.
                 let frame_id = viewer.frame_id(step, self.live.model.scene.stepping.rate_hz);
-                self.post(encoder, vec![(viewer.clone(), frame_id)]);
+                self.post(desk.encoder, vec![(viewer.clone(), frame_id)]);
                 self.taps.viewers.push(ViewTap { viewer, shown: step, passed: frame_id });
             }
             Request::Hash { at, reply } => {
@@ -296,6 +308,9 @@ impl Running {
                 self.end(&why);
                 self.deleted = true;
             }
+            #[cfg(test)]
+            #[allow(clippy::panic)]
+            Request::Panic => panic!("a test"),
         }
         self.plan();
         self.publish_status();
@@ -311,11 +326,11 @@ impl Running {
     }
 
     /// Time stands from now on. Who reads samples gets the present one.
-    fn stand(&mut self) {
+    fn stand(&mut self, desk: &mut Desk<'_>) {
         self.running = false;
         self.plan();
         self.publish_status();
-        self.tell_all(true);
+        self.tell_all(true, &mut desk.wakes);
     }
 
     fn passed(&self, at: u64) -> Refusal {
@@ -336,7 +351,7 @@ impl Running {
         }
         self.until = until;
         if !self.running {
-            let now = now_ns();
+            let now = beat_ns(now_ns());
             self.running = true;
             self.schedule = Schedule::new(step, now, self.live.model.scene.stepping.rate_hz);
             self.schedule.delay(1.0);
@@ -347,8 +362,8 @@ impl Running {
 
     /// What it is behind beyond what it may catch up is dropped.
     #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    fn drop_backlog(&mut self) {
-        let late_ns = now_ns().saturating_sub(self.schedule.due_ns(self.next_step));
+    fn drop_backlog(&mut self, now_ns: u64, forgiven_ns: u64) {
+        let late_ns = now_ns.saturating_sub(self.schedule.due_ns(self.next_step)).saturating_sub(forgiven_ns);
         let behind = (late_ns as f64 / self.schedule.period_ns()).floor() - CATCH_UP_STEPS;
         if behind > 0.0 {
             self.schedule.delay(behind);
@@ -358,25 +373,28 @@ impl Running {
     }
 
     /// The next step, at its time or after it.
-    fn step(&mut self, encoder: &Encoder, refiner: &SyncSender<Refinement>) {
-        if self.next_step > self.session.step_count() {
+    fn step(&mut self, begun_ns: u64, desk: &mut Desk<'_>) {
+        let sampled = self.next_step.is_multiple_of(STEPS_PER_SPAN);
+        let span = sampled.then(|| tracing::debug_span!("step", session = %self.live.id, step = self.next_step));
+        let _span = span.map(tracing::Span::entered);
+        if self.next_step == self.session.step_count() {
+            // Only of steps that cost something can a session be behind.
+            self.drop_backlog(begun_ns, desk.longest.ns());
+        } else {
             self.plan();
             self.skip_to(self.next_step);
-        } else {
-            // Only of steps that cost something can a session be behind.
-            self.drop_backlog();
         }
         let step = self.session.step_count();
         let change = {
             let mut intake = lock(&self.live.intake);
-            intake.take_due(step, now_ns(), &mut self.due);
+            intake.take_due(step, begun_ns, &mut self.due);
             intake.take_change(step)
         };
         if let Some(model) = change {
             self.session.change(&model);
         }
 
-        let Running { session, taps, due, .. } = self;
+        let (Running { session, taps, due, .. }, wakes) = (&mut *self, &mut desk.wakes);
         session.advance(due, |session| {
             let step = session.step_count();
             // A pass over the sheet, once for all who want it.
@@ -386,7 +404,7 @@ impl Running {
                 if tap.energy {
                     record.energy_j = Some(*energy.get_or_insert_with(|| session.energy()));
                 }
-                tap.writer.push(PacedRecord { step, record });
+                tap.writer.push_quietly(PacedRecord { step, record }, wakes);
             }
         });
         if let Some(reason) = self.session.hold_reason() {
@@ -406,13 +424,13 @@ impl Running {
         }
         let step = self.session.step_count();
         self.still_since = self.session.rests_until().map(|_| self.still_since.unwrap_or(step));
-        self.dilation.observe(now_ns(), step, self.schedule.period_ns());
+        self.dilation.observe(begun_ns, step, self.schedule.period_ns());
         // The status first: who is told of this step may ask for it at once.
         self.publish_status();
-        self.publish(encoder);
+        self.publish(desk);
         let every = (self.live.model.scene.stepping.rate_hz / REFINED_HZ).max(1.0) as u64;
         if self.session.step_count().is_multiple_of(every) {
-            self.refine(refiner);
+            self.refine(desk.refiner);
         }
         self.plan();
     }
@@ -426,25 +444,26 @@ impl Running {
     }
 
     /// Gives a stream the present sample, if it is to get it, or if no other follows for now.
-    fn tell(&self, tap: &mut SampleTap, last: bool) {
+    fn tell(&self, tap: &mut SampleTap, last: bool, wakes: &mut Wakes) {
         let Some(sample) = tap.sampler.pick(&self.session, last || tap.once) else { return };
         let overrun = self.overrun_count > tap.overrun_count;
         tap.overrun_count = self.overrun_count;
         let Running { overrun_count, .. } = *self;
-        tap.writer.push(PacedSample { sample, overrun_count, time_dilation: self.dilation.value, overrun });
+        let paced = PacedSample { sample, overrun_count, time_dilation: self.dilation.value, overrun };
+        tap.writer.push_quietly(paced, wakes);
     }
 
-    fn tell_all(&mut self, last: bool) {
+    fn tell_all(&mut self, last: bool, wakes: &mut Wakes) {
         let mut taps = std::mem::take(&mut self.taps.samples);
-        taps.iter_mut().for_each(|tap| self.tell(tap, last));
+        taps.iter_mut().for_each(|tap| self.tell(tap, last, wakes));
         taps.retain(|tap| !tap.once);
         self.taps.samples = taps;
     }
 
     /// Tells everybody who wants to know of this step.
-    fn publish(&mut self, encoder: &Encoder) {
+    fn publish(&mut self, desk: &mut Desk<'_>) {
         let step = self.session.step_count();
-        self.tell_all(!self.running);
+        self.tell_all(!self.running, &mut desk.wakes);
         self.taps.forget_the_gone();
         let (still_since, rate_hz) = (self.still_since, self.live.model.scene.stepping.rate_hz);
         let held = self.session.hold_reason().is_some();
@@ -458,7 +477,7 @@ impl Running {
         };
         let viewers: Vec<_> = self.taps.viewers.iter_mut().filter_map(due_frame).collect();
         if !viewers.is_empty() {
-            self.post(encoder, viewers);
+            self.post(desk.encoder, viewers);
         }
         for (at, reply) in self.taps.hashes.extract_if(.., |waiting| waiting.0 == step).collect::<Vec<_>>() {
             let _ = reply.send(Ok((at, self.hash())));
@@ -477,6 +496,20 @@ impl Running {
 
     fn publish_status(&self) {
         let mut status = lock(&self.live.status);
+        let (before, tally) = (&*status, &self.live.inbox.tally);
+        let path_counts = self.session.path_counts();
+        let guard_events = self.session.tissue().guard_events();
+        let is_held = self.session.hold_reason().is_some();
+        tally.rested_steps.add(self.rested_steps - before.rested_steps);
+        tally.overruns.add(self.overrun_count - before.overrun_count);
+        tally.late_commands.add(self.session.late_commands() - before.late_commands);
+        tally.lapsed_leases.add(self.lapsed_leases - before.lapsed_leases);
+        tally.guard_events.add(guard_events - before.guard_events);
+        tally.held_sessions.add(u64::from(is_held && before.state != State::Held));
+        let path_tallies = [&tally.limited_steps, &tally.dropped_poses, &tally.stale_releases];
+        for (index, count) in path_tallies.into_iter().enumerate() {
+            count.add(path_counts[index] - before.path_counts[index]);
+        }
         status.state = match (self.session.hold_reason(), self.running) {
             (Some(_), _) => State::Held,
             (None, true) => State::Running,
@@ -486,7 +519,10 @@ impl Running {
         status.model.clone_from(self.session.model());
         status.rested_steps = self.rested_steps;
         status.overrun_count = self.overrun_count;
-        status.guard_events = self.session.tissue().guard_events();
+        status.guard_events = guard_events;
+        status.awake_points = self.session.tissue().awake_points();
+        status.path_counts = path_counts;
+        status.lapsed_leases = self.lapsed_leases;
         status.dilation = self.dilation;
         status.schedule = self.schedule;
         status.late_commands = self.session.late_commands();

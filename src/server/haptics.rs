@@ -3,14 +3,18 @@
 use std::collections::VecDeque;
 use std::pin::Pin;
 use std::sync::Arc;
+use std::task::{Context, Poll, ready};
+use std::time::Duration;
 
 use futures_util::stream::{self, Stream, StreamExt};
 use tokio::sync::oneshot;
 use tonic::{Request, Response, Status, Streaming};
-use tracing::{debug, info};
+use tracing::{Instrument, debug, info};
 
 use super::House;
+use super::rate::Bucket;
 use crate::haptics::device::{Device, UNDECLARED_FORCE_N};
+use crate::limits::Limits;
 use crate::pace::clock::now_ns;
 use crate::pace::queue::{Reader, Writer, queue};
 use crate::pace::{Live, PacedSample, StreamGuard, random_bits};
@@ -51,6 +55,16 @@ struct Hold {
     device: Option<Device>,
 }
 
+impl Hold {
+    /// How fast commands may come: so many for each step and tool, and at once twice what may wait.
+    #[allow(clippy::cast_precision_loss)]
+    fn bucket(&self, limits: &Limits) -> Bucket {
+        let tools = self.tools.max(1) as f64;
+        let per_s = limits.commands_per_step * self.live.model.scene.stepping.rate_hz * tools;
+        Bucket::new(per_s, per_s.max(2.0 * limits.queued_commands_per_tool as f64 * tools))
+    }
+}
+
 impl Drop for Hold {
     fn drop(&mut self) {
         if self.tools > 0 {
@@ -89,7 +103,12 @@ impl Haptics {
         let guard = live.open_stream()?;
         if device.is_some() {
             let live = live.clone();
-            let law = tokio::task::spawn_blocking(move || live.law(tip.radius_m)).await;
+            let turn = self.0.heavy_work.clone().acquire_owned().await;
+            let law = tokio::task::spawn_blocking(move || {
+                let _turn = turn;
+                live.law(tip.radius_m)
+            });
+            let law = law.await;
             let failed = |_| Refusal::new(Reason::NotAvailable, "device", "the force law could not be computed");
             sampling.law = Some(law.map_err(failed)?);
         }
@@ -121,7 +140,13 @@ impl Haptics {
         events: Writer<Event>,
     ) {
         use pb::touch_request::Message;
-        let first = match inbound.message().await {
+        let patience = Duration::from_secs_f64(self.0.config.limits.open_s);
+        let Ok(first) = tokio::time::timeout(patience, inbound.message()).await else {
+            let message = format!("did not come within {} s", patience.as_secs_f64());
+            let _ = opening.send(Err(Refusal::new(Reason::TimedOut, "open", message).into()));
+            return;
+        };
+        let first = match first {
             Ok(Some(pb::TouchRequest { message: Some(Message::Open(open)) })) => self.open(&open).await,
             Ok(_) => Err(Refusal::new(Reason::OutOfTurn, "open", "the first message must be `open`")),
             Err(status) => {
@@ -140,22 +165,39 @@ impl Haptics {
             }
         };
         let live = &hold.live;
+        let mut bucket = hold.bucket(&self.0.config.limits);
         loop {
             match inbound.message().await {
                 Ok(Some(pb::TouchRequest { message: Some(Message::Command(command)) })) => {
                     let now = now_ns();
-                    let taken = wire::command::from_command(&command, &live.model.scene.sheet, now)
+                    let taken = bucket
+                        .take(now, "commands of this stream")
+                        .and_then(|()| wire::command::from_command(&command, &live.model.scene.sheet, now))
                         .and_then(|command| within_reach(command, live, hold.device.as_ref()))
                         .and_then(|command| {
                             live.at_intake(|intake, now| intake.submit(hold.lease, vec![command], now))
                         });
+                    self.0.traffic.commanded(usize::from(taken.is_ok()));
                     if let Err(refusal) = taken {
+                        live.count_refused(1);
+                        self.0.traffic.refused(refusal.reason);
                         debug!(session = %live.id, reason = refusal.reason.as_str(), %refusal, "command refused");
                         events.push(Event::Rejected(wire::sample::rejection(command.tool, command.sequence, &refusal)));
+                        if bucket.is_abused() {
+                            info!(session = %live.id, "haptic stream ended: its commands come far too fast");
+                            return events.close(refusal);
+                        }
                     }
                 }
                 Ok(Some(pb::TouchRequest { message: Some(Message::Renew(renew)) })) => {
                     let now = now_ns();
+                    if let Err(refusal) = bucket.take(now, "messages of this stream") {
+                        if bucket.is_abused() {
+                            return events.close(refusal);
+                        }
+                        events.push(Event::Rejected(wire::sample::rejection(0, 0, &refusal)));
+                        continue;
+                    }
                     if hold.tools > 0
                         && let Err(refusal) = live.at_intake(|intake, now| intake.renew(hold.lease, now))
                     {
@@ -185,52 +227,57 @@ struct Outlet {
 }
 
 impl Outlet {
-    async fn next(&mut self) -> Option<Result<pb::touch_response::Message, Status>> {
+    fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<Result<pb::touch_response::Message, Status>>> {
         use pb::touch_response::Message;
-        Some(tokio::select! {
-                biased;
-                event = self.events.pop() => match event {
-                    Ok((Event::Rejected(rejection), _)) => Ok(Message::Rejection(rejection)),
-                    Ok((Event::Renewed(client_time_ns, arrival_ns), _)) => {
-                        let server_hold_ns = now_ns().saturating_sub(arrival_ns);
-                        Ok(Message::Renewed(pb::Renewed { client_time_ns, server_hold_ns }))
-                    }
-                    Ok((Event::Failed(status), _)) => Err(status),
-                    Ok((Event::Finished, _)) => return None,
-                    Err(refusal) => Err(refusal.into()),
-                },
-                sample = self.samples.pop() => match sample {
-                    Ok((sample, dropped)) => Ok(Message::Sample(wire::sample::sample(&sample, dropped, now_ns()))),
-                    Err(refusal) => Err(refusal.into()),
-                },
-        })
+        if let Poll::Ready(event) = self.events.poll_pop(context) {
+            return Poll::Ready(match event {
+                Ok((Event::Rejected(rejection), _)) => Some(Ok(Message::Rejection(rejection))),
+                Ok((Event::Renewed(client_time_ns, arrival_ns), _)) => {
+                    let server_hold_ns = now_ns().saturating_sub(arrival_ns);
+                    Some(Ok(Message::Renewed(pb::Renewed { client_time_ns, server_hold_ns })))
+                }
+                Ok((Event::Failed(status), _)) => Some(Err(status)),
+                Ok((Event::Finished, _)) => None,
+                Err(refusal) => Some(Err(refusal.into())),
+            });
+        }
+        Poll::Ready(Some(match ready!(self.samples.poll_pop(context)) {
+            Ok((sample, dropped)) => Ok(Message::Sample(wire::sample::sample(&sample, dropped, now_ns()))),
+            Err(refusal) => Err(refusal.into()),
+        }))
     }
 }
 
 /// The output of a haptic stream: first the answer to `open`, then samples and rejections.
 enum Output {
-    Opening(oneshot::Receiver<Result<Opened, Status>>, Reader<Event>),
+    Opening(oneshot::Receiver<Result<Opened, Status>>, Option<Reader<Event>>),
     Open(Outlet),
+    Over,
 }
 
-impl Output {
-    async fn next(self) -> Option<(Result<pb::TouchResponse, Status>, Option<Output>)> {
+impl Stream for Output {
+    type Item = Result<pb::TouchResponse, Status>;
+
+    fn poll_next(self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
         use pb::touch_response::Message;
-        let (message, outlet) = match self {
-            Output::Opening(opening, events) => match opening.await {
-                Ok(Ok(Opened { answer, samples, guard })) => {
-                    (Ok(Message::Opened(answer)), Some(Outlet { events, samples, _guard: guard }))
+        let output = self.get_mut();
+        let message = match output {
+            Output::Opening(opening, events) => match (ready!(Pin::new(opening).poll(context)), events.take()) {
+                (Ok(Ok(Opened { answer, samples, guard })), Some(events)) => {
+                    *output = Output::Open(Outlet { events, samples, _guard: guard });
+                    Some(Ok(Message::Opened(answer)))
                 }
-                Ok(Err(status)) => (Err(status), None),
+                (Ok(Err(status)), _) => Some(Err(status)),
                 // The client vanished before it said anything.
-                Err(_) => return None,
+                _ => None,
             },
-            Output::Open(mut outlet) => match outlet.next().await? {
-                Ok(message) => (Ok(message), Some(outlet)),
-                Err(status) => (Err(status), None),
-            },
+            Output::Open(outlet) => ready!(outlet.poll(context)),
+            Output::Over => None,
         };
-        Some((message.map(|message| pb::TouchResponse { message: Some(message) }), outlet.map(Output::Open)))
+        if !matches!(message, Some(Ok(_))) {
+            *output = Output::Over;
+        }
+        Poll::Ready(message.map(|message| message.map(|message| pb::TouchResponse { message: Some(message) })))
     }
 }
 
@@ -247,10 +294,8 @@ impl HapticService for Haptics {
         let (writer, events) = queue(self.0.config.limits.queued_samples);
         // The client may wait for our headers before it opens, so its first message is not waited for here.
         let (opened, opening) = oneshot::channel();
-        tokio::spawn(self.clone().listen(request.into_inner(), opened, writer));
-        let output = Some(Output::Opening(opening, events));
-        let out = stream::unfold(output, |output| async move { output?.next().await });
-        Ok(Response::new(Box::pin(out)))
+        tokio::spawn(self.clone().listen(request.into_inner(), opened, writer).in_current_span());
+        Ok(Response::new(Box::pin(Output::Opening(opening, Some(events)))))
     }
 
     async fn acquire_tool(
@@ -286,15 +331,22 @@ impl HapticService for Haptics {
         let live = self.0.pacer.get(&request.session_id)?;
         let lease = lease_id(&request.lease_id)?;
         let sheet = &live.model.scene.sheet;
-        let mut commands = Vec::with_capacity(request.commands.len());
-        for (index, command) in request.commands.iter().enumerate() {
+        let read = |(index, command): (usize, &pb::Command)| {
             let command = wire::command::from_command(command, sheet, now);
-            commands.push(command.map_err(|refusal| refusal.within(&format!("commands[{index}]")))?);
-        }
-        let tools = live.at_intake(|intake, now| {
-            intake.submit(lease, commands, now)?;
-            Ok::<_, Refusal>(intake.tools_of(lease).collect())
+            command.map_err(|refusal| refusal.within(&format!("commands[{index}]")))
+        };
+        let commands: Result<Vec<Command>, Refusal> = request.commands.iter().enumerate().map(read).collect();
+        let taken = commands.and_then(|commands| {
+            live.at_intake(|intake, now| {
+                intake.submit(lease, commands, now)?;
+                Ok(intake.tools_of(lease).collect())
+            })
+        });
+        let tools = taken.inspect_err(|refusal| {
+            live.count_refused(request.commands.len());
+            self.0.traffic.refused(refusal.reason);
         })?;
+        self.0.traffic.commanded(request.commands.len());
         let sample = live.next_sample(tools).await?;
         let sample = Some(wire::sample::sample(&sample, 0, now_ns()));
         Ok(Response::new(pb::SendCommandsResponse { sample }))

@@ -3,12 +3,21 @@
 
 pub mod catalog;
 pub mod config;
+mod connections;
+mod guard;
 mod haptics;
+pub mod identity;
+mod metrics;
 mod page;
+mod protection;
+mod rate;
+mod reload;
 mod sessions;
 mod textures;
+mod tls;
 mod views;
 
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -16,17 +25,22 @@ use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 use tonic::service::Routes;
 use tonic::transport::Server;
-use tonic::transport::server::TcpIncoming;
 use tonic_web::GrpcWebLayer;
+use tower_http::cors::CorsLayer;
 use tracing::{info, warn};
 
 use crate::pace::Pacer;
+use crate::refusal::{Reason, Refusal};
 use crate::wire::pb;
 use catalog::Catalog;
 use config::Config;
+use guard::GuardLayer;
+use http::{HeaderName, HeaderValue, Method, header};
+use metrics::Traffic;
 use pb::haptic_service_server::HapticServiceServer;
 use pb::session_service_server::SessionServiceServer;
 use pb::view_service_server::ViewServiceServer;
+use protection::Protection;
 use textures::Textures;
 
 /// What every service needs.
@@ -36,11 +50,96 @@ pub(crate) struct House {
     pub(crate) catalog: Catalog,
     pub(crate) pacer: Arc<Pacer>,
     pub(crate) textures: Textures,
+    /// Sessions are laid out, and force laws computed, one at a time: to ask for many takes no more than a core.
+    pub(crate) heavy_work: Arc<tokio::sync::Semaphore>,
+    pub(crate) traffic: Arc<Traffic>,
+}
+
+/// Where a server is reached, and what stands there.
+pub struct Doors {
+    listener: TcpListener,
+    metrics: Option<TcpListener>,
+    protection: Protection,
+}
+
+impl Doors {
+    /// Listens where the configuration says, if that is safe.
+    pub async fn open(config: &Config) -> Result<Self, ServeError> {
+        let listener = listen("listen", &config.listen).await?;
+        let protection = Protection::load(config, local_address(&listener, &config.listen)?)?;
+        let metrics = match &config.metrics {
+            Some(text) => {
+                let listener = listen("metrics", text).await?;
+                let address = local_address(&listener, text)?;
+                if !address.ip().is_loopback() && !config.insecure {
+                    let why = "can be reached from other machines, and nobody is asked who they are there";
+                    let message = format!("{address} {why}: listen on 127.0.0.1, or say --insecure");
+                    return Err(Refusal::new(Reason::OutOfRange, "metrics", message).into());
+                }
+                Some(listener)
+            }
+            None => None,
+        };
+        Ok(Doors { listener, metrics, protection })
+    }
+
+    /// Where clients find the server.
+    pub fn url(&self) -> String {
+        url(self.protection.scheme(), &self.listener)
+    }
+
+    /// Where Prometheus does, if anywhere.
+    pub fn metrics_url(&self) -> Option<String> {
+        self.metrics.as_ref().map(|listener| url("http", listener) + "/metrics")
+    }
+}
+
+fn local_address(listener: &TcpListener, text: &str) -> Result<SocketAddr, ServeError> {
+    listener.local_addr().map_err(|error| ServeError::Listen { address: text.to_owned(), error })
+}
+
+fn url(scheme: &str, listener: &TcpListener) -> String {
+    listener.local_addr().map_or_else(|e| e.to_string(), |address| format!("{scheme}://{address}"))
+}
+
+async fn listen(field: &str, text: &str) -> Result<TcpListener, ServeError> {
+    TcpListener::bind(text).await.map_err(|error| {
+        if error.kind() == std::io::ErrorKind::InvalidInput {
+            let message = format!("must be address:port, as in 127.0.0.1:7117, but is {text}");
+            return Refusal::new(Reason::WrongKind, field, message).into();
+        }
+        ServeError::Listen { address: text.to_owned(), error }
+    })
+}
+
+/// What a page of another site may send, and read of the answer, of a call over gRPC-web.
+fn cors(origins: &[HeaderValue]) -> CorsLayer {
+    let own = |name| HeaderName::from_static(name);
+    let sent =
+        [header::CONTENT_TYPE, header::AUTHORIZATION, own("x-grpc-web"), own("x-user-agent"), own("grpc-timeout")];
+    let read = [own("grpc-status"), own("grpc-message"), own("grpc-status-details-bin")];
+    CorsLayer::new()
+        .allow_origin(origins.to_vec())
+        .allow_methods([Method::GET, Method::POST])
+        .allow_headers(sent)
+        .expose_headers(read)
+        .max_age(Duration::from_secs(3600))
 }
 
 /// Why a server could not run.
 #[derive(Debug, thiserror::Error)]
 pub enum ServeError {
+    /// The configuration makes no sense, or is not safe.
+    #[error("{0}")]
+    Refused(#[from] Refusal),
+    /// The address is taken, or none of this machine.
+    #[error("can't listen on {address}: {error}; another address, or port 0 for a free one, may do")]
+    Listen {
+        /// As it was given.
+        address: String,
+        /// Of the system.
+        error: std::io::Error,
+    },
     /// A thread can't be started.
     #[error("can't start a stepping thread: {0}")]
     Threads(#[from] std::io::Error),
@@ -52,9 +151,10 @@ pub enum ServeError {
     Reflection(#[from] tonic_reflection::server::Error),
 }
 
-/// Serves on `listener` until `shutdown` is cancelled; then ends all streams, and is over at the latest when the
+/// Serves at `doors` until `shutdown` is cancelled; then ends all streams, and is over at the latest when the
 /// deadline of the configuration has passed. The caller ends its runtime without waiting (`shutdown_background`).
-pub async fn serve(listener: TcpListener, config: Config, shutdown: CancellationToken) -> Result<(), ServeError> {
+pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) -> Result<(), ServeError> {
+    let Doors { listener, metrics, protection } = doors;
     let pacer = Pacer::start(config.stepping_threads(), &config.limits)?;
     let deadline = Duration::from_secs_f64(config.shutdown_deadline_s);
     let catalog = Catalog::new(&config.scenes, &config.scripts);
@@ -63,8 +163,30 @@ pub async fn serve(listener: TcpListener, config: Config, shutdown: Cancellation
             warn!(%refusal, "a scene that no session can be made from");
         }
     }
-    let textures = Textures::default();
-    let house = House { catalog, pacer: pacer.clone(), config: Arc::new(config), textures };
+    let limits = config.limits.clone();
+    let traffic = Arc::new(Traffic::default());
+    if let Some(listener) = metrics {
+        tokio::spawn(metrics::serve(listener, metrics::registry(&pacer, &traffic), shutdown.clone()));
+    }
+    let open = protection.credentials.get().is_open();
+    if config.insecure && open {
+        warn!("--insecure: whoever can reach this server may do everything");
+    }
+    let origins: Arc<[HeaderValue]> = config.origins.iter().filter_map(|origin| origin.parse().ok()).collect();
+    let guard = GuardLayer {
+        credentials: protection.credentials.clone(),
+        traffic: traffic.clone(),
+        local_only: open && !config.insecure,
+        origins: origins.clone(),
+    };
+    let house = House {
+        catalog,
+        pacer: pacer.clone(),
+        config: Arc::new(config),
+        textures: Textures::default(),
+        heavy_work: Arc::new(tokio::sync::Semaphore::new(1)),
+        traffic: traffic.clone(),
+    };
 
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<SessionServiceServer<sessions::Sessions>>().await;
@@ -87,28 +209,34 @@ pub async fn serve(listener: TcpListener, config: Config, shutdown: Cancellation
         }
     };
 
-    let folder = Arc::new(house.config.viewer.clone());
-    let painter = house.clone();
+    let incoming = connections::incoming(listener, protection.tls.clone(), &limits, traffic);
+    let silence = Some(Duration::from_secs_f64(limits.keepalive_s));
+    let bytes = limits.message_bytes;
+    let (folder, painter) = (Arc::new(house.config.viewer.clone()), house.clone());
+    let sessions = SessionServiceServer::new(sessions::Sessions(house.clone())).max_decoding_message_size(bytes);
+    let haptics = HapticServiceServer::new(haptics::Haptics(house.clone())).max_decoding_message_size(bytes);
+    let views = ViewServiceServer::new(views::Views(house)).max_decoding_message_size(bytes);
     let routes = Routes::new(health_service)
         .add_service(reflection().build_v1()?)
         .add_service(reflection().build_v1alpha()?)
-        .add_service(SessionServiceServer::new(sessions::Sessions(house.clone())))
-        .add_service(HapticServiceServer::new(haptics::Haptics(house.clone())))
-        .add_service(ViewServiceServer::new(views::Views(house)))
+        .add_service(sessions)
+        .add_service(haptics)
+        .add_service(views)
         .into_axum_router()
         // Of the services alone: it refuses what is no gRPC.
         .route_layer(GrpcWebLayer::new())
         .route("/textures/{file}", axum::routing::get(move |file, headers| textures::file(painter, file, headers)))
         .fallback(move |request| page::page(folder.clone(), request));
-
-    // Nagle's algorithm would hold a sample back for milliseconds.
-    let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
     let serving = Server::builder()
         // Finds out about clients whose host has vanished.
-        .http2_keepalive_interval(Some(Duration::from_secs(10)))
-        .http2_keepalive_timeout(Some(Duration::from_secs(10)))
+        .http2_keepalive_interval(silence)
+        .http2_keepalive_timeout(silence)
+        .max_concurrent_streams(limits.streams_per_connection)
+        .initial_connection_window_size(limits.connection_window_bytes)
         // Browsers speak HTTP/2 only over TLS.
         .accept_http1(true)
+        .layer(cors(&origins))
+        .layer(guard)
         .add_routes(routes.into())
         .serve_with_incoming_shutdown(incoming, shutdown.clone().cancelled_owned());
 
@@ -127,6 +255,7 @@ pub async fn serve(listener: TcpListener, config: Config, shutdown: Cancellation
     tokio::select! {
         (served, ()) = async { tokio::join!(serving, stop) } => served?,
         () = sweeping => {}
+        () = protection.watch() => {}
         () = over => warn!("steps or streams outlasted the deadline, and are cut"),
     }
     info!("stopped");

@@ -8,6 +8,8 @@ use tonic::{Request, Response, Status};
 use tracing::{info, warn};
 
 use super::House;
+use super::connections::Peer;
+use crate::pace::clock::now_ns;
 use crate::refusal::{Reason, Refusal, number};
 use crate::scene::script::Script;
 use crate::wire::pb::session_service_server::SessionService;
@@ -28,6 +30,9 @@ impl SessionService for Sessions {
         request: Request<pb::CreateSessionRequest>,
     ) -> Result<Response<pb::CreateSessionResponse>, Status> {
         use pb::create_session_request::Source;
+        if let Some(peer) = request.extensions().get::<Peer>() {
+            peer.may_create(now_ns())?;
+        }
         let request = request.into_inner();
         let scene = match &request.source {
             Some(Source::SceneName(name)) => self.0.catalog.load(name, &[], &self.0.config.limits)?,
@@ -38,9 +43,14 @@ impl SessionService for Sessions {
         let idle_timeout_s = request.idle_timeout_s.unwrap_or(most_s);
         let range = format!("above 0 and at most {most_s}");
         number("idle_timeout_s", idle_timeout_s, &range, |value| value > 0.0 && value <= most_s)?;
-        // A large sheet takes a while to lay out.
+        // A large sheet takes a while to lay out. Who hangs up before it is its turn is passed over.
+        let turn = self.0.heavy_work.clone().acquire_owned().await;
         let pacer = self.0.pacer.clone();
-        let made = tokio::task::spawn_blocking(move || pacer.create(&scene, request.paused, idle_timeout_s)).await;
+        let made = tokio::task::spawn_blocking(move || {
+            let _turn = turn;
+            pacer.create(&scene, request.paused, idle_timeout_s)
+        });
+        let made = made.await;
         let live = made.map_err(|e| Status::internal(e.to_string()))??;
         info!(session = %live.id, scene = %live.model.scene.name, points = live.model.len(), "session created");
         for warning in &live.model.warnings {
@@ -82,7 +92,7 @@ impl SessionService for Sessions {
     ) -> Result<Response<pb::StartSessionResponse>, Status> {
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
-        let step = live.start(request.until_step).await?;
+        let step = self.0.pacer.start_session(&live, request.until_step).await?;
         Ok(Response::new(pb::StartSessionResponse { step }))
     }
 

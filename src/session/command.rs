@@ -62,6 +62,21 @@ struct Lease {
 /// Place in the queue: step, then order of arrival.
 type Place = (u64, u64);
 
+/// What has become of the commands that were taken in: `accepted` is the sum of the others.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Counts {
+    /// Taken in.
+    pub accepted: u64,
+    /// Their step has come, and they have acted.
+    pub applied: u64,
+    /// A later place of the same tool took theirs before their step.
+    pub superseded: u64,
+    /// Their lease, or the session, ended before their step.
+    pub dropped: u64,
+    /// Wait for their step.
+    pub waiting: u64,
+}
+
 /// Where commands come in.
 #[derive(Debug)]
 pub struct Intake {
@@ -81,6 +96,8 @@ pub struct Intake {
     changed: bool,
     woken: bool,
     lapsed: u64,
+    /// Without those that wait.
+    counts: Counts,
     closed: Option<Refusal>,
 }
 
@@ -100,6 +117,7 @@ impl Intake {
             changed: false,
             woken: false,
             lapsed: 0,
+            counts: Counts::default(),
             closed: None,
         }
     }
@@ -170,7 +188,9 @@ impl Intake {
 
     fn end(&mut self, tool: u32) {
         self.leases.remove(&tool);
+        let waiting = self.waiting();
         self.queue.retain(|_, due| due.command.tool != tool);
+        self.counts.dropped += waiting - self.waiting();
         let command = Command {
             tool,
             sequence: 0,
@@ -228,6 +248,7 @@ impl Intake {
                 return Err(Refusal::new(Reason::QueueFull, "", message));
             }
         }
+        self.counts.accepted += commands.len() as u64;
         for command in commands {
             self.enqueue(command, false);
         }
@@ -279,6 +300,7 @@ impl Intake {
             {
                 late_commands += superseded.late_commands;
                 lease.waiting -= 1;
+                self.counts.superseded += 1;
             }
         }
         self.queue.insert(place, Due { command, late, late_commands, ends_lease });
@@ -372,6 +394,7 @@ impl Intake {
             if let Some(lease) = self.leases.get_mut(&entry.command.tool).filter(|_| !entry.ends_lease) {
                 lease.waiting = lease.waiting.saturating_sub(1);
             }
+            self.counts.applied += u64::from(!entry.ends_lease);
             due.push(entry);
         }
         self.next_step = step + 1;
@@ -397,9 +420,19 @@ impl Intake {
         self.lapsed
     }
 
+    /// What has become of the commands so far.
+    pub fn counts(&self) -> Counts {
+        Counts { waiting: self.waiting(), ..self.counts }
+    }
+
+    fn waiting(&self) -> u64 {
+        self.queue.values().filter(|due| !due.ends_lease).count() as u64
+    }
+
     /// From now on everything is refused with this.
     pub fn close(&mut self, refusal: Refusal) {
         self.closed = Some(refusal);
+        self.counts.dropped += self.waiting();
         self.queue.clear();
     }
 

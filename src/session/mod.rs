@@ -106,13 +106,20 @@ pub struct Session {
     tissue: Box<dyn Tissue>,
     tools: Vec<Tool>,
     late_commands: u64,
+    path_counts: [u64; 3],
     hold_reason: Option<String>,
 }
 
 impl Session {
     /// A tissue at rest.
     pub fn new(model: &Arc<Model>) -> Self {
-        Session { tissue: sheet::at_rest(model), tools: Vec::new(), late_commands: 0, hold_reason: None }
+        Session {
+            tissue: sheet::at_rest(model),
+            tools: Vec::new(),
+            late_commands: 0,
+            path_counts: [0; 3],
+            hold_reason: None,
+        }
     }
 
     /// What of the tissue never changes.
@@ -141,9 +148,19 @@ impl Session {
         self.hold_reason.as_deref()
     }
 
+    /// Ends it, as the guard does.
+    pub fn hold(&mut self, reason: String) {
+        self.hold_reason.get_or_insert(reason);
+    }
+
     /// Commands that came too late for their step, in all.
     pub fn late_commands(&self) -> u64 {
         self.late_commands
+    }
+
+    /// Of all tools that are led, as [`Path::counts`] tells it of one.
+    pub fn path_counts(&self) -> [u64; 3] {
+        self.path_counts
     }
 
     /// The step at whose beginning something happens by itself, if not before: nothing if the tissue moves.
@@ -200,7 +217,12 @@ impl Session {
         let end_s = self.time_s() + step_s;
         for (index, tool) in self.tools.iter_mut().enumerate() {
             let Some(led) = &mut tool.led else { continue };
-            match led.path.step(end_s, step_s) {
+            let before = led.path.counts();
+            let play = led.path.step(end_s, step_s);
+            for (index, count) in led.path.counts().into_iter().enumerate() {
+                self.path_counts[index] += count - before[index];
+            }
+            match play {
                 Some(Play::Lead(place_m, client_time_s)) => {
                     led.client_time_s = client_time_s;
                     self.tissue.lead(index, place_m, led.tip);
@@ -266,8 +288,8 @@ impl Session {
                 // What is stamped with its step is played there; what has only its client's time, by that.
                 if command.at_step.is_some() || command.client_time_ns == 0 {
                     led.path.go_to(client_time_s, place_m);
-                } else {
-                    led.path.receive(client_time_s, place_m, now_s);
+                } else if !led.path.receive(client_time_s, place_m, now_s) {
+                    self.path_counts[1] += 1;
                 }
             }
             Action::Release => {

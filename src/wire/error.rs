@@ -22,7 +22,10 @@ pub fn code(reason: Reason) -> Code {
         | Reason::ForceTooLarge
         | Reason::OffSheet
         | Reason::OutOfTurn => Code::InvalidArgument,
-        Reason::TooLarge | Reason::QueueFull | Reason::TooMany => Code::ResourceExhausted,
+        Reason::TooLarge | Reason::QueueFull | Reason::TooMany | Reason::Overloaded | Reason::RateLimited => {
+            Code::ResourceExhausted
+        }
+        Reason::TimedOut => Code::DeadlineExceeded,
         Reason::UnknownScene
         | Reason::UnknownScript
         | Reason::UnknownSession
@@ -30,7 +33,8 @@ pub fn code(reason: Reason) -> Code {
         | Reason::UnknownViewer => Code::NotFound,
         Reason::SessionHeld | Reason::StaleSequence | Reason::NotAvailable => Code::FailedPrecondition,
         Reason::ToolHeld => Code::AlreadyExists,
-        Reason::NotHolder => Code::PermissionDenied,
+        Reason::NotHolder | Reason::RoleMissing | Reason::OriginNotAllowed => Code::PermissionDenied,
+        Reason::Unauthenticated => Code::Unauthenticated,
         Reason::StepPassed => Code::OutOfRange,
         Reason::ShuttingDown => Code::Unavailable,
     }

@@ -169,10 +169,11 @@ pub fn add_to_record(record: &mut Record, message: &pb::ProbeResponse) -> bool {
 /// A session as it stands.
 pub fn session(live: &Arc<Live>) -> pb::Session {
     let status = live.status();
-    let (held_tools, lapsed_leases) = live.at_intake(|intake, _| {
+    let (held_tools, lapsed_leases, counts) = live.at_intake(|intake, _| {
         let held = intake.holders().map(|(tool, holder)| pb::HeldTool { tool, holder: holder.to_owned() });
-        (held.collect(), intake.lapsed())
+        (held.collect(), intake.lapsed(), intake.counts())
     });
+    let count = |count: usize| u32::try_from(count).unwrap_or(u32::MAX);
     let model = &status.model;
     #[allow(clippy::cast_precision_loss)]
     let simulation_time_s = status.step as f64 / model.scene.stepping.rate_hz;
@@ -196,6 +197,18 @@ pub fn session(live: &Arc<Live>) -> pb::Session {
         guard_events: status.guard_events,
         resting: status.resting,
         rested_steps: status.rested_steps,
+        commands: Some(pb::CommandCounts {
+            accepted: counts.accepted,
+            applied: counts.applied,
+            superseded: counts.superseded,
+            dropped: counts.dropped,
+            waiting: counts.waiting,
+            refused: live.refused(),
+        }),
+        awake_points: count(status.awake_points),
+        streams: count(live.streams()),
+        scene_name: model.scene.name.clone(),
+        points: count(model.len()),
         ..Default::default()
     };
     with_model(session, model)

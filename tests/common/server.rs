@@ -10,7 +10,7 @@
 
 use std::io::{BufRead, BufReader, Read};
 use std::path::PathBuf;
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, ChildStdout, Command, Stdio};
 use std::sync::OnceLock;
 use std::time::Duration;
 
@@ -48,11 +48,13 @@ pub fn client_program() -> PathBuf {
 pub struct Server {
     pub child: Child,
     pub url: String,
+    /// What it prints after the line with its address.
+    pub out: BufReader<ChildStdout>,
 }
 
 impl Server {
     pub fn start(arguments: &[&str]) -> Self {
-        let mut child = Command::new(env!("CARGO_BIN_EXE_palpate"))
+        let child = Command::new(env!("CARGO_BIN_EXE_palpate"))
             .args(["serve", "--listen", "127.0.0.1:0"])
             .args(arguments)
             .current_dir(env!("CARGO_MANIFEST_DIR"))
@@ -60,11 +62,17 @@ impl Server {
             .stderr(Stdio::piped())
             .spawn()
             .unwrap();
+        Server::of(child)
+    }
+
+    /// A server in `child`, which prints its address first.
+    pub fn of(mut child: Child) -> Self {
         let mut line = String::new();
-        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        let mut out = BufReader::new(child.stdout.take().unwrap());
+        out.read_line(&mut line).unwrap();
         let url = line.split_whitespace().last().unwrap_or_default().to_owned();
-        assert!(url.starts_with("http://127.0.0.1:"), "{line:?}");
-        Server { child, url }
+        assert!(url.contains("://127.0.0.1:"), "{line:?}");
+        Server { child, url, out }
     }
 
     pub async fn channel(&self) -> Channel {
@@ -163,6 +171,12 @@ impl Touch {
 
     pub async fn command(&self, command: pb::Command) {
         self.say(Say::Command(command)).await;
+    }
+
+    /// The same, of a stream that may have ended: whether it went out.
+    pub async fn try_command(&self, command: pb::Command) -> bool {
+        let message = pb::TouchRequest { message: Some(Say::Command(command)) };
+        self.outbound.as_ref().unwrap().send(message).await.is_ok()
     }
 
     /// No more from this side.

@@ -17,7 +17,8 @@ use pb::touch_request::Message as Say;
 use pb::touch_response::Message as Heard;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::transport::Endpoint;
+
+use crate::connect::Server;
 
 /// What the device's loop and the network pass to each other. The newest counts: neither waits.
 #[derive(Default)]
@@ -56,10 +57,10 @@ pub(crate) type Command = (u64, DVec3);
 /// What a bridge connects to.
 #[derive(Debug, Clone)]
 pub(crate) struct Target {
-    pub(crate) server: String,
+    pub(crate) server: Server,
     /// A session that is there, or a scene to make one of.
     pub(crate) session: Option<String>,
-    /// The session that was used last.
+    /// The session that it has made.
     pub(crate) made: Option<String>,
     pub(crate) scene: String,
     pub(crate) tool: u32,
@@ -111,27 +112,25 @@ async fn connect(
     shared: &Shared,
     commands: &mut mpsc::Receiver<Command>,
 ) -> Result<(), String> {
-    let endpoint = Endpoint::from_shared(target.server.clone()).map_err(|e| e.to_string())?;
-    let endpoint = endpoint.tcp_nodelay(true).connect_timeout(SILENCE);
-    let channel = endpoint.connect().await.map_err(|e| format!("can't connect to {}: {e}", target.server))?;
+    let channel = target.server.clone().within(SILENCE).connect().await?;
     let mut sessions = SessionServiceClient::new(channel.clone());
     let told = |status: tonic::Status| describe(&status);
-    let mut session = None;
+    let mut known = None;
     if let Some(id) = target.session.as_ref().or(target.made.as_ref()) {
         let request = pb::GetSessionRequest { session_id: id.clone() };
-        match sessions.get_session(request).await {
-            Ok(answer) => session = answer.into_inner().session,
-            // One that it made itself went with its server: it makes another.
-            Err(status) if status.code() == tonic::Code::NotFound && target.session.is_none() => target.made = None,
+        known = match sessions.get_session(request).await {
+            Ok(answer) => answer.into_inner().session,
+            // A server that was started anew has forgotten what we made.
+            Err(status) if status.code() == tonic::Code::NotFound && target.session.is_none() => None,
             Err(status) => return Err(told(status)),
-        }
+        };
     }
-    if session.is_none() {
+    if known.is_none() {
         let source = pb::create_session_request::Source::SceneName(target.scene.clone());
         let request = pb::CreateSessionRequest { source: Some(source), ..Default::default() };
-        session = sessions.create_session(request).await.map_err(told)?.into_inner().session;
+        known = sessions.create_session(request).await.map_err(told)?.into_inner().session;
     }
-    let session = session.ok_or("the server tells nothing of the session")?;
+    let session = known.ok_or("the server tells nothing of the session")?;
     target.made = Some(session.session_id.clone());
     let scene = session.scene.as_ref().ok_or("the server does not tell the session's scene")?;
     let sheet = scene.sheet.as_ref().ok_or("the server does not tell the scene's sheet")?;
@@ -182,7 +181,13 @@ async fn connect(
                             inbound.newest = Some(wire::local::from_local_model(model, sample.step));
                         }
                     }
-                    Some(Heard::Rejection(_)) => shared.inbound().refused += 1,
+                    Some(Heard::Rejection(rejection)) => {
+                        shared.inbound().refused += 1;
+                        // We were silent for so long that the tool was let go.
+                        if rejection.reason == "NOT_HOLDER" {
+                            return Err("the lease of the tool has lapsed".to_owned());
+                        }
+                    }
                     Some(Heard::Renewed(_)) | None => {}
                 }
             }

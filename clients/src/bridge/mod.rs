@@ -13,6 +13,7 @@ use serde_json::json;
 use tokio::sync::mpsc;
 
 use crate::Failure;
+use crate::connect::{Credentials, Server};
 use crate::link;
 use device::{HapticDevice, Simulated};
 use line::{COMMANDS, Shared, Target};
@@ -50,6 +51,8 @@ pub(crate) struct Arguments {
     /// Write time, place, force and state of each tick to this file, as CSV; at most an hour of them
     #[arg(long, value_name = "FILE")]
     course: Option<std::path::PathBuf>,
+    #[command(flatten)]
+    credentials: Credentials,
 }
 
 /// A tick of the device, s.
@@ -179,7 +182,7 @@ pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
     let task = link::Task::new(middle_m, link::LEAD_S, seconds, 0.2, &mut link::Dice::new(arguments.seed, 0));
     let mut simulated = Simulated::new(device, hand, task, TICK_S);
     let target = Target {
-        server: arguments.server.clone(),
+        server: Server::new(&arguments.server, &arguments.credentials)?,
         session: arguments.session.clone(),
         made: None,
         scene: arguments.scene.clone(),

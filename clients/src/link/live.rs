@@ -12,19 +12,20 @@ use crate::Failure;
 use crate::bridge::device::Simulated;
 use crate::bridge::line::Target;
 use crate::bridge::{self, Tick};
+use crate::connect::Server;
 
 /// Before the first press, s: the server computes its force law first.
 const LEAD_S: f64 = 3.0;
 
 /// Runs it at a server that has the scene by its name.
-pub(super) async fn run(setup: &Setup, server: &str) -> Result<Found, Failure> {
+pub(super) async fn run(setup: &Setup, server: Server) -> Result<Found, Failure> {
     let Setup { model, law, tip, hand, device, deadband, duration_s, seed, .. } = setup;
     let middle_m = (model.scene.sheet.extent_m() / 2.0).extend(0.0);
     let scale = task::scale(hand, law, device.most_n());
     let task = Task::new(middle_m, LEAD_S, *duration_s, scale, &mut Dice::new(*seed, 0));
     let mut simulated = Simulated::new(*device, *hand, task, TICK_S);
     let target = Target {
-        server: server.to_owned(),
+        server,
         session: None,
         made: None,
         scene: model.scene.name.clone(),

@@ -24,6 +24,7 @@ use palpate::sheet::Model;
 use serde_json::{Value, json};
 
 use crate::Failure;
+use crate::connect::{Credentials, Server};
 pub(crate) use network::Dice;
 use network::Weather;
 use run::{Found, Scheme, Setup, run};
@@ -81,6 +82,8 @@ pub(crate) struct Arguments {
     /// it is
     #[arg(long, value_name = "URL", conflicts_with_all = ["rtt_ms", "jitter_ms", "loss", "profile", "random", "boundary"])]
     server: Option<String>,
+    #[command(flatten)]
+    credentials: Credentials,
     /// Run so many random combinations of scene, hand, device, network and task (`--seed` is the first), and report the
     /// worst of each figure
     #[arg(long, value_name = "RUNS", conflicts_with_all = ["course", "boundary"])]
@@ -129,7 +132,7 @@ pub(crate) async fn link(arguments: &Arguments) -> Result<(), Failure> {
     let refused = |refusal: Refusal| Failure::Refused(refusal.to_string());
     let setup = setup(arguments).map_err(refused)?;
     let found = match &arguments.server {
-        Some(server) => live::run(&setup, server).await?,
+        Some(server) => live::run(&setup, Server::new(server, &arguments.credentials)?).await?,
         None => run(&setup).map_err(Failure::Failed)?,
     };
     if let Some(path) = &arguments.course {

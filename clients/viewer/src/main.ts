@@ -55,6 +55,9 @@ async function open(sessionId: string | undefined, scene: string | undefined): P
     } catch (error) {
       const refused = describe(error);
       if (isGone(error)) return over("There is no such session any more.");
+      if (reasonOf(error) === "UNAUTHENTICATED") {
+        return over(`The server asks who you are (${refused}). Put your token behind the address, as in #token=…`);
+      }
       // What the server refuses for a reason it refuses again.
       if (!["", "SHUTTING_DOWN", "TOO_MANY"].includes(reasonOf(error))) return over(`${refused}.`);
       const waitMs = backoffMs(failures);

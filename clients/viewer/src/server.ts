@@ -1,6 +1,6 @@
 // The server: its services, its errors, and streams that come back by themselves.
 
-import { Code, ConnectError, createClient } from "@connectrpc/connect";
+import { Code, ConnectError, createClient, type Interceptor } from "@connectrpc/connect";
 import { createGrpcWebTransport } from "@connectrpc/connect-web";
 import { ErrorInfoSchema } from "./gen/google/rpc/error_details_pb";
 import { HapticService } from "./gen/palpate/v1/haptic_pb";
@@ -23,10 +23,34 @@ const counted: typeof fetch = async (input, init) => {
   return new Response(answer.body.pipeThrough(count), answer);
 };
 
+/**
+ * Takes the token out of the address (`#token=…`), which people share. It is behind `#` so that no server is sent it and no
+ * log has it. True if there was one.
+ */
+function keepToken(): boolean {
+  const behind = new URLSearchParams(location.hash.slice(1));
+  const token = behind.get("token");
+  if (token === null) return false;
+  sessionStorage.setItem("token", token.trim());
+  history.replaceState(history.state, "", location.pathname + location.search);
+  return true;
+}
+
+keepToken();
+// A token that is put behind the address of a page that is open already loads nothing by itself.
+addEventListener("hashchange", () => keepToken() && location.reload());
+
+/** Shows with every call who calls, if a token was given. */
+const identified: Interceptor = (next) => (request) => {
+  const token = sessionStorage.getItem("token");
+  if (token) request.header.set("authorization", `Bearer ${token}`);
+  return next(request);
+};
+
 // A browser speaks HTTP/1.1 to a port without TLS, with at most six connections for all its windows of one server:
 // here two streams, two batches of commands, an acknowledgement and a question after the session. So frames can't have a
 // connection of their own among those, and a window that nobody sees gives its streams up.
-const transport = createGrpcWebTransport({ baseUrl: location.origin, fetch: counted });
+const transport = createGrpcWebTransport({ baseUrl: location.origin, fetch: counted, interceptors: [identified] });
 
 export const sessions = createClient(SessionService, transport);
 export const haptics = createClient(HapticService, transport);

@@ -62,12 +62,20 @@ function whileLoading(error) {
   throw error;
 }
 
+const PROGRAM = join(ROOT, "target/release/palpate");
+
+/** A new token, added to a file. @param {string} file @param {string} roles */
+export function makeToken(file, roles) {
+  const made = spawnSync(PROGRAM, ["token", "--name", "page", "--role", roles, "--tokens", file], { encoding: "utf8" });
+  if (made.status !== 0) throw new Error(made.stderr);
+  return made.stdout.trim();
+}
+
 /** `palpate serve` on a free port, or on `listen`. */
 export class Server {
   /** @param {string[]} options */
   static async start(options = [], listen = "127.0.0.1:0") {
-    const program = join(ROOT, "target/release/palpate");
-    const child = spawn(program, ["serve", "--listen", listen, "--log", "warn", ...options], {
+    const child = spawn(PROGRAM, ["serve", "--listen", listen, "--log", "warn", ...options], {
       cwd: ROOT,
       stdio: ["ignore", "pipe", "inherit"],
     });

@@ -5,7 +5,7 @@ import { mkdtempSync, writeFileSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { after, before, describe, test } from "node:test";
-import { launch, Page, Server } from "./harness.mjs";
+import { launch, makeToken, Page, Server } from "./harness.mjs";
 
 /** @type {import("playwright-core").Browser} */
 let browser;
@@ -141,6 +141,25 @@ describe("the page", () => {
     await page.until(({ largestM, forceN }) => largestM < 0.01 && forceN.length === 0);
     assert.deepEqual(page.complaints, []);
     await close(page);
+  });
+
+  test("shows the server a token from behind the address, and keeps it out of that", async () => {
+    const tokens = join(mkdtempSync(join(tmpdir(), "palpate-")), "tokens.toml");
+    const token = makeToken(tokens, "create,touch");
+    const asking = await Server.start(["--tokens", tokens]);
+    const page = new Page(await (await browser.newContext(VIEWPORT)).newPage());
+    await page.page.goto(asking.url);
+    await page.says("notice", /asks who you are/);
+    await page.page.goto(`${asking.url}/#token=${token}`);
+    await page.shows();
+    assert.match(page.page.url(), /\?session=[0-9a-f]+$/);
+    await page.page.reload();
+    await page.shows();
+    await page.press();
+    await page.until(({ largestM, forceN }) => largestM > 0.02 && forceN[0] > 0.3);
+    assert.deepEqual(page.complaints, []);
+    await close(page);
+    assert.equal(await asking.stop(), 0);
   });
 
   test("fits a phone, light and dark", async () => {

@@ -1,0 +1,296 @@
+//! How many sessions does a core bear, each with a haptic client at 1 kHz or none, what does each cost beside the kernel
+//! alone, and does anybody notice an attack? The server is kept to one core, the generator (`palpate-client load`) to the
+//! others. Writes docs/benchmarks/load.{md,json,svg}. `-- --quick` tries few numbers for a short time. Linux only: times
+//! are read from /proc.
+
+#![allow(clippy::unwrap_used, clippy::panic, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
+
+mod attack;
+mod report;
+#[path = "../tests/common/server.rs"]
+mod server;
+
+use std::f64::consts::TAU;
+use std::io::{BufRead, BufReader, Read};
+use std::process::{Command, Stdio};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use attack::{Attack, Kind};
+use glam::DVec3;
+use palpate::limits::Limits;
+use palpate::scene::law::Poke;
+use palpate::scene::script::Action;
+use palpate::scene::{PAPER, Scene};
+use palpate::session::Session;
+use palpate::session::command::{Command as Order, Due};
+use palpate::sheet::Model;
+use report::chart::{Look, Panel, Series};
+use report::{Report, cells, digits, quick};
+use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
+use serde_json::{Value, json};
+use server::{Server, client_program};
+
+const OBJECTIVE: &str = "p99<2ms,dilation>0.999";
+
+/// Runs `work` with this thread, and what it starts, kept to the first core, or to all others.
+fn kept_to<T>(first: bool, work: impl FnOnce() -> T) -> T {
+    let all = sched_getaffinity(None).unwrap();
+    let cores: Vec<usize> = (0..CpuSet::MAX_CPU).filter(|core| all.is_set(*core)).collect();
+    let mut some = CpuSet::new();
+    cores.iter().enumerate().filter(|core| (core.0 == 0) == first).for_each(|core| some.set(*core.1));
+    if some.count() > 0 {
+        sched_setaffinity(None, &some).unwrap();
+    }
+    let result = work();
+    sched_setaffinity(None, &all).unwrap();
+    result
+}
+
+/// Time of a server's threads so far, s: by the beginning of their names, in user mode and in the system.
+fn times(server: &Server) -> Vec<(String, [f64; 2])> {
+    let mut times: Vec<(String, [f64; 2])> = Vec::new();
+    for task in std::fs::read_dir(format!("/proc/{}/task", server.child.id())).unwrap() {
+        // A thread may have ended since.
+        let Ok(stat) = std::fs::read_to_string(task.unwrap().path().join("stat")) else { continue };
+        let (begin, end) = (stat.find('(').unwrap(), stat.rfind(')').unwrap());
+        let name = stat[begin + 1..end].split('-').next().unwrap().to_owned();
+        let ticks = stat[end + 2..].split_whitespace().skip(11).take(2).map(|field| field.parse::<f64>().unwrap());
+        let seconds: Vec<f64> = ticks.map(|ticks| ticks / 100.0).collect();
+        match times.iter_mut().find(|thread| thread.0 == name) {
+            Some((_, sum)) => *sum = [sum[0] + seconds[0], sum[1] + seconds[1]],
+            None => times.push((name, [seconds[0], seconds[1]])),
+        }
+    }
+    times
+}
+
+/// One run of the generator.
+struct Load {
+    told: Value,
+    /// Cores that the server took: stepping and network, each in user mode and in the system.
+    stepping: [f64; 2],
+    network: [f64; 2],
+    resident_mib: f64,
+}
+
+impl Load {
+    fn number(&self, path: &str) -> f64 {
+        self.told.pointer(path).and_then(Value::as_f64).unwrap_or(f64::NAN)
+    }
+
+    fn cores(&self) -> f64 {
+        self.stepping.iter().chain(&self.network).sum()
+    }
+}
+
+fn load(server: &Server, seconds: f64, arguments: &[&str]) -> Load {
+    let mut child = kept_to(false, || {
+        Command::new(client_program())
+            .args(["load", "--server", &server.url, "--seconds", &seconds.to_string(), "--json"])
+            .args(arguments)
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap()
+    });
+    let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+    // The first word comes a second after all clients are there.
+    let first = lines.next();
+    let (begun, before) = (Instant::now(), times(server));
+    std::thread::sleep(Duration::from_secs_f64((seconds - 1.5).max(0.1)));
+    let (elapsed_s, after) = (begun.elapsed().as_secs_f64(), times(server));
+    let resident_mib = resident_mib(server);
+    let rest: Vec<String> = lines.map_while(Result::ok).collect();
+    let mut text = String::new();
+    child.stdout.take().unwrap().read_to_string(&mut text).unwrap();
+    child.wait().unwrap();
+    let told = serde_json::from_str(&text).unwrap_or_else(|_| panic!("{first:?} {rest:?} {text}"));
+    let of = |times: &[(String, [f64; 2])], name: &str| {
+        times.iter().find(|thread| thread.0 == name).map_or([0.0; 2], |thread| thread.1)
+    };
+    let cores = |name: &str| {
+        let (before, after) = (of(&before, name), of(&after, name));
+        [0, 1].map(|mode| (after[mode] - before[mode]) / elapsed_s)
+    };
+    Load { told, stepping: cores("step"), network: cores("network"), resident_mib }
+}
+
+fn resident_mib(server: &Server) -> f64 {
+    let status = std::fs::read_to_string(format!("/proc/{}/status", server.child.id())).unwrap();
+    let line = status.lines().find(|line| line.starts_with("VmRSS:")).unwrap();
+    line.split_whitespace().nth(1).unwrap().parse::<f64>().unwrap() / 1024.0
+}
+
+/// What a step of one of `count` sheets takes that are stepped in turn, each under a stroke of its own, s.
+fn kernel_alone_s(count: usize, rounds: u64) -> f64 {
+    let limits = Limits::default();
+    let scene = Scene::parse("paper", PAPER, &[], &limits).unwrap();
+    let model = Model::compile(&scene, &limits).unwrap();
+    let mut sessions: Vec<Session> = (0..count).map(|_| Session::new(&model)).collect();
+    let mut due = Vec::new();
+    let mut round = |step: u64| {
+        for (number, session) in sessions.iter_mut().enumerate() {
+            let turn = TAU * (0.0005 * step as f64 + 0.618 * number as f64);
+            let action = Action::Push(Poke {
+                centre_m: scene.sheet.extent_m() / 2.0 + 0.25 * glam::DVec2::new(turn.cos(), turn.sin()),
+                force_n: DVec3::new(0.0, 0.0, -0.05),
+                falloff_per_m: 4.0 / scene.sheet.spacing_m,
+                falloff_offset: 0.0,
+            });
+            let command = Order {
+                tool: 0,
+                sequence: step,
+                client_time_ns: 0,
+                at_step: None,
+                time_to_live_s: None,
+                action,
+                arrival_ns: 1,
+            };
+            due.push(Due { command, late: false, late_commands: 0, ends_lease: false });
+            session.advance(&mut due, |_| {});
+        }
+    };
+    (1..200).for_each(&mut round);
+    let begun = Instant::now();
+    (200..200 + rounds).for_each(&mut round);
+    begun.elapsed().as_secs_f64() / (rounds as f64 * count as f64)
+}
+
+fn start(arguments: &[&str]) -> Arc<Server> {
+    let common = ["--threads", "1", "--log", "error"];
+    kept_to(true, || Arc::new(Server::start(&[&common[..], arguments].concat())))
+}
+
+fn main() {
+    if !std::path::Path::new("/proc/self/stat").exists() {
+        return println!("left out: there is no /proc on this system");
+    }
+    let seconds = if quick() { 3.0 } else { 10.0 };
+    let counts: &[usize] = if quick() { &[1, 25, 100] } else { &[1, 10, 25, 50, 75, 100, 150, 200, 300] };
+    let mut report = Report::new("load", "Many sessions on one core", "make bench-load");
+    report.say(
+        "Sessions of the paper's 31 × 31 points at 1 kHz, all of them awake: each is stroked without rest. The server (one \
+         stepping thread, one of the network) is kept to one core; `palpate-client load` has the others, and sends each \
+         client's commands at 1 kHz by its own clock, over a connection of its own.",
+    );
+    let (mut figures, mut series) = (Vec::new(), Vec::new());
+    let mut alone_line = Vec::new();
+    for (hue, (clients, name, heading)) in [
+        ("1", "with clients", "With one haptic client each, a command and a sample a step"),
+        ("0", "without clients", "Without clients"),
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        report.heading(heading);
+        let header = cells([
+            "sessions",
+            "dilation",
+            "round trip p50 / p99 / p99.9 / max, ms",
+            "lost",
+            "of the core",
+            "a session and step, µs",
+            "kernel alone, µs",
+            "stepping: program, system, µs",
+            "network: program, system, µs",
+            "memory, MiB",
+            "generator, cores",
+        ]);
+        let (mut rows, mut line) = (Vec::new(), Vec::new());
+        for count in counts {
+            eprintln!("{count} sessions {name}");
+            let server = start(&[]);
+            let sessions = count.to_string();
+            let found = load(&server, seconds, &["--sessions", &sessions, "--clients-per-session", clients]);
+            drop(server);
+            let alone_us = 1e6 * kept_to(true, || kernel_alone_s(*count, (20_000 / *count as u64).max(50)));
+            let dilation = found.number("/dilation_min");
+            // Of the steps that were done.
+            let each_us = |cores: f64| cores * 1e3 / (*count as f64 * dilation);
+            let ms = |quantile: &str| digits(found.number(&format!("/round_trip_us/{quantile}")) / 1e3);
+            let two = |parts: [f64; 2]| parts.map(|cores| digits(each_us(cores))).join(", ");
+            rows.push(cells([
+                sessions,
+                format!("{dilation:.4}"),
+                ["p50", "p99", "p999", "max"].map(ms).join(" / "),
+                found.number("/lost").to_string(),
+                digits(found.cores()),
+                digits(each_us(found.cores())),
+                digits(alone_us),
+                two(found.stepping),
+                two(found.network),
+                digits(found.resident_mib),
+                digits(found.number("/generator_cores")),
+            ]));
+            line.push((*count as f64, each_us(found.cores())));
+            if hue == 0 {
+                alone_line.push((*count as f64, alone_us));
+            }
+            figures.push(json!({
+                "sessions": count, "clients_per_session": clients, "told": found.told, "stepping_cores": found.stepping,
+                "network_cores": found.network, "kernel_alone_s": alone_us * 1e-6, "resident_mib": found.resident_mib,
+            }));
+        }
+        report.table(&header, &rows);
+        series.push(Series { name: name.to_owned(), hue, look: Look::Full, points: line });
+        eprintln!("the limit {name}");
+        let server = start(&[]);
+        let trial = if quick() { 2.0 } else { 6.0 };
+        let first = if clients == "1" { "40" } else { "100" };
+        let objective = if clients == "1" { OBJECTIVE } else { "dilation>0.999" };
+        let wanted = ["--sessions", first, "--clients-per-session", clients, "--find-limit", objective];
+        let found = load(&server, trial, &wanted);
+        let limit = found.number("/limit_sessions");
+        let bound = 1e-3 / (alone_line.last().map_or(f64::NAN, |last| last.1) * 1e-6);
+        report.say(&format!(
+            "The most that keep to `{objective}`: **{limit}** sessions, refused above or found by halving. By the kernel alone \
+             it would be {bound:.0}."
+        ));
+        report.figure(if clients == "1" { "limit_with_clients" } else { "limit_without_clients" }, json!(limit));
+    }
+    report.heading("Under attack");
+    report.say("Twenty sessions with a client each, on a server as above, while somebody else does this.");
+    let quiet = |attack: Option<Kind>| {
+        let server = start(&[]);
+        let attack = attack.map(|kind| kept_to(false, || Attack::start(kind, &server)));
+        let found = load(&server, seconds, &["--sessions", "20"]);
+        let strikes = attack.map_or(0, Attack::end);
+        (found, strikes)
+    };
+    let mut rows = Vec::new();
+    let mut base_us = f64::NAN;
+    for (kind, about) in std::iter::once((None, "nobody")).chain(Kind::ALL.map(|(kind, about)| (Some(kind), about))) {
+        eprintln!("under attack: {about}");
+        let (found, strikes) = quiet(kind);
+        let p99_us = found.number("/round_trip_us/p99");
+        if kind.is_none() {
+            base_us = p99_us;
+        }
+        rows.push(cells([
+            about.to_owned(),
+            strikes.to_string(),
+            digits(p99_us / 1e3),
+            digits(p99_us / base_us),
+            format!("{:.4}", found.number("/dilation_min")),
+            found.number("/lost").to_string(),
+            digits(found.cores()),
+            digits(found.resident_mib),
+        ]));
+        figures.push(
+            json!({ "attack": about, "told": found.told, "strikes": strikes, "resident_mib": found.resident_mib }),
+        );
+    }
+    let header =
+        cells(["what", "how often", "round trip p99, ms", "× quiet", "dilation", "lost", "of the core", "memory, MiB"]);
+    report.table(&header, &rows);
+    report.figure("runs", figures.into());
+    series.push(Series { name: "kernel alone".to_owned(), hue: 2, look: Look::Broad, points: alone_line });
+    let panel = Panel::Lines {
+        title: "What a session costs".to_owned(),
+        x: "sessions",
+        y: "µs of the core, a session and step",
+        series,
+    };
+    report.write(1, &[panel]);
+}

@@ -1,0 +1,40 @@
+//! `palpate-client health`: whether a server serves.
+
+use std::time::Duration;
+
+use palpate::wire::error::describe;
+use tonic_health::ServingStatus;
+use tonic_health::pb::HealthCheckRequest;
+use tonic_health::pb::health_client::HealthClient;
+
+use crate::Failure;
+use crate::connect::{Credentials, Server};
+
+/// What `health` is asked for.
+#[derive(clap::Args)]
+pub(crate) struct Arguments {
+    /// The server
+    #[arg(value_name = "URL", default_value = "http://127.0.0.1:7117")]
+    server: String,
+    #[command(flatten)]
+    credentials: Credentials,
+}
+
+/// One that is well answers sooner.
+const PATIENCE: Duration = Duration::from_secs(2);
+
+/// Fails unless the server says that it serves.
+pub(crate) async fn health(arguments: &Arguments) -> Result<(), Failure> {
+    let server = Server::new(&arguments.server, &arguments.credentials)?.within(PATIENCE);
+    let asked = async {
+        let mut health = HealthClient::new(server.connect().await?);
+        health.check(HealthCheckRequest::default()).await.map_err(|status| describe(&status))
+    };
+    let answer = tokio::time::timeout(PATIENCE, asked).await.map_err(|_| Failure::Failed("no answer".into()))?;
+    let status = answer.map_err(Failure::Failed)?.into_inner().status;
+    if status != ServingStatus::Serving as i32 {
+        return Err(Failure::Failed("the server does not serve".into()));
+    }
+    println!("serving");
+    Ok(())
+}

@@ -1,0 +1,321 @@
+//! One client of a load: strokes the tissue by a command each tick, and keeps account of what comes back.
+
+use std::f64::consts::TAU;
+use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use glam::{DVec2, DVec3};
+use palpate::scene::Scene;
+use palpate::scene::law::Poke;
+use palpate::scene::script::Action;
+use palpate::wire::error::describe;
+use palpate::wire::pb::haptic_service_client::HapticServiceClient;
+use palpate::wire::{self, pb};
+use pb::touch_request::Message as Say;
+use pb::touch_response::Message as Heard;
+use tokio::sync::watch;
+use tokio_stream::StreamExt;
+use tokio_stream::wrappers::WatchStream;
+
+use super::tally::Tally;
+use crate::connect::Channel;
+
+pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Where a load stands, and when the measurement ended.
+pub(crate) struct Stage(AtomicU8, AtomicU64);
+
+impl Stage {
+    /// Sessions and clients come; nothing is counted yet.
+    pub(crate) const RAMP: u8 = 0;
+    pub(crate) const MEASURE: u8 = 1;
+    /// Nothing is sent any more; what is under way comes back.
+    pub(crate) const DRAIN: u8 = 2;
+
+    pub(crate) fn new() -> Self {
+        Stage(AtomicU8::new(Stage::RAMP), AtomicU64::new(0))
+    }
+
+    pub(crate) fn measure(&self) {
+        self.0.store(Stage::MEASURE, Ordering::Release);
+    }
+
+    pub(crate) fn drain(&self, now_ns: u64) {
+        self.1.store(now_ns, Ordering::Release);
+        self.0.store(Stage::DRAIN, Ordering::Release);
+    }
+
+    pub(crate) fn is(&self, stage: u8) -> bool {
+        self.0.load(Ordering::Acquire) == stage
+    }
+}
+
+/// What all clients of a thread share.
+#[derive(Clone)]
+pub(crate) struct Common {
+    pub(crate) clock: Instant,
+    pub(crate) stage: Arc<Stage>,
+    pub(crate) tally: Arc<Mutex<Tally>>,
+    /// Commands a second.
+    pub(crate) rate_hz: f64,
+}
+
+impl Common {
+    #[allow(clippy::cast_possible_truncation)]
+    pub(crate) fn now_ns(&self) -> u64 {
+        self.clock.elapsed().as_nanos() as u64
+    }
+}
+
+/// A stroke: a circle about the middle of the sheet, pressed harder and less hard, never at rest.
+#[derive(Clone)]
+pub(crate) struct Stroke {
+    middle_m: DVec2,
+    radius_m: f64,
+    force_n: f64,
+    falloff_per_m: f64,
+    /// Of a turn: clients begin apart.
+    begin: f64,
+}
+
+impl Stroke {
+    pub(crate) fn new(scene: &Scene, begin: f64) -> Self {
+        let (sheet, springs) = (&scene.sheet, scene.springs.stiffness_n_per_m);
+        // Moves the middle by about a third of a spacing.
+        let stiffness_n_per_m = scene.virtual_stiffness_n_per_m + 0.1 * springs;
+        Stroke {
+            middle_m: sheet.extent_m() / 2.0,
+            radius_m: 0.25 * sheet.extent_m().min_element(),
+            force_n: 0.3 * stiffness_n_per_m * sheet.spacing_m,
+            falloff_per_m: 4.0 / sheet.spacing_m,
+            begin,
+        }
+    }
+
+    /// What the tool does at `time_s`: a turn in 2 s, three presses in it.
+    pub(crate) fn at(&self, time_s: f64) -> Action {
+        let turn = TAU * (0.5 * time_s + self.begin);
+        Action::Push(Poke {
+            centre_m: self.middle_m + self.radius_m * DVec2::new(turn.cos(), turn.sin()),
+            force_n: DVec3::new(0.0, 0.0, -self.force_n * (0.6 + 0.4 * (3.0 * turn).sin())),
+            falloff_per_m: self.falloff_per_m,
+            falloff_offset: 0.0,
+        })
+    }
+}
+
+/// Commands of which an answer may be outstanding.
+const OUTSTANDING: usize = 4096;
+
+/// The commands that a client has sent, and when.
+struct Sent {
+    /// The newest; they count from 1.
+    sequence: u64,
+    at_ns: Box<[u64; OUTSTANDING]>,
+    /// Newest that a sample acknowledged.
+    acknowledged: u64,
+    last_tick: Option<u64>,
+    is_open: bool,
+}
+
+impl Sent {
+    #[allow(clippy::cast_possible_truncation)]
+    fn at(&mut self, sequence: u64) -> &mut u64 {
+        &mut self.at_ns[sequence as usize % OUTSTANDING]
+    }
+
+    /// Commands of which nothing was heard.
+    fn outstanding(&mut self) -> u64 {
+        let (from, to) = (self.acknowledged + 1, self.sequence);
+        // Those that are older than what is kept were never answered either, or they would be acknowledged.
+        let kept = from.max(to.saturating_sub(OUTSTANDING as u64 - 1));
+        (kept - from) + (kept..=to).filter(|sequence| *self.at(*sequence) > 0).count() as u64
+    }
+}
+
+/// Steps of a session by when a client heard of them.
+#[derive(Default)]
+struct Heartbeat {
+    /// Server's time and step of the first sample that counts, and of the last.
+    first: Option<(u64, u64)>,
+    last: (u64, u64),
+    last_arrival_ns: u64,
+    /// Samples that were dropped before the first that counts.
+    dropped_before: Option<u64>,
+    dropped: u64,
+}
+
+/// When samples of a session arrived, for the age of its frames.
+pub(crate) struct Arrivals(Box<[(u64, u64); OUTSTANDING]>);
+
+impl Arrivals {
+    pub(crate) fn new() -> Self {
+        Arrivals(Box::new([(0, 0); OUTSTANDING]))
+    }
+
+    #[allow(clippy::cast_possible_truncation)]
+    fn note(&mut self, step: u64, arrival_ns: u64) {
+        self.0[step as usize % OUTSTANDING] = (step, arrival_ns);
+    }
+
+    #[allow(clippy::cast_possible_truncation)]
+    pub(crate) fn of(&self, step: u64) -> Option<u64> {
+        let (noted, arrival_ns) = self.0[step as usize % OUTSTANDING];
+        (noted == step && arrival_ns > 0).then_some(arrival_ns)
+    }
+}
+
+/// A client with a tool of its own.
+pub(crate) struct Client {
+    pub(crate) common: Common,
+    pub(crate) session_id: String,
+    pub(crate) tool: u32,
+    pub(crate) rate_hz: f64,
+    pub(crate) stroke: Stroke,
+    /// If the session has viewers.
+    pub(crate) arrivals: Option<Arc<Mutex<Arrivals>>>,
+}
+
+/// How long a client waits for what it has not heard of.
+const PATIENCE: Duration = Duration::from_secs(2);
+
+/// A session that was silent so long at the end of the measurement had stopped.
+const SILENCE_NS: u64 = 50_000_000;
+
+impl Client {
+    /// Opens the stream. `ticks` tells when to send. What it returns lives as long as the client.
+    pub(crate) async fn open(
+        self,
+        channel: Channel,
+        ticks: watch::Receiver<u64>,
+    ) -> Result<impl Future<Output = ()>, tonic::Status> {
+        let open = pb::TouchOpen {
+            session_id: self.session_id.clone(),
+            tools: vec![self.tool],
+            lease_s: Some(10.0),
+            holder: format!("palpate-client load {}", self.tool),
+            ..Default::default()
+        };
+        let at_ns = Box::new([0; OUTSTANDING]);
+        let sent = Sent { sequence: 0, at_ns, acknowledged: 0, last_tick: None, is_open: false };
+        let sent = Arc::new(Mutex::new(sent));
+        let commands = {
+            let (sent, common, stroke, tool) = (sent.clone(), self.common.clone(), self.stroke.clone(), self.tool);
+            WatchStream::from_changes(ticks).filter_map(move |tick| command(&common, &stroke, tool, &sent, tick))
+        };
+        let say = |message| pb::TouchRequest { message: Some(message) };
+        let outbound = tokio_stream::once(say(Say::Open(open))).chain(commands.map(move |c| say(Say::Command(c))));
+        let mut inbound = HapticServiceClient::new(channel).touch(outbound).await?.into_inner();
+        // The answer to `open`, or why it was refused.
+        inbound.message().await?;
+        lock(&sent).is_open = true;
+        Ok(self.listen(inbound, sent))
+    }
+
+    async fn listen(self, mut inbound: tonic::Streaming<pb::TouchResponse>, sent: Arc<Mutex<Sent>>) {
+        let mut heartbeat = Heartbeat::default();
+        let mut drained = std::pin::pin!(self.drained(&sent));
+        loop {
+            let message = tokio::select! {
+                biased;
+                message = inbound.message() => message,
+                () = &mut drained => break,
+            };
+            match message {
+                Ok(Some(pb::TouchResponse { message: Some(Heard::Sample(sample)) })) => {
+                    self.sample(&sample, &mut heartbeat, &mut lock(&sent));
+                }
+                Ok(Some(pb::TouchResponse { message: Some(Heard::Rejection(rejection)) })) => {
+                    // It never acts: the sample that acknowledges later ones is no answer to it.
+                    *lock(&sent).at(rejection.sequence) = 0;
+                    *lock(&self.common.tally).rejected.entry(rejection.reason).or_default() += 1;
+                }
+                Ok(Some(_)) => {}
+                Ok(None) => break lock(&self.common.tally).broke("the server ended a stream".to_owned()),
+                Err(status) => break lock(&self.common.tally).broke(describe(&status)),
+            }
+        }
+        let mut tally = lock(&self.common.tally);
+        tally.lost_commands += lock(&sent).outstanding();
+        tally.lost_samples += heartbeat.dropped - heartbeat.dropped_before.unwrap_or(heartbeat.dropped);
+        tally.dilation_min = tally.dilation_min.min(heartbeat.dilation(self.rate_hz, &self.common.stage));
+    }
+
+    /// Ends when nothing more is to come, or has not come for long.
+    async fn drained(&self, sent: &Mutex<Sent>) {
+        let mut begun: Option<Instant> = None;
+        loop {
+            tokio::time::sleep(Duration::from_millis(100)).await;
+            if self.common.stage.is(Stage::DRAIN) {
+                let begun = *begun.get_or_insert_with(Instant::now);
+                if lock(sent).outstanding() == 0 || begun.elapsed() > PATIENCE {
+                    return;
+                }
+            }
+        }
+    }
+
+    fn sample(&self, sample: &pb::Sample, heartbeat: &mut Heartbeat, sent: &mut Sent) {
+        let now_ns = self.common.now_ns();
+        if let Some(arrivals) = &self.arrivals {
+            lock(arrivals).note(sample.step, now_ns);
+        }
+        let acknowledged = sample.tools.first().map_or(0, |tool| tool.acknowledged_sequence);
+        let measures = self.common.stage.is(Stage::MEASURE);
+        let mut tally = measures.then(|| lock(&self.common.tally));
+        for sequence in sent.acknowledged + 1..=acknowledged.min(sent.sequence) {
+            let at_ns = std::mem::take(sent.at(sequence));
+            if let Some(tally) = tally.as_mut().filter(|_| at_ns > 0) {
+                tally.round_trip_ns.saturating_record(now_ns.saturating_sub(at_ns));
+            }
+        }
+        sent.acknowledged = sent.acknowledged.max(acknowledged);
+        if let Some(tally) = &mut tally {
+            if heartbeat.first.is_some() {
+                tally.sample_gap_ns.saturating_record(now_ns - heartbeat.last_arrival_ns);
+            }
+            tally.samples += 1;
+            tally.awake_points += u64::from(sample.awake_points);
+            heartbeat.first.get_or_insert((sample.server_time_ns, sample.step));
+            heartbeat.dropped_before.get_or_insert(sample.dropped_samples);
+            heartbeat.last = (sample.server_time_ns, sample.step);
+            heartbeat.last_arrival_ns = now_ns;
+        }
+        heartbeat.dropped = sample.dropped_samples;
+    }
+}
+
+impl Heartbeat {
+    /// Simulated over real time, by the server's clock, and by ours if nothing came for long at the end.
+    #[allow(clippy::cast_precision_loss)]
+    fn dilation(&self, rate_hz: f64, stage: &Stage) -> f64 {
+        let Some(first) = self.first else { return 0.0 };
+        let silent_ns = stage.1.load(Ordering::Acquire).saturating_sub(self.last_arrival_ns);
+        let silent_ns = if silent_ns > SILENCE_NS { silent_ns } else { 0 };
+        let real_s = (self.last.0 - first.0 + silent_ns) as f64 * 1e-9;
+        if real_s > 0.0 { (self.last.1 - first.1) as f64 / rate_hz / real_s } else { 0.0 }
+    }
+}
+
+/// The command of a tick, unless it is too early or too late for one.
+fn command(common: &Common, stroke: &Stroke, tool: u32, sent: &Mutex<Sent>, tick: u64) -> Option<pb::Command> {
+    let mut sent = lock(sent);
+    let missed = sent.last_tick.replace(tick).map_or(0, |last| tick - last - 1);
+    if !sent.is_open || common.stage.is(Stage::DRAIN) {
+        return None;
+    }
+    sent.sequence += 1;
+    let (sequence, now_ns) = (sent.sequence, common.now_ns());
+    *sent.at(sequence) = now_ns;
+    if common.stage.is(Stage::MEASURE) {
+        let mut tally = lock(&common.tally);
+        tally.commands += 1;
+        tally.unsent += missed;
+    }
+    #[allow(clippy::cast_precision_loss)]
+    let action = stroke.at(tick as f64 / common.rate_hz);
+    Some(wire::command::now(tool, sequence, &action, now_ns))
+}

@@ -1,0 +1,267 @@
+//! The sessions, clients and viewers of one thread of a load.
+
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use palpate::refusal::Refusal;
+use palpate::scene::Scene;
+use palpate::wire::error::describe;
+use palpate::wire::pb::create_session_request::Source;
+use palpate::wire::pb::haptic_service_client::HapticServiceClient;
+use palpate::wire::pb::session_service_client::SessionServiceClient;
+use palpate::wire::pb::view_service_client::ViewServiceClient;
+use palpate::wire::{self, pb};
+use tokio::sync::watch;
+use tokio::task::JoinSet;
+use tonic::Status;
+
+use super::client::{Arrivals, Client, Common, Stage, Stroke, lock};
+use crate::connect::{Channel, Server};
+
+/// What a thread is to do.
+pub(crate) struct Orders {
+    pub(crate) server: Server,
+    pub(crate) source: Source,
+    /// The numbers of its sessions among all.
+    pub(crate) sessions: Vec<usize>,
+    pub(crate) clients_per_session: u32,
+    pub(crate) viewers_per_session: u32,
+    pub(crate) clients_per_connection: usize,
+    pub(crate) frame_rate_hz: f64,
+    /// Between two sessions.
+    pub(crate) pause: Duration,
+    /// How long it may all take, for leases.
+    pub(crate) lasts_s: f64,
+}
+
+/// Why a load could not be laid on.
+pub(crate) struct Stopped {
+    pub(crate) message: String,
+    /// An input that was refused: not the server's state.
+    pub(crate) is_refusal: bool,
+}
+
+impl From<Status> for Stopped {
+    fn from(status: Status) -> Self {
+        let is_refusal = matches!(status.code(), tonic::Code::InvalidArgument | tonic::Code::NotFound);
+        Stopped { message: describe(&status), is_refusal }
+    }
+}
+
+/// The server can't be reached.
+impl From<String> for Stopped {
+    fn from(message: String) -> Self {
+        Stopped { message, is_refusal: false }
+    }
+}
+
+impl From<Refusal> for Stopped {
+    fn from(refusal: Refusal) -> Self {
+        Stopped { message: refusal.to_string(), is_refusal: true }
+    }
+}
+
+/// A session, and what is known of it.
+struct Made {
+    id: String,
+    rate_hz: f64,
+    /// Step and our time, when the measurement began.
+    begin: Option<(u64, u64)>,
+}
+
+/// Connections that several clients share.
+struct Connections<'o> {
+    orders: &'o Orders,
+    newest: Option<(Channel, usize)>,
+}
+
+impl Connections<'_> {
+    async fn next(&mut self) -> Result<Channel, Stopped> {
+        match &mut self.newest {
+            Some((channel, users)) if *users < self.orders.clients_per_connection => {
+                *users += 1;
+                Ok(channel.clone())
+            }
+            newest => {
+                let channel = self.orders.server.connect().await?;
+                *newest = Some((channel.clone(), 1));
+                Ok(channel)
+            }
+        }
+    }
+}
+
+/// Sessions of a thread while they are there.
+pub(crate) struct Swarm {
+    client: SessionServiceClient<Channel>,
+    made: Vec<Made>,
+    tasks: JoinSet<()>,
+    common: Common,
+}
+
+impl Swarm {
+    pub(crate) async fn new(server: &Server, common: &Common) -> Result<Self, Stopped> {
+        let client = SessionServiceClient::new(server.connect().await?);
+        Ok(Swarm { client, made: Vec::new(), tasks: JoinSet::new(), common: common.clone() })
+    }
+
+    /// Makes the sessions and opens what belongs to them.
+    pub(crate) async fn gather(&mut self, orders: &Orders, phases: &[watch::Receiver<u64>]) -> Result<(), Stopped> {
+        let mut connections = Connections { orders, newest: None };
+        // Frames would go before samples on a connection of both.
+        let mut viewing = Connections { orders, newest: None };
+        let begun = tokio::time::Instant::now();
+        for (place, number) in orders.sessions.iter().enumerate() {
+            #[allow(clippy::cast_possible_truncation)]
+            tokio::time::sleep_until(begun + orders.pause * place as u32).await;
+            let request = pb::CreateSessionRequest {
+                source: Some(orders.source.clone()),
+                paused: false,
+                // Should we vanish, so do they.
+                idle_timeout_s: Some(10.0),
+            };
+            let created = self.client.create_session(request).await?.into_inner().session.unwrap_or_default();
+            let (id, step) = (created.session_id, created.step);
+            let scene = wire::scene::from_scene(&created.scene.unwrap_or_default())?;
+            let rate_hz = scene.stepping.rate_hz;
+            self.made.push(Made { id: id.clone(), rate_hz, begin: None });
+            let arrivals = (orders.viewers_per_session > 0).then(|| Arc::new(Mutex::new(Arrivals::new())));
+            for tool in 0..orders.clients_per_session {
+                let client = Client {
+                    common: self.common.clone(),
+                    session_id: id.clone(),
+                    tool,
+                    rate_hz,
+                    #[allow(clippy::cast_precision_loss)]
+                    stroke: Stroke::new(&scene, 0.618 * (number + tool as usize) as f64),
+                    arrivals: arrivals.clone(),
+                };
+                let ticks = phases[(number + tool as usize) % phases.len()].clone();
+                self.tasks.spawn(client.open(connections.next().await?, ticks).await?);
+            }
+            if orders.clients_per_session == 0 {
+                let channel = connections.next().await?;
+                keep_awake(channel, &id, &scene, step, orders.lasts_s).await?;
+            }
+            for _ in 0..orders.viewers_per_session {
+                let request = pb::WatchFramesRequest {
+                    session_id: id.clone(),
+                    encoding: pb::Encoding::I16.into(),
+                    rate_hz: Some(orders.frame_rate_hz.min(rate_hz)),
+                    ..Default::default()
+                };
+                let channel = viewing.next().await?;
+                let parts = ViewServiceClient::new(channel).watch_frames(request).await?.into_inner();
+                self.tasks.spawn(watch(self.common.clone(), parts, arrivals.clone()));
+            }
+        }
+        Ok(())
+    }
+
+    /// Where sessions stand of which no client hears, at the beginning of the measurement and at its end.
+    pub(crate) async fn look(&mut self, orders: &Orders) {
+        if orders.clients_per_session > 0 {
+            return;
+        }
+        for made in &mut self.made {
+            let request = pb::GetSessionRequest { session_id: made.id.clone() };
+            let answer = self.client.get_session(request).await;
+            let now_ns = self.common.now_ns();
+            let mut tally = lock(&self.common.tally);
+            match answer.map(|answer| answer.into_inner().session.unwrap_or_default()) {
+                Ok(session) => match made.begin {
+                    None => made.begin = Some((session.step, now_ns)),
+                    Some((step, at_ns)) => {
+                        #[allow(clippy::cast_precision_loss)]
+                        let (simulated_s, real_s) =
+                            ((session.step - step) as f64 / made.rate_hz, (now_ns - at_ns) as f64 * 1e-9);
+                        tally.dilation_min = tally.dilation_min.min(simulated_s / real_s);
+                        if session.resting {
+                            tally.broke("a session came to rest that was to be kept awake".to_owned());
+                        }
+                    }
+                },
+                Err(status) => tally.broke(describe(&status)),
+            }
+        }
+    }
+
+    /// Waits for what is under way.
+    pub(crate) async fn drain(&mut self) {
+        while self.tasks.join_next().await.is_some() {}
+    }
+
+    /// Deletes the sessions: also those of a load that failed.
+    pub(crate) async fn disperse(&mut self) {
+        self.tasks.abort_all();
+        for made in self.made.drain(..) {
+            let deleted = self.client.delete_session(pb::DeleteSessionRequest { session_id: made.id });
+            if !matches!(tokio::time::timeout(Duration::from_secs(2), deleted).await, Ok(Ok(_))) {
+                // A server that has gone has no sessions any more.
+                return;
+            }
+        }
+    }
+}
+
+/// A session that nobody streams to is told beforehand what its tool is to do, in one call: a new force now and then, so
+/// that the tissue never comes to rest.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+async fn keep_awake(channel: Channel, id: &str, scene: &Scene, step: u64, lasts_s: f64) -> Result<(), Stopped> {
+    /// Below what a session queues.
+    const MOST_COMMANDS: u64 = 4000;
+    const APART_S: f64 = 0.05;
+    let rate_hz = scene.stepping.rate_hz;
+    let steps = (lasts_s * rate_hz) as u64;
+    let apart = ((APART_S * rate_hz) as u64).max(steps / MOST_COMMANDS).max(1);
+    let stroke = Stroke::new(scene, 0.0);
+    let mut haptics = HapticServiceClient::new(channel);
+    let acquire = pb::AcquireToolRequest {
+        session_id: id.to_owned(),
+        tool: 0,
+        lease_s: Some(lasts_s),
+        holder: "palpate-client load".to_owned(),
+    };
+    let lease_id = haptics.acquire_tool(acquire).await?.into_inner().lease_id;
+    let command = |index: u64| {
+        let at_step = step + index * apart;
+        let action = stroke.at(at_step as f64 / rate_hz);
+        pb::Command { at_step: Some(at_step), ..wire::command::now(0, index + 1, &action, 0) }
+    };
+    let commands = (0..steps.div_ceil(apart)).map(command).collect();
+    haptics.send_commands(pb::SendCommandsRequest { session_id: id.to_owned(), lease_id, commands }).await?;
+    Ok(())
+}
+
+/// A viewer, until the measurement is over.
+async fn watch(
+    common: Common,
+    mut parts: tonic::Streaming<pb::WatchFramesResponse>,
+    arrivals: Option<Arc<Mutex<Arrivals>>>,
+) {
+    // Without samples: arrival less simulated time of the least delayed frame, s.
+    let mut least_s = f64::INFINITY;
+    while !common.stage.is(Stage::DRAIN) {
+        let part = match tokio::time::timeout(Duration::from_millis(200), parts.message()).await {
+            Err(_) => continue,
+            Ok(Ok(Some(part))) => part,
+            Ok(Ok(None)) => return lock(&common.tally).broke("the server ended a viewer's stream".to_owned()),
+            Ok(Err(status)) => return lock(&common.tally).broke(describe(&status)),
+        };
+        if !part.last {
+            continue;
+        }
+        let now_ns = common.now_ns();
+        #[allow(clippy::cast_precision_loss)]
+        let ahead_s = now_ns as f64 * 1e-9 - part.simulation_time_s;
+        least_s = least_s.min(ahead_s);
+        if common.stage.is(Stage::MEASURE) {
+            let sampled_ns = arrivals.as_ref().and_then(|arrivals| lock(arrivals).of(part.step));
+            #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+            let age_ns = sampled_ns.map_or(((ahead_s - least_s) * 1e9) as u64, |at_ns| now_ns.saturating_sub(at_ns));
+            let mut tally = lock(&common.tally);
+            tally.frames += 1;
+            tally.frame_age_ns.saturating_record(age_ns);
+        }
+    }
+}

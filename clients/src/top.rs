@@ -1,0 +1,194 @@
+//! `palpate-client top`: the sessions of a server, once a second.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::io::{ErrorKind, IsTerminal, Write};
+use std::time::{Duration, Instant};
+
+use palpate::wire::error::describe;
+use palpate::wire::pb::session_service_client::SessionServiceClient;
+use palpate::wire::pb::{ListSessionsRequest, Session, SessionState};
+use serde_json::{Value, json};
+use tonic::Code;
+
+use crate::Failure;
+use crate::connect::{Channel, Credentials, Server};
+
+/// What `top` is asked for.
+#[derive(clap::Args)]
+pub(crate) struct Arguments {
+    /// The server
+    #[arg(value_name = "URL", default_value = "http://127.0.0.1:7117")]
+    server: String,
+    /// Show it once, after a second, and end
+    #[arg(long)]
+    once: bool,
+    /// One JSON object a line, instead of a table
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    credentials: Credentials,
+}
+
+/// Between two looks.
+const EVERY: Duration = Duration::from_secs(1);
+
+/// A session, and how many steps it does and drops a second since the last look.
+struct Row {
+    session: Session,
+    steps_per_s: f64,
+    overruns_per_s: f64,
+}
+
+/// Steps done and dropped, by session, at some moment.
+struct Seen {
+    at: Instant,
+    counts: BTreeMap<String, (u64, u64)>,
+}
+
+/// Looks at a server until it is interrupted, or nobody reads any more.
+pub(crate) async fn top(arguments: &Arguments) -> Result<(), Failure> {
+    let server = Server::new(&arguments.server, &arguments.credentials)?;
+    let unreached = |why| Failure::Failed(format!("{why}; `palpate serve` starts a server"));
+    let mut sessions = SessionServiceClient::new(server.connect().await.map_err(unreached)?);
+    let terminal = std::io::stdout().is_terminal() && !arguments.json && !arguments.once;
+    let mut seen = None;
+    let mut ticks = tokio::time::interval(EVERY);
+    loop {
+        tokio::select! {
+            _ = ticks.tick() => {}
+            _ = tokio::signal::ctrl_c() => return Ok(()),
+        }
+        let (rows, now) = match look(&mut sessions, seen.as_ref()).await {
+            Ok(looked) => looked,
+            // The channel connects again by itself.
+            Err(status) if status.code() == Code::Unavailable && !arguments.once => {
+                eprintln!("palpate-client: warning: {}; looking again", describe(&status));
+                continue;
+            }
+            Err(status) => return Err(Failure::Failed(describe(&status))),
+        };
+        // A rate needs two looks.
+        if seen.replace(now).is_none() {
+            continue;
+        }
+        let text = match (arguments.json, terminal) {
+            (true, _) => format!("{}\n", as_json(&rows)),
+            (false, false) => table(&arguments.server, &rows, usize::MAX) + if arguments.once { "" } else { "\n" },
+            // Over what was there, without a flicker.
+            (false, true) => {
+                let height = usize::from(console::Term::stdout().size().0);
+                let table = table(&arguments.server, &rows, height.saturating_sub(4));
+                format!("\x1b[H{}\x1b[J", table.replace('\n', "\x1b[K\n"))
+            }
+        };
+        match std::io::stdout().write_all(text.as_bytes()).and_then(|()| std::io::stdout().flush()) {
+            Err(e) if e.kind() == ErrorKind::BrokenPipe => return Err(Failure::Unread),
+            Err(e) => return Err(Failure::Failed(e.to_string())),
+            Ok(()) if arguments.once => return Ok(()),
+            Ok(()) => {}
+        }
+    }
+}
+
+#[allow(clippy::cast_precision_loss)]
+async fn look(
+    sessions: &mut SessionServiceClient<Channel>,
+    seen: Option<&Seen>,
+) -> Result<(Vec<Row>, Seen), tonic::Status> {
+    let listed = sessions.list_sessions(ListSessionsRequest {}).await?.into_inner().sessions;
+    let at = Instant::now();
+    let counts =
+        listed.iter().map(|session| (session.session_id.clone(), (session.step, session.overrun_count))).collect();
+    let row = |session: Session| {
+        // One that is new has no rate yet.
+        let before = seen.and_then(|seen| Some((seen.at, seen.counts.get(&session.session_id)?)));
+        let (steps_per_s, overruns_per_s) = before.map_or((0.0, 0.0), |(before, (steps, overruns))| {
+            let per_s = |count: u64| count as f64 / (at - before).as_secs_f64().max(1e-3);
+            (per_s(session.step.saturating_sub(*steps)), per_s(session.overrun_count.saturating_sub(*overruns)))
+        });
+        Row { session, steps_per_s, overruns_per_s }
+    };
+    Ok((listed.into_iter().map(row).collect(), Seen { at, counts }))
+}
+
+fn state(session: &Session) -> &'static str {
+    match session.state() {
+        SessionState::Running if session.resting => "resting",
+        SessionState::Running => "running",
+        SessionState::Paused => "paused",
+        SessionState::Held => "held",
+        SessionState::Unspecified => "?",
+    }
+}
+
+fn as_json(rows: &[Row]) -> Value {
+    let one = |Row { session, steps_per_s, overruns_per_s }: &Row| {
+        let holders = session.held_tools.iter().map(|held| json!({ "tool": held.tool, "holder": held.holder }));
+        json!({
+            "session_id": session.session_id, "scene": session.scene_name, "state": state(session),
+            "step": session.step, "steps_per_s": steps_per_s, "time_dilation": session.time_dilation,
+            "points": session.points, "awake_points": session.awake_points,
+            "overrun_count": session.overrun_count, "overruns_per_s": overruns_per_s,
+            "late_commands": session.late_commands, "guard_events": session.guard_events,
+            "streams": session.streams, "held_tools": holders.collect::<Vec<_>>(), "hold_reason": session.hold_reason,
+        })
+    };
+    json!({ "sessions": rows.iter().map(one).collect::<Vec<_>>() })
+}
+
+/// A line of sums, a head, and a line for each session; of `most` lines the busiest.
+fn table(server: &str, rows: &[Row], most: usize) -> String {
+    let count = |wanted: &str| rows.iter().filter(|row| state(&row.session) == wanted).count();
+    let sum = |of: &dyn Fn(&Row) -> f64| rows.iter().map(of).sum::<f64>();
+    let mut text = format!(
+        "{server}: {} sessions ({} running, {} resting, {} paused, {} held), {:.0} awake points, {:.0} steps/s, \
+         {:.0} overruns/s\n\n",
+        rows.len(),
+        count("running"),
+        count("resting"),
+        count("paused"),
+        count("held"),
+        sum(&|row| f64::from(row.session.awake_points)),
+        sum(&|row| row.steps_per_s),
+        sum(&|row| row.overruns_per_s),
+    );
+    let _ = writeln!(
+        text,
+        "{:<32}  {:<12} {:<7} {:>10} {:>7} {:>8} {:>15} {:>8} {:>6} {:>7}  held by",
+        "session", "scene", "state", "step", "steps/s", "dilation", "awake/points", "overruns", "late", "streams"
+    );
+    let mut rows: Vec<&Row> = rows.iter().collect();
+    if rows.len() > most {
+        rows.sort_by_key(|row| std::cmp::Reverse((row.session.awake_points, row.session.streams)));
+    }
+    for Row { session, steps_per_s, .. } in rows.iter().take(most) {
+        let holders: Vec<_> = session.held_tools.iter().map(|held| format!("{}: {}", held.tool, held.holder)).collect();
+        let awake = format!("{}/{}", session.awake_points, session.points);
+        let _ = writeln!(
+            text,
+            "{:<32}  {:<12.12} {:<7} {:>10} {:>7.0} {:>8.4} {:>15} {:>8} {:>6} {:>7}  {}",
+            session.session_id,
+            // Names are for people, and may hold anything.
+            printable(&session.scene_name),
+            state(session),
+            session.step,
+            steps_per_s,
+            session.time_dilation,
+            awake,
+            session.overrun_count,
+            session.late_commands,
+            session.streams,
+            printable(&holders.join(", ")),
+        );
+    }
+    if rows.len() > most {
+        let _ = writeln!(text, "and {} more", rows.len() - most);
+    }
+    text
+}
+
+/// What a client named itself must not move the cursor.
+fn printable(text: &str) -> String {
+    text.chars().map(|c| if c.is_control() { '?' } else { c }).collect()
+}

@@ -1,0 +1,459 @@
+//! What reads bytes of others: one function each. libFuzzer calls them, and so does `tests/fuzz.rs` with inputs of its own.
+//! None may panic, whatever it is given; what it takes must be finite and within its bounds. True: the input was taken.
+#![allow(
+    missing_docs,
+    unreachable_pub,
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::missing_panics_doc
+)]
+
+use std::path::Path;
+use std::sync::{Arc, OnceLock};
+
+use glam::DVec3;
+use palpate::haptics::device::Device;
+use palpate::haptics::envelope::Envelope;
+use palpate::haptics::{Law, Renderer};
+use palpate::limits::Limits;
+use palpate::scene::record::{Record, write_line};
+use palpate::scene::script::Script;
+use palpate::scene::{PAPER, Scene};
+use palpate::server::config::Config;
+use palpate::server::identity::{self, Credentials, Role};
+use palpate::session::Session;
+use palpate::session::command::Intake;
+use palpate::session::sampling::Sampler;
+use palpate::sheet::Model;
+use palpate::surface::Refinement;
+use palpate::wire::{self, pb};
+use prost::Message;
+
+/// Whether an input is taken.
+pub type Taker = fn(&[u8]) -> bool;
+
+/// A decoder.
+pub struct Target {
+    pub name: &'static str,
+    pub run: Taker,
+    /// Inputs that it takes, to begin with.
+    pub seeds: fn() -> Vec<Vec<u8>>,
+}
+
+pub const TARGETS: [Target; 7] = [
+    Target { name: "scene", run: scene, seeds: scene_seeds },
+    Target { name: "script", run: script, seeds: script_seeds },
+    Target { name: "request", run: request, seeds: request_seeds },
+    Target { name: "sample", run: sample, seeds: sample_seeds },
+    Target { name: "record", run: record, seeds: record_seeds },
+    Target { name: "frame", run: frame, seeds: frame_seeds },
+    Target { name: "config", run: config, seeds: config_seeds },
+];
+
+/// What is read at all is read under these; what is compiled is smaller still.
+fn limits() -> Limits {
+    Limits { points: 1 << 12, substeps: 1000, ..Limits::default() }
+}
+
+const COMPILED_POINTS: usize = 64;
+
+/// Compiles a small scene and steps it.
+fn step(scene: &Scene) -> bool {
+    if scene.sheet.points[0] * scene.sheet.points[1] > COMPILED_POINTS {
+        return true;
+    }
+    let small = Limits { substeps: 20, ..limits() };
+    let Ok(model) = Model::compile(scene, &small) else { return false };
+    let mut session = Session::new(&model);
+    session.advance(&mut Vec::new(), |_| {});
+    true
+}
+
+pub fn scene(bytes: &[u8]) -> bool {
+    let Ok(text) = std::str::from_utf8(bytes) else { return false };
+    Scene::parse("fuzz", text, &[], &limits()).is_ok_and(|scene| step(&scene))
+}
+
+fn scene_seeds() -> Vec<Vec<u8>> {
+    let small = PAPER.replace("[31, 31]", "[5, 4]");
+    let more = "[sleep]\ntolerance = 1e-4\n[stepping]\nrate_hz = 500.0\nintegrator = \"rk4\"\nprecision = \"f64\"\n";
+    vec![PAPER.into(), small.clone().into(), include_str!("../../scenes/liver.toml").into(), (small + more).into()]
+}
+
+/// 5 × 5 points, and what of them never changes.
+fn model() -> &'static Arc<Model> {
+    static MODEL: OnceLock<Arc<Model>> = OnceLock::new();
+    MODEL.get_or_init(|| {
+        let text = PAPER.replace("[31, 31]", "[5, 5]");
+        let scene = Scene::parse("fuzz", &text, &[], &limits()).expect("the scene is sound");
+        assert_eq!(scene.sheet.points, [5, 5], "the paper's scene has other points");
+        Model::compile(&scene, &limits()).expect("the scene is sound")
+    })
+}
+
+pub fn script(bytes: &[u8]) -> bool {
+    let Ok(text) = std::str::from_utf8(bytes) else { return false };
+    static SCENE: OnceLock<Scene> = OnceLock::new();
+    let scene = SCENE.get_or_init(|| Scene::parse("fuzz", PAPER, &[], &limits()).expect("the scene is sound"));
+    let Ok(script) = Script::parse("fuzz", text, Path::new("nowhere"), scene, &limits()) else { return false };
+    let _actions: usize = (0..3).map(|step| script.actions_at(step).count()).sum();
+    true
+}
+
+fn script_seeds() -> Vec<Vec<u8>> {
+    let scripts = [include_str!("../../scripts/vertical-60.toml"), include_str!("../../scripts/oblique-100.toml")];
+    scripts.iter().map(|text| text.as_bytes().to_vec()).collect()
+}
+
+/// Every request of the protocol: decodes one, and does with it what can be done without a server.
+pub const REQUESTS: [(&str, Taker); 22] = [
+    ("CreateSessionRequest", |bytes| {
+        use pb::create_session_request::Source;
+        match pb::CreateSessionRequest::decode(bytes).map(|request| request.source) {
+            Ok(Some(Source::Scene(scene))) => wire::scene::from_scene(&scene).is_ok_and(|scene| step(&scene)),
+            other => other.is_ok(),
+        }
+    }),
+    ("TouchRequest", |bytes| match pb::TouchRequest::decode(bytes).map(|request| request.message) {
+        Ok(Some(pb::touch_request::Message::Open(message))) => open(&message),
+        Ok(Some(pb::touch_request::Message::Command(command))) => command_all(&[command]),
+        other => other.is_ok(),
+    }),
+    ("SendCommandsRequest", |bytes| {
+        pb::SendCommandsRequest::decode(bytes).is_ok_and(|request| command_all(&request.commands))
+    }),
+    ("AcquireToolRequest", |bytes| {
+        pb::AcquireToolRequest::decode(bytes).is_ok_and(|request| {
+            let mut intake = Intake::new(&model().scene, &limits());
+            intake.acquire(&[request.tool], &request.holder, request.lease_s.unwrap_or(2.0), 1, 0).is_ok()
+        })
+    }),
+    ("WatchSamplesRequest", |bytes| {
+        pb::WatchSamplesRequest::decode(bytes).is_ok_and(|request| {
+            let (every, deadband) = (request.sample_every_steps, request.deadband.as_ref());
+            let sampling = wire::sample::sampling(every, None, deadband, request.heartbeat_s, false);
+            sampling.is_ok_and(|sampling| Sampler::new(sampling, 1000.0).next_due(7) > 7)
+        })
+    }),
+    ("ProbeRequest", |bytes| {
+        pb::ProbeRequest::decode(bytes).is_ok_and(|request| {
+            let every = wire::every("every_steps", request.every_steps).is_ok();
+            match &request.r#where {
+                Some(pb::probe_request::Where::Points(points)) => points.points.iter().all(|point| {
+                    model()
+                        .scene
+                        .sheet
+                        .index("points", wire::from_point(point))
+                        .is_ok_and(|index| index < model().len())
+                }),
+                _ => every,
+            }
+        })
+    }),
+    ("GetMeshRequest", |bytes| {
+        pb::GetMeshRequest::decode(bytes)
+            .is_ok_and(|request| Refinement::new(model().points, request.refinement, &limits()).is_ok())
+    }),
+    ("WatchFramesRequest", |bytes| {
+        pb::WatchFramesRequest::decode(bytes)
+            .is_ok_and(|request| Refinement::new(model().points, request.refinement, &limits()).is_ok())
+    }),
+    ("UpdateTissueRequest", |bytes| {
+        pb::UpdateTissueRequest::decode(bytes).is_ok_and(|request| {
+            let change = wire::scene::from_change(&request);
+            model().changed(&change, &model().scene, &limits()).is_ok()
+        })
+    }),
+    ("GetTextureRequest", |bytes| pb::GetTextureRequest::decode(bytes).is_ok()),
+    ("ListScriptsRequest", |bytes| pb::ListScriptsRequest::decode(bytes).is_ok()),
+    ("GetScriptRequest", |bytes| pb::GetScriptRequest::decode(bytes).is_ok()),
+    ("AcknowledgeFramesRequest", |bytes| pb::AcknowledgeFramesRequest::decode(bytes).is_ok()),
+    ("ReleaseToolRequest", |bytes| pb::ReleaseToolRequest::decode(bytes).is_ok()),
+    ("ListScenesRequest", |bytes| pb::ListScenesRequest::decode(bytes).is_ok()),
+    ("GetSessionRequest", |bytes| pb::GetSessionRequest::decode(bytes).is_ok()),
+    ("ListSessionsRequest", |bytes| pb::ListSessionsRequest::decode(bytes).is_ok()),
+    ("DeleteSessionRequest", |bytes| pb::DeleteSessionRequest::decode(bytes).is_ok()),
+    ("StartSessionRequest", |bytes| pb::StartSessionRequest::decode(bytes).is_ok()),
+    ("PauseSessionRequest", |bytes| pb::PauseSessionRequest::decode(bytes).is_ok()),
+    ("GetStateHashRequest", |bytes| pb::GetStateHashRequest::decode(bytes).is_ok()),
+    // Of a client that writes what no request is.
+    ("", |bytes| pb::Scene::decode(bytes).is_ok_and(|scene| wire::scene::from_scene(&scene).is_ok())),
+];
+
+/// The first byte says which request the others are.
+pub fn request(bytes: &[u8]) -> bool {
+    bytes.split_first().is_some_and(|(which, bytes)| REQUESTS[usize::from(*which) % REQUESTS.len()].1(bytes))
+}
+
+fn open(open: &pb::TouchOpen) -> bool {
+    let sheet = &model().scene.sheet;
+    let device = open.device.as_ref().map(wire::local::from_device);
+    let tip = wire::command::from_tip(open.tip.as_ref());
+    let only = (!open.tools.is_empty()).then(|| open.tools.clone());
+    let (every, deadband) = (open.sample_every_steps, open.deadband.as_ref());
+    let sampling = wire::sample::sampling(every, only, deadband, open.heartbeat_s, open.device.is_some());
+    let mut intake = Intake::new(&model().scene, &limits());
+    let held = intake.acquire(&open.tools, &open.holder, open.lease_s.unwrap_or(2.0), 1, 0).is_ok();
+    if tip.check("tip", sheet).is_ok() {
+        assert!(tip.radius_m.is_finite() && tip.friction.is_finite());
+    }
+    let taken = sampling.map(|sampling| Sampler::new(sampling, 1000.0).next_due(7));
+    held && taken.is_ok() && device.is_none_or(|device| device.is_ok())
+}
+
+/// All of them at one session, all or none, and two steps after them.
+fn command_all(messages: &[pb::Command]) -> bool {
+    let scene = &model().scene;
+    let mut intake = Intake::new(scene, &limits());
+    intake.acquire(&[0, 1, 2], "fuzz", 60.0, 1, 0).expect("tools are free");
+    let commands: Result<Vec<_>, _> =
+        messages.iter().map(|message| wire::command::from_command(message, &scene.sheet, 1)).collect();
+    let Ok(commands) = commands else { return false };
+    if intake.submit(1, commands, 1).is_err() {
+        return false;
+    }
+    let mut session = Session::new(model());
+    let mut due = Vec::new();
+    for _ in 0..2 {
+        intake.take_due(session.step_count(), 2, &mut due);
+        session.advance(&mut due, |_| {});
+        let sample = session.sample(None);
+        for contact in sample.tools.iter().filter_map(|tool| tool.contact) {
+            assert!(contact.displacement_m.is_finite() && contact.force_on_tool_n.is_finite(), "{contact:?}");
+        }
+    }
+    true
+}
+
+fn request_seeds() -> Vec<Vec<u8>> {
+    let vector = |x, y, z| Some(pb::Vector3 { x, y, z });
+    let point = pb::GridPoint { x: 2, y: 1 };
+    let force = pb::command::Action::Force(pb::Force {
+        centre: Some(pb::force::Centre::Point(point)),
+        force_n: vector(0.1, 0.0, -1.0),
+        falloff_per_m: 150.0,
+        falloff_offset: 0.0,
+    });
+    let position = pb::command::Action::Position(pb::Position {
+        point: Some(point),
+        target: Some(pb::position::Target::DisplacementM(pb::Vector3 { x: 0.0, y: 0.0, z: -0.01 })),
+    });
+    let pose = pb::command::Action::Pose(pb::Pose {
+        position_m: vector(0.05, 0.05, -0.002),
+        orientation: Some(pb::Quaternion { w: 1.0, ..Default::default() }),
+        tip_offset_m: vector(0.0, 0.0, 0.01),
+        tip: Some(pb::Tip {
+            radius_m: 0.02,
+            friction: 0.3,
+            grasps: true,
+            spring: Some(pb::Spring { stiffness_n_per_m: 100.0, damping_n_s_per_m: 1.0 }),
+        }),
+    });
+    let actions = [force, position, pose, pb::command::Action::Release(pb::Release {})];
+    let command = |index: usize| pb::Command {
+        tool: index as u32 % 3,
+        sequence: index as u64 + 1,
+        client_time_ns: index as u64 * 1_000_000,
+        at_step: (index == 1).then_some(1),
+        time_to_live_s: (index == 2).then_some(0.001),
+        action: Some(actions[index % 4]),
+    };
+    let commands: Vec<_> = (0..4).map(command).collect();
+    let deadband = pb::Deadband { force_n: Some(0.01), force_fraction: Some(0.1), ..Default::default() };
+    let open = pb::TouchOpen {
+        session_id: "0123456789abcdef".into(),
+        tools: vec![0, 2],
+        sample_every_steps: Some(2),
+        lease_s: Some(1.0),
+        holder: "somebody".into(),
+        deadband: Some(deadband),
+        heartbeat_s: Some(0.04),
+        device: Some(wire::local::device(&Device::named("omega3").expect("there is one"))),
+        tip: Some(pb::Tip { radius_m: 0.02, friction: 0.2, ..Default::default() }),
+    };
+    let touch = |message| pb::TouchRequest { message: Some(message) }.encode_to_vec();
+    let scene = pb::create_session_request::Source::Scene(wire::scene::scene(&model().scene));
+    let watch = pb::WatchSamplesRequest { deadband: Some(deadband), heartbeat_s: Some(1.0), ..Default::default() };
+    let points = pb::probe_request::Where::Points(pb::GridPoints { points: vec![point] });
+    let mut seeds = vec![
+        (
+            "CreateSessionRequest",
+            pb::CreateSessionRequest { source: Some(scene), ..Default::default() }.encode_to_vec(),
+        ),
+        ("TouchRequest", touch(pb::touch_request::Message::Open(open))),
+        ("TouchRequest", touch(pb::touch_request::Message::Renew(pb::Renew { client_time_ns: 7 }))),
+        (
+            "SendCommandsRequest",
+            pb::SendCommandsRequest { commands: commands.clone(), ..Default::default() }.encode_to_vec(),
+        ),
+        (
+            "AcquireToolRequest",
+            pb::AcquireToolRequest { tool: 3, lease_s: Some(1.0), ..Default::default() }.encode_to_vec(),
+        ),
+        ("WatchSamplesRequest", watch.encode_to_vec()),
+        ("ProbeRequest", pb::ProbeRequest { r#where: Some(points), ..Default::default() }.encode_to_vec()),
+        ("GetMeshRequest", pb::GetMeshRequest { refinement: 3, ..Default::default() }.encode_to_vec()),
+        ("WatchFramesRequest", pb::WatchFramesRequest { refinement: 10, ..Default::default() }.encode_to_vec()),
+        (
+            "UpdateTissueRequest",
+            pb::UpdateTissueRequest {
+                stiffness_n_per_m: Some(4.0),
+                damping_n_s_per_m: Some(1.0),
+                ..Default::default()
+            }
+            .encode_to_vec(),
+        ),
+        ("GetStateHashRequest", pb::GetStateHashRequest { at_step: Some(9), ..Default::default() }.encode_to_vec()),
+    ];
+    for command in commands {
+        seeds.push(("TouchRequest", touch(pb::touch_request::Message::Command(command))));
+    }
+    let which = |name: &str| REQUESTS.iter().position(|request| request.0 == name).expect("is in the table") as u8;
+    seeds.into_iter().map(|(name, bytes)| [vec![which(name)], bytes].concat()).collect()
+}
+
+/// What a device would render of whatever a server sends, N: finite, and never above this.
+const MOST_N: f64 = 3.3;
+
+/// What a client hears in a haptic stream, up to the force at the device.
+pub fn sample(bytes: &[u8]) -> bool {
+    let Ok(response) = pb::TouchResponse::decode(bytes) else { return false };
+    let device = Device::named("omega3").expect("there is one");
+    let render = |law: Law, models: &mut dyn Iterator<Item = (&pb::LocalModel, u64)>| {
+        let mut renderer = Renderer::new(law, Envelope::new(device, DVec3::ZERO));
+        renderer.envelope.enable();
+        for tick in 0..4 {
+            let now_s = 1e-3 * f64::from(tick);
+            if let Some((model, step)) = models.next() {
+                renderer.receive(wire::local::from_local_model(model, step), now_s);
+            }
+            let force_n = renderer.tick(now_s, DVec3::new(0.0, 0.0, -1e-3 * f64::from(tick)));
+            assert!(force_n.is_finite() && force_n.length() <= MOST_N + 1e-9, "{force_n}");
+        }
+    };
+    match response.message {
+        Some(pb::touch_response::Message::Opened(pb::TouchOpened { law: Some(law), .. })) => {
+            wire::local::from_law(&law).map(|law| render(law, &mut std::iter::empty())).is_ok()
+        }
+        Some(pb::touch_response::Message::Sample(sample)) => {
+            let _ = wire::local::wire_bytes(&sample);
+            let models = sample.tools.iter().filter_map(|tool| tool.local_model.as_ref());
+            render(Law::linear(500.0, 1.0), &mut models.map(|model| (model, sample.step)));
+            true
+        }
+        other => other.is_some(),
+    }
+}
+
+fn sample_seeds() -> Vec<Vec<u8>> {
+    use pb::touch_response::Message as Heard;
+    let vector = |x, y, z| Some(pb::Vector3 { x, y, z });
+    let matrix = |k| Some(pb::Symmetric3 { xx: k, yy: k, zz: 2.0 * k, ..Default::default() });
+    let model = |contact: pb::Contact| pb::LocalModel {
+        sequence: 1 + contact as u64,
+        client_time_ns: 1_000_000,
+        position_m: vector(0.0, 0.0, -0.001),
+        velocity_m_per_s: vector(0.01, 0.0, -0.01),
+        force_on_tool_n: vector(0.01, 0.0, 0.3),
+        stiffness_n_per_m: matrix(100.0),
+        damping_n_s_per_m: matrix(1.0),
+        surface_m: vector(0.0, 0.0, 0.0),
+        normal: vector(0.0, 0.0, 1.0),
+        valid_m: 0.005,
+        friction: 0.2,
+        contact: contact.into(),
+    };
+    let contacts = [pb::Contact::Free, pb::Contact::Sticking, pb::Contact::Sliding, pb::Contact::Holding];
+    let tools = contacts.map(|contact| pb::ToolSample { local_model: Some(model(contact)), ..Default::default() });
+    let mut messages: Vec<Heard> = tools
+        .iter()
+        .map(|tool| Heard::Sample(pb::Sample { step: 5, tools: vec![*tool], ..Default::default() }))
+        .collect();
+    messages.push(Heard::Sample(pb::Sample { step: 7, tools: tools.to_vec(), ..Default::default() }));
+    let law = wire::local::law(&Law::linear(300.0, 1.0));
+    messages.push(Heard::Opened(pb::TouchOpened { step: 3, law: Some(law), ..Default::default() }));
+    messages.into_iter().map(|message| pb::TouchResponse { message: Some(message) }.encode_to_vec()).collect()
+}
+
+/// A part of a record on its way to the file of a replay.
+pub fn record(bytes: &[u8]) -> bool {
+    let Ok(message) = pb::ProbeResponse::decode(bytes) else { return false };
+    let mut record = Record::default();
+    let _ = wire::sample::add_to_record(&mut record, &message);
+    let mut line = Vec::new();
+    write_line(&mut line, &record).expect("memory takes all");
+    assert_eq!(line.iter().filter(|byte| **byte == b'\n').count(), 1);
+    true
+}
+
+fn record_seeds() -> Vec<Vec<u8>> {
+    let vector = Some(pb::Vector3 { x: 0.1, y: -0.2, z: 3e-9 });
+    let point = pb::PointRecord {
+        point: Some(pb::GridPoint { x: 2, y: 3 }),
+        displacement_m: vector,
+        spring_n: vector,
+        constraint_n: vector,
+        ..Default::default()
+    };
+    let energy = Some(pb::Energy { kinetic_j: 1.0, spring_j: 2.0, virtual_j: 3.0 });
+    let last = pb::ProbeResponse { step: 9, points: vec![point; 3], energy, last: true, ..Default::default() };
+    vec![last.encode_to_vec(), pb::ProbeResponse { last: false, ..last }.encode_to_vec()]
+}
+
+/// A frame, a mesh or a session as a client reads them: what was read is written and read again as the same.
+pub fn frame(bytes: &[u8]) -> bool {
+    fn again<M: Message + Default + PartialEq>(bytes: &[u8]) -> bool {
+        let Ok(message) = M::decode(bytes) else { return false };
+        let written = message.encode_to_vec();
+        // NaN is not the same as itself; its bytes are.
+        let read = M::decode(&*written).expect("what was written can be read");
+        assert_eq!(read.encode_to_vec(), written);
+        true
+    }
+    match bytes.split_first() {
+        Some((which, bytes)) if which % 3 == 0 => again::<pb::WatchFramesResponse>(bytes),
+        Some((which, bytes)) if which % 3 == 1 => again::<pb::GetMeshResponse>(bytes),
+        Some((_, bytes)) => again::<pb::Session>(bytes),
+        None => false,
+    }
+}
+
+fn frame_seeds() -> Vec<Vec<u8>> {
+    let patch =
+        pb::Patch { first_x: 1, count_x: 2, count_y: 3, displacement: vec![7; 36].into(), ..Default::default() };
+    let frame = pb::WatchFramesResponse {
+        viewer_id: "viewer".into(),
+        frame_id: 9,
+        encoding: pb::Encoding::I16.into(),
+        patches: vec![patch; 2],
+        ..Default::default()
+    };
+    let mesh = pb::GetMeshResponse {
+        vertices_x: 3,
+        vertices_y: 2,
+        rest_position_m: vec![0.5; 18],
+        triangles: vec![0, 1, 2, 1, 3, 2],
+        ..Default::default()
+    };
+    let held_tools = vec![pb::HeldTool { tool: 1, holder: "somebody".into() }];
+    let session =
+        pb::Session { scene: Some(wire::scene::scene(&model().scene)), step: 9, held_tools, ..Default::default() };
+    let messages = [frame.encode_to_vec(), mesh.encode_to_vec(), session.encode_to_vec()];
+    messages.into_iter().enumerate().map(|(which, bytes)| [vec![which as u8], bytes].concat()).collect()
+}
+
+/// A configuration, or a file of tokens.
+pub fn config(bytes: &[u8]) -> bool {
+    let Ok(text) = std::str::from_utf8(bytes) else { return false };
+    let known = Credentials::parse(Path::new("fuzz"), text).is_ok();
+    Config::parse("fuzz", text).is_ok() || known
+}
+
+fn config_seeds() -> Vec<Vec<u8>> {
+    let config = "listen = \"127.0.0.1:0\"\nthreads = 2\nlease_s = 1.5\norigins = [\"https://example.org\"]\n\
+                  [limits]\npoints = 1000\nlease_s = 60.0\nsession_rate_hz = 2e3\n";
+    let token = identity::entry("somebody", &[Role::Touch, Role::Create], "palpate_00").expect("is an entry");
+    let certificate = "[[certificate]]\nname = \"bench-3\"\nroles = [\"touch\"]\n";
+    vec![config.into(), format!("{token}{certificate}").into()]
+}

@@ -1,0 +1,143 @@
+//! What steps take, and who bears it when a thread has not enough time for all.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use crate::sheet::Model;
+
+/// Before anything was measured: of a point and substep, and of a step beside its points, ns.
+const GUESS_NS: f64 = 2.0;
+const GUESS_STEP_NS: f64 = 2000.0;
+
+/// Steps over which the mean goes.
+const MEMORY: f64 = 64.0;
+
+/// A step that took longer than so many times the mean counts as so many: one in which the thread was not running tells
+/// nothing of the session.
+const OUTLIER: f64 = 8.0;
+
+/// What a session takes of its thread.
+#[derive(Debug)]
+pub(super) struct Cost {
+    /// Mean time of a step, ns, as bits of an f64.
+    step_ns: AtomicU64,
+    /// The same of a core, while steps are computed; 0 at rest.
+    share: AtomicU64,
+    rate_hz: f64,
+    point_substeps: f64,
+}
+
+fn get(bits: &AtomicU64) -> f64 {
+    f64::from_bits(bits.load(Ordering::Relaxed))
+}
+
+fn set(bits: &AtomicU64, value: f64) {
+    bits.store(value.to_bits(), Ordering::Relaxed);
+}
+
+#[allow(clippy::cast_precision_loss)]
+impl Cost {
+    /// Of a session that has not begun: by what others take for their points, of `known`.
+    pub(super) fn guess<'c>(model: &Model, known: impl Iterator<Item = &'c Cost>) -> Self {
+        let point_substeps = model.len() as f64 * f64::from(model.plan.substeps);
+        let (taken_ns, worked) = known.filter(|cost| cost.share() > 0.0).fold((0.0, 0.0), |(ns, work), cost| {
+            (ns + get(&cost.step_ns), work + cost.point_substeps + GUESS_STEP_NS / GUESS_NS)
+        });
+        let each_ns = if worked > 0.0 { taken_ns / worked } else { GUESS_NS };
+        let step_ns = each_ns * (point_substeps + GUESS_STEP_NS / GUESS_NS);
+        let rate_hz = model.scene.stepping.rate_hz;
+        Cost { step_ns: AtomicU64::new(step_ns.to_bits()), share: AtomicU64::new(0), rate_hz, point_substeps }
+    }
+
+    /// Of a core, if it is awake.
+    pub(super) fn awake_share(&self) -> f64 {
+        get(&self.step_ns) * 1e-9 * self.rate_hz
+    }
+
+    /// Of a core, now.
+    pub(super) fn share(&self) -> f64 {
+        get(&self.share)
+    }
+
+    /// A step took so long. By the thread that steps it alone.
+    pub(super) fn observe(&self, took_ns: u64) {
+        let mean_ns = get(&self.step_ns);
+        let took_ns = (took_ns as f64).min(OUTLIER * mean_ns.max(1.0));
+        set(&self.step_ns, mean_ns + (took_ns - mean_ns) / MEMORY);
+    }
+
+    /// Whether steps are computed now.
+    pub(super) fn set_awake(&self, is_awake: bool) {
+        set(&self.share, if is_awake { self.awake_share() } else { 0.0 });
+    }
+}
+
+/// The longest step that a thread did of late: so much anybody may be late through no fault of its own.
+#[derive(Debug, Default)]
+pub(super) struct Longest {
+    /// Of this window, and of the last.
+    now_ns: u64,
+    before_ns: u64,
+    since_ns: u64,
+}
+
+/// Of the windows.
+const WINDOW_NS: u64 = 250_000_000;
+
+/// No step is forgiven more than this.
+const MOST_NS: u64 = 100_000_000;
+
+impl Longest {
+    pub(super) fn observe(&mut self, now_ns: u64, took_ns: u64) {
+        if now_ns.saturating_sub(self.since_ns) > WINDOW_NS {
+            (self.before_ns, self.now_ns, self.since_ns) = (self.now_ns, 0, now_ns);
+        }
+        self.now_ns = self.now_ns.max(took_ns.min(MOST_NS));
+    }
+
+    pub(super) fn ns(&self) -> u64 {
+        self.now_ns.max(self.before_ns)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::limits::Limits;
+    use crate::scene::{PAPER, Scene};
+
+    fn model(points: &str) -> std::sync::Arc<Model> {
+        let limits = Limits::default();
+        let scene = Scene::parse("paper", PAPER, &[format!("sheet.points={points}")], &limits).unwrap();
+        Model::compile(&scene, &limits).unwrap()
+    }
+
+    #[test]
+    fn a_session_is_guessed_by_what_others_take_and_only_the_awake_count() {
+        let small = Cost::guess(&model("[31, 31]"), std::iter::empty());
+        (0..1000).for_each(|_| small.observe(10_000));
+        assert_eq!(small.share(), 0.0);
+        small.set_awake(true);
+        assert!((small.share() - 0.01).abs() < 1e-4);
+        let large = Cost::guess(&model("[310, 310]"), std::iter::once(&small));
+        assert!((0.1..1.0).contains(&large.awake_share()), "{large:?}");
+        // One step in which the thread did not run says little.
+        small.observe(1_000_000_000);
+        assert!(small.awake_share() < 0.012);
+        small.set_awake(false);
+        assert_eq!(small.share(), 0.0);
+    }
+
+    #[test]
+    fn a_long_step_is_forgiven_for_a_while_and_within_reason() {
+        let mut longest = Longest::default();
+        longest.observe(1, 5_000_000);
+        longest.observe(2, 1000);
+        assert_eq!(longest.ns(), 5_000_000);
+        longest.observe(3, 10_000_000_000);
+        assert_eq!(longest.ns(), MOST_NS);
+        for window in 1..4 {
+            longest.observe(window * (WINDOW_NS + 1) + 3, 1000);
+        }
+        assert_eq!(longest.ns(), 1000);
+    }
+}

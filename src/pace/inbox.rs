@@ -1,0 +1,102 @@
+//! Where a stepping thread is asked for something, and waits until it is.
+
+use std::collections::VecDeque;
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::time::Duration;
+
+use tokio::sync::oneshot;
+
+use super::clock::now_ns;
+use super::frames::Viewer;
+use super::queue::lock;
+use super::tally::Tally;
+use super::taps::{HashReply, ProbeTap, SampleTap};
+use super::thread::Running;
+use crate::refusal::{Refusal, Result};
+
+/// What a stepping thread is asked for.
+pub(super) enum Request {
+    Adopt(Box<Running>),
+    Start {
+        until: Option<u64>,
+        reply: oneshot::Sender<Result<u64>>,
+    },
+    Pause {
+        reply: oneshot::Sender<Result<()>>,
+    },
+    /// Something came to a session at rest.
+    Wake,
+    Samples(SampleTap),
+    Probe(ProbeTap),
+    View(Arc<Viewer>),
+    Hash {
+        at: Option<u64>,
+        reply: HashReply,
+    },
+    Delete(Refusal),
+    /// A fault of the program, to see what comes of it.
+    #[cfg(test)]
+    Panic,
+}
+
+/// Where a stepping thread is asked.
+#[derive(Default)]
+pub(super) struct Inbox {
+    state: Mutex<InboxState>,
+    wake: Condvar,
+    /// Written by the thread that reads here.
+    pub(super) tally: Tally,
+}
+
+#[derive(Default)]
+struct InboxState {
+    requests: Vec<(u64, Request)>,
+    stop: Option<Refusal>,
+}
+
+impl Inbox {
+    pub(super) fn send(&self, session: u64, request: Request) {
+        let mut state = lock(&self.state);
+        if state.stop.is_none() {
+            state.requests.push((session, request));
+        }
+        drop(state);
+        self.wake.notify_one();
+    }
+
+    pub(super) fn stop(&self, why: Refusal) {
+        let mut state = lock(&self.state);
+        state.stop = Some(why);
+        state.requests.clear();
+        drop(state);
+        self.wake.notify_one();
+    }
+
+    /// Waits until `deadline_ns` or until something is asked, which is added to `requests`. Tells why to stop, if so.
+    pub(super) fn wait(
+        &self,
+        deadline_ns: Option<u64>,
+        mut now: u64,
+        requests: &mut VecDeque<(u64, Request)>,
+    ) -> Option<Refusal> {
+        let mut state = lock(&self.state);
+        loop {
+            requests.extend(state.requests.drain(..));
+            if !requests.is_empty() || state.stop.is_some() {
+                return state.stop.clone();
+            }
+            state = match deadline_ns {
+                None => self.wake.wait(state).unwrap_or_else(PoisonError::into_inner),
+                Some(deadline_ns) => {
+                    let rest_ns = deadline_ns.saturating_sub(now);
+                    if rest_ns == 0 {
+                        return None;
+                    }
+                    let waited = self.wake.wait_timeout(state, Duration::from_nanos(rest_ns));
+                    now = now_ns();
+                    waited.unwrap_or_else(PoisonError::into_inner).0
+                }
+            };
+        }
+    }
+}

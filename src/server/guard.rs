@@ -1,0 +1,118 @@
+//! The one layer that every call goes through: who calls, and whether they may.
+
+use std::sync::Arc;
+use std::task::{Context, Poll};
+
+use futures_util::future::{Either, Ready, ready};
+use http::{HeaderValue, Request, Response, header};
+use tonic::Status;
+use tonic::body::Body;
+use tower::{Layer, Service};
+use tracing::instrument::Instrumented;
+use tracing::{Instrument, info, info_span};
+
+use super::connections::Peer;
+use super::identity::{Access, Caller, Credentials, access};
+use super::metrics::Traffic;
+use super::reload::Reloaded;
+use crate::refusal::{Reason, Refusal, Result};
+
+/// Puts a [`Guard`] before a service.
+#[derive(Clone)]
+pub(super) struct GuardLayer {
+    pub(super) credentials: Arc<Reloaded<Credentials>>,
+    pub(super) traffic: Arc<Traffic>,
+    /// Nobody is asked who they are because nobody else can get here: then no page of another site may, either.
+    pub(super) local_only: bool,
+    /// Pages that may.
+    pub(super) origins: Arc<[HeaderValue]>,
+}
+
+impl<S> Layer<S> for GuardLayer {
+    type Service = Guard<S>;
+
+    fn layer(&self, inner: S) -> Guard<S> {
+        Guard { layer: self.clone(), inner }
+    }
+}
+
+/// Lets a call through whose caller has the role that it asks for.
+#[derive(Clone)]
+pub(super) struct Guard<S> {
+    layer: GuardLayer,
+    inner: S,
+}
+
+/// Calls of this server's own protocol.
+const OWN: &str = "/palpate.";
+
+impl GuardLayer {
+    fn admit<B>(&self, request: &Request<B>) -> Result<Caller> {
+        let path = request.uri().path();
+        let peer = request.extensions().get::<Peer>();
+        let caller = || self.credentials.get().caller(request.headers().get(header::AUTHORIZATION), peer);
+        let nobody = || Ok(Caller::nobody());
+        match access(path) {
+            Some(Access::Open) => nobody(),
+            Some(Access::Role(role)) => {
+                self.check_origin(request)?;
+                let caller = caller()?;
+                caller.needs(role)?;
+                self.traffic.called(path);
+                Ok(caller)
+            }
+            // Nobody is asked anything: then it is not known, rather than not allowed.
+            None if path.starts_with(OWN) && self.credentials.get().is_open() => nobody(),
+            None if path.starts_with(OWN) => {
+                let message = "is a call that nobody has been given a role for";
+                Err(Refusal::new(Reason::RoleMissing, "", format!("{} {message}", crate::pace::excerpt(path))))
+            }
+            // What is not a call to a session: a page, or nothing.
+            None => nobody(),
+        }
+    }
+
+    /// A site can give its own name the address of this machine; its pages then pass for pages of this server. They
+    /// can't pass for an address, or for `localhost`.
+    fn check_origin<B>(&self, request: &Request<B>) -> Result<()> {
+        let Some(origin) = request.headers().get(header::ORIGIN).filter(|_| self.local_only) else { return Ok(()) };
+        let uri = origin.to_str().ok().and_then(|origin| origin.parse::<http::Uri>().ok());
+        let host = uri.as_ref().and_then(http::Uri::host).unwrap_or_default();
+        let is_address = host.trim_matches(['[', ']']).parse::<std::net::IpAddr>().is_ok();
+        if is_address || host == "localhost" || self.origins.contains(origin) {
+            return Ok(());
+        }
+        let message = "is not this machine, nor one of `origins` in the configuration";
+        Err(Refusal::new(Reason::OriginNotAllowed, "origin", message))
+    }
+}
+
+impl<S> Service<Request<Body>> for Guard<S>
+where
+    S: Service<Request<Body>, Response = Response<Body>>,
+{
+    type Response = Response<Body>;
+    type Error = S::Error;
+    type Future = Either<Ready<std::result::Result<Response<Body>, S::Error>>, Instrumented<S::Future>>;
+
+    fn poll_ready(&mut self, cx: &mut Context<'_>) -> Poll<std::result::Result<(), S::Error>> {
+        self.inner.poll_ready(cx)
+    }
+
+    fn call(&mut self, request: Request<Body>) -> Self::Future {
+        match self.layer.admit(&request) {
+            Ok(caller) => {
+                // In every line of the log that the call writes.
+                let span = info_span!("call", path = request.uri().path(), client = &*caller.name);
+                Either::Right(self.inner.call(request).instrument(span))
+            }
+            Err(refusal) => {
+                let address = request.extensions().get::<Peer>().map(|peer| peer.address);
+                let reason = refusal.reason.as_str();
+                info!(path = request.uri().path(), client = ?address, reason, "call refused: {refusal}");
+                self.layer.traffic.refused(refusal.reason);
+                Either::Left(ready(Ok(Status::from(refusal).into_http())))
+            }
+        }
+    }
+}

@@ -1,0 +1,219 @@
+//! What Prometheus is told: counts of the stepping threads, the sessions as they stand, and what goes over the network.
+//! Nothing here names a session: who knows an id may go there.
+
+use std::fmt;
+use std::net::SocketAddr;
+use std::sync::{Arc, Mutex};
+
+use axum::Router;
+use axum::http::header;
+use axum::routing::get;
+use prometheus_client::collector::Collector;
+use prometheus_client::encoding::{DescriptorEncoder, EncodeMetric, MetricEncoder, NoLabelSet, text};
+use prometheus_client::metrics::MetricType;
+use prometheus_client::metrics::counter::{ConstCounter, Counter};
+use prometheus_client::metrics::family::Family;
+use prometheus_client::metrics::gauge::{ConstGauge, Gauge};
+use prometheus_client::registry::{Registry, Unit};
+use tokio::net::TcpListener;
+use tokio_util::sync::CancellationToken;
+use tracing::info;
+
+use super::identity::CALLS;
+use crate::pace::queue::lock;
+use crate::pace::tally::{Count, Tally, Times};
+use crate::pace::{Pacer, State};
+use crate::refusal::Reason;
+
+/// One label.
+type Label = [(&'static str, &'static str); 1];
+
+/// What goes over the network.
+#[derive(Debug, Default)]
+pub(crate) struct Traffic {
+    connections: Gauge,
+    connected: Counter,
+    handshakes_failed: Counter,
+    pub(super) bytes_in: Counter,
+    pub(super) bytes_out: Counter,
+    calls: Family<Label, Counter>,
+    commands: Counter,
+    refusals: Family<Label, Counter>,
+}
+
+/// Counts a connection until it is dropped.
+pub(super) struct Open(Gauge);
+
+impl Drop for Open {
+    fn drop(&mut self) {
+        self.0.dec();
+    }
+}
+
+impl Traffic {
+    /// A connection is open for as long as what this returns.
+    pub(super) fn open(&self) -> Open {
+        self.connected.inc();
+        self.connections.inc();
+        Open(self.connections.clone())
+    }
+
+    pub(super) fn handshake_failed(&self, client: SocketAddr, error: &str) {
+        info!(%client, error, "TLS handshake failed");
+        self.handshakes_failed.inc();
+    }
+
+    /// A call was let through.
+    pub(super) fn called(&self, path: &str) {
+        if let Some((path, _)) = CALLS.iter().find(|call| call.0 == path) {
+            self.calls.get_or_create(&[("call", path)]).inc();
+        }
+    }
+
+    /// Commands were taken.
+    pub(super) fn commanded(&self, commands: usize) {
+        self.commands.inc_by(commands as u64);
+    }
+
+    /// A call or a command was refused.
+    pub(super) fn refused(&self, reason: Reason) {
+        self.refusals.get_or_create(&[("reason", reason.as_str())]).inc();
+    }
+}
+
+/// Everything, as it is when it is asked for.
+pub(super) fn registry(pacer: &Arc<Pacer>, traffic: &Traffic) -> Registry {
+    let mut registry = Registry::with_prefix("palpate");
+    let connections = "Connections that are open";
+    registry.register("connections", connections, traffic.connections.clone());
+    registry.register("connected", "Connections so far", traffic.connected.clone());
+    let failed = "Connections that were cut off before they were secure";
+    registry.register("tls_handshakes_failed", failed, traffic.handshakes_failed.clone());
+    let (bytes_in, bytes_out) = (traffic.bytes_in.clone(), traffic.bytes_out.clone());
+    registry.register_with_unit("received", "What clients sent, before encryption", Unit::Bytes, bytes_in);
+    registry.register_with_unit("sent", "What clients were sent, before encryption", Unit::Bytes, bytes_out);
+    registry.register("calls", "Calls that were let through", traffic.calls.clone());
+    registry.register("commands", "Commands to tools that were taken", traffic.commands.clone());
+    let refusals = "Calls and commands that were refused, by reason";
+    registry.register("refusals", refusals, traffic.refusals.clone());
+    registry.register_collector(Box::new(Stepping(pacer.clone())));
+    registry
+}
+
+/// The stepping threads and the sessions.
+struct Stepping(Arc<Pacer>);
+
+impl fmt::Debug for Stepping {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Stepping")
+    }
+}
+
+/// Times of all stepping threads as one histogram.
+struct Histogram {
+    sum_s: f64,
+    /// Bound, s, and times within it and above the last.
+    buckets: Vec<(f64, u64)>,
+}
+
+impl Histogram {
+    fn of<'t>(mut times: impl Iterator<Item = &'t Times>) -> Self {
+        let first = times.next().map_or_else(|| (0.0, Vec::new()), |times| (times.sum_s(), times.buckets()));
+        let (sum_s, buckets) = times.fold(first, |(sum_s, mut buckets), times| {
+            buckets.iter_mut().zip(times.buckets()).for_each(|(sum, more)| sum.1 += more.1);
+            (sum_s + times.sum_s(), buckets)
+        });
+        Histogram { sum_s, buckets }
+    }
+}
+
+impl EncodeMetric for Histogram {
+    fn encode(&self, mut encoder: MetricEncoder<'_>) -> fmt::Result {
+        let count = self.buckets.iter().map(|bucket| bucket.1).sum();
+        encoder.encode_histogram::<NoLabelSet>(self.sum_s, count, &self.buckets, None)
+    }
+
+    fn metric_type(&self) -> MetricType {
+        MetricType::Histogram
+    }
+}
+
+/// Counts of the stepping threads: name, what it is, and where.
+type Counts = [(&'static str, &'static str, fn(&Tally) -> &Count); 9];
+
+const COUNTS: Counts = [
+    ("rested_steps", "Steps that were passed over at rest", |tally| &tally.rested_steps),
+    ("overruns", "Steps that were due and dropped", |tally| &tally.overruns),
+    ("late_commands", "Commands that came too late for their step", |tally| &tally.late_commands),
+    ("lapsed_leases", "Leases of tools that ran out", |tally| &tally.lapsed_leases),
+    ("guard_events", "How often the guard went back to a checkpoint", |tally| &tally.guard_events),
+    ("held_sessions", "Sessions that the guard has ended", |tally| &tally.held_sessions),
+    ("limited_steps", "Steps in which a tool was held to the speed limit", |tally| &tally.limited_steps),
+    ("dropped_poses", "Poses that were not newer, or passed over as a backlog", |tally| &tally.dropped_poses),
+    ("stale_releases", "Tools let go because nothing came any more", |tally| &tally.stale_releases),
+];
+
+impl Collector for Stepping {
+    #[allow(clippy::cast_precision_loss, clippy::cast_possible_wrap)]
+    fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> fmt::Result {
+        let pacer = &self.0;
+        let mut tell = |name: &str, help: &str, unit: Option<&Unit>, metric: &dyn EncodeMetric| {
+            metric.encode(encoder.encode_descriptor(name, help, unit, metric.metric_type())?)
+        };
+        let step_time = Histogram::of(pacer.tallies().map(|tally| &tally.step_time));
+        tell("step_time", "What a step took, with all that it told", Some(&Unit::Seconds), &step_time)?;
+        let lateness = Histogram::of(pacer.tallies().map(|tally| &tally.lateness));
+        tell("step_lateness", "How long after it was due a step began", Some(&Unit::Seconds), &lateness)?;
+        for (name, help, count) in COUNTS {
+            let sum: u64 = pacer.tallies().map(|tally| count(tally).get()).sum();
+            tell(name, help, None, &ConstCounter::new(sum))?;
+        }
+
+        let sessions = pacer.list();
+        let statuses: Vec<_> = sessions.iter().map(|live| live.status()).collect();
+        let mut states = encoder.encode_descriptor("sessions", "Sessions, by state", None, MetricType::Gauge)?;
+        for (name, is) in [
+            (
+                "running",
+                (|status| status.state == State::Running && !status.resting) as fn(&crate::pace::Status) -> bool,
+            ),
+            ("resting", |status| status.state == State::Running && status.resting),
+            ("paused", |status| status.state == State::Paused),
+            ("held", |status| status.state == State::Held),
+        ] {
+            let count = statuses.iter().filter(|status| is(status)).count();
+            states.encode_family(&[("state", name)])?.encode_gauge(&(count as i64))?;
+        }
+        let mut gauge = |name: &str, help: &str, value: f64| {
+            let gauge = ConstGauge::new(value);
+            gauge.encode(encoder.encode_descriptor(name, help, None, MetricType::Gauge)?)
+        };
+        let points: usize = sessions.iter().map(|live| live.model.len()).sum();
+        let awake: usize = statuses.iter().map(|status| status.awake_points).sum();
+        let streams: usize = sessions.iter().map(|live| live.streams()).sum();
+        gauge("points", "Mass points of all sessions", points as f64)?;
+        gauge("awake_points", "Mass points that the last steps of all sessions computed", awake as f64)?;
+        gauge("streams", "Streams that read a session", streams as f64)?;
+        gauge("viewers", "Streams of frames", pacer.viewers() as f64)?;
+        let running = statuses.iter().filter(|status| status.state == State::Running);
+        let slowest = running.map(|status| status.dilation.value).fold(1.0, f64::min);
+        gauge("time_dilation_min", "Simulated over real time of the session that is furthest behind", slowest)
+    }
+}
+
+/// Serves the metrics on `listener` until `shutdown` is cancelled.
+pub(super) async fn serve(listener: TcpListener, registry: Registry, shutdown: CancellationToken) {
+    // One at a time: what is asked for more often than it can be told is no use to anybody.
+    let registry = Arc::new(Mutex::new(registry));
+    let told = move || {
+        let registry = registry.clone();
+        async move {
+            let mut body = String::new();
+            let encoded = text::encode(&mut body, &lock(&registry));
+            let kind = [(header::CONTENT_TYPE, "application/openmetrics-text; version=1.0.0; charset=utf-8")];
+            encoded.map(|()| (kind, body)).map_err(|_| axum::http::StatusCode::INTERNAL_SERVER_ERROR)
+        }
+    };
+    let router = Router::new().route("/metrics", get(told));
+    let _ = axum::serve(listener, router).with_graceful_shutdown(shutdown.cancelled_owned()).await;
+}

@@ -1,0 +1,75 @@
+//! What stands between a server and the network: TLS, and whom it knows. A server that others can reach does not start
+//! without.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+
+use tokio_rustls::rustls::ServerConfig;
+
+use super::config::Config;
+use super::identity::Credentials;
+use super::reload::{Reloaded, of_file, warn_if_readable};
+use super::tls;
+use crate::refusal::{Reason, Refusal, Result};
+
+/// Of one server.
+pub(super) struct Protection {
+    pub(super) tls: Option<Arc<Reloaded<ServerConfig>>>,
+    pub(super) credentials: Arc<Reloaded<Credentials>>,
+}
+
+impl Protection {
+    /// Reads the files that the configuration names. Refuses to have none at an address that others can reach.
+    pub(super) fn load(config: &Config, address: SocketAddr) -> Result<Self> {
+        config.check()?;
+        let tls = match (&config.tls_cert, &config.tls_key) {
+            (Some(cert), Some(key)) => Some(Arc::new(tls::load(cert, key, config.tls_client_ca.as_deref())?)),
+            _ => None,
+        };
+        let certified = config.tls_client_ca.is_some();
+        let known = certified || config.tokens.is_some();
+        if !(config.insecure || address.ip().is_loopback() || (tls.is_some() && known)) {
+            let message = format!(
+                "{address} can be reached from other machines, and {}. Either protect it, with --tls-cert FILE and \
+                 --tls-key FILE, and --tokens FILE or --tls-client-ca FILE (`palpate serve --help` tells how), or say \
+                 --insecure to serve whoever can reach it, and let everybody on the way read along",
+                match (tls.is_some(), known) {
+                    (false, false) => "has neither TLS nor tokens",
+                    (false, true) => "has no TLS: tokens would be sent in the clear",
+                    _ => "everybody would be let in",
+                }
+            );
+            return Err(Refusal::new(Reason::OutOfRange, "listen", message));
+        }
+        let paths = config.tokens.iter().cloned().collect();
+        let tokens = config.tokens.clone();
+        if let Some(path) = &tokens {
+            warn_if_readable(path, "the hashes of tokens");
+        }
+        let credentials = Reloaded::load("tokens", paths, move |texts| match (&tokens, texts) {
+            (Some(path), [text]) => Credentials::parse(path, text).map_err(|refusal| match refusal.place {
+                Some(_) => refusal,
+                None => of_file(path)(refusal),
+            }),
+            _ if certified => Ok(Credentials::certified()),
+            _ => Ok(Credentials::open()),
+        })?;
+        Ok(Protection { tls, credentials: Arc::new(credentials) })
+    }
+
+    /// How URLs of the server begin.
+    pub(super) fn scheme(&self) -> &'static str {
+        if self.tls.is_some() { "https" } else { "http" }
+    }
+
+    /// Looks for new files, for ever.
+    pub(super) async fn watch(&self) {
+        let tls = async {
+            match &self.tls {
+                Some(tls) => tls.watch().await,
+                None => std::future::pending().await,
+            }
+        };
+        tokio::join!(tls, self.credentials.watch());
+    }
+}

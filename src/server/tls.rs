@@ -1,0 +1,67 @@
+//! TLS and mutual TLS: the certificate that the server shows, and whose certificates it takes.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use tokio_rustls::rustls::crypto::ring;
+use tokio_rustls::rustls::pki_types::pem::PemObject;
+use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use tokio_rustls::rustls::server::WebPkiClientVerifier;
+use tokio_rustls::rustls::{RootCertStore, ServerConfig};
+
+use super::reload::{Reloaded, of_file, warn_if_readable};
+use crate::refusal::{Reason, Refusal, Result};
+
+/// Of the files `cert`, `key` and, if clients must show one, the certificates that sign theirs.
+pub(super) fn load(cert: &Path, key: &Path, client_ca: Option<&Path>) -> Result<Reloaded<ServerConfig>> {
+    warn_if_readable(key, "the private key");
+    let mut paths = vec![cert.to_owned(), key.to_owned()];
+    paths.extend(client_ca.map(Path::to_owned));
+    let named = paths.clone();
+    Reloaded::load("TLS", paths, move |texts| configure(&named, texts))
+}
+
+fn configure(paths: &[PathBuf], texts: &[String]) -> Result<ServerConfig> {
+    let unreadable = |what: &str| Refusal::new(Reason::Unreadable, "", what.to_owned());
+    let chain = certificates(&paths[0], &texts[0])?;
+    // An error of a key says nothing of the key.
+    let key = PrivateKeyDer::from_pem_slice(texts[1].as_bytes())
+        .map_err(|_| of_file(&paths[1])(unreadable("is no private key in PEM")))?;
+    let provider = Arc::new(ring::default_provider());
+    let builder = ServerConfig::builder_with_provider(provider.clone())
+        .with_safe_default_protocol_versions()
+        .map_err(|e| unreadable(&e.to_string()))?;
+    let builder = match (paths.get(2), texts.get(2)) {
+        (Some(path), Some(text)) => {
+            let refuse = |why: String| of_file(path)(unreadable(&why));
+            let mut roots = RootCertStore::empty();
+            for certificate in certificates(path, text)? {
+                roots.add(certificate).map_err(|e| refuse(e.to_string()))?;
+            }
+            let verifier = WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider).build();
+            builder.with_client_cert_verifier(verifier.map_err(|e| refuse(e.to_string()))?)
+        }
+        _ => builder.with_no_client_auth(),
+    };
+    let mut config = builder.with_single_cert(chain, key).map_err(|e| {
+        let both = format!("with the key of {}: {e}", paths[1].display());
+        of_file(&paths[0])(unreadable(&both))
+    })?;
+    config.alpn_protocols = vec![b"h2".to_vec(), b"http/1.1".to_vec()];
+    Ok(config)
+}
+
+fn certificates(path: &Path, text: &str) -> Result<Vec<CertificateDer<'static>>> {
+    let read: std::result::Result<Vec<_>, _> = CertificateDer::pem_slice_iter(text.as_bytes()).collect();
+    let refuse = |why: String| of_file(path)(Refusal::new(Reason::Unreadable, "", why));
+    let certificates = read.map_err(|e| refuse(format!("is no certificate in PEM: {e}")))?;
+    if certificates.is_empty() { Err(refuse("has no certificate in PEM".into())) } else { Ok(certificates) }
+}
+
+/// The names that a client's certificate gives it: DNS names and URIs of its `subjectAltName`. The chain has been checked.
+pub(super) fn names(chain: &[CertificateDer<'_>]) -> Vec<String> {
+    let Some(certificate) = chain.first().and_then(|first| webpki::EndEntityCert::try_from(first).ok()) else {
+        return Vec::new();
+    };
+    certificate.valid_dns_names().chain(certificate.valid_uri_names()).map(str::to_owned).collect()
+}

@@ -1,0 +1,360 @@
+//! Nobody suffers from another: slow, silent, flooding and greedy clients, and sessions that are too heavy.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
+
+#[path = "common/server.rs"]
+mod server;
+
+use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::time::Duration;
+
+use palpate::wire::pb;
+use pb::create_session_request::Source;
+use pb::haptic_service_client::HapticServiceClient;
+use pb::touch_response::Message as Heard;
+use server::{PATIENCE, Server, Touch, force, told};
+use tonic::Code;
+
+/// A server with these keys of `[limits]`.
+fn limited(limits: &str, arguments: &[&str]) -> Server {
+    let folder = tempfile::tempdir().unwrap();
+    let config = folder.path().join("palpate.toml");
+    std::fs::write(&config, format!("[limits]\n{limits}\n")).unwrap();
+    Server::start(&[&["--config", config.to_str().unwrap()], arguments].concat())
+}
+
+/// A server as a shell starts it: $0 is the program, $1 where it is to listen.
+#[cfg(unix)]
+fn serve(command: &str, address: &str) -> Server {
+    let child = std::process::Command::new("sh")
+        .args(["-c", &format!("{command} \"$1\""), env!("CARGO_BIN_EXE_palpate"), address])
+        .stdout(std::process::Stdio::piped())
+        .stderr(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    Server::of(child)
+}
+
+fn connect(server: &Server) -> TcpStream {
+    let socket = TcpStream::connect(server.url.strip_prefix("http://").unwrap()).unwrap();
+    socket.set_read_timeout(Some(PATIENCE)).unwrap();
+    socket
+}
+
+/// The server has closed it.
+fn is_closed(mut socket: TcpStream) -> bool {
+    let mut buffer = [0; 1024];
+    loop {
+        match socket.read(&mut buffer) {
+            Ok(0) => return true,
+            Ok(_) => {}
+            Err(error) => return error.kind() == std::io::ErrorKind::ConnectionReset,
+        }
+    }
+}
+
+/// So many commands are taken and act, each of them.
+async fn all_act(server: &Server, session: &str, count: u64) {
+    let mut touch = Touch::hold(server, session).await;
+    for sequence in 1..=count {
+        touch.command(force(0, sequence, -1.0 - 0.001 * sequence as f64)).await;
+        touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == sequence).await;
+    }
+    let commands = server.status(session).await.commands.unwrap();
+    assert_eq!((commands.accepted, commands.applied, commands.refused), (count, count, 0));
+}
+
+fn handles(server: &Server) -> usize {
+    std::fs::read_dir(format!("/proc/{}/fd", server.child.id())).map_or(0, Iterator::count)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_thousand_connections_that_say_nothing_disturb_nobody_and_are_closed() {
+    let server = limited("handshake_s = 2.0", &["--log", "error"]);
+    let session = server.paper(false).await;
+    let before = handles(&server);
+    let mut silent: Vec<TcpStream> = (0..1000).map(|_| connect(&server)).collect();
+    // Some say half of what they should.
+    for socket in silent.iter_mut().step_by(3) {
+        socket.write_all(b"PRI * HTTP/2").unwrap();
+    }
+    all_act(&server, &session, 50).await;
+    tokio::task::spawn_blocking(move || assert!(silent.into_iter().all(is_closed))).await.unwrap();
+    // Only what the test itself has open still.
+    let waited = tokio::time::timeout(PATIENCE, async {
+        while handles(&server) > before + 8 {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    });
+    waited.await.expect("the server keeps what it has closed");
+}
+
+#[tokio::test]
+async fn connections_above_the_limit_are_closed_and_let_in_later() {
+    let server = limited("connections = 4\nhandshake_s = 600.0", &["--log", "error"]);
+    let held: Vec<TcpStream> = (0..4).map(|_| connect(&server)).collect();
+    let fifth = connect(&server);
+    assert!(tokio::task::spawn_blocking(move || is_closed(fifth)).await.unwrap());
+    drop(held);
+    let waited = tokio::time::timeout(PATIENCE, async {
+        loop {
+            let endpoint = tonic::transport::Channel::from_shared(server.url.clone()).unwrap();
+            if let Ok(channel) = endpoint.connect().await {
+                let mut sessions = pb::session_service_client::SessionServiceClient::new(channel);
+                if sessions.list_scenes(pb::ListScenesRequest {}).await.is_ok() {
+                    break;
+                }
+            }
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    });
+    waited.await.expect("nobody is let in any more");
+}
+
+#[cfg(unix)]
+#[tokio::test]
+async fn a_server_without_file_descriptors_waits_for_some() {
+    let server = serve("ulimit -n 64 && exec \"$0\" serve --log error --listen", "127.0.0.1:0");
+    let session = server.paper(false).await;
+    let mut touch = Touch::hold(&server, &session).await;
+    let held: Vec<TcpStream> = (0..100).map(|_| connect(&server)).collect();
+    // Who is there already is served on.
+    for sequence in 1..=50 {
+        touch.command(force(0, sequence, -1.0)).await;
+        touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == sequence).await;
+    }
+    drop(held);
+    assert_eq!(tokio::time::timeout(PATIENCE, server.status(&session)).await.unwrap().commands.unwrap().applied, 50);
+}
+
+#[tokio::test]
+async fn a_stream_that_never_opens_is_ended() {
+    let server = limited("open_s = 0.2", &[]);
+    let silent = tokio_stream::pending::<pb::TouchRequest>();
+    let mut inbound = server.haptics().await.touch(silent).await.unwrap().into_inner();
+    let ended = tokio::time::timeout(PATIENCE, inbound.message()).await.unwrap().unwrap_err();
+    assert_eq!(told(&ended), (Code::DeadlineExceeded, "TIMED_OUT".into(), "open".into()));
+}
+
+#[tokio::test]
+async fn a_message_that_is_too_large_is_refused_and_the_connection_goes_on() {
+    let server = limited("message_bytes = 10000", &[]);
+    let session = server.paper(true).await;
+    let mut haptics = HapticServiceClient::new(server.channel().await);
+    let points = (0..10_000).map(|_| pb::GridPoint { x: 1, y: 1 }).collect();
+    let probe = |points| pb::ProbeRequest {
+        session_id: session.clone(),
+        r#where: Some(pb::probe_request::Where::Points(pb::GridPoints { points })),
+        ..Default::default()
+    };
+    let refused = haptics.probe(probe(points)).await.unwrap_err();
+    assert_eq!(refused.code(), Code::OutOfRange, "{refused:?}");
+    haptics.probe(probe(vec![pb::GridPoint { x: 1, y: 1 }])).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_flood_is_refused_with_a_reason_accounted_for_and_no_harm_to_others() {
+    let server = limited("queued_commands_per_tool = 500", &["--log", "error"]);
+    let (flooded, other) = (server.paper(false).await, server.paper(false).await);
+    let flood = Touch::hold(&server, &flooded).await;
+    let flooding = tokio::spawn(async move {
+        let mut flood = flood;
+        let (mut sent, mut rejected) = (0, 0);
+        // Far more than a hundred times what a session steps, until that is the end of the stream.
+        loop {
+            for _ in 0..1000 {
+                if !flood.try_command(force(0, sent + 1, -1.0)).await {
+                    break;
+                }
+                sent += 1;
+            }
+            while let Ok(heard) = tokio::time::timeout(Duration::ZERO, flood.hear()).await {
+                match heard {
+                    Ok(Some(Heard::Rejection(rejection))) => {
+                        let known = ["RATE_LIMITED", "QUEUE_FULL"].contains(&rejection.reason.as_str());
+                        assert!(known, "{rejection:?}");
+                        rejected += u64::from(rejection.reason == "RATE_LIMITED");
+                    }
+                    Ok(_) => {}
+                    Err(status) => return (told(&status), sent, rejected),
+                }
+            }
+        }
+    });
+    all_act(&server, &other, 200).await;
+    let (ended, sent, rejected) = tokio::time::timeout(PATIENCE, flooding).await.unwrap().unwrap();
+    assert_eq!((ended.0, ended.1.as_str()), (Code::ResourceExhausted, "RATE_LIMITED"));
+    assert!(rejected > 0);
+    let status = server.status(&flooded).await;
+    assert!(status.held_tools.is_empty(), "{status:?}");
+    let commands = status.commands.unwrap();
+    assert!(commands.refused > 0 && commands.waiting <= 500, "{commands:?}");
+    assert!(commands.accepted + commands.refused <= sent, "{commands:?} of {sent}");
+    assert_eq!(
+        commands.accepted,
+        commands.applied + commands.superseded + commands.dropped + commands.waiting,
+        "{commands:?}"
+    );
+}
+
+#[tokio::test]
+async fn sessions_made_without_end_are_refused_to_who_makes_them_alone() {
+    let server = limited("sessions_per_minute = 5.0", &[]);
+    let mut greedy = server.sessions().await;
+    let source = || Some(Source::SceneName("paper".into()));
+    let request = || pb::CreateSessionRequest { source: source(), ..Default::default() };
+    let mut made = 0;
+    let refused = loop {
+        match greedy.create_session(request()).await {
+            Ok(created) => {
+                let session_id = created.into_inner().session.unwrap().session_id;
+                greedy.delete_session(pb::DeleteSessionRequest { session_id }).await.unwrap();
+                made += 1;
+            }
+            Err(status) => break status,
+        }
+        assert!(made < 1000, "no end");
+    };
+    assert!(made >= 5);
+    assert_eq!(told(&refused), (Code::ResourceExhausted, "RATE_LIMITED".into(), String::new()));
+    // Over a connection of its own.
+    server.paper(false).await;
+}
+
+#[tokio::test]
+async fn who_does_not_read_loses_samples_and_delays_nobody() {
+    let server = limited("queued_samples = 8", &["--log", "error"]);
+    let session = server.paper(false).await;
+    // What its transport takes in unread is little.
+    let endpoint = tonic::transport::Channel::from_shared(server.url.clone()).unwrap();
+    let channel = endpoint.initial_stream_window_size(16_384).connect().await.unwrap();
+    let request = pb::WatchSamplesRequest { session_id: session.clone(), ..Default::default() };
+    let mut stalled = HapticServiceClient::new(channel).watch_samples(request).await.unwrap().into_inner();
+    all_act(&server, &session, 1000).await;
+    let mut last = 0;
+    loop {
+        let sample = tokio::time::timeout(PATIENCE, stalled.message()).await.unwrap().unwrap().unwrap().sample.unwrap();
+        assert!(sample.step > last);
+        last = sample.step;
+        if sample.dropped_samples > 0 {
+            break;
+        }
+    }
+}
+
+/// What no machine does so often on one core, while all of it moves.
+fn heavy() -> Source {
+    let limits = palpate::limits::Limits::default();
+    let paper = palpate::scene::Scene::parse("paper", palpate::scene::PAPER, &[], &limits).unwrap();
+    let mut scene = palpate::wire::scene::scene(&paper);
+    let sheet = scene.sheet.as_mut().unwrap();
+    (sheet.points_x, sheet.points_y) = (Some(800), Some(500));
+    scene.stepping.as_mut().unwrap().rate_hz = Some(10_000.0);
+    Source::Scene(scene)
+}
+
+/// The same force everywhere: all of a tissue moves.
+fn everywhere(sequence: u64) -> pb::Command {
+    let mut command = force(0, sequence, -1.0);
+    let Some(pb::command::Action::Force(force)) = &mut command.action else { unreachable!() };
+    force.falloff_per_m = 0.0;
+    command
+}
+
+#[tokio::test]
+async fn a_heavy_session_slows_itself_and_lets_no_further_one_in() {
+    let server = Server::start(&["--threads", "1"]);
+    let heavy = server.create(heavy(), false).await.unwrap().session_id;
+    // At rest it takes nothing: others are let in.
+    let light = server.paper(false).await;
+    let (slow, mut quick) = (Touch::hold(&server, &heavy).await, Touch::hold(&server, &light).await);
+    slow.command(everywhere(1)).await;
+    for sequence in 1..=500 {
+        quick.command(force(0, sequence, -1.0 - 0.001 * sequence as f64)).await;
+        quick.sample_with(|sample| sample.tools[0].acknowledged_sequence == sequence).await;
+    }
+    let (heavy_now, light_now) = (server.status(&heavy).await, server.status(&light).await);
+    let kept = |session: &pb::Session| session.step as f64 / (session.step + session.overrun_count) as f64;
+    assert!(kept(&heavy_now) < 0.5, "{heavy_now:?}");
+    assert!(kept(&light_now) > 1.5 * kept(&heavy_now), "{light_now:?} {heavy_now:?}");
+    // The thread is full, and says so; a session that stands takes nothing until it is started.
+    let refused = server.create(Source::SceneName("paper".into()), false).await.unwrap_err();
+    assert_eq!(told(&refused), (Code::ResourceExhausted, "OVERLOADED".into(), String::new()));
+    let standing = server.paper(true).await;
+    let start = || pb::StartSessionRequest { session_id: standing.clone(), until_step: None };
+    let refused = server.sessions().await.start_session(start()).await.unwrap_err();
+    assert_eq!(told(&refused).1, "OVERLOADED");
+    server.sessions().await.delete_session(pb::DeleteSessionRequest { session_id: heavy }).await.unwrap();
+    server.paper(false).await;
+    server.sessions().await.start_session(start()).await.unwrap();
+}
+
+#[cfg(unix)]
+#[tokio::test(flavor = "multi_thread")]
+async fn a_bridge_comes_back_to_a_server_that_was_killed() {
+    let mut server = Server::start(&[]);
+    let address = server.url.strip_prefix("http://").unwrap().to_owned();
+    let mut bridge = std::process::Command::new(server::client_program())
+        .args(["bridge", "--server", &server.url, "--scene", "liver"])
+        .stdout(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    let wait_for_hand = async |server: &Server| {
+        let waited = tokio::time::timeout(PATIENCE, async {
+            loop {
+                let sessions = server.sessions().await.list_sessions(pb::ListSessionsRequest {}).await.unwrap();
+                if sessions.into_inner().sessions.iter().any(|one| one.commands.unwrap().applied > 100) {
+                    break;
+                }
+                tokio::time::sleep(Duration::from_millis(20)).await;
+            }
+        });
+        waited.await.expect("no bridge comes");
+    };
+    wait_for_hand(&server).await;
+    server.child.kill().unwrap();
+    server.child.wait().unwrap();
+    let again = serve("exec \"$0\" serve --log error --listen", &address);
+    wait_for_hand(&again).await;
+    bridge.kill().unwrap();
+    bridge.wait().unwrap();
+    // Its tools are let go, whatever it did.
+    let waited = tokio::time::timeout(PATIENCE, async {
+        loop {
+            let sessions = again.sessions().await.list_sessions(pb::ListSessionsRequest {}).await.unwrap();
+            if sessions.into_inner().sessions.iter().all(|session| session.held_tools.is_empty()) {
+                break;
+            }
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    });
+    waited.await.expect("a tool is held by nobody");
+}
+
+#[cfg(unix)]
+#[tokio::test]
+async fn a_second_signal_ends_the_server_at_once() {
+    let mut server = Server::start(&["--shutdown-deadline-s", "3600"]);
+    let session = server.paper(true).await;
+    // Nothing of it is read: it would not end before the deadline.
+    let request = pb::WatchFramesRequest {
+        session_id: session,
+        refinement: 10,
+        rate_hz: Some(1000.0),
+        always_full: true,
+        ..Default::default()
+    };
+    let _stalled = server.views().await.watch_frames(request).await.unwrap();
+    let id = server.child.id().to_string();
+    let signal = || assert!(std::process::Command::new("kill").arg(&id).status().unwrap().success());
+    let ended = tokio::time::timeout(PATIENCE, async {
+        loop {
+            signal();
+            tokio::time::sleep(Duration::from_millis(100)).await;
+            if let Some(status) = server.child.try_wait().unwrap() {
+                return status;
+            }
+        }
+    });
+    assert_eq!(ended.await.unwrap().code(), Some(130));
+}

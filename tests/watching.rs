@@ -1,0 +1,186 @@
+//! What those see who look after a server: metrics, `palpate top`, and the files that come with it.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
+
+#[path = "common/server.rs"]
+mod server;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::{BufRead, BufReader, Read, Write};
+use std::process::{Command, Output, Stdio};
+
+use palpate::wire::pb;
+use serde_json::Value;
+use server::{PATIENCE, Server, Touch, client_program, force};
+
+/// Metrics as they are served: each line's name and labels, and its value.
+fn scrape(url: &str) -> BTreeMap<String, f64> {
+    let (host, path) = url.trim_start_matches("http://").split_once('/').unwrap();
+    let mut stream = std::net::TcpStream::connect(host).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    write!(stream, "GET /{path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n").unwrap();
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).unwrap();
+    let (head, body) = answer.split_once("\r\n\r\n").unwrap();
+    assert!(head.starts_with("HTTP/1.1 200") && head.contains("application/openmetrics-text"), "{head}");
+    assert!(body.ends_with("# EOF\n"), "{body}");
+    let told = body.lines().filter(|line| !line.starts_with('#')).map(|line| {
+        let (name, value) = line.rsplit_once(' ').unwrap();
+        (name.to_owned(), value.parse().unwrap_or_else(|_| panic!("{line}")))
+    });
+    told.collect()
+}
+
+fn metrics_url(server: &mut Server) -> String {
+    let mut line = String::new();
+    server.out.read_line(&mut line).unwrap();
+    line.split_whitespace().last().unwrap().to_owned()
+}
+
+#[tokio::test]
+async fn metrics_tell_what_was_done_and_name_no_session() {
+    let mut server = Server::start(&["--metrics", "127.0.0.1:0"]);
+    let url = metrics_url(&mut server);
+    let (running, paused) = (server.paper(false).await, server.paper(true).await);
+    let mut touch = Touch::hold(&server, &running).await;
+    for sequence in 1..=3 {
+        touch.command(force(0, sequence, -1.0)).await;
+    }
+    touch.command(force(0, 3, -1.0)).await;
+    assert_eq!(touch.rejection().await.reason, "STALE_SEQUENCE");
+    touch.sample_with(|sample| sample.awake_points > 0 && sample.step > 10).await;
+    let told = scrape(&url);
+    let value = |name: &str| *told.get(name).unwrap_or_else(|| panic!("{name} is not in {told:?}"));
+    assert_eq!(value("palpate_commands_total"), 3.0);
+    assert_eq!(value("palpate_refusals_total{reason=\"STALE_SEQUENCE\"}"), 1.0);
+    assert_eq!(value("palpate_calls_total{call=\"/palpate.v1.HapticService/Touch\"}"), 1.0);
+    assert_eq!(value("palpate_calls_total{call=\"/palpate.v1.SessionService/CreateSession\"}"), 2.0);
+    assert_eq!((value("palpate_sessions{state=\"running\"}"), value("palpate_sessions{state=\"paused\"}")), (1.0, 1.0));
+    assert_eq!((value("palpate_points"), value("palpate_streams"), value("palpate_viewers")), (1922.0, 1.0, 0.0));
+    assert!(value("palpate_awake_points") > 0.0 && value("palpate_connections") >= 1.0);
+    assert!(value("palpate_sent_bytes_total") > 100.0 && value("palpate_received_bytes_total") > 100.0);
+    for histogram in ["step_time", "step_lateness"] {
+        let name = format!("palpate_{histogram}_seconds");
+        let (count, all) = (value(&format!("{name}_count")), value(&format!("{name}_bucket{{le=\"+Inf\"}}")));
+        assert!(count > 10.0 && count == all && value(&format!("{name}_sum")) > 0.0);
+    }
+    assert!(!told.keys().any(|name| name.contains(&running) || name.contains(&paused)));
+    // A count does not fall when what it counted is gone.
+    touch.finish();
+    for session_id in [running, paused] {
+        server.sessions().await.delete_session(pb::DeleteSessionRequest { session_id }).await.unwrap();
+    }
+    let later = scrape(&url);
+    for (name, value) in told.iter().filter(|told| told.0.contains("_total") || told.0.contains("_count")) {
+        assert!(later[name] >= *value, "{name} fell from {value} to {}", later[name]);
+    }
+    assert_eq!((later["palpate_sessions{state=\"running\"}"], later["palpate_points"]), (0.0, 0.0));
+}
+
+#[test]
+fn the_dashboard_asks_for_nothing_that_is_not_there() {
+    let mut server = Server::start(&["--metrics", "127.0.0.1:0"]);
+    let url = metrics_url(&mut server);
+    let told = scrape(&url);
+    let names: BTreeSet<&str> = told.keys().map(|name| name.split('{').next().unwrap()).collect();
+    let dashboard: Value = serde_json::from_str(include_str!("../contrib/grafana.json")).unwrap();
+    let mut asked = 0;
+    for target in dashboard["panels"].as_array().unwrap().iter().flat_map(|panel| panel["targets"].as_array().unwrap())
+    {
+        let query = target["expr"].as_str().unwrap();
+        for (at, _) in query.match_indices("palpate_") {
+            let name: String = query[at..].chars().take_while(|c| c.is_ascii_alphanumeric() || *c == '_').collect();
+            // These are there when the first call or refusal is.
+            let later = ["palpate_calls_total", "palpate_refusals_total"];
+            assert!(names.contains(&*name) || later.contains(&&*name), "{name} is not in {names:?}");
+            asked += 1;
+        }
+    }
+    assert!(asked > 20);
+}
+
+fn top(arguments: &[&str]) -> Output {
+    // The server's program hands over to the client's, which lies beside it.
+    client_program();
+    Command::new(env!("CARGO_BIN_EXE_palpate")).arg("top").args(arguments).output().unwrap()
+}
+
+#[tokio::test]
+async fn top_shows_sessions_as_a_table_and_as_json() {
+    let server = Server::start(&[]);
+    let (running, paused) = (server.paper(false).await, server.paper(true).await);
+    let touch = Touch::hold(&server, &running).await;
+    touch.command(force(0, 1, -1.0)).await;
+    let told = top(&[&server.url, "--once", "--json"]);
+    assert!(told.status.success(), "{told:?}");
+    let told: Value = serde_json::from_slice(&told.stdout).unwrap();
+    let [first, second] = &told["sessions"].as_array().unwrap()[..] else { panic!("{told}") };
+    assert_eq!(
+        (&first["session_id"], &first["state"], &first["scene"]),
+        (&running.into(), &"running".into(), &"paper".into())
+    );
+    assert_eq!((&first["streams"], &first["points"]), (&1.into(), &961.into()));
+    assert_eq!(first["held_tools"][0]["holder"], "test");
+    assert!(first["steps_per_s"].as_f64().unwrap() > 0.0 && first["awake_points"].as_f64().unwrap() > 0.0);
+    assert_eq!(
+        (&second["session_id"], &second["state"], &second["step"]),
+        (&paused.into(), &"paused".into(), &0.into())
+    );
+    let table = top(&[&server.url, "--once"]);
+    let table = String::from_utf8(table.stdout).unwrap();
+    assert!(table.contains("2 sessions (1 running") && table.contains("0: test"), "{table}");
+    assert!(!table.contains('\u{1b}'), "no terminal, no colours");
+    // In a pipe whose reader has seen enough.
+    let mut child = Command::new(client_program())
+        .args(["top", &server.url, "--json"])
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let lines = BufReader::new(child.stdout.take().unwrap()).lines().take(2);
+    assert!(lines.map(Result::unwrap).all(|line| line.starts_with("{\"sessions\":")));
+    let ended = child.wait_with_output().unwrap();
+    assert!(ended.status.success() && ended.stderr.is_empty(), "{ended:?}");
+    let nobody = top(&["http://127.0.0.1:1", "--once"]);
+    assert_eq!(nobody.status.code(), Some(1));
+    assert!(String::from_utf8(nobody.stderr).unwrap().contains("palpate serve"));
+}
+
+#[test]
+fn a_server_says_that_it_is_well_and_one_that_is_gone_does_not() {
+    let server = Server::start(&[]);
+    let health = |url: &str| Command::new(client_program()).args(["health", url]).output().unwrap().status.code();
+    assert_eq!(health(&server.url), Some(0));
+    let url = server.url.clone();
+    drop(server);
+    assert_eq!(health(&url), Some(1));
+}
+
+/// Options in a text that `palpate serve` has not got.
+fn unknown_options(text: &str) -> Vec<String> {
+    let help = Command::new(env!("CARGO_BIN_EXE_palpate")).args(["serve", "--help"]).output().unwrap();
+    let client = Command::new(client_program()).args(["health", "--help"]).output().unwrap();
+    let help = String::from_utf8([help.stdout, client.stdout].concat()).unwrap();
+    let words = text.split(|c: char| c.is_whitespace() || "\",[]`".contains(c));
+    words.filter(|word| word.starts_with("--") && !help.contains(word)).map(str::to_owned).collect()
+}
+
+#[test]
+fn the_packaged_files_start_servers_as_they_are() {
+    let unit = include_str!("../contrib/palpate.service");
+    let start = unit.split("ExecStart=").nth(1).unwrap().split("LoadCredential").next().unwrap();
+    assert_eq!(unknown_options(start), [] as [&str; 0]);
+    let dockerfile = include_str!("../contrib/Dockerfile");
+    let commands = dockerfile.split("HEALTHCHECK").nth(1).unwrap();
+    let commands = commands.split_once("CMD").unwrap().1;
+    assert_eq!(unknown_options(commands), [] as [&str; 0]);
+    for line in ["DynamicUser=yes", "NoNewPrivileges=yes", "ProtectSystem=strict", "MemoryMax=", "LimitNOFILE="] {
+        assert!(unit.contains(line), "the unit lacks {line}");
+    }
+    // Where systemd is, it says whether it understands the unit, with this build's program in the place of the installed.
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("palpate.service");
+    std::fs::write(&path, unit.replace("/usr/local/bin/palpate", env!("CARGO_BIN_EXE_palpate"))).unwrap();
+    if let Ok(verified) = Command::new("systemd-analyze").arg("verify").arg(&path).output() {
+        assert!(verified.status.success() && verified.stderr.is_empty(), "{verified:?}");
+    }
+}
