@@ -140,7 +140,8 @@ fn as_json(rows: &[Row]) -> Value {
 /// A line of sums, a head, and a line for each session; of `most` lines the busiest.
 fn table(server: &str, rows: &[Row], most: usize) -> String {
     let count = |wanted: &str| rows.iter().filter(|row| state(&row.session) == wanted).count();
-    let sum = |of: &dyn Fn(&Row) -> f64| rows.iter().map(of).sum::<f64>();
+    // (`sum` of none is −0, and is written so.)
+    let sum = |of: &dyn Fn(&Row) -> f64| rows.iter().map(of).fold(0.0, |sum, value| sum + value);
     let mut text = format!(
         "{server}: {} sessions ({} running, {} resting, {} paused, {} held), {:.0} awake points, {:.0} steps/s, \
          {:.0} overruns/s\n\n",
