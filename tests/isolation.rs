@@ -335,7 +335,7 @@ async fn a_bridge_comes_back_to_a_server_that_was_killed() {
 #[tokio::test]
 async fn a_second_signal_ends_the_server_at_once() {
     let mut server = Server::start(&["--shutdown-deadline-s", "3600"]);
-    let session = server.paper(true).await;
+    let session = server.paper(false).await;
     // Nothing of it is read: it would not end before the deadline.
     let request = pb::WatchFramesRequest {
         session_id: session,
@@ -345,6 +345,9 @@ async fn a_second_signal_ends_the_server_at_once() {
         ..Default::default()
     };
     let _stalled = server.views().await.watch_frames(request).await.unwrap();
+    let mut touch = Touch::hold(&server, &session).await;
+    touch.command(force(0, 1, -1.0)).await;
+    touch.sample_with(|sample| sample.step >= 300).await;
     let id = server.child.id().to_string();
     let signal = || assert!(std::process::Command::new("kill").arg(&id).status().unwrap().success());
     let ended = tokio::time::timeout(PATIENCE, async {
