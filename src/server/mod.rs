@@ -66,11 +66,11 @@ impl Doors {
     /// Listens where the configuration says, if that is safe.
     pub async fn open(config: &Config) -> Result<Self, ServeError> {
         let listener = listen("listen", &config.listen).await?;
-        let protection = Protection::load(config, local_address(&listener, &config.listen)?)?;
+        let protection = Protection::load(config, local_address("listen", &listener, &config.listen)?)?;
         let metrics = match &config.metrics {
             Some(text) => {
                 let listener = listen("metrics", text).await?;
-                let address = local_address(&listener, text)?;
+                let address = local_address("metrics", &listener, text)?;
                 if !address.ip().is_loopback() && !config.insecure {
                     let why = "can be reached from other machines, and nobody is asked who they are there";
                     let message = format!("{address} {why}: listen on 127.0.0.1, or say --insecure");
@@ -94,21 +94,21 @@ impl Doors {
     }
 }
 
-fn local_address(listener: &TcpListener, text: &str) -> Result<SocketAddr, ServeError> {
-    listener.local_addr().map_err(|error| ServeError::Listen { address: text.to_owned(), error })
+fn local_address(field: &'static str, listener: &TcpListener, text: &str) -> Result<SocketAddr, ServeError> {
+    listener.local_addr().map_err(|error| ServeError::Listen { field, address: text.to_owned(), error })
 }
 
 fn url(scheme: &str, listener: &TcpListener) -> String {
     listener.local_addr().map_or_else(|e| e.to_string(), |address| format!("{scheme}://{address}"))
 }
 
-async fn listen(field: &str, text: &str) -> Result<TcpListener, ServeError> {
+async fn listen(field: &'static str, text: &str) -> Result<TcpListener, ServeError> {
     TcpListener::bind(text).await.map_err(|error| {
         if error.kind() == std::io::ErrorKind::InvalidInput {
-            let message = format!("must be address:port, as in 127.0.0.1:7117, but is {text}");
+            let message = format!("{text}: must be address:port, as in 127.0.0.1:7117");
             return Refusal::new(Reason::WrongKind, field, message).into();
         }
-        ServeError::Listen { address: text.to_owned(), error }
+        ServeError::Listen { field, address: text.to_owned(), error }
     })
 }
 
@@ -133,8 +133,10 @@ pub enum ServeError {
     #[error("{0}")]
     Refused(#[from] Refusal),
     /// The address is taken, or none of this machine.
-    #[error("can't listen on {address}: {error}; another address, or port 0 for a free one, may do")]
+    #[error("can't listen on {address}: {error}; another --{field}, or port 0 for a free one, may do")]
     Listen {
+        /// Which of the addresses of the configuration.
+        field: &'static str,
         /// As it was given.
         address: String,
         /// Of the system.
