@@ -338,7 +338,7 @@ async fn a_second_signal_ends_the_server_at_once() {
     let session = server.paper(false).await;
     // Nothing of it is read: it would not end before the deadline.
     let request = pb::WatchFramesRequest {
-        session_id: session,
+        session_id: session.clone(),
         refinement: 10,
         rate_hz: Some(1000.0),
         always_full: true,

@@ -106,6 +106,8 @@ fn top(arguments: &[&str]) -> Output {
 
 #[tokio::test]
 async fn top_shows_sessions_as_a_table_and_as_json() {
+    // While it is built a tissue would come to rest.
+    client_program();
     let server = Server::start(&[]);
     let (running, paused) = (server.paper(false).await, server.paper(true).await);
     let touch = Touch::hold(&server, &running).await;

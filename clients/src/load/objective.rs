@@ -95,6 +95,7 @@ mod tests {
         let objective: Objective = "p99<2ms, dilation>0.999,gap_max<500us,lost<1".parse().unwrap();
         let mut outcome = Tally::new().outcome(1);
         outcome.round_trip_us.p99 = 1999.0;
+        outcome.sample_gap_us.max = 499.0;
         outcome.dilation_min = 0.9991;
         assert!(objective.missed(&outcome).is_empty());
         outcome.round_trip_us.p99 = 2001.0;
