@@ -104,14 +104,21 @@ fn top(arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_palpate")).arg("top").args(arguments).output().unwrap()
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn top_shows_sessions_as_a_table_and_as_json() {
     // While it is built a tissue would come to rest.
     client_program();
     let server = Server::start(&[]);
     let (running, paused) = (server.paper(false).await, server.paper(true).await);
-    let touch = Touch::hold(&server, &running).await;
-    touch.command(force(0, 1, -1.0)).await;
+    let mut touch = Touch::hold(&server, &running).await;
+    // Now more and now less, all the while: it would come to rest.
+    tokio::spawn(async move {
+        for sequence in 1.. {
+            touch.command(force(0, sequence, -1.0 / f64::from(1 + u32::from(sequence % 2 == 0)))).await;
+            touch.sample_with(|_| true).await;
+            tokio::time::sleep(std::time::Duration::from_millis(20)).await;
+        }
+    });
     let told = top(&[&server.url, "--once", "--json"]);
     assert!(told.status.success(), "{told:?}");
     let told: Value = serde_json::from_slice(&told.stdout).unwrap();
