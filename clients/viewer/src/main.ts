@@ -288,6 +288,10 @@ const inside = {
   get forceN() {
     return visit?.samples.tools.map((tool) => norm(tool.forceN)) ?? [];
   },
+  /** Of the control point, as far back as the plots go. */
+  get deepestM() {
+    return Math.max(0, ...(visit?.samples.history.map((moment) => norm(moment.displacementM)) ?? []));
+  },
   get holds() {
     return visit?.hand.holds ?? false;
   },
