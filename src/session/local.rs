@@ -49,11 +49,6 @@ impl Modeller {
         Modeller { law, surface: None, knocked: 0, sequence: 0, tangent: Arc::default() }
     }
 
-    /// The law that it goes by.
-    pub fn law(&self) -> &Arc<Law> {
-        &self.law
-    }
-
     /// What computes the stiffness anew, from the sheet around the tool.
     pub fn refinement(&self, surroundings: Surroundings) -> Refinement {
         Refinement { surroundings, tangent: self.tangent.clone() }
