@@ -5,6 +5,8 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 mod common;
+#[path = "common/random.rs"]
+mod random;
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BinaryHeap};
@@ -19,6 +21,7 @@ use palpate::scene::script::Action;
 use palpate::session::command::{Command, Intake, LeaseId};
 use palpate::session::schedule::Schedule;
 use palpate::session::{Sample, Session};
+use random::Random;
 
 const MS: u64 = 1_000_000;
 const STEPS: u64 = 1500;
@@ -27,18 +30,6 @@ const CLIENTS: usize = 4;
 const TOOLS: u64 = 3;
 const LEASE_MS: u64 = 60;
 const QUEUED_SAMPLES: usize = 8;
-
-struct Random(u64);
-
-impl Random {
-    fn below(&mut self, bound: u64) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        (z ^ (z >> 31)) % bound
-    }
-}
 
 /// What a client says to the server.
 #[derive(Debug, PartialEq, Eq, PartialOrd, Ord)]

@@ -2,6 +2,8 @@
 //! threads of the server must not grow, and every command must be accounted for.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
+#[path = "common/random.rs"]
+mod random;
 #[path = "common/server.rs"]
 mod server;
 
@@ -10,20 +12,8 @@ use std::time::{Duration, Instant};
 
 use palpate::wire::pb;
 use pb::touch_response::Message as Heard;
+use random::Random;
 use server::{PATIENCE, Server, Touch, force, position};
-
-/// Of one generator: splitmix64.
-struct Random(u64);
-
-impl Random {
-    fn below(&mut self, bound: u64) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        (z ^ (z >> 31)) % bound
-    }
-}
 
 /// What one client has sent and heard.
 #[derive(Default)]
