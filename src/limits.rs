@@ -65,8 +65,10 @@ pub struct Limits {
     pub keepalive_s: f64,
     /// Commands of a haptic stream, per tool and step of the session: what comes faster for long is refused.
     pub commands_per_step: f64,
-    /// Sessions made over one connection, per minute.
+    /// Sessions made over one connection, per minute, and at once.
     pub sessions_per_minute: f64,
+    /// Calls made over one connection, of any kind, per second, and at once.
+    pub calls_per_s: f64,
 }
 
 impl Default for Limits {
@@ -102,6 +104,7 @@ impl Default for Limits {
             keepalive_s: 10.0,
             commands_per_step: 4.0,
             sessions_per_minute: 600.0,
+            calls_per_s: 2000.0,
         }
     }
 }

@@ -222,6 +222,30 @@ async fn sessions_made_without_end_are_refused_to_who_makes_them_alone() {
 }
 
 #[tokio::test]
+async fn calls_without_end_are_refused_to_who_makes_them_alone() {
+    let server = limited("calls_per_s = 20.0", &[]);
+    let mut greedy = server.sessions().await;
+    // Together: what is refused is told so when the next would be let in, and the bucket fills meanwhile.
+    let calls = (0..200).map(|_| {
+        let mut sessions = greedy.clone();
+        async move { sessions.list_scenes(pb::ListScenesRequest {}).await }
+    });
+    let answers = futures_util::future::join_all(calls).await;
+    let refused: Vec<_> = answers.iter().filter_map(|answer| answer.as_ref().err()).collect();
+    assert!(answers.len() - refused.len() >= 20, "{} of {} were refused", refused.len(), answers.len());
+    assert!(!refused.is_empty());
+    for status in refused {
+        assert_eq!(told(status), (Code::ResourceExhausted, "RATE_LIMITED".into(), String::new()));
+    }
+    // Over a connection of its own.
+    server.paper(false).await;
+    // And who asks no more than it may is served again, if it waits as long as it was kept waiting.
+    while let Err(status) = greedy.list_scenes(pb::ListScenesRequest {}).await {
+        assert_eq!(told(&status).1, "RATE_LIMITED");
+    }
+}
+
+#[tokio::test]
 async fn who_does_not_read_loses_samples_and_delays_nobody() {
     let server = limited("queued_samples = 8", &["--log", "error"]);
     let session = server.paper(false).await;

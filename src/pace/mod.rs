@@ -5,6 +5,7 @@ pub mod clock;
 mod cost;
 pub mod frames;
 mod inbox;
+pub(crate) mod priority;
 pub mod queue;
 pub mod tally;
 mod taps;
@@ -32,6 +33,7 @@ use clock::{Dilation, now_ns};
 use cost::Cost;
 use frames::{Delivery, Encoder, Viewer};
 use inbox::{Inbox, Request};
+use priority::give_way;
 use queue::{Reader, lock, queue};
 use tally::Tally;
 use taps::{ProbeTap, SampleTap};
@@ -328,7 +330,10 @@ impl Pacer {
         let mut inboxes = Vec::new();
         // It ends when the stepping threads have ended, and nobody sends any more.
         let (refiner, refinements) = std::sync::mpsc::sync_channel::<Refinement>(WAITING_REFINEMENTS);
-        let worker = move || refinements.into_iter().for_each(Refinement::work);
+        let worker = move || {
+            give_way();
+            refinements.into_iter().for_each(Refinement::work);
+        };
         handles.push(std::thread::Builder::new().name("stiffness".into()).spawn(worker)?);
         for index in 0..threads.max(1) {
             let inbox = Arc::new(Inbox::default());
@@ -354,7 +359,7 @@ impl Pacer {
     pub fn create(&self, scene: &Scene, paused: bool, idle_timeout_s: f64) -> Result<Arc<Live>> {
         let most_hz = self.limits.session_rate_hz;
         number("stepping.rate_hz", scene.stepping.rate_hz, &format!("at most {most_hz}"), |v| v <= most_hz)?;
-        let model = Model::compile(scene, &self.limits)?;
+        let model = self.compile(scene)?;
         let id = random_id()?;
         check_work(&model, &self.limits)?;
         let number = {
@@ -413,6 +418,13 @@ impl Pacer {
         // Before anybody can name the session: what is asked of it comes after this.
         inbox.send(number, Request::Adopt(running));
         Ok(live)
+    }
+
+    /// What never changes is one in memory for all sessions of a scene, and compiled once.
+    fn compile(&self, scene: &Scene) -> Result<Arc<Model>> {
+        let known =
+            lock(&self.sessions).values().find(|live| live.model.scene == *scene).map(|live| live.model.clone());
+        known.map_or_else(|| Model::compile(scene, &self.limits), Ok)
     }
 
     /// The thread with the most time to spare for a further session, and what that will take.

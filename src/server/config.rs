@@ -100,6 +100,7 @@ impl Config {
             ("limits.session_rate_hz", self.limits.session_rate_hz),
             ("limits.commands_per_step", self.limits.commands_per_step),
             ("limits.sessions_per_minute", self.limits.sessions_per_minute),
+            ("limits.calls_per_s", self.limits.calls_per_s),
             ("limits.thread_share", self.limits.thread_share),
         ] {
             positive(field, value)?;

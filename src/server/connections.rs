@@ -4,7 +4,7 @@
 use std::io;
 use std::net::SocketAddr;
 use std::pin::Pin;
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
@@ -21,12 +21,10 @@ use tonic::transport::server::Connected;
 use tracing::{debug, warn};
 
 use super::metrics::{Open, Traffic};
-use super::rate::Bucket;
+use super::rate::Turnstile;
 use super::reload::Reloaded;
 use super::tls;
 use crate::limits::Limits;
-use crate::pace::queue::lock;
-use crate::refusal::Result;
 
 /// After the system could not give us a connection: file descriptors that have run out come back.
 const PAUSE: Duration = Duration::from_millis(100);
@@ -95,20 +93,17 @@ pub(crate) struct Peer {
     pub(crate) address: SocketAddr,
     /// What its certificate calls it, if it had to show one.
     pub(crate) certificate: Option<Arc<[String]>>,
-    creations: Arc<Mutex<Bucket>>,
-}
-
-impl Peer {
-    /// Whether it may make a further session now.
-    pub(super) fn may_create(&self, now_ns: u64) -> Result<()> {
-        lock(&self.creations).take(now_ns, "sessions made over this connection")
-    }
+    /// For calls of any kind.
+    pub(super) calls: Arc<Turnstile>,
+    /// For those that make a session.
+    pub(super) creations: Arc<Turnstile>,
 }
 
 /// A connection that was let in, before its handshake.
 struct Entry {
     address: SocketAddr,
-    creations: Bucket,
+    calls: Turnstile,
+    creations: Turnstile,
     /// For the handshake and the greeting together.
     deadline: Pin<Box<Sleep>>,
     traffic: Arc<Traffic>,
@@ -117,10 +112,11 @@ struct Entry {
 
 impl Entry {
     fn new(address: SocketAddr, permit: OwnedSemaphorePermit, limits: &Limits, traffic: &Arc<Traffic>) -> Self {
-        let each_minute = limits.sessions_per_minute;
+        let per_minute = limits.sessions_per_minute;
         Entry {
             address,
-            creations: Bucket::new(each_minute / 60.0, each_minute),
+            calls: Turnstile::new(limits.calls_per_s, limits.calls_per_s, "calls of this connection"),
+            creations: Turnstile::new(per_minute / 60.0, per_minute, "sessions made over this connection"),
             deadline: Box::pin(tokio::time::sleep(Duration::from_secs_f64(limits.handshake_s))),
             traffic: traffic.clone(),
             permit,
@@ -128,11 +124,11 @@ impl Entry {
     }
 
     fn connection(self, transport: Transport, certificate: Option<Arc<[String]>>) -> Connection {
-        let Entry { address, creations, deadline, traffic, permit } = self;
+        let Entry { address, calls, creations, deadline, traffic, permit } = self;
         debug!(%address, "connected");
         Connection {
             transport,
-            peer: Peer { address, certificate, creations: Arc::new(Mutex::new(creations)) },
+            peer: Peer { address, certificate, calls: Arc::new(calls), creations: Arc::new(creations) },
             greeting: Some((GREETING_BYTES, deadline)),
             _open: traffic.open(),
             traffic,
@@ -187,7 +183,7 @@ impl AsyncRead for Connection {
         let Some((left, deadline)) = &mut this.greeting else { return polled };
         if polled.is_pending() {
             ready!(deadline.as_mut().poll(cx));
-            debug!(address = %this.peer.address, "connection closed: it did not say what it wants");
+            this.traffic.stayed_silent(this.peer.address);
             return Poll::Ready(Err(io::ErrorKind::TimedOut.into()));
         }
         *left = left.saturating_sub(bytes);

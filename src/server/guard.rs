@@ -1,9 +1,11 @@
 //! The one layer that every call goes through: who calls, and whether they may.
 
+use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
+use std::time::Duration;
 
-use futures_util::future::{Either, Ready, ready};
+use futures_util::future::Either;
 use http::{HeaderValue, Request, Response, header};
 use tonic::Status;
 use tonic::body::Body;
@@ -43,13 +45,22 @@ pub(super) struct Guard<S> {
     inner: S,
 }
 
+/// The answer to a call that is not let through, perhaps kept back.
+type Refused<E> = Pin<Box<dyn Future<Output = std::result::Result<Response<Body>, E>> + Send>>;
+
 /// Calls of this server's own protocol.
 const OWN: &str = "/palpate.";
 
 impl GuardLayer {
-    fn admit<B>(&self, request: &Request<B>) -> Result<Caller> {
-        let path = request.uri().path();
+    /// Who calls, if they may; else why not, and how long that is to be kept back.
+    fn admit<B>(&self, request: &Request<B>) -> std::result::Result<Caller, (Refusal, Duration)> {
         let peer = request.extensions().get::<Peer>();
+        peer.map_or(Ok(()), |peer| peer.calls.pass())?;
+        self.identify(request, peer).map_err(|refusal| (refusal, Duration::ZERO))
+    }
+
+    fn identify<B>(&self, request: &Request<B>, peer: Option<&Peer>) -> Result<Caller> {
+        let path = request.uri().path();
         let caller = || self.credentials.get().caller(request.headers().get(header::AUTHORIZATION), peer);
         let nobody = || Ok(Caller::nobody());
         match access(path) {
@@ -93,7 +104,7 @@ where
 {
     type Response = Response<Body>;
     type Error = S::Error;
-    type Future = Either<Ready<std::result::Result<Response<Body>, S::Error>>, Instrumented<S::Future>>;
+    type Future = Either<Refused<S::Error>, Instrumented<S::Future>>;
 
     fn poll_ready(&mut self, cx: &mut Context<'_>) -> Poll<std::result::Result<(), S::Error>> {
         self.inner.poll_ready(cx)
@@ -106,12 +117,15 @@ where
                 let span = info_span!("call", path = request.uri().path(), client = &*caller.name);
                 Either::Right(self.inner.call(request).instrument(span))
             }
-            Err(refusal) => {
+            Err((refusal, wait)) => {
                 let address = request.extensions().get::<Peer>().map(|peer| peer.address);
                 let reason = refusal.reason.as_str();
                 info!(path = request.uri().path(), client = ?address, reason, "call refused: {refusal}");
                 self.layer.traffic.refused(refusal.reason);
-                Either::Left(ready(Ok(Status::from(refusal).into_http())))
+                Either::Left(Box::pin(async move {
+                    tokio::time::sleep(wait).await;
+                    Ok(Status::from(refusal).into_http())
+                }))
             }
         }
     }

@@ -103,12 +103,7 @@ impl Haptics {
         let guard = live.open_stream()?;
         if device.is_some() {
             let live = live.clone();
-            let turn = self.0.heavy_work.clone().acquire_owned().await;
-            let law = tokio::task::spawn_blocking(move || {
-                let _turn = turn;
-                live.law(tip.radius_m)
-            });
-            let law = law.await;
+            let law = self.0.workshop.work(move || live.law(tip.radius_m)).await;
             let failed = |_| Refusal::new(Reason::NotAvailable, "device", "the force law could not be computed");
             sampling.law = Some(law.map_err(failed)?);
         }

@@ -34,6 +34,7 @@ pub(crate) struct Traffic {
     connections: Gauge,
     connected: Counter,
     handshakes_failed: Counter,
+    silent: Counter,
     pub(super) bytes_in: Counter,
     pub(super) bytes_out: Counter,
     calls: Family<Label, Counter>,
@@ -63,6 +64,12 @@ impl Traffic {
         self.handshakes_failed.inc();
     }
 
+    /// A connection had to be closed that did not say what it wants.
+    pub(super) fn stayed_silent(&self, client: SocketAddr) {
+        info!(%client, "connection closed: it did not say what it wants");
+        self.silent.inc();
+    }
+
     /// A call was let through.
     pub(super) fn called(&self, path: &str) {
         if let Some((path, _)) = CALLS.iter().find(|call| call.0 == path) {
@@ -89,6 +96,8 @@ pub(super) fn registry(pacer: &Arc<Pacer>, traffic: &Traffic) -> Registry {
     registry.register("connected", "Connections so far", traffic.connected.clone());
     let failed = "Connections that were cut off before they were secure";
     registry.register("tls_handshakes_failed", failed, traffic.handshakes_failed.clone());
+    let silent = "Connections that did not say in time what they want";
+    registry.register("silent_connections", silent, traffic.silent.clone());
     let (bytes_in, bytes_out) = (traffic.bytes_in.clone(), traffic.bytes_out.clone());
     registry.register_with_unit("received", "What clients sent, before encryption", Unit::Bytes, bytes_in);
     registry.register_with_unit("sent", "What clients were sent, before encryption", Unit::Bytes, bytes_out);

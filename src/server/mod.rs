@@ -16,6 +16,7 @@ mod sessions;
 mod textures;
 mod tls;
 mod views;
+mod workshop;
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -42,6 +43,7 @@ use pb::session_service_server::SessionServiceServer;
 use pb::view_service_server::ViewServiceServer;
 use protection::Protection;
 use textures::Textures;
+use workshop::Workshop;
 
 /// What every service needs.
 #[derive(Clone)]
@@ -50,8 +52,8 @@ pub(crate) struct House {
     pub(crate) catalog: Catalog,
     pub(crate) pacer: Arc<Pacer>,
     pub(crate) textures: Textures,
-    /// Sessions are laid out, and force laws computed, one at a time: to ask for many takes no more than a core.
-    pub(crate) heavy_work: Arc<tokio::sync::Semaphore>,
+    /// Where sessions are laid out and changed, scripts read, and force laws computed.
+    pub(crate) workshop: Workshop,
     pub(crate) traffic: Arc<Traffic>,
 }
 
@@ -185,8 +187,8 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
         catalog,
         pacer: pacer.clone(),
         config: Arc::new(config),
-        textures: Textures::default(),
-        heavy_work: Arc::new(tokio::sync::Semaphore::new(1)),
+        textures: Textures::new()?,
+        workshop: Workshop::open("workshop")?,
         traffic: traffic.clone(),
     };
 

@@ -1,5 +1,10 @@
 //! How fast somebody may ask: a bucket that fills steadily, from which each asking takes. Time is an argument.
 
+use std::sync::Mutex;
+use std::time::Duration;
+
+use crate::pace::clock::now_ns;
+use crate::pace::queue::lock;
 use crate::refusal::{Reason, Refusal, Result};
 
 /// What may still be asked for at once, and how fast that comes back.
@@ -37,15 +42,52 @@ impl Bucket {
         Ok(())
     }
 
+    /// How long it takes until there is one, a second at most.
+    fn wait(&self) -> Duration {
+        Duration::from_secs_f64(((1.0 - self.left) / self.per_s).clamp(0.0, 1.0))
+    }
+
     /// Whether it was asked so much too fast that even to refuse is too much: the excess is more than it holds.
     pub(super) fn is_abused(&self) -> bool {
         self.refused > self.most
     }
 }
 
+/// A bucket that all calls of a connection take from. Who finds it empty is told so when there would be one again: so
+/// whoever tries on and on, one call after another, is slowed to what is allowed.
+#[derive(Debug)]
+pub(super) struct Turnstile {
+    bucket: Mutex<Bucket>,
+    what: &'static str,
+}
+
+impl Turnstile {
+    pub(super) fn new(per_s: f64, most: f64, what: &'static str) -> Self {
+        Turnstile { bucket: Mutex::new(Bucket::new(per_s, most)), what }
+    }
+
+    /// Lets a call through, or tells why not and how long that is to be kept back.
+    pub(super) fn pass(&self) -> std::result::Result<(), (Refusal, Duration)> {
+        let mut bucket = lock(&self.bucket);
+        bucket.take(now_ns(), self.what).map_err(|refusal| (refusal, bucket.wait()))
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_refusal_is_kept_back_until_the_next_would_pass() {
+        let turnstile = Turnstile::new(10.0, 3.0, "calls");
+        (0..3).for_each(|_| turnstile.pass().unwrap());
+        let (refusal, wait) = turnstile.pass().unwrap_err();
+        assert_eq!(refusal.reason, Reason::RateLimited);
+        assert!(wait <= Duration::from_millis(100), "{wait:?}");
+        let slow = Turnstile::new(0.01, 1.0, "calls");
+        slow.pass().unwrap();
+        assert_eq!(slow.pass().unwrap_err().1, Duration::from_secs(1));
+    }
 
     #[test]
     fn a_bucket_gives_what_it_holds_at_once_and_then_what_comes_in() {

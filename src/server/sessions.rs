@@ -9,7 +9,6 @@ use tracing::{info, warn};
 
 use super::House;
 use super::connections::Peer;
-use crate::pace::clock::now_ns;
 use crate::refusal::{Reason, Refusal, number};
 use crate::scene::script::Script;
 use crate::wire::pb::session_service_server::SessionService;
@@ -30,8 +29,13 @@ impl SessionService for Sessions {
         request: Request<pb::CreateSessionRequest>,
     ) -> Result<Response<pb::CreateSessionResponse>, Status> {
         use pb::create_session_request::Source;
-        if let Some(peer) = request.extensions().get::<Peer>() {
-            peer.may_create(now_ns())?;
+        if let Some(peer) = request.extensions().get::<Peer>()
+            && let Err((refusal, wait)) = peer.creations.pass()
+        {
+            info!(client = %peer.address, "session refused: {refusal}");
+            self.0.traffic.refused(refusal.reason);
+            tokio::time::sleep(wait).await;
+            return Err(refusal.into());
         }
         let request = request.into_inner();
         let scene = match &request.source {
@@ -43,15 +47,9 @@ impl SessionService for Sessions {
         let idle_timeout_s = request.idle_timeout_s.unwrap_or(most_s);
         let range = format!("above 0 and at most {most_s}");
         number("idle_timeout_s", idle_timeout_s, &range, |value| value > 0.0 && value <= most_s)?;
-        // A large sheet takes a while to lay out. Who hangs up before it is its turn is passed over.
-        let turn = self.0.heavy_work.clone().acquire_owned().await;
+        // A large sheet takes a while to lay out.
         let pacer = self.0.pacer.clone();
-        let made = tokio::task::spawn_blocking(move || {
-            let _turn = turn;
-            pacer.create(&scene, request.paused, idle_timeout_s)
-        });
-        let made = made.await;
-        let live = made.map_err(|e| Status::internal(e.to_string()))??;
+        let live = self.0.workshop.work(move || pacer.create(&scene, request.paused, idle_timeout_s)).await??;
         info!(session = %live.id, scene = %live.model.scene.name, points = live.model.len(), "session created");
         for warning in &live.model.warnings {
             warn!(session = %live.id, warning);
@@ -103,8 +101,7 @@ impl SessionService for Sessions {
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
         let (change, to_change) = (wire::scene::from_change(&request), live.clone());
-        let changed = tokio::task::spawn_blocking(move || to_change.change(&change, request.at_step)).await;
-        let (step, model) = changed.map_err(|e| Status::internal(e.to_string()))??;
+        let (step, model) = self.0.workshop.work(move || to_change.change(&change, request.at_step)).await??;
         info!(
             session = %live.id,
             step,
@@ -154,10 +151,8 @@ impl SessionService for Sessions {
         let guard = live.open_stream()?;
         let (catalog, config) = (self.0.catalog.clone(), self.0.config.clone());
         // A script may have traces of megabytes.
-        let read = tokio::task::spawn_blocking(move || {
-            catalog.script(&request.script_name, &live.model.scene, &config.limits)
-        });
-        let script = read.await.map_err(|e| Status::internal(e.to_string()))??;
+        let read = move || catalog.script(&request.script_name, &live.model.scene, &config.limits);
+        let script = self.0.workshop.work(read).await??;
         let out = stream::unfold(Some((script, 0, guard)), |state| async move {
             let (script, from, guard) = state?;
             let (message, next) = script_part(&script, from);

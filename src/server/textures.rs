@@ -7,6 +7,7 @@ use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
 use tonic::Status;
 
+use super::workshop::Workshop;
 use super::{House, page};
 use crate::pace::queue::lock;
 use crate::refusal::Refusal;
@@ -17,8 +18,18 @@ use crate::texture::{Texture, texture};
 const MOST_KEPT: usize = 8;
 
 /// The textures last asked for, the newest last.
-#[derive(Debug, Clone, Default)]
-pub(crate) struct Textures(Arc<Mutex<Vec<(Appearance, Texture)>>>);
+#[derive(Clone)]
+pub(crate) struct Textures {
+    kept: Arc<Mutex<Vec<(Appearance, Texture)>>>,
+    /// Of their own: a texture may take a second, and nobody who wants a session waits for that.
+    workshop: Workshop,
+}
+
+impl Textures {
+    pub(super) fn new() -> std::io::Result<Self> {
+        Ok(Textures { kept: Arc::default(), workshop: Workshop::open("textures")? })
+    }
+}
 
 /// `NAME.png` for a browser, which draws a picture of its own where there is none.
 pub(super) async fn file(house: House, Path(file): Path<String>, headers: HeaderMap) -> Response {
@@ -35,8 +46,7 @@ impl House {
     /// once, and kept: a second or so for who asks first.
     pub(crate) async fn texture(&self, name: &str) -> Result<Texture, Status> {
         let (house, name) = (self.clone(), name.to_owned());
-        let found = tokio::task::spawn_blocking(move || house.find_texture(&name)).await;
-        Ok(found.map_err(|e| Status::internal(e.to_string()))??)
+        Ok(self.textures.workshop.work(move || house.find_texture(&name)).await??)
     }
 
     fn find_texture(&self, name: &str) -> Result<Texture, Refusal> {
@@ -46,8 +56,7 @@ impl House {
             (_, Ok(live)) => live.model.scene.appearance.clone(),
             _ => self.catalog.load(name, &[], limits)?.appearance,
         };
-        // Who asks for the same meanwhile waits for it.
-        let mut kept = lock(&self.textures.0);
+        let mut kept = lock(&self.textures.kept);
         if let Some((_, texture)) = kept.iter().find(|entry| entry.0 == appearance) {
             return Ok(texture.clone());
         }
