@@ -43,7 +43,8 @@ help:
 	@echo 'make bench-stability the largest stable step, predicted and observed'
 	@echo 'make bench-skip      what it saves to leave out what is at rest, and its error'
 	@echo 'make bench-load      sessions that one core bears, with clients and without, and under attack: docs/benchmarks/load.md'
-	@echo 'make soak            random clients for SECONDS=1800: memory, handles, threads, and every command accounted for'
+	@echo 'make soak            random clients for SECONDS=1800: memory, handles, threads, and every command accounted for; then'
+	@echo '                     clients and servers killed KILLS=50 times'
 
 need-rust:
 	@command -v $(CARGO) >/dev/null || { echo 'Rust is missing: install it from https://rustup.rs' >&2; exit 1; }
@@ -174,5 +175,7 @@ bench-load: build
 
 # How long, s.
 SECONDS ?= 1800
+KILLS ?= 50
 soak: need-rust
 	PALPATE_SOAK_S=$(SECONDS) $(CARGO) test --release --test soak -- --include-ignored --nocapture
+	PALPATE_KILLS=$(KILLS) $(CARGO) test --release --test kill -- --nocapture

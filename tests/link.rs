@@ -1,6 +1,8 @@
 //! `palpate-client link` and `bridge`: what a simulated hand must feel through any network.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
+#[path = "common/course.rs"]
+mod course;
 #[path = "common/proxy.rs"]
 mod proxy;
 #[path = "common/server.rs"]
@@ -9,6 +11,7 @@ mod server;
 use std::process::{Command, Output};
 use std::time::Duration;
 
+use course::Course;
 use proxy::Proxy;
 use serde_json::Value;
 use server::{Server, client_program};
@@ -138,23 +141,6 @@ async fn a_bridge_outlives_a_cut() {
     assert!(found["interventions_ticks"]["stale"].as_u64().unwrap() > 0, "the cut was not noticed: {found}");
 }
 
-/// A tick of a bridge's course.
-struct Tick {
-    time_s: f64,
-    force_n: [f64; 3],
-    state: String,
-}
-
-fn course(path: &std::path::Path) -> Vec<Tick> {
-    let text = std::fs::read_to_string(path).unwrap();
-    let tick = |line: &str| {
-        let fields: Vec<&str> = line.split(',').collect();
-        let number = |at: usize| fields[at].parse::<f64>().unwrap();
-        Tick { time_s: number(0), force_n: [number(4), number(5), number(6)], state: fields[7].to_owned() }
-    };
-    text.lines().skip(1).map(tick).collect()
-}
-
 /// The server is killed, the client is frozen: what leaves the client stays within the envelope, and comes back when the
 /// device's owner asks for it.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -185,32 +171,9 @@ async fn forces_stay_within_the_envelope_whatever_breaks() {
     signal("-CONT");
     let output = tokio::task::spawn_blocking(move || bridge.wait_with_output().unwrap()).await.unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    let ticks = course(&file);
-    std::fs::remove_file(&file).unwrap();
-    let length = |v: [f64; 3]| v.iter().map(|c| c * c).sum::<f64>().sqrt();
-    let mut pauses = Vec::new();
-    for pair in ticks.windows(2) {
-        let (before, now) = (&pair[0], &pair[1]);
-        assert!(now.force_n.iter().all(|c| c.is_finite()) && length(now.force_n) <= 3.3, "at {} s", now.time_s);
-        let change_n = length(std::array::from_fn(|c| now.force_n[c] - before.force_n[c]));
-        let most_n = 100.0 * (now.time_s - before.time_s).min(0.01) + 1e-5;
-        assert!(change_n <= most_n, "{change_n} N at {} s, at most {most_n}", now.time_s);
-        match (before.state.as_str(), now.state.as_str()) {
-            ("enabled", "paused") => pauses.push(now.time_s),
-            ("paused", "paused") => {
-                assert!(length(now.force_n) <= length(before.force_n) + 1e-6, "at {} s", now.time_s);
-            }
-            _ => {}
-        }
-    }
+    let course = Course::take(&file);
+    let pauses = course.keeps_to_the_envelope();
     // One for the server, one for the freeze.
     assert!(pauses.len() >= 2, "{pauses:?}");
-    for paused_s in &pauses {
-        let later = ticks.iter().filter(|tick| tick.time_s > paused_s + 0.3 && tick.state == "paused");
-        later
-            .take(50)
-            .for_each(|tick| assert!(length(tick.force_n) < 0.05, "{} N at {} s", length(tick.force_n), tick.time_s));
-    }
-    let last_s = pauses[pauses.len() - 1];
-    assert!(ticks.iter().any(|tick| tick.time_s > last_s && tick.state == "enabled"), "it never came back");
+    assert!(course.comes_back_after(pauses[pauses.len() - 1]), "it never came back");
 }

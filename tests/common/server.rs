@@ -35,7 +35,9 @@ pub fn client_program() -> PathBuf {
     BUILT
         .get_or_init(|| {
             let mut build = Command::new(env!("CARGO"));
-            build.args(["build", "--quiet", "--package", "palpate-client"]).current_dir(env!("CARGO_MANIFEST_DIR"));
+            // All programs, as `make build` does: a part of them might want other features of what both use, and so all
+            // of that once more.
+            build.args(["build", "--quiet", "--workspace", "--bins"]).current_dir(env!("CARGO_MANIFEST_DIR"));
             if !cfg!(debug_assertions) {
                 build.arg("--release");
             }

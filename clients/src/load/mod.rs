@@ -215,6 +215,7 @@ async fn trial(arguments: &Arguments, server: &Server, source: &Source, sessions
     }
     drop((ready, phases));
 
+    let streams = sessions as u64 * u64::from(arguments.clients_per_session + arguments.viewers);
     let mut progress = Progress::new(arguments, sessions, clock);
     let cpu_s = async {
         for _ in 0..threads {
@@ -230,6 +231,11 @@ async fn trial(arguments: &Arguments, server: &Server, source: &Source, sessions
         while begun.elapsed() < length {
             tokio::time::sleep((length - begun.elapsed()).min(Duration::from_secs(1))).await;
             progress.tell(&tallies);
+            // Nobody is left whom one could measure.
+            let broken: u64 = tallies.iter().map(|tally| lock(tally).broken).sum();
+            if broken > 0 && broken >= streams {
+                break;
+            }
         }
         let cores = (cpu_s()? - begun_s?) / begun.elapsed().as_secs_f64();
         Some(cores)

@@ -1,0 +1,122 @@
+//! Clients and servers are killed at random moments under load (`kill -9`): who is left goes on, tools are let go, clients
+//! come back by themselves, and what a device renders stays within its envelope throughout.
+//!
+//! Twice in every run of the tests; `make soak` does it KILLS=50 times (PALPATE_KILLS, and PALPATE_SEED for other moments).
+#![cfg(unix)]
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
+
+#[path = "common/course.rs"]
+mod course;
+#[path = "common/proxy.rs"]
+mod proxy;
+#[path = "common/random.rs"]
+mod random;
+#[path = "common/server.rs"]
+mod server;
+
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use course::Course;
+use palpate::wire::pb;
+use proxy::Proxy;
+use random::Random;
+use server::{PATIENCE, Server, client_program};
+
+/// Sessions of a load, each with a client that holds its tool 0.
+const SESSIONS: usize = 4;
+
+/// So long, s, a device is left alone after its server was killed: it finds the new one, touches, and is enabled again.
+const REST_S: u64 = 5;
+
+/// A program that is killed with whoever started it.
+struct Program(Child);
+
+impl Drop for Program {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+fn load(server: &Server) -> Program {
+    let sessions = SESSIONS.to_string();
+    let arguments = ["load", "--server", &server.url, "--sessions", &sessions, "--seconds", "600", "--ramp-s", "0.1"];
+    let child = Command::new(client_program()).args(arguments).stdout(Stdio::null()).stderr(Stdio::null()).spawn();
+    Program(child.unwrap())
+}
+
+/// Sessions of the paper's scene (the device's has another) of which a tool is held.
+async fn held(server: &Server) -> Vec<String> {
+    let listed = server.sessions().await.list_sessions(pb::ListSessionsRequest {}).await.unwrap().into_inner();
+    let held = listed.sessions.into_iter().filter(|one| one.scene_name == "paper" && !one.held_tools.is_empty());
+    held.map(|session| session.session_id).collect()
+}
+
+async fn held_at_last(server: &Server, wanted: usize) -> Vec<String> {
+    let begun = Instant::now();
+    loop {
+        let held = held(server).await;
+        if held.len() == wanted {
+            return held;
+        }
+        assert!(begun.elapsed() < PATIENCE, "{} sessions are held, not {wanted}", held.len());
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn who_is_killed_holds_nothing_and_who_is_left_comes_back() {
+    let of = |name: &str, otherwise: u64| std::env::var(name).map_or(otherwise, |text| text.parse().unwrap());
+    let (kills, seed) = (of("PALPATE_KILLS", 2), of("PALPATE_SEED", 1));
+    let mut random = Random(seed);
+    let mut moment = move || Duration::from_millis(random.below(1500));
+    let address = |server: &Server| server.url.trim_start_matches("http://").to_owned();
+    let mut server = Server::start(&["--log", "error"]);
+    let proxy = Proxy::start(address(&server), Duration::from_millis(2)).await;
+    let file = std::env::temp_dir().join(format!("palpate-kill-{}.csv", std::process::id()));
+    let begun = Instant::now();
+    // Ended when it has been killed often enough: how long that takes, nobody knows before.
+    let mut bridge = Program(
+        Command::new(client_program())
+            .args(["bridge", "--scene", "liver", "--server", &proxy.url(), "--course"])
+            .arg(&file)
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap(),
+    );
+    tokio::time::sleep(Duration::from_secs(REST_S)).await;
+    for kill in 1..=kills {
+        let mut clients = load(&server);
+        let before = held_at_last(&server, SESSIONS).await;
+        tokio::time::sleep(moment()).await;
+        clients.0.kill().unwrap();
+        held_at_last(&server, 0).await;
+        // Anybody may take them now.
+        for session_id in before {
+            let mut haptics = server.haptics().await;
+            let request = pb::AcquireToolRequest { session_id: session_id.clone(), tool: 0, ..Default::default() };
+            let lease_id = haptics.acquire_tool(request).await.unwrap().into_inner().lease_id;
+            haptics.release_tool(pb::ReleaseToolRequest { session_id, lease_id }).await.unwrap();
+        }
+        let mut clients = load(&server);
+        held_at_last(&server, SESSIONS).await;
+        tokio::time::sleep(moment()).await;
+        server.child.kill().unwrap();
+        // A load without a server has nothing to measure, and says so.
+        let ended = tokio::task::spawn_blocking(move || clients.0.wait().unwrap()).await.unwrap();
+        assert!(!ended.success());
+        tokio::time::sleep(moment()).await;
+        server = Server::start(&["--log", "error"]);
+        proxy.aim(address(&server));
+        tokio::time::sleep(Duration::from_secs(REST_S)).await;
+        println!("{kill} of {kills} after {:.0} s", begun.elapsed().as_secs_f64());
+    }
+    let told = Command::new("kill").args(["-INT", &bridge.0.id().to_string()]).status().unwrap();
+    assert!(told.success() && bridge.0.wait().unwrap().success());
+    let course = Course::take(&file);
+    let pauses = course.keeps_to_the_envelope();
+    assert!(pauses.len() >= kills as usize, "killed {kills} times, paused at {pauses:?} s");
+    assert!(course.comes_back_after(pauses[pauses.len() - 1]), "it never came back");
+}
