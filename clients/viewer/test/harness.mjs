@@ -108,7 +108,7 @@ export class Server {
 /**
  * @typedef {{
  *   frames: { taken: number, skipped: number, drawn: number }, received: number, largestM: number, deepestM: number, forceN: number[],
- *   holds: boolean, at: (x: number, y: number) => [number, number], pixelAfterPress: (x: number, y: number) => Promise<number>,
+ *   ageMs: number | undefined, picture: string, holds: boolean, at: (x: number, y: number) => [number, number], pixelAfterPress: (x: number, y: number) => Promise<number>,
  * }} Inside What the page tells of itself (src/main.ts).
  */
 
