@@ -37,6 +37,9 @@ import { Effort, isDrawnBySoftware } from "./effort";
 import type { Vec3 } from "./samples";
 import type { Surface } from "./surface";
 
+/** After so long without a frame there is a picture of what tools do. */
+const ALONE_MS = 40;
+
 /** A tool as the server has it. */
 export interface ShownTool {
   placeM: Vec3;
@@ -69,6 +72,8 @@ export class Stage {
   private readonly effort: Effort;
   private wireframe = false;
   private held = false;
+  /** A picture of tools, if no frame asks for one before. */
+  private later: ReturnType<typeof setTimeout> | undefined;
 
   /** `isFixed` keeps to the greatest effort, however long a picture takes. */
   constructor(
@@ -170,7 +175,8 @@ export class Stage {
       this.scene.add(mark.group);
     }
     this.marks.forEach((mark, index) => mark.show(this.held ? undefined : tools[index], size, mostN));
-    this.draw();
+    // What moves a tool moves tissue, and is seen with it: a picture of the tool alone would only keep that one waiting.
+    this.later ??= setTimeout(() => this.draw(), ALONE_MS);
   }
 
   /** For a measurement: tissue alone, and each picture made like the one before. */
@@ -266,6 +272,8 @@ export class Stage {
 
   private drawNow(askedMs: number): void {
     this.wanted = false;
+    clearTimeout(this.later);
+    this.later = undefined;
     this.surface?.refresh();
     this.renderer.render(this.scene, this.camera);
     this.drawn += 1;

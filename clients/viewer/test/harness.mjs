@@ -112,6 +112,14 @@ export class Server {
  * }} Inside What the page tells of itself (src/main.ts).
  */
 
+/** The processes that a browser runs pages in. @param {import("playwright-core").Browser} browser */
+export async function pageProcesses(browser) {
+  const session = await browser.newBrowserCDPSession();
+  const { processInfo } = await session.send("SystemInfo.getProcessInfo");
+  await session.detach();
+  return processInfo.filter(({ type }) => type === "renderer").map(({ id }) => id);
+}
+
 /** A page, and all that its console was told. */
 export class Page {
   /**
