@@ -283,7 +283,8 @@ function frameAgeMs(): number | undefined {
 /** For tests and measurements: what the page has, as numbers. */
 const inside = {
   get frames() {
-    return { taken: visit?.frames.taken ?? 0, skipped: Number(visit?.frames.skipped ?? 0), drawn: stage.drawn };
+    const { taken, skipped, newest } = visit?.frames ?? { taken: 0, skipped: 0n };
+    return { taken, skipped: Number(skipped), drawn: stage.drawn, timeS: newest?.timeS ?? 0 };
   },
   get received() {
     return received.bytes;

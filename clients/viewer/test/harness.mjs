@@ -107,7 +107,7 @@ export class Server {
 
 /**
  * @typedef {{
- *   frames: { taken: number, skipped: number, drawn: number }, received: number, largestM: number, deepestM: number, forceN: number[],
+ *   frames: { taken: number, skipped: number, drawn: number, timeS: number }, received: number, largestM: number, deepestM: number, forceN: number[],
  *   ageMs: number | undefined, picture: string, holds: boolean, at: (x: number, y: number) => [number, number], pixelAfterPress: (x: number, y: number) => Promise<number>,
  * }} Inside What the page tells of itself (src/main.ts).
  */
