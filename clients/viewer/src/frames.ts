@@ -1,16 +1,12 @@
-// Frames: the surface as it changes, on credit, so that no queue grows between the server and the picture.
+// Frames: the surface as it changes. A worker takes them in (intake.ts); here the newest is put on the surface.
 
-import { Encoding, type WatchFramesResponse } from "./gen/palpate/v1/view_pb";
-import { keepOpen, PATIENCE_MS, views } from "./server";
+import type { News, Order, Trouble } from "./intake";
+import { caller, type Failure, received } from "./server";
 import type { Surface } from "./surface";
-
-/** Frames on their way: a round trip of 60 ms at 60 frames a second. */
-const IN_FLIGHT = 4;
 
 export interface FrameTold {
   step: bigint;
   timeS: number;
-  isFull: boolean;
 }
 
 export class Frames {
@@ -20,62 +16,30 @@ export class Frames {
   newest: FrameTold | undefined;
   onFrame: (frame: FrameTold) => void = () => {};
 
+  /** Until it is aborted. The worker goes then, and its stream with it. */
   run(
     sessionId: string,
     refinement: number,
     surface: Surface,
     signal: AbortSignal,
-    onFailure: (error: unknown, waitMs: number) => void,
-  ): Promise<void> {
-    return keepOpen(
-      async (signal, alive) => {
-        const request = { sessionId, refinement, encoding: Encoding.I16, maxFramesInFlight: IN_FLIGHT };
-        const credit = new Credit(signal);
-        let parts: WatchFramesResponse[] = [];
-        const before = this.skipped;
-        for await (const part of views.watchFrames(request, { signal })) {
-          alive();
-          parts.push(part);
-          if (!part.last) continue;
-          // Between the parts of a frame nothing is drawn.
-          surface.apply(parts);
-          this.taken += 1;
-          this.skipped = before + part.skippedFrames;
-          this.newest = { step: part.step, timeS: part.simulationTimeS, isFull: part.full };
-          parts = [];
-          credit.giveBack(part.viewerId, part.frameId);
-          this.onFrame(this.newest);
-        }
-      },
-      signal,
-      onFailure,
-    );
-  }
-}
-
-/** Acknowledges frames, one message at a time, always the newest. */
-class Credit {
-  private due: [string, bigint] | undefined;
-  private underWay = false;
-
-  constructor(private readonly signal: AbortSignal) {}
-
-  giveBack(viewerId: string, frameId: bigint): void {
-    this.due = [viewerId, frameId];
-    if (!this.underWay) void this.send();
-  }
-
-  private async send(): Promise<void> {
-    this.underWay = true;
-    while (this.due && !this.signal.aborted) {
-      const [viewerId, frameId] = this.due;
-      this.due = undefined;
-      try {
-        await views.acknowledgeFrames({ viewerId, frameId }, { signal: this.signal, timeoutMs: PATIENCE_MS });
-      } catch {
-        // The stream fails as well, and tells; or the next acknowledgement covers this one.
-      }
-    }
-    this.underWay = false;
+    onFailure: (failure: Failure, waitMs: number) => void,
+  ): void {
+    const worker = new Worker(new URL("./intake.ts", import.meta.url), { type: "module", name: "frames" });
+    signal.addEventListener("abort", () => worker.terminate());
+    const before = this.skipped;
+    worker.onmessage = ({ data }: MessageEvent<News | Trouble>) => {
+      if (signal.aborted) return;
+      if ("failure" in data) return onFailure(data.failure, data.waitMs);
+      surface.field.copyFrom(data.values, data.changed);
+      worker.postMessage(data.values, [data.values.buffer]);
+      this.taken += data.taken;
+      this.skipped = before + data.skipped;
+      received.bytes += data.bytes;
+      this.newest = { step: data.step, timeS: data.timeS };
+      this.onFrame(this.newest);
+    };
+    worker.onerror = (event) => onFailure({ isGone: false, text: event.message || "frames can't be taken in" }, 0);
+    const vertices: [number, number] = [surface.field.nx, surface.field.ny];
+    worker.postMessage({ sessionId, token: caller.token, refinement, vertices } satisfies Order);
   }
 }

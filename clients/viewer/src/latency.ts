@@ -20,7 +20,7 @@ export class Latency {
 
   /** Resolves with the milliseconds from the next press to when the pixel at (x, y) of the window has changed. */
   next(x: number, y: number): Promise<number> {
-    this.stage.hideTools();
+    this.stage.hold(true);
     return new Promise((done) => {
       this.watch = { x, y, before: new Uint8Array(), pressedMs: undefined, done };
       this.stage.draw();
@@ -44,6 +44,7 @@ export class Latency {
     const difference = [0, 1, 2].reduce((sum, i) => sum + Math.abs(now[i]! - watch.before[i]!), 0);
     if (difference < SEEN) return;
     this.watch = undefined;
+    this.stage.hold(false);
     watch.done(performance.now() - watch.pressedMs);
   }
 }

@@ -9,7 +9,7 @@ import { asked, askedNumber, holderName, part, writeAddress } from "./page";
 import { Plots, quantity } from "./plot";
 import { norm, type Vec3 } from "./samples";
 import { playScript } from "./script";
-import { backoffMs, describe, isGone, PATIENCE_MS, reasonOf, received, sessions, sleep } from "./server";
+import { backoffMs, describe, type Failure, isGone, PATIENCE_MS, reasonOf, received, sessions, sleep } from "./server";
 import { Stage } from "./stage";
 import { Status } from "./status";
 import { tissueTexture } from "./texture";
@@ -116,9 +116,9 @@ function wellText(session: Session): string {
   return `Connected to a session of ${name}.`;
 }
 
-function trouble(error: unknown, waitMs: number): void {
-  if (isGone(error)) return over("The session has ended.");
-  status.say(`Connection lost (${describe(error)}). Trying again in ${(waitMs / 1000).toFixed(1)} s.`);
+function trouble(failure: Failure, waitMs: number): void {
+  if (failure.isGone) return over("The session has ended.");
+  status.say(`Connection lost (${failure.text}). Trying again in ${(waitMs / 1000).toFixed(1)} s.`);
 }
 
 /** What the session says of itself. */
@@ -242,15 +242,15 @@ setInterval(() => {
 setInterval(() => {
   if (!visit || document.hidden) return;
   const { session, samples, frames } = visit;
-  const now = visit.nowS();
   const { newest } = samples;
   status.show({
     roundTripMs: visit.roundTripMs,
     networkMs: visit.hand.networkMs,
-    frameAgeMs: now && frames.newest && Math.max(0, 1000 * (now - frames.newest.timeS)),
+    frameAgeMs: frameAgeMs(),
     framesTaken: frames.taken,
     framesDrawn: stage.drawn,
     framesSkipped: frames.skipped,
+    picture: stage.describe(),
     overruns: newest?.overrunCount ?? session.overrunCount,
     dilation: newest?.timeDilation ?? session.timeDilation,
     awakePoints: newest?.awakePoints,
@@ -274,13 +274,26 @@ async function lists(): Promise<void> {
   }
 }
 
+/** Of the newest frame here. */
+function frameAgeMs(): number | undefined {
+  const [now, newest] = [visit?.nowS(), visit?.frames.newest];
+  return now === undefined || !newest ? undefined : Math.max(0, 1000 * (now - newest.timeS));
+}
+
 /** For tests and measurements: what the page has, as numbers. */
 const inside = {
   get frames() {
-    return { taken: visit?.frames.taken ?? 0, skipped: Number(visit?.frames.skipped ?? 0), drawn: stage.drawn };
+    const { taken, skipped, newest } = visit?.frames ?? { taken: 0, skipped: 0n };
+    return { taken, skipped: Number(skipped), drawn: stage.drawn, timeS: newest?.timeS ?? 0 };
   },
   get received() {
     return received.bytes;
+  },
+  get ageMs() {
+    return frameAgeMs();
+  },
+  get picture() {
+    return stage.describe();
   },
   get largestM() {
     return visit?.surface.largestM() ?? 0;

@@ -1,5 +1,7 @@
 // Parts of the page by their names, and what its address asks for (README, "The page").
 
+import { caller } from "./server";
+
 export function part<T extends HTMLElement>(id: string, kind: new () => T): T {
   const element = document.getElementById(id);
   if (!(element instanceof kind)) throw new Error(`the page has no ${id}`);
@@ -35,3 +37,21 @@ export function holderName(): string {
   }
   return name;
 }
+
+/**
+ * Takes the token out of the address (`#token=…`), which people share. It is behind `#` so that no server is sent it and no
+ * log has it. True if there was one.
+ */
+function keepToken(): boolean {
+  const behind = new URLSearchParams(location.hash.slice(1));
+  const token = behind.get("token");
+  if (token === null) return false;
+  sessionStorage.setItem("token", token.trim());
+  history.replaceState(history.state, "", location.pathname + location.search);
+  return true;
+}
+
+keepToken();
+caller.token = sessionStorage.getItem("token") ?? "";
+// A token that is put behind the address of a page that is open already loads nothing by itself.
+addEventListener("hashchange", () => keepToken() && location.reload());

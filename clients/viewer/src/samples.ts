@@ -2,7 +2,7 @@
 
 import type { GridPoint, Vector3 } from "./gen/palpate/v1/geometry_pb";
 import type { Sample } from "./gen/palpate/v1/haptic_pb";
-import { haptics, keepOpen } from "./server";
+import { type Failure, haptics, keepOpen } from "./server";
 
 export type Vec3 = [number, number, number];
 
@@ -54,7 +54,7 @@ export class Samples {
     sessionId: string,
     stepRateHz: number,
     signal: AbortSignal,
-    onFailure: (error: unknown, waitMs: number) => void,
+    onFailure: (failure: Failure, waitMs: number) => void,
   ): Promise<void> {
     const sampleEverySteps = Math.max(1, Math.round(stepRateHz / RATE_HZ));
     return keepOpen(

@@ -23,27 +23,12 @@ const counted: typeof fetch = async (input, init) => {
   return new Response(answer.body.pipeThrough(count), answer);
 };
 
-/**
- * Takes the token out of the address (`#token=…`), which people share. It is behind `#` so that no server is sent it and no
- * log has it. True if there was one.
- */
-function keepToken(): boolean {
-  const behind = new URLSearchParams(location.hash.slice(1));
-  const token = behind.get("token");
-  if (token === null) return false;
-  sessionStorage.setItem("token", token.trim());
-  history.replaceState(history.state, "", location.pathname + location.search);
-  return true;
-}
-
-keepToken();
-// A token that is put behind the address of a page that is open already loads nothing by itself.
-addEventListener("hashchange", () => keepToken() && location.reload());
+/** Who calls: the token that the page was given (page.ts), or nothing. */
+export const caller = { token: "" };
 
 /** Shows with every call who calls, if a token was given. */
 const identified: Interceptor = (next) => (request) => {
-  const token = sessionStorage.getItem("token");
-  if (token) request.header.set("authorization", `Bearer ${token}`);
+  if (caller.token) request.header.set("authorization", `Bearer ${caller.token}`);
   return next(request);
 };
 
@@ -100,11 +85,18 @@ export function backoffMs(failures: number): number {
   return Math.min(8000, 250 * 2 ** Math.min(failures, 6)) * (0.75 + 0.5 * Math.random());
 }
 
+/** What went wrong with a stream, as a worker can tell it too. */
+export interface Failure {
+  /** The session is over, and won't come back. */
+  isGone: boolean;
+  text: string;
+}
+
 /** Keeps a stream open until it is aborted or the session is gone. `onFailure` gets what went wrong and the wait. */
 export async function keepOpen(
   read: (signal: AbortSignal, alive: () => void) => Promise<void>,
   signal: AbortSignal,
-  onFailure: (error: unknown, waitMs: number) => void,
+  onFailure: (failure: Failure, waitMs: number) => void,
 ): Promise<void> {
   let failures = 0;
   while (!signal.aborted) {
@@ -115,7 +107,7 @@ export async function keepOpen(
       if (signal.aborted) return;
       const waitMs = backoffMs(failures);
       failures += 1;
-      onFailure(error, waitMs);
+      onFailure({ isGone: isGone(error), text: describe(error) }, waitMs);
       if (isGone(error)) return;
       await sleep(waitMs, signal);
     }

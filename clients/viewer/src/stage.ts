@@ -33,19 +33,12 @@ import {
 } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { RoomEnvironment } from "three/addons/environments/RoomEnvironment.js";
+import { Effort, isDrawnBySoftware } from "./effort";
 import type { Vec3 } from "./samples";
 import type { Surface } from "./surface";
 
-/** Pictures that follow one another and take longer than this each, so many times, are drawn with less effort. */
-const SLOW_MS = 45;
-const SLOW_TIMES = 5;
-/** Efforts, the greatest first: the part of the window's pixels along a side, and whether light is worked out physically. */
-const EFFORTS = [
-  { pixels: 1, isPhysical: true },
-  { pixels: 0.7, isPhysical: true },
-  { pixels: 0.7, isPhysical: false },
-  { pixels: 0.5, isPhysical: false },
-] as const;
+/** After so long without a frame there is a picture of what tools do. */
+const ALONE_MS = 40;
 
 /** A tool as the server has it. */
 export interface ShownTool {
@@ -75,17 +68,22 @@ export class Stage {
   private readonly aim: Mesh;
   private extentM = new Vector2(1, 1);
   private wanted = false;
-  private slow = 0;
   private before = 0;
-  private effort = 0;
+  private readonly effort: Effort;
   private wireframe = false;
+  private held = false;
+  /** A picture of tools, if no frame asks for one before. */
+  private later: ReturnType<typeof setTimeout> | undefined;
 
   /** `isFixed` keeps to the greatest effort, however long a picture takes. */
   constructor(
     private readonly canvas: HTMLCanvasElement,
-    private readonly isFixed: boolean,
+    isFixed: boolean,
   ) {
-    this.renderer = new WebGLRenderer({ canvas, antialias: true });
+    const isSoftware = isDrawnBySoftware();
+    this.effort = new Effort(isSoftware, isFixed);
+    // Smooth edges cost nothing, or, without a graphics processor, several times all else.
+    this.renderer = new WebGLRenderer({ canvas, antialias: isFixed || !isSoftware });
     this.renderer.outputColorSpace = SRGBColorSpace;
     this.renderer.toneMapping = ACESFilmicToneMapping;
     const room = new PMREMGenerator(this.renderer);
@@ -132,6 +130,7 @@ export class Stage {
     if (this.mesh && this.lines) this.scene.remove(this.mesh, this.lines);
     this.surface?.dispose();
     this.surface = surface;
+    surface.drawEvery(this.effort.now.every);
     if (texture) {
       this.skin.map?.dispose();
       this.skin.map = this.skin.bumpMap = this.plain.map = texture;
@@ -162,7 +161,7 @@ export class Stage {
 
   setWireframe(on: boolean): void {
     this.wireframe = on;
-    const skin = EFFORTS[this.effort]!.isPhysical ? this.skin : this.plain;
+    const skin = this.effort.now.isPhysical ? this.skin : this.plain;
     if (this.mesh) this.mesh.material = on ? this.hidden : skin;
     if (this.lines) this.lines.visible = on;
     this.draw();
@@ -175,13 +174,20 @@ export class Stage {
       this.marks.push(mark);
       this.scene.add(mark.group);
     }
-    this.marks.forEach((mark, index) => mark.show(tools[index], size, mostN));
-    this.draw();
+    this.marks.forEach((mark, index) => mark.show(this.held ? undefined : tools[index], size, mostN));
+    // What moves a tool moves tissue, and is seen with it: a picture of the tool alone would only keep that one waiting.
+    this.later ??= setTimeout(() => this.draw(), ALONE_MS);
   }
 
-  /** Tissue alone, for a measurement of it. */
-  hideTools(): void {
-    for (const mark of this.marks) mark.group.visible = false;
+  /** For a measurement: tissue alone, and each picture made like the one before. */
+  hold(on: boolean): void {
+    this.held = on;
+    if (on) for (const mark of this.marks) mark.group.visible = false;
+  }
+
+  /** What there is less of in a picture than there could be. */
+  describe(): string {
+    return this.effort.describe(this.surface?.every ?? 1);
   }
 
   setAim(at: Vec3 | undefined): void {
@@ -266,14 +272,20 @@ export class Stage {
 
   private drawNow(askedMs: number): void {
     this.wanted = false;
+    clearTimeout(this.later);
+    this.later = undefined;
+    this.surface?.refresh();
     this.renderer.render(this.scene, this.camera);
     this.drawn += 1;
     this.onDrawn();
-    // Only pictures that were waited for tell how long one takes: the graphics processor works on by itself.
-    const now = performance.now();
-    const tookMs = now - Math.max(this.before, askedMs);
-    this.before = now;
-    this.adapt(tookMs);
+    // The browser may keep the page waiting until the picture is there: only afterwards it is known how long one takes.
+    setTimeout(() => {
+      const now = performance.now();
+      // Only pictures that were waited for tell.
+      const tookMs = now - Math.max(this.before, askedMs);
+      this.before = now;
+      this.adapt(tookMs);
+    });
   }
 
   /** One pixel of the picture, straight after it was drawn; waits for the graphics processor. */
@@ -286,12 +298,10 @@ export class Stage {
     return colour;
   }
 
-  /** Without a graphics processor plainer pictures are better than fewer. */
+  /** Plainer pictures are better than fewer. */
   private adapt(tookMs: number): void {
-    this.slow = tookMs > SLOW_MS ? this.slow + 1 : 0;
-    if (this.isFixed || this.slow < SLOW_TIMES || this.effort + 1 === EFFORTS.length) return;
-    this.slow = 0;
-    this.effort += 1;
+    if (this.held || !this.effort.tell(tookMs)) return;
+    this.surface?.drawEvery(this.effort.now.every);
     this.setWireframe(this.wireframe);
     this.resize();
   }
@@ -299,7 +309,7 @@ export class Stage {
   private resize(): void {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     if (width === 0 || height === 0) return;
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2) * EFFORTS[this.effort]!.pixels);
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2) * this.effort.now.pixels);
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
     // A narrow window sees the whole sheet as well.

@@ -10,6 +10,8 @@ export interface Figures {
   framesTaken: number;
   framesDrawn: number;
   framesSkipped: bigint;
+  /** What there is less of in a picture than there could be. */
+  picture: string;
   overruns: bigint;
   dilation: number;
   awakePoints?: number;
@@ -43,6 +45,7 @@ export class Status {
     this.set("of commands, network alone", inMs(figures.networkMs));
     this.set("frame age", figures.isAsleep ? "still" : inMs(figures.frameAgeMs));
     this.set("frames", `${taken.toFixed(0)}/s, drawn ${drawn.toFixed(0)}/s, skipped ${figures.framesSkipped}`);
+    this.set("picture", figures.picture);
     this.set("received", bytes >= 1e6 ? `${(bytes / 1e6).toFixed(2)} MB/s` : `${(bytes / 1e3).toFixed(1)} kB/s`);
     this.set("overruns", String(figures.overruns));
     this.set("time", `${figures.dilation.toFixed(2)} × real`);

@@ -1,53 +1,66 @@
-// The surface: every vertex's displacement as the server sent it, positions and normals for the picture.
+// The surface as it is drawn: positions and normals of all vertices, or of every second or fourth a side.
 
 import { BufferAttribute, BufferGeometry, DynamicDrawUsage } from "three";
-import { Encoding, type Patch, type WatchFramesResponse } from "./gen/palpate/v1/view_pb";
+import { Field, type Rectangle } from "./field";
 
-/** Rows a0 … a1 and columns b0 … b1 of vertices, the last ones included. */
-interface Rectangle {
-  a0: number;
-  a1: number;
-  b0: number;
-  b1: number;
-}
+/** A sheet that is drawn with fewer vertices than this is seen to be. */
+const LEAST_VERTICES = 6000;
 
 export class Surface {
+  readonly field: Field;
   /** Of the triangles. */
   readonly geometry = new BufferGeometry();
   /** Of the lines between mass points. */
   readonly lines = new BufferGeometry();
-  private readonly position: BufferAttribute;
-  private readonly normal: BufferAttribute;
-  private readonly displacementM: Float32Array;
+  /** One vertex in so many a side is drawn, and the last. */
+  every = 0;
+  /** Of the vertices that are drawn: row i is row `rows[i]` of all. */
+  private rows = new Uint32Array();
+  private columns = new Uint32Array();
+  private position = new BufferAttribute(new Float32Array(), 3);
+  private normal = this.position;
 
   /**
-   * Vertex (a, b) has index a·ny + b, rests at (a, b, 0)·spacing, and has texture coordinates (a/(nx − 1), b/(ny − 1)):
-   * what `GetMesh` would tell, at megabytes. `every` vertices is a mass point.
+   * Vertex (a, b) rests at (a, b, 0)·spacing, and has texture coordinates (a/(nx − 1), b/(ny − 1)): what `GetMesh` would
+   * tell, at megabytes. `pointEvery` vertices is a mass point.
    */
   constructor(
-    readonly nx: number,
-    readonly ny: number,
-    readonly spacingM: number,
-    every: number,
+    nx: number,
+    ny: number,
+    private readonly spacingM: number,
+    private readonly pointEvery: number,
   ) {
-    const vertices = nx * ny;
-    this.displacementM = new Float32Array(3 * vertices);
-    this.position = new BufferAttribute(new Float32Array(3 * vertices), 3).setUsage(DynamicDrawUsage);
-    this.normal = new BufferAttribute(new Float32Array(3 * vertices), 3).setUsage(DynamicDrawUsage);
-    const uv = new Float32Array(2 * vertices);
-    for (let a = 0, i = 0; a < nx; a++) {
-      for (let b = 0; b < ny; b++, i++) {
-        this.position.setXYZ(i, a * spacingM, b * spacingM, 0);
-        this.normal.setXYZ(i, 0, 0, 1);
-        uv[2 * i] = a / Math.max(nx - 1, 1);
-        uv[2 * i + 1] = b / Math.max(ny - 1, 1);
+    this.field = new Field(nx, ny);
+    this.drawEvery(1);
+  }
+
+  /** Draws one vertex in `wanted` a side, or more where those would be too few. True if that is another number. */
+  drawEvery(wanted: number): boolean {
+    const { nx, ny } = this.field;
+    let every = wanted;
+    while (every > 1 && nx * ny < LEAST_VERTICES * every * every) every /= 2;
+    if (every === this.every) return false;
+    this.every = every;
+    const among = (n: number) => Uint32Array.from({ length: Math.ceil((n - 1) / every) + 1 }, (_, i) => Math.min(i * every, n - 1));
+    const [rows, columns] = [among(nx), among(ny)];
+    [this.rows, this.columns] = [rows, columns];
+    // What the graphics processor has of the old ones goes.
+    this.dispose();
+    const [mx, my] = [rows.length, columns.length];
+    this.position = new BufferAttribute(new Float32Array(3 * mx * my), 3).setUsage(DynamicDrawUsage);
+    this.normal = new BufferAttribute(new Float32Array(3 * mx * my), 3).setUsage(DynamicDrawUsage);
+    const uv = new Float32Array(2 * mx * my);
+    for (let a = 0, i = 0; a < mx; a++) {
+      for (let b = 0; b < my; b++, i++) {
+        uv[2 * i] = rows[a]! / Math.max(nx - 1, 1);
+        uv[2 * i + 1] = columns[b]! / Math.max(ny - 1, 1);
       }
     }
-    const triangles = new Uint32Array(6 * (nx - 1) * (ny - 1));
-    for (let a = 0, t = 0; a + 1 < nx; a++) {
-      for (let b = 0; b + 1 < ny; b++, t += 6) {
-        const corner = a * ny + b;
-        triangles.set([corner, corner + ny, corner + ny + 1, corner, corner + ny + 1, corner + 1], t);
+    const triangles = new Uint32Array(6 * (mx - 1) * (my - 1));
+    for (let a = 0, t = 0; a + 1 < mx; a++) {
+      for (let b = 0; b + 1 < my; b++, t += 6) {
+        const corner = a * my + b;
+        triangles.set([corner, corner + my, corner + my + 1, corner, corner + my + 1, corner + 1], t);
       }
     }
     this.geometry.setAttribute("position", this.position);
@@ -55,65 +68,51 @@ export class Surface {
     this.geometry.setAttribute("uv", new BufferAttribute(uv, 2));
     this.geometry.setIndex(new BufferAttribute(triangles, 1));
     this.lines.setAttribute("position", this.position);
-    this.lines.setIndex(new BufferAttribute(gridLines(nx, ny, every), 1));
+    this.lines.setIndex(new BufferAttribute(gridLines(rows, columns, this.pointEvery), 1));
+    this.work({ a0: 0, a1: mx - 1, b0: 0, b1: my - 1 });
+    return true;
   }
 
-  /** Writes the patches of a whole frame over what is shown. */
-  apply(parts: WatchFramesResponse[]): void {
-    let first = this.nx;
-    let last = -1;
-    const changed: Rectangle[] = [];
-    for (const part of parts) {
-      for (const patch of part.patches) {
-        this.write(part, patch);
-        const [a0, b0] = [patch.firstX, patch.firstY];
-        changed.push({ a0, a1: a0 + patch.countX - 1, b0, b1: b0 + patch.countY - 1 });
-      }
-    }
-    for (const { a0, a1, b0, b1 } of changed) {
-      // The normals around a patch change as well.
-      const wider = {
-        a0: Math.max(a0 - 1, 0),
-        a1: Math.min(a1 + 1, this.nx - 1),
-        b0: Math.max(b0 - 1, 0),
-        b1: Math.min(b1 + 1, this.ny - 1),
-      };
-      this.turn(wider);
-      first = Math.min(first, wider.a0);
-      last = Math.max(last, wider.a1);
-    }
-    if (last < first) return;
+  /** Before a picture: makes positions and normals of what changed since the last. */
+  refresh(): void {
+    const changed = this.field.takeChanged();
+    if (!changed) return;
+    const { nx, ny } = this.field;
+    const end = (last: number, n: number, among: Uint32Array) =>
+      last === n - 1 ? among.length - 1 : Math.floor(last / this.every);
+    this.work({
+      a0: Math.ceil(changed.a0 / this.every),
+      a1: end(changed.a1, nx, this.rows),
+      b0: Math.ceil(changed.b0 / this.every),
+      b1: end(changed.b1, ny, this.columns),
+    });
+  }
+
+  private work({ a0, a1, b0, b1 }: Rectangle): void {
+    if (a1 < a0 || b1 < b0) return;
+    this.place({ a0, a1, b0, b1 });
+    // The normals around it change as well.
+    const [mx, my] = [this.rows.length, this.columns.length];
+    const [first, last] = [Math.max(a0 - 1, 0), Math.min(a1 + 1, mx - 1)];
+    this.turn({ a0: first, a1: last, b0: Math.max(b0 - 1, 0), b1: Math.min(b1 + 1, my - 1) });
     for (const attribute of [this.position, this.normal]) {
-      attribute.addUpdateRange(3 * first * this.ny, 3 * (last - first + 1) * this.ny);
+      attribute.addUpdateRange(3 * first * my, 3 * (last - first + 1) * my);
       attribute.needsUpdate = true;
     }
   }
 
-  private write(part: WatchFramesResponse, patch: Patch): void {
-    const { displacement: bytes, firstX, firstY, countX, countY } = patch;
-    const isWhole = part.encoding === Encoding.I16;
-    const size = 3 * countX * countY;
-    if (bytes.byteLength !== size * (isWhole ? 2 : 4) || firstX + countX > this.nx || firstY + countY > this.ny) {
-      throw new RangeError("a patch is not of this surface");
-    }
-    // Numbers lie anywhere in a message: copied, they are aligned. Browsers' machines are little-endian, as the wire is.
-    const own = bytes.slice().buffer;
-    const q = isWhole ? new Int16Array(own) : new Float32Array(own);
-    const [o, s] = [part.originM, part.scaleM];
-    const origin = [o?.x ?? 0, o?.y ?? 0, o?.z ?? 0] as const;
-    const scale = isWhole ? ([s?.x ?? 0, s?.y ?? 0, s?.z ?? 0] as const) : ([1, 1, 1] as const);
-    const positions = this.position.array as Float32Array;
-    for (let a = firstX, k = 0; a < firstX + countX; a++) {
-      for (let b = firstY, i = 3 * (a * this.ny + firstY); b < firstY + countY; b++, i += 3, k += 3) {
-        const x = origin[0] + scale[0] * q[k]!;
-        const y = origin[1] + scale[1] * q[k + 1]!;
-        const z = origin[2] + scale[2] * q[k + 2]!;
-        this.displacementM[i] = x;
-        this.displacementM[i + 1] = y;
-        this.displacementM[i + 2] = z;
-        positions[i] = a * this.spacingM + x;
-        positions[i + 1] = b * this.spacingM + y;
-        positions[i + 2] = z;
+  private place({ a0, a1, b0, b1 }: Rectangle): void {
+    const { rows, columns, spacingM } = this;
+    const { ny, displacementM: d } = this.field;
+    const p = this.position.array as Float32Array;
+    for (let a = a0; a <= a1; a++) {
+      const row = rows[a]!;
+      for (let b = b0, i = 3 * (a * columns.length + b0); b <= b1; b++, i += 3) {
+        const column = columns[b]!;
+        const k = 3 * (row * ny + column);
+        p[i] = row * spacingM + d[k]!;
+        p[i + 1] = column * spacingM + d[k + 1]!;
+        p[i + 2] = d[k + 2]!;
       }
     }
   }
@@ -122,7 +121,7 @@ export class Surface {
   private turn({ a0, a1, b0, b1 }: Rectangle): void {
     const p = this.position.array as Float32Array;
     const n = this.normal.array as Float32Array;
-    const [nx, ny] = [this.nx, this.ny];
+    const [nx, ny] = [this.rows.length, this.columns.length];
     for (let a = a0; a <= a1; a++) {
       const before = a > 0 ? -3 * ny : 0;
       const after = a + 1 < nx ? 3 * ny : 0;
@@ -149,16 +148,16 @@ export class Surface {
 
   /** Displacement of the vertex nearest to a place of the rest plane. */
   displacementAtM(xM: number, yM: number): [number, number, number] {
+    const { nx, ny, displacementM: d } = this.field;
     const near = (at: number, count: number) => Math.min(Math.max(Math.round(at / this.spacingM), 0), count - 1);
-    const i = 3 * (near(xM, this.nx) * this.ny + near(yM, this.ny));
-    const d = this.displacementM;
+    const i = 3 * (near(xM, nx) * ny + near(yM, ny));
     return [d[i]!, d[i + 1]!, d[i + 2]!];
   }
 
   /** The largest displacement of any vertex, m. */
   largestM(): number {
     let most = 0;
-    const d = this.displacementM;
+    const d = this.field.displacementM;
     for (let i = 0; i < d.length; i += 3) most = Math.max(most, d[i]! ** 2 + d[i + 1]! ** 2 + d[i + 2]! ** 2);
     return Math.sqrt(most);
   }
@@ -169,15 +168,15 @@ export class Surface {
   }
 }
 
-/** Lines along the rows and columns of mass points, through the vertices between them. */
-function gridLines(nx: number, ny: number, every: number): Uint32Array {
+/** Lines along rows and columns of mass points, through the vertices between them; of all that are drawn. */
+function gridLines(rows: Uint32Array, columns: Uint32Array, pointEvery: number): Uint32Array {
   const ends: number[] = [];
-  for (let a = 0; a < nx; a++) {
-    for (let b = 0; b < ny; b++) {
-      const i = a * ny + b;
-      if (a % every === 0 && b + 1 < ny) ends.push(i, i + 1);
-      if (b % every === 0 && a + 1 < nx) ends.push(i, i + ny);
-    }
-  }
+  rows.forEach((row, a) => {
+    columns.forEach((column, b) => {
+      const i = a * columns.length + b;
+      if (row % pointEvery === 0 && b + 1 < columns.length) ends.push(i, i + 1);
+      if (column % pointEvery === 0 && a + 1 < rows.length) ends.push(i, i + columns.length);
+    });
+  });
   return new Uint32Array(ends);
 }

@@ -4,7 +4,7 @@ import { Frames } from "./frames";
 import type { Session } from "./gen/palpate/v1/session_pb";
 import { Hand, type Reach } from "./hand";
 import { Samples } from "./samples";
-import { isGone, keepOpen, PATIENCE_MS, sessions, sleep } from "./server";
+import { type Failure, keepOpen, PATIENCE_MS, sessions, sleep } from "./server";
 import { Surface } from "./surface";
 
 /** Between two questions after the session. */
@@ -18,7 +18,7 @@ const MOST_VERTICES = 1_500_000;
 /** What a visit tells of itself. */
 export interface Told {
   onSession: (session: Session) => void;
-  onTrouble: (error: unknown, waitMs: number) => void;
+  onTrouble: (failure: Failure, waitMs: number) => void;
   onWell: () => void;
 }
 
@@ -38,7 +38,7 @@ export class Visit {
   private seen = new AbortController();
   private watching = new AbortController();
   /** Simulated less local time, s, by the fastest answer of late, and that answer's round trip. */
-  private clock: { offsetS: number; roundTripMs: number; atMs: number } | undefined;
+  private clock: { offsetS: number; roundTripMs: number; atMs: number; overruns: bigint } | undefined;
 
   constructor(
     public session: Session,
@@ -96,7 +96,7 @@ export class Visit {
     this.watching = new AbortController();
     const { signal } = this.watching;
     this.seen.signal.addEventListener("abort", () => this.watching.abort());
-    void this.frames.run(this.session.sessionId, this.refinement, this.surface, signal, this.told.onTrouble);
+    this.frames.run(this.session.sessionId, this.refinement, this.surface, signal, this.told.onTrouble);
   }
 
   /** Closes the streams, and leaves the session as it is. */
@@ -139,9 +139,9 @@ export class Visit {
         }
       },
       this.ended.signal,
-      (error, waitMs) => {
-        if (isGone(error)) this.leave();
-        this.told.onTrouble(error, waitMs);
+      (failure, waitMs) => {
+        if (failure.isGone) this.leave();
+        this.told.onTrouble(failure, waitMs);
       },
     );
   }
@@ -150,11 +150,14 @@ export class Visit {
     this.session = session;
     const roundTripMs = endedMs - begunMs;
     this.roundTripMs = roundTripMs;
-    // The fastest answer says best when it was; after a while others are heard again, for clocks drift and steps are dropped.
+    // The fastest answer says best when it was. After a while others are heard again, for clocks drift, and when steps were
+    // dropped.
     const clock = this.clock;
-    if (!clock || roundTripMs <= clock.roundTripMs || endedMs - clock.atMs > 10_000) {
+    const overruns = session.overrunCount;
+    const isOld = clock && (endedMs - clock.atMs > 10_000 || overruns !== clock.overruns);
+    if (!clock || isOld || roundTripMs <= clock.roundTripMs) {
       const middleS = (begunMs + endedMs) / 2000;
-      this.clock = { offsetS: session.simulationTimeS - middleS, roundTripMs, atMs: endedMs };
+      this.clock = { offsetS: session.simulationTimeS - middleS, roundTripMs, atMs: endedMs, overruns };
     }
     this.told.onSession(session);
     this.told.onWell();

@@ -107,10 +107,18 @@ export class Server {
 
 /**
  * @typedef {{
- *   frames: { taken: number, skipped: number, drawn: number }, received: number, largestM: number, deepestM: number, forceN: number[],
- *   holds: boolean, at: (x: number, y: number) => [number, number], pixelAfterPress: (x: number, y: number) => Promise<number>,
+ *   frames: { taken: number, skipped: number, drawn: number, timeS: number }, received: number, largestM: number, deepestM: number, forceN: number[],
+ *   ageMs: number | undefined, picture: string, holds: boolean, at: (x: number, y: number) => [number, number], pixelAfterPress: (x: number, y: number) => Promise<number>,
  * }} Inside What the page tells of itself (src/main.ts).
  */
+
+/** The processes that a browser runs pages in. @param {import("playwright-core").Browser} browser */
+export async function pageProcesses(browser) {
+  const session = await browser.newBrowserCDPSession();
+  const { processInfo } = await session.send("SystemInfo.getProcessInfo");
+  await session.detach();
+  return processInfo.filter(({ type }) => type === "renderer").map(({ id }) => id);
+}
 
 /** A page, and all that its console was told. */
 export class Page {

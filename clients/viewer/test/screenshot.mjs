@@ -6,7 +6,7 @@ import { launch, Page, ROOT, Server } from "./harness.mjs";
 const server = await Server.start();
 const browser = await launch();
 const context = await browser.newContext({ viewport: { width: 1100, height: 640 }, colorScheme: "light" });
-const page = await Page.open(context, `${server.url}/?name=Guest&refinement=3`);
+const page = await Page.open(context, `${server.url}/?name=Guest&refinement=3&quality=high`);
 await page.page.fill("#strength", "0.8");
 const [left, top] = await page.press(0.48, 0.45);
 await page.until(({ largestM }) => largestM > 0.02);

@@ -5,7 +5,7 @@ import { mkdtempSync, writeFileSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { after, before, describe, test } from "node:test";
-import { launch, makeToken, Page, Server } from "./harness.mjs";
+import { launch, makeToken, Page, pageProcesses, Server } from "./harness.mjs";
 
 /** @type {import("playwright-core").Browser} */
 let browser;
@@ -132,6 +132,20 @@ describe("the page", () => {
     await close(page);
   });
 
+  test("says when a picture is drawn with less effort, and draws in full if asked", async () => {
+    const page = await open(`${server.url}/?refinement=5`);
+    await page.says("figures", /1 vertex in 2 a side.*no graphics processor/);
+    const rest = await page.picture("coarse-rest");
+    await page.press();
+    await page.until(({ largestM }) => largestM > 0.02);
+    assert.notDeepEqual(rest, await page.picture("coarse-pressed"));
+    await page.page.goto(`${page.page.url()}&refinement=5&quality=high`);
+    await page.shows();
+    await page.says("figures", /picture\s*no graphics processor/);
+    assert.deepEqual(page.complaints, []);
+    await close(page);
+  });
+
   test("plays a shipped script", async () => {
     const page = await open();
     await page.page.selectOption("#script", "vertical-60");
@@ -178,6 +192,22 @@ describe("the page", () => {
   });
 });
 
+/** Nobody presses. @param {Page} page */
+async function rests(page) {
+  await page.page.mouse.up();
+  await page.until(({ largestM, forceN }) => largestM < 0.004 && forceN.length === 0);
+}
+
+/** Lets go, presses again, and sees many frames. @param {Page} page */
+async function pressAgain(page) {
+  const taken = await page.ask(({ frames }) => frames.taken);
+  do {
+    await rests(page);
+    await page.press();
+    await page.until(({ largestM, forceN }) => largestM > 0.02 && forceN[0] > 0.3);
+  } while ((await page.ask(({ frames }) => frames.taken)) < taken + 30);
+}
+
 describe("several pages on one session", () => {
   test("see the same, and only one may touch", async () => {
     const holder = await open(`${server.url}/?name=first`);
@@ -213,6 +243,7 @@ describe("several pages on one session", () => {
     writeFileSync(config, "[limits]\nstreams_per_session = 5\n");
     const strict = await Server.start(["--config", config]);
     const well = await open(strict.url);
+    const others = await pageProcesses(browser);
     const ill = await open(well.page.url());
     await well.press();
     await ill.until(({ largestM }) => largestM > 0.02);
@@ -233,18 +264,29 @@ describe("several pages on one session", () => {
       await route.fulfill({ status: 204 });
     });
     let isStalled = true;
+    const takenBefore = ill.ask(({ frames }) => frames.taken);
     const stalled = ill.page
       .evaluate("const ask = new XMLHttpRequest(); ask.open('GET', '/hold', false); ask.send();")
       .then(() => (isStalled = false));
-    await well.page.mouse.up();
-    await well.until(({ largestM, forceN }) => largestM < 0.004 && forceN.length === 0);
-    await well.press();
-    const taken = await well.ask(({ frames }) => frames.taken);
-    await well.until(({ largestM, forceN }) => largestM > 0.02 && forceN[0] > 0.3);
-    await well.until(({ frames }, taken) => frames.taken > taken + 5, taken);
+    const illTook = await takenBefore;
+    await pressAgain(well);
     assert.ok(isStalled, "all that while the other stood still");
+    await rests(well);
     answer();
     await stalled;
+    // More than its credit: frames were taken in, and credit given back, all the while.
+    await ill.until(({ frames }, before) => frames.taken > before + 8, illTook);
+    await well.press();
+    await ill.until(({ largestM }) => largestM > 0.02);
+    // All of it stands still, with its worker: its processes are stopped.
+    const stopped = (await pageProcesses(browser)).filter((id) => !others.includes(id));
+    assert.notEqual(stopped.length, 0);
+    stopped.forEach((id) => process.kill(id, "SIGSTOP"));
+    try {
+      await pressAgain(well);
+    } finally {
+      stopped.forEach((id) => process.kill(id, "SIGCONT"));
+    }
     // It has the newest at once: credit kept what it missed on the server.
     await ill.until(({ largestM }) => largestM > 0.02);
     await close(ill);

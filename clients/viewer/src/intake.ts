@@ -1,0 +1,134 @@
+// A worker that takes frames in and gives credit back, however long the page takes to draw. The page gets what is newest
+// in one buffer that goes to and fro: while the page has it, changes gather here, and nothing queues.
+
+import { Field, type Rectangle } from "./field";
+import { Encoding, type WatchFramesResponse } from "./gen/palpate/v1/view_pb";
+import { caller, type Failure, keepOpen, PATIENCE_MS, received, views } from "./server";
+
+/** Frames on their way: a round trip of 60 ms at 60 frames a second. */
+const IN_FLIGHT = 4;
+
+/** What to take in: the page's first message. Each further one is the buffer. */
+export interface Order {
+  sessionId: string;
+  token: string;
+  refinement: number;
+  vertices: [number, number];
+}
+
+/** The newest frame, and what happened since the last news. */
+export interface News {
+  changed: Rectangle;
+  /** Displacements of the rectangle, at the beginning of the buffer. */
+  values: Float32Array<ArrayBuffer>;
+  step: bigint;
+  timeS: number;
+  /** Frames taken in, those that the server left out in all of this stream, and bytes. */
+  taken: number;
+  skipped: bigint;
+  bytes: number;
+}
+
+export interface Trouble {
+  failure: Failure;
+  waitMs: number;
+}
+
+// The library for workers and that for pages can't be had at once.
+const page = self as unknown as {
+  onmessage: (event: MessageEvent<Order | Float32Array<ArrayBuffer>>) => void;
+  postMessage: (message: News | Trouble, transfer?: Transferable[]) => void;
+};
+
+class Intake {
+  private readonly field: Field;
+  private buffer: Float32Array<ArrayBuffer> | undefined;
+  private taken = 0;
+  private last: WatchFramesResponse | undefined;
+  /** Left out by the server, in the streams before this one and in all. */
+  private skipped = { before: 0n, now: 0n };
+
+  constructor(private readonly order: Order) {
+    this.field = new Field(...order.vertices);
+    this.buffer = new Float32Array(this.field.displacementM.length);
+    // It ends with the worker.
+    const { signal } = new AbortController();
+    void keepOpen(
+      (signal, alive) => this.read(signal, alive),
+      signal,
+      (failure, waitMs) => page.postMessage({ failure, waitMs }),
+    );
+  }
+
+  private async read(signal: AbortSignal, alive: () => void): Promise<void> {
+    const { sessionId, refinement } = this.order;
+    const request = { sessionId, refinement, encoding: Encoding.I16, maxFramesInFlight: IN_FLIGHT };
+    const credit = new Credit(signal);
+    this.skipped.before = this.skipped.now;
+    let parts: WatchFramesResponse[] = [];
+    for await (const part of views.watchFrames(request, { signal })) {
+      alive();
+      parts.push(part);
+      if (!part.last) continue;
+      // Half a frame is never seen.
+      for (const each of parts) each.patches.forEach((patch) => this.field.write(each, patch));
+      parts = [];
+      credit.giveBack(part.viewerId, part.frameId);
+      this.taken += 1;
+      this.skipped.now = this.skipped.before + part.skippedFrames;
+      this.last = part;
+      this.tell();
+    }
+  }
+
+  /** The page has done with the buffer. */
+  reuse(buffer: Float32Array<ArrayBuffer>): void {
+    this.buffer = buffer;
+    this.tell();
+  }
+
+  private tell(): void {
+    const { buffer: values, last } = this;
+    if (!values || !last || this.taken === 0) return;
+    const changed = this.field.takeChanged() ?? { a0: 0, a1: -1, b0: 0, b1: -1 };
+    this.field.copyTo(values, changed);
+    const { step, simulationTimeS: timeS } = last;
+    const news = { changed, values, step, timeS, taken: this.taken, skipped: this.skipped.now, bytes: received.bytes };
+    [this.buffer, this.taken, received.bytes] = [undefined, 0, 0];
+    page.postMessage(news, [values.buffer]);
+  }
+}
+
+/** Acknowledges frames, one message at a time, always the newest. */
+class Credit {
+  private due: [string, bigint] | undefined;
+  private underWay = false;
+
+  constructor(private readonly signal: AbortSignal) {}
+
+  giveBack(viewerId: string, frameId: bigint): void {
+    this.due = [viewerId, frameId];
+    if (!this.underWay) void this.send();
+  }
+
+  private async send(): Promise<void> {
+    this.underWay = true;
+    while (this.due && !this.signal.aborted) {
+      const [viewerId, frameId] = this.due;
+      this.due = undefined;
+      try {
+        await views.acknowledgeFrames({ viewerId, frameId }, { signal: this.signal, timeoutMs: PATIENCE_MS });
+      } catch {
+        // The stream fails as well, and tells; or the next acknowledgement covers this one.
+      }
+    }
+    this.underWay = false;
+  }
+}
+
+let intake: Intake | undefined;
+page.onmessage = ({ data }) => {
+  if (data instanceof Float32Array) return intake?.reuse(data);
+  caller.token = data.token;
+  intake = new Intake(data);
+};
