@@ -35,6 +35,9 @@ const CANDIDATES: [(Integrator, f64, f64); 4] = [
     (Integrator::Exponential4, 5.0, 1.6),
 ];
 
+/// Numbers of substeps that are tried before they are doubled.
+const MOST_ROUNDS: u32 = 32;
+
 /// What f64 and compensated f32 cost, in f32.
 const COST_F64: f64 = 2.6;
 const COST_COMPENSATED: f64 = 1.1;
@@ -154,6 +157,7 @@ fn with_precision(integrator: Integrator, substeps: u32, stepping: &Stepping, sh
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 fn fewest(integrator: Integrator, order: f64, sheet: &Oscillator, step_s: f64, tolerance: f64, most: u32) -> u32 {
     let mut substeps = stability::substeps(integrator, step_s, sheet);
+    let mut rounds = 0;
     loop {
         // More than are allowed for accuracy's sake, no; for stability's, that is for others to refuse.
         if substeps >= most {
@@ -164,8 +168,11 @@ fn fewest(integrator: Integrator, order: f64, sheet: &Oscillator, step_s: f64, t
         if excess <= 1.0 {
             return substeps;
         }
-        // As many more as the order says; one at least, and not more than the double at a time.
-        let ratio = excess.powf(order.recip()).clamp(1.0, 2.0);
+        // As many more as the order says; one at least, and not more than the double at a time. An error that does not get
+        // less as it should is not followed one by one for ever.
+        rounds += 1;
+        let least = if rounds < MOST_ROUNDS { 1.0 } else { 2.0 };
+        let ratio = excess.powf(order.recip()).clamp(least, 2.0);
         substeps = (f64::from(substeps) * ratio).ceil().max(f64::from(substeps + 1)).min(f64::from(most)) as u32;
     }
 }

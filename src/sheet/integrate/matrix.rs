@@ -3,17 +3,19 @@
 /// Components of the longest vector: u, d, the forces that a scheme of the fourth order keeps, and one that stays.
 pub(super) const LONGEST: usize = 7;
 
-/// A square matrix, by rows.
-#[derive(Debug, Clone, PartialEq)]
+/// A square matrix, by rows. It lies where it is used: choosing a scheme makes many thousands.
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Matrix {
     n: usize,
-    values: Vec<f64>,
+    values: [f64; LONGEST * LONGEST],
 }
 
 impl Matrix {
     /// From the value at each row and column.
     pub fn of(n: usize, value: impl Fn(usize, usize) -> f64) -> Self {
-        Matrix { n, values: (0..n * n).map(|at| value(at / n, at % n)).collect() }
+        let mut values = [0.0; LONGEST * LONGEST];
+        values[..n * n].iter_mut().enumerate().for_each(|(at, entry)| *entry = value(at / n, at % n));
+        Matrix { n, values }
     }
 
     /// The value at a row and column.
@@ -28,7 +30,7 @@ impl Matrix {
     /// The matrix times a vector of at most [`LONGEST`] components.
     pub fn applied_to(&self, vector: &[f64]) -> [f64; LONGEST] {
         let mut product = [0.0; LONGEST];
-        for (value, row) in product.iter_mut().zip(self.values.chunks_exact(self.n)) {
+        for (value, row) in product[..self.n].iter_mut().zip(self.values.chunks_exact(self.n)) {
             *value = row.iter().zip(vector).map(|(a, b)| a * b).sum();
         }
         product
@@ -36,7 +38,7 @@ impl Matrix {
 
     /// The matrix times itself, so often.
     pub fn power(&self, mut exponent: u32) -> Matrix {
-        let mut square = self.clone();
+        let mut square = *self;
         let mut product = Matrix::of(self.n, |i, j| f64::from(u8::from(i == j)));
         while exponent > 0 {
             if exponent % 2 == 1 {
@@ -51,7 +53,7 @@ impl Matrix {
     }
 
     fn scaled(&self, factor: f64) -> Matrix {
-        Matrix { n: self.n, values: self.values.iter().map(|value| value * factor).collect() }
+        Matrix { n: self.n, values: self.values.map(|value| value * factor) }
     }
 
     fn largest(&self) -> f64 {
@@ -61,13 +63,13 @@ impl Matrix {
     /// e to the matrix: a Taylor series of the matrix halved until it is small, squared as often.
     pub fn exponential(&self) -> Matrix {
         let mut halvings = 0;
-        let mut small = self.clone();
+        let mut small = *self;
         while small.largest() > 0.125 {
             small = small.scaled(0.5);
             halvings += 1;
         }
         let mut sum = Matrix::of(self.n, |i, j| f64::from(u8::from(i == j)));
-        let mut term = sum.clone();
+        let mut term = sum;
         for k in 1..20 {
             term = term.times(&small).scaled(1.0 / f64::from(k));
             sum.values.iter_mut().zip(&term.values).for_each(|(sum, term)| *sum += term);
@@ -80,7 +82,7 @@ impl Matrix {
 
     /// The largest magnitude among the eigenvalues: the 2ᵏ-th root of the size of the 2ᵏ-th power.
     pub fn spectral_radius(&self) -> f64 {
-        let (mut power, mut logarithm, mut exponent) = (self.clone(), 0.0, 1.0);
+        let (mut power, mut logarithm, mut exponent) = (*self, 0.0, 1.0);
         for _ in 0..36 {
             let size = power.largest();
             if size == 0.0 || !size.is_finite() {
