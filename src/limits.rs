@@ -51,6 +51,8 @@ pub struct Limits {
     pub thread_share: f64,
     /// Connections; what comes above that is closed at once.
     pub connections: usize,
+    /// Connections from one address, of IPv6 from one network of 64 bits; what comes above that is closed at once.
+    pub connections_per_address: usize,
     /// Streams and calls at once on a connection.
     pub streams_per_connection: u32,
     /// Bytes of a message from a client.
@@ -96,6 +98,7 @@ impl Default for Limits {
             lease_s: 600.0,
             thread_share: 0.85,
             connections: 4096,
+            connections_per_address: 2048,
             streams_per_connection: 256,
             message_bytes: 1 << 20,
             connection_window_bytes: 1 << 18,

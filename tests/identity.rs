@@ -203,6 +203,52 @@ async fn tokens_come_and_go_while_the_server_runs() {
     assert!(is_known(&first).await && !is_known(&second).await);
 }
 
+#[tokio::test]
+async fn who_loses_a_token_loses_the_streams_and_tools_that_it_opened() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("tokens.toml");
+    let stays = token(&file, "stays", "create,touch");
+    let before = std::fs::read_to_string(&file).unwrap();
+    let goes = token(&file, "goes", "touch");
+    let (server, log) = start_logged(&["--tokens", file.to_str().unwrap()]);
+    let source = Some(pb::create_session_request::Source::SceneName("paper".into()));
+    let request = pb::CreateSessionRequest { source, ..Default::default() };
+    let created = server.sessions().await.create_session(with_token(request, &stays)).await.unwrap();
+    let session = created.into_inner().session.unwrap().session_id;
+    let open = async |tool: u32, token: &str| {
+        let (sender, receiver) = tokio::sync::mpsc::channel(4);
+        let message = Some(pb::touch_request::Message::Open(server::open(&session, &[tool])));
+        sender.send(pb::TouchRequest { message }).await.unwrap();
+        let outbound = tokio_stream::wrappers::ReceiverStream::new(receiver);
+        let mut inbound = server.haptics().await.touch(with_token(outbound, token)).await.unwrap().into_inner();
+        inbound.message().await.unwrap().unwrap();
+        (sender, inbound)
+    };
+    let (_sender, mut lost) = open(0, &goes).await;
+    let (_other, mut kept) = open(1, &stays).await;
+    std::fs::write(&file, &before).unwrap();
+    log.wait_for("new files are in use");
+    let ended = loop {
+        if let Err(status) = tokio::time::timeout(PATIENCE, lost.message()).await.unwrap().map(Option::unwrap) {
+            break status;
+        }
+    };
+    assert_eq!(ended.code(), Code::Unauthenticated, "{ended}");
+    // Whoever may takes the tool, and who was not meant goes on.
+    let mut haptics = server.haptics().await;
+    let begun = std::time::Instant::now();
+    loop {
+        let request = pb::AcquireToolRequest { session_id: session.clone(), tool: 0, ..Default::default() };
+        match haptics.acquire_tool(with_token(request, &stays)).await {
+            Ok(_) => break,
+            Err(status) => assert!(begun.elapsed() < PATIENCE, "{status}"),
+        }
+    }
+    for _ in 0..3 {
+        kept.message().await.unwrap().unwrap();
+    }
+}
+
 /// What a server logs, as it does.
 struct Log(mpsc::Receiver<String>);
 

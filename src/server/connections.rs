@@ -1,18 +1,19 @@
 //! Connections as they come, plain or through TLS: how many there may be, how long one may take to say what it wants, how
 //! fast it may ask, and what it carries. None waits for another's handshake.
 
+use std::collections::HashMap;
 use std::io;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::pin::Pin;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
 use futures_util::stream::Stream;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
-use tokio::time::Sleep;
+use tokio::sync::mpsc;
+use tokio::time::{MissedTickBehavior, Sleep};
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::rustls::ServerConfig;
 use tokio_rustls::server::TlsStream;
@@ -25,12 +26,17 @@ use super::rate::Turnstile;
 use super::reload::Reloaded;
 use super::tls;
 use crate::limits::Limits;
+use crate::pace::queue::lock;
 
 /// After the system could not give us a connection: file descriptors that have run out come back.
 const PAUSE: Duration = Duration::from_millis(100);
 
 /// Bytes with which any client of ours begins: the preface of HTTP/2.
 const GREETING_BYTES: usize = 24;
+
+/// Between two connections that are taken in: a thousand that come at once (and, if they say nothing, are closed at once)
+/// would keep a core from all others for tens of milliseconds. Those that wait do so in the system.
+const APART: Duration = Duration::from_millis(1);
 
 /// Connections that wait to be served.
 const WAITING: usize = 64;
@@ -45,8 +51,11 @@ pub(super) fn incoming(
     let (ready, connections) = mpsc::channel(WAITING);
     let limits = limits.clone();
     tokio::spawn(async move {
-        let free = Arc::new(Semaphore::new(limits.connections));
+        let seats = Arc::new(Seats::new(&limits));
+        let mut pace = tokio::time::interval(APART);
+        pace.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
+            pace.tick().await;
             let (socket, address) = tokio::select! {
                 // Nobody takes them any more: the server is going down.
                 () = ready.closed() => return,
@@ -59,13 +68,16 @@ pub(super) fn incoming(
                     }
                 },
             };
-            let Ok(permit) = free.clone().try_acquire_owned() else {
-                warn!(%address, connections = limits.connections, "connection closed: there are too many already");
-                continue;
+            let seat = match seats.take(address.ip()) {
+                Ok(seat) => seat,
+                Err(why) => {
+                    warn!(%address, "connection closed: {why}");
+                    continue;
+                }
             };
             // Nagle's algorithm would hold a sample back for milliseconds. Who has gone already is noticed later.
             let _ = socket.set_nodelay(true);
-            let entry = Entry::new(address, permit, &limits, &traffic);
+            let entry = Entry::new(address, seat, &limits, &traffic);
             let Some(tls) = &tls else {
                 let _ = ready.send(Ok(entry.connection(Transport::Plain(socket), None))).await;
                 continue;
@@ -84,6 +96,58 @@ pub(super) fn incoming(
         }
     });
     ReceiverStream::new(connections)
+}
+
+/// Room for connections: so many in all, and so many from one address.
+struct Seats {
+    most: usize,
+    most_each: usize,
+    /// By address; those that have none are left out.
+    taken: Mutex<HashMap<IpAddr, usize>>,
+}
+
+/// A connection's, until it is dropped.
+struct Seat {
+    seats: Arc<Seats>,
+    address: IpAddr,
+}
+
+impl Seats {
+    fn new(limits: &Limits) -> Self {
+        let (most, most_each) = (limits.connections, limits.connections_per_address);
+        Seats { most, most_each, taken: Mutex::default() }
+    }
+
+    /// A seat, or why there is none.
+    fn take(self: &Arc<Self>, address: IpAddr) -> Result<Seat, String> {
+        // Whoever has IPv6 has 2⁶⁴ addresses.
+        let address = match address.to_canonical() {
+            IpAddr::V6(address) => IpAddr::V6((u128::from(address) >> 64 << 64).into()),
+            IpAddr::V4(address) => IpAddr::V4(address),
+        };
+        let mut taken = lock(&self.taken);
+        if taken.values().sum::<usize>() >= self.most {
+            return Err(format!("there are {} already (limits.connections)", self.most));
+        }
+        let each = taken.entry(address).or_default();
+        if *each >= self.most_each {
+            return Err(format!("its address has {each} already (limits.connections_per_address)"));
+        }
+        *each += 1;
+        Ok(Seat { seats: self.clone(), address })
+    }
+}
+
+impl Drop for Seat {
+    fn drop(&mut self) {
+        let mut taken = lock(&self.seats.taken);
+        if let Some(each) = taken.get_mut(&self.address) {
+            *each -= 1;
+            if *each == 0 {
+                taken.remove(&self.address);
+            }
+        }
+    }
 }
 
 /// What is known of who is at the other end, for every request that comes from there.
@@ -107,11 +171,11 @@ struct Entry {
     /// For the handshake and the greeting together.
     deadline: Pin<Box<Sleep>>,
     traffic: Arc<Traffic>,
-    permit: OwnedSemaphorePermit,
+    seat: Seat,
 }
 
 impl Entry {
-    fn new(address: SocketAddr, permit: OwnedSemaphorePermit, limits: &Limits, traffic: &Arc<Traffic>) -> Self {
+    fn new(address: SocketAddr, seat: Seat, limits: &Limits, traffic: &Arc<Traffic>) -> Self {
         let per_minute = limits.sessions_per_minute;
         Entry {
             address,
@@ -119,12 +183,12 @@ impl Entry {
             creations: Turnstile::new(per_minute / 60.0, per_minute, "sessions made over this connection"),
             deadline: Box::pin(tokio::time::sleep(Duration::from_secs_f64(limits.handshake_s))),
             traffic: traffic.clone(),
-            permit,
+            seat,
         }
     }
 
     fn connection(self, transport: Transport, certificate: Option<Arc<[String]>>) -> Connection {
-        let Entry { address, calls, creations, deadline, traffic, permit } = self;
+        let Entry { address, calls, creations, deadline, traffic, seat } = self;
         debug!(%address, "connected");
         Connection {
             transport,
@@ -132,7 +196,7 @@ impl Entry {
             greeting: Some((GREETING_BYTES, deadline)),
             _open: traffic.open(),
             traffic,
-            _permit: permit,
+            _seat: seat,
         }
     }
 }
@@ -150,7 +214,7 @@ pub(super) struct Connection {
     greeting: Option<(usize, Pin<Box<Sleep>>)>,
     traffic: Arc<Traffic>,
     _open: Open,
-    _permit: OwnedSemaphorePermit,
+    _seat: Seat,
 }
 
 impl Connection {
@@ -236,5 +300,28 @@ impl AsyncWrite for Connection {
             Transport::Plain(stream) => Pin::new(stream).poll_shutdown(cx),
             Transport::Tls(stream) => Pin::new(stream).poll_shutdown(cx),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_address_does_not_take_all_seats_and_what_goes_makes_room() {
+        let limits = Limits { connections: 5, connections_per_address: 3, ..Limits::default() };
+        let seats = Arc::new(Seats::new(&limits));
+        let take = |address: &str| seats.take(address.parse().unwrap());
+        let mut greedy: Vec<_> = (0..3).map(|_| take("192.0.2.1").unwrap()).collect();
+        assert!(take("::ffff:192.0.2.1").is_err_and(|why| why.contains("per_address")));
+        // Two of one network.
+        let others = [take("2001:db8::1").unwrap(), take("2001:db8::ffff:1").unwrap()];
+        assert!(take("192.0.2.2").is_err_and(|why| why.contains("limits.connections)")));
+        greedy.pop();
+        let third = take("2001:db8:0:0:1::").unwrap();
+        drop((greedy, third));
+        assert_eq!(lock(&seats.taken).len(), 1);
+        drop(others);
+        assert!(lock(&seats.taken).is_empty());
     }
 }

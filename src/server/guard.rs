@@ -5,18 +5,17 @@ use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::Duration;
 
-use futures_util::future::Either;
 use http::{HeaderValue, Request, Response, header};
 use tonic::Status;
 use tonic::body::Body;
 use tower::{Layer, Service};
-use tracing::instrument::Instrumented;
 use tracing::{Instrument, info, info_span};
 
 use super::connections::Peer;
 use super::identity::{Access, Caller, Credentials, access};
 use super::metrics::Traffic;
 use super::reload::Reloaded;
+use super::revocation::{Revocable, Shown};
 use crate::refusal::{Reason, Refusal, Result};
 
 /// Puts a [`Guard`] before a service.
@@ -45,32 +44,33 @@ pub(super) struct Guard<S> {
     inner: S,
 }
 
-/// The answer to a call that is not let through, perhaps kept back.
-type Refused<E> = Pin<Box<dyn Future<Output = std::result::Result<Response<Body>, E>> + Send>>;
+/// The answer to a call.
+type Answer<E> = Pin<Box<dyn Future<Output = std::result::Result<Response<Body>, E>> + Send>>;
 
 /// Calls of this server's own protocol.
 const OWN: &str = "/palpate.";
 
 impl GuardLayer {
-    /// Who calls, if they may; else why not, and how long that is to be kept back.
-    fn admit<B>(&self, request: &Request<B>) -> std::result::Result<Caller, (Refusal, Duration)> {
+    /// Who calls, if they may, and what they showed for it; else why not, and how long that is to be kept back.
+    fn admit<B>(&self, request: &Request<B>) -> std::result::Result<(Caller, Option<Shown>), (Refusal, Duration)> {
         let peer = request.extensions().get::<Peer>();
         peer.map_or(Ok(()), |peer| peer.calls.pass())?;
         self.identify(request, peer).map_err(|refusal| (refusal, Duration::ZERO))
     }
 
-    fn identify<B>(&self, request: &Request<B>, peer: Option<&Peer>) -> Result<Caller> {
+    fn identify<B>(&self, request: &Request<B>, peer: Option<&Peer>) -> Result<(Caller, Option<Shown>)> {
         let path = request.uri().path();
-        let caller = || self.credentials.get().caller(request.headers().get(header::AUTHORIZATION), peer);
-        let nobody = || Ok(Caller::nobody());
+        let nobody = || Ok((Caller::nobody(), None));
         match access(path) {
             Some(Access::Open) => nobody(),
             Some(Access::Role(role)) => {
                 self.check_origin(request)?;
-                let caller = caller()?;
-                caller.needs(role)?;
+                let authorization = request.headers().get(header::AUTHORIZATION).cloned();
+                let version = self.credentials.version();
+                let shown = Shown { authorization, peer: peer.cloned(), role, version };
+                let caller = shown.check(&self.credentials.get())?;
                 self.traffic.called(path);
-                Ok(caller)
+                Ok((caller, Some(shown)))
             }
             // Nobody is asked anything: then it is not known, rather than not allowed.
             None if path.starts_with(OWN) && self.credentials.get().is_open() => nobody(),
@@ -101,10 +101,11 @@ impl GuardLayer {
 impl<S> Service<Request<Body>> for Guard<S>
 where
     S: Service<Request<Body>, Response = Response<Body>>,
+    S::Future: Send + 'static,
 {
     type Response = Response<Body>;
     type Error = S::Error;
-    type Future = Either<Refused<S::Error>, Instrumented<S::Future>>;
+    type Future = Answer<S::Error>;
 
     fn poll_ready(&mut self, cx: &mut Context<'_>) -> Poll<std::result::Result<(), S::Error>> {
         self.inner.poll_ready(cx)
@@ -112,20 +113,24 @@ where
 
     fn call(&mut self, request: Request<Body>) -> Self::Future {
         match self.layer.admit(&request) {
-            Ok(caller) => {
+            Ok((caller, shown)) => {
                 // In every line of the log that the call writes.
                 let span = info_span!("call", path = request.uri().path(), client = &*caller.name);
-                Either::Right(self.inner.call(request).instrument(span))
+                let answer = self.inner.call(request).instrument(span);
+                // Who need not show anything is not asked again.
+                let credentials = self.layer.credentials.clone();
+                let Some(shown) = shown.filter(|_| !credentials.get().is_open()) else { return Box::pin(answer) };
+                Box::pin(async move { Ok(answer.await?.map(|body| Revocable::body(body, shown, credentials))) })
             }
             Err((refusal, wait)) => {
                 let address = request.extensions().get::<Peer>().map(|peer| peer.address);
                 let reason = refusal.reason.as_str();
                 info!(path = request.uri().path(), client = ?address, reason, "call refused: {refusal}");
                 self.layer.traffic.refused(refusal.reason);
-                Either::Left(Box::pin(async move {
+                Box::pin(async move {
                     tokio::time::sleep(wait).await;
                     Ok(Status::from(refusal).into_http())
-                }))
+                })
             }
         }
     }

@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use futures_util::stream::{self, Stream, StreamExt};
 use tokio::sync::oneshot;
+use tokio_util::task::AbortOnDropHandle;
 use tonic::{Request, Response, Status, Streaming};
 use tracing::{Instrument, debug, info};
 
@@ -243,8 +244,14 @@ impl Outlet {
     }
 }
 
-/// The output of a haptic stream: first the answer to `open`, then samples and rejections.
-enum Output {
+/// The output of a haptic stream. When nobody wants it any more, nothing is listened to any more, and tools are let go.
+struct Output {
+    stage: Stage,
+    _listening: AbortOnDropHandle<()>,
+}
+
+/// First the answer to `open`, then samples and rejections.
+enum Stage {
     Opening(oneshot::Receiver<Result<Opened, Status>>, Option<Reader<Event>>),
     Open(Outlet),
     Over,
@@ -255,22 +262,22 @@ impl Stream for Output {
 
     fn poll_next(self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
         use pb::touch_response::Message;
-        let output = self.get_mut();
-        let message = match output {
-            Output::Opening(opening, events) => match (ready!(Pin::new(opening).poll(context)), events.take()) {
+        let stage = &mut self.get_mut().stage;
+        let message = match stage {
+            Stage::Opening(opening, events) => match (ready!(Pin::new(opening).poll(context)), events.take()) {
                 (Ok(Ok(Opened { answer, samples, guard })), Some(events)) => {
-                    *output = Output::Open(Outlet { events, samples, _guard: guard });
+                    *stage = Stage::Open(Outlet { events, samples, _guard: guard });
                     Some(Ok(Message::Opened(answer)))
                 }
                 (Ok(Err(status)), _) => Some(Err(status)),
                 // The client vanished before it said anything.
                 _ => None,
             },
-            Output::Open(outlet) => ready!(outlet.poll(context)),
-            Output::Over => None,
+            Stage::Open(outlet) => ready!(outlet.poll(context)),
+            Stage::Over => None,
         };
         if !matches!(message, Some(Ok(_))) {
-            *output = Output::Over;
+            *stage = Stage::Over;
         }
         Poll::Ready(message.map(|message| message.map(|message| pb::TouchResponse { message: Some(message) })))
     }
@@ -289,8 +296,9 @@ impl HapticService for Haptics {
         let (writer, events) = queue(self.0.config.limits.queued_samples);
         // The client may wait for our headers before it opens, so its first message is not waited for here.
         let (opened, opening) = oneshot::channel();
-        tokio::spawn(self.clone().listen(request.into_inner(), opened, writer).in_current_span());
-        Ok(Response::new(Box::pin(Output::Opening(opening, Some(events)))))
+        let listening = tokio::spawn(self.clone().listen(request.into_inner(), opened, writer).in_current_span());
+        let _listening = AbortOnDropHandle::new(listening);
+        Ok(Response::new(Box::pin(Output { stage: Stage::Opening(opening, Some(events)), _listening })))
     }
 
     async fn acquire_tool(

@@ -12,6 +12,7 @@ mod page;
 mod protection;
 mod rate;
 mod reload;
+mod revocation;
 mod sessions;
 mod textures;
 mod tls;

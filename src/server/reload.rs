@@ -1,6 +1,7 @@
 //! Something that is made from files, and made anew when they change: certificates, keys, tokens.
 
 use std::path::PathBuf;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -26,6 +27,7 @@ pub(super) struct Reloaded<T> {
     paths: Vec<PathBuf>,
     make: Make<T>,
     current: Mutex<Arc<T>>,
+    version: AtomicU64,
     /// Of the texts that were looked at last, or why they could not be read.
     seen: Mutex<Result<u128>>,
 }
@@ -40,12 +42,17 @@ impl<T> Reloaded<T> {
         let texts = read(&paths)?;
         let current = Mutex::new(Arc::new(make(&texts)?));
         let seen = Mutex::new(Ok(digest(&texts)));
-        Ok(Reloaded { what, paths, make: Box::new(make), current, seen })
+        Ok(Reloaded { what, paths, make: Box::new(make), current, version: AtomicU64::new(0), seen })
     }
 
     /// What holds now.
     pub(super) fn get(&self) -> Arc<T> {
         lock(&self.current).clone()
+    }
+
+    /// How often it has changed.
+    pub(super) fn version(&self) -> u64 {
+        self.version.load(Ordering::Acquire)
     }
 
     /// Looks at the files. If they have changed, what they say holds from now on; if that makes no sense, what held before.
@@ -58,6 +65,7 @@ impl<T> Reloaded<T> {
         match texts.and_then(|texts| (self.make)(&texts)) {
             Ok(value) => {
                 *lock(&self.current) = Arc::new(value);
+                self.version.fetch_add(1, Ordering::Release);
                 info!("{}: new files are in use", self.what);
             }
             Err(refusal) => warn!(%refusal, "{}: the new files are of no use, the old ones hold", self.what),
