@@ -1,11 +1,12 @@
 //! How many sessions does a core bear, each with a haptic client at 1 kHz or none, what does each cost beside the kernel
 //! alone, and does anybody notice an attack? The server is kept to one core, the generator (`palpate-client load`) to the
-//! others. Writes docs/benchmarks/load.{md,json,svg}. `-- --quick` tries few numbers for a short time. Linux only: times
-//! are read from /proc.
+//! others. Writes docs/benchmarks/load.{md,json,svg}. `-- --quick` tries few numbers for a short time; `-- attacks` or `-- profile`
+//! prints that part alone, and writes nothing. Linux only: times are read from /proc.
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
 
 mod attack;
+mod profile;
 mod report;
 #[path = "../tests/common/server.rs"]
 mod server;
@@ -162,20 +163,32 @@ fn start(arguments: &[&str]) -> Arc<Server> {
     kept_to(true, || Arc::new(Server::start(&[&common[..], arguments].concat())))
 }
 
-fn main() {
-    if !std::path::Path::new("/proc/self/stat").exists() {
-        return println!("left out: there is no /proc on this system");
+/// How many sessions take a core for themselves, by what one takes among so many (µs a step of 1 ms): the more there are,
+/// the less of their states the caches hold.
+fn most_by(line: &[(f64, f64)]) -> f64 {
+    let load = |(count, us): (f64, f64)| count * us;
+    let over = line.windows(2).find(|pair| load(pair[1]) > 1e3);
+    match (over, line.last()) {
+        // Between the two the load is nearly straight.
+        (Some(pair), _) => {
+            let part = (1e3 - load(pair[0])) / (load(pair[1]) - load(pair[0]));
+            pair[0].0 + part * (pair[1].0 - pair[0].0)
+        }
+        (None, Some(last)) => 1e3 / last.1,
+        (None, None) => f64::NAN,
     }
-    let seconds = if quick() { 3.0 } else { 10.0 };
+}
+
+/// How many sessions there may be, with clients and without, and what each costs.
+fn crowds(report: &mut Report, figures: &mut Vec<Value>, seconds: f64) -> Vec<Series> {
     let counts: &[usize] = if quick() { &[1, 25, 100] } else { &[1, 10, 25, 50, 75, 100, 150, 200, 300] };
-    let mut report = Report::new("load", "Many sessions on one core", "make bench-load");
-    report.say(
-        "Sessions of the paper's 31 × 31 points at 1 kHz, all of them awake: each is stroked without rest. The server (one \
-         stepping thread, one of the network) is kept to one core; `palpate-client load` has the others, and sends each \
-         client's commands at 1 kHz by its own clock, over a connection of its own.",
-    );
-    let (mut figures, mut series) = (Vec::new(), Vec::new());
-    let mut alone_line = Vec::new();
+    // Also those that a server would not let in.
+    let folder = tempfile::tempdir().unwrap();
+    let config = folder.path().join("palpate.toml");
+    std::fs::write(&config, "[limits]\nthread_share = 1000.0\n").unwrap();
+    let all_let_in = ["--config", config.to_str().unwrap()];
+    let mut series = Vec::new();
+    let mut kernel_line = Vec::new();
     for (hue, (clients, name, heading)) in [
         ("1", "with clients", "With one haptic client each, a command and a sample a step"),
         ("0", "without clients", "Without clients"),
@@ -197,10 +210,11 @@ fn main() {
             "memory, MiB",
             "generator, cores",
         ]);
-        let (mut rows, mut line) = (Vec::new(), Vec::new());
-        for count in counts {
+        let (mut rows, mut line, mut alone_line) = (Vec::new(), Vec::new(), Vec::new());
+        // Far beyond what a core bears, a client each would only show the generator's limits.
+        for count in counts.iter().filter(|count| clients == "0" || **count <= 100) {
             eprintln!("{count} sessions {name}");
-            let server = start(&[]);
+            let server = start(&all_let_in);
             let sessions = count.to_string();
             let found = load(&server, seconds, &["--sessions", &sessions, "--clients-per-session", clients]);
             drop(server);
@@ -224,9 +238,7 @@ fn main() {
                 digits(found.number("/generator_cores")),
             ]));
             line.push((*count as f64, each_us(found.cores())));
-            if hue == 0 {
-                alone_line.push((*count as f64, alone_us));
-            }
+            alone_line.push((*count as f64, alone_us));
             figures.push(json!({
                 "sessions": count, "clients_per_session": clients, "told": found.told, "stepping_cores": found.stepping,
                 "network_cores": found.network, "kernel_alone_s": alone_us * 1e-6, "resident_mib": found.resident_mib,
@@ -242,13 +254,68 @@ fn main() {
         let wanted = ["--sessions", first, "--clients-per-session", clients, "--find-limit", objective];
         let found = load(&server, trial, &wanted);
         let limit = found.number("/limit_sessions");
-        let bound = 1e-3 / (alone_line.last().map_or(f64::NAN, |last| last.1) * 1e-6);
         report.say(&format!(
             "The most that keep to `{objective}`: **{limit}** sessions, refused above or found by halving. By the kernel alone \
-             it would be {bound:.0}."
+             it would be {:.0}.",
+            most_by(&alone_line)
         ));
+        kernel_line = alone_line;
         report.figure(if clients == "1" { "limit_with_clients" } else { "limit_without_clients" }, json!(limit));
     }
+    series.push(Series { name: "kernel alone".to_owned(), hue: 2, look: Look::Broad, points: kernel_line });
+    series
+}
+
+/// Sessions, each with a client, that a profile is made of: as many as a core bears with ease.
+const PROFILED: usize = 50;
+
+/// Where the time goes beside the kernel.
+fn profile(report: &mut Report) {
+    report.heading("Where it goes");
+    eprintln!("a profile of {PROFILED} sessions");
+    let server = start(&[]);
+    let id = server.child.id();
+    let sampling = std::thread::spawn(move || {
+        // When all clients are there.
+        std::thread::sleep(Duration::from_secs(4));
+        profile::parts(id, 6)
+    });
+    let found = load(&server, 12.0, &["--sessions", &PROFILED.to_string()]);
+    let Some(parts) = sampling.join().unwrap() else {
+        return report.say("Left out: there is no `perf` here, or it may not look.");
+    };
+    let each_us = found.cores() * 1e3 / (PROFILED as f64 * found.number("/dilation_min"));
+    report.say(&format!(
+        "Of {PROFILED} sessions with a client each: {} µs a session and step, divided as `perf` found the threads at work \
+         (which slows them a little itself). Of what the system does, receiving is the other end's: with clients on other \
+         machines their cores do it.",
+        digits(each_us)
+    ));
+    let row = |((thread, doing), part): &(profile::Place, f64)| {
+        cells([(*thread).to_owned(), (*doing).to_owned(), digits(part * each_us), format!("{:.1}", 100.0 * part)])
+    };
+    let shown: Vec<_> = parts.iter().filter(|entry| entry.1 >= 0.002).map(row).collect();
+    report.table(&cells(["thread", "doing what", "µs", "%"]), &shown);
+    let of = |is: fn(&str) -> bool| {
+        let parts = parts.iter().filter(|((_, doing), _)| is(doing)).map(|(_, part)| part * each_us);
+        parts.sum::<f64>()
+    };
+    let (system_us, sweep_us) = (of(|doing| doing.starts_with("system")), of(|doing| doing.starts_with("the sweep")));
+    report.say(&format!(
+        "So the sweep ({} µs) and what the system does for a connection a client ({} µs) leave room for {:.0} sessions on a \
+         core, whatever a server does beside.",
+        digits(sweep_us),
+        digits(system_us),
+        1e3 / (sweep_us + system_us)
+    ));
+    report.figure(
+        "profile",
+        parts.iter().map(|((thread, doing), part)| json!([thread, doing, part * each_us])).collect(),
+    );
+}
+
+/// What twenty sessions with a client each notice of clients that are not friends.
+fn attacks(report: &mut Report, figures: &mut Vec<Value>, seconds: f64) {
     report.heading("Under attack");
     report.say("Twenty sessions with a client each, on a server as above, while somebody else does this.");
     let quiet = |attack: Option<Kind>| {
@@ -284,13 +351,38 @@ fn main() {
     let header =
         cells(["what", "how often", "round trip p99, ms", "× quiet", "dilation", "lost", "of the core", "memory, MiB"]);
     report.table(&header, &rows);
-    report.figure("runs", figures.into());
-    series.push(Series { name: "kernel alone".to_owned(), hue: 2, look: Look::Broad, points: alone_line });
-    let panel = Panel::Lines {
-        title: "What a session costs".to_owned(),
-        x: "sessions",
-        y: "µs of the core, a session and step",
-        series,
-    };
-    report.write(1, &[panel]);
+}
+
+fn main() {
+    if !std::path::Path::new("/proc/self/stat").exists() {
+        return println!("left out: there is no /proc on this system");
+    }
+    let seconds = if quick() { 3.0 } else { 10.0 };
+    // Built before anything is measured.
+    client_program();
+    let mut report = Report::new("load", "Many sessions on one core", "make bench-load");
+    report.say(
+        "Sessions of the paper's 31 × 31 points at 1 kHz, all of them awake: each is stroked without rest. The server (one \
+         stepping thread, one of the network) is kept to one core; `palpate-client load` has the others, and sends each \
+         client's commands at 1 kHz by its own clock, over a connection of its own.",
+    );
+    let mut figures = Vec::new();
+    match std::env::args().find(|argument| ["attacks", "profile"].contains(&argument.as_str())).as_deref() {
+        Some("attacks") => attacks(&mut report, &mut figures, seconds),
+        Some(_) => profile(&mut report),
+        None => {
+            let series = crowds(&mut report, &mut figures, seconds);
+            profile(&mut report);
+            attacks(&mut report, &mut figures, seconds);
+            report.figure("runs", figures.into());
+            let panel = Panel::Lines {
+                title: "What a session costs".to_owned(),
+                x: "sessions",
+                y: "µs of the core, a session and step",
+                series,
+            };
+            return report.write(1, &[panel]);
+        }
+    }
+    report.print();
 }

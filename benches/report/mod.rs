@@ -55,6 +55,11 @@ impl Report {
         self.figures.insert(name.to_owned(), value);
     }
 
+    /// The page to standard output, and nothing else.
+    pub fn print(&self) {
+        print!("{}", self.text);
+    }
+
     /// Writes the page, the figures and the picture to docs/benchmarks, and the page to standard output.
     pub fn write(self, columns: usize, panels: &[Panel]) {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/benchmarks");
@@ -63,7 +68,7 @@ impl Report {
         std::fs::write(file("md"), &self.text).unwrap();
         std::fs::write(file("json"), serde_json::to_string_pretty(&self.figures).unwrap() + "\n").unwrap();
         std::fs::write(file("svg"), chart::svg(columns, panels)).unwrap();
-        print!("{}", self.text);
+        self.print();
     }
 }
 
