@@ -17,7 +17,7 @@ MODULES := $(VIEWER)/node_modules/.package-lock.json
 PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/*.yaml $(VIEWER)/index.html $(VIEWER)/src/*.ts \
 	$(VIEWER)/src/*.css $(VIEWER)/public/* proto/palpate/v1/*.proto)
 
-.PHONY: help run build viewer page-if-node test test-viewer stress lint picture figures screenshot bench-roundtrip bench-duty \
+.PHONY: help run build viewer page-if-node test test-viewer stress libfuzzer lint picture figures screenshot bench-roundtrip bench-duty \
 	bench-frames bench-error bench-kernel bench-stability bench-skip bench-rest bench-link bench-viewer bench-load soak fuzz need-rust \
 	need-python need-node
 
@@ -27,7 +27,8 @@ help:
 	@echo 'make test            every test (Rust, Python 3, and the page in a browser)'
 	@echo 'make test-viewer     the page alone; its screenshots are in target/viewer'
 	@echo 'make stress          ten thousand random scenes, ten million steps (some minutes)'
-	@echo 'make fuzz            a million bent inputs for every decoder (some minutes); fuzz/ has them for libFuzzer'
+	@echo 'make fuzz            a million bent inputs for every decoder (some minutes)'
+	@echo 'make libfuzzer       one decoder under libFuzzer: TARGET=request (or scene, script, …) FUZZ_SECONDS=60'
 	@echo 'make lint            formatting, compiler and clippy warnings'
 	@echo 'make picture         the curve of the README'
 	@echo 'make figures         the paper'"'"'s figures and experiments: docs/figures, shown in docs/paper.md'
@@ -136,6 +137,18 @@ stress: need-rust
 FUZZ_INPUTS ?= 1000000
 fuzz: need-rust
 	PALPATE_FUZZ_INPUTS=$(FUZZ_INPUTS) $(CARGO) test --release --test fuzz -- --nocapture
+
+# The same functions under libFuzzer, which looks for inputs that reach further; needs a C++ compiler, and no other Rust.
+TARGET ?= request
+FUZZ_SECONDS ?= 60
+HOST := $(shell rustc -vV 2>/dev/null | sed -n 's/^host: //p')
+COVERAGE := --cfg fuzzing -Ccodegen-units=1 -Cpasses=sancov-module -Cllvm-args=-sanitizer-coverage-level=4 \
+	-Cllvm-args=-sanitizer-coverage-inline-8bit-counters -Cllvm-args=-sanitizer-coverage-pc-table \
+	-Cllvm-args=-sanitizer-coverage-trace-compares
+libfuzzer: need-rust
+	cd fuzz && RUSTFLAGS='$(COVERAGE)' $(CARGO) build --release --target $(HOST)
+	mkdir -p fuzz/target/corpus/$(TARGET)
+	fuzz/target/$(HOST)/release/$(TARGET) -max_total_time=$(FUZZ_SECONDS) -timeout=20 -max_len=16384 fuzz/target/corpus/$(TARGET)
 
 # `make bench-error ARGUMENTS=--quick`, and bench-kernel and bench-frames likewise.
 bench-error: need-rust

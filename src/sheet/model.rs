@@ -77,12 +77,12 @@ impl Plan {
 }
 
 impl Oscillator {
-    /// Of a scene.
+    /// Of a scene. A zero is positive here, whatever its sign was: what is divided by it is infinite, not below all.
     pub fn of(scene: &Scene) -> Self {
         Oscillator {
             mass_kg: scene.sheet.point_mass_kg,
-            damping_n_s_per_m: scene.damping_n_s_per_m,
-            virtual_stiffness_n_per_m: scene.virtual_stiffness_n_per_m,
+            damping_n_s_per_m: scene.damping_n_s_per_m + 0.0,
+            virtual_stiffness_n_per_m: scene.virtual_stiffness_n_per_m + 0.0,
             spring_stiffness_n_per_m: stability::largest_stiffness_n_per_m(&scene.springs),
         }
     }
@@ -137,7 +137,9 @@ impl Model {
         });
         let fixed = scene.sheet.fixed_indices();
         let points = scene.sheet.points;
-        let scene = scene.clone();
+        let mut scene = scene.clone();
+        (scene.damping_n_s_per_m, scene.virtual_stiffness_n_per_m) =
+            (sheet.damping_n_s_per_m, sheet.virtual_stiffness_n_per_m);
         Ok(Arc::new(Model {
             scene,
             points,
@@ -202,5 +204,24 @@ impl Model {
     /// The array place of a grid place that is on the sheet.
     pub fn index_of(&self, [i, j]: [usize; 2]) -> usize {
         i * self.points[1] + j
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::PAPER;
+
+    #[test]
+    fn a_zero_has_no_sign() {
+        let limits = Limits::default();
+        let compile = |zero: &str| {
+            let keys = ["damping.coefficient_n_s_per_m", "virtual_springs.stiffness_n_per_m"];
+            let scene = Scene::parse("paper", PAPER, &keys.map(|key| format!("{key}={zero}")), &limits).unwrap();
+            Model::compile(&scene, &limits).unwrap()
+        };
+        let (negative, positive) = (compile("-0.0"), compile("0.0"));
+        assert_eq!((&negative.plan, negative.expected_error), (&positive.plan, positive.expected_error));
+        assert!(negative.scene.damping_n_s_per_m.is_sign_positive());
     }
 }

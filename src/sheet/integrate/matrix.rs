@@ -14,7 +14,9 @@ impl Matrix {
     /// From the value at each row and column.
     pub fn of(n: usize, value: impl Fn(usize, usize) -> f64) -> Self {
         let mut values = [0.0; LONGEST * LONGEST];
-        values[..n * n].iter_mut().enumerate().for_each(|(at, entry)| *entry = value(at / n, at % n));
+        for (i, row) in values[..n * n].chunks_exact_mut(n).enumerate() {
+            row.iter_mut().enumerate().for_each(|(j, entry)| *entry = value(i, j));
+        }
         Matrix { n, values }
     }
 
@@ -60,8 +62,12 @@ impl Matrix {
         self.values.iter().fold(0.0, |largest, value| value.abs().max(largest))
     }
 
-    /// e to the matrix: a Taylor series of the matrix halved until it is small, squared as often.
+    /// e to the matrix: a Taylor series of the matrix halved until it is small, squared as often. Of what is not finite
+    /// nothing is known.
     pub fn exponential(&self) -> Matrix {
+        if !self.values.iter().all(|value| value.is_finite()) {
+            return Matrix::of(self.n, |_, _| f64::NAN);
+        }
         let mut halvings = 0;
         let mut small = *self;
         while small.largest() > 0.125 {
@@ -106,6 +112,14 @@ mod tests {
     fn the_exponential_of_a_rotation_is_a_rotation() {
         let e = Matrix::of(2, |i, j| [[0.0, 7.0], [-7.0, 0.0]][i][j]).exponential();
         assert!((e.at(0, 0) - 7.0_f64.cos()).abs() < 1e-14 && (e.at(0, 1) - 7.0_f64.sin()).abs() < 1e-14);
+    }
+
+    #[test]
+    fn the_exponential_of_what_is_not_finite_comes_to_an_end() {
+        for value in [f64::INFINITY, f64::NEG_INFINITY, f64::NAN] {
+            let e = Matrix::of(2, |i, j| if i == j { value } else { 0.0 }).exponential();
+            assert!(e.at(0, 0).is_nan());
+        }
     }
 
     #[test]
