@@ -85,10 +85,10 @@ const PHASES: usize = 4;
 /// Between the last arrival and the beginning of the measurement.
 const SETTLE: Duration = Duration::from_millis(500);
 
-/// A limit is found when the bracket is narrower than a part of it, and is not believed before the next number has
-/// failed twice.
+/// A limit is found when the bracket is narrower than a part of it, and a number has failed when it has failed so often:
+/// one stall of the machine would do else.
 const RESOLUTION: usize = 40;
-const TRIES: usize = 2;
+const TRIES: usize = 3;
 
 /// The largest number that is tried.
 const MOST_SESSIONS: usize = 1 << 16;
