@@ -4,25 +4,17 @@
 #[path = "common/server.rs"]
 mod server;
 
-use std::process::{Command, Output};
+use std::process::Command;
 
 use palpate::wire::pb;
 use pb::create_session_request::Source;
-use server::{PATIENCE, Server, Touch, force, open, told};
+use server::{PATIENCE, Server, Touch, force, open, palpate, told};
 use tonic::Code;
 
 fn paper() -> pb::Scene {
     let limits = palpate::limits::Limits::default();
     let paper = palpate::scene::Scene::parse("paper", palpate::scene::PAPER, &[], &limits).unwrap();
     palpate::wire::scene::scene(&paper)
-}
-
-fn palpate(arguments: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_palpate"))
-        .args(arguments)
-        .current_dir(env!("CARGO_MANIFEST_DIR"))
-        .output()
-        .unwrap()
 }
 
 #[tokio::test]

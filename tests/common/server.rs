@@ -10,7 +10,7 @@
 
 use std::io::{BufRead, BufReader, Read};
 use std::path::PathBuf;
-use std::process::{Child, ChildStdout, Command, Stdio};
+use std::process::{Child, ChildStdout, Command, Output, Stdio};
 use std::sync::OnceLock;
 use std::time::Duration;
 
@@ -45,6 +45,15 @@ pub fn client_program() -> PathBuf {
             PathBuf::from(env!("CARGO_BIN_EXE_palpate")).with_file_name("palpate-client")
         })
         .clone()
+}
+
+/// The server's program, to its end.
+pub fn palpate(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_palpate"))
+        .args(arguments)
+        .current_dir(env!("CARGO_MANIFEST_DIR"))
+        .output()
+        .unwrap()
 }
 
 pub struct Server {
