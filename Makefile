@@ -17,8 +17,8 @@ MODULES := $(VIEWER)/node_modules/.package-lock.json
 PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/*.yaml $(VIEWER)/index.html $(VIEWER)/src/*.ts \
 	$(VIEWER)/src/*.css $(VIEWER)/public/* proto/palpate/v1/*.proto)
 
-.PHONY: help run build viewer page-if-node test test-viewer stress libfuzzer lint picture figures screenshot bench-roundtrip bench-duty \
-	bench-frames bench-error bench-kernel bench-stability bench-skip bench-rest bench-link bench-viewer bench-load soak fuzz need-rust \
+.PHONY: help run build viewer page-if-node test test-viewer test-arm test-asan test-valgrind test-debug need-arm stress libfuzzer lint picture figures screenshot bench-roundtrip bench-duty \
+	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-rest bench-link bench-viewer bench-load soak fuzz need-rust \
 	need-python need-node
 
 help:
@@ -26,6 +26,10 @@ help:
 	@echo 'make viewer          the page that shows the tissue, clients/viewer/dist (Node.js; make run does it by itself)'
 	@echo 'make test            every test (Rust, Python 3, and the page in a browser)'
 	@echo 'make test-viewer     the page alone; its screenshots are in target/viewer'
+	@echo 'make test-arm        the same bits on ARM (NEON): tests/determinism under qemu-user; says what it needs'
+	@echo 'make test-asan       the kernel under the address sanitizer'
+	@echo 'make test-valgrind   the kernel under memcheck of valgrind, plain and AVX2'
+	@echo 'make test-debug      the kernel with debug assertions'
 	@echo 'make stress          ten thousand random scenes, ten million steps (some minutes)'
 	@echo 'make fuzz            a million bent inputs for every decoder (some minutes)'
 	@echo 'make libfuzzer       one decoder under libFuzzer: TARGET=request (or scene, script, …) FUZZ_SECONDS=60'
@@ -38,6 +42,7 @@ help:
 	@echo 'make bench-rest      a thousand sessions at rest: their share of a core, and the memory of each'
 	@echo 'make bench-frames    a frame beside a plain copy of its bytes, and the bytes of a poke: docs/benchmarks/frames.md'
 	@echo 'make bench-error     run time against error, every scheme on seven scenes: docs/benchmarks/error.md'
+	@echo 'make bench-tolerance is the tolerance kept? Random scenes against f64 at 1e-10: docs/benchmarks/tolerance.md'
 	@echo 'make bench-kernel    the time of a step beside the machine'"'"'s limits, numba, Taichi and NumPy'
 	@echo 'make bench-link      touch over a network in virtual time, by delay, tissue, hand and scheme: docs/benchmarks/link.md'
 	@echo 'make bench-viewer    331 × 331 points at 60 frames a second in a browser, and from a press to its pixel'
@@ -92,8 +97,10 @@ $(VENV)/ready: tests/python/requirements.txt | need-python
 	$(VENV)/bin/pip install --quiet --disable-pip-version-check -r tests/python/requirements.txt
 	touch $@
 
+# The same random cases every time, so that the result is that of the change. `cargo test` alone draws others each time,
+# and `make stress` many.
 test: build $(VENV)/ready test-viewer
-	$(CARGO) test --release --workspace
+	PROPTEST_RNG_SEED=20261122 $(CARGO) test --release --workspace
 	$(VENV)/bin/python -m unittest discover -s tests/python -v
 
 test-viewer: build viewer
@@ -133,6 +140,33 @@ bench-frames: need-rust
 stress: need-rust
 	PALPATE_STRESS_SCENES=10000 $(CARGO) test --release --test stress --test sleep -- --include-ignored --nocapture
 
+# Another processor, the same golden hashes. The compiler and the standard library for ARM are Debian's.
+ARM := aarch64-unknown-linux-gnu
+need-arm:
+	@test -x /usr/bin/cargo -a -d /usr/lib/rustlib/$(ARM) && command -v aarch64-linux-gnu-gcc qemu-aarch64 >/dev/null || \
+		{ echo 'A compiler for ARM or qemu is missing. Debian: dpkg --add-architecture arm64; apt-get update;' >&2; \
+		echo 'apt-get install rustc-web cargo-web libstd-rust-web-dev:arm64 gcc-aarch64-linux-gnu qemu-user' >&2; exit 1; }
+
+test-arm: need-arm
+	RUSTC=/usr/bin/rustc CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=aarch64-linux-gnu-gcc \
+		CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUNNER='qemu-aarch64 -L /usr/aarch64-linux-gnu' \
+		/usr/bin/cargo test --release --target $(ARM) --target-dir target/arm --test determinism -- --nocapture
+
+# The sanitizer's runtime comes with the stable compiler, its switch does not.
+test-asan: need-rust
+	RUSTC_BOOTSTRAP=1 RUSTFLAGS=-Zsanitizer=address $(CARGO) test --release --target $(shell uname -m)-unknown-linux-gnu \
+		--target-dir target/asan --lib --test determinism -- sheet:: bits hash
+
+# Memcheck does not know AVX-512: `auto` becomes AVX2.
+test-valgrind: need-rust
+	@command -v valgrind >/dev/null || { echo 'valgrind is missing (Debian: apt-get install valgrind)' >&2; exit 1; }
+	CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_RUNNER='valgrind --error-exitcode=1 --quiet' \
+		$(CARGO) test --release --lib --test determinism -- every_operation the_golden_hash every_width --test-threads=1
+
+test-debug: need-rust
+	CARGO_PROFILE_RELEASE_DEBUG_ASSERTIONS=true $(CARGO) test --release --target-dir target/assertions --lib \
+		--test determinism --test sleep --test physics
+
 # A million inputs a decoder; FUZZ_INPUTS=… for more.
 FUZZ_INPUTS ?= 1000000
 fuzz: need-rust
@@ -153,6 +187,10 @@ libfuzzer: need-rust
 # `make bench-error ARGUMENTS=--quick`, and bench-kernel and bench-frames likewise.
 bench-error: need-rust
 	$(CARGO) bench --quiet --bench error -- $(ARGUMENTS)
+
+# `make bench-tolerance ARGUMENTS='--scenes 100 --seed 7 --tolerances 1e-3,1e-5'`; exit status 1 if one was broken.
+bench-tolerance: need-rust
+	$(CARGO) bench --quiet --bench tolerance -- $(ARGUMENTS)
 
 # The kernels that a user would write otherwise, each installed by itself: what does not install is left out.
 PEERS := target/venv-peers

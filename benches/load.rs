@@ -255,8 +255,8 @@ fn crowds(report: &mut Report, figures: &mut Vec<Value>, seconds: f64) -> Vec<Se
         let found = load(&server, trial, &wanted);
         let limit = found.number("/limit_sessions");
         report.say(&format!(
-            "The most that keep to `{objective}`: **{limit}** sessions, refused above or found by halving. By the kernel alone \
-             it would be {:.0}.",
+            "The most that keep to `{objective}` in two of three trials of {trial} s: **{limit}** sessions, refused above or \
+             found by halving. By the kernel alone it would be {:.0}.",
             most_by(&alone_line)
         ));
         kernel_line = alone_line;

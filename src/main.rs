@@ -145,6 +145,9 @@ struct ServeArguments {
     /// Stepping threads [default: one less than the machine has cores]
     #[arg(long, value_name = "N")]
     threads: Option<usize>,
+    /// Part of a core with which the errors of live sessions are measured; 0 measures nothing [default: 0.02]
+    #[arg(long, value_name = "SHARE")]
+    audit_share: Option<f64>,
     /// How long streams may take to end at shutdown before they are cut, s [default: 5]
     #[arg(long, value_name = "SECONDS")]
     shutdown_deadline_s: Option<f64>,
@@ -183,6 +186,11 @@ struct RunArguments {
     /// Hold forces and paths for each step, as a client does that streams a command a step
     #[arg(long)]
     held: bool,
+    /// Play it a second time beside the first, in f64 with a quarter of the substep and nothing asleep: the summary then
+    /// has audited_error, the largest difference of displacement and of force at the sample points and times, each
+    /// relative to its largest. With [stepping] correct = true the run is corrected where an error is above the tolerance
+    #[arg(long)]
+    audit: bool,
 }
 
 #[derive(clap::Args)]
@@ -307,6 +315,9 @@ fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     }
     if let Some(threads) = arguments.threads {
         config.threads = threads;
+    }
+    if let Some(share) = arguments.audit_share {
+        config.audit_share = share;
     }
     if let Some(deadline_s) = arguments.shutdown_deadline_s {
         config.shutdown_deadline_s = deadline_s;
@@ -535,8 +546,9 @@ fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
         None => Box::new(std::io::stdout().lock()),
     };
     let mut output = BufWriter::new(output);
+    let run = if arguments.audit { run::audited } else { run::run };
     let ended = with_progress(script.steps, |progress| {
-        run::run(&model, &script, arguments.held, &limits, &mut output, &clock_s, progress)
+        run(&model, &script, arguments.held, &limits, &mut output, &clock_s, progress)
     });
     let ended = ended.and_then(|_| output.flush().map_err(run::Failure::Output));
     match ended {

@@ -20,7 +20,8 @@ async fn a_force_is_felt_and_acknowledged() {
     touch.command(command).await;
     let sample = touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == 7).await;
     assert_eq!(sample.tools[0].client_time_ns, 123);
-    assert!(sample.tools[0].server_hold_ns > 0);
+    let tool = &sample.tools[0];
+    assert!(tool.server_hold_ns > 0 && tool.step_wait_ns <= tool.server_hold_ns, "{tool:?}");
     let first_step = sample.step;
     let later = touch.sample_with(|sample| sample.step > first_step + 600).await;
     let tool = &later.tools[0];

@@ -28,8 +28,8 @@ use server::{PATIENCE, Server, client_program};
 /// Sessions of a load, each with a client that holds its tool 0.
 const SESSIONS: usize = 4;
 
-/// So long, s, a device is left alone after its server was killed: it finds the new one, touches, and is enabled again.
-const REST_S: u64 = 5;
+/// So many commands, one a tick, a device is left alone for after its server was killed: it touches, and is enabled again.
+const TOUCHES: u64 = 1000;
 
 /// A server that lets everybody in: on a busy machine steps take long, and a session more would make others late.
 fn start(config: &Path) -> Server {
@@ -83,7 +83,8 @@ async fn who_is_killed_holds_nothing_and_who_is_left_comes_back() {
     let of = |name: &str, otherwise: u64| std::env::var(name).map_or(otherwise, |text| text.parse().unwrap());
     let (kills, seed) = (of("PALPATE_KILLS", 2), of("PALPATE_SEED", 1));
     let mut random = Random(seed);
-    let mut moment = move || Duration::from_millis(random.below(1500));
+    // Commands of a load before a kill, and ms without a server.
+    let mut moment = move || random.below(1500);
     let address = |server: &Server| server.url.trim_start_matches("http://").to_owned();
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("palpate.toml");
@@ -101,11 +102,11 @@ async fn who_is_killed_holds_nothing_and_who_is_left_comes_back() {
             .spawn()
             .unwrap(),
     );
-    tokio::time::sleep(Duration::from_secs(REST_S)).await;
+    server.until_applied("liver", TOUCHES).await;
     for kill in 1..=kills {
         let mut clients = load(&server);
         let before = held_at_last(&server, &mut clients, SESSIONS).await;
-        tokio::time::sleep(moment()).await;
+        server.until_applied("paper", moment()).await;
         clients.0.kill().unwrap();
         held_at_last(&server, &mut clients, 0).await;
         // Anybody may take them now.
@@ -117,15 +118,15 @@ async fn who_is_killed_holds_nothing_and_who_is_left_comes_back() {
         }
         let mut clients = load(&server);
         held_at_last(&server, &mut clients, SESSIONS).await;
-        tokio::time::sleep(moment()).await;
+        server.until_applied("paper", moment()).await;
         server.child.kill().unwrap();
         // A load without a server has nothing to measure, and says so.
         let ended = tokio::task::spawn_blocking(move || clients.0.wait().unwrap()).await.unwrap();
         assert!(!ended.success());
-        tokio::time::sleep(moment()).await;
+        tokio::time::sleep(Duration::from_millis(moment())).await;
         server = start(&config);
         proxy.aim(address(&server));
-        tokio::time::sleep(Duration::from_secs(REST_S)).await;
+        server.until_applied("liver", TOUCHES).await;
         println!("{kill} of {kills} after {:.0} s", begun.elapsed().as_secs_f64());
     }
     let told = Command::new("kill").args(["-INT", &bridge.0.id().to_string()]).status().unwrap();

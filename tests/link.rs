@@ -8,7 +8,7 @@ mod proxy;
 #[path = "common/server.rs"]
 mod server;
 
-use std::process::{Command, Output};
+use std::process::{Child, Command, Output, Stdio};
 use std::time::Duration;
 
 use course::Course;
@@ -42,17 +42,19 @@ fn the_same_seed_is_the_same_run() {
     );
 }
 
+/// Virtual time is the same on every machine: bounds are a quarter above what is measured.
 #[test]
 fn touch_is_true_passive_and_smooth_up_to_100_ms() {
-    for scene in ["liver", "fibrotic"] {
-        for (rtt_ms, most_percent) in [(0.0, 2.0), (10.0, 2.0), (50.0, 3.6), (100.0, 7.3)] {
+    for (scene, at_once_percent, delayed_percent) in [("liver", 0.95, 0.68), ("fibrotic", 2.3, 0.44)] {
+        for rtt_ms in [0.0, 10.0, 50.0, 100.0] {
+            let most_percent = if rtt_ms > 0.0 { delayed_percent } else { at_once_percent };
             for hand in ["light", "medium", "firm"] {
                 let found = link(&format!("--scene {scene} --hand {hand} --rtt-ms {rtt_ms} --seconds 6 --seed 3"));
                 let error = number(&found, "force_error_rms_percent");
                 assert!(error < most_percent, "{scene}, {hand}, {rtt_ms} ms: {error} %");
-                assert!(number(&found, "energy_min_j") >= -1e-3, "{found}");
-                assert!(number(&found, "jump_max_n") <= 0.1 + 1e-9, "{found}");
-                assert!(number(&found, "rendered_share") >= 0.7, "{found}");
+                assert!(number(&found, "energy_min_j") >= -1e-6, "{found}");
+                assert!(number(&found, "jump_max_n") <= 0.062, "{found}");
+                assert!((number(&found, "rendered_share") - 1.0).abs() < 0.01, "{found}");
                 assert_eq!((&found["unstable"], &found["faults"]), (&Value::Bool(false), &Value::from(0)), "{found}");
             }
         }
@@ -62,20 +64,39 @@ fn touch_is_true_passive_and_smooth_up_to_100_ms() {
 #[test]
 fn what_others_do_shakes_or_lies_where_the_model_does_not() {
     let run = |scheme: &str| link(&format!("--scene fibrotic --rtt-ms 50 --seconds 6 --scheme {scheme}"));
-    assert_eq!(run("raw")["unstable"], true);
-    let hold = run("hold");
+    let (raw, hold, model) = (run("raw"), run("hold"), run("model"));
+    // Of the same task.
+    assert!(number(&raw, "scale") < 1.0 && raw["scale"] == hold["scale"] && raw["scale"] == model["scale"], "{raw}");
+    assert_eq!(raw["unstable"], true);
     assert_eq!(hold["unstable"], false, "the envelope holds whatever is in it");
-    assert!(number(&hold, "energy_min_j") >= -1e-3, "{hold}");
-    assert!(number(&hold, "force_error_rms_percent") > 20.0, "{hold}");
-    assert_eq!(run("model")["unstable"], false);
+    assert!(number(&hold, "energy_min_j") >= -3e-4, "{hold}");
+    assert!((38.0..58.0).contains(&number(&hold, "force_error_rms_percent")), "{hold}");
+    assert_eq!(model["unstable"], false);
+}
+
+/// The most that a hand gets from the force that is held for 100 ms, once a second, J.
+const LONG_STALL_J: f64 = 2.5e-3;
+
+/// The device holds its last force meanwhile, and the hand moves on: no envelope can help that, and it is not hidden.
+#[test]
+fn what_a_client_gives_that_stands_still_is_counted() {
+    for scene in ["liver", "fibrotic"] {
+        let found = |stall_ms| link(&format!("--scene {scene} --rtt-ms 10 --stall-ms {stall_ms} --seconds 6"));
+        let [short, long] = [found(20), found(100)];
+        assert!(number(&short, "energy_min_j") >= -1e-6, "{short}");
+        assert!((-LONG_STALL_J..-1e-5).contains(&number(&long, "energy_min_j")), "{long}");
+        for found in [short, long] {
+            assert_eq!((&found["unstable"], &found["faults"]), (&Value::Bool(false), &Value::from(0)), "{found}");
+        }
+    }
 }
 
 #[test]
 fn a_deadband_sends_a_twentieth_and_is_not_felt() {
     for scene in ["liver", "fibrotic", "stomach"] {
         let found = link(&format!("--scene {scene} --rtt-ms 2 --deadband 0.1 --seconds 8"));
-        assert!(number(&found, "packets_per_s") <= 50.0, "{found}");
-        assert!(number(&found, "force_error_rms_percent") <= 2.0, "{found}");
+        assert!((25.0..=32.0).contains(&number(&found, "packets_per_s")), "{found}");
+        assert!(number(&found, "force_error_rms_percent") <= 0.4, "{found}");
     }
 }
 
@@ -85,9 +106,9 @@ fn random_combinations_are_passive() {
     let found = link("--random 24 --seconds 5 --seed 100");
     assert_eq!((&found["runs"], &found["unstable"]), (&Value::from(24), &Value::from(0)));
     let worst = |name: &str| found[name]["worst"].as_f64().unwrap();
-    assert!(worst("energy_min_j") >= -1e-3, "{found}");
+    assert!(worst("energy_min_j") >= -3e-4, "{found}");
     assert!(worst("jump_max_n") <= 0.1 + 1e-9, "{found}");
-    assert!(worst("force_max_n") <= 3.3, "{found}");
+    assert!(worst("force_max_n") <= 2.6, "{found}");
 }
 
 #[test]
@@ -109,33 +130,51 @@ fn a_wrong_argument_is_refused_and_named() {
     }
 }
 
+/// Commands of a bridge, one a tick: within so many its owner has asked for forces three times, and pressed.
+const TOUCHES: u64 = 1000;
+
+fn bridge(proxy: &Proxy, more: &[&str]) -> Child {
+    Command::new(client_program())
+        .args(["bridge", "--scene", "liver", "--server", &proxy.url()])
+        .args(more)
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap()
+}
+
+fn signal(child: &Child, name: &str) {
+    assert!(Command::new("kill").args([name, &child.id().to_string()]).status().unwrap().success());
+}
+
+/// Ends a bridge as its user does.
+async fn interrupted(bridge: Child) -> Output {
+    signal(&bridge, "-INT");
+    let output = tokio::task::spawn_blocking(move || bridge.wait_with_output().unwrap()).await.unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    output
+}
+
+fn address(server: &Server) -> String {
+    server.url.trim_start_matches("http://").to_owned()
+}
+
 /// Over real gRPC, a wire that delays, and a cut: the bridge comes back by itself, its forces when they are asked for.
+#[cfg(unix)]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_bridge_outlives_a_cut() {
     let server = Server::start(&[]);
-    let proxy = Proxy::start(server.url.trim_start_matches("http://").to_owned(), Duration::from_millis(5)).await;
-    let bridge = Command::new(client_program())
-        .args(["bridge", "--scene", "liver", "--seconds", "12", "--server", &proxy.url()])
-        .stdout(std::process::Stdio::piped())
-        .stderr(std::process::Stdio::piped())
-        .spawn()
-        .unwrap();
-    let waited = tokio::time::timeout(Duration::from_secs(30), async {
-        while proxy.connections() == 0 {
-            tokio::time::sleep(Duration::from_millis(10)).await;
-        }
-    });
-    waited.await.expect("the bridge connects");
-    tokio::time::sleep(Duration::from_secs(4)).await;
+    let proxy = Proxy::start(address(&server), Duration::from_millis(5)).await;
+    let bridge = bridge(&proxy, &[]);
+    server.until_applied("liver", TOUCHES).await;
     proxy.cut();
-    tokio::time::sleep(Duration::from_millis(500)).await;
+    server.until_let_go().await;
     proxy.mend();
-    let output = tokio::task::spawn_blocking(move || bridge.wait_with_output().unwrap()).await.unwrap();
-    let told = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert!(output.status.success(), "{told}");
+    server.until_applied("liver", TOUCHES).await;
+    let output = interrupted(bridge).await;
     let found: Value = serde_json::from_slice(&output.stdout).unwrap();
     assert!(proxy.connections() >= 2, "{found}");
-    assert!(number(&found, "connections") >= 2.0 && number(&found, "samples") > 100.0, "{found} {told}");
+    assert!(number(&found, "connections") >= 2.0 && number(&found, "samples") > 100.0, "{found}");
     assert!(number(&found, "energy_j") >= -1e-3, "{found}");
     assert_eq!(found["interventions_ticks"]["not_finite"], 0, "{found}");
     assert!(found["interventions_ticks"]["stale"].as_u64().unwrap() > 0, "the cut was not noticed: {found}");
@@ -143,34 +182,24 @@ async fn a_bridge_outlives_a_cut() {
 
 /// The server is killed, the client is frozen: what leaves the client stays within the envelope, and comes back when the
 /// device's owner asks for it.
+#[cfg(unix)]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn forces_stay_within_the_envelope_whatever_breaks() {
-    let address = |server: &Server| server.url.trim_start_matches("http://").to_owned();
     let first = Server::start(&[]);
     let proxy = Proxy::start(address(&first), Duration::from_millis(5)).await;
-    let file = std::env::temp_dir().join(format!("palpate-course-{}.csv", std::process::id()));
-    let bridge = Command::new(client_program())
-        .args(["bridge", "--scene", "liver", "--seconds", "14", "--server", &proxy.url(), "--course"])
-        .arg(&file)
-        .stdout(std::process::Stdio::piped())
-        .stderr(std::process::Stdio::piped())
-        .spawn()
-        .unwrap();
-    let signal = |name: &str| {
-        let told = Command::new("kill").args([name, &bridge.id().to_string()]).status().unwrap();
-        assert!(told.success());
-    };
-    tokio::time::sleep(Duration::from_secs(5)).await;
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("course.csv");
+    let bridge = bridge(&proxy, &["--course", file.to_str().unwrap()]);
+    first.until_applied("liver", TOUCHES).await;
     drop(first);
-    tokio::time::sleep(Duration::from_secs(1)).await;
     let second = Server::start(&[]);
     proxy.aim(address(&second));
-    tokio::time::sleep(Duration::from_secs(4)).await;
-    signal("-STOP");
-    tokio::time::sleep(Duration::from_secs(1)).await;
-    signal("-CONT");
-    let output = tokio::task::spawn_blocking(move || bridge.wait_with_output().unwrap()).await.unwrap();
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    second.until_applied("liver", TOUCHES).await;
+    signal(&bridge, "-STOP");
+    second.until_let_go().await;
+    signal(&bridge, "-CONT");
+    second.until_applied("liver", TOUCHES).await;
+    interrupted(bridge).await;
     let course = Course::take(&file);
     let pauses = course.keeps_to_the_envelope();
     // One for the server, one for the freeze.

@@ -39,13 +39,29 @@ async fn every_command_of_a_load_is_accounted_for_and_no_session_stays() {
     assert!(number(&told, "/commands") > 0.0, "{told}");
     assert!(number(&told, "/samples") > 0.0 && number(&told, "/frames") > 0.0, "{told}");
     assert!(number(&told, "/awake_points_mean") > 100.0, "{told}");
-    let dilation = number(&told, "/dilation_min");
-    assert!(dilation > 0.0 && dilation < 1.2, "{told}");
+    assert!(number(&told, "/dilation_min") > 0.0, "{told}");
     for name in ["round_trip_us", "sample_gap_us", "frame_age_us"] {
         let quantiles = ["p50", "p99", "p999", "max"].map(|quantile| number(&told, &format!("/{name}/{quantile}")));
         assert!(quantiles.is_sorted() && quantiles[3] > 0.0, "{name} of {told}");
     }
     assert!(sessions(&server).await.is_empty());
+}
+
+/// 400,000 points 10,000 times a second, which no core does: its time goes on slower than ours, and that is told.
+#[tokio::test(flavor = "multi_thread")]
+async fn the_dilation_of_sessions_that_are_too_heavy_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let (scene, config) = (folder.path().join("heavy.toml"), folder.path().join("palpate.toml"));
+    let paper = palpate::scene::PAPER.replace("points = [31, 31]", "points = [800, 500]");
+    std::fs::write(&scene, paper + "[stepping]\nrate_hz = 10000.0\n[sleep]\ntolerance = 0.0\n").unwrap();
+    std::fs::write(&config, "[limits]\nthread_share = 1000.0\n").unwrap();
+    let server = Server::start(&["--config", config.to_str().unwrap()]);
+    for clients in [0, 1] {
+        let scene = scene.to_str().unwrap();
+        let told = told(&server, &format!("--scene {scene} --sessions 1 --clients-per-session {clients} --seconds 2"));
+        let dilation = number(&told, "/dilation_min");
+        assert!(dilation > 0.0 && dilation < 0.9, "{clients} clients: {told}");
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -98,6 +98,7 @@ async fn what_makes_no_sense_is_refused() {
         (broken(|device| device.workspace_radius_m = 0.0), "OUT_OF_RANGE", "device.workspace_m"),
         (pb::TouchOpen { deadband: Some(foretold()), ..open(&session, &[0]) }, "MISSING", "device"),
         (pb::TouchOpen { tip: Some(tip), ..open(&session, &[0]) }, "OUT_OF_RANGE", "tip.radius_m"),
+        (pb::TouchOpen { touch_stiffness: true, ..open(&session, &[0]) }, "MISSING", "device"),
     ] {
         let refused = Touch::open(&server, request).await.err().unwrap();
         let (code, told_reason, told_field) = told(&refused);

@@ -74,8 +74,8 @@ fn a_run_writes_a_header_records_and_a_summary() {
     assert_eq!(lines.len(), 5);
     let header = &lines[0]["run"];
     assert_eq!((&header["scene"], &header["script"]), (&"test".into(), &"test".into()));
-    assert_eq!((&header["integrator"], &header["precision"]), (&"exponential3".into(), &"compensated".into()));
-    assert_eq!((&header["substeps"], &header["rate_hz"]), (&2.into(), &1000.0.into()));
+    assert_eq!((&header["integrator"], &header["precision"]), (&"exponential4".into(), &"f32".into()));
+    assert_eq!((&header["substeps"], &header["rate_hz"]), (&1.into(), &1000.0.into()));
     assert!(header["version"].is_string());
     for (index, record) in lines[1..4].iter().enumerate() {
         assert_eq!(record["time_s"].as_f64().unwrap(), 0.05 * index as f64);
@@ -95,7 +95,7 @@ fn a_run_writes_a_header_records_and_a_summary() {
         assert_eq!(pushed["applied_n"][2], -1.0);
     }
     let summary = &lines[4]["summary"];
-    assert_eq!((&summary["steps"], &summary["substeps"]), (&100.into(), &200.into()));
+    assert_eq!((&summary["steps"], &summary["substeps"]), (&100.into(), &100.into()));
     assert_eq!((&summary["points"], &summary["guard_events"]), (&63.into(), &0.into()));
     assert_eq!(summary["computed_fraction"], 1.0);
     assert!(summary["wall_s"].as_f64().unwrap() > 0.0 && summary["ns_per_point_substep"].as_f64().unwrap() > 0.0);

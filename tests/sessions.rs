@@ -29,7 +29,7 @@ async fn sessions_are_made_listed_and_deleted() {
     own.name = "own".into();
     own.stepping = Some(pb::Stepping { precision: "f64".into(), ..Default::default() });
     let own = server.create(Source::Scene(own), true).await.unwrap();
-    assert_eq!((own.precision.as_str(), own.integrator.as_str(), own.substeps), ("f64", "exponential4", 1));
+    assert_eq!((own.precision.as_str(), own.integrator.as_str(), own.substeps), ("f64", "exponential3", 1));
     assert_eq!((by_name.state(), own.state()), (pb::SessionState::Running, pb::SessionState::Paused));
     let listed = sessions.list_sessions(pb::ListSessionsRequest {}).await.unwrap().into_inner().sessions;
     let ids: Vec<_> = listed.iter().map(|session| session.session_id.clone()).collect();
@@ -256,7 +256,19 @@ async fn time_goes_on_at_rest_without_steps_and_without_overruns() {
     assert_eq!(later.state(), pb::SessionState::Running);
     assert!(later.rested_steps > 1400, "{} of {} steps", later.rested_steps, later.step);
     assert_eq!((later.overrun_count, later.simulation_time_s), (0, later.step as f64 / 1000.0));
-    assert!((later.time_dilation - 1.0).abs() < 0.01, "{}", later.time_dilation);
+    // As many steps as there is time for, by our clock: what passed at least and at most between the two answers.
+    let ask = async || {
+        let asked = std::time::Instant::now();
+        (asked, rested(&server, &session).await.step, std::time::Instant::now())
+    };
+    let (from, to) = (ask().await, {
+        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+        ask().await
+    });
+    let steps = |begun: std::time::Instant, ended: std::time::Instant| (ended - begun).as_secs_f64() * 1000.0;
+    let (least, most) = (steps(from.2, to.0) - 2.0, steps(from.0, to.2) + 2.0);
+    let passed = (to.1 - from.1) as f64;
+    assert!((least..=most).contains(&passed), "{passed} steps, not {least} to {most}");
     // To be paused ends it: time stands where it is.
     let mut sessions = server.sessions().await;
     sessions.pause_session(pb::PauseSessionRequest { session_id: session.clone() }).await.unwrap();
@@ -442,13 +454,13 @@ async fn health_is_served() {
 
 #[cfg(unix)]
 #[tokio::test]
-async fn shutdown_tells_open_streams_and_ends_within_the_deadline() {
-    let mut server = Server::start(&["--shutdown-deadline-s", "20"]);
+async fn shutdown_tells_open_streams_and_ends_before_the_deadline() {
+    // Who waits for the deadline waits for longer than anybody here.
+    let mut server = Server::start(&["--shutdown-deadline-s", "3600"]);
     let session = server.paper(false).await;
     let mut touch = Touch::hold(&server, &session).await;
     touch.command(force(0, 1, -1.0)).await;
     touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == 1).await;
-    let started = std::time::Instant::now();
     let killed = Command::new("kill").arg(server.child.id().to_string()).status().unwrap();
     assert!(killed.success());
     let ended = loop {
@@ -458,10 +470,15 @@ async fn shutdown_tells_open_streams_and_ends_within_the_deadline() {
     };
     assert_eq!(told(&ended), (Code::Unavailable, "SHUTTING_DOWN".into(), String::new()));
     drop(touch);
-    let status = tokio::task::spawn_blocking(move || server.child.wait().unwrap()).await.unwrap();
-    assert!(status.success());
-    // Well before the streams would have been cut.
-    assert!(started.elapsed().as_secs() < 15);
+    let waited = async {
+        loop {
+            if let Some(status) = server.child.try_wait().unwrap() {
+                return status;
+            }
+            tokio::time::sleep(std::time::Duration::from_millis(10)).await;
+        }
+    };
+    assert!(tokio::time::timeout(PATIENCE, waited).await.expect("it does not end").success());
 }
 
 #[cfg(unix)]

@@ -203,8 +203,84 @@ fn sleeping_is_the_same_at_every_width() {
             Some(tissue.state_hash())
         };
         let plain = hash("plain");
-        for lanes in ["avx2", "avx512"] {
+        for lanes in ["neon", "avx2", "avx512"] {
             assert!(hash(lanes).is_none_or(|hash| Some(hash) == plain), "{integrator} {lanes}");
         }
+    }
+}
+
+/// The energies by the points' displacements and velocities, J: each spring by itself.
+fn energies_by_points(tissue: &dyn Tissue) -> [f64; 3] {
+    let scene = &tissue.model().scene;
+    let [rows, columns] = tissue.model().points;
+    let points: Vec<_> = (0..rows * columns).map(|index| tissue.point(index)).collect();
+    let mut spring_j = 0.0;
+    for i in 0..rows {
+        for j in 0..columns {
+            for (di, dj, k) in [
+                (0, 1, scene.springs.stiffness_n_per_m),
+                (1, 0, scene.springs.stiffness_n_per_m),
+                (1, 1, scene.springs.shear_stiffness_n_per_m),
+                (1, -1, scene.springs.shear_stiffness_n_per_m),
+            ] {
+                let Some(to) = j.checked_add_signed(dj).filter(|to| *to < columns && i + di < rows) else { continue };
+                let rest_m = DVec3::new(di as f64, dj as f64, 0.0) * scene.sheet.spacing_m;
+                let delta_m = points[(i + di) * columns + to].displacement_m - points[i * columns + j].displacement_m;
+                // L − L0 = (L² − L0²)/(L + L0), without cancellation.
+                let longer_m = (2.0 * rest_m + delta_m).dot(delta_m) / ((rest_m + delta_m).length() + rest_m.length());
+                spring_j += 0.5 * k * longer_m * longer_m;
+            }
+        }
+    }
+    let kinetic_j =
+        points.iter().map(|point| 0.5 * scene.sheet.point_mass_kg * point.velocity_m_per_s.length_squared());
+    let virtual_j =
+        points.iter().map(|point| 0.5 * scene.virtual_stiffness_n_per_m * point.displacement_m.length_squared());
+    [kinetic_j.sum(), spring_j, virtual_j.sum()]
+}
+
+#[test]
+fn the_energy_of_tiles_that_sleep_is_counted_to_the_last_digits() {
+    // A multistep scheme's springs are where it predicts the points to be, within what it then corrects.
+    for (integrator, part) in [("central", 1e-11), ("exponential3", 1e-7)] {
+        let integrator = format!("stepping.integrator={integrator}");
+        let settings = [integrator.as_str(), "stepping.precision=f64", "sheet.points=[65, 97]", "sleep.tolerance=1e-4"];
+        let (mut asked, mut unasked) = (sheet(&settings), sheet(&settings));
+        let path = CentreLaw::Path { from_m: DVec2::new(0.5, 0.5), velocity_m_per_s: DVec2::new(0.5, 0.9) };
+        for tissue in [&mut asked, &mut unasked] {
+            tissue.push(0, Some(law(path.clone(), [0.2, 0.3, -1.0], 60.0, Profile::Pulse { on: 0, off: 1500 })));
+            tissue.push(1, Some(law(at(1.5, 0.5), [0.0, 0.0, -2.0], 150.0, Profile::Constant)));
+        }
+        let mut partly = 0;
+        for step in 1..=2000 {
+            asked.step().unwrap();
+            unasked.step().unwrap();
+            let energy = asked.energy();
+            if step % 100 != 0 {
+                continue;
+            }
+            partly += usize::from((1..65 * 97).contains(&asked.awake_points()));
+            let truth = energies_by_points(&*asked);
+            let total_j: f64 = truth.iter().sum();
+            for (found_j, truth_j) in [energy.kinetic_j, energy.spring_j, energy.virtual_j].into_iter().zip(truth) {
+                assert!((found_j - truth_j).abs() <= part * total_j, "{integrator}, {step}: {energy:?}, {truth:?}");
+            }
+            // Who asked before makes no difference.
+            assert_eq!(unasked.energy(), energy);
+        }
+        assert!(partly > 10, "{integrator}: {partly}");
+    }
+}
+
+#[test]
+fn a_moving_tool_asks_only_tiles_within_its_reach() {
+    // Springs that pass nothing on, and a tool that trembles: its force ends 11 points from it (e^−22), in the first tile.
+    let mut tissue = sheet(&["sheet.points=[16, 64]", "springs.stiffness_n_per_m=1e-6", "sleep.tolerance=1e-6"]);
+    let hops = (0..20_000).map(|step| (step, DVec2::new(0.2, if step % 2 == 0 { 0.09 } else { 0.11 }))).collect();
+    tissue.push(0, Some(law(CentreLaw::Hops(hops), [0.0, 0.0, -3.0], 60.0, Profile::Constant)));
+    for step in 0..20_000 {
+        tissue.step().unwrap();
+        // A bound on the force beyond its reach, summed up over all steps, would wake the second tile in the end.
+        assert_eq!(tissue.awake_points(), 16 * 16, "step {step}");
     }
 }

@@ -157,6 +157,23 @@ fn random_scenes_stay_finite_and_take_no_energy_from_nowhere() {
     }
 }
 
+/// Where nothing but the damping is fast, dt·C/m from 0.7 to 90: `rk4` was stable by its vibrations alone, and grew.
+#[test]
+fn strong_damping_alone_lets_no_scheme_grow() {
+    let held = Act { step: 0, tool: 0, place: [0.0; 2], towards: [0.0, 0.0, 0.77], manner: 1 };
+    for integrator in ["auto", "central", "lagged", "exponential2", "exponential3", "exponential4", "rk4"] {
+        for damping in [0.2, 0.7, 0.75, 1.4, 6.0, 25.0] {
+            let text = format!(
+                "[sheet]\npoints = [3, 7]\nspacing_m = 1.0\npoint_mass_kg = 2.5e-4\nfixed = []\n\
+                 [springs]\nstiffness_n_per_m = 0.015\nflexion = false\n\
+                 [virtual_springs]\nstiffness_n_per_m = 1.0\n[damping]\ncoefficient_n_s_per_m = {damping}\n\
+                 [stepping]\nintegrator = \"{integrator}\"\ntolerance = 1e-2\n"
+            );
+            play(&text, &[held]).unwrap_or_else(|failure| panic!("{integrator}, C = {damping}: {failure}"));
+        }
+    }
+}
+
 /// Tools that do their worst, at 1 kHz.
 #[test]
 fn adversarial_commands_leave_the_tissue_finite() {

@@ -201,11 +201,10 @@ async fn a_viewer_without_credit_gets_no_more_frames_until_it_acknowledges() {
     let (second, _) = frame(&mut frames).await;
     assert_eq!((first.frame_id, second.frame_id), (0, 1));
     server.hash_at(&session, 1000).await;
-    // A hundred frames were due, and none was sent beyond the credit.
-    assert!(tokio::time::timeout(std::time::Duration::from_millis(300), frames.message()).await.is_err());
     let acknowledge = pb::AcknowledgeFramesRequest { viewer_id: first.viewer_id, frame_id: second.frame_id };
     views.acknowledge_frames(acknowledge.clone()).await.unwrap();
     server.start_until(&session, 1010).await;
+    // A hundred frames were due, and none was sent beyond the credit: the next is of what came after.
     let (third, _) = frame(&mut frames).await;
     assert_eq!((third.frame_id, third.step), (101, 1010));
     assert_eq!(third.skipped_frames, 99);
@@ -306,9 +305,13 @@ async fn a_still_tissue_sends_nothing_and_five_seconds_of_change_a_full_frame() 
         }
     };
     server.hash_at(&session, 5600).await;
-    // At rest under the force; what is left of its motion can't be seen.
-    assert!(tokio::time::timeout(std::time::Duration::from_millis(300), frames.message()).await.is_err());
     check(&server, &session, &pb::WatchFramesResponse { step: 5600, ..last }, &vertices).await;
+    // At rest under the force; what is left of its motion can't be seen: the next frame is of another force.
+    touch.command(at_a_corner(2, -2.0)).await;
+    touch.settle().await;
+    server.start_until(&session, 5610).await;
+    let (next, _) = show(&mut frames, &mut vertices).await;
+    assert_eq!((next.frame_id, next.step), (561, 5610));
 }
 
 #[tokio::test]
@@ -350,12 +353,10 @@ async fn a_viewer_that_reads_nothing_delays_nobody() {
     }
     let request = watch(&session, 0, pb::Encoding::I16);
     let mut quick = server.views().await.watch_frames(request).await.unwrap().into_inner();
-    let mut touch = Touch::hold(&server, &session).await;
-    touch.command(force(0, 1, -1.0)).await;
-    touch.settle().await;
+    let mut touch = stir(&server, &session, 1000).await;
     server.start_until(&session, 1000).await;
-    touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == 1).await;
-    touch.sample_with(|sample| sample.step == 1000).await;
+    let last = touch.sample_with(|sample| sample.step == 1000).await;
+    assert_eq!(last.tools[0].acknowledged_sequence, 996);
     loop {
         let (last, _) = frame(&mut quick).await;
         if last.step > 950 {
@@ -379,11 +380,9 @@ async fn a_greedy_session_leaves_frames_for_others() {
     let mut frames = server.views().await.watch_frames(request).await.unwrap().into_inner();
     let _touch = stir(&server, &session, 1000).await;
     server.start_until(&session, 1000).await;
-    let mut count = 0;
-    while frame(&mut frames).await.0.step < 1000 {
-        count += 1;
-    }
-    assert!(count > 10, "{count} frames of 50");
+    // How many come in time is for a bench; that whose turn it is gets it, for `pace::frames`.
+    while frame(&mut frames).await.0.step < 1000 {}
+    assert!(!reading.is_finished(), "the flood has ended");
     reading.abort();
 }
 

@@ -18,7 +18,7 @@ pub const INTEGRATORS: [&str; 6] = ["lagged", "central", "rk4", "exponential2", 
 /// The key of each name below.
 pub const LANES: &str = "stepping.lanes";
 /// Every width of the kernel.
-pub const LANE_NAMES: [&str; 3] = ["avx512", "avx2", "plain"];
+pub const LANE_NAMES: [&str; 4] = ["avx512", "avx2", "neon", "plain"];
 
 /// The key of the number format.
 pub const PRECISION: &str = "stepping.precision";

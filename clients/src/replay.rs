@@ -1,5 +1,6 @@
 //! `palpate-client replay`: a script through a server, exactly.
 
+use std::collections::VecDeque;
 use std::io::{BufWriter, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
@@ -20,13 +21,14 @@ use palpate::wire::{self, pb};
 use pb::touch_request::Message as Say;
 use pb::touch_response::Message as Heard;
 use tokio::sync::mpsc;
+use tokio::task::JoinHandle;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Status, Streaming};
 
 use crate::connect::{Channel, Credentials, Server};
 use crate::{Failure, plot};
 
-/// How far ahead of the server's step commands are sent: as long as a network may stall and none is late.
+/// How far ahead of the server's step commands are sent: a network may stall for about as long before time has to stand.
 const AHEAD_S: f64 = 2.0;
 
 /// Commands of a tool on their way at most, below what a session queues.
@@ -267,6 +269,8 @@ struct Streamer<'s> {
     outbound: mpsc::Sender<pb::TouchRequest>,
     clock: Instant,
     next_step: u64,
+    /// For each heartbeat on its way, the step before which all commands were sent ahead of it.
+    sent_before: VecDeque<u64>,
 }
 
 impl Streamer<'_> {
@@ -292,9 +296,22 @@ impl Streamer<'_> {
         Ok(())
     }
 
-    async fn heartbeat(&self) -> Result<(), Failure> {
+    async fn heartbeat(&mut self) -> Result<(), Failure> {
+        self.sent_before.push_back(self.next_step);
         self.say(Say::Renew(pb::Renew { client_time_ns: self.now_ns() })).await
     }
+
+    /// A heartbeat was answered, which happens in order: tells the step before which the server has all commands.
+    fn taken_in(&mut self) -> u64 {
+        self.sent_before.pop_front().unwrap_or(0)
+    }
+}
+
+/// Lets time go on until `step`: only as far as the server has all commands, so that none is ever late.
+fn go_on(sessions: &SessionServiceClient<Channel>, session_id: &str, step: u64) -> JoinHandle<Result<(), Status>> {
+    let mut sessions = sessions.clone();
+    let request = pb::StartSessionRequest { session_id: session_id.to_owned(), until_step: Some(step) };
+    tokio::spawn(async move { sessions.start_session(request).await.map(|_| ()) })
 }
 
 async fn next<T>(stream: &mut Streaming<T>, heard: &LastHeard) -> Result<T, Failure> {
@@ -383,7 +400,8 @@ async fn play(
     let mut records = haptics.probe(probe).await.map_err(refused_or_failed)?.into_inner();
 
     let (outbound, messages) = mpsc::channel(1024);
-    let mut streamer = Streamer { script: &script, outbound, clock: Instant::now(), next_step: 0 };
+    let mut streamer =
+        Streamer { script: &script, outbound, clock: Instant::now(), next_step: 0, sent_before: VecDeque::new() };
     let open = pb::TouchOpen {
         session_id: session_id.clone(),
         tools: (0..script.tools() as u32).collect(),
@@ -403,21 +421,20 @@ async fn play(
     arguments.sampling.check(scene.stepping.rate_hz, ahead)?;
     let mut seen = Seen::new()?;
     streamer.send_before(ahead).await?;
-    // Answered in order: what has been sent so far is in the queue before the first step.
     streamer.heartbeat().await?;
-    loop {
+    let mut taken_in = loop {
         match next(&mut touch, heard).await?.message {
-            Some(Heard::Renewed(_)) => break,
+            Some(Heard::Renewed(_)) => break streamer.taken_in(),
             Some(Heard::Rejection(rejection)) => return Err(rejected(&rejection)),
             _ => {}
         }
-    }
+    };
     let mut hasher = sessions.clone();
     let asked = pb::GetStateHashRequest { session_id: session_id.clone(), at_step: Some(script.steps) };
     let mut hash = tokio::spawn(async move { hasher.get_state_hash(asked).await });
-    let start = pb::StartSessionRequest { session_id: session_id.clone(), until_step: Some(script.steps) };
     let started = Instant::now();
-    sessions.start_session(start).await.map_err(refused_or_failed)?;
+    let mut until = taken_in;
+    let (mut going_on, mut is_answered) = (go_on(&sessions, session_id, until), false);
 
     let progress = progress_bar(script.steps, arguments.quiet);
     let mut heartbeat = tokio::time::interval(HEARTBEAT);
@@ -427,6 +444,12 @@ async fn play(
     let mut final_hash = None;
     let mut wall_s = 0.0;
     while records_left > 0 || final_hash.is_none() || seen.last.0 < script.steps {
+        // Not for each heartbeat; and well before time would stand.
+        let is_worth_it = taken_in >= until + ahead / 4 || taken_in == script.steps;
+        if is_answered && taken_in > until && is_worth_it {
+            until = taken_in;
+            (going_on, is_answered) = (go_on(&sessions, session_id, until), false);
+        }
         tokio::select! {
             message = next(&mut touch, heard), if seen.last.0 < script.steps => match message?.message {
                 Some(Heard::Sample(sample)) => {
@@ -445,6 +468,7 @@ async fn play(
                     let round_trip_ns = streamer.now_ns().saturating_sub(renewed.client_time_ns);
                     let _ = seen.round_trip_ns.record(round_trip_ns);
                     let _ = seen.hold_ns.record(renewed.server_hold_ns);
+                    taken_in = streamer.taken_in();
                 }
                 Some(Heard::Rejection(rejection)) => {
                     seen.rejected += 1;
@@ -464,6 +488,10 @@ async fn play(
                     records_left -= 1;
                 }
             },
+            answer = &mut going_on, if !is_answered => {
+                answer.map_err(|e| Failure::Failed(e.to_string()))?.map_err(refused_or_failed)?;
+                is_answered = true;
+            }
             answer = &mut hash, if final_hash.is_none() => {
                 let answer = answer.map_err(|e| Failure::Failed(e.to_string()))?.map_err(failed)?;
                 final_hash = Some(answer.into_inner().state_hash);
@@ -483,6 +511,8 @@ async fn play(
         server_hold_us: percentiles_us(&seen.hold_ns),
     };
     let summary = Summary {
+        audited_error: None,
+        corrections: Vec::new(),
         steps: script.steps,
         substeps,
         points,

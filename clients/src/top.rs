@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use palpate::wire::error::describe;
 use palpate::wire::pb::session_service_client::SessionServiceClient;
-use palpate::wire::pb::{ListSessionsRequest, Session, SessionState};
+use palpate::wire::pb::{Audit, AuditedError, ListSessionsRequest, Session, SessionState};
 use serde_json::{Value, json};
 use tonic::Code;
 
@@ -131,10 +131,20 @@ fn as_json(rows: &[Row]) -> Value {
             "points": session.points, "awake_points": session.awake_points,
             "overrun_count": session.overrun_count, "overruns_per_s": overruns_per_s,
             "late_commands": session.late_commands, "guard_events": session.guard_events,
-            "streams": session.streams, "held_tools": holders.collect::<Vec<_>>(), "hold_reason": session.hold_reason,
+            "audit": session.audit.as_ref().map(audit), "streams": session.streams, "held_tools": holders.collect::<Vec<_>>(), "hold_reason": session.hold_reason,
         })
     };
     json!({ "sessions": rows.iter().map(one).collect::<Vec<_>>() })
+}
+
+fn audit(audit: &Audit) -> Value {
+    let error = |error: &AuditedError| json!({ "displacement": error.displacement, "force": error.force });
+    json!({
+        "windows": audit.windows, "step": audit.step, "newest_error": audit.newest_error.as_ref().map(error),
+        "largest_error": audit.largest_error.as_ref().map(error),
+        "windows_above_tolerance": audit.windows_above_tolerance, "reason": audit.reason,
+        "corrections": audit.corrections,
+    })
 }
 
 /// A line of sums, a head, and a line for each session; of `most` lines the busiest.
@@ -156,8 +166,18 @@ fn table(server: &str, rows: &[Row], most: usize) -> String {
     );
     let _ = writeln!(
         text,
-        "{:<32}  {:<12} {:<7} {:>10} {:>7} {:>8} {:>15} {:>8} {:>6} {:>7}  held by",
-        "session", "scene", "state", "step", "steps/s", "dilation", "awake/points", "overruns", "late", "streams"
+        "{:<32}  {:<12} {:<7} {:>10} {:>7} {:>8} {:>15} {:>8} {:>6} {:>8} {:>7}  held by",
+        "session",
+        "scene",
+        "state",
+        "step",
+        "steps/s",
+        "dilation",
+        "awake/points",
+        "overruns",
+        "late",
+        "error",
+        "streams"
     );
     let mut rows: Vec<&Row> = rows.iter().collect();
     if rows.len() > most {
@@ -165,10 +185,12 @@ fn table(server: &str, rows: &[Row], most: usize) -> String {
     }
     for Row { session, steps_per_s, .. } in rows.iter().take(most) {
         let holders: Vec<_> = session.held_tools.iter().map(|held| format!("{}: {}", held.tool, held.holder)).collect();
+        let newest = session.audit.as_ref().and_then(|audit| audit.newest_error.as_ref());
+        let error = newest.map_or("-".to_owned(), |error| format!("{:.1e}", error.displacement.max(error.force)));
         let awake = format!("{}/{}", session.awake_points, session.points);
         let _ = writeln!(
             text,
-            "{:<32}  {:<12.12} {:<7} {:>10} {:>7.0} {:>8.4} {:>15} {:>8} {:>6} {:>7}  {}",
+            "{:<32}  {:<12.12} {:<7} {:>10} {:>7.0} {:>8.4} {:>15} {:>8} {:>6} {:>8} {:>7}  {}",
             session.session_id,
             // Names are for people, and may hold anything.
             printable(&session.scene_name),
@@ -179,6 +201,7 @@ fn table(server: &str, rows: &[Row], most: usize) -> String {
             awake,
             session.overrun_count,
             session.late_commands,
+            error,
             session.streams,
             printable(&holders.join(", ")),
         );

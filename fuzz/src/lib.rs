@@ -271,6 +271,7 @@ fn request_seeds() -> Vec<Vec<u8>> {
         heartbeat_s: Some(0.04),
         device: Some(wire::local::device(&Device::named("omega3").expect("there is one"))),
         tip: Some(pb::Tip { radius_m: 0.02, friction: 0.2, ..Default::default() }),
+        touch_stiffness: true,
     };
     let touch = |message| pb::TouchRequest { message: Some(message) }.encode_to_vec();
     let scene = pb::create_session_request::Source::Scene(wire::scene::scene(&model().scene));

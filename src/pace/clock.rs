@@ -12,6 +12,18 @@ pub fn now_ns() -> u64 {
     now.duration_since(origin).as_nanos() as u64
 }
 
+/// Processor time of the calling thread, ns. Where the system does not tell it, the time that passes.
+#[allow(clippy::cast_sign_loss)]
+pub(super) fn thread_time_ns() -> u64 {
+    #[cfg(target_os = "linux")]
+    {
+        let time = rustix::time::clock_gettime(rustix::time::ClockId::ThreadCPUTime);
+        time.tv_sec as u64 * 1_000_000_000 + time.tv_nsec as u64
+    }
+    #[cfg(not(target_os = "linux"))]
+    now_ns()
+}
+
 /// Over which time dilation is measured.
 const DILATION_WINDOW_NS: u64 = 1_000_000_000;
 

@@ -1,6 +1,7 @@
 //! Where a stepping thread is asked for something, and waits until it is.
 
 use std::collections::VecDeque;
+use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -13,6 +14,7 @@ use super::tally::Tally;
 use super::taps::{HashReply, ProbeTap, SampleTap};
 use super::thread::Running;
 use crate::refusal::{Refusal, Result};
+use crate::sheet::audit::{Inputs, Mark};
 
 /// What a stepping thread is asked for.
 pub(super) enum Request {
@@ -29,6 +31,8 @@ pub(super) enum Request {
     Samples(SampleTap),
     Probe(ProbeTap),
     View(Arc<Viewer>),
+    /// To have a window of steps audited.
+    Audit(Inputs, SyncSender<Mark>),
     Hash {
         at: Option<u64>,
         reply: HashReply,

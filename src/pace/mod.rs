@@ -1,6 +1,7 @@
 //! Sessions in real time: the only room with a clock. Stepping threads own the sessions; what servers call here
 //! posts a request to one, or goes through the session's intake, and never waits for a step.
 
+pub mod auditor;
 pub mod clock;
 mod cost;
 pub mod frames;
@@ -29,6 +30,7 @@ use crate::session::local::Refinement;
 use crate::session::sampling::{HEARTBEAT_S, Sampler, Sampling};
 use crate::session::schedule::Schedule;
 use crate::sheet::Model;
+use auditor::{AuditTally, Audited, Auditor, Sessions};
 use clock::{Dilation, now_ns};
 use cost::Cost;
 use frames::{Delivery, Encoder, Viewer};
@@ -44,6 +46,8 @@ use thread::{Running, beat_ns};
 pub struct PacedSample {
     /// What the tools felt.
     pub sample: Sample,
+    /// When its step was due, by the server's clock.
+    pub due_ns: u64,
     /// Steps dropped so far.
     pub overrun_count: u64,
     /// Of the last second or so.
@@ -123,6 +127,7 @@ pub struct Live {
     refused: AtomicU64,
     laws: Mutex<Vec<KeptLaw>>,
     cost: Cost,
+    audited: Mutex<Audited>,
     /// Of the stepping threads, its own, and where that is asked.
     thread: usize,
     inbox: Arc<Inbox>,
@@ -181,6 +186,11 @@ impl Live {
     /// So many commands were refused.
     pub fn count_refused(&self, commands: usize) {
         self.refused.fetch_add(commands as u64, Ordering::Relaxed);
+    }
+
+    /// What audits have found so far.
+    pub fn audited(&self) -> Audited {
+        lock(&self.audited).clone()
     }
 
     /// Commands that were refused, in all.
@@ -246,7 +256,9 @@ impl Live {
 
     /// The next sample; the present one if time stands.
     pub async fn next_sample(&self, only: Vec<u32>) -> Result<PacedSample> {
-        let sampling = Sampling { every: 1, only: Some(only), deadband: None, heartbeat_s: HEARTBEAT_S, law: None };
+        let (law, touch_stiffness) = (None, false);
+        let sampling =
+            Sampling { every: 1, only: Some(only), deadband: None, heartbeat_s: HEARTBEAT_S, law, touch_stiffness };
         Ok(self.tap(sampling, true).pop().await?.0)
     }
 
@@ -304,7 +316,8 @@ pub struct Pacer {
     inboxes: Vec<Arc<Inbox>>,
     encoder: Arc<Encoder>,
     threads: Mutex<Vec<JoinHandle<()>>>,
-    sessions: Mutex<BTreeMap<String, Arc<Live>>>,
+    sessions: Sessions,
+    auditor: Arc<Auditor>,
     viewers: Mutex<BTreeMap<String, std::sync::Weak<Viewer>>>,
     numbers: Mutex<u64>,
 }
@@ -323,8 +336,9 @@ pub fn random_bits() -> Result<u128> {
 }
 
 impl Pacer {
-    /// Starts `threads` stepping threads, and one that encodes frames.
-    pub fn start(threads: usize, limits: &Limits) -> std::io::Result<Arc<Self>> {
+    /// Starts `threads` stepping threads, one that encodes frames, and one that measures errors with `audit_share` of a core;
+    /// none if that is 0.
+    pub fn start(threads: usize, audit_share: f64, limits: &Limits) -> std::io::Result<Arc<Self>> {
         let encoder = Arc::new(Encoder::default());
         let mut handles = Vec::new();
         let mut inboxes = Vec::new();
@@ -344,12 +358,22 @@ impl Pacer {
         }
         let worker = encoder.clone();
         handles.push(std::thread::Builder::new().name("frames".into()).spawn(move || worker.work())?);
+        let (auditor, sessions) = (Arc::new(Auditor::default()), Sessions::default());
+        if audit_share > 0.0 {
+            let (auditor, sessions) = (auditor.clone(), sessions.clone());
+            let worker = move || {
+                give_way();
+                auditor.work(&sessions, audit_share);
+            };
+            handles.push(std::thread::Builder::new().name("audit".into()).spawn(worker)?);
+        }
         Ok(Arc::new(Pacer {
             limits: limits.clone(),
             inboxes,
             encoder,
             threads: Mutex::new(handles),
-            sessions: Mutex::new(BTreeMap::new()),
+            sessions,
+            auditor,
             viewers: Mutex::new(BTreeMap::new()),
             numbers: Mutex::new(0),
         }))
@@ -398,6 +422,7 @@ impl Pacer {
             streams: Mutex::new(0),
             refused: AtomicU64::new(0),
             laws: Mutex::new(Vec::new()),
+            audited: Mutex::new(Audited::default()),
             cost,
             thread,
             inbox: inbox.clone(),
@@ -489,6 +514,11 @@ impl Pacer {
         self.inboxes.iter().map(|inbox| &inbox.tally)
     }
 
+    /// What the auditor counts.
+    pub fn audit_tally(&self) -> &AuditTally {
+        &self.auditor.tally
+    }
+
     /// Those who look at some session.
     pub fn viewers(&self) -> usize {
         lock(&self.viewers).values().filter(|viewer| viewer.strong_count() > 0).count()
@@ -534,6 +564,7 @@ impl Pacer {
         }
         self.inboxes.iter().for_each(|inbox| inbox.stop(why.clone()));
         self.encoder.stop();
+        self.auditor.stop();
         for thread in lock(&self.threads).drain(..) {
             let _ = thread.join();
         }
@@ -564,34 +595,4 @@ pub fn excerpt(text: &str) -> String {
 pub type FrameReader = Reader<Delivery>;
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::scene::PAPER;
-
-    #[tokio::test]
-    async fn a_fault_in_one_session_ends_that_one_alone() {
-        let limits = Limits::default();
-        let scene = Scene::parse("paper", PAPER, &[], &limits).unwrap();
-        let pacer = Pacer::start(1, &limits).unwrap();
-        let [faulty, sound] = [(); 2].map(|()| pacer.create(&scene, false, 60.0).unwrap());
-        let mut samples =
-            faulty.samples(Sampling { every: 1, only: None, deadband: None, heartbeat_s: 0.01, law: None });
-        samples.pop().await.unwrap();
-        faulty.inbox.send(faulty.number, Request::Panic);
-        let told = faulty.hash_at(Some(1_000_000)).await.unwrap_err();
-        assert_eq!((told.reason, faulty.status().state), (Reason::SessionHeld, State::Held));
-        assert!(told.message.contains("a test"), "{told}");
-        let ended = loop {
-            if let Err(ended) = samples.pop().await {
-                break ended;
-            }
-        };
-        assert_eq!(ended.reason, Reason::SessionHeld);
-        let refused = faulty.at_intake(|intake, now| intake.acquire(&[0], "", 1.0, 1, now));
-        assert_eq!(refused.unwrap_err().reason, Reason::SessionHeld);
-        // On the same thread.
-        let step = sound.status().step;
-        assert_eq!(sound.hash_at(Some(step + 20)).await.unwrap().0, step + 20);
-        pacer.stop();
-    }
-}
+mod tests;

@@ -33,6 +33,7 @@ use crate::session::Session;
 use crate::session::command::Due;
 use crate::session::local::Refinement;
 use crate::session::schedule::Schedule;
+use crate::sheet::audit::Mark;
 use crate::surface::Snapshot;
 
 /// Steps that a session may be behind before the rest is dropped.
@@ -61,6 +62,8 @@ pub(super) struct Running {
     schedule: Schedule,
     /// The step to do next. At rest, those before it are skipped; `u64::MAX` if there is none.
     next_step: u64,
+    /// When the newest step was due, before what it was late by beyond measure was dropped.
+    due_ns: u64,
     /// It was late, and takes more than its part: it goes after those that were due by then.
     not_before_ns: u64,
     /// Steps done when all was asleep first, if it still is.
@@ -72,6 +75,8 @@ pub(super) struct Running {
     due: Vec<Due>,
     hashed: Option<(u64, u128)>,
     taps: Taps,
+    /// Who is to be told of the window that the session was asked for.
+    audit: Option<SyncSender<Mark>>,
     deleted: bool,
 }
 
@@ -185,6 +190,7 @@ impl Running {
             until: None,
             schedule,
             next_step: 0,
+            due_ns: 0,
             not_before_ns: 0,
             still_since: Some(0),
             rested_steps: 0,
@@ -194,6 +200,7 @@ impl Running {
             due: Vec::new(),
             hashed: None,
             taps: Taps::default(),
+            audit: None,
             deleted: false,
             live,
         }
@@ -288,6 +295,10 @@ impl Running {
                     self.taps.samples.push(tap);
                 }
             }
+            Request::Audit(inputs, marks) => {
+                self.session.watch(inputs);
+                self.audit = Some(marks);
+            }
             Request::Probe(tap) if self.session.hold_reason().is_some() => tap.writer.close(self.passed(0)),
             Request::Probe(tap) => self.taps.probes.push(tap),
             Request::View(viewer) => {
@@ -377,6 +388,7 @@ impl Running {
         let sampled = self.next_step.is_multiple_of(STEPS_PER_SPAN);
         let span = sampled.then(|| tracing::debug_span!("step", session = %self.live.id, step = self.next_step));
         let _span = span.map(tracing::Span::entered);
+        self.due_ns = self.schedule.due_ns(self.next_step);
         if self.next_step == self.session.step_count() {
             // Only of steps that cost something can a session be behind.
             self.drop_backlog(begun_ns, desk.longest.ns());
@@ -407,6 +419,7 @@ impl Running {
                 tap.writer.push_quietly(PacedRecord { step, record }, wakes);
             }
         });
+        self.tell_auditor();
         if let Some(reason) = self.session.hold_reason() {
             tracing::warn!(session = %self.live.id, reason, "session held");
             self.running = false;
@@ -435,6 +448,17 @@ impl Running {
         self.plan();
     }
 
+    /// Tells the auditor where the window begins or ends, without waiting: there is room for both.
+    fn tell_auditor(&mut self) {
+        let Some(auditor) = &self.audit else { return };
+        let ended = self.session.hold_reason().is_some();
+        let Some(mark) = self.session.take_mark().or(ended.then_some(Mark::Dropped)) else { return };
+        let is_last = !matches!(mark, Mark::Begin(_));
+        if auditor.try_send(mark).is_err() || is_last {
+            self.audit = None;
+        }
+    }
+
     /// Has the stiffness computed anew under the tools of which it is told.
     fn refine(&self, refiner: &SyncSender<Refinement>) {
         for refinement in self.taps.samples.iter().flat_map(|tap| tap.sampler.refinements(&self.session)) {
@@ -448,8 +472,8 @@ impl Running {
         let Some(sample) = tap.sampler.pick(&self.session, last || tap.once) else { return };
         let overrun = self.overrun_count > tap.overrun_count;
         tap.overrun_count = self.overrun_count;
-        let Running { overrun_count, .. } = *self;
-        let paced = PacedSample { sample, overrun_count, time_dilation: self.dilation.value, overrun };
+        let Running { overrun_count, due_ns, .. } = *self;
+        let paced = PacedSample { sample, due_ns, overrun_count, time_dilation: self.dilation.value, overrun };
         tap.writer.push_quietly(paced, wakes);
     }
 
@@ -544,3 +568,6 @@ impl Running {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

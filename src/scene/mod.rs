@@ -141,6 +141,8 @@ pub struct Stepping {
     pub precision: Precision,
     /// How many numbers are worked on at once.
     pub lanes: Lanes,
+    /// Where an audit finds an error above the tolerance, the tissue is stepped more accurately from then on.
+    pub correct: bool,
 }
 
 impl Default for Stepping {
@@ -152,6 +154,7 @@ impl Default for Stepping {
             substeps: None,
             precision: Precision::Auto,
             lanes: Lanes::Auto,
+            correct: false,
         }
     }
 }
@@ -244,13 +247,20 @@ pub enum Lanes {
     Avx512,
     /// 32 bytes.
     Avx2,
+    /// 16 bytes: on ARM.
+    Neon,
     /// One by one: on any machine.
     Plain,
 }
 
 impl Named for Lanes {
-    const NAMES: &'static [(&'static str, Self)] =
-        &[("auto", Lanes::Auto), ("avx512", Lanes::Avx512), ("avx2", Lanes::Avx2), ("plain", Lanes::Plain)];
+    const NAMES: &'static [(&'static str, Self)] = &[
+        ("auto", Lanes::Auto),
+        ("avx512", Lanes::Avx512),
+        ("avx2", Lanes::Avx2),
+        ("neon", Lanes::Neon),
+        ("plain", Lanes::Plain),
+    ];
 }
 
 impl Scene {
@@ -492,6 +502,7 @@ fn read_stepping(item: &Item<'_>) -> Result<Stepping> {
                 Some(name) => Lanes::named(&fields.path("lanes"), &name)?,
                 None => standard.lanes,
             },
+            correct: fields.item("correct").map_or(Ok(standard.correct), |item| item.flag())?,
         })
     })
 }

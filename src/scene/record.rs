@@ -4,6 +4,8 @@ use std::io::Write;
 
 use serde::Serialize;
 
+use super::{Integrator, Named, Precision};
+
 /// The first line.
 #[derive(Debug, Clone, Serialize)]
 pub struct Run {
@@ -84,9 +86,61 @@ pub struct Summary {
     pub guard_events: u64,
     /// XXH3-128 of the state, in hexadecimal.
     pub final_hash: String,
+    /// What an audit measured: of all sample points and times.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub audited_error: Option<AuditedError>,
+    /// What an audit changed, by rising steps.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub corrections: Vec<Correction>,
     /// What a replay measured besides.
     #[serde(flatten, skip_serializing_if = "Option::is_none")]
     pub network: Option<Network>,
+}
+
+/// An error that was measured, each part relative to the largest component of its kind.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+pub struct AuditedError {
+    /// Largest difference of any component of a displacement.
+    pub displacement: f64,
+    /// The same of the tissue's force on a tool: springs, virtual springs and damping.
+    pub force: f64,
+}
+
+impl AuditedError {
+    /// The larger of the two.
+    pub fn largest(&self) -> f64 {
+        self.displacement.max(self.force)
+    }
+
+    /// The larger of each part.
+    pub fn max(self, other: Self) -> Self {
+        AuditedError { displacement: self.displacement.max(other.displacement), force: self.force.max(other.force) }
+    }
+}
+
+/// A tissue is stepped more accurately from a step on, because an audited error was above the tolerance.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Correction {
+    /// The step at whose beginning it acts.
+    pub step: u64,
+    /// The error that was found.
+    pub audited_error: AuditedError,
+    /// Where most of it came from.
+    pub reason: String,
+    /// Scheme from then on.
+    #[serde(serialize_with = "name")]
+    pub integrator: Integrator,
+    /// Substeps from then on.
+    pub substeps: u32,
+    /// Number format from then on.
+    #[serde(serialize_with = "name")]
+    pub precision: Precision,
+    /// What regions at rest may cost from then on.
+    pub sleep_tolerance: f64,
+}
+
+fn name<S: serde::Serializer>(value: &impl Named, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_str(value.name())
 }
 
 /// What a replay through a server measured.

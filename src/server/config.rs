@@ -38,6 +38,8 @@ pub struct Config {
     pub threads: usize,
     /// Threads of the network side; as many as the stepping threads leave cores, at least 1, if 0.
     pub network_threads: usize,
+    /// Part of a core with which the errors of live sessions are measured; nothing is measured if 0.
+    pub audit_share: f64,
     /// How long open streams may take to end at shutdown before they are cut, s.
     pub shutdown_deadline_s: f64,
     /// Lease of a tool if the client asks for none, s.
@@ -66,6 +68,7 @@ impl Default for Config {
             viewer: PathBuf::from("clients/viewer/dist"),
             threads: 0,
             network_threads: 0,
+            audit_share: 0.02,
             shutdown_deadline_s: 5.0,
             lease_s: 2.0,
             idle_session_s: 900.0,
@@ -132,6 +135,7 @@ impl Config {
             number(field, value, "above 0 and at most a day", within(day_s))?;
         }
         number("shutdown_deadline_s", self.shutdown_deadline_s, "above 0 and at most a day", within(day_s))?;
+        number("audit_share", self.audit_share, "from 0 to 1", |share| (0.0..=1.0).contains(&share))?;
         number("idle_session_s", self.idle_session_s, "above 0", |value| value > 0.0)?;
         Ok(())
     }

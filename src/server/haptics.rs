@@ -101,6 +101,11 @@ impl Haptics {
         let only = (!open.tools.is_empty()).then(|| open.tools.clone());
         let (every, deadband) = (open.sample_every_steps, open.deadband.as_ref());
         let mut sampling = wire::sample::sampling(every, only, deadband, open.heartbeat_s, device.is_some())?;
+        if open.touch_stiffness && device.is_none() {
+            let message = "is missing: touch_stiffness is of its local models";
+            return Err(Refusal::new(Reason::Missing, "device", message));
+        }
+        sampling.touch_stiffness = open.touch_stiffness;
         let guard = live.open_stream()?;
         if device.is_some() {
             let live = live.clone();

@@ -24,6 +24,7 @@ use crate::pace::queue::lock;
 use crate::pace::tally::{Count, Tally, Times};
 use crate::pace::{Pacer, State};
 use crate::refusal::Reason;
+use crate::scene::record::AuditedError;
 
 /// One label.
 type Label = [(&'static str, &'static str); 1];
@@ -178,6 +179,17 @@ impl Collector for Stepping {
             tell(name, help, None, &ConstCounter::new(sum))?;
         }
 
+        let audits = pacer.audit_tally();
+        for (name, help, count) in [
+            ("audited_windows", "Windows of steps whose error was measured", &audits.windows),
+            ("audited_windows_above_tolerance", "Of those, with an error above the scene's tolerance", &audits.above),
+            ("corrections", "Tissues that are stepped more accurately since an audit", &audits.corrections),
+        ] {
+            tell(name, help, None, &ConstCounter::new(count.get()))?;
+        }
+        let busy_s = audits.busy_ns.get() as f64 * 1e-9;
+        tell("audit_time", "Processor time of the auditor", Some(&Unit::Seconds), &ConstCounter::new(busy_s))?;
+
         let sessions = pacer.list();
         let statuses: Vec<_> = sessions.iter().map(|live| live.status()).collect();
         let mut states = encoder.encode_descriptor("sessions", "Sessions, by state", None, MetricType::Gauge)?;
@@ -204,6 +216,11 @@ impl Collector for Stepping {
         gauge("awake_points", "Mass points that the last steps of all sessions computed", awake as f64)?;
         gauge("streams", "Streams that read a session", streams as f64)?;
         gauge("viewers", "Streams of frames", pacer.viewers() as f64)?;
+        let newest = sessions.iter().filter_map(|live| live.audited().newest);
+        let worst = newest.map(|(_, error)| error).reduce(AuditedError::max).unwrap_or_default();
+        let help = "Of the newest audits of all sessions the largest error of a displacement, relative to the largest";
+        gauge("audited_displacement_error_max", help, worst.displacement)?;
+        gauge("audited_force_error_max", "The same of a force", worst.force)?;
         let running = statuses.iter().filter(|status| status.state == State::Running);
         let slowest = running.map(|status| status.dilation.value).fold(1.0, f64::min);
         gauge("time_dilation_min", "Simulated over real time of the session that is furthest behind", slowest)

@@ -160,7 +160,7 @@ pub enum ServeError {
 /// deadline of the configuration has passed. The caller ends its runtime without waiting (`shutdown_background`).
 pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) -> Result<(), ServeError> {
     let Doors { listener, metrics, protection } = doors;
-    let pacer = Pacer::start(config.stepping_threads(), &config.limits)?;
+    let pacer = Pacer::start(config.stepping_threads(), config.audit_share, &config.limits)?;
     let deadline = Duration::from_secs_f64(config.shutdown_deadline_s);
     let catalog = Catalog::new(&config.scenes, &config.scripts);
     for name in catalog.names() {

@@ -29,8 +29,7 @@ const WINDOW_S: f64 = 0.004;
 
 /// Looks at a scene, and times its step under a poke. `clock_s` tells the time.
 pub fn check(model: &Arc<Model>, most_substeps: u32, clock_s: &dyn Fn() -> f64) -> Report {
-    let stepping = &model.scene.stepping;
-    let candidates = choice::candidates(stepping, &Oscillator::of(&model.scene), most_substeps);
+    let candidates = choice::candidates(&model.scene, most_substeps);
     Report { model: model.clone(), candidates, step_s: time(model, clock_s) }
 }
 

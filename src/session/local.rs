@@ -19,6 +19,10 @@ const KNOCKED_SAMPLES: u32 = 5;
 #[derive(Debug, Clone)]
 pub struct Modeller {
     law: Arc<Law>,
+    /// Also under a touch K and B are to be those of the sheet around it.
+    touches_too: bool,
+    /// How the tool stood to the tissue in the newest model.
+    standing: Standing,
     /// Where the surface was, and its normal, when the tool last did not touch it.
     surface: Option<(DVec3, DVec3)>,
     /// Samples in a row in which the tool was below it and did not touch.
@@ -44,9 +48,20 @@ impl Refinement {
 }
 
 impl Modeller {
-    /// For a tool on a tissue with this law.
-    pub fn new(law: Arc<Law>) -> Self {
-        Modeller { law, surface: None, knocked: 0, sequence: 0, tangent: Arc::default() }
+    /// For a tool on a tissue with this law. A grasp is rendered by K and B of the sheet around it, which are computed
+    /// anew again and again; a touch is rendered by the law, and has them computed only if `touches_too`.
+    pub fn new(law: Arc<Law>, touches_too: bool) -> Self {
+        let (standing, tangent) = (Standing::Free, Arc::default());
+        Modeller { law, touches_too, standing, surface: None, knocked: 0, sequence: 0, tangent }
+    }
+
+    /// Whether K and B are to be computed where the tool is now.
+    pub fn wants_refinement(&self) -> bool {
+        match self.standing {
+            Standing::Free => false,
+            Standing::Sticking | Standing::Sliding => self.touches_too,
+            Standing::Holding => true,
+        }
     }
 
     /// What computes the stiffness anew, from the sheet around the tool.
@@ -57,6 +72,7 @@ impl Modeller {
     /// The model after a step. K and B are the newest that were computed where the tool is, or else the law's.
     pub fn model(&mut self, feel: &Feel, step: u64, client_time_s: f64) -> LocalModel {
         self.sequence += 1;
+        self.standing = feel.standing;
         let touches = matches!(feel.standing, Standing::Sticking | Standing::Sliding);
         let below = self.surface.is_some_and(|(surface_m, normal)| (surface_m - feel.place_m).dot(normal) > 0.0);
         // A tissue that is met starts away from the tool for a moment: where it is then is not where it will be met.
@@ -77,7 +93,7 @@ impl Modeller {
         }
         let row = self.law.at_depth(depth_m);
         let mut newest = self.tangent.lock().unwrap_or_else(PoisonError::into_inner);
-        if feel.standing == Standing::Free {
+        if !self.wants_refinement() {
             *newest = None;
         }
         let (stiffness_n_per_m, damping_n_s_per_m) = match newest.as_ref() {

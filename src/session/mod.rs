@@ -1,6 +1,7 @@
 //! One tissue in use: what the tools do to it, what they feel, what is recorded. No clock, no socket: a session
 //! that is given the same commands at the same steps gives the same bits.
 
+pub mod audit;
 pub mod check;
 pub mod command;
 pub mod local;
@@ -18,6 +19,7 @@ use crate::scene::law::{ForceLaw, MoveLaw};
 use crate::scene::record::{EnergyJ, Point, Record};
 use crate::scene::script::{Action, nearest_point};
 use crate::scene::tip::Tip;
+use crate::sheet::audit::{Inputs, Mark};
 use crate::sheet::{self, Energy, Feel, Grasp, Model, PointState, Push, Tissue};
 use command::Due;
 
@@ -177,9 +179,23 @@ impl Session {
         self.tissue.skip_steps(step.saturating_sub(self.step_count()));
     }
 
-    /// From the coming step on the tissue is that of `model`, which is [`Model::changed`] of this one's.
+    /// From the coming step on the tissue is that of `model`, which is [`Model::changed`] or [`Model::corrected`] of this
+    /// one's.
     pub fn change(&mut self, model: &Arc<Model>) {
-        self.tissue.change(model);
+        match self.tissue.changed(model) {
+            Some(tissue) => self.tissue = tissue,
+            None => self.tissue.change(model),
+        }
+    }
+
+    /// Asks for a window of steps to be audited ([`sheet::audit`]).
+    pub fn watch(&mut self, inputs: Inputs) {
+        self.tissue.watch(inputs);
+    }
+
+    /// What there is to tell of that window after a step, once.
+    pub fn take_mark(&mut self) -> Option<Mark> {
+        self.tissue.take_mark()
     }
 
     /// One step: `due` acts at its beginning, by the number of the tool. `observe` is called at its end unless the guard

@@ -5,12 +5,14 @@ use std::io::Write;
 use std::sync::Arc;
 
 use super::Session;
+use super::audit::{Twin, Windows};
 use super::command::{Command, Intake};
 use crate::limits::Limits;
 use crate::refusal::{Refusal, Result};
 use crate::scene::Named;
-use crate::scene::record::{Line, Record, Run, Summary, write_line};
+use crate::scene::record::{Correction, Line, Record, Run, Summary, write_line};
 use crate::scene::script::{Action, Script};
+use crate::sheet::audit::Finding;
 use crate::sheet::{Model, Tissue};
 
 /// How a run can end early.
@@ -85,48 +87,124 @@ pub fn run(
     clock_s: &dyn Fn() -> f64,
     progress: &mut dyn FnMut(u64),
 ) -> std::result::Result<Summary, Failure> {
-    let mut session = Session::new(model);
-    let mut changes = model.course(&script.changes, limits)?;
-    // Held forces are commands, through the same intake as a server's; laws are set once.
-    let mut intake = held.then(|| intake(model, script, limits)).transpose()?;
-    if !held {
-        play(&mut session, script);
-    }
-    write_line(output, &Line::Run(&header(model, &script.name)))?;
-    let mut due = Vec::new();
-    let mut written: std::io::Result<()> = Ok(());
-    let (mut stepping_s, mut resumed_s) = (0.0, clock_s());
-    for step in 0..script.steps {
-        if let Some(intake) = &mut intake {
-            for (tool, action) in script.actions_at(step) {
-                intake.submit(LEASE, vec![command(tool, step, action)], 0)?;
-            }
-            intake.take_due(step, 0, &mut due);
+    Playing { model, script, held, limits, twin: None, corrections: Vec::new() }.play(output, clock_s, progress)
+}
+
+/// The same, with a twin in f64 with a quarter of the substep beside it: the summary has what they differ by. With
+/// `[stepping] correct`, errors above the tolerance are corrected on the way.
+pub fn audited(
+    model: &Arc<Model>,
+    script: &Script,
+    held: bool,
+    limits: &Limits,
+    output: &mut dyn Write,
+    clock_s: &dyn Fn() -> f64,
+    progress: &mut dyn FnMut(u64),
+) -> std::result::Result<Summary, Failure> {
+    let twin = Some(Twin::new(model));
+    Playing { model, script, held, limits, twin, corrections: Vec::new() }.play(output, clock_s, progress)
+}
+
+/// A script under way.
+struct Playing<'p> {
+    model: &'p Arc<Model>,
+    script: &'p Script,
+    held: bool,
+    limits: &'p Limits,
+    twin: Option<Twin>,
+    corrections: Vec<Correction>,
+}
+
+impl Playing<'_> {
+    fn play(
+        mut self,
+        output: &mut dyn Write,
+        clock_s: &dyn Fn() -> f64,
+        progress: &mut dyn FnMut(u64),
+    ) -> std::result::Result<Summary, Failure> {
+        let Playing { model, script, held, limits, .. } = self;
+        let mut session = Session::new(model);
+        let mut changes = model.course(&script.changes, limits)?;
+        // Held forces are commands, through the same intake as a server's; laws are set once.
+        let mut intake = held.then(|| intake(model, script, limits)).transpose()?;
+        if !held {
+            play(&mut session, script);
+            self.twin.iter_mut().for_each(|twin| play(twin.session(), script));
         }
-        change(&mut session, &mut changes);
-        session.advance(&mut due, |session| {
-            if session.step_count().is_multiple_of(script.sample_every) {
-                // The clock of the summary stands while a record is written.
-                stepping_s += clock_s() - resumed_s;
-                if written.is_ok() {
-                    let record = session.record(Some(&script.sample_points));
-                    written = write_line(output, &Record { energy_j: Some(session.energy()), ..record });
+        write_line(output, &Line::Run(&header(model, &script.name)))?;
+        let mut due = Vec::new();
+        let mut written: std::io::Result<()> = Ok(());
+        let mut windows = (self.twin.is_some() && model.scene.stepping.correct).then(Windows::default);
+        let (mut stepping_s, mut resumed_s) = (0.0, clock_s());
+        for step in 0..script.steps {
+            if let Some(intake) = &mut intake {
+                for (tool, action) in script.actions_at(step) {
+                    intake.submit(LEASE, vec![command(tool, step, action)], 0)?;
                 }
-                resumed_s = clock_s();
+                intake.take_due(step, 0, &mut due);
             }
-        });
-        std::mem::replace(&mut written, Ok(()))?;
-        if let Some(reason) = session.hold_reason() {
-            return Err(Failure::Held(reason.to_owned()));
+            // The clock of the summary stands for all that is not the session's own stepping.
+            stepping_s += clock_s() - resumed_s;
+            if let Some(windows) = &mut windows
+                && let Some(finding) = windows.look(&mut session)
+            {
+                self.correct(&mut session, &finding, &mut changes)?;
+            }
+            if changes.front().is_some_and(|change| change.0 <= step) {
+                change(&mut session, &mut changes);
+                let model = session.model().clone();
+                self.twin.iter_mut().for_each(|twin| twin.change(&model));
+            }
+            if let Some(twin) = &mut self.twin {
+                twin.advance(&due, script);
+                if let Some(reason) = twin.hold_reason() {
+                    return Err(Failure::Held(reason));
+                }
+            }
+            resumed_s = clock_s();
+            session.advance(&mut due, |session| {
+                if session.step_count().is_multiple_of(script.sample_every) {
+                    stepping_s += clock_s() - resumed_s;
+                    if written.is_ok() {
+                        let record = session.record(Some(&script.sample_points));
+                        self.twin.iter_mut().for_each(|twin| twin.compare(&record));
+                        written = write_line(output, &Record { energy_j: Some(session.energy()), ..record });
+                    }
+                    resumed_s = clock_s();
+                }
+            });
+            std::mem::replace(&mut written, Ok(()))?;
+            if let Some(reason) = session.hold_reason() {
+                return Err(Failure::Held(reason.to_owned()));
+            }
+            if step.is_multiple_of(1024) {
+                progress(step);
+            }
         }
-        if step.is_multiple_of(1024) {
-            progress(step);
-        }
+        stepping_s += clock_s() - resumed_s;
+        let audited_error = self.twin.as_ref().map(Twin::error);
+        let summary = Summary { audited_error, corrections: self.corrections, ..summary(session.tissue(), stepping_s) };
+        write_line(output, &Line::Summary(&summary))?;
+        Ok(summary)
     }
-    stepping_s += clock_s() - resumed_s;
-    let summary = summary(session.tissue(), stepping_s);
-    write_line(output, &Line::Summary(&summary))?;
-    Ok(summary)
+
+    /// Steps the tissue more accurately from now on, if the finding asks for it, and what the script makes of it later.
+    fn correct(
+        &mut self,
+        session: &mut Session,
+        finding: &Finding,
+        changes: &mut VecDeque<(u64, Arc<Model>)>,
+    ) -> Result<()> {
+        let step = session.step_count();
+        let Some(correction) = session.model().correction(finding, step, self.limits) else { return Ok(()) };
+        let corrected = session.model().corrected(&correction, self.limits)?;
+        session.change(&corrected);
+        self.twin.iter_mut().for_each(|twin| twin.change(&corrected));
+        self.corrections.push(correction);
+        let later = self.script.changes.len() - changes.len();
+        *changes = corrected.course_of(&self.model.scene, &self.script.changes[later..], self.limits)?;
+        Ok(())
+    }
 }
 
 /// Any number: in process nobody else asks.
@@ -156,6 +234,8 @@ pub fn summary(tissue: &dyn Tissue, wall_s: f64) -> Summary {
         computed_fraction: tissue.computed_fraction(),
         guard_events: tissue.guard_events(),
         final_hash: format!("{:032x}", tissue.state_hash()),
+        audited_error: None,
+        corrections: Vec::new(),
         network: None,
     }
 }

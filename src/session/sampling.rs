@@ -88,6 +88,8 @@ pub struct Sampling {
     pub heartbeat_s: f64,
     /// Samples have local models by this law.
     pub law: Option<Arc<Law>>,
+    /// Their stiffness and damping are those of the sheet around the tool also under a touch, not only under a grasp.
+    pub touch_stiffness: bool,
 }
 
 impl Sampling {
@@ -169,7 +171,7 @@ impl Sampler {
                 continue;
             };
             let foresight = self.foresight.entry(tool.tool).or_insert_with(|| Foresight {
-                modeller: Modeller::new(law.clone()),
+                modeller: Modeller::new(law.clone(), self.sampling.touch_stiffness),
                 deadband: haptics::Deadband::new(fraction.unwrap_or(0.0)),
             });
             let model = foresight.modeller.model(feel, sample.step, tool.place_time_s);
@@ -179,12 +181,12 @@ impl Sampler {
         (models, is_left)
     }
 
-    /// What computes the stiffness anew under each tool that touches, of which the stream is told.
+    /// What computes the stiffness anew under each tool of whose stiffness the stream is told.
     pub fn refinements(&self, session: &Session) -> impl Iterator<Item = Refinement> {
-        let refinement = |(tool, foresight): (&u32, &Foresight)| {
+        let wanted = self.foresight.iter().filter(|(_, foresight)| foresight.modeller.wants_refinement());
+        wanted.filter_map(|(tool, foresight)| {
             Some(foresight.modeller.refinement(session.tissue().surroundings(*tool as usize)?))
-        };
-        self.foresight.iter().filter_map(refinement)
+        })
     }
 
     fn is_news(&self, told: &Sample, now: &Sample) -> bool {
@@ -215,26 +217,73 @@ mod tests {
     use super::*;
     use crate::limits::Limits;
     use crate::scene::script::Action;
+    use crate::scene::tip::Tip;
     use crate::scene::{PAPER, Scene};
     use crate::session::command::{Command, Due};
     use crate::sheet::Model;
     use glam::DVec3;
 
-    fn session() -> Session {
+    fn session(assignments: &[&str]) -> Session {
         let limits = Limits::default();
-        let scene = Scene::parse("paper", PAPER, &[], &limits).unwrap();
+        let assignments: Vec<_> = assignments.iter().map(|text| (*text).to_owned()).collect();
+        let scene = Scene::parse("paper", PAPER, &assignments, &limits).unwrap();
         Session::new(&Model::compile(&scene, &limits).unwrap())
     }
 
     fn sampler(every: u64, deadband: Option<Deadband>) -> Sampler {
-        Sampler::new(Sampling { every, only: None, deadband, heartbeat_s: 0.02, law: None }, 1000.0)
+        Sampler::new(Sampling { every, deadband, heartbeat_s: 0.02, ..sampling() }, 1000.0)
     }
 
-    fn grasp(session: &mut Session, sequence: u64, z_m: f64) {
-        let action = Action::Grasp { point: [15, 15], displacement_m: DVec3::new(0.0, 0.0, z_m) };
+    fn sampling() -> Sampling {
+        Sampling { every: 1, only: None, deadband: None, heartbeat_s: HEARTBEAT_S, law: None, touch_stiffness: false }
+    }
+
+    fn tell(session: &mut Session, sequence: u64, action: Action) {
         let (at_step, time_to_live_s) = (None, None);
         let command = Command { tool: 0, sequence, client_time_ns: 0, at_step, time_to_live_s, action, arrival_ns: 1 };
         session.advance(&mut vec![Due { command, late: false, late_commands: 0, ends_lease: false }], |_| {});
+    }
+
+    fn grasp(session: &mut Session, sequence: u64, z_m: f64) {
+        tell(session, sequence, Action::Grasp { point: [15, 15], displacement_m: DVec3::new(0.0, 0.0, z_m) });
+    }
+
+    #[test]
+    fn the_stiffness_is_computed_under_grasps_and_under_touches_for_who_asked() {
+        for (grasps, touch_stiffness, computed) in
+            [(false, false, false), (false, true, true), (true, false, true), (true, true, true)]
+        {
+            // In f32 the surface's normal is tilted by its last digits.
+            let mut session = session(&["stepping.precision=f64"]);
+            let tip = Tip { grasps, radius_m: 0.05, ..Tip::default() };
+            let law = Arc::new(Law::of(session.model(), tip.radius_m));
+            let mut sampler = Sampler::new(Sampling { law: Some(law.clone()), touch_stiffness, ..sampling() }, 1000.0);
+            let middle_m = (session.model().scene.sheet.extent_m() / 2.0).extend(0.0);
+            let (mut model, mut touched) = (None, false);
+            for step in 1..=100 {
+                let place_m = middle_m - 1e-4 * step as f64 * DVec3::Z;
+                tell(&mut session, step, Action::Lead { place_m, tip });
+                model = sampler.pick(&session, false).and_then(|sample| sample.tools[0].local);
+                let refinements: Vec<_> = sampler.refinements(&session).collect();
+                // A touch begins where the surface is met.
+                let touches = session.tissue().surroundings(0).is_some();
+                assert_eq!(
+                    refinements.len(),
+                    usize::from(computed && touches),
+                    "grasps {grasps}, asked {touch_stiffness}, step {step}"
+                );
+                touched |= touches;
+                refinements.into_iter().for_each(Refinement::work);
+            }
+            assert!(touched, "grasps {grasps}, asked {touch_stiffness}");
+            // Without it they are the law's: one stiffness along the normal, and one across.
+            let k = model.unwrap().stiffness_n_per_m;
+            let by_law = (0..3).all(|c| (0..c).all(|row| k.col(c)[row].abs() < 1e-9)) && k.x_axis.x == k.y_axis.y;
+            let along = law.rows.iter().map(|row| row.stiffness_n_per_m);
+            let (least, most) = along.fold((f64::INFINITY, 0.0_f64), |(a, b), k| (a.min(k), b.max(k)));
+            assert!(k.z_axis.z > 0.5 * least && k.z_axis.z < 2.0 * most, "{k}");
+            assert!(computed || by_law, "{k}");
+        }
     }
 
     /// Steps at which a stream gets a sample while nothing is told to the session.
@@ -248,10 +297,10 @@ mod tests {
 
     #[test]
     fn what_is_still_is_told_by_heartbeats_at_multiples_of_n() {
-        assert_eq!(picked(&mut session(), &mut sampler(1, None), 50), [1, 21, 41]);
-        assert_eq!(picked(&mut session(), &mut sampler(15, None), 100), [15, 45, 75]);
+        assert_eq!(picked(&mut session(&[]), &mut sampler(1, None), 50), [1, 21, 41]);
+        assert_eq!(picked(&mut session(&[]), &mut sampler(15, None), 100), [15, 45, 75]);
         // And it is foretold, so that the steps between can be skipped.
-        let (mut session, mut sampler) = (session(), sampler(15, None));
+        let (mut session, mut sampler) = (session(&[]), sampler(15, None));
         for due in [15, 45, 75] {
             assert_eq!(sampler.next_due(session.step_count()), due);
             session.skip_to(due);
@@ -261,14 +310,14 @@ mod tests {
 
     #[test]
     fn what_moves_is_told_every_nth_step_without_a_deadband() {
-        let mut session = session();
+        let mut session = session(&[]);
         grasp(&mut session, 1, -0.01);
         assert_eq!(picked(&mut session, &mut sampler(7, None), 30), [7, 14, 21, 28]);
     }
 
     #[test]
     fn a_deadband_passes_what_leaves_it_and_heartbeats() {
-        let mut session = session();
+        let mut session = session(&[]);
         let deadband = Deadband { displacement_m: Some(0.0025), ..Deadband::default() };
         let mut sampler = sampler(1, Some(deadband));
         let mut steps = Vec::new();
@@ -314,7 +363,7 @@ mod tests {
 
     #[test]
     fn the_last_sample_before_time_stops_is_told_once() {
-        let (mut session, mut sampler) = (session(), sampler(5, None));
+        let (mut session, mut sampler) = (session(&[]), sampler(5, None));
         assert_eq!(picked(&mut session, &mut sampler, 7), [5]);
         assert_eq!(sampler.pick(&session, true).map(|sample| sample.step), Some(7));
         assert_eq!(sampler.pick(&session, true), None);

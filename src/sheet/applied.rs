@@ -16,7 +16,7 @@ use std::ops::Range;
 
 use glam::DVec3;
 
-use super::field::{Field, Layout};
+use super::field::{BLOCK, Field, Layout};
 use super::lanes::{self, Run, Vector, Width};
 use super::model::{Model, Plan};
 use super::real::Real;
@@ -54,6 +54,7 @@ struct Slot {
 pub(super) struct Touch {
     old: Option<Poke>,
     new: Option<Poke>,
+    reached: [[[usize; 2]; 2]; 2],
 }
 
 impl Touch {
@@ -68,16 +69,21 @@ impl Touch {
             let exponent = poke.falloff_offset - poke.falloff_per_m * (away[0] * away[0] + away[1] * away[1]).sqrt();
             libm::exp(exponent)
         };
-        let each = |poke: &Option<Poke>| poke.as_ref().map_or(0.0, |poke| poke.force_n.length() * nearest(poke));
-        let both = each(&self.old) + each(&self.new);
+        let [p, q] = [&self.old, &self.new].map(|poke| poke.as_ref().map_or(0.0, nearest));
+        let each = |poke: &Option<Poke>, factor: f64| poke.map_or(0.0, |poke| poke.force_n.length() * factor);
+        let both = each(&self.old, p) + each(&self.new, q);
         let Some((old, new)) = self.old.as_ref().zip(self.new.as_ref()) else { return both };
         if !same_falloff(&Poke { centre_m: new.centre_m, ..*old }, new) {
             return both;
         }
         // A centre that moves changes the exponent by c times as much at most.
-        let (p, q) = (nearest(old), nearest(new));
         let moved = new.falloff_per_m * old.centre_m.distance(new.centre_m);
         both.min((new.force_n - old.force_n).length() * q + old.force_n.length() * moved * p.max(q))
+    }
+
+    /// The points that the old force reaches, and the new one: along x and along y.
+    pub(super) fn reached(&self) -> [[Range<usize>; 2]; 2] {
+        self.reached.map(|sides| sides.map(|[from, to]| from..to))
     }
 
     /// The new force at its centre, N.
@@ -117,6 +123,8 @@ pub(super) struct Term<T: Real> {
     /// Where it counts.
     rows: Range<usize>,
     columns: Range<usize>,
+    /// Of each of those rows, the columns, in whole blocks.
+    spans: Vec<Range<usize>>,
     /// e^{−c·r} of those rows, each as long as a row of the sheet; 0 elsewhere.
     factors: Field<T>,
 }
@@ -124,6 +132,20 @@ pub(super) struct Term<T: Real> {
 /// Whether two pokes differ in the force alone.
 fn same_falloff(a: &Poke, b: &Poke) -> bool {
     Poke { force_n: b.force_n, ..*a } == *b
+}
+
+/// The points that a force reaches, along x and along y: beyond them its factor is 0.
+fn reached<T: Real>(poke: &Poke, model: &Model) -> [[usize; 2]; 2] {
+    let spacing_m = model.scene.sheet.spacing_m;
+    let reach_m = -T::NEGLIGIBLE_EXPONENT / poke.falloff_per_m;
+    std::array::from_fn(|axis| {
+        let (centre_m, points) = (poke.centre_m[axis], model.points[axis]);
+        // Saturating casts: a reach without end covers the whole sheet.
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+        let [from, to] = [((centre_m - reach_m) / spacing_m).ceil(), ((centre_m + reach_m) / spacing_m).floor() + 1.0]
+            .map(|edge| (edge.max(0.0) as usize).min(points));
+        [from, to.max(from)]
+    })
 }
 
 impl<T: Real> Term<T> {
@@ -135,6 +157,7 @@ impl<T: Real> Term<T> {
             forces: [[T::default(); 3]; 3],
             rows: 0..0,
             columns: 0..0,
+            spans: Vec::new(),
             factors: Field::of_length(0),
         }
     }
@@ -142,16 +165,7 @@ impl<T: Real> Term<T> {
     /// Puts the falloff of `poke` into the table.
     fn place(&mut self, poke: &Poke, model: &Model, layout: &Layout) {
         let spacing_m = model.scene.sheet.spacing_m;
-        let reach_m = -T::NEGLIGIBLE_EXPONENT / poke.falloff_per_m;
-        let span = |centre_m: f64, points: usize| {
-            // Saturating casts: a reach without end covers the whole sheet.
-            #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-            let [from, to] =
-                [((centre_m - reach_m) / spacing_m).ceil(), ((centre_m + reach_m) / spacing_m).floor() + 1.0]
-                    .map(|edge| (edge.max(0.0) as usize).min(points));
-            from..to.max(from)
-        };
-        (self.rows, self.columns) = (span(poke.centre_m.x, model.points[0]), span(poke.centre_m.y, model.points[1]));
+        [self.rows, self.columns] = reached::<T>(poke, model).map(|[from, to]| from..to);
         // The same bits on every machine: not the platform's exponential.
         self.gain = libm::exp(poke.falloff_offset);
         self.factors.resize(self.rows.len() * layout.stride);
@@ -165,6 +179,13 @@ impl<T: Real> Term<T> {
         };
         // SAFETY: `factors` has as many rows, each of whole blocks.
         unsafe { lanes::run(Width::of(model.lanes), &falloff) };
+        self.spans.clear();
+        self.spans.extend(self.factors.chunks_exact(layout.stride).map(|row| {
+            let counts = |block: &[T]| block.iter().any(|factor| *factor != T::default());
+            let first = row.chunks(BLOCK).position(counts).unwrap_or(0);
+            let last = row.chunks(BLOCK).rposition(counts).map_or(0, |last| last + 1);
+            first * BLOCK..last * BLOCK
+        }));
     }
 
     fn set(&mut self, wanted: Wanted, scale: f64) {
@@ -193,25 +214,29 @@ impl<T: Real> Run<T> for Falloff<T> {
     #[inline(always)]
     #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     unsafe fn run<V: Vector<Real = T>>(&self) {
-        let zero = V::splat(T::default());
-        let slope = V::splat(T::of(-self.per_spacing));
-        let farthest = V::splat(T::of(-T::NEGLIGIBLE_EXPONENT));
-        let [_, centre] = self.centre;
-        // Column numbers and what is whole of the centre are exact in any format; only the rest is rounded.
-        let (whole, rest) = (V::splat(T::of(centre.floor())), V::splat(T::of(centre - centre.floor())));
-        for i in self.rows.clone() {
-            let x = T::of(i as f64 - self.centre[0]);
-            let x = V::splat(x * x);
-            for at in (0..self.stride).step_by(V::LANES) {
-                let mut factor = zero;
-                if at < self.columns.end && at + V::LANES > self.columns.start {
-                    let y = V::count(at).sub(whole).sub(rest);
-                    let exponent = slope.mul(y.mul_add(y, x).root());
-                    let far = exponent.beyond(farthest);
-                    factor = V::select(far, zero, exponential(exponent)).keep(V::first(self.columns.end - at));
+        // SAFETY: the caller's promise.
+        unsafe {
+            let zero = V::of(T::default());
+            let slope = V::of(T::of(-self.per_spacing));
+            let farthest = V::of(T::of(-T::NEGLIGIBLE_EXPONENT));
+            let [_, centre] = self.centre;
+            // Column numbers and what is whole of the centre are exact in any format; only the rest is rounded.
+            let (whole, rest) = (V::of(T::of(centre.floor())), V::of(T::of(centre - centre.floor())));
+            for i in self.rows.clone() {
+                let x = T::of(i as f64 - self.centre[0]);
+                let x = V::of(x * x);
+                for at in (0..self.stride).step_by(V::LANES) {
+                    let mut factor = zero;
+                    if at < self.columns.end && at + V::LANES > self.columns.start {
+                        let y = zero.count(at).sub(whole).sub(rest);
+                        let exponent = slope.mul(y.mul_add(y, x).root());
+                        let far = exponent.beyond(farthest);
+                        factor = V::select(far, zero, exponential(exponent)).keep(zero.first(self.columns.end - at));
+                        // Where the reach ends is known better than by this format.
+                        factor = V::select(zero.first(self.columns.start.saturating_sub(at)), zero, factor);
+                    }
+                    factor.store(self.factors.add((i - self.rows.start) * self.stride + at));
                 }
-                // SAFETY: the caller's promise.
-                unsafe { factor.store(self.factors.add((i - self.rows.start) * self.stride + at)) };
             }
         }
     }
@@ -221,7 +246,7 @@ impl<T: Real> Run<T> for Falloff<T> {
 /// bits on every machine, unlike the platform's.
 #[inline(always)]
 fn exponential<V: Vector>(x: V) -> V {
-    let of = |value: f64| V::splat(V::Real::of(value));
+    let of = |value: f64| x.splat(V::Real::of(value));
     // Adding and taking off a number whose last digit is 1 rounds to whole numbers.
     let unit = of(V::Real::UNIT);
     let k = x.mul_add(of(std::f64::consts::LOG2_E), unit).sub(unit);
@@ -249,27 +274,37 @@ const INVERSE_FACTORIALS: [f64; 14] = {
 
 /// A term as a sweep sees it: pointers and numbers, nothing to check.
 #[derive(Clone, Copy)]
-pub(super) struct Pull<T> {
+pub(super) struct Pull<'a, T> {
     /// Where the factors of row 0 would be.
     factors: *const T,
     from: usize,
     to: usize,
+    spans: &'a [Range<usize>],
     /// Of one field and, if there is another, the next.
     forces: [[T; 3]; 2],
 }
 
-impl<T: Real> Pull<T> {
+impl<T: Real> Pull<'_, T> {
     pub(super) fn none() -> Self {
-        Pull { factors: std::ptr::null(), from: 0, to: 0, forces: [[T::default(); 3]; 2] }
+        Pull { factors: std::ptr::null(), from: 0, to: 0, spans: &[], forces: [[T::default(); 3]; 2] }
     }
 }
 
 impl<T: Real> Term<T> {
     /// Its fields from `field` on.
-    pub(super) fn pull(&self, field: usize, stride: usize) -> Pull<T> {
+    pub(super) fn pull(&self, field: usize, stride: usize) -> Pull<'_, T> {
         let factors = self.factors.as_ptr().wrapping_sub(self.rows.start * stride);
         let forces = [self.forces[field], self.forces[(field + 1).min(2)]];
-        Pull { factors, from: self.rows.start, to: self.rows.end, forces }
+        Pull { factors, from: self.rows.start, to: self.rows.end, spans: &self.spans, forces }
+    }
+}
+
+/// Whether any force acts on a block of a row on which one does.
+#[inline(always)]
+pub(super) fn reaches<T>(pulls: &[Pull<'_, T>], row: usize, column: usize) -> bool {
+    match pulls {
+        [pull] => pull.spans.get(row.wrapping_sub(pull.from)).is_some_and(|span| span.contains(&column)),
+        _ => true,
     }
 }
 
@@ -279,18 +314,31 @@ impl<T: Real> Term<T> {
 /// The tables are of the sheet that the block is of, and still there.
 #[inline(always)]
 pub(super) unsafe fn force_on<V: Vector, const FIELDS: usize>(
-    pulls: &[Pull<V::Real>],
+    pulls: &[Pull<'_, V::Real>],
     row: usize,
     at: usize,
 ) -> [[V; 2]; 3] {
-    let mut sum = [[V::splat(V::Real::default()); 2]; 3];
-    for pull in pulls {
+    // SAFETY: the caller's promise.
+    let mut sum = [[unsafe { V::of(V::Real::default()) }; 2]; 3];
+    if let [pull] = pulls
+        && row >= pull.from
+        && row < pull.to
+    {
+        // SAFETY: the caller's promise.
+        let factor = unsafe { V::load(pull.factors.wrapping_add(at)) };
+        for c in 0..3 {
+            for f in 0..FIELDS {
+                sum[c][f] = factor.splat(pull.forces[f][c]).mul(factor);
+            }
+        }
+    }
+    for pull in if pulls.len() > 1 { pulls } else { &[] } {
         if row >= pull.from && row < pull.to {
             // SAFETY: the caller's promise.
             let factor = unsafe { V::load(pull.factors.wrapping_add(at)) };
             for c in 0..3 {
                 for f in 0..FIELDS {
-                    sum[c][f] = V::splat(pull.forces[f][c]).mul_add(factor, sum[c][f]);
+                    sum[c][f] = factor.splat(pull.forces[f][c]).mul_add(factor, sum[c][f]);
                 }
             }
         }
@@ -322,6 +370,11 @@ impl<T: Real> Applied<T> {
         Applied { slots: Vec::new(), terms: Vec::new(), wanted: Vec::new(), settled: true }
     }
 
+    /// What the tools do, out of a sheet of either format.
+    pub(super) fn like<S: Real>(other: &Applied<S>) -> Self {
+        Applied { slots: other.slots.clone(), settled: false, ..Applied::new() }
+    }
+
     /// From the coming step on `tool` exerts `push`.
     pub(super) fn set(&mut self, tool: usize, push: Option<Push>) {
         if self.slots.len() <= tool {
@@ -337,17 +390,16 @@ impl<T: Real> Applied<T> {
     }
 
     /// Changes of force since the last call, up to the end of step `step`.
-    pub(super) fn changes(&mut self, model: &Model, step: u64) -> Vec<Touch> {
-        if self.settled {
-            return Vec::new();
-        }
+    pub(super) fn changes(&mut self, model: &Model, step: u64) -> impl Iterator<Item = Touch> {
         let end = Moment { step, fraction: 1.0 };
-        let change = |slot: &mut Slot| {
+        let change = move |slot: &mut Slot| {
             let new = slot.push.as_ref().map(|push| push.at(end, model.scene.stepping.rate_hz));
             let old = std::mem::replace(&mut slot.told, new);
-            (old != new).then_some(Touch { old, new })
+            let reached = |poke: Option<Poke>| poke.map_or_else(Default::default, |poke| reached::<T>(&poke, model));
+            (old != new).then(|| Touch { old, new, reached: [old, new].map(reached) })
         };
-        self.slots.iter_mut().filter_map(change).collect()
+        let slots = if self.settled { 0 } else { self.slots.len() };
+        self.slots[..slots].iter_mut().filter_map(change)
     }
 
     /// Brings the forces to the substep that begins at `moment` and takes `share` of the step.
@@ -465,4 +517,45 @@ impl<T: Real> Applied<T> {
 fn sum_at(model: &Model, index: usize, pokes: impl Iterator<Item = Poke>, negligible: f64) -> DVec3 {
     let (point, spacing_m) = (model.point_of(index), model.scene.sheet.spacing_m);
     pokes.map(|poke| poke.force_n * factor(&poke, point, spacing_m, negligible)).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::Lanes;
+
+    fn factors<T: Real>(lanes: Lanes, centre: f64) -> Vec<f64> {
+        let (stride, per_spacing) = (64, 1.7);
+        let reach = -T::NEGLIGIBLE_EXPONENT / per_spacing;
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+        let columns = (centre - reach).ceil() as usize..(centre + reach).floor() as usize + 1;
+        let mut factors = vec![T::default(); stride];
+        let factor = factors.as_mut_ptr();
+        let falloff = Falloff { centre: [0.0, centre], per_spacing, rows: 0..1, columns, stride, factors: factor };
+        // SAFETY: there is one row, of whole blocks.
+        unsafe { lanes::run(Width::of(lanes), &falloff) };
+        factors.into_iter().map(Real::wide).collect()
+    }
+
+    /// Where the reach ends between two lanes, one width must not see farther than another.
+    #[test]
+    fn a_falloff_has_the_same_bits_at_every_width_wherever_it_ends() {
+        let mut nonzero = 0;
+        for place in 0..4000 {
+            let centre = 24.0 + 0.00391 * f64::from(place);
+            for (plain, other) in [
+                (factors::<f32>(Lanes::Plain, centre), factors::<f32>(Lanes::Auto, centre)),
+                (factors::<f64>(Lanes::Plain, centre), factors::<f64>(Lanes::Auto, centre)),
+            ] {
+                assert_eq!(plain, other, "centre {centre}");
+                nonzero += plain.iter().filter(|factor| **factor != 0.0).count();
+            }
+        }
+        assert!(nonzero > 4000 * 20, "{nonzero}");
+        // A point at the very end of the reach: f32 may take it for inside.
+        for at in 0..24 {
+            let centre = f64::from(at) + 22.0 / 1.7 + 1e-9;
+            assert_eq!(factors::<f32>(Lanes::Plain, centre), factors::<f32>(Lanes::Auto, centre), "centre {centre}");
+        }
+    }
 }

@@ -6,7 +6,7 @@
 
 use std::sync::Arc;
 
-use super::field::State;
+use super::field::{Field, State};
 use super::model::Model;
 use super::real::Real;
 use super::survey::{Forces, Survey, Write};
@@ -17,6 +17,38 @@ impl<T: Real> Sheet<T> {
     /// From the coming step on: `model` has the same points and number format.
     pub(super) fn change(&mut self, model: &Arc<Model>) {
         self.tiles.begin_anew(rest::tolerance(model));
+        self.watch.give_up();
+        if self.is_same_tissue(model) {
+            self.resample(model);
+            // Nothing was lost before there was room for it.
+            let layout = self.bench.layout;
+            let kept = self.plan.scheme.kept(model.precision == Precision::Compensated);
+            self.state.kept.resize_with(kept, || Arc::new(Field::zero(&layout)));
+        } else {
+            self.exchange(model);
+        }
+        self.halvings = 0;
+
+        self.bench.is_calm(0.0);
+        self.bench.take_work();
+        let (survey, _, energy_j) = self.survey(&self.tiles.region);
+        self.work = Work::begun(energy_j, self.present_work_j(&survey));
+        self.checkpoint = None;
+        self.take_checkpoint();
+    }
+
+    /// Whether `model` has the same springs, damping and scheme: then what the scheme keeps of the past is as good as before.
+    fn is_same_tissue(&self, model: &Model) -> bool {
+        let tissue = |model: &Model| {
+            let scene = &model.scene;
+            let springs = scene.springs.clone();
+            (springs, scene.virtual_stiffness_n_per_m, scene.damping_n_s_per_m, model.plan.integrator)
+        };
+        tissue(&self.model) == tissue(model)
+    }
+
+    /// Other springs, or another scheme.
+    fn exchange(&mut self, model: &Arc<Model>) {
         self.write(Write::Seen);
         let ratio = T::of(model.plan.substep_s / self.plan.substep_s);
         self.state.d.iter_mut().for_each(|d| *d = *d * ratio);
@@ -24,7 +56,6 @@ impl<T: Real> Sheet<T> {
         let layout = self.bench.layout;
         self.model = model.clone();
         self.plan = model.plan.clone();
-        self.halvings = 0;
         self.bench.springs = springs_of(model, &self.plan);
         let kept = self.plan.scheme.kept(model.precision == Precision::Compensated);
         self.state.kept = State::at_rest(&layout, kept).kept;
@@ -39,13 +70,6 @@ impl<T: Real> Sheet<T> {
             }
         }
         self.write(Write::Begin);
-
-        self.bench.is_calm(0.0);
-        self.bench.take_work();
-        let (survey, _, energy_j) = self.survey(&self.tiles.region);
-        self.work = Work::begun(energy_j, self.present_work_j(&survey));
-        self.checkpoint = None;
-        self.take_checkpoint();
     }
 
     /// Writes all of the state anew.

@@ -1,46 +1,35 @@
-//! What a tolerance asks for: integrator, substeps and precision, and the error that they are expected to have.
-//!
-//! **The model of the error.** A force that is switched on at a point excites every vibration of the sheet. Of a
-//! vibration whose springs pull with −z·u (times in substeps, see `integrate`) both the exact course and the scheme's
-//! are known. The largest difference of the two over time, for vibrations spread evenly over z up to the bound under
-//! any deformation, gives what to expect: of displacements, in which a vibration has weight 1/(z + a), and of forces, in
-//! which all weigh the same. The sheet is not linear, and tools do other things than to switch on: so a part
-//! [`SAFETY`] of the tolerance is aimed at. (Measured against expected, on all scenes of `make bench-error`:
-//! docs/benchmarks/error.md.)
-//!
-//! **Rounding.** f32 errs by what [`rounding`] says, from measurements; a tenth of the tolerance may be that.
+//! What a tolerance asks for: integrator, substeps and number format, the cheapest that keep to it in a rehearsal.
 
-use super::integrate::{Oscillator, Scheme};
+use super::integrate::Oscillator;
+use super::rehearsal::{self, Rehearsal};
 use super::stability;
-use crate::scene::{Integrator, Precision, Stepping};
-
-/// Part of the tolerance that is aimed at.
-const SAFETY: f64 = 0.4;
-
-/// Vibrations that are looked at.
-const VIBRATIONS: u32 = 12;
-
-/// Longest course that is looked at, s. Where vibrations last longer, their error grows in proportion, up to
-/// [`LASTING_S`].
-const COURSE_S: f64 = 0.25;
+use crate::scene::{Integrator, Precision, Scene, Stepping};
 
 /// Errors that grow with time, where nothing damps them, are expected for so long, s.
-pub const LASTING_S: f64 = 2.0;
+pub const LASTING_S: f64 = rehearsal::LASTING_S;
 
 /// What a substep costs, in those of `central` in f32: integrator, order of the error, cost. Measured (`make bench-kernel`).
 const CANDIDATES: [(Integrator, f64, f64); 4] = [
-    (Integrator::Central, 2.0, 1.0),
-    (Integrator::Exponential2, 3.0, 1.3),
-    (Integrator::Exponential3, 4.0, 1.4),
     (Integrator::Exponential4, 5.0, 1.6),
+    (Integrator::Exponential3, 4.0, 1.4),
+    (Integrator::Exponential2, 3.0, 1.3),
+    (Integrator::Central, 2.0, 1.0),
 ];
 
-/// Numbers of substeps that are tried before they are doubled.
-const MOST_ROUNDS: u32 = 32;
+/// The number formats and what each costs, in f32.
+const FORMATS: [(Precision, f64); 3] = [(Precision::F32, 1.0), (Precision::Compensated, 1.1), (Precision::F64, 2.6)];
 
-/// What f64 and compensated f32 cost, in f32.
-const COST_F64: f64 = 2.6;
-const COST_COMPENSATED: f64 = 1.1;
+/// What rounding may add to a sheet that is at rest, as a part of the tolerance: a rehearsal is over before that shows.
+const RESTING_PART: f64 = 0.5;
+
+/// Rehearsals of one integrator in one format at most.
+const MOST_ROUNDS: u32 = 6;
+
+/// The power of the substep with which the error of an integrator falls.
+pub(super) fn order(integrator: Integrator) -> f64 {
+    let known = CANDIDATES.iter().find(|candidate| candidate.0 == integrator).map(|found| found.1);
+    known.unwrap_or(if integrator == Integrator::Rk4 { 4.0 } else { 1.0 })
+}
 
 /// An integrator, how often it is used in a step, in which format, and what to expect of that.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -55,35 +44,8 @@ pub struct Choice {
     pub expected_error: f64,
 }
 
-/// The expected error of a scheme with so many substeps in a step of `step_s`, but for rounding: of displacement and of
-/// force, at the ends of steps, which is all that anybody sees.
-pub fn expected_error(integrator: Integrator, sheet: &Oscillator, step_s: f64, seen: u32) -> [f64; 2] {
-    let substep_s = step_s / f64::from(seen);
-    let (a, g) = sheet.scaled(substep_s);
-    let scheme = Scheme::fit(integrator, a, g);
-    let stiffest = sheet.scaled_spring_stiffness(substep_s);
-    let decay_s = 2.0 * sheet.mass_kg / sheet.damping_n_s_per_m;
-    let course_s = COURSE_S.min(4.0 * decay_s);
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    let substeps = ((course_s / substep_s).ceil().min(1e5) as u32).max(seen.saturating_mul(16).min(100_000)).max(seen);
-    // Damping ends the growth of an error; until then it is in proportion to time.
-    let growth = (decay_s.min(LASTING_S) / course_s).max(1.0);
-    let (mut errors, mut largest) = ([0.0; 2], [0.0; 2]);
-    for k in 0..VIBRATIONS {
-        let z = stiffest * (f64::from(k) + 0.5) / f64::from(VIBRATIONS);
-        let [u, force] = scheme.error_of_a_switched_force(z, a, g, substeps, seen);
-        errors[0] += u;
-        errors[1] += force;
-        largest[0] += 1.0 / (z + a).max(f64::MIN_POSITIVE);
-        largest[1] += 1.0;
-    }
-    // Without springs nothing but the linear part moves, and all schemes but the two-step ones are exact.
-    let part = |which: usize| if stiffest + a > 0.0 { growth * errors[which] / largest[which] } else { 0.0 };
-    [part(0), part(1)]
-}
-
-/// What rounding is expected to add: measured, see docs/benchmarks/error.md.
-pub fn rounding(precision: Precision, sheet: &Oscillator, substep_s: f64) -> f64 {
+/// What rounding adds to the state of a sheet that has come to rest, relative to its displacement: measured.
+fn rounding(precision: Precision, sheet: &Oscillator, substep_s: f64) -> f64 {
     let unit = f64::from(f32::EPSILON) / 2.0;
     // A displacement that creeps by less than half its last digit in a substep stands still: short by so many digits as
     // the damping takes substeps to let go of one.
@@ -101,78 +63,175 @@ pub fn rounding(precision: Precision, sheet: &Oscillator, substep_s: f64) -> f64
     }
 }
 
-/// Every integrator, each with the fewest substeps that keep to the tolerance, of what `stepping` leaves open.
-pub fn candidates(stepping: &Stepping, sheet: &Oscillator, most_substeps: u32) -> Vec<Choice> {
-    let step_s = stepping.rate_hz.recip();
-    let open = CANDIDATES
-        .iter()
-        .filter(|(integrator, ..)| stepping.integrator == Integrator::Auto || stepping.integrator == *integrator);
-    let fitted = open.map(|&(integrator, order, _)| {
-        let tolerance = SAFETY * stepping.tolerance;
-        let needed = || fewest(integrator, order, sheet, step_s, tolerance, most_substeps);
-        with_precision(integrator, stepping.substeps.unwrap_or_else(needed), stepping, sheet)
-    });
-    fitted.collect()
+/// The choice for a scene, and what it is made from.
+struct Chooser<'a> {
+    stepping: &'a Stepping,
+    sheet: Oscillator,
+    rehearsal: Rehearsal,
+    most_substeps: u32,
 }
 
-/// The cheapest that keeps to the tolerance, of what `stepping` leaves open.
-pub fn choose(stepping: &Stepping, sheet: &Oscillator, most_substeps: u32) -> Choice {
-    let cost = |choice: &Choice| {
-        let scheme = CANDIDATES.iter().find(|candidate| candidate.0 == choice.integrator).map_or(1.0, |found| found.2);
-        let format = match choice.precision {
-            Precision::F64 => COST_F64,
-            Precision::Compensated => COST_COMPENSATED,
-            Precision::Auto | Precision::F32 => 1.0,
-        };
-        // What misses the tolerance is taken only if nothing keeps to it, and then the one that misses it least.
-        let miss = if choice.expected_error <= stepping.tolerance { 1.0 } else { 1e9 * choice.expected_error.min(1e9) };
-        scheme * format * f64::from(choice.substeps) * miss
-    };
-    let candidates = candidates(stepping, sheet, most_substeps);
-    candidates.into_iter().min_by(|a, b| cost(a).total_cmp(&cost(b))).unwrap_or_else(|| {
-        // A yardstick, asked for by name: as stable as it has to be.
-        let needed = || stability::substeps(stepping.integrator, stepping.rate_hz.recip(), sheet);
-        with_precision(stepping.integrator, stepping.substeps.unwrap_or_else(needed), stepping, sheet)
-    })
+/// How the search for the fewest substeps of an integrator in a format ended.
+struct Fewest {
+    /// What keeps to the tolerance or, if nothing does, what misses it least.
+    choice: Choice,
+    /// Shorter substeps did not help: the format's rounding is what errs.
+    rounding: bool,
 }
 
-fn with_precision(integrator: Integrator, substeps: u32, stepping: &Stepping, sheet: &Oscillator) -> Choice {
-    let step_s = stepping.rate_hz.recip();
-    let substep_s = step_s / f64::from(substeps);
-    let may_compensate = integrator.is_exponential();
-    let precision = match stepping.precision {
-        Precision::Auto => [Precision::F32, Precision::Compensated]
-            .into_iter()
-            .filter(|format| may_compensate || *format == Precision::F32)
-            .find(|format| rounding(*format, sheet, substep_s) <= stepping.tolerance / 10.0)
-            .unwrap_or(Precision::F64),
-        given => given,
-    };
-    let [displacement, force] = expected_error(integrator, sheet, step_s, substeps);
-    let expected_error = displacement.max(force) + rounding(precision, sheet, substep_s);
-    Choice { integrator, substeps, precision, expected_error }
-}
+impl Chooser<'_> {
+    fn new<'a>(scene: &'a Scene, most_substeps: u32) -> Chooser<'a> {
+        let rehearsal = Rehearsal::new(scene, scene.stepping.tolerance);
+        Chooser { stepping: &scene.stepping, sheet: Oscillator::of(scene), rehearsal, most_substeps }
+    }
 
-/// Fewest substeps with which a scheme is stable and errs by at most `tolerance`.
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-fn fewest(integrator: Integrator, order: f64, sheet: &Oscillator, step_s: f64, tolerance: f64, most: u32) -> u32 {
-    let mut substeps = stability::substeps(integrator, step_s, sheet);
-    let mut rounds = 0;
-    loop {
-        // More than are allowed for accuracy's sake, no; for stability's, that is for others to refuse.
-        if substeps >= most {
-            return substeps;
+    fn tried(&self, integrator: Integrator, substeps: u32, precision: Precision) -> Choice {
+        let expected_error = self.rehearsal.error(integrator, substeps, precision);
+        Choice { integrator, substeps, precision, expected_error }
+    }
+
+    fn keeps(&self, choice: &Choice) -> bool {
+        choice.expected_error <= self.stepping.tolerance && self.rests(choice.precision, choice.substeps)
+    }
+
+    /// Whether a sheet that is held in this format comes to rest where it should, as exactly as [`RESTING_PART`] asks.
+    fn rests(&self, precision: Precision, substeps: u32) -> bool {
+        let substep_s = (self.stepping.rate_hz * f64::from(substeps)).recip();
+        self.stepping.precision != Precision::Auto
+            || rounding(precision, &self.sheet, substep_s) <= RESTING_PART * self.stepping.tolerance
+    }
+
+    /// Formats that the scene leaves open to an integrator.
+    fn formats(&self, integrator: Integrator) -> impl Iterator<Item = (Precision, f64)> {
+        let asked = self.stepping.precision;
+        FORMATS.into_iter().filter(move |(format, _)| match asked {
+            Precision::Auto => *format != Precision::Compensated || integrator.is_exponential(),
+            asked => *format == asked,
+        })
+    }
+
+    /// Fewest substeps, at most `most`, with which a scheme of `order` is stable and keeps to the tolerance. None if it is
+    /// not stable with so few.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn fewest(&self, integrator: Integrator, order: f64, precision: Precision, most: u32) -> Option<Fewest> {
+        if let Some(substeps) = self.stepping.substeps {
+            return Some(Fewest { choice: self.tried(integrator, substeps, precision), rounding: false });
         }
-        let [displacement, force] = expected_error(integrator, sheet, step_s, substeps);
-        let excess = displacement.max(force) / tolerance;
-        if excess <= 1.0 {
-            return substeps;
+        let least = stability::stable_substeps(integrator, self.stepping.rate_hz.recip(), &self.sheet);
+        let least = self.rehearsal.whole(least);
+        if least > most || !self.rests(precision, least) {
+            return None;
         }
-        // As many more as the order says; one at least, and not more than the double at a time. An error that does not get
-        // less as it should is not followed one by one for ever.
-        rounds += 1;
-        let least = if rounds < MOST_ROUNDS { 1.0 } else { 2.0 };
-        let ratio = excess.powf(order.recip()).clamp(least, 2.0);
-        substeps = (f64::from(substeps) * ratio).ceil().max(f64::from(substeps + 1)).min(f64::from(most)) as u32;
+        let mut now = self.tried(integrator, least, precision);
+        let mut before: Option<Choice> = None;
+        for _ in 0..MOST_ROUNDS {
+            if self.keeps(&now) {
+                break;
+            }
+            // As many more as the order says; an infinite error says nothing.
+            let excess = now.expected_error / self.stepping.tolerance;
+            let ratio = libm::pow(excess, order.recip()).min(3.0);
+            let more = (f64::from(now.substeps) * ratio).ceil().max(f64::from(now.substeps + 1));
+            let more = self.rehearsal.whole(more.min(f64::from(u32::MAX / 2)) as u32);
+            if more > most {
+                return Some(Fewest { choice: now, rounding: false });
+            }
+            let next = self.tried(integrator, more, precision);
+            let shorter = f64::from(now.substeps) / f64::from(more);
+            if next.expected_error > now.expected_error * libm::pow(shorter, 0.3 * order) {
+                let choice = if next.expected_error < now.expected_error { next } else { now };
+                return Some(Fewest { choice, rounding: !self.keeps(&choice) });
+            }
+            (before, now) = (Some(now), next);
+        }
+        // The last leap may have gone too far: fewer, by the slope between the two.
+        if let Some(before) =
+            before.filter(|before| self.keeps(&now) && self.rehearsal.whole(before.substeps + 1) < now.substeps)
+        {
+            let ratio = libm::log(f64::from(now.substeps) / f64::from(before.substeps));
+            let slope = libm::log(before.expected_error / now.expected_error) / ratio;
+            let needed = libm::log(before.expected_error / self.stepping.tolerance) / slope;
+            let fewer = self.rehearsal.whole((f64::from(before.substeps) * libm::exp(needed)).ceil() as u32);
+            if fewer > before.substeps && fewer < now.substeps {
+                let tried = self.tried(integrator, fewer, precision);
+                if self.keeps(&tried) {
+                    now = tried;
+                }
+            }
+        }
+        Some(Fewest { choice: now, rounding: false })
+    }
+
+    /// Integrators that the scene leaves open.
+    fn integrators(&self) -> impl Iterator<Item = (Integrator, f64, f64)> + Clone + use<> {
+        let asked = self.stepping.integrator;
+        CANDIDATES.into_iter().filter(move |(integrator, ..)| asked == Integrator::Auto || asked == *integrator)
+    }
+
+    /// One that is asked for by name and is no candidate: as many substeps as it has to have.
+    fn yardstick(&self) -> Choice {
+        let integrator = self.stepping.integrator;
+        let needed = || stability::substeps(integrator, self.stepping.rate_hz.recip(), &self.sheet);
+        let substeps = self.stepping.substeps.unwrap_or_else(needed);
+        let tried = self.formats(integrator).map(|(precision, _)| self.tried(integrator, substeps, precision));
+        let mut least = None::<Choice>;
+        for choice in tried {
+            if self.keeps(&choice) {
+                return choice;
+            }
+            if least.is_none_or(|least| choice.expected_error < least.expected_error) {
+                least = Some(choice);
+            }
+        }
+        least.unwrap_or(Choice { integrator, substeps, precision: Precision::F64, expected_error: f64::INFINITY })
+    }
+}
+
+/// Every integrator that the scene leaves open, each with the cheapest that keeps to the tolerance.
+pub fn candidates(scene: &Scene, most_substeps: u32) -> Vec<Choice> {
+    let chooser = Chooser::new(scene, most_substeps);
+    let cheapest =
+        |(integrator, order, cost): (Integrator, f64, f64)| chooser.cheapest([(integrator, order, cost)].into_iter());
+    chooser.integrators().filter_map(cheapest).collect()
+}
+
+/// The cheapest that keeps to the tolerance, of what the scene leaves open; if nothing does, what misses it least.
+pub fn choose(scene: &Scene, most_substeps: u32) -> Choice {
+    let chooser = Chooser::new(scene, most_substeps);
+    chooser.cheapest(chooser.integrators()).unwrap_or_else(|| chooser.yardstick())
+}
+
+impl Chooser<'_> {
+    /// The cheapest of some integrators.
+    fn cheapest(&self, integrators: impl Iterator<Item = (Integrator, f64, f64)> + Clone) -> Option<Choice> {
+        let (mut best, mut nearest) = (None::<(f64, Choice)>, None::<Choice>);
+        for (format, format_cost) in FORMATS {
+            for (integrator, order, cost) in integrators.clone() {
+                if !self.formats(integrator).any(|(open, _)| open == format) {
+                    continue;
+                }
+                let cost = cost * format_cost;
+                #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+                let most = best.as_ref().map_or(self.most_substeps, |(least, _)| (least / cost - 1e-9).floor() as u32);
+                let Some(Fewest { choice, rounding }) =
+                    self.fewest(integrator, order, format, most.min(self.most_substeps))
+                else {
+                    continue;
+                };
+                if self.keeps(&choice) {
+                    let cost = cost * f64::from(choice.substeps);
+                    if best.as_ref().is_none_or(|(least, _)| cost < *least) {
+                        best = Some((cost, choice));
+                    }
+                } else if nearest.is_none_or(|nearest| choice.expected_error < nearest.expected_error) {
+                    nearest = Some(choice);
+                }
+                // Rounding is the format's, whatever the integrator.
+                if rounding {
+                    break;
+                }
+            }
+        }
+        best.map(|(_, choice)| choice).or(nearest)
     }
 }

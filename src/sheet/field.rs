@@ -3,6 +3,8 @@
 use std::ops::{Deref, DerefMut};
 use std::sync::Arc;
 
+use xxhash_rust::xxh3::Xxh3;
+
 use super::real::Real;
 
 /// Lanes of the widest vector: rows are padded to a multiple of it.
@@ -67,6 +69,12 @@ impl<T: Real> State<T> {
         State { u: zero(), d: zero(), kept: vec![past; kept] }
     }
 
+    /// The same, with memory of its own for each field: the system gives zeros when they are written to.
+    pub(super) fn zero(layout: &Layout, kept: usize) -> Self {
+        let zero = || Field::zero(layout);
+        State { u: zero(), d: zero(), kept: std::iter::repeat_with(|| Arc::new(zero())).take(kept).collect() }
+    }
+
     /// All of it.
     pub(super) fn fields(&self) -> impl Iterator<Item = &Field<T>> {
         [&self.u, &self.d].into_iter().chain(self.kept.iter().map(|field| &**field))
@@ -87,6 +95,45 @@ impl<T: Real> State<T> {
         if let Some((first, rest)) = self.kept[..count].split_first_mut() {
             rest.fill(first.clone());
         }
+    }
+
+    /// Gives what is one in memory memory of its own; `copy` copies what is not 0.
+    pub(super) fn part_history(&mut self, copy: impl Fn(&mut Field<T>, &Field<T>)) {
+        for field in &mut self.kept {
+            if Arc::get_mut(field).is_none() {
+                let mut own = Field::of_length(field.length);
+                copy(&mut own, field);
+                *field = Arc::new(own);
+            }
+        }
+    }
+
+    /// XXH3-128 of the values of each point, by rows: of each field, x, y and z, little-endian. What `has_moved` is false
+    /// for is known to be 0.
+    pub(super) fn hash(&self, layout: &Layout, has_moved: impl Fn([usize; 2]) -> bool) -> u128 {
+        let mut hasher = Xxh3::new();
+        let size = size_of::<T>();
+        let of_point = self.fields().count() * 3 * size;
+        let mut bytes = vec![0; layout.columns * of_point];
+        for i in 0..layout.rows {
+            if i.is_multiple_of(BLOCK) {
+                bytes.fill(0);
+            }
+            for (block, bytes) in bytes.chunks_mut(BLOCK * of_point).enumerate() {
+                if !has_moved([i, block * BLOCK]) {
+                    continue;
+                }
+                let from = i * layout.stride + block * BLOCK;
+                let planes = self.fields().flat_map(|field| (0..3).map(|c| &field[c * layout.plane + from..]));
+                for (plane, values) in planes.enumerate() {
+                    for (point, value) in bytes.chunks_exact_mut(of_point).zip(values) {
+                        value.write(&mut point[plane * size..][..size]);
+                    }
+                }
+            }
+            hasher.update(&bytes);
+        }
+        hasher.digest128()
     }
 
     /// Takes the values of another of the same layout and scheme.

@@ -103,6 +103,8 @@ pub(super) struct Checkpoint<T: Real> {
     pub(super) prescribed: Prescribed,
     pub(super) contacts: Contacts,
     pub(super) work: Work,
+    /// The largest displacement of late, spacings: what sleep is measured by.
+    pub(super) largest: f64,
 }
 
 /// Work of the tools, J, and energies at the last survey.
@@ -183,12 +185,21 @@ impl<T: Real> Sheet<T> {
     /// What the sheet is now is what it goes back to.
     pub(super) fn take_checkpoint(&mut self) {
         let Sheet { bench, state, applied, prescribed, contacts, tiles, .. } = self;
+        // One that an audit still holds stays as it is.
+        if self.checkpoint.as_mut().is_some_and(|checkpoint| Arc::get_mut(checkpoint).is_none()) {
+            self.checkpoint = None;
+        }
         let checkpoint = self.checkpoint.get_or_insert_with(|| {
+            // Of a large sheet little has ever moved: what has not, is not copied, nor given memory.
             tiles.touch_all();
-            let state = State::at_rest(&bench.layout, state.kept.len());
+            state.part_history(|to, from| tiles.copy_moved(to, from));
+            let state = State::zero(&bench.layout, state.kept.len());
             let (applied, prescribed, contacts) = (applied.clone(), prescribed.clone(), contacts.clone());
-            Box::new(Checkpoint { steps: 0, halvings: 0, state, applied, prescribed, contacts, work: Work::default() })
+            let (work, largest) = (Work::default(), 0.0);
+            Arc::new(Checkpoint { steps: 0, halvings: 0, state, applied, prescribed, contacts, work, largest })
         });
+        let Some(checkpoint) = Arc::get_mut(checkpoint) else { return };
+        checkpoint.largest = tiles.largest;
         checkpoint.steps = self.steps;
         checkpoint.halvings = self.halvings;
         tiles.copy_touched(checkpoint.state.fields_mut().zip(self.state.fields()));
@@ -197,11 +208,13 @@ impl<T: Real> Sheet<T> {
         checkpoint.contacts.clone_from(&self.contacts);
         checkpoint.work = self.work;
         self.inputs.clear();
+        self.mark();
     }
 
     /// A sheet that is still needs less: nothing can go wrong until a tool is told something.
     pub(super) fn forget_checkpoint(&mut self) {
         self.checkpoint = None;
+        self.watch.give_up();
         self.inputs.clear();
         if let Scheme::Multistep(multistep) = &self.plan.scheme {
             self.state.share_history(multistep.order);
@@ -213,6 +226,7 @@ impl<T: Real> Sheet<T> {
         // A sheet that has none has nothing to go back from.
         let Some(checkpoint) = &self.checkpoint else { return };
         let layout = self.bench.layout;
+        self.watch.give_up();
         self.steps = checkpoint.steps;
         self.tiles.wake_all();
         self.state.copy_from(&checkpoint.state);
@@ -237,6 +251,7 @@ impl<T: Real> Sheet<T> {
             self.take_checkpoint();
         }
         self.inputs.push((self.steps, tool, input.clone()));
+        self.watch.input(self.steps, tool, &input);
         self.tell(tool, input);
     }
 

@@ -28,10 +28,16 @@ macro_rules! with_scheme {
     };
 }
 
+mod advance;
 mod applied;
+pub mod audit;
 mod change;
 pub mod choice;
 mod contact;
+mod correction;
+#[cfg(test)]
+mod decay;
+mod edge;
 mod field;
 mod footprint;
 pub mod guard;
@@ -40,6 +46,8 @@ mod lanes;
 pub mod model;
 mod prescribed;
 mod real;
+mod region;
+mod rehearsal;
 mod rest;
 mod springs;
 pub mod stability;
@@ -51,13 +59,13 @@ mod tiles;
 use std::sync::Arc;
 
 use glam::DVec3;
-use xxhash_rust::xxh3::Xxh3;
 
 use crate::scene::Precision;
 use crate::scene::law::{Moment, Motion};
 use crate::scene::tip::Tip;
 use applied::Applied;
 pub use applied::Push;
+use audit::{Inputs, Mark, Watch};
 use contact::Contacts;
 pub use contact::{Feel, Standing, Surroundings};
 use field::{Layout, State};
@@ -72,7 +80,7 @@ use prescribed::Prescribed;
 use real::Real;
 use springs::Springs;
 use sweep::{Bench, MAX_KEPT};
-use tiles::{CHECK_STEPS, Region, Tiles};
+use tiles::{CHECK_STEPS, Tiles};
 
 /// One mass point at the end of a step: displacement, velocity, and the forces on the point. Where the applied
 /// force jumps it is the one just before; at step 0, just after.
@@ -142,6 +150,12 @@ pub trait Tissue: Send {
     /// From the coming step on springs, virtual springs and damping are those of `model` ([`Model::changed`] of this
     /// one's). Displacements and velocities stay; all tiles wake.
     fn change(&mut self, model: &Arc<Model>);
+    /// Asks for a window of steps to be audited: it begins at the next checkpoint.
+    fn watch(&mut self, inputs: Inputs);
+    /// What there is to tell of that window after a step, once.
+    fn take_mark(&mut self) -> Option<Mark>;
+    /// What [`Tissue::change`] would make of this, where `model` has another number format: a correction went over to f64.
+    fn changed(&self, model: &Arc<Model>) -> Option<Box<dyn Tissue>>;
     /// The scheme as it is now: the guard may have halved the substep of the model's.
     fn plan(&self) -> &Plan;
     /// How often the guard went back to a checkpoint and on with half the substep.
@@ -160,7 +174,7 @@ pub trait Tissue: Send {
     fn step(&mut self) -> Result<(), BlowUp>;
     /// The point at `index`.
     fn point(&self, index: usize) -> PointState;
-    /// A pass over the whole sheet.
+    /// A pass over what is awake; sleeping tiles keep what they have. The same whoever asked before.
     fn energy(&self) -> Energy;
     /// Length of the largest displacement, m.
     fn largest_displacement_m(&self) -> f64;
@@ -192,9 +206,12 @@ struct Sheet<T: Real> {
     steps: u64,
     work: Work,
     /// None: the state as it is. A sheet at rest needs no second one.
-    checkpoint: Option<Box<Checkpoint<T>>>,
+    checkpoint: Option<Arc<Checkpoint<T>>>,
     /// What the tools were told since the checkpoint: before which step, which tool.
     inputs: Vec<(u64, usize, Input)>,
+    watch: Watch,
+    /// The beginning of the window is to be told.
+    is_marked: bool,
     tiles: Tiles<T>,
     guard_events: u64,
     substeps_done: u64,
@@ -218,6 +235,8 @@ impl<T: Real> Sheet<T> {
             prescribed: Prescribed::new(),
             contacts: Contacts::default(),
             inputs: Vec::new(),
+            watch: Watch::Off,
+            is_marked: false,
             tiles: Tiles::new(layout, rest::tolerance(model), if model.scene.springs.flexion { 2 } else { 1 }),
             guard_events: 0,
             substeps_done: 0,
@@ -248,7 +267,7 @@ impl<T: Real> Sheet<T> {
 
     /// From `moment` to the fraction `end` of the same step.
     fn substep(&mut self, moment: Moment, end: f64) {
-        let far = self.farthest_unnoticed();
+        let far = rest::farthest_unnoticed(&self.model, &self.tiles);
         self.tiles.watch(&self.state.u, far);
         self.points_done += self.tiles.awake_points as u64;
         let Sheet { model, plan, bench, applied, .. } = self;
@@ -429,8 +448,20 @@ impl<T: Real> Tissue for Sheet<T> {
         Sheet::change(self, model);
     }
 
+    fn watch(&mut self, inputs: Inputs) {
+        Sheet::watch(self, inputs);
+    }
+
+    fn take_mark(&mut self) -> Option<Mark> {
+        Sheet::take_mark(self)
+    }
+
+    fn changed(&self, model: &Arc<Model>) -> Option<Box<dyn Tissue>> {
+        Sheet::changed(self, model).map(|sheet| sheet as Box<dyn Tissue>)
+    }
+
     fn is_still(&self) -> bool {
-        self.tiles.awake.is_empty()
+        self.tiles.region.tiles().is_empty()
             && self.applied.is_settled()
             && self.prescribed.is_empty()
             && self.contacts.is_empty()
@@ -485,7 +516,7 @@ impl<T: Real> Tissue for Sheet<T> {
     }
 
     fn energy(&self) -> Energy {
-        self.survey(&Region::whole(&self.bench.layout)).1
+        self.energies()
     }
 
     fn largest_displacement_m(&self) -> f64 {
@@ -510,15 +541,6 @@ impl<T: Real> Tissue for Sheet<T> {
     }
 
     fn state_hash(&self) -> u128 {
-        let mut hasher = Xxh3::new();
-        for index in 0..self.model.len() {
-            let at = self.bench.layout.place(index);
-            for field in self.state.fields() {
-                for c in 0..3 {
-                    field[c * self.bench.layout.plane + at].hash_into(&mut hasher);
-                }
-            }
-        }
-        hasher.digest128()
+        self.state.hash(&self.bench.layout, |point| self.tiles.has_moved(point))
     }
 }

@@ -33,6 +33,8 @@ pub struct Model {
     pub lanes: Lanes,
     /// What a user should know, in words.
     pub warnings: Vec<String>,
+    /// What a correction asked for, also with another tissue: the scheme, and no fewer substeps than this.
+    pub corrected: Option<(Integrator, u32)>,
 }
 
 /// What sleeping tiles may add to the error, by default, as a part of it.
@@ -56,7 +58,7 @@ pub struct Plan {
 }
 
 impl Plan {
-    fn new(integrator: Integrator, substeps: u32, step_s: f64, sheet: &Oscillator) -> Self {
+    pub(super) fn new(integrator: Integrator, substeps: u32, step_s: f64, sheet: &Oscillator) -> Self {
         let substep_s = step_s / f64::from(substeps);
         let (a, g) = sheet.scaled(substep_s);
         let scheme = Scheme::fit(integrator, a, g);
@@ -94,19 +96,27 @@ impl Model {
         scene.check(limits)?;
         let sheet = Oscillator::of(scene);
         let step_s = scene.stepping.rate_hz.recip();
-        let choice = choice::choose(&scene.stepping, &sheet, limits.substeps);
+        let too_many = |substeps: u32| {
+            let message = format!(
+                "would need {substeps} substeps a step for stability, above the limit of {}: the springs are too stiff \
+                 for points so light at this rate",
+                limits.substeps
+            );
+            Refusal::new(Reason::TooLarge, "stepping.substeps", message)
+        };
+        // Nothing is rehearsed that no scheme could do.
+        let least = stability::least_substeps(step_s, &sheet);
+        if scene.stepping.substeps.is_none() && least > limits.substeps {
+            return Err(too_many(least));
+        }
+        let choice = choice::choose(scene, limits.substeps);
         let Choice { integrator, substeps, precision, expected_error } = choice;
         if precision == Precision::Compensated && !integrator.is_exponential() {
             let message = format!("is for exponential schemes; `{}` has f32 and f64", integrator.name());
             return Err(Refusal::new(Reason::WrongKind, "stepping.precision", message));
         }
         if substeps > limits.substeps {
-            let message = format!(
-                "would need {substeps} substeps a step for stability, above the limit of {}: the springs are too stiff \
-                 for points so light at this rate",
-                limits.substeps
-            );
-            return Err(Refusal::new(Reason::TooLarge, "stepping.substeps", message));
+            return Err(too_many(substeps));
         }
         let plan = Plan::new(integrator, substeps, step_s, &sheet);
         let omega_bound_per_s = sheet.omega_bound_per_s();
@@ -151,6 +161,7 @@ impl Model {
             sleep_tolerance,
             lanes,
             warnings,
+            corrected: None,
         }))
     }
 
@@ -160,27 +171,37 @@ impl Model {
         if *change == Change::default() {
             return Err(Refusal::new(Reason::Missing, "", Change::NOTHING));
         }
-        let asked = self.scene.stepping.precision;
+        let asked = self.scene.stepping.clone();
         let mut scene = self.scene.changed(change, first);
         scene.stepping.precision = self.precision;
         // Compensated is f32 and what its rounding lost: where no exponential scheme will do, f32 goes on alone.
-        let compiled = Model::compile(&scene, limits).or_else(|refusal| {
+        let compiled = self.compile_corrected(&scene, limits).or_else(|refusal| {
             if self.precision != Precision::Compensated || refusal.field != "stepping.precision" {
                 return Err(refusal);
             }
             scene.stepping.precision = Precision::F32;
-            Model::compile(&scene, limits)
+            self.compile_corrected(&scene, limits)
         });
-        let mut model = Arc::unwrap_or_clone(compiled?);
-        model.scene.stepping.precision = asked;
+        let mut model = compiled?;
+        model.scene.stepping = asked;
         Ok(Arc::new(model))
     }
 
     /// What a script's changes make of this, each out of the one before it.
     pub fn course(self: &Arc<Self>, changes: &[(u64, Change)], limits: &Limits) -> Result<VecDeque<(u64, Arc<Self>)>> {
+        self.course_of(&self.scene, changes, limits)
+    }
+
+    /// The same for a session that began with the scene `first`.
+    pub fn course_of(
+        self: &Arc<Self>,
+        first: &Scene,
+        changes: &[(u64, Change)],
+        limits: &Limits,
+    ) -> Result<VecDeque<(u64, Arc<Self>)>> {
         let mut newest = self.clone();
         let compiled = changes.iter().map(|(step, change)| {
-            newest = newest.changed(change, &self.scene, limits)?;
+            newest = newest.changed(change, first, limits)?;
             Ok((*step, newest.clone()))
         });
         compiled.collect()

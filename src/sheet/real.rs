@@ -1,7 +1,10 @@
 //! The number format of the state: the same arithmetic in 4 and in 8 bytes.
 
 use std::ops::{Add, AddAssign, Mul, Neg, Sub, SubAssign};
+use std::sync::Arc;
 
+use super::audit::SharedCheckpoint;
+use super::guard::Checkpoint;
 use super::lanes::Vector;
 
 /// f32 or f64. Only operations that IEEE 754 rounds exactly, so that the bits do not depend on the machine.
@@ -27,6 +30,9 @@ pub(super) trait Real:
     type Avx512: Vector<Real = Self>;
     #[cfg(target_arch = "x86_64")]
     type Avx2: Vector<Real = Self>;
+    /// The vector of NEON.
+    #[cfg(target_arch = "aarch64")]
+    type Neon: Vector<Real = Self>;
     /// As many bits.
     type Bits;
     /// Terms of [`Real::SERIES`], even.
@@ -37,6 +43,15 @@ pub(super) trait Real:
     /// Where −c·r of a poke is below this, its force is left out. What is left out is (1 + |c·r|)·e^−|c·r| of the whole:
     /// e^−34.5 = 1e-15 of the force at the centre for f64, which is below what the worst sum loses; e^−22 for f32.
     const NEGLIGIBLE_EXPONENT: f64;
+    /// The smallest number whose square is not below the normal range. What is smaller counts as 0 in the state of a sheet.
+    const LEAST: f64;
+    /// The bits that a number has, one of them at least, from [`Real::LEAST`] on: the two highest of its exponent.
+    const LEAST_BITS: Self::Bits;
+    /// The smallest |Q| of a spring that pulls: half of it is a strain. What it pulls across its own direction is a product of
+    /// its Q and a difference of displacements, and seldom below the normal range then.
+    const LEAST_EXCESS: f64;
+    /// Far below any Q that counts, and its square; far above what is below the normal range.
+    const FAINT: f64;
     /// Nearest value of a f64.
     fn of(value: f64) -> Self;
     /// The same value as a f64.
@@ -47,6 +62,8 @@ pub(super) trait Real:
     const NEWTON: usize;
     /// 1/√self within 4 %.
     fn rough_inverse_root(self) -> Self;
+    /// The last digit of 1.
+    const EPSILON: f64;
     /// 1.5 times the number whose last digit is 1.
     const UNIT: f64;
     /// The number whose last digit is 1, and the exponent's bias.
@@ -65,26 +82,36 @@ pub(super) trait Real:
     fn magnitude(self) -> Self;
     /// Neither infinite nor NaN.
     fn is_finite(self) -> bool;
-    /// Appends the bytes of the value, little-endian.
-    fn hash_into(self, hasher: &mut xxhash_rust::xxh3::Xxh3);
+    /// Writes the bytes of the value, little-endian, to as many.
+    fn write(self, bytes: &mut [u8]);
+    /// A checkpoint in this format.
+    fn shared(checkpoint: Arc<Checkpoint<Self>>) -> SharedCheckpoint;
 }
 
 macro_rules! real {
-    ($t:ty, $bits:ty, $magic:literal, $newton:literal, $wide:ident, $narrow:ident, $terms:literal, $series:expr, $negligible:literal, $ln_2:expr,
+    ($t:ty, $bits:ty, $magic:literal, $newton:literal, $wide:ident, $narrow:ident, $neon:ident, $shared:ident, $small:expr, $terms:literal, $series:expr,
+     $negligible:literal, $ln_2:expr,
      $degree:literal) => {
         impl Real for $t {
             #[cfg(target_arch = "x86_64")]
             type Avx512 = super::lanes::$wide;
             #[cfg(target_arch = "x86_64")]
             type Avx2 = super::lanes::$narrow;
+            #[cfg(target_arch = "aarch64")]
+            type Neon = super::lanes::$neon;
             type Bits = $bits;
+            const LEAST: f64 = f64::from_bits(((1023 + (<$t>::MIN_EXP - 1) / 2) as u64) << 52);
+            const LEAST_BITS: $bits = 3 << (<$bits>::BITS - 3);
+            const LEAST_EXCESS: f64 = f64::from_bits(((1023 - $small[0]) as u64) << 52);
+            const FAINT: f64 = f64::from_bits(((1023 - $small[1]) as u64) << 52);
             const INVERSE_ROOT: $bits = $magic;
             const NEWTON: usize = $newton;
             fn rough_inverse_root(self) -> Self {
                 Self::from_bits(Self::INVERSE_ROOT.wrapping_sub(self.to_bits() >> 1))
             }
-            const UNIT: f64 = 1.5 / (<$t>::EPSILON as f64);
-            const POWER: f64 = 1.0 / (<$t>::EPSILON as f64) + (<$t>::MAX_EXP - 1) as f64;
+            const EPSILON: f64 = <$t>::EPSILON as f64;
+            const UNIT: f64 = 1.5 / <$t as Real>::EPSILON;
+            const POWER: f64 = 1.0 / <$t as Real>::EPSILON + (<$t>::MAX_EXP - 1) as f64;
             fn power_of_two(self) -> Self {
                 Self::from_bits((self + Self::of(Self::POWER)).to_bits() << (<$t>::MANTISSA_DIGITS - 1))
             }
@@ -112,8 +139,11 @@ macro_rules! real {
             fn is_finite(self) -> bool {
                 <$t>::is_finite(self)
             }
-            fn hash_into(self, hasher: &mut xxhash_rust::xxh3::Xxh3) {
-                hasher.update(&self.to_le_bytes());
+            fn write(self, bytes: &mut [u8]) {
+                bytes.copy_from_slice(&self.to_le_bytes());
+            }
+            fn shared(checkpoint: Arc<Checkpoint<Self>>) -> SharedCheckpoint {
+                SharedCheckpoint::$shared(checkpoint)
             }
         }
     };
@@ -153,7 +183,22 @@ const SERIES_F64: [f64; 14] = [
     -0.157_608_573_440_095_58,
 ];
 
-real!(f32, u32, 0x5f37_5a86, 2, WideF32, NarrowF32, 6, SERIES_F32, -22.0, [0.693_359_375, -2.121_944_4e-4], 7);
+real!(
+    f32,
+    u32,
+    0x5f37_5a86,
+    2,
+    WideF32,
+    NarrowF32,
+    NeonF32,
+    Single,
+    [54, 100],
+    6,
+    SERIES_F32,
+    -22.0,
+    [0.693_359_375, -2.121_944_4e-4],
+    7
+);
 real!(
     f64,
     u64,
@@ -161,6 +206,9 @@ real!(
     3,
     WideF64,
     NarrowF64,
+    NeonF64,
+    Double,
+    [450, 900],
     14,
     SERIES_F64,
     -34.5,

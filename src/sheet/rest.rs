@@ -1,51 +1,69 @@
 //! How a sheet puts tiles to sleep, and what wakes them: the physics of `tiles`.
 
-use super::choice;
 use super::integrate::Oscillator;
 use super::real::Real;
 use super::survey::{Forces, Survey, Write};
-use super::tiles::Region;
-use super::{Model, Sheet, central, exponential, rk4};
+use super::tiles::Tiles;
+use super::{Energy, Model, Sheet, central, exponential, rk4};
+use crate::scene::Precision;
 
-/// The tolerance of a model's tiles. Motion in the last digits never ends: what rounding is expected to do anyway counts as
-/// rest. Without virtual springs nothing bounds how far a force left out would move a sheet: then only what does not move
-/// at all may sleep.
+/// The tolerance of a model's tiles. Without virtual springs nothing bounds how far a force left out would move a sheet: then
+/// only what does not move at all may sleep.
 pub(super) fn tolerance(model: &Model) -> f64 {
-    let given = model.sleep_tolerance;
-    if model.scene.virtual_stiffness_n_per_m > 0.0 && given > 0.0 {
-        given.max(4.0 * choice::rounding(model.precision, &Oscillator::of(&model.scene), model.plan.substep_s))
-    } else {
-        given.min(f64::MIN_POSITIVE)
-    }
+    let bounded = model.scene.virtual_stiffness_n_per_m > 0.0;
+    if bounded { model.sleep_tolerance } else { model.sleep_tolerance.min(f64::MIN_POSITIVE) }
+}
+
+/// ε_w, spacings.
+pub(super) fn farthest_unnoticed<T: Real>(model: &Model, tiles: &Tiles<T>) -> f64 {
+    let (epsilon, scene) = (tiles.epsilon(), &model.scene);
+    let ratio = scene.virtual_stiffness_n_per_m / scene.springs.stiffness_n_per_m;
+    // Without springs nothing passes from tile to tile.
+    let unnoticed = if ratio.is_nan() { epsilon } else { epsilon * (20.0 * ratio).clamp(0.1, 1.0) };
+    // Nobody notices a last digit.
+    if scene.virtual_stiffness_n_per_m > 0.0 { unnoticed.max(T::EPSILON * tiles.largest) } else { unnoticed }
 }
 
 impl<T: Real> Sheet<T> {
-    /// ε_w, spacings.
-    pub(super) fn farthest_unnoticed(&self) -> f64 {
-        let epsilon = self.tiles.epsilon();
-        let scene = &self.model.scene;
-        let ratio = scene.virtual_stiffness_n_per_m / scene.springs.stiffness_n_per_m;
-        // Without springs nothing passes from tile to tile.
-        if ratio.is_nan() { epsilon } else { epsilon * (20.0 * ratio).clamp(0.1, 1.0) }
-    }
-
     /// Wakes tiles whose force changes in the coming step.
     pub(super) fn wake_what_is_pushed(&mut self) {
-        let spacing_m = self.model.scene.sheet.spacing_m;
-        for touch in self.applied.changes(&self.model, self.steps) {
+        let Sheet { model, applied, tiles, steps, .. } = self;
+        let spacing_m = model.scene.sheet.spacing_m;
+        for touch in applied.changes(model, *steps) {
             // No force moves its centre less than if all springs held it.
-            let stiffness = self.model.omega_bound_per_s.powi(2) * self.model.scene.sheet.point_mass_kg;
+            let stiffness = model.omega_bound_per_s.powi(2) * model.scene.sheet.point_mass_kg;
             if stiffness > 0.0 {
-                self.tiles.largest = self.tiles.largest.max(touch.peak_n() / (stiffness * spacing_m));
+                tiles.largest = tiles.largest.max(touch.peak_n() / (stiffness * spacing_m));
             }
-            let least_n = self.model.scene.virtual_stiffness_n_per_m * self.farthest_unnoticed() * spacing_m;
-            self.tiles.pushed(&touch, spacing_m, least_n);
+            let least_n = model.scene.virtual_stiffness_n_per_m * farthest_unnoticed(model, tiles) * spacing_m;
+            tiles.pushed(&touch, spacing_m, least_n);
         }
+    }
+
+    /// The energies of the whole sheet: of what is awake, and of springs and virtual springs of the tiles that sleep. Those
+    /// follow from where their points are, so that it does not matter when they were found.
+    pub(super) fn energies(&self) -> Energy {
+        let Sheet { plan, bench, state, tiles, .. } = self;
+        let (_, mut energy, _) = self.survey(&tiles.region);
+        let forces = Forces { terms: &[], field: 0, part: 1.0, pull: 0.0 };
+        let mut region = tiles.no_region();
+        for (tile, known) in tiles.sleeping() {
+            let [spring_j, virtual_j] = known.unwrap_or_else(|| {
+                tiles.cover(&mut region, std::iter::once(tile));
+                let survey = with_scheme!(plan, T, |scheme| Survey::of(bench, scheme, state, forces, &region));
+                let (Energy { spring_j, virtual_j, .. }, _) = self.energy_of(&survey);
+                tiles.keep_energies(tile, [spring_j, virtual_j]);
+                [spring_j, virtual_j]
+            });
+            energy.spring_j += spring_j;
+            energy.virtual_j += virtual_j;
+        }
+        energy
     }
 
     /// Puts tiles that are calm to sleep.
     pub(super) fn rest(&mut self) {
-        if !self.tiles.may_sleep() || self.tiles.awake.is_empty() {
+        if !self.tiles.may_sleep() || self.tiles.region.tiles().is_empty() {
             return;
         }
         let Sheet { model, plan, bench, state, tiles, prescribed, contacts, applied, .. } = self;
@@ -57,9 +75,16 @@ impl<T: Real> Sheet<T> {
             tiles.largest = tiles.largest.max(motion.displacement_m.length() / spacing_m);
         }
         // In the scheme's units: of forces, and of velocities.
-        let pull =
-            model.scene.virtual_stiffness_n_per_m * plan.substep_s * plan.substep_s / model.scene.sheet.point_mass_kg;
-        let slow = |epsilon: f64| epsilon * pull.sqrt();
+        let sheet = Oscillator::of(&model.scene);
+        let (pull, drag) = sheet.scaled(plan.substep_s);
+        // A displacement is known to half its last digit. What the springs make of that is no force that moves anything: it
+        // differs from point to point, and a point between its neighbours gives way by as little. Nor does anything move
+        // by less than that digit in a substep, unless what is lost is kept. (Without virtual springs all may matter.)
+        let half_digit = if pull > 0.0 { 0.5 * T::EPSILON } else { 0.0 };
+        let creep = if model.precision == Precision::Compensated { 0.0 } else { half_digit };
+        let unknown = half_digit * sheet.scaled_spring_stiffness(plan.substep_s) + creep * drag;
+        let creep = creep * tiles.largest;
+        let slow = |epsilon: f64| (epsilon * pull.sqrt()).max(creep);
         let calm = tiles.glance(&state.u, &state.d, slow);
         let epsilon = tiles.epsilon();
         let scale = plan.scheme.spring_scale();
@@ -69,19 +94,20 @@ impl<T: Real> Sheet<T> {
             part: scale / plan.scheme.impulse(),
             pull: pull * scale,
         };
-        let mut region = Region::default();
+        let balanced = |survey: &Survey| survey.imbalance <= scale * (epsilon * pull + unknown * survey.largest);
+        let mut region = tiles.no_region();
         let mut sleepers = Vec::new();
         for tile in calm.into_iter().filter(|tile| !held.contains(tile)) {
-            tiles.region_of_one(tile, &mut region);
+            tiles.cover(&mut region, std::iter::once(tile));
             let survey = with_scheme!(plan, T, |scheme| Survey::of(bench, scheme, state, forces, &region));
-            if tiles.is_calm(tile, survey.speed <= slow(epsilon) && survey.imbalance <= epsilon * pull * scale) {
+            if tiles.is_calm(tile, survey.speed <= slow(epsilon) && balanced(&survey)) {
                 sleepers.push((tile, survey));
             }
         }
         if sleepers.is_empty() {
             return;
         }
-        let region = tiles.region_of(sleepers.iter().map(|(tile, _)| *tile));
+        tiles.cover(&mut region, sleepers.iter().map(|(tile, _)| *tile));
         with_scheme!(plan, T, |scheme| Survey::write(bench, scheme, state, forces, &region, Write::Rest));
         let sleepers: Vec<_> = sleepers.into_iter().map(|(tile, survey)| (tile, self.energy_of(&survey).1)).collect();
         self.tiles.sleep(&sleepers, &self.state.u);

@@ -50,22 +50,23 @@ impl<T: Real> Kind<T> {
         }
     }
 
-    /// The bound of |Q| within which [`Kind::near`] holds.
+    /// Where [`Kind::near`] does not hold.
     #[inline(always)]
-    pub(super) fn bound<V: Vector<Real = T>>(&self) -> V {
-        V::splat(self.near)
+    pub(super) fn is_far<V: Vector<Real = T>>(&self, excess: V) -> V::Mask {
+        excess.beyond(excess.splat(self.near))
     }
 
-    /// Stiffness × (1 − L0/L) for small Q: even and odd powers apart, which halves the wait of each for the last.
+    /// Stiffness × (1 − L0/L) for small Q: even and odd powers apart, which halves the wait of each for the last. A
+    /// spring that is strained too little to count does not pull: at rest, the force is exactly 0.
     #[inline(always)]
     pub(super) fn near<V: Vector<Real = T>>(&self, excess: V) -> V {
-        let square = excess.mul(excess);
-        let (mut even, mut odd) = (V::splat(self.series[T::TERMS - 2]), V::splat(self.series[T::TERMS - 1]));
+        let square = excess.mul_add(excess, excess.splat(T::of(T::FAINT)));
+        let (mut even, mut odd) = (excess.splat(self.series[T::TERMS - 2]), excess.splat(self.series[T::TERMS - 1]));
         for term in (0..T::TERMS / 2 - 1).rev() {
-            even = even.mul_add(square, V::splat(self.series[2 * term]));
-            odd = odd.mul_add(square, V::splat(self.series[2 * term + 1]));
+            even = even.mul_add(square, excess.splat(self.series[2 * term]));
+            odd = odd.mul_add(square, excess.splat(self.series[2 * term + 1]));
         }
-        odd.mul_add(square, even.mul(excess))
+        odd.mul_add(excess, even).mul(excess).keep(excess.beyond(excess.splat(T::of(T::LEAST_EXCESS))))
     }
 
     /// Stiffness × (1 − L0/L) for any Q, best away from 0: with r near 1/s, e = 1 − r²(1 + q) is small, and
@@ -74,25 +75,25 @@ impl<T: Real> Kind<T> {
     /// wide as they seem.
     #[inline(always)]
     pub(super) fn far<V: Vector<Real = T>>(&self, excess: V) -> V {
-        let (one, half) = (V::splat(T::of(1.0)), V::splat(T::of(0.5)));
-        let q = excess.mul(V::splat(self.per_length_squared));
+        let (one, half) = (excess.splat(T::of(1.0)), excess.splat(T::of(0.5)));
+        let q = excess.mul(excess.splat(self.per_length_squared));
         let sum = one.add(q);
         // What the sum lost.
         let rest = q.sub(sum.sub(one));
-        let square = sum.larger(V::splat(T::of(LEAST_LENGTH_SQUARED)));
+        let square = sum.larger(excess.splat(T::of(LEAST_LENGTH_SQUARED)));
         let mut r = square.rough_inverse_root();
         let halved = half.mul(square);
         for _ in 0..T::NEWTON {
-            r = r.mul(V::splat(T::of(1.5)).minus(halved.mul(r), r));
+            r = r.mul(excess.splat(T::of(1.5)).minus(halved.mul(r), r));
         }
         let e = one.minus(square.mul(r), r).minus(r.mul(r), rest);
-        V::splat(self.stiffness).mul(one.sub(r).minus(half.mul(r), e))
+        excess.splat(self.stiffness).mul(one.sub(r).minus(half.mul(r), e))
     }
 
     /// Stiffness × (1 − L0/L), by whichever holds for the lane.
     #[inline(always)]
     pub(super) fn weight<V: Vector<Real = T>>(&self, excess: V) -> V {
-        let far = excess.beyond(self.bound());
+        let far = self.is_far(excess);
         let near = self.near(excess);
         if V::any(far) { V::select(far, self.far(excess), near) } else { near }
     }
@@ -101,16 +102,17 @@ impl<T: Real> Kind<T> {
     #[inline(always)]
     pub(super) fn energy<V: Vector<Real = T>>(&self, excess: V) -> V {
         let (q, s) = self.stretch(excess);
-        let extension = q.div(V::splat(T::of(1.0)).add(s));
-        V::splat(T::of(0.5 * self.stiffness.wide() / self.per_length_squared.wide())).mul(extension.mul(extension))
+        let extension = q.div(excess.splat(T::of(1.0)).add(s));
+        let extension = extension.keep(excess.beyond(excess.splat(T::of(T::LEAST_EXCESS))));
+        excess.splat(T::of(0.5 * self.stiffness.wide() / self.per_length_squared.wide())).mul(extension.mul(extension))
     }
 
     /// q and s.
     #[inline(always)]
     fn stretch<V: Vector<Real = T>>(&self, excess: V) -> (V, V) {
-        let q = excess.mul(V::splat(self.per_length_squared));
-        let square = V::splat(T::of(1.0)).add(q);
-        (q, square.larger(V::splat(T::of(LEAST_LENGTH_SQUARED))).root())
+        let q = excess.mul(excess.splat(self.per_length_squared));
+        let square = excess.splat(T::of(1.0)).add(q);
+        (q, square.larger(excess.splat(T::of(LEAST_LENGTH_SQUARED))).root())
     }
 }
 
@@ -152,7 +154,7 @@ impl<T: Real> Springs<T> {
                 let delta: [T; 3] = std::array::from_fn(|c| at(i1, j1, c) - at(i, j, c));
                 let along = rest[0] * delta[0] + rest[1] * delta[1];
                 let squares = delta.iter().fold(along + along, |sum, d| d.fused(*d, sum));
-                let weight = kind.weight(Plain::<T, 1>::splat(squares)).value();
+                let weight = kind.weight(Plain::one(squares)).value();
                 for c in 0..3 {
                     sum[c] += weight.fused(delta[c], weight * rest[c]);
                 }

@@ -66,7 +66,31 @@ pub fn is_stable(scheme: &Scheme, stiffness: f64) -> bool {
     })
 }
 
-/// Fewest substeps of `step_s` with which a scheme is stable, and as accurate as it promises. Saturates for absurd scenes.
+/// Fewest substeps of `step_s` with which any scheme is stable. Saturates for absurd scenes.
+pub fn least_substeps(step_s: f64, sheet: &Oscillator) -> u32 {
+    fewest(step_s, sheet.omega_bound_per_s(), 2.0)
+}
+
+/// Fewest substeps of `step_s` with which a scheme is stable. Saturates for absurd scenes.
+pub fn stable_substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) -> u32 {
+    let mut substeps = least_substeps(step_s, sheet);
+    let stable = |substeps: u32| {
+        let substep_s = step_s / f64::from(substeps);
+        let (a, g) = sheet.scaled(substep_s);
+        is_stable(&Scheme::fit(integrator, a, g), sheet.scaled_spring_stiffness(substep_s))
+    };
+    // The limit of all is above dt·ω = 0.3 even without damping, and above dt·C/m = 2 (that of `rk4` is 2.785); rounding
+    // may tell otherwise for ever.
+    let fastest_per_s = (sheet.omega_bound_per_s() / 0.1).max(sheet.damping_n_s_per_m / sheet.mass_kg);
+    let most = (step_s * fastest_per_s).min(f64::from(u32::MAX));
+    while !stable(substeps) && f64::from(substeps) < most {
+        substeps = substeps.saturating_add(substeps / 8 + 1);
+    }
+    substeps
+}
+
+/// Fewest substeps of `step_s` with which a yardstick is stable, and as accurate as it promises. Saturates for absurd
+/// scenes.
 pub fn substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) -> u32 {
     match integrator {
         Integrator::Central | Integrator::Lagged => {
@@ -77,19 +101,7 @@ pub fn substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) -> u32 
             let lag = fewest(step_s, sheet.damping_n_s_per_m / sheet.mass_kg, 1.0);
             if integrator == Integrator::Lagged { turn.max(lag) } else { turn }
         }
-        _ => {
-            let mut substeps = fewest(step_s, sheet.omega_bound_per_s(), 2.0);
-            let stable = |substeps: u32| {
-                let substep_s = step_s / f64::from(substeps);
-                let (a, g) = sheet.scaled(substep_s);
-                is_stable(&Scheme::fit(integrator, a, g), sheet.scaled_spring_stiffness(substep_s))
-            };
-            // The limit of all is above dt·ω = 0.3 even without damping; rounding may tell otherwise for ever.
-            while !stable(substeps) && f64::from(substeps) < step_s * sheet.omega_bound_per_s() / 0.1 {
-                substeps = substeps.saturating_add(substeps / 8 + 1);
-            }
-            substeps
-        }
+        _ => stable_substeps(integrator, step_s, sheet),
     }
 }
 

@@ -12,8 +12,8 @@ use super::applied::{self, Pull, Term};
 use super::field::{BLOCK, Layout, State};
 use super::lanes::Vector;
 use super::real::Real;
+use super::region::Region;
 use super::sweep::{Bench, MAX_KEPT, Scheme, Stage};
-use super::tiles::Region;
 use super::{Energy, Sheet, central, exponential, rk4};
 
 /// What was seen, in the scheme's units (`integrate`).
@@ -75,16 +75,22 @@ pub(super) enum Write {
     Begin,
 }
 
+/// u, d, and what is kept at most.
+const FIELDS: usize = 2 + MAX_KEPT;
+
 struct Look<'a, T: Real, C> {
     layout: Layout,
     scheme: &'a C,
-    u: *mut T,
-    d: *mut T,
-    kept: [*mut T; MAX_KEPT],
+    /// d and what is kept.
+    d: *const T,
+    kept: [*const T; MAX_KEPT],
+    /// What is written, and where: u and d, and what is kept; null if nothing is.
     write: Write,
+    to: [*mut T; 2],
+    to_kept: [*mut T; MAX_KEPT],
     forces: Forces<'a, T>,
     /// The same tools, as the sweep sees them.
-    pulls: &'a [Pull<T>],
+    pulls: &'a [Pull<'a, T>],
     free: *const T,
     sums: &'a UnsafeCell<Sums<T>>,
 }
@@ -98,8 +104,9 @@ impl Survey {
         forces: Forces<'_, T>,
         over: &Region,
     ) -> Survey {
-        let pointers = state.fields().map(|field| field.as_ptr().cast_mut());
-        Survey::by(bench, scheme, pointers, forces, over, Write::Nothing)
+        let mut fields = state.fields().map(|field| field.as_ptr());
+        let from = std::array::from_fn(|_| fields.next().unwrap_or(std::ptr::null()));
+        Survey::by(bench, scheme, (from, [std::ptr::null_mut(); FIELDS]), forces, over, Write::Nothing)
     }
 
     /// The same, and changes it.
@@ -111,32 +118,32 @@ impl Survey {
         over: &Region,
         write: Write,
     ) {
-        let pointers = state.fields_mut().map(|field| field.as_mut_ptr());
-        Survey::by(bench, scheme, pointers, forces, over, write);
+        let mut fields = state.fields_mut().map(|field| field.as_mut_ptr());
+        let to: [*mut T; FIELDS] = std::array::from_fn(|_| fields.next().unwrap_or(std::ptr::null_mut()));
+        Survey::by(bench, scheme, (to.map(<*mut T>::cast_const), to), forces, over, write);
     }
 
-    /// `pointers`: to u, d and what is kept.
+    /// From where to read u, d and what is kept, and where to write them.
     fn by<T: Real, C: Scheme<T>>(
         bench: &Bench<T>,
         scheme: &C,
-        mut pointers: impl Iterator<Item = *mut T>,
+        ([u, d, kept @ ..], [to_u, to_d, to_kept @ ..]): ([*const T; FIELDS], [*mut T; FIELDS]),
         forces: Forces<'_, T>,
         over: &Region,
         write: Write,
     ) -> Survey {
         let zero = [T::default(); BLOCK];
         let sums = UnsafeCell::new(Sums { row: [zero; 5], total: [[0.0; BLOCK]; 5], largest: [zero; 4] });
-        let pull = |term: &Term<T>| term.pull(forces.field, bench.layout.stride);
-        let pulls: Vec<Pull<T>> = forces.terms.iter().map(pull).collect();
-        let mut next = || pointers.next().unwrap_or(std::ptr::null_mut());
-        let (u, d) = (next(), next());
+        let pulls = forces.terms.iter().map(|term| term.pull(forces.field, bench.layout.stride));
+        let pulls: Vec<Pull<'_, T>> = pulls.collect();
         let look = Look {
             layout: bench.layout,
             scheme,
-            u,
             d,
-            kept: std::array::from_fn(|_| next()),
+            kept,
             write,
+            to: [to_u, to_d],
+            to_kept,
             forces,
             pulls: &pulls,
             free: bench.free.as_ref().map_or(std::ptr::null(), |free| free.as_ptr()),
@@ -178,7 +185,7 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Look<'_, T, C> {
     const ENERGY: bool = true;
 
     #[inline(always)]
-    unsafe fn finish<V: Vector<Real = T>, const LEAN: bool>(
+    unsafe fn finish<V: Vector<Real = T>, const DUTY: u8>(
         &self,
         row: usize,
         at: usize,
@@ -193,10 +200,10 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Look<'_, T, C> {
             let Forces { terms, part, pull, .. } = self.forces;
             let force = applied::force_on::<V, 1>(self.pulls, row, at);
             let free = if self.free.is_null() { None } else { Some(V::load(self.free.add(at))) };
-            let (part, pull) = (V::splat(T::of(part)), V::splat(T::of(pull)));
-            let zero = V::splat(T::default());
+            let (part, pull) = (V::of(T::of(part)), V::of(T::of(pull)));
+            let zero = V::of(T::default());
             let (mut speed, mut place, mut vigour, mut power) = (zero, zero, zero, zero);
-            let mut most = [V::splat(T::default()); 4];
+            let mut most = [zero; 4];
             for c in 0..3 {
                 let at = at + c * self.layout.plane;
                 let d = V::load(self.d.add(at));
@@ -219,18 +226,18 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Look<'_, T, C> {
                 match self.write {
                     Write::Nothing => {}
                     Write::Rest => {
-                        seen.store(self.u.add(at));
-                        zero.store(self.d.add(at));
+                        seen.store(self.to[0].add(at));
+                        zero.store(self.to[1].add(at));
                     }
                     Write::Seen => {
-                        seen.store(self.u.add(at));
-                        speed_seen.store(self.d.add(at));
+                        seen.store(self.to[0].add(at));
+                        speed_seen.store(self.to[1].add(at));
                     }
-                    Write::Begin => d.add(d.sub(speed_seen)).store(self.d.add(at)),
+                    Write::Begin => d.add(d.sub(speed_seen)).store(self.to[1].add(at)),
                 }
                 if matches!(self.write, Write::Rest | Write::Begin) {
                     for k in 0..C::KEPT {
-                        n[c].store(self.kept[k].add(at));
+                        n[c].store(self.to_kept[k].add(at));
                     }
                 }
                 most = [most[0].farther(u), most[1].farther(u.sub(x[c])), most[2].farther(w), most[3].farther(short)];

@@ -13,7 +13,9 @@
 //! A lane's result depends on the same operations in the same order at every width: the bits are the same.
 //!
 //! Where only part of the sheet is awake (`tiles`), the sweep goes over strips: rectangles of rows and columns that cover
-//! it, and what its forces need of the springs beside and above. The stage is told of awake blocks alone.
+//! it, and what its forces need of the springs above. The stage is told of awake blocks alone. The springs of the column
+//! to the left of a strip are evaluated along the column, a vector of rows at a time ([`Edge`]): a block of columns for each
+//! row would cost as much as one that is awake. (Flexion springs, which begin two columns to the left, have that block.)
 #![allow(unsafe_code)]
 // Iterators over vectors are not always inlined, and then run without the instructions of their caller: ten times slower.
 #![allow(clippy::needless_range_loop)]
@@ -22,12 +24,14 @@ use std::cell::RefCell;
 use std::ops::Range;
 use std::sync::Arc;
 
+use super::advance::Advance;
 use super::applied::{self, Pull, Term};
+use super::edge::Edge;
 use super::field::{BLOCK, Field, Layout, State};
 use super::lanes::{self, Run, Vector, Width};
 use super::real::Real;
+use super::region::Region;
 use super::springs::{Kind, Springs};
-use super::tiles::Region;
 use crate::scene::Lanes;
 
 /// What is done with the force on a block of points.
@@ -35,9 +39,18 @@ pub(super) trait Stage<T: Real> {
     /// Whether the sweep tells the springs' energies as well.
     const ENERGY: bool = false;
 
-    /// Whether the stage has less to do in a row than in others: `finish` is told so at compile time.
-    fn is_lean(&self, _row: usize) -> bool {
-        true
+    /// What the stage has to do in a row: `finish` is told so at compile time.
+    fn duty(&self, _row: usize) -> u8 {
+        LEAN
+    }
+
+    /// What the sums begin from.
+    ///
+    /// # Safety
+    /// As for `finish`.
+    #[inline(always)]
+    unsafe fn begin<V: Vector<Real = T>>(&self) -> [V; 2] {
+        [unsafe { V::of(T::default()) }; 2]
     }
 
     /// `x`: displacements of the block of row `row` that begins at place `at`; `n`: the springs' forces on it. Adds to
@@ -45,7 +58,7 @@ pub(super) trait Stage<T: Real> {
     ///
     /// # Safety
     /// What the stage points to is as it promised.
-    unsafe fn finish<V: Vector<Real = T>, const LEAN: bool>(
+    unsafe fn finish<V: Vector<Real = T>, const DUTY: u8>(
         &self,
         row: usize,
         at: usize,
@@ -72,6 +85,11 @@ pub(super) trait Stage<T: Real> {
     /// As for `finish`.
     unsafe fn end<V: Vector<Real = T>>(&self, _sums: [V; 2]) {}
 }
+
+/// Duties of a row ([`Stage::duty`]): the springs alone, one force of a tool beside them, or whatever there may be.
+pub(super) const LEAN: u8 = 0;
+pub(super) const PUSHED: u8 = 1;
+pub(super) const ANY: u8 = 2;
 
 /// A sweep, ready to run at any width.
 pub(super) struct Sweep<'a, T, S> {
@@ -101,15 +119,17 @@ impl<T: Real, S: Stage<T>> Run<T> for Sweep<'_, T, S> {
     }
 }
 
-/// Q of a spring whose rest vector is `rest` times the unit along it: 2·along + Δ·Δ, `along` being D0·Δ.
+/// Q of a spring whose rest vector is `rest` times the unit along it: 2·along + Δ·Δ, `along` being D0·Δ. [`Real::FAINT`] more
+/// keeps squares of small Δ, across the spring, from ending below the normal range.
 #[inline(always)]
-fn excess<V: Vector>(along: V, delta: &[V; 3], [first, second, third]: [usize; 3]) -> V {
-    let sum = delta[first].mul_add(delta[first], along.add(along));
+pub(super) fn excess<V: Vector>(along: V, delta: &[V; 3], [first, second, third]: [usize; 3]) -> V {
+    let faint = along.mul_add(along.splat(V::Real::of(2.0)), along.splat(V::Real::of(V::Real::FAINT)));
+    let sum = delta[first].mul_add(delta[first], faint);
     delta[third].mul_add(delta[third], delta[second].mul_add(delta[second], sum))
 }
 
 #[inline(always)]
-fn difference<V: Vector>(to: &[V; 3], from: &[V; 3]) -> [V; 3] {
+pub(super) fn difference<V: Vector>(to: &[V; 3], from: &[V; 3]) -> [V; 3] {
     [to[0].sub(from[0]), to[1].sub(from[1]), to[2].sub(from[2])]
 }
 
@@ -118,7 +138,7 @@ fn difference<V: Vector>(to: &[V; 3], from: &[V; 3]) -> [V; 3] {
 /// # Safety
 /// They can be read.
 #[inline(always)]
-unsafe fn load<V: Vector>(at: *const V::Real, plane: usize) -> [V; 3] {
+pub(super) unsafe fn load<V: Vector>(at: *const V::Real, plane: usize) -> [V; 3] {
     // SAFETY: the caller's promise.
     unsafe { [V::load(at), V::load(at.add(plane)), V::load(at.add(2 * plane))] }
 }
@@ -131,32 +151,46 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
         // SAFETY: the caller's promise; offsets stay within rows + 1 rows and a block.
         unsafe {
             let Layout { rows, columns, stride, plane } = self.layout;
-            let zero = V::splat(T::default());
-            let mut sums = [zero; 2];
+            let zero = V::of(T::default());
+            let mut sums = self.stage.begin::<V>();
             for strip in &self.over.strips {
-                // With the block to the left, whose springs pull at the first column.
-                let from = strip.columns.start.saturating_sub(V::LANES);
+                // With the block to the left, whose springs pull at the first column, or its last column.
+                let beside = strip.columns.start.saturating_sub(V::LANES);
+                let from = if FLEXION { beside } else { strip.columns.start };
                 let to = strip.columns.end.min(columns.next_multiple_of(V::LANES));
                 if strip.rows.start == 0 {
                     for row in 0..if FLEXION { CARRY_ROWS } else { 2 } {
                         for c in 0..3 {
-                            for column in (from..to).step_by(V::LANES) {
+                            for column in (beside..to).step_by(V::LANES) {
                                 zero.store(self.carry.add(c * plane + row * stride + column));
                             }
                         }
                     }
                 }
                 let mut ahead = excesses(self.x.add(strip.rows.start * stride + from), stride, plane);
+                let all = strip.awake && beside == strip.columns.start && to == columns.next_multiple_of(V::LANES);
+                let whole = V::IS_REGISTER && all;
+                let mut edge = if FLEXION || from == 0 { None } else { Some(Edge::new(self, from, strip.rows.start)) };
                 for i in strip.rows.clone() {
-                    let (span, under_way) = (from..to, (&mut ahead, &mut sums));
-                    let lean = !FLEXION && self.stage.is_lean(i);
+                    let left = match &mut edge {
+                        Some(edge) => edge.left_of(self, i),
+                        None => [zero; 3],
+                    };
+                    let span = (from..to, strip.awake && from == strip.columns.start, left);
+                    let under_way = (&mut ahead, &mut sums);
+                    let duty = if FLEXION || S::ENERGY || !V::IS_REGISTER { ANY } else { self.stage.duty(i) };
                     // The usual rows have loops of their own, without what only others need.
-                    match (i + 1 < rows, strip.whole, lean) {
-                        (true, true, true) => self.row::<V, FLEXION, true, true, true>(flexion, i, span, under_way),
-                        (true, true, false) => self.row::<V, FLEXION, true, true, false>(flexion, i, span, under_way),
-                        (true, false, _) => self.row::<V, FLEXION, true, false, false>(flexion, i, span, under_way),
-                        (false, ..) => self.row::<V, FLEXION, false, false, false>(flexion, i, span, under_way),
+                    match (i + 1 < rows, whole, duty) {
+                        (true, true, LEAN) => self.row::<V, FLEXION, true, true, LEAN>(flexion, i, span, under_way),
+                        (true, true, PUSHED) => self.row::<V, FLEXION, true, true, PUSHED>(flexion, i, span, under_way),
+                        (true, true, _) => self.row::<V, FLEXION, true, true, ANY>(flexion, i, span, under_way),
+                        (true, false, LEAN) => self.row::<V, FLEXION, true, false, LEAN>(flexion, i, span, under_way),
+                        (true, false, _) => self.row::<V, FLEXION, true, false, ANY>(flexion, i, span, under_way),
+                        (false, ..) => self.row::<V, FLEXION, false, false, ANY>(flexion, i, span, under_way),
                     }
+                }
+                if let Some(edge) = edge {
+                    edge.leave(self, strip.rows.end);
                 }
             }
             self.stage.end(sums);
@@ -166,11 +200,11 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
     /// Row `i`, which has a row below or not. The Qs are formed one block ahead, so that two blocks' chains of operations
     /// are under way at once.
     #[inline(always)]
-    unsafe fn row<V: Vector<Real = T>, const FLEXION: bool, const BELOW: bool, const WHOLE: bool, const LEAN: bool>(
+    unsafe fn row<V: Vector<Real = T>, const FLEXION: bool, const BELOW: bool, const WHOLE: bool, const DUTY: u8>(
         &self,
         flexion: &Kind<T>,
         i: usize,
-        span: Range<usize>,
+        (span, all_awake, left): (Range<usize>, bool, [V; 3]),
         (ahead, sums): (&mut [V; 4], &mut [V; 2]),
     ) {
         // SAFETY: as for `rows`.
@@ -178,13 +212,13 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
             let Layout { rows, columns, stride, plane } = self.layout;
             let Springs { structural, shear, .. } = self.springs;
             let x = self.x.add(i * stride);
-            let zero = V::splat(T::default());
+            let zero = V::of(T::default());
             let (down, diagonal) = (self.carry, self.carry.add(stride));
             let two_down = self.carry.add((2 + i % 2) * stride);
             // Springs to the next column: none from the last.
-            let full = V::first(V::LANES);
-            let tail = V::first((columns - 1) % V::LANES);
-            let (mut passed, mut passed_two) = ([zero; 3], [zero; 3]);
+            let full = zero.first(V::LANES);
+            let tail = zero.first((columns - 1) % V::LANES);
+            let (mut passed, mut passed_two) = (if WHOLE { [zero; 3] } else { left }, [zero; 3]);
             let span = if WHOLE { 0..columns.next_multiple_of(V::LANES) } else { span };
             let mut column = span.start;
             while column < span.end {
@@ -195,13 +229,13 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                 if BELOW || more {
                     *ahead = excesses(x.add(next), stride, plane);
                 }
-                let awake = WHOLE || self.over.is_awake(i, column);
+                let awake = WHOLE || all_awake || self.over.is_awake(i, column);
                 let mut wr = structural.near(qr);
                 let (mut wd, mut wa, mut wb) = (zero, zero, zero);
                 if BELOW {
                     (wd, wa, wb) = (structural.near(qd), shear.near(qa), shear.near(qb));
-                    let far = qr.farther(qd).beyond(structural.bound());
-                    if V::any(V::either(far, qa.farther(qb).beyond(shear.bound()))) {
+                    let far = structural.is_far(qr.farther(qd));
+                    if V::any(V::either(far, shear.is_far(qa.farther(qb)))) {
                         (wr, wd) = (structural.weight(qr), structural.weight(qd));
                         (wa, wb) = (shear.weight(qa), shear.weight(qb));
                     }
@@ -243,7 +277,7 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                 }
                 if FLEXION {
                     // The last block may have a single column: then the one before is not full either.
-                    let mask = V::first(columns.saturating_sub(2 + column));
+                    let mask = zero.first(columns.saturating_sub(2 + column));
                     let r = difference(&load(at.add(2), plane), &here);
                     let q = excess(r[1].add(r[1]), &r, [1, 0, 2]);
                     let w = flexion.weight(q).keep(mask);
@@ -274,7 +308,7 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                     }
                 }
                 if awake {
-                    self.stage.finish::<V, LEAN>(i, i * stride + column, here, n, sums);
+                    self.stage.finish::<V, DUTY>(i, i * stride + column, here, n, sums);
                 }
                 column += V::LANES;
             }
@@ -382,12 +416,12 @@ impl<T: Real> Bench<T> {
         assert_eq!(state.kept.len(), C::KEPT);
         // Few tools' forces need no memory from the heap.
         let (mut few, mut many) = ([Pull::none(); FEW], Vec::new());
-        let pull = |term: &Term<T>| term.pull(field, self.layout.stride);
-        let pulls: &[Pull<T>] = if terms.len() <= FEW {
-            few.iter_mut().zip(terms).for_each(|(to, term)| *to = pull(term));
+        let pulls = terms.iter().map(|term| term.pull(field, self.layout.stride));
+        let pulls: &[Pull<'_, T>] = if terms.len() <= FEW {
+            few.iter_mut().zip(pulls).for_each(|(to, pull)| *to = pull);
             &few[..terms.len()]
         } else {
-            many.extend(terms.iter().map(pull));
+            many.extend(pulls);
             &many
         };
         let u = state.u.as_mut_ptr();
@@ -432,100 +466,5 @@ impl<T: Real> Bench<T> {
         // Four chains of additions at once, in an order that does not change.
         let chains: [f64; 4] = std::array::from_fn(|chain| (0..BLOCK / 4).map(|n| work[4 * n + chain].wide()).sum());
         (chains[0] + chains[1]) + (chains[2] + chains[3])
-    }
-}
-
-/// The stage that advances every point.
-struct Advance<'a, T: Real, C> {
-    layout: Layout,
-    scheme: &'a C,
-    /// u and d, three planes each.
-    u: *mut T,
-    d: *mut T,
-    kept: [*mut T; MAX_KEPT],
-    /// The tools' forces, in rows `forced`.
-    pulls: &'a [Pull<T>],
-    forced: Range<usize>,
-    /// 1 where a point moves, 0 where it is fixed; null if none is.
-    free: *const T,
-    /// A block that sums up squares of increments: finite and small only if all are.
-    probe: *mut T,
-    /// One that sums up the work of the tools, for each of 16 columns apart: the same at every width.
-    work: *mut T,
-}
-
-impl<T: Real, C: Scheme<T>> Stage<T> for Advance<'_, T, C> {
-    fn is_lean(&self, row: usize) -> bool {
-        self.free.is_null() && !self.forced.contains(&row)
-    }
-
-    #[inline(always)]
-    unsafe fn finish<V: Vector<Real = T>, const LEAN: bool>(
-        &self,
-        row: usize,
-        at: usize,
-        x: [V; 3],
-        n: [V; 3],
-        sums: &mut [V; 2],
-    ) {
-        // SAFETY: the caller's promise.
-        unsafe {
-            let Layout { stride, plane, .. } = self.layout;
-            let forced = !LEAN && self.forced.contains(&row);
-            let column = at - row * stride;
-            let free = if LEAN || self.free.is_null() { None } else { Some(V::load(self.free.add(at))) };
-            let mut force = [[V::splat(T::default()); 2]; 3];
-            // A vector as wide as a block has each of its columns in a lane of its own.
-            let apart = V::LANES < BLOCK;
-            let mut work = sums[1];
-            if forced {
-                if apart {
-                    work = V::load(self.work.add(column % BLOCK));
-                }
-                if C::FORCES == 1 {
-                    force = applied::force_on::<V, 1>(self.pulls, row, at);
-                } else {
-                    force = applied::force_on::<V, 2>(self.pulls, row, at);
-                }
-            }
-            for c in 0..3 {
-                let at = at + c * plane;
-                let before = [x[c], V::load(self.d.add(at))];
-                let mut kept = [before[1]; MAX_KEPT];
-                for k in 0..C::KEPT {
-                    kept[k] = V::load(self.kept[k].add(at));
-                }
-                let force = if forced { Some(force[c]) } else { None };
-                let (mut x, mut d) = self.scheme.advance(before[0], before[1], n[c], &mut kept, force);
-                if let Some(free) = free {
-                    (x, d) = (x.mul(free), d.mul(free));
-                }
-                x.store(self.u.add(at));
-                d.store(self.d.add(at));
-                for k in C::KEPT - C::WRITTEN..C::KEPT {
-                    kept[k].store(self.kept[k].add(at));
-                }
-                sums[0] = d.mul_add(d, sums[0]);
-                if let Some([_, force]) = force {
-                    work = force.mul_add(self.scheme.travel(before, [x, d]), work);
-                }
-            }
-            if forced && apart {
-                work.store(self.work.add(column % BLOCK));
-            } else {
-                sums[1] = work;
-            }
-        }
-    }
-
-    #[inline(always)]
-    unsafe fn end<V: Vector<Real = T>>(&self, [probe, work]: [V; 2]) {
-        // SAFETY: a block is as long as the widest vector.
-        unsafe {
-            V::load(self.probe).add(probe).store(self.probe);
-            if V::LANES == BLOCK {
-                work.store(self.work);
-            }
-        }
     }
 }

@@ -10,14 +10,13 @@
 //! where springs are much stiffer than the virtual ones, which then let through more of what is left out. It wakes as well
 //! when the tools' force on it may have changed by more than ε_w·K″ since, and when it is grasped.
 
+use std::cell::Cell;
 use std::ops::Range;
 
 use super::applied::Touch;
-use super::field::{BLOCK, Field, Layout};
+use super::field::{Field, Layout};
 use super::real::Real;
-
-/// Points along a side.
-pub(super) const TILE: usize = BLOCK;
+use super::region::{Marks, Region, TILE, tiles};
 
 /// Steps between two looks at whether tiles may sleep.
 pub(super) const CHECK_STEPS: u64 = 16;
@@ -35,99 +34,22 @@ const FORGET: f64 = 0.99;
 /// Places of a tile's neighbours: along x, along y.
 const NEIGHBOURS: [[isize; 2]; 8] = [[-1, -1], [-1, 0], [-1, 1], [0, -1], [0, 1], [1, -1], [1, 0], [1, 1]];
 
+/// Of those, the ones with springs that begin there and reach the tile.
+const PULLING: [usize; 3] = [0, 1, 3];
+
 /// Values of a snapshot: three of each of 16 points for a side or a corner.
 const SNAPSHOT: usize = NEIGHBOURS.len() * 3 * TILE;
 
-/// Part of a sheet that a sweep goes over.
-#[derive(Debug, Clone, Default)]
-pub(super) struct Region {
-    /// In the order in which a sweep may take them: none reads what one before it has overwritten.
-    pub(super) strips: Vec<Strip>,
-    awake: Vec<bool>,
-    /// Tiles along y.
-    columns: usize,
-}
-
-/// A rectangle of points.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct Strip {
-    pub(super) rows: Range<usize>,
-    /// Whole tiles, the last of which may reach beyond the sheet.
-    pub(super) columns: Range<usize>,
-    /// All of it is awake, and nothing to the left is asleep.
-    pub(super) whole: bool,
-}
-
-impl Region {
-    /// All of a sheet.
-    pub(super) fn whole(layout: &Layout) -> Self {
-        Region::of(layout, &vec![true; tiles(layout.rows) * tiles(layout.columns)], 0)
-    }
-
-    /// The tiles that are `awake`; springs reach `reach` rows on.
-    fn of(layout: &Layout, awake: &[bool], reach: usize) -> Self {
-        let columns = tiles(layout.columns);
-        let mut region = Region { strips: Vec::new(), awake: awake.to_vec(), columns };
-        if awake.iter().all(|awake| *awake) {
-            let whole = Strip { rows: 0..layout.rows, columns: 0..columns * TILE, whole: true };
-            region.strips.push(whole);
-            return region;
-        }
-        let runs = |row: usize| -> Vec<Range<usize>> {
-            let mut runs: Vec<Range<usize>> = Vec::new();
-            for tile in (0..columns).filter(|tile| awake.get(row * columns + tile) == Some(&true)) {
-                match runs.last_mut() {
-                    Some(run) if run.end == tile => run.end = tile + 1,
-                    _ => runs.push(tile..tile + 1),
-                }
-            }
-            runs
-        };
-        let mut own = runs(0);
-        for row in 0..tiles(layout.rows) {
-            let below = runs(row + 1);
-            let rows = row * TILE..((row + 1) * TILE).min(layout.rows);
-            // The last rows begin springs that pull at the tiles below.
-            let body =
-                rows.start..if below.is_empty() { rows.end } else { rows.end.saturating_sub(reach).max(rows.start) };
-            region.push(body.clone(), &own);
-            let mut both = own;
-            both.extend(below.iter().cloned());
-            both.sort_by_key(|run| run.start);
-            both.dedup_by(|next, run| {
-                let joined = next.start <= run.end;
-                if joined {
-                    run.end = run.end.max(next.end);
-                }
-                joined
-            });
-            region.push(body.end..rows.end, &both);
-            own = below;
-        }
-        region
-    }
-
-    fn push(&mut self, rows: Range<usize>, runs: &[Range<usize>]) {
-        if !rows.is_empty() {
-            let strip = |run: &Range<usize>| Strip {
-                rows: rows.clone(),
-                columns: run.start * TILE..run.end * TILE,
-                whole: false,
-            };
-            self.strips.extend(runs.iter().map(strip));
-        }
-    }
-
-    /// Whether the tile of a point is awake.
-    #[inline(always)]
-    pub(super) fn is_awake(&self, row: usize, column: usize) -> bool {
-        self.awake[row / TILE * self.columns + column / TILE]
-    }
-}
-
-/// Tiles along so many points.
-fn tiles(points: usize) -> usize {
-    points.div_ceil(TILE)
+/// Points beside a sleeping tile, in a tile that is awake.
+#[derive(Debug, Clone, Copy)]
+struct Watch {
+    tile: usize,
+    /// The first of the points, and how far it is to the next.
+    first: usize,
+    next: usize,
+    count: usize,
+    /// Where they were: the place in the snapshots.
+    then: usize,
 }
 
 /// Which tiles of a sheet sleep, and what they remember.
@@ -141,8 +63,6 @@ pub(super) struct Tiles<T> {
     /// Nothing sleeps without one.
     tolerance: f64,
     pub(super) region: Region,
-    /// Numbers of the tiles that are awake, rising.
-    pub(super) awake: Vec<usize>,
     pub(super) awake_points: usize,
     /// Of each tile, looks in a row at which it was calm.
     calm: Vec<u8>,
@@ -152,12 +72,16 @@ pub(super) struct Tiles<T> {
     energy_j: Vec<f64>,
     /// Of all that sleep.
     pub(super) asleep_j: f64,
+    /// The energies that it has, once somebody has asked, until it or one that its springs reach wakes.
+    elastic_j: Vec<Cell<Option<[f64; 2]>>>,
     /// Where the points around it were; made when the first tile sleeps.
     snapshots: Vec<T>,
-    /// Sides of sleeping tiles beyond which a tile is awake: tile and neighbour.
-    watched: Vec<(usize, usize)>,
-    /// Since the last checkpoint it was awake.
-    touched: Vec<bool>,
+    /// What the sleeping tiles beside those that are awake look at.
+    watches: Vec<Watch>,
+    /// Since the last checkpoint these were awake.
+    touched: Marks,
+    /// These were ever awake, or their springs reach such: in the others nothing has ever moved, and all is 0.
+    moved: Marks,
     /// The largest displacement of late, spacings.
     pub(super) largest: f64,
 }
@@ -172,20 +96,22 @@ impl<T: Real> Tiles<T> {
             counts,
             reach,
             tolerance,
-            region: Region::default(),
-            awake: Vec::new(),
+            region: Region::none(&layout),
             awake_points: 0,
             calm: vec![0; count],
             drift_n: vec![0.0; count],
             energy_j: vec![0.0; count],
             asleep_j: 0.0,
+            elastic_j: vec![Cell::new(None); count],
             snapshots: Vec::new(),
-            watched: Vec::new(),
-            touched: vec![false; count],
+            watches: Vec::new(),
+            touched: Marks::none_of(count),
+            moved: Marks::none_of(count),
             largest: 0.0,
         };
-        let all = vec![!tiles.may_sleep(); count];
-        tiles.set(&all);
+        if !tiles.may_sleep() {
+            tiles.wake_all();
+        }
         tiles
     }
 
@@ -217,18 +143,25 @@ impl<T: Real> Tiles<T> {
         from..(from + TILE).min(self.layout.columns)
     }
 
-    /// Makes just those tiles awake.
-    fn set(&mut self, awake: &[bool]) {
-        self.region = Region::of(&self.layout, awake, self.reach);
-        self.awake = (0..awake.len()).filter(|tile| awake[*tile]).collect();
-        self.awake_points = self.awake.iter().map(|tile| self.rows(*tile).len() * self.columns(*tile).len()).sum();
-        let mut watched = Vec::new();
-        for (tile, _) in awake.iter().enumerate().filter(|(_, awake)| !**awake) {
-            let beyond = |side: &usize| self.neighbour(tile, *side).is_some_and(|other| awake[other]);
-            watched.extend((0..NEIGHBOURS.len()).filter(beyond).map(|side| (tile, side)));
+    /// Brings everything to the tiles that are awake now: costs what they are, not what the sheet is.
+    fn settle(&mut self) {
+        self.region.cover(&self.layout, self.reach);
+        self.awake_points = 0;
+        self.watches.clear();
+        for index in 0..self.region.tiles().len() {
+            let tile = self.region.tiles()[index];
+            self.awake_points += self.rows(tile).len() * self.columns(tile).len();
+            self.touched.add(tile);
+            // Neighbours and their opposites are in opposite order.
+            for (side, opposite) in (0..NEIGHBOURS.len()).zip((0..NEIGHBOURS.len()).rev()) {
+                let beside = self.neighbour(tile, opposite);
+                if let Some(other) = beside.filter(|other| !self.region.awake.has[*other]) {
+                    let (first, next, count) = self.beyond(other, side);
+                    let then = other * SNAPSHOT + side * 3 * TILE;
+                    self.watches.push(Watch { tile: other, first, next, count, then });
+                }
+            }
         }
-        self.watched = watched;
-        self.awake.iter().for_each(|tile| self.touched[*tile] = true);
     }
 
     fn neighbour(&self, tile: usize, side: usize) -> Option<usize> {
@@ -257,19 +190,20 @@ impl<T: Real> Tiles<T> {
 
     /// Wakes those of `which` that sleep.
     pub(super) fn wake(&mut self, which: impl IntoIterator<Item = usize>) {
-        let mut awake = std::mem::take(&mut self.region.awake);
         let mut any = false;
         for tile in which {
-            if !std::mem::replace(&mut awake[tile], true) {
+            if self.region.awake.add(tile) {
                 any = true;
                 self.asleep_j -= self.energy_j[tile];
                 self.calm[tile] = 0;
+                let around = (0..NEIGHBOURS.len()).filter_map(|side| self.neighbour(tile, side));
+                around.chain([tile]).for_each(|other| self.elastic_j[other].set(None));
+                let pulling = PULLING.map(|side| self.neighbour(tile, side));
+                pulling.into_iter().flatten().chain([tile]).for_each(|other| _ = self.moved.add(other));
             }
         }
         if any {
-            self.set(&awake);
-        } else {
-            self.region.awake = awake;
+            self.settle();
         }
     }
 
@@ -293,20 +227,25 @@ impl<T: Real> Tiles<T> {
 
     /// Wakes tiles whose neighbours have moved by more than `far`.
     pub(super) fn watch(&mut self, u: &Field<T>, far: f64) {
-        if self.watched.is_empty() {
+        if self.watches.is_empty() {
             return;
         }
         self.remember();
         let far = T::of(far);
-        let moved = |&(tile, side): &(usize, usize)| {
-            let (first, next, count) = self.beyond(tile, side);
-            let then = &self.snapshots[tile * SNAPSHOT + side * 3 * TILE..];
+        let moved = |watch: &&Watch| {
+            let Watch { first, next, count, then, .. } = **watch;
             (0..3).any(|c| {
-                let from = c * self.layout.plane + first;
-                (0..count).any(|k| (u[from + k * next] - then[c * TILE + k]).magnitude() > far)
+                let (here, then) = (&u[c * self.layout.plane + first..], &self.snapshots[then + c * TILE..][..count]);
+                // All of them, without a way out: then it is a few vectors.
+                let any = |any: bool, (now, then): (&T, &T)| any | ((*now - *then).magnitude() > far);
+                if next == 1 {
+                    here[..count].iter().zip(then).fold(false, any)
+                } else {
+                    here.iter().step_by(next).zip(then).fold(false, any)
+                }
             })
         };
-        let waking: Vec<usize> = self.watched.iter().filter(|watch| moved(watch)).map(|(tile, _)| *tile).collect();
+        let waking: Vec<usize> = self.watches.iter().filter(moved).map(|watch| watch.tile).collect();
         self.wake(waking);
     }
 
@@ -318,19 +257,29 @@ impl<T: Real> Tiles<T> {
     }
 
     /// Adds a change of the tools' force, and wakes tiles for which all changes since they fell asleep may be more than
-    /// `least_n`. `touch`: how much at a tile as far from the centres as this.
+    /// `least_n`. `touch`: how much at a tile as far from the centres as this. Beyond the points that it reaches nothing has
+    /// changed. If the least is 0, it wakes the whole sheet: what moves at all must not meet a sleeping tile.
     pub(super) fn pushed(&mut self, touch: &Touch, spacing_m: f64, least_n: f64) {
         let mut waking = Vec::new();
-        for tile in 0..self.calm.len() {
-            if self.region.awake[tile] {
-                continue;
-            }
-            #[allow(clippy::cast_precision_loss)]
-            let sides = [self.rows(tile), self.columns(tile)]
-                .map(|range| [range.start as f64 * spacing_m, (range.end - 1) as f64 * spacing_m]);
-            self.drift_n[tile] += touch.most_n(sides);
-            if self.drift_n[tile] > least_n {
-                waking.push(tile);
+        let within = |sides: [Range<usize>; 2]| sides.map(|points| points.start / TILE..tiles(points.end));
+        let [old, new] = match touch.reached() {
+            reached if least_n > 0.0 => reached.map(within),
+            _ => [self.counts.map(|count| 0..count), [0..0, 0..0]],
+        };
+        let is_old = |row, column| old[0].contains(&row) && old[1].contains(&column);
+        for (which, [rows, columns]) in [&old, &new].into_iter().enumerate() {
+            for (row, column) in rows.clone().flat_map(|row| columns.clone().map(move |column| (row, column))) {
+                let tile = row * self.counts[1] + column;
+                if self.region.awake.has[tile] || which == 1 && is_old(row, column) {
+                    continue;
+                }
+                #[allow(clippy::cast_precision_loss)]
+                let sides = [self.rows(tile), self.columns(tile)]
+                    .map(|range| [range.start as f64 * spacing_m, (range.end - 1) as f64 * spacing_m]);
+                self.drift_n[tile] += touch.most_n(sides);
+                if self.drift_n[tile] > least_n {
+                    waking.push(tile);
+                }
             }
         }
         self.wake(waking);
@@ -359,42 +308,47 @@ impl<T: Real> Tiles<T> {
             }
             most
         };
-        let largest = self.awake.iter().map(|tile| most(u, *tile)).fold(self.largest * FORGET, f64::max);
+        let largest = self.region.tiles().iter().map(|tile| most(u, *tile)).fold(self.largest * FORGET, f64::max);
         let slow = slow(self.epsilon_of(largest));
-        let (calm, moving): (Vec<usize>, Vec<usize>) = self.awake.iter().partition(|tile| most(d, **tile) <= slow);
+        let (calm, moving): (Vec<usize>, Vec<usize>) =
+            self.region.tiles().iter().partition(|tile| most(d, **tile) <= slow);
         self.largest = largest;
         moving.into_iter().for_each(|tile| self.calm[tile] = 0);
         calm
     }
 
-    /// The region of some tiles.
-    pub(super) fn region_of(&self, which: impl Iterator<Item = usize>) -> Region {
-        let mut awake = vec![false; self.calm.len()];
-        which.for_each(|tile| awake[tile] = true);
-        Region::of(&self.layout, &awake, self.reach)
+    /// Makes `region`, of this sheet, that of some tiles.
+    pub(super) fn cover(&self, region: &mut Region, which: impl Iterator<Item = usize>) {
+        region.awake.clear();
+        which.for_each(|tile| _ = region.awake.add(tile));
+        region.cover(&self.layout, self.reach);
     }
 
-    /// Of one tile; `region` is one that this gave before, or a new one.
-    pub(super) fn region_of_one(&self, tile: usize, region: &mut Region) {
-        let Region { strips, awake, columns } = region;
-        awake.resize(self.calm.len(), false);
-        // At most one was awake.
-        if let Some(strip) = strips.pop() {
-            awake[self.of([strip.rows.end - 1, strip.columns.start])] = false;
+    /// A region of this sheet, of no tile.
+    pub(super) fn no_region(&self) -> Region {
+        Region::none(&self.layout)
+    }
+
+    /// The tiles that sleep and are not at 0, and what is known of their energies.
+    pub(super) fn sleeping(&self) -> impl Iterator<Item = (usize, Option<[f64; 2]>)> {
+        let asleep = self.moved.members.iter().filter(|tile| !self.region.awake.has[**tile]);
+        asleep.map(|tile| (*tile, self.elastic_j[*tile].get()))
+    }
+
+    /// Keeps the energies of a sleeping tile, if nothing can change them before it or one beside it is woken. (What a
+    /// multistep scheme shows of a displacement depends on the springs' force, and so on all tiles around.)
+    pub(super) fn keep_energies(&self, tile: usize, elastic_j: [f64; 2]) {
+        let mut beyond = (0..NEIGHBOURS.len()).filter_map(|side| self.neighbour(tile, side));
+        if !beyond.any(|other| self.region.awake.has[other]) {
+            self.elastic_j[tile].set(Some(elastic_j));
         }
-        awake[tile] = true;
-        *columns = self.counts[1];
-        let (rows, along) = (self.rows(tile), self.columns(tile));
-        let rows = rows.start.saturating_sub(self.reach)..rows.end;
-        strips.push(Strip { rows, columns: along.start..along.start + TILE, whole: false });
     }
 
     /// Puts tiles to sleep, with the energies that they have.
     pub(super) fn sleep(&mut self, which: &[(usize, f64)], u: &Field<T>) {
         self.remember();
-        let mut awake = std::mem::take(&mut self.region.awake);
         for &(tile, energy_j) in which {
-            awake[tile] = false;
+            self.region.awake.has[tile] = false;
             self.energy_j[tile] = energy_j;
             self.asleep_j += energy_j;
             self.drift_n[tile] = 0.0;
@@ -411,35 +365,46 @@ impl<T: Real> Tiles<T> {
                 }
             }
         }
-        self.set(&awake);
+        self.settle();
     }
 
-    /// The next copy is of everything.
+    /// The next copy is of everything that is not 0.
     pub(super) fn touch_all(&mut self) {
-        self.touched.fill(true);
+        self.moved.members.iter().for_each(|tile| _ = self.touched.add(*tile));
     }
 
     /// Copies what was awake since the last call from `from` to `to`.
     pub(super) fn copy_touched<'a>(&mut self, fields: impl Iterator<Item = (&'a mut Field<T>, &'a Field<T>)>) {
-        let all = self.touched.iter().all(|touched| *touched);
-        let touched: Vec<usize> = (0..self.touched.len()).filter(|tile| self.touched[*tile]).collect();
         for (to, from) in fields {
-            if all {
-                to.copy_from_slice(from);
-                continue;
-            }
-            for tile in &touched {
-                for c in 0..3 {
-                    for i in self.rows(*tile) {
-                        let columns = self.columns(*tile);
-                        let row = c * self.layout.plane + i * self.layout.stride;
-                        to[row + columns.start..row + columns.end]
-                            .copy_from_slice(&from[row + columns.start..row + columns.end]);
-                    }
+            self.copy(&self.touched, to, from);
+        }
+        self.touched.clear();
+        self.region.tiles().iter().for_each(|tile| _ = self.touched.add(*tile));
+    }
+
+    /// Copies what is not 0 to a field of zeros.
+    pub(super) fn copy_moved(&self, to: &mut Field<T>, from: &Field<T>) {
+        self.copy(&self.moved, to, from);
+    }
+
+    fn copy(&self, which: &Marks, to: &mut Field<T>, from: &Field<T>) {
+        if which.is_full() {
+            return to.copy_from_slice(from);
+        }
+        for tile in &which.members {
+            let columns = self.columns(*tile);
+            for c in 0..3 {
+                for i in self.rows(*tile) {
+                    let row = c * self.layout.plane + i * self.layout.stride;
+                    let place = row + columns.start..row + columns.end;
+                    to[place.clone()].copy_from_slice(&from[place]);
                 }
             }
         }
-        self.touched.fill(false);
-        self.awake.iter().for_each(|tile| self.touched[*tile] = true);
+    }
+
+    /// Whether a tile may be anything but 0.
+    pub(super) fn has_moved(&self, point: [usize; 2]) -> bool {
+        self.moved.has[self.of(point)]
     }
 }

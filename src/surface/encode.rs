@@ -6,7 +6,7 @@ use bytes::{Bytes, BytesMut};
 use glam::DVec3;
 
 use super::refine::{COMPONENTS, Points, Rows, Source, Written};
-use super::wide::{LANES, Lanes, Width, Work};
+use super::wide::{Available, LANES, Lanes, Width, Work};
 use super::{Refinement, Snapshot};
 
 /// How displacements are written.
@@ -165,7 +165,7 @@ where
     [u8; BYTES]: Written,
 {
     #[inline(always)]
-    fn work<L: Lanes>(self) {
+    fn work<L: Lanes>(self, with: Available<L>) {
         let Fill { patches, rows } = self;
         let [first_x, first_y] = patches.first().map_or([0, 0], |patch| patch.first);
         let mut parted = Vec::new();
@@ -175,13 +175,13 @@ where
                 let row_bytes = COMPONENTS * BYTES * patch.count[1];
                 let mut bytes = patch.buffer(rows_of_band * row_bytes);
                 for (a, row) in bytes.chunks_exact_mut(row_bytes).enumerate() {
-                    rows.write::<L, _>(x - first_x + a, row.as_chunks_mut::<BYTES>().0);
+                    rows.write(with, x - first_x + a, row.as_chunks_mut::<BYTES>().0);
                 }
                 patch.bytes = bytes.freeze();
             } else {
                 // One row, in parts.
                 parted.resize(COMPONENTS * band.iter().map(|patch| patch.count[1]).sum::<usize>(), [0; BYTES]);
-                rows.write::<L, _>(x - first_x, &mut parted);
+                rows.write(with, x - first_x, &mut parted);
                 for patch in band {
                     let part =
                         parted[COMPONENTS * (patch.first[1] - first_y)..][..COMPONENTS * patch.count[1]].as_flattened();
@@ -217,16 +217,16 @@ struct Range<'v> {
 
 impl Work for Range<'_> {
     #[inline(always)]
-    fn work<L: Lanes>(self) {
+    fn work<L: Lanes>(self, with: Available<L>) {
         // As many as hide the time of a comparison.
         const AT_ONCE: usize = 4;
-        let mut low = [L::splat(f32::INFINITY); AT_ONCE];
-        let mut high = [L::splat(f32::NEG_INFINITY); AT_ONCE];
+        let mut low = [with.splat(f32::INFINITY); AT_ONCE];
+        let mut high = [with.splat(f32::NEG_INFINITY); AT_ONCE];
         let (chunks, rest) = self.values.as_chunks::<{ AT_ONCE * LANES }>();
         for chunk in chunks {
             let (blocks, _) = chunk.as_chunks();
             for k in 0..AT_ONCE {
-                let values = L::load(&blocks[k]);
+                let values = with.load(&blocks[k]);
                 low[k] = values.smaller(low[k]);
                 high[k] = values.larger(high[k]);
             }

@@ -3,7 +3,7 @@
 // Iterators over vectors are not always inlined, and then run without the instructions of their caller.
 #![allow(clippy::needless_range_loop)]
 
-use super::wide::{LANES, Lanes};
+use super::wide::{Available, LANES, Lanes};
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result};
 
@@ -191,40 +191,40 @@ impl<'v> Rows<'v> {
     /// from 0.
     #[inline(always)]
     #[allow(clippy::cast_precision_loss)]
-    pub(super) fn write<L: Lanes, W: Written>(&mut self, a: usize, row: &mut [W]) {
+    pub(super) fn write<L: Lanes, W: Written>(&mut self, with: Available<L>, a: usize, row: &mut [W]) {
         let cells = self.cells;
         if cells == 1 {
-            return weave::<L, W>(&self.source, a, row);
+            return weave(with, &self.source, a, row);
         }
         let (i, k) = (a / cells, a % cells);
         match k {
             0 => {
                 if a == 0 {
-                    self.load::<L>(0);
+                    self.load(with, 0);
                 }
                 // A row of points has no row beyond it to be mixed with, and at the rim there is none.
                 std::mem::swap(&mut self.near, &mut self.far);
-                put::<L, W>(&self.near, row);
+                put(with, &self.near, row);
             }
             _ => {
                 if k == 1 {
-                    self.load::<L>(i + 1);
+                    self.load(with, i + 1);
                 }
-                mix::<L, W>(&self.near, &self.far, k as f32 / cells as f32, row);
+                mix(with, &self.near, &self.far, k as f32 / cells as f32, row);
             }
         }
     }
 
     /// Brings row `i` of the points into `far`.
     #[inline(always)]
-    fn load<L: Lanes>(&mut self, i: usize) {
-        weave::<L, f32>(&self.source, i, &mut self.points[..COMPONENTS * self.source.points.count[1]]);
+    fn load<L: Lanes>(&mut self, with: Available<L>, i: usize) {
+        weave(with, &self.source, i, &mut self.points[..COMPONENTS * self.source.points.count[1]]);
         for (period, row) in self.far.chunks_exact_mut(self.spread.len()).enumerate() {
             let points = &self.points[period * COMPONENTS * LANES..];
             for (spread, vertices) in self.spread.iter().zip(row) {
-                let points = L::load(&points[spread.begin..].as_chunks().0[0]);
+                let points = with.load(&points[spread.begin..].as_chunks().0[0]);
                 let (left, right) = (points.permute(&spread.left.0), points.permute(&spread.right.0));
-                between(left, right, L::load(&spread.part.0)).store(&mut vertices.0);
+                between(left, right, with.load(&spread.part.0)).store(&mut vertices.0);
             }
         }
     }
@@ -247,7 +247,7 @@ impl Spread {
 
 /// The points of row `i` in quanta, one after the other, as many as `row` has room for.
 #[inline(always)]
-fn weave<L: Lanes, W: Written>(source: &Source<'_>, i: usize, row: &mut [W]) {
+fn weave<L: Lanes, W: Written>(with: Available<L>, source: &Source<'_>, i: usize, row: &mut [W]) {
     let row = row.as_chunks_mut::<COMPONENTS>().0;
     let (count, points) = (row.len(), &source.points);
     let values = [&points.row(0, i)[..count], &points.row(1, i)[..count], &points.row(2, i)[..count]];
@@ -257,7 +257,7 @@ fn weave<L: Lanes, W: Written>(source: &Source<'_>, i: usize, row: &mut [W]) {
             padded[c][..count].copy_from_slice(values[c]);
         }
         let mut block = [[W::default(); COMPONENTS]; LANES];
-        source.weave::<L, W>([&padded[0], &padded[1], &padded[2]], &mut block);
+        source.weave(with, [&padded[0], &padded[1], &padded[2]], &mut block);
         return row.copy_from_slice(&block[..count]);
     }
     let blocks = row.as_chunks_mut::<LANES>().0;
@@ -265,22 +265,27 @@ fn weave<L: Lanes, W: Written>(source: &Source<'_>, i: usize, row: &mut [W]) {
     let y = &values[1].as_chunks::<LANES>().0[..blocks.len()];
     let z = &values[2].as_chunks::<LANES>().0[..blocks.len()];
     for block in 0..blocks.len() {
-        source.weave::<L, W>([&x[block], &y[block], &z[block]], &mut blocks[block]);
+        source.weave(with, [&x[block], &y[block], &z[block]], &mut blocks[block]);
     }
     // The last block overlaps the one before.
     let last = (values[0].last_chunk(), values[1].last_chunk(), values[2].last_chunk(), row.last_chunk_mut());
     if let (Some(x), Some(y), Some(z), Some(block)) = last {
-        source.weave::<L, W>([x, y, z], block);
+        source.weave(with, [x, y, z], block);
     }
 }
 
 impl Source<'_> {
     /// x, y and z of a block, in quanta.
     #[inline(always)]
-    fn weave<L: Lanes, W: Written>(&self, xyz: [&[f32; LANES]; COMPONENTS], to: &mut [[W; COMPONENTS]; LANES]) {
-        let mut quanta = [L::splat(0.0); COMPONENTS];
+    fn weave<L: Lanes, W: Written>(
+        &self,
+        with: Available<L>,
+        xyz: [&[f32; LANES]; COMPONENTS],
+        to: &mut [[W; COMPONENTS]; LANES],
+    ) {
+        let mut quanta = [with.splat(0.0); COMPONENTS];
         for c in 0..COMPONENTS {
-            quanta[c] = L::load(xyz[c]).sub(L::load(&self.origin[c].0)).mul(L::load(&self.per_scale[c].0));
+            quanta[c] = with.load(xyz[c]).sub(with.load(&self.origin[c].0)).mul(with.load(&self.per_scale[c].0));
         }
         if let Some(to) = to.as_flattened_mut().as_chunks_mut().0.first_chunk_mut() {
             W::weave(quanta, to);
@@ -296,28 +301,28 @@ fn between<L: Lanes>(near: L, far: L, part: L) -> L {
 
 /// Writes a row as it is.
 #[inline(always)]
-fn put<L: Lanes, W: Written>(values: &[Block<f32>], row: &mut [W]) {
+fn put<L: Lanes, W: Written>(with: Available<L>, values: &[Block<f32>], row: &mut [W]) {
     let (blocks, rest) = row.as_chunks_mut();
     for (block, values) in blocks.iter_mut().zip(values) {
-        W::write(L::load(&values.0), block);
+        W::write(with.load(&values.0), block);
     }
     if !rest.is_empty() {
         let mut block = [W::default(); LANES];
-        W::write(L::load(&values[blocks.len()].0), &mut block);
+        W::write(with.load(&values[blocks.len()].0), &mut block);
         rest.copy_from_slice(&block[..rest.len()]);
     }
 }
 
 /// Writes a row that is `part` of the way from `near` to `far`.
 #[inline(always)]
-fn mix<L: Lanes, W: Written>(near: &[Block<f32>], far: &[Block<f32>], part: f32, row: &mut [W]) {
-    let part = L::splat(part);
+fn mix<L: Lanes, W: Written>(with: Available<L>, near: &[Block<f32>], far: &[Block<f32>], part: f32, row: &mut [W]) {
+    let part = with.splat(part);
     let (blocks, rest) = row.as_chunks_mut();
     for ((block, near), far) in blocks.iter_mut().zip(near).zip(far) {
-        W::write(between(L::load(&near.0), L::load(&far.0), part), block);
+        W::write(between(with.load(&near.0), with.load(&far.0), part), block);
     }
     if !rest.is_empty() {
-        let (near, far) = (L::load(&near[blocks.len()].0), L::load(&far[blocks.len()].0));
+        let (near, far) = (with.load(&near[blocks.len()].0), with.load(&far[blocks.len()].0));
         let mut block = [W::default(); LANES];
         W::write(between(near, far, part), &mut block);
         rest.copy_from_slice(&block[..rest.len()]);
@@ -326,7 +331,6 @@ fn mix<L: Lanes, W: Written>(near: &[Block<f32>], far: &[Block<f32>], part: f32,
 
 #[cfg(test)]
 mod tests {
-    use super::super::wide::Plain;
     use super::*;
 
     /// All rows of one component.
@@ -336,7 +340,7 @@ mod tests {
         let mut rows = Rows::new(grid.between, y, Source::new(points, [0.0; COMPONENTS], [1.0; COMPONENTS]));
         let row = |a| {
             let mut row = vec![[0; 4]; COMPONENTS * y];
-            rows.write::<Plain, _>(a, &mut row);
+            rows.write(Available::PLAIN, a, &mut row);
             row.chunks(COMPONENTS).map(|vertex| f32::from_le_bytes(vertex[1])).collect()
         };
         (0..x).map(row).collect()

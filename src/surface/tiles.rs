@@ -12,7 +12,7 @@ use std::sync::Arc;
 
 use super::encode::{Frame, Patch, Quanta, fill, lay_out};
 use super::refine::{COMPONENTS, Points, Rows};
-use super::wide::{LANES, Lanes, Width, Work};
+use super::wide::{Available, LANES, Lanes, Width, Work};
 use super::{Encoding, Refinement, Snapshot};
 
 /// Points along a side of a tile.
@@ -255,15 +255,15 @@ struct Compare<'v> {
 
 impl Work for Compare<'_> {
     #[inline(always)]
-    fn work<L: Lanes>(self) {
+    fn work<L: Lanes>(self, with: Available<L>) {
         let Compare { now, shown, unseen_m, moved } = self;
         for c in 0..COMPONENTS {
-            let (mut low, mut high) = (L::splat(0.0), L::splat(0.0));
+            let (mut low, mut high) = (with.splat(0.0), with.splat(0.0));
             for i in 0..now.count[0] {
                 let (now, shown) = (now.row(c, i), shown.row(c, i));
                 let (now_blocks, shown_blocks) = (now.as_chunks().0, shown.as_chunks().0);
                 for block in 0..now_blocks.len() {
-                    let by = L::load(&now_blocks[block]).sub(L::load(&shown_blocks[block]));
+                    let by = with.load(&now_blocks[block]).sub(with.load(&shown_blocks[block]));
                     low = by.smaller(low);
                     high = by.larger(high);
                 }

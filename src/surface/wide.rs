@@ -7,14 +7,21 @@
 #![allow(unsafe_code)]
 #![allow(clippy::needless_range_loop)]
 
+use std::marker::PhantomData;
+
 /// How many.
 pub(super) const LANES: usize = 16;
 
-/// That many numbers. A value is only made within [`Width::run`], where the processor has the instructions.
+/// That many numbers. A value is the proof that the processor has the instructions: the first are made by unsafe
+/// functions, through an [`Available`], all others out of values.
 pub(super) trait Lanes: Copy {
-    fn load(from: &[f32; LANES]) -> Self;
+    /// # Safety
+    /// The processor has the instructions.
+    unsafe fn load(from: &[f32; LANES]) -> Self;
+    /// # Safety
+    /// The processor has the instructions.
+    unsafe fn splat(value: f32) -> Self;
     fn store(self, to: &mut [f32; LANES]);
-    fn splat(value: f32) -> Self;
     fn add(self, other: Self) -> Self;
     fn sub(self, other: Self) -> Self;
     fn mul(self, other: Self) -> Self;
@@ -32,10 +39,49 @@ pub(super) trait Lanes: Copy {
     fn store_rounded(self, to: &mut [[u8; 2]; LANES]);
 }
 
+/// The processor has the instructions of `L`. Only this file makes one.
+pub(super) struct Available<L>(PhantomData<L>);
+
+impl<L> Clone for Available<L> {
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+
+impl<L> Copy for Available<L> {}
+
+impl Available<Plain> {
+    /// Every processor has what is plain.
+    pub(super) const PLAIN: Self = Available(PhantomData);
+}
+
+impl<L: Lanes> Available<L> {
+    /// # Safety
+    /// The processor has the instructions.
+    #[cfg(target_arch = "x86_64")]
+    unsafe fn new() -> Self {
+        Available(PhantomData)
+    }
+
+    /// Sixteen numbers.
+    #[inline(always)]
+    pub(super) fn load(self, from: &[f32; LANES]) -> L {
+        // SAFETY: whoever made this promised the instructions.
+        unsafe { L::load(from) }
+    }
+
+    /// `value` in every lane.
+    #[inline(always)]
+    pub(super) fn splat(self, value: f32) -> L {
+        // SAFETY: the same.
+        unsafe { L::splat(value) }
+    }
+}
+
 /// Something to be done at any width.
 pub(super) trait Work {
     /// Does it; `#[inline(always)]`.
-    fn work<L: Lanes>(self);
+    fn work<L: Lanes>(self, with: Available<L>);
 }
 
 /// The instructions to be used.
@@ -77,7 +123,7 @@ impl Width {
             // SAFETY: the same.
             #[cfg(target_arch = "x86_64")]
             Width::Avx2 if self.is_available() => unsafe { x86::with_avx2(work) },
-            _ => work.work::<Plain>(),
+            _ => work.work(Available::PLAIN),
         }
     }
 }
@@ -98,7 +144,7 @@ macro_rules! each {
 
 impl Lanes for Plain {
     #[inline(always)]
-    fn load(from: &[f32; LANES]) -> Self {
+    unsafe fn load(from: &[f32; LANES]) -> Self {
         Plain(*from)
     }
     #[inline(always)]
@@ -106,7 +152,7 @@ impl Lanes for Plain {
         *to = self.0;
     }
     #[inline(always)]
-    fn splat(value: f32) -> Self {
+    unsafe fn splat(value: f32) -> Self {
         Plain([value; LANES])
     }
     #[inline(always)]
@@ -163,20 +209,22 @@ impl Lanes for Plain {
 mod x86 {
     use std::arch::x86_64::*;
 
-    use super::{LANES, Lanes, Work};
+    use super::{Available, LANES, Lanes, Work};
 
     /// # Safety
     /// The processor has these instructions.
     #[target_feature(enable = "avx512f,avx512bw")]
     pub(super) unsafe fn with_avx512(work: impl Work) {
-        work.work::<Wide>();
+        // SAFETY: the caller's promise.
+        work.work(unsafe { Available::<Wide>::new() });
     }
 
     /// # Safety
     /// The processor has these instructions.
     #[target_feature(enable = "avx2")]
     pub(super) unsafe fn with_avx2(work: impl Work) {
-        work.work::<Narrow>();
+        // SAFETY: the caller's promise.
+        work.work(unsafe { Available::<Narrow>::new() });
     }
 
     /// Where the `lanes` lanes of component `c` come from when three vectors are woven. In each of the three results the
@@ -195,11 +243,11 @@ mod x86 {
     #[derive(Clone, Copy)]
     struct Wide(__m512);
 
-    // SAFETY (of every block below): a value of these types is only made by `Width::run`, for which the processor has
+    // SAFETY (of every block below): a value of these types, or the caller's promise, is the proof that the processor has
     // the instructions; memory is an array of as many numbers.
     impl Lanes for Wide {
         #[inline(always)]
-        fn load(from: &[f32; LANES]) -> Self {
+        unsafe fn load(from: &[f32; LANES]) -> Self {
             unsafe { Wide(_mm512_loadu_ps(from.as_ptr())) }
         }
         #[inline(always)]
@@ -207,7 +255,7 @@ mod x86 {
             unsafe { _mm512_storeu_ps(to.as_mut_ptr(), self.0) }
         }
         #[inline(always)]
-        fn splat(value: f32) -> Self {
+        unsafe fn splat(value: f32) -> Self {
             unsafe { Wide(_mm512_set1_ps(value)) }
         }
         #[inline(always)]
@@ -347,7 +395,7 @@ mod x86 {
 
     impl Lanes for Narrow {
         #[inline(always)]
-        fn load(from: &[f32; LANES]) -> Self {
+        unsafe fn load(from: &[f32; LANES]) -> Self {
             unsafe { Narrow([_mm256_loadu_ps(from.as_ptr()), _mm256_loadu_ps(from.as_ptr().add(8))]) }
         }
         #[inline(always)]
@@ -358,7 +406,7 @@ mod x86 {
             }
         }
         #[inline(always)]
-        fn splat(value: f32) -> Self {
+        unsafe fn splat(value: f32) -> Self {
             unsafe { Narrow([_mm256_set1_ps(value); 2]) }
         }
         #[inline(always)]

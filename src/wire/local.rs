@@ -139,6 +139,7 @@ pub fn sample_bytes(model: &LocalModel) -> u64 {
         acknowledged_sequence: model.sequence,
         client_time_ns: 1,
         server_hold_ns: 1 << 20,
+        step_wait_ns: 1 << 19,
         point: Some(super::point([15, 15])),
         displacement_m: vector(model.surface_m),
         velocity_m_per_s: vector(model.velocity_m_per_s),

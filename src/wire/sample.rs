@@ -7,10 +7,11 @@ use crate::pace::frames::Delivery;
 use crate::pace::{Live, PacedRecord, PacedSample, State};
 use crate::refusal::{Reason, Refusal, Result};
 use crate::scene::Named;
-use crate::scene::record::{EnergyJ, Point, Record};
+use crate::scene::record::{AuditedError, EnergyJ, Point, Record};
 use crate::session::ToolSample;
 use crate::session::sampling::{Deadband, HEARTBEAT_S, Sampling};
 use crate::sheet::Model;
+use crate::sheet::audit::Origin;
 use crate::surface::Encoding;
 use crate::surface::encode::Patch;
 
@@ -37,6 +38,7 @@ pub fn sampling(
         }),
         heartbeat_s: heartbeat_s.unwrap_or(HEARTBEAT_S),
         law: None,
+        touch_stiffness: false,
     };
     sampling.check()?;
     Ok(sampling)
@@ -58,17 +60,19 @@ pub fn sample(paced: &PacedSample, dropped: u64, now_ns: u64) -> pb::Sample {
         held: sample.held,
         late_commands: sample.late_commands,
         dropped_samples: dropped,
-        tools: sample.tools.iter().map(|tool| tool_sample(tool, now_ns)).collect(),
+        tools: sample.tools.iter().map(|tool| tool_sample(tool, paced.due_ns, now_ns)).collect(),
     }
 }
 
-fn tool_sample(tool: &ToolSample, now_ns: u64) -> pb::ToolSample {
+fn tool_sample(tool: &ToolSample, due_ns: u64, now_ns: u64) -> pb::ToolSample {
     let contact = tool.contact.as_ref();
+    let since_arrival_ns = |at_ns: u64| if tool.arrival_ns == 0 { 0 } else { at_ns.saturating_sub(tool.arrival_ns) };
     pb::ToolSample {
         tool: tool.tool,
         acknowledged_sequence: tool.acknowledged_sequence,
         client_time_ns: tool.client_time_ns,
-        server_hold_ns: if tool.arrival_ns == 0 { 0 } else { now_ns.saturating_sub(tool.arrival_ns) },
+        server_hold_ns: since_arrival_ns(now_ns),
+        step_wait_ns: since_arrival_ns(due_ns),
         point: contact.map(|contact| point(contact.point)),
         displacement_m: contact.and_then(|contact| vector(contact.displacement_m)),
         velocity_m_per_s: contact.and_then(|contact| vector(contact.velocity_m_per_s)),
@@ -209,9 +213,35 @@ pub fn session(live: &Arc<Live>) -> pb::Session {
         streams: count(live.streams()),
         scene_name: model.scene.name.clone(),
         points: count(model.len()),
+        audit: audit(live),
         ..Default::default()
     };
     with_model(session, model)
+}
+
+/// What audits have found, if there was one.
+fn audit(live: &Live) -> Option<pb::Audit> {
+    let audited = live.audited();
+    let (step, newest) = audited.newest?;
+    let error = |error: AuditedError| Some(pb::AuditedError { displacement: error.displacement, force: error.force });
+    Some(pb::Audit {
+        windows: audited.windows,
+        step,
+        newest_error: error(newest),
+        largest_error: error(audited.largest),
+        windows_above_tolerance: audited.above,
+        reason: audited.origin.map(Origin::describe).unwrap_or_default().to_owned(),
+        corrections: audited.corrections,
+        newest_correction: audited.correction.map(|correction| pb::Correction {
+            step: correction.step,
+            audited_error: error(correction.audited_error),
+            reason: correction.reason,
+            integrator: correction.integrator.name().to_owned(),
+            substeps: correction.substeps,
+            precision: correction.precision.name().to_owned(),
+            sleep_tolerance: correction.sleep_tolerance,
+        }),
+    })
 }
 
 /// A session, with what is known of the tissue from `model`.

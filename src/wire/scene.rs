@@ -61,6 +61,7 @@ fn from_stepping(message: &pb::Stepping) -> Result<Stepping> {
         precision: Precision::named("stepping.precision", &or_auto(&message.precision))?,
         // A matter of the server's machine.
         lanes: Lanes::Auto,
+        correct: message.correct,
     })
 }
 
@@ -119,6 +120,7 @@ pub fn scene(scene: &Scene) -> pb::Scene {
             integrator: scene.stepping.integrator.name().to_owned(),
             substeps: scene.stepping.substeps,
             precision: scene.stepping.precision.name().to_owned(),
+            correct: scene.stepping.correct,
         }),
         sleep: scene.sleep_tolerance.map(|tolerance| pb::Sleep { tolerance: Some(tolerance) }),
     }

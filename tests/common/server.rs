@@ -38,6 +38,14 @@ pub fn client_program() -> PathBuf {
             // All programs, as `make build` does: a part of them might want other features of what both use, and so all
             // of that once more.
             build.args(["build", "--quiet", "--workspace", "--bins"]).current_dir(env!("CARGO_MANIFEST_DIR"));
+            // What cargo tells a test of its package is news to build scripts: libraries would be built once more.
+            let of_package = |key: &str| {
+                let starts = ["CARGO_MANIFEST_", "CARGO_PKG_", "CARGO_BIN_"].iter().any(|start| key.starts_with(start));
+                starts || key == "CARGO_CRATE_NAME" || key == "CARGO_PRIMARY_PACKAGE"
+            };
+            for (key, _) in std::env::vars().filter(|(key, _)| of_package(key)) {
+                build.env_remove(key);
+            }
             if !cfg!(debug_assertions) {
                 build.arg("--release");
             }
@@ -132,6 +140,40 @@ impl Server {
     pub async fn status(&self, session_id: &str) -> pb::Session {
         let request = pb::GetSessionRequest { session_id: session_id.into() };
         self.sessions().await.get_session(request).await.unwrap().into_inner().session.unwrap()
+    }
+
+    /// Waits until `more` commands have acted in the sessions of a scene, all together, since it was asked; tells whose
+    /// sessions they are.
+    pub async fn until_applied(&self, scene_name: &str, more: u64) -> Vec<pb::Session> {
+        let mut sessions = self.sessions().await;
+        let waited = tokio::time::timeout(PATIENCE, async {
+            let mut before = None;
+            loop {
+                let listed = sessions.list_sessions(pb::ListSessionsRequest {}).await.unwrap().into_inner().sessions;
+                let ours: Vec<_> = listed.into_iter().filter(|session| session.scene_name == scene_name).collect();
+                let applied: u64 = ours.iter().map(|session| session.commands.unwrap().applied).sum();
+                if applied >= *before.get_or_insert(applied) + more {
+                    return ours;
+                }
+                tokio::time::sleep(Duration::from_millis(10)).await;
+            }
+        });
+        waited.await.unwrap_or_else(|_| panic!("{more} commands to {scene_name} do not come"))
+    }
+
+    /// Waits until nobody holds a tool of any session.
+    pub async fn until_let_go(&self) {
+        let mut sessions = self.sessions().await;
+        let waited = tokio::time::timeout(PATIENCE, async {
+            loop {
+                let listed = sessions.list_sessions(pb::ListSessionsRequest {}).await.unwrap().into_inner().sessions;
+                if listed.iter().all(|session| session.held_tools.is_empty()) {
+                    return;
+                }
+                tokio::time::sleep(Duration::from_millis(10)).await;
+            }
+        });
+        waited.await.expect("a tool is held by nobody");
     }
 
     /// What it logged; ends it.

@@ -14,6 +14,8 @@
 //! `read` and `write` are called once a tick and must not wait for longer than a part of one. An error of either ends the
 //! loop after the force has been set to zero.
 
+use std::time::Instant;
+
 use glam::DVec3;
 use palpate::haptics::Device;
 use palpate::haptics::hand::{Hand, Held};
@@ -39,25 +41,81 @@ pub(crate) trait HapticDevice: Send {
     fn write(&mut self, force_n: DVec3) -> std::io::Result<()>;
 }
 
-/// A device in a simulated hand, which goes on by a tick with each force that is written.
+/// What a simulated hand did in one part of its course.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Part {
+    /// When it ended, from the beginning, s.
+    pub(crate) time_s: f64,
+    /// Where the hand was then, m.
+    pub(crate) place_m: DVec3,
+    /// What the device held meanwhile, N.
+    pub(crate) force_n: DVec3,
+}
+
+/// A device in a simulated hand. The hand goes on by the time that passes, whoever is late: until the next force is
+/// written, the device holds the last one, as real ones do.
 pub(crate) struct Simulated {
     device: Device,
     hand: Hand,
     held: Held,
     task: Task,
-    tick: u32,
-    tick_s: f64,
+    force_n: DVec3,
+    begun: Option<Instant>,
+    time_s: f64,
+    energy_j: f64,
+    energy_min_j: f64,
+    /// Its parts, if they are remembered.
+    course: Option<Vec<Part>>,
 }
 
+/// Longest part of a simulated hand's course, s.
+const PART_S: f64 = 1e-3;
+
 impl Simulated {
-    pub(crate) fn new(device: Device, hand: Hand, task: Task, tick_s: f64) -> Self {
+    pub(crate) fn new(device: Device, hand: Hand, task: Task, remember: bool) -> Self {
         let held = Held { place_m: task.start_m(), velocity_m_per_s: DVec3::ZERO };
-        Simulated { device, hand, held, task, tick: 0, tick_s }
+        let (force_n, course) = (DVec3::ZERO, remember.then(Vec::new));
+        let (begun, time_s, energy_j, energy_min_j) = (None, 0.0, 0.0, 0.0);
+        Simulated { device, hand, held, task, force_n, begun, time_s, energy_j, energy_min_j, course }
+    }
+
+    /// What it did so far, if that is remembered.
+    pub(crate) fn course(&self) -> &[Part] {
+        self.course.as_deref().unwrap_or_default()
+    }
+
+    /// The least that the port had received, J, each force counted for as long as the device held it.
+    pub(crate) fn energy_min_j(&self) -> f64 {
+        self.energy_min_j
+    }
+
+    /// Time goes on under the force that is held.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn advance_to(&mut self, time_s: f64) {
+        let passed_s = time_s - self.time_s;
+        let parts = (passed_s / PART_S).ceil().max(0.0) as u32;
+        for _ in 0..parts {
+            let part_s = passed_s / f64::from(parts);
+            let (from_m, to_m) = (self.task.at(self.time_s), self.task.at(self.time_s + part_s));
+            let string_n = self.hand.string_n(from_m, self.held.place_m);
+            let before_m = self.held.place_m;
+            self.held = self.hand.advance(self.held, from_m, to_m, self.force_n + string_n, part_s);
+            self.time_s += part_s;
+            self.energy_j -= self.force_n.dot(self.held.place_m - before_m);
+            self.energy_min_j = self.energy_min_j.min(self.energy_j);
+            if let Some(course) = &mut self.course {
+                course.push(Part { time_s: self.time_s, place_m: self.held.place_m, force_n: self.force_n });
+            }
+        }
+    }
+
+    fn now_s(&mut self) -> f64 {
+        self.begun.get_or_insert_with(Instant::now).elapsed().as_secs_f64()
     }
 }
 
-/// The owner of a simulated hand asks for forces so often, ticks: it may be refused, or taken from it.
-const ASKS_EVERY: u32 = 300;
+/// The owner of a simulated hand asks for forces so often, s: it may be refused, or taken from it.
+const ASKS_EVERY_S: f64 = 0.3;
 
 impl HapticDevice for Simulated {
     fn descriptor(&self) -> Device {
@@ -65,14 +123,64 @@ impl HapticDevice for Simulated {
     }
 
     fn read(&mut self) -> std::io::Result<Reading> {
-        Ok(Reading { place_m: self.held.place_m, enable: self.tick % ASKS_EVERY < ASKS_EVERY / 2 })
+        let now_s = self.now_s();
+        self.advance_to(now_s);
+        Ok(Reading { place_m: self.held.place_m, enable: now_s % ASKS_EVERY_S < ASKS_EVERY_S / 2.0 })
     }
 
     fn write(&mut self, force_n: DVec3) -> std::io::Result<()> {
-        let at = |tick: u32| self.task.at(f64::from(tick) * self.tick_s);
-        let string_n = self.hand.string_n(at(self.tick), self.held.place_m);
-        self.held = self.hand.advance(self.held, at(self.tick), at(self.tick + 1), force_n + string_n, self.tick_s);
-        self.tick += 1;
+        let now_s = self.now_s();
+        self.advance_to(now_s);
+        self.force_n = force_n;
         Ok(())
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+    use crate::link::Dice;
+
+    fn simulated(remember: bool) -> Simulated {
+        let task = Task::new(DVec3::ZERO, 0.0, 2.0, 1.0, &mut Dice::new(1, 0));
+        Simulated::new(Device::named("omega3").unwrap(), Hand::named("medium").unwrap(), task, remember)
+    }
+
+    #[test]
+    fn a_hand_goes_on_by_time_and_not_by_ticks() {
+        // The same force, held: it does not matter how often anybody looked.
+        let force_n = DVec3::new(0.0, 0.0, 0.5);
+        let after = |looks: u32| {
+            let mut simulated = simulated(false);
+            simulated.force_n = force_n;
+            (1..=looks).for_each(|look| simulated.advance_to(0.25 * f64::from(look) / f64::from(looks)));
+            (simulated.held.place_m, simulated.energy_j)
+        };
+        let (often, once) = (after(250), after(1));
+        // Within what the parts differ in: the target of each is taken at its middle.
+        assert!((often.0 - once.0).length() < 1e-7, "{often:?} {once:?}");
+        assert!((often.1 - once.1).abs() < 1e-7, "{often:?} {once:?}");
+        assert!(often.0.z < simulated(false).held.place_m.z - 1e-3, "{often:?}: it did not go on");
+    }
+
+    #[test]
+    fn the_energy_is_that_of_the_force_that_was_held() {
+        let mut simulated = simulated(true);
+        simulated.force_n = DVec3::new(0.0, 0.0, 1.0);
+        simulated.advance_to(0.05);
+        simulated.force_n = DVec3::new(0.3, 0.0, -0.5);
+        // A stall of a tenth of a second.
+        simulated.advance_to(0.15);
+        let mut before_m = simulated.task.start_m();
+        let (mut energy_j, mut least_j) = (0.0, 0.0_f64);
+        for part in simulated.course() {
+            energy_j -= part.force_n.dot(part.place_m - before_m);
+            before_m = part.place_m;
+            least_j = least_j.min(energy_j);
+        }
+        assert!(simulated.course().len() >= 150 && energy_j != 0.0);
+        assert!((simulated.energy_j - energy_j).abs() < 1e-15 && (simulated.energy_min_j() - least_j).abs() < 1e-15);
+        assert!(simulated.course().iter().all(|part| part.force_n.x == if part.time_s < 0.0501 { 0.0 } else { 0.3 }));
     }
 }

@@ -88,12 +88,12 @@ pub(crate) struct Served {
     pub(crate) ages_s: Vec<f64>,
 }
 
-/// Runs a device against a server until `ticks` are done. The device's frame is the sheet's. `remember`: keeps its course.
+/// Runs a device against a server for so long. The device's frame is the sheet's. `remember`: keeps its course.
 pub(crate) fn serve(
     device: &mut dyn HapticDevice,
     shared: &Shared,
     commands: &mpsc::Sender<line::Command>,
-    ticks: Option<u32>,
+    lasts: Option<Duration>,
     remember: bool,
 ) -> std::io::Result<Served> {
     let descriptor = device.descriptor();
@@ -102,8 +102,8 @@ pub(crate) fn serve(
     let (start, mut asked) = (Instant::now(), false);
     // A clock that does not begin at 0: 0 means no time.
     let clock_s = |at: Instant| 1.0 + at.duration_since(start).as_secs_f64();
-    let (mut tick, mut due) = (0_u32, start);
-    while ticks.is_none_or(|ticks| tick < ticks) && !commands.is_closed() {
+    let mut due = start;
+    while lasts.is_none_or(|lasts| due < start + lasts) && !commands.is_closed() {
         wait_until(due);
         let now = Instant::now();
         let late = now.duration_since(due);
@@ -152,7 +152,6 @@ pub(crate) fn serve(
         }
         // A network that does not keep up gets the next one.
         let _ = commands.try_send((now_ns, reading.place_m));
-        tick += 1;
     }
     let _ = device.write(DVec3::ZERO);
     served.envelope = renderer.map(|renderer| renderer.envelope);
@@ -180,7 +179,7 @@ pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
     let seconds = arguments.seconds.unwrap_or(3600.0);
     let middle_m = (scene.sheet.extent_m() / 2.0).extend(0.0);
     let task = link::Task::new(middle_m, link::LEAD_S, seconds, 0.2, &mut link::Dice::new(arguments.seed, 0));
-    let mut simulated = Simulated::new(device, hand, task, TICK_S);
+    let mut simulated = Simulated::new(device, hand, task, false);
     let target = Target {
         server: Server::new(&arguments.server, &arguments.credentials)?,
         session: arguments.session.clone(),
@@ -190,9 +189,9 @@ pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
         tip: Tip::default(),
         deadband: arguments.deadband,
     };
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    let ticks = arguments.seconds.map(|seconds| (seconds / TICK_S) as u32);
-    let (served, shared) = run(&mut simulated, target, ticks, arguments.course.is_some()).await?;
+    let lasts = arguments.seconds.map(Duration::try_from_secs_f64).transpose();
+    let lasts = lasts.map_err(|error| Failure::Refused(format!("--seconds: {error}")))?;
+    let (served, shared) = run(&mut simulated, target, lasts, arguments.course.is_some()).await?;
     if let Some(path) = &arguments.course {
         write_course(path, &served.course)?;
     }
@@ -221,11 +220,11 @@ fn write_course(path: &std::path::Path, course: &[Tick]) -> Result<(), Failure> 
     std::fs::write(path, text).map_err(|error| Failure::Failed(format!("{}: {error}", path.display())))
 }
 
-/// A device's loop on a thread of its own, and the network beside it; until the ticks are done, or Ctrl-C.
+/// A device's loop on a thread of its own, and the network beside it; for so long, or until Ctrl-C.
 pub(crate) async fn run(
     device: &mut dyn HapticDevice,
     target: Target,
-    ticks: Option<u32>,
+    lasts: Option<Duration>,
     remember: bool,
 ) -> Result<(Served, Arc<Shared>), Failure> {
     let shared = Arc::new(Shared::default());
@@ -243,7 +242,7 @@ pub(crate) async fn run(
     });
     let served = std::thread::scope(|scope| {
         let worker = scope.spawn(|| {
-            let served = serve(device, &shared, &commands, ticks, remember);
+            let served = serve(device, &shared, &commands, lasts, remember);
             drop(commands);
             served
         });

@@ -1,17 +1,19 @@
 //! A run in real time, over a real connection to a real server: to show that virtual time tells the truth. The simulated
-//! hand, its task and the twin are those of `run`; the twin follows the tool's course when that is over.
+//! hand, its task and the twin are those of `run`; the twin follows the tool's course when that is over, step by step of
+//! the time that has passed, whether the client was late or not.
 
-use glam::DVec3;
+use std::time::Duration;
+
 use palpate::haptics::Reason;
 
 use super::network::Dice;
-use super::run::{Account, Found, Setup, TICK_S};
-use super::task::{self, Task};
+use super::run::{Account, Found, Setup, TICK_S, fitting_scale};
+use super::task::Task;
 use super::tissue::{Tissue, Twin};
 use crate::Failure;
-use crate::bridge::device::Simulated;
+use crate::bridge;
+use crate::bridge::device::{Part, Simulated};
 use crate::bridge::line::Target;
-use crate::bridge::{self, Tick};
 use crate::connect::Server;
 
 /// Before the first press, s: the server computes its force law first.
@@ -21,9 +23,9 @@ const LEAD_S: f64 = 3.0;
 pub(super) async fn run(setup: &Setup, server: Server) -> Result<Found, Failure> {
     let Setup { model, law, tip, hand, device, deadband, duration_s, seed, .. } = setup;
     let middle_m = (model.scene.sheet.extent_m() / 2.0).extend(0.0);
-    let scale = task::scale(hand, law, device.most_n());
+    let scale = fitting_scale(setup, LEAD_S).map_err(Failure::Failed)?;
     let task = Task::new(middle_m, LEAD_S, *duration_s, scale, &mut Dice::new(*seed, 0));
-    let mut simulated = Simulated::new(*device, *hand, task, TICK_S);
+    let mut simulated = Simulated::new(*device, *hand, task, true);
     let target = Target {
         server,
         session: None,
@@ -33,21 +35,21 @@ pub(super) async fn run(setup: &Setup, server: Server) -> Result<Found, Failure>
         tip: *tip,
         deadband: *deadband,
     };
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    let ticks = (duration_s / TICK_S).round() as u32;
-    let (mut served, shared) = bridge::run(&mut simulated, target, Some(ticks), true).await?;
+    let lasts = Duration::from_secs_f64(*duration_s);
+    let (mut served, shared) = bridge::run(&mut simulated, target, Some(lasts), true).await?;
     let mut twin = Twin::new(Tissue::new(model, *tip, law.clone()));
     let mut account = Account::default();
-    for (tick, Tick { place_m, force_n, .. }) in served.course.iter().enumerate() {
-        let (true_n, touches) = twin.truth(*place_m).map_err(Failure::Failed)?;
-        account.moved(*place_m);
+    for (step, part) in steps(simulated.course()).enumerate() {
+        let (true_n, touches) = twin.truth(part.place_m).map_err(Failure::Failed)?;
+        account.moved(part.place_m);
         #[allow(clippy::cast_precision_loss)]
-        account.rendered(tick as f64 * TICK_S, *force_n, true_n, touches, None);
+        account.rendered((step + 1) as f64 * TICK_S, part.force_n, true_n, touches, None);
     }
-    // The last force was let go.
-    account.moved(served.course.last().map_or(DVec3::ZERO, |last| last.place_m));
     account.ages_s.append(&mut served.ages_s);
     let mut found = account.close();
+    found.scale = scale;
+    // By the simulated hand itself: exact also between these steps.
+    found.energy_min_j = simulated.energy_min_j();
     let inbound = shared.inbound();
     found.packets_per_s = inbound.samples as f64 / duration_s;
     found.kbit_per_s = inbound.bytes as f64 * 8e-3 / duration_s;
@@ -59,4 +61,41 @@ pub(super) async fn run(setup: &Setup, server: Server) -> Result<Found, Failure>
         found.interventions = Reason::ALL.iter().map(|(reason, name)| (*name, envelope.count(*reason).0)).collect();
     }
     Ok(found)
+}
+
+/// A course at each whole tick: the place there, on a straight way between two parts, and the force that was held.
+fn steps(course: &[Part]) -> impl Iterator<Item = Part> {
+    let (mut at, mut tick) = (1, 0_u32);
+    std::iter::from_fn(move || {
+        tick += 1;
+        let time_s = f64::from(tick) * TICK_S;
+        while course.get(at)?.time_s < time_s {
+            at += 1;
+        }
+        let (before, after) = (&course[at - 1], &course[at]);
+        let part = ((time_s - before.time_s) / (after.time_s - before.time_s)).clamp(0.0, 1.0);
+        Some(Part { time_s, place_m: before.place_m.lerp(after.place_m, part), force_n: after.force_n })
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DVec3;
+
+    #[test]
+    fn a_course_that_stood_still_is_followed_by_the_time_that_passed() {
+        let part = |time_s: f64, z_m: f64, z_n: f64| Part {
+            time_s,
+            place_m: DVec3::new(0.0, 0.0, z_m),
+            force_n: DVec3::new(0.0, 0.0, z_n),
+        };
+        // Two parts, a tenth of a second of nothing, and one more.
+        let course =
+            [part(0.0005, 0.0, 1.0), part(0.0015, 1.0, 2.0), part(0.1015, 101.0, 3.0), part(0.1025, 101.5, 4.0)];
+        let steps: Vec<Part> = steps(&course).collect();
+        assert_eq!(steps.len(), 102);
+        assert!((steps[0].place_m.z - 0.5).abs() < 1e-9 && steps[0].force_n.z == 2.0);
+        assert!((steps[50].place_m.z - 50.5).abs() < 1e-6 && steps[50].force_n.z == 3.0);
+    }
 }

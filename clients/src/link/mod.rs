@@ -51,6 +51,9 @@ pub(crate) struct Arguments {
     /// Part of the messages that TCP must send again, which holds up all after them
     #[arg(long, value_name = "PART", conflicts_with = "profile")]
     loss: Option<f64>,
+    /// Once a second, at a random moment, the client stands still for so long, ms; the device holds its last force
+    #[arg(long, value_name = "MS", default_value_t = 0.0, conflicts_with = "random")]
+    stall_ms: f64,
     /// A network by name, in place of the three above
     #[arg(long)]
     profile: Option<Profile>,
@@ -80,7 +83,7 @@ pub(crate) struct Arguments {
     course: Option<PathBuf>,
     /// Run in real time against this server, which has the scene by its name, in place of virtual time; the network is what
     /// it is
-    #[arg(long, value_name = "URL", conflicts_with_all = ["rtt_ms", "jitter_ms", "loss", "profile", "random", "boundary"])]
+    #[arg(long, value_name = "URL", conflicts_with_all = ["rtt_ms", "jitter_ms", "loss", "stall_ms", "profile", "random", "boundary"])]
     server: Option<String>,
     #[command(flatten)]
     credentials: Credentials,
@@ -209,6 +212,8 @@ fn setup(arguments: &Arguments) -> Result<Setup, Refusal> {
     };
     let range = format!("from 0.001 to {LONGEST_S}");
     let duration_s = number("--seconds", arguments.seconds, &range, |v| (1e-3..=LONGEST_S).contains(&v))?;
+    let stalls = "from 0 to 1000";
+    let stall_s = 1e-3 * number("--stall-ms", arguments.stall_ms, stalls, |v| (0.0..=1000.0).contains(&v))?;
     let deadband = number("--deadband", arguments.deadband, "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
     let scene = scene_named(&arguments.scene, &limits)?;
     let tip = Tip { radius_m: arguments.radius_m, friction: arguments.friction, ..Tip::default() };
@@ -216,7 +221,7 @@ fn setup(arguments: &Arguments) -> Result<Setup, Refusal> {
     let model = Model::compile(&scene, &limits)?;
     let law = Arc::new(Law::of(&model, tip.radius_m));
     let (scheme, seed) = (arguments.scheme, arguments.seed);
-    Ok(Setup { model, law, tip, hand, device, weather, scheme, deadband, duration_s, seed })
+    Ok(Setup { model, law, tip, hand, device, weather, stall_s, scheme, deadband, duration_s, seed })
 }
 
 /// What is printed of a run.
@@ -232,9 +237,11 @@ fn figures(setup: &Setup, found: &Found) -> Value {
         "rtt_ms": 1e3 * setup.weather.round_trip_s,
         "jitter_ms": 1e3 * setup.weather.jitter_s,
         "loss": setup.weather.loss,
+        "stall_ms": 1e3 * setup.stall_s,
         "deadband": setup.deadband,
         "seconds": setup.duration_s,
         "seed": setup.seed,
+        "scale": found.scale,
         "force_error_rms_percent": found.force_error_rms_percent,
         "force_error_p99_n": found.force_error_p99_n,
         "energy_min_j": found.energy_min_j,

@@ -64,6 +64,7 @@ pub(super) fn print(arguments: &Arguments, runs: u64) -> Result<(), Failure> {
             hand,
             device,
             weather,
+            stall_s: 0.0,
             scheme: arguments.scheme,
             deadband: arguments.deadband,
             duration_s: arguments.seconds,

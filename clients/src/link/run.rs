@@ -36,6 +36,8 @@ pub(super) struct Setup {
     pub(super) hand: Hand,
     pub(super) device: Device,
     pub(super) weather: Weather,
+    /// Once a second the client stands still for so long, s.
+    pub(super) stall_s: f64,
     pub(super) scheme: Scheme,
     pub(super) deadband: f64,
     pub(super) duration_s: f64,
@@ -58,6 +60,8 @@ const PATIENCE_S: f64 = 0.3;
 /// What a run found.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Found {
+    /// Of the task's depths.
+    pub(super) scale: f64,
     pub(super) force_error_rms_percent: Option<f64>,
     pub(super) force_error_p99_n: f64,
     pub(super) energy_min_j: f64,
@@ -131,21 +135,69 @@ impl Client {
     }
 }
 
-/// Runs it. The task's depth is drawn in further while the true force is above what the device is asked for.
-pub(super) fn run(setup: &Setup) -> Result<Found, String> {
-    let most_n = setup.device.most_n();
-    let mut scale = task::scale(&setup.hand, &setup.law, most_n);
+/// The scale of the task's depths: drawn in until a hand that feels the tissue itself, with no network and no client
+/// between, meets no more than what the device is asked for. So it does not depend on what a client makes of samples.
+pub(super) fn fitting_scale(setup: &Setup, lead_s: f64) -> Result<f64, String> {
+    let Setup { model, law, tip, hand, device, duration_s, seed, .. } = setup;
+    let most_n = task::SHARE * device.most_n();
+    let middle_m = (model.scene.sheet.extent_m() / 2.0).extend(0.0);
+    let mut scale = task::scale(hand, law, device.most_n());
     loop {
-        let found = run_scaled(setup, scale)?;
-        if found.true_force_max_n <= task::SHARE * most_n || found.unstable_at_s.is_some() {
-            return Ok(found);
+        let task = Task::new(middle_m, lead_s, *duration_s, scale, &mut Dice::new(*seed, 0));
+        let mut twin = Twin::new(Tissue::new(model, *tip, law.clone()));
+        let mut held = Held { place_m: task.start_m(), velocity_m_per_s: DVec3::ZERO };
+        let mut largest_n = 0.0_f64;
+        for tick in 0..ticks(*duration_s) {
+            let now_s = f64::from(tick) * TICK_S;
+            let (true_n, _) = twin.truth(held.place_m)?;
+            largest_n = largest_n.max(true_n.length());
+            if largest_n > most_n {
+                break;
+            }
+            let (from_m, to_m) = (task.at(now_s), task.at(now_s + TICK_S));
+            let string_n = hand.string_n(from_m, held.place_m);
+            held = hand.advance(held, from_m, to_m, true_n + string_n, TICK_S);
+        }
+        if largest_n <= most_n || scale < LEAST_SCALE {
+            return Ok(scale);
         }
         scale *= 0.9;
     }
 }
 
-fn run_scaled(setup: &Setup, scale: f64) -> Result<Found, String> {
-    let Setup { model, law, tip, hand, device, weather, scheme, deadband, duration_s, seed } = setup;
+/// A task that is drawn in further would touch nothing any more.
+const LEAST_SCALE: f64 = 0.01;
+
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+fn ticks(duration_s: f64) -> u32 {
+    (duration_s / TICK_S).round() as u32
+}
+
+/// Moments at which a client stands still for some time, once a second.
+struct Stalls {
+    stall_s: f64,
+    dice: Dice,
+    begin_s: f64,
+}
+
+impl Stalls {
+    fn new(stall_s: f64, mut dice: Dice) -> Self {
+        let begin_s = task::LEAD_S + dice.between(0.0, 1.0);
+        Stalls { stall_s, dice, begin_s }
+    }
+
+    fn is_at(&mut self, now_s: f64) -> bool {
+        while now_s >= self.begin_s + self.stall_s {
+            self.begin_s = self.begin_s.ceil() + self.dice.between(0.0, 1.0);
+        }
+        self.stall_s > 0.0 && now_s >= self.begin_s
+    }
+}
+
+/// Runs it.
+pub(super) fn run(setup: &Setup) -> Result<Found, String> {
+    let scale = fitting_scale(setup, task::LEAD_S)?;
+    let Setup { model, law, tip, hand, device, weather, stall_s, scheme, deadband, duration_s, seed } = setup;
     let middle_m = (model.scene.sheet.extent_m() / 2.0).extend(0.0);
     let task = Task::new(middle_m, task::LEAD_S, *duration_s, scale, &mut Dice::new(*seed, 0));
     let tissue = || Tissue::new(model, *tip, law.clone());
@@ -165,10 +217,11 @@ fn run_scaled(setup: &Setup, scale: f64) -> Result<Found, String> {
     };
     let mut held = Held { place_m: task.start_m(), velocity_m_per_s: DVec3::ZERO };
     let mut account = Account::default();
+    account.found.scale = scale;
     let mut paused_s: Option<f64> = None;
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    let ticks = (duration_s / TICK_S).round() as u32;
-    for tick in 0..ticks {
+    let mut stalls = Stalls::new(*stall_s, Dice::new(*seed, 4));
+    let mut force_n = DVec3::ZERO;
+    for tick in 0..ticks(*duration_s) {
         let now_s = f64::from(tick) * TICK_S;
         let place_m = held.place_m;
         account.moved(place_m);
@@ -177,7 +230,10 @@ fn run_scaled(setup: &Setup, scale: f64) -> Result<Found, String> {
             account.found.unstable_at_s = Some(now_s);
             break;
         }
-        up.send(now_s, (now_s, place_m));
+        let stands = stalls.is_at(now_s);
+        if !stands {
+            up.send(now_s, (now_s, place_m));
+        }
         while let Some((time_s, place_m)) = up.receive(now_s) {
             server.path.receive(time_s, place_m, now_s);
         }
@@ -189,14 +245,17 @@ fn run_scaled(setup: &Setup, scale: f64) -> Result<Found, String> {
             account.bytes += sample_bytes(&model);
             down.send(now_s, model);
         }
-        while let Some(model) = down.receive(now_s) {
+        // While the client stands still the device holds the last force, and samples wait.
+        while !stands && let Some(model) = down.receive(now_s) {
             client.receive(model, now_s);
         }
-        let force_n = client.tick(now_s, place_m);
+        if !stands {
+            force_n = client.tick(now_s, place_m);
+        }
         let (true_n, touches) = twin.truth(place_m)?;
         let age_s = client.model_time_s().map(|time_s| now_s - time_s);
         account.rendered(now_s, force_n, true_n, touches, age_s);
-        if let Some(envelope) = client.envelope() {
+        if let Some(envelope) = client.envelope().filter(|_| !stands) {
             owner(envelope, now_s, &mut paused_s, &mut account.found);
         }
         let (from_m, to_m) = (task.at(now_s), task.at(now_s + TICK_S));

@@ -21,7 +21,7 @@ pub(super) struct Tissue {
 
 impl Tissue {
     pub(super) fn new(model: &Arc<Model>, tip: Tip, law: Arc<Law>) -> Self {
-        Tissue { session: Session::new(model), tip, modeller: Modeller::new(law) }
+        Tissue { session: Session::new(model), tip, modeller: Modeller::new(law, false) }
     }
 
     /// One step, at whose end the tool is at `place_m`, or nowhere.

@@ -319,3 +319,25 @@ fn command(common: &Common, stroke: &Stroke, tool: u32, sent: &Mutex<Sent>, tick
     let action = stroke.at(tick as f64 / common.rate_hz);
     Some(wire::command::now(tool, sequence, &action, now_ns))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn dilation_is_simulated_over_real_time_and_silence_counts() {
+        let stage = Stage::new();
+        stage.drain(4_000_000_000);
+        let heartbeat = |last_arrival_ns: u64| Heartbeat {
+            first: Some((1_000_000_000, 500)),
+            last: (3_000_000_000, 2000),
+            last_arrival_ns,
+            ..Heartbeat::default()
+        };
+        // 1500 steps in 2 s; and the session was silent for two more.
+        assert!((heartbeat(4_000_000_000).dilation(1000.0, &stage) - 0.75).abs() < 1e-12);
+        assert!((heartbeat(2_000_000_000).dilation(1000.0, &stage) - 0.375).abs() < 1e-12);
+        assert!((heartbeat(4_000_000_000).dilation(500.0, &stage) - 1.5).abs() < 1e-12);
+        assert!(Heartbeat::default().dilation(1000.0, &stage).abs() < 1e-12);
+    }
+}

@@ -243,6 +243,7 @@ setInterval(() => {
   if (!visit || document.hidden) return;
   const { session, samples, frames } = visit;
   const { newest } = samples;
+  const audited = session.audit?.newestError;
   status.show({
     roundTripMs: visit.roundTripMs,
     networkMs: visit.hand.networkMs,
@@ -255,6 +256,8 @@ setInterval(() => {
     dilation: newest?.timeDilation ?? session.timeDilation,
     awakePoints: newest?.awakePoints,
     isAsleep: newest?.asleep ?? session.resting,
+    auditedError: audited && Math.max(audited.displacement, audited.force),
+    tolerance: session.scene?.stepping?.tolerance,
   });
 }, 1000);
 

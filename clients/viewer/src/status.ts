@@ -16,6 +16,9 @@ export interface Figures {
   dilation: number;
   awakePoints?: number;
   isAsleep: boolean;
+  /** Of displacement or force, the larger, in the newest audit; absent before the first. */
+  auditedError?: number;
+  tolerance?: number;
 }
 
 export class Status {
@@ -50,6 +53,10 @@ export class Status {
     this.set("overruns", String(figures.overruns));
     this.set("time", `${figures.dilation.toFixed(2)} × real`);
     this.set("tissue", figures.isAsleep ? "asleep" : `${figures.awakePoints ?? "–"} points awake`);
+    if (figures.auditedError !== undefined) {
+      const asked = figures.tolerance === undefined ? "" : ` (asked ${figures.tolerance.toExponential(0)})`;
+      this.set("error", `${figures.auditedError.toExponential(0)}${asked}`);
+    }
   }
 
   private set(name: string, text: string): void {

@@ -54,7 +54,7 @@ impl<T: Real> sweep::Scheme<T> for Advance<T> {
     #[inline(always)]
     fn advance<V: Vector<Real = T>>(&self, x: V, d: V, n: V, _: &mut [V; MAX_KEPT], force: Option<[V; 2]>) -> (V, V) {
         let n = if let Some(force) = force { n.add(force[0]) } else { n };
-        let d = V::splat(self.p).mul_add(d, V::splat(self.pull).mul_add(x, n));
+        let d = d.splat(self.p).mul_add(d, d.splat(self.pull).mul_add(x, n));
         (x.add(d), d)
     }
 
@@ -70,7 +70,7 @@ impl<T: Real> sweep::Scheme<T> for Advance<T> {
         // The mean of the increments of the substep just done and of the one that would follow: second order, and at
         // the time of the displacement.
         let (_, next) = self.advance(x, d, n, &mut kept.clone(), force.map(|force| [force; 2]));
-        (x, V::splat(T::of(0.5)).mul(d.add(next)))
+        (x, d.splat(T::of(0.5)).mul(d.add(next)))
     }
 
     #[inline(always)]
@@ -79,7 +79,7 @@ impl<T: Real> sweep::Scheme<T> for Advance<T> {
         // the substep; with the square of the velocity instead, the sum swings by (dt·ω)²/8. Strong damping hides that
         // swing, and may let d·d₊ rise.
         let (_, next) = self.advance(x, d, n, &mut kept.clone(), force.map(|force| [force; 2]));
-        let mean = V::splat(T::of(0.5)).mul(d.add(next));
+        let mean = d.splat(T::of(0.5)).mul(d.add(next));
         if self.keeps { d.mul(next) } else { mean.mul(mean) }
     }
 }

@@ -1,7 +1,7 @@
 //! Small square matrices: the exponential of one, and the largest magnitude among its eigenvalues.
 
-/// Components of the longest vector: u, d, the forces that a scheme of the fourth order keeps, and one that stays.
-pub(super) const LONGEST: usize = 7;
+/// Rows of the largest: of u, d, and what a scheme keeps; or of u, d and the powers that make a scheme's weights.
+const LONGEST: usize = 7;
 
 /// A square matrix, by rows. It lies where it is used: choosing a scheme makes many thousands.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -27,31 +27,6 @@ impl Matrix {
 
     fn times(&self, other: &Matrix) -> Matrix {
         Matrix::of(self.n, |i, j| (0..self.n).map(|k| self.at(i, k) * other.at(k, j)).sum())
-    }
-
-    /// The matrix times a vector of at most [`LONGEST`] components.
-    pub fn applied_to(&self, vector: &[f64]) -> [f64; LONGEST] {
-        let mut product = [0.0; LONGEST];
-        for (value, row) in product[..self.n].iter_mut().zip(self.values.chunks_exact(self.n)) {
-            *value = row.iter().zip(vector).map(|(a, b)| a * b).sum();
-        }
-        product
-    }
-
-    /// The matrix times itself, so often.
-    pub fn power(&self, mut exponent: u32) -> Matrix {
-        let mut square = *self;
-        let mut product = Matrix::of(self.n, |i, j| f64::from(u8::from(i == j)));
-        while exponent > 0 {
-            if exponent % 2 == 1 {
-                product = product.times(&square);
-            }
-            exponent /= 2;
-            if exponent > 0 {
-                square = square.times(&square);
-            }
-        }
-        product
     }
 
     fn scaled(&self, factor: f64) -> Matrix {
@@ -120,15 +95,6 @@ mod tests {
             let e = Matrix::of(2, |i, j| if i == j { value } else { 0.0 }).exponential();
             assert!(e.at(0, 0).is_nan());
         }
-    }
-
-    #[test]
-    fn a_power_is_so_many_products() {
-        let shear = Matrix::of(2, |i, j| [[1.0, 0.5], [0.0, -1.0]][i][j]);
-        let product =
-            (0..11).fold(Matrix::of(2, |i, j| f64::from(u8::from(i == j))), |product, _| product.times(&shear));
-        assert_eq!(shear.power(11), product);
-        assert_eq!(shear.power(0).applied_to(&[3.0, 4.0])[..2], [3.0, 4.0]);
     }
 
     #[test]

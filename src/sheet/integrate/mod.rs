@@ -162,59 +162,6 @@ impl Scheme {
         }
     }
 
-    /// What a constant force of 1 adds to the state in a substep, in the same terms.
-    fn forced(&self, z: f64) -> Vec<f64> {
-        match self {
-            Scheme::TwoStep(two) => vec![two.q, two.q],
-            Scheme::Multistep(multistep) => multistep.forced(),
-            Scheme::Rk4 { a, g } => rk4::forced(*a + z, *g),
-        }
-    }
-
-    /// A force of 1 that is switched on, and the vibration z that it excites: the largest errors of displacement and of the
-    /// force (of springs, virtual springs and damping) within `substeps`, seen after every `seen` of them. Infinite where
-    /// the scheme's course leaves the numbers.
-    pub fn error_of_a_switched_force(&self, z: f64, a: f64, g: f64, substeps: u32, seen: u32) -> [f64; 2] {
-        let (step, forced) = (self.propagator(z), self.forced(z));
-        let n = forced.len();
-        // The force as one component more, which does not change: what many substeps do is then a power.
-        let step = Matrix::of(n + 1, |i, j| match (i < n, j < n) {
-            (true, true) => step.at(i, j),
-            (true, false) => forced[i],
-            (false, _) => f64::from(u8::from(i == j)),
-        });
-        let exact = Matrix::of(3, |i, j| [[0.0, 1.0, 0.0], [-z - a, -g, 1.0], [0.0; 3]][i][j]).exponential();
-        // After the first substep, in which a two-step scheme takes the mean of before and after.
-        let part = if self.takes_means() { 0.5 } else { 1.0 };
-        let first: Vec<f64> = forced.iter().map(|force| part * force).chain([1.0]).collect();
-        let mut state = step.power(seen - 1).applied_to(&first);
-        let mut truth = exact.power(seen).applied_to(&[0.0, 0.0, 1.0]);
-        let (step, exact) = (step.power(seen), exact.power(seen));
-        let mut errors = [0.0_f64; 2];
-        for _ in 0..substeps / seen {
-            let [u, w] = match self {
-                Scheme::TwoStep(two) => {
-                    let next = two.p * state[1] + two.q * (1.0 - (z + two.a) * state[0]);
-                    [state[0], 0.5 * (state[1] + next)]
-                }
-                Scheme::Multistep(multistep) => {
-                    let mut history = state;
-                    history[1] = -z * state[0];
-                    let surprise = multistep.surprise(&history[1..n]);
-                    [state[0] + multistep.correction[0] * surprise, state[1] + multistep.correction[1] * surprise]
-                }
-                Scheme::Rk4 { .. } => [state[0], state[1]],
-            };
-            let (du, dw) = (u - truth[0], w - truth[1]);
-            if !(du.is_finite() && dw.is_finite()) {
-                return [f64::INFINITY; 2];
-            }
-            errors = [errors[0].max(du.abs()), errors[1].max(((z + a) * du + g * dw).abs())];
-            (state, truth) = (step.applied_to(&state), exact.applied_to(&truth));
-        }
-        errors
-    }
-
     /// The magnitude by which a vibration z grows at most in a substep.
     pub fn growth(&self, z: f64) -> f64 {
         self.propagator(z).spectral_radius()

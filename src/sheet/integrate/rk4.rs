@@ -32,10 +32,6 @@ pub(super) fn propagator(pull: f64, g: f64) -> Matrix {
     Matrix::of(2, |i, j| columns[j][i])
 }
 
-pub(super) fn forced(pull: f64, g: f64) -> Vec<f64> {
-    step(pull, g, 1.0, [0.0; 2]).to_vec()
-}
-
 /// One stage, in the format of the state.
 #[derive(Debug, Clone, Copy)]
 pub(in super::super) struct Advance<T> {
@@ -68,8 +64,8 @@ impl<T: Real> sweep::Scheme<T> for Advance<T> {
         force: Option<[V; 2]>,
     ) -> (V, V) {
         let n = if let Some(force) = force { n.add(force[0]) } else { n };
-        let slope = [d, V::splat(self.g).mul_add(d, V::splat(self.a).mul_add(x, n))];
-        let share = V::splat(self.share);
+        let slope = [d, d.splat(self.g).mul_add(d, d.splat(self.a).mul_add(x, n))];
+        let share = d.splat(self.share);
         if self.stage == 0 {
             [kept[0], kept[1], kept[2], kept[3]] = [x, d, share.mul(slope[0]), share.mul(slope[1])];
         } else {
@@ -79,13 +75,13 @@ impl<T: Real> sweep::Scheme<T> for Advance<T> {
         if self.stage + 1 == STAGES.len() {
             return (kept[0].add(kept[2]), kept[1].add(kept[3]));
         }
-        let far = V::splat(self.far);
+        let far = d.splat(self.far);
         (far.mul_add(slope[0], kept[0]), far.mul_add(slope[1], kept[1]))
     }
 
     #[inline(always)]
     fn travel<V: Vector<Real = T>>(&self, [_, d]: [V; 2], _: [V; 2]) -> V {
-        V::splat(self.share).mul(d)
+        d.splat(self.share).mul(d)
     }
 
     #[inline(always)]

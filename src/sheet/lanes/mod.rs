@@ -1,8 +1,10 @@
-//! Vectors of several widths, so that one algorithm is written once: AVX-512, AVX2 with FMA, and plain arrays.
+//! Vectors of several widths, so that one algorithm is written once: AVX-512, AVX2 with FMA, NEON, and plain arrays.
 //!
 //! Every operation is one that IEEE 754 rounds exactly, or moves bits. An algorithm in which a lane's result depends on
-//! that lane's inputs alone therefore has the same bits at every width. An instruction must exist on the processor,
-//! which [`Width::of`] makes sure of.
+//! that lane's inputs alone therefore has the same bits at every width.
+//!
+//! The processor must have the instructions. [`Width::of`] checks that, and a vector is the proof: the first ones are made
+//! by `unsafe` functions that ask for it, all others out of vectors.
 #![allow(unsafe_code)]
 
 use super::real::Real;
@@ -14,14 +16,26 @@ pub(super) trait Vector: Copy {
     /// Which lanes.
     type Mask: Copy;
     const LANES: usize;
+    /// The lanes are those of one register: loops for the usual rows are worth their code.
+    const IS_REGISTER: bool = true;
 
     /// # Safety
-    /// `LANES` values can be read at `from`.
+    /// The processor has the instructions, and `LANES` values can be read at `from`.
     unsafe fn load(from: *const Self::Real) -> Self;
     /// # Safety
     /// `LANES` values can be written at `to`.
     unsafe fn store(self, to: *mut Self::Real);
-    fn splat(value: Self::Real) -> Self;
+    /// `value` in every lane.
+    ///
+    /// # Safety
+    /// The processor has the instructions.
+    unsafe fn of(value: Self::Real) -> Self;
+    /// `value` in every lane; `self` only proves that there are such vectors.
+    #[inline(always)]
+    fn splat(self, value: Self::Real) -> Self {
+        // SAFETY: there is a vector.
+        unsafe { Self::of(value) }
+    }
     fn add(self, other: Self) -> Self;
     fn sub(self, other: Self) -> Self;
     fn mul(self, other: Self) -> Self;
@@ -37,20 +51,22 @@ pub(super) trait Vector: Copy {
     fn rough_inverse_root(self) -> Self;
     /// 2^self, for whole numbers from -100 to 100.
     fn power_of_two(self) -> Self;
-    /// `first`, `first` + 1, …
-    fn count(first: usize) -> Self;
+    /// `first`, `first` + 1, …; `self` is the proof.
+    fn count(self, first: usize) -> Self;
     /// The larger; `other` if one is NaN.
     fn larger(self, other: Self) -> Self;
     /// The larger magnitude; whichever if one is NaN.
     fn farther(self, other: Self) -> Self;
     /// Where |self| > `bound`.
     fn beyond(self, bound: Self) -> Self::Mask;
+    /// Where |self| is not below [`Real::LEAST`].
+    fn counts(self) -> Self::Mask;
     fn any(mask: Self::Mask) -> bool;
     fn either(a: Self::Mask, b: Self::Mask) -> Self::Mask;
     /// `a` where the mask is set, else `b`.
     fn select(mask: Self::Mask, a: Self, b: Self) -> Self;
-    /// The first `count` lanes.
-    fn first(count: usize) -> Self::Mask;
+    /// The first `count` lanes; `self` is the proof.
+    fn first(self, count: usize) -> Self::Mask;
     /// 0 where the mask is not set.
     fn keep(self, mask: Self::Mask) -> Self;
     /// Each lane one place up; the last of `before` comes in.
@@ -71,6 +87,18 @@ pub(super) trait Run<T> {
 pub(super) struct Plain<T, const N: usize>([T; N]);
 
 impl<T: Real, const N: usize> Plain<T, N> {
+    /// a·b + c. Not inlined: without the instruction each lane is a call of its own, and a row of points has hundreds.
+    #[inline(never)]
+    fn fused(a: Self, b: Self, c: Self) -> Self {
+        Plain(std::array::from_fn(|lane| a.0[lane].fused(b.0[lane], c.0[lane])))
+    }
+
+    #[inline(always)]
+    fn negative(self) -> Self {
+        Plain(self.0.map(|value| -value))
+    }
+
+    #[inline(always)]
     fn each(self, other: Self, f: impl Fn(T, T) -> T) -> Self {
         Plain(std::array::from_fn(|lane| f(self.0[lane], other.0[lane])))
     }
@@ -92,6 +120,7 @@ impl<T: Real, const N: usize> Vector for Plain<T, N> {
     type Real = T;
     type Mask = [bool; N];
     const LANES: usize = N;
+    const IS_REGISTER: bool = false;
 
     #[inline(always)]
     unsafe fn load(from: *const T) -> Self {
@@ -104,7 +133,7 @@ impl<T: Real, const N: usize> Vector for Plain<T, N> {
         unsafe { to.cast::<[T; N]>().write(self.0) }
     }
     #[inline(always)]
-    fn splat(value: T) -> Self {
+    unsafe fn of(value: T) -> Self {
         Plain([value; N])
     }
     #[inline(always)]
@@ -129,15 +158,15 @@ impl<T: Real, const N: usize> Vector for Plain<T, N> {
     }
     #[inline(always)]
     fn mul_add(self, b: Self, c: Self) -> Self {
-        Plain(std::array::from_fn(|lane| self.0[lane].fused(b.0[lane], c.0[lane])))
+        Self::fused(self, b, c)
     }
     #[inline(always)]
     fn mul_sub(self, b: Self, c: Self) -> Self {
-        Plain(std::array::from_fn(|lane| self.0[lane].fused(b.0[lane], -c.0[lane])))
+        Self::fused(self, b, c.negative())
     }
     #[inline(always)]
     fn minus(self, a: Self, b: Self) -> Self {
-        Plain(std::array::from_fn(|lane| (-a.0[lane]).fused(b.0[lane], self.0[lane])))
+        Self::fused(a.negative(), b, self)
     }
     #[inline(always)]
     fn rough_inverse_root(self) -> Self {
@@ -149,7 +178,7 @@ impl<T: Real, const N: usize> Vector for Plain<T, N> {
     }
     #[inline(always)]
     #[allow(clippy::cast_precision_loss)]
-    fn count(first: usize) -> Self {
+    fn count(self, first: usize) -> Self {
         Plain(std::array::from_fn(|lane| T::of((first + lane) as f64)))
     }
     #[inline(always)]
@@ -165,6 +194,12 @@ impl<T: Real, const N: usize> Vector for Plain<T, N> {
         std::array::from_fn(|lane| self.0[lane].magnitude() > bound.0[lane])
     }
     #[inline(always)]
+    #[allow(clippy::neg_cmp_op_on_partial_ord)]
+    fn counts(self) -> [bool; N] {
+        // NaN counts: whoever looks for it must find it.
+        std::array::from_fn(|lane| !(self.0[lane].magnitude() < T::of(T::LEAST)))
+    }
+    #[inline(always)]
     fn any(mask: [bool; N]) -> bool {
         mask.contains(&true)
     }
@@ -177,7 +212,7 @@ impl<T: Real, const N: usize> Vector for Plain<T, N> {
         Plain(std::array::from_fn(|lane| if mask[lane] { a.0[lane] } else { b.0[lane] }))
     }
     #[inline(always)]
-    fn first(count: usize) -> [bool; N] {
+    fn first(self, count: usize) -> [bool; N] {
         std::array::from_fn(|lane| lane < count)
     }
     #[inline(always)]
@@ -204,12 +239,16 @@ pub(super) fn available(lanes: Lanes) -> Option<Lanes> {
     };
     #[cfg(not(target_arch = "x86_64"))]
     let (wide, narrow) = (false, false);
+    // Every processor that this is compiled for has it, or none.
+    let neon = cfg!(target_arch = "aarch64");
     match lanes {
         Lanes::Auto if wide => Some(Lanes::Avx512),
         Lanes::Auto if narrow => Some(Lanes::Avx2),
+        Lanes::Auto if neon => Some(Lanes::Neon),
         Lanes::Auto | Lanes::Plain => Some(Lanes::Plain),
         Lanes::Avx512 => wide.then_some(Lanes::Avx512),
         Lanes::Avx2 => narrow.then_some(Lanes::Avx2),
+        Lanes::Neon => neon.then_some(Lanes::Neon),
     }
 }
 
@@ -229,8 +268,6 @@ impl Width {
 /// # Safety
 /// What `program` points to is as it promised.
 pub(super) unsafe fn run<T: Real>(width: Width, program: &impl Run<T>) {
-    #[cfg(target_arch = "x86_64")]
-    let _flushing = x86::Flushing::begin();
     // SAFETY: the instructions are there, by `Width::of`; the rest is the caller's promise.
     unsafe {
         match width.0 {
@@ -238,7 +275,9 @@ pub(super) unsafe fn run<T: Real>(width: Width, program: &impl Run<T>) {
             Lanes::Avx512 => x86::with_avx512(program),
             #[cfg(target_arch = "x86_64")]
             Lanes::Avx2 => x86::with_avx2(program),
-            _ => program.run::<Plain<T, 4>>(),
+            #[cfg(target_arch = "aarch64")]
+            Lanes::Neon => program.run::<T::Neon>(),
+            _ => program.run::<Plain<T, 2>>(),
         }
     }
 }
@@ -247,6 +286,11 @@ pub(super) unsafe fn run<T: Real>(width: Width, program: &impl Run<T>) {
 mod x86;
 #[cfg(target_arch = "x86_64")]
 pub(super) use x86::{NarrowF32, NarrowF64, WideF32, WideF64};
+
+#[cfg(target_arch = "aarch64")]
+mod neon;
+#[cfg(target_arch = "aarch64")]
+pub(super) use neon::{NeonF32, NeonF64};
 
 #[cfg(test)]
 mod tests {
@@ -264,11 +308,11 @@ mod tests {
         #[inline(always)]
         unsafe fn run<V: Vector<Real = T>>(&self) {
             unsafe {
-                let mut before = V::splat(T::of(7.0));
+                let mut before = V::of(T::of(7.0));
                 for at in (0..16).step_by(V::LANES) {
                     let (a, b) = (V::load(self.a.as_ptr().add(at)), V::load(self.b.as_ptr().add(at)));
-                    let mask = V::first(11_usize.saturating_sub(at));
-                    let far = V::either(a.beyond(V::splat(T::of(2.5))), b.beyond(V::splat(T::of(100.0))));
+                    let mask = a.first(11_usize.saturating_sub(at));
+                    let far = V::either(a.beyond(a.splat(T::of(2.5))), b.beyond(a.splat(T::of(100.0))));
                     let results = [
                         a.add(b),
                         a.sub(b),
@@ -285,13 +329,14 @@ mod tests {
                         a.shift_two(before),
                         a.minus(a, b),
                         b.mul(b).rough_inverse_root(),
-                        V::count(at).sub(V::splat(T::of(9.0))).power_of_two(),
+                        a.count(at).sub(a.splat(T::of(9.0))).power_of_two(),
+                        a.keep(a.mul(a.splat(T::of(T::LEAST))).counts()),
                         if V::any(mask) { a } else { b },
                     ];
                     before = a;
                     for (n, result) in results.into_iter().enumerate() {
                         // Whether any lane is set depends on the width by nature.
-                        if n < 16 {
+                        if n < 17 {
                             result.store(self.out.add(16 * n + at));
                         }
                     }
@@ -304,13 +349,13 @@ mod tests {
         let a: [T; 16] = std::array::from_fn(|i| T::of(0.37 * i as f64 * if i % 3 == 0 { -1.0 } else { 1.1 }));
         let b: [T; 16] = std::array::from_fn(|i| T::of(13.0 / (1.0 + i as f64) - 2.0));
         let result = |lanes| {
-            let mut out = vec![T::default(); 16 * 16];
+            let mut out = vec![T::default(); 17 * 16];
             unsafe { run(Width::of(lanes), &Everything { a: &a, b: &b, out: out.as_mut_ptr() }) };
             out.into_iter().map(Real::wide).collect::<Vec<_>>()
         };
         let plain = result(Lanes::Plain);
         assert!(plain.iter().any(|v| *v != 0.0));
-        for lanes in [Lanes::Avx2, Lanes::Avx512] {
+        for lanes in [Lanes::Avx2, Lanes::Avx512, Lanes::Neon] {
             if available(lanes).is_some() {
                 assert_eq!(result(lanes), plain, "{lanes:?}");
             }

@@ -1,41 +1,9 @@
 //! The widths of x86-64: AVX-512, and AVX2 with FMA.
 #![allow(unsafe_code)]
 
-use std::arch::x86_64::_CMP_GT_OQ;
+use std::arch::x86_64::{_CMP_GT_OQ, _CMP_NLT_UQ};
 
 use super::{Real, Run, Vector};
-
-/// While one is alive, results and operands below the normal range count as 0 on this thread. Fields decay in time
-/// and towards the rim of a sheet without end, and each operation on the subnormal numbers at which they arrive
-/// costs as much as a hundred others.
-pub(super) struct Flushing {
-    before: u32,
-}
-
-/// Flush to zero, and denormals are zero: bits of the control register.
-const FLUSH: u32 = 0x8040;
-
-impl Flushing {
-    pub(super) fn begin() -> Self {
-        let mut before = 0_u32;
-        // SAFETY: stores the control register to a place of its size.
-        unsafe { std::arch::asm!("stmxcsr [{}]", in(reg) &raw mut before, options(nostack)) };
-        Flushing::set(before | FLUSH);
-        Flushing { before }
-    }
-
-    fn set(control: u32) {
-        // SAFETY: only the two bits change, which alter nothing but numbers below the normal range; they are put
-        // back before anything other than a sweep runs.
-        unsafe { std::arch::asm!("ldmxcsr [{}]", in(reg) &raw const control, options(nostack, readonly)) };
-    }
-}
-
-impl Drop for Flushing {
-    fn drop(&mut self) {
-        Flushing::set(self.before);
-    }
-}
 
 /// # Safety
 /// As [`super::run`], and the processor has these instructions.
@@ -60,8 +28,8 @@ macro_rules! vector {
         #[derive(Clone, Copy)]
         pub(in super::super) struct $name($i::Register);
 
-        // SAFETY (of every block below): a value of this type is only made by `Run::run`, for which the processor
-        // has the instructions; memory is the caller's promise.
+        // SAFETY (of every block below): the processor has the instructions. Who makes the first value promises it, and every
+        // other function takes a value. Memory is the caller's promise.
         impl Vector for $name {
             type Real = $real;
             type Mask = $mask;
@@ -75,7 +43,7 @@ macro_rules! vector {
                 unsafe { $i::store(to, self.0) }
             }
             #[inline(always)]
-            fn splat(value: $real) -> Self {
+            unsafe fn of(value: $real) -> Self {
                 unsafe { $name($i::splat(value)) }
             }
             #[inline(always)]
@@ -120,15 +88,15 @@ macro_rules! vector {
             #[inline(always)]
             fn power_of_two(self) -> Self {
                 // The last bits of the sum are the exponent's.
-                let sum = self.add(Self::splat(<$real>::of(<$real as Real>::POWER)));
+                let sum = self.add(self.splat(<$real>::of(<$real as Real>::POWER)));
                 unsafe { $name($i::real($i::left::<$mantissa>($i::bits(sum.0)))) }
             }
             #[inline(always)]
             #[allow(clippy::cast_precision_loss)]
-            fn count(first: usize) -> Self {
+            fn count(self, first: usize) -> Self {
                 const COUNT: [$real; 16] =
                     [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0];
-                unsafe { $name($i::load(COUNT.as_ptr())).add(Self::splat(first as $real)) }
+                unsafe { $name($i::load(COUNT.as_ptr())).add(self.splat(first as $real)) }
             }
             #[inline(always)]
             fn larger(self, other: Self) -> Self {
@@ -153,6 +121,10 @@ macro_rules! avx512 {
                 unsafe { $i::compare::<_CMP_GT_OQ>($i::magnitude(self.0), bound.0) }
             }
             #[inline(always)]
+            fn counts(self) -> $mask {
+                unsafe { $i::test_bits($i::bits(self.0), $i::splat_bits(<$real as Real>::LEAST_BITS.cast_signed())) }
+            }
+            #[inline(always)]
             fn any(mask: $mask) -> bool {
                 mask != 0
             }
@@ -165,7 +137,7 @@ macro_rules! avx512 {
                 unsafe { $name($i::select(b.0, mask, a.0)) }
             }
             #[inline(always)]
-            fn first(count: usize) -> $mask {
+            fn first(self, count: usize) -> $mask {
                 if count >= $lanes { <$mask>::MAX } else { (1 << count) - 1 }
             }
             #[inline(always)]
@@ -188,7 +160,7 @@ macro_rules! avx512 {
 macro_rules! avx2 {
     ($name:ident, $real:ty, $lanes:literal, $mantissa:literal, $i:ident, |$high:ident, $mid:ident| $shift:expr,
      |$high2:ident, $mid2:ident| $shift_two:expr) => {
-        vector!($name, $real, $lanes, $mantissa, $i::Register, $i, {
+        vector!($name, $real, $lanes, $mantissa, $name, $i, {
             #[inline(always)]
             fn farther(self, other: Self) -> Self {
                 unsafe {
@@ -197,29 +169,34 @@ macro_rules! avx2 {
                 }
             }
             #[inline(always)]
-            fn beyond(self, bound: Self) -> $i::Register {
-                unsafe { $i::compare::<_CMP_GT_OQ>($i::and_not($i::splat(-0.0), self.0), bound.0) }
+            fn beyond(self, bound: Self) -> Self {
+                unsafe { $name($i::compare::<_CMP_GT_OQ>($i::and_not($i::splat(-0.0), self.0), bound.0)) }
             }
             #[inline(always)]
-            fn any(mask: $i::Register) -> bool {
-                unsafe { $i::signs(mask) != 0 }
+            fn counts(self) -> Self {
+                let least = self.splat(<$real>::of(<$real as Real>::LEAST));
+                unsafe { $name($i::compare::<_CMP_NLT_UQ>($i::and_not($i::splat(-0.0), self.0), least.0)) }
             }
             #[inline(always)]
-            fn either(a: $i::Register, b: $i::Register) -> $i::Register {
-                unsafe { $i::or(a, b) }
+            fn any(mask: Self) -> bool {
+                unsafe { $i::signs(mask.0) != 0 }
             }
             #[inline(always)]
-            fn select(mask: $i::Register, a: Self, b: Self) -> Self {
-                unsafe { $name($i::select(b.0, a.0, mask)) }
+            fn either(a: Self, b: Self) -> Self {
+                unsafe { $name($i::or(a.0, b.0)) }
+            }
+            #[inline(always)]
+            fn select(mask: Self, a: Self, b: Self) -> Self {
+                unsafe { $name($i::select(b.0, a.0, mask.0)) }
             }
             #[inline(always)]
             #[allow(clippy::cast_precision_loss)]
-            fn first(count: usize) -> $i::Register {
-                unsafe { $i::compare::<_CMP_GT_OQ>($i::splat(count.min($lanes) as $real), Self::count(0).0) }
+            fn first(self, count: usize) -> Self {
+                unsafe { $name($i::compare::<_CMP_GT_OQ>($i::splat(count.min($lanes) as $real), self.count(0).0)) }
             }
             #[inline(always)]
-            fn keep(self, mask: $i::Register) -> Self {
-                unsafe { $name($i::and(mask, self.0)) }
+            fn keep(self, mask: Self) -> Self {
+                unsafe { $name($i::and(mask.0, self.0)) }
             }
             #[inline(always)]
             fn shift(self, before: Self) -> Self {
@@ -247,7 +224,7 @@ mod wide_f32 {
         _mm512_mask_mov_ps as select, _mm512_maskz_mov_ps as keep, _mm512_max_ps as larger, _mm512_mul_ps as mul,
         _mm512_range_ps as range, _mm512_set1_epi32 as splat_bits, _mm512_set1_ps as splat, _mm512_slli_epi32 as left,
         _mm512_sqrt_ps as root, _mm512_srli_epi32 as half_bits, _mm512_storeu_ps as store,
-        _mm512_sub_epi32 as sub_bits, _mm512_sub_ps as sub,
+        _mm512_sub_epi32 as sub_bits, _mm512_sub_ps as sub, _mm512_test_epi32_mask as test_bits,
     };
 }
 mod wide_f64 {
@@ -258,7 +235,7 @@ mod wide_f64 {
         _mm512_mask_mov_pd as select, _mm512_maskz_mov_pd as keep, _mm512_max_pd as larger, _mm512_mul_pd as mul,
         _mm512_range_pd as range, _mm512_set1_epi64 as splat_bits, _mm512_set1_pd as splat, _mm512_slli_epi64 as left,
         _mm512_sqrt_pd as root, _mm512_srli_epi64 as half_bits, _mm512_storeu_pd as store,
-        _mm512_sub_epi64 as sub_bits, _mm512_sub_pd as sub,
+        _mm512_sub_epi64 as sub_bits, _mm512_sub_pd as sub, _mm512_test_epi64_mask as test_bits,
     };
 }
 mod narrow_f32 {

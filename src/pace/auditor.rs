@@ -1,0 +1,231 @@
+//! The auditor: one thread that measures errors of live sessions, with little time and a lower priority than stepping.
+//!
+//! It asks the awake sessions in turns for a window of steps (`sheet::audit`), and repeats that at a quarter of the substep
+//! in f64. The stepping thread shares two checkpoints and writes down what the tools are told; it waits for nothing and
+//! copies nothing, unless the auditor has not taken its copy of a checkpoint before the next one is made. After each slice
+//! of work the auditor rests until its processor time is within its share of a core.
+//!
+//! What it finds is told in the session's status, in the metrics, and in the log if it is above the tolerance. Where the
+//! scene says `correct`, a more accurate model enters as another tissue does: through the intake, at a step that is told.
+
+use std::collections::BTreeMap;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::mpsc::{Receiver, sync_channel};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::time::Duration;
+
+use super::clock::{now_ns, thread_time_ns};
+use super::inbox::Request;
+use super::queue::lock;
+use super::tally::Count;
+use super::{Live, check_work};
+use crate::scene::Named;
+use crate::scene::record::{AuditedError, Correction};
+use crate::sheet::Model;
+use crate::sheet::audit::{Extent, FINER, Finding, Inputs, Mark, Origin};
+use crate::sheet::guard::INTERVAL_SUBSTEPS;
+
+/// How long to wait where no session is awake.
+const IDLE: Duration = Duration::from_millis(250);
+
+/// A session whose window takes more than so many times what it should is passed over: it was paused, say.
+const PATIENCE: f64 = 2.0;
+
+/// Between two warnings about one session, ns.
+const WARN_EVERY_NS: u64 = 10_000_000_000;
+
+/// What audits have found of a session.
+#[derive(Debug, Clone, Default)]
+pub struct Audited {
+    /// Windows that were audited.
+    pub windows: u64,
+    /// The steps done at the end of the newest window, and the error that it added.
+    pub newest: Option<(u64, AuditedError)>,
+    /// The largest of each part in any window.
+    pub largest: AuditedError,
+    /// Windows whose error was above the tolerance.
+    pub above: u64,
+    /// Where most of the newest of those errors came from.
+    pub origin: Option<Origin>,
+    /// How often the tissue was corrected.
+    pub corrections: u64,
+    /// The newest of these.
+    pub correction: Option<Correction>,
+    extent: Extent,
+    warned_ns: Option<u64>,
+}
+
+/// What the auditor counts, of all sessions, since it began.
+#[derive(Debug, Default)]
+pub struct AuditTally {
+    /// Windows that were audited.
+    pub windows: Count,
+    /// Windows whose error was above the tolerance.
+    pub above: Count,
+    /// Corrections.
+    pub corrections: Count,
+    /// Processor time, ns.
+    pub busy_ns: Count,
+}
+
+/// All sessions of a server.
+pub(super) type Sessions = Arc<Mutex<BTreeMap<String, Arc<Live>>>>;
+
+/// The thread, as others see it.
+#[derive(Debug, Default)]
+pub(super) struct Auditor {
+    stopped: Mutex<bool>,
+    wake: Condvar,
+    pub(super) tally: AuditTally,
+}
+
+impl Auditor {
+    pub(super) fn stop(&self) {
+        *lock(&self.stopped) = true;
+        self.wake.notify_all();
+    }
+
+    /// Waits so long, or until it is to stop. False if it is.
+    fn wait(&self, time: Duration) -> bool {
+        let stopped = lock(&self.stopped);
+        let waited = self.wake.wait_timeout_while(stopped, time, |stopped| !*stopped);
+        !*waited.unwrap_or_else(PoisonError::into_inner).0
+    }
+
+    /// The thread's work, with `share` of a core.
+    pub(super) fn work(&self, sessions: &Sessions, share: f64) {
+        let mut duty = Duty { auditor: self, share, since_ns: thread_time_ns() };
+        let mut last = 0;
+        loop {
+            let next = {
+                let sessions = lock(sessions);
+                let awake = || sessions.values().filter(|live| live.cost.share() > 0.0);
+                let after = awake().filter(|live| live.number > last).min_by_key(|live| live.number);
+                after.or_else(|| awake().min_by_key(|live| live.number)).cloned()
+            };
+            let goes_on = match next {
+                Some(live) => {
+                    last = live.number;
+                    // A fault in one audit must not end the others.
+                    let audited = catch_unwind(AssertUnwindSafe(|| audit(&live, &mut duty, &self.tally)));
+                    if audited.is_err() {
+                        tracing::error!(session = %live.id, "a fault of the program ended an audit");
+                    }
+                    // Also where nothing came of it: to ask is work too.
+                    duty.rest() && self.wait(Duration::from_millis(1))
+                }
+                None => self.wait(IDLE),
+            };
+            if !goes_on {
+                return;
+            }
+        }
+    }
+}
+
+/// Keeps the thread to its share of a core.
+struct Duty<'a> {
+    auditor: &'a Auditor,
+    share: f64,
+    since_ns: u64,
+}
+
+impl Duty<'_> {
+    /// Rests for what was done since the last rest. False if it is time to stop.
+    #[allow(clippy::cast_precision_loss)]
+    fn rest(&mut self) -> bool {
+        let now_ns = thread_time_ns();
+        let busy_ns = now_ns.saturating_sub(self.since_ns);
+        self.since_ns = now_ns;
+        self.auditor.tally.busy_ns.add(busy_ns);
+        let rest_s = busy_ns as f64 * 1e-9 * (self.share.recip() - 1.0).max(0.0);
+        self.auditor.wait(Duration::from_secs_f64(rest_s))
+    }
+}
+
+/// Audits one window of a session, if one comes.
+fn audit(live: &Live, duty: &mut Duty<'_>, tally: &AuditTally) {
+    let (marks, told) = sync_channel(2);
+    live.inbox.send(live.number, Request::Audit(Inputs::default(), marks));
+    let Some((model, opening)) = next(&told, longest(&live.model)).and_then(|mark| match mark {
+        Mark::Begin(look) => Some((look.model().clone(), look.open())),
+        Mark::End(..) | Mark::Dropped => None,
+    }) else {
+        return;
+    };
+    let Some(Mark::End(look, inputs)) = next(&told, longest(&model)) else { return };
+    let audit = opening.close(look, inputs);
+    let extent = lock(&live.audited).extent;
+    let Some(finding) = audit.work(FINER, extent, &mut || duty.rest()) else { return };
+    tell(live, &finding, tally);
+    if finding.origin.is_some() && model.scene.stepping.correct {
+        correct(live, &model, &finding, tally);
+    }
+}
+
+fn next(told: &Receiver<Mark>, within: Duration) -> Option<Mark> {
+    told.recv_timeout(within).ok()
+}
+
+/// How long to wait for the beginning or the end of a window: with one interval of checkpoints before each.
+#[allow(clippy::cast_precision_loss)]
+fn longest(model: &Model) -> Duration {
+    let interval = (INTERVAL_SUBSTEPS / u64::from(model.plan.substeps)).max(1);
+    let steps = (model.window_steps() + interval) as f64;
+    Duration::from_secs_f64((PATIENCE * steps / model.scene.stepping.rate_hz + 1.0).min(600.0))
+}
+
+fn tell(live: &Live, finding: &Finding, tally: &AuditTally) {
+    let Finding { step, error, origin, largest, .. } = *finding;
+    let is_above = origin.is_some();
+    tally.windows.add(1);
+    tally.above.add(u64::from(is_above));
+    let mut audited = lock(&live.audited);
+    audited.windows += 1;
+    audited.above += u64::from(is_above);
+    audited.newest = Some((step, error));
+    audited.largest = audited.largest.max(error);
+    audited.extent = largest;
+    audited.origin = origin.or(audited.origin);
+    let Some(origin) = origin else { return };
+    let now = now_ns();
+    if audited.warned_ns.is_some_and(|warned| now < warned + WARN_EVERY_NS) {
+        return;
+    }
+    audited.warned_ns = Some(now);
+    let above = audited.above;
+    drop(audited);
+    let (asked, from) = (live.model.scene.stepping.tolerance, origin.describe());
+    tracing::warn!(
+        session = %live.id, step, displacement = error.displacement, force = error.force, asked, windows = above,
+        "audited error above the tolerance: most of it comes from {from}"
+    );
+}
+
+/// Steps the tissue more accurately from the next step on. Nothing happens if meanwhile it is another.
+fn correct(live: &Live, audited: &Arc<Model>, finding: &Finding, tally: &AuditTally) {
+    let base = live.at_intake(|intake, _| intake.changed_to());
+    if !Arc::ptr_eq(base.as_ref().unwrap_or(&live.model), audited) {
+        return;
+    }
+    let Some(correction) = audited.correction(finding, finding.step, &live.limits) else { return };
+    let corrected = audited.corrected(&correction, &live.limits).and_then(|model| {
+        check_work(&model, &live.limits)?;
+        let step = live.at_intake(|intake, now| intake.change(base.as_ref(), &model, None, now))?;
+        Ok(step.map(|step| Correction { step, ..correction }))
+    });
+    match corrected {
+        Ok(Some(told)) => {
+            tally.corrections.add(1);
+            tracing::info!(
+                session = %live.id, step = told.step, integrator = told.integrator.name(), substeps = told.substeps, precision = told.precision.name(),
+                sleep_tolerance = told.sleep_tolerance, "tissue corrected: {} had too large an error", told.reason
+            );
+            let mut audited = lock(&live.audited);
+            audited.corrections += 1;
+            audited.correction = Some(told);
+        }
+        Ok(None) => {}
+        Err(refusal) => tracing::debug!(session = %live.id, %refusal, "no correction"),
+    }
+}

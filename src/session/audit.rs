@@ -1,0 +1,114 @@
+//! The audit of a run: a twin in f64 with a quarter of the substep, of which nothing sleeps, gets the same inputs, step
+//! by step. The records of the two are compared. With `[stepping] correct`, windows of the run are audited one after the
+//! other as a server does it, and an error above the tolerance changes how the tissue is stepped.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+
+use super::Session;
+use super::command::Due;
+use crate::scene::Precision;
+use crate::scene::record::{AuditedError, Record};
+use crate::scene::script::Script;
+use crate::sheet::Model;
+use crate::sheet::audit::{Extent, FINER, Finding, Inputs, Mark, Opening};
+
+/// What a session is compared with.
+fn twin_of(model: &Model) -> Arc<Model> {
+    model.twin(FINER, Precision::F64)
+}
+
+/// A session that is more accurate than the one beside it, and what the two differ by.
+pub struct Twin {
+    session: Session,
+    records: VecDeque<Record>,
+    differences: Extent,
+    largest: Extent,
+}
+
+impl Twin {
+    /// Beside a session of `model` that has not begun.
+    pub fn new(model: &Model) -> Self {
+        let session = Session::new(&twin_of(model));
+        Twin { session, records: VecDeque::new(), differences: Extent::default(), largest: Extent::default() }
+    }
+
+    /// To tell its tools what those of the other session are told.
+    pub fn session(&mut self) -> &mut Session {
+        &mut self.session
+    }
+
+    /// Changes the tissue as that of the other session.
+    pub fn change(&mut self, model: &Model) {
+        self.session.change(&twin_of(model));
+    }
+
+    /// One step, before the other session does it.
+    pub fn advance(&mut self, due: &[Due], script: &Script) {
+        let Twin { session, records, .. } = self;
+        session.advance(&mut due.to_vec(), |session| {
+            if session.step_count().is_multiple_of(script.sample_every) {
+                records.push_back(session.record(Some(&script.sample_points)));
+            }
+        });
+    }
+
+    /// Why it can't go on, if it can't.
+    pub fn hold_reason(&self) -> Option<String> {
+        self.session.hold_reason().map(|reason| format!("the audit's twin: {reason}"))
+    }
+
+    /// The other session has made its next record.
+    pub fn compare(&mut self, record: &Record) {
+        let Some(truth) = self.records.pop_front() else { return };
+        for (point, truth) in record.points.iter().zip(&truth.points) {
+            for c in 0..3 {
+                let (displacement_m, force_n) = (truth.displacement_m[c], truth.reaction_n[c]);
+                let found = Extent {
+                    displacement_m: (point.displacement_m[c] - displacement_m).abs(),
+                    force_n: (point.reaction_n[c] - force_n).abs(),
+                };
+                self.differences = self.differences.max(found);
+                let size = Extent { displacement_m: displacement_m.abs(), force_n: force_n.abs() };
+                self.largest = self.largest.max(size);
+            }
+        }
+    }
+
+    /// The largest difference of all records so far, relative to the largest value.
+    pub fn error(&self) -> AuditedError {
+        self.differences.relative_to(self.largest)
+    }
+}
+
+/// Audits windows of a session one after the other. Which steps they are depends on the scene and its inputs alone.
+#[derive(Default)]
+pub struct Windows {
+    opening: Option<Opening>,
+    largest: Extent,
+    begun: bool,
+}
+
+impl Windows {
+    /// After a step, and before the first: audits the window that is over, if one is.
+    pub fn look(&mut self, session: &mut Session) -> Option<Finding> {
+        if !std::mem::replace(&mut self.begun, true) {
+            session.watch(Inputs::default());
+        }
+        let mut found = None;
+        match session.take_mark()? {
+            Mark::Begin(look) => {
+                self.opening = Some(look.open());
+                return None;
+            }
+            Mark::End(look, inputs) => {
+                let audit = self.opening.take().map(|opening| opening.close(look, inputs));
+                found = audit.and_then(|audit| audit.work(FINER, self.largest, &mut || true));
+            }
+            Mark::Dropped => self.opening = None,
+        }
+        self.largest = found.map_or(self.largest, |finding| finding.largest);
+        session.watch(Inputs::default());
+        found
+    }
+}

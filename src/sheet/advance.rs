@@ -1,0 +1,145 @@
+//! The stage of a sweep that advances every point by a scheme, under the tools' forces.
+#![allow(unsafe_code)]
+// Iterators and closures over vectors are not always inlined, and then run without the instructions of their caller: ten
+// times slower.
+#![allow(clippy::needless_range_loop, clippy::manual_map)]
+
+use std::ops::Range;
+
+use super::applied::{self, Pull};
+use super::field::{BLOCK, Layout};
+use super::lanes::Vector;
+use super::real::Real;
+use super::sweep::{ANY, LEAN, MAX_KEPT, PUSHED, Scheme, Stage};
+
+/// The stage that advances every point.
+pub(super) struct Advance<'a, T: Real, C> {
+    pub(super) layout: Layout,
+    pub(super) scheme: &'a C,
+    /// u and d, three planes each.
+    pub(super) u: *mut T,
+    pub(super) d: *mut T,
+    pub(super) kept: [*mut T; MAX_KEPT],
+    /// The tools' forces, in rows `forced`.
+    pub(super) pulls: &'a [Pull<'a, T>],
+    pub(super) forced: Range<usize>,
+    /// 1 where a point moves, 0 where it is fixed; null if none is.
+    pub(super) free: *const T,
+    /// A block that sums up squares of increments: finite and small only if all are.
+    pub(super) probe: *mut T,
+    /// One that sums up the work of the tools, for each of 16 columns apart: the same at every width.
+    pub(super) work: *mut T,
+}
+
+impl<T: Real, C: Scheme<T>> Stage<T> for Advance<'_, T, C> {
+    fn duty(&self, row: usize) -> u8 {
+        match (self.free.is_null(), self.forced.contains(&row), self.pulls.len()) {
+            (true, false, _) => LEAN,
+            (true, true, 1) => PUSHED,
+            _ => ANY,
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn finish<V: Vector<Real = T>, const DUTY: u8>(
+        &self,
+        row: usize,
+        at: usize,
+        x: [V; 3],
+        n: [V; 3],
+        sums: &mut [V; 2],
+    ) {
+        let reaches = || applied::reaches(self.pulls, row, at - row * self.layout.stride);
+        let forced = DUTY != LEAN && self.forced.contains(&row) && reaches();
+        // SAFETY: the caller's promise.
+        unsafe {
+            if forced {
+                self.put::<V, DUTY, true>(row, at, x, n, sums);
+            } else {
+                self.put::<V, DUTY, false>(row, at, x, n, sums);
+            }
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn begin<V: Vector<Real = T>>(&self) -> [V; 2] {
+        // The stages of a substep add to one account, in the same order at every width.
+        // SAFETY: the caller's promise; a block is as long as the widest vector.
+        unsafe { [V::of(T::default()), if V::LANES == BLOCK { V::load(self.work) } else { V::of(T::default()) }] }
+    }
+
+    #[inline(always)]
+    unsafe fn end<V: Vector<Real = T>>(&self, [probe, work]: [V; 2]) {
+        // SAFETY: a block is as long as the widest vector.
+        unsafe {
+            V::load(self.probe).add(probe).store(self.probe);
+            if V::LANES == BLOCK {
+                work.store(self.work);
+            }
+        }
+    }
+}
+
+impl<T: Real, C: Scheme<T>> Advance<'_, T, C> {
+    /// Advances a block, on which a tool's force acts or not.
+    #[inline(always)]
+    unsafe fn put<V: Vector<Real = T>, const DUTY: u8, const FORCED: bool>(
+        &self,
+        row: usize,
+        at: usize,
+        x: [V; 3],
+        n: [V; 3],
+        sums: &mut [V; 2],
+    ) {
+        // SAFETY: the caller's promise.
+        unsafe {
+            let Layout { stride, plane, .. } = self.layout;
+            let column = at - row * stride;
+            let free = if DUTY != ANY || self.free.is_null() { None } else { Some(V::load(self.free.add(at))) };
+            // A vector as wide as a block has each of its columns in a lane of its own.
+            let apart = V::LANES < BLOCK;
+            let mut work = sums[1];
+            let mut forces = None;
+            if FORCED {
+                if apart {
+                    work = V::load(self.work.add(column % BLOCK));
+                }
+                forces = Some(if C::FORCES == 1 {
+                    applied::force_on::<V, 1>(self.pulls, row, at)
+                } else {
+                    applied::force_on::<V, 2>(self.pulls, row, at)
+                });
+            }
+            for c in 0..3 {
+                let at = at + c * plane;
+                let before = [x[c], V::load(self.d.add(at))];
+                let mut kept = [before[1]; MAX_KEPT];
+                for k in 0..C::KEPT {
+                    kept[k] = V::load(self.kept[k].add(at));
+                }
+                let force = if let Some(forces) = &forces { Some(forces[c]) } else { None };
+                let (mut x, mut d) = self.scheme.advance(before[0], before[1], n[c], &mut kept, force);
+                if let Some(free) = free {
+                    (x, d) = (x.mul(free), d.mul(free));
+                }
+                // A field decays without end, in time and towards the rim, and arithmetic on numbers below the normal range
+                // costs up to a hundred times as much. So what has a square there is 0.
+                (x, d) = (x.keep(x.counts()), d.keep(d.counts()));
+                x.store(self.u.add(at));
+                d.store(self.d.add(at));
+                for k in C::KEPT - C::WRITTEN..C::KEPT {
+                    kept[k].keep(kept[k].counts()).store(self.kept[k].add(at));
+                }
+                sums[0] = d.mul_add(d, sums[0]);
+                if let Some([_, force]) = force {
+                    work = force.mul_add(self.scheme.travel(before, [x, d]), work);
+                }
+            }
+            if FORCED && apart {
+                work.store(self.work.add(column % BLOCK));
+            } else {
+                sums[1] = work;
+            }
+        }
+    }
+}

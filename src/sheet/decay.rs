@@ -1,0 +1,57 @@
+//! Test of a sheet that rings down: no number gets so small that the processor takes long over it.
+#![allow(clippy::unwrap_used)]
+
+use glam::{DVec2, DVec3};
+
+use super::{Model, Push, Real, Sheet, Tissue};
+use crate::limits::Limits;
+use crate::scene::law::Poke;
+use crate::scene::{PAPER, Scene};
+
+/// Values of the state that are not 0, and have a square below the normal range.
+fn too_small<T: Real>(sheet: &Sheet<T>) -> usize {
+    let small = |value: &&T| **value != T::default() && value.wide().abs() < T::LEAST;
+    sheet.state.fields().map(|field| field.iter().filter(small).count()).sum()
+}
+
+fn rings_down<T: Real>(sets: &[&str]) {
+    for lanes in ["plain", "neon", "avx2", "avx512"] {
+        let mut settings: Vec<String> = sets.iter().map(|text| (*text).to_owned()).collect();
+        settings.extend([format!("stepping.lanes={lanes}"), "sheet.points=[5, 19]".to_owned()]);
+        settings.extend(["sleep.tolerance=0.0", "damping.coefficient_n_s_per_m=0.5"].map(str::to_owned));
+        let scene = Scene::parse("paper", PAPER, &settings, &Limits::default()).unwrap();
+        // Lanes that this machine does not have are refused.
+        let Ok(model) = Model::compile(&scene, &Limits::default()) else { continue };
+        let mut sheet = Sheet::<T>::new(&model);
+        let poke = Poke {
+            centre_m: scene.sheet.spacing_m * DVec2::new(2.0, 7.0),
+            force_n: DVec3::new(0.2, -0.1, 1.0),
+            falloff_per_m: 1.0 / (1.3 * scene.sheet.spacing_m),
+            falloff_offset: 0.0,
+        };
+        sheet.push(0, Some(Push::Held(poke)));
+        (0..50).for_each(|_| sheet.step().unwrap());
+        sheet.push(0, None);
+        // The way from 1 down to what rounding and the smallest number that counts leave of a vibration.
+        let mut passed = 0;
+        for step in 0.. {
+            sheet.step().unwrap();
+            assert_eq!(too_small(&sheet), 0, "{sets:?}, {lanes}, step {step}");
+            let largest = sheet.state.u.iter().map(|value| value.wide().abs()).fold(0.0, f64::max);
+            passed += usize::from(largest < 1e6 * T::LEAST);
+            if passed == 500 {
+                break;
+            }
+            assert!(step < 60_000, "{sets:?}, {lanes}: {largest:e} is left");
+        }
+    }
+}
+
+#[test]
+fn a_field_that_decays_has_no_number_whose_square_is_below_the_normal_range() {
+    rings_down::<f32>(&["stepping.integrator=central", "stepping.precision=f32"]);
+    rings_down::<f32>(&["stepping.integrator=lagged", "stepping.precision=f32", "springs.flexion=true"]);
+    rings_down::<f32>(&["stepping.integrator=rk4", "stepping.precision=f32"]);
+    rings_down::<f32>(&["stepping.integrator=exponential3", "stepping.precision=compensated"]);
+    rings_down::<f64>(&["stepping.integrator=exponential2", "stepping.precision=f64"]);
+}

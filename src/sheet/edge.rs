@@ -1,0 +1,119 @@
+//! The left edge of a strip: springs that begin in the column beside it and pull at its first.
+//!
+//! They are evaluated along the column, as many rows at a time as a vector has lanes: a block of columns for each row would
+//! cost as much as one that is awake. Each lane does what the sweep would do for its row, in the same order: the bits are
+//! the same.
+#![allow(unsafe_code)]
+// Iterators over vectors are not always inlined, and then run without the instructions of their caller: ten times slower.
+#![allow(clippy::needless_range_loop)]
+
+use super::field::{BLOCK, Layout};
+use super::lanes::Vector;
+use super::springs::Springs;
+use super::sweep::{Stage, Sweep, difference, excess, load};
+
+/// What the column to the left of a strip does to the strip's first, as many rows at a time as a vector has lanes.
+pub(super) struct Edge<V: Vector> {
+    /// The strip's first column.
+    column: usize,
+    /// The first of the rows that are known, and where they end.
+    from: usize,
+    to: usize,
+    /// What each row passes on to the right: as the sweep would, row by row.
+    across: [[V::Real; BLOCK]; 3],
+    /// Of the diagonals, what each row leaves to the row below.
+    leaves: [V; 3],
+}
+
+impl<V: Vector> Edge<V> {
+    /// Of a strip whose first row is `row`: what the one above leaves is in the carry, if a strip has been there.
+    ///
+    /// # Safety
+    /// As for `Sweep::rows`; `column` is not 0.
+    #[inline(always)]
+    pub(super) unsafe fn new<S: Stage<V::Real>>(sweep: &Sweep<'_, V::Real, S>, column: usize, row: usize) -> Self {
+        let Layout { stride, plane, .. } = sweep.layout;
+        // SAFETY: the caller's promise: the processor has the instructions, the carry has a second row.
+        let leaves = unsafe {
+            let left = sweep.carry.add(stride + column - 1);
+            [V::of(*left), V::of(*left.add(plane)), V::of(*left.add(2 * plane))]
+        };
+        Edge { column, from: row, to: row, across: [[V::Real::default(); BLOCK]; 3], leaves }
+    }
+
+    /// What the column passes to the right in row `i`, in the last lane; rows are asked for one after the other.
+    ///
+    /// # Safety
+    /// As for `Sweep::rows`; the strip's rows from `i` on have not been advanced.
+    #[inline(always)]
+    pub(super) unsafe fn left_of<S: Stage<V::Real>>(&mut self, sweep: &Sweep<'_, V::Real, S>, i: usize) -> [V; 3] {
+        if i == self.to {
+            // SAFETY: the caller's promise.
+            unsafe { self.evaluate(sweep, i) };
+        }
+        let (k, proof) = (i - self.from, self.leaves[0]);
+        [proof.splat(self.across[0][k]), proof.splat(self.across[1][k]), proof.splat(self.across[2][k])]
+    }
+
+    #[inline(always)]
+    unsafe fn evaluate<S: Stage<V::Real>>(&mut self, sweep: &Sweep<'_, V::Real, S>, row: usize) {
+        let Layout { rows, stride, plane, .. } = sweep.layout;
+        let Springs { structural, shear, .. } = sweep.springs;
+        // Three components of both columns, and a row more; what lies below the sheet is not used.
+        const LONG: usize = BLOCK + 1;
+        let mut columns = [[V::Real::default(); 3 * LONG]; 2];
+        for k in 0..=V::LANES {
+            // SAFETY: the caller's promise: a row beyond the last can be read.
+            let at = unsafe { sweep.x.add((row + k).min(rows) * stride + self.column - 1) };
+            for c in 0..3 {
+                // SAFETY: as above.
+                unsafe {
+                    columns[0][c * LONG + k] = *at.add(c * plane);
+                    columns[1][c * LONG + k] = *at.add(c * plane + 1);
+                }
+            }
+        }
+        let (first, second) = (columns[0].as_ptr(), columns[1].as_ptr());
+        // SAFETY: each component has room for a vector that begins at 1.
+        let (here, right) = unsafe { (load::<V>(first, LONG), load::<V>(second, LONG)) };
+        // SAFETY: as above.
+        let (below, beside) = unsafe { (load::<V>(first.add(1), LONG), load::<V>(second.add(1), LONG)) };
+        let (r, a, b) = (difference(&right, &here), difference(&beside, &here), difference(&below, &right));
+        let qr = excess(r[1], &r, [1, 0, 2]);
+        let (qa, qb) = (excess(a[0].add(a[1]), &a, [0, 1, 2]), excess(b[0].sub(b[1]), &b, [0, 1, 2]));
+        let (mut wr, mut wa, mut wb) = (structural.near(qr), shear.near(qa), shear.near(qb));
+        if V::any(V::either(structural.is_far(qr), shear.is_far(qa.farther(qb)))) {
+            (wr, wa, wb) = (structural.weight(qr), shear.weight(qa), shear.weight(qb));
+        }
+        let last = r[0].first((rows - 1).saturating_sub(row).min(V::LANES));
+        for c in 0..3 {
+            let fr = if c == 1 { wr.mul_add(r[c], wr) } else { wr.mul(r[c]) };
+            let fa = if c < 2 { wa.mul_add(a[c], wa) } else { wa.mul(a[c]) };
+            let fb = [wb.mul_add(b[c], wb), wb.mul_sub(b[c], wb), wb.mul(b[c])][c];
+            let above = fa.shift(self.leaves[c]);
+            // The last row of the sheet has only the spring to the right.
+            let across = V::select(last, fb.sub(fr).sub(above), fr.add(above));
+            // SAFETY: a block is as long as the widest vector.
+            unsafe { across.store(self.across[c].as_mut_ptr()) };
+            self.leaves[c] = fa;
+        }
+        (self.from, self.to) = (row, row + V::LANES);
+    }
+
+    /// Leaves to the strip below, which begins at row `end`, what a block of the column would have left.
+    ///
+    /// # Safety
+    /// As for `Sweep::rows`.
+    #[inline(always)]
+    pub(super) unsafe fn leave<S: Stage<V::Real>>(&self, sweep: &Sweep<'_, V::Real, S>, end: usize) {
+        let Layout { stride, plane, .. } = sweep.layout;
+        for c in 0..3 {
+            let mut leaves = [V::Real::default(); BLOCK];
+            // SAFETY: a block is as long as the widest vector; the carry has a second row.
+            unsafe {
+                self.leaves[c].store(leaves.as_mut_ptr());
+                *sweep.carry.add(stride + c * plane + self.column - 1) = leaves[end - 1 - self.from];
+            }
+        }
+    }
+}

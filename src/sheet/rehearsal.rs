@@ -1,0 +1,235 @@
+//! A rehearsal: a small sheet of a scene's tissue, pushed hard, to measure by how much a scheme errs.
+//!
+//! The error of a scheme depends on the spectrum of the sheet, on its geometry once springs turn and stretch, and on the
+//! rounding of a number format. A formula knows the first alone: on random scenes its estimate was between 0.04 and
+//! 10,000 times the true error. So the scheme itself is run, on at most [`SIDE`]² points for half a second, under a few
+//! loads that are harder than most scripts ([`LOADS`]). The truth is the same in f64 with a substep so short that half of it
+//! changes nothing. The true error of a script on the whole sheet is then at most [`MARGIN`] times the rehearsed one
+//! (`make bench-tolerance`). Forces that change smoothly err by 10 to 1000 times less than those that jump, and a choice
+//! that is made before the script is known can't use that.
+
+use std::sync::Arc;
+
+use glam::DVec3;
+
+use super::applied::Push;
+use super::integrate::Oscillator;
+use super::model::{Model, Plan};
+use super::{at_rest, lanes, stability};
+use crate::scene::law::{CentreLaw, ForceLaw, Profile, StrengthLaw};
+use crate::scene::{Fixed, Integrator, Precision, Scene};
+
+/// Points along a side at most. Larger sheets err alike: a force spreads over some points.
+const SIDE: usize = 12;
+
+/// How long a rehearsal lasts, s. Rounding and phase errors grow with time where little damps them.
+const COURSE_S: f64 = 0.5;
+
+/// Steps of a rehearsal at most and, of slow steps, at least.
+const STEPS: (f64, f64) = (40.0, 4000.0);
+
+/// Substeps of a rehearsal with the longest stable substep, at most: bounds the work for absurd scenes.
+const SUBSTEPS: f64 = 8000.0;
+
+/// Where each step needs more substeps than this to be stable, a rehearsal looks at parts of steps.
+const SUBSTEPS_A_LOOK: u32 = 8;
+
+/// Errors that grow with time, where nothing damps them, are expected for so long, s.
+pub(super) const LASTING_S: f64 = 2.0;
+
+/// By how much the true error of a script may exceed the rehearsed one.
+const MARGIN: f64 = 5.0;
+
+/// For so long after a force jumps its error may be [`ALLOWANCE`] times the tolerance, s: a jump starts the fastest
+/// vibrations, which no substep follows exactly and which are over before anybody feels them.
+const SOON_S: f64 = 0.02;
+
+/// See [`SOON_S`].
+const ALLOWANCE: f64 = 10.0;
+
+/// Substeps of the truth at most: bounds the work for absurd scenes and tolerances.
+const MOST_SUBSTEPS: u64 = 400_000;
+
+/// How often the truth's substep is halved before it counts as good as it gets.
+const MOST_HALVINGS: u32 = 6;
+
+/// What pushes the small sheet, from its first step on.
+struct Load {
+    profile: Profile,
+    /// Part of the course that it takes to show its errors.
+    part: f64,
+    /// c of the falloff, in 1/spacing.
+    falloff: f64,
+    /// The force, in (K″ + 0.3·k)·spacing: what bends a point by about so many spacings.
+    force: DVec3,
+}
+
+/// A sharp one excites every vibration. Under a wide one the springs' forces are small differences of large displacements,
+/// which is where rounding shows. One that swings as fast as scripts usually do shows how well a scheme follows a force.
+const LOADS: [Load; 3] = [
+    Load { profile: Profile::Constant, part: 1.0, falloff: 3.0, force: DVec3::new(0.3, 0.15, -0.37) },
+    Load { profile: Profile::Constant, part: 1.0, falloff: 0.3, force: DVec3::new(0.1, 0.06, -0.16) },
+    Load {
+        profile: Profile::Sine { frequency_hz: 20.0 },
+        part: 0.25,
+        falloff: 1.0,
+        force: DVec3::new(0.1, 0.06, -0.16),
+    },
+];
+
+/// Displacement and reaction of the points that are looked at, step by step.
+type Course = Vec<[[DVec3; 2]; 3]>;
+
+/// The small sheet, and how it truly moves.
+pub(super) struct Rehearsal {
+    scene: Scene,
+    sheet: Oscillator,
+    /// Parts of the scene's step that count as a step here.
+    parts: u32,
+    steps: usize,
+    /// None: the motion is chaotic, or beyond every bound.
+    truth: [Option<Course>; LOADS.len()],
+}
+
+impl Rehearsal {
+    /// Of a scene, with a truth that is good enough to judge schemes by `tolerance`.
+    pub(super) fn new(scene: &Scene, tolerance: f64) -> Self {
+        let sheet = Oscillator::of(scene);
+        let step_s = scene.stepping.rate_hz.recip();
+        let parts = stability::stable_substeps(Integrator::Exponential4, step_s, &sheet) / SUBSTEPS_A_LOOK;
+        let parts = parts.min(scene.stepping.substeps.unwrap_or(u32::MAX)).max(1);
+        let mut small = scene.clone();
+        small.sheet.points = scene.sheet.points.map(|points| points.min(SIDE));
+        if let Fixed::Points(points) = &mut small.sheet.fixed {
+            points.retain(|[i, j]| *i < SIDE && *j < SIDE);
+        }
+        if small.sheet.is_fixed(pushed(&small)) {
+            small.sheet.fixed = Fixed::Points(Vec::new());
+        }
+        small.stepping.rate_hz = scene.stepping.rate_hz * f64::from(parts);
+        let least = stability::stable_substeps(Integrator::Exponential4, small.stepping.rate_hz.recip(), &sheet);
+        let most_steps = STEPS.1.min(SUBSTEPS / f64::from(least)).max(STEPS.0);
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+        let steps = (COURSE_S * small.stepping.rate_hz).clamp(STEPS.0, most_steps) as usize;
+        let mut rehearsal = Rehearsal { scene: small, sheet, parts, steps, truth: [const { None }; LOADS.len()] };
+        rehearsal.truth = LOADS.each_ref().map(|load| rehearsal.true_course(load, least, tolerance));
+        rehearsal
+    }
+
+    /// Halves the substep until that changes less than the tolerance: an error of fifth order is then 32 times smaller.
+    fn true_course(&self, load: &Load, least: u32, tolerance: f64) -> Option<Course> {
+        let mut substeps = least;
+        let mut coarse = self.course(load, Integrator::Exponential4, substeps, Precision::F64);
+        for _ in 0..MOST_HALVINGS {
+            substeps = substeps.saturating_mul(2);
+            if u64::from(substeps) * self.steps as u64 > MOST_SUBSTEPS {
+                break;
+            }
+            let fine = self.course(load, Integrator::Exponential4, substeps, Precision::F64)?;
+            if coarse.is_some_and(|coarse| self.difference(load, &fine, &coarse) <= tolerance) {
+                return Some(fine);
+            }
+            coarse = Some(fine);
+        }
+        None
+    }
+
+    /// What to expect of a scheme with so many substeps in a step of the scene, in a format: the error of displacement and
+    /// force, the larger, each relative to its largest. Infinite if the motion can't be followed.
+    pub(super) fn error(&self, integrator: Integrator, substeps: u32, precision: Precision) -> f64 {
+        let substeps = (substeps / self.parts).max(1);
+        let error = |(load, truth): (&Load, &Option<Course>)| -> Option<f64> {
+            Some(self.difference(load, truth.as_ref()?, &self.course(load, integrator, substeps, precision)?))
+        };
+        let errors = LOADS.iter().zip(&self.truth).map(|pair| error(pair).unwrap_or(f64::INFINITY));
+        MARGIN * errors.fold(0.0, f64::max)
+    }
+
+    /// How many substeps a scheme takes in whole rehearsed steps: no fewer than `substeps`.
+    pub(super) fn whole(&self, substeps: u32) -> u32 {
+        substeps.div_ceil(self.parts).saturating_mul(self.parts)
+    }
+
+    /// The course of a scheme; none if the guard finds fault with it.
+    fn course(&self, load: &Load, integrator: Integrator, substeps: u32, precision: Precision) -> Option<Course> {
+        let scene = &self.scene;
+        let plan = Plan::new(integrator, substeps, scene.stepping.rate_hz.recip(), &self.sheet);
+        let model = Arc::new(Model {
+            points: scene.sheet.points,
+            fixed: scene.sheet.fixed_indices(),
+            omega_bound_per_s: self.sheet.omega_bound_per_s(),
+            plan,
+            precision,
+            expected_error: 0.0,
+            sleep_tolerance: 0.0,
+            lanes: lanes::available(scene.stepping.lanes).unwrap_or(crate::scene::Lanes::Plain),
+            warnings: Vec::new(),
+            corrected: None,
+            scene: scene.clone(),
+        });
+        let [nx, ny] = scene.sheet.points;
+        let (spacing_m, at) = (scene.sheet.spacing_m, pushed(scene));
+        let stiffness = scene.virtual_stiffness_n_per_m + 0.3 * scene.springs.stiffness_n_per_m;
+        // Without any spring, what brings a point about as far within a step.
+        let free = scene.sheet.point_mass_kg * scene.stepping.rate_hz * scene.stepping.rate_hz;
+        let newtons = spacing_m * if stiffness > 0.0 { stiffness } else { free };
+        let mut tissue = at_rest(&model);
+        let law = ForceLaw {
+            centre: CentreLaw::Hops(vec![(0, scene.sheet.rest_m(at))]),
+            strength: StrengthLaw::Scaled(load.force * newtons, load.profile),
+            falloff_per_m: load.falloff / spacing_m,
+            falloff_offset: 0.0,
+        };
+        tissue.push(0, Some(Push::Law(law)));
+        let looked_at = [at, [nx / 2, ny / 2], [1.min(nx - 1), 1.min(ny - 1)]].map(|point| model.index_of(point));
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+        let steps = (load.part * self.steps as f64) as usize;
+        let mut course = Vec::with_capacity(steps);
+        for _ in 0..steps {
+            tissue.step().ok()?;
+            course.push(looked_at.map(|index| {
+                let point = tissue.point(index);
+                [point.displacement_m, point.reaction_n()]
+            }));
+        }
+        (tissue.guard_events() == 0).then_some(course)
+    }
+
+    /// The largest difference of two courses, of displacement and force, relative to the largest of each. What grows in
+    /// the second half of the course is expected to go on growing for as long as vibrations last.
+    fn difference(&self, load: &Load, truth: &Course, other: &Course) -> f64 {
+        #[allow(clippy::cast_precision_loss)]
+        let course_s = self.steps as f64 / self.scene.stepping.rate_hz;
+        // A short course has no time to wait.
+        let soon_s = if load.profile == Profile::Constant { SOON_S.min(0.04 * course_s) } else { 0.0 };
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+        let soon = (soon_s * self.scene.stepping.rate_hz).ceil() as usize;
+        let (mut largest, mut error, mut early) = ([0.0_f64; 2], [0.0_f64; 2], [0.0_f64; 2]);
+        for (step, (a, b)) in truth.iter().zip(other).enumerate() {
+            let weight = if step < soon { 1.0 / ALLOWANCE } else { 1.0 };
+            if step == truth.len() / 2 {
+                early = error;
+            }
+            for which in 0..2 {
+                for (a, b) in a.iter().zip(b) {
+                    largest[which] = largest[which].max(a[which].abs().max_element());
+                    error[which] = error[which].max(weight * (a[which] - b[which]).abs().max_element());
+                }
+            }
+        }
+        let decay_s = 2.0 * self.sheet.mass_kg / self.sheet.damping_n_s_per_m;
+        let halves_to_come = ((decay_s.min(LASTING_S) - course_s) / (0.5 * course_s)).max(0.0);
+        let relative = |which: usize| {
+            let growth = if error[which] > 1.5 * early[which] { error[which] - early[which] } else { 0.0 };
+            // Where nothing moves nothing errs.
+            if largest[which] > 0.0 { (error[which] + growth * halves_to_come) / largest[which] } else { 0.0 }
+        };
+        relative(0).max(relative(1))
+    }
+}
+
+/// The point that is pushed.
+fn pushed(scene: &Scene) -> [usize; 2] {
+    let [nx, ny] = scene.sheet.points;
+    [nx / 3, 2 * ny / 5]
+}

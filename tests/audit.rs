@@ -1,0 +1,398 @@
+//! The measured error: of a run, of windows of steps, and of live sessions; and what is done about it.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
+
+mod common;
+#[path = "common/server.rs"]
+mod server;
+
+use std::io::BufRead;
+use std::time::Instant;
+
+use common::{SMALL, model, playing, scene_with, script};
+use glam::DVec3;
+use palpate::limits::Limits;
+use palpate::scene::record::{AuditedError, Correction, Summary};
+use palpate::scene::script::Action;
+use palpate::scene::tip::Tip;
+use palpate::scene::{BUILT_IN, Integrator, Precision, Scene};
+use palpate::session::Session;
+use palpate::session::audit::Windows;
+use palpate::session::command::Due;
+use palpate::session::run::{self, command};
+use palpate::sheet::audit::{Extent, FINER, Finding, Inputs, Mark, Origin};
+use palpate::wire::pb;
+use pb::create_session_request::Source;
+use serde_json::Value;
+use server::{PATIENCE, Server, Touch, force};
+
+/// A force that comes and goes, beside the middle.
+const PULSE: &str = "duration_s = 1.0\nsample_every_s = 0.02\nsample_points = [[3, 2], [1, 1], [5, 3]]\n[[force]]\n\
+    point = [3, 2]\nforce_n = [0.1, 0.05, -0.3]\nfalloff_per_m = 20.0\nfalloff_offset = 0.0\n\
+    profile = { type = \"pulse\", on_s = 0.1, off_s = 0.4 }\n";
+
+/// A force that never rests, along a way.
+const SINE: &str = "duration_s = 2.0\nsample_every_s = 0.02\nsample_points = [[3, 2], [1, 1], [5, 3]]\n[[force]]\n\
+    path = { from_m = [0.1, 0.1], velocity_m_per_s = [0.03, 0.01] }\nforce_n = [0.05, 0.1, -0.3]\n\
+    falloff_per_m = 20.0\nfalloff_offset = 0.0\nprofile = { type = \"sine\", frequency_hz = 3.0 }\n";
+
+/// A point that is taken and moved.
+const GRASP: &str = "duration_s = 1.0\nsample_every_s = 0.02\nsample_points = [[3, 2], [2, 2], [5, 3]]\n[[tool]]\n\
+    point = [3, 2]\nmoves = [{ from_s = 0.0, to_s = 0.2, by_m = [0.0, 0.01, 0.02] }, \
+    { from_s = 0.5, to_s = 0.6, by_m = [0.01, 0.0, -0.03] }]\n";
+
+/// Runs a script, audited or not: the summary, and the records as they were written.
+fn play(scene: &Scene, text: &str, held: bool, audited: bool) -> (Summary, Vec<Value>) {
+    let script = script(text, scene);
+    let mut output = Vec::new();
+    let run = if audited { run::audited } else { run::run };
+    let limits = Limits::default();
+    let summary = run(&model(scene), &script, held, &limits, &mut output, &|| 0.0, &mut |_| {}).unwrap();
+    let lines = String::from_utf8(output).unwrap();
+    let lines = lines.lines().map(|line| serde_json::from_str::<Value>(line).unwrap());
+    (summary, lines.filter(|line| line.get("time_s").is_some()).collect())
+}
+
+/// The largest difference of any component of displacement and of reaction, relative to the largest component of each.
+fn true_error(records: &[Value], truth: &[Value]) -> AuditedError {
+    let numbers = |records: &[Value], key: &str| -> Vec<f64> {
+        let points = records.iter().flat_map(|record| record["points"].as_array().unwrap().clone());
+        points
+            .flat_map(|point| point[key].as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect::<Vec<_>>())
+            .collect()
+    };
+    let part = |key: &str| {
+        let (found, truth) = (numbers(records, key), numbers(truth, key));
+        assert_eq!(found.len(), truth.len());
+        let differences = found.iter().zip(&truth).map(|(a, b)| (a - b).abs());
+        differences.fold(0.0, f64::max) / truth.iter().map(|v| v.abs()).fold(0.0, f64::max)
+    };
+    AuditedError { displacement: part("displacement_m"), force: part("reaction_n") }
+}
+
+#[test]
+fn an_audit_finds_an_error_that_is_there() {
+    let coarse: [&[&str]; 6] = [
+        &["stepping.integrator=central", "stepping.substeps=1"],
+        &["stepping.integrator=lagged", "stepping.substeps=1"],
+        &["stepping.integrator=exponential2", "stepping.substeps=1"],
+        &["stepping.integrator=exponential3", "stepping.substeps=1", "stepping.precision=compensated"],
+        &["stepping.integrator=rk4", "stepping.substeps=1"],
+        &["stepping.integrator=central", "stepping.substeps=2", "damping.coefficient_n_s_per_m=2.0"],
+    ];
+    for (index, settings) in coarse.into_iter().enumerate() {
+        for (name, text) in [("pulse", PULSE), ("sine", SINE), ("grasp", GRASP)] {
+            for held in [false, true] {
+                let with = |more: &[&str]| scene_with(SMALL, &[settings, &["stepping.rate_hz=250"], more].concat());
+                let (summary, records) = play(&with(&[]), text, held, true);
+                let exact = ["stepping.integrator=auto", "stepping.substeps=auto", "stepping.precision=f64"];
+                let exact = with(&[&exact[..], &["stepping.tolerance=1e-10", "sleep.tolerance=0"]].concat());
+                let truth = true_error(&records, &play(&exact, text, held, false).1);
+                let audited = summary.audited_error.unwrap();
+                let parts = [(audited.displacement, truth.displacement), (audited.force, truth.force)];
+                for (audited, truth) in parts {
+                    assert!(truth > 1e-7, "{index} {name} {held}: there is no error to find: {truth:e}");
+                    let ratio = audited / truth;
+                    assert!((0.5..2.0).contains(&ratio), "{index} {name} {held}: {audited:e} of {truth:e}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn an_audit_of_a_good_scene_is_within_its_tolerance() {
+    for (name, text) in BUILT_IN {
+        let scene = scene_with(text, &[]);
+        let file = format!("{}/scripts/vertical-60.toml", env!("CARGO_MANIFEST_DIR"));
+        let error = play(&scene, &std::fs::read_to_string(file).unwrap(), false, true).0.audited_error.unwrap();
+        assert!(error.largest() <= scene.stepping.tolerance && error.largest() > 0.0, "{name}: {error:?}");
+    }
+}
+
+/// What a client tells tools at a step.
+type Told = fn(u64) -> Vec<(usize, Action)>;
+
+/// A touch that presses, slides and lets go; a spherical grasp would hold.
+fn touching(grasps: bool, step: u64) -> Vec<(usize, Action)> {
+    let t = step as f64 / 250.0;
+    let tip = Tip { radius_m: 0.06, grasps, ..Tip::default() };
+    let depth_m = 0.004 * (1.0 - (std::f64::consts::TAU * 1.5 * t).cos());
+    vec![(0, Action::Lead { place_m: DVec3::new(0.13 + 0.02 * t, 0.1, 0.001 - depth_m), tip })]
+}
+
+fn pushing(step: u64) -> Vec<(usize, Action)> {
+    let scene = scene_with(SMALL, &["stepping.rate_hz=250"]);
+    script(SINE, &scene).actions_at(step).collect()
+}
+
+fn grasping(step: u64) -> Vec<(usize, Action)> {
+    let z = 0.02 * (step as f64 / 250.0 * 9.0).sin();
+    vec![(1, Action::Grasp { point: [2, 2], displacement_m: DVec3::new(0.0, 0.5 * z, z) })]
+}
+
+/// Runs a session with commands; `look` is called after each step.
+fn commanded(scene: &Scene, told: Told, steps: u64, mut look: impl FnMut(&mut Session)) -> Session {
+    let mut session = Session::new(&model(scene));
+    for step in 0..steps {
+        let due = |(tool, action)| Due {
+            command: command(tool, step, action),
+            late: false,
+            late_commands: 0,
+            ends_lease: false,
+        };
+        session.advance(&mut told(step).into_iter().map(due).collect(), |_| {});
+        assert_eq!(session.hold_reason(), None);
+        look(&mut session);
+    }
+    session
+}
+
+/// All windows of such a session, each done again with `finer` times the substeps.
+fn findings(scene: &Scene, told: Told, steps: u64, finer: u32) -> Vec<Finding> {
+    let (mut opening, mut found, mut asked) = (None, Vec::new(), false);
+    commanded(scene, told, steps, |session| {
+        match session.take_mark() {
+            Some(Mark::Begin(look)) => opening = Some(look.open()),
+            Some(Mark::End(look, inputs)) => {
+                let audit = opening.take().unwrap().close(look, inputs);
+                found.push(audit.work(finer, Extent::default(), &mut || true).unwrap());
+                asked = false;
+            }
+            Some(Mark::Dropped) => panic!("a window was dropped"),
+            None => {}
+        }
+        if !std::mem::replace(&mut asked, true) {
+            session.watch(Inputs::default());
+        }
+    });
+    found
+}
+
+#[test]
+fn a_window_agrees_with_one_of_a_much_shorter_substep() {
+    // The error of a tool that meets the sheet falls more slowly with the substep than that of the scheme: contact begins and
+    // ends within a substep, and a tip that sticks or slips a substep sooner ends elsewhere. So a quarter of the substep
+    // shows less of it, and of some windows much less.
+    let tools: [(&str, f64, f64, Told); 4] = [
+        ("push", 2.0, 1.0, pushing),
+        ("grasp of a point", 2.0, 1.0, grasping),
+        ("touch", 5.0, 0.9, |step| touching(false, step)),
+        ("grasp", 5.0, 0.9, |step| touching(true, step)),
+    ];
+    let schemes: [&[&str]; 5] = [
+        &["stepping.integrator=central", "stepping.substeps=4"],
+        &["stepping.integrator=exponential2", "stepping.substeps=4"],
+        &["stepping.integrator=exponential3", "stepping.substeps=4", "stepping.precision=compensated"],
+        &["stepping.integrator=exponential4", "stepping.substeps=4", "stepping.precision=f64"],
+        &["stepping.integrator=rk4", "stepping.substeps=4", "stepping.precision=f64"],
+    ];
+    for (name, most, part, told) in tools {
+        let (mut windows, mut beyond) = (0, Vec::new());
+        for settings in schemes {
+            let scene = scene_with(SMALL, &[settings, &["stepping.rate_hz=250"]].concat());
+            let [audited, truth] = [FINER, 16 * FINER].map(|finer| findings(&scene, told, 700, finer));
+            assert!(audited.len() >= 3 && audited.len() == truth.len(), "{name} {settings:?}: {}", audited.len());
+            for (audited, truth) in audited.iter().zip(&truth) {
+                assert_eq!(audited.step, truth.step);
+                let ratio = audited.error.largest() / truth.error.largest();
+                windows += 1;
+                if !(most.recip()..most).contains(&ratio) {
+                    beyond.push(format!("{settings:?}: {:?} of {:?}", audited.error, truth.error));
+                }
+            }
+        }
+        let within = 1.0 - beyond.len() as f64 / f64::from(windows);
+        assert!(within >= part, "{name}: {within} of {windows} windows within {most}: {beyond:#?}");
+    }
+}
+
+#[test]
+fn the_audit_changes_no_bit() {
+    let tools: [Told; 3] = [pushing, grasping, |step| touching(false, step)];
+    for told in tools {
+        for precision in ["f32", "compensated", "f64"] {
+            let precision = format!("stepping.precision={precision}");
+            let scene = scene_with(SMALL, &["stepping.rate_hz=250", "stepping.integrator=exponential3", &precision]);
+            let (mut windows, mut found) = (Windows::default(), 0);
+            let audited =
+                commanded(&scene, told, 1000, |session| found += usize::from(windows.look(session).is_some()));
+            let alone = commanded(&scene, told, 1000, |_| {});
+            assert!(found > 0);
+            assert_eq!(audited.tissue().state_hash(), alone.tissue().state_hash());
+        }
+    }
+    let scene = scene_with(SMALL, &[]);
+    let hash = |audited| play(&scene, PULSE, true, audited).0.final_hash;
+    assert_eq!(hash(true), hash(false));
+}
+
+#[test]
+fn an_error_is_told_with_what_it_comes_from() {
+    let of = |settings: &[&str]| {
+        let scene = scene_with(SMALL, &[settings, &["stepping.rate_hz=250"]].concat());
+        let found = findings(&scene, pushing, 700, FINER);
+        found.iter().map(|finding| finding.origin).collect::<Vec<_>>()
+    };
+    let substep = of(&["stepping.integrator=central", "stepping.substeps=1"]);
+    assert!(!substep.is_empty() && substep.iter().all(|origin| *origin == Some(Origin::Substep)), "{substep:?}");
+    let rounding = ["stepping.integrator=exponential4", "stepping.substeps=40", "stepping.precision=f32"];
+    let rounding = of(&[&rounding[..], &["stepping.tolerance=1e-9"]].concat());
+    assert!(!rounding.is_empty() && rounding.iter().all(|origin| *origin == Some(Origin::Rounding)), "{rounding:?}");
+    let none = of(&["stepping.tolerance=1e-4"]);
+    assert!(!none.is_empty() && none.iter().all(Option::is_none), "{none:?}");
+    // A long sheet, of which most sleeps though it moves a little.
+    let asleep = ["sheet.points=[7, 120]", "sleep.tolerance=0.3", "stepping.tolerance=1e-6", "stepping.precision=f64"];
+    let asleep = of(&[&asleep[..], &["springs.stiffness_n_per_m=300"]].concat());
+    assert!(asleep.contains(&Some(Origin::Sleep)), "{asleep:?}");
+}
+
+/// Plays a script without an audit, but with corrections that another run was told of.
+fn corrected(scene: &Scene, text: &str, corrections: &[Correction]) -> Session {
+    let script = script(text, scene);
+    let mut session = playing(scene, &script);
+    for step in 0..script.steps {
+        for correction in corrections.iter().filter(|correction| correction.step == step) {
+            let model = session.model().corrected(correction, &Limits::default()).unwrap();
+            session.change(&model);
+        }
+        session.advance(&mut Vec::new(), |_| {});
+    }
+    session
+}
+
+#[test]
+fn a_correction_acts_at_its_step() {
+    let text = SINE.replace("duration_s = 2.0", "duration_s = 8.0").replace("0.03, 0.01", "0.003, 0.001");
+    let substep = ["stepping.integrator=central", "stepping.substeps=2", "stepping.tolerance=1e-5"];
+    let format = ["stepping.integrator=exponential4", "stepping.substeps=8", "stepping.precision=f32"];
+    let format = [&format[..], &["stepping.tolerance=3e-10"]].concat();
+    let more = ["stepping.integrator=exponential4", "stepping.substeps=1", "stepping.precision=f64"];
+    let more = [&more[..], &["stepping.tolerance=1e-8"]].concat();
+    let cases = [(&substep[..], Precision::F64), (&format[..], Precision::F64), (&more[..], Precision::F64)];
+    for (settings, precision) in cases {
+        let with = |correct: &str| scene_with(SMALL, &[settings, &["stepping.rate_hz=250", correct]].concat());
+        let (summary, _) = play(&with("stepping.correct=true"), &text, false, true);
+        let corrections = &summary.corrections;
+        assert!((1..=4).contains(&corrections.len()), "{corrections:?}");
+        assert!(corrections.iter().all(|one| one.step > 0 && one.audited_error.largest() > 3e-10), "{corrections:?}");
+        assert_eq!(corrections.last().unwrap().precision, precision, "{corrections:?}");
+        let again = corrected(&with("stepping.correct=false"), &text, corrections);
+        assert_eq!(format!("{:032x}", again.tissue().state_hash()), summary.final_hash, "{corrections:?}");
+        let (uncorrected, _) = play(&with("stepping.correct=false"), &text, false, true);
+        assert_eq!(uncorrected.corrections, []);
+        assert_ne!(uncorrected.final_hash, summary.final_hash);
+    }
+}
+
+#[test]
+fn a_correction_brings_the_error_below_the_tolerance() {
+    let settings = ["stepping.integrator=exponential2", "stepping.substeps=1", "stepping.tolerance=1e-5"];
+    let scene = scene_with(SMALL, &[&settings[..], &["stepping.rate_hz=250", "stepping.correct=true"]].concat());
+    let (mut windows, mut errors) = (Windows::default(), Vec::new());
+    let session = commanded(&scene, grasping, 4000, |session| {
+        let Some(finding) = windows.look(session) else { return };
+        errors.push(finding.error.largest());
+        let limits = Limits::default();
+        if let Some(correction) = session.model().correction(&finding, session.step_count(), &limits) {
+            let model = session.model().corrected(&correction, &limits).unwrap();
+            session.change(&model);
+        }
+    });
+    let plan = session.tissue().plan();
+    let was = (Integrator::Exponential2, 1);
+    assert!(errors[0] > 1e-5 && (plan.integrator, plan.substeps) != was, "{errors:?}");
+    assert!(errors.len() > 8 && errors[errors.len() - 4..].iter().all(|error| *error <= 1e-5), "{errors:?}");
+}
+
+/// A session that steps too coarsely for its tolerance.
+fn coarse(correct: bool) -> Source {
+    let settings = ["stepping.integrator=lagged".to_owned(), "stepping.substeps=1".to_owned()];
+    let mut scene = Scene::parse("paper", palpate::scene::PAPER, &settings, &Limits::default()).unwrap();
+    scene.stepping.correct = correct;
+    Source::Scene(palpate::wire::scene::scene(&scene))
+}
+
+/// Pushes up and down until the status is as `wanted`.
+async fn push_until(server: &Server, session_id: &str, wanted: impl Fn(&pb::Session) -> bool) -> pb::Session {
+    let touch = Touch::hold(server, session_id).await;
+    let begun = Instant::now();
+    for sequence in 1.. {
+        touch.command(force(0, sequence, if sequence % 2 == 0 { -1.0 } else { -2.0 })).await;
+        tokio::time::sleep(std::time::Duration::from_millis(20)).await;
+        let status = server.status(session_id).await;
+        if wanted(&status) {
+            return status;
+        }
+        assert!(begun.elapsed() < PATIENCE, "{status:?}");
+    }
+    unreachable!()
+}
+
+fn scrape(server: &mut Server) -> String {
+    let mut line = String::new();
+    server.out.read_line(&mut line).unwrap();
+    let url = line.split_whitespace().last().unwrap().to_owned();
+    let (host, path) = url.trim_start_matches("http://").split_once('/').unwrap();
+    let mut stream = std::net::TcpStream::connect(host).unwrap();
+    std::io::Write::write_all(
+        &mut stream,
+        format!("GET /{path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n").as_bytes(),
+    )
+    .unwrap();
+    std::io::read_to_string(stream).unwrap()
+}
+
+#[tokio::test]
+async fn a_live_session_tells_its_audited_error_and_why() {
+    let mut server = Server::start(&["--audit-share", "0.5", "--metrics", "127.0.0.1:0"]);
+    let session = server.create(coarse(false), false).await.unwrap();
+    assert_eq!(session.audit, None);
+    let status = push_until(&server, &session.session_id, |status| status.audit.is_some()).await;
+    let audit = status.audit.unwrap();
+    let newest = audit.newest_error.unwrap();
+    let tolerance = session.scene.unwrap().stepping.unwrap().tolerance.unwrap();
+    assert!(audit.windows >= 1 && audit.step > 0 && newest.displacement > tolerance && newest.force > tolerance);
+    assert!(newest.displacement < 0.5 && newest.force < 0.5, "{newest:?}");
+    assert!(
+        audit.windows_above_tolerance >= 1 && audit.reason.contains("substep") && audit.corrections == 0,
+        "{audit:?}"
+    );
+    let metrics = scrape(&mut server);
+    let value = |name: &str| -> f64 {
+        let line =
+            metrics.lines().find(|line| line.starts_with(&format!("{name} "))).unwrap_or_else(|| panic!("{metrics}"));
+        line.rsplit(' ').next().unwrap().parse().unwrap()
+    };
+    assert!(
+        value("palpate_audited_windows_total") >= 1.0 && value("palpate_audited_windows_above_tolerance_total") >= 1.0
+    );
+    assert!(value("palpate_audited_force_error_max") > tolerance && value("palpate_audit_time_seconds_total") > 0.0);
+    assert_eq!(value("palpate_corrections_total"), 0.0);
+    let log = server.log();
+    assert!(log.contains("audited error above the tolerance") && log.contains("substep"), "{log}");
+}
+
+#[tokio::test]
+async fn a_live_session_is_corrected_if_its_scene_says_so() {
+    let server = Server::start(&["--audit-share", "0.5"]);
+    let session = server.create(coarse(true), false).await.unwrap();
+    assert!(session.scene.as_ref().unwrap().stepping.as_ref().unwrap().correct);
+    let acted = |status: &pb::Session| {
+        let correction = status.audit.as_ref().and_then(|audit| audit.newest_correction.clone());
+        correction.is_some_and(|correction| correction.step < status.step && correction.integrator == status.integrator)
+    };
+    let status = push_until(&server, &session.session_id, acted).await;
+    let audit = status.audit.unwrap();
+    assert!(audit.corrections >= 1 && (status.integrator.as_str(), status.substeps) != ("lagged", 1), "{audit:?}");
+    let log = server.log();
+    assert!(log.contains("tissue corrected"), "{log}");
+}
+
+#[tokio::test]
+async fn without_a_share_nothing_is_audited() {
+    let server = Server::start(&["--audit-share", "0"]);
+    let session = server.create(coarse(false), false).await.unwrap();
+    // Long enough for several windows of a quarter of a second of simulated time.
+    let status = push_until(&server, &session.session_id, |status| status.step > 2000).await;
+    assert_eq!(status.audit, None);
+}

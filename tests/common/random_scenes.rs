@@ -1,0 +1,156 @@
+//! Random scenes with random scripts, by seed: what a promise about every scene is tried on.
+// A benchmark uses this too.
+#![allow(dead_code, unreachable_pub, clippy::cast_precision_loss)]
+
+use std::path::Path;
+use std::sync::Arc;
+
+use palpate::limits::Limits;
+use palpate::scene::Scene;
+use palpate::scene::script::Script;
+use palpate::session::{Session, run};
+use palpate::sheet::Model;
+
+/// A scene and a script as files say them, and what they are in short.
+pub struct Case {
+    pub scene: String,
+    pub script: String,
+    pub about: String,
+}
+
+/// Sheets of 4 to 33 points a side, spacing 1 mm to 0.1 m, points of 10⁻⁵ to 0.1 kg, fastest vibration × 1 ms from 0.02 to
+/// 1.5, k/K″ from 0.3 to 200, ζ from 0.02 to 5 (of a point on its virtual spring), in part with flexion and fixed points;
+/// forces that strain springs by 1 to 50 %, constant, as a pulse, a ramp or a sine of 0.5 to 20 Hz, some of which move.
+pub fn case(seed: u64) -> Case {
+    let mut random = fastrand::Rng::with_seed(seed);
+    let mut uniform = |from: f64, to: f64| from + (to - from) * random.f64();
+    let [mut sides, mut control] = [[0.0; 2]; 2];
+    for (side, control) in sides.iter_mut().zip(&mut control) {
+        *side = uniform(4.0, 34.0).floor();
+        *control = uniform(1.0, *side - 1.0).floor();
+    }
+    let mut decades = |from: f64, to: f64| (uniform(from.ln(), to.ln())).exp();
+    let (spacing, mass, turn) = (decades(1e-3, 0.1), decades(1e-5, 0.1), decades(0.02, 1.5));
+    let stiffness = mass * (turn / 1e-3_f64).powi(2) / 12.0;
+    let (ratio, zeta, strain) = (decades(0.3, 200.0), decades(0.02, 5.0), decades(0.01, 0.5));
+    let falloff = decades(0.3, 3.0);
+    let virtual_stiffness = stiffness / ratio;
+    let damping = 2.0 * zeta * (virtual_stiffness * mass).sqrt();
+    let force = strain * spacing * (virtual_stiffness + 0.3 * stiffness);
+    // A direction, all alike.
+    let (along_z, angle) = (uniform(-1.0, 1.0), uniform(0.0, std::f64::consts::TAU));
+    let level = (1.0 - along_z * along_z).sqrt();
+    let force = [level * angle.cos(), level * angle.sin(), along_z].map(|part| part * force);
+    let flexion = uniform(0.0, 1.0) < 0.4;
+    let fixed = ["", "fixed = \"edges\"\n", "fixed = \"corners\"\n"][uniform(0.0, 3.0) as usize];
+    let profile = match uniform(0.0, 4.0) as usize {
+        0 => "{ type = \"constant\" }".to_owned(),
+        1 => "{ type = \"pulse\", on_s = 0.1, off_s = 0.4 }".to_owned(),
+        2 => "{ type = \"ramp\", from_s = 0.05, to_s = 0.25 }".to_owned(),
+        _ => format!("{{ type = \"sine\", frequency_hz = {:?} }}", uniform(0.5, 20.0)),
+    };
+    let duration = [0.5, 1.0][uniform(0.0, 2.0) as usize];
+    let [nx, ny] = sides;
+    let [i, j] = control;
+    let place = if uniform(0.0, 1.0) < 0.25 {
+        let speed = [(); 2].map(|()| 3.0 * spacing * uniform(-1.0, 1.0));
+        format!("path = {{ from_m = {:?}, velocity_m_per_s = {speed:?} }}", [i * spacing, j * spacing])
+    } else {
+        format!("point = [{i}, {j}]")
+    };
+    let corner = if fixed.is_empty() { [0.0, 0.0] } else { [1.0, 1.0] };
+    let mut watched = vec![control];
+    for point in [corner, [(nx / 2.0).floor(), (ny / 2.0).floor()]] {
+        if !watched.contains(&point) {
+            watched.push(point);
+        }
+    }
+    let watched: Vec<String> = watched.iter().map(|[i, j]| format!("[{i}, {j}]")).collect();
+    Case {
+        scene: format!(
+            "name = \"random {seed}\"\n[sheet]\npoints = [{nx}, {ny}]\nspacing_m = {spacing:?}\npoint_mass_kg = {mass:?}\n{fixed}\
+             [springs]\nstiffness_n_per_m = {stiffness:?}\nflexion = {flexion}\n\
+             [virtual_springs]\nstiffness_n_per_m = {virtual_stiffness:?}\n[damping]\ncoefficient_n_s_per_m = {damping:?}\n"
+        ),
+        script: format!(
+            "name = \"random {seed}\"\nduration_s = {duration:?}\nsample_every_s = 0.025\nsample_points = [{}]\n\
+             [[force]]\n{place}\nforce_n = {force:?}\nfalloff_per_m = {:?}\nfalloff_offset = 0.0\nprofile = {profile}\n",
+            watched.join(", "),
+            falloff / spacing
+        ),
+        about: format!(
+            "seed {seed}: {nx} × {ny}, k/K″ {ratio:.3}, ω·1 ms {turn:.2}, ζ {zeta:.2}, strain {strain:.2}, falloff \
+             {falloff:.2} a spacing, flexion {flexion}, {} {}",
+            fixed.trim_end(),
+            profile.replace("type = ", "")
+        ),
+    }
+}
+
+/// Displacement and reaction, each x, y and z, of every watched point at each sample time.
+pub type Course = Vec<Vec<[[f64; 3]; 2]>>;
+
+/// A case that was played.
+pub struct Played {
+    pub course: Course,
+    pub model: Arc<Model>,
+    /// What a step took on average, if a clock was given, s.
+    pub step_s: f64,
+}
+
+/// A case with assignments over its scene, compiled.
+pub fn compile(case: &Case, assignments: &[String]) -> Result<(Arc<Model>, Script), String> {
+    let limits = Limits::default();
+    let text = |refusal: palpate::refusal::Refusal| refusal.to_string();
+    let scene = Scene::parse("random", &case.scene, assignments, &limits).map_err(text)?;
+    let script = Script::parse("random", &case.script, Path::new("."), &scene, &limits).map_err(text)?;
+    Ok((Model::compile(&scene, &limits).map_err(text)?, script))
+}
+
+/// The errors of displacement and force that `palpate run --audit` tells of a case.
+pub fn audited_errors(case: &Case, assignments: &[String]) -> Result<[f64; 2], String> {
+    let (model, script) = compile(case, assignments)?;
+    let (limits, mut output) = (Limits::default(), std::io::sink());
+    let summary = run::audited(&model, &script, false, &limits, &mut output, &|| 0.0, &mut |_| {});
+    let error = summary.map_err(|failure| failure.to_string())?.audited_error.ok_or("the run was not audited")?;
+    Ok([error.displacement, error.force])
+}
+
+/// Plays a case with assignments over its scene.
+pub fn play(case: &Case, assignments: &[String], clock_s: &dyn Fn() -> f64) -> Result<Played, String> {
+    let (model, script) = compile(case, assignments)?;
+    let mut session = Session::new(&model);
+    run::play(&mut session, &script);
+    let (mut course, begun_s) = (Vec::new(), clock_s());
+    for _ in 0..script.steps {
+        session.advance(&mut Vec::new(), |session| {
+            if session.step_count().is_multiple_of(script.sample_every) {
+                let record = session.record(Some(&script.sample_points));
+                course.push(record.points.iter().map(|point| [point.displacement_m, point.reaction_n]).collect());
+            }
+        });
+        if let Some(reason) = session.hold_reason() {
+            return Err(reason.to_owned());
+        }
+    }
+    Ok(Played { course, model, step_s: (clock_s() - begun_s) / script.steps as f64 })
+}
+
+/// The same in f64 at a tolerance of 1e-10, with everything awake.
+pub fn truth(case: &Case) -> Result<Played, String> {
+    let settings = ["stepping.precision=f64", "stepping.tolerance=1e-10", "sleep.tolerance=0"];
+    play(case, &settings.map(str::to_owned), &|| 0.0)
+}
+
+/// The largest difference of any component, relative to the largest: of displacements, and of forces.
+pub fn errors(truth: &Course, other: &Course) -> [f64; 2] {
+    [0, 1].map(|which: usize| {
+        let (mut largest, mut error) = (0.0_f64, 0.0_f64);
+        for (a, b) in truth.iter().flatten().zip(other.iter().flatten()) {
+            for (a, b) in a[which].iter().zip(b[which]) {
+                (largest, error) = (largest.max(a.abs()), error.max((a - b).abs()));
+            }
+        }
+        error / largest
+    })
+}

@@ -1,0 +1,61 @@
+//! The tolerance that a scene asks for is kept, on random scenes too. `make bench-tolerance` tries a thousand.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
+
+#[path = "common/random_scenes.rs"]
+mod random_scenes;
+
+use palpate::limits::Limits;
+use palpate::refusal::Reason;
+use palpate::scene::{PAPER, Precision, Scene};
+use palpate::sheet::Model;
+use random_scenes::{case, errors, play, truth};
+
+#[test]
+fn every_tolerance_is_kept_on_random_scenes() {
+    for seed in 0..16 {
+        let case = case(seed);
+        let truth = truth(&case).unwrap().course;
+        for tolerance in [1e-2, 1e-3, 1e-4, 1e-5, 1e-6] {
+            let played = play(&case, &[format!("stepping.tolerance={tolerance:e}")], &|| 0.0).unwrap();
+            let [displacement, force] = errors(&truth, &played.course);
+            let model = &played.model;
+            assert!(
+                displacement.max(force) <= tolerance,
+                "{}: displacement {displacement:.1e}, force {force:.1e} with {:?} × {} {:?}, asked for {tolerance:.0e}",
+                case.about,
+                model.plan.integrator,
+                model.plan.substeps,
+                model.precision
+            );
+        }
+    }
+}
+
+fn paper_with(assignments: &[&str]) -> palpate::refusal::Result<std::sync::Arc<Model>> {
+    let (assignments, limits) =
+        (assignments.iter().map(|text| (*text).to_owned()).collect::<Vec<_>>(), Limits::default());
+    Model::compile(&Scene::parse("paper", PAPER, &assignments, &limits)?, &limits)
+}
+
+/// The force of a stiff, lightly tied sheet is a small difference of large displacements: f32 rounds it away.
+#[test]
+fn a_stiff_sheet_on_soft_virtual_springs_gets_f64() {
+    let stiff = ["springs.stiffness_n_per_m=1000", "damping.coefficient_n_s_per_m=0.05"];
+    assert_eq!(paper_with(&stiff).unwrap().precision, Precision::F64);
+    assert_eq!(paper_with(&[]).unwrap().precision, Precision::F32);
+}
+
+/// Not even the check of a scene may take for ever.
+#[test]
+fn a_scene_that_needs_endless_substeps_is_refused() {
+    let refusal = paper_with(&[
+        "sheet.points=[2, 2]",
+        "sheet.point_mass_kg=1e-12",
+        "springs.stiffness_n_per_m=1e12",
+        "virtual_springs.stiffness_n_per_m=1",
+        "damping.coefficient_n_s_per_m=0",
+        "stepping.rate_hz=1",
+    ])
+    .unwrap_err();
+    assert_eq!((refusal.reason, refusal.field.as_str()), (Reason::TooLarge, "stepping.substeps"));
+}
