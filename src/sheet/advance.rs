@@ -32,6 +32,7 @@ pub(super) struct Advance<'a, T: Real, C> {
 }
 
 impl<T: Real, C: Scheme<T>> Stage<T> for Advance<'_, T, C> {
+    #[inline(always)]
     fn duty(&self, row: usize) -> u8 {
         match (self.free.is_null(), self.forced.contains(&row), self.pulls.len()) {
             (true, false, _) => LEAN,
@@ -50,7 +51,11 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Advance<'_, T, C> {
         sums: &mut [V; 2],
     ) {
         let reaches = || applied::reaches(self.pulls, row, at - row * self.layout.stride);
-        let forced = DUTY != LEAN && self.forced.contains(&row) && reaches();
+        let forced = match DUTY {
+            LEAN => false,
+            PUSHED => reaches(),
+            _ => self.forced.contains(&row) && reaches(),
+        };
         // SAFETY: the caller's promise.
         unsafe {
             if forced {
@@ -94,6 +99,7 @@ impl<T: Real, C: Scheme<T>> Advance<'_, T, C> {
         // SAFETY: the caller's promise.
         unsafe {
             let Layout { stride, plane, .. } = self.layout;
+            debug_assert!(self.layout.holds(at, V::LANES) && V::LANES <= BLOCK);
             let column = at - row * stride;
             let free = if DUTY != ANY || self.free.is_null() { None } else { Some(V::load(self.free.add(at))) };
             // A vector as wide as a block has each of its columns in a lane of its own.
@@ -104,10 +110,11 @@ impl<T: Real, C: Scheme<T>> Advance<'_, T, C> {
                 if apart {
                     work = V::load(self.work.add(column % BLOCK));
                 }
-                forces = Some(if C::FORCES == 1 {
-                    applied::force_on::<V, 1>(self.pulls, row, at)
-                } else {
-                    applied::force_on::<V, 2>(self.pulls, row, at)
+                forces = Some(match (DUTY, C::FORCES) {
+                    (PUSHED, 1) => applied::force_of::<V, 1>(&self.pulls[0], at),
+                    (PUSHED, _) => applied::force_of::<V, 2>(&self.pulls[0], at),
+                    (_, 1) => applied::force_on::<V, 1>(self.pulls, row, at),
+                    _ => applied::force_on::<V, 2>(self.pulls, row, at),
                 });
             }
             for c in 0..3 {
@@ -124,7 +131,9 @@ impl<T: Real, C: Scheme<T>> Advance<'_, T, C> {
                 }
                 // A field decays without end, in time and towards the rim, and arithmetic on numbers below the normal range
                 // costs up to a hundred times as much. So what has a square there is 0.
-                (x, d) = (x.keep(x.counts()), d.keep(d.counts()));
+                if !C::CUTS {
+                    (x, d) = (x.keep(x.counts()), d.keep(d.counts()));
+                }
                 x.store(self.u.add(at));
                 d.store(self.d.add(at));
                 for k in C::KEPT - C::WRITTEN..C::KEPT {

@@ -235,6 +235,7 @@ impl<T: Real> Run<T> for Falloff<T> {
                         // Where the reach ends is known better than by this format.
                         factor = V::select(zero.first(self.columns.start.saturating_sub(at)), zero, factor);
                     }
+                    debug_assert!(at + V::LANES <= self.stride);
                     factor.store(self.factors.add((i - self.rows.start) * self.stride + at));
                 }
             }
@@ -279,6 +280,8 @@ pub(super) struct Pull<'a, T> {
     factors: *const T,
     from: usize,
     to: usize,
+    /// Where the table begins and ends, to check by.
+    places: [usize; 2],
     spans: &'a [Range<usize>],
     /// Of one field and, if there is another, the next.
     forces: [[T; 3]; 2],
@@ -286,7 +289,7 @@ pub(super) struct Pull<'a, T> {
 
 impl<T: Real> Pull<'_, T> {
     pub(super) fn none() -> Self {
-        Pull { factors: std::ptr::null(), from: 0, to: 0, spans: &[], forces: [[T::default(); 3]; 2] }
+        Pull { factors: std::ptr::null(), from: 0, to: 0, places: [0; 2], spans: &[], forces: [[T::default(); 3]; 2] }
     }
 }
 
@@ -295,7 +298,14 @@ impl<T: Real> Term<T> {
     pub(super) fn pull(&self, field: usize, stride: usize) -> Pull<'_, T> {
         let factors = self.factors.as_ptr().wrapping_sub(self.rows.start * stride);
         let forces = [self.forces[field], self.forces[(field + 1).min(2)]];
-        Pull { factors, from: self.rows.start, to: self.rows.end, spans: &self.spans, forces }
+        Pull {
+            factors,
+            from: self.rows.start,
+            to: self.rows.end,
+            places: [self.rows.start, self.rows.end].map(|row| row * stride),
+            spans: &self.spans,
+            forces,
+        }
     }
 }
 
@@ -308,7 +318,28 @@ pub(super) fn reaches<T>(pulls: &[Pull<'_, T>], row: usize, column: usize) -> bo
     }
 }
 
-/// The force on a block, component by component: of `FIELDS` fields; if it is one, twice.
+/// A force on a block of a row that it reaches, component by component: of `FIELDS` fields; if it is one, twice.
+///
+/// # Safety
+/// The table is of the sheet that the block is of, and still there.
+#[inline(always)]
+pub(super) unsafe fn force_of<V: Vector, const FIELDS: usize>(pull: &Pull<'_, V::Real>, at: usize) -> [[V; 2]; 3] {
+    debug_assert!(pull.places[0] <= at && at + V::LANES <= pull.places[1]);
+    // SAFETY: the caller's promise.
+    let factor = unsafe { V::load(pull.factors.wrapping_add(at)) };
+    let mut forces = [[factor; 2]; 3];
+    for c in 0..3 {
+        for f in 0..FIELDS {
+            forces[c][f] = factor.splat(pull.forces[f][c]).mul(factor);
+        }
+        if FIELDS == 1 {
+            forces[c][1] = forces[c][0];
+        }
+    }
+    forces
+}
+
+/// The forces of all tools on a block, component by component: of `FIELDS` fields; if it is one, twice.
 ///
 /// # Safety
 /// The tables are of the sheet that the block is of, and still there.
@@ -325,15 +356,11 @@ pub(super) unsafe fn force_on<V: Vector, const FIELDS: usize>(
         && row < pull.to
     {
         // SAFETY: the caller's promise.
-        let factor = unsafe { V::load(pull.factors.wrapping_add(at)) };
-        for c in 0..3 {
-            for f in 0..FIELDS {
-                sum[c][f] = factor.splat(pull.forces[f][c]).mul(factor);
-            }
-        }
+        return unsafe { force_of::<V, FIELDS>(pull, at) };
     }
     for pull in if pulls.len() > 1 { pulls } else { &[] } {
         if row >= pull.from && row < pull.to {
+            debug_assert!(pull.places[0] <= at && at + V::LANES <= pull.places[1]);
             // SAFETY: the caller's promise.
             let factor = unsafe { V::load(pull.factors.wrapping_add(at)) };
             for c in 0..3 {

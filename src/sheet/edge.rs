@@ -33,6 +33,7 @@ impl<V: Vector> Edge<V> {
     #[inline(always)]
     pub(super) unsafe fn new<S: Stage<V::Real>>(sweep: &Sweep<'_, V::Real, S>, column: usize, row: usize) -> Self {
         let Layout { stride, plane, .. } = sweep.layout;
+        debug_assert!((1..=stride).contains(&column) && sweep.layout.holds(stride + column - 1, 1));
         // SAFETY: the caller's promise: the processor has the instructions, the carry has a second row.
         let leaves = unsafe {
             let left = sweep.carry.add(stride + column - 1);
@@ -64,7 +65,9 @@ impl<V: Vector> Edge<V> {
         let mut columns = [[V::Real::default(); 3 * LONG]; 2];
         for k in 0..=V::LANES {
             // SAFETY: the caller's promise: a row beyond the last can be read.
-            let at = unsafe { sweep.x.add((row + k).min(rows) * stride + self.column - 1) };
+            let place = (row + k).min(rows) * stride + self.column - 1;
+            debug_assert!(sweep.layout.holds(place, 2));
+            let at = unsafe { sweep.x.add(place) };
             for c in 0..3 {
                 // SAFETY: as above.
                 unsafe {
@@ -82,7 +85,7 @@ impl<V: Vector> Edge<V> {
         let qr = excess(r[1], &r, [1, 0, 2]);
         let (qa, qb) = (excess(a[0].add(a[1]), &a, [0, 1, 2]), excess(b[0].sub(b[1]), &b, [0, 1, 2]));
         let (mut wr, mut wa, mut wb) = (structural.near(qr), shear.near(qa), shear.near(qb));
-        if V::any(V::either(structural.is_far(qr), shear.is_far(qa.farther(qb)))) {
+        if V::any(V::either(structural.is_far(qr.farther(qr)), shear.is_far(qa.farther(qb)))) {
             (wr, wa, wb) = (structural.weight(qr), shear.weight(qa), shear.weight(qb));
         }
         let last = r[0].first((rows - 1).saturating_sub(row).min(V::LANES));

@@ -44,6 +44,11 @@ impl Layout {
         Layout { rows, columns, stride, plane }
     }
 
+    /// Whether so many numbers from a place of a plane on are memory of that plane.
+    pub(super) fn holds(&self, place: usize, count: usize) -> bool {
+        place + count <= self.plane
+    }
+
     /// The place of the x component of the point that is number `index` of all, by rows.
     pub(super) fn place(&self, index: usize) -> usize {
         index / self.columns * self.stride + index % self.columns

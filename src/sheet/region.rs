@@ -107,6 +107,13 @@ impl Region {
         }
     }
 
+    /// Whether all of it is memory of such a sheet: strips may reach beyond its columns, but not beyond its rows.
+    pub(super) fn is_within(&self, layout: &Layout) -> bool {
+        let is_within =
+            |strip: &Strip| strip.rows.end <= layout.rows && strip.columns.end <= tiles(layout.columns) * TILE;
+        self.strips.iter().all(is_within)
+    }
+
     /// Whether the tile of a point is awake.
     #[inline(always)]
     pub(super) fn is_awake(&self, row: usize, column: usize) -> bool {

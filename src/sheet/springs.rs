@@ -50,23 +50,39 @@ impl<T: Real> Kind<T> {
         }
     }
 
-    /// Where [`Kind::near`] does not hold.
+    /// Where [`Kind::near`] does not hold; of the magnitude of Q.
     #[inline(always)]
-    pub(super) fn is_far<V: Vector<Real = T>>(&self, excess: V) -> V::Mask {
-        excess.beyond(excess.splat(self.near))
+    pub(super) fn is_far<V: Vector<Real = T>>(&self, magnitude: V) -> V::Mask {
+        magnitude.above(magnitude.splat(self.near))
     }
 
     /// Stiffness × (1 − L0/L) for small Q: even and odd powers apart, which halves the wait of each for the last. A
     /// spring that is strained too little to count does not pull: at rest, the force is exactly 0.
     #[inline(always)]
     pub(super) fn near<V: Vector<Real = T>>(&self, excess: V) -> V {
+        self.series(excess).keep(Self::counts(excess))
+    }
+
+    /// The same for the springs of `mask`; the others do not pull.
+    #[inline(always)]
+    pub(super) fn near_of<V: Vector<Real = T>>(&self, mask: V::Mask, excess: V) -> V {
+        self.series(excess).keep(V::both(Self::counts(excess), mask))
+    }
+
+    #[inline(always)]
+    fn counts<V: Vector<Real = T>>(excess: V) -> V::Mask {
+        excess.beyond(excess.splat(T::of(T::LEAST_EXCESS)))
+    }
+
+    #[inline(always)]
+    fn series<V: Vector<Real = T>>(&self, excess: V) -> V {
         let square = excess.mul_add(excess, excess.splat(T::of(T::FAINT)));
         let (mut even, mut odd) = (excess.splat(self.series[T::TERMS - 2]), excess.splat(self.series[T::TERMS - 1]));
         for term in (0..T::TERMS / 2 - 1).rev() {
             even = even.mul_add(square, excess.splat(self.series[2 * term]));
             odd = odd.mul_add(square, excess.splat(self.series[2 * term + 1]));
         }
-        odd.mul_add(excess, even).mul(excess).keep(excess.beyond(excess.splat(T::of(T::LEAST_EXCESS))))
+        odd.mul_add(excess, even).mul(excess)
     }
 
     /// Stiffness × (1 − L0/L) for any Q, best away from 0: with r near 1/s, e = 1 − r²(1 + q) is small, and
@@ -93,7 +109,7 @@ impl<T: Real> Kind<T> {
     /// Stiffness × (1 − L0/L), by whichever holds for the lane.
     #[inline(always)]
     pub(super) fn weight<V: Vector<Real = T>>(&self, excess: V) -> V {
-        let far = self.is_far(excess);
+        let far = excess.beyond(excess.splat(self.near));
         let near = self.near(excess);
         if V::any(far) { V::select(far, self.far(excess), near) } else { near }
     }
@@ -103,7 +119,7 @@ impl<T: Real> Kind<T> {
     pub(super) fn energy<V: Vector<Real = T>>(&self, excess: V) -> V {
         let (q, s) = self.stretch(excess);
         let extension = q.div(excess.splat(T::of(1.0)).add(s));
-        let extension = extension.keep(excess.beyond(excess.splat(T::of(T::LEAST_EXCESS))));
+        let extension = extension.keep(Self::counts(excess));
         excess.splat(T::of(0.5 * self.stiffness.wide() / self.per_length_squared.wide())).mul(extension.mul(extension))
     }
 

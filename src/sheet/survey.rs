@@ -132,6 +132,11 @@ impl Survey {
         over: &Region,
         write: Write,
     ) -> Survey {
+        let needed = 2 + C::KEPT;
+        debug_assert!([u, d].iter().chain(&kept).take(needed).all(|field| !field.is_null()));
+        debug_assert!(
+            write == Write::Nothing || [to_u, to_d].iter().chain(&to_kept).take(needed).all(|field| !field.is_null())
+        );
         let zero = [T::default(); BLOCK];
         let sums = UnsafeCell::new(Sums { row: [zero; 5], total: [[0.0; BLOCK]; 5], largest: [zero; 4] });
         let pulls = forces.terms.iter().map(|term| term.pull(forces.field, bench.layout.stride));
@@ -196,6 +201,7 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Look<'_, T, C> {
         // SAFETY: the fields have the layout; the sums as above.
         unsafe {
             let stride = self.layout.stride;
+            debug_assert!(self.layout.holds(at, V::LANES) && V::LANES <= BLOCK);
             let column = at - row * stride;
             let Forces { terms, part, pull, .. } = self.forces;
             let force = applied::force_on::<V, 1>(self.pulls, row, at);

@@ -162,31 +162,33 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                     for row in 0..if FLEXION { CARRY_ROWS } else { 2 } {
                         for c in 0..3 {
                             for column in (beside..to).step_by(V::LANES) {
+                                debug_assert!(self.layout.holds(row * stride + column, V::LANES));
                                 zero.store(self.carry.add(c * plane + row * stride + column));
                             }
                         }
                     }
                 }
-                let mut ahead = excesses(self.x.add(strip.rows.start * stride + from), stride, plane);
                 let all = strip.awake && beside == strip.columns.start && to == columns.next_multiple_of(V::LANES);
                 let whole = V::IS_REGISTER && all;
                 let mut edge = if FLEXION || from == 0 { None } else { Some(Edge::new(self, from, strip.rows.start)) };
                 for i in strip.rows.clone() {
+                    // Hidden from the compiler, which would keep an address for each array and kind of row, and count them
+                    // all up with each row.
+                    let i = std::hint::black_box(i);
                     let left = match &mut edge {
                         Some(edge) => edge.left_of(self, i),
                         None => [zero; 3],
                     };
                     let span = (from..to, strip.awake && from == strip.columns.start, left);
-                    let under_way = (&mut ahead, &mut sums);
                     let duty = if FLEXION || S::ENERGY || !V::IS_REGISTER { ANY } else { self.stage.duty(i) };
                     // The usual rows have loops of their own, without what only others need.
                     match (i + 1 < rows, whole, duty) {
-                        (true, true, LEAN) => self.row::<V, FLEXION, true, true, LEAN>(flexion, i, span, under_way),
-                        (true, true, PUSHED) => self.row::<V, FLEXION, true, true, PUSHED>(flexion, i, span, under_way),
-                        (true, true, _) => self.row::<V, FLEXION, true, true, ANY>(flexion, i, span, under_way),
-                        (true, false, LEAN) => self.row::<V, FLEXION, true, false, LEAN>(flexion, i, span, under_way),
-                        (true, false, _) => self.row::<V, FLEXION, true, false, ANY>(flexion, i, span, under_way),
-                        (false, ..) => self.row::<V, FLEXION, false, false, ANY>(flexion, i, span, under_way),
+                        (true, true, LEAN) => self.row::<V, FLEXION, true, true, LEAN>(flexion, i, span, &mut sums),
+                        (true, true, PUSHED) => self.row::<V, FLEXION, true, true, PUSHED>(flexion, i, span, &mut sums),
+                        (true, true, _) => self.row::<V, FLEXION, true, true, ANY>(flexion, i, span, &mut sums),
+                        (true, false, LEAN) => self.row::<V, FLEXION, true, false, LEAN>(flexion, i, span, &mut sums),
+                        (true, false, _) => self.row::<V, FLEXION, true, false, ANY>(flexion, i, span, &mut sums),
+                        (false, ..) => self.row::<V, FLEXION, false, false, ANY>(flexion, i, span, &mut sums),
                     }
                 }
                 if let Some(edge) = edge {
@@ -197,15 +199,14 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
         }
     }
 
-    /// Row `i`, which has a row below or not. The Qs are formed one block ahead, so that two blocks' chains of operations
-    /// are under way at once.
+    /// Row `i`, which has a row below or not.
     #[inline(always)]
     unsafe fn row<V: Vector<Real = T>, const FLEXION: bool, const BELOW: bool, const WHOLE: bool, const DUTY: u8>(
         &self,
         flexion: &Kind<T>,
         i: usize,
         (span, all_awake, left): (Range<usize>, bool, [V; 3]),
-        (ahead, sums): (&mut [V; 4], &mut [V; 2]),
+        sums: &mut [V; 2],
     ) {
         // SAFETY: as for `rows`.
         unsafe {
@@ -223,24 +224,36 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
             let mut column = span.start;
             while column < span.end {
                 let mask = if column + V::LANES < columns { full } else { tail };
-                let [qr, qd, qa, qb] = *ahead;
-                let more = column + V::LANES < span.end;
-                let next = if more { column + V::LANES } else { stride + span.start };
-                if BELOW || more {
-                    *ahead = excesses(x.add(next), stride, plane);
-                }
                 let awake = WHOLE || all_awake || self.over.is_awake(i, column);
-                let mut wr = structural.near(qr);
-                let (mut wd, mut wa, mut wb) = (zero, zero, zero);
+                // The farthest that is read: a row and a point on, or two of each, and the carry's last row.
+                debug_assert!(
+                    self.layout.holds((i + usize::from(BELOW)) * stride + column + 1, V::LANES)
+                        && (!FLEXION || self.layout.holds(i * stride + column + 2, V::LANES))
+                        && (!FLEXION || i + 2 >= rows || self.layout.holds((i + 2) * stride + column, V::LANES))
+                        && self.layout.holds((CARRY_ROWS - 1) * stride + column, V::LANES)
+                );
+                let at = x.add(column);
+                let (here, right) = (load::<V>(at, plane), load::<V>(at.add(1), plane));
+                let r = difference(&right, &here);
+                let qr = excess(r[1], &r, [1, 0, 2]);
+                let (mut d, mut a, mut b) = ([zero; 3], [zero; 3], [zero; 3]);
+                let (mut qd, mut qa, mut qb) = (zero, zero, zero);
+                let (wr, wd, wa, wb);
                 if BELOW {
-                    (wd, wa, wb) = (structural.near(qd), shear.near(qa), shear.near(qb));
+                    let (below, beside) = (load(at.add(stride), plane), load(at.add(stride + 1), plane));
+                    (d, a, b) = (difference(&below, &here), difference(&beside, &here), difference(&below, &right));
+                    qd = excess(d[0], &d, [0, 1, 2]);
+                    (qa, qb) = (excess(a[0].add(a[1]), &a, [0, 1, 2]), excess(b[0].sub(b[1]), &b, [0, 1, 2]));
                     let far = structural.is_far(qr.farther(qd));
                     if V::any(V::either(far, shear.is_far(qa.farther(qb)))) {
-                        (wr, wd) = (structural.weight(qr), structural.weight(qd));
-                        (wa, wb) = (shear.weight(qa), shear.weight(qb));
+                        (wr, wd) = (structural.weight(qr).keep(mask), structural.weight(qd));
+                        (wa, wb) = (shear.weight(qa).keep(mask), shear.weight(qb).keep(mask));
+                    } else {
+                        (wr, wd) = (structural.near_of(mask, qr), structural.near(qd));
+                        (wa, wb) = (shear.near_of(mask, qa), shear.near_of(mask, qb));
                     }
                 } else {
-                    wr = structural.weight(qr);
+                    (wr, wd, wa, wb) = (structural.weight(qr).keep(mask), zero, zero, zero);
                 }
                 if S::ENERGY && awake {
                     let mut sum = structural.energy(qr).keep(mask);
@@ -249,21 +262,14 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                     }
                     self.stage.energy(column, sum);
                 }
-                let (wr, wa, wb) = (wr.keep(mask), wa.keep(mask), wb.keep(mask));
-                let at = x.add(column);
-                let (here, right) = (load::<V>(at, plane), load::<V>(at.add(1), plane));
                 let mut n = [zero; 3];
                 for c in 0..3 {
                     let (down, diagonal) = (down.add(c * plane + column), diagonal.add(c * plane + column));
-                    let r = right[c].sub(here[c]);
-                    let fr = if c == 1 { wr.mul_add(r, wr) } else { wr.mul(r) };
+                    let fr = if c == 1 { wr.mul_add(r[c], wr) } else { wr.mul(r[c]) };
                     if BELOW {
-                        let (below, beside) =
-                            (V::load(at.add(stride + c * plane)), V::load(at.add(stride + 1 + c * plane)));
-                        let (d, a, b) = (below.sub(here[c]), beside.sub(here[c]), below.sub(right[c]));
-                        let fd = if c == 0 { wd.mul_add(d, wd) } else { wd.mul(d) };
-                        let fa = if c < 2 { wa.mul_add(a, wa) } else { wa.mul(a) };
-                        let fb = [wb.mul_add(b, wb), wb.mul_sub(b, wb), wb.mul(b)][c];
+                        let fd = if c == 0 { wd.mul_add(d[c], wd) } else { wd.mul(d[c]) };
+                        let fa = if c < 2 { wa.mul_add(a[c], wa) } else { wa.mul(a[c]) };
+                        let fb = [wb.mul_add(b[c], wb), wb.mul_sub(b[c], wb), wb.mul(b[c])][c];
                         let across = fb.sub(fr).sub(V::load(diagonal));
                         n[c] = fr.add(fd).add(fa.sub(V::load(down))).add(across.shift(passed[c]));
                         fd.add(fb).store(down);
@@ -317,21 +323,6 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
     }
 }
 
-/// Qs of the four springs of each point of a block: right, down, and the diagonals. Those of the last row, which has only
-/// the first, reach into what pads the plane.
-#[inline(always)]
-unsafe fn excesses<V: Vector>(at: *const V::Real, stride: usize, plane: usize) -> [V; 4] {
-    // SAFETY: the caller's promise: a row and a block beyond the last point can be read.
-    unsafe {
-        let (here, right) = (load::<V>(at, plane), load::<V>(at.add(1), plane));
-        let r = difference(&right, &here);
-        let qr = excess(r[1], &r, [1, 0, 2]);
-        let (below, beside) = (load(at.add(stride), plane), load(at.add(stride + 1), plane));
-        let (d, a, b) = (difference(&below, &here), difference(&beside, &here), difference(&below, &right));
-        [qr, excess(d[0], &d, [0, 1, 2]), excess(a[0].add(a[1]), &a, [0, 1, 2]), excess(b[0].sub(b[1]), &b, [0, 1, 2])]
-    }
-}
-
 /// How a scheme advances one component of a block, in terms of u (here `x`), d, the springs' force `n` and what it
 /// keeps of steps before: pure arithmetic, in one file each (`integrate`).
 pub(super) trait Scheme<T: Real> {
@@ -341,6 +332,9 @@ pub(super) trait Scheme<T: Real> {
     const WRITTEN: usize;
     /// Fields of force that it takes, 1 or 2.
     const FORCES: usize;
+
+    /// Whether `advance` itself cuts what is too small to count ([`Real::LEAST`]) of u and d.
+    const CUTS: bool = false;
 
     /// u and d after the (sub)step; `kept` is brought up to date. `force`: the tools' part, in the scheme's terms; if there
     /// is one field, twice.
@@ -437,6 +431,10 @@ impl<T: Real> Bench<T> {
             probe: self.probe.as_mut_ptr(),
             work: self.work.as_mut_ptr(),
         };
+        let of_points = |field: &Field<T>| field.len() == 3 * self.layout.plane;
+        debug_assert!(state.fields().all(of_points) && of_points(self.carry.get_mut()));
+        debug_assert!(self.free.as_ref().is_none_or(|free| free.len() == self.layout.plane));
+        debug_assert!(over.is_within(&self.layout));
         let carry = self.carry.get_mut().as_mut_ptr();
         let sweep = Sweep { layout: self.layout, springs: &self.springs, x: u.cast_const(), carry, over, stage };
         // SAFETY: all fields have the layout's three planes, padded by a row and a block, and the tables are of this
@@ -449,6 +447,7 @@ impl<T: Real> Bench<T> {
     /// # Safety
     /// `u` and the stage are of fields of this layout.
     pub(super) unsafe fn look<S: Stage<T>>(&self, u: *const T, over: &Region, stage: S) {
+        debug_assert!(over.is_within(&self.layout));
         let mut carry = self.carry.borrow_mut();
         let sweep = Sweep { layout: self.layout, springs: &self.springs, x: u, carry: carry.as_mut_ptr(), over, stage };
         // SAFETY: as above.

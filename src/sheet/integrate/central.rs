@@ -50,11 +50,14 @@ impl<T: Real> sweep::Scheme<T> for Advance<T> {
     const KEPT: usize = 0;
     const WRITTEN: usize = 0;
     const FORCES: usize = 1;
+    /// Of d alone: u is a sum of what was not cut, and smaller for a moment only where two of those cancel.
+    const CUTS: bool = true;
 
     #[inline(always)]
     fn advance<V: Vector<Real = T>>(&self, x: V, d: V, n: V, _: &mut [V; MAX_KEPT], force: Option<[V; 2]>) -> (V, V) {
         let n = if let Some(force) = force { n.add(force[0]) } else { n };
         let d = d.splat(self.p).mul_add(d, d.splat(self.pull).mul_add(x, n));
+        let d = d.keep(d.counts());
         (x.add(d), d)
     }
 

@@ -59,10 +59,13 @@ pub(super) trait Vector: Copy {
     fn farther(self, other: Self) -> Self;
     /// Where |self| > `bound`.
     fn beyond(self, bound: Self) -> Self::Mask;
+    /// Where self > `bound`.
+    fn above(self, bound: Self) -> Self::Mask;
     /// Where |self| is not below [`Real::LEAST`].
     fn counts(self) -> Self::Mask;
     fn any(mask: Self::Mask) -> bool;
     fn either(a: Self::Mask, b: Self::Mask) -> Self::Mask;
+    fn both(a: Self::Mask, b: Self::Mask) -> Self::Mask;
     /// `a` where the mask is set, else `b`.
     fn select(mask: Self::Mask, a: Self, b: Self) -> Self;
     /// The first `count` lanes; `self` is the proof.
@@ -194,6 +197,10 @@ impl<T: Real, const N: usize> Vector for Plain<T, N> {
         std::array::from_fn(|lane| self.0[lane].magnitude() > bound.0[lane])
     }
     #[inline(always)]
+    fn above(self, bound: Self) -> [bool; N] {
+        std::array::from_fn(|lane| self.0[lane] > bound.0[lane])
+    }
+    #[inline(always)]
     #[allow(clippy::neg_cmp_op_on_partial_ord)]
     fn counts(self) -> [bool; N] {
         // NaN counts: whoever looks for it must find it.
@@ -206,6 +213,10 @@ impl<T: Real, const N: usize> Vector for Plain<T, N> {
     #[inline(always)]
     fn either(a: [bool; N], b: [bool; N]) -> [bool; N] {
         std::array::from_fn(|lane| a[lane] || b[lane])
+    }
+    #[inline(always)]
+    fn both(a: [bool; N], b: [bool; N]) -> [bool; N] {
+        std::array::from_fn(|lane| a[lane] && b[lane])
     }
     #[inline(always)]
     fn select(mask: [bool; N], a: Self, b: Self) -> Self {
@@ -331,12 +342,13 @@ mod tests {
                         b.mul(b).rough_inverse_root(),
                         a.count(at).sub(a.splat(T::of(9.0))).power_of_two(),
                         a.keep(a.mul(a.splat(T::of(T::LEAST))).counts()),
+                        a.keep(V::both(a.above(b), mask)),
                         if V::any(mask) { a } else { b },
                     ];
                     before = a;
                     for (n, result) in results.into_iter().enumerate() {
                         // Whether any lane is set depends on the width by nature.
-                        if n < 17 {
+                        if n < 18 {
                             result.store(self.out.add(16 * n + at));
                         }
                     }
@@ -349,7 +361,7 @@ mod tests {
         let a: [T; 16] = std::array::from_fn(|i| T::of(0.37 * i as f64 * if i % 3 == 0 { -1.0 } else { 1.1 }));
         let b: [T; 16] = std::array::from_fn(|i| T::of(13.0 / (1.0 + i as f64) - 2.0));
         let result = |lanes| {
-            let mut out = vec![T::default(); 17 * 16];
+            let mut out = vec![T::default(); 18 * 16];
             unsafe { run(Width::of(lanes), &Everything { a: &a, b: &b, out: out.as_mut_ptr() }) };
             out.into_iter().map(Real::wide).collect::<Vec<_>>()
         };

@@ -93,6 +93,10 @@ macro_rules! vector {
                 unsafe { $i::greater($i::magnitude(self.0), bound.0) }
             }
             #[inline(always)]
+            fn above(self, bound: Self) -> $i::Mask {
+                unsafe { $i::greater(self.0, bound.0) }
+            }
+            #[inline(always)]
             fn counts(self) -> $i::Mask {
                 unsafe { $i::test_bits($i::bits(self.0), $i::splat_bits(<$real as Real>::LEAST_BITS)) }
             }
@@ -103,6 +107,10 @@ macro_rules! vector {
             #[inline(always)]
             fn either(a: $i::Mask, b: $i::Mask) -> $i::Mask {
                 unsafe { $i::or(a, b) }
+            }
+            #[inline(always)]
+            fn both(a: $i::Mask, b: $i::Mask) -> $i::Mask {
+                unsafe { $i::and(a, b) }
             }
             #[inline(always)]
             fn select(mask: $i::Mask, a: Self, b: Self) -> Self {

@@ -121,6 +121,10 @@ macro_rules! avx512 {
                 unsafe { $i::compare::<_CMP_GT_OQ>($i::magnitude(self.0), bound.0) }
             }
             #[inline(always)]
+            fn above(self, bound: Self) -> $mask {
+                unsafe { $i::compare::<_CMP_GT_OQ>(self.0, bound.0) }
+            }
+            #[inline(always)]
             fn counts(self) -> $mask {
                 unsafe { $i::test_bits($i::bits(self.0), $i::splat_bits(<$real as Real>::LEAST_BITS.cast_signed())) }
             }
@@ -131,6 +135,10 @@ macro_rules! avx512 {
             #[inline(always)]
             fn either(a: $mask, b: $mask) -> $mask {
                 a | b
+            }
+            #[inline(always)]
+            fn both(a: $mask, b: $mask) -> $mask {
+                a & b
             }
             #[inline(always)]
             fn select(mask: $mask, a: Self, b: Self) -> Self {
@@ -173,6 +181,10 @@ macro_rules! avx2 {
                 unsafe { $name($i::compare::<_CMP_GT_OQ>($i::and_not($i::splat(-0.0), self.0), bound.0)) }
             }
             #[inline(always)]
+            fn above(self, bound: Self) -> Self {
+                unsafe { $name($i::compare::<_CMP_GT_OQ>(self.0, bound.0)) }
+            }
+            #[inline(always)]
             fn counts(self) -> Self {
                 let least = self.splat(<$real>::of(<$real as Real>::LEAST));
                 unsafe { $name($i::compare::<_CMP_NLT_UQ>($i::and_not($i::splat(-0.0), self.0), least.0)) }
@@ -184,6 +196,10 @@ macro_rules! avx2 {
             #[inline(always)]
             fn either(a: Self, b: Self) -> Self {
                 unsafe { $name($i::or(a.0, b.0)) }
+            }
+            #[inline(always)]
+            fn both(a: Self, b: Self) -> Self {
+                unsafe { $name($i::and(a.0, b.0)) }
             }
             #[inline(always)]
             fn select(mask: Self, a: Self, b: Self) -> Self {
