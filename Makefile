@@ -138,7 +138,7 @@ bench-frames: need-rust
 
 # Ten thousand random scenes, and a soak of ten million steps.
 stress: need-rust
-	PALPATE_STRESS_SCENES=10000 $(CARGO) test --release --test stress --test sleep -- --include-ignored --nocapture
+	PALPATE_STRESS_SCENES=10000 $(CARGO) test --release --test stress --test physics -- --include-ignored --nocapture
 
 # Another processor, the same golden hashes. The compiler and the standard library for ARM are Debian's.
 ARM := aarch64-unknown-linux-gnu
@@ -165,7 +165,7 @@ test-valgrind: need-rust
 
 test-debug: need-rust
 	CARGO_PROFILE_RELEASE_DEBUG_ASSERTIONS=true $(CARGO) test --release --target-dir target/assertions --lib \
-		--test determinism --test sleep --test physics
+		--test determinism --test physics
 
 # A million inputs a decoder; FUZZ_INPUTS=… for more.
 FUZZ_INPUTS ?= 1000000

@@ -115,3 +115,97 @@ impl Hand {
             .fold(f64::INFINITY, f64::min)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// One that is held so firmly and damped so strongly that it does not swing.
+    const CREEPING: Hand = hand("creeping", 0.1, 20.0, 300.0);
+
+    /// The equation of motion in steps that are far too short to matter, of fourth order.
+    fn integrated(hand: &Hand, held: Held, from_m: DVec3, to_m: DVec3, force_n: DVec3, time_s: f64) -> Held {
+        const STEPS: u32 = 2000;
+        let dt = time_s / f64::from(STEPS);
+        let slope = |[x, v]: [DVec3; 2], part: f64| {
+            let pull_n = hand.stiffness_n_per_m * (from_m.lerp(to_m, part) - x) - hand.damping_n_s_per_m * v;
+            [v, (pull_n + force_n) / hand.mass_kg]
+        };
+        let along = |[x, v]: [DVec3; 2], [dx, dv]: [DVec3; 2], t: f64| [x + t * dx, v + t * dv];
+        let [place_m, velocity_m_per_s] = (0..STEPS).fold([held.place_m, held.velocity_m_per_s], |y, step| {
+            let part = |share: f64| (f64::from(step) + share) / f64::from(STEPS);
+            let k1 = slope(y, part(0.0));
+            let k2 = slope(along(y, k1, 0.5 * dt), part(0.5));
+            let k3 = slope(along(y, k2, 0.5 * dt), part(0.5));
+            let k4 = slope(along(y, k3, dt), part(1.0));
+            [0, 1].map(|c: usize| y[c] + dt / 6.0 * (k1[c] + 2.0 * k2[c] + 2.0 * k3[c] + k4[c]))
+        });
+        Held { place_m, velocity_m_per_s }
+    }
+
+    #[test]
+    fn a_hand_obeys_its_equation() {
+        let held = Held { place_m: DVec3::new(0.01, -0.02, 0.003), velocity_m_per_s: DVec3::new(-0.1, 0.05, 0.2) };
+        let (force_n, target_m) = (DVec3::new(0.4, -0.3, 1.1), DVec3::new(0.02, 0.01, -0.015));
+        for hand in HANDS.into_iter().chain([CREEPING]) {
+            for time_s in [0.001, 0.02, 0.3] {
+                let truth = integrated(&hand, held, target_m, target_m, force_n, time_s);
+                let found = hand.advance(held, target_m, target_m, force_n, time_s);
+                let way_m = truth.place_m.distance(held.place_m);
+                assert!(found.place_m.distance(truth.place_m) < 1e-8 * way_m, "{} {time_s}: {found:?}", hand.name);
+                let speeds = [found, truth].map(|held| held.velocity_m_per_s);
+                assert!(speeds[0].distance(speeds[1]) < 1e-7, "{} {time_s}: {speeds:?}", hand.name);
+            }
+            // A target that moves counts by its mean over a quarter of the time.
+            let to_m = target_m + DVec3::new(3e-4, 0.0, 0.0);
+            let truth = integrated(&hand, held, target_m, to_m, force_n, 0.001);
+            let found = hand.advance(held, target_m, to_m, force_n, 0.001);
+            let speeds = [found, truth].map(|held| held.velocity_m_per_s);
+            assert!(found.place_m.distance(truth.place_m) < 1e-8, "{}: {found:?} {truth:?}", hand.name);
+            assert!(speeds[0].distance(speeds[1]) < 2e-5, "{}: {speeds:?}", hand.name);
+        }
+    }
+
+    #[test]
+    fn a_hand_comes_to_rest_where_its_spring_bears_the_force() {
+        for hand in HANDS.into_iter().filter(|hand| hand.stiffness_n_per_m > 0.0) {
+            let (target_m, force_n) = (DVec3::new(0.0, 0.01, 0.02), DVec3::new(0.0, 0.0, 1.0));
+            let end = (0..200).fold(Held::default(), |held, _| hand.advance(held, target_m, target_m, force_n, 0.05));
+            assert!(end.place_m.distance(target_m + force_n / hand.stiffness_n_per_m) < 1e-12);
+            assert_eq!(hand.string_n(target_m, DVec3::ZERO), DVec3::ZERO);
+        }
+        // One that nobody holds is drawn by a string of half a newton.
+        let nobody = Hand::named("none").unwrap_or(CREEPING);
+        assert_eq!(nobody.string_n(DVec3::new(0.001, 0.0, 0.0), DVec3::ZERO), DVec3::new(0.06, 0.0, 0.0));
+        assert!((nobody.string_n(DVec3::ONE, DVec3::ZERO).length() - 0.5).abs() < 1e-12);
+        assert_eq!(Hand::named("nobody"), None);
+    }
+
+    /// m·s² + b·s + k + K·e^(−s·t) at s = iω.
+    fn characteristic(hand: &Hand, stiffness: f64, delay_s: f64, omega: f64) -> f64 {
+        let real = hand.stiffness_n_per_m - hand.mass_kg * omega * omega + stiffness * (omega * delay_s).cos();
+        let imaginary = hand.damping_n_s_per_m * omega - stiffness * (omega * delay_s).sin();
+        real.hypot(imaginary)
+    }
+
+    #[test]
+    fn the_critical_delay_is_the_least_with_a_vibration_that_lasts() {
+        for hand in HANDS {
+            for stiffness in [20.0, 150.0, 400.0, 1500.0] {
+                let delay_s = hand.critical_delay_s(stiffness);
+                let least = |delay_s: f64| {
+                    let omegas = (1..200_000).map(|n| 2e-3 * f64::from(n));
+                    omegas.map(|omega| characteristic(&hand, stiffness, delay_s, omega)).fold(f64::INFINITY, f64::min)
+                };
+                if delay_s.is_finite() {
+                    assert!(least(delay_s) < 0.1, "{} {stiffness}: {delay_s}", hand.name);
+                    for part in [0.5, 0.8, 0.95] {
+                        assert!(least(part * delay_s) > 0.1, "{} {stiffness}: {part}", hand.name);
+                    }
+                } else {
+                    assert!(least(0.02) > 0.0 && stiffness < hand.stiffness_n_per_m, "{} {stiffness}", hand.name);
+                }
+            }
+        }
+    }
+}

@@ -143,3 +143,98 @@ impl Law {
         (self.rows.len() - 1) as f64 * self.step_m
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// One that hardens, with rows 0.5 mm apart; each value differs from the others.
+    fn hardening() -> Law {
+        let rows = (0..5).map(|row| {
+            let x = f64::from(row);
+            Row {
+                force_n: 0.1 * x + 0.02 * x * x,
+                stiffness_n_per_m: (0.1 + 0.04 * x) / 5e-4,
+                across_n_per_m: 50.0 + 3.0 * x,
+                damping_n_s_per_m: 0.5 + 0.1 * x,
+                across_n_s_per_m: 0.3 + 0.07 * x,
+                drag_n_s_per_m: 0.2 + 0.01 * x * x,
+            }
+        });
+        Law { step_m: 5e-4, rows: rows.collect() }
+    }
+
+    #[test]
+    fn a_law_meets_its_rows_and_is_smooth_between_them() {
+        let law = hardening();
+        assert!(law.is_sound());
+        assert!((law.reach_m() - 2e-3).abs() < 1e-15);
+        for (index, row) in law.rows.iter().enumerate() {
+            let at = law.at_depth(index as f64 * law.step_m);
+            assert!((at.force_n - row.force_n).abs() < 1e-12 && (at.drag_n_s_per_m - row.drag_n_s_per_m).abs() < 1e-12);
+            assert!((at.stiffness_n_per_m - row.stiffness_n_per_m).abs() < 1e-6, "{index}: {at:?}");
+        }
+        // The force is a parabola here, which cubics follow exactly; beyond the last row it is a straight line.
+        for depth_m in [1e-4, 3e-4, 7e-4, 1.21e-3, 1.9e-3, 2.2e-3, 4e-3] {
+            let x = depth_m / law.step_m;
+            let end = x.min(4.0);
+            let force_n = 0.1 * end + 0.02 * end * end + (x - end) * (0.1 + 0.04 * end);
+            let at = law.at_depth(depth_m);
+            assert!((at.force_n - force_n).abs() < 1e-12, "{depth_m}: {at:?}");
+            let slope = (law.at_depth(depth_m + 1e-8).force_n - law.at_depth(depth_m - 1e-8).force_n) / 2e-8;
+            assert!((at.stiffness_n_per_m - slope).abs() < 1e-4 * slope, "{depth_m}: {at:?} {slope}");
+            assert!((law.depth_of(force_n) - depth_m).abs() < 1e-12, "{depth_m}: {}", law.depth_of(force_n));
+            if x < 4.0 {
+                let near = [at.across_n_per_m - (50.0 + 3.0 * x), at.damping_n_s_per_m - (0.5 + 0.1 * x)];
+                assert!(near.iter().chain([&(at.across_n_s_per_m - (0.3 + 0.07 * x))]).all(|v| v.abs() < 1e-12));
+            }
+        }
+        // A cubic whose slopes differ from the chord has the slope that it says.
+        let bent = Law {
+            step_m: 1.0,
+            rows: vec![
+                Row { stiffness_n_per_m: 3.0, ..Row::default() },
+                Row { force_n: 1.0, stiffness_n_per_m: 0.5, ..Row::default() },
+            ],
+        };
+        for depth_m in [0.1, 0.4, 0.85] {
+            let slope = (bent.at_depth(depth_m + 1e-7).force_n - bent.at_depth(depth_m - 1e-7).force_n) / 2e-7;
+            assert!((bent.at_depth(depth_m).stiffness_n_per_m - slope).abs() < 1e-6, "{depth_m}");
+        }
+        assert_eq!(law.at_depth(-1.0), law.rows[0]);
+        assert_eq!([law.depth_of(0.0), law.depth_of(-1.0)], [0.0; 2]);
+    }
+
+    #[test]
+    fn a_law_that_no_client_can_use_is_not_sound() {
+        let sound = hardening();
+        let broken: [fn(&mut Law); 7] = [
+            |law| law.rows.truncate(1),
+            |law| law.step_m = 0.0,
+            |law| law.step_m = f64::INFINITY,
+            |law| law.rows[2].force_n = 0.0,
+            |law| law.rows[1].drag_n_s_per_m = f64::NAN,
+            |law| law.rows[1].across_n_per_m = -1.0,
+            |law| law.rows[4].damping_n_s_per_m = f64::INFINITY,
+        ];
+        for spoil in broken {
+            let mut law = sound.clone();
+            spoil(&mut law);
+            assert!(!law.is_sound(), "{law:?}");
+        }
+        let two = Law { rows: sound.rows[..2].to_vec(), ..sound };
+        assert!(two.is_sound());
+    }
+
+    #[test]
+    fn a_linear_law_is_a_spring_at_every_depth() {
+        let law = Law::linear(400.0, 0.5);
+        for depth_m in [0.0, 1e-3, 0.05, 0.1, 0.3] {
+            let row = law.at_depth(depth_m);
+            assert!((row.force_n - 400.0 * depth_m).abs() < 1e-9 && (row.stiffness_n_per_m - 400.0).abs() < 1e-9);
+            let others = [row.across_n_per_m, row.damping_n_s_per_m, row.across_n_s_per_m, row.drag_n_s_per_m];
+            assert_eq!(others, [400.0, 0.5, 0.5, 0.0]);
+            assert!((law.depth_of(row.force_n) - depth_m).abs() < 1e-9);
+        }
+    }
+}

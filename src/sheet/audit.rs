@@ -514,3 +514,37 @@ impl Audit {
         Some(finding)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::limits::Limits;
+    use crate::scene::{PAPER, Scene};
+
+    #[test]
+    fn a_window_lasts_until_the_slowest_vibration_has_lost_half() {
+        // m = 0.01 kg; γ = C/2m, overdamped (C − √(C² − 4mK))/2m.
+        for (damping, stiffness, window_s) in [
+            (0.5, 50.0, 2.0_f64.ln() / 25.0),
+            (0.2, 1.0, 2.0_f64.ln() / 10.0),
+            (1.0, 5.0, 2.0_f64.ln() / (50.0 - 2000.0_f64.sqrt())),
+            (1.0, 0.0, LONGEST_S),
+            (0.0, 5.0, LONGEST_S),
+            (1e-3, 5.0, LONGEST_S),
+        ] {
+            let sets = [
+                format!("damping.coefficient_n_s_per_m={damping}"),
+                format!("virtual_springs.stiffness_n_per_m={stiffness}"),
+                "stepping.rate_hz=2000".to_owned(),
+                "stepping.integrator=exponential3".to_owned(),
+                "stepping.precision=f64".to_owned(),
+                "sheet.points=[3, 3]".to_owned(),
+            ];
+            let scene = Scene::parse("paper", PAPER, &sets, &Limits::default()).unwrap();
+            let steps = Model::compile(&scene, &Limits::default()).unwrap().window_steps();
+            let expected = (2000.0 * window_s.min(LONGEST_S)).ceil();
+            assert!((steps as f64 - expected).abs() <= 1.0, "{damping} {stiffness}: {steps}, not {expected}");
+        }
+    }
+}

@@ -359,3 +359,92 @@ fn through(values: &[f64], s: f64) -> f64 {
     };
     values.iter().enumerate().map(|(i, value)| value * weight(i)).sum()
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use glam::DVec2;
+
+    use super::*;
+    use crate::limits::Limits;
+    use crate::scene::law::Poke;
+    use crate::scene::{PAPER, Scene};
+    use crate::sheet::Tissue;
+
+    fn sheet(integrator: &str) -> Sheet<f64> {
+        let sets = [
+            format!("stepping.integrator={integrator}"),
+            "stepping.substeps=4".to_owned(),
+            "stepping.precision=f64".to_owned(),
+            "sheet.points=[7, 9]".to_owned(),
+            "sleep.tolerance=0.0".to_owned(),
+        ];
+        let scene = Scene::parse("paper", PAPER, &sets, &Limits::default()).unwrap();
+        let mut sheet = Sheet::new(&Model::compile(&scene, &Limits::default()).unwrap());
+        sheet.push(
+            0,
+            Some(Push::Held(Poke {
+                centre_m: scene.sheet.spacing_m * DVec2::new(3.0, 4.0),
+                force_n: DVec3::new(0.1, -0.2, -1.0),
+                falloff_per_m: 0.7 / scene.sheet.spacing_m,
+                falloff_offset: 0.0,
+            })),
+        );
+        (0..40).for_each(|_| sheet.step().unwrap());
+        sheet
+    }
+
+    /// As `go_back` does, but from now on.
+    fn halve(sheet: &mut Sheet<f64>) {
+        let plan = sheet.model.plan.divided(&sheet.model.scene, 2);
+        let springs = springs_of(&sheet.model, &sheet.plan);
+        convert(&sheet.bench.layout, &springs, &sheet.plan, &plan, &sheet.applied, &mut sheet.state);
+        sheet.applied.forget();
+        sheet.bench.springs = springs_of(&sheet.model, &plan);
+        (sheet.halvings, sheet.plan) = (1, plan);
+    }
+
+    /// Largest difference of displacements and of velocities, each as a part of the largest.
+    fn apart(a: &Sheet<f64>, b: &Sheet<f64>) -> [f64; 2] {
+        let (mut most, mut largest) = ([0.0_f64; 2], [0.0_f64; 2]);
+        for index in 0..a.model.len() {
+            let [p, q] = [a, b].map(|sheet| sheet.point(index));
+            let pairs = [(p.displacement_m, q.displacement_m), (p.velocity_m_per_s, q.velocity_m_per_s)];
+            for (which, (p, q)) in pairs.into_iter().enumerate() {
+                most[which] = most[which].max(p.distance(q));
+                largest[which] = largest[which].max(p.length());
+            }
+        }
+        [most[0] / largest[0], most[1] / largest[1]]
+    }
+
+    #[test]
+    fn half_the_substep_shows_the_same_state_and_goes_on_the_same_way() {
+        for (integrator, within) in [
+            ("central", 1e-3),
+            ("lagged", 1e-3),
+            ("rk4", 1e-7),
+            ("exponential2", 1e-3),
+            ("exponential3", 1e-4),
+            ("exponential4", 1e-5),
+        ] {
+            let (mut as_it_was, mut halved) = (sheet(integrator), sheet(integrator));
+            halve(&mut halved);
+            let now = apart(&as_it_was, &halved);
+            assert!(now[0] < 1e-9 && now[1] < within, "{integrator}: {now:?}");
+            (0..40).for_each(|_| [&mut as_it_was, &mut halved].into_iter().for_each(|sheet| sheet.step().unwrap()));
+            let later = apart(&as_it_was, &halved);
+            assert!(later.iter().all(|part| *part < within), "{integrator}, later: {later:?}");
+            assert!(halved.guard_events() == 0 && as_it_was.guard_events() == 0);
+        }
+    }
+
+    #[test]
+    fn a_polynomial_goes_through_its_values_and_between() {
+        let cube = |s: f64| 2.0 - s + 0.5 * s * s - 0.25 * s * s * s;
+        let values = [0.0, -1.0, -2.0, -3.0].map(cube);
+        for s in [0.0, -1.0, -3.0, -0.5, -2.25, 0.7] {
+            assert!((through(&values, s) - cube(s)).abs() < 1e-12, "{s}");
+        }
+    }
+}

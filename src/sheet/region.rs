@@ -151,3 +151,76 @@ fn push_strips(strips: &mut Vec<Strip>, rows: Range<usize>, columns: usize, [mut
         strips.pop();
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn region(layout: &Layout, awake: &[usize], reach: usize) -> Region {
+        let mut region = Region::none(layout);
+        awake.iter().for_each(|tile| {
+            region.awake.add(*tile);
+        });
+        region.cover(layout, reach);
+        region
+    }
+
+    #[test]
+    fn strips_cover_what_is_awake_and_the_springs_above_once() {
+        let layout = Layout::new::<f32>([3 * TILE + 5, 4 * TILE + 1]);
+        let [down, across] = [4, 5];
+        let mut dice = 20_261_122_u64;
+        for _ in 0..400 {
+            dice = dice.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            let bits = (dice >> 33) & (dice >> 40) | (dice >> 12) & 0b1000;
+            let awake: Vec<usize> = (0..down * across).filter(|tile| bits >> tile & 1 == 1).rev().collect();
+            for reach in [1, 2] {
+                let region = region(&layout, &awake, reach);
+                assert!(region.is_within(&layout));
+                assert!(region.tiles().is_sorted() && region.tiles().len() == awake.len());
+                let is_awake = |i: usize, j: usize| awake.contains(&(i / TILE * across + j / TILE));
+                let of = |i: usize, j: usize| {
+                    region.strips.iter().filter(move |strip| strip.rows.contains(&i) && strip.columns.contains(&j))
+                };
+                for i in 0..layout.rows {
+                    for j in 0..layout.columns {
+                        // The last rows above an awake tile begin springs that pull at it.
+                        let above = (1..=reach).any(|k| i + k < layout.rows && is_awake(i + k, j));
+                        let needed = is_awake(i, j) || above && i % TILE + reach >= TILE;
+                        assert_eq!(of(i, j).count(), usize::from(needed), "{awake:?} {reach}: {i}, {j}");
+                        assert!(of(i, j).all(|strip| !strip.awake || is_awake(i, j)), "{awake:?} {reach}: {i}, {j}");
+                        assert_eq!(region.is_awake(i, j), is_awake(i, j));
+                    }
+                }
+                // None reads what one before it has overwritten: of its points, and of those that its springs reach.
+                for (index, strip) in region.strips.iter().enumerate() {
+                    let rows = strip.rows.start..(strip.rows.end + reach).min(layout.rows);
+                    let columns = strip.columns.start.saturating_sub(reach)..strip.columns.end + reach;
+                    for before in &region.strips[..index] {
+                        let shared = |a: &Range<usize>, b: &Range<usize>| a.start.max(b.start)..a.end.min(b.end);
+                        let mut both = shared(&rows, &before.rows)
+                            .flat_map(|i| shared(&columns, &before.columns).map(move |j| (i, j)));
+                        assert!(!both.any(|(i, j)| is_awake(i, j)), "{awake:?} {reach}: {before:?}, {strip:?}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_sheet_that_is_awake_is_one_strip() {
+        let layout = Layout::new::<f32>([2 * TILE + 3, TILE + 1]);
+        let region = region(&layout, &[5, 1, 0, 3, 2, 4], 1);
+        assert_eq!(region.strips, [Strip { rows: 0..2 * TILE + 3, columns: 0..2 * TILE, awake: true }]);
+        assert!(Region::none(&layout).tiles().is_empty());
+    }
+
+    #[test]
+    fn marks_are_added_once_and_cleared_whole() {
+        let mut marks = Marks::none_of(3);
+        assert!([marks.add(2), marks.add(0), !marks.add(2), !marks.is_full()].iter().all(|holds| *holds));
+        assert!(marks.add(1) && marks.is_full());
+        marks.clear();
+        assert!(marks.members.is_empty() && marks.has == [false; 3]);
+    }
+}

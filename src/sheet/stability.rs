@@ -110,3 +110,115 @@ pub fn substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) -> u32 
 fn fewest(step_s: f64, omega_per_s: f64, theta: f64) -> u32 {
     (step_s * omega_per_s / theta).ceil().clamp(1.0, f64::from(u32::MAX)) as u32
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::cast_precision_loss)]
+    use super::*;
+
+    const ALL: [Integrator; 6] = [
+        Integrator::Central,
+        Integrator::Lagged,
+        Integrator::Rk4,
+        Integrator::Exponential2,
+        Integrator::Exponential3,
+        Integrator::Exponential4,
+    ];
+
+    fn springs(k: f64, shear: f64, flexion: bool) -> Springs {
+        Springs { stiffness_n_per_m: k, shear_stiffness_n_per_m: shear, flexion }
+    }
+
+    #[test]
+    fn the_largest_stiffness_is_that_of_the_fastest_wave() {
+        for (k, shear) in [(1.0, 1.0), (1.0, 0.0), (0.0, 2.0), (3.0, 0.2), (0.1, 5.0), (0.0, 0.0)] {
+            for flexion in [false, true] {
+                // Force on a point of u = e^{i(aj + bk)}: over all its springs, 1 − cos of the phase between their ends.
+                let wave = |a: f64, b: f64| {
+                    let both_ways = |stiffness: f64, phase: f64| 2.0 * stiffness * (1.0 - phase.cos());
+                    let bending = if flexion { both_ways(k, 2.0 * a) + both_ways(k, 2.0 * b) } else { 0.0 };
+                    both_ways(k, a) + both_ways(k, b) + both_ways(shear, a + b) + both_ways(shear, a - b) + bending
+                };
+                let angles = (0..=720).map(|n| f64::from(n) * std::f64::consts::PI / 720.0);
+                let most = angles.clone().flat_map(|a| angles.clone().map(move |b| wave(a, b))).fold(0.0, f64::max);
+                let found = largest_stiffness_n_per_m(&springs(k, shear, flexion));
+                assert!(found >= most - 1e-12 && found <= most * (1.0 + 1e-4), "{k} {shear} {flexion}: {found} {most}");
+            }
+        }
+    }
+
+    #[test]
+    fn vibrations_that_last_ask_for_smaller_turns() {
+        assert_eq!([endurance(10.0, 2.7), endurance(1.0, 1.0), endurance(0.0, f64::INFINITY)], [1.0; 3]);
+        assert!((endurance(100.0, 1.08) - 2.0).abs() < 1e-12);
+        assert_eq!([endurance(1e3, 1e3), endurance(1.0, f64::INFINITY)], [8.0; 2]);
+    }
+
+    #[test]
+    fn stable_is_as_few_substeps_as_do_not_grow() {
+        let omega_per_s = |stiffness: f64| (stiffness / 0.01_f64).sqrt();
+        for spring_stiffness_n_per_m in [0.0, 10.0, 3e3, 4e5] {
+            for damping_n_s_per_m in [0.0, 0.05, 8.0, 400.0] {
+                let sheet = Oscillator {
+                    mass_kg: 0.01,
+                    damping_n_s_per_m,
+                    virtual_stiffness_n_per_m: 5.0,
+                    spring_stiffness_n_per_m,
+                };
+                for integrator in ALL {
+                    let grows = |substeps: u32| {
+                        let substep_s = 1e-3 / f64::from(substeps);
+                        let (a, g) = sheet.scaled(substep_s);
+                        !is_stable(&Scheme::fit(integrator, a, g), sheet.scaled_spring_stiffness(substep_s))
+                    };
+                    let found = stable_substeps(integrator, 1e-3, &sheet);
+                    let case = format!("{integrator:?} {spring_stiffness_n_per_m} {damping_n_s_per_m}: {found}");
+                    let turn = omega_per_s(spring_stiffness_n_per_m + 5.0) * 1e-3;
+                    // Without damping some grow by less than rounding tells, however short the substep.
+                    assert!(!grows(found) || damping_n_s_per_m == 0.0 && turn / f64::from(found) <= 0.1, "{case}");
+                    // The search goes by eighths: what is a fifth shorter grows, or turns by more than 2.
+                    let fewer = found * 4 / 5;
+                    assert!(fewer == 0 || grows(fewer) || turn / f64::from(fewer) > 2.0, "{case}");
+                    assert!(turn / f64::from(found) <= 2.0, "{case}");
+                }
+                let turn = |integrator| {
+                    let substeps = f64::from(substeps(integrator, 1e-3, &sheet));
+                    omega_per_s(spring_stiffness_n_per_m + 5.0) * 1e-3 / substeps
+                };
+                assert!(turn(Integrator::Central) <= THETA && turn(Integrator::Lagged) <= THETA);
+                let lagged = substeps(Integrator::Lagged, 1e-3, &sheet);
+                assert!(damping_n_s_per_m / 0.01 * 1e-3 / f64::from(lagged) <= 1.0);
+                assert_eq!(substeps(Integrator::Rk4, 1e-3, &sheet), stable_substeps(Integrator::Rk4, 1e-3, &sheet));
+            }
+        }
+    }
+
+    #[test]
+    fn a_vibration_grows_by_what_its_damping_says() {
+        // Of u̇̇ + g·u̇ + (a + z)·u = 0 the slower part of e^{λ}; a scheme of second order errs by its square.
+        for (a, g, z) in [(0.01, 0.02, 0.0), (0.01, 0.02, 0.05), (0.04, 0.5, 0.0), (0.001, 0.1, 0.02)] {
+            let square: f64 = 0.25 * g * g - a - z;
+            let truth = (if square > 0.0 { square.sqrt() } else { 0.0 } - 0.5 * g).exp();
+            for (integrator, within) in ALL.into_iter().zip([2e-3, 3e-2, 1e-4, 2e-3, 1e-3, 1e-3]) {
+                let found = Scheme::fit(integrator, a, g).growth(z);
+                assert!((found - truth).abs() < within, "{integrator:?} {a} {g} {z}: {found} {truth}");
+            }
+        }
+    }
+
+    #[test]
+    fn nothing_that_vibrates_needs_one_substep() {
+        let sheet = Oscillator {
+            mass_kg: 1.0,
+            damping_n_s_per_m: 0.0,
+            virtual_stiffness_n_per_m: 0.0,
+            spring_stiffness_n_per_m: 0.0,
+        };
+        for integrator in ALL {
+            assert_eq!(substeps(integrator, 1e-3, &sheet), 1, "{integrator:?}");
+        }
+        // An absurd one asks for as many as can be counted, at once.
+        let absurd = Oscillator { spring_stiffness_n_per_m: 1e40, ..sheet };
+        assert_eq!(least_substeps(1e-3, &absurd), u32::MAX);
+    }
+}

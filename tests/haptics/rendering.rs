@@ -1,5 +1,4 @@
 //! The rendering law and its safety envelope, without a network: what a device must never be given.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 use glam::{DMat3, DVec3};
 use palpate::haptics::device::{DEVICES, Device, SAFE_FORCE_N, UNDECLARED};

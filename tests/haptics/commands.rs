@@ -1,13 +1,9 @@
 //! Touching over the network: commands, samples, leases, probes.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
-#[path = "common/server.rs"]
-mod server;
-
+use crate::server::{PATIENCE, Server, Touch, force, open, position, told};
 use palpate::wire::pb;
 use pb::command::Action;
 use pb::touch_response::Message as Heard;
-use server::{PATIENCE, Server, Touch, force, open, position, told};
 use tonic::Code;
 
 #[tokio::test]

@@ -1,11 +1,8 @@
 //! Touch and grasp: what a tool of finite size must feel of a sheet.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
-
-mod common;
 
 use std::sync::Arc;
 
-use common::{model, scene_with};
+use crate::common::{model, scene_with};
 use glam::{DVec2, DVec3};
 use palpate::haptics::Law;
 use palpate::scene::BUILT_IN;
@@ -173,6 +170,36 @@ fn a_coupling_spring_is_felt_in_series_with_the_tissue() {
     }
     let (stiff_n, _) = force(Coupling::Spring { stiffness_n_per_m: 50_000.0, damping_n_s_per_m: 0.1 });
     assert!((stiff_n / rigid_n - 1.0).abs() < 0.02, "{stiff_n} N beside {rigid_n} N");
+}
+
+#[test]
+fn a_disc_that_slides_lags_by_what_its_coupling_spring_stretches() {
+    let model = tissue("liver", &[]);
+    let stiffness_n_per_m = 500.0;
+    let coupling = Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m: 0.1 };
+    let tip = Tip { friction: 0.4, coupling, ..Tip::default() };
+    let mut sheet = sheet::at_rest(&model);
+    let from_m = middle(&model) - DVec3::new(0.012, 0.0, 0.0);
+    let way =
+        |t: f64| from_m + DVec3::new(0.024 * ((t - 0.4) / 0.8).clamp(0.0, 1.0), 0.0, 0.001 - 0.005 * smooth(t / 0.3));
+    let mut looked = 0;
+    lead(&mut *sheet, tip, 1200, way, |time_s, feel| {
+        if time_s < 0.9 {
+            return;
+        }
+        assert_eq!(feel.standing, Standing::Sliding, "{time_s} s");
+        let across = |v: DVec3| v - v.dot(feel.normal) * feel.normal;
+        let (apart_m, felt_n) = (across(feel.place_m - feel.surface_m), across(feel.force_on_tool_n));
+        let pressure_n = feel.force_on_tool_n.dot(feel.normal);
+        assert!(
+            (felt_n.length() - 0.4 * pressure_n).abs() < 1e-6 * pressure_n && felt_n.x < 0.0,
+            "{time_s} s: {feel:?}"
+        );
+        let left_n = stiffness_n_per_m * apart_m + felt_n;
+        assert!(left_n.length() < 0.1 * felt_n.length(), "{time_s} s: {apart_m} m apart under {felt_n} N");
+        looked += 1;
+    });
+    assert!(looked > 200);
 }
 
 #[test]

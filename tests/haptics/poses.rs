@@ -1,13 +1,9 @@
 //! Tools led by poses over a real server: local models, the force law, deadbands, and what is refused.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
-#[path = "common/server.rs"]
-mod server;
-
+use crate::server::{Server, Touch, open, told};
 use palpate::haptics::device::DEVICES;
 use palpate::haptics::{Device, Touching};
 use palpate::wire::{self, pb};
-use server::{Server, Touch, open, told};
 use tonic::Code;
 
 fn device() -> pb::Device {

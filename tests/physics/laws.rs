@@ -1,9 +1,6 @@
 //! Laws of nature that the sheet keeps.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
-mod common;
-
-use common::{SMALL, advance, model, playing, push_on, scene, scene_with, script};
+use crate::common::{SMALL, advance, model, playing, push_on, scene, scene_with, script};
 use glam::DVec3;
 use palpate::scene::Scene;
 use palpate::scene::law::{ForceLaw, Moment};

@@ -1,13 +1,9 @@
 //! A tissue whose springs, virtual springs and damping change while it is in use.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
-
-mod common;
-#[path = "common/server.rs"]
-mod server;
 
 use std::sync::Arc;
 
-use common::{advance, scene_with};
+use crate::common::{advance, scene_with};
+use crate::server::{PATIENCE, Server, Touch, force, open, told};
 use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::refusal::Reason;
@@ -17,7 +13,6 @@ use palpate::session::command::{Command, Due, Intake};
 use palpate::session::schedule::Schedule;
 use palpate::sheet::{Grasp, Model, Push, Tissue, at_rest};
 use palpate::wire::pb;
-use server::{PATIENCE, Server, Touch, force, open, told};
 use tonic::Code;
 
 const SCHEMES: [&[&str]; 7] = [
@@ -31,7 +26,7 @@ const SCHEMES: [&[&str]; 7] = [
 ];
 
 fn compile(sets: &[&str]) -> Arc<Model> {
-    common::model(&scene_with(PAPER, sets))
+    crate::common::model(&scene_with(PAPER, sets))
 }
 
 fn changed(model: &Model, change: Change) -> Arc<Model> {
@@ -46,7 +41,7 @@ fn other(k: f64, c: f64, virtual_k: f64) -> Change {
 fn poked(model: &Arc<Model>) -> Box<dyn Tissue> {
     let mut tissue = at_rest(model);
     let scene = &model.scene;
-    let Push::Held(mut poke) = common::push_on(scene, [15, 15], [0.7, 0.0, -2.0]) else { unreachable!() };
+    let Push::Held(mut poke) = crate::common::push_on(scene, [15, 15], [0.7, 0.0, -2.0]) else { unreachable!() };
     poke.falloff_per_m = 30.0;
     tissue.push(0, Some(Push::Held(poke)));
     tissue.grasp(1, model.index_of([22, 8]), Grasp::Held(DVec3::new(0.0, 0.0, 0.02)));

@@ -1,5 +1,4 @@
 //! What is at rest is not computed: what that may cost, and that nothing sleeps through what it should feel.
-#![allow(clippy::unwrap_used, clippy::cast_precision_loss, missing_docs)]
 
 use glam::{DVec2, DVec3};
 use palpate::limits::Limits;

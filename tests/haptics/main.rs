@@ -1,0 +1,12 @@
+//! Touch: what a tool meets, what a device is given, and the streams between.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
+
+#[path = "../common/mod.rs"]
+mod common;
+#[path = "../common/server.rs"]
+mod server;
+
+mod commands;
+mod contact;
+mod poses;
+mod rendering;

@@ -1,0 +1,17 @@
+//! What the sheet does: the laws of nature that it keeps, with other tissue under way, and at rest.
+#![allow(
+    clippy::cast_precision_loss,
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::disallowed_methods
+)]
+
+#[path = "../common/mod.rs"]
+mod common;
+#[path = "../common/server.rs"]
+mod server;
+
+mod change;
+mod laws;
+mod sleep;
