@@ -102,13 +102,9 @@ impl Longest {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::limits::Limits;
-    use crate::scene::{PAPER, Scene};
 
     fn model(points: &str) -> std::sync::Arc<Model> {
-        let limits = Limits::default();
-        let scene = Scene::parse("paper", PAPER, &[format!("sheet.points={points}")], &limits).unwrap();
-        Model::compile(&scene, &limits).unwrap()
+        Model::paper(&[&format!("sheet.points={points}")])
     }
 
     #[test]

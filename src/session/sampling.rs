@@ -215,19 +215,14 @@ impl Sampler {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::limits::Limits;
     use crate::scene::script::Action;
     use crate::scene::tip::Tip;
-    use crate::scene::{PAPER, Scene};
     use crate::session::command::{Command, Due};
     use crate::sheet::Model;
     use glam::DVec3;
 
     fn session(assignments: &[&str]) -> Session {
-        let limits = Limits::default();
-        let assignments: Vec<_> = assignments.iter().map(|text| (*text).to_owned()).collect();
-        let scene = Scene::parse("paper", PAPER, &assignments, &limits).unwrap();
-        Session::new(&Model::compile(&scene, &limits).unwrap())
+        Session::new(&Model::paper(assignments))
     }
 
     fn sampler(every: u64, deadband: Option<Deadband>) -> Sampler {

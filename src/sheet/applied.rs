@@ -291,6 +291,17 @@ impl<T: Real> Pull<'_, T> {
     pub(super) fn none() -> Self {
         Pull { factors: std::ptr::null(), from: 0, to: 0, places: [0; 2], spans: &[], forces: [[T::default(); 3]; 2] }
     }
+
+    /// The factors of a block of one of its rows.
+    ///
+    /// # Safety
+    /// The table is of the sheet that the block is of, and still there.
+    #[inline(always)]
+    unsafe fn factor<V: Vector<Real = T>>(&self, at: usize) -> V {
+        debug_assert!(self.places[0] <= at && at + V::LANES <= self.places[1]);
+        // SAFETY: the caller's promise.
+        unsafe { V::load(self.factors.wrapping_add(at)) }
+    }
 }
 
 impl<T: Real> Term<T> {
@@ -324,9 +335,8 @@ pub(super) fn reaches<T>(pulls: &[Pull<'_, T>], row: usize, column: usize) -> bo
 /// The table is of the sheet that the block is of, and still there.
 #[inline(always)]
 pub(super) unsafe fn force_of<V: Vector, const FIELDS: usize>(pull: &Pull<'_, V::Real>, at: usize) -> [[V; 2]; 3] {
-    debug_assert!(pull.places[0] <= at && at + V::LANES <= pull.places[1]);
     // SAFETY: the caller's promise.
-    let factor = unsafe { V::load(pull.factors.wrapping_add(at)) };
+    let factor = unsafe { pull.factor::<V>(at) };
     let mut forces = [[factor; 2]; 3];
     for c in 0..3 {
         for f in 0..FIELDS {
@@ -358,11 +368,10 @@ pub(super) unsafe fn force_on<V: Vector, const FIELDS: usize>(
         // SAFETY: the caller's promise.
         return unsafe { force_of::<V, FIELDS>(pull, at) };
     }
-    for pull in if pulls.len() > 1 { pulls } else { &[] } {
+    for pull in pulls {
         if row >= pull.from && row < pull.to {
-            debug_assert!(pull.places[0] <= at && at + V::LANES <= pull.places[1]);
             // SAFETY: the caller's promise.
-            let factor = unsafe { V::load(pull.factors.wrapping_add(at)) };
+            let factor = unsafe { pull.factor::<V>(at) };
             for c in 0..3 {
                 for f in 0..FIELDS {
                     sum[c][f] = factor.splat(pull.forces[f][c]).mul_add(factor, sum[c][f]);

@@ -517,10 +517,7 @@ impl Audit {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::limits::Limits;
-    use crate::scene::{PAPER, Scene};
 
     #[test]
     fn a_window_lasts_until_the_slowest_vibration_has_lost_half() {
@@ -533,16 +530,11 @@ mod tests {
             (0.0, 5.0, LONGEST_S),
             (1e-3, 5.0, LONGEST_S),
         ] {
-            let sets = [
-                format!("damping.coefficient_n_s_per_m={damping}"),
-                format!("virtual_springs.stiffness_n_per_m={stiffness}"),
-                "stepping.rate_hz=2000".to_owned(),
-                "stepping.integrator=exponential3".to_owned(),
-                "stepping.precision=f64".to_owned(),
-                "sheet.points=[3, 3]".to_owned(),
-            ];
-            let scene = Scene::parse("paper", PAPER, &sets, &Limits::default()).unwrap();
-            let steps = Model::compile(&scene, &Limits::default()).unwrap().window_steps();
+            let damped = format!("damping.coefficient_n_s_per_m={damping}");
+            let held = format!("virtual_springs.stiffness_n_per_m={stiffness}");
+            let stepping = ["stepping.rate_hz=2000", "stepping.integrator=exponential3", "stepping.precision=f64"];
+            let sets = [&damped, &held, "sheet.points=[3, 3]"];
+            let steps = Model::paper(&[&sets[..], &stepping].concat()).window_steps();
             let expected = (2000.0 * window_s.min(LONGEST_S)).ceil();
             assert!((steps as f64 - expected).abs() <= 1.0, "{damping} {stiffness}: {steps}, not {expected}");
         }

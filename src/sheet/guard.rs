@@ -225,7 +225,6 @@ impl<T: Real> Sheet<T> {
     fn go_back(&mut self, halvings: u32) {
         // A sheet that has none has nothing to go back from.
         let Some(checkpoint) = &self.checkpoint else { return };
-        let layout = self.bench.layout;
         self.watch.give_up();
         self.steps = checkpoint.steps;
         self.tiles.wake_all();
@@ -234,16 +233,20 @@ impl<T: Real> Sheet<T> {
         self.prescribed.clone_from(&checkpoint.prescribed);
         self.contacts.clone_from(&checkpoint.contacts);
         self.work = checkpoint.work;
-        let was = self.model.plan.divided(&self.model.scene, 1 << checkpoint.halvings);
-        let plan = self.model.plan.divided(&self.model.scene, 1 << halvings);
-        let springs = springs_of(&self.model, &was);
-        convert(&layout, &springs, &was, &plan, &self.applied, &mut self.state);
-        self.applied.forget();
-        self.bench.springs = springs_of(&self.model, &plan);
+        let was = checkpoint.halvings;
+        self.halve(was, halvings);
         self.bench.is_calm(0.0);
         self.bench.take_work();
-        self.halvings = halvings;
-        self.plan = plan;
+    }
+
+    /// Turns the state, which is one of the substep of `was` halvings, into one of the substep of `halvings`.
+    fn halve(&mut self, was: u32, halvings: u32) {
+        let [was, plan] = [was, halvings].map(|halvings| self.model.plan.divided(&self.model.scene, 1 << halvings));
+        let springs = springs_of(&self.model, &was);
+        convert(&self.bench.layout, &springs, &was, &plan, &self.applied, &mut self.state);
+        self.applied.forget();
+        self.bench.springs = springs_of(&self.model, &plan);
+        (self.halvings, self.plan) = (halvings, plan);
     }
 
     pub(super) fn input(&mut self, tool: usize, input: Input) {
@@ -366,21 +369,14 @@ mod tests {
     use glam::DVec2;
 
     use super::*;
-    use crate::limits::Limits;
     use crate::scene::law::Poke;
-    use crate::scene::{PAPER, Scene};
     use crate::sheet::Tissue;
 
     fn sheet(integrator: &str) -> Sheet<f64> {
-        let sets = [
-            format!("stepping.integrator={integrator}"),
-            "stepping.substeps=4".to_owned(),
-            "stepping.precision=f64".to_owned(),
-            "sheet.points=[7, 9]".to_owned(),
-            "sleep.tolerance=0.0".to_owned(),
-        ];
-        let scene = Scene::parse("paper", PAPER, &sets, &Limits::default()).unwrap();
-        let mut sheet = Sheet::new(&Model::compile(&scene, &Limits::default()).unwrap());
+        let integrator = format!("stepping.integrator={integrator}");
+        let format = ["stepping.substeps=4", "stepping.precision=f64"];
+        let model = Model::paper(&[&integrator, format[0], format[1], "sheet.points=[7, 9]", "sleep.tolerance=0.0"]);
+        let (scene, mut sheet) = (&model.scene, Sheet::new(&model));
         sheet.push(
             0,
             Some(Push::Held(Poke {
@@ -392,16 +388,6 @@ mod tests {
         );
         (0..40).for_each(|_| sheet.step().unwrap());
         sheet
-    }
-
-    /// As `go_back` does, but from now on.
-    fn halve(sheet: &mut Sheet<f64>) {
-        let plan = sheet.model.plan.divided(&sheet.model.scene, 2);
-        let springs = springs_of(&sheet.model, &sheet.plan);
-        convert(&sheet.bench.layout, &springs, &sheet.plan, &plan, &sheet.applied, &mut sheet.state);
-        sheet.applied.forget();
-        sheet.bench.springs = springs_of(&sheet.model, &plan);
-        (sheet.halvings, sheet.plan) = (1, plan);
     }
 
     /// Largest difference of displacements and of velocities, each as a part of the largest.
@@ -429,7 +415,7 @@ mod tests {
             ("exponential4", 1e-5),
         ] {
             let (mut as_it_was, mut halved) = (sheet(integrator), sheet(integrator));
-            halve(&mut halved);
+            halved.halve(0, 1);
             let now = apart(&as_it_was, &halved);
             assert!(now[0] < 1e-9 && now[1] < within, "{integrator}: {now:?}");
             (0..40).for_each(|_| [&mut as_it_was, &mut halved].into_iter().for_each(|sheet| sheet.step().unwrap()));

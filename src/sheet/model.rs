@@ -229,17 +229,23 @@ impl Model {
 }
 
 #[cfg(test)]
+impl Model {
+    /// Of the paper's scene, with some values set: for tests.
+    pub(crate) fn paper(sets: &[&str]) -> Arc<Self> {
+        let (limits, sets) = (Limits::default(), sets.iter().map(|text| (*text).to_owned()).collect::<Vec<_>>());
+        Model::compile(&Scene::parse("paper", crate::scene::PAPER, &sets, &limits).unwrap(), &limits).unwrap()
+    }
+}
+
+#[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::PAPER;
 
     #[test]
     fn a_zero_has_no_sign() {
-        let limits = Limits::default();
         let compile = |zero: &str| {
             let keys = ["damping.coefficient_n_s_per_m", "virtual_springs.stiffness_n_per_m"];
-            let scene = Scene::parse("paper", PAPER, &keys.map(|key| format!("{key}={zero}")), &limits).unwrap();
-            Model::compile(&scene, &limits).unwrap()
+            Model::paper(&keys.map(|key| format!("{key}={zero}")).each_ref().map(String::as_str))
         };
         let (negative, positive) = (compile("-0.0"), compile("0.0"));
         assert_eq!((&negative.plan, negative.expected_error), (&positive.plan, positive.expected_error));

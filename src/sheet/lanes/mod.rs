@@ -293,6 +293,60 @@ pub(super) unsafe fn run<T: Real>(width: Width, program: &impl Run<T>) {
     }
 }
 
+/// The operations that the registers of every kind have under one name.
+// SAFETY (of every block): the processor has the instructions. Who makes the first value promises it, and every other
+// function takes a value. Memory is the caller's promise.
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+macro_rules! ordinary {
+    ($name:ident, $real:ty, $mantissa:literal, $i:ident) => {
+        #[inline(always)]
+        unsafe fn load(from: *const $real) -> Self {
+            unsafe { $name($i::load(from)) }
+        }
+        #[inline(always)]
+        unsafe fn store(self, to: *mut $real) {
+            unsafe { $i::store(to, self.0) }
+        }
+        #[inline(always)]
+        unsafe fn of(value: $real) -> Self {
+            unsafe { $name($i::splat(value)) }
+        }
+        #[inline(always)]
+        fn add(self, other: Self) -> Self {
+            unsafe { $name($i::add(self.0, other.0)) }
+        }
+        #[inline(always)]
+        fn sub(self, other: Self) -> Self {
+            unsafe { $name($i::sub(self.0, other.0)) }
+        }
+        #[inline(always)]
+        fn mul(self, other: Self) -> Self {
+            unsafe { $name($i::mul(self.0, other.0)) }
+        }
+        #[inline(always)]
+        fn div(self, other: Self) -> Self {
+            unsafe { $name($i::div(self.0, other.0)) }
+        }
+        #[inline(always)]
+        fn root(self) -> Self {
+            unsafe { $name($i::root(self.0)) }
+        }
+        #[inline(always)]
+        fn power_of_two(self) -> Self {
+            // The last bits of the sum are the exponent's.
+            let sum = self.add(self.splat(<$real>::of(<$real as Real>::POWER)));
+            unsafe { $name($i::real($i::left::<$mantissa>($i::bits(sum.0)))) }
+        }
+        #[inline(always)]
+        #[allow(clippy::cast_precision_loss)]
+        fn count(self, first: usize) -> Self {
+            const COUNT: [$real; 16] =
+                [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0];
+            unsafe { $name($i::load(COUNT.as_ptr())).add(self.splat(first as $real)) }
+        }
+    };
+}
+
 #[cfg(target_arch = "x86_64")]
 mod x86;
 #[cfg(target_arch = "x86_64")]

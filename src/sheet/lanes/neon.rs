@@ -16,38 +16,7 @@ macro_rules! vector {
             type Real = $real;
             type Mask = $i::Mask;
             const LANES: usize = $lanes;
-            #[inline(always)]
-            unsafe fn load(from: *const $real) -> Self {
-                unsafe { $name($i::load(from)) }
-            }
-            #[inline(always)]
-            unsafe fn store(self, to: *mut $real) {
-                unsafe { $i::store(to, self.0) }
-            }
-            #[inline(always)]
-            unsafe fn of(value: $real) -> Self {
-                unsafe { $name($i::splat(value)) }
-            }
-            #[inline(always)]
-            fn add(self, other: Self) -> Self {
-                unsafe { $name($i::add(self.0, other.0)) }
-            }
-            #[inline(always)]
-            fn sub(self, other: Self) -> Self {
-                unsafe { $name($i::sub(self.0, other.0)) }
-            }
-            #[inline(always)]
-            fn mul(self, other: Self) -> Self {
-                unsafe { $name($i::mul(self.0, other.0)) }
-            }
-            #[inline(always)]
-            fn div(self, other: Self) -> Self {
-                unsafe { $name($i::div(self.0, other.0)) }
-            }
-            #[inline(always)]
-            fn root(self) -> Self {
-                unsafe { $name($i::root(self.0)) }
-            }
+            ordinary!($name, $real, $mantissa, $i);
             #[inline(always)]
             fn mul_add(self, b: Self, c: Self) -> Self {
                 unsafe { $name($i::plus_product(c.0, self.0, b.0)) }
@@ -66,18 +35,6 @@ macro_rules! vector {
                     let magic = $i::splat_bits(<$real as Real>::INVERSE_ROOT);
                     $name($i::real($i::sub_bits(magic, $i::half_bits::<1>($i::bits(self.0)))))
                 }
-            }
-            #[inline(always)]
-            fn power_of_two(self) -> Self {
-                // The last bits of the sum are the exponent's.
-                let sum = self.add(self.splat(<$real>::of(<$real as Real>::POWER)));
-                unsafe { $name($i::real($i::left::<$mantissa>($i::bits(sum.0)))) }
-            }
-            #[inline(always)]
-            #[allow(clippy::cast_precision_loss)]
-            fn count(self, first: usize) -> Self {
-                const COUNT: [$real; 4] = [0.0, 1.0, 2.0, 3.0];
-                unsafe { $name($i::load(COUNT.as_ptr())).add(self.splat(first as $real)) }
             }
             #[inline(always)]
             fn larger(self, other: Self) -> Self {
