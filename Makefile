@@ -140,9 +140,9 @@ bench-frames: need-rust
 stress: need-rust
 	PALPATE_STRESS_SCENES=10000 $(CARGO) test --release --test stress --test physics -- --include-ignored --nocapture
 
-# Another processor, the same golden hashes. The compiler and the standard library for ARM are Debian's. An emulated vector
-# takes some thousand times as long: `make test-arm ARM_TESTS=` for all of the tests, and hours.
-ARM_TESTS ?= the_golden_hash
+# Another processor, the same bits. The compiler and the standard library for ARM are Debian's. An emulated vector takes some
+# thousand times as long: `make test-arm ARM_TESTS="--test determinism"` for whole courses, and hours.
+ARM_TESTS ?= --lib -- a_plan_gives every_operation
 ARM := aarch64-unknown-linux-gnu
 need-arm:
 	@test -x /usr/bin/cargo -a -d /usr/lib/rustlib/$(ARM) && command -v aarch64-linux-gnu-gcc qemu-aarch64 >/dev/null || \
@@ -152,7 +152,7 @@ need-arm:
 test-arm: need-arm
 	RUSTC=/usr/bin/rustc CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=aarch64-linux-gnu-gcc \
 		CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUNNER='qemu-aarch64 -L /usr/aarch64-linux-gnu' \
-		/usr/bin/cargo test --release --target $(ARM) --target-dir target/arm --test determinism -- --nocapture $(ARM_TESTS)
+		/usr/bin/cargo test --release --target $(ARM) --target-dir target/arm $(ARM_TESTS)
 
 # The sanitizer's runtime comes with the stable compiler, its switch does not.
 test-asan: need-rust
@@ -163,7 +163,7 @@ test-asan: need-rust
 test-valgrind: need-rust
 	@command -v valgrind >/dev/null || { echo 'valgrind is missing (Debian: apt-get install valgrind)' >&2; exit 1; }
 	CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_RUNNER='valgrind --error-exitcode=1 --quiet' \
-		$(CARGO) test --release --lib --test determinism -- every_operation region:: the_golden_hash --test-threads=1
+		$(CARGO) test --release --lib --test determinism -- every_operation region:: a_plan_gives the_golden_hash --test-threads=1
 
 test-debug: need-rust
 	CARGO_PROFILE_RELEASE_DEBUG_ASSERTIONS=true $(CARGO) test --release --target-dir target/assertions --lib \
