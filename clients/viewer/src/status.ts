@@ -1,8 +1,8 @@
-// The status line: what the connection and the server are really doing.
+// The status line: the actual state of the connection and the server.
 
 import { received } from "./server";
 
-/** What is told, in this order; one that is absent is not known. */
+/** The figures, in display order. An absent one is unknown. */
 export interface Figures {
   roundTripMs?: number;
   networkMs?: number;
@@ -10,13 +10,13 @@ export interface Figures {
   framesTaken: number;
   framesDrawn: number;
   framesSkipped: bigint;
-  /** What there is less of in a picture than there could be. */
+  /** What is reduced in the picture. */
   picture: string;
   overruns: bigint;
   dilation: number;
   awakePoints?: number;
   isAsleep: boolean;
-  /** Of displacement or force, the larger, in the newest audit; absent before the first. */
+  /** The larger relative error of displacement and force in the newest audit; absent before the first. */
   auditedError?: number;
   tolerance?: number;
 }
@@ -30,12 +30,12 @@ export class Status {
     private readonly list: HTMLElement,
   ) {}
 
-  /** Said by screen readers too, so only what changed. */
+  /** Screen readers announce it, so only changes are written. */
   say(text: string): void {
     if (this.line.textContent !== text) this.line.textContent = text;
   }
 
-  /** Once a second or so. */
+  /** Updates the figures. Call about once a second. */
   show(figures: Figures): void {
     const ms = performance.now();
     const seconds = (ms - this.before.ms) / 1000;
