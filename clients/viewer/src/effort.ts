@@ -75,7 +75,7 @@ export class Effort {
     const less = [
       pixels < 1 ? `${Math.round(100 * pixels)} % of the pixels a side` : "",
       every > 1 ? `1 vertex in ${every} a side` : "",
-      isPhysical ? "" : "plain light",
+      isPhysical ? "" : "simple lighting",
       this.isSoftware ? "no graphics processor" : "",
     ].filter((what) => what !== "");
     return less.join(", ") || "in full";

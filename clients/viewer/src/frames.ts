@@ -38,7 +38,7 @@ export class Frames {
       this.newest = { step: data.step, timeS: data.timeS };
       this.onFrame(this.newest);
     };
-    worker.onerror = (event) => onFailure({ isGone: false, text: event.message || "frames can't be taken in" }, 0);
+    worker.onerror = (event) => onFailure({ isGone: false, text: event.message || "can't receive frames" }, 0);
     const vertices: [number, number] = [surface.field.nx, surface.field.ny];
     worker.postMessage({ sessionId, token: caller.token, refinement, vertices } satisfies Order);
   }

@@ -92,7 +92,7 @@ export class Hand {
       return true;
     } catch (error) {
       this.pressed = false;
-      this.onRefused(reasonOf(error) === "TOOL_HELD" ? "Somebody else holds the tool: look on." : describe(error));
+      this.onRefused(reasonOf(error) === "TOOL_HELD" ? "Somebody else holds the tool: you can only watch." : describe(error));
       this.onChange();
       return false;
     }

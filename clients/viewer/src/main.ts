@@ -54,14 +54,14 @@ async function open(sessionId: string | undefined, scene: string | undefined): P
       if (session) return await show(session, sessionId === undefined);
     } catch (error) {
       const refused = describe(error);
-      if (isGone(error)) return over("There is no such session any more.");
+      if (isGone(error)) return over("This session no longer exists.");
       if (reasonOf(error) === "UNAUTHENTICATED") {
         return over(`The server asks who you are (${refused}). Put your token behind the address, as in #token=…`);
       }
       // A refusal with any other reason would be repeated.
       if (!["", "SHUTTING_DOWN", "TOO_MANY"].includes(reasonOf(error))) return over(`${refused}.`);
       const waitMs = backoffMs(failures);
-      status.say(`The server does not answer as it should (${refused}). Trying again in ${(waitMs / 1000).toFixed(1)} s.`);
+      status.say(`Unexpected answer from the server (${refused}). Trying again in ${(waitMs / 1000).toFixed(1)} s.`);
       await sleep(waitMs);
     }
   }
@@ -74,7 +74,7 @@ function over(why: string): void {
   status.say(why);
   notice(`${why} `, 0);
   const again = document.createElement("button");
-  again.textContent = "Begin a new one";
+  again.textContent = "Start a new session";
   again.addEventListener("click", () => {
     notice("", 0);
     void open(undefined, part("scene", HTMLSelectElement).value || undefined);
@@ -112,7 +112,7 @@ async function show(session: Session, isNew: boolean): Promise<void> {
 function wellText(session: Session): string {
   const name = session.scene?.name ?? "";
   if (session.state === SessionState.HELD) return `The session is held: ${session.holdReason}`;
-  if (session.state === SessionState.PAUSED) return `Connected to a session of ${name}; its time stands still.`;
+  if (session.state === SessionState.PAUSED) return `Connected to a session of ${name}, which is paused.`;
   return `Connected to a session of ${name}.`;
 }
 
@@ -188,9 +188,9 @@ part("scene", HTMLSelectElement).addEventListener("change", (event) => {
 });
 part("share", HTMLButtonElement).addEventListener("click", () => {
   // Browsers offer the clipboard only to pages from a secure origin or from this machine.
-  const failed = () => notice("The link is the address of this page.");
+  const failed = () => notice("The link could not be copied. Copy the address of this page instead.");
   if (!isSecureContext) return failed();
-  const copied = () => notice("The link is copied: whoever opens it sees this session.");
+  const copied = () => notice("Link copied. Anyone who opens it sees this session.");
   void navigator.clipboard.writeText(location.href).then(copied, failed);
 });
 part("play", HTMLButtonElement).addEventListener("click", () => void play());

@@ -45,7 +45,7 @@ export class Status {
     this.before = { ms, bytes: received.bytes, taken: figures.framesTaken, drawn: figures.framesDrawn };
     const inMs = (value: number | undefined) => (value === undefined ? "–" : `${value.toFixed(1)} ms`);
     this.set("round trip", inMs(figures.roundTripMs));
-    this.set("of commands, network alone", inMs(figures.networkMs));
+    this.set("commands, network only", inMs(figures.networkMs));
     this.set("frame age", figures.isAsleep ? "still" : inMs(figures.frameAgeMs));
     this.set("frames", `${taken.toFixed(0)}/s, drawn ${drawn.toFixed(0)}/s, skipped ${figures.framesSkipped}`);
     this.set("picture", figures.picture);
@@ -54,7 +54,7 @@ export class Status {
     this.set("time", `${figures.dilation.toFixed(2)} × real`);
     this.set("tissue", figures.isAsleep ? "asleep" : `${figures.awakePoints ?? "–"} points awake`);
     if (figures.auditedError !== undefined) {
-      const asked = figures.tolerance === undefined ? "" : ` (asked ${figures.tolerance.toExponential(0)})`;
+      const asked = figures.tolerance === undefined ? "" : ` (tolerance ${figures.tolerance.toExponential(0)})`;
       this.set("error", `${figures.auditedError.toExponential(0)}${asked}`);
     }
   }
