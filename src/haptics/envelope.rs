@@ -1,11 +1,11 @@
 //! The safety envelope: the limits between a wanted force and a device. Every force passes them, in this order:
 //!
 //! 1. the age of the model, counted from when the newest *arrived* (a constant delay is not staleness), or the time
-//! since the last tick if that is longer: up to [`FRESH_S`] no change; up to [`STALE_S`] the force fades to a half;
-//! beyond, it decays with [`DECAY_S`]; from [`PAUSE_S`] on the state is PAUSED. A model that arrives before brings the
-//! force back within [`RETURN_S`];
+//!    since the last tick if that is longer: up to [`FRESH_S`] no change; up to [`STALE_S`] the force fades to a half;
+//!    beyond, it decays with [`DECAY_S`]; from [`PAUSE_S`] on the state is PAUSED. A model that arrives before brings
+//!    the force back within [`RETURN_S`];
 //! 2. soft engage: after `enable` nothing is rendered until the wanted force is below [`ENGAGE_BELOW_N`]; then the
-//! force ramps in over [`ENGAGE_S`];
+//!    force ramps in over [`ENGAGE_S`];
 //! 3. the norm of the force (clamping its components would turn it), and the device's continuous force;
 //! 4. passivity: no more energy leaves the port than has entered it;
 //! 5. slew: at most [`SLEW_N_PER_S`], up and down, in every state.

@@ -336,6 +336,9 @@ impl Intake {
     /// Accepts another tissue, made from `base`, for the beginning of step `at_step`, or of the next step. Returns the
     /// step, or `None` if [`Intake::changed_to`] is no longer `base`. Changes take effect in their order of arrival,
     /// and each is made from the one before it. Of several for one step the last one applies; it includes the others.
+    ///
+    /// # Errors
+    /// Refuses if the intake is closed, for a step before that of a waiting change, and for too many waiting changes.
     pub fn change(
         &mut self,
         base: Option<&Arc<Model>>,

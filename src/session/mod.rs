@@ -341,7 +341,7 @@ impl Session {
         self.tissue.grasp(tool, index, Grasp::Law(law));
     }
 
-    /// The samples of the tools; only those of `only`, if given.
+    /// The samples of the tools; only those with a number in `only`, if given.
     pub fn sample(&self, only: Option<&[u32]>) -> Sample {
         let sample_of = |number: u32| {
             let tool = self.tools.get(number as usize).cloned().unwrap_or_default();
@@ -400,7 +400,7 @@ impl Session {
         energy_record(self.tissue.energy())
     }
 
-    /// A record of `points`, or of all, without energies.
+    /// A record of `points` (grid indices [i, j]), or of all points, without energies.
     pub fn record(&self, points: Option<&[[usize; 2]]>) -> Record {
         let of = |point: &[usize; 2]| point_record(*point, &self.tissue.point(self.model().index_of(*point)));
         Record {

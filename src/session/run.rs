@@ -78,6 +78,9 @@ pub fn change(session: &mut Session, changes: &mut VecDeque<(u64, Arc<Model>)>) 
 
 /// Plays `script` and writes its records, as JSON Lines, to `output`. `clock_s` returns the time, for the summary;
 /// `progress` gets the number of steps done from time to time.
+///
+/// # Errors
+/// Returns an error if the guard stops the run, a command or change is refused, or the output can't be written.
 pub fn run(
     model: &Arc<Model>,
     script: &Script,
@@ -92,6 +95,9 @@ pub fn run(
 
 /// The same, with a twin in f64 with a quarter of the substep beside it: the summary has the differences. With
 /// `[stepping] correct`, the run corrects errors above the tolerance as it goes.
+///
+/// # Errors
+/// As for [`run`].
 pub fn audited(
     model: &Arc<Model>,
     script: &Script,

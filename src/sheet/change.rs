@@ -21,7 +21,7 @@ impl<T: Real> Sheet<T> {
         self.watch.give_up();
         if self.is_same_tissue(model) {
             self.resample(model);
-            // There is no rounding loss to carry over from before there was room for it.
+            // A newly allocated rounding loss begins at 0.
             let layout = self.bench.layout;
             let kept = self.plan.scheme.kept(model.precision == Precision::Compensated);
             self.state.kept.resize_with(kept, || Arc::new(Field::zero(&layout)));

@@ -20,7 +20,7 @@ pub(super) fn farthest_unnoticed<T: Real>(model: &Model, tiles: &Tiles<T>) -> f6
     let ratio = scene.virtual_stiffness_n_per_m / scene.springs.stiffness_n_per_m;
     // Without springs nothing passes from tile to tile.
     let unnoticed = if ratio.is_nan() { epsilon } else { epsilon * (20.0 * ratio).clamp(0.1, 1.0) };
-    // The last digit is below the rounding error in any case.
+    // A difference in the last digit is rounding noise.
     if scene.virtual_stiffness_n_per_m > 0.0 { unnoticed.max(T::EPSILON * tiles.largest) } else { unnoticed }
 }
 
@@ -68,7 +68,7 @@ impl<T: Real> Sheet<T> {
         }
         let Sheet { model, plan, bench, state, tiles, prescribed, contacts, applied, .. } = self;
         let spacing_m = model.scene.sheet.spacing_m;
-        // The points under a tool that holds or touches stay awake.
+        // Tiles under a tool that holds or touches stay awake.
         let grasped = prescribed.grasped().map(|(index, _)| model.point_of(index));
         let held: Vec<usize> = grasped.chain(contacts.points()).map(|point| tiles.of(point)).collect();
         for (_, motion) in prescribed.grasped() {

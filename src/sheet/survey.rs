@@ -71,8 +71,8 @@ pub(super) enum Write {
     /// Replaces the scheme's internal values by the observed u and w.
     Seen,
     /// Replaces the observed u and w by the scheme's internal values, as if the springs had always pulled as they do
-    /// now. (In a two-step scheme, w is half a change ahead of d: d = w − (next − w)/2, and the observed velocity is (d
-    /// + next)/2.)
+    /// now. (In a two-step scheme, w is half a change ahead of d: d = w − (next − w)/2, and the scheme observes
+    /// (d + next)/2 as w.)
     Begin,
 }
 

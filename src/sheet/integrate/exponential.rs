@@ -129,7 +129,7 @@ impl Multistep {
         places.iter().map(node).collect()
     }
 
-    /// The difference between the springs' force and its prediction: `history` has the force at 0, −1, …, −p.
+    /// The difference between the springs' force and its prediction: `history` has p + 1 values, at 0, −1, …, −p.
     pub fn surprise(&self, history: &[f64]) -> f64 {
         history[0] - self.extrapolation.iter().zip(&history[1..]).map(|(weight, past)| weight * past).sum::<f64>()
     }
