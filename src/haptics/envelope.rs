@@ -11,8 +11,8 @@
 //! 5. slew: at most [`SLEW_N_PER_S`], up and down, in every state.
 //!
 //! **Passivity.** The port's energy is exact for a held force: E −= f·Δx at each tick. A force f that moves with the
-//! hand at v, and that slew lets fall no faster than S, still gives f²·v/2S before it is zero. So it is limited to f ≤
-//! √(2·S·E/v): a spring of K, pressed in and released at v, is not limited as long as its force falls no faster than
+//! hand at v, and that slew lets fall no faster than S, still gives f²·v/2S before it is zero. So it is limited to
+//! f ≤ √(2·S·E/v): a spring of K, pressed in and released at v, is not limited as long as its force falls no faster than
 //! the slew allows, K·v ≤ S. A hand at rest may start at any moment, so v counts as at least [`LEAST_SPEED_M_PER_S`].
 //! To allow a first force before any energy has entered, the tank begins with [`CREDIT_J`], and [`FIRST_N`] against a
 //! hand that presses on is always allowed.

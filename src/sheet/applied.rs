@@ -23,7 +23,7 @@ use super::model::{Model, Plan};
 use super::real::Real;
 use crate::scene::law::{ForceLaw, Moment, Poke};
 
-/// What a tool exerts.
+/// The force of a tool.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Push {
     /// Constant until the next command.

@@ -234,9 +234,9 @@ impl Model {
 
     /// Steps in a window: until the slowest vibration has lost half its amplitude, at most [`LONGEST_S`] s.
     ///
-    /// The amplitude of m·ü + C·u̇ + K·u = 0 falls as e^(−γt), with γ = C/2m, or in the overdamped case γ = (C − √(C² −
-    /// 4mK))/2m for the slower part. K is that of the virtual springs alone: the slowest vibration of a sheet bends it
-    /// least.
+    /// The amplitude of m·ü + C·u̇ + K·u = 0 falls as e^(−γt), with γ = C/2m, or in the overdamped case
+    /// γ = (C − √(C² − 4mK))/2m for the slower part. K is that of the virtual springs alone: the slowest vibration of a
+    /// sheet bends it least.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub fn window_steps(&self) -> u64 {
         let Oscillator { mass_kg, damping_n_s_per_m: c, virtual_stiffness_n_per_m: k, .. } =

@@ -16,8 +16,9 @@ use crate::scene::{Integrator, Precision, Scene, Stepping};
 const AIM: f64 = 0.5;
 
 impl Model {
-    /// What keeps the error of `finding` below the tolerance from step `step` on: another scheme or more substeps, a
-    /// better number format, or less sleep. `None` if the error is within the tolerance, or if nothing better exists.
+    /// The correction that keeps the error of `finding` below the tolerance from step `step` on: another scheme or more
+    /// substeps, a better number format, or less sleep. `None` if the error is within the tolerance, or if nothing
+    /// better exists.
     pub fn correction(&self, finding: &Finding, step: u64, limits: &Limits) -> Option<Correction> {
         let origin = finding.origin?;
         let excess = finding.error.largest() / (AIM * self.scene.stepping.tolerance);

@@ -85,8 +85,8 @@ impl<T: Real> Kind<T> {
         odd.mul_add(excess, even).mul(excess)
     }
 
-    /// Stiffness × (1 − L0/L) for any Q, most accurate away from 0: with r near 1/s, e = 1 − r²(1 + q) is small, and 1
-    /// − 1/s = (1 − r) − r·e/2 up to e², where 1 − r is exact for r from ½ to 2. A rough r from the bits of the number
+    /// Stiffness × (1 − L0/L) for any Q, most accurate away from 0: with r near 1/s, e = 1 − r²(1 + q) is small, and
+    /// 1 − 1/s = (1 − r) − r·e/2 up to e², where 1 − r is exact for r from ½ to 2. A rough r from the bits of the number
     /// and a few Newton steps cost a quarter of a root and a division, whose throughput does not grow with the vector
     /// width.
     #[inline(always)]

@@ -76,7 +76,7 @@ pub(super) struct Tiles<T> {
     elastic_j: Vec<Cell<Option<[f64; 2]>>>,
     /// Positions of the points around each tile; allocated when the first tile sleeps.
     snapshots: Vec<T>,
-    /// What the sleeping tiles next to awake ones compare.
+    /// The comparisons of the sleeping tiles next to awake ones.
     watches: Vec<Watch>,
     /// Tiles that were awake since the last checkpoint.
     touched: Marks,
