@@ -1,6 +1,6 @@
-//! A session at work: for a minute (DUTY_S seconds), a haptic stream that sends a command for each sample, a thousand a
-//! second, and a viewer that takes 60 frames of 331 × 331 vertices a second, each on a thread and a connection of its
-//! own. Was time kept? Was a command lost?
+//! A session under load: for a minute (DUTY_S seconds), a haptic stream that sends a command for each sample, a
+//! thousand a second, and a viewer that takes 60 frames of 331 × 331 vertices a second, each on its own thread and
+//! connection. Checks that steps stay on time and that no command is lost.
 
 #![allow(clippy::unwrap_used, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
 
@@ -63,7 +63,7 @@ fn main() {
                     if sample.step == steps {
                         break (first.unwrap(), sample, sent, rejected, samples);
                     }
-                    // The last few have no step left to act in.
+                    // The last few have no step left to take effect in.
                     if sample.step < steps - 20 {
                         sent += 1;
                         let strength_n = -1.0 - 0.5 * (sample.step as f64 * 0.01).sin();

@@ -1,4 +1,4 @@
-//! What does accuracy cost? Every scheme, number format and step on seven scenes: run time against error. Writes
+//! The cost of accuracy: every scheme, number format and step on seven scenes, run time against error. Writes
 //! docs/benchmarks/error.{md,json,svg}; `-- --quick` tries fewer steps and measures each once.
 
 #![allow(
@@ -33,7 +33,7 @@ use subject::{INTEGRATOR, INTEGRATORS, PRECISION, PRECISIONS, known, set};
 /// How far the steps are refined, and how often each run is timed.
 struct Effort {
     rounds: usize,
-    /// No run is to take longer, s.
+    /// Longest time of a run, s.
     longest_run_s: f64,
     least_error: f64,
 }
@@ -72,7 +72,7 @@ impl Run {
         session
     }
 
-    /// Runs it and looks; `None` if the guard ended it.
+    /// Runs it and records; `None` if the guard ended it.
     fn trace(&self) -> Option<Trace> {
         let mut trace = Trace { displacements_m: Vec::new(), forces_n: Vec::new() };
         let mut session = self.session();
@@ -91,7 +91,7 @@ impl Run {
         session.hold_reason().is_none().then_some(trace)
     }
 
-    /// Runs it without a look; run time a simulated second, s.
+    /// Runs it without recording. Run time per simulated second, s.
     fn cost(&self) -> f64 {
         let mut session = self.session();
         let mut due = Vec::new();
@@ -109,15 +109,15 @@ fn errors(trace: &Trace, truth: &Trace) -> [f64; 2] {
     [relative(&trace.displacements_m, &truth.displacements_m), relative(&trace.forces_n, &truth.forces_n)]
 }
 
-/// The settings of one step of 8 ms / 2ⁿ: below 125 Hz · 8 by the rate, above by substeps.
+/// The settings for a step of 8 ms / 2ⁿ: the rate sets steps of up to 1 kHz, and substeps set shorter ones.
 fn step_of(halvings: u32) -> (f64, Vec<String>) {
     let (rate_hz, substeps) = (125.0 * f64::from(1_u32 << halvings.min(3)), 1_u32 << halvings.saturating_sub(3));
     let settings = vec![set("stepping.rate_hz", rate_hz), set("stepping.substeps", substeps)];
     (1.0 / (rate_hz * f64::from(substeps)), settings)
 }
 
-/// What the scene does in truth, and how well two ways of finding it agree. One is central differences at two small
-/// steps, extrapolated to none: of a kind with nothing that is measured. The other is Runge–Kutta at a small step or,
+/// The true motion of a scene, and how well two ways of finding it agree. One is central differences at two small
+/// steps, extrapolated to step zero: unlike any of the schemes measured. The other is Runge–Kutta at a small step or,
 /// in a build without it, the extrapolation from twice the steps.
 fn truth(case: &Case, knows_rk4: bool) -> (Trace, [f64; 2], &'static str) {
     let one_step = subject::model(&case.with(&[])).unwrap();
@@ -149,7 +149,7 @@ fn truth(case: &Case, knows_rk4: bool) -> (Trace, [f64; 2], &'static str) {
     (truth, agreement, kind)
 }
 
-/// Every trial of one scheme and format, from the coarsest stable step on, not timed yet.
+/// Every trial of one scheme and format from the coarsest stable step on, not yet timed.
 fn curve(
     case: &Case,
     integrator: &'static str,
@@ -168,7 +168,7 @@ fn curve(
         let Some(trace) = trace else { continue };
         let [displacement, force] = errors(&trace, truth);
         let trial = Trial { integrator, precision, step_s, displacement, force, cost: f64::NAN };
-        // Rounding stops the gain sooner or later.
+        // At some step, rounding stops the gain.
         in_vain = if trial.error() < 0.8 * best { 0 } else { in_vain + 1 };
         best = best.min(trial.error());
         trials.push((run, trial));
@@ -235,7 +235,7 @@ fn tell_case(report: &mut Report, case: &Case, curves: &[Curve], truth: &str) {
     report.table(&cells(header), &curves.iter().flatten().map(row).collect::<Vec<_>>());
 }
 
-/// Ratios at equal error: what the reference scheme costs over what the best costs.
+/// Ratios at equal error: the cost of the reference scheme over that of the best.
 fn tell_ratios(report: &mut Report, reference: &str, at: &[f64], results: &[(&Case, Vec<Curve>)]) {
     let mut header = vec!["scene".to_owned()];
     header.extend(at.iter().map(|error| format!("at {error:.0e}")));
@@ -245,7 +245,7 @@ fn tell_ratios(report: &mut Report, reference: &str, at: &[f64], results: &[(&Ca
         let mut row = vec![case.name.to_owned()];
         for &error in at {
             let of = |trial: &Trial| trial.integrator == reference;
-            // Only of a scheme of first order is it known how it would go on.
+            // Extrapolation is possible only for a scheme of first order.
             let reference = cheapest(curves, error, of, reference == "lagged");
             let best = cheapest(curves, error, |_| true, false);
             row.push(match (reference, best) {

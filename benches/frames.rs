@@ -1,6 +1,6 @@
-//! Refining and encoding a frame beside a plain copy of its bytes: both on one core, in turn, the least time of many
-//! turns. The frame is written into the buffers of the one before, as the server does; the copy goes into a buffer
-//! that has been written before. And the bytes of a poke whose frames are of what changed. Writes
+//! Compares refining and encoding a frame with a plain copy of its bytes: both on one core, in turn, the least time of
+//! many turns. The frame is written into the buffers of the one before, as in the server; the copy goes into a buffer
+//! that has been written before. Also measures the bytes of a poke sent as frames of changes. Writes
 //! docs/benchmarks/frames.{md,json,svg}.
 
 #![allow(clippy::unwrap_used, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
@@ -26,11 +26,11 @@ const SIDES: [usize; 2] = [31, 331];
 const REFINEMENTS: [u32; 4] = [0, 1, 3, 10];
 const ENCODINGS: [Encoding; 2] = [Encoding::F32, Encoding::I16];
 
-/// How long each case is measured, and at least how often.
+/// How long each case is measured, and the least number of times.
 const DURATION: Duration = Duration::from_millis(1000);
 const LEAST_TURNS: u32 = 25;
 
-/// What is asked for: a frame of 331 × 331 points takes at most as long as so many copies.
+/// The goal: a frame of 331 × 331 points takes at most as long as this many copies.
 const GOAL: f64 = 3.0;
 
 struct Case {
@@ -40,7 +40,7 @@ struct Case {
     vertices: usize,
     bytes: usize,
     frame_s: f64,
-    /// To find the box around the displacements, once for all frames of a snapshot.
+    /// The time to find the bounding box of the displacements, once for all frames of a snapshot.
     box_s: f64,
     copy_s: f64,
 }
@@ -50,14 +50,14 @@ impl Case {
         self.frame_s / self.copy_s
     }
 
-    /// With the box, as if nobody else looked; only `I16` needs it.
+    /// Including the box, as if there were one viewer; only `I16` needs it.
     fn ratio_with_box(&self) -> f64 {
         let box_s = if self.encoding == Encoding::I16 { self.box_s } else { 0.0 };
         (self.frame_s + box_s) / self.copy_s
     }
 }
 
-/// A sheet that waves, each component on its own scale.
+/// A sheet with waves, each component on its own scale.
 fn waving(side: usize) -> [Vec<f32>; 3] {
     let wave = |k: usize, c: usize| {
         let (x, y) = ((k / side) as f32, (k % side) as f32);
@@ -120,7 +120,7 @@ fn table(report: &mut Report, cases: &[Case]) {
     report.table(&cells(header), &rows.collect::<Vec<_>>());
 }
 
-/// The ratio of each case, by sheet, refinement and encoding; the goal is yellow.
+/// The ratio of each case by sheet, refinement and encoding; yellow is the goal.
 fn map(cases: &[Case]) -> Panel {
     let shown = |case: &Case| (digits(case.ratio()), 0.5 * case.ratio() / GOAL);
     let column = |side: usize| cases.iter().filter(move |case| case.side == side);
@@ -135,21 +135,21 @@ fn map(cases: &[Case]) -> Panel {
     }
 }
 
-/// Frames a second.
+/// Frames per second.
 const RATE_HZ: u64 = 60;
 
-/// A poke of 331 × 331 points, in phases that end after so many ms; the force acts in the first.
+/// A poke of 331 × 331 points, in phases with their end times, ms; the force acts in the first.
 const PHASES: [(&str, u64); 4] = [("poked", 1000), ("let go", 2000), ("coming to rest", 7000), ("still", 12_000)];
 
-/// Of what changed in one phase.
+/// The frames of changes sent in one phase.
 struct Sent {
     bytes: usize,
     frames: u64,
-    /// Between a vertex and where it should be, in quanta.
+    /// Largest distance of a vertex from its true place, in quanta.
     error: f64,
 }
 
-/// What a viewer is sent of a poke: of each phase, and in all.
+/// The frames that a viewer gets of a poke: for each phase, and in total.
 fn poke(force_n: DVec3, refinement: u32, report: &mut Report, rows: &mut Vec<Vec<String>>) {
     let side = 331;
     let model = subject::model(&[subject::set("sheet.points", format!("[{side}, {side}]"))]).unwrap();
@@ -192,11 +192,11 @@ fn poke(force_n: DVec3, refinement: u32, report: &mut Report, rows: &mut Vec<Vec
                     overrun_count: 0,
                     time_dilation: 1.0,
                 };
-                // With what the protocol adds.
+                // Including the protocol's overhead.
                 let messages = palpate::wire::sample::frame(&"0".repeat(32), &delivery, 0);
                 sent.bytes += messages.iter().map(prost::Message::encoded_len).sum::<usize>();
                 sent.frames += 1;
-                // To compare every frame would take a while.
+                // Comparing every frame would take too long.
                 if frames.is_multiple_of(8) {
                     let truth = encode(&snapshot, grid, Encoding::F32);
                     sent.error = sent.error.max(error(&truth, &delivery.frame, columns, &shown));
@@ -226,7 +226,7 @@ fn poke(force_n: DVec3, refinement: u32, report: &mut Report, rows: &mut Vec<Vec
     }
 }
 
-/// Vertices of a patch, and their bytes.
+/// The vertices of a frame and their bytes.
 fn vertices(frame: &Frame, columns: usize) -> impl Iterator<Item = (usize, &[u8])> {
     let size = frame.encoding.bytes_per_vertex();
     frame.patches.iter().flat_map(move |patch| {
@@ -236,7 +236,7 @@ fn vertices(frame: &Frame, columns: usize) -> impl Iterator<Item = (usize, &[u8]
     })
 }
 
-/// Writes a frame over what was shown.
+/// Writes a frame over the displacements shown before.
 fn show(frame: &Frame, columns: usize, shown: &mut [[f64; 3]]) {
     for (vertex, bytes) in vertices(frame, columns) {
         shown[vertex] = std::array::from_fn(|c| {
@@ -246,7 +246,7 @@ fn show(frame: &Frame, columns: usize, shown: &mut [[f64; 3]]) {
     }
 }
 
-/// The largest between what is shown and the truth, in quanta.
+/// The largest difference between the displacements shown and the truth, in quanta.
 fn error(truth: &Frame, frame: &Frame, columns: usize, shown: &[[f64; 3]]) -> f64 {
     let errors = vertices(truth, columns).flat_map(|(vertex, bytes)| {
         (0..3).map(move |c| {

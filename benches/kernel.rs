@@ -1,6 +1,6 @@
-//! How long does a step take? Every width of the kernel, number format and size, beside what the machine could do and what
-//! a user would write in NumPy, numba or Taichi. Writes docs/benchmarks/kernel.{md,json,svg}. The peers run if PEERS
-//! names a Python that has them; `make bench-kernel` sees to that. `-- --quick` measures two sizes once.
+//! The time of a step for every width of the kernel, number format and size, compared with the limits of the machine
+//! and with implementations in NumPy, numba or Taichi. Writes docs/benchmarks/kernel.{md,json,svg}. The peers run if
+//! PEERS names a Python that has them, as `make bench-kernel` ensures. `-- --quick` measures two sizes once.
 
 #![allow(
     clippy::unwrap_used,
@@ -26,29 +26,30 @@ use report::{Report, digits, quick, seconds};
 use serde_json::{Value, json};
 use subject::{INTEGRATOR, LANE_NAMES, LANES, PRECISION, PRECISIONS, known, set};
 
-/// Sums, products and both at once, of 16 lanes, a point: what the measured chain of multiplications and additions is made
-/// of. Comparisons, masks and shifts of lanes are not counted: some processors have other units for them. Of each of its 4
-/// springs: 3 for the difference, ½ along the spring, 4 for the square, 7 for a polynomial of degree 5, 3 for the force, 5¼
-/// to add it to both ends. Of each of its 3 components: 4 for virtual spring, damping, the sum, and the check of all.
+/// Additions, multiplications and fused multiply-adds of 16 lanes per point, the operations of the measured chain.
+/// Comparisons, masks and shifts of lanes are not counted: some processors have other units for them. For each of its 4
+/// springs: 3 for the difference, ½ along the spring, 4 for the square, 7 for a polynomial of degree 5, 3 for the
+/// force, 5¼ to add it to both ends. For each of its 3 components: 4 for virtual spring, damping, the sum, and the
+/// check of all.
 const OPERATIONS_PER_POINT: f64 = (4.0 * 22.75 + 3.0 * 4.0) / 16.0;
 
-/// A window of this length is long for the clock and short for whatever else the machine does.
+/// Long enough for the clock, and short enough to fall between the machine's other activities.
 const WINDOW_S: f64 = 3e-3;
-/// All windows of one kernel in a round, if they are at least 5.
+/// Total length of the windows of one kernel in a round, if they are at least 5.
 const WINDOWS_S: f64 = 0.15;
 
-/// By what was measured and the side of the sheet: the windows of each round.
+/// The windows of each round, by subject and side of the sheet.
 type Rounds = BTreeMap<(String, usize), Vec<Windows>>;
 
-/// Many windows, ns a point and step.
+/// Statistics of many windows, ns per point and step.
 #[derive(Clone, Copy)]
 struct Windows {
     least_ns: f64,
     median_ns: f64,
 }
 
-/// A sheet in motion everywhere: pushed like the paper's, within a few points, and so weakly that it hardly matters as
-/// far as the rim, so that all numbers are ordinary.
+/// A sheet in motion everywhere: pushed like the paper's within a few points, and also pushed too weakly to matter as
+/// far as the edge, so that all numbers are in the normal range.
 fn tissue(settings: &[String], side: usize) -> Box<dyn Tissue> {
     let size = set("sheet.points", format!("[{side}, {side}]"));
     let settings: Vec<String> = settings.iter().cloned().chain([size, set("stepping.substeps", 1)]).collect();
@@ -71,7 +72,7 @@ fn tissue(settings: &[String], side: usize) -> Box<dyn Tissue> {
 fn measure(settings: &[String], side: usize) -> Windows {
     let mut tissue = tissue(settings, side);
     let mut run = |steps: usize| seconds(|| (0..steps).for_each(|_| tissue.step().unwrap())).0;
-    // Sets it in motion; the slowest kernels on the largest sheets have to do with little of it.
+    // Sets it in motion. Few steps, because the slowest kernels on the largest sheets take long.
     let step_s = run(4) / 4.0;
     run((WINDOWS_S / step_s).min(50.0) as usize);
     let steps = ((WINDOW_S / step_s) as usize).max(1);
@@ -82,7 +83,7 @@ fn measure(settings: &[String], side: usize) -> Windows {
     Windows { least_ns: windows[0], median_ns: windows[count / 2] }
 }
 
-/// Settings of every kernel there is, by name.
+/// Settings of every kernel, by name.
 fn kernels() -> Vec<(String, Vec<String>)> {
     let lanes: Vec<Option<&str>> = match known(LANES, &LANE_NAMES).as_slice() {
         [] => vec![None],
@@ -102,7 +103,7 @@ fn kernels() -> Vec<(String, Vec<String>)> {
     kernels
 }
 
-/// What a peer's script prints, line by line; nothing if it does not run.
+/// The lines that a peer's script prints as JSON; empty if it does not run.
 fn peer(python: &str, script: &str, sides: &[usize]) -> Vec<Value> {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/peers").join(script);
     let mut command = Command::new(python);
@@ -123,7 +124,7 @@ fn peer(python: &str, script: &str, sides: &[usize]) -> Vec<Value> {
     String::from_utf8_lossy(&output).lines().filter_map(|line| serde_json::from_str(line).ok()).collect()
 }
 
-/// Compiles the limits for just this processor, and measures them.
+/// Compiles the limits for this processor, and measures them.
 fn machine_limits(sides: &[usize]) -> Option<Value> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let program = root.join("target/machine-limits");
@@ -139,7 +140,7 @@ fn machine_limits(sides: &[usize]) -> Option<Value> {
     serde_json::from_slice(&output.stdout).ok()
 }
 
-/// Of `rounds` rounds; the kernels, the peers and the limits take turns.
+/// Runs `rounds` rounds in which the kernels, the peers and the limits take turns.
 fn measure_all(rounds: usize, sides: &[usize], kernels: &[(String, Vec<String>)]) -> (Rounds, Vec<Value>) {
     let python = std::env::var("PEERS").ok().filter(|path| Path::new(path).exists());
     if python.is_none() {
@@ -193,7 +194,7 @@ fn main() {
     let product_ns =
         |side: usize| product.iter().map(|name| least(of(name, side).unwrap())).fold(f64::INFINITY, f64::min);
 
-    // The best that the machine did in any round.
+    // The best result of the machine in any round.
     let best = |read: &dyn Fn(&Value) -> Option<f64>| limits.iter().filter_map(read).reduce(f64::min);
     let arithmetic_ns = best(&|limit| limit["fma_of_16_lanes_ns"].as_f64()).map(|ns| ns * OPERATIONS_PER_POINT);
     let memory_ns = |side: usize| best(&|limit| limit["traffic_ns_per_point"][side.to_string()].as_f64());

@@ -1,6 +1,7 @@
-//! Touch over a network, in virtual time: how true, how steady and how passive is what a simulated hand feels, by delay,
-//! tissue, hand, network and scheme. First the delay at which hand and spring become unstable, which theory knows; and
-//! how stiff the tissues are under a disc, which a flat punch knows. Runs `palpate-client link`, as anybody can.
+//! Touch over a network, in virtual time: the accuracy, stability and passivity of the force on a simulated hand, by
+//! delay, tissue, hand, network and scheme. It first compares two results with theory: the delay at which hand and
+//! spring become unstable, and the stiffness of the tissues under a disc (a flat punch). Runs `palpate-client link`, as
+//! a user can.
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
 
@@ -25,7 +26,7 @@ use serde_json::{Value, json};
 const SCHEMES: [&str; 3] = ["model", "hold", "raw"];
 const ROUND_TRIPS_MS: [f64; 7] = [0.5, 2.0, 10.0, 20.0, 50.0, 100.0, 200.0];
 
-/// The program, which `make bench-link` has built.
+/// The program that `make bench-link` has built.
 fn program() -> PathBuf {
     PathBuf::from(env!("CARGO_BIN_EXE_palpate")).with_file_name("palpate-client")
 }
@@ -37,7 +38,7 @@ fn link(arguments: &[String]) -> Value {
     serde_json::from_slice(&output.stdout).unwrap()
 }
 
-/// All runs, on all processors, in order.
+/// Performs all runs on all processors; results are in order.
 fn links(runs: &[Vec<String>]) -> Vec<Value> {
     let next = AtomicUsize::new(0);
     let results = Mutex::new(vec![Value::Null; runs.len()]);
@@ -65,7 +66,7 @@ fn number(value: &Value) -> f64 {
     value.as_f64().unwrap_or(f64::NAN)
 }
 
-/// Of several seeds: means, and the worst where a mean says little.
+/// Merges several seeds: means, and the worst case where a mean says little.
 fn merged(runs: &[Value], name: &str) -> f64 {
     let values = runs.iter().map(|run| number(&run[name]));
     match name {
@@ -292,7 +293,7 @@ fn others(report: &mut Report, seeds: u64) {
     table(report, "stalls", &["tissue", "stands still for, ms"], runs);
 }
 
-/// The same hand and task in real time, over gRPC and a wire that delays: does virtual time tell the truth?
+/// The same hand and task in real time, over gRPC with a delay, to validate virtual time.
 fn live(report: &mut Report) {
     report.heading("In real time: medium hand, omega3");
     report.say(

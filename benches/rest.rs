@@ -1,6 +1,6 @@
-//! Sessions at rest: what a thousand of them (REST_SESSIONS) cost a server together, that nobody has touched yet and that
-//! have come to rest again after a poke. Memory is what the process has resident, beyond what it had before; time that of
-//! all its threads, over 10 s (REST_S). Linux only: both are read from /proc.
+//! Sessions at rest: the total cost to a server of a thousand sessions (REST_SESSIONS) that are untouched, and of
+//! sessions at rest again after a poke. Memory is the resident memory of the process beyond its initial size; time is
+//! that of all its threads, over 10 s (REST_S). Linux only: both are read from /proc.
 
 #![allow(clippy::unwrap_used, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
 
@@ -16,13 +16,13 @@ use pb::session_service_client::SessionServiceClient;
 use server::{Server, force};
 use tonic::transport::Channel;
 
-/// Of one core, all sessions together.
+/// Limit for all sessions together, per cent of one core.
 const MOST_PERCENT: f64 = 1.0;
 
-/// Of one session of 31 × 31 points.
+/// Limit for one session of 31 × 31 points.
 const MOST_KIB: f64 = 128.0;
 
-/// Sessions poked at a time: fewer than a core steps.
+/// Sessions poked at a time: fewer than a core can step.
 const BATCH: usize = 50;
 
 fn environment(name: &str, otherwise: f64) -> f64 {
@@ -36,7 +36,7 @@ fn memory_kib(server: &Server) -> f64 {
     line.split_whitespace().nth(1).unwrap().parse().unwrap()
 }
 
-/// Time of all threads so far, s: in ticks of 10 ms, on every Linux.
+/// Processor time of all threads so far, s. Linux counts it in ticks of 10 ms.
 fn cpu_s(server: &Server) -> f64 {
     let stat = std::fs::read_to_string(format!("/proc/{}/stat", server.child.id())).unwrap();
     let after_name = &stat[stat.rfind(')').unwrap() + 2..];
@@ -44,7 +44,7 @@ fn cpu_s(server: &Server) -> f64 {
     ticks.sum::<f64>() / 100.0
 }
 
-/// Per cent of a core, over some seconds in which nobody asks for anything.
+/// Per cent of a core, over some seconds without requests.
 fn share_percent(server: &Server) -> f64 {
     let (begun, before_s) = (Instant::now(), cpu_s(server));
     std::thread::sleep(Duration::from_secs_f64(environment("REST_S", 10.0)));
@@ -62,7 +62,7 @@ async fn is_resting(sessions: &mut SessionServiceClient<Channel>, session_id: &s
     sessions.get_session(request).await.unwrap().into_inner().session.unwrap().resting
 }
 
-/// A tenth of a second at 1 N, then the tool is let go.
+/// Pushes with 1 N for a tenth of a second, then releases the tool.
 async fn poke(haptics: &mut HapticServiceClient<Channel>, session_id: &str) {
     let acquire = pb::AcquireToolRequest { session_id: session_id.to_owned(), ..Default::default() };
     let lease_id = haptics.acquire_tool(acquire).await.unwrap().into_inner().lease_id;
@@ -71,7 +71,7 @@ async fn poke(haptics: &mut HapticServiceClient<Channel>, session_id: &str) {
     haptics.send_commands(request).await.unwrap();
 }
 
-/// Whether all come to rest within a minute.
+/// Whether all sessions come to rest within a minute.
 async fn settle(sessions: &mut SessionServiceClient<Channel>, ids: &[String]) -> bool {
     let begun = Instant::now();
     for id in ids {
@@ -95,7 +95,7 @@ fn main() {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     let channel = runtime.block_on(server.channel());
     let (mut sessions, mut haptics) = (SessionServiceClient::new(channel.clone()), HapticServiceClient::new(channel));
-    // What the first session alone brings with it belongs to the server.
+    // The cost that the first session adds once belongs to the server.
     runtime.block_on(create(&mut sessions));
     let before_kib = memory_kib(&server);
     let mut missed = false;
@@ -119,7 +119,7 @@ fn main() {
             for id in batch {
                 poke(&mut haptics, id).await;
             }
-            // They lapse with the leases, if not before.
+            // The tools are released when their leases lapse, if not before.
             if !settle(&mut sessions, batch).await {
                 return false;
             }
@@ -134,7 +134,7 @@ fn main() {
     }
     if missed {
         println!("\nabove the bounds of {MOST_PERCENT} % and {MOST_KIB} KiB");
-        // Ends the server, as an exit would not.
+        // Stops the server; an exit would not run the destructor.
         drop(server);
         std::process::exit(1);
     }

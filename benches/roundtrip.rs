@@ -1,12 +1,12 @@
-//! The haptic round trip beside a bare tonic echo: what Palpate adds to the network.
+//! The haptic round trip compared with a bare tonic echo: what Palpate adds to the network.
 //!
-//! A real `palpate serve` and an echo server (each a process of its own) are asked in turn, a second each, by one
-//! client. Both streams carry the same messages: a force command up, a sample with one tool down, a thousand times a
-//! second. Of the haptic round trip only the wait until the step was due is left out, which passes by design: that the
-//! server was late, stepped, encoded and waited to send is counted. The echo is measured in three ways: a message a
-//! millisecond; the same, but answered after a millisecond, so that the client is as fast asleep when the answer comes as
-//! it is in a haptic loop (less all that the echo had the message, which is the network alone); and back to back, when no
-//! core ever falls asleep.
+//! One client asks a real `palpate serve` and an echo server (each a process of its own) in turn, a second each. Both
+//! streams carry the same messages: a force command up, a sample with one tool down, a thousand times a second. Only
+//! the wait until the step was due is subtracted from the haptic round trip, because it is by design; lateness,
+//! stepping, encoding and queueing in the server all count. The echo is measured in three ways: a message per
+//! millisecond; the same with an answer after a millisecond, so that the client is as deeply asleep when the answer
+//! comes as in a haptic loop (minus the time that the echo held the message, which leaves the network alone); and back
+//! to back, when no core ever sleeps.
 
 #![allow(clippy::unwrap_used, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
 
@@ -28,7 +28,7 @@ use tonic::{Request, Response, Status, Streaming};
 
 type Out<T> = std::pin::Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
-/// Answers each command with a sample of the usual size: at once, or in a session named "wait" after a millisecond.
+/// Answers each command with a sample of the usual size: at once, or after a millisecond in a session named "wait".
 struct Echo;
 
 const WAIT: &str = "wait";
@@ -135,7 +135,7 @@ fn serve_echo() {
     });
 }
 
-/// The echo server, in a process of its own.
+/// Starts the echo server in a process of its own.
 fn spawn_echo() -> Server {
     let mut echo = Command::new(std::env::current_exe().unwrap());
     Server::of(echo.arg("--echo").stdout(Stdio::piped()).spawn().unwrap())
@@ -157,7 +157,8 @@ impl Asker {
         u64::try_from(self.clock.elapsed().as_nanos()).unwrap()
     }
 
-    /// Round trip; of it, the time the server had the command; and of that, the wait until its step was due, ns.
+    /// Round trip; the part of it in which the server held the command; and the part of that until its step was due,
+    /// ns.
     async fn ask(&mut self) -> [u64; 3] {
         self.sequence += 1;
         let strength_n = if self.sequence.is_multiple_of(2) { -1.0 } else { -0.9 };
@@ -191,7 +192,7 @@ fn main() {
         let (mut whole, mut unplanned, mut network) = (histogram(), histogram(), histogram());
         let (mut paced, mut asleep, mut busy) = (histogram(), histogram(), histogram());
         for _ in 0..rounds {
-            // Reads what has waited.
+            // Read what is already there.
             haptic.ask().await;
             let until = Instant::now() + Duration::from_secs(1);
             while Instant::now() < until {
@@ -200,7 +201,7 @@ fn main() {
                 unplanned.record(round_trip_ns - wait_ns).unwrap();
                 network.record(round_trip_ns - hold_ns).unwrap();
             }
-            // The session steps on beside the echo, so that both are measured on a machine equally busy.
+            // The session keeps stepping beside the echo, so that the machine is equally busy in both measurements.
             let until = Instant::now() + Duration::from_secs(1);
             let mut tick = tokio::time::interval(Duration::from_millis(1));
             while Instant::now() < until {

@@ -1,6 +1,6 @@
-//! What does it save to leave out what is at rest, and what does it cost in accuracy? Sizes, springs and kinds of poke
-//! against the tolerance of `[sleep]`; truth is the same run with everything awake. Writes
-//! docs/benchmarks/skip.{md,json,svg}. `-- --quick` measures the small sheets.
+//! How much time sleep saves, and how much accuracy it costs. Sizes, springs and kinds of poke against the tolerance of
+//! `[sleep]`; the truth is the same run with everything awake. Writes docs/benchmarks/skip.{md,json,svg}. `-- --quick`
+//! measures the small sheets.
 
 #![allow(clippy::unwrap_used, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
 
@@ -17,17 +17,17 @@ use subject::set;
 
 const TOLERANCES: [f64; 4] = [1e-3, 1e-4, 1e-5, 1e-6];
 const STEPS: u64 = 2000;
-/// Steps between two looks at the whole field.
+/// Steps between two records of the whole field.
 const LOOK_STEPS: u64 = 50;
 
-/// What is done to a sheet of the side `length_m`, at 1 kHz.
+/// The forces on a sheet of side `length_m`, at 1 kHz.
 struct Kind {
     name: &'static str,
     about: &'static str,
     pushes: fn(length_m: f64) -> Vec<ForceLaw>,
 }
 
-/// The paper's poke: 3 N, 150 /m, let go after a second.
+/// The paper's poke: 3 N, 150 /m, released after a second.
 fn poke(centre_m: DVec2, force_n: DVec3) -> ForceLaw {
     ForceLaw {
         centre: CentreLaw::Hops(vec![(0, centre_m)]),
@@ -80,7 +80,7 @@ const KINDS: [Kind; 4] = [
     },
 ];
 
-/// A run: what a step took on average, the part that was computed, and the fields seen.
+/// A run: the mean time of a step, the computed fraction, and the recorded fields.
 struct Run {
     step_s: f64,
     computed: f64,
@@ -110,7 +110,8 @@ fn run(settings: &[String], kind: &Kind, rounds: usize) -> Run {
     Run { step_s: least_s / STEPS as f64, computed, fields }
 }
 
-/// What a step may cost of which only a part of the points is awake: 1.1 times what these cost where all are, and 1 µs.
+/// Bound for the time of a step with a part of the points awake: 1.1 times the cost of those points in a step with all
+/// awake, plus 1 µs.
 fn bound_s(all_awake_s: f64, computed: f64) -> f64 {
     1.1 * computed * all_awake_s + 1e-6
 }
@@ -156,7 +157,7 @@ fn main() {
         for ratio in [2.0, 20.0, 200.0] {
             let mut line = Vec::new();
             for side in sides {
-                // The largest sheets of stiff springs tell nothing that smaller ones don't.
+                // The largest sheets of stiff springs show nothing that smaller ones don't.
                 if *side > 500 && ratio > 20.0 {
                     continue;
                 }

@@ -1,5 +1,5 @@
-//! How large may a step be? The limit that is predicted, and the one that is observed, for every scheme over stiffness and
-//! damping; and what a large force does near it. Writes docs/benchmarks/stability.{md,json,svg}.
+//! The largest stable step: the predicted and the observed limit for every scheme, by stiffness and damping; and the
+//! effect of a large force near it. Writes docs/benchmarks/stability.{md,json,svg}.
 
 #![allow(
     clippy::unwrap_used,
@@ -27,14 +27,14 @@ const SPRINGS_N_PER_M: [f64; 4] = [0.0, 10.0, 100.0, 1000.0];
 const VIRTUAL_N_PER_M: f64 = 5.0;
 const DAMPINGS_N_S_PER_M: [f64; 5] = [0.0, 0.05, 0.5, 2.0, 10.0];
 
-/// What grows by less than this in so many steps is called stable: less than 0.05 % a step.
+/// A motion that grows by less than [`GROWTH`] in this many steps counts as stable: less than 0.05 % per step.
 const STEPS: u32 = 20_000;
 const GROWTH: f64 = 1e4;
 
-/// What becomes of a sheet, from best to worst, and its colour.
+/// The outcomes for a sheet, from best to worst, with their colours.
 const FATES: [(&str, f64); 4] = [("stable", 0.0), ("mended", 0.4), ("astray", 0.6), ("held", 1.0)];
 
-/// A scheme and what it has to do with.
+/// A scheme and its conditions.
 #[derive(Clone, Copy)]
 struct Tissue {
     integrator: &'static str,
@@ -55,11 +55,11 @@ impl Tissue {
         subject::model(&settings)
     }
 
-    /// What the scheme promises for a sheet whose fastest vibration is just `omega_per_s`: for this, springs whose bound
-    /// (12k + K″)/m is ω². `None` if it promises something for every step that a scene may have.
+    /// The limit that the scheme predicts for a sheet whose fastest vibration is exactly `omega_per_s`: for this,
+    /// springs whose bound (12k + K″)/m is ω². `None` if it predicts stability at every step that a scene may have.
     fn predicted_s(self, omega_per_s: f64, mass_kg: f64) -> Option<f64> {
         let spring_n_per_m = (omega_per_s * omega_per_s * mass_kg - VIRTUAL_N_PER_M) / 12.0;
-        // What is left by rounding is no spring.
+        // A remainder from rounding is not a spring.
         let spring_n_per_m = if spring_n_per_m < 1e-9 { 0.0 } else { spring_n_per_m };
         let bounded = Tissue { spring_n_per_m, ..self };
         largest_s(1.0 / omega_per_s, |step_s| bounded.model(step_s).unwrap().plan.stable)
@@ -70,7 +70,7 @@ impl Tissue {
         largest_s(1.0 / omega_per_s, |step_s| self.after_kick(step_s).is_none())
     }
 
-    /// What goes wrong after a small kick, if anything does.
+    /// The failure after a small kick, if there is one.
     fn after_kick(self, step_s: f64) -> Option<&'static str> {
         let model = self.model(step_s).unwrap();
         let sheet = &model.scene.sheet;
@@ -91,7 +91,7 @@ impl Tissue {
             if step == 0 {
                 tissue.push(0, None);
             }
-            // Looking costs as much as a step.
+            // A check costs as much as a step.
             if step % 16 == 0 {
                 largest_m = tissue.largest_displacement_m();
             }
@@ -105,7 +105,8 @@ impl Tissue {
         None
     }
 
-    /// Which of [`FATES`] it is at such a force, if it is to move no farther than about `settled_m`.
+    /// The index in [`FATES`] of the outcome at this force, given that the sheet should move no farther than about
+    /// `settled_m`.
     fn fate(self, step_s: f64, force_n: f64, settled_m: f64) -> usize {
         match self.pushed(step_s, force_n) {
             None => 3,
@@ -114,7 +115,8 @@ impl Tissue {
         }
     }
 
-    /// The largest displacement under a force on the centre, and how often the guard acted; `None` if it ended the session.
+    /// The largest displacement under a force on the centre, and the number of guard events; `None` if the guard ended
+    /// the session.
     fn pushed(self, step_s: f64, force_n: f64) -> Option<(f64, u64)> {
         let model = self.model(step_s).unwrap();
         let sheet = &model.scene.sheet;
@@ -138,8 +140,8 @@ impl Tissue {
     }
 }
 
-/// The largest step for which `holds`, by bisection between a 64th and 64 times of `about_s`. `None` if it holds for all,
-/// 0 if for none.
+/// The largest step for which `holds`, by bisection between 1/64 and 64 times `about_s`. `None` if it holds for all, 0
+/// if for none.
 fn largest_s(about_s: f64, holds: impl Fn(f64) -> bool) -> Option<f64> {
     let (mut low, mut high) = (about_s / 64.0, 64.0 * about_s);
     if holds(high) {
@@ -155,8 +157,8 @@ fn largest_s(about_s: f64, holds: impl Fn(f64) -> bool) -> Option<f64> {
     Some(low)
 }
 
-/// The fastest vibration of a sheet without fixed points or flexion at rest, rad/s: the largest eigenvalue of its stiffness by the power method. At rest a
-/// spring resists along itself only, so that all is in the plane.
+/// The fastest vibration of a sheet without fixed points or flexion at rest, rad/s: the largest eigenvalue of its
+/// stiffness by the power method. At rest a spring resists only along itself, so everything is in the plane.
 fn fastest_per_s(model: &Model) -> f64 {
     let scene = &model.scene;
     let [nx, ny] = model.points;
@@ -179,7 +181,7 @@ fn fastest_per_s(model: &Model) -> f64 {
         force
     };
     let length = |u: &[DVec2]| u.iter().map(|u| u.length_squared()).sum::<f64>().sqrt();
-    // Something of every vibration.
+    // A start vector with a part of every vibration.
     let mut u: Vec<DVec2> = (0..model.len()).map(|n| DVec2::new((n as f64).sin(), (1.7 * n as f64).cos())).collect();
     let mut eigenvalue = 0.0;
     for _ in 0..20_000 {
@@ -191,7 +193,7 @@ fn fastest_per_s(model: &Model) -> f64 {
     (eigenvalue / scene.sheet.point_mass_kg).sqrt()
 }
 
-/// dt·ω at the limit by the textbook, for the schemes that it has.
+/// dt·ω at the limit by the textbook, for the schemes that it covers.
 fn textbook(integrator: &str, omega_per_s: f64, damping_per_s: f64) -> Option<f64> {
     match integrator {
         "central" => Some(2.0),
@@ -210,7 +212,7 @@ struct Limit {
     omega_per_s: f64,
     predicted: Option<f64>,
     observed: Option<f64>,
-    /// What goes wrong just beyond.
+    /// The failure just beyond the limit.
     beyond: Option<&'static str>,
     textbook: Option<f64>,
 }
@@ -282,7 +284,7 @@ fn limit_panel(integrator: &str, limits: &[Limit]) -> Panel {
     }
 }
 
-/// What a large force does, over steps and forces, and whether all within the predicted limit was well.
+/// The effect of a large force, over steps and forces, and whether everything within the predicted limit went well.
 fn force_panel(integrator: &'static str) -> (Panel, Vec<Value>) {
     let tissue = Tissue { integrator, spring_n_per_m: 10.0, damping_n_s_per_m: 0.5 };
     let omega_per_s = tissue.model(1e-3).unwrap().omega_bound_per_s;

@@ -1,7 +1,7 @@
-//! Is the tolerance kept that a scene asks for, and how much better than asked for is what was chosen? Random scenes with
-//! random scripts against f64 at 1e-10. Writes docs/benchmarks/tolerance.{md,json,svg}.
-//! `-- --scenes 1000 --seed 1 --tolerances 1e-3,1e-5`; exit status 1 if a tolerance was broken. `--audit` compares what
-//! an audit tells with the true error as well, which takes ten times as long.
+//! Whether the chosen scheme keeps a scene's tolerance, and by how much. Random scenes with random scripts against f64
+//! at 1e-10. Writes docs/benchmarks/tolerance.{md,json,svg}. `-- --scenes 1000 --seed 1 --tolerances 1e-3,1e-5`; exit
+//! status 1 if a tolerance was broken. `--audit` also compares an audit's result with the true error, which takes ten
+//! times as long.
 
 #![allow(clippy::unwrap_used, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
 #![allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
@@ -26,7 +26,7 @@ struct Row {
     part: f64,
     /// The expected error over the true one.
     expected: f64,
-    /// More than one substep or f64: something cheaper might have done.
+    /// More than one substep, or f64: something cheaper might have been enough.
     dear: bool,
     chosen: String,
     step_s: f64,
@@ -35,7 +35,7 @@ struct Row {
     about: String,
 }
 
-/// By which an audited error may differ from the true one.
+/// Largest ratio between an audited error and the true one.
 const FACTOR: f64 = 5.0;
 
 fn argument(name: &str) -> Option<String> {

@@ -1,6 +1,7 @@
-//! `make figures`: the figures and experiments of docs/paper.md, into docs/figures. The same bytes on every run.
+//! `make figures`: generates the figures and experiments of docs/paper.md in docs/figures. Every run gives the same
+//! bytes.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
-#![allow(dead_code, unreachable_pub)] // Of the module of charts.
+#![allow(dead_code, unreachable_pub)] // The chart module is shared.
 
 #[path = "../benches/report/chart.rs"]
 mod chart;
@@ -20,7 +21,7 @@ use palpate::texture;
 
 const SIZE: [usize; 2] = [560, 420];
 
-/// Each side has as many pixels as the sheet refined tenfold has vertices.
+/// The texture has as many pixels per side as the tenfold refined sheet has vertices.
 const TEXTURE: &str = "appearance.texture_size=331";
 
 fn model(sets: &[String]) -> Arc<Model> {
@@ -40,7 +41,7 @@ fn write(name: &str, bytes: &[u8]) {
     println!("docs/figures/{name}: {} KiB", bytes.len().div_ceil(1024));
 }
 
-/// One of the paper's figures: refinement, whether its mesh shows, script and moment.
+/// One of the paper's figures: refinement, whether to show its mesh, script and moment.
 fn figure(number: u32, n: u32, mesh: bool, script_name: &str, at_step: u64) {
     let (model, limits) = (model(&[TEXTURE.to_owned()]), Limits::default());
     let script = script(script_name, &model);
@@ -51,7 +52,7 @@ fn figure(number: u32, n: u32, mesh: bool, script_name: &str, at_step: u64) {
     write(&format!("figure-{number}.png"), &still.picture(&model, &view).png().unwrap());
 }
 
-/// How deep the control point is, mm, over time, s, while `vertical-60` is played with some settings of the scene.
+/// Depth of the control point, mm, over time, s, while `vertical-60` is played with the settings `sets`.
 fn depth(sets: &[String]) -> Vec<(f64, f64)> {
     let model = model(sets);
     let script = script("vertical-60", &model);
@@ -81,13 +82,13 @@ fn curves(title: &str, (key, name): (&str, &str), values: &[f64], up: std::ops::
     Panel::Curves { title: title.to_owned(), x: "time, s", y: "depth, mm", up, series }
 }
 
-/// Keys of a scene, and what they are called in a picture.
+/// Keys of a scene and their labels in a picture.
 const K: (&str, &str) = ("springs.stiffness_n_per_m", "k");
 const C: (&str, &str) = ("damping.coefficient_n_s_per_m", "C");
 const VIRTUAL: (&str, &str) = ("virtual_springs.stiffness_n_per_m", "K″");
 
 fn main() {
-    // Before the force is let go.
+    // The last step before the force is released.
     let poked = 500;
     figure(2, 0, true, "vertical-60", poked);
     figure(3, 1, true, "vertical-60", poked);

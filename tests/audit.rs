@@ -1,4 +1,4 @@
-//! The measured error: of a run, of windows of steps, and of live sessions; and what is done about it.
+//! The measured error of a run, of windows of steps and of live sessions, and the corrections that follow from it.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 mod common;
@@ -30,17 +30,17 @@ const PULSE: &str = "duration_s = 1.0\nsample_every_s = 0.02\nsample_points = [[
     point = [3, 2]\nforce_n = [0.1, 0.05, -0.3]\nfalloff_per_m = 20.0\nfalloff_offset = 0.0\n\
     profile = { type = \"pulse\", on_s = 0.1, off_s = 0.4 }\n";
 
-/// A force that never rests, along a way.
+/// A force that is never constant, along a path.
 const SINE: &str = "duration_s = 2.0\nsample_every_s = 0.02\nsample_points = [[3, 2], [1, 1], [5, 3]]\n[[force]]\n\
     path = { from_m = [0.1, 0.1], velocity_m_per_s = [0.03, 0.01] }\nforce_n = [0.05, 0.1, -0.3]\n\
     falloff_per_m = 20.0\nfalloff_offset = 0.0\nprofile = { type = \"sine\", frequency_hz = 3.0 }\n";
 
-/// A point that is taken and moved.
+/// A point that is grasped and moved.
 const GRASP: &str = "duration_s = 1.0\nsample_every_s = 0.02\nsample_points = [[3, 2], [2, 2], [5, 3]]\n[[tool]]\n\
     point = [3, 2]\nmoves = [{ from_s = 0.0, to_s = 0.2, by_m = [0.0, 0.01, 0.02] }, \
     { from_s = 0.5, to_s = 0.6, by_m = [0.01, 0.0, -0.03] }]\n";
 
-/// Runs a script, audited or not: the summary, and the records as they were written.
+/// Runs a script, audited or not. Returns the summary and the records as written.
 fn play(scene: &Scene, text: &str, held: bool, audited: bool) -> (Summary, Vec<Value>) {
     let script = script(text, scene);
     let mut output = Vec::new();
@@ -109,10 +109,10 @@ fn an_audit_of_a_good_scene_is_within_its_tolerance() {
     }
 }
 
-/// What a client tells tools at a step.
+/// The actions that a client commands at a step.
 type Told = fn(u64) -> Vec<(usize, Action)>;
 
-/// A touch that presses, slides and lets go; a spherical grasp would hold.
+/// A touch that presses, slides and releases; with `grasps`, a grasp that holds.
 fn touching(grasps: bool, step: u64) -> Vec<(usize, Action)> {
     let t = step as f64 / 250.0;
     let tip = Tip { radius_m: 0.06, grasps, ..Tip::default() };
@@ -147,7 +147,7 @@ fn commanded(scene: &Scene, told: Told, steps: u64, mut look: impl FnMut(&mut Se
     session
 }
 
-/// All windows of such a session, each done again with `finer` times the substeps.
+/// The findings of all windows of such a session, each repeated with `finer` times the substeps.
 fn findings(scene: &Scene, told: Told, steps: u64, finer: u32) -> Vec<Finding> {
     let (mut opening, mut found, mut asked) = (None, Vec::new(), false);
     commanded(scene, told, steps, |session| {
@@ -170,9 +170,9 @@ fn findings(scene: &Scene, told: Told, steps: u64, finer: u32) -> Vec<Finding> {
 
 #[test]
 fn a_window_agrees_with_one_of_a_much_shorter_substep() {
-    // The error of a tool that meets the sheet falls more slowly with the substep than that of the scheme: contact begins and
-    // ends within a substep, and a tip that sticks or slips a substep sooner ends elsewhere. So a quarter of the substep
-    // shows less of it, and of some windows much less.
+    // The error of a tool that meets the sheet falls more slowly with the substep than the scheme's: contact begins and
+    // ends within a substep, and a tip that sticks or slips a substep earlier ends elsewhere. So a quarter of the
+    // substep reveals less of that error, and in some windows much less.
     let tools: [(&str, f64, f64, Told); 4] = [
         ("push", 2.0, 1.0, pushing),
         ("grasp of a point", 2.0, 1.0, grasping),
@@ -240,13 +240,13 @@ fn an_error_is_told_with_what_it_comes_from() {
     assert!(!rounding.is_empty() && rounding.iter().all(|origin| *origin == Some(Origin::Rounding)), "{rounding:?}");
     let none = of(&["stepping.tolerance=1e-4"]);
     assert!(!none.is_empty() && none.iter().all(Option::is_none), "{none:?}");
-    // A long sheet, of which most sleeps though it moves a little.
+    // A long sheet, most of which sleeps though it moves a little.
     let asleep = ["sheet.points=[7, 120]", "sleep.tolerance=0.3", "stepping.tolerance=1e-6", "stepping.precision=f64"];
     let asleep = of(&[&asleep[..], &["springs.stiffness_n_per_m=300"]].concat());
     assert!(asleep.contains(&Some(Origin::Sleep)), "{asleep:?}");
 }
 
-/// Plays a script without an audit, but with corrections that another run was told of.
+/// Plays a script without an audit, but with the corrections recorded in another run.
 fn corrected(scene: &Scene, text: &str, corrections: &[Correction]) -> Session {
     let script = script(text, scene);
     let mut session = playing(scene, &script);
@@ -304,7 +304,7 @@ fn a_correction_brings_the_error_below_the_tolerance() {
     assert!(errors.len() > 8 && errors[errors.len() - 4..].iter().all(|error| *error <= 1e-5), "{errors:?}");
 }
 
-/// A session that steps too coarsely for its tolerance.
+/// A session with steps too coarse for its tolerance.
 fn coarse(correct: bool) -> Source {
     let settings = ["stepping.integrator=lagged".to_owned(), "stepping.substeps=1".to_owned()];
     let mut scene = Scene::parse("paper", palpate::scene::PAPER, &settings, &Limits::default()).unwrap();

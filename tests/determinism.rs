@@ -46,7 +46,7 @@ fn hash(scene: &Scene, held: bool) -> String {
 
 #[test]
 fn the_golden_hash_of_a_fixed_scene_stays() {
-    // These change only when the arithmetic does: then say so in CHANGELOG.md.
+    // These change only when the arithmetic changes. If they do, say so in CHANGELOG.md.
     for (sets, golden) in [
         (vec!["stepping.precision=f32"], GOLDEN_F32),
         (vec!["stepping.precision=f64", "springs.flexion=true", "stepping.substeps=3"], GOLDEN_F64),
@@ -78,7 +78,7 @@ fn every_width_of_vectors_gives_the_same_bits() {
         sets.extend([points.as_str(), lanes.as_str()]);
         let scene = scene_with(PAPER, &sets);
         let mut tissue = sheet::at_rest(&common::model(&scene));
-        // Strong enough for springs beyond the polynomial, and to bring rounding into play.
+        // Strong enough to strain springs beyond the polynomial's range, and for rounding to matter.
         tissue.push(0, Some(common::push_on(&scene, [0, 0], [0.7, 0.2, -0.9])));
         let middle = [scene.sheet.points[0] / 2, scene.sheet.points[1] / 2];
         tissue.push(1, Some(common::push_on(&scene, middle, [-0.1, 0.5, 1.5])));

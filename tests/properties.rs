@@ -1,5 +1,5 @@
-//! What holds for every input: no text panics a reader, no command moves the tissue out of bounds, what is refused
-//! changes nothing.
+//! Properties of every input: no text makes a reader panic, no command moves the tissue out of bounds, and a refused
+//! input changes nothing.
 #![allow(clippy::unwrap_used)]
 
 mod common;
@@ -38,7 +38,7 @@ fn spoilt(text: &'static str) -> impl Strategy<Value = String> {
     })
 }
 
-/// Any number that a client may send.
+/// Any number that a client can send.
 fn number() -> impl Strategy<Value = f64> {
     prop_oneof![8 => -3.0..3.0_f64, 1 => any::<f64>(), 1 => Just(f64::NAN), 1 => Just(1e4), 1 => Just(0.0)]
 }
@@ -100,7 +100,7 @@ proptest! {
     ) {
         let set = format!("stepping.precision={precision}");
         let scene = Scene::parse("small", SMALL, &[set], &Limits::default()).unwrap();
-        // Which were refused, and the state after all.
+        // Returns which commands were refused, and the final state.
         let run = |left_out: &[bool]| {
             let limits = Limits::default();
             let mut intake = Intake::new(&scene, &limits);

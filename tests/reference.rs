@@ -1,5 +1,5 @@
-//! Accuracy against scenes that were solved to 1e-10 by other means (tests/reference: each file has the scene, the
-//! times, and at each time displacements, velocities, forces and energies).
+//! Accuracy against scenes solved to 1e-10 by other means. Each file in tests/reference has the scene, the times, and
+//! for each time displacements, velocities, forces and energies.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 mod common;
@@ -28,7 +28,7 @@ fn point(value: &Value) -> [usize; 2] {
     [value[0].as_u64().unwrap() as usize, value[1].as_u64().unwrap() as usize]
 }
 
-/// The scene of a reference, as a scene file says it.
+/// The scene of a reference as a scene file.
 fn scene_text(scene: &Value) -> String {
     format!(
         "[sheet]\npoints = [{}, {}]\nspacing_m = {}\npoint_mass_kg = {}\n[springs]\nstiffness_n_per_m = {}\n\
@@ -37,7 +37,7 @@ fn scene_text(scene: &Value) -> String {
     )
 }
 
-/// Its forces and tool, as a script says them.
+/// Its forces and tool as a script.
 fn script_text(scene: &Value) -> String {
     let times = scene["times"].as_array().unwrap();
     let mut text = format!("duration_s = {}\nsample_every_s = {}\n", scene["t_end"], times[1]);
@@ -76,7 +76,7 @@ struct Errors {
     energy: f64,
 }
 
-/// Runs a reference scene with `assignments` and compares everything that the reference has.
+/// Runs a reference scene with `assignments` and compares every value in the reference.
 fn errors(name: &str, assignments: &[&str]) -> Errors {
     let reference = load(name);
     let scene = scene_with(&scene_text(&reference["scene"]), assignments);
@@ -140,7 +140,7 @@ fn errors(name: &str, assignments: &[&str]) -> Errors {
     }
 }
 
-/// By what each error falls when the step falls by 4.
+/// The factor by which each error falls when the step falls by 4.
 fn gains(name: &str, integrator: &str, rate_hz: f64) -> [f64; 4] {
     let at = |rate_hz: f64| {
         let integrator = format!("stepping.integrator={integrator}");
@@ -158,7 +158,8 @@ fn gains(name: &str, integrator: &str, rate_hz: f64) -> [f64; 4] {
 
 #[test]
 fn each_scheme_has_its_order() {
-    // At these rates the coarse step is accurate already, and the fine one is not yet at the digits of the references.
+    // At these rates the coarse step is already accurate, and the fine one does not reach the digits of the references
+    // yet.
     for (integrator, order, rate_hz) in [
         ("central", 2.0, 1000.0),
         ("rk4", 4.0, 2000.0),
@@ -169,7 +170,8 @@ fn each_scheme_has_its_order() {
         for name in SCENES {
             for gain in gains(name, integrator, rate_hz) {
                 println!("{integrator} {name}: {:.2}", gain.log2() / 2.0);
-                // Damping that takes five times a point's momentum in a step leaves the fifth order to finer ones.
+                // Damping that takes five times a point's momentum in a step reaches the fifth order only at finer
+                // steps.
                 let order = if name == "overdamped19" { f64::min(order, 4.0) } else { order };
                 assert!(gain.log2() / 2.0 > order - 0.75, "{integrator}, {name}: {gain}");
             }

@@ -1,6 +1,7 @@
-//! Random scenes under random tools, and adversarial ones: all stays finite, no energy comes from nowhere, nothing panics.
+//! Random scenes under random tools, and adversarial ones: everything stays finite, no energy appears from nowhere, no
+//! panic.
 //!
-//! A hundred in every run of the tests; `make stress` does ten thousand (`PALPATE_STRESS_SCENES`) and a soak of 10⁷ steps.
+//! A hundred in every test run; `make stress` does ten thousand (`PALPATE_STRESS_SCENES`) and a soak of 10⁷ steps.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 mod common;
@@ -14,8 +15,9 @@ use palpate::sheet::{self, Grasp, Model, Push, Tissue};
 use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
 
-/// What the energy may exceed the work of all tools by, as a part of the largest energy so far and of all work: the
-/// margin of the guard, which looks every 256 substeps, and what the work of held positions is estimated by.
+/// Bound on the excess of the energy over the work of all tools, as a fraction of the largest energy so far and of all
+/// work: the margin of the guard, which checks every 256 substeps, and the error of estimating the work of held
+/// positions.
 const MARGIN: f64 = 0.1;
 
 /// Ten to the power of something in a range.
@@ -23,7 +25,7 @@ fn decades(from: f64, to: f64) -> impl Strategy<Value = f64> {
     (from..to).prop_map(|exponent| 10_f64.powf(exponent))
 }
 
-/// A scene as a file says it: k over twelve decades, all coefficients also 0.
+/// A scene as a file: k over twelve decades, all coefficients also 0.
 fn any_scene() -> impl Strategy<Value = String> {
     let coefficient = |from, to| prop_oneof![6 => decades(from, to), 1 => Just(0.0)];
     let integrator = prop_oneof![6 => Just("auto"), 1 => Just("central"), 1 => Just("exponential2"), 1 => Just("rk4")];
@@ -43,7 +45,7 @@ fn any_scene() -> impl Strategy<Value = String> {
     )
 }
 
-/// What a tool does before a step: how strongly (in terms of the scene), where, and in which manner.
+/// The action of a tool before a step: its strength (relative to the scene), place and kind.
 #[derive(Debug, Clone, Copy)]
 struct Act {
     step: u64,
@@ -67,11 +69,11 @@ fn act(tissue: &mut dyn Tissue, Act { tool, place, towards, manner, .. }: Act) {
         return tissue.release(tool);
     }
     if manner < 3 {
-        // Up to through its neighbours and out: springs pressed to nothing and turned inside out.
+        // As far as through its neighbours and out: springs pressed to zero length and inverted.
         let index = tissue.model().index_of(point);
         return tissue.grasp(tool, index, Grasp::Held(2.5 * spacing_m * towards));
     }
-    // What moves a point by up to some spacings.
+    // A force that moves a point by up to some spacings.
     let stiffness = scene.virtual_stiffness_n_per_m + scene.springs.stiffness_n_per_m.min(1e3);
     tissue.push(
         tool,
@@ -97,11 +99,12 @@ fn energy_j(tissue: &dyn Tissue) -> f64 {
     energy.kinetic_j + energy.spring_j + energy.virtual_j
 }
 
-/// Plays the acts for 256 steps, then lets go and waits: all must be finite, and without tools no energy may come.
+/// Plays the acts for 256 steps, then releases and waits. Everything must be finite, and without tools no energy may
+/// appear.
 fn play(text: &str, acts: &[Act]) -> Result<(), TestCaseError> {
     let limits = Limits { substeps: 400, ..Limits::default() };
     let scene = Scene::parse("random", text, &[], &limits).unwrap();
-    // What would need more substeps is refused, which is an answer.
+    // A scene that needs more substeps is refused, which is a valid result.
     let Ok(model) = Model::compile(&scene, &limits) else { return Ok(()) };
     let mut tissue = sheet::at_rest(&model);
     let mut acts = acts.to_vec();
@@ -112,7 +115,7 @@ fn play(text: &str, acts: &[Act]) -> Result<(), TestCaseError> {
             act(&mut *tissue, next);
         }
         if tissue.step().is_err() {
-            // Held: the state is a finite one, and stays.
+            // Held: the state is finite and stays the same.
             prop_assert!(all_finite(&*tissue));
             return Ok(());
         }
@@ -157,7 +160,7 @@ fn random_scenes_stay_finite_and_take_no_energy_from_nowhere() {
     }
 }
 
-/// Where nothing but the damping is fast, dt·C/m from 0.7 to 90: `rk4` was stable by its vibrations alone, and grew.
+/// Scenes where only the damping is fast, dt·C/m from 0.7 to 90: `rk4` was stable by its vibrations alone, and grew.
 #[test]
 fn strong_damping_alone_lets_no_scheme_grow() {
     let held = Act { step: 0, tool: 0, place: [0.0; 2], towards: [0.0, 0.0, 0.77], manner: 1 };
@@ -174,7 +177,7 @@ fn strong_damping_alone_lets_no_scheme_grow() {
     }
 }
 
-/// Tools that do their worst, at 1 kHz.
+/// Adversarial tools, at 1 kHz.
 #[test]
 fn adversarial_commands_leave_the_tissue_finite() {
     for worst in 0..4 {
@@ -219,7 +222,7 @@ fn a_sheet_that_wrinkles_stays_bounded() {
 #[test]
 #[ignore = "ten million steps: make stress"]
 fn ten_million_steps_end_where_they_should() {
-    // Every step is to be computed: nothing may sleep.
+    // Every step must be computed: nothing may sleep.
     let scene = scene_with(SMALL, &["stepping.precision=auto", "sleep.tolerance=0"]);
     let mut tissue = sheet::at_rest(&model(&scene));
     tissue.push(0, Some(common::push_on(&scene, [3, 2], [0.1, 0.0, -0.3])));

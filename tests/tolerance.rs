@@ -1,4 +1,4 @@
-//! The tolerance that a scene asks for is kept, on random scenes too. `make bench-tolerance` tries a thousand.
+//! Schemes chosen for a scene's tolerance keep it, also on random scenes. `make bench-tolerance` tries a thousand.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 #[path = "common/random_scenes.rs"]
@@ -45,7 +45,7 @@ fn a_stiff_sheet_on_soft_virtual_springs_gets_f64() {
     assert_eq!(paper_with(&[]).unwrap().precision, Precision::F32);
 }
 
-/// Not even the check of a scene may take for ever.
+/// The check of a scene takes bounded time too.
 #[test]
 fn a_scene_that_needs_endless_substeps_is_refused() {
     let refusal = paper_with(&[

@@ -1,4 +1,4 @@
-//! Trials of schemes at steps, and which of them nothing beats.
+//! Trials of schemes at several steps, and their Pareto frontier of time and error.
 #![allow(unreachable_pub, missing_docs)]
 
 use serde_json::{Value, json};
@@ -16,11 +16,11 @@ pub struct Trial {
     pub displacement: f64,
     /// Largest error, relative to the largest force.
     pub force: f64,
-    /// Run time a simulated second, s.
+    /// Run time per simulated second, s.
     pub cost: f64,
 }
 
-/// The trials of one scheme and number format, from the largest step on.
+/// The trials of one scheme and number format, largest step first.
 pub type Curve = Vec<Trial>;
 
 impl Trial {
@@ -38,13 +38,13 @@ impl Trial {
     }
 }
 
-/// Whether no other trial takes less time for an error that is smaller, or larger by no more than a 50th: f32 and f64 at
-/// one step differ by less, and nobody pays for that.
+/// Whether no other trial takes less time for an error that is smaller, or larger by at most a 50th: f32 and f64 at one
+/// step differ by less, which is not worth a cost.
 pub fn is_best(trial: &Trial, curves: &[Curve]) -> bool {
     !curves.iter().flatten().any(|other| other.error() < 1.02 * trial.error() && other.cost < trial.cost)
 }
 
-/// Whether a scheme has a trial that nothing beats, on any scene.
+/// Whether a scheme has a trial on the frontier of any scene.
 pub fn on_any_frontier(integrator: &str, precision: &str, results: &[(&Case, Vec<Curve>)]) -> bool {
     results.iter().any(|(_, curves)| {
         let mut own = curves.iter().flatten().filter(|t| t.integrator == integrator && t.precision == precision);
@@ -52,18 +52,18 @@ pub fn on_any_frontier(integrator: &str, precision: &str, results: &[(&Case, Vec
     })
 }
 
-/// What an error costs.
+/// The cost of an error.
 pub struct Offer {
-    /// Run time a simulated second, s.
+    /// Run time per simulated second, s.
     pub cost: f64,
     /// The scheme and number format.
     pub by: String,
-    /// Beyond the smallest step tried.
+    /// Whether it lies beyond the smallest step tried.
     pub extrapolated: bool,
 }
 
-/// The least cost at which those trials that `of` lets pass come to `error`. If none does and `extrapolate` is true,
-/// the f64 curves are carried on by first order; rounding would stop those in f32.
+/// The least cost at which the trials accepted by `of` reach `error`. If none does and `extrapolate` is true, the f64
+/// curves are extrapolated at first order; rounding would stop those in f32.
 pub fn cheapest(curves: &[Curve], error: f64, of: impl Fn(&Trial) -> bool, extrapolate: bool) -> Option<Offer> {
     let offers = |extrapolated: bool| {
         let curves = curves.iter().filter(|curve| of(&curve[0]) && (!extrapolated || curve[0].precision == "f64"));
@@ -76,8 +76,8 @@ pub fn cheapest(curves: &[Curve], error: f64, of: impl Fn(&Trial) -> bool, extra
     offers(false).or_else(|| extrapolate.then(|| offers(true)).flatten())
 }
 
-/// The cost of `error` on a curve, between its trials by logarithms. An error larger than that of the largest step costs
-/// what that step does: a larger one is not stable.
+/// The cost of `error` on a curve, interpolated between its trials in logarithms. An error larger than that of the
+/// largest step costs as much as that step, because a larger step is not stable.
 fn between(curve: &Curve, error: f64) -> Option<f64> {
     let place = curve.iter().position(|trial| trial.error() <= error)?;
     let fine = &curve[place];

@@ -1,10 +1,10 @@
-//! What this processor can do, as JSON: the kernel benchmark compiles this file for it and runs it.
-//! Arguments: the sides of the sheets whose traffic is to be measured.
+//! The limits of this processor, as JSON: the kernel benchmark compiles this file for it and runs it.
+//! Arguments: sides of the sheets whose memory traffic it measures.
 
 use std::hint::black_box;
 use std::time::Instant;
 
-/// The least time of some runs of `work`, s.
+/// The least time of `runs` runs of `work`, s.
 fn least_s(runs: usize, mut work: impl FnMut()) -> f64 {
     let once = |()| {
         let start = Instant::now();
@@ -14,7 +14,7 @@ fn least_s(runs: usize, mut work: impl FnMut()) -> f64 {
     std::iter::repeat_n((), runs).map(once).fold(f64::INFINITY, f64::min)
 }
 
-/// Multiplications and exclusive ors, each of which waits for the last: 3 + 1 cycles on every x86 of these years.
+/// Dependent multiplications and exclusive ors: 3 + 1 cycles on every recent x86.
 fn clock_ghz() -> f64 {
     const LINKS: u32 = 1_000_000;
     let (factor, mask) = (black_box(0x9e37_79b9_7f4a_7c15_u64), black_box(0x5555_u64));
@@ -28,7 +28,7 @@ fn clock_ghz() -> f64 {
     4.0 * f64::from(LINKS) / chain_s * 1e-9
 }
 
-/// A multiplication and addition of 16 lanes, ns: chains of them on many values that lie in the nearest cache.
+/// A fused multiply-add of 16 lanes, ns: chains on many values in the nearest cache.
 fn fma_of_16_lanes_ns() -> f64 {
     const VALUES: usize = 4096;
     const CHAIN: usize = 8;
@@ -48,7 +48,7 @@ fn fma_of_16_lanes_ns() -> f64 {
     run_s * 1e9 / (VALUES / 16 * CHAIN * PASSES) as f64
 }
 
-/// To read and write back 6 arrays of f32 (displacement and increment of each point), ns a point.
+/// Reading and writing back 6 arrays of f32 (displacement and increment of each point), ns per point.
 fn traffic_ns(side: usize) -> f64 {
     let points = side * side;
     let mut arrays: [Vec<f32>; 6] = std::array::from_fn(|_| vec![0.5; points]);

@@ -1,7 +1,7 @@
-"""What the peers share: the paper's tissue in numbers, the forces on it, and how a window is timed.
+"""Shared by the peers: the paper's tissue in numbers, the forces on it, and the timing of a window.
 
 The physics, at every point: structural and shear springs to 8 neighbours, each k (1 - L0/L)(x_b - x_a); a virtual
-spring -K u to where the point rests; damping -C v; a constant applied force. Central differences with implicit damping:
+spring -K u to the rest position; damping -C v; a constant applied force. Central differences with implicit damping:
 d <- p d + q F(u), u <- u + d, u from rest, d the increment of the last step. f32, one thread.
 
 Each peer prints, for each size given as an argument, a JSON line: {"peer", "side", "least_ns", "median_ns"}, per point
@@ -29,7 +29,7 @@ K = np.float32(STIFFNESS_N_PER_M)
 VIRTUAL = np.float32(VIRTUAL_N_PER_M)
 H = np.float32(SPACING_M)
 
-# Each neighbour: rows and columns away.
+# Offsets of each neighbour: rows and columns.
 NEIGHBOURS = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1)]
 
 
@@ -49,7 +49,7 @@ def measure(peer, make):
         run(50)  # compiles, and sets the sheet in motion
         begin = time.perf_counter()
         run(10)
-        # Even, for those who swap two grids.
+        # Even, for peers that swap two grids.
         steps = 2 * max(1, round(2e-3 / ((time.perf_counter() - begin) / 10)))
         windows = []
         end = time.perf_counter() + 1.0

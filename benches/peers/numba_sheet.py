@@ -1,6 +1,6 @@
-"""The step in numba, as one who knows it writes it: loops over rows that become vectors, one pass a step, many steps a
-call. Displacements of this and the last step lie in two padded grids that change places; a point gathers its 8 springs;
-those that lead into the pad have no stiffness, so that no point needs a branch."""
+"""The step in numba, written by an expert: vectorized loops over rows, one pass per step, many steps per call.
+Displacements of this and the last step lie in two padded grids that are swapped; a point gathers its 8 springs. Springs
+into the padding have no stiffness, so no point needs a branch."""
 
 import numba
 import numpy as np
@@ -11,7 +11,7 @@ K, VIRTUAL, H, P, Q = common.K, common.VIRTUAL, common.H, common.P, common.Q
 DIAGONAL = np.float32(np.sqrt(2.0)) * H
 ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
 VECTOR = 16
-# Divisions need no check for 0, which would keep the compiler from vectors.
+# Divisions need no check for 0, which would prevent vectorization.
 options = {"fastmath": True, "error_model": "numpy"}
 
 
@@ -70,7 +70,7 @@ def advance(steps, u, last, applied, left, right):
 
 
 def make(side):
-    # Rows of whole vectors: what is beyond the sheet has no springs and no force, and stays where it is.
+    # Whole vectors per row. Points beyond the sheet have no springs and no force, and stay in place.
     width = -(-side // VECTOR) * VECTOR
     u, last = np.zeros((2, 3, side + 2, width + 2), np.float32)
     applied = np.zeros((3, side, width), np.float32)

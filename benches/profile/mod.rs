@@ -1,16 +1,16 @@
-//! Where the time of a running server goes, by `perf`: samples of all its threads, by what they were found doing.
+//! Where a running server spends its time: samples of all its threads from `perf`, grouped by activity.
 #![allow(unreachable_pub)]
 
 use std::collections::BTreeMap;
 use std::process::{Command, Stdio};
 
-/// Samples a second.
+/// Samples per second.
 const RATE_HZ: u32 = 1999;
 
-/// Thread, and what it does.
+/// Thread and activity.
 pub type Place = (&'static str, &'static str);
 
-/// By the first that a frame of the stack contains; the leaf first. System calls come before what they were called for.
+/// Matched against each frame of the stack, leaf first; the first match counts. System calls come before their causes.
 const SYSTEM: [(&str, &str); 8] = [
     ("net_rx_action", "system: receiving what was written, for the client on the same machine"),
     ("tcp_sendmsg", "system: writing"),
@@ -22,7 +22,7 @@ const SYSTEM: [(&str, &str); 8] = [
     ("__schedule", "system: waking and sleeping"),
 ];
 
-/// By the first that the leaf contains, outside the system.
+/// Matched against the leaf, outside the system; the first match counts.
 const PROGRAM: [(&str, &str); 17] = [
     ("palpate::sheet::lanes", "the sweep over the springs"),
     ("palpate::sheet", "the sheet beside the sweep: forces, samples, checks"),
@@ -50,15 +50,15 @@ fn place(thread: &str, stack: &[&str]) -> Place {
     };
     let system = SYSTEM.iter().find(|entry| stack.iter().any(|frame| frame.contains(entry.0))).map(|entry| entry.1);
     let leaf = stack.first().copied().unwrap_or_default();
-    // Addresses of the system are the highest.
+    // Kernel addresses are the highest.
     let is_kernel = leaf.starts_with("ffff");
     let elsewhere = || if is_kernel { "system: the rest" } else { "memory, and what else there is" };
     let doing = system.filter(|_| is_kernel).or_else(|| find(&PROGRAM, leaf).filter(|_| !is_kernel));
     (thread, doing.unwrap_or_else(elsewhere))
 }
 
-/// The parts of the time that process `id` spends in each place, of `seconds` from now, the largest first. `None` where
-/// there is no `perf` that may look.
+/// The fraction of time that process `id` spends in each place, over `seconds` from now, largest first. `None` if there
+/// is no `perf` with permission to sample.
 pub fn parts(id: u32, seconds: u32) -> Option<Vec<(Place, f64)>> {
     let folder = tempfile::tempdir().unwrap();
     let data = folder.path().join("perf.data");

@@ -24,9 +24,9 @@ pub enum Panel {
         x: &'static str,
         /// Left of the chart.
         y: &'static str,
-        /// What is shown along y.
+        /// The range of y.
         up: std::ops::Range<f64>,
-        /// The lines; they may leave the chart.
+        /// The lines, which may leave the chart.
         series: Vec<Series>,
     },
     /// Cells, the first row at the bottom.
@@ -37,7 +37,7 @@ pub enum Panel {
         x: (&'static str, Vec<String>),
         /// Left of the chart, with the name of each row.
         y: (&'static str, Vec<String>),
-        /// Text, and from 0 (green) to 1 (red) its colour.
+        /// Text, and its colour from 0 (green) to 1 (red).
         rows: Vec<Vec<(String, f64)>>,
     },
 }
@@ -45,31 +45,31 @@ pub enum Panel {
 /// A line.
 #[derive(Clone)]
 pub struct Series {
-    /// In the legend; panels share one, so the same name should mean the same look.
+    /// Name in the legend. Panels share one legend, so the same name should have the same look.
     pub name: String,
-    /// Which colour.
+    /// Index of the colour.
     pub hue: usize,
-    /// How it is drawn.
+    /// Style of the line.
     pub look: Look,
-    /// Along x and y.
+    /// Points along x and y.
     pub points: Vec<(f64, f64)>,
 }
 
-/// How a line is drawn.
+/// Style of a line.
 #[derive(Clone, Copy, PartialEq)]
 pub enum Look {
     /// A line with filled markers.
     Full,
     /// A thin line with hollow markers.
     Hollow,
-    /// A broad pale line without markers, to lie below others.
+    /// A broad pale line without markers, drawn below others.
     Broad,
 }
 
 const PANEL: (u32, u32) = (480, 360);
 const LEGEND_ENTRY: (u32, u32) = (170, 20);
 
-/// Colours that differ also to those who see few.
+/// Colours that colour-blind readers can distinguish.
 const HUES: [RGBColor; 10] = [
     RGBColor(213, 94, 0),
     RGBColor(0, 114, 178),
@@ -148,7 +148,7 @@ fn draw_marker<C>(series: &Series, at: C, draw: impl FnOnce(Circle<C, i32>)) {
     }
 }
 
-/// The powers of ten around all values; whatever there is of them.
+/// The powers of ten around all values, for any number of values.
 fn span(values: impl Iterator<Item = f64>) -> std::ops::Range<f64> {
     let (low, high) = values.fold((f64::INFINITY, 0.0_f64), |(low, high), v| (low.min(v), high.max(v)));
     if low <= high && low > 0.0 {
@@ -217,7 +217,7 @@ fn draw_curves(area: &Area<'_>, title: &str, x: &str, y: &str, up: &std::ops::Ra
     }
 }
 
-/// Green over yellow to red.
+/// A colour from green over yellow to red.
 fn colour(shade: f64) -> RGBColor {
     let stops = [(152.0, 205.0, 160.0), (250.0, 225.0, 140.0), (226.0, 120.0, 105.0)];
     let place = 2.0 * shade.clamp(0.0, 1.0);

@@ -1,5 +1,5 @@
-//! What a benchmark leaves behind: tables, figures and charts in docs/benchmarks; and how it reads the clock.
-// Each benchmark uses a part of this.
+//! The output of a benchmark: tables, figures and charts in docs/benchmarks; and its clock.
+// Each benchmark uses only a part of this module.
 #![allow(dead_code, unreachable_pub)]
 
 pub mod chart;
@@ -10,7 +10,7 @@ use std::time::Instant;
 use chart::Panel;
 use serde_json::{Map, Value, json};
 
-/// A benchmark's results as they come in.
+/// The results of a benchmark as they come in.
 pub struct Report {
     name: &'static str,
     text: String,
@@ -18,7 +18,7 @@ pub struct Report {
 }
 
 impl Report {
-    /// A report that `command` makes again.
+    /// A report that the command `command` reproduces.
     pub fn new(name: &'static str, title: &str, command: &str) -> Self {
         let machine = machine();
         let command = if quick() { format!("{command} ARGUMENTS=--quick") } else { command.to_owned() };
@@ -32,17 +32,17 @@ impl Report {
         Report { name, text, figures }
     }
 
-    /// A heading.
+    /// Adds a heading.
     pub fn heading(&mut self, heading: &str) {
         self.text += &format!("\n## {heading}\n");
     }
 
-    /// A paragraph.
+    /// Adds a paragraph.
     pub fn say(&mut self, paragraph: &str) {
         self.text += &format!("\n{paragraph}\n");
     }
 
-    /// A table; numbers are to be text already.
+    /// Adds a table. Cells are text.
     pub fn table(&mut self, header: &[String], rows: &[Vec<String>]) {
         let line = |cells: &[String]| format!("| {} |\n", cells.join(" | "));
         let rule: String = header.iter().map(|_| "|---").collect();
@@ -50,12 +50,12 @@ impl Report {
         self.text.extend(rows.iter().map(|row| line(row)));
     }
 
-    /// What a program may read.
+    /// Adds a figure for programs to read.
     pub fn figure(&mut self, name: &str, value: Value) {
         self.figures.insert(name.to_owned(), value);
     }
 
-    /// The page to standard output, and nothing else.
+    /// Prints the page to standard output, and writes no files.
     pub fn print(&self) {
         print!("{}", self.text);
     }
@@ -72,7 +72,7 @@ impl Report {
     }
 }
 
-/// What the machine calls its processors.
+/// The name of the machine's processors.
 fn machine() -> String {
     let text = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let of = |key: &str| {
@@ -89,15 +89,15 @@ fn machine() -> String {
     }
 }
 
-/// What `work` takes, s.
+/// The time of `work`, s, and its result.
 pub fn seconds<T>(work: impl FnOnce() -> T) -> (f64, T) {
     let start = Instant::now();
     let result = work();
     (start.elapsed().as_secs_f64(), result)
 }
 
-/// The least of what `run` tells of each job, over `rounds` through all of them: so what slows the machine down for a
-/// while slows all jobs down, and is left out of all.
+/// The least result of `run` for each job, over `rounds` rounds through all jobs. A temporary slowdown of the machine
+/// affects all jobs alike, and the minimum excludes it.
 pub fn least<J>(rounds: usize, jobs: &[J], mut run: impl FnMut(&J) -> f64) -> Vec<f64> {
     let mut least = vec![f64::INFINITY; jobs.len()];
     for _ in 0..rounds {
@@ -108,17 +108,17 @@ pub fn least<J>(rounds: usize, jobs: &[J], mut run: impl FnMut(&J) -> f64) -> Ve
     least
 }
 
-/// Whether the benchmark is to be quick and rough: `cargo bench --bench NAME -- --quick`.
+/// Whether to run quickly and roughly: `cargo bench --bench NAME -- --quick`.
 pub fn quick() -> bool {
     std::env::args().any(|argument| argument == "--quick")
 }
 
-/// Two digits that tell: `1.3e-4`.
+/// Two significant digits: `1.3e-4`.
 pub fn rough(value: f64) -> String {
     format!("{value:.1e}")
 }
 
-/// Three digits that tell, or a dash for what could not be had.
+/// Three significant digits, or a dash for a missing value.
 pub fn digits(value: f64) -> String {
     let power = value.abs().log10().floor();
     match value.abs() {

@@ -1,34 +1,34 @@
-//! The scenes of the error benchmark: the paper's scene with assignments over it, and a script. All that jumps does so at
-//! multiples of 0.04 s, which are whole steps at every rate from 125 Hz on.
+//! The scenes of the error benchmark: the paper's scene with assignments, and a script. All jumps are at multiples of
+//! 0.04 s, which are whole steps at every rate from 125 Hz on.
 #![allow(unreachable_pub)]
 
-/// A scene and what is done to it.
+/// A scene and its script.
 pub struct Case {
-    /// Short.
+    /// A short name.
     pub name: &'static str,
-    /// What it is there for.
+    /// Its purpose.
     pub about: &'static str,
-    /// As for `--set`, over the paper's scene.
+    /// Assignments as for `--set`, on the paper's scene.
     pub assignments: &'static [&'static str],
     /// Forces and tools, as in a script.
     pub acts: &'static str,
-    /// Where displacement and force are compared.
+    /// Points where displacement and force are compared.
     pub sample_points: &'static str,
 }
 
 impl Case {
-    /// The script, in full.
+    /// The complete script.
     pub fn script(&self) -> String {
         format!("duration_s = 0.8\nsample_every_s = 0.04\nsample_points = {}\n{}", self.sample_points, self.acts)
     }
 
-    /// The assignments, and `more`.
+    /// The assignments, followed by `more`.
     pub fn with(&self, more: &[String]) -> Vec<String> {
         self.assignments.iter().map(|text| (*text).to_owned()).chain(more.iter().cloned()).collect()
     }
 }
 
-/// What is measured.
+/// The cases to measure.
 pub const CASES: [Case; 7] = [
     Case {
         name: "gentle",

@@ -1,6 +1,6 @@
-//! What is measured: scenes by their text, settings by the names that `--set` takes. So a scheme that this build does
-//! not know yet is left out, and one that it comes to know is measured, without a change here.
-// Each benchmark uses a part of this.
+//! The program under test: scenes by their text, settings by the names that `--set` takes. A scheme that this build
+//! does not know is left out, and a new one is measured as soon as the build knows it, without a change here.
+// Each benchmark uses only a part of this module.
 #![allow(dead_code, unreachable_pub)]
 
 use std::sync::Arc;
@@ -12,7 +12,7 @@ use palpate::sheet::Model;
 
 /// The key of each name below.
 pub const INTEGRATOR: &str = "stepping.integrator";
-/// Every scheme there is or may come to be, the paper's first.
+/// Every scheme that exists or is planned, the paper's first.
 pub const INTEGRATORS: [&str; 6] = ["lagged", "central", "rk4", "exponential2", "exponential3", "exponential4"];
 
 /// The key of each name below.
@@ -30,18 +30,18 @@ pub fn set(key: &str, value: impl std::fmt::Display) -> String {
     format!("{key}={value}")
 }
 
-/// The paper's scene with everything awake, and assignments over it.
+/// The paper's scene with everything awake, and the assignments.
 pub fn scene(assignments: &[String]) -> Result<Scene> {
     let all: Vec<String> = std::iter::once(set("sleep.tolerance", 0)).chain(assignments.iter().cloned()).collect();
     Scene::parse("paper", PAPER, &all, &Limits { points: 10_000_000, ..Limits::default() })
 }
 
-/// The same, compiled.
+/// The same scene, compiled.
 pub fn model(assignments: &[String]) -> Result<Arc<Model>> {
     Model::compile(&scene(assignments)?, &Limits::default())
 }
 
-/// Those names that this build, on this machine, takes for a key. What it refuses is told.
+/// The names that this build, on this machine, accepts for a key. Reports the ones it refuses.
 pub fn known(key: &str, names: &[&'static str]) -> Vec<&'static str> {
     let takes = |name: &&'static str| match model(&[set(key, name)]) {
         Ok(_) => true,

@@ -1,4 +1,4 @@
-//! Haptic devices: what a client says of its own, so that nobody asks more of it.
+//! Haptic devices: the limits that a client declares for its device, so that it gets no larger forces.
 
 use super::law::{Law, Row};
 use crate::refusal::{Result, number};
@@ -6,13 +6,13 @@ use crate::refusal::{Result, number};
 /// A device's descriptor.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Device {
-    /// Any name.
+    /// The name, for selection.
     pub name: &'static str,
     /// Largest force, N.
     pub force_n: f64,
     /// Largest force for longer than [`CONTINUOUS_S`], N.
     pub continuous_n: f64,
-    /// Largest stiffness that its own loop renders without shaking, N/m.
+    /// Largest stiffness that its own loop renders stably, N/m.
     pub stiffness_n_per_m: f64,
     /// Largest damping, N·s/m.
     pub damping_n_s_per_m: f64,
@@ -20,13 +20,13 @@ pub struct Device {
     pub workspace_m: f64,
 }
 
-/// Nobody is asked to bear more, whatever the device can do, N.
+/// Limit of the force on a person, whatever the device can do, N.
 pub const SAFE_FORCE_N: f64 = 3.3;
 
-/// What a device that says nothing of itself gets, N.
+/// Limit for a device without a declaration, N.
 pub const UNDECLARED_FORCE_N: f64 = 2.0;
 
-/// For so long a device may give more than its continuous force, s.
+/// How long a device may exceed its continuous force, s.
 pub const CONTINUOUS_S: f64 = 2.0;
 
 const fn device(
@@ -40,7 +40,7 @@ const fn device(
     Device { name, force_n, continuous_n, stiffness_n_per_m, damping_n_s_per_m, workspace_m }
 }
 
-/// Devices by what their makers say; where no continuous force is given it is the largest. Inverse3: unverified.
+/// Devices by their makers' data. Where no continuous force is given, it is the largest. Inverse3: unverified.
 pub const DEVICES: [Device; 9] = [
     device("touch", 3.3, 3.3, 400.0, 4.0, 0.075),
     device("omni", 3.3, 0.88, 700.0, 5.0, 0.10),
@@ -53,23 +53,23 @@ pub const DEVICES: [Device; 9] = [
     device("inverse3", 10.0, 10.0, 1000.0, 6.0, 0.15),
 ];
 
-/// One that says nothing of itself.
+/// A device without a declaration.
 pub const UNDECLARED: Device = device("undeclared", UNDECLARED_FORCE_N, UNDECLARED_FORCE_N, 400.0, 4.0, 0.075);
 
 impl Device {
-    /// By its name.
+    /// The device of that name.
     pub fn named(name: &str) -> Option<Self> {
         DEVICES.iter().find(|device| device.name == name).copied()
     }
 
-    /// The largest force that it is asked for, N.
+    /// The largest force requested from it, N.
     pub fn most_n(&self) -> f64 {
         self.force_n.min(SAFE_FORCE_N)
     }
 
-    /// What of a tissue is beyond what it renders without shaking, in words, up to the largest force that it is asked for.
-    /// It is rendered all the same: to make it softer would be another tissue. What shakes gives energy, and that the
-    /// envelope takes away.
+    /// Describes in what the tissue exceeds the limits of stable rendering, up to the largest force requested. The
+    /// tissue is rendered all the same: a softer one would be another tissue. An unstable loop gives energy, and the
+    /// envelope removes that.
     pub fn misgivings(&self, law: &Law) -> Vec<String> {
         let reached = law.rows.iter().position(|row| row.force_n >= self.most_n()).unwrap_or(law.rows.len() - 1);
         let most = |of: fn(&Row) -> f64| law.rows[..=reached].iter().map(of).fold(0.0, f64::max);
@@ -84,7 +84,10 @@ impl Device {
         beyond.map(words).collect()
     }
 
-    /// Whether it makes sense.
+    /// Checks the descriptor.
+    ///
+    /// # Errors
+    /// Refuses a limit that is not finite or not positive.
     pub fn check(&self) -> Result<()> {
         let fields = [
             ("device.force_n", self.force_n, 1e3),

@@ -1,83 +1,84 @@
-//! The safety envelope: what stands between a wanted force and a device, and never lets go of it. In this order:
+//! The safety envelope: the limits between a wanted force and a device. Every force passes them, in this order:
 //!
-//! 1. the model's age, by when the newest *arrived* (a constant delay is not staleness), and the time since the last tick,
-//!    if that is long: up to [`FRESH_S`] nothing; up to
-//!    [`STALE_S`] the force fades to a half; beyond, it decays with [`DECAY_S`]; from [`PAUSE_S`] on the state is PAUSED. News
-//!    that come before bring the force back within [`RETURN_S`];
-//! 2. soft engage: after `enable` nothing is rendered until less than [`ENGAGE_BELOW_N`] is wanted, then the force ramps
-//!    in over [`ENGAGE_S`];
+//! 1. the age of the model, counted from when the newest *arrived* (a constant delay is not staleness), or the time
+//!    since the last tick if that is longer: up to [`FRESH_S`] no change; up to [`STALE_S`] the force fades to a half;
+//!    beyond, it decays with [`DECAY_S`]; from [`PAUSE_S`] on the state is PAUSED. A model that arrives before brings
+//!    the force back within [`RETURN_S`];
+//! 2. soft engage: after `enable` nothing is rendered until the wanted force is below [`ENGAGE_BELOW_N`]; then the
+//!    force ramps in over [`ENGAGE_S`];
 //! 3. the norm of the force (clamping its components would turn it), and the device's continuous force;
-//! 4. passivity: no more energy leaves the port than has come in;
-//! 5. slew: [`SLEW_N_PER_S`], up and down, whatever happens.
+//! 4. passivity: no more energy leaves the port than has entered it;
+//! 5. slew: at most [`SLEW_N_PER_S`], up and down, in every state.
 //!
 //! **Passivity.** The port's energy is exact for a held force: E −= f·Δx at each tick. A force f that moves with the
 //! hand at v, and that slew lets fall no faster than S, still gives f²·v/2S before it is zero. So it is limited to
-//! f ≤ √(2·S·E/v): a spring of K, pressed in and let go at v, is left alone as long as its force falls no faster than the
-//! slew allows, K·v ≤ S. A hand at rest may start at any moment: v counts as at least [`LEAST_SPEED_M_PER_S`]. So that
-//! something can be rendered before anything has come in, the tank begins with [`CREDIT_J`], and a hand that presses on
-//! may always be met with [`FIRST_N`].
+//! f ≤ √(2·S·E/v): a spring of K, pressed in and released at v, is not limited as long as its force falls no faster than
+//! the slew allows, K·v ≤ S. A hand at rest may start at any moment, so v counts as at least [`LEAST_SPEED_M_PER_S`].
+//! To allow a first force before any energy has entered, the tank begins with [`CREDIT_J`], and [`FIRST_N`] against a
+//! hand that presses on is always allowed.
 
 use glam::DVec3;
 
 use super::device::{CONTINUOUS_S, Device};
 
-/// A model so old is as good as new, s.
+/// A model up to this age counts as fresh, s.
 pub const FRESH_S: f64 = 0.05;
 /// From this age on the force decays to zero, s.
 pub const STALE_S: f64 = 0.15;
 /// From this age on rendering pauses until it is enabled, s: a twentieth of half the force is left.
 pub const PAUSE_S: f64 = 0.3;
-/// A force that has faded comes back within this, s.
+/// A faded force returns within this time, s.
 const RETURN_S: f64 = 0.25;
-/// Time constant of that decay, s.
+/// Time constant of the decay beyond [`STALE_S`], s.
 pub const DECAY_S: f64 = 0.05;
-/// What is left of the force at [`STALE_S`].
+/// The fraction of the force that is left at [`STALE_S`].
 const STALE_SHARE: f64 = 0.5;
-/// Rendering begins only when less is wanted, N.
+/// Rendering begins only when the wanted force is smaller, N.
 pub const ENGAGE_BELOW_N: f64 = 0.2;
-/// And then ramps in, s.
+/// Duration of the ramp that follows, s.
 pub const ENGAGE_S: f64 = 0.5;
-/// N/s.
+/// Largest rate of change of the force, N/s.
 pub const SLEW_N_PER_S: f64 = 100.0;
-/// m/s.
+/// Least speed that passivity assumes for the hand, m/s.
 const LEAST_SPEED_M_PER_S: f64 = 0.08;
-/// A hand may speed up while a force falls, and a force that turns falls slower along where it was.
+/// Margin for a hand that speeds up while a force falls, and for a turning force, which falls slower along its old
+/// direction.
 const SPEED_MARGIN: f64 = 1.5;
-/// What the tank holds at most: later generosity is not paid by friction of long ago, J.
+/// Largest energy in the tank, J: friction from long ago must not pay for energy given later.
 const TANK_J: f64 = 0.05;
 
-/// What the tank begins with, J: less than any hand notices.
+/// Initial energy in the tank, J: less than any hand notices.
 const CREDIT_J: f64 = 2.5e-4;
-/// N.
+/// Force that is always allowed against a hand that presses on, N.
 const FIRST_N: f64 = 0.2;
 
 /// Whether forces are rendered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum State {
-    /// Not until `enable`.
+    /// Nothing is rendered until `enable`.
     Disabled,
     /// Rendering, or ramping in.
     Enabled,
-    /// Nothing came for too long; not until `enable`.
+    /// No model arrived for too long. Nothing is rendered until `enable`.
     Paused,
-    /// Something was wrong; not until `reset`, and then `enable`.
+    /// An error. Nothing is rendered until `reset` and then `enable`.
     Fault,
 }
 
-/// Why a force is not the wanted one.
+/// The reason why a force differs from the wanted one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Reason {
     /// The newest model is old.
     Stale,
-    /// Not enabled, or ramping in.
+    /// Rendering is not enabled, or ramping in.
     Engage,
-    /// The largest force.
+    /// Limit of the largest force.
     Force,
-    /// The continuous force.
+    /// Limit of the continuous force.
     Continuous,
-    /// It would have given energy.
+    /// The force would have given energy.
     Passivity,
-    /// It would have changed too fast.
+    /// The force would have changed too fast.
     Slew,
     /// The tool is outside the device's workspace.
     Workspace,
@@ -86,7 +87,7 @@ pub enum Reason {
 }
 
 impl Reason {
-    /// All, in the order of their counters.
+    /// All reasons, in the order of their counters.
     pub const ALL: [(Reason, &'static str); 8] = [
         (Reason::Stale, "stale"),
         (Reason::Engage, "engage"),
@@ -99,18 +100,18 @@ impl Reason {
     ];
 }
 
-/// What is wanted at one tick.
+/// The input of one tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Wanted {
-    /// s.
+    /// Present time, s.
     pub now_s: f64,
-    /// Where the device is, in its own frame, m.
+    /// Place of the device in its own frame, m.
     pub place_m: DVec3,
-    /// m/s.
+    /// Velocity of the device, m/s.
     pub velocity_m_per_s: DVec3,
-    /// N.
+    /// Wanted force, N.
     pub force_n: DVec3,
-    /// Since the newest model arrived, s.
+    /// Time since the newest model arrived, s.
     pub age_s: f64,
 }
 
@@ -121,24 +122,24 @@ pub struct Envelope {
     /// Middle of the device's workspace, m.
     middle_m: DVec3,
     state: State,
-    /// Since when it ramps in; none while it waits for a small force.
+    /// When the ramp began; `None` while it waits for a small force.
     engaged_s: Option<f64>,
-    /// Rendered now, N.
+    /// The force rendered now, N.
     force_n: DVec3,
     before: Option<(f64, DVec3)>,
-    /// What the tank holds, J.
+    /// Energy in the tank, J.
     tank_j: f64,
-    /// Given to the port by the hand, in all, J.
+    /// Total energy that the hand has given to the port, J.
     energy_j: f64,
     over_s: f64,
-    /// Of the force, by the model's age.
+    /// The fraction of the force that the model's age leaves.
     share: f64,
     counts: [u64; Reason::ALL.len()],
     ticks: u64,
 }
 
 impl Envelope {
-    /// DISABLED; the device's workspace is around `middle_m`.
+    /// An envelope in state DISABLED. The device's workspace is around `middle_m`.
     pub fn new(device: Device, middle_m: DVec3) -> Self {
         Envelope {
             device,
@@ -161,36 +162,36 @@ impl Envelope {
         self.state
     }
 
-    /// Energy that the hand has given to the port, less what it got back, J.
+    /// Energy that the hand has given to the port minus the energy it got back, J.
     pub fn energy_j(&self) -> f64 {
         self.energy_j
     }
 
-    /// Ticks in which a reason changed the force, and ticks in all.
+    /// The number of ticks in which `reason` changed the force, and of all ticks.
     pub fn count(&self, reason: Reason) -> (u64, u64) {
         (self.counts[reason as usize], self.ticks)
     }
 
-    /// From DISABLED or PAUSED; a FAULT must be reset first.
+    /// Leaves DISABLED or PAUSED. A FAULT must be reset first.
     pub fn enable(&mut self) {
         if matches!(self.state, State::Disabled | State::Paused) {
             (self.state, self.engaged_s) = (State::Enabled, None);
         }
     }
 
-    /// Renders nothing until it is enabled.
+    /// Stops rendering until it is enabled.
     pub fn disable(&mut self) {
         if self.state != State::Fault {
             self.state = State::Disabled;
         }
     }
 
-    /// Renders nothing until it is reset and enabled.
+    /// Stops rendering until it is reset and enabled.
     pub fn fail(&mut self) {
         self.state = State::Fault;
     }
 
-    /// Out of a fault, to DISABLED.
+    /// Leaves FAULT for DISABLED.
     pub fn reset(&mut self) {
         if self.state == State::Fault {
             self.state = State::Disabled;
@@ -206,7 +207,7 @@ impl Envelope {
         self.ticks += 1;
         let finite = wanted.place_m.is_finite() && wanted.velocity_m_per_s.is_finite() && wanted.now_s.is_finite();
         if !finite {
-            // Where the device is is not known: nothing to account for but to let go.
+            // The place of the device is unknown, so there is no work to account for; let go.
             self.acted(Reason::NotFinite);
             self.fail();
             let step_n = SLEW_N_PER_S * NOMINAL_S;
@@ -219,7 +220,7 @@ impl Envelope {
                 self.energy_j += given_j;
                 self.tank_j = (self.tank_j + given_j).min(TANK_J);
                 if wanted.now_s - then_s > PAUSE_S && self.state == State::Enabled {
-                    // Its own loop stood still: the hand is elsewhere, and does not expect a force.
+                    // The client's own loop stood still: the hand is elsewhere and does not expect a force.
                     self.acted(Reason::Stale);
                     self.state = State::Paused;
                 }
@@ -246,7 +247,7 @@ impl Envelope {
         force_n
     }
 
-    /// By the model's age.
+    /// Reduces the force by the model's age.
     fn fade(&mut self, wanted: &Wanted, elapsed_s: f64, force_n: DVec3) -> DVec3 {
         if wanted.age_s > PAUSE_S && self.state == State::Enabled {
             self.state = State::Paused;
@@ -266,7 +267,7 @@ impl Envelope {
     fn engage(&mut self, now_s: f64, force_n: DVec3) -> DVec3 {
         match self.state {
             State::Enabled => {}
-            // What a pause leaves decays by itself, in `fade`, if the models do not come again: then it is let go.
+            // While no model arrives, `fade` reduces the force. Here the rest of it is released.
             State::Disabled | State::Paused | State::Fault => {
                 self.engaged_s = None;
                 self.acted(Reason::Engage);
@@ -309,7 +310,7 @@ impl Envelope {
         force_n * (most_n / length_n)
     }
 
-    /// The largest force along `force_n` whose energy the tank can still bear until slew has let it go, N.
+    /// The largest force along `force_n` whose energy the tank can cover until slew has reduced it to zero, N.
     fn bearable_n(&self, velocity_m_per_s: DVec3, force_n: DVec3) -> f64 {
         let along_m_per_s = velocity_m_per_s.dot(force_n.normalize_or_zero());
         let speed = (SPEED_MARGIN * along_m_per_s).max(LEAST_SPEED_M_PER_S);
@@ -317,8 +318,8 @@ impl Envelope {
         if along_m_per_s < 0.0 { most_n.max(FIRST_N) } else { most_n }
     }
 
-    /// Goes from the last force to a wanted one, as fast as slew allows. A force that turns is on its way neither the one nor
-    /// the other: where the tank can't bear what it is there, it goes straight to zero.
+    /// Changes the last force towards the wanted one as fast as slew allows. A turning force passes through directions
+    /// between the two: where the tank can't cover such a force, it goes straight to zero.
     fn slew(&mut self, elapsed_s: f64, velocity_m_per_s: DVec3, force_n: DVec3) -> DVec3 {
         let step_n = SLEW_N_PER_S * elapsed_s;
         let change_n = force_n - self.force_n;
@@ -335,5 +336,5 @@ impl Envelope {
     }
 }
 
-/// What a tick takes where nothing better is known, s.
+/// Duration of a tick if unknown, s.
 const NOMINAL_S: f64 = 1e-3;

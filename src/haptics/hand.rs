@@ -1,18 +1,18 @@
-//! Simulated hands: a mass that holds the device, drawn by a spring to where its owner wants it. What a simulated hand
-//! feels says how a loop behaves, not how it feels to people.
+//! Simulated hands: a mass that holds the device, pulled by a spring to its owner's target. The results show how a loop
+//! behaves, not how it feels to people.
 
 use glam::DVec3;
 
 /// m·ẍ = k(target − x) − b·ẋ + force of the device.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hand {
-    /// Any name.
+    /// The name, for selection.
     pub name: &'static str,
-    /// Of hand and device, kg.
+    /// Mass of hand and device, kg.
     pub mass_kg: f64,
-    /// N·s/m.
+    /// Damping, N·s/m.
     pub damping_n_s_per_m: f64,
-    /// N/m.
+    /// Stiffness, N/m.
     pub stiffness_n_per_m: f64,
 }
 
@@ -20,7 +20,7 @@ const fn hand(name: &'static str, mass_kg: f64, damping_n_s_per_m: f64, stiffnes
     Hand { name, mass_kg, damping_n_s_per_m, stiffness_n_per_m }
 }
 
-/// From a loose grip to a firm one; `none` is a device that nobody holds.
+/// From a loose grip to a firm one. `none` is a device that is not held.
 pub const HANDS: [Hand; 4] = [
     hand("light", 0.1, 2.0, 100.0),
     hand("medium", 0.15, 5.5, 300.0),
@@ -28,26 +28,26 @@ pub const HANDS: [Hand; 4] = [
     hand("none", 0.05, 0.3, 0.0),
 ];
 
-/// The string of a device that nobody holds, N/m, and the most that it pulls with, N.
+/// The string that pulls a device that is not held: its stiffness, N/m, and its largest force, N.
 const STRING_N_PER_M: f64 = 60.0;
 const STRING_N: f64 = 0.5;
 
-/// Where a hand is.
+/// The state of a hand.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Held {
-    /// m.
+    /// Place, m.
     pub place_m: DVec3,
-    /// m/s.
+    /// Velocity, m/s.
     pub velocity_m_per_s: DVec3,
 }
 
 impl Hand {
-    /// By its name.
+    /// The hand of that name.
     pub fn named(name: &str) -> Option<Self> {
         HANDS.iter().find(|hand| hand.name == name).copied()
     }
 
-    /// What leads a device that nobody holds to its target: a string, N. Hands need none.
+    /// The force of the string that pulls a device that is not held to its target, N; 0 for hands.
     pub fn string_n(&self, target_m: DVec3, place_m: DVec3) -> DVec3 {
         if self.stiffness_n_per_m > 0.0 {
             return DVec3::ZERO;
@@ -55,8 +55,8 @@ impl Hand {
         (STRING_N_PER_M * (target_m - place_m)).clamp_length_max(STRING_N)
     }
 
-    /// After `time_s` under a constant force, with a target that moves straight from `from_m` to `to_m`: exact but for
-    /// the target's part, which is that of its mean.
+    /// The state after `time_s` under a constant force, with a target that moves straight from `from_m` to `to_m`.
+    /// Exact except for the target, which is taken at its mean.
     pub fn advance(&self, held: Held, from_m: DVec3, to_m: DVec3, force_n: DVec3, time_s: f64) -> Held {
         const PARTS: u32 = 4;
         let part_s = time_s / f64::from(PARTS);
@@ -66,13 +66,13 @@ impl Hand {
         })
     }
 
-    /// The exact solution for a target that rests.
+    /// The exact solution for a target at rest.
     fn coast(&self, held: Held, target_m: DVec3, force_n: DVec3, t: f64) -> Held {
         let (m, b, k) = (self.mass_kg, self.damping_n_s_per_m, self.stiffness_n_per_m);
         let rate = b / (2.0 * m);
         let Held { place_m: x, velocity_m_per_s: v } = held;
         if k == 0.0 {
-            // Nothing draws it: the speed goes to force/b.
+            // Without a spring, the speed tends to force/b.
             let (last, decay) = (force_n / b, (-b / m * t).exp());
             let place_m = x + last * t + (v - last) * (1.0 - decay) * (m / b);
             return Held { place_m, velocity_m_per_s: last + (v - last) * decay };
@@ -80,7 +80,7 @@ impl Hand {
         let rest_m = target_m + force_n / k;
         let square = k / m - rate * rate;
         let omega = square.abs().sqrt();
-        // cos and sin/ω of the vibration, or their hyperbolic kin.
+        // cos and sin/ω of the vibration, or the hyperbolic functions.
         let (c, s) = if omega * t < 1e-9 {
             (1.0, t)
         } else if square > 0.0 {
@@ -95,8 +95,8 @@ impl Hand {
         Held { place_m, velocity_m_per_s }
     }
 
-    /// The delay in the loop with a spring of `stiffness` at which it stops being stable, s; infinite if it never does:
-    /// the least t with m·s² + b·s + k + K·e^{−s·t} = 0 on the imaginary axis. A held sample counts as half a period.
+    /// The delay at which the loop with a spring of `stiffness` becomes unstable, s; infinite if it never does: the
+    /// least t with m·s² + b·s + k + K·e^{−s·t} = 0 on the imaginary axis. A held sample counts as half a period.
     pub fn critical_delay_s(&self, stiffness_n_per_m: f64) -> f64 {
         let (m, b, k, stiffness) = (self.mass_kg, self.damping_n_s_per_m, self.stiffness_n_per_m, stiffness_n_per_m);
         let sum = 2.0 * m * k - b * b;
@@ -120,10 +120,10 @@ impl Hand {
 mod tests {
     use super::*;
 
-    /// One that is held so firmly and damped so strongly that it does not swing.
+    /// A hand so firm and damped that it does not oscillate.
     const CREEPING: Hand = hand("creeping", 0.1, 20.0, 300.0);
 
-    /// The equation of motion in steps that are far too short to matter, of fourth order.
+    /// The equation of motion integrated to fourth order in steps too short to matter.
     fn integrated(hand: &Hand, held: Held, from_m: DVec3, to_m: DVec3, force_n: DVec3, time_s: f64) -> Held {
         const STEPS: u32 = 2000;
         let dt = time_s / f64::from(STEPS);
@@ -156,7 +156,7 @@ mod tests {
                 let speeds = [found, truth].map(|held| held.velocity_m_per_s);
                 assert!(speeds[0].distance(speeds[1]) < 1e-7, "{} {time_s}: {speeds:?}", hand.name);
             }
-            // A target that moves counts by its mean over a quarter of the time.
+            // A moving target counts by its mean over a quarter of the time.
             let to_m = target_m + DVec3::new(3e-4, 0.0, 0.0);
             let truth = integrated(&hand, held, target_m, to_m, force_n, 0.001);
             let found = hand.advance(held, target_m, to_m, force_n, 0.001);
@@ -174,7 +174,7 @@ mod tests {
             assert!(end.place_m.distance(target_m + force_n / hand.stiffness_n_per_m) < 1e-12);
             assert_eq!(hand.string_n(target_m, DVec3::ZERO), DVec3::ZERO);
         }
-        // One that nobody holds is drawn by a string of half a newton.
+        // A device that is not held is pulled by a string with half a newton.
         let nobody = Hand::named("none").unwrap_or(CREEPING);
         assert_eq!(nobody.string_n(DVec3::new(0.001, 0.0, 0.0), DVec3::ZERO), DVec3::new(0.06, 0.0, 0.0));
         assert!((nobody.string_n(DVec3::ONE, DVec3::ZERO).length() - 0.5).abs() < 1e-12);

@@ -1,9 +1,9 @@
-//! The local model: what a sample says of the tissue around the place where the tool was.
+//! The local model: the content of a sample about the tissue around the tool's place at that time.
 //!
-//! A client is ahead of every sample by the round trip, and knows its own way since. So it repeats, from the sample's
-//! state on, what the tissue will have done along that way ([`Touching`]): the depth below the surface gives the
-//! pressure by the force law, less damping; across, the disc sticks with the law's stiffness until the friction cone is
-//! reached, and slides beyond. The error is that of the law along some millimetres, not that of some milliseconds.
+//! A client is ahead of every sample by the round trip, and knows its own path since. So it starts from the sample's
+//! state and repeats the response of the tissue along that path ([`Touching`]): the depth below the surface gives the
+//! pressure by the force law, less damping; tangentially, the disc sticks with the law's stiffness up to the friction
+//! cone, and slides beyond. The error is that of the law along some millimetres, not that of some milliseconds.
 
 use std::collections::VecDeque;
 
@@ -12,18 +12,18 @@ use glam::{DMat3, DVec3};
 use super::law::Law;
 use crate::sheet::Standing;
 
-/// What a sample says. Forces are those on the tool.
+/// The content of a sample. Forces are those on the tool.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LocalModel {
-    /// Rises with each.
+    /// Sequence number; each sample has a higher one.
     pub sequence: u64,
-    /// The client's time of the place that the tool had, s.
+    /// Client time of the tool's place, s.
     pub client_time_s: f64,
     /// Steps done.
     pub step: u64,
-    /// x0: where the tool was, m.
+    /// x0: place of the tool, m.
     pub place_m: DVec3,
-    /// How it moved, m/s.
+    /// Velocity of the tool, m/s.
     pub velocity_m_per_s: DVec3,
     /// f0: the force there, N.
     pub force_n: DVec3,
@@ -31,20 +31,20 @@ pub struct LocalModel {
     pub stiffness_n_per_m: DMat3,
     /// B: symmetric, N·s/m.
     pub damping_n_s_per_m: DMat3,
-    /// p: a place of the surface under the tool as it would be without the tool, m.
+    /// p: a place on the surface under the tool as it would be without the tool, m.
     pub surface_m: DVec3,
-    /// n: outward there.
+    /// n: the outward normal there.
     pub normal: DVec3,
-    /// How far from x0 K may be believed, m.
+    /// The distance from x0 within which K is valid, m.
     pub valid_m: f64,
     /// μ.
     pub friction: f64,
-    /// How the tool stood to the tissue.
+    /// The state of contact between the tool and the tissue.
     pub standing: Standing,
 }
 
 impl LocalModel {
-    /// Whether every number is finite and the normal a normal.
+    /// Whether every number is finite and the normal has unit length.
     pub fn is_sound(&self) -> bool {
         let vectors = [self.place_m, self.velocity_m_per_s, self.force_n, self.surface_m];
         vectors.iter().all(|v| v.is_finite())
@@ -58,19 +58,19 @@ impl LocalModel {
     }
 }
 
-/// How far K may be believed: where half its change along the way is a tenth of the force, or `least_n`. `change` is
-/// ‖∂K/∂x‖, N/m².
+/// The distance within which K is valid: where half its change along the path is a tenth of the force, or of `least_n`
+/// if that is larger. `change` is ‖∂K/∂x‖, N/m².
 pub fn valid_m(force_n: f64, least_n: f64, change_n_per_m2: f64) -> f64 {
     (2.0 * (0.1 * force_n).max(least_n) / change_n_per_m2.max(1e-9)).sqrt()
 }
 
-/// Where a tool was, and when: the newest places of a client's own clock.
+/// The newest places of a tool, by the client's own clock.
 #[derive(Debug, Clone, Default)]
 pub struct Track {
     places: VecDeque<(f64, DVec3)>,
 }
 
-/// Places that are kept: two seconds at 1 kHz.
+/// Number of places kept: two seconds at 1 kHz.
 const KEPT: usize = 2048;
 
 impl Track {
@@ -82,14 +82,14 @@ impl Track {
         self.places.push_back((time_s, place_m));
     }
 
-    /// All places later than a time, in order.
+    /// All places after a time, in order.
     pub fn after(&self, time_s: f64) -> impl Iterator<Item = DVec3> {
-        // Half a microsecond: times come back from the wire in whole nanoseconds.
+        // Half a microsecond of tolerance: times return from the wire in whole nanoseconds.
         let from = self.places.partition_point(|place| place.0 <= time_s + 5e-7);
         self.places.range(from..).map(|place| place.1)
     }
 
-    /// Forgets all.
+    /// Removes all places.
     pub fn clear(&mut self) {
         self.places.clear();
     }
@@ -98,19 +98,19 @@ impl Track {
 /// A client's usual tick, s.
 const TICK_S: f64 = 1e-3;
 
-/// The state of a touch along a tool's way.
+/// The state of a touch along a tool's path.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Touching {
-    /// How far the tissue under the disc is drawn along, from where it would not pull, m.
+    /// How far the tissue under the disc is displaced tangentially from where it would not pull, m.
     stretch_m: DVec3,
     sliding: bool,
-    /// What of the sample's force the law does not explain, N.
+    /// The part of the sample's force that the law does not explain, N.
     rest_n: DVec3,
     place_m: DVec3,
 }
 
 impl Touching {
-    /// As it was when the sample was taken.
+    /// The state when the sample was taken.
     pub fn at_sample(model: &LocalModel, law: &Law) -> Self {
         let mut touching =
             Touching { stretch_m: DVec3::ZERO, sliding: false, rest_n: DVec3::ZERO, place_m: model.place_m };
@@ -126,7 +126,7 @@ impl Touching {
         if row.across_n_per_m > 0.0 {
             let most_m = model.friction * row.force_n / row.across_n_per_m;
             touching.stretch_m = within(-drawn_n / row.across_n_per_m, most_m);
-            // By the rule of `move_to`, not by the sample: else the force would change with the first move.
+            // By the rule of `move_to`, not by the sample: otherwise the force would change with the first move.
             let ahead_m = touching.stretch_m + moved * TICK_S;
             touching.sliding = within(ahead_m, most_m) != ahead_m;
         }
@@ -134,7 +134,7 @@ impl Touching {
         touching
     }
 
-    /// Depth below the surface, the law there, and the pressure with damping.
+    /// Depth below the surface, the law at that depth, and the pressure with damping.
     fn pressure(
         &self,
         model: &LocalModel,
@@ -150,7 +150,7 @@ impl Touching {
         (depth_m, row, (row.force_n - row.damping_n_s_per_m * velocity_m_per_s.dot(model.normal)).max(0.0))
     }
 
-    /// Goes on to the tool's next place.
+    /// Advances to the tool's next place.
     pub fn move_to(&mut self, model: &LocalModel, law: &Law, place_m: DVec3) {
         let moved_m = place_m - self.place_m;
         self.place_m = place_m;
@@ -165,7 +165,7 @@ impl Touching {
         self.sliding = self.stretch_m != stretch_m;
     }
 
-    /// The force on the tool where it is now, N.
+    /// The force on the tool at its present place, N.
     pub fn force_n(&self, model: &LocalModel, law: &Law, velocity_m_per_s: DVec3) -> DVec3 {
         if model.standing == Standing::Holding {
             let away_m = within(self.place_m - model.place_m, model.valid_m);
@@ -191,7 +191,7 @@ impl Touching {
     }
 }
 
-/// A vector, shortened to a length.
+/// `vector`, shortened to the length `most`.
 fn within(vector: DVec3, most: f64) -> DVec3 {
     let length = vector.length();
     if length <= most { vector } else { vector * (most / length) }

@@ -1,6 +1,6 @@
-//! Touch that stays true and safe over a network: what a server sends with each sample, what a client makes of it a
-//! thousand times a second, and what keeps both from doing harm. Pure functions of what they are given: no clock, no
-//! socket, no random number; time is an argument, in seconds from any origin.
+//! Touch that stays accurate and safe over a network: the data a server sends with each sample, how a client renders it
+//! a thousand times a second, and the limits that protect both. Pure functions: no clock, no socket, no random number;
+//! time is an argument, in seconds from any origin.
 //!
 //! Conventions: `force_on_tool_n` is the force of the tissue on the tool; stiffness and damping are positive; the sheet's
 //! frame is right-handed with z out of the tissue.

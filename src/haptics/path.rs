@@ -1,50 +1,51 @@
-//! The server's side of a tool's way: what becomes of commands that come through a network in knots and gaps.
+//! The server's side of a tool's path: how commands that arrive in bursts and gaps become a movement.
 //!
-//! A client says a thousand times a second where its tool is, and when. Played as they come, a knot would make the tool
-//! stand still and then leap, and the tissue would answer leaps. So they are played by their own times: the moment that
-//! is played advances with the steps, stands when nothing newer has come, and catches up by a tenth as long as something
-//! newer was always at hand. With a constant delay that adds nothing.
+//! A client reports a thousand times a second where its tool is, and when. Played on arrival, a burst would make the
+//! tool stop and then leap, and the tissue would respond to the leaps. So commands are played by their own times: the
+//! played moment advances with the steps, stops when there is nothing newer, and catches up by a tenth while something
+//! newer has always been available. With a constant delay this adds no latency.
 //!
-//! What is old is never replayed: of a backlog of more than [`BACKLOG_S`] only the newest place counts, and the tool goes
-//! there no faster than [`SPEED_M_PER_S`]. Nothing new for [`RELEASE_S`]: the tool lets go. A command that tells no time, or
-//! is stamped with its step, acts at once and is not waited after; but no tool ever leaps.
+//! Old commands are never replayed: of a backlog of more than [`BACKLOG_S`] only the newest place counts, and the tool
+//! goes there no faster than [`SPEED_M_PER_S`]. After [`RELEASE_S`] without a command the tool lets go. A command
+//! without a time, or stamped with its step, takes effect at once and the path does not wait for a successor; but no
+//! tool ever leaps.
 
 use std::collections::VecDeque;
 
 use glam::DVec3;
 
-/// The tool is moved no faster, m/s.
+/// Largest speed of a tool, m/s.
 pub const SPEED_M_PER_S: f64 = 0.5;
-/// More than this is a backlog, s.
+/// A longer queue is a backlog, s.
 pub const BACKLOG_S: f64 = 0.1;
-/// Without a command for so long the tool is held where it is; that is told, s.
+/// Without a command for this long the tool is held in place, and the client is told, s.
 pub const HOLD_S: f64 = 0.05;
-/// Without a command for so long the tool lets go, s.
+/// Without a command for this long the tool lets go, s.
 pub const RELEASE_S: f64 = 0.25;
-/// By which part of a step the played moment catches up.
+/// The played moment catches up by this fraction of a step.
 const CATCH_UP: f64 = 0.1;
-/// For so long something newer must have been at hand, s.
+/// Before it catches up, something newer must have been available for this long, s.
 const WATCHED_S: f64 = 0.25;
-/// Places that wait, at most.
+/// Most places in the queue.
 const MOST: usize = 1024;
 
-/// What a tool is to do in a step.
+/// The action of a tool in a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Play {
-    /// Be here at its end; this was the client's time there, s.
+    /// Reach this place by the step's end; the client's time there, s.
     Lead(DVec3, f64),
     /// Let go.
     Release,
 }
 
-/// Commands of one tool.
+/// The commands of one tool.
 #[derive(Debug, Clone, Default)]
 pub struct Path {
     waiting: VecDeque<(f64, DVec3)>,
     played: Option<(f64, DVec3)>,
     place_m: Option<DVec3>,
     arrived_s: f64,
-    /// Least that was at hand beyond the played moment, and since when it is watched.
+    /// Least time available beyond the played moment, and since when it is measured.
     spare_s: f64,
     watched_s: f64,
     limited: u64,
@@ -53,7 +54,8 @@ pub struct Path {
 }
 
 impl Path {
-    /// Takes a command that has arrived: where the tool was at `time_s` of the client. Not newer, or not finite: refused.
+    /// Takes a command that has arrived: the tool's place at client time `time_s`. Returns false if it refuses one that
+    /// is not newer or not finite.
     pub fn receive(&mut self, time_s: f64, place_m: DVec3, now_s: f64) -> bool {
         let newest_s = self.waiting.back().or(self.played.as_ref()).map_or(f64::NEG_INFINITY, |place| place.0);
         if !place_m.is_finite() || !time_s.is_finite() || time_s <= newest_s {
@@ -68,23 +70,23 @@ impl Path {
         true
     }
 
-    /// Takes a command that is to act at once and for good, whatever the time: where the tool was at `time_s` of the client.
+    /// Takes a command that takes effect at once, whatever its time: the tool's place at client time `time_s`.
     pub fn go_to(&mut self, time_s: f64, place_m: DVec3) {
         self.waiting.clear();
         (self.played, self.arrived_s) = (Some((time_s, place_m)), f64::INFINITY);
     }
 
-    /// Steps in which the speed limit acted; commands that were refused or passed over; releases.
+    /// Steps in which the speed limit acted; commands that were refused or skipped; releases.
     pub fn counts(&self) -> [u64; 3] {
         [self.limited, self.dropped, self.released]
     }
 
-    /// Whether the newest command is so old that the tool is held, at `now_s`.
+    /// Whether the newest command is so old at `now_s` that the tool is held.
     pub fn is_held(&self, now_s: f64) -> bool {
         now_s - self.arrived_s > HOLD_S
     }
 
-    /// What the tool does in the step of `step_s` that ends at `now_s`; nothing before the first command.
+    /// The action of the tool in the step of `step_s` that ends at `now_s`; `None` before the first command.
     pub fn step(&mut self, now_s: f64, step_s: f64) -> Option<Play> {
         let newest = self.waiting.back().copied();
         if let Some(newest) = newest {
@@ -100,7 +102,7 @@ impl Path {
             }
             return Some(Play::Release);
         }
-        // A tool that comes new, comes from above.
+        // A new tool comes from above.
         let from_m = self.place_m.unwrap_or(DVec3::new(target_m.x, target_m.y, target_m.z.max(ABOVE_M)));
         let way_m = target_m - from_m;
         let most_m = SPEED_M_PER_S * step_s;
@@ -124,7 +126,7 @@ impl Path {
         if now_s - self.watched_s >= WATCHED_S {
             if self.spare_s > 0.5 * step_s {
                 next_s += (CATCH_UP * step_s).min(self.spare_s);
-                // Watched anew once it has caught up.
+                // Measure anew after catching up.
                 self.spare_s -= CATCH_UP * step_s;
             } else {
                 (self.spare_s, self.watched_s) = (f64::INFINITY, now_s);
@@ -146,5 +148,5 @@ impl Path {
     }
 }
 
-/// How high above the sheet at rest a tool begins that was not there before, at least, m.
+/// A new tool begins at least this high above the sheet at rest, m.
 const ABOVE_M: f64 = 0.002;

@@ -1,7 +1,8 @@
-//! The rendering law: a thousand times a second, from the newest local model and the tool's own way, a force.
+//! The rendering law: a thousand times a second, it computes a force from the newest local model and the tool's own
+//! path.
 //!
-//! When a newer model comes the force would jump by what the old one was wrong. That difference is kept as a bias and
-//! decays with [`BIAS_S`], so the hand feels the news arrive, not a knock.
+//! When a newer model arrives, the force would jump by the error of the old one. That difference is kept as a bias and
+//! decays with [`BIAS_S`], so the hand feels a smooth change, not a knock.
 
 use glam::DVec3;
 
@@ -10,16 +11,16 @@ use super::law::Law;
 use super::local::{LocalModel, Touching, Track};
 use crate::sheet::Standing;
 
-/// Time constant with which the error of the last model leaves, s.
+/// Time constant with which the error of the last model decays, s.
 pub const BIAS_S: f64 = 0.02;
 
 /// One tool's renderer.
 #[derive(Debug, Clone)]
 pub struct Renderer {
     law: Law,
-    /// The newest model, and the touch as it follows from it.
+    /// The newest model, and the touch that follows from it.
     newest: Option<(LocalModel, Touching)>,
-    /// One that is newer still.
+    /// A newer model that has arrived since.
     arrived: Option<LocalModel>,
     arrived_s: Option<f64>,
     bias_n: DVec3,
@@ -28,12 +29,12 @@ pub struct Renderer {
     before: Option<(f64, DVec3)>,
     velocity_m_per_s: DVec3,
     refused: u64,
-    /// What stands between the law and the device.
+    /// The limits between the law and the device.
     pub envelope: Envelope,
 }
 
 impl Renderer {
-    /// For a tissue with `law`, which must be sound, behind `envelope`.
+    /// A renderer for a tissue with `law`, which must be sound, behind `envelope`.
     pub fn new(law: Law, envelope: Envelope) -> Self {
         Renderer {
             law,
@@ -50,12 +51,12 @@ impl Renderer {
         }
     }
 
-    /// Begins anew with another far end: its models begin anew too. The envelope goes on as it is.
+    /// Restarts with another server, whose models start from the beginning. The envelope keeps its state.
     pub fn begin(&mut self, law: Law) {
         (self.law, self.newest, self.arrived, self.arrived_s) = (law, None, None, None);
     }
 
-    /// Models that were not taken: out of order, or not finite.
+    /// The number of models refused: out of order, or not finite.
     pub fn refused(&self) -> u64 {
         self.refused
     }
@@ -65,12 +66,12 @@ impl Renderer {
         self.envelope.state()
     }
 
-    /// When the newest model was true by the client's clock, s.
+    /// The time of the newest model by the client's clock, s.
     pub fn model_time_s(&self) -> Option<f64> {
         self.newest.as_ref().map(|newest| newest.0.client_time_s)
     }
 
-    /// Takes a model that has just arrived; it counts from the next tick on.
+    /// Takes a model that has just arrived. It takes effect at the next tick.
     pub fn receive(&mut self, model: LocalModel, now_s: f64) {
         let newest = self.arrived.as_ref().or(self.newest.as_ref().map(|newest| &newest.0));
         let late = newest.is_some_and(|newest| model.sequence <= newest.sequence);
@@ -81,7 +82,8 @@ impl Renderer {
         (self.arrived, self.arrived_s) = (Some(model), Some(now_s));
     }
 
-    /// Goes over to a model that has arrived: repeats the tool's way since, and keeps what it is apart from the last.
+    /// Switches to a model that has arrived: repeats the tool's path since, and keeps the difference from the last
+    /// model.
     fn adopt(&mut self, model: LocalModel, now_s: f64) {
         let before_n = self.newest.is_some().then(|| self.wanted_n(now_s));
         let mut touching = Touching::at_sample(&model, &self.law);
@@ -95,7 +97,7 @@ impl Renderer {
         }
     }
 
-    /// What the law wants, without the envelope, N.
+    /// The force that the law asks for, before the envelope, N.
     fn wanted_n(&self, now_s: f64) -> DVec3 {
         let Some((model, touching)) = &self.newest else { return DVec3::ZERO };
         let force_n = touching.force_n(model, &self.law, self.velocity_m_per_s)
@@ -106,7 +108,7 @@ impl Renderer {
         force_n - force_n.dot(model.normal).min(0.0) * model.normal
     }
 
-    /// The force to render until the next tick, for a tool that is at `place_m` now, N.
+    /// The force to render until the next tick, for a tool at `place_m` now, N.
     pub fn tick(&mut self, now_s: f64, place_m: DVec3) -> DVec3 {
         let known = place_m.is_finite() && now_s.is_finite();
         if let Some((then_s, from_m)) = self.before.filter(|_| known)
@@ -125,7 +127,7 @@ impl Renderer {
             }
         }
         let force_n = self.wanted_n(now_s);
-        // What has not begun is not stale.
+        // Before the first model nothing is stale.
         let age_s = self.arrived_s.map_or(0.0, |arrived_s| now_s - arrived_s);
         let wanted = Wanted { now_s, place_m, velocity_m_per_s: self.velocity_m_per_s, force_n, age_s };
         self.envelope.render(&wanted)

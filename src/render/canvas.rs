@@ -1,4 +1,5 @@
-//! A canvas of samples with depth: triangles and lines on it, and pixels out of it. Linear light; several samples a pixel.
+//! A canvas of samples with depth: draws triangles and lines, and resolves pixels. Linear light; several samples per
+//! pixel.
 
 use glam::{DVec2, DVec3};
 
@@ -7,7 +8,7 @@ use crate::texture::Image;
 /// Samples along each side of a pixel.
 pub(super) const SAMPLES: usize = 3;
 
-/// A corner of a triangle on the canvas: where, in samples, and one over its distance from the eye's plane.
+/// A corner of a triangle on the canvas: its place in samples, and the inverse of its distance from the eye's plane.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Corner {
     pub(super) at: DVec2,
@@ -17,37 +18,37 @@ pub(super) struct Corner {
 #[derive(Debug)]
 pub(super) struct Canvas {
     size: [usize; 2],
-    /// Linear red, green and blue, and nearness.
+    /// Linear red, green and blue, and inverse distance.
     samples: Vec<[f32; 4]>,
 }
 
-/// 0 to 1 in linear light, of a byte of sRGB.
+/// Linear light, 0 to 1, of an sRGB byte.
 pub(super) fn linear(byte: u8) -> f64 {
     let value = f64::from(byte) / 255.0;
     if value <= 0.040_45 { value / 12.92 } else { libm::pow((value + 0.055) / 1.055, 2.4) }
 }
 
-/// A byte of sRGB.
+/// The sRGB byte of linear light.
 fn srgb(linear: f64) -> u8 {
     let value = linear.clamp(0.0, 1.0);
     let value = if value <= 0.003_130_8 { 12.92 * value } else { 1.055 * libm::pow(value, 1.0 / 2.4) - 0.055 };
     (255.0 * value + 0.5) as u8
 }
 
-/// Of a colour.
+/// Linear light of an sRGB colour.
 pub(super) fn colour([r, g, b]: [u8; 3]) -> DVec3 {
     DVec3::new(linear(r), linear(g), linear(b))
 }
 
 impl Canvas {
-    /// Of `size` pixels; farther than all else, the background.
+    /// A canvas of `size` pixels. The background is farther than everything else.
     pub(super) fn new(size: [usize; 2], background: DVec3) -> Self {
         let size = size.map(|pixels| pixels * SAMPLES);
         let [r, g, b] = background.as_vec3().to_array();
         Canvas { size, samples: vec![[r, g, b, 0.0]; size[0] * size[1]] }
     }
 
-    /// The samples whose middles are in a box, cut at the rim.
+    /// The samples whose middles lie in a box, clipped to the canvas.
     fn span(&self, axis: usize, values: impl Iterator<Item = f64> + Clone) -> std::ops::Range<usize> {
         let low = values.clone().fold(f64::INFINITY, f64::min);
         let high = values.fold(f64::NEG_INFINITY, f64::max);
@@ -63,7 +64,7 @@ impl Canvas {
         }
     }
 
-    /// A triangle; `shade` tells the colour from the shares of the corners, right in perspective.
+    /// Draws a triangle. `shade` gives the colour from the perspective-correct weights of the corners.
     pub(super) fn triangle(&mut self, corners: [Corner; 3], shade: impl Fn([f64; 3]) -> DVec3) {
         let [a, b, c] = corners.map(|corner| corner.at);
         let area = (b - a).perp_dot(c - a);
@@ -87,7 +88,8 @@ impl Canvas {
         }
     }
 
-    /// A line `width` pixels wide. It hides what is up to a part `bias` of its distance nearer.
+    /// Draws a line `width` pixels wide. It hides surfaces that are nearer by at most the fraction `bias` of its
+    /// distance.
     pub(super) fn line(&mut self, from: Corner, to: Corner, width: f64, bias: f64, colour: DVec3) {
         let half = 0.5 * width * SAMPLES as f64;
         let along = to.at - from.at;
@@ -117,7 +119,7 @@ impl Canvas {
                     let mut sum = 0.0;
                     for row in y * SAMPLES..(y + 1) * SAMPLES {
                         let from = row * self.size[0] + x * SAMPLES;
-                        // What is brighter than white does not outshine a whole pixel.
+                        // Values above white are clamped, so that one sample does not outshine a whole pixel.
                         sum += self.samples[from..from + SAMPLES].iter().map(|s| f64::from(s[c].min(1.0))).sum::<f64>();
                     }
                     rgb.push(srgb(sum / (SAMPLES * SAMPLES) as f64));

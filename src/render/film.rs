@@ -1,4 +1,4 @@
-//! A script played for its pictures.
+//! A script played to make pictures.
 
 use std::collections::VecDeque;
 use std::io::Write;
@@ -15,13 +15,13 @@ use crate::sheet::Model;
 use crate::surface::Snapshot;
 use crate::texture::Image;
 
-/// Why there is no picture.
+/// The reason why there is no picture.
 #[derive(Debug, thiserror::Error)]
 pub enum Failure {
     /// The guard has ended the session.
     #[error("the run was stopped: {0}")]
     Held(String),
-    /// The script asks for what can't be.
+    /// The input is refused.
     #[error("{0}")]
     Refused(#[from] Refusal),
     /// The file can't be written.
@@ -29,21 +29,24 @@ pub enum Failure {
     Output(String),
 }
 
-/// A script that is being played.
+/// A script being played.
 pub struct Film<'a> {
     session: Session,
     script: &'a Script,
     changes: VecDeque<(u64, Arc<Model>)>,
 }
 
-/// The tissue at one moment, and what acts on it.
+/// The tissue at one moment, and the forces that act on it.
 pub struct Still {
     snapshot: Snapshot,
     arrows: Vec<Arrow>,
 }
 
 impl<'a> Film<'a> {
-    /// From the beginning.
+    /// Begins the script.
+    ///
+    /// # Errors
+    /// Returns a failure if a change of the tissue is refused.
     pub fn new(model: &Arc<Model>, script: &'a Script, limits: &Limits) -> Result<Self, Failure> {
         let changes = model.course(&script.changes, limits)?;
         let mut session = Session::new(model);
@@ -51,7 +54,7 @@ impl<'a> Film<'a> {
         Ok(Film { session, script, changes })
     }
 
-    /// Goes on until `step` steps are done.
+    /// Advances until `step` steps are done.
     fn advance(&mut self, step: u64) -> Result<(), Failure> {
         while self.session.step_count() < step {
             run::change(&mut self.session, &mut self.changes);
@@ -64,12 +67,15 @@ impl<'a> Film<'a> {
     }
 
     /// The tissue when `step` steps are done.
+    ///
+    /// # Errors
+    /// Returns a failure if the guard stops the run or a change of the tissue is refused.
     pub fn at(&mut self, step: u64) -> Result<Still, Failure> {
         self.advance(step)?;
         let mut displacement_m = std::array::from_fn(|_| Vec::new());
         self.session.tissue().displacements_m(&mut displacement_m);
         let model = self.session.model();
-        // What has acted until now: at a jump, just before it.
+        // The force until now: at a jump, the one just before it.
         let before = step.saturating_sub(1);
         let moment = Moment { step: before, fraction: if step > 0 { 1.0 } else { 0.0 } };
         let pokes = self.script.forces.iter().map(|law| law.at(moment, model.scene.stepping.rate_hz));
@@ -80,7 +86,10 @@ impl<'a> Film<'a> {
         Ok(Still { snapshot, arrows })
     }
 
-    /// The tissue at that of the script's sample times at which it is displaced most.
+    /// The tissue at the script's sample time with the largest displacement.
+    ///
+    /// # Errors
+    /// As for [`Film::at`].
     pub fn deepest(&mut self) -> Result<Still, Failure> {
         let (mut most_m, mut found) = (f64::NEG_INFINITY, None);
         for step in (0..=self.script.steps).step_by(self.script.sample_every.max(1) as usize) {
@@ -109,8 +118,11 @@ impl Still {
     }
 }
 
-/// Plays the whole script into a GIF of `frames_hz` pictures a second, which is over as fast as it was in simulated time.
-/// `progress` is told the step now and then.
+/// Plays the whole script into a GIF of `frames_hz` pictures a second, at the speed of simulated time. `progress` gets
+/// the step from time to time.
+///
+/// # Errors
+/// Returns a failure if the guard stops the run, a change of the tissue is refused, or the file can't be written.
 pub fn gif(
     model: &Arc<Model>,
     script: &Script,

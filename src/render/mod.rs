@@ -1,4 +1,5 @@
-//! Pictures of a tissue without a screen: an own rasteriser, the same pixels on any machine. Nothing that a server needs.
+//! Pictures of a tissue without a screen: a software rasteriser that gives the same pixels on any machine. The server
+//! does not use it.
 
 mod canvas;
 mod film;
@@ -15,14 +16,14 @@ use crate::texture::Image;
 use canvas::{Canvas, Corner, SAMPLES, colour, linear};
 use surface::{Surface, Vertex};
 
-/// From where the tissue is seen: always its middle.
+/// The camera. It always looks at the middle of the tissue.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Camera {
-    /// Turned about the tissue's normal from its front side (y = 0), degrees.
+    /// Rotation about the tissue's normal from its front side (y = 0), degrees.
     pub azimuth_deg: f64,
-    /// Above the tissue, 90 straight from above, degrees.
+    /// Elevation above the tissue, degrees; 90 is straight from above.
     pub elevation_deg: f64,
-    /// Of the eye from the middle, in longer sides of the sheet.
+    /// Distance of the eye from the middle, in longer sides of the sheet.
     pub distance: f64,
 }
 
@@ -63,41 +64,41 @@ impl std::str::FromStr for Camera {
 /// How a picture is drawn.
 #[derive(Debug, Clone)]
 pub struct View {
-    /// From where.
+    /// The camera.
     pub camera: Camera,
     /// Pixels along x and y.
     pub size: [usize; 2],
     /// Vertices between neighbouring points.
     pub refinement: Refinement,
-    /// What covers the surface; `None` shows its mesh.
+    /// Texture of the surface; `None` shows its mesh.
     pub texture: Option<Image>,
 }
 
 /// Largest side of a picture, pixels.
 pub const LARGEST_SIDE: usize = 1920;
 
-/// A force that is shown as an arrow.
+/// A force drawn as an arrow.
 #[derive(Debug, Clone, Copy)]
 pub struct Arrow {
-    /// The point that its tip is at.
+    /// The point at its tip.
     pub point: [usize; 2],
-    /// Where it points to.
+    /// Its direction.
     pub towards: DVec3,
 }
 
-/// Half the height of what is seen, at a distance of 1.
+/// Half the height of the field of view, at a distance of 1.
 const HALF_VIEW: f64 = 0.30;
 
 /// Length of an arrow, in longer sides of the sheet.
 const ARROW: f64 = 0.16;
 
-/// The eye, and how it projects.
+/// The eye and its projection.
 struct Eye {
     at_m: DVec3,
-    /// To the right, up and forward, as seen.
+    /// To the right, up and forward in the picture.
     axes: [DVec3; 3],
     middle: DVec2,
-    /// Samples from a place beside the axis, at a distance of 1.
+    /// Samples per unit of offset from the axis, at a distance of 1.
     scale: f64,
 }
 
@@ -113,13 +114,14 @@ impl Eye {
         Eye {
             at_m: centre_m + distance * sheet.longer_side_m() * away,
             axes: [right, right.cross(-away), -away],
-            // What is near takes more of the picture than what is far: the middle of the sheet is above that of it.
+            // Near parts take more of the picture than far parts, so the middle of the sheet is drawn above the
+            // picture's middle.
             middle: DVec2::new(0.48 * width, 0.44 * height),
             scale: width.min(height * 4.0 / 3.0) * 0.375 / HALF_VIEW,
         }
     }
 
-    /// `None` if it is behind the eye, or next to it.
+    /// Projects a place. `None` if it is behind the eye or nearer than `nearest_m`.
     fn project(&self, at_m: DVec3, nearest_m: f64) -> Option<Corner> {
         let [x, y, forward] = self.axes.map(|axis| axis.dot(at_m - self.at_m));
         (forward > nearest_m)
@@ -127,7 +129,7 @@ impl Eye {
     }
 }
 
-/// Draws the sheet as it is in `snapshot`.
+/// Draws the sheet in the state of `snapshot`.
 pub fn picture(sheet: &Sheet, snapshot: &Snapshot, arrows: &[Arrow], view: &View) -> Image {
     let surface = Surface::new(sheet, snapshot, view.refinement);
     let eye = Eye::new(sheet, view);
@@ -146,7 +148,7 @@ pub fn picture(sheet: &Sheet, snapshot: &Snapshot, arrows: &[Arrow], view: &View
                 let vertices = triangle.map(|index| surface.vertices[index]);
                 canvas.triangle([p, q, r], |shares| match &skin {
                     Some(skin) => skin.shade(&between(&vertices, shares)),
-                    // Pale enough for lines, and hides what is behind.
+                    // Pale enough for lines to show, and opaque.
                     None => DVec3::splat(0.80 + 0.18 * between(&vertices, shares).open),
                 });
             }
@@ -154,7 +156,7 @@ pub fn picture(sheet: &Sheet, snapshot: &Snapshot, arrows: &[Arrow], view: &View
     }
     if skin.is_none() {
         let ink = colour([96, 36, 34]);
-        // Thin where lines are close.
+        // Thinner where lines are dense.
         let width = (0.055 * view.size[0] as f64 / nx.max(ny) as f64).clamp(0.35, 1.1);
         for index in 0..nx * ny {
             let beyond = [(index / ny + 1 < nx).then_some(index + ny), (index % ny + 1 < ny).then_some(index + 1)];
@@ -177,7 +179,7 @@ fn draw(canvas: &mut Canvas, eye: &Eye, surface: &Surface, arrow: &Arrow, view: 
     let tail_m = tip_m - ARROW * sheet.longer_side_m() * arrow.towards.normalize_or_zero();
     let (Some(tip), Some(tail)) = (eye.project(tip_m, nearest_m), eye.project(tail_m, nearest_m)) else { return };
     let ink = colour(if view.texture.is_some() { [150, 205, 255] } else { [20, 80, 160] });
-    // In front of all: what it points at may be at the bottom of a dent.
+    // In front of everything: the arrow's target may be at the bottom of a dent.
     let [tip, tail] = [tip, tail].map(|corner| Corner { nearness: 2.0 / nearest_m, ..corner });
     let along = (tip.at - tail.at).normalize_or_zero();
     let head = 0.022 * (view.size[0] * SAMPLES) as f64;
@@ -198,14 +200,14 @@ fn between(vertices: &[Vertex; 3], shares: [f64; 3]) -> Vertex {
     sum
 }
 
-/// Wet tissue under a lamp to the left of the eye, so low that the relief shows; its light is weaker with distance.
+/// Wet tissue under a lamp to the left of the eye, low enough to show the relief; its light falls off with distance.
 struct Skin<'a> {
     image: &'a Image,
     /// Linear light of each byte.
     linear: Vec<f64>,
     eye_m: DVec3,
     lamp_m: DVec3,
-    /// From the lamp to the middle, m.
+    /// Distance from the lamp to the middle, m.
     usual_m: f64,
 }
 
@@ -219,8 +221,8 @@ impl<'a> Skin<'a> {
         Skin { image, linear, eye_m: eye.at_m, lamp_m, usual_m: lamp_m.distance(centre_m) }
     }
 
-    /// The texture's colour: the middles of its corner pixels lie on the sheet's corners, so an image of as many pixels as
-    /// the sheet has vertices puts one on each. Row 0 is at the far side (y largest).
+    /// The texture's colour. The middles of its corner pixels lie on the sheet's corners, so an image of as many pixels
+    /// as the sheet has vertices puts one on each. Row 0 is at the far side (y largest).
     fn albedo(&self, share: DVec2) -> DVec3 {
         let Image { width, height, rgb } = self.image;
         let x = share.x.clamp(0.0, 1.0) * (width - 1) as f64;
@@ -239,13 +241,13 @@ impl<'a> Skin<'a> {
         let to_eye = (self.eye_m - vertex.at_m).normalize_or_zero();
         let mut normal = vertex.normal.normalize_or_zero();
         if normal.dot(to_eye) < 0.0 {
-            // Its back, seen from below.
+            // The underside, seen from below.
             normal = -normal;
         }
         let to_lamp_m = self.lamp_m - vertex.at_m;
         let to_lamp = to_lamp_m.normalize_or_zero();
         let light = (self.usual_m * self.usual_m / to_lamp_m.length_squared()).min(2.0);
-        // Light goes a little way into tissue, and comes out beyond the edge of a shadow.
+        // Light scatters a little way in tissue and comes out beyond the edge of a shadow.
         let diffuse = ((normal.dot(to_lamp) + 0.18) / 1.18).max(0.0);
         let around = DVec3::new(0.15, 0.10, 0.09) * normal.z.max(0.0);
         let albedo = self.albedo(vertex.share);

@@ -1,4 +1,4 @@
-//! The sheet as vertices in space, refined as viewers get it, with normals and places on the texture.
+//! The sheet as vertices in space, refined as for viewers, with normals and texture coordinates.
 
 use glam::{DVec2, DVec3};
 
@@ -7,13 +7,13 @@ use crate::surface::{Encoding, Refinement, Snapshot, encode};
 
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Vertex {
-    /// m.
+    /// Position, m.
     pub(super) at_m: DVec3,
-    /// Out of the tissue, of length 1.
+    /// Unit normal out of the tissue.
     pub(super) normal: DVec3,
-    /// 0 to 1 along x and along y.
+    /// Texture coordinates, 0 to 1 along x and along y.
     pub(super) share: DVec2,
-    /// The part of the light from all around that reaches it: less in a dent.
+    /// The fraction of ambient light that reaches the vertex: less in a dent.
     pub(super) open: f64,
 }
 
@@ -27,7 +27,7 @@ pub(super) struct Surface {
 impl Surface {
     pub(super) fn new(sheet: &Sheet, snapshot: &Snapshot, refinement: Refinement) -> Self {
         let points = Refinement { between: 0, ..refinement };
-        // Those of the points, smooth: a bilinear patch has creases of its own.
+        // Interpolate the points' normals, so that shading is smooth: a bilinear patch has creases of its own.
         let places_m = places(sheet, snapshot, points);
         let (normals, open) = (normals(sheet.points, &places_m), openness(sheet, &places_m));
         let count = refinement.vertices();
@@ -47,7 +47,7 @@ impl Surface {
     }
 }
 
-/// Where the vertices are, m: by what a viewer is sent.
+/// The positions of the vertices, m, from the data that a viewer gets.
 fn places(sheet: &Sheet, snapshot: &Snapshot, refinement: Refinement) -> Vec<DVec3> {
     let [nx, ny] = refinement.vertices();
     let spacing_m = refinement.spacing_m(sheet.spacing_m);
@@ -78,7 +78,7 @@ fn normals([nx, ny]: [usize; 2], places: &[DVec3]) -> Vec<DVec3> {
         .collect()
 }
 
-/// How open to light from all around each point is, from how much higher those around it are at some distances; in x.
+/// The ambient openness of each point, from the height of its surroundings at some distances. Stored in x.
 fn openness(sheet: &Sheet, places_m: &[DVec3]) -> Vec<DVec3> {
     let [nx, ny] = sheet.points;
     let of = |index: usize| {
@@ -102,7 +102,7 @@ fn openness(sheet: &Sheet, places_m: &[DVec3]) -> Vec<DVec3> {
     (0..nx * ny).map(of).collect()
 }
 
-/// Between the values of the points, at vertex `[a, b]`, of which there are `part` to a spacing.
+/// Interpolates `values`, one for each point, at vertex `[a, b]`; there are `part` vertices per spacing.
 fn bilinear([nx, ny]: [usize; 2], values: &[DVec3], [a, b]: [usize; 2], part: usize) -> DVec3 {
     let (i, j) = (a / part, b / part);
     let (s, t) = ((a % part) as f64 / part as f64, (b % part) as f64 / part as f64);

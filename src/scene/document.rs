@@ -1,5 +1,5 @@
-//! TOML with its line numbers: what a scene or a script is read from, so that every refusal can name the
-//! file, the line and the key. `--set` writes over it before it is read.
+//! TOML with line numbers, the source of scenes and scripts, so that every refusal can name the file, the line and the
+//! key. `--set` overrides values before they are read.
 
 use std::collections::BTreeMap;
 use std::io::Read;
@@ -10,14 +10,14 @@ use toml::de::{DeTable, DeValue};
 
 use crate::refusal::{Reason, Refusal, Result, finite};
 
-/// A text, parsed.
+/// A parsed text.
 #[derive(Debug)]
 pub struct Document {
     name: String,
     root: Node,
 }
 
-/// A value and the line where it stands; none if it came by `--set`.
+/// A value and its line; no line if it came from `--set`.
 #[derive(Debug, Clone)]
 struct Node {
     line: Option<usize>,
@@ -49,7 +49,10 @@ impl Value {
     }
 }
 
-/// Reads at most `limit` bytes of UTF-8, also from what is not a plain file.
+/// Reads at most `limit` bytes of UTF-8, also from a pipe or device.
+///
+/// # Errors
+/// Refuses a path that can't be read, a longer text, and text that is not UTF-8.
 pub fn read_text(path: &Path, limit: u64) -> Result<String> {
     let place = path.display().to_string();
     let refuse = |reason, message: String| Refusal { place: Some(place.clone()), ..Refusal::new(reason, "", message) };
@@ -69,9 +72,12 @@ pub fn read_text(path: &Path, limit: u64) -> Result<String> {
 }
 
 impl Document {
-    /// Parses `text`; `name` is what refusals call it.
+    /// Parses `text`; refusals call it `name`.
+    ///
+    /// # Errors
+    /// Refuses text that is not TOML, with its line.
     pub fn parse(name: &str, text: &str) -> Result<Self> {
-        // Lines are found by bisection, so that a long file is read in time linear in its length.
+        // Binary search for lines: a long file is read in nearly linear time.
         let starts: Vec<usize> =
             std::iter::once(0).chain(text.bytes().enumerate().filter(|b| b.1 == b'\n').map(|b| b.0 + 1)).collect();
         let line_of = |offset: usize| starts.partition_point(|&start| start <= offset);
@@ -84,6 +90,9 @@ impl Document {
     }
 
     /// Applies `key.path=value`: a TOML value, or a bare string.
+    ///
+    /// # Errors
+    /// Refuses an assignment without `=`, an empty part of the path, and a path through a value that is not a table.
     pub fn set(&mut self, assignment: &str) -> Result<()> {
         let refuse = |message: String| Refusal {
             place: Some("--set".into()),
@@ -113,7 +122,10 @@ impl Document {
         Ok(())
     }
 
-    /// The whole as fields to be read; then every refusal is given its place.
+    /// Reads the whole document as fields.
+    ///
+    /// # Errors
+    /// Returns the refusal of `read`, with its file and line, and refuses keys that `read` did not ask for.
     pub fn read<'a, T>(&'a self, read: impl FnOnce(&mut Fields<'a>) -> Result<T>) -> Result<T> {
         Item { path: String::new(), node: &self.root }.table(read).map_err(|refusal| self.locate(refusal))
     }
@@ -128,7 +140,7 @@ impl Document {
                     Value::List(items) => key.parse::<usize>().ok().and_then(|index| items.get(index)),
                     _ => None,
                 };
-                // A key that is missing is reported at the table that should have it.
+                // Report a missing key at the table that should have it.
                 let Some(inner) = inner else { break };
                 node = inner;
             }
@@ -182,7 +194,7 @@ fn value_of(value: &DeValue<'_>, line_of: &dyn Fn(usize) -> usize) -> Value {
     }
 }
 
-/// The keys of one table. Each is asked for by name; what was never asked for is unknown.
+/// The keys of one table. `read` asks for each by name; a key that it never asks for is unknown.
 #[derive(Debug)]
 pub struct Fields<'a> {
     path: String,
@@ -209,13 +221,16 @@ impl<'a> Fields<'a> {
         Refusal::new(reason, path, message)
     }
 
-    /// The value of `key`, if it is there.
+    /// The value of `key`, if present.
     pub fn item(&mut self, key: &'static str) -> Option<Item<'a>> {
         self.known.push(key);
         self.entries.get(key).map(|node| Item { path: self.path(key), node })
     }
 
-    /// The value of `key`, which has to be there.
+    /// The value of `key`.
+    ///
+    /// # Errors
+    /// Refuses the table if the key is missing.
     pub fn required(&mut self, key: &'static str) -> Result<Item<'a>> {
         self.item(key).ok_or_else(|| match self.entries.keys().find(|there| is_meant(there, key)) {
             Some(there) => self.misspelt(there, key),
@@ -231,22 +246,31 @@ impl<'a> Fields<'a> {
         self.refuse(Reason::UnknownKey, there, message)
     }
 
-    /// A finite number, if it is there.
+    /// A finite number, if present.
+    ///
+    /// # Errors
+    /// Refuses any other value.
     pub fn number(&mut self, key: &'static str) -> Result<Option<f64>> {
         self.item(key).map(|item| item.number()).transpose()
     }
 
     /// A finite number.
+    ///
+    /// # Errors
+    /// Refuses a missing key and any other value.
     pub fn required_number(&mut self, key: &'static str) -> Result<f64> {
         self.required(key)?.number()
     }
 
-    /// A string, if it is there.
+    /// A string, if present.
+    ///
+    /// # Errors
+    /// Refuses any other value.
     pub fn text(&mut self, key: &'static str) -> Result<Option<String>> {
         self.item(key).map(|item| item.text()).transpose()
     }
 
-    /// Every key that was not asked for is refused.
+    /// Refuses every key that was not asked for.
     fn done(&self) -> Result<()> {
         let Some(key) = self.entries.keys().find(|key| !self.known.contains(&key.as_str())) else { return Ok(()) };
         Err(match self.known.iter().find(|known| !self.entries.contains_key(**known) && is_meant(key, known)) {
@@ -270,12 +294,15 @@ impl<'a> Item<'a> {
         Refusal::new(reason, &self.path, message)
     }
 
-    /// This is not what `expected` says.
+    /// A refusal that says what was expected.
     pub fn wrong(&self, expected: &str) -> Refusal {
         self.refuse(Reason::WrongKind, format!("must be {expected}, but is {}", self.node.value.kind()))
     }
 
     /// A finite number.
+    ///
+    /// # Errors
+    /// Refuses any other value.
     pub fn number(&self) -> Result<f64> {
         match self.node.value {
             Value::Number(number) => finite(&self.path, number),
@@ -285,7 +312,10 @@ impl<'a> Item<'a> {
         }
     }
 
-    /// A whole number, 0 or more.
+    /// An integer, 0 or more.
+    ///
+    /// # Errors
+    /// Refuses any other value.
     pub fn whole(&self) -> Result<u64> {
         match self.node.value {
             Value::Whole(whole) => u64::try_from(whole)
@@ -295,6 +325,9 @@ impl<'a> Item<'a> {
     }
 
     /// A string.
+    ///
+    /// # Errors
+    /// Refuses any other value.
     pub fn text(&self) -> Result<String> {
         match &self.node.value {
             Value::Text(text) => Ok(text.clone()),
@@ -302,7 +335,7 @@ impl<'a> Item<'a> {
         }
     }
 
-    /// Whether this is a string, and which.
+    /// The string, if this is one.
     pub fn as_text(&self) -> Option<&'a str> {
         match &self.node.value {
             Value::Text(text) => Some(text),
@@ -311,6 +344,9 @@ impl<'a> Item<'a> {
     }
 
     /// True or false.
+    ///
+    /// # Errors
+    /// Refuses any other value.
     pub fn flag(&self) -> Result<bool> {
         match self.node.value {
             Value::Flag(flag) => Ok(flag),
@@ -319,6 +355,9 @@ impl<'a> Item<'a> {
     }
 
     /// A list of values.
+    ///
+    /// # Errors
+    /// Refuses any other value.
     pub fn list(&self) -> Result<Vec<Item<'a>>> {
         match &self.node.value {
             Value::List(items) => Ok(items
@@ -337,16 +376,25 @@ impl<'a> Item<'a> {
     }
 
     /// `[x, y, z]`.
+    ///
+    /// # Errors
+    /// Refuses anything but three finite numbers.
     pub fn vector(&self) -> Result<DVec3> {
         Ok(DVec3::from_array(self.numbers("a list of three numbers")?))
     }
 
     /// `[x, y]`.
+    ///
+    /// # Errors
+    /// Refuses anything but two finite numbers.
     pub fn place(&self) -> Result<DVec2> {
         Ok(DVec2::from_array(self.numbers("a list of two numbers")?))
     }
 
     /// `[i, j]`, both 0 or more.
+    ///
+    /// # Errors
+    /// Refuses anything but two such integers.
     pub fn point(&self) -> Result<[usize; 2]> {
         let expected = "a list of two whole numbers";
         let items = self.list().map_err(|_| self.wrong(expected))?;
@@ -360,6 +408,9 @@ impl<'a> Item<'a> {
     }
 
     /// Reads this as a table.
+    ///
+    /// # Errors
+    /// Refuses any other value and unknown keys; returns the refusal of `read`.
     pub fn table<T>(&self, read: impl FnOnce(&mut Fields<'a>) -> Result<T>) -> Result<T> {
         let Value::Table(entries) = &self.node.value else { return Err(self.wrong("a table")) };
         let mut fields = Fields { path: self.path.clone(), entries, known: Vec::new() };

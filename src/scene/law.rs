@@ -1,16 +1,16 @@
-//! Forces and tool movements as laws of time: what a script means, bound to a sheet and a step rate.
+//! Forces and tool movements as functions of time: a script's meaning, bound to a sheet and a step rate.
 //!
-//! Time is counted in whole steps and a fraction of the step that is under way, so that a law that jumps
-//! has a value on either side: just before the jump at (n − 1, 1), just after it at (n, 0).
+//! Time is counted in whole steps and a fraction of the present step, so that a law that jumps has a value on either
+//! side: just before the jump at (n − 1, 1), just after it at (n, 0).
 
 use glam::{DVec2, DVec3};
 
 /// A moment within a step: `fraction` from 0 (its beginning) to 1 (its end).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Moment {
-    /// The step under way.
+    /// The present step.
     pub step: u64,
-    /// How much of it is over.
+    /// The part of it that has passed.
     pub fraction: f64,
 }
 
@@ -20,60 +20,60 @@ impl Moment {
         Moment { step, fraction: 0.0 }
     }
 
-    /// In seconds, at `rate_hz` steps a second.
+    /// The time in seconds, at `rate_hz` steps a second.
     #[allow(clippy::cast_precision_loss)]
     pub fn time_s(self, rate_hz: f64) -> f64 {
         (self.step as f64 + self.fraction) / rate_hz
     }
 }
 
-/// A surgical force as it acts at one moment (the paper's exerting force and its falloff): point p gets
-/// `force_n`·exp(−`falloff_per_m`·r + `falloff_offset`), r the distance at rest from p to `centre_m`.
+/// A surgical force at one moment (the paper's exerting force and its falloff): point p gets
+/// `force_n`·exp(−`falloff_per_m`·r + `falloff_offset`), where r is the distance at rest from p to `centre_m`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Poke {
     /// The control point, in the rest plane.
     pub centre_m: DVec2,
     /// The exerting force, N.
     pub force_n: DVec3,
-    /// c.
+    /// Falloff c, 1/m.
     pub falloff_per_m: f64,
-    /// c′.
+    /// Offset c′ of the exponent.
     pub falloff_offset: f64,
 }
 
 /// A surgical force over time.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ForceLaw {
-    /// Where.
+    /// The control point over time.
     pub centre: CentreLaw,
-    /// How strong.
+    /// The exerting force over time.
     pub strength: StrengthLaw,
-    /// c.
+    /// Falloff c, 1/m.
     pub falloff_per_m: f64,
-    /// c′.
+    /// Offset c′ of the exponent.
     pub falloff_offset: f64,
 }
 
-/// Where the control point is.
+/// The control point over time.
 #[derive(Debug, Clone, PartialEq)]
 pub enum CentreLaw {
-    /// From each step on at that place; before the first there is no force.
+    /// The place from each step on. Before the first there is no force.
     Hops(Vec<(u64, DVec2)>),
     /// A straight line.
     Path {
         /// Place at time 0.
         from_m: DVec2,
-        /// Velocity.
+        /// Velocity, m/s.
         velocity_m_per_s: DVec2,
     },
 }
 
-/// The exerting force.
+/// The exerting force over time.
 #[derive(Debug, Clone, PartialEq)]
 pub enum StrengthLaw {
     /// A fixed vector times a profile.
     Scaled(DVec3, Profile),
-    /// From each step on that vector; before the first, none.
+    /// The vector from each step on, N. Before the first there is no force.
     Recorded(Vec<(u64, DVec3)>),
 }
 
@@ -91,14 +91,14 @@ pub enum Profile {
     },
     /// 0, then linear to 1, then 1.
     Ramp {
-        /// Begins to rise.
+        /// Time at which the rise begins, s.
         from_s: f64,
-        /// Is 1.
+        /// Time at which the factor is 1, s.
         to_s: f64,
     },
     /// sin(2πft).
     Sine {
-        /// f.
+        /// f, Hz.
         frequency_hz: f64,
     },
 }
@@ -115,14 +115,14 @@ impl Profile {
             Profile::Constant => 1.0,
             Profile::Pulse { on, off } => f64::from(u8::from((on..off).contains(&moment.step))),
             Profile::Ramp { from_s, to_s } => ((moment.time_s(rate_hz) - from_s) / (to_s - from_s)).clamp(0.0, 1.0),
-            // The same bits on every machine: not the platform's sine.
+            // `libm` gives the same bits on every machine; the platform's sine does not.
             Profile::Sine { frequency_hz } => libm::sin(std::f64::consts::TAU * frequency_hz * moment.time_s(rate_hz)),
         }
     }
 }
 
 impl ForceLaw {
-    /// The force as it acts at a moment.
+    /// The force at a moment.
     pub fn at(&self, moment: Moment, rate_hz: f64) -> Poke {
         let force_n = match &self.strength {
             StrengthLaw::Scaled(force, profile) => *force * profile.at(moment, rate_hz),
@@ -146,29 +146,29 @@ impl ForceLaw {
 pub struct MoveLaw {
     /// The point.
     pub point: [usize; 2],
-    /// Displacements that add up.
+    /// Displacements, which add up.
     pub moves: Vec<Move>,
 }
 
 /// A smooth displacement: `by_m`·s((t − from)/(to − from)), s(x) = 10x³ − 15x⁴ + 6x⁵ clamped to 0…1.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Move {
-    /// Begins.
+    /// Time at which it begins, s.
     pub from_s: f64,
-    /// Is there.
+    /// Time at which it ends, s.
     pub to_s: f64,
     /// Displacement, m.
     pub by_m: DVec3,
 }
 
-/// Where a prescribed point is and how it moves.
+/// The position and motion of a prescribed point.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Motion {
-    /// From rest, m.
+    /// Displacement from rest, m.
     pub displacement_m: DVec3,
-    /// m/s.
+    /// Velocity, m/s.
     pub velocity_m_per_s: DVec3,
-    /// m/s².
+    /// Acceleration, m/s².
     pub acceleration_m_per_s2: DVec3,
 }
 

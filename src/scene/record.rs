@@ -6,33 +6,33 @@ use serde::Serialize;
 
 use super::{Integrator, Named, Precision};
 
-/// The first line.
+/// The first line of a record.
 #[derive(Debug, Clone, Serialize)]
 pub struct Run {
     /// Name of the scene.
     pub scene: String,
     /// Name of the script.
     pub script: String,
-    /// What `auto` became.
+    /// The scheme that `auto` selected.
     pub integrator: String,
-    /// Substeps a step.
+    /// Substeps per step.
     pub substeps: u32,
-    /// What `auto` became.
+    /// The precision that `auto` selected.
     pub precision: String,
-    /// Steps a second.
+    /// Steps per second.
     pub rate_hz: f64,
-    /// Of Palpate.
+    /// Version of Palpate.
     pub version: String,
 }
 
-/// A line a sample time. Forces are those on the tissue point, N.
+/// One line per sample time. Forces are those on the tissue point, N.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Record {
     /// Simulated time.
     pub time_s: f64,
-    /// In the order asked for.
+    /// The points, in the order requested.
     pub points: Vec<Point>,
-    /// Of the whole sheet.
+    /// Energies of the whole sheet.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub energy_j: Option<EnergyJ>,
     /// Points computed in the step.
@@ -52,7 +52,7 @@ pub struct Point {
     pub applied_n: [f64; 3],
     /// spring + virtual + damping.
     pub reaction_n: [f64; 3],
-    /// Of a prescribed point: what holds it.
+    /// For a prescribed point, the force that holds it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub constraint_n: Option<[f64; 3]>,
 }
@@ -67,7 +67,7 @@ pub struct EnergyJ {
     pub virtual_springs: f64,
 }
 
-/// The last line.
+/// The last line of a record.
 #[derive(Debug, Clone, Serialize)]
 pub struct Summary {
     /// Steps done.
@@ -76,33 +76,33 @@ pub struct Summary {
     pub substeps: u64,
     /// Points of the sheet.
     pub points: usize,
-    /// The stepping alone.
+    /// Wall time of the stepping alone.
     pub wall_s: f64,
-    /// `wall_s` over `substeps`·`points`.
+    /// `wall_s`/(`substeps`·`points`).
     pub ns_per_point_substep: f64,
-    /// Computed over all point-substeps.
+    /// Point-substeps computed, as a fraction of all.
     pub computed_fraction: f64,
     /// How often the guard acted.
     pub guard_events: u64,
     /// XXH3-128 of the state, in hexadecimal.
     pub final_hash: String,
-    /// What an audit measured: of all sample points and times.
+    /// The result of an audit, over all sample points and times.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub audited_error: Option<AuditedError>,
-    /// What an audit changed, by rising steps.
+    /// Corrections of an audit, by ascending step.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub corrections: Vec<Correction>,
-    /// What a replay measured besides.
+    /// The additional measurements of a replay.
     #[serde(flatten, skip_serializing_if = "Option::is_none")]
     pub network: Option<Network>,
 }
 
-/// An error that was measured, each part relative to the largest component of its kind.
+/// A measured error. Each part is relative to the largest component of its kind.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct AuditedError {
     /// Largest difference of any component of a displacement.
     pub displacement: f64,
-    /// The same of the tissue's force on a tool: springs, virtual springs and damping.
+    /// The same for the tissue's force on a tool: springs, virtual springs and damping.
     pub force: f64,
 }
 
@@ -118,24 +118,25 @@ impl AuditedError {
     }
 }
 
-/// A tissue is stepped more accurately from a step on, because an audited error was above the tolerance.
+/// A correction: from a step on the tissue is stepped more accurately, because an audited error was above the
+/// tolerance.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Correction {
-    /// The step at whose beginning it acts.
+    /// The step at whose beginning it takes effect.
     pub step: u64,
     /// The error that was found.
     pub audited_error: AuditedError,
-    /// Where most of it came from.
+    /// The main source of the error.
     pub reason: String,
-    /// Scheme from then on.
+    /// The scheme from then on.
     #[serde(serialize_with = "name")]
     pub integrator: Integrator,
-    /// Substeps from then on.
+    /// The substeps from then on.
     pub substeps: u32,
-    /// Number format from then on.
+    /// The number format from then on.
     #[serde(serialize_with = "name")]
     pub precision: Precision,
-    /// What regions at rest may cost from then on.
+    /// The error that sleeping regions may add, from then on.
     pub sleep_tolerance: f64,
 }
 
@@ -143,24 +144,24 @@ fn name<S: serde::Serializer>(value: &impl Named, serializer: S) -> Result<S::Ok
     serializer.serialize_str(value.name())
 }
 
-/// What a replay through a server measured.
+/// The measurements of a replay through a server.
 #[derive(Debug, Clone, Serialize)]
 pub struct Network {
-    /// Commands that came after their step.
+    /// Commands that arrived after their step.
     pub late_commands: u64,
     /// Commands that the server refused.
     pub rejected_commands: u64,
     /// Steps that the server dropped.
     pub overruns: u64,
-    /// Simulated over real time, from the first sample to the last.
+    /// Simulated time over real time, from the first sample to the last.
     pub time_dilation: f64,
-    /// From a message's departure to its answer, which does not wait for a step.
+    /// From sending a message to its answer, which does not wait for a step.
     pub round_trip_us: Percentiles,
-    /// Time the server had that message.
+    /// Time that the server held that message.
     pub server_hold_us: Percentiles,
 }
 
-/// Of a distribution.
+/// Percentiles of a distribution.
 #[derive(Debug, Clone, Copy, Default, Serialize)]
 #[allow(missing_docs)]
 pub struct Percentiles {
@@ -173,13 +174,16 @@ pub struct Percentiles {
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Line<'a> {
-    /// The first.
+    /// The first line.
     Run(&'a Run),
-    /// The last.
+    /// The last line.
     Summary(&'a Summary),
 }
 
-/// One JSON object, one line.
+/// Writes one JSON object on one line.
+///
+/// # Errors
+/// Returns the error of `output`.
 pub fn write_line(output: &mut dyn Write, line: &impl Serialize) -> std::io::Result<()> {
     serde_json::to_writer(&mut *output, line)?;
     output.write_all(b"\n")

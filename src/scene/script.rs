@@ -1,5 +1,5 @@
-//! What a script is: forces, tool movements and samples over time. Read from TOML and bound to a scene,
-//! which turns its times into whole steps and its points into places.
+//! Scripts: forces, tool movements and samples over time. Read from TOML and bound to a scene, which converts times to
+//! whole steps and points to places.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -13,21 +13,21 @@ use super::{Change, Scene, Sheet};
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, not_negative, number, positive};
 
-/// The scripts that ship, within the program: name and text.
+/// The built-in scripts: name and text.
 pub const BUILT_IN: [(&str, &str); 3] = [
     ("oblique-100", include_str!("../../scripts/oblique-100.toml")),
     ("oblique-60", include_str!("../../scripts/oblique-60.toml")),
     ("vertical-60", include_str!("../../scripts/vertical-60.toml")),
 ];
 
-/// A script bound to a scene: what to do at which step.
+/// A script bound to a scene.
 #[derive(Debug, Clone)]
 pub struct Script {
     /// Any name, for people.
     pub name: String,
-    /// Steps of the whole.
+    /// Length in steps.
     pub steps: u64,
-    /// A record every so many steps, from step 0 on.
+    /// Steps between two records, the first of which is at step 0.
     pub sample_every: u64,
     /// Points of the records.
     pub sample_points: Vec<[usize; 2]>,
@@ -35,11 +35,11 @@ pub struct Script {
     pub forces: Vec<ForceLaw>,
     /// Grasped points.
     pub moves: Vec<MoveLaw>,
-    /// What becomes of the tissue at the beginning of which step, by rising steps.
+    /// Changes of the tissue and the step at whose beginning each takes effect, by ascending step.
     pub changes: Vec<(u64, Change)>,
-    /// What had to be rounded, in words.
+    /// Descriptions of values that were rounded.
     pub warnings: Vec<String>,
-    /// Steps a second, as the scene says.
+    /// Steps per second, from the scene.
     pub rate_hz: f64,
     /// The sheet that it is bound to.
     pub sheet: Sheet,
@@ -47,6 +47,9 @@ pub struct Script {
 
 impl Script {
     /// Reads a script, by its file or by its name in ./scripts, and binds it to `scene`.
+    ///
+    /// # Errors
+    /// Refuses a script that can't be read, parsed or bound to the scene.
     pub fn load(name: &Path, scene: &Scene, limits: &Limits) -> Result<Self> {
         let mut named = Path::new("scripts").join(name).into_os_string();
         named.push(".toml");
@@ -57,19 +60,22 @@ impl Script {
         Self::parse(&path.display().to_string(), &text, folder, scene, limits)
     }
 
-    /// Reads a script from TOML; `name` is what refusals call the text, `folder` where its traces are.
+    /// Reads a script from TOML. Refusals call the text `name`; its traces are in `folder`.
+    ///
+    /// # Errors
+    /// Refuses a script that can't be parsed or bound to the scene.
     pub fn parse(name: &str, text: &str, folder: &Path, scene: &Scene, limits: &Limits) -> Result<Self> {
         let document = Document::parse(name, text)?;
         document.read(|fields| Binding { folder, scene, limits, warnings: Vec::new() }.script(fields))
     }
 
-    /// What a client that streams this script tells the tools to do at step `step`: only what differs from the
-    /// step before. Force k is tool k, and the grasped points follow. A force is held for the step, from its
-    /// beginning; a grasped point is brought to where it is to be at the step's end.
+    /// The actions that a client streaming this script commands at step `step`: only differences from the step before.
+    /// Force k is tool k, and the grasped points follow. A force is held for the step, from its beginning; a grasped
+    /// point reaches its target at the step's end.
     pub fn actions_at(&self, step: u64) -> impl Iterator<Item = (usize, Action)> {
         let poke = move |law: &ForceLaw, step: u64| {
             let poke = law.at(Moment::start_of(step), self.rate_hz);
-            // What has left the sheet can't be commanded any more.
+            // A force that has left the sheet can no longer be commanded.
             (poke.force_n != DVec3::ZERO && is_near(&self.sheet, poke.centre_m)).then_some(poke)
         };
         let pushes = self.forces.iter().enumerate().filter_map(move |(tool, law)| {
@@ -86,42 +92,42 @@ impl Script {
         pushes.chain(grasps)
     }
 
-    /// How many tools the script uses.
+    /// The number of tools that the script uses.
     pub fn tools(&self) -> usize {
         self.forces.len() + self.moves.len()
     }
 }
 
-/// What a tool is told to do, until it is told something else.
+/// The action of a tool, which lasts until the next one.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Action {
     /// Exerts a force.
     Push(Poke),
-    /// Has grasped a point, and brings it to this displacement by the end of the step.
+    /// Holds a point and brings it to this displacement by the end of the step.
     Grasp {
         /// The point.
         point: [usize; 2],
         /// From its rest position, m.
         displacement_m: DVec3,
     },
-    /// Is at this place by the end of the step, and meets what is there with its tip.
+    /// Reaches this place by the end of the step and meets the sheet with its tip.
     Lead {
-        /// In the frame of the sheet at rest, z out of the tissue, m.
+        /// Place in the frame of the sheet at rest, z out of the tissue, m.
         place_m: DVec3,
-        /// What it is there.
+        /// The tool's tip.
         tip: Tip,
     },
-    /// None of these.
+    /// Ends any of these.
     Release,
 }
 
-/// A quicker move would need accelerations that no number holds.
+/// A shorter move would need accelerations beyond the number range.
 const SHORTEST_MOVE_S: f64 = 1e-6;
 
 /// Beyond this a phase has no digits left.
 const HIGHEST_HZ: f64 = 1e6;
 
-/// What the reading needs to know.
+/// The inputs of reading a script.
 struct Binding<'s> {
     folder: &'s Path,
     scene: &'s Scene,
@@ -204,7 +210,7 @@ impl Binding<'_> {
         Ok(whole as u64)
     }
 
-    /// A grid point, and where it rests.
+    /// A grid point and its place at rest.
     fn point(&self, item: &Item<'_>) -> Result<([usize; 2], DVec2)> {
         let point = item.point()?;
         let sheet: &Sheet = &self.scene.sheet;
@@ -212,7 +218,7 @@ impl Binding<'_> {
         Ok((point, sheet.rest_m(point)))
     }
 
-    /// Changes of the tissue, each checked with those before it.
+    /// Changes of the tissue. Each is checked with those before it.
     fn changes(&mut self, list: &[Item<'_>]) -> Result<Vec<(u64, Change)>> {
         let mut scene = self.scene.clone();
         let mut changes: Vec<(u64, Change)> = Vec::new();
@@ -262,7 +268,7 @@ impl Binding<'_> {
                     StrengthLaw::Scaled(force_n, profile)
                 }
                 Err(rows) => {
-                    // A trace replaces force_n, which may stand there all the same.
+                    // A trace replaces force_n, which may be present all the same.
                     fields.item("force_n").map(|item| item.vector()).transpose()?;
                     for (_, force_n) in &rows {
                         within_limit(&fields.path("profile.file"), *force_n)?;
@@ -339,7 +345,7 @@ impl Binding<'_> {
                 if to_s > from_s {
                     Profile::Ramp { from_s, to_s }
                 } else {
-                    // A ramp without a rise is a jump, and jumps are at whole steps.
+                    // A ramp of zero length is a jump, and jumps are at whole steps.
                     Profile::Pulse { on: self.steps(&fields.path("from_s"), from_s)?, off: u64::MAX }
                 }
             }
@@ -399,7 +405,7 @@ impl Binding<'_> {
             let step = self.steps("time_s", time_s).map_err(|refusal| refuse(line_number, refusal.message))?;
             rounded += self.warnings.len() - warnings;
             self.warnings.truncate(warnings);
-            // Of several rows for one step the last holds.
+            // Of several rows for one step, the last one applies.
             if rows.last().is_some_and(|row| row.0 == step) {
                 rows.pop();
             }
@@ -432,7 +438,7 @@ impl Binding<'_> {
                 })?);
             }
             let law = MoveLaw { point, moves };
-            // The displacement is largest at the end of a move, or where moves overlap below their sum.
+            // The displacement is largest at the end of a move. Where moves overlap, their sum is an upper bound.
             let farthest: f64 = law.moves.iter().map(|m| m.by_m.length()).sum();
             check_reach(&fields.path("moves"), &self.scene.sheet, farthest, self.limits)?;
             Ok(law)
@@ -440,12 +446,12 @@ impl Binding<'_> {
     }
 }
 
-/// The entries of `[[key]]`; none if the key is absent.
+/// The entries of `[[key]]`; empty if the key is absent.
 fn items<'a>(fields: &mut Fields<'a>, key: &'static str) -> Result<Vec<Item<'a>>> {
     fields.item(key).map_or(Ok(Vec::new()), |item| item.list())
 }
 
-/// Times have to rise; of two that fall on one step after rounding the later holds.
+/// Requires ascending times. Of two that round to one step, the later one applies.
 fn rising<T>(list: &Item<'_>, key: &str, entries: &mut Vec<(u64, T)>) -> Result<()> {
     if entries.is_empty() {
         return Err(list.refuse(Reason::Missing, "must have at least one entry"));
@@ -465,11 +471,11 @@ fn rising<T>(list: &Item<'_>, key: &str, entries: &mut Vec<(u64, T)>) -> Result<
     Ok(())
 }
 
-/// Refuses a force whose largest part on a point, |force|·e^{c′}, is above the limit.
+/// Refuses a force whose largest value at a point, |force|·e^{c′}, is above the limit.
 fn check_force(field: &str, force_n: DVec3, factor: f64, limit_n: f64) -> Result<()> {
     crate::refusal::finite_vector(field, force_n)?;
     let largest_n = force_n.length() * factor;
-    // A force of 0 may have any factor, as 0·∞ is no number.
+    // A force of 0 may have any factor; 0·∞ would be NaN.
     if force_n != DVec3::ZERO && (largest_n.is_nan() || largest_n > limit_n) {
         let message =
             format!("is {largest_n:.6e} N on the control point (|force|·e^offset), above the limit of {limit_n} N");
@@ -478,6 +484,9 @@ fn check_force(field: &str, force_n: DVec3, factor: f64, limit_n: f64) -> Result
     Ok(())
 }
 
+/// Checks a poke.
+///
+/// # Errors
 /// Refuses a poke that is not finite, too strong, or off the sheet.
 pub fn check_poke(poke: &Poke, sheet: &Sheet, limits: &Limits) -> Result<()> {
     not_negative("force.falloff_per_m", poke.falloff_per_m)?;
@@ -486,14 +495,20 @@ pub fn check_poke(poke: &Poke, sheet: &Sheet, limits: &Limits) -> Result<()> {
     check_force("force.force_n", poke.force_n, libm::exp(poke.falloff_offset), limits.point_force_n)
 }
 
-/// Refuses a displacement of a grasped point beyond the limit.
+/// Checks a displacement of a grasped point.
+///
+/// # Errors
+/// Refuses one beyond the limit.
 pub fn check_reach(field: &str, sheet: &Sheet, displacement_m: f64, limits: &Limits) -> Result<()> {
     let limit_m = sheet.longer_side_m() * limits.reach_in_sheets;
     number(field, displacement_m, &format!("at most {limit_m} m from the rest position"), |v| v <= limit_m)?;
     Ok(())
 }
 
-/// Refuses a point that can't be grasped: one that is not on the sheet, or fixed.
+/// Checks whether a point can be grasped.
+///
+/// # Errors
+/// Refuses a point that is fixed or not on the sheet.
 pub fn check_free(field: &str, sheet: &Sheet, point: [usize; 2]) -> Result<()> {
     sheet.index(field, point)?;
     if sheet.is_fixed(point) {
@@ -503,8 +518,10 @@ pub fn check_free(field: &str, sheet: &Sheet, point: [usize; 2]) -> Result<()> {
     Ok(())
 }
 
-/// Refuses a control point farther than a tenth of the sheet's longer side from it. Not on the sheet exactly:
-/// a tool that strokes over the rim is still felt.
+/// Checks a control point. It may be a little off the sheet, because a tool that strokes over the edge is still felt.
+///
+/// # Errors
+/// Refuses a control point farther from the sheet than a tenth of its longer side.
 pub fn check_centre(field: &str, sheet: &Sheet, centre_m: DVec2) -> Result<()> {
     for component in centre_m.to_array() {
         crate::refusal::finite(field, component)?;
@@ -520,14 +537,14 @@ pub fn check_centre(field: &str, sheet: &Sheet, centre_m: DVec2) -> Result<()> {
     Ok(())
 }
 
-/// Whether a control point is on the sheet or at most a tenth of its longer side off it.
+/// Whether a control point is on the sheet, or off it by at most a tenth of its longer side.
 pub fn is_near(sheet: &Sheet, centre_m: DVec2) -> bool {
     let extent_m = sheet.extent_m();
     let margin_m = DVec2::splat(0.1 * sheet.longer_side_m());
     centre_m.cmpge(-margin_m).all() && centre_m.cmple(extent_m + margin_m).all()
 }
 
-/// The mass point that rests nearest to a place.
+/// The mass point whose rest position is nearest to a place.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
 pub fn nearest_point(sheet: &Sheet, place_m: DVec2) -> [usize; 2] {
     let nearest =

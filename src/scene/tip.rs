@@ -1,15 +1,15 @@
-//! What a tool that is led by its position is where it meets the sheet.
+//! The tip of a position-controlled tool: how it meets the sheet.
 
 use crate::refusal::{Result, not_negative, number, positive};
 
 use super::Sheet;
 
-/// How a tool is bound to what it touches.
+/// The coupling between a tool and the surface it touches.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Coupling {
-    /// The surface is where the tool is: the stiffness that is felt is the tissue's.
+    /// The surface follows the tool exactly: the stiffness felt is the tissue's.
     Constraint,
-    /// By a spring of Kc and a damper of Bc: felt is K·Kc/(K + Kc).
+    /// A spring of Kc and a damper of Bc: the stiffness felt is K·Kc/(K + Kc).
     Spring {
         /// Kc, N/m.
         stiffness_n_per_m: f64,
@@ -18,28 +18,31 @@ pub enum Coupling {
     },
 }
 
-/// What a tool is where it meets the sheet.
+/// The properties of a tool's tip.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tip {
-    /// Of the disc with which it meets the sheet, m. Stiffness in N/m means little without it.
+    /// Radius of the disc with which it meets the sheet, m. A stiffness in N/m means little without it.
     pub radius_m: f64,
-    /// μ of Coulomb's friction; of a grasp it has no meaning.
+    /// μ of Coulomb friction; unused for a grasp.
     pub friction: f64,
-    /// Holds what it has, pulling as well as pushing; or touches, and only pushes.
+    /// Whether it holds the tissue, and so pulls as well as pushes. Otherwise it touches and only pushes.
     pub grasps: bool,
-    /// How it is bound.
+    /// The coupling.
     pub coupling: Coupling,
 }
 
 impl Default for Tip {
-    /// A finger's end on wet tissue.
+    /// A fingertip on wet tissue.
     fn default() -> Self {
         Tip { radius_m: 0.005, friction: 0.2, grasps: false, coupling: Coupling::Constraint }
     }
 }
 
 impl Tip {
-    /// Whether such a tool can be on such a sheet.
+    /// Checks whether such a tool fits such a sheet.
+    ///
+    /// # Errors
+    /// Refuses a value that is not finite or out of range; `field` is the name that the refusal gives.
     pub fn check(&self, field: &str, sheet: &Sheet) -> Result<()> {
         let longest_m = sheet.longer_side_m();
         let range = format!("above 0 and at most {longest_m}, the sheet's longer side");

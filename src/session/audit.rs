@@ -1,6 +1,6 @@
-//! The audit of a run: a twin in f64 with a quarter of the substep, of which nothing sleeps, gets the same inputs, step
-//! by step. The records of the two are compared. With `[stepping] correct`, windows of the run are audited one after the
-//! other as a server does it, and an error above the tolerance changes how the tissue is stepped.
+//! The audit of a run: a twin in f64 with a quarter of the substep and without sleep gets the same inputs, step by
+//! step, and the records of the two are compared. With `[stepping] correct`, windows of the run are audited one after
+//! the other, as in a server, and an error above the tolerance changes how the tissue is stepped.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -13,12 +13,12 @@ use crate::scene::script::Script;
 use crate::sheet::Model;
 use crate::sheet::audit::{Extent, FINER, Finding, Inputs, Mark, Opening};
 
-/// What a session is compared with.
+/// The model of the session to compare with.
 fn twin_of(model: &Model) -> Arc<Model> {
     model.twin(FINER, Precision::F64)
 }
 
-/// A session that is more accurate than the one beside it, and what the two differ by.
+/// A more accurate session beside another, and the differences between the two.
 pub struct Twin {
     session: Session,
     records: VecDeque<Record>,
@@ -27,23 +27,23 @@ pub struct Twin {
 }
 
 impl Twin {
-    /// Beside a session of `model` that has not begun.
+    /// A twin of a session of `model` that has not begun.
     pub fn new(model: &Model) -> Self {
         let session = Session::new(&twin_of(model));
         Twin { session, records: VecDeque::new(), differences: Extent::default(), largest: Extent::default() }
     }
 
-    /// To tell its tools what those of the other session are told.
+    /// The twin's session, for inputs equal to those of the other session.
     pub fn session(&mut self) -> &mut Session {
         &mut self.session
     }
 
-    /// Changes the tissue as that of the other session.
+    /// Changes the tissue in the same way as the other session's.
     pub fn change(&mut self, model: &Model) {
         self.session.change(&twin_of(model));
     }
 
-    /// One step, before the other session does it.
+    /// Advances one step, before the other session does it.
     pub fn advance(&mut self, due: &[Due], script: &Script) {
         let Twin { session, records, .. } = self;
         session.advance(&mut due.to_vec(), |session| {
@@ -53,12 +53,12 @@ impl Twin {
         });
     }
 
-    /// Why it can't go on, if it can't.
+    /// The reason why it was stopped, if it was.
     pub fn hold_reason(&self) -> Option<String> {
         self.session.hold_reason().map(|reason| format!("the audit's twin: {reason}"))
     }
 
-    /// The other session has made its next record.
+    /// Compares with the next record of the other session.
     pub fn compare(&mut self, record: &Record) {
         let Some(truth) = self.records.pop_front() else { return };
         for (point, truth) in record.points.iter().zip(&truth.points) {
@@ -75,13 +75,13 @@ impl Twin {
         }
     }
 
-    /// The largest difference of all records so far, relative to the largest value.
+    /// The largest difference in all records so far, relative to the largest value.
     pub fn error(&self) -> AuditedError {
         self.differences.relative_to(self.largest)
     }
 }
 
-/// Audits windows of a session one after the other. Which steps they are depends on the scene and its inputs alone.
+/// Audits windows of a session one after the other. The choice of steps depends only on the scene and its inputs.
 #[derive(Default)]
 pub struct Windows {
     opening: Option<Opening>,
@@ -90,7 +90,7 @@ pub struct Windows {
 }
 
 impl Windows {
-    /// After a step, and before the first: audits the window that is over, if one is.
+    /// Call after each step, and before the first: audits the window that has ended, if one has.
     pub fn look(&mut self, session: &mut Session) -> Option<Finding> {
         if !std::mem::replace(&mut self.begun, true) {
             session.watch(Inputs::default());

@@ -1,4 +1,4 @@
-//! `palpate check`: what a scene asks of the program, and what the program makes of it.
+//! `palpate check`: what a scene requires, and how the program will run it.
 
 use std::f64::consts::TAU;
 use std::fmt;
@@ -13,29 +13,29 @@ use crate::sheet::choice::{self, Choice};
 use crate::sheet::integrate::Oscillator;
 use crate::sheet::{Model, Push};
 
-/// What is told of a scene.
+/// The report on a scene.
 #[derive(Debug)]
 pub struct Report {
     model: Arc<Model>,
-    /// What the tolerance could have been kept with.
+    /// The choices that could keep the tolerance.
     candidates: Vec<Choice>,
-    /// Least and median of a step, s; nothing if it could not be done.
+    /// Least and median time of a step, s; `None` if the step failed.
     step_s: Option<[f64; 2]>,
 }
 
-/// Windows in which the step is timed, and how long each is, s.
+/// Number of windows in which the step is timed, and the length of each, s.
 const WINDOWS: usize = 50;
 const WINDOW_S: f64 = 0.004;
 
-/// Looks at a scene, and times its step under a poke. `clock_s` tells the time.
+/// Reports on a scene, and times its step under a poke. `clock_s` returns the time.
 pub fn check(model: &Arc<Model>, most_substeps: u32, clock_s: &dyn Fn() -> f64) -> Report {
     let candidates = choice::candidates(&model.scene, most_substeps);
     Report { model: model.clone(), candidates, step_s: time(model, clock_s) }
 }
 
-/// A poke that moves the middle by about a tenth of a spacing: numbers of the usual size.
+/// Times the step under a poke that moves the middle by about a tenth of a spacing, so that values have usual sizes.
 fn time(model: &Arc<Model>, clock_s: &dyn Fn() -> f64) -> Option<[f64; 2]> {
-    // What a step costs while all of the sheet moves.
+    // Measure the cost of a step while the whole sheet moves.
     let mut session = Session::new(&Arc::new(Model { sleep_tolerance: 0.0, ..Model::clone(model) }));
     let scene = &model.scene;
     let stiffness = scene.virtual_stiffness_n_per_m + 0.1 * scene.springs.stiffness_n_per_m;

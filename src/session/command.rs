@@ -1,5 +1,5 @@
-//! What a client tells a tool, and the desk where it is taken in: leases, sequence numbers, and the queue of
-//! what waits for its step. Time is an argument.
+//! Commands to tools and their intake: leases, sequence numbers, and the queue of commands that wait for their step.
+//! Time is an argument.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
@@ -16,17 +16,17 @@ use crate::sheet::Model;
 pub struct Command {
     /// The tool's number.
     pub tool: u32,
-    /// Rises with each command to the tool.
+    /// Must rise with each command to the tool.
     pub sequence: u64,
-    /// The client's clock, handed back with the sample that acknowledges the command.
+    /// Time by the client's clock, returned with the sample that acknowledges the command.
     pub client_time_ns: u64,
-    /// The step at whose beginning it acts; the next one if `None`.
+    /// The step at whose beginning it takes effect; the next one if `None`.
     pub at_step: Option<u64>,
-    /// Simulated time after which what it did is ended.
+    /// Simulated time after which its action ends.
     pub time_to_live_s: Option<f64>,
-    /// What to do.
+    /// The action.
     pub action: Action,
-    /// When it came, by the server's clock.
+    /// Arrival time by the server's clock.
     pub arrival_ns: u64,
 }
 
@@ -35,15 +35,15 @@ pub struct Command {
 pub struct Due {
     /// The command.
     pub command: Command,
-    /// It was to act at an earlier step.
+    /// Whether it was meant for an earlier step.
     pub late: bool,
-    /// Late commands that it stands for: itself, and those that it has superseded.
+    /// Number of late commands that it represents: itself, and those that it has superseded.
     pub late_commands: u64,
-    /// Not a client's: the end of a lease, and of all that its holder did with the tool.
+    /// Not a client's command: it ends a lease and all actions of its holder with the tool.
     pub ends_lease: bool,
 }
 
-/// Names a lease. Random, so that it can't be guessed.
+/// Identifies a lease. Random, so that it can't be guessed.
 pub type LeaseId = u128;
 
 #[derive(Debug)]
@@ -53,56 +53,56 @@ struct Lease {
     duration_ns: u64,
     expires_ns: u64,
     last_sequence: Option<u64>,
-    /// Commands of the tool in the queue.
+    /// Number of commands of the tool in the queue.
     waiting: usize,
-    /// Where the tool's newest command waits.
+    /// Place of the tool's newest command in the queue.
     last_place: Option<Place>,
 }
 
 /// Place in the queue: step, then order of arrival.
 type Place = (u64, u64);
 
-/// What has become of the commands that were taken in: `accepted` is the sum of the others.
+/// Counts of the accepted commands by outcome: `accepted` is the sum of the others.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Counts {
-    /// Taken in.
+    /// Commands accepted.
     pub accepted: u64,
-    /// Their step has come, and they have acted.
+    /// Commands that took effect at their step.
     pub applied: u64,
-    /// A later place of the same tool took theirs before their step.
+    /// Commands replaced by a later place of the same tool before their step.
     pub superseded: u64,
-    /// Their lease, or the session, ended before their step.
+    /// Commands whose lease or session ended before their step.
     pub dropped: u64,
-    /// Wait for their step.
+    /// Commands that wait for their step.
     pub waiting: u64,
 }
 
-/// Where commands come in.
+/// Takes in commands and holds them until their step.
 #[derive(Debug)]
 pub struct Intake {
     scene: Scene,
     limits: Limits,
     leases: BTreeMap<u32, Lease>,
     queue: BTreeMap<Place, Due>,
-    /// Other tissues that wait for their step, by steps that rise.
+    /// Changes of tissue that wait for their step, by ascending step.
     changes: VecDeque<(u64, Arc<Model>)>,
-    /// The last that was taken in, if there was one.
+    /// The last change accepted, if there was one.
     changed_to: Option<Arc<Model>>,
     arrivals: u64,
     next_step: u64,
-    /// The session rests: its steps are done in thought, up to this one.
+    /// The session rests: its steps up to this one are skipped, not computed.
     resting: Option<(Schedule, u64)>,
-    /// Something came that may have to act before that, and who steps the session was woken.
+    /// A command or change has arrived that may take effect earlier, and the session's thread was woken for it.
     changed: bool,
     woken: bool,
     lapsed: u64,
-    /// Without those that wait.
+    /// Counts without the waiting commands.
     counts: Counts,
     closed: Option<Refusal>,
 }
 
 impl Intake {
-    /// For a session of `scene` that has not begun.
+    /// An intake for a session of `scene` that has not begun.
     pub fn new(scene: &Scene, limits: &Limits) -> Self {
         Intake {
             scene: scene.clone(),
@@ -122,7 +122,11 @@ impl Intake {
         }
     }
 
-    /// Takes all of `tools` or none. They lapse when nothing came for `lease_s`.
+    /// Takes all of `tools` or none. The leases lapse after `lease_s` without a command or renewal.
+    ///
+    /// # Errors
+    /// Refuses if the intake is closed, for tools that are unknown, named twice or held, and for a holder name or a lease
+    /// time out of range.
     pub fn acquire(&mut self, tools: &[u32], holder: &str, lease_s: f64, id: LeaseId, now_ns: u64) -> Result<()> {
         self.check_open()?;
         self.lapse(now_ns);
@@ -163,7 +167,10 @@ impl Intake {
         Ok(())
     }
 
-    /// The holder is alive.
+    /// Extends a lease: its holder is alive.
+    ///
+    /// # Errors
+    /// Refuses an unknown or lapsed lease.
     pub fn renew(&mut self, id: LeaseId, now_ns: u64) -> Result<()> {
         self.lapse(now_ns);
         let mut held = false;
@@ -174,7 +181,10 @@ impl Intake {
         if held { Ok(()) } else { Err(not_holder("no tool is held by this lease: it lapsed or was given back".into())) }
     }
 
-    /// Gives back every tool of a lease. What they did is ended at the next step, what waits is dropped.
+    /// Releases every tool of a lease. Their actions end at the next step; waiting commands are dropped.
+    ///
+    /// # Errors
+    /// Refuses an unknown or lapsed lease.
     pub fn release(&mut self, id: LeaseId) -> Result<()> {
         let tools: Vec<u32> = self.tools_of(id).collect();
         if tools.is_empty() {
@@ -203,8 +213,8 @@ impl Intake {
         self.enqueue(command, true);
     }
 
-    /// Time has gone on: ends the leases that have run out. At rest, steps have been done in thought, but none at whose
-    /// beginning something waits.
+    /// Ends the leases that have expired at `now_ns`. In a resting session, time passes without computed steps, but
+    /// never past a step that has something waiting.
     pub fn lapse(&mut self, now_ns: u64) {
         if let Some((schedule, until)) = &self.resting {
             let until = self.first_waiting().map_or(*until, |step| step.min(*until));
@@ -216,7 +226,11 @@ impl Intake {
         }
     }
 
-    /// Takes in all of `commands`, from the holder of `id`, or none.
+    /// Accepts all of `commands`, from the holder of `id`, or none.
+    ///
+    /// # Errors
+    /// Refuses if the intake is closed, too many commands for the queue, tools that this lease does not hold, sequence
+    /// numbers that do not rise, and what the checks of an action refuse.
     pub fn submit(&mut self, id: LeaseId, commands: Vec<Command>, now_ns: u64) -> Result<()> {
         self.check_open()?;
         self.lapse(now_ns);
@@ -239,7 +253,7 @@ impl Intake {
             last.insert(command.tool, command.sequence);
             self.check(command)?;
         }
-        // Per tool, so that no holder fills the queue for the others.
+        // A limit per tool, so that no holder fills the queue for the others.
         for tool in last.keys() {
             let waiting = self.leases.get(tool).map_or(0, |lease| lease.waiting);
             let coming = commands.iter().filter(|command| command.tool == *tool).count();
@@ -287,8 +301,8 @@ impl Intake {
             lease.last_sequence = Some(command.sequence);
             lease.waiting += 1;
             let last = lease.last_place.replace(place);
-            // The latest position wins: one that can't act any more makes room.
-            // Not of those that are played by their client's time (`haptics::path`): there each counts.
+            // The latest position wins: it supersedes an earlier one that has not taken effect. This does not apply to
+            // poses played by client time (`haptics::path`), where each one counts.
             let is_place = |command: &Command| match command.action {
                 Action::Grasp { .. } => true,
                 Action::Lead { .. } => command.at_step.is_some() || command.client_time_ns == 0,
@@ -314,14 +328,17 @@ impl Intake {
         commands.into_iter().chain(changes).min()
     }
 
-    /// The tissue as it will be when all changes have acted that were taken in; `None` if there was none.
+    /// The tissue after all accepted changes; `None` if there was none.
     pub fn changed_to(&self) -> Option<Arc<Model>> {
         self.changed_to.clone()
     }
 
-    /// Takes in another tissue, made out of `base`, to act at the beginning of step `at_step`, or the next. Tells the
-    /// step; `None` if meanwhile [`Intake::changed_to`] is not `base` any more. Changes act in the order in which they
-    /// come: each is made out of the one before it. Of several for one step the last counts, which has the others in it.
+    /// Accepts another tissue, made from `base`, for the beginning of step `at_step`, or of the next step. Returns the
+    /// step, or `None` if [`Intake::changed_to`] is no longer `base`. Changes take effect in their order of arrival,
+    /// and each is made from the one before it. Of several for one step the last one applies; it includes the others.
+    ///
+    /// # Errors
+    /// Refuses if the intake is closed, for a step before that of a waiting change, and for too many waiting changes.
     pub fn change(
         &mut self,
         base: Option<&Arc<Model>>,
@@ -354,15 +371,15 @@ impl Intake {
         Ok(Some(step))
     }
 
-    /// The tissue that is due at the beginning of step `step`, if another is: the last of those that are.
+    /// The last tissue that is due at the beginning of step `step`, if there is one.
     pub fn take_change(&mut self, step: u64) -> Option<Arc<Model>> {
         let due = self.changes.partition_point(|change| change.0 <= step);
         self.changes.drain(..due).next_back().map(|change| change.1)
     }
 
-    /// The session has done `step` steps, and would rest until step `until`: tells the step that it must do next, which is
-    /// earlier if something waits here. From now until that is taken ([`Intake::take_due`]) it rests, if that is not the
-    /// very next one.
+    /// Begins a rest: the session has done `step` steps and could rest until step `until`. Returns the next step that
+    /// must be computed, which is earlier than `until` if something waits here. The session then rests until
+    /// [`Intake::take_due`] takes that step, unless it is the very next one.
     pub fn rest(&mut self, step: u64, until: u64, schedule: &Schedule) -> u64 {
         let waiting = self.first_waiting();
         let lapse = self.leases.values().map(|lease| lease.expires_ns).min().map(|ns| schedule.next_step(ns));
@@ -373,19 +390,19 @@ impl Intake {
         next
     }
 
-    /// The session rests.
+    /// Whether the session rests.
     pub fn is_resting(&self) -> bool {
         self.resting.is_some()
     }
 
-    /// Whether who steps a session at rest must be woken, to ask again for how long it rests. Told once.
+    /// Whether the thread of a resting session must be woken to call [`Intake::rest`] again. True once per wake.
     pub fn take_wake(&mut self) -> bool {
         let wake = self.changed && !self.woken && self.is_resting();
         self.woken |= wake;
         wake
     }
 
-    /// Moves what is due at the beginning of step `step` into `due`, in the order in which it is to act.
+    /// Moves what is due at the beginning of step `step` into `due`, in order of effect.
     pub fn take_due(&mut self, step: u64, now_ns: u64, due: &mut Vec<Due>) {
         self.lapse(now_ns);
         self.resting = None;
@@ -400,7 +417,7 @@ impl Intake {
         self.next_step = step + 1;
     }
 
-    /// The step that comes next.
+    /// The next step.
     pub fn next_step(&self) -> u64 {
         self.next_step
     }
@@ -410,17 +427,17 @@ impl Intake {
         self.leases.iter().filter(move |lease| lease.1.id == id).map(|lease| *lease.0)
     }
 
-    /// Who holds what.
+    /// Each held tool and its holder.
     pub fn holders(&self) -> impl Iterator<Item = (u32, &str)> {
         self.leases.iter().map(|(tool, lease)| (*tool, lease.holder.as_str()))
     }
 
-    /// Tools whose lease lapsed, in all.
+    /// Total number of tools whose lease lapsed.
     pub fn lapsed(&self) -> u64 {
         self.lapsed
     }
 
-    /// What has become of the commands so far.
+    /// Counts of the commands so far, by outcome.
     pub fn counts(&self) -> Counts {
         Counts { waiting: self.waiting(), ..self.counts }
     }
@@ -429,7 +446,7 @@ impl Intake {
         self.queue.values().filter(|due| !due.ends_lease).count() as u64
     }
 
-    /// From now on everything is refused with this.
+    /// From now on refuses everything with `refusal`.
     pub fn close(&mut self, refusal: Refusal) {
         self.closed = Some(refusal);
         self.counts.dropped += self.waiting();
@@ -474,11 +491,11 @@ mod tests {
     #[test]
     fn a_command_at_rest_acts_at_the_next_step_by_the_clock_and_wakes_once() {
         let (mut intake, schedule) = intake();
-        // At rest until the lease would lapse.
+        // The rest lasts until the lease would lapse.
         assert_eq!(intake.rest(5, u64::MAX, &schedule), 1001);
         intake.submit(LEASE, vec![release(1, None)], 500 * MS).unwrap();
         assert_eq!((steps(&intake), intake.take_wake(), intake.take_wake()), (vec![501], true, false));
-        // Time does not pass what waits: a second one comes after it, or with it.
+        // Time does not pass a waiting command: a second one comes after it, or with it.
         intake.submit(LEASE, vec![release(2, None)], 520 * MS).unwrap();
         assert_eq!(steps(&intake), [501, 501]);
         assert!(!intake.take_wake());
@@ -495,7 +512,7 @@ mod tests {
         intake.rest(0, u64::MAX, &schedule);
         let commands = vec![release(1, Some(400)), release(2, Some(501)), release(3, Some(800))];
         intake.submit(LEASE, commands, 500 * MS).unwrap();
-        // 400 is over at 500 ms, though no step was computed.
+        // Step 400 is over at 500 ms, though no step was computed.
         assert_eq!(steps(&intake), [501, 501, 800]);
         assert_eq!(intake.queue.values().map(|due| due.late).collect::<Vec<_>>(), [true, false, false]);
         assert_eq!(intake.rest(0, u64::MAX, &schedule), 501);
@@ -507,13 +524,13 @@ mod tests {
     fn a_lease_lapses_at_rest_and_what_is_wanted_earlier_comes_first() {
         let (mut intake, schedule) = intake();
         assert_eq!(intake.rest(3, 50, &schedule), 50);
-        // The clock is late: time stands at the step that is to be done.
+        // The clock is late: time stops at the step that is due.
         intake.lapse(90 * MS);
         assert_eq!(intake.next_step(), 50);
         assert_eq!(intake.rest(51, u64::MAX, &schedule), 1001);
         intake.lapse(1000 * MS);
         assert_eq!((intake.lapsed(), steps(&intake), intake.take_wake()), (1, vec![1001], true));
-        // Whose very next step is wanted does not rest.
+        // A session whose very next step is wanted does not rest.
         assert_eq!(intake.rest(1001, u64::MAX, &schedule), 1001);
         assert!(!intake.is_resting());
     }

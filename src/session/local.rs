@@ -1,4 +1,4 @@
-//! Local models of one tool: what a sample says of the tissue around it (`haptics::local`).
+//! Local models of one tool: the content of a sample about the tissue around it (`haptics::local`).
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -9,30 +9,30 @@ use crate::haptics::{Law, law::Row};
 use crate::sheet::tangent::Tangent;
 use crate::sheet::{Feel, Standing, Surroundings};
 
-/// Forces below need no validity, N.
+/// Smaller forces do not limit the valid distance, N.
 const LEAST_N: f64 = 0.05;
 
-/// For so long after it was met a tissue may be off the tool.
+/// A tissue may lose contact with the tool for this many samples after it was met.
 const KNOCKED_SAMPLES: u32 = 5;
 
 /// Makes the local models of one tool.
 #[derive(Debug, Clone)]
 pub struct Modeller {
     law: Arc<Law>,
-    /// Also under a touch K and B are to be those of the sheet around it.
+    /// Whether K and B are those of the sheet around the tool also under a touch.
     touches_too: bool,
-    /// How the tool stood to the tissue in the newest model.
+    /// The state of contact in the newest model.
     standing: Standing,
-    /// Where the surface was, and its normal, when the tool last did not touch it.
+    /// The surface and its normal when the tool last did not touch it.
     surface: Option<(DVec3, DVec3)>,
-    /// Samples in a row in which the tool was below it and did not touch.
+    /// Consecutive samples in which the tool was below the surface and did not touch it.
     knocked: u32,
     sequence: u64,
-    /// The newest that was computed where the tool is.
+    /// The newest stiffness computed at the tool.
     tangent: Arc<Mutex<Option<Tangent>>>,
 }
 
-/// The stiffness under a tool, to be computed where it makes no step wait.
+/// A pending computation of the stiffness under a tool, for a thread where no step waits for it.
 #[derive(Debug)]
 pub struct Refinement {
     surroundings: Surroundings,
@@ -40,7 +40,7 @@ pub struct Refinement {
 }
 
 impl Refinement {
-    /// Computes it, and hands it to the tool's modeller.
+    /// Computes the stiffness and passes it to the tool's modeller.
     pub fn work(self) {
         let tangent = self.surroundings.tangent();
         *self.tangent.lock().unwrap_or_else(PoisonError::into_inner) = Some(tangent);
@@ -48,14 +48,14 @@ impl Refinement {
 }
 
 impl Modeller {
-    /// For a tool on a tissue with this law. A grasp is rendered by K and B of the sheet around it, which are computed
-    /// anew again and again; a touch is rendered by the law, and has them computed only if `touches_too`.
+    /// A modeller for a tool on a tissue with this law. A grasp is rendered with K and B of the sheet around it, which
+    /// are recomputed continually; a touch is rendered with the law, and K and B are computed only if `touches_too`.
     pub fn new(law: Arc<Law>, touches_too: bool) -> Self {
         let (standing, tangent) = (Standing::Free, Arc::default());
         Modeller { law, touches_too, standing, surface: None, knocked: 0, sequence: 0, tangent }
     }
 
-    /// Whether K and B are to be computed where the tool is now.
+    /// Whether K and B should be computed at the tool's present place.
     pub fn wants_refinement(&self) -> bool {
         match self.standing {
             Standing::Free => false,
@@ -64,18 +64,19 @@ impl Modeller {
         }
     }
 
-    /// What computes the stiffness anew, from the sheet around the tool.
+    /// A computation of the stiffness from the sheet around the tool.
     pub fn refinement(&self, surroundings: Surroundings) -> Refinement {
         Refinement { surroundings, tangent: self.tangent.clone() }
     }
 
-    /// The model after a step. K and B are the newest that were computed where the tool is, or else the law's.
+    /// The model after a step. K and B are the newest that were computed at the tool, or else the law's.
     pub fn model(&mut self, feel: &Feel, step: u64, client_time_s: f64) -> LocalModel {
         self.sequence += 1;
         self.standing = feel.standing;
         let touches = matches!(feel.standing, Standing::Sticking | Standing::Sliding);
         let below = self.surface.is_some_and(|(surface_m, normal)| (surface_m - feel.place_m).dot(normal) > 0.0);
-        // A tissue that is met starts away from the tool for a moment: where it is then is not where it will be met.
+        // On contact, the tissue moves away from the tool for a moment. Its place then is not where the tool will meet
+        // it.
         self.knocked = if below && feel.standing == Standing::Free { self.knocked + 1 } else { 0 };
         if !touches && !(1..=KNOCKED_SAMPLES).contains(&self.knocked) {
             self.surface = Some((feel.surface_m, feel.normal));
@@ -83,7 +84,7 @@ impl Modeller {
         let (mut surface_m, normal) = self.surface.unwrap_or((feel.surface_m, DVec3::Z));
         let mut depth_m = (surface_m - feel.place_m).dot(normal);
         if touches {
-            // The surface is where the law says that this force begins: so the law goes through this sample.
+            // Put the surface where the law gives this force, so that the law goes through this sample.
             let damping = self.law.at_depth(depth_m).damping_n_s_per_m;
             let pressure_n = feel.force_on_tool_n.dot(normal) + damping * feel.velocity_m_per_s.dot(normal);
             if pressure_n > 0.0 {
@@ -122,7 +123,7 @@ impl Modeller {
         }
     }
 
-    /// By how much the stiffness changes with depth, N/m².
+    /// The change of stiffness with depth, N/m².
     fn hardening(&self, depth_m: f64, row: &Row) -> f64 {
         let further = self.law.at_depth(depth_m + self.law.step_m);
         (further.stiffness_n_per_m - row.stiffness_n_per_m).abs() / self.law.step_m

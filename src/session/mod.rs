@@ -1,5 +1,5 @@
-//! One tissue in use: what the tools do to it, what they feel, what is recorded. No clock, no socket: a session
-//! that is given the same commands at the same steps gives the same bits.
+//! One tissue in use: the actions of the tools, the forces on them, and the records. No clock, no socket: a session
+//! with the same commands at the same steps gives the same bits.
 
 pub mod audit;
 pub mod check;
@@ -23,30 +23,30 @@ use crate::sheet::audit::{Inputs, Mark};
 use crate::sheet::{self, Energy, Feel, Grasp, Model, PointState, Push, Tissue};
 use command::Due;
 
-/// What one tool felt at the end of a step.
+/// The sample of one tool at the end of a step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ToolSample {
     /// The tool's number.
     pub tool: u32,
-    /// Sequence of the newest command that acted; 0 before the first.
+    /// Sequence of the newest command that took effect; 0 before the first.
     pub acknowledged_sequence: u64,
-    /// Its time by the client's clock.
+    /// Time of that command by the client's clock.
     pub client_time_ns: u64,
-    /// When it came, by the server's clock; 0 before the first.
+    /// Arrival of that command by the server's clock; 0 before the first.
     pub arrival_ns: u64,
-    /// What it does, and feels, if anything.
+    /// Motion and forces at the tool's control point, if it acts.
     pub contact: Option<Contact>,
-    /// The same of a tool that is led by its position, from its own point of view.
+    /// Motion and force of a position-controlled tool itself.
     pub feel: Option<Feel>,
-    /// The client's time of the place where such a tool is, s.
+    /// Client time of the place of such a tool, s.
     pub place_time_s: f64,
-    /// What is sent ahead for a client to render by, of a stream that has asked for it.
+    /// The local model from which a client renders, for a stream that requests it.
     pub local: Option<LocalModel>,
-    /// No command came for long: the tool is held where it is.
+    /// Whether the tool is held in place because no command came for long.
     pub stale: bool,
-    /// The acknowledged command came too late for its step.
+    /// Whether the acknowledged command came too late for its step.
     pub late: bool,
-    /// What the tool did was ended by its time to live, with its lease, or because no pose came.
+    /// Whether the tool's action was ended by its time to live, with its lease, or for lack of poses.
     pub expired: bool,
 }
 
@@ -59,13 +59,13 @@ pub struct Contact {
     pub displacement_m: DVec3,
     /// m/s.
     pub velocity_m_per_s: DVec3,
-    /// Of the tissue on the tool: springs + virtual spring + damping, N.
+    /// Force of the tissue on the tool: springs + virtual spring + damping, N.
     pub force_on_tool_n: DVec3,
-    /// Of all tools on the point, N.
+    /// Force of all tools on the point, N.
     pub applied_force_n: DVec3,
 }
 
-/// What all tools felt at the end of a step.
+/// The samples of all tools at the end of a step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sample {
     /// Steps done.
@@ -74,11 +74,11 @@ pub struct Sample {
     pub simulation_time_s: f64,
     /// Points computed in the step.
     pub awake_points: usize,
-    /// Commands that came too late, in all.
+    /// Total number of commands that came too late.
     pub late_commands: u64,
-    /// The guard has ended the session.
+    /// Whether the guard has ended the session.
     pub held: bool,
-    /// By the number of the tool, rising.
+    /// By ascending number of the tool.
     pub tools: Vec<ToolSample>,
 }
 
@@ -94,12 +94,12 @@ struct Tool {
     led: Option<Led>,
 }
 
-/// A tool that is led by its position.
+/// A position-controlled tool.
 #[derive(Debug, Clone)]
 struct Led {
     tip: Tip,
     path: Path,
-    /// The client's time of the place where it is, s.
+    /// Client time of its place, s.
     client_time_s: f64,
 }
 
@@ -113,7 +113,7 @@ pub struct Session {
 }
 
 impl Session {
-    /// A tissue at rest.
+    /// Creates a session of a tissue at rest.
     pub fn new(model: &Arc<Model>) -> Self {
         Session {
             tissue: sheet::at_rest(model),
@@ -124,12 +124,12 @@ impl Session {
         }
     }
 
-    /// What of the tissue never changes.
+    /// The model of the tissue.
     pub fn model(&self) -> &Arc<Model> {
         self.tissue.model()
     }
 
-    /// The tissue, to look at.
+    /// The tissue, read-only.
     pub fn tissue(&self) -> &dyn Tissue {
         &*self.tissue
     }
@@ -145,42 +145,42 @@ impl Session {
         self.step_count() as f64 / self.model().scene.stepping.rate_hz
     }
 
-    /// Why the guard has ended the session, if it has.
+    /// The reason why the guard has ended the session, if it has.
     pub fn hold_reason(&self) -> Option<&str> {
         self.hold_reason.as_deref()
     }
 
-    /// Ends it, as the guard does.
+    /// Ends the session, as the guard does.
     pub fn hold(&mut self, reason: String) {
         self.hold_reason.get_or_insert(reason);
     }
 
-    /// Commands that came too late for their step, in all.
+    /// Total number of commands that came too late for their step.
     pub fn late_commands(&self) -> u64 {
         self.late_commands
     }
 
-    /// Of all tools that are led, as [`Path::counts`] tells it of one.
+    /// The sum of [`Path::counts`] over all position-controlled tools.
     pub fn path_counts(&self) -> [u64; 3] {
         self.path_counts
     }
 
-    /// The step at whose beginning something happens by itself, if not before: nothing if the tissue moves.
+    /// The step at whose beginning something happens without a new command; `None` if the tissue moves.
     pub fn rests_until(&self) -> Option<u64> {
         let expiry = self.tools.iter().filter_map(|tool| tool.expires_at).min();
-        // A path may bring a tool at any time.
+        // A path may move a tool at any time.
         let still = self.tissue.is_still() && self.tools.iter().all(|tool| tool.led.is_none());
         still.then(|| expiry.unwrap_or(u64::MAX))
     }
 
-    /// Goes on to the moment when `step` steps are done, which must not be later than [`Session::rests_until`]: the same
-    /// as to advance so often with nothing due.
+    /// Skips to the moment when `step` steps are done, which must not be later than [`Session::rests_until`]. The
+    /// result is the same as that of single steps with nothing due.
     pub fn skip_to(&mut self, step: u64) {
         self.tissue.skip_steps(step.saturating_sub(self.step_count()));
     }
 
-    /// From the coming step on the tissue is that of `model`, which is [`Model::changed`] or [`Model::corrected`] of this
-    /// one's.
+    /// From the coming step on the tissue is that of `model`, which comes from [`Model::changed`] or
+    /// [`Model::corrected`] of this session's model.
     pub fn change(&mut self, model: &Arc<Model>) {
         match self.tissue.changed(model) {
             Some(tissue) => self.tissue = tissue,
@@ -188,24 +188,25 @@ impl Session {
         }
     }
 
-    /// Asks for a window of steps to be audited ([`sheet::audit`]).
+    /// Requests an audit of a window of steps ([`sheet::audit`]).
     pub fn watch(&mut self, inputs: Inputs) {
         self.tissue.watch(inputs);
     }
 
-    /// What there is to tell of that window after a step, once.
+    /// Takes the report on that window after a step, once.
     pub fn take_mark(&mut self) -> Option<Mark> {
         self.tissue.take_mark()
     }
 
-    /// One step: `due` acts at its beginning, by the number of the tool. `observe` is called at its end unless the guard
-    /// has ended the session, and before the first also at t = 0⁺, when what is due acts and nothing has moved.
+    /// Advances one step. The commands in `due` take effect at its beginning, by the number of the tool. `observe` is
+    /// called at its end unless the guard has ended the session, and before the first step also at t = 0⁺, when the
+    /// commands act and nothing has moved.
     pub fn advance(&mut self, due: &mut Vec<Due>, mut observe: impl FnMut(&Session)) {
         if self.hold_reason.is_some() {
             due.clear();
             return;
         }
-        // Whose command came first must not matter between tools: a network decides that.
+        // The network decides the order of arrival between tools, so it must not affect the result.
         due.sort_by_key(|due| due.command.tool);
         for due in due.drain(..) {
             self.act(due);
@@ -269,7 +270,7 @@ impl Session {
             *tool = Tool { control_point: tool.control_point, expired: true, ..Tool::default() };
             return self.tissue.release(index);
         }
-        // Stamped commands may act in another order than they were sent in.
+        // Commands with a step may take effect in another order than they were sent in.
         if command.sequence > tool.acknowledged_sequence {
             tool.acknowledged_sequence = command.sequence;
             tool.client_time_ns = command.client_time_ns;
@@ -301,7 +302,7 @@ impl Session {
                 tool.control_point = Some(point);
                 let led = tool.led.get_or_insert(Led { tip, path: Path::default(), client_time_s });
                 led.tip = tip;
-                // What is stamped with its step is played there; what has only its client's time, by that.
+                // A pose with a step is played at that step; a pose with client time only is played by that time.
                 if command.at_step.is_some() || command.client_time_ns == 0 {
                     led.path.go_to(client_time_s, place_m);
                 } else if !led.path.receive(client_time_s, place_m, now_s) {
@@ -316,7 +317,7 @@ impl Session {
         }
     }
 
-    /// Ends what has outlived its time.
+    /// Ends actions whose time to live is over.
     fn expire(&mut self) {
         let step = self.step_count();
         for index in 0..self.tools.len() {
@@ -329,18 +330,18 @@ impl Session {
         }
     }
 
-    /// A force as a continuous law, exact within the step: what no command can ask for.
+    /// Applies a force as a continuous law, exact within the step. No command can express this.
     pub fn play_force(&mut self, tool: usize, law: ForceLaw) {
         self.tissue.push(tool, Some(Push::Law(law)));
     }
 
-    /// A movement as a continuous law.
+    /// Applies a movement as a continuous law.
     pub fn play_move(&mut self, tool: usize, law: MoveLaw) {
         let index = self.model().index_of(law.point);
         self.tissue.grasp(tool, index, Grasp::Law(law));
     }
 
-    /// What the tools feel; only those of `only`, if given.
+    /// The samples of the tools; only those with a number in `only`, if given.
     pub fn sample(&self, only: Option<&[u32]>) -> Sample {
         let sample_of = |number: u32| {
             let tool = self.tools.get(number as usize).cloned().unwrap_or_default();
@@ -399,7 +400,7 @@ impl Session {
         energy_record(self.tissue.energy())
     }
 
-    /// A record of `points`, or of all, without energies.
+    /// A record of `points` (grid indices [i, j]), or of all points, without energies.
     pub fn record(&self, points: Option<&[[usize; 2]]>) -> Record {
         let of = |point: &[usize; 2]| point_record(*point, &self.tissue.point(self.model().index_of(*point)));
         Record {
@@ -419,7 +420,7 @@ fn energy_record(energy: Energy) -> EnergyJ {
 }
 
 fn point_record(point: [usize; 2], state: &PointState) -> Point {
-    // −0 reads badly.
+    // Write −0 as 0.
     let array = |v: DVec3| (v + DVec3::ZERO).to_array();
     Point {
         point,

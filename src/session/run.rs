@@ -1,4 +1,4 @@
-//! `palpate run`: a script played offline, in process, as fast as it goes.
+//! `palpate run`: plays a script offline, in process, as fast as possible.
 
 use std::collections::VecDeque;
 use std::io::Write;
@@ -15,13 +15,13 @@ use crate::scene::script::{Action, Script};
 use crate::sheet::audit::Finding;
 use crate::sheet::{Model, Tissue};
 
-/// How a run can end early.
+/// The reason why a run ends early.
 #[derive(Debug, thiserror::Error)]
 pub enum Failure {
     /// The guard has ended the session.
     #[error("the run was stopped: {0}")]
     Held(String),
-    /// What a command would be refused for.
+    /// The input is refused, for the same reasons as a command.
     #[error("{0}")]
     Refused(#[from] Refusal),
     /// The output can't be written.
@@ -47,7 +47,7 @@ pub fn command(tool: usize, step: u64, action: Action) -> Command {
     Command {
         #[allow(clippy::cast_possible_truncation)]
         tool: tool as u32,
-        // One command a step at most, so steps make sequence numbers.
+        // At most one command per step, so steps serve as sequence numbers.
         sequence: step + 1,
         client_time_ns: 0,
         at_step: Some(step),
@@ -57,7 +57,7 @@ pub fn command(tool: usize, step: u64, action: Action) -> Command {
     }
 }
 
-/// Lets the laws of a script act on a session that has not begun.
+/// Applies the laws of a script to a session that has not begun.
 pub fn play(session: &mut Session, script: &Script) {
     for (tool, law) in script.forces.iter().enumerate() {
         session.play_force(tool, law.clone());
@@ -67,7 +67,7 @@ pub fn play(session: &mut Session, script: &Script) {
     }
 }
 
-/// Changes the tissue to what it is to be from the coming step on.
+/// Changes the tissue to the one due at the coming step.
 pub fn change(session: &mut Session, changes: &mut VecDeque<(u64, Arc<Model>)>) {
     while changes.front().is_some_and(|change| change.0 <= session.step_count()) {
         if let Some((_, model)) = changes.pop_front() {
@@ -76,8 +76,11 @@ pub fn change(session: &mut Session, changes: &mut VecDeque<(u64, Arc<Model>)>) 
     }
 }
 
-/// Plays `script` and writes its records, as JSON Lines, to `output`. `clock_s` tells the time, for the summary;
-/// `progress` is told the steps done now and then.
+/// Plays `script` and writes its records, as JSON Lines, to `output`. `clock_s` returns the time, for the summary;
+/// `progress` gets the number of steps done from time to time.
+///
+/// # Errors
+/// Returns an error if the guard stops the run, a command or change is refused, or the output can't be written.
 pub fn run(
     model: &Arc<Model>,
     script: &Script,
@@ -90,8 +93,11 @@ pub fn run(
     Playing { model, script, held, limits, twin: None, corrections: Vec::new() }.play(output, clock_s, progress)
 }
 
-/// The same, with a twin in f64 with a quarter of the substep beside it: the summary has what they differ by. With
-/// `[stepping] correct`, errors above the tolerance are corrected on the way.
+/// The same, with a twin in f64 with a quarter of the substep beside it: the summary has the differences. With
+/// `[stepping] correct`, the run corrects errors above the tolerance as it goes.
+///
+/// # Errors
+/// As for [`run`].
 pub fn audited(
     model: &Arc<Model>,
     script: &Script,
@@ -105,7 +111,7 @@ pub fn audited(
     Playing { model, script, held, limits, twin, corrections: Vec::new() }.play(output, clock_s, progress)
 }
 
-/// A script under way.
+/// A script being played.
 struct Playing<'p> {
     model: &'p Arc<Model>,
     script: &'p Script,
@@ -125,7 +131,7 @@ impl Playing<'_> {
         let Playing { model, script, held, limits, .. } = self;
         let mut session = Session::new(model);
         let mut changes = model.course(&script.changes, limits)?;
-        // Held forces are commands, through the same intake as a server's; laws are set once.
+        // Held forces are commands, through the same intake as in a server; laws are set once.
         let mut intake = held.then(|| intake(model, script, limits)).transpose()?;
         if !held {
             play(&mut session, script);
@@ -143,7 +149,7 @@ impl Playing<'_> {
                 }
                 intake.take_due(step, 0, &mut due);
             }
-            // The clock of the summary stands for all that is not the session's own stepping.
+            // The summary's clock stops during everything other than the session's own stepping.
             stepping_s += clock_s() - resumed_s;
             if let Some(windows) = &mut windows
                 && let Some(finding) = windows.look(&mut session)
@@ -188,7 +194,7 @@ impl Playing<'_> {
         Ok(summary)
     }
 
-    /// Steps the tissue more accurately from now on, if the finding asks for it, and what the script makes of it later.
+    /// Applies the finding's correction, if it needs one, from now on, and to the script's later changes.
     fn correct(
         &mut self,
         session: &mut Session,
@@ -207,7 +213,7 @@ impl Playing<'_> {
     }
 }
 
-/// Any number: in process nobody else asks.
+/// Any number will do: there is no other client in the process.
 const LEASE: u128 = 1;
 
 fn intake(model: &Model, script: &Script, limits: &Limits) -> Result<Intake> {

@@ -1,4 +1,4 @@
-//! Which samples a stream gets: every Nth, those of a change beyond a deadband, and heartbeats where nothing changes.
+//! Selects the samples of a stream: every Nth, changes beyond a deadband, and heartbeats while nothing changes.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -8,28 +8,31 @@ use super::{Sample, Session, ToolSample};
 use crate::haptics::{self, Law, LocalModel};
 use crate::refusal::{Reason, Refusal, Result, number};
 
-/// Between two samples of what does not change, s, unless asked otherwise: 20 a second, so that a client can tell
-/// stillness from silence within the 50 ms after which it should no longer trust what it knows.
+/// Default interval between samples while nothing changes, s: 20 a second, so that a client can tell stillness from
+/// silence within the 50 ms after which it should no longer trust its model.
 pub const HEARTBEAT_S: f64 = 0.05;
 
-/// The longest that can be asked for, s: clients take longer silence for an end.
+/// The longest heartbeat, s: clients take a longer silence for the end of the stream.
 pub const MOST_HEARTBEAT_S: f64 = 10.0;
 
-/// How much of a change is not worth a sample. A quantity without a bound is not looked at.
+/// The changes that are not worth a sample. A quantity without a bound is not compared.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Deadband {
-    /// Of the force on the tool, N.
+    /// Change of the force on the tool, N.
     pub force_n: Option<f64>,
-    /// The same as a part of the force; of both the larger counts.
+    /// The same as a fraction of the force. If both are given, the larger bound applies.
     pub force_fraction: Option<f64>,
-    /// Of the control point's displacement, m.
+    /// Change of the control point's displacement, m.
     pub displacement_m: Option<f64>,
-    /// Of the force that a client renders by the last local model, as a part of the true one.
+    /// Error of the force that a client renders from the last local model, as a fraction of the true one.
     pub rendered_fraction: Option<f64>,
 }
 
 impl Deadband {
-    /// Whether it can be used. 0 is any change.
+    /// Checks the bounds; 0 means any change.
+    ///
+    /// # Errors
+    /// Refuses a deadband without a bound, and a bound out of range.
     pub fn check(&self) -> Result<()> {
         let Deadband { force_n, force_fraction, displacement_m, rendered_fraction } = *self;
         if !self.looks_at_samples() && rendered_fraction.is_none() {
@@ -51,7 +54,7 @@ impl Deadband {
         Ok(())
     }
 
-    /// Whether samples are compared with each other, or only with what is rendered.
+    /// Whether samples are compared with each other, or only with the rendered force.
     fn looks_at_samples(&self) -> bool {
         self.force_n.or(self.force_fraction).or(self.displacement_m).is_some()
     }
@@ -75,25 +78,28 @@ impl Deadband {
     }
 }
 
-/// What a stream asked for.
+/// The request of a stream.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sampling {
     /// Samples of steps that are multiples of this.
     pub every: u64,
-    /// These tools; all in use if none are named.
+    /// The tools to sample; `None` for all in use.
     pub only: Option<Vec<u32>>,
-    /// Only what is beyond it, and heartbeats; each, if none.
+    /// Send only changes beyond it, and heartbeats. `None`: send each sample.
     pub deadband: Option<Deadband>,
-    /// Between two samples of what does not change, s.
+    /// Interval between samples while nothing changes, s.
     pub heartbeat_s: f64,
-    /// Samples have local models by this law.
+    /// The law for the local models of the samples. `None`: no local models.
     pub law: Option<Arc<Law>>,
-    /// Their stiffness and damping are those of the sheet around the tool also under a touch, not only under a grasp.
+    /// Whether stiffness and damping are those of the sheet around the tool also under a touch, not only under a grasp.
     pub touch_stiffness: bool,
 }
 
 impl Sampling {
-    /// Whether it can be used.
+    /// Checks the request.
+    ///
+    /// # Errors
+    /// Refuses a value out of range.
     pub fn check(&self) -> Result<()> {
         if let Some(deadband) = &self.deadband {
             deadband.check()?;
@@ -103,17 +109,17 @@ impl Sampling {
     }
 }
 
-/// Picks the samples of one stream.
+/// Selects the samples of one stream.
 #[derive(Debug)]
 pub struct Sampler {
     sampling: Sampling,
     heartbeat_steps: u64,
-    /// Without local models.
+    /// The last sample sent, without its local models.
     told: Option<Sample>,
     foresight: BTreeMap<u32, Foresight>,
 }
 
-/// What is sent ahead of a tool's way, and what is rendered by it.
+/// The local models of one tool, and the deadband that follows how the client renders them.
 #[derive(Debug)]
 struct Foresight {
     modeller: Modeller,
@@ -121,15 +127,15 @@ struct Foresight {
 }
 
 impl Sampler {
-    /// For a session that steps at `rate_hz`.
+    /// A sampler for a session with `rate_hz` steps per second.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub fn new(sampling: Sampling, rate_hz: f64) -> Self {
         let heartbeat_steps = (sampling.heartbeat_s * rate_hz).round().max(1.0) as u64;
         Sampler { sampling, heartbeat_steps, told: None, foresight: BTreeMap::new() }
     }
 
-    /// The sample of the step that was just done, if the stream is to get it. `last`: it gets it anyhow, because for
-    /// now no other follows.
+    /// The sample of the last step, if the stream should get it. `last`: the stream gets it in any case, because no
+    /// other follows for now.
     pub fn pick(&mut self, session: &Session, last: bool) -> Option<Sample> {
         let (step, told) = (session.step_count(), self.told.as_ref());
         let is_told = told.is_some_and(|told| told.step == step && told.held == session.hold_reason().is_some());
@@ -159,14 +165,14 @@ impl Sampler {
         Some(sample)
     }
 
-    /// The local models of the tools that are led by their position, and whether the client is off by too much.
+    /// The local models of the position-controlled tools, and whether a client's force is off by too much.
     fn look_ahead(&mut self, sample: &Sample, law: &Arc<Law>) -> (Vec<(u32, LocalModel)>, bool) {
         let fraction = self.sampling.deadband.as_ref().and_then(|deadband| deadband.rendered_fraction);
         let (mut models, mut is_left) = (Vec::new(), false);
         for tool in &sample.tools {
             let Some(feel) = &tool.feel else {
                 self.foresight.remove(&tool.tool);
-                // What has no model can't be foretold.
+                // A client can't predict a tool without a model.
                 is_left |= fraction.is_some() && tool.contact.is_some();
                 continue;
             };
@@ -181,7 +187,7 @@ impl Sampler {
         (models, is_left)
     }
 
-    /// What computes the stiffness anew under each tool of whose stiffness the stream is told.
+    /// The stiffness computations for the tools whose stiffness the stream requests.
     pub fn refinements(&self, session: &Session) -> impl Iterator<Item = Refinement> {
         let wanted = self.foresight.iter().filter(|(_, foresight)| foresight.modeller.wants_refinement());
         wanted.filter_map(|(tool, foresight)| {
@@ -195,7 +201,7 @@ impl Sampler {
             return true;
         }
         match &self.sampling.deadband {
-            // What sleeps is still, but a command may have acted that changes nothing else.
+            // A sleeping tissue is still, but a command may have taken effect that changes nothing else.
             None => !asleep || told.tools != now.tools,
             Some(deadband) => {
                 let mut pairs = told.tools.iter().zip(&now.tools);
@@ -204,7 +210,7 @@ impl Sampler {
         }
     }
 
-    /// The next step after `step` whose sample the stream gets also if nothing changes from now on.
+    /// The next step after `step` whose sample the stream gets even if nothing changes from now on.
     pub fn next_due(&self, step: u64) -> u64 {
         let told = self.told.as_ref().filter(|told| told.awake_points == 0);
         let heartbeat = told.map_or(0, |told| told.step + self.heartbeat_steps);
@@ -248,7 +254,7 @@ mod tests {
         for (grasps, touch_stiffness, computed) in
             [(false, false, false), (false, true, true), (true, false, true), (true, true, true)]
         {
-            // In f32 the surface's normal is tilted by its last digits.
+            // In f32 the last digits tilt the surface's normal.
             let mut session = session(&["stepping.precision=f64"]);
             let tip = Tip { grasps, radius_m: 0.05, ..Tip::default() };
             let law = Arc::new(Law::of(session.model(), tip.radius_m));
@@ -260,7 +266,7 @@ mod tests {
                 tell(&mut session, step, Action::Lead { place_m, tip });
                 model = sampler.pick(&session, false).and_then(|sample| sample.tools[0].local);
                 let refinements: Vec<_> = sampler.refinements(&session).collect();
-                // A touch begins where the surface is met.
+                // A touch begins where the tool meets the surface.
                 let touches = session.tissue().surroundings(0).is_some();
                 assert_eq!(
                     refinements.len(),
@@ -281,7 +287,7 @@ mod tests {
         }
     }
 
-    /// Steps at which a stream gets a sample while nothing is told to the session.
+    /// Steps at which a stream gets a sample while the session gets no command.
     fn picked(session: &mut Session, sampler: &mut Sampler, steps: u64) -> Vec<u64> {
         let pick = |_| {
             session.advance(&mut Vec::new(), |_| {});
@@ -294,7 +300,7 @@ mod tests {
     fn what_is_still_is_told_by_heartbeats_at_multiples_of_n() {
         assert_eq!(picked(&mut session(&[]), &mut sampler(1, None), 50), [1, 21, 41]);
         assert_eq!(picked(&mut session(&[]), &mut sampler(15, None), 100), [15, 45, 75]);
-        // And it is foretold, so that the steps between can be skipped.
+        // `next_due` predicts it, so the steps between can be skipped.
         let (mut session, mut sampler) = (session(&[]), sampler(15, None));
         for due in [15, 45, 75] {
             assert_eq!(sampler.next_due(session.step_count()), due);
@@ -350,7 +356,7 @@ mod tests {
         for (told_n, now_n, left) in [(0.0, 0.09, false), (0.0, 0.11, true), (10.0, 10.9, false), (10.0, 11.2, true)] {
             assert_eq!(deadband.is_left(&tool(told_n), &tool(now_n)), left, "{told_n} N to {now_n} N");
         }
-        // An acknowledgement alone is not news; an end is.
+        // A new acknowledgement alone is not a change; an expired action is.
         let later = ToolSample { acknowledged_sequence: 2, ..tool(0.0) };
         assert!(!deadband.is_left(&tool(0.0), &later));
         assert!(deadband.is_left(&tool(0.0), &ToolSample { expired: true, ..tool(0.0) }));

@@ -1,4 +1,4 @@
-//! When steps are due. Time is an argument.
+//! The times at which steps are due. Time is an argument.
 
 /// Step `step` is due at `at_ns`, and each further one a period later.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -10,22 +10,22 @@ pub struct Schedule {
 
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 impl Schedule {
-    /// Step `step` is due at `at_ns`; `rate_hz` steps a second.
+    /// Creates a schedule: step `step` is due at `at_ns`, with `rate_hz` steps a second.
     pub fn new(step: u64, at_ns: u64, rate_hz: f64) -> Self {
         Schedule { step, at_ns: at_ns as f64, period_ns: 1e9 / rate_hz }
     }
 
-    /// Between two steps, ns.
+    /// Time between two steps, ns.
     pub fn period_ns(&self) -> f64 {
         self.period_ns
     }
 
-    /// When a step is due.
+    /// The time at which a step is due.
     pub fn due_ns(&self, step: u64) -> u64 {
         (self.at_ns + step.saturating_sub(self.step) as f64 * self.period_ns) as u64
     }
 
-    /// The first step that is due after `now_ns`: as many are done at that time by one who is never late.
+    /// The first step due after `now_ns`, which is the number of steps that a session on time has done.
     pub fn next_step(&self, now_ns: u64) -> u64 {
         let periods = (now_ns as f64 - self.at_ns) / self.period_ns;
         let mut step = self.step.saturating_add(periods.max(0.0) as u64);
@@ -39,7 +39,7 @@ impl Schedule {
         step
     }
 
-    /// All that is due comes later by so many periods.
+    /// Delays all steps by `periods` periods.
     pub fn delay(&mut self, periods: f64) {
         self.at_ns += periods * self.period_ns;
     }

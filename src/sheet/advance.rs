@@ -1,7 +1,7 @@
-//! The stage of a sweep that advances every point by a scheme, under the tools' forces.
+//! The stage of a sweep that advances every point by a scheme under the tools' forces.
 #![allow(unsafe_code)]
-// Iterators and closures over vectors are not always inlined, and then run without the instructions of their caller: ten
-// times slower.
+// The compiler does not always inline iterators and closures over vectors. They then run without the caller's
+// instructions, ten times slower.
 #![allow(clippy::needless_range_loop, clippy::manual_map)]
 
 use std::ops::Range;
@@ -23,11 +23,11 @@ pub(super) struct Advance<'a, T: Real, C> {
     /// The tools' forces, in rows `forced`.
     pub(super) pulls: &'a [Pull<'a, T>],
     pub(super) forced: Range<usize>,
-    /// 1 where a point moves, 0 where it is fixed; null if none is.
+    /// 1 where a point moves, 0 where it is fixed; null if every point moves.
     pub(super) free: *const T,
-    /// A block that sums up squares of increments: finite and small only if all are.
+    /// A block that sums the squares of increments: finite and small only if all of them are.
     pub(super) probe: *mut T,
-    /// One that sums up the work of the tools, for each of 16 columns apart: the same at every width.
+    /// A block that sums the work of the tools, kept apart for each of 16 columns: the same at every width.
     pub(super) work: *mut T,
 }
 
@@ -68,7 +68,7 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Advance<'_, T, C> {
 
     #[inline(always)]
     unsafe fn begin<V: Vector<Real = T>>(&self) -> [V; 2] {
-        // The stages of a substep add to one account, in the same order at every width.
+        // The stages of a substep add to one sum, in the same order at every width.
         // SAFETY: the caller's promise; a block is as long as the widest vector.
         unsafe { [V::of(T::default()), if V::LANES == BLOCK { V::load(self.work) } else { V::of(T::default()) }] }
     }
@@ -86,7 +86,7 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Advance<'_, T, C> {
 }
 
 impl<T: Real, C: Scheme<T>> Advance<'_, T, C> {
-    /// Advances a block, on which a tool's force acts or not.
+    /// Advances a block, with or without a tool's force.
     #[inline(always)]
     unsafe fn put<V: Vector<Real = T>, const DUTY: u8, const FORCED: bool>(
         &self,
@@ -102,7 +102,7 @@ impl<T: Real, C: Scheme<T>> Advance<'_, T, C> {
             debug_assert!(self.layout.holds(at, V::LANES) && V::LANES <= BLOCK);
             let column = at - row * stride;
             let free = if DUTY != ANY || self.free.is_null() { None } else { Some(V::load(self.free.add(at))) };
-            // A vector as wide as a block has each of its columns in a lane of its own.
+            // In a vector as wide as a block, each column has a lane of its own.
             let apart = V::LANES < BLOCK;
             let mut work = sums[1];
             let mut forces = None;
@@ -129,8 +129,8 @@ impl<T: Real, C: Scheme<T>> Advance<'_, T, C> {
                 if let Some(free) = free {
                     (x, d) = (x.mul(free), d.mul(free));
                 }
-                // A field decays without end, in time and towards the rim, and arithmetic on numbers below the normal range
-                // costs up to a hundred times as much. So what has a square there is 0.
+                // A field decays without end, in time and towards the edge, and arithmetic on subnormal numbers costs
+                // up to a hundred times as much. So values whose square is subnormal become 0.
                 if !C::CUTS {
                     (x, d) = (x.keep(x.counts()), d.keep(d.counts()));
                 }

@@ -1,15 +1,16 @@
-//! Surgical forces: how those of all tools act on the points.
+//! Surgical forces: how the forces of all tools act on the points.
 //!
-//! A scheme says at which moments of a substep it asks for a law, and with which weights that adds to its fields. A
-//! two-step scheme sees the substep's beginning only. Where the force jumps there, it must see the mean of the values
-//! just before and just after (as if the substep before had ended, and this one begun, with a half kick each): with
-//! the new value alone the error is first order, with the mean second. The others take the new value.
+//! A scheme says at which moments of a substep it evaluates a law, and with which weights the values add to its fields.
+//! A two-step scheme sees the substep's beginning only. Where the force jumps there, it must see the mean of the values
+//! just before and just after (as if the substep before had ended, and this one begun, with a half kick each): with the
+//! new value alone the error is first order, with the mean second. The other schemes take the new value.
 //!
 //! A force is a vector times a falloff over the points. The falloff is a table, made when a poke is placed, and only
-//! where it counts; the sweep multiplies. So a force that changes costs as little as one that stays, and only one that
-//! moves needs new tables.
+//! where it counts; the sweep multiplies. So a changing force costs as little as a constant one, and only a moving
+//! force needs new tables.
 #![allow(unsafe_code)]
-// Iterators over vectors are not always inlined, and then run without the instructions of their caller: ten times slower.
+// The compiler does not always inline iterators over vectors. They then run without the caller's instructions, ten
+// times slower.
 #![allow(clippy::needless_range_loop)]
 
 use std::ops::Range;
@@ -22,10 +23,10 @@ use super::model::{Model, Plan};
 use super::real::Real;
 use crate::scene::law::{ForceLaw, Moment, Poke};
 
-/// What a tool exerts.
+/// The force of a tool.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Push {
-    /// The same until another command.
+    /// Constant until the next command.
     Held(Poke),
     /// A law of time, exact within the step.
     Law(ForceLaw),
@@ -45,7 +46,7 @@ impl Push {
 struct Slot {
     push: Option<Push>,
     before: Option<Poke>,
-    /// What the tiles that sleep were last told of.
+    /// The force that the sleeping tiles were last compared with.
     told: Option<Poke>,
 }
 
@@ -58,7 +59,7 @@ pub(super) struct Touch {
 }
 
 impl Touch {
-    /// At most how much the force on any point of a rectangle changes, N; `sides`: its ends along x and along y, m.
+    /// Upper bound of the change of force on any point of a rectangle, N; `sides`: its ends along x and along y, m.
     pub(super) fn most_n(&self, sides: [[f64; 2]; 2]) -> f64 {
         let nearest = |poke: &Poke| {
             let away: [f64; 2] = std::array::from_fn(|axis| {
@@ -76,12 +77,12 @@ impl Touch {
         if !same_falloff(&Poke { centre_m: new.centre_m, ..*old }, new) {
             return both;
         }
-        // A centre that moves changes the exponent by c times as much at most.
+        // A moving centre changes the exponent by at most the falloff times the distance.
         let moved = new.falloff_per_m * old.centre_m.distance(new.centre_m);
         both.min((new.force_n - old.force_n).length() * q + old.force_n.length() * moved * p.max(q))
     }
 
-    /// The points that the old force reaches, and the new one: along x and along y.
+    /// The points that the old force reaches, and those that the new one reaches: along x and along y.
     pub(super) fn reached(&self) -> [[Range<usize>; 2]; 2] {
         self.reached.map(|sides| sides.map(|[from, to]| from..to))
     }
@@ -96,18 +97,18 @@ impl Touch {
 #[derive(Debug, Clone)]
 pub(super) struct Applied<T: Real> {
     slots: Vec<Slot>,
-    /// What acts in the substep under way.
+    /// The terms that act in the present substep.
     pub(super) terms: Vec<Term<T>>,
-    /// The same before it has tables: kept, so that a step allocates nothing.
+    /// The terms before they have tables. Kept, so that a step allocates nothing.
     wanted: Vec<Wanted>,
-    /// The terms hold for the coming steps as well.
+    /// Whether the terms hold for the coming steps as well.
     settled: bool,
 }
 
-/// Forces of the same falloff: of each of the scheme's fields a weighted sum, N.
+/// Forces of equal falloff: for each of the scheme's fields a weighted sum, N.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Wanted {
-    /// Its force does not matter.
+    /// Defines the falloff; its force is not used.
     poke: Poke,
     forces_n: [DVec3; 3],
 }
@@ -118,29 +119,29 @@ pub(super) struct Term<T: Real> {
     wanted: Wanted,
     /// e^{c′}.
     gain: f64,
-    /// Of each of the scheme's fields, in its terms.
+    /// For each of the scheme's fields, in its terms.
     forces: [[T; 3]; 3],
-    /// Where it counts.
+    /// The rows where the force counts.
     rows: Range<usize>,
     columns: Range<usize>,
-    /// Of each of those rows, the columns, in whole blocks.
+    /// The columns in each of those rows, in whole blocks.
     spans: Vec<Range<usize>>,
-    /// e^{−c·r} of those rows, each as long as a row of the sheet; 0 elsewhere.
+    /// e^{−c·r} for those rows, each as long as a row of the sheet; 0 elsewhere.
     factors: Field<T>,
 }
 
-/// Whether two pokes differ in the force alone.
+/// Whether two pokes differ only in the force.
 fn same_falloff(a: &Poke, b: &Poke) -> bool {
     Poke { force_n: b.force_n, ..*a } == *b
 }
 
-/// The points that a force reaches, along x and along y: beyond them its factor is 0.
+/// The points that a force reaches, along x and along y. Beyond them its factor is 0.
 fn reached<T: Real>(poke: &Poke, model: &Model) -> [[usize; 2]; 2] {
     let spacing_m = model.scene.sheet.spacing_m;
     let reach_m = -T::NEGLIGIBLE_EXPONENT / poke.falloff_per_m;
     std::array::from_fn(|axis| {
         let (centre_m, points) = (poke.centre_m[axis], model.points[axis]);
-        // Saturating casts: a reach without end covers the whole sheet.
+        // Saturating casts: an infinite reach covers the whole sheet.
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
         let [from, to] = [((centre_m - reach_m) / spacing_m).ceil(), ((centre_m + reach_m) / spacing_m).floor() + 1.0]
             .map(|edge| (edge.max(0.0) as usize).min(points));
@@ -162,11 +163,11 @@ impl<T: Real> Term<T> {
         }
     }
 
-    /// Puts the falloff of `poke` into the table.
+    /// Writes the falloff of `poke` to the table.
     fn place(&mut self, poke: &Poke, model: &Model, layout: &Layout) {
         let spacing_m = model.scene.sheet.spacing_m;
         [self.rows, self.columns] = reached::<T>(poke, model).map(|[from, to]| from..to);
-        // The same bits on every machine: not the platform's exponential.
+        // `libm` gives the same bits on every machine; the platform's exponential does not.
         self.gain = libm::exp(poke.falloff_offset);
         self.factors.resize(self.rows.len() * layout.stride);
         let falloff = Falloff {
@@ -220,7 +221,7 @@ impl<T: Real> Run<T> for Falloff<T> {
             let slope = V::of(T::of(-self.per_spacing));
             let farthest = V::of(T::of(-T::NEGLIGIBLE_EXPONENT));
             let [_, centre] = self.centre;
-            // Column numbers and what is whole of the centre are exact in any format; only the rest is rounded.
+            // Column numbers and the integer part of the centre are exact in any format; only the fraction is rounded.
             let (whole, rest) = (V::of(T::of(centre.floor())), V::of(T::of(centre - centre.floor())));
             for i in self.rows.clone() {
                 let x = T::of(i as f64 - self.centre[0]);
@@ -232,7 +233,7 @@ impl<T: Real> Run<T> for Falloff<T> {
                         let exponent = slope.mul(y.mul_add(y, x).root());
                         let far = exponent.beyond(farthest);
                         factor = V::select(far, zero, exponential(exponent)).keep(zero.first(self.columns.end - at));
-                        // Where the reach ends is known better than by this format.
+                        // The columns bound the reach more exactly than this format can.
                         factor = V::select(zero.first(self.columns.start.saturating_sub(at)), zero, factor);
                     }
                     debug_assert!(at + V::LANES <= self.stride);
@@ -243,12 +244,12 @@ impl<T: Real> Run<T> for Falloff<T> {
     }
 }
 
-/// e^x for x from [`Real::NEGLIGIBLE_EXPONENT`] to 0, within two units of the last place: 2^k·e^r, |r| ≤ ½ln 2. The same
-/// bits on every machine, unlike the platform's.
+/// e^x for x from [`Real::NEGLIGIBLE_EXPONENT`] to 0, within two units of the last place: 2^k·e^r, |r| ≤ ½ln 2. Unlike
+/// the platform's function, it has the same bits on every machine.
 #[inline(always)]
 fn exponential<V: Vector>(x: V) -> V {
     let of = |value: f64| x.splat(V::Real::of(value));
-    // Adding and taking off a number whose last digit is 1 rounds to whole numbers.
+    // Adding and subtracting a number whose last digit is 1 rounds to an integer.
     let unit = of(V::Real::UNIT);
     let k = x.mul_add(of(std::f64::consts::LOG2_E), unit).sub(unit);
     let [high, low] = V::Real::LN_2;
@@ -273,17 +274,17 @@ const INVERSE_FACTORIALS: [f64; 14] = {
     series
 };
 
-/// A term as a sweep sees it: pointers and numbers, nothing to check.
+/// A term in the form that a sweep uses: pointers and numbers that need no checks.
 #[derive(Clone, Copy)]
 pub(super) struct Pull<'a, T> {
     /// Where the factors of row 0 would be.
     factors: *const T,
     from: usize,
     to: usize,
-    /// Where the table begins and ends, to check by.
+    /// First and last place of the table, for debug checks.
     places: [usize; 2],
     spans: &'a [Range<usize>],
-    /// Of one field and, if there is another, the next.
+    /// Forces of one field and, if there is another, the next.
     forces: [[T; 3]; 2],
 }
 
@@ -295,7 +296,7 @@ impl<T: Real> Pull<'_, T> {
     /// The factors of a block of one of its rows.
     ///
     /// # Safety
-    /// The table is of the sheet that the block is of, and still there.
+    /// The table belongs to the same sheet as the block and is still alive.
     #[inline(always)]
     unsafe fn factor<V: Vector<Real = T>>(&self, at: usize) -> V {
         debug_assert!(self.places[0] <= at && at + V::LANES <= self.places[1]);
@@ -305,7 +306,7 @@ impl<T: Real> Pull<'_, T> {
 }
 
 impl<T: Real> Term<T> {
-    /// Its fields from `field` on.
+    /// The fields from `field` on.
     pub(super) fn pull(&self, field: usize, stride: usize) -> Pull<'_, T> {
         let factors = self.factors.as_ptr().wrapping_sub(self.rows.start * stride);
         let forces = [self.forces[field], self.forces[(field + 1).min(2)]];
@@ -320,7 +321,7 @@ impl<T: Real> Term<T> {
     }
 }
 
-/// Whether any force acts on a block of a row on which one does.
+/// Whether any force acts on a block of a row that has a force.
 #[inline(always)]
 pub(super) fn reaches<T>(pulls: &[Pull<'_, T>], row: usize, column: usize) -> bool {
     match pulls {
@@ -329,10 +330,10 @@ pub(super) fn reaches<T>(pulls: &[Pull<'_, T>], row: usize, column: usize) -> bo
     }
 }
 
-/// A force on a block of a row that it reaches, component by component: of `FIELDS` fields; if it is one, twice.
+/// The force of one term on a block that it reaches, by component, for `FIELDS` fields; a single field is given twice.
 ///
 /// # Safety
-/// The table is of the sheet that the block is of, and still there.
+/// The table belongs to the same sheet as the block and is still alive.
 #[inline(always)]
 pub(super) unsafe fn force_of<V: Vector, const FIELDS: usize>(pull: &Pull<'_, V::Real>, at: usize) -> [[V; 2]; 3] {
     // SAFETY: the caller's promise.
@@ -349,10 +350,10 @@ pub(super) unsafe fn force_of<V: Vector, const FIELDS: usize>(pull: &Pull<'_, V:
     forces
 }
 
-/// The forces of all tools on a block, component by component: of `FIELDS` fields; if it is one, twice.
+/// The forces of all terms on a block, by component, for `FIELDS` fields; a single field is given twice.
 ///
 /// # Safety
-/// The tables are of the sheet that the block is of, and still there.
+/// The tables belong to the same sheet as the block and are still alive.
 #[inline(always)]
 pub(super) unsafe fn force_on<V: Vector, const FIELDS: usize>(
     pulls: &[Pull<'_, V::Real>],
@@ -387,7 +388,7 @@ pub(super) unsafe fn force_on<V: Vector, const FIELDS: usize>(
     sum
 }
 
-/// Rows on which any force acts.
+/// The rows on which any force acts.
 pub(super) fn rows<T: Real>(terms: &[Term<T>]) -> Range<usize> {
     let rows = terms.iter().map(|term| term.rows.clone());
     rows.reduce(|a, b| a.start.min(b.start)..a.end.max(b.end)).unwrap_or(0..0)
@@ -406,7 +407,7 @@ impl<T: Real> Applied<T> {
         Applied { slots: Vec::new(), terms: Vec::new(), wanted: Vec::new(), settled: true }
     }
 
-    /// What the tools do, out of a sheet of either format.
+    /// The same forces, taken from a sheet of either format.
     pub(super) fn like<S: Real>(other: &Applied<S>) -> Self {
         Applied { slots: other.slots.clone(), settled: false, ..Applied::new() }
     }
@@ -420,12 +421,12 @@ impl<T: Real> Applied<T> {
         self.settled = false;
     }
 
-    /// Whether nothing changes until a tool is told something else.
+    /// Whether the forces stay constant until a tool gets another command.
     pub(super) fn is_settled(&self) -> bool {
         self.settled
     }
 
-    /// Changes of force since the last call, up to the end of step `step`.
+    /// The changes of force since the last call, up to the end of step `step`.
     pub(super) fn changes(&mut self, model: &Model, step: u64) -> impl Iterator<Item = Touch> {
         let end = Moment { step, fraction: 1.0 };
         let change = move |slot: &mut Slot| {
@@ -438,7 +439,7 @@ impl<T: Real> Applied<T> {
         self.slots[..slots].iter_mut().filter_map(change)
     }
 
-    /// Brings the forces to the substep that begins at `moment` and takes `share` of the step.
+    /// Updates the forces for the substep that begins at `moment` and takes `share` of the step.
     pub(super) fn prepare(&mut self, model: &Model, plan: &Plan, layout: &Layout, moment: Moment, share: f64) {
         if self.settled {
             return;
@@ -452,7 +453,7 @@ impl<T: Real> Applied<T> {
                 (Some(before), Some(Push::Held(poke))) => before == poke,
                 _ => false,
             };
-            // Of one tool, what differs in the force alone is one.
+            // Forces of one tool that differ only in the vector are merged.
             let own = self.wanted.len();
             let mut add = |weights: [f64; 3], poke: Option<Poke>| {
                 let Some(poke) = poke.filter(|poke| poke.force_n != DVec3::ZERO) else { return };
@@ -480,7 +481,8 @@ impl<T: Real> Applied<T> {
         }
     }
 
-    /// Makes `terms` what is wanted. A table whose falloff is wanted again stays, the memory of others is used again.
+    /// Makes `terms` equal `wanted`. Keeps each table whose falloff is wanted again and reuses the memory of the
+    /// others.
     fn put(&mut self, model: &Model, layout: &Layout, scale: f64) {
         for place in 0..self.wanted.len() {
             let wanted = self.wanted[place];
@@ -501,7 +503,7 @@ impl<T: Real> Applied<T> {
         self.terms.truncate(self.wanted.len());
     }
 
-    /// What acts at the end of the last step, in the scale of a scheme, as a field of its own.
+    /// The forces at the end of the last step, in the scale of a scheme, as a field of its own.
     pub(super) fn until_now(&self, model: &Model, layout: &Layout, scale: f64) -> Vec<Term<T>> {
         let pokes = self.slots.iter().filter_map(|slot| slot.before).filter(|poke| poke.force_n != DVec3::ZERO);
         let term = |poke: Poke| {
@@ -513,7 +515,7 @@ impl<T: Real> Applied<T> {
         pokes.map(term).collect()
     }
 
-    /// Of a field, what the substep under way adds at a point.
+    /// The force that the present substep adds to a point in one field.
     pub(super) fn force_at(&self, layout: &Layout, field: usize, point: [usize; 2]) -> [f64; 3] {
         let mut sum = [0.0; 3];
         for term in &self.terms {
@@ -523,13 +525,13 @@ impl<T: Real> Applied<T> {
         sum
     }
 
-    /// Forgets what acts, and in which scale.
+    /// Forgets the terms and their scale.
     pub(super) fn forget(&mut self) {
         self.terms.clear();
         self.settled = false;
     }
 
-    /// Ends a step: what acts now is what will have acted before the next.
+    /// Ends a step: the present force becomes the force before the next step.
     pub(super) fn finish(&mut self, model: &Model, step: u64) {
         let end = Moment { step, fraction: 1.0 };
         for slot in &mut self.slots {
@@ -537,7 +539,7 @@ impl<T: Real> Applied<T> {
         }
     }
 
-    /// The force on a point from a moment on.
+    /// The force on a point just after a moment.
     pub(super) fn from(&self, model: &Model, index: usize, moment: Moment) -> DVec3 {
         let rate_hz = model.scene.stepping.rate_hz;
         let pokes = self.slots.iter().filter_map(|slot| slot.push.as_ref().map(|push| push.at(moment, rate_hz)));
@@ -573,7 +575,7 @@ mod tests {
         factors.into_iter().map(Real::wide).collect()
     }
 
-    /// Where the reach ends between two lanes, one width must not see farther than another.
+    /// A reach that ends between two lanes must end at the same point for every width.
     #[test]
     fn a_falloff_has_the_same_bits_at_every_width_wherever_it_ends() {
         let mut nonzero = 0;
@@ -588,7 +590,7 @@ mod tests {
             }
         }
         assert!(nonzero > 4000 * 20, "{nonzero}");
-        // A point at the very end of the reach: f32 may take it for inside.
+        // Skip a point at the very end of the reach: f32 may count it as inside.
         for at in 0..24 {
             let centre = f64::from(at) + 22.0 / 1.7 + 1e-9;
             assert_eq!(factors::<f32>(Lanes::Plain, centre), factors::<f32>(Lanes::Auto, centre), "centre {centre}");

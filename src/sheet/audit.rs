@@ -1,15 +1,15 @@
-//! The audit: a window of steps is done again in f64 with a quarter of the substep, and the two ends are compared.
+//! The audit: it repeats a window of steps in f64 with a quarter of the substep and compares the two results.
 //!
-//! The sheet marks where a window begins and where it ends. Both are checkpoints of the guard, which are shared for this,
-//! not copied. Between them the sheet writes down what the tools were told. What takes time happens to copies, in any
-//! thread: [`Look::open`] copies the beginning and gives the checkpoint back, [`Opening::close`] does the same with the end,
-//! and [`Audit::work`] repeats the window in slices.
+//! The sheet marks where a window begins and ends. Both are checkpoints of the guard, which are shared for this, not
+//! copied. Between them the sheet records its tools' inputs. The slow work happens on copies, in any thread:
+//! [`Look::open`] copies the beginning and releases the checkpoint, [`Opening::close`] does the same with the end, and
+//! [`Audit::work`] repeats the window in slices.
 //!
-//! The result is the error that the window added. Two errors stay unseen: that of the state in which the window began, and
-//! what the twin shares with the sheet, which for a scheme of order p is 4^−p of the error.
+//! The result is the error that the window added. Two errors stay unseen: that of the state in which the window began,
+//! and the error that the twin shares with the sheet, which for a scheme of order p is 4^−p of the error.
 //!
-//! An error is relative to the largest displacement and force of the window, or of earlier windows if those were larger:
-//! in a sheet that comes to rest, what is left of a poke is measured by the poke.
+//! An error is relative to the largest displacement and force of the window, or of earlier windows if those were
+//! larger: in a sheet that comes to rest, what is left of a poke is measured relative to the poke.
 
 use std::sync::Arc;
 
@@ -25,19 +25,19 @@ use super::{Sheet, Tissue, springs_of};
 use crate::scene::Precision;
 pub use crate::scene::record::AuditedError;
 
-/// The twin's substep is this part of the sheet's.
+/// The twin's substep is 1/`FINER` of the sheet's.
 pub const FINER: u32 = 4;
 
 /// Longest window, s, before it is rounded up to the next checkpoint.
 const LONGEST_S: f64 = 0.25;
 
-/// Inputs that a window may have; with more it ends without a result.
+/// Most inputs in a window. With more it ends without a result.
 const MOST_INPUTS: usize = 4096;
 
-/// Points times substeps of a slice of an audit: some milliseconds.
+/// Points times substeps in a slice of an audit: some milliseconds.
 const SLICE: u64 = 1 << 20;
 
-/// What most of an error comes from.
+/// The main source of an error.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Origin {
     /// The scheme with this substep.
@@ -49,7 +49,7 @@ pub enum Origin {
 }
 
 impl Origin {
-    /// In words.
+    /// A description for messages.
     pub fn describe(self) -> &'static str {
         match self {
             Origin::Substep => "the length of the substep",
@@ -59,32 +59,32 @@ impl Origin {
     }
 }
 
-/// What an audit of a window found.
+/// The result of an audit of a window.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Finding {
     /// Steps done at the end of the window.
     pub step: u64,
     /// The error that the window added.
     pub error: AuditedError,
-    /// Where it comes from, if it is above the tolerance of the scene.
+    /// The main source of the error, if it is above the scene's tolerance.
     pub origin: Option<Origin>,
-    /// Substeps a step in the window, after what the guard has halved.
+    /// Substeps per step in the window, after the guard's halvings.
     pub substeps: u32,
-    /// The largest of this and earlier windows, by which the next one's error is measured.
+    /// The largest extent of this and earlier windows, to which the next window's error is relative.
     pub largest: Extent,
 }
 
 /// Largest components over the points of a sheet.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Extent {
-    /// Of displacements, m.
+    /// Displacements, m.
     pub displacement_m: f64,
-    /// Of the tissue's forces on tools, N.
+    /// Forces of the tissue on tools, N.
     pub force_n: f64,
 }
 
 impl Extent {
-    /// The larger of each.
+    /// The larger of each component.
     pub fn max(self, other: Self) -> Self {
         Extent {
             displacement_m: self.displacement_m.max(other.displacement_m),
@@ -104,8 +104,8 @@ impl Extent {
     }
 }
 
-/// What the tools were told in a window: before which step, which tool. It has its room from the beginning, so that the
-/// sheet need not make any.
+/// The tools' inputs in a window: step they precede, tool, input. Its memory is allocated at the beginning, so that the
+/// sheet need not allocate.
 #[derive(Debug)]
 pub struct Inputs(Vec<(u64, usize, Input)>);
 
@@ -115,43 +115,44 @@ impl Default for Inputs {
     }
 }
 
-/// What a sheet tells of the window that it was asked for.
+/// What a sheet reports about the requested window.
 #[derive(Debug)]
 pub enum Mark {
-    /// It begins.
+    /// The window has begun.
     Begin(Look),
-    /// It is over.
+    /// The window has ended.
     End(Look, Inputs),
-    /// It can't be audited: the guard went back, the tissue changed, all came to rest, or too much was told to the tools.
+    /// The window can't be audited: the guard went back, the tissue changed, everything came to rest, or there were too
+    /// many inputs.
     Dropped,
 }
 
-/// A sheet as it was at a checkpoint, shared with the sheet.
+/// A sheet's state at a checkpoint, shared with the sheet.
 #[derive(Debug)]
 pub struct Look {
     model: Arc<Model>,
     checkpoint: SharedCheckpoint,
 }
 
-/// In either format.
+/// A checkpoint in either format.
 #[derive(Debug)]
 pub(super) enum SharedCheckpoint {
     Single(Arc<Checkpoint<f32>>),
     Double(Arc<Checkpoint<f64>>),
 }
 
-/// The beginning of a window, copied.
+/// A copy of a window's beginning.
 #[derive(Debug)]
 pub struct Opening(Copy);
 
-/// A sheet that is done with being shared. Nothing of it sleeps.
+/// A sheet copied from a shared checkpoint. None of it sleeps.
 #[derive(Debug)]
 enum Copy {
     Single(Box<Sheet<f32>>),
     Double(Box<Sheet<f64>>),
 }
 
-/// A window that is over: all that it takes to do it again.
+/// A complete window: everything needed to repeat it.
 #[derive(Debug)]
 pub struct Audit {
     begin: Copy,
@@ -160,7 +161,7 @@ pub struct Audit {
     until: u64,
 }
 
-/// What is compared: of every point the displacement, m, and the tissue's force on a tool, N.
+/// The compared values: for each point the displacement, m, and the tissue's force on a tool, N.
 #[derive(Debug)]
 struct Observed(Vec<[DVec3; 2]>);
 
@@ -186,24 +187,24 @@ impl Observed {
     }
 }
 
-/// How far a sheet is with a window that it was asked for.
+/// How far a sheet is with a requested window.
 #[derive(Debug, Default)]
 pub(super) enum Watch {
-    /// Nobody has asked.
+    /// No window is requested.
     #[default]
     Off,
-    /// It begins at the next checkpoint.
+    /// The window begins at the next checkpoint.
     Wanted(Inputs),
-    /// It ends at the first checkpoint from this step on.
+    /// The window ends at the first checkpoint from this step on.
     Open(u64, Inputs),
-    /// Its end is to be told.
+    /// The end is still to be reported.
     Closed(Inputs),
-    /// It is to be told that there is no result.
+    /// The failure is still to be reported.
     Dropped,
 }
 
 impl Watch {
-    /// A tool is told something.
+    /// Records an input of a tool.
     pub(super) fn input(&mut self, step: u64, tool: usize, input: &Input) {
         let Watch::Open(_, inputs) = self else { return };
         if inputs.0.len() < MOST_INPUTS {
@@ -213,7 +214,7 @@ impl Watch {
         }
     }
 
-    /// Something happened that a twin can't repeat.
+    /// Drops the window after an event that a twin can't repeat.
     pub(super) fn give_up(&mut self) {
         if matches!(self, Watch::Open(..) | Watch::Closed(_)) {
             *self = Watch::Dropped;
@@ -222,7 +223,7 @@ impl Watch {
 }
 
 impl Model {
-    /// The same tissue in another format with `by` times the substeps, and nothing sleeps.
+    /// The same tissue in another format, with `by` times the substeps and without sleep.
     pub fn twin(&self, by: u32, precision: Precision) -> Arc<Self> {
         let mut model = self.clone();
         model.plan = self.plan.divided(&self.scene, by);
@@ -231,10 +232,10 @@ impl Model {
         Arc::new(model)
     }
 
-    /// Steps of a window: until the slowest vibration has lost half its amplitude, at most [`LONGEST_S`] s.
+    /// Steps in a window: until the slowest vibration has lost half its amplitude, at most [`LONGEST_S`] s.
     ///
-    /// The amplitude of m·ü + C·u̇ + K·u = 0 falls as e^(−γt), γ = C/2m, or in the overdamped case
-    /// γ = (C − √(C² − 4mK))/2m of the slower part. K is that of the virtual springs alone: the slowest vibration of a
+    /// The amplitude of m·ü + C·u̇ + K·u = 0 falls as e^(−γt), with γ = C/2m, or in the overdamped case
+    /// γ = (C − √(C² − 4mK))/2m for the slower part. K is that of the virtual springs alone: the slowest vibration of a
     /// sheet bends it least.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub fn window_steps(&self) -> u64 {
@@ -249,20 +250,20 @@ impl Model {
 }
 
 impl<T: Real> Sheet<T> {
-    /// Asks for a window: it begins at the next checkpoint.
+    /// Requests a window, which begins at the next checkpoint.
     pub(super) fn watch(&mut self, mut inputs: Inputs) {
         inputs.0.clear();
         (self.watch, self.is_marked) = (Watch::Wanted(inputs), false);
     }
 
-    /// There is a new checkpoint, at which a window may begin or end.
+    /// Handles a new checkpoint, at which a window may begin or end.
     pub(super) fn mark(&mut self) {
         self.watch = match std::mem::take(&mut self.watch) {
             Watch::Wanted(inputs) => {
                 self.is_marked = true;
                 Watch::Open(self.steps + self.model.window_steps(), inputs)
             }
-            // The beginning was not told yet, and that checkpoint is gone.
+            // The beginning has not been reported yet, and its checkpoint is gone.
             Watch::Open(_, mut inputs) if self.is_marked => {
                 inputs.0.clear();
                 Watch::Open(self.steps + self.model.window_steps(), inputs)
@@ -273,7 +274,7 @@ impl<T: Real> Sheet<T> {
         };
     }
 
-    /// What there is to tell of the window, once.
+    /// Takes the report on the window, once.
     pub(super) fn take_mark(&mut self) -> Option<Mark> {
         let look = |sheet: &Self| {
             let checkpoint = sheet.checkpoint.clone()?;
@@ -294,7 +295,7 @@ impl<T: Real> Sheet<T> {
         }
     }
 
-    /// A sheet as it was at a checkpoint of one with `model`.
+    /// A sheet in the state of a checkpoint of a sheet with `model`.
     fn resumed(model: &Model, checkpoint: &Checkpoint<T>) -> Box<Self> {
         let mut sheet = Box::new(Sheet::new(&model.twin(1 << checkpoint.halvings, model.precision)));
         sheet.steps = checkpoint.steps;
@@ -306,7 +307,7 @@ impl<T: Real> Sheet<T> {
         sheet
     }
 
-    /// The same state in f64. `model` is this one's, but for the format and what may sleep.
+    /// The same state in f64. `model` differs from this sheet's only in the format and in what may sleep.
     pub(super) fn widened(&self, model: &Arc<Model>) -> Sheet<f64> {
         let mut sheet = Sheet::<f64>::new(model);
         sheet.steps = self.steps;
@@ -319,7 +320,7 @@ impl<T: Real> Sheet<T> {
             for index in 0..self.model.len() {
                 for c in 0..3 {
                     let at = c * from.plane + from.place(index);
-                    // What a compensated displacement has lost belongs to it.
+                    // The rounding loss of a compensated displacement belongs to it.
                     let lost = lost.filter(|_| number == 0).map_or(0.0, |lost| lost[at].wide());
                     wide[c * to.plane + to.place(index)] = narrow[at].wide() + lost;
                 }
@@ -331,7 +332,7 @@ impl<T: Real> Sheet<T> {
         sheet
     }
 
-    /// The same sheet under `model`, if that is in f64 and this is not.
+    /// The same sheet under `model`, if that is in f64 and this one is not.
     pub(super) fn changed(&self, model: &Arc<Model>) -> Option<Box<Sheet<f64>>> {
         if self.model.precision == Precision::F64 || model.precision != Precision::F64 {
             return None;
@@ -349,10 +350,10 @@ impl<T: Real> Sheet<T> {
         Some(sheet)
     }
 
-    /// Goes on with another substep of the same scheme. The tissue stays, and all that the scheme keeps of its past.
+    /// Continues with another substep of the same scheme. The tissue and the scheme's history stay.
     pub(super) fn resample(&mut self, model: &Arc<Model>) {
         let (was, plan) = (self.plan.clone(), model.plan.clone());
-        // What acts now, as an acceleration; the scheme's own terms may be the mean of both sides of a jump.
+        // The present force as an acceleration; the scheme's own terms may be the mean of both sides of a jump.
         self.applied.terms = self.present_terms();
         let springs = springs_of(&self.model, &was);
         convert(&self.bench.layout, &springs, &was, &plan, &self.applied, &mut self.state);
@@ -362,7 +363,7 @@ impl<T: Real> Sheet<T> {
         self.plan = plan;
     }
 
-    /// What is compared.
+    /// The values to compare.
     fn observed(&self) -> Observed {
         let points = (0..self.model.len()).map(|index| {
             let point = self.point(index);
@@ -371,7 +372,8 @@ impl<T: Real> Sheet<T> {
         Observed(points.collect())
     }
 
-    /// Repeats what the tools were told, to `until`, in slices. `go_on` is asked between them; false if it said no.
+    /// Repeats the recorded inputs up to step `until`, in slices. Calls `go_on` between slices; returns false if that
+    /// did.
     fn repeat(&mut self, inputs: &Inputs, until: u64, go_on: &mut dyn FnMut() -> bool) -> bool {
         let work = self.model.len() as u64 * u64::from(self.plan.substeps);
         let slice = (SLICE / work).max(1);
@@ -395,7 +397,7 @@ impl Look {
         &self.model
     }
 
-    /// Copies it, and gives back what was shared.
+    /// Copies the beginning and releases the shared checkpoint.
     pub fn open(self) -> Opening {
         Opening(match &self.checkpoint {
             SharedCheckpoint::Single(checkpoint) => Copy::Single(Sheet::resumed(&self.model, checkpoint)),
@@ -419,7 +421,7 @@ impl Copy {
         }
     }
 
-    /// In f64, with a part of the substep.
+    /// A twin in f64 with 1/`by` of the substep.
     fn twin(&self, by: u32) -> Sheet<f64> {
         let wide = match self {
             Copy::Single(sheet) => sheet.widened(&sheet.model.twin(1, Precision::F64)),
@@ -434,7 +436,8 @@ impl Copy {
         wide
     }
 
-    /// Extents at least as large as what sleep is measured by: the largest displacement of late, and a force in proportion.
+    /// An extent at least as large as the one that sleep is relative to: the recent largest displacement, and a force
+    /// in proportion.
     fn since_rest(&self, extent: Extent) -> Extent {
         let largest = match self {
             Copy::Single(sheet) => sheet.tiles.largest,
@@ -454,7 +457,7 @@ impl Copy {
 }
 
 impl Opening {
-    /// The window ended at `end`: gives back what of that was shared.
+    /// Ends the window at `end` and releases its shared checkpoint.
     pub fn close(self, end: Look, inputs: Inputs) -> Audit {
         let Opening(end) = end.open();
         Audit { begin: self.0, inputs, end: end.observed(), until: end.steps() }
@@ -462,8 +465,9 @@ impl Opening {
 }
 
 impl Audit {
-    /// Repeats the window with `finer` times the substeps ([`FINER`]). `largest` is what earlier windows told; `go_on` is
-    /// asked between slices of some milliseconds. `None` if it said no, if nothing moved, or if the twin left the numbers.
+    /// Repeats the window with `finer` times the substeps ([`FINER`]). `largest` is the result of earlier windows;
+    /// `go_on` is called between slices of some milliseconds. `None` if it returned false, if nothing moved, or if the
+    /// twin did not stay finite.
     pub fn work(self, finer: u32, largest: Extent, go_on: &mut dyn FnMut() -> bool) -> Option<Finding> {
         let Audit { begin, inputs, end, until } = self;
         let first = begin.observed();
@@ -471,7 +475,7 @@ impl Audit {
             return None;
         }
         let mut twin = begin.twin(finer);
-        // Something may have come and gone within the window.
+        // A movement may begin and end within the window.
         let middle = begin.steps().midpoint(until);
         if !twin.repeat(&inputs, middle, go_on) {
             return None;
@@ -494,7 +498,7 @@ impl Audit {
         if found.largest() <= tolerance {
             return Some(finding);
         }
-        // From the sheet to the twin, one change at a time: awake, in f64, with the shorter substep.
+        // From the sheet to the twin, one change at a time: awake, then f64, then the shorter substep.
         let mut wide = begin.twin(1);
         let (woken, same) = match begin {
             Copy::Single(mut sheet) => (sheet.repeat(&inputs, until, go_on), sheet.observed()),

@@ -1,8 +1,9 @@
-//! Another tissue under way: between two steps springs, virtual springs and damping become those of another model.
+//! A change of tissue under way: between two steps, springs, virtual springs and damping become those of another model.
 //!
-//! Displacements and velocities stay. What a scheme keeps beside belongs to the old springs, and is made anew as if the
-//! new ones had always pulled as they do now: constant forces for a past, so that nothing jumps. Energy does: that of the
-//! springs is another. So the guard's account begins anew, and what it goes back to is the state just after the change.
+//! Displacements and velocities stay. The scheme's kept values belong to the old springs and are rebuilt as if the new
+//! springs had always pulled as they do now: a constant force history, so nothing jumps. The energy does jump, because
+//! the new springs store another energy. So the guard's account begins anew, and its checkpoint becomes the state just
+//! after the change.
 
 use std::sync::Arc;
 
@@ -14,13 +15,13 @@ use super::{Sheet, Work, central, exponential, rest, rk4, springs_of};
 use crate::scene::Precision;
 
 impl<T: Real> Sheet<T> {
-    /// From the coming step on: `model` has the same points and number format.
+    /// From the coming step on, uses `model`, which has the same points and number format.
     pub(super) fn change(&mut self, model: &Arc<Model>) {
         self.tiles.begin_anew(rest::tolerance(model));
         self.watch.give_up();
         if self.is_same_tissue(model) {
             self.resample(model);
-            // Nothing was lost before there was room for it.
+            // A newly allocated rounding loss begins at 0.
             let layout = self.bench.layout;
             let kept = self.plan.scheme.kept(model.precision == Precision::Compensated);
             self.state.kept.resize_with(kept, || Arc::new(Field::zero(&layout)));
@@ -37,7 +38,7 @@ impl<T: Real> Sheet<T> {
         self.take_checkpoint();
     }
 
-    /// Whether `model` has the same springs, damping and scheme: then what the scheme keeps of the past is as good as before.
+    /// Whether `model` has the same springs, damping and scheme, so that the kept history stays valid.
     fn is_same_tissue(&self, model: &Model) -> bool {
         let tissue = |model: &Model| {
             let scene = &model.scene;
@@ -47,7 +48,7 @@ impl<T: Real> Sheet<T> {
         tissue(&self.model) == tissue(model)
     }
 
-    /// Other springs, or another scheme.
+    /// Exchanges the springs or the scheme.
     fn exchange(&mut self, model: &Arc<Model>) {
         self.write(Write::Seen);
         let ratio = T::of(model.plan.substep_s / self.plan.substep_s);
@@ -61,7 +62,7 @@ impl<T: Real> Sheet<T> {
         self.state.kept = State::at_rest(&layout, kept).kept;
         self.applied.forget();
         let spacing_m = model.scene.sheet.spacing_m;
-        // What a scheme would make of a grasped point is not what is seen of it.
+        // The scheme does not produce the visible motion of a grasped point, so restore it.
         for (index, motion) in self.prescribed.grasped() {
             for c in 0..3 {
                 let at = c * layout.plane + layout.place(index);
@@ -72,7 +73,7 @@ impl<T: Real> Sheet<T> {
         self.write(Write::Begin);
     }
 
-    /// Writes all of the state anew.
+    /// Rewrites the whole state.
     fn write(&mut self, write: Write) {
         let terms = self.present_terms();
         let Sheet { plan, bench, state, tiles, .. } = self;

@@ -1,24 +1,24 @@
-//! Tools that are led by their position and have a finite size: a touch, which only pushes, and a grasp, which holds.
+//! Position-controlled tools of finite size: a touch, which only pushes, and a grasp, which holds.
 //!
-//! A tool meets the sheet with a disc (`footprint`), whose place s(c) = Σ w·x follows from the material place c that is
-//! under the tool. In each substep the sheet first moves under the force F₀ of the last. Then the force F is found that
-//! takes s to where the tool is (or, coupled by a spring, that the spring then has); the difference is given as a blow at
-//! the substep's beginning. That changes s by A·(F − F₀), A = Σ w²·dt²/m and the scheme's damping, so this is a division
-//! and no iteration, and stable however stiff the coupling:
+//! A tool meets the sheet with a disc (`footprint`), whose place s(c) = Σ w·x follows from the material place c under
+//! the tool. In each substep the sheet first moves under the force F₀ of the last. Then the step finds the force F that
+//! takes s to the tool (or, with a spring as coupling, the force that the spring then has); the difference is applied
+//! as an impulse at the substep's beginning. That changes s by A·(F − F₀), where A follows from Σ w²·dt²/m and the
+//! scheme's damping. So this is a division, not an iteration, and stable however stiff the coupling:
 //!
-//! gap g = x_tool − s + A·F₀,  F = (Kc·g + Bc·(v_tool − ṡ))/(1 + A·(Kc + Bc/dt)),  a constraint: F = g/A.
+//! gap g = x_tool − s + A·F₀,  F = (Kc·g + Bc·(v_tool − ṡ))/(1 + A·(Kc + Bc/dt)),  for a constraint F = g/A.
 //!
-//! (A steady force all along alone would ring: a mass that is to be at rest at the end of each substep swings within
-//! them for ever. A blow alone leaves a speed of half of it at each end. Of both, an error in F or speed is halved in each
+//! (A steady force alone would ring: a mass that must be at rest at the end of each substep oscillates within them for
+//! ever. An impulse alone leaves half of its speed at each end. With both, an error in F or in speed is halved in each
 //! substep.)
 //!
 //! A touch is unilateral: with n the outward normal of the surface under the disc, N = −F·n must be positive, or the
 //! tool is free; |F_t| may be at most μN, or the disc slides: F_t is shortened, and c follows the tool. With μ = 0 it
-//! follows always. So c is the proxy: where the tool is on the surface. n = ∂s/∂c_x × ∂s/∂c_y, which is the only
-//! choice whose work is what the sheet gets when the disc slides over a slope.
+//! always follows. So c is the proxy: the place of the tool on the surface. n = ∂s/∂c_x × ∂s/∂c_y is the only choice
+//! whose work equals what the sheet gets when the disc slides over a slope.
 //!
-//! What the tool feels of a constraint is the force of springs, virtual springs and damping on the disc,
-//! Σ w·f/Σ w²: F without the points' own inertia, which a hand would feel as knocks of each command.
+//! The force felt under a constraint is that of springs, virtual springs and damping on the disc, Σ w·f/Σ w²: F without
+//! the points' own inertia, which a hand would feel as a knock at each command.
 
 use std::sync::Arc;
 
@@ -32,7 +32,7 @@ use super::real::Real;
 use super::tangent::{Patch, Tangent, Window};
 use crate::scene::tip::{Coupling, Tip};
 
-/// How a tool stands to the sheet.
+/// The state of contact between a tool and the sheet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Standing {
     /// Not touching.
@@ -45,28 +45,28 @@ pub enum Standing {
     Holding,
 }
 
-/// What a tool does and feels at the end of a step.
+/// The motion of a tool and the force on it at the end of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Feel {
-    /// Where the tool is, m; z is up, out of the tissue.
+    /// Place of the tool, m; z points up, out of the tissue.
     pub place_m: DVec3,
-    /// How it moved in the last step, m/s.
+    /// Velocity in the last step, m/s.
     pub velocity_m_per_s: DVec3,
-    /// How it stands to the sheet.
+    /// The state of contact.
     pub standing: Standing,
-    /// Of the tissue on the tool, N.
+    /// Force of the tissue on the tool, N.
     pub force_on_tool_n: DVec3,
-    /// Where the surface is under the tool, m.
+    /// Place of the surface under the tool, m.
     pub surface_m: DVec3,
-    /// The material place of that, in the rest plane, m.
+    /// The material point there, in the rest plane, m.
     pub anchor_m: DVec2,
-    /// Out of the tissue, of length 1.
+    /// Unit normal out of the tissue.
     pub normal: DVec3,
-    /// μ, of the tool's tip.
+    /// μ of the tool's tip.
     pub friction: f64,
 }
 
-/// What the stiffness under a tool is computed from: a copy, for another thread.
+/// A copy of the data from which the stiffness under a tool is computed, for another thread.
 #[derive(Debug)]
 pub struct Surroundings {
     model: Arc<Model>,
@@ -76,7 +76,7 @@ pub struct Surroundings {
 }
 
 impl Surroundings {
-    /// Computes it: some milliseconds for a thousand points.
+    /// Computes the stiffness. Takes some milliseconds for a thousand points.
     pub fn tangent(self) -> Tangent {
         Patch::new(&self.model, &self.footprint, self.window, self.displacement_m).tangent()
     }
@@ -87,28 +87,28 @@ struct Tool {
     number: usize,
     tip: Tip,
     footprint: Footprint,
-    /// Where it is at the step's beginning and is to be at its end, m.
+    /// Place at the step's beginning and at its end, m.
     from_m: DVec3,
     to_m: DVec3,
     standing: Standing,
     normal: DVec3,
-    /// What a grasp keeps between the tool and the surface, m.
+    /// The offset that a grasp keeps between the tool and the surface, m.
     offset_m: DVec3,
-    /// On the sheet in the last substep, N.
+    /// Force on the sheet in the last substep, N.
     force_n: DVec3,
-    /// What of that goes on in the next: not the blow of meeting.
+    /// The part of that force that continues in the next substep, without the impulse of meeting.
     steady_n: DVec3,
     velocity_m_per_s: DVec3,
 }
 
-/// All tools that are led by their position.
+/// All position-controlled tools.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Contacts {
     tools: Vec<Tool>,
 }
 
 impl Contacts {
-    /// From the coming step on: the tool is at `to_m` at its end. A new tool begins there.
+    /// From the coming step on the tool is at `to_m` at the step's end. A new tool begins there.
     pub(super) fn lead(&mut self, model: &Model, number: usize, to_m: DVec3, tip: Tip) {
         if let Some(tool) = self.tools.iter_mut().find(|tool| tool.number == number) {
             if tool.tip.radius_m != tip.radius_m {
@@ -141,7 +141,7 @@ impl Contacts {
         self.tools.is_empty()
     }
 
-    /// The points under tools that touch or hold, some of them more than once.
+    /// The points under tools that touch or hold. Some occur more than once.
     pub(super) fn points(&self) -> impl Iterator<Item = [usize; 2]> {
         self.tools.iter().filter(|tool| tool.standing != Standing::Free).flat_map(Tool::points)
     }
@@ -159,14 +159,15 @@ impl Contacts {
     }
 }
 
-/// Where a point is, from rest, m: of a multistep scheme, as predicted.
+/// The displacement of a point from rest, m. For a multistep scheme, as predicted.
 fn displacement_m<T: Real>(model: &Model, layout: &Layout, state: &State<T>, [i, j]: [usize; 2]) -> DVec3 {
     let at = i * layout.stride + j;
     let component = |c: usize| state.u[c * layout.plane + at].wide() * model.scene.sheet.spacing_m;
     DVec3::new(component(0), component(1), component(2))
 }
 
-/// Adds to u and d of the disc's points what `force_n` makes of `[of_u, of_d]` (`Scheme::kick`, `Scheme::constant`).
+/// Adds to u and d of the disc's points the effect of `force_n` with `[of_u, of_d]` (`Scheme::kick`,
+/// `Scheme::constant`).
 fn push<T: Real>(
     model: &Model,
     plan: &Plan,
@@ -187,7 +188,7 @@ fn push<T: Real>(
     }
 }
 
-/// How the disc moves in a substep, Σ w·d, m.
+/// The movement of the disc in a substep, Σ w·d, m.
 fn movement_m<T: Real>(model: &Model, layout: &Layout, state: &State<T>, footprint: &Footprint) -> DVec3 {
     let mut moved = DVec3::ZERO;
     for Reached { point: [i, j], weight, .. } in footprint.reached().iter().copied() {
@@ -209,12 +210,12 @@ impl Tool {
         if fraction >= 1.0 { self.to_m } else { self.from_m.lerp(self.to_m, fraction) }
     }
 
-    /// Finds how the tool stands to the sheet, and the force that it exerts on it, N.
+    /// Finds the state of contact, and the force of the tool on the sheet, N.
     fn meet<T: Real>(&mut self, model: &Model, plan: &Plan, layout: &Layout, state: &State<T>, fraction: f64) -> DVec3 {
         let place_m = self.place_m(fraction);
         let displacement = |point| displacement_m(model, layout, state, point);
         if self.standing == Standing::Free {
-            // Where on the sheet the tool is: a contraction, as long as the sheet is not folded.
+            // Finds the tool's place on the sheet. A contraction, as long as the sheet is not folded.
             for _ in 0..2 {
                 let (surface_m, _) = self.footprint.surface(displacement);
                 let beside = (place_m - surface_m).truncate();
@@ -226,7 +227,7 @@ impl Tool {
         let mut gap_m = place_m - surface_m;
         match self.standing {
             Standing::Free => {
-                // What is left beside the sheet's rim does not meet it.
+                // A disc that is farther off the sheet's edge than its radius does not meet it.
                 if gap_m.truncate().length() > self.tip.radius_m {
                     return DVec3::ZERO;
                 }
@@ -275,7 +276,7 @@ impl Tool {
         }
     }
 
-    /// After the force has acted: where the disc slides, it stays under the tool.
+    /// After the force has acted: a sliding disc stays under the tool.
     fn follow<T: Real>(&mut self, model: &Model, layout: &Layout, state: &State<T>, fraction: f64) {
         if self.standing != Standing::Sliding {
             return;
@@ -290,7 +291,7 @@ impl Tool {
     }
 }
 
-/// A force on the sheet within the cone of friction about −`normal`, and whether it was inside.
+/// A force on the sheet within the friction cone about −`normal`, and whether it was already inside.
 fn within_cone(force_n: DVec3, normal: DVec3, friction: f64) -> (bool, DVec3) {
     let pressing_n = force_n.dot(normal) * normal;
     let across_n = force_n - pressing_n;
@@ -300,7 +301,7 @@ fn within_cone(force_n: DVec3, normal: DVec3, friction: f64) -> (bool, DVec3) {
 }
 
 impl<T: Real> Sheet<T> {
-    /// Lets tools that are led by their position act, at the end of a substep that ends at `fraction` of the step.
+    /// Makes position-controlled tools act at the end of a substep that ends at `fraction` of the step.
     pub(super) fn meet(&mut self, fraction: f64) {
         let Sheet { model, plan, bench, state, contacts, tiles, work, .. } = self;
         let layout = &bench.layout;
@@ -314,12 +315,12 @@ impl<T: Real> Sheet<T> {
             tool.steady_n = if met { tool.force_n } else { DVec3::ZERO };
             if tool.force_n == DVec3::ZERO {
                 if before_n != DVec3::ZERO {
-                    // It has let go: nothing acted in this substep.
+                    // The tool has let go: undo the force of this substep.
                     push(model, plan, layout, state, &tool.footprint, -before_n, plan.scheme.constant());
                 }
                 continue;
             }
-            // What slept was at rest in this substep, as if it had been computed.
+            // Tiles that slept were at rest in this substep, as if they had been computed.
             tiles.wake_under(tool.points());
             push(model, plan, layout, state, &tool.footprint, tool.force_n - before_n, plan.scheme.kick());
             work.add(tool.force_n.dot(movement_m(model, layout, state, &tool.footprint)));
@@ -327,7 +328,7 @@ impl<T: Real> Sheet<T> {
         }
     }
 
-    /// What a tool that is led by its position does and feels.
+    /// The motion of a position-controlled tool and the force on it.
     pub(super) fn feel(&self, number: usize) -> Option<Feel> {
         let model = &self.model;
         let tool = self.contacts.tools.iter().find(|tool| tool.number == number)?;
@@ -359,7 +360,7 @@ impl<T: Real> Sheet<T> {
         })
     }
 
-    /// The disc of such a tool, if it touches or holds, and how the points around it are displaced.
+    /// The disc of such a tool, if it touches or holds, and the displacements of the points around it.
     pub(super) fn surroundings(&self, number: usize) -> Option<Surroundings> {
         let tool = self.contacts.tools.iter().find(|tool| tool.number == number)?;
         if tool.standing == Standing::Free {
@@ -372,7 +373,7 @@ impl<T: Real> Sheet<T> {
         Some(Surroundings { model: self.model.clone(), footprint: tool.footprint.clone(), window, displacement_m })
     }
 
-    /// Σ w·f/Σ w², f of springs, virtual springs, damping and tools that exert a given force.
+    /// Σ w·f/Σ w², where f is the force of springs, virtual springs, damping and force-controlled tools.
     fn without_inertia(&self, tool: &Tool) -> DVec3 {
         let (model, footprint) = (&self.model, &tool.footprint);
         let scene = &model.scene;

@@ -1,6 +1,6 @@
 //! A correction: the same tissue, stepped more accurately, because an audit found an error above the tolerance.
 //!
-//! It is an input like another tissue: whoever has its record and gives it to the tissue at the same step gets the same bits.
+//! It is an input like a change of tissue: a recorded correction, applied at the same step, gives the same bits.
 
 use std::sync::Arc;
 
@@ -12,12 +12,13 @@ use crate::refusal::Result;
 use crate::scene::record::Correction;
 use crate::scene::{Integrator, Precision, Scene, Stepping};
 
-/// Part of the tolerance that a correction aims at: so that the next window is not just above it again.
+/// A correction aims at this part of the tolerance, so that the next window is not just above it again.
 const AIM: f64 = 0.5;
 
 impl Model {
-    /// What keeps the error of `finding` below the tolerance from step `step` on: another scheme or more substeps, a better
-    /// number format, or less sleep. `None` if the error is within the tolerance, or if there is nothing better.
+    /// The correction that keeps the error of `finding` below the tolerance from step `step` on: another scheme or more
+    /// substeps, a better number format, or less sleep. `None` if the error is within the tolerance, or if nothing
+    /// better exists.
     pub fn correction(&self, finding: &Finding, step: u64, limits: &Limits) -> Option<Correction> {
         let origin = finding.origin?;
         let excess = finding.error.largest() / (AIM * self.scene.stepping.tolerance);
@@ -60,7 +61,8 @@ impl Model {
         Some(correction)
     }
 
-    /// What the tolerance would choose, if that is another scheme and takes fewer substeps than `needed` of this one.
+    /// The scheme that the tolerance would choose, if it differs and takes fewer substeps than `needed` of the present
+    /// one.
     fn better_scheme(&self, needed: u32, limits: &Limits) -> Option<Choice> {
         let stepping = &self.scene.stepping;
         let mut open = self.scene.clone();
@@ -72,7 +74,10 @@ impl Model {
         (keeps && fits && choice.integrator != self.plan.integrator).then_some(choice)
     }
 
-    /// The same tissue as a correction of it has it stepped.
+    /// The same tissue, stepped as `correction` says.
+    ///
+    /// # Errors
+    /// Refuses a correction that this model can't be compiled with.
     pub fn corrected(&self, correction: &Correction, limits: &Limits) -> Result<Arc<Self>> {
         let mut scene = self.scene.clone();
         scene.sleep_tolerance = Some(correction.sleep_tolerance);
@@ -80,12 +85,13 @@ impl Model {
         (scene.stepping.integrator, scene.stepping.substeps) = (correction.integrator, Some(correction.substeps));
         let mut model = Arc::unwrap_or_clone(Model::compile(&scene, limits)?);
         model.corrected = Some((correction.integrator, correction.substeps));
-        // What was asked for stays; what is in force is the plan and the format.
+        // Keep the request; the plan and the format in force change.
         model.scene.stepping = self.scene.stepping.clone();
         Ok(Arc::new(model))
     }
 
-    /// Compiles another tissue out of this one's: with the scheme, and at least the substeps, that a correction asked for.
+    /// Compiles another tissue from this one's scene, with the scheme and at least the substeps of the correction in
+    /// force.
     pub(super) fn compile_corrected(&self, scene: &Scene, limits: &Limits) -> Result<Self> {
         let Some((integrator, least)) = self.corrected else {
             return Ok(Arc::unwrap_or_clone(Model::compile(scene, limits)?));

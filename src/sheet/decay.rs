@@ -1,4 +1,4 @@
-//! Test of a sheet that rings down: no number gets so small that the processor takes long over it.
+//! Test of a sheet that rings down: no value becomes so small that the processor handles it slowly.
 #![allow(clippy::unwrap_used)]
 
 use glam::{DVec2, DVec3};
@@ -8,21 +8,21 @@ use crate::limits::Limits;
 use crate::scene::law::Poke;
 use crate::scene::{PAPER, Scene};
 
-/// Values of displacements, and of the rest of the state, that are not 0 and below `least`.
+/// Counts the nonzero values below `least` among the displacements, and in the rest of the state.
 fn too_small<T: Real>(sheet: &Sheet<T>, least: f64) -> [usize; 2] {
     let small = |value: &&T| **value != T::default() && value.wide().abs() < least;
     let mut counts = sheet.state.fields().map(|field| field.iter().filter(small).count());
     [counts.next().unwrap(), counts.sum()]
 }
 
-/// `CUTS_U`: the scheme cuts displacements as well, not increments alone.
+/// `CUTS_U`: the scheme cuts displacements as well as increments.
 fn rings_down<T: Real, const CUTS_U: bool>(sets: &[&str]) {
     for lanes in ["plain", "neon", "avx2", "avx512"] {
         let mut settings: Vec<String> = sets.iter().map(|text| (*text).to_owned()).collect();
         settings.extend([format!("stepping.lanes={lanes}"), "sheet.points=[5, 19]".to_owned()]);
         settings.extend(["sleep.tolerance=0.0", "damping.coefficient_n_s_per_m=0.5"].map(str::to_owned));
         let scene = Scene::parse("paper", PAPER, &settings, &Limits::default()).unwrap();
-        // Lanes that this machine does not have are refused.
+        // Skip lanes that this machine does not have.
         let Ok(model) = Model::compile(&scene, &Limits::default()) else { continue };
         let mut sheet = Sheet::<T>::new(&model);
         let poke = Poke {
@@ -34,7 +34,7 @@ fn rings_down<T: Real, const CUTS_U: bool>(sets: &[&str]) {
         sheet.push(0, Some(Push::Held(poke)));
         (0..50).for_each(|_| sheet.step().unwrap());
         sheet.push(0, None);
-        // The way from 1 down to what rounding and the smallest number that counts leave of a vibration.
+        // From 1 down to what rounding and the smallest number that counts leave of a vibration.
         let (mut passed, mut cancelled) = (0, 0);
         for step in 0.. {
             sheet.step().unwrap();
@@ -43,7 +43,7 @@ fn rings_down<T: Real, const CUTS_U: bool>(sets: &[&str]) {
             if CUTS_U {
                 assert_eq!(displacements, 0, "{sets:?}, {lanes}, step {step}");
             }
-            // A sum of increments that count is 0 or not below the last digit of the least of them.
+            // A sum of increments that count is either 0 or at least the last digit of the smallest of them.
             assert_eq!(too_small(&sheet, T::LEAST * T::EPSILON), [0; 2], "{sets:?}, {lanes}, step {step}");
             cancelled += displacements;
             let largest = sheet.state.u.iter().map(|value| value.wide().abs()).fold(0.0, f64::max);

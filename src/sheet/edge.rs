@@ -1,10 +1,11 @@
-//! The left edge of a strip: springs that begin in the column beside it and pull at its first.
+//! The left edge of a strip: springs that begin in the column to its left and pull at its first column.
 //!
-//! They are evaluated along the column, as many rows at a time as a vector has lanes: a block of columns for each row would
-//! cost as much as one that is awake. Each lane does what the sweep would do for its row, in the same order: the bits are
-//! the same.
+//! They are evaluated along the column, as many rows at a time as a vector has lanes: a block of columns for each row
+//! would cost as much as an awake block. Each lane does the same operations as the sweep would for its row, in the same
+//! order: the bits are the same.
 #![allow(unsafe_code)]
-// Iterators over vectors are not always inlined, and then run without the instructions of their caller: ten times slower.
+// The compiler does not always inline iterators over vectors. They then run without the caller's instructions, ten
+// times slower.
 #![allow(clippy::needless_range_loop)]
 
 use super::field::{BLOCK, Layout};
@@ -12,21 +13,22 @@ use super::lanes::Vector;
 use super::springs::Springs;
 use super::sweep::{Stage, Sweep, difference, excess, load};
 
-/// What the column to the left of a strip does to the strip's first, as many rows at a time as a vector has lanes.
+/// The forces of the column to the left of a strip on its first column, for as many rows at a time as a vector has
+/// lanes.
 pub(super) struct Edge<V: Vector> {
     /// The strip's first column.
     column: usize,
-    /// The first of the rows that are known, and where they end.
+    /// The range of rows that are evaluated.
     from: usize,
     to: usize,
-    /// What each row passes on to the right: as the sweep would, row by row.
+    /// The force that each row passes to the right, in the sweep's order.
     across: [[V::Real; BLOCK]; 3],
-    /// Of the diagonals, what each row leaves to the row below.
+    /// The forces of the diagonals that each row leaves to the row below.
     leaves: [V; 3],
 }
 
 impl<V: Vector> Edge<V> {
-    /// Of a strip whose first row is `row`: what the one above leaves is in the carry, if a strip has been there.
+    /// Begins a strip whose first row is `row`. The force from the strip above is in the carry, if there is one.
     ///
     /// # Safety
     /// As for `Sweep::rows`; `column` is not 0.
@@ -34,7 +36,7 @@ impl<V: Vector> Edge<V> {
     pub(super) unsafe fn new<S: Stage<V::Real>>(sweep: &Sweep<'_, V::Real, S>, column: usize, row: usize) -> Self {
         let Layout { stride, plane, .. } = sweep.layout;
         debug_assert!((1..=stride).contains(&column) && sweep.layout.holds(stride + column - 1, 1));
-        // SAFETY: the caller's promise: the processor has the instructions, the carry has a second row.
+        // SAFETY: the caller's promise: the processor has the instructions, and the carry has a second row.
         let leaves = unsafe {
             let left = sweep.carry.add(stride + column - 1);
             [V::of(*left), V::of(*left.add(plane)), V::of(*left.add(2 * plane))]
@@ -42,7 +44,7 @@ impl<V: Vector> Edge<V> {
         Edge { column, from: row, to: row, across: [[V::Real::default(); BLOCK]; 3], leaves }
     }
 
-    /// What the column passes to the right in row `i`, in the last lane; rows are asked for one after the other.
+    /// The force that the column passes to the right in row `i`, in the last lane. Call it for consecutive rows.
     ///
     /// # Safety
     /// As for `Sweep::rows`; the strip's rows from `i` on have not been advanced.
@@ -60,7 +62,7 @@ impl<V: Vector> Edge<V> {
     unsafe fn evaluate<S: Stage<V::Real>>(&mut self, sweep: &Sweep<'_, V::Real, S>, row: usize) {
         let Layout { rows, stride, plane, .. } = sweep.layout;
         let Springs { structural, shear, .. } = sweep.springs;
-        // Three components of both columns, and a row more; what lies below the sheet is not used.
+        // Three components of both columns, and one extra row. Values below the sheet are not used.
         const LONG: usize = BLOCK + 1;
         let mut columns = [[V::Real::default(); 3 * LONG]; 2];
         for k in 0..=V::LANES {
@@ -103,7 +105,7 @@ impl<V: Vector> Edge<V> {
         (self.from, self.to) = (row, row + V::LANES);
     }
 
-    /// Leaves to the strip below, which begins at row `end`, what a block of the column would have left.
+    /// Leaves to the strip below, which begins at row `end`, the forces that a block of this column would have left.
     ///
     /// # Safety
     /// As for `Sweep::rows`.

@@ -1,4 +1,4 @@
-//! Memory of a sheet: numbers for each point, laid out so that rows can be swept by vectors of any width.
+//! The memory of a sheet: values per point, laid out so that vectors of any width can sweep the rows.
 
 use std::ops::{Deref, DerefMut};
 use std::sync::Arc;
@@ -10,31 +10,31 @@ use super::real::Real;
 /// Lanes of the widest vector: rows are padded to a multiple of it.
 pub(super) const BLOCK: usize = 16;
 
-/// Bytes that every row and plane is aligned to: a cache line.
+/// Alignment of every row and plane, bytes: a cache line.
 const LINE: usize = 64;
 
-/// By how many bytes a plane is longer than a multiple of a page. A processor takes a load for one that waits for an
-/// earlier store if the two agree in the last 12 bits of their addresses; with planes apart by whole pages, each store
-/// to x would seem to be what the next load of y waits for. (Measured at 31²: up to a quarter of a step.)
+/// The length of a plane exceeds a multiple of a page by this many bytes. A processor treats a load as dependent on an
+/// earlier store if their addresses agree in the last 12 bits. With planes whole pages apart, each store to x would
+/// seem to block the next load of y. (Measured at 31²: up to a quarter of a step.)
 const SKEW: usize = 1408;
 
-/// Where the numbers of a point are: component c of point [i, j] at c·plane + i·stride + j.
+/// Where the values of a point are: component c of point [i, j] at c·plane + i·stride + j.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Layout {
     /// Along x.
     pub(super) rows: usize,
     /// Along y.
     pub(super) columns: usize,
-    /// From a row to the next.
+    /// From one row to the next.
     pub(super) stride: usize,
-    /// From a component to the next.
+    /// From one component to the next.
     pub(super) plane: usize,
 }
 
 impl Layout {
     pub(super) fn new<T: Real>([rows, columns]: [usize; 2]) -> Self {
         let mut stride = columns.next_multiple_of(BLOCK);
-        // Rows apart by half a page or more would collide like planes.
+        // Rows half a page or more apart would collide like planes.
         if (stride * size_of::<T>()).is_multiple_of(2048) {
             stride += BLOCK;
         }
@@ -44,43 +44,43 @@ impl Layout {
         Layout { rows, columns, stride, plane }
     }
 
-    /// Whether so many numbers from a place of a plane on are memory of that plane.
+    /// Whether `count` values from `place` on lie within one plane.
     pub(super) fn holds(&self, place: usize, count: usize) -> bool {
         place + count <= self.plane
     }
 
-    /// The place of the x component of the point that is number `index` of all, by rows.
+    /// The place of the x component of the point with row-major number `index`.
     pub(super) fn place(&self, index: usize) -> usize {
         index / self.columns * self.stride + index % self.columns
     }
 }
 
-/// What a step advances. Lengths are in spacings (`integrate`).
+/// The state that a step advances. Lengths are in spacings (`integrate`).
 #[derive(Debug)]
 pub(super) struct State<T> {
-    /// Displacement from rest: of a multistep scheme as predicted for now.
+    /// Displacement from rest. For a multistep scheme, as predicted for the present.
     pub(super) u: Field<T>,
     /// The increment of the last substep, or the velocity times the substep.
     pub(super) d: Field<T>,
-    /// What the scheme keeps beside; of a sheet at rest, some are one in memory.
+    /// The other values that the scheme keeps. In a sheet at rest, some of them share memory.
     pub(super) kept: Vec<Arc<Field<T>>>,
 }
 
 impl<T: Real> State<T> {
     pub(super) fn at_rest(layout: &Layout, kept: usize) -> Self {
         let zero = || Field::zero(layout);
-        // The past of rest is the same at all times: one in memory, until it is written to.
+        // The history of a sheet at rest is the same at all times, so it shares memory until the first write.
         let past = Arc::new(zero());
         State { u: zero(), d: zero(), kept: vec![past; kept] }
     }
 
-    /// The same, with memory of its own for each field: the system gives zeros when they are written to.
+    /// The same, with separate memory for each field. The system supplies zeroed pages at the first write.
     pub(super) fn zero(layout: &Layout, kept: usize) -> Self {
         let zero = || Field::zero(layout);
         State { u: zero(), d: zero(), kept: std::iter::repeat_with(|| Arc::new(zero())).take(kept).collect() }
     }
 
-    /// All of it.
+    /// All fields.
     pub(super) fn fields(&self) -> impl Iterator<Item = &Field<T>> {
         [&self.u, &self.d].into_iter().chain(self.kept.iter().map(|field| &**field))
     }
@@ -89,20 +89,20 @@ impl<T: Real> State<T> {
         [&mut self.u, &mut self.d].into_iter().chain(self.kept.iter_mut().map(Arc::make_mut))
     }
 
-    /// The last values of the springs' force at a place, newest first: `now`, and `count` that a multistep scheme keeps.
+    /// The last values of the springs' force at a place, newest first: `now`, and the `count` values that a multistep
+    /// scheme keeps.
     pub(super) fn history(&self, now: f64, count: usize, at: usize) -> Vec<f64> {
         std::iter::once(now).chain(self.kept[..count].iter().map(|field| field[at].wide())).collect()
     }
 
-    /// Of a sheet at rest the last `count` forces of the springs are the same: they become one in memory, until they are
-    /// written to.
+    /// Makes the last `count` spring forces share memory until the next write. They are equal in a sheet at rest.
     pub(super) fn share_history(&mut self, count: usize) {
         if let Some((first, rest)) = self.kept[..count].split_first_mut() {
             rest.fill(first.clone());
         }
     }
 
-    /// Gives what is one in memory memory of its own; `copy` copies what is not 0.
+    /// Gives fields that share memory their own; `copy` copies the nonzero part.
     pub(super) fn part_history(&mut self, copy: impl Fn(&mut Field<T>, &Field<T>)) {
         for field in &mut self.kept {
             if Arc::get_mut(field).is_none() {
@@ -113,8 +113,8 @@ impl<T: Real> State<T> {
         }
     }
 
-    /// XXH3-128 of the values of each point, by rows: of each field, x, y and z, little-endian. What `has_moved` is false
-    /// for is known to be 0.
+    /// XXH3-128 of the values of each point, by rows: for each field x, y and z, little-endian. Points for which
+    /// `has_moved` is false are known to be 0.
     pub(super) fn hash(&self, layout: &Layout, has_moved: impl Fn([usize; 2]) -> bool) -> u128 {
         let mut hasher = Xxh3::new();
         let size = size_of::<T>();
@@ -141,13 +141,13 @@ impl<T: Real> State<T> {
         hasher.digest128()
     }
 
-    /// Takes the values of another of the same layout and scheme.
+    /// Copies the values of another state of the same layout and scheme.
     pub(super) fn copy_from(&mut self, other: &Self) {
         self.fields_mut().zip(other.fields()).for_each(|(to, from)| to.copy_from_slice(from));
     }
 }
 
-/// Numbers over the points: three each, x, y and z apart, or (a table) one. What pads rows and planes is 0.
+/// Values over the points: three each, with x, y and z in separate planes, or (for a table) one. Padding is 0.
 #[derive(Debug)]
 pub(super) struct Field<T> {
     storage: Vec<T>,
@@ -160,15 +160,15 @@ impl<T: Real> Field<T> {
         Field::of_length(3 * layout.plane)
     }
 
-    /// Zeros.
+    /// All zeros.
     pub(super) fn of_length(length: usize) -> Self {
         let storage = vec![T::default(); length + LINE / size_of::<T>()];
-        // Where no alignment is promised, none is needed: it is for speed alone.
+        // `align_offset` need not succeed: alignment only affects speed.
         let from = storage.as_ptr().align_offset(LINE).min(LINE / size_of::<T>());
         Field { storage, from, length }
     }
 
-    /// Makes room for another length; what is in it does not matter.
+    /// Changes the length; the contents are unspecified.
     pub(super) fn resize(&mut self, length: usize) {
         if self.from + length <= self.storage.len() {
             self.length = length;

@@ -2,18 +2,17 @@
 //!
 //! The surface between points is bilinear: the material place c (in the rest plane) is at Σ N_p(c)·x_p, N_p the bilinear
 //! hats. A disc of radius a about c averages that over its area, s(c) = Σ w_p·x_p with w_p = ⨍ N_p; the weights add up
-//! to 1 and their centre is c exactly. A tool moves s, and its force goes to the points with the same weights, so the
-//! work that it does is force · ds. With a single point instead, stiffness would fall without end as the grid gets
-//! finer; with the disc it converges.
+//! to 1 and their centre is c exactly. A tool moves s, and its force goes to the points with the same weights, so its
+//! work is force · ds. With a single point instead, the stiffness would fall without limit as the grid gets finer; with
+//! the disc it converges.
 //!
-//! The hats blur the disc: pressed evenly, it would seem larger than it is, by much where the grid is coarse. What counts
-//! is the area A = h²/Σ w² that takes part, as a force is shared: a foundation of k″ N/m³ has the stiffness k″·A under
-//! the disc. So the disc over which the hats are averaged is drawn smaller, by so much that A is that of the disc that
-//! was asked for, in the mean over its places in a cell. From two spacings across on that is exact; below, the hats
-//! alone are too large.
+//! The hats blur the disc: under even pressure it would act as if larger, by much where the grid is coarse. The area
+//! that matters is the A = h²/Σ w² that shares a force: a foundation of k″ N/m³ has the stiffness k″·A under the disc.
+//! So the hats are averaged over a smaller disc, chosen so that A is that of the requested disc, in the mean over its
+//! places in a cell. From two spacings across on that is exact; below, the hats alone are too large.
 //!
-//! The integral is a sum over rings of equal area, each with points at equal angles: sums of first powers vanish, those
-//! of second powers are the same in every direction.
+//! The integral is a sum over rings of equal area, each with points at equal angles: sums of first powers vanish, and
+//! sums of second powers are the same in every direction.
 
 use std::f64::consts::TAU;
 
@@ -22,36 +21,36 @@ use glam::{DVec2, DVec3};
 use super::model::Model;
 use crate::scene::Sheet;
 
-/// Rings of the disc: at least this many, and two a spacing.
+/// Least number of rings in a disc; larger discs have two per spacing.
 const LEAST_RINGS: f64 = 6.0;
 
-/// Each ring is turned against the last, so that hardly two places cross a line of the grid at once: the slope of the
-/// surface, which jumps there for each, changes smoothly for all.
+/// Each ring is rotated against the one before, so that hardly two places cross a grid line at once. The slope of the
+/// surface jumps at each crossing; this makes the sum change smoothly.
 const GOLDEN: f64 = 0.618_033_988_749_895;
 
-/// Most rings: beyond, a spacing has fewer than two, which a disc so large does not notice.
+/// Most rings. Beyond, a spacing has fewer than two, which makes no difference to a disc that large.
 const MOST_RINGS: f64 = 16.0;
 
 /// A disc on a sheet, at a place. Lengths in m.
 #[derive(Debug, Clone)]
 pub struct Footprint {
     radius_m: f64,
-    /// Of the disc that the hats are averaged over.
+    /// Radius of the disc that the hats are averaged over.
     drawn_m: f64,
-    /// Places of the sum, from the centre.
+    /// Sample places of the sum, from the centre.
     offsets_m: Vec<DVec2>,
     centre_m: DVec2,
     reached: Vec<Reached>,
-    /// Room for the sums of a rectangle of points.
+    /// Scratch memory for the sums of a rectangle of points.
     sums: Vec<(f64, DVec2)>,
     /// Σ w² over the points that can move.
     mobility: f64,
 }
 
-/// A mass point that a disc reaches.
+/// A mass point that a disc covers.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Reached {
-    /// Its place in the grid.
+    /// Its indices in the grid.
     pub point: [usize; 2],
     /// Whether it is not fixed.
     pub free: bool,
@@ -62,7 +61,7 @@ pub struct Reached {
 }
 
 impl Footprint {
-    /// A disc of `radius_m` about `centre_m`, which is brought onto the sheet if it is beside it.
+    /// A disc of `radius_m` about `centre_m`, which is moved onto the sheet if it is beside it.
     pub fn new(model: &Model, radius_m: f64, centre_m: DVec2) -> Self {
         let spacing_m = model.scene.sheet.spacing_m;
         let drawn = drawn_radius(radius_m / spacing_m);
@@ -89,7 +88,7 @@ impl Footprint {
         self.centre_m
     }
 
-    /// Brings the disc to another material place.
+    /// Moves the disc to another material place.
     pub fn move_to(&mut self, model: &Model, centre_m: DVec2) {
         let sheet = &model.scene.sheet;
         let centre_m = centre_m.clamp(DVec2::ZERO, sheet.extent_m());
@@ -111,7 +110,7 @@ impl Footprint {
         for offset in &self.offsets_m {
             let at = centre_m + *offset;
             let [(i, x), (j, y)] = [cell(sheet, 0, at.x), cell(sheet, 1, at.y)];
-            // Beside the sheet its rim goes on, and is level.
+            // Outside the sheet, the surface continues level from its edge.
             let slope = |axis: usize| {
                 let inside = at[axis] >= 0.0 && at[axis] <= sheet.extent_m()[axis] && sheet.points[axis] > 1;
                 if inside { share / sheet.spacing_m } else { 0.0 }
@@ -120,7 +119,7 @@ impl Footprint {
             for (di, wx, sx) in [(0, 1.0 - x, -slope_x), (1, x, slope_x)] {
                 for (dj, wy, sy) in [(0, 1.0 - y, -slope_y), (1, y, slope_y)] {
                     let [row, column] = [i + di - origin[0], j + dj - origin[1]];
-                    // A sheet of one row has none beside it.
+                    // A sheet of one row has no next row.
                     if row < size[0] && column < size[1] {
                         let sum = &mut self.sums[row * size[1] + column];
                         sum.0 += share * wx * wy;
@@ -139,17 +138,17 @@ impl Footprint {
         self.mobility = self.reached.iter().filter(|point| point.free).map(|point| point.weight * point.weight).sum();
     }
 
-    /// The points that it reaches.
+    /// The points that the disc covers.
     pub fn reached(&self) -> &[Reached] {
         &self.reached
     }
 
-    /// Σ w² over the points that can move: how much a force of 1 moves s, in what it does to one free point.
+    /// Σ w² over the points that can move: the movement of s per unit force, relative to that of one free point.
     pub fn mobility(&self) -> f64 {
         self.mobility
     }
 
-    /// Where the disc is, s, m, and ∂s/∂c, of points displaced by `displacement_m`.
+    /// s, the place of the disc, in m, and ∂s/∂c, for points displaced by `displacement_m`.
     pub fn surface(&self, displacement_m: impl Fn([usize; 2]) -> DVec3) -> (DVec3, [DVec3; 2]) {
         let mut place = self.centre_m.extend(0.0);
         let mut along = [DVec3::X, DVec3::Y];
@@ -163,7 +162,7 @@ impl Footprint {
     }
 }
 
-/// Places spread evenly over a disc, all lengths in spacings.
+/// Places spread evenly over a disc. All lengths in spacings.
 fn disc(radius: f64) -> Vec<DVec2> {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     let rings = (2.0 * radius).ceil().clamp(LEAST_RINGS, MOST_RINGS) as u32;
@@ -188,7 +187,7 @@ fn drawn_radius(radius: f64) -> f64 {
     0.5 * (low + high)
 }
 
-/// 1/Σ w² on a grid without end, in the mean over places in a cell, in spacings squared.
+/// 1/Σ w² on an infinite grid, in the mean over places in a cell, in spacings squared.
 fn shared_area(radius: f64) -> f64 {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     let (reach, offsets) = (radius.ceil() as usize + 2, disc(radius));
@@ -217,7 +216,7 @@ fn shared_area(radius: f64) -> f64 {
     samples * samples * count / sum
 }
 
-/// The cell that a coordinate is in and how far into it, from 0 to 1; beside the sheet, the rim.
+/// The cell of a coordinate and the position in it, from 0 to 1. Coordinates outside the sheet are clamped to its edge.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
 fn cell(sheet: &Sheet, axis: usize, at_m: f64) -> (usize, f64) {
     let last = sheet.points[axis].saturating_sub(2);

@@ -1,14 +1,14 @@
-//! The guard: what must hold of a sheet's motion, looked at now and then, and the checkpoint to go back to.
+//! The guard: periodic checks of a sheet's motion, and the checkpoint to go back to.
 //!
-//! Numbers must be finite; energy must not come from nowhere; the springs' force must be near what its history foretold.
-//! Every [`INTERVAL_SUBSTEPS`] substeps a survey of the sheet (a sweep, about twice the price of a substep) looks at
-//! them: E − E₀ ≤ W + [`MARGIN`]·(E₀ + |W|), E₀ the energy at the last survey and W the work of all tools since. Damping
-//! only takes energy, so it is on the safe side. Increments are summed in every substep, which shows at once if one is not
-//! finite.
+//! Numbers must be finite; energy must not appear from nowhere; the springs' force must be near its prediction from its
+//! history. Every [`INTERVAL_SUBSTEPS`] substeps a survey of the sheet (a sweep, about twice the cost of a substep)
+//! checks them: E − E₀ ≤ W + [`MARGIN`]·(E₀ + |W|), with E₀ the energy at the last survey and W the work of all tools
+//! since. Damping only removes energy, so it is on the safe side. Increments are summed in every substep, so a value
+//! that is not finite shows at once.
 //!
-//! If it does not hold, the sheet goes back to the last checkpoint and repeats, with half the substep, what the tools did
-//! since: time does not go back for those who look on. It keeps the shorter substep. After [`MOST_HALVINGS`] halvings it
-//! gives up, at the checkpoint.
+//! If a check fails, the sheet goes back to the last checkpoint and repeats the tools' inputs since then with half the
+//! substep; observers never see time go back. It keeps the shorter substep. After [`MOST_HALVINGS`] halvings it gives
+//! up, at the checkpoint.
 
 use std::fmt;
 use std::sync::Arc;
@@ -30,38 +30,38 @@ use crate::scene::tip::Tip;
 /// Substeps between two surveys.
 pub const INTERVAL_SUBSTEPS: u64 = 256;
 
-/// What the sum of energy and work may be off by, as a part of either: errors of the schemes at the stability bound.
+/// Tolerance of the energy balance, as a fraction of energy and of work: errors of the schemes at the stability bound.
 pub const MARGIN: f64 = 0.05;
 
-/// By how much, of the largest displacement, a prediction may be off.
+/// Largest error of a prediction, as a fraction of the largest displacement.
 pub const MOST_SURPRISE: f64 = 0.5;
 
-/// How often a substep is halved before the guard gives up.
+/// Number of times a substep is halved before the guard gives up.
 pub const MOST_HALVINGS: u32 = 4;
 
-/// Inputs that are kept since the last checkpoint; more bring the next one on.
+/// Most inputs kept since the last checkpoint. More bring the next checkpoint forward.
 pub(super) const MOST_INPUTS: usize = 1024;
 
 /// Why the guard gave up.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Cause {
-    /// A point is not finite, or is displaced by a billion sheets.
+    /// A point is not finite, or is displaced by a billion times the sheet's size.
     NotFinite {
         /// The point.
         point: [usize; 2],
     },
     /// Energy from nowhere.
     Energy {
-        /// Of springs, virtual springs and motion, J.
+        /// Energy of springs, virtual springs and motion, J.
         energy_j: f64,
-        /// What it was at the last survey, J.
+        /// That energy at the last survey, J.
         before_j: f64,
         /// Work of all tools since, J.
         work_j: f64,
     },
-    /// The springs' force is far from what its history foretold.
+    /// The springs' force is far from its prediction.
     Surprise {
-        /// The difference that it makes to a displacement, as a part of the largest.
+        /// The resulting difference of a displacement, as a fraction of the largest.
         part: f64,
     },
 }
@@ -85,7 +85,7 @@ impl fmt::Display for Cause {
     }
 }
 
-/// What a tool was told.
+/// An input of a tool.
 #[derive(Debug, Clone)]
 pub(super) enum Input {
     Push(Option<Push>),
@@ -93,7 +93,7 @@ pub(super) enum Input {
     Lead(DVec3, Tip),
 }
 
-/// Everything that a sheet goes back to.
+/// The complete state that a sheet goes back to.
 #[derive(Debug)]
 pub(super) struct Checkpoint<T: Real> {
     pub(super) steps: u64,
@@ -103,38 +103,38 @@ pub(super) struct Checkpoint<T: Real> {
     pub(super) prescribed: Prescribed,
     pub(super) contacts: Contacts,
     pub(super) work: Work,
-    /// The largest displacement of late, spacings: what sleep is measured by.
+    /// The recent largest displacement, spacings. Sleep is relative to it.
     pub(super) largest: f64,
 }
 
 /// Work of the tools, J, and energies at the last survey.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct Work {
-    /// Since the last survey, and what its `present_j` took off.
+    /// Work since the last survey, plus what its `present_j` subtracted.
     done_j: f64,
-    /// At the last survey.
+    /// Energy at the last survey.
     energy_j: f64,
-    /// The largest that any survey saw.
+    /// The largest energy at any survey.
     largest_j: f64,
 }
 
-/// A rise of less than this part of the largest energy so far is noise of rounding, in a sheet that has come to rest; or
-/// of less than the square of ten times what tiles may be off by that sleep.
+/// A rise of energy below this fraction of the largest so far is rounding noise in a sheet that has come to rest. So is
+/// a rise below the square of ten times the error that sleeping tiles may have.
 const NOISE: f64 = 1e-10;
 
 impl Work {
-    /// Adds what was done.
+    /// Adds work.
     pub(super) fn add(&mut self, work_j: f64) {
         self.done_j += work_j;
     }
 
-    /// An account that begins with an energy.
+    /// An account that begins with the given energy.
     pub(super) fn begun(energy_j: f64, present_j: f64) -> Self {
         Work { done_j: present_j, energy_j, largest_j: energy_j }
     }
 
-    /// Judges an energy; a rise by `noise` of the largest is none. `present_j` is to be taken off what was done so far, and
-    /// belongs to what comes. The account begins anew.
+    /// Checks an energy; a rise by `noise` of the largest does not count. `present_j` is subtracted from the work so
+    /// far and belongs to the next interval. The account begins anew.
     pub(super) fn survey(&mut self, energy_j: f64, present_j: f64, noise: f64) -> Result<(), Cause> {
         let (work_j, before_j) = (self.done_j - present_j, self.energy_j);
         let allowed_j = work_j + MARGIN * (before_j + work_j.abs()) + noise * self.largest_j;
@@ -147,7 +147,8 @@ impl Work {
 }
 
 impl<T: Real> Sheet<T> {
-    /// What is wrong, if anything. Every step whether all is finite; the rest now and then, and then there is a checkpoint.
+    /// Returns the cause of a failure, if there is one. Checks in every step that all is finite; the full check is
+    /// periodic, and takes a checkpoint.
     pub(super) fn check(&mut self) -> Result<(), Cause> {
         let interval = (INTERVAL_SUBSTEPS / u64::from(self.plan.substeps)).max(1);
         let due = self.steps.is_multiple_of(interval) || self.inputs.len() >= MOST_INPUTS;
@@ -177,20 +178,20 @@ impl<T: Real> Sheet<T> {
         Ok(())
     }
 
-    /// Of the work done, what belongs to what comes: half of the last increment's (`central`).
+    /// The part of the work done that belongs to the next interval: half of the last increment's (`central`).
     pub(super) fn present_work_j(&self, survey: &Survey) -> f64 {
         if self.plan.scheme.takes_means() { 0.5 * survey.power * self.unit_of_work_j() } else { 0.0 }
     }
 
-    /// What the sheet is now is what it goes back to.
+    /// Stores the present state as the state to go back to.
     pub(super) fn take_checkpoint(&mut self) {
         let Sheet { bench, state, applied, prescribed, contacts, tiles, .. } = self;
-        // One that an audit still holds stays as it is.
+        // A checkpoint that an audit still holds stays as it is.
         if self.checkpoint.as_mut().is_some_and(|checkpoint| Arc::get_mut(checkpoint).is_none()) {
             self.checkpoint = None;
         }
         let checkpoint = self.checkpoint.get_or_insert_with(|| {
-            // Of a large sheet little has ever moved: what has not, is not copied, nor given memory.
+            // Most of a large sheet has never moved. That part is neither copied nor given memory.
             tiles.touch_all();
             state.part_history(|to, from| tiles.copy_moved(to, from));
             let state = State::zero(&bench.layout, state.kept.len());
@@ -211,7 +212,7 @@ impl<T: Real> Sheet<T> {
         self.mark();
     }
 
-    /// A sheet that is still needs less: nothing can go wrong until a tool is told something.
+    /// Frees the checkpoint of a still sheet: nothing can go wrong until a tool gets a command.
     pub(super) fn forget_checkpoint(&mut self) {
         self.checkpoint = None;
         self.watch.give_up();
@@ -221,9 +222,9 @@ impl<T: Real> Sheet<T> {
         }
     }
 
-    /// Back to the checkpoint, with the substep of `halvings`.
+    /// Goes back to the checkpoint, with the substep of `halvings`.
     fn go_back(&mut self, halvings: u32) {
-        // A sheet that has none has nothing to go back from.
+        // Without a checkpoint there is nothing to go back to.
         let Some(checkpoint) = &self.checkpoint else { return };
         self.watch.give_up();
         self.steps = checkpoint.steps;
@@ -239,7 +240,7 @@ impl<T: Real> Sheet<T> {
         self.bench.take_work();
     }
 
-    /// Turns the state, which is one of the substep of `was` halvings, into one of the substep of `halvings`.
+    /// Converts the state from the substep of `was` halvings to that of `halvings`.
     fn halve(&mut self, was: u32, halvings: u32) {
         let [was, plan] = [was, halvings].map(|halvings| self.model.plan.divided(&self.model.scene, 1 << halvings));
         let springs = springs_of(&self.model, &was);
@@ -258,7 +259,8 @@ impl<T: Real> Sheet<T> {
         self.tell(tool, input);
     }
 
-    /// From the checkpoint to `steps` again, with shorter substeps, until all is well or they are the shortest.
+    /// Repeats from the checkpoint to `steps` with shorter substeps, until the checks pass or the substep is the
+    /// shortest.
     pub(super) fn mend(&mut self, steps: u64, mut cause: Cause) -> Result<(), BlowUp> {
         let inputs = std::mem::take(&mut self.inputs);
         let blow_up = |cause| BlowUp { step: steps, cause };
@@ -292,12 +294,12 @@ impl<T: Real> Sheet<T> {
     }
 }
 
-/// Displacements from here on are a blow-up: far beyond any tissue, and far below what f32 can square.
+/// Displacements beyond this are a blow-up: far beyond any tissue, and far below what f32 can square.
 pub(super) fn farthest_in_spacings(model: &Model) -> f64 {
     1e9 * model.scene.sheet.longer_side_m() / model.scene.sheet.spacing_m
 }
 
-/// A point that is not finite or beyond every bound, if there is one: its number.
+/// The number of a point that is not finite or beyond the bound, if there is one.
 pub(super) fn broken_point<T: Real>(model: &Model, layout: &Layout, state: &State<T>) -> Option<usize> {
     let farthest = T::of(farthest_in_spacings(model));
     let is_good = |field: &Field<T>, at: usize| field[at].is_finite() && field[at].magnitude() < farthest;
@@ -307,7 +309,7 @@ pub(super) fn broken_point<T: Real>(model: &Model, layout: &Layout, state: &Stat
     })
 }
 
-/// Turns a state of one substep into that of another: `from` and `to` are of the same scheme, `springs` of `from`.
+/// Converts a state from one substep to another: `from` and `to` are plans of the same scheme, `springs` of `from`.
 pub(super) fn convert<T: Real>(
     layout: &Layout,
     springs: &Springs<T>,
@@ -318,7 +320,7 @@ pub(super) fn convert<T: Real>(
 ) {
     let ratio = to.substep_s / from.substep_s;
     let points = layout.rows * layout.columns;
-    // All forces first: points are converted one by one, in place.
+    // Compute all forces first: points are converted one by one, in place.
     let forces: Vec<[T; 3]> = (0..points)
         .map(|index| springs.gather(layout, &state.u, [index / layout.columns, index % layout.columns]))
         .collect();
@@ -390,7 +392,7 @@ mod tests {
         sheet
     }
 
-    /// Largest difference of displacements and of velocities, each as a part of the largest.
+    /// Largest difference of displacements and of velocities, each as a fraction of the largest.
     fn apart(a: &Sheet<f64>, b: &Sheet<f64>) -> [f64; 2] {
         let (mut most, mut largest) = ([0.0_f64; 2], [0.0_f64; 2]);
         for index in 0..a.model.len() {

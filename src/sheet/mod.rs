@@ -1,6 +1,7 @@
-//! The tissue: an immutable model, a state, and the step that takes one to the next. No clock, no socket.
+//! The tissue: an immutable model, a state, and the step that advances it. No clock, no socket.
 
-/// Does something with the scheme of a plan, in format `$t`: what does not advance it, and needs no compensation.
+/// Runs code with the scheme of a plan in format `$t`, for uses that do not advance the scheme and need no
+/// compensation.
 macro_rules! with_scheme {
     ($plan:expr, $t:ty, |$scheme:ident| $body:expr) => {
         match &$plan.scheme {
@@ -82,23 +83,23 @@ use springs::Springs;
 use sweep::{Bench, MAX_KEPT};
 use tiles::{CHECK_STEPS, Tiles};
 
-/// One mass point at the end of a step: displacement, velocity, and the forces on the point. Where the applied
-/// force jumps it is the one just before; at step 0, just after.
+/// One mass point at the end of a step: displacement, velocity, and the forces on it. Where the applied force jumps,
+/// the value just before the jump; at step 0, just after.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PointState {
-    /// From rest, m.
+    /// Displacement from rest, m.
     pub displacement_m: DVec3,
-    /// m/s.
+    /// Velocity, m/s.
     pub velocity_m_per_s: DVec3,
-    /// Of all springs, N.
+    /// Force of all springs, N.
     pub spring_n: DVec3,
     /// −K″·u, N.
     pub virtual_n: DVec3,
     /// −C·v, N.
     pub damping_n: DVec3,
-    /// Of all tools that push, N.
+    /// Force of all pushing tools, N.
     pub applied_n: DVec3,
-    /// Of a prescribed point, the force that holds it: m·a − spring − virtual − damping − applied, N.
+    /// For a prescribed point, the force that holds it: m·a − spring − virtual − damping − applied, N.
     pub constraint_n: Option<DVec3>,
 }
 
@@ -120,71 +121,76 @@ pub struct Energy {
     pub virtual_j: f64,
 }
 
-/// What the guard could not mend.
+/// A failure that the guard could not repair.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BlowUp {
-    /// Steps done when it was found.
+    /// Steps done when the guard found it.
     pub step: u64,
-    /// What it was.
+    /// The cause.
     pub cause: Cause,
 }
 
-/// A sheet in motion, in whichever precision.
+/// A sheet in motion, in any precision.
 pub trait Tissue: Send {
-    /// What it was made from.
+    /// The model that it was made from.
     fn model(&self) -> &Arc<Model>;
     /// Steps done.
     fn step_count(&self) -> u64;
-    /// From the coming step on `tool` exerts `push`, or nothing.
+    /// From the coming step on `tool` exerts `push`, or no force.
     fn push(&mut self, tool: usize, push: Option<Push>);
     /// From the coming step on `tool` moves the point at `index`.
     fn grasp(&mut self, tool: usize, index: usize, grasp: Grasp);
-    /// From the coming step on `tool`, which meets the sheet with `tip`, is at `place_m` at the step's end.
+    /// From the coming step on `tool` meets the sheet with `tip` and is at `place_m` at the step's end.
     fn lead(&mut self, tool: usize, place_m: DVec3, tip: Tip);
-    /// What a tool that is led by its position does and feels.
+    /// The motion of a position-controlled tool and the force on it.
     fn feel(&self, tool: usize) -> Option<Feel>;
-    /// A copy of the sheet around such a tool, if it touches or holds: to compute the stiffness there.
+    /// A copy of the sheet around such a tool, if it touches or holds, to compute the stiffness there.
     fn surroundings(&self, tool: usize) -> Option<Surroundings>;
-    /// `tool` neither pushes nor grasps nor touches any more, from the coming step on.
+    /// From the coming step on `tool` no longer pushes, grasps or touches.
     fn release(&mut self, tool: usize);
-    /// From the coming step on springs, virtual springs and damping are those of `model` ([`Model::changed`] of this
-    /// one's). Displacements and velocities stay; all tiles wake.
+    /// From the coming step on springs, virtual springs and damping are those of `model` (from [`Model::changed`] of
+    /// this sheet's model). Displacements and velocities stay; all tiles wake.
     fn change(&mut self, model: &Arc<Model>);
-    /// Asks for a window of steps to be audited: it begins at the next checkpoint.
+    /// Requests an audit of a window of steps, which begins at the next checkpoint.
     fn watch(&mut self, inputs: Inputs);
-    /// What there is to tell of that window after a step, once.
+    /// Takes the report on that window after a step, once.
     fn take_mark(&mut self) -> Option<Mark>;
-    /// What [`Tissue::change`] would make of this, where `model` has another number format: a correction went over to f64.
+    /// The result of [`Tissue::change`] if `model` has another number format, as after a correction to f64.
     fn changed(&self, model: &Arc<Model>) -> Option<Box<dyn Tissue>>;
-    /// The scheme as it is now: the guard may have halved the substep of the model's.
+    /// The present scheme. The guard may have halved the model's substep.
     fn plan(&self) -> &Plan;
-    /// How often the guard went back to a checkpoint and on with half the substep.
+    /// How often the guard went back to a checkpoint and continued with half the substep.
     fn guard_events(&self) -> u64;
-    /// Substeps done, those that the guard repeated as well.
+    /// Substeps done, including those that the guard repeated.
     fn substeps_done(&self) -> u64;
     /// Points that a step computes now; the others are at rest.
     fn awake_points(&self) -> usize;
-    /// Whether a step changes nothing but the time, until a tool is told something.
+    /// Whether a step changes only the time, until a tool gets a command.
     fn is_still(&self) -> bool;
-    /// So many steps at once, of a sheet that is still: the same as to step so often.
+    /// Skips `steps` steps of a still sheet. The result is the same as that of single steps.
     fn skip_steps(&mut self, steps: u64);
-    /// Of all points in all substeps, the part that was computed.
+    /// The fraction of all points in all substeps that was computed.
     fn computed_fraction(&self) -> f64;
-    /// One step. After a blow-up the state is that of the last checkpoint, which is finite.
+    /// Advances one step.
+    ///
+    /// # Errors
+    /// Returns a blow-up that the guard could not repair. The state is then that of the last checkpoint, which is
+    /// finite.
     fn step(&mut self) -> Result<(), BlowUp>;
     /// The point at `index`.
     fn point(&self, index: usize) -> PointState;
-    /// A pass over what is awake; sleeping tiles keep what they have. The same whoever asked before.
+    /// The energies. A pass over what is awake; sleeping tiles use cached values. Earlier calls do not affect the
+    /// result.
     fn energy(&self) -> Energy;
     /// Length of the largest displacement, m.
     fn largest_displacement_m(&self) -> f64;
-    /// Writes the displacements, m, x, y and z apart.
+    /// Writes the displacements, m, with x, y and z in separate vectors, points by rows.
     fn displacements_m(&self, into: &mut [Vec<f32>; 3]);
-    /// XXH3-128 of the state of every point: displacement, increment, and what the scheme keeps beside.
+    /// XXH3-128 of the state of every point: displacement, increment, and the scheme's kept values.
     fn state_hash(&self) -> u128;
 }
 
-/// A sheet at rest.
+/// Creates a sheet at rest.
 pub fn at_rest(model: &Arc<Model>) -> Box<dyn Tissue> {
     match model.precision {
         Precision::F64 => Box::new(Sheet::<f64>::new(model)),
@@ -195,7 +201,7 @@ pub fn at_rest(model: &Arc<Model>) -> Box<dyn Tissue> {
 #[derive(Debug)]
 struct Sheet<T: Real> {
     model: Arc<Model>,
-    /// The model's, or with a shorter substep.
+    /// The model's plan, or one with a shorter substep.
     plan: Plan,
     halvings: u32,
     bench: Bench<T>,
@@ -205,17 +211,17 @@ struct Sheet<T: Real> {
     contacts: Contacts,
     steps: u64,
     work: Work,
-    /// None: the state as it is. A sheet at rest needs no second one.
+    /// `None` means the present state. A sheet at rest needs no copy.
     checkpoint: Option<Arc<Checkpoint<T>>>,
-    /// What the tools were told since the checkpoint: before which step, which tool.
+    /// The inputs of the tools since the checkpoint: step they precede, tool, input.
     inputs: Vec<(u64, usize, Input)>,
     watch: Watch,
-    /// The beginning of the window is to be told.
+    /// Whether the beginning of the window is still to be reported.
     is_marked: bool,
     tiles: Tiles<T>,
     guard_events: u64,
     substeps_done: u64,
-    /// Points computed, of all substeps.
+    /// Points computed, summed over all substeps.
     points_done: u64,
 }
 
@@ -265,7 +271,7 @@ impl<T: Real> Sheet<T> {
         }
     }
 
-    /// From `moment` to the fraction `end` of the same step.
+    /// Advances from `moment` to the fraction `end` of the same step.
     fn substep(&mut self, moment: Moment, end: f64) {
         let far = rest::farthest_unnoticed(&self.model, &self.tiles);
         self.tiles.watch(&self.state.u, far);
@@ -283,7 +289,7 @@ impl<T: Real> Sheet<T> {
                 bench.advance(&central::Advance::new(two), state, &applied.terms, 0, region);
             }
             Scheme::Multistep(multistep) => {
-                // The change is to what the substep begins with.
+                // The change applies to the substep's initial state.
                 for (index, change) in &released {
                     shift(&layout, state, *index, change);
                 }
@@ -295,13 +301,13 @@ impl<T: Real> Sheet<T> {
                                 let scheme = exponential::Advance::<T, $order, $with>::new(multistep);
                                 bench.advance(&scheme, state, &applied.terms, 0, region);
                             })*
-                            // `Scheme::fit` makes no others.
+                            // `Scheme::fit` makes no other combination.
                             _ => {}
                         }
                     };
                 }
                 advance!((2, false)(3, false)(4, false)(2, true)(3, true)(4, true));
-                // The newest force is where the oldest was.
+                // The newest force takes the place of the oldest.
                 state.kept[..multistep.order].rotate_right(1);
             }
             Scheme::Rk4 { a, g } => {
@@ -319,7 +325,7 @@ impl<T: Real> Sheet<T> {
             }
         }
         if self.plan.scheme.takes_means() {
-            // The change is to the substep's increment.
+            // The change applies to the substep's increment.
             for (index, change) in &released {
                 shift(&layout, &mut self.state, *index, change);
             }
@@ -330,7 +336,7 @@ impl<T: Real> Sheet<T> {
         self.meet(end);
     }
 
-    /// Of 1 in the fields of the tools' force along 1 in u.
+    /// The work of a force of 1 in the fields of the tools along a displacement of 1, J.
     fn unit_of_work_j(&self) -> f64 {
         let Sheet { model, plan, .. } = self;
         model.scene.sheet.spacing_m / (plan.scheme.impulse() * plan.force_scale(&model.scene))

@@ -1,4 +1,4 @@
-//! Points that do not move freely: fixed ones, and those that a tool has grasped.
+//! Points that do not move freely: fixed points and grasped points.
 
 use glam::DVec3;
 
@@ -8,7 +8,7 @@ use super::model::Model;
 use super::real::Real;
 use crate::scene::law::{Moment, Motion, MoveLaw};
 
-/// How a tool moves the point that it has grasped.
+/// How a tool moves its grasped point.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Grasp {
     /// To this displacement by the end of the step, at constant velocity; then it stays.
@@ -23,9 +23,9 @@ struct Grasped {
     tool: usize,
     index: usize,
     grasp: Grasp,
-    /// At the end of the last step.
+    /// The motion at the end of the last step.
     now: Motion,
-    /// A step was done since it was grasped.
+    /// Whether a step was done since the grasp.
     held: bool,
 }
 
@@ -33,7 +33,7 @@ struct Grasped {
 #[derive(Debug, Clone)]
 pub(super) struct Prescribed {
     grasped: Vec<Grasped>,
-    /// Points let go, and the velocity that they had, until the coming substep.
+    /// Released points and their velocities, until the coming substep.
     released: Vec<(usize, DVec3)>,
 }
 
@@ -42,13 +42,13 @@ impl Prescribed {
         Prescribed { grasped: Vec::new(), released: Vec::new() }
     }
 
-    /// No point is grasped, and none was let go just now.
+    /// Whether no point is grasped and none was released just now.
     pub(super) fn is_empty(&self) -> bool {
         self.grasped.is_empty() && self.released.is_empty()
     }
 
-    /// From the coming step on `tool` moves the point at `index`, which now moves like `now`, and lets go what it had
-    /// before. A point that another tool has is taken over.
+    /// From the coming step on `tool` moves the point at `index`, which now moves like `now`, and releases the point it
+    /// held before. A point that another tool holds is taken over.
     pub(super) fn grasp(&mut self, tool: usize, index: usize, grasp: Grasp, now: Motion) {
         if let Some(place) = self.grasped.iter().position(|g| g.index == index) {
             let taken = Grasped { tool, grasp, ..self.grasped.remove(place) };
@@ -63,22 +63,22 @@ impl Prescribed {
         self.grasped.push(Grasped { tool, index, grasp, now, held: false });
     }
 
-    /// `tool` lets go. The point goes on with the velocity that it has.
+    /// `tool` releases its point. The point keeps its velocity.
     pub(super) fn release(&mut self, tool: usize) {
         let Some(place) = self.grasped.iter().position(|g| g.tool == tool) else { return };
         let grasped = self.grasped.remove(place);
-        // What was grasped and let go at the same boundary was never held.
+        // A point that was grasped and released at the same boundary was never held.
         if grasped.held {
             self.released.push((grasped.index, grasped.now.velocity_m_per_s));
         }
     }
 
-    /// The points let go since the last call, and their velocities, m/s.
+    /// The points released since the last call, and their velocities, m/s.
     pub(super) fn take_released(&mut self) -> Vec<(usize, DVec3)> {
         std::mem::take(&mut self.released)
     }
 
-    /// The grasped points where they are at `fraction` of step `step`: index, displacement and velocity.
+    /// The grasped points at `fraction` of step `step`: index, displacement and velocity.
     #[allow(clippy::cast_precision_loss)]
     pub(super) fn at(&self, model: &Model, step: u64, fraction: f64) -> impl Iterator<Item = (usize, DVec3, DVec3)> {
         let rate_hz = model.scene.stepping.rate_hz;
@@ -121,7 +121,7 @@ impl Prescribed {
         self.grasped.iter().map(|grasped| (grasped.index, grasped.now))
     }
 
-    /// How a point is made to move, if it is: at the end of the last step.
+    /// The imposed motion of a point at the end of the last step, if it has one.
     pub(super) fn motion(&self, model: &Model, index: usize) -> Option<Motion> {
         let fixed = || model.fixed.binary_search(&index).is_ok().then(Motion::default);
         self.grasped.iter().find(|g| g.index == index).map(|g| g.now).or_else(fixed)
@@ -129,7 +129,7 @@ impl Prescribed {
 }
 
 impl<T: Real> Sheet<T> {
-    /// Puts the grasped points where they are at `fraction` of the step, and counts the work of that if it is `counted`.
+    /// Puts the grasped points at their places at `fraction` of the step, and counts the work if `counted`.
     pub(super) fn hold(&mut self, step: u64, fraction: f64, counted: bool) {
         let unit_j = self.unit_of_work_j();
         let Sheet { model, plan, bench, state, prescribed, work, .. } = self;
@@ -141,7 +141,7 @@ impl<T: Real> Sheet<T> {
                 let (free_u, free_d) = (state.u[at], state.d[at]);
                 state.u[at] = T::of(displacement_m[c] / spacing_m);
                 state.d[at] = if plan.scheme.takes_means() {
-                    // What the scheme has just done is undone: the increment is from where the point was before.
+                    // Undo the scheme's own movement: the increment starts from where the point was before.
                     state.u[at] - (free_u - free_d)
                 } else {
                     T::of(velocity_m_per_s[c] * plan.substep_s / spacing_m)
@@ -154,15 +154,16 @@ impl<T: Real> Sheet<T> {
         }
     }
 
-    /// What to add to u and d of a point that is let go with `velocity`, so that it goes on smoothly.
+    /// The change of u and d of a point that is released with `velocity`, so that it continues smoothly.
     ///
-    /// To a two-step scheme, that is a jump: before it the whole force on the point, damping left out, was m·a + C·v with
-    /// the a and v of the tool; after it, it is F = spring + applied − K″·u. At a jump such a scheme needs the mean of both
-    /// (see `applied`), and it uses F with the mean of the applied force. The tool moved at constant velocity, so a = 0:
-    /// the point gets ½(C·v + F) less that. In terms of the increment, q times the difference.
+    /// For a two-step scheme, a release is a jump: before it the whole force on the point without damping was m·a + C·v
+    /// with the tool's a and v; after it, the force is F = spring + applied − K″·u. At a jump such a scheme needs the
+    /// mean of both (see `applied`), and it uses F with the mean of the applied force. The tool moved at constant
+    /// velocity, so a = 0: the point gets ½(C·v + F) less that. In terms of the increment, this is q times the
+    /// difference.
     ///
-    /// To a multistep scheme, u and d are predictions that the next substep corrects; those of the tool are right as they
-    /// are, so the correction is taken off.
+    /// For a multistep scheme, u and d are predictions that the next substep corrects. The tool's values are already
+    /// right, so the correction is subtracted.
     pub(super) fn change_at_release(&self, index: usize, velocity_m_per_s: DVec3, moment: Moment) -> [[f64; 2]; 3] {
         let Sheet { model, plan, bench, state, applied, .. } = self;
         let springs = bench.springs.gather(&bench.layout, &state.u, model.point_of(index)).map(Real::wide);

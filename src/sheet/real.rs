@@ -7,7 +7,7 @@ use super::audit::SharedCheckpoint;
 use super::guard::Checkpoint;
 use super::lanes::Vector;
 
-/// f32 or f64. Only operations that IEEE 754 rounds exactly, so that the bits do not depend on the machine.
+/// f32 or f64. Only operations that IEEE 754 rounds exactly, so the bits do not depend on the machine.
 pub(super) trait Real:
     Copy
     + Default
@@ -33,32 +33,32 @@ pub(super) trait Real:
     /// The vector of NEON.
     #[cfg(target_arch = "aarch64")]
     type Neon: Vector<Real = Self>;
-    /// As many bits.
+    /// An integer with the same number of bits.
     type Bits;
-    /// Terms of [`Real::SERIES`], even.
+    /// Number of terms of [`Real::SERIES`], even.
     const TERMS: usize;
-    /// The polynomial in q that is nearest to (1 − 1/√(1 + q))/q on |q| ≤ 1/8, relative to it: within 5.2e-8 (degree 5)
-    /// for f32, 9e-18 (degree 13) for f64. From the exchange algorithm of Remez.
+    /// The polynomial in q nearest to (1 − 1/√(1 + q))/q on |q| ≤ 1/8 in relative error: within 5.2e-8 (degree 5) for
+    /// f32, 9e-18 (degree 13) for f64. From the Remez exchange algorithm.
     const SERIES: [f64; 14];
-    /// Where −c·r of a poke is below this, its force is left out. What is left out is (1 + |c·r|)·e^−|c·r| of the whole:
-    /// e^−34.5 = 1e-15 of the force at the centre for f64, which is below what the worst sum loses; e^−22 for f32.
+    /// A poke's force is omitted where −c·r is below this. The omitted part is (1 + |c·r|)·e^−|c·r| of the whole:
+    /// e^−34.5 = 1e-15 of the force at the centre for f64, less than the worst sum loses; e^−22 for f32.
     const NEGLIGIBLE_EXPONENT: f64;
-    /// The smallest number whose square is not below the normal range. What is smaller counts as 0 in the state of a sheet.
+    /// The smallest number whose square is a normal number. Smaller values count as 0 in the state of a sheet.
     const LEAST: f64;
-    /// The bits that a number has, one of them at least, from [`Real::LEAST`] on: the two highest of its exponent.
+    /// Numbers from [`Real::LEAST`] on have at least one of these bits: the two highest of the exponent.
     const LEAST_BITS: Self::Bits;
-    /// The smallest |Q| of a spring that pulls: half of it is a strain. What it pulls across its own direction is a product of
-    /// its Q and a difference of displacements, and seldom below the normal range then.
+    /// The smallest |Q| of a spring that pulls; half of it is a strain. The force across the spring's direction is a
+    /// product of Q and a difference of displacements, and with this bound it is seldom subnormal.
     const LEAST_EXCESS: f64;
-    /// Far below any Q that counts, and its square; far above what is below the normal range.
+    /// Far below any Q that counts, and its square; far above the subnormal range.
     const FAINT: f64;
-    /// Nearest value of a f64.
+    /// The nearest value to an f64.
     fn of(value: f64) -> Self;
-    /// The same value as a f64.
+    /// The same value as an f64.
     fn wide(self) -> f64;
-    /// 1.5 times the bits of 1, less what makes the rough inverse root's error smallest.
+    /// 1.5 times the bits of 1, minus the constant that makes the error of the rough inverse root smallest.
     const INVERSE_ROOT: Self::Bits;
-    /// Steps of Newton's method from there to a few parts in 10⁶ (f32) or 10¹¹ (f64).
+    /// Newton steps from there to a few parts in 10⁶ (f32) or 10¹¹ (f64).
     const NEWTON: usize;
     /// 1/√self within 4 %.
     fn rough_inverse_root(self) -> Self;
@@ -68,11 +68,11 @@ pub(super) trait Real:
     const UNIT: f64;
     /// The number whose last digit is 1, and the exponent's bias.
     const POWER: f64;
-    /// 2^self, for whole numbers.
+    /// 2^self, for integers.
     fn power_of_two(self) -> Self;
-    /// ln 2 in two parts: the first has zeros enough at its end that a whole number times it is exact.
+    /// ln 2 in two parts: the first ends in enough zeros that its product with an integer is exact.
     const LN_2: [f64; 2];
-    /// Of the polynomial of e^r, |r| ≤ ½ln 2.
+    /// Degree of the polynomial of e^r, |r| ≤ ½ln 2.
     const EXPONENTIAL_DEGREE: usize;
     /// Square root, correctly rounded.
     fn root(self) -> Self;
@@ -82,7 +82,7 @@ pub(super) trait Real:
     fn magnitude(self) -> Self;
     /// Neither infinite nor NaN.
     fn is_finite(self) -> bool;
-    /// Writes the bytes of the value, little-endian, to as many.
+    /// Writes the value's bytes, little-endian, to `bytes`, which has the value's size.
     fn write(self, bytes: &mut [u8]);
     /// A checkpoint in this format.
     fn shared(checkpoint: Arc<Checkpoint<Self>>) -> SharedCheckpoint;

@@ -1,6 +1,6 @@
 //! The part of a sheet that a sweep goes over: whole tiles, and the strips of rows and columns that cover them.
 //!
-//! Everything costs what is in it, not what is in the sheet.
+//! Every operation costs as much as the part holds, not as much as the sheet.
 
 use std::ops::Range;
 
@@ -9,12 +9,12 @@ use super::field::{BLOCK, Layout};
 /// Points along a side of a tile.
 pub(super) const TILE: usize = BLOCK;
 
-/// Tiles along so many points.
+/// Number of tiles that cover `points` points.
 pub(super) fn tiles(points: usize) -> usize {
     points.div_ceil(TILE)
 }
 
-/// A set of tiles: to go through it or to empty it costs what is in it, whatever the size of the sheet.
+/// A set of tiles. Iterating and clearing cost as much as the set holds, whatever the size of the sheet.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Marks {
     pub(super) members: Vec<usize>,
@@ -26,7 +26,7 @@ impl Marks {
         Marks { members: Vec::new(), has: vec![false; count] }
     }
 
-    /// Adds a tile; whether it is new.
+    /// Adds a tile. Returns whether it is new.
     pub(super) fn add(&mut self, tile: usize) -> bool {
         let new = !std::mem::replace(&mut self.has[tile], true);
         if new {
@@ -48,9 +48,9 @@ impl Marks {
 /// Part of a sheet that a sweep goes over.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Region {
-    /// In the order in which a sweep may take them: none reads what one before it has overwritten.
+    /// Ordered for the sweep: no strip reads what an earlier strip has overwritten.
     pub(super) strips: Vec<Strip>,
-    /// [`Region::cover`] puts the members in order, and takes those out that are no longer.
+    /// [`Region::cover`] sorts the members and removes those that are no longer awake.
     pub(super) awake: Marks,
     /// Tiles along y.
     columns: usize,
@@ -62,23 +62,23 @@ pub(super) struct Strip {
     pub(super) rows: Range<usize>,
     /// Whole tiles, the last of which may reach beyond the sheet.
     pub(super) columns: Range<usize>,
-    /// All of it is awake.
+    /// Whether all of it is awake.
     pub(super) awake: bool,
 }
 
 impl Region {
-    /// No tile of a sheet.
+    /// A region without tiles.
     pub(super) fn none(layout: &Layout) -> Self {
         let columns = tiles(layout.columns);
         Region { strips: Vec::new(), awake: Marks::none_of(tiles(layout.rows) * columns), columns }
     }
 
-    /// The tiles that are awake, rising.
+    /// The awake tiles, ascending.
     pub(super) fn tiles(&self) -> &[usize] {
         &self.awake.members
     }
 
-    /// Makes the strips those of the tiles that are awake; springs reach `reach` rows on.
+    /// Makes the strips cover the awake tiles; springs reach `reach` rows on.
     pub(super) fn cover(&mut self, layout: &Layout, reach: usize) {
         let Region { strips, awake, columns } = self;
         let Marks { members, has } = awake;
@@ -95,7 +95,7 @@ impl Region {
         };
         let mut next = 0;
         for tile in members.iter() {
-            // The last rows above a tile begin springs that pull at it.
+            // Springs that begin in the last rows above a tile pull at it.
             for row in (tile / *columns).saturating_sub(1).max(next)..=tile / *columns {
                 let (own, below) = (row_of(row), row_of(row + 1));
                 let rows = row * TILE..((row + 1) * TILE).min(layout.rows);
@@ -107,7 +107,7 @@ impl Region {
         }
     }
 
-    /// Whether all of it is memory of such a sheet: strips may reach beyond its columns, but not beyond its rows.
+    /// Whether the strip lies within the memory of `layout`: it may reach beyond the columns, but not beyond the rows.
     pub(super) fn is_within(&self, layout: &Layout) -> bool {
         let is_within =
             |strip: &Strip| strip.rows.end <= layout.rows && strip.columns.end <= tiles(layout.columns) * TILE;
@@ -121,7 +121,7 @@ impl Region {
     }
 }
 
-/// Adds the strips over `rows` of two rows of tiles, rising, joined where they meet. The first is awake there.
+/// Adds the strips over `rows` of two ascending rows of tiles, joined where they meet. The first row is awake.
 fn push_strips(strips: &mut Vec<Strip>, rows: Range<usize>, columns: usize, [mut own, mut below]: [&[usize]; 2]) {
     if rows.is_empty() {
         return;
@@ -143,7 +143,7 @@ fn push_strips(strips: &mut Vec<Strip>, rows: Range<usize>, columns: usize, [mut
             _ => strips.push(Strip { rows: rows.clone(), columns: from..from + TILE, awake }),
         }
     }
-    // A strip that goes on below the one before it is the same strip.
+    // A strip that continues the one above is merged with it.
     if let [.., above, below] = &mut strips[..]
         && (above.rows.end, &above.columns, above.awake) == (below.rows.start, &below.columns, below.awake)
     {
@@ -184,7 +184,7 @@ mod tests {
                 };
                 for i in 0..layout.rows {
                     for j in 0..layout.columns {
-                        // The last rows above an awake tile begin springs that pull at it.
+                        // Springs that begin in the last rows above an awake tile pull at it.
                         let above = (1..=reach).any(|k| i + k < layout.rows && is_awake(i + k, j));
                         let needed = is_awake(i, j) || above && i % TILE + reach >= TILE;
                         assert_eq!(of(i, j).count(), usize::from(needed), "{awake:?} {reach}: {i}, {j}");
@@ -192,7 +192,8 @@ mod tests {
                         assert_eq!(region.is_awake(i, j), is_awake(i, j));
                     }
                 }
-                // None reads what one before it has overwritten: of its points, and of those that its springs reach.
+                // No strip reads what an earlier strip has overwritten: its own points, and those that its springs
+                // reach.
                 for (index, strip) in region.strips.iter().enumerate() {
                     let rows = strip.rows.start..(strip.rows.end + reach).min(layout.rows);
                     let columns = strip.columns.start.saturating_sub(reach)..strip.columns.end + reach;

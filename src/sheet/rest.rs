@@ -1,4 +1,4 @@
-//! How a sheet puts tiles to sleep, and what wakes them: the physics of `tiles`.
+//! How a sheet puts tiles to sleep and what wakes them: the physics behind `tiles`.
 
 use super::integrate::Oscillator;
 use super::real::Real;
@@ -7,20 +7,20 @@ use super::tiles::Tiles;
 use super::{Energy, Model, Sheet, central, exponential, rk4};
 use crate::scene::Precision;
 
-/// The tolerance of a model's tiles. Without virtual springs nothing bounds how far a force left out would move a sheet: then
-/// only what does not move at all may sleep.
+/// The tolerance of a model's tiles. Without virtual springs nothing bounds how far an omitted force would move a
+/// sheet, so then only what does not move at all may sleep.
 pub(super) fn tolerance(model: &Model) -> f64 {
     let bounded = model.scene.virtual_stiffness_n_per_m > 0.0;
     if bounded { model.sleep_tolerance } else { model.sleep_tolerance.min(f64::MIN_POSITIVE) }
 }
 
-/// ε_w, spacings.
+/// ε_w, in spacings.
 pub(super) fn farthest_unnoticed<T: Real>(model: &Model, tiles: &Tiles<T>) -> f64 {
     let (epsilon, scene) = (tiles.epsilon(), &model.scene);
     let ratio = scene.virtual_stiffness_n_per_m / scene.springs.stiffness_n_per_m;
     // Without springs nothing passes from tile to tile.
     let unnoticed = if ratio.is_nan() { epsilon } else { epsilon * (20.0 * ratio).clamp(0.1, 1.0) };
-    // Nobody notices a last digit.
+    // A difference in the last digit is rounding noise.
     if scene.virtual_stiffness_n_per_m > 0.0 { unnoticed.max(T::EPSILON * tiles.largest) } else { unnoticed }
 }
 
@@ -30,7 +30,7 @@ impl<T: Real> Sheet<T> {
         let Sheet { model, applied, tiles, steps, .. } = self;
         let spacing_m = model.scene.sheet.spacing_m;
         for touch in applied.changes(model, *steps) {
-            // No force moves its centre less than if all springs held it.
+            // No force moves its centre less than it would if all springs held the centre.
             let stiffness = model.omega_bound_per_s.powi(2) * model.scene.sheet.point_mass_kg;
             if stiffness > 0.0 {
                 tiles.largest = tiles.largest.max(touch.peak_n() / (stiffness * spacing_m));
@@ -40,8 +40,8 @@ impl<T: Real> Sheet<T> {
         }
     }
 
-    /// The energies of the whole sheet: of what is awake, and of springs and virtual springs of the tiles that sleep. Those
-    /// follow from where their points are, so that it does not matter when they were found.
+    /// The energies of the whole sheet: the awake part, and the springs and virtual springs of sleeping tiles. The
+    /// latter follow from the positions of their points alone, so it does not matter when they were computed.
     pub(super) fn energies(&self) -> Energy {
         let Sheet { plan, bench, state, tiles, .. } = self;
         let (_, mut energy, _) = self.survey(&tiles.region);
@@ -61,25 +61,26 @@ impl<T: Real> Sheet<T> {
         energy
     }
 
-    /// Puts tiles that are calm to sleep.
+    /// Puts calm tiles to sleep.
     pub(super) fn rest(&mut self) {
         if !self.tiles.may_sleep() || self.tiles.region.tiles().is_empty() {
             return;
         }
         let Sheet { model, plan, bench, state, tiles, prescribed, contacts, applied, .. } = self;
         let spacing_m = model.scene.sheet.spacing_m;
-        // What a tool holds or touches goes on being computed.
+        // Tiles under a tool that holds or touches stay awake.
         let grasped = prescribed.grasped().map(|(index, _)| model.point_of(index));
         let held: Vec<usize> = grasped.chain(contacts.points()).map(|point| tiles.of(point)).collect();
         for (_, motion) in prescribed.grasped() {
             tiles.largest = tiles.largest.max(motion.displacement_m.length() / spacing_m);
         }
-        // In the scheme's units: of forces, and of velocities.
+        // In the scheme's units of force and velocity.
         let sheet = Oscillator::of(&model.scene);
         let (pull, drag) = sheet.scaled(plan.substep_s);
-        // A displacement is known to half its last digit. What the springs make of that is no force that moves anything: it
-        // differs from point to point, and a point between its neighbours gives way by as little. Nor does anything move
-        // by less than that digit in a substep, unless what is lost is kept. (Without virtual springs all may matter.)
+        // A displacement is known to half its last digit. The spring force that this rounding causes moves nothing: it
+        // differs from point to point, and a point between its neighbours gives way by as little. Nor does a substep
+        // move anything by less than that digit, unless the scheme keeps the rounding loss. (Without virtual springs
+        // all of it may matter.)
         let half_digit = if pull > 0.0 { 0.5 * T::EPSILON } else { 0.0 };
         let creep = if model.precision == Precision::Compensated { 0.0 } else { half_digit };
         let unknown = half_digit * sheet.scaled_spring_stiffness(plan.substep_s) + creep * drag;

@@ -7,28 +7,28 @@
 //! force on a = k(1 − L0/L)(x_b − x_a) = k·q/(s(1 + s))·(D0 + Δ),  energy = ½k(L − L0)² = ½k·L0²·(q/(1 + s))².
 //!
 //! For |q| ≤ 1/8 (strains up to 6 %), q/(s(1 + s)) is q times a polynomial that is exact to the last bits; beyond, it
-//! comes from 1/s ([`Kind::far`]). Which of the two is a matter of the one spring alone, so every width of vectors agrees.
+//! comes from 1/s ([`Kind::far`]). The choice depends on that spring alone, so every vector width agrees.
 
 use super::field::Layout;
 use super::lanes::{Plain, Vector};
 use super::model::Model;
 use super::real::Real;
 
-/// Least 1 + q = (L/L0)². A spring pressed to no length at all has no direction; below a millionth of its rest
-/// length its force fades to 0 in proportion to its length, so that nothing divides by 0.
+/// Least 1 + q = (L/L0)². A spring pressed to zero length has no direction. Below a millionth of its rest length its
+/// force fades to 0 in proportion to its length, so nothing divides by 0.
 const LEAST_LENGTH_SQUARED: f64 = 1e-12;
 
-/// Up to which |q| the polynomial holds.
+/// The largest |q| for which the polynomial holds.
 const NEAR: f64 = 0.125;
 
 /// Springs of the same rest length and stiffness.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Kind<T> {
-    /// k times the factor that makes forces what the scheme adds up.
+    /// k times the factor that puts forces in the scheme's units.
     stiffness: T,
-    /// Of Q, for the stiffness times (1 − L0/L)/Q.
+    /// Polynomial in Q for the stiffness times (1 − L0/L)/Q.
     series: [T; 14],
-    /// The largest |Q| of the polynomial.
+    /// The largest |Q| for which the polynomial holds.
     near: T,
     /// 1/L0².
     per_length_squared: T,
@@ -50,14 +50,14 @@ impl<T: Real> Kind<T> {
         }
     }
 
-    /// Where [`Kind::near`] does not hold; of the magnitude of Q.
+    /// Lanes where [`Kind::near`] does not hold, given the magnitude of Q.
     #[inline(always)]
     pub(super) fn is_far<V: Vector<Real = T>>(&self, magnitude: V) -> V::Mask {
         magnitude.above(magnitude.splat(self.near))
     }
 
-    /// Stiffness × (1 − L0/L) for small Q: even and odd powers apart, which halves the wait of each for the last. A
-    /// spring that is strained too little to count does not pull: at rest, the force is exactly 0.
+    /// Stiffness × (1 − L0/L) for small Q. Even and odd powers are summed apart, which halves the dependency chain. A
+    /// spring whose strain is too small to count does not pull: at rest, the force is exactly 0.
     #[inline(always)]
     pub(super) fn near<V: Vector<Real = T>>(&self, excess: V) -> V {
         self.series(excess).keep(Self::counts(excess))
@@ -85,16 +85,16 @@ impl<T: Real> Kind<T> {
         odd.mul_add(excess, even).mul(excess)
     }
 
-    /// Stiffness × (1 − L0/L) for any Q, best away from 0: with r near 1/s, e = 1 − r²(1 + q) is small, and
-    /// 1 − 1/s = (1 − r) − r·e/2 but for e², where 1 − r is exact for r from ½ to 2. A rough r from the bits of the number
-    /// and a few steps of Newton's method are a quarter of the price of a root and a division, which have no vectors as
-    /// wide as they seem.
+    /// Stiffness × (1 − L0/L) for any Q, most accurate away from 0: with r near 1/s, e = 1 − r²(1 + q) is small, and
+    /// 1 − 1/s = (1 − r) − r·e/2 up to e², where 1 − r is exact for r from ½ to 2. A rough r from the bits of the number
+    /// and a few Newton steps cost a quarter of a root and a division, whose throughput does not grow with the vector
+    /// width.
     #[inline(always)]
     pub(super) fn far<V: Vector<Real = T>>(&self, excess: V) -> V {
         let (one, half) = (excess.splat(T::of(1.0)), excess.splat(T::of(0.5)));
         let q = excess.mul(excess.splat(self.per_length_squared));
         let sum = one.add(q);
-        // What the sum lost.
+        // The rounding error of the sum.
         let rest = q.sub(sum.sub(one));
         let square = sum.larger(excess.splat(T::of(LEAST_LENGTH_SQUARED)));
         let mut r = square.rough_inverse_root();
@@ -106,7 +106,7 @@ impl<T: Real> Kind<T> {
         excess.splat(self.stiffness).mul(one.sub(r).minus(half.mul(r), e))
     }
 
-    /// Stiffness × (1 − L0/L), by whichever holds for the lane.
+    /// Stiffness × (1 − L0/L), by the form that holds for each lane.
     #[inline(always)]
     pub(super) fn weight<V: Vector<Real = T>>(&self, excess: V) -> V {
         let far = excess.beyond(excess.splat(self.near));
@@ -152,7 +152,7 @@ impl<T: Real> Springs<T> {
         }
     }
 
-    /// The force of all springs on the point [i, j], gathered: for the few points that somebody asks about.
+    /// The force of all springs on the point [i, j], gathered: for the few points that a caller asks about.
     pub(super) fn gather(&self, layout: &Layout, u: &[T], [i, j]: [usize; 2]) -> [T; 3] {
         let mut sum = [T::default(); 3];
         let at = |i: usize, j: usize, c: usize| u[c * layout.plane + i * layout.stride + j];

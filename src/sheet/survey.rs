@@ -1,9 +1,10 @@
-//! A look at the sheet, by a sweep that advances nothing: energies, the largest displacement, and by how much the
-//! springs' force differs from what its history foretold.
+//! A survey of the sheet by a sweep that advances nothing: energies, the largest displacement, and how far the springs'
+//! force is from the force that its history predicts.
 //!
-//! Sums are taken apart for each of 16 columns, row by row, so that they too are the same at every width.
+//! Sums are kept apart for each of 16 columns, row by row, so that they too are the same at every width.
 #![allow(unsafe_code)]
-// Iterators over vectors are not always inlined, and then run without the instructions of their caller: ten times slower.
+// The compiler does not always inline iterators over vectors. They then run without the caller's instructions, ten
+// times slower.
 #![allow(clippy::needless_range_loop)]
 
 use std::cell::UnsafeCell;
@@ -16,30 +17,30 @@ use super::region::Region;
 use super::sweep::{Bench, MAX_KEPT, Scheme, Stage};
 use super::{Energy, Sheet, central, exponential, rk4};
 
-/// What was seen, in the scheme's units (`integrate`).
+/// The result of a survey, in the scheme's units (`integrate`).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Survey {
     /// Σ w².
     pub(super) speed_squared: f64,
-    /// The same, as it enters the energy that the scheme keeps.
+    /// The same, in the form that the scheme's conserved energy uses.
     pub(super) vigour: f64,
     /// Σ u².
     pub(super) displacement_squared: f64,
-    /// Of all springs.
+    /// Energy of all springs.
     pub(super) spring_energy: f64,
     /// The largest component of any displacement.
     pub(super) largest: f64,
-    /// The largest difference of a corrected displacement and the predicted one.
+    /// The largest difference between a corrected displacement and the predicted one.
     pub(super) surprise: f64,
     /// The largest component of any w.
     pub(super) speed: f64,
-    /// The largest component of the force that any free point is short of balance: N − a·u + F.
+    /// The largest component of the force imbalance of any free point: N − a·u + F.
     pub(super) imbalance: f64,
     /// Σ F·d of the tools.
     pub(super) power: f64,
 }
 
-/// The sums: w², u², spring energy, vigour, F·d; and the maxima.
+/// The sums w², u², spring energy, vigour, F·d; and the maxima.
 #[derive(Debug)]
 struct Sums<T> {
     row: [[T; BLOCK]; 5],
@@ -47,56 +48,56 @@ struct Sums<T> {
     largest: [[T; BLOCK]; 4],
 }
 
-/// What acts on a state beside the springs, in their units.
+/// The forces on a state other than the springs', and how to scale them to the springs' units.
 #[derive(Clone, Copy)]
 pub(super) struct Forces<'a, T: Real> {
-    /// Of the tools.
+    /// The tools' forces.
     pub(super) terms: &'a [Term<T>],
-    /// Which of their fields.
+    /// The field of the terms to use.
     pub(super) field: usize,
-    /// What turns it into the springs' units.
+    /// The factor that converts that field to the springs' units.
     pub(super) part: f64,
-    /// a: of the virtual springs.
+    /// a, from the virtual springs.
     pub(super) pull: f64,
 }
 
-/// What a look leaves behind.
+/// What a survey writes to the state.
 #[derive(Clone, Copy, PartialEq)]
 pub(super) enum Write {
-    /// All as it was.
+    /// The state stays as it is.
     Nothing,
-    /// Rest: no motion, and the present force of the springs for a past.
+    /// A state of rest: no motion, and the present spring force as the whole history.
     Rest,
-    /// In place of what the scheme keeps to advance by, u and w as they are seen.
+    /// Replaces the scheme's internal values by the observed u and w.
     Seen,
-    /// Out of u and w as they are seen, what the scheme advances by, as if the present force of the springs had always
-    /// been there. (Of a two-step scheme, w is half a change ahead of d: d = w − (next − w)/2, and what it shows of a state
-    /// is (d + next)/2.)
+    /// Replaces the observed u and w by the scheme's internal values, as if the springs had always pulled as they do
+    /// now. (In a two-step scheme, w is half a change ahead of d: d = w − (next − w)/2, and the scheme observes
+    /// (d + next)/2 as w.)
     Begin,
 }
 
-/// u, d, and what is kept at most.
+/// u, d, and the largest number of kept fields.
 const FIELDS: usize = 2 + MAX_KEPT;
 
 struct Look<'a, T: Real, C> {
     layout: Layout,
     scheme: &'a C,
-    /// d and what is kept.
+    /// d and the kept fields.
     d: *const T,
     kept: [*const T; MAX_KEPT],
-    /// What is written, and where: u and d, and what is kept; null if nothing is.
+    /// What to write, and where to: u, d and the kept fields. Null if nothing is written.
     write: Write,
     to: [*mut T; 2],
     to_kept: [*mut T; MAX_KEPT],
     forces: Forces<'a, T>,
-    /// The same tools, as the sweep sees them.
+    /// The same forces in the form that the sweep uses.
     pulls: &'a [Pull<'a, T>],
     free: *const T,
     sums: &'a UnsafeCell<Sums<T>>,
 }
 
 impl Survey {
-    /// Looks at a state, at what is awake in `over`.
+    /// Surveys the awake part of a state in `over`.
     pub(super) fn of<T: Real, C: Scheme<T>>(
         bench: &Bench<T>,
         scheme: &C,
@@ -109,7 +110,7 @@ impl Survey {
         Survey::by(bench, scheme, (from, [std::ptr::null_mut(); FIELDS]), forces, over, Write::Nothing)
     }
 
-    /// The same, and changes it.
+    /// Surveys it and rewrites it.
     pub(super) fn write<T: Real, C: Scheme<T>>(
         bench: &Bench<T>,
         scheme: &C,
@@ -123,7 +124,7 @@ impl Survey {
         Survey::by(bench, scheme, (to.map(<*mut T>::cast_const), to), forces, over, write);
     }
 
-    /// From where to read u, d and what is kept, and where to write them.
+    /// Reads u, d and the kept fields from one state and writes them to another.
     fn by<T: Real, C: Scheme<T>>(
         bench: &Bench<T>,
         scheme: &C,
@@ -154,8 +155,8 @@ impl Survey {
             free: bench.free.as_ref().map_or(std::ptr::null(), |free| free.as_ptr()),
             sums: &sums,
         };
-        // SAFETY: a state has u, d and at least what the scheme keeps, all of the bench's layout; u is written behind what
-        // the sweep still reads.
+        // SAFETY: a state has u, d and at least the fields that the scheme keeps, all of the bench's layout; u is
+        // written behind what the sweep still reads.
         unsafe { bench.look(u, over, look) };
         let Sums { total, largest, .. } = sums.into_inner();
         let sum = |which: usize| total[which].iter().sum();
@@ -178,7 +179,7 @@ impl<T: Real, C: Scheme<T>> Look<'_, T, C> {
     /// Adds to a sum of the row.
     #[inline(always)]
     unsafe fn add<V: Vector<Real = T>>(&self, which: usize, at: usize, value: V) {
-        // SAFETY: one sweep runs at a time, and its stage alone refers to the sums.
+        // SAFETY: one sweep runs at a time, and only its stage refers to the sums.
         unsafe {
             let sum = (&raw mut (*self.sums.get()).row[which]).cast::<T>().add(at % BLOCK);
             V::load(sum).add(value).store(sum);
@@ -277,7 +278,8 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Look<'_, T, C> {
 }
 
 impl<T: Real> Sheet<T> {
-    /// The tools' force at the end of the last step, if the scheme needs it to tell a velocity, as the springs' force.
+    /// The tools' force at the end of the last step, as the springs' force, if the scheme needs it to observe a
+    /// velocity.
     pub(super) fn present_terms(&self) -> Vec<Term<T>> {
         let Sheet { model, plan, bench, .. } = self;
         if !plan.scheme.takes_means() || self.steps == 0 {
@@ -286,14 +288,14 @@ impl<T: Real> Sheet<T> {
         self.applied.until_now(model, &bench.layout, plan.scheme.spring_scale() * plan.force_scale(&model.scene))
     }
 
-    /// Looks at part of the sheet: what a survey sees, the energies, and the energy that the scheme keeps.
+    /// Surveys part of the sheet. Returns the survey, the energies, and the energy that the scheme conserves.
     pub(super) fn survey(&self, over: &Region) -> (Survey, Energy, f64) {
         let Sheet { model, plan, bench, state, .. } = self;
         let terms = self.present_terms();
         let forces = Forces { terms: &terms, field: 0, part: 1.0, pull: 0.0 };
         let survey = with_scheme!(plan, T, |scheme| Survey::of(bench, scheme, state, forces, over));
         let (mut energy, kept_j) = self.energy_of(&survey);
-        // A grasped point moves as its tool does, whatever the scheme would make of it.
+        // A grasped point moves with its tool, not as the scheme would move it.
         let own = self.prescribed.grasped().map(|(index, motion)| {
             let [_, free, _] = self.free_point(index, self.applied.until(model, index));
             motion.velocity_m_per_s.length_squared() - free.length_squared()
@@ -303,11 +305,11 @@ impl<T: Real> Sheet<T> {
         (survey, energy, kept_j + grasped_j)
     }
 
-    /// The energies of what a survey saw, and the one that the scheme keeps.
+    /// The energies of a survey, and the energy that the scheme conserves.
     pub(super) fn energy_of(&self, survey: &Survey) -> (Energy, f64) {
         let Sheet { model, plan, .. } = self;
         let sheet = &model.scene.sheet;
-        // Of a mass that moves by a spacing in a substep, twice.
+        // Twice the energy of a point that moves by a spacing in a substep.
         let unit_j = sheet.point_mass_kg * (sheet.spacing_m / plan.substep_s).powi(2);
         let stiffness = model.scene.virtual_stiffness_n_per_m * sheet.spacing_m * sheet.spacing_m;
         let energy = Energy {

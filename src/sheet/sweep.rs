@@ -1,23 +1,25 @@
-//! The sweep: one pass over the rows that evaluates every spring once and advances what it has passed, in place.
+//! The sweep: one pass over the rows that evaluates every spring once and advances the points behind it, in place.
 //!
-//! Row i has four springs a point: to the right, and from the pair of points j, j + 1 to the pair below, down and both
-//! diagonals. A spring's force on the row below waits in `carry` until that row is reached; one on the next column
-//! reaches it by shifting a vector by one lane. When the sweep leaves a block of row i all its forces are known,
-//! and nothing will read its displacement any more: the stage may overwrite it.
+//! Row i has four springs per point: to the right, and from the pair of points j, j + 1 to the pair below, down and
+//! along both diagonals. A spring's force on the row below waits in `carry` until the sweep reaches that row; its force
+//! on the next column moves there by a shift of the vector by one lane. When the sweep leaves a block of row i, all
+//! forces on it are known and nothing reads its displacement again, so the stage may overwrite it.
 //!
 //! At column j, with R to the right, D down, A the diagonal from j to j + 1 below, B that from j + 1 to j below:
 //!
-//! force on j = R + D + A − (what the row above left) + (B − R − A of the row above) of column j − 1,
-//! and the row leaves D + B, and A.
+//! force on j = R + D + A − (what the row above left) + (B − R − A of the row above) of column j − 1;
+//! the row leaves D + B, and A.
 //!
 //! A lane's result depends on the same operations in the same order at every width: the bits are the same.
 //!
-//! Where only part of the sheet is awake (`tiles`), the sweep goes over strips: rectangles of rows and columns that cover
-//! it, and what its forces need of the springs above. The stage is told of awake blocks alone. The springs of the column
-//! to the left of a strip are evaluated along the column, a vector of rows at a time ([`Edge`]): a block of columns for each
-//! row would cost as much as one that is awake. (Flexion springs, which begin two columns to the left, have that block.)
+//! Where only part of the sheet is awake (`tiles`), the sweep goes over strips: rectangles of rows and columns that
+//! cover the awake part, plus the springs above that its forces need. The stage gets awake blocks only. The springs of
+//! the column to the left of a strip are evaluated along the column, a vector of rows at a time ([`Edge`]): a block of
+//! columns for each row would cost as much as an awake block. (Flexion springs begin two columns to the left and do use
+//! that block.)
 #![allow(unsafe_code)]
-// Iterators over vectors are not always inlined, and then run without the instructions of their caller: ten times slower.
+// The compiler does not always inline iterators over vectors. They then run without the caller's instructions, ten
+// times slower.
 #![allow(clippy::needless_range_loop)]
 
 use std::cell::RefCell;
@@ -34,17 +36,17 @@ use super::region::Region;
 use super::springs::{Kind, Springs};
 use crate::scene::Lanes;
 
-/// What is done with the force on a block of points.
+/// What to do with the force on a block of points.
 pub(super) trait Stage<T: Real> {
-    /// Whether the sweep tells the springs' energies as well.
+    /// Whether the sweep also reports the energies of the springs.
     const ENERGY: bool = false;
 
-    /// What the stage has to do in a row: `finish` is told so at compile time.
+    /// The duty of a row (see [`LEAN`]). `finish` gets it at compile time.
     fn duty(&self, _row: usize) -> u8 {
         LEAN
     }
 
-    /// What the sums begin from.
+    /// The initial values of the sums.
     ///
     /// # Safety
     /// As for `finish`.
@@ -54,10 +56,10 @@ pub(super) trait Stage<T: Real> {
     }
 
     /// `x`: displacements of the block of row `row` that begins at place `at`; `n`: the springs' forces on it. Adds to
-    /// `sums`, which the stage gets at the end.
+    /// `sums`; the stage gets the totals at the end.
     ///
     /// # Safety
-    /// What the stage points to is as it promised.
+    /// The pointers of the stage are valid.
     unsafe fn finish<V: Vector<Real = T>, const DUTY: u8>(
         &self,
         row: usize,
@@ -67,26 +69,26 @@ pub(super) trait Stage<T: Real> {
         sums: &mut [V; 2],
     );
 
-    /// The energies of springs that begin in the block at `column`.
+    /// Takes the energies of the springs that begin in the block at `column`.
     ///
     /// # Safety
     /// As for `finish`.
     unsafe fn energy<V: Vector<Real = T>>(&self, _column: usize, _energy: V) {}
 
-    /// A row is done.
+    /// Ends a row.
     ///
     /// # Safety
     /// As for `finish`.
     unsafe fn end_row(&self) {}
 
-    /// All is done.
+    /// Ends the sweep.
     ///
     /// # Safety
     /// As for `finish`.
     unsafe fn end<V: Vector<Real = T>>(&self, _sums: [V; 2]) {}
 }
 
-/// Duties of a row ([`Stage::duty`]): the springs alone, one force of a tool beside them, or whatever there may be.
+/// Duties of a row ([`Stage::duty`]): springs only, springs and one tool's force, or anything.
 pub(super) const LEAN: u8 = 0;
 pub(super) const PUSHED: u8 = 1;
 pub(super) const ANY: u8 = 2;
@@ -97,13 +99,13 @@ pub(super) struct Sweep<'a, T, S> {
     pub(super) springs: &'a Springs<T>,
     /// Displacements: three planes, spacings.
     pub(super) x: *const T,
-    /// What rows leave to those below: three planes of [`CARRY_ROWS`] rows.
+    /// Forces that rows leave to those below: three planes of [`CARRY_ROWS`] rows.
     pub(super) carry: *mut T,
     pub(super) over: &'a Region,
     pub(super) stage: S,
 }
 
-/// Rows of the carry: two of the row before, and two for flexion springs, which reach two rows on.
+/// Rows of the carry: two for the row before, and two for flexion springs, which reach two rows on.
 const CARRY_ROWS: usize = 4;
 
 impl<T: Real, S: Stage<T>> Run<T> for Sweep<'_, T, S> {
@@ -119,8 +121,8 @@ impl<T: Real, S: Stage<T>> Run<T> for Sweep<'_, T, S> {
     }
 }
 
-/// Q of a spring whose rest vector is `rest` times the unit along it: 2·along + Δ·Δ, `along` being D0·Δ. [`Real::FAINT`] more
-/// keeps squares of small Δ, across the spring, from ending below the normal range.
+/// Q of a spring whose rest vector is `rest` times the unit vector along it: 2·along + Δ·Δ, where `along` is D0·Δ. The
+/// added [`Real::FAINT`] keeps the squares of small Δ across the spring above the subnormal range.
 #[inline(always)]
 pub(super) fn excess<V: Vector>(along: V, delta: &[V; 3], [first, second, third]: [usize; 3]) -> V {
     let faint = along.mul_add(along.splat(V::Real::of(2.0)), along.splat(V::Real::of(V::Real::FAINT)));
@@ -133,10 +135,10 @@ pub(super) fn difference<V: Vector>(to: &[V; 3], from: &[V; 3]) -> [V; 3] {
     [to[0].sub(from[0]), to[1].sub(from[1]), to[2].sub(from[2])]
 }
 
-/// The three components of a block.
+/// Loads the three components of a block.
 ///
 /// # Safety
-/// They can be read.
+/// All three can be read.
 #[inline(always)]
 pub(super) unsafe fn load<V: Vector>(at: *const V::Real, plane: usize) -> [V; 3] {
     // SAFETY: the caller's promise.
@@ -145,7 +147,7 @@ pub(super) unsafe fn load<V: Vector>(at: *const V::Real, plane: usize) -> [V; 3]
 
 impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
     /// # Safety
-    /// `x` has 3 planes that can be read a row and a block beyond the last point, `carry` is that of the layout.
+    /// `x` has 3 planes that can be read a row and a block beyond the last point; `carry` has the layout's size.
     #[inline(always)]
     unsafe fn rows<V: Vector<Real = T>, const FLEXION: bool>(&self, flexion: &Kind<T>) {
         // SAFETY: the caller's promise; offsets stay within rows + 1 rows and a block.
@@ -154,7 +156,7 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
             let zero = V::of(T::default());
             let mut sums = self.stage.begin::<V>();
             for strip in &self.over.strips {
-                // With the block to the left, whose springs pull at the first column, or its last column.
+                // Include the block to the left, or its last column: its springs pull at the first column.
                 let beside = strip.columns.start.saturating_sub(V::LANES);
                 let from = if FLEXION { beside } else { strip.columns.start };
                 let to = strip.columns.end.min(columns.next_multiple_of(V::LANES));
@@ -172,8 +174,8 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                 let whole = V::IS_REGISTER && all;
                 let mut edge = if FLEXION || from == 0 { None } else { Some(Edge::new(self, from, strip.rows.start)) };
                 for i in strip.rows.clone() {
-                    // Hidden from the compiler, which would keep an address for each array and kind of row, and count them
-                    // all up with each row.
+                    // `black_box` hides `i` from the compiler, which would otherwise keep an address for each array and
+                    // kind of row and increment all of them for each row.
                     let i = std::hint::black_box(i);
                     let left = match &mut edge {
                         Some(edge) => edge.left_of(self, i),
@@ -181,7 +183,7 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                     };
                     let span = (from..to, strip.awake && from == strip.columns.start, left);
                     let duty = if FLEXION || S::ENERGY || !V::IS_REGISTER { ANY } else { self.stage.duty(i) };
-                    // The usual rows have loops of their own, without what only others need.
+                    // The common rows have loops of their own, without the code that only other rows need.
                     match (i + 1 < rows, whole, duty) {
                         (true, true, LEAN) => self.row::<V, FLEXION, true, true, LEAN>(flexion, i, span, &mut sums),
                         (true, true, PUSHED) => self.row::<V, FLEXION, true, true, PUSHED>(flexion, i, span, &mut sums),
@@ -199,7 +201,7 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
         }
     }
 
-    /// Row `i`, which has a row below or not.
+    /// Sweeps row `i`, which may be the last.
     #[inline(always)]
     unsafe fn row<V: Vector<Real = T>, const FLEXION: bool, const BELOW: bool, const WHOLE: bool, const DUTY: u8>(
         &self,
@@ -216,7 +218,7 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
             let zero = V::of(T::default());
             let (down, diagonal) = (self.carry, self.carry.add(stride));
             let two_down = self.carry.add((2 + i % 2) * stride);
-            // Springs to the next column: none from the last.
+            // The last point has no spring to the next column.
             let full = zero.first(V::LANES);
             let tail = zero.first((columns - 1) % V::LANES);
             let (mut passed, mut passed_two) = (if WHOLE { [zero; 3] } else { left }, [zero; 3]);
@@ -225,7 +227,7 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
             while column < span.end {
                 let mask = if column + V::LANES < columns { full } else { tail };
                 let awake = WHOLE || all_awake || self.over.is_awake(i, column);
-                // The farthest that is read: a row and a point on, or two of each, and the carry's last row.
+                // The farthest place read: a row and a point on, or two of each, and the carry's last row.
                 debug_assert!(
                     self.layout.holds((i + usize::from(BELOW)) * stride + column + 1, V::LANES)
                         && (!FLEXION || self.layout.holds(i * stride + column + 2, V::LANES))
@@ -282,7 +284,7 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                     }
                 }
                 if FLEXION {
-                    // The last block may have a single column: then the one before is not full either.
+                    // If the last block has a single column, the block before is not full either.
                     let mask = zero.first(columns.saturating_sub(2 + column));
                     let r = difference(&load(at.add(2), plane), &here);
                     let q = excess(r[1].add(r[1]), &r, [1, 0, 2]);
@@ -323,52 +325,52 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
     }
 }
 
-/// How a scheme advances one component of a block, in terms of u (here `x`), d, the springs' force `n` and what it
-/// keeps of steps before: pure arithmetic, in one file each (`integrate`).
+/// How a scheme advances one component of a block: pure arithmetic on u (here `x`), d, the springs' force `n` and the
+/// values it keeps from earlier steps. Each scheme has a file of its own (`integrate`).
 pub(super) trait Scheme<T: Real> {
     /// Fields that the scheme keeps beside u and d.
     const KEPT: usize;
-    /// How many of those, the last ones, it writes in a step.
+    /// How many of those, counted from the last, it writes in a step.
     const WRITTEN: usize;
-    /// Fields of force that it takes, 1 or 2.
+    /// Number of force fields that it takes, 1 or 2.
     const FORCES: usize;
 
-    /// Whether `advance` itself cuts what is too small to count ([`Real::LEAST`]) of u and d.
+    /// Whether `advance` itself cuts values of u and d below [`Real::LEAST`] to 0.
     const CUTS: bool = false;
 
-    /// u and d after the (sub)step; `kept` is brought up to date. `force`: the tools' part, in the scheme's terms; if there
-    /// is one field, twice.
+    /// Returns u and d after the (sub)step and updates `kept`. `force`: the tools' part, in the scheme's terms; a
+    /// single field is passed twice.
     fn advance<V: Vector<Real = T>>(&self, x: V, d: V, n: V, kept: &mut [V; MAX_KEPT], force: Option<[V; 2]>)
     -> (V, V);
 
-    /// The displacement along which the tools' force (the last of its fields) has worked, given u and d before and after.
+    /// The displacement along which the tools' force (the last of its fields) did work, given u and d before and after.
     fn travel<V: Vector<Real = T>>(&self, before: [V; 2], after: [V; 2]) -> V;
 
-    /// Displacement and velocity × substep as they are now; `force` is that of the tools, in the springs' units.
+    /// The present displacement and velocity × substep; `force` is that of the tools, in the springs' units.
     fn observe<V: Vector<Real = T>>(&self, x: V, d: V, n: V, kept: &[V; MAX_KEPT], force: Option<V>) -> (V, V);
 
-    /// The square of the velocity × substep, as it enters the energy that the scheme itself keeps, if it keeps one.
+    /// The square of velocity × substep, in the form that the scheme's own conserved energy uses, if it has one.
     fn vigour<V: Vector<Real = T>>(&self, x: V, d: V, n: V, kept: &[V; MAX_KEPT], force: Option<V>) -> V {
         let (_, w) = self.observe(x, d, n, kept, force);
         w.mul(w)
     }
 }
 
-/// Forces of tools that are usual at most.
+/// Number of tool forces that need no heap memory.
 const FEW: usize = 4;
 
-/// Most fields that any scheme keeps beside u and d.
+/// Upper bound of the fields that any scheme keeps beside u and d.
 pub(super) const MAX_KEPT: usize = 5;
 
-/// What a sweep needs beside the state: of one sheet, made once.
+/// The buffers and tables that a sweep needs beside the state. One for each sheet, made once.
 #[derive(Debug)]
 pub(super) struct Bench<T> {
     width: Width,
     pub(super) layout: Layout,
     pub(super) springs: Springs<T>,
-    /// 1 where a point moves, 0 where it is fixed, if any is: one plane.
+    /// 1 where a point moves, 0 where it is fixed: one plane. `None` if every point moves.
     pub(super) free: Option<Field<T>>,
-    /// Of the planes only the first rows are used: of the layout's length, they need no more registers for addresses.
+    /// Only the first rows of each plane are used. Planes of the layout's length need no extra address registers.
     carry: RefCell<Field<T>>,
     probe: [T; BLOCK],
     work: [T; BLOCK],
@@ -394,7 +396,7 @@ impl<T: Real> Bench<T> {
         }
     }
 
-    /// Advances every point with `scheme`; the tools' force is that of their fields from `field` on.
+    /// Advances every point with `scheme`. The tools' force is read from field `field` on.
     pub(super) fn advance<C: Scheme<T>>(
         &mut self,
         scheme: &C,
@@ -408,7 +410,7 @@ impl<T: Real> Bench<T> {
             *pointer = Arc::make_mut(field).as_mut_ptr();
         }
         assert_eq!(state.kept.len(), C::KEPT);
-        // Few tools' forces need no memory from the heap.
+        // A few forces need no heap memory.
         let (mut few, mut many) = ([Pull::none(); FEW], Vec::new());
         let pulls = terms.iter().map(|term| term.pull(field, self.layout.stride));
         let pulls: &[Pull<'_, T>] = if terms.len() <= FEW {
@@ -437,7 +439,7 @@ impl<T: Real> Bench<T> {
         debug_assert!(over.is_within(&self.layout));
         let carry = self.carry.get_mut().as_mut_ptr();
         let sweep = Sweep { layout: self.layout, springs: &self.springs, x: u.cast_const(), carry, over, stage };
-        // SAFETY: all fields have the layout's three planes, padded by a row and a block, and the tables are of this
+        // SAFETY: all fields have the layout's three planes, padded by a row and a block, and the tables have this
         // layout; u is written behind what the sweep still reads, through the same pointer.
         unsafe { lanes::run(self.width, &sweep) };
     }
@@ -445,7 +447,7 @@ impl<T: Real> Bench<T> {
     /// Sweeps over the displacements `u`.
     ///
     /// # Safety
-    /// `u` and the stage are of fields of this layout.
+    /// `u` and the pointers of the stage belong to fields of this layout.
     pub(super) unsafe fn look<S: Stage<T>>(&self, u: *const T, over: &Region, stage: S) {
         debug_assert!(over.is_within(&self.layout));
         let mut carry = self.carry.borrow_mut();
@@ -454,7 +456,8 @@ impl<T: Real> Bench<T> {
         unsafe { lanes::run(self.width, &sweep) };
     }
 
-    /// Whether the increments since the last call were finite, and none was `farthest`; false may be a sum of many.
+    /// Whether all increments since the last call were finite and below `farthest`. False may also come from a sum of
+    /// many.
     pub(super) fn is_calm(&mut self, farthest: f64) -> bool {
         std::mem::take(&mut self.probe).iter().all(|sum| sum.wide() < farthest * farthest)
     }
@@ -462,7 +465,7 @@ impl<T: Real> Bench<T> {
     /// Σ force · travel of the tools since the last call, in the scheme's terms.
     pub(super) fn take_work(&mut self) -> f64 {
         let work = std::mem::take(&mut self.work);
-        // Four chains of additions at once, in an order that does not change.
+        // Four chains of additions at once, in a fixed order.
         let chains: [f64; 4] = std::array::from_fn(|chain| (0..BLOCK / 4).map(|n| work[4 * n + chain].wide()).sum());
         (chains[0] + chains[1]) + (chains[2] + chains[3])
     }

@@ -1,14 +1,14 @@
-//! Tiles of points that are at rest sleep: what does not move is not computed.
+//! Sleeping tiles: points at rest are not computed.
 //!
-//! **To sleep.** With ε a length, a part of the scene's tolerance times the largest displacement of late, a tile may sleep
-//! if of every point of it |v|·√(m/K″) ≤ ε and |F + N − K″·u|/K″ ≤ ε (F of the tools, N of the springs), and still so
-//! [`CHECK_STEPS`] later: then it is within ε of where it would come to rest. It stays there, with what a scheme keeps of
-//! its past made true: constant forces.
+//! **Falling asleep.** Let ε be a length, a part of the scene's tolerance times the recent largest displacement. A tile
+//! may sleep if |v|·√(m/K″) ≤ ε and |F + N − K″·u|/K″ ≤ ε for each of its points (F of the tools, N of the springs),
+//! and again [`CHECK_STEPS`] later. Then it is within ε of its rest position. It stays where it is, and the scheme's
+//! history becomes that of constant forces.
 //!
-//! **To wake.** A tile that sleeps remembers where the points around it were when it fell asleep, and wakes when one of
-//! them is more than ε_w from there: compared with the step before, a slow creep would pass unseen. ε_w is ε, or less
-//! where springs are much stiffer than the virtual ones, which then let through more of what is left out. It wakes as well
-//! when the tools' force on it may have changed by more than ε_w·K″ since, and when it is grasped.
+//! **Waking.** A sleeping tile remembers where the points around it were when it fell asleep, and wakes when one of
+//! them is more than ε_w from there. (A comparison with the step before would miss a slow creep.) ε_w is ε, or less
+//! where springs are much stiffer than the virtual ones and so pass on more of an omitted force. A tile also wakes when
+//! the tools' force on it may have changed by more than ε_w·K″ since, and when it is grasped.
 
 use std::cell::Cell;
 use std::ops::Range;
@@ -18,76 +18,76 @@ use super::field::{Field, Layout};
 use super::real::Real;
 use super::region::{Marks, Region, TILE, tiles};
 
-/// Steps between two looks at whether tiles may sleep.
+/// Steps between two checks whether tiles may sleep.
 pub(super) const CHECK_STEPS: u64 = 16;
 
-/// Looks in a row at which a tile has to be calm.
+/// Consecutive checks at which a tile must be calm.
 const CALM_LOOKS: u8 = 2;
 
 /// Part of the tolerance that a tile may be from its rest: errors of neighbours add up. (Measured: up to three and a
-/// half times the ε of a tile, where all of a sheet creeps one way.)
+/// half times the ε of a tile, where a whole sheet creeps one way.)
 const PART: f64 = 0.25;
 
-/// By which the largest displacement of late is forgotten from one look to the next.
+/// The recent largest displacement decays by this factor from one check to the next.
 const FORGET: f64 = 0.99;
 
-/// Places of a tile's neighbours: along x, along y.
+/// Offsets of a tile's neighbours: along x, along y.
 const NEIGHBOURS: [[isize; 2]; 8] = [[-1, -1], [-1, 0], [-1, 1], [0, -1], [0, 1], [1, -1], [1, 0], [1, 1]];
 
-/// Of those, the ones with springs that begin there and reach the tile.
+/// Indices of the neighbours where springs begin that reach the tile.
 const PULLING: [usize; 3] = [0, 1, 3];
 
-/// Values of a snapshot: three of each of 16 points for a side or a corner.
+/// Values of a snapshot: three for each of 16 points, for each side and corner.
 const SNAPSHOT: usize = NEIGHBOURS.len() * 3 * TILE;
 
-/// Points beside a sleeping tile, in a tile that is awake.
+/// Points next to a sleeping tile, in an awake tile.
 #[derive(Debug, Clone, Copy)]
 struct Watch {
     tile: usize,
-    /// The first of the points, and how far it is to the next.
+    /// The first point, and the distance to the next.
     first: usize,
     next: usize,
     count: usize,
-    /// Where they were: the place in the snapshots.
+    /// Their earlier positions: the place in the snapshots.
     then: usize,
 }
 
-/// Which tiles of a sheet sleep, and what they remember.
+/// Which tiles of a sheet sleep, and the values kept for waking them.
 #[derive(Debug)]
 pub(super) struct Tiles<T> {
     layout: Layout,
     /// Tiles along x and along y.
     counts: [usize; 2],
-    /// Rows that a spring reaches on.
+    /// Number of rows that a spring reaches on.
     reach: usize,
-    /// Nothing sleeps without one.
+    /// Without a tolerance, nothing sleeps.
     tolerance: f64,
     pub(super) region: Region,
     pub(super) awake_points: usize,
-    /// Of each tile, looks in a row at which it was calm.
+    /// For each tile, consecutive checks at which it was calm.
     calm: Vec<u8>,
-    /// By how much the tools' force on it may have changed since it fell asleep, N.
+    /// How much the tools' force on each tile may have changed since it fell asleep, N.
     drift_n: Vec<f64>,
-    /// The energy that it had.
+    /// The energy of each tile when it fell asleep.
     energy_j: Vec<f64>,
-    /// Of all that sleep.
+    /// The sum over all sleeping tiles.
     pub(super) asleep_j: f64,
-    /// The energies that it has, once somebody has asked, until it or one that its springs reach wakes.
+    /// The elastic energies of each tile, cached until it, or a tile that its springs reach, wakes.
     elastic_j: Vec<Cell<Option<[f64; 2]>>>,
-    /// Where the points around it were; made when the first tile sleeps.
+    /// Positions of the points around each tile; allocated when the first tile sleeps.
     snapshots: Vec<T>,
-    /// What the sleeping tiles beside those that are awake look at.
+    /// The comparisons of the sleeping tiles next to awake ones.
     watches: Vec<Watch>,
-    /// Since the last checkpoint these were awake.
+    /// Tiles that were awake since the last checkpoint.
     touched: Marks,
-    /// These were ever awake, or their springs reach such: in the others nothing has ever moved, and all is 0.
+    /// Tiles that were ever awake, or whose springs reach such a tile. In all others nothing has ever moved: all is 0.
     moved: Marks,
-    /// The largest displacement of late, spacings.
+    /// The recent largest displacement, spacings.
     pub(super) largest: f64,
 }
 
 impl<T: Real> Tiles<T> {
-    /// All asleep if there is a tolerance: a sheet at rest. Else all awake, for good.
+    /// All asleep if there is a tolerance (a sheet at rest). Otherwise all awake, for good.
     pub(super) fn new(layout: Layout, tolerance: f64, reach: usize) -> Self {
         let counts = [tiles(layout.rows), tiles(layout.columns)];
         let count = counts[0] * counts[1];
@@ -119,7 +119,7 @@ impl<T: Real> Tiles<T> {
         self.tolerance > 0.0
     }
 
-    /// ε, spacings.
+    /// ε, in spacings.
     pub(super) fn epsilon(&self) -> f64 {
         self.epsilon_of(self.largest)
     }
@@ -143,7 +143,7 @@ impl<T: Real> Tiles<T> {
         from..(from + TILE).min(self.layout.columns)
     }
 
-    /// Brings everything to the tiles that are awake now: costs what they are, not what the sheet is.
+    /// Updates everything to the set of awake tiles. Costs as much as those, not as much as the sheet.
     fn settle(&mut self) {
         self.region.cover(&self.layout, self.reach);
         self.awake_points = 0;
@@ -152,7 +152,7 @@ impl<T: Real> Tiles<T> {
             let tile = self.region.tiles()[index];
             self.awake_points += self.rows(tile).len() * self.columns(tile).len();
             self.touched.add(tile);
-            // Neighbours and their opposites are in opposite order.
+            // The order of neighbours is the reverse of that of their opposites.
             for (side, opposite) in (0..NEIGHBOURS.len()).zip((0..NEIGHBOURS.len()).rev()) {
                 let beside = self.neighbour(tile, opposite);
                 if let Some(other) = beside.filter(|other| !self.region.awake.has[*other]) {
@@ -170,7 +170,7 @@ impl<T: Real> Tiles<T> {
         (i < self.counts[0] && j < self.counts[1]).then_some(i * self.counts[1] + j)
     }
 
-    /// The points beyond a side or corner: the first place, how far it is to the next, and their number.
+    /// The points beyond a side or corner: the first place, the distance to the next, and their number.
     fn beyond(&self, tile: usize, side: usize) -> (usize, usize, usize) {
         let Layout { stride, .. } = self.layout;
         let (rows, columns) = (self.rows(tile), self.columns(tile));
@@ -188,7 +188,7 @@ impl<T: Real> Tiles<T> {
         (i * stride + j, if x == 0 { stride } else { 1 }, count_x.max(count_y))
     }
 
-    /// Wakes those of `which` that sleep.
+    /// Wakes the sleeping ones among `which`.
     pub(super) fn wake(&mut self, which: impl IntoIterator<Item = usize>) {
         let mut any = false;
         for tile in which {
@@ -207,7 +207,7 @@ impl<T: Real> Tiles<T> {
         }
     }
 
-    /// Wakes the tiles of points.
+    /// Wakes the tiles that contain the points.
     pub(super) fn wake_under(&mut self, points: impl IntoIterator<Item = [usize; 2]>) {
         let columns = self.counts[1];
         self.wake(points.into_iter().map(|[i, j]| i / TILE * columns + j / TILE));
@@ -218,7 +218,7 @@ impl<T: Real> Tiles<T> {
         self.asleep_j = 0.0;
     }
 
-    /// All awake, and from now on with another tolerance.
+    /// Wakes all tiles, and sets another tolerance.
     pub(super) fn begin_anew(&mut self, tolerance: f64) {
         self.wake_all();
         self.tolerance = tolerance;
@@ -236,7 +236,7 @@ impl<T: Real> Tiles<T> {
             let Watch { first, next, count, then, .. } = **watch;
             (0..3).any(|c| {
                 let (here, then) = (&u[c * self.layout.plane + first..], &self.snapshots[then + c * TILE..][..count]);
-                // All of them, without a way out: then it is a few vectors.
+                // Compares all of them without an early exit, so that it compiles to a few vectors.
                 let any = |any: bool, (now, then): (&T, &T)| any | ((*now - *then).magnitude() > far);
                 if next == 1 {
                     here[..count].iter().zip(then).fold(false, any)
@@ -249,16 +249,17 @@ impl<T: Real> Tiles<T> {
         self.wake(waking);
     }
 
-    /// Makes room for snapshots. Before anything slept, all was at 0.
+    /// Allocates the snapshots. Before the first sleep, all points were at 0.
     fn remember(&mut self) {
         if self.snapshots.is_empty() {
             self.snapshots = vec![T::default(); self.calm.len() * SNAPSHOT];
         }
     }
 
-    /// Adds a change of the tools' force, and wakes tiles for which all changes since they fell asleep may be more than
-    /// `least_n`. `touch`: how much at a tile as far from the centres as this. Beyond the points that it reaches nothing has
-    /// changed. If the least is 0, it wakes the whole sheet: what moves at all must not meet a sleeping tile.
+    /// Adds a change of the tools' force, and wakes tiles for which all changes since they fell asleep may exceed
+    /// `least_n`. `touch` gives the bound for a tile by its distance from the centres. Beyond the points it reaches,
+    /// nothing has changed. With `least_n` = 0 it wakes the whole sheet: anything that moves must not meet a sleeping
+    /// tile.
     pub(super) fn pushed(&mut self, touch: &Touch, spacing_m: f64, least_n: f64) {
         let mut waking = Vec::new();
         let within = |sides: [Range<usize>; 2]| sides.map(|points| points.start / TILE..tiles(points.end));
@@ -285,14 +286,14 @@ impl<T: Real> Tiles<T> {
         self.wake(waking);
     }
 
-    /// Counts looks at which a tile was calm; whether it may sleep.
+    /// Counts the consecutive checks at which a tile was calm. Returns whether it may sleep.
     pub(super) fn is_calm(&mut self, tile: usize, calm: bool) -> bool {
         self.calm[tile] = if calm { self.calm[tile].saturating_add(1) } else { 0 };
         self.calm[tile] >= CALM_LOOKS
     }
 
-    /// Looks at a few points of each awake tile: updates the largest displacement, and tells which tiles may be calm, all
-    /// of whose increments looked at are at most `slow`.
+    /// Samples a few points of each awake tile: updates the largest displacement, and returns the tiles that may be
+    /// calm because all sampled increments are at most `slow`.
     pub(super) fn glance(&mut self, u: &Field<T>, d: &Field<T>, slow: impl Fn(f64) -> f64) -> Vec<usize> {
         let Layout { stride, plane, .. } = self.layout;
         let most = |field: &Field<T>, tile: usize| {
@@ -317,26 +318,26 @@ impl<T: Real> Tiles<T> {
         calm
     }
 
-    /// Makes `region`, of this sheet, that of some tiles.
+    /// Makes `region`, which belongs to this sheet, cover the tiles of `which`.
     pub(super) fn cover(&self, region: &mut Region, which: impl Iterator<Item = usize>) {
         region.awake.clear();
         which.for_each(|tile| _ = region.awake.add(tile));
         region.cover(&self.layout, self.reach);
     }
 
-    /// A region of this sheet, of no tile.
+    /// A region of this sheet without tiles.
     pub(super) fn no_region(&self) -> Region {
         Region::none(&self.layout)
     }
 
-    /// The tiles that sleep and are not at 0, and what is known of their energies.
+    /// The sleeping tiles that are not at 0, and their energies if cached.
     pub(super) fn sleeping(&self) -> impl Iterator<Item = (usize, Option<[f64; 2]>)> {
         let asleep = self.moved.members.iter().filter(|tile| !self.region.awake.has[**tile]);
         asleep.map(|tile| (*tile, self.elastic_j[*tile].get()))
     }
 
-    /// Keeps the energies of a sleeping tile, if nothing can change them before it or one beside it is woken. (What a
-    /// multistep scheme shows of a displacement depends on the springs' force, and so on all tiles around.)
+    /// Caches the energies of a sleeping tile if nothing can change them before it or a neighbour wakes. (In a
+    /// multistep scheme the observed displacement depends on the springs' force, and so on all tiles around.)
     pub(super) fn keep_energies(&self, tile: usize, elastic_j: [f64; 2]) {
         let mut beyond = (0..NEIGHBOURS.len()).filter_map(|side| self.neighbour(tile, side));
         if !beyond.any(|other| self.region.awake.has[other]) {
@@ -344,7 +345,7 @@ impl<T: Real> Tiles<T> {
         }
     }
 
-    /// Puts tiles to sleep, with the energies that they have.
+    /// Puts tiles to sleep, and stores their energies.
     pub(super) fn sleep(&mut self, which: &[(usize, f64)], u: &Field<T>) {
         self.remember();
         for &(tile, energy_j) in which {
@@ -368,12 +369,12 @@ impl<T: Real> Tiles<T> {
         self.settle();
     }
 
-    /// The next copy is of everything that is not 0.
+    /// Makes the next copy include everything that is not 0.
     pub(super) fn touch_all(&mut self) {
         self.moved.members.iter().for_each(|tile| _ = self.touched.add(*tile));
     }
 
-    /// Copies what was awake since the last call from `from` to `to`.
+    /// Copies from `from` to `to` what was awake since the last call.
     pub(super) fn copy_touched<'a>(&mut self, fields: impl Iterator<Item = (&'a mut Field<T>, &'a Field<T>)>) {
         for (to, from) in fields {
             self.copy(&self.touched, to, from);
@@ -382,7 +383,7 @@ impl<T: Real> Tiles<T> {
         self.region.tiles().iter().for_each(|tile| _ = self.touched.add(*tile));
     }
 
-    /// Copies what is not 0 to a field of zeros.
+    /// Copies the nonzero part to a field of zeros.
     pub(super) fn copy_moved(&self, to: &mut Field<T>, from: &Field<T>) {
         self.copy(&self.moved, to, from);
     }
@@ -403,7 +404,7 @@ impl<T: Real> Tiles<T> {
         }
     }
 
-    /// Whether a tile may be anything but 0.
+    /// Whether a tile may have values other than 0.
     pub(super) fn has_moved(&self, point: [usize; 2]) -> bool {
         self.moved.has[self.of(point)]
     }

@@ -1,5 +1,5 @@
-//! Frames: the refined displacements as bytes, in patches small enough that other streams get in between.
-// Iterators over vectors are not always inlined, and then run without the instructions of their caller.
+//! Frames: the refined displacements as bytes, in patches small enough that other streams can interleave with them.
+// The compiler does not always inline iterators over vectors. They then run without the caller's instructions.
 #![allow(clippy::needless_range_loop)]
 
 use bytes::{Bytes, BytesMut};
@@ -9,7 +9,7 @@ use super::refine::{COMPONENTS, Points, Rows, Source, Written};
 use super::wide::{Available, LANES, Lanes, Width, Work};
 use super::{Refinement, Snapshot};
 
-/// How displacements are written.
+/// Number format of displacements.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Encoding {
     /// 4-byte IEEE floats, little-endian, m.
@@ -19,7 +19,7 @@ pub enum Encoding {
 }
 
 impl Encoding {
-    /// Three components.
+    /// Bytes of the three components of a vertex.
     pub fn bytes_per_vertex(self) -> usize {
         match self {
             Encoding::F32 => 12,
@@ -28,29 +28,29 @@ impl Encoding {
     }
 }
 
-/// Bytes of a patch at most: small messages of other streams wait no longer than one of these takes.
+/// Most bytes in a patch: small messages of other streams wait for one patch at most.
 const PATCH_BYTES: usize = 64 << 10;
 
-/// An encoded frame, shared by all viewers that asked for the same.
+/// An encoded frame, shared by all viewers that request the same kind.
 #[derive(Debug, Clone)]
 pub struct Frame {
     /// Steps done.
     pub step: u64,
-    /// s.
+    /// Simulated time, s.
     pub simulation_time_s: f64,
-    /// How far refined.
+    /// The refinement.
     pub refinement: Refinement,
-    /// How written.
+    /// The encoding.
     pub encoding: Encoding,
-    /// What the integers of `I16` mean.
+    /// Scale and origin of the integers of `I16`.
     pub quanta: Quanta,
     /// Whether every vertex is in the patches.
     pub full: bool,
-    /// No vertex is in two.
+    /// The patches. No vertex is in two of them.
     pub patches: Vec<Patch>,
 }
 
-/// A displacement is origin + scale·q, of each component; m.
+/// Scale and origin: a displacement is origin + scale·q for each component; m.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Quanta {
     /// Middle of the bounding box for `I16`, else 0.
@@ -66,11 +66,11 @@ impl Default for Quanta {
 }
 
 impl Quanta {
-    /// The finest that integers allow in a box, but none finer than `finest_m`. Values interpolated between those in
-    /// the box are within it too.
+    /// The finest quanta that integers allow in a box, but none finer than `finest_m`. Interpolation between values in
+    /// the box stays in the box. `box_m`: least and greatest value of each component.
     pub(super) fn over(box_m: &[[f32; 2]; COMPONENTS], finest_m: f64) -> Self {
         let spans = box_m.map(|[low, high]| {
-            // A value of f32, which is what encodes; the box then reaches as far as its farther side.
+            // Round to f32, the encoder's format. The box then reaches as far as its farther side.
             let middle = 0.5 * low + 0.5 * high;
             let quantum = f64::from((high - middle).max(middle - low)) / f64::from(i16::MAX);
             (f64::from(middle), quantum.max(finest_m))
@@ -78,10 +78,10 @@ impl Quanta {
         Quanta { origin_m: spans.map(|span| span.0).into(), scale_m: spans.map(|span| span.1).into() }
     }
 
-    /// Some points to be written in quanta.
+    /// A source that writes `points` in these quanta.
     #[allow(clippy::cast_possible_truncation)]
     pub(super) fn source<'v>(&self, points: Points<'v>) -> Source<'v> {
-        // Of a box without extent there is nothing but the middle.
+        // A box without extent holds only its middle.
         let per_scale = |scale_m: f64| Some(scale_m.recip() as f32).filter(|per_scale| per_scale.is_finite());
         let per_scale = self.scale_m.to_array().map(|scale_m| per_scale(scale_m).unwrap_or(0.0));
         Source::new(points, self.origin_m.to_array().map(|v| v as f32), per_scale)
@@ -95,7 +95,7 @@ pub struct Patch {
     pub first: [usize; 2],
     /// Vertices along x and y.
     pub count: [usize; 2],
-    /// Displacements, three components a vertex, y running fastest.
+    /// Displacements, three components per vertex. The y index runs fastest.
     pub bytes: Bytes,
 }
 
@@ -109,7 +109,7 @@ impl Frame {
 
 /// Patches without bytes for a rectangle of vertices.
 pub(super) fn lay_out(first: [usize; 2], [count_x, count_y]: [usize; 2], encoding: Encoding) -> Vec<Patch> {
-    // Whole rows, as many as fit; parts of a row where not even one does.
+    // Whole rows, as many as fit, or parts of a row if a whole one does not fit.
     let vertices = PATCH_BYTES / encoding.bytes_per_vertex();
     let columns_per_patch = count_y.min(vertices);
     let rows_per_patch = (vertices / count_y).max(1);
@@ -129,8 +129,8 @@ pub fn encode(snapshot: &Snapshot, refinement: Refinement, encoding: Encoding) -
     encode_over(snapshot, Frame::blank(refinement, encoding))
 }
 
-/// Makes the next frame of the kind of `spent`, a full one, in its buffers where nobody else holds them: fresh memory
-/// costs more than what is written into it.
+/// Makes the next frame of the kind of `spent`, which is a full frame, and reuses its buffers where nothing else holds
+/// them: fresh memory costs more than writing the frame.
 pub fn encode_over(snapshot: &Snapshot, spent: Frame) -> Frame {
     encode_at(Width::widest(), snapshot, spent)
 }
@@ -146,7 +146,7 @@ fn encode_at(width: Width, snapshot: &Snapshot, spent: Frame) -> Frame {
     frame
 }
 
-/// Refines and encodes the rows into the patches that were laid out for them.
+/// Refines and encodes the rows into patches laid out for them.
 pub(super) fn fill(width: Width, encoding: Encoding, patches: &mut [Patch], rows: &mut Rows<'_>) {
     match encoding {
         Encoding::F32 => width.run(Fill::<4> { patches, rows }),
@@ -154,7 +154,7 @@ pub(super) fn fill(width: Width, encoding: Encoding, patches: &mut [Patch], rows
     }
 }
 
-/// Writes all rows into the patches, `BYTES` a component.
+/// Writes all rows into the patches, with `BYTES` bytes per component.
 struct Fill<'f, 'v, const BYTES: usize> {
     patches: &'f mut [Patch],
     rows: &'f mut Rows<'v>,
@@ -195,7 +195,7 @@ where
 }
 
 impl Patch {
-    /// `length` bytes to write to: the patch's own, if nobody else reads them.
+    /// A buffer of `length` bytes: the patch's own, if nothing else reads it.
     fn buffer(&mut self, length: usize) -> BytesMut {
         let mut bytes = std::mem::take(&mut self.bytes).try_into_mut().unwrap_or_default();
         bytes.resize(length, 0);
@@ -203,7 +203,7 @@ impl Patch {
     }
 }
 
-/// The least and the greatest of some values.
+/// The least and the greatest of the values.
 pub(super) fn range(values: &[f32]) -> [f32; 2] {
     let mut range = [f32::INFINITY, f32::NEG_INFINITY];
     Width::widest().run(Range { values, range: &mut range });
@@ -218,7 +218,7 @@ struct Range<'v> {
 impl Work for Range<'_> {
     #[inline(always)]
     fn work<L: Lanes>(self, with: Available<L>) {
-        // As many as hide the time of a comparison.
+        // Enough parallel comparisons to hide their latency.
         const AT_ONCE: usize = 4;
         let mut low = [with.splat(f32::INFINITY); AT_ONCE];
         let mut high = [with.splat(f32::NEG_INFINITY); AT_ONCE];
@@ -254,7 +254,7 @@ mod tests {
         Snapshot::new(7, 0.007, [31, 17], std::array::from_fn(|c| (0..31 * 17).map(|k| wave(k, c)).collect()))
     }
 
-    /// Every vertex of a frame, decoded as a client does.
+    /// Decodes every vertex of a frame as a client does.
     fn decode(frame: &Frame) -> Vec<[f64; 3]> {
         let mut vertices = Vec::new();
         for patch in &frame.patches {
@@ -286,7 +286,7 @@ mod tests {
             for (a, b) in exact.iter().zip(&decoded) {
                 for c in 0..3 {
                     let error = (a[c] - b[c]).abs();
-                    // Half a quantum, and what f32 loses in between.
+                    // Half a quantum, plus the f32 rounding error in between.
                     assert!(
                         error <= 0.5 * coarse.quanta.scale_m[c] * 1.02,
                         "{error} against {}",

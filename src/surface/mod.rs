@@ -1,4 +1,4 @@
-//! What a viewer gets: the sheet refined by bilinear interpolation, encoded, in pieces.
+//! Frames for viewers: the sheet refined by bilinear interpolation, encoded, in patches.
 
 pub mod encode;
 pub mod refine;
@@ -11,14 +11,14 @@ pub use tiles::Tiles;
 
 use refine::Points;
 
-/// The displacements of a sheet at one moment: what frames are made of.
+/// The displacements of a sheet at one moment, from which frames are made.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Snapshot {
     /// Steps done.
     pub step: u64,
-    /// s.
+    /// Simulated time, s.
     pub simulation_time_s: f64,
-    /// m, x, y and z apart, point [i, j] at i·ny + j.
+    /// Displacements, m: x, y and z separate, point [i, j] at i·ny + j.
     displacement_m: [Vec<f32>; 3],
     /// The least and the greatest of each component, m.
     box_m: [[f32; 2]; 3],
@@ -27,13 +27,14 @@ pub struct Snapshot {
 }
 
 impl Snapshot {
-    /// Looks through the displacements once for the box around them, for all encodings.
+    /// Creates a snapshot of `points` along x and y. `displacement_m` has nx·ny values for each component, point [i, j]
+    /// at i·ny + j. Computes the bounding box once for all encodings.
     pub fn new(step: u64, simulation_time_s: f64, points: [usize; 2], displacement_m: [Vec<f32>; 3]) -> Self {
         let box_m = displacement_m.each_ref().map(|values| encode::range(values));
         Snapshot { step, simulation_time_s, displacement_m, box_m, points }
     }
 
-    /// All of them.
+    /// All points.
     fn points(&self) -> Points<'_> {
         let values = self.displacement_m.each_ref().map(Vec::as_slice);
         Points { values, stride: self.points[1], count: self.points }

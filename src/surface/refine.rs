@@ -1,6 +1,6 @@
 //! Refinement (the paper's bilinear interpolation): n vertices between neighbouring points, so that a side of m
 //! points has M = (m − 1)·n + m vertices.
-// Iterators over vectors are not always inlined, and then run without the instructions of their caller.
+// The compiler does not always inline iterators over vectors. They then run without the caller's instructions.
 #![allow(clippy::needless_range_loop)]
 
 use super::wide::{Available, LANES, Lanes};
@@ -20,7 +20,10 @@ pub struct Refinement {
 }
 
 impl Refinement {
-    /// Refinement `n` of a sheet of `points`.
+    /// Refinement `n` of a sheet with `points` along x and y.
+    ///
+    /// # Errors
+    /// Refuses an `n` above [`LARGEST_REFINEMENT`] and a grid with too many vertices.
     pub fn new(points: [usize; 2], n: u32, limits: &Limits) -> Result<Self> {
         if n > LARGEST_REFINEMENT {
             let message = format!("must be from 0 to {LARGEST_REFINEMENT}, but is {n}");
@@ -40,17 +43,17 @@ impl Refinement {
         self.points.map(|points| (points - 1) * (self.between + 1) + 1)
     }
 
-    /// Distance of vertices at rest, for points `spacing_m` apart.
+    /// Distance between vertices at rest, for points `spacing_m` apart.
     #[allow(clippy::cast_precision_loss)]
     pub fn spacing_m(&self, spacing_m: f64) -> f64 {
         spacing_m / (self.between + 1) as f64
     }
 }
 
-/// Components of a point or vertex: in a row, x, y and z of one lie together, as they do in a patch.
+/// Components of a point or vertex. In a row, x, y and z of a vertex are adjacent, as in a patch.
 pub(super) const COMPONENTS: usize = 3;
 
-/// A component as it is written.
+/// The written form of a component.
 pub(super) trait Written: Copy + Default {
     /// Writes displacements in quanta.
     fn write<L: Lanes>(values: L, to: &mut [Self; LANES]);
@@ -58,7 +61,7 @@ pub(super) trait Written: Copy + Default {
     fn weave<L: Lanes>(xyz: [L; COMPONENTS], to: &mut [[Self; LANES]; COMPONENTS]);
 }
 
-/// To be refined further.
+/// Not encoded: refined further.
 impl Written for f32 {
     #[inline(always)]
     fn write<L: Lanes>(values: L, to: &mut [Self; LANES]) {
@@ -104,11 +107,11 @@ impl Written for [u8; 2] {
     }
 }
 
-/// What is refined: displacements of points, and how they become quanta, (v − origin)·per_scale.
+/// The input of refinement: displacements of points, and their conversion to quanta, (v − origin)·per_scale.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Source<'v> {
     points: Points<'v>,
-    /// In each lane the same: what the compiler knows to be so, it shuffles.
+    /// The same value in each lane. The compiler would shuffle a value that it knows to be uniform.
     origin: [Block<f32>; COMPONENTS],
     per_scale: [Block<f32>; COMPONENTS],
 }
@@ -116,9 +119,9 @@ pub(super) struct Source<'v> {
 /// A rectangle of points.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Points<'v> {
-    /// x, y and z apart, points along y beside each other, the first one first.
+    /// x, y and z separate. Points along y are adjacent.
     pub(super) values: [&'v [f32]; COMPONENTS],
-    /// From a point to the next along x.
+    /// From one point to the next along x.
     pub(super) stride: usize,
     /// Along x and y.
     pub(super) count: [usize; 2],
@@ -140,34 +143,35 @@ impl<'v> Source<'v> {
 
 /// The rows of vertices between some points, from the first to the last.
 ///
-/// Points become quanta before they are refined: there are fewer of them than vertices. Interpolation along y costs
-/// permutations, interpolation along x does not; so rows of points are refined along y, and rows of vertices are mixed
-/// from them.
+/// Points are converted to quanta before refinement, because there are fewer points than vertices. Interpolation along
+/// y costs permutations, interpolation along x does not. So rows of points are refined along y, and rows of vertices
+/// are mixed from them.
 pub(super) struct Rows<'v> {
-    /// Vertices for each point, but for the last.
+    /// Vertices for each point except the last.
     cells: usize,
     source: Source<'v>,
     /// The rows of points on either side of the row of vertices, refined along y, in whole periods of `spread`.
     near: Vec<Block<f32>>,
     far: Vec<Block<f32>>,
-    /// A row of points before it is refined, and what reads beyond it need.
+    /// A row of points before refinement, with padding for reads beyond it.
     points: Vec<f32>,
     spread: Vec<Spread>,
 }
 
-/// Lies in one cache line: a load across two costs twice as much.
+/// Aligned to one cache line: a load across two costs twice as much.
 #[derive(Debug, Clone, Copy)]
 #[repr(align(64))]
 struct Block<T>([T; LANES]);
 
-/// A block of vertices in a row. After as many as one point has components of vertices, they repeat 16 points on.
+/// A block of vertices in a row. The pattern repeats 16 points on, after as many blocks as a point has components of
+/// vertices.
 struct Spread {
-    /// Where the block of points begins of which they are made.
+    /// Beginning of the block of points that it is made from.
     begin: usize,
-    /// The components on either side, in that block.
+    /// Indices of the components on the left and right side in that block.
     left: Block<i32>,
     right: Block<i32>,
-    /// How much of the way each vertex is from the left to the right.
+    /// The position of each vertex between left (0) and right (1).
     part: Block<f32>,
 }
 
@@ -182,13 +186,12 @@ impl<'v> Rows<'v> {
         Rows { cells, source, near, far, points, spread }
     }
 
-    /// Goes on with the rows between other points.
+    /// Continues with the rows between other points.
     pub(super) fn turn_to(&mut self, source: Source<'v>) {
         self.source = source;
     }
 
-    /// Writes row `a`, three components a vertex, as many as there is room for. Rows are asked for one after the other,
-    /// from 0.
+    /// Writes row `a`, three components per vertex, as many as `to` has room for. Call it for consecutive rows from 0.
     #[inline(always)]
     #[allow(clippy::cast_precision_loss)]
     pub(super) fn write<L: Lanes, W: Written>(&mut self, with: Available<L>, a: usize, row: &mut [W]) {
@@ -202,7 +205,7 @@ impl<'v> Rows<'v> {
                 if a == 0 {
                     self.load(with, 0);
                 }
-                // A row of points has no row beyond it to be mixed with, and at the rim there is none.
+                // A row that lies on points is not mixed with the next, and at the edge there is no next row.
                 std::mem::swap(&mut self.near, &mut self.far);
                 put(with, &self.near, row);
             }
@@ -215,7 +218,7 @@ impl<'v> Rows<'v> {
         }
     }
 
-    /// Brings row `i` of the points into `far`.
+    /// Loads row `i` of the points into `far`.
     #[inline(always)]
     fn load<L: Lanes>(&mut self, with: Available<L>, i: usize) {
         weave(with, &self.source, i, &mut self.points[..COMPONENTS * self.source.points.count[1]]);
@@ -245,7 +248,7 @@ impl Spread {
     }
 }
 
-/// The points of row `i` in quanta, one after the other, as many as `row` has room for.
+/// Converts the points of row `i` to quanta, as many as `row` has room for.
 #[inline(always)]
 fn weave<L: Lanes, W: Written>(with: Available<L>, source: &Source<'_>, i: usize, row: &mut [W]) {
     let row = row.as_chunks_mut::<COMPONENTS>().0;
@@ -293,13 +296,13 @@ impl Source<'_> {
     }
 }
 
-/// `part` of the way from `near` to `far`.
+/// Interpolates at `part` between `near` and `far`.
 #[inline(always)]
 fn between<L: Lanes>(near: L, far: L, part: L) -> L {
     near.add(part.mul(far.sub(near)))
 }
 
-/// Writes a row as it is.
+/// Writes a row without mixing.
 #[inline(always)]
 fn put<L: Lanes, W: Written>(with: Available<L>, values: &[Block<f32>], row: &mut [W]) {
     let (blocks, rest) = row.as_chunks_mut();
@@ -313,7 +316,7 @@ fn put<L: Lanes, W: Written>(with: Available<L>, values: &[Block<f32>], row: &mu
     }
 }
 
-/// Writes a row that is `part` of the way from `near` to `far`.
+/// Writes a row at `part` between `near` and `far`.
 #[inline(always)]
 fn mix<L: Lanes, W: Written>(with: Available<L>, near: &[Block<f32>], far: &[Block<f32>], part: f32, row: &mut [W]) {
     let part = with.splat(part);

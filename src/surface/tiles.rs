@@ -1,11 +1,11 @@
-//! Frames of what changed. A sheet is cut into tiles of 16 × 16 points; a tile is written anew when what was last
-//! written of it no longer shows where it is, and each viewer gets the tiles that are newer than what it has.
+//! Frames of changes. A sheet is cut into tiles of 16 × 16 points. A tile is rewritten when its last written state no
+//! longer shows its position, and each viewer gets the tiles that are newer than its own copy.
 //!
-//! A tile keeps the displacements that it was last written from, and is compared with those, not with the last frame:
-//! slow creep adds up. It is rewritten when a point has moved by more than half a quantum since; the other half is what
-//! rounding may cost. The box over which quanta are spread only grows until the next keyframe, so what was written
-//! before is never coarser than what is written now: every vertex is within one quantum of where it should be.
-// Iterators over vectors are not always inlined, and then run without the instructions of their caller.
+//! A tile keeps the displacements that it was last written from and is compared with those, not with the last frame,
+//! because slow creep adds up. It is rewritten when a point has moved by more than half a quantum since; rounding may
+//! take the other half. The box that quanta cover only grows until the next keyframe, so earlier writes are never
+//! coarser than the present ones: every vertex is within one quantum of its true place.
+// The compiler does not always inline iterators over vectors. They then run without the caller's instructions.
 #![allow(clippy::needless_range_loop)]
 
 use std::sync::Arc;
@@ -18,30 +18,30 @@ use super::{Encoding, Refinement, Snapshot};
 /// Points along a side of a tile.
 const SIDE: usize = 16;
 
-/// Simulated time from a keyframe, in which all tiles are written over a box that fits, to the next; if anything changes.
+/// Simulated time between keyframes, if anything changes. A keyframe writes all tiles in a box that fits.
 const KEYFRAME_S: f64 = 5.0;
 
-/// The finest quantum, in spacings of the points: no eye sees less, and what has all but come to rest is still.
+/// The finest quantum, in spacings of the points: smaller movements are invisible, so an almost resting sheet is still.
 const FINEST: f64 = 1e-6;
 
-/// What viewers of one refinement and encoding have been shown of a sheet, or could have been.
+/// The state of a sheet as viewers of one refinement and encoding see it.
 #[derive(Debug)]
 pub struct Tiles {
     refinement: Refinement,
     encoding: Encoding,
     finest_m: f64,
-    /// Counts updates; a tile has that of the update at which it was last written.
+    /// Counts updates. A tile has the version of the update at which it was last written.
     version: u64,
-    /// What the tiles were written from at the keyframe.
+    /// The snapshot that the keyframe was written from.
     key: Arc<Snapshot>,
-    /// Whether anything was written since.
+    /// Whether anything was written since the keyframe.
     changed: bool,
-    /// The newest; all tiles show it within a quantum.
+    /// The newest snapshot. All tiles show it within a quantum.
     now: Arc<Snapshot>,
     box_m: [[f32; 2]; COMPONENTS],
     quanta: Quanta,
     tiles: Vec<Tile>,
-    /// Of each tile, what was last written for somebody, and at which update.
+    /// For each tile, the last patches written for a viewer, and their version.
     written: Vec<(u64, Vec<Patch>)>,
 }
 
@@ -49,17 +49,17 @@ pub struct Tiles {
 struct Tile {
     area: Area,
     version: u64,
-    /// What it was written from, if that was after the keyframe: x, y and z of `area.points`.
+    /// The displacements it was last written from, if that was after the keyframe: x, y and z of `area.points`.
     own: Option<[Vec<f32>; COMPONENTS]>,
 }
 
-/// A tile's place.
+/// The place of a tile.
 #[derive(Debug, Clone, Copy)]
 struct Area {
     /// Its vertices.
     first: [usize; 2],
     vertices: [usize; 2],
-    /// The points around them.
+    /// The points around those vertices.
     first_point: [usize; 2],
     points: [usize; 2],
 }
@@ -70,7 +70,7 @@ impl Area {
         let [mut first, mut vertices, mut points] = [[0; 2]; 3];
         for axis in 0..2 {
             first[axis] = tile[axis] * SIDE * cells;
-            // The last tile has the rim too.
+            // The last tile also has the vertices of the edge.
             let is_last = tile[axis] + 1 == tiles_along(grid.points[axis]);
             let end = if is_last { grid.vertices()[axis] } else { first[axis] + SIDE * cells };
             vertices[axis] = end - first[axis];
@@ -79,7 +79,7 @@ impl Area {
         Area { first, vertices, first_point: tile.map(|tile| tile * SIDE), points }
     }
 
-    /// The points in a whole sheet of them.
+    /// The tile's points within those of a whole sheet.
     fn of_sheet<'v>(&self, snapshot: &'v Snapshot) -> Points<'v> {
         let Points { values, stride, .. } = snapshot.points();
         let from = self.first_point[0] * stride + self.first_point[1];
@@ -92,7 +92,7 @@ fn tiles_along(points: usize) -> usize {
 }
 
 impl Tile {
-    /// What it was last written from.
+    /// The displacements that it was last written from.
     fn shown<'v>(&'v self, key: &'v Snapshot) -> Points<'v> {
         match &self.own {
             None => self.area.of_sheet(key),
@@ -103,7 +103,7 @@ impl Tile {
         }
     }
 
-    /// Is written from `points`.
+    /// Stores `points` as the displacements it is written from.
     fn take(&mut self, points: Points<'_>, version: u64) {
         let mut own = self.own.take().unwrap_or_default();
         for (c, own) in own.iter_mut().enumerate() {
@@ -116,7 +116,7 @@ impl Tile {
 }
 
 impl Tiles {
-    /// Begins with a keyframe. Points are `spacing_m` apart.
+    /// Begins with a keyframe. `spacing_m` is the distance between points, m.
     pub fn new(snapshot: &Arc<Snapshot>, refinement: Refinement, encoding: Encoding, spacing_m: f64) -> Self {
         let [along_x, along_y] = refinement.points.map(tiles_along);
         let place = |number: usize| Area::of(refinement, [number / along_y, number % along_y]);
@@ -138,27 +138,27 @@ impl Tiles {
         tiles
     }
 
-    /// How far refined.
+    /// The refinement.
     pub fn refinement(&self) -> Refinement {
         self.refinement
     }
 
-    /// How written.
+    /// The encoding.
     pub fn encoding(&self) -> Encoding {
         self.encoding
     }
 
-    /// Counts updates: who has been given the frame of this one has everything.
+    /// The number of updates. A viewer with the frame of this version has everything.
     pub fn version(&self) -> u64 {
         self.version
     }
 
-    /// Looks for what changed.
+    /// Finds the tiles that changed.
     pub fn update(&mut self, snapshot: &Arc<Snapshot>) {
         if Arc::ptr_eq(snapshot, &self.now) {
             return;
         }
-        // The buffers of tiles that go on changing are used again; those of the others are not kept.
+        // Reuse the buffers of tiles that keep changing; drop the others.
         for (version, patches) in &mut self.written {
             if *version != self.version {
                 patches.clear();
@@ -174,7 +174,7 @@ impl Tiles {
             *whole = [whole[0].min(now[0]), whole[1].max(now[1])];
         }
         self.fit();
-        // f32 shows the least change.
+        // f32 shows the smallest change.
         let unseen_m = match self.encoding {
             Encoding::F32 => [0.0; COMPONENTS],
             #[allow(clippy::cast_possible_truncation)]
@@ -191,7 +191,7 @@ impl Tiles {
         }
     }
 
-    /// A keyframe.
+    /// Writes a keyframe.
     fn write_all(&mut self, snapshot: &Arc<Snapshot>) {
         self.version += 1;
         self.key = snapshot.clone();
@@ -211,12 +211,12 @@ impl Tiles {
         }
     }
 
-    /// Whether any tile is newer than an update, or than nothing at all.
+    /// Whether any tile is newer than `version`; `None` is older than all.
     pub fn is_newer_than(&self, version: Option<u64>) -> bool {
         self.tiles.iter().any(|tile| Some(tile.version) > version)
     }
 
-    /// The tiles that are newer, written once for all who need them.
+    /// A frame of the tiles newer than `version`. Each tile is written once for all viewers that need it.
     pub fn newer_than(&mut self, version: Option<u64>) -> Frame {
         let Tiles { refinement, encoding, version: now_at, quanta, key, now, tiles, written, .. } = self;
         let (width, most) = (Width::widest(), SIDE * (refinement.between + 1) + 1);
@@ -245,7 +245,7 @@ impl Tiles {
     }
 }
 
-/// Whether a point has moved by more than can be seen.
+/// Compares whether a point has moved by more than is visible.
 struct Compare<'v> {
     now: Points<'v>,
     shown: Points<'v>,
@@ -299,7 +299,7 @@ mod tests {
         Refinement::new(points, n, &Limits::default()).unwrap()
     }
 
-    /// What a viewer sees: it keeps vertices, and writes patches over them.
+    /// A viewer's state: it keeps vertices and writes patches over them.
     #[derive(Clone)]
     struct Picture {
         vertices: Vec<Option<[f64; 3]>>,
@@ -311,7 +311,7 @@ mod tests {
             Picture { vertices: Vec::new(), has: None }
         }
 
-        /// Tells how many vertices were written.
+        /// Applies a frame. Returns the number of vertices written.
         fn show(&mut self, frame: &Frame) -> usize {
             let [x, y] = frame.refinement.vertices();
             self.vertices.resize(x * y, None);
@@ -336,7 +336,7 @@ mod tests {
             count
         }
 
-        /// Every vertex is where it should be, within some fraction of the quantum; f32 to the bit.
+        /// Checks that every vertex is within `quanta` quanta of its true place; f32 to the bit.
         fn check(&self, tiles: &Tiles, truth: &Snapshot, quanta: f64) {
             let mut exact = Picture::new();
             exact.show(&encode(truth, tiles.refinement, Encoding::F32));
@@ -380,7 +380,7 @@ mod tests {
             (0, [20, 20], 1),
             (0, [16, 20], 1),
             (3, [20, 20], 1),
-            // On the first row of a tile, between whose points and the last ones of the tile before there are vertices.
+            // On the first row of a tile: there are vertices between its points and the last ones of the tile before.
             (3, [16, 20], 2),
             (3, [16, 32], 4),
         ] {
@@ -408,7 +408,7 @@ mod tests {
         let mut written = 0;
         for step in 1..200 {
             let version = tiles.version();
-            // Every other time nothing moves.
+            // Every second time nothing moves.
             displacement_m[0][210] += if step % 2 == 0 { 0.04 * quantum_m } else { 0.0 };
             let snapshot = at(points, step, step as f64 * 0.01, &displacement_m);
             tiles.update(&snapshot);
@@ -444,12 +444,12 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig { cases: 40, failure_persistence: None, ..ProptestConfig::default() })]
 
-        /// Whatever moves, and whichever frames a viewer gets, after each it sees the present.
+        /// For any movement and any selection of frames: after each frame a viewer sees the present.
         #[test]
         fn a_viewer_sees_the_present_whichever_frames_it_got(
             n in 0_u32..4,
             i16 in any::<bool>(),
-            // Few points and strides, so that they also go back.
+            // Few points and strides, so that some movements also go back.
             moves in prop::collection::vec((0_usize..6, 0_usize..3, -7..-1, any::<bool>(), 0_u8..8, 0.0..0.5), 1..60),
         ) {
             let points = [35, 18];

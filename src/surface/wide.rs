@@ -1,19 +1,19 @@
 //! Sixteen numbers at a time, with AVX-512, AVX2 or plain instructions, chosen at run time.
 //!
-//! Every operation is one that IEEE 754 rounds exactly, or moves bits; so the bits are the same at every width. What
-//! the compiler does not inline into the function of a width loses that width's instructions: hot code is
-//! `#[inline(always)]` and uses neither iterators nor closures over lanes. This is the only file of the room with
-//! unsafe code: an instruction must exist on the processor, which [`Width::run`] makes sure of.
+//! Every operation is one that IEEE 754 rounds exactly, or moves bits, so the bits are the same at every width. Code
+//! that the compiler does not inline into the function of a width loses that width's instructions: hot code is
+//! `#[inline(always)]` and uses neither iterators nor closures over lanes. This is the only file here with unsafe code:
+//! the processor must have each instruction, which [`Width::run`] ensures.
 #![allow(unsafe_code)]
 #![allow(clippy::needless_range_loop)]
 
 use std::marker::PhantomData;
 
-/// How many.
+/// Number of lanes.
 pub(super) const LANES: usize = 16;
 
-/// That many numbers. A value is the proof that the processor has the instructions: the first are made by unsafe
-/// functions, through an [`Available`], all others out of values.
+/// Sixteen numbers. A value is the proof that the processor has the instructions: unsafe functions create the first
+/// ones through an [`Available`], and all others come from values.
 pub(super) trait Lanes: Copy {
     /// # Safety
     /// The processor has the instructions.
@@ -31,7 +31,7 @@ pub(super) trait Lanes: Copy {
     fn larger(self, other: Self) -> Self;
     /// Stores x, y and z of sixteen points as x0 y0 z0 x1 …
     fn weave(xyz: [Self; 3], to: &mut [[f32; LANES]; 3]);
-    /// The same, as [`Lanes::store_rounded`] does.
+    /// The same, rounded as in [`Lanes::store_rounded`].
     fn weave_rounded(xyz: [Self; 3], to: &mut [[[u8; 2]; LANES]; 3]);
     /// Lane l of the result is lane `from[l]`, below 16.
     fn permute(self, from: &[i32; LANES]) -> Self;
@@ -39,7 +39,7 @@ pub(super) trait Lanes: Copy {
     fn store_rounded(self, to: &mut [[u8; 2]; LANES]);
 }
 
-/// The processor has the instructions of `L`. Only this file makes one.
+/// Proof that the processor has the instructions of `L`. Only this file creates one.
 pub(super) struct Available<L>(PhantomData<L>);
 
 impl<L> Clone for Available<L> {
@@ -51,7 +51,7 @@ impl<L> Clone for Available<L> {
 impl<L> Copy for Available<L> {}
 
 impl Available<Plain> {
-    /// Every processor has what is plain.
+    /// Every processor has the plain instructions.
     pub(super) const PLAIN: Self = Available(PhantomData);
 }
 
@@ -63,10 +63,10 @@ impl<L: Lanes> Available<L> {
         Available(PhantomData)
     }
 
-    /// Sixteen numbers.
+    /// Loads sixteen numbers.
     #[inline(always)]
     pub(super) fn load(self, from: &[f32; LANES]) -> L {
-        // SAFETY: whoever made this promised the instructions.
+        // SAFETY: the creator of this value promised the instructions.
         unsafe { L::load(from) }
     }
 
@@ -78,13 +78,13 @@ impl<L: Lanes> Available<L> {
     }
 }
 
-/// Something to be done at any width.
+/// A computation that can run at any width.
 pub(super) trait Work {
-    /// Does it; `#[inline(always)]`.
+    /// Runs it; implement it with `#[inline(always)]`.
     fn work<L: Lanes>(self, with: Available<L>);
 }
 
-/// The instructions to be used.
+/// An instruction set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Width {
     Plain,
@@ -114,7 +114,7 @@ impl Width {
         Width::ALL.into_iter().rfind(|width| width.is_available()).unwrap_or(Width::Plain)
     }
 
-    /// Does `work` with these instructions, or with plain ones where they are not available.
+    /// Runs `work` with these instructions, or with plain ones if they are not available.
     pub(super) fn run(self, work: impl Work) {
         match self {
             // SAFETY: the processor has the instructions.
@@ -227,8 +227,8 @@ mod x86 {
         work.work(unsafe { Available::<Narrow>::new() });
     }
 
-    /// Where the `lanes` lanes of component `c` come from when three vectors are woven. In each of the three results the
-    /// component takes other lanes, so one permutation is enough.
+    /// For each of `lanes` lanes, the source lane of component `c` when three vectors are interleaved. In each of the
+    /// three results the component takes other lanes, so one permutation is enough.
     const fn sources<const N: usize>(c: usize) -> [i32; N] {
         let mut sources = [0; N];
         let mut place = c;
@@ -243,8 +243,8 @@ mod x86 {
     #[derive(Clone, Copy)]
     struct Wide(__m512);
 
-    // SAFETY (of every block below): a value of these types, or the caller's promise, is the proof that the processor has
-    // the instructions; memory is an array of as many numbers.
+    // SAFETY (of every block below): a value of these types, or the caller's promise, is the proof that the processor
+    // has the instructions; memory is an array of that many numbers.
     impl Lanes for Wide {
         #[inline(always)]
         unsafe fn load(from: &[f32; LANES]) -> Self {
@@ -380,13 +380,13 @@ mod x86 {
             unsafe {
                 let low = _mm256_permutevar8x32_ps(self.0[0], from);
                 let high = _mm256_permutevar8x32_ps(self.0[1], from);
-                // The bit of 8 decides, as the sign.
+                // Bit 3 of the index selects the half, as the sign.
                 _mm256_blendv_ps(low, high, _mm256_castsi256_ps(_mm256_slli_epi32::<28>(from)))
             }
         }
     }
 
-    /// Half by half.
+    /// Each half separately.
     macro_rules! halves {
         ($operation:ident, $a:ident, $b:ident) => {
             unsafe { Narrow([$operation($a.0[0], $b.0[0]), $operation($a.0[1], $b.0[1])]) }
@@ -455,7 +455,7 @@ mod x86 {
         fn store_rounded(self, to: &mut [[u8; 2]; LANES]) {
             unsafe {
                 let packed = _mm256_packs_epi32(_mm256_cvtps_epi32(self.0[0]), _mm256_cvtps_epi32(self.0[1]));
-                // The instruction packs each half by itself.
+                // The instruction packs each half separately.
                 _mm256_storeu_si256(to.as_mut_ptr().cast(), _mm256_permute4x64_epi64::<0b11_01_10_00>(packed));
             }
         }

@@ -1,5 +1,5 @@
-//! What a tissue looks like: an image for its surface, made out of a seed or the user's own. The same seed and size give
-//! the same bytes anywhere.
+//! The appearance of a tissue: an image of its surface, generated from a seed or supplied by the user. The same seed
+//! and size give the same bytes on any machine.
 
 mod mucosa;
 mod noise;
@@ -14,27 +14,30 @@ use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, number};
 use crate::scene::{Appearance, SMALLEST_TEXTURE};
 
-/// Rows of pixels from the top, sRGB.
+/// An image: rows of pixels from the top, sRGB.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Image {
     /// Pixels in a row.
     pub width: usize,
     /// Rows.
     pub height: usize,
-    /// Red, green and blue of each.
+    /// Red, green and blue of each pixel: 3·`width`·`height` bytes.
     pub rgb: Vec<u8>,
 }
 
-/// An image as it is served.
+/// An image in the form that the server sends.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Texture {
     /// The file.
     pub png: Bytes,
-    /// Differs for any two that differ; a quoted string, for HTTP.
+    /// An identifier that differs between different images; a quoted string, for HTTP.
     pub etag: String,
 }
 
-/// The lining of a stomach as an endoscope shows it, `size` × `size` pixels.
+/// The lining of a stomach as in an endoscope, `size` × `size` pixels.
+///
+/// # Errors
+/// Refuses a size outside the limits.
 pub fn mucosa(seed: u64, size: u32, limits: &Limits) -> Result<Image> {
     let range = format!("from {SMALLEST_TEXTURE} to {} pixels", limits.texture_side);
     let holds = |v| v >= f64::from(SMALLEST_TEXTURE) && v <= f64::from(limits.texture_side);
@@ -44,6 +47,9 @@ pub fn mucosa(seed: u64, size: u32, limits: &Limits) -> Result<Image> {
 }
 
 /// The image of a scene's tissue.
+///
+/// # Errors
+/// Refuses a size beyond the limits, and a file that can't be read as a PNG image within the limits.
 pub fn image(appearance: &Appearance, limits: &Limits) -> Result<Image> {
     match &appearance.texture {
         Some(path) => Image::decode(path, &read(path, limits)?, limits),
@@ -51,7 +57,10 @@ pub fn image(appearance: &Appearance, limits: &Limits) -> Result<Image> {
     }
 }
 
-/// The same as a file: the user's own as it is, after a look at whether it is one.
+/// The same as a PNG file. A user's own file is checked and passed on unchanged.
+///
+/// # Errors
+/// As for [`image`].
 pub fn texture(appearance: &Appearance, limits: &Limits) -> Result<Texture> {
     let png = match &appearance.texture {
         Some(path) => {
@@ -84,7 +93,7 @@ fn read(path: &Path, limits: &Limits) -> Result<Vec<u8>> {
 }
 
 impl Image {
-    /// Reads a PNG file of any colour type; what is transparent shows as it is painted.
+    /// Reads a PNG file of any colour type. Transparency is ignored.
     fn decode(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Self> {
         let wrong = |e: png::DecodingError| refuse(path, Reason::Unreadable, format!("is no PNG image: {e}"));
         let mut decoder = png::Decoder::new(Cursor::new(bytes));
@@ -107,7 +116,10 @@ impl Image {
         Ok(Image { width: width as usize, height: height as usize, rgb })
     }
 
-    /// As a PNG file.
+    /// The image as a PNG file.
+    ///
+    /// # Errors
+    /// Returns an error if the encoder refuses the image.
     pub fn png(&self) -> Result<Vec<u8>> {
         let mut file = Vec::new();
         #[allow(clippy::cast_possible_truncation)]

@@ -1,7 +1,8 @@
-//! What the lining of a stomach looks like through an endoscope: broad folds, a relief of small fields, vessels at two
-//! depths, capillaries around the fields, redder and paler regions, and a wet film that glitters.
+//! The lining of a stomach seen through an endoscope: broad folds, a relief of small fields, vessels at two depths,
+//! capillaries around the fields, redder and paler regions, and a wet film with glints.
 //!
-//! All is a function of place (sides of the image), so that another size shows the same at another sharpness.
+//! Everything is a function of place (in sides of the image), so another size shows the same picture at another
+//! resolution.
 
 use super::noise::{cells, fractal, gradient, step};
 use super::vessels::{self, Habit};
@@ -32,12 +33,12 @@ fn fold(seed: u32, x: f32, y: f32) -> f32 {
     let from_groove = 1.0 - (2.0 * (across - across.floor()) - 1.0).abs();
     // Broad backs, narrow grooves.
     let back = 1.0 - (1.0 - from_groove) * (1.0 - from_groove) * (1.0 - from_groove);
-    // Grooves end.
+    // Grooves have ends.
     let depth = step(-0.35, 0.25, gradient(seed + 18, 2.2 * x + 5.0, 2.2 * y));
     1.0 - depth * (1.0 - back)
 }
 
-/// Height of the surface, and distances to a field's middle and to the next one's.
+/// Height of the surface, and the distances to the middle of this field and of the next one.
 fn relief(seed: u32, x: f32, y: f32) -> (f32, [f32; 2]) {
     let swell = fractal(seed + 20, 7.0 * x, 7.0 * y, 3);
     let (a, b) = (0.012 * fractal(seed + 24, 14.0 * x, 14.0 * y, 2), 0.012 * fractal(seed + 27, 14.0 * x, 14.0 * y, 2));
@@ -56,7 +57,7 @@ pub(super) fn paint(seed: u64, size: usize) -> Vec<u8> {
     let veins = vessels::paint(seed + 1, size, veins);
     let arteries = vessels::paint(seed + 2, size, arteries);
     let mut pixels = vec![0; 3 * size * size];
-    // Each row on its own, so it does not matter who paints it.
+    // Rows are independent, so the result does not depend on which thread paints them.
     let workers = std::thread::available_parallelism().map_or(1, usize::from);
     let rows = size.div_ceil(workers);
     std::thread::scope(|scope| {

@@ -1,7 +1,7 @@
-//! Noise over the plane: numbers that look random, but are those of a place and a seed. Nothing but arithmetic that
-//! IEEE 754 rounds exactly, so the same on every machine.
+//! Noise over the plane: values that look random but are functions of a place and a seed. All operations are arithmetic
+//! that IEEE 754 rounds exactly, so the values are the same on every machine.
 
-/// Bits of a lattice point, by multiplying and mixing (the finalizer of MurmurHash3).
+/// Hashes a lattice point by multiplying and mixing (the finalizer of MurmurHash3).
 pub(super) fn bits(seed: u32, x: i32, y: i32) -> u32 {
     let mut h = seed ^ (x as u32).wrapping_mul(0x9e37_79b1) ^ (y as u32).wrapping_mul(0x85eb_ca77).rotate_left(16);
     h ^= h >> 16;
@@ -11,7 +11,7 @@ pub(super) fn bits(seed: u32, x: i32, y: i32) -> u32 {
     h ^ h >> 16
 }
 
-/// From 0 to 1, out of some bits.
+/// A number from 0 to 1 from hash bits.
 pub(super) fn unit(bits: u32) -> f32 {
     (bits >> 8) as f32 / (1 << 24) as f32
 }
@@ -22,7 +22,7 @@ pub(super) fn step(from: f32, to: f32, x: f32) -> f32 {
     t * t * (3.0 - 2.0 * t)
 }
 
-/// Gradient noise (Perlin's), from −1 to 1: smooth, and 0 at whole numbers.
+/// Gradient noise (Perlin noise), from −1 to 1: smooth, and 0 at integers.
 pub(super) fn gradient(seed: u32, x: f32, y: f32) -> f32 {
     let (left, top) = (x.floor(), y.floor());
     let (i, j) = (left as i32, top as i32);
@@ -38,11 +38,11 @@ pub(super) fn gradient(seed: u32, x: f32, y: f32) -> f32 {
     1.4 * mix(mix(corner(0, 0), corner(1, 0), u), mix(corner(0, 1), corner(1, 1), u), v)
 }
 
-/// Gradient noise in `octaves` of twice the frequency and half the height each.
+/// Gradient noise in `octaves` of twice the frequency and half the amplitude each.
 pub(super) fn fractal(seed: u32, x: f32, y: f32, octaves: u32) -> f32 {
     let (mut sum, mut scale, mut height) = (0.0, 1.0, 1.0);
     for octave in 0..octaves {
-        // Turned, so that the lattices don't show.
+        // Rotated, so that the lattices don't show.
         let (a, b) = (scale * (0.8 * x - 0.6 * y), scale * (0.6 * x + 0.8 * y));
         sum += height
             * if octave % 2 == 0 {
@@ -55,7 +55,7 @@ pub(super) fn fractal(seed: u32, x: f32, y: f32, octaves: u32) -> f32 {
     sum
 }
 
-/// Distances to the nearest and the next of scattered points, one in each square of side 1 (Worley's noise).
+/// Distances to the nearest and the second nearest of scattered points, one in each square of side 1 (Worley noise).
 pub(super) fn cells(seed: u32, x: f32, y: f32) -> [f32; 2] {
     let (i, j) = (x.floor() as i32, y.floor() as i32);
     let mut nearest = [f32::MAX; 2];

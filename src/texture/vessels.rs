@@ -2,7 +2,7 @@
 
 use super::noise::{bits, gradient, unit};
 
-/// A piece of a vessel; lengths in sides of the image.
+/// A piece of a vessel. Lengths are in sides of the image.
 #[derive(Debug, Clone, Copy)]
 struct Stroke {
     from: [f32; 2],
@@ -31,17 +31,17 @@ impl Numbers {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Habit {
     pub(super) trees: u32,
-    /// Of a trunk, in sides.
+    /// Radius of a trunk, in sides.
     pub(super) radius: f32,
-    /// Below which nothing grows on.
+    /// Radius below which growth stops.
     pub(super) thinnest: f32,
-    /// By how much a vessel gets thinner over a length of 1.
+    /// Decrease of radius over a length of 1.
     pub(super) taper: f32,
-    /// Branches over a length of 1.
+    /// Number of branches over a length of 1.
     pub(super) branches: f32,
 }
 
-/// How much of a vessel there is at each pixel, 0 to 1.
+/// The coverage of each pixel by vessels, 0 to 1: `size` × `size` values, by rows.
 pub(super) fn paint(seed: u32, size: usize, habit: Habit) -> Vec<f32> {
     let mut map = vec![0.0; size * size];
     for stroke in grow(seed, habit) {
@@ -50,7 +50,7 @@ pub(super) fn paint(seed: u32, size: usize, habit: Habit) -> Vec<f32> {
     map
 }
 
-/// Most strokes of all trees.
+/// Most strokes of all trees together.
 const MOST: usize = 40_000;
 
 /// Length of a stroke.
@@ -62,7 +62,7 @@ fn grow(seed: u32, habit: Habit) -> Vec<Stroke> {
     // Place, direction, radius.
     let mut tips: Vec<([f32; 2], [f32; 2], f32)> = Vec::new();
     for tree in 0..habit.trees {
-        // From the rim inwards, all around.
+        // From the edge inwards, all around.
         let along = (tree as f32 + numbers.next()) / habit.trees as f32 * 4.0;
         let t = along.fract();
         let (place, inwards) = match along as u32 {
@@ -75,7 +75,7 @@ fn grow(seed: u32, habit: Habit) -> Vec<Stroke> {
     }
     while let Some((mut place, mut towards, mut radius)) = tips.pop() {
         while radius > habit.thinnest && strokes.len() < MOST {
-            // A slow meander that neighbours share, and a tremble of its own.
+            // A slow meander that neighbours share, and a tremor of its own.
             let meander = 1.2 * gradient(seed ^ 0x51, 6.0 * place[0], 6.0 * place[1]);
             towards = turned(towards, PIECE * 14.0 * meander + numbers.between(-0.16, 0.16));
             let to = [place[0] + PIECE * towards[0], place[1] + PIECE * towards[1]];
@@ -87,7 +87,7 @@ fn grow(seed: u32, habit: Habit) -> Vec<Stroke> {
             }
             if numbers.next() < PIECE * habit.branches {
                 let side = if numbers.next() < 0.5 { -1.0 } else { 1.0 };
-                // What branches off takes its share of the section.
+                // A branch takes its share of the cross section.
                 let share = numbers.between(0.25, 0.6);
                 tips.push((place, turned(towards, side * numbers.between(0.5, 1.1)), radius * share.sqrt()));
                 radius *= (1.0 - 0.5 * share).sqrt();
@@ -99,7 +99,7 @@ fn grow(seed: u32, habit: Habit) -> Vec<Stroke> {
 }
 
 fn turned([x, y]: [f32; 2], by: f32) -> [f32; 2] {
-    // A turn by less than a right angle, without sine and cosine: by twice the angle whose tangent is by/2, nearly.
+    // A turn by less than a right angle, without sine and cosine: by twice the angle whose tangent is nearly by/2.
     let t = 0.5 * by;
     let (cos, sin) = ((1.0 - t * t) / (1.0 + t * t), 2.0 * t / (1.0 + t * t));
     [x * cos - y * sin, x * sin + y * cos]
@@ -108,7 +108,7 @@ fn turned([x, y]: [f32; 2], by: f32) -> [f32; 2] {
 fn draw(map: &mut [f32], size: usize, stroke: &Stroke) {
     let pixels = size as f32;
     let Stroke { from, to, radius } = *stroke;
-    // No thinner than a pixel shows: it gets paler instead.
+    // A vessel is never drawn thinner than a pixel can show: it gets paler instead.
     let least = 0.55 / pixels;
     let reach = radius[0].max(least) + 1.0 / pixels;
     let range = |axis: usize| {
@@ -125,7 +125,7 @@ fn draw(map: &mut [f32], size: usize, stroke: &Stroke) {
             let away = ((x - t * dx) * (x - t * dx) + (y - t * dy) * (y - t * dy)).sqrt();
             let own = radius[0] + (radius[1] - radius[0]) * t;
             let shown = own.max(least);
-            // Rounder than a tube: soft at its sides, under tissue.
+            // Rounder than a tube: with soft sides, as under tissue.
             let inside = (1.0 - away / (shown + 0.5 / pixels)).clamp(0.0, 1.0);
             let amount = (inside * (2.0 - inside)).min(1.0) * (own / shown);
             let at = &mut map[row * size + column];

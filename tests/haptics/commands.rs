@@ -1,4 +1,4 @@
-//! Touching over the network: commands, samples, leases, probes.
+//! Touch over the network: commands, samples, leases, probes.
 
 use crate::server::{PATIENCE, Server, Touch, force, open, position, told};
 use palpate::wire::pb;
@@ -97,11 +97,11 @@ async fn bad_commands_are_refused_with_a_reason_and_change_nothing() {
         assert_eq!(rejection.sequence, 100 + index as u64);
         assert!(rejection.message.contains(field) || reason == "NOT_HOLDER", "{}", rejection.message);
     }
-    // Nothing acted: both sessions are the same after some steps.
+    // No command took effect: both sessions are the same after some steps.
     server.start_until(&session, 50).await;
     server.start_until(&untouched, 50).await;
     assert_eq!(server.hash_at(&session, 50).await, server.hash_at(&untouched, 50).await);
-    // And a good command is still taken.
+    // A valid command is still accepted.
     touch.command(force(0, 200, -1.0)).await;
     touch.settle().await;
 }
@@ -134,12 +134,12 @@ async fn a_tool_has_one_holder_until_it_is_let_go() {
     let mut haptics = server.haptics().await;
     let acquire = pb::AcquireToolRequest { session_id: session.clone(), tool: 0, ..Default::default() };
     assert_eq!(told(&haptics.acquire_tool(acquire.clone()).await.unwrap_err()).1, "TOOL_HELD");
-    // Tool 1 was not taken by the stream that was refused.
+    // The refused stream did not take tool 1.
     drop(Touch::open(&server, open(&session, &[1])).await.unwrap());
 
     first.command(force(0, 1, -1.0)).await;
     first.sample_with(|sample| sample.tools[0].acknowledged_sequence == 1).await;
-    // The end of a stream lets go, and ends the force.
+    // The end of a stream releases the tool and ends the force.
     first.finish();
     while first.hear().await.unwrap().is_some() {}
     let lease = haptics.acquire_tool(acquire).await.unwrap().into_inner();
@@ -170,7 +170,7 @@ async fn a_lease_lapses_by_itself_and_ends_what_the_tool_did() {
     let mut touch = Touch::open(&server, pb::TouchOpen { lease_s: Some(0.2), ..open(&session, &[0]) }).await.unwrap();
     touch.command(force(0, 1, -1.0)).await;
     touch.sample_with(|sample| sample.tools[0].applied_force_n.is_some_and(|force| force.z == -1.0)).await;
-    // No word from the holder, though it reads on.
+    // The holder sends nothing, though it keeps reading.
     let sample = touch.sample_with(|sample| sample.tools[0].expired).await;
     touch.sample_with(|later| later.step > sample.step && later.tools[0].applied_force_n.unwrap().z == 0.0).await;
     assert_eq!(server.status(&session).await.lapsed_leases, 1);
@@ -189,7 +189,7 @@ async fn a_command_outlives_its_time_by_no_step() {
     server.start_until(&session, 40).await;
     for _ in 0..40 {
         let sample = touch.sample().await;
-        // The forces of a sample are those of the step that it ends.
+        // The forces of a sample are those of the step that has just ended.
         let acts = (11..=30).contains(&sample.step);
         let applied = sample.tools[0].applied_force_n.map_or(0.0, |force| force.z);
         assert_eq!(applied, if acts { -1.0 } else { 0.0 }, "step {}", sample.step);
@@ -211,7 +211,7 @@ async fn commands_act_at_their_step_and_late_ones_are_told() {
     let acknowledged = touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == 1).await;
     assert_eq!((acknowledged.step, acknowledged.tools[0].late), (21, false));
     touch.sample_with(|sample| sample.step == 30).await;
-    // Step 5 is over: it acts at the next one, and that is said.
+    // Step 5 is over: the command takes effect at the next one and is reported late.
     touch.command(pb::Command { at_step: Some(5), ..force(0, 2, -0.5) }).await;
     touch.settle().await;
     server.start_until(&session, 40).await;
@@ -225,7 +225,7 @@ async fn a_position_is_reached_by_the_end_of_its_step_and_the_latest_wins() {
     let server = Server::start(&[]);
     let session = server.paper(true).await;
     let mut touch = Touch::hold(&server, &session).await;
-    // More than a queue would hold: each replaces the one before.
+    // More than a queue holds: each replaces the one before.
     for sequence in 1..=6000 {
         touch.command(position(0, sequence, -0.01 * (sequence % 7) as f64)).await;
     }
@@ -364,7 +364,7 @@ async fn a_unary_batch_is_taken_whole_or_not_at_all() {
     assert_eq!(told(&refused), (Code::InvalidArgument, "NOT_FINITE".into(), "force.force_n".into()));
     let refused = haptics.send_commands(batch(vec![force(3, 5, -1.0), force(3, 4, -1.0)])).await.unwrap_err();
     assert_eq!(told(&refused).1, "STALE_SEQUENCE");
-    // Sequence 1 is free: nothing of the refused batches was taken.
+    // Sequence 1 is free: no command of the refused batches was accepted.
     let taken = haptics.send_commands(batch(vec![force(3, 1, -1.0), force(3, 2, -0.25)])).await.unwrap().into_inner();
     let tool = taken.sample.unwrap().tools[0];
     assert_eq!((tool.tool, tool.acknowledged_sequence, tool.applied_force_n.unwrap().z), (3, 2, -0.25));
@@ -451,7 +451,7 @@ async fn who_watches_a_still_tissue_gets_heartbeats_at_the_rate_that_was_said() 
             last = sample;
         }
     }
-    // What moves is told at once, each Nth step.
+    // Motion is reported at once, every Nth step.
     seldom.command(force(0, 1, -1.0)).await;
     let first = usual.sample_with(|sample| !sample.asleep).await;
     assert_eq!(usual.sample().await.step, first.step + 1);
@@ -465,7 +465,7 @@ async fn a_deadband_leaves_out_what_changes_too_little() {
     let wanted = pb::TouchOpen { deadband: Some(deadband), heartbeat_s: Some(0.1), ..open(&session, &[0]) };
     let mut touch = Touch::open(&server, wanted).await.unwrap();
     for step in 0..100_u64 {
-        // A millimetre a step for ten steps, then held.
+        // A millimetre per step for ten steps, then held.
         let z_m = -0.001 * (step + 1).min(10) as f64;
         touch.command(pb::Command { at_step: Some(step), ..position(0, step + 1, z_m) }).await;
     }
@@ -475,12 +475,12 @@ async fn a_deadband_leaves_out_what_changes_too_little() {
     server.start_until(&session, 250).await;
     let mut steps = Vec::new();
     while steps.last() != Some(&250) {
-        // One of step 0 came before the start.
+        // A sample of step 0 came before the start.
         steps.extend(Some(touch.sample().await.step).filter(|step| *step > 0));
     }
-    // Also the first, at which the tool touched, and the last, at which time stopped.
+    // Including the first, at which the tool touched, and the last, at which time stopped.
     assert_eq!(steps, [1, 4, 7, 10, 110, 210, 250]);
-    // Others get what they asked for.
+    // Other streams get what they requested.
     let sample = watched.message().await.unwrap().unwrap().sample.unwrap();
     assert_eq!(sample.step + 1, watched.message().await.unwrap().unwrap().sample.unwrap().step);
 }
@@ -541,7 +541,7 @@ async fn probes_tell_every_part_of_the_force_from_step_0_on() {
         let named: Vec<_> = record.points.iter().map(|point| point.point.unwrap()).collect();
         assert_eq!(named, points);
         let centre = &record.points[0];
-        // Also at step 0: the force acts, and nothing has moved yet.
+        // Including step 0: the force acts, and nothing has moved yet.
         assert_eq!(centre.applied_n.unwrap().z, -1.0);
         assert_eq!(centre.displacement_m.unwrap().z < 0.0, expected > 0);
         let z = |v: &Option<pb::Vector3>| v.unwrap().z;
@@ -640,7 +640,7 @@ async fn a_session_that_blows_up_is_held_with_a_reason_and_sends_no_nan() {
         }
     };
     assert_eq!(rejection.reason, "SESSION_HELD");
-    // Who comes now is told at once: the last good state, and that no more follows.
+    // A new reader gets the last good state at once, and the information that no more follows.
     let request = pb::WatchSamplesRequest { session_id: session.clone(), ..Default::default() };
     let mut watched = server.haptics().await.watch_samples(request).await.unwrap().into_inner();
     assert!(watched.message().await.unwrap().unwrap().sample.unwrap().held);
@@ -652,7 +652,7 @@ async fn a_session_that_blows_up_is_held_with_a_reason_and_sends_no_nan() {
     };
     let mut records = server.haptics().await.probe(request).await.unwrap().into_inner();
     assert_eq!(told(&records.message().await.unwrap_err()).1, "SESSION_HELD");
-    // Others live on.
+    // Other sessions continue.
     let other = server.paper(true).await;
     server.start_until(&other, 5).await;
     server.hash_at(&other, 5).await;

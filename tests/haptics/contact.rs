@@ -1,4 +1,4 @@
-//! Touch and grasp: what a tool of finite size must feel of a sheet.
+//! Touch and grasp: the force of a sheet on a tool of finite size.
 
 use std::sync::Arc;
 
@@ -21,13 +21,13 @@ fn middle(model: &Model) -> DVec3 {
     (model.scene.sheet.extent_m() / 2.0).extend(0.0)
 }
 
-/// 0 to 1 without jolt.
+/// From 0 to 1 without a jerk.
 fn smooth(x: f64) -> f64 {
     let x = x.clamp(0.0, 1.0);
     x * x * x * (10.0 + x * (6.0 * x - 15.0))
 }
 
-/// Leads tool 0 along a way, and looks at what it feels after each step.
+/// Moves tool 0 along a path, and calls `look` with the force after each step.
 fn lead(sheet: &mut dyn Tissue, tip: Tip, steps: u32, way: impl Fn(f64) -> DVec3, mut look: impl FnMut(f64, &Feel)) {
     for step in 1..=steps {
         let time_s = f64::from(step) * 1e-3;
@@ -75,7 +75,7 @@ fn a_touch_enters_slides_and_leaves_without_a_jump_and_never_pulls() {
 
 #[test]
 fn stiffness_converges_as_the_grid_gets_finer() {
-    // The same tissue on finer grids: masses, virtual springs and damping go with h², springs stay.
+    // The same tissue on finer grids: masses, virtual springs and damping scale with h², springs stay.
     let stiffness = |spacing_m: f64, points: usize| {
         let base = tissue("liver", &[]);
         let share = (spacing_m / base.scene.sheet.spacing_m).powi(2);
@@ -163,7 +163,7 @@ fn a_coupling_spring_is_felt_in_series_with_the_tissue() {
     let (rigid_n, _) = force(Coupling::Constraint);
     for stiffness_n_per_m in [50.0, 500.0, 50_000.0] {
         let (coupled_n, depth_m) = force(Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m: 0.1 });
-        // What the spring gives is its stiffness times what the surface is short of the tool.
+        // The spring's force is its stiffness times the distance from the surface to the tool.
         let spring_n = stiffness_n_per_m * (0.001 - depth_m);
         assert!((coupled_n / spring_n - 1.0).abs() < 0.02, "{coupled_n} N, the spring {spring_n} N");
         assert!(coupled_n < rigid_n * 1.001, "{coupled_n} N is above {rigid_n} N");
@@ -222,8 +222,8 @@ fn two_tools_press_one_tissue_each_for_itself() {
     assert!(sheet.feel(1).is_none());
 }
 
-/// In plane the lattice of the presets is an isotropic sheet with ν = 1/3: stretched evenly, it stays even, and pulls
-/// with E·t a metre, but for the springs of its two free sides, which belong to half a cell only.
+/// In the plane, the presets' lattice is an isotropic sheet with ν = 1/3: under even strain it stays even and pulls
+/// with E·t per metre, minus the springs of its two free sides, which belong to only half a cell.
 #[test]
 fn the_lattice_passes_the_patch_test() {
     let model = tissue(

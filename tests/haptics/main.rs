@@ -1,4 +1,4 @@
-//! Touch: what a tool meets, what a device is given, and the streams between.
+//! Touch: contact, rendering for a device, and the streams between.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 #[path = "../common/mod.rs"]

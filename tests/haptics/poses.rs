@@ -1,4 +1,4 @@
-//! Tools led by poses over a real server: local models, the force law, deadbands, and what is refused.
+//! Tools controlled by poses over a real server: local models, the force law, deadbands, and refusals.
 
 use crate::server::{Server, Touch, open, told};
 use palpate::haptics::device::DEVICES;
@@ -55,7 +55,7 @@ async fn a_pressed_tool_gets_local_models_that_agree_with_the_law() {
     let model = wire::local::from_local_model(tool.local_model.as_ref().unwrap(), sample.step);
     assert!(model.is_sound() && model.force_n.z > 0.2, "{model:?}");
     assert_eq!(model.force_n.z, tool.force_on_tool_n.as_ref().unwrap().z);
-    // The law goes through the sample.
+    // The law passes through the sample.
     let repeated_n = Touching::at_sample(&model, &law).force_n(&model, &law, model.velocity_m_per_s);
     assert!((repeated_n - model.force_n).length() < 1e-6, "{repeated_n} beside {}", model.force_n);
     let stiffness = model.stiffness_n_per_m;
@@ -110,7 +110,7 @@ async fn what_makes_no_sense_is_refused() {
     assert_eq!(DEVICES.len(), 9);
 }
 
-/// A deadband on what a client renders.
+/// A deadband on the force that a client renders.
 fn foretold() -> pb::Deadband {
     pb::Deadband { rendered_fraction: Some(0.1), ..Default::default() }
 }
@@ -144,7 +144,7 @@ async fn a_tissue_beyond_the_device_is_told_of() {
     }
 }
 
-/// Whoever asks for it and however: no tool leaps.
+/// No tool ever leaps, whatever commands ask for it.
 #[tokio::test]
 async fn a_pose_across_the_sheet_is_walked_to() {
     let server = Server::start(&[]);

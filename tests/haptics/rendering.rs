@@ -1,4 +1,4 @@
-//! The rendering law and its safety envelope, without a network: what a device must never be given.
+//! The rendering law and its safety envelope, without a network: forces that a device must never get.
 
 use glam::{DMat3, DVec3};
 use palpate::haptics::device::{DEVICES, Device, SAFE_FORCE_N, UNDECLARED};
@@ -19,7 +19,7 @@ fn omega() -> Device {
     Device::named("omega3").unwrap()
 }
 
-/// What a server says of a tool at `place_m`.
+/// A server's model of a tool at `place_m`.
 fn model(sequence: u64, time_s: f64, place_m: DVec3) -> LocalModel {
     let depth_m = (-place_m.z).max(0.0);
     LocalModel {
@@ -45,7 +45,7 @@ fn enabled(device: Device) -> Envelope {
     envelope
 }
 
-/// A renderer that is engaged in the air and then pressed to a depth; and the tick that comes next.
+/// A renderer that engages in the air and is then pressed to a depth; and the next tick.
 fn pressed(depth_m: f64) -> (Renderer, u32) {
     let mut renderer = Renderer::new(law(), enabled(omega()));
     let mut tick = 0;
@@ -89,7 +89,7 @@ fn a_force_without_news_fades_pauses_decays_and_comes_back_only_on_enable() {
     let (decayed_n, _) = at(&mut renderer, PAUSE_S + 0.002);
     assert!(decayed_n < 2.0 * (-3.0_f64).exp(), "{decayed_n} N at {PAUSE_S} s");
     assert_eq!(renderer.state(), State::Paused);
-    // News alone does not bring it back.
+    // A new model alone does not end the pause.
     let (_, mut tick) = at(&mut renderer, 0.5);
     for _ in 0..200 {
         let now_s = f64::from(tick) * TICK_S;
@@ -98,7 +98,7 @@ fn a_force_without_news_fades_pauses_decays_and_comes_back_only_on_enable() {
         tick += 1;
     }
     assert_eq!(renderer.state(), State::Paused);
-    // Nor does `enable` while the tool is deep in the tissue: only in the air it engages.
+    // Nor does `enable` while the tool is deep in the tissue: it engages only in the air.
     renderer.envelope.enable();
     for step in 0..1500 {
         let now_s = f64::from(tick) * TICK_S;
@@ -157,7 +157,7 @@ fn the_norm_is_clamped_not_the_components() {
         let mut force = DVec3::ZERO;
         for tick in 0..3000 {
             let now_s = f64::from(tick) * TICK_S;
-            // Pressed further and further in, so that energy is no limit.
+            // Pressed further and further in, so that energy is not a limit.
             let place_m = -direction * (f64::from(tick) * 1e-5);
             let force_n = if tick < 600 { DVec3::ZERO } else { 50.0 * direction };
             let wanted = Wanted { now_s, place_m, velocity_m_per_s: -0.01 * direction, force_n, age_s: 0.0 };
@@ -188,7 +188,7 @@ fn outside_the_workspace_is_a_fault() {
 
 #[test]
 fn a_sample_is_repeated_along_the_way_since() {
-    // A model of the past, and a tool that has gone on: deeper, and across until it slides.
+    // A model of the past, and a tool that has moved since: deeper, and sideways until it slides.
     let law = law();
     let old = model(1, 0.0, DVec3::new(0.0, 0.0, -0.002));
     let mut touching = Touching::at_sample(&old, &law);
@@ -211,7 +211,7 @@ fn a_path_is_played_as_it_was_walked_and_never_faster_than_allowed() {
     let walked = |time_s: f64| DVec3::new(0.03 * time_s, 0.0, 0.002 * (7.0 * time_s).sin());
     let mut path = Path::default();
     let mut before: Option<DVec3> = None;
-    // Commands come in knots of seven, 25 ms late.
+    // Commands come in bursts of seven, 25 ms late.
     for step in 0..4000_u32 {
         let now_s = f64::from(step) * TICK_S;
         if step % 7 == 0 && step >= 32 {
@@ -274,7 +274,7 @@ fn broken_and_stale_commands_change_nothing() {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 300, failure_persistence: None, ..ProptestConfig::default() })]
 
-    /// Whatever a far end says and a hand does: no force is beyond its limits, none changes faster than the slew, and
+    /// For any models and any movement of a hand: no force exceeds its limits, none changes faster than the slew, and
     /// the port gives no energy that a hand would notice.
     #[test]
     fn any_forces_and_any_hand_stay_within_the_envelope(
@@ -288,7 +288,7 @@ proptest! {
         let (mut place_m, mut velocity, mut before, mut energy_j) = (DVec3::ZERO, DVec3::ZERO, DVec3::ZERO, 0.0);
         for tick in 0..2400_u32 {
             let part = tick as usize / 100;
-            // Hands do not change their speed at once.
+            // A hand does not change its speed at once.
             velocity += 0.02 * (DVec3::from(speeds[part]) - velocity);
             let moved_m = velocity * TICK_S;
             place_m += moved_m;

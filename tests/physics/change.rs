@@ -1,4 +1,4 @@
-//! A tissue whose springs, virtual springs and damping change while it is in use.
+//! Changes of a tissue's springs, virtual springs and damping while it is in use.
 
 use std::sync::Arc;
 
@@ -37,7 +37,7 @@ fn other(k: f64, c: f64, virtual_k: f64) -> Change {
     Change { stiffness_n_per_m: Some(k), damping_n_s_per_m: Some(c), virtual_stiffness_n_per_m: Some(virtual_k) }
 }
 
-/// Pushes and grasps.
+/// A tissue with a push and a grasp.
 fn poked(model: &Arc<Model>) -> Box<dyn Tissue> {
     let mut tissue = at_rest(model);
     let scene = &model.scene;
@@ -92,7 +92,7 @@ fn nothing_jumps_but_the_springs() {
             let kicked = is.velocity_m_per_s.distance(was.velocity_m_per_s);
             let most = if sets.contains(&"stepping.integrator=lagged") { 5e-3 } else { 2e-3 };
             assert!(kicked < most * fastest, "{sets:?}: point {index} was kicked by {kicked} of {fastest} m/s");
-            // The same shape, four times the springs; they are linear in k.
+            // The same shape with four times the spring stiffness; the forces are linear in k.
             if !sets.iter().any(|set| set.starts_with("sheet.fixed")) {
                 pulled_n = pulled_n.max(was.spring_n.length());
                 let off_n = is.spring_n.distance(4.0 * was.spring_n);
@@ -125,7 +125,7 @@ fn the_tissue_moves_to_the_balance_of_one_that_began_so() {
     }
 }
 
-/// A change that is undone at once is none, but for what rounding and a scheme's memory of the past make of it.
+/// A change that is undone at once has no effect beyond rounding and the scheme's history.
 #[test]
 fn a_change_in_full_motion_does_not_disturb_the_course() {
     for (sets, most) in SCHEMES.iter().zip([2e-4, 2e-4, 2e-3, 1e-9, 1e-4, 2e-4, 2e-4]) {
@@ -152,7 +152,7 @@ fn extremes_stay_finite_and_end_in_balance() {
         let model = compile(sets);
         let mut tissue = poked(&model);
         step(&mut *tissue, 80);
-        // (With nothing that pulls, what is pushed flies off.)
+        // (Without any restoring force, a pushed sheet flies off.)
         let changes = [
             (other(1e4, 0.0, 0.0), 100),
             (other(0.0, 0.0, 0.0), 20),
@@ -190,7 +190,7 @@ fn a_sheet_at_rest_wakes_for_it_and_sleeps_again() {
     assert!(sleep(&mut *fresh));
     let off_m = apart_m(&*tissue, &places(&*fresh));
     assert!(off_m < 2e-5 * fresh.largest_displacement_m(), "{off_m}");
-    // Twice the virtual springs, and the others as they are: less deep, and more than half as much.
+    // Twice the virtual stiffness, with the other springs unchanged: less deep, and more than half as deep.
     let centre = model.index_of([15, 15]);
     let ratio = tissue.point(centre).displacement_m.z / before[centre].z;
     assert!((0.5..0.9).contains(&ratio), "{ratio}");
@@ -241,7 +241,7 @@ fn changes_act_in_order_and_wake_a_session_at_rest() {
     assert_eq!(intake.change(None, &a, Some(500), 0).unwrap(), Some(500));
     assert!(intake.take_wake());
     assert_eq!(intake.rest(0, u64::MAX, &schedule), 500);
-    // Made out of what is not the newest any more.
+    // Made from a tissue that is no longer the newest.
     assert_eq!(intake.change(None, &b, Some(500), 0).unwrap(), None);
     let refusal = intake.change(Some(&a), &b, Some(499), 0).unwrap_err();
     assert_eq!((refusal.reason, refusal.field.as_str()), (Reason::OutOfTurn, "at_step"));
@@ -277,7 +277,7 @@ fn update(session_id: &str, change: Change, at_step: Option<u64>) -> pb::UpdateT
     }
 }
 
-/// What a server makes of a push and two changes, and what it tells.
+/// The result in a server of a push and two changes, and its reports.
 async fn over_the_network(threads: &str) -> String {
     let server = Server::start(&["--threads", threads]);
     let session_id = server.paper(true).await;
@@ -290,10 +290,10 @@ async fn over_the_network(threads: &str) -> String {
     assert_eq!(answer.step, 50);
     let springs = answer.session.unwrap().scene.unwrap().springs.unwrap();
     assert_eq!((springs.stiffness_n_per_m, springs.shear_stiffness_n_per_m), (Some(60.0), Some(60.0)));
-    // It is not there yet.
+    // It has not taken effect yet.
     let scene = server.status(&session_id).await.scene.unwrap();
     assert_eq!(scene.springs.unwrap().stiffness_n_per_m, Some(10.0));
-    // What is refused changes nothing: neither now nor then.
+    // A refused change has no effect, neither now nor later.
     let bad = Change { damping_n_s_per_m: Some(0.1), virtual_stiffness_n_per_m: Some(f64::NAN), ..Change::default() };
     let refused = sessions.update_tissue(update(&session_id, bad, Some(60))).await.unwrap_err();
     assert_eq!(
@@ -337,7 +337,7 @@ async fn the_same_bits_on_any_number_of_threads_and_offline() {
 async fn a_running_session_changes_at_once_and_logs_it() {
     let server = Server::start(&[]);
     let session_id = server.paper(false).await;
-    // It says nothing while the tissue comes to rest.
+    // The holder sends nothing while the tissue comes to rest.
     let patient = pb::TouchOpen { lease_s: Some(600.0), ..open(&session_id, &[0]) };
     let mut touch = Touch::open(&server, patient).await.unwrap();
     touch.command(force(0, 1, -2.0)).await;

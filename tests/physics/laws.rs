@@ -1,4 +1,4 @@
-//! Laws of nature that the sheet keeps.
+//! Laws of nature that the sheet obeys.
 
 use crate::common::{SMALL, advance, model, playing, push_on, scene, scene_with, script};
 use glam::DVec3;
@@ -7,7 +7,7 @@ use palpate::scene::law::{ForceLaw, Moment};
 use palpate::session::Session;
 use palpate::sheet::{self, Energy, Grasp, Tissue};
 
-/// A tissue that is not at rest any more: pushed at a point for some steps, then let go.
+/// A tissue in motion: pushed at a point for some steps, then released.
 fn shaken(scene: &Scene, steps: u64) -> Box<dyn Tissue> {
     let mut tissue = sheet::at_rest(&model(scene));
     tissue.push(0, Some(push_on(scene, [3, 2], [0.4, 0.3, -0.6])));
@@ -59,7 +59,7 @@ fn a_point_without_springs_is_the_damped_oscillator() {
                 let mut session = Session::new(&model(&scene));
                 session.play_force(0, constant(&scene, [3, 2], DVec3::new(0.1, 0.0, -0.2)));
                 let mut largest = [0.0_f64; 2];
-                // At the same times for both rates: each has its largest error in the first milliseconds.
+                // At the same times for both rates: the error is largest in the first milliseconds.
                 for _ in 0..1000 {
                     advance(&mut session, (rate_hz / 1000.0) as u64);
                     let point = session.tissue().point(session.model().index_of([3, 2]));
@@ -69,7 +69,7 @@ fn a_point_without_springs_is_the_damped_oscillator() {
                 }
                 largest
             };
-            // Without springs there is nothing that an exponential scheme does not take exactly.
+            // Without springs an exponential scheme is exact.
             for integrator in ["exponential2", "exponential3", "exponential4"] {
                 let [u, v] = error(integrator);
                 assert!(u < 1e-12 && v < 1e-11, "{integrator}, C = {damping}: {u:e}, {v:e}");
@@ -189,8 +189,8 @@ fn equilibrium_is_the_solution_of_newtons_method() {
     }
 }
 
-/// An independent statement of the static problem: springs as their definition has them, on absolute positions,
-/// solved by Newton's method with a tangent from finite differences.
+/// An independent formulation of the static problem: springs by their definition, on absolute positions, solved by
+/// Newton's method with a tangent from finite differences.
 struct Static<'a> {
     scene: &'a Scene,
     loaded: usize,
@@ -253,7 +253,7 @@ impl Static<'_> {
 fn newton(scene: &Scene, [i, j]: [usize; 2], load: DVec3) -> Vec<DVec3> {
     let [nx, ny] = scene.sheet.points;
     let problem = Static { scene, loaded: i * ny + j, load };
-    // Small loads first: Newton's method converges from near.
+    // Small loads first: Newton's method converges from a nearby start.
     let mut u = vec![DVec3::ZERO; nx * ny];
     for share in [0.1, 0.3, 0.6, 1.0] {
         let problem = Static { load: load * share, ..problem };
@@ -331,7 +331,7 @@ fn solve(mut system: Vec<Vec<f64>>) -> Vec<f64> {
 
 #[test]
 fn the_force_field_is_minus_the_gradient_of_the_energy() {
-    // Central: its displacement is exactly that at which the springs were evaluated.
+    // Central differences: the displacement is exactly the one at which the springs were evaluated.
     let sets = ["springs.flexion=true", "springs.shear_stiffness_n_per_m=12.0", "stepping.integrator=central"];
     let scene = scene_with(SMALL, &sets);
     let tissue = shaken(&scene, 60);
@@ -390,7 +390,7 @@ fn fixed_points_never_move_and_carry_the_load() {
             assert_eq!(held[index].displacement_m, DVec3::ZERO);
             carried += held[index].constraint_n.unwrap();
         }
-        // A sheet without virtual springs creeps for long: what the fixed points do not carry, damping does.
+        // A sheet without virtual springs creeps for long: damping carries what the fixed points do not.
         let damping: DVec3 = held.iter().map(|point| point.damping_n).sum();
         assert!((carried + damping + load).length() < 1e-6, "{fixed}: {carried}, {damping}");
         assert!(damping.length() < 2e-3 * load.length(), "{fixed}: {damping}");
@@ -400,7 +400,7 @@ fn fixed_points_never_move_and_carry_the_load() {
 
 #[test]
 fn a_let_go_point_goes_on_with_its_velocity() {
-    // A free point of mass m moved at constant velocity and let go: then it swings about its rest.
+    // A free point of mass m moved at constant velocity and released: it then oscillates about its rest position.
     let (m, k, speed) = (0.02_f64, 5.0_f64, 0.4_f64);
     let mut errors = Vec::new();
     for rate_hz in [1000.0, 4000.0] {
@@ -436,7 +436,7 @@ fn a_let_go_point_goes_on_with_its_velocity() {
 
 #[test]
 fn a_point_let_go_as_a_force_begins_starts_like_any_free_point() {
-    // Held at rest, then let go at the step at which a force begins: the same as a force that begins on a free point.
+    // Held at rest, then released at the step at which a force begins: the same as a force that begins on a free point.
     let scene = scene_with(SMALL, &["stepping.substeps=2"]);
     let index = model(&scene).index_of([3, 2]);
     let run = |hold: bool| {
@@ -488,7 +488,7 @@ fn a_grasped_point_taken_over_by_another_tool_follows_that_one() {
     let point = tissue.point(index);
     assert!((point.displacement_m.z - 0.012).abs() < 1e-15);
     assert!((point.velocity_m_per_s.z - 2.0).abs() < 1e-9);
-    // The first has nothing to let go any more.
+    // The first tool has nothing left to release.
     tissue.release(0);
     tissue.step().unwrap();
     assert_eq!(tissue.point(index).displacement_m.z, 0.012);
@@ -545,7 +545,7 @@ profile = { type = "sine", frequency_hz = 2.5 }
         let point = session.tissue().point(session.model().index_of([i, j]));
         assert!((point.applied_n - expected).length() < 1e-12, "{}, expected {expected}", point.applied_n);
     }
-    // A hop shows its old place just before it.
+    // Just before a hop, the force is at its old place.
     let before = script.forces[1].at(Moment { step: 49, fraction: 1.0 }, 1000.0);
     let after = script.forces[1].at(Moment::start_of(50), 1000.0);
     assert_ne!(before.centre_m, after.centre_m);
@@ -553,8 +553,8 @@ profile = { type = "sine", frequency_hz = 2.5 }
 
 #[test]
 fn a_spring_pressed_to_no_length_stays_finite() {
-    // A point is brought exactly onto its neighbour, which is held, and through it: their spring has no length then, and so
-    // no direction.
+    // A point is brought exactly onto its neighbour, which is held, and through it: their spring then has no length,
+    // and so no direction.
     let h = 0.05;
     for sets in [
         ["stepping.precision=f32", "stepping.integrator=central"],
@@ -570,7 +570,7 @@ fn a_spring_pressed_to_no_length_stays_finite() {
                 let point = tissue.point(index);
                 let vectors = [point.displacement_m, point.velocity_m_per_s, point.spring_n, point.reaction_n()];
                 assert!(vectors.iter().all(|v| v.is_finite()), "{sets:?}: point {index} after step {step}: {point:?}");
-                // Eight springs, none longer than three times what it was.
+                // Eight springs, none longer than three times its rest length.
                 let most_n = 8.0 * 2.0 * 2.0_f64.sqrt() * h * scene.springs.stiffness_n_per_m;
                 assert!(point.spring_n.length() < most_n, "{sets:?}: point {index} after step {step}: {point:?}");
             }
@@ -598,7 +598,7 @@ fn a_spring_pressed_to_no_length_stays_finite() {
 
 #[test]
 fn a_vibration_without_damping_keeps_its_phase() {
-    // A stiff undamped sheet, pushed and let go, against itself at a twentieth of the substep.
+    // A stiff undamped sheet, pushed and released, against itself at a twentieth of the substep.
     let sets = ["damping.coefficient_n_s_per_m=0.0", "springs.stiffness_n_per_m=60.0", "sheet.points=[15, 15]"];
     let shaken_for_a_second = |substeps: Option<u32>| {
         let substeps = substeps.map_or("stepping.substeps=auto".to_owned(), |n| format!("stepping.substeps={n}"));
@@ -625,7 +625,7 @@ fn a_vibration_without_damping_keeps_its_phase() {
 #[test]
 fn substeps_follow_the_bound_and_a_bound_is_never_below_a_vibration() {
     use palpate::sheet::stability::largest_stiffness_n_per_m;
-    // λ over the whole unbounded grid, by brute force.
+    // λ over the whole infinite grid, by brute force.
     for (k1, k2, flexion) in
         [(1.0, 1.0, false), (1.0, 1.0, true), (1.0, 0.3, true), (0.2, 1.0, false), (1.0, 0.0, true)]
     {

@@ -1,4 +1,4 @@
-//! What the sheet does: the laws of nature that it keeps, with other tissue under way, and at rest.
+//! Physics of the sheet: its laws of nature, changes of tissue in use, and sleep.
 #![allow(
     clippy::cast_precision_loss,
     clippy::unwrap_used,

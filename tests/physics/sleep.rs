@@ -1,4 +1,4 @@
-//! What is at rest is not computed: what that may cost, and that nothing sleeps through what it should feel.
+//! Sleep: the cost in accuracy of not computing what rests, and that every force wakes the tiles it reaches.
 
 use glam::{DVec2, DVec3};
 use palpate::limits::Limits;
@@ -35,7 +35,7 @@ fn at(x: f64, y: f64) -> CentreLaw {
     CentreLaw::Hops(vec![(0, DVec2::new(x, y))])
 }
 
-/// What is done to a sheet of 65 × 97 points, each with the settings that it needs.
+/// The pushes on a sheet of 65 × 97 points, each with the settings that it needs.
 fn cases() -> Vec<(&'static str, Vec<&'static str>, Vec<Push>)> {
     let pulse = Profile::Pulse { on: 0, off: 400 };
     let path = CentreLaw::Path { from_m: DVec2::new(1.0, 0.3), velocity_m_per_s: DVec2::new(0.05, 1.2) };
@@ -106,7 +106,7 @@ fn a_sheet_at_rest_computes_nothing_and_wakes_within_the_step_that_touches_it() 
     tissue.step().unwrap();
     assert!(tissue.awake_points() > 0);
     assert!(tissue.point(tissue.model().index_of([15, 15])).displacement_m.z < 0.0);
-    // A held poke comes to rest, and rests as it is.
+    // A held poke comes to rest and stays there.
     for _ in 0..3000 {
         tissue.step().unwrap();
     }
@@ -115,7 +115,7 @@ fn a_sheet_at_rest_computes_nothing_and_wakes_within_the_step_that_touches_it() 
     tissue.step().unwrap();
     assert_eq!(tissue.point(tissue.model().index_of([15, 15])), held);
     assert_eq!(held.velocity_m_per_s, DVec3::ZERO);
-    // Balance of all forces, but for what the tolerance leaves.
+    // All forces balance within the tolerance.
     let rest = held.spring_n + held.virtual_n + held.applied_n;
     assert!(rest.length() < 1e-5 * held.applied_n.length(), "{rest}");
     tissue.push(0, None);
@@ -125,7 +125,7 @@ fn a_sheet_at_rest_computes_nothing_and_wakes_within_the_step_that_touches_it() 
 
 #[test]
 fn a_tile_wakes_with_the_history_that_it_would_have_had() {
-    // Pressed, at rest, and let go: with zeros for a past the first steps would err by the whole of the springs' force.
+    // Pressed, at rest, and released: with zeros as history the first steps would be wrong by the whole spring force.
     let with = |sleep: &str| sheet(&["stepping.integrator=exponential3", "stepping.substeps=1", sleep]);
     let (mut truth, mut skipping) = (with("sleep.tolerance=0"), with("sleep.tolerance=1e-6"));
     for tissue in [&mut truth, &mut skipping] {
@@ -146,7 +146,7 @@ fn a_tile_wakes_with_the_history_that_it_would_have_had() {
     assert!(most < 2e-6 * largest, "{:e}", most / largest);
 }
 
-/// Pulls a point by `far_m` in so many steps; returns the largest error seen, relative to the largest displacement.
+/// Pulls a point by `far_m` in `steps` steps; returns the largest error seen, relative to the largest displacement.
 fn creep(steps: u32, far_m: f64) -> f64 {
     let with = |sleep: &str| sheet(&["sheet.points=[64, 64]", "springs.stiffness_n_per_m=50", sleep]);
     let (mut truth, mut skipping) = (with("sleep.tolerance=0"), with("sleep.tolerance=1e-4"));
@@ -158,7 +158,7 @@ fn creep(steps: u32, far_m: f64) -> f64 {
             tissue.grasp(0, index, Grasp::Held(DVec3::new(to_m, to_m, -to_m)));
             tissue.step().unwrap();
         }
-        // Once the error is one of the creep, not of its first steps.
+        // Compare once the error comes from the creep, not from its first steps.
         if step > steps / 10 && step.is_multiple_of(steps / 40) {
             let [error, largest] = difference(&field(&*truth), &field(&*skipping));
             most = f64::max(most, error / largest);
@@ -170,7 +170,7 @@ fn creep(steps: u32, far_m: f64) -> f64 {
 
 #[test]
 fn a_creep_too_slow_for_any_one_step_wakes_what_it_reaches() {
-    // A micrometre a step: compared with the step before, nothing beyond the point's tile would ever wake.
+    // A micrometre per step: a comparison with the step before would never wake anything beyond the point's tile.
     let error = creep(20_000, 0.02);
     assert!(error <= 1e-4, "{error:e}");
 }
@@ -191,7 +191,7 @@ fn sleeping_is_the_same_at_every_width() {
             let settings = [integrator.as_str(), lanes.as_str(), "sheet.points=[61, 77]", "sleep.tolerance=1e-4"];
             let settings: Vec<String> = settings.iter().map(|text| (*text).to_owned()).collect();
             let scene = Scene::parse("paper", PAPER, &settings, &Limits::default()).unwrap();
-            // Lanes that this machine does not have are refused.
+            // Skip lanes that this machine does not have.
             let model = Model::compile(&scene, &Limits::default()).ok()?;
             let mut tissue = at_rest(&model);
             let path = CentreLaw::Path { from_m: DVec2::splat(0.4), velocity_m_per_s: DVec2::new(1.5, 2.0) };
@@ -208,7 +208,7 @@ fn sleeping_is_the_same_at_every_width() {
     }
 }
 
-/// The energies by the points' displacements and velocities, J: each spring by itself.
+/// The energies from the points' displacements and velocities, J: each spring computed separately.
 fn energies_by_points(tissue: &dyn Tissue) -> [f64; 3] {
     let scene = &tissue.model().scene;
     let [rows, columns] = tissue.model().points;
@@ -240,7 +240,7 @@ fn energies_by_points(tissue: &dyn Tissue) -> [f64; 3] {
 
 #[test]
 fn the_energy_of_tiles_that_sleep_is_counted_to_the_last_digits() {
-    // A multistep scheme's springs are where it predicts the points to be, within what it then corrects.
+    // A multistep scheme evaluates its springs at the predicted places, which differ by the later correction.
     for (integrator, part) in [("central", 1e-11), ("exponential3", 1e-7)] {
         let integrator = format!("stepping.integrator={integrator}");
         let settings = [integrator.as_str(), "stepping.precision=f64", "sheet.points=[65, 97]", "sleep.tolerance=1e-4"];
@@ -264,7 +264,7 @@ fn the_energy_of_tiles_that_sleep_is_counted_to_the_last_digits() {
             for (found_j, truth_j) in [energy.kinetic_j, energy.spring_j, energy.virtual_j].into_iter().zip(truth) {
                 assert!((found_j - truth_j).abs() <= part * total_j, "{integrator}, {step}: {energy:?}, {truth:?}");
             }
-            // Who asked before makes no difference.
+            // Earlier calls make no difference.
             assert_eq!(unasked.energy(), energy);
         }
         assert!(partly > 10, "{integrator}: {partly}");
@@ -273,13 +273,14 @@ fn the_energy_of_tiles_that_sleep_is_counted_to_the_last_digits() {
 
 #[test]
 fn a_moving_tool_asks_only_tiles_within_its_reach() {
-    // Springs that pass nothing on, and a tool that trembles: its force ends 11 points from it (e^−22), in the first tile.
+    // Springs too weak to pass anything on, and a trembling tool: its force ends 11 points away (e^−22), in the first
+    // tile.
     let mut tissue = sheet(&["sheet.points=[16, 64]", "springs.stiffness_n_per_m=1e-6", "sleep.tolerance=1e-6"]);
     let hops = (0..20_000).map(|step| (step, DVec2::new(0.2, if step % 2 == 0 { 0.09 } else { 0.11 }))).collect();
     tissue.push(0, Some(law(CentreLaw::Hops(hops), [0.0, 0.0, -3.0], 60.0, Profile::Constant)));
     for step in 0..20_000 {
         tissue.step().unwrap();
-        // A bound on the force beyond its reach, summed up over all steps, would wake the second tile in the end.
+        // A bound on the force beyond its reach, summed over all steps, would finally wake the second tile.
         assert_eq!(tissue.awake_points(), 16 * 16, "step {step}");
     }
 }

@@ -1,6 +1,6 @@
-// How much work goes into a picture: as much as there is time for, and no more.
+// Adapts the effort for a picture to the time available.
 
-/** Efforts, the greatest first; each takes about two thirds of the time of the one before where there is no graphics processor. */
+/** Efforts, greatest first. Without a graphics processor, each takes about two thirds of the time of the one before. */
 export const EFFORTS = [
   { pixels: 1, isPhysical: true, every: 1 },
   { pixels: 0.7, isPhysical: true, every: 1 },
@@ -10,13 +10,13 @@ export const EFFORTS = [
   { pixels: 0.5, isPhysical: false, every: 4 },
 ] as const satisfies { pixels: number; isPhysical: boolean; every: number }[];
 
-/** Pictures that take longer are late: where a processor of its own draws, and where it is ours (ms). */
+/** Pictures that take longer are late, ms: with a graphics processor, and with software rendering. */
 const LATE_MS = { hardware: 45, software: 40 };
-/** Late by so much in all, in pictures that follow one another, there are to be plainer ones. */
+/** After this much lateness in consecutive pictures, the effort is reduced. */
 const DEBT_MS = 150;
-/** What takes longer was no picture: the window was hidden, or the machine asleep. */
+/** A longer time was not a picture: the window was hidden, or the machine asleep. */
 const PAUSE_MS = 5000;
-/** After so long without a late picture a greater effort is tried; twice as long after each try that failed. */
+/** After this time without a late picture a greater effort is tried; twice as long after each failed try. */
 const PATIENCE_MS = { least: 4000, most: 128_000 };
 
 export class Effort {
@@ -28,7 +28,7 @@ export class Effort {
   private patienceMs = PATIENCE_MS.least;
   private isFirst = true;
 
-  /** `isFixed` keeps to the greatest, however long a picture takes. */
+  /** With `isFixed`, always uses the greatest effort, however long a picture takes. */
   constructor(
     private readonly isSoftware: boolean,
     private readonly isFixed: boolean,
@@ -41,9 +41,9 @@ export class Effort {
     return EFFORTS[this.index]!;
   }
 
-  /** Takes in how long a picture took to come. True if the next is another effort. */
+  /** Records the time a picture took. Returns true if the next one has another effort. */
   tell(tookMs: number): boolean {
-    // The first has programs to be compiled and buffers to be filled.
+    // The first picture includes compiling programs and filling buffers.
     const isFirst = this.isFirst;
     this.isFirst = false;
     if (this.isFixed || isFirst || tookMs > PAUSE_MS) return false;
@@ -56,7 +56,7 @@ export class Effort {
       return this.change(Math.min(this.index + steps, EFFORTS.length - 1));
     }
     if (this.wellMs < this.patienceMs || this.index === 0) return false;
-    // If it does not last, the next try is later.
+    // If the greater effort fails, the next try is later.
     this.patienceMs = Math.min(2 * this.patienceMs, PATIENCE_MS.most);
     return this.change(this.index - 1);
   }
@@ -69,20 +69,20 @@ export class Effort {
     return true;
   }
 
-  /** For people: what is less than it could be. */
+  /** Text for the status line: what is reduced. */
   describe(every: number): string {
     const { pixels, isPhysical } = this.now;
     const less = [
       pixels < 1 ? `${Math.round(100 * pixels)} % of the pixels a side` : "",
       every > 1 ? `1 vertex in ${every} a side` : "",
-      isPhysical ? "" : "plain light",
+      isPhysical ? "" : "simple lighting",
       this.isSoftware ? "no graphics processor" : "",
     ].filter((what) => what !== "");
     return less.join(", ") || "in full";
   }
 }
 
-/** Whether pictures are drawn by the processor: by the name that what draws them gives itself. */
+/** Whether the processor draws the pictures, judged by the renderer's name. */
 export function isDrawnBySoftware(): boolean {
   const gl = document.createElement("canvas").getContext("webgl2");
   if (!gl) return false;

@@ -1,9 +1,9 @@
-// The field: every vertex's displacement as the server sent it, and where it changed. The worker that takes frames in
-// has one, and the page has another that follows it.
+// The field: the displacement of every vertex as the server sent it, and where it changed. The worker that receives
+// frames has one, and the page has a copy that follows it.
 
 import { Encoding, type Patch, type WatchFramesResponse } from "./gen/palpate/v1/view_pb";
 
-/** Rows a0 … a1 and columns b0 … b1 of vertices, the last ones included. */
+/** Rows a0 … a1 and columns b0 … b1 of vertices, inclusive. */
 export interface Rectangle {
   a0: number;
   a1: number;
@@ -12,9 +12,9 @@ export interface Rectangle {
 }
 
 export class Field {
-  /** Vertex (a, b) has three components from 3·(a·ny + b). */
+  /** Vertex (a, b) has its three components from 3·(a·ny + b) on. */
   readonly displacementM: Float32Array<ArrayBuffer>;
-  /** Around all that changed since it was last asked what did. */
+  /** Bounds of all changes since the last `takeChanged`. */
   private changed: Rectangle | undefined;
 
   constructor(
@@ -32,7 +32,8 @@ export class Field {
     if (bytes.byteLength !== size * (isWhole ? 2 : 4) || firstX + countX > this.nx || firstY + countY > this.ny) {
       throw new RangeError("a patch is not of this surface");
     }
-    // Numbers lie anywhere in a message: copied, they are aligned. Browsers' machines are little-endian, as the wire is.
+    // Numbers in a message may be unaligned; the copy is aligned. Browsers run on little-endian machines, like the wire
+    // format.
     const own = bytes.slice().buffer;
     const q = isWhole ? new Int16Array(own) : new Float32Array(own);
     const [o, s] = [part.originM, part.scaleM];
@@ -59,14 +60,14 @@ export class Field {
     };
   }
 
-  /** Where it changed since it was last asked. */
+  /** Returns the bounds of the changes since the last call. */
   takeChanged(): Rectangle | undefined {
     const changed = this.changed;
     this.changed = undefined;
     return changed;
   }
 
-  /** Writes a rectangle's displacements one after the other. */
+  /** Copies a rectangle's displacements to consecutive places in `values`. */
   copyTo(values: Float32Array, { a0, a1, b0, b1 }: Rectangle): void {
     const width = 3 * (b1 + 1 - b0);
     for (let a = a0, at = 0; a <= a1; a++, at += width) {
@@ -75,7 +76,7 @@ export class Field {
     }
   }
 
-  /** The reverse. */
+  /** Copies consecutive `values` into a rectangle. */
   copyFrom(values: Float32Array, rectangle: Rectangle): void {
     const { a0, a1, b0, b1 } = rectangle;
     const width = 3 * (b1 + 1 - b0);

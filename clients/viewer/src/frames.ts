@@ -1,4 +1,4 @@
-// Frames: the surface as it changes. A worker takes them in (intake.ts); here the newest is put on the surface.
+// Frames: the changing surface. A worker receives them (intake.ts), and this module applies the newest to the surface.
 
 import type { News, Order, Trouble } from "./intake";
 import { caller, type Failure, received } from "./server";
@@ -10,13 +10,13 @@ export interface FrameTold {
 }
 
 export class Frames {
-  /** Frames taken in, and those that the server left out for this viewer. */
+  /** Frames received, and frames that the server skipped for this viewer. */
   taken = 0;
   skipped = 0n;
   newest: FrameTold | undefined;
   onFrame: (frame: FrameTold) => void = () => {};
 
-  /** Until it is aborted. The worker goes then, and its stream with it. */
+  /** Runs until it is aborted. Then the worker ends, and its stream with it. */
   run(
     sessionId: string,
     refinement: number,
@@ -38,7 +38,7 @@ export class Frames {
       this.newest = { step: data.step, timeS: data.timeS };
       this.onFrame(this.newest);
     };
-    worker.onerror = (event) => onFailure({ isGone: false, text: event.message || "frames can't be taken in" }, 0);
+    worker.onerror = (event) => onFailure({ isGone: false, text: event.message || "can't receive frames" }, 0);
     const vertices: [number, number] = [surface.field.nx, surface.field.ny];
     worker.postMessage({ sessionId, token: caller.token, refinement, vertices } satisfies Order);
   }

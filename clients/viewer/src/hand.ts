@@ -1,8 +1,9 @@
-// The hand: one tool, held by a lease, led by mouse, finger or keys.
+// The hand: one tool, held by a lease, controlled by mouse, finger or keys.
 //
-// Pushing is the paper's surgical force at the place where one began, leaning the way one drags. Stroking takes it along,
-// leaning the way it goes. Pulling grasps a mass point, and brings it where one drags it. Tools that are led by poses
-// would do as well, but need a command every 50 ms, which no browser promises.
+// A push is the paper's surgical force at the place where the drag began, leaning in the direction of the drag. A
+// stroke moves that place along, leaning in its direction of movement. A pull grasps a mass point and brings it where
+// you drag it. Tools controlled by poses would work as well, but they need a command every 50 ms, which no browser
+// guarantees.
 
 import type { MessageInitShape } from "@bufbuild/protobuf";
 import type { CommandSchema, Sample } from "./gen/palpate/v1/haptic_pb";
@@ -12,35 +13,35 @@ import { describe, haptics, isGone, PATIENCE_MS, reasonOf } from "./server";
 export type Mode = "push" | "pull" | "stroke";
 type Command = MessageInitShape<typeof CommandSchema>;
 
-/** The number of the tool that pages hold. */
+/** The number of the tool that all pages use. */
 const TOOL = 0;
-/** Of the tissue's own time, without a newer command: a page that vanishes does not go on pressing. */
+/** In the tissue's own time, without a newer command: a page that vanishes does not keep pressing. */
 const TIME_TO_LIVE_S = 2;
-/** Between two commands that say the same: well within the time to live. */
+/** Interval between identical commands: well within the time to live. */
 const REPEAT_MS = 100;
-/** Between two looks whether there is something to say. */
+/** Interval between checks for something to send. */
 const TICK_MS = 15;
 const LEASE_S = 4;
-/** Who has not touched for so long lets the tool go. */
+/** After this time without a touch the hand releases the tool. */
 const IDLE_MS = 5000;
-/** Batches on their way: a round trip does not slow the hand down, and connections are left for others. */
+/** Batches in flight: a round trip does not slow the hand down, and connections stay free for other calls. */
 const IN_FLIGHT = 2;
 
-/** What the tissue makes of a strength of 1. */
+/** The effect of strength 1 on the tissue. */
 export interface Reach {
   spacingM: number;
-  /** Of a push. */
+  /** Force of a push, N. */
   mostN: number;
-  /** Of a drag that leans a push all the way, and of a pull by keys. */
+  /** Length of a drag that leans a push fully, and of a pull by keys, m. */
   depthM: number;
 }
 
 
 export class Hand {
   mode: Mode = "push";
-  /** 0 to 1. */
+  /** Strength, 0 to 1. */
   strength = 0.5;
-  /** Round trip of the last batch less what the server held it, ms. */
+  /** Round trip of the last batch minus the time that the server held it, ms. */
   networkMs: number | undefined;
   onChange: () => void = () => {};
   onRefused: (message: string) => void = () => {};
@@ -91,13 +92,13 @@ export class Hand {
       return true;
     } catch (error) {
       this.pressed = false;
-      this.onRefused(reasonOf(error) === "TOOL_HELD" ? "Somebody else holds the tool: look on." : describe(error));
+      this.onRefused(reasonOf(error) === "TOOL_HELD" ? "Somebody else holds the tool: you can only watch." : describe(error));
       this.onChange();
       return false;
     }
   }
 
-  /** Begins to touch at a place of the rest plane, whose tissue is on the surface there. */
+  /** Begins to touch at `placeM` in the rest plane; its tissue is at `onSurfaceM` on the surface. */
   async press(placeM: [number, number], onSurfaceM: Vec3): Promise<void> {
     this.pressed = true;
     this.released = false;
@@ -109,16 +110,16 @@ export class Hand {
     if (await this.take()) this.tick();
   }
 
-  /** Goes on to another place, leaning the way it goes. */
+  /** Moves to another place, leaning in the direction of the movement. */
   goOn(placeM: [number, number]): void {
     const way = [placeM[0] - this.placeM[0], placeM[1] - this.placeM[1]] as const;
-    // What was before fades, as long as a push leans all the way.
+    // The earlier lean fades over the length that leans a push fully.
     const kept = Math.exp(-Math.hypot(...way) / this.reach.depthM);
     this.placeM = placeM;
     this.lean([kept * this.leanM[0] + way[0], kept * this.leanM[1] + way[1], 0]);
   }
 
-  /** Leans that far from where it was pressed. */
+  /** Leans by `leanM` from the place of the press. */
   lean(leanM: Vec3): void {
     if (!this.pressed) return;
     this.leanM = leanM;
@@ -127,7 +128,7 @@ export class Hand {
     this.tick();
   }
 
-  /** Ends the touch; the tool stays in the hand for a while. */
+  /** Ends the touch; the hand keeps the tool for a while. */
   lift(): void {
     if (!this.pressed) return;
     this.pressed = false;
@@ -136,7 +137,7 @@ export class Hand {
     this.tick();
   }
 
-  /** Gives the tool back. */
+  /** Releases the tool. */
   async letGo(): Promise<void> {
     const leaseId = this.leaseId;
     this.pressed = false;
@@ -145,7 +146,7 @@ export class Hand {
     try {
       await haptics.releaseTool({ sessionId: this.sessionId, leaseId }, { timeoutMs: PATIENCE_MS });
     } catch {
-      // The lease ends by itself, and what the tool did with it.
+      // The lease lapses by itself, and the tool's action ends with it.
     }
   }
 
@@ -156,13 +157,13 @@ export class Hand {
     this.onChange();
   }
 
-  /** Says what there is to say, if it is time to. */
+  /** Sends the present action, if it is due. */
   private tick(): void {
     if (!this.leaseId || this.underWay >= IN_FLIGHT) return;
     const now = performance.now();
     const isRest = !this.pressed && this.released;
     if (isRest && now - this.touchedMs > IDLE_MS) return void this.letGo();
-    // At rest just enough that the lease does not end.
+    // At rest, send just often enough to keep the lease.
     if (!this.fresh && now - this.sentMs < (isRest ? (LEASE_S * 1000) / 4 : REPEAT_MS)) return;
     this.fresh = false;
     this.sentMs = now;
@@ -190,7 +191,7 @@ export class Hand {
     return { ...command, timeToLiveS, action: { case: "force", value } };
   }
 
-  /** Down, and the way of the drag: at 45° when that is as far as the reach. */
+  /** Downwards, plus the direction of the drag: at 45° when the drag is as long as the reach. */
   private forceN(strengthN: number): { x: number; y: number; z: number } {
     const across = [this.leanM[0] / this.reach.depthM, this.leanM[1] / this.reach.depthM] as const;
     const most = Math.max(1, Math.hypot(...across));
@@ -207,7 +208,7 @@ export class Hand {
       const { sample } = await haptics.sendCommands(request, { timeoutMs: PATIENCE_MS });
       if (sample && commands.length > 0) this.measure(sample, performance.now() - begun);
     } catch (error) {
-      // Two batches may overtake one another: the newer counts.
+      // Two batches may overtake each other: the newer one counts.
       if (reasonOf(error) !== "STALE_SEQUENCE" && this.leaseId === leaseId) this.failed(error);
     } finally {
       this.underWay -= 1;
@@ -225,7 +226,7 @@ export class Hand {
   private failed(error: unknown): void {
     if (isGone(error)) this.pressed = false;
     if (reasonOf(error) !== "NOT_HOLDER" && !isGone(error)) return this.onRefused(describe(error));
-    // The server took the tool back, because nothing came for so long. Whoever still presses takes it again.
+    // The server ended the lease because no command came for too long. A user who still presses takes the tool again.
     this.lost();
     if (this.pressed) void this.take().then((holds) => holds && this.tick());
   }

@@ -6,7 +6,7 @@ import type { Vec3 } from "./samples";
 import type { Stage } from "./stage";
 import type { Surface } from "./surface";
 
-/** What there is to touch. */
+/** What the user can touch. */
 export interface Touched {
   hand: Hand;
   surface: Surface;
@@ -14,7 +14,7 @@ export interface Touched {
   extentM: [number, number];
 }
 
-/** Radians a key turns the view. */
+/** Rotation of the view per key press, radians. */
 const TURN = 0.08;
 
 export class Input {
@@ -64,7 +64,7 @@ export class Input {
 
   private begin(hand: Hand, placeM: [number, number]): void {
     const { spacingM } = hand.reach;
-    // A grasp holds a mass point, and begins where that is.
+    // A grasp holds a mass point and begins at that point.
     if (hand.mode === "pull") placeM = [spacingM * Math.round(placeM[0] / spacingM), spacingM * Math.round(placeM[1] / spacingM)];
     this.from = { placeM, onSurfaceM: this.onSurface(placeM) };
     void hand.press(placeM, this.from.onSurfaceM);
@@ -114,7 +114,7 @@ export class Input {
     if (way && event.shiftKey) {
       this.stage.turn(-way[0] * TURN, way[1] * TURN, 1);
     } else if (way) {
-      // Right is right as it is seen.
+      // Right is the right side of the view.
       const [rx, ry] = this.stage.rightwards();
       const [x, y] = this.aimM ?? [extentM[0] / 2, extentM[1] / 2];
       const by: [number, number] = [way[0] * rx - way[1] * ry, way[0] * ry + way[1] * rx];
@@ -127,7 +127,7 @@ export class Input {
         this.aimM ??= [extentM[0] / 2, extentM[1] / 2];
         this.latency.pressed(event.timeStamp);
         this.begin(hand, this.aimM);
-        // Pulled by a key it comes up.
+        // A pull by key lifts the point.
         if (hand.mode === "pull") hand.lean([0, 0, reach.depthM * hand.strength]);
         this.stage.setAim(this.onSurface(this.aimM));
       }
@@ -141,7 +141,7 @@ export class Input {
     event.preventDefault();
   }
 
-  /** Keys while Space is down: a stroke goes on, a push leans, a pull is drawn aside. */
+  /** Arrow keys while Space is down: a stroke moves on, a push leans, a pull moves sideways. */
   private lead(aimM: [number, number], { hand, reach }: Touched): void {
     if (hand.mode === "stroke") return hand.goOn(aimM);
     const from = this.from?.placeM ?? aimM;

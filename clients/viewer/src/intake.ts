@@ -1,14 +1,14 @@
-// A worker that takes frames in and gives credit back, however long the page takes to draw. The page gets what is newest
-// in one buffer that goes to and fro: while the page has it, changes gather here, and nothing queues.
+// A worker that receives frames and returns credit, however long the page takes to draw. The page gets the newest state
+// in one buffer that is passed back and forth: while the page has it, changes accumulate here, and nothing queues.
 
 import { Field, type Rectangle } from "./field";
 import { Encoding, type WatchFramesResponse } from "./gen/palpate/v1/view_pb";
 import { caller, type Failure, keepOpen, PATIENCE_MS, received, views } from "./server";
 
-/** Frames on their way: a round trip of 60 ms at 60 frames a second. */
+/** Frames in flight: a round trip of 60 ms at 60 frames a second. */
 const IN_FLIGHT = 4;
 
-/** What to take in: the page's first message. Each further one is the buffer. */
+/** The stream to receive: the page's first message. Each later message returns the buffer. */
 export interface Order {
   sessionId: string;
   token: string;
@@ -16,14 +16,14 @@ export interface Order {
   vertices: [number, number];
 }
 
-/** The newest frame, and what happened since the last news. */
+/** The newest frame, and the changes since the last message. */
 export interface News {
   changed: Rectangle;
   /** Displacements of the rectangle, at the beginning of the buffer. */
   values: Float32Array<ArrayBuffer>;
   step: bigint;
   timeS: number;
-  /** Frames taken in, those that the server left out in all of this stream, and bytes. */
+  /** Frames received, frames that the server skipped in all of this stream, and bytes. */
   taken: number;
   skipped: bigint;
   bytes: number;
@@ -34,7 +34,7 @@ export interface Trouble {
   waitMs: number;
 }
 
-// The library for workers and that for pages can't be had at once.
+// TypeScript can't load the type libraries for workers and for pages together.
 const page = self as unknown as {
   onmessage: (event: MessageEvent<Order | Float32Array<ArrayBuffer>>) => void;
   postMessage: (message: News | Trouble, transfer?: Transferable[]) => void;
@@ -45,13 +45,13 @@ class Intake {
   private buffer: Float32Array<ArrayBuffer> | undefined;
   private taken = 0;
   private last: WatchFramesResponse | undefined;
-  /** Left out by the server, in the streams before this one and in all. */
+  /** Frames skipped by the server: in the earlier streams, and in total. */
   private skipped = { before: 0n, now: 0n };
 
   constructor(private readonly order: Order) {
     this.field = new Field(...order.vertices);
     this.buffer = new Float32Array(this.field.displacementM.length);
-    // It ends with the worker.
+    // The stream ends with the worker.
     const { signal } = new AbortController();
     void keepOpen(
       (signal, alive) => this.read(signal, alive),
@@ -70,7 +70,7 @@ class Intake {
       alive();
       parts.push(part);
       if (!part.last) continue;
-      // Half a frame is never seen.
+      // Apply all parts at once, so that half a frame is never visible.
       for (const each of parts) each.patches.forEach((patch) => this.field.write(each, patch));
       parts = [];
       credit.giveBack(part.viewerId, part.frameId);
@@ -81,7 +81,7 @@ class Intake {
     }
   }
 
-  /** The page has done with the buffer. */
+  /** The page has finished with the buffer. */
   reuse(buffer: Float32Array<ArrayBuffer>): void {
     this.buffer = buffer;
     this.tell();
@@ -119,7 +119,7 @@ class Credit {
       try {
         await views.acknowledgeFrames({ viewerId, frameId }, { signal: this.signal, timeoutMs: PATIENCE_MS });
       } catch {
-        // The stream fails as well, and tells; or the next acknowledgement covers this one.
+        // The stream fails as well and reports it; or the next acknowledgement covers this one.
       }
     }
     this.underWay = false;

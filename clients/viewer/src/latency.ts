@@ -1,8 +1,8 @@
-// From a press to the pixel that shows it: measured in the page, on the picture itself.
+// The latency from a press to its visible pixel, measured in the page on the picture itself.
 
 import type { Stage } from "./stage";
 
-/** Sum over red, green and blue by which a pixel must differ: above what smoothing edges could do. */
+/** Least change of a pixel, summed over red, green and blue: above the effect of smoothed edges. */
 const SEEN = 6;
 
 interface Watch {
@@ -18,7 +18,7 @@ export class Latency {
 
   constructor(private readonly stage: Stage) {}
 
-  /** Resolves with the milliseconds from the next press to when the pixel at (x, y) of the window has changed. */
+  /** Resolves with the milliseconds from the next press to the change of the pixel at (x, y) of the window. */
   next(x: number, y: number): Promise<number> {
     this.stage.hold(true);
     return new Promise((done) => {
@@ -27,12 +27,12 @@ export class Latency {
     });
   }
 
-  /** A press, at the time that the browser gives it. */
+  /** Records a press, at the time that the browser gives. */
   pressed(eventMs: number): void {
     if (this.watch && this.watch.pressedMs === undefined) this.watch.pressedMs = eventMs;
   }
 
-  /** After each picture. */
+  /** Call after each picture. */
   drawn(): void {
     const watch = this.watch;
     if (!watch) return;

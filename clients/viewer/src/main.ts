@@ -1,4 +1,4 @@
-// The page: puts the parts together.
+// The page: connects the parts.
 
 import type { Session } from "./gen/palpate/v1/session_pb";
 import { SessionState } from "./gen/palpate/v1/session_pb";
@@ -16,7 +16,7 @@ import { tissueTexture } from "./texture";
 import { TissueValues } from "./tissue";
 import { Visit } from "./visit";
 
-/** The scene of a new session, if the server has it and the address asks for no other. */
+/** The scene of a new session, if the server has it and the address names no other. */
 const DEFAULT_SCENE = "paper";
 
 const canvas = part("tissue", HTMLCanvasElement);
@@ -32,7 +32,7 @@ let playing: AbortController | undefined;
 new Input(canvas, stage, latency, () => visit);
 
 let noticed: ReturnType<typeof setTimeout> | undefined;
-/** Says something for a while; for ever if `seconds` is 0. */
+/** Shows a message for `seconds`; permanently if 0. */
 function notice(text: string, seconds = 5): void {
   const line = part("notice", HTMLElement);
   clearTimeout(noticed);
@@ -41,7 +41,7 @@ function notice(text: string, seconds = 5): void {
   if (seconds > 0) noticed = setTimeout(() => (line.hidden = true), 1000 * seconds);
 }
 
-/** Goes to a session: one that is there, or a new one of a scene. */
+/** Opens a session: an existing one, or a new one of a scene. */
 async function open(sessionId: string | undefined, scene: string | undefined): Promise<void> {
   visit?.leave();
   visit = undefined;
@@ -54,27 +54,27 @@ async function open(sessionId: string | undefined, scene: string | undefined): P
       if (session) return await show(session, sessionId === undefined);
     } catch (error) {
       const refused = describe(error);
-      if (isGone(error)) return over("There is no such session any more.");
+      if (isGone(error)) return over("This session no longer exists.");
       if (reasonOf(error) === "UNAUTHENTICATED") {
         return over(`The server asks who you are (${refused}). Put your token behind the address, as in #token=…`);
       }
-      // What the server refuses for a reason it refuses again.
+      // A refusal with any other reason would be repeated.
       if (!["", "SHUTTING_DOWN", "TOO_MANY"].includes(reasonOf(error))) return over(`${refused}.`);
       const waitMs = backoffMs(failures);
-      status.say(`The server does not answer as it should (${refused}). Trying again in ${(waitMs / 1000).toFixed(1)} s.`);
+      status.say(`Unexpected answer from the server (${refused}). Trying again in ${(waitMs / 1000).toFixed(1)} s.`);
       await sleep(waitMs);
     }
   }
 }
 
-/** A session has ended: what to do is for the person to say. */
+/** A session has ended: the user decides what to do. */
 function over(why: string): void {
   visit?.leave();
   visit = undefined;
   status.say(why);
   notice(`${why} `, 0);
   const again = document.createElement("button");
-  again.textContent = "Begin a new one";
+  again.textContent = "Start a new session";
   again.addEventListener("click", () => {
     notice("", 0);
     void open(undefined, part("scene", HTMLSelectElement).value || undefined);
@@ -112,7 +112,7 @@ async function show(session: Session, isNew: boolean): Promise<void> {
 function wellText(session: Session): string {
   const name = session.scene?.name ?? "";
   if (session.state === SessionState.HELD) return `The session is held: ${session.holdReason}`;
-  if (session.state === SessionState.PAUSED) return `Connected to a session of ${name}; its time stands still.`;
+  if (session.state === SessionState.PAUSED) return `Connected to a session of ${name}, which is paused.`;
   return `Connected to a session of ${name}.`;
 }
 
@@ -121,7 +121,7 @@ function trouble(failure: Failure, waitMs: number): void {
   status.say(`Connection lost (${failure.text}). Trying again in ${(waitMs / 1000).toFixed(1)} s.`);
 }
 
-/** What the session says of itself. */
+/** Handles the session's status. */
 function heard(session: Session): void {
   if (session.sessionId !== visit?.session.sessionId) return;
   visit.session = session;
@@ -138,7 +138,7 @@ function holding(): void {
   part("release", HTMLButtonElement).disabled = !mine;
 }
 
-/** Where tools are, and what they feel. */
+/** Shows the tools and the forces on them. */
 function felt(of: Visit): void {
   if (of !== visit) return;
   const { spacingM, mostN } = of.reach;
@@ -187,10 +187,10 @@ part("scene", HTMLSelectElement).addEventListener("change", (event) => {
   void open(undefined, (event.target as HTMLSelectElement).value);
 });
 part("share", HTMLButtonElement).addEventListener("click", () => {
-  // Browsers have a clipboard only for pages that came safely, or from this machine.
-  const failed = () => notice("The link is the address of this page.");
+  // Browsers offer the clipboard only to pages from a secure origin or from this machine.
+  const failed = () => notice("The link could not be copied. Copy the address of this page instead.");
   if (!isSecureContext) return failed();
-  const copied = () => notice("The link is copied: whoever opens it sees this session.");
+  const copied = () => notice("Link copied. Anyone who opens it sees this session.");
   void navigator.clipboard.writeText(location.href).then(copied, failed);
 });
 part("play", HTMLButtonElement).addEventListener("click", () => void play());
@@ -220,7 +220,7 @@ async function play(): Promise<void> {
 
 stage.onDrawn = () => latency.drawn();
 
-// Windows that nobody sees give their connections to those that somebody does.
+// A hidden window releases its connections for visible ones.
 document.addEventListener("visibilitychange", () => (document.hidden ? visit?.lookAway() : visit?.look()));
 addEventListener("pagehide", () => void visit?.hand.letGo());
 addEventListener("popstate", () => {
@@ -228,7 +228,7 @@ addEventListener("popstate", () => {
   if (sessionId !== visit?.session.sessionId) void open(sessionId, undefined);
 });
 
-// Ten times a second what is read as it changes, once a second what is read as a figure.
+// Ten times a second for values read as they change, once a second for figures.
 setInterval(() => {
   if (!visit || document.hidden) return;
   const { samples } = visit;
@@ -277,13 +277,13 @@ async function lists(): Promise<void> {
   }
 }
 
-/** Of the newest frame here. */
+/** Age of the newest frame here. */
 function frameAgeMs(): number | undefined {
   const [now, newest] = [visit?.nowS(), visit?.frames.newest];
   return now === undefined || !newest ? undefined : Math.max(0, 1000 * (now - newest.timeS));
 }
 
-/** For tests and measurements: what the page has, as numbers. */
+/** The page's state as numbers, for tests and measurements. */
 const inside = {
   get frames() {
     const { taken, skipped, newest } = visit?.frames ?? { taken: 0, skipped: 0n };
@@ -304,14 +304,14 @@ const inside = {
   get forceN() {
     return visit?.samples.tools.map((tool) => norm(tool.forceN)) ?? [];
   },
-  /** Of the control point, as far back as the plots go. */
+  /** Largest displacement of the control point within the length of the plots. */
   get deepestM() {
     return Math.max(0, ...(visit?.samples.history.map((moment) => norm(moment.displacementM)) ?? []));
   },
   get holds() {
     return visit?.hand.holds ?? false;
   },
-  /** Where in the window the tissue of a place is, in parts of the sheet. */
+  /** The window point of the tissue at (x, y), in fractions of the sheet. */
   at(x: number, y: number): [number, number] | undefined {
     if (!visit) return undefined;
     const placeM = [x * visit.extentM[0], y * visit.extentM[1]] as const;

@@ -1,4 +1,4 @@
-// Parts of the page by their names, and what its address asks for (README, "The page").
+// Elements of the page by id, and the parameters in its address (README, "The page").
 
 import { caller } from "./server";
 
@@ -10,14 +10,14 @@ export function part<T extends HTMLElement>(id: string, kind: new () => T): T {
 
 export const asked = new URLSearchParams(location.search);
 
-/** A whole number of the address, if it is within a range. */
+/** An integer parameter of the address, if it is within the range. */
 export function askedNumber(key: string, least: number, most: number): number | undefined {
   const text = asked.get(key);
   const value = Number(text);
   return text !== null && text !== "" && value >= least && value <= most ? value : undefined;
 }
 
-/** Writes the session into the address, so that loading again and sharing work. */
+/** Writes the session into the address, so that reloading and sharing work. */
 export function writeAddress(sessionId: string, isNew: boolean): void {
   const address = new URL(location.href);
   address.searchParams.set("session", sessionId);
@@ -26,7 +26,7 @@ export function writeAddress(sessionId: string, isNew: boolean): void {
   else history.replaceState(null, "", address);
 }
 
-/** A name for others to see: what the address says, or one made up for this window. */
+/** The name that others see: from the address, or generated for this window. */
 export function holderName(): string {
   const given = asked.get("name")?.slice(0, 60);
   if (given) return given;
@@ -39,8 +39,8 @@ export function holderName(): string {
 }
 
 /**
- * Takes the token out of the address (`#token=…`), which people share. It is behind `#` so that no server is sent it and no
- * log has it. True if there was one.
+ * Removes the token (`#token=…`) from the address, because people share addresses. It comes after `#`, so that it never
+ * reaches a server or a log. Returns true if there was one.
  */
 function keepToken(): boolean {
   const behind = new URLSearchParams(location.hash.slice(1));
@@ -53,5 +53,5 @@ function keepToken(): boolean {
 
 keepToken();
 caller.token = sessionStorage.getItem("token") ?? "";
-// A token that is put behind the address of a page that is open already loads nothing by itself.
+// Adding a token to the address of an open page does not reload it by itself.
 addEventListener("hashchange", () => keepToken() && location.reload());

@@ -1,22 +1,22 @@
-// Two small plots of the last seconds: a line a quantity, its axis, its largest value.
+// Two small plots of the last seconds: one line per quantity, an axis, and the largest value.
 
 import { HISTORY_S, type Moment, norm } from "./samples";
 
 interface Line {
   name: string;
-  /** A variable of the style. */
+  /** A CSS variable. */
   colour: string;
   of: (moment: Moment) => number;
 }
 
-/** A prefix of SI that suits a size: a factor and its letters. */
+/** The SI prefix for a magnitude: its factor and letters. */
 function prefixed(most: number): [number, string] {
   if (most >= 1) return [1, ""];
   if (most >= 1e-3) return [1e3, "m"];
   return [1e6, "µ"];
 }
 
-/** A number as people write it, with a unit. */
+/** A number with its unit, for display. */
 export function quantity(value: number, unit: string): string {
   const [factor, prefix] = prefixed(Math.abs(value));
   return `${(value * factor).toPrecision(3)} ${prefix}${unit}`;
@@ -80,7 +80,7 @@ class Plot {
       pen.beginPath();
       let before = -Infinity;
       for (const moment of history) {
-        // Where nothing was felt there is no line.
+        // A gap without samples gets no line.
         if (moment.timeS - before > 0.5) pen.moveTo(x(moment.timeS), y(of(moment)));
         else pen.lineTo(x(moment.timeS), y(of(moment)));
         before = moment.timeS;

@@ -1,4 +1,4 @@
-// What the tools feel: the newest sample, and those of the last seconds.
+// The samples of the tools: the newest, and those of the last seconds.
 
 import type { GridPoint, Vector3 } from "./gen/palpate/v1/geometry_pb";
 import type { Sample } from "./gen/palpate/v1/haptic_pb";
@@ -14,42 +14,42 @@ export function norm([x, y, z]: Vec3): number {
   return Math.hypot(x, y, z);
 }
 
-/** A tool at the end of a step. */
+/** The sample of a tool at the end of a step. */
 export interface Felt {
   tool: number;
-  /** The control point, in the grid. */
+  /** The control point's indices in the grid. */
   point: GridPoint | undefined;
   displacementM: Vec3;
   forceN: Vec3;
   appliedN: Vec3;
 }
 
-/** A moment of the plots. */
+/** One moment in the plots. */
 export interface Moment {
   timeS: number;
   displacementM: Vec3;
   forceN: Vec3;
 }
 
-/** Samples a second: more than a screen shows, fewer than matter to a network. */
+/** Samples per second: more than a screen shows, few enough for any network. */
 const RATE_HZ = 100;
 
-/** What plots show, s. */
+/** Length of the plots, s. */
 export const HISTORY_S = 6;
 
-/** A tool touches if there is more force, as a part of the strongest push. */
+/** A tool counts as touching above this fraction of the strongest push. */
 const FELT = 0.01;
 
 export class Samples {
   newest: Sample | undefined;
-  /** Those that touch. */
+  /** The tools that touch. */
   tools: Felt[] = [];
   readonly history: Moment[] = [];
   onSample: (sample: Sample) => void = () => {};
 
   constructor(private readonly mostN: number) {}
 
-  /** Reads until it is aborted. */
+  /** Reads until `signal` aborts. */
   run(
     sessionId: string,
     stepRateHz: number,
@@ -80,13 +80,13 @@ export class Samples {
         forceN: vec(tool.forceOnToolN),
         appliedN: vec(tool.appliedForceN),
       }));
-    // A tool that has let go is told of as long as its place still moves: the plots show how it comes to rest.
+    // The server reports a released tool while its point still moves, so the plots show it come to rest.
     const least = FELT * this.mostN;
     this.tools = felt.filter((tool) => norm(tool.appliedN) > least || norm(tool.forceN) > least);
     const timeS = sample.simulationTimeS;
     const first = this.tools[0] ?? felt[0];
     if (first) this.history.push({ timeS, displacementM: first.displacementM, forceN: first.forceN });
-    // A gap of a second or more is seen as one, and the past goes.
+    // A gap of a second or more stays visible. Older samples are dropped.
     while (this.history.length > 0 && this.history[0]!.timeS < timeS - HISTORY_S) this.history.shift();
     this.onSample(sample);
   }

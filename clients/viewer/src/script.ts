@@ -1,17 +1,17 @@
-// Plays a script of the server in a session: its commands, stamped with the steps at which they act.
+// Plays a script from the server in a session: its commands, stamped with the steps at which they take effect.
 
 import { create } from "@bufbuild/protobuf";
 import { type Command, CommandSchema } from "./gen/palpate/v1/haptic_pb";
 import { haptics, PATIENCE_MS, sessions, sleep } from "./server";
 
-/** How long after the beginning the first command acts, and how far ahead others are sent, s. */
+/** Delay from the start to the first command's step, and how far ahead the others are sent, s. */
 const LEAD_S = 0.3;
 const AHEAD_S = 1;
-/** Commands of one message. */
+/** Most commands in a message. */
 const BATCH = 500;
 const LEASE_S = 2;
 
-/** Plays to the end or until it is aborted. `onProgress` gets parts of 1. */
+/** Plays to the end or until it is aborted. `onProgress` gets the fraction done. */
 export async function playScript(
   sessionId: string,
   scriptName: string,
@@ -57,7 +57,7 @@ export async function playScript(
       if (signal.aborted) break;
     }
   } finally {
-    // What the tools did ends with their leases.
+    // The tools' actions end with their leases.
     for (const leaseId of leases) {
       await haptics.releaseTool({ sessionId, leaseId }, { timeoutMs: PATIENCE_MS }).catch(() => {});
     }

@@ -1,4 +1,4 @@
-// The server: its services, its errors, and streams that come back by themselves.
+// The server: its services, its errors, and streams that reconnect.
 
 import { Code, ConnectError, createClient, type Interceptor } from "@connectrpc/connect";
 import { createGrpcWebTransport } from "@connectrpc/connect-web";
@@ -7,10 +7,10 @@ import { HapticService } from "./gen/palpate/v1/haptic_pb";
 import { SessionService } from "./gen/palpate/v1/session_pb";
 import { ViewService } from "./gen/palpate/v1/view_pb";
 
-/** Bytes that came from the server, of answers' bodies: headers of HTTP are not counted. */
+/** Bytes received from the server in response bodies, without HTTP headers. */
 export const received = { bytes: 0 };
 
-/** Counts what passes. */
+/** Counts the bytes that pass. */
 const counted: typeof fetch = async (input, init) => {
   const answer = await fetch(input, init);
   if (!answer.body) return answer;
@@ -23,18 +23,18 @@ const counted: typeof fetch = async (input, init) => {
   return new Response(answer.body.pipeThrough(count), answer);
 };
 
-/** Who calls: the token that the page was given (page.ts), or nothing. */
+/** The identity of the caller: the token that the page was given (page.ts), or nothing. */
 export const caller = { token: "" };
 
-/** Shows with every call who calls, if a token was given. */
+/** Sends the token, if there is one, with every call. */
 const identified: Interceptor = (next) => (request) => {
   if (caller.token) request.header.set("authorization", `Bearer ${caller.token}`);
   return next(request);
 };
 
-// A browser speaks HTTP/1.1 to a port without TLS, with at most six connections for all its windows of one server:
-// here two streams, two batches of commands, an acknowledgement and a question after the session. So frames can't have a
-// connection of their own among those, and a window that nobody sees gives its streams up.
+// A browser speaks HTTP/1.1 to a port without TLS, with at most six connections for all its windows of one server. A
+// window uses two streams, two batches of commands, an acknowledgement and a status request. So frames can't have a
+// connection of their own, and a hidden window closes its streams.
 const transport = createGrpcWebTransport({ baseUrl: location.origin, fetch: counted, interceptors: [identified] });
 
 export const sessions = createClient(SessionService, transport);
@@ -42,22 +42,22 @@ export const haptics = createClient(HapticService, transport);
 export const views = createClient(ViewService, transport);
 
 /**
- * Of every call that is no stream: a server that does not answer by then has gone. Long, for a window that was busy sees
- * answers late; a server that is not there refuses at once.
+ * Timeout of every call that is not a stream: a server that takes longer is gone. It is long, because a busy window
+ * sees answers late; a server that is not running refuses at once.
  */
 export const PATIENCE_MS = 20_000;
 
-/** The server's own reason (README, "Errors"); empty if it gave none. */
+/** The server's reason code (README, "Errors"); empty if it gave none. */
 export function reasonOf(error: unknown): string {
   return ConnectError.from(error).findDetails(ErrorInfoSchema)[0]?.reason ?? "";
 }
 
-/** What people are told of an error. */
+/** The message for an error. */
 export function describe(error: unknown): string {
   return ConnectError.from(error).rawMessage;
 }
 
-/** The session is over, and won't come back. */
+/** Whether the session is over for good. */
 export function isGone(error: unknown): boolean {
   return ["UNKNOWN_SESSION", "SESSION_DELETED"].includes(reasonOf(error));
 }
@@ -66,7 +66,7 @@ export function isUnimplemented(error: unknown): boolean {
   return ConnectError.from(error).code === Code.Unimplemented;
 }
 
-/** Resolves after a while, or as soon as the signal says. */
+/** Resolves after `ms`, or when `signal` aborts. */
 export function sleep(ms: number, signal?: AbortSignal): Promise<void> {
   return new Promise((resolve) => {
     if (signal?.aborted) return resolve();
@@ -80,19 +80,19 @@ export function sleep(ms: number, signal?: AbortSignal): Promise<void> {
   });
 }
 
-/** Waits longer from one failure to the next: 0.25 s to 8 s, each a bit different so that not all come back at once. */
+/** The wait grows with each failure, from 0.25 s to 8 s, with some jitter so that not all clients return at once. */
 export function backoffMs(failures: number): number {
   return Math.min(8000, 250 * 2 ** Math.min(failures, 6)) * (0.75 + 0.5 * Math.random());
 }
 
-/** What went wrong with a stream, as a worker can tell it too. */
+/** A stream's failure, in a form that a worker can send. */
 export interface Failure {
-  /** The session is over, and won't come back. */
+  /** Whether the session is over for good. */
   isGone: boolean;
   text: string;
 }
 
-/** Keeps a stream open until it is aborted or the session is gone. `onFailure` gets what went wrong and the wait. */
+/** Keeps a stream open until it is aborted or the session is gone. `onFailure` gets the failure and the wait. */
 export async function keepOpen(
   read: (signal: AbortSignal, alive: () => void) => Promise<void>,
   signal: AbortSignal,

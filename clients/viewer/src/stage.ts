@@ -1,4 +1,4 @@
-// The picture: tissue, light, tools and the view of it. Drawn when something changed, never twice in a frame.
+// The picture: tissue, light, tools and camera. Drawn on changes, at most once per display frame.
 
 import {
   AmbientLight,
@@ -37,13 +37,13 @@ import { Effort, isDrawnBySoftware } from "./effort";
 import type { Vec3 } from "./samples";
 import type { Surface } from "./surface";
 
-/** After so long without a frame there is a picture of what tools do. */
+/** After this time without a frame, tool changes are drawn on their own. */
 const ALONE_MS = 40;
 
-/** A tool as the server has it. */
+/** A tool in the state of the server's sample. */
 export interface ShownTool {
   placeM: Vec3;
-  /** Of the tissue on the tool. */
+  /** Force of the tissue on the tool. */
   forceN: Vec3;
 }
 
@@ -51,13 +51,13 @@ export class Stage {
   readonly camera = new PerspectiveCamera(38, 1, 0.01, 10);
   /** Called after each picture. */
   onDrawn: () => void = () => {};
-  /** Pictures drawn. */
+  /** Number of pictures drawn. */
   drawn = 0;
   private readonly renderer: WebGLRenderer;
   private readonly scene = new Scene();
   private readonly orbit: OrbitControls;
   private readonly skin: MeshPhysicalMaterial;
-  /** The same for a tenth of the work. */
+  /** A simple material for the same tissue, at a tenth of the cost. */
   private readonly plain = new MeshPhongMaterial({ specular: 0x9a8f8c, shininess: 90, side: DoubleSide });
   private readonly hidden: MeshBasicMaterial;
   private readonly wires: LineBasicMaterial;
@@ -72,17 +72,17 @@ export class Stage {
   private readonly effort: Effort;
   private wireframe = false;
   private held = false;
-  /** A picture of tools, if no frame asks for one before. */
+  /** A pending picture of tools, drawn if no frame causes one first. */
   private later: ReturnType<typeof setTimeout> | undefined;
 
-  /** `isFixed` keeps to the greatest effort, however long a picture takes. */
+  /** With `isFixed`, always uses the greatest effort, however long a picture takes. */
   constructor(
     private readonly canvas: HTMLCanvasElement,
     isFixed: boolean,
   ) {
     const isSoftware = isDrawnBySoftware();
     this.effort = new Effort(isSoftware, isFixed);
-    // Smooth edges cost nothing, or, without a graphics processor, several times all else.
+    // Smooth edges cost nothing with a graphics processor; without one, they cost several times everything else.
     this.renderer = new WebGLRenderer({ canvas, antialias: isFixed || !isSoftware });
     this.renderer.outputColorSpace = SRGBColorSpace;
     this.renderer.toneMapping = ACESFilmicToneMapping;
@@ -96,7 +96,7 @@ export class Stage {
       clearcoatRoughness: 0.22,
       side: DoubleSide,
     });
-    // Behind its lines the tissue hides those further away.
+    // Behind the lines of the mesh, the tissue hides the lines that are further away.
     this.hidden = new MeshBasicMaterial({ side: DoubleSide });
     for (const material of [this.skin, this.plain, this.hidden]) {
       material.polygonOffset = true;
@@ -104,7 +104,7 @@ export class Stage {
       material.polygonOffsetUnits = 1;
     }
     this.wires = new LineBasicMaterial();
-    // The light of an endoscope is beside its lens.
+    // An endoscope's light is beside its lens.
     this.camera.up.set(0, 0, 1);
     const lamp = new DirectionalLight(0xfff3e6, 1.9);
     lamp.position.set(-0.35, 0.25, 0.3);
@@ -115,7 +115,7 @@ export class Stage {
     this.aim.visible = false;
     this.scene.add(this.camera, new AmbientLight(0xffffff, 0.25), this.aim);
     this.orbit = new OrbitControls(this.camera, canvas);
-    // The left button and one finger are the tool's.
+    // The left button and one finger control the tool.
     this.orbit.mouseButtons = { LEFT: null, MIDDLE: MOUSE.DOLLY, RIGHT: MOUSE.ROTATE };
     this.orbit.touches = { ONE: null, TWO: TOUCH.DOLLY_ROTATE };
     this.orbit.maxPolarAngle = 0.49 * Math.PI;
@@ -125,7 +125,7 @@ export class Stage {
     this.colours();
   }
 
-  /** Shows a surface of this many metres. `keepView` leaves the camera where it is. */
+  /** Shows a surface of `extentM` metres. `keepView` keeps the camera. */
   show(surface: Surface, extentM: [number, number], texture: Texture | undefined, keepView: boolean): void {
     if (this.mesh && this.lines) this.scene.remove(this.mesh, this.lines);
     this.surface?.dispose();
@@ -138,7 +138,7 @@ export class Stage {
     }
     this.mesh = new Mesh(surface.geometry, this.skin);
     this.lines = new LineSegments(surface.lines, this.wires);
-    // What moves has no bounds worth knowing.
+    // Bounds of a moving surface are not worth computing.
     this.mesh.frustumCulled = this.lines.frustumCulled = false;
     this.scene.add(this.mesh, this.lines);
     this.extentM.set(...extentM);
@@ -149,7 +149,7 @@ export class Stage {
     this.orbit.minDistance = size / 8;
     this.orbit.maxDistance = size * 4;
     if (!keepView) {
-      // What is near is large: the middle of the picture is a bit before that of the sheet.
+      // Near parts look larger, so the picture's middle is slightly in front of the sheet's middle.
       const middle = new Vector3(extentM[0] / 2, 0.42 * extentM[1], -0.04 * size);
       this.orbit.target.copy(middle);
       this.camera.position.copy(middle).add(new Vector3(0, -0.86 * size, 0.66 * size));
@@ -175,17 +175,17 @@ export class Stage {
       this.scene.add(mark.group);
     }
     this.marks.forEach((mark, index) => mark.show(this.held ? undefined : tools[index], size, mostN));
-    // What moves a tool moves tissue, and is seen with it: a picture of the tool alone would only keep that one waiting.
+    // A tool's movement also moves tissue. A picture of the tool alone would only delay the one that shows both.
     this.later ??= setTimeout(() => this.draw(), ALONE_MS);
   }
 
-  /** For a measurement: tissue alone, and each picture made like the one before. */
+  /** For measurements: hides everything but tissue, and makes each picture like the one before. */
   hold(on: boolean): void {
     this.held = on;
     if (on) for (const mark of this.marks) mark.group.visible = false;
   }
 
-  /** What there is less of in a picture than there could be. */
+  /** Text for the status line: what is reduced in the picture. */
   describe(): string {
     return this.effort.describe(this.surface?.every ?? 1);
   }
@@ -197,7 +197,7 @@ export class Stage {
     this.draw();
   }
 
-  /** Turns the view by angles, and moves it nearer by a factor. */
+  /** Turns the view by two angles and scales its distance. */
   turn(azimuth: number, polar: number, nearer: number): void {
     const offset = this.camera.position.clone().sub(this.orbit.target);
     const flat = Math.hypot(offset.x, offset.y);
@@ -219,7 +219,7 @@ export class Stage {
     return caster;
   }
 
-  /** The place of the rest plane whose tissue is under a point of the window; none beside the sheet. */
+  /** The place in the rest plane whose tissue is under a point of the window; undefined beside the sheet. */
   pick(x: number, y: number): [number, number] | undefined {
     const surface = this.surface;
     if (!surface) return undefined;
@@ -227,7 +227,7 @@ export class Stage {
     const level = new Plane(new Vector3(0, 0, 1), 0);
     const hit = new Vector3();
     let moved: Vec3 = [0, 0, 0];
-    // Where the ray meets the level of the tissue that it met before; dents are flat enough for a few rounds.
+    // Intersect the ray with the level of the tissue found in the last round; dents are flat enough for a few rounds.
     for (let round = 0; round < 6; round++) {
       level.constant = -moved[2];
       if (!ray.intersectPlane(level, hit)) return undefined;
@@ -240,14 +240,14 @@ export class Stage {
     return inside ? [clamped(px, this.extentM.x), clamped(py, this.extentM.y)] : undefined;
   }
 
-  /** Where a point of the window is on the plane through `at` that faces the camera. */
+  /** The place of a window point on the plane through `at` that faces the camera. */
   onFacingPlane(x: number, y: number, at: Vec3): Vec3 | undefined {
     const facing = this.camera.getWorldDirection(new Vector3());
     const plane = new Plane().setFromNormalAndCoplanarPoint(facing, new Vector3(...at));
     return this.ray(x, y).ray.intersectPlane(plane, new Vector3())?.toArray();
   }
 
-  /** Where a place is in the window. */
+  /** The window point of a place. */
   inWindow(at: Vec3): [number, number] {
     const box = this.canvas.getBoundingClientRect();
     this.camera.updateMatrixWorld();
@@ -255,14 +255,14 @@ export class Stage {
     return [box.left + ((p.x + 1) / 2) * box.width, box.top + ((1 - p.y) / 2) * box.height];
   }
 
-  /** The way across the view, in the rest plane: one metre to the right of the window. */
+  /** The direction in the rest plane that points right in the window; one metre long. */
   rightwards(): [number, number] {
     const right = new Vector3().setFromMatrixColumn(this.camera.matrixWorld, 0);
     const length = Math.hypot(right.x, right.y) || 1;
     return [right.x / length, right.y / length];
   }
 
-  /** Asks for a picture. */
+  /** Requests a picture. */
   draw(): void {
     if (this.wanted) return;
     this.wanted = true;
@@ -278,17 +278,17 @@ export class Stage {
     this.renderer.render(this.scene, this.camera);
     this.drawn += 1;
     this.onDrawn();
-    // The browser may keep the page waiting until the picture is there: only afterwards it is known how long one takes.
+    // The browser may block the page until the picture is done, so measure its time afterwards.
     setTimeout(() => {
       const now = performance.now();
-      // Only pictures that were waited for tell.
+      // Only pictures that the page waited for count.
       const tookMs = now - Math.max(this.before, askedMs);
       this.before = now;
       this.adapt(tookMs);
     });
   }
 
-  /** One pixel of the picture, straight after it was drawn; waits for the graphics processor. */
+  /** One pixel of the picture, right after drawing; waits for the graphics processor. */
   pixel(x: number, y: number): Uint8Array {
     const gl = this.renderer.getContext();
     const box = this.canvas.getBoundingClientRect();
@@ -298,7 +298,7 @@ export class Stage {
     return colour;
   }
 
-  /** Plainer pictures are better than fewer. */
+  /** Simpler pictures are better than fewer pictures. */
   private adapt(tookMs: number): void {
     if (this.held || !this.effort.tell(tookMs)) return;
     this.surface?.drawEvery(this.effort.now.every);
@@ -312,7 +312,7 @@ export class Stage {
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2) * this.effort.now.pixels);
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
-    // A narrow window sees the whole sheet as well.
+    // A narrow window also shows the whole sheet.
     this.camera.fov = width < height ? 38 * Math.min(height / width, 1.8) : 38;
     this.camera.updateProjectionMatrix();
     this.draw();
@@ -363,7 +363,8 @@ class ToolMark {
     this.ring.scale.setScalar(size / 110);
     this.arrow.visible = this.ring.visible = strength > 1e-3 * mostN;
     if (!this.arrow.visible) return;
-    // The tool comes from the side and leans against the force that it feels; pulled by it, it does not turn round.
+    // The tool approaches from the side and leans against the force on it. When the force pulls it, it does not turn
+    // round.
     const axis = force.clone().normalize();
     if (axis.z < 0) axis.negate();
     axis.add(new Vector3(0.55, 0.2, 0)).normalize();

@@ -1,8 +1,8 @@
-// The status line: what the connection and the server are really doing.
+// The status line: the actual state of the connection and the server.
 
 import { received } from "./server";
 
-/** What is told, in this order; one that is absent is not known. */
+/** The figures, in display order. An absent one is unknown. */
 export interface Figures {
   roundTripMs?: number;
   networkMs?: number;
@@ -10,13 +10,13 @@ export interface Figures {
   framesTaken: number;
   framesDrawn: number;
   framesSkipped: bigint;
-  /** What there is less of in a picture than there could be. */
+  /** What is reduced in the picture. */
   picture: string;
   overruns: bigint;
   dilation: number;
   awakePoints?: number;
   isAsleep: boolean;
-  /** Of displacement or force, the larger, in the newest audit; absent before the first. */
+  /** The larger relative error of displacement and force in the newest audit; absent before the first. */
   auditedError?: number;
   tolerance?: number;
 }
@@ -30,12 +30,12 @@ export class Status {
     private readonly list: HTMLElement,
   ) {}
 
-  /** Said by screen readers too, so only what changed. */
+  /** Screen readers announce it, so only changes are written. */
   say(text: string): void {
     if (this.line.textContent !== text) this.line.textContent = text;
   }
 
-  /** Once a second or so. */
+  /** Updates the figures. Call about once a second. */
   show(figures: Figures): void {
     const ms = performance.now();
     const seconds = (ms - this.before.ms) / 1000;
@@ -45,7 +45,7 @@ export class Status {
     this.before = { ms, bytes: received.bytes, taken: figures.framesTaken, drawn: figures.framesDrawn };
     const inMs = (value: number | undefined) => (value === undefined ? "–" : `${value.toFixed(1)} ms`);
     this.set("round trip", inMs(figures.roundTripMs));
-    this.set("of commands, network alone", inMs(figures.networkMs));
+    this.set("commands, network only", inMs(figures.networkMs));
     this.set("frame age", figures.isAsleep ? "still" : inMs(figures.frameAgeMs));
     this.set("frames", `${taken.toFixed(0)}/s, drawn ${drawn.toFixed(0)}/s, skipped ${figures.framesSkipped}`);
     this.set("picture", figures.picture);
@@ -54,7 +54,7 @@ export class Status {
     this.set("time", `${figures.dilation.toFixed(2)} × real`);
     this.set("tissue", figures.isAsleep ? "asleep" : `${figures.awakePoints ?? "–"} points awake`);
     if (figures.auditedError !== undefined) {
-      const asked = figures.tolerance === undefined ? "" : ` (asked ${figures.tolerance.toExponential(0)})`;
+      const asked = figures.tolerance === undefined ? "" : ` (tolerance ${figures.tolerance.toExponential(0)})`;
       this.set("error", `${figures.auditedError.toExponential(0)}${asked}`);
     }
   }

@@ -1,28 +1,28 @@
-// The surface as it is drawn: positions and normals of all vertices, or of every second or fourth a side.
+// The surface as drawn: positions and normals of all vertices, or of every second or fourth one per side.
 
 import { BufferAttribute, BufferGeometry, DynamicDrawUsage } from "three";
 import { Field, type Rectangle } from "./field";
 
-/** A sheet that is drawn with fewer vertices than this is seen to be. */
+/** With fewer vertices than this, a sheet shows its coarse drawing. */
 const LEAST_VERTICES = 6000;
 
 export class Surface {
   readonly field: Field;
-  /** Of the triangles. */
+  /** Geometry of the triangles. */
   readonly geometry = new BufferGeometry();
-  /** Of the lines between mass points. */
+  /** Geometry of the lines between mass points. */
   readonly lines = new BufferGeometry();
-  /** One vertex in so many a side is drawn, and the last. */
+  /** One in `every` vertices per side is drawn, and always the last one. */
   every = 0;
-  /** Of the vertices that are drawn: row i is row `rows[i]` of all. */
+  /** Rows of the drawn vertices: row i is row `rows[i]` of all. */
   private rows = new Uint32Array();
   private columns = new Uint32Array();
   private position = new BufferAttribute(new Float32Array(), 3);
   private normal = this.position;
 
   /**
-   * Vertex (a, b) rests at (a, b, 0)·spacing, and has texture coordinates (a/(nx − 1), b/(ny − 1)): what `GetMesh` would
-   * tell, at megabytes. `pointEvery` vertices is a mass point.
+   * Vertex (a, b) rests at (a, b, 0)·spacing, and has texture coordinates (a/(nx − 1), b/(ny − 1)). `GetMesh` would
+   * return the same, in megabytes. Every `pointEvery`-th vertex is a mass point.
    */
   constructor(
     nx: number,
@@ -34,7 +34,7 @@ export class Surface {
     this.drawEvery(1);
   }
 
-  /** Draws one vertex in `wanted` a side, or more where those would be too few. True if that is another number. */
+  /** Draws one in `wanted` vertices per side, or more if those would be too few. Returns true if the number changed. */
   drawEvery(wanted: number): boolean {
     const { nx, ny } = this.field;
     let every = wanted;
@@ -44,7 +44,7 @@ export class Surface {
     const among = (n: number) => Uint32Array.from({ length: Math.ceil((n - 1) / every) + 1 }, (_, i) => Math.min(i * every, n - 1));
     const [rows, columns] = [among(nx), among(ny)];
     [this.rows, this.columns] = [rows, columns];
-    // What the graphics processor has of the old ones goes.
+    // Free the buffers of the old vertices on the graphics processor.
     this.dispose();
     const [mx, my] = [rows.length, columns.length];
     this.position = new BufferAttribute(new Float32Array(3 * mx * my), 3).setUsage(DynamicDrawUsage);
@@ -73,7 +73,7 @@ export class Surface {
     return true;
   }
 
-  /** Before a picture: makes positions and normals of what changed since the last. */
+  /** Call before each picture: updates positions and normals of what changed since the last. */
   refresh(): void {
     const changed = this.field.takeChanged();
     if (!changed) return;
@@ -91,7 +91,7 @@ export class Surface {
   private work({ a0, a1, b0, b1 }: Rectangle): void {
     if (a1 < a0 || b1 < b0) return;
     this.place({ a0, a1, b0, b1 });
-    // The normals around it change as well.
+    // The normals around the changed part change as well.
     const [mx, my] = [this.rows.length, this.columns.length];
     const [first, last] = [Math.max(a0 - 1, 0), Math.min(a1 + 1, mx - 1)];
     this.turn({ a0: first, a1: last, b0: Math.max(b0 - 1, 0), b1: Math.min(b1 + 1, my - 1) });
@@ -146,7 +146,7 @@ export class Surface {
     }
   }
 
-  /** Displacement of the vertex nearest to a place of the rest plane. */
+  /** Displacement of the vertex nearest to a place in the rest plane. */
   displacementAtM(xM: number, yM: number): [number, number, number] {
     const { nx, ny, displacementM: d } = this.field;
     const near = (at: number, count: number) => Math.min(Math.max(Math.round(at / this.spacingM), 0), count - 1);
@@ -168,7 +168,7 @@ export class Surface {
   }
 }
 
-/** Lines along rows and columns of mass points, through the vertices between them; of all that are drawn. */
+/** Lines along rows and columns of mass points, through the drawn vertices between them. */
 function gridLines(rows: Uint32Array, columns: Uint32Array, pointEvery: number): Uint32Array {
   const ends: number[] = [];
   rows.forEach((row, a) => {

@@ -1,8 +1,8 @@
-// The picture on the tissue: the server's for the session, its default one, or one painted here.
+// The image on the tissue: the server's image for the session, its default image, or one painted here.
 
 import { CanvasTexture, type Texture, SRGBColorSpace } from "three";
 
-/** Pixels of a painted one, each way. */
+/** Pixels per side of a painted image. */
 const SIZE = 512;
 
 export async function tissueTexture(session: string): Promise<Texture> {
@@ -16,7 +16,7 @@ export async function tissueTexture(session: string): Promise<Texture> {
 async function fetchPicture(name: string): Promise<ImageBitmap | undefined> {
   try {
     const answer = await fetch(`/textures/${encodeURIComponent(name)}.png`);
-    // "No content" is how the server says that it has none.
+    // The server answers "No content" if it has no image.
     if (answer.status !== 200) return undefined;
     return await createImageBitmap(await answer.blob(), { imageOrientation: "flipY" });
   } catch {
@@ -41,7 +41,7 @@ function randoms(seed: number): () => number {
   };
 }
 
-/** Mucosa, mottled, with vessels that branch. */
+/** Paints mottled mucosa with branching vessels. */
 function paint(): HTMLCanvasElement {
   const canvas = document.createElement("canvas");
   canvas.width = canvas.height = SIZE;
@@ -50,7 +50,7 @@ function paint(): HTMLCanvasElement {
   const random = randoms(7);
   pen.fillStyle = "#c4625a";
   pen.fillRect(0, 0, SIZE, SIZE);
-  // Lighter and darker clouds, the large ones first.
+  // Lighter and darker clouds, large ones first.
   for (let i = 0; i < 420; i++) {
     const radius = SIZE * (0.18 * Math.exp(-i / 110) + 0.012) * (0.5 + random());
     const [x, y] = [random() * SIZE, random() * SIZE];

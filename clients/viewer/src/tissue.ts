@@ -1,4 +1,4 @@
-// Sliders of k, C and K″: factors on what the scene began with, sent as one command at a time, the newest last.
+// Sliders of k, C and K″: factors on the scene's initial values, sent one command at a time, newest last.
 
 import { part } from "./page";
 import { quantity } from "./plot";
@@ -26,7 +26,7 @@ function valuesOf(scene: Scene | undefined): Values {
 export class TissueValues {
   private readonly sliders = NAMES.map((name) => part(name, HTMLInputElement));
   private begun: Values = { k: 1, c: 1, v: 1 };
-  /** The same; 1 instead of 0, which no factor leaves. */
+  /** The same; 1 instead of 0, because a factor can't change 0. */
   private base: Values = this.begun;
   private sessionId = "";
   private wanted: Partial<Values> | undefined;
@@ -43,7 +43,7 @@ export class TissueValues {
     part("reset", HTMLButtonElement).addEventListener("click", () => this.set(this.begun));
   }
 
-  /** Of another session: its values now are the middle of the sliders. */
+  /** Begins with another session: its present values are the middle of the sliders. */
   begin(session: Session): void {
     this.sessionId = session.sessionId;
     this.begun = valuesOf(session.scene);
@@ -51,7 +51,7 @@ export class TissueValues {
     this.show(session);
   }
 
-  /** What the session says, unless something is still to be said to it. */
+  /** Shows the session's values, unless a change is still to be sent. */
   show(session: Session): void {
     if (this.underWay || this.wanted) return;
     const values = valuesOf(session.scene);

@@ -1,4 +1,4 @@
-// A visit to a session: its streams, its surface and the hand, until one leaves.
+// A visit to a session: its streams, its surface and the hand, until the user leaves.
 
 import { Frames } from "./frames";
 import type { Session } from "./gen/palpate/v1/session_pb";
@@ -7,15 +7,15 @@ import { Samples } from "./samples";
 import { type Failure, keepOpen, PATIENCE_MS, sessions, sleep } from "./server";
 import { Surface } from "./surface";
 
-/** Between two questions after the session. */
+/** Interval between two requests for the session's status. */
 const ASK_MS = 1000;
 
-/** Vertices of a refinement that is chosen for a sheet; more may be asked for. */
+/** The default refinement has at most this many vertices; the user may select more. */
 const CHOSEN_VERTICES = 40_000;
-/** Above this browsers get slow, whatever the machine. */
+/** Above this browsers get slow on any machine. */
 const MOST_VERTICES = 1_500_000;
 
-/** What a visit tells of itself. */
+/** Callbacks of a visit. */
 export interface Told {
   onSession: (session: Session) => void;
   onTrouble: (failure: Failure, waitMs: number) => void;
@@ -37,7 +37,7 @@ export class Visit {
   private readonly ended = new AbortController();
   private seen = new AbortController();
   private watching = new AbortController();
-  /** Simulated less local time, s, by the fastest answer of late, and that answer's round trip. */
+  /** Simulated time minus local time, s, from the fastest recent answer, and that answer's round trip. */
   private clock: { offsetS: number; roundTripMs: number; atMs: number; overruns: bigint } | undefined;
 
   constructor(
@@ -65,7 +65,7 @@ export class Visit {
     this.surface = this.newSurface();
   }
 
-  /** Of a refinement n: M = (m − 1)·n + m along a side. */
+  /** Vertices of refinement n: M = (m − 1)·n + m along a side. */
   private vertices(n: number): number {
     return this.points.map((m) => (m - 1) * n + m).reduce((x, y) => x * y);
   }
@@ -99,12 +99,12 @@ export class Visit {
     this.frames.run(this.session.sessionId, this.refinement, this.surface, signal, this.told.onTrouble);
   }
 
-  /** Closes the streams, and leaves the session as it is. */
+  /** Closes the streams and leaves the session unchanged. */
   lookAway(): void {
     this.seen.abort();
   }
 
-  /** Another refinement, as a surface of its own. */
+  /** Switches to another refinement, with a new surface. */
   refine(n: number): Surface {
     this.refinement = n;
     this.surface = this.newSurface();
@@ -118,7 +118,7 @@ export class Visit {
     this.seen.abort();
   }
 
-  /** Simulated time now, as well as it is known here, s. */
+  /** Estimate of the simulated time now, s. */
   nowS(): number | undefined {
     return this.clock && performance.now() / 1000 + this.clock.offsetS;
   }
@@ -150,8 +150,8 @@ export class Visit {
     this.session = session;
     const roundTripMs = endedMs - begunMs;
     this.roundTripMs = roundTripMs;
-    // The fastest answer says best when it was. After a while others are heard again, for clocks drift, and when steps were
-    // dropped.
+    // The fastest answer gives the most exact time. After a while slower ones count again, because clocks drift, and
+    // also after dropped steps.
     const clock = this.clock;
     const overruns = session.overrunCount;
     const isOld = clock && (endedMs - clock.atMs > 10_000 || overruns !== clock.overruns);

@@ -31,12 +31,12 @@ impl TwoStep {
     }
 }
 
-/// The same in the format of the state; q is in the springs' and the tools' scale.
+/// The same in the format of the state; q is in the scale of the springs and the tools.
 #[derive(Debug, Clone, Copy)]
 pub(in super::super) struct Advance<T> {
     p: T,
     pull: T,
-    /// Hardly damped: then d·d₊ is twice the kinetic energy that the scheme keeps.
+    /// Damping is almost zero, so d·d₊ is twice the kinetic energy that the scheme conserves.
     keeps: bool,
 }
 
@@ -50,7 +50,7 @@ impl<T: Real> sweep::Scheme<T> for Advance<T> {
     const KEPT: usize = 0;
     const WRITTEN: usize = 0;
     const FORCES: usize = 1;
-    /// Of d alone: u is a sum of what was not cut, and smaller for a moment only where two of those cancel.
+    /// Cuts d only: u is a sum of values that were not cut, and gets smaller only where two of them cancel.
     const CUTS: bool = true;
 
     #[inline(always)]
@@ -64,7 +64,7 @@ impl<T: Real> sweep::Scheme<T> for Advance<T> {
     #[inline(always)]
     fn travel<V: Vector<Real = T>>(&self, _: [V; 2], [_, next]: [V; 2]) -> V {
         // The force acts from half a substep before the substep's beginning to half a substep after: the mean of d and
-        // this, of which the guard takes off half the last at each survey.
+        // this. The guard subtracts half of the last at each survey.
         next
     }
 
@@ -78,9 +78,9 @@ impl<T: Real> sweep::Scheme<T> for Advance<T> {
 
     #[inline(always)]
     fn vigour<V: Vector<Real = T>>(&self, x: V, d: V, n: V, kept: &[V; MAX_KEPT], force: Option<V>) -> V {
-        // Without damping and tools, ½·d·d₊ + the elastic energy is what the scheme keeps to the last bit, however large
-        // the substep; with the square of the velocity instead, the sum swings by (dt·ω)²/8. Strong damping hides that
-        // swing, and may let d·d₊ rise.
+        // Without damping and tools, the scheme conserves ½·d·d₊ + the elastic energy to the last bit, however large
+        // the substep; with the square of the velocity instead, the sum oscillates by (dt·ω)²/8. Strong damping hides
+        // that oscillation, and may let d·d₊ rise.
         let (_, next) = self.advance(x, d, n, &mut kept.clone(), force.map(|force| [force; 2]));
         let mean = d.splat(T::of(0.5)).mul(d.add(next));
         if self.keeps { d.mul(next) } else { mean.mul(mean) }

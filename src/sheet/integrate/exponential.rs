@@ -6,21 +6,21 @@
 //! y(1) = E·y(0) + ∫₀¹ e^{A(1−s)}·b·(N(s) + F(s)) ds,  E = e^A.
 //!
 //! Predict y* with N(s) through the last p values N₀, N₋₁, …; evaluate N* = N(u*), once; correct with the polynomial
-//! through N* as well: it differs from the other by δ·π(s), δ = N* − (the other at s = 1), π(s) = ∏(s + i)/(1 + i),
-//! so y = y* + γ·δ, γ = ∫ e^{A(1−s)}·b·π(s) ds. Keep N* as the next N₀.
+//! through N* as well. It differs from the first polynomial by δ·π(s), where δ = N* − (first polynomial at s = 1) and
+//! π(s) = ∏(s + i)/(1 + i), so y = y* + γ·δ, γ = ∫ e^{A(1−s)}·b·π(s) ds. Keep N* as the next N₀.
 //!
-//! **As the sweep does it.** The state between substeps is the *predicted* y* of the present, with N of the p times
-//! before. A substep evaluates N₀ = N(u*), which completes y₀ = y* + γ(N₀ − Σ e_i·N₋₁₋ᵢ), eᵢ the weights of the
-//! extrapolation, and predicts: y*₊ = E·y₀ + Σ aᵢ·N₋ᵢ + forced, i = 0 … p − 1. Together
+//! **In the sweep.** The state between substeps is the *predicted* y* of the present, with N of the p times before. A
+//! substep evaluates N₀ = N(u*), which completes y₀ = y* + γ(N₀ − Σ e_i·N₋₁₋ᵢ), with eᵢ the weights of the
+//! extrapolation, and predicts y*₊ = E·y₀ + Σ aᵢ·N₋ᵢ + forced, i = 0 … p − 1. Together:
 //!
 //! y*₊ = E·y* + (E·γ + a₀)·N₀ + Σ (aᵢ − e_{i−1}·E·γ)·N₋ᵢ + forced,  i = 1 … p,  a_p = 0:
 //!
-//! one pass, in place, without a buffer for what is predicted. u and w advance by increments, with E − 1 formed in f64,
-//! so f32 keeps its digits.
+//! This takes one pass, in place, without a buffer for predictions. u and w advance by increments, with E − 1 formed in
+//! f64, so f32 keeps its digits.
 //!
-//! **Tools.** A force acts exactly for as long as it is a polynomial of degree 2k − 1 within the substep, by its values at
-//! the k Gauss points (the weights are those of the integral with e^{A(1−s)}·b, exact to degree k − 1). A jump at a step's
-//! beginning costs nothing: N does not jump with it.
+//! **Tools.** A force that is a polynomial of degree 2k − 1 within the substep acts exactly, through its values at the
+//! k Gauss points (the weights are those of the integral with e^{A(1−s)}·b, exact to degree k − 1). A jump at a step's
+//! beginning costs no accuracy: N does not jump with it.
 //!
 //! Literature: exponential Adams methods (Hochbruck and Ostermann, Acta Numerica 19, 2010, section 2.5); predicting and
 //! correcting with one evaluation is PEC mode (Hairer, Nørsett, Wanner I, III.1).
@@ -37,21 +37,21 @@ const ORDER_MAX: usize = 4;
 /// The weights of a scheme, each for u and for w.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Multistep {
-    /// p: how many values of the springs' force are kept.
+    /// p: the number of kept values of the springs' force.
     pub order: usize,
     /// E − 1, by rows.
     linear: [[f64; 2]; 2],
-    /// Of N₀, N₋₁, … N₋p.
+    /// Weights of N₀, N₋₁, … N₋p.
     springs: Vec<[f64; 2]>,
     /// γ.
     pub correction: [f64; 2],
-    /// e: of N₋₁, … N₋p for what they foretell of N₀.
+    /// e: weights of N₋₁, … N₋p in the prediction of N₀.
     pub extrapolation: Vec<f64>,
     /// ∫ e^{A(1−s)}·b·sʲ ds for j = 0, 1, …
     moments: Vec<[f64; 2]>,
 }
 
-/// Coefficients of the polynomial that is 1 at `roots`' complement `one` and 0 at the `roots`, rising powers.
+/// Coefficients, in rising powers, of the polynomial that is 1 at `one` and 0 at the `roots`.
 fn basis(one: f64, roots: impl Iterator<Item = f64>) -> Vec<f64> {
     roots.fold(vec![1.0], |polynomial, root| {
         let mut product = vec![0.0; polynomial.len() + 1];
@@ -71,7 +71,7 @@ fn integral(moments: &[[f64; 2]], polynomial: &[f64]) -> [f64; 2] {
 /// The scheme that keeps `order` values.
 #[allow(clippy::cast_precision_loss)]
 pub(super) fn fit(order: usize, a: f64, g: f64) -> Multistep {
-    // y′ = A·y + b·c₀, cⱼ′ = cⱼ₊₁: from c = the j-th unit vector, c₀ is sʲ/j!, and y(1) its integral.
+    // y′ = A·y + b·c₀, cⱼ′ = cⱼ₊₁: starting from c = the j-th unit vector, c₀ is sʲ/j!, and y(1) is its integral.
     let powers = order + 1;
     let system = Matrix::of(2 + powers, |i, j| match (i, j) {
         (0, 1) | (1, 2) => 1.0,
@@ -117,7 +117,8 @@ pub(super) fn fit(order: usize, a: f64, g: f64) -> Multistep {
 }
 
 impl Multistep {
-    /// Three Gauss points. (Two keep the order, but a force that swings at 20 Hz then errs by 1e-7 in steps of 1 ms.)
+    /// Three Gauss points. (Two keep the order, but a force oscillating at 20 Hz then has an error of 1e-7 in steps of
+    /// 1 ms.)
     pub(super) fn nodes(&self) -> Vec<Node> {
         let places = [0.112_701_665_379_258_3, 0.5, 0.887_298_334_620_741_7];
         let node = |&fraction: &f64| {
@@ -128,17 +129,17 @@ impl Multistep {
         places.iter().map(node).collect()
     }
 
-    /// By how much the springs' force differs from what its last values foretold: `history` has it at 0, −1, …, −p.
+    /// The difference between the springs' force and its prediction: `history` has p + 1 values, at 0, −1, …, −p.
     pub fn surprise(&self, history: &[f64]) -> f64 {
         history[0] - self.extrapolation.iter().zip(&history[1..]).map(|(weight, past)| weight * past).sum::<f64>()
     }
 
-    /// What a constant force of 1 adds to u and w in a substep.
+    /// The u and w that a constant force of 1 adds in a substep.
     pub(super) fn constant(&self) -> [f64; 2] {
         self.moments[0]
     }
 
-    /// E·b: what a blow adds to u and w.
+    /// E·b: the u and w that an impulse adds.
     pub(super) fn kick(&self) -> [f64; 2] {
         [self.linear[0][1], 1.0 + self.linear[1][1]]
     }
@@ -165,8 +166,8 @@ impl Multistep {
 
 /// The same in the format of the state.
 ///
-/// Where `COMPENSATED`, what a sum u + increment loses in rounding is kept, and added to the next increment (Kahan 1965).
-/// Without it, a displacement that creeps by less than half its last digit in a substep stands still.
+/// With `COMPENSATED`, the rounding loss of each sum u + increment is kept and added to the next increment (Kahan
+/// 1965). Without it, a displacement that creeps by less than half its last digit per substep stands still.
 #[derive(Debug, Clone, Copy)]
 pub(in super::super) struct Advance<T, const ORDER: usize, const COMPENSATED: bool> {
     linear: [[T; 2]; 2],
@@ -191,10 +192,10 @@ impl<T: Real, const ORDER: usize, const COMPENSATED: bool> Advance<T, ORDER, COM
 }
 
 impl<T: Real, const ORDER: usize, const COMPENSATED: bool> Advance<T, ORDER, COMPENSATED> {
-    /// What u (`row` 0) or w changes by, but for the tools.
+    /// The change of u (`row` 0) or w without the tools.
     #[inline(always)]
     fn increment<V: Vector<Real = T>>(&self, row: usize, x: V, d: V, n: V, kept: &[V; MAX_KEPT]) -> V {
-        // Two sums, so that neither waits for the other.
+        // Two independent sums shorten the dependency chain.
         let mut even = d.splat(self.springs[0][row]).mul(n);
         let mut odd = d.splat(self.springs[1][row]).mul_add(kept[0], d.splat(self.linear[row][0]).mul(x));
         odd = d.splat(self.linear[row][1]).mul_add(d, odd);
@@ -212,7 +213,8 @@ impl<T: Real, const ORDER: usize, const COMPENSATED: bool> Advance<T, ORDER, COM
 
 impl<T: Real, const ORDER: usize, const COMPENSATED: bool> sweep::Scheme<T> for Advance<T, ORDER, COMPENSATED> {
     const KEPT: usize = ORDER + COMPENSATED as usize;
-    /// The oldest becomes the newest; the others change places by their order alone. And what was lost.
+    /// The newest value replaces the oldest, and the others move by renumbering. Beside it, the rounding loss is
+    /// written.
     const WRITTEN: usize = 1 + COMPENSATED as usize;
     const FORCES: usize = 2;
 

@@ -1,9 +1,9 @@
-//! Small square matrices: the exponential of one, and the largest magnitude among its eigenvalues.
+//! Small square matrices: their exponential and spectral radius.
 
-/// Rows of the largest: of u, d, and what a scheme keeps; or of u, d and the powers that make a scheme's weights.
+/// Rows of the largest matrix: u, d and the kept values; or u, d and the powers that give a scheme's weights.
 const LONGEST: usize = 7;
 
-/// A square matrix, by rows. It lies where it is used: choosing a scheme makes many thousands.
+/// A square matrix, by rows, without heap memory: choosing a scheme makes many thousands of them.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Matrix {
     n: usize,
@@ -11,7 +11,7 @@ pub struct Matrix {
 }
 
 impl Matrix {
-    /// From the value at each row and column.
+    /// Builds the matrix from the value at each row and column.
     pub fn of(n: usize, value: impl Fn(usize, usize) -> f64) -> Self {
         let mut values = [0.0; LONGEST * LONGEST];
         for (i, row) in values[..n * n].chunks_exact_mut(n).enumerate() {
@@ -37,8 +37,8 @@ impl Matrix {
         self.values.iter().fold(0.0, |largest, value| value.abs().max(largest))
     }
 
-    /// e to the matrix: a Taylor series of the matrix halved until it is small, squared as often. Of what is not finite
-    /// nothing is known.
+    /// e to the matrix: a Taylor series of the matrix halved until it is small, then squared as often. The result for a
+    /// matrix that is not finite is NaN.
     pub fn exponential(&self) -> Matrix {
         if !self.values.iter().all(|value| value.is_finite()) {
             return Matrix::of(self.n, |_, _| f64::NAN);

@@ -1,9 +1,9 @@
 //! The schemes that advance the sheet: one file each, and one line each in [`Scheme::fit`].
 //!
-//! Everywhere below lengths are in spacings h, time in substeps dt: u is a displacement over h, d what a scheme adds to
-//! it in a substep or nearly so, forces are times dt²/(m·h). The numbers of the equation of motion are then
-//! a = K″·dt²/m and g = C·dt/m: u̇̇ = N − a·u − g·u̇ + F, with N of the springs and F of the tools. Small numbers
-//! stay small, and keep their digits in f32.
+//! Units in this module: lengths are in spacings h, time in substeps dt. u is a displacement over h, d is (nearly) the
+//! amount a scheme adds to it in a substep, forces are times dt²/(m·h). The coefficients of the equation of motion are
+//! then a = K″·dt²/m and g = C·dt/m: u̇̇ = N − a·u − g·u̇ + F, with N from the springs and F from the tools. Small
+//! numbers stay small and keep their digits in f32.
 
 pub(super) mod central;
 pub(super) mod exponential;
@@ -16,7 +16,7 @@ use central::TwoStep;
 use exponential::Multistep;
 use matrix::Matrix;
 
-/// What a scheme needs to know of a sheet.
+/// The properties of a sheet that a scheme depends on.
 #[derive(Debug, Clone, Copy)]
 pub struct Oscillator {
     /// Mass of a point, kg.
@@ -25,7 +25,7 @@ pub struct Oscillator {
     pub damping_n_s_per_m: f64,
     /// K″, N/m.
     pub virtual_stiffness_n_per_m: f64,
-    /// Of the springs' stiffness under any deformation the largest eigenvalue, N/m.
+    /// The largest eigenvalue of the springs' stiffness under any deformation, N/m.
     pub spring_stiffness_n_per_m: f64,
 }
 
@@ -41,7 +41,7 @@ impl Oscillator {
         self.spring_stiffness_n_per_m * substep_s * substep_s / self.mass_kg
     }
 
-    /// ω_b: no vibration is faster, under any deformation, rad/s.
+    /// ω_b, rad/s: an upper bound of every vibration's frequency, under any deformation.
     pub fn omega_bound_per_s(&self) -> f64 {
         ((self.spring_stiffness_n_per_m + self.virtual_stiffness_n_per_m) / self.mass_kg).sqrt()
     }
@@ -54,7 +54,7 @@ pub enum Scheme {
     TwoStep(TwoStep),
     /// The exponential multistep schemes.
     Multistep(Multistep),
-    /// Runge and Kutta's of fourth order.
+    /// The classical fourth-order Runge–Kutta scheme.
     Rk4 {
         /// K″·dt²/m.
         a: f64,
@@ -76,8 +76,8 @@ impl Scheme {
         }
     }
 
-    /// How the tools' force enters a substep: at which moments of it (0 to 1) a law is asked, and with which weights it
-    /// adds to each of the scheme's force fields.
+    /// How the tools' force enters a substep: the moments (0 to 1) at which a law is evaluated, and the weights with
+    /// which each value adds to the scheme's force fields.
     pub fn nodes(&self) -> Vec<Node> {
         match self {
             // The scheme sees the beginning only, and takes the mean of both sides where the force jumps.
@@ -94,12 +94,12 @@ impl Scheme {
         }
     }
 
-    /// Whether the force of a jump has to be the mean of both sides.
+    /// Whether a force that jumps must be given as the mean of both sides.
     pub fn takes_means(&self) -> bool {
         matches!(self, Scheme::TwoStep(_))
     }
 
-    /// By which the forces of springs are scaled beyond dt²/(m·h).
+    /// The factor that scales the springs' forces beyond dt²/(m·h).
     pub fn spring_scale(&self) -> f64 {
         match self {
             Scheme::TwoStep(two) => two.q,
@@ -107,12 +107,12 @@ impl Scheme {
         }
     }
 
-    /// What a constant force of 1 adds to the velocity in a substep, or nearly so: by the last of its fields.
+    /// The velocity that a constant force of 1 adds in a substep (nearly), through the last of its fields.
     pub fn impulse(&self) -> f64 {
         self.constant()[1]
     }
 
-    /// Which field of the tools' force adds to the velocity.
+    /// The field of the tools' force that adds to the velocity.
     pub fn last_field(&self) -> usize {
         match self {
             Scheme::TwoStep(_) => 0,
@@ -120,7 +120,7 @@ impl Scheme {
         }
     }
 
-    /// What a constant force of 1 adds to u and to d in a substep.
+    /// The u and d that a constant force of 1 adds in a substep.
     pub fn constant(&self) -> [f64; 2] {
         match self {
             Scheme::TwoStep(two) => [two.q; 2],
@@ -129,7 +129,7 @@ impl Scheme {
         }
     }
 
-    /// What a short blow of impulse 1 at a substep's beginning adds, by its end, to u and to d.
+    /// The u and d that an impulse of 1 at a substep's beginning has added by its end.
     pub fn kick(&self) -> [f64; 2] {
         match self {
             Scheme::TwoStep(two) => [two.q; 2],
@@ -152,8 +152,8 @@ impl Scheme {
         if matches!(self, Scheme::Rk4 { .. }) { 4 } else { 1 }
     }
 
-    /// The matrix that advances u, d and what is kept of a single vibration whose springs pull with −z·u: its eigenvalues
-    /// tell all about stability and accuracy.
+    /// The matrix that advances u, d and the kept values of a single vibration whose springs pull with −z·u. Its
+    /// eigenvalues determine stability and accuracy.
     pub fn propagator(&self, z: f64) -> Matrix {
         match self {
             Scheme::TwoStep(two) => two.propagator(z),
@@ -162,17 +162,17 @@ impl Scheme {
         }
     }
 
-    /// The magnitude by which a vibration z grows at most in a substep.
+    /// The largest growth factor of a vibration z in a substep.
     pub fn growth(&self, z: f64) -> f64 {
         self.propagator(z).spectral_radius()
     }
 }
 
-/// A moment of a substep at which a tool's law counts.
+/// A moment of a substep at which a tool's law is evaluated.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Node {
     /// From 0, its beginning, to 1, its end.
     pub fraction: f64,
-    /// By which the force (times dt²/(m·h)) adds to each field of the scheme.
+    /// Weights with which the force (times dt²/(m·h)) adds to each field of the scheme.
     pub weights: [f64; 3],
 }

@@ -1,18 +1,18 @@
-//! The classical scheme of Runge and Kutta: fourth order, four evaluations a substep. A yardstick.
+//! The classical fourth-order Runge–Kutta scheme: four evaluations a substep. A reference for comparison.
 //!
 //! y′ = f(y), y = (u, w): k₁ = f(y), k₂ = f(y + k₁/2), k₃ = f(y + k₂/2), k₄ = f(y + k₃),
-//! y₊ = y + (k₁ + 2k₂ + 2k₃ + k₄)/6. Each stage is a sweep that evaluates the springs where the last one put u, adds
-//! to the sum, and puts u and w where the next wants them.
+//! y₊ = y + (k₁ + 2k₂ + 2k₃ + k₄)/6. Each stage is a sweep that evaluates the springs at the u of the stage before,
+//! adds to the sum, and writes the u and w that the next stage needs.
 
 use super::super::lanes::Vector;
 use super::super::real::Real;
 use super::super::sweep::{self, MAX_KEPT};
 use super::matrix::Matrix;
 
-/// Kept: u and w at the beginning, and the sums of the slopes so far.
+/// Kept fields: u and w at the beginning, and the sums of the slopes so far.
 pub(super) const KEPT: usize = 4;
 
-/// The four stages: how far the next goes with this one's slope, and how much of it counts in the sum.
+/// The four stages: how far the next one goes along this slope, and the weight of the slope in the sum.
 pub(in super::super) const STAGES: [(f64, f64); 4] =
     [(0.5, 1.0 / 6.0), (0.5, 1.0 / 3.0), (1.0, 1.0 / 3.0), (0.0, 1.0 / 6.0)];
 

@@ -1,22 +1,22 @@
-//! Vectors of several widths, so that one algorithm is written once: AVX-512, AVX2 with FMA, NEON, and plain arrays.
+//! Vectors of several widths, so that an algorithm is written once: AVX-512, AVX2 with FMA, NEON, and plain arrays.
 //!
-//! Every operation is one that IEEE 754 rounds exactly, or moves bits. An algorithm in which a lane's result depends on
-//! that lane's inputs alone therefore has the same bits at every width.
+//! Every operation is one that IEEE 754 rounds exactly, or moves bits. So an algorithm in which a lane's result depends
+//! only on that lane's inputs has the same bits at every width.
 //!
-//! The processor must have the instructions. [`Width::of`] checks that, and a vector is the proof: the first ones are made
-//! by `unsafe` functions that ask for it, all others out of vectors.
+//! The processor must have the instructions. [`Width::of`] checks that, and a vector is the proof: `unsafe` functions
+//! that require the instructions create the first vectors, and all others come from vectors.
 #![allow(unsafe_code)]
 
 use super::real::Real;
 use crate::scene::Lanes;
 
-/// A fixed number of numbers that are worked on together.
+/// A fixed number of values that are processed together.
 pub(super) trait Vector: Copy {
     type Real: Real;
-    /// Which lanes.
+    /// A set of lanes.
     type Mask: Copy;
     const LANES: usize;
-    /// The lanes are those of one register: loops for the usual rows are worth their code.
+    /// Whether the lanes form one register. If so, separate loops for the usual rows are worth their code size.
     const IS_REGISTER: bool = true;
 
     /// # Safety
@@ -30,10 +30,10 @@ pub(super) trait Vector: Copy {
     /// # Safety
     /// The processor has the instructions.
     unsafe fn of(value: Self::Real) -> Self;
-    /// `value` in every lane; `self` only proves that there are such vectors.
+    /// `value` in every lane; `self` only proves that the processor has such vectors.
     #[inline(always)]
     fn splat(self, value: Self::Real) -> Self {
-        // SAFETY: there is a vector.
+        // SAFETY: `self` is such a vector.
         unsafe { Self::of(value) }
     }
     fn add(self, other: Self) -> Self;
@@ -49,19 +49,19 @@ pub(super) trait Vector: Copy {
     fn minus(self, a: Self, b: Self) -> Self;
     /// 1/√self within 4 %, from half the exponent: the bits of a positive number are nearly its logarithm.
     fn rough_inverse_root(self) -> Self;
-    /// 2^self, for whole numbers from -100 to 100.
+    /// 2^self, for integers from -100 to 100.
     fn power_of_two(self) -> Self;
     /// `first`, `first` + 1, …; `self` is the proof.
     fn count(self, first: usize) -> Self;
     /// The larger; `other` if one is NaN.
     fn larger(self, other: Self) -> Self;
-    /// The larger magnitude; whichever if one is NaN.
+    /// The value of larger magnitude; either if one is NaN.
     fn farther(self, other: Self) -> Self;
-    /// Where |self| > `bound`.
+    /// Lanes where |self| > `bound`.
     fn beyond(self, bound: Self) -> Self::Mask;
-    /// Where self > `bound`.
+    /// Lanes where self > `bound`.
     fn above(self, bound: Self) -> Self::Mask;
-    /// Where |self| is not below [`Real::LEAST`].
+    /// Lanes where |self| is not below [`Real::LEAST`].
     fn counts(self) -> Self::Mask;
     fn any(mask: Self::Mask) -> bool;
     fn either(a: Self::Mask, b: Self::Mask) -> Self::Mask;
@@ -72,25 +72,25 @@ pub(super) trait Vector: Copy {
     fn first(self, count: usize) -> Self::Mask;
     /// 0 where the mask is not set.
     fn keep(self, mask: Self::Mask) -> Self;
-    /// Each lane one place up; the last of `before` comes in.
+    /// Shifts each lane up by one; the last lane of `before` comes in.
     fn shift(self, before: Self) -> Self;
-    /// Each lane two places up; the last two of `before` come in.
+    /// Shifts each lane up by two; the last two lanes of `before` come in.
     fn shift_two(self, before: Self) -> Self;
 }
 
-/// What can be run at any width.
+/// A program that can run at any width.
 pub(super) trait Run<T> {
     /// # Safety
-    /// The processor has the instructions of `V`, and what `self` points to is as it promised.
+    /// The processor has the instructions of `V`, and the pointers of `self` are valid as documented.
     unsafe fn run<V: Vector<Real = T>>(&self);
 }
 
-/// Lanes one by one, for processors that have neither of the others, and for single points.
+/// Lanes processed one by one, for processors without any of the instruction sets, and for single points.
 #[derive(Clone, Copy)]
 pub(super) struct Plain<T, const N: usize>([T; N]);
 
 impl<T: Real, const N: usize> Plain<T, N> {
-    /// a·b + c. Not inlined: without the instruction each lane is a call of its own, and a row of points has hundreds.
+    /// a·b + c. Not inlined: without the instruction each lane is a function call, and a row of points has hundreds.
     #[inline(never)]
     fn fused(a: Self, b: Self, c: Self) -> Self {
         Plain(std::array::from_fn(|lane| a.0[lane].fused(b.0[lane], c.0[lane])))
@@ -108,12 +108,12 @@ impl<T: Real, const N: usize> Plain<T, N> {
 }
 
 impl<T: Real> Plain<T, 1> {
-    /// A single lane.
+    /// A vector of one lane.
     pub(super) fn one(value: T) -> Self {
         Plain([value])
     }
 
-    /// The one value.
+    /// The value of the one lane.
     pub(super) fn value(self) -> T {
         self.0[0]
     }
@@ -203,7 +203,7 @@ impl<T: Real, const N: usize> Vector for Plain<T, N> {
     #[inline(always)]
     #[allow(clippy::neg_cmp_op_on_partial_ord)]
     fn counts(self) -> [bool; N] {
-        // NaN counts: whoever looks for it must find it.
+        // NaN counts, so that a check can find it.
         std::array::from_fn(|lane| !(self.0[lane].magnitude() < T::of(T::LEAST)))
     }
     #[inline(always)]
@@ -240,17 +240,17 @@ impl<T: Real, const N: usize> Vector for Plain<T, N> {
     }
 }
 
-/// Which lanes `auto` becomes on this machine, or whether those asked for are there.
+/// The lanes that `auto` selects on this machine, or the requested ones if it has them.
 pub(super) fn available(lanes: Lanes) -> Option<Lanes> {
     #[cfg(target_arch = "x86_64")]
     let (wide, narrow) = {
-        // `range` is of DQ.
+        // `range` needs AVX-512DQ.
         let wide = is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512dq");
         (wide, is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"))
     };
     #[cfg(not(target_arch = "x86_64"))]
     let (wide, narrow) = (false, false);
-    // Every processor that this is compiled for has it, or none.
+    // A compile-time fact: every AArch64 processor has it.
     let neon = cfg!(target_arch = "aarch64");
     match lanes {
         Lanes::Auto if wide => Some(Lanes::Avx512),
@@ -263,12 +263,12 @@ pub(super) fn available(lanes: Lanes) -> Option<Lanes> {
     }
 }
 
-/// Lanes that this machine has.
+/// Lanes that this machine supports.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Width(Lanes);
 
 impl Width {
-    /// The lanes asked for if they are there, else those of `auto`.
+    /// The requested lanes if this machine has them, else those of `auto`.
     pub(super) fn of(lanes: Lanes) -> Self {
         Width(available(lanes).or_else(|| available(Lanes::Auto)).unwrap_or(Lanes::Plain))
     }
@@ -277,9 +277,9 @@ impl Width {
 /// Runs `program` at a width.
 ///
 /// # Safety
-/// What `program` points to is as it promised.
+/// The pointers of `program` are valid as documented.
 pub(super) unsafe fn run<T: Real>(width: Width, program: &impl Run<T>) {
-    // SAFETY: the instructions are there, by `Width::of`; the rest is the caller's promise.
+    // SAFETY: `Width::of` has checked the instructions; the rest is the caller's promise.
     unsafe {
         match width.0 {
             #[cfg(target_arch = "x86_64")]
@@ -293,9 +293,9 @@ pub(super) unsafe fn run<T: Real>(width: Width, program: &impl Run<T>) {
     }
 }
 
-/// The operations that the registers of every kind have under one name.
-// SAFETY (of every block): the processor has the instructions. Who makes the first value promises it, and every other
-// function takes a value. Memory is the caller's promise.
+/// The operations that registers of every kind have under the same name.
+// SAFETY (of every block): the processor has the instructions. The functions that create the first value require it,
+// and every other function takes a value. Memory is the caller's promise.
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 macro_rules! ordinary {
     ($name:ident, $real:ty, $mantissa:literal, $i:ident) => {
@@ -333,7 +333,7 @@ macro_rules! ordinary {
         }
         #[inline(always)]
         fn power_of_two(self) -> Self {
-            // The last bits of the sum are the exponent's.
+            // The last bits of the sum are the exponent.
             let sum = self.add(self.splat(<$real>::of(<$real as Real>::POWER)));
             unsafe { $name($i::real($i::left::<$mantissa>($i::bits(sum.0)))) }
         }
@@ -401,7 +401,7 @@ mod tests {
                     ];
                     before = a;
                     for (n, result) in results.into_iter().enumerate() {
-                        // Whether any lane is set depends on the width by nature.
+                        // Whether any lane is set depends on the width by definition.
                         if n < 18 {
                             result.store(self.out.add(16 * n + at));
                         }

@@ -1,10 +1,10 @@
-//! The width of AArch64, of which every processor has NEON: 4 of f32, 2 of f64.
-// Where the compiler's target has the instructions anyway, calling them is safe; where it has not, it is not.
+//! The NEON width, which every AArch64 processor has: 4 of f32, 2 of f64.
+// If the compile target includes the instructions, calling them is safe; otherwise it is unsafe.
 #![allow(unsafe_code, unused_unsafe)]
 
 use super::{Real, Vector};
 
-/// The operations that both formats have under one name.
+/// The operations that both formats have under the same name.
 macro_rules! vector {
     ($name:ident, $real:ty, $lanes:literal, $mantissa:literal, $i:ident, |$self:ident, $before:ident| $shift_two:expr) => {
         /// A register.
@@ -38,7 +38,7 @@ macro_rules! vector {
             }
             #[inline(always)]
             fn larger(self, other: Self) -> Self {
-                // Not the instruction of that name, which makes NaN of NaN and a number.
+                // Not the NEON maximum, which returns NaN for NaN and a number.
                 unsafe { Self::select($i::greater(self.0, other.0), self, other) }
             }
             #[inline(always)]

@@ -21,15 +21,15 @@ pub(super) unsafe fn with_avx2<T: Real>(program: &impl Run<T>) {
     unsafe { program.run::<T::Avx2>() }
 }
 
-/// The operations that both widths and both formats have under one name; the others follow in braces.
+/// The operations that both widths and both formats have under the same name; the others follow in braces.
 macro_rules! vector {
     ($name:ident, $real:ty, $lanes:literal, $mantissa:literal, $mask:ty, $i:ident, { $($own:tt)* }) => {
         /// A register.
         #[derive(Clone, Copy)]
         pub(in super::super) struct $name($i::Register);
 
-        // SAFETY (of every block below): the processor has the instructions. Who makes the first value promises it, and every
-        // other function takes a value. Memory is the caller's promise.
+        // SAFETY (of every block below): the processor has the instructions. The functions that create the first value
+        // require it, and every other function takes a value. Memory is the caller's promise.
         impl Vector for $name {
             type Real = $real;
             type Mask = $mask;
@@ -63,7 +63,7 @@ macro_rules! vector {
     };
 }
 
-/// What AVX-512 has, for a format: masks of its own kind, and shifts across the register.
+/// AVX-512 operations for a format: masks of their own type, and shifts across the register.
 macro_rules! avx512 {
     ($name:ident, $real:ty, $lanes:literal, $mantissa:literal, $mask:ty, $i:ident) => {
         vector!($name, $real, $lanes, $mantissa, $mask, $i, {
@@ -120,7 +120,7 @@ macro_rules! avx512 {
     };
 }
 
-/// What AVX2 has, for a format: masks are registers, and a shift first brings both halves together.
+/// AVX2 operations for a format: masks are registers, and a shift first joins both halves.
 macro_rules! avx2 {
     ($name:ident, $real:ty, $lanes:literal, $mantissa:literal, $i:ident, |$high:ident, $mid:ident| $shift:expr,
      |$high2:ident, $mid2:ident| $shift_two:expr) => {
