@@ -31,9 +31,6 @@ use server::{PATIENCE, Server, palpate};
 const ATTACKERS: u64 = 8;
 const HONEST: u64 = 4;
 
-/// Points along a side of an honest client's sheet: a step of it is little work even where nothing is optimized.
-const SIDE: u32 = 9;
-
 /// What the server may take for all callers together, and what it may need beside: code, threads, and what an allocator
 /// keeps.
 const BUDGET: u64 = 256 << 20;
@@ -175,7 +172,8 @@ fn weather(besieged: &Besieged, seed: u64, shared: &str, until: Instant) -> u64 
 
 #[test]
 fn honest_clients_outlive_a_siege_and_all_is_given_back() {
-    let (seconds, seed) = (environment("PALPATE_SIEGE_S").unwrap_or(30), environment("PALPATE_SIEGE_SEED").unwrap_or(16));
+    let (seconds, seed) =
+        (environment("PALPATE_SIEGE_S").unwrap_or(30), environment("PALPATE_SIEGE_SEED").unwrap_or(16));
     let keys = Keys::new();
     let admit = |name: &str, number: u64| keys.admit(&format!("{name}-{number}"), &[Role::Create, Role::Touch]);
     let honest: Vec<String> = (0..HONEST).map(|number| admit("honest", number)).collect();
@@ -184,10 +182,9 @@ fn honest_clients_outlive_a_siege_and_all_is_given_back() {
     let mut besieged = Besieged::start(keys);
     let url = besieged.server.url.clone();
     let (clients, newcomers) = kept_to(false, || {
-        let clients: Vec<Honest> =
-            honest.iter().map(|token| Honest::start(Caller::new(&url, token), 1, SIDE)).collect();
+        let clients: Vec<Honest> = honest.iter().map(|token| Honest::start(Caller::new(&url, token), 1)).collect();
         let shared = clients[0].session_id.clone();
-        let newcomers = Newcomers::start(Caller::new(&url, &newcomer), shared, SIDE, PATIENCE);
+        let newcomers = Newcomers::start(Caller::new(&url, &newcomer), shared, PATIENCE);
         (clients, newcomers)
     });
     let shared = clients[0].session_id.clone();
@@ -278,7 +275,10 @@ fn honest_clients_outlive_a_siege_and_all_is_given_back() {
         must(kept, format!("honest {number} was cut, lost commands, or had some refused"));
         // What was cut is not accounted for by any one stream.
         let all = [account.answered, counts.accepted, counts.applied].iter().all(|count| *count == account.sent);
-        must(!kept || all && account.sent > 0, format!("honest {number}: of {} the server says {counts:?}", account.sent));
+        must(
+            !kept || all && account.sent > 0,
+            format!("honest {number}: of {} the server says {counts:?}", account.sent),
+        );
     }
     // The server.
     must(besieged.server.child.try_wait().unwrap().is_none(), "the server has ended".into());

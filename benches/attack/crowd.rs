@@ -12,7 +12,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::Status;
 
 use super::Ground;
-use crate::caller::{Caller, create, haptics, push, sessions, sheet};
+use crate::caller::{Caller, MIDDLE, SIDE, create, haptics, push, sessions, sheet};
 
 /// A stream whose client never reads, and whose token is struck out after a second of commands. Strikes are commands that
 /// were taken more than 2 s later.
@@ -24,7 +24,7 @@ pub async fn revoked_unread(ground: &Ground) -> Result<(), Status> {
         loop {
             // The server looks at the file once a second.
             let door = prey.door().await?;
-            match create(&door, sheet(9, 9), false).await {
+            match create(&door, sheet(SIDE, SIDE), false).await {
                 Err(status) if status.code() == tonic::Code::Unauthenticated => {
                     tokio::time::sleep(Duration::from_millis(50)).await;
                 }
@@ -43,7 +43,7 @@ pub async fn revoked_unread(ground: &Ground) -> Result<(), Status> {
     let mut tick = tokio::time::interval(Duration::from_millis(20));
     let mut command = async |sequence| {
         tick.tick().await;
-        let command = push(0, sequence, [4, 4], -0.1);
+        let command = push(0, sequence, MIDDLE, -0.1);
         say.send(pb::TouchRequest { message: Some(Say::Command(command)) }).await.is_ok()
     };
     for sequence in 1..=50 {
@@ -128,7 +128,8 @@ pub async fn connections(ground: &Ground, greeting: &[u8]) -> Result<(), Status>
         };
         open.retain(still_open);
         while open.len() < most {
-            let dialed = tokio::time::timeout(Duration::from_secs(1), TcpStream::connect(ground.caller.address())).await;
+            let dialed =
+                tokio::time::timeout(Duration::from_secs(1), TcpStream::connect(ground.caller.address())).await;
             let Ok(Ok(mut socket)) = dialed else { break };
             if socket.write_all(greeting).await.is_ok() {
                 open.push(socket);

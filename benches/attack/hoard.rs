@@ -7,14 +7,14 @@ use palpate::wire::pb;
 use tonic::{Status, Streaming};
 
 use super::Ground;
-use crate::caller::{Door, create, haptics, push, push_all, sessions, sheet, views};
+use crate::caller::{Door, MIDDLE, SIDE, create, haptics, push, push_all, sessions, sheet, views};
 
 /// A step that is never done.
 const NEVER: u64 = 1 << 40;
 
 /// So many fixed points in a scene, all of them the same one.
 pub fn fixed(points: u32) -> pb::Scene {
-    let mut scene = sheet(31, 31);
+    let mut scene = sheet(SIDE, SIDE);
     let points = vec![pb::GridPoint { x: 0, y: 0 }; points as usize];
     let fixed = pb::sheet::Fixed::FixedPoints(pb::GridPoints { points });
     scene.sheet.get_or_insert_default().fixed = Some(fixed);
@@ -23,18 +23,15 @@ pub fn fixed(points: u32) -> pb::Scene {
 
 /// A lease of one tool.
 pub async fn lease(door: &Door, session_id: &str, tool: u32) -> Result<String, Status> {
-    let request = pb::AcquireToolRequest {
-        session_id: session_id.to_owned(),
-        tool,
-        lease_s: Some(60.0),
-        holder: "siege".into(),
-    };
+    let request =
+        pb::AcquireToolRequest { session_id: session_id.to_owned(), tool, lease_s: Some(60.0), holder: "siege".into() };
     Ok(haptics(door).acquire_tool(request).await?.into_inner().lease_id)
 }
 
 /// Commands by a lease.
 pub async fn send(door: &Door, session_id: &str, lease_id: &str, commands: Vec<pb::Command>) -> Result<(), Status> {
-    let request = pb::SendCommandsRequest { session_id: session_id.to_owned(), lease_id: lease_id.to_owned(), commands };
+    let request =
+        pb::SendCommandsRequest { session_id: session_id.to_owned(), lease_id: lease_id.to_owned(), commands };
     haptics(door).send_commands(request).await.map(drop)
 }
 
@@ -99,19 +96,20 @@ async fn viewer(door: &Door, session_id: &str, rate_hz: f64) -> Result<Streaming
 }
 
 pub async fn unread_viewers(ground: &Ground) -> Result<(), Status> {
-    let (door, side) = (narrow(ground).await?, ground.side(186));
-    let session_id = create(&ground.caller.door().await?, sheet(side, side), false).await?;
+    let (wide, side) = (ground.caller.door().await?, ground.side(186));
+    let session_id = create(&wide, sheet(side, side), false).await?;
+    let door = narrow(ground).await?;
     let mut unread = Vec::new();
     for _ in 0..ground.count(139) {
         unread.extend(ground.heard(viewer(&door, &session_id, 60.0).await).inspect(|_| ground.strike()));
     }
-    push_everywhere(&door, &session_id, -0.01).await?;
+    push_everywhere(&wide, &session_id, -0.01).await?;
     std::future::pending().await
 }
 
 pub async fn stalled_viewer(ground: &Ground) -> Result<(), Status> {
     let door = ground.caller.door().await?;
-    let session_id = create(&door, sheet(31, 31), false).await?;
+    let session_id = create(&door, sheet(SIDE, SIDE), false).await?;
     let _unread = viewer(&door, &session_id, 1000.0).await?;
     ground.strike();
     std::future::pending().await
@@ -122,7 +120,7 @@ pub async fn fill(ground: &Ground, door: &Door, session_id: &str) -> Result<(), 
     for tool in 0..ground.count(64) {
         let lease_id = lease(door, session_id, tool).await?;
         for batch in 0..4 {
-            let command = |at| pb::Command { at_step: Some(NEVER + at), ..push(tool, at, [15, 15], -0.1) };
+            let command = |at| pb::Command { at_step: Some(NEVER + at), ..push(tool, at, MIDDLE, -0.1) };
             let commands = (1024 * batch + 1..=1024 * (batch + 1)).map(command).collect();
             send(door, session_id, &lease_id, commands).await?;
             ground.strike();
@@ -134,7 +132,7 @@ pub async fn fill(ground: &Ground, door: &Door, session_id: &str) -> Result<(), 
 pub async fn waiting_commands(ground: &Ground) -> Result<(), Status> {
     loop {
         let door = ground.caller.door().await?;
-        let session_id = create(&door, sheet(31, 31), true).await?;
+        let session_id = create(&door, sheet(SIDE, SIDE), true).await?;
         if ground.heard(fill(ground, &door, &session_id).await).is_none() {
             tokio::time::sleep(Duration::from_millis(100)).await;
         }

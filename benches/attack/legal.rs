@@ -68,7 +68,10 @@ fn command(random: &mut Rng, tool: u32, sequence: u64) -> pb::Command {
     let z = -random.f64();
     let mut command = match random.u8(..4) {
         0 => push_all(tool, sequence, 0.01 * z),
-        1 => pb::Command { action: Some(pb::command::Action::Release(pb::Release {})), ..push(tool, sequence, [0, 0], z) },
+        1 => pb::Command {
+            action: Some(pb::command::Action::Release(pb::Release {})),
+            ..push(tool, sequence, [0, 0], z)
+        },
         2 => {
             let position_m = Some(pb::Vector3 { x: 0.05 * random.f64(), y: 0.05 * random.f64(), z: 0.01 * z });
             let pose = pb::Pose { position_m, ..Default::default() };

@@ -18,7 +18,7 @@ use futures_util::future::BoxFuture;
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
-use crate::caller::{Caller, Keys, why};
+use crate::caller::{Caller, Keys, SIDE, why};
 use crate::honest::Freezer;
 
 /// Where an attack takes place.
@@ -106,7 +106,9 @@ const fn kind(name: &'static str, about: &'static str, run: Run) -> Kind {
 /// All that is known, in the order of the points of what a server has to bear.
 pub const KINDS: &[Kind] = &[
     // Work without end.
-    kind("endless-scene", "scenes of four points that need 2³² substeps", |g| Box::pin(toil::endless_scene(g))),
+    kind("endless-scene", "scenes of four points that ask for 1 substep and need 2³²", |g| {
+        Box::pin(toil::endless_scene(g))
+    }),
     kind("big-law", "force laws of a sheet of 331² that hardly anything holds back", |g| Box::pin(toil::big_law(g))),
     // Somebody stands still.
     kind("stall-server", "the server stands still for 5 s", |g| Box::pin(bytes::stall_server(g, 5.0))),
@@ -147,13 +149,17 @@ pub const KINDS: &[Kind] = &[
     }),
     kind("empty-commands", "500,000 empty commands a call", |g| Box::pin(toil::empty_commands(g))),
     // A token that is not one any more.
-    kind("revoked-unread", "commands by a token that was struck out, reading nothing (counted: taken 2 s after)", |g| {
-        Box::pin(crowd::revoked_unread(g))
-    }),
+    kind(
+        "revoked-unread",
+        "commands by a token that was struck out, reading nothing (counted: taken 2 s after)",
+        |g| Box::pin(crowd::revoked_unread(g)),
+    ),
     // Memory.
-    kind("tissue-changes", "changes of a tissue with 500,000 fixed points, that wait for a step that never comes", |g| {
-        Box::pin(hoard::tissue_changes(g))
-    }),
+    kind(
+        "tissue-changes",
+        "changes of a tissue with 500,000 fixed points, that wait for a step that never comes",
+        |g| Box::pin(hoard::tissue_changes(g)),
+    ),
     kind("fixed-sessions", "sessions with 500,000 fixed points each", |g| Box::pin(hoard::fixed_sessions(g))),
     kind("unread-viewers", "139 viewers of 186² at refinement 10 that read nothing", |g| {
         Box::pin(hoard::unread_viewers(g))
@@ -163,16 +169,18 @@ pub const KINDS: &[Kind] = &[
     }),
     kind("thin-sheet", "a sheet of 4,194,304 × 1, all of it awake", |g| Box::pin(hoard::thin_sheet(g))),
     // What a request costs.
-    kind("unread-probes", "20 probes of all points that nobody reads", |g| Box::pin(toil::unread_probes(g, 20, 31))),
+    kind("unread-probes", "20 probes of all points that nobody reads", |g| Box::pin(toil::unread_probes(g, 20, SIDE))),
     Kind {
         same_caller: true,
         ..kind("unread-probes-same", "the same by the honest client's own token", |g| {
-            Box::pin(toil::unread_probes(g, 20, 31))
+            Box::pin(toil::unread_probes(g, 20, SIDE))
         })
     },
-    kind("unread-probes-250", "250 such probes", |g| Box::pin(toil::unread_probes(g, 250, 31))),
-    kind("probe-2048", "a probe of all points of 2048²", |g| Box::pin(toil::unread_probes(g, 1, 2048))),
-    kind("heavy-poked", "a sheet of 2000², made at rest and then pushed everywhere", |g| Box::pin(toil::heavy_poked(g))),
+    kind("unread-probes-250", "250 such probes", |g| Box::pin(toil::unread_probes(g, 250, SIDE))),
+    kind("probe-2048", "a probe of all points of 2048²", |g| Box::pin(toil::unread_probes(g, 1, g.side(2048)))),
+    kind("heavy-poked", "a sheet of 2000², made at rest and then pushed everywhere", |g| {
+        Box::pin(toil::heavy_poked(g))
+    }),
     kind("stiff-change", "a tissue that is changed to k = 10⁹ N/m and pushed", |g| Box::pin(toil::stiff_change(g))),
     kind("woken-together", "400 resting sessions pushed at once", |g| Box::pin(toil::woken_together(g))),
     kind("polling", "GetSession again and again while 262,144 commands wait", |g| Box::pin(toil::polling(g))),

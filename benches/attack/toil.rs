@@ -14,7 +14,7 @@ use tonic::{Request, Status};
 
 use super::Ground;
 use super::hoard::{fill, fixed, lease, narrow, push_everywhere, send};
-use crate::caller::{create, haptics, push, push_all, sessions, sheet};
+use crate::caller::{MIDDLE, SIDE, create, haptics, push, push_all, sessions, sheet};
 
 /// An attacker waits so long for what may never come.
 const PATIENCE: Duration = Duration::from_secs(3);
@@ -28,10 +28,10 @@ async fn within<T>(work: impl Future<Output = Result<T, Status>>) -> Result<T, S
 pub async fn endless_scene(ground: &Ground) -> Result<(), Status> {
     let mut scene = sheet(2, 2);
     scene.sheet.get_or_insert_default().point_mass_kg = Some(1e-12);
-    scene.springs.get_or_insert_default().stiffness_n_per_m = Some(1e12);
+    scene.springs = Some(pb::Springs { stiffness_n_per_m: Some(1e12), ..Default::default() });
     scene.virtual_springs.get_or_insert_default().stiffness_n_per_m = Some(1.0);
     scene.damping.get_or_insert_default().coefficient_n_s_per_m = Some(0.0);
-    scene.stepping.get_or_insert_default().rate_hz = Some(1.0);
+    scene.stepping = Some(pb::Stepping { rate_hz: Some(1.0), substeps: Some(1), ..Default::default() });
     loop {
         ground.strike();
         let door = ground.caller.door().await?;
@@ -71,7 +71,7 @@ pub async fn fixed_positions(ground: &Ground) -> Result<(), Status> {
     let session_id = create(&door, fixed(ground.count(500_000)), false).await?;
     let lease_id = lease(&door, &session_id, 0).await?;
     let target = Some(pb::position::Target::DisplacementM(pb::Vector3::default()));
-    let position = pb::Position { point: Some(pb::GridPoint { x: 15, y: 15 }), target };
+    let position = pb::Position { point: Some(pb::GridPoint { x: SIDE / 2, y: SIDE / 2 }), target };
     let mut first = 1;
     loop {
         let command = |sequence| pb::Command {
@@ -127,7 +127,7 @@ impl Decoder for Raw {
 
 pub async fn empty_commands(ground: &Ground) -> Result<(), Status> {
     let door = ground.caller.door().await?;
-    let session_id = create(&door, sheet(31, 31), true).await?;
+    let session_id = create(&door, sheet(SIDE, SIDE), true).await?;
     let lease_id = lease(&door, &session_id, 0).await?;
     let mut message = pb::SendCommandsRequest { session_id, lease_id, commands: Vec::new() }.encode_to_vec();
     // Field 3, no bytes.
@@ -147,7 +147,6 @@ pub async fn empty_commands(ground: &Ground) -> Result<(), Status> {
 
 /// So many probes of all points of a sheet, each step, that nobody reads.
 pub async fn unread_probes(ground: &Ground, probes: u32, side: u32) -> Result<(), Status> {
-    let side = if side > 100 { ground.side(side) } else { side };
     let session_id = create(&ground.caller.door().await?, sheet(side, side), false).await?;
     let mut unread = Vec::new();
     for _ in 0..ground.count(probes).div_ceil(100) {
@@ -175,12 +174,9 @@ pub async fn heavy_poked(ground: &Ground) -> Result<(), Status> {
 
 pub async fn stiff_change(ground: &Ground) -> Result<(), Status> {
     let door = ground.caller.door().await?;
-    let session_id = create(&door, sheet(31, 31), false).await?;
-    let request = pb::UpdateTissueRequest {
-        session_id: session_id.clone(),
-        stiffness_n_per_m: Some(1e9),
-        ..Default::default()
-    };
+    let session_id = create(&door, sheet(SIDE, SIDE), false).await?;
+    let request =
+        pb::UpdateTissueRequest { session_id: session_id.clone(), stiffness_n_per_m: Some(1e9), ..Default::default() };
     ground.heard(within(sessions(&door).update_tissue(request)).await).inspect(|_| ground.strike());
     push_everywhere(&door, &session_id, -0.1).await?;
     std::future::pending().await
@@ -192,7 +188,7 @@ pub async fn woken_together(ground: &Ground) -> Result<(), Status> {
     for _ in 0..4 {
         let door = ground.caller.door().await?;
         for _ in 0..ground.count(100) {
-            let Some(session_id) = ground.heard(create(&door, sheet(31, 31), false).await) else { break };
+            let Some(session_id) = ground.heard(create(&door, sheet(SIDE, SIDE), false).await) else { break };
             let Some(lease_id) = ground.heard(lease(&door, &session_id, 0).await) else { break };
             resting.push((door.clone(), session_id, lease_id));
         }
@@ -210,7 +206,7 @@ pub async fn woken_together(ground: &Ground) -> Result<(), Status> {
 
 pub async fn polling(ground: &Ground) -> Result<(), Status> {
     let door = ground.caller.door().await?;
-    let session_id = create(&door, sheet(31, 31), true).await?;
+    let session_id = create(&door, sheet(SIDE, SIDE), true).await?;
     ground.heard(fill(ground, &door, &session_id).await);
     let each = async || {
         loop {
@@ -239,7 +235,7 @@ pub async fn hashes(ground: &Ground) -> Result<(), Status> {
 
 pub async fn command_flood(ground: &Ground) -> Result<(), Status> {
     let door = ground.caller.door().await?;
-    let session_id = create(&door, sheet(31, 31), false).await?;
+    let session_id = create(&door, sheet(SIDE, SIDE), false).await?;
     let say = |message| pb::TouchRequest { message: Some(message) };
     let (sender, receiver) = tokio::sync::mpsc::channel(64);
     let open = pb::TouchOpen { session_id, tools: vec![0], ..Default::default() };
@@ -252,15 +248,18 @@ pub async fn command_flood(ground: &Ground) -> Result<(), Status> {
             if sequence % 100 == 0 {
                 tick.tick().await;
             }
-            if sender.send(say(Say::Command(push(0, sequence, [15, 15], -1.0)))).await.is_err() {
+            if sender.send(say(Say::Command(push(0, sequence, MIDDLE, -1.0)))).await.is_err() {
                 break;
             }
             ground.strike();
         }
         // The reason is yet to be read.
-        std::future::pending().await
+        std::future::pending::<()>().await;
     };
-    let reading = async { while inbound.message().await?.is_some() {} Ok(()) };
+    let reading = async {
+        while inbound.message().await?.is_some() {}
+        Ok(())
+    };
     tokio::select! {
         () = writing => Ok(()),
         ended = reading => ended,
@@ -271,7 +270,7 @@ pub async fn create_and_drop(ground: &Ground) -> Result<(), Status> {
     let door = ground.caller.door().await?;
     loop {
         ground.strike();
-        let Some(session_id) = ground.heard(create(&door, sheet(31, 31), false).await) else { continue };
+        let Some(session_id) = ground.heard(create(&door, sheet(SIDE, SIDE), false).await) else { continue };
         ground.heard(sessions(&door).delete_session(pb::DeleteSessionRequest { session_id }).await);
     }
 }

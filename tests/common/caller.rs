@@ -138,6 +138,12 @@ pub async fn create(door: &Door, scene: pb::Scene, paused: bool) -> Result<Strin
     Ok(sessions(door).create_session(request).await?.into_inner().session.unwrap_or_default().session_id)
 }
 
+/// Points along a side of an ordinary sheet: the paper's, or what a server that was not optimized steps as fast.
+pub const SIDE: u32 = if cfg!(debug_assertions) { 9 } else { 31 };
+
+/// Its middle.
+pub const MIDDLE: [u32; 2] = [SIDE / 2; 2];
+
 /// A sheet of the paper's tissue with so many points.
 pub fn sheet(points_x: u32, points_y: u32) -> pb::Scene {
     let limits = palpate::limits::Limits::default();

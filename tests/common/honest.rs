@@ -16,7 +16,7 @@ use tokio::time::MissedTickBehavior;
 use tokio_stream::wrappers::UnboundedReceiverStream;
 use tonic::{Status, Streaming};
 
-use crate::caller::{Caller, Door, create, haptics, push, sessions, sheet, why};
+use crate::caller::{Caller, Door, MIDDLE, SIDE, create, haptics, push, sessions, sheet, why};
 use crate::server::PATIENCE;
 
 fn alone<T>(work: impl Future<Output = T>) -> T {
@@ -109,13 +109,13 @@ pub struct Verdict {
 }
 
 impl Honest {
-    /// With so many tools in a session of its own of `side` × `side` points.
-    pub fn start(caller: Caller, tools: u32, side: u32) -> Self {
+    /// With so many tools in a session of its own.
+    pub fn start(caller: Caller, tools: u32) -> Self {
         let shared = Arc::new(Shared::default());
         let (ready, made) = mpsc::channel();
         let thread = std::thread::spawn({
             let shared = shared.clone();
-            move || alone(work(caller, tools, side, &shared, &ready))
+            move || alone(work(caller, tools, &shared, &ready))
         });
         let session_id = made.recv().unwrap();
         Honest { session_id, shared, thread }
@@ -141,22 +141,16 @@ impl Honest {
 /// A tool's commands that are not answered: number, and when it was sent.
 type Waiting = VecDeque<(u64, Instant)>;
 
-async fn work(
-    caller: Caller,
-    tools: u32,
-    side: u32,
-    shared: &Shared,
-    ready: &mpsc::Sender<String>,
-) -> Option<pb::CommandCounts> {
+async fn work(caller: Caller, tools: u32, shared: &Shared, ready: &mpsc::Sender<String>) -> Option<pb::CommandCounts> {
     let door = caller.door().await.unwrap();
-    let session_id = create(&door, sheet(side, side), false).await.unwrap();
+    let session_id = create(&door, sheet(SIDE, SIDE), false).await.unwrap();
     ready.send(session_id.clone()).unwrap();
     let mut sequence = 0;
     let mut door = Ok(door);
     while !shared.over.load(Ordering::Relaxed) {
         let mut waiting = vec![Waiting::new(); tools as usize];
         let visited = match &door {
-            Ok(door) => visit(door, &session_id, side, shared, &mut sequence, &mut waiting).await,
+            Ok(door) => visit(door, &session_id, shared, &mut sequence, &mut waiting).await,
             Err(error) => Err(Status::clone(error)),
         };
         {
@@ -184,7 +178,6 @@ async fn work(
 async fn visit(
     door: &Door,
     session_id: &str,
-    side: u32,
     shared: &Shared,
     sequence: &mut u64,
     waiting: &mut [Waiting],
@@ -218,7 +211,7 @@ async fn visit(
                     // Never the same force twice: the tissue does not fall asleep.
                     #[allow(clippy::cast_precision_loss)]
                     let force_n = -0.1 - 0.02 * (0.003 * *sequence as f64 + f64::from(*tool)).sin();
-                    let command = push(*tool, *sequence, [side / 2, side / 2], force_n);
+                    let command = push(*tool, *sequence, MIDDLE, force_n);
                     // A stream that has ended is told by what is heard.
                     let _ = say.send(pb::TouchRequest { message: Some(Say::Command(command)) });
                 }
@@ -273,6 +266,9 @@ async fn open(door: &Door, session_id: &str, tools: &[u32]) -> Result<Stream, St
     }
 }
 
+/// A newcomer's tool: none of those that an honest client has in its own session.
+pub const GUEST: u32 = 40;
+
 /// How newcomers fared.
 #[derive(Clone, Default)]
 pub struct Welcome {
@@ -281,6 +277,19 @@ pub struct Welcome {
     pub slowest: Duration,
     /// Why the others were not.
     pub reasons: BTreeMap<String, u64>,
+    /// Since when the last of these rounds is under way, if it is.
+    pub waiting: Option<Instant>,
+}
+
+impl Welcome {
+    /// Takes what there is; a round under way is counted before and after.
+    fn take(&mut self) -> Welcome {
+        let waiting = self.waiting;
+        let next = Welcome { rounds: waiting.iter().len() as u64, waiting, ..Welcome::default() };
+        let mut taken = std::mem::replace(self, next);
+        taken.slowest = taken.slowest.max(waiting.map_or(Duration::ZERO, |since| since.elapsed()));
+        taken
+    }
 }
 
 /// One newcomer after the other.
@@ -291,9 +300,9 @@ pub struct Newcomers {
 }
 
 impl Newcomers {
-    /// Each makes a session, feels one command in it and one by tool 1 of the session `shared`, and deletes its own. Who is
-    /// not done within `patience` gives up.
-    pub fn start(caller: Caller, shared: String, side: u32, patience: Duration) -> Self {
+    /// Each makes a session, feels one command in it and one in the session `shared`, and deletes its own. Who is not done
+    /// within `patience` gives up.
+    pub fn start(caller: Caller, shared: String, patience: Duration) -> Self {
         let (over, welcome) = (Arc::new(AtomicBool::new(false)), Arc::new(Mutex::new(Welcome::default())));
         let thread = std::thread::spawn({
             let (over, welcome) = (over.clone(), welcome.clone());
@@ -301,11 +310,16 @@ impl Newcomers {
                 alone(async {
                     while !over.load(Ordering::Relaxed) {
                         let begun = Instant::now();
-                        let served = tokio::time::timeout(patience, newcomer(&caller, &shared, side)).await;
-                        let served = served.unwrap_or_else(|_| Err(Status::deadline_exceeded("no answer")));
                         {
                             let mut welcome = welcome.lock().unwrap();
                             welcome.rounds += 1;
+                            welcome.waiting = Some(begun);
+                        }
+                        let served = tokio::time::timeout(patience, newcomer(&caller, &shared)).await;
+                        let served = served.unwrap_or_else(|_| Err(Status::deadline_exceeded("no answer")));
+                        {
+                            let mut welcome = welcome.lock().unwrap();
+                            welcome.waiting = None;
                             welcome.slowest = welcome.slowest.max(begun.elapsed());
                             match served {
                                 Ok(()) => welcome.served += 1,
@@ -322,34 +336,36 @@ impl Newcomers {
 
     /// How they fared since this was last asked.
     pub fn take(&self) -> Welcome {
-        std::mem::take(&mut self.welcome.lock().unwrap())
+        self.welcome.lock().unwrap().take()
     }
 
     /// No more of them; how the last fared.
     pub fn end(self) -> Welcome {
         self.over.store(true, Ordering::Relaxed);
         self.thread.join().unwrap();
-        std::mem::take(&mut self.welcome.lock().unwrap())
+        self.welcome.lock().unwrap().take()
     }
 }
 
-async fn newcomer(caller: &Caller, shared: &str, side: u32) -> Result<(), Status> {
+async fn newcomer(caller: &Caller, shared: &str) -> Result<(), Status> {
     let door = caller.door().await?;
-    let session_id = create(&door, sheet(side, side), false).await?;
-    let own = feel(&door, &session_id, side, 0).await;
-    let other = feel(&door, shared, side, 1).await;
+    let session_id = create(&door, sheet(SIDE, SIDE), false).await?;
+    let own = feel(&door, &session_id).await;
+    let other = feel(&door, shared).await;
     sessions(&door).delete_session(pb::DeleteSessionRequest { session_id }).await?;
     own.and(other)
 }
 
 /// One command, and the sample that answers it.
-async fn feel(door: &Door, session_id: &str, side: u32, tool: u32) -> Result<(), Status> {
-    let (say, mut inbound) = open(door, session_id, &[tool]).await?;
-    let command = push(tool, 1, [side / 2, side / 2], -0.1);
+async fn feel(door: &Door, session_id: &str) -> Result<(), Status> {
+    let (say, mut inbound) = open(door, session_id, &[GUEST]).await?;
+    let command = push(GUEST, 1, MIDDLE, -0.1);
     let _ = say.send(pb::TouchRequest { message: Some(Say::Command(command)) });
     loop {
         match inbound.message().await?.and_then(|heard| heard.message) {
-            Some(Heard::Sample(sample)) if sample.tools.iter().any(|told| told.acknowledged_sequence > 0) => return Ok(()),
+            Some(Heard::Sample(sample)) if sample.tools.iter().any(|told| told.acknowledged_sequence > 0) => {
+                return Ok(());
+            }
             Some(Heard::Rejection(rejection)) => return Err(Status::aborted(rejection.reason)),
             Some(_) => {}
             None => return Err(Status::unavailable("the server ended the stream")),
