@@ -102,7 +102,7 @@ pub fn run(kind: Option<&'static Kind>) -> Row {
     });
     std::thread::sleep(part(1.0));
     let mut whole = client.take();
-    let before = watch(process, part(3.0));
+    let before = watch(process, part(2.0));
     let quiet = client.take();
     newcomers.take();
     let (begun, processor_before) = (Instant::now(), processor_s(process));
@@ -118,9 +118,9 @@ pub fn run(kind: Option<&'static Kind>) -> Row {
     let toll = attack.map(Attack::end).unwrap_or_default();
     let processor_s = processor_s(process) - processor_before;
     // What the attacker left is put away; the last of it is quiet.
-    let most = most.max(watch(process, part(7.0)));
+    let most = most.max(watch(process, part(6.0)));
     let settling = client.take();
-    std::thread::sleep(part(3.0));
+    std::thread::sleep(part(2.0));
     let after = client.take();
     let late = newcomers.end();
     let verdict = client.end();

@@ -308,23 +308,10 @@ impl Newcomers {
             let (over, welcome) = (over.clone(), welcome.clone());
             move || {
                 alone(async {
-                    while !over.load(Ordering::Relaxed) {
-                        let begun = Instant::now();
-                        {
-                            let mut welcome = welcome.lock().unwrap();
-                            welcome.rounds += 1;
-                            welcome.waiting = Some(begun);
-                        }
-                        let served = tokio::time::timeout(patience, newcomer(&caller, &shared)).await;
-                        let served = served.unwrap_or_else(|_| Err(Status::deadline_exceeded("no answer")));
-                        {
-                            let mut welcome = welcome.lock().unwrap();
-                            welcome.waiting = None;
-                            welcome.slowest = welcome.slowest.max(begun.elapsed());
-                            match served {
-                                Ok(()) => welcome.served += 1,
-                                Err(error) => *welcome.reasons.entry(why(&error)).or_default() += 1,
-                            }
+                    loop {
+                        round(&caller, &shared, patience, &welcome).await;
+                        if over.load(Ordering::Relaxed) {
+                            return;
                         }
                         tokio::time::sleep(Duration::from_millis(300)).await;
                     }
@@ -339,11 +326,30 @@ impl Newcomers {
         self.welcome.lock().unwrap().take()
     }
 
-    /// No more of them; how the last fared.
+    /// No more of them; how the last fared. There was one at least.
     pub fn end(self) -> Welcome {
         self.over.store(true, Ordering::Relaxed);
         self.thread.join().unwrap();
         self.welcome.lock().unwrap().take()
+    }
+}
+
+/// One newcomer, kept account of.
+async fn round(caller: &Caller, shared: &str, patience: Duration, welcome: &Mutex<Welcome>) {
+    let begun = Instant::now();
+    {
+        let mut welcome = welcome.lock().unwrap();
+        welcome.rounds += 1;
+        welcome.waiting = Some(begun);
+    }
+    let served = tokio::time::timeout(patience, newcomer(caller, shared)).await;
+    let served = served.unwrap_or_else(|_| Err(Status::deadline_exceeded("no answer")));
+    let mut welcome = welcome.lock().unwrap();
+    welcome.waiting = None;
+    welcome.slowest = welcome.slowest.max(begun.elapsed());
+    match served {
+        Ok(()) => welcome.served += 1,
+        Err(error) => *welcome.reasons.entry(why(&error)).or_default() += 1,
     }
 }
 
