@@ -147,6 +147,7 @@ async fn work(caller: Caller, tools: u32, shared: &Shared, ready: &mpsc::Sender<
     ready.send(session_id.clone()).unwrap();
     let mut sequence = 0;
     let mut door = Ok(door);
+    let mut counts = None;
     while !shared.over.load(Ordering::Relaxed) {
         let mut waiting = vec![Waiting::new(); tools as usize];
         let visited = match &door {
@@ -156,7 +157,10 @@ async fn work(caller: Caller, tools: u32, shared: &Shared, ready: &mpsc::Sender<
         {
             let mut account = shared.account.lock().unwrap();
             account.lost += waiting.iter().map(|waiting| waiting.len() as u64).sum::<u64>();
-            account.broken.extend(visited.err().map(|error| why(&error)));
+            match visited {
+                Ok(told) => counts = told,
+                Err(error) => account.broken.push(why(&error)),
+            }
         }
         if !shared.over.load(Ordering::Relaxed) {
             // As a program does that wants to go on.
@@ -164,24 +168,27 @@ async fn work(caller: Caller, tools: u32, shared: &Shared, ready: &mpsc::Sender<
             door = caller.door().await;
         }
     }
-    let asked = tokio::time::timeout(PATIENCE, async {
-        let door = caller.door().await.ok()?;
-        let session = pb::GetSessionRequest { session_id: session_id.clone() };
-        let counts = sessions(&door).get_session(session).await.ok()?.into_inner().session?.commands;
-        let _ = sessions(&door).delete_session(pb::DeleteSessionRequest { session_id }).await;
-        counts
-    });
-    asked.await.ok().flatten()
+    if let Ok(door) = door {
+        let deleted = async { sessions(&door).delete_session(pb::DeleteSessionRequest { session_id }).await };
+        let _ = tokio::time::timeout(PATIENCE, deleted).await;
+    }
+    counts
 }
 
-/// One stream, until it is over or broken.
+/// What has become of the session's commands.
+async fn counts(door: &Door, session_id: &str) -> Result<Option<pb::CommandCounts>, Status> {
+    let request = pb::GetSessionRequest { session_id: session_id.to_owned() };
+    Ok(sessions(door).get_session(request).await?.into_inner().session.and_then(|session| session.commands))
+}
+
+/// One stream, until it is broken, or over and all is answered: then what the server says of it.
 async fn visit(
     door: &Door,
     session_id: &str,
     shared: &Shared,
     sequence: &mut u64,
     waiting: &mut [Waiting],
-) -> Result<(), Status> {
+) -> Result<Option<pb::CommandCounts>, Status> {
     let tools: Vec<u32> = (0..u32::try_from(waiting.len()).unwrap()).collect();
     let (say, mut inbound) = open(door, session_id, &tools).await?;
     let mut tick = tokio::time::interval(Duration::from_millis(1));
@@ -197,7 +204,7 @@ async fn visit(
                 std::thread::sleep(Duration::from_millis(still_ms));
                 if let Some(over) = over {
                     if waiting.iter().all(VecDeque::is_empty) {
-                        return Ok(());
+                        return counts(door, session_id).await;
                     }
                     if over.elapsed() > PATIENCE {
                         return Err(Status::deadline_exceeded("the last commands are not answered"));
