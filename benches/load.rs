@@ -317,8 +317,8 @@ fn attacks(report: &mut Report, figures: &mut Vec<Value>, name: Option<&str>) {
         "One client at 1 kHz in a session of its own, on a server as above, while somebody else, with a token of its own \
          unless it says so, does this for 7 s from the other cores; quiet is 2 s before, and 2 s that end 8 s after. Beside \
          it newcomers, one after the other, make a session, feel a command in it and one in the client's session, and go; \
-         who waits for 5 s gives up. Lost are commands that were never answered. Memory is resident: before, at most, and 10 s after, when \
-         all have gone.",
+         who waits for 5 s gives up. Lost are commands that were never answered. Memory is resident: before, at most, and \
+         10 s after, when all have gone.",
     );
     let kinds: Vec<Option<&'static Kind>> = match name {
         Some(name) => vec![Some(attack::named(name).unwrap_or_else(|| unknown_attack(name)))],
