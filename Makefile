@@ -18,7 +18,7 @@ PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/*.yaml $(VI
 	$(VIEWER)/src/*.css $(VIEWER)/public/* proto/palpate/v1/*.proto)
 
 .PHONY: help run build viewer page-if-node test test-viewer test-arm test-asan test-valgrind test-debug need-arm stress libfuzzer lint picture figures screenshot bench-roundtrip bench-duty \
-	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-rest bench-link bench-viewer bench-load soak fuzz need-rust \
+	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-rest bench-link bench-viewer bench-load soak siege fuzz need-rust \
 	need-python need-node
 
 help:
@@ -49,8 +49,11 @@ help:
 	@echo 'make bench-stability the largest stable step, predicted and observed'
 	@echo 'make bench-skip      what it saves to leave out what is at rest, and its error'
 	@echo 'make bench-load      sessions that one core bears, with clients and without, and under attack: docs/benchmarks/load.md'
+	@echo '                     one attack alone: make bench-load ATTACK=endless-scene (ATTACK=all: each of them, and no more)'
 	@echo 'make soak            random clients for SECONDS=1800: memory, handles, threads, and every command accounted for; then'
 	@echo '                     clients and servers killed KILLS=50 times'
+	@echo 'make siege           eight attackers at random against four honest clients for SECONDS=1800, by SEED=16: their times,'
+	@echo '                     memory, and whether all is given back; make test does it for 30 s'
 
 need-rust:
 	@command -v $(CARGO) >/dev/null || { echo 'Rust is missing: install it from https://rustup.rs' >&2; exit 1; }
@@ -223,8 +226,9 @@ bench-viewer: build viewer
 bench-link: build
 	$(CARGO) bench --quiet --bench link -- $(ARGUMENTS)
 
+# `make bench-load ATTACK=unread-probes` is one row of the table of attacks, ATTACK=all all of that table.
 bench-load: build
-	$(CARGO) bench --quiet --bench load -- $(ARGUMENTS)
+	$(CARGO) bench --quiet --bench load -- $(if $(ATTACK),attacks $(ATTACK)) $(ARGUMENTS)
 
 # How long, s.
 SECONDS ?= 1800
@@ -232,3 +236,8 @@ KILLS ?= 50
 soak: need-rust
 	PALPATE_SOAK_S=$(SECONDS) $(CARGO) test --release --test soak -- --include-ignored --nocapture
 	PALPATE_KILLS=$(KILLS) $(CARGO) test --release --test kill -- --nocapture
+
+# Each seed is another siege; the first failure is said as it is found, all of them at the end.
+SEED ?= 16
+siege: need-rust
+	PALPATE_SIEGE_S=$(SECONDS) PALPATE_SIEGE_SEED=$(SEED) $(CARGO) test --release --test siege -- --nocapture

@@ -1,13 +1,22 @@
 //! How many sessions does a core bear, each with a haptic client at 1 kHz or none, what does each cost beside the kernel
 //! alone, and does anybody notice an attack? The server is kept to one core, the generator (`palpate-client load`) to the
-//! others. Writes docs/benchmarks/load.{md,json,svg}. `-- --quick` tries few numbers for a short time; `-- attacks` or `-- profile`
-//! prints that part alone, and writes nothing. Linux only: times are read from /proc.
+//! others. Writes docs/benchmarks/load.{md,json,svg}. `-- --quick` tries few numbers for a short time; `-- attacks` (or
+//! `-- attacks NAME`, of one) or `-- profile` prints that part alone, and writes nothing. Linux only: times are read from /proc.
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
 
 mod attack;
+#[path = "../tests/common/caller.rs"]
+mod caller;
+#[path = "../tests/common/cores.rs"]
+mod cores;
+#[path = "../tests/common/honest.rs"]
+mod honest;
 mod profile;
+#[path = "../tests/common/proxy.rs"]
+mod proxy;
 mod report;
+mod rows;
 #[path = "../tests/common/server.rs"]
 mod server;
 
@@ -17,7 +26,8 @@ use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use attack::{Attack, Kind};
+use attack::Kind;
+use cores::kept_to;
 use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::scene::law::Poke;
@@ -28,25 +38,11 @@ use palpate::session::command::{Command as Order, Due};
 use palpate::sheet::Model;
 use report::chart::{Look, Panel, Series};
 use report::{Report, cells, digits, quick};
-use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
+use rows::Row;
 use serde_json::{Value, json};
 use server::{Server, client_program};
 
 const OBJECTIVE: &str = "p99<2ms,dilation>0.999";
-
-/// Runs `work` with this thread, and what it starts, kept to the first core, or to all others.
-fn kept_to<T>(first: bool, work: impl FnOnce() -> T) -> T {
-    let all = sched_getaffinity(None).unwrap();
-    let cores: Vec<usize> = (0..CpuSet::MAX_CPU).filter(|core| all.is_set(*core)).collect();
-    let mut some = CpuSet::new();
-    cores.iter().enumerate().filter(|core| (core.0 == 0) == first).for_each(|core| some.set(*core.1));
-    if some.count() > 0 {
-        sched_setaffinity(None, &some).unwrap();
-    }
-    let result = work();
-    sched_setaffinity(None, &all).unwrap();
-    result
-}
 
 /// Time of a server's threads so far, s: by the beginning of their names, in user mode and in the system.
 fn times(server: &Server) -> Vec<(String, [f64; 2])> {
@@ -314,50 +310,35 @@ fn profile(report: &mut Report) {
     );
 }
 
-/// What twenty sessions with a client each notice of clients that are not friends.
-fn attacks(report: &mut Report, figures: &mut Vec<Value>, seconds: f64) {
+/// What an honest client notices of clients that are not: of the attack of that name, or of all of them.
+fn attacks(report: &mut Report, figures: &mut Vec<Value>, name: Option<&str>) {
     report.heading("Under attack");
-    report.say("Twenty sessions with a client each, on a server as above, while somebody else does this.");
-    let quiet = |attack: Option<Kind>| {
-        let server = start(&[]);
-        let attack = attack.map(|kind| kept_to(false, || Attack::start(kind, &server)));
-        let found = load(&server, seconds, &["--sessions", "20"]);
-        let strikes = attack.map_or(0, Attack::end);
-        (found, strikes)
+    report.say(
+        "One client at 1 kHz in a session of its own, on a server as above, while somebody else, with a token of its own \
+         unless it says so, does this for 7 s from the other cores; quiet is 2 s before, and 2 s that end 8 s after. Beside \
+         it newcomers, one after the other, make a session, feel a command in it and one in the client's session, and go; \
+         who waits for 5 s gives up. Lost are commands that were never answered. Memory is resident: before, at most, and \
+         10 s after, when all have gone.",
+    );
+    let kinds: Vec<Option<&'static Kind>> = match name {
+        Some(name) => vec![Some(attack::named(name).unwrap_or_else(|| unknown_attack(name)))],
+        // Quiet before and after: the two tell how far one row can be trusted.
+        None => std::iter::once(None).chain(attack::KINDS.iter().map(Some)).chain([None]).collect(),
     };
-    // Quiet before and after: the two tell how far one run can be trusted.
-    let calm = |about| std::iter::once((None, about));
-    let kinds =
-        calm("nobody").chain(Kind::ALL.map(|(kind, about)| (Some(kind), about))).chain(calm("nobody, once more"));
-    let run = |(kind, about): (Option<Kind>, &'static str)| {
-        eprintln!("under attack: {about}");
-        let (found, strikes) = quiet(kind);
-        (kind, about, found, strikes)
-    };
-    let runs: Vec<_> = kinds.map(run).collect();
-    let p99_us = |found: &Load| found.number("/round_trip_us/p99");
-    let calm_us: Vec<f64> = runs.iter().filter(|run| run.0.is_none()).map(|run| p99_us(&run.2)).collect();
-    let base_us = calm_us.iter().sum::<f64>() / calm_us.len() as f64;
     let mut rows = Vec::new();
-    for (_, about, found, strikes) in &runs {
-        let p99_us = p99_us(found);
-        rows.push(cells([
-            (*about).to_owned(),
-            strikes.to_string(),
-            digits(p99_us / 1e3),
-            digits(p99_us / base_us),
-            format!("{:.4}", found.number("/dilation_min")),
-            found.number("/lost").to_string(),
-            digits(found.cores()),
-            digits(found.resident_mib),
-        ]));
-        figures.push(
-            json!({ "attack": about, "told": found.told, "strikes": strikes, "resident_mib": found.resident_mib }),
-        );
+    for kind in kinds {
+        let row = rows::run(kind);
+        eprintln!("| {} |", row.cells().join(" | "));
+        rows.push(row.cells());
+        figures.push(row.figures());
     }
-    let header =
-        cells(["what", "how often", "round trip p99, ms", "× quiet", "dilation", "lost", "of the core", "memory, MiB"]);
-    report.table(&header, &rows);
+    report.table(&Row::header(), &rows);
+}
+
+fn unknown_attack(name: &str) -> ! {
+    let names: Vec<_> = attack::KINDS.iter().map(|kind| kind.name).collect();
+    eprintln!("there is no attack `{name}`: all, {}", names.join(", "));
+    std::process::exit(2)
 }
 
 fn main() {
@@ -365,8 +346,6 @@ fn main() {
         return println!("left out: there is no /proc on this system");
     }
     let seconds = if quick() { 3.0 } else { 10.0 };
-    // Built before anything is measured.
-    client_program();
     let mut report = Report::new("load", "Many sessions on one core", "make bench-load");
     report.say(
         "Sessions of the paper's 31 × 31 points at 1 kHz, all of them awake: each is stroked without rest. The server (one \
@@ -374,13 +353,22 @@ fn main() {
          client's commands at 1 kHz by its own clock, over a connection of its own.",
     );
     let mut figures = Vec::new();
-    match std::env::args().find(|argument| ["attacks", "profile"].contains(&argument.as_str())).as_deref() {
-        Some("attacks") => attacks(&mut report, &mut figures, seconds),
-        Some(_) => profile(&mut report),
+    let mut arguments = std::env::args().skip_while(|argument| !["attacks", "profile"].contains(&argument.as_str()));
+    match arguments.next().as_deref() {
+        Some("attacks") => {
+            let name = arguments.next().filter(|name| name != "all" && !name.starts_with('-'));
+            attacks(&mut report, &mut figures, name.as_deref());
+        }
+        Some(_) => {
+            client_program();
+            profile(&mut report);
+        }
         None => {
+            // Built before anything is measured.
+            client_program();
             let series = crowds(&mut report, &mut figures, seconds);
             profile(&mut report);
-            attacks(&mut report, &mut figures, seconds);
+            attacks(&mut report, &mut figures, None);
             report.figure("runs", figures.into());
             let panel = Panel::Lines {
                 title: "What a session costs".to_owned(),

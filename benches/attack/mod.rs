@@ -1,145 +1,279 @@
-//! Clients that are not friends, each on a thread of its own until it is ended.
-#![allow(unreachable_pub)]
+//! Clients that are not friends: a table of what they do, and a thread for each that does it until it is called off.
+//! `make bench-load` shows what each does to one honest client; `tests/siege.rs` mixes them.
+#![allow(dead_code, unreachable_pub, clippy::unwrap_used, clippy::panic, clippy::disallowed_methods)]
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+mod bytes;
+mod crowd;
+mod hoard;
+mod legal;
+mod toil;
+
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use palpate::wire::pb;
-use pb::touch_request::Message as Say;
-use tokio_stream::StreamExt;
+use futures_util::future::BoxFuture;
+use tokio_util::sync::CancellationToken;
+use tonic::Status;
 
-use crate::server::{Server, force, open};
+use crate::caller::{Caller, Keys, SIDE, why};
+use crate::honest::Freezer;
 
-/// What an attack does.
-#[derive(Clone, Copy)]
-pub enum Kind {
-    /// Asks for a thousand full frames a second, and reads none.
-    StalledViewer,
-    /// Sends commands at a hundred times the rate of the session.
-    Flood,
-    /// Opens a thousand connections, and says nothing.
-    HalfOpen,
-    /// Makes sessions and drops them, as fast as it can.
-    CreateAndDrop,
+/// Where an attack takes place.
+pub struct Ground {
+    /// Who attacks.
+    pub caller: Caller,
+    /// A session of an honest client, whose id got about. It holds tool 0 there.
+    pub shared: String,
+    /// The server's process.
+    pub process: u32,
+    /// The file of tokens, which changes under attacks that need it to.
+    pub keys: Arc<Keys>,
+    /// The honest client itself, where an attack has it stand still.
+    pub freezer: Option<Freezer>,
+    /// How much of everything: 1 is all that the attack is known for.
+    pub scale: f64,
+    pub seed: u64,
+    strikes: AtomicU64,
+    refusals: Mutex<BTreeMap<String, u64>>,
 }
 
-impl Kind {
-    pub const ALL: [(Kind, &'static str); 4] = [
-        (Kind::StalledViewer, "a viewer that asks for 1000 full frames a second and reads none"),
-        (Kind::Flood, "a client that sends 100 times as many commands"),
-        (Kind::HalfOpen, "1000 connections that say nothing"),
-        (Kind::CreateAndDrop, "a client that makes and drops sessions without end"),
-    ];
+impl Ground {
+    pub fn new(caller: Caller, shared: &str, process: u32, keys: &Arc<Keys>) -> Self {
+        Ground {
+            caller,
+            shared: shared.to_owned(),
+            process,
+            keys: keys.clone(),
+            freezer: None,
+            scale: 1.0,
+            seed: 0,
+            strikes: AtomicU64::new(0),
+            refusals: Mutex::default(),
+        }
+    }
+
+    /// So many of something, one at least.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn count(&self, all: u32) -> u32 {
+        ((f64::from(all) * self.scale) as u32).max(1)
+    }
+
+    /// The side of a square sheet: its points are scaled.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn side(&self, all: u32) -> u32 {
+        ((f64::from(all) * self.scale.sqrt()) as u32).max(4)
+    }
+
+    /// Counts what was done.
+    fn strike(&self) {
+        self.strikes.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Counts what was refused, by reason; `None` of that.
+    fn heard<T>(&self, answer: Result<T, Status>) -> Option<T> {
+        let note = |status: Status| *self.refusals.lock().unwrap().entry(why(&status)).or_default() += 1;
+        answer.map_err(note).ok()
+    }
+}
+
+/// Does it for as long as it is let; fails if the server does not play.
+type Run = for<'g> fn(&'g Ground) -> BoxFuture<'g, Result<(), Status>>;
+
+/// An attack.
+#[derive(Clone, Copy)]
+pub struct Kind {
+    pub name: &'static str,
+    /// In one line.
+    pub about: &'static str,
+    pub run: Run,
+    /// Tools of the honest client beside it.
+    pub tools: u32,
+    /// Of the honest client's way to the server and back, ms.
+    pub round_trip_ms: u64,
+    /// The attacker shows the honest client's own token.
+    pub same_caller: bool,
+    /// The server's file descriptors.
+    pub descriptors: Option<u32>,
+}
+
+const fn kind(name: &'static str, about: &'static str, run: Run) -> Kind {
+    Kind { name, about, run, tools: 1, round_trip_ms: 0, same_caller: false, descriptors: None }
+}
+
+/// All that is known, in the order of the points of what a server has to bear.
+pub const KINDS: &[Kind] = &[
+    // Work without end.
+    kind("endless-scene", "scenes of four points that ask for 1 substep and need 2³²", |g| {
+        Box::pin(toil::endless_scene(g))
+    }),
+    kind("big-law", "force laws of a sheet of 331² that hardly anything holds back", |g| Box::pin(toil::big_law(g))),
+    // Somebody stands still.
+    kind("stall-server", "the server stands still for 5 s", |g| Box::pin(bytes::stall_server(g, 5.0))),
+    Kind {
+        round_trip_ms: 50,
+        ..kind("stall-server-far", "the same, 50 ms away", |g| Box::pin(bytes::stall_server(g, 5.0)))
+    },
+    Kind {
+        tools: 16,
+        ..kind("stall-server-16", "the server stands still for 1 s, under 16 tools", |g| {
+            Box::pin(bytes::stall_server(g, 1.0))
+        })
+    },
+    Kind {
+        tools: 16,
+        round_trip_ms: 50,
+        ..kind("stall-server-16-far", "the same, 50 ms away", |g| Box::pin(bytes::stall_server(g, 1.0)))
+    },
+    kind("stall-client", "the honest client stands still for 5 s", |g| Box::pin(bytes::stall_client(g, 5.0))),
+    Kind {
+        round_trip_ms: 50,
+        ..kind("stall-client-far", "the same, 50 ms away", |g| Box::pin(bytes::stall_client(g, 5.0)))
+    },
+    Kind {
+        tools: 16,
+        ..kind("stall-client-16", "the honest client stands still for 1 s, with 16 tools", |g| {
+            Box::pin(bytes::stall_client(g, 1.0))
+        })
+    },
+    Kind {
+        tools: 16,
+        round_trip_ms: 50,
+        ..kind("stall-client-16-far", "the same, 50 ms away", |g| Box::pin(bytes::stall_client(g, 1.0)))
+    },
+    // What one call makes the server do.
+    kind("fixed-positions", "4096 positions a call to a sheet with 500,000 fixed points", |g| {
+        Box::pin(toil::fixed_positions(g))
+    }),
+    kind("empty-commands", "500,000 empty commands a call", |g| Box::pin(toil::empty_commands(g))),
+    // A token that is not one any more.
+    kind(
+        "revoked-unread",
+        "commands by a token that was struck out, reading nothing (counted: taken 2 s after)",
+        |g| Box::pin(crowd::revoked_unread(g)),
+    ),
+    // Memory.
+    kind(
+        "tissue-changes",
+        "changes of a tissue with 500,000 fixed points, that wait for a step that never comes",
+        |g| Box::pin(hoard::tissue_changes(g)),
+    ),
+    kind("fixed-sessions", "sessions with 500,000 fixed points each", |g| Box::pin(hoard::fixed_sessions(g))),
+    kind("unread-viewers", "139 viewers of 186² at refinement 10 that read nothing", |g| {
+        Box::pin(hoard::unread_viewers(g))
+    }),
+    kind("waiting-commands", "64 tools with 4096 commands each that wait, in one session after the other", |g| {
+        Box::pin(hoard::waiting_commands(g))
+    }),
+    kind("thin-sheet", "a sheet of 4,194,304 × 1, all of it awake", |g| Box::pin(hoard::thin_sheet(g))),
+    // What a request costs.
+    kind("unread-probes", "20 probes of all points that nobody reads", |g| Box::pin(toil::unread_probes(g, 20, SIDE))),
+    Kind {
+        same_caller: true,
+        ..kind("unread-probes-same", "the same by the honest client's own token", |g| {
+            Box::pin(toil::unread_probes(g, 20, SIDE))
+        })
+    },
+    kind("unread-probes-250", "250 such probes", |g| Box::pin(toil::unread_probes(g, 250, SIDE))),
+    kind("probe-2048", "a probe of all points of 2048²", |g| Box::pin(toil::unread_probes(g, 1, g.side(2048)))),
+    kind("heavy-poked", "a sheet of 2000², made at rest and then pushed everywhere", |g| {
+        Box::pin(toil::heavy_poked(g))
+    }),
+    kind("stiff-change", "a tissue that is changed to k = 10⁹ N/m and pushed", |g| Box::pin(toil::stiff_change(g))),
+    kind("woken-together", "400 resting sessions pushed at once", |g| Box::pin(toil::woken_together(g))),
+    kind("polling", "GetSession again and again while 262,144 commands wait", |g| Box::pin(toil::polling(g))),
+    kind("hash-1024", "the hash of a sheet of 1024², eight times a second", |g| Box::pin(toil::hashes(g))),
+    kind("page-gets", "GETs of the page without waiting for answers", |g| Box::pin(bytes::page_gets(g))),
+    kind("flood-window-update", "WINDOW_UPDATE frames as fast as they go", |g| {
+        Box::pin(bytes::frames(g, &bytes::WINDOW_UPDATE))
+    }),
+    kind("flood-priority", "PRIORITY frames as fast as they go", |g| Box::pin(bytes::frames(g, &bytes::PRIORITY))),
+    kind("flood-ping", "PING frames as fast as they go", |g| Box::pin(bytes::frames(g, &bytes::PING))),
+    kind("flood-settings", "SETTINGS frames as fast as they go", |g| Box::pin(bytes::frames(g, &bytes::SETTINGS))),
+    kind("stalled-viewer", "a viewer that asks for 1000 full frames a second and reads none", |g| {
+        Box::pin(hoard::stalled_viewer(g))
+    }),
+    kind("command-flood", "a client that sends 100 times as many commands", |g| Box::pin(toil::command_flood(g))),
+    kind("create-and-drop", "sessions made and dropped without end", |g| Box::pin(toil::create_and_drop(g))),
+    kind("legal-calls", "random legal calls to sessions of its own", |g| Box::pin(legal::calls(g))),
+    // Who is locked out.
+    kind("watchers", "256 streams of samples of the honest client's session", |g| Box::pin(crowd::watchers(g))),
+    kind("kept-leases", "every other tool of the honest client's session taken for 600 s, then hung up", |g| {
+        Box::pin(crowd::kept_leases(g))
+    }),
+    kind("all-slots", "as many sessions as there may be", |g| Box::pin(crowd::all_slots(g))),
+    Kind {
+        descriptors: Some(1024),
+        ..kind("descriptors", "1500 connections without a token, to a server that may open 1024 files", |g| {
+            Box::pin(crowd::connections(g, bytes::GREETING))
+        })
+    },
+    kind("half-open", "1000 connections that say nothing", |g| Box::pin(crowd::connections(g, b""))),
+];
+
+/// The attack of that name.
+pub fn named(name: &str) -> Option<&'static Kind> {
+    KINDS.iter().find(|kind| kind.name == name)
+}
+
+/// What an attack came to.
+#[derive(Default)]
+pub struct Toll {
+    pub strikes: u64,
+    /// By reason.
+    pub refusals: BTreeMap<String, u64>,
+    /// What the attacker itself took, s of a core.
+    pub processor_s: f64,
 }
 
 /// An attack under way.
 pub struct Attack {
-    over: Arc<AtomicBool>,
-    thread: Option<JoinHandle<u64>>,
+    over: CancellationToken,
+    thread: JoinHandle<Toll>,
 }
 
 impl Attack {
-    pub fn start(kind: Kind, server: &Arc<Server>) -> Self {
-        let over = Arc::new(AtomicBool::new(false));
+    pub fn start(run: Run, ground: Ground) -> Self {
+        let over = CancellationToken::new();
         let thread = std::thread::spawn({
-            let (over, server) = (over.clone(), server.clone());
+            let over = over.clone();
             move || {
                 // Whoever attacks shares a core with the clients that are measured: it is the server's that counts.
                 #[cfg(target_os = "linux")]
                 rustix::process::setpriority_process(None, 19).unwrap();
                 let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-                runtime.block_on(run(kind, &server, &over))
-            }
-        });
-        Attack { over, thread: Some(thread) }
-    }
-
-    /// Ends it; tells how often it struck.
-    pub fn end(mut self) -> u64 {
-        self.over.store(true, Ordering::Relaxed);
-        self.thread.take().unwrap().join().unwrap()
-    }
-}
-
-async fn until(over: &AtomicBool) {
-    while !over.load(Ordering::Relaxed) {
-        tokio::time::sleep(Duration::from_millis(20)).await;
-    }
-}
-
-async fn run(kind: Kind, server: &Arc<Server>, over: &AtomicBool) -> u64 {
-    match kind {
-        Kind::StalledViewer => {
-            let session_id = server.paper(false).await;
-            let request = pb::WatchFramesRequest {
-                session_id,
-                refinement: 10,
-                rate_hz: Some(1000.0),
-                always_full: true,
-                ..Default::default()
-            };
-            let _stalled = server.views().await.watch_frames(request).await.unwrap();
-            until(over).await;
-            1
-        }
-        Kind::Flood => {
-            let session = server.paper(false).await;
-            let say = |message| pb::TouchRequest { message: Some(message) };
-            let mut sent = 0;
-            // Its stream is ended again and again.
-            while !over.load(Ordering::Relaxed) {
-                let (sender, receiver) = tokio::sync::mpsc::channel(64);
-                sender.send(say(Say::Open(open(&session, &[0])))).await.unwrap();
-                let outbound = tokio_stream::wrappers::ReceiverStream::new(receiver);
-                let mut inbound = server.haptics().await.touch(outbound).await.unwrap().into_inner();
-                let reading = tokio::spawn(async move { while let Some(Ok(_)) = inbound.next().await {} });
-                let mut sequence = 0;
-                // A hundred a millisecond, or what the transport lets through.
-                let mut tick = tokio::time::interval(Duration::from_millis(1));
-                'stream: while !over.load(Ordering::Relaxed) {
-                    tick.tick().await;
-                    for _ in 0..100 {
-                        sequence += 1;
-                        if sender.send(say(Say::Command(force(0, sequence, -1.0)))).await.is_err() {
-                            break 'stream;
+                runtime.block_on(async {
+                    while !over.is_cancelled() {
+                        tokio::select! {
+                            () = over.cancelled() => {}
+                            // What was opened is dropped, and opened again.
+                            done = run(&ground) => {
+                                ground.heard(done);
+                                tokio::time::sleep(Duration::from_millis(20)).await;
+                            }
                         }
                     }
+                });
+                // With what the attack has left to itself.
+                drop(runtime);
+                let took = rustix::time::clock_gettime(rustix::time::ClockId::ThreadCPUTime);
+                #[allow(clippy::cast_precision_loss)]
+                let processor_s = took.tv_sec as f64 + took.tv_nsec as f64 * 1e-9;
+                Toll {
+                    strikes: ground.strikes.into_inner(),
+                    refusals: ground.refusals.into_inner().unwrap(),
+                    processor_s,
                 }
-                sent += sequence;
-                reading.abort();
             }
-            sent
-        }
-        Kind::HalfOpen => {
-            let address = server.url.strip_prefix("http://").unwrap();
-            let mut open = Vec::new();
-            let mut count = 0;
-            while !over.load(Ordering::Relaxed) {
-                // Those that were closed are opened again.
-                open.retain(|socket: &tokio::net::TcpStream| socket.try_read(&mut [0; 64]).is_err());
-                while open.len() < 1000 && !over.load(Ordering::Relaxed) {
-                    let Ok(socket) = tokio::net::TcpStream::connect(address).await else { break };
-                    open.push(socket);
-                    count += 1;
-                }
-                tokio::time::sleep(Duration::from_millis(100)).await;
-            }
-            count
-        }
-        Kind::CreateAndDrop => {
-            let mut sessions = server.sessions().await;
-            let mut count = 0;
-            while !over.load(Ordering::Relaxed) {
-                let source = Some(pb::create_session_request::Source::SceneName("paper".into()));
-                let request = pb::CreateSessionRequest { source, ..Default::default() };
-                count += 1;
-                let Ok(created) = sessions.create_session(request).await else { continue };
-                let session_id = created.into_inner().session.unwrap().session_id;
-                let _ = sessions.delete_session(pb::DeleteSessionRequest { session_id }).await;
-            }
-            count
-        }
+        });
+        Attack { over, thread }
+    }
+
+    /// Calls it off, and hangs up.
+    pub fn end(self) -> Toll {
+        self.over.cancel();
+        self.thread.join().unwrap()
     }
 }
