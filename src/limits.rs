@@ -101,7 +101,7 @@ impl Default for Limits {
             connections_per_address: 2048,
             streams_per_connection: 256,
             message_bytes: 1 << 20,
-            connection_window_bytes: 1 << 18,
+            connection_window_bytes: 1 << 20,
             handshake_s: 10.0,
             open_s: 10.0,
             keepalive_s: 10.0,

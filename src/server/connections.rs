@@ -25,6 +25,7 @@ use super::metrics::{Open, Traffic};
 use super::rate::Turnstile;
 use super::reload::Reloaded;
 use super::tls;
+use super::transport::{Frames, Gate, Holdback};
 use crate::limits::Limits;
 use crate::pace::queue::lock;
 
@@ -161,6 +162,8 @@ pub(crate) struct Peer {
     pub(super) calls: Arc<Turnstile>,
     /// For those that make a session.
     pub(super) creations: Arc<Turnstile>,
+    /// Between the connection and its transport.
+    pub(super) gate: Arc<Gate>,
 }
 
 /// A connection that was let in, before its handshake.
@@ -172,6 +175,7 @@ struct Entry {
     deadline: Pin<Box<Sleep>>,
     traffic: Arc<Traffic>,
     seat: Seat,
+    gate: Arc<Gate>,
 }
 
 impl Entry {
@@ -184,15 +188,19 @@ impl Entry {
             deadline: Box::pin(tokio::time::sleep(Duration::from_secs_f64(limits.handshake_s))),
             traffic: traffic.clone(),
             seat,
+            gate: Arc::new(Gate::new(limits.connection_window_bytes)),
         }
     }
 
     fn connection(self, transport: Transport, certificate: Option<Arc<[String]>>) -> Connection {
-        let Entry { address, calls, creations, deadline, traffic, seat } = self;
+        let Entry { address, calls, creations, deadline, traffic, seat, gate } = self;
         debug!(%address, "connected");
         Connection {
             transport,
-            peer: Peer { address, certificate, calls: Arc::new(calls), creations: Arc::new(creations) },
+            peer: Peer { address, certificate, calls: Arc::new(calls), creations: Arc::new(creations), gate },
+            inward: Frames::default(),
+            outward: Frames::of_server(),
+            holdback: Holdback::default(),
             greeting: Some((GREETING_BYTES, deadline)),
             _open: traffic.open(),
             traffic,
@@ -210,6 +218,10 @@ enum Transport {
 pub(super) struct Connection {
     transport: Transport,
     peer: Peer,
+    /// What comes and what goes.
+    inward: Frames,
+    outward: Frames,
+    holdback: Holdback,
     /// Until so many bytes have come, it has so long.
     greeting: Option<(usize, Pin<Box<Sleep>>)>,
     traffic: Arc<Traffic>,
@@ -218,11 +230,26 @@ pub(super) struct Connection {
 }
 
 impl Connection {
-    fn count(&self, polled: Poll<io::Result<usize>>) -> Poll<io::Result<usize>> {
-        if let Poll::Ready(Ok(bytes)) = &polled {
-            self.traffic.bytes_out.inc_by(*bytes as u64);
+    /// Fails if the connection is to be closed, and wakes who asks when it is.
+    fn check_open(&self, context: &Context<'_>) -> io::Result<()> {
+        if self.peer.gate.is_closed(context) { Err(io::ErrorKind::ConnectionAborted.into()) } else { Ok(()) }
+    }
+
+    /// So many bytes of `slices` were sent.
+    fn went(&mut self, slices: &[io::IoSlice<'_>], bytes: usize) {
+        self.traffic.bytes_out.inc_by(bytes as u64);
+        // What the answer of HTTP/1.1 is made of are no frames.
+        if !self.inward.are_read() {
+            return;
         }
-        polled
+        let mut left = bytes;
+        for slice in slices {
+            let here = &slice[..slice.len().min(left)];
+            left -= here.len();
+            if let Some(cut) = self.outward.pass(here, None) {
+                self.traffic.cut(self.peer.address, "server", &cut);
+            }
+        }
     }
 }
 
@@ -237,20 +264,25 @@ impl Connected for Connection {
 impl AsyncRead for Connection {
     fn poll_read(self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
         let this = self.get_mut();
+        this.check_open(cx)?;
+        ready!(this.holdback.poll(&this.peer.gate, cx));
         let before = buffer.filled().len();
         let polled = match &mut this.transport {
             Transport::Plain(stream) => Pin::new(stream).poll_read(cx, buffer),
             Transport::Tls(stream) => Pin::new(stream).poll_read(cx, buffer),
         };
-        let bytes = buffer.filled().len() - before;
-        this.traffic.bytes_in.inc_by(bytes as u64);
+        let came = &buffer.filled()[before..];
+        this.traffic.bytes_in.inc_by(came.len() as u64);
+        if let Some(cut) = this.inward.pass(came, Some(&this.peer.gate)) {
+            this.traffic.cut(this.peer.address, "client", &cut);
+        }
         let Some((left, deadline)) = &mut this.greeting else { return polled };
         if polled.is_pending() {
             ready!(deadline.as_mut().poll(cx));
             this.traffic.stayed_silent(this.peer.address);
             return Poll::Ready(Err(io::ErrorKind::TimedOut.into()));
         }
-        *left = left.saturating_sub(bytes);
+        *left = left.saturating_sub(came.len());
         if *left == 0 {
             this.greeting = None;
         }
@@ -260,12 +292,7 @@ impl AsyncRead for Connection {
 
 impl AsyncWrite for Connection {
     fn poll_write(self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
-        let this = self.get_mut();
-        let polled = match &mut this.transport {
-            Transport::Plain(stream) => Pin::new(stream).poll_write(cx, bytes),
-            Transport::Tls(stream) => Pin::new(stream).poll_write(cx, bytes),
-        };
-        this.count(polled)
+        self.poll_write_vectored(cx, &[io::IoSlice::new(bytes)])
     }
 
     fn poll_write_vectored(
@@ -274,11 +301,15 @@ impl AsyncWrite for Connection {
         slices: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
         let this = self.get_mut();
+        this.check_open(cx)?;
         let polled = match &mut this.transport {
             Transport::Plain(stream) => Pin::new(stream).poll_write_vectored(cx, slices),
             Transport::Tls(stream) => Pin::new(stream).poll_write_vectored(cx, slices),
         };
-        this.count(polled)
+        if let Poll::Ready(Ok(bytes)) = &polled {
+            this.went(slices, *bytes);
+        }
+        polled
     }
 
     fn is_write_vectored(&self) -> bool {

@@ -17,9 +17,10 @@ use prometheus_client::metrics::gauge::{ConstGauge, Gauge};
 use prometheus_client::registry::{Registry, Unit};
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
-use tracing::info;
+use tracing::{info, warn};
 
 use super::identity::CALLS;
+use super::transport::Cut;
 use crate::pace::queue::lock;
 use crate::pace::tally::{Count, Tally, Times};
 use crate::pace::{Pacer, State};
@@ -36,6 +37,7 @@ pub(crate) struct Traffic {
     connected: Counter,
     handshakes_failed: Counter,
     silent: Counter,
+    cuts: Family<[(&'static str, &'static str); 2], Counter>,
     pub(super) bytes_in: Counter,
     pub(super) bytes_out: Counter,
     calls: Family<Label, Counter>,
@@ -71,6 +73,13 @@ impl Traffic {
         self.silent.inc();
     }
 
+    /// The transport of `side` has cut a connection.
+    pub(super) fn cut(&self, client: SocketAddr, side: &'static str, cut: &Cut) {
+        let Cut { reason, words } = cut;
+        warn!(%client, reason, "connection cut by the transport of the {side}: {words}");
+        self.cuts.get_or_create(&[("side", side), ("reason", reason)]).inc();
+    }
+
     /// A call was let through.
     pub(super) fn called(&self, path: &str) {
         if let Some((path, _)) = CALLS.iter().find(|call| call.0 == path) {
@@ -99,6 +108,8 @@ pub(super) fn registry(pacer: &Arc<Pacer>, traffic: &Traffic) -> Registry {
     registry.register("tls_handshakes_failed", failed, traffic.handshakes_failed.clone());
     let silent = "Connections that did not say in time what they want";
     registry.register("silent_connections", silent, traffic.silent.clone());
+    let cuts = "Connections that a transport has cut: whose, and why (RFC 9113)";
+    registry.register("transport_cuts", cuts, traffic.cuts.clone());
     let (bytes_in, bytes_out) = (traffic.bytes_in.clone(), traffic.bytes_out.clone());
     registry.register_with_unit("received", "What clients sent, before encryption", Unit::Bytes, bytes_in);
     registry.register_with_unit("sent", "What clients were sent, before encryption", Unit::Bytes, bytes_out);

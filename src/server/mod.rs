@@ -12,10 +12,12 @@ mod page;
 mod protection;
 mod rate;
 mod reload;
+mod request;
 mod revocation;
 mod sessions;
 mod textures;
 mod tls;
+mod transport;
 mod views;
 mod workshop;
 
@@ -43,6 +45,7 @@ use pb::haptic_service_server::HapticServiceServer;
 use pb::session_service_server::SessionServiceServer;
 use pb::view_service_server::ViewServiceServer;
 use protection::Protection;
+use revocation::Calls;
 use textures::Textures;
 use workshop::Workshop;
 
@@ -178,8 +181,11 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
         warn!("--insecure: whoever can reach this server may do everything");
     }
     let origins: Arc<[HeaderValue]> = config.origins.iter().filter_map(|origin| origin.parse().ok()).collect();
+    let calls = Calls::new(protection.credentials.clone());
     let guard = GuardLayer {
         credentials: protection.credentials.clone(),
+        calls: calls.clone(),
+        patience: Duration::from_secs_f64(limits.open_s),
         traffic: traffic.clone(),
         local_only: open && !config.insecure,
         origins: origins.clone(),
@@ -261,6 +267,7 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
         (served, ()) = async { tokio::join!(serving, stop) } => served?,
         () = sweeping => {}
         () = protection.watch() => {}
+        () = calls.watch() => {}
         () = over => warn!("steps or streams outlasted the deadline, and are cut"),
     }
     info!("stopped");

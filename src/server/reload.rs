@@ -1,10 +1,10 @@
 //! Something that is made from files, and made anew when they change: certificates, keys, tokens.
 
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use tokio::sync::watch;
 use tracing::{info, warn};
 use xxhash_rust::xxh3::xxh3_128;
 
@@ -27,7 +27,8 @@ pub(super) struct Reloaded<T> {
     paths: Vec<PathBuf>,
     make: Make<T>,
     current: Mutex<Arc<T>>,
-    version: AtomicU64,
+    /// How often it has changed.
+    version: watch::Sender<u64>,
     /// Of the texts that were looked at last, or why they could not be read.
     seen: Mutex<Result<u128>>,
 }
@@ -42,7 +43,7 @@ impl<T> Reloaded<T> {
         let texts = read(&paths)?;
         let current = Mutex::new(Arc::new(make(&texts)?));
         let seen = Mutex::new(Ok(digest(&texts)));
-        Ok(Reloaded { what, paths, make: Box::new(make), current, version: AtomicU64::new(0), seen })
+        Ok(Reloaded { what, paths, make: Box::new(make), current, version: watch::Sender::new(0), seen })
     }
 
     /// What holds now.
@@ -52,7 +53,12 @@ impl<T> Reloaded<T> {
 
     /// How often it has changed.
     pub(super) fn version(&self) -> u64 {
-        self.version.load(Ordering::Acquire)
+        *self.version.borrow()
+    }
+
+    /// Tells of each change.
+    pub(super) fn changes(&self) -> watch::Receiver<u64> {
+        self.version.subscribe()
     }
 
     /// Looks at the files. If they have changed, what they say holds from now on; if that makes no sense, what held before.
@@ -65,7 +71,7 @@ impl<T> Reloaded<T> {
         match texts.and_then(|texts| (self.make)(&texts)) {
             Ok(value) => {
                 *lock(&self.current) = Arc::new(value);
-                self.version.fetch_add(1, Ordering::Release);
+                self.version.send_modify(|version| *version += 1);
                 info!("{}: new files are in use", self.what);
             }
             Err(refusal) => warn!(%refusal, "{}: the new files are of no use, the old ones hold", self.what),
