@@ -9,6 +9,7 @@ mod proxy;
 mod server;
 
 use std::collections::HashMap;
+use std::io::{BufRead, Read, Write};
 use std::time::{Duration, Instant};
 
 use glam::DVec3;
@@ -55,9 +56,10 @@ struct Led {
 }
 
 impl Led {
-    async fn open(channel: Channel, session: &str, tools: u32) -> Self {
+    async fn open(channel: Channel, session: &str, tools: u32, lease_s: f64) -> Self {
         let (outbound, messages) = mpsc::channel(1 << 20);
-        let open = open(session, &(0..tools).collect::<Vec<_>>());
+        let tool_numbers: Vec<_> = (0..tools).collect();
+        let open = pb::TouchOpen { lease_s: Some(lease_s), ..open(session, &tool_numbers) };
         outbound.send(pb::TouchRequest { message: Some(Say::Open(open)) }).await.unwrap();
         let mut inbound = HapticServiceClient::new(channel).touch(ReceiverStream::new(messages)).await.unwrap().into_inner();
         assert!(matches!(inbound.message().await.unwrap().unwrap().message, Some(Heard::Opened(_))));
@@ -103,9 +105,23 @@ impl Led {
             }
         }
     }
+
+    /// The reasons of all refusals up to the one of the newest command.
+    async fn refused(&mut self) -> HashMap<String, u64> {
+        let mut refused = HashMap::new();
+        loop {
+            let heard = tokio::time::timeout(PATIENCE, self.inbound.message()).await.expect("the server is silent");
+            if let Some(Heard::Rejection(rejection)) = heard.unwrap().unwrap().message {
+                *refused.entry(rejection.reason).or_default() += 1;
+                if rejection.sequence == self.sequence {
+                    return refused;
+                }
+            }
+        }
+    }
 }
 
-/// Every command was taken in or refused, and no tool moved by more than it was led.
+/// Every command was taken in or refused.
 async fn all_are_told(server: &Server, session: &str, led: &Led) {
     let status = server.status(session).await;
     let commands = status.commands.unwrap();
@@ -121,7 +137,7 @@ async fn all_are_told(server: &Server, session: &str, led: &Led) {
 async fn the_server_stands_still(url: String, server: &Server, tools: u32, stall: Duration) {
     let session = server.create(small(), false).await.unwrap().session_id;
     let channel = Channel::from_shared(url).unwrap().connect().await.unwrap();
-    let mut led = Led::open(channel, &session, tools).await;
+    let mut led = Led::open(channel, &session, tools, 60.0).await;
     led.lead(Duration::from_millis(100)).await;
     led.acknowledged().await;
     signal(server, "-STOP");
@@ -151,4 +167,77 @@ async fn a_tool_far_away_outlives_a_server_that_stands_still() {
     let address = server.url.strip_prefix("http://").unwrap().to_owned();
     let proxy = Proxy::start(address, Duration::from_millis(25)).await;
     the_server_stands_still(proxy.url(), &server, 1, STALL).await;
+}
+
+/// A client in a thread of its own that stands still with all it has, its transport too; then it says on, as long as `lease_s`
+/// lets it.
+fn a_client_that_stands_still(url: String, session: String, lease_s: f64) -> std::thread::JoinHandle<()> {
+    std::thread::spawn(move || {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        runtime.block_on(async {
+            let channel = Channel::from_shared(url).unwrap().connect().await.unwrap();
+            let mut led = Led::open(channel, &session, 1, lease_s).await;
+            led.lead(Duration::from_millis(100)).await;
+            led.acknowledged().await;
+            std::thread::sleep(STALL);
+            let refused_from = led.sequence;
+            led.lead(Duration::from_millis(20)).await;
+            if lease_s > STALL.as_secs_f64() {
+                assert!(led.acknowledged().await.is_empty());
+            } else {
+                let refused = led.refused().await;
+                assert_eq!(refused, HashMap::from([("NOT_HOLDER".to_owned(), led.sequence - refused_from)]));
+            }
+        });
+    })
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_client_that_stands_still_keeps_its_stream_and_its_tool_lets_go() {
+    let server = Server::start(&["--log", "error"]);
+    let mut clients = Vec::new();
+    for lease_s in [60.0, 2.0] {
+        let session = server.create(small(), false).await.unwrap().session_id;
+        let request = pb::WatchSamplesRequest { session_id: session.clone(), ..Default::default() };
+        let mut watching = server.haptics().await.watch_samples(request).await.unwrap().into_inner();
+        clients.push(a_client_that_stands_still(server.url.clone(), session, lease_s));
+        // Held, then let go, in this order.
+        for wanted in [(|tool| tool.stale && !tool.expired) as fn(&pb::ToolSample) -> bool, |tool| tool.expired] {
+            let seen = tokio::time::timeout(PATIENCE, async {
+                loop {
+                    let sample = watching.message().await.unwrap().unwrap().sample.unwrap();
+                    if sample.tools.iter().any(wanted) {
+                        return;
+                    }
+                }
+            });
+            seen.await.expect("the tool goes on");
+        }
+    }
+    tokio::task::spawn_blocking(|| clients.into_iter().for_each(|client| client.join().unwrap())).await.unwrap();
+}
+
+#[tokio::test]
+async fn a_cut_by_the_transport_is_logged_and_counted() {
+    let mut server = Server::start(&["--metrics", "127.0.0.1:0"]);
+    let mut line = String::new();
+    server.out.read_line(&mut line).unwrap();
+    let metrics = line.split_whitespace().last().unwrap().strip_prefix("http://").unwrap().to_owned();
+    let address = server.url.strip_prefix("http://").unwrap();
+    // DATA that belongs to no stream.
+    let mut socket = std::net::TcpStream::connect(address).unwrap();
+    socket.write_all(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0\0\0\x01\0\0\0\0\0\0x").unwrap();
+    let mut answer = Vec::new();
+    let _ = socket.read_to_end(&mut answer);
+    let mut scrape = std::net::TcpStream::connect(metrics.strip_suffix("/metrics").unwrap()).unwrap();
+    scrape.write_all(b"GET /metrics HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n").unwrap();
+    let mut told = String::new();
+    scrape.read_to_string(&mut told).unwrap();
+    let counted = "palpate_transport_cuts_total{side=\"server\",reason=\"PROTOCOL_ERROR\"} 1";
+    // What it logs is written when it ends.
+    signal(&server, "-TERM");
+    server.child.wait().unwrap();
+    let log = server.log();
+    assert!(told.contains(counted), "{told}, {answer:?}: {log}");
+    assert!(log.contains("connection cut by the transport of the server") && log.contains("PROTOCOL_ERROR"), "{log}");
 }
