@@ -72,8 +72,9 @@ enum Command {
         `authorization: Bearer TOKEN`; roles are watch, touch (hold a tool, change the tissue), create (make,\n\
         start, stop and delete sessions) and administer (everything; the only one that lists sessions). Health, reflection\n\
         and the page's files are open; the page takes a token behind its address, as in https://server:7117/#token=TOKEN.\n\
-        Certificates, keys and tokens are looked at every second: new ones hold at once, for new connections and calls;\n\
-        what makes no sense is logged, and the old ones hold.")]
+        Certificates, keys and tokens are looked at twice a second: new ones hold at once, for new connections and calls;\n\
+        what makes no sense is logged, and the old ones hold: health tells of it as `palpate.tokens`. SIGHUP has them looked at\n\
+        at once.")]
     Serve(Box<ServeArguments>),
     /// Make a token for clients of a server: prints the token, once, and keeps only its hash
     #[command(after_help = "Examples:\n  \
@@ -351,6 +352,7 @@ fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     let ended = runtime.block_on(async {
         let doors = Doors::open(&config).await?;
         let shutdown = CancellationToken::new();
+        outlive_signals();
         tokio::spawn(cancel_on_signal(shutdown.clone()));
         // Who started us may have stopped listening; we serve all the same.
         let _ = writeln!(std::io::stdout(), "palpate listens on {}", doors.url());
@@ -396,6 +398,20 @@ fn token(arguments: &TokenArguments) -> Result<(), Failure> {
     // In one piece: a server may look at any moment.
     file.write_all(format!("\n{entry}").as_bytes()).map_err(refuse)?;
     writeln!(std::io::stdout(), "{token}").map_err(|e| Failure::Failed(e.to_string()))
+}
+
+/// What would end a process by default and is no reason for a server to end: SIGHUP has it look at its files, the others
+/// mean nothing to it; a log that may not grow any more (SIGXFSZ) is an error to who writes it.
+fn outlive_signals() {
+    #[cfg(unix)]
+    {
+        use rustix::process::Signal;
+        use tokio::signal::unix::{SignalKind, signal};
+        for ignored in [Signal::HUP, Signal::USR1, Signal::USR2, Signal::XFSZ] {
+            // Caught from now on, though nobody is told here.
+            let _ = signal(SignalKind::from_raw(ignored.as_raw()));
+        }
+    }
 }
 
 /// Ctrl-C and SIGTERM end the server; a second one ends it at once.

@@ -61,7 +61,8 @@ impl Led {
         let tool_numbers: Vec<_> = (0..tools).collect();
         let open = pb::TouchOpen { lease_s: Some(lease_s), ..open(session, &tool_numbers) };
         outbound.send(pb::TouchRequest { message: Some(Say::Open(open)) }).await.unwrap();
-        let mut inbound = HapticServiceClient::new(channel).touch(ReceiverStream::new(messages)).await.unwrap().into_inner();
+        let mut inbound =
+            HapticServiceClient::new(channel).touch(ReceiverStream::new(messages)).await.unwrap().into_inner();
         assert!(matches!(inbound.message().await.unwrap().unwrap().message, Some(Heard::Opened(_))));
         Led { outbound, inbound, tools, sequence: 0, begun: Instant::now() }
     }

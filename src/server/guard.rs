@@ -85,6 +85,9 @@ impl GuardLayer {
                 let credentials = self.credentials.get();
                 let caller = shown.check(&credentials)?;
                 self.traffic.called(path);
+                if let Some(peer) = peer {
+                    peer.seat.is_known();
+                }
                 // Who need not show anything is not asked again.
                 Ok((caller, (!credentials.is_open()).then_some((shown, version))))
             }

@@ -64,10 +64,7 @@ impl http_body::Body for Inward {
     type Data = Bytes;
     type Error = Status;
 
-    fn poll_frame(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-    ) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+    fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
         let this = &mut *self;
         if let Some(Err(refusal)) = this.call.as_ref().map(|call| call.may_say(context)) {
             return Poll::Ready(Some(Err(refusal.into())));

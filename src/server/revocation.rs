@@ -180,7 +180,9 @@ impl http_body::Body for Answer {
         if let Some(refusal) = self.call.refused() {
             self.over = true;
             let mut trailers = HeaderMap::new();
-            return Poll::Ready(Status::from(refusal).add_header(&mut trailers).ok().map(|()| Ok(Frame::trailers(trailers))));
+            return Poll::Ready(
+                Status::from(refusal).add_header(&mut trailers).ok().map(|()| Ok(Frame::trailers(trailers))),
+            );
         }
         let mut state = lock(&self.call.state);
         match &mut state.answer {

@@ -72,6 +72,11 @@ impl Gate {
         self.closed.load(Ordering::Acquire)
     }
 
+    /// Over when it is to be closed.
+    pub(super) async fn closed(&self) {
+        std::future::poll_fn(|context| if self.is_closed(context) { Poll::Ready(()) } else { Poll::Pending }).await;
+    }
+
     fn is_full(&self) -> bool {
         self.charged_bytes.load(Ordering::Acquire) >= self.portion_bytes
     }
@@ -86,7 +91,13 @@ impl Holdback {
     pub(super) fn poll(&mut self, gate: &Gate, context: &mut Context<'_>) -> Poll<()> {
         if gate.is_full() {
             let until = Instant::now() + PATIENCE;
-            if self.0.get_or_insert_with(|| Box::pin(tokio::time::sleep_until(until))).as_mut().poll(context).is_pending() {
+            if self
+                .0
+                .get_or_insert_with(|| Box::pin(tokio::time::sleep_until(until)))
+                .as_mut()
+                .poll(context)
+                .is_pending()
+            {
                 return Poll::Pending;
             }
             gate.charged_bytes.store(0, Ordering::Release);
@@ -220,7 +231,8 @@ impl Frames {
 /// What a GOAWAY says, unless it is an orderly end.
 fn told(payload: &[u8]) -> Option<Cut> {
     let code: [u8; 4] = payload.get(4..8)?.try_into().ok()?;
-    let reason = *usize::try_from(u32::from_be_bytes(code)).ok().and_then(|code| REASONS.get(code)).unwrap_or(&"UNKNOWN");
+    let reason =
+        *usize::try_from(u32::from_be_bytes(code)).ok().and_then(|code| REASONS.get(code)).unwrap_or(&"UNKNOWN");
     let words = String::from_utf8_lossy(&payload[8..]).escape_debug().to_string();
     (reason != REASONS[0]).then_some(Cut { reason, words })
 }
