@@ -166,6 +166,32 @@ async fn a_call_whose_message_does_not_come_is_ended() {
     assert!(tokio::task::spawn_blocking(|| is_closed(socket)).await.unwrap());
 }
 
+#[tokio::test]
+async fn what_is_no_message_and_no_call_is_refused_in_words() {
+    let server = Server::start(&["--log", "error"]);
+    // A field of a length that is not there.
+    let mut head = "POST /palpate.v1.SessionService/GetSession HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\
+                    Content-Type: application/grpc-web+proto\r\nContent-Length: 7\r\n\r\n"
+        .as_bytes()
+        .to_vec();
+    head.extend([0, 0, 0, 0, 2, 0x0a, 0x7f]);
+    let ask = |said: &[u8]| {
+        let mut socket = connect(&server);
+        socket.write_all(said).unwrap();
+        let mut answer = Vec::new();
+        socket.read_to_end(&mut answer).unwrap();
+        String::from_utf8_lossy(&answer).to_lowercase()
+    };
+    let answer = ask(&head);
+    assert!(answer.contains("grpc-status: 3") || answer.contains("grpc-status:3"), "{answer}");
+    assert!(answer.contains("grpc-status-details-bin"), "{answer}");
+    let path = "/palpate.v1.SessionService/GetSession HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n";
+    let answer = ask(format!("POST {path}Content-Type: application/json\r\nContent-Length: 2\r\n\r\n{{}}").as_bytes());
+    assert!(answer.starts_with("http/1.1 415") && answer.contains("application/grpc-web"), "{answer}");
+    let answer = ask(format!("GET {path}\r\n").as_bytes());
+    assert!(answer.starts_with("http/1.1 405") && answer.contains("post"), "{answer}");
+}
+
 #[cfg(unix)]
 #[tokio::test]
 async fn connections_that_show_no_token_leave_room_for_who_does() {

@@ -218,6 +218,70 @@ async fn a_client_that_stands_still_keeps_its_stream_and_its_tool_lets_go() {
     tokio::task::spawn_blocking(|| clients.into_iter().for_each(|client| client.join().unwrap())).await.unwrap();
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn commands_before_a_stream_is_open_are_taken_in_or_refused() {
+    let server = Server::start(&["--log", "error"]);
+    let session = server.create(small(), false).await.unwrap().session_id;
+    let (outbound, messages) = mpsc::channel(1 << 20);
+    let say = |message: Say| outbound.try_send(pb::TouchRequest { message: Some(message) }).unwrap();
+    // With a device, so that a force law is computed first.
+    let device = palpate::haptics::Device::named("omega3").unwrap();
+    say(Say::Open(pb::TouchOpen { device: Some(wire::local::device(&device)), ..open(&session, &[0]) }));
+    const COMMANDS: u64 = 20_000;
+    for sequence in 1..=COMMANDS {
+        let action = Action::Lead { place_m: DVec3::new(0.04, 0.04, 0.02), tip: Tip::default() };
+        say(Say::Command(wire::command::now(0, sequence, &action, 1000 * sequence)));
+    }
+    let channel = server.channel().await;
+    let mut inbound =
+        HapticServiceClient::new(channel).touch(ReceiverStream::new(messages)).await.unwrap().into_inner();
+    let commands = tokio::time::timeout(PATIENCE, async {
+        loop {
+            let ended = inbound.message().await.map(|message| message.expect("the stream is over")).err();
+            let commands = server.status(&session).await.commands.unwrap();
+            if let Some(status) = &ended {
+                // Our own rule for who is far too fast, with a reason; not the transport's.
+                assert_eq!(server::told(status).1, "RATE_LIMITED");
+            }
+            if ended.is_some() || commands.accepted + commands.refused == COMMANDS {
+                return commands;
+            }
+        }
+    });
+    let commands = commands.await.expect("the commands do not come");
+    assert!(commands.accepted > 0, "{commands:?}");
+}
+
+/// A server that takes connections and says nothing.
+#[test]
+fn no_program_waits_for_who_says_nothing() {
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let url = format!("http://{}", listener.local_addr().unwrap());
+    let programs = [
+        "replay vertical-60 --quiet --server",
+        "load --sessions 1 --seconds 1 --server",
+        "bridge --seconds 1 --server",
+        "top --once",
+        "health",
+    ];
+    let client = server::client_program();
+    let start = |program: &str| {
+        let mut command = std::process::Command::new(&client);
+        command.args(program.split(' ')).arg(&url).stderr(std::process::Stdio::piped()).spawn().unwrap()
+    };
+    let children: Vec<_> = programs.into_iter().map(|program| (program, start(program))).collect();
+    for (program, child) in children {
+        let ended = child.wait_with_output().unwrap();
+        let said = String::from_utf8(ended.stderr).unwrap();
+        assert_eq!(ended.status.code(), Some(1), "{program}: {said}");
+        assert!(said.contains("says nothing") || said.contains("never connected"), "{program}: {said}");
+    }
+    // And nobody who hears what went wrong is no reason to break down.
+    let shell = format!("'{}' health 127.0.0.1:1 2>&-", client.display());
+    let ended = std::process::Command::new("sh").args(["-c", &shell]).status().unwrap();
+    assert_eq!(ended.code(), Some(1));
+}
+
 #[tokio::test]
 async fn a_cut_by_the_transport_is_logged_and_counted() {
     let mut server = Server::start(&["--metrics", "127.0.0.1:0"]);

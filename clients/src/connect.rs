@@ -174,7 +174,10 @@ fn in_words(said: &str) -> String {
         ("excessive load", "the server's transport cut it, for too much came at once"),
         ("keep-alive timed out", "nothing was heard for too long"),
     ];
-    known.iter().find(|(name, _)| said.contains(name)).map_or_else(|| said.to_owned(), |(_, words)| format!("{words} ({said})"))
+    known
+        .iter()
+        .find(|(name, _)| said.contains(name))
+        .map_or_else(|| said.to_owned(), |(_, words)| format!("{words} ({said})"))
 }
 
 impl Credentials {
@@ -226,7 +229,9 @@ fn warn_if_readable(path: &Path) {
         use std::os::unix::fs::PermissionsExt;
         if std::fs::metadata(path).is_ok_and(|meta| meta.permissions().mode() & 0o007 != 0) {
             let path = path.display();
-            crate::say!("palpate-client: warning: {path}: every user of this machine can read it; `chmod o= {path}` ends that");
+            crate::say!(
+                "palpate-client: warning: {path}: every user of this machine can read it; `chmod o= {path}` ends that"
+            );
         }
     }
     #[cfg(not(unix))]

@@ -531,7 +531,8 @@ async fn play(
     output.flush().map_err(written)?;
     if arguments.plot {
         // Not among the records.
-        let show = |text: String| if arguments.output.is_some() { crate::tell!("{text}") } else { crate::say!("{text}") };
+        let show =
+            |text: String| if arguments.output.is_some() { crate::tell!("{text}") } else { crate::say!("{text}") };
         show(plot::draw("Displacement of the control point along z, m", &seen.displacement));
         show(plot::draw("Force of the tissue on the tool along z, N", &seen.reaction));
     }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::Duration;
 
-use http::{HeaderValue, Request, Response, header};
+use http::{HeaderValue, Method, Request, Response, StatusCode, header};
 use tonic::Status;
 use tonic::body::Body;
 use tower::{Layer, Service};
@@ -117,6 +117,30 @@ impl GuardLayer {
     }
 }
 
+/// What is told to who asks for a call in another way than gRPC: gRPC itself could not say it so that they read it.
+fn misdirected<B>(request: &Request<B>) -> Option<Response<Body>> {
+    let path = request.uri().path();
+    access(path)?;
+    let kind = request.headers().get(header::CONTENT_TYPE).map(HeaderValue::as_bytes).unwrap_or_default();
+    let (status, message) = if request.method() != Method::POST {
+        (StatusCode::METHOD_NOT_ALLOWED, "is a gRPC call: it is made by POST")
+    } else if !kind.starts_with(b"application/grpc") {
+        (
+            StatusCode::UNSUPPORTED_MEDIA_TYPE,
+            "is a gRPC call: its content-type is application/grpc or application/grpc-web",
+        )
+    } else {
+        return None;
+    };
+    let mut answer = Response::new(Body::new(axum::body::Body::from(format!("{path} {message}\n"))));
+    *answer.status_mut() = status;
+    answer.headers_mut().insert(header::CONTENT_TYPE, HeaderValue::from_static("text/plain; charset=utf-8"));
+    if status == StatusCode::METHOD_NOT_ALLOWED {
+        answer.headers_mut().insert(header::ALLOW, HeaderValue::from_static("POST"));
+    }
+    Some(answer)
+}
+
 impl<S> Service<Request<Body>> for Guard<S>
 where
     S: Service<Request<Body>, Response = Response<Body>>,
@@ -131,6 +155,9 @@ where
     }
 
     fn call(&mut self, request: Request<Body>) -> Self::Future {
+        if let Some(answer) = misdirected(&request) {
+            return Box::pin(async move { Ok(answer) });
+        }
         match self.layer.admit(&request) {
             Ok((caller, shown)) => {
                 let pace = match request.uri().path() {

@@ -255,7 +255,8 @@ pub(crate) async fn run(
     let served = served.map_err(|error| Failure::Failed(format!("the device: {error}")))?;
     let never = {
         let inbound = shared.inbound();
-        (inbound.connections == 0).then(|| inbound.failure.clone().unwrap_or("the server said nothing in time".to_owned()))
+        (inbound.connections == 0)
+            .then(|| inbound.failure.clone().unwrap_or("the server said nothing in time".to_owned()))
     };
     match never {
         Some(why) => Err(Failure::Failed(format!("never connected: {why}"))),
