@@ -20,6 +20,13 @@ use palpate::texture;
 use tokio_util::sync::CancellationToken;
 use tracing_subscriber::fmt::format::FmtSpan;
 
+/// Tells whoever looks at the standard error; that nobody does is no reason to break down.
+macro_rules! say {
+    ($($text:tt)*) => {{
+        let _ = std::io::stderr().write_all((format!($($text)*) + "\n").as_bytes());
+    }};
+}
+
 /// A server for touching soft tissue over a network.
 #[derive(Parser)]
 #[command(version, about, max_term_width = 100)]
@@ -274,7 +281,7 @@ fn main() -> ExitCode {
         Err(Failure::Failed(message)) => (1, message),
         Err(Failure::Refused(message)) => (2, message),
     };
-    eprintln!("palpate: {message}");
+    say!("palpate: {message}");
     ExitCode::from(status)
 }
 
@@ -371,7 +378,7 @@ fn top(arguments: &[std::ffi::OsString]) -> ExitCode {
     match std::process::Command::new(&program).arg("top").args(arguments).status() {
         Ok(status) => status.code().and_then(|code| u8::try_from(code).ok()).map_or(ExitCode::FAILURE, ExitCode::from),
         Err(e) => {
-            eprintln!("palpate: {}: {e}", program.display());
+            say!("palpate: {}: {e}", program.display());
             ExitCode::FAILURE
         }
     }
@@ -476,7 +483,7 @@ fn with_progress<T>(steps: u64, work: impl FnOnce(&mut dyn FnMut(u64)) -> T) -> 
         }
     });
     if watched && clock_s() - begun_s > 1.0 {
-        eprintln!();
+        say!("");
     }
     done
 }
@@ -509,7 +516,7 @@ fn render(arguments: &RenderArguments) -> Result<(), Failure> {
     let (model, limits) = compile(&arguments.scene)?;
     let script = Script::load(&arguments.script, &model.scene, &limits)?;
     for warning in model.warnings.iter().chain(&script.warnings) {
-        eprintln!("palpate: warning: {warning}");
+        say!("palpate: warning: {warning}");
     }
     let rate_hz = model.scene.stepping.rate_hz;
     let at_step = arguments.at_s.map(|at_s| {
@@ -552,7 +559,7 @@ fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     let (model, limits) = compile(&arguments.scene)?;
     let script = Script::load(&arguments.script, &model.scene, &limits)?;
     for warning in model.warnings.iter().chain(&script.warnings) {
-        eprintln!("palpate: warning: {warning}");
+        say!("palpate: warning: {warning}");
     }
     let output: Box<dyn Write> = match &arguments.output {
         Some(path) => Box::new(
