@@ -155,11 +155,12 @@ where
     }
 
     fn call(&mut self, request: Request<Body>) -> Self::Future {
-        if let Some(answer) = misdirected(&request) {
-            return Box::pin(async move { Ok(answer) });
-        }
         match self.layer.admit(&request) {
             Ok((caller, shown)) => {
+                // Who may not call is told that first.
+                if let Some(answer) = misdirected(&request) {
+                    return Box::pin(async move { Ok(answer) });
+                }
                 let pace = match request.uri().path() {
                     TOUCH => Pace::Own,
                     path if path.starts_with(REFLECTION) => Pace::Each(self.layer.patience),
