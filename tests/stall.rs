@@ -248,7 +248,9 @@ async fn commands_before_a_stream_is_open_are_taken_in_or_refused() {
             }
         }
     });
-    let commands = commands.await.expect("the commands do not come");
+    let Ok(commands) = commands.await else {
+        panic!("the commands do not come: {:?}", server.status(&session).await.commands)
+    };
     assert!(commands.accepted > 0, "{commands:?}");
 }
 

@@ -174,10 +174,10 @@ impl Haptics {
         for command in early.dropped.drain(..) {
             let message = "was one of too many that came before the stream was open";
             let refusal = Refusal::new(Reason::QueueFull, "command", message);
-            live.count_refused(1);
             self.0.traffic.refused(refusal.reason);
             events.push(Event::Rejected(wire::sample::rejection(command.0, command.1, &refusal)));
         }
+        live.count_refused(early.refused);
         loop {
             match early.next(&mut inbound).await {
                 Ok(Some(pb::TouchRequest { message: Some(Message::Command(command)) })) => {
@@ -236,7 +236,8 @@ impl Haptics {
 #[derive(Default)]
 struct Early {
     said: VecDeque<Result<Option<pb::TouchRequest>, Status>>,
-    /// Tool and sequence number of the oldest commands, when they were too many.
+    /// Commands that were dropped for newer ones, and of the last of those tool and sequence number.
+    refused: usize,
     dropped: VecDeque<(u32, u64)>,
 }
 
@@ -263,6 +264,7 @@ impl Early {
             if self.said.len() > most
                 && let Some(Ok(Some(pb::TouchRequest { message: Some(Message::Command(old)) }))) = self.said.pop_front()
             {
+                self.refused += 1;
                 self.dropped.push_back((old.tool, old.sequence));
                 if self.dropped.len() > most {
                     self.dropped.pop_front();
