@@ -11,6 +11,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     std::fs::write(out.join("palpate.bin"), prost::Message::encode_to_vec(&descriptors))?;
     // Frames are shared between viewers, not copied for each.
     let shared = [".palpate.v1.Patch.displacement", ".palpate.v1.GetTextureResponse.png"];
-    shared.iter().fold(tonic_prost_build::configure(), tonic_prost_build::Builder::bytes).compile_fds(descriptors)?;
+    let build = tonic_prost_build::configure().codec_path("crate::wire::codec::Codec");
+    shared.iter().fold(build, tonic_prost_build::Builder::bytes).compile_fds(descriptors)?;
     Ok(())
 }

@@ -49,7 +49,7 @@ pub struct Limits {
     pub lease_s: f64,
     /// Share of a stepping thread's time that sessions may take before no further one is let in, 0 to 1.
     pub thread_share: f64,
-    /// Connections; what comes above that is closed at once.
+    /// Connections; what comes above that is closed at once. Fewer, if the process may not open as many files.
     pub connections: usize,
     /// Connections from one address, of IPv6 from one network of 64 bits; what comes above that is closed at once.
     pub connections_per_address: usize,
@@ -57,11 +57,13 @@ pub struct Limits {
     pub streams_per_connection: u32,
     /// Bytes of a message from a client.
     pub message_bytes: usize,
-    /// Bytes of a connection that wait to be read, in all its streams, before the transport holds the client back.
+    /// Bytes of a connection that wait to be read, in all its streams, before the transport holds the client back: what a
+    /// connection can take of the server's memory.
     pub connection_window_bytes: u32,
     /// A connection that has not said what it wants to speak after so long is closed, the handshake of TLS included, s.
     pub handshake_s: f64,
-    /// A haptic stream without its first message after so long is ended, s.
+    /// A haptic stream without its first message after so long is ended, and so is a call whose message has not come in
+    /// full, s.
     pub open_s: f64,
     /// A connection is asked whether it lives when it was silent so long, and closed if it does not answer for as long, s.
     pub keepalive_s: f64,
@@ -101,7 +103,7 @@ impl Default for Limits {
             connections_per_address: 2048,
             streams_per_connection: 256,
             message_bytes: 1 << 20,
-            connection_window_bytes: 1 << 18,
+            connection_window_bytes: 1 << 20,
             handshake_s: 10.0,
             open_s: 10.0,
             keepalive_s: 10.0,

@@ -20,6 +20,13 @@ use palpate::texture;
 use tokio_util::sync::CancellationToken;
 use tracing_subscriber::fmt::format::FmtSpan;
 
+/// Tells whoever looks at the standard error; that nobody does is no reason to break down.
+macro_rules! say {
+    ($($text:tt)*) => {{
+        let _ = std::io::stderr().write_all((format!($($text)*) + "\n").as_bytes());
+    }};
+}
+
 /// A server for touching soft tissue over a network.
 #[derive(Parser)]
 #[command(version, about, max_term_width = 100)]
@@ -72,8 +79,9 @@ enum Command {
         `authorization: Bearer TOKEN`; roles are watch, touch (hold a tool, change the tissue), create (make,\n\
         start, stop and delete sessions) and administer (everything; the only one that lists sessions). Health, reflection\n\
         and the page's files are open; the page takes a token behind its address, as in https://server:7117/#token=TOKEN.\n\
-        Certificates, keys and tokens are looked at every second: new ones hold at once, for new connections and calls;\n\
-        what makes no sense is logged, and the old ones hold.")]
+        Certificates, keys and tokens are looked at twice a second: new ones hold at once, for new connections and calls;\n\
+        what makes no sense is logged, and the old ones hold: health tells of it as `palpate.tokens`. SIGHUP has them looked at\n\
+        at once.")]
     Serve(Box<ServeArguments>),
     /// Make a token for clients of a server: prints the token, once, and keeps only its hash
     #[command(after_help = "Examples:\n  \
@@ -273,7 +281,7 @@ fn main() -> ExitCode {
         Err(Failure::Failed(message)) => (1, message),
         Err(Failure::Refused(message)) => (2, message),
     };
-    eprintln!("palpate: {message}");
+    say!("palpate: {message}");
     ExitCode::from(status)
 }
 
@@ -351,6 +359,7 @@ fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     let ended = runtime.block_on(async {
         let doors = Doors::open(&config).await?;
         let shutdown = CancellationToken::new();
+        outlive_signals();
         tokio::spawn(cancel_on_signal(shutdown.clone()));
         // Who started us may have stopped listening; we serve all the same.
         let _ = writeln!(std::io::stdout(), "palpate listens on {}", doors.url());
@@ -369,7 +378,7 @@ fn top(arguments: &[std::ffi::OsString]) -> ExitCode {
     match std::process::Command::new(&program).arg("top").args(arguments).status() {
         Ok(status) => status.code().and_then(|code| u8::try_from(code).ok()).map_or(ExitCode::FAILURE, ExitCode::from),
         Err(e) => {
-            eprintln!("palpate: {}: {e}", program.display());
+            say!("palpate: {}: {e}", program.display());
             ExitCode::FAILURE
         }
     }
@@ -396,6 +405,20 @@ fn token(arguments: &TokenArguments) -> Result<(), Failure> {
     // In one piece: a server may look at any moment.
     file.write_all(format!("\n{entry}").as_bytes()).map_err(refuse)?;
     writeln!(std::io::stdout(), "{token}").map_err(|e| Failure::Failed(e.to_string()))
+}
+
+/// What would end a process by default and is no reason for a server to end: SIGHUP has it look at its files, the others
+/// mean nothing to it; a log that may not grow any more (SIGXFSZ) is an error to who writes it.
+fn outlive_signals() {
+    #[cfg(unix)]
+    {
+        use rustix::process::Signal;
+        use tokio::signal::unix::{SignalKind, signal};
+        for ignored in [Signal::HUP, Signal::USR1, Signal::USR2, Signal::XFSZ] {
+            // Caught from now on, though nobody is told here.
+            let _ = signal(SignalKind::from_raw(ignored.as_raw()));
+        }
+    }
 }
 
 /// Ctrl-C and SIGTERM end the server; a second one ends it at once.
@@ -460,7 +483,7 @@ fn with_progress<T>(steps: u64, work: impl FnOnce(&mut dyn FnMut(u64)) -> T) -> 
         }
     });
     if watched && clock_s() - begun_s > 1.0 {
-        eprintln!();
+        say!("");
     }
     done
 }
@@ -493,7 +516,7 @@ fn render(arguments: &RenderArguments) -> Result<(), Failure> {
     let (model, limits) = compile(&arguments.scene)?;
     let script = Script::load(&arguments.script, &model.scene, &limits)?;
     for warning in model.warnings.iter().chain(&script.warnings) {
-        eprintln!("palpate: warning: {warning}");
+        say!("palpate: warning: {warning}");
     }
     let rate_hz = model.scene.stepping.rate_hz;
     let at_step = arguments.at_s.map(|at_s| {
@@ -536,7 +559,7 @@ fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     let (model, limits) = compile(&arguments.scene)?;
     let script = Script::load(&arguments.script, &model.scene, &limits)?;
     for warning in model.warnings.iter().chain(&script.warnings) {
-        eprintln!("palpate: warning: {warning}");
+        say!("palpate: warning: {warning}");
     }
     let output: Box<dyn Write> = match &arguments.output {
         Some(path) => Box::new(

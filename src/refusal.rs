@@ -126,7 +126,10 @@ impl fmt::Display for Refusal {
         if !self.field.is_empty() {
             write!(f, "{}: ", self.field)?;
         }
-        f.write_str(&self.message)
+        // A message may quote what a client sent; that must move no cursor, and begin no line of a log. What was read from a
+        // file is shown with its lines.
+        let lines = self.place.is_some();
+        f.write_str(&self.message.replace(|c: char| c.is_control() && !(lines && c == '\n'), "?"))
     }
 }
 
@@ -174,4 +177,18 @@ pub fn label(field: &str, label: &str) -> Result<()> {
         return Err(Refusal::new(Reason::OutOfRange, field, message));
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_client_sent_moves_no_cursor_and_begins_no_line() {
+        let refusal = Refusal::new(Reason::UnknownScene, "scene_name", "there is no `a\x1b[2J\r\nINFO\u{9b}`");
+        assert_eq!(refusal.to_string(), "scene_name: there is no `a?[2J??INFO?`");
+        let of_file =
+            Refusal { place: Some("a.toml:1".into()), ..Refusal::new(Reason::Unreadable, "", "two\nlines\x07") };
+        assert_eq!(of_file.to_string(), "a.toml:1: two\nlines?");
+    }
 }

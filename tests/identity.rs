@@ -241,6 +241,152 @@ async fn who_loses_a_token_loses_the_streams_and_tools_that_it_opened() {
     }
 }
 
+/// A haptic stream of whom a token was given, over a connection whose transport lets so many bytes of answers in.
+async fn touch_with(
+    server: &Server,
+    token: &str,
+    session: &str,
+    window_bytes: u32,
+) -> (tokio::sync::mpsc::Sender<pb::TouchRequest>, Channel, tonic::Streaming<pb::TouchResponse>) {
+    let endpoint = Channel::from_shared(server.url.clone()).unwrap();
+    let channel = endpoint.initial_stream_window_size(window_bytes).connect().await.unwrap();
+    let (sender, receiver) = tokio::sync::mpsc::channel(4);
+    let message = Some(pb::touch_request::Message::Open(server::open(session, &[0])));
+    sender.send(pb::TouchRequest { message }).await.unwrap();
+    let outbound = tokio_stream::wrappers::ReceiverStream::new(receiver);
+    let mut haptics = pb::haptic_service_client::HapticServiceClient::new(channel.clone());
+    let inbound = haptics.touch(with_token(outbound, token)).await.unwrap().into_inner();
+    (sender, channel, inbound)
+}
+
+#[tokio::test]
+async fn who_loses_a_token_and_does_not_read_commands_nothing_more() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("tokens.toml");
+    let stays = token(&file, "stays", "create,touch");
+    let before = std::fs::read_to_string(&file).unwrap();
+    let goes = token(&file, "goes", "touch");
+    let (server, log) = start_logged(&["--tokens", file.to_str().unwrap()]);
+    let source = Some(pb::create_session_request::Source::SceneName("paper".into()));
+    let request = pb::CreateSessionRequest { source, ..Default::default() };
+    let created = server.sessions().await.create_session(with_token(request, &stays)).await.unwrap();
+    let session = created.into_inner().session.unwrap().session_id;
+    let status = async || {
+        let request = pb::GetSessionRequest { session_id: session.clone() };
+        let told = server.sessions().await.get_session(with_token(request, &stays)).await.unwrap();
+        told.into_inner().session.unwrap()
+    };
+    // What is not read fills the window; commands go on.
+    let (sender, _channel, _unread) = touch_with(&server, &goes, &session, 1).await;
+    let mut sequence = 0;
+    let command = async |sequence: u64| {
+        let message = Some(pb::touch_request::Message::Command(force(0, sequence, -1.0)));
+        tokio::time::timeout(PATIENCE, sender.send(pb::TouchRequest { message })).await.unwrap().is_ok()
+    };
+    while status().await.commands.unwrap().applied < 20 {
+        sequence += 1;
+        assert!(command(sequence).await);
+    }
+    std::fs::write(&file, &before).unwrap();
+    log.wait_for("call ended");
+    let accepted = status().await.commands.unwrap().accepted;
+    // Both directions end, though nothing was read.
+    loop {
+        sequence += 1;
+        if !command(sequence).await {
+            break;
+        }
+        tokio::time::sleep(std::time::Duration::from_millis(1)).await;
+    }
+    log.wait_for("it does not read that its call is over");
+    let after = status().await;
+    assert!(after.held_tools.is_empty(), "{after:?}");
+    assert_eq!(after.commands.unwrap().accepted, accepted);
+}
+
+#[cfg(unix)]
+#[tokio::test]
+async fn tokens_that_can_not_be_read_are_told_of_and_the_old_ones_hold() {
+    use tonic_health::ServingStatus::{NotServing, Serving};
+    use tonic_health::pb::HealthCheckRequest;
+    use tonic_health::pb::health_client::HealthClient;
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("tokens.toml");
+    let known = token(&file, "known", "watch");
+    let text = std::fs::read_to_string(&file).unwrap();
+    let (server, _log) = start_logged(&["--tokens", file.to_str().unwrap()]);
+    let channel = server.channel().await;
+    let mut health = HealthClient::new(channel.clone());
+    let request = |service: &str| HealthCheckRequest { service: service.into() };
+    let mut watching = health.watch(request("palpate.tokens")).await.unwrap().into_inner();
+    let mut told = async || {
+        let answer = tokio::time::timeout(PATIENCE, watching.message()).await.unwrap();
+        answer.unwrap().unwrap().status
+    };
+    assert_eq!(told().await, Serving as i32);
+    let list = "/palpate.v1.SessionService/ListScenes";
+    let is_known = async || call(&channel, list, Some(&format!("Bearer {known}"))).await.is_ok();
+    let remove = || std::fs::remove_file(&file).unwrap();
+    let cases: [(&str, &dyn Fn()); 4] = [
+        ("a pipe", &|| {
+            remove();
+            assert!(Command::new("mkfifo").arg(&file).status().unwrap().success());
+        }),
+        ("nothing", &remove),
+        ("being written", &|| std::fs::write(&file, "").unwrap()),
+        ("nonsense", &|| std::fs::write(&file, "[[tok").unwrap()),
+    ];
+    for (what, spoil) in cases {
+        spoil();
+        assert_eq!(told().await, NotServing as i32, "{what}");
+        assert!(is_known().await, "{what}");
+        assert_eq!(health.check(request("")).await.unwrap().into_inner().status, Serving as i32, "{what}");
+        let _ = std::fs::remove_file(&file);
+        std::fs::write(&file, &text).unwrap();
+        assert_eq!(told().await, Serving as i32, "after {what}");
+    }
+    // What can be read and has no token in it lets nobody in.
+    std::fs::write(&file, "# nobody\n").unwrap();
+    let waited = tokio::time::timeout(PATIENCE, async { while is_known().await {} });
+    waited.await.expect("a token that is not in the file is known");
+}
+
+#[cfg(unix)]
+#[test]
+fn signals_that_mean_nothing_to_a_server_do_not_end_it_and_a_hangup_has_it_look() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("tokens.toml");
+    token(&file, "known", "watch");
+    let (mut server, log) = start_logged(&["--tokens", file.to_str().unwrap()]);
+    for signal in ["-USR1", "-USR2", "-XFSZ", "-HUP"] {
+        let id = server.child.id().to_string();
+        assert!(Command::new("kill").args([signal, &id]).status().unwrap().success());
+    }
+    log.wait_for("told to look at the files");
+    assert_eq!(server.child.try_wait().unwrap(), None);
+}
+
+#[tokio::test]
+async fn a_certificate_near_its_end_is_warned_of() {
+    let authority = Authority::new();
+    let folder = tempfile::tempdir().unwrap();
+    let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap();
+    let today = rcgen::date_time_ymd(1970, 1, 1) + now;
+    for (name, ends, told) in [
+        ("soon", today + std::time::Duration::from_secs(3 * 86_400 + 3600), "expires in 3 days"),
+        ("over", today - std::time::Duration::from_secs(86_400), "has expired"),
+    ] {
+        let mut params = CertificateParams::new(vec!["localhost".to_owned()]).unwrap();
+        params.not_after = ends;
+        let key = KeyPair::generate().unwrap();
+        let cert = params.signed_by(&key, &authority.issuer).unwrap();
+        let names = [format!("{name}.pem"), format!("{name}.key")];
+        let [cert, key] = write(folder.path(), [(&names[0], &cert.pem()), (&names[1], &key.serialize_pem())]);
+        let (_server, log) = start_logged(&["--tls-cert", &cert, "--tls-key", &key]);
+        log.wait_for(told);
+    }
+}
+
 /// What a server logs, as it does.
 struct Log(mpsc::Receiver<String>);
 

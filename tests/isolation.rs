@@ -137,6 +137,106 @@ async fn a_stream_that_never_opens_is_ended() {
 }
 
 #[tokio::test]
+async fn a_call_whose_message_does_not_come_is_ended() {
+    let server = limited("open_s = 0.2", &[]);
+    // A stream that is half open: the head of a call, and no message.
+    let channel = server.channel().await;
+    for path in ["/palpate.v1.SessionService/ListScenes", "/grpc.reflection.v1.ServerReflection/ServerReflectionInfo"] {
+        let mut grpc = tonic::client::Grpc::new(channel.clone());
+        grpc.ready().await.unwrap();
+        let codec = tonic_prost::ProstCodec::<(), ()>::default();
+        let silent = tonic::Request::new(tokio_stream::pending());
+        let ended = tokio::time::timeout(PATIENCE, async {
+            let mut answer = grpc.streaming(silent, path.parse().unwrap(), codec).await?.into_inner();
+            answer.message().await
+        });
+        match ended.await.unwrap() {
+            // Reflection ends without a word.
+            Ok(message) => assert!(message.is_none() && path.starts_with("/grpc.reflection."), "{path}"),
+            Err(status) => {
+                assert_eq!(told(&status), (Code::DeadlineExceeded, "TIMED_OUT".into(), "request".into()), "{path}");
+            }
+        }
+    }
+    // A browser's call that says how long it is, and no more.
+    let mut socket = connect(&server);
+    let head = "POST /palpate.v1.SessionService/ListScenes HTTP/1.1\r\nHost: localhost\r\n\
+                Content-Type: application/grpc-web+proto\r\nContent-Length: 5\r\n\r\n";
+    socket.write_all(head.as_bytes()).unwrap();
+    assert!(tokio::task::spawn_blocking(|| is_closed(socket)).await.unwrap());
+}
+
+#[tokio::test]
+async fn what_is_no_message_and_no_call_is_refused_in_words() {
+    let server = Server::start(&["--log", "error"]);
+    // A field of a length that is not there.
+    let mut head = "POST /palpate.v1.SessionService/GetSession HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\
+                    Content-Type: application/grpc-web+proto\r\nContent-Length: 7\r\n\r\n"
+        .as_bytes()
+        .to_vec();
+    head.extend([0, 0, 0, 0, 2, 0x0a, 0x7f]);
+    let ask = |said: &[u8]| {
+        let mut socket = connect(&server);
+        socket.write_all(said).unwrap();
+        let mut answer = Vec::new();
+        socket.read_to_end(&mut answer).unwrap();
+        String::from_utf8_lossy(&answer).to_lowercase()
+    };
+    let answer = ask(&head);
+    assert!(answer.contains("grpc-status: 3") || answer.contains("grpc-status:3"), "{answer}");
+    assert!(answer.contains("grpc-status-details-bin"), "{answer}");
+    let path = "/palpate.v1.SessionService/GetSession HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n";
+    let answer = ask(format!("POST {path}Content-Type: application/json\r\nContent-Length: 2\r\n\r\n{{}}").as_bytes());
+    assert!(answer.starts_with("http/1.1 415") && answer.contains("application/grpc-web"), "{answer}");
+    let answer = ask(format!("GET {path}\r\n").as_bytes());
+    assert!(answer.starts_with("http/1.1 405") && answer.contains("post"), "{answer}");
+}
+
+#[cfg(unix)]
+#[tokio::test]
+async fn connections_that_show_no_token_leave_room_for_who_does() {
+    let folder = tempfile::tempdir().unwrap();
+    let tokens = folder.path().join("tokens.toml");
+    let file = tokens.to_str().unwrap();
+    let made = server::palpate(&["token", "--name", "a", "--role", "create,touch", "--tokens", file]);
+    let token = format!("Bearer {}", String::from_utf8(made.stdout).unwrap().trim());
+    let server = limited("connections = 8\nhandshake_s = 600.0", &["--log", "error", "--tokens", file]);
+    let list = async |channel: tonic::transport::Channel| {
+        let mut request = tonic::Request::new(pb::ListScenesRequest {});
+        request.metadata_mut().insert("authorization", token.parse().unwrap());
+        let mut sessions = pb::session_service_client::SessionServiceClient::new(channel);
+        tokio::time::timeout(PATIENCE, sessions.list_scenes(request)).await.unwrap()
+    };
+    let known = server.channel().await;
+    list(known.clone()).await.unwrap();
+    let silent: Vec<TcpStream> = (0..100).map(|_| connect(&server)).collect();
+    // Who is known stays, and who comes now is let in.
+    list(known).await.unwrap();
+    list(server.channel().await).await.unwrap();
+    let closed = tokio::task::spawn_blocking(move || {
+        let mut closed = 0;
+        for socket in silent {
+            socket.set_read_timeout(Some(Duration::from_millis(20))).unwrap();
+            closed += usize::from(is_closed(socket));
+        }
+        closed
+    });
+    assert!(closed.await.unwrap() >= 92);
+}
+
+#[cfg(unix)]
+#[tokio::test]
+async fn a_server_raises_its_limit_of_descriptors() {
+    let server = serve("ulimit -Sn 40 && exec \"$0\" serve --log error --listen", "127.0.0.1:0");
+    let session = server.paper(false).await;
+    let held: Vec<TcpStream> = (0..100).map(|_| connect(&server)).collect();
+    // All of them are there, and more.
+    all_act(&server, &session, 3).await;
+    assert!(handles(&server) > 100);
+    drop(held);
+}
+
+#[tokio::test]
 async fn a_message_that_is_too_large_is_refused_and_the_connection_goes_on() {
     let server = limited("message_bytes = 10000", &[]);
     let session = server.paper(true).await;

@@ -561,3 +561,21 @@ fn bad_configuration_is_refused() {
         assert_eq!(output.status.code(), Some(2), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
     }
 }
+
+#[cfg(unix)]
+#[tokio::test]
+async fn who_watches_the_health_is_told_first_and_not_waited_for() {
+    use tonic_health::ServingStatus::{NotServing, Serving};
+    use tonic_health::pb::HealthCheckRequest;
+    use tonic_health::pb::health_client::HealthClient;
+    // A deadline that the test would not outlive.
+    let mut server = Server::start(&["--shutdown-deadline-s", "3600"]);
+    let mut health = HealthClient::new(server.channel().await);
+    let mut watching = health.watch(HealthCheckRequest::default()).await.unwrap().into_inner();
+    assert_eq!(watching.message().await.unwrap().unwrap().status, Serving as i32);
+    assert!(Command::new("kill").arg(server.child.id().to_string()).status().unwrap().success());
+    assert_eq!(watching.message().await.unwrap().unwrap().status, NotServing as i32);
+    assert!(watching.message().await.unwrap().is_none());
+    let ended = tokio::task::spawn_blocking(move || server.child.wait().unwrap());
+    assert!(tokio::time::timeout(PATIENCE, ended).await.unwrap().unwrap().success());
+}

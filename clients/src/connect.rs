@@ -1,14 +1,18 @@
 //! How every command reaches its server: in the clear, or by TLS, and with what shows who calls.
 
+use std::error::Error;
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use palpate::wire::error;
 use tonic::metadata::{Ascii, MetadataValue};
 use tonic::service::Interceptor;
 use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{Certificate, ClientTlsConfig, Endpoint, Identity, Uri};
 use tonic::{Request, Status};
+use tonic_health::pb::HealthCheckRequest;
+use tonic_health::pb::health_client::HealthClient;
 
 use crate::Failure;
 
@@ -55,7 +59,20 @@ pub(crate) struct Server {
     url: String,
     endpoint: Endpoint,
     bearer: Bearer,
+    /// For the connection and the first answer.
+    patience: Duration,
 }
+
+/// For the connection and the first answer, unless a program is in a hurry.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+/// A connection that says nothing for so long is asked whether it lives, and given up after [`PATIENCE`]: longer than a
+/// server may stand still.
+const SILENCE: Duration = Duration::from_secs(5);
+
+/// What may wait unread on a connection. Our transport cuts a connection when small messages nobody has read make up half of
+/// that, at 256 bytes each: this bears 5 s of samples of several tools at 1 kHz, while we stand still.
+const WINDOW_BYTES: u32 = 16 << 20;
 
 impl std::fmt::Debug for Server {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
@@ -80,45 +97,96 @@ impl Server {
         if token.is_some() && !secure && !is_here {
             return Err(refuse("a token would be sent in the clear; the URL must begin with https://"));
         }
-        let mut endpoint = Endpoint::from(uri).tcp_nodelay(true).connect_timeout(Duration::from_secs(10));
+        let mut endpoint = Endpoint::from(uri)
+            .tcp_nodelay(true)
+            .initial_connection_window_size(WINDOW_BYTES)
+            .http2_keep_alive_interval(SILENCE)
+            .keep_alive_timeout(PATIENCE)
+            .keep_alive_while_idle(true);
         if secure {
-            endpoint = endpoint.tls_config(credentials.tls()?).map_err(|e| refuse(&causes(&e)))?;
+            endpoint = endpoint.tls_config(credentials.tls()?).map_err(|e| refuse(&root(&e)))?;
         } else if credentials.ca.is_some() || credentials.cert.is_some() || credentials.tls_name.is_some() {
             let why =
                 "has no TLS, so --ca, --cert, --key and --tls-name mean nothing; the URL must begin with https://";
             return Err(refuse(why));
         }
-        Ok(Server { url: url_text, endpoint, bearer: Bearer(token) })
+        Ok(Server { url: url_text, endpoint, bearer: Bearer(token), patience: PATIENCE })
     }
 
     /// Gives up connecting after `timeout`.
     #[must_use]
     pub(crate) fn within(mut self, timeout: Duration) -> Self {
-        self.endpoint = self.endpoint.connect_timeout(timeout);
+        self.patience = timeout;
         self
     }
 
-    /// Connects.
+    /// Connects, and hears that a server is there: one that takes connections and says nothing is none.
     pub(crate) async fn connect(&self) -> Result<Channel, String> {
-        let connected = self.endpoint.connect().await;
-        let channel = connected.map_err(|e| format!("can't reach {}: {}", self.url, causes(&e)))?;
+        let unreached = |why: String| format!("can't reach {}: {why}", self.url);
+        let connecting = async {
+            let channel = self.endpoint.connect().await.map_err(|e| unreached(in_words(&root(&e))))?;
+            // Whatever it answers, it answers.
+            match HealthClient::new(channel.clone()).check(HealthCheckRequest::default()).await {
+                Err(status) if status.source().is_some() => Err(unreached(broken(&status))),
+                _ => Ok(channel),
+            }
+        };
+        let within_s = self.patience.as_secs_f64();
+        let silent = |_| unreached(format!("it takes the connection and says nothing for {within_s} s"));
+        let channel = tokio::time::timeout(self.patience, connecting).await.map_err(silent)??;
         Ok(InterceptedService::new(channel, self.bearer.clone()))
     }
 }
 
+/// What a program shows of a status: what the server says, or in words how the connection broke.
+pub(crate) fn describe(status: &Status) -> String {
+    if status.source().is_some() { broken(status) } else { error::describe(status) }
+}
+
+fn broken(status: &Status) -> String {
+    let root = status.source().map_or_else(|| status.message().to_owned(), root);
+    let hint = if root.contains("frame with invalid size") || root.contains("invalid HTTP version") {
+        "; it may speak TLS: then the URL begins with https://"
+    } else {
+        ""
+    };
+    format!("the connection broke: {}{hint}", in_words(&root))
+}
+
 /// What an error says at its root.
-fn causes(error: &tonic::transport::Error) -> String {
-    let mut cause: &dyn std::error::Error = error;
+fn root(error: &(dyn std::error::Error + 'static)) -> String {
+    let mut cause = error;
     while let Some(deeper) = cause.source() {
         cause = deeper;
     }
     cause.to_string()
 }
 
+/// What libraries say in names of their own, in words.
+fn in_words(said: &str) -> String {
+    let known = [
+        ("UnknownIssuer", "the server's certificate is signed by nobody that is trusted here; --ca FILE tells who is"),
+        ("NotValidForName", "the server's certificate is of another name; --tls-name NAME tells which is meant"),
+        ("Expired", "the server's certificate has expired"),
+        ("CertificateRequired", "the server asks for a client's certificate: --cert FILE and --key FILE"),
+        ("InvalidContentType", "it does not speak TLS; the URL may have to begin with http://"),
+        ("too_many_data_frames", "a transport cut it, for too many small messages waited unread"),
+        ("excessive load", "the server's transport cut it, for too much came at once"),
+        ("keep-alive timed out", "nothing was heard for too long"),
+    ];
+    known
+        .iter()
+        .find(|(name, _)| said.contains(name))
+        .map_or_else(|| said.to_owned(), |(_, words)| format!("{words} ({said})"))
+}
+
 impl Credentials {
     fn token(&self) -> Result<Option<MetadataValue<Ascii>>, Failure> {
         let (text, place) = match (&self.token_file, std::env::var("PALPATE_TOKEN")) {
-            (Some(path), _) => (read("--token-file", path)?, path.display().to_string()),
+            (Some(path), _) => {
+                warn_if_readable(path);
+                (read("--token-file", path)?, path.display().to_string())
+            }
             (None, Ok(text)) => (text, "PALPATE_TOKEN".to_owned()),
             (None, Err(_)) => return Ok(None),
         };
@@ -152,6 +220,22 @@ impl Credentials {
         }
         Ok(tls)
     }
+}
+
+/// A token that every user of this machine can read is no secret.
+fn warn_if_readable(path: &Path) {
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::PermissionsExt;
+        if std::fs::metadata(path).is_ok_and(|meta| meta.permissions().mode() & 0o007 != 0) {
+            let path = path.display();
+            crate::say!(
+                "palpate-client: warning: {path}: every user of this machine can read it; `chmod o= {path}` ends that"
+            );
+        }
+    }
+    #[cfg(not(unix))]
+    let _ = path;
 }
 
 fn read(option: &str, path: &Path) -> Result<String, Failure> {

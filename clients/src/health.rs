@@ -2,13 +2,12 @@
 
 use std::time::Duration;
 
-use palpate::wire::error::describe;
 use tonic_health::ServingStatus;
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_client::HealthClient;
 
 use crate::Failure;
-use crate::connect::{Credentials, Server};
+use crate::connect::{Credentials, Server, describe};
 
 /// What `health` is asked for.
 #[derive(clap::Args)]
@@ -35,6 +34,6 @@ pub(crate) async fn health(arguments: &Arguments) -> Result<(), Failure> {
     if status != ServingStatus::Serving as i32 {
         return Err(Failure::Failed("the server does not serve".into()));
     }
-    println!("serving");
+    crate::tell!("serving");
     Ok(())
 }

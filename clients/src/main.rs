@@ -3,6 +3,23 @@
 // Clients live in real time; the rule is for what a server computes.
 #![allow(clippy::disallowed_methods)]
 
+/// Tells whoever looks at the standard error; a program goes on though nobody does, and no control character of a server
+/// gets into a terminal.
+macro_rules! say {
+    ($($text:tt)*) => {{
+        let text = format!($($text)*).replace(|c: char| c.is_control() && c != '\n', "?");
+        let _ = std::io::Write::write_all(&mut std::io::stderr(), (text + "\n").as_bytes());
+    }};
+}
+
+/// The same of the standard output.
+macro_rules! tell {
+    ($($text:tt)*) => {{
+        let _ = std::io::Write::write_all(&mut std::io::stdout(), (format!($($text)*) + "\n").as_bytes());
+    }};
+}
+pub(crate) use {say, tell};
+
 mod bridge;
 mod connect;
 mod health;
@@ -108,6 +125,6 @@ async fn main() -> ExitCode {
         Err(Failure::Failed(message)) => (1, message),
         Err(Failure::Refused(message)) => (2, message),
     };
-    eprintln!("palpate-client: {message}");
+    crate::say!("palpate-client: {message}");
     ExitCode::from(status)
 }

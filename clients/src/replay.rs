@@ -13,7 +13,6 @@ use palpate::refusal::Refusal;
 use palpate::scene::Scene;
 use palpate::scene::record::{Line, Network, Percentiles, Record, Run, Summary, write_line};
 use palpate::scene::script::Script;
-use palpate::wire::error::describe;
 use palpate::wire::pb::create_session_request::Source;
 use palpate::wire::pb::haptic_service_client::HapticServiceClient;
 use palpate::wire::pb::session_service_client::SessionServiceClient;
@@ -25,7 +24,7 @@ use tokio::task::JoinHandle;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Status, Streaming};
 
-use crate::connect::{Channel, Credentials, Server};
+use crate::connect::{Channel, Credentials, Server, describe};
 use crate::{Failure, plot};
 
 /// How far ahead of the server's step commands are sent: a network may stall for about as long before time has to stand.
@@ -39,6 +38,9 @@ const HEARTBEAT: Duration = Duration::from_millis(5);
 
 /// A running session answers heartbeats at once; this long without a word is an end.
 const SILENCE: Duration = Duration::from_secs(10);
+
+/// A scene that takes longer to be laid out is too large for a replay.
+const PATIENCE: Duration = Duration::from_secs(120);
 
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
@@ -132,7 +134,9 @@ pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
     let mut client = SessionServiceClient::new(channel.clone());
     let request =
         pb::CreateSessionRequest { source: Some(source), paused: true, idle_timeout_s: Some(SILENCE.as_secs_f64()) };
-    let created = client.create_session(request).await.map_err(refused_or_failed)?.into_inner().session;
+    let silent = |_| Failure::Failed(format!("the server made no session within {} s", PATIENCE.as_secs()));
+    let created = tokio::time::timeout(PATIENCE, client.create_session(request)).await.map_err(silent)?;
+    let created = created.map_err(refused_or_failed)?.into_inner().session;
     let created = created.ok_or_else(|| Failure::Failed("the server made no session".into()))?;
     let mut session = Session { client, id: created.session_id.clone() };
     let sessions = session.client.clone();
@@ -349,7 +353,7 @@ async fn play(
     let limits = Limits::default();
     let script = Script::load(&arguments.script, &scene, &limits).map_err(refused)?;
     for warning in created.warnings.iter().chain(&script.warnings) {
-        eprintln!("palpate-client: warning: {warning}");
+        crate::say!("palpate-client: warning: {warning}");
     }
     let mut output: Box<dyn Write> = match &arguments.output {
         Some(path) => Box::new(BufWriter::new(
@@ -472,7 +476,7 @@ async fn play(
                 }
                 Some(Heard::Rejection(rejection)) => {
                     seen.rejected += 1;
-                    progress.suspend(|| eprintln!("palpate-client: warning: {}", rejection_text(&rejection)));
+                    progress.suspend(|| crate::say!("palpate-client: warning: {}", rejection_text(&rejection)));
                 }
                 Some(Heard::Opened(_)) | None => {}
             },
@@ -527,7 +531,8 @@ async fn play(
     output.flush().map_err(written)?;
     if arguments.plot {
         // Not among the records.
-        let show = |text: String| if arguments.output.is_some() { println!("{text}") } else { eprintln!("{text}") };
+        let show =
+            |text: String| if arguments.output.is_some() { crate::tell!("{text}") } else { crate::say!("{text}") };
         show(plot::draw("Displacement of the control point along z, m", &seen.displacement));
         show(plot::draw("Force of the tissue on the tool along z, N", &seen.reaction));
     }
@@ -569,9 +574,9 @@ fn table(arguments: &Arguments, summary: &Summary, network: &Network, seen: &See
     ];
     for (name, value) in rows {
         if arguments.output.is_some() {
-            println!("{name:<28}{value}");
+            crate::tell!("{name:<28}{value}");
         } else {
-            eprintln!("{name:<28}{value}");
+            crate::say!("{name:<28}{value}");
         }
     }
 }

@@ -5,14 +5,13 @@ use std::fmt::Write as _;
 use std::io::{ErrorKind, IsTerminal, Write};
 use std::time::{Duration, Instant};
 
-use palpate::wire::error::describe;
 use palpate::wire::pb::session_service_client::SessionServiceClient;
 use palpate::wire::pb::{Audit, AuditedError, ListSessionsRequest, Session, SessionState};
 use serde_json::{Value, json};
 use tonic::Code;
 
 use crate::Failure;
-use crate::connect::{Channel, Credentials, Server};
+use crate::connect::{Channel, Credentials, Server, describe};
 
 /// What `top` is asked for.
 #[derive(clap::Args)]
@@ -59,11 +58,13 @@ pub(crate) async fn top(arguments: &Arguments) -> Result<(), Failure> {
             _ = ticks.tick() => {}
             _ = tokio::signal::ctrl_c() => return Ok(()),
         }
-        let (rows, now) = match look(&mut sessions, seen.as_ref()).await {
+        let looked = tokio::time::timeout(PATIENCE, look(&mut sessions, seen.as_ref())).await;
+        let silent = |_| Err(tonic::Status::unavailable(format!("no answer within {} s", PATIENCE.as_secs())));
+        let (rows, now) = match looked.unwrap_or_else(silent) {
             Ok(looked) => looked,
             // The channel connects again by itself.
             Err(status) if status.code() == Code::Unavailable && !arguments.once => {
-                eprintln!("palpate-client: warning: {}; looking again", describe(&status));
+                crate::say!("palpate-client: warning: {}; looking again", describe(&status));
                 continue;
             }
             Err(status) => return Err(Failure::Failed(describe(&status))),
@@ -90,6 +91,9 @@ pub(crate) async fn top(arguments: &Arguments) -> Result<(), Failure> {
         }
     }
 }
+
+/// For an answer.
+const PATIENCE: Duration = Duration::from_secs(10);
 
 #[allow(clippy::cast_precision_loss)]
 async fn look(

@@ -108,6 +108,19 @@ impl Config {
         ] {
             positive(field, value)?;
         }
+        // None of these would let anything through.
+        macro_rules! whole {
+            ($($limit:ident)*) => { [$((concat!("limits.", stringify!($limit)), self.limits.$limit == 0),)*] };
+        }
+        let whole = whole!(
+            points substeps file_bytes trace_bytes tools queued_commands_per_tool queued_samples queued_records
+            queued_bytes sessions points_in_all point_substeps_per_step streams_per_session frame_vertices texture_side
+            probe_points connections connections_per_address streams_per_connection message_bytes
+            connection_window_bytes
+        );
+        if let Some((field, _)) = whole.iter().find(|limit| limit.1) {
+            return Err(Refusal::new(Reason::OutOfRange, *field, "must be 1 or more: 0 lets nothing through"));
+        }
         let together = |field: &str, given: bool, needs: &str, there: bool| {
             let missing = || Refusal::new(Reason::Missing, needs, format!("is missing, which goes with {field}"));
             if given && !there { Err(missing()) } else { Ok(()) }
@@ -154,4 +167,27 @@ impl Config {
 
 fn cores() -> usize {
     std::thread::available_parallelism().map_or(1, std::num::NonZero::get)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_limit_of_nothing_is_refused_with_its_name() {
+        let guide = include_str!("../../docs/palpate.toml");
+        let limits = guide.split_once("[limits]").unwrap().1;
+        let mut named = 0;
+        for line in limits.lines() {
+            let Some((key, _)) = line.trim_start_matches(['#', ' ']).split_once(" = ") else { continue };
+            for nothing in ["0", "0.0", "-1.0"] {
+                // One of the two is of the wrong kind; which, the kind of the limit tells.
+                let refused = Config::parse("test", &format!("[limits]\n{key} = {nothing}\n")).unwrap_err();
+                let told = format!("{} {}", refused.field, refused.message);
+                assert!(told.contains(key), "{key} = {nothing}: {told}");
+            }
+            named += 1;
+        }
+        assert!(named >= 30, "{named}");
+    }
 }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::Duration;
 
-use http::{HeaderValue, Request, Response, header};
+use http::{HeaderValue, Method, Request, Response, StatusCode, header};
 use tonic::Status;
 use tonic::body::Body;
 use tower::{Layer, Service};
@@ -15,13 +15,18 @@ use super::connections::Peer;
 use super::identity::{Access, Caller, Credentials, access};
 use super::metrics::Traffic;
 use super::reload::Reloaded;
-use super::revocation::{Revocable, Shown};
+use super::request::{Inward, Pace};
+use super::revocation::{Calls, Shown};
 use crate::refusal::{Reason, Refusal, Result};
 
 /// Puts a [`Guard`] before a service.
 #[derive(Clone)]
 pub(super) struct GuardLayer {
     pub(super) credentials: Arc<Reloaded<Credentials>>,
+    /// Those under way whose callers were asked.
+    pub(super) calls: Arc<Calls>,
+    /// For the messages of a call.
+    pub(super) patience: Duration,
     pub(super) traffic: Arc<Traffic>,
     /// Nobody is asked who they are because nobody else can get here: then no page of another site may, either.
     pub(super) local_only: bool,
@@ -47,18 +52,27 @@ pub(super) struct Guard<S> {
 /// The answer to a call.
 type Answer<E> = Pin<Box<dyn Future<Output = std::result::Result<Response<Body>, E>> + Send>>;
 
+/// Who calls, and what they showed for it, with the version of the file by which that was enough.
+type Known = (Caller, Option<(Shown, u64)>);
+
 /// Calls of this server's own protocol.
 const OWN: &str = "/palpate.";
 
+/// Its messages come for as long as somebody holds a tool; for the first there is a deadline of its own.
+const TOUCH: &str = "/palpate.v1.HapticService/Touch";
+
+/// Anybody may ask, as often as they like.
+const REFLECTION: &str = "/grpc.reflection.";
+
 impl GuardLayer {
     /// Who calls, if they may, and what they showed for it; else why not, and how long that is to be kept back.
-    fn admit<B>(&self, request: &Request<B>) -> std::result::Result<(Caller, Option<Shown>), (Refusal, Duration)> {
+    fn admit<B>(&self, request: &Request<B>) -> std::result::Result<Known, (Refusal, Duration)> {
         let peer = request.extensions().get::<Peer>();
         peer.map_or(Ok(()), |peer| peer.calls.pass())?;
         self.identify(request, peer).map_err(|refusal| (refusal, Duration::ZERO))
     }
 
-    fn identify<B>(&self, request: &Request<B>, peer: Option<&Peer>) -> Result<(Caller, Option<Shown>)> {
+    fn identify<B>(&self, request: &Request<B>, peer: Option<&Peer>) -> Result<Known> {
         let path = request.uri().path();
         let nobody = || Ok((Caller::nobody(), None));
         match access(path) {
@@ -67,10 +81,15 @@ impl GuardLayer {
                 self.check_origin(request)?;
                 let authorization = request.headers().get(header::AUTHORIZATION).cloned();
                 let version = self.credentials.version();
-                let shown = Shown { authorization, peer: peer.cloned(), role, version };
-                let caller = shown.check(&self.credentials.get())?;
+                let shown = Shown { authorization, peer: peer.cloned(), role };
+                let credentials = self.credentials.get();
+                let caller = shown.check(&credentials)?;
                 self.traffic.called(path);
-                Ok((caller, Some(shown)))
+                if let Some(peer) = peer {
+                    peer.seat.is_known();
+                }
+                // Who need not show anything is not asked again.
+                Ok((caller, (!credentials.is_open()).then_some((shown, version))))
             }
             // Nobody is asked anything: then it is not known, rather than not allowed.
             None if path.starts_with(OWN) && self.credentials.get().is_open() => nobody(),
@@ -98,6 +117,30 @@ impl GuardLayer {
     }
 }
 
+/// What is told to who asks for a call in another way than gRPC: gRPC itself could not say it so that they read it.
+fn misdirected<B>(request: &Request<B>) -> Option<Response<Body>> {
+    let path = request.uri().path();
+    access(path)?;
+    let kind = request.headers().get(header::CONTENT_TYPE).map(HeaderValue::as_bytes).unwrap_or_default();
+    let (status, message) = if request.method() != Method::POST {
+        (StatusCode::METHOD_NOT_ALLOWED, "is a gRPC call: it is made by POST")
+    } else if !kind.starts_with(b"application/grpc") {
+        (
+            StatusCode::UNSUPPORTED_MEDIA_TYPE,
+            "is a gRPC call: its content-type is application/grpc or application/grpc-web",
+        )
+    } else {
+        return None;
+    };
+    let mut answer = Response::new(Body::new(axum::body::Body::from(format!("{path} {message}\n"))));
+    *answer.status_mut() = status;
+    answer.headers_mut().insert(header::CONTENT_TYPE, HeaderValue::from_static("text/plain; charset=utf-8"));
+    if status == StatusCode::METHOD_NOT_ALLOWED {
+        answer.headers_mut().insert(header::ALLOW, HeaderValue::from_static("POST"));
+    }
+    Some(answer)
+}
+
 impl<S> Service<Request<Body>> for Guard<S>
 where
     S: Service<Request<Body>, Response = Response<Body>>,
@@ -114,13 +157,23 @@ where
     fn call(&mut self, request: Request<Body>) -> Self::Future {
         match self.layer.admit(&request) {
             Ok((caller, shown)) => {
+                // Who may not call is told that first.
+                if let Some(answer) = misdirected(&request) {
+                    return Box::pin(async move { Ok(answer) });
+                }
+                let pace = match request.uri().path() {
+                    TOUCH => Pace::Own,
+                    path if path.starts_with(REFLECTION) => Pace::Each(self.layer.patience),
+                    _ => Pace::Whole(self.layer.patience),
+                };
+                let gate = request.extensions().get::<Peer>().map(|peer| peer.gate.clone());
+                let call = shown.map(|(shown, version)| self.layer.calls.begin(shown, version));
+                let request = request.map(|body| Inward::body(body, call.clone(), gate, pace));
                 // In every line of the log that the call writes.
                 let span = info_span!("call", path = request.uri().path(), client = &*caller.name);
                 let answer = self.inner.call(request).instrument(span);
-                // Who need not show anything is not asked again.
-                let credentials = self.layer.credentials.clone();
-                let Some(shown) = shown.filter(|_| !credentials.get().is_open()) else { return Box::pin(answer) };
-                Box::pin(async move { Ok(answer.await?.map(|body| Revocable::body(body, shown, credentials))) })
+                let Some(call) = call else { return Box::pin(answer) };
+                Box::pin(async move { Ok(answer.await?.map(|body| call.answer(body))) })
             }
             Err((refusal, wait)) => {
                 let address = request.extensions().get::<Peer>().map(|peer| peer.address);

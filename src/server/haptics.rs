@@ -147,8 +147,12 @@ impl Haptics {
             let _ = opening.send(Err(Refusal::new(Reason::TimedOut, "open", message).into()));
             return;
         };
+        let mut early = Early::default();
         let first = match first {
-            Ok(Some(pb::TouchRequest { message: Some(Message::Open(open)) })) => self.open(&open).await,
+            Ok(Some(pb::TouchRequest { message: Some(Message::Open(open)) })) => {
+                let opening = self.open(&open);
+                early.gather(opening, &mut inbound, self.0.config.limits.queued_commands_per_tool).await
+            }
             Ok(_) => Err(Refusal::new(Reason::OutOfTurn, "open", "the first message must be `open`")),
             Err(status) => {
                 let _ = opening.send(Err(status));
@@ -167,8 +171,15 @@ impl Haptics {
         };
         let live = &hold.live;
         let mut bucket = hold.bucket(&self.0.config.limits);
+        for command in early.dropped.drain(..) {
+            let message = "was one of too many that came before the stream was open";
+            let refusal = Refusal::new(Reason::QueueFull, "command", message);
+            self.0.traffic.refused(refusal.reason);
+            events.push(Event::Rejected(wire::sample::rejection(command.0, command.1, &refusal)));
+        }
+        live.count_refused(early.refused);
         loop {
-            match inbound.message().await {
+            match early.next(&mut inbound).await {
                 Ok(Some(pb::TouchRequest { message: Some(Message::Command(command)) })) => {
                     let now = now_ns();
                     let taken = bucket
@@ -216,6 +227,57 @@ impl Haptics {
                     return events.push(Event::Failed(status));
                 }
             }
+        }
+    }
+}
+
+/// What a client says before its stream is open, which may take as long as a force law does. It is taken from the transport,
+/// which cuts connections whose small messages nobody reads.
+#[derive(Default)]
+struct Early {
+    said: VecDeque<Result<Option<pb::TouchRequest>, Status>>,
+    /// Commands that were dropped for newer ones, and of the last of those tool and sequence number.
+    refused: usize,
+    dropped: VecDeque<(u32, u64)>,
+}
+
+impl Early {
+    /// Waits for `opening`, and keeps the newest `most` messages that come meanwhile.
+    async fn gather<T>(
+        &mut self,
+        opening: impl Future<Output = T>,
+        inbound: &mut Streaming<pb::TouchRequest>,
+        most: usize,
+    ) -> T {
+        use pb::touch_request::Message;
+        let mut opening = std::pin::pin!(opening);
+        loop {
+            // Behind the end, or what should not come now, nothing is kept.
+            let goes_on = self.said.back().is_none_or(|said| {
+                let message = said.as_ref().ok().and_then(|said| said.as_ref()?.message.as_ref());
+                matches!(message, Some(Message::Command(_) | Message::Renew(_)))
+            });
+            tokio::select! {
+                opened = &mut opening => return opened,
+                message = inbound.message(), if goes_on => self.said.push_back(message),
+            }
+            if self.said.len() > most
+                && let Some(Ok(Some(pb::TouchRequest { message: Some(Message::Command(old)) }))) = self.said.pop_front()
+            {
+                self.refused += 1;
+                self.dropped.push_back((old.tool, old.sequence));
+                if self.dropped.len() > most {
+                    self.dropped.pop_front();
+                }
+            }
+        }
+    }
+
+    /// What was said next.
+    async fn next(&mut self, inbound: &mut Streaming<pb::TouchRequest>) -> Result<Option<pb::TouchRequest>, Status> {
+        match self.said.pop_front() {
+            Some(said) => said,
+            None => inbound.message().await,
         }
     }
 }

@@ -1,13 +1,15 @@
 //! What Prometheus is told: counts of the stepping threads, the sessions as they stand, and what goes over the network.
 //! Nothing here names a session: who knows an id may go there.
 
-use std::fmt;
 use std::net::SocketAddr;
+use std::pin::Pin;
 use std::sync::{Arc, Mutex};
+use std::{fmt, io};
 
 use axum::Router;
 use axum::http::header;
 use axum::routing::get;
+use futures_util::stream::{Stream, StreamExt};
 use prometheus_client::collector::Collector;
 use prometheus_client::encoding::{DescriptorEncoder, EncodeMetric, MetricEncoder, NoLabelSet, text};
 use prometheus_client::metrics::MetricType;
@@ -17,9 +19,12 @@ use prometheus_client::metrics::gauge::{ConstGauge, Gauge};
 use prometheus_client::registry::{Registry, Unit};
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
-use tracing::info;
+use tracing::{info, warn};
 
+use super::connections::{self, Connection, Seats};
 use super::identity::CALLS;
+use super::transport::Cut;
+use crate::limits::Limits;
 use crate::pace::queue::lock;
 use crate::pace::tally::{Count, Tally, Times};
 use crate::pace::{Pacer, State};
@@ -36,6 +41,8 @@ pub(crate) struct Traffic {
     connected: Counter,
     handshakes_failed: Counter,
     silent: Counter,
+    cuts: Family<[(&'static str, &'static str); 2], Counter>,
+    useless_files: Family<Label, Gauge>,
     pub(super) bytes_in: Counter,
     pub(super) bytes_out: Counter,
     calls: Family<Label, Counter>,
@@ -71,6 +78,18 @@ impl Traffic {
         self.silent.inc();
     }
 
+    /// The transport of `side` has cut a connection.
+    pub(super) fn cut(&self, client: SocketAddr, side: &'static str, cut: &Cut) {
+        let Cut { reason, words } = cut;
+        warn!(%client, reason, "connection cut by the transport of the {side}: {words}");
+        self.cuts.get_or_create(&[("side", side), ("reason", reason)]).inc();
+    }
+
+    /// What these files hold is in force, or not.
+    pub(super) fn files(&self, what: &'static str, are_useless: bool) {
+        self.useless_files.get_or_create(&[("files", what)]).set(are_useless.into());
+    }
+
     /// A call was let through.
     pub(super) fn called(&self, path: &str) {
         if let Some((path, _)) = CALLS.iter().find(|call| call.0 == path) {
@@ -99,6 +118,10 @@ pub(super) fn registry(pacer: &Arc<Pacer>, traffic: &Traffic) -> Registry {
     registry.register("tls_handshakes_failed", failed, traffic.handshakes_failed.clone());
     let silent = "Connections that did not say in time what they want";
     registry.register("silent_connections", silent, traffic.silent.clone());
+    let cuts = "Connections that a transport has cut: whose, and why (RFC 9113)";
+    registry.register("transport_cuts", cuts, traffic.cuts.clone());
+    let useless = "1 while what these files hold is not in force: they can't be read, or make no sense";
+    registry.register("useless_files", useless, traffic.useless_files.clone());
     let (bytes_in, bytes_out) = (traffic.bytes_in.clone(), traffic.bytes_out.clone());
     registry.register_with_unit("received", "What clients sent, before encryption", Unit::Bytes, bytes_in);
     registry.register_with_unit("sent", "What clients were sent, before encryption", Unit::Bytes, bytes_out);
@@ -227,8 +250,38 @@ impl Collector for Stepping {
     }
 }
 
+/// Connections to the metrics at once: who has been there longest goes when another comes.
+pub(super) const SCRAPERS: usize = 16;
+
+/// The connections to the metrics.
+struct Scrapers(SocketAddr, Pin<Box<dyn Stream<Item = io::Result<Connection>> + Send>>);
+
+impl axum::serve::Listener for Scrapers {
+    type Io = Connection;
+    type Addr = SocketAddr;
+
+    async fn accept(&mut self) -> (Connection, SocketAddr) {
+        loop {
+            match self.1.next().await {
+                Some(Ok(connection)) => return (connection, self.0),
+                Some(Err(_)) => {}
+                None => std::future::pending().await,
+            }
+        }
+    }
+
+    fn local_addr(&self) -> io::Result<SocketAddr> {
+        Ok(self.0)
+    }
+}
+
 /// Serves the metrics on `listener` until `shutdown` is cancelled.
-pub(super) async fn serve(listener: TcpListener, registry: Registry, shutdown: CancellationToken) {
+pub(super) async fn serve(
+    listener: TcpListener,
+    limits: &Limits,
+    registry: Registry,
+    shutdown: CancellationToken,
+) -> io::Result<()> {
     // One at a time: what is asked for more often than it can be told is no use to anybody.
     let registry = Arc::new(Mutex::new(registry));
     let told = move || {
@@ -240,6 +293,12 @@ pub(super) async fn serve(listener: TcpListener, registry: Registry, shutdown: C
             encoded.map(|()| (kind, body)).map_err(|_| axum::http::StatusCode::INTERNAL_SERVER_ERROR)
         }
     };
+    let limits = Limits { connections: SCRAPERS, connections_per_address: SCRAPERS, ..limits.clone() };
+    let seats = Arc::new(Seats::new(&limits, Some(SCRAPERS)));
+    // What the server's clients do is counted elsewhere.
+    let address = listener.local_addr()?;
+    let connections = connections::incoming(listener, None, seats, &limits, Arc::default());
     let router = Router::new().route("/metrics", get(told));
-    let _ = axum::serve(listener, router).with_graceful_shutdown(shutdown.cancelled_owned()).await;
+    let serving = axum::serve(Scrapers(address, Box::pin(connections)), router);
+    serving.with_graceful_shutdown(shutdown.cancelled_owned()).await
 }

@@ -4,6 +4,7 @@
 pub mod catalog;
 pub mod config;
 mod connections;
+mod descriptors;
 mod guard;
 mod haptics;
 pub mod identity;
@@ -12,10 +13,13 @@ mod page;
 mod protection;
 mod rate;
 mod reload;
+mod request;
 mod revocation;
 mod sessions;
 mod textures;
 mod tls;
+mod transport;
+mod validity;
 mod views;
 mod workshop;
 
@@ -25,8 +29,11 @@ use std::time::Duration;
 
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
+use tonic::server::NamedService;
 use tonic::service::Routes;
 use tonic::transport::Server;
+use tonic_health::ServingStatus;
+use tonic_health::server::HealthReporter;
 use tonic_web::GrpcWebLayer;
 use tower_http::cors::CorsLayer;
 use tracing::{info, warn};
@@ -36,6 +43,7 @@ use crate::refusal::{Reason, Refusal};
 use crate::wire::pb;
 use catalog::Catalog;
 use config::Config;
+use connections::Seats;
 use guard::GuardLayer;
 use http::{HeaderName, HeaderValue, Method, header};
 use metrics::Traffic;
@@ -43,6 +51,7 @@ use pb::haptic_service_server::HapticServiceServer;
 use pb::session_service_server::SessionServiceServer;
 use pb::view_service_server::ViewServiceServer;
 use protection::Protection;
+use revocation::Calls;
 use textures::Textures;
 use workshop::Workshop;
 
@@ -156,6 +165,62 @@ pub enum ServeError {
     Reflection(#[from] tonic_reflection::server::Error),
 }
 
+/// What the health service tells of. The server itself, "", serves also where a part of it does not.
+const SERVICES: [&str; 5] = [
+    "",
+    <SessionServiceServer<sessions::Sessions> as NamedService>::NAME,
+    <HapticServiceServer<haptics::Haptics> as NamedService>::NAME,
+    <ViewServiceServer<views::Views> as NamedService>::NAME,
+    TOKENS,
+];
+
+/// Serves while the tokens in force are those of the file.
+const TOKENS: &str = "palpate.tokens";
+
+/// Tells of files whose contents are not in force, for ever.
+fn tell_troubles(
+    protection: &Protection,
+    health: HealthReporter,
+    traffic: Arc<Traffic>,
+) -> impl Future<Output = ()> + use<> {
+    let mut tokens = protection.credentials.troubles();
+    let tls = protection.tls.as_ref().map(|tls| tls.troubles());
+    let told = traffic.clone();
+    let of_tokens = async move {
+        loop {
+            let useless = tokens.borrow_and_update().is_some();
+            told.files("tokens", useless);
+            let status = if useless { ServingStatus::NotServing } else { ServingStatus::Serving };
+            health.set_service_status(TOKENS, status).await;
+            if tokens.changed().await.is_err() {
+                return;
+            }
+        }
+    };
+    let of_tls = async move {
+        let Some(mut tls) = tls else { return };
+        loop {
+            traffic.files("TLS", tls.borrow_and_update().is_some());
+            if tls.changed().await.is_err() {
+                return;
+            }
+        }
+    };
+    async {
+        tokio::join!(of_tokens, of_tls);
+    }
+}
+
+/// Says that the server does not serve any more. Then those who watch that are done with: they would be waited for.
+async fn leave(mut health: HealthReporter) {
+    for service in SERVICES {
+        health.set_service_status(service, ServingStatus::NotServing).await;
+    }
+    for service in SERVICES {
+        health.clear_service_status(service).await;
+    }
+}
+
 /// Serves at `doors` until `shutdown` is cancelled; then ends all streams, and is over at the latest when the
 /// deadline of the configuration has passed. The caller ends its runtime without waiting (`shutdown_background`).
 pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) -> Result<(), ServeError> {
@@ -168,18 +233,25 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
             warn!(%refusal, "a scene that no session can be made from");
         }
     }
-    let limits = config.limits.clone();
+    let mut limits = config.limits.clone();
     let traffic = Arc::new(Traffic::default());
+    descriptors::raise();
+    limits.connections =
+        descriptors::connections(limits.connections, metrics.as_ref().map_or(0, |_| metrics::SCRAPERS));
     if let Some(listener) = metrics {
-        tokio::spawn(metrics::serve(listener, metrics::registry(&pacer, &traffic), shutdown.clone()));
+        let (limits, registry, shutdown) = (limits.clone(), metrics::registry(&pacer, &traffic), shutdown.clone());
+        tokio::spawn(async move { metrics::serve(listener, &limits, registry, shutdown).await });
     }
     let open = protection.credentials.get().is_open();
     if config.insecure && open {
         warn!("--insecure: whoever can reach this server may do everything");
     }
     let origins: Arc<[HeaderValue]> = config.origins.iter().filter_map(|origin| origin.parse().ok()).collect();
+    let calls = Calls::new(protection.credentials.clone());
     let guard = GuardLayer {
         credentials: protection.credentials.clone(),
+        calls: calls.clone(),
+        patience: Duration::from_secs_f64(limits.open_s),
         traffic: traffic.clone(),
         local_only: open && !config.insecure,
         origins: origins.clone(),
@@ -194,9 +266,10 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
     };
 
     let (health, health_service) = tonic_health::server::health_reporter();
-    health.set_serving::<SessionServiceServer<sessions::Sessions>>().await;
-    health.set_serving::<HapticServiceServer<haptics::Haptics>>().await;
-    health.set_serving::<ViewServiceServer<views::Views>>().await;
+    for service in SERVICES {
+        health.set_service_status(service, ServingStatus::Serving).await;
+    }
+    let telling = tell_troubles(&protection, health.clone(), traffic.clone());
     let reflection = || {
         tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(pb::DESCRIPTORS)
@@ -214,7 +287,10 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
         }
     };
 
-    let incoming = connections::incoming(listener, protection.tls.clone(), &limits, traffic);
+    // Who has not shown who they are leaves half of the room to others.
+    let strangers = (!open).then_some(limits.connections.div_ceil(2));
+    let seats = Arc::new(Seats::new(&limits, strangers));
+    let incoming = connections::incoming(listener, protection.tls.clone(), seats, &limits, traffic);
     let silence = Some(Duration::from_secs_f64(limits.keepalive_s));
     let bytes = limits.message_bytes;
     let (folder, painter) = (Arc::new(house.config.viewer.clone()), house.clone());
@@ -232,6 +308,7 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
         .route_layer(GrpcWebLayer::new())
         .route("/textures/{file}", axum::routing::get(move |file, headers| textures::file(painter, file, headers)))
         .fallback(move |request| page::page(folder.clone(), request));
+    let drain = CancellationToken::new();
     let serving = Server::builder()
         // Finds out about clients whose host has vanished.
         .http2_keepalive_interval(silence)
@@ -243,13 +320,15 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
         .layer(cors(&origins))
         .layer(guard)
         .add_routes(routes.into())
-        .serve_with_incoming_shutdown(incoming, shutdown.clone().cancelled_owned());
+        .serve_with_incoming_shutdown(incoming, drain.clone().cancelled_owned());
 
     // One deadline for all that is left to do. A step that outlasts it goes down with the process.
     let (stopping, begun) = (pacer.clone(), shutdown.clone());
     let stop = async move {
         begun.cancelled().await;
         info!("shutting down");
+        leave(health).await;
+        drain.cancel();
         // Waits for the steps under way. Every stream then reads its end from its queue.
         let _ = tokio::task::spawn_blocking(move || stopping.stop()).await;
     };
@@ -261,6 +340,8 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
         (served, ()) = async { tokio::join!(serving, stop) } => served?,
         () = sweeping => {}
         () = protection.watch() => {}
+        () = calls.watch() => {}
+        () = telling => {}
         () = over => warn!("steps or streams outlasted the deadline, and are cut"),
     }
     info!("stopped");

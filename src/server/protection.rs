@@ -3,18 +3,20 @@
 
 use std::net::SocketAddr;
 use std::sync::Arc;
-
-use tokio_rustls::rustls::ServerConfig;
+use std::time::Duration;
 
 use super::config::Config;
 use super::identity::Credentials;
 use super::reload::{Reloaded, of_file, warn_if_readable};
-use super::tls;
+use super::tls::{self, Tls};
 use crate::refusal::{Reason, Refusal, Result};
+
+/// Between two looks at the ends of certificates.
+const DAY: Duration = Duration::from_secs(86_400);
 
 /// Of one server.
 pub(super) struct Protection {
-    pub(super) tls: Option<Arc<Reloaded<ServerConfig>>>,
+    pub(super) tls: Option<Arc<Reloaded<Tls>>>,
     pub(super) credentials: Arc<Reloaded<Credentials>>,
 }
 
@@ -65,11 +67,18 @@ impl Protection {
     /// Looks for new files, for ever.
     pub(super) async fn watch(&self) {
         let tls = async {
-            match &self.tls {
-                Some(tls) => tls.watch().await,
-                None => std::future::pending().await,
-            }
+            let Some(tls) = &self.tls else { return std::future::pending().await };
+            let mut days = tokio::time::interval(DAY);
+            // The certificates were looked at when they were read.
+            days.tick().await;
+            let warning = async {
+                loop {
+                    days.tick().await;
+                    tls.get().warn_of_ends();
+                }
+            };
+            tokio::join!(tls.clone().watch(), warning);
         };
-        tokio::join!(tls, self.credentials.watch());
+        tokio::join!(tls, self.credentials.clone().watch());
     }
 }

@@ -1,21 +1,29 @@
-//! A call that goes on for long ends when who made it may not any more: the answer of a stream asks again, whenever
-//! something of it leaves, if the file of tokens has changed since.
+//! A call ends when who made it may not any more: it is looked at whenever a message of it comes or goes, if the file of
+//! tokens has changed, and all calls are looked at when it changes. For a client that does not read would never be asked.
 
+use std::collections::HashMap;
 use std::pin::Pin;
-use std::sync::Arc;
-use std::task::{Context, Poll, ready};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, Weak};
+use std::task::{Context, Poll};
+use std::time::Duration;
 
 use bytes::Bytes;
+use futures_util::task::AtomicWaker;
 use http::{HeaderMap, HeaderValue};
 use http_body::Frame;
 use tonic::Status;
 use tonic::body::Body;
-use tracing::info;
+use tracing::{info, warn};
 
 use super::connections::Peer;
 use super::identity::{Caller, Credentials, Role};
 use super::reload::Reloaded;
-use crate::refusal::Result;
+use crate::pace::queue::lock;
+use crate::refusal::{Refusal, Result};
+
+/// So long a client may take to read that its call is over; then its connection is closed.
+const GRACE: Duration = Duration::from_secs(1);
 
 /// What a caller showed, and for what.
 #[derive(Clone)]
@@ -23,8 +31,6 @@ pub(super) struct Shown {
     pub(super) authorization: Option<HeaderValue>,
     pub(super) peer: Option<Peer>,
     pub(super) role: Role,
-    /// Of the file by which that was enough.
-    pub(super) version: u64,
 }
 
 impl Shown {
@@ -36,35 +42,130 @@ impl Shown {
     }
 }
 
-/// The answer to a call, until its caller is told to go.
-pub(super) struct Revocable {
-    answer: Option<Body>,
-    shown: Shown,
+/// The calls under way of callers that showed something.
+pub(super) struct Calls {
     credentials: Arc<Reloaded<Credentials>>,
+    under_way: Mutex<HashMap<u64, Weak<Call>>>,
+    begun: AtomicU64,
 }
 
-impl Revocable {
-    /// `answer` to who has shown that.
-    pub(super) fn body(answer: Body, shown: Shown, credentials: Arc<Reloaded<Credentials>>) -> Body {
-        Body::new(Revocable { answer: Some(answer), shown, credentials })
+impl Calls {
+    pub(super) fn new(credentials: Arc<Reloaded<Credentials>>) -> Arc<Self> {
+        Arc::new(Calls { credentials, under_way: Mutex::default(), begun: AtomicU64::new(0) })
     }
 
-    /// Why the caller may not go on, if so.
-    fn refused(&mut self) -> Option<HeaderMap> {
-        let version = self.credentials.version();
-        if version == self.shown.version {
-            return None;
+    /// A call by who has shown that, which was enough by the file of `version`.
+    pub(super) fn begin(self: &Arc<Self>, shown: Shown, version: u64) -> Arc<Call> {
+        let number = self.begun.fetch_add(1, Ordering::Relaxed);
+        let call = Arc::new(Call {
+            calls: self.clone(),
+            number,
+            shown,
+            version: AtomicU64::new(version),
+            state: Mutex::default(),
+            inward: AtomicWaker::new(),
+            outward: AtomicWaker::new(),
+        });
+        lock(&self.under_way).insert(number, Arc::downgrade(&call));
+        call
+    }
+
+    /// Ends the calls of those who are struck from the file, for ever.
+    pub(super) async fn watch(self: Arc<Self>) {
+        let mut changes = self.credentials.changes();
+        while changes.changed().await.is_ok() {
+            let calls: Vec<_> = lock(&self.under_way).values().filter_map(Weak::upgrade).collect();
+            let ended: Vec<_> = calls.iter().filter(|call| call.refused().is_some()).map(Arc::downgrade).collect();
+            drop(calls);
+            if ended.is_empty() {
+                continue;
+            }
+            tokio::spawn(async move {
+                tokio::time::sleep(GRACE).await;
+                for call in ended.iter().filter_map(Weak::upgrade) {
+                    if let Some(peer) = &call.shown.peer {
+                        warn!(client = %peer.address, "connection closed: it does not read that its call is over");
+                        peer.gate.close();
+                    }
+                }
+            });
         }
-        self.shown.version = version;
-        let refusal = self.shown.check(&self.credentials.get()).err()?;
-        info!(client = ?self.shown.peer.as_ref().map(|peer| peer.address), "stream ended: {refusal}");
-        let mut trailers = HeaderMap::new();
-        Status::from(refusal).add_header(&mut trailers).ok()?;
-        Some(trailers)
     }
 }
 
-impl http_body::Body for Revocable {
+/// A call, until both its directions are over.
+pub(super) struct Call {
+    calls: Arc<Calls>,
+    number: u64,
+    shown: Shown,
+    /// Of the file by which it was looked at last.
+    version: AtomicU64,
+    state: Mutex<State>,
+    inward: AtomicWaker,
+    outward: AtomicWaker,
+}
+
+#[derive(Default)]
+struct State {
+    answer: Option<Body>,
+    refusal: Option<Refusal>,
+}
+
+impl Call {
+    /// Why the caller may not go on, if so. Then what the call holds (a tool, perhaps) is given back, and both directions
+    /// are told.
+    fn refused(&self) -> Option<Refusal> {
+        let credentials = &self.calls.credentials;
+        let version = credentials.version();
+        if self.version.swap(version, Ordering::AcqRel) != version
+            && let Err(refusal) = self.shown.check(&credentials.get())
+        {
+            let mut state = lock(&self.state);
+            if state.refusal.is_none() {
+                info!(client = ?self.shown.peer.as_ref().map(|peer| peer.address), "call ended: {refusal}");
+            }
+            state.refusal.get_or_insert(refusal);
+            let answer = state.answer.take();
+            // What is dropped here may wake, and ask.
+            drop(state);
+            drop(answer);
+            self.inward.wake();
+            self.outward.wake();
+        }
+        lock(&self.state).refusal.clone()
+    }
+
+    /// Whether a further message may come in; who asks is woken when none may.
+    pub(super) fn may_say(&self, context: &Context<'_>) -> Result<()> {
+        self.inward.register(context.waker());
+        self.refused().map_or(Ok(()), Err)
+    }
+
+    /// The answer, until the caller is told to go.
+    pub(super) fn answer(self: Arc<Self>, answer: Body) -> Body {
+        let mut state = lock(&self.state);
+        // A call that is over already has nothing to answer but that.
+        if state.refusal.is_none() {
+            state.answer = Some(answer);
+        }
+        drop(state);
+        Body::new(Answer { call: self, over: false })
+    }
+}
+
+impl Drop for Call {
+    fn drop(&mut self) {
+        lock(&self.calls.under_way).remove(&self.number);
+    }
+}
+
+/// The answer to a call.
+struct Answer {
+    call: Arc<Call>,
+    over: bool,
+}
+
+impl http_body::Body for Answer {
     type Data = Bytes;
     type Error = Status;
 
@@ -72,17 +173,29 @@ impl http_body::Body for Revocable {
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
     ) -> Poll<Option<std::result::Result<Frame<Bytes>, Status>>> {
-        let Some(answer) = &mut self.answer else { return Poll::Ready(None) };
-        let frame = ready!(Pin::new(answer).poll_frame(context));
-        if let Some(trailers) = self.refused() {
-            // What the stream holds (a tool, perhaps) is given back.
-            self.answer = None;
-            return Poll::Ready(Some(Ok(Frame::trailers(trailers))));
+        if self.over {
+            return Poll::Ready(None);
         }
-        Poll::Ready(frame)
+        self.call.outward.register(context.waker());
+        if let Some(refusal) = self.call.refused() {
+            self.over = true;
+            let mut trailers = HeaderMap::new();
+            return Poll::Ready(
+                Status::from(refusal).add_header(&mut trailers).ok().map(|()| Ok(Frame::trailers(trailers))),
+            );
+        }
+        let mut state = lock(&self.call.state);
+        match &mut state.answer {
+            Some(answer) => Pin::new(answer).poll_frame(context),
+            // It was taken away since: the next turn tells why.
+            None => {
+                context.waker().wake_by_ref();
+                Poll::Pending
+            }
+        }
     }
 
     fn is_end_stream(&self) -> bool {
-        self.answer.as_ref().is_none_or(Body::is_end_stream)
+        self.over || lock(&self.call.state).answer.as_ref().is_some_and(Body::is_end_stream)
     }
 }

@@ -8,12 +8,42 @@ use tokio_rustls::rustls::pki_types::pem::PemObject;
 use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use tokio_rustls::rustls::server::WebPkiClientVerifier;
 use tokio_rustls::rustls::{RootCertStore, ServerConfig};
+use tracing::warn;
 
 use super::reload::{Reloaded, of_file, warn_if_readable};
+use super::validity;
 use crate::refusal::{Reason, Refusal, Result};
 
+/// How connections are made secure.
+pub(super) struct Tls {
+    pub(super) config: Arc<ServerConfig>,
+    /// When certificates end, s since 1970, and of which file they are.
+    ends: Vec<(PathBuf, i64)>,
+}
+
+/// So long before it ends a certificate is warned of, s.
+const NEAR_S: i64 = 14 * validity::DAY_S;
+
+impl Tls {
+    /// Certificates that have ended or will soon.
+    #[allow(clippy::disallowed_methods)]
+    pub(super) fn warn_of_ends(&self) {
+        // Certificates are of the wall clock.
+        let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
+        let now_s = i64::try_from(now.as_secs()).unwrap_or(i64::MAX);
+        for (path, ends_s) in &self.ends {
+            let left_s = ends_s.saturating_sub(now_s);
+            if left_s <= 0 {
+                warn!("{}: the certificate has expired: clients refuse it", path.display());
+            } else if left_s < NEAR_S {
+                warn!("{}: the certificate expires in {} days", path.display(), left_s / validity::DAY_S);
+            }
+        }
+    }
+}
+
 /// Of the files `cert`, `key` and, if clients must show one, the certificates that sign theirs.
-pub(super) fn load(cert: &Path, key: &Path, client_ca: Option<&Path>) -> Result<Reloaded<ServerConfig>> {
+pub(super) fn load(cert: &Path, key: &Path, client_ca: Option<&Path>) -> Result<Reloaded<Tls>> {
     warn_if_readable(key, "the private key");
     let mut paths = vec![cert.to_owned(), key.to_owned()];
     paths.extend(client_ca.map(Path::to_owned));
@@ -21,9 +51,10 @@ pub(super) fn load(cert: &Path, key: &Path, client_ca: Option<&Path>) -> Result<
     Reloaded::load("TLS", paths, move |texts| configure(&named, texts))
 }
 
-fn configure(paths: &[PathBuf], texts: &[String]) -> Result<ServerConfig> {
+fn configure(paths: &[PathBuf], texts: &[String]) -> Result<Tls> {
     let unreadable = |what: &str| Refusal::new(Reason::Unreadable, "", what.to_owned());
     let chain = certificates(&paths[0], &texts[0])?;
+    let mut ends: Vec<_> = chain.iter().filter_map(|c| Some((paths[0].clone(), validity::ends_s(c)?))).collect();
     // An error of a key says nothing of the key.
     let key = PrivateKeyDer::from_pem_slice(texts[1].as_bytes())
         .map_err(|_| of_file(&paths[1])(unreadable("is no private key in PEM")))?;
@@ -36,6 +67,7 @@ fn configure(paths: &[PathBuf], texts: &[String]) -> Result<ServerConfig> {
             let refuse = |why: String| of_file(path)(unreadable(&why));
             let mut roots = RootCertStore::empty();
             for certificate in certificates(path, text)? {
+                ends.extend(validity::ends_s(&certificate).map(|ends_s| (path.clone(), ends_s)));
                 roots.add(certificate).map_err(|e| refuse(e.to_string()))?;
             }
             let verifier = WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider).build();
@@ -48,7 +80,9 @@ fn configure(paths: &[PathBuf], texts: &[String]) -> Result<ServerConfig> {
         of_file(&paths[0])(unreadable(&both))
     })?;
     config.alpn_protocols = vec![b"h2".to_vec(), b"http/1.1".to_vec()];
-    Ok(config)
+    let tls = Tls { config: Arc::new(config), ends };
+    tls.warn_of_ends();
+    Ok(tls)
 }
 
 fn certificates(path: &Path, text: &str) -> Result<Vec<CertificateDer<'static>>> {

@@ -252,7 +252,8 @@ pub fn with_model(session: pb::Session, model: &Model) -> pb::Session {
         substeps: model.plan.substeps,
         precision: model.precision.name().to_owned(),
         warnings: model.warnings.clone(),
-        expected_error: model.expected_error,
+        // A scheme of which nothing is known may be as wrong as can be.
+        expected_error: if model.expected_error.is_finite() { model.expected_error } else { 1.0 },
         ..session
     }
 }

@@ -9,7 +9,6 @@ use palpate::haptics::deadband::HEARTBEAT_S;
 use palpate::haptics::{Device, Law, LocalModel};
 use palpate::scene::script::Action;
 use palpate::scene::tip::Tip;
-use palpate::wire::error::describe;
 use palpate::wire::pb::haptic_service_client::HapticServiceClient;
 use palpate::wire::pb::session_service_client::SessionServiceClient;
 use palpate::wire::{self, pb};
@@ -18,7 +17,7 @@ use pb::touch_response::Message as Heard;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 
-use crate::connect::Server;
+use crate::connect::{Server, describe};
 
 /// What the device's loop and the network pass to each other. The newest counts: neither waits.
 #[derive(Default)]
@@ -85,7 +84,7 @@ pub(crate) async fn keep(mut target: Target, device: Device, shared: &Shared, mu
         match connect(&mut target, &device, shared, &mut commands).await {
             Ok(()) => return,
             Err(message) => {
-                eprintln!("palpate-client: warning: {message}; connecting again");
+                crate::say!("palpate-client: warning: {message}; connecting again");
                 shared.inbound().failure = Some(message);
             }
         }
@@ -163,7 +162,7 @@ async fn connect(
                 let heard = heard.map_err(|_| "the server says nothing".to_owned())?.map_err(told)?;
                 match heard.ok_or("the server has ended the stream")?.message {
                     Some(Heard::Opened(opened)) => {
-                        opened.warnings.iter().for_each(|warning| eprintln!("palpate-client: warning: {warning}"));
+                        opened.warnings.iter().for_each(|warning| crate::say!("palpate-client: warning: {warning}"));
                         let law = opened.law.as_ref().ok_or("the server sent no force law")?;
                         let law = wire::local::from_law(law).map_err(|refusal| refusal.to_string())?;
                         let mut inbound = shared.inbound();

@@ -206,7 +206,7 @@ pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
         let counts = Reason::ALL.iter().map(|(reason, name)| ((*name).to_owned(), json!(envelope.count(*reason).0)));
         told["interventions_ticks"] = serde_json::Value::Object(counts.collect());
     }
-    println!("{told}");
+    crate::tell!("{told}");
     Ok(())
 }
 
@@ -249,7 +249,17 @@ pub(crate) async fn run(
         tokio::task::block_in_place(|| worker.join())
     });
     let served = served.map_err(|_| Failure::Failed("the device's loop broke down".to_owned()))?;
+    // It waits for what a server may never say.
+    network.abort();
     let _ = network.await;
     let served = served.map_err(|error| Failure::Failed(format!("the device: {error}")))?;
-    Ok((served, shared))
+    let never = {
+        let inbound = shared.inbound();
+        (inbound.connections == 0)
+            .then(|| inbound.failure.clone().unwrap_or("the server said nothing in time".to_owned()))
+    };
+    match never {
+        Some(why) => Err(Failure::Failed(format!("never connected: {why}"))),
+        None => Ok((served, shared)),
+    }
 }

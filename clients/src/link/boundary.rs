@@ -106,12 +106,12 @@ pub(super) fn print(as_json: bool) -> Result<(), Failure> {
                 "predicted_ms": 1e3 * row.predicted_s, "observed_ms": 1e3 * row.observed_s,
             })
         });
-        println!("{}", Value::Array(rows.collect()));
+        crate::tell!("{}", Value::Array(rows.collect()));
     } else {
-        println!("{:<8} {:>12} {:>14} {:>13}", "hand", "K (N/m)", "predicted (ms)", "observed (ms)");
+        crate::tell!("{:<8} {:>12} {:>14} {:>13}", "hand", "K (N/m)", "predicted (ms)", "observed (ms)");
         for row in &all {
             let (predicted_ms, observed_ms) = (1e3 * row.predicted_s, 1e3 * row.observed_s);
-            println!("{:<8} {:>12} {predicted_ms:>14.2} {observed_ms:>13.2}", row.hand, row.stiffness_n_per_m);
+            crate::tell!("{:<8} {:>12} {predicted_ms:>14.2} {observed_ms:>13.2}", row.hand, row.stiffness_n_per_m);
         }
     }
     Ok(())

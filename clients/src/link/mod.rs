@@ -147,10 +147,10 @@ pub(crate) async fn link(arguments: &Arguments) -> Result<(), Failure> {
     }
     let figures = figures(&setup, &found);
     if arguments.json {
-        println!("{figures}");
+        crate::tell!("{figures}");
     } else if let Value::Object(fields) = figures {
         for (name, value) in fields {
-            println!("{name:<26} {value}");
+            crate::tell!("{name:<26} {value}");
         }
     }
     Ok(())

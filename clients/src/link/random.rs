@@ -87,7 +87,7 @@ pub(super) fn print(arguments: &Arguments, runs: u64) -> Result<(), Failure> {
                     if let Ok(mut results) = results.lock() {
                         results.push((setup.seed, setup, found));
                         if results.len().is_multiple_of(TOLD_EVERY) {
-                            eprintln!("palpate-client: {} of {runs} runs", results.len());
+                            crate::say!("palpate-client: {} of {runs} runs", results.len());
                         }
                     }
                 }
@@ -122,7 +122,7 @@ fn report(arguments: &Arguments, results: &[(u64, Setup, Result<Found, String>)]
         }
         if !arguments.json {
             let f = found;
-            println!(
+            crate::tell!(
                 "{seed:>6} {:<9} {:<7} {:<9} rtt {:>5.1} ms jitter {:>4.1} loss {:<6} error {:>7.2} % energy {:>10.2e} J jump \
                  {:.3} N guard {:.4} share {:.3} pauses {} faults {} {}",
                 setup.model.scene.name,
@@ -150,12 +150,12 @@ fn report(arguments: &Arguments, results: &[(u64, Setup, Result<Found, String>)]
     fields.insert("runs".to_owned(), json!(results.len()));
     fields.insert("unstable".to_owned(), json!(unstable));
     if arguments.json {
-        println!("{}", Value::Object(fields));
+        crate::tell!("{}", Value::Object(fields));
     } else {
-        println!("\n{} runs, {unstable} unstable. Worst of each:", results.len());
+        crate::tell!("\n{} runs, {unstable} unstable. Worst of each:", results.len());
         for worst in &all {
             let Some((value, run)) = &worst.found else { continue };
-            println!("{:<26} {value:<12.5} seed {}", worst.name, run["seed"]);
+            crate::tell!("{:<26} {value:<12.5} seed {}", worst.name, run["seed"]);
         }
     }
     Ok(())

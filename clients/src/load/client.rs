@@ -9,7 +9,6 @@ use glam::{DVec2, DVec3};
 use palpate::scene::Scene;
 use palpate::scene::law::Poke;
 use palpate::scene::script::Action;
-use palpate::wire::error::describe;
 use palpate::wire::pb::haptic_service_client::HapticServiceClient;
 use palpate::wire::{self, pb};
 use pb::touch_request::Message as Say;
@@ -19,7 +18,7 @@ use tokio_stream::StreamExt;
 use tokio_stream::wrappers::WatchStream;
 
 use super::tally::Tally;
-use crate::connect::Channel;
+use crate::connect::{Channel, describe};
 
 pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)

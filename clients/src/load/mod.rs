@@ -112,7 +112,7 @@ pub(crate) async fn load(arguments: &Arguments) -> Result<(), Failure> {
         false => Failure::Failed(stopped.message),
     })?;
     if arguments.json {
-        println!("{}", outcome.json(limit));
+        crate::tell!("{}", outcome.json(limit));
     } else {
         print!("{}", outcome.table(limit));
     }
@@ -166,7 +166,7 @@ async fn find_limit(
             };
             if !arguments.quiet {
                 let verdict = if why.is_empty() { "within the objective".to_owned() } else { format!("misses {why}") };
-                eprintln!("{next} sessions: {verdict}");
+                crate::say!("{next} sessions: {verdict}");
             }
             Ok((outcome, why.is_empty()))
         });
@@ -255,7 +255,7 @@ async fn trial(arguments: &Arguments, server: &Server, source: &Source, sessions
     let cores = tokio::select! {
         cores = cpu_s => cores,
         _ = tokio::signal::ctrl_c() => {
-            eprintln!("palpate-client: interrupted: the sessions are taken away");
+            crate::say!("palpate-client: interrupted: the sessions are taken away");
             None
         }
     };
@@ -278,11 +278,11 @@ async fn trial(arguments: &Arguments, server: &Server, source: &Source, sessions
         all.add(std::mem::replace(&mut *lock(tally), Tally::new()));
     }
     if let Some(why) = &all.first_break {
-        eprintln!("palpate-client: warning: {} streams broke, the first because {why}", all.broken);
+        crate::say!("palpate-client: warning: {} streams broke, the first because {why}", all.broken);
     }
     if all.unsent > all.commands / 100 {
         let share = 100.0 * all.unsent as f64 / (all.unsent + all.commands) as f64;
-        eprintln!("palpate-client: warning: this generator was too slow for {share:.0} % of its commands");
+        crate::say!("palpate-client: warning: this generator was too slow for {share:.0} % of its commands");
     }
     Ok(Outcome { generator_cores: cores.unwrap_or(f64::NAN), ..all.outcome(sessions) })
 }
@@ -385,7 +385,7 @@ impl Progress {
         if std::io::stderr().is_terminal() {
             eprint!("\r\x1b[K{text}");
         } else {
-            eprintln!("{text}");
+            crate::say!("{text}");
         }
     }
 

@@ -5,7 +5,6 @@ use std::time::Duration;
 
 use palpate::refusal::Refusal;
 use palpate::scene::Scene;
-use palpate::wire::error::describe;
 use palpate::wire::pb::create_session_request::Source;
 use palpate::wire::pb::haptic_service_client::HapticServiceClient;
 use palpate::wire::pb::session_service_client::SessionServiceClient;
@@ -16,7 +15,7 @@ use tokio::task::JoinSet;
 use tonic::Status;
 
 use super::client::{Arrivals, Client, Common, Stage, Stroke, lock};
-use crate::connect::{Channel, Server};
+use crate::connect::{Channel, Server, describe};
 
 /// What a thread is to do.
 pub(crate) struct Orders {
