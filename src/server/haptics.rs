@@ -14,6 +14,7 @@ use tracing::{Instrument, debug, info};
 
 use super::House;
 use super::rate::Bucket;
+use super::workshop::{Asker, asker};
 use crate::haptics::device::{Device, UNDECLARED_FORCE_N};
 use crate::limits::Limits;
 use crate::pace::clock::now_ns;
@@ -93,7 +94,7 @@ fn within_reach(command: Command, live: &Live, device: Option<&Device>) -> Resul
 
 impl Haptics {
     /// Answers the first message of a haptic stream.
-    async fn open(&self, open: &pb::TouchOpen) -> Result<(Opened, Hold), Refusal> {
+    async fn open(&self, open: &pb::TouchOpen, asker: &Asker) -> Result<(Opened, Hold), Status> {
         let live = self.0.pacer.get(&open.session_id)?;
         let device = open.device.as_ref().map(wire::local::from_device).transpose()?;
         let tip = wire::command::from_tip(open.tip.as_ref());
@@ -103,15 +104,13 @@ impl Haptics {
         let mut sampling = wire::sample::sampling(every, only, deadband, open.heartbeat_s, device.is_some())?;
         if open.touch_stiffness && device.is_none() {
             let message = "is missing: touch_stiffness is of its local models";
-            return Err(Refusal::new(Reason::Missing, "device", message));
+            return Err(Refusal::new(Reason::Missing, "device", message).into());
         }
         sampling.touch_stiffness = open.touch_stiffness;
         let guard = live.open_stream()?;
         if device.is_some() {
             let live = live.clone();
-            let law = self.0.workshop.work(move || live.law(tip.radius_m)).await;
-            let failed = |_| Refusal::new(Reason::NotAvailable, "device", "the force law could not be computed");
-            sampling.law = Some(law.map_err(failed)?);
+            sampling.law = Some(self.0.workshop.work(asker, move |_| live.law(tip.radius_m)).await?);
         }
         let lease_s = open.lease_s.unwrap_or(self.0.config.lease_s);
         let lease = random_bits()?;
@@ -137,6 +136,7 @@ impl Haptics {
     async fn listen(
         self,
         mut inbound: Streaming<pb::TouchRequest>,
+        asker: Asker,
         opening: oneshot::Sender<Result<Opened, Status>>,
         events: Writer<Event>,
     ) {
@@ -148,8 +148,8 @@ impl Haptics {
             return;
         };
         let first = match first {
-            Ok(Some(pb::TouchRequest { message: Some(Message::Open(open)) })) => self.open(&open).await,
-            Ok(_) => Err(Refusal::new(Reason::OutOfTurn, "open", "the first message must be `open`")),
+            Ok(Some(pb::TouchRequest { message: Some(Message::Open(open)) })) => self.open(&open, &asker).await,
+            Ok(_) => Err(Refusal::new(Reason::OutOfTurn, "open", "the first message must be `open`").into()),
             Err(status) => {
                 let _ = opening.send(Err(status));
                 return;
@@ -160,8 +160,8 @@ impl Haptics {
                 let _ = opening.send(Ok(opened));
                 hold
             }
-            Err(refusal) => {
-                let _ = opening.send(Err(refusal.into()));
+            Err(status) => {
+                let _ = opening.send(Err(status));
                 return;
             }
         };
@@ -301,7 +301,8 @@ impl HapticService for Haptics {
         let (writer, events) = queue(self.0.config.limits.queued_samples);
         // The client may wait for our headers before it opens, so its first message is not waited for here.
         let (opened, opening) = oneshot::channel();
-        let listening = tokio::spawn(self.clone().listen(request.into_inner(), opened, writer).in_current_span());
+        let asker = asker(&request);
+        let listening = tokio::spawn(self.clone().listen(request.into_inner(), asker, opened, writer).in_current_span());
         let _listening = AbortOnDropHandle::new(listening);
         Ok(Response::new(Box::pin(Output { stage: Stage::Opening(opening, Some(events)), _listening })))
     }

@@ -27,6 +27,8 @@ use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 use tonic::service::Routes;
 use tonic::transport::Server;
+use tonic_health::ServingStatus;
+use tonic_health::server::HealthReporter;
 use tonic_web::GrpcWebLayer;
 use tower_http::cors::CorsLayer;
 use tracing::{info, warn};
@@ -156,6 +158,27 @@ pub enum ServeError {
     Reflection(#[from] tonic_reflection::server::Error),
 }
 
+/// The health service that tells whether heavy work is done in time.
+const WORKSHOP: &str = "palpate.workshop";
+
+/// Tells by [`WORKSHOP`] whether the workshop's oldest piece is within its deadline.
+async fn report_workshop(workshop: Workshop, health: HealthReporter) {
+    let mut look = tokio::time::interval(Duration::from_millis(250));
+    let mut was_late = None;
+    loop {
+        look.tick().await;
+        let load = workshop.load();
+        if was_late.replace(load.is_late) == Some(load.is_late) {
+            continue;
+        }
+        if load.is_late {
+            warn!(oldest_s = load.oldest_s, waiting = load.waiting, "heavy work is past its deadline");
+        }
+        let status = if load.is_late { ServingStatus::NotServing } else { ServingStatus::Serving };
+        health.set_service_status(WORKSHOP, status).await;
+    }
+}
+
 /// Serves at `doors` until `shutdown` is cancelled; then ends all streams, and is over at the latest when the
 /// deadline of the configuration has passed. The caller ends its runtime without waiting (`shutdown_background`).
 pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) -> Result<(), ServeError> {
@@ -170,8 +193,10 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
     }
     let limits = config.limits.clone();
     let traffic = Arc::new(Traffic::default());
+    let workshop = Workshop::open("workshop", &limits)?;
     if let Some(listener) = metrics {
-        tokio::spawn(metrics::serve(listener, metrics::registry(&pacer, &traffic), shutdown.clone()));
+        let registry = metrics::registry(&pacer, &traffic, &workshop);
+        tokio::spawn(metrics::serve(listener, registry, shutdown.clone()));
     }
     let open = protection.credentials.get().is_open();
     if config.insecure && open {
@@ -188,8 +213,8 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
         catalog,
         pacer: pacer.clone(),
         config: Arc::new(config),
-        textures: Textures::new()?,
-        workshop: Workshop::open("workshop")?,
+        textures: Textures::new(&limits)?,
+        workshop: workshop.clone(),
         traffic: traffic.clone(),
     };
 
@@ -203,6 +228,7 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
 
+    let reporting = report_workshop(workshop, health);
     let unused = pacer.clone();
     let sweeping = async move {
         let mut sweep = tokio::time::interval(Duration::from_secs(1));
@@ -260,6 +286,7 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
     tokio::select! {
         (served, ()) = async { tokio::join!(serving, stop) } => served?,
         () = sweeping => {}
+        () = reporting => {}
         () = protection.watch() => {}
         () = over => warn!("steps or streams outlasted the deadline, and are cut"),
     }
