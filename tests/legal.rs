@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 use palpate::limits::Limits;
 use palpate::pace::Pacer;
 use palpate::refusal::Reason;
-use palpate::scene::{Fixed, Integrator, Lanes, Named, Precision, Scene, Sheet, Springs, Stepping};
+use palpate::scene::{Fixed, Integrator, Lanes, Named, PointSet, Precision, Scene, Sheet, Springs, Stepping};
 use palpate::sheet::{self, choice};
 
 fn name<T: Named>(random: &mut fastrand::Rng) -> T {
@@ -33,7 +33,7 @@ fn legal(seed: u64, limits: &Limits) -> Scene {
         0 => Fixed::Edges,
         1 => Fixed::Corners,
         2 => Fixed::Points((0..random.usize(..100)).map(|_| place(&mut random)).collect()),
-        _ => Fixed::Points(Vec::new()),
+        _ => Fixed::Points(PointSet::default()),
     };
     let stiffness_n_per_m = or_zero(&mut random);
     let shear_stiffness_n_per_m = if random.bool() { stiffness_n_per_m } else { or_zero(&mut random) };

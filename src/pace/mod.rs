@@ -25,7 +25,7 @@ use crate::refusal::{Reason, Refusal, Result, number};
 use crate::scene::record::{Point, Record};
 use crate::scene::{Change, Scene};
 use crate::session::Sample;
-use crate::session::command::Intake;
+use crate::session::command::{Command, Intake, LeaseId};
 use crate::session::local::Refinement;
 use crate::session::sampling::{HEARTBEAT_S, Sampler, Sampling};
 use crate::session::schedule::Schedule;
@@ -181,6 +181,13 @@ impl Live {
             self.inbox.send(self.number, Request::Wake);
         }
         answer
+    }
+
+    /// Takes in all of `commands` from the holder of `lease`, or none. The lock is held to put them in the queue alone.
+    pub fn submit(&self, lease: LeaseId, commands: Vec<Command>) -> Result<()> {
+        let rules = lock(&self.intake).rules();
+        let checked = rules.check(commands)?;
+        self.at_intake(|intake, now| intake.take(lease, checked, now))
     }
 
     /// So many commands were refused.

@@ -175,9 +175,7 @@ impl Haptics {
                         .take(now, "commands of this stream")
                         .and_then(|()| wire::command::from_command(&command, &live.model.scene.sheet, now))
                         .and_then(|command| within_reach(command, live, hold.device.as_ref()))
-                        .and_then(|command| {
-                            live.at_intake(|intake, now| intake.submit(hold.lease, vec![command], now))
-                        });
+                        .and_then(|command| live.submit(hold.lease, vec![command]));
                     self.0.traffic.commanded(usize::from(taken.is_ok()));
                     if let Err(refusal) = taken {
                         live.count_refused(1);
@@ -346,10 +344,8 @@ impl HapticService for Haptics {
         };
         let commands: Result<Vec<Command>, Refusal> = request.commands.iter().enumerate().map(read).collect();
         let taken = commands.and_then(|commands| {
-            live.at_intake(|intake, now| {
-                intake.submit(lease, commands, now)?;
-                Ok(intake.tools_of(lease).collect())
-            })
+            live.submit(lease, commands)?;
+            Ok(live.at_intake(|intake, _| intake.tools_of(lease).collect()))
         });
         let tools = taken.inspect_err(|refusal| {
             live.count_refused(request.commands.len());

@@ -18,7 +18,7 @@ use super::integrate::Oscillator;
 use super::model::{Model, Plan};
 use super::{at_rest, lanes, stability};
 use crate::scene::law::{CentreLaw, ForceLaw, Profile, StrengthLaw};
-use crate::scene::{Fixed, Integrator, Precision, Scene};
+use crate::scene::{Fixed, Integrator, PointSet, Precision, Scene};
 
 /// Points along a side at most. Larger sheets err alike: a force spreads over some points.
 const SIDE: usize = 12;
@@ -110,10 +110,10 @@ impl Rehearsal {
         let mut small = scene.clone();
         small.sheet.points = scene.sheet.points.map(|points| points.min(SIDE));
         if let Fixed::Points(points) = &mut small.sheet.fixed {
-            points.retain(|[i, j]| *i < SIDE && *j < SIDE);
+            *points = points.as_slice().iter().copied().filter(|[i, j]| *i < SIDE && *j < SIDE).collect();
         }
         if small.sheet.is_fixed(pushed(&small)) {
-            small.sheet.fixed = Fixed::Points(Vec::new());
+            small.sheet.fixed = Fixed::Points(PointSet::default());
         }
         small.stepping.rate_hz = scene.stepping.rate_hz * f64::from(parts);
         let least = stability::stable_substeps(Integrator::Exponential4, small.stepping.rate_hz.recip(), &sheet);

@@ -1,5 +1,6 @@
 //! Protobuf messages to our types and back. What a message leaves out is said here, once.
 
+pub mod codec;
 pub mod command;
 pub mod error;
 pub mod local;
