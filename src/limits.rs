@@ -72,6 +72,8 @@ pub struct Limits {
     pub keepalive_s: f64,
     /// Commands of a haptic stream, per tool and step of the session: what comes faster for long is refused.
     pub commands_per_step: f64,
+    /// Springs times iterations that a force law may take before it becomes a coarse one.
+    pub law_work: u64,
     /// Pieces of heavy work (a session laid out, another tissue, a force law) of one caller that wait.
     pub queued_work: usize,
     /// Such a piece has to be done within so long after it was asked for, s.
@@ -117,6 +119,7 @@ impl Default for Limits {
             open_s: 10.0,
             keepalive_s: 10.0,
             commands_per_step: 4.0,
+            law_work: 1 << 27,
             queued_work: 256,
             work_s: 10.0,
             sessions_per_minute: 600.0,

@@ -316,7 +316,9 @@ impl Scene {
                         points: fields.required("points")?.point()?,
                         spacing_m: fields.required_number("spacing_m")?,
                         point_mass_kg: fields.required_number("point_mass_kg")?,
-                        fixed: fields.item("fixed").map_or(Ok(Fixed::Points(PointSet::default())), |item| read_fixed(&item))?,
+                        fixed: fields
+                            .item("fixed")
+                            .map_or(Ok(Fixed::Points(PointSet::default())), |item| read_fixed(&item))?,
                     })
                 })?,
                 springs: fields.required("springs")?.table(|fields| {

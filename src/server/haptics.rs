@@ -15,6 +15,7 @@ use tracing::{Instrument, debug, info};
 use super::House;
 use super::rate::Bucket;
 use super::workshop::{Asker, asker};
+use crate::haptics::Law;
 use crate::haptics::device::{Device, UNDECLARED_FORCE_N};
 use crate::limits::Limits;
 use crate::pace::clock::now_ns;
@@ -92,6 +93,13 @@ fn within_reach(command: Command, live: &Live, device: Option<&Device>) -> Resul
     Ok(command)
 }
 
+/// What a client should know of its device on this tissue, in words.
+fn misgivings(device: Device, law: &Law) -> Vec<String> {
+    let coarse = "the force law is a coarse one: the tissue's own would take more work than limits.law_work allows";
+    let coarse = law.is_coarse.then(|| coarse.to_owned());
+    device.misgivings(law).into_iter().chain(coarse).collect()
+}
+
 impl Haptics {
     /// Answers the first message of a haptic stream.
     async fn open(&self, open: &pb::TouchOpen, asker: &Asker) -> Result<(Opened, Hold), Status> {
@@ -110,7 +118,7 @@ impl Haptics {
         let guard = live.open_stream()?;
         if device.is_some() {
             let live = live.clone();
-            sampling.law = Some(self.0.workshop.work(asker, move |_| live.law(tip.radius_m)).await?);
+            sampling.law = Some(self.0.workshop.work(asker, move |stop| live.law(tip.radius_m, stop.flag())).await??);
         }
         let lease_s = open.lease_s.unwrap_or(self.0.config.lease_s);
         let lease = random_bits()?;
@@ -124,7 +132,7 @@ impl Haptics {
             lease_s,
             heartbeat_s: sampling.heartbeat_s,
             law: sampling.law.as_deref().map(wire::local::law),
-            warnings: device.zip(sampling.law.as_deref()).map_or(Vec::new(), |(device, law)| device.misgivings(law)),
+            warnings: device.zip(sampling.law.as_deref()).map_or(Vec::new(), |(device, law)| misgivings(device, law)),
             max_force_n: device.map_or(UNDECLARED_FORCE_N, |device| device.most_n()),
         };
         let samples = live.samples(sampling);
@@ -230,7 +238,9 @@ impl Outlet {
         use pb::touch_response::Message;
         if let Poll::Ready(event) = self.events.poll_pop(context) {
             return Poll::Ready(match event {
-                Ok((Event::Rejected(rejection), _)) => Some(Ok(Message::Rejection(rejection))),
+                Ok((Event::Rejected(rejection), dropped_answers)) => {
+                    Some(Ok(Message::Rejection(pb::Rejection { dropped_answers, ..rejection })))
+                }
                 Ok((Event::Renewed(client_time_ns, arrival_ns), _)) => {
                     let server_hold_ns = now_ns().saturating_sub(arrival_ns);
                     Some(Ok(Message::Renewed(pb::Renewed { client_time_ns, server_hold_ns })))
@@ -300,7 +310,8 @@ impl HapticService for Haptics {
         // The client may wait for our headers before it opens, so its first message is not waited for here.
         let (opened, opening) = oneshot::channel();
         let asker = asker(&request);
-        let listening = tokio::spawn(self.clone().listen(request.into_inner(), asker, opened, writer).in_current_span());
+        let listening =
+            tokio::spawn(self.clone().listen(request.into_inner(), asker, opened, writer).in_current_span());
         let _listening = AbortOnDropHandle::new(listening);
         Ok(Response::new(Box::pin(Output { stage: Stage::Opening(opening, Some(events)), _listening })))
     }

@@ -129,7 +129,12 @@ impl Collector for Heavy {
         let help = "Pieces of heavy work (sessions laid out, force laws) that wait for their turn";
         waiting.encode(encoder.encode_descriptor("workshop_waiting", help, None, MetricType::Gauge)?)?;
         let (unit, help) = (Some(&Unit::Seconds), "Age of the oldest piece of heavy work, under way or waiting");
-        ConstGauge::new(load.oldest_s).encode(encoder.encode_descriptor("workshop_oldest", help, unit, MetricType::Gauge)?)
+        ConstGauge::new(load.oldest_s).encode(encoder.encode_descriptor(
+            "workshop_oldest",
+            help,
+            unit,
+            MetricType::Gauge,
+        )?)
     }
 }
 

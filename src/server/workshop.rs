@@ -55,9 +55,9 @@ pub(crate) fn asker<T>(request: &tonic::Request<T>) -> Asker {
 pub(crate) struct Stop(Arc<AtomicBool>);
 
 impl Stop {
-    /// Nobody waits any more.
-    pub(crate) fn is_set(&self) -> bool {
-        self.0.load(Ordering::Relaxed)
+    /// Set when nobody waits any more.
+    pub(crate) fn flag(&self) -> &AtomicBool {
+        &self.0
     }
 }
 
@@ -219,7 +219,8 @@ impl Workshop {
         let piece = Piece { number, asked: Instant::now(), work };
         match shop.waiting.iter_mut().find(|waiting| waiting.0 == *asker) {
             Some((_, pieces)) if pieces.len() >= bench.most_waiting => {
-                let message = format!("{} pieces of work of this caller wait already (limits.queued_work)", pieces.len());
+                let message =
+                    format!("{} pieces of work of this caller wait already (limits.queued_work)", pieces.len());
                 return Err(Refusal::new(Reason::Overloaded, "", message));
             }
             Some((_, pieces)) => pieces.push_back(piece),
@@ -274,7 +275,7 @@ mod tests {
         let (ended, end) = mpsc::channel();
         let endless = |ended: mpsc::Sender<()>| {
             move |stop: &Stop| {
-                while !stop.is_set() {
+                while !stop.flag().load(Ordering::Relaxed) {
                     std::thread::yield_now();
                 }
                 let _ = ended.send(());

@@ -34,7 +34,11 @@ const WINDOW_S: f64 = 0.004;
 /// Looks at a scene, and times its step under a poke. `clock_s` tells the time.
 pub fn check(model: &Arc<Model>, limits: &Limits, clock_s: &dyn Fn() -> f64) -> Report {
     let candidates = choice::candidates(&model.scene, limits);
-    Report { model: model.clone(), candidates, step_s: (model.predicted_step_s() <= LONGEST_STEP_S).then(|| time(model, clock_s)).flatten() }
+    Report {
+        model: model.clone(),
+        candidates,
+        step_s: (model.predicted_step_s() <= LONGEST_STEP_S).then(|| time(model, clock_s)).flatten(),
+    }
 }
 
 /// A poke that moves the middle by about a tenth of a spacing: numbers of the usual size.

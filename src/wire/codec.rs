@@ -146,10 +146,7 @@ mod tests {
             client_time_ns: u64::MAX,
             at_step: Some(u64::MAX),
             time_to_live_s: Some(1.0),
-            action: Some(pb::command::Action::Force(pb::Force {
-                force_n: vector(DVec3::ONE),
-                ..Default::default()
-            })),
+            action: Some(pb::command::Action::Force(pb::Force { force_n: vector(DVec3::ONE), ..Default::default() })),
         };
         let batch = |commands| pb::SendCommandsRequest { commands, ..Default::default() };
         checked(&batch(vec![command; 4096])).unwrap();

@@ -2,7 +2,9 @@
 
 use super::{from_point, pb, point, required};
 use crate::refusal::{Reason, Refusal, Result};
-use crate::scene::{Appearance, Change, Fixed, Integrator, Lanes, Named, PointSet, Precision, Scene, Sheet, Springs, Stepping};
+use crate::scene::{
+    Appearance, Change, Fixed, Integrator, Lanes, Named, PointSet, Precision, Scene, Sheet, Springs, Stepping,
+};
 
 /// A scene out of a message.
 pub fn from_scene(message: &pb::Scene) -> Result<Scene> {
