@@ -121,7 +121,7 @@ impl Default for Limits {
             commands_per_step: 4.0,
             law_work: 1 << 27,
             queued_work: 256,
-            work_s: 10.0,
+            work_s: 30.0,
             sessions_per_minute: 600.0,
             calls_per_s: 2000.0,
         }

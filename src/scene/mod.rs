@@ -383,10 +383,10 @@ impl Scene {
         }
         physical("sheet.spacing_m", positive("sheet.spacing_m", self.sheet.spacing_m)?)?;
         physical("sheet.point_mass_kg", positive("sheet.point_mass_kg", self.sheet.point_mass_kg)?)?;
-        if let Fixed::Points(points) = &self.sheet.fixed {
-            if let Some(index) = points.as_slice().iter().position(|[i, j]| *i >= nx || *j >= ny) {
-                self.sheet.index(&format!("sheet.fixed[{index}]"), points.as_slice()[index])?;
-            }
+        if let Fixed::Points(points) = &self.sheet.fixed
+            && let Some(index) = points.as_slice().iter().position(|[i, j]| *i >= nx || *j >= ny)
+        {
+            self.sheet.index(&format!("sheet.fixed[{index}]"), points.as_slice()[index])?;
         }
         let coefficients = [
             ("springs.stiffness_n_per_m", self.springs.stiffness_n_per_m),

@@ -8,12 +8,13 @@ use std::net::IpAddr;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use tokio::sync::oneshot;
 use tonic::Status;
 
 use crate::limits::Limits;
+use crate::pace::clock::now_ns;
 use crate::pace::priority::give_way;
 use crate::pace::queue::lock;
 use crate::refusal::{Reason, Refusal};
@@ -63,7 +64,7 @@ impl Stop {
 
 struct Piece {
     number: u64,
-    asked: Instant,
+    asked_ns: u64,
     work: Box<dyn FnOnce() + Send>,
 }
 
@@ -72,7 +73,7 @@ struct Shop {
     /// By who asks, in the order of their turns; nobody without work.
     waiting: VecDeque<(Asker, VecDeque<Piece>)>,
     /// For whom something is done, and since when it was asked for.
-    working: Vec<(Asker, Instant)>,
+    working: Vec<(Asker, u64)>,
     pieces: u64,
     is_closed: bool,
 }
@@ -87,7 +88,7 @@ impl Shop {
         if !pieces.is_empty() {
             self.waiting.push_back((asker.clone(), pieces));
         }
-        self.working.push((asker.clone(), piece.asked));
+        self.working.push((asker.clone(), piece.asked_ns));
         Some((asker, piece))
     }
 
@@ -216,7 +217,7 @@ impl Workshop {
         let mut shop = lock(&bench.shop);
         let number = shop.pieces;
         shop.pieces += 1;
-        let piece = Piece { number, asked: Instant::now(), work };
+        let piece = Piece { number, asked_ns: now_ns(), work };
         match shop.waiting.iter_mut().find(|waiting| waiting.0 == *asker) {
             Some((_, pieces)) if pieces.len() >= bench.most_waiting => {
                 let message =
@@ -235,7 +236,8 @@ impl Workshop {
         let shop = lock(&self.0.0.shop);
         let pieces = shop.waiting.iter().flat_map(|waiting| &waiting.1);
         let begun = shop.working.iter().map(|busy| busy.1);
-        let oldest = pieces.map(|piece| piece.asked).chain(begun).min().map_or(Duration::ZERO, |asked| asked.elapsed());
+        let asked_ns = pieces.map(|piece| piece.asked_ns).chain(begun).min();
+        let oldest = asked_ns.map_or(Duration::ZERO, |asked| Duration::from_nanos(now_ns().saturating_sub(asked)));
         let waiting = shop.waiting.iter().map(|waiting| waiting.1.len()).sum();
         Load { waiting, oldest_s: oldest.as_secs_f64(), is_late: oldest > self.0.0.deadline }
     }
@@ -323,7 +325,7 @@ mod tests {
         let now = std::future::poll_fn(|cx| std::task::Poll::Ready(third.as_mut().poll(cx).is_pending()));
         assert!(now.await);
         let refused = workshop.work(&one, |_| ()).await.unwrap_err();
-        assert_eq!(refused.code(), tonic::Code::from(Status::from(Refusal::new(Reason::Overloaded, "", "")).code()));
+        assert_eq!(refused.code(), tonic::Code::ResourceExhausted);
         let (stuck, second) = waiting.await;
         assert_eq!(stuck.unwrap_err().code(), tonic::Code::DeadlineExceeded);
         assert_eq!(second.unwrap_err().code(), tonic::Code::DeadlineExceeded);

@@ -107,18 +107,16 @@ impl Chooser<'_> {
         Chooser { stepping: &scene.stepping, sheet: Oscillator::of(scene), rehearsal, most_substeps: limits.substeps }
     }
 
-    /// A choice is never less accurate than it would be with more work: it is refused. Where nothing is left to choose, the
-    /// rehearsals tell the expected error alone.
+    /// A choice is never less accurate for want of work: it is refused. Whoever gives the number of substeps answers for
+    /// it, and is warned of an error that is not known.
     fn check_work(&self, limits: &Limits) -> Result<()> {
-        let Stepping { integrator, substeps, precision, tolerance, .. } = self.stepping;
-        let named = *integrator != Integrator::Auto && substeps.is_some() && *precision != Precision::Auto;
-        if named || !self.rehearsal.is_cut() {
+        if self.stepping.substeps.is_some() || !self.rehearsal.is_cut() {
             return Ok(());
         }
         let message = format!(
-            "to find out what keeps an error of {tolerance:e} here would take more than {} points × substeps of rehearsals \
-             (limits.rehearsal_work): a larger tolerance takes less, and integrator, substeps and precision given by name none",
-            limits.rehearsal_work
+            "to find out what keeps an error of {:e} here would take more than {} points × substeps of rehearsals \
+             (limits.rehearsal_work): a larger tolerance takes less, and a given number of substeps none",
+            self.stepping.tolerance, limits.rehearsal_work
         );
         Err(Refusal::new(Reason::TooLarge, "stepping.tolerance", message))
     }
