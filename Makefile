@@ -139,9 +139,9 @@ bench-rest: build
 bench-frames: need-rust
 	$(CARGO) bench --quiet --bench frames -- $(ARGUMENTS)
 
-# Ten thousand random scenes, and a soak of ten million steps.
+# Ten thousand random scenes, as many that are merely legal, and a soak of ten million steps.
 stress: need-rust
-	PALPATE_STRESS_SCENES=10000 $(CARGO) test --release --test stress --test physics -- --include-ignored --nocapture
+	PALPATE_STRESS_SCENES=10000 $(CARGO) test --release --test stress --test legal --test physics -- --include-ignored --nocapture
 
 # Another processor, the same bits. The compiler and the standard library for ARM are Debian's. An emulated vector takes some
 # thousand times as long: `make test-arm ARM_TESTS="--test determinism"` for whole courses, and hours.

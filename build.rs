@@ -11,7 +11,10 @@ fn main() -> Result<(), Box<dyn Error>> {
     std::fs::write(out.join("palpate.bin"), prost::Message::encode_to_vec(&descriptors))?;
     // Frames are shared between viewers, not copied for each.
     let shared = [".palpate.v1.Patch.displacement", ".palpate.v1.GetTextureResponse.png"];
-    let build = tonic_prost_build::configure().codec_path("crate::wire::codec::Codec");
-    shared.iter().fold(build, tonic_prost_build::Builder::bytes).compile_fds(descriptors)?;
+    let configured = shared.iter().fold(tonic_prost_build::configure(), tonic_prost_build::Builder::bytes);
+    // Requests are bounded before they are decoded (`wire::codec`), which tells them by their names.
+    let mut named = tonic_prost_build::Config::new();
+    named.enable_type_names();
+    configured.codec_path("crate::wire::codec::BoundedCodec").compile_fds_with_config(descriptors, named)?;
     Ok(())
 }

@@ -35,6 +35,11 @@ pub struct Limits {
     pub points_in_all: usize,
     /// Points times substeps of a session: what one step may cost its thread.
     pub point_substeps_per_step: u64,
+    /// How long a step of a session may take, predicted with all points awake, in periods of its rate.
+    pub periods_per_step: f64,
+    /// Points times substeps that may be computed to find out which scheme and how many substeps keep a scene's tolerance;
+    /// offline 32 times as many. With the rest, some tenths of a second.
+    pub rehearsal_work: u64,
     /// Streams that read one session.
     pub streams_per_session: usize,
     /// Step rate of a session, Hz.
@@ -69,6 +74,12 @@ pub struct Limits {
     pub keepalive_s: f64,
     /// Commands of a haptic stream, per tool and step of the session: what comes faster for long is refused.
     pub commands_per_step: f64,
+    /// Springs times iterations that a force law may take before it becomes a coarse one.
+    pub law_work: u64,
+    /// Pieces of heavy work (a session laid out, another tissue, a force law) of one caller that wait.
+    pub queued_work: usize,
+    /// Such a piece has to be done within so long after it was asked for, s.
+    pub work_s: f64,
     /// Sessions made over one connection, per minute, and at once.
     pub sessions_per_minute: f64,
     /// Calls made over one connection, of any kind, per second, and at once.
@@ -92,6 +103,8 @@ impl Default for Limits {
             sessions: 1024,
             points_in_all: 1 << 24,
             point_substeps_per_step: 1 << 26,
+            periods_per_step: 1.0,
+            rehearsal_work: 1 << 27,
             streams_per_session: 256,
             session_rate_hz: 20_000.0,
             frame_vertices: 1 << 22,
@@ -108,6 +121,9 @@ impl Default for Limits {
             open_s: 10.0,
             keepalive_s: 10.0,
             commands_per_step: 4.0,
+            law_work: 1 << 27,
+            queued_work: 256,
+            work_s: 30.0,
             sessions_per_minute: 600.0,
             calls_per_s: 2000.0,
         }

@@ -13,7 +13,7 @@ mod taps;
 mod thread;
 
 use std::collections::BTreeMap;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 
@@ -25,7 +25,7 @@ use crate::refusal::{Reason, Refusal, Result, number};
 use crate::scene::record::{Point, Record};
 use crate::scene::{Change, Scene};
 use crate::session::Sample;
-use crate::session::command::Intake;
+use crate::session::command::{Command, Intake, LeaseId};
 use crate::session::local::Refinement;
 use crate::session::sampling::{HEARTBEAT_S, Sampler, Sampling};
 use crate::session::schedule::Schedule;
@@ -183,6 +183,13 @@ impl Live {
         answer
     }
 
+    /// Takes in all of `commands` from the holder of `lease`, or none. The lock is held to put them in the queue alone.
+    pub fn submit(&self, lease: LeaseId, commands: Vec<Command>) -> Result<()> {
+        let rules = lock(&self.intake).rules();
+        let checked = rules.check(commands)?;
+        self.at_intake(|intake, now| intake.take(lease, checked, now))
+    }
+
     /// So many commands were refused.
     pub fn count_refused(&self, commands: usize) {
         self.refused.fetch_add(commands as u64, Ordering::Relaxed);
@@ -278,20 +285,24 @@ impl Live {
         reader
     }
 
-    /// The force law under a tip of `radius_m`. Computed once a radius, by who asks first: tenths of a second, and who asks
-    /// for the same meanwhile waits.
-    pub fn law(&self, radius_m: f64) -> Arc<Law> {
+    /// The force law under a tip of `radius_m`. Computed once a radius, tenths of a second, unless `stop` is set; a coarse
+    /// one where that would take longer.
+    pub fn law(&self, radius_m: f64, stop: &AtomicBool) -> Result<Arc<Law>> {
         let model = lock(&self.status).model.clone();
-        let mut laws = lock(&self.laws);
-        if let Some((.., law)) = laws.iter().find(|law| law.0 == radius_m && Arc::ptr_eq(&law.1, &model)) {
-            return law.clone();
+        let kept = |law: &&KeptLaw| law.0 == radius_m && Arc::ptr_eq(&law.1, &model);
+        if let Some((.., law)) = lock(&self.laws).iter().find(kept) {
+            return Ok(law.clone());
         }
-        let law = Arc::new(Law::of(&model, radius_m));
+        let Some(law) = Law::within(&model, radius_m, self.limits.law_work, stop).map(Arc::new) else {
+            let message = "the force law of this tissue would take too much work: touch without a device";
+            return Err(Refusal::new(Reason::NotAvailable, "device", message));
+        };
+        let mut laws = lock(&self.laws);
         if laws.len() == MOST_LAWS {
             laws.remove(0);
         }
         laws.push((radius_m, model, law.clone()));
-        law
+        Ok(law)
     }
 
     /// Frames for a viewer.
@@ -574,11 +585,22 @@ impl Pacer {
 /// Refuses steps that would keep the server from all others.
 fn check_work(model: &Model, limits: &Limits) -> Result<()> {
     let (points, substeps, most) = (model.len(), model.plan.substeps, limits.point_substeps_per_step);
-    if points as u64 * u64::from(substeps) <= most {
-        return Ok(());
+    if points as u64 * u64::from(substeps) > most {
+        let message =
+            format!("a step would compute {points} points {substeps} times, above the limit of {most} in all");
+        return Err(Refusal::new(Reason::TooLarge, "stepping.substeps", message));
     }
-    let message = format!("a step would compute {points} points {substeps} times, above the limit of {most} in all");
-    Err(Refusal::new(Reason::TooLarge, "stepping.substeps", message))
+    let (step_s, rate_hz, most) = (model.predicted_step_s(), model.scene.stepping.rate_hz, limits.periods_per_step);
+    let periods = step_s * rate_hz;
+    if periods > most {
+        let message = format!(
+            "a step of {points} points, computed {substeps} times each, would take {:.3} ms, which is {periods:.2} of its \
+             periods: above the limit of {most} (limits.periods_per_step). Fewer points, softer springs or a lower rate take less",
+            step_s * 1e3
+        );
+        return Err(Refusal::new(Reason::TooLarge, "stepping.rate_hz", message));
+    }
+    Ok(())
 }
 
 fn unknown_session(id: &str) -> Refusal {

@@ -8,6 +8,7 @@ pub mod script;
 pub mod tip;
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, not_negative, number, positive};
@@ -112,7 +113,32 @@ pub enum Fixed {
     /// The four corners.
     Corners,
     /// Just these; an empty list fixes none.
-    Points(Vec<[usize; 2]>),
+    Points(PointSet),
+}
+
+/// Mass points, each once, in order. One in memory for all clones: a scene may name many, and is shared by all that know it.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct PointSet(Arc<[[usize; 2]]>);
+
+impl PointSet {
+    /// Whether a point is one of them.
+    pub fn contains(&self, point: [usize; 2]) -> bool {
+        self.0.binary_search(&point).is_ok()
+    }
+
+    /// All of them.
+    pub fn as_slice(&self) -> &[[usize; 2]] {
+        &self.0
+    }
+}
+
+impl FromIterator<[usize; 2]> for PointSet {
+    fn from_iter<I: IntoIterator<Item = [usize; 2]>>(points: I) -> Self {
+        let mut points: Vec<_> = points.into_iter().collect();
+        points.sort_unstable();
+        points.dedup();
+        PointSet(points.into())
+    }
 }
 
 /// Springs between neighbours: the force on a from a spring a–b is k (L − L0)(x_b − x_a)/L.
@@ -290,7 +316,9 @@ impl Scene {
                         points: fields.required("points")?.point()?,
                         spacing_m: fields.required_number("spacing_m")?,
                         point_mass_kg: fields.required_number("point_mass_kg")?,
-                        fixed: fields.item("fixed").map_or(Ok(Fixed::Points(Vec::new())), |item| read_fixed(&item))?,
+                        fixed: fields
+                            .item("fixed")
+                            .map_or(Ok(Fixed::Points(PointSet::default())), |item| read_fixed(&item))?,
                     })
                 })?,
                 springs: fields.required("springs")?.table(|fields| {
@@ -355,10 +383,10 @@ impl Scene {
         }
         physical("sheet.spacing_m", positive("sheet.spacing_m", self.sheet.spacing_m)?)?;
         physical("sheet.point_mass_kg", positive("sheet.point_mass_kg", self.sheet.point_mass_kg)?)?;
-        if let Fixed::Points(points) = &self.sheet.fixed {
-            for (index, &point) in points.iter().enumerate() {
-                self.sheet.index(&format!("sheet.fixed[{index}]"), point)?;
-            }
+        if let Fixed::Points(points) = &self.sheet.fixed
+            && let Some(index) = points.as_slice().iter().position(|[i, j]| *i >= nx || *j >= ny)
+        {
+            self.sheet.index(&format!("sheet.fixed[{index}]"), points.as_slice()[index])?;
         }
         let coefficients = [
             ("springs.stiffness_n_per_m", self.springs.stiffness_n_per_m),
@@ -426,7 +454,7 @@ impl Sheet {
         match &self.fixed {
             Fixed::Edges => rim_x || rim_y,
             Fixed::Corners => rim_x && rim_y,
-            Fixed::Points(points) => points.contains(&[i, j]),
+            Fixed::Points(points) => points.contains([i, j]),
         }
     }
 
@@ -434,7 +462,7 @@ impl Sheet {
     pub fn fixed_indices(&self) -> Vec<usize> {
         let [nx, ny] = self.points;
         let mut indices: Vec<usize> = match &self.fixed {
-            Fixed::Points(points) => points.iter().map(|[i, j]| i * ny + j).collect(),
+            Fixed::Points(points) => points.as_slice().iter().map(|[i, j]| i * ny + j).collect(),
             _ => (0..nx * ny).filter(|index| self.is_fixed([index / ny, index % ny])).collect(),
         };
         indices.sort_unstable();

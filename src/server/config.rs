@@ -101,6 +101,7 @@ impl Config {
             ("limits.point_force_n", self.limits.point_force_n),
             ("limits.reach_in_sheets", self.limits.reach_in_sheets),
             ("limits.session_rate_hz", self.limits.session_rate_hz),
+            ("limits.periods_per_step", self.limits.periods_per_step),
             ("limits.commands_per_step", self.limits.commands_per_step),
             ("limits.sessions_per_minute", self.limits.sessions_per_minute),
             ("limits.calls_per_s", self.limits.calls_per_s),
@@ -144,6 +145,7 @@ impl Config {
             ("limits.handshake_s", self.limits.handshake_s),
             ("limits.open_s", self.limits.open_s),
             ("limits.keepalive_s", self.limits.keepalive_s),
+            ("limits.work_s", self.limits.work_s),
         ] {
             number(field, value, "above 0 and at most a day", within(day_s))?;
         }

@@ -17,6 +17,7 @@ use super::metrics::Traffic;
 use super::reload::Reloaded;
 use super::request::{Inward, Pace};
 use super::revocation::{Calls, Shown};
+use super::workshop::Asker;
 use crate::refusal::{Reason, Refusal, Result};
 
 /// Puts a [`Guard`] before a service.
@@ -70,6 +71,12 @@ impl GuardLayer {
         let peer = request.extensions().get::<Peer>();
         peer.map_or(Ok(()), |peer| peer.calls.pass())?;
         self.identify(request, peer).map_err(|refusal| (refusal, Duration::ZERO))
+    }
+
+    /// On whose behalf the work of a call is done: who has shown who they are is one caller wherever they are.
+    fn asker<B>(&self, caller: &Caller, request: &Request<B>) -> Asker {
+        let peer = request.extensions().get::<Peer>().filter(|_| self.credentials.get().is_open());
+        peer.map_or_else(|| Asker::named(&caller.name), |peer| Asker::at(peer.address.ip()))
     }
 
     fn identify<B>(&self, request: &Request<B>, peer: Option<&Peer>) -> Result<Known> {
@@ -154,9 +161,11 @@ where
         self.inner.poll_ready(cx)
     }
 
-    fn call(&mut self, request: Request<Body>) -> Self::Future {
+    fn call(&mut self, mut request: Request<Body>) -> Self::Future {
         match self.layer.admit(&request) {
             Ok((caller, shown)) => {
+                let asker = self.layer.asker(&caller, &request);
+                request.extensions_mut().insert(asker);
                 // Who may not call is told that first.
                 if let Some(answer) = misdirected(&request) {
                     return Box::pin(async move { Ok(answer) });

@@ -14,6 +14,8 @@ use tracing::{Instrument, debug, info};
 
 use super::House;
 use super::rate::Bucket;
+use super::workshop::{Asker, asker};
+use crate::haptics::Law;
 use crate::haptics::device::{Device, UNDECLARED_FORCE_N};
 use crate::limits::Limits;
 use crate::pace::clock::now_ns;
@@ -91,9 +93,16 @@ fn within_reach(command: Command, live: &Live, device: Option<&Device>) -> Resul
     Ok(command)
 }
 
+/// What a client should know of its device on this tissue, in words.
+fn misgivings(device: Device, law: &Law) -> Vec<String> {
+    let coarse = "the force law is a coarse one: the tissue's own would take more work than limits.law_work allows";
+    let coarse = law.is_coarse.then(|| coarse.to_owned());
+    device.misgivings(law).into_iter().chain(coarse).collect()
+}
+
 impl Haptics {
     /// Answers the first message of a haptic stream.
-    async fn open(&self, open: &pb::TouchOpen) -> Result<(Opened, Hold), Refusal> {
+    async fn open(&self, open: &pb::TouchOpen, asker: &Asker) -> Result<(Opened, Hold), Status> {
         let live = self.0.pacer.get(&open.session_id)?;
         let device = open.device.as_ref().map(wire::local::from_device).transpose()?;
         let tip = wire::command::from_tip(open.tip.as_ref());
@@ -103,15 +112,13 @@ impl Haptics {
         let mut sampling = wire::sample::sampling(every, only, deadband, open.heartbeat_s, device.is_some())?;
         if open.touch_stiffness && device.is_none() {
             let message = "is missing: touch_stiffness is of its local models";
-            return Err(Refusal::new(Reason::Missing, "device", message));
+            return Err(Refusal::new(Reason::Missing, "device", message).into());
         }
         sampling.touch_stiffness = open.touch_stiffness;
         let guard = live.open_stream()?;
         if device.is_some() {
             let live = live.clone();
-            let law = self.0.workshop.work(move || live.law(tip.radius_m)).await;
-            let failed = |_| Refusal::new(Reason::NotAvailable, "device", "the force law could not be computed");
-            sampling.law = Some(law.map_err(failed)?);
+            sampling.law = Some(self.0.workshop.work(asker, move |stop| live.law(tip.radius_m, stop.flag())).await??);
         }
         let lease_s = open.lease_s.unwrap_or(self.0.config.lease_s);
         let lease = random_bits()?;
@@ -125,7 +132,7 @@ impl Haptics {
             lease_s,
             heartbeat_s: sampling.heartbeat_s,
             law: sampling.law.as_deref().map(wire::local::law),
-            warnings: device.zip(sampling.law.as_deref()).map_or(Vec::new(), |(device, law)| device.misgivings(law)),
+            warnings: device.zip(sampling.law.as_deref()).map_or(Vec::new(), |(device, law)| misgivings(device, law)),
             max_force_n: device.map_or(UNDECLARED_FORCE_N, |device| device.most_n()),
         };
         let samples = live.samples(sampling);
@@ -137,6 +144,7 @@ impl Haptics {
     async fn listen(
         self,
         mut inbound: Streaming<pb::TouchRequest>,
+        asker: Asker,
         opening: oneshot::Sender<Result<Opened, Status>>,
         events: Writer<Event>,
     ) {
@@ -150,10 +158,10 @@ impl Haptics {
         let mut early = Early::default();
         let first = match first {
             Ok(Some(pb::TouchRequest { message: Some(Message::Open(open)) })) => {
-                let opening = self.open(&open);
+                let opening = self.open(&open, &asker);
                 early.gather(opening, &mut inbound, self.0.config.limits.queued_commands_per_tool).await
             }
-            Ok(_) => Err(Refusal::new(Reason::OutOfTurn, "open", "the first message must be `open`")),
+            Ok(_) => Err(Refusal::new(Reason::OutOfTurn, "open", "the first message must be `open`").into()),
             Err(status) => {
                 let _ = opening.send(Err(status));
                 return;
@@ -164,8 +172,8 @@ impl Haptics {
                 let _ = opening.send(Ok(opened));
                 hold
             }
-            Err(refusal) => {
-                let _ = opening.send(Err(refusal.into()));
+            Err(status) => {
+                let _ = opening.send(Err(status));
                 return;
             }
         };
@@ -186,9 +194,7 @@ impl Haptics {
                         .take(now, "commands of this stream")
                         .and_then(|()| wire::command::from_command(&command, &live.model.scene.sheet, now))
                         .and_then(|command| within_reach(command, live, hold.device.as_ref()))
-                        .and_then(|command| {
-                            live.at_intake(|intake, now| intake.submit(hold.lease, vec![command], now))
-                        });
+                        .and_then(|command| live.submit(hold.lease, vec![command]));
                     self.0.traffic.commanded(usize::from(taken.is_ok()));
                     if let Err(refusal) = taken {
                         live.count_refused(1);
@@ -294,7 +300,9 @@ impl Outlet {
         use pb::touch_response::Message;
         if let Poll::Ready(event) = self.events.poll_pop(context) {
             return Poll::Ready(match event {
-                Ok((Event::Rejected(rejection), _)) => Some(Ok(Message::Rejection(rejection))),
+                Ok((Event::Rejected(rejection), dropped_answers)) => {
+                    Some(Ok(Message::Rejection(pb::Rejection { dropped_answers, ..rejection })))
+                }
                 Ok((Event::Renewed(client_time_ns, arrival_ns), _)) => {
                     let server_hold_ns = now_ns().saturating_sub(arrival_ns);
                     Some(Ok(Message::Renewed(pb::Renewed { client_time_ns, server_hold_ns })))
@@ -363,7 +371,9 @@ impl HapticService for Haptics {
         let (writer, events) = queue(self.0.config.limits.queued_samples);
         // The client may wait for our headers before it opens, so its first message is not waited for here.
         let (opened, opening) = oneshot::channel();
-        let listening = tokio::spawn(self.clone().listen(request.into_inner(), opened, writer).in_current_span());
+        let asker = asker(&request);
+        let listening =
+            tokio::spawn(self.clone().listen(request.into_inner(), asker, opened, writer).in_current_span());
         let _listening = AbortOnDropHandle::new(listening);
         Ok(Response::new(Box::pin(Output { stage: Stage::Opening(opening, Some(events)), _listening })))
     }
@@ -407,10 +417,8 @@ impl HapticService for Haptics {
         };
         let commands: Result<Vec<Command>, Refusal> = request.commands.iter().enumerate().map(read).collect();
         let taken = commands.and_then(|commands| {
-            live.at_intake(|intake, now| {
-                intake.submit(lease, commands, now)?;
-                Ok(intake.tools_of(lease).collect())
-            })
+            live.submit(lease, commands)?;
+            Ok(live.at_intake(|intake, _| intake.tools_of(lease).collect()))
         });
         let tools = taken.inspect_err(|refusal| {
             live.count_refused(request.commands.len());

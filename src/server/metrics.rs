@@ -24,6 +24,7 @@ use tracing::{info, warn};
 use super::connections::{self, Connection, Seats};
 use super::identity::CALLS;
 use super::transport::Cut;
+use super::workshop::Workshop;
 use crate::limits::Limits;
 use crate::pace::queue::lock;
 use crate::pace::tally::{Count, Tally, Times};
@@ -109,7 +110,7 @@ impl Traffic {
 }
 
 /// Everything, as it is when it is asked for.
-pub(super) fn registry(pacer: &Arc<Pacer>, traffic: &Traffic) -> Registry {
+pub(super) fn registry(pacer: &Arc<Pacer>, traffic: &Traffic, workshop: &Workshop) -> Registry {
     let mut registry = Registry::with_prefix("palpate");
     let connections = "Connections that are open";
     registry.register("connections", connections, traffic.connections.clone());
@@ -130,7 +131,34 @@ pub(super) fn registry(pacer: &Arc<Pacer>, traffic: &Traffic) -> Registry {
     let refusals = "Calls and commands that were refused, by reason";
     registry.register("refusals", refusals, traffic.refusals.clone());
     registry.register_collector(Box::new(Stepping(pacer.clone())));
+    registry.register_collector(Box::new(Heavy(workshop.clone())));
     registry
+}
+
+/// What waits in the workshop.
+struct Heavy(Workshop);
+
+impl fmt::Debug for Heavy {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Heavy")
+    }
+}
+
+impl Collector for Heavy {
+    #[allow(clippy::cast_precision_loss)]
+    fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> fmt::Result {
+        let load = self.0.load();
+        let waiting = ConstGauge::new(load.waiting as f64);
+        let help = "Pieces of heavy work (sessions laid out, force laws) that wait for their turn";
+        waiting.encode(encoder.encode_descriptor("workshop_waiting", help, None, MetricType::Gauge)?)?;
+        let (unit, help) = (Some(&Unit::Seconds), "Age of the oldest piece of heavy work, under way or waiting");
+        ConstGauge::new(load.oldest_s).encode(encoder.encode_descriptor(
+            "workshop_oldest",
+            help,
+            unit,
+            MetricType::Gauge,
+        )?)
+    }
 }
 
 /// The stepping threads and the sessions.

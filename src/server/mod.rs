@@ -166,12 +166,13 @@ pub enum ServeError {
 }
 
 /// What the health service tells of. The server itself, "", serves also where a part of it does not.
-const SERVICES: [&str; 5] = [
+const SERVICES: [&str; 6] = [
     "",
     <SessionServiceServer<sessions::Sessions> as NamedService>::NAME,
     <HapticServiceServer<haptics::Haptics> as NamedService>::NAME,
     <ViewServiceServer<views::Views> as NamedService>::NAME,
     TOKENS,
+    WORKSHOP,
 ];
 
 /// Serves while the tokens in force are those of the file.
@@ -221,6 +222,27 @@ async fn leave(mut health: HealthReporter) {
     }
 }
 
+/// The health service that tells whether heavy work is done in time.
+const WORKSHOP: &str = "palpate.workshop";
+
+/// Tells by [`WORKSHOP`] whether the workshop's oldest piece is within its deadline.
+async fn report_workshop(workshop: Workshop, health: HealthReporter) {
+    let mut look = tokio::time::interval(Duration::from_millis(250));
+    let mut was_late = None;
+    loop {
+        look.tick().await;
+        let load = workshop.load();
+        if was_late.replace(load.is_late) == Some(load.is_late) {
+            continue;
+        }
+        if load.is_late {
+            warn!(oldest_s = load.oldest_s, waiting = load.waiting, "heavy work is past its deadline");
+        }
+        let status = if load.is_late { ServingStatus::NotServing } else { ServingStatus::Serving };
+        health.set_service_status(WORKSHOP, status).await;
+    }
+}
+
 /// Serves at `doors` until `shutdown` is cancelled; then ends all streams, and is over at the latest when the
 /// deadline of the configuration has passed. The caller ends its runtime without waiting (`shutdown_background`).
 pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) -> Result<(), ServeError> {
@@ -238,8 +260,10 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
     descriptors::raise();
     limits.connections =
         descriptors::connections(limits.connections, metrics.as_ref().map_or(0, |_| metrics::SCRAPERS));
+    let workshop = Workshop::open("workshop", &limits)?;
     if let Some(listener) = metrics {
-        let (limits, registry, shutdown) = (limits.clone(), metrics::registry(&pacer, &traffic), shutdown.clone());
+        let registry = metrics::registry(&pacer, &traffic, &workshop);
+        let (limits, shutdown) = (limits.clone(), shutdown.clone());
         tokio::spawn(async move { metrics::serve(listener, &limits, registry, shutdown).await });
     }
     let open = protection.credentials.get().is_open();
@@ -260,8 +284,8 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
         catalog,
         pacer: pacer.clone(),
         config: Arc::new(config),
-        textures: Textures::new()?,
-        workshop: Workshop::open("workshop")?,
+        textures: Textures::new(&limits)?,
+        workshop: workshop.clone(),
         traffic: traffic.clone(),
     };
 
@@ -276,6 +300,7 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
 
+    let reporting = report_workshop(workshop, health.clone());
     let unused = pacer.clone();
     let sweeping = async move {
         let mut sweep = tokio::time::interval(Duration::from_secs(1));
@@ -339,6 +364,7 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
     tokio::select! {
         (served, ()) = async { tokio::join!(serving, stop) } => served?,
         () = sweeping => {}
+        () = reporting => {}
         () = protection.watch() => {}
         () = calls.watch() => {}
         () = telling => {}

@@ -9,6 +9,7 @@ use tracing::{info, warn};
 
 use super::House;
 use super::connections::Peer;
+use super::workshop::{Stop, asker};
 use crate::refusal::{Reason, Refusal, number};
 use crate::scene::script::Script;
 use crate::wire::pb::session_service_server::SessionService;
@@ -37,6 +38,7 @@ impl SessionService for Sessions {
             tokio::time::sleep(wait).await;
             return Err(refusal.into());
         }
+        let asker = asker(&request);
         let request = request.into_inner();
         let scene = match &request.source {
             Some(Source::SceneName(name)) => self.0.catalog.load(name, &[], &self.0.config.limits)?,
@@ -49,7 +51,8 @@ impl SessionService for Sessions {
         number("idle_timeout_s", idle_timeout_s, &range, |value| value > 0.0 && value <= most_s)?;
         // A large sheet takes a while to lay out.
         let pacer = self.0.pacer.clone();
-        let live = self.0.workshop.work(move || pacer.create(&scene, request.paused, idle_timeout_s)).await??;
+        let create = move |_: &Stop| pacer.create(&scene, request.paused, idle_timeout_s);
+        let live = self.0.workshop.work(&asker, create).await??;
         info!(session = %live.id, scene = %live.model.scene.name, points = live.model.len(), "session created");
         for warning in &live.model.warnings {
             warn!(session = %live.id, warning);
@@ -98,10 +101,12 @@ impl SessionService for Sessions {
         &self,
         request: Request<pb::UpdateTissueRequest>,
     ) -> Result<Response<pb::UpdateTissueResponse>, Status> {
+        let asker = asker(&request);
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
         let (change, to_change) = (wire::scene::from_change(&request), live.clone());
-        let (step, model) = self.0.workshop.work(move || to_change.change(&change, request.at_step)).await??;
+        let change = move |_: &Stop| to_change.change(&change, request.at_step);
+        let (step, model) = self.0.workshop.work(&asker, change).await??;
         info!(
             session = %live.id,
             step,
@@ -146,13 +151,14 @@ impl SessionService for Sessions {
         &self,
         request: Request<pb::GetScriptRequest>,
     ) -> Result<Response<Self::GetScriptStream>, Status> {
+        let asker = asker(&request);
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
         let guard = live.open_stream()?;
         let (catalog, config) = (self.0.catalog.clone(), self.0.config.clone());
         // A script may have traces of megabytes.
-        let read = move || catalog.script(&request.script_name, &live.model.scene, &config.limits);
-        let script = self.0.workshop.work(read).await??;
+        let read = move |_: &Stop| catalog.script(&request.script_name, &live.model.scene, &config.limits);
+        let script = self.0.workshop.work(&asker, read).await??;
         let out = stream::unfold(Some((script, 0, guard)), |state| async move {
             let (script, from, guard) = state?;
             let (message, next) = script_part(&script, from);

@@ -7,8 +7,9 @@ use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
 use tonic::Status;
 
-use super::workshop::Workshop;
+use super::workshop::{Asker, Workshop};
 use super::{House, page};
+use crate::limits::Limits;
 use crate::pace::queue::lock;
 use crate::refusal::Refusal;
 use crate::scene::Appearance;
@@ -26,8 +27,8 @@ pub(crate) struct Textures {
 }
 
 impl Textures {
-    pub(super) fn new() -> std::io::Result<Self> {
-        Ok(Textures { kept: Arc::default(), workshop: Workshop::open("textures")? })
+    pub(super) fn new(limits: &Limits) -> std::io::Result<Self> {
+        Ok(Textures { kept: Arc::default(), workshop: Workshop::open("textures", limits)? })
     }
 }
 
@@ -46,7 +47,8 @@ impl House {
     /// once, and kept: a second or so for who asks first.
     pub(crate) async fn texture(&self, name: &str) -> Result<Texture, Status> {
         let (house, name) = (self.clone(), name.to_owned());
-        Ok(self.textures.workshop.work(move || house.find_texture(&name)).await??)
+        // One at a time: the next may be the same.
+        Ok(self.textures.workshop.work(&Asker::anybody(), move |_| house.find_texture(&name)).await??)
     }
 
     fn find_texture(&self, name: &str) -> Result<Texture, Refusal> {

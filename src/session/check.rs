@@ -7,6 +7,7 @@ use std::sync::Arc;
 use glam::DVec3;
 
 use super::Session;
+use crate::limits::Limits;
 use crate::scene::Named;
 use crate::scene::law::Poke;
 use crate::sheet::choice::{self, Choice};
@@ -19,18 +20,25 @@ pub struct Report {
     model: Arc<Model>,
     /// The choices that could keep the tolerance.
     candidates: Vec<Choice>,
-    /// Least and median time of a step, s; `None` if the step failed.
+    /// Least and median time of a step, s; `None` if the step failed or would take too long.
     step_s: Option<[f64; 2]>,
 }
+
+/// A step that is predicted to take longer is not timed, s.
+const LONGEST_STEP_S: f64 = 0.2;
 
 /// Number of windows in which the step is timed, and the length of each, s.
 const WINDOWS: usize = 50;
 const WINDOW_S: f64 = 0.004;
 
 /// Reports on a scene, and times its step under a poke. `clock_s` returns the time.
-pub fn check(model: &Arc<Model>, most_substeps: u32, clock_s: &dyn Fn() -> f64) -> Report {
-    let candidates = choice::candidates(&model.scene, most_substeps);
-    Report { model: model.clone(), candidates, step_s: time(model, clock_s) }
+pub fn check(model: &Arc<Model>, limits: &Limits, clock_s: &dyn Fn() -> f64) -> Report {
+    let candidates = choice::candidates(&model.scene, limits);
+    Report {
+        model: model.clone(),
+        candidates,
+        step_s: (model.predicted_step_s() <= LONGEST_STEP_S).then(|| time(model, clock_s)).flatten(),
+    }
 }
 
 /// Times the step under a poke that moves the middle by about a tenth of a spacing, so that values have usual sizes.
@@ -114,6 +122,8 @@ impl fmt::Display for Report {
             )?;
             let sessions = 1.0 / (median_s * scene.stepping.rate_hz);
             writeln!(f, "sessions      {sessions:.1} on a core, without clients and frames")?;
+        } else if model.predicted_step_s() > LONGEST_STEP_S {
+            writeln!(f, "time          not measured: a step would take about {:.1} s", model.predicted_step_s())?;
         } else {
             writeln!(f, "time          not measured: the guard stopped the sheet")?;
         }

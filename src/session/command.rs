@@ -77,10 +77,55 @@ pub struct Counts {
     pub waiting: u64,
 }
 
+/// What a command has to keep to, whenever it comes: so it is looked at before anybody's turn at the intake.
+#[derive(Debug)]
+pub struct Rules {
+    scene: Scene,
+    limits: Limits,
+}
+
+/// Commands that keep to the rules of a session.
+#[derive(Debug)]
+pub struct Checked(Vec<Command>);
+
+impl Rules {
+    /// All of `commands`, if each keeps to the rules.
+    pub fn check(&self, commands: Vec<Command>) -> Result<Checked> {
+        if commands.len() > self.limits.queued_commands_per_tool {
+            let message = format!("{} commands are more than a tool may have waiting", commands.len());
+            return Err(Refusal::new(Reason::QueueFull, "", message));
+        }
+        commands.iter().try_for_each(|command| self.check_one(command))?;
+        Ok(Checked(commands))
+    }
+
+    fn check_one(&self, command: &Command) -> Result<()> {
+        if let Some(seconds) = command.time_to_live_s {
+            positive("time_to_live_s", seconds)?;
+        }
+        match &command.action {
+            Action::Push(poke) => check_poke(poke, &self.scene.sheet, &self.limits),
+            Action::Grasp { point, displacement_m } => {
+                crate::scene::script::check_free("position.point", &self.scene.sheet, *point)?;
+                crate::refusal::finite_vector("position.displacement_m", *displacement_m)?;
+                let far_m = displacement_m.length();
+                check_reach("position.displacement_m", &self.scene.sheet, far_m, &self.limits)
+            }
+            Action::Lead { place_m, tip } => {
+                crate::refusal::finite_vector("place_m", *place_m)?;
+                let centre_m = (self.scene.sheet.extent_m() / 2.0).extend(0.0);
+                check_reach("place_m", &self.scene.sheet, (*place_m - centre_m).length(), &self.limits)?;
+                tip.check("tip", &self.scene.sheet)
+            }
+            Action::Release => Ok(()),
+        }
+    }
+}
+
 /// Takes in commands and holds them until their step.
 #[derive(Debug)]
 pub struct Intake {
-    scene: Scene,
+    rules: Arc<Rules>,
     limits: Limits,
     leases: BTreeMap<u32, Lease>,
     queue: BTreeMap<Place, Due>,
@@ -105,7 +150,7 @@ impl Intake {
     /// An intake for a session of `scene` that has not begun.
     pub fn new(scene: &Scene, limits: &Limits) -> Self {
         Intake {
-            scene: scene.clone(),
+            rules: Arc::new(Rules { scene: scene.clone(), limits: limits.clone() }),
             limits: limits.clone(),
             leases: BTreeMap::new(),
             queue: BTreeMap::new(),
@@ -226,6 +271,11 @@ impl Intake {
         }
     }
 
+    /// What commands have to keep to.
+    pub fn rules(&self) -> Arc<Rules> {
+        self.rules.clone()
+    }
+
     /// Accepts all of `commands`, from the holder of `id`, or none.
     ///
     /// # Errors
@@ -233,30 +283,33 @@ impl Intake {
     /// numbers that do not rise, and what the checks of an action refuse.
     pub fn submit(&mut self, id: LeaseId, commands: Vec<Command>, now_ns: u64) -> Result<()> {
         self.check_open()?;
+        let checked = self.rules.check(commands)?;
+        self.take(id, checked, now_ns)
+    }
+
+    /// The same of commands that were looked at before ([`Rules::check`]).
+    pub fn take(&mut self, id: LeaseId, Checked(commands): Checked, now_ns: u64) -> Result<()> {
+        self.check_open()?;
         self.lapse(now_ns);
-        if commands.len() > self.limits.queued_commands_per_tool {
-            let message = format!("{} commands are more than a tool may have waiting", commands.len());
-            return Err(Refusal::new(Reason::QueueFull, "", message));
-        }
         if commands.is_empty() {
             return self.renew(id, now_ns);
         }
-        let mut last: BTreeMap<u32, u64> = BTreeMap::new();
+        // Of each tool the last sequence number, and how many come.
+        let mut last: BTreeMap<u32, (u64, usize)> = BTreeMap::new();
         for command in &commands {
             let lease = self.leases.get(&command.tool).filter(|lease| lease.id == id);
             let lease = lease.ok_or_else(|| not_holder(format!("tool {} is not held by this client", command.tool)))?;
-            let before = last.get(&command.tool).copied().or(lease.last_sequence);
+            let coming = last.get(&command.tool).copied();
+            let before = coming.map(|(sequence, _)| sequence).or(lease.last_sequence);
             if let Some(before) = before.filter(|before| command.sequence <= *before) {
                 let message = format!("must be above {before}, the last one, but is {}", command.sequence);
                 return Err(Refusal::new(Reason::StaleSequence, "sequence", message));
             }
-            last.insert(command.tool, command.sequence);
-            self.check(command)?;
+            last.insert(command.tool, (command.sequence, coming.map_or(0, |coming| coming.1) + 1));
         }
         // A limit per tool, so that no holder fills the queue for the others.
-        for tool in last.keys() {
+        for (tool, (_, coming)) in &last {
             let waiting = self.leases.get(tool).map_or(0, |lease| lease.waiting);
-            let coming = commands.iter().filter(|command| command.tool == *tool).count();
             if waiting + coming > self.limits.queued_commands_per_tool {
                 let message = format!("{waiting} commands of tool {tool} wait for their step already");
                 return Err(Refusal::new(Reason::QueueFull, "", message));
@@ -267,28 +320,6 @@ impl Intake {
             self.enqueue(command, false);
         }
         self.renew(id, now_ns)
-    }
-
-    fn check(&self, command: &Command) -> Result<()> {
-        if let Some(seconds) = command.time_to_live_s {
-            positive("time_to_live_s", seconds)?;
-        }
-        match &command.action {
-            Action::Push(poke) => check_poke(poke, &self.scene.sheet, &self.limits),
-            Action::Grasp { point, displacement_m } => {
-                crate::scene::script::check_free("position.point", &self.scene.sheet, *point)?;
-                crate::refusal::finite_vector("position.displacement_m", *displacement_m)?;
-                let far_m = displacement_m.length();
-                check_reach("position.displacement_m", &self.scene.sheet, far_m, &self.limits)
-            }
-            Action::Lead { place_m, tip } => {
-                crate::refusal::finite_vector("place_m", *place_m)?;
-                let centre_m = (self.scene.sheet.extent_m() / 2.0).extend(0.0);
-                check_reach("place_m", &self.scene.sheet, (*place_m - centre_m).length(), &self.limits)?;
-                tip.check("tip", &self.scene.sheet)
-            }
-            Action::Release => Ok(()),
-        }
     }
 
     fn enqueue(&mut self, command: Command, ends_lease: bool) {

@@ -3,7 +3,9 @@
 use super::integrate::Oscillator;
 use super::rehearsal::{self, Rehearsal};
 use super::stability;
-use crate::scene::{Integrator, Precision, Scene, Stepping};
+use crate::limits::Limits;
+use crate::refusal::{Reason, Refusal, Result};
+use crate::scene::{Integrator, Lanes, Precision, Scene, Stepping};
 
 /// Errors that grow with time, where nothing damps them, are expected for so long, s.
 pub const LASTING_S: f64 = rehearsal::LASTING_S;
@@ -18,6 +20,26 @@ const CANDIDATES: [(Integrator, f64, f64); 4] = [
 
 /// The number formats and what each costs, in f32.
 const FORMATS: [(Precision, f64); 3] = [(Precision::F32, 1.0), (Precision::Compensated, 1.1), (Precision::F64, 2.6)];
+
+/// A point in a substep of `central` in f32 with the widest lanes, and a step beside its points, ns: measured.
+const POINT_SUBSTEP_NS: f64 = 1.7;
+pub(super) const STEP_NS: f64 = 2000.0;
+
+/// The processor time that a point is expected to take in a substep, ns.
+pub(super) fn point_substep_ns(integrator: Integrator, precision: Precision, lanes: Lanes) -> f64 {
+    let scheme = CANDIDATES.iter().find(|candidate| candidate.0 == integrator).map(|found| found.2);
+    // `rk4` evaluates the springs four times; `lagged` is `central` but for a number.
+    let scheme = scheme.unwrap_or(if integrator == Integrator::Rk4 { 4.0 } else { 1.0 });
+    let format = FORMATS.iter().find(|format| format.0 == precision).map_or(1.0, |found| found.1);
+    let width = match lanes {
+        Lanes::Auto | Lanes::Avx512 => 1.0,
+        Lanes::Avx2 => 1.6,
+        Lanes::Neon => 3.0,
+        // Fused multiply-adds are calls.
+        Lanes::Plain => 200.0,
+    };
+    POINT_SUBSTEP_NS * scheme * format * width
+}
 
 /// What rounding may add to a sheet that is at rest, as a part of the tolerance: a rehearsal is over before that shows.
 const RESTING_PART: f64 = 0.5;
@@ -80,9 +102,23 @@ struct Fewest {
 }
 
 impl Chooser<'_> {
-    fn new<'a>(scene: &'a Scene, most_substeps: u32) -> Chooser<'a> {
-        let rehearsal = Rehearsal::new(scene, scene.stepping.tolerance);
-        Chooser { stepping: &scene.stepping, sheet: Oscillator::of(scene), rehearsal, most_substeps }
+    fn new<'a>(scene: &'a Scene, limits: &Limits) -> Chooser<'a> {
+        let rehearsal = Rehearsal::new(scene, scene.stepping.tolerance, limits.rehearsal_work);
+        Chooser { stepping: &scene.stepping, sheet: Oscillator::of(scene), rehearsal, most_substeps: limits.substeps }
+    }
+
+    /// A choice is never less accurate for want of work: it is refused. Whoever gives the number of substeps answers for
+    /// it, and is warned of an error that is not known.
+    fn check_work(&self, limits: &Limits) -> Result<()> {
+        if self.stepping.substeps.is_some() || !self.rehearsal.is_cut() {
+            return Ok(());
+        }
+        let message = format!(
+            "to find out what keeps an error of {:e} here would take more than {} points × substeps of rehearsals \
+             (limits.rehearsal_work): a larger tolerance takes less, and a given number of substeps none",
+            self.stepping.tolerance, limits.rehearsal_work
+        );
+        Err(Refusal::new(Reason::TooLarge, "stepping.tolerance", message))
     }
 
     fn tried(&self, integrator: Integrator, substeps: u32, precision: Precision) -> Choice {
@@ -188,17 +224,19 @@ impl Chooser<'_> {
 }
 
 /// Every integrator that the scene leaves open, each with the cheapest that keeps to the tolerance.
-pub fn candidates(scene: &Scene, most_substeps: u32) -> Vec<Choice> {
-    let chooser = Chooser::new(scene, most_substeps);
+pub fn candidates(scene: &Scene, limits: &Limits) -> Vec<Choice> {
+    let chooser = Chooser::new(scene, limits);
     let cheapest =
         |(integrator, order, cost): (Integrator, f64, f64)| chooser.cheapest([(integrator, order, cost)].into_iter());
     chooser.integrators().filter_map(cheapest).collect()
 }
 
-/// The cheapest that keeps to the tolerance, of what the scene leaves open; if nothing does, what misses it least.
-pub fn choose(scene: &Scene, most_substeps: u32) -> Choice {
-    let chooser = Chooser::new(scene, most_substeps);
-    chooser.cheapest(chooser.integrators()).unwrap_or_else(|| chooser.yardstick())
+/// The cheapest that keeps to the tolerance, of what the scene leaves open; if nothing does, what misses it least. Refused
+/// if that would take more work than the limits allow. Also tells the work: points × substeps of rehearsals.
+pub fn choose(scene: &Scene, limits: &Limits) -> Result<(Choice, u64)> {
+    let chooser = Chooser::new(scene, limits);
+    let choice = chooser.cheapest(chooser.integrators()).unwrap_or_else(|| chooser.yardstick());
+    chooser.check_work(limits).map(|()| (choice, limits.rehearsal_work - chooser.rehearsal.left()))
 }
 
 impl Chooser<'_> {

@@ -68,7 +68,7 @@ impl Model {
         let mut open = self.scene.clone();
         open.stepping =
             Stepping { integrator: Integrator::Auto, substeps: None, precision: self.precision, ..stepping.clone() };
-        let choice = choice::choose(&open, limits.substeps);
+        let choice = choice::choose(&open, limits).ok()?.0;
         let keeps = choice.expected_error <= stepping.tolerance && choice.substeps < needed;
         let fits = self.precision != Precision::Compensated || choice.integrator.is_exponential();
         (keeps && fits && choice.integrator != self.plan.integrator).then_some(choice)

@@ -35,6 +35,8 @@ pub struct Model {
     pub warnings: Vec<String>,
     /// What a correction asked for, also with another tissue: the scheme, and no fewer substeps than this.
     pub corrected: Option<(Integrator, u32)>,
+    /// Points × substeps of the rehearsals by which it was chosen: at most `limits.rehearsal_work`.
+    pub rehearsed: u64,
 }
 
 /// What sleeping tiles may add to the error, by default, as a part of it.
@@ -59,12 +61,18 @@ pub struct Plan {
 
 impl Plan {
     pub(super) fn new(integrator: Integrator, substeps: u32, step_s: f64, sheet: &Oscillator) -> Self {
+        let plan = Plan::unjudged(integrator, substeps, step_s, sheet);
+        let stable = stability::is_stable(&plan.scheme, sheet.scaled_spring_stiffness(plan.substep_s));
+        Plan { stable, ..plan }
+    }
+
+    /// The same without a look at its stability, which a rehearsal sees for itself.
+    pub(super) fn unjudged(integrator: Integrator, substeps: u32, step_s: f64, sheet: &Oscillator) -> Self {
         let substep_s = step_s / f64::from(substeps);
         let (a, g) = sheet.scaled(substep_s);
         let scheme = Scheme::fit(integrator, a, g);
-        let stable = stability::is_stable(&scheme, sheet.scaled_spring_stiffness(substep_s));
         let nodes = scheme.nodes();
-        Plan { integrator, substeps, substep_s, scheme, nodes, stable }
+        Plan { integrator, substeps, substep_s, scheme, nodes, stable: true }
     }
 
     /// The same scheme with a shorter substep.
@@ -109,7 +117,7 @@ impl Model {
         if scene.stepping.substeps.is_none() && least > limits.substeps {
             return Err(too_many(least));
         }
-        let choice = choice::choose(scene, limits.substeps);
+        let (choice, rehearsed) = choice::choose(scene, limits)?;
         let Choice { integrator, substeps, precision, expected_error } = choice;
         if precision == Precision::Compensated && !integrator.is_exponential() {
             let message = format!("is for exponential schemes; `{}` has f32 and f64", integrator.name());
@@ -149,7 +157,7 @@ impl Model {
         (scene.damping_n_s_per_m, scene.virtual_stiffness_n_per_m) =
             (sheet.damping_n_s_per_m, sheet.virtual_stiffness_n_per_m);
         let model = Model::planned(scene, plan, precision, lanes);
-        Ok(Arc::new(Model { expected_error, sleep_tolerance, warnings, ..model }))
+        Ok(Arc::new(Model { expected_error, sleep_tolerance, warnings, rehearsed, ..model }))
     }
 
     /// Of a scene with a scheme that somebody else has chosen: nothing is checked, nothing expected, nothing sleeps.
@@ -165,6 +173,7 @@ impl Model {
             lanes,
             warnings: Vec::new(),
             corrected: None,
+            rehearsed: 0,
             scene,
         }
     }
@@ -209,6 +218,13 @@ impl Model {
             Ok((*step, newest.clone()))
         });
         compiled.collect()
+    }
+
+    /// The processor time that a step is expected to take while all of the sheet moves, s.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn predicted_step_s(&self) -> f64 {
+        let point_ns = choice::point_substep_ns(self.plan.integrator, self.precision, self.lanes);
+        1e-9 * (choice::STEP_NS + point_ns * self.len() as f64 * f64::from(self.plan.substeps))
     }
 
     /// Number of points.

@@ -8,6 +8,7 @@
 //! (`make bench-tolerance`). Forces that change smoothly err by 10 to 1000 times less than those that jump, and a choice
 //! that is made before the script is known can't use that.
 
+use std::cell::Cell;
 use std::sync::Arc;
 
 use glam::DVec3;
@@ -17,7 +18,7 @@ use super::integrate::Oscillator;
 use super::model::{Model, Plan};
 use super::{at_rest, lanes, stability};
 use crate::scene::law::{CentreLaw, ForceLaw, Profile, StrengthLaw};
-use crate::scene::{Fixed, Integrator, Precision, Scene};
+use crate::scene::{Fixed, Integrator, PointSet, Precision, Scene};
 
 /// Points along a side at most. Larger sheets err alike: a force spreads over some points.
 const SIDE: usize = 12;
@@ -78,6 +79,10 @@ const LOADS: [Load; 3] = [
     },
 ];
 
+/// What a substep and a step of a rehearsal cost beside their points, in points: small sheets are not for nothing.
+const SUBSTEP_POINTS: u64 = 32;
+const STEP_POINTS: u64 = 500;
+
 /// Displacement and reaction of the points that are looked at, step by step.
 type Course = Vec<[[DVec3; 2]; 3]>;
 
@@ -90,11 +95,15 @@ pub(super) struct Rehearsal {
     steps: usize,
     /// None: the motion is chaotic, or beyond every bound.
     truth: [Option<Course>; LOADS.len()],
+    /// Points × substeps that may still be computed, and whether something was left out for want of them.
+    left: Cell<u64>,
+    is_cut: Cell<bool>,
 }
 
 impl Rehearsal {
-    /// Of a scene, with a truth that is good enough to judge schemes by `tolerance`.
-    pub(super) fn new(scene: &Scene, tolerance: f64) -> Self {
+    /// Of a scene, with a truth that is good enough to judge schemes by `tolerance`. All courses together compute at most
+    /// `most_work` points × substeps.
+    pub(super) fn new(scene: &Scene, tolerance: f64, most_work: u64) -> Self {
         let sheet = Oscillator::of(scene);
         let step_s = scene.stepping.rate_hz.recip();
         let parts = stability::stable_substeps(Integrator::Exponential4, step_s, &sheet) / SUBSTEPS_A_LOOK;
@@ -102,19 +111,43 @@ impl Rehearsal {
         let mut small = scene.clone();
         small.sheet.points = scene.sheet.points.map(|points| points.min(SIDE));
         if let Fixed::Points(points) = &mut small.sheet.fixed {
-            points.retain(|[i, j]| *i < SIDE && *j < SIDE);
+            *points = points.as_slice().iter().copied().filter(|[i, j]| *i < SIDE && *j < SIDE).collect();
         }
         if small.sheet.is_fixed(pushed(&small)) {
-            small.sheet.fixed = Fixed::Points(Vec::new());
+            small.sheet.fixed = Fixed::Points(PointSet::default());
         }
         small.stepping.rate_hz = scene.stepping.rate_hz * f64::from(parts);
         let least = stability::stable_substeps(Integrator::Exponential4, small.stepping.rate_hz.recip(), &sheet);
         let most_steps = STEPS.1.min(SUBSTEPS / f64::from(least)).max(STEPS.0);
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
         let steps = (COURSE_S * small.stepping.rate_hz).clamp(STEPS.0, most_steps) as usize;
-        let mut rehearsal = Rehearsal { scene: small, sheet, parts, steps, truth: [const { None }; LOADS.len()] };
-        rehearsal.truth = LOADS.each_ref().map(|load| rehearsal.true_course(load, least, tolerance));
+        let mut rehearsal = Rehearsal {
+            scene: small,
+            sheet,
+            parts,
+            steps,
+            truth: [const { None }; LOADS.len()],
+            left: Cell::new(most_work),
+            is_cut: Cell::new(false),
+        };
+        for (load, at) in LOADS.iter().zip(0..) {
+            rehearsal.truth[at] = rehearsal.true_course(load, least, tolerance);
+            // Without one of them nothing can be judged.
+            if rehearsal.truth[at].is_none() {
+                break;
+            }
+        }
         rehearsal
+    }
+
+    /// Points × substeps that may still be computed.
+    pub(super) fn left(&self) -> u64 {
+        self.left.get()
+    }
+
+    /// Some course was left out because it would have taken more work than there was left.
+    pub(super) fn is_cut(&self) -> bool {
+        self.is_cut.get()
     }
 
     /// Halves the substep until that changes less than the tolerance: an error of fifth order is then 32 times smaller.
@@ -138,12 +171,16 @@ impl Rehearsal {
     /// What to expect of a scheme with so many substeps in a step of the scene, in a format: the error of displacement and
     /// force, the larger, each relative to its largest. Infinite if the motion can't be followed.
     pub(super) fn error(&self, integrator: Integrator, substeps: u32, precision: Precision) -> f64 {
+        if self.truth.iter().any(Option::is_none) {
+            return f64::INFINITY;
+        }
         let substeps = (substeps / self.parts).max(1);
         let error = |(load, truth): (&Load, &Option<Course>)| -> Option<f64> {
             Some(self.difference(load, truth.as_ref()?, &self.course(load, integrator, substeps, precision)?))
         };
-        let errors = LOADS.iter().zip(&self.truth).map(|pair| error(pair).unwrap_or(f64::INFINITY));
-        MARGIN * errors.fold(0.0, f64::max)
+        // The first that can't be followed is enough.
+        let largest = LOADS.iter().zip(&self.truth).try_fold(0.0, |largest: f64, pair| Some(largest.max(error(pair)?)));
+        MARGIN * largest.unwrap_or(f64::INFINITY)
     }
 
     /// How many substeps a scheme takes in whole rehearsed steps: no fewer than `substeps`.
@@ -151,10 +188,18 @@ impl Rehearsal {
         substeps.div_ceil(self.parts).saturating_mul(self.parts)
     }
 
-    /// The course of a scheme; none if the guard finds fault with it.
+    /// The course of a scheme; none if the guard finds fault with it, or if it would be too much work.
     fn course(&self, load: &Load, integrator: Integrator, substeps: u32, precision: Precision) -> Option<Course> {
         let scene = &self.scene;
-        let plan = Plan::new(integrator, substeps, scene.stepping.rate_hz.recip(), &self.sheet);
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+        let steps = (load.part * self.steps as f64) as usize;
+        let points = scene.sheet.points[0] as u64 * scene.sheet.points[1] as u64 + SUBSTEP_POINTS;
+        let work = |substeps: u64| points.saturating_mul(substeps) + STEP_POINTS * steps as u64;
+        if work((steps as u64).saturating_mul(u64::from(substeps))) > self.left.get() {
+            self.is_cut.set(true);
+            return None;
+        }
+        let plan = Plan::unjudged(integrator, substeps, scene.stepping.rate_hz.recip(), &self.sheet);
         let lanes = lanes::available(scene.stepping.lanes).unwrap_or(crate::scene::Lanes::Plain);
         let model = Arc::new(Model::planned(scene.clone(), plan, precision, lanes));
         let [nx, ny] = scene.sheet.points;
@@ -172,17 +217,18 @@ impl Rehearsal {
         };
         tissue.push(0, Some(Push::Law(law)));
         let looked_at = [at, [nx / 2, ny / 2], [1.min(nx - 1), 1.min(ny - 1)]].map(|point| model.index_of(point));
-        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
-        let steps = (load.part * self.steps as f64) as usize;
         let mut course = Vec::with_capacity(steps);
-        for _ in 0..steps {
-            tissue.step().ok()?;
+        let mut is_sound = true;
+        while is_sound && course.len() < steps {
+            is_sound = tissue.step().is_ok() && tissue.guard_events() == 0;
             course.push(looked_at.map(|index| {
                 let point = tissue.point(index);
                 [point.displacement_m, point.reaction_n()]
             }));
         }
-        (tissue.guard_events() == 0).then_some(course)
+        // What the guard repeated counts as well.
+        self.left.set(self.left.get().saturating_sub(work(tissue.substeps_done())));
+        is_sound.then_some(course)
     }
 
     /// The largest difference of two courses, of displacement and force, relative to the largest of each. What grows in

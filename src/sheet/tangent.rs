@@ -10,10 +10,14 @@
 //! indefinite. Conjugate gradients, the three systems side by side, preconditioned by the points' own blocks. Points far
 //! enough away not to notice are held: a press reaches √(k/K″) spacings.
 
+use std::cell::Cell;
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use glam::{DMat3, DVec2, DVec3};
 
 use super::footprint::{Footprint, Reached};
 use super::model::Model;
+use crate::scene::{Fixed, Sheet};
 
 /// How many times its reach around a disc the sheet is looked at: e⁻⁶ is left.
 const REACHES: f64 = 6.0;
@@ -27,6 +31,40 @@ const ARRIVED: f64 = 1e-5;
 
 /// Most iterations of conjugate gradients.
 const MOST_ITERATIONS: u32 = 400;
+
+/// How much may be computed, and whether it is still wanted.
+#[derive(Debug, Clone)]
+pub struct Allowance<'a> {
+    /// Springs times iterations that are left.
+    left: Cell<u64>,
+    stop: Option<&'a AtomicBool>,
+}
+
+impl Default for Allowance<'_> {
+    fn default() -> Self {
+        Allowance { left: Cell::new(u64::MAX), stop: None }
+    }
+}
+
+impl<'a> Allowance<'a> {
+    /// So many springs times iterations, as long as `stop` is not set.
+    pub fn of(work: u64, stop: &'a AtomicBool) -> Self {
+        Allowance { left: Cell::new(work), stop: Some(stop) }
+    }
+
+    /// Takes some of it, if there is so much.
+    fn take(&self, work: usize) -> bool {
+        let is_wanted = self.stop.is_none_or(|stop| !stop.load(Ordering::Relaxed));
+        let left = if is_wanted { self.left.get().checked_sub(work as u64) } else { None };
+        self.left.set(left.unwrap_or(0));
+        left.is_some()
+    }
+
+    /// Something had to be left undone.
+    fn is_spent(&self) -> bool {
+        self.left.get() == 0
+    }
+}
 
 /// Three vectors a point: one of each system.
 type Triple = [DVec3; 3];
@@ -44,6 +82,7 @@ pub struct Patch<'m> {
     weights: Vec<f64>,
     springs: Vec<Spring>,
     inverses: Vec<DMat3>,
+    allowance: Allowance<'m>,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -147,6 +186,7 @@ impl<'m> Patch<'m> {
             weights,
             springs: Vec::new(),
             inverses: Vec::new(),
+            allowance: Allowance::default(),
         };
         patch.connect();
         patch.linearise();
@@ -255,6 +295,9 @@ impl<'m> Patch<'m> {
             if (0..3).all(|system| left[system] <= good * good * whole[system]) {
                 return (x, iteration);
             }
+            if !self.allowance.take(self.springs.len()) {
+                return (x, iteration);
+            }
             self.times(&direction, &mut product);
             let curvature = dot(&direction, &product);
             let step: [f64; 3] = std::array::from_fn(|s| if curvature[s] > 0.0 { rz[s] / curvature[s] } else { 0.0 });
@@ -343,7 +386,7 @@ impl<'m> Patch<'m> {
                 largest_m = largest_m.max(change.abs().max_element());
             }
             self.linearise();
-            if largest_m < ARRIVED * self.model.scene.sheet.spacing_m {
+            if largest_m < ARRIVED * self.model.scene.sheet.spacing_m || self.allowance.is_spent() {
                 break;
             }
         }
@@ -363,15 +406,68 @@ fn symmetric(of: impl Fn(usize, usize) -> f64) -> DMat3 {
 
 /// A slow press by a disc of `radius_m` at `centre_m`, at `count` depths, `step_m` apart, from 0 on.
 pub fn press(model: &Model, radius_m: f64, centre_m: DVec2, step_m: f64, count: u32) -> Vec<Pressed> {
+    press_within(model, radius_m, centre_m, step_m, count, Allowance::default()).unwrap_or_default()
+}
+
+/// The same, if it takes no more than `allowance`.
+pub fn press_within<'m>(
+    model: &'m Model,
+    radius_m: f64,
+    centre_m: DVec2,
+    step_m: f64,
+    count: u32,
+    allowance: Allowance<'m>,
+) -> Option<Vec<Pressed>> {
     let footprint = Footprint::new(model, radius_m, centre_m);
     let window = Window::around(model, &footprint);
+    // A solution takes as many iterations as there are points from the middle to where nothing is noticed, or nearly so,
+    // and each depth some solutions: what can't be done is not begun.
+    let [rows, columns] = window.size;
+    let least = (rows * columns) as u64 * 4 * u64::from(count) * (rows.max(columns) as u64);
+    if least > allowance.left.get() {
+        return None;
+    }
     let at_rest = window.points(model).map(|_| DVec3::ZERO).collect();
-    let mut patch = Patch::new(model, &footprint, window, at_rest);
-    (0..count)
-        .map(|k| {
-            let depth_m = f64::from(k) * step_m;
-            let force_n = if k == 0 { 0.0 } else { patch.press(depth_m) };
-            Pressed { depth_m, force_n, tangent: patch.tangent() }
-        })
-        .collect()
+    let mut patch = Patch { allowance, ..Patch::new(model, &footprint, window, at_rest) };
+    let mut pressed = Vec::new();
+    for k in 0..count {
+        let depth_m = f64::from(k) * step_m;
+        let force_n = if k == 0 { 0.0 } else { patch.press(depth_m) };
+        pressed.push(Pressed { depth_m, force_n, tangent: patch.tangent() });
+        if patch.allowance.is_spent() {
+            return None;
+        }
+    }
+    Some(pressed)
+}
+
+/// The same tissue in points `spacing_m` apart, each of which stands for several; as far as `half_m` from the middle, where
+/// it is held, or all of it. What holds a membrane is in the springs whatever their length; mass, damping and virtual
+/// springs are of an area.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+pub fn stand_in(model: &Model, spacing_m: f64, half_m: f64) -> Model {
+    let fine = &model.scene.sheet;
+    let times = spacing_m / fine.spacing_m;
+    let is_cut = fine.longer_side_m() > 2.0 * half_m;
+    // As many on either side of the middle.
+    let points = [0, 1].map(|axis| {
+        let extent_m = fine.extent_m()[axis];
+        2 * (extent_m.min(2.0 * half_m) / (2.0 * spacing_m)).round() as usize + 1
+    });
+    let fixed = match &fine.fixed {
+        _ if is_cut => Fixed::Edges,
+        Fixed::Points(named) => {
+            let coarse_of = |place: usize, most: usize| ((place as f64 / times).round() as usize).min(most - 1);
+            Fixed::Points(
+                named.as_slice().iter().map(|[i, j]| [coarse_of(*i, points[0]), coarse_of(*j, points[1])]).collect(),
+            )
+        }
+        set => set.clone(),
+    };
+    let mut scene = model.scene.clone();
+    let area = times * times;
+    scene.sheet = Sheet { points, spacing_m, point_mass_kg: area * fine.point_mass_kg, fixed };
+    scene.virtual_stiffness_n_per_m *= area;
+    scene.damping_n_s_per_m *= area;
+    Model { points, fixed: scene.sheet.fixed_indices(), scene, ..model.clone() }
 }

@@ -45,7 +45,7 @@ pub fn law(law: &Law) -> pb::ForceLaw {
         across_n_s_per_m: row.across_n_s_per_m,
         drag_n_s_per_m: row.drag_n_s_per_m,
     };
-    pb::ForceLaw { step_m: law.step_m, rows: law.rows.iter().map(row).collect() }
+    pb::ForceLaw { step_m: law.step_m, rows: law.rows.iter().map(row).collect(), coarse: law.is_coarse }
 }
 
 /// A force law out of a message.
@@ -58,7 +58,8 @@ pub fn from_law(message: &pb::ForceLaw) -> Result<Law> {
         across_n_s_per_m: row.across_n_s_per_m,
         drag_n_s_per_m: row.drag_n_s_per_m,
     };
-    let law = Law { step_m: message.step_m, rows: message.rows.iter().map(row).collect() };
+    let rows = message.rows.iter().map(row).collect();
+    let law = Law { step_m: message.step_m, rows, is_coarse: message.coarse };
     let wrong = || Refusal::new(Reason::OutOfRange, "law", "must have two rows or more, finite and rising");
     if law.is_sound() { Ok(law) } else { Err(wrong()) }
 }

@@ -93,6 +93,7 @@ pub fn rejection(tool: u32, sequence: u64, refusal: &Refusal) -> pb::Rejection {
         reason: refusal.reason.as_str().to_owned(),
         field: refusal.field.clone(),
         message: refusal.to_string(),
+        dropped_answers: 0,
     }
 }
 

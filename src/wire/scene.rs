@@ -2,7 +2,9 @@
 
 use super::{from_point, pb, point, required};
 use crate::refusal::{Reason, Refusal, Result};
-use crate::scene::{Appearance, Change, Fixed, Integrator, Lanes, Named, Precision, Scene, Sheet, Springs, Stepping};
+use crate::scene::{
+    Appearance, Change, Fixed, Integrator, Lanes, Named, PointSet, Precision, Scene, Sheet, Springs, Stepping,
+};
 
 /// A scene out of a message.
 pub fn from_scene(message: &pb::Scene) -> Result<Scene> {
@@ -37,10 +39,10 @@ pub fn from_scene(message: &pb::Scene) -> Result<Scene> {
 
 fn from_fixed(fixed: Option<&pb::sheet::Fixed>) -> Result<Fixed> {
     Ok(match fixed {
-        None => Fixed::Points(Vec::new()),
+        None => Fixed::Points(PointSet::default()),
         Some(pb::sheet::Fixed::FixedPoints(points)) => Fixed::Points(points.points.iter().map(from_point).collect()),
         Some(pb::sheet::Fixed::FixedSet(set)) => match pb::FixedSet::try_from(*set) {
-            Ok(pb::FixedSet::Unspecified) => Fixed::Points(Vec::new()),
+            Ok(pb::FixedSet::Unspecified) => Fixed::Points(PointSet::default()),
             Ok(pb::FixedSet::Edges) => Fixed::Edges,
             Ok(pb::FixedSet::Corners) => Fixed::Corners,
             Err(_) => {
@@ -92,9 +94,9 @@ pub fn scene(scene: &Scene) -> pb::Scene {
     let fixed = match &scene.sheet.fixed {
         Fixed::Edges => Some(pb::sheet::Fixed::FixedSet(pb::FixedSet::Edges.into())),
         Fixed::Corners => Some(pb::sheet::Fixed::FixedSet(pb::FixedSet::Corners.into())),
-        Fixed::Points(points) if points.is_empty() => None,
+        Fixed::Points(points) if points.as_slice().is_empty() => None,
         Fixed::Points(points) => {
-            let points = points.iter().copied().map(point).collect();
+            let points = points.as_slice().iter().copied().map(point).collect();
             Some(pb::sheet::Fixed::FixedPoints(pb::GridPoints { points }))
         }
     };
@@ -134,7 +136,8 @@ mod tests {
     #[test]
     fn a_scene_comes_back_as_it_went() {
         let mut paper = Scene::parse("paper", crate::scene::PAPER, &[], &Limits::default()).unwrap();
-        for fixed in [Fixed::Edges, Fixed::Corners, Fixed::Points(vec![]), Fixed::Points(vec![[1, 2], [30, 0]])] {
+        let points = |points: &[[usize; 2]]| Fixed::Points(points.iter().copied().collect());
+        for fixed in [Fixed::Edges, Fixed::Corners, points(&[]), points(&[[30, 0], [1, 2], [30, 0]])] {
             paper.sheet.fixed = fixed;
             assert_eq!(from_scene(&scene(&paper)).unwrap(), paper);
         }

@@ -107,6 +107,25 @@ async fn bad_commands_are_refused_with_a_reason_and_change_nothing() {
 }
 
 #[tokio::test]
+async fn every_refused_command_of_a_burst_is_told_of_or_counted() {
+    let server = Server::start(&[]);
+    let session = server.paper(true).await;
+    let mut touch = Touch::hold(&server, &session).await;
+    for sequence in 1..=1000 {
+        // Tool 1 is nobody's.
+        touch.command(force(1, sequence, -1.0)).await;
+    }
+    let (mut told, mut last) = (0, pb::Rejection::default());
+    while last.sequence < 1000 {
+        let rejection = touch.rejection().await;
+        assert!(rejection.sequence > last.sequence && rejection.dropped_answers >= last.dropped_answers);
+        assert_eq!(rejection.reason, "NOT_HOLDER");
+        (told, last) = (told + 1, rejection);
+    }
+    assert_eq!(told + last.dropped_answers, 1000);
+}
+
+#[tokio::test]
 async fn stale_sequences_are_refused() {
     let server = Server::start(&[]);
     let session = server.paper(false).await;
