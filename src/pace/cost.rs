@@ -2,6 +2,8 @@
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use crate::limits::Limits;
+use crate::refusal::{Reason, Refusal, Result};
 use crate::sheet::Model;
 
 /// Before anything was measured: of a point and substep, and of a step beside its points, ns.
@@ -69,6 +71,27 @@ impl Cost {
     pub(super) fn set_awake(&self, is_awake: bool) {
         set(&self.share, if is_awake { self.awake_share() } else { 0.0 });
     }
+}
+
+/// Refuses steps that would keep the server from all others.
+pub(super) fn check_work(model: &Model, limits: &Limits) -> Result<()> {
+    let (points, substeps, most) = (model.len(), model.plan.substeps, limits.point_substeps_per_step);
+    if points as u64 * u64::from(substeps) > most {
+        let message =
+            format!("a step would compute {points} points {substeps} times, above the limit of {most} in all");
+        return Err(Refusal::new(Reason::TooLarge, "stepping.substeps", message));
+    }
+    let (step_s, rate_hz, most) = (model.predicted_step_s(), model.scene.stepping.rate_hz, limits.periods_per_step);
+    let periods = step_s * rate_hz;
+    if periods > most {
+        let message = format!(
+            "a step of {points} points, computed {substeps} times each, would take {:.3} ms, which is {periods:.2} of its \
+             periods: above the limit of {most} (limits.periods_per_step). Fewer points, softer springs or a lower rate take less",
+            step_s * 1e3
+        );
+        return Err(Refusal::new(Reason::TooLarge, "stepping.rate_hz", message));
+    }
+    Ok(())
 }
 
 /// The longest step that a thread did of late: so much anybody may be late through no fault of its own.

@@ -32,7 +32,7 @@ use crate::session::schedule::Schedule;
 use crate::sheet::Model;
 use auditor::{AuditTally, Audited, Auditor, Sessions};
 use clock::{Dilation, now_ns};
-use cost::Cost;
+use cost::{Cost, check_work};
 use frames::{Delivery, Encoder, Viewer};
 use inbox::{Inbox, Request};
 use priority::give_way;
@@ -580,27 +580,6 @@ impl Pacer {
             let _ = thread.join();
         }
     }
-}
-
-/// Refuses steps that would keep the server from all others.
-fn check_work(model: &Model, limits: &Limits) -> Result<()> {
-    let (points, substeps, most) = (model.len(), model.plan.substeps, limits.point_substeps_per_step);
-    if points as u64 * u64::from(substeps) > most {
-        let message =
-            format!("a step would compute {points} points {substeps} times, above the limit of {most} in all");
-        return Err(Refusal::new(Reason::TooLarge, "stepping.substeps", message));
-    }
-    let (step_s, rate_hz, most) = (model.predicted_step_s(), model.scene.stepping.rate_hz, limits.periods_per_step);
-    let periods = step_s * rate_hz;
-    if periods > most {
-        let message = format!(
-            "a step of {points} points, computed {substeps} times each, would take {:.3} ms, which is {periods:.2} of its \
-             periods: above the limit of {most} (limits.periods_per_step). Fewer points, softer springs or a lower rate take less",
-            step_s * 1e3
-        );
-        return Err(Refusal::new(Reason::TooLarge, "stepping.rate_hz", message));
-    }
-    Ok(())
 }
 
 fn unknown_session(id: &str) -> Refusal {
