@@ -6,6 +6,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 
 use clap::{Parser, Subcommand};
+use palpate::budget;
 use palpate::limits::Limits;
 use palpate::pace::clock::now_ns;
 use palpate::refusal::Refusal;
@@ -151,6 +152,10 @@ struct ServeArguments {
     /// How long streams may take to end at shutdown before they are cut, s [default: 5]
     #[arg(long, value_name = "SECONDS")]
     shutdown_deadline_s: Option<f64>,
+    /// Bytes that the server may take in all for what its callers ask for, as in 512MiB or 2GiB [default: half of the
+    /// machine's, or of its control group's]
+    #[arg(long, value_name = "BYTES", value_parser = budget::parse_bytes)]
+    memory: Option<u64>,
     /// What is logged to standard error: error, warn, info, debug, or palpate=debug,tonic=warn, … [default: info]
     #[arg(long, value_name = "FILTER")]
     log: Option<String>,
@@ -321,6 +326,9 @@ fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     }
     if let Some(deadline_s) = arguments.shutdown_deadline_s {
         config.shutdown_deadline_s = deadline_s;
+    }
+    if let Some(bytes) = arguments.memory {
+        config.limits.memory_bytes = bytes;
     }
     if let Some(log) = &arguments.log {
         config.log.clone_from(log);

@@ -38,7 +38,7 @@ fn set(bits: &AtomicU64, value: f64) {
 impl Cost {
     /// Of a session that has not begun: by what others take for their points, of `known`.
     pub(super) fn guess<'c>(model: &Model, known: impl Iterator<Item = &'c Cost>) -> Self {
-        let point_substeps = model.len() as f64 * f64::from(model.plan.substeps);
+        let point_substeps = model.swept_points() as f64 * f64::from(model.plan.substeps);
         let (taken_ns, worked) = known.filter(|cost| cost.share() > 0.0).fold((0.0, 0.0), |(ns, work), cost| {
             (ns + get(&cost.step_ns), work + cost.point_substeps + GUESS_STEP_NS / GUESS_NS)
         });
@@ -51,6 +51,12 @@ impl Cost {
     /// Of a core, if it is awake.
     pub(super) fn awake_share(&self) -> f64 {
         get(&self.step_ns) * 1e-9 * self.rate_hz
+    }
+
+    /// Of a core, if it is awake and its tissue is that of `model`.
+    pub(super) fn awake_share_of(&self, model: &Model) -> f64 {
+        let point_substeps = model.swept_points() as f64 * f64::from(model.plan.substeps);
+        self.awake_share() * (point_substeps / self.point_substeps).max(1.0)
     }
 
     /// Of a core, now.

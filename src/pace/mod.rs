@@ -19,6 +19,7 @@ use std::thread::JoinHandle;
 
 use tokio::sync::oneshot;
 
+use crate::budget::{Account, Budget, Purpose, Resource, Taken};
 use crate::haptics::Law;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, number};
@@ -56,13 +57,18 @@ pub struct PacedSample {
     pub overrun: bool,
 }
 
-/// A record, and its step.
-#[derive(Debug, Clone)]
-pub struct PacedRecord {
+/// A record, and its step. All who asked for the same share one.
+pub type PacedRecord = Arc<Recorded>;
+
+/// What was measured once, for whoever asked for it.
+#[derive(Debug)]
+pub struct Recorded {
     /// Steps done.
     pub step: u64,
     /// What was measured.
     pub record: Record,
+    /// Its memory.
+    _taken: Taken,
 }
 
 /// Whether a session's time goes on.
@@ -116,6 +122,8 @@ pub struct Live {
     /// The tissue as the session began with it. Points and rate stay; coefficients, scheme and substeps may be others by
     /// now ([`Status::model`]).
     pub model: Arc<Model>,
+    /// Who made it, and pays for it.
+    pub owner: Account,
     intake: Mutex<Intake>,
     /// Deleted when so long nobody asked for it, held a tool or had a stream, s.
     pub idle_timeout_s: f64,
@@ -131,6 +139,8 @@ pub struct Live {
     /// Of the stepping threads, its own, and where that is asked.
     thread: usize,
     inbox: Arc<Inbox>,
+    /// The session, and its memory.
+    _taken: [Taken; 2],
 }
 
 /// The law of a tissue under a tip of a radius, m.
@@ -227,11 +237,21 @@ impl Live {
 
     /// Changes the tissue from the beginning of step `at_step` on, or of the next. Tells the step, and the tissue from then
     /// on. It is compiled here, by who asks, some milliseconds: no step waits for that.
-    pub fn change(&self, change: &Change, at_step: Option<u64>) -> Result<(u64, Arc<Model>)> {
+    ///
+    /// `admit` is asked whether the thread has the time that the tissue will take of it, as a part of all.
+    pub fn change(
+        &self,
+        change: &Change,
+        at_step: Option<u64>,
+        admit: impl Fn(f64) -> Result<()>,
+    ) -> Result<(u64, Arc<Model>)> {
         loop {
             let base = self.at_intake(|intake, _| intake.changed_to());
             let model = base.as_ref().unwrap_or(&self.model).changed(change, &self.model.scene, &self.limits)?;
             check_work(&model, &self.limits)?;
+            if model.plan.substeps > self.model.plan.substeps {
+                admit(self.cost.awake_share_of(&model))?;
+            }
             // Somebody may have been quicker; then it is made out of theirs.
             if let Some(step) = self.at_intake(|intake, now| intake.change(base.as_ref(), &model, at_step, now))? {
                 return Ok((step, model));
@@ -270,11 +290,18 @@ impl Live {
     }
 
     /// Records of some points, or of all, every so many steps.
-    pub fn probe(&self, every: u64, points: Option<Vec<[usize; 2]>>, energy: bool) -> Reader<PacedRecord> {
+    pub fn probe(
+        &self,
+        every: u64,
+        points: Option<Vec<[usize; 2]>>,
+        energy: bool,
+        account: &Account,
+    ) -> Reader<PacedRecord> {
         let count = points.as_ref().map_or(self.model.len(), Vec::len).max(1);
         let room = self.limits.queued_bytes / (count * size_of::<Point>());
         let (writer, reader) = queue(room.clamp(1, self.limits.queued_records));
-        self.inbox.send(self.number, Request::Probe(ProbeTap { every, points, energy, writer }));
+        let account = account.clone();
+        self.inbox.send(self.number, Request::Probe(ProbeTap { every, points, energy, writer, account }));
         reader
     }
 
@@ -313,6 +340,8 @@ fn deleted() -> Refusal {
 /// All sessions of a server, and the threads that step them.
 pub struct Pacer {
     limits: Limits,
+    /// What callers share.
+    pub budget: Arc<Budget>,
     inboxes: Vec<Arc<Inbox>>,
     encoder: Arc<Encoder>,
     threads: Mutex<Vec<JoinHandle<()>>>,
@@ -338,7 +367,7 @@ pub fn random_bits() -> Result<u128> {
 impl Pacer {
     /// Starts `threads` stepping threads, one that encodes frames, and one that measures errors with `audit_share` of a core;
     /// none if that is 0.
-    pub fn start(threads: usize, audit_share: f64, limits: &Limits) -> std::io::Result<Arc<Self>> {
+    pub fn start(threads: usize, audit_share: f64, limits: &Limits, budget: Arc<Budget>) -> std::io::Result<Arc<Self>> {
         let encoder = Arc::new(Encoder::default());
         let mut handles = Vec::new();
         let mut inboxes = Vec::new();
@@ -369,6 +398,7 @@ impl Pacer {
         }
         Ok(Arc::new(Pacer {
             limits: limits.clone(),
+            budget,
             inboxes,
             encoder,
             threads: Mutex::new(handles),
@@ -379,13 +409,16 @@ impl Pacer {
         }))
     }
 
-    /// Makes a session.
-    pub fn create(&self, scene: &Scene, paused: bool, idle_timeout_s: f64) -> Result<Arc<Live>> {
+    /// Makes a session for `owner`.
+    pub fn create(&self, scene: &Scene, paused: bool, idle_timeout_s: f64, owner: &Account) -> Result<Arc<Live>> {
+        // Before anything is done for it.
+        let slot = owner.take(Resource::Sessions, 1, "")?;
         let most_hz = self.limits.session_rate_hz;
         number("stepping.rate_hz", scene.stepping.rate_hz, &format!("at most {most_hz}"), |v| v <= most_hz)?;
         let model = self.compile(scene)?;
         let id = random_id()?;
         check_work(&model, &self.limits)?;
+        let memory = owner.take(Resource::Memory(Purpose::Session), model.session_bytes(), "sheet.points")?;
         let number = {
             let mut numbers = lock(&self.numbers);
             *numbers += 1;
@@ -412,8 +445,9 @@ impl Pacer {
         let inbox = self.inboxes[thread].clone();
         let live = Arc::new(Live {
             id: id.clone(),
-            intake: Mutex::new(Intake::new(&model.scene, &self.limits)),
+            intake: Mutex::new(Intake::new(&model.scene, &self.limits).charged_to(owner)),
             model,
+            owner: owner.clone(),
             idle_timeout_s,
             asked_ns: AtomicU64::new(now_ns()),
             number,
@@ -426,6 +460,7 @@ impl Pacer {
             cost,
             thread,
             inbox: inbox.clone(),
+            _taken: [slot, memory],
         });
         // Laid out before the lock is taken, on which all calls wait.
         let running = Box::new(Running::new(live.clone(), !paused));
@@ -434,10 +469,6 @@ impl Pacer {
         if points + live.model.len() > self.limits.points_in_all {
             let message = format!("the sessions of the server have {points} points already");
             return Err(Refusal::new(Reason::TooMany, "sheet.points", message));
-        }
-        if sessions.len() >= self.limits.sessions {
-            let message = format!("the server has {} sessions already", sessions.len());
-            return Err(Refusal::new(Reason::TooMany, "", message));
         }
         sessions.insert(id, live.clone());
         // Before anybody can name the session: what is asked of it comes after this.
@@ -466,20 +497,31 @@ impl Pacer {
             |a: &(usize, &(f64, usize)), b: &(usize, &(f64, usize))| a.1.0.total_cmp(&b.1.0).then(a.1.1.cmp(&b.1.1));
         let (thread, (taken, _)) = taken.iter().enumerate().min_by(spare).unwrap_or((0, &(0.0, 0)));
         if !paused {
-            self.check_share(*taken, &cost)?;
+            self.check_share(*taken, cost.awake_share())?;
         }
         Ok((cost, thread))
     }
 
+    /// Another tissue for a session ([`Live::change`]), unless its steps would make others late.
+    pub fn change_tissue(&self, live: &Live, change: &Change, at_step: Option<u64>) -> Result<(u64, Arc<Model>)> {
+        live.change(change, at_step, |needed| self.check_share(self.taken_by_others(live), needed))
+    }
+
+    /// Of the thread of a session, what the others that are awake take.
+    fn taken_by_others(&self, live: &Live) -> f64 {
+        let others = |other: &&Arc<Live>| other.thread == live.thread && other.number != live.number;
+        lock(&self.sessions).values().filter(others).map(|other| other.cost.share()).sum()
+    }
+
     /// Refuses what would make others late. Whoever is alone on its thread delays nobody, however heavy; and what rests
     /// takes nothing.
-    fn check_share(&self, taken: f64, cost: &Cost) -> Result<()> {
-        let (needed, most) = (cost.awake_share(), self.limits.thread_share);
+    fn check_share(&self, taken: f64, needed: f64) -> Result<()> {
+        let most = self.limits.thread_share;
         if taken == 0.0 || taken + needed <= most {
             return Ok(());
         }
         let message = format!(
-            "the sessions of the stepping thread with the most time to spare take {taken:.3} of it, and this one would take \
+            "the other sessions of the stepping thread take {taken:.3} of it, and this one would take \
              {needed:.3}: above the {most} that sessions may take (limits.thread_share)"
         );
         Err(Refusal::new(Reason::Overloaded, "", message))
@@ -488,9 +530,7 @@ impl Pacer {
     /// Lets a session's time go on ([`Live::start`]), unless that would make others late.
     pub async fn start_session(&self, live: &Live, until: Option<u64>) -> Result<u64> {
         if lock(&live.status).state == State::Paused {
-            let others = |other: &&Arc<Live>| other.thread == live.thread && other.number != live.number;
-            let taken = lock(&self.sessions).values().filter(others).map(|other| other.cost.share()).sum();
-            self.check_share(taken, &live.cost)?;
+            self.check_share(self.taken_by_others(live), live.cost.awake_share())?;
         }
         live.start(until).await
     }
@@ -573,7 +613,7 @@ impl Pacer {
 
 /// Refuses steps that would keep the server from all others.
 fn check_work(model: &Model, limits: &Limits) -> Result<()> {
-    let (points, substeps, most) = (model.len(), model.plan.substeps, limits.point_substeps_per_step);
+    let (points, substeps, most) = (model.swept_points(), model.plan.substeps, limits.point_substeps_per_step);
     if points as u64 * u64::from(substeps) <= most {
         return Ok(());
     }

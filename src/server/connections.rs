@@ -25,6 +25,8 @@ use super::metrics::{Open, Traffic};
 use super::rate::Turnstile;
 use super::reload::Reloaded;
 use super::tls;
+use super::visitor::address_name;
+use crate::budget::{Budget, Purpose, Resource, Taken};
 use crate::limits::Limits;
 use crate::pace::queue::lock;
 
@@ -38,6 +40,10 @@ const GREETING_BYTES: usize = 24;
 /// would keep a core from all others for tens of milliseconds. Those that wait do so in the system.
 const APART: Duration = Duration::from_millis(1);
 
+/// After so many bytes of one connection the others get their turn: small frames, of which nobody need read anything (PING,
+/// SETTINGS, WINDOW_UPDATE, PRIORITY), cost a hundred nanoseconds each.
+const BYTES_A_TURN: usize = 8 << 10;
+
 /// Connections that wait to be served.
 const WAITING: usize = 64;
 
@@ -46,6 +52,7 @@ pub(super) fn incoming(
     listener: TcpListener,
     tls: Option<Arc<Reloaded<ServerConfig>>>,
     limits: &Limits,
+    budget: Arc<Budget>,
     traffic: Arc<Traffic>,
 ) -> impl Stream<Item = io::Result<Connection>> + use<> {
     let (ready, connections) = mpsc::channel(WAITING);
@@ -75,9 +82,18 @@ pub(super) fn incoming(
                     continue;
                 }
             };
+            let account = budget.account(&address_name(address.ip()));
+            let bytes = u64::from(limits.connection_window_bytes);
+            let window = match account.take(Resource::Memory(Purpose::Connections), bytes, "") {
+                Ok(window) => window,
+                Err(why) => {
+                    warn!(%address, "connection closed: its window {why}");
+                    continue;
+                }
+            };
             // Nagle's algorithm would hold a sample back for milliseconds. Who has gone already is noticed later.
             let _ = socket.set_nodelay(true);
-            let entry = Entry::new(address, seat, &limits, &traffic);
+            let entry = Entry::new(address, seat, window, &limits, &traffic);
             let Some(tls) = &tls else {
                 let _ = ready.send(Ok(entry.connection(Transport::Plain(socket), None))).await;
                 continue;
@@ -96,6 +112,14 @@ pub(super) fn incoming(
         }
     });
     ReceiverStream::new(connections)
+}
+
+/// Where somebody comes from: whoever has IPv6 has 2⁶⁴ addresses.
+pub(super) fn network(address: IpAddr) -> IpAddr {
+    match address.to_canonical() {
+        IpAddr::V6(address) => IpAddr::V6((u128::from(address) >> 64 << 64).into()),
+        IpAddr::V4(address) => IpAddr::V4(address),
+    }
 }
 
 /// Room for connections: so many in all, and so many from one address.
@@ -120,11 +144,7 @@ impl Seats {
 
     /// A seat, or why there is none.
     fn take(self: &Arc<Self>, address: IpAddr) -> Result<Seat, String> {
-        // Whoever has IPv6 has 2⁶⁴ addresses.
-        let address = match address.to_canonical() {
-            IpAddr::V6(address) => IpAddr::V6((u128::from(address) >> 64 << 64).into()),
-            IpAddr::V4(address) => IpAddr::V4(address),
-        };
+        let address = network(address);
         let mut taken = lock(&self.taken);
         if taken.values().sum::<usize>() >= self.most {
             return Err(format!("there are {} already (limits.connections)", self.most));
@@ -166,6 +186,8 @@ pub(crate) struct Peer {
 /// A connection that was let in, before its handshake.
 struct Entry {
     address: SocketAddr,
+    /// The memory of what comes and nobody has read.
+    window: Taken,
     calls: Turnstile,
     creations: Turnstile,
     /// For the handshake and the greeting together.
@@ -175,10 +197,11 @@ struct Entry {
 }
 
 impl Entry {
-    fn new(address: SocketAddr, seat: Seat, limits: &Limits, traffic: &Arc<Traffic>) -> Self {
+    fn new(address: SocketAddr, seat: Seat, window: Taken, limits: &Limits, traffic: &Arc<Traffic>) -> Self {
         let per_minute = limits.sessions_per_minute;
         Entry {
             address,
+            window,
             calls: Turnstile::new(limits.calls_per_s, limits.calls_per_s, "calls of this connection"),
             creations: Turnstile::new(per_minute / 60.0, per_minute, "sessions made over this connection"),
             deadline: Box::pin(tokio::time::sleep(Duration::from_secs_f64(limits.handshake_s))),
@@ -188,7 +211,7 @@ impl Entry {
     }
 
     fn connection(self, transport: Transport, certificate: Option<Arc<[String]>>) -> Connection {
-        let Entry { address, calls, creations, deadline, traffic, seat } = self;
+        let Entry { address, window, calls, creations, deadline, traffic, seat } = self;
         debug!(%address, "connected");
         Connection {
             transport,
@@ -196,7 +219,9 @@ impl Entry {
             greeting: Some((GREETING_BYTES, deadline)),
             _open: traffic.open(),
             traffic,
+            unyielded: 0,
             _seat: seat,
+            _window: window,
         }
     }
 }
@@ -213,8 +238,11 @@ pub(super) struct Connection {
     /// Until so many bytes have come, it has so long.
     greeting: Option<(usize, Pin<Box<Sleep>>)>,
     traffic: Arc<Traffic>,
+    /// Bytes since others had their turn.
+    unyielded: usize,
     _open: Open,
     _seat: Seat,
+    _window: Taken,
 }
 
 impl Connection {
@@ -237,6 +265,11 @@ impl Connected for Connection {
 impl AsyncRead for Connection {
     fn poll_read(self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
         let this = self.get_mut();
+        if this.unyielded >= BYTES_A_TURN {
+            this.unyielded = 0;
+            cx.waker().wake_by_ref();
+            return Poll::Pending;
+        }
         let before = buffer.filled().len();
         let polled = match &mut this.transport {
             Transport::Plain(stream) => Pin::new(stream).poll_read(cx, buffer),
@@ -244,6 +277,8 @@ impl AsyncRead for Connection {
         };
         let bytes = buffer.filled().len() - before;
         this.traffic.bytes_in.inc_by(bytes as u64);
+        // Nothing waits: the others had their turn, or will.
+        this.unyielded = if polled.is_pending() { 0 } else { this.unyielded + bytes };
         let Some((left, deadline)) = &mut this.greeting else { return polled };
         if polled.is_pending() {
             ready!(deadline.as_mut().poll(cx));

@@ -16,6 +16,8 @@ use super::identity::{Access, Caller, Credentials, access};
 use super::metrics::Traffic;
 use super::reload::Reloaded;
 use super::revocation::{Revocable, Shown};
+use super::visitor::Visitor;
+use crate::budget::Budget;
 use crate::refusal::{Reason, Refusal, Result};
 
 /// Puts a [`Guard`] before a service.
@@ -23,6 +25,7 @@ use crate::refusal::{Reason, Refusal, Result};
 pub(super) struct GuardLayer {
     pub(super) credentials: Arc<Reloaded<Credentials>>,
     pub(super) traffic: Arc<Traffic>,
+    pub(super) budget: Arc<Budget>,
     /// Nobody is asked who they are because nobody else can get here: then no page of another site may, either.
     pub(super) local_only: bool,
     /// Pages that may.
@@ -111,9 +114,14 @@ where
         self.inner.poll_ready(cx)
     }
 
-    fn call(&mut self, request: Request<Body>) -> Self::Future {
+    fn call(&mut self, mut request: Request<Body>) -> Self::Future {
         match self.layer.admit(&request) {
             Ok((caller, shown)) => {
+                let asked = shown.is_some() && !self.layer.credentials.get().is_open();
+                let peer = request.extensions().get::<Peer>();
+                let name = Visitor::account_name(asked.then_some(&*caller.name), peer);
+                let visitor = Visitor::new(self.layer.budget.account(&name), &request);
+                request.extensions_mut().insert(visitor);
                 // In every line of the log that the call writes.
                 let span = info_span!("call", path = request.uri().path(), client = &*caller.name);
                 let answer = self.inner.call(request).instrument(span);

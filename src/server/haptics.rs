@@ -1,6 +1,5 @@
 //! `HapticService`.
 
-use std::collections::VecDeque;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll, ready};
@@ -14,6 +13,7 @@ use tracing::{Instrument, debug, info};
 
 use super::House;
 use super::rate::Bucket;
+use super::visitor::Visitor;
 use crate::haptics::device::{Device, UNDECLARED_FORCE_N};
 use crate::limits::Limits;
 use crate::pace::clock::now_ns;
@@ -385,6 +385,7 @@ impl HapticService for Haptics {
 
     async fn probe(&self, request: Request<pb::ProbeRequest>) -> Result<Response<Self::ProbeStream>, Status> {
         use pb::probe_request::Where;
+        let Visitor { account, .. } = Visitor::of(request.extensions());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
         let every = wire::every("every_steps", request.every_steps)?;
@@ -407,18 +408,19 @@ impl HapticService for Haptics {
             _ => return Err(Refusal::new(Reason::Missing, "where", "points or all_points is missing").into()),
         };
         let guard = live.open_stream()?;
-        let records = live.probe(every, points, request.energy);
-        let state = Some((records, guard, VecDeque::new()));
-        let out = stream::unfold(state, |state| async move {
-            let (mut records, guard, mut messages) = state?;
-            if messages.is_empty() {
-                match records.pop().await {
-                    Ok((record, dropped)) => messages.extend(wire::sample::record(&record, dropped)),
+        let records = live.probe(every, points, request.energy, &account);
+        let out = stream::unfold(Some((records, guard, None)), |state| async move {
+            let (mut records, guard, begun) = state?;
+            let (record, dropped, part) = match begun {
+                Some(begun) => begun,
+                None => match records.pop().await {
+                    Ok((record, dropped)) => (record, dropped, 0),
                     Err(refusal) => return Some((Err(refusal.into()), None)),
-                }
-            }
-            let message: pb::ProbeResponse = messages.pop_front()?;
-            Some((Ok(message), Some((records, guard, messages))))
+                },
+            };
+            let message = wire::sample::record(&record, dropped, part)?;
+            let begun = (!message.last).then_some((record, dropped, part + 1));
+            Some((Ok(message), Some((records, guard, begun))))
         });
         Ok(Response::new(out.boxed()))
     }

@@ -20,6 +20,7 @@ use tokio_util::sync::CancellationToken;
 use tracing::info;
 
 use super::identity::CALLS;
+use crate::budget::{Purpose, Resource};
 use crate::pace::queue::lock;
 use crate::pace::tally::{Count, Tally, Times};
 use crate::pace::{Pacer, State};
@@ -205,6 +206,13 @@ impl Collector for Stepping {
             let count = statuses.iter().filter(|status| is(status)).count();
             states.encode_family(&[("state", name)])?.encode_gauge(&(count as i64))?;
         }
+        let budget = &pacer.budget;
+        let help = "Memory that is taken, by what it is for";
+        let mut taken = encoder.encode_descriptor("memory_taken", help, Some(&Unit::Bytes), MetricType::Gauge)?;
+        for purpose in Purpose::ALL {
+            let bytes = budget.bytes_for(purpose) as i64;
+            taken.encode_family(&[("for", purpose.name())])?.encode_gauge(&bytes)?;
+        }
         let mut gauge = |name: &str, help: &str, value: f64| {
             let gauge = ConstGauge::new(value);
             gauge.encode(encoder.encode_descriptor(name, help, None, MetricType::Gauge)?)
@@ -212,6 +220,9 @@ impl Collector for Stepping {
         let points: usize = sessions.iter().map(|live| live.model.len()).sum();
         let awake: usize = statuses.iter().map(|status| status.awake_points).sum();
         let streams: usize = sessions.iter().map(|live| live.streams()).sum();
+        gauge("memory_budget_bytes", "Memory that there is for callers", budget.bytes() as f64)?;
+        gauge("callers", "Callers that have something, or are there", budget.accounts().len() as f64)?;
+        gauge("held_tools", "Tools that are held", budget.taken(Resource::Leases) as f64)?;
         gauge("points", "Mass points of all sessions", points as f64)?;
         gauge("awake_points", "Mass points that the last steps of all sessions computed", awake as f64)?;
         gauge("streams", "Streams that read a session", streams as f64)?;

@@ -17,6 +17,7 @@ mod sessions;
 mod textures;
 mod tls;
 mod views;
+mod visitor;
 mod workshop;
 
 use std::net::SocketAddr;
@@ -31,6 +32,7 @@ use tonic_web::GrpcWebLayer;
 use tower_http::cors::CorsLayer;
 use tracing::{info, warn};
 
+use crate::budget::{Budget, give_back_to_the_system};
 use crate::pace::Pacer;
 use crate::refusal::{Reason, Refusal};
 use crate::wire::pb;
@@ -129,6 +131,9 @@ fn cors(origins: &[HeaderValue]) -> CorsLayer {
         .max_age(Duration::from_secs(3600))
 }
 
+/// Bytes that were taken and are free again: then the allocator is asked to give what it keeps back to the system.
+const WORTH_GIVING_BACK: u64 = 16 << 20;
+
 /// Why a server could not run.
 #[derive(Debug, thiserror::Error)]
 pub enum ServeError {
@@ -160,7 +165,9 @@ pub enum ServeError {
 /// deadline of the configuration has passed. The caller ends its runtime without waiting (`shutdown_background`).
 pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) -> Result<(), ServeError> {
     let Doors { listener, metrics, protection } = doors;
-    let pacer = Pacer::start(config.stepping_threads(), config.audit_share, &config.limits)?;
+    let budget = Budget::new(&config.limits, config.stepping_threads(), config.serving_threads());
+    info!(bytes = budget.bytes(), "memory to share");
+    let pacer = Pacer::start(config.stepping_threads(), config.audit_share, &config.limits, budget.clone())?;
     let deadline = Duration::from_secs_f64(config.shutdown_deadline_s);
     let catalog = Catalog::new(&config.scenes, &config.scripts);
     for name in catalog.names() {
@@ -181,6 +188,7 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
     let guard = GuardLayer {
         credentials: protection.credentials.clone(),
         traffic: traffic.clone(),
+        budget: budget.clone(),
         local_only: open && !config.insecure,
         origins: origins.clone(),
     };
@@ -203,7 +211,8 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
 
-    let unused = pacer.clone();
+    let (unused, memory) = (pacer.clone(), budget.clone());
+    let mut most_bytes = 0;
     let sweeping = async move {
         let mut sweep = tokio::time::interval(Duration::from_secs(1));
         loop {
@@ -211,10 +220,16 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
             for session in unused.delete_idle() {
                 info!(session, "session deleted: nobody used it");
             }
+            let bytes = memory.bytes_taken();
+            most_bytes = most_bytes.max(bytes);
+            if most_bytes - bytes >= WORTH_GIVING_BACK {
+                most_bytes = bytes;
+                let _ = tokio::task::spawn_blocking(give_back_to_the_system).await;
+            }
         }
     };
 
-    let incoming = connections::incoming(listener, protection.tls.clone(), &limits, traffic);
+    let incoming = connections::incoming(listener, protection.tls.clone(), &limits, budget.clone(), traffic);
     let silence = Some(Duration::from_secs_f64(limits.keepalive_s));
     let bytes = limits.message_bytes;
     let (folder, painter) = (Arc::new(house.config.viewer.clone()), house.clone());

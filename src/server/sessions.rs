@@ -9,6 +9,7 @@ use tracing::{info, warn};
 
 use super::House;
 use super::connections::Peer;
+use super::visitor::Visitor;
 use crate::refusal::{Reason, Refusal, number};
 use crate::scene::script::Script;
 use crate::wire::pb::session_service_server::SessionService;
@@ -37,6 +38,7 @@ impl SessionService for Sessions {
             tokio::time::sleep(wait).await;
             return Err(refusal.into());
         }
+        let Visitor { account, .. } = Visitor::of(request.extensions());
         let request = request.into_inner();
         let scene = match &request.source {
             Some(Source::SceneName(name)) => self.0.catalog.load(name, &[], &self.0.config.limits)?,
@@ -49,7 +51,7 @@ impl SessionService for Sessions {
         number("idle_timeout_s", idle_timeout_s, &range, |value| value > 0.0 && value <= most_s)?;
         // A large sheet takes a while to lay out.
         let pacer = self.0.pacer.clone();
-        let live = self.0.workshop.work(move || pacer.create(&scene, request.paused, idle_timeout_s)).await??;
+        let live = self.0.workshop.work(move || pacer.create(&scene, request.paused, idle_timeout_s, &account)).await??;
         info!(session = %live.id, scene = %live.model.scene.name, points = live.model.len(), "session created");
         for warning in &live.model.warnings {
             warn!(session = %live.id, warning);
@@ -100,8 +102,9 @@ impl SessionService for Sessions {
     ) -> Result<Response<pb::UpdateTissueResponse>, Status> {
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
-        let (change, to_change) = (wire::scene::from_change(&request), live.clone());
-        let (step, model) = self.0.workshop.work(move || to_change.change(&change, request.at_step)).await??;
+        let (change, to_change, pacer) = (wire::scene::from_change(&request), live.clone(), self.0.pacer.clone());
+        let change = move || pacer.change_tissue(&to_change, &change, request.at_step);
+        let (step, model) = self.0.workshop.work(change).await??;
         info!(
             session = %live.id,
             step,

@@ -9,6 +9,7 @@ use tonic::Status;
 
 use super::workshop::Workshop;
 use super::{House, page};
+use crate::budget::{Purpose, Resource, Taken};
 use crate::pace::queue::lock;
 use crate::refusal::Refusal;
 use crate::scene::Appearance;
@@ -17,10 +18,13 @@ use crate::texture::{Texture, texture};
 /// Textures that a server keeps.
 const MOST_KEPT: usize = 8;
 
+/// While it is painted.
+const BYTES_PER_PIXEL: u64 = 16;
+
 /// The textures last asked for, the newest last.
 #[derive(Clone)]
 pub(crate) struct Textures {
-    kept: Arc<Mutex<Vec<(Appearance, Texture)>>>,
+    kept: Arc<Mutex<Vec<(Appearance, Texture, Taken)>>>,
     /// Of their own: a texture may take a second, and nobody who wants a session waits for that.
     workshop: Workshop,
 }
@@ -57,14 +61,19 @@ impl House {
             _ => self.catalog.load(name, &[], limits)?.appearance,
         };
         let mut kept = lock(&self.textures.kept);
-        if let Some((_, texture)) = kept.iter().find(|entry| entry.0 == appearance) {
+        if let Some((_, texture, _)) = kept.iter().find(|entry| entry.0 == appearance) {
             return Ok(texture.clone());
         }
-        let texture = texture(&appearance, limits)?;
+        // What is kept serves whoever asks next: nobody pays for it alone.
+        let account = self.pacer.budget.account("textures");
+        let side = u64::from(appearance.texture_size);
         if kept.len() == MOST_KEPT {
             kept.remove(0);
         }
-        kept.push((appearance, texture.clone()));
+        let mut taken = account.take(Resource::Memory(Purpose::Textures), side * side * BYTES_PER_PIXEL, "texture_size")?;
+        let texture = texture(&appearance, limits)?;
+        taken.shrink_to(texture.png.len() as u64);
+        kept.push((appearance, texture.clone(), taken));
         Ok(texture)
     }
 }

@@ -9,6 +9,7 @@ use tonic::{Request, Response, Status};
 use tracing::info;
 
 use super::House;
+use super::visitor::Visitor;
 use crate::pace::frames::Viewer;
 use crate::pace::{FrameReader, StreamGuard, random_id};
 use crate::refusal::{Reason, Refusal, number};
@@ -100,6 +101,7 @@ impl ViewService for Views {
         &self,
         request: Request<pb::WatchFramesRequest>,
     ) -> Result<Response<Self::WatchFramesStream>, Status> {
+        let Visitor { account, .. } = Visitor::of(request.extensions());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
         let grid = Refinement::new(live.model.points, request.refinement, &self.0.config.limits)?;
@@ -129,7 +131,8 @@ impl ViewService for Views {
             request.always_full,
             request.max_frames_in_flight,
             room,
-        );
+            &account,
+        )?;
         self.0.pacer.add_viewer(&live, &viewer);
         info!(session = %live.id, refinement = request.refinement, ?encoding, rate_hz, "viewer joined");
         let frames = Frames { viewer_id, reader, _guard: guard, messages: VecDeque::new(), last: None, skipped: 0 };

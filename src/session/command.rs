@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
 use super::schedule::Schedule;
+use crate::budget::{Account, Purpose, Resource, Taken};
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, positive};
 use crate::scene::Scene;
@@ -84,8 +85,13 @@ pub struct Intake {
     limits: Limits,
     leases: BTreeMap<u32, Lease>,
     queue: BTreeMap<Place, Due>,
-    /// Other tissues that wait for their step, by steps that rise.
-    changes: VecDeque<(u64, Arc<Model>)>,
+    /// Of those, commands of clients: counted as they come and go, for whoever asks.
+    waiting: u64,
+    /// Other tissues that wait for their step, by steps that rise, and the memory of each.
+    changes: VecDeque<(u64, Arc<Model>, Option<Taken>)>,
+    /// Who pays for what waits here, and what was taken for commands.
+    account: Option<Account>,
+    taken: Option<Taken>,
     /// The last that was taken in, if there was one.
     changed_to: Option<Arc<Model>>,
     arrivals: u64,
@@ -109,7 +115,10 @@ impl Intake {
             limits: limits.clone(),
             leases: BTreeMap::new(),
             queue: BTreeMap::new(),
+            waiting: 0,
             changes: VecDeque::new(),
+            account: None,
+            taken: None,
             changed_to: None,
             arrivals: 0,
             next_step: 0,
@@ -119,6 +128,30 @@ impl Intake {
             lapsed: 0,
             counts: Counts::default(),
             closed: None,
+        }
+    }
+
+    /// The memory of what waits is charged to `account`.
+    #[must_use]
+    pub fn charged_to(self, account: &Account) -> Self {
+        Intake { account: Some(account.clone()), ..self }
+    }
+
+    /// Has the memory of `more` commands beside those that wait, or refuses.
+    fn make_room(&mut self, more: usize) -> Result<()> {
+        let bytes = bytes_of(self.queue.len() + more);
+        let Some(account) = self.account.as_ref().filter(|_| bytes > 0) else { return Ok(()) };
+        match &mut self.taken {
+            Some(taken) => taken.grow_to(bytes, ""),
+            None => account.take(Resource::Memory(Purpose::Commands), bytes, "").map(|taken| self.taken = Some(taken)),
+        }
+    }
+
+    /// Gives back what no longer waits.
+    fn give_back(&mut self) {
+        let bytes = bytes_of(self.queue.len());
+        if let Some(taken) = self.taken.as_mut().filter(|taken| taken.amount() > bytes) {
+            taken.shrink_to(bytes);
         }
     }
 
@@ -188,9 +221,11 @@ impl Intake {
 
     fn end(&mut self, tool: u32) {
         self.leases.remove(&tool);
-        let waiting = self.waiting();
+        let waiting = self.waiting;
         self.queue.retain(|_, due| due.command.tool != tool);
-        self.counts.dropped += waiting - self.waiting();
+        self.waiting = self.queue.values().filter(|due| !due.ends_lease).count() as u64;
+        self.counts.dropped += waiting - self.waiting;
+        self.give_back();
         let command = Command {
             tool,
             sequence: 0,
@@ -248,6 +283,7 @@ impl Intake {
                 return Err(Refusal::new(Reason::QueueFull, "", message));
             }
         }
+        self.make_room(commands.len())?;
         self.counts.accepted += commands.len() as u64;
         for command in commands {
             self.enqueue(command, false);
@@ -300,9 +336,11 @@ impl Intake {
             {
                 late_commands += superseded.late_commands;
                 lease.waiting -= 1;
+                self.waiting -= u64::from(!superseded.ends_lease);
                 self.counts.superseded += 1;
             }
         }
+        self.waiting += u64::from(!ends_lease);
         self.queue.insert(place, Due { command, late, late_commands, ends_lease });
         self.changed = true;
     }
@@ -335,20 +373,22 @@ impl Intake {
             return Ok(None);
         }
         let step = at_step.unwrap_or(0).max(self.next_step);
-        if let Some((last, _)) = self.changes.back() {
-            if *last > step {
-                let message = format!("is {step}, but a change of the tissue waits for step {last}: they act in order");
-                return Err(Refusal::new(Reason::OutOfTurn, "at_step", message));
-            }
-            if *last == step {
-                self.changes.pop_back();
-            }
+        let last = self.changes.back().map(|change| change.0);
+        if let Some(last) = last.filter(|last| *last > step) {
+            let message = format!("is {step}, but a change of the tissue waits for step {last}: they act in order");
+            return Err(Refusal::new(Reason::OutOfTurn, "at_step", message));
         }
-        if self.changes.len() >= self.limits.queued_commands_per_tool {
+        let replaces = last == Some(step);
+        if !replaces && self.changes.len() >= self.limits.queued_changes {
             let message = format!("{} changes of the tissue wait for their step already", self.changes.len());
             return Err(Refusal::new(Reason::QueueFull, "", message));
         }
-        self.changes.push_back((step, model.clone()));
+        let account = self.account.as_ref();
+        let taken = account.map(|account| account.take(Resource::Memory(Purpose::Change), model.bytes(), "")).transpose()?;
+        if replaces {
+            self.changes.pop_back();
+        }
+        self.changes.push_back((step, model.clone(), taken));
         self.changed_to = Some(model.clone());
         self.changed = true;
         Ok(Some(step))
@@ -395,8 +435,10 @@ impl Intake {
                 lease.waiting = lease.waiting.saturating_sub(1);
             }
             self.counts.applied += u64::from(!entry.ends_lease);
+            self.waiting -= u64::from(!entry.ends_lease);
             due.push(entry);
         }
+        self.give_back();
         self.next_step = step + 1;
     }
 
@@ -422,23 +464,32 @@ impl Intake {
 
     /// What has become of the commands so far.
     pub fn counts(&self) -> Counts {
-        Counts { waiting: self.waiting(), ..self.counts }
-    }
-
-    fn waiting(&self) -> u64 {
-        self.queue.values().filter(|due| !due.ends_lease).count() as u64
+        Counts { waiting: self.waiting, ..self.counts }
     }
 
     /// From now on everything is refused with this.
     pub fn close(&mut self, refusal: Refusal) {
         self.closed = Some(refusal);
-        self.counts.dropped += self.waiting();
+        self.counts.dropped += self.waiting;
         self.queue.clear();
+        self.waiting = 0;
+        self.changes.clear();
+        self.taken = None;
     }
 
     fn check_open(&self) -> Result<()> {
         self.closed.clone().map_or(Ok(()), Err)
     }
+}
+
+/// Commands are charged in pieces of so many bytes, and the first of a session is its own: who has a few waiting at a
+/// time, as most do, pays nothing.
+const PIECE_BYTES: u64 = 64 << 10;
+
+/// What so many commands are charged: they are in a tree, whose nodes are two thirds full.
+fn bytes_of(commands: usize) -> u64 {
+    let bytes = commands * size_of::<(Place, Due)>() * 3 / 2;
+    (bytes as u64 / PIECE_BYTES) * PIECE_BYTES
 }
 
 fn not_holder(message: String) -> Refusal {
