@@ -90,6 +90,13 @@ enum Command {
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         arguments: Vec<std::ffi::OsString>,
     },
+    /// Show who has what of a server, and take it from them (`palpate-client admin`)
+    #[command(disable_help_flag = true, disable_help_subcommand = true)]
+    Admin {
+        /// As `palpate-client admin --help` tells
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        arguments: Vec<std::ffi::OsString>,
+    },
 }
 
 #[derive(clap::Args)]
@@ -271,7 +278,8 @@ fn main() -> ExitCode {
         Command::Texture(arguments) => make_texture(&arguments),
         Command::Serve(arguments) => serve(&arguments),
         Command::Token(arguments) => token(&arguments),
-        Command::Top { arguments } => return top(&arguments),
+        Command::Top { arguments } => return client("top", &arguments),
+        Command::Admin { arguments } => return client("admin", &arguments),
     };
     let (status, message) = match ended {
         Ok(()) => return ExitCode::SUCCESS,
@@ -372,9 +380,9 @@ fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
 }
 
 /// Runs the client's program, which lies beside this one.
-fn top(arguments: &[std::ffi::OsString]) -> ExitCode {
+fn client(command: &str, arguments: &[std::ffi::OsString]) -> ExitCode {
     let program = std::env::current_exe().unwrap_or_default().with_file_name("palpate-client");
-    match std::process::Command::new(&program).arg("top").args(arguments).status() {
+    match std::process::Command::new(&program).arg(command).args(arguments).status() {
         Ok(status) => status.code().and_then(|code| u8::try_from(code).ok()).map_or(ExitCode::FAILURE, ExitCode::from),
         Err(e) => {
             eprintln!("palpate: {}: {e}", program.display());

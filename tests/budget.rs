@@ -158,3 +158,90 @@ async fn memory_goes_back_to_the_system_with_the_sessions() {
     until("sessions keep their memory", || metric(&metrics, name) < f64::from(4 << 20)).await;
     until("memory does not go back to the system", || resident(&server) < before + (64 << 20)).await;
 }
+
+/// The tool of a session that is held.
+async fn held(server: &Server, session: &str) -> usize {
+    server.status(session).await.held_tools.len()
+}
+
+#[tokio::test]
+async fn a_lease_ends_with_its_connection_unless_asked_otherwise() {
+    let server = Server::start(&[]);
+    let session = server.paper(false).await;
+    let request = |tool, outlives_connection| pb::AcquireToolRequest {
+        session_id: session.clone(),
+        tool,
+        lease_s: Some(600.0),
+        outlives_connection,
+        ..Default::default()
+    };
+    let mut haptics = server.haptics().await;
+    haptics.acquire_tool(request(0, false)).await.unwrap();
+    haptics.acquire_tool(request(1, true)).await.unwrap();
+    assert_eq!(held(&server, &session).await, 2);
+    drop(haptics);
+    let waited = tokio::time::timeout(PATIENCE, async {
+        while held(&server, &session).await > 1 {
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+    });
+    waited.await.expect("a tool is held by nobody");
+    assert_eq!(server.status(&session).await.held_tools[0].tool, 1);
+}
+
+#[tokio::test]
+async fn who_administers_frees_tools_and_cuts_streams_and_callers() {
+    let server = Server::start(&["--log", "error"]);
+    let session = server.paper(false).await;
+    let admin = |arguments: &[&str]| {
+        let mut command = std::process::Command::new(server::client_program());
+        command.arg("admin").args(arguments).args(["--server", &server.url]);
+        command.output().unwrap()
+    };
+    let text = |output: &std::process::Output| String::from_utf8(output.stdout.clone()).unwrap();
+    let mut touch = server::Touch::hold(&server, &session).await;
+    let shown = text(&admin(&["streams", &session]));
+    assert!(shown.contains("Touch") && shown.contains("holds") && shown.contains("address:127.0.0.1"), "{shown}");
+    assert!(text(&admin(&["callers"])).contains("address:127.0.0.1"));
+    let number = shown.lines().nth(1).unwrap().split_whitespace().next().unwrap();
+    assert!(admin(&["cut-stream", &session, number]).status.success());
+    let ended = loop {
+        match tokio::time::timeout(PATIENCE, touch.hear()).await.expect("a stream that was cut goes on") {
+            Ok(Some(_)) => {}
+            Ok(None) => panic!("it ends without a reason"),
+            Err(status) => break status,
+        }
+    };
+    assert_eq!(told(&ended), (Code::Aborted, "CUT".into(), String::new()));
+    server.until_let_go().await;
+    assert!(!admin(&["cut-stream", &session, number]).status.success());
+
+    let request = pb::AcquireToolRequest { session_id: session.clone(), lease_s: Some(600.0), ..Default::default() };
+    let mut haptics = server.haptics().await;
+    haptics.acquire_tool(request.clone()).await.unwrap();
+    assert!(admin(&["free-tool", &session, "0"]).status.success());
+    assert_eq!(held(&server, &session).await, 0);
+    haptics.acquire_tool(request).await.unwrap();
+    assert!(!admin(&["revive", &session]).status.success());
+    // Its own connection goes, too.
+    admin(&["cut-caller", "address:127.0.0.1", "--delete-sessions"]);
+    let listed = server.sessions().await.list_sessions(pb::ListSessionsRequest {}).await.unwrap();
+    assert!(listed.into_inner().sessions.is_empty());
+}
+
+#[tokio::test]
+async fn watchers_leave_room_for_who_holds_a_tool() {
+    let server = Server::start(&["--log", "error"]);
+    let session = server.paper(true).await;
+    let mut haptics = server.haptics().await;
+    let mut watchers = Vec::new();
+    let refused = loop {
+        let request = pb::WatchSamplesRequest { session_id: session.clone(), ..Default::default() };
+        match haptics.watch_samples(request).await {
+            Ok(stream) => watchers.push(stream),
+            Err(refused) => break refused,
+        }
+    };
+    assert_eq!(told(&refused), (Code::ResourceExhausted, "TOO_MANY".into(), String::new()));
+    server::Touch::hold(&server, &session).await;
+}

@@ -213,7 +213,12 @@ impl Budget {
         }
         let number = known.map_or(accounts.numbers + 1, |known| known.0);
         accounts.numbers = accounts.numbers.max(number);
-        let owner = Arc::new(Owner { name: name.to_owned(), number, budget: self.clone() });
+        let owner = Arc::new(Owner {
+            name: name.to_owned(),
+            number,
+            budget: self.clone(),
+            turn: tokio::sync::Mutex::default(),
+        });
         if accounts.known.len() > MOST_FORMER {
             accounts.known.retain(|_, (_, owner)| owner.strong_count() > 0);
         }
@@ -252,6 +257,7 @@ struct Owner {
     name: String,
     number: u64,
     budget: Arc<Budget>,
+    turn: tokio::sync::Mutex<()>,
 }
 
 /// A caller's account: what it takes is charged to it.
@@ -294,6 +300,11 @@ impl Account {
     /// Its request took so long, ns, of threads that do such work.
     pub fn spend(&self, work: Work, now_ns: u64, took_ns: u64) {
         lock(&self.0.budget.times)[work as usize].add(self.0.number, now_ns, took_ns);
+    }
+
+    /// Its calls begin one after another: what one takes is known before the next begins.
+    pub async fn turn(&self) -> tokio::sync::MutexGuard<'_, ()> {
+        self.0.turn.lock().await
     }
 
     /// How long it has to wait until its part of such work is free again, ns; 0 if it need not wait.

@@ -53,12 +53,6 @@ impl Cost {
         get(&self.step_ns) * 1e-9 * self.rate_hz
     }
 
-    /// Of a core, if it is awake and its tissue is that of `model`.
-    pub(super) fn awake_share_of(&self, model: &Model) -> f64 {
-        let point_substeps = model.swept_points() as f64 * f64::from(model.plan.substeps);
-        self.awake_share() * (point_substeps / self.point_substeps).max(1.0)
-    }
-
     /// Of a core, now.
     pub(super) fn share(&self) -> f64 {
         get(&self.share)

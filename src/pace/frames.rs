@@ -362,9 +362,8 @@ mod tests {
     async fn who_wants_changes_gets_all_of_them_however_it_reads() {
         let grid = Refinement::new([3, 3], 0, &Limits::default()).unwrap();
         let account = Account::alone();
-        let changes = |credit| {
-            Viewer::new("viewer".into(), grid, Encoding::F32, 60.0, false, credit, 1 << 20, &account).unwrap()
-        };
+        let changes =
+            |credit| Viewer::new("viewer".into(), grid, Encoding::F32, 60.0, false, credit, 1 << 20, &account).unwrap();
         let ((slow, mut read_slow), (thrifty, mut read_thrifty)) = (changes(None), changes(Some(1)));
         let (mut spent, mut watched) = (Spent::default(), Watched::default());
         let mut show = |frame_id: u64, z: f32| {

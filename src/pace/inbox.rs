@@ -23,6 +23,9 @@ pub(super) enum Request {
         until: Option<u64>,
         reply: oneshot::Sender<Result<u64>>,
     },
+    Revive {
+        reply: oneshot::Sender<Result<u64>>,
+    },
     Pause {
         reply: oneshot::Sender<Result<()>>,
     },

@@ -4,8 +4,8 @@ use std::sync::Arc;
 
 use tokio::sync::oneshot;
 
-use super::frames::Viewer;
 use super::clock::now_ns;
+use super::frames::Viewer;
 use super::queue::{Wakes, Writer};
 use super::{PacedRecord, PacedSample, Recorded};
 use crate::budget::{Account, Purpose, Resource, Work};
@@ -109,7 +109,8 @@ impl Taps {
             let points = tap.points.as_ref().map_or(session.model().len(), Vec::len);
             let bytes = (points * size_of::<Point>()) as u64;
             let has_time = tap.account.must_wait_ns(Work::Reading, now) == 0;
-            let taken = has_time.then(|| tap.account.take(Resource::Memory(Purpose::Records), bytes, "").ok()).flatten();
+            let taken =
+                has_time.then(|| tap.account.take(Resource::Memory(Purpose::Records), bytes, "").ok()).flatten();
             let Some(_taken) = taken else {
                 tap.writer.skip();
                 continue;

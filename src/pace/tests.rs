@@ -1,5 +1,6 @@
 use super::*;
-use crate::scene::PAPER;
+use crate::budget::{Account, Budget};
+use crate::scene::{PAPER, Scene};
 
 #[tokio::test]
 async fn a_fault_in_one_session_ends_that_one_alone() {

@@ -298,6 +298,9 @@ impl Running {
                 self.publish_status();
                 let _ = reply.send(started);
             }
+            Request::Revive { reply } => {
+                let _ = reply.send(self.revive());
+            }
             Request::Pause { reply } => {
                 self.stand(desk);
                 let _ = reply.send(Ok(()));
@@ -386,6 +389,22 @@ impl Running {
             self.schedule.delay(1.0);
             self.dilation = Dilation::new(now, step);
         }
+        Ok(step)
+    }
+
+    /// The same tissue at rest, at the same step; time stands.
+    fn revive(&mut self) -> Result<u64> {
+        if self.session.hold_reason().is_none() {
+            return Err(Refusal::new(Reason::OutOfTurn, "session_id", "is a session that is not held"));
+        }
+        let step = self.session.step_count();
+        let mut session = Session::new(self.session.model());
+        session.skip_to(step);
+        (self.session, self.hashed, self.audit) = (session, None, None);
+        (self.running, self.until, self.still_since) = (false, None, Some(step));
+        lock(&self.live.intake).reopen();
+        lock(&self.live.status).forget_hold();
+        tracing::info!(session = %self.live.id, step, "session revived");
         Ok(step)
     }
 

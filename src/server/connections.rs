@@ -1,7 +1,7 @@
 //! Connections as they come, plain or through TLS: how many there may be, how long one may take to say what it wants, how
 //! fast it may ask, and what it carries. None waits for another's handshake.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::io;
 use std::net::{IpAddr, SocketAddr};
 use std::pin::Pin;
@@ -18,9 +18,11 @@ use tokio_rustls::TlsAcceptor;
 use tokio_rustls::rustls::ServerConfig;
 use tokio_rustls::server::TlsStream;
 use tokio_stream::wrappers::ReceiverStream;
+use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
 use tonic::transport::server::Connected;
 use tracing::{debug, warn};
 
+use super::leases::Leases;
 use super::metrics::{Open, Traffic};
 use super::rate::Turnstile;
 use super::reload::Reloaded;
@@ -54,6 +56,7 @@ pub(super) fn incoming(
     limits: &Limits,
     budget: Arc<Budget>,
     traffic: Arc<Traffic>,
+    register: Arc<Register>,
 ) -> impl Stream<Item = io::Result<Connection>> + use<> {
     let (ready, connections) = mpsc::channel(WAITING);
     let limits = limits.clone();
@@ -93,7 +96,7 @@ pub(super) fn incoming(
             };
             // Nagle's algorithm would hold a sample back for milliseconds. Who has gone already is noticed later.
             let _ = socket.set_nodelay(true);
-            let entry = Entry::new(address, seat, window, &limits, &traffic);
+            let entry = Entry::new(address, seat, window, &limits, &traffic, &register);
             let Some(tls) = &tls else {
                 let _ = ready.send(Ok(entry.connection(Transport::Plain(socket), None))).await;
                 continue;
@@ -181,6 +184,40 @@ pub(crate) struct Peer {
     pub(super) calls: Arc<Turnstile>,
     /// For those that make a session.
     pub(super) creations: Arc<Turnstile>,
+    /// Tools that are let go when it ends.
+    pub(super) leases: Arc<Leases>,
+    /// Cancelled when whoever administers the server has cut the connection.
+    cut: CancellationToken,
+    /// Accounts of those who have called over it.
+    callers: Arc<Mutex<BTreeSet<u64>>>,
+}
+
+impl Peer {
+    /// Somebody with that account has called.
+    pub(super) fn used_by(&self, account: u64) {
+        lock(&self.callers).insert(account);
+    }
+}
+
+/// The connections that are open.
+#[derive(Debug, Default)]
+pub(crate) struct Register(Mutex<(u64, BTreeMap<u64, Peer>)>);
+
+impl Register {
+    fn enter(&self, peer: &Peer) -> u64 {
+        let mut open = lock(&self.0);
+        open.0 += 1;
+        let number = open.0;
+        open.1.insert(number, peer.clone());
+        number
+    }
+
+    /// Closes those over which somebody with that account has called; tells how many.
+    pub(super) fn cut(&self, account: u64) -> usize {
+        let open = lock(&self.0);
+        let theirs = open.1.values().filter(|peer| lock(&peer.callers).contains(&account));
+        theirs.map(|peer| peer.cut.cancel()).count()
+    }
 }
 
 /// A connection that was let in, before its handshake.
@@ -193,11 +230,19 @@ struct Entry {
     /// For the handshake and the greeting together.
     deadline: Pin<Box<Sleep>>,
     traffic: Arc<Traffic>,
+    register: Arc<Register>,
     seat: Seat,
 }
 
 impl Entry {
-    fn new(address: SocketAddr, seat: Seat, window: Taken, limits: &Limits, traffic: &Arc<Traffic>) -> Self {
+    fn new(
+        address: SocketAddr,
+        seat: Seat,
+        window: Taken,
+        limits: &Limits,
+        traffic: &Arc<Traffic>,
+        register: &Arc<Register>,
+    ) -> Self {
         let per_minute = limits.sessions_per_minute;
         Entry {
             address,
@@ -206,19 +251,33 @@ impl Entry {
             creations: Turnstile::new(per_minute / 60.0, per_minute, "sessions made over this connection"),
             deadline: Box::pin(tokio::time::sleep(Duration::from_secs_f64(limits.handshake_s))),
             traffic: traffic.clone(),
+            register: register.clone(),
             seat,
         }
     }
 
     fn connection(self, transport: Transport, certificate: Option<Arc<[String]>>) -> Connection {
-        let Entry { address, window, calls, creations, deadline, traffic, seat } = self;
+        let Entry { address, window, calls, creations, deadline, traffic, register, seat } = self;
         debug!(%address, "connected");
+        let cut = CancellationToken::new();
+        let peer = Peer {
+            address,
+            certificate,
+            calls: Arc::new(calls),
+            creations: Arc::new(creations),
+            leases: Arc::default(),
+            cut: cut.clone(),
+            callers: Arc::default(),
+        };
         Connection {
             transport,
-            peer: Peer { address, certificate, calls: Arc::new(calls), creations: Arc::new(creations) },
             greeting: Some((GREETING_BYTES, deadline)),
             _open: traffic.open(),
             traffic,
+            is_cut: Box::pin(cut.cancelled_owned()),
+            number: register.enter(&peer),
+            register,
+            peer,
             unyielded: 0,
             _seat: seat,
             _window: window,
@@ -238,11 +297,21 @@ pub(super) struct Connection {
     /// Until so many bytes have come, it has so long.
     greeting: Option<(usize, Pin<Box<Sleep>>)>,
     traffic: Arc<Traffic>,
+    is_cut: Pin<Box<WaitForCancellationFutureOwned>>,
+    register: Arc<Register>,
+    number: u64,
     /// Bytes since others had their turn.
     unyielded: usize,
     _open: Open,
     _seat: Seat,
     _window: Taken,
+}
+
+impl Drop for Connection {
+    fn drop(&mut self) {
+        lock(&self.register.0).1.remove(&self.number);
+        self.peer.leases.end();
+    }
 }
 
 impl Connection {
@@ -265,6 +334,9 @@ impl Connected for Connection {
 impl AsyncRead for Connection {
     fn poll_read(self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
         let this = self.get_mut();
+        if this.is_cut.as_mut().poll(cx).is_ready() {
+            return Poll::Ready(Err(io::ErrorKind::ConnectionAborted.into()));
+        }
         if this.unyielded >= BYTES_A_TURN {
             this.unyielded = 0;
             cx.waker().wake_by_ref();

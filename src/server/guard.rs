@@ -14,6 +14,7 @@ use tracing::{Instrument, info, info_span};
 use super::connections::Peer;
 use super::identity::{Access, Caller, Credentials, access};
 use super::metrics::Traffic;
+use super::price::Price;
 use super::reload::Reloaded;
 use super::revocation::{Revocable, Shown};
 use super::visitor::Visitor;
@@ -105,6 +106,7 @@ impl<S> Service<Request<Body>> for Guard<S>
 where
     S: Service<Request<Body>, Response = Response<Body>>,
     S::Future: Send + 'static,
+    S::Error: Send + 'static,
 {
     type Response = Response<Body>;
     type Error = S::Error;
@@ -120,15 +122,36 @@ where
                 let asked = shown.is_some() && !self.layer.credentials.get().is_open();
                 let peer = request.extensions().get::<Peer>();
                 let name = Visitor::account_name(asked.then_some(&*caller.name), peer);
-                let visitor = Visitor::new(self.layer.budget.account(&name), &request);
+                let account = self.layer.budget.account(&name);
+                if let Some(peer) = peer {
+                    peer.used_by(account.number());
+                }
+                let price = Price::of(request.uri().path(), &account);
+                let visitor = Visitor::new(account, &request);
                 request.extensions_mut().insert(visitor);
                 // In every line of the log that the call writes.
                 let span = info_span!("call", path = request.uri().path(), client = &*caller.name);
                 let answer = self.inner.call(request).instrument(span);
                 // Who need not show anything is not asked again.
                 let credentials = self.layer.credentials.clone();
-                let Some(shown) = shown.filter(|_| !credentials.get().is_open()) else { return Box::pin(answer) };
-                Box::pin(async move { Ok(answer.await?.map(|body| Revocable::body(body, shown, credentials))) })
+                let traffic = self.layer.traffic.clone();
+                let shown = shown.filter(|_| !credentials.get().is_open());
+                Box::pin(async move {
+                    let answer = match price {
+                        None => answer.await?,
+                        Some(price) => match price.answer(answer).await {
+                            Ok(answer) => answer?.map(|body| price.body(body)),
+                            Err(refusal) => {
+                                traffic.refused(refusal.reason);
+                                return Ok(Status::from(refusal).into_http());
+                            }
+                        },
+                    };
+                    Ok(match shown {
+                        Some(shown) => answer.map(|body| Revocable::body(body, shown, credentials)),
+                        None => answer,
+                    })
+                })
             }
             Err((refusal, wait)) => {
                 let address = request.extensions().get::<Peer>().map(|peer| peer.address);

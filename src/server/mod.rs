@@ -1,14 +1,18 @@
 //! The server: gRPC services over `pace`, for browsers too (gRPC-web), their page, health, reflection, and a shutdown
 //! with a deadline.
 
+mod admin;
 pub mod catalog;
 pub mod config;
 mod connections;
+mod cut;
 mod guard;
 mod haptics;
 pub mod identity;
+mod leases;
 mod metrics;
 mod page;
+mod price;
 mod protection;
 mod rate;
 mod reload;
@@ -41,6 +45,7 @@ use config::Config;
 use guard::GuardLayer;
 use http::{HeaderName, HeaderValue, Method, header};
 use metrics::Traffic;
+use pb::admin_service_server::AdminServiceServer;
 use pb::haptic_service_server::HapticServiceServer;
 use pb::session_service_server::SessionServiceServer;
 use pb::view_service_server::ViewServiceServer;
@@ -229,12 +234,16 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
         }
     };
 
-    let incoming = connections::incoming(listener, protection.tls.clone(), &limits, budget.clone(), traffic);
+    let register = Arc::new(connections::Register::default());
+    let incoming =
+        connections::incoming(listener, protection.tls.clone(), &limits, budget.clone(), traffic, register.clone());
     let silence = Some(Duration::from_secs_f64(limits.keepalive_s));
     let bytes = limits.message_bytes;
     let (folder, painter) = (Arc::new(house.config.viewer.clone()), house.clone());
     let sessions = SessionServiceServer::new(sessions::Sessions(house.clone())).max_decoding_message_size(bytes);
     let haptics = HapticServiceServer::new(haptics::Haptics(house.clone())).max_decoding_message_size(bytes);
+    let admin =
+        AdminServiceServer::new(admin::Admin { house: house.clone(), register }).max_decoding_message_size(bytes);
     let views = ViewServiceServer::new(views::Views(house)).max_decoding_message_size(bytes);
     let routes = Routes::new(health_service)
         .add_service(reflection().build_v1()?)
@@ -242,6 +251,7 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
         .add_service(sessions)
         .add_service(haptics)
         .add_service(views)
+        .add_service(admin)
         .into_axum_router()
         // Of the services alone: it refuses what is no gRPC.
         .route_layer(GrpcWebLayer::new())

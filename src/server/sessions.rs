@@ -9,7 +9,9 @@ use tracing::{info, warn};
 
 use super::House;
 use super::connections::Peer;
+use super::cut::until_cut;
 use super::visitor::Visitor;
+use crate::pace::Held;
 use crate::refusal::{Reason, Refusal, number};
 use crate::scene::script::Script;
 use crate::wire::pb::session_service_server::SessionService;
@@ -51,7 +53,8 @@ impl SessionService for Sessions {
         number("idle_timeout_s", idle_timeout_s, &range, |value| value > 0.0 && value <= most_s)?;
         // A large sheet takes a while to lay out.
         let pacer = self.0.pacer.clone();
-        let live = self.0.workshop.work(move || pacer.create(&scene, request.paused, idle_timeout_s, &account)).await??;
+        let live =
+            self.0.workshop.work(move || pacer.create(&scene, request.paused, idle_timeout_s, &account)).await??;
         info!(session = %live.id, scene = %live.model.scene.name, points = live.model.len(), "session created");
         for warning in &live.model.warnings {
             warn!(session = %live.id, warning);
@@ -149,9 +152,11 @@ impl SessionService for Sessions {
         &self,
         request: Request<pb::GetScriptRequest>,
     ) -> Result<Response<Self::GetScriptStream>, Status> {
+        let Visitor { account, .. } = Visitor::of(request.extensions());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
-        let guard = live.open_stream()?;
+        let guard = live.open_stream("GetScript", Held::Nothing, &account)?;
+        let cut = guard.cut().clone();
         let (catalog, config) = (self.0.catalog.clone(), self.0.config.clone());
         // A script may have traces of megabytes.
         let read = move || catalog.script(&request.script_name, &live.model.scene, &config.limits);
@@ -161,7 +166,7 @@ impl SessionService for Sessions {
             let (message, next) = script_part(&script, from);
             Some((Ok(message), next.map(|next| (script, next, guard))))
         });
-        Ok(Response::new(Box::pin(out)))
+        Ok(Response::new(until_cut(out, cut)))
     }
 }
 

@@ -70,7 +70,8 @@ impl House {
         if kept.len() == MOST_KEPT {
             kept.remove(0);
         }
-        let mut taken = account.take(Resource::Memory(Purpose::Textures), side * side * BYTES_PER_PIXEL, "texture_size")?;
+        let mut taken =
+            account.take(Resource::Memory(Purpose::Textures), side * side * BYTES_PER_PIXEL, "texture_size")?;
         let texture = texture(&appearance, limits)?;
         taken.shrink_to(texture.png.len() as u64);
         kept.push((appearance, texture.clone(), taken));

@@ -58,6 +58,8 @@ struct Lease {
     waiting: usize,
     /// Where the tool's newest command waits.
     last_place: Option<Place>,
+    /// Counts it among those of who holds it.
+    seat: Option<Taken>,
 }
 
 /// Place in the queue: step, then order of arrival.
@@ -189,6 +191,7 @@ impl Intake {
                 last_sequence: None,
                 waiting: 0,
                 last_place: None,
+                seat: None,
             };
             self.leases.insert(*tool, lease);
         }
@@ -384,7 +387,8 @@ impl Intake {
             return Err(Refusal::new(Reason::QueueFull, "", message));
         }
         let account = self.account.as_ref();
-        let taken = account.map(|account| account.take(Resource::Memory(Purpose::Change), model.bytes(), "")).transpose()?;
+        let taken =
+            account.map(|account| account.take(Resource::Memory(Purpose::Change), model.bytes(), "")).transpose()?;
         if replaces {
             self.changes.pop_back();
         }
@@ -475,6 +479,31 @@ impl Intake {
         self.waiting = 0;
         self.changes.clear();
         self.taken = None;
+    }
+
+    /// After that: as it was in the beginning, with the same tissue, and no tool held.
+    pub fn reopen(&mut self) {
+        self.closed = None;
+        self.leases.clear();
+    }
+
+    /// Ends the leases of the tools for which `chosen` holds, by number and by who pays for them; tells how many.
+    pub fn free(&mut self, chosen: impl Fn(u32, Option<&Account>) -> bool) -> usize {
+        let payer = |lease: &Lease| lease.seat.as_ref().map(Taken::account).cloned();
+        let tools: Vec<u32> = self
+            .leases
+            .iter()
+            .filter(|(tool, lease)| chosen(**tool, payer(lease).as_ref()))
+            .map(|lease| *lease.0)
+            .collect();
+        tools.iter().for_each(|tool| self.end(*tool));
+        tools.len()
+    }
+
+    /// The tools of a lease are charged to who took them, one of `seats` each.
+    pub fn seat(&mut self, id: LeaseId, seats: Vec<Taken>) {
+        let leases = self.leases.values_mut().filter(|lease| lease.id == id);
+        leases.zip(seats).for_each(|(lease, seat)| lease.seat = Some(seat));
     }
 
     fn check_open(&self) -> Result<()> {
