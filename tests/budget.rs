@@ -189,8 +189,10 @@ async fn a_lease_ends_with_its_connection_unless_asked_otherwise() {
     assert_eq!(server.status(&session).await.held_tools[0].tool, 1);
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread")]
 async fn who_administers_frees_tools_and_cuts_streams_and_callers() {
+    // Built before anything is held: a connection that does not answer meanwhile is closed.
+    tokio::task::spawn_blocking(server::client_program).await.unwrap();
     let server = Server::start(&["--log", "error"]);
     let session = server.paper(false).await;
     let admin = |arguments: &[&str]| {

@@ -13,6 +13,7 @@ use super::queue::lock;
 use super::tally::Tally;
 use super::taps::{HashReply, ProbeTap, SampleTap};
 use super::thread::Running;
+use crate::budget::Account;
 use crate::refusal::{Refusal, Result};
 use crate::sheet::audit::{Inputs, Mark};
 
@@ -38,6 +39,8 @@ pub(super) enum Request {
     Audit(Inputs, SyncSender<Mark>),
     Hash {
         at: Option<u64>,
+        /// Who pays for it.
+        account: Account,
         reply: HashReply,
     },
     Delete(Refusal),

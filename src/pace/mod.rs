@@ -258,8 +258,10 @@ impl Live {
     }
 
     /// Waits until `at` steps are done (now, if `None`), and tells the step and the state's hash there.
-    pub async fn hash_at(&self, at: Option<u64>) -> Result<(u64, u128)> {
-        self.ask(|reply| Request::Hash { at, reply }).await
+    /// `account` is charged for it.
+    pub async fn hash_at(&self, at: Option<u64>, account: &Account) -> Result<(u64, u128)> {
+        let account = account.clone();
+        self.ask(|reply| Request::Hash { at, account, reply }).await
     }
 
     /// The samples that are asked for.

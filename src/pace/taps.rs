@@ -89,7 +89,7 @@ pub(super) struct Taps {
     pub(super) samples: Vec<SampleTap>,
     pub(super) probes: Vec<ProbeTap>,
     pub(super) viewers: Vec<ViewTap>,
-    pub(super) hashes: Vec<(u64, HashReply)>,
+    pub(super) hashes: Vec<(u64, Account, HashReply)>,
 }
 
 impl Taps {
@@ -131,7 +131,7 @@ impl Taps {
         self.samples.retain(|tap| !tap.writer.is_abandoned());
         self.probes.retain(|tap| !tap.writer.is_abandoned());
         self.viewers.retain(|tap| !tap.viewer.is_gone());
-        self.hashes.retain(|waiting| !waiting.1.is_closed());
+        self.hashes.retain(|waiting| !waiting.2.is_closed());
     }
 
     /// Of a session at rest that has done `step` steps: the step to do next, that somebody may be told of its end;

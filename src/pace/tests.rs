@@ -13,7 +13,7 @@ async fn a_fault_in_one_session_ends_that_one_alone() {
         faulty.samples(Sampling { every: 1, only: None, deadband: None, heartbeat_s: 0.01, law, touch_stiffness });
     samples.pop().await.unwrap();
     faulty.inbox.send(faulty.number, Request::Panic);
-    let told = faulty.hash_at(Some(1_000_000)).await.unwrap_err();
+    let told = faulty.hash_at(Some(1_000_000), &Account::alone()).await.unwrap_err();
     assert_eq!((told.reason, faulty.status().state), (Reason::SessionHeld, State::Held));
     assert!(told.message.contains("a test"), "{told}");
     let ended = loop {
@@ -26,6 +26,6 @@ async fn a_fault_in_one_session_ends_that_one_alone() {
     assert_eq!(refused.unwrap_err().reason, Reason::SessionHeld);
     // On the same thread.
     let step = sound.status().step;
-    assert_eq!(sound.hash_at(Some(step + 20)).await.unwrap().0, step + 20);
+    assert_eq!(sound.hash_at(Some(step + 20), &Account::alone()).await.unwrap().0, step + 20);
     pacer.stop();
 }

@@ -328,12 +328,12 @@ impl Running {
                 self.post(desk.encoder, vec![(viewer.clone(), frame_id)]);
                 self.taps.viewers.push(ViewTap { viewer, shown: step, passed: frame_id });
             }
-            Request::Hash { at, reply } => {
+            Request::Hash { at, account, reply } => {
                 let at = at.unwrap_or(step);
                 if at > step && self.session.hold_reason().is_none() {
-                    self.taps.hashes.push((at, reply));
+                    self.taps.hashes.push((at, account, reply));
                 } else {
-                    let _ = reply.send(if at == step { Ok((step, self.hash())) } else { Err(self.passed(at)) });
+                    let _ = reply.send(if at == step { self.hash_for(&account) } else { Err(self.passed(at)) });
                 }
             }
             Request::Delete(why) => {
@@ -346,15 +346,6 @@ impl Running {
         }
         self.plan();
         self.publish_status();
-    }
-
-    /// The state's hash, computed once a step.
-    fn hash(&mut self) -> u128 {
-        let step = self.session.step_count();
-        let hash = self.hashed.filter(|hashed| hashed.0 == step).map(|hashed| hashed.1);
-        let hash = hash.unwrap_or_else(|| self.session.tissue().state_hash());
-        self.hashed = Some((step, hash));
-        hash
     }
 
     /// Time stands from now on. Who reads samples gets the present one.
@@ -389,22 +380,6 @@ impl Running {
             self.schedule.delay(1.0);
             self.dilation = Dilation::new(now, step);
         }
-        Ok(step)
-    }
-
-    /// The same tissue at rest, at the same step; time stands.
-    fn revive(&mut self) -> Result<u64> {
-        if self.session.hold_reason().is_none() {
-            return Err(Refusal::new(Reason::OutOfTurn, "session_id", "is a session that is not held"));
-        }
-        let step = self.session.step_count();
-        let mut session = Session::new(self.session.model());
-        session.skip_to(step);
-        (self.session, self.hashed, self.audit) = (session, None, None);
-        (self.running, self.until, self.still_since) = (false, None, Some(step));
-        lock(&self.live.intake).reopen();
-        lock(&self.live.status).forget_hold();
-        tracing::info!(session = %self.live.id, step, "session revived");
         Ok(step)
     }
 
@@ -451,7 +426,7 @@ impl Running {
             self.running = false;
             lock(&self.live.intake).close(Refusal::new(Reason::SessionHeld, "", reason));
             self.publish_status();
-            for (at, reply) in std::mem::take(&mut self.taps.hashes) {
+            for (at, _, reply) in std::mem::take(&mut self.taps.hashes) {
                 let _ = reply.send(Err(self.passed(at)));
             }
             // No further record will come.
@@ -529,8 +504,8 @@ impl Running {
         if !viewers.is_empty() {
             self.post(desk.encoder, viewers);
         }
-        for (at, reply) in self.taps.hashes.extract_if(.., |waiting| waiting.0 == step).collect::<Vec<_>>() {
-            let _ = reply.send(Ok((at, self.hash())));
+        for (_, account, reply) in self.taps.hashes.extract_if(.., |waiting| waiting.0 == step).collect::<Vec<_>>() {
+            let _ = reply.send(self.hash_for(&account));
         }
     }
 
@@ -589,11 +564,12 @@ impl Running {
         taps.samples.iter().for_each(|tap| tap.writer.close(why.clone()));
         taps.probes.iter().for_each(|tap| tap.writer.close(why.clone()));
         taps.viewers.iter().for_each(|tap| tap.viewer.close(why.clone()));
-        for (_, reply) in taps.hashes {
+        for (_, _, reply) in taps.hashes {
             let _ = reply.send(Err(why.clone()));
         }
     }
 }
 
+mod care;
 #[cfg(test)]
 mod tests;

@@ -7,7 +7,7 @@ use tracing::info;
 
 use super::House;
 use super::connections::Register;
-use crate::budget::{Purpose, Resource, Work};
+use crate::budget::{Account, Purpose, Resource, Work};
 use crate::pace::clock::now_ns;
 use crate::pace::{Held, excerpt};
 use crate::refusal::{Reason, Refusal};
@@ -27,7 +27,7 @@ impl AdminService for Admin {
         _: Request<pb::ListCallersRequest>,
     ) -> Result<Response<pb::ListCallersResponse>, Status> {
         let now = now_ns();
-        let use_of = |account: &crate::budget::Account| pb::CallerUse {
+        let use_of = |account: &Account| pb::CallerUse {
             caller: account.name().to_owned(),
             memory_bytes: account.has(Resource::Memory(Purpose::Session)),
             sessions: account.has(Resource::Sessions),
@@ -91,8 +91,8 @@ impl AdminService for Admin {
         let mut answer = pb::CutCallerResponse::default();
         for live in pacer.list() {
             answer.streams += live.cut_streams(|_, other| other.number() == account.number()) as u32;
-            let theirs = |payer: Option<&crate::budget::Account>| payer.map(|payer| payer.number());
-            let freed = live.at_intake(|intake, _| intake.free(|_, payer| theirs(payer) == Some(account.number())));
+            let theirs = |payer: Option<&Account>| payer.is_some_and(|payer| payer.number() == account.number());
+            let freed = live.at_intake(|intake, _| intake.free(|_, payer| theirs(payer)));
             answer.tools += freed as u32;
             if delete_sessions && live.owner.number() == account.number() && pacer.delete(&live.id).is_ok() {
                 answer.sessions += 1;

@@ -2,6 +2,7 @@
 
 use std::pin::Pin;
 use std::sync::Arc;
+use std::time::Duration;
 
 use futures_util::stream::{self, Stream};
 use tonic::{Request, Response, Status};
@@ -11,7 +12,9 @@ use super::House;
 use super::connections::Peer;
 use super::cut::until_cut;
 use super::visitor::Visitor;
+use crate::budget::Work;
 use crate::pace::Held;
+use crate::pace::clock::now_ns;
 use crate::refusal::{Reason, Refusal, number};
 use crate::scene::script::Script;
 use crate::wire::pb::session_service_server::SessionService;
@@ -135,9 +138,15 @@ impl SessionService for Sessions {
         &self,
         request: Request<pb::GetStateHashRequest>,
     ) -> Result<Response<pb::GetStateHashResponse>, Status> {
+        let Visitor { account, .. } = Visitor::of(request.extensions());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
-        let (step, hash) = live.hash_at(request.at_step).await?;
+        // A hash that is asked for now waits for its caller's part; one of a step to come must be taken there.
+        let wait_ns = account.must_wait_ns(Work::Reading, now_ns());
+        if request.at_step.is_none() && wait_ns > 0 {
+            tokio::time::sleep(Duration::from_nanos(wait_ns)).await;
+        }
+        let (step, hash) = live.hash_at(request.at_step, &account).await?;
         Ok(Response::new(pb::GetStateHashResponse { step, state_hash: format!("{hash:032x}") }))
     }
 
