@@ -4,7 +4,8 @@ use std::error::Error;
 use std::path::PathBuf;
 
 fn main() -> Result<(), Box<dyn Error>> {
-    const FILES: [&str; 3] = ["palpate/v1/session.proto", "palpate/v1/haptic.proto", "palpate/v1/view.proto"];
+    const FILES: [&str; 4] =
+        ["palpate/v1/session.proto", "palpate/v1/haptic.proto", "palpate/v1/view.proto", "palpate/v1/admin.proto"];
     println!("cargo::rerun-if-changed=proto");
     let descriptors = protox::compile(FILES, ["proto"])?;
     let out = PathBuf::from(std::env::var("OUT_DIR")?);

@@ -1,5 +1,6 @@
 //! Palpate: a server for touching soft tissue over a network. ARCHITECTURE.md is the map.
 
+pub mod budget;
 pub mod haptics;
 pub mod limits;
 pub mod pace;

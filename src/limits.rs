@@ -29,6 +29,11 @@ pub struct Limits {
     pub queued_records: usize,
     /// Bytes that wait for one reader, of records or of frames; at least one record or frame may.
     pub queued_bytes: usize,
+    /// Bytes that the server may take in all for what its callers ask for; half of what the machine or its control group
+    /// has, if 0.
+    pub memory_bytes: u64,
+    /// Other tissues of a session that wait for their step.
+    pub queued_changes: usize,
     /// Sessions of a server.
     pub sessions: usize,
     /// Mass points of all sessions of a server.
@@ -42,6 +47,12 @@ pub struct Limits {
     pub rehearsal_work: u64,
     /// Streams that read one session.
     pub streams_per_session: usize,
+    /// Of those, kept for streams that hold a tool.
+    pub streams_for_holders: usize,
+    /// Streams of a server.
+    pub streams: usize,
+    /// Tools that are held, of all sessions of a server.
+    pub leases: usize,
     /// Step rate of a session, Hz.
     pub session_rate_hz: f64,
     /// Vertices of a refined frame.
@@ -100,12 +111,17 @@ impl Default for Limits {
             queued_samples: 64,
             queued_records: 64,
             queued_bytes: 64 << 20,
+            memory_bytes: 0,
+            queued_changes: 16,
             sessions: 1024,
             points_in_all: 1 << 24,
             point_substeps_per_step: 1 << 26,
             periods_per_step: 1.0,
             rehearsal_work: 1 << 27,
             streams_per_session: 256,
+            streams_for_holders: 32,
+            streams: 16_384,
+            leases: 16_384,
             session_rate_hz: 20_000.0,
             frame_vertices: 1 << 22,
             texture_side: 4096,

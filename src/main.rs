@@ -6,6 +6,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 
 use clap::{Parser, Subcommand};
+use palpate::budget;
 use palpate::limits::Limits;
 use palpate::pace::clock::now_ns;
 use palpate::refusal::Refusal;
@@ -97,6 +98,13 @@ enum Command {
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         arguments: Vec<std::ffi::OsString>,
     },
+    /// Show who has what of a server, and take it from them (`palpate-client admin`)
+    #[command(disable_help_flag = true, disable_help_subcommand = true)]
+    Admin {
+        /// As `palpate-client admin --help` tells
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        arguments: Vec<std::ffi::OsString>,
+    },
 }
 
 #[derive(clap::Args)]
@@ -159,6 +167,10 @@ struct ServeArguments {
     /// How long streams may take to end at shutdown before they are cut, s [default: 5]
     #[arg(long, value_name = "SECONDS")]
     shutdown_deadline_s: Option<f64>,
+    /// Bytes that the server may take in all for what its callers ask for, as in 512MiB or 2GiB [default: half of the
+    /// machine's, or of its control group's]
+    #[arg(long, value_name = "BYTES", value_parser = budget::parse_bytes)]
+    memory: Option<u64>,
     /// What is logged to standard error: error, warn, info, debug, or palpate=debug,tonic=warn, … [default: info]
     #[arg(long, value_name = "FILTER")]
     log: Option<String>,
@@ -274,7 +286,8 @@ fn main() -> ExitCode {
         Command::Texture(arguments) => make_texture(&arguments),
         Command::Serve(arguments) => serve(&arguments),
         Command::Token(arguments) => token(&arguments),
-        Command::Top { arguments } => return top(&arguments),
+        Command::Top { arguments } => return client("top", &arguments),
+        Command::Admin { arguments } => return client("admin", &arguments),
     };
     let (status, message) = match ended {
         Ok(()) => return ExitCode::SUCCESS,
@@ -330,6 +343,9 @@ fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     if let Some(deadline_s) = arguments.shutdown_deadline_s {
         config.shutdown_deadline_s = deadline_s;
     }
+    if let Some(bytes) = arguments.memory {
+        config.limits.memory_bytes = bytes;
+    }
     if let Some(log) = &arguments.log {
         config.log.clone_from(log);
     }
@@ -373,9 +389,9 @@ fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
 }
 
 /// Runs the client's program, which lies beside this one.
-fn top(arguments: &[std::ffi::OsString]) -> ExitCode {
+fn client(command: &str, arguments: &[std::ffi::OsString]) -> ExitCode {
     let program = std::env::current_exe().unwrap_or_default().with_file_name("palpate-client");
-    match std::process::Command::new(&program).arg("top").args(arguments).status() {
+    match std::process::Command::new(&program).arg(command).args(arguments).status() {
         Ok(status) => status.code().and_then(|code| u8::try_from(code).ok()).map_or(ExitCode::FAILURE, ExitCode::from),
         Err(e) => {
             say!("palpate: {}: {e}", program.display());

@@ -74,6 +74,8 @@ reasons! {
     Overloaded = "OVERLOADED",
     /// Commands or calls come faster than the configuration allows.
     RateLimited = "RATE_LIMITED",
+    /// Whoever administers the server has ended it.
+    Cut = "CUT",
     /// What was waited for did not come in time.
     TimedOut = "TIMED_OUT",
     /// The first message of a stream must open it, and only the first.

@@ -147,8 +147,13 @@ async fn a_lease_is_of_no_use_to_whom_it_was_not_given() {
     let create = pb::CreateSessionRequest { source, paused: true, idle_timeout_s: None };
     let session = sessions.create_session(with_token(create, &owner)).await.unwrap().into_inner().session.unwrap();
     let id = session.session_id;
-    let acquire =
-        pb::AcquireToolRequest { session_id: id.clone(), tool: 0, lease_s: Some(60.0), holder: "owner".into() };
+    let acquire = pb::AcquireToolRequest {
+        session_id: id.clone(),
+        tool: 0,
+        lease_s: Some(60.0),
+        holder: "owner".into(),
+        ..Default::default()
+    };
     let lease_id = haptics.acquire_tool(with_token(acquire.clone(), &owner)).await.unwrap().into_inner().lease_id;
     // All that can be seen of the session, without the id of the lease.
     let seen = pb::GetSessionRequest { session_id: id.clone() };

@@ -95,6 +95,7 @@ pub async fn kept_leases(ground: &Ground) -> Result<(), Status> {
             tool,
             lease_s: Some(600.0),
             holder: "kept".into(),
+            outlives_connection: true,
         };
         ground.heard(haptics(&door).acquire_tool(request).await).inspect(|_| ground.strike());
     }

@@ -23,8 +23,13 @@ pub fn fixed(points: u32) -> pb::Scene {
 
 /// A lease of one tool.
 pub async fn lease(door: &Door, session_id: &str, tool: u32) -> Result<String, Status> {
-    let request =
-        pb::AcquireToolRequest { session_id: session_id.to_owned(), tool, lease_s: Some(60.0), holder: "siege".into() };
+    let request = pb::AcquireToolRequest {
+        session_id: session_id.to_owned(),
+        tool,
+        lease_s: Some(60.0),
+        holder: "siege".into(),
+        outlives_connection: false,
+    };
     Ok(haptics(door).acquire_tool(request).await?.into_inner().lease_id)
 }
 

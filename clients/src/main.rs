@@ -20,6 +20,7 @@ macro_rules! tell {
 }
 pub(crate) use {say, tell};
 
+mod admin;
 mod bridge;
 mod connect;
 mod health;
@@ -97,6 +98,16 @@ enum Command {
         Of a server that knows its clients the token needs the role `administer`.\n\n\
         Exit status: 0; 1 when the server can't be reached or does not tell; 2 when an input was refused.")]
     Top(top::Arguments),
+    /// Show who has what of a server, and take it from them: free a tool, cut a stream or a caller, revive or delete a session
+    #[command(after_help = "Examples:\n  \
+        palpate admin callers\n  \
+        palpate admin streams 0123456789abcdef0123456789abcdef\n  \
+        palpate admin cut-caller token:ann --delete-sessions --server https://server:7117 --token-file admin.token\n\n\
+        Of a server that knows its clients the token needs the role `administer`. A caller is known by the name of its token\n\
+        or certificate, and where nobody is asked by its address. Who is cut may come back: take its entry from the file\n\
+        of tokens first.\n\n\
+        Exit status: 0; 1 when the server can't be reached or refuses; 2 when an input was refused.")]
+    Admin(admin::Arguments),
 }
 
 /// How a program ends that does not end well.
@@ -119,6 +130,7 @@ async fn main() -> ExitCode {
         Command::Load(arguments) => load::load(&arguments).await,
         Command::Health(arguments) => health::health(&arguments).await,
         Command::Top(arguments) => top::top(&arguments).await,
+        Command::Admin(arguments) => admin::admin(&arguments).await,
     };
     let (status, message) = match ended {
         Ok(()) | Err(Failure::Unread) => return ExitCode::SUCCESS,

@@ -14,7 +14,7 @@ pub fn now_ns() -> u64 {
 
 /// Processor time of the calling thread, ns. Where the system does not tell it, the time that passes.
 #[allow(clippy::cast_sign_loss)]
-pub(super) fn thread_time_ns() -> u64 {
+pub(crate) fn thread_time_ns() -> u64 {
     #[cfg(target_os = "linux")]
     {
         let time = rustix::time::clock_gettime(rustix::time::ClockId::ThreadCPUTime);

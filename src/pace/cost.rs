@@ -40,7 +40,7 @@ fn set(bits: &AtomicU64, value: f64) {
 impl Cost {
     /// Of a session that has not begun: by what others take for their points, of `known`.
     pub(super) fn guess<'c>(model: &Model, known: impl Iterator<Item = &'c Cost>) -> Self {
-        let point_substeps = model.len() as f64 * f64::from(model.plan.substeps);
+        let point_substeps = model.swept_points() as f64 * f64::from(model.plan.substeps);
         let (taken_ns, worked) = known.filter(|cost| cost.share() > 0.0).fold((0.0, 0.0), |(ns, work), cost| {
             (ns + get(&cost.step_ns), work + cost.point_substeps + GUESS_STEP_NS / GUESS_NS)
         });
@@ -75,7 +75,7 @@ impl Cost {
 
 /// Refuses steps that would keep the server from all others.
 pub(super) fn check_work(model: &Model, limits: &Limits) -> Result<()> {
-    let (points, substeps, most) = (model.len(), model.plan.substeps, limits.point_substeps_per_step);
+    let (points, substeps, most) = (model.swept_points(), model.plan.substeps, limits.point_substeps_per_step);
     if points as u64 * u64::from(substeps) > most {
         let message =
             format!("a step would compute {points} points {substeps} times, above the limit of {most} in all");

@@ -3,8 +3,11 @@
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
+use std::time::Duration;
 
 use super::queue::{Reader, Writer, lock, queue};
+use crate::budget::{Account, Purpose, Resource, Taken};
+use crate::refusal::Result;
 use crate::surface::{Encoding, Frame, Refinement, Snapshot, Tiles, encode, encode_over};
 
 /// One who looks at a session.
@@ -24,6 +27,8 @@ pub struct Viewer {
     /// Frames sent and not yet acknowledged, if acknowledgements are asked for.
     credit: Option<Mutex<Credit>>,
     writer: Writer<Delivery>,
+    /// The memory of what it is shown.
+    _taken: Taken,
 }
 
 /// How far a viewer has come.
@@ -59,7 +64,8 @@ pub struct Delivery {
 }
 
 impl Viewer {
-    /// A viewer, and where it reads its frames.
+    /// A viewer, and where it reads its frames. Their memory is charged to `account`.
+    #[allow(clippy::too_many_arguments)]
     pub fn new(
         id: String,
         refinement: Refinement,
@@ -68,15 +74,21 @@ impl Viewer {
         always_full: bool,
         max_in_flight: Option<u32>,
         queued_bytes: usize,
-    ) -> (Arc<Self>, Reader<Delivery>) {
+        account: &Account,
+    ) -> Result<(Arc<Self>, Reader<Delivery>)> {
         let frame_bytes = refinement.vertices().iter().product::<usize>() * encoding.bytes_per_vertex();
         let room = (queued_bytes / frame_bytes).max(1);
         let most = max_in_flight.map(|most| (most as usize).min(room));
+        // What waits, what is being sent, and what the tiles keep: the frame last written, and the points of three moments.
+        let points = refinement.points.iter().product::<usize>();
+        let bytes = (most.unwrap_or(1) + 2) * frame_bytes + 3 * points * size_of::<[f32; 3]>();
+        let _taken = account.take(Resource::Memory(Purpose::Frames), bytes as u64, "refinement")?;
         // Without credit only the newest frame waits.
         let (writer, reader) = queue(most.unwrap_or(1));
         let credit = most.map(|most| Mutex::new(Credit { most, in_flight: VecDeque::with_capacity(most) }));
         let progress = Mutex::default();
-        (Arc::new(Viewer { id, refinement, encoding, rate_hz, always_full, progress, credit, writer }), reader)
+        let viewer = Viewer { id, refinement, encoding, rate_hz, always_full, progress, credit, writer, _taken };
+        Ok((Arc::new(viewer), reader))
     }
 
     /// The number of the frame that belongs to step `step` of a session that steps at `rate_hz`.
@@ -168,6 +180,9 @@ struct Board {
     stop: bool,
 }
 
+/// When nothing was encoded for so long, what viewers left behind that have gone is given back, and buffers.
+const IDLE: Duration = Duration::from_millis(500);
+
 /// The thread that encodes.
 #[derive(Debug, Default)]
 pub struct Encoder {
@@ -210,7 +225,19 @@ impl Encoder {
                 if let Some(next) = board.jobs.pop_front() {
                     break next;
                 }
-                board = self.posted.wait(board).unwrap_or_else(PoisonError::into_inner);
+                if spent.0.is_empty() && watched.0.is_empty() {
+                    board = self.posted.wait(board).unwrap_or_else(PoisonError::into_inner);
+                    continue;
+                }
+                let waited = self.posted.wait_timeout(board, IDLE);
+                let (again, idle) = waited.unwrap_or_else(PoisonError::into_inner);
+                board = again;
+                if idle.timed_out() && board.jobs.is_empty() {
+                    drop(board);
+                    spent.0.clear();
+                    watched.forget_the_gone();
+                    board = lock(&self.board);
+                }
             };
             drop(board);
             serve(number, &job, &mut spent, &mut watched);
@@ -317,7 +344,7 @@ mod tests {
 
     fn viewer(n: u32, encoding: Encoding, credit: Option<u32>) -> (Arc<Viewer>, Reader<Delivery>) {
         let grid = Refinement::new([3, 3], n, &Limits::default()).unwrap();
-        Viewer::new("viewer".into(), grid, encoding, 60.0, true, credit, 1 << 20)
+        Viewer::new("viewer".into(), grid, encoding, 60.0, true, credit, 1 << 20, &Account::alone()).unwrap()
     }
 
     #[tokio::test]
@@ -334,7 +361,9 @@ mod tests {
     #[tokio::test]
     async fn who_wants_changes_gets_all_of_them_however_it_reads() {
         let grid = Refinement::new([3, 3], 0, &Limits::default()).unwrap();
-        let changes = |credit| Viewer::new("viewer".into(), grid, Encoding::F32, 60.0, false, credit, 1 << 20);
+        let account = Account::alone();
+        let changes =
+            |credit| Viewer::new("viewer".into(), grid, Encoding::F32, 60.0, false, credit, 1 << 20, &account).unwrap();
         let ((slow, mut read_slow), (thrifty, mut read_thrifty)) = (changes(None), changes(Some(1)));
         let (mut spent, mut watched) = (Spent::default(), Watched::default());
         let mut show = |frame_id: u64, z: f32| {

@@ -13,6 +13,7 @@ use super::queue::lock;
 use super::tally::Tally;
 use super::taps::{HashReply, ProbeTap, SampleTap};
 use super::thread::Running;
+use crate::budget::Account;
 use crate::refusal::{Refusal, Result};
 use crate::sheet::audit::{Inputs, Mark};
 
@@ -21,6 +22,9 @@ pub(super) enum Request {
     Adopt(Box<Running>),
     Start {
         until: Option<u64>,
+        reply: oneshot::Sender<Result<u64>>,
+    },
+    Revive {
         reply: oneshot::Sender<Result<u64>>,
     },
     Pause {
@@ -35,6 +39,8 @@ pub(super) enum Request {
     Audit(Inputs, SyncSender<Mark>),
     Hash {
         at: Option<u64>,
+        /// Who pays for it.
+        account: Account,
         reply: HashReply,
     },
     Delete(Refusal),

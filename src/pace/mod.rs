@@ -1,6 +1,7 @@
 //! Sessions in real time: the only room with a clock. Stepping threads own the sessions; what servers call here
 //! posts a request to one, or goes through the session's intake, and never waits for a step.
 
+mod admission;
 pub mod auditor;
 pub mod clock;
 mod cost;
@@ -8,6 +9,7 @@ pub mod frames;
 mod inbox;
 pub(crate) mod priority;
 pub mod queue;
+pub mod streams;
 pub mod tally;
 mod taps;
 mod thread;
@@ -19,11 +21,12 @@ use std::thread::JoinHandle;
 
 use tokio::sync::oneshot;
 
+use crate::budget::{Account, Budget, Taken};
 use crate::haptics::Law;
 use crate::limits::Limits;
-use crate::refusal::{Reason, Refusal, Result, number};
+use crate::refusal::{Reason, Refusal, Result};
+use crate::scene::Change;
 use crate::scene::record::{Point, Record};
-use crate::scene::{Change, Scene};
 use crate::session::Sample;
 use crate::session::command::{Command, Intake, LeaseId};
 use crate::session::local::Refinement;
@@ -37,9 +40,10 @@ use frames::{Delivery, Encoder, Viewer};
 use inbox::{Inbox, Request};
 use priority::give_way;
 use queue::{Reader, lock, queue};
+use streams::Streams;
+pub use streams::{Held, StreamGuard};
 use tally::Tally;
 use taps::{ProbeTap, SampleTap};
-use thread::{Running, beat_ns};
 
 /// A sample, and how the session keeps time.
 #[derive(Debug, Clone, PartialEq)]
@@ -56,13 +60,18 @@ pub struct PacedSample {
     pub overrun: bool,
 }
 
-/// A record, and its step.
-#[derive(Debug, Clone)]
-pub struct PacedRecord {
+/// A record, and its step. All who asked for the same share one.
+pub type PacedRecord = Arc<Recorded>;
+
+/// What was measured once, for whoever asked for it.
+#[derive(Debug)]
+pub struct Recorded {
     /// Steps done.
     pub step: u64,
     /// What was measured.
     pub record: Record,
+    /// Its memory.
+    _taken: Taken,
 }
 
 /// Whether a session's time goes on.
@@ -109,6 +118,14 @@ pub struct Status {
     pub model: Arc<Model>,
 }
 
+impl Status {
+    /// The session goes on, and what it counts of itself begins anew.
+    fn forget_hold(&mut self) {
+        (self.hold_reason, self.state) = (None, State::Paused);
+        (self.late_commands, self.guard_events, self.path_counts) = (0, 0, [0; 3]);
+    }
+}
+
 /// A session as the server sees it.
 pub struct Live {
     /// Random, not to be guessed.
@@ -116,6 +133,8 @@ pub struct Live {
     /// The tissue as the session began with it. Points and rate stay; coefficients, scheme and substeps may be others by
     /// now ([`Status::model`]).
     pub model: Arc<Model>,
+    /// Who made it, and pays for it.
+    pub owner: Account,
     intake: Mutex<Intake>,
     /// Deleted when so long nobody asked for it, held a tool or had a stream, s.
     pub idle_timeout_s: f64,
@@ -123,7 +142,7 @@ pub struct Live {
     number: u64,
     limits: Limits,
     status: Mutex<Status>,
-    streams: Mutex<usize>,
+    streams: Mutex<Streams>,
     refused: AtomicU64,
     laws: Mutex<Vec<KeptLaw>>,
     cost: Cost,
@@ -131,20 +150,12 @@ pub struct Live {
     /// Of the stepping threads, its own, and where that is asked.
     thread: usize,
     inbox: Arc<Inbox>,
+    /// The session, and its memory.
+    _taken: [Taken; 2],
 }
 
 /// The law of a tissue under a tip of a radius, m.
 type KeptLaw = (f64, Arc<Model>, Arc<Law>);
-
-/// Counts a stream of a session until it is dropped.
-pub struct StreamGuard(Arc<Live>);
-
-impl Drop for StreamGuard {
-    fn drop(&mut self) {
-        *lock(&self.0.streams) -= 1;
-        self.0.asked_ns.store(now_ns(), Ordering::Relaxed);
-    }
-}
 
 impl Live {
     /// How the session stands now: at rest its steps are done in thought.
@@ -164,7 +175,7 @@ impl Live {
     fn is_idle(&self, now_ns: u64) -> bool {
         let unused_s = now_ns.saturating_sub(self.asked_ns.load(Ordering::Relaxed)) as f64 * 1e-9;
         unused_s > self.idle_timeout_s
-            && *lock(&self.streams) == 0
+            && self.streams() == 0
             && self.at_intake(|intake, _| intake.holders().next().is_none())
     }
 
@@ -205,22 +216,6 @@ impl Live {
         self.refused.load(Ordering::Relaxed)
     }
 
-    /// Room for one more stream.
-    pub fn open_stream(self: &Arc<Self>) -> Result<StreamGuard> {
-        let mut streams = lock(&self.streams);
-        if *streams >= self.limits.streams_per_session {
-            let message = format!("the session has {streams} streams already");
-            return Err(Refusal::new(Reason::TooMany, "", message));
-        }
-        *streams += 1;
-        Ok(StreamGuard(self.clone()))
-    }
-
-    /// Streams that read the session.
-    pub fn streams(&self) -> usize {
-        *lock(&self.streams)
-    }
-
     async fn ask<T>(&self, request: impl FnOnce(oneshot::Sender<Result<T>>) -> Request) -> Result<T> {
         let (reply, answer) = oneshot::channel();
         self.inbox.send(self.number, request(reply));
@@ -234,16 +229,33 @@ impl Live {
 
     /// Changes the tissue from the beginning of step `at_step` on, or of the next. Tells the step, and the tissue from then
     /// on. It is compiled here, by who asks, some milliseconds: no step waits for that.
-    pub fn change(&self, change: &Change, at_step: Option<u64>) -> Result<(u64, Arc<Model>)> {
+    ///
+    /// `admit` is asked whether the thread has the time that the tissue will take of it, as a part of all.
+    pub fn change(
+        &self,
+        change: &Change,
+        at_step: Option<u64>,
+        admit: impl Fn(f64) -> Result<()>,
+    ) -> Result<(u64, Arc<Model>)> {
         loop {
             let base = self.at_intake(|intake, _| intake.changed_to());
             let model = base.as_ref().unwrap_or(&self.model).changed(change, &self.model.scene, &self.limits)?;
             check_work(&model, &self.limits)?;
+            let (before, after) = (lock(&self.status).model.plan.substeps, model.plan.substeps);
+            if after > before {
+                admit(self.cost.awake_share() * f64::from(after) / f64::from(before))?;
+            }
             // Somebody may have been quicker; then it is made out of theirs.
             if let Some(step) = self.at_intake(|intake, now| intake.change(base.as_ref(), &model, at_step, now))? {
                 return Ok((step, model));
             }
         }
+    }
+
+    /// Has a session that is held go on: from the step that it was held at, paused, with its tissue at rest, and no tool
+    /// held. What made the tissue fail may make it fail again.
+    pub async fn revive(&self) -> Result<u64> {
+        self.ask(|reply| Request::Revive { reply }).await
     }
 
     /// Stops time.
@@ -252,8 +264,10 @@ impl Live {
     }
 
     /// Waits until `at` steps are done (now, if `None`), and tells the step and the state's hash there.
-    pub async fn hash_at(&self, at: Option<u64>) -> Result<(u64, u128)> {
-        self.ask(|reply| Request::Hash { at, reply }).await
+    /// `account` is charged for it.
+    pub async fn hash_at(&self, at: Option<u64>, account: &Account) -> Result<(u64, u128)> {
+        let account = account.clone();
+        self.ask(|reply| Request::Hash { at, account, reply }).await
     }
 
     /// The samples that are asked for.
@@ -277,11 +291,18 @@ impl Live {
     }
 
     /// Records of some points, or of all, every so many steps.
-    pub fn probe(&self, every: u64, points: Option<Vec<[usize; 2]>>, energy: bool) -> Reader<PacedRecord> {
+    pub fn probe(
+        &self,
+        every: u64,
+        points: Option<Vec<[usize; 2]>>,
+        energy: bool,
+        account: &Account,
+    ) -> Reader<PacedRecord> {
         let count = points.as_ref().map_or(self.model.len(), Vec::len).max(1);
         let room = self.limits.queued_bytes / (count * size_of::<Point>());
         let (writer, reader) = queue(room.clamp(1, self.limits.queued_records));
-        self.inbox.send(self.number, Request::Probe(ProbeTap { every, points, energy, writer }));
+        let account = account.clone();
+        self.inbox.send(self.number, Request::Probe(ProbeTap { every, points, energy, writer, account }));
         reader
     }
 
@@ -324,6 +345,8 @@ fn deleted() -> Refusal {
 /// All sessions of a server, and the threads that step them.
 pub struct Pacer {
     limits: Limits,
+    /// What callers share.
+    pub budget: Arc<Budget>,
     inboxes: Vec<Arc<Inbox>>,
     encoder: Arc<Encoder>,
     threads: Mutex<Vec<JoinHandle<()>>>,
@@ -349,7 +372,7 @@ pub fn random_bits() -> Result<u128> {
 impl Pacer {
     /// Starts `threads` stepping threads, one that encodes frames, and one that measures errors with `audit_share` of a core;
     /// none if that is 0.
-    pub fn start(threads: usize, audit_share: f64, limits: &Limits) -> std::io::Result<Arc<Self>> {
+    pub fn start(threads: usize, audit_share: f64, limits: &Limits, budget: Arc<Budget>) -> std::io::Result<Arc<Self>> {
         let encoder = Arc::new(Encoder::default());
         let mut handles = Vec::new();
         let mut inboxes = Vec::new();
@@ -380,6 +403,7 @@ impl Pacer {
         }
         Ok(Arc::new(Pacer {
             limits: limits.clone(),
+            budget,
             inboxes,
             encoder,
             threads: Mutex::new(handles),
@@ -388,122 +412,6 @@ impl Pacer {
             viewers: Mutex::new(BTreeMap::new()),
             numbers: Mutex::new(0),
         }))
-    }
-
-    /// Makes a session.
-    pub fn create(&self, scene: &Scene, paused: bool, idle_timeout_s: f64) -> Result<Arc<Live>> {
-        let most_hz = self.limits.session_rate_hz;
-        number("stepping.rate_hz", scene.stepping.rate_hz, &format!("at most {most_hz}"), |v| v <= most_hz)?;
-        let model = self.compile(scene)?;
-        let id = random_id()?;
-        check_work(&model, &self.limits)?;
-        let number = {
-            let mut numbers = lock(&self.numbers);
-            *numbers += 1;
-            *numbers
-        };
-        let begin_ns = beat_ns(now_ns());
-        let status = Status {
-            state: if paused { State::Paused } else { State::Running },
-            step: 0,
-            resting: false,
-            rested_steps: 0,
-            overrun_count: 0,
-            dilation: Dilation::new(begin_ns, 0),
-            schedule: Schedule::new(0, begin_ns, scene.stepping.rate_hz),
-            late_commands: 0,
-            hold_reason: None,
-            guard_events: 0,
-            awake_points: 0,
-            path_counts: [0; 3],
-            lapsed_leases: 0,
-            model: model.clone(),
-        };
-        let (cost, thread) = self.place(&model, paused)?;
-        let inbox = self.inboxes[thread].clone();
-        let live = Arc::new(Live {
-            id: id.clone(),
-            intake: Mutex::new(Intake::new(&model.scene, &self.limits)),
-            model,
-            idle_timeout_s,
-            asked_ns: AtomicU64::new(now_ns()),
-            number,
-            limits: self.limits.clone(),
-            status: Mutex::new(status),
-            streams: Mutex::new(0),
-            refused: AtomicU64::new(0),
-            laws: Mutex::new(Vec::new()),
-            audited: Mutex::new(Audited::default()),
-            cost,
-            thread,
-            inbox: inbox.clone(),
-        });
-        // Laid out before the lock is taken, on which all calls wait.
-        let running = Box::new(Running::new(live.clone(), !paused));
-        let mut sessions = lock(&self.sessions);
-        let points: usize = sessions.values().map(|live| live.model.len()).sum();
-        if points + live.model.len() > self.limits.points_in_all {
-            let message = format!("the sessions of the server have {points} points already");
-            return Err(Refusal::new(Reason::TooMany, "sheet.points", message));
-        }
-        if sessions.len() >= self.limits.sessions {
-            let message = format!("the server has {} sessions already", sessions.len());
-            return Err(Refusal::new(Reason::TooMany, "", message));
-        }
-        sessions.insert(id, live.clone());
-        // Before anybody can name the session: what is asked of it comes after this.
-        inbox.send(number, Request::Adopt(running));
-        Ok(live)
-    }
-
-    /// What never changes is one in memory for all sessions of a scene, and compiled once.
-    fn compile(&self, scene: &Scene) -> Result<Arc<Model>> {
-        let known =
-            lock(&self.sessions).values().find(|live| live.model.scene == *scene).map(|live| live.model.clone());
-        known.map_or_else(|| Model::compile(scene, &self.limits), Ok)
-    }
-
-    /// The thread with the most time to spare for a further session, and what that will take.
-    fn place(&self, model: &Model, paused: bool) -> Result<(Cost, usize)> {
-        let sessions = lock(&self.sessions);
-        let cost = Cost::guess(model, sessions.values().map(|live| &live.cost));
-        let mut taken = vec![(0.0, 0_usize); self.inboxes.len()];
-        for live in sessions.values() {
-            taken[live.thread].0 += live.cost.share();
-            taken[live.thread].1 += 1;
-        }
-        drop(sessions);
-        let spare =
-            |a: &(usize, &(f64, usize)), b: &(usize, &(f64, usize))| a.1.0.total_cmp(&b.1.0).then(a.1.1.cmp(&b.1.1));
-        let (thread, (taken, _)) = taken.iter().enumerate().min_by(spare).unwrap_or((0, &(0.0, 0)));
-        if !paused {
-            self.check_share(*taken, &cost)?;
-        }
-        Ok((cost, thread))
-    }
-
-    /// Refuses what would make others late. Whoever is alone on its thread delays nobody, however heavy; and what rests
-    /// takes nothing.
-    fn check_share(&self, taken: f64, cost: &Cost) -> Result<()> {
-        let (needed, most) = (cost.awake_share(), self.limits.thread_share);
-        if taken == 0.0 || taken + needed <= most {
-            return Ok(());
-        }
-        let message = format!(
-            "the sessions of the stepping thread with the most time to spare take {taken:.3} of it, and this one would take \
-             {needed:.3}: above the {most} that sessions may take (limits.thread_share)"
-        );
-        Err(Refusal::new(Reason::Overloaded, "", message))
-    }
-
-    /// Lets a session's time go on ([`Live::start`]), unless that would make others late.
-    pub async fn start_session(&self, live: &Live, until: Option<u64>) -> Result<u64> {
-        if lock(&live.status).state == State::Paused {
-            let others = |other: &&Arc<Live>| other.thread == live.thread && other.number != live.number;
-            let taken = lock(&self.sessions).values().filter(others).map(|other| other.cost.share()).sum();
-            self.check_share(taken, &live.cost)?;
-        }
-        live.start(until).await
     }
 
     /// The session of that id.

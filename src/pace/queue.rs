@@ -94,6 +94,11 @@ impl<T> Writer<T> {
         inner.waiting.take()
     }
 
+    /// One item could not be had: it counts as dropped.
+    pub fn skip(&self) {
+        lock(&self.0).dropped += 1;
+    }
+
     /// Takes back the newest item, if it has not been read.
     pub fn withdraw(&self) -> Option<T> {
         lock(&self.0).items.pop_back()

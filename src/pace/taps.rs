@@ -4,10 +4,14 @@ use std::sync::Arc;
 
 use tokio::sync::oneshot;
 
+use super::clock::now_ns;
 use super::frames::Viewer;
-use super::queue::Writer;
-use super::{PacedRecord, PacedSample};
+use super::queue::{Wakes, Writer};
+use super::{PacedRecord, PacedSample, Recorded};
+use crate::budget::{Account, Purpose, Resource, Work};
 use crate::refusal::Result;
+use crate::scene::record::Point;
+use crate::session::Session;
 use crate::session::sampling::Sampler;
 
 /// Who waits for the step and the hash of a state.
@@ -29,6 +33,8 @@ pub(super) struct ProbeTap {
     pub(super) points: Option<Vec<[usize; 2]>>,
     pub(super) energy: bool,
     pub(super) writer: Writer<PacedRecord>,
+    /// Who reads, and pays.
+    pub(super) account: Account,
 }
 
 /// A stream of frames.
@@ -83,15 +89,49 @@ pub(super) struct Taps {
     pub(super) samples: Vec<SampleTap>,
     pub(super) probes: Vec<ProbeTap>,
     pub(super) viewers: Vec<ViewTap>,
-    pub(super) hashes: Vec<(u64, HashReply)>,
+    pub(super) hashes: Vec<(u64, Account, HashReply)>,
 }
 
 impl Taps {
+    /// Tells who probes of this moment: a record each for those who ask for different things.
+    pub(super) fn record(&self, session: &Session, wakes: &mut Wakes) {
+        let step = session.step_count();
+        // A pass over the sheet, once for all who want it.
+        let mut energy = None;
+        let mut told: Vec<(&ProbeTap, PacedRecord)> = Vec::new();
+        for tap in self.probes.iter().filter(|tap| step.is_multiple_of(tap.every)) {
+            let same = |told: &&(&ProbeTap, _)| (&told.0.points, told.0.energy) == (&tap.points, tap.energy);
+            if let Some((_, record)) = told.iter().find(same) {
+                tap.writer.push_quietly(record.clone(), wakes);
+                continue;
+            }
+            let now = now_ns();
+            let points = tap.points.as_ref().map_or(session.model().len(), Vec::len);
+            let bytes = (points * size_of::<Point>()) as u64;
+            let has_time = tap.account.must_wait_ns(Work::Reading, now) == 0;
+            let taken =
+                has_time.then(|| tap.account.take(Resource::Memory(Purpose::Records), bytes, "").ok()).flatten();
+            let Some(_taken) = taken else {
+                tap.writer.skip();
+                continue;
+            };
+            let mut record = session.record(tap.points.as_deref());
+            if tap.energy {
+                record.energy_j = Some(*energy.get_or_insert_with(|| session.energy()));
+            }
+            let ended = now_ns();
+            tap.account.spend(Work::Reading, ended, ended.saturating_sub(now));
+            let record = Arc::new(Recorded { step, record, _taken });
+            tap.writer.push_quietly(record.clone(), wakes);
+            told.push((tap, record));
+        }
+    }
+
     pub(super) fn forget_the_gone(&mut self) {
         self.samples.retain(|tap| !tap.writer.is_abandoned());
         self.probes.retain(|tap| !tap.writer.is_abandoned());
         self.viewers.retain(|tap| !tap.viewer.is_gone());
-        self.hashes.retain(|waiting| !waiting.1.is_closed());
+        self.hashes.retain(|waiting| !waiting.2.is_closed());
     }
 
     /// Of a session at rest that has done `step` steps: the step to do next, that somebody may be told of its end;

@@ -1,18 +1,19 @@
 use super::*;
-use crate::scene::PAPER;
+use crate::budget::{Account, Budget};
+use crate::scene::{PAPER, Scene};
 
 #[tokio::test]
 async fn a_fault_in_one_session_ends_that_one_alone() {
     let limits = Limits::default();
     let scene = Scene::parse("paper", PAPER, &[], &limits).unwrap();
-    let pacer = Pacer::start(1, 0.02, &limits).unwrap();
-    let [faulty, sound] = [(); 2].map(|()| pacer.create(&scene, false, 60.0).unwrap());
+    let pacer = Pacer::start(1, 0.02, &limits, Budget::new(&limits, 1, 1)).unwrap();
+    let [faulty, sound] = [(); 2].map(|()| pacer.create(&scene, false, 60.0, &Account::alone()).unwrap());
     let (law, touch_stiffness) = (None, false);
     let mut samples =
         faulty.samples(Sampling { every: 1, only: None, deadband: None, heartbeat_s: 0.01, law, touch_stiffness });
     samples.pop().await.unwrap();
     faulty.inbox.send(faulty.number, Request::Panic);
-    let told = faulty.hash_at(Some(1_000_000)).await.unwrap_err();
+    let told = faulty.hash_at(Some(1_000_000), &Account::alone()).await.unwrap_err();
     assert_eq!((told.reason, faulty.status().state), (Reason::SessionHeld, State::Held));
     assert!(told.message.contains("a test"), "{told}");
     let ended = loop {
@@ -25,6 +26,6 @@ async fn a_fault_in_one_session_ends_that_one_alone() {
     assert_eq!(refused.unwrap_err().reason, Reason::SessionHeld);
     // On the same thread.
     let step = sound.status().step;
-    assert_eq!(sound.hash_at(Some(step + 20)).await.unwrap().0, step + 20);
+    assert_eq!(sound.hash_at(Some(step + 20), &Account::alone()).await.unwrap().0, step + 20);
     pacer.stop();
 }

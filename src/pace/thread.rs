@@ -4,8 +4,9 @@
 //! behind beyond that is dropped from its schedule, and counted. Simulated time then runs slower than real time.
 //!
 //! Fair parts: the session that is due first goes first, so those of any rates are all on time while there is time for
-//! all. If there is not, whoever takes no more than an equal part of the thread still goes by when it is due; whoever
-//! takes more and is late goes after all that are due. So between two steps of a session that is too heavy all others
+//! all. If there is not, whoever takes no more than its part of the thread still goes by when it is due; whoever
+//! takes more and is late goes after all that are due. The thread is divided among the callers whose sessions are awake,
+//! and each one's part among its sessions: who wakes four hundred at once slows those. So between two steps of a session that is too heavy all others
 //! get theirs, and it gets what they leave. A step can't be interrupted: by the longest one of late everybody may be
 //! behind through no fault of its own, and catches that up however many steps it is.
 //!
@@ -27,7 +28,7 @@ use super::frames::{Encoder, Job, Viewer};
 use super::inbox::{Inbox, Request};
 use super::queue::{Wakes, lock};
 use super::taps::{SampleTap, Taps, ViewTap};
-use super::{Live, PacedRecord, PacedSample, State};
+use super::{Live, PacedSample, State};
 use crate::refusal::{Reason, Refusal, Result};
 use crate::session::Session;
 use crate::session::command::Due;
@@ -85,6 +86,8 @@ pub(super) struct Running {
 struct Rota {
     sessions: BTreeMap<u64, Box<Running>>,
     due: BTreeSet<(u64, u64)>,
+    /// Sessions that are due some time, by the account of who made them.
+    awake: BTreeMap<u64, usize>,
 }
 
 impl Rota {
@@ -92,16 +95,31 @@ impl Rota {
     fn with(&mut self, number: u64, act: impl FnOnce(&mut Running)) {
         let Entry::Occupied(mut session) = self.sessions.entry(number) else { return };
         let running = session.get_mut();
-        if let Some(due_ns) = running.due_ns() {
-            self.due.remove(&(due_ns, number));
+        let owner = running.live.owner.number();
+        if let Some(due_ns) = running.due_ns()
+            && self.due.remove(&(due_ns, number))
+            && let Entry::Occupied(mut awake) = self.awake.entry(owner)
+        {
+            *awake.get_mut() -= 1;
+            if *awake.get() == 0 {
+                awake.remove();
+            }
         }
         act(running);
         if let Some(due_ns) = running.due_ns() {
             self.due.insert((due_ns, number));
+            *self.awake.entry(owner).or_default() += 1;
         }
         if running.deleted {
             session.remove();
         }
+    }
+
+    /// Of how many the thread's time is an equal part for session `number`: each caller gets as much as another, and divides
+    /// it among its sessions.
+    fn parts(&self, number: u64) -> usize {
+        let owner = self.sessions.get(&number).map(|running| running.live.owner.number());
+        self.awake.len() * owner.and_then(|owner| self.awake.get(&owner)).copied().unwrap_or(1)
     }
 
     /// The session that is due first, and when.
@@ -163,7 +181,7 @@ pub(super) fn work(inbox: &Inbox, encoder: &Encoder, refiner: &SyncSender<Refine
             if desk.wakes.is_empty() {
                 begun_round_ns = begun_ns;
             }
-            let awake = rota.due.len();
+            let (parts, alone) = (rota.parts(number), rota.due.len() == 1);
             rota.with(number, |running| {
                 let late_ns = begun_ns.saturating_sub(running.schedule.due_ns(running.next_step));
                 running.guarded(|running| running.step(begun_ns, &mut desk));
@@ -172,7 +190,7 @@ pub(super) fn work(inbox: &Inbox, encoder: &Encoder, refiner: &SyncSender<Refine
                 desk.longest.observe(ended_ns, taken_ns);
                 inbox.tally.lateness.add(late_ns);
                 inbox.tally.step_time.add(taken_ns);
-                running.queue_again(begun_ns, ended_ns, awake);
+                running.queue_again(begun_ns, ended_ns, parts, alone);
             });
         }
     }
@@ -212,15 +230,15 @@ impl Running {
         Some(due_ns.max(self.not_before_ns))
     }
 
-    /// Finds its place among `awake` sessions of the thread, after a step.
+    /// Finds its place among the sessions of the thread, after a step, if one of `parts` of its time is its own.
     #[allow(clippy::cast_precision_loss)]
-    fn queue_again(&mut self, begun_ns: u64, now_ns: u64, awake: usize) {
+    fn queue_again(&mut self, begun_ns: u64, now_ns: u64, parts: usize, alone: bool) {
         if self.still_since.is_none() {
             self.live.cost.observe(now_ns.saturating_sub(begun_ns));
         }
         let is_late = now_ns.saturating_sub(self.schedule.due_ns(self.next_step)) as f64 > self.schedule.period_ns();
-        let takes_more = self.live.cost.awake_share() * awake as f64 > 1.0;
-        self.not_before_ns = if awake > 1 && is_late && takes_more { now_ns } else { 0 };
+        let takes_more = self.live.cost.awake_share() * parts as f64 > 1.0;
+        self.not_before_ns = if !alone && is_late && takes_more { now_ns } else { 0 };
     }
 
     /// Does something with it. A panic ends this session, and no other.
@@ -280,6 +298,9 @@ impl Running {
                 self.publish_status();
                 let _ = reply.send(started);
             }
+            Request::Revive { reply } => {
+                let _ = reply.send(self.revive());
+            }
             Request::Pause { reply } => {
                 self.stand(desk);
                 let _ = reply.send(Ok(()));
@@ -307,12 +328,12 @@ impl Running {
                 self.post(desk.encoder, vec![(viewer.clone(), frame_id)]);
                 self.taps.viewers.push(ViewTap { viewer, shown: step, passed: frame_id });
             }
-            Request::Hash { at, reply } => {
+            Request::Hash { at, account, reply } => {
                 let at = at.unwrap_or(step);
                 if at > step && self.session.hold_reason().is_none() {
-                    self.taps.hashes.push((at, reply));
+                    self.taps.hashes.push((at, account, reply));
                 } else {
-                    let _ = reply.send(if at == step { Ok((step, self.hash())) } else { Err(self.passed(at)) });
+                    let _ = reply.send(if at == step { self.hash_for(&account) } else { Err(self.passed(at)) });
                 }
             }
             Request::Delete(why) => {
@@ -325,15 +346,6 @@ impl Running {
         }
         self.plan();
         self.publish_status();
-    }
-
-    /// The state's hash, computed once a step.
-    fn hash(&mut self) -> u128 {
-        let step = self.session.step_count();
-        let hash = self.hashed.filter(|hashed| hashed.0 == step).map(|hashed| hashed.1);
-        let hash = hash.unwrap_or_else(|| self.session.tissue().state_hash());
-        self.hashed = Some((step, hash));
-        hash
     }
 
     /// Time stands from now on. Who reads samples gets the present one.
@@ -407,25 +419,14 @@ impl Running {
         }
 
         let (Running { session, taps, due, .. }, wakes) = (&mut *self, &mut desk.wakes);
-        session.advance(due, |session| {
-            let step = session.step_count();
-            // A pass over the sheet, once for all who want it.
-            let mut energy = None;
-            for tap in taps.probes.iter().filter(|tap| step.is_multiple_of(tap.every)) {
-                let mut record = session.record(tap.points.as_deref());
-                if tap.energy {
-                    record.energy_j = Some(*energy.get_or_insert_with(|| session.energy()));
-                }
-                tap.writer.push_quietly(PacedRecord { step, record }, wakes);
-            }
-        });
+        session.advance(due, |session| taps.record(session, wakes));
         self.tell_auditor();
         if let Some(reason) = self.session.hold_reason() {
             tracing::warn!(session = %self.live.id, reason, "session held");
             self.running = false;
             lock(&self.live.intake).close(Refusal::new(Reason::SessionHeld, "", reason));
             self.publish_status();
-            for (at, reply) in std::mem::take(&mut self.taps.hashes) {
+            for (at, _, reply) in std::mem::take(&mut self.taps.hashes) {
                 let _ = reply.send(Err(self.passed(at)));
             }
             // No further record will come.
@@ -503,8 +504,8 @@ impl Running {
         if !viewers.is_empty() {
             self.post(desk.encoder, viewers);
         }
-        for (at, reply) in self.taps.hashes.extract_if(.., |waiting| waiting.0 == step).collect::<Vec<_>>() {
-            let _ = reply.send(Ok((at, self.hash())));
+        for (_, account, reply) in self.taps.hashes.extract_if(.., |waiting| waiting.0 == step).collect::<Vec<_>>() {
+            let _ = reply.send(self.hash_for(&account));
         }
     }
 
@@ -563,11 +564,12 @@ impl Running {
         taps.samples.iter().for_each(|tap| tap.writer.close(why.clone()));
         taps.probes.iter().for_each(|tap| tap.writer.close(why.clone()));
         taps.viewers.iter().for_each(|tap| tap.viewer.close(why.clone()));
-        for (_, reply) in taps.hashes {
+        for (_, _, reply) in taps.hashes {
             let _ = reply.send(Err(why.clone()));
         }
     }
 }
 
+mod care;
 #[cfg(test)]
 mod tests;

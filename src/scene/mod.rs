@@ -242,6 +242,9 @@ impl Named for Integrator {
     ];
 }
 
+/// Points of a row that are computed at least: the lanes of the widest vector.
+pub const LEAST_WIDTH: usize = 16;
+
 /// The number format of the state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Precision {
@@ -379,6 +382,15 @@ impl Scene {
         }
         if nx.checked_mul(ny).is_none_or(|points| points > limits.points) {
             let message = format!("are {nx} × {ny}, above the limit of {} points in all", limits.points);
+            return Err(Refusal::new(Reason::TooLarge, "sheet.points", message));
+        }
+        // A narrow sheet takes the memory and the time of one of this width, which may be sixteen times its own.
+        if nx.checked_mul(ny.max(LEAST_WIDTH)).is_none_or(|points| points > limits.points) {
+            let message = format!(
+                "are {nx} × {ny}: rows of fewer than {LEAST_WIDTH} points are computed as if they had so many, and \
+                 {nx} × {LEAST_WIDTH} are above the limit of {} points in all; give the longer side last",
+                limits.points
+            );
             return Err(Refusal::new(Reason::TooLarge, "sheet.points", message));
         }
         physical("sheet.spacing_m", positive("sheet.spacing_m", self.sheet.spacing_m)?)?;

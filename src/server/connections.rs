@@ -1,7 +1,7 @@
 //! Connections as they come, plain or through TLS: how many there may be, how long one may take to say what it wants, how
 //! fast it may ask, and what it carries. None waits for another's handshake.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::io;
 use std::net::{IpAddr, SocketAddr};
 use std::pin::Pin;
@@ -21,11 +21,14 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::transport::server::Connected;
 use tracing::{debug, warn};
 
+use super::leases::Leases;
 use super::metrics::{Open, Traffic};
 use super::rate::Turnstile;
 use super::reload::Reloaded;
 use super::tls::{self, Tls};
 use super::transport::{Frames, Gate, Holdback};
+use super::visitor::address_name;
+use crate::budget::{Budget, Purpose, Resource, Taken};
 use crate::limits::Limits;
 use crate::pace::queue::lock;
 
@@ -41,6 +44,9 @@ const APART: Duration = Duration::from_millis(1);
 
 /// Connections above the limits that are there for a moment, while those go that were sent away.
 const LEAVING: usize = 16;
+/// After so many bytes of one connection the others get their turn: small frames, of which nobody need read anything (PING,
+/// SETTINGS, WINDOW_UPDATE, PRIORITY), cost a hundred nanoseconds each.
+const BYTES_A_TURN: usize = 8 << 10;
 
 /// Connections that wait to be served.
 const WAITING: usize = 64;
@@ -51,7 +57,9 @@ pub(super) fn incoming(
     tls: Option<Arc<Reloaded<Tls>>>,
     seats: Arc<Seats>,
     limits: &Limits,
+    budget: Arc<Budget>,
     traffic: Arc<Traffic>,
+    register: Arc<Register>,
 ) -> impl Stream<Item = io::Result<Connection>> + use<> {
     let (ready, connections) = mpsc::channel(WAITING);
     let limits = limits.clone();
@@ -80,9 +88,18 @@ pub(super) fn incoming(
                     continue;
                 }
             };
+            let account = budget.account(&address_name(address.ip()));
+            let bytes = u64::from(limits.connection_window_bytes);
+            let window = match account.take(Resource::Memory(Purpose::Connections), bytes, "") {
+                Ok(window) => window,
+                Err(why) => {
+                    warn!(%address, "connection closed: its window {why}");
+                    continue;
+                }
+            };
             // Nagle's algorithm would hold a sample back for milliseconds. Who has gone already is noticed later.
             let _ = socket.set_nodelay(true);
-            let entry = Entry::new(address, Arc::new(seat), gate, &limits, &traffic);
+            let entry = Entry::new(address, Arc::new(seat), gate, window, &limits, &traffic, &register);
             let Some(tls) = &tls else {
                 let _ = ready.send(Ok(entry.connection(Transport::Plain(socket), None))).await;
                 continue;
@@ -107,6 +124,14 @@ pub(super) fn incoming(
     ReceiverStream::new(connections)
 }
 
+/// Where somebody comes from: whoever has IPv6 has 2⁶⁴ addresses.
+pub(super) fn network(address: IpAddr) -> IpAddr {
+    match address.to_canonical() {
+        IpAddr::V6(address) => IpAddr::V6((u128::from(address) >> 64 << 64).into()),
+        IpAddr::V4(address) => IpAddr::V4(address),
+    }
+}
+
 /// Room for connections: so many in all, and so many from one address.
 #[derive(Debug)]
 pub(super) struct Seats {
@@ -114,11 +139,11 @@ pub(super) struct Seats {
     most_each: usize,
     /// Of those, for who has not shown who they are; nobody is asked if there is none.
     strangers: Option<usize>,
-    taken: Mutex<Taken>,
+    taken: Mutex<Occupied>,
 }
 
 #[derive(Debug, Default)]
-struct Taken {
+struct Occupied {
     /// By address; those that have none are left out.
     each: HashMap<IpAddr, usize>,
     /// Who has not shown who they are, the oldest first.
@@ -133,7 +158,7 @@ struct Stranger {
     gate: Weak<Gate>,
 }
 
-impl Taken {
+impl Occupied {
     /// Closes the connection of the stranger who has been there longest, of this address if one is given; tells if there
     /// was one.
     fn send_away(&mut self, of: Option<IpAddr>) -> bool {
@@ -165,11 +190,7 @@ impl Seats {
 
     /// A seat, or why there is none.
     fn take(self: &Arc<Self>, address: IpAddr, gate: &Arc<Gate>) -> Result<Seat, String> {
-        // Whoever has IPv6 has 2⁶⁴ addresses.
-        let address = match address.to_canonical() {
-            IpAddr::V6(address) => IpAddr::V6((u128::from(address) >> 64 << 64).into()),
-            IpAddr::V4(address) => IpAddr::V4(address),
-        };
+        let address = network(address);
         let mut taken = lock(&self.taken);
         let all: usize = taken.each.values().sum();
         let each = taken.each.get(&address).copied().unwrap_or_default();
@@ -230,46 +251,105 @@ pub(crate) struct Peer {
     pub(super) gate: Arc<Gate>,
     /// For when it has shown who it is.
     pub(super) seat: Arc<Seat>,
+    /// Tools that are let go when it ends.
+    pub(super) leases: Arc<Leases>,
+    /// Accounts of those who have called over it.
+    callers: Arc<Mutex<BTreeSet<u64>>>,
+}
+
+impl Peer {
+    /// Somebody with that account has called.
+    pub(super) fn used_by(&self, account: u64) {
+        lock(&self.callers).insert(account);
+    }
+}
+
+/// The connections that are open.
+#[derive(Debug, Default)]
+pub(crate) struct Register(Mutex<(u64, BTreeMap<u64, Peer>)>);
+
+impl Register {
+    fn enter(&self, peer: &Peer) -> u64 {
+        let mut open = lock(&self.0);
+        open.0 += 1;
+        let number = open.0;
+        open.1.insert(number, peer.clone());
+        number
+    }
+
+    /// Closes those over which somebody with that account has called; tells how many.
+    pub(super) fn cut(&self, account: u64) -> usize {
+        let open = lock(&self.0);
+        let theirs = open.1.values().filter(|peer| lock(&peer.callers).contains(&account));
+        theirs.map(|peer| peer.gate.close()).count()
+    }
 }
 
 /// A connection that was let in, before its handshake.
 struct Entry {
     address: SocketAddr,
+    /// The memory of what comes and nobody has read.
+    window: Taken,
     calls: Turnstile,
     creations: Turnstile,
     /// For the handshake and the greeting together.
     deadline: Pin<Box<Sleep>>,
     traffic: Arc<Traffic>,
+    register: Arc<Register>,
     seat: Arc<Seat>,
     gate: Arc<Gate>,
 }
 
 impl Entry {
-    fn new(address: SocketAddr, seat: Arc<Seat>, gate: Arc<Gate>, limits: &Limits, traffic: &Arc<Traffic>) -> Self {
+    fn new(
+        address: SocketAddr,
+        seat: Arc<Seat>,
+        gate: Arc<Gate>,
+        window: Taken,
+        limits: &Limits,
+        traffic: &Arc<Traffic>,
+        register: &Arc<Register>,
+    ) -> Self {
         let per_minute = limits.sessions_per_minute;
         Entry {
             address,
+            window,
             calls: Turnstile::new(limits.calls_per_s, limits.calls_per_s, "calls of this connection"),
             creations: Turnstile::new(per_minute / 60.0, per_minute, "sessions made over this connection"),
             deadline: Box::pin(tokio::time::sleep(Duration::from_secs_f64(limits.handshake_s))),
             traffic: traffic.clone(),
+            register: register.clone(),
             seat,
             gate,
         }
     }
 
     fn connection(self, transport: Transport, certificate: Option<Arc<[String]>>) -> Connection {
-        let Entry { address, calls, creations, deadline, traffic, seat, gate } = self;
+        let Entry { address, window, calls, creations, deadline, traffic, register, seat, gate } = self;
         debug!(%address, "connected");
+        let peer = Peer {
+            address,
+            certificate,
+            calls: Arc::new(calls),
+            creations: Arc::new(creations),
+            leases: Arc::default(),
+            gate,
+            seat,
+            callers: Arc::default(),
+        };
         Connection {
             transport,
-            peer: Peer { address, certificate, calls: Arc::new(calls), creations: Arc::new(creations), gate, seat },
             inward: Frames::default(),
             outward: Frames::of_server(),
             holdback: Holdback::default(),
             greeting: Some((GREETING_BYTES, deadline)),
             _open: traffic.open(),
             traffic,
+            number: register.enter(&peer),
+            register,
+            peer,
+            unyielded: 0,
+            _window: window,
         }
     }
 }
@@ -290,7 +370,19 @@ pub(super) struct Connection {
     /// Until so many bytes have come, it has so long.
     greeting: Option<(usize, Pin<Box<Sleep>>)>,
     traffic: Arc<Traffic>,
+    register: Arc<Register>,
+    number: u64,
+    /// Bytes since others had their turn.
+    unyielded: usize,
     _open: Open,
+    _window: Taken,
+}
+
+impl Drop for Connection {
+    fn drop(&mut self) {
+        lock(&self.register.0).1.remove(&self.number);
+        self.peer.leases.end();
+    }
 }
 
 impl Connection {
@@ -330,6 +422,11 @@ impl AsyncRead for Connection {
         let this = self.get_mut();
         this.check_open(cx)?;
         ready!(this.holdback.poll(&this.peer.gate, cx));
+        if this.unyielded >= BYTES_A_TURN {
+            this.unyielded = 0;
+            cx.waker().wake_by_ref();
+            return Poll::Pending;
+        }
         let before = buffer.filled().len();
         let polled = match &mut this.transport {
             Transport::Plain(stream) => Pin::new(stream).poll_read(cx, buffer),
@@ -340,6 +437,8 @@ impl AsyncRead for Connection {
         if let Some(cut) = this.inward.pass(came, Some(&this.peer.gate)) {
             this.traffic.cut(this.peer.address, "client", &cut);
         }
+        // Nothing waits: the others had their turn, or will.
+        this.unyielded = if polled.is_pending() { 0 } else { this.unyielded + came.len() };
         let Some((left, deadline)) = &mut this.greeting else { return polled };
         if polled.is_pending() {
             ready!(deadline.as_mut().poll(cx));

@@ -14,10 +14,12 @@ use tracing::{Instrument, info, info_span};
 use super::connections::Peer;
 use super::identity::{Access, Caller, Credentials, access};
 use super::metrics::Traffic;
+use super::price::Price;
 use super::reload::Reloaded;
 use super::request::{Inward, Pace};
 use super::revocation::{Calls, Shown};
-use super::workshop::Asker;
+use super::visitor::Visitor;
+use crate::budget::Budget;
 use crate::refusal::{Reason, Refusal, Result};
 
 /// Puts a [`Guard`] before a service.
@@ -29,6 +31,7 @@ pub(super) struct GuardLayer {
     /// For the messages of a call.
     pub(super) patience: Duration,
     pub(super) traffic: Arc<Traffic>,
+    pub(super) budget: Arc<Budget>,
     /// Nobody is asked who they are because nobody else can get here: then no page of another site may, either.
     pub(super) local_only: bool,
     /// Pages that may.
@@ -71,12 +74,6 @@ impl GuardLayer {
         let peer = request.extensions().get::<Peer>();
         peer.map_or(Ok(()), |peer| peer.calls.pass())?;
         self.identify(request, peer).map_err(|refusal| (refusal, Duration::ZERO))
-    }
-
-    /// On whose behalf the work of a call is done: who has shown who they are is one caller wherever they are.
-    fn asker<B>(&self, caller: &Caller, request: &Request<B>) -> Asker {
-        let peer = request.extensions().get::<Peer>().filter(|_| self.credentials.get().is_open());
-        peer.map_or_else(|| Asker::named(&caller.name), |peer| Asker::at(peer.address.ip()))
     }
 
     fn identify<B>(&self, request: &Request<B>, peer: Option<&Peer>) -> Result<Known> {
@@ -152,6 +149,7 @@ impl<S> Service<Request<Body>> for Guard<S>
 where
     S: Service<Request<Body>, Response = Response<Body>>,
     S::Future: Send + 'static,
+    S::Error: Send + 'static,
 {
     type Response = Response<Body>;
     type Error = S::Error;
@@ -164,25 +162,47 @@ where
     fn call(&mut self, mut request: Request<Body>) -> Self::Future {
         match self.layer.admit(&request) {
             Ok((caller, shown)) => {
-                let asker = self.layer.asker(&caller, &request);
-                request.extensions_mut().insert(asker);
                 // Who may not call is told that first.
                 if let Some(answer) = misdirected(&request) {
                     return Box::pin(async move { Ok(answer) });
                 }
+                let peer = request.extensions().get::<Peer>();
+                let name = Visitor::account_name(shown.is_some().then_some(&*caller.name), peer);
+                let account = self.layer.budget.account(&name);
+                if let Some(peer) = peer {
+                    peer.used_by(account.number());
+                }
+                let gate = peer.map(|peer| peer.gate.clone());
                 let pace = match request.uri().path() {
                     TOUCH => Pace::Own,
                     path if path.starts_with(REFLECTION) => Pace::Each(self.layer.patience),
                     _ => Pace::Whole(self.layer.patience),
                 };
-                let gate = request.extensions().get::<Peer>().map(|peer| peer.gate.clone());
+                let price = Price::of(request.uri().path(), &account);
+                let visitor = Visitor::new(account, &request);
+                request.extensions_mut().insert(visitor);
                 let call = shown.map(|(shown, version)| self.layer.calls.begin(shown, version));
                 let request = request.map(|body| Inward::body(body, call.clone(), gate, pace));
                 // In every line of the log that the call writes.
                 let span = info_span!("call", path = request.uri().path(), client = &*caller.name);
                 let answer = self.inner.call(request).instrument(span);
-                let Some(call) = call else { return Box::pin(answer) };
-                Box::pin(async move { Ok(answer.await?.map(|body| call.answer(body))) })
+                let traffic = self.layer.traffic.clone();
+                Box::pin(async move {
+                    let answer = match price {
+                        None => answer.await?,
+                        Some(price) => match price.answer(answer).await {
+                            Ok(answer) => answer?.map(|body| price.body(body)),
+                            Err(refusal) => {
+                                traffic.refused(refusal.reason);
+                                return Ok(Status::from(refusal).into_http());
+                            }
+                        },
+                    };
+                    Ok(match call {
+                        Some(call) => answer.map(|body| call.answer(body)),
+                        None => answer,
+                    })
+                })
             }
             Err((refusal, wait)) => {
                 let address = request.extensions().get::<Peer>().map(|peer| peer.address);

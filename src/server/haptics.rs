@@ -6,21 +6,24 @@ use std::sync::Arc;
 use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
-use futures_util::stream::{self, Stream, StreamExt};
+use futures_util::stream::{self, Stream};
 use tokio::sync::oneshot;
 use tokio_util::task::AbortOnDropHandle;
 use tonic::{Request, Response, Status, Streaming};
 use tracing::{Instrument, debug, info};
 
 use super::House;
+use super::connections::Peer;
+use super::cut::until_cut;
 use super::rate::Bucket;
-use super::workshop::{Asker, asker};
+use super::visitor::Visitor;
+use crate::budget::{Account, Resource, Taken};
 use crate::haptics::Law;
 use crate::haptics::device::{Device, UNDECLARED_FORCE_N};
 use crate::limits::Limits;
 use crate::pace::clock::now_ns;
 use crate::pace::queue::{Reader, Writer, queue};
-use crate::pace::{Live, PacedSample, StreamGuard, random_bits};
+use crate::pace::{Held, Live, PacedSample, StreamGuard, random_bits};
 use crate::refusal::{Reason, Refusal, number};
 use crate::scene::script::Action;
 use crate::session::command::{Command, LeaseId};
@@ -77,6 +80,15 @@ impl Drop for Hold {
     }
 }
 
+/// The end of a connection that may be shared, or cut without a word, says nothing of who holds a tool: a lease taken over
+/// one lasts no longer than this without a command or a renewal, s.
+const VANISHED_S: f64 = 10.0;
+
+/// So many tools for `account`.
+fn seats(account: &Account, tools: usize) -> Result<Vec<Taken>, Refusal> {
+    (0..tools).map(|_| account.take(Resource::Leases, 1, "tools")).collect()
+}
+
 fn lease_id(text: &str) -> Result<LeaseId, Refusal> {
     let wrong = |_| Refusal::new(Reason::NotHolder, "lease_id", "is none that this server gave");
     LeaseId::from_str_radix(text, 16).map_err(wrong)
@@ -102,7 +114,7 @@ fn misgivings(device: Device, law: &Law) -> Vec<String> {
 
 impl Haptics {
     /// Answers the first message of a haptic stream.
-    async fn open(&self, open: &pb::TouchOpen, asker: &Asker) -> Result<(Opened, Hold), Status> {
+    async fn open(&self, open: &pb::TouchOpen, account: &Account) -> Result<(Opened, Hold), Status> {
         let live = self.0.pacer.get(&open.session_id)?;
         let device = open.device.as_ref().map(wire::local::from_device).transpose()?;
         let tip = wire::command::from_tip(open.tip.as_ref());
@@ -115,15 +127,19 @@ impl Haptics {
             return Err(Refusal::new(Reason::Missing, "device", message).into());
         }
         sampling.touch_stiffness = open.touch_stiffness;
-        let guard = live.open_stream()?;
+        let held = if open.tools.is_empty() { Held::Nothing } else { Held::Tools };
+        let guard = live.open_stream("Touch", held, account)?;
         if device.is_some() {
             let live = live.clone();
-            sampling.law = Some(self.0.workshop.work(asker, move |stop| live.law(tip.radius_m, stop.flag())).await??);
+            sampling.law = Some(self.0.workshop.work(account, move |stop| live.law(tip.radius_m, stop.flag())).await??);
         }
         let lease_s = open.lease_s.unwrap_or(self.0.config.lease_s);
         let lease = random_bits()?;
+        let seats = seats(account, open.tools.len())?;
         let step = live.at_intake(|intake, now| {
-            intake.acquire(&open.tools, &open.holder, lease_s, lease, now).map(|()| intake.next_step())
+            intake.acquire(&open.tools, &open.holder, lease_s, lease, now)?;
+            intake.seat(lease, seats);
+            Ok::<_, Refusal>(intake.next_step())
         })?;
         let hold = Hold { live: live.clone(), lease, tools: open.tools.len(), device };
         let answer = pb::TouchOpened {
@@ -144,7 +160,7 @@ impl Haptics {
     async fn listen(
         self,
         mut inbound: Streaming<pb::TouchRequest>,
-        asker: Asker,
+        account: Account,
         opening: oneshot::Sender<Result<Opened, Status>>,
         events: Writer<Event>,
     ) {
@@ -158,7 +174,7 @@ impl Haptics {
         let mut early = Early::default();
         let first = match first {
             Ok(Some(pb::TouchRequest { message: Some(Message::Open(open)) })) => {
-                let opening = self.open(&open, &asker);
+                let opening = self.open(&open, &account);
                 early.gather(opening, &mut inbound, self.0.config.limits.queued_commands_per_tool).await
             }
             Ok(_) => Err(Refusal::new(Reason::OutOfTurn, "open", "the first message must be `open`").into()),
@@ -167,10 +183,11 @@ impl Haptics {
                 return;
             }
         };
-        let hold = match first {
+        let (hold, cut) = match first {
             Ok((opened, hold)) => {
+                let cut = opened.guard.cut().clone();
                 let _ = opening.send(Ok(opened));
-                hold
+                (hold, cut)
             }
             Err(status) => {
                 let _ = opening.send(Err(status));
@@ -187,7 +204,11 @@ impl Haptics {
         }
         live.count_refused(early.refused);
         loop {
-            match early.next(&mut inbound).await {
+            let message = tokio::select! {
+                message = early.next(&mut inbound) => message,
+                () = cut.cancelled() => return events.close(crate::pace::streams::cut()),
+            };
+            match message {
                 Ok(Some(pb::TouchRequest { message: Some(Message::Command(command)) })) => {
                     let now = now_ns();
                     let taken = bucket
@@ -368,12 +389,12 @@ impl HapticService for Haptics {
         &self,
         request: Request<Streaming<pb::TouchRequest>>,
     ) -> Result<Response<Self::TouchStream>, Status> {
+        let Visitor { account, .. } = Visitor::of(request.extensions());
         let (writer, events) = queue(self.0.config.limits.queued_samples);
         // The client may wait for our headers before it opens, so its first message is not waited for here.
         let (opened, opening) = oneshot::channel();
-        let asker = asker(&request);
         let listening =
-            tokio::spawn(self.clone().listen(request.into_inner(), asker, opened, writer).in_current_span());
+            tokio::spawn(self.clone().listen(request.into_inner(), account, opened, writer).in_current_span());
         let _listening = AbortOnDropHandle::new(listening);
         Ok(Response::new(Box::pin(Output { stage: Stage::Opening(opening, Some(events)), _listening })))
     }
@@ -382,11 +403,24 @@ impl HapticService for Haptics {
         &self,
         request: Request<pb::AcquireToolRequest>,
     ) -> Result<Response<pb::AcquireToolResponse>, Status> {
+        let Visitor { account, may_vanish } = Visitor::of(request.extensions());
+        let peer = request.extensions().get::<Peer>().cloned();
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
-        let lease_s = request.lease_s.unwrap_or(self.0.config.lease_s);
+        let mut lease_s = request.lease_s.unwrap_or(self.0.config.lease_s);
+        if may_vanish && !request.outlives_connection && lease_s > VANISHED_S {
+            lease_s = VANISHED_S;
+        }
         let lease = random_bits()?;
-        live.at_intake(|intake, now| intake.acquire(&[request.tool], &request.holder, lease_s, lease, now))?;
+        let seats = seats(&account, 1)?;
+        live.at_intake(|intake, now| {
+            intake.acquire(&[request.tool], &request.holder, lease_s, lease, now)?;
+            intake.seat(lease, seats);
+            Ok::<_, Refusal>(())
+        })?;
+        if let Some(peer) = peer.filter(|_| !may_vanish && !request.outlives_connection) {
+            peer.leases.add(&live, lease);
+        }
         info!(session = %live.id, tool = request.tool, holder = ?request.holder, "tool acquired");
         Ok(Response::new(pb::AcquireToolResponse { lease_id: format!("{lease:032x}"), lease_s }))
     }
@@ -434,11 +468,13 @@ impl HapticService for Haptics {
         &self,
         request: Request<pb::WatchSamplesRequest>,
     ) -> Result<Response<Self::WatchSamplesStream>, Status> {
+        let Visitor { account, .. } = Visitor::of(request.extensions());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
         let (every, deadband) = (request.sample_every_steps, request.deadband.as_ref());
         let sampling = wire::sample::sampling(every, None, deadband, request.heartbeat_s, false)?;
-        let guard = live.open_stream()?;
+        let guard = live.open_stream("WatchSamples", Held::Nothing, &account)?;
+        let cut = guard.cut().clone();
         let samples = live.samples(sampling);
         let out = stream::unfold(Some((samples, guard)), |state| async move {
             let (mut samples, guard) = state?;
@@ -450,11 +486,12 @@ impl HapticService for Haptics {
                 Err(refusal) => (Err(refusal.into()), None),
             })
         });
-        Ok(Response::new(Box::pin(out)))
+        Ok(Response::new(until_cut(out, cut)))
     }
 
     async fn probe(&self, request: Request<pb::ProbeRequest>) -> Result<Response<Self::ProbeStream>, Status> {
         use pb::probe_request::Where;
+        let Visitor { account, .. } = Visitor::of(request.extensions());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
         let every = wire::every("every_steps", request.every_steps)?;
@@ -476,20 +513,22 @@ impl HapticService for Haptics {
             Some(Where::AllPoints(true)) => None,
             _ => return Err(Refusal::new(Reason::Missing, "where", "points or all_points is missing").into()),
         };
-        let guard = live.open_stream()?;
-        let records = live.probe(every, points, request.energy);
-        let state = Some((records, guard, VecDeque::new()));
-        let out = stream::unfold(state, |state| async move {
-            let (mut records, guard, mut messages) = state?;
-            if messages.is_empty() {
-                match records.pop().await {
-                    Ok((record, dropped)) => messages.extend(wire::sample::record(&record, dropped)),
+        let guard = live.open_stream("Probe", Held::Nothing, &account)?;
+        let cut = guard.cut().clone();
+        let records = live.probe(every, points, request.energy, &account);
+        let out = stream::unfold(Some((records, guard, None)), |state| async move {
+            let (mut records, guard, begun) = state?;
+            let (record, dropped, part) = match begun {
+                Some(begun) => begun,
+                None => match records.pop().await {
+                    Ok((record, dropped)) => (record, dropped, 0),
                     Err(refusal) => return Some((Err(refusal.into()), None)),
-                }
-            }
-            let message: pb::ProbeResponse = messages.pop_front()?;
-            Some((Ok(message), Some((records, guard, messages))))
+                },
+            };
+            let message = wire::sample::record(&record, dropped, part)?;
+            let begun = (!message.last).then_some((record, dropped, part + 1));
+            Some((Ok(message), Some((records, guard, begun))))
         });
-        Ok(Response::new(out.boxed()))
+        Ok(Response::new(until_cut(out, cut)))
     }
 }

@@ -25,6 +25,7 @@ use super::connections::{self, Connection, Seats};
 use super::identity::CALLS;
 use super::transport::Cut;
 use super::workshop::Workshop;
+use crate::budget::{Budget, Purpose, Resource};
 use crate::limits::Limits;
 use crate::pace::queue::lock;
 use crate::pace::tally::{Count, Tally, Times};
@@ -256,6 +257,13 @@ impl Collector for Stepping {
             let count = statuses.iter().filter(|status| is(status)).count();
             states.encode_family(&[("state", name)])?.encode_gauge(&(count as i64))?;
         }
+        let budget = &pacer.budget;
+        let help = "Memory that is taken, by what it is for";
+        let mut taken = encoder.encode_descriptor("memory_taken", help, Some(&Unit::Bytes), MetricType::Gauge)?;
+        for purpose in Purpose::ALL {
+            let bytes = budget.bytes_for(purpose) as i64;
+            taken.encode_family(&[("for", purpose.name())])?.encode_gauge(&bytes)?;
+        }
         let mut gauge = |name: &str, help: &str, value: f64| {
             let gauge = ConstGauge::new(value);
             gauge.encode(encoder.encode_descriptor(name, help, None, MetricType::Gauge)?)
@@ -263,6 +271,9 @@ impl Collector for Stepping {
         let points: usize = sessions.iter().map(|live| live.model.len()).sum();
         let awake: usize = statuses.iter().map(|status| status.awake_points).sum();
         let streams: usize = sessions.iter().map(|live| live.streams()).sum();
+        gauge("memory_budget_bytes", "Memory that there is for callers", budget.bytes() as f64)?;
+        gauge("callers", "Callers that have something, or are there", budget.accounts().len() as f64)?;
+        gauge("held_tools", "Tools that are held", budget.taken(Resource::Leases) as f64)?;
         gauge("points", "Mass points of all sessions", points as f64)?;
         gauge("awake_points", "Mass points that the last steps of all sessions computed", awake as f64)?;
         gauge("streams", "Streams that read a session", streams as f64)?;
@@ -307,6 +318,7 @@ impl axum::serve::Listener for Scrapers {
 pub(super) async fn serve(
     listener: TcpListener,
     limits: &Limits,
+    budget: Arc<Budget>,
     registry: Registry,
     shutdown: CancellationToken,
 ) -> io::Result<()> {
@@ -325,7 +337,7 @@ pub(super) async fn serve(
     let seats = Arc::new(Seats::new(&limits, Some(SCRAPERS)));
     // What the server's clients do is counted elsewhere.
     let address = listener.local_addr()?;
-    let connections = connections::incoming(listener, None, seats, &limits, Arc::default());
+    let connections = connections::incoming(listener, None, seats, &limits, budget, Arc::default(), Arc::default());
     let router = Router::new().route("/metrics", get(told));
     let serving = axum::serve(Scrapers(address, Box::pin(connections)), router);
     serving.with_graceful_shutdown(shutdown.cancelled_owned()).await

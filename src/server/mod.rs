@@ -1,15 +1,19 @@
 //! The server: gRPC services over `pace`, for browsers too (gRPC-web), their page, health, reflection, and a shutdown
 //! with a deadline.
 
+mod admin;
 pub mod catalog;
 pub mod config;
 mod connections;
+mod cut;
 mod descriptors;
 mod guard;
 mod haptics;
 pub mod identity;
+mod leases;
 mod metrics;
 mod page;
+mod price;
 mod protection;
 mod rate;
 mod reload;
@@ -21,6 +25,7 @@ mod tls;
 mod transport;
 mod validity;
 mod views;
+mod visitor;
 mod workshop;
 
 use std::net::SocketAddr;
@@ -38,6 +43,7 @@ use tonic_web::GrpcWebLayer;
 use tower_http::cors::CorsLayer;
 use tracing::{info, warn};
 
+use crate::budget::{Budget, give_back_to_the_system};
 use crate::pace::Pacer;
 use crate::refusal::{Reason, Refusal};
 use crate::wire::pb;
@@ -47,6 +53,7 @@ use connections::Seats;
 use guard::GuardLayer;
 use http::{HeaderName, HeaderValue, Method, header};
 use metrics::Traffic;
+use pb::admin_service_server::AdminServiceServer;
 use pb::haptic_service_server::HapticServiceServer;
 use pb::session_service_server::SessionServiceServer;
 use pb::view_service_server::ViewServiceServer;
@@ -137,6 +144,9 @@ fn cors(origins: &[HeaderValue]) -> CorsLayer {
         .expose_headers(read)
         .max_age(Duration::from_secs(3600))
 }
+
+/// Bytes that were taken and are free again: then the allocator is asked to give what it keeps back to the system.
+const WORTH_GIVING_BACK: u64 = 16 << 20;
 
 /// Why a server could not run.
 #[derive(Debug, thiserror::Error)]
@@ -247,7 +257,9 @@ async fn report_workshop(workshop: Workshop, health: HealthReporter) {
 /// deadline of the configuration has passed. The caller ends its runtime without waiting (`shutdown_background`).
 pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) -> Result<(), ServeError> {
     let Doors { listener, metrics, protection } = doors;
-    let pacer = Pacer::start(config.stepping_threads(), config.audit_share, &config.limits)?;
+    let budget = Budget::new(&config.limits, config.stepping_threads(), config.serving_threads());
+    info!(bytes = budget.bytes(), "memory to share");
+    let pacer = Pacer::start(config.stepping_threads(), config.audit_share, &config.limits, budget.clone())?;
     let deadline = Duration::from_secs_f64(config.shutdown_deadline_s);
     let catalog = Catalog::new(&config.scenes, &config.scripts);
     for name in catalog.names() {
@@ -263,8 +275,8 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
     let workshop = Workshop::open("workshop", &limits)?;
     if let Some(listener) = metrics {
         let registry = metrics::registry(&pacer, &traffic, &workshop);
-        let (limits, shutdown) = (limits.clone(), shutdown.clone());
-        tokio::spawn(async move { metrics::serve(listener, &limits, registry, shutdown).await });
+        let (limits, budget, shutdown) = (limits.clone(), budget.clone(), shutdown.clone());
+        tokio::spawn(async move { metrics::serve(listener, &limits, budget, registry, shutdown).await });
     }
     let open = protection.credentials.get().is_open();
     if config.insecure && open {
@@ -277,6 +289,7 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
         calls: calls.clone(),
         patience: Duration::from_secs_f64(limits.open_s),
         traffic: traffic.clone(),
+        budget: budget.clone(),
         local_only: open && !config.insecure,
         origins: origins.clone(),
     };
@@ -301,7 +314,8 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
     };
 
     let reporting = report_workshop(workshop, health.clone());
-    let unused = pacer.clone();
+    let (unused, memory) = (pacer.clone(), budget.clone());
+    let mut most_bytes = 0;
     let sweeping = async move {
         let mut sweep = tokio::time::interval(Duration::from_secs(1));
         loop {
@@ -309,18 +323,28 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
             for session in unused.delete_idle() {
                 info!(session, "session deleted: nobody used it");
             }
+            let bytes = memory.bytes_taken();
+            most_bytes = most_bytes.max(bytes);
+            if most_bytes - bytes >= WORTH_GIVING_BACK {
+                most_bytes = bytes;
+                let _ = tokio::task::spawn_blocking(give_back_to_the_system).await;
+            }
         }
     };
 
     // Who has not shown who they are leaves half of the room to others.
     let strangers = (!open).then_some(limits.connections.div_ceil(2));
     let seats = Arc::new(Seats::new(&limits, strangers));
-    let incoming = connections::incoming(listener, protection.tls.clone(), seats, &limits, traffic);
+    let register = Arc::new(connections::Register::default());
+    let tls = protection.tls.clone();
+    let incoming = connections::incoming(listener, tls, seats, &limits, budget.clone(), traffic, register.clone());
     let silence = Some(Duration::from_secs_f64(limits.keepalive_s));
     let bytes = limits.message_bytes;
     let (folder, painter) = (Arc::new(house.config.viewer.clone()), house.clone());
     let sessions = SessionServiceServer::new(sessions::Sessions(house.clone())).max_decoding_message_size(bytes);
     let haptics = HapticServiceServer::new(haptics::Haptics(house.clone())).max_decoding_message_size(bytes);
+    let admin =
+        AdminServiceServer::new(admin::Admin { house: house.clone(), register }).max_decoding_message_size(bytes);
     let views = ViewServiceServer::new(views::Views(house)).max_decoding_message_size(bytes);
     let routes = Routes::new(health_service)
         .add_service(reflection().build_v1()?)
@@ -328,6 +352,7 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
         .add_service(sessions)
         .add_service(haptics)
         .add_service(views)
+        .add_service(admin)
         .into_axum_router()
         // Of the services alone: it refuses what is no gRPC.
         .route_layer(GrpcWebLayer::new())

@@ -2,6 +2,7 @@
 
 use std::pin::Pin;
 use std::sync::Arc;
+use std::time::Duration;
 
 use futures_util::stream::{self, Stream};
 use tonic::{Request, Response, Status};
@@ -9,7 +10,12 @@ use tracing::{info, warn};
 
 use super::House;
 use super::connections::Peer;
-use super::workshop::{Stop, asker};
+use super::cut::until_cut;
+use super::visitor::Visitor;
+use super::workshop::Stop;
+use crate::budget::Work;
+use crate::pace::Held;
+use crate::pace::clock::now_ns;
 use crate::refusal::{Reason, Refusal, number};
 use crate::scene::script::Script;
 use crate::wire::pb::session_service_server::SessionService;
@@ -38,7 +44,7 @@ impl SessionService for Sessions {
             tokio::time::sleep(wait).await;
             return Err(refusal.into());
         }
-        let asker = asker(&request);
+        let Visitor { account, .. } = Visitor::of(request.extensions());
         let request = request.into_inner();
         let scene = match &request.source {
             Some(Source::SceneName(name)) => self.0.catalog.load(name, &[], &self.0.config.limits)?,
@@ -51,8 +57,9 @@ impl SessionService for Sessions {
         number("idle_timeout_s", idle_timeout_s, &range, |value| value > 0.0 && value <= most_s)?;
         // A large sheet takes a while to lay out.
         let pacer = self.0.pacer.clone();
-        let create = move |_: &Stop| pacer.create(&scene, request.paused, idle_timeout_s);
-        let live = self.0.workshop.work(&asker, create).await??;
+        let payer = account.clone();
+        let create = move |_: &Stop| pacer.create(&scene, request.paused, idle_timeout_s, &payer);
+        let live = self.0.workshop.work(&account, create).await??;
         info!(session = %live.id, scene = %live.model.scene.name, points = live.model.len(), "session created");
         for warning in &live.model.warnings {
             warn!(session = %live.id, warning);
@@ -101,12 +108,12 @@ impl SessionService for Sessions {
         &self,
         request: Request<pb::UpdateTissueRequest>,
     ) -> Result<Response<pb::UpdateTissueResponse>, Status> {
-        let asker = asker(&request);
+        let Visitor { account, .. } = Visitor::of(request.extensions());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
-        let (change, to_change) = (wire::scene::from_change(&request), live.clone());
-        let change = move |_: &Stop| to_change.change(&change, request.at_step);
-        let (step, model) = self.0.workshop.work(&asker, change).await??;
+        let (change, to_change, pacer) = (wire::scene::from_change(&request), live.clone(), self.0.pacer.clone());
+        let change = move |_: &Stop| pacer.change_tissue(&to_change, &change, request.at_step);
+        let (step, model) = self.0.workshop.work(&account, change).await??;
         info!(
             session = %live.id,
             step,
@@ -134,9 +141,15 @@ impl SessionService for Sessions {
         &self,
         request: Request<pb::GetStateHashRequest>,
     ) -> Result<Response<pb::GetStateHashResponse>, Status> {
+        let Visitor { account, .. } = Visitor::of(request.extensions());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
-        let (step, hash) = live.hash_at(request.at_step).await?;
+        // A hash that is asked for now waits for its caller's part; one of a step to come must be taken there.
+        let wait_ns = account.must_wait_ns(Work::Reading, now_ns());
+        if request.at_step.is_none() && wait_ns > 0 {
+            tokio::time::sleep(Duration::from_nanos(wait_ns)).await;
+        }
+        let (step, hash) = live.hash_at(request.at_step, &account).await?;
         Ok(Response::new(pb::GetStateHashResponse { step, state_hash: format!("{hash:032x}") }))
     }
 
@@ -151,20 +164,21 @@ impl SessionService for Sessions {
         &self,
         request: Request<pb::GetScriptRequest>,
     ) -> Result<Response<Self::GetScriptStream>, Status> {
-        let asker = asker(&request);
+        let Visitor { account, .. } = Visitor::of(request.extensions());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
-        let guard = live.open_stream()?;
+        let guard = live.open_stream("GetScript", Held::Nothing, &account)?;
+        let cut = guard.cut().clone();
         let (catalog, config) = (self.0.catalog.clone(), self.0.config.clone());
         // A script may have traces of megabytes.
         let read = move |_: &Stop| catalog.script(&request.script_name, &live.model.scene, &config.limits);
-        let script = self.0.workshop.work(&asker, read).await??;
+        let script = self.0.workshop.work(&account, read).await??;
         let out = stream::unfold(Some((script, 0, guard)), |state| async move {
             let (script, from, guard) = state?;
             let (message, next) = script_part(&script, from);
             Some((Ok(message), next.map(|next| (script, next, guard))))
         });
-        Ok(Response::new(Box::pin(out)))
+        Ok(Response::new(until_cut(out, cut)))
     }
 }
 

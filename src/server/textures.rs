@@ -7,21 +7,28 @@ use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
 use tonic::Status;
 
-use super::workshop::{Asker, Workshop};
+use super::workshop::Workshop;
 use super::{House, page};
+use crate::budget::{Purpose, Resource, Taken};
 use crate::limits::Limits;
 use crate::pace::queue::lock;
 use crate::refusal::Refusal;
 use crate::scene::Appearance;
 use crate::texture::{Texture, texture};
 
+/// The account on which they are made and kept: what is kept serves whoever asks next.
+const EVERYBODY: &str = "textures";
+
 /// Textures that a server keeps.
 const MOST_KEPT: usize = 8;
+
+/// While it is painted.
+const BYTES_PER_PIXEL: u64 = 16;
 
 /// The textures last asked for, the newest last.
 #[derive(Clone)]
 pub(crate) struct Textures {
-    kept: Arc<Mutex<Vec<(Appearance, Texture)>>>,
+    kept: Arc<Mutex<Vec<(Appearance, Texture, Taken)>>>,
     /// Of their own: a texture may take a second, and nobody who wants a session waits for that.
     workshop: Workshop,
 }
@@ -48,7 +55,8 @@ impl House {
     pub(crate) async fn texture(&self, name: &str) -> Result<Texture, Status> {
         let (house, name) = (self.clone(), name.to_owned());
         // One at a time: the next may be the same.
-        Ok(self.textures.workshop.work(&Asker::anybody(), move |_| house.find_texture(&name)).await??)
+        let everybody = self.pacer.budget.account(EVERYBODY);
+        Ok(self.textures.workshop.work(&everybody, move |_| house.find_texture(&name)).await??)
     }
 
     fn find_texture(&self, name: &str) -> Result<Texture, Refusal> {
@@ -59,14 +67,20 @@ impl House {
             _ => self.catalog.load(name, &[], limits)?.appearance,
         };
         let mut kept = lock(&self.textures.kept);
-        if let Some((_, texture)) = kept.iter().find(|entry| entry.0 == appearance) {
+        if let Some((_, texture, _)) = kept.iter().find(|entry| entry.0 == appearance) {
             return Ok(texture.clone());
         }
-        let texture = texture(&appearance, limits)?;
+        // What is kept serves whoever asks next: nobody pays for it alone.
+        let account = self.pacer.budget.account(EVERYBODY);
+        let side = u64::from(appearance.texture_size);
         if kept.len() == MOST_KEPT {
             kept.remove(0);
         }
-        kept.push((appearance, texture.clone()));
+        let mut taken =
+            account.take(Resource::Memory(Purpose::Textures), side * side * BYTES_PER_PIXEL, "texture_size")?;
+        let texture = texture(&appearance, limits)?;
+        taken.shrink_to(texture.png.len() as u64);
+        kept.push((appearance, texture.clone(), taken));
         Ok(texture)
     }
 }

@@ -9,8 +9,10 @@ use tonic::{Request, Response, Status};
 use tracing::info;
 
 use super::House;
+use super::cut::until_cut;
+use super::visitor::Visitor;
 use crate::pace::frames::Viewer;
-use crate::pace::{FrameReader, StreamGuard, random_id};
+use crate::pace::{FrameReader, Held, StreamGuard, random_id};
 use crate::refusal::{Reason, Refusal, number};
 use crate::surface::{Encoding, Refinement};
 use crate::texture::Texture;
@@ -65,23 +67,27 @@ impl ViewService for Views {
     type WatchFramesStream = Out<pb::WatchFramesResponse>;
 
     async fn get_mesh(&self, request: Request<pb::GetMeshRequest>) -> Result<Response<Self::GetMeshStream>, Status> {
+        let Visitor { account, .. } = Visitor::of(request.extensions());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
         let grid = Refinement::new(live.model.points, request.refinement, &self.0.config.limits)?;
-        let guard = live.open_stream()?;
+        let guard = live.open_stream("GetMesh", Held::Nothing, &account)?;
+        let cut = guard.cut().clone();
         let spacing_m = grid.spacing_m(live.model.scene.sheet.spacing_m);
         let out = stream::unfold((0, guard), move |(part, guard)| async move {
             mesh_part(grid, spacing_m, part).map(|message| (Ok(message), (part + 1, guard)))
         });
-        Ok(Response::new(Box::pin(out)))
+        Ok(Response::new(until_cut(out, cut)))
     }
 
     async fn get_texture(
         &self,
         request: Request<pb::GetTextureRequest>,
     ) -> Result<Response<Self::GetTextureStream>, Status> {
+        let Visitor { account, .. } = Visitor::of(request.extensions());
         let request = request.into_inner();
-        let guard = self.0.pacer.get(&request.session_id)?.open_stream()?;
+        let guard = self.0.pacer.get(&request.session_id)?.open_stream("GetTexture", Held::Nothing, &account)?;
+        let cut = guard.cut().clone();
         let Texture { png, etag } = self.0.texture(&request.session_id).await?;
         let png = if etag == request.known_etag { Bytes::new() } else { png };
         // Even of nothing there is one part.
@@ -93,13 +99,14 @@ impl ViewService for Views {
             let message = pb::GetTextureResponse { png: part, etag: etag.clone(), last };
             Some((Ok(message), (!last).then_some((png, etag, guard))))
         });
-        Ok(Response::new(Box::pin(out)))
+        Ok(Response::new(until_cut(out, cut)))
     }
 
     async fn watch_frames(
         &self,
         request: Request<pb::WatchFramesRequest>,
     ) -> Result<Response<Self::WatchFramesStream>, Status> {
+        let Visitor { account, .. } = Visitor::of(request.extensions());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
         let grid = Refinement::new(live.model.points, request.refinement, &self.0.config.limits)?;
@@ -118,7 +125,8 @@ impl ViewService for Views {
         if let Some(most) = request.max_frames_in_flight {
             number("max_frames_in_flight", f64::from(most), "from 1 to 64", |v| (1.0..=64.0).contains(&v))?;
         }
-        let guard = live.open_stream()?;
+        let guard = live.open_stream("WatchFrames", Held::Nothing, &account)?;
+        let cut = guard.cut().clone();
         let room = self.0.config.limits.queued_bytes;
         let viewer_id = random_id()?;
         let (viewer, reader) = Viewer::new(
@@ -129,12 +137,13 @@ impl ViewService for Views {
             request.always_full,
             request.max_frames_in_flight,
             room,
-        );
+            &account,
+        )?;
         self.0.pacer.add_viewer(&live, &viewer);
         info!(session = %live.id, refinement = request.refinement, ?encoding, rate_hz, "viewer joined");
         let frames = Frames { viewer_id, reader, _guard: guard, messages: VecDeque::new(), last: None, skipped: 0 };
         let out = stream::unfold(Some(frames), |frames| async move { frames?.next().await });
-        Ok(Response::new(Box::pin(out)))
+        Ok(Response::new(until_cut(out, cut)))
     }
 
     async fn acknowledge_frames(

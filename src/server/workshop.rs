@@ -4,7 +4,6 @@
 //! piece. What nobody waits for any more is not begun, and is told to end.
 
 use std::collections::VecDeque;
-use std::net::IpAddr;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
@@ -13,6 +12,7 @@ use std::time::Duration;
 use tokio::sync::oneshot;
 use tonic::Status;
 
+use crate::budget::Account;
 use crate::limits::Limits;
 use crate::pace::clock::now_ns;
 use crate::pace::priority::give_way;
@@ -21,35 +21,6 @@ use crate::refusal::{Reason, Refusal};
 
 /// Threads of a workshop.
 const THREADS: usize = 2;
-
-/// On whose behalf work is done: a name of the file of tokens, or an address.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Asker(Arc<str>);
-
-impl Asker {
-    /// Whoever is known by that name.
-    pub(crate) fn named(name: &Arc<str>) -> Self {
-        Asker(name.clone())
-    }
-
-    /// Whoever is at an address; of IPv6, in a network of 64 bits.
-    pub(crate) fn at(address: IpAddr) -> Self {
-        Asker(match address.to_canonical() {
-            IpAddr::V4(address) => address.to_string().into(),
-            IpAddr::V6(address) => format!("{:x}", address.to_bits() >> 64).into(),
-        })
-    }
-
-    /// Everybody together.
-    pub(crate) fn anybody() -> Self {
-        Asker("".into())
-    }
-}
-
-/// On whose behalf a request is to be served: the guard has said.
-pub(crate) fn asker<T>(request: &tonic::Request<T>) -> Asker {
-    request.extensions().get().cloned().unwrap_or_else(Asker::anybody)
-}
 
 /// Tells work whether anybody still waits for it.
 #[derive(Debug, Clone, Default)]
@@ -70,30 +41,30 @@ struct Piece {
 
 #[derive(Default)]
 struct Shop {
-    /// By who asks, in the order of their turns; nobody without work.
-    waiting: VecDeque<(Asker, VecDeque<Piece>)>,
+    /// By the number of the account, in the order of their turns; nobody without work.
+    waiting: VecDeque<(u64, VecDeque<Piece>)>,
     /// For whom something is done, and since when it was asked for.
-    working: Vec<(Asker, u64)>,
+    working: Vec<(u64, u64)>,
     pieces: u64,
     is_closed: bool,
 }
 
 impl Shop {
     /// The first of the next caller for whom nothing is being done.
-    fn next(&mut self) -> Option<(Asker, Piece)> {
-        let is_free = |asker: &Asker| !self.working.iter().any(|busy| busy.0 == *asker);
-        let turn = self.waiting.iter().position(|(asker, _)| is_free(asker))?;
-        let (asker, mut pieces) = self.waiting.remove(turn)?;
+    fn next(&mut self) -> Option<(u64, Piece)> {
+        let is_free = |account: u64| !self.working.iter().any(|busy| busy.0 == account);
+        let turn = self.waiting.iter().position(|(account, _)| is_free(*account))?;
+        let (account, mut pieces) = self.waiting.remove(turn)?;
         let piece = pieces.pop_front()?;
         if !pieces.is_empty() {
-            self.waiting.push_back((asker.clone(), pieces));
+            self.waiting.push_back((account, pieces));
         }
-        self.working.push((asker.clone(), piece.asked_ns));
-        Some((asker, piece))
+        self.working.push((account, piece.asked_ns));
+        Some((account, piece))
     }
 
-    fn remove(&mut self, asker: &Asker, number: u64) {
-        if let Some((_, pieces)) = self.waiting.iter_mut().find(|waiting| waiting.0 == *asker) {
+    fn remove(&mut self, account: u64, number: u64) {
+        if let Some((_, pieces)) = self.waiting.iter_mut().find(|waiting| waiting.0 == account) {
             pieces.retain(|piece| piece.number != number);
         }
         self.waiting.retain(|waiting| !waiting.1.is_empty());
@@ -111,11 +82,11 @@ impl Bench {
     fn work(&self) {
         let mut shop = lock(&self.shop);
         loop {
-            if let Some((asker, piece)) = shop.next() {
+            if let Some((account, piece)) = shop.next() {
                 drop(shop);
                 (piece.work)();
                 shop = lock(&self.shop);
-                if let Some(done) = shop.working.iter().position(|busy| busy.0 == asker) {
+                if let Some(done) = shop.working.iter().position(|busy| busy.0 == account) {
                     shop.working.swap_remove(done);
                 }
                 // Its next piece may be begun by any thread.
@@ -142,7 +113,7 @@ impl Drop for Door {
 /// Whoever waits for a piece. When they are gone it is not begun, and ends soon if it was.
 struct Waiting {
     bench: Arc<Bench>,
-    asker: Asker,
+    account: u64,
     number: u64,
     stop: Stop,
 }
@@ -150,7 +121,7 @@ struct Waiting {
 impl Drop for Waiting {
     fn drop(&mut self) {
         self.stop.0.store(true, Ordering::Relaxed);
-        lock(&self.bench.shop).remove(&self.asker, self.number);
+        lock(&self.bench.shop).remove(self.account, self.number);
     }
 }
 
@@ -186,11 +157,11 @@ impl Workshop {
         Ok(Workshop(door))
     }
 
-    /// Does `work` when it is the turn of `asker`. Who hangs up before that is passed over; who hangs up later sets the
+    /// Does `work` when it is the turn of `account`. Who hangs up before that is passed over; who hangs up later sets the
     /// flag that `work` is given, and so does the deadline.
     pub(crate) async fn work<T: Send + 'static>(
         &self,
-        asker: &Asker,
+        account: &Account,
         work: impl FnOnce(&Stop) -> T + Send + 'static,
     ) -> Result<T, Status> {
         let (done, result) = oneshot::channel();
@@ -201,7 +172,7 @@ impl Workshop {
                 let _ = done.send(answer);
             }
         };
-        let _waiting = self.put(asker, stop, Box::new(work))?;
+        let _waiting = self.put(account.number(), stop, Box::new(work))?;
         match tokio::time::timeout(self.0.0.deadline, result).await {
             Ok(Ok(answer)) => Ok(answer),
             Ok(Err(_)) => Err(Status::internal("a fault of the program ended what was asked for")),
@@ -212,23 +183,23 @@ impl Workshop {
         }
     }
 
-    fn put(&self, asker: &Asker, stop: Stop, work: Box<dyn FnOnce() + Send>) -> Result<Waiting, Refusal> {
+    fn put(&self, account: u64, stop: Stop, work: Box<dyn FnOnce() + Send>) -> Result<Waiting, Refusal> {
         let bench = &self.0.0;
         let mut shop = lock(&bench.shop);
         let number = shop.pieces;
         shop.pieces += 1;
         let piece = Piece { number, asked_ns: now_ns(), work };
-        match shop.waiting.iter_mut().find(|waiting| waiting.0 == *asker) {
+        match shop.waiting.iter_mut().find(|waiting| waiting.0 == account) {
             Some((_, pieces)) if pieces.len() >= bench.most_waiting => {
                 let message =
                     format!("{} pieces of work of this caller wait already (limits.queued_work)", pieces.len());
                 return Err(Refusal::new(Reason::Overloaded, "", message));
             }
             Some((_, pieces)) => pieces.push_back(piece),
-            None => shop.waiting.push_back((asker.clone(), VecDeque::from([piece]))),
+            None => shop.waiting.push_back((account, VecDeque::from([piece]))),
         }
         bench.more.notify_one();
-        Ok(Waiting { bench: bench.clone(), asker: asker.clone(), number, stop })
+        Ok(Waiting { bench: bench.clone(), account, number, stop })
     }
 
     /// How much there is to do.
@@ -246,19 +217,21 @@ impl Workshop {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::budget::Budget;
     use std::sync::mpsc;
 
     fn workshop(limits: Limits) -> Workshop {
         Workshop::open("test", &limits).unwrap()
     }
 
-    fn asker(name: &str) -> Asker {
-        Asker(name.into())
+    fn accounts<const N: usize>(names: [&str; N]) -> [Account; N] {
+        let budget = Budget::new(&Limits::default(), 1, 1);
+        names.map(|name| budget.account(name))
     }
 
     #[tokio::test]
     async fn work_of_one_caller_is_done_in_order_whatever_becomes_of_a_piece() {
-        let (workshop, one) = (workshop(Limits::default()), asker("one"));
+        let (workshop, [one]) = (workshop(Limits::default()), accounts(["one"]));
         let faulty = workshop.work(&one, |_| -> u32 { panic!("a test") }).await;
         assert_eq!(faulty.unwrap_err().code(), tonic::Code::Internal);
         let order = Arc::new(Mutex::new(Vec::new()));
@@ -273,7 +246,7 @@ mod tests {
 
     #[tokio::test]
     async fn one_callers_endless_work_does_not_stop_anothers_and_ends_when_it_is_given_up() {
-        let (workshop, greedy, other) = (workshop(Limits::default()), asker("greedy"), asker("other"));
+        let (workshop, [greedy, other]) = (workshop(Limits::default()), accounts(["greedy", "other"]));
         let (ended, end) = mpsc::channel();
         let endless = |ended: mpsc::Sender<()>| {
             move |stop: &Stop| {
@@ -311,7 +284,7 @@ mod tests {
     #[tokio::test]
     async fn what_waits_is_bounded_and_has_a_deadline() {
         let limits = Limits { queued_work: 2, work_s: 0.2, ..Limits::default() };
-        let (workshop, one) = (workshop(limits), asker("one"));
+        let (workshop, [one]) = (workshop(limits), accounts(["one"]));
         let (release, gate) = mpsc::channel::<()>();
         // Deaf to the flag.
         let stuck = workshop.work(&one, move |_| gate.recv().is_err());

@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
 use super::schedule::Schedule;
+use crate::budget::{Account, Purpose, Resource, Taken};
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, positive};
 use crate::scene::Scene;
@@ -57,6 +58,8 @@ struct Lease {
     waiting: usize,
     /// Place of the tool's newest command in the queue.
     last_place: Option<Place>,
+    /// Counts it among those of who holds it.
+    seat: Option<Taken>,
 }
 
 /// Place in the queue: step, then order of arrival.
@@ -129,8 +132,13 @@ pub struct Intake {
     limits: Limits,
     leases: BTreeMap<u32, Lease>,
     queue: BTreeMap<Place, Due>,
-    /// Changes of tissue that wait for their step, by ascending step.
-    changes: VecDeque<(u64, Arc<Model>)>,
+    /// Of those, commands of clients: counted as they come and go, for whoever asks.
+    waiting: u64,
+    /// Changes of tissue that wait for their step, by ascending step, and the memory of each.
+    changes: VecDeque<(u64, Arc<Model>, Option<Taken>)>,
+    /// Who pays for what waits here, and what was taken for commands.
+    account: Option<Account>,
+    taken: Option<Taken>,
     /// The last change accepted, if there was one.
     changed_to: Option<Arc<Model>>,
     arrivals: u64,
@@ -154,7 +162,10 @@ impl Intake {
             limits: limits.clone(),
             leases: BTreeMap::new(),
             queue: BTreeMap::new(),
+            waiting: 0,
             changes: VecDeque::new(),
+            account: None,
+            taken: None,
             changed_to: None,
             arrivals: 0,
             next_step: 0,
@@ -164,6 +175,30 @@ impl Intake {
             lapsed: 0,
             counts: Counts::default(),
             closed: None,
+        }
+    }
+
+    /// The memory of what waits is charged to `account`.
+    #[must_use]
+    pub fn charged_to(self, account: &Account) -> Self {
+        Intake { account: Some(account.clone()), ..self }
+    }
+
+    /// Has the memory of `more` commands beside those that wait, or refuses.
+    fn make_room(&mut self, more: usize) -> Result<()> {
+        let bytes = bytes_of(self.queue.len() + more);
+        let Some(account) = self.account.as_ref().filter(|_| bytes > 0) else { return Ok(()) };
+        match &mut self.taken {
+            Some(taken) => taken.grow_to(bytes, ""),
+            None => account.take(Resource::Memory(Purpose::Commands), bytes, "").map(|taken| self.taken = Some(taken)),
+        }
+    }
+
+    /// Gives back what no longer waits.
+    fn give_back(&mut self) {
+        let bytes = bytes_of(self.queue.len());
+        if let Some(taken) = self.taken.as_mut().filter(|taken| taken.amount() > bytes) {
+            taken.shrink_to(bytes);
         }
     }
 
@@ -205,6 +240,7 @@ impl Intake {
                 last_sequence: None,
                 waiting: 0,
                 last_place: None,
+                seat: None,
             };
             self.leases.insert(*tool, lease);
         }
@@ -243,9 +279,11 @@ impl Intake {
 
     fn end(&mut self, tool: u32) {
         self.leases.remove(&tool);
-        let waiting = self.waiting();
+        let waiting = self.waiting;
         self.queue.retain(|_, due| due.command.tool != tool);
-        self.counts.dropped += waiting - self.waiting();
+        self.waiting = self.queue.values().filter(|due| !due.ends_lease).count() as u64;
+        self.counts.dropped += waiting - self.waiting;
+        self.give_back();
         let command = Command {
             tool,
             sequence: 0,
@@ -315,6 +353,7 @@ impl Intake {
                 return Err(Refusal::new(Reason::QueueFull, "", message));
             }
         }
+        self.make_room(commands.len())?;
         self.counts.accepted += commands.len() as u64;
         for command in commands {
             self.enqueue(command, false);
@@ -345,9 +384,11 @@ impl Intake {
             {
                 late_commands += superseded.late_commands;
                 lease.waiting -= 1;
+                self.waiting -= u64::from(!superseded.ends_lease);
                 self.counts.superseded += 1;
             }
         }
+        self.waiting += u64::from(!ends_lease);
         self.queue.insert(place, Due { command, late, late_commands, ends_lease });
         self.changed = true;
     }
@@ -383,20 +424,23 @@ impl Intake {
             return Ok(None);
         }
         let step = at_step.unwrap_or(0).max(self.next_step);
-        if let Some((last, _)) = self.changes.back() {
-            if *last > step {
-                let message = format!("is {step}, but a change of the tissue waits for step {last}: they act in order");
-                return Err(Refusal::new(Reason::OutOfTurn, "at_step", message));
-            }
-            if *last == step {
-                self.changes.pop_back();
-            }
+        let last = self.changes.back().map(|change| change.0);
+        if let Some(last) = last.filter(|last| *last > step) {
+            let message = format!("is {step}, but a change of the tissue waits for step {last}: they act in order");
+            return Err(Refusal::new(Reason::OutOfTurn, "at_step", message));
         }
-        if self.changes.len() >= self.limits.queued_commands_per_tool {
+        let replaces = last == Some(step);
+        if !replaces && self.changes.len() >= self.limits.queued_changes {
             let message = format!("{} changes of the tissue wait for their step already", self.changes.len());
             return Err(Refusal::new(Reason::QueueFull, "", message));
         }
-        self.changes.push_back((step, model.clone()));
+        let account = self.account.as_ref();
+        let taken =
+            account.map(|account| account.take(Resource::Memory(Purpose::Change), model.bytes(), "")).transpose()?;
+        if replaces {
+            self.changes.pop_back();
+        }
+        self.changes.push_back((step, model.clone(), taken));
         self.changed_to = Some(model.clone());
         self.changed = true;
         Ok(Some(step))
@@ -443,8 +487,10 @@ impl Intake {
                 lease.waiting = lease.waiting.saturating_sub(1);
             }
             self.counts.applied += u64::from(!entry.ends_lease);
+            self.waiting -= u64::from(!entry.ends_lease);
             due.push(entry);
         }
+        self.give_back();
         self.next_step = step + 1;
     }
 
@@ -470,18 +516,42 @@ impl Intake {
 
     /// Counts of the commands so far, by outcome.
     pub fn counts(&self) -> Counts {
-        Counts { waiting: self.waiting(), ..self.counts }
-    }
-
-    fn waiting(&self) -> u64 {
-        self.queue.values().filter(|due| !due.ends_lease).count() as u64
+        Counts { waiting: self.waiting, ..self.counts }
     }
 
     /// From now on refuses everything with `refusal`.
     pub fn close(&mut self, refusal: Refusal) {
         self.closed = Some(refusal);
-        self.counts.dropped += self.waiting();
+        self.counts.dropped += self.waiting;
         self.queue.clear();
+        self.waiting = 0;
+        self.changes.clear();
+        self.taken = None;
+    }
+
+    /// After that: as it was in the beginning, with the same tissue, and no tool held.
+    pub fn reopen(&mut self) {
+        self.closed = None;
+        self.leases.clear();
+    }
+
+    /// Ends the leases of the tools for which `chosen` holds, by number and by who pays for them; tells how many.
+    pub fn free(&mut self, chosen: impl Fn(u32, Option<&Account>) -> bool) -> usize {
+        let payer = |lease: &Lease| lease.seat.as_ref().map(Taken::account).cloned();
+        let tools: Vec<u32> = self
+            .leases
+            .iter()
+            .filter(|(tool, lease)| chosen(**tool, payer(lease).as_ref()))
+            .map(|lease| *lease.0)
+            .collect();
+        tools.iter().for_each(|tool| self.end(*tool));
+        tools.len()
+    }
+
+    /// The tools of a lease are charged to who took them, one of `seats` each.
+    pub fn seat(&mut self, id: LeaseId, seats: Vec<Taken>) {
+        let leases = self.leases.values_mut().filter(|lease| lease.id == id);
+        leases.zip(seats).for_each(|(lease, seat)| lease.seat = Some(seat));
     }
 
     fn check_open(&self) -> Result<()> {
@@ -489,89 +559,19 @@ impl Intake {
     }
 }
 
+/// Commands are charged in pieces of so many bytes, and the first of a session is its own: who has a few waiting at a
+/// time, as most do, pays nothing.
+const PIECE_BYTES: u64 = 64 << 10;
+
+/// What so many commands are charged: they are in a tree, whose nodes are two thirds full.
+fn bytes_of(commands: usize) -> u64 {
+    let bytes = commands * size_of::<(Place, Due)>() * 3 / 2;
+    (bytes as u64 / PIECE_BYTES) * PIECE_BYTES
+}
+
 fn not_holder(message: String) -> Refusal {
     Refusal::new(Reason::NotHolder, "lease_id", message)
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::scene::PAPER;
-
-    const LEASE: LeaseId = 7;
-    const MS: u64 = 1_000_000;
-
-    /// Tool 0 is held for a second from 0 on; step k is due at k ms.
-    fn intake() -> (Intake, Schedule) {
-        let limits = Limits::default();
-        let scene = Scene::parse("paper", PAPER, &[], &limits).unwrap();
-        let mut intake = Intake::new(&scene, &limits);
-        intake.acquire(&[0], "test", 1.0, LEASE, 0).unwrap();
-        (intake, Schedule::new(0, 0, 1000.0))
-    }
-
-    fn release(sequence: u64, at_step: Option<u64>) -> Command {
-        let (client_time_ns, time_to_live_s, arrival_ns) = (0, None, 0);
-        Command { tool: 0, sequence, client_time_ns, at_step, time_to_live_s, action: Action::Release, arrival_ns }
-    }
-
-    fn steps(intake: &Intake) -> Vec<u64> {
-        intake.queue.keys().map(|place| place.0).collect()
-    }
-
-    #[test]
-    fn a_command_at_rest_acts_at_the_next_step_by_the_clock_and_wakes_once() {
-        let (mut intake, schedule) = intake();
-        // The rest lasts until the lease would lapse.
-        assert_eq!(intake.rest(5, u64::MAX, &schedule), 1001);
-        intake.submit(LEASE, vec![release(1, None)], 500 * MS).unwrap();
-        assert_eq!((steps(&intake), intake.take_wake(), intake.take_wake()), (vec![501], true, false));
-        // Time does not pass a waiting command: a second one comes after it, or with it.
-        intake.submit(LEASE, vec![release(2, None)], 520 * MS).unwrap();
-        assert_eq!(steps(&intake), [501, 501]);
-        assert!(!intake.take_wake());
-        assert_eq!(intake.rest(5, u64::MAX, &schedule), 501);
-        let mut due = Vec::new();
-        intake.take_due(501, 520 * MS, &mut due);
-        assert_eq!((due.len(), intake.next_step(), intake.is_resting()), (2, 502, false));
-        assert!(due.iter().all(|due| !due.late));
-    }
-
-    #[test]
-    fn stamps_mean_the_same_at_rest() {
-        let (mut intake, schedule) = intake();
-        intake.rest(0, u64::MAX, &schedule);
-        let commands = vec![release(1, Some(400)), release(2, Some(501)), release(3, Some(800))];
-        intake.submit(LEASE, commands, 500 * MS).unwrap();
-        // Step 400 is over at 500 ms, though no step was computed.
-        assert_eq!(steps(&intake), [501, 501, 800]);
-        assert_eq!(intake.queue.values().map(|due| due.late).collect::<Vec<_>>(), [true, false, false]);
-        assert_eq!(intake.rest(0, u64::MAX, &schedule), 501);
-        intake.take_due(501, 501 * MS, &mut Vec::new());
-        assert_eq!(intake.rest(502, u64::MAX, &schedule), 800);
-    }
-
-    #[test]
-    fn a_lease_lapses_at_rest_and_what_is_wanted_earlier_comes_first() {
-        let (mut intake, schedule) = intake();
-        assert_eq!(intake.rest(3, 50, &schedule), 50);
-        // The clock is late: time stops at the step that is due.
-        intake.lapse(90 * MS);
-        assert_eq!(intake.next_step(), 50);
-        assert_eq!(intake.rest(51, u64::MAX, &schedule), 1001);
-        intake.lapse(1000 * MS);
-        assert_eq!((intake.lapsed(), steps(&intake), intake.take_wake()), (1, vec![1001], true));
-        // A session whose very next step is wanted does not rest.
-        assert_eq!(intake.rest(1001, u64::MAX, &schedule), 1001);
-        assert!(!intake.is_resting());
-    }
-
-    #[test]
-    fn renewing_wakes_nobody() {
-        let (mut intake, schedule) = intake();
-        intake.rest(0, u64::MAX, &schedule);
-        intake.renew(LEASE, 900 * MS).unwrap();
-        assert!(!intake.take_wake());
-        assert_eq!(intake.rest(1001, u64::MAX, &schedule), 1901);
-    }
-}
+mod tests;

@@ -8,7 +8,7 @@ use xxhash_rust::xxh3::Xxh3;
 use super::real::Real;
 
 /// Lanes of the widest vector: rows are padded to a multiple of it.
-pub(super) const BLOCK: usize = 16;
+pub(super) const BLOCK: usize = crate::scene::LEAST_WIDTH;
 
 /// Alignment of every row and plane, bytes: a cache line.
 const LINE: usize = 64;

@@ -4,6 +4,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use super::choice::{self, Choice};
+use super::field::{BLOCK, Layout};
 use super::integrate::{Node, Oscillator, Scheme};
 use super::{lanes, stability};
 use crate::limits::Limits;
@@ -224,12 +225,37 @@ impl Model {
     #[allow(clippy::cast_precision_loss)]
     pub fn predicted_step_s(&self) -> f64 {
         let point_ns = choice::point_substep_ns(self.plan.integrator, self.precision, self.lanes);
-        1e-9 * (choice::STEP_NS + point_ns * self.len() as f64 * f64::from(self.plan.substeps))
+        1e-9 * (choice::STEP_NS + point_ns * self.swept_points() as f64 * f64::from(self.plan.substeps))
+    }
+
+    /// What the model itself takes, bytes.
+    pub fn bytes(&self) -> u64 {
+        let fixed = self.fixed.len() * (size_of::<usize>() + size_of::<[usize; 2]>());
+        let vectors = self.warnings.iter().map(String::len).sum::<usize>() + self.plan.nodes.len() * size_of::<Node>();
+        (size_of::<Model>() + fixed + vectors) as u64
+    }
+
+    /// What a session of it may take, bytes: its state, the checkpoint, and one more that an audit begins from.
+    pub fn session_bytes(&self) -> u64 {
+        const STATES: usize = 3;
+        let fields = 2 + self.plan.scheme.kept(self.precision == Precision::Compensated);
+        let plane_bytes = match self.precision {
+            Precision::F64 => Layout::new::<f64>(self.points).plane * size_of::<f64>(),
+            Precision::Auto | Precision::F32 | Precision::Compensated => {
+                Layout::new::<f32>(self.points).plane * size_of::<f32>()
+            }
+        };
+        (STATES * fields * 3 * plane_bytes) as u64 + self.bytes()
     }
 
     /// Number of points.
     pub fn len(&self) -> usize {
         self.points[0] * self.points[1]
+    }
+
+    /// What a substep computes, in points: rows are padded, and a short one costs what one of a vector's width does.
+    pub fn swept_points(&self) -> usize {
+        self.points[0] * self.points[1].max(BLOCK)
     }
 
     /// A sheet has at least one point.

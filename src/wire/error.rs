@@ -36,6 +36,7 @@ pub fn code(reason: Reason) -> Code {
         Reason::NotHolder | Reason::RoleMissing | Reason::OriginNotAllowed => Code::PermissionDenied,
         Reason::Unauthenticated => Code::Unauthenticated,
         Reason::StepPassed => Code::OutOfRange,
+        Reason::Cut => Code::Aborted,
         Reason::ShuttingDown => Code::Unavailable,
     }
 }

@@ -100,34 +100,30 @@ pub fn rejection(tool: u32, sequence: u64, refusal: &Refusal) -> pb::Rejection {
 /// Points of one message of a record.
 const POINTS_PER_MESSAGE: usize = 1000;
 
-/// The messages of a record.
-pub fn record(paced: &PacedRecord, dropped: u64) -> Vec<pb::ProbeResponse> {
-    let PacedRecord { step, record } = paced;
-    let mut messages: Vec<_> = record
-        .points
-        .chunks(POINTS_PER_MESSAGE)
-        .map(|points| pb::ProbeResponse {
-            step: *step,
-            simulation_time_s: record.time_s,
-            points: points.iter().map(point_record).collect(),
-            dropped_records: dropped,
-            ..Default::default()
-        })
-        .collect();
-    if messages.is_empty() {
-        messages.push(pb::ProbeResponse { step: *step, simulation_time_s: record.time_s, ..Default::default() });
-    }
+/// Message `part` of a record; a record of no points is one as well. One at a time: those of a large sheet would take a
+/// second to write, and a gigabyte.
+pub fn record(paced: &PacedRecord, dropped: u64, part: usize) -> Option<pb::ProbeResponse> {
+    let record = &paced.record;
+    let parts = record.points.len().div_ceil(POINTS_PER_MESSAGE).max(1);
+    let points = record.points.chunks(POINTS_PER_MESSAGE).nth(part).unwrap_or_default();
+    let mut message = pb::ProbeResponse {
+        step: paced.step,
+        simulation_time_s: record.time_s,
+        points: points.iter().map(point_record).collect(),
+        dropped_records: dropped,
+        ..Default::default()
+    };
     #[allow(clippy::cast_possible_truncation)]
-    if let Some(last) = messages.last_mut() {
-        last.last = true;
-        last.awake_points = record.awake_points as u32;
-        last.energy = record.energy_j.map(|energy| pb::Energy {
+    if part + 1 == parts {
+        message.last = true;
+        message.awake_points = record.awake_points as u32;
+        message.energy = record.energy_j.map(|energy| pb::Energy {
             kinetic_j: energy.kinetic,
             spring_j: energy.spring,
             virtual_j: energy.virtual_springs,
         });
     }
-    messages
+    (part < parts).then_some(message)
 }
 
 fn point_record(record: &Point) -> pb::PointRecord {

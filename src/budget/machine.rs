@@ -1,0 +1,102 @@
+//! How much memory there is, and how what is free gets back to the system.
+
+use std::path::{Path, PathBuf};
+
+/// Where nothing is known of the machine.
+const UNKNOWN: u64 = 1 << 30;
+
+/// Bytes: half of what the machine has, or of what the control groups of this process leave it, if that is less.
+pub fn half_of_the_machine() -> u64 {
+    let machine = std::fs::read_to_string("/proc/meminfo").ok().and_then(|text| total(&text));
+    let groups = std::fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
+    groups_of(&groups).into_iter().filter_map(|file| number(&file)).chain(machine).min().unwrap_or(UNKNOWN) / 2
+}
+
+/// `MemTotal:  16324520 kB`.
+fn total(meminfo: &str) -> Option<u64> {
+    let line = meminfo.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
+    Some(line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()? << 10)
+}
+
+/// The files in which the groups of `/proc/self/cgroup` and those above them say how much there may be.
+fn groups_of(text: &str) -> Vec<PathBuf> {
+    let root = Path::new("/sys/fs/cgroup");
+    let mut files = Vec::new();
+    for line in text.lines() {
+        let mut fields = line.splitn(3, ':').skip(1);
+        let (Some(controllers), Some(group)) = (fields.next(), fields.next()) else { continue };
+        let (root, names): (_, &[&str]) = match controllers {
+            "" => (root.to_owned(), &["memory.max", "memory.high"]),
+            "memory" => (root.join("memory"), &["memory.limit_in_bytes"]),
+            _ => continue,
+        };
+        // In a container the group's own path may not be there, but its root is.
+        let group = Path::new(group.trim_start_matches('/'));
+        let above = group.ancestors().map(|group| root.join(group));
+        files.extend(above.flat_map(|folder| names.iter().map(move |name| folder.join(name))));
+    }
+    files
+}
+
+/// `max` is no number.
+fn number(file: &Path) -> Option<u64> {
+    std::fs::read_to_string(file).ok()?.trim().parse().ok()
+}
+
+/// What has been freed and lies about in the allocator goes back to the system. Some milliseconds: not for a thread that
+/// steps.
+#[allow(unsafe_code)]
+pub fn give_back_to_the_system() {
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    {
+        // SAFETY: it takes a number, and may be called by any thread at any time (malloc_trim(3)).
+        unsafe extern "C" {
+            safe fn malloc_trim(pad: usize) -> std::ffi::c_int;
+        }
+        malloc_trim(0);
+    }
+}
+
+/// Bytes as people write them: `512MiB`, `2GiB`, `1048576`.
+pub fn parse_bytes(text: &str) -> Result<u64, String> {
+    const UNITS: [(&str, u32); 5] = [("KiB", 10), ("MiB", 20), ("GiB", 30), ("TiB", 40), ("", 0)];
+    let number = UNITS.iter().find_map(|(unit, shift)| Some((text.strip_suffix(unit)?, *shift)));
+    let bytes = number.and_then(|(number, shift)| number.trim().parse::<u64>().ok()?.checked_mul(1 << shift));
+    let why = "must be a whole number of bytes, or of KiB, MiB, GiB or TiB, and 1MiB at least";
+    bytes.filter(|bytes| *bytes >= 1 << 20).ok_or_else(|| why.to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bytes_are_read_as_people_write_them() {
+        assert_eq!(parse_bytes("64MiB"), Ok(64 << 20));
+        assert_eq!(parse_bytes("2 GiB"), Ok(2 << 30));
+        assert_eq!(parse_bytes("1048576"), Ok(1 << 20));
+        for wrong in ["", "MiB", "1000", "-1GiB", "99999999999TiB", "1.5GiB", "2GB"] {
+            assert!(parse_bytes(wrong).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn the_machine_has_memory_and_groups_are_found() {
+        assert!(half_of_the_machine() > 1 << 20);
+        assert_eq!(total("MemFree: 1 kB\nMemTotal:       2048 kB\n"), Some(2 << 20));
+        let files = groups_of("12:cpu,cpuacct:/x\n3:memory:/a\n0::/b/c\n");
+        let told: Vec<_> = files.iter().map(|file| file.to_str().unwrap()).collect();
+        let (v1, v2) = ("/sys/fs/cgroup/memory", "/sys/fs/cgroup");
+        let expected = [
+            format!("{v1}/a/memory.limit_in_bytes"),
+            format!("{v1}/memory.limit_in_bytes"),
+            format!("{v2}/b/c/memory.max"),
+            format!("{v2}/b/c/memory.high"),
+            format!("{v2}/b/memory.max"),
+            format!("{v2}/b/memory.high"),
+            format!("{v2}/memory.max"),
+            format!("{v2}/memory.high"),
+        ];
+        assert_eq!(told, expected);
+    }
+}

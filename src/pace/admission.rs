@@ -1,0 +1,148 @@
+//! Who is let in: sessions as they are made, started and changed, by what their steps will take.
+
+use std::sync::Arc;
+use std::sync::Mutex;
+use std::sync::atomic::AtomicU64;
+
+use super::auditor::Audited;
+use super::clock::{Dilation, now_ns};
+use super::cost::{Cost, check_work};
+use super::inbox::Request;
+use super::queue::lock;
+use super::streams::Streams;
+use super::thread::{Running, beat_ns};
+use super::{Live, Pacer, State, Status, random_id};
+use crate::budget::{Account, Purpose, Resource};
+use crate::refusal::{Reason, Refusal, Result, number};
+use crate::scene::{Change, Scene};
+use crate::session::command::Intake;
+use crate::session::schedule::Schedule;
+use crate::sheet::Model;
+
+impl Pacer {
+    /// Makes a session for `owner`.
+    pub fn create(&self, scene: &Scene, paused: bool, idle_timeout_s: f64, owner: &Account) -> Result<Arc<Live>> {
+        // Before anything is done for it.
+        let slot = owner.take(Resource::Sessions, 1, "")?;
+        let most_hz = self.limits.session_rate_hz;
+        number("stepping.rate_hz", scene.stepping.rate_hz, &format!("at most {most_hz}"), |v| v <= most_hz)?;
+        let model = self.compile(scene)?;
+        let id = random_id()?;
+        check_work(&model, &self.limits)?;
+        let memory = owner.take(Resource::Memory(Purpose::Session), model.session_bytes(), "sheet.points")?;
+        let number = {
+            let mut numbers = lock(&self.numbers);
+            *numbers += 1;
+            *numbers
+        };
+        let begin_ns = beat_ns(now_ns());
+        let status = Status {
+            state: if paused { State::Paused } else { State::Running },
+            step: 0,
+            resting: false,
+            rested_steps: 0,
+            overrun_count: 0,
+            dilation: Dilation::new(begin_ns, 0),
+            schedule: Schedule::new(0, begin_ns, scene.stepping.rate_hz),
+            late_commands: 0,
+            hold_reason: None,
+            guard_events: 0,
+            awake_points: 0,
+            path_counts: [0; 3],
+            lapsed_leases: 0,
+            model: model.clone(),
+        };
+        let (cost, thread) = self.place(&model, paused)?;
+        let inbox = self.inboxes[thread].clone();
+        let live = Arc::new(Live {
+            id: id.clone(),
+            intake: Mutex::new(Intake::new(&model.scene, &self.limits).charged_to(owner)),
+            model,
+            owner: owner.clone(),
+            idle_timeout_s,
+            asked_ns: AtomicU64::new(now_ns()),
+            number,
+            limits: self.limits.clone(),
+            status: Mutex::new(status),
+            streams: Mutex::new(Streams::new(&self.limits)),
+            refused: AtomicU64::new(0),
+            laws: Mutex::new(Vec::new()),
+            audited: Mutex::new(Audited::default()),
+            cost,
+            thread,
+            inbox: inbox.clone(),
+            _taken: [slot, memory],
+        });
+        // Laid out before the lock is taken, on which all calls wait.
+        let running = Box::new(Running::new(live.clone(), !paused));
+        let mut sessions = lock(&self.sessions);
+        let points: usize = sessions.values().map(|live| live.model.len()).sum();
+        if points + live.model.len() > self.limits.points_in_all {
+            let message = format!("the sessions of the server have {points} points already");
+            return Err(Refusal::new(Reason::TooMany, "sheet.points", message));
+        }
+        sessions.insert(id, live.clone());
+        // Before anybody can name the session: what is asked of it comes after this.
+        inbox.send(number, Request::Adopt(running));
+        Ok(live)
+    }
+
+    /// What never changes is one in memory for all sessions of a scene, and compiled once.
+    fn compile(&self, scene: &Scene) -> Result<Arc<Model>> {
+        let known =
+            lock(&self.sessions).values().find(|live| live.model.scene == *scene).map(|live| live.model.clone());
+        known.map_or_else(|| Model::compile(scene, &self.limits), Ok)
+    }
+
+    /// The thread with the most time to spare for a further session, and what that will take.
+    fn place(&self, model: &Model, paused: bool) -> Result<(Cost, usize)> {
+        let sessions = lock(&self.sessions);
+        let cost = Cost::guess(model, sessions.values().map(|live| &live.cost));
+        let mut taken = vec![(0.0, 0_usize); self.inboxes.len()];
+        for live in sessions.values() {
+            taken[live.thread].0 += live.cost.share();
+            taken[live.thread].1 += 1;
+        }
+        drop(sessions);
+        let spare =
+            |a: &(usize, &(f64, usize)), b: &(usize, &(f64, usize))| a.1.0.total_cmp(&b.1.0).then(a.1.1.cmp(&b.1.1));
+        let (thread, (taken, _)) = taken.iter().enumerate().min_by(spare).unwrap_or((0, &(0.0, 0)));
+        if !paused {
+            self.check_share(*taken, cost.awake_share())?;
+        }
+        Ok((cost, thread))
+    }
+
+    /// Another tissue for a session ([`Live::change`]), unless its steps would make others late.
+    pub fn change_tissue(&self, live: &Live, change: &Change, at_step: Option<u64>) -> Result<(u64, Arc<Model>)> {
+        live.change(change, at_step, |needed| self.check_share(self.taken_by_others(live), needed))
+    }
+
+    /// Of the thread of a session, what the others that are awake take.
+    fn taken_by_others(&self, live: &Live) -> f64 {
+        let others = |other: &&Arc<Live>| other.thread == live.thread && other.number != live.number;
+        lock(&self.sessions).values().filter(others).map(|other| other.cost.share()).sum()
+    }
+
+    /// Refuses what would make others late. Whoever is alone on its thread delays nobody, however heavy; and what rests
+    /// takes nothing.
+    fn check_share(&self, taken: f64, needed: f64) -> Result<()> {
+        let most = self.limits.thread_share;
+        if taken == 0.0 || taken + needed <= most {
+            return Ok(());
+        }
+        let message = format!(
+            "the other sessions of the stepping thread take {taken:.3} of it, and this one would take \
+             {needed:.3}: above the {most} that sessions may take (limits.thread_share)"
+        );
+        Err(Refusal::new(Reason::Overloaded, "", message))
+    }
+
+    /// Lets a session's time go on ([`Live::start`]), unless that would make others late.
+    pub async fn start_session(&self, live: &Live, until: Option<u64>) -> Result<u64> {
+        if lock(&live.status).state == State::Paused {
+            self.check_share(self.taken_by_others(live), live.cost.awake_share())?;
+        }
+        live.start(until).await
+    }
+}

@@ -1,0 +1,187 @@
+//! The streams of a session: how many there may be, whose they are, and how one is cut.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+
+use tokio_util::sync::CancellationToken;
+
+use super::Live;
+use super::clock::now_ns;
+use super::queue::lock;
+use crate::budget::{Account, Pool, Resource, Taken};
+use crate::limits::Limits;
+use crate::refusal::{Reason, Refusal, Result};
+
+/// What a stream is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Held {
+    /// It holds tools: some places of a session are kept for such.
+    Tools,
+    /// It only reads.
+    Nothing,
+}
+
+/// Those of one session.
+#[derive(Debug)]
+pub(super) struct Streams {
+    most: usize,
+    numbers: u64,
+    open: BTreeMap<u64, Open>,
+    /// Places of those that only read, by who reads.
+    readers: Pool,
+}
+
+#[derive(Debug)]
+struct Open {
+    what: &'static str,
+    held: Held,
+    account: Account,
+    since_ns: u64,
+    cut: CancellationToken,
+    _taken: Taken,
+}
+
+/// A stream as it is shown to who administers.
+#[derive(Debug, Clone)]
+pub struct Shown {
+    /// Names it within its session.
+    pub number: u64,
+    /// The call that opened it.
+    pub what: &'static str,
+    /// Whether it holds tools.
+    pub held: Held,
+    /// Whose it is.
+    pub caller: String,
+    /// For how long it has been open, ns.
+    pub age_ns: u64,
+}
+
+impl Streams {
+    pub(super) fn new(limits: &Limits) -> Self {
+        let most = limits.streams_per_session;
+        let readers = most - limits.streams_for_holders.min(most / 8);
+        Streams { most, numbers: 0, open: BTreeMap::new(), readers: Pool::new(readers as u64, 16) }
+    }
+
+    fn close(&mut self, number: u64) -> Option<Open> {
+        let open = self.open.remove(&number)?;
+        if open.held == Held::Nothing {
+            self.readers.give_back(open.account.number(), 1);
+        }
+        Some(open)
+    }
+}
+
+/// Counts a stream of a session until it is dropped or cut.
+pub struct StreamGuard {
+    live: Arc<Live>,
+    number: u64,
+    cut: CancellationToken,
+}
+
+impl StreamGuard {
+    /// Cancelled when somebody who administers has cut the stream.
+    pub fn cut(&self) -> &CancellationToken {
+        &self.cut
+    }
+}
+
+impl Drop for StreamGuard {
+    fn drop(&mut self) {
+        lock(&self.live.streams).close(self.number);
+        self.live.asked_ns.store(now_ns(), Ordering::Relaxed);
+    }
+}
+
+/// What a stream is told that was cut.
+pub fn cut() -> Refusal {
+    Refusal::new(Reason::Cut, "", "whoever administers the server has ended this stream")
+}
+
+impl Live {
+    /// Room for one more stream of `account`, opened by the call `what`.
+    pub fn open_stream(self: &Arc<Self>, what: &'static str, held: Held, account: &Account) -> Result<StreamGuard> {
+        let _taken = account.take(Resource::Streams, 1, "")?;
+        let mut streams = lock(&self.streams);
+        let all = streams.open.len();
+        if all >= streams.most || held == Held::Nothing && !streams.readers.take(account.number(), 1) {
+            let Streams { most, readers, .. } = &*streams;
+            let message = format!(
+                "the session has {all} streams of {most} already, {} of those that only read are this caller's; the others \
+                 are kept for other callers and for those who hold tools",
+                readers.of(account.number())
+            );
+            return Err(Refusal::new(Reason::TooMany, "", message));
+        }
+        streams.numbers += 1;
+        let (number, cut) = (streams.numbers, CancellationToken::new());
+        let open = Open { what, held, account: account.clone(), since_ns: now_ns(), cut: cut.clone(), _taken };
+        streams.open.insert(number, open);
+        drop(streams);
+        Ok(StreamGuard { live: self.clone(), number, cut })
+    }
+
+    /// Streams that read the session.
+    pub fn streams(&self) -> usize {
+        lock(&self.streams).open.len()
+    }
+
+    /// Each of them, oldest first.
+    pub fn shown_streams(&self) -> Vec<Shown> {
+        let now = now_ns();
+        let show = |(number, open): (&u64, &Open)| Shown {
+            number: *number,
+            what: open.what,
+            held: open.held,
+            caller: open.account.name().to_owned(),
+            age_ns: now.saturating_sub(open.since_ns),
+        };
+        lock(&self.streams).open.iter().map(show).collect()
+    }
+
+    /// Ends the streams for which `chosen` holds, by number and caller: they make room at once, and are told when they read.
+    pub fn cut_streams(&self, chosen: impl Fn(u64, &Account) -> bool) -> usize {
+        let mut streams = lock(&self.streams);
+        let numbers: Vec<u64> =
+            streams.open.iter().filter(|(number, open)| chosen(**number, &open.account)).map(|open| *open.0).collect();
+        let cut: Vec<Open> = numbers.iter().filter_map(|number| streams.close(*number)).collect();
+        drop(streams);
+        cut.iter().for_each(|open| open.cut.cancel());
+        cut.len()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::budget::Budget;
+    use crate::pace::Pacer;
+    use crate::scene::{PAPER, Scene};
+
+    #[test]
+    fn who_reads_leaves_places_to_others_and_to_who_holds_tools() {
+        let limits = Limits { streams_per_session: 64, streams_for_holders: 4, ..Limits::default() };
+        let scene = Scene::parse("paper", PAPER, &[], &limits).unwrap();
+        let budget = Budget::new(&limits, 1, 1);
+        let pacer = Pacer::start(1, 0.0, &limits, budget.clone()).unwrap();
+        let live = pacer.create(&scene, true, 60.0, &budget.account("owner")).unwrap();
+        let [greedy, other] = ["greedy", "other"].map(|name| budget.account(name));
+        let open = |held, account: &Account| live.open_stream("Test", held, account);
+        let mut all: Vec<_> = std::iter::from_fn(|| open(Held::Nothing, &greedy).ok()).collect();
+        assert_eq!(all.len(), 57);
+        all.push(open(Held::Nothing, &other).unwrap());
+        all.extend(std::iter::from_fn(|| open(Held::Nothing, &other).ok()));
+        // Who holds tools always finds the places that are kept.
+        let holders: Vec<_> = (0..4).map(|_| open(Held::Tools, &other).unwrap()).collect();
+        assert_eq!(live.streams(), all.len() + 4);
+        assert!(budget.taken(Resource::Streams) == live.streams() as u64);
+        // Who is cut makes room, whether they notice or not.
+        assert_eq!(live.cut_streams(|_, account| account.number() == greedy.number()), 57);
+        assert!(all[0].cut().is_cancelled() && !holders[0].cut().is_cancelled());
+        assert!(open(Held::Nothing, &other).is_ok());
+        drop((all, holders));
+        assert_eq!((live.streams(), budget.taken(Resource::Streams)), (0, 0));
+        pacer.stop();
+    }
+}

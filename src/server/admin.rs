@@ -1,0 +1,113 @@
+//! `AdminService`.
+
+use std::sync::Arc;
+
+use tonic::{Request, Response, Status};
+use tracing::info;
+
+use super::House;
+use super::connections::Register;
+use crate::budget::{Account, Purpose, Resource, Work};
+use crate::pace::clock::now_ns;
+use crate::pace::{Held, excerpt};
+use crate::refusal::{Reason, Refusal};
+use crate::wire::pb;
+use crate::wire::pb::admin_service_server::AdminService;
+
+pub(super) struct Admin {
+    pub(super) house: House,
+    pub(super) register: Arc<Register>,
+}
+
+#[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
+#[tonic::async_trait]
+impl AdminService for Admin {
+    async fn list_callers(
+        &self,
+        _: Request<pb::ListCallersRequest>,
+    ) -> Result<Response<pb::ListCallersResponse>, Status> {
+        let now = now_ns();
+        let use_of = |account: &Account| pb::CallerUse {
+            caller: account.name().to_owned(),
+            memory_bytes: account.has(Resource::Memory(Purpose::Session)),
+            sessions: account.has(Resource::Sessions),
+            streams: account.has(Resource::Streams),
+            tools: account.has(Resource::Leases),
+            processor_share: Work::ALL.iter().map(|work| account.share(*work, now)).sum(),
+        };
+        let callers = self.house.pacer.budget.accounts().iter().map(use_of).collect();
+        Ok(Response::new(pb::ListCallersResponse { callers }))
+    }
+
+    async fn list_streams(
+        &self,
+        request: Request<pb::ListStreamsRequest>,
+    ) -> Result<Response<pb::ListStreamsResponse>, Status> {
+        let live = self.house.pacer.get(&request.get_ref().session_id)?;
+        let shown = live.shown_streams().into_iter().map(|stream| pb::StreamUse {
+            number: stream.number,
+            call: stream.what.to_owned(),
+            caller: stream.caller,
+            holds_tools: stream.held == Held::Tools,
+            age_s: stream.age_ns as f64 * 1e-9,
+        });
+        Ok(Response::new(pb::ListStreamsResponse { streams: shown.collect() }))
+    }
+
+    async fn free_tool(&self, request: Request<pb::FreeToolRequest>) -> Result<Response<pb::FreeToolResponse>, Status> {
+        let pb::FreeToolRequest { session_id, tool } = request.into_inner();
+        let live = self.house.pacer.get(&session_id)?;
+        if live.at_intake(|intake, _| intake.free(|other, _| other == tool)) == 0 {
+            return Err(Refusal::new(Reason::OutOfRange, "tool", format!("tool {tool} is held by nobody")).into());
+        }
+        info!(session = %live.id, tool, "tool freed");
+        Ok(Response::new(pb::FreeToolResponse {}))
+    }
+
+    async fn cut_stream(
+        &self,
+        request: Request<pb::CutStreamRequest>,
+    ) -> Result<Response<pb::CutStreamResponse>, Status> {
+        let pb::CutStreamRequest { session_id, number } = request.into_inner();
+        let live = self.house.pacer.get(&session_id)?;
+        if live.cut_streams(|other, _| other == number) == 0 {
+            let message = format!("the session has no stream {number}");
+            return Err(Refusal::new(Reason::OutOfRange, "number", message).into());
+        }
+        info!(session = %live.id, number, "stream cut");
+        Ok(Response::new(pb::CutStreamResponse {}))
+    }
+
+    async fn cut_caller(
+        &self,
+        request: Request<pb::CutCallerRequest>,
+    ) -> Result<Response<pb::CutCallerResponse>, Status> {
+        let pb::CutCallerRequest { caller, delete_sessions } = request.into_inner();
+        let pacer = &self.house.pacer;
+        let account =
+            pacer.budget.accounts().into_iter().find(|account| account.name() == caller).ok_or_else(|| {
+                Refusal::new(Reason::OutOfRange, "caller", format!("`{}` has nothing here", excerpt(&caller)))
+            })?;
+        let mut answer = pb::CutCallerResponse::default();
+        for live in pacer.list() {
+            answer.streams += live.cut_streams(|_, other| other.number() == account.number()) as u32;
+            let theirs = |payer: Option<&Account>| payer.is_some_and(|payer| payer.number() == account.number());
+            let freed = live.at_intake(|intake, _| intake.free(|_, payer| theirs(payer)));
+            answer.tools += freed as u32;
+            if delete_sessions && live.owner.number() == account.number() && pacer.delete(&live.id).is_ok() {
+                answer.sessions += 1;
+            }
+        }
+        answer.connections = self.register.cut(account.number()) as u32;
+        info!(caller, streams = answer.streams, tools = answer.tools, sessions = answer.sessions, "caller cut");
+        Ok(Response::new(answer))
+    }
+
+    async fn revive_session(
+        &self,
+        request: Request<pb::ReviveSessionRequest>,
+    ) -> Result<Response<pb::ReviveSessionResponse>, Status> {
+        let step = self.house.pacer.get(&request.get_ref().session_id)?.revive().await?;
+        Ok(Response::new(pb::ReviveSessionResponse { step }))
+    }
+}

@@ -1,0 +1,82 @@
+//! The desk in virtual time: rest, stamps, leases.
+#![allow(clippy::unwrap_used)]
+
+use super::*;
+use crate::scene::PAPER;
+
+const LEASE: LeaseId = 7;
+const MS: u64 = 1_000_000;
+
+/// Tool 0 is held for a second from 0 on; step k is due at k ms.
+fn intake() -> (Intake, Schedule) {
+    let limits = Limits::default();
+    let scene = Scene::parse("paper", PAPER, &[], &limits).unwrap();
+    let mut intake = Intake::new(&scene, &limits);
+    intake.acquire(&[0], "test", 1.0, LEASE, 0).unwrap();
+    (intake, Schedule::new(0, 0, 1000.0))
+}
+
+fn release(sequence: u64, at_step: Option<u64>) -> Command {
+    let (client_time_ns, time_to_live_s, arrival_ns) = (0, None, 0);
+    Command { tool: 0, sequence, client_time_ns, at_step, time_to_live_s, action: Action::Release, arrival_ns }
+}
+
+fn steps(intake: &Intake) -> Vec<u64> {
+    intake.queue.keys().map(|place| place.0).collect()
+}
+
+#[test]
+fn a_command_at_rest_acts_at_the_next_step_by_the_clock_and_wakes_once() {
+    let (mut intake, schedule) = intake();
+    // At rest until the lease would lapse.
+    assert_eq!(intake.rest(5, u64::MAX, &schedule), 1001);
+    intake.submit(LEASE, vec![release(1, None)], 500 * MS).unwrap();
+    assert_eq!((steps(&intake), intake.take_wake(), intake.take_wake()), (vec![501], true, false));
+    // Time does not pass what waits: a second one comes after it, or with it.
+    intake.submit(LEASE, vec![release(2, None)], 520 * MS).unwrap();
+    assert_eq!(steps(&intake), [501, 501]);
+    assert!(!intake.take_wake());
+    assert_eq!(intake.rest(5, u64::MAX, &schedule), 501);
+    let mut due = Vec::new();
+    intake.take_due(501, 520 * MS, &mut due);
+    assert_eq!((due.len(), intake.next_step(), intake.is_resting()), (2, 502, false));
+    assert!(due.iter().all(|due| !due.late));
+}
+
+#[test]
+fn stamps_mean_the_same_at_rest() {
+    let (mut intake, schedule) = intake();
+    intake.rest(0, u64::MAX, &schedule);
+    let commands = vec![release(1, Some(400)), release(2, Some(501)), release(3, Some(800))];
+    intake.submit(LEASE, commands, 500 * MS).unwrap();
+    // 400 is over at 500 ms, though no step was computed.
+    assert_eq!(steps(&intake), [501, 501, 800]);
+    assert_eq!(intake.queue.values().map(|due| due.late).collect::<Vec<_>>(), [true, false, false]);
+    assert_eq!(intake.rest(0, u64::MAX, &schedule), 501);
+    intake.take_due(501, 501 * MS, &mut Vec::new());
+    assert_eq!(intake.rest(502, u64::MAX, &schedule), 800);
+}
+
+#[test]
+fn a_lease_lapses_at_rest_and_what_is_wanted_earlier_comes_first() {
+    let (mut intake, schedule) = intake();
+    assert_eq!(intake.rest(3, 50, &schedule), 50);
+    // The clock is late: time stands at the step that is to be done.
+    intake.lapse(90 * MS);
+    assert_eq!(intake.next_step(), 50);
+    assert_eq!(intake.rest(51, u64::MAX, &schedule), 1001);
+    intake.lapse(1000 * MS);
+    assert_eq!((intake.lapsed(), steps(&intake), intake.take_wake()), (1, vec![1001], true));
+    // Whose very next step is wanted does not rest.
+    assert_eq!(intake.rest(1001, u64::MAX, &schedule), 1001);
+    assert!(!intake.is_resting());
+}
+
+#[test]
+fn renewing_wakes_nobody() {
+    let (mut intake, schedule) = intake();
+    intake.rest(0, u64::MAX, &schedule);
+    intake.renew(LEASE, 900 * MS).unwrap();
+    assert!(!intake.take_wake());
+    assert_eq!(intake.rest(1001, u64::MAX, &schedule), 1901);
+}

@@ -1,0 +1,249 @@
+//! Memory has a budget: what would be above it is refused with a reason before it is taken, and all is given back.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
+
+#[path = "common/server.rs"]
+mod server;
+
+use std::io::{Read, Write};
+use std::time::Duration;
+
+use palpate::wire::pb;
+use pb::create_session_request::Source;
+use server::{PATIENCE, Server, told};
+use tonic::Code;
+
+/// A server with so much memory, and where its metrics are.
+fn small(memory: &str) -> (Server, String) {
+    let mut server = Server::start(&["--memory", memory, "--metrics", "127.0.0.1:0", "--log", "error"]);
+    let mut line = String::new();
+    std::io::BufRead::read_line(&mut server.out, &mut line).unwrap();
+    let metrics = line.split_whitespace().last().unwrap().to_owned();
+    (server, metrics)
+}
+
+/// What a server tells of itself under a name that begins so, of all labels together.
+fn metric(url: &str, name: &str) -> f64 {
+    let address = url.strip_prefix("http://").unwrap().split('/').next().unwrap();
+    let mut socket = std::net::TcpStream::connect(address).unwrap();
+    socket.write_all(b"GET /metrics HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n").unwrap();
+    let mut text = String::new();
+    socket.read_to_string(&mut text).unwrap();
+    let lines = text.lines().filter(|line| line.starts_with(name));
+    lines.filter_map(|line| line.rsplit(' ').next()?.parse::<f64>().ok()).sum()
+}
+
+/// Waits until it is true.
+async fn until(what: &str, mut holds: impl FnMut() -> bool) {
+    let waited = tokio::time::timeout(PATIENCE, async {
+        while !holds() {
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+    });
+    assert!(waited.await.is_ok(), "{what}");
+}
+
+/// Bytes that the process has in memory.
+fn resident(server: &Server) -> u64 {
+    let text = std::fs::read_to_string(format!("/proc/{}/statm", server.child.id())).unwrap();
+    text.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap() * 4096
+}
+
+/// The paper's scene with so many points.
+fn sheet(nx: u32, ny: u32) -> Source {
+    let limits = palpate::limits::Limits { points: 1 << 40, ..Default::default() };
+    let points = format!("sheet.points=[{nx}, {ny}]");
+    let scene = palpate::scene::Scene::parse("paper", palpate::scene::PAPER, &[points], &limits).unwrap();
+    Source::Scene(palpate::wire::scene::scene(&scene))
+}
+
+const TAKEN: &str = "palpate_memory_taken_bytes{";
+
+#[tokio::test]
+async fn sessions_above_the_budget_are_refused_and_what_went_makes_room() {
+    let (server, metrics) = small("64MiB");
+    let mut kept = Vec::new();
+    let refused = loop {
+        match server.create(sheet(128, 128), true).await {
+            Ok(session) => kept.push(session.session_id),
+            Err(refused) => break refused,
+        }
+        assert!(kept.len() < 100, "nothing is refused");
+    };
+    assert_eq!(told(&refused), (Code::ResourceExhausted, "OVERLOADED".into(), "sheet.points".into()));
+    assert!(kept.len() > 2 && metric(&metrics, TAKEN) <= f64::from(48 << 20));
+    // What could never fit is told so.
+    let refused = server.create(sheet(1024, 1024), true).await.unwrap_err();
+    assert_eq!(told(&refused).1, "TOO_LARGE");
+    let mut sessions = server.sessions().await;
+    for session_id in kept {
+        sessions.delete_session(pb::DeleteSessionRequest { session_id }).await.unwrap();
+    }
+    drop(sessions);
+    until("memory is not given back", || metric(&metrics, TAKEN) == 0.0).await;
+    server.create(sheet(128, 128), true).await.unwrap();
+}
+
+#[tokio::test]
+async fn viewers_above_the_budget_are_refused_and_what_they_were_shown_is_forgotten() {
+    let (server, metrics) = small("64MiB");
+    let session = server.create(sheet(65, 65), false).await.unwrap().session_id;
+    let request = || pb::WatchFramesRequest { session_id: session.clone(), refinement: 5, ..Default::default() };
+    let mut unread = Vec::new();
+    let refused = loop {
+        match server.views().await.watch_frames(request()).await {
+            Ok(stream) => unread.push(stream),
+            Err(refused) => break refused,
+        }
+        assert!(unread.len() < 100, "nobody is refused");
+    };
+    assert_eq!(told(&refused), (Code::ResourceExhausted, "OVERLOADED".into(), "refinement".into()));
+    assert!(unread.len() > 2);
+    drop(unread);
+    until("what viewers saw is kept", || metric(&metrics, "palpate_memory_taken_bytes{for=\"frames\"}") == 0.0).await;
+    server.views().await.watch_frames(request()).await.unwrap();
+}
+
+#[tokio::test]
+async fn few_changes_of_the_tissue_wait() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = folder.path().join("palpate.toml");
+    std::fs::write(&config, "[limits]\nqueued_changes = 3\n").unwrap();
+    let server = Server::start(&["--config", config.to_str().unwrap()]);
+    let session = server.paper(true).await;
+    let mut sessions = server.sessions().await;
+    let mut taken = 0;
+    let refused = loop {
+        let request = pb::UpdateTissueRequest {
+            session_id: session.clone(),
+            at_step: Some(1000 + taken),
+            damping_n_s_per_m: Some(1.0 + taken as f64),
+            ..Default::default()
+        };
+        match sessions.update_tissue(request).await {
+            Ok(_) => taken += 1,
+            Err(refused) => break refused,
+        }
+    };
+    assert_eq!((taken, told(&refused).1.as_str()), (3, "QUEUE_FULL"));
+}
+
+#[tokio::test]
+async fn a_sheet_of_short_rows_counts_as_what_it_costs() {
+    let (server, _) = small("1GiB");
+    let refused = server.create(sheet(1 << 22, 1), true).await.unwrap_err();
+    assert_eq!(told(&refused), (Code::ResourceExhausted, "TOO_LARGE".into(), "sheet.points".into()));
+    assert!(refused.message().contains("longer side last"), "{refused:?}");
+}
+
+#[cfg(all(target_os = "linux", target_env = "gnu"))]
+#[tokio::test]
+async fn memory_goes_back_to_the_system_with_the_sessions() {
+    let (server, metrics) = small("2GiB");
+    server.paper(true).await;
+    let before = resident(&server);
+    let mut sessions = server.sessions().await;
+    for _ in 0..3 {
+        let session_id = server.create(sheet(512, 512), false).await.unwrap().session_id;
+        // Something moves, so that its memory is there.
+        let mut touch = server::Touch::hold(&server, &session_id).await;
+        touch.command(server::force(0, 1, -1.0)).await;
+        touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == 1).await;
+        let request = pb::GetStateHashRequest { session_id: session_id.clone(), at_step: None };
+        sessions.get_state_hash(request).await.unwrap();
+        assert!(resident(&server) > before + (4 << 20));
+        drop(touch);
+        sessions.delete_session(pb::DeleteSessionRequest { session_id }).await.unwrap();
+    }
+    let name = "palpate_memory_taken_bytes{for=\"sessions\"}";
+    until("sessions keep their memory", || metric(&metrics, name) < f64::from(4 << 20)).await;
+    until("memory does not go back to the system", || resident(&server) < before + (64 << 20)).await;
+}
+
+/// The tool of a session that is held.
+async fn held(server: &Server, session: &str) -> usize {
+    server.status(session).await.held_tools.len()
+}
+
+#[tokio::test]
+async fn a_lease_ends_with_its_connection_unless_asked_otherwise() {
+    let server = Server::start(&[]);
+    let session = server.paper(false).await;
+    let request = |tool, outlives_connection| pb::AcquireToolRequest {
+        session_id: session.clone(),
+        tool,
+        lease_s: Some(600.0),
+        outlives_connection,
+        ..Default::default()
+    };
+    let mut haptics = server.haptics().await;
+    haptics.acquire_tool(request(0, false)).await.unwrap();
+    haptics.acquire_tool(request(1, true)).await.unwrap();
+    assert_eq!(held(&server, &session).await, 2);
+    drop(haptics);
+    let waited = tokio::time::timeout(PATIENCE, async {
+        while held(&server, &session).await > 1 {
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+    });
+    waited.await.expect("a tool is held by nobody");
+    assert_eq!(server.status(&session).await.held_tools[0].tool, 1);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn who_administers_frees_tools_and_cuts_streams_and_callers() {
+    // Built before anything is held: a connection that does not answer meanwhile is closed.
+    tokio::task::spawn_blocking(server::client_program).await.unwrap();
+    let server = Server::start(&["--log", "error"]);
+    let session = server.paper(false).await;
+    let admin = |arguments: &[&str]| {
+        let mut command = std::process::Command::new(server::client_program());
+        command.arg("admin").args(arguments).args(["--server", &server.url]);
+        command.output().unwrap()
+    };
+    let text = |output: &std::process::Output| String::from_utf8(output.stdout.clone()).unwrap();
+    let mut touch = server::Touch::hold(&server, &session).await;
+    let shown = text(&admin(&["streams", &session]));
+    assert!(shown.contains("Touch") && shown.contains("holds") && shown.contains("address:127.0.0.1"), "{shown}");
+    assert!(text(&admin(&["callers"])).contains("address:127.0.0.1"));
+    let number = shown.lines().nth(1).unwrap().split_whitespace().next().unwrap();
+    assert!(admin(&["cut-stream", &session, number]).status.success());
+    let ended = loop {
+        match tokio::time::timeout(PATIENCE, touch.hear()).await.expect("a stream that was cut goes on") {
+            Ok(Some(_)) => {}
+            Ok(None) => panic!("it ends without a reason"),
+            Err(status) => break status,
+        }
+    };
+    assert_eq!(told(&ended), (Code::Aborted, "CUT".into(), String::new()));
+    server.until_let_go().await;
+    assert!(!admin(&["cut-stream", &session, number]).status.success());
+
+    let request = pb::AcquireToolRequest { session_id: session.clone(), lease_s: Some(600.0), ..Default::default() };
+    let mut haptics = server.haptics().await;
+    haptics.acquire_tool(request.clone()).await.unwrap();
+    assert!(admin(&["free-tool", &session, "0"]).status.success());
+    assert_eq!(held(&server, &session).await, 0);
+    haptics.acquire_tool(request).await.unwrap();
+    assert!(!admin(&["revive", &session]).status.success());
+    // Its own connection goes, too.
+    admin(&["cut-caller", "address:127.0.0.1", "--delete-sessions"]);
+    let listed = server.sessions().await.list_sessions(pb::ListSessionsRequest {}).await.unwrap();
+    assert!(listed.into_inner().sessions.is_empty());
+}
+
+#[tokio::test]
+async fn watchers_leave_room_for_who_holds_a_tool() {
+    let server = Server::start(&["--log", "error"]);
+    let session = server.paper(true).await;
+    let mut haptics = server.haptics().await;
+    let mut watchers = Vec::new();
+    let refused = loop {
+        let request = pb::WatchSamplesRequest { session_id: session.clone(), ..Default::default() };
+        match haptics.watch_samples(request).await {
+            Ok(stream) => watchers.push(stream),
+            Err(refused) => break refused,
+        }
+    };
+    assert_eq!(told(&refused), (Code::ResourceExhausted, "TOO_MANY".into(), String::new()));
+    server::Touch::hold(&server, &session).await;
+}
