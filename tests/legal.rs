@@ -7,7 +7,9 @@
 #![allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
+use palpate::budget::Budget;
 use palpate::limits::Limits;
 use palpate::pace::Pacer;
 use palpate::refusal::Reason;
@@ -63,6 +65,11 @@ fn processor_s() -> f64 {
     time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
 }
 
+/// One stepping thread.
+fn one_thread(limits: &Limits) -> Arc<Pacer> {
+    Pacer::start(1, 0.0, limits, Budget::new(limits, 1, 1)).unwrap()
+}
+
 /// Steps that each is stepped.
 const STEPS: u64 = 10;
 
@@ -72,13 +79,13 @@ fn every_legal_scene_is_bounded_work_or_refused() {
     // An unoptimized build takes a hundred times as long for each.
     let rehearsal_work = if cfg!(debug_assertions) { 1 << 18 } else { Limits::default().rehearsal_work };
     let limits = Limits { rehearsal_work, ..Limits::default() };
-    let pacer = Pacer::start(1, 0.0, &limits).unwrap();
+    let pacer = one_thread(&limits);
     let (mut taken, mut refused) = (Vec::new(), BTreeMap::<String, u32>::new());
     for seed in 0..scenes {
         let scene = legal(seed, &limits);
         scene.check(&limits).unwrap();
         let begun_s = processor_s();
-        match pacer.create(&scene, true, 60.0) {
+        match pacer.create(&scene, true, 60.0, &pacer.budget.account("test")) {
             Err(refusal) => {
                 assert!([Reason::TooLarge, Reason::WrongKind].contains(&refusal.reason), "{seed}: {refusal}");
                 *refused.entry(refusal.field).or_default() += 1;
@@ -136,21 +143,22 @@ fn what_no_number_of_substeps_can_do_is_refused_at_once_with_the_figure() {
 fn a_step_longer_than_its_period_is_refused_with_the_figure() {
     let large = scene(palpate::scene::PAPER, &["sheet.points=[1001, 1001]"]);
     let limits = Limits::default();
-    let pacer = Pacer::start(1, 0.0, &limits).unwrap();
-    let Err(refusal) = pacer.create(&large, true, 60.0) else { panic!("let in") };
+    let pacer = one_thread(&limits);
+    let Err(refusal) = pacer.create(&large, true, 60.0, &pacer.budget.account("test")) else { panic!("let in") };
     assert_eq!((refusal.reason, refusal.field.as_str()), (Reason::TooLarge, "stepping.rate_hz"));
     assert!(refusal.message.contains("limits.periods_per_step"), "{refusal}");
     pacer.stop();
-    let pacer = Pacer::start(1, 0.0, &Limits { periods_per_step: 20.0, ..limits }).unwrap();
-    assert!(pacer.create(&large, true, 60.0).is_ok());
+    let pacer = one_thread(&Limits { periods_per_step: 20.0, ..limits });
+    assert!(pacer.create(&large, true, 60.0, &pacer.budget.account("test")).is_ok());
     pacer.stop();
 }
 
 #[test]
 fn the_scenes_that_are_built_in_are_never_refused() {
-    let pacer = Pacer::start(1, 0.0, &Limits::default()).unwrap();
+    let pacer = one_thread(&Limits::default());
     for (name, text) in palpate::scene::BUILT_IN {
-        pacer.create(&scene(text, &[]), true, 60.0).unwrap_or_else(|refusal| panic!("{name}: {refusal}"));
+        let account = pacer.budget.account("test");
+        pacer.create(&scene(text, &[]), true, 60.0, &account).unwrap_or_else(|refusal| panic!("{name}: {refusal}"));
     }
     pacer.stop();
 }
