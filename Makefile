@@ -34,7 +34,7 @@ help:
 	@echo 'make fuzz            a million bent inputs for every decoder (some minutes)'
 	@echo 'make libfuzzer       one decoder under libFuzzer: TARGET=request (or scene, script, …) FUZZ_SECONDS=60'
 	@echo 'make lint            formatting, compiler and clippy warnings'
-	@echo 'make picture         the curve of the README'
+	@echo 'make picture         docs/poke.svg, the curve of the guide'
 	@echo 'make figures         the paper'"'"'s figures and experiments: docs/figures, shown in docs/paper.md'
 	@echo 'make screenshot      the screenshot of the README'
 	@echo 'make bench-roundtrip the haptic round trip beside a bare gRPC echo'

@@ -4,6 +4,7 @@ use std::io::{BufWriter, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
+use std::time::Duration;
 
 use clap::{Parser, Subcommand};
 use palpate::budget;
@@ -13,7 +14,7 @@ use palpate::refusal::Refusal;
 use palpate::render::{self, Film, View};
 use palpate::scene::{Scene, script::Script};
 use palpate::server::identity::{self, Role};
-use palpate::server::{self, Doors, ServeError, catalog::Catalog, config::Config};
+use palpate::server::{self, Doors, ServeError, catalog::Catalog, config::Config, signals};
 use palpate::session::{check, run};
 use palpate::sheet::Model;
 use palpate::surface::Refinement;
@@ -155,7 +156,7 @@ struct ServeArguments {
     /// Folder of the page that `/` shows, built by `npm run build` in clients/viewer [default: clients/viewer/dist]
     #[arg(long, value_name = "DIR")]
     viewer: Option<PathBuf>,
-    /// Configuration file (TOML); its keys are in the README. These options go before it
+    /// Configuration file (TOML); docs/palpate.toml has every key. These options go before it
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Stepping threads [default: one less than the machine has cores]
@@ -369,14 +370,17 @@ fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(config.serving_threads())
         .thread_name("network")
+        // For files. They are looked at twice a second: threads that would wait longer for the next look would never end.
+        .max_blocking_threads(16)
+        .thread_keep_alive(Duration::from_secs(1))
         .enable_all()
         .build()
         .map_err(|e| Failure::Failed(format!("can't start the network threads: {e}")))?;
     let ended = runtime.block_on(async {
         let doors = Doors::open(&config).await?;
         let shutdown = CancellationToken::new();
-        outlive_signals();
-        tokio::spawn(cancel_on_signal(shutdown.clone()));
+        signals::outlive();
+        tokio::spawn(signals::cancel_on(shutdown.clone()));
         // Who started us may have stopped listening; we serve all the same.
         let _ = writeln!(std::io::stdout(), "palpate listens on {}", doors.url());
         if let Some(url) = doors.metrics_url() {
@@ -421,41 +425,6 @@ fn token(arguments: &TokenArguments) -> Result<(), Failure> {
     // In one piece: a server may look at any moment.
     file.write_all(format!("\n{entry}").as_bytes()).map_err(refuse)?;
     writeln!(std::io::stdout(), "{token}").map_err(|e| Failure::Failed(e.to_string()))
-}
-
-/// What would end a process by default and is no reason for a server to end: SIGHUP has it look at its files, the others
-/// mean nothing to it; a log that may not grow any more (SIGXFSZ) is an error to who writes it.
-fn outlive_signals() {
-    #[cfg(unix)]
-    {
-        use rustix::process::Signal;
-        use tokio::signal::unix::{SignalKind, signal};
-        for ignored in [Signal::HUP, Signal::USR1, Signal::USR2, Signal::XFSZ] {
-            // Caught from now on, though nobody is told here.
-            let _ = signal(SignalKind::from_raw(ignored.as_raw()));
-        }
-    }
-}
-
-/// Ctrl-C and SIGTERM end the server; a second one ends it at once.
-async fn cancel_on_signal(shutdown: CancellationToken) {
-    for signals in 0.. {
-        #[cfg(unix)]
-        {
-            use tokio::signal::unix::{SignalKind, signal};
-            let Ok(mut terminate) = signal(SignalKind::terminate()) else { return };
-            tokio::select! {
-                _ = tokio::signal::ctrl_c() => {}
-                _ = terminate.recv() => {}
-            }
-        }
-        #[cfg(not(unix))]
-        let _ = tokio::signal::ctrl_c().await;
-        if signals > 0 {
-            std::process::exit(130);
-        }
-        shutdown.cancel();
-    }
 }
 
 /// How much more a scene may take to be compiled here than on a server: a tolerance of 1e-10 is for yardsticks.

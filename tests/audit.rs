@@ -384,6 +384,8 @@ async fn a_live_session_is_corrected_if_its_scene_says_so() {
     let status = push_until(&server, &session.session_id, acted).await;
     let audit = status.audit.unwrap();
     assert!(audit.corrections >= 1 && (status.integrator.as_str(), status.substeps) != ("lagged", 1), "{audit:?}");
+    // The log is written by a thread of its own, after the correction has acted.
+    push_until(&server, &session.session_id, |later| later.step > status.step + 500).await;
     let log = server.log();
     assert!(log.contains("tissue corrected"), "{log}");
 }

@@ -387,7 +387,7 @@ fn everywhere(sequence: u64) -> pb::Command {
 
 #[tokio::test]
 async fn a_heavy_session_slows_itself_and_lets_no_further_one_in() {
-    let server = Server::start(&["--threads", "1"]);
+    let server = limited("periods_per_step = 20.0", &["--threads", "1"]);
     let heavy = server.create(heavy(), false).await.unwrap().session_id;
     // At rest it takes nothing: others are let in.
     let light = server.paper(false).await;

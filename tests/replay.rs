@@ -113,6 +113,8 @@ fn hammer(url: String) -> Hammer {
 
 #[test]
 fn a_replay_is_exact_while_another_client_hammers_another_session() {
+    // Built before anybody hammers.
+    server::client_program();
     let server = Server::start(&["--log", "error"]);
     let hammer = hammer(server.url.clone());
     for script in shipped_scripts() {

@@ -196,7 +196,10 @@ async fn the_same_scene_and_commands_give_the_same_hash_on_any_number_of_threads
 
 #[tokio::test]
 async fn a_session_too_heavy_for_its_rate_slows_its_own_time_and_says_so() {
-    let server = Server::start(&[]);
+    let folder = tempfile::tempdir().unwrap();
+    let config = folder.path().join("palpate.toml");
+    std::fs::write(&config, "[limits]\nperiods_per_step = 20.0\n").unwrap();
+    let server = Server::start(&["--config", config.to_str().unwrap()]);
     let mut heavy = paper();
     let sheet = heavy.sheet.as_mut().unwrap();
     // No machine does 400,000 points 10,000 times a second on one core.

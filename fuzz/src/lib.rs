@@ -107,7 +107,7 @@ fn script_seeds() -> Vec<Vec<u8>> {
 }
 
 /// Every request of the protocol: decodes one, and does with it what can be done without a server.
-pub const REQUESTS: [(&str, Taker); 22] = [
+pub const REQUESTS: [(&str, Taker); 28] = [
     ("CreateSessionRequest", |bytes| {
         use pb::create_session_request::Source;
         match pb::CreateSessionRequest::decode(bytes).map(|request| request.source) {
@@ -177,6 +177,12 @@ pub const REQUESTS: [(&str, Taker); 22] = [
     ("StartSessionRequest", |bytes| pb::StartSessionRequest::decode(bytes).is_ok()),
     ("PauseSessionRequest", |bytes| pb::PauseSessionRequest::decode(bytes).is_ok()),
     ("GetStateHashRequest", |bytes| pb::GetStateHashRequest::decode(bytes).is_ok()),
+    ("ListCallersRequest", |bytes| pb::ListCallersRequest::decode(bytes).is_ok()),
+    ("ListStreamsRequest", |bytes| pb::ListStreamsRequest::decode(bytes).is_ok()),
+    ("FreeToolRequest", |bytes| pb::FreeToolRequest::decode(bytes).is_ok()),
+    ("CutStreamRequest", |bytes| pb::CutStreamRequest::decode(bytes).is_ok()),
+    ("CutCallerRequest", |bytes| pb::CutCallerRequest::decode(bytes).is_ok()),
+    ("ReviveSessionRequest", |bytes| pb::ReviveSessionRequest::decode(bytes).is_ok()),
     // Of a client that writes what no request is.
     ("", |bytes| pb::Scene::decode(bytes).is_ok_and(|scene| wire::scene::from_scene(&scene).is_ok())),
 ];

@@ -318,7 +318,6 @@ impl axum::serve::Listener for Scrapers {
 pub(super) async fn serve(
     listener: TcpListener,
     limits: &Limits,
-    budget: Arc<Budget>,
     registry: Registry,
     shutdown: CancellationToken,
 ) -> io::Result<()> {
@@ -335,7 +334,8 @@ pub(super) async fn serve(
     };
     let limits = Limits { connections: SCRAPERS, connections_per_address: SCRAPERS, ..limits.clone() };
     let seats = Arc::new(Seats::new(&limits, Some(SCRAPERS)));
-    // What the server's clients do is counted elsewhere.
+    // What the server's clients do and take is counted elsewhere.
+    let budget = Budget::new(&limits, 1, 1);
     let address = listener.local_addr()?;
     let connections = connections::incoming(listener, None, seats, &limits, budget, Arc::default(), Arc::default());
     let router = Router::new().route("/metrics", get(told));

@@ -20,6 +20,7 @@ mod reload;
 mod request;
 mod revocation;
 mod sessions;
+pub mod signals;
 mod textures;
 mod tls;
 mod transport;
@@ -275,8 +276,8 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
     let workshop = Workshop::open("workshop", &limits)?;
     if let Some(listener) = metrics {
         let registry = metrics::registry(&pacer, &traffic, &workshop);
-        let (limits, budget, shutdown) = (limits.clone(), budget.clone(), shutdown.clone());
-        tokio::spawn(async move { metrics::serve(listener, &limits, budget, registry, shutdown).await });
+        let (limits, shutdown) = (limits.clone(), shutdown.clone());
+        tokio::spawn(async move { metrics::serve(listener, &limits, registry, shutdown).await });
     }
     let open = protection.credentials.get().is_open();
     if config.insecure && open {

@@ -54,6 +54,8 @@ struct Lease {
     duration_ns: u64,
     expires_ns: u64,
     last_sequence: Option<u64>,
+    /// Radius of the tip by which the newest command leads the tool, m.
+    tip_radius_m: Option<f64>,
     /// Number of commands of the tool in the queue.
     waiting: usize,
     /// Place of the tool's newest command in the queue.
@@ -122,6 +124,23 @@ impl Rules {
             }
             Action::Release => Ok(()),
         }
+    }
+}
+
+/// Radius of the tip by which a command leads its tool, m.
+fn tip_radius_m(command: &Command) -> Option<f64> {
+    if let Action::Lead { tip, .. } = &command.action { Some(tip.radius_m) } else { None }
+}
+
+/// Refuses another tip in the tissue: the surface under a larger one lies elsewhere, and to meet it at once is a blow that no
+/// instrument gives.
+fn check_tip(before_m: Option<f64>, now_m: Option<f64>) -> Result<()> {
+    match (before_m, now_m) {
+        (Some(before_m), Some(now_m)) if before_m.to_bits() != now_m.to_bits() => {
+            let message = format!("is {now_m} m, but the tool is led with a tip of {before_m} m: release it first");
+            Err(Refusal::new(Reason::OutOfTurn, "pose.tip.radius_m", message))
+        }
+        _ => Ok(()),
     }
 }
 
@@ -238,6 +257,7 @@ impl Intake {
                 duration_ns,
                 expires_ns: now_ns.saturating_add(duration_ns),
                 last_sequence: None,
+                tip_radius_m: None,
                 waiting: 0,
                 last_place: None,
                 seat: None,
@@ -332,21 +352,23 @@ impl Intake {
         if commands.is_empty() {
             return self.renew(id, now_ns);
         }
-        // Of each tool the last sequence number, and how many come.
-        let mut last: BTreeMap<u32, (u64, usize)> = BTreeMap::new();
+        // Of each tool the last sequence number, how many commands come, and the tip after them.
+        let mut last: BTreeMap<u32, (u64, usize, Option<f64>)> = BTreeMap::new();
         for command in &commands {
             let lease = self.leases.get(&command.tool).filter(|lease| lease.id == id);
             let lease = lease.ok_or_else(|| not_holder(format!("tool {} is not held by this client", command.tool)))?;
             let coming = last.get(&command.tool).copied();
-            let before = coming.map(|(sequence, _)| sequence).or(lease.last_sequence);
+            let before = coming.map(|(sequence, ..)| sequence).or(lease.last_sequence);
             if let Some(before) = before.filter(|before| command.sequence <= *before) {
                 let message = format!("must be above {before}, the last one, but is {}", command.sequence);
                 return Err(Refusal::new(Reason::StaleSequence, "sequence", message));
             }
-            last.insert(command.tool, (command.sequence, coming.map_or(0, |coming| coming.1) + 1));
+            let tip_radius_m = tip_radius_m(command);
+            check_tip(coming.map_or(lease.tip_radius_m, |coming| coming.2), tip_radius_m)?;
+            last.insert(command.tool, (command.sequence, coming.map_or(0, |coming| coming.1) + 1, tip_radius_m));
         }
         // A limit per tool, so that no holder fills the queue for the others.
-        for (tool, (_, coming)) in &last {
+        for (tool, (_, coming, _)) in &last {
             let waiting = self.leases.get(tool).map_or(0, |lease| lease.waiting);
             if waiting + coming > self.limits.queued_commands_per_tool {
                 let message = format!("{waiting} commands of tool {tool} wait for their step already");
@@ -369,6 +391,7 @@ impl Intake {
         self.arrivals += 1;
         if let Some(lease) = self.leases.get_mut(&command.tool) {
             lease.last_sequence = Some(command.sequence);
+            lease.tip_radius_m = tip_radius_m(&command);
             lease.waiting += 1;
             let last = lease.last_place.replace(place);
             // The latest position wins: it supersedes an earlier one that has not taken effect. This does not apply to

@@ -111,10 +111,11 @@ impl Contacts {
     /// From the coming step on the tool is at `to_m` at the step's end. A new tool begins there.
     pub(super) fn lead(&mut self, model: &Model, number: usize, to_m: DVec3, tip: Tip) {
         if let Some(tool) = self.tools.iter_mut().find(|tool| tool.number == number) {
-            if tool.tip.radius_m != tip.radius_m {
+            let is_other = tool.tip.radius_m != tip.radius_m;
+            if is_other {
                 tool.footprint = Footprint::new(model, tip.radius_m, tool.footprint.centre_m());
             }
-            if tool.tip.grasps != tip.grasps {
+            if is_other || tool.tip.grasps != tip.grasps {
                 (tool.standing, tool.steady_n) = (Standing::Free, DVec3::ZERO);
             }
             (tool.to_m, tool.tip) = (to_m, tip);

@@ -68,10 +68,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_reason_is_told_in_the_readme() {
-        let readme = include_str!("../../README.md");
+    fn every_reason_is_told_in_the_guide() {
+        let guide = include_str!("../../docs/protocol.md");
         for reason in Reason::ALL {
-            assert!(readme.contains(&format!("`{}`", reason.as_str())), "the README lacks {}", reason.as_str());
+            assert!(guide.contains(&format!("`{}`", reason.as_str())), "docs/protocol.md lacks {}", reason.as_str());
         }
     }
 

@@ -30,7 +30,9 @@ fn compile(sets: &[&str]) -> Arc<Model> {
 }
 
 fn changed(model: &Model, change: Change) -> Arc<Model> {
-    model.changed(&change, &model.scene, &Limits::default()).unwrap()
+    // Undamped tissue without virtual springs takes more rehearsals than a server has time for.
+    let limits = Limits { rehearsal_work: u64::MAX, ..Limits::default() };
+    model.changed(&change, &model.scene, &limits).unwrap()
 }
 
 fn other(k: f64, c: f64, virtual_k: f64) -> Change {
@@ -264,7 +266,7 @@ fn changes_act_in_order_and_wake_a_session_at_rest() {
             }
         })
         .unwrap();
-    assert_eq!((refusal.reason, waiting), (Reason::QueueFull, Limits::default().queued_commands_per_tool as u64));
+    assert_eq!((refusal.reason, waiting), (Reason::QueueFull, Limits::default().queued_changes as u64));
 }
 
 fn update(session_id: &str, change: Change, at_step: Option<u64>) -> pb::UpdateTissueRequest {

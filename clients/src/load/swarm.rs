@@ -220,7 +220,8 @@ async fn keep_awake(channel: Channel, id: &str, scene: &Scene, step: u64, lasts_
         tool: 0,
         lease_s: Some(lasts_s),
         holder: "palpate-client load".to_owned(),
-        outlives_connection: false,
+        // Nobody stays to hold it.
+        outlives_connection: true,
     };
     let lease_id = haptics.acquire_tool(acquire).await?.into_inner().lease_id;
     let command = |index: u64| {

@@ -3,6 +3,7 @@
 
 use super::*;
 use crate::scene::PAPER;
+use crate::scene::tip::Tip;
 
 const LEASE: LeaseId = 7;
 const MS: u64 = 1_000_000;
@@ -79,4 +80,19 @@ fn renewing_wakes_nobody() {
     intake.renew(LEASE, 900 * MS).unwrap();
     assert!(!intake.take_wake());
     assert_eq!(intake.rest(1001, u64::MAX, &schedule), 1901);
+}
+
+#[test]
+fn a_tool_keeps_its_tip_until_it_is_released() {
+    let (mut intake, _) = intake();
+    let lead = |sequence, radius_m| Command {
+        action: Action::Lead { place_m: glam::DVec3::ZERO, tip: Tip { radius_m, ..Tip::default() } },
+        ..release(sequence, None)
+    };
+    intake.submit(LEASE, vec![lead(1, 0.005)], 0).unwrap();
+    let refused = intake.submit(LEASE, vec![lead(2, 0.005), lead(3, 0.006)], 0).unwrap_err();
+    assert_eq!((refused.reason, refused.field.as_str()), (Reason::OutOfTurn, "pose.tip.radius_m"));
+    // Of a batch that is refused nothing is taken in.
+    intake.submit(LEASE, vec![lead(2, 0.005), release(3, None), lead(4, 0.006)], 0).unwrap();
+    assert!(intake.submit(LEASE, vec![lead(5, 0.005)], 0).is_err());
 }

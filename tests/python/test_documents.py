@@ -1,4 +1,4 @@
-"""What the README tells a newcomer to do, done to the letter with stock grpcio."""
+"""What README and guide show is done to the letter: every block of code that is not marked with `not-run: REASON`."""
 
 import json
 import pathlib
@@ -16,17 +16,70 @@ from grpc_reflection.v1alpha.proto_reflection_descriptor_database import ProtoRe
 
 from server import ROOT, Server
 
-README = (ROOT / "README.md").read_text()
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PROGRAM, CLIENT = "target/release/palpate", "target/release/palpate-client"
+LANGUAGES = {"sh", "python", "toml", ""}
 
 
-def blocks(language):
-    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+def blocks():
+    """(file, line, language, mark, text) of every fenced block."""
+    for path in DOCUMENTS:
+        text = path.read_text()
+        for match in re.finditer(r"^```(\S*)[ ]*(.*)\n((?:.*\n)*?)```$", text, re.MULTILINE):
+            line = text[: match.start()].count("\n") + 1
+            yield path.relative_to(ROOT), line, match[1], match[2], match[3]
+
+
+def run_of(language):
+    return [block for block in blocks() if block[2] == language and not block[3].startswith("not-run:")]
+
+
+class EveryBlock(unittest.TestCase):
+    def test_every_block_is_run_or_says_why_not(self):
+        for path, line, language, mark, _ in blocks():
+            with self.subTest(f"{path}:{line}"):
+                self.assertIn(language, LANGUAGES)
+                if mark:
+                    self.assertRegex(mark, r"^not-run: \w+", "a mark is `not-run: REASON`")
+
+    def test_the_commands_succeed(self):
+        with Server() as server:
+            for path, line, _, _, text in run_of("sh"):
+                if "grpcurl" in text or "grpc_tools" in text:
+                    continue  # FirstClient
+                for command in text.splitlines():
+                    with self.subTest(f"{path}:{line}: {command}"):
+                        self.run_command(command, server)
+
+    def run_command(self, command, server):
+        words = shlex.split(command, comments=True)
+        if not words or words[:2] == [PROGRAM, "serve"]:
+            return  # the server runs: `Server` began it by that command
+        self.assertIn(words[0], (PROGRAM, CLIENT), "only our programs; mark the block as not run")
+        if words[:2] == [CLIENT, "replay"]:
+            words += ["--server", f"http://{server.address}"]
+        ran = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=120)
+        self.assertEqual(ran.returncode, 0, ran.stderr)
+
+    def test_scenes_and_scripts_are_as_described(self):
+        files = {"[sheet]": "scene.toml", "duration_s": "script.toml"}
+        with tempfile.TemporaryDirectory() as folder:
+            found = {}
+            for path, line, _, _, text in run_of("toml"):
+                (name,) = [name for key, name in files.items() if key in text] or [None]
+                if name:
+                    found[name] = pathlib.Path(folder) / name
+                    found[name].write_text(text)
+            self.assertEqual(set(found), set(files.values()))
+            command = [PROGRAM, "run", found["scene.toml"], found["script.toml"]]
+            ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+            self.assertEqual(ran.returncode, 0, ran.stderr)
 
 
 class FirstClient(unittest.TestCase):
     def test_the_python_client_presses_and_feels_a_force(self):
-        (program,) = blocks("python")
-        (install,) = [block for block in blocks("sh") if "grpc_tools" in block]
+        ((*_, program),) = run_of("python")
+        (install,) = [block[-1] for block in run_of("sh") if "grpc_tools" in block[-1]]
         (compile_protocol,) = [line for line in install.splitlines() if "grpc_tools.protoc" in line]
         with Server() as server, tempfile.TemporaryDirectory() as folder:
             shutil.copytree(ROOT / "proto", pathlib.Path(folder) / "proto")
@@ -44,7 +97,7 @@ class FirstClient(unittest.TestCase):
         self.assertTrue(0.9 < force_n < 1.1, lines[-1])
 
     def test_the_grpcurl_calls_are_answered_by_reflection(self):
-        (calls,) = [block for block in blocks("sh") if "grpcurl" in block]
+        (calls,) = [block[-1] for block in run_of("sh") if "grpcurl" in block[-1]]
         with Server() as server, grpc.insecure_channel(server.address) as channel:
             reflection = ProtoReflectionDescriptorDatabase(channel)
             pool = descriptor_pool.DescriptorPool(reflection)
