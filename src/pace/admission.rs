@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicU64;
 
 use super::auditor::Audited;
 use super::clock::{Dilation, now_ns};
-use super::cost::{Cost, check_work};
+use super::cost::{Cost, check_asked, check_work};
 use super::inbox::Request;
 use super::queue::lock;
 use super::streams::Streams;
@@ -26,6 +26,7 @@ impl Pacer {
         let slot = owner.take(Resource::Sessions, 1, "")?;
         let most_hz = self.limits.session_rate_hz;
         number("stepping.rate_hz", scene.stepping.rate_hz, &format!("at most {most_hz}"), |v| v <= most_hz)?;
+        check_asked(scene, &self.limits)?;
         let model = self.compile(scene)?;
         let id = random_id()?;
         check_work(&model, &self.limits)?;

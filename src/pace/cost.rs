@@ -4,7 +4,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result};
-use crate::sheet::Model;
+use crate::scene::Scene;
+use crate::sheet::{Model, choice};
 
 /// Before anything was measured: of a point and substep, and of a step beside its points, ns.
 const GUESS_NS: f64 = 2.0;
@@ -73,16 +74,28 @@ impl Cost {
     }
 }
 
+/// Refuses a scene whose step is too much whatever is chosen for it, before that takes any time.
+pub(super) fn check_asked(scene: &Scene, limits: &Limits) -> Result<()> {
+    scene.check(limits)?;
+    let (substeps, step_s) = choice::least_step(scene);
+    let [nx, ny] = scene.sheet.points;
+    check_step(nx * ny, substeps, step_s, scene.stepping.rate_hz, limits)
+}
+
 /// Refuses steps that would keep the server from all others.
 pub(super) fn check_work(model: &Model, limits: &Limits) -> Result<()> {
-    let (points, substeps, most) = (model.swept_points(), model.plan.substeps, limits.point_substeps_per_step);
-    if points as u64 * u64::from(substeps) > most {
+    let (step_s, rate_hz) = (model.predicted_step_s(), model.scene.stepping.rate_hz);
+    check_step(model.swept_points(), model.plan.substeps, step_s, rate_hz, limits)
+}
+
+fn check_step(points: usize, substeps: u32, step_s: f64, rate_hz: f64, limits: &Limits) -> Result<()> {
+    let most = limits.point_substeps_per_step;
+    if (points as u64).saturating_mul(u64::from(substeps)) > most {
         let message =
             format!("a step would compute {points} points {substeps} times, above the limit of {most} in all");
         return Err(Refusal::new(Reason::TooLarge, "stepping.substeps", message));
     }
-    let (step_s, rate_hz, most) = (model.predicted_step_s(), model.scene.stepping.rate_hz, limits.periods_per_step);
-    let periods = step_s * rate_hz;
+    let (periods, most) = (step_s * rate_hz, limits.periods_per_step);
     if periods > most {
         let message = format!(
             "a step of {points} points, computed {substeps} times each, would take {:.3} ms, which is {periods:.2} of its \

@@ -223,6 +223,27 @@ impl Chooser<'_> {
     }
 }
 
+/// The fewest substeps of `step_s` with which an integrator can do, or the best of those that `auto` may become. Saturates
+/// for absurd scenes.
+pub(super) fn least_substeps(asked: Integrator, step_s: f64, sheet: &Oscillator) -> u32 {
+    let is_open = |integrator: Integrator| asked == Integrator::Auto || asked == integrator;
+    let open = CANDIDATES.iter().map(|candidate| candidate.0).filter(|integrator| is_open(*integrator));
+    let least = open.map(|integrator| stability::stable_substeps(integrator, step_s, sheet)).min();
+    least.unwrap_or_else(|| stability::substeps(asked, step_s, sheet))
+}
+
+/// The fewest substeps that a scene can do with, or those that it gives, and the time that a step of the cheapest kind
+/// takes with them while all of the sheet moves, s.
+#[allow(clippy::cast_precision_loss)]
+pub fn least_step(scene: &Scene) -> (u32, f64) {
+    let Stepping { integrator, substeps, precision, rate_hz, lanes, .. } = scene.stepping;
+    let least = || least_substeps(integrator, rate_hz.recip(), &Oscillator::of(scene));
+    let substeps = substeps.unwrap_or_else(least);
+    let point_ns = point_substep_ns(integrator, precision, super::lanes::available(lanes).unwrap_or(lanes));
+    let [nx, ny] = scene.sheet.points;
+    (substeps, 1e-9 * (STEP_NS + point_ns * (nx * ny) as f64 * f64::from(substeps)))
+}
+
 /// Every integrator that the scene leaves open, each with the cheapest that keeps to the tolerance.
 pub fn candidates(scene: &Scene, limits: &Limits) -> Vec<Choice> {
     let chooser = Chooser::new(scene, limits);

@@ -114,7 +114,7 @@ impl Model {
             Refusal::new(Reason::TooLarge, "stepping.substeps", message)
         };
         // Nothing is rehearsed that no scheme could do.
-        let least = stability::least_substeps(step_s, &sheet);
+        let least = choice::least_substeps(scene.stepping.integrator, step_s, &sheet);
         if scene.stepping.substeps.is_none() && least > limits.substeps {
             return Err(too_many(least));
         }
