@@ -3,6 +3,7 @@
 pub mod budget;
 pub mod haptics;
 pub mod limits;
+mod lock;
 pub mod pace;
 pub mod refusal;
 pub mod render;

@@ -2,10 +2,11 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 mod common;
+#[path = "common/metrics.rs"]
+mod metrics;
 #[path = "common/server.rs"]
 mod server;
 
-use std::io::BufRead;
 use std::time::Instant;
 
 use common::{SMALL, model, playing, scene_with, script};
@@ -328,20 +329,6 @@ async fn push_until(server: &Server, session_id: &str, wanted: impl Fn(&pb::Sess
     unreachable!()
 }
 
-fn scrape(server: &mut Server) -> String {
-    let mut line = String::new();
-    server.out.read_line(&mut line).unwrap();
-    let url = line.split_whitespace().last().unwrap().to_owned();
-    let (host, path) = url.trim_start_matches("http://").split_once('/').unwrap();
-    let mut stream = std::net::TcpStream::connect(host).unwrap();
-    std::io::Write::write_all(
-        &mut stream,
-        format!("GET /{path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n").as_bytes(),
-    )
-    .unwrap();
-    std::io::read_to_string(stream).unwrap()
-}
-
 #[tokio::test]
 async fn a_live_session_tells_its_audited_error_and_why() {
     let mut server = Server::start(&["--audit-share", "0.5", "--metrics", "127.0.0.1:0"]);
@@ -357,12 +344,8 @@ async fn a_live_session_tells_its_audited_error_and_why() {
         audit.windows_above_tolerance >= 1 && audit.reason.contains("substep") && audit.corrections == 0,
         "{audit:?}"
     );
-    let metrics = scrape(&mut server);
-    let value = |name: &str| -> f64 {
-        let line =
-            metrics.lines().find(|line| line.starts_with(&format!("{name} "))).unwrap_or_else(|| panic!("{metrics}"));
-        line.rsplit(' ').next().unwrap().parse().unwrap()
-    };
+    let metrics = metrics::scrape(&metrics::url(&mut server.out));
+    let value = |name: &str| *metrics.get(name).unwrap_or_else(|| panic!("{metrics:?}"));
     assert!(
         value("palpate_audited_windows_total") >= 1.0 && value("palpate_audited_windows_above_tolerance_total") >= 1.0
     );

@@ -1,10 +1,13 @@
 //! Memory has a budget: what would be above it is refused with a reason before it is taken, and all is given back.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
+#[path = "common/cores.rs"]
+mod cores;
+#[path = "common/metrics.rs"]
+mod metrics;
 #[path = "common/server.rs"]
 mod server;
 
-use std::io::{Read, Write};
 use std::time::Duration;
 
 use palpate::wire::pb;
@@ -15,21 +18,13 @@ use tonic::Code;
 /// A server with so much memory, and where its metrics are.
 fn small(memory: &str) -> (Server, String) {
     let mut server = Server::start(&["--memory", memory, "--metrics", "127.0.0.1:0", "--log", "error"]);
-    let mut line = String::new();
-    std::io::BufRead::read_line(&mut server.out, &mut line).unwrap();
-    let metrics = line.split_whitespace().last().unwrap().to_owned();
+    let metrics = metrics::url(&mut server.out);
     (server, metrics)
 }
 
-/// What a server tells of itself under a name that begins so, of all labels together.
+/// A metric, of all labels together.
 fn metric(url: &str, name: &str) -> f64 {
-    let address = url.strip_prefix("http://").unwrap().split('/').next().unwrap();
-    let mut socket = std::net::TcpStream::connect(address).unwrap();
-    socket.write_all(b"GET /metrics HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n").unwrap();
-    let mut text = String::new();
-    socket.read_to_string(&mut text).unwrap();
-    let lines = text.lines().filter(|line| line.starts_with(name));
-    lines.filter_map(|line| line.rsplit(' ').next()?.parse::<f64>().ok()).sum()
+    metrics::sum(&metrics::scrape(url), name)
 }
 
 /// Waits until it is true.
@@ -44,8 +39,7 @@ async fn until(what: &str, mut holds: impl FnMut() -> bool) {
 
 /// Bytes that the process has in memory.
 fn resident(server: &Server) -> u64 {
-    let text = std::fs::read_to_string(format!("/proc/{}/statm", server.child.id())).unwrap();
-    text.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap() * 4096
+    cores::resident(server.child.id())
 }
 
 /// The paper's scene with so many points.
@@ -56,7 +50,7 @@ fn sheet(nx: u32, ny: u32) -> Source {
     Source::Scene(palpate::wire::scene::scene(&scene))
 }
 
-const TAKEN: &str = "palpate_memory_taken_bytes{";
+const TAKEN: &str = "palpate_memory_taken_bytes";
 
 #[tokio::test]
 async fn sessions_above_the_budget_are_refused_and_what_went_makes_room() {

@@ -200,8 +200,19 @@ async fn tokens_come_and_go_while_the_server_runs() {
     assert!(is_known(&first).await && !is_known(&second).await);
 }
 
-#[tokio::test]
-async fn who_loses_a_token_loses_the_streams_and_tools_that_it_opened() {
+/// A server with a session, and two who know it: one of them is struck from the file when `before` is written there.
+struct Two {
+    _folder: tempfile::TempDir,
+    file: std::path::PathBuf,
+    before: String,
+    stays: String,
+    goes: String,
+    server: Server,
+    log: Log,
+    session: String,
+}
+
+async fn two_tokens() -> Two {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("tokens.toml");
     let stays = token(&file, "stays", "create,touch");
@@ -212,6 +223,12 @@ async fn who_loses_a_token_loses_the_streams_and_tools_that_it_opened() {
     let request = pb::CreateSessionRequest { source, ..Default::default() };
     let created = server.sessions().await.create_session(with_token(request, &stays)).await.unwrap();
     let session = created.into_inner().session.unwrap().session_id;
+    Two { _folder: folder, file, before, stays, goes, server, log, session }
+}
+
+#[tokio::test]
+async fn who_loses_a_token_loses_the_streams_and_tools_that_it_opened() {
+    let Two { _folder, file, before, stays, goes, server, log, session } = two_tokens().await;
     let open = async |tool: u32, token: &str| {
         let (sender, receiver) = tokio::sync::mpsc::channel(4);
         let message = Some(pb::touch_request::Message::Open(server::open(&session, &[tool])));
@@ -266,16 +283,7 @@ async fn touch_with(
 
 #[tokio::test]
 async fn who_loses_a_token_and_does_not_read_commands_nothing_more() {
-    let folder = tempfile::tempdir().unwrap();
-    let file = folder.path().join("tokens.toml");
-    let stays = token(&file, "stays", "create,touch");
-    let before = std::fs::read_to_string(&file).unwrap();
-    let goes = token(&file, "goes", "touch");
-    let (server, log) = start_logged(&["--tokens", file.to_str().unwrap()]);
-    let source = Some(pb::create_session_request::Source::SceneName("paper".into()));
-    let request = pb::CreateSessionRequest { source, ..Default::default() };
-    let created = server.sessions().await.create_session(with_token(request, &stays)).await.unwrap();
-    let session = created.into_inner().session.unwrap().session_id;
+    let Two { _folder, file, before, stays, goes, server, log, session } = two_tokens().await;
     let status = async || {
         let request = pb::GetSessionRequest { session_id: session.clone() };
         let told = server.sessions().await.get_session(with_token(request, &stays)).await.unwrap();

@@ -18,11 +18,11 @@ mod caller;
 mod cores;
 #[path = "common/honest.rs"]
 mod honest;
+#[path = "common/metrics.rs"]
+mod metrics;
 #[path = "common/server.rs"]
 mod server;
 
-use std::io::{BufRead, Read, Write};
-use std::net::TcpStream;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -32,7 +32,7 @@ use cores::{descriptors, kept_to, peak, resident, threads};
 use fastrand::Rng;
 use honest::{Account, Honest, Newcomers};
 use palpate::server::identity::Role;
-use server::{PATIENCE, Server, palpate};
+use server::{PATIENCE, Server};
 
 const ATTACKERS: u64 = 8;
 const HONEST: u64 = 4;
@@ -60,7 +60,7 @@ fn mixable() -> Vec<&'static Kind> {
 struct Besieged {
     server: Server,
     keys: Arc<Keys>,
-    /// Where the metrics are: "127.0.0.1:9117".
+    /// Where the metrics are.
     metrics: String,
     /// Descriptors and threads of a server that has nothing to do.
     before: [u64; 2],
@@ -73,19 +73,13 @@ impl Besieged {
         let mut arguments = vec!["--tokens", keys.file(), "--metrics", "127.0.0.1:0", "--threads", "1"];
         arguments.extend(["--log", "error", "--config", &config]);
         let budget = BUDGET.to_string();
-        let help = palpate(&["serve", "--help"]).stdout;
-        if String::from_utf8(help).unwrap().contains("--memory") {
-            arguments.extend(["--memory", &budget]);
-        }
+        arguments.extend(["--memory", &budget]);
         // Attackers do not take the server's core from it, but only its time.
         let mut server = kept_to(true, || Server::start(&arguments));
         // A log that nobody reads would hold the server up.
         let mut log = server.child.stderr.take().unwrap();
         std::thread::spawn(move || std::io::copy(&mut log, &mut std::io::stderr()));
-        let mut line = String::new();
-        server.out.read_line(&mut line).unwrap();
-        let url = line.split_whitespace().last().unwrap();
-        let metrics = url.trim_start_matches("http://").trim_end_matches("/metrics").to_owned();
+        let metrics = metrics::url(&mut server.out);
         let mut besieged = Besieged { server, keys: Arc::new(keys), metrics, before: [0; 2] };
         // What the first look at it brings with it is the server's own.
         besieged.gauge("palpate_streams");
@@ -103,16 +97,7 @@ impl Besieged {
 
     /// Sum of a metric over its labels; nothing if the server does not answer.
     fn gauge(&self, name: &str) -> Option<f64> {
-        let mut stream = TcpStream::connect(&self.metrics).ok()?;
-        stream.set_read_timeout(Some(PATIENCE)).ok()?;
-        write!(stream, "GET /metrics HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n").ok()?;
-        let mut text = String::new();
-        stream.read_to_string(&mut text).ok()?;
-        let of = |line: &str| {
-            let rest = line.strip_prefix(name)?;
-            rest.starts_with([' ', '{']).then(|| rest.rsplit_once(' ')?.1.parse::<f64>().ok())?
-        };
-        Some(text.lines().filter_map(of).sum())
+        metrics::try_scrape(&self.metrics).map(|told| metrics::sum(&told, name))
     }
 
     /// Waits until `is`, for as long as any machine may need.

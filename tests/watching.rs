@@ -1,45 +1,24 @@
 //! What those see who look after a server: metrics, `palpate top`, and the files that come with it.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
+#[path = "common/metrics.rs"]
+mod metrics;
 #[path = "common/server.rs"]
 mod server;
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::io::{BufRead, BufReader, Read, Write};
+use std::collections::BTreeSet;
+use std::io::{BufRead, BufReader};
 use std::process::{Command, Output, Stdio};
 
+use metrics::scrape;
 use palpate::wire::pb;
 use serde_json::Value;
-use server::{PATIENCE, Server, Touch, client_program, force};
-
-/// Metrics as they are served: each line's name and labels, and its value.
-fn scrape(url: &str) -> BTreeMap<String, f64> {
-    let (host, path) = url.trim_start_matches("http://").split_once('/').unwrap();
-    let mut stream = std::net::TcpStream::connect(host).unwrap();
-    stream.set_read_timeout(Some(PATIENCE)).unwrap();
-    write!(stream, "GET /{path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n").unwrap();
-    let mut answer = String::new();
-    stream.read_to_string(&mut answer).unwrap();
-    let (head, body) = answer.split_once("\r\n\r\n").unwrap();
-    assert!(head.starts_with("HTTP/1.1 200") && head.contains("application/openmetrics-text"), "{head}");
-    assert!(body.ends_with("# EOF\n"), "{body}");
-    let told = body.lines().filter(|line| !line.starts_with('#')).map(|line| {
-        let (name, value) = line.rsplit_once(' ').unwrap();
-        (name.to_owned(), value.parse().unwrap_or_else(|_| panic!("{line}")))
-    });
-    told.collect()
-}
-
-fn metrics_url(server: &mut Server) -> String {
-    let mut line = String::new();
-    server.out.read_line(&mut line).unwrap();
-    line.split_whitespace().last().unwrap().to_owned()
-}
+use server::{Server, Touch, client_program, force};
 
 #[tokio::test]
 async fn metrics_tell_what_was_done_and_name_no_session() {
     let mut server = Server::start(&["--metrics", "127.0.0.1:0"]);
-    let url = metrics_url(&mut server);
+    let url = metrics::url(&mut server.out);
     let (running, paused) = (server.paper(false).await, server.paper(true).await);
     let mut touch = Touch::hold(&server, &running).await;
     for sequence in 1..=3 {
@@ -79,7 +58,7 @@ async fn metrics_tell_what_was_done_and_name_no_session() {
 #[test]
 fn the_dashboard_asks_for_nothing_that_is_not_there() {
     let mut server = Server::start(&["--metrics", "127.0.0.1:0"]);
-    let url = metrics_url(&mut server);
+    let url = metrics::url(&mut server.out);
     let told = scrape(&url);
     let names: BTreeSet<&str> = told.keys().map(|name| name.split('{').next().unwrap()).collect();
     let dashboard: Value = serde_json::from_str(include_str!("../contrib/grafana.json")).unwrap();

@@ -68,7 +68,7 @@ pub(crate) async fn admin(arguments: &Arguments) -> Result<(), Failure> {
     let server = Server::new(&arguments.server, &arguments.credentials)?;
     let channel = server.connect().await.map_err(Failure::Failed)?;
     let text = act(&arguments.act, channel).await.map_err(|status| Failure::Failed(describe(&status)))?;
-    println!("{text}");
+    crate::tell!("{text}");
     Ok(())
 }
 

@@ -10,13 +10,14 @@ mod machine;
 mod time;
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::sync::{Arc, Mutex, Weak};
 
 pub use machine::{give_back_to_the_system, half_of_the_machine, parse_bytes};
 use time::Spent;
 pub use time::Work;
 
 use crate::limits::Limits;
+use crate::lock::lock;
 use crate::refusal::{Reason, Refusal, Result};
 
 /// What memory is taken for.
@@ -180,11 +181,6 @@ struct Accounts {
     known: BTreeMap<String, (u64, Weak<Owner>)>,
 }
 
-/// Holders leave no half-done work behind.
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
 impl Budget {
     /// Of a server with these limits, and so many threads that step and that serve the network.
     pub fn new(limits: &Limits, stepping: usize, network: usize) -> Arc<Self> {
@@ -243,7 +239,7 @@ impl Budget {
 
     /// Bytes that are taken, for whatever it is.
     pub fn bytes_taken(&self) -> u64 {
-        lock(&self.pools[0]).taken()
+        self.taken(Resource::Memory(Purpose::Session))
     }
 
     /// Bytes that there are to share.

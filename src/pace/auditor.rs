@@ -16,9 +16,9 @@ use std::time::Duration;
 
 use super::clock::{now_ns, thread_time_ns};
 use super::inbox::Request;
-use super::queue::lock;
 use super::tally::Count;
 use super::{Live, check_work};
+use crate::lock::lock;
 use crate::scene::Named;
 use crate::scene::record::{AuditedError, Correction};
 use crate::sheet::Model;

@@ -5,8 +5,9 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
 use std::time::Duration;
 
-use super::queue::{Reader, Writer, lock, queue};
+use super::queue::{Reader, Writer, queue};
 use crate::budget::{Account, Purpose, Resource, Taken};
+use crate::lock::lock;
 use crate::refusal::Result;
 use crate::surface::{Encoding, Frame, Refinement, Snapshot, Tiles, encode, encode_over};
 

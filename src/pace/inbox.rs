@@ -9,11 +9,11 @@ use tokio::sync::oneshot;
 
 use super::clock::now_ns;
 use super::frames::Viewer;
-use super::queue::lock;
 use super::tally::Tally;
 use super::taps::{HashReply, ProbeTap, SampleTap};
 use super::thread::Running;
 use crate::budget::Account;
+use crate::lock::lock;
 use crate::refusal::{Refusal, Result};
 use crate::sheet::audit::{Inputs, Mark};
 

@@ -8,9 +8,9 @@ use tokio_util::sync::CancellationToken;
 
 use super::Live;
 use super::clock::now_ns;
-use super::queue::lock;
 use crate::budget::{Account, Pool, Resource, Taken};
 use crate::limits::Limits;
+use crate::lock::lock;
 use crate::refusal::{Reason, Refusal, Result};
 
 /// What a stream is for.

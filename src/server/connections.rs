@@ -30,7 +30,7 @@ use super::transport::{Frames, Gate, Holdback};
 use super::visitor::address_name;
 use crate::budget::{Budget, Purpose, Resource, Taken};
 use crate::limits::Limits;
-use crate::pace::queue::lock;
+use crate::lock::lock;
 
 /// After the system could not give us a connection: file descriptors that have run out come back.
 const PAUSE: Duration = Duration::from_millis(100);

@@ -2,8 +2,8 @@
 
 use std::sync::{Arc, Mutex, Weak};
 
+use crate::lock::lock;
 use crate::pace::Live;
-use crate::pace::queue::lock;
 use crate::session::command::LeaseId;
 
 /// Those of one connection.

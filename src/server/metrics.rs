@@ -27,7 +27,7 @@ use super::transport::Cut;
 use super::workshop::Workshop;
 use crate::budget::{Budget, Purpose, Resource};
 use crate::limits::Limits;
-use crate::pace::queue::lock;
+use crate::lock::lock;
 use crate::pace::tally::{Count, Tally, Times};
 use crate::pace::{Pacer, State};
 use crate::refusal::Reason;

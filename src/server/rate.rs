@@ -3,8 +3,8 @@
 use std::sync::Mutex;
 use std::time::Duration;
 
+use crate::lock::lock;
 use crate::pace::clock::now_ns;
-use crate::pace::queue::lock;
 use crate::refusal::{Reason, Refusal, Result};
 
 /// What may still be asked for at once, and how fast that comes back.

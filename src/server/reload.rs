@@ -10,8 +10,8 @@ use tokio::time::MissedTickBehavior;
 use tracing::{info, warn};
 use xxhash_rust::xxh3::xxh3_128;
 
+use crate::lock::lock;
 use crate::pace::clock::now_ns;
-use crate::pace::queue::lock;
 use crate::refusal::{Reason, Refusal, Result};
 
 /// How often the files are looked at: contents, not times, so that a link that is turned counts as well.

@@ -19,7 +19,7 @@ use tracing::{info, warn};
 use super::connections::Peer;
 use super::identity::{Caller, Credentials, Role};
 use super::reload::Reloaded;
-use crate::pace::queue::lock;
+use crate::lock::lock;
 use crate::refusal::{Refusal, Result};
 
 /// So long a client may take to read that its call is over; then its connection is closed.

@@ -11,7 +11,7 @@ use super::workshop::Workshop;
 use super::{House, page};
 use crate::budget::{Purpose, Resource, Taken};
 use crate::limits::Limits;
-use crate::pace::queue::lock;
+use crate::lock::lock;
 use crate::refusal::Refusal;
 use crate::scene::Appearance;
 use crate::texture::{Texture, texture};

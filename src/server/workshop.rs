@@ -14,9 +14,9 @@ use tonic::Status;
 
 use crate::budget::Account;
 use crate::limits::Limits;
+use crate::lock::lock;
 use crate::pace::clock::now_ns;
 use crate::pace::priority::give_way;
-use crate::pace::queue::lock;
 use crate::refusal::{Reason, Refusal};
 
 /// Threads of a workshop.

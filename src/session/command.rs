@@ -148,7 +148,6 @@ fn check_tip(before_m: Option<f64>, now_m: Option<f64>) -> Result<()> {
 #[derive(Debug)]
 pub struct Intake {
     rules: Arc<Rules>,
-    limits: Limits,
     leases: BTreeMap<u32, Lease>,
     queue: BTreeMap<Place, Due>,
     /// Of those, commands of clients: counted as they come and go, for whoever asks.
@@ -178,7 +177,6 @@ impl Intake {
     pub fn new(scene: &Scene, limits: &Limits) -> Self {
         Intake {
             rules: Arc::new(Rules { scene: scene.clone(), limits: limits.clone() }),
-            limits: limits.clone(),
             leases: BTreeMap::new(),
             queue: BTreeMap::new(),
             waiting: 0,
@@ -229,14 +227,14 @@ impl Intake {
     pub fn acquire(&mut self, tools: &[u32], holder: &str, lease_s: f64, id: LeaseId, now_ns: u64) -> Result<()> {
         self.check_open()?;
         self.lapse(now_ns);
-        let longest_s = self.limits.lease_s;
+        let longest_s = self.rules.limits.lease_s;
         crate::refusal::number("lease_s", lease_s, &format!("from 0.01 to {longest_s}"), |v| {
             v >= 0.01 && v <= longest_s
         })?;
         crate::refusal::label("holder", holder)?;
         for (index, tool) in tools.iter().enumerate() {
-            if *tool >= self.limits.tools {
-                let message = format!("must be below {}, but is {tool}", self.limits.tools);
+            if *tool >= self.rules.limits.tools {
+                let message = format!("must be below {}, but is {tool}", self.rules.limits.tools);
                 return Err(Refusal::new(Reason::OutOfRange, "tool", message));
             }
             if tools[..index].contains(tool) {
@@ -370,7 +368,7 @@ impl Intake {
         // A limit per tool, so that no holder fills the queue for the others.
         for (tool, (_, coming, _)) in &last {
             let waiting = self.leases.get(tool).map_or(0, |lease| lease.waiting);
-            if waiting + coming > self.limits.queued_commands_per_tool {
+            if waiting + coming > self.rules.limits.queued_commands_per_tool {
                 let message = format!("{waiting} commands of tool {tool} wait for their step already");
                 return Err(Refusal::new(Reason::QueueFull, "", message));
             }
@@ -453,7 +451,7 @@ impl Intake {
             return Err(Refusal::new(Reason::OutOfTurn, "at_step", message));
         }
         let replaces = last == Some(step);
-        if !replaces && self.changes.len() >= self.limits.queued_changes {
+        if !replaces && self.changes.len() >= self.rules.limits.queued_changes {
             let message = format!("{} changes of the tissue wait for their step already", self.changes.len());
             return Err(Refusal::new(Reason::QueueFull, "", message));
         }
