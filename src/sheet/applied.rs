@@ -163,9 +163,13 @@ impl<T: Real> Term<T> {
         }
     }
 
-    /// Writes the falloff of `poke` to the table.
+    /// Writes the falloff of `poke` to the table. Costs as much as the points that the old falloff and the new one reach.
     fn place(&mut self, poke: &Poke, model: &Model, layout: &Layout) {
         let spacing_m = model.scene.sheet.spacing_m;
+        // Beyond its spans the table is 0, also where it was longer before.
+        for (row, span) in self.factors.chunks_exact_mut(layout.stride).zip(&self.spans) {
+            row[span.clone()].fill(T::default());
+        }
         [self.rows, self.columns] = reached::<T>(poke, model).map(|[from, to]| from..to);
         // `libm` gives the same bits on every machine; the platform's exponential does not.
         self.gain = libm::exp(poke.falloff_offset);
@@ -180,12 +184,16 @@ impl<T: Real> Term<T> {
         };
         // SAFETY: `factors` has as many rows, each of whole blocks.
         unsafe { lanes::run(Width::of(model.lanes), &falloff) };
+        let written = falloff.written(BLOCK);
         self.spans.clear();
         self.spans.extend(self.factors.chunks_exact(layout.stride).map(|row| {
             let counts = |block: &[T]| block.iter().any(|factor| *factor != T::default());
-            let first = row.chunks(BLOCK).position(counts).unwrap_or(0);
-            let last = row.chunks(BLOCK).rposition(counts).map_or(0, |last| last + 1);
-            first * BLOCK..last * BLOCK
+            let mut blocks = row[written.clone()].chunks(BLOCK);
+            let place = |block: usize| written.start + block * BLOCK;
+            match (blocks.clone().position(counts), blocks.rposition(counts)) {
+                (Some(first), Some(last)) => place(first)..place(last + 1),
+                _ => 0..0,
+            }
         }));
     }
 
@@ -211,6 +219,14 @@ struct Falloff<T> {
     factors: *mut T,
 }
 
+impl<T> Falloff<T> {
+    /// The places of a row that are written, in blocks of `length`.
+    #[inline(always)]
+    fn written(&self, length: usize) -> Range<usize> {
+        self.columns.start / length * length..self.columns.end.next_multiple_of(length)
+    }
+}
+
 impl<T: Real> Run<T> for Falloff<T> {
     #[inline(always)]
     #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
@@ -226,16 +242,13 @@ impl<T: Real> Run<T> for Falloff<T> {
             for i in self.rows.clone() {
                 let x = T::of(i as f64 - self.centre[0]);
                 let x = V::of(x * x);
-                for at in (0..self.stride).step_by(V::LANES) {
-                    let mut factor = zero;
-                    if at < self.columns.end && at + V::LANES > self.columns.start {
-                        let y = zero.count(at).sub(whole).sub(rest);
-                        let exponent = slope.mul(y.mul_add(y, x).root());
-                        let far = exponent.beyond(farthest);
-                        factor = V::select(far, zero, exponential(exponent)).keep(zero.first(self.columns.end - at));
-                        // The columns bound the reach more exactly than this format can.
-                        factor = V::select(zero.first(self.columns.start.saturating_sub(at)), zero, factor);
-                    }
+                for at in self.written(V::LANES).step_by(V::LANES) {
+                    let y = zero.count(at).sub(whole).sub(rest);
+                    let exponent = slope.mul(y.mul_add(y, x).root());
+                    let far = exponent.beyond(farthest);
+                    let factor = V::select(far, zero, exponential(exponent)).keep(zero.first(self.columns.end - at));
+                    // The columns bound the reach more exactly than this format can.
+                    let factor = V::select(zero.first(self.columns.start.saturating_sub(at)), zero, factor);
                     debug_assert!(at + V::LANES <= self.stride);
                     factor.store(self.factors.add((i - self.rows.start) * self.stride + at));
                 }
@@ -560,7 +573,8 @@ fn sum_at(model: &Model, index: usize, pokes: impl Iterator<Item = Poke>, neglig
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::Lanes;
+    use crate::limits::Limits;
+    use crate::scene::{Lanes, PAPER, Scene};
 
     fn factors<T: Real>(lanes: Lanes, centre: f64) -> Vec<f64> {
         let (stride, per_spacing) = (64, 1.7);
@@ -573,6 +587,34 @@ mod tests {
         // SAFETY: there is one row, of whole blocks.
         unsafe { lanes::run(Width::of(lanes), &falloff) };
         factors.into_iter().map(Real::wide).collect()
+    }
+
+    /// A table that is placed again, elsewhere and with another reach, is that of a fresh one.
+    #[test]
+    fn a_table_keeps_nothing_of_the_place_before() {
+        let scene = Scene::parse("test", PAPER, &["sheet.points=[70, 90]".to_owned()], &Limits::default()).unwrap();
+        let model = Model::compile(&scene, &Limits::default()).unwrap();
+        let layout = Layout::new::<f32>(model.points);
+        let mut term = Term::<f32>::new();
+        let spacing_m = scene.sheet.spacing_m;
+        let places = [(35.2, 45.7, 4.0), (3.0, 88.9, 20.0), (69.0, 0.4, 1.0), (-40.0, 20.0, 9.0), (30.5, 60.0, 0.5)];
+        for (x, y, reach) in places.into_iter().chain(places.into_iter().rev()) {
+            let poke = Poke {
+                centre_m: glam::DVec2::new(x, y) * spacing_m,
+                force_n: DVec3::ZERO,
+                falloff_per_m: 10.0 / (reach * spacing_m),
+                falloff_offset: 0.0,
+            };
+            let mut fresh = Term::<f32>::new();
+            fresh.place(&poke, &model, &layout);
+            term.place(&poke, &model, &layout);
+            assert_eq!((&term.rows, &term.spans), (&fresh.rows, &fresh.spans));
+            assert_eq!(*term.factors, *fresh.factors);
+            let outside = |(row, span): (&[f32], &Range<usize>)| {
+                (0..layout.stride).filter(|at| !span.contains(at)).all(|at| row[at] == 0.0)
+            };
+            assert!(term.factors.chunks_exact(layout.stride).zip(&term.spans).all(outside));
+        }
     }
 
     /// A reach that ends between two lanes must end at the same point for every width.
