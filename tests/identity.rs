@@ -570,7 +570,7 @@ fn a_server_that_others_can_reach_does_not_start_unprotected() {
     let tokens = tokens.to_str().unwrap();
     let (tls, known) = (["--tls-cert", &cert, "--tls-key", &key], ["--tokens", tokens]);
     let anywhere = ["serve", "--listen", "0.0.0.0:0"];
-    for (more, why) in [(&[][..], "neither TLS nor tokens"), (&tls[..], "let in"), (&known[..], "in the clear")] {
+    for (more, why) in [(&[][..], "neither TLS nor tokens"), (&tls[..], "authenticate"), (&known[..], "in the clear")] {
         let ended = palpate(&[&anywhere[..], more].concat());
         let said = String::from_utf8(ended.stderr).unwrap();
         assert_eq!(ended.status.code(), Some(2), "{said}");
