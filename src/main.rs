@@ -382,7 +382,7 @@ fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
         let shutdown = CancellationToken::new();
         signals::outlive();
         tokio::spawn(signals::cancel_on(shutdown.clone()));
-        // The standard output may be closed; the server runs all the same.
+        // The standard output may be closed; that does not stop the server.
         let _ = writeln!(std::io::stdout(), "palpate listens on {}", doors.url());
         if let Some(url) = doors.metrics_url() {
             let _ = writeln!(std::io::stdout(), "metrics are at {url}");

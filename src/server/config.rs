@@ -197,7 +197,7 @@ mod tests {
                 continue;
             }
             for value in ["0", "0.0", "-1.0"] {
-                // Some of these are of the wrong type for an integer limit; the message names the key all the same.
+                // An integer limit refuses some of these by their type; the message still names the key.
                 let refused = Config::parse("test", &format!("[limits]\n{key} = {value}\n")).unwrap_err();
                 let told = format!("{} {}", refused.field, refused.message);
                 assert!(told.contains(key), "{key} = {value}: {told}");

@@ -144,7 +144,7 @@ impl SessionService for Sessions {
         let Visitor { account, .. } = Visitor::of(request.extensions());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
-        // A request for the current hash waits for its caller's share. One for a later step can't wait: the step would pass.
+        // A request for the current hash waits for its caller's share. A request for a later step must reach that step.
         let wait_ns = account.must_wait_ns(Work::Reading, now_ns());
         if request.at_step.is_none() && wait_ns > 0 {
             tokio::time::sleep(Duration::from_nanos(wait_ns)).await;

@@ -21,8 +21,8 @@ const SMALL_BYTES: usize = 256;
 /// transport closes the connection at half of the window, so after eight portions of which none was taken.
 const PORTIONS: usize = 16;
 
-/// Longest time without reading while readers take nothing. Then another portion is read all the same: an answer may depend
-/// on later frames, and frames of a stream that has ended are never taken.
+/// Longest time without reading while readers take nothing. Then another portion is read regardless: an answer may depend on
+/// later frames, and frames of a stream that has ended are never taken.
 const PATIENCE: Duration = Duration::from_millis(100);
 
 /// The bytes that one connection's untaken frames are charged with, and whether the connection is to be closed.

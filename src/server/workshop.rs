@@ -1,7 +1,7 @@
-//! Runs work that takes milliseconds or more and that a call waits for (compiling a session's scene, a force law, a texture)
-//! on threads of lower priority than the stepping threads. Callers take turns, and each has at most one job running. So a
-//! caller with many jobs delays itself only, while fewer such callers than threads are there; with more of them, others wait
-//! for one job at most. A job that no call waits for any more is not started, or told to stop.
+//! Runs work that takes milliseconds or more and that a call waits for (a session's scene, a force law, a texture) on
+//! threads of lower priority than the stepping threads. Callers take turns, and each has at most one job running. A caller
+//! with many jobs therefore delays only itself, as long as there are fewer such callers than threads; beyond that, others
+//! wait for at most one job. A job that no call waits for any more is not started, or is told to stop.
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -161,8 +161,8 @@ impl Workshop {
         Ok(Workshop(close))
     }
 
-    /// Runs `work` when it is the turn of `account`. If the call ends or the deadline passes before that, `work` is not run;
-    /// afterwards, the flag that `work` gets is set.
+    /// Runs `work` when it is the turn of `account`. If the call ends or the deadline passes before that, `work` never runs;
+    /// if it happens while `work` runs, the flag that `work` has is set.
     ///
     /// # Errors
     /// Returns an error if too many jobs of this account wait, if the deadline passes, or if `work` panics.
