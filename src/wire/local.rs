@@ -66,8 +66,8 @@ pub fn from_law(message: &pb::ForceLaw) -> Result<Law> {
     };
     let rows = message.rows.iter().map(row).collect();
     let law = Law { step_m: message.step_m, rows, is_coarse: message.coarse };
-    let message = "must have at least two rows, all numbers finite and at least 0, and forces that never fall";
-    let wrong = || Refusal::new(Reason::OutOfRange, "law", message);
+    let range = "must have at least two rows, all numbers finite and at least 0, and forces that never fall";
+    let wrong = || Refusal::new(Reason::OutOfRange, "law", range);
     if law.is_sound() { Ok(law) } else { Err(wrong()) }
 }
 
