@@ -1,4 +1,4 @@
-//! The program `palpate`: parses arguments and calls one function.
+//! The program `palpate`: one function for each subcommand.
 
 use std::io::{BufWriter, IsTerminal, Write};
 use std::path::{Path, PathBuf};
@@ -22,7 +22,7 @@ use palpate::texture;
 use tokio_util::sync::CancellationToken;
 use tracing_subscriber::fmt::format::FmtSpan;
 
-/// Tells whoever looks at the standard error; that nobody does is no reason to break down.
+/// Writes a line to the standard error. A closed standard error does not end the program.
 macro_rules! say {
     ($($text:tt)*) => {{
         let _ = std::io::stderr().write_all((format!($($text)*) + "\n").as_bytes());
@@ -39,70 +39,70 @@ struct Arguments {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Play a script on a scene, offline, as fast as it goes; write its records as JSON Lines
+    /// Play a script on a scene, offline and as fast as possible; write the records as JSON Lines
     #[command(after_help = "Examples:\n  \
         palpate run paper vertical-60\n  \
         palpate run my-scene.toml my-script.toml --output poke.jsonl --set stepping.integrator=lagged\n\n\
         Exit status: 0; 1 when the run failed; 2 when an input was refused.")]
     Run(RunArguments),
-    /// Tell what a scene asks for: frequencies, integrator, substeps, expected error, time of a step, sessions on a core
+    /// Report what a scene needs: frequencies, integrator, substeps, expected error, time per step, sessions per core
     #[command(after_help = "Examples:\n  \
         palpate check paper\n  \
         palpate check my-scene.toml --set stepping.tolerance=1e-8\n\n\
         Exit status: 0; 2 when the scene was refused.")]
     Check(SceneArguments),
-    /// Draw a tissue that a script acts on, without a screen: a PNG image of one moment, or all of it as a GIF
+    /// Draw a tissue while a script acts on it, without a screen: a PNG image of one moment, or a GIF of the whole script
     #[command(after_help = "Examples:\n  \
         palpate render paper oblique-100 --output poke.png\n  \
         palpate render paper vertical-60 --output mesh.png --wireframe --refine 1 --at-s 0.3 --camera 0,25\n  \
         palpate render liver my-script.toml --output poke.gif --size 480x360 --frames-hz 20\n\n\
-        The texture is the scene's own ([appearance]). A force shows as an arrow at its control point.\n\
+        The scene's section [appearance] defines the texture. An arrow at its control point shows each force.\n\
         Exit status: 0; 1 when the run failed or the file can't be written; 2 when an input was refused.")]
     Render(RenderArguments),
-    /// Make an image for a tissue's surface: the lining of a stomach as an endoscope shows it
+    /// Paint an image for a tissue's surface: the lining of a stomach as an endoscope shows it
     #[command(after_help = "Examples:\n  \
         palpate texture --output mucosa.png\n  \
         palpate texture --seed 7 --size 4096 --output mucosa.png\n\n\
-        The same seed and size give the same bytes, and another size the same tissue at another sharpness. A scene has one\n\
-        by texture_seed and texture_size in its section [appearance], or an image of its own by texture = \"FILE.png\".\n\
+        The same seed and size give the same bytes; another size gives the same tissue at another resolution. To use a\n\
+        texture in a scene, set texture_seed and texture_size in its section [appearance], or texture = \"FILE.png\".\n\
         Exit status: 0; 1 when the file can't be written; 2 when an input was refused.")]
     Texture(TextureArguments),
-    /// Serve tissue over gRPC and in the browser: sessions stepped in real time, commands in, forces and frames out
+    /// Serve tissue over gRPC and to browsers: sessions in real time, commands in, forces and frames out
     #[command(after_help = "Examples:\n  \
         palpate serve\n  \
         palpate serve --listen 127.0.0.1:0 --scenes my-scenes --threads 1\n  \
         palpate token --name ann --role create,touch --tokens tokens.toml > ann.token\n  \
         palpate serve --listen 0.0.0.0:7117 --tls-cert server.pem --tls-key server.key --tokens tokens.toml\n  \
         palpate-client replay vertical-60 --server https://server:7117 --token-file ann.token\n\n\
-        The address is printed to the standard output when the server is ready. Ctrl-C or SIGTERM ends it: streams\n\
-        are told, and cut when the deadline has passed.\n\n\
-        On an address of this machine alone anybody may do everything. On any other the server starts only with TLS and\n\
-        with tokens or client certificates, or with --insecure. A client shows its token with every call, as\n\
-        `authorization: Bearer TOKEN`; roles are watch, touch (hold a tool, change the tissue), create (make,\n\
-        start, stop and delete sessions) and administer (everything; the only one that lists sessions). Health, reflection\n\
-        and the page's files are open; the page takes a token behind its address, as in https://server:7117/#token=TOKEN.\n\
-        Certificates, keys and tokens are looked at twice a second: new ones hold at once, for new connections and calls;\n\
-        what makes no sense is logged, and the old ones hold: health tells of it as `palpate.tokens`. SIGHUP has them looked at\n\
-        at once.")]
+        The server prints its address to the standard output when it is ready. Ctrl-C or SIGTERM ends it: all streams end\n\
+        with the reason, and what remains after the deadline is cut.\n\n\
+        On a loopback address every caller may do everything. At any other address the server starts only with TLS and\n\
+        with tokens or client certificates, or with --insecure. A client sends its token with every call, as\n\
+        `authorization: Bearer TOKEN`. Roles are watch, touch (hold a tool, change the tissue), create (create,\n\
+        start, pause and delete sessions) and administer (everything, including the list of sessions). Health, reflection\n\
+        and the page's files need no token; give the page one as in https://server:7117/#token=TOKEN.\n\
+        The server checks certificates, keys and tokens twice a second, and at once on SIGHUP. Valid changes apply at once\n\
+        to new connections and calls. Invalid files are logged and the old ones stay in use; for tokens, the health\n\
+        service `palpate.tokens` reports it.")]
     Serve(Box<ServeArguments>),
-    /// Make a token for clients of a server: prints the token, once, and keeps only its hash
+    /// Create a token for clients of a server; prints the token once and stores only its hash
     #[command(after_help = "Examples:\n  \
         palpate token --name ann --role create,touch --tokens tokens.toml > ann.token\n  \
         palpate token --name screen --role watch\n\n\
-        Roles: watch (who has any role may), touch (hold a tool, change the tissue), create (make, start, stop and delete\n\
-        sessions), administer (everything). To take a token back, delete its entry: the server looks every second.")]
+        Roles: watch (every role includes it), touch (hold a tool, change the tissue), create (create, start, pause and\n\
+        delete sessions), administer (everything). To revoke a token, delete its entry; the server notices within 1 s.")]
     Token(TokenArguments),
-    /// Show the sessions of a server, once a second (`palpate-client top`)
+    /// Show the sessions of a server once a second (`palpate-client top`)
     #[command(disable_help_flag = true)]
     Top {
-        /// As `palpate-client top --help` tells
+        /// See `palpate-client top --help`
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         arguments: Vec<std::ffi::OsString>,
     },
-    /// Show who has what of a server, and take it from them (`palpate-client admin`)
+    /// Show what each caller uses of a server, and take it back (`palpate-client admin`)
     #[command(disable_help_flag = true, disable_help_subcommand = true)]
     Admin {
-        /// As `palpate-client admin --help` tells
+        /// See `palpate-client admin --help`
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         arguments: Vec<std::ffi::OsString>,
     },
@@ -110,13 +110,13 @@ enum Command {
 
 #[derive(clap::Args)]
 struct TokenArguments {
-    /// Whose it is, for the log
+    /// Name of the token's owner, for the log
     #[arg(long)]
     name: String,
-    /// What it allows: watch, touch, create, administer; separated by commas
+    /// Roles of the token: watch, touch, create, administer; separated by commas
     #[arg(long, value_name = "ROLE", required = true, value_delimiter = ',')]
     role: Vec<String>,
-    /// Add the entry to this file, instead of printing it too
+    /// Append the entry to this file instead of printing it
     #[arg(long, value_name = "FILE")]
     tokens: Option<PathBuf>,
 }
@@ -126,68 +126,68 @@ struct ServeArguments {
     /// Where to listen; port 0 takes a free one [default: 127.0.0.1:7117]
     #[arg(long, value_name = "ADDRESS:PORT")]
     listen: Option<String>,
-    /// The server's certificate chain (PEM), for TLS
+    /// The server's certificate chain (PEM); enables TLS
     #[arg(long, value_name = "FILE")]
     tls_cert: Option<PathBuf>,
-    /// Its private key (PEM)
+    /// The server's private key (PEM)
     #[arg(long, value_name = "FILE")]
     tls_key: Option<PathBuf>,
-    /// Clients must show a certificate that was signed by one of these (PEM)
+    /// Certificate authorities (PEM): clients must present a certificate that one of them has signed
     #[arg(long, value_name = "FILE")]
     tls_client_ca: Option<PathBuf>,
-    /// Which tokens and certificates may do what (TOML); `palpate token` makes entries
+    /// Roles of tokens and client certificates (TOML); `palpate token` writes entries
     #[arg(long, value_name = "FILE")]
     tokens: Option<PathBuf>,
-    /// Listen also where other machines can reach the server, though nobody is asked who they are
+    /// Allow an address that other machines can reach, without TLS or authentication
     #[arg(long)]
     insecure: bool,
-    /// A page of another site that may call, as in https://example.org; may be repeated
+    /// Origin of another site whose pages may call, such as https://example.org; may be repeated
     #[arg(long, value_name = "ORIGIN")]
     origin: Vec<String>,
-    /// Tell Prometheus at http://ADDRESS:PORT/metrics; off unless given
+    /// Serve Prometheus metrics at http://ADDRESS:PORT/metrics [default: off]
     #[arg(long, value_name = "ADDRESS:PORT")]
     metrics: Option<String>,
-    /// Folder of the scenes that sessions can be made from by name [default: scenes]
+    /// Folder of the scenes that clients can create sessions from by name [default: scenes]
     #[arg(long, value_name = "DIR")]
     scenes: Option<PathBuf>,
     /// Folder of the scripts that clients can ask for by name [default: scripts]
     #[arg(long, value_name = "DIR")]
     scripts: Option<PathBuf>,
-    /// Folder of the page that `/` shows, built by `npm run build` in clients/viewer [default: clients/viewer/dist]
+    /// Folder of the page that `/` serves, built by `npm run build` in clients/viewer [default: clients/viewer/dist]
     #[arg(long, value_name = "DIR")]
     viewer: Option<PathBuf>,
-    /// Configuration file (TOML); docs/palpate.toml has every key. These options go before it
+    /// Configuration file (TOML); docs/palpate.toml lists every key. Options on the command line override it
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Stepping threads [default: one less than the machine has cores]
     #[arg(long, value_name = "N")]
     threads: Option<usize>,
-    /// Part of a core with which the errors of live sessions are measured; 0 measures nothing [default: 0.02]
+    /// Fraction of a core for measuring the errors of live sessions; 0 disables that [default: 0.02]
     #[arg(long, value_name = "SHARE")]
     audit_share: Option<f64>,
-    /// How long streams may take to end at shutdown before they are cut, s [default: 5]
+    /// Time that streams get to end at shutdown before they are cut, s [default: 5]
     #[arg(long, value_name = "SECONDS")]
     shutdown_deadline_s: Option<f64>,
-    /// Bytes that the server may take in all for what its callers ask for, as in 512MiB or 2GiB [default: half of the
-    /// machine's, or of its control group's]
+    /// Memory that the server may use for all callers together, such as 512MiB or 2GiB [default: half of the machine's, or
+    /// of its control group's]
     #[arg(long, value_name = "BYTES", value_parser = budget::parse_bytes)]
     memory: Option<u64>,
-    /// What is logged to standard error: error, warn, info, debug, or palpate=debug,tonic=warn, … [default: info]
+    /// What to log to the standard error: error, warn, info, debug, or palpate=debug,tonic=warn, … [default: info]
     #[arg(long, value_name = "FILTER")]
     log: Option<String>,
-    /// Log as JSON, a line an event
+    /// Log as JSON Lines
     #[arg(long)]
     log_json: bool,
 }
 
 #[derive(clap::Args)]
 struct SceneArguments {
-    /// A scene file, or the name of one in --scenes; `paper` is built in
+    /// A scene file, or the name of a scene in --scenes; `paper` is built in
     scene: PathBuf,
-    /// Folder of the scenes that have a name
+    /// Folder of the scenes that you can give by name
     #[arg(long, value_name = "DIR", default_value = "scenes")]
     scenes: PathBuf,
-    /// Set a key of the scene: a TOML value, or a bare string; may be repeated
+    /// Override a key of the scene: a TOML value, or a bare string; may be repeated
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
     /// Configuration file (TOML) with other limits, in a section [limits]
@@ -199,17 +199,17 @@ struct SceneArguments {
 struct RunArguments {
     #[command(flatten)]
     scene: SceneArguments,
-    /// A script file, or the name of one in ./scripts
+    /// A script file, or the name of a script in ./scripts
     script: PathBuf,
     /// Write the records here instead of to the standard output
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// Hold forces and paths for each step, as a client does that streams a command a step
+    /// Hold forces and paths constant within each step, like a client that sends one command per step
     #[arg(long)]
     held: bool,
-    /// Play it a second time beside the first, in f64 with a quarter of the substep and nothing asleep: the summary then
-    /// has audited_error, the largest difference of displacement and of force at the sample points and times, each
-    /// relative to its largest. With [stepping] correct = true the run is corrected where an error is above the tolerance
+    /// Play the script a second time in parallel, in f64 with a quarter of the substep and all points awake. The summary
+    /// then has audited_error: the largest difference of displacement and of force at the sample points and times, each
+    /// relative to its largest. With [stepping] correct = true, the run is corrected where an error exceeds the tolerance
     #[arg(long)]
     audit: bool,
 }
@@ -218,45 +218,45 @@ struct RunArguments {
 struct RenderArguments {
     #[command(flatten)]
     scene: SceneArguments,
-    /// A script file, or the name of one in ./scripts
+    /// A script file, or the name of a script in ./scripts
     script: PathBuf,
-    /// Where to write it: a .png of one moment, or a .gif of the whole script
+    /// The file to write: a .png of one moment, or a .gif of the whole script
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// The moment, s; a step's [default: the sample time at which the tissue is displaced most]
+    /// The moment to draw, s, rounded to a step [default: the sample time with the largest displacement]
     #[arg(long, value_name = "SECONDS")]
     at_s: Option<f64>,
     /// Show the mesh instead of the texture
     #[arg(long)]
     wireframe: bool,
-    /// Vertices between neighbouring points, 0 to 10 [default: what makes 300 along a side; 0 for a mesh]
+    /// Vertices between neighbouring points, 0 to 10 [default: enough for 300 along a side; 0 with --wireframe]
     #[arg(long, value_name = "N")]
     refine: Option<u32>,
-    /// From where: turned about the tissue's normal and above it, in degrees, and how far, in sides of the sheet
+    /// The camera: azimuth about the tissue's normal and elevation, degrees; distance, in sides of the sheet
     #[arg(long, value_name = "AZIMUTH,ELEVATION[,DISTANCE]", default_value = "25,32,2", allow_hyphen_values = true)]
     camera: String,
-    /// Pixels
+    /// Size of the image, pixels
     #[arg(long, value_name = "WIDTHxHEIGHT", default_value = "800x600")]
     size: String,
-    /// Pictures a second of a GIF
+    /// Images per second of a GIF
     #[arg(long, value_name = "HZ", default_value_t = 20.0)]
     frames_hz: f64,
 }
 
 #[derive(clap::Args)]
 struct TextureArguments {
-    /// Which: any whole number
+    /// Seed of the texture, an integer
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
     /// Pixels along each side
     #[arg(long, value_name = "PIXELS", default_value_t = 1024)]
     size: u32,
-    /// Where to write it, as a PNG image
+    /// The PNG file to write
     #[arg(short, long, value_name = "FILE.png")]
     output: PathBuf,
 }
 
-/// How a program ends that does not end well.
+/// Why the program ends early.
 enum Failure {
     /// Exit status 1.
     Failed(String),
@@ -354,12 +354,12 @@ fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     let filter = tracing_subscriber::EnvFilter::try_new(&config.log)
         .map_err(|e| Failure::Refused(format!("--log {}: {e}", config.log)))?;
     let detailed = filter.max_level_hint().is_none_or(|level| level >= tracing::Level::DEBUG);
-    // Nobody waits for a log that is not read: what does not fit is dropped.
+    // Logging never blocks: lines that do not fit into the queue are dropped.
     let (writer, _flush) = tracing_appender::non_blocking(std::io::stderr());
     let subscriber = tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(writer)
-        // How long a call or a sampled step took is told when it is over, to those who ask for so much.
+        // At level debug, the duration of each call and sampled step is logged when it ends.
         .with_span_events(if detailed { FmtSpan::CLOSE } else { FmtSpan::NONE })
         .with_ansi(std::io::stderr().is_terminal());
     if arguments.log_json {
@@ -370,7 +370,8 @@ fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(config.serving_threads())
         .thread_name("network")
-        // For files. They are looked at twice a second: threads that would wait longer for the next look would never end.
+        // Blocking threads read files, twice a second. With the default keep-alive of 10 s these checks would wake every
+        // idle thread in turn before it ends, so that none ever would.
         .max_blocking_threads(16)
         .thread_keep_alive(Duration::from_secs(1))
         .enable_all()
@@ -381,7 +382,7 @@ fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
         let shutdown = CancellationToken::new();
         signals::outlive();
         tokio::spawn(signals::cancel_on(shutdown.clone()));
-        // Who started us may have stopped listening; we serve all the same.
+        // The standard output may be closed; that does not stop the server.
         let _ = writeln!(std::io::stdout(), "palpate listens on {}", doors.url());
         if let Some(url) = doors.metrics_url() {
             let _ = writeln!(std::io::stdout(), "metrics are at {url}");
@@ -392,7 +393,7 @@ fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     ended
 }
 
-/// Runs the client's program, which lies beside this one.
+/// Runs a command of `palpate-client`, which must be in the folder of this program.
 fn client(command: &str, arguments: &[std::ffi::OsString]) -> ExitCode {
     let program = std::env::current_exe().unwrap_or_default().with_file_name("palpate-client");
     match std::process::Command::new(&program).arg(command).args(arguments).status() {
@@ -411,7 +412,7 @@ fn token(arguments: &TokenArguments) -> Result<(), Failure> {
     let Some(path) = &arguments.tokens else {
         let printed = writeln!(
             std::io::stdout(),
-            "# For the client: --token-file, or PALPATE_TOKEN. It is kept nowhere.\n{token}\n\n\
+            "# For the client (--token-file or PALPATE_TOKEN); it is not stored anywhere:\n{token}\n\n\
              # For the server's file (--tokens):\n{entry}"
         );
         return printed.map_err(|e| Failure::Failed(e.to_string()));
@@ -422,28 +423,29 @@ fn token(arguments: &TokenArguments) -> Result<(), Failure> {
     #[cfg(unix)]
     std::os::unix::fs::OpenOptionsExt::mode(&mut options, 0o600);
     let mut file = options.open(path).map_err(refuse)?;
-    // In one piece: a server may look at any moment.
+    // In one write: a server may read the file at any moment.
     file.write_all(format!("\n{entry}").as_bytes()).map_err(refuse)?;
     writeln!(std::io::stdout(), "{token}").map_err(|e| Failure::Failed(e.to_string()))
 }
 
-/// How much more a scene may take to be compiled here than on a server: a tolerance of 1e-10 is for yardsticks.
+/// Factor by which compiling a scene may take more work here than on a server: reference solutions need a tolerance of
+/// 1e-10.
 const OFFLINE_WORK: u64 = 32;
 
-/// The compiled scene that the arguments name, and the limits that hold.
+/// Compiles the scene that the arguments name; returns it with the limits in force.
 fn compile(arguments: &SceneArguments) -> Result<(Arc<Model>, Limits), Failure> {
     let mut limits: Limits = load_config(arguments.config.as_deref())?.limits;
-    // Nobody else waits here.
+    // No other caller waits here.
     limits.rehearsal_work = limits.rehearsal_work.saturating_mul(OFFLINE_WORK);
     let path = &arguments.scene;
     let scene = match path.to_str() {
-        // A bare word that is no file is a name.
+        // A plain word that is not a file is a scene's name.
         Some(name) if !path.is_file() && path.components().count() == 1 && path.extension().is_none() => {
             Catalog::new(&arguments.scenes, Path::new("scripts")).load(name, &arguments.set, &limits)?
         }
         _ => Scene::load(path, &arguments.set, &limits)?,
     };
-    // What only the compiled scene shows is of no one line.
+    // An error of compilation belongs to no single line.
     let in_scene = |refusal: Refusal| Refusal { place: Some(path.display().to_string()), ..refusal };
     Ok((Model::compile(&scene, &limits).map_err(in_scene)?, limits))
 }
@@ -457,17 +459,17 @@ fn check(arguments: &SceneArguments) -> Result<(), Failure> {
     let (model, limits) = compile(arguments)?;
     let report = check::check(&model, &limits, &clock_s);
     match write!(std::io::stdout(), "{report}") {
-        // Who reads has seen enough.
+        // A reader that closed the pipe is not an error.
         Err(e) if e.kind() != std::io::ErrorKind::BrokenPipe => Err(Failure::Failed(e.to_string())),
         _ => Ok(()),
     }
 }
 
-/// Does something that tells the steps it has done, and shows them.
+/// Runs `work` and shows its progress; `work` reports the steps that it has done.
 fn with_progress<T>(steps: u64, work: impl FnOnce(&mut dyn FnMut(u64)) -> T) -> T {
     let (begun_s, watched) = (clock_s(), std::io::stderr().is_terminal());
     let done = work(&mut |step| {
-        // Only where somebody looks, and has waited.
+        // Only on a terminal, and after a second.
         if watched && clock_s() - begun_s > 1.0 {
             eprint!("\rstep {step} of {steps} ");
         }
@@ -518,7 +520,7 @@ fn render(arguments: &RenderArguments) -> Result<(), Failure> {
     });
     let at_step = at_step.transpose()?;
     if moves && at_step.is_some() {
-        return Err(refused("at-s", "is for a .png: a .gif shows the whole script".to_owned()));
+        return Err(refused("at-s", "applies to a .png only: a .gif shows the whole script".to_owned()));
     }
     let camera = arguments.camera.parse()?;
     let cells = (model.points[0].max(model.points[1]) - 1).max(1) as u32;
@@ -565,7 +567,7 @@ fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     });
     let ended = ended.and_then(|_| output.flush().map_err(run::Failure::Output));
     match ended {
-        // Who reads has seen enough.
+        // A reader that closed the pipe is not an error.
         Err(run::Failure::Output(e)) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
         Err(run::Failure::Refused(refusal)) => Err(refusal.into()),
         ended => ended.map(drop).map_err(|failure| Failure::Failed(failure.to_string())),

@@ -193,7 +193,7 @@ async fn tokens_come_and_go_while_the_server_runs() {
     log.wait_for("new files are in use");
     assert!(is_known(&first).await && is_known(&second).await);
     std::fs::write(&file, before.replace("watch", "wach")).unwrap();
-    log.wait_for("old ones hold");
+    log.wait_for("the old ones stay in use");
     assert!(is_known(&first).await && is_known(&second).await);
     std::fs::write(&file, &before).unwrap();
     log.wait_for("new files are in use");
@@ -375,7 +375,7 @@ fn signals_that_mean_nothing_to_a_server_do_not_end_it_and_a_hangup_has_it_look(
         let id = server.child.id().to_string();
         assert!(Command::new("kill").args([signal, &id]).status().unwrap().success());
     }
-    log.wait_for("told to look at the files");
+    log.wait_for("SIGHUP: checking the files");
     assert_eq!(server.child.try_wait().unwrap(), None);
 }
 
@@ -517,7 +517,7 @@ async fn new_certificates_are_shown_without_a_restart_and_bad_ones_are_not() {
     assert!(connect(&server.url, new.trust()).await.is_err());
     // A certificate without its key.
     std::fs::write(&cert, &new_cert).unwrap();
-    log.wait_for("old ones hold");
+    log.wait_for("the old ones stay in use");
     assert!(connect(&server.url, old.trust()).await.is_ok() && connect(&server.url, new.trust()).await.is_err());
     std::fs::write(&key, &new_key).unwrap();
     log.wait_for("new files are in use");
@@ -570,7 +570,7 @@ fn a_server_that_others_can_reach_does_not_start_unprotected() {
     let tokens = tokens.to_str().unwrap();
     let (tls, known) = (["--tls-cert", &cert, "--tls-key", &key], ["--tokens", tokens]);
     let anywhere = ["serve", "--listen", "0.0.0.0:0"];
-    for (more, why) in [(&[][..], "neither TLS nor tokens"), (&tls[..], "let in"), (&known[..], "in the clear")] {
+    for (more, why) in [(&[][..], "neither TLS nor tokens"), (&tls[..], "authenticate"), (&known[..], "in the clear")] {
         let ended = palpate(&[&anywhere[..], more].concat());
         let said = String::from_utf8(ended.stderr).unwrap();
         assert_eq!(ended.status.code(), Some(2), "{said}");
@@ -622,7 +622,7 @@ fn files_that_make_no_sense_are_refused_with_their_names() {
         (vec![("--tls-key", "key.pem")], "tls_cert"),
         (vec![("--tls-client-ca", "cert.pem")], "tls_cert"),
         (vec![("--tls-cert", "cert.pem"), ("--tls-key", "other.pem")], "other.pem"),
-        (vec![("--tls-cert", "cert.pem"), ("--tls-key", "cert.pem")], "cert.pem: is no private key"),
+        (vec![("--tls-cert", "cert.pem"), ("--tls-key", "cert.pem")], "cert.pem: is not a private key"),
         (vec![("--tls-cert", "empty.pem"), ("--tls-key", "key.pem")], "empty.pem: has no certificate"),
         (vec![("--tls-cert", "absent.pem"), ("--tls-key", "key.pem")], "absent.pem"),
         (vec![("--tokens", "short.toml")], "token[0].sha256"),

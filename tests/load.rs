@@ -92,7 +92,7 @@ fn what_makes_no_sense_is_refused() {
     let server = Server::start(&[]);
     for (arguments, expected) in [
         ("--find-limit p99<2", "no bound of p99"),
-        ("--find-limit p98<2ms", "there is no `p98`"),
+        ("--find-limit p98<2ms", "unknown quantity `p98`"),
         ("--sessions 0", "--sessions"),
         ("--rate-hz 0", "--rate-hz"),
         ("--scene nothing", "there is no scene `nothing`"),

@@ -276,7 +276,7 @@ fn no_program_waits_for_who_says_nothing() {
         let ended = child.wait_with_output().unwrap();
         let said = String::from_utf8(ended.stderr).unwrap();
         assert_eq!(ended.status.code(), Some(1), "{program}: {said}");
-        assert!(said.contains("says nothing") || said.contains("never connected"), "{program}: {said}");
+        assert!(said.contains("has not answered") || said.contains("never connected"), "{program}: {said}");
     }
     // And nobody who hears what went wrong is no reason to break down.
     let shell = format!("'{}' health 127.0.0.1:1 2>&-", client.display());

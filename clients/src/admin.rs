@@ -1,4 +1,4 @@
-//! `palpate admin`: who has what of a server, and how to take it from them.
+//! `palpate admin`: shows what callers use of a server, and takes it from them.
 
 use palpate::wire::error::describe;
 use palpate::wire::pb;
@@ -8,7 +8,7 @@ use pb::session_service_client::SessionServiceClient;
 use crate::Failure;
 use crate::connect::{Channel, Credentials, Server};
 
-/// What `admin` is asked for.
+/// Arguments of `admin`.
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
     #[command(subcommand)]
@@ -22,48 +22,48 @@ pub(crate) struct Arguments {
 
 #[derive(clap::Subcommand)]
 enum Act {
-    /// Show who has what: memory, sessions, streams, tools, and processor time of late
+    /// Show what each caller uses: memory, sessions, streams, tools, recent processor time
     Callers,
-    /// Show the streams of a session: their numbers, who reads, and for how long
+    /// Show the streams of a session: number, caller, age
     Streams {
         /// As `palpate top` shows it
         session: String,
     },
-    /// Take a tool from whoever holds it; what it did ends at the next step
+    /// Release a tool whoever holds it; its action ends at the next step
     FreeTool {
         /// As `palpate top` shows it
         session: String,
         /// The tool's number
         tool: u32,
     },
-    /// End a stream, and let the tools go that it holds
+    /// End a stream and release the tools that it holds
     CutStream {
         /// As `palpate top` shows it
         session: String,
         /// As `streams` shows it
         number: u64,
     },
-    /// End all streams of a caller, let its tools go, and close its connections; it may come back unless its token is gone
+    /// End all streams of a caller, release its tools and close its connections; it can come back while its token is valid
     CutCaller {
         /// As `callers` shows it: token:NAME or address:IP
         caller: String,
-        /// Delete the sessions that it made, too
+        /// Also delete the sessions that it created
         #[arg(long)]
         delete_sessions: bool,
     },
-    /// Have a session that is held go on: paused at its step, the tissue at rest, no tool held
+    /// Recover a session in state HELD: paused at its step, the tissue at rest, all tools released
     Revive {
         /// As `palpate top` shows it
         session: String,
     },
-    /// Delete a session, and end all its streams
+    /// Delete a session and end all its streams
     Delete {
         /// As `palpate top` shows it
         session: String,
     },
 }
 
-/// Does it, and tells what came of it.
+/// Performs the action and prints the result.
 pub(crate) async fn admin(arguments: &Arguments) -> Result<(), Failure> {
     let server = Server::new(&arguments.server, &arguments.credentials)?;
     let channel = server.connect().await.map_err(Failure::Failed)?;

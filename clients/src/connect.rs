@@ -1,4 +1,4 @@
-//! How every command reaches its server: in the clear, or by TLS, and with what shows who calls.
+//! Connections to a server: plain or TLS, with the caller's credentials.
 
 use std::error::Error;
 use std::net::IpAddr;
@@ -16,28 +16,28 @@ use tonic_health::pb::health_client::HealthClient;
 
 use crate::Failure;
 
-/// Who calls, and which servers are trusted.
+/// The caller's credentials, and which servers are trusted.
 #[derive(clap::Args, Debug, Clone, Default)]
-#[command(next_help_heading = "Identity (a server on this machine mostly asks for none)")]
+#[command(next_help_heading = "Credentials (a server on this machine usually needs none)")]
 pub(crate) struct Credentials {
-    /// The file of a token that the server knows [or the token itself in the environment variable PALPATE_TOKEN]
+    /// File with your token [or set the environment variable PALPATE_TOKEN to the token itself]
     #[arg(long, value_name = "FILE")]
     token_file: Option<PathBuf>,
-    /// Certificates (PEM) to trust for an https URL, instead of the system's
+    /// Certificates (PEM) to trust for https URLs instead of the system's
     #[arg(long, value_name = "FILE")]
     ca: Option<PathBuf>,
-    /// The name that the server's certificate must be of, if it is not that of the URL
+    /// Name that the server's certificate must carry, if it differs from the URL's host
     #[arg(long, value_name = "NAME")]
     tls_name: Option<String>,
-    /// The client's own certificate (PEM), if the server asks for one
+    /// Your client certificate (PEM), if the server requires one
     #[arg(long, value_name = "FILE", requires = "key")]
     cert: Option<PathBuf>,
-    /// Its private key (PEM)
+    /// Private key of the client certificate (PEM)
     #[arg(long, value_name = "FILE", requires = "cert")]
     key: Option<PathBuf>,
 }
 
-/// A connection whose calls all show the token, if there is one.
+/// A connection that adds the token, if there is one, to each call.
 pub(crate) type Channel = InterceptedService<tonic::transport::Channel, Bearer>;
 
 /// Adds the token to each call.
@@ -53,25 +53,25 @@ impl Interceptor for Bearer {
     }
 }
 
-/// A server, and how to reach it.
+/// A server's address and how to connect to it.
 #[derive(Clone)]
 pub(crate) struct Server {
     url: String,
     endpoint: Endpoint,
     bearer: Bearer,
-    /// For the connection and the first answer.
+    /// Time limit for the connection and the first answer.
     patience: Duration,
 }
 
-/// For the connection and the first answer, unless a program is in a hurry.
+/// Default time limit for the connection and the first answer.
 const PATIENCE: Duration = Duration::from_secs(10);
 
-/// A connection that says nothing for so long is asked whether it lives, and given up after [`PATIENCE`]: longer than a
-/// server may stand still.
+/// A connection that is silent for so long is pinged, and closed after a further [`PATIENCE`]. That is longer than a server
+/// may stall.
 const SILENCE: Duration = Duration::from_secs(5);
 
-/// What may wait unread on a connection. Our transport cuts a connection when small messages nobody has read make up half of
-/// that, at 256 bytes each: this bears 5 s of samples of several tools at 1 kHz, while we stand still.
+/// Bytes that may wait unread on a connection. The transport closes a connection when unread small messages, counted as 256
+/// bytes each, fill half of it. This size allows a stall of 5 s with samples of several tools at 1 kHz.
 const WINDOW_BYTES: u32 = 16 << 20;
 
 impl std::fmt::Debug for Server {
@@ -81,7 +81,7 @@ impl std::fmt::Debug for Server {
 }
 
 impl Server {
-    /// The server at `url`; http:// may be left out.
+    /// The server at `url`; you may omit http://.
     pub(crate) fn new(url: &str, credentials: &Credentials) -> Result<Self, Failure> {
         let refuse = |why: &str| Failure::Refused(format!("--server {url}: {why}"));
         let url_text = if url.contains("://") { url.to_owned() } else { format!("http://{url}") };
@@ -113,32 +113,32 @@ impl Server {
         Ok(Server { url: url_text, endpoint, bearer: Bearer(token), patience: PATIENCE })
     }
 
-    /// Gives up connecting after `timeout`.
+    /// Sets the time limit for connecting.
     #[must_use]
     pub(crate) fn within(mut self, timeout: Duration) -> Self {
         self.patience = timeout;
         self
     }
 
-    /// Connects, and hears that a server is there: one that takes connections and says nothing is none.
+    /// Connects and waits for a first answer: a listener that accepts connections and stays silent is an error.
     pub(crate) async fn connect(&self) -> Result<Channel, String> {
         let unreached = |why: String| format!("can't reach {}: {why}", self.url);
         let connecting = async {
             let channel = self.endpoint.connect().await.map_err(|e| unreached(in_words(&root(&e))))?;
-            // Whatever it answers, it answers.
+            // Any answer will do, also a refusal.
             match HealthClient::new(channel.clone()).check(HealthCheckRequest::default()).await {
                 Err(status) if status.source().is_some() => Err(unreached(broken(&status))),
                 _ => Ok(channel),
             }
         };
         let within_s = self.patience.as_secs_f64();
-        let silent = |_| unreached(format!("it takes the connection and says nothing for {within_s} s"));
+        let silent = |_| unreached(format!("it accepts the connection but has not answered within {within_s} s"));
         let channel = tokio::time::timeout(self.patience, connecting).await.map_err(silent)??;
         Ok(InterceptedService::new(channel, self.bearer.clone()))
     }
 }
 
-/// What a program shows of a status: what the server says, or in words how the connection broke.
+/// The text that a program shows for a status: the server's message, or how the connection broke.
 pub(crate) fn describe(status: &Status) -> String {
     if status.source().is_some() { broken(status) } else { error::describe(status) }
 }
@@ -146,14 +146,14 @@ pub(crate) fn describe(status: &Status) -> String {
 fn broken(status: &Status) -> String {
     let root = status.source().map_or_else(|| status.message().to_owned(), root);
     let hint = if root.contains("frame with invalid size") || root.contains("invalid HTTP version") {
-        "; it may speak TLS: then the URL begins with https://"
+        "; if it speaks TLS, the URL must begin with https://"
     } else {
         ""
     };
     format!("the connection broke: {}{hint}", in_words(&root))
 }
 
-/// What an error says at its root.
+/// The message of an error's innermost cause.
 fn root(error: &(dyn std::error::Error + 'static)) -> String {
     let mut cause = error;
     while let Some(deeper) = cause.source() {
@@ -162,17 +162,17 @@ fn root(error: &(dyn std::error::Error + 'static)) -> String {
     cause.to_string()
 }
 
-/// What libraries say in names of their own, in words.
+/// Library errors in plain words.
 fn in_words(said: &str) -> String {
     let known = [
-        ("UnknownIssuer", "the server's certificate is signed by nobody that is trusted here; --ca FILE tells who is"),
-        ("NotValidForName", "the server's certificate is of another name; --tls-name NAME tells which is meant"),
+        ("UnknownIssuer", "no authority that is trusted here has signed the server's certificate; --ca FILE adds one"),
+        ("NotValidForName", "the server's certificate is for another name; give the expected one with --tls-name NAME"),
         ("Expired", "the server's certificate has expired"),
-        ("CertificateRequired", "the server asks for a client's certificate: --cert FILE and --key FILE"),
+        ("CertificateRequired", "the server requires a client certificate: --cert FILE and --key FILE"),
         ("InvalidContentType", "it does not speak TLS; the URL may have to begin with http://"),
-        ("too_many_data_frames", "a transport cut it, for too many small messages waited unread"),
-        ("excessive load", "the server's transport cut it, for too much came at once"),
-        ("keep-alive timed out", "nothing was heard for too long"),
+        ("too_many_data_frames", "a transport closed it: too many small messages waited unread"),
+        ("excessive load", "the server's transport closed it: too many requests at once"),
+        ("keep-alive timed out", "the other side was silent for too long"),
     ];
     known
         .iter()
@@ -191,7 +191,7 @@ impl Credentials {
             (None, Err(_)) => return Ok(None),
         };
         let token = text.trim();
-        // What is wrong with it is not said: it would show in a log.
+        // The message does not quote the token: it would appear in a log.
         let wrong = || Failure::Refused(format!("{place}: holds no token; `palpate token` makes one"));
         if token.is_empty() || token.contains(char::is_whitespace) {
             return Err(wrong());
@@ -205,7 +205,7 @@ impl Credentials {
         let mut tls = ClientTlsConfig::new();
         tls = match &self.ca {
             Some(path) => tls.ca_certificate(Certificate::from_pem(read("--ca", path)?)),
-            // Not by a feature of tonic: it would have the server built with another tonic than the clients.
+            // tonic's own feature for this would make cargo build tonic twice, for the server and for the clients.
             None => {
                 tls.trust_anchors(rustls_native_certs::load_native_certs().certs.iter().filter_map(|certificate| {
                     webpki::anchor_from_trusted_cert(certificate).map(|anchor| anchor.to_owned()).ok()
@@ -222,7 +222,7 @@ impl Credentials {
     }
 }
 
-/// A token that every user of this machine can read is no secret.
+/// Warns if every user of this machine can read the token file.
 fn warn_if_readable(path: &Path) {
     #[cfg(unix)]
     {
@@ -230,7 +230,7 @@ fn warn_if_readable(path: &Path) {
         if std::fs::metadata(path).is_ok_and(|meta| meta.permissions().mode() & 0o007 != 0) {
             let path = path.display();
             crate::say!(
-                "palpate-client: warning: {path}: every user of this machine can read it; `chmod o= {path}` ends that"
+                "palpate-client: warning: {path}: every user of this machine can read it; run `chmod o= {path}`"
             );
         }
     }

@@ -1,4 +1,4 @@
-//! `palpate-client health`: whether a server serves.
+//! `palpate-client health`: checks that a server is serving.
 
 use std::time::Duration;
 
@@ -9,7 +9,7 @@ use tonic_health::pb::health_client::HealthClient;
 use crate::Failure;
 use crate::connect::{Credentials, Server, describe};
 
-/// What `health` is asked for.
+/// Arguments of `health`.
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
     /// The server
@@ -19,10 +19,10 @@ pub(crate) struct Arguments {
     credentials: Credentials,
 }
 
-/// One that is well answers sooner.
+/// A healthy server answers sooner.
 const PATIENCE: Duration = Duration::from_secs(2);
 
-/// Fails unless the server says that it serves.
+/// Fails unless the server reports that it is serving.
 pub(crate) async fn health(arguments: &Arguments) -> Result<(), Failure> {
     let server = Server::new(&arguments.server, &arguments.credentials)?.within(PATIENCE);
     let asked = async {
@@ -32,7 +32,7 @@ pub(crate) async fn health(arguments: &Arguments) -> Result<(), Failure> {
     let answer = tokio::time::timeout(PATIENCE, asked).await.map_err(|_| Failure::Failed("no answer".into()))?;
     let status = answer.map_err(Failure::Failed)?.into_inner().status;
     if status != ServingStatus::Serving as i32 {
-        return Err(Failure::Failed("the server does not serve".into()));
+        return Err(Failure::Failed("the server is not serving".into()));
     }
     crate::tell!("serving");
     Ok(())

@@ -1,8 +1,8 @@
-//! A curve in the terminal.
+//! Curves in the terminal.
 
 use textplots::{Chart, LabelBuilder, LabelFormat, Plot, Shape};
 
-/// `points` (time, value) drawn under a title.
+/// Draws `points` (time in s, value) under a title.
 pub(crate) fn draw(title: &str, points: &[(f32, f32)]) -> String {
     let (Some(first), Some(last)) = (points.first(), points.last()) else { return format!("{title}: nothing") };
     let values = points.iter().map(|point| point.1);

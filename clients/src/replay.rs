@@ -1,4 +1,4 @@
-//! `palpate-client replay`: a script through a server, exactly.
+//! `palpate-client replay`: plays a script through a server, each command at its exact step.
 
 use std::collections::VecDeque;
 use std::io::{BufWriter, IsTerminal, Write};
@@ -27,38 +27,39 @@ use tonic::{Status, Streaming};
 use crate::connect::{Channel, Credentials, Server, describe};
 use crate::{Failure, plot};
 
-/// How far ahead of the server's step commands are sent: a network may stall for about as long before time has to stand.
+/// How far ahead of the server's step commands are sent, s: a network may stall for about as long before the session has to
+/// wait.
 const AHEAD_S: f64 = 2.0;
 
-/// Commands of a tool on their way at most, below what a session queues.
+/// Largest number of commands of a tool that are sent ahead: fewer than a session queues.
 const COMMANDS_AHEAD: u64 = 4000;
 
-/// Between two heartbeats.
+/// Time between two heartbeats.
 const HEARTBEAT: Duration = Duration::from_millis(5);
 
-/// A running session answers heartbeats at once; this long without a word is an end.
+/// A server that is silent for longer than this has failed: a running session answers heartbeats at once.
 const SILENCE: Duration = Duration::from_secs(10);
 
-/// A scene that takes longer to be laid out is too large for a replay.
+/// Time limit for creating the session.
 const PATIENCE: Duration = Duration::from_secs(120);
 
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
-    /// A script file, or the name of one in ./scripts
+    /// A script file, or the name of a script in ./scripts
     script: PathBuf,
     /// The server
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7117")]
     server: String,
-    /// A scene that the server has by that name, or a scene file of your own (ends in .toml)
+    /// Name of a scene of the server, or a scene file of your own (ends in .toml)
     #[arg(long, value_name = "NAME", default_value = "paper")]
     scene: String,
     /// Write the records here instead of to the standard output
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// Draw the first control point's displacement and force in the terminal
+    /// Plot displacement and force of the first control point in the terminal
     #[arg(long)]
     plot: bool,
-    /// No progress bar
+    /// Show no progress bar
     #[arg(short, long)]
     quiet: bool,
     #[command(flatten)]
@@ -67,26 +68,24 @@ pub(crate) struct Arguments {
     credentials: Credentials,
 }
 
-/// Which samples the server is asked for. The records do not depend on it.
+/// The samples that the server is to send. The records do not depend on them.
 #[derive(clap::Args)]
-#[command(
-    next_help_heading = "Samples (what the tools feel, for --plot and the table; a sample a step if nothing is given)"
-)]
+#[command(next_help_heading = "Samples (forces on the tools, for --plot and the table) [default: one per step]")]
 struct Sampling {
-    /// A sample every Nth step
+    /// Sample every Nth step
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     every: u32,
-    /// Leave out samples whose force on the tool differs from the last one's by no more than this, N
+    /// Skip samples whose force on the tool differs from the last sample's by at most this, N
     #[arg(long, value_name = "N")]
     deadband_force_n: Option<f64>,
-    /// The same as a part of the force, 0 to 1: of both the larger counts. People notice a tenth or so
+    /// The same as a fraction of the force, 0 to 1; the larger of both applies. People notice about a tenth
     #[arg(long, value_name = "FRACTION")]
     deadband_force_fraction: Option<f64>,
-    /// Leave out samples whose control point moved by no more than this, m. With a force deadband too, a sample comes if
-    /// either is left
+    /// Skip samples whose control point has moved by at most this, m. With a force deadband too, a sample is sent when
+    /// either is exceeded
     #[arg(long, value_name = "M")]
     deadband_displacement_m: Option<f64>,
-    /// The longest between two samples when nothing changes, s: above 0 and at most 10 [default: 0.05]
+    /// Longest time between two samples when nothing changes, s: above 0 and at most 10 [default: 0.05]
     #[arg(long, value_name = "SECONDS")]
     heartbeat_s: Option<f64>,
 }
@@ -102,30 +101,34 @@ impl Sampling {
         (deadband != pb::Deadband::default()).then_some(deadband)
     }
 
-    /// Samples pace the commands, which are sent so many steps ahead: they must come twice as often.
+    /// Checks that samples arrive at least twice while the commands sent ahead last: samples pace the commands.
     #[allow(clippy::cast_precision_loss)]
     fn check(&self, rate_hz: f64, ahead: u64) -> Result<(), Failure> {
         let most_s = 0.5 * ahead as f64 / rate_hz;
         let apart_s = f64::from(self.every) / rate_hz;
         for (option, seconds) in [("--every", apart_s), ("--heartbeat-s", self.heartbeat_s.unwrap_or(0.0) + apart_s)] {
             if seconds > most_s {
-                let why = "samples pace the commands, and would be up to";
-                return Err(Failure::Refused(format!("{option}: {why} {seconds} s apart, above {most_s} s")));
+                let why = "samples pace the commands, so they must be at most";
+                return Err(Failure::Refused(format!("{option}: {why} {most_s} s apart, but would be {seconds} s")));
             }
         }
         Ok(())
     }
 }
 
-/// When the server was last heard.
+/// When the last message of the server arrived.
 type LastHeard = Mutex<Instant>;
 
-/// The session is deleted also when the replay fails.
+/// The replay's session. It is deleted even when the replay fails.
 struct Session {
     client: SessionServiceClient<Channel>,
     id: String,
 }
 
+/// Plays the script; writes the records and a summary.
+///
+/// # Errors
+/// Returns an error if an input is refused, the server fails or is silent, or the output can't be written.
 pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
     let server = Server::new(&arguments.server, &arguments.credentials)?;
     let source = source(&arguments.scene)?;
@@ -134,10 +137,10 @@ pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
     let mut client = SessionServiceClient::new(channel.clone());
     let request =
         pb::CreateSessionRequest { source: Some(source), paused: true, idle_timeout_s: Some(SILENCE.as_secs_f64()) };
-    let silent = |_| Failure::Failed(format!("the server made no session within {} s", PATIENCE.as_secs()));
+    let silent = |_| Failure::Failed(format!("the server created no session within {} s", PATIENCE.as_secs()));
     let created = tokio::time::timeout(PATIENCE, client.create_session(request)).await.map_err(silent)?;
     let created = created.map_err(refused_or_failed)?.into_inner().session;
-    let created = created.ok_or_else(|| Failure::Failed("the server made no session".into()))?;
+    let created = created.ok_or_else(|| Failure::Failed("the server's answer has no session".into()))?;
     let mut session = Session { client, id: created.session_id.clone() };
     let sessions = session.client.clone();
     let heard = LastHeard::new(Instant::now());
@@ -146,12 +149,16 @@ pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
         failure = silence(&heard) => Err(failure),
         _ = tokio::signal::ctrl_c() => Err(Failure::Failed("interrupted".into())),
     };
-    // A server that has gone has no sessions any more.
+    // The result does not matter: a server that has ended has no sessions any more.
     let deleted = session.client.delete_session(pb::DeleteSessionRequest { session_id: session.id });
     let _ = tokio::time::timeout(Duration::from_secs(2), deleted).await;
     ended
 }
 
+/// The scene of a session: one of the server's by its name, or the contents of a file that ends in .toml.
+///
+/// # Errors
+/// Returns an error if the file can't be read, or if its scene is invalid.
 pub(crate) fn source(scene: &str) -> Result<Source, Failure> {
     if Path::new(scene).extension().is_none_or(|extension| extension != "toml") {
         return Ok(Source::SceneName(scene.to_owned()));
@@ -175,32 +182,32 @@ fn refused_or_failed(status: Status) -> Failure {
     }
 }
 
-/// What a replay has seen.
-struct Seen {
+/// What a replay has measured.
+struct Measured {
     round_trip_ns: Histogram<u64>,
     hold_ns: Histogram<u64>,
     overruns: u64,
     samples: u64,
-    /// Of the last sample.
+    /// Awake points in the last sample.
     awake_points: u64,
-    /// Points times steps that were computed: a sample stands for the steps since the one before, unless all was asleep.
+    /// Points × steps that were computed: a sample counts for the steps since the one before, unless all points slept.
     computed: u64,
     late: u64,
     rejected: u64,
     largest_displacement_m: f64,
     peak_reaction_n: f64,
-    /// Step and server time of the first sample and of the last.
+    /// Step and server time, ns, of the first sample and of the last.
     first: Option<(u64, u64)>,
     last: (u64, u64),
-    /// Time, displacement and reaction of the first control point, signed by their largest component.
+    /// Time, s, with the vertical displacement, m, and reaction, N, of the first control point.
     displacement: Vec<(f32, f32)>,
     reaction: Vec<(f32, f32)>,
 }
 
-impl Seen {
+impl Measured {
     fn new() -> Result<Self, Failure> {
         let histogram = || Histogram::new(3).map_err(|e| Failure::Failed(e.to_string()));
-        Ok(Seen {
+        Ok(Measured {
             round_trip_ns: histogram()?,
             hold_ns: histogram()?,
             overruns: 0,
@@ -235,7 +242,7 @@ impl Seen {
             self.largest_displacement_m = self.largest_displacement_m.max(displacement_m.length());
             self.peak_reaction_n = self.peak_reaction_n.max(reaction_n.length());
             if index == 0 && tool.point.is_some() {
-                // The vertical part: what the paper's figures show.
+                // The vertical component, as in the paper's figures.
                 self.displacement.push((sample.simulation_time_s as f32, displacement_m.z as f32));
                 self.reaction.push((sample.simulation_time_s as f32, reaction_n.z as f32));
             }
@@ -267,13 +274,13 @@ fn percentiles_us(histogram: &Histogram<u64>) -> Percentiles {
     }
 }
 
-/// The script's side of the haptic stream.
+/// Sends a script's commands over the haptic stream.
 struct Streamer<'s> {
     script: &'s Script,
     outbound: mpsc::Sender<pb::TouchRequest>,
     clock: Instant,
     next_step: u64,
-    /// For each heartbeat on its way, the step before which all commands were sent ahead of it.
+    /// For each unanswered heartbeat: all commands before this step were sent ahead of it.
     sent_before: VecDeque<u64>,
 }
 
@@ -305,14 +312,15 @@ impl Streamer<'_> {
         self.say(Say::Renew(pb::Renew { client_time_ns: self.now_ns() })).await
     }
 
-    /// A heartbeat was answered, which happens in order: tells the step before which the server has all commands.
-    fn taken_in(&mut self) -> u64 {
+    /// Called for each answered heartbeat; they are answered in order. Returns the step before which the server has all
+    /// commands.
+    fn heartbeat_answered(&mut self) -> u64 {
         self.sent_before.pop_front().unwrap_or(0)
     }
 }
 
-/// Lets time go on until `step`: only as far as the server has all commands, so that none is ever late.
-fn go_on(sessions: &SessionServiceClient<Channel>, session_id: &str, step: u64) -> JoinHandle<Result<(), Status>> {
+/// Runs the session until `step`. That is only as far as the server has all commands, so that none is ever late.
+fn run_until(sessions: &SessionServiceClient<Channel>, session_id: &str, step: u64) -> JoinHandle<Result<(), Status>> {
     let mut sessions = sessions.clone();
     let request = pb::StartSessionRequest { session_id: session_id.to_owned(), until_step: Some(step) };
     tokio::spawn(async move { sessions.start_session(request).await.map(|_| ()) })
@@ -323,12 +331,12 @@ async fn next<T>(stream: &mut Streaming<T>, heard: &LastHeard) -> Result<T, Fail
     *heard.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now();
     match message {
         Ok(Some(message)) => Ok(message),
-        Ok(None) => Err(Failure::Failed("the server ended the replay".into())),
+        Ok(None) => Err(Failure::Failed("the server ended the stream".into())),
         Err(status) => Err(failed(status)),
     }
 }
 
-/// Ends a replay whose server says nothing any more, whatever the replay waits for.
+/// Completes when the server has been silent for too long, whatever the replay waits for.
 async fn silence(heard: &LastHeard) -> Failure {
     loop {
         let last = *heard.lock().unwrap_or_else(PoisonError::into_inner);
@@ -377,7 +385,7 @@ async fn play(
     };
     write_line(&mut output, &Line::Run(&run)).map_err(written)?;
 
-    // Another tissue may take other substeps.
+    // A change of the tissue may change the number of substeps.
     let (mut substeps, mut since, mut a_step) = (0, 0, u64::from(created.substeps));
     for (step, change) in &script.changes {
         let update = wire::scene::update_tissue(session_id, change, *step);
@@ -418,17 +426,17 @@ async fn play(
     };
     streamer.say(Say::Open(open)).await?;
     let mut touch = haptics.touch(ReceiverStream::new(messages)).await.map_err(refused_or_failed)?.into_inner();
-    // The answer to `open`, or why it was refused.
+    // The first message answers `open`, or is an error.
     touch.message().await.map_err(refused_or_failed)?;
 
     let ahead = ((AHEAD_S * scene.stepping.rate_hz) as u64).clamp(1, COMMANDS_AHEAD);
     arguments.sampling.check(scene.stepping.rate_hz, ahead)?;
-    let mut seen = Seen::new()?;
+    let mut measured = Measured::new()?;
     streamer.send_before(ahead).await?;
     streamer.heartbeat().await?;
-    let mut taken_in = loop {
+    let mut commands_until = loop {
         match next(&mut touch, heard).await?.message {
-            Some(Heard::Renewed(_)) => break streamer.taken_in(),
+            Some(Heard::Renewed(_)) => break streamer.heartbeat_answered(),
             Some(Heard::Rejection(rejection)) => return Err(rejected(&rejection)),
             _ => {}
         }
@@ -437,8 +445,8 @@ async fn play(
     let asked = pb::GetStateHashRequest { session_id: session_id.clone(), at_step: Some(script.steps) };
     let mut hash = tokio::spawn(async move { hasher.get_state_hash(asked).await });
     let started = Instant::now();
-    let mut until = taken_in;
-    let (mut going_on, mut is_answered) = (go_on(&sessions, session_id, until), false);
+    let mut until = commands_until;
+    let (mut running, mut is_answered) = (run_until(&sessions, session_id, until), false);
 
     let progress = progress_bar(script.steps, arguments.quiet);
     let mut heartbeat = tokio::time::interval(HEARTBEAT);
@@ -447,15 +455,15 @@ async fn play(
     let mut records_left = script.steps / script.sample_every + 1;
     let mut final_hash = None;
     let mut wall_s = 0.0;
-    while records_left > 0 || final_hash.is_none() || seen.last.0 < script.steps {
-        // Not for each heartbeat; and well before time would stand.
-        let is_worth_it = taken_in >= until + ahead / 4 || taken_in == script.steps;
-        if is_answered && taken_in > until && is_worth_it {
-            until = taken_in;
-            (going_on, is_answered) = (go_on(&sessions, session_id, until), false);
+    while records_left > 0 || final_hash.is_none() || measured.last.0 < script.steps {
+        // Not at each heartbeat, but well before the session would have to wait.
+        let is_due = commands_until >= until + ahead / 4 || commands_until == script.steps;
+        if is_answered && commands_until > until && is_due {
+            until = commands_until;
+            (running, is_answered) = (run_until(&sessions, session_id, until), false);
         }
         tokio::select! {
-            message = next(&mut touch, heard), if seen.last.0 < script.steps => match message?.message {
+            message = next(&mut touch, heard), if measured.last.0 < script.steps => match message?.message {
                 Some(Heard::Sample(sample)) => {
                     if sample.held {
                         let asked = pb::GetSessionRequest { session_id: session_id.clone() };
@@ -463,19 +471,19 @@ async fn play(
                         let reason = session.map(|session| session.hold_reason).unwrap_or_default();
                         return Err(Failure::Failed(format!("the run was stopped: {reason}")));
                     }
-                    seen.sample(&sample, arguments.sampling.every);
+                    measured.sample(&sample, arguments.sampling.every);
                     wall_s = started.elapsed().as_secs_f64();
                     progress.set_position(sample.step);
                     streamer.send_before(sample.step + ahead).await?;
                 }
                 Some(Heard::Renewed(renewed)) => {
                     let round_trip_ns = streamer.now_ns().saturating_sub(renewed.client_time_ns);
-                    let _ = seen.round_trip_ns.record(round_trip_ns);
-                    let _ = seen.hold_ns.record(renewed.server_hold_ns);
-                    taken_in = streamer.taken_in();
+                    let _ = measured.round_trip_ns.record(round_trip_ns);
+                    let _ = measured.hold_ns.record(renewed.server_hold_ns);
+                    commands_until = streamer.heartbeat_answered();
                 }
                 Some(Heard::Rejection(rejection)) => {
-                    seen.rejected += 1;
+                    measured.rejected += 1;
                     progress.suspend(|| crate::say!("palpate-client: warning: {}", rejection_text(&rejection)));
                 }
                 Some(Heard::Opened(_)) | None => {}
@@ -483,16 +491,17 @@ async fn play(
             message = next(&mut records, heard), if records_left > 0 => {
                 let message = message?;
                 if message.dropped_records > 0 {
-                    return Err(Failure::Failed("records were lost: this client is too slow for so many points so often".into()));
+                    let why = "records were lost: this client can't keep up with so many points at this rate";
+                    return Err(Failure::Failed(why.into()));
                 }
                 if wire::sample::add_to_record(&mut record, &message) {
                     let record = std::mem::take(&mut record);
-                    seen.record(&record);
+                    measured.record(&record);
                     write_line(&mut output, &record).map_err(written)?;
                     records_left -= 1;
                 }
             },
-            answer = &mut going_on, if !is_answered => {
+            answer = &mut running, if !is_answered => {
                 answer.map_err(|e| Failure::Failed(e.to_string()))?.map_err(refused_or_failed)?;
                 is_answered = true;
             }
@@ -500,19 +509,19 @@ async fn play(
                 let answer = answer.map_err(|e| Failure::Failed(e.to_string()))?.map_err(failed)?;
                 final_hash = Some(answer.into_inner().state_hash);
             }
-            _ = heartbeat.tick(), if seen.last.0 < script.steps => streamer.heartbeat().await?,
+            _ = heartbeat.tick(), if measured.last.0 < script.steps => streamer.heartbeat().await?,
         }
     }
     progress.finish_and_clear();
 
     let points = scene.sheet.points[0] * scene.sheet.points[1];
     let network = Network {
-        late_commands: seen.late,
-        rejected_commands: seen.rejected,
-        overruns: seen.overruns,
-        time_dilation: seen.dilation(scene.stepping.rate_hz),
-        round_trip_us: percentiles_us(&seen.round_trip_ns),
-        server_hold_us: percentiles_us(&seen.hold_ns),
+        late_commands: measured.late,
+        rejected_commands: measured.rejected,
+        overruns: measured.overruns,
+        time_dilation: measured.dilation(scene.stepping.rate_hz),
+        round_trip_us: percentiles_us(&measured.round_trip_ns),
+        server_hold_us: percentiles_us(&measured.hold_ns),
     };
     let summary = Summary {
         audited_error: None,
@@ -522,7 +531,7 @@ async fn play(
         points,
         wall_s,
         ns_per_point_substep: wall_s * 1e9 / (substeps as f64 * points as f64),
-        computed_fraction: seen.computed as f64 / (script.steps * points as u64) as f64,
+        computed_fraction: measured.computed as f64 / (script.steps * points as u64) as f64,
         guard_events: 0,
         final_hash: final_hash.unwrap_or_default(),
         network: Some(network.clone()),
@@ -530,15 +539,16 @@ async fn play(
     write_line(&mut output, &Line::Summary(&summary)).map_err(written)?;
     output.flush().map_err(written)?;
     if arguments.plot {
-        // Not among the records.
+        // The plot must not go where the records go.
         let show =
             |text: String| if arguments.output.is_some() { crate::tell!("{text}") } else { crate::say!("{text}") };
-        show(plot::draw("Displacement of the control point along z, m", &seen.displacement));
-        show(plot::draw("Force of the tissue on the tool along z, N", &seen.reaction));
+        show(plot::draw("Displacement of the control point along z, m", &measured.displacement));
+        show(plot::draw("Force of the tissue on the tool along z, N", &measured.reaction));
     }
-    table(arguments, &summary, &network, &seen);
-    if seen.rejected > 0 {
-        return Err(Failure::Failed(format!("{} commands were rejected: this was not the script", seen.rejected)));
+    table(arguments, &summary, &network, &measured);
+    if measured.rejected > 0 {
+        let why = "commands were rejected, so the run differs from the script";
+        return Err(Failure::Failed(format!("{} {why}", measured.rejected)));
     }
     Ok(())
 }
@@ -559,16 +569,16 @@ fn progress_bar(steps: u64, quiet: bool) -> ProgressBar {
     ProgressBar::new(steps).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
 }
 
-/// What people want to know, where the records do not go.
-fn table(arguments: &Arguments, summary: &Summary, network: &Network, seen: &Seen) {
+/// Prints the summary as a table, on the output that the records do not go to.
+fn table(arguments: &Arguments, summary: &Summary, network: &Network, measured: &Measured) {
     let percentiles = |p: &Percentiles| format!("{:.0} / {:.0} / {:.0} µs", p.p50, p.p99, p.max);
     let rows = [
         ("steps", format!("{} in {:.2} s", summary.steps, summary.wall_s)),
         ("overruns", format!("{} (time dilation {:.5})", network.overruns, network.time_dilation)),
-        ("samples", format!("{} for {} steps", seen.samples, summary.steps)),
+        ("samples", format!("{} for {} steps", measured.samples, summary.steps)),
         ("late commands", network.late_commands.to_string()),
-        ("largest displacement", format!("{:.6} m", seen.largest_displacement_m)),
-        ("peak reaction", format!("{:.6} N", seen.peak_reaction_n)),
+        ("largest displacement", format!("{:.6} m", measured.largest_displacement_m)),
+        ("peak reaction", format!("{:.6} N", measured.peak_reaction_n)),
         ("round trip p50 / p99 / max", percentiles(&network.round_trip_us)),
         ("final hash", summary.final_hash.clone()),
     ];

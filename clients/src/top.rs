@@ -1,4 +1,4 @@
-//! `palpate-client top`: the sessions of a server, once a second.
+//! `palpate-client top`: shows the sessions of a server once a second.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -13,39 +13,39 @@ use tonic::Code;
 use crate::Failure;
 use crate::connect::{Channel, Credentials, Server, describe};
 
-/// What `top` is asked for.
+/// Arguments of `top`.
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
     /// The server
     #[arg(value_name = "URL", default_value = "http://127.0.0.1:7117")]
     server: String,
-    /// Show it once, after a second, and end
+    /// Print one table, after a second, and exit
     #[arg(long)]
     once: bool,
-    /// One JSON object a line, instead of a table
+    /// Print one JSON object per line instead of a table
     #[arg(long)]
     json: bool,
     #[command(flatten)]
     credentials: Credentials,
 }
 
-/// Between two looks.
+/// Time between two queries.
 const EVERY: Duration = Duration::from_secs(1);
 
-/// A session, and how many steps it does and drops a second since the last look.
+/// A session with its steps and overruns per second since the last query.
 struct Row {
     session: Session,
     steps_per_s: f64,
     overruns_per_s: f64,
 }
 
-/// Steps done and dropped, by session, at some moment.
+/// Steps and overruns of each session at a moment.
 struct Seen {
     at: Instant,
     counts: BTreeMap<String, (u64, u64)>,
 }
 
-/// Looks at a server until it is interrupted, or nobody reads any more.
+/// Shows a server's sessions until it is interrupted or its output is closed.
 pub(crate) async fn top(arguments: &Arguments) -> Result<(), Failure> {
     let server = Server::new(&arguments.server, &arguments.credentials)?;
     let unreached = |why| Failure::Failed(format!("{why}; `palpate serve` starts a server"));
@@ -62,21 +62,21 @@ pub(crate) async fn top(arguments: &Arguments) -> Result<(), Failure> {
         let silent = |_| Err(tonic::Status::unavailable(format!("no answer within {} s", PATIENCE.as_secs())));
         let (rows, now) = match looked.unwrap_or_else(silent) {
             Ok(looked) => looked,
-            // The channel connects again by itself.
+            // The channel reconnects by itself.
             Err(status) if status.code() == Code::Unavailable && !arguments.once => {
-                crate::say!("palpate-client: warning: {}; looking again", describe(&status));
+                crate::say!("palpate-client: warning: {}; trying again", describe(&status));
                 continue;
             }
             Err(status) => return Err(Failure::Failed(describe(&status))),
         };
-        // A rate needs two looks.
+        // A rate needs two queries.
         if seen.replace(now).is_none() {
             continue;
         }
         let text = match (arguments.json, terminal) {
             (true, _) => format!("{}\n", as_json(&rows)),
             (false, false) => table(&arguments.server, &rows, usize::MAX) + if arguments.once { "" } else { "\n" },
-            // Over what was there, without a flicker.
+            // Overwrites the last table in place, which does not flicker.
             (false, true) => {
                 let height = usize::from(console::Term::stdout().size().0);
                 let table = table(&arguments.server, &rows, height.saturating_sub(4));
@@ -92,7 +92,7 @@ pub(crate) async fn top(arguments: &Arguments) -> Result<(), Failure> {
     }
 }
 
-/// For an answer.
+/// Time limit for an answer.
 const PATIENCE: Duration = Duration::from_secs(10);
 
 #[allow(clippy::cast_precision_loss)]
@@ -105,7 +105,7 @@ async fn look(
     let counts =
         listed.iter().map(|session| (session.session_id.clone(), (session.step, session.overrun_count))).collect();
     let row = |session: Session| {
-        // One that is new has no rate yet.
+        // A new session has no rate yet.
         let before = seen.and_then(|seen| Some((seen.at, seen.counts.get(&session.session_id)?)));
         let (steps_per_s, overruns_per_s) = before.map_or((0.0, 0.0), |(before, (steps, overruns))| {
             let per_s = |count: u64| count as f64 / (at - before).as_secs_f64().max(1e-3);
@@ -151,10 +151,10 @@ fn audit(audit: &Audit) -> Value {
     })
 }
 
-/// A line of sums, a head, and a line for each session; of `most` lines the busiest.
+/// A line of totals, a header, and a line for each session; if there are more than `most`, the busiest.
 fn table(server: &str, rows: &[Row], most: usize) -> String {
     let count = |wanted: &str| rows.iter().filter(|row| state(&row.session) == wanted).count();
-    // (`sum` of none is −0, and is written so.)
+    // Not `sum()`: the sum of nothing is −0 and would be printed with its sign.
     let sum = |of: &dyn Fn(&Row) -> f64| rows.iter().map(of).fold(0.0, |sum, value| sum + value);
     let mut text = format!(
         "{server}: {} sessions ({} running, {} resting, {} paused, {} held), {:.0} awake points, {:.0} steps/s, \
@@ -196,7 +196,7 @@ fn table(server: &str, rows: &[Row], most: usize) -> String {
             text,
             "{:<32}  {:<12.12} {:<7} {:>10} {:>7.0} {:>8.4} {:>15} {:>8} {:>6} {:>8} {:>7}  {}",
             session.session_id,
-            // Names are for people, and may hold anything.
+            // Clients choose names freely.
             printable(&session.scene_name),
             state(session),
             session.step,
@@ -216,7 +216,7 @@ fn table(server: &str, rows: &[Row], most: usize) -> String {
     text
 }
 
-/// What a client named itself must not move the cursor.
+/// Replaces control characters, which would act on the terminal.
 fn printable(text: &str) -> String {
     text.chars().map(|c| if c.is_control() { '?' } else { c }).collect()
 }

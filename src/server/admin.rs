@@ -1,4 +1,4 @@
-//! `AdminService`.
+//! `AdminService`: shows what callers use, and takes it back.
 
 use std::sync::Arc;
 
@@ -58,9 +58,9 @@ impl AdminService for Admin {
         let pb::FreeToolRequest { session_id, tool } = request.into_inner();
         let live = self.house.pacer.get(&session_id)?;
         if live.at_intake(|intake, _| intake.free(|other, _| other == tool)) == 0 {
-            return Err(Refusal::new(Reason::OutOfRange, "tool", format!("tool {tool} is held by nobody")).into());
+            return Err(Refusal::new(Reason::OutOfRange, "tool", format!("nobody holds tool {tool}")).into());
         }
-        info!(session = %live.id, tool, "tool freed");
+        info!(session = %live.id, tool, "tool released by an administrator");
         Ok(Response::new(pb::FreeToolResponse {}))
     }
 
@@ -86,7 +86,7 @@ impl AdminService for Admin {
         let pacer = &self.house.pacer;
         let account =
             pacer.budget.accounts().into_iter().find(|account| account.name() == caller).ok_or_else(|| {
-                Refusal::new(Reason::OutOfRange, "caller", format!("`{}` has nothing here", excerpt(&caller)))
+                Refusal::new(Reason::OutOfRange, "caller", format!("unknown caller `{}`", excerpt(&caller)))
             })?;
         let mut answer = pb::CutCallerResponse::default();
         for live in pacer.list() {

@@ -1,4 +1,4 @@
-//! The scenes and scripts that a server knows by name: `NAME.toml` in its folders, and those built in.
+//! The scenes and scripts that a server knows by name: `NAME.toml` in its folders, and the built-in ones.
 
 use std::path::{Path, PathBuf};
 
@@ -9,14 +9,14 @@ use crate::scene::document::read_text;
 use crate::scene::script::{self, Script};
 use crate::scene::{self, Scene};
 
-/// Texts by name.
+/// Texts by name: the files of a folder, and the built-in ones.
 #[derive(Debug, Clone)]
-struct Shelf {
+struct Collection {
     folder: PathBuf,
     built_in: &'static [(&'static str, &'static str)],
 }
 
-impl Shelf {
+impl Collection {
     /// Every name, sorted.
     fn names(&self) -> Vec<String> {
         let mut names: Vec<String> = self.built_in.iter().map(|text| text.0.to_owned()).collect();
@@ -34,8 +34,8 @@ impl Shelf {
         names
     }
 
-    /// What refusals call the text of that name, and the text; none if there is none. The folder's own goes before one
-    /// built in. Clients learn the file's name, not where the server keeps it.
+    /// The text of that name, after the name that refusals use for it; `None` if there is none. A file of the folder
+    /// overrides a built-in text. Refusals name the file without its folder: clients do not learn the server's paths.
     fn text(&self, name: &str, limits: &Limits) -> Result<Option<(String, String)>> {
         let path = self.folder.join(format!("{name}.toml"));
         if is_name(name) && path.is_file() {
@@ -52,30 +52,33 @@ impl Shelf {
 /// Scenes and scripts by name.
 #[derive(Debug, Clone)]
 pub struct Catalog {
-    scenes: Shelf,
-    scripts: Shelf,
+    scenes: Collection,
+    scripts: Collection,
 }
 
 impl Catalog {
-    /// Those of two folders, which may be missing.
+    /// The scenes and scripts of two folders, either of which may be missing, and the built-in ones.
     pub fn new(scenes: &Path, scripts: &Path) -> Self {
         Catalog {
-            scenes: Shelf { folder: scenes.to_owned(), built_in: &scene::BUILT_IN },
-            scripts: Shelf { folder: scripts.to_owned(), built_in: &script::BUILT_IN },
+            scenes: Collection { folder: scenes.to_owned(), built_in: &scene::BUILT_IN },
+            scripts: Collection { folder: scripts.to_owned(), built_in: &script::BUILT_IN },
         }
     }
 
-    /// Every scene's name, sorted.
+    /// The names of all scenes, sorted.
     pub fn names(&self) -> Vec<String> {
         self.scenes.names()
     }
 
-    /// Every script's name, sorted.
+    /// The names of all scripts, sorted.
     pub fn script_names(&self) -> Vec<String> {
         self.scripts.names()
     }
 
-    /// The scene of that name, with `--set` assignments over it.
+    /// Loads the scene of that name; `--set` assignments override its keys.
+    ///
+    /// # Errors
+    /// Returns an error if there is no such scene, or if it is invalid.
     pub fn load(&self, name: &str, assignments: &[String], limits: &Limits) -> Result<Scene> {
         match self.scenes.text(name, limits)? {
             Some((file, text)) => {
@@ -89,7 +92,10 @@ impl Catalog {
         }
     }
 
-    /// The script of that name, bound to a scene.
+    /// Loads the script of that name and binds it to a scene.
+    ///
+    /// # Errors
+    /// Returns an error if there is no such script, or if it is invalid for this scene.
     pub fn script(&self, name: &str, scene: &Scene, limits: &Limits) -> Result<Script> {
         match self.scripts.text(name, limits)? {
             Some((file, text)) => Script::parse(&file, &text, &self.scripts.folder, scene, limits),
@@ -102,7 +108,7 @@ impl Catalog {
     }
 }
 
-/// A plain word: nothing that could lead out of the folder.
+/// Whether `name` is a plain word, which can't lead out of the folder.
 fn is_name(name: &str) -> bool {
     !name.is_empty() && name.chars().all(|c| c.is_ascii_alphanumeric() || c == '-' || c == '_')
 }

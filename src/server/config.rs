@@ -1,4 +1,4 @@
-//! The configuration of a server: a TOML file, then the command line over it.
+//! The configuration of a server: a TOML file, which the command line overrides.
 
 use std::path::{Path, PathBuf};
 
@@ -8,45 +8,46 @@ use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, number, positive};
 use crate::scene::document::read_text;
 
-/// Everything that can be configured. Absent keys keep these defaults.
+/// Everything that you can configure. Absent keys keep their defaults.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
-    /// Where to listen: address:port. At one that other machines can reach, TLS and tokens or client certificates are needed.
+    /// Where to listen: address:port. An address that other machines can reach requires TLS, and tokens or client
+    /// certificates.
     pub listen: String,
-    /// File of the certificate chain that the server shows, PEM. Looked at again when it changes, as the next three.
+    /// File of the server's certificate chain, PEM. This file and the next three are reloaded when they change.
     pub tls_cert: Option<PathBuf>,
-    /// File of its private key, PEM.
+    /// File of the server's private key, PEM.
     pub tls_key: Option<PathBuf>,
-    /// File of certificates, PEM: a client must show one that was signed by one of them.
+    /// File of certificate authorities, PEM: a client must present a certificate that one of them has signed.
     pub tls_client_ca: Option<PathBuf>,
-    /// File of tokens and the names of client certificates, and what they may do (docs/formats.md).
+    /// File of the roles of tokens and client certificates (docs/formats.md).
     pub tokens: Option<PathBuf>,
-    /// Serve unprotected also where other machines can reach it.
+    /// Serve without TLS or authentication even where other machines can reach the server.
     pub insecure: bool,
-    /// Origins of pages of other sites that may call, as in `https://example.org`.
+    /// Origins of other sites whose pages may call, such as `https://example.org`.
     pub origins: Vec<String>,
-    /// Where Prometheus finds `/metrics`: address:port; nowhere if absent. Nobody is asked who they are there.
+    /// Where to serve `/metrics` for Prometheus, without authentication: address:port. `None` disables it.
     pub metrics: Option<String>,
-    /// Folder of the scenes that sessions can be made from by name.
+    /// Folder of the scenes that clients can create sessions from by name.
     pub scenes: PathBuf,
     /// Folder of the scripts that clients can ask for by name.
     pub scripts: PathBuf,
-    /// Folder of the page that `/` shows, built by `npm run build`.
+    /// Folder of the page that `/` serves, built by `npm run build`.
     pub viewer: PathBuf,
-    /// Stepping threads; one less than the machine has cores if 0.
+    /// Stepping threads; 0: one less than the machine has cores.
     pub threads: usize,
-    /// Threads of the network side; as many as the stepping threads leave cores, at least 1, if 0.
+    /// Network threads; 0: as many as the stepping threads leave cores, at least 1.
     pub network_threads: usize,
-    /// Part of a core with which the errors of live sessions are measured; nothing is measured if 0.
+    /// Fraction of a core for measuring the errors of live sessions; 0 disables the measurement.
     pub audit_share: f64,
-    /// How long open streams may take to end at shutdown before they are cut, s.
+    /// Time that open streams get to end at shutdown before they are cut, s.
     pub shutdown_deadline_s: f64,
-    /// Lease of a tool if the client asks for none, s.
+    /// Duration of a tool's lease if the client gives none, s.
     pub lease_s: f64,
-    /// A session is deleted when so long nobody asked for it, held a tool or had a stream, s.
+    /// A session is deleted after this time without a call, a held tool or a stream, s.
     pub idle_session_s: f64,
-    /// What is logged: `info`, `debug`, `palpate=debug,tonic=warn`, …
+    /// The log filter: `info`, `debug`, `palpate=debug,tonic=warn`, …
     pub log: String,
     /// Upper bounds.
     pub limits: Limits,
@@ -80,11 +81,17 @@ impl Default for Config {
 
 impl Config {
     /// Reads a configuration file.
+    ///
+    /// # Errors
+    /// Returns an error if the file can't be read, or if the configuration is invalid.
     pub fn load(path: &Path) -> Result<Self> {
         Config::parse(&path.display().to_string(), &read_text(path, Limits::default().file_bytes)?)
     }
 
-    /// Parses a configuration; `name` is what refusals call it.
+    /// Parses a configuration; refusals call it `name`.
+    ///
+    /// # Errors
+    /// Returns an error with the line if the text is not TOML or has an unknown key, and the errors of [`Config::check`].
     pub fn parse(name: &str, text: &str) -> Result<Self> {
         let config: Config = toml::from_str(text).map_err(|e| {
             let line = e.span().map_or(1, |span| text[..span.start].matches('\n').count() + 1);
@@ -95,7 +102,10 @@ impl Config {
         Ok(config)
     }
 
-    /// Ranges.
+    /// Checks ranges, and that keys that need each other are given together.
+    ///
+    /// # Errors
+    /// Returns an error that names the first key that is out of range or missing.
     pub fn check(&self) -> Result<()> {
         for (field, value) in [
             ("limits.point_force_n", self.limits.point_force_n),
@@ -109,7 +119,7 @@ impl Config {
         ] {
             positive(field, value)?;
         }
-        // None of these would let anything through.
+        // A 0 in any of these would refuse everything.
         macro_rules! whole {
             ($($limit:ident)*) => { [$((concat!("limits.", stringify!($limit)), self.limits.$limit == 0),)*] };
         }
@@ -120,10 +130,10 @@ impl Config {
             connection_window_bytes queued_changes rehearsal_work law_work queued_work streams leases
         );
         if let Some((field, _)) = whole.iter().find(|limit| limit.1) {
-            return Err(Refusal::new(Reason::OutOfRange, *field, "must be 1 or more: 0 lets nothing through"));
+            return Err(Refusal::new(Reason::OutOfRange, *field, "must be at least 1: 0 would refuse everything"));
         }
         let together = |field: &str, given: bool, needs: &str, there: bool| {
-            let missing = || Refusal::new(Reason::Missing, needs, format!("is missing, which goes with {field}"));
+            let missing = || Refusal::new(Reason::Missing, needs, format!("is missing, but {field} requires it"));
             if given && !there { Err(missing()) } else { Ok(()) }
         };
         let (cert, key) = (self.tls_cert.is_some(), self.tls_key.is_some());
@@ -133,7 +143,7 @@ impl Config {
         for (index, origin) in self.origins.iter().enumerate() {
             let uri = origin.parse::<http::Uri>().ok().filter(|uri| uri.scheme().is_some() && uri.host().is_some());
             if uri.is_none() || origin.ends_with('/') {
-                let message = format!("must be a scheme, a host and perhaps a port, as https://example.org: {origin}");
+                let message = format!("must be scheme://host or scheme://host:port, but is `{origin}`");
                 return Err(Refusal::new(Reason::WrongKind, format!("origins[{index}]"), message));
             }
         }
@@ -155,12 +165,12 @@ impl Config {
         Ok(())
     }
 
-    /// Stepping threads, at least 1.
+    /// The number of stepping threads, at least 1.
     pub fn stepping_threads(&self) -> usize {
         if self.threads > 0 { self.threads } else { cores().saturating_sub(1).max(1) }
     }
 
-    /// Threads of the network side, at least 1.
+    /// The number of network threads, at least 1.
     pub fn serving_threads(&self) -> usize {
         let left = cores().saturating_sub(self.stepping_threads()).max(1);
         if self.network_threads > 0 { self.network_threads } else { left }
@@ -176,21 +186,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_limit_of_nothing_is_refused_with_its_name() {
+    fn a_limit_of_zero_is_refused_with_its_name() {
         let guide = include_str!("../../docs/palpate.toml");
         let limits = guide.split_once("[limits]").unwrap().1;
         let mut named = 0;
         for line in limits.lines() {
             let Some((key, _)) = line.trim_start_matches(['#', ' ']).split_once(" = ") else { continue };
-            // Half of the memory that there is; no stream kept.
+            // 0 is allowed here: half of the machine's memory, and no reserved stream.
             if ["memory_bytes", "streams_for_holders"].contains(&key) {
                 continue;
             }
-            for nothing in ["0", "0.0", "-1.0"] {
-                // One of the two is of the wrong kind; which, the kind of the limit tells.
-                let refused = Config::parse("test", &format!("[limits]\n{key} = {nothing}\n")).unwrap_err();
+            for value in ["0", "0.0", "-1.0"] {
+                // An integer limit refuses some of these by their type; the message still names the key.
+                let refused = Config::parse("test", &format!("[limits]\n{key} = {value}\n")).unwrap_err();
                 let told = format!("{} {}", refused.field, refused.message);
-                assert!(told.contains(key), "{key} = {nothing}: {told}");
+                assert!(told.contains(key), "{key} = {value}: {told}");
             }
             named += 1;
         }

@@ -1,5 +1,5 @@
-//! Connections as they come, plain or through TLS: how many there may be, how long one may take to say what it wants, how
-//! fast it may ask, and what it carries. None waits for another's handshake.
+//! Accepts connections, plain or TLS. Bounds their number, the time until a client's first bytes, and the rate of calls;
+//! counts the bytes they carry. No connection waits for another's handshake.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::io;
@@ -23,35 +23,35 @@ use tracing::{debug, warn};
 
 use super::leases::Leases;
 use super::metrics::{Open, Traffic};
-use super::rate::Turnstile;
+use super::rate::RateLimiter;
 use super::reload::Reloaded;
 use super::tls::{self, Tls};
-use super::transport::{Frames, Gate, Holdback};
+use super::transport::{Frames, Gate, ReadPause};
 use super::visitor::address_name;
 use crate::budget::{Budget, Purpose, Resource, Taken};
 use crate::limits::Limits;
 use crate::lock::lock;
 
-/// After the system could not give us a connection: file descriptors that have run out come back.
-const PAUSE: Duration = Duration::from_millis(100);
+/// Time before accepting again after an error: file descriptors that have run out become free again.
+const ACCEPT_RETRY: Duration = Duration::from_millis(100);
 
-/// Bytes with which any client of ours begins: the preface of HTTP/2.
-const GREETING_BYTES: usize = 24;
+/// Bytes that a client must send in time: the length of HTTP/2's connection preface. An HTTP/1.1 request is longer.
+const PREFACE_BYTES: usize = 24;
 
-/// Between two connections that are taken in: a thousand that come at once (and, if they say nothing, are closed at once)
-/// would keep a core from all others for tens of milliseconds. Those that wait do so in the system.
-const APART: Duration = Duration::from_millis(1);
+/// Time between two accepted connections: a thousand that arrive at once would otherwise occupy a core for tens of
+/// milliseconds. Meanwhile the others wait in the system's queue.
+const ACCEPT_INTERVAL: Duration = Duration::from_millis(1);
 
-/// Connections above the limits that are there for a moment, while those go that were sent away.
-const LEAVING: usize = 16;
-/// After so many bytes of one connection the others get their turn: small frames, of which nobody need read anything (PING,
-/// SETTINGS, WINDOW_UPDATE, PRIORITY), cost a hundred nanoseconds each.
-const BYTES_A_TURN: usize = 8 << 10;
+/// Connections that may exceed the limits for a moment, while connections that we told to close are still open.
+const CLOSING: usize = 16;
+/// After this many bytes a connection yields to the others: small frames that reach no reader (PING, SETTINGS,
+/// WINDOW_UPDATE, PRIORITY) cost a hundred nanoseconds each.
+const BYTES_PER_TURN: usize = 8 << 10;
 
-/// Connections that wait to be served.
-const WAITING: usize = 64;
+/// Accepted connections that may wait to be served.
+const QUEUE: usize = 64;
 
-/// The connections to `listener`, through TLS if there is a configuration for it. Never ends, and never fails.
+/// The connections to `listener`, through TLS if it is configured. The stream never ends and yields no errors.
 pub(super) fn incoming(
     listener: TcpListener,
     tls: Option<Arc<Reloaded<Tls>>>,
@@ -61,21 +61,21 @@ pub(super) fn incoming(
     traffic: Arc<Traffic>,
     register: Arc<Register>,
 ) -> impl Stream<Item = io::Result<Connection>> + use<> {
-    let (ready, connections) = mpsc::channel(WAITING);
+    let (ready, connections) = mpsc::channel(QUEUE);
     let limits = limits.clone();
     tokio::spawn(async move {
-        let mut pace = tokio::time::interval(APART);
-        pace.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut interval = tokio::time::interval(ACCEPT_INTERVAL);
+        interval.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
-            pace.tick().await;
+            interval.tick().await;
             let (socket, address) = tokio::select! {
-                // Nobody takes them any more: the server is going down.
+                // The server is shutting down.
                 () = ready.closed() => return,
                 accepted = listener.accept() => match accepted {
                     Ok(accepted) => accepted,
                     Err(error) => {
-                        warn!(%error, "no connection can be accepted; trying again");
-                        tokio::time::sleep(PAUSE).await;
+                        warn!(%error, "can't accept connections; retrying");
+                        tokio::time::sleep(ACCEPT_RETRY).await;
                         continue;
                     }
                 },
@@ -93,11 +93,12 @@ pub(super) fn incoming(
             let window = match account.take(Resource::Memory(Purpose::Connections), bytes, "") {
                 Ok(window) => window,
                 Err(why) => {
-                    warn!(%address, "connection closed: its window {why}");
+                    warn!(%address, "connection closed: no memory for its window: {why}");
                     continue;
                 }
             };
-            // Nagle's algorithm would hold a sample back for milliseconds. Who has gone already is noticed later.
+            // Nagle's algorithm would delay a sample by milliseconds. An error means that the client has closed the
+            // connection; reading will notice that.
             let _ = socket.set_nodelay(true);
             let entry = Entry::new(address, Arc::new(seat), gate, window, &limits, &traffic, &register);
             let Some(tls) = &tls else {
@@ -109,12 +110,12 @@ pub(super) fn incoming(
                 let deadline = entry.deadline.deadline();
                 let accepted = tokio::select! {
                     accepted = tokio::time::timeout_at(deadline, acceptor.accept(socket)) => accepted,
-                    () = entry.gate.closed() => return entry.traffic.handshake_failed(address, "others came"),
+                    () = entry.gate.closed() => return entry.traffic.handshake_failed(address, "closed to make room"),
                 };
                 let stream = match accepted {
                     Ok(Ok(stream)) => stream,
                     Ok(Err(error)) => return entry.traffic.handshake_failed(address, &error.to_string()),
-                    Err(_) => return entry.traffic.handshake_failed(address, "it took too long"),
+                    Err(_) => return entry.traffic.handshake_failed(address, "timed out"),
                 };
                 let certificate = stream.get_ref().1.peer_certificates().map(|chain| tls::names(chain).into());
                 let _ = ready.send(Ok(entry.connection(Transport::Tls(Box::new(stream)), certificate))).await;
@@ -124,7 +125,7 @@ pub(super) fn incoming(
     ReceiverStream::new(connections)
 }
 
-/// Where somebody comes from: whoever has IPv6 has 2⁶⁴ addresses.
+/// The network that limits per address count: of IPv6 the first 64 bits, because each client there has 2⁶⁴ addresses.
 pub(super) fn network(address: IpAddr) -> IpAddr {
     match address.to_canonical() {
         IpAddr::V6(address) => IpAddr::V6((u128::from(address) >> 64 << 64).into()),
@@ -132,139 +133,142 @@ pub(super) fn network(address: IpAddr) -> IpAddr {
     }
 }
 
-/// Room for connections: so many in all, and so many from one address.
+/// Limits the number of connections: in all, and from one address.
 #[derive(Debug)]
 pub(super) struct Seats {
     most: usize,
     most_each: usize,
-    /// Of those, for who has not shown who they are; nobody is asked if there is none.
-    strangers: Option<usize>,
-    taken: Mutex<Occupied>,
+    /// The largest number of unauthenticated ones; `None` if the server authenticates nobody.
+    most_unauthenticated: Option<usize>,
+    open: Mutex<OpenConnections>,
 }
 
 #[derive(Debug, Default)]
-struct Occupied {
-    /// By address; those that have none are left out.
-    each: HashMap<IpAddr, usize>,
-    /// Who has not shown who they are, the oldest first.
-    strangers: VecDeque<Stranger>,
-    numbers: u64,
+struct OpenConnections {
+    /// The number of connections of each address that has any.
+    by_address: HashMap<IpAddr, usize>,
+    /// Those that have not authenticated, the oldest first.
+    unauthenticated: VecDeque<Unauthenticated>,
+    last_number: u64,
 }
 
 #[derive(Debug)]
-struct Stranger {
+struct Unauthenticated {
     number: u64,
     address: IpAddr,
     gate: Weak<Gate>,
 }
 
-impl Occupied {
-    /// Closes the connection of the stranger who has been there longest, of this address if one is given; tells if there
-    /// was one.
-    fn send_away(&mut self, of: Option<IpAddr>) -> bool {
-        let oldest = self.strangers.iter().position(|stranger| of.is_none_or(|address| address == stranger.address));
-        let Some(stranger) = oldest.and_then(|index| self.strangers.remove(index)) else { return false };
-        if let Some(gate) = stranger.gate.upgrade() {
+impl OpenConnections {
+    /// Closes the oldest unauthenticated connection, of `address` if one is given; returns whether there was one.
+    fn close_oldest_unauthenticated(&mut self, address: Option<IpAddr>) -> bool {
+        let is_meant = |other: &Unauthenticated| address.is_none_or(|address| address == other.address);
+        let oldest = self.unauthenticated.iter().position(is_meant);
+        let Some(oldest) = oldest.and_then(|index| self.unauthenticated.remove(index)) else { return false };
+        if let Some(gate) = oldest.gate.upgrade() {
             gate.close();
         }
         true
     }
 }
 
-/// A connection's, until it is dropped.
+/// A connection's place within the limits, until it is dropped.
 #[derive(Debug)]
 pub(super) struct Seat {
     seats: Arc<Seats>,
     address: IpAddr,
     number: u64,
-    known: AtomicBool,
+    is_authenticated: AtomicBool,
 }
 
 impl Seats {
-    /// For as many connections as `limits` say; who has not shown who they are gets `strangers` at most, and has to go when
-    /// others come.
-    pub(super) fn new(limits: &Limits, strangers: Option<usize>) -> Self {
+    /// For as many connections as `limits` allow, of which at most `most_unauthenticated` may be unauthenticated. When a
+    /// limit is reached, the oldest of those is closed in favour of a new connection.
+    pub(super) fn new(limits: &Limits, most_unauthenticated: Option<usize>) -> Self {
         let (most, most_each) = (limits.connections, limits.connections_per_address);
-        Seats { most, most_each, strangers, taken: Mutex::default() }
+        Seats { most, most_each, most_unauthenticated, open: Mutex::default() }
     }
 
-    /// A seat, or why there is none.
+    /// Takes a place for a connection, or says why there is none.
     fn take(self: &Arc<Self>, address: IpAddr, gate: &Arc<Gate>) -> Result<Seat, String> {
         let address = network(address);
-        let mut taken = lock(&self.taken);
-        let all: usize = taken.each.values().sum();
-        let each = taken.each.get(&address).copied().unwrap_or_default();
-        // Who is sent away needs a moment to go, and counts until then.
-        let leaving = if self.strangers.is_some() { LEAVING } else { 0 };
-        let is_full = all >= self.most || self.strangers.is_some_and(|most| taken.strangers.len() >= most);
-        if all >= self.most + leaving || (is_full && !taken.send_away(None)) {
-            return Err(format!("there are {all} already (limits.connections)"));
+        let mut open = lock(&self.open);
+        let all: usize = open.by_address.values().sum();
+        let each = open.by_address.get(&address).copied().unwrap_or_default();
+        // A connection that was told to close needs a moment, and counts until then.
+        let closing = if self.most_unauthenticated.is_some() { CLOSING } else { 0 };
+        let is_full =
+            all >= self.most || self.most_unauthenticated.is_some_and(|most| open.unauthenticated.len() >= most);
+        if all >= self.most + closing || (is_full && !open.close_oldest_unauthenticated(None)) {
+            return Err(format!("the server has {all} connections already (limits.connections)"));
         }
-        if each >= self.most_each.saturating_add(leaving) || (each >= self.most_each && !taken.send_away(Some(address)))
+        let is_address_full = each >= self.most_each;
+        if each >= self.most_each.saturating_add(closing)
+            || (is_address_full && !open.close_oldest_unauthenticated(Some(address)))
         {
-            return Err(format!("its address has {each} already (limits.connections_per_address)"));
+            return Err(format!("its address has {each} connections already (limits.connections_per_address)"));
         }
-        *taken.each.entry(address).or_default() += 1;
-        taken.numbers += 1;
-        let number = taken.numbers;
-        if self.strangers.is_some() {
-            taken.strangers.push_back(Stranger { number, address, gate: Arc::downgrade(gate) });
+        *open.by_address.entry(address).or_default() += 1;
+        open.last_number += 1;
+        let number = open.last_number;
+        if self.most_unauthenticated.is_some() {
+            open.unauthenticated.push_back(Unauthenticated { number, address, gate: Arc::downgrade(gate) });
         }
-        Ok(Seat { seats: self.clone(), address, number, known: false.into() })
+        Ok(Seat { seats: self.clone(), address, number, is_authenticated: false.into() })
     }
 }
 
 impl Seat {
-    /// Who has it has shown who they are.
-    pub(super) fn is_known(&self) {
-        if !self.known.swap(true, Ordering::Relaxed) {
-            lock(&self.seats.taken).strangers.retain(|stranger| stranger.number != self.number);
+    /// Marks the connection as authenticated: it is not closed in favour of others any more.
+    pub(super) fn mark_authenticated(&self) {
+        if !self.is_authenticated.swap(true, Ordering::Relaxed) {
+            lock(&self.seats.open).unauthenticated.retain(|other| other.number != self.number);
         }
     }
 }
 
 impl Drop for Seat {
     fn drop(&mut self) {
-        let mut taken = lock(&self.seats.taken);
-        taken.strangers.retain(|stranger| stranger.number != self.number);
-        if let Some(each) = taken.each.get_mut(&self.address) {
+        let mut open = lock(&self.seats.open);
+        open.unauthenticated.retain(|other| other.number != self.number);
+        if let Some(each) = open.by_address.get_mut(&self.address) {
             *each -= 1;
             if *each == 0 {
-                taken.each.remove(&self.address);
+                open.by_address.remove(&self.address);
             }
         }
     }
 }
 
-/// What is known of who is at the other end, for every request that comes from there.
+/// The client's side of a connection, as every request on it knows it.
 #[derive(Debug, Clone)]
 pub(crate) struct Peer {
-    /// Where from.
+    /// The client's address.
     pub(crate) address: SocketAddr,
-    /// What its certificate calls it, if it had to show one.
+    /// The names in its certificate, if it had to present one.
     pub(crate) certificate: Option<Arc<[String]>>,
-    /// For calls of any kind.
-    pub(super) calls: Arc<Turnstile>,
-    /// For those that make a session.
-    pub(super) creations: Arc<Turnstile>,
-    /// Between the connection and its transport.
+    /// Limits the rate of all calls.
+    pub(super) calls: Arc<RateLimiter>,
+    /// Limits the rate of calls that create a session.
+    pub(super) creations: Arc<RateLimiter>,
+    /// Flow control between the connection and its transport.
     pub(super) gate: Arc<Gate>,
-    /// For when it has shown who it is.
+    /// The connection's place within the limits.
     pub(super) seat: Arc<Seat>,
-    /// Tools that are let go when it ends.
+    /// Leases that end with the connection.
     pub(super) leases: Arc<Leases>,
-    /// Accounts of those who have called over it.
+    /// Numbers of the accounts that have called over it.
     callers: Arc<Mutex<BTreeSet<u64>>>,
 }
 
 impl Peer {
-    /// Somebody with that account has called.
+    /// Remembers that the caller with this account has called.
     pub(super) fn used_by(&self, account: u64) {
         lock(&self.callers).insert(account);
     }
 }
 
-/// The connections that are open.
+/// The open connections, by number, after the last number given.
 #[derive(Debug, Default)]
 pub(crate) struct Register(Mutex<(u64, BTreeMap<u64, Peer>)>);
 
@@ -277,7 +281,7 @@ impl Register {
         number
     }
 
-    /// Closes those over which somebody with that account has called; tells how many.
+    /// Closes the connections over which this account has called; returns their number.
     pub(super) fn cut(&self, account: u64) -> usize {
         let open = lock(&self.0);
         let theirs = open.1.values().filter(|peer| lock(&peer.callers).contains(&account));
@@ -285,14 +289,14 @@ impl Register {
     }
 }
 
-/// A connection that was let in, before its handshake.
+/// An accepted connection before its TLS handshake.
 struct Entry {
     address: SocketAddr,
-    /// The memory of what comes and nobody has read.
+    /// The memory that unread data may take.
     window: Taken,
-    calls: Turnstile,
-    creations: Turnstile,
-    /// For the handshake and the greeting together.
+    calls: RateLimiter,
+    creations: RateLimiter,
+    /// For the handshake and the first bytes together.
     deadline: Pin<Box<Sleep>>,
     traffic: Arc<Traffic>,
     register: Arc<Register>,
@@ -314,8 +318,8 @@ impl Entry {
         Entry {
             address,
             window,
-            calls: Turnstile::new(limits.calls_per_s, limits.calls_per_s, "calls of this connection"),
-            creations: Turnstile::new(per_minute / 60.0, per_minute, "sessions made over this connection"),
+            calls: RateLimiter::new(limits.calls_per_s, limits.calls_per_s, "calls of this connection"),
+            creations: RateLimiter::new(per_minute / 60.0, per_minute, "sessions created over this connection"),
             deadline: Box::pin(tokio::time::sleep(Duration::from_secs_f64(limits.handshake_s))),
             traffic: traffic.clone(),
             register: register.clone(),
@@ -341,14 +345,14 @@ impl Entry {
             transport,
             inward: Frames::default(),
             outward: Frames::of_server(),
-            holdback: Holdback::default(),
-            greeting: Some((GREETING_BYTES, deadline)),
+            read_pause: ReadPause::default(),
+            preface: Some((PREFACE_BYTES, deadline)),
             _open: traffic.open(),
             traffic,
             number: register.enter(&peer),
             register,
             peer,
-            unyielded: 0,
+            bytes_this_turn: 0,
             _window: window,
         }
     }
@@ -359,21 +363,21 @@ enum Transport {
     Tls(Box<TlsStream<TcpStream>>),
 }
 
-/// A connection that counts what it carries, before encryption.
+/// A connection that counts the bytes it carries, before encryption.
 pub(super) struct Connection {
     transport: Transport,
     peer: Peer,
-    /// What comes and what goes.
+    /// The frames that it receives and sends.
     inward: Frames,
     outward: Frames,
-    holdback: Holdback,
-    /// Until so many bytes have come, it has so long.
-    greeting: Option<(usize, Pin<Box<Sleep>>)>,
+    read_pause: ReadPause,
+    /// While the client has not sent this many bytes: how many are left, and the deadline.
+    preface: Option<(usize, Pin<Box<Sleep>>)>,
     traffic: Arc<Traffic>,
     register: Arc<Register>,
     number: u64,
-    /// Bytes since others had their turn.
-    unyielded: usize,
+    /// Bytes read since the connection last yielded to the others.
+    bytes_this_turn: usize,
     _open: Open,
     _window: Taken,
 }
@@ -386,15 +390,15 @@ impl Drop for Connection {
 }
 
 impl Connection {
-    /// Fails if the connection is to be closed, and wakes who asks when it is.
+    /// Returns an error if the connection is to be closed; otherwise registers the task to be woken when it is.
     fn check_open(&self, context: &Context<'_>) -> io::Result<()> {
         if self.peer.gate.is_closed(context) { Err(io::ErrorKind::ConnectionAborted.into()) } else { Ok(()) }
     }
 
-    /// So many bytes of `slices` were sent.
-    fn went(&mut self, slices: &[io::IoSlice<'_>], bytes: usize) {
+    /// Counts the first `bytes` bytes of `slices`, which were sent, and reads their frames.
+    fn count_sent(&mut self, slices: &[io::IoSlice<'_>], bytes: usize) {
         self.traffic.bytes_out.inc_by(bytes as u64);
-        // What the answer of HTTP/1.1 is made of are no frames.
+        // An HTTP/1.1 answer has no frames.
         if !self.inward.are_read() {
             return;
         }
@@ -421,9 +425,9 @@ impl AsyncRead for Connection {
     fn poll_read(self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
         let this = self.get_mut();
         this.check_open(cx)?;
-        ready!(this.holdback.poll(&this.peer.gate, cx));
-        if this.unyielded >= BYTES_A_TURN {
-            this.unyielded = 0;
+        ready!(this.read_pause.poll(&this.peer.gate, cx));
+        if this.bytes_this_turn >= BYTES_PER_TURN {
+            this.bytes_this_turn = 0;
             cx.waker().wake_by_ref();
             return Poll::Pending;
         }
@@ -432,22 +436,22 @@ impl AsyncRead for Connection {
             Transport::Plain(stream) => Pin::new(stream).poll_read(cx, buffer),
             Transport::Tls(stream) => Pin::new(stream).poll_read(cx, buffer),
         };
-        let came = &buffer.filled()[before..];
-        this.traffic.bytes_in.inc_by(came.len() as u64);
-        if let Some(cut) = this.inward.pass(came, Some(&this.peer.gate)) {
+        let received = &buffer.filled()[before..];
+        this.traffic.bytes_in.inc_by(received.len() as u64);
+        if let Some(cut) = this.inward.pass(received, Some(&this.peer.gate)) {
             this.traffic.cut(this.peer.address, "client", &cut);
         }
-        // Nothing waits: the others had their turn, or will.
-        this.unyielded = if polled.is_pending() { 0 } else { this.unyielded + came.len() };
-        let Some((left, deadline)) = &mut this.greeting else { return polled };
+        // Pending: the socket is empty, so the other connections get their turn anyway.
+        this.bytes_this_turn = if polled.is_pending() { 0 } else { this.bytes_this_turn + received.len() };
+        let Some((left, deadline)) = &mut this.preface else { return polled };
         if polled.is_pending() {
             ready!(deadline.as_mut().poll(cx));
             this.traffic.stayed_silent(this.peer.address);
             return Poll::Ready(Err(io::ErrorKind::TimedOut.into()));
         }
-        *left = left.saturating_sub(came.len());
+        *left = left.saturating_sub(received.len());
         if *left == 0 {
-            this.greeting = None;
+            this.preface = None;
         }
         polled
     }
@@ -470,7 +474,7 @@ impl AsyncWrite for Connection {
             Transport::Tls(stream) => Pin::new(stream).poll_write_vectored(cx, slices),
         };
         if let Poll::Ready(Ok(bytes)) = &polled {
-            this.went(slices, *bytes);
+            this.count_sent(slices, *bytes);
         }
         polled
     }
@@ -501,9 +505,9 @@ impl AsyncWrite for Connection {
 mod tests {
     use super::*;
 
-    fn seats(strangers: Option<usize>) -> Arc<Seats> {
+    fn seats(most_unauthenticated: Option<usize>) -> Arc<Seats> {
         let limits = Limits { connections: 5, connections_per_address: 3, ..Limits::default() };
-        Arc::new(Seats::new(&limits, strangers))
+        Arc::new(Seats::new(&limits, most_unauthenticated))
     }
 
     fn take(seats: &Arc<Seats>, address: &str) -> Result<(Seat, Arc<Gate>), String> {
@@ -512,38 +516,38 @@ mod tests {
     }
 
     #[test]
-    fn one_address_does_not_take_all_seats_and_what_goes_makes_room() {
+    fn one_address_does_not_get_all_connections_and_a_closed_one_makes_room() {
         let seats = seats(None);
         let mut greedy: Vec<_> = (0..3).map(|_| take(&seats, "192.0.2.1").unwrap()).collect();
         assert!(take(&seats, "::ffff:192.0.2.1").is_err_and(|why| why.contains("per_address")));
-        // Two of one network.
+        // Two addresses of one network.
         let others = [take(&seats, "2001:db8::1").unwrap(), take(&seats, "2001:db8::ffff:1").unwrap()];
         assert!(take(&seats, "192.0.2.2").is_err_and(|why| why.contains("limits.connections)")));
         greedy.pop();
         let third = take(&seats, "2001:db8:0:0:1::").unwrap();
         drop((greedy, third));
-        assert_eq!(lock(&seats.taken).each.len(), 1);
+        assert_eq!(lock(&seats.open).by_address.len(), 1);
         drop(others);
-        assert!(lock(&seats.taken).each.is_empty());
+        assert!(lock(&seats.open).by_address.is_empty());
     }
 
     #[tokio::test]
-    async fn strangers_make_room_for_others_and_who_is_known_stays() {
+    async fn unauthenticated_connections_make_room_for_others_and_authenticated_ones_stay() {
         let seats = seats(Some(2));
         let is_closed = async |gate: &Gate| futures_util::poll!(std::pin::pin!(gate.closed())).is_ready();
         let known: Vec<_> = (1..=3).map(|host| take(&seats, &format!("192.0.2.{host}")).unwrap()).collect();
-        // The third took the place of the first, which did not say who it is in time.
+        // The third took the place of the first, which had not authenticated yet.
         assert!(is_closed(&known[0].1).await && !is_closed(&known[1].1).await);
-        known.iter().for_each(|(seat, _)| seat.is_known());
-        let strangers: Vec<_> = (4..=30).map_while(|host| take(&seats, &format!("192.0.2.{host}")).ok()).collect();
-        // Those who are sent away and do not go take no more than a few places.
-        assert_eq!(known.len() + strangers.len(), 5 + LEAVING);
+        known.iter().for_each(|(seat, _)| seat.mark_authenticated());
+        let unknown: Vec<_> = (4..=30).map_while(|host| take(&seats, &format!("192.0.2.{host}")).ok()).collect();
+        // Connections that were told to close, and do not, take only a few places.
+        assert_eq!(known.len() + unknown.len(), 5 + CLOSING);
         for (_, gate) in &known[1..] {
             assert!(!is_closed(gate).await);
         }
-        drop(strangers);
-        assert!(lock(&seats.taken).strangers.is_empty());
-        // The same within one address: its own strangers go.
+        drop(unknown);
+        assert!(lock(&seats.open).unauthenticated.is_empty());
+        // The same within one address: its own unauthenticated connections are closed.
         let first = take(&seats, "192.0.2.2").unwrap();
         let _second = take(&seats, "192.0.2.2").unwrap();
         drop(known);

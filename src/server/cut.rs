@@ -1,4 +1,4 @@
-//! A stream goes on until whoever administers the server has cut it.
+//! Streams that an administrator can cut.
 
 use std::pin::Pin;
 
@@ -6,7 +6,7 @@ use futures_util::stream::{self, Stream, StreamExt};
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
-/// `out`, and an end with the reason when it is cut.
+/// Passes `out` on. When `cut` is cancelled, ends the stream with the reason.
 pub(super) fn until_cut<T: Send + 'static>(
     out: impl Stream<Item = Result<T, Status>> + Send + 'static,
     cut: CancellationToken,

@@ -1,12 +1,12 @@
-//! File descriptors: as many as the system grants, and fewer connections than that.
+//! File descriptors: raises the process's limit, and bounds the number of connections by it.
 
 use tracing::warn;
 
-/// Kept for files: scenes, scripts, textures, certificates and tokens, several at once.
+/// Descriptors reserved for files: scenes, scripts, textures, certificates and tokens, several at once.
 #[cfg(unix)]
 const RESERVE: usize = 64;
 
-/// Raises what the process may open to what it may raise it to.
+/// Raises the soft limit of open files to the hard limit.
 pub(super) fn raise() {
     #[cfg(unix)]
     {
@@ -14,23 +14,24 @@ pub(super) fn raise() {
         let mut limit = getrlimit(Resource::Nofile);
         limit.current = limit.maximum;
         if let Err(error) = setrlimit(Resource::Nofile, limit) {
-            warn!(%error, "the limit of file descriptors can't be raised");
+            warn!(%error, "can't raise the limit of open files");
         }
     }
 }
 
-/// How many of so many connections there can be beside `others`, which have descriptors of their own.
+/// The number of connections that the limit of open files allows, at most `wanted`. `others` is the number of
+/// connections with descriptors of their own, such as those to the metrics.
 pub(super) fn connections(wanted: usize, others: usize) -> usize {
     #[cfg(unix)]
     {
         let limit = rustix::process::getrlimit(rustix::process::Resource::Nofile).current;
         let Some(limit) = limit.and_then(|limit| usize::try_from(limit).ok()) else { return wanted };
-        // A system that does not tell has a few more than it needs.
+        // Without a /proc, assume as many open files as are reserved.
         let open = std::fs::read_dir("/proc/self/fd").map_or(RESERVE, Iterator::count);
         let most = room(limit, open + others);
         if most < wanted {
             warn!(
-                "the process may open {limit} files (`ulimit -Hn`), which is enough for {most} connections, not for \
+                "the process may open {limit} files (`ulimit -Hn`); that allows {most} connections, fewer than \
                  limits.connections = {wanted}"
             );
         }
@@ -43,7 +44,7 @@ pub(super) fn connections(wanted: usize, others: usize) -> usize {
     }
 }
 
-/// Connections for which there is room, one at least: of a small limit a quarter is kept.
+/// The number of connections that fit, at least 1. Of a small limit, a quarter is reserved.
 #[cfg(unix)]
 fn room(limit: usize, taken: usize) -> usize {
     limit.saturating_sub(taken + RESERVE.min(limit / 4)).max(1)
@@ -54,7 +55,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn files_keep_their_part() {
+    fn descriptors_are_reserved_for_files() {
         assert_eq!(room(65_536, 30), 65_536 - 30 - RESERVE);
         assert_eq!(room(64, 20), 28);
         assert_eq!(room(16, 20), 1);

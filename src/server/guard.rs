@@ -1,4 +1,4 @@
-//! The one layer that every call goes through: who calls, and whether they may.
+//! The layer that every call goes through: it authenticates the caller and checks the caller's role.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -16,25 +16,25 @@ use super::identity::{Access, Caller, Credentials, access};
 use super::metrics::Traffic;
 use super::price::Price;
 use super::reload::Reloaded;
-use super::request::{Inward, Pace};
+use super::request::{RequestBody, TimeLimit};
 use super::revocation::{Calls, Shown};
 use super::visitor::Visitor;
 use crate::budget::Budget;
 use crate::refusal::{Reason, Refusal, Result};
 
-/// Puts a [`Guard`] before a service.
+/// Puts a [`Guard`] in front of a service.
 #[derive(Clone)]
 pub(super) struct GuardLayer {
     pub(super) credentials: Arc<Reloaded<Credentials>>,
-    /// Those under way whose callers were asked.
+    /// The running calls of authenticated callers.
     pub(super) calls: Arc<Calls>,
-    /// For the messages of a call.
-    pub(super) patience: Duration,
+    /// Time limit for the messages of a call.
+    pub(super) message_timeout: Duration,
     pub(super) traffic: Arc<Traffic>,
     pub(super) budget: Arc<Budget>,
-    /// Nobody is asked who they are because nobody else can get here: then no page of another site may, either.
+    /// Authentication is disabled because only this machine can reach the server. Then pages of other sites must not call.
     pub(super) local_only: bool,
-    /// Pages that may.
+    /// Origins whose pages may call.
     pub(super) origins: Arc<[HeaderValue]>,
 }
 
@@ -46,7 +46,7 @@ impl<S> Layer<S> for GuardLayer {
     }
 }
 
-/// Lets a call through whose caller has the role that it asks for.
+/// Lets a call through if its caller has the required role.
 #[derive(Clone)]
 pub(super) struct Guard<S> {
     layer: GuardLayer,
@@ -56,31 +56,31 @@ pub(super) struct Guard<S> {
 /// The answer to a call.
 type Answer<E> = Pin<Box<dyn Future<Output = std::result::Result<Response<Body>, E>> + Send>>;
 
-/// Who calls, and what they showed for it, with the version of the file by which that was enough.
-type Known = (Caller, Option<(Shown, u64)>);
+/// A caller; if it was authenticated, with its credentials and the version of the token file that accepted them.
+type Identified = (Caller, Option<(Shown, u64)>);
 
 /// Calls of this server's own protocol.
 const OWN: &str = "/palpate.";
 
-/// Its messages come for as long as somebody holds a tool; for the first there is a deadline of its own.
+/// Its messages arrive for as long as the client holds a tool; the call sets the deadline for the first.
 const TOUCH: &str = "/palpate.v1.HapticService/Touch";
 
-/// Anybody may ask, as often as they like.
+/// Calls without authentication and with many messages.
 const REFLECTION: &str = "/grpc.reflection.";
 
 impl GuardLayer {
-    /// Who calls, if they may, and what they showed for it; else why not, and how long that is to be kept back.
-    fn admit<B>(&self, request: &Request<B>) -> std::result::Result<Known, (Refusal, Duration)> {
+    /// The caller, if the call is allowed; otherwise the refusal, and for how long to delay it.
+    fn admit<B>(&self, request: &Request<B>) -> std::result::Result<Identified, (Refusal, Duration)> {
         let peer = request.extensions().get::<Peer>();
         peer.map_or(Ok(()), |peer| peer.calls.pass())?;
         self.identify(request, peer).map_err(|refusal| (refusal, Duration::ZERO))
     }
 
-    fn identify<B>(&self, request: &Request<B>, peer: Option<&Peer>) -> Result<Known> {
+    fn identify<B>(&self, request: &Request<B>, peer: Option<&Peer>) -> Result<Identified> {
         let path = request.uri().path();
-        let nobody = || Ok((Caller::nobody(), None));
+        let anonymous = || Ok((Caller::anonymous(), None));
         match access(path) {
-            Some(Access::Open) => nobody(),
+            Some(Access::Open) => anonymous(),
             Some(Access::Role(role)) => {
                 self.check_origin(request)?;
                 let authorization = request.headers().get(header::AUTHORIZATION).cloned();
@@ -90,24 +90,24 @@ impl GuardLayer {
                 let caller = shown.check(&credentials)?;
                 self.traffic.called(path);
                 if let Some(peer) = peer {
-                    peer.seat.is_known();
+                    peer.seat.mark_authenticated();
                 }
-                // Who need not show anything is not asked again.
+                // With authentication disabled there is nothing to check again later.
                 Ok((caller, (!credentials.is_open()).then_some((shown, version))))
             }
-            // Nobody is asked anything: then it is not known, rather than not allowed.
-            None if path.starts_with(OWN) && self.credentials.get().is_open() => nobody(),
+            // With authentication disabled, gRPC answers that the call is unknown.
+            None if path.starts_with(OWN) && self.credentials.get().is_open() => anonymous(),
             None if path.starts_with(OWN) => {
-                let message = "is a call that nobody has been given a role for";
-                Err(Refusal::new(Reason::RoleMissing, "", format!("{} {message}", crate::pace::excerpt(path))))
+                let message = format!("no role allows the call {}", crate::pace::excerpt(path));
+                Err(Refusal::new(Reason::RoleMissing, "", message))
             }
-            // What is not a call to a session: a page, or nothing.
-            None => nobody(),
+            // Not one of our calls: a page's file, or nothing.
+            None => anonymous(),
         }
     }
 
-    /// A site can give its own name the address of this machine; its pages then pass for pages of this server. They
-    /// can't pass for an address, or for `localhost`.
+    /// Refuses pages of other sites (DNS rebinding). A site can give its own name the address of this machine, so that
+    /// its pages seem to come from this server. Such an origin is a name, never an address or `localhost`.
     fn check_origin<B>(&self, request: &Request<B>) -> Result<()> {
         let Some(origin) = request.headers().get(header::ORIGIN).filter(|_| self.local_only) else { return Ok(()) };
         let uri = origin.to_str().ok().and_then(|origin| origin.parse::<http::Uri>().ok());
@@ -116,22 +116,22 @@ impl GuardLayer {
         if is_address || host == "localhost" || self.origins.contains(origin) {
             return Ok(());
         }
-        let message = "is not this machine, nor one of `origins` in the configuration";
+        let message = "must be this machine, or one of `origins` in the configuration";
         Err(Refusal::new(Reason::OriginNotAllowed, "origin", message))
     }
 }
 
-/// What is told to who asks for a call in another way than gRPC: gRPC itself could not say it so that they read it.
-fn misdirected<B>(request: &Request<B>) -> Option<Response<Body>> {
+/// The answer to a request for a gRPC call that is not gRPC itself: a status of gRPC would be invisible to such a client.
+fn answer_if_not_grpc<B>(request: &Request<B>) -> Option<Response<Body>> {
     let path = request.uri().path();
     access(path)?;
     let kind = request.headers().get(header::CONTENT_TYPE).map(HeaderValue::as_bytes).unwrap_or_default();
     let (status, message) = if request.method() != Method::POST {
-        (StatusCode::METHOD_NOT_ALLOWED, "is a gRPC call: it is made by POST")
+        (StatusCode::METHOD_NOT_ALLOWED, "is a gRPC call: use POST")
     } else if !kind.starts_with(b"application/grpc") {
         (
             StatusCode::UNSUPPORTED_MEDIA_TYPE,
-            "is a gRPC call: its content-type is application/grpc or application/grpc-web",
+            "is a gRPC call: the content-type must be application/grpc or application/grpc-web",
         )
     } else {
         return None;
@@ -162,8 +162,8 @@ where
     fn call(&mut self, mut request: Request<Body>) -> Self::Future {
         match self.layer.admit(&request) {
             Ok((caller, shown)) => {
-                // Who may not call is told that first.
-                if let Some(answer) = misdirected(&request) {
+                // After the check of the role: an unauthorized caller gets that refusal first.
+                if let Some(answer) = answer_if_not_grpc(&request) {
                     return Box::pin(async move { Ok(answer) });
                 }
                 let peer = request.extensions().get::<Peer>();
@@ -173,17 +173,17 @@ where
                     peer.used_by(account.number());
                 }
                 let gate = peer.map(|peer| peer.gate.clone());
-                let pace = match request.uri().path() {
-                    TOUCH => Pace::Own,
-                    path if path.starts_with(REFLECTION) => Pace::Each(self.layer.patience),
-                    _ => Pace::Whole(self.layer.patience),
+                let limit = match request.uri().path() {
+                    TOUCH => TimeLimit::None,
+                    path if path.starts_with(REFLECTION) => TimeLimit::EachMessage(self.layer.message_timeout),
+                    _ => TimeLimit::WholeBody(self.layer.message_timeout),
                 };
                 let price = Price::of(request.uri().path(), &account);
                 let visitor = Visitor::new(account, &request);
                 request.extensions_mut().insert(visitor);
                 let call = shown.map(|(shown, version)| self.layer.calls.begin(shown, version));
-                let request = request.map(|body| Inward::body(body, call.clone(), gate, pace));
-                // In every line of the log that the call writes.
+                let request = request.map(|body| RequestBody::wrap(body, call.clone(), gate, limit));
+                // The span adds path and client to every line that the call logs.
                 let span = info_span!("call", path = request.uri().path(), client = &*caller.name);
                 let answer = self.inner.call(request).instrument(span);
                 let traffic = self.layer.traffic.clone();

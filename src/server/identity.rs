@@ -1,4 +1,5 @@
-//! Who may do what: the roles, what each call asks for, and the file that says which token or certificate has which.
+//! Authentication and authorization: roles, the role that each call requires, and the token file, which gives roles to
+//! tokens and client certificates.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -12,25 +13,25 @@ use super::connections::Peer;
 use crate::pace::random_bits;
 use crate::refusal::{Reason, Refusal, Result, label};
 
-/// What a caller may do. Who has any role may watch, and who may administer may do everything.
+/// What a caller may do. Every role includes `Watch`, and `Administer` includes every role.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Role {
-    /// Look at sessions whose id one knows.
+    /// Read from sessions whose ID the caller knows.
     Watch,
-    /// Hold a tool, or change the tissue.
+    /// Hold a tool, change the tissue.
     Touch,
-    /// Make, start, stop and delete sessions.
+    /// Create, start, pause and delete sessions.
     Create,
-    /// See every session of the server, and all else.
+    /// List all sessions of the server, and everything else.
     Administer,
 }
 
 impl Role {
-    /// All of them.
+    /// All roles.
     pub const ALL: [Role; 4] = [Role::Watch, Role::Touch, Role::Create, Role::Administer];
 
-    /// Its name in files and on the command line.
+    /// The role's name in files and on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Role::Watch => "watch",
@@ -41,24 +42,28 @@ impl Role {
     }
 
     /// The role of that name.
+    ///
+    /// # Errors
+    /// Returns an error if there is no such role.
     pub fn named(name: &str) -> Result<Role> {
         Role::ALL.into_iter().find(|role| role.name() == name).ok_or_else(|| {
-            Refusal::new(Reason::WrongKind, "role", format!("`{name}` is none of watch, touch, create, administer"))
+            let message = format!("must be one of watch, touch, create, administer, but is `{name}`");
+            Refusal::new(Reason::WrongKind, "role", message)
         })
     }
 }
 
-/// What a call asks of its caller.
+/// What a call requires of its caller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Access {
-    /// Nothing: it tells nothing of any session.
+    /// Nothing: the call reveals nothing about sessions.
     Open,
     /// This role.
     Role(Role),
 }
 
-/// What each call asks for. A call of this server's own that is not here is refused; `tests/identity.rs` goes through the
-/// descriptors.
+/// What each call requires. The server refuses calls of its own protocol that are not in this table; `tests/identity.rs`
+/// checks the table against the protocol's descriptors.
 pub const CALLS: &[(&str, Access)] = &[
     ("/grpc.health.v1.Health/Check", Access::Open),
     ("/grpc.health.v1.Health/Watch", Access::Open),
@@ -83,7 +88,7 @@ pub const CALLS: &[(&str, Access)] = &[
     ("/palpate.v1.SessionService/GetStateHash", Access::Role(Role::Watch)),
     ("/palpate.v1.SessionService/ListScenes", Access::Role(Role::Watch)),
     ("/palpate.v1.SessionService/ListScripts", Access::Role(Role::Watch)),
-    // It tells the ids of all sessions, and who knows an id may go there.
+    // It reveals the IDs of all sessions, and whoever knows an ID can use that session.
     ("/palpate.v1.SessionService/ListSessions", Access::Role(Role::Administer)),
     ("/palpate.v1.SessionService/PauseSession", Access::Role(Role::Create)),
     ("/palpate.v1.SessionService/StartSession", Access::Role(Role::Create)),
@@ -94,48 +99,58 @@ pub const CALLS: &[(&str, Access)] = &[
     ("/palpate.v1.ViewService/WatchFrames", Access::Role(Role::Watch)),
 ];
 
-/// What the call of that path asks for; nothing is known of what is not the server's own.
+/// What the call with that path requires; `None` if it is not in the table.
 pub fn access(path: &str) -> Option<Access> {
     CALLS.iter().find(|call| call.0 == path).map(|call| call.1)
 }
 
-/// Who calls.
+/// The caller of a call.
 #[derive(Debug, Clone)]
 pub struct Caller {
-    /// As the file calls them, for people.
+    /// The caller's name in the token file, for logs and messages.
     pub name: Arc<str>,
     roles: Vec<Role>,
 }
 
 impl Caller {
-    fn anybody() -> Self {
-        Caller { name: "anybody".into(), roles: vec![Role::Administer] }
+    /// The caller where authentication is disabled: it may do everything.
+    fn unrestricted() -> Self {
+        Caller { name: "anonymous".into(), roles: vec![Role::Administer] }
     }
 
-    /// Who is not asked, at a call that asks for nothing.
-    pub(super) fn nobody() -> Self {
-        Caller { roles: Vec::new(), ..Caller::anybody() }
+    /// The caller of a call that requires nothing: it has no role.
+    pub(super) fn anonymous() -> Self {
+        Caller { roles: Vec::new(), ..Caller::unrestricted() }
     }
 
-    /// Refuses who has not got `role`.
+    /// Checks that the caller has `role`.
+    ///
+    /// # Errors
+    /// Returns an error if the caller lacks the role.
     pub fn needs(&self, role: Role) -> Result<()> {
         if role == Role::Watch || self.roles.contains(&role) || self.roles.contains(&Role::Administer) {
             return Ok(());
         }
-        let message = format!("`{}` has not got the role `{}`, which this call asks for", self.name, role.name());
+        let message = format!("`{}` lacks the role `{}`, which this call requires", self.name, role.name());
         Err(Refusal::new(Reason::RoleMissing, "", message))
     }
 }
 
-/// Every token begins so: it is known for one wherever it turns up.
+/// Every token begins with this, so that people and programs recognize a token wherever it appears.
 const PREFIX: &str = "palpate_";
 
-/// A new token, of 256 random bits.
+/// Creates a token of 256 random bits.
+///
+/// # Errors
+/// Returns an error if the system gives no random bits.
 pub fn new_token() -> Result<String> {
     Ok(format!("{PREFIX}{:032x}{:032x}", random_bits()?, random_bits()?))
 }
 
-/// The entry of a token in the file of tokens, which does not hold the token itself.
+/// The entry of a token for the token file. It holds the token's hash, not the token.
+///
+/// # Errors
+/// Returns an error if the name is not fit for a log.
 pub fn entry(name: &str, roles: &[Role], token: &str) -> Result<String> {
     label("name", name)?;
     let roles: Vec<_> = roles.iter().map(|role| format!("\"{}\"", role.name())).collect();
@@ -144,7 +159,7 @@ pub fn entry(name: &str, roles: &[Role], token: &str) -> Result<String> {
     Ok(format!("[[token]]\nname = {name}\nroles = [{}]\nsha256 = \"{hash}\"\n", roles.join(", ")))
 }
 
-/// A token is 256 random bits: its hash needs no salt and no slowness.
+/// The hash of a token. Since a token has 256 random bits, the hash needs neither salt nor a slow function.
 fn hash(token: &str) -> [u8; 32] {
     let mut bytes = [0; 32];
     bytes.copy_from_slice(digest(&SHA256, token.as_bytes()).as_ref());
@@ -175,45 +190,48 @@ struct CertificateEntry {
     roles: Vec<Role>,
 }
 
-/// Whom the server knows.
+/// The callers that the server knows.
 pub struct Credentials {
-    /// Nobody is asked.
+    /// Authentication is disabled.
     open: bool,
-    /// A certificate that the file does not name may do everything: there is no file.
+    /// There is no token file: every client certificate may do everything.
     any_certificate: bool,
     tokens: Vec<([u8; 32], Caller)>,
     certificates: Vec<(String, Caller)>,
 }
 
 impl Credentials {
-    /// Everybody may do everything.
+    /// Authentication is disabled: every caller may do everything.
     pub fn open() -> Self {
         Credentials { open: true, any_certificate: false, tokens: Vec::new(), certificates: Vec::new() }
     }
 
-    /// Whoever has a certificate that was checked may do everything.
+    /// Every caller with a valid client certificate may do everything.
     pub fn certified() -> Self {
         Credentials { open: false, any_certificate: true, ..Credentials::open() }
     }
 
-    /// Nobody need show anything.
+    /// Whether authentication is disabled.
     pub fn is_open(&self) -> bool {
         self.open
     }
 
-    /// Reads a file of tokens.
+    /// Parses a token file.
+    ///
+    /// # Errors
+    /// Returns an error with the line or entry if the text is not TOML, or if an entry is invalid or a duplicate.
     pub fn parse(path: &Path, text: &str) -> Result<Self> {
         let file: File = toml::from_str(text).map_err(|e| {
             let line = e.span().map_or(1, |span| text[..span.start].matches('\n').count() + 1);
-            // A token may have been written where it does not belong; it must not get into a log.
-            let message = if e.message().contains(PREFIX) { "is not what belongs here" } else { e.message() };
+            // TOML's message may quote a token from the wrong place; a token must not appear in a log.
+            let message = if e.message().contains(PREFIX) { "unexpected value" } else { e.message() };
             let place = Some(format!("{}:{line}", path.display()));
             Refusal { place, ..Refusal::new(Reason::Unreadable, "", message) }
         })?;
         let caller = |field: &str, name: &str, roles: Vec<Role>| {
             label(field, name)?;
             if roles.is_empty() {
-                let why = "are none; one at least of watch, touch, create, administer is needed";
+                let why = "is empty: give at least one of watch, touch, create, administer";
                 return Err(Refusal::new(Reason::Missing, format!("{field}.roles"), why));
             }
             Ok(Caller { name: name.into(), roles })
@@ -222,12 +240,12 @@ impl Credentials {
         for (index, TokenEntry { name, roles, sha256 }) in file.token.into_iter().enumerate() {
             let field = format!("token[{index}]");
             let wrong = || {
-                let message = "must be the 64 hexadecimal digits of a token's SHA-256: `palpate token` makes the entry";
+                let message = "must be 64 hexadecimal digits, a token's SHA-256; `palpate token` writes such entries";
                 Refusal::new(Reason::WrongKind, format!("{field}.sha256"), message)
             };
             let hash = from_hex(&sha256).ok_or_else(wrong)?;
             if known.tokens.iter().any(|token| token.0 == hash) {
-                let message = "is that of another token of this file, too";
+                let message = "duplicates that of another token in this file";
                 return Err(Refusal::new(Reason::OutOfRange, format!("{field}.sha256"), message));
             }
             known.tokens.push((hash, caller(&field, &name, roles)?));
@@ -239,37 +257,38 @@ impl Credentials {
         Ok(known)
     }
 
-    /// Who it is that calls, by the header `authorization` if there is one, or else by the certificate.
+    /// Authenticates a caller by the header `authorization` if there is one, otherwise by the client certificate.
     pub(super) fn caller(&self, authorization: Option<&HeaderValue>, peer: Option<&Peer>) -> Result<Caller> {
         if self.open {
-            return Ok(Caller::anybody());
+            return Ok(Caller::unrestricted());
         }
         let unknown = |message: &str| Refusal::new(Reason::Unauthenticated, "authorization", message);
         if let Some(value) = authorization {
             let text = value.to_str().unwrap_or_default();
             let token = match text.split_once(' ') {
                 Some((scheme, token)) if scheme.eq_ignore_ascii_case("bearer") => token.trim(),
-                _ => return Err(unknown("must be `Bearer` and a token")),
+                _ => return Err(unknown("must be `Bearer TOKEN`")),
             };
             let hash = hash(token);
-            // Every one is compared, and each in full: time tells nothing of any.
+            // Compares with all hashes, each in full: the time taken reveals nothing about them.
             let found = self
                 .tokens
                 .iter()
                 .fold(None, |found, (known, caller)| if bool::from(known.ct_eq(&hash)) { Some(caller) } else { found });
-            return found.cloned().ok_or_else(|| unknown("is a token that this server does not know"));
+            return found.cloned().ok_or_else(|| unknown("the server does not know this token"));
         }
         let names = peer.and_then(|peer| peer.certificate.as_deref());
         match names {
             Some(names) if self.any_certificate => {
-                Ok(Caller { name: names.first().map_or("a certificate", String::as_str).into(), ..Caller::anybody() })
+                let name = names.first().map_or("unnamed certificate", String::as_str);
+                Ok(Caller { name: name.into(), ..Caller::unrestricted() })
             }
             Some(names) => {
                 let known = self.certificates.iter().find(|known| names.contains(&known.0));
-                let message = "is missing, and the client's certificate is none that the server has roles for";
+                let message = "is missing, and the server has no roles for the client's certificate";
                 known.map(|known| known.1.clone()).ok_or_else(|| unknown(message))
             }
-            None => Err(unknown("is missing: `Bearer` and a token of this server")),
+            None => Err(unknown("is missing: send `Bearer TOKEN` with a token of this server")),
         }
     }
 }

@@ -1,5 +1,5 @@
-//! The server: gRPC services over `pace`, for browsers too (gRPC-web), their page, health, reflection, and a shutdown
-//! with a deadline.
+//! The server: gRPC and gRPC-web services over `pace`, the page, health, reflection, metrics, and a shutdown with a
+//! deadline.
 
 mod admin;
 pub mod catalog;
@@ -70,12 +70,12 @@ pub(crate) struct House {
     pub(crate) catalog: Catalog,
     pub(crate) pacer: Arc<Pacer>,
     pub(crate) textures: Textures,
-    /// Where sessions are laid out and changed, scripts read, and force laws computed.
+    /// Creates and changes sessions, reads scripts and computes force laws.
     pub(crate) workshop: Workshop,
     pub(crate) traffic: Arc<Traffic>,
 }
 
-/// Where a server is reached, and what stands there.
+/// A server's listeners and its protection.
 pub struct Doors {
     listener: TcpListener,
     metrics: Option<TcpListener>,
@@ -83,7 +83,10 @@ pub struct Doors {
 }
 
 impl Doors {
-    /// Listens where the configuration says, if that is safe.
+    /// Listens on the configured addresses, if that is safe.
+    ///
+    /// # Errors
+    /// Returns an error if the configuration is invalid or unsafe, a file can't be read, or an address is not available.
     pub async fn open(config: &Config) -> Result<Self, ServeError> {
         let listener = listen("listen", &config.listen).await?;
         let protection = Protection::load(config, local_address("listen", &listener, &config.listen)?)?;
@@ -92,8 +95,8 @@ impl Doors {
                 let listener = listen("metrics", text).await?;
                 let address = local_address("metrics", &listener, text)?;
                 if !address.ip().is_loopback() && !config.insecure {
-                    let why = "can be reached from other machines, and nobody is asked who they are there";
-                    let message = format!("{address} {why}: listen on 127.0.0.1, or say --insecure");
+                    let why = "and the metrics need no authentication: listen on 127.0.0.1, or pass --insecure";
+                    let message = format!("other machines can reach {address}, {why}");
                     return Err(Refusal::new(Reason::OutOfRange, "metrics", message).into());
                 }
                 Some(listener)
@@ -103,12 +106,12 @@ impl Doors {
         Ok(Doors { listener, metrics, protection })
     }
 
-    /// Where clients find the server.
+    /// The server's URL.
     pub fn url(&self) -> String {
         url(self.protection.scheme(), &self.listener)
     }
 
-    /// Where Prometheus does, if anywhere.
+    /// The URL of the metrics, if they are served.
     pub fn metrics_url(&self) -> Option<String> {
         self.metrics.as_ref().map(|listener| url("http", listener) + "/metrics")
     }
@@ -125,14 +128,14 @@ fn url(scheme: &str, listener: &TcpListener) -> String {
 async fn listen(field: &'static str, text: &str) -> Result<TcpListener, ServeError> {
     TcpListener::bind(text).await.map_err(|error| {
         if error.kind() == std::io::ErrorKind::InvalidInput {
-            let message = format!("{text}: must be address:port, as in 127.0.0.1:7117");
+            let message = format!("must be address:port, such as 127.0.0.1:7117, but is `{text}`");
             return Refusal::new(Reason::WrongKind, field, message).into();
         }
         ServeError::Listen { field, address: text.to_owned(), error }
     })
 }
 
-/// What a page of another site may send, and read of the answer, of a call over gRPC-web.
+/// The headers that pages of these origins may send and read in gRPC-web calls.
 fn cors(origins: &[HeaderValue]) -> CorsLayer {
     let own = |name| HeaderName::from_static(name);
     let sent =
@@ -146,23 +149,23 @@ fn cors(origins: &[HeaderValue]) -> CorsLayer {
         .max_age(Duration::from_secs(3600))
 }
 
-/// Bytes that were taken and are free again: then the allocator is asked to give what it keeps back to the system.
+/// When this many bytes have become free, the allocator is asked to return its free memory to the system.
 const WORTH_GIVING_BACK: u64 = 16 << 20;
 
-/// Why a server could not run.
+/// Why a server can't run.
 #[derive(Debug, thiserror::Error)]
 pub enum ServeError {
-    /// The configuration makes no sense, or is not safe.
+    /// The configuration is invalid or not safe.
     #[error("{0}")]
     Refused(#[from] Refusal),
-    /// The address is taken, or none of this machine.
-    #[error("can't listen on {address}: {error}; another --{field}, or port 0 for a free one, may do")]
+    /// The address is in use, or not one of this machine.
+    #[error("can't listen on {address}: {error}; try another --{field}, or port 0 for any free port")]
     Listen {
-        /// Which of the addresses of the configuration.
+        /// The configuration's key of the address.
         field: &'static str,
-        /// As it was given.
+        /// The address as it was given.
         address: String,
-        /// Of the system.
+        /// The system's error.
         error: std::io::Error,
     },
     /// A thread can't be started.
@@ -172,11 +175,11 @@ pub enum ServeError {
     #[error("the transport failed: {0}")]
     Transport(#[from] tonic::transport::Error),
     /// The reflection service can't read its own descriptors.
-    #[error("the descriptors of the protocol can't be read: {0}")]
+    #[error("can't read the descriptors of the protocol: {0}")]
     Reflection(#[from] tonic_reflection::server::Error),
 }
 
-/// What the health service tells of. The server itself, "", serves also where a part of it does not.
+/// The services that the health service reports. The server itself, "", is serving even while one of the others is not.
 const SERVICES: [&str; 6] = [
     "",
     <SessionServiceServer<sessions::Sessions> as NamedService>::NAME,
@@ -186,23 +189,23 @@ const SERVICES: [&str; 6] = [
     WORKSHOP,
 ];
 
-/// Serves while the tokens in force are those of the file.
+/// The health service that is serving while the tokens in use are those of the file.
 const TOKENS: &str = "palpate.tokens";
 
-/// Tells of files whose contents are not in force, for ever.
-fn tell_troubles(
+/// Reports, to health and metrics, files whose contents are not in use. Never completes.
+fn report_files(
     protection: &Protection,
     health: HealthReporter,
     traffic: Arc<Traffic>,
 ) -> impl Future<Output = ()> + use<> {
-    let mut tokens = protection.credentials.troubles();
-    let tls = protection.tls.as_ref().map(|tls| tls.troubles());
-    let told = traffic.clone();
+    let mut tokens = protection.credentials.problems();
+    let tls = protection.tls.as_ref().map(|tls| tls.problems());
+    let token_traffic = traffic.clone();
     let of_tokens = async move {
         loop {
-            let useless = tokens.borrow_and_update().is_some();
-            told.files("tokens", useless);
-            let status = if useless { ServingStatus::NotServing } else { ServingStatus::Serving };
+            let are_unused = tokens.borrow_and_update().is_some();
+            token_traffic.files("tokens", are_unused);
+            let status = if are_unused { ServingStatus::NotServing } else { ServingStatus::Serving };
             health.set_service_status(TOKENS, status).await;
             if tokens.changed().await.is_err() {
                 return;
@@ -223,8 +226,9 @@ fn tell_troubles(
     }
 }
 
-/// Says that the server does not serve any more. Then those who watch that are done with: they would be waited for.
-async fn leave(mut health: HealthReporter) {
+/// Reports that the server is not serving any more. Then ends the streams that watch its health: shutdown would wait for
+/// them.
+async fn end_health(mut health: HealthReporter) {
     for service in SERVICES {
         health.set_service_status(service, ServingStatus::NotServing).await;
     }
@@ -233,15 +237,15 @@ async fn leave(mut health: HealthReporter) {
     }
 }
 
-/// The health service that tells whether heavy work is done in time.
+/// The health service that is serving while heavy work is done in time.
 const WORKSHOP: &str = "palpate.workshop";
 
-/// Tells by [`WORKSHOP`] whether the workshop's oldest piece is within its deadline.
+/// Reports by [`WORKSHOP`] whether the workshop's oldest job is within its deadline. Never completes.
 async fn report_workshop(workshop: Workshop, health: HealthReporter) {
-    let mut look = tokio::time::interval(Duration::from_millis(250));
+    let mut checks = tokio::time::interval(Duration::from_millis(250));
     let mut was_late = None;
     loop {
-        look.tick().await;
+        checks.tick().await;
         let load = workshop.load();
         if was_late.replace(load.is_late) == Some(load.is_late) {
             continue;
@@ -254,18 +258,21 @@ async fn report_workshop(workshop: Workshop, health: HealthReporter) {
     }
 }
 
-/// Serves at `doors` until `shutdown` is cancelled; then ends all streams, and is over at the latest when the
-/// deadline of the configuration has passed. The caller ends its runtime without waiting (`shutdown_background`).
+/// Serves at `doors` until `shutdown` is cancelled. Then ends all streams, and returns at the latest after the configured
+/// deadline. The caller must end its runtime without waiting (`shutdown_background`).
+///
+/// # Errors
+/// Returns an error if a thread can't be started, or if the transport fails.
 pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) -> Result<(), ServeError> {
     let Doors { listener, metrics, protection } = doors;
     let budget = Budget::new(&config.limits, config.stepping_threads(), config.serving_threads());
-    info!(bytes = budget.bytes(), "memory to share");
+    info!(bytes = budget.bytes(), "memory that callers share");
     let pacer = Pacer::start(config.stepping_threads(), config.audit_share, &config.limits, budget.clone())?;
     let deadline = Duration::from_secs_f64(config.shutdown_deadline_s);
     let catalog = Catalog::new(&config.scenes, &config.scripts);
     for name in catalog.names() {
         if let Err(refusal) = catalog.load(&name, &[], &config.limits) {
-            warn!(%refusal, "a scene that no session can be made from");
+            warn!(%refusal, "this scene is invalid: no session can be created from it");
         }
     }
     let mut limits = config.limits.clone();
@@ -281,14 +288,14 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
     }
     let open = protection.credentials.get().is_open();
     if config.insecure && open {
-        warn!("--insecure: whoever can reach this server may do everything");
+        warn!("--insecure: everyone who can reach this server may do everything");
     }
     let origins: Arc<[HeaderValue]> = config.origins.iter().filter_map(|origin| origin.parse().ok()).collect();
     let calls = Calls::new(protection.credentials.clone());
     let guard = GuardLayer {
         credentials: protection.credentials.clone(),
         calls: calls.clone(),
-        patience: Duration::from_secs_f64(limits.open_s),
+        message_timeout: Duration::from_secs_f64(limits.open_s),
         traffic: traffic.clone(),
         budget: budget.clone(),
         local_only: open && !config.insecure,
@@ -307,14 +314,14 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
     for service in SERVICES {
         health.set_service_status(service, ServingStatus::Serving).await;
     }
-    let telling = tell_troubles(&protection, health.clone(), traffic.clone());
+    let reporting_files = report_files(&protection, health.clone(), traffic.clone());
     let reflection = || {
         tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(pb::DESCRIPTORS)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
 
-    let reporting = report_workshop(workshop, health.clone());
+    let reporting_work = report_workshop(workshop, health.clone());
     let (unused, memory) = (pacer.clone(), budget.clone());
     let mut most_bytes = 0;
     let sweeping = async move {
@@ -322,7 +329,7 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
         loop {
             sweep.tick().await;
             for session in unused.delete_idle() {
-                info!(session, "session deleted: nobody used it");
+                info!(session, "session deleted: it was idle");
             }
             let bytes = memory.bytes_taken();
             most_bytes = most_bytes.max(bytes);
@@ -333,15 +340,15 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
         }
     };
 
-    // Who has not shown who they are leaves half of the room to others.
-    let strangers = (!open).then_some(limits.connections.div_ceil(2));
-    let seats = Arc::new(Seats::new(&limits, strangers));
+    // Unauthenticated connections leave half of the limit to the others.
+    let most_unauthenticated = (!open).then_some(limits.connections.div_ceil(2));
+    let seats = Arc::new(Seats::new(&limits, most_unauthenticated));
     let register = Arc::new(connections::Register::default());
     let tls = protection.tls.clone();
     let incoming = connections::incoming(listener, tls, seats, &limits, budget.clone(), traffic, register.clone());
     let silence = Some(Duration::from_secs_f64(limits.keepalive_s));
     let bytes = limits.message_bytes;
-    let (folder, painter) = (Arc::new(house.config.viewer.clone()), house.clone());
+    let (folder, shared) = (Arc::new(house.config.viewer.clone()), house.clone());
     let sessions = SessionServiceServer::new(sessions::Sessions(house.clone())).max_decoding_message_size(bytes);
     let haptics = HapticServiceServer::new(haptics::Haptics(house.clone())).max_decoding_message_size(bytes);
     let admin =
@@ -355,13 +362,13 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
         .add_service(views)
         .add_service(admin)
         .into_axum_router()
-        // Of the services alone: it refuses what is no gRPC.
+        // Not for the routes below: the layer refuses what is not gRPC.
         .route_layer(GrpcWebLayer::new())
-        .route("/textures/{file}", axum::routing::get(move |file, headers| textures::file(painter, file, headers)))
+        .route("/textures/{file}", axum::routing::get(move |file, headers| textures::file(shared, file, headers)))
         .fallback(move |request| page::page(folder.clone(), request));
     let drain = CancellationToken::new();
     let serving = Server::builder()
-        // Finds out about clients whose host has vanished.
+        // Detects clients whose host has disappeared.
         .http2_keepalive_interval(silence)
         .http2_keepalive_timeout(silence)
         .max_concurrent_streams(limits.streams_per_connection)
@@ -373,28 +380,28 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
         .add_routes(routes.into())
         .serve_with_incoming_shutdown(incoming, drain.clone().cancelled_owned());
 
-    // One deadline for all that is left to do. A step that outlasts it goes down with the process.
+    // One deadline for everything that is left to do. A step that takes longer ends with the process.
     let (stopping, begun) = (pacer.clone(), shutdown.clone());
     let stop = async move {
         begun.cancelled().await;
         info!("shutting down");
-        leave(health).await;
+        end_health(health).await;
         drain.cancel();
-        // Waits for the steps under way. Every stream then reads its end from its queue.
+        // Waits for the running steps. Every stream then reads its end from its queue.
         let _ = tokio::task::spawn_blocking(move || stopping.stop()).await;
     };
-    let over = async {
+    let deadline_passed = async {
         shutdown.cancelled().await;
         tokio::time::sleep(deadline).await;
     };
     tokio::select! {
         (served, ()) = async { tokio::join!(serving, stop) } => served?,
         () = sweeping => {}
-        () = reporting => {}
+        () = reporting_work => {}
         () = protection.watch() => {}
         () = calls.watch() => {}
-        () = telling => {}
-        () = over => warn!("steps or streams outlasted the deadline, and are cut"),
+        () = reporting_files => {}
+        () = deadline_passed => warn!("the shutdown deadline has passed: cutting the remaining steps and streams"),
     }
     info!("stopped");
     Ok(())

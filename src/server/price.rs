@@ -1,6 +1,6 @@
-//! Every call has a price: the processor time of the network's threads that it takes, charged to its caller. Who has used up
-//! their part waits, and is refused if that takes too long. Commands and haptic streams do not wait: they have bounds of
-//! their own, and are what the server is for.
+//! Every call has a price: the processor time that it takes on the network threads, charged to its caller. The calls of a
+//! caller that has used up its share wait, and are refused if they wait too long. Commands and haptic streams never wait:
+//! they have limits of their own, and are the server's main task.
 
 use std::pin::Pin;
 use std::task::{Context, Poll, ready};
@@ -16,8 +16,8 @@ use crate::budget::{Account, Work};
 use crate::pace::clock::{now_ns, thread_time_ns};
 use crate::refusal::{Reason, Refusal, Result};
 
-/// Calls of these beginnings are not made to wait.
-const AT_ONCE: [&str; 5] = [
+/// Calls whose paths begin with these never wait.
+const NEVER_WAIT: [&str; 5] = [
     "/palpate.v1.HapticService/Touch",
     "/palpate.v1.HapticService/SendCommands",
     "/palpate.v1.HapticService/ReleaseTool",
@@ -25,18 +25,18 @@ const AT_ONCE: [&str; 5] = [
     "/grpc.health.",
 ];
 
-/// A call waits no longer than this for its caller's part.
+/// Longest time that a call waits for its caller's share.
 const PATIENCE: Duration = Duration::from_secs(1);
 
-/// What a call takes is charged to this.
+/// The account that the processor time of a call is charged to.
 #[derive(Debug, Clone)]
 pub(super) struct Price(Account);
 
 impl Price {
-    /// Of a call of `account`; none if it does not wait.
+    /// For a call of `account`; `None` if the call never waits.
     pub(super) fn of(path: &str, account: &Account) -> Option<Self> {
-        let at_once = AT_ONCE.iter().any(|beginning| path.starts_with(beginning));
-        (!at_once).then(|| Price(account.clone()))
+        let never_waits = NEVER_WAIT.iter().any(|beginning| path.starts_with(beginning));
+        (!never_waits).then(|| Price(account.clone()))
     }
 
     fn must_wait(&self) -> Option<Duration> {
@@ -44,14 +44,14 @@ impl Price {
         (ns > 0).then(|| Duration::from_nanos(ns))
     }
 
-    /// Waits until there is time for a call.
+    /// Waits until the caller's share allows a call.
     async fn wait(&self) {
         while let Some(wait) = self.must_wait() {
             tokio::time::sleep(wait).await;
         }
     }
 
-    /// Does something, and charges what it took.
+    /// Runs `act` and charges the processor time that it took.
     fn measure<T>(&self, act: impl FnOnce() -> T) -> T {
         let begun_ns = thread_time_ns();
         let done = act();
@@ -59,7 +59,7 @@ impl Price {
         done
     }
 
-    /// The answer to a call, at that price: begun when its caller's part allows, one call of a caller after another.
+    /// Runs a call and charges it. The call begins when its caller's share allows; a caller's calls begin one after another.
     pub(super) async fn answer<F: Future>(&self, call: F) -> Result<F::Output> {
         let mut call = std::pin::pin!(call);
         let begun = {
@@ -69,10 +69,10 @@ impl Price {
                 turn
             };
             let Ok(_turn) = tokio::time::timeout(PATIENCE, turn).await else {
-                let message = "the calls of this caller take more than its part of the server's time";
+                let message = "the calls of this caller take more than its share of the server's time";
                 return Err(Refusal::new(Reason::Overloaded, "", message));
             };
-            // Not more than a look: what the call waits for, others do not wait for.
+            // Polls once only: while the call waits for something, the caller's next call may begin.
             std::future::poll_fn(|context| Poll::Ready(self.measure(|| call.as_mut().poll(context)))).await
         };
         match begun {
@@ -81,7 +81,7 @@ impl Price {
         }
     }
 
-    /// The answer, at that price: it comes as fast as its caller's part allows.
+    /// The body of the answer, charged: it is sent as fast as its caller's share allows.
     pub(super) fn body(self, answer: Body) -> Body {
         Body::new(Charged { answer, price: self, wait: None })
     }
@@ -108,7 +108,7 @@ impl http_body::Body for Charged {
         }
         let answer = &mut this.answer;
         let frame = ready!(this.price.measure(|| Pin::new(answer).poll_frame(context)));
-        // The end is told at once.
+        // Trailers are sent at once.
         if frame.as_ref().is_some_and(|frame| frame.as_ref().is_ok_and(Frame::is_data)) {
             this.wait = this.price.must_wait().map(|wait| Box::pin(tokio::time::sleep(wait)));
         }
@@ -131,7 +131,7 @@ mod tests {
     use crate::limits::Limits;
 
     #[test]
-    fn who_has_used_up_their_part_waits_and_others_do_not() {
+    fn a_caller_that_has_used_up_its_share_waits_and_others_do_not() {
         let budget = Budget::new(&Limits::default(), 1, 1);
         let [greedy, other] = ["greedy", "other"].map(|name| budget.account(name));
         let price = |account| Price::of("/palpate.v1.SessionService/GetSession", account).unwrap();
@@ -159,7 +159,7 @@ mod tests {
         };
         price.answer(busy()).await.unwrap();
         assert!(price.must_wait().is_some());
-        // It waits until it may, and goes on.
+        // It waits until its share allows it, then runs.
         price.answer(busy()).await.unwrap();
     }
 }

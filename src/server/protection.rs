@@ -1,5 +1,4 @@
-//! What stands between a server and the network: TLS, and whom it knows. A server that others can reach does not start
-//! without.
+//! A server's protection: TLS and credentials. A server that other machines can reach does not start without them.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -11,17 +10,17 @@ use super::reload::{Reloaded, of_file, warn_if_readable};
 use super::tls::{self, Tls};
 use crate::refusal::{Reason, Refusal, Result};
 
-/// Between two looks at the ends of certificates.
+/// Time between two checks of when certificates expire.
 const DAY: Duration = Duration::from_secs(86_400);
 
-/// Of one server.
+/// The protection of one server.
 pub(super) struct Protection {
     pub(super) tls: Option<Arc<Reloaded<Tls>>>,
     pub(super) credentials: Arc<Reloaded<Credentials>>,
 }
 
 impl Protection {
-    /// Reads the files that the configuration names. Refuses to have none at an address that others can reach.
+    /// Reads the files that the configuration names. Refuses an unprotected address that other machines can reach.
     pub(super) fn load(config: &Config, address: SocketAddr) -> Result<Self> {
         config.check()?;
         let tls = match (&config.tls_cert, &config.tls_key) {
@@ -32,13 +31,13 @@ impl Protection {
         let known = certified || config.tokens.is_some();
         if !(config.insecure || address.ip().is_loopback() || (tls.is_some() && known)) {
             let message = format!(
-                "{address} can be reached from other machines, and {}. Either protect it, with --tls-cert FILE and \
-                 --tls-key FILE, and --tokens FILE or --tls-client-ca FILE (`palpate serve --help` tells how), or say \
-                 --insecure to serve whoever can reach it, and let everybody on the way read along",
+                "other machines can reach {address}, and the server {}. Either protect it with --tls-cert FILE and \
+                 --tls-key FILE, and with --tokens FILE or --tls-client-ca FILE (see `palpate serve --help`), or pass \
+                 --insecure: then everyone who can reach it may do everything, and the network can read it all",
                 match (tls.is_some(), known) {
                     (false, false) => "has neither TLS nor tokens",
-                    (false, true) => "has no TLS: tokens would be sent in the clear",
-                    _ => "everybody would be let in",
+                    (false, true) => "has no TLS, so tokens would be sent in the clear",
+                    _ => "does not authenticate callers",
                 }
             );
             return Err(Refusal::new(Reason::OutOfRange, "listen", message));
@@ -59,22 +58,22 @@ impl Protection {
         Ok(Protection { tls, credentials: Arc::new(credentials) })
     }
 
-    /// How URLs of the server begin.
+    /// The scheme of the server's URLs.
     pub(super) fn scheme(&self) -> &'static str {
         if self.tls.is_some() { "https" } else { "http" }
     }
 
-    /// Looks for new files, for ever.
+    /// Reloads files that change, and warns of certificates that expire. Never completes.
     pub(super) async fn watch(&self) {
         let tls = async {
             let Some(tls) = &self.tls else { return std::future::pending().await };
             let mut days = tokio::time::interval(DAY);
-            // The certificates were looked at when they were read.
+            // The first tick is at once; loading has checked the certificates already.
             days.tick().await;
             let warning = async {
                 loop {
                     days.tick().await;
-                    tls.get().warn_of_ends();
+                    tls.get().warn_of_expiry();
                 }
             };
             tokio::join!(tls.clone().watch(), warning);

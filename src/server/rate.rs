@@ -1,4 +1,4 @@
-//! How fast somebody may ask: a bucket that fills steadily, from which each asking takes. Time is an argument.
+//! Rate limits: a token bucket that fills steadily; each request takes one. Time is an argument of the bucket.
 
 use std::sync::Mutex;
 use std::time::Duration;
@@ -7,25 +7,25 @@ use crate::lock::lock;
 use crate::pace::clock::now_ns;
 use crate::refusal::{Reason, Refusal, Result};
 
-/// What may still be asked for at once, and how fast that comes back.
+/// A token bucket.
 #[derive(Debug, Clone)]
 pub(super) struct Bucket {
     per_s: f64,
     most: f64,
     left: f64,
     filled_ns: u64,
-    /// Askings that were refused, less those that were not.
+    /// Requests that were refused, less those granted since; never below 0.
     refused: f64,
 }
 
 impl Bucket {
-    /// A full one that holds `most`, and gets `per_s` a second.
+    /// A full bucket that holds `most` and gains `per_s` per second.
     pub(super) fn new(per_s: f64, most: f64) -> Self {
         let most = most.max(1.0);
         Bucket { per_s, most, left: most, filled_ns: 0, refused: 0.0 }
     }
 
-    /// Takes one, unless there is none; `what` is asked for too fast.
+    /// Takes one. Returns an error if the bucket is empty; its message calls the requests `what`.
     #[allow(clippy::cast_precision_loss)]
     pub(super) fn take(&mut self, now_ns: u64, what: &str) -> Result<()> {
         let elapsed_s = now_ns.saturating_sub(self.filled_ns) as f64 * 1e-9;
@@ -34,7 +34,7 @@ impl Bucket {
         if self.left < 1.0 {
             self.refused += 1.0;
             let Bucket { per_s, most, .. } = *self;
-            let message = format!("{what} are more than {:.0} a minute, and {most:.0} at once", 60.0 * per_s);
+            let message = format!("{what} exceed {:.0} a minute, and {most:.0} at once", 60.0 * per_s);
             return Err(Refusal::new(Reason::RateLimited, "", message));
         }
         self.left -= 1.0;
@@ -42,31 +42,31 @@ impl Bucket {
         Ok(())
     }
 
-    /// How long it takes until there is one, a second at most.
+    /// Time until the next request would be granted, at most a second.
     fn wait(&self) -> Duration {
         Duration::from_secs_f64(((1.0 - self.left) / self.per_s).clamp(0.0, 1.0))
     }
 
-    /// Whether it was asked so much too fast that even to refuse is too much: the excess is more than it holds.
+    /// Whether requests come so fast that even refusing them costs too much: the excess is more than the bucket holds.
     pub(super) fn is_abused(&self) -> bool {
         self.refused > self.most
     }
 }
 
-/// A bucket that all calls of a connection take from. Who finds it empty is told so when there would be one again: so
-/// whoever tries on and on, one call after another, is slowed to what is allowed.
+/// A bucket that all calls of a connection share. A refusal is delayed until the next call would be granted. A client that
+/// retries in a loop, one call after another, is thus slowed to the allowed rate.
 #[derive(Debug)]
-pub(super) struct Turnstile {
+pub(super) struct RateLimiter {
     bucket: Mutex<Bucket>,
     what: &'static str,
 }
 
-impl Turnstile {
+impl RateLimiter {
     pub(super) fn new(per_s: f64, most: f64, what: &'static str) -> Self {
-        Turnstile { bucket: Mutex::new(Bucket::new(per_s, most)), what }
+        RateLimiter { bucket: Mutex::new(Bucket::new(per_s, most)), what }
     }
 
-    /// Lets a call through, or tells why not and how long that is to be kept back.
+    /// Lets a call through, or returns the refusal and for how long to delay it.
     pub(super) fn pass(&self) -> std::result::Result<(), (Refusal, Duration)> {
         let mut bucket = lock(&self.bucket);
         bucket.take(now_ns(), self.what).map_err(|refusal| (refusal, bucket.wait()))
@@ -78,13 +78,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_refusal_is_kept_back_until_the_next_would_pass() {
-        let turnstile = Turnstile::new(10.0, 3.0, "calls");
-        (0..3).for_each(|_| turnstile.pass().unwrap());
-        let (refusal, wait) = turnstile.pass().unwrap_err();
+    fn a_refusal_is_delayed_until_the_next_call_would_pass() {
+        let limiter = RateLimiter::new(10.0, 3.0, "calls");
+        (0..3).for_each(|_| limiter.pass().unwrap());
+        let (refusal, wait) = limiter.pass().unwrap_err();
         assert_eq!(refusal.reason, Reason::RateLimited);
         assert!(wait <= Duration::from_millis(100), "{wait:?}");
-        let slow = Turnstile::new(0.01, 1.0, "calls");
+        let slow = RateLimiter::new(0.01, 1.0, "calls");
         slow.pass().unwrap();
         assert_eq!(slow.pass().unwrap_err().1, Duration::from_secs(1));
     }
@@ -96,11 +96,11 @@ mod tests {
             |bucket: &mut Bucket, now_ns| (0..100).take_while(|_| bucket.take(now_ns, "things").is_ok()).count();
         assert_eq!(taken(&mut bucket, 1), 5);
         assert_eq!(taken(&mut bucket, 250_000_000), 2);
-        // Time that goes back gives nothing; a long one no more than it holds.
+        // Time that goes back gains nothing; a long time gains no more than the bucket holds.
         assert_eq!(taken(&mut bucket, 0), 0);
         assert_eq!(taken(&mut bucket, 1_000_000_000_000), 5);
         assert_eq!(bucket.take(1_000_000_000_000, "things").unwrap_err().reason, Reason::RateLimited);
-        // Who asks on and on is told apart from who is a little too fast.
+        // A small excess is not abuse, a long one is.
         assert!(!bucket.is_abused());
         (0..5).for_each(|_| assert!(bucket.take(1_000_000_000_000, "things").is_err()));
         assert!(bucket.is_abused());

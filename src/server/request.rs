@@ -1,5 +1,5 @@
-//! The body of a request as it comes: it must come in time, its caller must still be allowed to, and what of it was taken
-//! makes room for more of the connection.
+//! The body of a request. It must arrive in time, its caller's credentials must still be valid, and each part that is read
+//! lets the connection receive more.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -16,51 +16,51 @@ use super::revocation::Call;
 use super::transport::Gate;
 use crate::refusal::{Reason, Refusal};
 
-/// How long the messages of a call may take.
+/// How long the messages of a call may take to arrive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Pace {
-    /// All of it must have come by then: a call with one message.
-    Whole(Duration),
-    /// The next must have come by then: a call with many, to nobody in particular.
-    Each(Duration),
-    /// The call itself says.
-    Own,
+pub(super) enum TimeLimit {
+    /// The whole body must arrive within this time: a call with one message.
+    WholeBody(Duration),
+    /// Each message must arrive within this time after the one before: a call with many messages.
+    EachMessage(Duration),
+    /// The call itself sets its deadlines.
+    None,
 }
 
 /// A request's body.
-pub(super) struct Inward {
+pub(super) struct RequestBody {
     body: Body,
-    /// Of a caller that showed who it is.
+    /// Present if the caller was authenticated.
     call: Option<Arc<Call>>,
     gate: Option<Arc<Gate>>,
-    pace: Pace,
-    /// Only once it is waited for.
+    limit: TimeLimit,
+    /// Created when the body is first waited for.
     deadline: Option<Pin<Box<Sleep>>>,
     begun: Instant,
 }
 
-impl Inward {
-    pub(super) fn body(body: Body, call: Option<Arc<Call>>, gate: Option<Arc<Gate>>, pace: Pace) -> Body {
-        // What has no body, or a page's whole one, is not waited for.
+impl RequestBody {
+    pub(super) fn wrap(body: Body, call: Option<Arc<Call>>, gate: Option<Arc<Gate>>, limit: TimeLimit) -> Body {
+        // An empty body needs no wait and no check.
         if http_body::Body::is_end_stream(&body) {
             return body;
         }
-        Body::new(Inward { body, call, gate, pace, deadline: None, begun: Instant::now() })
+        Body::new(RequestBody { body, call, gate, limit, deadline: None, begun: Instant::now() })
     }
 
-    /// What has not come in time.
+    /// Ready with the refusal when the time limit has passed.
     fn poll_late(&mut self, context: &mut Context<'_>) -> Poll<Refusal> {
-        let (Pace::Whole(within) | Pace::Each(within)) = self.pace else { return Poll::Pending };
+        let (TimeLimit::WholeBody(within) | TimeLimit::EachMessage(within)) = self.limit else { return Poll::Pending };
         let until = self.begun + within;
         let deadline = self.deadline.get_or_insert_with(|| Box::pin(tokio::time::sleep_until(until)));
         deadline.as_mut().poll(context).map(|()| {
-            let message = format!("did not come in full within {} s", within.as_secs_f64());
+            let message = format!("did not arrive in full within {} s", within.as_secs_f64());
             Refusal::new(Reason::TimedOut, "request", message)
         })
     }
 }
 
-impl http_body::Body for Inward {
+impl http_body::Body for RequestBody {
     type Data = Bytes;
     type Error = Status;
 
@@ -77,7 +77,7 @@ impl http_body::Body for Inward {
         {
             gate.taken(data.len());
         }
-        if matches!(this.pace, Pace::Each(_)) {
+        if matches!(this.limit, TimeLimit::EachMessage(_)) {
             (this.deadline, this.begun) = (None, Instant::now());
         }
         Poll::Ready(frame)

@@ -1,4 +1,4 @@
-//! `SessionService`.
+//! `SessionService`: creates, starts, changes, pauses and deletes sessions; lists scenes and scripts.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -12,7 +12,7 @@ use super::House;
 use super::connections::Peer;
 use super::cut::until_cut;
 use super::visitor::Visitor;
-use super::workshop::Stop;
+use super::workshop::CancelFlag;
 use crate::budget::Work;
 use crate::pace::Held;
 use crate::pace::clock::now_ns;
@@ -55,10 +55,10 @@ impl SessionService for Sessions {
         let idle_timeout_s = request.idle_timeout_s.unwrap_or(most_s);
         let range = format!("above 0 and at most {most_s}");
         number("idle_timeout_s", idle_timeout_s, &range, |value| value > 0.0 && value <= most_s)?;
-        // A large sheet takes a while to lay out.
+        // A large sheet takes a while to compile.
         let pacer = self.0.pacer.clone();
         let payer = account.clone();
-        let create = move |_: &Stop| pacer.create(&scene, request.paused, idle_timeout_s, &payer);
+        let create = move |_: &CancelFlag| pacer.create(&scene, request.paused, idle_timeout_s, &payer);
         let live = self.0.workshop.work(&account, create).await??;
         info!(session = %live.id, scene = %live.model.scene.name, points = live.model.len(), "session created");
         for warning in &live.model.warnings {
@@ -112,7 +112,7 @@ impl SessionService for Sessions {
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
         let (change, to_change, pacer) = (wire::scene::from_change(&request), live.clone(), self.0.pacer.clone());
-        let change = move |_: &Stop| pacer.change_tissue(&to_change, &change, request.at_step);
+        let change = move |_: &CancelFlag| pacer.change_tissue(&to_change, &change, request.at_step);
         let (step, model) = self.0.workshop.work(&account, change).await??;
         info!(
             session = %live.id,
@@ -144,7 +144,7 @@ impl SessionService for Sessions {
         let Visitor { account, .. } = Visitor::of(request.extensions());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
-        // A hash that is asked for now waits for its caller's part; one of a step to come must be taken there.
+        // A request for the current hash waits for its caller's share. A request for a later step must reach that step.
         let wait_ns = account.must_wait_ns(Work::Reading, now_ns());
         if request.at_step.is_none() && wait_ns > 0 {
             tokio::time::sleep(Duration::from_nanos(wait_ns)).await;
@@ -170,8 +170,8 @@ impl SessionService for Sessions {
         let guard = live.open_stream("GetScript", Held::Nothing, &account)?;
         let cut = guard.cut().clone();
         let (catalog, config) = (self.0.catalog.clone(), self.0.config.clone());
-        // A script may have traces of megabytes.
-        let read = move |_: &Stop| catalog.script(&request.script_name, &live.model.scene, &config.limits);
+        // A script may have megabytes of traces.
+        let read = move |_: &CancelFlag| catalog.script(&request.script_name, &live.model.scene, &config.limits);
         let script = self.0.workshop.work(&account, read).await??;
         let out = stream::unfold(Some((script, 0, guard)), |state| async move {
             let (script, from, guard) = state?;
@@ -182,13 +182,13 @@ impl SessionService for Sessions {
     }
 }
 
-/// Commands of one message: 50 KiB or so.
+/// Commands per message, about 50 KiB.
 const COMMANDS_PER_PART: usize = 500;
 
-/// Steps that are looked at for one message, so that a script of a week does not hold a thread.
+/// Steps that are searched for one message: a script of a week must not occupy a thread.
 const STEPS_PER_PART: u64 = 100_000;
 
-/// What the script does from step `from` on, and the step from which the next part goes on.
+/// The message with the script's commands from step `from` on, and the step at which the next message begins.
 #[allow(clippy::cast_possible_truncation)]
 fn script_part(script: &Script, from: u64) -> (pb::GetScriptResponse, Option<u64>) {
     let mut message = pb::GetScriptResponse { steps: script.steps, tools: script.tools() as u32, ..Default::default() };

@@ -1,22 +1,22 @@
-//! What the system tells a server: to end, to look at its files, or nothing of interest.
+//! Signals of the system: those that end the server, and those that must not.
 
 use tokio_util::sync::CancellationToken;
 
-/// What would end a process by default and is no reason for a server to end: SIGHUP has it look at its files, the others
-/// mean nothing to it; a log that may not grow any more (SIGXFSZ) is an error to who writes it.
+/// Catches signals that would end the process by default. SIGHUP makes the server check its files; SIGUSR1 and SIGUSR2 do
+/// nothing; with SIGXFSZ caught, writing to a log at its size limit returns an error instead.
 pub fn outlive() {
     #[cfg(unix)]
     {
         use rustix::process::Signal;
         use tokio::signal::unix::{SignalKind, signal};
         for ignored in [Signal::HUP, Signal::USR1, Signal::USR2, Signal::XFSZ] {
-            // Caught from now on, though nobody is told here.
+            // This call installs the handler, which stays when the stream of signals is dropped.
             let _ = signal(SignalKind::from_raw(ignored.as_raw()));
         }
     }
 }
 
-/// Ctrl-C and SIGTERM end the server; a second one ends it at once.
+/// Cancels `shutdown` at Ctrl-C or SIGTERM; a second one ends the process at once.
 pub async fn cancel_on(shutdown: CancellationToken) {
     for signals in 0.. {
         #[cfg(unix)]

@@ -1,4 +1,4 @@
-//! Textures by name: those of sessions, of scenes, and the default one.
+//! Textures by name: of sessions, of scenes, and the default one.
 
 use std::sync::{Arc, Mutex};
 
@@ -16,20 +16,20 @@ use crate::refusal::Refusal;
 use crate::scene::Appearance;
 use crate::texture::{Texture, texture};
 
-/// The account on which they are made and kept: what is kept serves whoever asks next.
-const EVERYBODY: &str = "textures";
+/// The account that textures are charged to. No caller pays for them: a kept texture serves later callers too.
+const ACCOUNT: &str = "textures";
 
-/// Textures that a server keeps.
+/// Number of textures that a server keeps.
 const MOST_KEPT: usize = 8;
 
-/// While it is painted.
+/// Memory for painting a texture, bytes per pixel.
 const BYTES_PER_PIXEL: u64 = 16;
 
-/// The textures last asked for, the newest last.
+/// The textures that were requested last, the newest last.
 #[derive(Clone)]
 pub(crate) struct Textures {
     kept: Arc<Mutex<Vec<(Appearance, Texture, Taken)>>>,
-    /// Of their own: a texture may take a second, and nobody who wants a session waits for that.
+    /// Separate threads: a texture may take a second, and sessions must not wait for it.
     workshop: Workshop,
 }
 
@@ -39,24 +39,27 @@ impl Textures {
     }
 }
 
-/// `NAME.png` for a browser, which draws a picture of its own where there is none.
+/// Answers a browser's request for `NAME.png`. If there is no such texture, the page paints its own.
 pub(super) async fn file(house: House, Path(file): Path<String>, headers: HeaderMap) -> Response {
     match house.texture(file.strip_suffix(".png").unwrap_or(&file)).await {
-        // A scene's own image may be another one soon.
+        // A scene's image may change.
         Ok(texture) => page::cached(texture.png, "image/png", "no-cache", &headers),
-        // Not an error, of which a browser would tell.
+        // Not an error status: a browser would log one.
         Err(_) => StatusCode::NO_CONTENT.into_response(),
     }
 }
 
 impl House {
-    /// The texture of a session by its id, of a scene that the server has by its name, or the `default` one. Made or read
-    /// once, and kept: a second or so for who asks first.
+    /// The texture of a session by its ID, of a scene by its name, or the one named `default`. It is made or read once and
+    /// then kept; the first request takes about a second.
+    ///
+    /// # Errors
+    /// Returns an error if there is no such session or scene, if its image is invalid, or if the server is overloaded.
     pub(crate) async fn texture(&self, name: &str) -> Result<Texture, Status> {
         let (house, name) = (self.clone(), name.to_owned());
-        // One at a time: the next may be the same.
-        let everybody = self.pacer.budget.account(EVERYBODY);
-        Ok(self.textures.workshop.work(&everybody, move |_| house.find_texture(&name)).await??)
+        // One account, so one at a time: the next request may be for the same texture.
+        let account = self.pacer.budget.account(ACCOUNT);
+        Ok(self.textures.workshop.work(&account, move |_| house.find_texture(&name)).await??)
     }
 
     fn find_texture(&self, name: &str) -> Result<Texture, Refusal> {
@@ -70,8 +73,7 @@ impl House {
         if let Some((_, texture, _)) = kept.iter().find(|entry| entry.0 == appearance) {
             return Ok(texture.clone());
         }
-        // What is kept serves whoever asks next: nobody pays for it alone.
-        let account = self.pacer.budget.account(EVERYBODY);
+        let account = self.pacer.budget.account(ACCOUNT);
         let side = u64::from(appearance.texture_size);
         if kept.len() == MOST_KEPT {
             kept.remove(0);

@@ -1,4 +1,4 @@
-//! TLS and mutual TLS: the certificate that the server shows, and whose certificates it takes.
+//! TLS and mutual TLS: the server's certificate, and the authorities of the client certificates that it accepts.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -14,25 +14,25 @@ use super::reload::{Reloaded, of_file, warn_if_readable};
 use super::validity;
 use crate::refusal::{Reason, Refusal, Result};
 
-/// How connections are made secure.
+/// The TLS configuration of new connections.
 pub(super) struct Tls {
     pub(super) config: Arc<ServerConfig>,
-    /// When certificates end, s since 1970, and of which file they are.
-    ends: Vec<(PathBuf, i64)>,
+    /// The file of each certificate, and when it expires, s since 1970.
+    expiries: Vec<(PathBuf, i64)>,
 }
 
-/// So long before it ends a certificate is warned of, s.
+/// The log warns of a certificate this long before it expires, s.
 const NEAR_S: i64 = 14 * validity::DAY_S;
 
 impl Tls {
-    /// Certificates that have ended or will soon.
+    /// Logs a warning for each certificate that has expired or will soon.
     #[allow(clippy::disallowed_methods)]
-    pub(super) fn warn_of_ends(&self) {
-        // Certificates are of the wall clock.
+    pub(super) fn warn_of_expiry(&self) {
+        // Certificates expire by the wall clock.
         let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
         let now_s = i64::try_from(now.as_secs()).unwrap_or(i64::MAX);
-        for (path, ends_s) in &self.ends {
-            let left_s = ends_s.saturating_sub(now_s);
+        for (path, expires_s) in &self.expiries {
+            let left_s = expires_s.saturating_sub(now_s);
             if left_s <= 0 {
                 warn!("{}: the certificate has expired: clients refuse it", path.display());
             } else if left_s < NEAR_S {
@@ -42,7 +42,8 @@ impl Tls {
     }
 }
 
-/// Of the files `cert`, `key` and, if clients must show one, the certificates that sign theirs.
+/// Loads the certificate chain `cert` and its key. With `client_ca`, clients must present a certificate that one of its
+/// authorities has signed.
 pub(super) fn load(cert: &Path, key: &Path, client_ca: Option<&Path>) -> Result<Reloaded<Tls>> {
     warn_if_readable(key, "the private key");
     let mut paths = vec![cert.to_owned(), key.to_owned()];
@@ -54,10 +55,10 @@ pub(super) fn load(cert: &Path, key: &Path, client_ca: Option<&Path>) -> Result<
 fn configure(paths: &[PathBuf], texts: &[String]) -> Result<Tls> {
     let unreadable = |what: &str| Refusal::new(Reason::Unreadable, "", what.to_owned());
     let chain = certificates(&paths[0], &texts[0])?;
-    let mut ends: Vec<_> = chain.iter().filter_map(|c| Some((paths[0].clone(), validity::ends_s(c)?))).collect();
-    // An error of a key says nothing of the key.
+    let mut expiries: Vec<_> = chain.iter().filter_map(|c| Some((paths[0].clone(), validity::expires_s(c)?))).collect();
+    // The parser's error is dropped: no part of a key may appear in a log.
     let key = PrivateKeyDer::from_pem_slice(texts[1].as_bytes())
-        .map_err(|_| of_file(&paths[1])(unreadable("is no private key in PEM")))?;
+        .map_err(|_| of_file(&paths[1])(unreadable("is not a private key in PEM")))?;
     let provider = Arc::new(ring::default_provider());
     let builder = ServerConfig::builder_with_provider(provider.clone())
         .with_safe_default_protocol_versions()
@@ -67,7 +68,7 @@ fn configure(paths: &[PathBuf], texts: &[String]) -> Result<Tls> {
             let refuse = |why: String| of_file(path)(unreadable(&why));
             let mut roots = RootCertStore::empty();
             for certificate in certificates(path, text)? {
-                ends.extend(validity::ends_s(&certificate).map(|ends_s| (path.clone(), ends_s)));
+                expiries.extend(validity::expires_s(&certificate).map(|expires_s| (path.clone(), expires_s)));
                 roots.add(certificate).map_err(|e| refuse(e.to_string()))?;
             }
             let verifier = WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider).build();
@@ -76,23 +77,23 @@ fn configure(paths: &[PathBuf], texts: &[String]) -> Result<Tls> {
         _ => builder.with_no_client_auth(),
     };
     let mut config = builder.with_single_cert(chain, key).map_err(|e| {
-        let both = format!("with the key of {}: {e}", paths[1].display());
+        let both = format!("can't be used with the key {}: {e}", paths[1].display());
         of_file(&paths[0])(unreadable(&both))
     })?;
     config.alpn_protocols = vec![b"h2".to_vec(), b"http/1.1".to_vec()];
-    let tls = Tls { config: Arc::new(config), ends };
-    tls.warn_of_ends();
+    let tls = Tls { config: Arc::new(config), expiries };
+    tls.warn_of_expiry();
     Ok(tls)
 }
 
 fn certificates(path: &Path, text: &str) -> Result<Vec<CertificateDer<'static>>> {
     let read: std::result::Result<Vec<_>, _> = CertificateDer::pem_slice_iter(text.as_bytes()).collect();
     let refuse = |why: String| of_file(path)(Refusal::new(Reason::Unreadable, "", why));
-    let certificates = read.map_err(|e| refuse(format!("is no certificate in PEM: {e}")))?;
+    let certificates = read.map_err(|e| refuse(format!("is not a certificate in PEM: {e}")))?;
     if certificates.is_empty() { Err(refuse("has no certificate in PEM".into())) } else { Ok(certificates) }
 }
 
-/// The names that a client's certificate gives it: DNS names and URIs of its `subjectAltName`. The chain has been checked.
+/// The names in a client's certificate: DNS names and URIs of its `subjectAltName`. TLS has verified the chain before.
 pub(super) fn names(chain: &[CertificateDer<'_>]) -> Vec<String> {
     let Some(certificate) = chain.first().and_then(|first| webpki::EndEntityCert::try_from(first).ok()) else {
         return Vec::new();

@@ -1,10 +1,10 @@
-//! What the transport (HTTP/2) is given of a connection, and what it says when it cuts one.
+//! Flow control between a socket and the transport (HTTP/2), and the reason when a transport closes a connection.
 //!
-//! The transport counts small DATA frames that came and that nobody has read: each is charged 256 bytes less its own, and
-//! above half of the connection's window it takes them for an attack and cuts the connection. A client that commands a
-//! tool at 1 kHz sends nothing but such frames. When the server has stood still, or its cores were busy, seconds of them
-//! wait in the socket, and the transport would read them all before anybody gets a turn. So we give it no more than a
-//! portion before its readers have taken that: the rest waits in the system's buffer, where TCP holds the client back.
+//! The transport counts small DATA frames that it has received and that no reader has taken: it charges each with 256 bytes
+//! less its length. When the sum exceeds half of the connection's window, it assumes an attack and closes the connection. A
+//! client that commands a tool at 1 kHz sends nothing but such frames. After a stall of the server, seconds of them wait in
+//! the socket, and the transport would read them all before any reader runs. So we give it no more than a portion until its
+//! readers have taken that. The rest waits in the system's buffer, where TCP slows the client down.
 
 use std::pin::Pin;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -14,18 +14,18 @@ use std::time::Duration;
 use futures_util::task::AtomicWaker;
 use tokio::time::{Instant, Sleep};
 
-/// What a small frame is charged, less its length, bytes (`DEFAULT_DATA_FRAME_OVERHEAD_THRESHOLD` of the crate h2).
+/// A frame is charged with this many bytes less its length (`DEFAULT_DATA_FRAME_OVERHEAD_THRESHOLD` of the crate h2).
 const SMALL_BYTES: usize = 256;
 
-/// What may be charged for frames that nobody has taken before no more is read, as a part of the connection's window: the
-/// transport cuts at half of it, after eight portions of which none was taken.
+/// Portions in a connection's window. Reading stops when the frames that no reader has taken are charged with a portion; the
+/// transport closes the connection at half of the window, so after eight portions of which none was taken.
 const PORTIONS: usize = 16;
 
-/// So long nothing more is read for readers that take nothing. Then a portion is given all the same: an answer may wait for
-/// what comes behind, and what was sent to a stream that is over is never taken.
+/// Longest time without reading while readers take nothing. Then another portion is read regardless: an answer may depend on
+/// later frames, and frames of a stream that has ended are never taken.
 const PATIENCE: Duration = Duration::from_millis(100);
 
-/// What one connection has given the transport that nobody has taken yet; and whether it is to be closed.
+/// The bytes that one connection's untaken frames are charged with, and whether the connection is to be closed.
 #[derive(Debug)]
 pub(super) struct Gate {
     portion_bytes: usize,
@@ -39,18 +39,18 @@ fn charge(bytes: usize) -> usize {
 }
 
 impl Gate {
-    /// Of a connection with that window.
+    /// For a connection with that window.
     pub(super) fn new(window_bytes: u32) -> Self {
         let portion_bytes = (window_bytes as usize / PORTIONS).max(SMALL_BYTES);
         Gate { portion_bytes, charged_bytes: 0.into(), closed: false.into(), waker: AtomicWaker::new() }
     }
 
-    /// The transport was given a frame with so many bytes.
+    /// Counts a frame with this many bytes that the transport was given.
     fn given(&self, bytes: usize) {
         self.charged_bytes.fetch_add(charge(bytes), Ordering::AcqRel);
     }
 
-    /// Who was meant has taken a frame with so many bytes.
+    /// Counts a frame with this many bytes that its reader has taken.
     pub(super) fn taken(&self, bytes: usize) {
         let less = |charged: usize| Some(charged.saturating_sub(charge(bytes)));
         let before = self.charged_bytes.fetch_update(Ordering::AcqRel, Ordering::Acquire, less).unwrap_or_default();
@@ -60,19 +60,19 @@ impl Gate {
         }
     }
 
-    /// Closes the connection, whatever goes on there.
+    /// Closes the connection, whatever its state.
     pub(super) fn close(&self) {
         self.closed.store(true, Ordering::Release);
         self.waker.wake();
     }
 
-    /// Whether it is to be closed; who asks is woken when it is.
+    /// Whether the connection is to be closed; registers the task to be woken when it is.
     pub(super) fn is_closed(&self, context: &Context<'_>) -> bool {
         self.waker.register(context.waker());
         self.closed.load(Ordering::Acquire)
     }
 
-    /// Over when it is to be closed.
+    /// Waits until the connection is to be closed.
     pub(super) async fn closed(&self) {
         std::future::poll_fn(|context| if self.is_closed(context) { Poll::Ready(()) } else { Poll::Pending }).await;
     }
@@ -82,12 +82,12 @@ impl Gate {
     }
 }
 
-/// Holds a connection back whose frames nobody takes.
+/// Stops reading from a connection while its readers take nothing.
 #[derive(Debug, Default)]
-pub(super) struct Holdback(Option<Pin<Box<Sleep>>>);
+pub(super) struct ReadPause(Option<Pin<Box<Sleep>>>);
 
-impl Holdback {
-    /// Ready when more may be read; who asks was registered by [`Gate::is_closed`] before.
+impl ReadPause {
+    /// Ready when more may be read. The caller has registered its task by [`Gate::is_closed`] before.
     pub(super) fn poll(&mut self, gate: &Gate, context: &mut Context<'_>) -> Poll<()> {
         if gate.is_full() {
             let until = Instant::now() + PATIENCE;
@@ -107,39 +107,40 @@ impl Holdback {
     }
 }
 
-/// Why a transport cuts a connection.
+/// Why a transport closed a connection.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct Cut {
-    /// By RFC 9113.
+    /// The name of the error code in RFC 9113.
     pub(super) reason: &'static str,
-    /// The words of who cut it, fit for a log.
+    /// The debug data of the GOAWAY frame, escaped for a log.
     pub(super) words: String,
 }
 
-/// One direction of a connection as it passes: of HTTP/2 the heads of its frames are read.
+/// A reader of the frame headers in one direction of a connection: the state of its parser.
 #[derive(Debug, Default)]
 pub(super) enum Frames {
-    /// So many bytes of the preface have come.
+    /// Nothing has arrived yet.
     #[default]
     Unknown,
+    /// This many bytes of HTTP/2's preface have arrived.
     Preface(usize),
-    /// It is HTTP/1.1.
+    /// The protocol is HTTP/1.1.
     Other,
     Head([u8; HEAD_BYTES], usize),
     Payload(usize),
     GoAway(usize, Vec<u8>),
 }
 
-/// Length (3 bytes), kind, flags and stream (4).
+/// A frame's header: length (3 bytes), type, flags and stream (4).
 const HEAD_BYTES: usize = 9;
 const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
 const DATA: u8 = 0;
 const GOAWAY: u8 = 7;
 
-/// Of a GOAWAY: the last stream, the reason, and what is kept of the words.
+/// Bytes of a GOAWAY's payload that are kept: the last stream, the error code, and the beginning of the debug data.
 const MOST_OF_GOAWAY: usize = 8 + 64;
 
-/// Names of the reasons, by RFC 9113, section 7.
+/// Names of the error codes, RFC 9113, section 7.
 const REASONS: [&str; 14] = [
     "NO_ERROR",
     "PROTOCOL_ERROR",
@@ -158,41 +159,41 @@ const REASONS: [&str; 14] = [
 ];
 
 impl Frames {
-    /// Before the first frame of a server.
+    /// The state before a server's first frame: a server sends no preface.
     pub(super) fn of_server() -> Self {
         Frames::Head([0; HEAD_BYTES], 0)
     }
 
-    /// HTTP/2 is spoken.
+    /// Whether the protocol is HTTP/2.
     pub(super) fn are_read(&self) -> bool {
         !matches!(self, Frames::Unknown | Frames::Preface(_) | Frames::Other)
     }
 
-    /// So many bytes have passed: counts their DATA frames at `gate`; tells if the connection is cut.
+    /// Parses further bytes and counts their DATA frames at `gate`. Returns the reason if they end the connection.
     pub(super) fn pass(&mut self, mut bytes: &[u8], gate: Option<&Gate>) -> Option<Cut> {
         let mut cut = None;
         while !bytes.is_empty() {
             match self {
                 Frames::Unknown => *self = Frames::Preface(0),
                 Frames::Other => break,
-                Frames::Preface(come) => {
-                    let here = bytes.len().min(PREFACE.len() - *come);
-                    if bytes[..here] != PREFACE[*come..*come + here] {
+                Frames::Preface(read) => {
+                    let here = bytes.len().min(PREFACE.len() - *read);
+                    if bytes[..here] != PREFACE[*read..*read + here] {
                         *self = Frames::Other;
                         break;
                     }
-                    *come += here;
+                    *read += here;
                     bytes = &bytes[here..];
-                    if *come == PREFACE.len() {
+                    if *read == PREFACE.len() {
                         *self = Frames::Head([0; HEAD_BYTES], 0);
                     }
                 }
-                Frames::Head(head, come) => {
-                    let here = bytes.len().min(HEAD_BYTES - *come);
-                    head[*come..*come + here].copy_from_slice(&bytes[..here]);
-                    *come += here;
+                Frames::Head(head, read) => {
+                    let here = bytes.len().min(HEAD_BYTES - *read);
+                    head[*read..*read + here].copy_from_slice(&bytes[..here]);
+                    *read += here;
                     bytes = &bytes[here..];
-                    if *come == HEAD_BYTES {
+                    if *read == HEAD_BYTES {
                         let length = usize::from(head[0]) << 16 | usize::from(head[1]) << 8 | usize::from(head[2]);
                         if let (DATA, Some(gate)) = (head[3], gate) {
                             gate.given(length);
@@ -218,7 +219,7 @@ impl Frames {
                     bytes = &bytes[here..];
                     *left -= here;
                     if *left == 0 {
-                        cut = told(kept).or(cut);
+                        cut = parse_goaway(kept).or(cut);
                         *self = Frames::Head([0; HEAD_BYTES], 0);
                     }
                 }
@@ -228,8 +229,8 @@ impl Frames {
     }
 }
 
-/// What a GOAWAY says, unless it is an orderly end.
-fn told(payload: &[u8]) -> Option<Cut> {
+/// The reason in a GOAWAY's payload; `None` for an orderly end.
+fn parse_goaway(payload: &[u8]) -> Option<Cut> {
     let code: [u8; 4] = payload.get(4..8)?.try_into().ok()?;
     let reason =
         *usize::try_from(u32::from_be_bytes(code)).ok().and_then(|code| REASONS.get(code)).unwrap_or(&"UNKNOWN");
@@ -253,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn small_frames_are_charged_however_they_are_cut_up_and_until_they_are_taken() {
+    fn small_frames_are_charged_however_they_are_split_and_until_they_are_taken() {
         let goaway = [&[0, 0, 0, 0, 0, 0, 0, 11][..], b"too_many\x1b[2J"].concat();
         let said = [PREFACE, &frame(4, &[0; 18]), &frame(DATA, &[7; 56]), &frame(DATA, &[0; 300]), &frame(DATA, &[])];
         let said = [&said.concat()[..], &frame(GOAWAY, &goaway), &frame(DATA, &[9; 6])].concat();
@@ -262,7 +263,7 @@ mod tests {
             let cuts: Vec<_> = said.chunks(piece).filter_map(|bytes| frames.pass(bytes, Some(&gate))).collect();
             assert!(frames.are_read());
             assert_eq!(charged(&gate), 200 + 250, "in pieces of {piece}");
-            // Nothing of a client gets into a log as it is.
+            // A client's text is escaped before it is logged.
             assert_eq!(cuts, [Cut { reason: "ENHANCE_YOUR_CALM", words: "too_many\\u{1b}[2J".into() }]);
             gate.taken(56);
             gate.taken(300);
@@ -273,7 +274,7 @@ mod tests {
     }
 
     #[test]
-    fn an_orderly_end_is_no_cut_and_another_protocol_is_left_alone() {
+    fn an_orderly_end_is_no_error_and_another_protocol_is_not_parsed() {
         let mut frames = Frames::of_server();
         assert_eq!(frames.pass(&frame(GOAWAY, &[0; 8]), None), None);
         assert_eq!(frames.pass(&frame(GOAWAY, &[0; 3]), None), None);
@@ -284,16 +285,16 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_portion_that_nobody_takes_is_waited_for_but_not_for_ever() {
-        let (gate, mut holdback) = (Gate::new(WINDOW_BYTES), Holdback::default());
+    async fn a_portion_that_nobody_takes_stops_reading_for_a_limited_time() {
+        let (gate, mut read_pause) = (Gate::new(WINDOW_BYTES), ReadPause::default());
         for _ in 0..WINDOW_BYTES / 16 / 200 + 1 {
             gate.given(56);
         }
         let begun = Instant::now();
-        let passed = std::future::poll_fn(|context| holdback.poll(&gate, context));
+        let passed = std::future::poll_fn(|context| read_pause.poll(&gate, context));
         passed.await;
         assert!(begun.elapsed() >= PATIENCE);
         assert_eq!(charged(&gate), 0);
-        std::future::poll_fn(|context| holdback.poll(&gate, context)).await;
+        std::future::poll_fn(|context| read_pause.poll(&gate, context)).await;
     }
 }

@@ -1,4 +1,4 @@
-//! When a certificate ends. The library that checks certificates does not tell.
+//! When a certificate expires. The library that verifies certificates does not expose that.
 
 /// A day, s.
 pub(super) const DAY_S: i64 = 86_400;
@@ -6,17 +6,17 @@ pub(super) const DAY_S: i64 = 86_400;
 const SEQUENCE: u8 = 0x30;
 const UTC_TIME: u8 = 0x17;
 const GENERALIZED_TIME: u8 = 0x18;
-/// The version, which the first kind of certificates lacks.
+/// The tag of the version, a field that certificates of version 1 lack.
 const VERSION: u8 = 0xa0;
 
-/// The end of a certificate (X.509 in DER, RFC 5280), s since 1970.
-pub(super) fn ends_s(certificate: &[u8]) -> Option<i64> {
+/// When a certificate (X.509 in DER, RFC 5280) expires, s since 1970.
+pub(super) fn expires_s(certificate: &[u8]) -> Option<i64> {
     let (certificate, _) = element(certificate, Some(SEQUENCE))?;
     let (mut rest, _) = element(certificate, Some(SEQUENCE))?;
     if rest.first() == Some(&VERSION) {
         rest = element(rest, None)?.1;
     }
-    // Serial number, algorithm, issuer.
+    // Skips serial number, algorithm and issuer.
     for _ in 0..3 {
         rest = element(rest, None)?.1;
     }
@@ -27,7 +27,7 @@ pub(super) fn ends_s(certificate: &[u8]) -> Option<i64> {
     time_s(kind, text)
 }
 
-/// What is in the first element, of this kind if one is given, and what comes behind.
+/// The contents of the first element and the bytes after it; `None` if the element is not of `kind`, where one is given.
 fn element(bytes: &[u8], kind: Option<u8>) -> Option<(&[u8], &[u8])> {
     let (&first, &length) = (bytes.first()?, bytes.get(1)?);
     if kind.is_some_and(|kind| kind != first) {
@@ -47,7 +47,7 @@ fn element(bytes: &[u8], kind: Option<u8>) -> Option<(&[u8], &[u8])> {
     Some((rest.get(..length)?, rest.get(length..)?))
 }
 
-/// YYMMDDhhmmssZ, or with four digits of the year.
+/// Parses a time: YYMMDDhhmmssZ, or with four digits of the year.
 fn time_s(kind: u8, text: &[u8]) -> Option<i64> {
     let number = |from: usize, count: usize| -> Option<i64> {
         let digits = std::str::from_utf8(text.get(from..from + count)?).ok()?;
@@ -60,7 +60,7 @@ fn time_s(kind: u8, text: &[u8]) -> Option<i64> {
     };
     let (month, day) = (number(at, 2)?, number(at + 2, 2)?);
     let (hours, minutes, seconds) = (number(at + 4, 2)?, number(at + 6, 2)?, number(at + 8, 2)?);
-    // Days of a calendar whose years begin in March, since 1 March of the year 0.
+    // Days since 1 March of the year 0, in a calendar whose years begin in March: the leap day is each year's last.
     let (year, month) = if month > 2 { (year, month - 3) } else { (year - 1, month + 9) };
     let days = 365 * year + year / 4 - year / 100 + year / 400 + (153 * month + 2) / 5 + day - 1;
     Some((days - 719_468) * DAY_S + 3600 * hours + 60 * minutes + seconds)
@@ -71,8 +71,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_end_of_a_certificate_is_found() {
-        for (year, month, day, ends) in [
+    fn the_expiry_of_a_certificate_is_found() {
+        for (year, month, day, expires) in [
             (2024, 2, 29, 1_709_164_800),
             (2049, 12, 31, 2_524_521_600),
             (2050, 1, 1, 2_524_608_000),
@@ -83,11 +83,11 @@ mod tests {
             params.not_after = rcgen::date_time_ymd(year, month, day);
             let key = rcgen::KeyPair::generate().unwrap();
             let certificate = params.self_signed(&key).unwrap();
-            assert_eq!(ends_s(certificate.der()), Some(ends));
-            // However it is cut off, nothing but an end is found in it.
+            assert_eq!(expires_s(certificate.der()), Some(expires));
+            // A certificate that is cut off has no expiry.
             let bytes = certificate.der();
             for length in 0..bytes.len() {
-                assert!(ends_s(&bytes[..length]).is_none());
+                assert!(expires_s(&bytes[..length]).is_none());
             }
         }
     }

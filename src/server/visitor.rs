@@ -1,5 +1,5 @@
-//! Who makes a call, for what is charged to them: known by their token or certificate, and by their address where nobody
-//! is asked.
+//! The caller of a call, as the account that the call is charged to: the name of its token or certificate, or its address
+//! where authentication is disabled.
 
 use std::net::IpAddr;
 
@@ -9,17 +9,17 @@ use tonic::Extensions;
 use super::connections::{Peer, network};
 use crate::budget::Account;
 
-/// In the extensions of every call that the guard has let through.
+/// The caller. The guard puts it into the extensions of every call that it lets through.
 #[derive(Debug, Clone)]
 pub(crate) struct Visitor {
     pub(crate) account: Account,
-    /// The end of its connection may not be noticed, or says nothing: HTTP/1.1, and gRPC-web, whose connections a browser
-    /// shares among pages.
+    /// The client may go away without the server noticing by its connection: HTTP/1.1, and gRPC-web, whose connections a
+    /// browser shares among pages.
     pub(crate) may_vanish: bool,
 }
 
 impl Visitor {
-    /// The name of an account: of `caller`, if they were asked who they are.
+    /// The name of a caller's account; `caller` is the authenticated name, if any.
     pub(super) fn account_name(caller: Option<&str>, peer: Option<&Peer>) -> String {
         match (caller, peer) {
             (Some(name), _) => format!("token:{name}"),
@@ -34,14 +34,14 @@ impl Visitor {
         Visitor { account, may_vanish: is_web || request.version() < Version::HTTP_2 }
     }
 
-    /// Whoever made the call; the guard put them there.
+    /// The caller of the call with these extensions.
     pub(super) fn of(extensions: &Extensions) -> Self {
         let known = extensions.get::<Visitor>().cloned();
         known.unwrap_or_else(|| Visitor { account: Account::alone(), may_vanish: true })
     }
 }
 
-/// The account of who comes from there: of IPv6, from one network of 64 bits.
+/// The name of an address's account. Addresses of one IPv6 network of 64 bits share an account.
 pub(super) fn address_name(address: IpAddr) -> String {
     format!("address:{}", network(address))
 }

@@ -1,7 +1,7 @@
-//! Work of milliseconds or more that a call waits for (a session laid out, a force law, a texture), on threads that give
-//! way to those that step. Callers have their turns one after another, and each has one piece under way at a time: so to ask
-//! for much delays nobody but who asks, as long as fewer ask for much than there are threads, and others by no more than a
-//! piece. What nobody waits for any more is not begun, and is told to end.
+//! Runs work that takes milliseconds or more and that a call waits for (a session's scene, a force law, a texture) on
+//! threads of lower priority than the stepping threads. Callers take turns, and each has at most one job running. A caller
+//! with many jobs therefore delays only itself, as long as there are fewer such callers than threads; beyond that, others
+//! wait for at most one job. A job that no call waits for any more is not started, or is told to stop.
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -19,197 +19,210 @@ use crate::pace::clock::now_ns;
 use crate::pace::priority::give_way;
 use crate::refusal::{Reason, Refusal};
 
-/// Threads of a workshop.
+/// Number of threads of a workshop.
 const THREADS: usize = 2;
 
-/// Tells work whether anybody still waits for it.
+/// Tells a job that its call does not wait for it any more.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Stop(Arc<AtomicBool>);
+pub(crate) struct CancelFlag(Arc<AtomicBool>);
 
-impl Stop {
-    /// Set when nobody waits any more.
+impl CancelFlag {
+    /// The flag; it is set when the call does not wait any more.
     pub(crate) fn flag(&self) -> &AtomicBool {
         &self.0
     }
 }
 
-struct Piece {
+struct Job {
     number: u64,
-    asked_ns: u64,
-    work: Box<dyn FnOnce() + Send>,
+    requested_ns: u64,
+    run: Box<dyn FnOnce() + Send>,
 }
 
 #[derive(Default)]
-struct Shop {
-    /// By the number of the account, in the order of their turns; nobody without work.
-    waiting: VecDeque<(u64, VecDeque<Piece>)>,
-    /// For whom something is done, and since when it was asked for.
-    working: Vec<(u64, u64)>,
-    pieces: u64,
+struct Queue {
+    /// The waiting jobs of each account that has any, by its number, in the order of their turns.
+    waiting: VecDeque<(u64, VecDeque<Job>)>,
+    /// The running jobs: the account's number, and when the job was requested, ns.
+    running: Vec<(u64, u64)>,
+    next_number: u64,
     is_closed: bool,
 }
 
-impl Shop {
-    /// The first of the next caller for whom nothing is being done.
-    fn next(&mut self) -> Option<(u64, Piece)> {
-        let is_free = |account: u64| !self.working.iter().any(|busy| busy.0 == account);
-        let turn = self.waiting.iter().position(|(account, _)| is_free(*account))?;
-        let (account, mut pieces) = self.waiting.remove(turn)?;
-        let piece = pieces.pop_front()?;
-        if !pieces.is_empty() {
-            self.waiting.push_back((account, pieces));
+impl Queue {
+    /// Starts the first job of the next account without a running job, and returns both.
+    fn start_next(&mut self) -> Option<(u64, Job)> {
+        let is_idle = |account: u64| !self.running.iter().any(|running| running.0 == account);
+        let turn = self.waiting.iter().position(|(account, _)| is_idle(*account))?;
+        let (account, mut jobs) = self.waiting.remove(turn)?;
+        let job = jobs.pop_front()?;
+        if !jobs.is_empty() {
+            self.waiting.push_back((account, jobs));
         }
-        self.working.push((account, piece.asked_ns));
-        Some((account, piece))
+        self.running.push((account, job.requested_ns));
+        Some((account, job))
     }
 
     fn remove(&mut self, account: u64, number: u64) {
-        if let Some((_, pieces)) = self.waiting.iter_mut().find(|waiting| waiting.0 == account) {
-            pieces.retain(|piece| piece.number != number);
+        if let Some((_, jobs)) = self.waiting.iter_mut().find(|waiting| waiting.0 == account) {
+            jobs.retain(|job| job.number != number);
         }
         self.waiting.retain(|waiting| !waiting.1.is_empty());
     }
 }
 
-struct Bench {
-    shop: Mutex<Shop>,
-    more: Condvar,
+struct Shared {
+    queue: Mutex<Queue>,
+    changed: Condvar,
     deadline: Duration,
     most_waiting: usize,
 }
 
-impl Bench {
+impl Shared {
+    /// Runs jobs until the workshop is closed and no job is left to start.
     fn work(&self) {
-        let mut shop = lock(&self.shop);
+        let mut queue = lock(&self.queue);
         loop {
-            if let Some((account, piece)) = shop.next() {
-                drop(shop);
-                (piece.work)();
-                shop = lock(&self.shop);
-                if let Some(done) = shop.working.iter().position(|busy| busy.0 == account) {
-                    shop.working.swap_remove(done);
+            if let Some((account, job)) = queue.start_next() {
+                drop(queue);
+                (job.run)();
+                queue = lock(&self.queue);
+                if let Some(done) = queue.running.iter().position(|running| running.0 == account) {
+                    queue.running.swap_remove(done);
                 }
-                // Its next piece may be begun by any thread.
-                self.more.notify_all();
-            } else if shop.is_closed {
+                // Any thread may start the account's next job.
+                self.changed.notify_all();
+            } else if queue.is_closed {
                 return;
             } else {
-                shop = self.more.wait(shop).unwrap_or_else(PoisonError::into_inner);
+                queue = self.changed.wait(queue).unwrap_or_else(PoisonError::into_inner);
             }
         }
     }
 }
 
-/// Ends the threads with the last clone of a workshop.
-struct Door(Arc<Bench>);
+/// Ends the threads when it is dropped, with the last clone of a workshop.
+struct CloseOnDrop(Arc<Shared>);
 
-impl Drop for Door {
+impl Drop for CloseOnDrop {
     fn drop(&mut self) {
-        lock(&self.0.shop).is_closed = true;
-        self.0.more.notify_all();
+        lock(&self.0.queue).is_closed = true;
+        self.0.changed.notify_all();
     }
 }
 
-/// Whoever waits for a piece. When they are gone it is not begun, and ends soon if it was.
-struct Waiting {
-    bench: Arc<Bench>,
+/// A call's wait for its job. When it is dropped, the job is cancelled: removed from the queue, or told to stop.
+struct CancelOnDrop {
+    shared: Arc<Shared>,
     account: u64,
     number: u64,
-    stop: Stop,
+    cancelled: CancelFlag,
 }
 
-impl Drop for Waiting {
+impl Drop for CancelOnDrop {
     fn drop(&mut self) {
-        self.stop.0.store(true, Ordering::Relaxed);
-        lock(&self.bench.shop).remove(self.account, self.number);
+        self.cancelled.0.store(true, Ordering::Relaxed);
+        lock(&self.shared.queue).remove(self.account, self.number);
     }
 }
 
-/// How much there is to do.
+/// How busy a workshop is.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Load {
-    /// Pieces that wait for their turn.
+    /// Number of jobs that wait for their turn.
     pub(crate) waiting: usize,
-    /// How long ago the oldest was asked for, of those that wait and those under way; 0 if there is none, s.
+    /// Age of the oldest waiting or running job since its request; 0 if there is none, s.
     pub(crate) oldest_s: f64,
-    /// The oldest should be over.
+    /// Whether the oldest job is past its deadline.
     pub(crate) is_late: bool,
 }
 
 /// Threads for heavy work. They end with the last clone.
 #[derive(Clone)]
-pub(crate) struct Workshop(Arc<Door>);
+pub(crate) struct Workshop(Arc<CloseOnDrop>);
 
 impl Workshop {
     /// Starts the threads.
+    ///
+    /// # Errors
+    /// Returns the system's error if a thread can't be started.
     pub(crate) fn open(name: &str, limits: &Limits) -> std::io::Result<Self> {
         let deadline = Duration::from_secs_f64(limits.work_s);
-        let (shop, more) = (Mutex::default(), Condvar::new());
-        let bench = Arc::new(Bench { shop, more, deadline, most_waiting: limits.queued_work });
-        let door = Arc::new(Door(bench.clone()));
+        let (queue, changed) = (Mutex::default(), Condvar::new());
+        let shared = Arc::new(Shared { queue, changed, deadline, most_waiting: limits.queued_work });
+        let close = Arc::new(CloseOnDrop(shared.clone()));
         for index in 0..THREADS {
-            let bench = bench.clone();
+            let shared = shared.clone();
             std::thread::Builder::new().name(format!("{name}-{index}")).spawn(move || {
                 give_way();
-                bench.work();
+                shared.work();
             })?;
         }
-        Ok(Workshop(door))
+        Ok(Workshop(close))
     }
 
-    /// Does `work` when it is the turn of `account`. Who hangs up before that is passed over; who hangs up later sets the
-    /// flag that `work` is given, and so does the deadline.
+    /// Runs `work` when it is the turn of `account`. If the call ends or the deadline passes before that, `work` never runs;
+    /// if it happens while `work` runs, the flag that `work` has is set.
+    ///
+    /// # Errors
+    /// Returns an error if too many jobs of this account wait, if the deadline passes, or if `work` panics.
     pub(crate) async fn work<T: Send + 'static>(
         &self,
         account: &Account,
-        work: impl FnOnce(&Stop) -> T + Send + 'static,
+        work: impl FnOnce(&CancelFlag) -> T + Send + 'static,
     ) -> Result<T, Status> {
         let (done, result) = oneshot::channel();
-        let stop = Stop::default();
-        let told = stop.clone();
-        let work = move || {
-            if let Ok(answer) = catch_unwind(AssertUnwindSafe(|| work(&told))) {
+        let cancelled = CancelFlag::default();
+        let flag = cancelled.clone();
+        let run = move || {
+            if let Ok(answer) = catch_unwind(AssertUnwindSafe(|| work(&flag))) {
                 let _ = done.send(answer);
             }
         };
-        let _waiting = self.put(account.number(), stop, Box::new(work))?;
+        let _waiting = self.enqueue(account.number(), cancelled, Box::new(run))?;
         match tokio::time::timeout(self.0.0.deadline, result).await {
             Ok(Ok(answer)) => Ok(answer),
-            Ok(Err(_)) => Err(Status::internal("a fault of the program ended what was asked for")),
+            Ok(Err(_)) => Err(Status::internal("internal error (worker panicked)")),
             Err(_) => {
-                let message = format!("was not done within {} s (limits.work_s)", self.0.0.deadline.as_secs_f64());
+                let message =
+                    format!("the work took longer than {} s (limits.work_s)", self.0.0.deadline.as_secs_f64());
                 Err(Refusal::new(Reason::TimedOut, "", message).into())
             }
         }
     }
 
-    fn put(&self, account: u64, stop: Stop, work: Box<dyn FnOnce() + Send>) -> Result<Waiting, Refusal> {
-        let bench = &self.0.0;
-        let mut shop = lock(&bench.shop);
-        let number = shop.pieces;
-        shop.pieces += 1;
-        let piece = Piece { number, asked_ns: now_ns(), work };
-        match shop.waiting.iter_mut().find(|waiting| waiting.0 == account) {
-            Some((_, pieces)) if pieces.len() >= bench.most_waiting => {
-                let message =
-                    format!("{} pieces of work of this caller wait already (limits.queued_work)", pieces.len());
+    fn enqueue(
+        &self,
+        account: u64,
+        cancelled: CancelFlag,
+        run: Box<dyn FnOnce() + Send>,
+    ) -> Result<CancelOnDrop, Refusal> {
+        let shared = &self.0.0;
+        let mut queue = lock(&shared.queue);
+        let number = queue.next_number;
+        queue.next_number += 1;
+        let job = Job { number, requested_ns: now_ns(), run };
+        match queue.waiting.iter_mut().find(|waiting| waiting.0 == account) {
+            Some((_, jobs)) if jobs.len() >= shared.most_waiting => {
+                let message = format!("this caller has {} jobs waiting already (limits.queued_work)", jobs.len());
                 return Err(Refusal::new(Reason::Overloaded, "", message));
             }
-            Some((_, pieces)) => pieces.push_back(piece),
-            None => shop.waiting.push_back((account, VecDeque::from([piece]))),
+            Some((_, jobs)) => jobs.push_back(job),
+            None => queue.waiting.push_back((account, VecDeque::from([job]))),
         }
-        bench.more.notify_one();
-        Ok(Waiting { bench: bench.clone(), account, number, stop })
+        shared.changed.notify_one();
+        Ok(CancelOnDrop { shared: shared.clone(), account, number, cancelled })
     }
 
-    /// How much there is to do.
+    /// How busy the workshop is.
     pub(crate) fn load(&self) -> Load {
-        let shop = lock(&self.0.0.shop);
-        let pieces = shop.waiting.iter().flat_map(|waiting| &waiting.1);
-        let begun = shop.working.iter().map(|busy| busy.1);
-        let asked_ns = pieces.map(|piece| piece.asked_ns).chain(begun).min();
-        let oldest = asked_ns.map_or(Duration::ZERO, |asked| Duration::from_nanos(now_ns().saturating_sub(asked)));
-        let waiting = shop.waiting.iter().map(|waiting| waiting.1.len()).sum();
+        let queue = lock(&self.0.0.queue);
+        let jobs = queue.waiting.iter().flat_map(|waiting| &waiting.1);
+        let running = queue.running.iter().map(|running| running.1);
+        let requested_ns = jobs.map(|job| job.requested_ns).chain(running).min();
+        let age = |requested_ns| Duration::from_nanos(now_ns().saturating_sub(requested_ns));
+        let oldest = requested_ns.map_or(Duration::ZERO, age);
+        let waiting = queue.waiting.iter().map(|waiting| waiting.1.len()).sum();
         Load { waiting, oldest_s: oldest.as_secs_f64(), is_late: oldest > self.0.0.deadline }
     }
 }
@@ -230,7 +243,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn work_of_one_caller_is_done_in_order_whatever_becomes_of_a_piece() {
+    async fn jobs_of_one_caller_run_in_order_even_after_a_panic() {
         let (workshop, [one]) = (workshop(Limits::default()), accounts(["one"]));
         let faulty = workshop.work(&one, |_| -> u32 { panic!("a test") }).await;
         assert_eq!(faulty.unwrap_err().code(), tonic::Code::Internal);
@@ -241,15 +254,16 @@ mod tests {
         });
         futures_util::future::join_all(all).await;
         assert_eq!(*lock(&order), (0..20).collect::<Vec<_>>());
-        assert_eq!(workshop.load(), Load { waiting: 0, oldest_s: workshop.load().oldest_s, is_late: false });
+        let load = workshop.load();
+        assert!(load.waiting == 0 && !load.is_late, "{load:?}");
     }
 
     #[tokio::test]
-    async fn one_callers_endless_work_does_not_stop_anothers_and_ends_when_it_is_given_up() {
+    async fn one_callers_endless_jobs_do_not_stop_anothers_and_end_when_they_are_cancelled() {
         let (workshop, [greedy, other]) = (workshop(Limits::default()), accounts(["greedy", "other"]));
         let (ended, end) = mpsc::channel();
         let endless = |ended: mpsc::Sender<()>| {
-            move |stop: &Stop| {
+            move |stop: &CancelFlag| {
                 while !stop.flag().load(Ordering::Relaxed) {
                     std::thread::yield_now();
                 }
@@ -265,7 +279,7 @@ mod tests {
         while workshop.load().waiting < 4 {
             tokio::task::yield_now().await;
         }
-        // One piece is under way, four wait, and the other thread is free.
+        // One job runs, four wait, and the other thread is free.
         for number in 0..10 {
             assert_eq!(workshop.work(&other, move |_| number).await.unwrap(), number);
         }
@@ -274,7 +288,7 @@ mod tests {
         for asked in asked {
             assert!(asked.await.unwrap_err().is_cancelled());
         }
-        // The one that was begun was told to end; the others never began.
+        // The running job was told to stop; the others never began.
         end.recv().unwrap();
         assert_eq!(workshop.load().waiting, 0);
         assert_eq!(workshop.work(&greedy, |_| 7).await.unwrap(), 7);
@@ -286,10 +300,10 @@ mod tests {
         let limits = Limits { queued_work: 2, work_s: 0.2, ..Limits::default() };
         let (workshop, [one]) = (workshop(limits), accounts(["one"]));
         let (release, gate) = mpsc::channel::<()>();
-        // Deaf to the flag.
+        // A job that ignores the flag.
         let stuck = workshop.work(&one, move |_| gate.recv().is_err());
         let mut waiting = Box::pin(futures_util::future::join(stuck, workshop.work(&one, |_| ())));
-        let is_stuck = || workshop.load().waiting == 1 && !lock(&workshop.0.0.shop).working.is_empty();
+        let is_stuck = || workshop.load().waiting == 1 && !lock(&workshop.0.0.queue).running.is_empty();
         while !is_stuck() {
             let now = std::future::poll_fn(|cx| std::task::Poll::Ready(waiting.as_mut().poll(cx).is_pending()));
             assert!(now.await);
@@ -303,7 +317,7 @@ mod tests {
         assert_eq!(stuck.unwrap_err().code(), tonic::Code::DeadlineExceeded);
         assert_eq!(second.unwrap_err().code(), tonic::Code::DeadlineExceeded);
         drop(third);
-        // What is stuck is told of until it ends.
+        // The stuck job counts until it ends.
         assert!(workshop.load().is_late && workshop.load().waiting == 0);
         drop(release);
         assert_eq!(workshop.work(&one, |_| 7).await.unwrap(), 7);

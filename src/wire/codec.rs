@@ -1,5 +1,5 @@
-//! How messages are read: a request is looked through before it is decoded, for a megabyte of empty parts would take a
-//! network thread a tenth of a second and many times their memory.
+//! Decodes messages, requests with a bound on their fields: the fields are counted before decoding. A megabyte of empty
+//! parts would otherwise occupy a network thread for a tenth of a second and take many times its size in memory.
 
 use prost::{Message, Name};
 use tonic::Status;
@@ -8,16 +8,16 @@ use tonic_prost::ProstCodec;
 
 use crate::refusal::{Reason, Refusal, Result};
 
-/// Fields of a request's own level: all the commands of a batch that may wait, and some more.
+/// Largest number of fields at a request's top level: a batch of as many commands as may wait, and some more.
 const MOST_FIELDS: usize = 4096 + 256;
 
-/// Fields of all levels of a request together: such a batch of poses, or 20,000 fixed points.
+/// Largest number of fields of all levels of a request together: such a batch of poses, or 20,000 fixed points.
 const MOST_FIELDS_IN_ALL: usize = 1 << 16;
 
-/// Levels that are looked at: more than any request has.
+/// Levels that are counted: more than any request has.
 const LEVELS: u32 = 16;
 
-/// Protobuf, of which requests are bounded. What a server answers is trusted by whoever chose the server.
+/// The protobuf codec with a bound on requests. Answers have no bound: a client trusts the server that it has chosen.
 pub struct BoundedCodec<T, U>(ProstCodec<T, U>);
 
 impl<T, U> Default for BoundedCodec<T, U> {
@@ -45,7 +45,7 @@ where
     }
 }
 
-/// Reads messages that are not too much.
+/// The decoder of [`BoundedCodec`].
 pub struct BoundedDecoder<D> {
     inner: D,
     is_request: bool,
@@ -60,10 +60,10 @@ impl<D: Decoder<Error = Status>> Decoder for BoundedDecoder<D> {
         if !self.is_request {
             return self.inner.decode(buffer);
         }
-        // A message lies in one piece.
+        // The buffer holds the message in one chunk.
         check(buffer.chunk())?;
         self.inner.decode(buffer).map_err(|status| {
-            let message = format!("is no message of this protocol: {}", status.message());
+            let message = format!("the message can't be decoded: {}", status.message());
             Refusal::new(Reason::Unreadable, "", message).into()
         })
     }
@@ -73,7 +73,7 @@ impl<D: Decoder<Error = Status>> Decoder for BoundedDecoder<D> {
     }
 }
 
-/// Refuses a message of more fields than a request has use for.
+/// Refuses a message with more fields than any valid request has.
 fn check(message: &[u8]) -> Result<()> {
     let too_many = |what: &str, most: usize| {
         Refusal::new(Reason::TooLarge, "", format!("the message has more than {most} {what}: send it in parts"))
@@ -82,13 +82,13 @@ fn check(message: &[u8]) -> Result<()> {
     match count(message, LEVELS, &mut left) {
         _ if left == 0 => Err(too_many("fields in all", MOST_FIELDS_IN_ALL)),
         Some(own) if own > MOST_FIELDS => Err(too_many("fields or entries of its own", MOST_FIELDS)),
-        // What can't be read is refused by who decodes it.
+        // The decoder refuses malformed messages.
         _ => Ok(()),
     }
 }
 
-/// The fields of a message, and takes those of all levels from `left` until nothing is left. None: it is no message. A text
-/// that could be one counts as one.
+/// Counts the fields of a message; subtracts those of all levels from `left` until it is 0. Returns `None` if the bytes are
+/// not a message. A text or byte string that could be a message counts as one.
 fn count(mut message: &[u8], levels: u32, left: &mut usize) -> Option<usize> {
     let mut fields = 0;
     while !message.is_empty() && *left > 0 {
@@ -114,7 +114,7 @@ fn count(mut message: &[u8], levels: u32, left: &mut usize) -> Option<usize> {
     Some(fields)
 }
 
-/// A number of variable length, taken from the front.
+/// Takes a varint from the front of `bytes`.
 fn varint(bytes: &mut &[u8]) -> Option<u64> {
     let mut value = 0;
     for shift in (0..64).step_by(7) {
@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn a_batch_that_may_wait_passes_and_a_flood_of_empty_parts_does_not() {
+    fn a_full_batch_of_commands_passes_and_a_flood_of_empty_parts_does_not() {
         let command = pb::Command {
             tool: 63,
             sequence: u64::MAX,
@@ -169,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_message_is_left_to_who_decodes_it() {
+    fn malformed_messages_are_left_to_the_decoder() {
         for bytes in [&[0xff; 100][..], &[0x0a, 0xff, 0xff, 0xff, 0x7f], &[0x0b], &[0x80; 20], &[]] {
             check(bytes).unwrap();
         }

@@ -1,4 +1,4 @@
-//! Commands.
+//! Conversion of commands.
 
 use glam::{DQuat, DVec3};
 
@@ -10,7 +10,10 @@ use crate::scene::script::Action;
 use crate::scene::tip::{Coupling, Tip};
 use crate::session::command::Command;
 
-/// A command out of a message that came at `arrival_ns`.
+/// The command in a message that arrived at `arrival_ns`.
+///
+/// # Errors
+/// Returns an error if a field is missing, a point is not on the sheet, or an orientation is not of length 1.
 pub fn from_command(message: &pb::Command, sheet: &Sheet, arrival_ns: u64) -> Result<Command> {
     use pb::command::Action as Message;
     let action = match required("action", message.action.as_ref())? {
@@ -49,7 +52,7 @@ pub fn from_command(message: &pb::Command, sheet: &Sheet, arrival_ns: u64) -> Re
     })
 }
 
-/// Where a pose has its tip.
+/// The position of a pose's tip, m.
 fn from_pose(pose: &pb::Pose) -> Result<DVec3> {
     let position_m = from_vector(required("pose.position_m", pose.position_m.as_ref()).map(Some)?);
     let offset_m = from_vector(pose.tip_offset_m.as_ref());
@@ -59,7 +62,7 @@ fn from_pose(pose: &pb::Pose) -> Result<DVec3> {
     Ok(position_m + turn.normalize() * offset_m)
 }
 
-/// A tip out of a message; what an absent one is.
+/// The tip in a message; the default tip if it is absent.
 pub fn from_tip(tip: Option<&pb::Tip>) -> Tip {
     tip.map_or_else(Tip::default, |tip| Tip {
         radius_m: tip.radius_m,
@@ -87,13 +90,13 @@ pub fn tip(tip: &Tip) -> pb::Tip {
     }
 }
 
-/// A message of what a script tells tool `tool`, to act at step `at_step`.
+/// The message of a script's command to tool `tool`, which acts at step `at_step`.
 #[allow(clippy::cast_possible_truncation)]
 pub fn scripted(tool: usize, at_step: u64, action: &Action, client_time_ns: u64) -> pb::Command {
     pb::Command { at_step: Some(at_step), ..now(tool as u32, at_step + 1, action, client_time_ns) }
 }
 
-/// A message of what a tool is to do when it arrives, or of a pose, by the client's own time.
+/// The message of a command without a step: it acts when it arrives; a pose acts by the client's time.
 pub fn now(tool: u32, sequence: u64, action: &Action, client_time_ns: u64) -> pb::Command {
     use pb::command::Action as Message;
     let action = match action {

@@ -1,4 +1,4 @@
-//! Refusals as gRPC statuses, with google.rpc.ErrorInfo.
+//! Refusals as gRPC statuses with google.rpc.ErrorInfo.
 
 use std::collections::HashMap;
 
@@ -7,7 +7,7 @@ use tonic_types::{ErrorDetails, StatusExt};
 
 use crate::refusal::{Reason, Refusal};
 
-/// Domain of every `ErrorInfo`.
+/// The domain of every `ErrorInfo`.
 pub const DOMAIN: &str = "palpate";
 
 /// The status code of a reason.
@@ -55,7 +55,7 @@ impl From<Refusal> for Status {
     }
 }
 
-/// What a client shows of a status: its message, and the reason if it has one.
+/// The text that a client shows for a status: its message, with the reason or, if there is none, the code.
 pub fn describe(status: &Status) -> String {
     match status.get_details_error_info() {
         Some(info) => format!("{} ({})", status.message(), info.reason),
@@ -68,7 +68,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_reason_is_told_in_the_guide() {
+    fn the_guide_explains_every_reason() {
         let guide = include_str!("../../docs/protocol.md");
         for reason in Reason::ALL {
             assert!(guide.contains(&format!("`{}`", reason.as_str())), "docs/protocol.md lacks {}", reason.as_str());

@@ -1,4 +1,4 @@
-//! Devices, force laws and local models.
+//! Conversion of devices, force laws and local models.
 
 use glam::{DMat3, DVec3};
 
@@ -8,7 +8,10 @@ use crate::haptics::{Device, LocalModel};
 use crate::refusal::{Reason, Refusal, Result};
 use crate::sheet::Standing;
 
-/// A device out of a message.
+/// The device in a message.
+///
+/// # Errors
+/// Returns an error if the name is not fit for a log, or if a limit of the device is out of range.
 pub fn from_device(message: &pb::Device) -> Result<Device> {
     crate::refusal::label("device.name", &message.name)?;
     let device = Device {
@@ -48,7 +51,10 @@ pub fn law(law: &Law) -> pb::ForceLaw {
     pb::ForceLaw { step_m: law.step_m, rows: law.rows.iter().map(row).collect(), coarse: law.is_coarse }
 }
 
-/// A force law out of a message.
+/// The force law in a message.
+///
+/// # Errors
+/// Returns an error if a client can't use the law ([`Law::is_sound`]).
 pub fn from_law(message: &pb::ForceLaw) -> Result<Law> {
     let row = |row: &pb::ForceLawRow| Row {
         force_n: row.force_n,
@@ -60,7 +66,8 @@ pub fn from_law(message: &pb::ForceLaw) -> Result<Law> {
     };
     let rows = message.rows.iter().map(row).collect();
     let law = Law { step_m: message.step_m, rows, is_coarse: message.coarse };
-    let wrong = || Refusal::new(Reason::OutOfRange, "law", "must have two rows or more, finite and rising");
+    let range = "must have at least two rows, all numbers finite and at least 0, and forces that never fall";
+    let wrong = || Refusal::new(Reason::OutOfRange, "law", range);
     if law.is_sound() { Ok(law) } else { Err(wrong()) }
 }
 
@@ -100,7 +107,7 @@ pub fn local_model(model: &LocalModel) -> pb::LocalModel {
     }
 }
 
-/// A local model out of a message. What can't be rendered is refused by the renderer.
+/// The local model in a message. The renderer refuses models that it can't render.
 pub fn from_local_model(message: &pb::LocalModel, step: u64) -> LocalModel {
     let standing = match message.contact() {
         pb::Contact::Unspecified | pb::Contact::Free => Standing::Free,
@@ -126,15 +133,15 @@ pub fn from_local_model(message: &pb::LocalModel, step: u64) -> LocalModel {
     }
 }
 
-/// Headers of gRPC, HTTP/2, TCP and IP around a message of a stream.
+/// Bytes of the headers around a message of a stream: gRPC, HTTP/2, TCP and IP.
 const HEADER_BYTES: u64 = 5 + 9 + 32 + 20;
 
-/// What a sample takes on the wire, bytes.
+/// The size of a sample on the wire, bytes.
 pub fn wire_bytes(sample: &pb::Sample) -> u64 {
     prost::Message::encoded_len(sample) as u64 + HEADER_BYTES
 }
 
-/// What a sample of one tool with this model takes on the wire, bytes.
+/// The size on the wire of a sample of one tool with this model, bytes.
 pub fn sample_bytes(model: &LocalModel) -> u64 {
     let tool = pb::ToolSample {
         acknowledged_sequence: model.sequence,

@@ -1,4 +1,4 @@
-//! Samples, records, sessions and frames on their way out; records on their way back in.
+//! Conversion of samples, records, sessions and frames to messages, and of records back.
 
 use std::sync::Arc;
 
@@ -15,7 +15,10 @@ use crate::sheet::audit::Origin;
 use crate::surface::Encoding;
 use crate::surface::encode::Patch;
 
-/// Which samples a stream asks for. `renders`: it has declared a device.
+/// The samples that a stream asks for. `renders`: the stream has declared a device.
+///
+/// # Errors
+/// Returns an error if a value is out of range, or if a deadband of rendered force is given without a device.
 pub fn sampling(
     every_steps: Option<u32>,
     only: Option<Vec<u32>>,
@@ -24,7 +27,7 @@ pub fn sampling(
     renders: bool,
 ) -> Result<Sampling> {
     if !renders && deadband.is_some_and(|deadband| deadband.rendered_fraction.is_some()) {
-        let message = "is missing: deadband.rendered_fraction goes by its local models";
+        let message = "is missing, but deadband.rendered_fraction requires it";
         return Err(Refusal::new(Reason::Missing, "device", message));
     }
     let sampling = Sampling {
@@ -44,7 +47,7 @@ pub fn sampling(
     Ok(sampling)
 }
 
-/// A sample that leaves at `now_ns`.
+/// A sample as a message that is sent at `now_ns`.
 pub fn sample(paced: &PacedSample, dropped: u64, now_ns: u64) -> pb::Sample {
     let sample = &paced.sample;
     #[allow(clippy::cast_possible_truncation)]
@@ -85,7 +88,7 @@ fn tool_sample(tool: &ToolSample, due_ns: u64, now_ns: u64) -> pb::ToolSample {
     }
 }
 
-/// A refused command.
+/// A refused command as a message.
 pub fn rejection(tool: u32, sequence: u64, refusal: &Refusal) -> pb::Rejection {
     pb::Rejection {
         tool,
@@ -97,11 +100,11 @@ pub fn rejection(tool: u32, sequence: u64, refusal: &Refusal) -> pb::Rejection {
     }
 }
 
-/// Points of one message of a record.
+/// Points per message of a record.
 const POINTS_PER_MESSAGE: usize = 1000;
 
-/// Message `part` of a record; a record of no points is one as well. One at a time: those of a large sheet would take a
-/// second to write, and a gigabyte.
+/// Message `part` of a record; `None` after the last. A record without points has one message. The messages are made one
+/// at a time: those of a large sheet together would take a second and a gigabyte.
 pub fn record(paced: &PacedRecord, dropped: u64, part: usize) -> Option<pb::ProbeResponse> {
     let record = &paced.record;
     let parts = record.points.len().div_ceil(POINTS_PER_MESSAGE).max(1);
@@ -141,7 +144,7 @@ fn point_record(record: &Point) -> pb::PointRecord {
     }
 }
 
-/// Adds a message to a record; true when that was its last.
+/// Adds a message to a record; returns whether it was the record's last.
 pub fn add_to_record(record: &mut Record, message: &pb::ProbeResponse) -> bool {
     let array = |v: &Option<pb::Vector3>| from_vector(v.as_ref()).to_array();
     record.time_s = message.simulation_time_s;
@@ -167,7 +170,7 @@ pub fn add_to_record(record: &mut Record, message: &pb::ProbeResponse) -> bool {
     message.last
 }
 
-/// A session as it stands.
+/// The current state of a session as a message.
 pub fn session(live: &Arc<Live>) -> pb::Session {
     let status = live.status();
     let (held_tools, lapsed_leases, counts) = live.at_intake(|intake, _| {
@@ -216,7 +219,7 @@ pub fn session(live: &Arc<Live>) -> pb::Session {
     with_model(session, model)
 }
 
-/// What audits have found, if there was one.
+/// The results of a session's audits; `None` before the first.
 fn audit(live: &Live) -> Option<pb::Audit> {
     let audited = live.audited();
     let (step, newest) = audited.newest?;
@@ -241,7 +244,7 @@ fn audit(live: &Live) -> Option<pb::Audit> {
     })
 }
 
-/// A session, with what is known of the tissue from `model`.
+/// Adds the fields that describe the tissue's model.
 pub fn with_model(session: pb::Session, model: &Model) -> pb::Session {
     pb::Session {
         scene: Some(super::scene::scene(&model.scene)),
@@ -249,13 +252,13 @@ pub fn with_model(session: pb::Session, model: &Model) -> pb::Session {
         substeps: model.plan.substeps,
         precision: model.precision.name().to_owned(),
         warnings: model.warnings.clone(),
-        // A scheme of which nothing is known may be as wrong as can be.
+        // An unknown error counts as the largest possible one.
         expected_error: if model.expected_error.is_finite() { model.expected_error } else { 1.0 },
         ..session
     }
 }
 
-/// Bytes of displacements in one message: those of other streams wait no longer than one of these takes.
+/// Bytes of displacements per message: messages of other streams wait for at most one of these.
 const FRAME_BYTES_PER_MESSAGE: usize = 64 << 10;
 
 /// The messages of a frame for one viewer.

@@ -1,4 +1,4 @@
-//! Scenes. The same fields and defaults as in a scene file; ranges are checked when the scene is compiled.
+//! Conversion of scenes: the fields and defaults of a scene file. Ranges are checked when the scene is compiled.
 
 use super::{from_point, pb, point, required};
 use crate::refusal::{Reason, Refusal, Result};
@@ -6,7 +6,10 @@ use crate::scene::{
     Appearance, Change, Fixed, Integrator, Lanes, Named, PointSet, Precision, Scene, Sheet, Springs, Stepping,
 };
 
-/// A scene out of a message.
+/// The scene in a message.
+///
+/// # Errors
+/// Returns an error if a required field is missing, or if a name or set is unknown.
 pub fn from_scene(message: &pb::Scene) -> Result<Scene> {
     let sheet = required("sheet", message.sheet.as_ref())?;
     let springs = required("springs", message.springs.as_ref())?;
@@ -46,7 +49,7 @@ fn from_fixed(fixed: Option<&pb::sheet::Fixed>) -> Result<Fixed> {
             Ok(pb::FixedSet::Edges) => Fixed::Edges,
             Ok(pb::FixedSet::Corners) => Fixed::Corners,
             Err(_) => {
-                return Err(Refusal::new(Reason::WrongKind, "sheet.fixed_set", format!("{set} is no set of points")));
+                return Err(Refusal::new(Reason::WrongKind, "sheet.fixed_set", format!("unknown set of points {set}")));
             }
         },
     })
@@ -61,13 +64,13 @@ fn from_stepping(message: &pb::Stepping) -> Result<Stepping> {
         integrator: Integrator::named("stepping.integrator", &or_auto(&message.integrator))?,
         substeps: message.substeps,
         precision: Precision::named("stepping.precision", &or_auto(&message.precision))?,
-        // A matter of the server's machine.
+        // The server chooses this for its processor.
         lanes: Lanes::Auto,
         correct: message.correct,
     })
 }
 
-/// A change of a tissue.
+/// The change of the tissue in a message.
 pub fn from_change(message: &pb::UpdateTissueRequest) -> Change {
     Change {
         stiffness_n_per_m: message.stiffness_n_per_m,
@@ -76,7 +79,7 @@ pub fn from_change(message: &pb::UpdateTissueRequest) -> Change {
     }
 }
 
-/// Asks for a change at the beginning of a step.
+/// The message that requests a change of the tissue at the beginning of step `step`.
 pub fn update_tissue(session_id: &str, change: &Change, step: u64) -> pb::UpdateTissueRequest {
     pb::UpdateTissueRequest {
         session_id: session_id.to_owned(),
@@ -87,7 +90,7 @@ pub fn update_tissue(session_id: &str, change: &Change, step: u64) -> pb::Update
     }
 }
 
-/// A message of a scene, every default filled in.
+/// A scene as a message, with all defaults filled in.
 pub fn scene(scene: &Scene) -> pb::Scene {
     #[allow(clippy::cast_possible_truncation)]
     let [points_x, points_y] = scene.sheet.points.map(|points| Some(points as u32));
@@ -134,7 +137,7 @@ mod tests {
     use crate::limits::Limits;
 
     #[test]
-    fn a_scene_comes_back_as_it_went() {
+    fn a_scene_survives_conversion_both_ways() {
         let mut paper = Scene::parse("paper", crate::scene::PAPER, &[], &Limits::default()).unwrap();
         let points = |points: &[[usize; 2]]| Fixed::Points(points.iter().copied().collect());
         for fixed in [Fixed::Edges, Fixed::Corners, points(&[]), points(&[[30, 0], [1, 2], [30, 0]])] {

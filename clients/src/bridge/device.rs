@@ -1,18 +1,20 @@
-//! What a bridge needs of a haptic device, and devices that are simulated.
+//! The interface of haptic devices, and simulated devices.
 //!
-//! # An adapter for a real one
+//! # Adapters for real devices
 //!
-//! Implement [`HapticDevice`] over the maker's library, and hand it to [`super::serve`]: the bridge does the rest, at
-//! 1 kHz, on a thread of its own. Places are in metres in the device's frame, forces in newtons on the hand; whatever
-//! else the library speaks (OpenHaptics mm, joints in degrees) is turned into that here and nowhere else.
+//! Implement [`HapticDevice`] with the manufacturer's library and pass it to [`super::serve`], which calls it at 1 kHz on a
+//! thread of its own. Positions are in metres in the device's frame; forces are in newtons and act on the hand. Convert the
+//! library's units (OpenHaptics uses mm, and degrees for joints) in your adapter.
 //!
 //! - OpenHaptics: `read` is `hdBeginFrame`, `hdGetDoublev(HD_CURRENT_POSITION)`·1e-3, `HD_CURRENT_BUTTONS`; `write` is
 //!   `hdSetDoublev(HD_CURRENT_FORCE)`, `hdEndFrame`; `descriptor` is `HD_NOMINAL_MAX_FORCE`, `HD_NOMINAL_MAX_STIFFNESS`.
-//! - Force Dimension: `dhdGetPosition`, `dhdGetButton`; `dhdSetForce`. Leave `dhdEnableExpertMode` alone.
-//! - Haply Inverse3: the newest `cursor_position` of its stream; `set_cursor_force`. Its z is up, as ours is.
+//! - Force Dimension: `read` is `dhdGetPosition`, `dhdGetButton`; `write` is `dhdSetForce`. Do not call
+//!   `dhdEnableExpertMode`.
+//! - Haply Inverse3: `read` is the newest `cursor_position` of its stream; `write` is `set_cursor_force`. Its z axis points
+//!   up, like ours.
 //!
-//! `read` and `write` are called once a tick and must not wait for longer than a part of one. An error of either ends the
-//! loop after the force has been set to zero.
+//! Each tick calls `read` and `write` once; both must return within a fraction of a tick. An error of either ends the loop
+//! at once, without a further `write`: set the force to zero in the adapter before you return one.
 
 use std::time::Instant;
 
@@ -22,38 +24,44 @@ use palpate::haptics::hand::{Hand, Held};
 
 use crate::link::Task;
 
-/// What a device says at a tick.
+/// What a device reports at a tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Reading {
-    /// In the device's frame, m.
+    /// Position in the device's frame, m.
     pub(crate) place_m: DVec3,
-    /// Its owner asks for forces: a button, a pedal. Only a change from false to true enables.
+    /// The operator asks for forces, by a button or pedal. Only a change from false to true enables them.
     pub(crate) enable: bool,
 }
 
 /// A haptic device.
 pub(crate) trait HapticDevice: Send {
-    /// What it can bear.
+    /// The device's limits.
     fn descriptor(&self) -> Device;
-    /// Where it is.
+    /// Reads position and button.
+    ///
+    /// # Errors
+    /// Returns an error if the device can't be read.
     fn read(&mut self) -> std::io::Result<Reading>;
-    /// What it renders until the next tick, N, in its own frame.
+    /// Sets the force to render until the next tick, N, in the device's frame.
+    ///
+    /// # Errors
+    /// Returns an error if the force can't be set.
     fn write(&mut self, force_n: DVec3) -> std::io::Result<()>;
 }
 
-/// What a simulated hand did in one part of its course.
+/// One part of a simulated hand's course.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Part {
-    /// When it ended, from the beginning, s.
+    /// The end of the part, since the beginning of the course, s.
     pub(crate) time_s: f64,
-    /// Where the hand was then, m.
+    /// Position of the hand at the end, m.
     pub(crate) place_m: DVec3,
-    /// What the device held meanwhile, N.
+    /// Force that the device held during the part, N.
     pub(crate) force_n: DVec3,
 }
 
-/// A device in a simulated hand. The hand goes on by the time that passes, whoever is late: until the next force is
-/// written, the device holds the last one, as real ones do.
+/// A simulated device in a simulated hand. The hand moves with real time, even if the loop is late: like a real device, it
+/// holds the last force until the next is written.
 pub(crate) struct Simulated {
     device: Device,
     hand: Hand,
@@ -64,7 +72,7 @@ pub(crate) struct Simulated {
     time_s: f64,
     energy_j: f64,
     energy_min_j: f64,
-    /// Its parts, if they are remembered.
+    /// The parts of the course, if they are remembered.
     course: Option<Vec<Part>>,
 }
 
@@ -79,17 +87,17 @@ impl Simulated {
         Simulated { device, hand, held, task, force_n, begun, time_s, energy_j, energy_min_j, course }
     }
 
-    /// What it did so far, if that is remembered.
+    /// The course so far; empty if it is not remembered.
     pub(crate) fn course(&self) -> &[Part] {
         self.course.as_deref().unwrap_or_default()
     }
 
-    /// The least that the port had received, J, each force counted for as long as the device held it.
+    /// The minimum of the energy that the port has received, J. Each force counts for as long as the device held it.
     pub(crate) fn energy_min_j(&self) -> f64 {
         self.energy_min_j
     }
 
-    /// Time goes on under the force that is held.
+    /// Advances the hand to `time_s` under the held force.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     fn advance_to(&mut self, time_s: f64) {
         let passed_s = time_s - self.time_s;
@@ -114,7 +122,7 @@ impl Simulated {
     }
 }
 
-/// The owner of a simulated hand asks for forces so often, s: it may be refused, or taken from it.
+/// The simulated operator asks for forces with this period, s: the envelope may refuse or stop them.
 const ASKS_EVERY_S: f64 = 0.3;
 
 impl HapticDevice for Simulated {
@@ -140,16 +148,16 @@ impl HapticDevice for Simulated {
 #[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
-    use crate::link::Dice;
+    use crate::link::Random;
 
     fn simulated(remember: bool) -> Simulated {
-        let task = Task::new(DVec3::ZERO, 0.0, 2.0, 1.0, &mut Dice::new(1, 0));
+        let task = Task::new(DVec3::ZERO, 0.0, 2.0, 1.0, &mut Random::new(1, 0));
         Simulated::new(Device::named("omega3").unwrap(), Hand::named("medium").unwrap(), task, remember)
     }
 
     #[test]
-    fn a_hand_goes_on_by_time_and_not_by_ticks() {
-        // The same force, held: it does not matter how often anybody looked.
+    fn a_hand_advances_by_time_and_not_by_ticks() {
+        // Under the same held force, the number of calls does not matter.
         let force_n = DVec3::new(0.0, 0.0, 0.5);
         let after = |looks: u32| {
             let mut simulated = simulated(false);
@@ -158,10 +166,10 @@ mod tests {
             (simulated.held.place_m, simulated.energy_j)
         };
         let (often, once) = (after(250), after(1));
-        // Within what the parts differ in: the target of each is taken at its middle.
+        // The parts differ in length, and each takes the target at its middle: hence the tolerance.
         assert!((often.0 - once.0).length() < 1e-7, "{often:?} {once:?}");
         assert!((often.1 - once.1).abs() < 1e-7, "{often:?} {once:?}");
-        assert!(often.0.z < simulated(false).held.place_m.z - 1e-3, "{often:?}: it did not go on");
+        assert!(often.0.z < simulated(false).held.place_m.z - 1e-3, "{often:?}: the hand did not move");
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! `palpate-client bridge`: a haptic device at a server, at 1 kHz.
+//! `palpate-client bridge`: connects a haptic device to a server at 1 kHz.
 
 pub(crate) mod device;
 pub(crate) mod line;
@@ -18,77 +18,82 @@ use crate::link;
 use device::{HapticDevice, Simulated};
 use line::{COMMANDS, Shared, Target};
 
-/// What `bridge` is asked for.
+/// Arguments of `bridge`.
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
     /// The server
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7117")]
     server: String,
-    /// A session that is there; otherwise one is made of --scene
+    /// ID of an existing session [default: a new session of --scene]
     #[arg(long, value_name = "ID")]
     session: Option<String>,
-    /// A scene that the server has by that name
+    /// Name of a scene of the server
     #[arg(long, value_name = "NAME", default_value = "liver")]
     scene: String,
     /// The tool's number
     #[arg(long, default_value_t = 0)]
     tool: u32,
-    /// A simulated device: touch, omni, desktop, falcon, omega3, delta3, sigma7, lambda7, inverse3 or undeclared
+    /// The simulated device: touch, omni, desktop, falcon, omega3, delta3, sigma7, lambda7, inverse3 or undeclared
     #[arg(long, default_value = "omega3")]
     device: String,
-    /// A simulated hand that holds it: light, medium, firm or none
+    /// The simulated hand that holds the device: light, medium, firm or none
     #[arg(long, default_value = "medium")]
     hand: String,
-    /// Samples only where the rendered force would be off by this part; 0: one a step
+    /// Receive a sample only when the rendered force would be off by more than this fraction; 0: one per step
     #[arg(long, value_name = "PART", default_value_t = 0.0)]
     deadband: f64,
-    /// Ends after so long, s; default: at Ctrl-C
+    /// End after this time, s [default: at Ctrl-C]
     #[arg(long, value_name = "S")]
     seconds: Option<f64>,
-    /// Of what the simulated hand does
+    /// Seed of the simulated hand's movements
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Write time, place, force and state of each tick to this file, as CSV; at most an hour of them
+    /// Write time, place, force and state of each tick to this file (CSV); at most an hour
     #[arg(long, value_name = "FILE")]
     course: Option<std::path::PathBuf>,
     #[command(flatten)]
     credentials: Credentials,
 }
 
-/// A tick of the device, s.
+/// Period of the device's loop, s.
 pub(crate) const TICK_S: f64 = 1e-3;
 
-/// A device so late has been held up, and what it missed is left out: a burst of ticks would be a backlog.
-const HELD_UP: Duration = Duration::from_millis(5);
+/// After a longer delay the loop skips the missed ticks: catching up would cause a burst.
+const MOST_LATE: Duration = Duration::from_millis(5);
 
-/// Ticks that are remembered at most.
+/// Largest number of ticks that are remembered.
 const MOST_REMEMBERED: usize = 3_600_000;
 
-/// What a device's loop remembers of a tick.
+/// One tick of a device's loop.
 pub(crate) struct Tick {
-    /// Since the loop began.
+    /// Time since the loop began, s.
     pub(crate) time_s: f64,
     pub(crate) place_m: DVec3,
-    /// Rendered.
+    /// The rendered force, N.
     pub(crate) force_n: DVec3,
-    /// None before there was a server.
+    /// `None` before the first connection.
     pub(crate) state: Option<State>,
 }
 
-/// What a device's loop has done.
+/// The results of a device's loop.
 pub(crate) struct Served {
-    /// Only as long as it was asked to remember.
+    /// The remembered ticks; empty unless the loop was to remember them.
     pub(crate) course: Vec<Tick>,
-    /// Of the last renderer.
+    /// The renderer's envelope; `None` without a connection.
     pub(crate) envelope: Option<Envelope>,
-    /// Ticks that began more than a tick late.
+    /// Number of ticks that began more than a tick late.
     pub(crate) late_ticks: u64,
-    /// Ticks that were left out.
+    /// Number of ticks that were skipped.
     pub(crate) missed_ticks: u64,
+    /// Age of the local model at each tick, s; empty unless the loop was to remember.
     pub(crate) ages_s: Vec<f64>,
 }
 
-/// Runs a device against a server for so long. The device's frame is the sheet's. `remember`: keeps its course.
+/// Runs the loop of a device for a time, or until `commands` is closed. The device's frame is the sheet's. `remember`: keeps
+/// the course and the models' ages.
+///
+/// # Errors
+/// Returns the device's error if it can't be read or written.
 pub(crate) fn serve(
     device: &mut dyn HapticDevice,
     shared: &Shared,
@@ -99,8 +104,8 @@ pub(crate) fn serve(
     let descriptor = device.descriptor();
     let mut renderer: Option<Renderer> = None;
     let mut served = Served { course: Vec::new(), envelope: None, late_ticks: 0, missed_ticks: 0, ages_s: Vec::new() };
-    let (start, mut asked) = (Instant::now(), false);
-    // A clock that does not begin at 0: 0 means no time.
+    let (start, mut was_asked) = (Instant::now(), false);
+    // The clock begins at 1 s, because 0 means "no time" in the protocol.
     let clock_s = |at: Instant| 1.0 + at.duration_since(start).as_secs_f64();
     let mut due = start;
     while lasts.is_none_or(|lasts| due < start + lasts) && !commands.is_closed() {
@@ -108,7 +113,7 @@ pub(crate) fn serve(
         let now = Instant::now();
         let late = now.duration_since(due);
         served.late_ticks += u64::from(late.as_secs_f64() > TICK_S);
-        if late > HELD_UP {
+        if late > MOST_LATE {
             #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
             let missed = (late.as_secs_f64() / TICK_S) as u64;
             served.missed_ticks += missed;
@@ -126,13 +131,13 @@ pub(crate) fn serve(
         };
         if let Some(law) = law {
             match &mut renderer {
-                // The envelope goes on: what was paused stays paused, what was rendered is let go at its rate.
+                // The envelope stays: what was paused stays paused, and a rendered force falls at the slew limit.
                 Some(renderer) => renderer.begin(law),
                 None => renderer = Some(Renderer::new(law, Envelope::new(descriptor, middle_m))),
             }
         }
         if let Some(renderer) = &mut renderer {
-            if reading.enable && !asked {
+            if reading.enable && !was_asked {
                 renderer.envelope.reset();
                 renderer.envelope.enable();
             }
@@ -144,13 +149,13 @@ pub(crate) fn serve(
                 served.ages_s.push(now_s - time_s);
             }
         }
-        asked = reading.enable;
+        was_asked = reading.enable;
         device.write(force_n)?;
         if remember && served.course.len() < MOST_REMEMBERED {
             let state = renderer.as_ref().map(Renderer::state);
             served.course.push(Tick { time_s: now_s - 1.0, place_m: reading.place_m, force_n, state });
         }
-        // A network that does not keep up gets the next one.
+        // If the network does not keep up, this position is dropped; the next one replaces it.
         let _ = commands.try_send((now_ns, reading.place_m));
     }
     let _ = device.write(DVec3::ZERO);
@@ -158,7 +163,7 @@ pub(crate) fn serve(
     Ok(served)
 }
 
-/// Sleeps, and looks at the clock for the last part.
+/// Sleeps until shortly before `due`, then polls the clock.
 fn wait_until(due: Instant) {
     const SPIN: Duration = Duration::from_micros(80);
     if let Some(rest) = due.checked_duration_since(Instant::now() + SPIN) {
@@ -169,7 +174,10 @@ fn wait_until(due: Instant) {
     }
 }
 
-/// Runs a simulated device.
+/// Runs a simulated device and prints the results.
+///
+/// # Errors
+/// Returns an error if an argument is refused, no connection succeeds, or the course can't be written.
 pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
     let refused = |refusal: palpate::refusal::Refusal| Failure::Refused(refusal.to_string());
     let (hand, device) =
@@ -178,7 +186,7 @@ pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
     let scene = scene.map_err(refused)?;
     let seconds = arguments.seconds.unwrap_or(3600.0);
     let middle_m = (scene.sheet.extent_m() / 2.0).extend(0.0);
-    let task = link::Task::new(middle_m, link::LEAD_S, seconds, 0.2, &mut link::Dice::new(arguments.seed, 0));
+    let task = link::Task::new(middle_m, link::LEAD_S, seconds, 0.2, &mut link::Random::new(arguments.seed, 0));
     let mut simulated = Simulated::new(device, hand, task, false);
     let target = Target {
         server: Server::new(&arguments.server, &arguments.credentials)?,
@@ -196,17 +204,17 @@ pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
         write_course(path, &served.course)?;
     }
     let inbound = shared.inbound();
-    let mut told = json!({
+    let mut report = json!({
         "connections": inbound.connections, "samples": inbound.samples, "commands_refused": inbound.refused,
         "late_ticks": served.late_ticks, "missed_ticks": served.missed_ticks,
     });
     if let Some(envelope) = &served.envelope {
-        told["energy_j"] = json!(envelope.energy_j());
-        told["enabled"] = json!(envelope.state() == State::Enabled);
+        report["energy_j"] = json!(envelope.energy_j());
+        report["enabled"] = json!(envelope.state() == State::Enabled);
         let counts = Reason::ALL.iter().map(|(reason, name)| ((*name).to_owned(), json!(envelope.count(*reason).0)));
-        told["interventions_ticks"] = serde_json::Value::Object(counts.collect());
+        report["interventions_ticks"] = serde_json::Value::Object(counts.collect());
     }
-    crate::tell!("{told}");
+    crate::tell!("{report}");
     Ok(())
 }
 
@@ -220,7 +228,10 @@ fn write_course(path: &std::path::Path, course: &[Tick]) -> Result<(), Failure> 
     std::fs::write(path, text).map_err(|error| Failure::Failed(format!("{}: {error}", path.display())))
 }
 
-/// A device's loop on a thread of its own, and the network beside it; for so long, or until Ctrl-C.
+/// Runs a device's loop on its own thread, and the network on the runtime; for a time, or until Ctrl-C.
+///
+/// # Errors
+/// Returns an error if the device fails, or if no connection succeeds.
 pub(crate) async fn run(
     device: &mut dyn HapticDevice,
     target: Target,
@@ -235,7 +246,7 @@ pub(crate) async fn run(
         async move {
             tokio::select! {
                 () = line::keep(target, descriptor, &shared, received) => {}
-                // The loop sees that nobody takes its commands any more.
+                // The loop notices that its channel of commands is closed.
                 _ = tokio::signal::ctrl_c() => {}
             }
         }
@@ -248,15 +259,15 @@ pub(crate) async fn run(
         });
         tokio::task::block_in_place(|| worker.join())
     });
-    let served = served.map_err(|_| Failure::Failed("the device's loop broke down".to_owned()))?;
-    // It waits for what a server may never say.
+    let served = served.map_err(|_| Failure::Failed("internal error (the device's loop panicked)".to_owned()))?;
+    // The task may wait for an answer that never arrives.
     network.abort();
     let _ = network.await;
     let served = served.map_err(|error| Failure::Failed(format!("the device: {error}")))?;
     let never = {
         let inbound = shared.inbound();
         (inbound.connections == 0)
-            .then(|| inbound.failure.clone().unwrap_or("the server said nothing in time".to_owned()))
+            .then(|| inbound.failure.clone().unwrap_or("the server did not answer in time".to_owned()))
     };
     match never {
         Some(why) => Err(Failure::Failed(format!("never connected: {why}"))),

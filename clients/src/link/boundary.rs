@@ -1,43 +1,44 @@
-//! The delay at which a hand and a spring at the far end of a wire become unstable: found by the loop of `link` itself,
-//! with a spring for a tissue, beside what theory says of it. A loop that misses this is believed nothing else.
+//! The delay at which a hand and a spring at the other end of a network become unstable: measured with the loop of `link`
+//! and a spring in place of the tissue, and predicted by theory. This validates the loop.
 
 use glam::DVec3;
 use palpate::haptics::hand::{HANDS, Hand, Held};
 use serde_json::{Value, json};
 
-use super::network::{Dice, Way, Weather};
+use super::network::{Conditions, Direction, Random};
 use super::run::TICK_S;
 use crate::Failure;
 
-/// Springs that are tried, N/m.
+/// Stiffnesses to try, N/m.
 pub(super) const STIFFNESSES_N_PER_M: [f64; 9] = [150.0, 250.0, 300.0, 400.0, 500.0, 700.0, 1000.0, 1500.0, 3000.0];
 
-/// Longest delay that is tried, ticks.
+/// Longest delay to try, ticks.
 const MOST_TICKS: u32 = 200;
 
-/// How long a loop is watched, s.
-const WATCHED_S: f64 = 4.0;
+/// Simulated duration of each try, s.
+const DURATION_S: f64 = 4.0;
 
-/// One combination.
+/// The result for one hand and one spring.
 pub(super) struct Boundary {
     pub(super) hand: &'static str,
     pub(super) stiffness_n_per_m: f64,
-    /// By theory, s.
+    /// The delay by theory, s.
     pub(super) predicted_s: f64,
-    /// By the loop; infinite if none was found below [`MOST_TICKS`].
+    /// The measured delay, s; infinite if the loop is stable up to [`MOST_TICKS`].
     pub(super) observed_s: f64,
 }
 
-/// By how much the energy of the vibration grows in the loop, e-folds a second.
+/// Growth rate of the vibration's energy in the loop, 1/s.
 fn growth_per_s(hand: &Hand, stiffness_n_per_m: f64, ticks: u32) -> f64 {
-    // All on one way: halves of an odd number of ticks would each count as a whole one more.
-    let weather = |ticks: u32| Weather { round_trip_s: 2.0 * f64::from(ticks) * TICK_S, jitter_s: 0.0, loss: 0.0 };
-    let mut up: Way<DVec3> = Way::new(weather(ticks), Dice::new(0, 0));
-    let mut down: Way<DVec3> = Way::new(weather(0), Dice::new(0, 1));
+    // The whole delay is on one way: with half of an odd number on each, each half would be rounded up to a tick.
+    let conditions =
+        |ticks: u32| Conditions { round_trip_s: 2.0 * f64::from(ticks) * TICK_S, jitter_s: 0.0, loss: 0.0 };
+    let mut up: Direction<DVec3> = Direction::new(conditions(ticks), Random::new(0, 0));
+    let mut down: Direction<DVec3> = Direction::new(conditions(0), Random::new(0, 1));
     let mut held = Held { place_m: DVec3::new(0.0, 0.0, 1e-3), velocity_m_per_s: DVec3::ZERO };
     let (mut place_m, mut force_n) = (DVec3::ZERO, DVec3::ZERO);
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    let whole = (WATCHED_S / TICK_S) as u32;
+    let whole = (DURATION_S / TICK_S) as u32;
     let mut halves = [0.0; 2];
     for tick in 0..whole {
         let now_s = f64::from(tick) * TICK_S;
@@ -50,23 +51,23 @@ fn growth_per_s(hand: &Hand, stiffness_n_per_m: f64, ticks: u32) -> f64 {
             force_n = force;
         }
         held = hand.advance(held, DVec3::ZERO, DVec3::ZERO, force_n, TICK_S);
-        // What it was set out with takes a while to forget.
+        // The first half is skipped: there the initial condition still shows.
         let part = 4 * tick / whole;
         if part >= 2 {
             let energy_j = hand.stiffness_n_per_m * held.place_m.length_squared()
                 + hand.mass_kg * held.velocity_m_per_s.length_squared();
             halves[part as usize - 2] += energy_j;
         }
-        // Decided long ago, and soon no number any more.
+        // Clearly unstable; stop before the numbers overflow.
         if held.place_m.length() >= 1e6 || held.place_m.is_nan() {
             return f64::INFINITY;
         }
     }
-    (halves[1] / halves[0]).ln() / (WATCHED_S / 4.0)
+    (halves[1] / halves[0]).ln() / (DURATION_S / 4.0)
 }
 
-/// The delay between two whole ticks at which the growth is zero. A force that is held for a tick is half a tick older
-/// than it says, in the mean.
+/// The delay, interpolated between two whole ticks, at which the growth is zero, s. Half a tick is added: a force that is
+/// held for a tick is half a tick older on average.
 fn observed_s(hand: &Hand, stiffness_n_per_m: f64) -> f64 {
     let mut before = f64::NEG_INFINITY;
     for ticks in 0..=MOST_TICKS {
@@ -80,13 +81,13 @@ fn observed_s(hand: &Hand, stiffness_n_per_m: f64) -> f64 {
     f64::INFINITY
 }
 
-/// Every hand with every spring for which there is a boundary to find.
+/// All combinations of hand and spring that have a boundary in the range of delays.
 pub(super) fn all() -> Vec<Boundary> {
     let mut found = Vec::new();
     for hand in &HANDS {
         for stiffness_n_per_m in STIFFNESSES_N_PER_M {
             let predicted_s = hand.critical_delay_s(stiffness_n_per_m);
-            // Below a tick there is nothing between two ticks to find.
+            // A delay below a tick can't be resolved.
             if predicted_s > TICK_S && predicted_s < f64::from(MOST_TICKS) * TICK_S {
                 let observed_s = observed_s(hand, stiffness_n_per_m);
                 found.push(Boundary { hand: hand.name, stiffness_n_per_m, predicted_s, observed_s });
@@ -96,7 +97,7 @@ pub(super) fn all() -> Vec<Boundary> {
     found
 }
 
-/// Prints all.
+/// Prints all combinations.
 pub(super) fn print(as_json: bool) -> Result<(), Failure> {
     let all = all();
     if as_json {

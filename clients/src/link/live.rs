@@ -1,13 +1,13 @@
-//! A run in real time, over a real connection to a real server: to show that virtual time tells the truth. The simulated
-//! hand, its task and the twin are those of `run`; the twin follows the tool's course when that is over, step by step of
-//! the time that has passed, whether the client was late or not.
+//! A run in real time, over a real connection to a real server: it validates the runs in virtual time. The simulated hand,
+//! its task and the twin are those of `run`. The twin follows the tool's course afterwards, step by step of the time that
+//! has passed, whether the client was late or not.
 
 use std::time::Duration;
 
 use palpate::haptics::Reason;
 
-use super::network::Dice;
-use super::run::{Account, Found, Setup, TICK_S, fitting_scale};
+use super::network::Random;
+use super::run::{Outcome, Setup, TICK_S, Totals, fitting_scale};
 use super::task::Task;
 use super::tissue::{Tissue, Twin};
 use crate::Failure;
@@ -16,15 +16,15 @@ use crate::bridge::device::{Part, Simulated};
 use crate::bridge::line::Target;
 use crate::connect::Server;
 
-/// Before the first press, s: the server computes its force law first.
+/// Time before the first press, s: the server computes its force law first.
 const LEAD_S: f64 = 3.0;
 
-/// Runs it at a server that has the scene by its name.
-pub(super) async fn run(setup: &Setup, server: Server) -> Result<Found, Failure> {
+/// Performs the run at a server, which must know the scene by its name.
+pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failure> {
     let Setup { model, law, tip, hand, device, deadband, duration_s, seed, .. } = setup;
     let middle_m = (model.scene.sheet.extent_m() / 2.0).extend(0.0);
     let scale = fitting_scale(setup, LEAD_S).map_err(Failure::Failed)?;
-    let task = Task::new(middle_m, LEAD_S, *duration_s, scale, &mut Dice::new(*seed, 0));
+    let task = Task::new(middle_m, LEAD_S, *duration_s, scale, &mut Random::new(*seed, 0));
     let mut simulated = Simulated::new(*device, *hand, task, true);
     let target = Target {
         server,
@@ -38,32 +38,32 @@ pub(super) async fn run(setup: &Setup, server: Server) -> Result<Found, Failure>
     let lasts = Duration::from_secs_f64(*duration_s);
     let (mut served, shared) = bridge::run(&mut simulated, target, Some(lasts), true).await?;
     let mut twin = Twin::new(Tissue::new(model, *tip, law.clone()));
-    let mut account = Account::default();
+    let mut totals = Totals::default();
     for (step, part) in steps(simulated.course()).enumerate() {
         let (true_n, touches) = twin.truth(part.place_m).map_err(Failure::Failed)?;
-        account.moved(part.place_m);
+        totals.moved(part.place_m);
         #[allow(clippy::cast_precision_loss)]
-        account.rendered((step + 1) as f64 * TICK_S, part.force_n, true_n, touches, None);
+        totals.rendered((step + 1) as f64 * TICK_S, part.force_n, true_n, touches, None);
     }
-    account.ages_s.append(&mut served.ages_s);
-    let mut found = account.close();
-    found.scale = scale;
-    // By the simulated hand itself: exact also between these steps.
-    found.energy_min_j = simulated.energy_min_j();
+    totals.ages_s.append(&mut served.ages_s);
+    let mut outcome = totals.close();
+    outcome.scale = scale;
+    // From the simulated hand, which is exact between these steps too.
+    outcome.energy_min_j = simulated.energy_min_j();
     let inbound = shared.inbound();
-    found.packets_per_s = inbound.samples as f64 / duration_s;
-    found.kbit_per_s = inbound.bytes as f64 * 8e-3 / duration_s;
-    found.commands_per_s = TICK_S.recip();
-    found.late_ticks = Some(served.late_ticks);
+    outcome.packets_per_s = inbound.samples as f64 / duration_s;
+    outcome.kbit_per_s = inbound.bytes as f64 * 8e-3 / duration_s;
+    outcome.commands_per_s = TICK_S.recip();
+    outcome.late_ticks = Some(served.late_ticks);
     if let Some(envelope) = &served.envelope {
         let (acted, ticks) = envelope.count(Reason::Passivity);
-        found.guard_share = acted as f64 / ticks.max(1) as f64;
-        found.interventions = Reason::ALL.iter().map(|(reason, name)| (*name, envelope.count(*reason).0)).collect();
+        outcome.guard_share = acted as f64 / ticks.max(1) as f64;
+        outcome.interventions = Reason::ALL.iter().map(|(reason, name)| (*name, envelope.count(*reason).0)).collect();
     }
-    Ok(found)
+    Ok(outcome)
 }
 
-/// A course at each whole tick: the place there, on a straight way between two parts, and the force that was held.
+/// A course resampled at each whole tick: the place, interpolated linearly, and the force that the device held.
 fn steps(course: &[Part]) -> impl Iterator<Item = Part> {
     let (mut at, mut tick) = (1, 0_u32);
     std::iter::from_fn(move || {
@@ -84,13 +84,13 @@ mod tests {
     use glam::DVec3;
 
     #[test]
-    fn a_course_that_stood_still_is_followed_by_the_time_that_passed() {
+    fn a_course_with_a_stall_is_resampled_by_the_time_that_passed() {
         let part = |time_s: f64, z_m: f64, z_n: f64| Part {
             time_s,
             place_m: DVec3::new(0.0, 0.0, z_m),
             force_n: DVec3::new(0.0, 0.0, z_n),
         };
-        // Two parts, a tenth of a second of nothing, and one more.
+        // Two parts, a stall of a tenth of a second, and one more.
         let course =
             [part(0.0005, 0.0, 1.0), part(0.0015, 1.0, 2.0), part(0.1015, 101.0, 3.0), part(0.1025, 101.5, 4.0)];
         let steps: Vec<Part> = steps(&course).collect();

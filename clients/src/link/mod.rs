@@ -1,5 +1,5 @@
-//! `palpate-client link`: hand, device, network and tissue in one loop in virtual time. It is deterministic by its seed,
-//! and alone among the programs here it drives a tissue itself.
+//! `palpate-client link`: simulates hand, device, network and tissue in one loop in virtual time. The seed determines the
+//! result. Only this program drives a tissue itself.
 
 mod boundary;
 mod live;
@@ -25,73 +25,72 @@ use serde_json::{Value, json};
 
 use crate::Failure;
 use crate::connect::{Credentials, Server};
-pub(crate) use network::Dice;
-use network::Weather;
-use run::{Found, Scheme, Setup, run};
+use network::Conditions;
+pub(crate) use network::Random;
+use run::{Outcome, Scheme, Setup, run};
 pub(crate) use task::{LEAD_S, Task};
 
-/// What `link` is asked for.
+/// Arguments of `link`.
 #[derive(Args)]
 pub(crate) struct Arguments {
-    /// A scene file, or the name of one: in ./scenes, or built in (fibrotic, liver, paper, stomach)
+    /// A scene file, or the name of a scene in ./scenes or built in (fibrotic, liver, paper, stomach)
     #[arg(long, default_value = "liver")]
     scene: PathBuf,
-    /// Who holds the device: light, medium or firm; or none, who lets a string lead it
+    /// The hand that holds the device: light, medium or firm; or none: a weak string leads the device
     #[arg(long, default_value = "medium")]
     hand: String,
-    /// touch, omni, desktop, falcon, omega3, delta3, sigma7, lambda7 or inverse3; or undeclared
+    /// The device: touch, omni, desktop, falcon, omega3, delta3, sigma7, lambda7 or inverse3; or undeclared
     #[arg(long, default_value = "omega3")]
     device: String,
-    /// Delay there and back, ms
+    /// Round-trip time, ms
     #[arg(long, value_name = "MS", conflicts_with = "profile")]
     rtt_ms: Option<f64>,
-    /// Standard deviation of the delay each way, ms; order is kept
+    /// Standard deviation of the delay each way, ms; messages stay in order
     #[arg(long, value_name = "MS", conflicts_with = "profile")]
     jitter_ms: Option<f64>,
-    /// Part of the messages that TCP must send again, which holds up all after them
+    /// Fraction of the messages that TCP must retransmit, which delays all later ones
     #[arg(long, value_name = "PART", conflicts_with = "profile")]
     loss: Option<f64>,
-    /// Once a second, at a random moment, the client stands still for so long, ms; the device holds its last force
+    /// Stall the client once a second, at a random moment, for this long, ms; the device holds its last force
     #[arg(long, value_name = "MS", default_value_t = 0.0, conflicts_with = "random")]
     stall_ms: f64,
-    /// A network by name, in place of the three above
+    /// A network by name, instead of the three options above
     #[arg(long)]
     profile: Option<Profile>,
-    /// What the client makes of samples
+    /// How the client renders samples
     #[arg(long, default_value = "model")]
     scheme: Scheme,
-    /// Send a sample only when the force that the client renders is off by this part; 0 sends one a step
+    /// Send a sample only when the force that the client renders is off by more than this fraction; 0 sends one per step
     #[arg(long, value_name = "PART", default_value_t = 0.0)]
     deadband: f64,
-    /// Simulated time, s
+    /// Duration in simulated time, s
     #[arg(long, value_name = "S", default_value_t = 20.0)]
     seconds: f64,
-    /// Of the task and the network
+    /// Seed of the task and the network
     #[arg(long, default_value_t = 1)]
     seed: u64,
     /// Radius of the tool's tip, m
     #[arg(long, value_name = "M", default_value_t = Tip::default().radius_m)]
     radius_m: f64,
-    /// Friction of the tip
+    /// Friction coefficient of the tip
     #[arg(long, default_value_t = Tip::default().friction)]
     friction: f64,
-    /// Print one JSON object, not a table
+    /// Print one JSON object instead of a table
     #[arg(long)]
     json: bool,
-    /// Write time, depth, rendered and true force of each tick to this file, as CSV
+    /// Write time, depth, rendered and true force of each tick to this file (CSV)
     #[arg(long, value_name = "FILE")]
     course: Option<PathBuf>,
-    /// Run in real time against this server, which has the scene by its name, in place of virtual time; the network is what
-    /// it is
+    /// Run in real time against this server, which must know the scene by its name, over the real network
     #[arg(long, value_name = "URL", conflicts_with_all = ["rtt_ms", "jitter_ms", "loss", "stall_ms", "profile", "random", "boundary"])]
     server: Option<String>,
     #[command(flatten)]
     credentials: Credentials,
-    /// Run so many random combinations of scene, hand, device, network and task (`--seed` is the first), and report the
-    /// worst of each figure
+    /// Run this many random combinations of scene, hand, device, network and task, with seeds from --seed on; report the
+    /// worst value of each figure
     #[arg(long, value_name = "RUNS", conflicts_with_all = ["course", "boundary"])]
     random: Option<u64>,
-    /// Find the delay at which hand and spring become unstable, beside what theory says
+    /// Find the delay at which hand and spring become unstable, and compare it with theory
     #[arg(long, conflicts_with = "course")]
     boundary: bool,
 }
@@ -105,26 +104,29 @@ pub(crate) enum Profile {
     Metro,
     /// 50 ± 10 ms, one message in a thousand lost
     Wan,
-    /// 120 ± 40 ms, one in a hundred lost
+    /// 120 ± 40 ms, one message in a hundred lost
     BadWan,
 }
 
 impl Profile {
-    fn weather(self) -> Weather {
+    fn conditions(self) -> Conditions {
         let (round_trip_s, jitter_s, loss) = match self {
             Profile::Lan => (0.0005, 0.0, 0.0),
             Profile::Metro => (0.010, 0.002, 0.0),
             Profile::Wan => (0.050, 0.010, 0.001),
             Profile::BadWan => (0.120, 0.040, 0.01),
         };
-        Weather { round_trip_s, jitter_s, loss }
+        Conditions { round_trip_s, jitter_s, loss }
     }
 }
 
 /// Longest simulated time, s.
 const LONGEST_S: f64 = 3600.0;
 
-/// Runs what was asked for and prints what was found.
+/// Performs the run or runs and prints the results.
+///
+/// # Errors
+/// Returns an error if an argument is refused, a run fails, or a file can't be written.
 pub(crate) async fn link(arguments: &Arguments) -> Result<(), Failure> {
     if arguments.boundary {
         return boundary::print(arguments.json);
@@ -134,18 +136,18 @@ pub(crate) async fn link(arguments: &Arguments) -> Result<(), Failure> {
     }
     let refused = |refusal: Refusal| Failure::Refused(refusal.to_string());
     let setup = setup(arguments).map_err(refused)?;
-    let found = match &arguments.server {
+    let outcome = match &arguments.server {
         Some(server) => live::run(&setup, Server::new(server, &arguments.credentials)?).await?,
         None => run(&setup).map_err(Failure::Failed)?,
     };
     if let Some(path) = &arguments.course {
         let mut text = "time_s,depth_m,rendered_n,true_n\n".to_owned();
-        for [time_s, depth_m, rendered_n, true_n] in &found.course {
+        for [time_s, depth_m, rendered_n, true_n] in &outcome.course {
             text += &format!("{time_s:.3},{depth_m:.6},{rendered_n:.6},{true_n:.6}\n");
         }
         std::fs::write(path, text).map_err(|error| Failure::Failed(format!("{}: {error}", path.display())))?;
     }
-    let figures = figures(&setup, &found);
+    let figures = figures(&setup, &outcome);
     if arguments.json {
         crate::tell!("{figures}");
     } else if let Value::Object(fields) = figures {
@@ -156,13 +158,17 @@ pub(crate) async fn link(arguments: &Arguments) -> Result<(), Failure> {
     Ok(())
 }
 
-/// By its name, or what there is.
+/// The value found for a name, or an error that lists the names.
 fn named<T>(field: &str, name: &str, found: Option<T>, names: &[&str]) -> Result<T, Refusal> {
     found.ok_or_else(|| {
         Refusal::new(Reason::WrongKind, field, format!("must be one of {}, but is `{name}`", names.join(", ")))
     })
 }
 
+/// The device of that name.
+///
+/// # Errors
+/// Returns an error that lists the names if there is no such device.
 pub(crate) fn device_named(name: &str) -> Result<Device, Refusal> {
     let mut names: Vec<&str> = DEVICES.iter().map(|device| device.name).collect();
     names.push(UNDECLARED.name);
@@ -170,7 +176,10 @@ pub(crate) fn device_named(name: &str) -> Result<Device, Refusal> {
     named("--device", name, found, &names)
 }
 
-/// A scene file, or a scene in ./scenes, or one built in.
+/// Loads a scene file, a scene in ./scenes, or a built-in scene.
+///
+/// # Errors
+/// Returns an error if there is no such scene, or if it is invalid.
 pub(crate) fn scene_named(name: &std::path::Path, limits: &Limits) -> Result<Scene, Refusal> {
     let mut beside = std::path::Path::new("scenes").join(name).into_os_string();
     beside.push(".toml");
@@ -182,12 +191,16 @@ pub(crate) fn scene_named(name: &std::path::Path, limits: &Limits) -> Result<Sce
         Some((name, text)) => Scene::parse(name, text, &[], limits),
         None => {
             let names: Vec<&str> = BUILT_IN.iter().map(|scene| scene.0).collect();
-            let message = format!("there is no scene `{}`; built in are {}", name.display(), names.join(", "));
+            let message = format!("there is no scene `{}`; the built-in ones are {}", name.display(), names.join(", "));
             Err(Refusal::new(Reason::UnknownScene, "--scene", message))
         }
     }
 }
 
+/// The hand of that name.
+///
+/// # Errors
+/// Returns an error that lists the names if there is no such hand.
 pub(crate) fn hand_named(name: &str) -> Result<Hand, Refusal> {
     let names: Vec<&str> = HANDS.iter().map(|hand| hand.name).collect();
     named("--hand", name, Hand::named(name), &names)
@@ -197,13 +210,13 @@ fn setup(arguments: &Arguments) -> Result<Setup, Refusal> {
     let limits = Limits::default();
     let hand = hand_named(&arguments.hand)?;
     let device = device_named(&arguments.device)?;
-    let weather = match arguments.profile {
-        Some(profile) => profile.weather(),
+    let conditions = match arguments.profile {
+        Some(profile) => profile.conditions(),
         None => {
             let part = |field: &str, value: Option<f64>, range: &str, most: f64| {
                 number(field, value.unwrap_or(0.0), range, |v| (0.0..=most).contains(&v))
             };
-            Weather {
+            Conditions {
                 round_trip_s: 1e-3 * part("--rtt-ms", arguments.rtt_ms, "from 0 to 10000", 1e4)?,
                 jitter_s: 1e-3 * part("--jitter-ms", arguments.jitter_ms, "from 0 to 10000", 1e4)?,
                 loss: part("--loss", arguments.loss, "from 0 to 1", 1.0)?,
@@ -221,48 +234,48 @@ fn setup(arguments: &Arguments) -> Result<Setup, Refusal> {
     let model = Model::compile(&scene, &limits)?;
     let law = Arc::new(Law::of(&model, tip.radius_m));
     let (scheme, seed) = (arguments.scheme, arguments.seed);
-    Ok(Setup { model, law, tip, hand, device, weather, stall_s, scheme, deadband, duration_s, seed })
+    Ok(Setup { model, law, tip, hand, device, conditions, stall_s, scheme, deadband, duration_s, seed })
 }
 
-/// What is printed of a run.
-fn figures(setup: &Setup, found: &Found) -> Value {
+/// The figures of a run that are printed.
+fn figures(setup: &Setup, outcome: &Outcome) -> Value {
     let interventions: serde_json::Map<String, Value> =
-        found.interventions.iter().map(|(name, ticks)| ((*name).to_owned(), json!(ticks))).collect();
-    let [limited, dropped, released] = found.path;
+        outcome.interventions.iter().map(|(name, ticks)| ((*name).to_owned(), json!(ticks))).collect();
+    let [limited, dropped, released] = outcome.path;
     json!({
         "scene": setup.model.scene.name,
         "hand": setup.hand.name,
         "device": setup.device.name,
         "scheme": format!("{:?}", setup.scheme).to_lowercase(),
-        "rtt_ms": 1e3 * setup.weather.round_trip_s,
-        "jitter_ms": 1e3 * setup.weather.jitter_s,
-        "loss": setup.weather.loss,
+        "rtt_ms": 1e3 * setup.conditions.round_trip_s,
+        "jitter_ms": 1e3 * setup.conditions.jitter_s,
+        "loss": setup.conditions.loss,
         "stall_ms": 1e3 * setup.stall_s,
         "deadband": setup.deadband,
         "seconds": setup.duration_s,
         "seed": setup.seed,
-        "scale": found.scale,
-        "force_error_rms_percent": found.force_error_rms_percent,
-        "force_error_p99_n": found.force_error_p99_n,
-        "energy_min_j": found.energy_min_j,
-        "jump_max_n": found.jump_max_n,
-        "guard_share": found.guard_share,
-        "rendered_share": found.rendered_share,
-        "packets_per_s": found.packets_per_s,
-        "kbit_per_s": found.kbit_per_s,
-        "model_age_ms_p99": found.model_age_ms_p99,
-        "peak_ratio": found.peak_ratio,
-        "unstable": found.unstable_at_s.is_some(),
-        "unstable_at_s": found.unstable_at_s,
-        "true_force_max_n": found.true_force_max_n,
-        "force_max_n": found.force_max_n,
-        "pauses": found.pauses,
-        "faults": found.faults,
-        "commands_per_s": found.commands_per_s,
+        "scale": outcome.scale,
+        "force_error_rms_percent": outcome.force_error_rms_percent,
+        "force_error_p99_n": outcome.force_error_p99_n,
+        "energy_min_j": outcome.energy_min_j,
+        "jump_max_n": outcome.jump_max_n,
+        "guard_share": outcome.guard_share,
+        "rendered_share": outcome.rendered_share,
+        "packets_per_s": outcome.packets_per_s,
+        "kbit_per_s": outcome.kbit_per_s,
+        "model_age_ms_p99": outcome.model_age_ms_p99,
+        "peak_ratio": outcome.peak_ratio,
+        "unstable": outcome.unstable_at_s.is_some(),
+        "unstable_at_s": outcome.unstable_at_s,
+        "true_force_max_n": outcome.true_force_max_n,
+        "force_max_n": outcome.force_max_n,
+        "pauses": outcome.pauses,
+        "faults": outcome.faults,
+        "commands_per_s": outcome.commands_per_s,
         "speed_limited_steps": limited,
         "commands_dropped": dropped,
         "releases": released,
         "interventions_ticks": interventions,
-        "late_ticks": found.late_ticks,
+        "late_ticks": outcome.late_ticks,
     })
 }

@@ -1,73 +1,73 @@
-//! A network in virtual time, as TCP makes it: nothing is lost and nothing overtakes, but a lost packet holds up all that
-//! come after it until it has been sent again.
+//! A network with TCP in virtual time: nothing is lost and messages stay in order, but a lost packet delays all later ones
+//! until it has been retransmitted.
 //!
-//! arrival = max(arrival of the one before, sent + delay + jitter + (RTT … RTO if lost)).
+//! arrival = max(arrival of the message before, sent + delay + jitter + (RTT … RTO if lost)).
 
 use std::collections::VecDeque;
 
-/// Random numbers, the same on every machine.
-pub(crate) struct Dice(fastrand::Rng);
+/// A random number generator with the same results on every machine.
+pub(crate) struct Random(fastrand::Rng);
 
-impl Dice {
-    /// One of many streams of a seed.
+impl Random {
+    /// One of the independent streams of a seed.
     pub(crate) fn new(seed: u64, stream: u64) -> Self {
-        // An odd factor: neighbouring seeds and streams are far apart.
-        Dice(fastrand::Rng::with_seed((seed ^ stream.rotate_left(32)).wrapping_mul(0x9e37_79b9_7f4a_7c15)))
+        // The odd factor spreads neighbouring seeds and streams.
+        Random(fastrand::Rng::with_seed((seed ^ stream.rotate_left(32)).wrapping_mul(0x9e37_79b9_7f4a_7c15)))
     }
 
-    /// From `low` to `high`.
+    /// A uniformly distributed number from `low` to `high`.
     pub(super) fn between(&mut self, low: f64, high: f64) -> f64 {
         low + (high - low) * self.0.f64()
     }
 
-    /// Of a normal distribution (Box and Muller).
+    /// A number of the standard normal distribution (Box and Muller).
     pub(super) fn normal(&mut self) -> f64 {
         let radius = (-2.0 * (1.0 - self.between(0.0, 1.0)).ln()).sqrt();
         radius * (std::f64::consts::TAU * self.between(0.0, 1.0)).cos()
     }
 
-    /// One of a list.
+    /// A random element of a list.
     pub(super) fn one_of<'t, T>(&mut self, list: &'t [T]) -> &'t T {
         &list[self.0.usize(..list.len())]
     }
 }
 
-/// What a network does to messages.
+/// The conditions of a network.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Weather {
-    /// There and back, s.
+pub(super) struct Conditions {
+    /// Round-trip time without jitter, s.
     pub(super) round_trip_s: f64,
-    /// Standard deviation each way, s.
+    /// Standard deviation of the delay each way, s.
     pub(super) jitter_s: f64,
-    /// Part of the messages that has to be sent again.
+    /// Fraction of the messages that are retransmitted.
     pub(super) loss: f64,
 }
 
-/// The least time after which TCP sends again without being told, s (RFC 6298 says 1 s, Linux 200 ms).
+/// Least retransmission timeout of TCP, s (RFC 6298 requires 1 s, Linux uses 200 ms).
 const LEAST_RTO_S: f64 = 0.2;
 
-/// One way of a connection.
-pub(super) struct Way<T> {
-    weather: Weather,
-    dice: Dice,
+/// One direction of a connection.
+pub(super) struct Direction<T> {
+    conditions: Conditions,
+    random: Random,
     under_way: VecDeque<(f64, T)>,
     last_s: f64,
     sent: u64,
 }
 
-impl<T> Way<T> {
-    pub(super) fn new(weather: Weather, dice: Dice) -> Self {
-        Way { weather, dice, under_way: VecDeque::new(), last_s: f64::NEG_INFINITY, sent: 0 }
+impl<T> Direction<T> {
+    pub(super) fn new(conditions: Conditions, random: Random) -> Self {
+        Direction { conditions, random, under_way: VecDeque::new(), last_s: f64::NEG_INFINITY, sent: 0 }
     }
 
     pub(super) fn send(&mut self, now_s: f64, message: T) {
-        let Weather { round_trip_s, jitter_s, loss } = self.weather;
+        let Conditions { round_trip_s, jitter_s, loss } = self.conditions;
         let mut delay_s = round_trip_s / 2.0;
         if jitter_s > 0.0 {
-            delay_s = (delay_s + jitter_s * self.dice.normal()).max(0.0);
+            delay_s = (delay_s + jitter_s * self.random.normal()).max(0.0);
         }
-        if loss > 0.0 && self.dice.between(0.0, 1.0) < loss {
-            delay_s += self.dice.between(round_trip_s, (2.0 * round_trip_s).max(LEAST_RTO_S));
+        if loss > 0.0 && self.random.between(0.0, 1.0) < loss {
+            delay_s += self.random.between(round_trip_s, (2.0 * round_trip_s).max(LEAST_RTO_S));
         }
         self.last_s = self.last_s.max(now_s + delay_s);
         self.sent += 1;
@@ -76,7 +76,7 @@ impl<T> Way<T> {
 
     /// The next message that has arrived.
     pub(super) fn receive(&mut self, now_s: f64) -> Option<T> {
-        // A nanosecond: times are sums of milliseconds.
+        // The nanosecond allows for rounding: times are sums of milliseconds.
         if self.under_way.front()?.0 > now_s + 1e-9 {
             return None;
         }

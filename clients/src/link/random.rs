@@ -1,4 +1,4 @@
-//! Many runs of random combinations: what must hold of any, holds of all.
+//! Runs of random combinations, for properties that must hold for every combination.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -12,30 +12,30 @@ use palpate::scene::{BUILT_IN, Scene};
 use palpate::sheet::Model;
 use serde_json::{Value, json};
 
-use super::network::{Dice, Weather};
-use super::run::{Found, Setup, run};
+use super::network::{Conditions, Random};
+use super::run::{Outcome, Setup, run};
 use super::{Arguments, figures};
 use crate::Failure;
 
 /// Tissues of the random runs.
 const TISSUES: [&str; 3] = ["fibrotic", "liver", "stomach"];
 
-/// Round trips of the random runs, s: each is a constant delay, or one of the four profiles.
+/// Constant round-trip times of the random runs, s. Half of the runs use one of the four profiles instead.
 const ROUND_TRIPS_S: [f64; 6] = [0.0, 0.002, 0.01, 0.02, 0.05, 0.1];
 
-/// Runs between two words on how far it is.
-const TOLD_EVERY: usize = 50;
+/// Number of runs between two reports of the progress.
+const REPORT_EVERY: usize = 50;
 
-/// Of one figure, the worst and whose it is.
+/// The worst value of one figure, and the run that it is from.
 struct Worst {
     name: &'static str,
-    /// Larger is worse.
+    /// Whether a larger value is worse.
     largest: bool,
-    of: fn(&Found) -> Option<f64>,
+    of: fn(&Outcome) -> Option<f64>,
     found: Option<(f64, Value)>,
 }
 
-/// Runs them on all processors, and prints the worst of each figure.
+/// Performs the runs on all processors and prints the worst value of each figure.
 pub(super) fn print(arguments: &Arguments, runs: u64) -> Result<(), Failure> {
     let refused = |refusal: palpate::refusal::Refusal| Failure::Refused(refusal.to_string());
     let limits = Limits::default();
@@ -48,22 +48,22 @@ pub(super) fn print(arguments: &Arguments, runs: u64) -> Result<(), Failure> {
         tissues.insert(*name, (model, law));
     }
     let setup = |seed: u64| {
-        let mut dice = Dice::new(seed, 3);
-        let (model, law) = &tissues[dice.one_of(&TISSUES)];
+        let mut random = Random::new(seed, 3);
+        let (model, law) = &tissues[random.one_of(&TISSUES)];
         let profiles = <super::Profile as clap::ValueEnum>::value_variants();
-        let weather = if dice.between(0.0, 1.0) < 0.5 {
-            dice.one_of(profiles).weather()
+        let conditions = if random.between(0.0, 1.0) < 0.5 {
+            random.one_of(profiles).conditions()
         } else {
-            Weather { round_trip_s: *dice.one_of(&ROUND_TRIPS_S), jitter_s: 0.0, loss: 0.0 }
+            Conditions { round_trip_s: *random.one_of(&ROUND_TRIPS_S), jitter_s: 0.0, loss: 0.0 }
         };
-        let (hand, device) = (*dice.one_of(&HANDS), *dice.one_of(&DEVICES));
+        let (hand, device) = (*random.one_of(&HANDS), *random.one_of(&DEVICES));
         Setup {
             model: model.clone(),
             law: law.clone(),
             tip,
             hand,
             device,
-            weather,
+            conditions,
             stall_s: 0.0,
             scheme: arguments.scheme,
             deadband: arguments.deadband,
@@ -83,10 +83,10 @@ pub(super) fn print(arguments: &Arguments, runs: u64) -> Result<(), Failure> {
                         return;
                     }
                     let setup = setup(arguments.seed.wrapping_add(index));
-                    let found = run(&setup);
+                    let outcome = run(&setup);
                     if let Ok(mut results) = results.lock() {
-                        results.push((setup.seed, setup, found));
-                        if results.len().is_multiple_of(TOLD_EVERY) {
+                        results.push((setup.seed, setup, outcome));
+                        if results.len().is_multiple_of(REPORT_EVERY) {
                             crate::say!("palpate-client: {} of {runs} runs", results.len());
                         }
                     }
@@ -99,38 +99,38 @@ pub(super) fn print(arguments: &Arguments, runs: u64) -> Result<(), Failure> {
     report(arguments, &results)
 }
 
-fn report(arguments: &Arguments, results: &[(u64, Setup, Result<Found, String>)]) -> Result<(), Failure> {
+fn report(arguments: &Arguments, results: &[(u64, Setup, Result<Outcome, String>)]) -> Result<(), Failure> {
     let worst = |name, largest, of| Worst { name, largest, of, found: None };
     let mut all = [
-        worst("energy_min_j", false, |found| Some(found.energy_min_j)),
-        worst("jump_max_n", true, |found| Some(found.jump_max_n)),
-        worst("force_error_rms_percent", true, |found| found.force_error_rms_percent),
-        worst("rendered_share", false, |found| found.rendered_share),
-        worst("guard_share", true, |found| Some(found.guard_share)),
-        worst("force_max_n", true, |found| Some(found.force_max_n)),
+        worst("energy_min_j", false, |outcome| Some(outcome.energy_min_j)),
+        worst("jump_max_n", true, |outcome| Some(outcome.jump_max_n)),
+        worst("force_error_rms_percent", true, |outcome| outcome.force_error_rms_percent),
+        worst("rendered_share", false, |outcome| outcome.rendered_share),
+        worst("guard_share", true, |outcome| Some(outcome.guard_share)),
+        worst("force_max_n", true, |outcome| Some(outcome.force_max_n)),
     ];
     let mut unstable = 0_u64;
-    for (seed, setup, found) in results {
-        let found = found.as_ref().map_err(|error| Failure::Failed(format!("seed {seed}: {error}")))?;
-        unstable += u64::from(found.unstable_at_s.is_some());
+    for (seed, setup, outcome) in results {
+        let outcome = outcome.as_ref().map_err(|error| Failure::Failed(format!("seed {seed}: {error}")))?;
+        unstable += u64::from(outcome.unstable_at_s.is_some());
         for worst in &mut all {
-            let Some(value) = (worst.of)(found) else { continue };
+            let Some(value) = (worst.of)(outcome) else { continue };
             let beaten = worst.found.as_ref().is_none_or(|(w, _)| if worst.largest { value > *w } else { value < *w });
             if beaten {
-                worst.found = Some((value, figures(setup, found)));
+                worst.found = Some((value, figures(setup, outcome)));
             }
         }
         if !arguments.json {
-            let f = found;
+            let f = outcome;
             crate::tell!(
                 "{seed:>6} {:<9} {:<7} {:<9} rtt {:>5.1} ms jitter {:>4.1} loss {:<6} error {:>7.2} % energy {:>10.2e} J jump \
                  {:.3} N guard {:.4} share {:.3} pauses {} faults {} {}",
                 setup.model.scene.name,
                 setup.hand.name,
                 setup.device.name,
-                1e3 * setup.weather.round_trip_s,
-                1e3 * setup.weather.jitter_s,
-                setup.weather.loss,
+                1e3 * setup.conditions.round_trip_s,
+                1e3 * setup.conditions.jitter_s,
+                setup.conditions.loss,
                 f.force_error_rms_percent.unwrap_or(f64::NAN),
                 f.energy_min_j,
                 f.jump_max_n,
@@ -152,7 +152,7 @@ fn report(arguments: &Arguments, results: &[(u64, Setup, Result<Found, String>)]
     if arguments.json {
         crate::tell!("{}", Value::Object(fields));
     } else {
-        crate::tell!("\n{} runs, {unstable} unstable. Worst of each:", results.len());
+        crate::tell!("\n{} runs, {unstable} unstable. Worst values:", results.len());
         for worst in &all {
             let Some((value, run)) = &worst.found else { continue };
             crate::tell!("{:<26} {value:<12.5} seed {}", worst.name, run["seed"]);

@@ -1,4 +1,4 @@
-//! One run: hand, device, network, tissue and its twin, tick by tick in virtual time.
+//! One run in virtual time, tick by tick: hand, device, network, tissue, and the tissue's twin without a network.
 
 use std::sync::Arc;
 
@@ -12,22 +12,22 @@ use palpate::scene::tip::Tip;
 use palpate::sheet::Model;
 use palpate::wire::local::sample_bytes;
 
-use super::network::{Dice, Way, Weather};
+use super::network::{Conditions, Direction, Random};
 use super::task::{self, Task};
 use super::tissue::{Server, Tissue, Twin};
 
-/// What a client makes of samples.
+/// How the client renders samples.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub(super) enum Scheme {
-    /// The newest force, as it came: no model, no envelope
+    /// The newest force, unchanged: no model, no safety envelope
     Raw,
-    /// The newest force, held, within the safety envelope
+    /// The newest force, held until the next, within the safety envelope
     Hold,
-    /// The local model along the tool's own way, within the safety envelope
+    /// The local model, evaluated along the tool's path, within the safety envelope
     Model,
 }
 
-/// What a run is of.
+/// The setup of a run.
 #[derive(Debug, Clone)]
 pub(super) struct Setup {
     pub(super) model: Arc<Model>,
@@ -35,8 +35,8 @@ pub(super) struct Setup {
     pub(super) tip: Tip,
     pub(super) hand: Hand,
     pub(super) device: Device,
-    pub(super) weather: Weather,
-    /// Once a second the client stands still for so long, s.
+    pub(super) conditions: Conditions,
+    /// Once a second the client stalls for this long, s.
     pub(super) stall_s: f64,
     pub(super) scheme: Scheme,
     pub(super) deadband: f64,
@@ -44,23 +44,24 @@ pub(super) struct Setup {
     pub(super) seed: u64,
 }
 
-/// A tick of the device, s.
+/// Period of the device's loop, s.
 pub(super) const TICK_S: f64 = 1e-3;
 
-/// The port has given so much, or the tool has left so many times the task's amplitude: that is unstable.
+/// A run is unstable if the energy that the port has received falls below this, J, or if the tool moves away farther than
+/// this many times the task's amplitude.
 const UNSTABLE_J: f64 = -0.1;
 const UNSTABLE_AMPLITUDES: f64 = 3.0;
 
-/// Below, nothing is rendered, N.
-const NOTHING_N: f64 = 1e-6;
+/// A smaller rendered force counts as none, N.
+const LEAST_FORCE_N: f64 = 1e-6;
 
-/// The simulated owner enables again so long after a pause began, s.
-const PATIENCE_S: f64 = 0.3;
+/// The simulated operator enables rendering this long after a pause began, s.
+const PAUSE_S: f64 = 0.3;
 
-/// What a run found.
+/// The outcome of a run.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Found {
-    /// Of the task's depths.
+pub(super) struct Outcome {
+    /// Scale of the task's depths.
     pub(super) scale: f64,
     pub(super) force_error_rms_percent: Option<f64>,
     pub(super) force_error_p99_n: f64,
@@ -80,13 +81,13 @@ pub(super) struct Found {
     pub(super) faults: u64,
     pub(super) interventions: Vec<(&'static str, u64)>,
     pub(super) path: [u64; 3],
-    /// Of a run in real time.
+    /// Only for a run in real time.
     pub(super) late_ticks: Option<u64>,
-    /// Time, tool's depth below the rest plane, rendered and true force, each tick.
+    /// For each tick: time, s, the tool's depth below the rest plane, m, rendered and true force, N.
     pub(super) course: Vec<[f64; 4]>,
 }
 
-/// What stands at the device.
+/// The client at the device, by scheme.
 enum Client {
     Raw(Option<LocalModel>),
     Hold(Option<LocalModel>, Option<f64>, Option<DVec3>, Box<Envelope>),
@@ -135,15 +136,18 @@ impl Client {
     }
 }
 
-/// The scale of the task's depths: drawn in until a hand that feels the tissue itself, with no network and no client
-/// between, meets no more than what the device is asked for. So it does not depend on what a client makes of samples.
+/// The scale of the task's depths: reduced until a hand that feels the tissue directly, without network and client, meets no
+/// more than [`task::FORCE_SHARE`] of the device's force. So it does not depend on how the client renders samples.
+///
+/// # Errors
+/// Returns the reason if the guard stops the tissue.
 pub(super) fn fitting_scale(setup: &Setup, lead_s: f64) -> Result<f64, String> {
     let Setup { model, law, tip, hand, device, duration_s, seed, .. } = setup;
-    let most_n = task::SHARE * device.most_n();
+    let most_n = task::FORCE_SHARE * device.most_n();
     let middle_m = (model.scene.sheet.extent_m() / 2.0).extend(0.0);
     let mut scale = task::scale(hand, law, device.most_n());
     loop {
-        let task = Task::new(middle_m, lead_s, *duration_s, scale, &mut Dice::new(*seed, 0));
+        let task = Task::new(middle_m, lead_s, *duration_s, scale, &mut Random::new(*seed, 0));
         let mut twin = Twin::new(Tissue::new(model, *tip, law.clone()));
         let mut held = Held { place_m: task.start_m(), velocity_m_per_s: DVec3::ZERO };
         let mut largest_n = 0.0_f64;
@@ -165,7 +169,7 @@ pub(super) fn fitting_scale(setup: &Setup, lead_s: f64) -> Result<f64, String> {
     }
 }
 
-/// A task that is drawn in further would touch nothing any more.
+/// Least scale: a smaller task would hardly touch the tissue.
 const LEAST_SCALE: f64 = 0.01;
 
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
@@ -173,38 +177,41 @@ fn ticks(duration_s: f64) -> u32 {
     (duration_s / TICK_S).round() as u32
 }
 
-/// Moments at which a client stands still for some time, once a second.
+/// The moments at which a client stalls, once a second.
 struct Stalls {
     stall_s: f64,
-    dice: Dice,
+    random: Random,
     begin_s: f64,
 }
 
 impl Stalls {
-    fn new(stall_s: f64, mut dice: Dice) -> Self {
-        let begin_s = task::LEAD_S + dice.between(0.0, 1.0);
-        Stalls { stall_s, dice, begin_s }
+    fn new(stall_s: f64, mut random: Random) -> Self {
+        let begin_s = task::LEAD_S + random.between(0.0, 1.0);
+        Stalls { stall_s, random, begin_s }
     }
 
     fn is_at(&mut self, now_s: f64) -> bool {
         while now_s >= self.begin_s + self.stall_s {
-            self.begin_s = self.begin_s.ceil() + self.dice.between(0.0, 1.0);
+            self.begin_s = self.begin_s.ceil() + self.random.between(0.0, 1.0);
         }
         self.stall_s > 0.0 && now_s >= self.begin_s
     }
 }
 
-/// Runs it.
-pub(super) fn run(setup: &Setup) -> Result<Found, String> {
+/// Performs a run.
+///
+/// # Errors
+/// Returns the reason if the guard stops the tissue.
+pub(super) fn run(setup: &Setup) -> Result<Outcome, String> {
     let scale = fitting_scale(setup, task::LEAD_S)?;
-    let Setup { model, law, tip, hand, device, weather, stall_s, scheme, deadband, duration_s, seed } = setup;
+    let Setup { model, law, tip, hand, device, conditions, stall_s, scheme, deadband, duration_s, seed } = setup;
     let middle_m = (model.scene.sheet.extent_m() / 2.0).extend(0.0);
-    let task = Task::new(middle_m, task::LEAD_S, *duration_s, scale, &mut Dice::new(*seed, 0));
+    let task = Task::new(middle_m, task::LEAD_S, *duration_s, scale, &mut Random::new(*seed, 0));
     let tissue = || Tissue::new(model, *tip, law.clone());
     let (mut server, mut twin) = (Server::new(tissue()), Twin::new(tissue()));
-    let mut up: Way<(f64, DVec3)> = Way::new(*weather, Dice::new(*seed, 1));
-    let mut down: Way<LocalModel> = Way::new(*weather, Dice::new(*seed, 2));
-    let (mut deadband, mut told_s) = (Deadband::new(*deadband), f64::NEG_INFINITY);
+    let mut up: Direction<(f64, DVec3)> = Direction::new(*conditions, Random::new(*seed, 1));
+    let mut down: Direction<LocalModel> = Direction::new(*conditions, Random::new(*seed, 2));
+    let (mut deadband, mut sent_s) = (Deadband::new(*deadband), f64::NEG_INFINITY);
     let envelope = || {
         let mut envelope = Envelope::new(*device, middle_m);
         envelope.enable();
@@ -216,79 +223,79 @@ pub(super) fn run(setup: &Setup) -> Result<Found, String> {
         Scheme::Model => Client::Model(Box::new(Renderer::new((**law).clone(), envelope()))),
     };
     let mut held = Held { place_m: task.start_m(), velocity_m_per_s: DVec3::ZERO };
-    let mut account = Account::default();
-    account.found.scale = scale;
+    let mut totals = Totals::default();
+    totals.outcome.scale = scale;
     let mut paused_s: Option<f64> = None;
-    let mut stalls = Stalls::new(*stall_s, Dice::new(*seed, 4));
+    let mut stalls = Stalls::new(*stall_s, Random::new(*seed, 4));
     let mut force_n = DVec3::ZERO;
     for tick in 0..ticks(*duration_s) {
         let now_s = f64::from(tick) * TICK_S;
         let place_m = held.place_m;
-        account.moved(place_m);
-        if account.energy_j < UNSTABLE_J || (place_m - task.start_m()).length() > UNSTABLE_AMPLITUDES * task.amplitude_m
+        totals.moved(place_m);
+        if totals.energy_j < UNSTABLE_J || (place_m - task.start_m()).length() > UNSTABLE_AMPLITUDES * task.amplitude_m
         {
-            account.found.unstable_at_s = Some(now_s);
+            totals.outcome.unstable_at_s = Some(now_s);
             break;
         }
-        let stands = stalls.is_at(now_s);
-        if !stands {
+        let is_stalled = stalls.is_at(now_s);
+        if !is_stalled {
             up.send(now_s, (now_s, place_m));
         }
         while let Some((time_s, place_m)) = up.receive(now_s) {
             server.path.receive(time_s, place_m, now_s);
         }
         if let Some(model) = server.step(now_s, TICK_S)?
-            && (deadband.is_left(&model, law) || now_s - told_s >= HEARTBEAT_S - 1e-9)
+            && (deadband.is_left(&model, law) || now_s - sent_s >= HEARTBEAT_S - 1e-9)
         {
             deadband.send(&model, law);
-            told_s = now_s;
-            account.bytes += sample_bytes(&model);
+            sent_s = now_s;
+            totals.bytes += sample_bytes(&model);
             down.send(now_s, model);
         }
-        // While the client stands still the device holds the last force, and samples wait.
-        while !stands && let Some(model) = down.receive(now_s) {
+        // While the client is stalled, the device holds the last force, and samples wait.
+        while !is_stalled && let Some(model) = down.receive(now_s) {
             client.receive(model, now_s);
         }
-        if !stands {
+        if !is_stalled {
             force_n = client.tick(now_s, place_m);
         }
         let (true_n, touches) = twin.truth(place_m)?;
         let age_s = client.model_time_s().map(|time_s| now_s - time_s);
-        account.rendered(now_s, force_n, true_n, touches, age_s);
-        if let Some(envelope) = client.envelope().filter(|_| !stands) {
-            owner(envelope, now_s, &mut paused_s, &mut account.found);
+        totals.rendered(now_s, force_n, true_n, touches, age_s);
+        if let Some(envelope) = client.envelope().filter(|_| !is_stalled) {
+            operate(envelope, now_s, &mut paused_s, &mut totals.outcome);
         }
         let (from_m, to_m) = (task.at(now_s), task.at(now_s + TICK_S));
         let string_n = hand.string_n(from_m, place_m);
         held = hand.advance(held, from_m, to_m, force_n + string_n, TICK_S);
     }
-    let lasted_s = account.found.unstable_at_s.unwrap_or(*duration_s).max(TICK_S);
-    let bytes = account.bytes;
-    let mut found = account.close();
-    found.packets_per_s = down.sent() as f64 / lasted_s;
-    found.kbit_per_s = bytes as f64 * 8e-3 / lasted_s;
-    found.commands_per_s = up.sent() as f64 / lasted_s;
-    found.path = server.path.counts();
+    let lasted_s = totals.outcome.unstable_at_s.unwrap_or(*duration_s).max(TICK_S);
+    let bytes = totals.bytes;
+    let mut outcome = totals.close();
+    outcome.packets_per_s = down.sent() as f64 / lasted_s;
+    outcome.kbit_per_s = bytes as f64 * 8e-3 / lasted_s;
+    outcome.commands_per_s = up.sent() as f64 / lasted_s;
+    outcome.path = server.path.counts();
     if let Some(envelope) = client.envelope() {
         let (acted, ticks) = envelope.count(Reason::Passivity);
-        found.guard_share = acted as f64 / ticks.max(1) as f64;
-        found.interventions = Reason::ALL.iter().map(|(reason, name)| (*name, envelope.count(*reason).0)).collect();
+        outcome.guard_share = acted as f64 / ticks.max(1) as f64;
+        outcome.interventions = Reason::ALL.iter().map(|(reason, name)| (*name, envelope.count(*reason).0)).collect();
     }
-    Ok(found)
+    Ok(outcome)
 }
 
-/// The owner of the simulated hand sees that rendering has paused, and enables it again after a while.
-fn owner(envelope: &mut Envelope, now_s: f64, paused_s: &mut Option<f64>, found: &mut Found) {
+/// The simulated operator notices that rendering has paused, and enables it again after [`PAUSE_S`].
+fn operate(envelope: &mut Envelope, now_s: f64, paused_s: &mut Option<f64>, outcome: &mut Outcome) {
     match (envelope.state(), *paused_s) {
         (State::Enabled, _) => *paused_s = None,
         (_, None) => {
             *paused_s = Some(now_s);
-            found.pauses += 1;
+            outcome.pauses += 1;
             if envelope.state() == State::Fault {
-                found.faults += 1;
+                outcome.faults += 1;
             }
         }
-        (_, Some(since_s)) if now_s - since_s > PATIENCE_S => {
+        (_, Some(since_s)) if now_s - since_s > PAUSE_S => {
             envelope.reset();
             envelope.enable();
         }
@@ -296,14 +303,14 @@ fn owner(envelope: &mut Envelope, now_s: f64, paused_s: &mut Option<f64>, found:
     }
 }
 
-/// What is summed up on the way.
+/// Accumulates the outcome of a run.
 #[derive(Default)]
-pub(super) struct Account {
-    found: Found,
+pub(super) struct Totals {
+    outcome: Outcome,
     energy_j: f64,
     before: Option<DVec3>,
     force_n: DVec3,
-    /// Squares and sums over the ticks in which either is in contact.
+    /// Sums over the ticks in which the twin touches or a force is rendered.
     error_squared: f64,
     true_squared: f64,
     rendered_sum: f64,
@@ -313,23 +320,24 @@ pub(super) struct Account {
     pub(super) ages_s: Vec<f64>,
 }
 
-impl Account {
-    /// The tool has moved under the force of the last tick.
+impl Totals {
+    /// Counts the tool's movement to `place_m` under the force of the last tick.
     pub(super) fn moved(&mut self, place_m: DVec3) {
         if let Some(before_m) = self.before.replace(place_m) {
             self.energy_j -= self.force_n.dot(place_m - before_m);
-            self.found.energy_min_j = self.found.energy_min_j.min(self.energy_j);
+            self.outcome.energy_min_j = self.outcome.energy_min_j.min(self.energy_j);
         }
     }
 
+    /// Counts a tick's rendered force against the true one; `age_s` is the age of the sample that it is from.
     pub(super) fn rendered(&mut self, now_s: f64, force_n: DVec3, true_n: DVec3, touches: bool, age_s: Option<f64>) {
-        let found = &mut self.found;
-        found.jump_max_n = found.jump_max_n.max((force_n - self.force_n).length());
+        let outcome = &mut self.outcome;
+        outcome.jump_max_n = outcome.jump_max_n.max((force_n - self.force_n).length());
         self.force_n = force_n;
         let (rendered, truth) = (force_n.length(), true_n.length());
-        found.force_max_n = found.force_max_n.max(rendered);
-        found.true_force_max_n = found.true_force_max_n.max(truth);
-        if touches || rendered > NOTHING_N {
+        outcome.force_max_n = outcome.force_max_n.max(rendered);
+        outcome.true_force_max_n = outcome.true_force_max_n.max(truth);
+        if touches || rendered > LEAST_FORCE_N {
             let error_n = (force_n - true_n).length();
             self.error_squared += error_n * error_n;
             self.true_squared += truth * truth;
@@ -339,17 +347,18 @@ impl Account {
         }
         self.ages_s.extend(age_s);
         let depth_m = -self.before.map_or(0.0, |place_m| place_m.z);
-        found.course.push([now_s, depth_m, rendered, truth]);
+        outcome.course.push([now_s, depth_m, rendered, truth]);
     }
 
-    pub(super) fn close(mut self) -> Found {
+    /// Computes the outcome from the sums.
+    pub(super) fn close(mut self) -> Outcome {
         let part = |of: f64, whole: f64| (whole > 0.0).then(|| of / whole);
-        self.found.force_error_rms_percent = part(self.error_squared, self.true_squared).map(|p| 100.0 * p.sqrt());
-        self.found.rendered_share = part(self.rendered_sum, self.true_sum);
-        self.found.peak_ratio = part(self.found.force_max_n, self.found.true_force_max_n);
-        self.found.force_error_p99_n = percentile(&mut self.errors_n, 0.99).unwrap_or(0.0);
-        self.found.model_age_ms_p99 = percentile(&mut self.ages_s, 0.99).map(|age_s| 1e3 * age_s);
-        self.found
+        self.outcome.force_error_rms_percent = part(self.error_squared, self.true_squared).map(|p| 100.0 * p.sqrt());
+        self.outcome.rendered_share = part(self.rendered_sum, self.true_sum);
+        self.outcome.peak_ratio = part(self.outcome.force_max_n, self.outcome.true_force_max_n);
+        self.outcome.force_error_p99_n = percentile(&mut self.errors_n, 0.99).unwrap_or(0.0);
+        self.outcome.model_age_ms_p99 = percentile(&mut self.ages_s, 0.99).map(|age_s| 1e3 * age_s);
+        self.outcome
     }
 }
 

@@ -1,4 +1,4 @@
-//! The far end: a session that plays a tool's commands, and tells what it felt.
+//! The server's side of the loop: a session that plays a tool's commands and returns what the tool felt.
 
 use std::sync::Arc;
 
@@ -12,7 +12,7 @@ use palpate::session::command::{Command, Due};
 use palpate::session::local::Modeller;
 use palpate::sheet::{Feel, Model, Standing};
 
-/// One tissue with one tool.
+/// A tissue with one tool.
 pub(super) struct Tissue {
     session: Session,
     tip: Tip,
@@ -24,7 +24,7 @@ impl Tissue {
         Tissue { session: Session::new(model), tip, modeller: Modeller::new(law, false) }
     }
 
-    /// One step, at whose end the tool is at `place_m`, or nowhere.
+    /// Performs one step, at the end of which the tool is at `place_m`, or released if that is `None`.
     pub(super) fn step(&mut self, place_m: Option<DVec3>) -> Result<Option<Feel>, String> {
         let tip = self.tip;
         let action = place_m.map_or(Action::Release, |place_m| Action::Lead { place_m, tip });
@@ -44,14 +44,14 @@ impl Tissue {
         }
     }
 
-    /// The local model of what was felt in the last step.
+    /// The local model of what the tool felt in the last step.
     fn model(&mut self, feel: &Feel, client_time_s: f64) -> LocalModel {
         let step = self.session.step_count();
         self.modeller.model(feel, step, client_time_s)
     }
 }
 
-/// A tissue at the far end of a network.
+/// A tissue behind a network.
 pub(super) struct Server {
     tissue: Tissue,
     pub(super) path: Path,
@@ -62,7 +62,7 @@ impl Server {
         Server { tissue, path: Path::default() }
     }
 
-    /// One step, and the sample of it, if a tool is there.
+    /// Performs one step; returns its sample while the tool is in use.
     pub(super) fn step(&mut self, now_s: f64, step_s: f64) -> Result<Option<LocalModel>, String> {
         let (place_m, time_s) = match self.path.step(now_s, step_s) {
             Some(Play::Lead(place_m, time_s)) => (Some(place_m), time_s),
@@ -73,7 +73,7 @@ impl Server {
     }
 }
 
-/// The same tissue without a network: the truth.
+/// The same tissue without a network: its force is the true one.
 pub(super) struct Twin(Tissue);
 
 impl Twin {
@@ -81,7 +81,7 @@ impl Twin {
         Twin(tissue)
     }
 
-    /// The force on the tool at `place_m`, N, and whether it touches.
+    /// The force on the tool at `place_m`, N, and whether the tool touches the tissue.
     pub(super) fn truth(&mut self, place_m: DVec3) -> Result<(DVec3, bool), String> {
         let feel = self.0.step(Some(place_m))?;
         Ok(feel.map_or((DVec3::ZERO, false), |feel| (feel.force_on_tool_n, feel.standing != Standing::Free)))

@@ -1,4 +1,4 @@
-//! One client of a load: strokes the tissue by a command each tick, and keeps account of what comes back.
+//! One client of a load: it strokes the tissue with a command each tick and counts the answers.
 
 use std::f64::consts::TAU;
 use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
@@ -24,14 +24,14 @@ pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Where a load stands, and when the measurement ended.
+/// The stage of a load, and when the measurement ended, ns.
 pub(crate) struct Stage(AtomicU8, AtomicU64);
 
 impl Stage {
-    /// Sessions and clients come; nothing is counted yet.
+    /// Sessions and clients start; nothing is counted yet.
     pub(crate) const RAMP: u8 = 0;
     pub(crate) const MEASURE: u8 = 1;
-    /// Nothing is sent any more; what is under way comes back.
+    /// Nothing more is sent; outstanding answers arrive.
     pub(crate) const DRAIN: u8 = 2;
 
     pub(crate) fn new() -> Self {
@@ -58,7 +58,7 @@ pub(crate) struct Common {
     pub(crate) clock: Instant,
     pub(crate) stage: Arc<Stage>,
     pub(crate) tally: Arc<Mutex<Tally>>,
-    /// Commands a second.
+    /// Commands per second.
     pub(crate) rate_hz: f64,
 }
 
@@ -69,21 +69,21 @@ impl Common {
     }
 }
 
-/// A stroke: a circle about the middle of the sheet, pressed harder and less hard, never at rest.
+/// A stroke: a circle about the middle of the sheet with a varying force, never at rest.
 #[derive(Clone)]
 pub(crate) struct Stroke {
     middle_m: DVec2,
     radius_m: f64,
     force_n: f64,
     falloff_per_m: f64,
-    /// Of a turn: clients begin apart.
+    /// Where the stroke begins, as a fraction of a turn; it differs from client to client.
     begin: f64,
 }
 
 impl Stroke {
     pub(crate) fn new(scene: &Scene, begin: f64) -> Self {
         let (sheet, springs) = (&scene.sheet, scene.springs.stiffness_n_per_m);
-        // Moves the middle by about a third of a spacing.
+        // With this force the middle moves by about a third of a spacing.
         let stiffness_n_per_m = scene.virtual_stiffness_n_per_m + 0.1 * springs;
         Stroke {
             middle_m: sheet.extent_m() / 2.0,
@@ -94,7 +94,7 @@ impl Stroke {
         }
     }
 
-    /// What the tool does at `time_s`: a turn in 2 s, three presses in it.
+    /// The tool's action at `time_s`: one turn in 2 s, with three presses.
     pub(crate) fn at(&self, time_s: f64) -> Action {
         let turn = TAU * (0.5 * time_s + self.begin);
         Action::Push(Poke {
@@ -106,15 +106,15 @@ impl Stroke {
     }
 }
 
-/// Commands of which an answer may be outstanding.
+/// Number of commands whose send times are kept.
 const OUTSTANDING: usize = 4096;
 
-/// The commands that a client has sent, and when.
+/// The commands that a client has sent, with their times.
 struct Sent {
-    /// The newest; they count from 1.
+    /// Sequence number of the newest; the first has 1.
     sequence: u64,
     at_ns: Box<[u64; OUTSTANDING]>,
-    /// Newest that a sample acknowledged.
+    /// Newest sequence number that a sample acknowledged.
     acknowledged: u64,
     last_tick: Option<u64>,
     is_open: bool,
@@ -126,28 +126,28 @@ impl Sent {
         &mut self.at_ns[sequence as usize % OUTSTANDING]
     }
 
-    /// Commands of which nothing was heard.
+    /// Number of commands that nothing has acknowledged or rejected.
     fn outstanding(&mut self) -> u64 {
         let (from, to) = (self.acknowledged + 1, self.sequence);
-        // Those that are older than what is kept were never answered either, or they would be acknowledged.
+        // Older commands than those kept are outstanding too, else they would count as acknowledged.
         let kept = from.max(to.saturating_sub(OUTSTANDING as u64 - 1));
         (kept - from) + (kept..=to).filter(|sequence| *self.at(*sequence) > 0).count() as u64
     }
 }
 
-/// Steps of a session by when a client heard of them.
+/// Steps of a session and when this client heard of them.
 #[derive(Default)]
 struct Heartbeat {
-    /// Server's time and step of the first sample that counts, and of the last.
+    /// Server's time, ns, and step of the first and the last sample within the measurement.
     first: Option<(u64, u64)>,
     last: (u64, u64),
     last_arrival_ns: u64,
-    /// Samples that were dropped before the first that counts.
+    /// Samples that were dropped before the measurement.
     dropped_before: Option<u64>,
     dropped: u64,
 }
 
-/// When samples of a session arrived, for the age of its frames.
+/// Arrival times of a session's samples, from which the age of its frames follows.
 pub(crate) struct Arrivals(Box<[(u64, u64); OUTSTANDING]>);
 
 impl Arrivals {
@@ -167,25 +167,25 @@ impl Arrivals {
     }
 }
 
-/// A client with a tool of its own.
+/// A client with its own tool.
 pub(crate) struct Client {
     pub(crate) common: Common,
     pub(crate) session_id: String,
     pub(crate) tool: u32,
     pub(crate) rate_hz: f64,
     pub(crate) stroke: Stroke,
-    /// If the session has viewers.
+    /// Present if the session has viewers.
     pub(crate) arrivals: Option<Arc<Mutex<Arrivals>>>,
 }
 
-/// How long a client waits for what it has not heard of.
+/// How long a client waits for outstanding answers.
 const PATIENCE: Duration = Duration::from_secs(2);
 
-/// A session that was silent so long at the end of the measurement had stopped.
+/// A session that was silent for longer than this at the end of the measurement had stopped, ns.
 const SILENCE_NS: u64 = 50_000_000;
 
 impl Client {
-    /// Opens the stream. `ticks` tells when to send. What it returns lives as long as the client.
+    /// Opens the stream; `ticks` tells when to send. The returned future is the client's life.
     pub(crate) async fn open(
         self,
         channel: Channel,
@@ -208,7 +208,7 @@ impl Client {
         let say = |message| pb::TouchRequest { message: Some(message) };
         let outbound = tokio_stream::once(say(Say::Open(open))).chain(commands.map(move |c| say(Say::Command(c))));
         let mut inbound = HapticServiceClient::new(channel).touch(outbound).await?.into_inner();
-        // The answer to `open`, or why it was refused.
+        // The first message answers `open`, or is an error.
         inbound.message().await?;
         lock(&sent).is_open = true;
         Ok(self.listen(inbound, sent))
@@ -228,7 +228,7 @@ impl Client {
                     self.sample(&sample, &mut heartbeat, &mut lock(&sent));
                 }
                 Ok(Some(pb::TouchResponse { message: Some(Heard::Rejection(rejection)) })) => {
-                    // It never acts: the sample that acknowledges later ones is no answer to it.
+                    // A rejected command never acts, so a later acknowledgement does not count for it.
                     *lock(&sent).at(rejection.sequence) = 0;
                     *lock(&self.common.tally).rejected.entry(rejection.reason).or_default() += 1;
                 }
@@ -243,7 +243,7 @@ impl Client {
         tally.dilation_min = tally.dilation_min.min(heartbeat.dilation(self.rate_hz, &self.common.stage));
     }
 
-    /// Ends when nothing more is to come, or has not come for long.
+    /// Completes when no answer is outstanding any more, or [`PATIENCE`] has passed.
     async fn drained(&self, sent: &Mutex<Sent>) {
         let mut begun: Option<Instant> = None;
         loop {
@@ -288,7 +288,7 @@ impl Client {
 }
 
 impl Heartbeat {
-    /// Simulated over real time, by the server's clock, and by ours if nothing came for long at the end.
+    /// Simulated time over real time: by the server's clock, plus our own for a long silence at the end.
     #[allow(clippy::cast_precision_loss)]
     fn dilation(&self, rate_hz: f64, stage: &Stage) -> f64 {
         let Some(first) = self.first else { return 0.0 };
@@ -299,7 +299,7 @@ impl Heartbeat {
     }
 }
 
-/// The command of a tick, unless it is too early or too late for one.
+/// The command of a tick; `None` before the stream is open and after the measurement.
 fn command(common: &Common, stroke: &Stroke, tool: u32, sent: &Mutex<Sent>, tick: u64) -> Option<pb::Command> {
     let mut sent = lock(sent);
     let missed = sent.last_tick.replace(tick).map_or(0, |last| tick - last - 1);

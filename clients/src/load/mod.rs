@@ -1,4 +1,4 @@
-//! `palpate-client load`: many sessions, clients and viewers at once, and how the server bears them.
+//! `palpate-client load`: loads a server with sessions, clients and viewers, and measures how it copes.
 
 mod client;
 mod objective;
@@ -25,38 +25,38 @@ pub(crate) struct Arguments {
     /// The server
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7117")]
     server: String,
-    /// Sessions; with --find-limit, where the search begins
+    /// Number of sessions; with --find-limit, where the search begins
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..))]
     sessions: u32,
-    /// Haptic clients of each session, with a tool each. Without clients a session is told beforehand to stay awake
+    /// Haptic clients of each session, with one tool each. With 0, commands sent beforehand keep each session awake
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(0..=64))]
     clients_per_session: u32,
     /// Viewers of each session
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=64))]
     viewers: u32,
-    /// A scene that the server has by that name, or a scene file of your own (ends in .toml)
+    /// Name of a scene of the server, or a scene file of your own (ends in .toml)
     #[arg(long, value_name = "NAME", default_value = "paper")]
     scene: String,
-    /// How long it is measured, when all are there
+    /// Duration of the measurement, once all clients are connected
     #[arg(long, value_name = "SECONDS", default_value_t = 10.0, value_parser = seconds)]
     seconds: f64,
-    /// Over how long sessions and clients come [default: as fast as the server makes them]
+    /// Time over which sessions and clients start [default: as fast as the server creates them]
     #[arg(long, value_name = "SECONDS", default_value_t = 0.0, value_parser = seconds)]
     ramp_s: f64,
-    /// Commands a second of each client
+    /// Commands per second of each client
     #[arg(long, value_name = "HZ", default_value_t = 1000.0, value_parser = rate)]
     rate_hz: f64,
-    /// Frames a second of each viewer
+    /// Frames per second of each viewer
     #[arg(long, value_name = "HZ", default_value_t = 60.0, value_parser = rate)]
     frame_rate_hz: f64,
-    /// Clients that share a connection. With 1 each has its own, as clients on machines of their own have
+    /// Clients that share a connection. With 1 each client has its own, like clients on separate machines
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     clients_per_connection: u32,
     /// Threads of this generator
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
     threads: u32,
-    /// Find the largest number of sessions that keeps to this in two of three trials: bounds on p50, p99, p999, max (round trip), gap_p99, gap_max,
-    /// frame_age_p99, dilation, lost and rejected, as in 'p99<2ms,dilation>0.999'
+    /// Find the largest number of sessions that meets this objective in two of three trials: bounds on p50, p99, p999,
+    /// max (round trip), gap_p99, gap_max, frame_age_p99, dilation, lost and rejected, such as 'p99<2ms,dilation>0.999'
     #[arg(long, value_name = "OBJECTIVE")]
     find_limit: Option<Objective>,
     /// Print one JSON object instead of a table
@@ -79,17 +79,17 @@ fn rate(text: &str) -> Result<f64, String> {
     if (0.1..=20_000.0).contains(&value) { Ok(value) } else { Err("must be from 0.1 to 20000".to_owned()) }
 }
 
-/// Clients send at so many different moments of a period: not all at once, and without a wake-up for each.
+/// Clients send at this many moments of a period: not all at once, and without a wake-up for each.
 const PHASES: usize = 4;
 
-/// Between the last arrival and the beginning of the measurement.
+/// Between the last client's start and the beginning of the measurement.
 const SETTLE: Duration = Duration::from_millis(500);
 
-/// A limit is found when the bracket is narrower than a part of it.
+/// The search ends when the bracket is narrower than this fraction of the limit (1/40).
 const RESOLUTION: usize = 40;
 
-/// Trials of a number that must agree on it: two of three, since one stall of the machine may spoil a trial, and one
-/// lucky trial says as little.
+/// Number of trials that must agree: two of three, because one stall of the machine can spoil a trial, and one lucky trial
+/// proves nothing.
 const AGREE: usize = 2;
 
 /// The largest number that is tried.
@@ -117,7 +117,7 @@ pub(crate) async fn load(arguments: &Arguments) -> Result<(), Failure> {
         print!("{}", outcome.table(limit));
     }
     if limit.is_none() && outcome.samples == 0 && arguments.clients_per_session > 0 && arguments.seconds > 0.0 {
-        return Err(Failure::Failed("no sample came".to_owned()));
+        return Err(Failure::Failed("no sample arrived".to_owned()));
     }
     if limit.is_none() && outcome.broken > 0 {
         return Err(Failure::Failed(format!("{} streams broke", outcome.broken)));
@@ -125,7 +125,8 @@ pub(crate) async fn load(arguments: &Arguments) -> Result<(), Failure> {
     Ok(())
 }
 
-/// What `AGREE` trials agree on: whether they keep to the objective, and the outcome of the last of them, if it had one.
+/// Repeats a trial until `AGREE` of them agree on whether the objective is met. Returns that, and the outcome of the last of
+/// them, if it had one.
 async fn agreed<E>(
     mut trial: impl AsyncFnMut() -> Result<(Option<Outcome>, bool), E>,
 ) -> Result<(Option<Outcome>, bool), E> {
@@ -139,8 +140,7 @@ async fn agreed<E>(
     }
 }
 
-/// The largest number of sessions that keeps to the objective, and its outcome: doubled until it fails, then halved
-/// between.
+/// The largest number of sessions that meets the objective, and its outcome: doubled until it fails, then bisected.
 async fn find_limit(
     arguments: &Arguments,
     server: &Server,
@@ -148,7 +148,7 @@ async fn find_limit(
     first: usize,
     objective: &Objective,
 ) -> Result<(Outcome, usize), Stopped> {
-    // Nothing is known of 0 sessions but that they keep to everything.
+    // 0 sessions meet every objective.
     let (mut best, mut low, mut high) = (None, 0, None);
     let mut next = first;
     loop {
@@ -186,11 +186,11 @@ async fn find_limit(
             Some(high) => usize::midpoint(low, high),
         };
     }
-    let none = || Stopped { message: "not one session could be had".to_owned(), is_refusal: false };
+    let none = || Stopped { message: "the server gave not one session".to_owned(), is_refusal: false };
     best.map(|outcome| (outcome, low)).ok_or_else(none)
 }
 
-/// Puts `sessions` on the server, measures, and takes them away again.
+/// Creates `sessions` on the server, measures, and deletes them again.
 async fn trial(arguments: &Arguments, server: &Server, source: &Source, sessions: usize) -> Result<Outcome, Stopped> {
     let stage = Arc::new(Stage::new());
     let clock = Instant::now();
@@ -201,7 +201,7 @@ async fn trial(arguments: &Arguments, server: &Server, source: &Source, sessions
         let rate_hz = arguments.rate_hz;
         move || tick(&senders, rate_hz, &is_over)
     });
-    // Told once by each thread when its clients are there, and by us when the measurement begins and ends.
+    // Each thread reports once when its clients are connected; we tell them when the measurement begins and ends.
     let (ready, mut gathered) = tokio::sync::mpsc::channel::<()>(threads);
     let (telling, told) = watch::channel(Stage::RAMP);
     let mut tallies = Vec::new();
@@ -231,7 +231,7 @@ async fn trial(arguments: &Arguments, server: &Server, source: &Source, sessions
     let mut progress = Progress::new(arguments, sessions, clock);
     let cpu_s = async {
         for _ in 0..threads {
-            // A thread that failed says nothing: it ends, and the rest is called off.
+            // A thread that failed closes its end of the channel; the trial is then called off.
             gathered.recv().await?;
         }
         tokio::time::sleep(SETTLE).await;
@@ -243,7 +243,7 @@ async fn trial(arguments: &Arguments, server: &Server, source: &Source, sessions
         while begun.elapsed() < length {
             tokio::time::sleep((length - begun.elapsed()).min(Duration::from_secs(1))).await;
             progress.tell(&tallies);
-            // Nobody is left whom one could measure.
+            // No stream is left to measure.
             let broken: u64 = tallies.iter().map(|tally| lock(tally).broken).sum();
             if broken > 0 && broken >= streams {
                 break;
@@ -255,7 +255,7 @@ async fn trial(arguments: &Arguments, server: &Server, source: &Source, sessions
     let cores = tokio::select! {
         cores = cpu_s => cores,
         _ = tokio::signal::ctrl_c() => {
-            crate::say!("palpate-client: interrupted: the sessions are taken away");
+            crate::say!("palpate-client: interrupted: deleting the sessions");
             None
         }
     };
@@ -318,7 +318,7 @@ fn work(
     })
 }
 
-/// Tells each phase in turn that its clients are to send: by the clock, whatever comes back.
+/// Tells each phase in turn that its clients are to send: by the clock, independent of the answers.
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 fn tick(phases: &[watch::Sender<u64>], rate_hz: f64, over: &watch::Receiver<()>) {
     let (begun, apart_s) = (Instant::now(), 1.0 / (rate_hz * phases.len() as f64));
@@ -331,7 +331,7 @@ fn tick(phases: &[watch::Sender<u64>], rate_hz: f64, over: &watch::Receiver<()>)
                 continue;
             }
         }
-        // What is overdue by more than a turn is not made good: clients count it.
+        // Ticks that are overdue by more than a turn are skipped, not caught up; clients count them.
         let count = phases.len() as u64;
         let behind = ((begun.elapsed().as_secs_f64() / apart_s) as u64).saturating_sub(tick) / count * count;
         tick += behind;
@@ -340,20 +340,20 @@ fn tick(phases: &[watch::Sender<u64>], rate_hz: f64, over: &watch::Receiver<()>)
     }
 }
 
-/// Time that this process has computed, s: where there is a /proc.
+/// Processor time of this process, s; `None` without a /proc.
 fn cpu_s() -> Option<f64> {
     let stat = std::fs::read_to_string("/proc/self/stat").ok()?;
     let ticks = stat[stat.rfind(')')? + 2..].split_whitespace().skip(11).take(2);
-    // In ticks of 10 ms, on every Linux.
+    // Linux counts ticks of 10 ms here.
     ticks.map(|field| field.parse::<f64>().ok()).sum::<Option<f64>>().map(|ticks| ticks / 100.0)
 }
 
-/// Tells now and then how it goes.
+/// Prints the progress of a trial.
 struct Progress {
     quiet: bool,
     sessions: usize,
     clock: Instant,
-    /// Samples, and when.
+    /// Number of samples at the last report, and its time.
     last: (u64, Instant),
 }
 

@@ -1,13 +1,13 @@
-//! What a load must keep to, as one writes it: `p99<2ms,dilation>0.999`.
+//! Objectives of a load, written like `p99<2ms,dilation>0.999`.
 
 use std::str::FromStr;
 
 use super::tally::Outcome;
 
-/// How something is read from a run.
+/// Reads a quantity from an outcome.
 type Quantity = fn(&Outcome) -> f64;
 
-/// What can be asked for.
+/// The quantities that an objective may bound.
 #[allow(clippy::cast_precision_loss)]
 const QUANTITIES: &[(&str, Quantity)] = &[
     ("p50", |outcome| outcome.round_trip_us.p50 * 1e-6),
@@ -28,11 +28,11 @@ struct Bound {
     text: String,
     quantity: Quantity,
     is_above: bool,
-    /// s, or a number.
+    /// In s for times, else a plain number.
     bound: f64,
 }
 
-/// Bounds that all must hold.
+/// Bounds that must all hold.
 #[derive(Clone)]
 pub(crate) struct Objective(Vec<Bound>);
 
@@ -53,7 +53,7 @@ impl FromStr for Bound {
         let (name, bound) = (text[..at].trim(), text[at + 1..].trim());
         let Some((_, quantity)) = QUANTITIES.iter().find(|quantity| quantity.0 == name) else {
             let names: Vec<&str> = QUANTITIES.iter().map(|quantity| quantity.0).collect();
-            return Err(format!("there is no `{name}`; there are {}", names.join(", ")));
+            return Err(format!("unknown quantity `{name}`; known are {}", names.join(", ")));
         };
         let units = [("ms", 1e-3), ("us", 1e-6), ("µs", 1e-6), ("s", 1.0)];
         let (number, unit) = units
@@ -62,19 +62,19 @@ impl FromStr for Bound {
             .unwrap_or((bound, 1.0));
         let is_time = !["dilation", "lost", "rejected"].contains(&name);
         if is_time == (number.len() == bound.len()) {
-            return Err(format!("`{bound}` is no bound of {name}: {example}"));
+            return Err(format!("`{bound}` is not a valid bound of {name}: {example}"));
         }
-        let bound = number.trim().parse::<f64>().map_err(|_| format!("`{bound}` is no number: {example}"))? * unit;
+        let bound = number.trim().parse::<f64>().map_err(|_| format!("`{bound}` is not a number: {example}"))? * unit;
         Ok(Bound { text: text.to_owned(), quantity: *quantity, is_above: text.as_bytes()[at] == b'>', bound })
     }
 }
 
 impl Objective {
-    /// The bounds that a run has not kept to.
+    /// The bounds that a run does not meet.
     pub(crate) fn missed(&self, outcome: &Outcome) -> Vec<&str> {
         let misses = |bound: &&Bound| {
             let value = (bound.quantity)(outcome);
-            // What was not measured meets nothing.
+            // NaN, which means not measured, meets no bound.
             let meets = if bound.is_above { value > bound.bound } else { value < bound.bound };
             !meets
         };

@@ -17,26 +17,26 @@ use tonic::Status;
 use super::client::{Arrivals, Client, Common, Stage, Stroke, lock};
 use crate::connect::{Channel, Server, describe};
 
-/// What a thread is to do.
+/// The task of one thread.
 pub(crate) struct Orders {
     pub(crate) server: Server,
     pub(crate) source: Source,
-    /// The numbers of its sessions among all.
+    /// Indices of its sessions among all.
     pub(crate) sessions: Vec<usize>,
     pub(crate) clients_per_session: u32,
     pub(crate) viewers_per_session: u32,
     pub(crate) clients_per_connection: usize,
     pub(crate) frame_rate_hz: f64,
-    /// Between two sessions.
+    /// Time between the starts of two sessions.
     pub(crate) pause: Duration,
-    /// How long it may all take, for leases.
+    /// Upper bound of the whole duration, s; leases last as long.
     pub(crate) lasts_s: f64,
 }
 
-/// Why a load could not be laid on.
+/// Why a load could not run.
 pub(crate) struct Stopped {
     pub(crate) message: String,
-    /// An input that was refused: not the server's state.
+    /// Whether an input was refused; otherwise the server failed.
     pub(crate) is_refusal: bool,
 }
 
@@ -60,11 +60,11 @@ impl From<Refusal> for Stopped {
     }
 }
 
-/// A session, and what is known of it.
+/// A session that this thread created.
 struct Made {
     id: String,
     rate_hz: f64,
-    /// Step and our time, when the measurement began.
+    /// Step and our time, ns, at which the measurement began.
     begin: Option<(u64, u64)>,
 }
 
@@ -90,7 +90,7 @@ impl Connections<'_> {
     }
 }
 
-/// Sessions of a thread while they are there.
+/// The sessions and clients of a thread.
 pub(crate) struct Swarm {
     client: SessionServiceClient<Channel>,
     made: Vec<Made>,
@@ -104,10 +104,10 @@ impl Swarm {
         Ok(Swarm { client, made: Vec::new(), tasks: JoinSet::new(), common: common.clone() })
     }
 
-    /// Makes the sessions and opens what belongs to them.
+    /// Creates the sessions and opens the streams of their clients and viewers.
     pub(crate) async fn gather(&mut self, orders: &Orders, phases: &[watch::Receiver<u64>]) -> Result<(), Stopped> {
         let mut connections = Connections { orders, newest: None };
-        // Frames would go before samples on a connection of both.
+        // Separate connections: on a shared one, frames would delay samples.
         let mut viewing = Connections { orders, newest: None };
         let begun = tokio::time::Instant::now();
         for (place, number) in orders.sessions.iter().enumerate() {
@@ -116,7 +116,7 @@ impl Swarm {
             let request = pb::CreateSessionRequest {
                 source: Some(orders.source.clone()),
                 paused: false,
-                // Should we vanish, so do they.
+                // If this program dies, the server deletes its sessions.
                 idle_timeout_s: Some(10.0),
             };
             let created = self.client.create_session(request).await?.into_inner().session.unwrap_or_default();
@@ -157,7 +157,7 @@ impl Swarm {
         Ok(())
     }
 
-    /// Where sessions stand of which no client hears, at the beginning of the measurement and at its end.
+    /// Asks for the steps of sessions without clients, at the beginning and at the end of the measurement.
     pub(crate) async fn look(&mut self, orders: &Orders) {
         if orders.clients_per_session > 0 {
             return;
@@ -176,7 +176,7 @@ impl Swarm {
                             ((session.step - step) as f64 / made.rate_hz, (now_ns - at_ns) as f64 * 1e-9);
                         tally.dilation_min = tally.dilation_min.min(simulated_s / real_s);
                         if session.resting {
-                            tally.broke("a session came to rest that was to be kept awake".to_owned());
+                            tally.broke("a session came to rest although it was to be kept awake".to_owned());
                         }
                     }
                 },
@@ -185,29 +185,29 @@ impl Swarm {
         }
     }
 
-    /// Waits for what is under way.
+    /// Waits for all clients and viewers to end.
     pub(crate) async fn drain(&mut self) {
         while self.tasks.join_next().await.is_some() {}
     }
 
-    /// Deletes the sessions: also those of a load that failed.
+    /// Deletes the sessions, also after a failure.
     pub(crate) async fn disperse(&mut self) {
         self.tasks.abort_all();
         for made in self.made.drain(..) {
             let deleted = self.client.delete_session(pb::DeleteSessionRequest { session_id: made.id });
             if !matches!(tokio::time::timeout(Duration::from_secs(2), deleted).await, Ok(Ok(_))) {
-                // A server that has gone has no sessions any more.
+                // The server is gone, and its sessions with it.
                 return;
             }
         }
     }
 }
 
-/// A session that nobody streams to is told beforehand what its tool is to do, in one call: a new force now and then, so
-/// that the tissue never comes to rest.
+/// Sends a session without clients all its commands in advance, in one call: a new force every [`APART_S`], so that the
+/// tissue never comes to rest.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
 async fn keep_awake(channel: Channel, id: &str, scene: &Scene, step: u64, lasts_s: f64) -> Result<(), Stopped> {
-    /// Below what a session queues.
+    /// Fewer than a session queues.
     const MOST_COMMANDS: u64 = 4000;
     const APART_S: f64 = 0.05;
     let rate_hz = scene.stepping.rate_hz;
@@ -220,7 +220,7 @@ async fn keep_awake(channel: Channel, id: &str, scene: &Scene, step: u64, lasts_
         tool: 0,
         lease_s: Some(lasts_s),
         holder: "palpate-client load".to_owned(),
-        // Nobody stays to hold it.
+        // The connection closes before the commands act.
         outlives_connection: true,
     };
     let lease_id = haptics.acquire_tool(acquire).await?.into_inner().lease_id;
@@ -234,13 +234,13 @@ async fn keep_awake(channel: Channel, id: &str, scene: &Scene, step: u64, lasts_
     Ok(())
 }
 
-/// A viewer, until the measurement is over.
+/// Counts a viewer's frames until the measurement is over.
 async fn watch(
     common: Common,
     mut parts: tonic::Streaming<pb::WatchFramesResponse>,
     arrivals: Option<Arc<Mutex<Arrivals>>>,
 ) {
-    // Without samples: arrival less simulated time of the least delayed frame, s.
+    // Used when there are no samples: arrival time minus simulated time of the least delayed frame, s.
     let mut least_s = f64::INFINITY;
     while !common.stage.is(Stage::DRAIN) {
         let part = match tokio::time::timeout(Duration::from_millis(200), parts.message()).await {

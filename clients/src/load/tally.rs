@@ -1,38 +1,39 @@
-//! What a load has seen, and what is told of it.
+//! Counts of a load, and the report of them.
 
 use std::collections::BTreeMap;
 
 use hdrhistogram::Histogram;
 use serde_json::{Value, json};
 
-/// The longest that is told apart, ns.
+/// The largest duration that the histograms resolve, ns.
 const LONGEST_NS: u64 = 60_000_000_000;
 
-/// Of all clients of one thread.
+/// Counts of all clients of one thread.
 pub(crate) struct Tally {
-    /// Of every command: sent to the first sample that acknowledges it.
+    /// From each command to the first sample that acknowledges it.
     pub(crate) round_trip_ns: Histogram<u64>,
     /// Between two samples of a client.
     pub(crate) sample_gap_ns: Histogram<u64>,
-    /// Of a frame: later than the sample of its step, or without one, than the least delayed frame.
+    /// Age of a frame against the sample of its step, or if there is none, against the least delayed frame.
     pub(crate) frame_age_ns: Histogram<u64>,
     pub(crate) samples: u64,
     pub(crate) frames: u64,
     pub(crate) commands: u64,
-    /// Ticks at which the generator itself was too late to send.
+    /// Ticks at which this generator was too late to send.
     pub(crate) unsent: u64,
-    /// Commands of which nothing was heard.
+    /// Commands that nothing acknowledged.
     pub(crate) lost_commands: u64,
     /// Samples that the server dropped because a client read too slowly.
     pub(crate) lost_samples: u64,
-    /// Commands that were refused, by reason.
+    /// Refused commands by reason.
     pub(crate) rejected: BTreeMap<String, u64>,
     /// Sum of the awake points of all samples.
     pub(crate) awake_points: u64,
-    /// The smallest of all sessions.
+    /// Smallest dilation of all sessions.
     pub(crate) dilation_min: f64,
-    /// Streams that broke, and why the first did.
+    /// Number of streams that broke.
     pub(crate) broken: u64,
+    /// Why the first of them broke.
     pub(crate) first_break: Option<String>,
 }
 
@@ -64,7 +65,7 @@ impl Tally {
             (&mut self.sample_gap_ns, &other.sample_gap_ns),
             (&mut self.frame_age_ns, &other.frame_age_ns),
         ] {
-            // Of the same bounds.
+            // Can't fail: both have the same bounds.
             let _ = all.add(one);
         }
         self.samples += other.samples;
@@ -87,7 +88,7 @@ impl Tally {
         self.first_break.get_or_insert(why);
     }
 
-    /// What is told of it.
+    /// Summary of the counts.
     #[allow(clippy::cast_precision_loss)]
     pub(crate) fn outcome(&self, sessions: usize) -> Outcome {
         Outcome {
@@ -112,7 +113,7 @@ impl Tally {
     }
 }
 
-/// Of a distribution, µs; NaN if nothing was measured.
+/// Quantiles of a distribution, µs; NaN if nothing was measured.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Quantiles {
     pub(crate) p50: f64,
@@ -141,7 +142,7 @@ impl Quantiles {
     }
 }
 
-/// What is told of one load.
+/// Summary of one load.
 #[derive(Debug, Clone)]
 pub(crate) struct Outcome {
     pub(crate) sessions: usize,
@@ -160,12 +161,12 @@ pub(crate) struct Outcome {
     pub(crate) round_trip_us: Quantiles,
     pub(crate) sample_gap_us: Quantiles,
     pub(crate) frame_age_us: Quantiles,
-    /// Cores that the generator itself took.
+    /// Processor time of this generator per second, cores.
     pub(crate) generator_cores: f64,
 }
 
 impl Outcome {
-    /// As one object; what was not measured is `null`.
+    /// As one JSON object; what was not measured is `null`.
     pub(crate) fn json(&self, limit_sessions: Option<usize>) -> Value {
         let mut object = json!({
             "sessions": self.sessions,
@@ -192,7 +193,7 @@ impl Outcome {
         object
     }
 
-    /// For people.
+    /// As a table for a terminal.
     pub(crate) fn table(&self, limit_sessions: Option<usize>) -> String {
         let reasons: Vec<String> = self.reasons.iter().map(|(reason, count)| format!("{reason} {count}")).collect();
         let mut rows = vec![
