@@ -17,7 +17,7 @@ MODULES := $(VIEWER)/node_modules/.package-lock.json
 PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/*.yaml $(VIEWER)/index.html $(VIEWER)/src/*.ts \
 	$(VIEWER)/src/*.css $(VIEWER)/public/* proto/palpate/v1/*.proto)
 
-.PHONY: help run build viewer page-if-node test test-viewer test-arm test-asan test-valgrind test-debug need-arm stress libfuzzer lint picture figures screenshot bench-roundtrip bench-duty \
+.PHONY: help run build viewer page-if-node test test-viewer test-arm test-asan test-valgrind test-debug test-mutants need-arm stress libfuzzer lint picture figures screenshot bench-roundtrip bench-duty \
 	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-rest bench-link bench-viewer bench-load soak siege fuzz need-rust \
 	need-python need-node
 
@@ -30,6 +30,7 @@ help:
 	@echo 'make test-asan       the kernel under the address sanitizer'
 	@echo 'make test-valgrind   the kernel under memcheck of valgrind, plain and AVX2'
 	@echo 'make test-debug      the kernel with debug assertions'
+	@echo 'make test-mutants    how many of 300 mutants of the kernel, touch and sessions the tests catch (an hour or two)'
 	@echo 'make stress          ten thousand random scenes, ten million steps (some minutes)'
 	@echo 'make fuzz            a million bent inputs for every decoder (some minutes)'
 	@echo 'make libfuzzer       one decoder under libFuzzer: TARGET=request (or scene, script, …) FUZZ_SECONDS=60'
@@ -171,6 +172,11 @@ test-valgrind: need-rust
 test-debug: need-rust
 	CARGO_PROFILE_RELEASE_DEBUG_ASSERTIONS=true $(CARGO) test --release --target-dir target/assertions --lib \
 		--test determinism --test physics
+
+# `make test-mutants ARGUMENTS='--count 20 --seed 7 --afresh'`; exit status 1 if fewer than nine in ten are caught.
+test-mutants: need-rust need-python
+	@command -v cargo-mutants >/dev/null || { echo 'cargo-mutants is missing: cargo install cargo-mutants' >&2; exit 1; }
+	$(PYTHON) tests/mutants/run.py $(ARGUMENTS)
 
 # A million inputs a decoder; FUZZ_INPUTS=… for more.
 FUZZ_INPUTS ?= 1000000

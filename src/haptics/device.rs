@@ -102,3 +102,37 @@ impl Device {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Row k is met with k/2 N and has a stiffness of 100·k N/m.
+    fn hardening(rows: u32) -> Law {
+        let row = |k: u32| Row {
+            force_n: 0.5 * f64::from(k),
+            stiffness_n_per_m: 100.0 * f64::from(k),
+            damping_n_s_per_m: 1.0,
+            ..Row::default()
+        };
+        Law { step_m: 1e-3, rows: (0..rows).map(row).collect(), is_coarse: false }
+    }
+
+    #[test]
+    fn misgivings_name_what_a_device_is_asked_for_beyond_its_limits() {
+        // The largest force is met in the row of 400 N/m. The harder rows are never rendered.
+        let device = Device { force_n: 2.0, stiffness_n_per_m: 400.0, ..UNDECLARED };
+        assert!(device.misgivings(&hardening(10)).is_empty());
+        let softer = Device { stiffness_n_per_m: 300.0, ..device };
+        let said = softer.misgivings(&hardening(10));
+        assert!(
+            said.len() == 1 && said[0].contains("stiffness reaches 400 N/m, above the device's 300 N/m"),
+            "{said:?}"
+        );
+        // A law that ends below the largest force counts up to its last row.
+        assert!(softer.misgivings(&hardening(4)).is_empty());
+        assert_eq!(Device { stiffness_n_per_m: 200.0, ..device }.misgivings(&hardening(4)).len(), 1);
+        let said = Device { stiffness_n_per_m: 10.0, damping_n_s_per_m: 0.5, ..device }.misgivings(&hardening(10));
+        assert!(said.len() == 2 && said[1].contains("damping reaches 1 N·s/m"), "{said:?}");
+    }
+}

@@ -338,3 +338,106 @@ impl Envelope {
 
 /// Duration of a tick if unknown, s.
 const NOMINAL_S: f64 = 1e-3;
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    /// A device that a hand pushes along −z, tick by tick.
+    struct Port {
+        envelope: Envelope,
+        tick: u32,
+        height_m: f64,
+    }
+
+    impl Port {
+        fn new(name: &str) -> Self {
+            let mut envelope = Envelope::new(Device::named(name).unwrap(), DVec3::ZERO);
+            envelope.enable();
+            Port { envelope, tick: 0, height_m: 0.0 }
+        }
+
+        /// One tick at a velocity with a wanted force, both along z. Returns the rendered force.
+        fn tick(&mut self, velocity_m_per_s: f64, force_n: f64) -> f64 {
+            let wanted = Wanted {
+                now_s: f64::from(self.tick) * 1e-3,
+                place_m: self.height_m * DVec3::Z,
+                velocity_m_per_s: velocity_m_per_s * DVec3::Z,
+                force_n: force_n * DVec3::Z,
+                age_s: 0.0,
+            };
+            self.tick += 1;
+            self.height_m += velocity_m_per_s * 1e-3;
+            self.envelope.render(&wanted).z
+        }
+
+        /// The same for many ticks. Returns the last force.
+        fn ticks(&mut self, count: u32, velocity_m_per_s: f64, force_n: f64) -> f64 {
+            (0..count).map(|_| self.tick(velocity_m_per_s, force_n)).last().unwrap()
+        }
+    }
+
+    #[test]
+    fn a_force_ramps_in_linearly_and_each_tick_of_the_ramp_is_counted() {
+        let mut port = Port::new("omega3");
+        // It engages at once, because the force is small. A hand that presses on pays for what follows.
+        port.tick(-0.05, 0.0);
+        let half_n = port.ticks(250, -0.05, 1.0);
+        assert!((half_n - 0.5).abs() < 1e-9, "{half_n}");
+        let whole_n = port.ticks(250, -0.05, 1.0);
+        assert!((whole_n - 1.0).abs() < 1e-9, "{whole_n}");
+        assert_eq!(port.envelope.count(Reason::Engage), (500, 501));
+        assert_eq!(port.ticks(100, -0.05, 1.0), 1.0);
+        assert_eq!(port.envelope.count(Reason::Engage), (500, 601));
+        for reason in [Reason::Stale, Reason::Force, Reason::Slew, Reason::Passivity, Reason::NotFinite] {
+            assert_eq!(port.envelope.count(reason).0, 0, "{reason:?}");
+        }
+    }
+
+    #[test]
+    fn what_is_disabled_lets_go_until_it_is_enabled_and_a_fault_stays_a_fault() {
+        let mut port = Port::new("omega3");
+        port.tick(-0.05, 0.0);
+        assert_eq!(port.ticks(600, -0.05, 1.0), 1.0);
+        port.envelope.disable();
+        assert_eq!(port.envelope.state(), State::Disabled);
+        assert!(port.ticks(300, 0.0, 1.0) < 0.01);
+        port.envelope.enable();
+        assert_eq!(port.envelope.state(), State::Enabled);
+        port.envelope.fail();
+        port.envelope.disable();
+        assert_eq!(port.envelope.state(), State::Fault);
+    }
+
+    #[test]
+    fn a_motor_exceeds_its_continuous_force_for_two_seconds_and_then_has_to_cool() {
+        let mut port = Port::new("omni");
+        port.tick(-0.01, 0.0);
+        // The ramp passes 0.88 N after 0.22 s.
+        assert_eq!(port.ticks(2200, -0.01, 2.0), 2.0);
+        assert_eq!(port.envelope.count(Reason::Continuous).0, 0);
+        assert!((port.ticks(60, -0.01, 2.0) - 0.88).abs() < 1e-12);
+        assert!(port.envelope.count(Reason::Continuous).0 > 0);
+        // A second of rest is good for a second of force.
+        assert_eq!(port.ticks(1000, -0.01, 0.5), 0.5);
+        assert_eq!(port.ticks(950, -0.01, 2.0), 2.0);
+        assert!((port.ticks(120, -0.01, 2.0) - 0.88).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_spring_that_falls_no_faster_than_the_slew_is_never_limited() {
+        let mut port = Port::new("omega3");
+        let spring_n = |port: &Port| 400.0 * (-port.height_m).max(0.0);
+        port.ticks(600, 0.0, 0.0);
+        for _ in 0..2 {
+            for velocity_m_per_s in [-0.05, 0.0, 0.05] {
+                for _ in 0..100 {
+                    let wanted_n = spring_n(&port);
+                    assert_eq!(port.tick(velocity_m_per_s, wanted_n), wanted_n, "at {} m", port.height_m);
+                }
+            }
+        }
+        assert_eq!([Reason::Passivity, Reason::Slew].map(|reason| port.envelope.count(reason).0), [0; 2]);
+    }
+}

@@ -196,3 +196,73 @@ fn within(vector: DVec3, most: f64) -> DVec3 {
     let length = vector.length();
     if length <= most { vector } else { vector * (most / length) }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::law::Row;
+    use super::*;
+
+    const NORMAL: DVec3 = DVec3::new(0.6, 0.0, 0.8);
+    /// A direction in the surface.
+    const ALONG: DVec3 = DVec3::new(-0.8, 0.0, 0.6);
+
+    /// 400 N/m and 0.5 N·s/m along the normal; across it 300 N/m and 2 N·s/m of a disc that sticks.
+    fn law() -> Law {
+        let row = |depth_m: f64| Row {
+            force_n: 400.0 * depth_m,
+            stiffness_n_per_m: 400.0,
+            across_n_per_m: 300.0,
+            damping_n_s_per_m: 0.5,
+            across_n_s_per_m: 2.0,
+            drag_n_s_per_m: 1.0,
+        };
+        Law { step_m: 0.1, rows: vec![row(0.0), row(0.1)], is_coarse: false }
+    }
+
+    /// A disc at rest, 4 mm deep, so pressed with 1.6 N, and drawn back along the surface with `drawn_n`.
+    fn model(drawn_n: f64) -> LocalModel {
+        LocalModel {
+            sequence: 1,
+            client_time_s: 0.0,
+            step: 1,
+            place_m: -0.004 * NORMAL,
+            velocity_m_per_s: DVec3::ZERO,
+            force_n: 1.6 * NORMAL - drawn_n * ALONG,
+            stiffness_n_per_m: DMat3::IDENTITY,
+            damping_n_s_per_m: DMat3::IDENTITY,
+            surface_m: DVec3::ZERO,
+            normal: NORMAL,
+            valid_m: 0.01,
+            friction: 0.2,
+            standing: Standing::Sticking,
+        }
+    }
+
+    #[test]
+    fn a_disc_that_sticks_goes_on_from_the_samples_stretch_up_to_the_cone_of_friction() {
+        let (law, model) = (law(), model(0.2));
+        let mut touching = Touching::at_sample(&model, &law);
+        // Where it is, it feels the sample's force; a way of 0.1 mm stretches by 0.03 N; the cone is at 0.2·1.6 N.
+        for (way_m, drawn_n) in [(0.0, 0.2), (1e-4, 0.23), (-1e-4, 0.17), (0.0, 0.2), (0.01, 0.32), (0.02, 0.32)] {
+            touching.move_to(&model, &law, model.place_m + way_m * ALONG);
+            let force_n = touching.force_n(&model, &law, DVec3::ZERO);
+            assert!((force_n - (1.6 * NORMAL - drawn_n * ALONG)).length() < 1e-12, "{way_m} m: {force_n}");
+        }
+        // Back from there the stretch gets less at once.
+        touching.move_to(&model, &law, model.place_m + (0.02 - 1e-4) * ALONG);
+        let force_n = touching.force_n(&model, &law, DVec3::ZERO);
+        assert!((force_n.dot(ALONG) + 0.29).abs() < 1e-12, "{force_n}");
+    }
+
+    #[test]
+    fn damping_acts_along_the_movement_and_across_never_beyond_the_cone() {
+        let (law, model) = (law(), model(0.0));
+        let touching = Touching::at_sample(&model, &law);
+        let inward_n = touching.force_n(&model, &law, -0.1 * NORMAL);
+        assert!((inward_n - 1.65 * NORMAL).length() < 1e-12, "{inward_n}");
+        let slow_n = touching.force_n(&model, &law, 0.1 * ALONG);
+        assert!((slow_n - (1.6 * NORMAL - 0.2 * ALONG)).length() < 1e-12, "{slow_n}");
+        let fast_n = touching.force_n(&model, &law, 1.0 * ALONG);
+        assert!((fast_n - (1.6 * NORMAL - 0.32 * ALONG)).length() < 1e-12, "{fast_n}");
+    }
+}

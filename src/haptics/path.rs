@@ -150,3 +150,48 @@ impl Path {
 
 /// A new tool begins at least this high above the sheet at rest, m.
 const ABOVE_M: f64 = 0.002;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const STEP_S: f64 = 1e-3;
+
+    /// Plays commands, one a millisecond, which arrive as `arrival` says: at step k come those before `arrival(k)`. Returns
+    /// the client's time of the tool at each step.
+    fn played(steps: u32, arrival: impl Fn(u32) -> u32) -> Vec<f64> {
+        let (mut path, mut sent, mut times) = (Path::default(), 0, Vec::new());
+        for step in 0..steps {
+            let now_s = f64::from(step) * STEP_S;
+            while sent < arrival(step) {
+                path.receive(f64::from(sent) * STEP_S, DVec3::ZERO, now_s);
+                sent += 1;
+            }
+            if let Some(Play::Lead(_, time_s)) = path.step(now_s, STEP_S) {
+                times.push(time_s);
+            }
+        }
+        times
+    }
+
+    #[test]
+    fn bursts_that_leave_nothing_to_spare_are_played_at_the_clients_own_pace() {
+        // Bursts of ten: the last command of each is played as the next arrives.
+        let times = played(1500, |step| step / 10 * 10);
+        for pair in times[20..].windows(2) {
+            assert!((pair[1] - pair[0] - STEP_S).abs() < 1e-9, "{pair:?}");
+        }
+    }
+
+    #[test]
+    fn a_tool_catches_up_with_commands_that_are_always_there_and_no_faster_than_by_a_tenth() {
+        // The first commands are late by 40 ms, the others by 5 ms.
+        let times = played(3000, |step| if step < 41 { u32::from(step == 40) } else { step - 5 });
+        let last = times.last().map_or(0.0, |time_s| 2999.0 * STEP_S - time_s);
+        assert!(last < 0.008, "{last} s late");
+        for pair in times.windows(2) {
+            let passed_s = pair[1] - pair[0];
+            assert!((0.0..=1.1 * STEP_S + 1e-9).contains(&passed_s), "{pair:?}");
+        }
+    }
+}

@@ -133,3 +133,65 @@ impl Renderer {
         self.envelope.render(&wanted)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use glam::DMat3;
+
+    use super::super::device::UNDECLARED;
+    use super::*;
+
+    /// Of a tool at rest at `place_m`, on a surface at `height_m` with a spring of 400 N/m.
+    fn model(sequence: u64, time_s: f64, place_m: DVec3, height_m: f64) -> LocalModel {
+        LocalModel {
+            sequence,
+            client_time_s: time_s,
+            step: sequence,
+            place_m,
+            velocity_m_per_s: DVec3::ZERO,
+            force_n: 400.0 * (height_m - place_m.z) * DVec3::Z,
+            stiffness_n_per_m: DMat3::IDENTITY,
+            damping_n_s_per_m: DMat3::IDENTITY,
+            surface_m: height_m * DVec3::Z,
+            normal: DVec3::Z,
+            valid_m: 0.01,
+            friction: 0.2,
+            standing: Standing::Sticking,
+        }
+    }
+
+    fn renderer() -> Renderer {
+        Renderer::new(Law::linear(400.0, 0.5), Envelope::new(UNDECLARED, DVec3::ZERO))
+    }
+
+    #[test]
+    fn a_moving_hand_feels_the_spring_where_it_is_and_the_damping_of_its_speed() {
+        let mut renderer = renderer();
+        let place_m = |tick: u32| -DVec3::Z * (0.002 + 1e-4 * f64::from(tick));
+        renderer.receive(model(1, 0.0, place_m(0), 0.0), 0.0);
+        for tick in 0..30 {
+            let now_s = f64::from(tick) * 1e-3;
+            renderer.tick(now_s, place_m(tick));
+            // 0.1 m/s from the second tick on.
+            let damping_n = if tick == 0 { 0.0 } else { 0.05 };
+            let expected_n = 0.8 + 0.04 * f64::from(tick) + damping_n;
+            let wanted_n = renderer.wanted_n(now_s);
+            assert!((wanted_n - expected_n * DVec3::Z).length() < 1e-9, "{tick}: {wanted_n}");
+        }
+    }
+
+    #[test]
+    fn a_newer_model_changes_the_force_without_a_jump() {
+        let (mut renderer, place_m) = (renderer(), -0.004 * DVec3::Z);
+        renderer.receive(model(1, 0.0, place_m, 0.0), 0.0);
+        renderer.tick(0.0, place_m);
+        assert!((renderer.wanted_n(0.0).z - 1.6).abs() < 1e-12);
+        // The surface was told a millimetre too high: 1.6 N instead of 1.2.
+        renderer.receive(model(2, 0.001, place_m, -0.001), 0.001);
+        renderer.tick(0.001, place_m);
+        for (later_s, expected_n) in [(0.0, 1.6), (BIAS_S, 1.2 + 0.4 / std::f64::consts::E), (1.0, 1.2)] {
+            let wanted_n = renderer.wanted_n(0.001 + later_s);
+            assert!((wanted_n - expected_n * DVec3::Z).length() < 1e-9, "{later_s} s: {wanted_n}");
+        }
+    }
+}

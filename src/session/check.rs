@@ -138,3 +138,25 @@ impl fmt::Display for Report {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use std::cell::Cell;
+
+    use super::*;
+
+    #[test]
+    fn a_report_tells_the_time_of_a_step_and_the_decay_of_vibrations() {
+        // 2m/C with m = 0.01 kg.
+        let model = Model::paper(&["sheet.points=[3, 3]", "damping.coefficient_n_s_per_m=0.4"]);
+        // Between two looks at this clock a whole window passes, whatever is done.
+        let now_s = Cell::new(100.0);
+        let clock_s = || now_s.replace(now_s.get() + WINDOW_S);
+        let report = check(&model, &Limits::default(), &clock_s);
+        assert!(report.step_s.unwrap().iter().all(|step_s| (step_s - WINDOW_S).abs() < 1e-9), "{:?}", report.step_s);
+        let text = report.to_string();
+        assert!(text.contains("vibrations decay by e in 0.0500 s"), "{text}");
+        assert!(text.contains("4000.00 µs a step at best"), "{text}");
+    }
+}

@@ -135,3 +135,75 @@ fn around(normal: DVec3, along: f64, across: f64) -> DMat3 {
     let outer = DMat3::from_cols(normal * normal.x, normal * normal.y, normal * normal.z);
     outer * (along - across) + DMat3::IDENTITY * across
 }
+
+#[cfg(test)]
+mod tests {
+    use glam::DVec2;
+
+    use super::*;
+
+    /// Of a tool at a height, over a surface that is level at `surface_m`.
+    fn feel(height_m: f64, surface_m: f64, standing: Standing) -> Feel {
+        Feel {
+            place_m: height_m * DVec3::Z,
+            velocity_m_per_s: DVec3::ZERO,
+            standing,
+            force_on_tool_n: DVec3::ZERO,
+            surface_m: surface_m * DVec3::Z,
+            anchor_m: DVec2::ZERO,
+            normal: DVec3::Z,
+            friction: 0.2,
+        }
+    }
+
+    fn modeller() -> Modeller {
+        Modeller::new(Arc::new(Law::linear(400.0, 0.5)), false)
+    }
+
+    #[test]
+    fn a_matrix_has_one_value_along_the_normal_and_another_across() {
+        let normal = DVec3::new(0.48, 0.6, 0.64);
+        let matrix = around(normal, 400.0, 150.0);
+        assert!((matrix * normal - 400.0 * normal).length() < 1e-9);
+        for across in [normal.any_orthogonal_vector(), normal.cross(normal.any_orthogonal_vector())] {
+            assert!((matrix * across - 150.0 * across).length() < 1e-9);
+        }
+    }
+
+    #[test]
+    fn a_surface_that_the_tool_knocks_away_stays_in_the_model_for_some_samples() {
+        let mut modeller = modeller();
+        assert_eq!(modeller.model(&feel(0.001, 0.0, Standing::Free), 0, 0.0).surface_m, DVec3::ZERO);
+        // Above the surface it is where it is.
+        assert_eq!(modeller.model(&feel(0.001, -0.0005, Standing::Free), 1, 0.0).surface_m.z, -0.0005);
+        // Knocked: the tool is below where the surface was, and does not touch it.
+        for step in 0..KNOCKED_SAMPLES {
+            let model = modeller.model(&feel(-0.001, -0.002, Standing::Free), 2 + u64::from(step), 0.0);
+            assert_eq!(model.surface_m.z, -0.0005, "sample {step}");
+        }
+        // It did not come back: that is where it is now.
+        assert_eq!(modeller.model(&feel(-0.001, -0.002, Standing::Free), 20, 0.0).surface_m.z, -0.002);
+    }
+
+    #[test]
+    fn a_grasp_has_the_newest_stiffness_that_was_computed_and_the_laws_before() {
+        let mut modeller = modeller();
+        let by_law = DMat3::IDENTITY * 400.0;
+        let near = |a: DMat3, b: DMat3| (a - b).abs_diff_eq(DMat3::ZERO, 1e-9);
+        assert!(near(modeller.model(&feel(0.0, 0.0, Standing::Holding), 0, 0.0).stiffness_n_per_m, by_law));
+        let tangent = Tangent {
+            stiffness_n_per_m: DMat3::IDENTITY * 123.0,
+            damping_n_s_per_m: DMat3::IDENTITY * 4.0,
+            drag_n_s_per_m: 0.0,
+            mass_kg: 0.0,
+            iterations: 1,
+        };
+        *modeller.tangent.lock().unwrap_or_else(PoisonError::into_inner) = Some(tangent);
+        let model = modeller.model(&feel(0.0, 0.0, Standing::Holding), 1, 0.0);
+        assert_eq!(model.stiffness_n_per_m, tangent.stiffness_n_per_m);
+        assert_eq!(model.damping_n_s_per_m, tangent.damping_n_s_per_m);
+        // It belongs to the place that was grasped.
+        modeller.model(&feel(0.001, 0.0, Standing::Free), 2, 0.0);
+        assert!(near(modeller.model(&feel(0.0, 0.0, Standing::Holding), 3, 0.0).stiffness_n_per_m, by_law));
+    }
+}

@@ -245,3 +245,66 @@ pub fn summary(tissue: &dyn Tissue, wall_s: f64) -> Summary {
         network: None,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use std::cell::Cell;
+    use std::path::Path;
+
+    use super::*;
+
+    /// Two forces and two grasped points, each far from the others.
+    const FOUR_TOOLS: &str = "duration_s = 0.02\nsample_every_s = 0.01\n\
+        [[force]]\npoint = [2, 2]\nforce_n = [0.0, 0.0, -0.1]\nfalloff_per_m = 500.0\nfalloff_offset = 0.0\n\
+        profile = { type = \"constant\" }\n\
+        [[force]]\npoint = [2, 12]\nforce_n = [0.0, 0.0, -0.1]\nfalloff_per_m = 500.0\nfalloff_offset = 0.0\n\
+        profile = { type = \"constant\" }\n\
+        [[tool]]\npoint = [12, 2]\nmoves = [{ from_s = 0.0, to_s = 0.02, by_m = [0.0, 0.0, -0.01] }]\n\
+        [[tool]]\npoint = [12, 12]\nmoves = [{ from_s = 0.0, to_s = 0.02, by_m = [0.0, 0.0, -0.01] }]\n";
+
+    fn model() -> Arc<Model> {
+        Model::paper(&["sheet.points=[15, 15]", "stepping.integrator=central", "stepping.substeps=1"])
+    }
+
+    fn script(model: &Model, more: &str) -> Script {
+        let text = format!("{FOUR_TOOLS}{more}");
+        Script::parse("test", &text, Path::new(""), &model.scene, &Limits::default()).unwrap()
+    }
+
+    #[test]
+    fn every_force_and_every_grasp_of_a_script_acts() {
+        let model = model();
+        let mut session = Session::new(&model);
+        play(&mut session, &script(&model, ""));
+        (0..10).for_each(|_| session.advance(&mut Vec::new(), |_| {}));
+        for (point, is_grasped) in [([2, 2], false), ([2, 12], false), ([12, 2], true), ([12, 12], true)] {
+            let state = session.tissue().point(model.index_of(point));
+            assert!(state.displacement_m.z < -1e-4, "{point:?}: {state:?}");
+            assert_eq!(state.constraint_n.is_some(), is_grasped, "{point:?}");
+            assert_eq!(state.applied_n.z < -0.09, !is_grasped, "{point:?}: {state:?}");
+        }
+    }
+
+    #[test]
+    fn a_run_takes_its_changes_of_tissue_and_no_more_time_than_passed() {
+        let model = model();
+        let run_with = |more: &str| {
+            let (begun_s, mut output) = (1e6, Vec::new());
+            let now_s = Cell::new(begun_s);
+            let clock_s = || now_s.replace(now_s.get() + 0.5);
+            let script = script(&model, more);
+            let summary = run(&model, &script, false, &Limits::default(), &mut output, &clock_s, &mut |_| {}).unwrap();
+            let passed_s = now_s.get() - begun_s;
+            assert!(summary.wall_s > 0.0 && summary.wall_s <= passed_s, "{} of {passed_s} s", summary.wall_s);
+            summary
+        };
+        let plain = run_with("");
+        let changed = run_with("[[tissue]]\nat_s = 0.01\nvirtual_stiffness_n_per_m = 50.0\n");
+        assert_eq!((plain.steps, changed.steps), (20, 20));
+        assert_ne!(plain.final_hash, changed.final_hash);
+        // At the very end it changes nothing any more.
+        let late = run_with("[[tissue]]\nat_s = 0.02\nvirtual_stiffness_n_per_m = 50.0\n");
+        assert_eq!(plain.final_hash, late.final_hash);
+    }
+}

@@ -369,4 +369,15 @@ mod tests {
         assert_eq!(sampler.pick(&session, true).map(|sample| sample.step), Some(7));
         assert_eq!(sampler.pick(&session, true), None);
     }
+
+    #[test]
+    fn a_heartbeat_is_above_0_and_at_most_10_s() {
+        let check = |heartbeat_s: f64| Sampling { heartbeat_s, ..sampling() }.check();
+        for good_s in [f64::MIN_POSITIVE, 0.05, MOST_HEARTBEAT_S] {
+            assert_eq!(check(good_s), Ok(()), "{good_s}");
+        }
+        for bad_s in [0.0, -0.05, 10.001, f64::INFINITY, f64::NAN] {
+            assert_eq!(check(bad_s).unwrap_err().field, "heartbeat_s", "{bad_s}");
+        }
+    }
 }

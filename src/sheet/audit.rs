@@ -520,27 +520,4 @@ impl Audit {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_window_lasts_until_the_slowest_vibration_has_lost_half() {
-        // m = 0.01 kg; γ = C/2m, overdamped (C − √(C² − 4mK))/2m.
-        for (damping, stiffness, window_s) in [
-            (0.5, 50.0, 2.0_f64.ln() / 25.0),
-            (0.2, 1.0, 2.0_f64.ln() / 10.0),
-            (1.0, 5.0, 2.0_f64.ln() / (50.0 - 2000.0_f64.sqrt())),
-            (1.0, 0.0, LONGEST_S),
-            (0.0, 5.0, LONGEST_S),
-            (1e-3, 5.0, LONGEST_S),
-        ] {
-            let damped = format!("damping.coefficient_n_s_per_m={damping}");
-            let held = format!("virtual_springs.stiffness_n_per_m={stiffness}");
-            let stepping = ["stepping.rate_hz=2000", "stepping.integrator=exponential3", "stepping.precision=f64"];
-            let sets = [&damped, &held, "sheet.points=[3, 3]"];
-            let steps = Model::paper(&[&sets[..], &stepping].concat()).window_steps();
-            let expected = (2000.0 * window_s.min(LONGEST_S)).ceil();
-            assert!((steps as f64 - expected).abs() <= 1.0, "{damping} {stiffness}: {steps}, not {expected}");
-        }
-    }
-}
+mod tests;

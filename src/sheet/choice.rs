@@ -294,3 +294,6 @@ impl Chooser<'_> {
         best.map(|(_, choice)| choice).or(nearest)
     }
 }
+
+#[cfg(test)]
+mod tests;

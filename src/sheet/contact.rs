@@ -388,3 +388,66 @@ impl<T: Real> Sheet<T> {
         if footprint.mobility() > 0.0 { sum / footprint.mobility() } else { DVec3::ZERO }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::sheet::Tissue;
+
+    fn sheet(sets: &[&str]) -> Sheet<f64> {
+        let always = ["stepping.precision=f64", "stepping.integrator=central", "stepping.substeps=1"];
+        Sheet::new(&Model::paper(&[&always[..], &["sheet.points=[9, 9]", "sleep.tolerance=0.0"], sets].concat()))
+    }
+
+    #[test]
+    fn within_a_step_a_tool_moves_straight_and_ends_where_it_is_told_to() {
+        let (sheet, mut contacts) = (sheet(&[]), Contacts::default());
+        let [from_m, to_m] = [DVec3::new(0.1, 0.12, 0.01), DVec3::new(0.1007, 0.1193, 0.0087)];
+        contacts.lead(&sheet.model, 3, from_m, Tip::default());
+        contacts.finish(1000.0);
+        contacts.lead(&sheet.model, 3, to_m, Tip::default());
+        for fraction in [0.0, 0.25, 0.8] {
+            let expected_m = from_m + fraction * (to_m - from_m);
+            assert!(contacts.tools[0].place_m(fraction).distance(expected_m) < 1e-15, "{fraction}");
+        }
+        assert_eq!(contacts.tools[0].place_m(1.0), to_m);
+    }
+
+    #[test]
+    fn a_coupling_pulls_with_its_spring_and_its_damper() {
+        // Points so heavy that they hardly move.
+        let mut sheet = sheet(&["sheet.point_mass_kg=1000"]);
+        let coupling = Coupling::Spring { stiffness_n_per_m: 100.0, damping_n_s_per_m: 3.0 };
+        let tip = Tip { radius_m: 0.03, grasps: true, coupling, ..Tip::default() };
+        let (held_m, step_m) = (DVec3::new(0.13, 0.12, 0.0), DVec3::new(2e-4, -1e-4, 5e-4));
+        sheet.lead(0, held_m, tip);
+        sheet.step().unwrap();
+        for step in 1..=10 {
+            sheet.lead(0, held_m + f64::from(step) * step_m, tip);
+            sheet.step().unwrap();
+            let expected_n = -(100.0 * f64::from(step) * step_m + 3.0 * step_m * 1000.0);
+            let felt_n = sheet.feel(0).unwrap().force_on_tool_n;
+            assert!(felt_n.distance(expected_n) < 1e-3 * expected_n.length(), "{step}: {felt_n} {expected_n}");
+        }
+    }
+
+    #[test]
+    fn a_disc_on_fixed_points_alone_exerts_no_force() {
+        for coupling in [Coupling::Constraint, Coupling::Spring { stiffness_n_per_m: 100.0, damping_n_s_per_m: 1.0 }] {
+            for grasps in [false, true] {
+                let mut sheet = sheet(&["sheet.fixed=[[3, 3], [3, 4], [4, 3], [4, 4]]"]);
+                let spacing_m = sheet.model.scene.sheet.spacing_m;
+                // In the middle of a cell, smaller than it: its four corners alone are under the disc.
+                let place_m = DVec3::new(3.5, 3.5, 0.0) * spacing_m;
+                let tip = Tip { radius_m: 0.1 * spacing_m, grasps, coupling, ..Tip::default() };
+                for step in 0..20 {
+                    sheet.lead(0, place_m - 1e-3 * f64::from(step) * DVec3::Z, tip);
+                    sheet.step().unwrap();
+                    assert_eq!(sheet.feel(0).unwrap().force_on_tool_n, DVec3::ZERO, "{tip:?}");
+                }
+                assert_eq!(sheet.largest_displacement_m(), 0.0);
+            }
+        }
+    }
+}

@@ -106,3 +106,70 @@ impl Model {
         Ok(Model { corrected: self.corrected, ..Arc::unwrap_or_clone(model) })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::super::audit::{AuditedError, Extent};
+    use super::*;
+
+    fn finding(error: f64, origin: Origin) -> Finding {
+        let error = AuditedError { displacement: error, force: 0.5 * error };
+        Finding { step: 64, error, origin: Some(origin), substeps: 4, largest: Extent::default() }
+    }
+
+    #[test]
+    fn more_substeps_are_as_many_as_the_order_of_the_scheme_asks_for() {
+        // Without work for rehearsals no other scheme is looked for.
+        let limits = Limits { rehearsal_work: 0, ..Limits::default() };
+        for (integrator, order) in
+            [("central", 2), ("exponential2", 3), ("exponential3", 4), ("exponential4", 5), ("rk4", 4), ("lagged", 1)]
+        {
+            let integrator = format!("stepping.integrator={integrator}");
+            let sets = [&integrator, "sheet.points=[3, 3]", "stepping.substeps=4", "stepping.tolerance=1e-4"];
+            let correction = Model::paper(&sets).correction(&finding(2e-3, Origin::Substep), 70, &limits).unwrap();
+            // An error of order p falls with the p-th power of the substep: from 2e-3 to half of the tolerance.
+            let left = |substeps: u32| 2e-3 * (4.0 / f64::from(substeps)).powi(order);
+            let substeps = correction.substeps;
+            assert!(left(substeps) <= 5.01e-5 && left(substeps - 1) > 4.99e-5, "{integrator}: {substeps}");
+            assert_eq!((correction.step, correction.audited_error.displacement), (70, 2e-3));
+        }
+    }
+
+    #[test]
+    fn another_scheme_is_taken_if_it_needs_fewer_substeps() {
+        let limits = Limits::default();
+        for (integrator, precision) in [("exponential2", "compensated"), ("exponential2", "f64"), ("lagged", "f32")] {
+            let [integrator, precision] =
+                [format!("stepping.integrator={integrator}"), format!("stepping.precision={precision}")];
+            let sets =
+                [&integrator, &precision, "sheet.points=[7, 7]", "stepping.substeps=1", "stepping.tolerance=1e-5"];
+            let model = Model::paper(&sets);
+            let correction = model.correction(&finding(0.1, Origin::Substep), 70, &limits).unwrap();
+            assert_ne!(correction.integrator, model.plan.integrator, "{sets:?}");
+            let corrected = model.corrected(&correction, &limits).unwrap();
+            assert!(corrected.expected_error <= 1e-5, "{sets:?}: {correction:?}");
+            assert_eq!(corrected.precision, model.precision);
+        }
+    }
+
+    #[test]
+    fn rounding_asks_for_a_better_format_and_sleep_for_less_of_it() {
+        let limits = Limits::default();
+        for (integrator, precision, better) in [
+            ("central", "f32", Some(Precision::F64)),
+            ("exponential3", "f32", Some(Precision::Compensated)),
+            ("exponential3", "compensated", Some(Precision::F64)),
+            ("exponential3", "f64", None),
+        ] {
+            let [integrator, precision] =
+                [format!("stepping.integrator={integrator}"), format!("stepping.precision={precision}")];
+            let sets = [&integrator, &precision, "sheet.points=[3, 3]", "stepping.substeps=1", "sleep.tolerance=1e-4"];
+            let model = Model::paper(&sets);
+            let correct = |origin| model.correction(&finding(1e-3, origin), 70, &limits);
+            assert_eq!(correct(Origin::Rounding).map(|correction| correction.precision), better, "{sets:?}");
+            let asleep = correct(Origin::Sleep).unwrap();
+            assert!(asleep.sleep_tolerance <= 0.5e-4 && asleep.substeps == 4, "{asleep:?}");
+        }
+    }
+}

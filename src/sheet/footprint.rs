@@ -224,3 +224,97 @@ fn cell(sheet: &Sheet, axis: usize, at_m: f64) -> (usize, f64) {
     let low = (at as usize).min(last);
     (low, at - low as f64)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn model(sets: &[&str]) -> std::sync::Arc<Model> {
+        let always = ["sheet.spacing_m=0.02", "stepping.integrator=central", "stepping.substeps=1"];
+        Model::paper(&[&always[..], sets].concat())
+    }
+
+    /// Radii, in spacings.
+    const RADII: [f64; 4] = [0.2, 1.0, 1.7, 3.2];
+
+    #[test]
+    fn the_places_in_a_disc_are_spread_alike_in_every_direction() {
+        for radius in RADII {
+            let places = disc(radius);
+            let mean = |of: &dyn Fn(&DVec2) -> f64| places.iter().map(of).sum::<f64>() / places.len() as f64;
+            // Of a disc that is filled evenly: the centre, and a quarter of the radius squared along each axis.
+            let quarter = 0.25 * radius * radius;
+            for (found, expected) in [
+                (mean(&|place| place.x), 0.0),
+                (mean(&|place| place.y), 0.0),
+                (mean(&|place| place.x * place.x), quarter),
+                (mean(&|place| place.y * place.y), quarter),
+                (mean(&|place| place.x * place.y), 0.0),
+            ] {
+                assert!((found - expected).abs() < 1e-12 * (1.0 + radius * radius), "{radius}: {found} {expected}");
+            }
+            assert!(places.iter().all(|place| place.length() < radius));
+        }
+    }
+
+    #[test]
+    fn a_disc_gives_way_like_its_own_area_of_a_foundation() {
+        let model = model(&["sheet.points=[21, 21]"]);
+        let spacing_m = model.scene.sheet.spacing_m;
+        for radius in RADII.into_iter().filter(|radius| *radius >= 1.0) {
+            // h²/Σ w² is the area, in the mean over places in a cell.
+            let places = (0..16).map(|place| DVec2::new(f64::from(place / 4), f64::from(place % 4)) / 4.0);
+            let mobility =
+                places.map(|place| Footprint::new(&model, radius * spacing_m, (place + 10.0) * spacing_m).mobility());
+            let area = 16.0 / mobility.sum::<f64>();
+            let expected = std::f64::consts::PI * radius * radius;
+            assert!((area - expected).abs() < 2e-3 * expected, "{radius}: {area} {expected}");
+        }
+    }
+
+    #[test]
+    fn weights_add_up_to_1_about_the_centre_and_follow_a_plane_exactly() {
+        let model = model(&["sheet.points=[13, 17]"]);
+        let spacing_m = model.scene.sheet.spacing_m;
+        for radius in RADII {
+            let centre_m = DVec2::new(6.13, 8.71) * spacing_m;
+            let footprint = Footprint::new(&model, radius * spacing_m, centre_m);
+            let rest_m = |[i, j]: [usize; 2]| DVec2::new(i as f64, j as f64) * spacing_m;
+            let whole: f64 = footprint.reached().iter().map(|point| point.weight).sum();
+            let middle_m: DVec2 = footprint.reached().iter().map(|point| point.weight * rest_m(point.point)).sum();
+            assert!((whole - 1.0).abs() < 1e-12 && middle_m.distance(centre_m) < 1e-12, "{radius}: {whole} {middle_m}");
+            let (slopes, level_m) = (DVec2::new(0.3, -0.2), 0.01);
+            let (place_m, along) = footprint.surface(|point| DVec3::new(0.0, 0.0, level_m + slopes.dot(rest_m(point))));
+            assert!((place_m - centre_m.extend(level_m + slopes.dot(centre_m))).length() < 1e-12, "{place_m}");
+            let tilted = [DVec3::new(1.0, 0.0, slopes.x), DVec3::new(0.0, 1.0, slopes.y)];
+            assert!((0..2).all(|axis| along[axis].distance(tilted[axis]) < 1e-9), "{radius}: {along:?}");
+        }
+    }
+
+    #[test]
+    fn the_slopes_are_the_change_of_place_also_where_the_disc_leaves_the_sheet() {
+        let model = model(&["sheet.points=[7, 9]"]);
+        let spacing_m = model.scene.sheet.spacing_m;
+        let displacement_m = |[i, j]: [usize; 2]| {
+            let (x, y) = (i as f64, j as f64);
+            1e-3 * DVec3::new((1.3 * x + y).sin(), (x - 0.7 * y).cos(), (0.9 * x * y).sin())
+        };
+        for radius in RADII {
+            for centre in [[0.31, 0.17], [2.87, 0.05], [5.96, 7.93], [3.11, 4.07]] {
+                let mut footprint = Footprint::new(&model, radius * spacing_m, DVec2::from(centre) * spacing_m);
+                let (centre_m, step_m) = (footprint.centre_m(), 1e-8 * spacing_m);
+                let (_, along) = footprint.surface(displacement_m);
+                for axis in 0..2 {
+                    let mut step = DVec2::ZERO;
+                    step[axis] = step_m;
+                    let [ahead_m, behind_m] = [centre_m + step, centre_m - step].map(|place_m| {
+                        footprint.move_to(&model, place_m);
+                        footprint.surface(displacement_m).0
+                    });
+                    let slope = (ahead_m - behind_m) / (2.0 * step_m);
+                    assert!(slope.distance(along[axis]) < 1e-5, "{radius} {centre:?}: {slope} {}", along[axis]);
+                }
+            }
+        }
+    }
+}

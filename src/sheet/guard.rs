@@ -241,7 +241,7 @@ impl<T: Real> Sheet<T> {
     }
 
     /// Converts the state from the substep of `was` halvings to that of `halvings`.
-    fn halve(&mut self, was: u32, halvings: u32) {
+    pub(super) fn halve(&mut self, was: u32, halvings: u32) {
         let [was, plan] = [was, halvings].map(|halvings| self.model.plan.divided(&self.model.scene, 1 << halvings));
         let springs = springs_of(&self.model, &was);
         convert(&self.bench.layout, &springs, &was, &plan, &self.applied, &mut self.state);
@@ -375,9 +375,13 @@ mod tests {
     use crate::sheet::Tissue;
 
     fn sheet(integrator: &str) -> Sheet<f64> {
+        sheet_with(integrator, &[])
+    }
+
+    fn sheet_with(integrator: &str, more: &[&str]) -> Sheet<f64> {
         let integrator = format!("stepping.integrator={integrator}");
-        let format = ["stepping.substeps=4", "stepping.precision=f64"];
-        let model = Model::paper(&[&integrator, format[0], format[1], "sheet.points=[7, 9]", "sleep.tolerance=0.0"]);
+        let format = ["stepping.substeps=4", "stepping.precision=f64", "sheet.points=[7, 9]", "sleep.tolerance=0.0"];
+        let model = Model::paper(&[&[integrator.as_str()], &format[..], more].concat());
         let (scene, mut sheet) = (&model.scene, Sheet::new(&model));
         sheet.push(
             0,
@@ -433,6 +437,98 @@ mod tests {
         let values = [0.0, -1.0, -2.0, -3.0].map(cube);
         for s in [0.0, -1.0, -3.0, -0.5, -2.25, 0.7] {
             assert!((through(&values, s) - cube(s)).abs() < 1e-12, "{s}");
+        }
+    }
+
+    #[test]
+    fn central_differences_show_the_same_velocity_with_half_the_substep_to_the_last_digits() {
+        let (as_it_was, mut halved) = (sheet("central"), sheet("central"));
+        halved.halve(0, 1);
+        let now = apart(&as_it_was, &halved);
+        assert!(now.iter().all(|part| *part < 1e-9), "{now:?}");
+    }
+
+    #[test]
+    fn energy_comes_from_work_alone() {
+        let begun = Work::begun(1.0, 0.0);
+        // Up to the margin.
+        assert_eq!({ begun }.survey(1.04, 0.0, 0.0), Ok(()));
+        let found = Cause::Energy { energy_j: 1.2, before_j: 1.0, work_j: 0.0 };
+        assert_eq!({ begun }.survey(1.2, 0.0, 0.0), Err(found));
+        let mut worked = begun;
+        worked.add(0.25);
+        // Work that belongs to the next interval does not count in this one.
+        assert!({ worked }.survey(1.25, 0.2, 0.0).is_err());
+        assert_eq!(worked.survey(1.2, 0.05, 0.0), Ok(()));
+        assert_eq!(worked, Work { done_j: 0.05, energy_j: 1.2, largest_j: 1.2 });
+        // It goes as it likes.
+        assert_eq!(worked.survey(0.01, 0.0, 0.0), Ok(()));
+    }
+
+    #[test]
+    fn what_the_tools_do_is_what_the_sheet_has() {
+        for integrator in ["central", "rk4", "exponential2", "exponential3", "exponential4"] {
+            let undamped = ["damping.coefficient_n_s_per_m=0.0"];
+            let mut sheet = sheet_with(integrator, &undamped);
+            let (survey, energy, energy_j) = sheet.survey(&sheet.tiles.region);
+            let work_j = sheet.work.done_j - sheet.present_work_j(&survey);
+            assert!((work_j - energy_j).abs() < 0.02 * energy_j, "{integrator}: {work_j} J, {energy_j} J");
+            let mass_kg = sheet.model.scene.sheet.point_mass_kg;
+            let points = (0..sheet.model.len()).map(|index| sheet.point(index));
+            let kinetic_j: f64 = points.map(|point| 0.5 * mass_kg * point.velocity_m_per_s.length_squared()).sum();
+            assert!((energy.kinetic_j - kinetic_j).abs() < 1e-9 * kinetic_j, "{integrator}: {energy:?} {kinetic_j}");
+            // And goes on so.
+            (0..20).for_each(|_| sheet.step().unwrap());
+            assert_eq!(sheet.guard_events(), 0);
+        }
+    }
+
+    #[test]
+    fn a_checkpoint_is_taken_every_256_substeps() {
+        let mut sheet = sheet("exponential2");
+        (40..130).for_each(|_| sheet.step().unwrap());
+        assert_eq!(sheet.checkpoint.as_ref().unwrap().steps, 128);
+    }
+
+    #[test]
+    fn a_point_that_is_not_finite_or_beyond_the_bound_is_named() {
+        for broken in [f64::NAN, f64::INFINITY, 2.0 * farthest_in_spacings(&sheet("central").model)] {
+            let mut sheet = sheet("central");
+            let layout = sheet.bench.layout;
+            assert_eq!(broken_point(&sheet.model, &layout, &sheet.state), None);
+            let index = sheet.model.index_of([2, 5]);
+            sheet.state.u[layout.plane + layout.place(index)] = broken;
+            assert_eq!(broken_point(&sheet.model, &layout, &sheet.state), Some(index));
+            // A survey is due at step 64.
+            sheet.steps = 64;
+            assert_eq!(sheet.check(), Err(Cause::NotFinite { point: [2, 5] }), "{broken}");
+        }
+    }
+
+    #[test]
+    fn increments_that_are_finite_and_below_the_bound_are_calm() {
+        let farthest = farthest_in_spacings(&sheet("central").model);
+        for (increment, calm) in [(1e-3, true), (0.1 * farthest, true), (10.0 * farthest, false), (f64::NAN, false)] {
+            let mut sheet = sheet_with("central", &["springs.stiffness_n_per_m=0.0"]);
+            let place = sheet.bench.layout.place(11);
+            sheet.bench.is_calm(0.0);
+            sheet.state.d[place] = increment;
+            sheet.do_step();
+            assert_eq!(sheet.bench.is_calm(farthest), calm, "{increment}");
+        }
+    }
+
+    #[test]
+    fn a_force_far_from_what_its_history_foretold_is_found() {
+        for integrator in ["exponential2", "exponential3", "exponential4"] {
+            let mut sheet = sheet(integrator);
+            sheet.steps = 64;
+            let Scheme::Multistep(multistep) = &sheet.plan.scheme else { panic!("{integrator} keeps a history") };
+            // A force of the past that moves the point by 5 spacings.
+            let past = 5.0 / (multistep.correction[0] * multistep.extrapolation[0]);
+            let place = sheet.bench.layout.place(31);
+            Arc::make_mut(&mut sheet.state.kept[0])[place] += past;
+            assert!(matches!(sheet.check(), Err(Cause::Surprise { .. })), "{integrator}");
         }
     }
 }

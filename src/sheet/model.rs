@@ -341,4 +341,23 @@ mod tests {
         "83a4672a09aa9fcfbccb48193d6e98c8",
         "d8f80cac7b2adfaa3508266eae6561de",
     ];
+
+    #[test]
+    fn an_error_above_the_tolerance_is_warned_of() {
+        let warns = |sets: &[&str]| {
+            let model = Model::paper(&[&["sheet.points=[5, 5]"][..], sets].concat());
+            let is_above = model.expected_error > model.scene.stepping.tolerance;
+            (is_above, model.warnings.iter().any(|warning| warning.starts_with("stepping.tolerance: ")))
+        };
+        assert_eq!(warns(&[]), (false, false));
+        assert_eq!(warns(&["stepping.integrator=lagged", "stepping.substeps=1"]), (true, true));
+    }
+
+    #[test]
+    fn numbers_and_grid_places_of_points_belong_to_each_other() {
+        let model = Model::paper(&["sheet.points=[3, 7]", "stepping.integrator=central", "stepping.substeps=1"]);
+        let places: Vec<[usize; 2]> = (0..3).flat_map(|i| (0..7).map(move |j| [i, j])).collect();
+        assert_eq!((0..model.len()).map(|index| model.point_of(index)).collect::<Vec<_>>(), places);
+        assert!(places.iter().enumerate().all(|(index, place)| model.index_of(*place) == index));
+    }
 }

@@ -224,4 +224,21 @@ mod tests {
         marks.clear();
         assert!(marks.members.is_empty() && marks.has == [false; 3]);
     }
+
+    #[test]
+    fn a_strip_may_reach_beyond_the_columns_up_to_a_tile_and_never_beyond_the_rows() {
+        let layout = Layout::new::<f32>([20, 20]);
+        for (rows, columns, within) in [
+            (0..20, 0..32, true),
+            (16..20, 16..32, true),
+            (0..21, 0..32, false),
+            (0..20, 0..48, false),
+            (0..32, 16..48, false),
+        ] {
+            let mut region = Region::none(&layout);
+            region.strips.push(Strip { rows: 0..4, columns: 0..16, awake: true });
+            region.strips.push(Strip { rows: rows.clone(), columns: columns.clone(), awake: true });
+            assert_eq!(region.is_within(&layout), within, "{rows:?} {columns:?}");
+        }
+    }
 }

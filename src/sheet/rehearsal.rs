@@ -202,7 +202,6 @@ impl Rehearsal {
         let plan = Plan::unjudged(integrator, substeps, scene.stepping.rate_hz.recip(), &self.sheet);
         let lanes = lanes::available(scene.stepping.lanes).unwrap_or(crate::scene::Lanes::Plain);
         let model = Arc::new(Model::planned(scene.clone(), plan, precision, lanes));
-        let [nx, ny] = scene.sheet.points;
         let (spacing_m, at) = (scene.sheet.spacing_m, pushed(scene));
         let stiffness = scene.virtual_stiffness_n_per_m + 0.3 * scene.springs.stiffness_n_per_m;
         // Without any spring, what brings a point about as far within a step.
@@ -216,7 +215,7 @@ impl Rehearsal {
             falloff_offset: 0.0,
         };
         tissue.push(0, Some(Push::Law(law)));
-        let looked_at = [at, [nx / 2, ny / 2], [1.min(nx - 1), 1.min(ny - 1)]].map(|point| model.index_of(point));
+        let looked_at = looked_at(scene).map(|point| model.index_of(point));
         let mut course = Vec::with_capacity(steps);
         let mut is_sound = true;
         while is_sound && course.len() < steps {
@@ -268,4 +267,64 @@ impl Rehearsal {
 fn pushed(scene: &Scene) -> [usize; 2] {
     let [nx, ny] = scene.sheet.points;
     [nx / 3, 2 * ny / 5]
+}
+
+/// The points that are compared: the one that is pushed, the middle, and one at a corner, where springs are fewer.
+fn looked_at(scene: &Scene) -> [[usize; 2]; 3] {
+    let [nx, ny] = scene.sheet.points;
+    [pushed(scene), [nx / 2, ny / 2], [1.min(nx - 1), 1.min(ny - 1)]]
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::limits::Limits;
+    use crate::scene::PAPER;
+
+    fn scene(sets: &[&str]) -> Scene {
+        let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
+        Scene::parse("paper", PAPER, &sets, &Limits::default()).unwrap()
+    }
+
+    #[test]
+    fn points_that_are_looked_at_are_on_the_sheet_and_one_is_its_middle() {
+        for points in [[1, 1], [1, 2], [2, 1], [9, 1], [1, 8], [2, 2], [11, 4], [12, 12]] {
+            let scene = scene(&[&format!("sheet.points={points:?}")]);
+            let looked_at = looked_at(&scene);
+            let on_sheet = looked_at.iter().all(|point| point[0] < points[0] && point[1] < points[1]);
+            assert!(on_sheet && looked_at[0] == pushed(&scene), "{points:?}: {looked_at:?}");
+            for axis in 0..2 {
+                // As far from either end, or nearer to the last by one point.
+                let after = points[axis] - 1 - looked_at[1][axis];
+                assert!(looked_at[1][axis] == after || looked_at[1][axis] == after + 1, "{points:?}: {looked_at:?}");
+            }
+        }
+    }
+
+    /// A course of values that depend on the part of the course that is over.
+    fn course(steps: usize, of: impl Fn(f64) -> f64) -> Course {
+        let value = |step: usize| DVec3::new(0.0, of((step + 1) as f64 / steps as f64), 0.0);
+        (0..steps).map(|step| [[value(step), 2.0 * value(step)]; 3]).collect()
+    }
+
+    #[test]
+    fn an_error_that_grows_is_expected_to_grow_as_long_as_vibrations_last() {
+        let difference = |sets: &[&str], error: &dyn Fn(f64) -> f64| {
+            let rehearsal = Rehearsal::new(&scene(&[&["sheet.points=[3, 3]"][..], sets].concat()), 1.0, 0);
+            let truth = course(rehearsal.steps, |_| 0.5);
+            let other = course(rehearsal.steps, |part| 0.5 + error(part));
+            rehearsal.difference(&LOADS[2], &truth, &other)
+        };
+        let undamped = ["damping.coefficient_n_s_per_m=0.0"];
+        // A course of 0.5 s of an undamped sheet stands for 2 s.
+        assert!((difference(&undamped, &|part| 1e-3 * part) / 8e-3 - 1.0).abs() < 0.01);
+        // An error that does not grow stays as it is, and so does one in a sheet whose vibrations die within the course.
+        assert!((difference(&undamped, &|_| 1e-3) - 2e-3).abs() < 1e-9);
+        assert!((difference(&["damping.coefficient_n_s_per_m=0.5"], &|part| 1e-3 * part) - 2e-3).abs() < 1e-9);
+        // Where nothing moves nothing errs.
+        let rehearsal = Rehearsal::new(&scene(&["sheet.points=[3, 3]"]), 1.0, 0);
+        let still = course(rehearsal.steps, |_| 0.0);
+        assert_eq!(rehearsal.difference(&LOADS[2], &still, &still), 0.0);
+    }
 }

@@ -183,3 +183,39 @@ impl<T: Real> Springs<T> {
 const STRUCTURAL: [[isize; 2]; 4] = [[-1, 0], [0, -1], [0, 1], [1, 0]];
 const SHEAR: [[isize; 2]; 4] = [[-1, -1], [-1, 1], [1, -1], [1, 1]];
 const FLEXION: [[isize; 2]; 4] = [[-2, 0], [0, -2], [0, 2], [2, 0]];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn pulls_by_its_extension<T: Real>(within: f64) {
+        for length_squared in [1.0, 2.0, 4.0] {
+            let kind = Kind::<T>::new(3.0, length_squared);
+            for thousandth in -600..=900 {
+                let length = 1.0 + f64::from(thousandth) / 1000.0;
+                let excess = T::of((length * length - 1.0) * length_squared);
+                // As the format has it.
+                let q = excess.wide() / length_squared;
+                let s = (1.0 + q).sqrt();
+                let truth = 3.0 * q / (s * (1.0 + s));
+                let found = kind.weight(Plain::one(excess)).value().wide();
+                assert!(
+                    (found - truth).abs() <= within * truth.abs(),
+                    "{length_squared} {thousandth}: {found} {truth}"
+                );
+                let energy = kind.energy(Plain::one(excess)).value().wide();
+                let truth = 1.5 * length_squared * (s - 1.0).powi(2);
+                assert!(
+                    (energy - truth).abs() <= 1e2 * within * truth,
+                    "{length_squared} {thousandth}: {energy} {truth}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn a_spring_pulls_by_its_extension_over_its_length() {
+        pulls_by_its_extension::<f32>(1e-6);
+        pulls_by_its_extension::<f64>(1e-14);
+    }
+}

@@ -131,7 +131,9 @@ mod tests {
 
     #[test]
     fn the_largest_stiffness_is_that_of_the_fastest_wave() {
-        for (k, shear) in [(1.0, 1.0), (1.0, 0.0), (0.0, 2.0), (3.0, 0.2), (0.1, 5.0), (0.0, 0.0)] {
+        // With flexion and a shear of 2 to 2.5 k, the fastest wave is on an edge between two corners.
+        let cases = [(1.0, 1.0), (1.0, 0.0), (0.0, 2.0), (3.0, 0.2), (0.1, 5.0), (0.0, 0.0), (1.0, 2.2), (2.0, 4.8)];
+        for (k, shear) in cases {
             for flexion in [false, true] {
                 // Force on a point of u = e^{i(aj + bk)}: over all its springs, 1 − cos of the phase between their ends.
                 let wave = |a: f64, b: f64| {
@@ -185,7 +187,9 @@ mod tests {
                     let substeps = f64::from(substeps(integrator, 1e-3, &sheet));
                     omega_per_s(spring_stiffness_n_per_m + 5.0) * 1e-3 / substeps
                 };
-                assert!(turn(Integrator::Central) <= THETA && turn(Integrator::Lagged) <= THETA);
+                // Vibrations that last for 2m/C ask for a smaller turn of the yardsticks.
+                let most = THETA / endurance(sheet.omega_bound_per_s(), 0.02 / damping_n_s_per_m) * (1.0 + 1e-12);
+                assert!(turn(Integrator::Central) <= most && turn(Integrator::Lagged) <= most);
                 let lagged = substeps(Integrator::Lagged, 1e-3, &sheet);
                 assert!(damping_n_s_per_m / 0.01 * 1e-3 / f64::from(lagged) <= 1.0);
                 assert_eq!(substeps(Integrator::Rk4, 1e-3, &sheet), stable_substeps(Integrator::Rk4, 1e-3, &sheet));

@@ -471,3 +471,6 @@ pub fn stand_in(model: &Model, spacing_m: f64, half_m: f64) -> Model {
     scene.damping_n_s_per_m *= area;
     Model { points, fixed: scene.sheet.fixed_indices(), scene, ..model.clone() }
 }
+
+#[cfg(test)]
+mod tests;

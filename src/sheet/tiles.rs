@@ -409,3 +409,6 @@ impl<T: Real> Tiles<T> {
         self.moved.has[self.of(point)]
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -96,3 +96,83 @@ fn a_tool_keeps_its_tip_until_it_is_released() {
     intake.submit(LEASE, vec![lead(2, 0.005), release(3, None), lead(4, 0.006)], 0).unwrap();
     assert!(intake.submit(LEASE, vec![lead(5, 0.005)], 0).is_err());
 }
+
+/// A grasp of a free point, for step `at_step`.
+fn grasp(sequence: u64, at_step: u64) -> Command {
+    let action = Action::Grasp { point: [15, 15], displacement_m: glam::DVec3::ZERO };
+    Command { action, ..release(sequence, Some(at_step)) }
+}
+
+fn due(intake: &mut Intake, step: u64) -> Vec<Due> {
+    let mut due = Vec::new();
+    intake.take_due(step, 0, &mut due);
+    due
+}
+
+#[test]
+fn commands_of_one_step_act_in_the_order_in_which_they_came() {
+    let (mut intake, _) = intake();
+    for commands in
+        [vec![release(1, Some(2))], vec![release(2, Some(1)), release(3, Some(2))], vec![release(4, Some(2))]]
+    {
+        intake.submit(LEASE, commands, 0).unwrap();
+    }
+    let order = |due: Vec<Due>| due.iter().map(|due| due.command.sequence).collect::<Vec<_>>();
+    assert_eq!(order(due(&mut intake, 0)), [0; 0]);
+    assert_eq!(order(due(&mut intake, 1)), [2]);
+    assert_eq!(order(due(&mut intake, 2)), [1, 3, 4]);
+}
+
+#[test]
+fn every_accepted_command_is_counted_by_one_outcome() {
+    let (mut intake, _) = intake();
+    let commands = vec![grasp(1, 5), grasp(2, 5), grasp(3, 5), grasp(4, 6), release(5, Some(6)), release(6, Some(9))];
+    intake.submit(LEASE, commands, 0).unwrap();
+    // Of places for one step the last one counts.
+    let counts = Counts { accepted: 6, superseded: 2, waiting: 4, ..Counts::default() };
+    assert_eq!(intake.counts(), counts);
+    assert_eq!(due(&mut intake, 5).len(), 1);
+    assert_eq!(intake.counts(), Counts { applied: 1, waiting: 3, ..counts });
+    assert_eq!(due(&mut intake, 6).len(), 2);
+    intake.release(LEASE).unwrap();
+    assert_eq!(intake.counts(), Counts { applied: 3, dropped: 1, waiting: 0, ..counts });
+    // What ends the lease is not a client's command.
+    assert!(due(&mut intake, 7).iter().all(|due| due.ends_lease));
+    assert_eq!(intake.counts(), Counts { applied: 3, dropped: 1, waiting: 0, ..counts });
+}
+
+#[test]
+fn a_closed_intake_refuses_with_its_reason_until_it_is_opened_again() {
+    let (mut intake, _) = intake();
+    let refusal = Refusal::new(Reason::NotAvailable, "", "the session has ended");
+    intake.submit(LEASE, vec![release(1, Some(3))], 0).unwrap();
+    intake.close(refusal.clone());
+    assert_eq!(intake.counts(), Counts { accepted: 1, dropped: 1, ..Counts::default() });
+    let model = Model::paper(&["sheet.points=[3, 3]"]);
+    let refused = [
+        intake.submit(LEASE, vec![release(2, None)], 0).unwrap_err(),
+        intake.acquire(&[1], "test", 1.0, LEASE + 1, 0).unwrap_err(),
+        intake.change(None, &model, None, 0).unwrap_err(),
+    ];
+    for refused in refused {
+        assert_eq!((refused.reason, &refused.message), (refusal.reason, &refusal.message));
+    }
+    intake.reopen();
+    intake.acquire(&[0], "test", 1.0, LEASE, 0).unwrap();
+    intake.submit(LEASE, vec![release(2, None)], 0).unwrap();
+}
+
+#[test]
+fn a_change_of_tissue_is_made_from_the_newest() {
+    let (mut intake, _) = intake();
+    let [first, second] = ["4.0", "6.0"]
+        .map(|k| Model::paper(&["sheet.points=[3, 3]", &format!("virtual_springs.stiffness_n_per_m={k}")]));
+    assert_eq!(intake.change(Some(&first), &second, Some(7), 0), Ok(None));
+    assert_eq!(intake.change(None, &first, Some(7), 0), Ok(Some(7)));
+    // Made from what is no longer the newest.
+    assert_eq!(intake.change(None, &second, Some(8), 0), Ok(None));
+    assert_eq!(intake.change(Some(&first), &second, Some(8), 0), Ok(Some(8)));
+    assert!(intake.take_change(6).is_none());
+    assert!(Arc::ptr_eq(&intake.take_change(7).unwrap(), &first));
+    assert!(Arc::ptr_eq(&intake.take_change(8).unwrap(), &second));
+}

@@ -176,3 +176,55 @@ pub struct Node {
     /// Weights with which the force (times dt²/(m·h)) adds to each field of the scheme.
     pub weights: [f64; 3],
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_and_the_springs_stiffness_make_the_square_of_the_fastest_turn() {
+        let sheet = Oscillator {
+            mass_kg: 0.02,
+            damping_n_s_per_m: 0.3,
+            virtual_stiffness_n_per_m: 7.0,
+            spring_stiffness_n_per_m: 130.0,
+        };
+        for substep_s in [1e-4, 1e-3, 0.02] {
+            let ((a, g), z) = (sheet.scaled(substep_s), sheet.scaled_spring_stiffness(substep_s));
+            let turn = sheet.omega_bound_per_s() * substep_s;
+            assert!((a + z - turn * turn).abs() < 1e-12 * turn * turn);
+            assert!((z / a - 130.0 / 7.0).abs() < 1e-12 && (g - 15.0 * substep_s).abs() < 1e-15);
+        }
+    }
+
+    /// u and u̇ after a substep of u̇̇ = force − a·u − g·u̇, in steps too short to matter.
+    fn moved(a: f64, g: f64, force: f64, velocity: f64) -> [f64; 2] {
+        const STEPS: u32 = 2000;
+        let dt = f64::from(STEPS).recip();
+        let slope = |[u, w]: [f64; 2]| [w, force - a * u - g * w];
+        (0..STEPS).fold([0.0, velocity], |y, _| {
+            let along = |k: [f64; 2], t: f64| [y[0] + t * k[0], y[1] + t * k[1]];
+            let middle = slope(along(slope(y), 0.5 * dt));
+            along(middle, dt)
+        })
+    }
+
+    #[test]
+    fn impulses_and_constant_forces_act_as_on_the_oscillator() {
+        for (a, g) in [(0.04, 0.3), (0.5, 0.0), (0.01, 2.0)] {
+            for integrator in [Integrator::Exponential2, Integrator::Exponential3, Integrator::Exponential4] {
+                let scheme = Scheme::fit(integrator, a, g);
+                for (found, truth) in
+                    [(scheme.kick(), moved(a, g, 0.0, 1.0)), (scheme.constant(), moved(a, g, 1.0, 0.0))]
+                {
+                    let near = (0..2).all(|row| (found[row] - truth[row]).abs() < 1e-6);
+                    assert!(near, "{integrator:?} {a} {g}: {found:?} {truth:?}");
+                }
+                assert_eq!(scheme.impulse(), scheme.constant()[1]);
+            }
+            // Two-step schemes move a point by what they change its increment by.
+            let central = Scheme::fit(Integrator::Central, a, g);
+            assert_eq!((central.kick(), central.constant()), ([1.0 / (1.0 + g / 2.0); 2], central.kick()));
+        }
+    }
+}

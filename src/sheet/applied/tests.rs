@@ -1,0 +1,112 @@
+//! Falloffs at every width, and the bound of a change of force.
+
+use glam::DVec2;
+
+use super::*;
+use crate::limits::Limits;
+use crate::scene::{Lanes, PAPER, Scene};
+
+fn factors<T: Real>(lanes: Lanes, centre: f64) -> Vec<f64> {
+    let (stride, per_spacing) = (64, 1.7);
+    let reach = -T::NEGLIGIBLE_EXPONENT / per_spacing;
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    let columns = (centre - reach).ceil() as usize..(centre + reach).floor() as usize + 1;
+    let mut factors = vec![T::default(); stride];
+    let factor = factors.as_mut_ptr();
+    let falloff = Falloff { centre: [0.0, centre], per_spacing, rows: 0..1, columns, stride, factors: factor };
+    // SAFETY: there is one row, of whole blocks.
+    unsafe { lanes::run(Width::of(lanes), &falloff) };
+    factors.into_iter().map(Real::wide).collect()
+}
+
+/// A table that is placed again, elsewhere and with another reach, is that of a fresh one.
+#[test]
+fn a_table_keeps_nothing_of_the_place_before() {
+    let scene = Scene::parse("test", PAPER, &["sheet.points=[70, 90]".to_owned()], &Limits::default()).unwrap();
+    let model = Model::compile(&scene, &Limits::default()).unwrap();
+    let layout = Layout::new::<f32>(model.points);
+    let mut term = Term::<f32>::new();
+    let spacing_m = scene.sheet.spacing_m;
+    let places = [(35.2, 45.7, 4.0), (3.0, 88.9, 20.0), (69.0, 0.4, 1.0), (-40.0, 20.0, 9.0), (30.5, 60.0, 0.5)];
+    for (x, y, reach) in places.into_iter().chain(places.into_iter().rev()) {
+        let poke = Poke {
+            centre_m: glam::DVec2::new(x, y) * spacing_m,
+            force_n: DVec3::ZERO,
+            falloff_per_m: 10.0 / (reach * spacing_m),
+            falloff_offset: 0.0,
+        };
+        let mut fresh = Term::<f32>::new();
+        fresh.place(&poke, &model, &layout);
+        term.place(&poke, &model, &layout);
+        assert_eq!((&term.rows, &term.spans), (&fresh.rows, &fresh.spans));
+        assert_eq!(*term.factors, *fresh.factors);
+        let outside = |(row, span): (&[f32], &Range<usize>)| {
+            (0..layout.stride).filter(|at| !span.contains(at)).all(|at| row[at] == 0.0)
+        };
+        assert!(term.factors.chunks_exact(layout.stride).zip(&term.spans).all(outside));
+    }
+}
+
+/// A reach that ends between two lanes must end at the same point for every width.
+#[test]
+fn a_falloff_has_the_same_bits_at_every_width_wherever_it_ends() {
+    let mut nonzero = 0;
+    for place in 0..4000 {
+        let centre = 24.0 + 0.00391 * f64::from(place);
+        for (plain, other) in [
+            (factors::<f32>(Lanes::Plain, centre), factors::<f32>(Lanes::Auto, centre)),
+            (factors::<f64>(Lanes::Plain, centre), factors::<f64>(Lanes::Auto, centre)),
+        ] {
+            assert_eq!(plain, other, "centre {centre}");
+            nonzero += plain.iter().filter(|factor| **factor != 0.0).count();
+        }
+    }
+    assert!(nonzero > 4000 * 20, "{nonzero}");
+    // Skip a point at the very end of the reach: f32 may count it as inside.
+    for at in 0..24 {
+        let centre = f64::from(at) + 22.0 / 1.7 + 1e-9;
+        assert_eq!(factors::<f32>(Lanes::Plain, centre), factors::<f32>(Lanes::Auto, centre), "centre {centre}");
+    }
+}
+
+#[test]
+fn a_change_of_force_on_a_rectangle_is_at_most_its_bound() {
+    let mut random = fastrand::Rng::with_seed(20_261_122);
+    let mut between = |low: f64, high: f64| low + (high - low) * random.f64();
+    let spacing_m = 0.05;
+    for case in 0..400 {
+        let mut poke = || Poke {
+            centre_m: DVec2::new(between(0.0, 1.0), between(0.0, 1.0)),
+            force_n: DVec3::new(between(-1.0, 1.0), between(-1.0, 1.0), between(-1.0, 1.0)),
+            falloff_per_m: between(0.0, 20.0),
+            falloff_offset: between(-1.0, 1.0),
+        };
+        let (old, other) = (poke(), poke());
+        let new = match case % 4 {
+            0 => other,
+            // Only the vector, only the place, or a little of both.
+            1 => Poke { force_n: other.force_n, ..old },
+            2 => Poke { centre_m: other.centre_m, ..old },
+            _ => Poke { force_n: 1.01 * old.force_n, centre_m: old.centre_m + 0.01 * other.centre_m, ..old },
+        };
+        let touch = Touch { old: Some(old), new: Some(new), reached: Default::default() };
+        let force_n = |poke: &Poke, point| poke.force_n * factor(poke, point, spacing_m, f64::NEG_INFINITY);
+        let change_n = |point| force_n(&new, point).distance(force_n(&old, point));
+        let most_n = |rows: Range<usize>, columns: Range<usize>| {
+            let changes = rows.flat_map(|i| columns.clone().map(move |j| [i, j])).map(change_n);
+            changes.fold(0.0, f64::max)
+        };
+        let bound_n = touch.most_n([[0.2, 0.45], [0.4, 0.65]]);
+        assert!(most_n(4..10, 8..14) <= bound_n * (1.0 + 1e-12), "{old:?} {new:?}: {bound_n}");
+        // Of a rectangle that is one point the bound is the change itself, if only the vector changes.
+        if case % 4 == 1 {
+            let bound_n = touch.most_n([[0.2, 0.2], [0.4, 0.4]]);
+            assert!((bound_n - change_n([4, 8])).abs() <= 1e-12, "{old:?} {new:?}: {bound_n}");
+        }
+        // A force that begins or ends changes by itself.
+        for touch in [Touch { old: None, ..touch }, Touch { new: None, old: Some(new), ..touch }] {
+            let bound_n = touch.most_n([[0.2, 0.2], [0.4, 0.4]]);
+            assert!((bound_n - force_n(&new, [4, 8]).length()).abs() <= 1e-12, "{new:?}: {bound_n}");
+        }
+    }
+}

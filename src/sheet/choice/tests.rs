@@ -1,0 +1,94 @@
+//! Choices beside all others that could have been made.
+#![allow(clippy::unwrap_used)]
+
+use super::*;
+use crate::scene::PAPER;
+
+fn scene(sets: &[&str]) -> Scene {
+    let sets: Vec<String> = ["sheet.points=[5, 4]"].iter().chain(sets).map(|set| (*set).to_owned()).collect();
+    Scene::parse("paper", PAPER, &sets, &Limits::default()).unwrap()
+}
+
+/// The cost of a choice, in substeps of `central` in f32.
+fn cost(choice: &Choice) -> f64 {
+    let scheme = CANDIDATES.iter().find(|candidate| candidate.0 == choice.integrator).map(|found| found.2);
+    let format = FORMATS.iter().find(|format| format.0 == choice.precision).map(|found| found.1);
+    scheme.unwrap() * format.unwrap() * f64::from(choice.substeps)
+}
+
+#[test]
+fn rounding_in_f32_grows_with_damping_and_with_shorter_substeps_and_is_less_in_better_formats() {
+    let sheet = |damping_n_s_per_m| Oscillator {
+        mass_kg: 0.01,
+        damping_n_s_per_m,
+        virtual_stiffness_n_per_m: 5.0,
+        spring_stiffness_n_per_m: 120.0,
+    };
+    let of = |precision, damping, substep_s| rounding(precision, &sheet(damping), substep_s);
+    let compensated = of(Precision::Compensated, 0.5, 1e-3);
+    let creep = |damping, substep_s| of(Precision::F32, damping, substep_s) - compensated;
+    // A displacement stands still when it creeps by less than its last digit: that is short by C/(K·dt) digits.
+    assert!(creep(0.0, 1e-3).abs() < 1e-12 * compensated);
+    assert!((creep(1.0, 1e-3) / creep(0.5, 1e-3) - 2.0).abs() < 1e-9);
+    assert!((creep(0.5, 2.5e-4) / creep(0.5, 1e-3) - 4.0).abs() < 1e-9);
+    assert!((of(Precision::Compensated, 9.0, 1e-5) - compensated).abs() < 1e-12 * compensated);
+    assert!(of(Precision::F64, 9.0, 1e-5) < 1e-4 * compensated);
+}
+
+#[test]
+fn the_choice_keeps_its_tolerance_and_nothing_that_keeps_it_is_much_cheaper() {
+    for tolerance in ["1e-2", "1e-4", "1e-6"] {
+        let scene = scene(&[&format!("stepping.tolerance={tolerance}")]);
+        let (choice, _) = choose(&scene, &Limits::default()).unwrap();
+        let chooser = Chooser::new(&scene, &Limits::default());
+        assert!(chooser.keeps(&choice), "{choice:?}");
+        assert!(CANDIDATES.iter().any(|candidate| candidate.0 == choice.integrator), "{choice:?}");
+        for (integrator, ..) in CANDIDATES {
+            let least = stability::stable_substeps(integrator, 1e-3, &chooser.sheet);
+            for (precision, _) in chooser.formats(integrator) {
+                for substeps in least.. {
+                    let other = Choice { integrator, substeps, precision, expected_error: 0.0 };
+                    if cost(&other) >= 0.8 * cost(&choice) {
+                        break;
+                    }
+                    assert!(
+                        !chooser.keeps(&chooser.tried(integrator, substeps, precision)),
+                        "{choice:?}, not {other:?}"
+                    );
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn an_integrator_takes_hardly_more_substeps_than_it_needs() {
+    for (integrator, order, tolerance) in [
+        (Integrator::Central, 2.0, "3e-3"),
+        (Integrator::Exponential2, 3.0, "1e-4"),
+        (Integrator::Exponential3, 4.0, "1e-6"),
+        (Integrator::Exponential4, 5.0, "1e-7"),
+    ] {
+        let scene = scene(&[&format!("stepping.tolerance={tolerance}"), "springs.stiffness_n_per_m=1000"]);
+        let chooser = Chooser::new(&scene, &Limits::default());
+        let found = chooser.fewest(integrator, order, Precision::F64, 1000).unwrap().choice;
+        assert!(chooser.keeps(&found) && found.substeps > 2, "{found:?}");
+        let fewer = chooser.tried(integrator, found.substeps * 2 / 3, Precision::F64);
+        assert!(!chooser.keeps(&fewer), "{found:?}, but {fewer:?} would do");
+        // With one less at most, there is none that keeps the tolerance, or one with fewer.
+        let bounded = chooser.fewest(integrator, order, Precision::F64, found.substeps - 1);
+        assert!(bounded.is_none_or(|bounded| bounded.choice.substeps < found.substeps));
+    }
+}
+
+#[test]
+fn where_nothing_keeps_the_tolerance_the_least_error_is_chosen() {
+    let limits = Limits { substeps: 2, ..Limits::default() };
+    let scene = scene(&["stepping.tolerance=1e-9"]);
+    let (choice, _) = choose(&scene, &limits).unwrap();
+    let others = candidates(&scene, &limits);
+    assert!(others.len() > 1 && choice.expected_error > 1e-9);
+    let least = others.iter().map(|other| other.expected_error).fold(f64::INFINITY, f64::min);
+    let most = others.iter().map(|other| other.expected_error).fold(0.0, f64::max);
+    assert!(choice.expected_error == least && least < most, "{choice:?}, not {others:?}");
+}

@@ -1,0 +1,182 @@
+//! Linearised springs beside the springs themselves, and what follows from them in closed form.
+#![allow(clippy::unwrap_used)]
+
+use std::sync::Arc;
+
+use super::*;
+
+fn model(sets: &[&str]) -> Arc<Model> {
+    let always = ["stepping.integrator=central", "stepping.substeps=1", "sheet.spacing_m=0.02"];
+    Model::paper(&[&always[..], sets].concat())
+}
+
+/// The whole sheet around a disc of some spacings near its middle, its points displaced so.
+fn patch<'m>(model: &'m Model, radius: f64, displacement_m: impl Fn([usize; 2]) -> DVec3) -> Patch<'m> {
+    let sheet = &model.scene.sheet;
+    let centre_m = 0.5 * sheet.extent_m() + DVec2::new(0.13, -0.21) * sheet.spacing_m;
+    let footprint = Footprint::new(model, radius * sheet.spacing_m, centre_m);
+    let window = Window { origin: [0, 0], size: model.points };
+    let displacement_m = (0..model.len()).map(|index| displacement_m(model.point_of(index))).collect();
+    Patch::new(model, &footprint, window, displacement_m)
+}
+
+/// Values between −1 and 1 that are different for each point and component.
+fn scattered([i, j]: [usize; 2]) -> DVec3 {
+    let (x, y) = (i as f64, j as f64);
+    DVec3::new((1.7 * x + 2.9 * y).sin(), (3.1 * x - 1.3 * y).cos(), (0.7 * x * y + 1.0).sin())
+}
+
+/// A stretch of 30 % with some disorder: each spring is longer than at rest.
+fn stretched(spacing_m: f64) -> impl Fn([usize; 2]) -> DVec3 {
+    move |[i, j]| spacing_m * (0.3 * DVec3::new(i as f64, j as f64, 0.0) + 0.04 * scattered([i, j]))
+}
+
+/// The force of springs and virtual springs on each point, by lengths and roots.
+fn forces_n(model: &Model, displacement_m: &[DVec3]) -> Vec<DVec3> {
+    let (springs, spacing_m) = (&model.scene.springs, model.scene.sheet.spacing_m);
+    let (k, shear) = (springs.stiffness_n_per_m, springs.shear_stiffness_n_per_m);
+    let kinds = [([1, 0], k), ([0, 1], k), ([1, 1], shear), ([1, -1], shear), ([2, 0], k), ([0, 2], k)];
+    let kinds = &kinds[..if springs.flexion { 6 } else { 4 }];
+    let mut forces: Vec<DVec3> = displacement_m.iter().map(|u| -model.scene.virtual_stiffness_n_per_m * *u).collect();
+    for a in 0..model.len() {
+        let [i, j] = model.point_of(a);
+        for ([di, dj], stiffness) in kinds {
+            let Some(other) = i.checked_add_signed(*di).zip(j.checked_add_signed(*dj)) else { continue };
+            if other.0 >= model.points[0] || other.1 >= model.points[1] {
+                continue;
+            }
+            let b = model.index_of([other.0, other.1]);
+            let rest_m = spacing_m * DVec3::new(*di as f64, *dj as f64, 0.0);
+            let apart_m = rest_m + displacement_m[b] - displacement_m[a];
+            let pull_n = *stiffness * (1.0 - rest_m.length() / apart_m.length()) * apart_m;
+            forces[a] += pull_n;
+            forces[b] -= pull_n;
+        }
+    }
+    forces
+}
+
+const SPRINGS: [&str; 2] = ["springs.flexion=true", "springs.shear_stiffness_n_per_m=4.0"];
+
+#[test]
+fn the_linearised_springs_have_the_springs_forces_and_their_derivative() {
+    let model = model(&[&SPRINGS[..], &["sheet.points=[6, 7]"]].concat());
+    let spacing_m = model.scene.sheet.spacing_m;
+    let patch = patch(&model, 1.0, stretched(spacing_m));
+    let mut found: Vec<DVec3> =
+        patch.displacement_m.iter().map(|u| -model.scene.virtual_stiffness_n_per_m * *u).collect();
+    for Spring { ends: [a, b], force_n, .. } in &patch.springs {
+        found[*a] += *force_n;
+        found[*b] -= *force_n;
+    }
+    let truth = forces_n(&model, &patch.displacement_m);
+    assert!(found.iter().zip(&truth).all(|(found, truth)| found.distance(*truth) < 1e-12));
+    // K·x is the change of the force against a small movement along x.
+    let x: Vec<Triple> =
+        (0..model.len()).map(|at| [0, 40, 80].map(|more| scattered([at + more, 2 * at + 1]))).collect();
+    let mut product = vec![[DVec3::ZERO; 3]; x.len()];
+    patch.times(&x, &mut product);
+    for system in 0..3 {
+        let [ahead, behind] = [1e-6, -1e-6].map(|part| {
+            let moved = patch.displacement_m.iter().zip(&x).map(|(u, x)| *u + part * spacing_m * x[system]);
+            forces_n(&model, &moved.collect::<Vec<_>>())
+        });
+        for (at, product) in product.iter().enumerate() {
+            let change = (behind[at] - ahead[at]) / (2e-6 * spacing_m);
+            assert!(change.distance(product[system]) < 1e-4, "{at} {system}: {change} {}", product[system]);
+        }
+    }
+}
+
+#[test]
+fn a_solution_leaves_no_more_than_the_part_it_may_of_any_load() {
+    let model = model(&[&SPRINGS[..], &["sheet.points=[9, 8]", "sheet.fixed=corners"]].concat());
+    let patch = patch(&model, 1.0, stretched(model.scene.sheet.spacing_m));
+    // A faint load is solved as exactly as a strong one.
+    for size in [1e-9, 1.0] {
+        let load: Vec<Triple> =
+            (0..model.len()).map(|at| [0, 40, 80].map(|more| size * scattered([at + more, at]))).collect();
+        let (x, iterations) = patch.solve(&load, 1e-8);
+        let mut left = vec![[DVec3::ZERO; 3]; x.len()];
+        patch.times(&x, &mut left);
+        for system in 0..3 {
+            let free = (0..model.len()).filter(|at| patch.free[*at]);
+            let (rest, whole) = free.fold((0.0, 0.0), |(rest, whole), at| {
+                let load = load[at][system];
+                (rest + (left[at][system] - load).length_squared(), whole + load.length_squared())
+            });
+            assert!(rest <= 1.01e-16 * whole, "{size} {system}: {rest:e} of {whole:e}");
+        }
+        // Preconditioned, such a small and stiffly held sheet takes far fewer than it has unknowns.
+        assert!(iterations < 60, "{iterations}");
+    }
+}
+
+#[test]
+fn without_springs_a_disc_moves_each_point_against_its_own_virtual_spring() {
+    let model = model(&["sheet.points=[7, 7]", "springs.stiffness_n_per_m=0.0"]);
+    let (scene, patch) = (&model.scene, patch(&model, 1.3, |_| DVec3::ZERO));
+    let tangent = patch.tangent();
+    // A force F moves point p by w·F/K″, and the disc by Σ w² F/K″.
+    let shared: f64 = patch.weights.iter().map(|weight| weight * weight).sum();
+    let is = |found: DMat3, expected: f64| found.abs_diff_eq(DMat3::IDENTITY * expected, 1e-6 * expected);
+    assert!(is(tangent.stiffness_n_per_m, scene.virtual_stiffness_n_per_m / shared), "{tangent:?}");
+    assert!(is(tangent.damping_n_s_per_m, scene.damping_n_s_per_m / shared), "{tangent:?}");
+    let mass_kg = scene.sheet.point_mass_kg / shared;
+    assert!((tangent.mass_kg - mass_kg).abs() < 1e-6 * mass_kg, "{tangent:?}");
+    assert_eq!(tangent.drag_n_s_per_m, 0.0);
+}
+
+#[test]
+fn drag_is_what_the_points_are_moved_as_the_dimple_passes() {
+    let model = model(&["sheet.points=[8, 11]"]);
+    let spacing_m = model.scene.sheet.spacing_m;
+    // Zero at the rim, where a dimple has no slope.
+    let rim = |[i, j]: [usize; 2]| i < 2 || j < 2 || i >= 6 || j >= 9;
+    let dimple_m = |point| if rim(point) { DVec3::ZERO } else { 1e-3 * scattered(point) };
+    let found = patch(&model, 1.0, dimple_m).tangent().drag_n_s_per_m;
+    let mut squares = 0.0;
+    for i in 1..7 {
+        for j in 1..10 {
+            let along_x = (dimple_m([i + 1, j]) - dimple_m([i - 1, j])) / (2.0 * spacing_m);
+            let along_y = (dimple_m([i, j + 1]) - dimple_m([i, j - 1])) / (2.0 * spacing_m);
+            squares += 0.5 * (along_x.length_squared() + along_y.length_squared());
+        }
+    }
+    let expected = model.scene.damping_n_s_per_m * squares;
+    assert!(expected > 0.0 && (found - expected).abs() < 1e-12 * expected, "{found} {expected}");
+}
+
+#[test]
+fn after_a_press_every_point_is_in_balance() {
+    let model = model(&["sheet.points=[9, 9]", "virtual_springs.stiffness_n_per_m=0.5", "sheet.fixed=edges"]);
+    let mut patch = patch(&model, 1.0, |_| DVec3::ZERO);
+    let depth_m = 1.5 * model.scene.sheet.spacing_m;
+    let force_n = patch.press(depth_m);
+    let place_m: f64 = patch.weights.iter().zip(&patch.displacement_m).map(|(weight, u)| weight * u.z).sum();
+    assert!((place_m + depth_m).abs() < 1e-6 * depth_m, "{place_m}");
+    let forces = forces_n(&model, &patch.displacement_m);
+    for at in (0..model.len()).filter(|at| patch.free[*at]) {
+        let left_n = forces[at] - force_n * patch.weights[at] * DVec3::Z;
+        assert!(left_n.length() < 1e-6 * force_n, "{at}: {left_n} of {force_n} N");
+    }
+}
+
+#[test]
+fn a_window_holds_all_that_notices_the_disc_and_not_much_more() {
+    // Virtual springs as stiff as the others: a press is felt within a spacing.
+    let model = model(&["sheet.points=[50, 44]", "virtual_springs.stiffness_n_per_m=10.0"]);
+    let spacing_m = model.scene.sheet.spacing_m;
+    for (centre, radius) in [([22.3, 20.1], 5.5), ([3.0, 41.0], 2.0), ([24.0, 21.0], 0.3)] {
+        let footprint = Footprint::new(&model, radius * spacing_m, DVec2::from(centre) * spacing_m);
+        let points: Vec<usize> = Window::around(&model, &footprint).points(&model).collect();
+        assert!(points.is_sorted_by(|a, b| a < b) && points.last().is_some_and(|last| *last < model.len()));
+        for index in 0..model.len() {
+            let [i, j] = model.point_of(index);
+            let away = (i as f64 - centre[0]).abs().max((j as f64 - centre[1]).abs());
+            let is_inside = points.binary_search(&index).is_ok();
+            assert!(is_inside || away > radius + REACHES, "{centre:?}: {i} {j} is left out");
+            assert!(!is_inside || away < radius + REACHES + 4.0, "{centre:?}: {i} {j} is in");
+        }
+    }
+}

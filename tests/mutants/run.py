@@ -1,0 +1,194 @@
+"""Mutation testing of sheet, haptics and session: how many mutants do the tests catch?
+
+cargo-mutants draws up the list of mutants (`cargo install cargo-mutants`). All that are drawn from it are compiled at once
+(src/main.rs), and each is run by the tests that concern it until one fails. Results are kept in target/mutants and continued
+from there. The exit status is 1 if fewer than nine in ten are caught.
+"""
+
+import argparse
+import concurrent.futures
+import json
+import os
+import random
+import re
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent.parent
+WORK = ROOT / "target" / "mutants"
+TREE = WORK / "tree"
+ROOMS = ["sheet", "haptics", "session"]
+
+# Test programs, and which of their tests: quick ones first. `commands` and `poses` need a server and take longer.
+UNIT = ("palpate", [f"{room}::" for room in ROOMS])
+TOUCH = ("haptics", ["contact", "rendering"])
+ORDER = {
+    "sheet": [UNIT, TOUCH, ("determinism", ["golden", "held"]), ("physics", []), ("reference", []), ("audit", [])],
+    "haptics": [UNIT, TOUCH, ("haptics", ["poses"])],
+    "session": [
+        UNIT,
+        ("determinism", ["golden", "held"]),
+        ("haptics", ["commands", "poses"]),
+        ("physics", []),
+        ("audit", []),
+        ("scenes", []),
+    ],
+}
+
+# A mutant that makes a test take so long does not end.
+LONGEST_S = 300
+
+
+def drawn(count, seed):
+    """The mutants to be tested, numbered from 1. The same as long as the tree is."""
+    path = WORK / "drawn.json"
+    if not path.exists():
+        files = [part for room in ROOMS for part in ("--file", f"src/{room}/**/*.rs")]
+        command = ["cargo", "mutants", "--list", "--json", "--package", "palpate", *files]
+        listed = json.loads(subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout)
+        mutants = [
+            {
+                "id": number,
+                "file": mutant["file"],
+                "line": mutant["span"]["start"]["line"],
+                "column": mutant["span"]["start"]["column"],
+                "genre": mutant["genre"],
+                "replacement": mutant["replacement"],
+                "name": mutant["name"],
+                "returns": (mutant["function"] or {}).get("return_type", ""),
+            }
+            for number, mutant in enumerate(random.Random(seed).sample(listed, min(count, len(listed))), 1)
+        ]
+        path.write_text(json.dumps(mutants, indent=1))
+    return json.loads(path.read_text())
+
+
+def lay_out(mutants):
+    """Writes the tree with these mutants. Returns the ids of those that have no place in it."""
+    shutil.rmtree(TREE, ignore_errors=True)
+    listed = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    for name in subprocess.run(listed, cwd=ROOT, check=True, capture_output=True, text=True).stdout.split("\0"):
+        if name and (ROOT / name).is_file():
+            (TREE / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(ROOT / name, TREE / name)
+    (WORK / "fit.json").write_text(json.dumps(mutants))
+    fitter = ["cargo", "run", "--quiet", "--manifest-path", HERE / "Cargo.toml", "--target-dir", WORK / "fitter", "--"]
+    unplaced = subprocess.run([*fitter, WORK / "fit.json", TREE], check=True, capture_output=True, text=True).stdout
+    with open(TREE / "src/lib.rs", "a") as library:
+        library.write((HERE / "mutant.rs").read_text())
+    return {int(line) for line in unplaced.split()}
+
+
+def compiled(arguments):
+    """Runs cargo in the tree. Returns its messages."""
+    environment = {**os.environ, "CARGO_TARGET_DIR": str(WORK / "build")}
+    command = ["cargo", *arguments, "--message-format=json"]
+    run = subprocess.run(command, cwd=TREE, env=environment, capture_output=True, text=True)
+    return [json.loads(line) for line in run.stdout.splitlines() if line.startswith("{")]
+
+
+def unviable():
+    """The ids of mutants that the compiler names in its errors."""
+    found = set()
+    for message in compiled(["check", "--lib"]):
+        if message.get("reason") != "compiler-message" or message["message"]["level"] != "error":
+            continue
+        for span in message["message"]["spans"]:
+            if span["is_primary"]:
+                line = (TREE / span["file_name"]).read_text().split("\n")[span["line_start"] - 1]
+                # The innermost of those before the error.
+                before = re.findall(r"crate::mutant\((\d+)\)", line[: span["column_end"]])
+                if not before:
+                    sys.exit(f"The tree does not compile: {message['message']['rendered']}")
+                found.add(int(before[-1]))
+    return found
+
+
+def programs():
+    """The test programs by name."""
+    tests = {name for order in ORDER.values() for name, _ in order} - {"palpate"}
+    named = [part for test in sorted(tests) for part in ("--test", test)]
+    found = {}
+    for message in compiled(["test", "--release", "--no-run", "--lib", *named]):
+        if message.get("executable") and message["profile"]["test"]:
+            found[message["target"]["name"]] = message["executable"]
+    if missing := (tests | {"palpate"}) - set(found):
+        sys.exit(f"Test programs are missing: {sorted(missing)}")
+    return found
+
+
+def tested(found, mutant):
+    """Runs the tests on a mutant until one fails."""
+    begun = time.time()
+    environment = {
+        **os.environ,
+        "CARGO_TARGET_DIR": str(WORK / "build"),
+        "PALPATE_MUTANT": str(mutant["id"]),
+        "PROPTEST_RNG_SEED": "20261122",
+        "RUST_BACKTRACE": "0",
+    }
+    caught_by = None
+    for name, filters in ORDER[mutant["file"].split("/")[1]]:
+        command = ["nice", "-n", "10", found[name], "--test-threads=1", *filters]
+        try:
+            run = subprocess.run(
+                command, cwd=TREE, env=environment, capture_output=True, text=True, errors="replace", timeout=LONGEST_S
+            )
+        except subprocess.TimeoutExpired:
+            caught_by = f"{name}: it does not end"
+            break
+        if run.returncode:
+            failed = re.findall(r"^test (\S+) \.\.\. FAILED$", run.stdout, re.MULTILINE)
+            caught_by = f"{name}: {failed[0] if failed else f'exit status {run.returncode}'}"
+            break
+    return {**mutant, "caught_by": caught_by, "seconds": round(time.time() - begun, 1)}
+
+
+def main():
+    arguments = argparse.ArgumentParser(description=__doc__)
+    arguments.add_argument("--count", type=int, default=300)
+    arguments.add_argument("--seed", type=int, default=20261122)
+    arguments.add_argument("--jobs", type=int, default=os.cpu_count())
+    arguments.add_argument("--afresh", action="store_true", help="forget what target/mutants holds")
+    options = arguments.parse_args()
+    if options.afresh:
+        for name in ("drawn.json", "results.jsonl"):
+            (WORK / name).unlink(missing_ok=True)
+    WORK.mkdir(parents=True, exist_ok=True)
+    mutants = drawn(options.count, options.seed)
+    unplaced = lay_out(mutants)
+    # What is returned as `impl Trait` has one type: the compiler's error is then beside the mutant.
+    left_out = unplaced | {m["id"] for m in mutants if m["genre"] == "FnValue" and "impl " in m["returns"]}
+    lay_out([mutant for mutant in mutants if mutant["id"] not in left_out])
+    while new := unviable() - left_out:
+        left_out |= new
+        lay_out([mutant for mutant in mutants if mutant["id"] not in left_out])
+    found = programs()
+    good = {**mutants[0], "id": 0}
+    if (whole := tested(found, good))["caught_by"]:
+        sys.exit(f"The tests fail without a mutant: {whole['caught_by']}")
+    path = WORK / "results.jsonl"
+    results = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    done = {result["id"] for result in results}
+    waiting = [mutant for mutant in mutants if mutant["id"] not in left_out | done]
+    with concurrent.futures.ThreadPoolExecutor(options.jobs) as jobs, open(path, "a") as file:
+        for result in jobs.map(lambda mutant: tested(found, mutant), waiting):
+            results.append(result)
+            file.write(json.dumps(result) + "\n")
+            file.flush()
+            outcome = result["caught_by"] or "SURVIVES"
+            print(f"{len(results)}/{len(done) + len(waiting)} {result['name']}: {outcome}", flush=True)
+    survivors = [result for result in results if not result["caught_by"]]
+    print(f"{len(mutants)} drawn, {len(left_out - unplaced)} do not compile, {len(unplaced)} can't be switched;")
+    print(f"{len(results)} run, {len(results) - len(survivors)} caught. Survivors:")
+    for result in survivors:
+        print(f"  {result['name']}")
+    sys.exit(len(survivors) > len(results) / 10)
+
+
+if __name__ == "__main__":
+    main()
