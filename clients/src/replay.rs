@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use hdrhistogram::Histogram;
 use indicatif::{ProgressBar, ProgressStyle};
 use palpate::limits::Limits;
-use palpate::refusal::Refusal;
+use palpate::refusal::{Reason, Refusal};
 use palpate::scene::Scene;
 use palpate::scene::record::{Line, Network, Percentiles, Record, Run, Summary, write_line};
 use palpate::scene::script::Script;
@@ -187,6 +187,8 @@ struct Seen {
     computed: u64,
     late: u64,
     rejected: u64,
+    /// How often the tissue went back to an earlier state.
+    recovery_count: u64,
     largest_displacement_m: f64,
     peak_reaction_n: f64,
     /// Step and server time of the first sample and of the last.
@@ -209,6 +211,7 @@ impl Seen {
             computed: 0,
             late: 0,
             rejected: 0,
+            recovery_count: 0,
             largest_displacement_m: 0.0,
             peak_reaction_n: 0.0,
             first: None,
@@ -227,6 +230,7 @@ impl Seen {
         self.awake_points = u64::from(sample.awake_points);
         self.computed += self.awake_points * awake_steps;
         self.late = sample.late_commands;
+        self.recovery_count = sample.recovery_count;
         self.last = (sample.step, sample.server_time_ns);
         self.first.get_or_insert(self.last);
         for (index, tool) in sample.tools.iter().enumerate() {
@@ -475,7 +479,8 @@ async fn play(
                     taken_in = streamer.taken_in();
                 }
                 Some(Heard::Rejection(rejection)) => {
-                    seen.rejected += 1;
+                    // Of a recovery the samples tell.
+                    seen.rejected += u64::from(rejection.reason != Reason::Recovered.as_str());
                     progress.suspend(|| crate::say!("palpate-client: warning: {}", rejection_text(&rejection)));
                 }
                 Some(Heard::Opened(_)) | None => {}
@@ -504,6 +509,12 @@ async fn play(
         }
     }
     progress.finish_and_clear();
+    let mut recoveries = Vec::new();
+    if seen.recovery_count > 0 {
+        let asked = pb::GetSessionRequest { session_id: session_id.clone() };
+        let session = sessions.get_session(asked).await.map_err(failed)?.into_inner().session.unwrap_or_default();
+        recoveries = session.recoveries.into_iter().map(wire::sample::from_recovery).collect();
+    }
 
     let points = scene.sheet.points[0] * scene.sheet.points[1];
     let network = Network {
@@ -517,6 +528,7 @@ async fn play(
     let summary = Summary {
         audited_error: None,
         corrections: Vec::new(),
+        recoveries,
         steps: script.steps,
         substeps,
         points,
@@ -539,6 +551,9 @@ async fn play(
     table(arguments, &summary, &network, &seen);
     if seen.rejected > 0 {
         return Err(Failure::Failed(format!("{} commands were rejected: this was not the script", seen.rejected)));
+    }
+    if let Some(fault) = summary.fault() {
+        return Err(Failure::Failed(fault));
     }
     Ok(())
 }

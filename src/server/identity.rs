@@ -8,7 +8,6 @@ use ring::digest::{SHA256, digest};
 use serde::Deserialize;
 use subtle::ConstantTimeEq;
 
-use super::connections::Peer;
 use crate::pace::random_bits;
 use crate::refusal::{Reason, Refusal, Result, label};
 
@@ -239,8 +238,8 @@ impl Credentials {
         Ok(known)
     }
 
-    /// Who it is that calls, by the header `authorization` if there is one, or else by the certificate.
-    pub(super) fn caller(&self, authorization: Option<&HeaderValue>, peer: Option<&Peer>) -> Result<Caller> {
+    /// Who it is that calls, by the header `authorization` if there is one, or else by the names of a certificate.
+    pub(super) fn caller(&self, authorization: Option<&HeaderValue>, certificate: Option<&[String]>) -> Result<Caller> {
         if self.open {
             return Ok(Caller::anybody());
         }
@@ -259,8 +258,7 @@ impl Credentials {
                 .fold(None, |found, (known, caller)| if bool::from(known.ct_eq(&hash)) { Some(caller) } else { found });
             return found.cloned().ok_or_else(|| unknown("is a token that this server does not know"));
         }
-        let names = peer.and_then(|peer| peer.certificate.as_deref());
-        match names {
+        match certificate {
             Some(names) if self.any_certificate => {
                 Ok(Caller { name: names.first().map_or("a certificate", String::as_str).into(), ..Caller::anybody() })
             }
