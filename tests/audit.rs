@@ -377,13 +377,14 @@ async fn a_live_session_is_corrected_if_its_scene_says_so() {
 #[tokio::test]
 async fn a_correction_that_would_take_longer_than_a_scene_may_is_refused_and_told() {
     let Source::Scene(scene) = coarse(true) else { unreachable!() };
-    let limits = Limits::default();
+    // Without rehearsals, which would find another scheme, a correction is more substeps of this one.
+    let limits = Limits { rehearsal_work: 1, ..Limits::default() };
     let model = Model::compile(&palpate::wire::scene::from_scene(&scene).unwrap(), &limits).unwrap();
     // As long as the scene's own steps are predicted to take, and no longer.
     let periods = 1.000_001 * model.predicted_step_s() * model.scene.stepping.rate_hz;
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("palpate.toml");
-    std::fs::write(&config, format!("[limits]\nperiods_per_step = {periods}\n")).unwrap();
+    std::fs::write(&config, format!("[limits]\nperiods_per_step = {periods}\nrehearsal_work = 1\n")).unwrap();
     let server = Server::start(&["--audit-share", "0.5", "--config", config.to_str().unwrap()]);
     let session = server.create(coarse(true), false).await.unwrap();
     let told = |status: &pb::Session| status.audit.as_ref().is_some_and(|audit| !audit.refused_correction.is_empty());
