@@ -88,7 +88,7 @@ impl Run {
                 }
             });
         }
-        session.hold_reason().is_none().then_some(trace)
+        session.fault().is_none().then_some(trace)
     }
 
     /// Runs it without recording. Run time per simulated second, s.

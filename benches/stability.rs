@@ -132,7 +132,7 @@ impl Tissue {
         let mut due = Vec::new();
         for _ in 0..(1.0 / step_s).ceil().max(1000.0) as u32 {
             session.advance(&mut due, |session| largest_m = largest_m.max(session.tissue().largest_displacement_m()));
-            if session.hold_reason().is_some() {
+            if session.fault().is_some() {
                 return None;
             }
         }

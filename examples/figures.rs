@@ -64,7 +64,9 @@ fn depth(sets: &[String]) -> Vec<(f64, f64)> {
         session.advance(&mut Vec::new(), |session| {
             course.push((session.time_s(), -1e3 * session.tissue().point(centre).displacement_m.z));
         });
-        if let Some(reason) = session.hold_reason() {
+        if let Some(reason) = session.fault() {
+            // The last point is of the state that the tissue went back to.
+            course.pop();
             println!("{sets:?}: {reason}");
             break;
         }

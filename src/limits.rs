@@ -63,6 +63,9 @@ pub struct Limits {
     pub probe_points: usize,
     /// Longest lease of a tool, s.
     pub lease_s: f64,
+    /// Longest lease of a tool that was taken by a call over HTTP/1.1 or gRPC-web, unless it is to outlive its connection,
+    /// s: the end of such a connection says nothing of who holds the tool.
+    pub browser_lease_s: f64,
     /// Share of a stepping thread's time that sessions may take before no further one is let in, 0 to 1.
     pub thread_share: f64,
     /// Connections; what comes above that is closed at once. Fewer, if the process may not open as many files.
@@ -127,6 +130,7 @@ impl Default for Limits {
             texture_side: 4096,
             probe_points: 1 << 16,
             lease_s: 600.0,
+            browser_lease_s: 10.0,
             thread_share: 0.85,
             connections: 4096,
             connections_per_address: 2048,

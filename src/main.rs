@@ -565,11 +565,12 @@ fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     let ended = with_progress(script.steps, |progress| {
         run(&model, &script, arguments.held, &limits, &mut output, &clock_s, progress)
     });
-    let ended = ended.and_then(|_| output.flush().map_err(run::Failure::Output));
+    let ended = ended.and_then(|summary| output.flush().map(|()| summary).map_err(run::Failure::Output));
     match ended {
         // A reader that closed the pipe is not an error.
         Err(run::Failure::Output(e)) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
         Err(run::Failure::Refused(refusal)) => Err(refusal.into()),
-        ended => ended.map(drop).map_err(|failure| Failure::Failed(failure.to_string())),
+        Err(failure) => Err(Failure::Failed(failure.to_string())),
+        Ok(summary) => summary.fault().map_or(Ok(()), |fault| Err(Failure::Failed(fault))),
     }
 }

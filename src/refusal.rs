@@ -50,6 +50,8 @@ reasons! {
     SessionDeleted = "SESSION_DELETED",
     /// The guard has ended the session.
     SessionHeld = "SESSION_HELD",
+    /// The guard took the tissue back to an earlier state, and the effect of the command was lost.
+    Recovered = "RECOVERED",
     /// No viewer of that id.
     UnknownViewer = "UNKNOWN_VIEWER",
     /// Another holds the tool.

@@ -20,6 +20,7 @@ use palpate::session::Session;
 use palpate::session::audit::Windows;
 use palpate::session::command::Due;
 use palpate::session::run::{self, command};
+use palpate::sheet::Model;
 use palpate::sheet::audit::{Extent, FINER, Finding, Inputs, Mark, Origin};
 use palpate::wire::pb;
 use pb::create_session_request::Source;
@@ -142,7 +143,7 @@ fn commanded(scene: &Scene, told: Told, steps: u64, mut look: impl FnMut(&mut Se
             ends_lease: false,
         };
         session.advance(&mut told(step).into_iter().map(due).collect(), |_| {});
-        assert_eq!(session.hold_reason(), None);
+        assert_eq!(session.fault(), None);
         look(&mut session);
     }
     session
@@ -371,6 +372,30 @@ async fn a_live_session_is_corrected_if_its_scene_says_so() {
     push_until(&server, &session.session_id, |later| later.step > status.step + 500).await;
     let log = server.log();
     assert!(log.contains("tissue corrected"), "{log}");
+}
+
+#[tokio::test]
+async fn a_correction_that_would_take_longer_than_a_scene_may_is_refused_and_told() {
+    let Source::Scene(scene) = coarse(true) else { unreachable!() };
+    // Without rehearsals, which would find another scheme, a correction is more substeps of this one.
+    let limits = Limits { rehearsal_work: 1, ..Limits::default() };
+    let model = Model::compile(&palpate::wire::scene::from_scene(&scene).unwrap(), &limits).unwrap();
+    // As long as the scene's own steps are predicted to take, and no longer.
+    let periods = 1.000_001 * model.predicted_step_s() * model.scene.stepping.rate_hz;
+    let folder = tempfile::tempdir().unwrap();
+    let config = folder.path().join("palpate.toml");
+    std::fs::write(&config, format!("[limits]\nperiods_per_step = {periods}\nrehearsal_work = 1\n")).unwrap();
+    let server = Server::start(&["--audit-share", "0.5", "--config", config.to_str().unwrap()]);
+    let session = server.create(coarse(true), false).await.unwrap();
+    let told = |status: &pb::Session| status.audit.as_ref().is_some_and(|audit| !audit.refused_correction.is_empty());
+    let status = push_until(&server, &session.session_id, told).await;
+    let audit = status.audit.unwrap();
+    assert!(audit.refused_correction.contains("limits.periods_per_step"), "{audit:?}");
+    assert_eq!((audit.corrections, &*status.integrator, status.substeps), (0, "lagged", 1));
+    // The log is written by a thread of its own.
+    push_until(&server, &session.session_id, |later| later.step > status.step + 500).await;
+    let log = server.log();
+    assert!(log.contains("a correction was refused: stepping.rate_hz"), "{log}");
 }
 
 #[tokio::test]

@@ -263,6 +263,34 @@ async fn who_loses_a_token_loses_the_streams_and_tools_that_it_opened() {
     }
 }
 
+#[tokio::test]
+async fn who_loses_a_token_loses_the_tools_that_outlive_its_calls() {
+    let Two { _folder, file, before, stays, goes, server, log, session } = two_tokens().await;
+    let mut haptics = server.haptics().await;
+    // Leases of ten minutes, whatever becomes of the connection.
+    let mut acquire = async |tool: u32, token: &str| {
+        let (session_id, lease_s, outlives_connection) = (session.clone(), Some(600.0), true);
+        let request = pb::AcquireToolRequest { session_id, tool, lease_s, outlives_connection, ..Default::default() };
+        haptics.acquire_tool(with_token(request, token)).await.unwrap().into_inner().lease_id
+    };
+    let (lost, kept) = (acquire(0, &goes).await, acquire(1, &stays).await);
+    let send = async |tool: u32, sequence: u64, lease_id: &str, token: &str| {
+        let commands = vec![force(tool, sequence, -1.0)];
+        let request = pb::SendCommandsRequest { session_id: session.clone(), lease_id: lease_id.into(), commands };
+        server.haptics().await.send_commands(with_token(request, token)).await
+    };
+    send(0, 1, &lost, &goes).await.unwrap();
+    std::fs::write(&file, &before).unwrap();
+    log.wait_for("tools released");
+    let request = pb::GetSessionRequest { session_id: session.clone() };
+    let told = server.sessions().await.get_session(with_token(request, &stays)).await.unwrap();
+    let held: Vec<u32> = told.into_inner().session.unwrap().held_tools.iter().map(|held| held.tool).collect();
+    assert_eq!(held, [1]);
+    // The lease is of no use to anybody, and the other one is.
+    assert_eq!(send(0, 2, &lost, &stays).await.unwrap_err().code(), Code::PermissionDenied);
+    send(1, 1, &kept, &stays).await.unwrap();
+}
+
 /// A haptic stream of whom a token was given, over a connection whose transport lets so many bytes of answers in.
 async fn touch_with(
     server: &Server,

@@ -15,6 +15,7 @@ use palpate::pace::Pacer;
 use palpate::refusal::Reason;
 use palpate::scene::{Fixed, Integrator, Lanes, Named, PointSet, Precision, Scene, Sheet, Springs, Stepping};
 use palpate::sheet;
+use palpate::sheet::choice::NEVER;
 
 fn name<T: Named>(random: &mut fastrand::Rng) -> T {
     T::NAMES[random.usize(..T::NAMES.len())].1
@@ -86,7 +87,7 @@ fn every_legal_scene_is_bounded_work_or_refused() {
         // A sheet of short rows counts as what it costs, and may then have too many points.
         scene.check(&limits).unwrap_or_else(|refusal| assert_eq!(refusal.field, "sheet.points", "{seed}: {refusal}"));
         let begun_s = processor_s();
-        match pacer.create(&scene, true, 60.0, &pacer.budget.account("test")) {
+        match pacer.create(&scene, true, 60.0, &pacer.budget.account("test"), &NEVER) {
             Err(refusal) => {
                 assert!([Reason::TooLarge, Reason::WrongKind].contains(&refusal.reason), "{seed}: {refusal}");
                 *refused.entry(refusal.field).or_default() += 1;
@@ -145,12 +146,14 @@ fn a_step_longer_than_its_period_is_refused_with_the_figure() {
     let large = scene(palpate::scene::PAPER, &["sheet.points=[1001, 1001]"]);
     let limits = Limits::default();
     let pacer = one_thread(&limits);
-    let Err(refusal) = pacer.create(&large, true, 60.0, &pacer.budget.account("test")) else { panic!("let in") };
+    let Err(refusal) = pacer.create(&large, true, 60.0, &pacer.budget.account("test"), &NEVER) else {
+        panic!("let in")
+    };
     assert_eq!((refusal.reason, refusal.field.as_str()), (Reason::TooLarge, "stepping.rate_hz"));
     assert!(refusal.message.contains("limits.periods_per_step"), "{refusal}");
     pacer.stop();
     let pacer = one_thread(&Limits { periods_per_step: 20.0, ..limits });
-    assert!(pacer.create(&large, true, 60.0, &pacer.budget.account("test")).is_ok());
+    assert!(pacer.create(&large, true, 60.0, &pacer.budget.account("test"), &NEVER).is_ok());
     pacer.stop();
 }
 
@@ -159,7 +162,9 @@ fn the_scenes_that_are_built_in_are_never_refused() {
     let pacer = one_thread(&Limits::default());
     for (name, text) in palpate::scene::BUILT_IN {
         let account = pacer.budget.account("test");
-        pacer.create(&scene(text, &[]), true, 60.0, &account).unwrap_or_else(|refusal| panic!("{name}: {refusal}"));
+        pacer
+            .create(&scene(text, &[]), true, 60.0, &account, &NEVER)
+            .unwrap_or_else(|refusal| panic!("{name}: {refusal}"));
     }
     pacer.stop();
 }

@@ -194,3 +194,55 @@ async fn a_script_of_the_server_is_the_commands_that_a_replay_sends() {
     let refused = sessions.get_script(request).await.unwrap_err();
     assert_eq!(told(&refused).1, "UNKNOWN_SCRIPT");
 }
+
+/// Takes a tool by a call over HTTP/1.1; how long it is held without a command, s.
+fn acquire(server: &Server, session_id: &str, tool: u32, outlives_connection: bool) -> f64 {
+    let lease_s = Some(600.0);
+    let request = pb::AcquireToolRequest {
+        session_id: session_id.to_owned(),
+        tool,
+        lease_s,
+        outlives_connection,
+        ..Default::default()
+    };
+    let message = request.encode_to_vec();
+    let frame = [&[0][..], &u32::try_from(message.len()).unwrap().to_be_bytes(), &message].concat();
+    let headers = "Content-Type: application/grpc-web+proto\r\n";
+    let (head, body) = ask(server, "POST", "/palpate.v1.HapticService/AcquireTool", headers, &frame);
+    assert!(head.starts_with("http/1.1 200"), "{head}");
+    // The frame of the answer, wherever the transfer coding has put it.
+    let answers = (0..body.len().saturating_sub(5)).filter_map(|at| {
+        let length = u32::from_be_bytes(body[at + 1..at + 5].try_into().unwrap()) as usize;
+        pb::AcquireToolResponse::decode(body.get(at + 5..)?.get(..length)?).ok().filter(|_| body[at] == 0)
+    });
+    let told = answers.into_iter().find(|answer| answer.lease_id.len() == 32);
+    told.unwrap_or_else(|| panic!("{head}\n{}", String::from_utf8_lossy(&body))).lease_s
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_tool_taken_over_grpc_web_is_not_held_for_long_by_who_says_nothing() {
+    let server = Server::start(&[]);
+    let session = server.paper(false).await;
+    assert_eq!(acquire(&server, &session, 0, false), 10.0);
+    assert_eq!(acquire(&server, &session, 1, true), 600.0);
+    assert_eq!(server.status(&session).await.held_tools.len(), 2);
+    // The same with a shorter time, to see it pass.
+    let folder = tempfile::tempdir().unwrap();
+    let config = folder.path().join("palpate.toml");
+    std::fs::write(&config, "[limits]\nbrowser_lease_s = 0.2\n").unwrap();
+    let server = Server::start(&["--config", config.to_str().unwrap()]);
+    let session = server.paper(false).await;
+    assert_eq!(acquire(&server, &session, 0, false), 0.2);
+    assert_eq!(acquire(&server, &session, 1, true), 600.0);
+    let lapsed = tokio::time::timeout(PATIENCE, async {
+        loop {
+            let status = server.status(&session).await;
+            if status.lapsed_leases == 1 {
+                break status.held_tools;
+            }
+            tokio::time::sleep(std::time::Duration::from_millis(10)).await;
+        }
+    });
+    let held: Vec<u32> = lapsed.await.expect("a tool is held by nobody").iter().map(|held| held.tool).collect();
+    assert_eq!(held, [1]);
+}

@@ -129,7 +129,7 @@ fn errors(name: &str, assignments: &[&str]) -> Errors {
     };
     for _ in 0..script.steps {
         session.advance(&mut Vec::new(), &mut compare);
-        assert_eq!(session.hold_reason(), None);
+        assert_eq!(session.fault(), None);
     }
     assert!(frames.next().is_none(), "the run is shorter than the reference");
     Errors {
@@ -202,7 +202,7 @@ fn lagged_explodes_where_its_damping_is_too_strong_and_the_guard_mends_it() {
                 assert!(point.displacement_m.is_finite() && point.reaction_n().is_finite());
             }
         });
-        assert_eq!(session.hold_reason(), None);
+        assert_eq!(session.fault(), None);
     }
     assert!(session.tissue().guard_events() > 0 && session.tissue().plan().substeps > 1);
     // Auto substeps are within the bound from the beginning.

@@ -409,3 +409,51 @@ async fn a_replay_leaves_no_session_behind() {
     let listed = server.sessions().await.list_sessions(request).await.unwrap().into_inner().sessions;
     assert!(listed.is_empty());
 }
+
+/// Springs far too stiff for the substeps that the scene gives: each force makes the tissue blow up.
+#[test]
+fn a_recovery_is_the_same_in_a_replay_and_offline_and_neither_calls_that_the_script() {
+    let folder = tempfile::tempdir().unwrap();
+    let write = |name: &str, text: String| {
+        let path = folder.path().join(name);
+        std::fs::write(&path, text).unwrap();
+        path
+    };
+    let stiff = palpate::scene::PAPER.replace("stiffness_n_per_m = 10.0", "stiffness_n_per_m = 1e9");
+    let scene = write("stiff.toml", format!("{stiff}\n[stepping]\nsubsteps = 1\n"));
+    let force = |on_s: f64| {
+        let profile = format!("{{ type = \"pulse\", on_s = {on_s}, off_s = {} }}", on_s + 0.1);
+        format!(
+            "[[force]]\npoint = [15, 15]\nforce_n = [0.1, 0.0, -1.0]\nfalloff_per_m = 20.0\nfalloff_offset = 0.0\n\
+             profile = {profile}\n"
+        )
+    };
+    let head = "duration_s = 0.6\nsample_every_s = 0.01\nsample_points = [[15, 15], [3, 4]]\n";
+    let script = write("twice.toml", format!("{head}{}{}", force(0.1), force(0.4)));
+    // The scene's error is not known, and looking for it would take long.
+    let config = write("palpate.toml", "[limits]\nrehearsal_work = 1\n".to_owned());
+    let config = ["--config", config.to_str().unwrap()];
+    let server = Server::start(&config);
+    let through = replay(&server, &script, &["--scene", scene.to_str().unwrap()]);
+    let offline = Command::new(env!("CARGO_BIN_EXE_palpate"))
+        .args(["run", scene.to_str().unwrap(), script.to_str().unwrap(), "--held"])
+        .args(config)
+        .output()
+        .unwrap();
+    for ended in [&through, &offline] {
+        let said = String::from_utf8_lossy(&ended.stderr);
+        assert!(ended.status.code() == Some(1) && said.contains("from there on this is not the script"), "{said}");
+    }
+    let (through, offline) = (lines(&through.stdout), lines(&offline.stdout));
+    let last = offline.len() - 1;
+    assert_eq!(through[..last], offline[..last]);
+    let (summary, expected) = (&through[last]["summary"], &offline[last]["summary"]);
+    assert_eq!(summary["final_hash"], expected["final_hash"]);
+    assert_eq!((&summary["recoveries"], &summary["rejected_commands"]), (&expected["recoveries"], &Value::from(0)));
+    let recoveries = expected["recoveries"].as_array().unwrap();
+    assert_eq!(recoveries.len(), 2, "{recoveries:?}");
+    for (recovery, state_of_step) in recoveries.iter().zip([100, 400]) {
+        assert_eq!((&recovery["state_of_step"], &recovery["undone_commands"]), (&state_of_step.into(), &1.into()));
+        assert!(recovery["step"].as_u64().unwrap() > state_of_step && recovery["reason"].is_string(), "{recovery:?}");
+    }
+}

@@ -582,3 +582,36 @@ async fn who_watches_the_health_is_told_first_and_not_waited_for() {
     let ended = tokio::task::spawn_blocking(move || server.child.wait().unwrap());
     assert!(tokio::time::timeout(PATIENCE, ended).await.unwrap().unwrap().success());
 }
+
+/// Springs far too stiff for the substeps that the scene gives: no error can be expected.
+#[tokio::test]
+async fn an_expected_error_is_always_finite() {
+    // Where a number of substeps is given, no rehearsal is needed; without one nothing is known.
+    let folder = tempfile::tempdir().unwrap();
+    let config = folder.path().join("palpate.toml");
+    std::fs::write(&config, "[limits]\nrehearsal_work = 1\n").unwrap();
+    let server = Server::start(&["--config", config.to_str().unwrap()]);
+    let mut unknown = paper();
+    unknown.springs.as_mut().unwrap().stiffness_n_per_m = Some(1e9);
+    unknown.springs.as_mut().unwrap().shear_stiffness_n_per_m = None;
+    unknown.stepping.as_mut().unwrap().substeps = Some(1);
+    let created = server.create(Source::Scene(unknown), true).await.unwrap();
+    let session_id = created.session_id.clone();
+    let mut sessions = server.sessions().await;
+    let request = pb::GetSessionRequest { session_id: session_id.clone() };
+    let got = sessions.get_session(request).await.unwrap().into_inner().session.unwrap();
+    let listed = sessions.list_sessions(pb::ListSessionsRequest {}).await.unwrap().into_inner().sessions.remove(0);
+    let stiffer = pb::UpdateTissueRequest { session_id, stiffness_n_per_m: Some(2e9), ..Default::default() };
+    let updated = sessions.update_tissue(stiffer).await.unwrap().into_inner().session.unwrap();
+    for session in [&created, &got, &listed, &updated] {
+        assert_eq!(session.expected_error, 1.0);
+        assert!(
+            !session.warnings.is_empty() && session.warnings.iter().all(|text| !text.contains("inf")),
+            "{session:?}"
+        );
+    }
+    // Of a scene whose tolerance is kept it is what is expected.
+    let server = Server::start(&[]);
+    let known = server.create(Source::SceneName("paper".into()), true).await.unwrap();
+    assert!(known.expected_error > 0.0 && known.expected_error < 1e-2, "{}", known.expected_error);
+}

@@ -176,7 +176,7 @@ fn course(seed: u64) -> Course {
         intake.take_due(step, now, &mut due);
         session.advance(&mut due, |_| {});
         intake.rest(session.step_count(), session.step_count(), &schedule);
-        assert_eq!(session.hold_reason(), None, "seed {seed}, step {step}");
+        assert_eq!(session.fault(), None, "seed {seed}, step {step}");
 
         // What came is accounted for, and no queue is above its bound.
         let counts = intake.counts();

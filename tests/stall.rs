@@ -263,6 +263,8 @@ fn no_program_waits_for_who_says_nothing() {
         "replay vertical-60 --quiet --server",
         "load --sessions 1 --seconds 1 --server",
         "bridge --seconds 1 --server",
+        "link --scene paper --seconds 1 --server",
+        "admin callers --server",
         "top --once",
         "health",
     ];

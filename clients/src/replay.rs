@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use hdrhistogram::Histogram;
 use indicatif::{ProgressBar, ProgressStyle};
 use palpate::limits::Limits;
-use palpate::refusal::Refusal;
+use palpate::refusal::{Reason, Refusal};
 use palpate::scene::Scene;
 use palpate::scene::record::{Line, Network, Percentiles, Record, Run, Summary, write_line};
 use palpate::scene::script::Script;
@@ -194,6 +194,8 @@ struct Measured {
     computed: u64,
     late: u64,
     rejected: u64,
+    /// How often the tissue went back to an earlier state.
+    recovery_count: u64,
     largest_displacement_m: f64,
     peak_reaction_n: f64,
     /// Step and server time, ns, of the first sample and of the last.
@@ -216,6 +218,7 @@ impl Measured {
             computed: 0,
             late: 0,
             rejected: 0,
+            recovery_count: 0,
             largest_displacement_m: 0.0,
             peak_reaction_n: 0.0,
             first: None,
@@ -234,6 +237,7 @@ impl Measured {
         self.awake_points = u64::from(sample.awake_points);
         self.computed += self.awake_points * awake_steps;
         self.late = sample.late_commands;
+        self.recovery_count = sample.recovery_count;
         self.last = (sample.step, sample.server_time_ns);
         self.first.get_or_insert(self.last);
         for (index, tool) in sample.tools.iter().enumerate() {
@@ -483,7 +487,8 @@ async fn play(
                     commands_until = streamer.heartbeat_answered();
                 }
                 Some(Heard::Rejection(rejection)) => {
-                    measured.rejected += 1;
+                    // The samples report recoveries.
+                    measured.rejected += u64::from(rejection.reason != Reason::Recovered.as_str());
                     progress.suspend(|| crate::say!("palpate-client: warning: {}", rejection_text(&rejection)));
                 }
                 Some(Heard::Opened(_)) | None => {}
@@ -513,6 +518,12 @@ async fn play(
         }
     }
     progress.finish_and_clear();
+    let mut recoveries = Vec::new();
+    if seen.recovery_count > 0 {
+        let asked = pb::GetSessionRequest { session_id: session_id.clone() };
+        let session = sessions.get_session(asked).await.map_err(failed)?.into_inner().session.unwrap_or_default();
+        recoveries = session.recoveries.into_iter().map(wire::sample::from_recovery).collect();
+    }
 
     let points = scene.sheet.points[0] * scene.sheet.points[1];
     let network = Network {
@@ -526,6 +537,7 @@ async fn play(
     let summary = Summary {
         audited_error: None,
         corrections: Vec::new(),
+        recoveries,
         steps: script.steps,
         substeps,
         points,
@@ -549,6 +561,9 @@ async fn play(
     if measured.rejected > 0 {
         let why = "commands were rejected, so the run differs from the script";
         return Err(Failure::Failed(format!("{} {why}", measured.rejected)));
+    }
+    if let Some(fault) = summary.fault() {
+        return Err(Failure::Failed(fault));
     }
     Ok(())
 }

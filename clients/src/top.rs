@@ -135,6 +135,7 @@ fn as_json(rows: &[Row]) -> Value {
             "points": session.points, "awake_points": session.awake_points,
             "overrun_count": session.overrun_count, "overruns_per_s": overruns_per_s,
             "late_commands": session.late_commands, "guard_events": session.guard_events,
+            "recoveries": session.recovery_count,
             "audit": session.audit.as_ref().map(audit), "streams": session.streams, "held_tools": holders.collect::<Vec<_>>(), "hold_reason": session.hold_reason,
         })
     };

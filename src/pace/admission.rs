@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 use std::sync::Mutex;
-use std::sync::atomic::AtomicU64;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use super::auditor::Audited;
 use super::clock::{Dilation, now_ns};
@@ -17,17 +17,24 @@ use crate::refusal::{Reason, Refusal, Result, number};
 use crate::scene::{Change, Scene};
 use crate::session::command::Intake;
 use crate::session::schedule::Schedule;
-use crate::sheet::Model;
+use crate::sheet::{Model, choice};
 
 impl Pacer {
-    /// Makes a session for `owner`.
-    pub fn create(&self, scene: &Scene, paused: bool, idle_timeout_s: f64, owner: &Account) -> Result<Arc<Live>> {
+    /// Makes a session for `owner`, unless `stop` is set before it is there.
+    pub fn create(
+        &self,
+        scene: &Scene,
+        paused: bool,
+        idle_timeout_s: f64,
+        owner: &Account,
+        stop: &AtomicBool,
+    ) -> Result<Arc<Live>> {
         // Before anything is done for it.
         let slot = owner.take(Resource::Sessions, 1, "")?;
         let most_hz = self.limits.session_rate_hz;
         number("stepping.rate_hz", scene.stepping.rate_hz, &format!("at most {most_hz}"), |v| v <= most_hz)?;
         check_asked(scene, &self.limits)?;
-        let model = self.compile(scene)?;
+        let model = self.compile(scene, stop)?;
         let id = random_id()?;
         check_work(&model, &self.limits)?;
         let memory = owner.take(Resource::Memory(Purpose::Session), model.session_bytes(), "sheet.points")?;
@@ -48,6 +55,8 @@ impl Pacer {
             late_commands: 0,
             hold_reason: None,
             guard_events: 0,
+            recovery_count: 0,
+            recoveries: Vec::new(),
             awake_points: 0,
             path_counts: [0; 3],
             lapsed_leases: 0,
@@ -76,6 +85,9 @@ impl Pacer {
         });
         // Laid out before the lock is taken, on which all calls wait.
         let running = Box::new(Running::new(live.clone(), !paused));
+        if stop.load(Ordering::Relaxed) {
+            return Err(choice::given_up());
+        }
         let mut sessions = lock(&self.sessions);
         let points: usize = sessions.values().map(|live| live.model.len()).sum();
         if points + live.model.len() > self.limits.points_in_all {
@@ -89,10 +101,10 @@ impl Pacer {
     }
 
     /// What never changes is one in memory for all sessions of a scene, and compiled once.
-    fn compile(&self, scene: &Scene) -> Result<Arc<Model>> {
+    fn compile(&self, scene: &Scene, stop: &AtomicBool) -> Result<Arc<Model>> {
         let known =
             lock(&self.sessions).values().find(|live| live.model.scene == *scene).map(|live| live.model.clone());
-        known.map_or_else(|| Model::compile(scene, &self.limits), Ok)
+        known.map_or_else(|| Model::compile_until(scene, &self.limits, stop), Ok)
     }
 
     /// The thread with the most time to spare for a further session, and what that will take.
@@ -115,8 +127,14 @@ impl Pacer {
     }
 
     /// Another tissue for a session ([`Live::change`]), unless its steps would make others late.
-    pub fn change_tissue(&self, live: &Live, change: &Change, at_step: Option<u64>) -> Result<(u64, Arc<Model>)> {
-        live.change(change, at_step, |needed| self.check_share(self.taken_by_others(live), needed))
+    pub fn change_tissue(
+        &self,
+        live: &Live,
+        change: &Change,
+        at_step: Option<u64>,
+        stop: &AtomicBool,
+    ) -> Result<(u64, Arc<Model>)> {
+        live.change(change, at_step, |needed| self.check_share(self.taken_by_others(live), needed), stop)
     }
 
     /// Of the thread of a session, what the others that are awake take.

@@ -19,6 +19,7 @@ use super::inbox::Request;
 use super::tally::Count;
 use super::{Live, check_work};
 use crate::lock::lock;
+use crate::refusal::{Refusal, Result};
 use crate::scene::Named;
 use crate::scene::record::{AuditedError, Correction};
 use crate::sheet::Model;
@@ -51,6 +52,8 @@ pub struct Audited {
     pub corrections: u64,
     /// The newest of these.
     pub correction: Option<Correction>,
+    /// Why the newest correction that was needed could not be made.
+    pub refused_correction: Option<Refusal>,
     extent: Extent,
     warned_ns: Option<u64>,
 }
@@ -157,10 +160,13 @@ fn audit(live: &Live, duty: &mut Duty<'_>, tally: &AuditTally) {
     let audit = opening.close(look, inputs);
     let extent = lock(&live.audited).extent;
     let Some(finding) = audit.work(FINER, extent, &mut || duty.rest()) else { return };
-    tell(live, &finding, tally);
-    if finding.origin.is_some() && model.scene.stepping.correct {
-        correct(live, &model, &finding, tally);
+    note(live, &finding, tally);
+    let Some(origin) = finding.origin else { return };
+    if model.scene.stepping.correct {
+        let corrected = correct(live, &model, &finding);
+        note_correction(live, corrected, tally);
     }
+    warn(live, &finding, origin);
 }
 
 fn next(told: &Receiver<Mark>, within: Duration) -> Option<Mark> {
@@ -175,7 +181,7 @@ fn longest(model: &Model) -> Duration {
     Duration::from_secs_f64((PATIENCE * steps / model.scene.stepping.rate_hz + 1.0).min(600.0))
 }
 
-fn tell(live: &Live, finding: &Finding, tally: &AuditTally) {
+fn note(live: &Live, finding: &Finding, tally: &AuditTally) {
     let Finding { step, error, origin, largest, .. } = *finding;
     let is_above = origin.is_some();
     tally.windows.add(1);
@@ -187,33 +193,44 @@ fn tell(live: &Live, finding: &Finding, tally: &AuditTally) {
     audited.largest = audited.largest.max(error);
     audited.extent = largest;
     audited.origin = origin.or(audited.origin);
-    let Some(origin) = origin else { return };
+}
+
+/// Logs an error above the tolerance, and why no correction was made of it if that was asked for. Not too often.
+fn warn(live: &Live, finding: &Finding, origin: Origin) {
+    let Finding { step, error, .. } = *finding;
     let now = now_ns();
+    let mut audited = lock(&live.audited);
     if audited.warned_ns.is_some_and(|warned| now < warned + WARN_EVERY_NS) {
         return;
     }
     audited.warned_ns = Some(now);
-    let above = audited.above;
+    let (above, refused) = (audited.above, audited.refused_correction.clone());
     drop(audited);
     let (asked, from) = (live.model.scene.stepping.tolerance, origin.describe());
+    let refused = refused.map(|refusal| format!("; a correction was refused: {refusal}")).unwrap_or_default();
     tracing::warn!(
         session = %live.id, step, displacement = error.displacement, force = error.force, asked, windows = above,
-        "audited error above the tolerance: most of it comes from {from}"
+        "audited error above the tolerance: most of it comes from {from}{refused}"
     );
 }
 
 /// Steps the tissue more accurately from the next step on. Nothing happens if meanwhile it is another.
-fn correct(live: &Live, audited: &Arc<Model>, finding: &Finding, tally: &AuditTally) {
+///
+/// # Errors
+/// Refuses a correction whose steps would take longer than a scene's may.
+fn correct(live: &Live, audited: &Arc<Model>, finding: &Finding) -> Result<Option<Correction>> {
     let base = live.at_intake(|intake, _| intake.changed_to());
     if !Arc::ptr_eq(base.as_ref().unwrap_or(&live.model), audited) {
-        return;
+        return Ok(None);
     }
-    let Some(correction) = audited.correction(finding, finding.step, &live.limits) else { return };
-    let corrected = audited.corrected(&correction, &live.limits).and_then(|model| {
-        check_work(&model, &live.limits)?;
-        let step = live.at_intake(|intake, now| intake.change(base.as_ref(), &model, None, now))?;
-        Ok(step.map(|step| Correction { step, ..correction }))
-    });
+    let Some(correction) = audited.correction(finding, finding.step, &live.limits) else { return Ok(None) };
+    let model = audited.corrected(&correction, &live.limits)?;
+    check_work(&model, &live.limits)?;
+    let step = live.at_intake(|intake, now| intake.change(base.as_ref(), &model, None, now))?;
+    Ok(step.map(|step| Correction { step, ..correction }))
+}
+
+fn note_correction(live: &Live, corrected: Result<Option<Correction>>, tally: &AuditTally) {
     match corrected {
         Ok(Some(told)) => {
             tally.corrections.add(1);
@@ -223,9 +240,9 @@ fn correct(live: &Live, audited: &Arc<Model>, finding: &Finding, tally: &AuditTa
             );
             let mut audited = lock(&live.audited);
             audited.corrections += 1;
-            audited.correction = Some(told);
+            (audited.correction, audited.refused_correction) = (Some(told), None);
         }
         Ok(None) => {}
-        Err(refusal) => tracing::debug!(session = %live.id, %refusal, "no correction"),
+        Err(refusal) => lock(&live.audited).refused_correction = Some(refusal),
     }
 }

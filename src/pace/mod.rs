@@ -27,7 +27,7 @@ use crate::limits::Limits;
 use crate::lock::lock;
 use crate::refusal::{Reason, Refusal, Result};
 use crate::scene::Change;
-use crate::scene::record::{Point, Record};
+use crate::scene::record::{Point, Record, Recovery};
 use crate::session::Sample;
 use crate::session::command::{Command, Intake, LeaseId};
 use crate::session::local::Refinement;
@@ -109,6 +109,10 @@ pub struct Status {
     pub hold_reason: Option<String>,
     /// How often the guard went back to a checkpoint.
     pub guard_events: u64,
+    /// How often the tissue was taken back to an earlier state.
+    pub recovery_count: u64,
+    /// The newest of these, by ascending step.
+    pub recoveries: Vec<Recovery>,
     /// Points that the last step computed.
     pub awake_points: usize,
     /// As [`crate::session::Session::path_counts`].
@@ -124,6 +128,7 @@ impl Status {
     fn forget_hold(&mut self) {
         (self.hold_reason, self.state) = (None, State::Paused);
         (self.late_commands, self.guard_events, self.path_counts) = (0, 0, [0; 3]);
+        (self.recovery_count, self.recoveries) = (0, Vec::new());
     }
 }
 
@@ -231,16 +236,19 @@ impl Live {
     /// Changes the tissue from the beginning of step `at_step` on, or of the next. Tells the step, and the tissue from then
     /// on. It is compiled here, by who asks, some milliseconds: no step waits for that.
     ///
-    /// `admit` is asked whether the thread has the time that the tissue will take of it, as a part of all.
+    /// `admit` is asked whether the thread has the time that the tissue will take of it, as a part of all. It is given up
+    /// when `stop` is set.
     pub fn change(
         &self,
         change: &Change,
         at_step: Option<u64>,
         admit: impl Fn(f64) -> Result<()>,
+        stop: &AtomicBool,
     ) -> Result<(u64, Arc<Model>)> {
         loop {
             let base = self.at_intake(|intake, _| intake.changed_to());
-            let model = base.as_ref().unwrap_or(&self.model).changed(change, &self.model.scene, &self.limits)?;
+            let now = base.as_ref().unwrap_or(&self.model);
+            let model = now.changed_until(change, &self.model.scene, &self.limits, stop)?;
             check_work(&model, &self.limits)?;
             let (before, after) = (lock(&self.status).model.plan.substeps, model.plan.substeps);
             if after > before {

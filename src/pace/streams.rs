@@ -158,6 +158,7 @@ mod tests {
     use crate::budget::Budget;
     use crate::pace::Pacer;
     use crate::scene::{PAPER, Scene};
+    use crate::sheet::choice::NEVER;
 
     #[test]
     fn who_reads_leaves_places_to_others_and_to_who_holds_tools() {
@@ -165,7 +166,7 @@ mod tests {
         let scene = Scene::parse("paper", PAPER, &[], &limits).unwrap();
         let budget = Budget::new(&limits, 1, 1);
         let pacer = Pacer::start(1, 0.0, &limits, budget.clone()).unwrap();
-        let live = pacer.create(&scene, true, 60.0, &budget.account("owner")).unwrap();
+        let live = pacer.create(&scene, true, 60.0, &budget.account("owner"), &NEVER).unwrap();
         let [greedy, other] = ["greedy", "other"].map(|name| budget.account(name));
         let open = |held, account: &Account| live.open_stream("Test", held, account);
         let mut all: Vec<_> = std::iter::from_fn(|| open(Held::Nothing, &greedy).ok()).collect();

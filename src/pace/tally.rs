@@ -70,6 +70,8 @@ pub struct Tally {
     pub lapsed_leases: Count,
     /// How often the guard went back to a checkpoint.
     pub guard_events: Count,
+    /// How often a tissue was taken back to an earlier state.
+    pub recoveries: Count,
     /// Sessions that the guard has ended.
     pub held_sessions: Count,
     /// Steps in which a tool was held to the speed limit.

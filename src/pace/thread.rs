@@ -422,6 +422,7 @@ impl Running {
         let (Running { session, taps, due, .. }, wakes) = (&mut *self, &mut desk.wakes);
         session.advance(due, |session| taps.record(session, wakes));
         self.tell_auditor();
+        self.log_recovery();
         if let Some(reason) = self.session.hold_reason() {
             tracing::warn!(session = %self.live.id, reason, "session held");
             self.running = false;
@@ -531,6 +532,8 @@ impl Running {
         tally.late_commands.add(self.session.late_commands() - before.late_commands);
         tally.lapsed_leases.add(self.lapsed_leases - before.lapsed_leases);
         tally.guard_events.add(guard_events - before.guard_events);
+        let recovery_count = self.session.recoveries().count();
+        tally.recoveries.add(recovery_count - before.recovery_count);
         tally.held_sessions.add(u64::from(is_held && before.state != State::Held));
         let path_tallies = [&tally.limited_steps, &tally.dropped_poses, &tally.stale_releases];
         for (index, count) in path_tallies.into_iter().enumerate() {
@@ -546,6 +549,9 @@ impl Running {
         status.rested_steps = self.rested_steps;
         status.overrun_count = self.overrun_count;
         status.guard_events = guard_events;
+        if status.recovery_count != recovery_count {
+            (status.recovery_count, status.recoveries) = (recovery_count, self.session.recoveries().list());
+        }
         status.awake_points = self.session.tissue().awake_points();
         status.path_counts = path_counts;
         status.lapsed_leases = self.lapsed_leases;

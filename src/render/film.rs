@@ -59,8 +59,8 @@ impl<'a> Film<'a> {
         while self.session.step_count() < step {
             run::change(&mut self.session, &mut self.changes);
             self.session.advance(&mut Vec::new(), |_| {});
-            if let Some(reason) = self.session.hold_reason() {
-                return Err(Failure::Held(reason.to_owned()));
+            if let Some(reason) = self.session.fault() {
+                return Err(Failure::Held(reason));
             }
         }
         Ok(())

@@ -92,9 +92,22 @@ pub struct Summary {
     /// Corrections of an audit, by ascending step.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub corrections: Vec<Correction>,
+    /// The newest recoveries, by ascending step.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub recoveries: Vec<Recovery>,
     /// The additional measurements of a replay.
     #[serde(flatten, skip_serializing_if = "Option::is_none")]
     pub network: Option<Network>,
+}
+
+impl Summary {
+    /// Why the records are not those of the script, if they are not.
+    pub fn fault(&self) -> Option<String> {
+        let Recovery { step, reason, .. } = self.recoveries.first()?;
+        Some(format!(
+            "the guard released all tools after step {step}, because {reason}: from there on this is not the script"
+        ))
+    }
 }
 
 /// A measured error. Each part is relative to the largest component of its kind.
@@ -138,6 +151,22 @@ pub struct Correction {
     pub precision: Precision,
     /// The error that sleeping regions may add, from then on.
     pub sleep_tolerance: f64,
+}
+
+/// A recovery: the guard found the tissue's motion wrong, and shorter substeps did not help. The tissue went back to the
+/// last state that the guard had believed, and continued without tools.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Recovery {
+    /// Steps done when it was found. Time continues from there.
+    pub step: u64,
+    /// The step whose state the tissue went back to.
+    pub state_of_step: u64,
+    /// Whether that state had passed no check of the guard, and the tissue continued at rest instead.
+    pub at_rest: bool,
+    /// Commands whose effect was lost: those that had taken effect since that state.
+    pub undone_commands: u64,
+    /// What the guard found.
+    pub reason: String,
 }
 
 fn name<S: serde::Serializer>(value: &impl Named, serializer: S) -> Result<S::Ok, S::Error> {

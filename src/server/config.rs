@@ -152,6 +152,7 @@ impl Config {
         number("lease_s", self.lease_s, &format!("above 0 and at most limits.lease_s, {most_s}"), within(most_s))?;
         number("limits.lease_s", most_s, "above 0 and at most a day", within(day_s))?;
         for (field, value) in [
+            ("limits.browser_lease_s", self.limits.browser_lease_s),
             ("limits.handshake_s", self.limits.handshake_s),
             ("limits.open_s", self.limits.open_s),
             ("limits.keepalive_s", self.limits.keepalive_s),

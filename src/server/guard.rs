@@ -85,7 +85,8 @@ impl GuardLayer {
                 self.check_origin(request)?;
                 let authorization = request.headers().get(header::AUTHORIZATION).cloned();
                 let version = self.credentials.version();
-                let shown = Shown { authorization, peer: peer.cloned(), role };
+                let certificate = peer.and_then(|peer| peer.certificate.clone());
+                let shown = Shown { authorization, certificate, role };
                 let credentials = self.credentials.get();
                 let caller = shown.check(&credentials)?;
                 self.traffic.called(path);
@@ -172,7 +173,7 @@ where
                 if let Some(peer) = peer {
                     peer.used_by(account.number());
                 }
-                let gate = peer.map(|peer| peer.gate.clone());
+                let (gate, from) = (peer.map(|peer| peer.gate.clone()), peer.cloned());
                 let limit = match request.uri().path() {
                     TOUCH => TimeLimit::None,
                     path if path.starts_with(REFLECTION) => TimeLimit::EachMessage(self.layer.message_timeout),
@@ -181,7 +182,10 @@ where
                 let price = Price::of(request.uri().path(), &account);
                 let visitor = Visitor::new(account, &request);
                 request.extensions_mut().insert(visitor);
-                let call = shown.map(|(shown, version)| self.layer.calls.begin(shown, version));
+                let call = shown.map(|(shown, version)| self.layer.calls.begin(shown, from, version));
+                if let Some(call) = &call {
+                    request.extensions_mut().insert(call.tenure());
+                }
                 let request = request.map(|body| RequestBody::wrap(body, call.clone(), gate, limit));
                 // The span adds path and client to every line that the call logs.
                 let span = info_span!("call", path = request.uri().path(), client = &*caller.name);

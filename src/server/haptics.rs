@@ -16,6 +16,8 @@ use super::House;
 use super::connections::Peer;
 use super::cut::until_cut;
 use super::rate::Bucket;
+use super::recovered::Notices;
+use super::revocation::Tenure;
 use super::visitor::Visitor;
 use crate::budget::{Account, Resource, Taken};
 use crate::haptics::Law;
@@ -39,6 +41,7 @@ type Out<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 struct Opened {
     answer: pb::TouchOpened,
     samples: Reader<PacedSample>,
+    notices: Notices,
     guard: StreamGuard,
 }
 
@@ -79,10 +82,6 @@ impl Drop for Hold {
         }
     }
 }
-
-/// The end of a connection that may be shared, or cut without a word, says nothing of who holds a tool: a lease taken over
-/// one lasts no longer than this without a command or a renewal, s.
-const VANISHED_S: f64 = 10.0;
 
 /// So many tools for `account`.
 fn seats(account: &Account, tools: usize) -> Result<Vec<Taken>, Refusal> {
@@ -153,7 +152,8 @@ impl Haptics {
         };
         let samples = live.samples(sampling);
         info!(session = %live.id, tools = ?open.tools, holder = ?open.holder, "haptic stream opened");
-        Ok((Opened { answer, samples, guard }, hold))
+        let notices = Notices::new(open.tools.clone(), step);
+        Ok((Opened { answer, samples, notices, guard }, hold))
     }
 
     /// Reads what the client says until it ends.
@@ -313,15 +313,24 @@ impl Early {
 struct Outlet {
     events: Reader<Event>,
     samples: Reader<PacedSample>,
+    notices: Notices,
+    /// What goes before the next sample, and that sample.
+    ready: VecDeque<pb::touch_response::Message>,
+    /// Answers that the client was too slow for.
+    dropped_answers: u64,
     _guard: StreamGuard,
 }
 
 impl Outlet {
     fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<Result<pb::touch_response::Message, Status>>> {
         use pb::touch_response::Message;
+        if let Some(message) = self.ready.pop_front() {
+            return Poll::Ready(Some(Ok(message)));
+        }
         if let Poll::Ready(event) = self.events.poll_pop(context) {
             return Poll::Ready(match event {
                 Ok((Event::Rejected(rejection), dropped_answers)) => {
+                    self.dropped_answers = dropped_answers;
                     Some(Ok(Message::Rejection(pb::Rejection { dropped_answers, ..rejection })))
                 }
                 Ok((Event::Renewed(client_time_ns, arrival_ns), _)) => {
@@ -333,10 +342,15 @@ impl Outlet {
                 Err(refusal) => Some(Err(refusal.into())),
             });
         }
-        Poll::Ready(Some(match ready!(self.samples.poll_pop(context)) {
-            Ok((sample, dropped)) => Ok(Message::Sample(wire::sample::sample(&sample, dropped, now_ns()))),
-            Err(refusal) => Err(refusal.into()),
-        }))
+        let (paced, dropped) = match ready!(self.samples.poll_pop(context)) {
+            Ok(popped) => popped,
+            Err(refusal) => return Poll::Ready(Some(Err(refusal.into()))),
+        };
+        let dropped_answers = self.dropped_answers;
+        let told = |rejection| Message::Rejection(pb::Rejection { dropped_answers, ..rejection });
+        self.ready.extend(self.notices.of(&paced.sample).into_iter().map(told));
+        self.ready.push_back(Message::Sample(wire::sample::sample(&paced, dropped, now_ns())));
+        Poll::Ready(self.ready.pop_front().map(Ok))
     }
 }
 
@@ -361,8 +375,9 @@ impl Stream for Output {
         let stage = &mut self.get_mut().stage;
         let message = match stage {
             Stage::Opening(opening, events) => match (ready!(Pin::new(opening).poll(context)), events.take()) {
-                (Ok(Ok(Opened { answer, samples, guard })), Some(events)) => {
-                    *stage = Stage::Open(Outlet { events, samples, _guard: guard });
+                (Ok(Ok(Opened { answer, samples, notices, guard })), Some(events)) => {
+                    let (ready, dropped_answers) = (VecDeque::new(), 0);
+                    *stage = Stage::Open(Outlet { events, samples, notices, ready, dropped_answers, _guard: guard });
                     Some(Ok(Message::Opened(answer)))
                 }
                 (Ok(Err(status)), _) => Some(Err(status)),
@@ -404,12 +419,13 @@ impl HapticService for Haptics {
         request: Request<pb::AcquireToolRequest>,
     ) -> Result<Response<pb::AcquireToolResponse>, Status> {
         let Visitor { account, may_vanish } = Visitor::of(request.extensions());
-        let peer = request.extensions().get::<Peer>().cloned();
+        let (peer, tenure) =
+            (request.extensions().get::<Peer>().cloned(), request.extensions().get::<Tenure>().cloned());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
         let mut lease_s = request.lease_s.unwrap_or(self.0.config.lease_s);
-        if may_vanish && !request.outlives_connection && lease_s > VANISHED_S {
-            lease_s = VANISHED_S;
+        if may_vanish && !request.outlives_connection {
+            lease_s = lease_s.min(self.0.config.limits.browser_lease_s);
         }
         let lease = random_bits()?;
         let seats = seats(&account, 1)?;
@@ -419,8 +435,9 @@ impl HapticService for Haptics {
             Ok::<_, Refusal>(())
         })?;
         if let Some(peer) = peer.filter(|_| !may_vanish && !request.outlives_connection) {
-            peer.leases.add(&live, lease);
+            peer.leases.add(&live, lease, None);
         }
+        tenure.map_or(Ok(()), |tenure| tenure.bind(&live, lease))?;
         info!(session = %live.id, tool = request.tool, holder = ?request.holder, "tool acquired");
         Ok(Response::new(pb::AcquireToolResponse { lease_id: format!("{lease:032x}"), lease_s }))
     }

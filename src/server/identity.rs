@@ -9,7 +9,6 @@ use ring::digest::{SHA256, digest};
 use serde::Deserialize;
 use subtle::ConstantTimeEq;
 
-use super::connections::Peer;
 use crate::pace::random_bits;
 use crate::refusal::{Reason, Refusal, Result, label};
 
@@ -257,8 +256,9 @@ impl Credentials {
         Ok(known)
     }
 
-    /// Authenticates a caller by the header `authorization` if there is one, otherwise by the client certificate.
-    pub(super) fn caller(&self, authorization: Option<&HeaderValue>, peer: Option<&Peer>) -> Result<Caller> {
+    /// Authenticates a caller by the header `authorization` if there is one, otherwise by the names of the client
+    /// certificate.
+    pub(super) fn caller(&self, authorization: Option<&HeaderValue>, certificate: Option<&[String]>) -> Result<Caller> {
         if self.open {
             return Ok(Caller::unrestricted());
         }
@@ -277,8 +277,7 @@ impl Credentials {
                 .fold(None, |found, (known, caller)| if bool::from(known.ct_eq(&hash)) { Some(caller) } else { found });
             return found.cloned().ok_or_else(|| unknown("the server does not know this token"));
         }
-        let names = peer.and_then(|peer| peer.certificate.as_deref());
-        match names {
+        match certificate {
             Some(names) if self.any_certificate => {
                 let name = names.first().map_or("unnamed certificate", String::as_str);
                 Ok(Caller { name: name.into(), ..Caller::unrestricted() })

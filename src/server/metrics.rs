@@ -201,7 +201,7 @@ impl EncodeMetric for Histogram {
 }
 
 /// Counts of the stepping threads: name, what it is, and where.
-type Counts = [(&'static str, &'static str, fn(&Tally) -> &Count); 9];
+type Counts = [(&'static str, &'static str, fn(&Tally) -> &Count); 10];
 
 const COUNTS: Counts = [
     ("rested_steps", "Steps that were passed over at rest", |tally| &tally.rested_steps),
@@ -209,6 +209,7 @@ const COUNTS: Counts = [
     ("late_commands", "Commands that came too late for their step", |tally| &tally.late_commands),
     ("lapsed_leases", "Leases of tools that ran out", |tally| &tally.lapsed_leases),
     ("guard_events", "How often the guard went back to a checkpoint", |tally| &tally.guard_events),
+    ("recoveries", "How often a tissue was taken back to an earlier state", |tally| &tally.recoveries),
     ("held_sessions", "Sessions that the guard has ended", |tally| &tally.held_sessions),
     ("limited_steps", "Steps in which a tool was held to the speed limit", |tally| &tally.limited_steps),
     ("dropped_poses", "Poses that were not newer, or passed over as a backlog", |tally| &tally.dropped_poses),

@@ -16,6 +16,7 @@ mod page;
 mod price;
 mod protection;
 mod rate;
+mod recovered;
 mod reload;
 mod request;
 mod revocation;

@@ -18,9 +18,12 @@ use tracing::{info, warn};
 
 use super::connections::Peer;
 use super::identity::{Caller, Credentials, Role};
+use super::leases::Leases;
 use super::reload::Reloaded;
 use crate::lock::lock;
+use crate::pace::Live;
 use crate::refusal::{Refusal, Result};
+use crate::session::command::LeaseId;
 
 /// So long a client may take to read that its call is over; then its connection is closed.
 const GRACE: Duration = Duration::from_secs(1);
@@ -29,14 +32,15 @@ const GRACE: Duration = Duration::from_secs(1);
 #[derive(Clone)]
 pub(super) struct Shown {
     pub(super) authorization: Option<HeaderValue>,
-    pub(super) peer: Option<Peer>,
+    /// The names of the certificate.
+    pub(super) certificate: Option<Arc<[String]>>,
     pub(super) role: Role,
 }
 
 impl Shown {
     /// Whether that is enough.
     pub(super) fn check(&self, credentials: &Credentials) -> Result<Caller> {
-        let caller = credentials.caller(self.authorization.as_ref(), self.peer.as_ref())?;
+        let caller = credentials.caller(self.authorization.as_ref(), self.certificate.as_deref())?;
         caller.needs(self.role)?;
         Ok(caller)
     }
@@ -47,20 +51,28 @@ pub(super) struct Calls {
     credentials: Arc<Reloaded<Credentials>>,
     under_way: Mutex<HashMap<u64, Weak<Call>>>,
     begun: AtomicU64,
+    /// What calls that are over have left.
+    leases: Leases,
 }
 
 impl Calls {
     pub(super) fn new(credentials: Arc<Reloaded<Credentials>>) -> Arc<Self> {
-        Arc::new(Calls { credentials, under_way: Mutex::default(), begun: AtomicU64::new(0) })
+        Arc::new(Calls {
+            credentials,
+            under_way: Mutex::default(),
+            begun: AtomicU64::new(0),
+            leases: Leases::default(),
+        })
     }
 
-    /// A call by who has shown that, which was enough by the file of `version`.
-    pub(super) fn begin(self: &Arc<Self>, shown: Shown, version: u64) -> Arc<Call> {
+    /// A call from `peer` by who has shown that, which was enough by the file of `version`.
+    pub(super) fn begin(self: &Arc<Self>, shown: Shown, peer: Option<Peer>, version: u64) -> Arc<Call> {
         let number = self.begun.fetch_add(1, Ordering::Relaxed);
         let call = Arc::new(Call {
             calls: self.clone(),
             number,
             shown,
+            peer,
             version: AtomicU64::new(version),
             state: Mutex::default(),
             inward: AtomicWaker::new(),
@@ -74,6 +86,11 @@ impl Calls {
     pub(super) async fn watch(self: Arc<Self>) {
         let mut changes = self.credentials.changes();
         while changes.changed().await.is_ok() {
+            let credentials = self.credentials.get();
+            let released = self.leases.end(|shown| shown.is_some_and(|shown| shown.check(&credentials).is_err()));
+            if released > 0 {
+                info!(released, "tools released: who held them may not any more");
+            }
             let calls: Vec<_> = lock(&self.under_way).values().filter_map(Weak::upgrade).collect();
             let ended: Vec<_> = calls.iter().filter(|call| call.refused().is_some()).map(Arc::downgrade).collect();
             drop(calls);
@@ -83,7 +100,7 @@ impl Calls {
             tokio::spawn(async move {
                 tokio::time::sleep(GRACE).await;
                 for call in ended.iter().filter_map(Weak::upgrade) {
-                    if let Some(peer) = &call.shown.peer {
+                    if let Some(peer) = &call.peer {
                         warn!(client = %peer.address, "connection closed: it does not read that its call is over");
                         peer.gate.close();
                     }
@@ -93,11 +110,33 @@ impl Calls {
     }
 }
 
+/// Who made a call, for what outlasts it.
+#[derive(Clone)]
+pub(super) struct Tenure {
+    calls: Arc<Calls>,
+    shown: Shown,
+}
+
+impl Tenure {
+    /// Has a lease end when who made the call may not make it any more.
+    ///
+    /// # Errors
+    /// Refuses, and ends the lease, if that is so already.
+    pub(super) fn bind(&self, live: &Arc<Live>, lease: LeaseId) -> Result<()> {
+        self.calls.leases.add(live, lease, Some(self.shown.clone()));
+        // The file may have changed since the call was let in. A change from now on finds the lease.
+        self.shown.check(&self.calls.credentials.get()).map(|_| ()).inspect_err(|_| {
+            let _ = live.at_intake(|intake, _| intake.release(lease));
+        })
+    }
+}
+
 /// A call, until both its directions are over.
 pub(super) struct Call {
     calls: Arc<Calls>,
     number: u64,
     shown: Shown,
+    peer: Option<Peer>,
     /// Of the file by which it was looked at last.
     version: AtomicU64,
     state: Mutex<State>,
@@ -112,6 +151,11 @@ struct State {
 }
 
 impl Call {
+    /// Who made it.
+    pub(super) fn tenure(&self) -> Tenure {
+        Tenure { calls: self.calls.clone(), shown: self.shown.clone() }
+    }
+
     /// Why the caller may not go on, if so. Then what the call holds (a tool, perhaps) is given back, and both directions
     /// are told.
     fn refused(&self) -> Option<Refusal> {
@@ -122,7 +166,7 @@ impl Call {
         {
             let mut state = lock(&self.state);
             if state.refusal.is_none() {
-                info!(client = ?self.shown.peer.as_ref().map(|peer| peer.address), "call ended: {refusal}");
+                info!(client = ?self.peer.as_ref().map(|peer| peer.address), "call ended: {refusal}");
             }
             state.refusal.get_or_insert(refusal);
             let answer = state.answer.take();

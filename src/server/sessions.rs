@@ -58,7 +58,8 @@ impl SessionService for Sessions {
         // A large sheet takes a while to compile.
         let pacer = self.0.pacer.clone();
         let payer = account.clone();
-        let create = move |_: &CancelFlag| pacer.create(&scene, request.paused, idle_timeout_s, &payer);
+        let create =
+            move |cancel: &CancelFlag| pacer.create(&scene, request.paused, idle_timeout_s, &payer, cancel.flag());
         let live = self.0.workshop.work(&account, create).await??;
         info!(session = %live.id, scene = %live.model.scene.name, points = live.model.len(), "session created");
         for warning in &live.model.warnings {
@@ -112,7 +113,8 @@ impl SessionService for Sessions {
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
         let (change, to_change, pacer) = (wire::scene::from_change(&request), live.clone(), self.0.pacer.clone());
-        let change = move |_: &CancelFlag| pacer.change_tissue(&to_change, &change, request.at_step);
+        let change =
+            move |cancel: &CancelFlag| pacer.change_tissue(&to_change, &change, request.at_step, cancel.flag());
         let (step, model) = self.0.workshop.work(&account, change).await??;
         info!(
             session = %live.id,

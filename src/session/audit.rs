@@ -53,9 +53,9 @@ impl Twin {
         });
     }
 
-    /// The reason why it was stopped, if it was.
-    pub fn hold_reason(&self) -> Option<String> {
-        self.session.hold_reason().map(|reason| format!("the audit's twin: {reason}"))
+    /// Why it can't be compared with the other session any more, if it can't.
+    pub fn fault(&self) -> Option<String> {
+        self.session.fault().map(|reason| format!("the audit's twin: {reason}"))
     }
 
     /// Compares with the next record of the other session.

@@ -62,7 +62,7 @@ fn time(model: &Arc<Model>, clock_s: &dyn Fn() -> f64) -> Option<[f64; 2]> {
             session.advance(&mut Vec::new(), |_| {});
         }
         let each_s = (clock_s() - begun_s) / steps as f64;
-        session.hold_reason().is_none().then_some(each_s)
+        session.fault().is_none().then_some(each_s)
     };
     let first_s = window(1)?.max(window(2)?);
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]

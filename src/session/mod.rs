@@ -5,6 +5,7 @@ pub mod audit;
 pub mod check;
 pub mod command;
 pub mod local;
+pub mod recovery;
 pub mod run;
 pub mod sampling;
 pub mod schedule;
@@ -22,6 +23,7 @@ use crate::scene::tip::Tip;
 use crate::sheet::audit::{Inputs, Mark};
 use crate::sheet::{self, Energy, Feel, Grasp, Model, PointState, Push, Tissue};
 use command::Due;
+use recovery::{Recovered, Recoveries};
 
 /// The sample of one tool at the end of a step.
 #[derive(Debug, Clone, PartialEq)]
@@ -46,7 +48,7 @@ pub struct ToolSample {
     pub stale: bool,
     /// Whether the acknowledged command came too late for its step.
     pub late: bool,
-    /// Whether the tool's action was ended by its time to live, with its lease, or for lack of poses.
+    /// Whether the tool's action was ended by its time to live, with its lease, for lack of poses, or by a recovery.
     pub expired: bool,
 }
 
@@ -78,6 +80,10 @@ pub struct Sample {
     pub late_commands: u64,
     /// Whether the guard has ended the session.
     pub held: bool,
+    /// How often the tissue was taken back to an earlier state ([`recovery`]).
+    pub recoveries: u64,
+    /// The newest of these, with the tools that it released.
+    pub recovered: Option<Arc<Recovered>>,
     /// By ascending number of the tool.
     pub tools: Vec<ToolSample>,
 }
@@ -109,6 +115,7 @@ pub struct Session {
     tools: Vec<Tool>,
     late_commands: u64,
     path_counts: [u64; 3],
+    recoveries: Recoveries,
     hold_reason: Option<String>,
 }
 
@@ -120,6 +127,7 @@ impl Session {
             tools: Vec::new(),
             late_commands: 0,
             path_counts: [0; 3],
+            recoveries: Recoveries::default(),
             hold_reason: None,
         }
     }
@@ -216,15 +224,12 @@ impl Session {
         if self.step_count() == 0 {
             observe(self);
         }
-        if let Err(blow_up) = self.tissue.step() {
-            self.hold_reason = Some(format!(
-                "after step {} {}; shorter substeps did not help; the state is that of step {}",
-                blow_up.step,
-                blow_up.cause,
-                self.step_count()
-            ));
+        if let Err(blow_up) = self.tissue.step()
+            && !self.recover(blow_up)
+        {
             return;
         }
+        self.recoveries.believe(self.tissue.checkpoint_step());
         observe(self);
     }
 
@@ -281,6 +286,7 @@ impl Session {
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
         let lifetime = command.time_to_live_s.map(|seconds| (seconds * rate_hz).ceil().max(1.0) as u64);
         tool.expires_at = lifetime.map(|steps| step.saturating_add(steps));
+        self.recoveries.note(step, command.tool);
         match command.action {
             Action::Push(poke) => {
                 self.tool(index).led = None;
@@ -391,6 +397,8 @@ impl Session {
             awake_points: self.tissue.awake_points(),
             late_commands: self.late_commands,
             held: self.hold_reason.is_some(),
+            recoveries: self.recoveries.count(),
+            recovered: self.recoveries.newest(),
             tools,
         }
     }

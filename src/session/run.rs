@@ -163,7 +163,7 @@ impl Playing<'_> {
             }
             if let Some(twin) = &mut self.twin {
                 twin.advance(&due, script);
-                if let Some(reason) = twin.hold_reason() {
+                if let Some(reason) = twin.fault() {
                     return Err(Failure::Held(reason));
                 }
             }
@@ -180,8 +180,10 @@ impl Playing<'_> {
                 }
             });
             std::mem::replace(&mut written, Ok(()))?;
-            if let Some(reason) = session.hold_reason() {
-                return Err(Failure::Held(reason.to_owned()));
+            // A tissue that went back can't be compared with a twin that did not.
+            let ended = if self.twin.is_some() { session.fault() } else { session.hold_reason().map(str::to_owned) };
+            if let Some(reason) = ended {
+                return Err(Failure::Held(reason));
             }
             if step.is_multiple_of(1024) {
                 progress(step);
@@ -189,7 +191,8 @@ impl Playing<'_> {
         }
         stepping_s += clock_s() - resumed_s;
         let audited_error = self.twin.as_ref().map(Twin::error);
-        let summary = Summary { audited_error, corrections: self.corrections, ..summary(session.tissue(), stepping_s) };
+        let (corrections, recoveries) = (self.corrections, session.recoveries().list());
+        let summary = Summary { audited_error, corrections, recoveries, ..summary(session.tissue(), stepping_s) };
         write_line(output, &Line::Summary(&summary))?;
         Ok(summary)
     }
@@ -242,6 +245,7 @@ pub fn summary(tissue: &dyn Tissue, wall_s: f64) -> Summary {
         final_hash: format!("{:032x}", tissue.state_hash()),
         audited_error: None,
         corrections: Vec::new(),
+        recoveries: Vec::new(),
         network: None,
     }
 }

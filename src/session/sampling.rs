@@ -197,7 +197,7 @@ impl Sampler {
 
     fn is_news(&self, told: &Sample, now: &Sample) -> bool {
         let asleep = now.awake_points == 0;
-        if asleep != (told.awake_points == 0) {
+        if asleep != (told.awake_points == 0) || told.recoveries != now.recoveries {
             return true;
         }
         match &self.sampling.deadband {

@@ -43,8 +43,8 @@ impl Push {
 
 /// One tool's force: what it is now, and what it was at the end of the last step.
 #[derive(Debug, Clone, Default)]
-struct Slot {
-    push: Option<Push>,
+pub(super) struct Slot {
+    pub(super) push: Option<Push>,
     before: Option<Poke>,
     /// The force that the sleeping tiles were last compared with.
     told: Option<Poke>,
@@ -96,7 +96,7 @@ impl Touch {
 /// The forces of all tools.
 #[derive(Debug, Clone)]
 pub(super) struct Applied<T: Real> {
-    slots: Vec<Slot>,
+    pub(super) slots: Vec<Slot>,
     /// The terms that act in the present substep.
     pub(super) terms: Vec<Term<T>>,
     /// The terms before they have tables. Kept, so that a step allocates nothing.

@@ -28,14 +28,21 @@ impl<T: Real> Sheet<T> {
         } else {
             self.exchange(model);
         }
-        self.halvings = 0;
+        self.begin_account();
+    }
 
+    /// Begins the guard's account and checkpoint anew, after the state or the springs have become others.
+    pub(super) fn begin_account(&mut self) {
+        self.halvings = 0;
         self.bench.is_calm(0.0);
         self.bench.take_work();
         let (survey, _, energy_j) = self.survey(&self.tiles.region);
         self.work = Work::begun(energy_j, self.present_work_j(&survey));
         self.checkpoint = None;
         self.take_checkpoint();
+        if let Some(checkpoint) = self.checkpoint.as_mut().and_then(Arc::get_mut) {
+            checkpoint.believed = false;
+        }
     }
 
     /// Whether `model` has the same springs, damping and scheme, so that the kept history stays valid.
@@ -48,8 +55,8 @@ impl<T: Real> Sheet<T> {
         tissue(&self.model) == tissue(model)
     }
 
-    /// Exchanges the springs or the scheme.
-    fn exchange(&mut self, model: &Arc<Model>) {
+    /// Exchanges the springs or the scheme. Displacements and velocities stay.
+    pub(super) fn exchange(&mut self, model: &Arc<Model>) {
         self.write(Write::Seen);
         let ratio = T::of(model.plan.substep_s / self.plan.substep_s);
         self.state.d.iter_mut().for_each(|d| *d = *d * ratio);

@@ -1,5 +1,7 @@
 //! What a tolerance asks for: integrator, substeps and number format, the cheapest that keep to it in a rehearsal.
 
+use std::sync::atomic::AtomicBool;
+
 use super::integrate::Oscillator;
 use super::rehearsal::{self, Rehearsal};
 use super::stability;
@@ -43,6 +45,14 @@ pub(super) fn point_substep_ns(integrator: Integrator, precision: Precision, lan
 
 /// What rounding may add to a sheet that is at rest, as a part of the tolerance: a rehearsal is over before that shows.
 const RESTING_PART: f64 = 0.5;
+
+/// The flag of a caller who waits to the end.
+pub static NEVER: AtomicBool = AtomicBool::new(false);
+
+/// The refusal of work whose caller's flag is set.
+pub fn given_up() -> Refusal {
+    Refusal::new(Reason::TimedOut, "", "was given up: nobody waits for it any more")
+}
 
 /// Rehearsals of one integrator in one format at most.
 const MOST_ROUNDS: u32 = 6;
@@ -89,7 +99,7 @@ fn rounding(precision: Precision, sheet: &Oscillator, substep_s: f64) -> f64 {
 struct Chooser<'a> {
     stepping: &'a Stepping,
     sheet: Oscillator,
-    rehearsal: Rehearsal,
+    rehearsal: Rehearsal<'a>,
     most_substeps: u32,
 }
 
@@ -102,14 +112,17 @@ struct Fewest {
 }
 
 impl Chooser<'_> {
-    fn new<'a>(scene: &'a Scene, limits: &Limits) -> Chooser<'a> {
-        let rehearsal = Rehearsal::new(scene, scene.stepping.tolerance, limits.rehearsal_work);
+    fn new<'a>(scene: &'a Scene, limits: &Limits, stop: &'a AtomicBool) -> Chooser<'a> {
+        let rehearsal = Rehearsal::new(scene, scene.stepping.tolerance, limits.rehearsal_work, stop);
         Chooser { stepping: &scene.stepping, sheet: Oscillator::of(scene), rehearsal, most_substeps: limits.substeps }
     }
 
     /// A choice is never less accurate for want of work: it is refused. Whoever gives the number of substeps answers for
     /// it, and is warned of an error that is not known.
     fn check_work(&self, limits: &Limits) -> Result<()> {
+        if self.rehearsal.is_stopped() {
+            return Err(given_up());
+        }
         if self.stepping.substeps.is_some() || !self.rehearsal.is_cut() {
             return Ok(());
         }
@@ -246,16 +259,17 @@ pub fn least_step(scene: &Scene) -> (u32, f64) {
 
 /// Every integrator that the scene leaves open, each with the cheapest that keeps to the tolerance.
 pub fn candidates(scene: &Scene, limits: &Limits) -> Vec<Choice> {
-    let chooser = Chooser::new(scene, limits);
+    let chooser = Chooser::new(scene, limits, &NEVER);
     let cheapest =
         |(integrator, order, cost): (Integrator, f64, f64)| chooser.cheapest([(integrator, order, cost)].into_iter());
     chooser.integrators().filter_map(cheapest).collect()
 }
 
 /// The cheapest that keeps to the tolerance, of what the scene leaves open; if nothing does, what misses it least. Refused
-/// if that would take more work than the limits allow. Also tells the work: points × substeps of rehearsals.
-pub fn choose(scene: &Scene, limits: &Limits) -> Result<(Choice, u64)> {
-    let chooser = Chooser::new(scene, limits);
+/// if that would take more work than the limits allow, and when `stop` is set. Also tells the work: points × substeps of
+/// rehearsals.
+pub fn choose(scene: &Scene, limits: &Limits, stop: &AtomicBool) -> Result<(Choice, u64)> {
+    let chooser = Chooser::new(scene, limits, stop);
     let choice = chooser.cheapest(chooser.integrators()).unwrap_or_else(|| chooser.yardstick());
     chooser.check_work(limits).map(|()| (choice, limits.rehearsal_work - chooser.rehearsal.left()))
 }

@@ -142,6 +142,11 @@ impl Contacts {
         self.tools.is_empty()
     }
 
+    /// The tools that are led.
+    pub(super) fn tools(&self) -> impl Iterator<Item = usize> {
+        self.tools.iter().map(|tool| tool.number)
+    }
+
     /// The points under tools that touch or hold. Some occur more than once.
     pub(super) fn points(&self) -> impl Iterator<Item = [usize; 2]> {
         self.tools.iter().filter(|tool| tool.standing != Standing::Free).flat_map(Tool::points)

@@ -3,6 +3,7 @@
 //! It is an input like a change of tissue: a recorded correction, applied at the same step, gives the same bits.
 
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 use super::audit::{Finding, Origin};
 use super::choice::{self, Choice};
@@ -68,7 +69,7 @@ impl Model {
         let mut open = self.scene.clone();
         open.stepping =
             Stepping { integrator: Integrator::Auto, substeps: None, precision: self.precision, ..stepping.clone() };
-        let choice = choice::choose(&open, limits).ok()?.0;
+        let choice = choice::choose(&open, limits, &choice::NEVER).ok()?.0;
         let keeps = choice.expected_error <= stepping.tolerance && choice.substeps < needed;
         let fits = self.precision != Precision::Compensated || choice.integrator.is_exponential();
         (keeps && fits && choice.integrator != self.plan.integrator).then_some(choice)
@@ -92,16 +93,16 @@ impl Model {
 
     /// Compiles another tissue from this one's scene, with the scheme and at least the substeps of the correction in
     /// force.
-    pub(super) fn compile_corrected(&self, scene: &Scene, limits: &Limits) -> Result<Self> {
+    pub(super) fn compile_corrected(&self, scene: &Scene, limits: &Limits, stop: &AtomicBool) -> Result<Self> {
         let Some((integrator, least)) = self.corrected else {
-            return Ok(Arc::unwrap_or_clone(Model::compile(scene, limits)?));
+            return Ok(Arc::unwrap_or_clone(Model::compile_until(scene, limits, stop)?));
         };
         let mut scene = scene.clone();
         (scene.stepping.integrator, scene.stepping.substeps) = (integrator, None);
-        let mut model = Model::compile(&scene, limits)?;
+        let mut model = Model::compile_until(&scene, limits, stop)?;
         if model.plan.substeps < least {
             scene.stepping.substeps = Some(least);
-            model = Model::compile(&scene, limits)?;
+            model = Model::compile_until(&scene, limits, stop)?;
         }
         Ok(Model { corrected: self.corrected, ..Arc::unwrap_or_clone(model) })
     }

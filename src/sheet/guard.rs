@@ -105,6 +105,8 @@ pub(super) struct Checkpoint<T: Real> {
     pub(super) work: Work,
     /// The recent largest displacement, spacings. Sleep is relative to it.
     pub(super) largest: f64,
+    /// Whether the motion that led here has passed the checks, under the present tissue.
+    pub(super) believed: bool,
 }
 
 /// Work of the tools, J, and energies at the last survey.
@@ -197,11 +199,12 @@ impl<T: Real> Sheet<T> {
             let state = State::zero(&bench.layout, state.kept.len());
             let (applied, prescribed, contacts) = (applied.clone(), prescribed.clone(), contacts.clone());
             let (work, largest) = (Work::default(), 0.0);
-            Arc::new(Checkpoint { steps: 0, halvings: 0, state, applied, prescribed, contacts, work, largest })
+            let (steps, halvings, believed) = (0, 0, true);
+            Arc::new(Checkpoint { steps, halvings, state, applied, prescribed, contacts, work, largest, believed })
         });
         let Some(checkpoint) = Arc::get_mut(checkpoint) else { return };
         checkpoint.largest = tiles.largest;
-        checkpoint.steps = self.steps;
+        (checkpoint.steps, checkpoint.believed) = (self.steps, true);
         checkpoint.halvings = self.halvings;
         tiles.copy_touched(checkpoint.state.fields_mut().zip(self.state.fields()));
         checkpoint.applied.clone_from(&self.applied);

@@ -47,6 +47,7 @@ mod lanes;
 pub mod model;
 mod prescribed;
 mod real;
+mod recovery;
 mod region;
 mod rehearsal;
 mod rest;
@@ -130,6 +131,15 @@ pub struct BlowUp {
     pub cause: Cause,
 }
 
+/// How a sheet continues after a blow-up.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Released {
+    /// The tools that acted in the state that it went back to, ascending. They do no longer.
+    pub tools: Vec<usize>,
+    /// Whether it continues at rest.
+    pub at_rest: bool,
+}
+
 /// A sheet in motion, in any precision.
 pub trait Tissue: Send {
     /// The model that it was made from.
@@ -161,6 +171,8 @@ pub trait Tissue: Send {
     fn plan(&self) -> &Plan;
     /// How often the guard went back to a checkpoint and continued with half the substep.
     fn guard_events(&self) -> u64;
+    /// The step whose state a blow-up would go back to.
+    fn checkpoint_step(&self) -> u64;
     /// Substeps done, including those that the guard repeated.
     fn substeps_done(&self) -> u64;
     /// Points that a step computes now; the others are at rest.
@@ -177,6 +189,9 @@ pub trait Tissue: Send {
     /// Returns a blow-up that the guard could not repair. The state is then that of the last checkpoint, which is
     /// finite.
     fn step(&mut self) -> Result<(), BlowUp>;
+    /// After a blow-up: continues at step `step` (of the blow-up) from the state of the last checkpoint, or at rest if
+    /// that has passed no check, with all tools released and the model's own substep.
+    fn recover(&mut self, step: u64) -> Released;
     /// The point at `index`.
     fn point(&self, index: usize) -> PointState;
     /// The energies. A pass over what is awake; sleeping tiles use cached values. Earlier calls do not affect the
@@ -422,6 +437,10 @@ impl<T: Real> Tissue for Sheet<T> {
         self.guard_events
     }
 
+    fn checkpoint_step(&self) -> u64 {
+        self.checkpoint.as_ref().map_or(self.steps, |checkpoint| checkpoint.steps)
+    }
+
     fn substeps_done(&self) -> u64 {
         self.substeps_done
     }
@@ -487,6 +506,10 @@ impl<T: Real> Tissue for Sheet<T> {
             self.forget_checkpoint();
         }
         Ok(())
+    }
+
+    fn recover(&mut self, step: u64) -> Released {
+        Sheet::recover(self, step)
     }
 
     fn point(&self, index: usize) -> PointState {

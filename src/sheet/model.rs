@@ -2,6 +2,7 @@
 
 use std::collections::VecDeque;
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 use super::choice::{self, Choice};
 use super::field::{BLOCK, Layout};
@@ -102,6 +103,11 @@ impl Oscillator {
 impl Model {
     /// Compiles a scene, after checking it.
     pub fn compile(scene: &Scene, limits: &Limits) -> Result<Arc<Self>> {
+        Model::compile_until(scene, limits, &choice::NEVER)
+    }
+
+    /// The same, given up when `stop` is set.
+    pub fn compile_until(scene: &Scene, limits: &Limits, stop: &AtomicBool) -> Result<Arc<Self>> {
         scene.check(limits)?;
         let sheet = Oscillator::of(scene);
         let step_s = scene.stepping.rate_hz.recip();
@@ -118,7 +124,7 @@ impl Model {
         if scene.stepping.substeps.is_none() && least > limits.substeps {
             return Err(too_many(least));
         }
-        let (choice, rehearsed) = choice::choose(scene, limits)?;
+        let (choice, rehearsed) = choice::choose(scene, limits, stop)?;
         let Choice { integrator, substeps, precision, expected_error } = choice;
         if precision == Precision::Compensated && !integrator.is_exponential() {
             let message = format!("is for exponential schemes; `{}` has f32 and f64", integrator.name());
@@ -139,9 +145,14 @@ impl Model {
             ));
         }
         if expected_error > scene.stepping.tolerance {
+            let expected = if expected_error.is_finite() {
+                format!("an error of {expected_error:.1e} is expected, above")
+            } else {
+                "nothing is known of the error, which may be above".to_owned()
+            };
             warnings.push(format!(
-                "stepping.tolerance: an error of {expected_error:.1e} is expected, above the {:.1e} asked for; leave \
-                 integrator, substeps and precision to `auto`, or raise the limit of substeps",
+                "stepping.tolerance: {expected} the {:.1e} asked for; leave integrator, substeps and precision to `auto`, \
+                 or raise the limit of substeps",
                 scene.stepping.tolerance
             ));
         }
@@ -182,6 +193,17 @@ impl Model {
     /// The same sheet with another tissue: integrator and substeps as its tolerance asks for, in the number format that a
     /// state of this model has. `first` is the scene that the session began with.
     pub fn changed(&self, change: &Change, first: &Scene, limits: &Limits) -> Result<Arc<Self>> {
+        self.changed_until(change, first, limits, &choice::NEVER)
+    }
+
+    /// The same, given up when `stop` is set.
+    pub fn changed_until(
+        &self,
+        change: &Change,
+        first: &Scene,
+        limits: &Limits,
+        stop: &AtomicBool,
+    ) -> Result<Arc<Self>> {
         if *change == Change::default() {
             return Err(Refusal::new(Reason::Missing, "", Change::NOTHING));
         }
@@ -189,12 +211,12 @@ impl Model {
         let mut scene = self.scene.changed(change, first);
         scene.stepping.precision = self.precision;
         // Compensated is f32 and what its rounding lost: where no exponential scheme will do, f32 goes on alone.
-        let compiled = self.compile_corrected(&scene, limits).or_else(|refusal| {
+        let compiled = self.compile_corrected(&scene, limits, stop).or_else(|refusal| {
             if self.precision != Precision::Compensated || refusal.field != "stepping.precision" {
                 return Err(refusal);
             }
             scene.stepping.precision = Precision::F32;
-            self.compile_corrected(&scene, limits)
+            self.compile_corrected(&scene, limits, stop)
         });
         let mut model = compiled?;
         model.scene.stepping = asked;

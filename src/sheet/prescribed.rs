@@ -73,6 +73,11 @@ impl Prescribed {
         }
     }
 
+    /// The tools that grasp a point.
+    pub(super) fn tools(&self) -> impl Iterator<Item = usize> {
+        self.grasped.iter().map(|grasped| grasped.tool)
+    }
+
     /// The points released since the last call, and their velocities, m/s.
     pub(super) fn take_released(&mut self) -> Vec<(usize, DVec3)> {
         std::mem::take(&mut self.released)

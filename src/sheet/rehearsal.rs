@@ -10,6 +10,7 @@
 
 use std::cell::Cell;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use glam::DVec3;
 
@@ -87,7 +88,7 @@ const STEP_POINTS: u64 = 500;
 type Course = Vec<[[DVec3; 2]; 3]>;
 
 /// The small sheet, and how it truly moves.
-pub(super) struct Rehearsal {
+pub(super) struct Rehearsal<'s> {
     scene: Scene,
     sheet: Oscillator,
     /// Parts of the scene's step that count as a step here.
@@ -98,12 +99,14 @@ pub(super) struct Rehearsal {
     /// Points × substeps that may still be computed, and whether something was left out for want of them.
     left: Cell<u64>,
     is_cut: Cell<bool>,
+    /// When set, nothing more is computed.
+    stop: &'s AtomicBool,
 }
 
-impl Rehearsal {
+impl<'s> Rehearsal<'s> {
     /// Of a scene, with a truth that is good enough to judge schemes by `tolerance`. All courses together compute at most
-    /// `most_work` points × substeps.
-    pub(super) fn new(scene: &Scene, tolerance: f64, most_work: u64) -> Self {
+    /// `most_work` points × substeps, and nothing more once `stop` is set.
+    pub(super) fn new(scene: &Scene, tolerance: f64, most_work: u64, stop: &'s AtomicBool) -> Self {
         let sheet = Oscillator::of(scene);
         let step_s = scene.stepping.rate_hz.recip();
         let parts = stability::stable_substeps(Integrator::Exponential4, step_s, &sheet) / SUBSTEPS_A_LOOK;
@@ -129,6 +132,7 @@ impl Rehearsal {
             truth: [const { None }; LOADS.len()],
             left: Cell::new(most_work),
             is_cut: Cell::new(false),
+            stop,
         };
         for (load, at) in LOADS.iter().zip(0..) {
             rehearsal.truth[at] = rehearsal.true_course(load, least, tolerance);
@@ -148,6 +152,11 @@ impl Rehearsal {
     /// Some course was left out because it would have taken more work than there was left.
     pub(super) fn is_cut(&self) -> bool {
         self.is_cut.get()
+    }
+
+    /// Whether nobody waits for the result.
+    pub(super) fn is_stopped(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
     }
 
     /// Halves the substep until that changes less than the tolerance: an error of fifth order is then 32 times smaller.
@@ -188,8 +197,11 @@ impl Rehearsal {
         substeps.div_ceil(self.parts).saturating_mul(self.parts)
     }
 
-    /// The course of a scheme; none if the guard finds fault with it, or if it would be too much work.
+    /// The course of a scheme; none if the guard finds fault with it, if it would be too much work, or if it is stopped.
     fn course(&self, load: &Load, integrator: Integrator, substeps: u32, precision: Precision) -> Option<Course> {
+        if self.is_stopped() {
+            return None;
+        }
         let scene = &self.scene;
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
         let steps = (load.part * self.steps as f64) as usize;
@@ -219,7 +231,7 @@ impl Rehearsal {
         let mut course = Vec::with_capacity(steps);
         let mut is_sound = true;
         while is_sound && course.len() < steps {
-            is_sound = tissue.step().is_ok() && tissue.guard_events() == 0;
+            is_sound = tissue.step().is_ok() && tissue.guard_events() == 0 && !self.is_stopped();
             course.push(looked_at.map(|index| {
                 let point = tissue.point(index);
                 [point.displacement_m, point.reaction_n()]
@@ -311,7 +323,7 @@ mod tests {
     #[test]
     fn an_error_that_grows_is_expected_to_grow_as_long_as_vibrations_last() {
         let difference = |sets: &[&str], error: &dyn Fn(f64) -> f64| {
-            let rehearsal = Rehearsal::new(&scene(&[&["sheet.points=[3, 3]"][..], sets].concat()), 1.0, 0);
+            let rehearsal = Rehearsal::new(&scene(&[&["sheet.points=[3, 3]"][..], sets].concat()), 1.0, 0, &NEVER);
             let truth = course(rehearsal.steps, |_| 0.5);
             let other = course(rehearsal.steps, |part| 0.5 + error(part));
             rehearsal.difference(&LOADS[2], &truth, &other)
@@ -323,7 +335,7 @@ mod tests {
         assert!((difference(&undamped, &|_| 1e-3) - 2e-3).abs() < 1e-9);
         assert!((difference(&["damping.coefficient_n_s_per_m=0.5"], &|part| 1e-3 * part) - 2e-3).abs() < 1e-9);
         // Where nothing moves nothing errs.
-        let rehearsal = Rehearsal::new(&scene(&["sheet.points=[3, 3]"]), 1.0, 0);
+        let rehearsal = Rehearsal::new(&scene(&["sheet.points=[3, 3]"]), 1.0, 0, &NEVER);
         let still = course(rehearsal.steps, |_| 0.0);
         assert_eq!(rehearsal.difference(&LOADS[2], &still, &still), 0.0);
     }

@@ -36,7 +36,7 @@ pub fn code(reason: Reason) -> Code {
         Reason::NotHolder | Reason::RoleMissing | Reason::OriginNotAllowed => Code::PermissionDenied,
         Reason::Unauthenticated => Code::Unauthenticated,
         Reason::StepPassed => Code::OutOfRange,
-        Reason::Cut => Code::Aborted,
+        Reason::Cut | Reason::Recovered => Code::Aborted,
         Reason::ShuttingDown => Code::Unavailable,
     }
 }

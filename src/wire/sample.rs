@@ -7,7 +7,7 @@ use crate::pace::frames::Delivery;
 use crate::pace::{Live, PacedRecord, PacedSample, State};
 use crate::refusal::{Reason, Refusal, Result};
 use crate::scene::Named;
-use crate::scene::record::{AuditedError, EnergyJ, Point, Record};
+use crate::scene::record::{AuditedError, EnergyJ, Point, Record, Recovery};
 use crate::session::ToolSample;
 use crate::session::sampling::{Deadband, HEARTBEAT_S, Sampling};
 use crate::sheet::Model;
@@ -63,6 +63,7 @@ pub fn sample(paced: &PacedSample, dropped: u64, now_ns: u64) -> pb::Sample {
         held: sample.held,
         late_commands: sample.late_commands,
         dropped_samples: dropped,
+        recovery_count: sample.recoveries,
         tools: sample.tools.iter().map(|tool| tool_sample(tool, paced.due_ns, now_ns)).collect(),
     }
 }
@@ -199,6 +200,8 @@ pub fn session(live: &Arc<Live>) -> pb::Session {
         lapsed_leases,
         idle_timeout_s: live.idle_timeout_s,
         guard_events: status.guard_events,
+        recovery_count: status.recovery_count,
+        recoveries: status.recoveries.into_iter().map(recovery).collect(),
         resting: status.resting,
         rested_steps: status.rested_steps,
         commands: Some(pb::CommandCounts {
@@ -219,6 +222,17 @@ pub fn session(live: &Arc<Live>) -> pb::Session {
     with_model(session, model)
 }
 
+fn recovery(recovery: Recovery) -> pb::Recovery {
+    let Recovery { step, state_of_step, at_rest, undone_commands, reason } = recovery;
+    pb::Recovery { step, state_of_step, undone_commands, reason, at_rest }
+}
+
+/// A recovery of a session, as a record has it.
+pub fn from_recovery(recovery: pb::Recovery) -> Recovery {
+    let pb::Recovery { step, state_of_step, undone_commands, reason, at_rest } = recovery;
+    Recovery { step, state_of_step, at_rest, undone_commands, reason }
+}
+
 /// The results of a session's audits; `None` before the first.
 fn audit(live: &Live) -> Option<pb::Audit> {
     let audited = live.audited();
@@ -232,6 +246,7 @@ fn audit(live: &Live) -> Option<pb::Audit> {
         windows_above_tolerance: audited.above,
         reason: audited.origin.map(Origin::describe).unwrap_or_default().to_owned(),
         corrections: audited.corrections,
+        refused_correction: audited.refused_correction.map(|refusal| refusal.to_string()).unwrap_or_default(),
         newest_correction: audited.correction.map(|correction| pb::Correction {
             step: correction.step,
             audited_error: error(correction.audited_error),

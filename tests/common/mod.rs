@@ -51,7 +51,7 @@ pub fn playing(scene: &Scene, script: &Script) -> Session {
 pub fn advance(session: &mut Session, steps: u64) {
     for _ in 0..steps {
         session.advance(&mut Vec::new(), |_| {});
-        assert_eq!(session.hold_reason(), None);
+        assert_eq!(session.fault(), None);
     }
 }
 

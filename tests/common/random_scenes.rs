@@ -130,8 +130,8 @@ pub fn play(case: &Case, assignments: &[String], clock_s: &dyn Fn() -> f64) -> R
                 course.push(record.points.iter().map(|point| [point.displacement_m, point.reaction_n]).collect());
             }
         });
-        if let Some(reason) = session.hold_reason() {
-            return Err(reason.to_owned());
+        if let Some(reason) = session.fault() {
+            return Err(reason);
         }
     }
     Ok(Played { course, model, step_s: (clock_s() - begun_s) / script.steps as f64 })

@@ -1,5 +1,6 @@
 //! Touch over the network: commands, samples, leases, probes.
 
+use crate::metrics;
 use crate::server::{PATIENCE, Server, Touch, force, open, position, told};
 use palpate::wire::pb;
 use pb::command::Action;
@@ -619,8 +620,14 @@ fn paper_scene() -> pb::Scene {
 }
 
 #[tokio::test]
-async fn a_session_that_blows_up_is_held_with_a_reason_and_sends_no_nan() {
-    let server = Server::start(&["--log", "warn"]);
+async fn a_session_that_blows_up_again_and_again_is_held_with_a_reason_and_sends_no_nan() {
+    // The scene's error is not known, and looking for it would take long.
+    let folder = tempfile::tempdir().unwrap();
+    let config = folder.path().join("palpate.toml");
+    std::fs::write(&config, "[limits]\nrehearsal_work = 1\n").unwrap();
+    let config = config.to_str().unwrap();
+    let mut server = Server::start(&["--log", "warn", "--metrics", "127.0.0.1:0", "--config", config]);
+    let metrics = metrics::url(&mut server.out);
     let mut scene = paper_scene();
     scene.springs.as_mut().unwrap().stiffness_n_per_m = Some(1e9);
     scene.springs.as_mut().unwrap().shear_stiffness_n_per_m = None;
@@ -635,8 +642,21 @@ async fn a_session_that_blows_up_is_held_with_a_reason_and_sends_no_nan() {
         let request = pb::GetStateHashRequest { session_id: session.clone(), at_step: Some(5000) };
         async move { sessions.get_state_hash(request).await }
     });
+    // It recovers, and the holder is told each time what became of its command.
+    let (mut told_of, mut last_step) = (0, 0);
     let held = loop {
-        let sample = touch.sample().await;
+        let sample = match touch.hear().await.unwrap().unwrap() {
+            Heard::Sample(sample) => sample,
+            Heard::Rejection(rejection) => {
+                told_of += 1;
+                assert_eq!((&*rejection.reason, rejection.tool, rejection.sequence), ("RECOVERED", 0, told_of));
+                assert!(rejection.message.contains("1 commands were undone"), "{rejection:?}");
+                // The same again.
+                touch.command(force(0, told_of + 1, -1.0)).await;
+                continue;
+            }
+            other => panic!("{other:?}"),
+        };
         for tool in &sample.tools {
             for v in [tool.displacement_m, tool.velocity_m_per_s, tool.force_on_tool_n].into_iter().flatten() {
                 assert!(v.x.is_finite() && v.y.is_finite() && v.z.is_finite(), "{tool:?}");
@@ -645,14 +665,21 @@ async fn a_session_that_blows_up_is_held_with_a_reason_and_sends_no_nan() {
         if sample.held {
             break sample;
         }
+        assert!(sample.step >= last_step && sample.recovery_count == told_of, "{told_of}: {sample:?}");
+        last_step = sample.step;
     };
-    assert!(held.step < 5000);
+    assert!(held.step < 5000 && told_of == 4, "{told_of}");
+    assert_eq!(metrics::scrape(&metrics)["palpate_recoveries_total"], 4.0);
     let refused = waiting.await.unwrap().unwrap_err();
     assert_eq!(told(&refused).1, "SESSION_HELD");
     let status = server.status(&session).await;
     assert_eq!(status.state(), pb::SessionState::Held);
     assert!(status.hold_reason.contains("shorter substeps did not help"), "{}", status.hold_reason);
-    touch.command(force(0, 2, -1.0)).await;
+    assert_eq!((status.recovery_count, status.recoveries.len()), (4, 4));
+    for recovery in &status.recoveries {
+        assert!(recovery.state_of_step <= recovery.step && recovery.undone_commands == 1, "{recovery:?}");
+    }
+    touch.command(force(0, 6, -1.0)).await;
     let rejection = loop {
         if let Some(Heard::Rejection(rejection)) = touch.hear().await.unwrap() {
             break rejection;
@@ -672,8 +699,11 @@ async fn a_session_that_blows_up_is_held_with_a_reason_and_sends_no_nan() {
     let mut records = server.haptics().await.probe(request).await.unwrap().into_inner();
     assert_eq!(told(&records.message().await.unwrap_err()).1, "SESSION_HELD");
     // Other sessions continue.
-    let other = server.paper(true).await;
+    let mut sound = paper_scene();
+    sound.stepping.as_mut().unwrap().substeps = Some(1);
+    let other = server.create(pb::create_session_request::Source::Scene(sound), true).await.unwrap().session_id;
     server.start_until(&other, 5).await;
     server.hash_at(&other, 5).await;
-    assert!(server.log().contains("session held"));
+    let log = server.log();
+    assert!(log.contains("session held") && log.contains("tissue recovered"), "{log}");
 }

@@ -38,8 +38,8 @@ impl Tissue {
             arrival_ns: 0,
         };
         self.session.advance(&mut vec![Due { command, late: false, late_commands: 0, ends_lease: false }], |_| {});
-        match self.session.hold_reason() {
-            Some(reason) => Err(reason.to_owned()),
+        match self.session.fault() {
+            Some(reason) => Err(reason),
             None => Ok(self.session.tissue().feel(0)),
         }
     }

@@ -1,9 +1,10 @@
-//! What a session is asked for now and then: its hash, and to go on after it was held.
+//! What a session needs now and then: its hash, a word on a recovery, and to go on after it was held.
 
 use super::{Running, lock, now_ns};
 use crate::budget::{Account, Work};
 use crate::refusal::{Reason, Refusal, Result};
 use crate::session::Session;
+use crate::session::recovery::describe;
 
 impl Running {
     /// The step and the state's hash, computed once a step; whoever has used up their part of the time is refused.
@@ -23,6 +24,14 @@ impl Running {
         account.spend(Work::Reading, ended_ns, ended_ns.saturating_sub(begun_ns));
         self.hashed = Some((step, hash));
         Ok((step, hash))
+    }
+
+    /// Logs the recovery in the step that was just done, if there was one.
+    pub(super) fn log_recovery(&self) {
+        let step = self.session.step_count();
+        if let Some(newest) = self.session.recoveries().newest().filter(|newest| newest.recovery.step == step) {
+            tracing::warn!(session = %self.live.id, "tissue recovered: {}", describe(&newest.recovery));
+        }
     }
 
     /// The same tissue at rest, at the same step; time stands.

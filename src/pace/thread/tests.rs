@@ -6,6 +6,7 @@ use crate::budget::{Account, Budget};
 use crate::limits::Limits;
 use crate::pace::Pacer;
 use crate::scene::{PAPER, Scene};
+use crate::sheet::choice::NEVER;
 
 /// In virtual time: a session on a beat of 1 ms, whose steps take `step_ns` on average, has just done step 0, from
 /// 5 ms to 7 ms; when is it due again among so many?
@@ -15,7 +16,7 @@ fn who_is_late_and_takes_more_than_an_equal_part_goes_after_all_that_are_due() {
     let scene = Scene::parse("paper", PAPER, &[], &limits).unwrap();
     let pacer = Pacer::start(1, 0.0, &limits, Budget::new(&limits, 1, 1)).unwrap();
     let due_ns = |step_ns: u64, awake: usize, begun_ns: u64, ended_ns: u64| {
-        let live = pacer.create(&scene, true, 60.0, &Account::alone()).unwrap();
+        let live = pacer.create(&scene, true, 60.0, &Account::alone(), &NEVER).unwrap();
         (0..1000).for_each(|_| live.cost.observe(step_ns));
         let mut running = Running::new(live, true);
         running.schedule = Schedule::new(0, 1_000_000, 1000.0);
@@ -44,7 +45,7 @@ fn a_thread_is_divided_among_callers_first() {
     let mut rota = Rota::default();
     for index in 0..41 {
         let owner = if index == 40 { &one } else { &many };
-        let live = pacer.create(&scene, true, 60.0, owner).unwrap();
+        let live = pacer.create(&scene, true, 60.0, owner, &NEVER).unwrap();
         (0..1000).for_each(|_| live.cost.observe(50_000));
         let mut running = Running::new(live, true);
         running.schedule = Schedule::new(0, 1_000_000, 1000.0);

@@ -39,8 +39,8 @@ fn rounding_in_f32_grows_with_damping_and_with_shorter_substeps_and_is_less_in_b
 fn the_choice_keeps_its_tolerance_and_nothing_that_keeps_it_is_much_cheaper() {
     for tolerance in ["1e-2", "1e-4", "1e-6"] {
         let scene = scene(&[&format!("stepping.tolerance={tolerance}")]);
-        let (choice, _) = choose(&scene, &Limits::default()).unwrap();
-        let chooser = Chooser::new(&scene, &Limits::default());
+        let (choice, _) = choose(&scene, &Limits::default(), &NEVER).unwrap();
+        let chooser = Chooser::new(&scene, &Limits::default(), &NEVER);
         assert!(chooser.keeps(&choice), "{choice:?}");
         assert!(CANDIDATES.iter().any(|candidate| candidate.0 == choice.integrator), "{choice:?}");
         for (integrator, ..) in CANDIDATES {
@@ -70,7 +70,7 @@ fn an_integrator_takes_hardly_more_substeps_than_it_needs() {
         (Integrator::Exponential4, 5.0, "1e-7"),
     ] {
         let scene = scene(&[&format!("stepping.tolerance={tolerance}"), "springs.stiffness_n_per_m=1000"]);
-        let chooser = Chooser::new(&scene, &Limits::default());
+        let chooser = Chooser::new(&scene, &Limits::default(), &NEVER);
         let found = chooser.fewest(integrator, order, Precision::F64, 1000).unwrap().choice;
         assert!(chooser.keeps(&found) && found.substeps > 2, "{found:?}");
         let fewer = chooser.tried(integrator, found.substeps * 2 / 3, Precision::F64);
@@ -85,10 +85,23 @@ fn an_integrator_takes_hardly_more_substeps_than_it_needs() {
 fn where_nothing_keeps_the_tolerance_the_least_error_is_chosen() {
     let limits = Limits { substeps: 2, ..Limits::default() };
     let scene = scene(&["stepping.tolerance=1e-9"]);
-    let (choice, _) = choose(&scene, &limits).unwrap();
+    let (choice, _) = choose(&scene, &limits, &NEVER).unwrap();
     let others = candidates(&scene, &limits);
     assert!(others.len() > 1 && choice.expected_error > 1e-9);
     let least = others.iter().map(|other| other.expected_error).fold(f64::INFINITY, f64::min);
     let most = others.iter().map(|other| other.expected_error).fold(0.0, f64::max);
     assert!(choice.expected_error == least && least < most, "{choice:?}, not {others:?}");
+}
+
+#[test]
+fn a_choice_that_nobody_waits_for_is_given_up_before_anything_is_rehearsed() {
+    let (limits, set) = (Limits::default(), AtomicBool::new(true));
+    let scene = Scene::parse("paper", crate::scene::PAPER, &[], &limits).unwrap();
+    assert_eq!(choose(&scene, &limits, &set).unwrap_err(), given_up());
+    assert_eq!(Chooser::new(&scene, &limits, &set).rehearsal.left(), limits.rehearsal_work);
+    // Also where substeps are given, and only the error is unknown.
+    let given = Scene::parse("paper", crate::scene::PAPER, &["stepping.substeps=3".into()], &limits).unwrap();
+    assert_eq!(choose(&given, &limits, &set).unwrap_err(), given_up());
+    let (choice, work) = choose(&scene, &limits, &NEVER).unwrap();
+    assert!(choice.expected_error <= scene.stepping.tolerance && work > 0);
 }
