@@ -341,7 +341,7 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
     let incoming = connections::incoming(listener, tls, seats, &limits, budget.clone(), traffic, register.clone());
     let silence = Some(Duration::from_secs_f64(limits.keepalive_s));
     let bytes = limits.message_bytes;
-    let (folder, painter) = (Arc::new(house.config.viewer.clone()), house.clone());
+    let (pages, painter) = (page::Page::of(house.config.viewer.clone()), house.clone());
     let sessions = SessionServiceServer::new(sessions::Sessions(house.clone())).max_decoding_message_size(bytes);
     let haptics = HapticServiceServer::new(haptics::Haptics(house.clone())).max_decoding_message_size(bytes);
     let admin =
@@ -358,7 +358,7 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
         // Of the services alone: it refuses what is no gRPC.
         .route_layer(GrpcWebLayer::new())
         .route("/textures/{file}", axum::routing::get(move |file, headers| textures::file(painter, file, headers)))
-        .fallback(move |request| page::page(folder.clone(), request));
+        .fallback(move |request| page::page(pages.clone(), request));
     let drain = CancellationToken::new();
     let serving = Server::builder()
         // Finds out about clients whose host has vanished.
