@@ -4,6 +4,7 @@ pub mod budget;
 pub mod haptics;
 pub mod limits;
 mod lock;
+pub mod memory;
 pub mod pace;
 pub mod refusal;
 pub mod render;

@@ -281,10 +281,10 @@ impl From<ServeError> for Failure {
 
 fn main() -> ExitCode {
     let ended = match Arguments::parse().command {
-        Command::Run(arguments) => run_script(&arguments),
-        Command::Check(arguments) => check(&arguments),
-        Command::Render(arguments) => render(&arguments),
-        Command::Texture(arguments) => make_texture(&arguments),
+        Command::Run(arguments) => within_memory(|| run_script(&arguments)),
+        Command::Check(arguments) => within_memory(|| check(&arguments)),
+        Command::Render(arguments) => within_memory(|| render(&arguments)),
+        Command::Texture(arguments) => within_memory(|| make_texture(&arguments)),
         Command::Serve(arguments) => serve(&arguments),
         Command::Token(arguments) => token(&arguments),
         Command::Top { arguments } => return client("top", &arguments),
@@ -297,6 +297,11 @@ fn main() -> ExitCode {
     };
     say!("palpate: {message}");
     ExitCode::from(status)
+}
+
+/// Does something that may need more memory than there is.
+fn within_memory(work: impl FnOnce() -> Result<(), Failure>) -> Result<(), Failure> {
+    palpate::memory::attempt("", || Ok(work()))?
 }
 
 fn load_config(path: Option<&Path>) -> Result<Config, Refusal> {

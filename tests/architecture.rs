@@ -4,9 +4,9 @@
 use std::path::{Path, PathBuf};
 
 /// Each room may use those before it.
-const ROOMS: [&str; 14] = [
-    "refusal", "limits", "lock", "budget", "scene", "texture", "sheet", "haptics", "surface", "session", "pace",
-    "wire", "server", "render",
+const ROOMS: [&str; 15] = [
+    "refusal", "limits", "lock", "memory", "budget", "scene", "texture", "sheet", "haptics", "surface", "session",
+    "pace", "wire", "server", "render",
 ];
 
 /// What clients may use; `link` alone drives a session.

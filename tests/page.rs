@@ -1,6 +1,8 @@
 //! The page and gRPC-web on the port of gRPC, spoken to by hand over HTTP/1.1.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
+#[path = "common/cores.rs"]
+mod cores;
 #[path = "common/server.rs"]
 mod server;
 
@@ -73,6 +75,48 @@ fn a_page_has_its_type_its_policy_and_a_tag() {
     let tag = head.lines().find_map(|line| line.strip_prefix("etag: ")).unwrap().to_owned();
     let (head, body) = get(&server, "/assets/index-1a2b.js", &format!("If-None-Match: {tag}\r\n"));
     assert!(head.starts_with("http/1.1 304") && body.is_empty(), "{head}");
+}
+
+/// A connection over which one file is asked for so many times at once.
+fn pipelined(server: &Server, path: &str, times: usize) -> TcpStream {
+    let address = server.url.trim_start_matches("http://");
+    let mut stream = TcpStream::connect(address).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    let request = format!("GET {path} HTTP/1.1\r\nHost: {address}\r\n\r\n");
+    stream.write_all(request.repeat(times).as_bytes()).unwrap();
+    stream
+}
+
+#[test]
+fn pipelined_requests_are_answered_in_order_and_unread_answers_share_one_file() {
+    let (server, folder) = with_page();
+    const BYTES: usize = 16 << 20;
+    let picture = (0..BYTES).map(|at| (at % 251) as u8).collect::<Vec<_>>();
+    std::fs::write(folder.path().join("page/picture.bin"), &picture).unwrap();
+    let before = cores::resident(server.child.id());
+    let mut connections: Vec<_> = (0..24).map(|_| pipelined(&server, "/picture.bin", 8)).collect();
+    // The first part of an answer has come to each, so that each has its file; nobody reads on.
+    for stream in &mut connections {
+        stream.read_exact(&mut [0; 1 << 16]).unwrap();
+    }
+    let more = cores::resident(server.child.id()) - before;
+    assert!(more < 96 << 20, "{more} bytes for unread answers of one file of {BYTES}");
+    drop(connections);
+    // Who reads gets each answer whole.
+    let mut stream = std::io::BufReader::new(pipelined(&server, "/picture.bin", 3));
+    for _ in 0..3 {
+        let mut head = Vec::new();
+        while !head.ends_with(b"\r\n\r\n") {
+            let mut byte = [0];
+            stream.read_exact(&mut byte).unwrap();
+            head.push(byte[0]);
+        }
+        let head = String::from_utf8(head).unwrap().to_lowercase();
+        assert!(head.starts_with("http/1.1 200") && head.contains(&format!("content-length: {BYTES}")), "{head}");
+        let mut body = vec![0; BYTES];
+        stream.read_exact(&mut body).unwrap();
+        assert!(body == picture);
+    }
 }
 
 #[test]

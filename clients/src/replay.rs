@@ -519,7 +519,7 @@ async fn play(
     }
     progress.finish_and_clear();
     let mut recoveries = Vec::new();
-    if seen.recovery_count > 0 {
+    if measured.recovery_count > 0 {
         let asked = pb::GetSessionRequest { session_id: session_id.clone() };
         let session = sessions.get_session(asked).await.map_err(failed)?.into_inner().session.unwrap_or_default();
         recoveries = session.recoveries.into_iter().map(wire::sample::from_recovery).collect();

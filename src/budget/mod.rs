@@ -18,6 +18,7 @@ pub use time::Work;
 
 use crate::limits::Limits;
 use crate::lock::lock;
+use crate::memory;
 use crate::refusal::{Reason, Refusal, Result};
 
 /// What memory is taken for.
@@ -35,7 +36,7 @@ pub enum Purpose {
     Commands,
     /// Textures that are kept or made.
     Textures,
-    /// What clients have sent and nobody has read yet.
+    /// What clients have sent and nobody has read yet, and what they were sent and have not taken.
     Connections,
 }
 
@@ -87,6 +88,12 @@ impl Resource {
             Resource::Streams => 2,
             Resource::Leases => 3,
         }
+    }
+
+    /// Whether it is memory that is laid out when it is taken. That of a connection is what its window allows, which few
+    /// use up.
+    fn is_laid_out(self) -> bool {
+        matches!(self, Resource::Memory(purpose) if purpose != Purpose::Connections)
     }
 
     /// For people, and the key of the configuration that bounds it.
@@ -333,11 +340,15 @@ impl Taken {
         &self.account
     }
 
-    /// Takes more, so that it is `amount`; or is as it was, and tells why.
+    /// Takes more, so that it is `amount`; or is as it was, and tells why. Of memory that is laid out the system must
+    /// have as much.
     pub fn grow_to(&mut self, amount: u64, field: &str) -> Result<()> {
         let more = amount.saturating_sub(self.amount);
         if more == 0 {
             return Ok(());
+        }
+        if self.resource.is_laid_out() && more <= self.account.0.budget.bytes() {
+            memory::check(more, "what was asked for").map_err(|refusal| refusal.within(field))?;
         }
         let (budget, number) = (&self.account.0.budget, self.account.0.number);
         let mut pool = lock(&budget.pools[self.resource.index()]);

@@ -13,6 +13,7 @@ use super::thread::{Running, beat_ns};
 use super::{Live, Pacer, State, Status, random_id};
 use crate::budget::{Account, Purpose, Resource};
 use crate::lock::lock;
+use crate::memory;
 use crate::refusal::{Reason, Refusal, Result, number};
 use crate::scene::{Change, Scene};
 use crate::session::command::Intake;
@@ -22,6 +23,17 @@ use crate::sheet::{Model, choice};
 impl Pacer {
     /// Makes a session for `owner`, unless `stop` is set before it is there.
     pub fn create(
+        &self,
+        scene: &Scene,
+        paused: bool,
+        idle_timeout_s: f64,
+        owner: &Account,
+        stop: &AtomicBool,
+    ) -> Result<Arc<Live>> {
+        memory::attempt("sheet.points", || self.lay_out(scene, paused, idle_timeout_s, owner, stop))
+    }
+
+    fn lay_out(
         &self,
         scene: &Scene,
         paused: bool,

@@ -18,12 +18,14 @@ use super::clock::{now_ns, thread_time_ns};
 use super::inbox::Request;
 use super::tally::Count;
 use super::{Live, check_work};
+use crate::budget::{Purpose, Resource};
 use crate::lock::lock;
+use crate::memory;
 use crate::refusal::{Refusal, Result};
 use crate::scene::Named;
 use crate::scene::record::{AuditedError, Correction};
 use crate::sheet::Model;
-use crate::sheet::audit::{Extent, FINER, Finding, Inputs, Mark, Origin};
+use crate::sheet::audit::{Audit, Extent, FINER, Finding, Inputs, Mark, Origin};
 use crate::sheet::guard::INTERVAL_SUBSTEPS;
 
 /// How long to wait where no session is awake.
@@ -110,9 +112,12 @@ impl Auditor {
                 Some(live) => {
                     last = live.number;
                     // A fault in one audit must not end the others.
-                    let audited = catch_unwind(AssertUnwindSafe(|| audit(&live, &mut duty, &self.tally)));
-                    if audited.is_err() {
-                        tracing::error!(session = %live.id, "a fault of the program ended an audit");
+                    let audited = catch_unwind(AssertUnwindSafe(|| audit(&live, sessions, &mut duty, &self.tally)));
+                    if let Err(panic) = audited {
+                        match memory::refusal_of(&*panic) {
+                            Some(refusal) => tracing::debug!(session = %live.id, %refusal, "no audit"),
+                            None => tracing::error!(session = %live.id, "a fault of the program ended an audit"),
+                        }
                     }
                     // Also where nothing came of it: to ask is work too.
                     duty.rest() && self.wait(Duration::from_millis(1))
@@ -146,8 +151,13 @@ impl Duty<'_> {
     }
 }
 
-/// Audits one window of a session, if one comes.
-fn audit(live: &Live, duty: &mut Duty<'_>, tally: &AuditTally) {
+/// Audits one window of a session, if one comes, and if there is memory for it.
+fn audit(live: &Live, sessions: &Sessions, duty: &mut Duty<'_>, tally: &AuditTally) {
+    let bytes = Audit::bytes(&live.model);
+    let _taken = match live.owner.take(Resource::Memory(Purpose::Session), bytes, "") {
+        Ok(taken) => taken,
+        Err(refusal) => return tracing::debug!(session = %live.id, %refusal, "no audit"),
+    };
     let (marks, told) = sync_channel(2);
     live.inbox.send(live.number, Request::Audit(Inputs::default(), marks));
     let Some((model, opening)) = next(&told, longest(&live.model)).and_then(|mark| match mark {
@@ -159,7 +169,9 @@ fn audit(live: &Live, duty: &mut Duty<'_>, tally: &AuditTally) {
     let Some(Mark::End(look, inputs)) = next(&told, longest(&model)) else { return };
     let audit = opening.close(look, inputs);
     let extent = lock(&live.audited).extent;
-    let Some(finding) = audit.work(FINER, extent, &mut || duty.rest()) else { return };
+    // Nobody wants to know of a session that is deleted, and its memory is to be freed.
+    let mut goes_on = || duty.rest() && lock(sessions).contains_key(&live.id);
+    let Some(finding) = audit.work(FINER, extent, &mut goes_on) else { return };
     note(live, &finding, tally);
     let Some(origin) = finding.origin else { return };
     if model.scene.stepping.correct {

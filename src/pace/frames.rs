@@ -6,9 +6,10 @@ use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
 use std::time::Duration;
 
 use super::queue::{Reader, Writer, queue};
-use crate::budget::{Account, Purpose, Resource, Taken};
+use crate::budget::{Account, Budget, Purpose, Resource, Taken};
 use crate::lock::lock;
-use crate::refusal::Result;
+use crate::memory;
+use crate::refusal::{Refusal, Result};
 use crate::surface::{Encoding, Frame, Refinement, Snapshot, Tiles, encode, encode_over};
 
 /// One who looks at a session.
@@ -64,6 +65,16 @@ pub struct Delivery {
     pub time_dilation: f64,
 }
 
+/// Bytes of a frame with every vertex.
+fn frame_bytes(refinement: Refinement, encoding: Encoding) -> usize {
+    refinement.vertices().iter().product::<usize>() * encoding.bytes_per_vertex()
+}
+
+/// Bytes of the displacements of all points at one moment.
+fn moment_bytes(refinement: Refinement) -> usize {
+    refinement.points.iter().product::<usize>() * size_of::<[f32; 3]>()
+}
+
 impl Viewer {
     /// A viewer, and where it reads its frames. Their memory is charged to `account`.
     #[allow(clippy::too_many_arguments)]
@@ -77,12 +88,11 @@ impl Viewer {
         queued_bytes: usize,
         account: &Account,
     ) -> Result<(Arc<Self>, Reader<Delivery>)> {
-        let frame_bytes = refinement.vertices().iter().product::<usize>() * encoding.bytes_per_vertex();
+        let frame_bytes = frame_bytes(refinement, encoding);
         let room = (queued_bytes / frame_bytes).max(1);
         let most = max_in_flight.map(|most| (most as usize).min(room));
         // What waits, what is being sent, and what the tiles keep: the frame last written, and the points of three moments.
-        let points = refinement.points.iter().product::<usize>();
-        let bytes = (most.unwrap_or(1) + 2) * frame_bytes + 3 * points * size_of::<[f32; 3]>();
+        let bytes = (most.unwrap_or(1) + 2) * frame_bytes + 3 * moment_bytes(refinement);
         let _taken = account.take(Resource::Memory(Purpose::Frames), bytes as u64, "refinement")?;
         // Without credit only the newest frame waits.
         let (writer, reader) = queue(most.unwrap_or(1));
@@ -154,7 +164,7 @@ impl Viewer {
     }
 
     /// Ends the stream.
-    pub fn close(&self, why: crate::refusal::Refusal) {
+    pub fn close(&self, why: Refusal) {
         self.writer.close(why);
     }
 }
@@ -214,9 +224,9 @@ impl Encoder {
         self.posted.notify_one();
     }
 
-    /// The thread's work.
-    pub fn work(&self) {
-        let (mut spent, mut watched) = (Spent::default(), Watched::default());
+    /// The thread's work. The memory of frames that are kept for their buffers is taken from `budget`.
+    pub fn work(&self, budget: &Arc<Budget>) {
+        let (mut spent, mut watched) = (Spent::of(budget), Watched::default());
         loop {
             let mut board = lock(&self.board);
             let (number, job) = loop {
@@ -226,7 +236,7 @@ impl Encoder {
                 if let Some(next) = board.jobs.pop_front() {
                     break next;
                 }
-                if spent.0.is_empty() && watched.0.is_empty() {
+                if spent.frames.is_empty() && watched.0.is_empty() {
                     board = self.posted.wait(board).unwrap_or_else(PoisonError::into_inner);
                     continue;
                 }
@@ -235,13 +245,21 @@ impl Encoder {
                 board = again;
                 if idle.timed_out() && board.jobs.is_empty() {
                     drop(board);
-                    spent.0.clear();
+                    spent.clear();
                     watched.forget_the_gone();
                     board = lock(&self.board);
                 }
             };
             drop(board);
-            serve(number, &job, &mut spent, &mut watched);
+            let served = memory::attempt("refinement", || {
+                serve(number, &job, &mut spent, &mut watched);
+                Ok(())
+            });
+            if let Err(refusal) = served {
+                job.viewers.iter().for_each(|(viewer, _)| viewer.close(refusal.clone()));
+                watched.give_up(number, &refusal);
+                spent.clear();
+            }
         }
     }
 }
@@ -249,25 +267,55 @@ impl Encoder {
 /// Bytes of full frames kept for their buffers, one of each kind that was asked for lately.
 const SPENT_BYTES: usize = 64 << 20;
 
+/// The account on which they are kept: they serve whoever looks next.
+const EVERYBODY: &str = "frames";
+
 /// The last frames of a few kinds, newest first. When the next of a kind is due, the viewers are mostly done with it.
-#[derive(Debug, Default)]
-struct Spent(Vec<Arc<Frame>>);
+#[derive(Debug)]
+struct Spent {
+    frames: Vec<Arc<Frame>>,
+    account: Account,
+    /// Their memory.
+    taken: Option<Taken>,
+}
 
 impl Spent {
+    fn of(budget: &Arc<Budget>) -> Self {
+        Spent { frames: Vec::new(), account: budget.account(EVERYBODY), taken: None }
+    }
+
+    fn clear(&mut self) {
+        (self.frames, self.taken) = (Vec::new(), None);
+    }
+
+    /// Takes the memory of the frames that are kept, or keeps none.
+    fn charge(&mut self, bytes: usize) {
+        self.taken = None;
+        match self.account.take(Resource::Memory(Purpose::Frames), bytes as u64, "") {
+            Ok(taken) => self.taken = Some(taken),
+            Err(_) => self.clear(),
+        }
+    }
+
     /// The next frame of a kind, in the buffers of the last one as far as they are free.
     fn encode(&mut self, snapshot: &Snapshot, refinement: Refinement, encoding: Encoding) -> Arc<Frame> {
         let same = |frame: &Arc<Frame>| frame.refinement == refinement && frame.encoding == encoding;
-        let last = self.0.iter().position(same).and_then(|index| Arc::into_inner(self.0.remove(index)));
+        let last = self.frames.iter().position(same).and_then(|index| Arc::into_inner(self.frames.remove(index)));
+        memory::require(frame_bytes(refinement, encoding) as u64, "a frame");
         let frame = Arc::new(match last {
             Some(last) => encode_over(snapshot, last),
             None => encode(snapshot, refinement, encoding),
         });
-        self.0.insert(0, frame.clone());
-        let mut bytes = 0;
-        self.0.retain(|frame| {
+        self.frames.insert(0, frame.clone());
+        let (mut bytes, mut kept_bytes) = (0, 0);
+        self.frames.retain(|frame| {
             bytes += frame.patches.iter().map(|patch| patch.bytes.len()).sum::<usize>();
+            if bytes <= SPENT_BYTES {
+                kept_bytes = bytes;
+            }
             bytes <= SPENT_BYTES
         });
+        self.charge(kept_bytes);
         frame
     }
 }
@@ -292,9 +340,17 @@ impl Watched {
         self.0.retain(|kind| !kind.viewers.is_empty());
     }
 
+    /// Ends the streams of those who look at a session, and forgets what they have: it is not up to date.
+    fn give_up(&mut self, session: u64, refusal: &Refusal) {
+        let kinds = self.0.extract_if(.., |kind| kind.session == session);
+        let viewers = kinds.flat_map(|kind| kind.viewers).filter_map(|viewer| viewer.upgrade());
+        viewers.for_each(|viewer| viewer.close(refusal.clone()));
+    }
+
     /// The tiles for a viewer, up to date.
     fn tiles(&mut self, session: u64, job: &Job, viewer: &Arc<Viewer>) -> &mut Tiles {
         let (refinement, encoding) = (viewer.refinement, viewer.encoding);
+        memory::require((frame_bytes(refinement, encoding) + moment_bytes(refinement)) as u64, "the tiles of a frame");
         let same = |kind: &Kind| {
             (kind.session, kind.tiles.refinement(), kind.tiles.encoding()) == (session, refinement, encoding)
         };
@@ -353,7 +409,13 @@ mod tests {
         let (a, mut read_a) = viewer(2, Encoding::I16, None);
         let (b, mut read_b) = viewer(2, Encoding::I16, Some(3));
         let (c, mut read_c) = viewer(2, Encoding::F32, None);
-        serve(1, &job(vec![(a, 7), (b, 9), (c, 7)]), &mut Spent::default(), &mut Watched::default());
+        let mut spent = Spent::of(&Budget::new(&Limits::default(), 1, 1));
+        serve(1, &job(vec![(a, 7), (b, 9), (c, 7)]), &mut spent, &mut Watched::default());
+        // Of the two kinds one frame each is kept, and counted.
+        let account = spent.account.clone();
+        assert_eq!(account.has(Resource::Memory(Purpose::Frames)), 49 * 6 + 49 * 12);
+        spent.clear();
+        assert_eq!(account.has(Resource::Memory(Purpose::Frames)), 0);
         let (a, b, c) = (read_a.pop().await.unwrap().0, read_b.pop().await.unwrap().0, read_c.pop().await.unwrap().0);
         assert!(Arc::ptr_eq(&a.frame, &b.frame) && !Arc::ptr_eq(&a.frame, &c.frame));
         assert_eq!((a.frame_id, b.frame_id), (7, 9));
@@ -366,7 +428,7 @@ mod tests {
         let changes =
             |credit| Viewer::new("viewer".into(), grid, Encoding::F32, 60.0, false, credit, 1 << 20, &account).unwrap();
         let ((slow, mut read_slow), (thrifty, mut read_thrifty)) = (changes(None), changes(Some(1)));
-        let (mut spent, mut watched) = (Spent::default(), Watched::default());
+        let (mut spent, mut watched) = (Spent::of(account.budget()), Watched::default());
         let mut show = |frame_id: u64, z: f32| {
             let snapshot = Snapshot::new(frame_id, 0.001, [3, 3], [vec![0.0; 9], vec![0.0; 9], vec![z; 9]]);
             let viewers = vec![(slow.clone(), frame_id), (thrifty.clone(), frame_id)];

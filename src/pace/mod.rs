@@ -9,6 +9,7 @@ pub mod frames;
 mod inbox;
 pub(crate) mod priority;
 pub mod queue;
+mod reading;
 pub mod streams;
 pub mod tally;
 mod taps;
@@ -25,11 +26,12 @@ use crate::budget::{Account, Budget, Taken};
 use crate::haptics::Law;
 use crate::limits::Limits;
 use crate::lock::lock;
+use crate::memory;
 use crate::refusal::{Reason, Refusal, Result};
 use crate::scene::Change;
 use crate::scene::record::{Point, Record, Recovery};
 use crate::session::Sample;
-use crate::session::command::{Command, Intake, LeaseId};
+use crate::session::command::{Batch, Command, Intake, LeaseId};
 use crate::session::local::Refinement;
 use crate::session::sampling::{HEARTBEAT_S, Sampler, Sampling};
 use crate::session::schedule::Schedule;
@@ -41,6 +43,7 @@ use frames::{Delivery, Encoder, Viewer};
 use inbox::{Inbox, Request};
 use priority::give_way;
 use queue::{Reader, queue};
+use reading::{Reading, Recipient};
 use streams::Streams;
 pub use streams::{Held, StreamGuard};
 use tally::Tally;
@@ -200,11 +203,15 @@ impl Live {
         answer
     }
 
-    /// Takes in all of `commands` from the holder of `lease`, or none. The lock is held to put them in the queue alone.
-    pub fn submit(&self, lease: LeaseId, commands: Vec<Command>) -> Result<()> {
+    /// Accepts all of `commands` from the holder of `lease`, or none. The first slice of them is put in the queue.
+    pub fn submit(&self, lease: LeaseId, commands: Vec<Command>) -> Result<Accepted<'_>> {
         let rules = lock(&self.intake).rules();
         let checked = rules.check(commands)?;
-        self.at_intake(|intake, now| intake.take(lease, checked, now))
+        self.at_intake(|intake, now| {
+            let mut batch = intake.accept(lease, checked, now)?;
+            let goes_on = intake.go_on(&mut batch);
+            Ok(Accepted { live: self, batch, goes_on })
+        })
     }
 
     /// So many commands were refused.
@@ -248,8 +255,10 @@ impl Live {
         loop {
             let base = self.at_intake(|intake, _| intake.changed_to());
             let now = base.as_ref().unwrap_or(&self.model);
-            let model = now.changed_until(change, &self.model.scene, &self.limits, stop)?;
+            let model = memory::attempt("", || now.changed_until(change, &self.model.scene, &self.limits, stop))?;
             check_work(&model, &self.limits)?;
+            // The stepping thread lays out what the new scheme keeps, and a checkpoint.
+            memory::check(2 * model.state_bytes(), "another tissue")?;
             let (before, after) = (lock(&self.status).model.plan.substeps, model.plan.substeps);
             if after > before {
                 admit(self.cost.awake_share() * f64::from(after) / f64::from(before))?;
@@ -299,20 +308,23 @@ impl Live {
         reader
     }
 
-    /// Records of some points, or of all, every so many steps.
+    /// Records of some points, or of all, every so many steps; refused if there is no memory for one.
     pub fn probe(
         &self,
         every: u64,
         points: Option<Vec<[usize; 2]>>,
         energy: bool,
         account: &Account,
-    ) -> Reader<PacedRecord> {
+    ) -> Result<Reader<PacedRecord>> {
         let count = points.as_ref().map_or(self.model.len(), Vec::len).max(1);
-        let room = self.limits.queued_bytes / (count * size_of::<Point>());
-        let (writer, reader) = queue(room.clamp(1, self.limits.queued_records));
+        let bytes = count * size_of::<Point>();
+        memory::check(bytes as u64, "a record")?;
+        let room = (self.limits.queued_bytes / bytes).clamp(1, self.limits.queued_records);
+        let (writer, reader) = queue(room);
+        let (recipient, points) = (Recipient::new(writer, room), points.map(Arc::from));
         let account = account.clone();
-        self.inbox.send(self.number, Request::Probe(ProbeTap { every, points, energy, writer, account }));
-        reader
+        self.inbox.send(self.number, Request::Probe(ProbeTap { every, points, energy, recipient, account }));
+        Ok(reader)
     }
 
     /// The force law under a tip of `radius_m`. Computed once a radius, tenths of a second, unless `stop` is set; a coarse
@@ -323,7 +335,8 @@ impl Live {
         if let Some((.., law)) = lock(&self.laws).iter().find(kept) {
             return Ok(law.clone());
         }
-        let Some(law) = Law::within(&model, radius_m, self.limits.law_work, stop).map(Arc::new) else {
+        let law = || Ok(Law::within(&model, radius_m, self.limits.law_work, stop));
+        let Some(law) = memory::attempt("device", law)?.map(Arc::new) else {
             let message = "the force law of this tissue would take too much work: touch without a device";
             return Err(Refusal::new(Reason::NotAvailable, "device", message));
         };
@@ -338,6 +351,36 @@ impl Live {
     /// Frames for a viewer.
     pub fn view(&self, viewer: Arc<Viewer>) {
         self.inbox.send(self.number, Request::View(viewer));
+    }
+}
+
+/// Commands that were accepted. Those that are not in the queue yet are put there when this is dropped.
+pub struct Accepted<'l> {
+    live: &'l Live,
+    batch: Batch,
+    goes_on: bool,
+}
+
+impl Accepted<'_> {
+    fn go_on(&mut self) {
+        let batch = &mut self.batch;
+        self.goes_on = self.live.at_intake(|intake, _| intake.go_on(batch));
+    }
+
+    /// Puts them in the queue slice by slice. Between slices other tasks and the stepping thread have their turns.
+    pub async fn taken_in(mut self) {
+        while self.goes_on {
+            tokio::task::yield_now().await;
+            self.go_on();
+        }
+    }
+}
+
+impl Drop for Accepted<'_> {
+    fn drop(&mut self) {
+        while self.goes_on {
+            self.go_on();
+        }
     }
 }
 
@@ -358,6 +401,7 @@ pub struct Pacer {
     pub budget: Arc<Budget>,
     inboxes: Vec<Arc<Inbox>>,
     encoder: Arc<Encoder>,
+    reading: Arc<Reading>,
     threads: Mutex<Vec<JoinHandle<()>>>,
     sessions: Sessions,
     auditor: Arc<Auditor>,
@@ -379,10 +423,10 @@ pub fn random_bits() -> Result<u128> {
 }
 
 impl Pacer {
-    /// Starts `threads` stepping threads, one that encodes frames, and one that measures errors with `audit_share` of a core;
-    /// none if that is 0.
+    /// Starts `threads` stepping threads, one that encodes frames, one that reads large sheets, and one that measures
+    /// errors with `audit_share` of a core; none if that is 0.
     pub fn start(threads: usize, audit_share: f64, limits: &Limits, budget: Arc<Budget>) -> std::io::Result<Arc<Self>> {
-        let encoder = Arc::new(Encoder::default());
+        let (encoder, reading) = (Arc::new(Encoder::default()), Arc::new(Reading::default()));
         let mut handles = Vec::new();
         let mut inboxes = Vec::new();
         // It ends when the stepping threads have ended, and nobody sends any more.
@@ -395,12 +439,18 @@ impl Pacer {
         for index in 0..threads.max(1) {
             let inbox = Arc::new(Inbox::default());
             inboxes.push(inbox.clone());
-            let (encoder, refiner) = (encoder.clone(), refiner.clone());
+            let (encoder, refiner, reading) = (encoder.clone(), refiner.clone(), reading.clone());
             let builder = std::thread::Builder::new().name(format!("step-{index}"));
-            handles.push(builder.spawn(move || thread::work(&inbox, &encoder, &refiner))?);
+            handles.push(builder.spawn(move || thread::work(&inbox, &encoder, &refiner, &reading))?);
         }
-        let worker = encoder.clone();
-        handles.push(std::thread::Builder::new().name("frames".into()).spawn(move || worker.work())?);
+        let (worker, shared) = (encoder.clone(), budget.clone());
+        handles.push(std::thread::Builder::new().name("frames".into()).spawn(move || worker.work(&shared))?);
+        let reader = reading.clone();
+        let worker = move || {
+            give_way();
+            reader.work();
+        };
+        handles.push(std::thread::Builder::new().name("records".into()).spawn(worker)?);
         let (auditor, sessions) = (Arc::new(Auditor::default()), Sessions::default());
         if audit_share > 0.0 {
             let (auditor, sessions) = (auditor.clone(), sessions.clone());
@@ -415,6 +465,7 @@ impl Pacer {
             budget,
             inboxes,
             encoder,
+            reading,
             threads: Mutex::new(handles),
             sessions,
             auditor,
@@ -492,6 +543,7 @@ impl Pacer {
         }
         self.inboxes.iter().for_each(|inbox| inbox.stop(why.clone()));
         self.encoder.stop();
+        self.reading.stop();
         self.auditor.stop();
         for thread in lock(&self.threads).drain(..) {
             let _ = thread.join();

@@ -8,7 +8,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::Live;
 use super::clock::now_ns;
-use crate::budget::{Account, Pool, Resource, Taken};
+use crate::budget::{Account, Pool, Purpose, Resource, Taken};
 use crate::limits::Limits;
 use crate::lock::lock;
 use crate::refusal::{Reason, Refusal, Result};
@@ -39,8 +39,12 @@ struct Open {
     account: Account,
     since_ns: u64,
     cut: CancellationToken,
-    _taken: Taken,
+    _taken: [Taken; 2],
 }
+
+/// Bytes of a stream that the client has not taken: the transport (hyper) asks for no more above 400 KiB, and then holds at most one
+/// more message, which is of 64 KiB or little more.
+const UNSENT_BYTES: u64 = (400 + 80) << 10;
 
 /// A stream as it is shown to who administers.
 #[derive(Debug, Clone)]
@@ -102,7 +106,8 @@ pub fn cut() -> Refusal {
 impl Live {
     /// Room for one more stream of `account`, opened by the call `what`.
     pub fn open_stream(self: &Arc<Self>, what: &'static str, held: Held, account: &Account) -> Result<StreamGuard> {
-        let _taken = account.take(Resource::Streams, 1, "")?;
+        let stream = account.take(Resource::Streams, 1, "")?;
+        let _taken = [stream, account.take(Resource::Memory(Purpose::Connections), UNSENT_BYTES, "")?];
         let mut streams = lock(&self.streams);
         let all = streams.open.len();
         if all >= streams.most || held == Held::Nothing && !streams.readers.take(account.number(), 1) {

@@ -7,10 +7,12 @@ use tokio::sync::oneshot;
 use super::clock::now_ns;
 use super::frames::Viewer;
 use super::queue::{Wakes, Writer};
+use super::reading::{Copied, Copies, Piece, Reading, Recipient, is_much};
 use super::{PacedRecord, PacedSample, Recorded};
-use crate::budget::{Account, Purpose, Resource, Work};
+use crate::budget::{Account, Purpose, Resource, Taken, Work};
+use crate::memory;
 use crate::refusal::Result;
-use crate::scene::record::Point;
+use crate::scene::record::{Point, Record};
 use crate::session::Session;
 use crate::session::sampling::Sampler;
 
@@ -30,11 +32,33 @@ pub(super) struct SampleTap {
 pub(super) struct ProbeTap {
     pub(super) every: u64,
     /// All, if none are named.
-    pub(super) points: Option<Vec<[usize; 2]>>,
+    pub(super) points: Option<Arc<[[usize; 2]]>>,
     pub(super) energy: bool,
-    pub(super) writer: Writer<PacedRecord>,
+    pub(super) recipient: Arc<Recipient>,
     /// Who reads, and pays.
     pub(super) account: Account,
+}
+
+/// A record of a moment, or what is to be read for one.
+enum Told {
+    Record(PacedRecord),
+    Piece(Piece),
+}
+
+impl ProbeTap {
+    /// A record without energies, and its memory; of many points one without points, and the copy to read them from.
+    fn read(&self, session: &Session, copies: &mut Copies) -> Result<(Record, Taken, Option<Arc<Copied>>)> {
+        let all = session.model().len();
+        let points = self.points.as_ref().map_or(all, |points| points.len());
+        let bytes = (points * size_of::<Point>()) as u64;
+        let taken = self.account.take(Resource::Memory(Purpose::Records), bytes, "")?;
+        if is_much(points, all) {
+            let copied = copies.of(session, &self.account)?;
+            return Ok((session.record(Some(&[])), taken, Some(copied)));
+        }
+        let record = memory::attempt("", || Ok(session.record(self.points.as_deref())))?;
+        Ok((record, taken, None))
+    }
 }
 
 /// A stream of frames.
@@ -93,43 +117,61 @@ pub(super) struct Taps {
 }
 
 impl Taps {
-    /// Tells who probes of this moment: a record each for those who ask for different things.
-    pub(super) fn record(&self, session: &Session, wakes: &mut Wakes) {
+    /// Tells who probes of this moment: a record each for those who ask for different things. Records of many points are
+    /// read from a copy, by the thread of `reading`.
+    pub(super) fn record(&self, session: &Session, copies: &mut Copies, reading: &Reading, wakes: &mut Wakes) {
         let step = session.step_count();
         // A pass over the sheet, once for all who want it.
         let mut energy = None;
-        let mut told: Vec<(&ProbeTap, PacedRecord)> = Vec::new();
+        let mut told: Vec<(&ProbeTap, Told)> = Vec::new();
         for tap in self.probes.iter().filter(|tap| step.is_multiple_of(tap.every)) {
-            let same = |told: &&(&ProbeTap, _)| (&told.0.points, told.0.energy) == (&tap.points, tap.energy);
-            if let Some((_, record)) = told.iter().find(same) {
-                tap.writer.push_quietly(record.clone(), wakes);
-                continue;
+            let writer = tap.recipient.writer();
+            let same = |told: &&mut (&ProbeTap, _)| (&told.0.points, told.0.energy) == (&tap.points, tap.energy);
+            match told.iter_mut().find(same) {
+                Some((_, Told::Record(record))) => {
+                    writer.push_quietly(record.clone(), wakes);
+                    continue;
+                }
+                Some((_, Told::Piece(Piece::Record { to, .. }))) if !tap.recipient.is_behind() => {
+                    to.push(tap.recipient.clone());
+                    continue;
+                }
+                _ => {}
             }
             let now = now_ns();
-            let points = tap.points.as_ref().map_or(session.model().len(), Vec::len);
-            let bytes = (points * size_of::<Point>()) as u64;
-            let has_time = tap.account.must_wait_ns(Work::Reading, now) == 0;
-            let taken =
-                has_time.then(|| tap.account.take(Resource::Memory(Purpose::Records), bytes, "").ok()).flatten();
-            let Some(_taken) = taken else {
-                tap.writer.skip();
+            let has_time = tap.account.must_wait_ns(Work::Reading, now) == 0 && !tap.recipient.is_behind();
+            let read = has_time.then(|| tap.read(session, copies)).and_then(Result::ok);
+            let Some((mut record, taken, copied)) = read else {
+                writer.skip();
                 continue;
             };
-            let mut record = session.record(tap.points.as_deref());
             if tap.energy {
                 record.energy_j = Some(*energy.get_or_insert_with(|| session.energy()));
             }
             let ended = now_ns();
             tap.account.spend(Work::Reading, ended, ended.saturating_sub(now));
-            let record = Arc::new(Recorded { step, record, _taken });
-            tap.writer.push_quietly(record.clone(), wakes);
-            told.push((tap, record));
+            told.push(match copied {
+                Some(copied) => {
+                    let (points, to) = (tap.points.clone(), vec![tap.recipient.clone()]);
+                    (tap, Told::Piece(Piece::Record { copied, points, step, record, taken, to }))
+                }
+                None => {
+                    let record = Arc::new(Recorded { step, record, _taken: taken });
+                    writer.push_quietly(record.clone(), wakes);
+                    (tap, Told::Record(record))
+                }
+            });
+        }
+        for (tap, told) in told {
+            if let Told::Piece(piece) = told {
+                reading.post(&tap.account, piece);
+            }
         }
     }
 
     pub(super) fn forget_the_gone(&mut self) {
         self.samples.retain(|tap| !tap.writer.is_abandoned());
-        self.probes.retain(|tap| !tap.writer.is_abandoned());
+        self.probes.retain(|tap| !tap.recipient.writer().is_abandoned());
         self.viewers.retain(|tap| !tap.viewer.is_gone());
         self.hashes.retain(|waiting| !waiting.2.is_closed());
     }

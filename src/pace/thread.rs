@@ -27,16 +27,17 @@ use super::cost::Longest;
 use super::frames::{Encoder, Job, Viewer};
 use super::inbox::{Inbox, Request};
 use super::queue::Wakes;
+use super::reading::{Copies, Hashed, Reading};
 use super::taps::{SampleTap, Taps, ViewTap};
 use super::{Live, PacedSample, State};
 use crate::lock::lock;
+use crate::memory;
 use crate::refusal::{Reason, Refusal, Result};
 use crate::session::Session;
 use crate::session::command::Due;
 use crate::session::local::Refinement;
 use crate::session::schedule::Schedule;
 use crate::sheet::audit::Mark;
-use crate::surface::Snapshot;
 
 /// Steps that a session may be behind before the rest is dropped.
 const CATCH_UP_STEPS: f64 = 2.0;
@@ -75,7 +76,8 @@ pub(super) struct Running {
     lapsed_leases: u64,
     dilation: Dilation,
     due: Vec<Due>,
-    hashed: Option<(u64, u128)>,
+    hashed: Hashed,
+    copies: Copies,
     taps: Taps,
     /// Who is to be told of the window that the session was asked for.
     audit: Option<SyncSender<Mark>>,
@@ -133,6 +135,7 @@ impl Rota {
 struct Desk<'t> {
     encoder: &'t Encoder,
     refiner: &'t SyncSender<Refinement>,
+    reading: &'t Reading,
     wakes: Wakes,
     longest: Longest,
 }
@@ -143,13 +146,13 @@ pub(super) fn beat_ns(now_ns: u64) -> u64 {
 }
 
 /// The thread's work.
-pub(super) fn work(inbox: &Inbox, encoder: &Encoder, refiner: &SyncSender<Refinement>) {
+pub(super) fn work(inbox: &Inbox, encoder: &Encoder, refiner: &SyncSender<Refinement>, reading: &Reading) {
     // The default slack of 50 µs would be the larger part of each step's lateness. Where it can't be set, so be it.
     #[cfg(target_os = "linux")]
     let _ = rustix::thread::set_current_timer_slack(std::num::NonZeroU64::new(1));
     let mut rota = Rota::default();
     let mut requests = VecDeque::new();
-    let mut desk = Desk { encoder, refiner, wakes: Wakes::default(), longest: Longest::default() };
+    let mut desk = Desk { encoder, refiner, reading, wakes: Wakes::default(), longest: Longest::default() };
     let mut begun_round_ns = 0;
     loop {
         let next_ns = rota.first().map(|first| first.0);
@@ -217,7 +220,8 @@ impl Running {
             lapsed_leases: 0,
             dilation,
             due: Vec::new(),
-            hashed: None,
+            hashed: Hashed::default(),
+            copies: Copies::default(),
             taps: Taps::default(),
             audit: None,
             deleted: false,
@@ -242,12 +246,17 @@ impl Running {
         self.not_before_ns = if !alone && is_late && takes_more { now_ns } else { 0 };
     }
 
-    /// Does something with it. A panic ends this session, and no other.
+    /// Does something with it. A panic ends this session, and no other; so does memory that can't be had.
     fn guarded(&mut self, act: impl FnOnce(&mut Self)) {
         let Err(panic) = catch_unwind(AssertUnwindSafe(|| act(self))) else { return };
-        let text = panic.downcast_ref::<String>().map(String::as_str);
-        let text = text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("without a message");
-        let reason = format!("a fault of the program ended it after step {}: {text}", self.session.step_count());
+        let step = self.session.step_count();
+        let reason = if let Some(refusal) = memory::refusal_of(&*panic) {
+            format!("after step {step} {}", refusal.message)
+        } else {
+            let text = panic.downcast_ref::<String>().map(String::as_str);
+            let text = text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("without a message");
+            format!("a fault of the program ended it after step {step}: {text}")
+        };
         tracing::error!(session = %self.live.id, reason, "session held");
         self.session.hold(reason.clone());
         self.end(&Refusal::new(Reason::SessionHeld, "", reason));
@@ -321,7 +330,9 @@ impl Running {
                 self.session.watch(inputs);
                 self.audit = Some(marks);
             }
-            Request::Probe(tap) if self.session.hold_reason().is_some() => tap.writer.close(self.passed(0)),
+            Request::Probe(tap) if self.session.hold_reason().is_some() => {
+                tap.recipient.writer().close(self.passed(0));
+            }
             Request::Probe(tap) => self.taps.probes.push(tap),
             Request::View(viewer) => {
                 // Who joins late gets a full frame first.
@@ -333,8 +344,10 @@ impl Running {
                 let at = at.unwrap_or(step);
                 if at > step && self.session.hold_reason().is_none() {
                     self.taps.hashes.push((at, account, reply));
+                } else if at == step {
+                    self.hash_for(&account, reply, desk.reading);
                 } else {
-                    let _ = reply.send(if at == step { self.hash_for(&account) } else { Err(self.passed(at)) });
+                    let _ = reply.send(Err(self.passed(at)));
                 }
             }
             Request::Delete(why) => {
@@ -419,8 +432,9 @@ impl Running {
             self.session.change(&model);
         }
 
-        let (Running { session, taps, due, .. }, wakes) = (&mut *self, &mut desk.wakes);
-        session.advance(due, |session| taps.record(session, wakes));
+        let (Running { session, taps, due, copies, .. }, wakes, reading) = (&mut *self, &mut desk.wakes, desk.reading);
+        copies.forget();
+        session.advance(due, |session| taps.record(session, copies, reading, wakes));
         self.tell_auditor();
         self.log_recovery();
         if let Some(reason) = self.session.hold_reason() {
@@ -433,7 +447,8 @@ impl Running {
             }
             // No further record will come.
             let held = self.passed(0);
-            self.taps.probes.drain(..).for_each(|tap| tap.writer.close(held.clone()));
+            let probes = self.taps.probes.drain(..);
+            probes.for_each(|tap| desk.reading.close(&tap.account, &tap.recipient, held.clone()));
         }
         if self.until.is_some_and(|until| self.session.step_count() >= until) {
             self.running = false;
@@ -507,18 +522,8 @@ impl Running {
             self.post(desk.encoder, viewers);
         }
         for (_, account, reply) in self.taps.hashes.extract_if(.., |waiting| waiting.0 == step).collect::<Vec<_>>() {
-            let _ = reply.send(self.hash_for(&account));
+            self.hash_for(&account, reply, desk.reading);
         }
-    }
-
-    fn post(&self, encoder: &Encoder, viewers: Vec<(Arc<Viewer>, u64)>) {
-        let mut displacement_m = std::array::from_fn(|_| Vec::new());
-        self.session.tissue().displacements_m(&mut displacement_m);
-        let points = self.live.model.points;
-        let snapshot = Snapshot::new(self.session.step_count(), self.session.time_s(), points, displacement_m);
-        let (snapshot, spacing_m) = (Arc::new(snapshot), self.live.model.scene.sheet.spacing_m);
-        let (overrun_count, time_dilation) = (self.overrun_count, self.dilation.value);
-        encoder.post(self.live.number, Job { snapshot, spacing_m, viewers, overrun_count, time_dilation });
     }
 
     fn publish_status(&self) {
@@ -569,7 +574,7 @@ impl Running {
         lock(&self.live.intake).close(why.clone());
         let taps = std::mem::take(&mut self.taps);
         taps.samples.iter().for_each(|tap| tap.writer.close(why.clone()));
-        taps.probes.iter().for_each(|tap| tap.writer.close(why.clone()));
+        taps.probes.iter().for_each(|tap| tap.recipient.writer().close(why.clone()));
         taps.viewers.iter().for_each(|tap| tap.viewer.close(why.clone()));
         for (_, _, reply) in taps.hashes {
             let _ = reply.send(Err(why.clone()));

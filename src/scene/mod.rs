@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::limits::Limits;
+use crate::memory;
 use crate::refusal::{Reason, Refusal, Result, not_negative, number, positive};
 use document::{Document, Item};
 
@@ -475,7 +476,12 @@ impl Sheet {
         let [nx, ny] = self.points;
         let mut indices: Vec<usize> = match &self.fixed {
             Fixed::Points(points) => points.as_slice().iter().map(|[i, j]| i * ny + j).collect(),
-            _ => (0..nx * ny).filter(|index| self.is_fixed([index / ny, index % ny])).collect(),
+            _ => {
+                // The rim, at most.
+                let mut indices = memory::with_room((2 * (nx + ny)).min(nx * ny), "the fixed points");
+                indices.extend((0..nx * ny).filter(|index| self.is_fixed([index / ny, index % ny])));
+                indices
+            }
         };
         indices.sort_unstable();
         indices.dedup();

@@ -215,7 +215,7 @@ impl Haptics {
                         .take(now, "commands of this stream")
                         .and_then(|()| wire::command::from_command(&command, &live.model.scene.sheet, now))
                         .and_then(|command| within_reach(command, live, hold.device.as_ref()))
-                        .and_then(|command| live.submit(hold.lease, vec![command]));
+                        .and_then(|command| live.submit(hold.lease, vec![command]).map(drop));
                     self.0.traffic.commanded(usize::from(taken.is_ok()));
                     if let Err(refusal) = taken {
                         live.count_refused(1);
@@ -467,14 +467,12 @@ impl HapticService for Haptics {
             command.map_err(|refusal| refusal.within(&format!("commands[{index}]")))
         };
         let commands: Result<Vec<Command>, Refusal> = request.commands.iter().enumerate().map(read).collect();
-        let taken = commands.and_then(|commands| {
-            live.submit(lease, commands)?;
-            Ok(live.at_intake(|intake, _| intake.tools_of(lease).collect()))
-        });
-        let tools = taken.inspect_err(|refusal| {
+        let accepted = commands.and_then(|commands| live.submit(lease, commands)).inspect_err(|refusal| {
             live.count_refused(request.commands.len());
             self.0.traffic.refused(refusal.reason);
         })?;
+        accepted.taken_in().await;
+        let tools = live.at_intake(|intake, _| intake.tools_of(lease).collect());
         self.0.traffic.commanded(request.commands.len());
         let sample = live.next_sample(tools).await?;
         let sample = Some(wire::sample::sample(&sample, 0, now_ns()));
@@ -532,7 +530,7 @@ impl HapticService for Haptics {
         };
         let guard = live.open_stream("Probe", Held::Nothing, &account)?;
         let cut = guard.cut().clone();
-        let records = live.probe(every, points, request.energy, &account);
+        let records = live.probe(every, points, request.energy, &account)?;
         let out = stream::unfold(Some((records, guard, None)), |state| async move {
             let (mut records, guard, begun) = state?;
             let (record, dropped, part) = match begun {

@@ -349,7 +349,7 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
     let incoming = connections::incoming(listener, tls, seats, &limits, budget.clone(), traffic, register.clone());
     let silence = Some(Duration::from_secs_f64(limits.keepalive_s));
     let bytes = limits.message_bytes;
-    let (folder, shared) = (Arc::new(house.config.viewer.clone()), house.clone());
+    let (pages, shared) = (page::Page::of(house.config.viewer.clone()), house.clone());
     let sessions = SessionServiceServer::new(sessions::Sessions(house.clone())).max_decoding_message_size(bytes);
     let haptics = HapticServiceServer::new(haptics::Haptics(house.clone())).max_decoding_message_size(bytes);
     let admin =
@@ -366,7 +366,7 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
         // Not for the routes below: the layer refuses what is not gRPC.
         .route_layer(GrpcWebLayer::new())
         .route("/textures/{file}", axum::routing::get(move |file, headers| textures::file(shared, file, headers)))
-        .fallback(move |request| page::page(folder.clone(), request));
+        .fallback(move |request| page::page(pages.clone(), request));
     let drain = CancellationToken::new();
     let serving = Server::builder()
         // Detects clients whose host has disappeared.

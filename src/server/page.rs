@@ -1,11 +1,15 @@
 //! The page that a browser shows: files of the built viewer, on the port that serves gRPC.
 //!
 //! They are looked up when they are asked for: in the folder of the configuration, then within the program (feature
-//! `viewer`). Without either, `/` says what is missing.
+//! `viewer`). Without either, `/` says what is missing. A file is read and hashed once as long as it does not change, and
+//! all answers share its bytes; so an answer that nobody reads takes no memory of its own.
 
+use std::collections::BTreeMap;
 use std::io::ErrorKind;
+use std::io::Read;
 use std::path::{Component, Path, PathBuf};
 use std::sync::Arc;
+use std::time::SystemTime;
 
 use axum::body::Body;
 use axum::extract::Request;
@@ -51,32 +55,116 @@ fn content_type(path: &str) -> &'static str {
     }
 }
 
+/// Bytes of all files that are kept. A larger file is not served.
+const MOST_BYTES: usize = 64 << 20;
+
+/// Files that are kept, at most.
+const MOST_FILES: usize = 256;
+
+/// Length and time of change of a file of the folder; none of one within the program.
+type Stamp = Option<(u64, Option<SystemTime>)>;
+
 /// A file of the page.
-fn read(folder: &Path, path: &str) -> Option<Bytes> {
-    let inside = Path::new(path);
-    // Nothing that could lead out of the folder.
-    if !inside.components().all(|part| matches!(part, Component::Normal(_))) {
-        return None;
+#[derive(Debug, Clone)]
+struct File {
+    stamp: Stamp,
+    bytes: Bytes,
+    /// For `ETag`.
+    tag: String,
+}
+
+/// The page's folder, and the files that were asked for.
+#[derive(Debug)]
+pub(super) struct Page {
+    folder: PathBuf,
+    kept: Arc<tokio::sync::Mutex<Kept>>,
+}
+
+/// Files by their paths.
+#[derive(Debug, Default)]
+struct Kept(BTreeMap<String, File>);
+
+impl Page {
+    /// The page in a folder.
+    pub(super) fn of(folder: PathBuf) -> Arc<Self> {
+        Arc::new(Page { folder, kept: Arc::default() })
     }
-    let file = folder.join(inside);
-    match std::fs::read(&file) {
-        Ok(bytes) => return Some(bytes.into()),
-        Err(e) if matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory | ErrorKind::IsADirectory) => {}
+
+    /// A file. They are looked up one at a time, so requests take one thread for files, and none reads what another is
+    /// reading.
+    async fn file(self: &Arc<Self>, path: &str) -> Option<File> {
+        let inside = PathBuf::from(path);
+        // Nothing that could lead out of the folder.
+        if !inside.components().all(|part| matches!(part, Component::Normal(_))) {
+            return None;
+        }
+        let (file, path) = (self.folder.join(inside), path.to_owned());
+        let mut kept = self.kept.clone().lock_owned().await;
+        tokio::task::spawn_blocking(move || kept.find(&file, path)).await.ok().flatten()
+    }
+}
+
+impl Kept {
+    /// The file of that path, read anew if it has changed.
+    fn find(&mut self, file: &Path, path: String) -> Option<File> {
+        let stamp = match std::fs::metadata(file) {
+            Ok(data) => data.is_file().then(|| (data.len(), data.modified().ok())),
+            Err(e) if matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => None,
+            Err(e) => {
+                warn!("{}: can't be read: {e}", file.display());
+                None
+            }
+        };
+        if let Some(known) = self.0.get(&path).filter(|known| known.stamp == stamp) {
+            return Some(known.clone());
+        }
+        self.0.remove(&path);
+        let (stamp, bytes) = match stamp.and_then(|_| read(file)) {
+            Some(bytes) => (stamp, bytes),
+            None => (None, embedded(&path)?),
+        };
+        let all = self.0.values().map(|file| file.bytes.len()).sum::<usize>() + bytes.len();
+        if all > MOST_BYTES || self.0.len() == MOST_FILES {
+            self.0.clear();
+        }
+        let file = File { stamp, tag: format!("\"{:032x}\"", xxh3_128(&bytes)), bytes };
+        self.0.insert(path, file.clone());
+        Some(file)
+    }
+}
+
+/// All of a file of the folder.
+fn read(file: &Path) -> Option<Bytes> {
+    let mut bytes = Vec::new();
+    let read = std::fs::File::open(file).and_then(|file| file.take(MOST_BYTES as u64 + 1).read_to_end(&mut bytes));
+    match read {
+        Ok(_) if bytes.len() <= MOST_BYTES => return Some(bytes.into()),
+        Ok(_) => warn!("{}: is larger than {MOST_BYTES} bytes", file.display()),
         Err(e) => warn!("{}: can't be read: {e}", file.display()),
-    }
-    #[cfg(feature = "viewer")]
-    if let Some(file) = Embedded::get(path) {
-        return Some(match file.data {
-            std::borrow::Cow::Borrowed(bytes) => Bytes::from_static(bytes),
-            std::borrow::Cow::Owned(bytes) => bytes.into(),
-        });
     }
     None
 }
 
+/// A file within the program.
+fn embedded(path: &str) -> Option<Bytes> {
+    #[cfg(feature = "viewer")]
+    let found = Embedded::get(path).map(|file| match file.data {
+        std::borrow::Cow::Borrowed(bytes) => Bytes::from_static(bytes),
+        std::borrow::Cow::Owned(bytes) => bytes.into(),
+    });
+    #[cfg(not(feature = "viewer"))]
+    let (found, _) = (None, path);
+    found
+}
+
 /// Bytes that a browser keeps and asks for again by their hash.
-pub(super) fn cached(bytes: Bytes, content_type: &'static str, control: &'static str, asked: &HeaderMap) -> Response {
-    let tag = format!("\"{:032x}\"", xxh3_128(&bytes));
+pub(super) fn cached(
+    bytes: Bytes,
+    tag: String,
+    content_type: &'static str,
+    control: &'static str,
+    asked: &HeaderMap,
+) -> Response {
     let known = asked.get_all(header::IF_NONE_MATCH).iter().filter_map(|value| value.to_str().ok());
     let known = known.flat_map(|tags| tags.split(',')).any(|known| known.trim().trim_start_matches("W/") == tag);
     let headers = [(header::ETAG, tag), (header::CACHE_CONTROL, control.to_owned())];
@@ -87,7 +175,7 @@ pub(super) fn cached(bytes: Bytes, content_type: &'static str, control: &'static
 }
 
 /// Answers whatever no service does.
-pub(super) async fn page(folder: Arc<PathBuf>, request: Request) -> Response {
+pub(super) async fn page(page: Arc<Page>, request: Request) -> Response {
     let headers = request.headers();
     let is_grpc = |value: &header::HeaderValue| value.as_bytes().starts_with(b"application/grpc");
     if headers.get(header::CONTENT_TYPE).is_some_and(is_grpc) {
@@ -103,20 +191,18 @@ pub(super) async fn page(folder: Arc<PathBuf>, request: Request) -> Response {
         path => path,
     }
     .to_owned();
-    let (asked, name) = (folder.clone(), path.clone());
-    let found = tokio::task::spawn_blocking(move || read(&asked, &name)).await.ok().flatten();
-    match found {
+    match page.file(&path).await {
         // Names in assets/ have a hash of what is in them.
-        Some(bytes) if path.starts_with("assets/") => {
-            cached(bytes, content_type(&path), "public, max-age=31536000, immutable", headers)
+        Some(File { bytes, tag, .. }) if path.starts_with("assets/") => {
+            cached(bytes, tag, content_type(&path), "public, max-age=31536000, immutable", headers)
         }
-        Some(bytes) => cached(bytes, content_type(&path), "no-cache", headers),
+        Some(File { bytes, tag, .. }) => cached(bytes, tag, content_type(&path), "no-cache", headers),
         None if path == "index.html" => {
             let html = [(header::CONTENT_TYPE, content_type(&path)), (header::CACHE_CONTROL, "no-store")];
             // Without this the policy would keep the page's own few rules out.
             let style =
                 [(header::CONTENT_SECURITY_POLICY, "default-src 'none'; style-src 'unsafe-inline'; img-src data:")];
-            let page = MISSING.replace("FOLDER", &escaped(&folder.display().to_string()));
+            let page = MISSING.replace("FOLDER", &escaped(&page.folder.display().to_string()));
             (StatusCode::NOT_FOUND, GUARDS, style, html, page).into_response()
         }
         None => (StatusCode::NOT_FOUND, GUARDS, format!("there is no {path} here\n")).into_response(),
@@ -125,4 +211,46 @@ pub(super) async fn page(folder: Arc<PathBuf>, request: Request) -> Response {
 
 fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn page() -> (Arc<Page>, tempfile::TempDir) {
+        let folder = tempfile::tempdir().unwrap();
+        (Page::of(folder.path().to_owned()), folder)
+    }
+
+    #[tokio::test]
+    async fn all_answers_share_the_bytes_of_a_file_until_it_changes() {
+        let (page, folder) = page();
+        std::fs::write(folder.path().join("a.js"), "one").unwrap();
+        let asked = (0..50).map(|_| page.file("a.js"));
+        let files: Vec<_> = futures_util::future::join_all(asked).await.into_iter().flatten().collect();
+        assert_eq!(files.len(), 50);
+        assert!(files.iter().all(|file| file.bytes.as_ptr() == files[0].bytes.as_ptr() && file.tag == files[0].tag));
+        std::fs::write(folder.path().join("a.js"), "another").unwrap();
+        let changed = page.file("a.js").await.unwrap();
+        assert_eq!((&*changed.bytes, changed.tag == files[0].tag), (&b"another"[..], false));
+        std::fs::remove_file(folder.path().join("a.js")).unwrap();
+        assert!(page.file("a.js").await.is_none() && page.kept.lock().await.0.is_empty());
+    }
+
+    #[tokio::test]
+    async fn what_is_kept_is_bounded() {
+        let (page, folder) = page();
+        for name in 0..MOST_FILES + 10 {
+            std::fs::write(folder.path().join(name.to_string()), name.to_string()).unwrap();
+            assert_eq!(page.file(&name.to_string()).await.unwrap().bytes, name.to_string());
+            assert!(page.kept.lock().await.0.len() <= MOST_FILES);
+        }
+        // Sparse: they take nothing of the disk.
+        for (name, bytes) in [("half", MOST_BYTES / 2), ("more", MOST_BYTES / 2 + 1), ("huge", MOST_BYTES + 1)] {
+            std::fs::File::create(folder.path().join(name)).unwrap().set_len(bytes as u64).unwrap();
+            assert_eq!(page.file(name).await.map(|file| file.bytes.len()), (bytes <= MOST_BYTES).then_some(bytes));
+            let kept: usize = page.kept.lock().await.0.values().map(|file| file.bytes.len()).sum();
+            assert!(kept <= MOST_BYTES, "{kept}");
+        }
+    }
 }

@@ -12,6 +12,7 @@ use super::{House, page};
 use crate::budget::{Purpose, Resource, Taken};
 use crate::limits::Limits;
 use crate::lock::lock;
+use crate::memory;
 use crate::refusal::Refusal;
 use crate::scene::Appearance;
 use crate::texture::{Texture, texture};
@@ -43,7 +44,7 @@ impl Textures {
 pub(super) async fn file(house: House, Path(file): Path<String>, headers: HeaderMap) -> Response {
     match house.texture(file.strip_suffix(".png").unwrap_or(&file)).await {
         // A scene's image may change.
-        Ok(texture) => page::cached(texture.png, "image/png", "no-cache", &headers),
+        Ok(texture) => page::cached(texture.png, texture.etag, "image/png", "no-cache", &headers),
         // Not an error status: a browser would log one.
         Err(_) => StatusCode::NO_CONTENT.into_response(),
     }
@@ -80,7 +81,7 @@ impl House {
         }
         let mut taken =
             account.take(Resource::Memory(Purpose::Textures), side * side * BYTES_PER_PIXEL, "texture_size")?;
-        let texture = texture(&appearance, limits)?;
+        let texture = memory::attempt("texture_size", || texture(&appearance, limits))?;
         taken.shrink_to(texture.png.len() as u64);
         kept.push((appearance, texture.clone(), taken));
         Ok(texture)

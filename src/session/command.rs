@@ -7,10 +7,13 @@ use std::sync::Arc;
 use super::schedule::Schedule;
 use crate::budget::{Account, Purpose, Resource, Taken};
 use crate::limits::Limits;
-use crate::refusal::{Reason, Refusal, Result, positive};
+use crate::refusal::{Reason, Refusal, Result};
 use crate::scene::Scene;
-use crate::scene::script::{Action, check_poke, check_reach};
+use crate::scene::script::Action;
 use crate::sheet::Model;
+pub use batch::{Batch, SLICE};
+use rules::tip_radius_m;
+pub use rules::{Checked, Rules};
 
 /// One command to one tool.
 #[derive(Debug, Clone, PartialEq)]
@@ -60,6 +63,8 @@ struct Lease {
     waiting: usize,
     /// Place of the tool's newest command in the queue.
     last_place: Option<Place>,
+    /// A batch of commands is being taken in: those of the tool that came since this arrival wait for the rest of it.
+    batch_since: Option<u64>,
     /// Counts it among those of who holds it.
     seat: Option<Taken>,
 }
@@ -82,68 +87,6 @@ pub struct Counts {
     pub waiting: u64,
 }
 
-/// What a command has to keep to, whenever it comes: so it is looked at before anybody's turn at the intake.
-#[derive(Debug)]
-pub struct Rules {
-    scene: Scene,
-    limits: Limits,
-}
-
-/// Commands that keep to the rules of a session.
-#[derive(Debug)]
-pub struct Checked(Vec<Command>);
-
-impl Rules {
-    /// All of `commands`, if each keeps to the rules.
-    pub fn check(&self, commands: Vec<Command>) -> Result<Checked> {
-        if commands.len() > self.limits.queued_commands_per_tool {
-            let message = format!("{} commands are more than a tool may have waiting", commands.len());
-            return Err(Refusal::new(Reason::QueueFull, "", message));
-        }
-        commands.iter().try_for_each(|command| self.check_one(command))?;
-        Ok(Checked(commands))
-    }
-
-    fn check_one(&self, command: &Command) -> Result<()> {
-        if let Some(seconds) = command.time_to_live_s {
-            positive("time_to_live_s", seconds)?;
-        }
-        match &command.action {
-            Action::Push(poke) => check_poke(poke, &self.scene.sheet, &self.limits),
-            Action::Grasp { point, displacement_m } => {
-                crate::scene::script::check_free("position.point", &self.scene.sheet, *point)?;
-                crate::refusal::finite_vector("position.displacement_m", *displacement_m)?;
-                let far_m = displacement_m.length();
-                check_reach("position.displacement_m", &self.scene.sheet, far_m, &self.limits)
-            }
-            Action::Lead { place_m, tip } => {
-                crate::refusal::finite_vector("place_m", *place_m)?;
-                let centre_m = (self.scene.sheet.extent_m() / 2.0).extend(0.0);
-                check_reach("place_m", &self.scene.sheet, (*place_m - centre_m).length(), &self.limits)?;
-                tip.check("tip", &self.scene.sheet)
-            }
-            Action::Release => Ok(()),
-        }
-    }
-}
-
-/// Radius of the tip by which a command leads its tool, m.
-fn tip_radius_m(command: &Command) -> Option<f64> {
-    if let Action::Lead { tip, .. } = &command.action { Some(tip.radius_m) } else { None }
-}
-
-/// Refuses another tip in the tissue: the surface under a larger one lies elsewhere, and to meet it at once is a blow that no
-/// instrument gives.
-fn check_tip(before_m: Option<f64>, now_m: Option<f64>) -> Result<()> {
-    match (before_m, now_m) {
-        (Some(before_m), Some(now_m)) if before_m.to_bits() != now_m.to_bits() => {
-            let message = format!("is {now_m} m, but the tool is led with a tip of {before_m} m: release it first");
-            Err(Refusal::new(Reason::OutOfTurn, "pose.tip.radius_m", message))
-        }
-        _ => Ok(()),
-    }
-}
-
 /// Takes in commands and holds them until their step.
 #[derive(Debug)]
 pub struct Intake {
@@ -152,6 +95,8 @@ pub struct Intake {
     queue: BTreeMap<Place, Due>,
     /// Of those, commands of clients: counted as they come and go, for whoever asks.
     waiting: u64,
+    /// Commands of batches that are not in the queue yet.
+    coming: usize,
     /// Changes of tissue that wait for their step, by ascending step, and the memory of each.
     changes: VecDeque<(u64, Arc<Model>, Option<Taken>)>,
     /// Who pays for what waits here, and what was taken for commands.
@@ -180,6 +125,7 @@ impl Intake {
             leases: BTreeMap::new(),
             queue: BTreeMap::new(),
             waiting: 0,
+            coming: 0,
             changes: VecDeque::new(),
             account: None,
             taken: None,
@@ -203,7 +149,7 @@ impl Intake {
 
     /// Has the memory of `more` commands beside those that wait, or refuses.
     fn make_room(&mut self, more: usize) -> Result<()> {
-        let bytes = bytes_of(self.queue.len() + more);
+        let bytes = bytes_of(self.queue.len() + self.coming + more);
         let Some(account) = self.account.as_ref().filter(|_| bytes > 0) else { return Ok(()) };
         match &mut self.taken {
             Some(taken) => taken.grow_to(bytes, ""),
@@ -213,7 +159,7 @@ impl Intake {
 
     /// Gives back what no longer waits.
     fn give_back(&mut self) {
-        let bytes = bytes_of(self.queue.len());
+        let bytes = bytes_of(self.queue.len() + self.coming);
         if let Some(taken) = self.taken.as_mut().filter(|taken| taken.amount() > bytes) {
             taken.shrink_to(bytes);
         }
@@ -258,6 +204,7 @@ impl Intake {
                 tip_radius_m: None,
                 waiting: 0,
                 last_place: None,
+                batch_since: None,
                 seat: None,
             };
             self.leases.insert(*tool, lease);
@@ -340,45 +287,9 @@ impl Intake {
     pub fn submit(&mut self, id: LeaseId, commands: Vec<Command>, now_ns: u64) -> Result<()> {
         self.check_open()?;
         let checked = self.rules.check(commands)?;
-        self.take(id, checked, now_ns)
-    }
-
-    /// The same of commands that were looked at before ([`Rules::check`]).
-    pub fn take(&mut self, id: LeaseId, Checked(commands): Checked, now_ns: u64) -> Result<()> {
-        self.check_open()?;
-        self.lapse(now_ns);
-        if commands.is_empty() {
-            return self.renew(id, now_ns);
-        }
-        // Of each tool the last sequence number, how many commands come, and the tip after them.
-        let mut last: BTreeMap<u32, (u64, usize, Option<f64>)> = BTreeMap::new();
-        for command in &commands {
-            let lease = self.leases.get(&command.tool).filter(|lease| lease.id == id);
-            let lease = lease.ok_or_else(|| not_holder(format!("tool {} is not held by this client", command.tool)))?;
-            let coming = last.get(&command.tool).copied();
-            let before = coming.map(|(sequence, ..)| sequence).or(lease.last_sequence);
-            if let Some(before) = before.filter(|before| command.sequence <= *before) {
-                let message = format!("must be above {before}, the last one, but is {}", command.sequence);
-                return Err(Refusal::new(Reason::StaleSequence, "sequence", message));
-            }
-            let tip_radius_m = tip_radius_m(command);
-            check_tip(coming.map_or(lease.tip_radius_m, |coming| coming.2), tip_radius_m)?;
-            last.insert(command.tool, (command.sequence, coming.map_or(0, |coming| coming.1) + 1, tip_radius_m));
-        }
-        // A limit per tool, so that no holder fills the queue for the others.
-        for (tool, (_, coming, _)) in &last {
-            let waiting = self.leases.get(tool).map_or(0, |lease| lease.waiting);
-            if waiting + coming > self.rules.limits.queued_commands_per_tool {
-                let message = format!("{waiting} commands of tool {tool} wait for their step already");
-                return Err(Refusal::new(Reason::QueueFull, "", message));
-            }
-        }
-        self.make_room(commands.len())?;
-        self.counts.accepted += commands.len() as u64;
-        for command in commands {
-            self.enqueue(command, false);
-        }
-        self.renew(id, now_ns)
+        let mut batch = self.accept(id, checked, now_ns)?;
+        while self.go_on(&mut batch) {}
+        Ok(())
     }
 
     fn enqueue(&mut self, command: Command, ends_lease: bool) {
@@ -502,8 +413,14 @@ impl Intake {
     pub fn take_due(&mut self, step: u64, now_ns: u64, due: &mut Vec<Due>) {
         self.lapse(now_ns);
         self.resting = None;
-        while let Some(entry) = self.queue.first_entry().filter(|entry| entry.key().0 <= step) {
-            let entry = entry.remove();
+        let mut from = (0, 0);
+        while let Some((place, entry)) = self.queue.range(from..=(step, u64::MAX)).next() {
+            let place = *place;
+            if self.is_held_back(&place, entry) {
+                from = (place.0, place.1 + 1);
+                continue;
+            }
+            let Some(entry) = self.queue.remove(&place) else { break };
             if let Some(lease) = self.leases.get_mut(&entry.command.tool).filter(|_| !entry.ends_lease) {
                 lease.waiting = lease.waiting.saturating_sub(1);
             }
@@ -537,7 +454,7 @@ impl Intake {
 
     /// Counts of the commands so far, by outcome.
     pub fn counts(&self) -> Counts {
-        Counts { waiting: self.waiting, ..self.counts }
+        Counts { waiting: self.waiting + self.coming as u64, ..self.counts }
     }
 
     /// From now on refuses everything with `refusal`.
@@ -594,5 +511,7 @@ fn not_holder(message: String) -> Refusal {
     Refusal::new(Reason::NotHolder, "lease_id", message)
 }
 
+mod batch;
+mod rules;
 #[cfg(test)]
 mod tests;

@@ -16,14 +16,18 @@ use glam::DVec3;
 
 use crate::haptics::LocalModel;
 use crate::haptics::path::{Path, Play};
+use crate::memory;
 use crate::scene::law::{ForceLaw, MoveLaw};
 use crate::scene::record::{EnergyJ, Point, Record};
 use crate::scene::script::{Action, nearest_point};
 use crate::scene::tip::Tip;
 use crate::sheet::audit::{Inputs, Mark};
-use crate::sheet::{self, Energy, Feel, Grasp, Model, PointState, Push, Tissue};
+use crate::sheet::{self, Energy, Feel, Grasp, Model, PointState, Push, Still, Tissue};
 use command::Due;
 use recovery::{Recovered, Recoveries};
+
+/// The name of a record in messages.
+const RECORD: &str = "a record";
 
 /// The sample of one tool at the end of a step.
 #[derive(Debug, Clone, PartialEq)]
@@ -403,6 +407,11 @@ impl Session {
         }
     }
 
+    /// A copy of the tissue as it is now, of which [`record_of`] tells the points later.
+    pub fn still(&self) -> Still {
+        self.tissue.still()
+    }
+
     /// The energies of the whole sheet, for a record: a pass over it.
     pub fn energy(&self) -> EnergyJ {
         energy_record(self.tissue.energy())
@@ -414,13 +423,21 @@ impl Session {
         Record {
             time_s: self.time_s(),
             points: match points {
-                Some(points) => points.iter().map(of).collect(),
-                None => (0..self.model().len()).map(|index| of(&self.model().point_of(index))).collect(),
+                Some(points) => memory::collected(points.iter().map(of), RECORD),
+                None => {
+                    let all = (0..self.model().len()).map(|index| of(&self.model().point_of(index)));
+                    memory::collected(all, RECORD)
+                }
             },
             energy_j: None,
             awake_points: self.tissue.awake_points(),
         }
     }
+}
+
+/// The record of a point (grid indices [i, j]) of a copy.
+pub fn record_of(still: &Still, point: [usize; 2]) -> Point {
+    point_record(point, &still.point(still.model().index_of(point)))
 }
 
 fn energy_record(energy: Energy) -> EnergyJ {

@@ -22,6 +22,7 @@ use super::integrate::Oscillator;
 use super::model::Model;
 use super::real::Real;
 use super::{Sheet, Tissue, springs_of};
+use crate::memory;
 use crate::scene::Precision;
 pub use crate::scene::record::AuditedError;
 
@@ -369,7 +370,7 @@ impl<T: Real> Sheet<T> {
             let point = self.point(index);
             [point.displacement_m, point.reaction_n()]
         });
-        Observed(points.collect())
+        Observed(memory::collected(points, "an audit"))
     }
 
     /// Repeats the recorded inputs up to step `until`, in slices. Calls `go_on` between slices; returns false if that
@@ -465,6 +466,13 @@ impl Opening {
 }
 
 impl Audit {
+    /// What an audit of a sheet takes beside the copy of its beginning ([`Model::session_bytes`]), bytes: two twins in f64,
+    /// and what is observed of at most six states.
+    pub fn bytes(model: &Model) -> u64 {
+        let observed = 6 * model.len() * size_of::<[DVec3; 2]>();
+        2 * model.twin(1, Precision::F64).state_bytes() + observed as u64
+    }
+
     /// Repeats the window with `finer` times the substeps ([`FINER`]). `largest` is the result of earlier windows;
     /// `go_on` is called between slices of some milliseconds. `None` if it returned false, if nothing moved, or if the
     /// twin did not stay finite.

@@ -30,6 +30,7 @@ use super::footprint::{Footprint, Reached};
 use super::model::{Model, Plan};
 use super::real::Real;
 use super::tangent::{Patch, Tangent, Window};
+use crate::memory;
 use crate::scene::tip::{Coupling, Tip};
 
 /// The state of contact between a tool and the sheet.
@@ -373,6 +374,8 @@ impl<T: Real> Sheet<T> {
             return None;
         }
         let window = Window::around(&self.model, &tool.footprint);
+        // Without memory for it, the stiffness of the force law has to do.
+        memory::check(window.bytes(), "the stiffness under a tool").ok()?;
         let displacement =
             |index: usize| displacement_m(&self.model, &self.bench.layout, &self.state, self.model.point_of(index));
         let displacement_m = window.points(&self.model).map(displacement).collect();

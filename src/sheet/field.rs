@@ -1,11 +1,12 @@
 //! The memory of a sheet: values per point, laid out so that vectors of any width can sweep the rows.
 
-use std::ops::{Deref, DerefMut};
+use std::ops::{Deref, DerefMut, Range};
 use std::sync::Arc;
 
 use xxhash_rust::xxh3::Xxh3;
 
 use super::real::Real;
+use crate::memory;
 
 /// Lanes of the widest vector: rows are padded to a multiple of it.
 pub(super) const BLOCK: usize = crate::scene::LEAST_WIDTH;
@@ -113,32 +114,36 @@ impl<T: Real> State<T> {
         }
     }
 
-    /// XXH3-128 of the values of each point, by rows: for each field x, y and z, little-endian. Points for which
-    /// `has_moved` is false are known to be 0.
-    pub(super) fn hash(&self, layout: &Layout, has_moved: impl Fn([usize; 2]) -> bool) -> u128 {
-        let mut hasher = Xxh3::new();
+    /// Adds to a hash the values of each point of some blocks of [`BLOCK`] points (the last of a row may be shorter), which
+    /// are counted by rows: for each field x, y and z, little-endian. Points for which `has_moved` is false are known to
+    /// be 0.
+    pub(super) fn hash_blocks(
+        &self,
+        layout: &Layout,
+        has_moved: impl Fn([usize; 2]) -> bool,
+        blocks: Range<usize>,
+        hasher: &mut Xxh3,
+    ) {
         let size = size_of::<T>();
         let of_point = self.fields().count() * 3 * size;
-        let mut bytes = vec![0; layout.columns * of_point];
-        for i in 0..layout.rows {
-            if i.is_multiple_of(BLOCK) {
-                bytes.fill(0);
+        let blocks_per_row = layout.columns.div_ceil(BLOCK);
+        let (zeros, mut bytes) = (vec![0; BLOCK * of_point], vec![0; BLOCK * of_point]);
+        for block in blocks {
+            let (i, column) = (block / blocks_per_row, block % blocks_per_row * BLOCK);
+            let length = (layout.columns - column).min(BLOCK) * of_point;
+            if !has_moved([i, column]) {
+                hasher.update(&zeros[..length]);
+                continue;
             }
-            for (block, bytes) in bytes.chunks_mut(BLOCK * of_point).enumerate() {
-                if !has_moved([i, block * BLOCK]) {
-                    continue;
-                }
-                let from = i * layout.stride + block * BLOCK;
-                let planes = self.fields().flat_map(|field| (0..3).map(|c| &field[c * layout.plane + from..]));
-                for (plane, values) in planes.enumerate() {
-                    for (point, value) in bytes.chunks_exact_mut(of_point).zip(values) {
-                        value.write(&mut point[plane * size..][..size]);
-                    }
+            let from = i * layout.stride + column;
+            let planes = self.fields().flat_map(|field| (0..3).map(|c| &field[c * layout.plane + from..]));
+            for (plane, values) in planes.enumerate() {
+                for (point, value) in bytes[..length].chunks_exact_mut(of_point).zip(values) {
+                    value.write(&mut point[plane * size..][..size]);
                 }
             }
-            hasher.update(&bytes);
+            hasher.update(&bytes[..length]);
         }
-        hasher.digest128()
     }
 
     /// Copies the values of another state of the same layout and scheme.
@@ -162,7 +167,7 @@ impl<T: Real> Field<T> {
 
     /// All zeros.
     pub(super) fn of_length(length: usize) -> Self {
-        let storage = vec![T::default(); length + LINE / size_of::<T>()];
+        let storage: Vec<T> = memory::zeroed(length + LINE / size_of::<T>(), "the state of a sheet");
         // `align_offset` need not succeed: alignment only affects speed.
         let from = storage.as_ptr().align_offset(LINE).min(LINE / size_of::<T>());
         Field { storage, from, length }

@@ -25,6 +25,7 @@ use super::real::Real;
 use super::springs::Springs;
 use super::survey::Survey;
 use super::{BlowUp, Sheet, springs_of};
+use crate::memory;
 use crate::scene::tip::Tip;
 
 /// Substeps between two surveys.
@@ -324,9 +325,8 @@ pub(super) fn convert<T: Real>(
     let ratio = to.substep_s / from.substep_s;
     let points = layout.rows * layout.columns;
     // Compute all forces first: points are converted one by one, in place.
-    let forces: Vec<[T; 3]> = (0..points)
-        .map(|index| springs.gather(layout, &state.u, [index / layout.columns, index % layout.columns]))
-        .collect();
+    let force = |index| springs.gather(layout, &state.u, [index / layout.columns, index % layout.columns]);
+    let forces: Vec<[T; 3]> = memory::collected((0..points).map(force), "the forces of a sheet");
     for (index, force) in forces.iter().enumerate() {
         let pushed = applied.force_at(layout, 0, [index / layout.columns, index % layout.columns]);
         for (c, n) in force.iter().enumerate() {

@@ -53,14 +53,17 @@ mod rehearsal;
 mod rest;
 mod springs;
 pub mod stability;
+mod still;
 mod survey;
 mod sweep;
 pub mod tangent;
 mod tiles;
 
+use std::ops::Range;
 use std::sync::Arc;
 
 use glam::DVec3;
+use xxhash_rust::xxh3::Xxh3;
 
 use crate::scene::Precision;
 use crate::scene::law::{Moment, Motion};
@@ -81,6 +84,7 @@ pub use prescribed::Grasp;
 use prescribed::Prescribed;
 use real::Real;
 use springs::Springs;
+pub use still::{Hashing, Still};
 use sweep::{Bench, MAX_KEPT};
 use tiles::{CHECK_STEPS, Tiles};
 
@@ -201,8 +205,15 @@ pub trait Tissue: Send {
     fn largest_displacement_m(&self) -> f64;
     /// Writes the displacements, m, with x, y and z in separate vectors, points by rows.
     fn displacements_m(&self, into: &mut [Vec<f32>; 3]);
-    /// XXH3-128 of the state of every point: displacement, increment, and the scheme's kept values.
-    fn state_hash(&self) -> u128;
+    /// Adds some blocks of 16 points of a row, counted by rows, to a hash: displacement, increment, and the scheme's kept
+    /// values of each point.
+    fn hash_blocks(&self, blocks: Range<usize>, hasher: &mut Xxh3);
+    /// XXH3-128 of the state of every point.
+    fn state_hash(&self) -> u128 {
+        Hashing::default().add(self, usize::MAX).unwrap_or_default()
+    }
+    /// A copy of the sheet as it is now, to be read by another thread.
+    fn still(&self) -> Still;
 }
 
 /// Creates a sheet at rest.
@@ -569,7 +580,11 @@ impl<T: Real> Tissue for Sheet<T> {
         }
     }
 
-    fn state_hash(&self) -> u128 {
-        self.state.hash(&self.bench.layout, |point| self.tiles.has_moved(point))
+    fn hash_blocks(&self, blocks: Range<usize>, hasher: &mut Xxh3) {
+        Sheet::hash_blocks(self, blocks, hasher);
+    }
+
+    fn still(&self) -> Still {
+        Sheet::still(self)
     }
 }

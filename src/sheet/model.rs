@@ -259,7 +259,12 @@ impl Model {
 
     /// What a session of it may take, bytes: its state, the checkpoint, and one more that an audit begins from.
     pub fn session_bytes(&self) -> u64 {
-        const STATES: usize = 3;
+        const STATES: u64 = 3;
+        STATES * self.state_bytes() + self.bytes()
+    }
+
+    /// What the state of a sheet takes, bytes.
+    pub fn state_bytes(&self) -> u64 {
         let fields = 2 + self.plan.scheme.kept(self.precision == Precision::Compensated);
         let plane_bytes = match self.precision {
             Precision::F64 => Layout::new::<f64>(self.points).plane * size_of::<f64>(),
@@ -267,7 +272,7 @@ impl Model {
                 Layout::new::<f32>(self.points).plane * size_of::<f32>()
             }
         };
-        (STATES * fields * 3 * plane_bytes) as u64 + self.bytes()
+        (fields * 3 * plane_bytes) as u64
     }
 
     /// Number of points.

@@ -10,6 +10,7 @@ use super::lanes::Vector;
 /// f32 or f64. Only operations that IEEE 754 rounds exactly, so the bits do not depend on the machine.
 pub(super) trait Real:
     Copy
+    + bytemuck::Zeroable
     + Default
     + std::fmt::Debug
     + PartialEq

@@ -5,6 +5,7 @@
 use std::ops::Range;
 
 use super::field::{BLOCK, Layout};
+use crate::memory;
 
 /// Points along a side of a tile.
 pub(super) const TILE: usize = BLOCK;
@@ -23,7 +24,7 @@ pub(super) struct Marks {
 
 impl Marks {
     pub(super) fn none_of(count: usize) -> Self {
-        Marks { members: Vec::new(), has: vec![false; count] }
+        Marks { members: Vec::new(), has: memory::zeroed(count, "the tiles of a sheet") }
     }
 
     /// Adds a tile. Returns whether it is new.

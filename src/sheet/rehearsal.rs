@@ -323,7 +323,12 @@ mod tests {
     #[test]
     fn an_error_that_grows_is_expected_to_grow_as_long_as_vibrations_last() {
         let difference = |sets: &[&str], error: &dyn Fn(f64) -> f64| {
-            let rehearsal = Rehearsal::new(&scene(&[&["sheet.points=[3, 3]"][..], sets].concat()), 1.0, 0, &NEVER);
+            let rehearsal = Rehearsal::new(
+                &scene(&[&["sheet.points=[3, 3]"][..], sets].concat()),
+                1.0,
+                0,
+                &crate::sheet::choice::NEVER,
+            );
             let truth = course(rehearsal.steps, |_| 0.5);
             let other = course(rehearsal.steps, |part| 0.5 + error(part));
             rehearsal.difference(&LOADS[2], &truth, &other)
@@ -335,7 +340,7 @@ mod tests {
         assert!((difference(&undamped, &|_| 1e-3) - 2e-3).abs() < 1e-9);
         assert!((difference(&["damping.coefficient_n_s_per_m=0.5"], &|part| 1e-3 * part) - 2e-3).abs() < 1e-9);
         // Where nothing moves nothing errs.
-        let rehearsal = Rehearsal::new(&scene(&["sheet.points=[3, 3]"]), 1.0, 0, &NEVER);
+        let rehearsal = Rehearsal::new(&scene(&["sheet.points=[3, 3]"]), 1.0, 0, &crate::sheet::choice::NEVER);
         let still = course(rehearsal.steps, |_| 0.0);
         assert_eq!(rehearsal.difference(&LOADS[2], &still, &still), 0.0);
     }

@@ -17,6 +17,7 @@ use glam::{DMat3, DVec2, DVec3};
 
 use super::footprint::{Footprint, Reached};
 use super::model::Model;
+use crate::memory;
 use crate::scene::{Fixed, Sheet};
 
 /// How many times its reach around a disc the sheet is looked at: e⁻⁶ is left.
@@ -31,6 +32,11 @@ const ARRIVED: f64 = 1e-5;
 
 /// Most iterations of conjugate gradients.
 const MOST_ITERATIONS: u32 = 400;
+
+/// A point of a patch with six springs, and the vectors of a solution. The work of a force law is bounded, and so is its memory:
+/// 20 MB for the 116² points that 2^27 springs times iterations allow.
+const BYTES_PER_POINT: usize =
+    6 * size_of::<Spring>() + size_of::<DMat3>() + size_of::<DVec3>() + 8 * size_of::<Triple>() + 16;
 
 /// How much may be computed, and whether it is still wanted.
 #[derive(Debug, Clone)]
@@ -146,6 +152,11 @@ impl Window {
             size[axis] = high.min(scene.sheet.points[axis] - 1) + 1 - origin[axis];
         }
         Window { origin, size }
+    }
+
+    /// What a patch of it and a solution take, bytes.
+    pub(super) fn bytes(&self) -> u64 {
+        (self.size[0] * self.size[1] * BYTES_PER_POINT) as u64
     }
 
     /// The numbers of its points, by rows.
@@ -427,6 +438,7 @@ pub fn press_within<'m>(
     if least > allowance.left.get() {
         return None;
     }
+    memory::require(window.bytes(), "a force law");
     let at_rest = window.points(model).map(|_| DVec3::ZERO).collect();
     let mut patch = Patch { allowance, ..Patch::new(model, &footprint, window, at_rest) };
     let mut pressed = Vec::new();

@@ -17,6 +17,7 @@ use super::applied::Touch;
 use super::field::{Field, Layout};
 use super::real::Real;
 use super::region::{Marks, Region, TILE, tiles};
+use crate::memory;
 
 /// Steps between two checks whether tiles may sleep.
 pub(super) const CHECK_STEPS: u64 = 16;
@@ -39,6 +40,9 @@ const PULLING: [usize; 3] = [0, 1, 3];
 
 /// Values of a snapshot: three for each of 16 points, for each side and corner.
 const SNAPSHOT: usize = NEIGHBOURS.len() * 3 * TILE;
+
+/// The name of the tables in messages.
+const TABLES: &str = "the tiles of a sheet";
 
 /// Points next to a sleeping tile, in an awake tile.
 #[derive(Debug, Clone, Copy)]
@@ -98,11 +102,11 @@ impl<T: Real> Tiles<T> {
             tolerance,
             region: Region::none(&layout),
             awake_points: 0,
-            calm: vec![0; count],
-            drift_n: vec![0.0; count],
-            energy_j: vec![0.0; count],
+            calm: memory::zeroed(count, TABLES),
+            drift_n: memory::zeroed(count, TABLES),
+            energy_j: memory::zeroed(count, TABLES),
             asleep_j: 0.0,
-            elastic_j: vec![Cell::new(None); count],
+            elastic_j: memory::filled(count, Cell::new(None), TABLES),
             snapshots: Vec::new(),
             watches: Vec::new(),
             touched: Marks::none_of(count),
@@ -113,6 +117,22 @@ impl<T: Real> Tiles<T> {
             tiles.wake_all();
         }
         tiles
+    }
+
+    /// Of a copy that stays as it is: what is awake and what has moved, without what a step needs.
+    pub(super) fn still(&self) -> Self {
+        Tiles {
+            region: self.region.clone(),
+            calm: Vec::new(),
+            drift_n: Vec::new(),
+            energy_j: Vec::new(),
+            elastic_j: Vec::new(),
+            snapshots: Vec::new(),
+            watches: Vec::new(),
+            touched: Marks::default(),
+            moved: self.moved.clone(),
+            ..*self
+        }
     }
 
     pub(super) fn may_sleep(&self) -> bool {
@@ -252,7 +272,7 @@ impl<T: Real> Tiles<T> {
     /// Allocates the snapshots. Before the first sleep, all points were at 0.
     fn remember(&mut self) {
         if self.snapshots.is_empty() {
-            self.snapshots = vec![T::default(); self.calm.len() * SNAPSHOT];
+            self.snapshots = memory::zeroed(self.calm.len() * SNAPSHOT, TABLES);
         }
     }
 

@@ -8,6 +8,7 @@ use glam::DVec3;
 use super::refine::{COMPONENTS, Points, Rows, Source, Written};
 use super::wide::{Available, LANES, Lanes, Width, Work};
 use super::{Refinement, Snapshot};
+use crate::memory;
 
 /// Number format of displacements.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -138,7 +139,7 @@ pub fn encode_over(snapshot: &Snapshot, spent: Frame) -> Frame {
 fn encode_at(width: Width, snapshot: &Snapshot, spent: Frame) -> Frame {
     let mut frame = Frame { step: snapshot.step, simulation_time_s: snapshot.simulation_time_s, ..spent };
     if frame.encoding == Encoding::I16 {
-        frame.quanta = Quanta::over(&snapshot.box_m, 0.0);
+        frame.quanta = Quanta::over(snapshot.box_m(), 0.0);
     }
     let grid = frame.refinement;
     let mut rows = Rows::new(grid.between, grid.vertices()[1], frame.quanta.source(snapshot.points()));
@@ -180,7 +181,10 @@ where
                 patch.bytes = bytes.freeze();
             } else {
                 // One row, in parts.
-                parted.resize(COMPONENTS * band.iter().map(|patch| patch.count[1]).sum::<usize>(), [0; BYTES]);
+                let length = COMPONENTS * band.iter().map(|patch| patch.count[1]).sum::<usize>();
+                if parted.len() != length {
+                    parted = memory::filled(length, [0; BYTES], "a row of a frame");
+                }
                 rows.write(with, x - first_x, &mut parted);
                 for patch in band {
                     let part =

@@ -5,7 +5,11 @@
 
 use super::wide::{Available, LANES, Lanes};
 use crate::limits::Limits;
+use crate::memory;
 use crate::refusal::{Reason, Refusal, Result};
+
+/// The name of buffers in messages.
+const ROW: &str = "a row of a frame";
 
 /// The largest n.
 pub const LARGEST_REFINEMENT: u32 = 10;
@@ -180,8 +184,8 @@ impl<'v> Rows<'v> {
     pub(super) fn new(between: usize, most: usize, source: Source<'v>) -> Self {
         let cells = between + 1;
         let periods = if cells == 1 { 0 } else { most.div_ceil(cells * LANES) };
-        let [near, far] = [(); 2].map(|()| vec![Block([0.0; LANES]); periods * COMPONENTS * cells]);
-        let points = vec![0.0; (periods + 1) * COMPONENTS * LANES];
+        let [near, far] = [(); 2].map(|()| memory::filled(periods * COMPONENTS * cells, Block([0.0; LANES]), ROW));
+        let points = memory::zeroed((periods + 1) * COMPONENTS * LANES, ROW);
         let spread = (0..COMPONENTS * cells).map(|block| Spread::new(cells, block)).collect();
         Rows { cells, source, near, far, points, spread }
     }

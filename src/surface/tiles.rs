@@ -129,7 +129,7 @@ impl Tiles {
             key: snapshot.clone(),
             changed: false,
             now: snapshot.clone(),
-            box_m: snapshot.box_m,
+            box_m: *snapshot.box_m(),
             quanta: Quanta::default(),
             tiles: (0..along_x * along_y).map(tile).collect(),
             written: vec![(0, Vec::new()); along_x * along_y],
@@ -170,7 +170,7 @@ impl Tiles {
         }
         self.version += 1;
         self.now = snapshot.clone();
-        for (whole, now) in self.box_m.iter_mut().zip(&snapshot.box_m) {
+        for (whole, now) in self.box_m.iter_mut().zip(snapshot.box_m()) {
             *whole = [whole[0].min(now[0]), whole[1].max(now[1])];
         }
         self.fit();
@@ -197,7 +197,7 @@ impl Tiles {
         self.key = snapshot.clone();
         self.now = snapshot.clone();
         self.changed = false;
-        self.box_m = snapshot.box_m;
+        self.box_m = *snapshot.box_m();
         self.fit();
         for tile in &mut self.tiles {
             tile.version = self.version;

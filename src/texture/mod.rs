@@ -11,6 +11,7 @@ use std::path::Path;
 use bytes::Bytes;
 
 use crate::limits::Limits;
+use crate::memory;
 use crate::refusal::{Reason, Refusal, Result, number};
 use crate::scene::{Appearance, SMALLEST_TEXTURE};
 
@@ -104,7 +105,9 @@ impl Image {
             let message = format!("is {width} × {height} pixels, above the limit of {most} a side");
             return Err(refuse(path, Reason::TooLarge, message));
         }
-        let mut pixels = vec![0; reader.output_buffer_size().unwrap_or(0)];
+        // The pixels as they are read, and as RGB.
+        memory::require(u64::from(width) * u64::from(height) * 8, "a texture");
+        let mut pixels = memory::zeroed(reader.output_buffer_size().unwrap_or(0), "a texture");
         let frame = reader.next_frame(&mut pixels).map_err(wrong)?;
         pixels.truncate(frame.buffer_size());
         let rgb = match frame.color_type {

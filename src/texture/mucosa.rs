@@ -6,6 +6,7 @@
 
 use super::noise::{cells, fractal, gradient, step};
 use super::vessels::{self, Habit};
+use crate::memory;
 
 type Colour = [f32; 3];
 
@@ -56,7 +57,7 @@ pub(super) fn paint(seed: u64, size: usize) -> Vec<u8> {
     let arteries = Habit { trees: 10, radius: 0.0036, thinnest: 0.0006, taper: 1.3, branches: 22.0 };
     let veins = vessels::paint(seed + 1, size, veins);
     let arteries = vessels::paint(seed + 2, size, arteries);
-    let mut pixels = vec![0; 3 * size * size];
+    let mut pixels = memory::zeroed(3 * size * size, "a texture");
     // Rows are independent, so the result does not depend on which thread paints them.
     let workers = std::thread::available_parallelism().map_or(1, usize::from);
     let rows = size.div_ceil(workers);

@@ -1,6 +1,7 @@
 //! Vessels: trees of strokes that wander, taper and branch.
 
 use super::noise::{bits, gradient, unit};
+use crate::memory;
 
 /// A piece of a vessel. Lengths are in sides of the image.
 #[derive(Debug, Clone, Copy)]
@@ -43,7 +44,7 @@ pub(super) struct Habit {
 
 /// The coverage of each pixel by vessels, 0 to 1: `size` × `size` values, by rows.
 pub(super) fn paint(seed: u32, size: usize, habit: Habit) -> Vec<f32> {
-    let mut map = vec![0.0; size * size];
+    let mut map = memory::zeroed(size * size, "a texture");
     for stroke in grow(seed, habit) {
         draw(&mut map, size, &stroke);
     }

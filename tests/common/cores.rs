@@ -34,6 +34,11 @@ pub fn peak(process: u32) -> u64 {
     status(process, "VmHWM:") * 1024
 }
 
+/// Address space, bytes.
+pub fn address_space(process: u32) -> u64 {
+    status(process, "VmSize:") * 1024
+}
+
 pub fn threads(process: u32) -> u64 {
     status(process, "Threads:")
 }

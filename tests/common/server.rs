@@ -311,6 +311,14 @@ pub fn position(tool: u32, sequence: u64, z_m: f64) -> pb::Command {
     pb::Command { tool, sequence, action: Some(pb::command::Action::Position(position)), ..Default::default() }
 }
 
+/// The paper's scene with so many points.
+pub fn sheet(nx: u32, ny: u32) -> pb::create_session_request::Source {
+    let limits = palpate::limits::Limits { points: 1 << 40, ..Default::default() };
+    let points = format!("sheet.points=[{nx}, {ny}]");
+    let scene = palpate::scene::Scene::parse("paper", palpate::scene::PAPER, &[points], &limits).unwrap();
+    pb::create_session_request::Source::Scene(palpate::wire::scene::scene(&scene))
+}
+
 /// Code, reason and field of an error.
 pub fn told(status: &Status) -> (Code, String, String) {
     let info = status.get_details_error_info().unwrap_or_else(|| panic!("{status:?}"));

@@ -176,3 +176,52 @@ fn a_change_of_tissue_is_made_from_the_newest() {
     assert!(Arc::ptr_eq(&intake.take_change(7).unwrap(), &first));
     assert!(Arc::ptr_eq(&intake.take_change(8).unwrap(), &second));
 }
+
+#[test]
+fn a_batch_is_taken_in_slices_and_acts_whole() {
+    let (mut intake, _) = intake();
+    intake.acquire(&[1], "other", 1.0, LEASE + 1, 0).unwrap();
+    intake.submit(LEASE, vec![release(1, Some(3))], 0).unwrap();
+    let commands = (2..902).map(|sequence| release(sequence, Some(3 + sequence % 2))).collect();
+    let checked = intake.rules().check(commands).unwrap();
+    let mut batch = intake.accept(LEASE, checked, 0).unwrap();
+    let mut slices = 1;
+    assert!(intake.go_on(&mut batch));
+    // Others are not kept out; of this lease nothing can come between.
+    let of_other = |sequence| Command { tool: 1, ..release(sequence, Some(3)) };
+    intake.submit(LEASE + 1, vec![of_other(1)], 0).unwrap();
+    assert_eq!(intake.submit(LEASE, vec![release(1000, None)], 0).unwrap_err().reason, Reason::OutOfTurn);
+    // What came before the batch acts at its step.
+    let mut due = Vec::new();
+    intake.take_due(4, 0, &mut due);
+    assert_eq!(due.iter().map(|due| (due.command.tool, due.command.sequence)).collect::<Vec<_>>(), [(0, 1), (1, 1)]);
+    while intake.go_on(&mut batch) {
+        slices += 1;
+    }
+    assert_eq!(slices + 1, 900_usize.div_ceil(SLICE));
+    due.clear();
+    intake.take_due(5, 0, &mut due);
+    let mut sequences: Vec<_> = due.iter().map(|due| due.command.sequence).collect();
+    sequences.sort_unstable();
+    assert_eq!(sequences, (2..902).collect::<Vec<_>>());
+    assert_eq!(intake.counts(), Counts { accepted: 902, applied: 902, ..Counts::default() });
+    intake.submit(LEASE, vec![release(1000, None)], 0).unwrap();
+}
+
+#[test]
+fn a_batch_whose_tool_is_released_meanwhile_is_dropped_whole() {
+    let (mut intake, _) = intake();
+    let commands = (0..600).map(|sequence| release(sequence, Some(9))).collect();
+    let checked = intake.rules().check(commands).unwrap();
+    let mut batch = intake.accept(LEASE, checked, 0).unwrap();
+    assert!(intake.go_on(&mut batch));
+    assert_eq!(intake.counts(), Counts { accepted: 600, waiting: 600, ..Counts::default() });
+    intake.release(LEASE).unwrap();
+    // Who takes the tool next has nothing of it.
+    intake.acquire(&[0], "next", 1.0, LEASE + 1, 0).unwrap();
+    while intake.go_on(&mut batch) {}
+    let mut due = Vec::new();
+    intake.take_due(9, 0, &mut due);
+    assert!(due.iter().all(|due| due.ends_lease) && due.len() == 1);
+    assert_eq!(intake.counts(), Counts { accepted: 600, dropped: 600, ..Counts::default() });
+}

@@ -1,0 +1,100 @@
+//! Batches of commands: accepted whole or not at all, and put in the queue in slices, so that nobody waits long for the
+//! intake.
+
+use std::collections::BTreeMap;
+
+use super::rules::{check_tip, tip_radius_m};
+use super::{Checked, Command, Due, Intake, LeaseId, Place, not_holder};
+use crate::refusal::{Reason, Refusal, Result};
+
+/// Commands that are put in the queue in one turn at the intake.
+pub const SLICE: usize = 256;
+
+/// The rest of a batch that was accepted. [`Intake::go_on`] takes it in.
+#[derive(Debug)]
+#[must_use]
+pub struct Batch {
+    id: LeaseId,
+    commands: std::vec::IntoIter<Command>,
+}
+
+impl Intake {
+    /// Accepts all of some commands that were looked at before ([`Rules::check`]), or none. They are taken in by
+    /// [`Intake::go_on`], and act together: none before the last is in the queue. So others have their turns between
+    /// slices.
+    ///
+    /// # Errors
+    /// As for [`Intake::submit`]; and refuses commands of a lease of which a batch is being taken in.
+    pub fn accept(&mut self, id: LeaseId, Checked(commands): Checked, now_ns: u64) -> Result<Batch> {
+        self.check_open()?;
+        self.lapse(now_ns);
+        if commands.is_empty() {
+            self.renew(id, now_ns)?;
+            return Ok(Batch { id, commands: commands.into_iter() });
+        }
+        if self.leases.values().any(|lease| lease.id == id && lease.batch_since.is_some()) {
+            let message = "commands of this lease are being taken in: send them one call after another";
+            return Err(Refusal::new(Reason::OutOfTurn, "", message));
+        }
+        // Of each tool the last sequence number, how many commands come, and the tip after them.
+        let mut last: BTreeMap<u32, (u64, usize, Option<f64>)> = BTreeMap::new();
+        for command in &commands {
+            let lease = self.leases.get(&command.tool).filter(|lease| lease.id == id);
+            let lease = lease.ok_or_else(|| not_holder(format!("tool {} is not held by this client", command.tool)))?;
+            let coming = last.get(&command.tool).copied();
+            let before = coming.map(|(sequence, ..)| sequence).or(lease.last_sequence);
+            if let Some(before) = before.filter(|before| command.sequence <= *before) {
+                let message = format!("must be above {before}, the last one, but is {}", command.sequence);
+                return Err(Refusal::new(Reason::StaleSequence, "sequence", message));
+            }
+            let tip_radius_m = tip_radius_m(command);
+            check_tip(coming.map_or(lease.tip_radius_m, |coming| coming.2), tip_radius_m)?;
+            last.insert(command.tool, (command.sequence, coming.map_or(0, |coming| coming.1) + 1, tip_radius_m));
+        }
+        // A limit per tool, so that no holder fills the queue for the others.
+        for (tool, (_, coming, _)) in &last {
+            let waiting = self.leases.get(tool).map_or(0, |lease| lease.waiting);
+            if waiting + coming > self.rules.limits.queued_commands_per_tool {
+                let message = format!("{waiting} commands of tool {tool} wait for their step already");
+                return Err(Refusal::new(Reason::QueueFull, "", message));
+            }
+        }
+        self.make_room(commands.len())?;
+        self.counts.accepted += commands.len() as u64;
+        self.coming += commands.len();
+        for lease in self.leases.values_mut().filter(|lease| lease.id == id) {
+            lease.batch_since = Some(self.arrivals);
+        }
+        self.renew(id, now_ns)?;
+        Ok(Batch { id, commands: commands.into_iter() })
+    }
+
+    /// Puts at most [`SLICE`] commands of a batch in the queue. Returns whether there are more. What is meant for a tool
+    /// that has been released meanwhile is dropped.
+    pub fn go_on(&mut self, batch: &mut Batch) -> bool {
+        let slice = batch.commands.len().min(SLICE);
+        self.coming -= slice;
+        for command in batch.commands.by_ref().take(slice) {
+            let is_held = self.leases.get(&command.tool).is_some_and(|lease| lease.id == batch.id);
+            if is_held && self.closed.is_none() {
+                self.enqueue(command, false);
+            } else {
+                self.counts.dropped += 1;
+            }
+        }
+        if batch.commands.len() > 0 {
+            return true;
+        }
+        for lease in self.leases.values_mut().filter(|lease| lease.id == batch.id) {
+            lease.batch_since = None;
+        }
+        self.changed |= slice > 0;
+        false
+    }
+
+    /// Whether a command in the queue belongs to a batch that is not complete.
+    pub(super) fn is_held_back(&self, place: &Place, due: &Due) -> bool {
+        let lease = self.leases.get(&due.command.tool).filter(|_| !due.ends_lease);
+        lease.and_then(|lease| lease.batch_since).is_some_and(|since| place.1 >= since)
+    }
+}

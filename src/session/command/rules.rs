@@ -1,0 +1,69 @@
+//! What a command has to keep to, whenever it comes: so it is looked at before anybody's turn at the intake.
+
+use super::Command;
+use crate::limits::Limits;
+use crate::refusal::{Reason, Refusal, Result, positive};
+use crate::scene::Scene;
+use crate::scene::script::{Action, check_poke, check_reach};
+
+/// The rules of a session.
+#[derive(Debug)]
+pub struct Rules {
+    pub(super) scene: Scene,
+    pub(super) limits: Limits,
+}
+
+/// Commands that keep to the rules of a session.
+#[derive(Debug)]
+pub struct Checked(pub(super) Vec<Command>);
+
+impl Rules {
+    /// All of `commands`, if each keeps to the rules.
+    pub fn check(&self, commands: Vec<Command>) -> Result<Checked> {
+        if commands.len() > self.limits.queued_commands_per_tool {
+            let message = format!("{} commands are more than a tool may have waiting", commands.len());
+            return Err(Refusal::new(Reason::QueueFull, "", message));
+        }
+        commands.iter().try_for_each(|command| self.check_one(command))?;
+        Ok(Checked(commands))
+    }
+
+    fn check_one(&self, command: &Command) -> Result<()> {
+        if let Some(seconds) = command.time_to_live_s {
+            positive("time_to_live_s", seconds)?;
+        }
+        match &command.action {
+            Action::Push(poke) => check_poke(poke, &self.scene.sheet, &self.limits),
+            Action::Grasp { point, displacement_m } => {
+                crate::scene::script::check_free("position.point", &self.scene.sheet, *point)?;
+                crate::refusal::finite_vector("position.displacement_m", *displacement_m)?;
+                let far_m = displacement_m.length();
+                check_reach("position.displacement_m", &self.scene.sheet, far_m, &self.limits)
+            }
+            Action::Lead { place_m, tip } => {
+                crate::refusal::finite_vector("place_m", *place_m)?;
+                let centre_m = (self.scene.sheet.extent_m() / 2.0).extend(0.0);
+                check_reach("place_m", &self.scene.sheet, (*place_m - centre_m).length(), &self.limits)?;
+                tip.check("tip", &self.scene.sheet)
+            }
+            Action::Release => Ok(()),
+        }
+    }
+}
+
+/// Radius of the tip by which a command leads its tool, m.
+pub(super) fn tip_radius_m(command: &Command) -> Option<f64> {
+    if let Action::Lead { tip, .. } = &command.action { Some(tip.radius_m) } else { None }
+}
+
+/// Refuses another tip in the tissue: the surface under a larger one lies elsewhere, and to meet it at once is a blow that no
+/// instrument gives.
+pub(super) fn check_tip(before_m: Option<f64>, now_m: Option<f64>) -> Result<()> {
+    match (before_m, now_m) {
+        (Some(before_m), Some(now_m)) if before_m.to_bits() != now_m.to_bits() => {
+            let message = format!("is {now_m} m, but the tool is led with a tip of {before_m} m: release it first");
+            Err(Refusal::new(Reason::OutOfTurn, "pose.tip.radius_m", message))
+        }
+        _ => Ok(()),
+    }
+}

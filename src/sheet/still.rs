@@ -1,0 +1,143 @@
+//! A copy of a sheet at one moment. Another thread reads it in slices while the sheet goes on.
+//!
+//! A copy reads and writes each field once, which is the memory traffic of one substep; and only what has ever moved is
+//! copied. So it is made in one go, between two steps. What takes long is worked out from the copy: forces take hundreds
+//! of nanoseconds a point, and a hash takes tens.
+
+use std::ops::Range;
+
+use xxhash_rust::xxh3::Xxh3;
+
+use super::audit::Watch;
+use super::contact::Contacts;
+use super::field::{BLOCK, State};
+use super::real::Real;
+use super::sweep::Bench;
+use super::{Applied, Model, PointState, Sheet, Tissue, Work};
+
+/// A sheet that stays as it was.
+pub struct Still(Box<dyn Tissue>);
+
+impl Still {
+    /// What it was copied from.
+    pub fn model(&self) -> &Model {
+        self.0.model()
+    }
+
+    /// The point at `index`.
+    pub fn point(&self, index: usize) -> PointState {
+        self.0.point(index)
+    }
+
+    /// Adds so many points, or a few more, to the hash. Returns it when all are in.
+    pub fn hash(&self, hashing: &mut Hashing, points: usize) -> Option<u128> {
+        hashing.add(&*self.0, points)
+    }
+}
+
+/// A hash of a state that is not finished.
+pub struct Hashing {
+    hasher: Box<Xxh3>,
+    /// The next block of points, by rows.
+    next: usize,
+}
+
+impl Default for Hashing {
+    fn default() -> Self {
+        Hashing { hasher: Box::new(Xxh3::new()), next: 0 }
+    }
+}
+
+impl Hashing {
+    /// Adds at least one and at most so many points of a tissue, rounded up to a block. Returns the hash when all are in.
+    pub(super) fn add(&mut self, tissue: &(impl Tissue + ?Sized), points: usize) -> Option<u128> {
+        let [rows, columns] = tissue.model().points;
+        let blocks = rows * columns.div_ceil(BLOCK);
+        let end = self.next.saturating_add(points.div_ceil(BLOCK).max(1)).min(blocks);
+        tissue.hash_blocks(self.next..end, &mut self.hasher);
+        self.next = end;
+        (end == blocks).then(|| self.hasher.digest128())
+    }
+}
+
+impl<T: Real> Sheet<T> {
+    /// A copy whose points and hash are those of this sheet. It is not for steps or surveys: it has no tables of fixed
+    /// points and forces.
+    pub(super) fn still(&self) -> Still {
+        let Sheet { model, plan, bench, state, tiles, .. } = self;
+        let mut copy = State::zero(&bench.layout, state.kept.len());
+        copy.fields_mut().zip(state.fields()).for_each(|(to, from)| tiles.copy_moved(to, from));
+        Still(Box::new(Sheet {
+            model: model.clone(),
+            plan: plan.clone(),
+            halvings: self.halvings,
+            bench: Bench::new(model.lanes, bench.layout, bench.springs, &[]),
+            state: copy,
+            applied: Applied::<T>::like(&self.applied),
+            prescribed: self.prescribed.clone(),
+            contacts: Contacts::default(),
+            steps: self.steps,
+            work: Work::default(),
+            checkpoint: None,
+            inputs: Vec::new(),
+            watch: Watch::Off,
+            is_marked: false,
+            tiles: tiles.still(),
+            guard_events: self.guard_events,
+            substeps_done: self.substeps_done,
+            points_done: self.points_done,
+        }))
+    }
+
+    /// Adds blocks of the state to a hash ([`State::hash_blocks`]).
+    pub(super) fn hash_blocks(&self, blocks: Range<usize>, hasher: &mut Xxh3) {
+        self.state.hash_blocks(&self.bench.layout, |point| self.tiles.has_moved(point), blocks, hasher);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use glam::{DVec2, DVec3};
+
+    use super::*;
+    use crate::scene::law::Poke;
+    use crate::sheet::{Grasp, Push, at_rest};
+
+    #[test]
+    fn a_copy_has_the_points_and_the_hash_of_its_moment_in_slices_of_any_size() {
+        for sets in [
+            ["sheet.points=[37, 51]", "stepping.precision=f32", "stepping.integrator=central"],
+            ["sheet.points=[3, 83]", "stepping.precision=f64", "stepping.integrator=exponential3"],
+            ["sheet.points=[90, 40]", "stepping.precision=compensated", "stepping.integrator=exponential4"],
+        ] {
+            let model = Model::paper(&sets);
+            let mut tissue = at_rest(&model);
+            let spacing_m = model.scene.sheet.spacing_m;
+            let centre_m = spacing_m * DVec2::new(1.0, 20.0);
+            let force_n = DVec3::new(0.2, 0.1, -0.8);
+            let falloff_per_m = 1.0 / spacing_m;
+            tissue.push(0, Some(Push::Held(Poke { centre_m, force_n, falloff_per_m, falloff_offset: 0.0 })));
+            tissue.grasp(1, model.index_of([1, 30]), Grasp::Held(DVec3::new(0.0, 0.0, 0.3 * spacing_m)));
+            (0..25).for_each(|_| tissue.step().unwrap());
+            let still = tissue.still();
+            let (hash, points) = (tissue.state_hash(), (0..model.len()).map(|index| tissue.point(index)));
+            let points: Vec<_> = points.collect();
+            (0..5).for_each(|_| tissue.step().unwrap());
+            assert_ne!(tissue.state_hash(), hash);
+            assert!(points.iter().enumerate().all(|(index, point)| still.point(index) == *point), "{sets:?}");
+            for slice in [1, 16, 700, usize::MAX] {
+                let (mut hashing, mut slices) = (Hashing::default(), 1);
+                let found = loop {
+                    if let Some(found) = still.hash(&mut hashing, slice) {
+                        break found;
+                    }
+                    slices += 1;
+                };
+                assert_eq!(found, hash, "{sets:?} by {slice}");
+                let [rows, columns] = model.points;
+                assert_eq!(slices, (rows * columns.div_ceil(BLOCK)).div_ceil(slice.div_ceil(BLOCK)));
+            }
+        }
+    }
+}

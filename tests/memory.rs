@@ -1,0 +1,114 @@
+//! A server to which the system gives no more memory: what needs much is refused with a reason, or ends the session that
+//! needs it; the process lives and serves others. Linux only: elsewhere the limit of a process can't be set by another.
+#![cfg(target_os = "linux")]
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
+
+#[path = "common/cores.rs"]
+mod cores;
+#[path = "common/server.rs"]
+mod server;
+
+use std::time::Duration;
+
+use palpate::haptics::device::Device;
+use palpate::wire::{self, pb};
+use pb::session_service_client::SessionServiceClient;
+use rustix::process::{Pid, Resource, Rlimit, prlimit};
+use server::{PATIENCE, Server, Touch, force, open, sheet, told};
+use tonic::transport::Channel;
+use tonic::{Code, Status};
+
+/// From now on the server may have so many bytes of address space more than it has.
+fn leave(server: &Server, bytes: u64) {
+    let limit = Some(cores::address_space(server.child.id()) + bytes);
+    prlimit(Some(Pid::from_child(&server.child)), Resource::As, Rlimit { current: limit, maximum: None }).unwrap();
+}
+
+async fn create(sessions: &mut SessionServiceClient<Channel>, side: u32, paused: bool) -> Result<String, Status> {
+    let request = pb::CreateSessionRequest { source: Some(sheet(side, side)), paused, idle_timeout_s: None };
+    Ok(sessions.create_session(request).await?.into_inner().session.unwrap().session_id)
+}
+
+/// Refused for want of memory, in the name of `field`.
+#[track_caller]
+fn assert_no_memory(refused: &Status, field: &str) {
+    assert_eq!(told(refused), (Code::ResourceExhausted, "OVERLOADED".into(), field.into()), "{refused:?}");
+    assert!(refused.message().contains("the system has no memory for"), "{refused:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn without_address_space_requests_are_refused_sessions_end_and_others_are_served() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = folder.path().join("palpate.toml");
+    std::fs::write(&config, "[limits]\npoints_in_all = 1000000000\nwork_s = 600\n").unwrap();
+    // The budget is no bound here.
+    let server = Server::start(&["--config", config.to_str().unwrap(), "--memory", "1024GiB", "--log", "error"]);
+    let mut sessions = server.sessions().await;
+    let small = server.paper(false).await;
+    let mut touch = Touch::hold(&server, &small).await;
+    let middling = create(&mut sessions, 100, true).await.unwrap();
+    let doomed = create(&mut sessions, 512, false).await.unwrap();
+    let doomed_touch = Touch::hold(&server, &doomed).await;
+    leave(&server, 512 << 20);
+
+    // Large sessions until one is refused, then smaller ones: after that there is room for small things alone.
+    let mut kept = Vec::new();
+    for side in [512, 256, 128, 64] {
+        let refused = loop {
+            match create(&mut sessions, side, true).await {
+                Ok(session) => kept.push(session),
+                Err(refused) => break refused,
+            }
+            assert!(kept.len() < 1000, "nothing is refused");
+        };
+        assert_no_memory(&refused, "sheet.points");
+    }
+    let large = kept[0].clone();
+
+    // Whatever needs much is refused.
+    let view = pb::WatchFramesRequest { session_id: large.clone(), ..Default::default() };
+    assert_no_memory(&server.views().await.watch_frames(view).await.unwrap_err(), "refinement");
+    let all = Some(pb::probe_request::Where::AllPoints(true));
+    let probe = pb::ProbeRequest { session_id: large.clone(), r#where: all, ..Default::default() };
+    assert_no_memory(&server.haptics().await.probe(probe).await.unwrap_err(), "");
+    let hash = pb::GetStateHashRequest { session_id: large.clone(), at_step: None };
+    assert_no_memory(&sessions.get_state_hash(hash).await.unwrap_err(), "");
+    let change = pb::UpdateTissueRequest { session_id: large, stiffness_n_per_m: Some(11.0), ..Default::default() };
+    assert_no_memory(&sessions.update_tissue(change).await.unwrap_err(), "");
+    let device = Some(wire::local::device(&Device::named("omega3").unwrap()));
+    let law = Touch::open(&server, pb::TouchOpen { device, ..open(&middling, &[1]) }).await;
+    assert_no_memory(&law.err().unwrap(), "device");
+
+    // A session that needs more to go on is held with the reason.
+    doomed_touch.command(force(0, 1, -1.0)).await;
+    let waited = tokio::time::timeout(PATIENCE, async {
+        loop {
+            let status = server.status(&doomed).await;
+            if status.state() == pb::SessionState::Held {
+                return status.hold_reason;
+            }
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    });
+    let reason = waited.await.expect("it goes on without memory");
+    assert!(reason.contains("the system has no memory for"), "{reason}");
+
+    // Others notice nothing.
+    for sequence in 1..50 {
+        touch.command(force(0, sequence, -1.0)).await;
+        touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == sequence).await;
+    }
+    assert_eq!(server.status(&small).await.state(), pb::SessionState::Running);
+
+    // What goes makes room.
+    for session_id in kept {
+        sessions.delete_session(pb::DeleteSessionRequest { session_id }).await.unwrap();
+    }
+    let again = tokio::time::timeout(PATIENCE, async {
+        while let Err(refused) = create(&mut sessions, 512, true).await {
+            assert_no_memory(&refused, "sheet.points");
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+    });
+    again.await.expect("memory does not come back");
+}
