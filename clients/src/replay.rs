@@ -478,7 +478,7 @@ async fn play(
                     seen.rejected += 1;
                     progress.suspend(|| crate::say!("palpate-client: warning: {}", rejection_text(&rejection)));
                 }
-                Some(Heard::Opened(_)) | None => {}
+                Some(Heard::Opened(_) | Heard::ForceLaw(_)) | None => {}
             },
             message = next(&mut records, heard), if records_left > 0 => {
                 let message = message?;

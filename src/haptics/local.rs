@@ -41,6 +41,8 @@ pub struct LocalModel {
     pub friction: f64,
     /// The state of contact between the tool and the tissue.
     pub standing: Standing,
+    /// The number of the force law that goes with this model: p is placed by it.
+    pub law: u32,
 }
 
 impl LocalModel {

@@ -8,5 +8,6 @@ mod server;
 
 mod commands;
 mod contact;
+mod laws;
 mod poses;
 mod rendering;
