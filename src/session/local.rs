@@ -50,8 +50,9 @@ impl Refinement {
 }
 
 impl Modeller {
-    /// A modeller for a tool on a tissue with this law, whose number in the stream is `number`. A grasp is rendered with K and B of the sheet around it, which
-    /// are recomputed continually; a touch is rendered with the law, and K and B are computed only if `touches_too`.
+    /// A modeller for a tool on a tissue with this law, whose number in the stream is `number`. A grasp is rendered with K
+    /// and B of the sheet around it, which are recomputed continually; a touch is rendered with the law, and K and B are
+    /// computed only if `touches_too`.
     pub fn new(number: u32, law: Arc<Law>, touches_too: bool) -> Self {
         let (standing, tangent) = (Standing::Free, Arc::default());
         Modeller { law, number, touches_too, standing, surface: None, knocked: 0, sequence: 0, tangent }
