@@ -88,7 +88,7 @@ pub struct Limits {
     pub keepalive_s: f64,
     /// Commands of a haptic stream, per tool and step of the session: what comes faster for long is refused.
     pub commands_per_step: f64,
-    /// Springs times iterations that a force law may take before it becomes a coarse one.
+    /// Springs times iterations that an exact force law may take; where they don't suffice, the coarse one stays.
     pub law_work: u64,
     /// Pieces of heavy work (a session laid out, another tissue, a force law) of one caller that wait.
     pub queued_work: usize,

@@ -491,7 +491,7 @@ async fn play(
                     measured.rejected += u64::from(rejection.reason != Reason::Recovered.as_str());
                     progress.suspend(|| crate::say!("palpate-client: warning: {}", rejection_text(&rejection)));
                 }
-                Some(Heard::Opened(_)) | None => {}
+                Some(Heard::Opened(_) | Heard::ForceLaw(_)) | None => {}
             },
             message = next(&mut records, heard), if records_left > 0 => {
                 let message = message?;

@@ -343,6 +343,9 @@ pub fn sample(bytes: &[u8]) -> bool {
         Some(pb::touch_response::Message::Opened(pb::TouchOpened { law: Some(law), .. })) => {
             wire::local::from_law(&law).map(|law| render(law, &mut std::iter::empty())).is_ok()
         }
+        Some(pb::touch_response::Message::ForceLaw(pb::ForceLawUpdate { law: Some(law), .. })) => {
+            wire::local::from_law(&law).map(|law| render(law, &mut std::iter::empty())).is_ok()
+        }
         Some(pb::touch_response::Message::Sample(sample)) => {
             let _ = wire::local::wire_bytes(&sample);
             let models = sample.tools.iter().filter_map(|tool| tool.local_model.as_ref());
@@ -370,6 +373,7 @@ fn sample_seeds() -> Vec<Vec<u8>> {
         valid_m: 0.005,
         friction: 0.2,
         contact: contact.into(),
+        law: contact as u32,
     };
     let contacts = [pb::Contact::Free, pb::Contact::Sticking, pb::Contact::Sliding, pb::Contact::Holding];
     let tools = contacts.map(|contact| pb::ToolSample { local_model: Some(model(contact)), ..Default::default() });
@@ -378,7 +382,9 @@ fn sample_seeds() -> Vec<Vec<u8>> {
         .map(|tool| Heard::Sample(pb::Sample { step: 5, tools: vec![*tool], ..Default::default() }))
         .collect();
     messages.push(Heard::Sample(pb::Sample { step: 7, tools: tools.to_vec(), ..Default::default() }));
-    let law = wire::local::law(&Law::linear(300.0, 1.0));
+    let law = wire::local::law(&Law::linear(300.0, 1.0), 1);
+    let update = pb::ForceLawUpdate { coarse_number: 0, law: Some(law.clone()), ..Default::default() };
+    messages.push(Heard::ForceLaw(update));
     messages.push(Heard::Opened(pb::TouchOpened { step: 3, law: Some(law), ..Default::default() }));
     messages.into_iter().map(|message| pb::TouchResponse { message: Some(message) }.encode_to_vec()).collect()
 }

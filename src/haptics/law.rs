@@ -7,10 +7,8 @@
 
 use std::sync::atomic::AtomicBool;
 
-use glam::DVec2;
-
 use crate::sheet::Model;
-use crate::sheet::tangent::{self, Allowance, Pressed};
+use crate::sheet::tangent::{self, Accuracy, Course, Deepened, Press, Pressed};
 
 /// The law at one depth.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -36,89 +34,87 @@ pub struct Law {
     pub step_m: f64,
     /// At least two.
     pub rows: Vec<Row>,
-    /// Of a coarser sheet, because the tissue's own would take too much work: within a tenth or so.
+    /// Put together from coarser sheets (`coarse`), because the tissue's own takes too much work to be given at once:
+    /// within a tenth of it.
     pub is_coarse: bool,
 }
 
-/// Rows of a law, and how many radii of the disc they reach.
-const ROWS: u32 = 21;
+/// Rows of an exact law.
+pub(super) const ROWS: u32 = 21;
+
+/// How many radii of the disc a law reaches.
 const REACH_IN_RADII: f64 = 4.0;
 
-/// Of the sheet that stands for one that is too large, from point to point along the longer side.
-const COARSE_INTERVALS: f64 = 20.0;
+/// An exact law under way, one depth after another.
+#[derive(Debug)]
+pub struct Computation(Press);
 
-/// Points so many radii of the disc apart know what is under it.
-const FINE_ENOUGH: f64 = 0.7;
+/// What became of a computation.
+#[derive(Debug)]
+pub enum Progress {
+    /// It can go on.
+    UnderWay(Computation),
+    /// The law.
+    Done(Law),
+    /// It would take more work than it may, or it was stopped.
+    GivenUp,
+}
+
+impl Computation {
+    /// Of the law under a disc of `radius_m` in the middle of the sheet, with at most `most_work` springs times iterations;
+    /// none if they can't suffice.
+    pub fn new(model: &Model, radius_m: f64, most_work: u64) -> Option<Self> {
+        Press::within(model, course(model, radius_m, ROWS), Accuracy::EXACT, most_work).map(Computation)
+    }
+
+    /// Computes the next depth, unless `stop` is set. `model` is the one that it was begun for.
+    pub fn advance(mut self, model: &Model, stop: &AtomicBool) -> Progress {
+        match self.0.deepen(model, stop) {
+            Deepened::Further => Progress::UnderWay(self),
+            Deepened::Done => Progress::Done(Law::from_pressed(self.0.pressed())),
+            Deepened::GivenUp => Progress::GivenUp,
+        }
+    }
+}
+
+/// In the middle of a sheet.
+fn course(model: &Model, radius_m: f64, rows: u32) -> Course {
+    let (centre_m, step_m) = (model.scene.sheet.extent_m() / 2.0, REACH_IN_RADII * radius_m / f64::from(rows - 1));
+    Course { radius_m, centre_m, step_m, count: rows }
+}
 
 impl Law {
     /// That of a disc of `radius_m` in the middle of a sheet: some tenths of a second of work for a thousand points.
     pub fn of(model: &Model, radius_m: f64) -> Self {
-        Self::at(model, radius_m, model.scene.sheet.extent_m() / 2.0)
+        let Course { centre_m, step_m, count, .. } = course(model, radius_m, ROWS);
+        Self::from_pressed(&tangent::press(model, radius_m, centre_m, step_m, count))
     }
 
-    /// The same with at most `most_work` springs times iterations; where they don't suffice, a coarse law; none if that
-    /// would be too much as well, or if `stop` is set.
+    /// The same with at most `most_work` springs times iterations; none if they don't suffice, or if `stop` is set.
     pub fn within(model: &Model, radius_m: f64, most_work: u64, stop: &AtomicBool) -> Option<Self> {
-        let of = |model: &Model| {
-            let (centre_m, allowance) = (model.scene.sheet.extent_m() / 2.0, Allowance::of(most_work, stop));
-            let step_m = REACH_IN_RADII * radius_m / f64::from(ROWS - 1);
-            let pressed = tangent::press_within(model, radius_m, centre_m, step_m, ROWS, allowance)?;
-            Some(Self::from_rows(step_m, pressed))
-        };
-        of(model).or_else(|| Self::coarse(model, radius_m, COARSE_INTERVALS, &of))
+        Self::pressed(model, radius_m, ROWS, Accuracy::EXACT, &mut { most_work }, stop)
     }
 
-    /// Of a sheet of few points, which knows the rim, and then of smaller and smaller sheets around the disc, in points
-    /// half as far apart each time: of each the depth counts by which it gives way more than the points before it do. `of`
-    /// tells the law of one.
-    fn coarse(model: &Model, radius_m: f64, intervals: f64, of: &dyn Fn(&Model) -> Option<Self>) -> Option<Self> {
-        let sheet = &model.scene.sheet;
-        let mut spacing_m = sheet.longer_side_m() / intervals;
-        if spacing_m <= sheet.spacing_m {
-            return None;
+    /// A law of so many rows, whose work is taken from `work`.
+    pub(super) fn pressed(
+        model: &Model,
+        radius_m: f64,
+        rows: u32,
+        accuracy: Accuracy,
+        work: &mut u64,
+        stop: &AtomicBool,
+    ) -> Option<Self> {
+        let mut press = Press::within(model, course(model, radius_m, rows), accuracy, *work)?;
+        let mut deepened = Deepened::Further;
+        while deepened == Deepened::Further {
+            deepened = press.deepen(model, stop);
         }
-        let mut law = of(&tangent::stand_in(model, spacing_m, f64::INFINITY))?;
-        while spacing_m > sheet.spacing_m && spacing_m > FINE_ENOUGH * radius_m {
-            let finer_m = (spacing_m / 2.0).max(sheet.spacing_m);
-            let patch = |spacing_m: f64| of(&tangent::stand_in(model, spacing_m, 0.5 * intervals * finer_m));
-            law = law.refined(&patch(finer_m)?, &patch(spacing_m)?);
-            spacing_m = finer_m;
-        }
-        Some(Law { is_coarse: true, ..law })
+        *work = press.left();
+        (deepened == Deepened::Done).then(|| Self::from_pressed(press.pressed()))
     }
 
-    /// This law, where by each force the disc goes deeper as `fine` gives way more than `coarse`.
-    fn refined(&self, fine: &Law, coarse: &Law) -> Self {
-        let depth_of = |force_n: f64| self.depth_of(force_n) + fine.depth_of(force_n) - coarse.depth_of(force_n);
-        let force_at = |depth_m: f64| {
-            let (mut low, mut high) = (0.0, self.rows.last().map_or(0.0, |row| row.force_n).max(f64::MIN_POSITIVE));
-            for _ in 0..8 {
-                high *= if depth_of(high) < depth_m { 2.0 } else { 1.0 };
-            }
-            for _ in 0..60 {
-                let middle = 0.5 * (low + high);
-                if depth_of(middle) < depth_m { low = middle } else { high = middle }
-            }
-            0.5 * (low + high)
-        };
-        let rows = (0..self.rows.len()).map(|row| {
-            let (depth_m, side_m) = (row as f64 * self.step_m, 0.05 * self.step_m);
-            let force_n = if row == 0 { 0.0 } else { force_at(depth_m) };
-            let below_m = (depth_m - side_m).max(0.0);
-            let rise_n = force_at(depth_m + side_m) - if below_m > 0.0 { force_at(below_m) } else { 0.0 };
-            let stiffness_n_per_m = (rise_n / (depth_m + side_m - below_m)).max(0.0);
-            Row { force_n, stiffness_n_per_m, ..self.at_depth(self.depth_of(force_n)) }
-        });
-        Law { rows: rows.collect(), ..self.clone() }
-    }
-
-    fn at(model: &Model, radius_m: f64, centre_m: DVec2) -> Self {
-        let step_m = REACH_IN_RADII * radius_m / f64::from(ROWS - 1);
-        Self::from_rows(step_m, tangent::press(model, radius_m, centre_m, step_m, ROWS))
-    }
-
-    fn from_rows(step_m: f64, pressed: Vec<Pressed>) -> Self {
-        let row = |pressed: Pressed| {
+    fn from_pressed(pressed: &[Pressed]) -> Self {
+        let row = |pressed: &Pressed| {
             let tangent::Tangent { stiffness_n_per_m: s, damping_n_s_per_m: b, drag_n_s_per_m, .. } = pressed.tangent;
             Row {
                 force_n: pressed.force_n,
@@ -129,7 +125,8 @@ impl Law {
                 drag_n_s_per_m,
             }
         };
-        Law { step_m, rows: pressed.into_iter().map(row).collect(), is_coarse: false }
+        let step_m = pressed.get(1).map_or(0.0, |pressed| pressed.depth_m);
+        Law { step_m, rows: pressed.iter().map(row).collect(), is_coarse: false }
     }
 
     /// That of a linear spring and damper, which feel the same in every direction.
@@ -276,42 +273,38 @@ mod tests {
         assert_eq!([law.depth_of(0.0), law.depth_of(-1.0)], [0.0; 2]);
     }
 
-    /// Largest difference of force and of stiffness over the depth, relative to the largest of each.
-    fn apart(one: &Law, other: &Law) -> [f64; 2] {
-        [|row: &Row| row.force_n, |row: &Row| row.stiffness_n_per_m].map(|of| {
-            let largest = one.rows.iter().map(of).fold(0.0, f64::max);
-            let apart = one.rows.iter().zip(&other.rows).map(|(a, b)| (of(a) - of(b)).abs()).fold(0.0, f64::max);
-            apart / largest
-        })
-    }
-
     #[test]
-    fn a_coarse_law_is_near_the_exact_one_and_bounded_work() {
-        // A membrane that hardly anything but its rim holds, and one that its virtual springs hold as well.
-        for virtual_stiffness in ["0.01", "0.5"] {
-            let virtual_stiffness = format!("virtual_springs.stiffness_n_per_m={virtual_stiffness}");
-            let model = Model::paper(&["sheet.points=[25, 25]", "sheet.fixed=\"edges\"", &virtual_stiffness]);
-            let radius_m = model.scene.sheet.spacing_m;
-            let exact = Law::of(&model, radius_m);
-            let coarse = Law::coarse(&model, radius_m, 12.0, &|model| Some(Law::of(model, radius_m))).unwrap();
-            let [force, stiffness] = apart(&exact, &coarse);
-            println!("{virtual_stiffness}: force {force:.4}, stiffness {stiffness:.4} apart");
-            assert!(coarse.is_coarse && coarse.is_sound() && !exact.is_coarse);
-            assert!(force < 0.1 && stiffness < 0.15, "{virtual_stiffness}: {force} {stiffness}");
-        }
-    }
-
-    #[test]
-    fn a_law_that_would_take_too_long_is_coarse_and_one_that_nobody_waits_for_is_none() {
-        let model = Model::paper(&["sheet.points=[45, 45]", "virtual_springs.stiffness_n_per_m=1e-6"]);
+    fn a_law_that_would_take_too_long_or_that_nobody_waits_for_is_none() {
+        let model = Model::paper(&["sheet.points=[9, 9]"]);
         let radius_m = 2.0 * model.scene.sheet.spacing_m;
-        // Enough for the coarse sheet, not for this one.
         let (go_on, stop) = (AtomicBool::new(false), AtomicBool::new(true));
-        assert!(Law::within(&model, radius_m, 1000, &go_on).is_none());
+        let exact = Law::of(&model, radius_m);
+        assert!(!exact.is_coarse && exact.rows.len() == 21);
+        assert_eq!(Law::within(&model, radius_m, u64::MAX, &go_on).as_ref(), Some(&exact));
         assert!(Law::within(&model, radius_m, u64::MAX, &stop).is_none());
-        let small = Model::paper(&["sheet.points=[9, 9]"]);
-        let law = Law::within(&small, 2.0 * small.scene.sheet.spacing_m, u64::MAX, &go_on).unwrap();
-        assert!(!law.is_coarse && law == Law::of(&small, 2.0 * small.scene.sheet.spacing_m));
+        // Too little for certain, and too little as it turns out.
+        assert!(Law::within(&model, radius_m, 1000, &go_on).is_none());
+        assert!(Computation::new(&model, radius_m, 1000).is_none());
+        assert!(Computation::new(&model, radius_m, 100_000).is_some());
+        assert!(Law::within(&model, radius_m, 100_000, &go_on).is_none());
+        // Depth by depth it has the same bits, and once stopped it stays given up.
+        let mut computation = Computation::new(&model, radius_m, u64::MAX).unwrap();
+        for depth in 1.. {
+            match computation.advance(&model, &go_on) {
+                Progress::UnderWay(further) => computation = further,
+                Progress::Done(law) => {
+                    assert_eq!((law, depth), (exact, 21));
+                    break;
+                }
+                Progress::GivenUp => panic!("given up at depth {depth}"),
+            }
+        }
+        let Progress::UnderWay(computation) =
+            Computation::new(&model, radius_m, u64::MAX).unwrap().advance(&model, &go_on)
+        else {
+            panic!("one depth is not all");
+        };
+        assert!(matches!(computation.advance(&model, &stop), Progress::GivenUp));
     }
 
     #[test]

@@ -41,6 +41,8 @@ pub struct LocalModel {
     pub friction: f64,
     /// The state of contact between the tool and the tissue.
     pub standing: Standing,
+    /// The number of the force law that goes with this model: p is placed by it.
+    pub law: u32,
 }
 
 impl LocalModel {
@@ -222,6 +224,7 @@ mod tests {
     /// A disc at rest, 4 mm deep, so pressed with 1.6 N, and drawn back along the surface with `drawn_n`.
     fn model(drawn_n: f64) -> LocalModel {
         LocalModel {
+            law: 0,
             sequence: 1,
             client_time_s: 0.0,
             step: 1,

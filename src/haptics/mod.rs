@@ -5,6 +5,7 @@
 //! Conventions: `force_on_tool_n` is the force of the tissue on the tool; stiffness and damping are positive; the sheet's
 //! frame is right-handed with z out of the tissue.
 
+mod coarse;
 pub mod deadband;
 pub mod device;
 pub mod envelope;

@@ -3,6 +3,20 @@
 //!
 //! When a newer model arrives, the force would jump by the error of the old one. That difference is kept as a bias and
 //! decays with [`BIAS_S`], so the hand feels a smooth change, not a knock.
+//!
+//! **A change of law.** A server that needs long for the exact law of a tissue sends a coarse one first. Each model names
+//! the law by which the server has placed its surface, so the renderer changes over with the first model of the new law,
+//! and never between two models. Let F be the force by the new model and law along the tool's path, and G that by the old
+//! ones. In the tick of the change, at t0, the bias is b = G(t0) − F(t0), and from then on the force is
+//! F(t) + b·e^{−(t − t0)/τ}, τ = [`BIAS_S`]. At t0 that is G(t0): no jump. In a tick of length h after it, the bias changes
+//! by no more than |b|·h/τ, and all else is the change of F, the tissue's own. Both models pass through the force of
+//! their sample, whatever their law ([`Touching::at_sample`]). So beside the error of the old model, b is not the
+//! difference of the laws' forces, but that of their slopes over the way since the sample: for a coarse law whose slope is
+//! within a tenth of K, and a way s, that is at most 0.1·K·s.
+//!
+//! The bias is not the force of a passive spring: it may give energy, at most |b|·v·τ when the tool moves at v. The
+//! envelope counts it like all other work at the port, and its limits act on the sum: so a change of law can't make the
+//! port active, nor the force faster than the slew.
 
 use glam::DVec3;
 
@@ -14,10 +28,14 @@ use crate::sheet::Standing;
 /// Time constant with which the error of the last model decays, s.
 pub const BIAS_S: f64 = 0.02;
 
+/// Laws that a renderer keeps.
+pub const MOST_LAWS: usize = 16;
+
 /// One tool's renderer.
 #[derive(Debug, Clone)]
 pub struct Renderer {
-    law: Law,
+    /// By number; the first is the one that the server began with.
+    laws: Vec<(u32, Law)>,
     /// The newest model, and the touch that follows from it.
     newest: Option<(LocalModel, Touching)>,
     /// A newer model that has arrived since.
@@ -34,10 +52,10 @@ pub struct Renderer {
 }
 
 impl Renderer {
-    /// A renderer for a tissue with `law`, which must be sound, behind `envelope`.
+    /// A renderer for a tissue with `law`, which must be sound and is number 0, behind `envelope`.
     pub fn new(law: Law, envelope: Envelope) -> Self {
         Renderer {
-            law,
+            laws: vec![(0, law)],
             newest: None,
             arrived: None,
             arrived_s: None,
@@ -53,7 +71,18 @@ impl Renderer {
 
     /// Restarts with another server, whose models start from the beginning. The envelope keeps its state.
     pub fn begin(&mut self, law: Law) {
-        (self.law, self.newest, self.arrived, self.arrived_s) = (law, None, None, None);
+        (self.laws, self.newest, self.arrived, self.arrived_s) = (vec![(0, law)], None, None, None);
+    }
+
+    /// Takes a further law, which models may name from now on. False: it is not sound, its number is known already, or
+    /// there are [`MOST_LAWS`]. Models that name a law which is not known are rendered with the first.
+    pub fn learn(&mut self, number: u32, law: Law) -> bool {
+        let is_new = self.laws.iter().all(|known| known.0 != number);
+        let is_learned = is_new && self.laws.len() < MOST_LAWS && law.is_sound();
+        if is_learned {
+            self.laws.push((number, law));
+        }
+        is_learned
     }
 
     /// The number of models refused: out of order, or not finite.
@@ -86,9 +115,10 @@ impl Renderer {
     /// model.
     fn adopt(&mut self, model: LocalModel, now_s: f64) {
         let before_n = self.newest.is_some().then(|| self.wanted_n(now_s));
-        let mut touching = Touching::at_sample(&model, &self.law);
+        let law = law_of(&self.laws, &model);
+        let mut touching = Touching::at_sample(&model, law);
         for place_m in self.track.after(model.client_time_s) {
-            touching.move_to(&model, &self.law, place_m);
+            touching.move_to(&model, law, place_m);
         }
         self.newest = Some((model, touching));
         (self.biased_s, self.bias_n) = (now_s, DVec3::ZERO);
@@ -100,7 +130,7 @@ impl Renderer {
     /// The force that the law asks for, before the envelope, N.
     fn wanted_n(&self, now_s: f64) -> DVec3 {
         let Some((model, touching)) = &self.newest else { return DVec3::ZERO };
-        let force_n = touching.force_n(model, &self.law, self.velocity_m_per_s)
+        let force_n = touching.force_n(model, law_of(&self.laws, model), self.velocity_m_per_s)
             + self.bias_n * ((self.biased_s - now_s) / BIAS_S).exp();
         if model.standing == Standing::Holding {
             return force_n;
@@ -120,7 +150,7 @@ impl Renderer {
             self.before = Some((now_s, place_m));
             self.track.push(now_s, place_m);
             if let Some((model, touching)) = &mut self.newest {
-                touching.move_to(model, &self.law, place_m);
+                touching.move_to(model, law_of(&self.laws, model), place_m);
             }
             if let Some(model) = self.arrived.take() {
                 self.adopt(model, now_s);
@@ -134,6 +164,11 @@ impl Renderer {
     }
 }
 
+/// The law that a model names.
+fn law_of<'l>(laws: &'l [(u32, Law)], model: &LocalModel) -> &'l Law {
+    &laws.iter().find(|known| known.0 == model.law).unwrap_or(&laws[0]).1
+}
+
 #[cfg(test)]
 mod tests {
     use glam::DMat3;
@@ -145,6 +180,7 @@ mod tests {
     fn model(sequence: u64, time_s: f64, place_m: DVec3, height_m: f64) -> LocalModel {
         LocalModel {
             sequence,
+            law: 0,
             client_time_s: time_s,
             step: sequence,
             place_m,

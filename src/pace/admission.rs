@@ -8,6 +8,7 @@ use super::auditor::Audited;
 use super::clock::{Dilation, now_ns};
 use super::cost::{Cost, check_asked, check_work};
 use super::inbox::Request;
+use super::laws::KeptLaws;
 use super::streams::Streams;
 use super::thread::{Running, beat_ns};
 use super::{Live, Pacer, State, Status, random_id};
@@ -88,7 +89,7 @@ impl Pacer {
             status: Mutex::new(status),
             streams: Mutex::new(Streams::new(&self.limits)),
             refused: AtomicU64::new(0),
-            laws: Mutex::new(Vec::new()),
+            laws: KeptLaws::default(),
             audited: Mutex::new(Audited::default()),
             cost,
             thread,

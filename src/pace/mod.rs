@@ -7,6 +7,7 @@ pub mod clock;
 mod cost;
 pub mod frames;
 mod inbox;
+pub(crate) mod laws;
 pub(crate) mod priority;
 pub mod queue;
 mod reading;
@@ -23,7 +24,6 @@ use std::thread::JoinHandle;
 use tokio::sync::oneshot;
 
 use crate::budget::{Account, Budget, Taken};
-use crate::haptics::Law;
 use crate::limits::Limits;
 use crate::lock::lock;
 use crate::memory;
@@ -41,6 +41,7 @@ use clock::{Dilation, now_ns};
 use cost::{Cost, check_work};
 use frames::{Delivery, Encoder, Viewer};
 use inbox::{Inbox, Request};
+use laws::{KeptLaws, SoughtLaw};
 use priority::give_way;
 use queue::{Reader, queue};
 use reading::{Reading, Recipient};
@@ -153,7 +154,7 @@ pub struct Live {
     status: Mutex<Status>,
     streams: Mutex<Streams>,
     refused: AtomicU64,
-    laws: Mutex<Vec<KeptLaw>>,
+    laws: KeptLaws,
     cost: Cost,
     audited: Mutex<Audited>,
     /// Of the stepping threads, its own, and where that is asked.
@@ -162,9 +163,6 @@ pub struct Live {
     /// The session, and its memory.
     _taken: [Taken; 2],
 }
-
-/// The law of a tissue under a tip of a radius, m.
-type KeptLaw = (f64, Arc<Model>, Arc<Law>);
 
 impl Live {
     /// How the session stands now: at rest its steps are done in thought.
@@ -295,9 +293,9 @@ impl Live {
 
     /// The next sample; the present one if time stands.
     pub async fn next_sample(&self, only: Vec<u32>) -> Result<PacedSample> {
-        let (law, touch_stiffness) = (None, false);
+        let (laws, touch_stiffness) = (None, false);
         let sampling =
-            Sampling { every: 1, only: Some(only), deadband: None, heartbeat_s: HEARTBEAT_S, law, touch_stiffness };
+            Sampling { every: 1, only: Some(only), deadband: None, heartbeat_s: HEARTBEAT_S, laws, touch_stiffness };
         Ok(self.tap(sampling, true).pop().await?.0)
     }
 
@@ -327,25 +325,10 @@ impl Live {
         Ok(reader)
     }
 
-    /// The force law under a tip of `radius_m`. Computed once a radius, tenths of a second, unless `stop` is set; a coarse
-    /// one where that would take longer.
-    pub fn law(&self, radius_m: f64, stop: &AtomicBool) -> Result<Arc<Law>> {
+    /// The force law of the tissue as it is now, under a tip of `radius_m`. Nothing is computed here.
+    pub(crate) fn law(&self, radius_m: f64) -> Arc<SoughtLaw> {
         let model = lock(&self.status).model.clone();
-        let kept = |law: &&KeptLaw| law.0 == radius_m && Arc::ptr_eq(&law.1, &model);
-        if let Some((.., law)) = lock(&self.laws).iter().find(kept) {
-            return Ok(law.clone());
-        }
-        let law = || Ok(Law::within(&model, radius_m, self.limits.law_work, stop));
-        let Some(law) = memory::attempt("device", law)?.map(Arc::new) else {
-            let message = "the force law of this tissue would take too much work: touch without a device";
-            return Err(Refusal::new(Reason::NotAvailable, "device", message));
-        };
-        let mut laws = lock(&self.laws);
-        if laws.len() == MOST_LAWS {
-            laws.remove(0);
-        }
-        laws.push((radius_m, model, law.clone()));
-        Ok(law)
+        self.laws.of(radius_m, &model, self.limits.law_work)
     }
 
     /// Frames for a viewer.
@@ -386,9 +369,6 @@ impl Drop for Accepted<'_> {
 
 /// Stiffnesses that wait to be computed, of all tools of a server.
 const WAITING_REFINEMENTS: usize = 8;
-
-/// Laws that a session keeps.
-const MOST_LAWS: usize = 16;
 
 fn deleted() -> Refusal {
     Refusal::new(Reason::SessionDeleted, "session_id", "the session has been deleted")

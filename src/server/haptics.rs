@@ -15,12 +15,12 @@ use tracing::{Instrument, debug, info};
 use super::House;
 use super::connections::Peer;
 use super::cut::until_cut;
+use super::force_law::{self, Update};
 use super::rate::Bucket;
 use super::recovered::Notices;
 use super::revocation::Tenure;
 use super::visitor::Visitor;
 use crate::budget::{Account, Resource, Taken};
-use crate::haptics::Law;
 use crate::haptics::device::{Device, UNDECLARED_FORCE_N};
 use crate::limits::Limits;
 use crate::pace::clock::now_ns;
@@ -29,6 +29,7 @@ use crate::pace::{Held, Live, PacedSample, StreamGuard, random_bits};
 use crate::refusal::{Reason, Refusal, number};
 use crate::scene::script::Action;
 use crate::session::command::{Command, LeaseId};
+use crate::session::laws::{FIRST, Laws};
 use crate::wire::pb::haptic_service_server::HapticService;
 use crate::wire::{self, pb};
 
@@ -40,6 +41,8 @@ type Out<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 /// What the output of a haptic stream begins with.
 struct Opened {
     answer: pb::TouchOpened,
+    /// What will be told of the law, if it is a coarse one.
+    update: Option<Update>,
     samples: Reader<PacedSample>,
     notices: Notices,
     guard: StreamGuard,
@@ -62,6 +65,8 @@ struct Hold {
     lease: LeaseId,
     tools: usize,
     device: Option<Device>,
+    /// Computes the exact law as long as the stream is there.
+    _improving: Option<AbortOnDropHandle<()>>,
 }
 
 impl Hold {
@@ -104,13 +109,6 @@ fn within_reach(command: Command, live: &Live, device: Option<&Device>) -> Resul
     Ok(command)
 }
 
-/// What a client should know of its device on this tissue, in words.
-fn misgivings(device: Device, law: &Law) -> Vec<String> {
-    let coarse = "the force law is a coarse one: the tissue's own would take more work than limits.law_work allows";
-    let coarse = law.is_coarse.then(|| coarse.to_owned());
-    device.misgivings(law).into_iter().chain(coarse).collect()
-}
-
 impl Haptics {
     /// Answers the first message of a haptic stream.
     async fn open(&self, open: &pb::TouchOpen, account: &Account) -> Result<(Opened, Hold), Status> {
@@ -128,9 +126,10 @@ impl Haptics {
         sampling.touch_stiffness = open.touch_stiffness;
         let held = if open.tools.is_empty() { Held::Nothing } else { Held::Tools };
         let guard = live.open_stream("Touch", held, account)?;
-        if device.is_some() {
-            let live = live.clone();
-            sampling.law = Some(self.0.workshop.work(account, move |stop| live.law(tip.radius_m, stop.flag())).await??);
+        let sought = device.map(|_| live.law(tip.radius_m));
+        if let Some(sought) = &sought {
+            let first = force_law::first(&self.0.workshop, account, sought).await?;
+            sampling.laws = Some(Arc::new(Laws::new(first)));
         }
         let lease_s = open.lease_s.unwrap_or(self.0.config.lease_s);
         let lease = random_bits()?;
@@ -140,20 +139,25 @@ impl Haptics {
             intake.seat(lease, seats);
             Ok::<_, Refusal>(intake.next_step())
         })?;
-        let hold = Hold { live: live.clone(), lease, tools: open.tools.len(), device };
+        let laws = sampling.laws.clone();
+        let coarse = sought.zip(laws.clone()).filter(|(_, laws)| laws.first().is_coarse);
+        let improving = coarse.map(|(sought, laws)| force_law::improve(&self.0.workshop, account, sought, laws));
+        let (update, _improving) = improving.unzip();
+        let hold = Hold { live: live.clone(), lease, tools: open.tools.len(), device, _improving };
+        let law = laws.as_deref().map(Laws::first);
         let answer = pb::TouchOpened {
             step,
             rate_hz: live.model.scene.stepping.rate_hz,
             lease_s,
             heartbeat_s: sampling.heartbeat_s,
-            law: sampling.law.as_deref().map(wire::local::law),
-            warnings: device.zip(sampling.law.as_deref()).map_or(Vec::new(), |(device, law)| misgivings(device, law)),
+            law: law.map(|law| wire::local::law(law, FIRST)),
+            warnings: device.zip(law).map_or(Vec::new(), |(device, law)| device.misgivings(law)),
             max_force_n: device.map_or(UNDECLARED_FORCE_N, |device| device.most_n()),
         };
         let samples = live.samples(sampling);
         info!(session = %live.id, tools = ?open.tools, holder = ?open.holder, "haptic stream opened");
         let notices = Notices::new(open.tools.clone(), step);
-        Ok((Opened { answer, samples, notices, guard }, hold))
+        Ok((Opened { answer, update, samples, notices, guard }, hold))
     }
 
     /// Reads what the client says until it ends.
@@ -311,6 +315,7 @@ impl Early {
 
 /// What the output of a haptic stream reads from.
 struct Outlet {
+    update: Option<Update>,
     events: Reader<Event>,
     samples: Reader<PacedSample>,
     notices: Notices,
@@ -326,6 +331,14 @@ impl Outlet {
         use pb::touch_response::Message;
         if let Some(message) = self.ready.pop_front() {
             return Poll::Ready(Some(Ok(message)));
+        }
+        if let Some(update) = &mut self.update
+            && let Poll::Ready(told) = update.poll(context)
+        {
+            self.update = None;
+            if let Some(update) = told {
+                return Poll::Ready(Some(Ok(Message::ForceLaw(update))));
+            }
         }
         if let Poll::Ready(event) = self.events.poll_pop(context) {
             return Poll::Ready(match event {
@@ -375,9 +388,10 @@ impl Stream for Output {
         let stage = &mut self.get_mut().stage;
         let message = match stage {
             Stage::Opening(opening, events) => match (ready!(Pin::new(opening).poll(context)), events.take()) {
-                (Ok(Ok(Opened { answer, samples, notices, guard })), Some(events)) => {
+                (Ok(Ok(Opened { answer, update, samples, notices, guard })), Some(events)) => {
                     let (ready, dropped_answers) = (VecDeque::new(), 0);
-                    *stage = Stage::Open(Outlet { events, samples, notices, ready, dropped_answers, _guard: guard });
+                    *stage =
+                        Stage::Open(Outlet { update, events, samples, notices, ready, dropped_answers, _guard: guard });
                     Some(Ok(Message::Opened(answer)))
                 }
                 (Ok(Err(status)), _) => Some(Err(status)),

@@ -7,6 +7,7 @@ pub mod config;
 mod connections;
 mod cut;
 mod descriptors;
+mod force_law;
 mod guard;
 mod haptics;
 pub mod identity;

@@ -19,6 +19,8 @@ const KNOCKED_SAMPLES: u32 = 5;
 #[derive(Debug, Clone)]
 pub struct Modeller {
     law: Arc<Law>,
+    /// The law's number in the stream.
+    number: u32,
     /// Whether K and B are those of the sheet around the tool also under a touch.
     touches_too: bool,
     /// The state of contact in the newest model.
@@ -48,11 +50,17 @@ impl Refinement {
 }
 
 impl Modeller {
-    /// A modeller for a tool on a tissue with this law. A grasp is rendered with K and B of the sheet around it, which
-    /// are recomputed continually; a touch is rendered with the law, and K and B are computed only if `touches_too`.
-    pub fn new(law: Arc<Law>, touches_too: bool) -> Self {
+    /// A modeller for a tool on a tissue with this law, whose number in the stream is `number`. A grasp is rendered with K
+    /// and B of the sheet around it, which are recomputed continually; a touch is rendered with the law, and K and B are
+    /// computed only if `touches_too`.
+    pub fn new(number: u32, law: Arc<Law>, touches_too: bool) -> Self {
         let (standing, tangent) = (Standing::Free, Arc::default());
-        Modeller { law, touches_too, standing, surface: None, knocked: 0, sequence: 0, tangent }
+        Modeller { law, number, touches_too, standing, surface: None, knocked: 0, sequence: 0, tangent }
+    }
+
+    /// Has the models from the next one on refer to another law.
+    pub fn change_law(&mut self, number: u32, law: Arc<Law>) {
+        (self.number, self.law) = (number, law);
     }
 
     /// Whether K and B should be computed at the tool's present place.
@@ -120,6 +128,7 @@ impl Modeller {
             valid_m: local::valid_m(force_n, LEAST_N, self.hardening(depth_m, &row)),
             friction: feel.friction,
             standing: feel.standing,
+            law: self.number,
         }
     }
 
@@ -157,7 +166,7 @@ mod tests {
     }
 
     fn modeller() -> Modeller {
-        Modeller::new(Arc::new(Law::linear(400.0, 0.5)), false)
+        Modeller::new(0, Arc::new(Law::linear(400.0, 0.5)), false)
     }
 
     #[test]

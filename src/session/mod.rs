@@ -4,6 +4,7 @@
 pub mod audit;
 pub mod check;
 pub mod command;
+pub mod laws;
 pub mod local;
 pub mod recovery;
 pub mod run;

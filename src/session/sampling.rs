@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use super::laws::{FIRST, Laws};
 use super::local::{Modeller, Refinement};
 use super::{Sample, Session, ToolSample};
 use crate::haptics::{self, Law, LocalModel};
@@ -89,8 +90,8 @@ pub struct Sampling {
     pub deadband: Option<Deadband>,
     /// Interval between samples while nothing changes, s.
     pub heartbeat_s: f64,
-    /// The law for the local models of the samples. `None`: no local models.
-    pub law: Option<Arc<Law>>,
+    /// The laws for the local models of the samples. `None`: no local models.
+    pub laws: Option<Arc<Laws>>,
     /// Whether stiffness and damping are those of the sheet around the tool also under a touch, not only under a grasp.
     pub touch_stiffness: bool,
 }
@@ -117,6 +118,8 @@ pub struct Sampler {
     /// The last sample sent, without its local models.
     told: Option<Sample>,
     foresight: BTreeMap<u32, Foresight>,
+    /// The number of the law that the last local models refer to.
+    law: u32,
 }
 
 /// The local models of one tool, and the deadband that follows how the client renders them.
@@ -131,7 +134,7 @@ impl Sampler {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub fn new(sampling: Sampling, rate_hz: f64) -> Self {
         let heartbeat_steps = (sampling.heartbeat_s * rate_hz).round().max(1.0) as u64;
-        Sampler { sampling, heartbeat_steps, told: None, foresight: BTreeMap::new() }
+        Sampler { sampling, heartbeat_steps, told: None, foresight: BTreeMap::new(), law: FIRST }
     }
 
     /// The sample of the last step, if the stream should get it. `last`: the stream gets it in any case, because no
@@ -147,18 +150,25 @@ impl Sampler {
             last || step.saturating_sub(told.step) >= self.heartbeat_steps || self.is_news(told, &sample)
         };
         let is_due = told.is_none_or(is_due);
-        let Some(law) = self.sampling.law.clone() else {
+        let Some(laws) = self.sampling.laws.clone() else {
             self.told = is_due.then(|| sample.clone()).or(self.told.take());
             return is_due.then_some(sample);
         };
-        let (models, is_left) = self.look_ahead(&sample, &law);
-        if !(is_due || is_left) {
+        let (number, law) = laws.newest();
+        let is_other = number != self.law;
+        if is_other {
+            self.law = number;
+            self.foresight.values_mut().for_each(|foresight| foresight.modeller.change_law(number, law.clone()));
+        }
+        let (models, is_left) = self.look_ahead(&sample, law);
+        // A better law is news: the client renders by the other one until a model names it.
+        if !(is_due || is_left || is_other && !models.is_empty()) {
             return None;
         }
         self.told = Some(sample.clone());
         for (tool, model) in models {
             if let Some(foresight) = self.foresight.get_mut(&tool) {
-                foresight.deadband.send(&model, &law);
+                foresight.deadband.send(&model, law);
             }
             sample.tools.iter_mut().filter(|sample| sample.tool == tool).for_each(|sample| sample.local = Some(model));
         }
@@ -177,7 +187,7 @@ impl Sampler {
                 continue;
             };
             let foresight = self.foresight.entry(tool.tool).or_insert_with(|| Foresight {
-                modeller: Modeller::new(law.clone(), self.sampling.touch_stiffness),
+                modeller: Modeller::new(self.law, law.clone(), self.sampling.touch_stiffness),
                 deadband: haptics::Deadband::new(fraction.unwrap_or(0.0)),
             });
             let model = foresight.modeller.model(feel, sample.step, tool.place_time_s);
@@ -236,7 +246,7 @@ mod tests {
     }
 
     fn sampling() -> Sampling {
-        Sampling { every: 1, only: None, deadband: None, heartbeat_s: HEARTBEAT_S, law: None, touch_stiffness: false }
+        Sampling { every: 1, only: None, deadband: None, heartbeat_s: HEARTBEAT_S, laws: None, touch_stiffness: false }
     }
 
     fn tell(session: &mut Session, sequence: u64, action: Action) {
@@ -258,7 +268,8 @@ mod tests {
             let mut session = session(&["stepping.precision=f64"]);
             let tip = Tip { grasps, radius_m: 0.05, ..Tip::default() };
             let law = Arc::new(Law::of(session.model(), tip.radius_m));
-            let mut sampler = Sampler::new(Sampling { law: Some(law.clone()), touch_stiffness, ..sampling() }, 1000.0);
+            let laws = Some(Arc::new(Laws::new(law.clone())));
+            let mut sampler = Sampler::new(Sampling { laws, touch_stiffness, ..sampling() }, 1000.0);
             let middle_m = (session.model().scene.sheet.extent_m() / 2.0).extend(0.0);
             let (mut model, mut touched) = (None, false);
             for step in 1..=100 {

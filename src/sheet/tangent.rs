@@ -23,12 +23,23 @@ use crate::scene::{Fixed, Sheet};
 /// How many times its reach around a disc the sheet is looked at: e⁻⁶ is left.
 const REACHES: f64 = 6.0;
 
-/// Residual at which a solution is good, relative to the right-hand side: of what is told, and on the way there.
-const RESIDUAL: f64 = 1e-5;
-const ROUGH_RESIDUAL: f64 = 1e-3;
+/// When a solution is good enough.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Accuracy {
+    /// Residual of the linear systems of a tangent, relative to the right-hand side.
+    residual: f64,
+    /// The same of those on the way of Newton's method.
+    rough_residual: f64,
+    /// Newton's method has arrived when no point moves farther, in spacings.
+    arrived: f64,
+}
 
-/// Newton's method has arrived when no point moves farther, in spacings.
-const ARRIVED: f64 = 1e-5;
+impl Accuracy {
+    /// Forces to about 1e-5.
+    pub const EXACT: Self = Accuracy { residual: 1e-5, rough_residual: 1e-3, arrived: 1e-5 };
+    /// Forces to about 1e-3, for a third of the work.
+    pub const COARSE: Self = Accuracy { residual: 1e-2, rough_residual: 1e-2, arrived: 1e-3 };
+}
 
 /// Most iterations of conjugate gradients.
 const MOST_ITERATIONS: u32 = 400;
@@ -40,7 +51,7 @@ const BYTES_PER_POINT: usize =
 
 /// How much may be computed, and whether it is still wanted.
 #[derive(Debug, Clone)]
-pub struct Allowance<'a> {
+struct Allowance<'a> {
     /// Springs times iterations that are left.
     left: Cell<u64>,
     stop: Option<&'a AtomicBool>,
@@ -54,7 +65,7 @@ impl Default for Allowance<'_> {
 
 impl<'a> Allowance<'a> {
     /// So many springs times iterations, as long as `stop` is not set.
-    pub fn of(work: u64, stop: &'a AtomicBool) -> Self {
+    fn of(work: u64, stop: &'a AtomicBool) -> Self {
         Allowance { left: Cell::new(work), stop: Some(stop) }
     }
 
@@ -88,6 +99,7 @@ pub struct Patch<'m> {
     weights: Vec<f64>,
     springs: Vec<Spring>,
     inverses: Vec<DMat3>,
+    accuracy: Accuracy,
     allowance: Allowance<'m>,
 }
 
@@ -137,12 +149,13 @@ pub struct Window {
 impl Window {
     /// Around a footprint.
     pub fn around(model: &Model, footprint: &Footprint) -> Self {
+        Self::at(model, footprint.radius_m(), footprint.centre_m())
+    }
+
+    fn at(model: &Model, radius_m: f64, centre_m: DVec2) -> Self {
         let scene = &model.scene;
-        let springs = &scene.springs;
-        let stiffest = springs.stiffness_n_per_m.max(springs.shear_stiffness_n_per_m);
-        let reach = (stiffest / scene.virtual_stiffness_n_per_m).sqrt().max(1.0);
-        let centre = footprint.centre_m() / scene.sheet.spacing_m;
-        let half = footprint.radius_m() / scene.sheet.spacing_m + REACHES * reach + 2.0;
+        let centre = centre_m / scene.sheet.spacing_m;
+        let half = half_window(model, radius_m);
         let (mut origin, mut size) = ([0; 2], [0; 2]);
         for axis in 0..2 {
             // Saturating casts: no virtual springs, no end.
@@ -165,6 +178,21 @@ impl Window {
         let columns = model.points[1];
         (0..size[0] * size[1]).map(move |at| (origin[0] + at / size[1]) * columns + origin[1] + at % size[1])
     }
+}
+
+/// How far from the middle of a disc of `radius_m` points notice what it does, in spacings; infinite without virtual
+/// springs.
+fn half_window(model: &Model, radius_m: f64) -> f64 {
+    let scene = &model.scene;
+    let springs = &scene.springs;
+    let stiffest = springs.stiffness_n_per_m.max(springs.shear_stiffness_n_per_m);
+    let reach = (stiffest / scene.virtual_stiffness_n_per_m).sqrt().max(1.0);
+    radius_m / scene.sheet.spacing_m + REACHES * reach + 2.0
+}
+
+/// The same in m.
+pub fn half_window_m(model: &Model, radius_m: f64) -> f64 {
+    half_window(model, radius_m) * model.scene.sheet.spacing_m
 }
 
 impl<'m> Patch<'m> {
@@ -197,6 +225,7 @@ impl<'m> Patch<'m> {
             weights,
             springs: Vec::new(),
             inverses: Vec::new(),
+            accuracy: Accuracy::EXACT,
             allowance: Allowance::default(),
         };
         patch.connect();
@@ -335,7 +364,7 @@ impl<'m> Patch<'m> {
     pub fn tangent(&self) -> Tangent {
         let axes = [DVec3::X, DVec3::Y, DVec3::Z];
         let right: Vec<Triple> = self.weights.iter().map(|weight| axes.map(|axis| *weight * axis)).collect();
-        let (shapes, iterations) = self.solve(&right, RESIDUAL);
+        let (shapes, iterations) = self.solve(&right, self.accuracy.residual);
         let compliance = |a: usize, b: usize| -> f64 {
             self.weights.iter().zip(&shapes).map(|(weight, shape)| weight * shape[b][a]).sum()
         };
@@ -382,7 +411,7 @@ impl<'m> Patch<'m> {
                 right[spring.ends[0]][0] += spring.force_n;
                 right[spring.ends[1]][0] -= spring.force_n;
             }
-            let (x, _) = self.solve(&right, ROUGH_RESIDUAL);
+            let (x, _) = self.solve(&right, self.accuracy.rough_residual);
             let on_disc = |x: &dyn Fn(usize) -> f64| -> f64 {
                 self.weights.iter().enumerate().map(|(at, weight)| weight * x(at)).sum()
             };
@@ -397,7 +426,7 @@ impl<'m> Patch<'m> {
                 largest_m = largest_m.max(change.abs().max_element());
             }
             self.linearise();
-            if largest_m < ARRIVED * self.model.scene.sheet.spacing_m || self.allowance.is_spent() {
+            if largest_m < self.accuracy.arrived * self.model.scene.sheet.spacing_m || self.allowance.is_spent() {
                 break;
             }
         }
@@ -417,40 +446,106 @@ fn symmetric(of: impl Fn(usize, usize) -> f64) -> DMat3 {
 
 /// A slow press by a disc of `radius_m` at `centre_m`, at `count` depths, `step_m` apart, from 0 on.
 pub fn press(model: &Model, radius_m: f64, centre_m: DVec2, step_m: f64, count: u32) -> Vec<Pressed> {
-    press_within(model, radius_m, centre_m, step_m, count, Allowance::default()).unwrap_or_default()
+    let course = Course { radius_m, centre_m, step_m, count };
+    let mut press = Press::new(model, course, Accuracy::EXACT);
+    let never = AtomicBool::new(false);
+    while press.deepen(model, &never) == Deepened::Further {}
+    press.pressed
 }
 
-/// The same, if it takes no more than `allowance`.
-pub fn press_within<'m>(
-    model: &'m Model,
-    radius_m: f64,
-    centre_m: DVec2,
-    step_m: f64,
-    count: u32,
-    allowance: Allowance<'m>,
-) -> Option<Vec<Pressed>> {
-    let footprint = Footprint::new(model, radius_m, centre_m);
-    let window = Window::around(model, &footprint);
-    // A solution takes as many iterations as there are points from the middle to where nothing is noticed, or nearly so,
-    // and each depth some solutions: what can't be done is not begun.
-    let [rows, columns] = window.size;
-    let least = (rows * columns) as u64 * 4 * u64::from(count) * (rows.max(columns) as u64);
-    if least > allowance.left.get() {
-        return None;
+/// What is pressed, where and how deep.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Course {
+    /// Of the disc.
+    pub radius_m: f64,
+    /// The middle of the disc in the rest plane.
+    pub centre_m: DVec2,
+    /// From one depth to the next; the first is 0.
+    pub step_m: f64,
+    /// Number of depths.
+    pub count: u32,
+}
+
+/// A slow press under way, one depth after another: between two of them whoever computes it may do something else.
+#[derive(Debug)]
+pub struct Press {
+    footprint: Footprint,
+    window: Window,
+    course: Course,
+    accuracy: Accuracy,
+    /// Springs times iterations that are left.
+    left: u64,
+    displacement_m: Vec<DVec3>,
+    pressed: Vec<Pressed>,
+}
+
+/// What became of a press.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Deepened {
+    /// Further depths are left.
+    Further,
+    /// All depths are computed.
+    Done,
+    /// The work was used up, or it was stopped: the press can't go on.
+    GivenUp,
+}
+
+impl Press {
+    /// A press by a disc with any amount of work.
+    pub fn new(model: &Model, course: Course, accuracy: Accuracy) -> Self {
+        let footprint = Footprint::new(model, course.radius_m, course.centre_m);
+        let window = Window::around(model, &footprint);
+        memory::require(window.bytes(), "a force law");
+        let displacement_m = vec![DVec3::ZERO; window.size[0] * window.size[1]];
+        let (left, pressed) = (u64::MAX, Vec::new());
+        Press { footprint, window, course, accuracy, left, displacement_m, pressed }
     }
-    memory::require(window.bytes(), "a force law");
-    let at_rest = window.points(model).map(|_| DVec3::ZERO).collect();
-    let mut patch = Patch { allowance, ..Patch::new(model, &footprint, window, at_rest) };
-    let mut pressed = Vec::new();
-    for k in 0..count {
-        let depth_m = f64::from(k) * step_m;
-        let force_n = if k == 0 { 0.0 } else { patch.press(depth_m) };
-        pressed.push(Pressed { depth_m, force_n, tangent: patch.tangent() });
-        if patch.allowance.is_spent() {
-            return None;
+
+    /// The same with at most `work` springs times iterations; none if that can't suffice.
+    pub fn within(model: &Model, course: Course, accuracy: Accuracy, work: u64) -> Option<Self> {
+        // A solution takes as many iterations as there are points from the middle to where nothing is noticed, or nearly
+        // so, and each depth some solutions: what can't be done is not begun, and no memory is taken for it.
+        let [rows, columns] = Window::at(model, course.radius_m, course.centre_m).size;
+        let least = (rows * columns) as u64 * 4 * u64::from(course.count) * (rows.max(columns) as u64);
+        (least <= work).then(|| Press { left: work, ..Self::new(model, course, accuracy) })
+    }
+
+    /// Springs times iterations that are left.
+    pub fn left(&self) -> u64 {
+        self.left
+    }
+
+    /// What was found at the depths so far.
+    pub fn pressed(&self) -> &[Pressed] {
+        &self.pressed
+    }
+
+    /// Computes the next depth, unless `stop` is set. `model` is the one that the press was made for.
+    pub fn deepen(&mut self, model: &Model, stop: &AtomicBool) -> Deepened {
+        if self.left == 0 {
+            return Deepened::GivenUp;
         }
+        let Some(depth_m) = self.next_depth_m() else { return Deepened::Done };
+        let displacement_m = std::mem::take(&mut self.displacement_m);
+        let patch = Patch::new(model, &self.footprint, self.window, displacement_m);
+        let mut patch = Patch { accuracy: self.accuracy, allowance: Allowance::of(self.left, stop), ..patch };
+        let force_n = if depth_m > 0.0 { patch.press(depth_m) } else { 0.0 };
+        let tangent = patch.tangent();
+        self.left = patch.allowance.left.get();
+        if patch.allowance.is_spent() {
+            // What was computed last is not complete, and nothing follows from it.
+            return Deepened::GivenUp;
+        }
+        self.displacement_m = patch.displacement_m;
+        self.pressed.push(Pressed { depth_m, force_n, tangent });
+        if self.next_depth_m().is_some() { Deepened::Further } else { Deepened::Done }
     }
-    Some(pressed)
+
+    #[allow(clippy::cast_precision_loss)]
+    fn next_depth_m(&self) -> Option<f64> {
+        let next = self.pressed.len();
+        (next < self.course.count as usize).then_some(next as f64 * self.course.step_m)
+    }
 }
 
 /// The same tissue in points `spacing_m` apart, each of which stands for several; as far as `half_m` from the middle, where

@@ -38,8 +38,8 @@ pub fn device(device: &Device) -> pb::Device {
     }
 }
 
-/// A force law as a message.
-pub fn law(law: &Law) -> pb::ForceLaw {
+/// A force law with its number in the stream, as a message.
+pub fn law(law: &Law, number: u32) -> pb::ForceLaw {
     let row = |row: &Row| pb::ForceLawRow {
         force_n: row.force_n,
         stiffness_n_per_m: row.stiffness_n_per_m,
@@ -48,7 +48,7 @@ pub fn law(law: &Law) -> pb::ForceLaw {
         across_n_s_per_m: row.across_n_s_per_m,
         drag_n_s_per_m: row.drag_n_s_per_m,
     };
-    pb::ForceLaw { step_m: law.step_m, rows: law.rows.iter().map(row).collect(), coarse: law.is_coarse }
+    pb::ForceLaw { step_m: law.step_m, rows: law.rows.iter().map(row).collect(), coarse: law.is_coarse, number }
 }
 
 /// The force law in a message.
@@ -69,6 +69,18 @@ pub fn from_law(message: &pb::ForceLaw) -> Result<Law> {
     let range = "must have at least two rows, all numbers finite and at least 0, and forces that never fall";
     let wrong = || Refusal::new(Reason::OutOfRange, "law", range);
     if law.is_sound() { Ok(law) } else { Err(wrong()) }
+}
+
+/// The exact law that takes the place of a coarse one, with its number; or the reason and the message why there is none.
+pub fn law_update(coarse_number: u32, exact: std::result::Result<(u32, &Law), (&str, &str)>) -> pb::ForceLawUpdate {
+    match exact {
+        Ok((number, exact)) => {
+            pb::ForceLawUpdate { coarse_number, law: Some(law(exact, number)), ..Default::default() }
+        }
+        Err((reason, message)) => {
+            pb::ForceLawUpdate { coarse_number, law: None, reason: reason.to_owned(), message: message.to_owned() }
+        }
+    }
 }
 
 fn symmetric(m: DMat3) -> Option<pb::Symmetric3> {
@@ -104,6 +116,7 @@ pub fn local_model(model: &LocalModel) -> pb::LocalModel {
         valid_m: model.valid_m,
         friction: model.friction,
         contact: contact.into(),
+        law: model.law,
     }
 }
 
@@ -130,6 +143,7 @@ pub fn from_local_model(message: &pb::LocalModel, step: u64) -> LocalModel {
         valid_m: message.valid_m,
         friction: message.friction,
         standing,
+        law: message.law,
     }
 }
 

@@ -40,7 +40,7 @@ pub fn sampling(
             rendered_fraction: deadband.rendered_fraction,
         }),
         heartbeat_s: heartbeat_s.unwrap_or(HEARTBEAT_S),
-        law: None,
+        laws: None,
         touch_stiffness: false,
     };
     sampling.check()?;

@@ -14,7 +14,8 @@ use std::process::{Child, ChildStdout, Command, Output, Stdio};
 use std::sync::OnceLock;
 use std::time::Duration;
 
-use palpate::wire::pb;
+use palpate::haptics::Law;
+use palpate::wire::{self, pb};
 use pb::haptic_service_client::HapticServiceClient;
 use pb::session_service_client::SessionServiceClient;
 use pb::touch_request::Message as Say;
@@ -258,6 +259,15 @@ impl Touch {
             let sample = self.sample().await;
             if wanted(&sample) {
                 return sample;
+            }
+        }
+    }
+
+    /// The law that takes the place of the coarse one of `opened`.
+    pub async fn exact_law(&mut self) -> Law {
+        loop {
+            if let Heard::ForceLaw(update) = self.hear().await.unwrap().unwrap() {
+                return wire::local::from_law(&update.law.expect("the coarse law stays")).unwrap();
             }
         }
     }

@@ -10,5 +10,6 @@ mod server;
 
 mod commands;
 mod contact;
+mod laws;
 mod poses;
 mod rendering;

@@ -39,8 +39,8 @@ async fn a_pressed_tool_gets_local_models_that_agree_with_the_law() {
     let mut touch =
         Touch::open(&server, pb::TouchOpen { device: Some(device()), ..open(&session, &[0]) }).await.unwrap();
     let opened = touch.opened.take().unwrap();
-    let law = wire::local::from_law(opened.law.as_ref().unwrap()).unwrap();
     assert!((opened.max_force_n - 3.3).abs() < 1e-12);
+    let law = touch.exact_law().await;
     assert!((law.at_depth(0.0005).force_n / 0.0005 / 71.1 - 1.0).abs() < 0.15);
     // Down to 4 mm, at 20 mm/s by the client's clock.
     for k in 0..400_u64 {
@@ -121,6 +121,8 @@ async fn a_deadband_sends_heartbeats_and_little_else() {
     let session = liver(&server).await;
     let thrifty = pb::TouchOpen { device: Some(device()), deadband: Some(foretold()), ..open(&session, &[0]) };
     let mut touch = Touch::open(&server, thrifty).await.unwrap();
+    // A better law is news.
+    touch.exact_law().await;
     touch.command(pose(1, 1, 0.001)).await;
     let with_model = |sample: &pb::Sample| sample.tools.first().is_some_and(|tool| tool.local_model.is_some());
     let first = touch.sample_with(with_model).await.step;

@@ -3,7 +3,9 @@
 use glam::{DMat3, DVec3};
 use palpate::haptics::device::{DEVICES, Device, SAFE_FORCE_N, UNDECLARED};
 use palpate::haptics::envelope::{ENGAGE_S, FRESH_S, PAUSE_S, SLEW_N_PER_S, STALE_S, Wanted};
+use palpate::haptics::law::Row;
 use palpate::haptics::path::{Path, Play, RELEASE_S, SPEED_M_PER_S};
+use palpate::haptics::renderer::{BIAS_S, MOST_LAWS};
 use palpate::haptics::{Envelope, Law, LocalModel, Reason, Renderer, State, Touching};
 use palpate::sheet::Standing;
 use proptest::prelude::*;
@@ -36,6 +38,7 @@ fn model(sequence: u64, time_s: f64, place_m: DVec3) -> LocalModel {
         valid_m: 0.01,
         friction: 0.2,
         standing: if depth_m > 0.0 { Standing::Sticking } else { Standing::Free },
+        law: 0,
     }
 }
 
@@ -204,6 +207,93 @@ fn a_sample_is_repeated_along_the_way_since() {
     assert!((still(&touching).x + 0.16).abs() < 1e-9, "turns back: {}", still(&touching));
     touching.move_to(&old, &law, DVec3::new(0.0096, 0.0, 0.001));
     assert_eq!(still(&touching), DVec3::ZERO);
+}
+
+/// A tissue that hardens, and the same as a coarse law may tell it: a tenth softer.
+fn hardening(share: f64) -> Law {
+    let row = |row: u32| {
+        let depth_m = f64::from(row) * 1e-3;
+        Row {
+            force_n: share * (300.0 * depth_m + 2e4 * depth_m * depth_m),
+            stiffness_n_per_m: share * (300.0 + 4e4 * depth_m),
+            across_n_per_m: 150.0,
+            damping_n_s_per_m: 0.3,
+            across_n_s_per_m: 0.2,
+            drag_n_s_per_m: 0.1,
+        }
+    };
+    Law { step_m: 1e-3, rows: (0..=10).map(row).collect(), is_coarse: share != 1.0 }
+}
+
+/// A run of a renderer whose hand moves up and down in the tissue with the full delay of a network: forces of all ticks, N.
+/// Models name law 1 from tick `changed` on.
+fn rendered_across(changed: u32) -> Vec<DVec3> {
+    const DELAY_TICKS: u32 = 50;
+    let laws = [hardening(0.9), hardening(1.0)];
+    let place = |tick: u32| {
+        let now_s = f64::from(tick) * TICK_S;
+        let down = ((now_s - ENGAGE_S - 0.1) / 0.5).clamp(0.0, 1.0);
+        let swing = 0.0015 * (std::f64::consts::TAU * 3.0 * (now_s - 1.2).max(0.0)).sin();
+        DVec3::new(0.0, 0.0, 0.001 - 0.004 * down - swing)
+    };
+    let mut renderer = Renderer::new(laws[0].clone(), enabled(omega()));
+    let mut forces = Vec::new();
+    for tick in 0..3000_u32 {
+        let now_s = f64::from(tick) * TICK_S;
+        if tick == changed.saturating_sub(10) {
+            assert!(renderer.learn(1, laws[1].clone()));
+        }
+        if let Some(then) = tick.checked_sub(DELAY_TICKS) {
+            // The tissue is as the exact law says, with its surface at 0; the server tells the surface by the law it names.
+            let (law, depth_m) = (u32::from(tick >= changed), (-place(then).z).max(0.0));
+            let force_n = laws[1].at_depth(depth_m).force_n;
+            let surface_m = place(then) + laws[law as usize].depth_of(force_n) * DVec3::Z;
+            let model = model(u64::from(tick), f64::from(then) * TICK_S, place(then));
+            let surface_m = if depth_m > 0.0 { surface_m } else { model.surface_m };
+            renderer.receive(LocalModel { force_n: force_n * DVec3::Z, surface_m, law, ..model }, now_s);
+        }
+        forces.push(renderer.tick(now_s, place(tick)));
+    }
+    assert_eq!((renderer.state(), renderer.refused()), (State::Enabled, 0));
+    forces
+}
+
+#[test]
+fn a_change_of_law_is_no_jump_of_force() {
+    // In the middle of a fast stroke, where the two laws differ most over the way since the sample, and elsewhere.
+    let steepest = |forces: &[DVec3]| forces.windows(2).map(|two| (two[1] - two[0]).length()).fold(0.0, f64::max);
+    let ([coarse, exact], mut sharpest) = ([u32::MAX, 0].map(rendered_across), 0.0_f64);
+    for changed in (1400..1740).step_by(17) {
+        let forces = rendered_across(changed);
+        let at = changed as usize;
+        assert_eq!(forces[..at], coarse[..at]);
+        // As long as the bias of the change lasts, which decays with its time constant.
+        let [own_n, other_n, found_n] = [&coarse, &exact, &forces].map(|forces| steepest(&forces[at - 1..at + 100]));
+        let (own_n, bias_n) = (own_n.max(other_n), (coarse[at] - exact[at]).length());
+        assert!(
+            found_n <= own_n + bias_n * TICK_S / BIAS_S + 1e-9,
+            "{found_n} N in a tick, {own_n} N without a change"
+        );
+        sharpest = sharpest.max(bias_n / own_n);
+    }
+    println!("a bias of up to {sharpest} times the change in a tick");
+    // Taken over at once, the change would be felt.
+    assert!(sharpest > 1.5, "{sharpest}");
+}
+
+#[test]
+fn laws_are_bounded_and_one_that_is_not_known_changes_nothing() {
+    let (mut renderer, tick) = pressed(0.005);
+    assert!(!renderer.learn(0, Law::linear(800.0, 0.5)), "the first stays what it is");
+    assert!(!renderer.learn(1, Law { step_m: f64::NAN, ..law() }));
+    let (now_s, place_m) = (f64::from(tick) * TICK_S, DVec3::new(0.0, 0.0, -0.005));
+    renderer.receive(LocalModel { law: 7, ..model(u64::from(tick) + 1, now_s, place_m) }, now_s);
+    assert!((renderer.tick(now_s, place_m).z - 2.0).abs() < 1e-6);
+    let learned = (1..100).filter(|number| renderer.learn(*number, law())).count();
+    assert_eq!(learned, MOST_LAWS - 1);
+    // Another server begins with its own.
+    renderer.begin(law());
+    assert!(renderer.learn(1, law()));
 }
 
 #[test]

@@ -30,6 +30,8 @@ pub(crate) struct Shared {
 pub(crate) struct Inbound {
     /// The law of a new connection.
     pub(crate) law: Option<Law>,
+    /// A further law of the newest connection, and its number.
+    pub(crate) further: Option<(u32, Law)>,
     /// The middle of the sheet, m.
     pub(crate) middle_m: DVec3,
     /// Of the newest connection.
@@ -167,8 +169,19 @@ async fn connect(
                         let law = wire::local::from_law(law).map_err(|refusal| refusal.to_string())?;
                         let mut inbound = shared.inbound();
                         inbound.connections += 1;
-                        (inbound.law, inbound.newest, inbound.middle_m) = (Some(law), None, middle_m);
+                        (inbound.law, inbound.further) = (Some(law), None);
+                        (inbound.newest, inbound.middle_m) = (None, middle_m);
                     }
+                    Some(Heard::ForceLaw(update)) => match update.law {
+                        Some(message) => {
+                            let law = wire::local::from_law(&message).map_err(|refusal| refusal.to_string())?;
+                            shared.inbound().further = Some((message.number, law));
+                        }
+                        None => {
+                            let (message, reason) = (update.message, update.reason);
+                            crate::say!("palpate-client: the force law stays a coarse one: {message} ({reason})");
+                        }
+                    },
                     Some(Heard::Sample(sample)) => {
                         if sample.held {
                             return Err("the session was stopped by its guard".to_owned());

@@ -125,9 +125,9 @@ pub(crate) fn serve(
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
         let now_ns = (now_s * 1e9) as u64;
         let mut force_n = DVec3::ZERO;
-        let (law, model, middle_m) = {
+        let (law, further, model, middle_m) = {
             let mut inbound = shared.inbound();
-            (inbound.law.take(), inbound.newest.take(), inbound.middle_m)
+            (inbound.law.take(), inbound.further.take(), inbound.newest.take(), inbound.middle_m)
         };
         if let Some(law) = law {
             match &mut renderer {
@@ -140,6 +140,10 @@ pub(crate) fn serve(
             if reading.enable && !was_asked {
                 renderer.envelope.reset();
                 renderer.envelope.enable();
+            }
+            // Before the models that name it.
+            if let Some((number, law)) = further {
+                renderer.learn(number, law);
             }
             if let Some(model) = model {
                 renderer.receive(model, now_s);

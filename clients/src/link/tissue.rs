@@ -9,6 +9,7 @@ use palpate::scene::script::Action;
 use palpate::scene::tip::Tip;
 use palpate::session::Session;
 use palpate::session::command::{Command, Due};
+use palpate::session::laws::FIRST;
 use palpate::session::local::Modeller;
 use palpate::sheet::{Feel, Model, Standing};
 
@@ -21,7 +22,7 @@ pub(super) struct Tissue {
 
 impl Tissue {
     pub(super) fn new(model: &Arc<Model>, tip: Tip, law: Arc<Law>) -> Self {
-        Tissue { session: Session::new(model), tip, modeller: Modeller::new(law, false) }
+        Tissue { session: Session::new(model), tip, modeller: Modeller::new(FIRST, law, false) }
     }
 
     /// Performs one step, at the end of which the tool is at `place_m`, or released if that is `None`.

@@ -1,0 +1,189 @@
+//! The first law that a client gets, and the change to the exact one.
+
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::time::{Duration, Instant};
+
+use crate::common::{model, scene_with};
+use crate::server::{PATIENCE, Server, Touch, open};
+use palpate::haptics::law::Row;
+use palpate::haptics::{Device, Law, Touching};
+use palpate::scene::BUILT_IN;
+use palpate::sheet::{Model, Standing};
+use palpate::wire::{self, pb};
+use pb::touch_response::Message as Heard;
+
+fn tissue(name: &str, sets: &[&str]) -> Arc<Model> {
+    let text = BUILT_IN.iter().find(|scene| scene.0 == name).unwrap().1;
+    model(&scene_with(text, sets))
+}
+
+/// The largest differences of force and stiffness at the depths of the exact law: of the force as a part of the force
+/// there, of the stiffness as a part of the largest.
+fn apart(exact: &Law, coarse: &Law) -> [f64; 2] {
+    let depths = (1..exact.rows.len()).map(|row| row as f64 * exact.step_m);
+    let pairs: Vec<[Row; 2]> = depths.map(|depth_m| [exact.at_depth(depth_m), coarse.at_depth(depth_m)]).collect();
+    let stiffest = exact.rows.iter().map(|row| row.stiffness_n_per_m).fold(0.0, f64::max);
+    let force = pairs.iter().map(|[exact, coarse]| (coarse.force_n / exact.force_n - 1.0).abs());
+    let stiffness = pairs.iter().map(|[exact, coarse]| (coarse.stiffness_n_per_m - exact.stiffness_n_per_m).abs());
+    [force.fold(0.0, f64::max), stiffness.fold(0.0, f64::max) / stiffest]
+}
+
+#[test]
+fn a_first_law_is_within_a_tenth_of_the_exact_one() {
+    let never = AtomicBool::new(false);
+    let membrane = "virtual_springs.stiffness_n_per_m=1e-3";
+    let cases: [(&str, &[&str]); 5] = [
+        ("paper", &[]),
+        ("liver", &["sheet.points=[32, 24]", membrane]),
+        ("liver", &[]),
+        ("stomach", &[]),
+        ("fibrotic", &[]),
+    ];
+    for (name, sets) in cases {
+        let model = tissue(name, sets);
+        let first = Law::first(&model, 0.005, &never).unwrap();
+        let [force, stiffness] = apart(&Law::of(&model, 0.005), &first);
+        println!("{name} {sets:?}: coarse {}, force {force:.4}, stiffness {stiffness:.4} apart", first.is_coarse);
+        assert!(first.is_sound(), "{name} {sets:?}: {first:?}");
+        assert!(force < 0.1, "{name} {sets:?}: {force}");
+        assert!(stiffness < 0.15, "{name} {sets:?}: {stiffness}");
+    }
+}
+
+/// Sheets whose exact law takes too long for any test, and those that are hard to put in few points.
+#[test]
+fn every_tissue_has_a_first_law() {
+    let never = AtomicBool::new(false);
+    let cases: [(&str, &[&str], f64); 6] = [
+        ("liver", &["sheet.points=[331, 331]", "virtual_springs.stiffness_n_per_m=1e-6"], 0.005),
+        ("liver", &["sheet.points=[1001, 1001]", "virtual_springs.stiffness_n_per_m=1e-6"], 0.003),
+        ("liver", &["sheet.points=[2001, 3]"], 0.005),
+        ("paper", &["sheet.points=[501, 501]"], 0.005),
+        ("paper", &["sheet.points=[2, 2]"], 0.005),
+        ("paper", &["sheet.points=[12, 31]", "sheet.fixed=[[3, 5], [11, 30]]"], 0.1),
+    ];
+    for (name, sets, radius_m) in cases {
+        let model = tissue(name, sets);
+        let first = Law::first(&model, radius_m, &never);
+        assert!(first.as_ref().is_some_and(Law::is_sound), "{name} {sets:?}: {first:?}");
+    }
+    let stopped = AtomicBool::new(true);
+    assert_eq!(Law::first(&tissue("liver", &[]), 0.005, &stopped), None);
+}
+
+/// Leads tool 0 of a stream by the client's clock.
+struct Lead {
+    touch: Touch,
+    begun: Instant,
+    sequence: u64,
+}
+
+impl Lead {
+    /// Into the middle of `paper`.
+    async fn press(&mut self, z_m: f64) {
+        self.sequence += 1;
+        let pose = pb::Pose { position_m: Some(pb::Vector3 { x: 0.5, y: 0.5, z: z_m }), ..Default::default() };
+        let command = pb::Command {
+            tool: 0,
+            sequence: self.sequence,
+            client_time_ns: u64::try_from((Duration::from_secs(1) + self.begun.elapsed()).as_nanos()).unwrap(),
+            action: Some(pb::command::Action::Pose(pose)),
+            ..Default::default()
+        };
+        self.touch.command(command).await;
+    }
+}
+
+fn with_device(session: &str, tools: &[u32]) -> pb::TouchOpen {
+    let device = wire::local::device(&Device::named("omega3").unwrap());
+    pb::TouchOpen { device: Some(device), ..open(session, tools) }
+}
+
+/// A server with these keys of `[limits]`. No deadline decides here.
+fn limited(limits: &str) -> Server {
+    let folder = tempfile::tempdir().unwrap();
+    let config = folder.path().join("palpate.toml");
+    std::fs::write(&config, format!("[limits]\nwork_s = 3600.0\n{limits}\n")).unwrap();
+    Server::start(&["--config", config.to_str().unwrap()])
+}
+
+/// A session of `paper`, whose exact law takes twice the work of a first one.
+async fn session(server: &Server) -> String {
+    let scene = scene_with(palpate::scene::PAPER, &["stepping.integrator=\"lagged\"", "stepping.substeps=1"]);
+    let source = pb::create_session_request::Source::Scene(wire::scene::scene(&scene));
+    server.create(source, false).await.unwrap().session_id
+}
+
+#[tokio::test]
+async fn a_coarse_law_is_changed_for_the_exact_one_by_a_model_that_names_it() {
+    let server = limited("");
+    let session = session(&server).await;
+    let mut touch = Touch::open(&server, with_device(&session, &[0])).await.unwrap();
+    let opened = touch.opened.take().unwrap().law.unwrap();
+    assert!(opened.coarse && opened.number == 0, "{opened:?}");
+    let mut laws = vec![wire::local::from_law(&opened).unwrap()];
+    let mut lead = Lead { touch, begun: Instant::now(), sequence: 0 };
+    // Until some models have named either law; the tool is pressed in all the while.
+    let mut named = [0_u32; 2];
+    tokio::time::timeout(10 * PATIENCE, async {
+        while named.iter().any(|models| *models < 20) {
+            lead.press(-0.002).await;
+            match lead.touch.hear().await.unwrap().unwrap() {
+                Heard::ForceLaw(update) => {
+                    assert_eq!((update.coarse_number, update.reason.as_str()), (0, ""));
+                    let law = update.law.unwrap();
+                    assert_eq!((law.number as usize, law.coarse), (laws.len(), false), "it is told once");
+                    laws.push(wire::local::from_law(&law).unwrap());
+                }
+                Heard::Sample(sample) => {
+                    let Some(model) = sample.tools.first().and_then(|tool| tool.local_model.as_ref()) else { continue };
+                    let model = wire::local::from_local_model(model, sample.step);
+                    let law = laws.get(model.law as usize).expect("the law comes before the model that names it");
+                    // Server and client mean the same: under a touch the law passes through the sample.
+                    if model.standing != Standing::Free {
+                        let repeated_n = Touching::at_sample(&model, law).force_n(&model, law, model.velocity_m_per_s);
+                        assert!((repeated_n - model.force_n).length() < 1e-6, "{repeated_n} beside {}", model.force_n);
+                    }
+                    let is_told = laws.len() == 2;
+                    assert!(model.law == 0 || is_told);
+                    named[model.law as usize] += 1;
+                }
+                _ => {}
+            }
+        }
+    })
+    .await
+    .unwrap_or_else(|_| panic!("models that named each law: {named:?}"));
+    // Whoever comes later begins with the exact law, and is told nothing more.
+    let mut later = Touch::open(&server, with_device(&session, &[1])).await.unwrap();
+    let law = later.opened.take().unwrap().law.unwrap();
+    assert!(!law.coarse && law.number == 0);
+    assert_eq!(wire::local::from_law(&law).unwrap(), laws[1]);
+    for _ in 0..10 {
+        assert!(matches!(later.hear().await.unwrap(), Some(Heard::Sample(_))));
+    }
+}
+
+#[tokio::test]
+async fn a_law_beyond_the_bound_stays_coarse_and_says_so_once() {
+    let server = limited("law_work = 1000000");
+    let session = session(&server).await;
+    // Of each stream: also where it is known already.
+    for tool in 0..2 {
+        let mut touch = Touch::open(&server, with_device(&session, &[tool])).await.unwrap();
+        assert!(touch.opened.take().unwrap().law.unwrap().coarse);
+        let (mut updates, mut after) = (Vec::new(), 0);
+        while after < 10 {
+            match touch.hear().await.unwrap().unwrap() {
+                Heard::ForceLaw(update) => updates.push(update),
+                Heard::Sample(_) => after += u32::from(!updates.is_empty()),
+                other => panic!("{other:?}"),
+            }
+        }
+        assert_eq!(updates.len(), 1, "{updates:?}");
+        let pb::ForceLawUpdate { coarse_number, law, reason, message } = updates.pop().unwrap();
+        assert_eq!((coarse_number, law, reason.as_str()), (0, None, "NOT_AVAILABLE"));
+        assert!(message.contains("limits.law_work"), "{message}");
+    }
+}
