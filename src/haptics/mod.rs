@@ -4,6 +4,11 @@
 //!
 //! Conventions: `force_on_tool_n` is the force of the tissue on the tool; stiffness and damping are positive; the sheet's
 //! frame is right-handed with z out of the tissue.
+//!
+//! **Delay.** Forces are not extrapolated over the delay. The client gets the force law of a slow press ahead of time (`law`). A
+//! sample tells where on that law the tissue was, and the client repeats pressure, damping, sticking and sliding along its own
+//! path since (`local`). The error is then what the law does not know (other tools, the grain of the grid, inertia) over some
+//! milliseconds, and stays at a few tenths of a per cent up to 200 ms of round trip. The safety envelope acts last.
 
 mod coarse;
 pub mod deadband;

@@ -1,4 +1,7 @@
 //! What steps take, and who bears it when a thread has not enough time for all.
+//!
+//! A new session's step is estimated from its points and substeps and from what awake sessions take for theirs. Sessions at rest
+//! do not count: a thousand of them are a valid use, and `limits.sessions` bounds them.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 

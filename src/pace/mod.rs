@@ -1,5 +1,13 @@
 //! Sessions in real time: the only room with a clock. Stepping threads own the sessions; what servers call here
 //! posts a request to one, or goes through the session's intake, and never waits for a step.
+//!
+//! **Stepping threads wait for nobody.** Commands wait in the intake, whose lock is held for a queue operation and never for a
+//! step. Samples and records wait in queues with bounds in items and bytes that drop the oldest and count it, snapshots for
+//! frames in a slot that keeps the newest, the log in a buffer that drops. Requests to a session are messages to its thread,
+//! which serves one of them before each step that is due.
+//!
+//! **Overruns.** Time steps are fixed. A session catches up two steps and what the longest step of its thread has made it late.
+//! What it is behind beyond that is dropped from its schedule, counted (`overrun_count`), and shows as `time_dilation`.
 
 mod admission;
 pub mod auditor;

@@ -15,6 +15,10 @@
 //! when the next is due. A session of which nobody waits for a step is not in the thread's rota at all, and a thread
 //! whose rota is empty sleeps until it is asked something. What comes in meanwhile is placed where it would be had the
 //! session been stepped ([`Intake::rest`](crate::session::command::Intake::rest)), and wakes the thread.
+//!
+//! One beat: sessions begin at a whole millisecond, so those of one rate are due together. The thread wakes once for all of
+//! them, and wakes their readers together at the end of the round, after 32 of them, or after 0.2 ms (`queue::Wakes`). So the
+//! samples of a round leave in few turns of the network threads.
 
 use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};

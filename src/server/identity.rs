@@ -1,5 +1,10 @@
 //! Authentication and authorization: roles, the role that each call requires, and the token file, which gives roles to
 //! tokens and client certificates.
+//!
+//! A call of our own package without an entry in the table is refused on a server that authenticates, and a test goes through
+//! the protocol's descriptors: no call can be forgotten. Ids of sessions and leases are 128 random bits each: a caller with the
+//! role `touch` still needs the one to find a session and the other to command a tool. A server without credentials on loopback
+//! refuses pages whose origin is a host name other than `localhost`: such a name may resolve to this machine.
 
 use std::path::Path;
 use std::sync::Arc;

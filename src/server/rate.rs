@@ -1,4 +1,8 @@
 //! Rate limits: a token bucket that fills steadily; each request takes one. Time is an argument of the bucket.
+//!
+//! Commands above a stream's rate are refused one by one. When the excess is more than the bucket holds, so that refusing costs
+//! too much as well, the stream ends with the reason. Other calls are counted by connection; the refusal of one that comes too
+//! fast is delayed until the next would be allowed, which slows callers that retry at once.
 
 use std::sync::Mutex;
 use std::time::Duration;

@@ -2,6 +2,10 @@
 //! threads of lower priority than the stepping threads. Callers take turns, and each has at most one job running. A caller
 //! with many jobs therefore delays only itself, as long as there are fewer such callers than threads; beyond that, others
 //! wait for at most one job. A job that no call waits for any more is not started, or is told to stop.
+//!
+//! Jobs are bounded by counted work, not by time, so that the same request has the same result on every machine:
+//! `limits.rehearsal_work` (points × substeps of the rehearsals of a choice), `limits.law_work` (springs × iterations of a force
+//! law). A scene that needs more is refused, never chosen less accurately; offline programs allow 32 times as much.
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};

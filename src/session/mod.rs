@@ -1,5 +1,15 @@
 //! One tissue in use: the actions of the tools, the forces on them, and the records. No clock, no socket: a session
 //! with the same commands at the same steps gives the same bits.
+//!
+//! **Held and continuous forces.** `palpate run` takes a script's force as a function of time. Commands, and `run --held`, keep
+//! a force constant over each step. `Script::actions_at` states once what a client tells the tools at each step; runs offline
+//! and replays both send that through the same intake, so their hashes are equal. A grasped point reaches its target at the
+//! *end* of the command's step with constant velocity: its place at each step is exact, and no substep sees a jump.
+//!
+//! **Records.** A record at a jump of force shows the forces just before it; at t = 0, just after.
+//!
+//! **Order.** Commands that are due at one step act in the order of their tools' numbers, not of arrival: two clients that
+//! stamp their commands get the same bits whichever network was faster. A second tool that grasps a point takes it over.
 
 pub mod audit;
 pub mod check;

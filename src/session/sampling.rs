@@ -1,4 +1,8 @@
 //! Selects the samples of a stream: every Nth, changes beyond a deadband, and heartbeats while nothing changes.
+//!
+//! One rule for all streams: of the steps that are multiples of N, those whose sample differs from the stream's last one, beyond
+//! the deadband if there is one, and those at which a heartbeat is due. Without a deadband every change counts. The stepping
+//! thread asks the same rule for the next step that would be due if nothing changed: so a session at rest skips to it.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

@@ -1,4 +1,8 @@
 //! The tissue: an immutable model, a state, and the step that advances it. No clock, no socket.
+//!
+//! The state is u, the displacement from rest, and d, what a substep adds to it, both in spacings. Positions are not stored: so
+//! small movements keep their digits in f32. Each substep is one sweep over the springs (`sweep`), in which a scheme
+//! (`integrate`) advances each point. A sheet at rest costs almost nothing: tiles sleep (`tiles`, `rest`).
 
 /// Runs code with the scheme of a plan in format `$t`, for uses that do not advance the scheme and need no
 /// compensation.

@@ -1,4 +1,10 @@
 // The page: connects the parts.
+//
+// It shows only what frames and samples say. A worker receives frames and returns credit (four in flight), so a page that
+// draws slowly is not sent less. Positions and normals are computed once for each picture, for what is drawn; picking and
+// figures use all vertices. Commands go in batches of one with at most two in flight, the newest place only; each push has a
+// time to live, each lease four seconds. Without TLS a browser speaks HTTP/1.1 with six connections: hence one stream of
+// frames, one of samples, and one acknowledgement at a time.
 
 import type { Session } from "./gen/palpate/v1/session_pb";
 import { SessionState } from "./gen/palpate/v1/session_pb";
