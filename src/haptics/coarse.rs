@@ -80,9 +80,9 @@ fn force_at(depth_m: f64, largest_n: f64, yields: &dyn Fn(f64) -> (f64, f64)) ->
     for _ in 0..40 {
         let (at_m, rise) = yields(force_n);
         if at_m < depth_m {
-            low = force_n
+            low = force_n;
         } else {
-            high = force_n
+            high = force_n;
         }
         let next_n = force_n + (depth_m - at_m) / rise;
         let next_n = if next_n > low && next_n < high { next_n } else { 0.5 * (low + high) };

@@ -47,7 +47,7 @@ const REACH_IN_RADII: f64 = 4.0;
 
 /// An exact law under way, one depth after another.
 #[derive(Debug)]
-pub struct Computation(Press);
+pub struct Computation(Box<Press>);
 
 /// What became of a computation.
 #[derive(Debug)]
@@ -64,7 +64,8 @@ impl Computation {
     /// Of the law under a disc of `radius_m` in the middle of the sheet, with at most `most_work` springs times iterations;
     /// none if they can't suffice.
     pub fn new(model: &Model, radius_m: f64, most_work: u64) -> Option<Self> {
-        Press::within(model, course(model, radius_m, ROWS), Accuracy::EXACT, most_work).map(Computation)
+        Press::within(model, course(model, radius_m, ROWS), Accuracy::EXACT, most_work)
+            .map(|press| Computation(Box::new(press)))
     }
 
     /// Computes the next depth, unless `stop` is set. `model` is the one that it was begun for.
