@@ -91,7 +91,7 @@ fn the_limit_is_the_largest_number_that_meets_the_objective() {
 fn what_makes_no_sense_is_refused() {
     let server = Server::start(&[]);
     for (arguments, expected) in [
-        ("--find-limit p99<2", "no bound of p99"),
+        ("--find-limit p99<2", "not a valid bound of p99"),
         ("--find-limit p98<2ms", "unknown quantity `p98`"),
         ("--sessions 0", "--sessions"),
         ("--rate-hz 0", "--rate-hz"),

@@ -442,7 +442,10 @@ fn a_recovery_is_the_same_in_a_replay_and_offline_and_neither_calls_that_the_scr
         .unwrap();
     for ended in [&through, &offline] {
         let said = String::from_utf8_lossy(&ended.stderr);
-        assert!(ended.status.code() == Some(1) && said.contains("from there on this is not the script"), "{said}");
+        assert!(
+            ended.status.code() == Some(1) && said.contains("from there on the run differs from the script"),
+            "{said}"
+        );
     }
     let (through, offline) = (lines(&through.stdout), lines(&offline.stdout));
     let last = offline.len() - 1;

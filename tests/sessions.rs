@@ -123,7 +123,7 @@ async fn bad_scenes_are_refused_with_the_field() {
             |s| s.springs.as_mut().unwrap().stiffness_n_per_m = Some(1e12),
             Code::ResourceExhausted,
             "TOO_LARGE",
-            "stepping.substeps",
+            "stepping.rate_hz",
         ),
     ];
     for (change, code, reason, field) in cases {
@@ -536,7 +536,7 @@ fn bad_configuration_is_refused() {
     let config = folder.path().join("palpate.toml");
     let path = config.to_str().unwrap();
     for (text, expected) in [
-        ("listen = \"nowhere\"\n", "nowhere: must be address:port"),
+        ("listen = \"nowhere\"\n", "listen: must be address:port"),
         ("listen = 7\n", "palpate.toml:1"),
         ("shutdown_deadline_s = 1e300\n", "shutdown_deadline_s"),
         ("lease_s = 1000.0\n", "lease_s"),

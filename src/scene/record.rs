@@ -105,7 +105,7 @@ impl Summary {
     pub fn fault(&self) -> Option<String> {
         let Recovery { step, reason, .. } = self.recoveries.first()?;
         Some(format!(
-            "the guard released all tools after step {step}, because {reason}: from there on this is not the script"
+            "the guard released all tools after step {step}, because {reason}: from there on the run differs from the script"
         ))
     }
 }

@@ -288,8 +288,9 @@ mod tests {
             assert_eq!(workshop.work(&other, move |_| number).await.unwrap(), number);
         }
         assert_eq!(workshop.load().waiting, 4);
-        asked.iter().for_each(tokio::task::JoinHandle::abort);
-        for asked in asked {
+        // Those that wait go first: the end of the running job would begin the next.
+        for asked in asked.into_iter().rev() {
+            asked.abort();
             assert!(asked.await.unwrap_err().is_cancelled());
         }
         // The running job was told to stop; the others never began.

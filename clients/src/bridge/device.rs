@@ -13,8 +13,8 @@
 //! - Haply Inverse3: `read` is the newest `cursor_position` of its stream; `write` is `set_cursor_force`. Its z axis points
 //!   up, like ours.
 //!
-//! Each tick calls `read` and `write` once; both must return within a fraction of a tick. An error of either ends the loop
-//! at once, without a further `write`: set the force to zero in the adapter before you return one.
+//! Each tick calls `read` and `write` once; both must return within a fraction of a tick. An error of either ends the loop,
+//! which then writes a force of zero once.
 
 use std::time::Instant;
 

@@ -89,12 +89,25 @@ pub(crate) struct Served {
     pub(crate) ages_s: Vec<f64>,
 }
 
-/// Runs the loop of a device for a time, or until `commands` is closed. The device's frame is the sheet's. `remember`: keeps
-/// the course and the models' ages.
+/// Runs the loop of a device for a time, or until `commands` is closed, and then sets its force to zero, also after an error.
+/// The device's frame is the sheet's. `remember`: keeps the course and the models' ages.
 ///
 /// # Errors
 /// Returns the device's error if it can't be read or written.
 pub(crate) fn serve(
+    device: &mut dyn HapticDevice,
+    shared: &Shared,
+    commands: &mpsc::Sender<line::Command>,
+    lasts: Option<Duration>,
+    remember: bool,
+) -> std::io::Result<Served> {
+    let ended = tick(device, shared, commands, lasts, remember);
+    // A device holds its last force until it is told another.
+    let _ = device.write(DVec3::ZERO);
+    ended
+}
+
+fn tick(
     device: &mut dyn HapticDevice,
     shared: &Shared,
     commands: &mpsc::Sender<line::Command>,
@@ -162,7 +175,6 @@ pub(crate) fn serve(
         // If the network does not keep up, this position is dropped; the next one replaces it.
         let _ = commands.try_send((now_ns, reading.place_m));
     }
-    let _ = device.write(DVec3::ZERO);
     served.envelope = renderer.map(|renderer| renderer.envelope);
     Ok(served)
 }
@@ -276,5 +288,51 @@ pub(crate) async fn run(
     match never {
         Some(why) => Err(Failure::Failed(format!("never connected: {why}"))),
         None => Ok((served, shared)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use palpate::haptics::Law;
+    use palpate::haptics::device::UNDECLARED;
+
+    use super::*;
+
+    /// Fails to be read at its 20th tick; remembers what it was last told.
+    struct Failing {
+        ticks: u32,
+        force_n: DVec3,
+    }
+
+    impl HapticDevice for Failing {
+        fn descriptor(&self) -> palpate::haptics::Device {
+            UNDECLARED
+        }
+
+        fn read(&mut self) -> std::io::Result<device::Reading> {
+            self.ticks += 1;
+            if self.ticks == 20 {
+                // As if a force were held.
+                self.force_n = DVec3::Z;
+                return Err(std::io::ErrorKind::BrokenPipe.into());
+            }
+            Ok(device::Reading { place_m: DVec3::ZERO, enable: true })
+        }
+
+        fn write(&mut self, force_n: DVec3) -> std::io::Result<()> {
+            self.force_n = force_n;
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn a_device_that_fails_is_left_without_a_force() {
+        let (commands, _received) = mpsc::channel(64);
+        let shared = Shared::default();
+        shared.inbound().law = Some(Law::linear(400.0, 0.5));
+        let mut device = Failing { ticks: 0, force_n: DVec3::X };
+        let ended = serve(&mut device, &shared, &commands, None, false);
+        assert!(ended.is_err());
+        assert_eq!((device.ticks, device.force_n), (20, DVec3::ZERO));
     }
 }
