@@ -12,6 +12,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::time::Duration;
 
 use course::Course;
+use palpate::haptics::envelope::PAUSE_S;
 use proxy::Proxy;
 use serde_json::Value;
 use server::{Server, client_program};
@@ -192,6 +193,8 @@ async fn forces_stay_within_the_envelope_whatever_breaks() {
     let bridge = bridge(&proxy, &["--course", file.to_str().unwrap()]);
     first.until_applied("liver", TOUCHES).await;
     drop(first);
+    // Long enough without a server that forces pause, however soon the next one is there.
+    tokio::time::sleep(Duration::from_secs_f64(2.0 * PAUSE_S)).await;
     let second = Server::start(&[]);
     proxy.aim(address(&second));
     second.until_applied("liver", TOUCHES).await;
