@@ -10,11 +10,10 @@ mod server;
 
 use std::time::Duration;
 
-use palpate::haptics::device::Device;
-use palpate::wire::{self, pb};
+use palpate::wire::pb;
 use pb::session_service_client::SessionServiceClient;
 use rustix::process::{Pid, Resource, Rlimit, prlimit};
-use server::{PATIENCE, Server, Touch, force, open, sheet, told};
+use server::{PATIENCE, Server, Touch, force, sheet, told};
 use tonic::transport::Channel;
 use tonic::{Code, Status};
 
@@ -47,7 +46,6 @@ async fn without_address_space_requests_are_refused_sessions_end_and_others_are_
     let mut sessions = server.sessions().await;
     let small = server.paper(false).await;
     let mut touch = Touch::hold(&server, &small).await;
-    let middling = create(&mut sessions, 100, true).await.unwrap();
     let doomed = create(&mut sessions, 512, false).await.unwrap();
     let doomed_touch = Touch::hold(&server, &doomed).await;
     leave(&server, 512 << 20);
@@ -76,9 +74,6 @@ async fn without_address_space_requests_are_refused_sessions_end_and_others_are_
     assert_no_memory(&sessions.get_state_hash(hash).await.unwrap_err(), "");
     let change = pb::UpdateTissueRequest { session_id: large, stiffness_n_per_m: Some(11.0), ..Default::default() };
     assert_no_memory(&sessions.update_tissue(change).await.unwrap_err(), "");
-    let device = Some(wire::local::device(&Device::named("omega3").unwrap()));
-    let law = Touch::open(&server, pb::TouchOpen { device, ..open(&middling, &[1]) }).await;
-    assert_no_memory(&law.err().unwrap(), "device");
 
     // A session that needs more to go on is held with the reason.
     doomed_touch.command(force(0, 1, -1.0)).await;
