@@ -49,8 +49,9 @@ help:
 	@echo 'make bench-viewer    331 × 331 points at 60 frames a second in a browser, and from a press to its pixel'
 	@echo 'make bench-stability the largest stable step, predicted and observed'
 	@echo 'make bench-skip      what it saves to leave out what is at rest, and its error'
-	@echo 'make bench-load      sessions that one core bears, with clients and without, and under attack: docs/benchmarks/load.md'
-	@echo '                     one attack alone: make bench-load ATTACK=endless-scene (ATTACK=all: each of them, and no more)'
+	@echo 'make bench-load      sessions that one core bears, with clients and without: docs/benchmarks/load.md'
+	@echo '                     ATTACK=all: what a client notices of 41 attacks (an hour): docs/benchmarks/attacks.md;'
+	@echo '                     one attack alone: make bench-load ATTACK=endless-scene'
 	@echo 'make soak            random clients for SECONDS=1800: memory, handles, threads, and every command accounted for; then'
 	@echo '                     clients and servers killed KILLS=50 times'
 	@echo 'make siege           eight attackers at random against four honest clients for SECONDS=1800, by SEED=16: their times,'
@@ -232,7 +233,8 @@ bench-viewer: build viewer
 bench-link: build
 	$(CARGO) bench --quiet --bench link -- $(ARGUMENTS)
 
-# `make bench-load ATTACK=unread-probes` is one row of the table of attacks, ATTACK=all all of that table.
+# `make bench-load ATTACK=unread-probes` is one row of the table of attacks, ATTACK=all all of that table, each three times
+# (ARGUMENTS='--runs 1').
 bench-load: build
 	$(CARGO) bench --quiet --bench load -- $(if $(ATTACK),attacks $(ATTACK)) $(ARGUMENTS)
 

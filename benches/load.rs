@@ -1,7 +1,8 @@
 //! How many sessions does a core bear, each with a haptic client at 1 kHz or none, what does each cost beside the kernel
-//! alone, and does anybody notice an attack? The server is kept to one core, the generator (`palpate-client load`) to the
-//! others. Writes docs/benchmarks/load.{md,json,svg}. `-- --quick` tries few numbers for a short time; `-- attacks` (or
-//! `-- attacks NAME`, of one) or `-- profile` prints that part alone, and writes nothing. Linux only: times are read from /proc.
+//! alone? The server is kept to one core, the generator (`palpate-client load`) to the others. Writes
+//! docs/benchmarks/load.{md,json,svg}. `-- --quick` tries few numbers for a short time; `-- profile` prints that part alone.
+//! `-- attacks` shows what one honest client notices of clients that attack, and writes docs/benchmarks/attacks.{md,json,svg};
+//! `-- attacks NAME` prints one attack's row alone. Linux only: times are read from /proc.
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
 
@@ -310,29 +311,54 @@ fn profile(report: &mut Report) {
     );
 }
 
+/// Runs of each attack: `-- attacks --runs 1`.
+fn runs() -> usize {
+    let mut arguments = std::env::args().skip_while(|argument| argument != "--runs").skip(1);
+    arguments.next().map_or(3, |count| count.parse().unwrap_or_else(|_| panic!("--runs {count}: not a number")))
+}
+
 /// What an honest client notices of clients that are not: of the attack of that name, or of all of them.
-fn attacks(report: &mut Report, figures: &mut Vec<Value>, name: Option<&str>) {
-    report.heading("Under attack");
-    report.say(
-        "One client at 1 kHz in a session of its own, on a server as above, while somebody else, with a token of its own \
-         unless it says so, does this for 7 s from the other cores; quiet is 2 s before, and 2 s that end 8 s after. Beside \
-         it newcomers, one after the other, make a session, feel a command in it and one in the client's session, and go; \
-         who waits for 5 s gives up. Lost are commands that were never answered. Memory is resident: before, at most, and \
-         10 s after, when all have gone.",
-    );
+fn attacks(report: &mut Report, name: Option<&str>) -> Panel {
+    let runs = runs().max(1);
+    report.say(&format!(
+        "One client at 1 kHz in a session of its own, on a server that is kept to one core (one stepping thread, one of the \
+         network), while somebody else, with a token of its own unless the row says otherwise, attacks for 7 s from the other \
+         cores. Quiet is the 2 s before, and 2 s that end 8 s after; \"p99 × quiet\" is relative to the mean of both. \
+         Meanwhile newcomers, one after the other, make a session, feel a command in it and one in the client's session, and \
+         leave; a newcomer that waits for 5 s gives up. Lost commands were never answered. Memory is resident: before, at \
+         most, and 10 s after, when all have left. Each attack is run {runs} times; the row is the run with the median p99."
+    ));
     let kinds: Vec<Option<&'static Kind>> = match name {
         Some(name) => vec![Some(attack::named(name).unwrap_or_else(|| unknown_attack(name)))],
         // Quiet before and after: the two tell how far one row can be trusted.
         None => std::iter::once(None).chain(attack::KINDS.iter().map(Some)).chain([None]).collect(),
     };
-    let mut rows = Vec::new();
+    let (mut table, mut figures, mut pictured) = (Vec::new(), Vec::new(), Vec::new());
     for kind in kinds {
-        let row = rows::run(kind);
-        eprintln!("| {} |", row.cells().join(" | "));
-        rows.push(row.cells());
-        figures.push(row.figures());
+        let mut rows: Vec<Row> = (0..runs)
+            .map(|_| {
+                let row = rows::run(kind);
+                eprintln!("| {} |", row.cells().join(" | "));
+                row
+            })
+            .collect();
+        figures.extend(rows.iter().map(Row::figures));
+        let each: Vec<_> = rows.iter().map(|row| digits(row.times_quiet())).collect();
+        rows.sort_by(|a, b| a.times_quiet().total_cmp(&b.times_quiet()));
+        let row = rows.swap_remove(runs / 2);
+        table.push([row.cells(), vec![each.join(", ")]].concat());
+        pictured.push(row);
     }
-    report.table(&Row::header(), &rows);
+    report.table(&[Row::header(), cells(["p99 × quiet, each run"])].concat(), &table);
+    report.figure("runs", figures.into());
+    // From the bottom up.
+    pictured.reverse();
+    Panel::Cells {
+        title: "What one honest client notices".to_owned(),
+        x: ("", cells(["p99 × quiet", "commands lost", "most memory, MiB"])),
+        y: ("", pictured.iter().map(|row| row.name().to_owned()).collect()),
+        rows: pictured.iter().map(Row::pictured).collect(),
+    }
 }
 
 fn unknown_attack(name: &str) -> ! {
@@ -345,30 +371,35 @@ fn main() {
     if !std::path::Path::new("/proc/self/stat").exists() {
         return println!("left out: there is no /proc on this system");
     }
-    let seconds = if quick() { 3.0 } else { 10.0 };
-    let mut report = Report::new("load", "Many sessions on one core", "make bench-load");
-    report.say(
-        "Sessions of the paper's 31 × 31 points at 1 kHz, all of them awake: each is stroked without rest. The server (one \
-         stepping thread, one of the network) is kept to one core; `palpate-client load` has the others, and sends each \
-         client's commands at 1 kHz by its own clock, over a connection of its own.",
-    );
-    let mut figures = Vec::new();
+    // Built before anything is measured.
+    client_program();
     let mut arguments = std::env::args().skip_while(|argument| !["attacks", "profile"].contains(&argument.as_str()));
     match arguments.next().as_deref() {
         Some("attacks") => {
             let name = arguments.next().filter(|name| name != "all" && !name.starts_with('-'));
-            attacks(&mut report, &mut figures, name.as_deref());
+            let mut report = Report::new("attacks", "Under attack", "make bench-load ATTACK=all");
+            let panel = attacks(&mut report, name.as_deref());
+            if name.is_none() {
+                return report.write(1, &[panel]);
+            }
+            report.print();
         }
         Some(_) => {
-            client_program();
+            let mut report = Report::new("load", "Many sessions on one core", "make bench-load");
             profile(&mut report);
+            report.print();
         }
         None => {
-            // Built before anything is measured.
-            client_program();
-            let series = crowds(&mut report, &mut figures, seconds);
+            let mut report = Report::new("load", "Many sessions on one core", "make bench-load");
+            report.say(
+                "Sessions of the paper's 31 × 31 points at 1 kHz, all of them awake: each is stroked without rest. The server \
+                 (one stepping thread, one of the network) is kept to one core; `palpate-client load` has the others, and \
+                 sends each client's commands at 1 kHz by its own clock, over a connection of its own. What an attack does \
+                 to a client is on [a page of its own](attacks.md).",
+            );
+            let mut figures = Vec::new();
+            let series = crowds(&mut report, &mut figures, if quick() { 3.0 } else { 10.0 });
             profile(&mut report);
-            attacks(&mut report, &mut figures, None);
             report.figure("runs", figures.into());
             let panel = Panel::Lines {
                 title: "What a session costs".to_owned(),
@@ -376,8 +407,7 @@ fn main() {
                 y: "µs of the core, a session and step",
                 series,
             };
-            return report.write(1, &[panel]);
+            report.write(1, &[panel]);
         }
     }
-    report.print();
 }

@@ -171,7 +171,23 @@ impl Row {
         ])
     }
 
-    fn times_quiet(&self) -> f64 {
+    pub fn name(&self) -> &'static str {
+        self.name
+    }
+
+    /// What a picture shows of it, and how bad that is, from 0 to 1.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn pictured(&self) -> Vec<(String, f64)> {
+        let (times, lost, most) = (self.times_quiet(), self.whole.lost, self.resident[1] >> 20);
+        vec![
+            // 1.2 is what is aimed at.
+            (digits(times), ((times - 1.2) / 2.0).clamp(0.0, 1.0)),
+            (lost.to_string(), if lost == 0 { 0.0 } else { 1.0 }),
+            (most.to_string(), (most as f64 / 4096.0).min(1.0)),
+        ]
+    }
+
+    pub fn times_quiet(&self) -> f64 {
         // Two quiet windows: their mean tells more than either.
         let quiet_ms = 0.5 * (self.quiet.quantile_ms(0.99) + self.after.quantile_ms(0.99));
         self.besieged.quantile_ms(0.99) / quiet_ms

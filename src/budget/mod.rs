@@ -8,6 +8,7 @@
 
 mod machine;
 mod time;
+mod turns;
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, Weak};
@@ -15,6 +16,7 @@ use std::sync::{Arc, Mutex, Weak};
 pub use machine::{give_back_to_the_system, half_of_the_machine, parse_bytes};
 use time::Spent;
 pub use time::Work;
+pub(crate) use turns::Turns;
 
 use crate::limits::Limits;
 use crate::lock::lock;

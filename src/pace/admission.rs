@@ -31,23 +31,12 @@ impl Pacer {
         owner: &Account,
         stop: &AtomicBool,
     ) -> Result<Arc<Live>> {
-        memory::attempt("sheet.points", || self.lay_out(scene, paused, idle_timeout_s, owner, stop))
-    }
-
-    fn lay_out(
-        &self,
-        scene: &Scene,
-        paused: bool,
-        idle_timeout_s: f64,
-        owner: &Account,
-        stop: &AtomicBool,
-    ) -> Result<Arc<Live>> {
         // Before anything is done for it.
         let slot = owner.take(Resource::Sessions, 1, "")?;
         let most_hz = self.limits.session_rate_hz;
         number("stepping.rate_hz", scene.stepping.rate_hz, &format!("at most {most_hz}"), |v| v <= most_hz)?;
         check_asked(scene, &self.limits)?;
-        let model = self.compile(scene, stop)?;
+        let model = memory::attempt("sheet.points", || self.compile(scene, stop))?;
         let id = random_id()?;
         check_work(&model, &self.limits)?;
         let memory = owner.take(Resource::Memory(Purpose::Session), model.session_bytes(), "sheet.points")?;
@@ -97,7 +86,7 @@ impl Pacer {
             _taken: [slot, memory],
         });
         // Laid out before the lock is taken, on which all calls wait.
-        let running = Box::new(Running::new(live.clone(), !paused));
+        let running = memory::attempt("sheet.points", || Ok(Box::new(Running::new(live.clone(), !paused))))?;
         if stop.load(Ordering::Relaxed) {
             return Err(choice::given_up());
         }

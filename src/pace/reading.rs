@@ -2,7 +2,6 @@
 //! ([`Still`](crate::sheet::Still)); a thread with a lower priority reads the copies in slices, callers in turns. What one
 //! caller reads is read in order.
 
-use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
@@ -10,7 +9,7 @@ use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
 use super::queue::Writer;
 use super::taps::HashReply;
 use super::{PacedRecord, Recorded};
-use crate::budget::{Account, Purpose, Resource, Taken};
+use crate::budget::{Account, Purpose, Resource, Taken, Turns};
 use crate::lock::lock;
 use crate::memory;
 use crate::refusal::{Refusal, Result};
@@ -167,29 +166,8 @@ impl Piece {
 
 #[derive(Default)]
 struct Board {
-    /// By number of account, in the order of their turns; nobody without a piece.
-    waiting: VecDeque<(u64, VecDeque<Piece>)>,
+    waiting: Turns<Piece>,
     stop: bool,
-}
-
-impl Board {
-    fn of(&mut self, account: u64) -> &mut VecDeque<Piece> {
-        let place = self.waiting.iter().position(|waiting| waiting.0 == account).unwrap_or_else(|| {
-            self.waiting.push_back((account, VecDeque::new()));
-            self.waiting.len() - 1
-        });
-        &mut self.waiting[place].1
-    }
-
-    /// The first piece of the caller whose turn it is.
-    fn next(&mut self) -> Option<(u64, Piece)> {
-        let (account, mut pieces) = self.waiting.pop_front()?;
-        let piece = pieces.pop_front()?;
-        if !pieces.is_empty() {
-            self.waiting.push_back((account, pieces));
-        }
-        Some((account, piece))
-    }
 }
 
 /// The thread that reads.
@@ -206,7 +184,7 @@ impl Reading {
         if let Piece::Record { to, .. } = &piece {
             to.iter().for_each(|recipient| _ = recipient.pending.fetch_add(1, Ordering::AcqRel));
         }
-        lock(&self.board).of(account.number()).push_back(piece);
+        lock(&self.board).waiting.push_back(account.number(), piece);
         self.posted.notify_one();
     }
 
@@ -240,7 +218,7 @@ impl Reading {
 
     /// Reads one slice.
     fn read(&self) {
-        let Some((account, piece)) = lock(&self.board).next() else { return };
+        let Some((account, piece)) = lock(&self.board).waiting.next(|_| true) else { return };
         let recipients = match &piece {
             Piece::Record { to, .. } => to.clone(),
             Piece::Hash { .. } | Piece::Close { .. } => Vec::new(),
@@ -248,7 +226,7 @@ impl Reading {
         match catch_unwind(AssertUnwindSafe(|| piece.read())) {
             Ok(None) => {}
             // Before the caller's next, which may have come meanwhile.
-            Ok(Some(rest)) => lock(&self.board).of(account).push_front(rest),
+            Ok(Some(rest)) => lock(&self.board).waiting.push_front(account, rest),
             Err(panic) => {
                 if memory::refusal_of(&*panic).is_none() {
                     tracing::error!("a fault of the program ended what was read of a sheet");

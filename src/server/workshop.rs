@@ -7,7 +7,6 @@
 //! `limits.rehearsal_work` (points × substeps of the rehearsals of a choice), `limits.law_work` (springs × iterations of a force
 //! law). A scene that needs more is refused, never chosen less accurately; offline programs allow 32 times as much.
 
-use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
@@ -16,7 +15,7 @@ use std::time::Duration;
 use tokio::sync::oneshot;
 use tonic::Status;
 
-use crate::budget::Account;
+use crate::budget::{Account, Turns};
 use crate::limits::Limits;
 use crate::lock::lock;
 use crate::pace::clock::now_ns;
@@ -45,8 +44,7 @@ struct Job {
 
 #[derive(Default)]
 struct Queue {
-    /// The waiting jobs of each account that has any, by its number, in the order of their turns.
-    waiting: VecDeque<(u64, VecDeque<Job>)>,
+    waiting: Turns<Job>,
     /// The running jobs: the account's number, and when the job was requested, ns.
     running: Vec<(u64, u64)>,
     next_number: u64,
@@ -57,21 +55,9 @@ impl Queue {
     /// Starts the first job of the next account without a running job, and returns both.
     fn start_next(&mut self) -> Option<(u64, Job)> {
         let is_idle = |account: u64| !self.running.iter().any(|running| running.0 == account);
-        let turn = self.waiting.iter().position(|(account, _)| is_idle(*account))?;
-        let (account, mut jobs) = self.waiting.remove(turn)?;
-        let job = jobs.pop_front()?;
-        if !jobs.is_empty() {
-            self.waiting.push_back((account, jobs));
-        }
+        let (account, job) = self.waiting.next(is_idle)?;
         self.running.push((account, job.requested_ns));
         Some((account, job))
-    }
-
-    fn remove(&mut self, account: u64, number: u64) {
-        if let Some((_, jobs)) = self.waiting.iter_mut().find(|waiting| waiting.0 == account) {
-            jobs.retain(|job| job.number != number);
-        }
-        self.waiting.retain(|waiting| !waiting.1.is_empty());
     }
 }
 
@@ -126,7 +112,7 @@ struct CancelOnDrop {
 impl Drop for CancelOnDrop {
     fn drop(&mut self) {
         self.cancelled.0.store(true, Ordering::Relaxed);
-        lock(&self.shared.queue).remove(self.account, self.number);
+        lock(&self.shared.queue).waiting.retain(self.account, |job| job.number != self.number);
     }
 }
 
@@ -206,14 +192,12 @@ impl Workshop {
         let number = queue.next_number;
         queue.next_number += 1;
         let job = Job { number, requested_ns: now_ns(), run };
-        match queue.waiting.iter_mut().find(|waiting| waiting.0 == account) {
-            Some((_, jobs)) if jobs.len() >= shared.most_waiting => {
-                let message = format!("this caller has {} jobs waiting already (limits.queued_work)", jobs.len());
-                return Err(Refusal::new(Reason::Overloaded, "", message));
-            }
-            Some((_, jobs)) => jobs.push_back(job),
-            None => queue.waiting.push_back((account, VecDeque::from([job]))),
+        let waiting = queue.waiting.count(account);
+        if waiting >= shared.most_waiting {
+            let message = format!("this caller has {waiting} jobs waiting already (limits.queued_work)");
+            return Err(Refusal::new(Reason::Overloaded, "", message));
         }
+        queue.waiting.push_back(account, job);
         shared.changed.notify_one();
         Ok(CancelOnDrop { shared: shared.clone(), account, number, cancelled })
     }
@@ -221,12 +205,11 @@ impl Workshop {
     /// How busy the workshop is.
     pub(crate) fn load(&self) -> Load {
         let queue = lock(&self.0.0.queue);
-        let jobs = queue.waiting.iter().flat_map(|waiting| &waiting.1);
         let running = queue.running.iter().map(|running| running.1);
-        let requested_ns = jobs.map(|job| job.requested_ns).chain(running).min();
+        let requested_ns = queue.waiting.iter().map(|job| job.requested_ns).chain(running).min();
         let age = |requested_ns| Duration::from_nanos(now_ns().saturating_sub(requested_ns));
         let oldest = requested_ns.map_or(Duration::ZERO, age);
-        let waiting = queue.waiting.iter().map(|waiting| waiting.1.len()).sum();
+        let waiting = queue.waiting.iter().count();
         Load { waiting, oldest_s: oldest.as_secs_f64(), is_late: oldest > self.0.0.deadline }
     }
 }

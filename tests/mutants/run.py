@@ -39,8 +39,9 @@ ORDER = {
     ],
 }
 
-# A mutant that makes a test take so long does not end.
-LONGEST_S = 300
+# A mutant does not end if its tests take so much longer than without one.
+LONGEST_S = 30
+LONGEST_RATIO = 6
 
 
 def drawn(count, seed):
@@ -121,30 +122,54 @@ def programs():
     return found
 
 
-def tested(found, mutant):
-    """Runs the tests on a mutant until one fails."""
-    begun = time.time()
+def order_of(mutant):
+    """The test programs for a mutant, and which of their tests. Those of its own module come first: they catch most."""
+    parts = Path(mutant["file"]).with_suffix("").parts[1:]
+    own = "::".join(part for part in parts if part != "mod") + "::"
+    return [("palpate", [own]), *ORDER[parts[0]]]
+
+
+def run_tests(program, filters, number, longest_s):
+    """Runs tests with one mutant. Returns what failed, or nothing."""
     environment = {
         **os.environ,
         "CARGO_TARGET_DIR": str(WORK / "build"),
-        "PALPATE_MUTANT": str(mutant["id"]),
+        "PALPATE_MUTANT": str(number),
         "PROPTEST_RNG_SEED": "20261122",
         "RUST_BACKTRACE": "0",
     }
-    caught_by = None
-    for name, filters in ORDER[mutant["file"].split("/")[1]]:
-        command = ["nice", "-n", "10", found[name], "--test-threads=1", *filters]
-        try:
-            run = subprocess.run(
-                command, cwd=TREE, env=environment, capture_output=True, text=True, errors="replace", timeout=LONGEST_S
-            )
-        except subprocess.TimeoutExpired:
-            caught_by = f"{name}: it does not end"
+    command = ["nice", "-n", "10", program, "--test-threads=1", *filters]
+    try:
+        run = subprocess.run(
+            command, cwd=TREE, env=environment, capture_output=True, text=True, errors="replace", timeout=longest_s
+        )
+    except subprocess.TimeoutExpired:
+        return "it does not end"
+    if not run.returncode:
+        return None
+    failed = re.findall(r"^test (\S+) \.\.\. FAILED$", run.stdout, re.MULTILINE)
+    return failed[0] if failed else f"exit status {run.returncode}"
+
+
+def limits(found, mutants):
+    """How long each test program may take, s: it is run without a mutant, and has to pass."""
+    longest_s = {}
+    for name, filters in {(name, tuple(filters)) for mutant in mutants for name, filters in order_of(mutant)}:
+        begun = time.time()
+        if failed := run_tests(found[name], filters, 0, None):
+            sys.exit(f"The tests fail without a mutant: {name}: {failed}")
+        longest_s[name, filters] = LONGEST_S + LONGEST_RATIO * (time.time() - begun)
+        print(f"{name} {' '.join(filters)}: {time.time() - begun:.1f} s without a mutant", flush=True)
+    return longest_s
+
+
+def tested(found, mutant, longest_s):
+    """Runs the tests on a mutant until one fails."""
+    begun = time.time()
+    for name, filters in order_of(mutant):
+        if failed := run_tests(found[name], filters, mutant["id"], longest_s[name, tuple(filters)]):
             break
-        if run.returncode:
-            failed = re.findall(r"^test (\S+) \.\.\. FAILED$", run.stdout, re.MULTILINE)
-            caught_by = f"{name}: {failed[0] if failed else f'exit status {run.returncode}'}"
-            break
+    caught_by = f"{name}: {failed}" if failed else None
     return {**mutant, "caught_by": caught_by, "seconds": round(time.time() - begun, 1)}
 
 
@@ -168,15 +193,13 @@ def main():
         left_out |= new
         lay_out([mutant for mutant in mutants if mutant["id"] not in left_out])
     found = programs()
-    good = {**mutants[0], "id": 0}
-    if (whole := tested(found, good))["caught_by"]:
-        sys.exit(f"The tests fail without a mutant: {whole['caught_by']}")
     path = WORK / "results.jsonl"
     results = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
     done = {result["id"] for result in results}
     waiting = [mutant for mutant in mutants if mutant["id"] not in left_out | done]
+    longest_s = limits(found, waiting)
     with concurrent.futures.ThreadPoolExecutor(options.jobs) as jobs, open(path, "a") as file:
-        for result in jobs.map(lambda mutant: tested(found, mutant), waiting):
+        for result in jobs.map(lambda mutant: tested(found, mutant, longest_s), waiting):
             results.append(result)
             file.write(json.dumps(result) + "\n")
             file.flush()
