@@ -18,7 +18,7 @@ impl Work {
 
 /// Over which time it fades, s: what was taken so long ago counts for 1/e.
 /// It is also how long a burst may keep others waiting.
-const MEMORY_S: f64 = 0.02;
+const MEMORY_S: f64 = 0.005;
 
 /// Of all the time there is, who is alone leaves so much.
 const RESERVE: f64 = 0.5;

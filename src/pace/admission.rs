@@ -1,5 +1,6 @@
 //! Who is let in: sessions as they are made, started and changed, by what their steps will take.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -64,7 +65,7 @@ impl Pacer {
             lapsed_leases: 0,
             model: model.clone(),
         };
-        let (cost, thread) = self.place(&model, paused)?;
+        let (cost, thread) = self.place(&model, paused, owner)?;
         let inbox = self.inboxes[thread].clone();
         let live = Arc::new(Live {
             id: id.clone(),
@@ -109,8 +110,8 @@ impl Pacer {
         known.map_or_else(|| Model::compile_until(scene, &self.limits, stop), Ok)
     }
 
-    /// The thread with the most time to spare for a further session, and what that will take.
-    fn place(&self, model: &Model, paused: bool) -> Result<(Cost, usize)> {
+    /// The thread with the most time to spare for a further session of `owner`, and what that will take.
+    fn place(&self, model: &Model, paused: bool, owner: &Account) -> Result<(Cost, usize)> {
         let sessions = lock(&self.sessions);
         let cost = Cost::guess(model, sessions.values().map(|live| &live.cost));
         let mut taken = vec![(0.0, 0_usize); self.inboxes.len()];
@@ -118,12 +119,12 @@ impl Pacer {
             taken[live.thread].0 += live.cost.share();
             taken[live.thread].1 += 1;
         }
-        drop(sessions);
         let spare =
             |a: &(usize, &(f64, usize)), b: &(usize, &(f64, usize))| a.1.0.total_cmp(&b.1.0).then(a.1.1.cmp(&b.1.1));
-        let (thread, (taken, _)) = taken.iter().enumerate().min_by(spare).unwrap_or((0, &(0.0, 0)));
+        let thread = taken.iter().enumerate().min_by(spare).map_or(0, |(thread, _)| thread);
         if !paused {
-            self.check_share(*taken, cost.awake_share())?;
+            let beside = self.taken_beside(sessions.values().filter(|live| live.thread == thread), owner);
+            self.check_share(beside, cost.awake_share())?;
         }
         Ok((cost, thread))
     }
@@ -142,7 +143,18 @@ impl Pacer {
     /// Of the thread of a session, what the others that are awake take.
     fn taken_by_others(&self, live: &Live) -> f64 {
         let others = |other: &&Arc<Live>| other.thread == live.thread && other.number != live.number;
-        lock(&self.sessions).values().filter(others).map(|other| other.cost.share()).sum()
+        self.taken_beside(lock(&self.sessions).values().filter(others), &live.owner)
+    }
+
+    /// What these sessions of a thread take from a further one of `owner`. Another caller counts with at most its equal
+    /// part, because the thread gives it no more where `owner` wants its own: what is beyond that makes only the other
+    /// caller's sessions late.
+    fn taken_beside<'a>(&self, sessions: impl Iterator<Item = &'a Arc<Live>>, owner: &Account) -> f64 {
+        let mut by_owner = BTreeMap::from([(owner.number(), 0.0)]);
+        for live in sessions {
+            *by_owner.entry(live.owner.number()).or_default() += live.cost.share();
+        }
+        fairly_taken(&by_owner, owner.number(), self.limits.thread_share)
     }
 
     /// Refuses what would make others late. Whoever is alone on its thread delays nobody, however heavy; and what rests
@@ -165,5 +177,33 @@ impl Pacer {
             self.check_share(self.taken_by_others(live), live.cost.awake_share())?;
         }
         live.start(until).await
+    }
+}
+
+/// The sum of what callers take of a thread, by their numbers, where each but `owner` counts with at most an equal part of
+/// `most`.
+#[allow(clippy::cast_precision_loss)]
+fn fairly_taken(by_owner: &BTreeMap<u64, f64>, owner: u64, most: f64) -> f64 {
+    let callers = by_owner.iter().filter(|(number, taken)| **number == owner || **taken > 0.0).count();
+    let part = most / callers.max(1) as f64;
+    by_owner.iter().map(|(number, taken)| if *number == owner { *taken } else { taken.min(part) }).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn another_caller_counts_with_its_part_at_most() {
+        let taken = |others: &[f64]| {
+            let mut by_owner = BTreeMap::from([(0, 0.1)]);
+            by_owner.extend((1..).zip(others.iter().copied()));
+            fairly_taken(&by_owner, 0, 0.8)
+        };
+        assert!((taken(&[]) - 0.1).abs() < 1e-12);
+        // Who takes less than its part counts in full, and who rests does not divide the thread.
+        assert!((taken(&[0.3, 0.0]) - 0.4).abs() < 1e-12);
+        assert!((taken(&[0.75, 0.0]) - 0.5).abs() < 1e-12);
+        assert!((taken(&[0.75, 0.1]) - (0.1 + 0.8 / 3.0 + 0.1)).abs() < 1e-12);
     }
 }

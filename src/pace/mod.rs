@@ -295,8 +295,11 @@ impl Live {
     }
 
     /// The samples that are asked for.
-    pub fn samples(&self, sampling: Sampling) -> Reader<PacedSample> {
-        self.tap(sampling, false)
+    ///
+    /// What it takes on the stepping thread is charged to `watcher`, who gets no sample while its share of that time is used
+    /// up; `None` for the stream of who holds a tool.
+    pub fn samples(&self, sampling: Sampling, watcher: Option<&Account>) -> Reader<PacedSample> {
+        self.tap(sampling, watcher, false)
     }
 
     /// The next sample; the present one if time stands.
@@ -304,13 +307,14 @@ impl Live {
         let (laws, touch_stiffness) = (None, false);
         let sampling =
             Sampling { every: 1, only: Some(only), deadband: None, heartbeat_s: HEARTBEAT_S, laws, touch_stiffness };
-        Ok(self.tap(sampling, true).pop().await?.0)
+        Ok(self.tap(sampling, None, true).pop().await?.0)
     }
 
-    fn tap(&self, sampling: Sampling, once: bool) -> Reader<PacedSample> {
+    fn tap(&self, sampling: Sampling, watcher: Option<&Account>, once: bool) -> Reader<PacedSample> {
         let (writer, reader) = queue(if once { 1 } else { self.limits.queued_samples });
         let sampler = Sampler::new(sampling, self.model.scene.stepping.rate_hz);
-        self.inbox.send(self.number, Request::Samples(SampleTap { sampler, once, writer, overrun_count: 0 }));
+        let tap = SampleTap { sampler, once, writer, watcher: watcher.cloned(), overrun_count: 0 };
+        self.inbox.send(self.number, Request::Samples(tap));
         reader
     }
 

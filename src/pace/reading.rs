@@ -1,6 +1,6 @@
 //! What is read of large sheets: records of many points and hashes. A stepping thread copies the sheet
 //! ([`Still`](crate::sheet::Still)); a thread with a lower priority reads the copies in slices, callers in turns. What one
-//! caller reads is read in order.
+//! caller reads is read in order. The same thread frees what deleted sessions leave behind.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -111,6 +111,8 @@ pub(super) enum Piece {
         taken: Taken,
         to: Vec<Arc<Recipient>>,
     },
+    /// What a deleted session leaves behind: nobody waits for its memory to be freed.
+    Remains(Box<dyn Send>),
     /// No further record will come.
     Close {
         to: Arc<Recipient>,
@@ -154,6 +156,10 @@ impl Piece {
                     recipient.writer.push(record.clone());
                     recipient.pending.fetch_sub(1, Ordering::AcqRel);
                 }
+                None
+            }
+            Piece::Remains(remains) => {
+                drop(remains);
                 None
             }
             Piece::Close { to, why } => {
@@ -221,7 +227,7 @@ impl Reading {
         let Some((account, piece)) = lock(&self.board).waiting.next(|_| true) else { return };
         let recipients = match &piece {
             Piece::Record { to, .. } => to.clone(),
-            Piece::Hash { .. } | Piece::Close { .. } => Vec::new(),
+            Piece::Hash { .. } | Piece::Remains(_) | Piece::Close { .. } => Vec::new(),
         };
         match catch_unwind(AssertUnwindSafe(|| piece.read())) {
             Ok(None) => {}

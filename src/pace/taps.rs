@@ -24,6 +24,8 @@ pub(super) struct SampleTap {
     pub(super) sampler: Sampler,
     pub(super) once: bool,
     pub(super) writer: Writer<PacedSample>,
+    /// Who pays, unless it holds a tool.
+    pub(super) watcher: Option<Account>,
     /// Dropped steps that it knows of.
     pub(super) overrun_count: u64,
 }

@@ -31,16 +31,17 @@ use super::cost::Longest;
 use super::frames::{Encoder, Job, Viewer};
 use super::inbox::{Inbox, Request};
 use super::queue::Wakes;
-use super::reading::{Copies, Hashed, Reading};
+use super::reading::{Copies, Hashed, Piece, Reading};
 use super::taps::{SampleTap, Taps, ViewTap};
 use super::{Live, PacedSample, State};
+use crate::budget::Work;
 use crate::lock::lock;
 use crate::memory;
 use crate::refusal::{Reason, Refusal, Result};
-use crate::session::Session;
 use crate::session::command::Due;
 use crate::session::local::Refinement;
 use crate::session::schedule::Schedule;
+use crate::session::{Sample, Session};
 use crate::sheet::audit::Mark;
 
 /// Steps that a session may be behind before the rest is dropped.
@@ -98,9 +99,10 @@ struct Rota {
 }
 
 impl Rota {
-    /// Does something with session `number`, if it is there still, which may change when it is due.
-    fn with(&mut self, number: u64, act: impl FnOnce(&mut Running)) {
-        let Entry::Occupied(mut session) = self.sessions.entry(number) else { return };
+    /// Does something with session `number`, if it is there still, which may change when it is due. Returns the session if
+    /// that has deleted it.
+    fn with(&mut self, number: u64, act: impl FnOnce(&mut Running)) -> Option<Box<Running>> {
+        let Entry::Occupied(mut session) = self.sessions.entry(number) else { return None };
         let running = session.get_mut();
         let owner = running.live.owner.number();
         if let Some(due_ns) = running.due_ns()
@@ -117,9 +119,7 @@ impl Rota {
             self.due.insert((due_ns, number));
             *self.awake.entry(owner).or_default() += 1;
         }
-        if running.deleted {
-            session.remove();
-        }
+        running.deleted.then(|| session.remove())
     }
 
     /// Of how many the thread's time is an equal part for session `number`: each caller gets as much as another, and divides
@@ -176,7 +176,12 @@ pub(super) fn work(inbox: &Inbox, encoder: &Encoder, refiner: &SyncSender<Refine
                 rota.sessions.insert(number, running);
                 rota.with(number, Running::plan);
             } else {
-                rota.with(number, |running| running.guarded(|running| running.serve(request, &mut desk)));
+                let deleted = rota.with(number, |running| running.guarded(|running| running.serve(request, &mut desk)));
+                if let Some(running) = deleted {
+                    // To free what a session has takes longer than a step may wait.
+                    let owner = running.live.owner.clone();
+                    reading.post(&owner, Piece::Remains(running));
+                }
             }
             if next_ns.is_some_and(|next_ns| next_ns <= now_ns()) {
                 break;
@@ -322,7 +327,7 @@ impl Running {
             Request::Samples(mut tap) => {
                 tap.overrun_count = self.overrun_count;
                 if !self.running {
-                    self.tell(&mut tap, true, &mut desk.wakes);
+                    self.tell(&mut tap, &mut None, true, &mut desk.wakes);
                 }
                 if self.session.hold_reason().is_some() {
                     tap.writer.close(self.passed(0));
@@ -489,9 +494,10 @@ impl Running {
         }
     }
 
-    /// Gives a stream the present sample, if it is to get it, or if no other follows for now.
-    fn tell(&self, tap: &mut SampleTap, last: bool, wakes: &mut Wakes) {
-        let Some(sample) = tap.sampler.pick(&self.session, last || tap.once) else { return };
+    /// Gives a stream the present sample, if it is to get it, or if no other follows for now. `all` is the sample of all
+    /// tools, once a stream has asked for it.
+    fn tell(&self, tap: &mut SampleTap, all: &mut Option<Sample>, last: bool, wakes: &mut Wakes) {
+        let Some(sample) = tap.sampler.pick_from(&self.session, all, last || tap.once) else { return };
         let overrun = self.overrun_count > tap.overrun_count;
         tap.overrun_count = self.overrun_count;
         let Running { overrun_count, due_ns, .. } = *self;
@@ -500,8 +506,20 @@ impl Running {
     }
 
     fn tell_all(&mut self, last: bool, wakes: &mut Wakes) {
-        let mut taps = std::mem::take(&mut self.taps.samples);
-        taps.iter_mut().for_each(|tap| self.tell(tap, last, wakes));
+        let (mut taps, mut all) = (std::mem::take(&mut self.taps.samples), None);
+        for tap in &mut taps {
+            let Some(watcher) = tap.watcher.clone() else {
+                self.tell(tap, &mut all, last, wakes);
+                continue;
+            };
+            let now = now_ns();
+            // The last sample for now is not left out: the stream would miss the state in which the session stands.
+            if last || watcher.must_wait_ns(Work::Reading, now) == 0 {
+                self.tell(tap, &mut all, last, wakes);
+                let ended = now_ns();
+                watcher.spend(Work::Reading, ended, ended.saturating_sub(now));
+            }
+        }
         taps.retain(|tap| !tap.once);
         self.taps.samples = taps;
     }

@@ -44,8 +44,7 @@ const ACCEPT_INTERVAL: Duration = Duration::from_millis(1);
 
 /// Connections that may exceed the limits for a moment, while connections that we told to close are still open.
 const CLOSING: usize = 16;
-/// After this many bytes a connection yields to the others: small frames that reach no reader (PING, SETTINGS,
-/// WINDOW_UPDATE, PRIORITY) cost a hundred nanoseconds each.
+/// After this many bytes a connection yields to the others: small frames cost some hundred nanoseconds each.
 const BYTES_PER_TURN: usize = 8 << 10;
 
 /// Accepted connections that may wait to be served.
@@ -345,7 +344,7 @@ impl Entry {
             transport,
             inward: Frames::default(),
             outward: Frames::of_server(),
-            read_pause: ReadPause::default(),
+            read_pause: ReadPause::new(),
             preface: Some((PREFACE_BYTES, deadline)),
             _open: traffic.open(),
             traffic,

@@ -154,7 +154,7 @@ impl Haptics {
             warnings: device.zip(law).map_or(Vec::new(), |(device, law)| device.misgivings(law)),
             max_force_n: device.map_or(UNDECLARED_FORCE_N, |device| device.most_n()),
         };
-        let samples = live.samples(sampling);
+        let samples = live.samples(sampling, open.tools.is_empty().then_some(account));
         info!(session = %live.id, tools = ?open.tools, holder = ?open.holder, "haptic stream opened");
         let notices = Notices::new(open.tools.clone(), step);
         Ok((Opened { answer, update, samples, notices, guard }, hold))
@@ -504,7 +504,7 @@ impl HapticService for Haptics {
         let sampling = wire::sample::sampling(every, None, deadband, request.heartbeat_s, false)?;
         let guard = live.open_stream("WatchSamples", Held::Nothing, &account)?;
         let cut = guard.cut().clone();
-        let samples = live.samples(sampling);
+        let samples = live.samples(sampling, Some(&account));
         let out = stream::unfold(Some((samples, guard)), |state| async move {
             let (mut samples, guard) = state?;
             Some(match samples.pop().await {

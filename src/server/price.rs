@@ -1,6 +1,6 @@
 //! Every call has a price: the processor time that it takes on the network threads, charged to its caller. The calls of a
-//! caller that has used up its share wait, and are refused if they wait too long. Commands and haptic streams never wait:
-//! they have limits of their own, and are the server's main task.
+//! caller that has used up its share wait, and are refused if they wait too long. Haptic streams never wait: they have limits
+//! of their own, and are the server's main task.
 
 use std::pin::Pin;
 use std::task::{Context, Poll, ready};
@@ -17,9 +17,8 @@ use crate::pace::clock::{now_ns, thread_time_ns};
 use crate::refusal::{Reason, Refusal, Result};
 
 /// Calls whose paths begin with these never wait.
-const NEVER_WAIT: [&str; 5] = [
+const NEVER_WAIT: [&str; 4] = [
     "/palpate.v1.HapticService/Touch",
-    "/palpate.v1.HapticService/SendCommands",
     "/palpate.v1.HapticService/ReleaseTool",
     "/palpate.v1.AdminService/",
     "/grpc.health.",
@@ -42,6 +41,11 @@ impl Price {
     fn must_wait(&self) -> Option<Duration> {
         let ns = self.0.must_wait_ns(Work::Network, now_ns());
         (ns > 0).then(|| Duration::from_nanos(ns))
+    }
+
+    /// A wait until the caller's share may allow more; `None` if it does.
+    fn sleep(&self) -> Option<Pin<Box<Sleep>>> {
+        self.must_wait().map(|wait| Box::pin(tokio::time::sleep(wait)))
     }
 
     /// Waits until the caller's share allows a call.
@@ -102,15 +106,16 @@ impl http_body::Body for Charged {
         context: &mut Context<'_>,
     ) -> Poll<Option<std::result::Result<Frame<Bytes>, Status>>> {
         let this = self.get_mut();
-        if let Some(wait) = &mut this.wait {
+        // Other calls of the caller may have used its share meanwhile.
+        while let Some(wait) = &mut this.wait {
             ready!(wait.as_mut().poll(context));
-            this.wait = None;
+            this.wait = this.price.sleep();
         }
         let answer = &mut this.answer;
         let frame = ready!(this.price.measure(|| Pin::new(answer).poll_frame(context)));
         // Trailers are sent at once.
         if frame.as_ref().is_some_and(|frame| frame.as_ref().is_ok_and(Frame::is_data)) {
-            this.wait = this.price.must_wait().map(|wait| Box::pin(tokio::time::sleep(wait)));
+            this.wait = this.price.sleep();
         }
         Poll::Ready(frame)
     }
@@ -139,6 +144,7 @@ mod tests {
         assert!(price(&greedy).must_wait().is_some());
         assert!(price(&other).must_wait().is_none());
         assert!(Price::of("/palpate.v1.HapticService/Touch", &greedy).is_none());
+        assert!(Price::of("/palpate.v1.HapticService/SendCommands", &greedy).is_some());
     }
 
     #[tokio::test]

@@ -5,10 +5,13 @@
 //! client that commands a tool at 1 kHz sends nothing but such frames. After a stall of the server, seconds of them wait in
 //! the socket, and the transport would read them all before any reader runs. So we give it no more than a portion until its
 //! readers have taken that. The rest waits in the system's buffer, where TCP slows the client down.
+//!
+//! Frames that reach no reader (PING, SETTINGS, WINDOW_UPDATE, PRIORITY, RST_STREAM) cost the transport some hundred
+//! nanoseconds each, and a client can send millions a second. So a connection with too many of them is read more slowly.
 
 use std::pin::Pin;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::task::{Context, Poll};
+use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
 use futures_util::task::AtomicWaker;
@@ -25,11 +28,18 @@ const PORTIONS: usize = 16;
 /// later frames, and frames of a stream that has ended are never taken.
 const PATIENCE: Duration = Duration::from_millis(100);
 
+/// Control frames that are read in a second, and at once. A client that reads from this server as fast as it can sends some
+/// thousand a second.
+const CONTROL_FRAMES_PER_S: f64 = 10_000.0;
+const CONTROL_FRAMES_AT_ONCE: f64 = 10_000.0;
+
 /// The bytes that one connection's untaken frames are charged with, and whether the connection is to be closed.
 #[derive(Debug)]
 pub(super) struct Gate {
     portion_bytes: usize,
     charged_bytes: AtomicUsize,
+    /// Control frames since they were counted last.
+    control_frames: AtomicUsize,
     closed: AtomicBool,
     waker: AtomicWaker,
 }
@@ -42,7 +52,13 @@ impl Gate {
     /// For a connection with that window.
     pub(super) fn new(window_bytes: u32) -> Self {
         let portion_bytes = (window_bytes as usize / PORTIONS).max(SMALL_BYTES);
-        Gate { portion_bytes, charged_bytes: 0.into(), closed: false.into(), waker: AtomicWaker::new() }
+        Gate {
+            portion_bytes,
+            charged_bytes: 0.into(),
+            control_frames: 0.into(),
+            closed: false.into(),
+            waker: AtomicWaker::new(),
+        }
     }
 
     /// Counts a frame with this many bytes that the transport was given.
@@ -82,28 +98,54 @@ impl Gate {
     }
 }
 
-/// Stops reading from a connection while its readers take nothing.
-#[derive(Debug, Default)]
-pub(super) struct ReadPause(Option<Pin<Box<Sleep>>>);
+/// Stops reading from a connection while its readers take nothing, and slows it while it sends too many control frames.
+#[derive(Debug)]
+pub(super) struct ReadPause {
+    untaken: Option<Pin<Box<Sleep>>>,
+    /// Control frames that may be read now; negative if too many were read.
+    control_frames: f64,
+    filled: Instant,
+    slowed: Option<Pin<Box<Sleep>>>,
+}
 
 impl ReadPause {
+    pub(super) fn new() -> Self {
+        ReadPause { untaken: None, control_frames: CONTROL_FRAMES_AT_ONCE, filled: Instant::now(), slowed: None }
+    }
+
     /// Ready when more may be read. The caller has registered its task by [`Gate::is_closed`] before.
     pub(super) fn poll(&mut self, gate: &Gate, context: &mut Context<'_>) -> Poll<()> {
+        ready!(self.poll_slowed(gate, context));
         if gate.is_full() {
             let until = Instant::now() + PATIENCE;
-            if self
-                .0
-                .get_or_insert_with(|| Box::pin(tokio::time::sleep_until(until)))
-                .as_mut()
-                .poll(context)
-                .is_pending()
-            {
-                return Poll::Pending;
-            }
+            let pause = self.untaken.get_or_insert_with(|| Box::pin(tokio::time::sleep_until(until)));
+            ready!(pause.as_mut().poll(context));
             gate.charged_bytes.store(0, Ordering::Release);
         }
-        self.0 = None;
+        self.untaken = None;
         Poll::Ready(())
+    }
+
+    fn poll_slowed(&mut self, gate: &Gate, context: &mut Context<'_>) -> Poll<()> {
+        let read = gate.control_frames.swap(0, Ordering::AcqRel);
+        if read > 0 {
+            let now = Instant::now();
+            self.slowed = self.debt(read, now).map(|debt| Box::pin(tokio::time::sleep_until(now + debt)));
+        }
+        if let Some(sleep) = &mut self.slowed {
+            ready!(sleep.as_mut().poll(context));
+            self.slowed = None;
+        }
+        Poll::Ready(())
+    }
+
+    /// Counts control frames that were read. Returns how long to read nothing, if they were too many.
+    #[allow(clippy::cast_precision_loss)]
+    fn debt(&mut self, read: usize, now: Instant) -> Option<Duration> {
+        let gained = CONTROL_FRAMES_PER_S * (now - self.filled).as_secs_f64();
+        self.control_frames = (self.control_frames + gained).min(CONTROL_FRAMES_AT_ONCE) - read as f64;
+        self.filled = now;
+        (self.control_frames < 0.0).then(|| Duration::from_secs_f64(-self.control_frames / CONTROL_FRAMES_PER_S))
     }
 }
 
@@ -135,7 +177,9 @@ pub(super) enum Frames {
 const HEAD_BYTES: usize = 9;
 const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
 const DATA: u8 = 0;
+const HEADERS: u8 = 1;
 const GOAWAY: u8 = 7;
+const CONTINUATION: u8 = 9;
 
 /// Bytes of a GOAWAY's payload that are kept: the last stream, the error code, and the beginning of the debug data.
 const MOST_OF_GOAWAY: usize = 8 + 64;
@@ -195,8 +239,10 @@ impl Frames {
                     bytes = &bytes[here..];
                     if *read == HEAD_BYTES {
                         let length = usize::from(head[0]) << 16 | usize::from(head[1]) << 8 | usize::from(head[2]);
-                        if let (DATA, Some(gate)) = (head[3], gate) {
-                            gate.given(length);
+                        match (head[3], gate) {
+                            (DATA, Some(gate)) => gate.given(length),
+                            (HEADERS | CONTINUATION, _) | (_, None) => {}
+                            (_, Some(gate)) => _ = gate.control_frames.fetch_add(1, Ordering::AcqRel),
                         }
                         *self = match (head[3], length) {
                             (_, 0) => Frames::Head([0; HEAD_BYTES], 0),
@@ -286,7 +332,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_portion_that_nobody_takes_stops_reading_for_a_limited_time() {
-        let (gate, mut read_pause) = (Gate::new(WINDOW_BYTES), ReadPause::default());
+        let (gate, mut read_pause) = (Gate::new(WINDOW_BYTES), ReadPause::new());
         for _ in 0..WINDOW_BYTES / 16 / 200 + 1 {
             gate.given(56);
         }
@@ -296,5 +342,21 @@ mod tests {
         assert!(begun.elapsed() >= PATIENCE);
         assert_eq!(charged(&gate), 0);
         std::future::poll_fn(|context| read_pause.poll(&gate, context)).await;
+    }
+
+    #[test]
+    fn control_frames_are_counted_and_read_at_a_limited_rate() {
+        let (gate, mut frames, mut read_pause) = (Gate::new(WINDOW_BYTES), Frames::default(), ReadPause::new());
+        frames.pass(PREFACE, Some(&gate));
+        frames.pass(&[frame(6, &[0; 8]), frame(1, &[0; 8]), frame(DATA, &[0; 8]), frame(4, &[])].concat(), Some(&gate));
+        assert_eq!(gate.control_frames.load(Ordering::Acquire), 2);
+        // A third of them at once, the rest in two seconds.
+        let begun = read_pause.filled;
+        let mut now = begun;
+        for _ in 0..30 {
+            now += read_pause.debt(1000, now).unwrap_or_default();
+        }
+        let elapsed_s = (now - begun).as_secs_f64();
+        assert!((elapsed_s - 2.0).abs() < 0.01, "{elapsed_s}");
     }
 }

@@ -12,6 +12,7 @@ use crate::scene::Scene;
 use crate::scene::script::Action;
 use crate::sheet::Model;
 pub use batch::{Batch, SLICE};
+use queue::Queue;
 use rules::tip_radius_m;
 pub use rules::{Checked, Rules};
 
@@ -59,8 +60,6 @@ struct Lease {
     last_sequence: Option<u64>,
     /// Radius of the tip by which the newest command leads the tool, m.
     tip_radius_m: Option<f64>,
-    /// Number of commands of the tool in the queue.
-    waiting: usize,
     /// Place of the tool's newest command in the queue.
     last_place: Option<Place>,
     /// A batch of commands is being taken in: those of the tool that came since this arrival wait for the rest of it.
@@ -92,9 +91,7 @@ pub struct Counts {
 pub struct Intake {
     rules: Arc<Rules>,
     leases: BTreeMap<u32, Lease>,
-    queue: BTreeMap<Place, Due>,
-    /// Of those, commands of clients: counted as they come and go, for whoever asks.
-    waiting: u64,
+    queue: Queue,
     /// Commands of batches that are not in the queue yet.
     coming: usize,
     /// Changes of tissue that wait for their step, by ascending step, and the memory of each.
@@ -123,8 +120,7 @@ impl Intake {
         Intake {
             rules: Arc::new(Rules { scene: scene.clone(), limits: limits.clone() }),
             leases: BTreeMap::new(),
-            queue: BTreeMap::new(),
-            waiting: 0,
+            queue: Queue::default(),
             coming: 0,
             changes: VecDeque::new(),
             account: None,
@@ -157,8 +153,9 @@ impl Intake {
         }
     }
 
-    /// Gives back what no longer waits.
+    /// Frees some of what no longer waits, and gives its memory back.
     fn give_back(&mut self) {
+        self.queue.free_some();
         let bytes = bytes_of(self.queue.len() + self.coming);
         if let Some(taken) = self.taken.as_mut().filter(|taken| taken.amount() > bytes) {
             taken.shrink_to(bytes);
@@ -202,7 +199,6 @@ impl Intake {
                 expires_ns: now_ns.saturating_add(duration_ns),
                 last_sequence: None,
                 tip_radius_m: None,
-                waiting: 0,
                 last_place: None,
                 batch_since: None,
                 seat: None,
@@ -244,11 +240,7 @@ impl Intake {
 
     fn end(&mut self, tool: u32) {
         self.leases.remove(&tool);
-        let waiting = self.waiting;
-        self.queue.retain(|_, due| due.command.tool != tool);
-        self.waiting = self.queue.values().filter(|due| !due.ends_lease).count() as u64;
-        self.counts.dropped += waiting - self.waiting;
-        self.give_back();
+        self.counts.dropped += self.queue.discard(tool) as u64;
         let command = Command {
             tool,
             sequence: 0,
@@ -271,6 +263,9 @@ impl Intake {
         while let Some(tool) = self.leases.iter().find(|lease| lease.1.expires_ns <= now_ns).map(|lease| *lease.0) {
             self.lapsed += 1;
             self.end(tool);
+        }
+        if self.queue.has_left_over() {
+            self.give_back();
         }
     }
 
@@ -301,7 +296,6 @@ impl Intake {
         if let Some(lease) = self.leases.get_mut(&command.tool) {
             lease.last_sequence = Some(command.sequence);
             lease.tip_radius_m = tip_radius_m(&command);
-            lease.waiting += 1;
             let last = lease.last_place.replace(place);
             // The latest position wins: it supersedes an earlier one that has not taken effect. This does not apply to
             // poses played by client time (`haptics::path`), where each one counts.
@@ -311,23 +305,19 @@ impl Intake {
                 Action::Push(_) | Action::Release => false,
             };
             if let Some(last) = last.filter(|last| last.0 == step && is_place(&command))
-                && self.queue.get(&last).is_some_and(|due| is_place(&due.command))
-                && let Some(superseded) = self.queue.remove(&last)
+                && let Some(superseded) = self.queue.remove_if(command.tool, last, |due| is_place(&due.command))
             {
                 late_commands += superseded.late_commands;
-                lease.waiting -= 1;
-                self.waiting -= u64::from(!superseded.ends_lease);
                 self.counts.superseded += 1;
             }
         }
-        self.waiting += u64::from(!ends_lease);
         self.queue.insert(place, Due { command, late, late_commands, ends_lease });
         self.changed = true;
     }
 
     /// The first step for which something waits.
     fn first_waiting(&self) -> Option<u64> {
-        let commands = self.queue.keys().next().map(|place| place.0);
+        let commands = self.queue.first_step();
         let changes = self.changes.front().map(|change| change.0);
         commands.into_iter().chain(changes).min()
     }
@@ -413,21 +403,12 @@ impl Intake {
     pub fn take_due(&mut self, step: u64, now_ns: u64, due: &mut Vec<Due>) {
         self.lapse(now_ns);
         self.resting = None;
-        let mut from = (0, 0);
-        while let Some((place, entry)) = self.queue.range(from..=(step, u64::MAX)).next() {
-            let place = *place;
-            if self.is_held_back(&place, entry) {
-                from = (place.0, place.1 + 1);
-                continue;
-            }
-            let Some(entry) = self.queue.remove(&place) else { break };
-            if let Some(lease) = self.leases.get_mut(&entry.command.tool).filter(|_| !entry.ends_lease) {
-                lease.waiting = lease.waiting.saturating_sub(1);
-            }
-            self.counts.applied += u64::from(!entry.ends_lease);
-            self.waiting -= u64::from(!entry.ends_lease);
-            due.push(entry);
-        }
+        let leases = &self.leases;
+        let is_held_back = |place: &Place, due: &Due| {
+            let lease = leases.get(&due.command.tool).filter(|_| !due.ends_lease);
+            lease.and_then(|lease| lease.batch_since).is_some_and(|since| place.1 >= since)
+        };
+        self.counts.applied += self.queue.take_due(step, is_held_back, due) as u64;
         self.give_back();
         self.next_step = step + 1;
     }
@@ -454,15 +435,13 @@ impl Intake {
 
     /// Counts of the commands so far, by outcome.
     pub fn counts(&self) -> Counts {
-        Counts { waiting: self.waiting + self.coming as u64, ..self.counts }
+        Counts { waiting: (self.queue.waiting() + self.coming) as u64, ..self.counts }
     }
 
     /// From now on refuses everything with `refusal`.
     pub fn close(&mut self, refusal: Refusal) {
         self.closed = Some(refusal);
-        self.counts.dropped += self.waiting;
-        self.queue.clear();
-        self.waiting = 0;
+        self.counts.dropped += self.queue.discard_all() as u64;
         self.changes.clear();
         self.taken = None;
     }
@@ -512,6 +491,7 @@ fn not_holder(message: String) -> Refusal {
 }
 
 mod batch;
+mod queue;
 mod rules;
 #[cfg(test)]
 mod tests;

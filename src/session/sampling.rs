@@ -144,12 +144,20 @@ impl Sampler {
     /// The sample of the last step, if the stream should get it. `last`: the stream gets it in any case, because no
     /// other follows for now.
     pub fn pick(&mut self, session: &Session, last: bool) -> Option<Sample> {
+        self.pick_from(session, &mut None, last)
+    }
+
+    /// The same for one of many streams: `all` is the sample of all tools, once a stream has asked for it.
+    pub fn pick_from(&mut self, session: &Session, all: &mut Option<Sample>, last: bool) -> Option<Sample> {
         let (step, told) = (session.step_count(), self.told.as_ref());
         let is_told = told.is_some_and(|told| told.step == step && told.held == session.hold_reason().is_some());
         if is_told || !(last || step.is_multiple_of(self.sampling.every)) {
             return None;
         }
-        let mut sample = session.sample(self.sampling.only.as_deref());
+        let mut sample = match &self.sampling.only {
+            Some(only) => session.sample(Some(only)),
+            None => all.get_or_insert_with(|| session.sample(None)).clone(),
+        };
         let is_due = |told: &Sample| {
             last || step.saturating_sub(told.step) >= self.heartbeat_steps || self.is_news(told, &sample)
         };

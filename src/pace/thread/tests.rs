@@ -62,7 +62,7 @@ fn a_thread_is_divided_among_callers_first() {
         assert_eq!(rota.sessions[&number].due_ns(), Some(expected), "{number}");
     }
     // Who rests is not counted.
-    (0..40).for_each(|number| rota.with(number, |running| running.running = false));
+    (0..40).for_each(|number| drop(rota.with(number, |running| running.running = false)));
     assert_eq!((rota.parts(40), rota.awake.len()), (1, 1));
     pacer.stop();
 }

@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 
 use super::rules::{check_tip, tip_radius_m};
-use super::{Checked, Command, Due, Intake, LeaseId, Place, not_holder};
+use super::{Checked, Command, Intake, LeaseId, not_holder};
 use crate::refusal::{Reason, Refusal, Result};
 
 /// Commands that are put in the queue in one turn at the intake.
@@ -53,7 +53,7 @@ impl Intake {
         }
         // A limit per tool, so that no holder fills the queue for the others.
         for (tool, (_, coming, _)) in &last {
-            let waiting = self.leases.get(tool).map_or(0, |lease| lease.waiting);
+            let waiting = self.queue.waiting_of(*tool);
             if waiting + coming > self.rules.limits.queued_commands_per_tool {
                 let message = format!("{waiting} commands of tool {tool} wait for their step already");
                 return Err(Refusal::new(Reason::QueueFull, "", message));
@@ -90,11 +90,5 @@ impl Intake {
         }
         self.changed |= slice > 0;
         false
-    }
-
-    /// Whether a command in the queue belongs to a batch that is not complete.
-    pub(super) fn is_held_back(&self, place: &Place, due: &Due) -> bool {
-        let lease = self.leases.get(&due.command.tool).filter(|_| !due.ends_lease);
-        lease.and_then(|lease| lease.batch_since).is_some_and(|since| place.1 >= since)
     }
 }

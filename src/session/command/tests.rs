@@ -23,7 +23,7 @@ fn release(sequence: u64, at_step: Option<u64>) -> Command {
 }
 
 fn steps(intake: &Intake) -> Vec<u64> {
-    intake.queue.keys().map(|place| place.0).collect()
+    intake.queue.in_order().iter().map(|(place, _)| place.0).collect()
 }
 
 #[test]
@@ -52,7 +52,7 @@ fn stamps_mean_the_same_at_rest() {
     intake.submit(LEASE, commands, 500 * MS).unwrap();
     // 400 is over at 500 ms, though no step was computed.
     assert_eq!(steps(&intake), [501, 501, 800]);
-    assert_eq!(intake.queue.values().map(|due| due.late).collect::<Vec<_>>(), [true, false, false]);
+    assert_eq!(intake.queue.in_order().iter().map(|(_, due)| due.late).collect::<Vec<_>>(), [true, false, false]);
     assert_eq!(intake.rest(0, u64::MAX, &schedule), 501);
     intake.take_due(501, 501 * MS, &mut Vec::new());
     assert_eq!(intake.rest(502, u64::MAX, &schedule), 800);
