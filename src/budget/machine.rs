@@ -66,6 +66,12 @@ pub fn parse_bytes(text: &str) -> Result<u64, String> {
     bytes.filter(|bytes| *bytes >= 1 << 20).ok_or_else(|| why.to_owned())
 }
 
+/// Number of cores that this process may use.
+#[allow(clippy::cast_precision_loss)]
+pub(super) fn cores() -> f64 {
+    std::thread::available_parallelism().map_or(1.0, |cores| cores.get() as f64)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -192,6 +192,7 @@ struct Accounts {
 
 impl Budget {
     /// Of a server with these limits, and so many threads that step and that serve the network.
+    #[allow(clippy::cast_precision_loss)]
     pub fn new(limits: &Limits, stepping: usize, network: usize) -> Arc<Self> {
         let bytes = if limits.memory_bytes > 0 { limits.memory_bytes } else { half_of_the_machine() };
         let pools = [
@@ -201,10 +202,17 @@ impl Budget {
             Pool::new(limits.streams as u64, 16),
             Pool::new(limits.leases as u64, 16),
         ];
+        let threads = [stepping, network].map(|threads| threads.max(1) as f64);
+        // Where there are fewer cores than threads, the threads share them.
+        let cores = (machine::cores() / threads.iter().sum::<f64>()).min(1.0);
+        let times = Work::ALL.map(|work| match work {
+            Work::Reading => Spent::new(cores * threads[0]),
+            Work::Network => Spent::new(cores * threads[1]),
+        });
         Arc::new(Budget {
             pools: pools.map(Mutex::new),
             purposes: Mutex::default(),
-            times: Mutex::new(Work::ALL.map(|work| Spent::new(if work == Work::Network { network } else { stepping }))),
+            times: Mutex::new(times),
             accounts: Mutex::default(),
         })
     }

@@ -498,7 +498,11 @@ impl Pacer {
     /// Ends a session and all its streams.
     pub fn delete(&self, id: &str) -> Result<()> {
         let live = lock(&self.sessions).remove(id).ok_or_else(|| unknown_session(id))?;
-        lock(&live.intake).close(deleted());
+        let waited = lock(&live.intake).close(deleted());
+        if !waited.is_empty() {
+            // To free many takes longer than other calls may wait.
+            self.reading.post(&live.owner, reading::Piece::Remains(Box::new(waited)));
+        }
         live.inbox.send(live.number, Request::Delete(deleted()));
         Ok(())
     }
@@ -531,7 +535,7 @@ impl Pacer {
     pub fn stop(&self) {
         let why = Refusal::new(Reason::ShuttingDown, "", "the server is going down");
         for live in lock(&self.sessions).values() {
-            lock(&live.intake).close(why.clone());
+            drop(lock(&live.intake).close(why.clone()));
         }
         self.inboxes.iter().for_each(|inbox| inbox.stop(why.clone()));
         self.encoder.stop();

@@ -449,7 +449,7 @@ impl Running {
         if let Some(reason) = self.session.hold_reason() {
             tracing::warn!(session = %self.live.id, reason, "session held");
             self.running = false;
-            lock(&self.live.intake).close(Refusal::new(Reason::SessionHeld, "", reason));
+            drop(lock(&self.live.intake).close(Refusal::new(Reason::SessionHeld, "", reason)));
             self.publish_status();
             for (at, _, reply) in std::mem::take(&mut self.taps.hashes) {
                 let _ = reply.send(Err(self.passed(at)));
@@ -593,7 +593,7 @@ impl Running {
     /// Ends every stream, and what waits.
     fn end(&mut self, why: &Refusal) {
         self.running = false;
-        lock(&self.live.intake).close(why.clone());
+        drop(lock(&self.live.intake).close(why.clone()));
         let taps = std::mem::take(&mut self.taps);
         taps.samples.iter().for_each(|tap| tap.writer.close(why.clone()));
         taps.probes.iter().for_each(|tap| tap.recipient.writer().close(why.clone()));

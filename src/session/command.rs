@@ -12,6 +12,7 @@ use crate::scene::Scene;
 use crate::scene::script::Action;
 use crate::sheet::Model;
 pub use batch::{Batch, SLICE};
+pub use queue::Discarded;
 use queue::Queue;
 use rules::tip_radius_m;
 pub use rules::{Checked, Rules};
@@ -438,12 +439,13 @@ impl Intake {
         Counts { waiting: (self.queue.waiting() + self.coming) as u64, ..self.counts }
     }
 
-    /// From now on refuses everything with `refusal`.
-    pub fn close(&mut self, refusal: Refusal) {
+    /// From now on refuses everything with `refusal`. Returns the commands that waited.
+    pub fn close(&mut self, refusal: Refusal) -> Discarded {
         self.closed = Some(refusal);
         self.counts.dropped += self.queue.discard_all() as u64;
         self.changes.clear();
         self.taken = None;
+        self.queue.take_left_over()
     }
 
     /// After that: as it was in the beginning, with the same tissue, and no tool held.

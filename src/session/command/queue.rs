@@ -7,6 +7,17 @@ use super::{Due, Place};
 /// Commands by their place: step, then order of arrival.
 type Commands = BTreeMap<Place, Due>;
 
+/// Commands that have no effect any more. To free them takes time.
+#[derive(Debug, Default)]
+pub struct Discarded(Vec<Commands>);
+
+impl Discarded {
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+}
+
 /// What waits.
 #[derive(Debug, Default)]
 pub(super) struct Queue {
@@ -14,8 +25,7 @@ pub(super) struct Queue {
     by_tool: BTreeMap<u32, Commands>,
     /// The ends of leases.
     endings: Commands,
-    /// Commands of leases that have ended, by tool. They have no effect any more. To free them takes time, so that
-    /// [`Queue::free_some`] does it bit by bit.
+    /// Commands of leases that have ended, by tool. [`Queue::free_some`] frees them bit by bit.
     discarded: Vec<Commands>,
     /// Number of commands in `by_tool`, and in `discarded`.
     waiting: usize,
@@ -80,6 +90,12 @@ impl Queue {
         if let Some(commands) = self.discarded.pop() {
             self.left_over -= commands.len();
         }
+    }
+
+    /// All discarded commands, to be freed elsewhere.
+    pub(super) fn take_left_over(&mut self) -> Discarded {
+        self.left_over = 0;
+        Discarded(std::mem::take(&mut self.discarded))
     }
 
     /// Whether there are discarded commands.

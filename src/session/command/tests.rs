@@ -146,7 +146,7 @@ fn a_closed_intake_refuses_with_its_reason_until_it_is_opened_again() {
     let (mut intake, _) = intake();
     let refusal = Refusal::new(Reason::NotAvailable, "", "the session has ended");
     intake.submit(LEASE, vec![release(1, Some(3))], 0).unwrap();
-    intake.close(refusal.clone());
+    drop(intake.close(refusal.clone()));
     assert_eq!(intake.counts(), Counts { accepted: 1, dropped: 1, ..Counts::default() });
     let model = Model::paper(&["sheet.points=[3, 3]"]);
     let refused = [
