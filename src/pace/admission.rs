@@ -55,6 +55,7 @@ impl Pacer {
             dilation: Dilation::new(begin_ns, 0),
             schedule: Schedule::new(0, begin_ns, scene.stepping.rate_hz),
             late_commands: 0,
+            paused_commands: 0,
             hold_reason: None,
             guard_events: 0,
             recovery_count: 0,

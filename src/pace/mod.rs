@@ -117,6 +117,8 @@ pub struct Status {
     pub schedule: Schedule,
     /// Commands that came too late for their step.
     pub late_commands: u64,
+    /// Commands that had no effect because their tool was paused ([`crate::session::recovery`]).
+    pub paused_commands: u64,
     /// Why it is held.
     pub hold_reason: Option<String>,
     /// How often the guard went back to a checkpoint.
@@ -140,6 +142,7 @@ impl Status {
     fn forget_hold(&mut self) {
         (self.hold_reason, self.state) = (None, State::Paused);
         (self.late_commands, self.guard_events, self.path_counts) = (0, 0, [0; 3]);
+        self.paused_commands = 0;
         (self.recovery_count, self.recoveries) = (0, Vec::new());
     }
 }

@@ -366,6 +366,7 @@ mod tests {
             stale: false,
             late: false,
             expired: false,
+            paused_until: None,
         };
         let deadband = Deadband { force_n: Some(0.1), force_fraction: Some(0.1), ..Deadband::default() };
         for (told_n, now_n, left) in [(0.0, 0.09, false), (0.0, 0.11, true), (10.0, 10.9, false), (10.0, 11.2, true)] {
