@@ -434,6 +434,7 @@ impl Running {
         };
         if let Some(model) = change {
             self.session.change(&model);
+            self.live.tissue.send_replace((step, model));
         }
 
         let (Running { session, taps, due, copies, .. }, wakes, reading) = (&mut *self, &mut desk.wakes, desk.reading);
