@@ -11,7 +11,7 @@ const ROOMS: [&str; 15] = [
 
 /// What clients may use; `link` alone drives a session.
 const FOR_CLIENTS: [&str; 5] = ["refusal", "limits", "scene", "haptics", "wire"];
-const FOR_LINK: [&str; 2] = ["sheet", "session"];
+const FOR_LINK: [&str; 3] = ["memory", "sheet", "session"];
 
 fn rust_files(folder: &Path) -> Vec<PathBuf> {
     let mut files = Vec::new();

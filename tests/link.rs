@@ -112,6 +112,20 @@ fn random_combinations_are_passive() {
     assert!(worst("force_max_n") <= 2.6, "{found}");
 }
 
+#[cfg(target_os = "linux")]
+#[test]
+fn a_sheet_for_which_there_is_no_memory_is_refused_with_a_reason() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = folder.path().join("large.toml");
+    std::fs::write(&scene, palpate::scene::PAPER.replace("points = [31, 31]", "points = [2048, 2048]")).unwrap();
+    let mut limited = Command::new("sh");
+    limited.args(["-c", "ulimit -v 524288; exec \"$@\"", "sh"]).arg(client_program());
+    let ended = limited.args(["link", "--seconds", "1", "--scene"]).arg(&scene).output().unwrap();
+    let said = String::from_utf8_lossy(&ended.stderr);
+    assert_eq!(ended.status.code(), Some(2), "{said}");
+    assert!(said.contains("--scene") && said.contains("the system has no memory for"), "{said}");
+}
+
 #[test]
 fn a_wrong_argument_is_refused_and_named() {
     for (arguments, named) in [

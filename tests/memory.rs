@@ -35,6 +35,31 @@ fn assert_no_memory(refused: &Status, field: &str) {
     assert!(refused.message().contains("the system has no memory for"), "{refused:?}");
 }
 
+/// Who reads a session that is held, or commands it, is told so.
+async fn assert_is_held(server: &Server, session: &str, mut touch: Touch) {
+    let ended = loop {
+        match tokio::time::timeout(PATIENCE, touch.hear()).await.expect("the stream goes on") {
+            Ok(Some(_)) => {}
+            Ok(None) => panic!("it ends without a reason"),
+            Err(status) => break status,
+        }
+    };
+    assert_eq!(told(&ended).1, "SESSION_HELD");
+    let mut haptics = server.haptics().await;
+    let acquire = pb::AcquireToolRequest { session_id: session.into(), tool: 1, ..Default::default() };
+    assert_eq!(told(&haptics.acquire_tool(acquire).await.unwrap_err()).1, "SESSION_HELD");
+    // A new reader gets the last good state at once, and the information that no more follows.
+    let request = pb::WatchSamplesRequest { session_id: session.into(), ..Default::default() };
+    let mut watched = haptics.watch_samples(request).await.unwrap().into_inner();
+    assert!(watched.message().await.unwrap().unwrap().sample.unwrap().held);
+    assert_eq!(told(&watched.message().await.unwrap_err()).1, "SESSION_HELD");
+    let points = pb::GridPoints { points: vec![pb::GridPoint { x: 0, y: 0 }] };
+    let named = Some(pb::probe_request::Where::Points(points));
+    let request = pb::ProbeRequest { session_id: session.into(), r#where: named, ..Default::default() };
+    let mut records = haptics.probe(request).await.unwrap().into_inner();
+    assert_eq!(told(&records.message().await.unwrap_err()).1, "SESSION_HELD");
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn without_address_space_requests_are_refused_sessions_end_and_others_are_served() {
     let folder = tempfile::tempdir().unwrap();
@@ -88,6 +113,7 @@ async fn without_address_space_requests_are_refused_sessions_end_and_others_are_
     });
     let reason = waited.await.expect("it goes on without memory");
     assert!(reason.contains("the system has no memory for"), "{reason}");
+    assert_is_held(&server, &doomed, doomed_touch).await;
 
     // Others notice nothing.
     for sequence in 1..50 {

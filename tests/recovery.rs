@@ -108,18 +108,34 @@ fn the_same_commands_recover_to_the_same_bits() {
 }
 
 #[test]
-fn too_many_recoveries_in_a_short_time_hold_the_session() {
+fn too_many_recoveries_in_a_short_time_pause_the_tool_that_caused_them() {
     let model = stiff();
-    let pushed =
-        |steps: &[u64]| -> Vec<Order> { steps.iter().map(|step| (*step, 0, push(&model, [15, 15], -1.0))).collect() };
-    let held = play(&model, &pushed(&[20, 120, 220, 320, 420]), 600).session;
-    assert_eq!(held.recoveries().count(), MOST as u64);
-    let reason = held.hold_reason().unwrap();
-    assert!(reason.contains("4 recoveries within 10000 steps were not enough"), "{reason}");
+    let pushed = |tool: u32, steps: &[u64]| -> Vec<Order> {
+        steps.iter().map(|step| (*step, tool, push(&model, [15, 15], -1.0))).collect()
+    };
+    let few = [20, 120, 220, 320];
+    let paused = play(&model, &pushed(0, &few), 400).session.recoveries().list();
+    let end = paused[0].step + WINDOW_STEPS;
+    let told: Vec<_> = paused.iter().map(|recovery| (recovery.at_rest, recovery.paused_until_step)).collect();
+    assert_eq!(told, [(false, None), (false, None), (false, None), (true, Some(end))]);
+    // What comes during the pause has no effect, to the last step; another tool is not paused.
+    let late = [420, 5000, end - 1, end];
+    let again = play(&model, &pushed(0, &[&few[..], &late[..]].concat()), end + 100);
+    let session = &again.session;
+    assert_eq!((session.hold_reason(), session.recoveries().count(), session.paused_commands()), (None, 5, 3));
+    assert_eq!(session.recoveries().newest().unwrap().recovery.state_of_step, end);
+    let sample = session.sample(Some(&[0, 1]));
+    assert_eq!((sample.tools[0].acknowledged_sequence, sample.tools[0].paused_until.is_some()), (8, true));
+    assert_eq!(sample.tools[1].paused_until, None);
+    let other = play(&model, &[pushed(0, &few), pushed(1, &[420])].concat(), 500).session;
+    assert_eq!((other.hold_reason(), other.recoveries().count(), other.paused_commands()), (None, MOST as u64 + 1, 0));
+    // The same commands give the same bits.
+    let repeated = play(&model, &pushed(0, &[&few[..], &late[..]].concat()), end + 100);
+    assert_eq!(again.hashes, repeated.hashes);
     // As many, and the last when the first is long over.
-    let kept = play(&model, &pushed(&[20, 120, 220, 320, WINDOW_STEPS + 70]), WINDOW_STEPS + 200).session;
-    assert_eq!((kept.hold_reason(), kept.recoveries().count()), (None, MOST as u64 + 1));
-    assert_eq!(kept.recoveries().list().len(), MOST);
+    let kept = play(&model, &pushed(0, &[20, 120, 220, WINDOW_STEPS + 70]), WINDOW_STEPS + 200).session;
+    assert_eq!((kept.hold_reason(), kept.recoveries().count()), (None, MOST as u64));
+    assert!(kept.recoveries().list().iter().all(|recovery| recovery.paused_until_step.is_none()));
 }
 
 /// Another tissue, legal and too stiff for the substeps that the scene gives, while the sheet is bent.

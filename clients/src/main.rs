@@ -63,7 +63,8 @@ enum Command {
         true force would exceed 0.8 of the device's). `true` is the same tissue without a delay at the tool's own place.\n\
         Errors are taken over the ticks in which either is in contact. Energies are measured at the device's port: below 0\n\
         the port has given energy. A run is unstable, and ends, when the port gave 0.1 J or the tool left three times the\n\
-        task's amplitude. The loop runs the code of the server and of `bridge` itself.")]
+        task's amplitude. The loop runs the code of the server and of `bridge` itself.\n\n\
+        Exit status: 0; 1 when a run failed; 2 when an input was refused, or the system has no memory for the sheet.")]
     Link(Box<link::Arguments>),
     /// Connect a haptic device to a server at 1 kHz; so far a simulated device in a simulated hand
     #[command(after_help = "Examples:\n  \

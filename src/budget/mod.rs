@@ -40,11 +40,13 @@ pub enum Purpose {
     Textures,
     /// What clients have sent and nobody has read yet, and what they were sent and have not taken.
     Connections,
+    /// Force laws that sessions keep.
+    Laws,
 }
 
 impl Purpose {
     /// All of them.
-    pub const ALL: [Purpose; 7] = [
+    pub const ALL: [Purpose; 8] = [
         Purpose::Session,
         Purpose::Change,
         Purpose::Frames,
@@ -52,6 +54,7 @@ impl Purpose {
         Purpose::Commands,
         Purpose::Textures,
         Purpose::Connections,
+        Purpose::Laws,
     ];
 
     /// The name that metrics give it.
@@ -64,6 +67,7 @@ impl Purpose {
             Purpose::Commands => "commands",
             Purpose::Textures => "textures",
             Purpose::Connections => "connections",
+            Purpose::Laws => "laws",
         }
     }
 }

@@ -4,8 +4,8 @@
 //! When a newer model arrives, the force would jump by the error of the old one. That difference is kept as a bias and
 //! decays with [`BIAS_S`], so the hand feels a smooth change, not a knock.
 //!
-//! **A change of law.** A server that needs long for the exact law of a tissue sends a coarse one first. Each model names
-//! the law by which the server has placed its surface, so the renderer changes over with the first model of the new law,
+//! **A change of law.** A server that needs long for the exact law of a tissue sends a coarse one first, and when the tissue
+//! becomes another it sends that one's. Each model names the law by which the server has placed its surface, so the renderer changes over with the first model of the new law,
 //! and never between two models. Let F be the force by the new model and law along the tool's path, and G that by the old
 //! ones. In the tick of the change, at t0, the bias is b = G(t0) − F(t0), and from then on the force is
 //! F(t) + b·e^{−(t − t0)/τ}, τ = [`BIAS_S`]. At t0 that is G(t0): no jump. In a tick of length h after it, the bias changes
@@ -34,7 +34,7 @@ pub const MOST_LAWS: usize = 16;
 /// One tool's renderer.
 #[derive(Debug, Clone)]
 pub struct Renderer {
-    /// By number; the first is the one that the server began with.
+    /// With their numbers, the oldest first.
     laws: Vec<(u32, Law)>,
     /// The newest model, and the touch that follows from it.
     newest: Option<(LocalModel, Touching)>,
@@ -74,15 +74,20 @@ impl Renderer {
         (self.laws, self.newest, self.arrived, self.arrived_s) = (vec![(0, law)], None, None, None);
     }
 
-    /// Takes a further law, which models may name from now on. False: it is not sound, its number is known already, or
-    /// there are [`MOST_LAWS`]. Models that name a law which is not known are rendered with the first.
+    /// Takes a further law, which models may name from now on. False: it is not sound, or its number is known already. Of
+    /// [`MOST_LAWS`] it takes the place of the oldest that no model at hand names. Models that name a law which is not known
+    /// are rendered with the oldest.
     pub fn learn(&mut self, number: u32, law: Law) -> bool {
-        let is_new = self.laws.iter().all(|known| known.0 != number);
-        let is_learned = is_new && self.laws.len() < MOST_LAWS && law.is_sound();
-        if is_learned {
-            self.laws.push((number, law));
+        if !law.is_sound() || self.laws.iter().any(|known| known.0 == number) {
+            return false;
         }
-        is_learned
+        if self.laws.len() == MOST_LAWS {
+            let in_use = [self.newest.map(|newest| newest.0.law), self.arrived.map(|model| model.law)];
+            let oldest = self.laws.iter().position(|known| !in_use.contains(&Some(known.0)));
+            self.laws.remove(oldest.unwrap_or(0));
+        }
+        self.laws.push((number, law));
+        true
     }
 
     /// The number of models refused: out of order, or not finite.

@@ -5,6 +5,8 @@ use std::sync::Arc;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
+use tokio::sync::watch;
+
 use super::auditor::Audited;
 use super::clock::{Dilation, now_ns};
 use super::cost::{Cost, check_asked, check_work};
@@ -56,6 +58,7 @@ impl Pacer {
             dilation: Dilation::new(begin_ns, 0),
             schedule: Schedule::new(0, begin_ns, scene.stepping.rate_hz),
             late_commands: 0,
+            paused_commands: 0,
             hold_reason: None,
             guard_events: 0,
             recovery_count: 0,
@@ -70,7 +73,6 @@ impl Pacer {
         let live = Arc::new(Live {
             id: id.clone(),
             intake: Mutex::new(Intake::new(&model.scene, &self.limits).charged_to(owner)),
-            model,
             owner: owner.clone(),
             idle_timeout_s,
             asked_ns: AtomicU64::new(now_ns()),
@@ -80,7 +82,9 @@ impl Pacer {
             streams: Mutex::new(Streams::new(&self.limits)),
             refused: AtomicU64::new(0),
             laws: KeptLaws::default(),
+            tissue: watch::Sender::new((0, model.clone())),
             audited: Mutex::new(Audited::default()),
+            model,
             cost,
             thread,
             inbox: inbox.clone(),

@@ -1,10 +1,12 @@
-//! The force laws of a session, one for each radius of a tip and each tissue that it had: computed once, whoever asks.
+//! The force laws of a session's tissue, one for each radius of a tip: computed once, whoever asks. With another tissue they
+//! are forgotten.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 
 use tokio::sync::MutexGuard;
 
+use crate::budget::{Account, Purpose, Resource, Taken};
 use crate::haptics::Law;
 use crate::haptics::law::{Computation, Progress};
 use crate::lock::lock;
@@ -15,24 +17,63 @@ use crate::sheet::Model;
 /// Laws that a session keeps.
 const MOST_LAWS: usize = 16;
 
+/// What a coarse and an exact law take: some tens of rows of six numbers.
+const LAW_BYTES: u64 = 2 << 10;
+
 /// What a session keeps of laws; the oldest goes when there are too many.
 #[derive(Default)]
-pub(crate) struct KeptLaws(Mutex<Vec<Arc<SoughtLaw>>>);
+pub(crate) struct KeptLaws(Mutex<Option<Kept>>);
+
+/// The laws of one tissue.
+struct Kept {
+    model: Arc<Model>,
+    laws: Vec<Arc<SoughtLaw>>,
+    /// The memory of the laws, and of the tissue, which they need as long as they are computed.
+    taken: Taken,
+}
+
+/// Whether two tissues of a session have the same laws. They may have other schemes and substeps.
+pub(crate) fn have_same_laws(a: &Model, b: &Model) -> bool {
+    let [a, b] = [a, b].map(|model| &model.scene);
+    a.springs == b.springs
+        && a.virtual_stiffness_n_per_m == b.virtual_stiffness_n_per_m
+        && a.damping_n_s_per_m == b.damping_n_s_per_m
+}
 
 impl KeptLaws {
-    /// The law of `model` under a tip of `radius_m`, for which at most `most_work` springs times iterations are done.
-    pub(crate) fn of(&self, radius_m: f64, model: &Arc<Model>, most_work: u64) -> Arc<SoughtLaw> {
+    /// The law of `model` under a tip of `radius_m`, for which at most `most_work` springs times iterations are done. Its
+    /// memory is charged to `payer`.
+    ///
+    /// # Errors
+    /// Refuses if `payer` can't have the memory.
+    pub(crate) fn of(
+        &self,
+        radius_m: f64,
+        model: &Arc<Model>,
+        most_work: u64,
+        payer: &Account,
+    ) -> Result<Arc<SoughtLaw>> {
         let mut kept = lock(&self.0);
-        if let Some(law) = kept.iter().find(|law| law.radius_m == radius_m && Arc::ptr_eq(&law.model, model)) {
-            return law.clone();
+        let kept = match &mut *kept {
+            Some(kept) if have_same_laws(&kept.model, model) => kept,
+            other => {
+                // What was kept is given back first.
+                *other = None;
+                let taken = payer.take(Resource::Memory(Purpose::Laws), model.bytes(), "device")?;
+                other.insert(Kept { model: model.clone(), laws: Vec::new(), taken })
+            }
+        };
+        if let Some(law) = kept.laws.iter().find(|law| law.radius_m == radius_m) {
+            return Ok(law.clone());
         }
-        if kept.len() == MOST_LAWS {
-            kept.remove(0);
+        if kept.laws.len() == MOST_LAWS {
+            kept.laws.remove(0);
         }
+        kept.taken.grow_to(kept.model.bytes() + (kept.laws.len() as u64 + 1) * LAW_BYTES, "device")?;
         let (coarse, exact, turn) = (OnceLock::new(), OnceLock::new(), tokio::sync::Mutex::default());
-        let law = Arc::new(SoughtLaw { radius_m, model: model.clone(), most_work, coarse, exact, turn });
-        kept.push(law.clone());
-        law
+        let law = Arc::new(SoughtLaw { radius_m, model: kept.model.clone(), most_work, coarse, exact, turn });
+        kept.laws.push(law.clone());
+        Ok(law)
     }
 }
 
@@ -113,5 +154,45 @@ impl SoughtLaw {
             }
         }
         None
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::budget::Budget;
+    use crate::limits::Limits;
+
+    #[test]
+    fn laws_of_a_tissue_are_kept_charged_and_given_back() {
+        let [soft, hard, finer] =
+            ["damping.coefficient_n_s_per_m=0.3", "damping.coefficient_n_s_per_m=0.6", "stepping.substeps=9"]
+                .map(|set| Model::paper(&["sheet.points=[5, 5]", "stepping.integrator=central", set]));
+        let budget = Budget::new(&Limits { memory_bytes: 64 << 10, ..Limits::default() }, 1, 1);
+        let (account, kept) = (budget.account("one"), KeptLaws::default());
+        let of = |radius: u32, model: &Arc<Model>| kept.of(f64::from(radius), model, 1, &account);
+        let taken = || budget.bytes_for(Purpose::Laws);
+        let first = of(1, &soft).unwrap();
+        assert_eq!(taken(), soft.bytes() + LAW_BYTES);
+        // The same, also for a tissue that only steps are finer of.
+        assert!(Arc::ptr_eq(&first, &of(1, &soft).unwrap()));
+        let same = Model { plan: finer.plan.clone(), ..(*soft).clone() };
+        assert!(Arc::ptr_eq(&first, &of(1, &Arc::new(same)).unwrap()));
+        (2..100).for_each(|radius| _ = of(radius, &soft).unwrap());
+        assert_eq!(taken(), soft.bytes() + MOST_LAWS as u64 * LAW_BYTES);
+        assert!(!Arc::ptr_eq(&first, &of(1, &soft).unwrap()), "the oldest went");
+        // Another tissue.
+        of(1, &hard).unwrap();
+        assert_eq!(taken(), hard.bytes() + LAW_BYTES);
+        // Others have all the rest.
+        let rest = std::iter::from_fn(|| account.take(Resource::Memory(Purpose::Session), 64, "").ok());
+        let rest: Vec<Taken> = rest.collect();
+        let refused = of(2, &hard).unwrap_err();
+        assert_eq!((refused.reason, refused.field.as_str()), (Reason::Overloaded, "device"));
+        assert!(of(1, &hard).is_ok(), "what is kept is there");
+        drop(rest);
+        of(2, &hard).unwrap();
+        drop(kept);
+        assert_eq!(taken(), 0);
     }
 }

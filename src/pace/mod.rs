@@ -29,7 +29,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 
-use tokio::sync::oneshot;
+use tokio::sync::{oneshot, watch};
 
 use crate::budget::{Account, Budget, Taken};
 use crate::limits::Limits;
@@ -117,6 +117,8 @@ pub struct Status {
     pub schedule: Schedule,
     /// Commands that came too late for their step.
     pub late_commands: u64,
+    /// Commands that had no effect because their tool was paused ([`crate::session::recovery`]).
+    pub paused_commands: u64,
     /// Why it is held.
     pub hold_reason: Option<String>,
     /// How often the guard went back to a checkpoint.
@@ -140,6 +142,7 @@ impl Status {
     fn forget_hold(&mut self) {
         (self.hold_reason, self.state) = (None, State::Paused);
         (self.late_commands, self.guard_events, self.path_counts) = (0, 0, [0; 3]);
+        self.paused_commands = 0;
         (self.recovery_count, self.recoveries) = (0, Vec::new());
     }
 }
@@ -163,6 +166,7 @@ pub struct Live {
     streams: Mutex<Streams>,
     refused: AtomicU64,
     laws: KeptLaws,
+    tissue: watch::Sender<(u64, Arc<Model>)>,
     cost: Cost,
     audited: Mutex<Audited>,
     /// Of the stepping threads, its own, and where that is asked.
@@ -337,10 +341,17 @@ impl Live {
         Ok(reader)
     }
 
-    /// The force law of the tissue as it is now, under a tip of `radius_m`. Nothing is computed here.
-    pub(crate) fn law(&self, radius_m: f64) -> Arc<SoughtLaw> {
-        let model = lock(&self.status).model.clone();
-        self.laws.of(radius_m, &model, self.limits.law_work)
+    /// The tissue, and the step from whose beginning on it acts. A change of it is noticed when it acts.
+    pub(crate) fn tissue(&self) -> watch::Receiver<(u64, Arc<Model>)> {
+        self.tissue.subscribe()
+    }
+
+    /// The force law of `model`, a tissue of this session, under a tip of `radius_m`. Nothing is computed here.
+    ///
+    /// # Errors
+    /// Refuses if the session's owner can't have the memory of a further law.
+    pub(crate) fn law(&self, model: &Arc<Model>, radius_m: f64) -> Result<Arc<SoughtLaw>> {
+        self.laws.of(radius_m, model, self.limits.law_work, &self.owner)
     }
 
     /// Frames for a viewer.

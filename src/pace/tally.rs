@@ -66,6 +66,8 @@ pub struct Tally {
     pub overruns: Count,
     /// Commands that came too late for their step.
     pub late_commands: Count,
+    /// Commands that had no effect because their tool was paused.
+    pub paused_commands: Count,
     /// Leases that ran out.
     pub lapsed_leases: Count,
     /// How often the guard went back to a checkpoint.

@@ -439,6 +439,7 @@ impl Running {
         };
         if let Some(model) = change {
             self.session.change(&model);
+            self.live.tissue.send_replace((step, model));
         }
 
         let (Running { session, taps, due, copies, .. }, wakes, reading) = (&mut *self, &mut desk.wakes, desk.reading);
@@ -557,6 +558,7 @@ impl Running {
         tally.rested_steps.add(self.rested_steps - before.rested_steps);
         tally.overruns.add(self.overrun_count - before.overrun_count);
         tally.late_commands.add(self.session.late_commands() - before.late_commands);
+        tally.paused_commands.add(self.session.paused_commands() - before.paused_commands);
         tally.lapsed_leases.add(self.lapsed_leases - before.lapsed_leases);
         tally.guard_events.add(guard_events - before.guard_events);
         let recovery_count = self.session.recoveries().count();
@@ -585,6 +587,7 @@ impl Running {
         status.dilation = self.dilation;
         status.schedule = self.schedule;
         status.late_commands = self.session.late_commands();
+        status.paused_commands = self.session.paused_commands();
         if status.hold_reason.is_none() {
             status.hold_reason = self.session.hold_reason().map(str::to_owned);
         }

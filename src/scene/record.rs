@@ -165,6 +165,9 @@ pub struct Recovery {
     pub at_rest: bool,
     /// Commands whose effect was lost: those that had taken effect since that state.
     pub undone_commands: u64,
+    /// The step before which commands to the tools that acted have no effect, if there were too many recoveries.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub paused_until_step: Option<u64>,
     /// What the guard found.
     pub reason: String,
 }

@@ -1,10 +1,10 @@
-//! The force law of a haptic stream: first one that is there at once, then the exact one, when it is computed.
+//! The force laws of a haptic stream: first one that is there at once, then the exact one, when it is computed; and the same
+//! again when another tissue acts.
 
-use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll, ready};
 
-use tokio::sync::oneshot;
+use tokio::sync::{mpsc, watch};
 use tokio_util::task::AbortOnDropHandle;
 use tonic::Status;
 use tonic_types::StatusExt;
@@ -13,71 +13,164 @@ use tracing::{Instrument, debug};
 use super::workshop::Workshop;
 use crate::budget::Account;
 use crate::haptics::Law;
-use crate::pace::laws::SoughtLaw;
-use crate::session::laws::{BETTER, FIRST, Laws};
+use crate::pace::Live;
+use crate::pace::laws::{SoughtLaw, have_same_laws};
+use crate::session::laws::{FIRST, Laws};
+use crate::sheet::Model;
 use crate::wire::{self, pb};
 
-/// The law that a stream begins with.
-pub(super) async fn first(workshop: &Workshop, account: &Account, sought: &Arc<SoughtLaw>) -> Result<Arc<Law>, Status> {
-    let sought = sought.clone();
-    Ok(workshop.work(account, move |stop| sought.first(stop.flag())).await??)
+/// A law for a stream, or why there is none.
+struct Told {
+    /// The number of the law that it replaces, or that stays.
+    before: u32,
+    /// The step from whose beginning on another tissue acts, if that is the cause.
+    tissue_step: Option<u64>,
+    law: Result<(u32, Arc<Law>), Status>,
 }
 
-/// What a stream is told of its coarse law, once.
-pub(super) struct Update {
-    exact: oneshot::Receiver<Result<Arc<Law>, Status>>,
+/// What a stream is told of its law after its opening.
+pub(super) struct Updates {
+    told: mpsc::Receiver<Told>,
     laws: Arc<Laws>,
 }
 
-impl Update {
-    /// The message, when there is one. The exact law is used by samples from then on: so none that names it can come before
-    /// the message. `None`: there will be no message.
+impl Updates {
+    /// The next message. Samples use its law from then on: so none that names it can come before the message. `None`: no
+    /// message will follow.
     pub(super) fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<pb::ForceLawUpdate>> {
-        let Ok(exact) = ready!(Pin::new(&mut self.exact).poll(context)) else { return Poll::Ready(None) };
-        Poll::Ready(Some(match exact {
-            Ok(law) => {
-                let update = wire::local::law_update(FIRST, Ok((BETTER, &law)));
-                self.laws.improve(law);
+        let Some(Told { before, tissue_step, law }) = ready!(self.told.poll_recv(context)) else {
+            return Poll::Ready(None);
+        };
+        Poll::Ready(Some(match law {
+            Ok((number, law)) => {
+                let update = wire::local::law_update(before, tissue_step, Ok((number, &law)));
+                self.laws.change(number, law);
                 update
             }
             Err(status) => {
                 let reason = status.get_details_error_info().map_or(String::new(), |info| info.reason);
-                wire::local::law_update(FIRST, Err((&reason, status.message())))
+                wire::local::law_update(before, tissue_step, Err((&reason, status.message())))
             }
         }))
     }
 }
 
-/// Computes the exact law until the handle is dropped.
-pub(super) fn improve(
-    workshop: &Workshop,
-    account: &Account,
-    sought: Arc<SoughtLaw>,
-    laws: Arc<Laws>,
-) -> (Update, AbortOnDropHandle<()>) {
-    let (tell, exact) = oneshot::channel();
-    let (workshop, account) = (workshop.clone(), account.clone());
-    let work = async move {
-        let exact = compute(&workshop, &account, &sought).await;
-        if let Err(status) = &exact {
-            debug!(message = status.message(), "a force law stays coarse");
-        }
-        // A stream that has ended is told nothing.
-        let _ = tell.send(exact);
-    };
-    (Update { exact, laws }, AbortOnDropHandle::new(tokio::spawn(work.in_current_span())))
+/// The law that a stream was told last.
+struct Known {
+    number: u32,
+    /// The tissue that it is of, or for which there is none.
+    model: Arc<Model>,
+    /// Whether the exact law may follow.
+    is_coarse: bool,
 }
 
-/// The exact law. It is computed depth by depth: between two of them it is the turn of other work, also of the same caller.
-async fn compute(workshop: &Workshop, account: &Account, sought: &Arc<SoughtLaw>) -> Result<Arc<Law>, Status> {
-    let _turn = sought.turn().await;
-    let mut computation = None;
-    loop {
-        if let Some(exact) = sought.exact() {
-            return Ok(exact?);
+/// Who computes the laws of a stream, and for which tip.
+struct Maker {
+    workshop: Workshop,
+    account: Account,
+    live: Arc<Live>,
+    radius_m: f64,
+}
+
+impl Maker {
+    /// The law to begin with: at most 50 ms of work.
+    async fn first(&self, model: &Arc<Model>) -> Result<Arc<Law>, Status> {
+        let sought = self.live.law(model, self.radius_m)?;
+        Ok(self.workshop.work(&self.account, move |stop| sought.first(stop.flag())).await??)
+    }
+
+    /// The exact law. It is computed depth by depth: between two of them it is the turn of other work, also of the same
+    /// caller.
+    async fn exact(&self, model: &Arc<Model>) -> Result<Arc<Law>, Status> {
+        let sought = self.live.law(model, self.radius_m)?;
+        let _turn = sought.turn().await;
+        let mut computation = None;
+        loop {
+            if let Some(exact) = sought.exact() {
+                return Ok(exact?);
+            }
+            let sought: Arc<SoughtLaw> = sought.clone();
+            let advance = self.workshop.work(&self.account, move |stop| sought.advance(computation, stop.flag()));
+            computation = advance.await?;
         }
-        let sought = sought.clone();
-        computation = workshop.work(account, move |stop| sought.advance(computation, stop.flag())).await?;
+    }
+
+    /// Tells the stream what it does not know of the laws of `model`, the tissue since `step`.
+    async fn tell(&self, known: &mut Known, step: u64, model: &Arc<Model>, tell: &mpsc::Sender<Told>) {
+        if !have_same_laws(&known.model, model) {
+            let law = self.first(model).await;
+            let is_coarse = law.as_ref().is_ok_and(|law| law.is_coarse);
+            self.say(known, Some(step), law, tell).await;
+            (known.model, known.is_coarse) = (model.clone(), is_coarse);
+        }
+        if known.is_coarse {
+            let law = self.exact(model).await;
+            self.say(known, None, law, tell).await;
+            known.is_coarse = false;
+        }
+    }
+
+    async fn say(
+        &self,
+        known: &mut Known,
+        tissue_step: Option<u64>,
+        law: Result<Arc<Law>, Status>,
+        tell: &mpsc::Sender<Told>,
+    ) {
+        if let Err(status) = &law {
+            debug!(session = %self.live.id, message = status.message(), "a force law can't be had");
+        }
+        let number = known.number.wrapping_add(u32::from(law.is_ok()));
+        // A stream that has ended is told nothing.
+        let _ = tell.send(Told { before: known.number, tissue_step, law: law.map(|law| (number, law)) }).await;
+        known.number = number;
+    }
+}
+
+/// The laws of a stream, as they are computed.
+pub(super) struct Computing {
+    maker: Maker,
+    tissue: watch::Receiver<(u64, Arc<Model>)>,
+    known: Known,
+}
+
+impl Computing {
+    /// The law that a stream of `live` with a tip of `radius_m` begins with, and what comes after it.
+    ///
+    /// # Errors
+    /// Returns an error if no law can be had now: for want of memory, work or time.
+    pub(super) async fn begin(
+        workshop: &Workshop,
+        account: &Account,
+        live: &Arc<Live>,
+        radius_m: f64,
+    ) -> Result<(Arc<Law>, Self), Status> {
+        let mut tissue = live.tissue();
+        let model = tissue.borrow_and_update().1.clone();
+        let maker = Maker { workshop: workshop.clone(), account: account.clone(), live: live.clone(), radius_m };
+        let law = maker.first(&model).await?;
+        let known = Known { number: FIRST, model, is_coarse: law.is_coarse };
+        Ok((law, Computing { maker, tissue, known }))
+    }
+
+    /// Goes on until the handle is dropped: tells the exact law, and those of other tissues. A computation ends when a
+    /// newer tissue acts.
+    pub(super) fn go_on(self, laws: Arc<Laws>) -> (Updates, AbortOnDropHandle<()>) {
+        let Computing { maker, mut tissue, mut known } = self;
+        let (tell, told) = mpsc::channel(1);
+        let work = async move {
+            loop {
+                let (step, model) = tissue.borrow_and_update().clone();
+                let changed = tokio::select! {
+                    changed = tissue.changed() => changed,
+                    () = maker.tell(&mut known, step, &model, &tell) => tissue.changed().await,
+                };
+                if changed.is_err() {
+                    return;
+                }
+            }
+        };
+        (Updates { told, laws }, AbortOnDropHandle::new(tokio::spawn(work.in_current_span())))
     }
 }
 
@@ -86,78 +179,153 @@ mod tests {
     use super::*;
     use crate::budget::Budget;
     use crate::limits::Limits;
-    use crate::pace::laws::KeptLaws;
-    use crate::sheet::Model;
+    use crate::pace::Pacer;
+    use crate::scene::{Change, PAPER, Scene};
+    use crate::sheet::choice::NEVER;
 
-    /// A tissue whose exact law takes longer than a first one may.
-    fn sought(limits: &Limits) -> Arc<SoughtLaw> {
-        let model = Model::paper(&["sheet.points=[21, 21]", "virtual_springs.stiffness_n_per_m=1.0"]);
-        KeptLaws::default().of(model.scene.sheet.spacing_m, &model, limits.law_work)
+    /// A session of a tissue whose exact law takes longer than a first one may.
+    struct Course {
+        pacer: Arc<Pacer>,
+        workshop: Workshop,
+        account: Account,
+        live: Arc<Live>,
     }
 
-    async fn told(mut update: Update) -> Option<pb::ForceLawUpdate> {
-        std::future::poll_fn(|context| update.poll(context)).await
+    impl Drop for Course {
+        fn drop(&mut self) {
+            self.pacer.stop();
+        }
     }
 
-    fn workshop(limits: &Limits) -> (Workshop, Account) {
-        (Workshop::open("test", limits).unwrap(), Budget::new(limits, 1, 1).account("one"))
+    impl Course {
+        fn new(limits: &Limits) -> Self {
+            let sets = ["sheet.points=[21, 21]", "virtual_springs.stiffness_n_per_m=1.0"].map(str::to_owned);
+            let scene = Scene::parse("paper", PAPER, &sets, limits).unwrap();
+            let budget = Budget::new(limits, 1, 1);
+            let account = budget.account("one");
+            let pacer = Pacer::start(1, 0.0, limits, budget).unwrap();
+            let live = pacer.create(&scene, false, 60.0, &account, &NEVER).unwrap();
+            Course { workshop: Workshop::open("test", limits).unwrap(), pacer, account, live }
+        }
+
+        fn radius_m(&self) -> f64 {
+            self.live.model.scene.sheet.spacing_m
+        }
+
+        /// The laws of a new stream.
+        async fn begin(&self) -> (Arc<Law>, Arc<Laws>, Computing) {
+            let begun = Computing::begin(&self.workshop, &self.account, &self.live, self.radius_m()).await;
+            let (law, computing) = begun.unwrap();
+            (law.clone(), Arc::new(Laws::new(law)), computing)
+        }
+
+        fn sought(&self) -> Arc<SoughtLaw> {
+            self.live.law(&self.live.model, self.radius_m()).unwrap()
+        }
+
+        /// Changes the tissue; tells the step from which on the other acts.
+        fn change(&self, virtual_stiffness_n_per_m: f64, at_step: Option<u64>) -> (u64, Arc<Model>) {
+            let change = Change { virtual_stiffness_n_per_m: Some(virtual_stiffness_n_per_m), ..Change::default() };
+            self.live.change(&change, at_step, |_| Ok(()), &NEVER).unwrap()
+        }
+    }
+
+    async fn told(updates: &mut Updates) -> pb::ForceLawUpdate {
+        std::future::poll_fn(|context| updates.poll(context)).await.unwrap()
     }
 
     #[tokio::test]
     async fn a_coarse_law_is_followed_by_the_exact_one() {
-        let limits = Limits::default();
-        let ((workshop, account), sought) = (workshop(&limits), sought(&limits));
-        let first = first(&workshop, &account, &sought).await.unwrap();
+        let course = Course::new(&Limits::default());
+        let (first, laws, computing) = course.begin().await;
+        let sought = course.sought();
         assert!(first.is_coarse && sought.exact().is_none());
-        let laws = Arc::new(Laws::new(first));
-        let (update, _computing) = improve(&workshop, &account, sought.clone(), laws.clone());
+        let (mut updates, _computing) = computing.go_on(laws.clone());
         // Local models refer to it when it was told, not before.
         while sought.exact().is_none() {
             tokio::task::yield_now().await;
         }
         assert_eq!(laws.newest().0, FIRST);
-        let update = told(update).await.unwrap();
-        assert_eq!((update.coarse_number, update.reason.as_str()), (FIRST, ""));
+        let update = told(&mut updates).await;
+        assert_eq!((update.coarse_number, update.reason.as_str(), update.tissue_step), (FIRST, "", None));
         let law = update.law.unwrap();
-        assert!(!law.coarse && law.number == BETTER);
+        assert!(!law.coarse && law.number == 1);
         let exact = sought.exact().unwrap().unwrap();
         assert_eq!(wire::local::from_law(&law).unwrap(), *exact);
-        assert_eq!(laws.newest(), (BETTER, &exact));
+        assert_eq!(laws.newest(), (1, exact.clone()));
         // Whoever comes later begins with it.
-        assert_eq!(super::first(&workshop, &account, &sought).await.unwrap(), exact);
+        assert_eq!(course.begin().await.0, exact);
     }
 
     #[tokio::test]
     async fn a_law_beyond_the_bound_stays_coarse_and_says_why() {
-        let limits = Limits { law_work: 1 << 20, ..Limits::default() };
-        let ((workshop, account), sought) = (workshop(&limits), sought(&limits));
-        let laws = Arc::new(Laws::new(first(&workshop, &account, &sought).await.unwrap()));
+        let course = Course::new(&Limits { law_work: 1 << 20, ..Limits::default() });
         for _ in 0..2 {
-            let (update, computing) = improve(&workshop, &account, sought.clone(), laws.clone());
-            let update = told(update).await.unwrap();
+            let (_, laws, computing) = course.begin().await;
+            let (mut updates, _computing) = computing.go_on(laws.clone());
+            let update = told(&mut updates).await;
             assert_eq!((update.law, update.reason.as_str()), (None, "NOT_AVAILABLE"));
             assert!(update.message.contains("limits.law_work"), "{}", update.message);
-            computing.await.unwrap();
             assert_eq!(laws.newest().0, FIRST);
         }
     }
 
     #[tokio::test]
     async fn a_computation_that_nobody_waits_for_ends_and_another_begins_anew() {
-        let limits = Limits::default();
-        let ((workshop, account), sought) = (workshop(&limits), sought(&limits));
-        let laws = Arc::new(Laws::new(first(&workshop, &account, &sought).await.unwrap()));
-        let (update, computing) = improve(&workshop, &account, sought.clone(), laws.clone());
+        let course = Course::new(&Limits::default());
+        let (_, laws, computing) = course.begin().await;
+        let sought = course.sought();
+        let (mut updates, handle) = computing.go_on(laws.clone());
         // It is under way when its turn is taken.
         while sought.is_free() {
             tokio::task::yield_now().await;
         }
-        drop(computing);
-        assert_eq!(told(update).await, None);
+        drop(handle);
+        assert_eq!(std::future::poll_fn(|context| updates.poll(context)).await, None);
         // The turn is given back, though nothing was settled.
         drop(sought.turn().await);
         assert!(sought.exact().is_none() && laws.newest().0 == FIRST);
-        let (update, _computing) = improve(&workshop, &account, sought.clone(), laws.clone());
-        assert!(told(update).await.unwrap().law.is_some());
+        let (_, laws, computing) = course.begin().await;
+        let (mut updates, _computing) = computing.go_on(laws);
+        assert!(told(&mut updates).await.law.is_some());
+    }
+
+    #[tokio::test]
+    async fn another_tissue_has_its_laws_told_when_it_acts() {
+        let course = Course::new(&Limits::default());
+        let (_, laws, computing) = course.begin().await;
+        let (mut updates, _computing) = computing.go_on(laws.clone());
+        assert_eq!(told(&mut updates).await.law.unwrap().number, 1);
+        let (step, model) = course.change(1.5, None);
+        let first = told(&mut updates).await;
+        let law = first.law.unwrap();
+        assert_eq!((first.coarse_number, first.tissue_step, law.number, law.coarse), (1, Some(step), 2, true));
+        let exact = told(&mut updates).await;
+        assert_eq!((exact.coarse_number, exact.tissue_step), (2, None));
+        let exact = exact.law.unwrap();
+        assert_eq!((exact.number, exact.coarse), (3, false));
+        assert_eq!(wire::local::from_law(&exact).unwrap(), Law::of(&model, course.radius_m()));
+        assert_eq!(laws.newest().0, 3);
+        // A stream that opens now begins with it.
+        let law = course.begin().await.0;
+        assert_eq!(law, laws.newest().1);
+    }
+
+    #[tokio::test]
+    async fn a_newer_tissue_ends_the_computation_for_an_older_one() {
+        let course = Course::new(&Limits::default());
+        let (_, laws, computing) = course.begin().await;
+        let old = course.sought();
+        let (mut updates, _computing) = computing.go_on(laws.clone());
+        while old.is_free() {
+            tokio::task::yield_now().await;
+        }
+        // Before the exact law of the first tissue is there.
+        let (step, _) = course.change(1.5, None);
+        let first = told(&mut updates).await;
+        assert_eq!((first.coarse_number, first.tissue_step), (FIRST, Some(step)));
+        drop(old.turn().await);
+        assert!(old.exact().is_none(), "it went on");
+        assert!(!told(&mut updates).await.law.unwrap().coarse);
     }
 }

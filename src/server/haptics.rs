@@ -15,7 +15,7 @@ use tracing::{Instrument, debug, info};
 use super::House;
 use super::connections::Peer;
 use super::cut::until_cut;
-use super::force_law::{self, Update};
+use super::force_law::{Computing, Updates};
 use super::rate::Bucket;
 use super::recovered::Notices;
 use super::revocation::Tenure;
@@ -41,8 +41,8 @@ type Out<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 /// What the output of a haptic stream begins with.
 struct Opened {
     answer: pb::TouchOpened,
-    /// What will be told of the law, if it is a coarse one.
-    update: Option<Update>,
+    /// What will be told of the law, if the stream has one.
+    updates: Option<Updates>,
     samples: Reader<PacedSample>,
     notices: Notices,
     guard: StreamGuard,
@@ -65,8 +65,8 @@ struct Hold {
     lease: LeaseId,
     tools: usize,
     device: Option<Device>,
-    /// Computes the exact law as long as the stream is there.
-    _improving: Option<AbortOnDropHandle<()>>,
+    /// Computes further laws as long as the stream is there.
+    _computing: Option<AbortOnDropHandle<()>>,
 }
 
 impl Hold {
@@ -126,11 +126,13 @@ impl Haptics {
         sampling.touch_stiffness = open.touch_stiffness;
         let held = if open.tools.is_empty() { Held::Nothing } else { Held::Tools };
         let guard = live.open_stream("Touch", held, account)?;
-        let sought = device.map(|_| live.law(tip.radius_m));
-        if let Some(sought) = &sought {
-            let first = force_law::first(&self.0.workshop, account, sought).await?;
-            sampling.laws = Some(Arc::new(Laws::new(first)));
-        }
+        let begun = match device {
+            Some(_) => Some(Computing::begin(&self.0.workshop, account, &live, tip.radius_m).await?),
+            None => None,
+        };
+        let (law, computing) = begun.unzip();
+        let laws = law.clone().map(|law| Arc::new(Laws::new(law)));
+        sampling.laws.clone_from(&laws);
         let lease_s = open.lease_s.unwrap_or(self.0.config.lease_s);
         let lease = random_bits()?;
         let seats = seats(account, open.tools.len())?;
@@ -139,12 +141,9 @@ impl Haptics {
             intake.seat(lease, seats);
             Ok::<_, Refusal>(intake.next_step())
         })?;
-        let laws = sampling.laws.clone();
-        let coarse = sought.zip(laws.clone()).filter(|(_, laws)| laws.first().is_coarse);
-        let improving = coarse.map(|(sought, laws)| force_law::improve(&self.0.workshop, account, sought, laws));
-        let (update, _improving) = improving.unzip();
-        let hold = Hold { live: live.clone(), lease, tools: open.tools.len(), device, _improving };
-        let law = laws.as_deref().map(Laws::first);
+        let (updates, _computing) = computing.zip(laws).map(|(computing, laws)| computing.go_on(laws)).unzip();
+        let hold = Hold { live: live.clone(), lease, tools: open.tools.len(), device, _computing };
+        let law = law.as_deref();
         let answer = pb::TouchOpened {
             step,
             rate_hz: live.model.scene.stepping.rate_hz,
@@ -157,7 +156,7 @@ impl Haptics {
         let samples = live.samples(sampling, open.tools.is_empty().then_some(account));
         info!(session = %live.id, tools = ?open.tools, holder = ?open.holder, "haptic stream opened");
         let notices = Notices::new(open.tools.clone(), step);
-        Ok((Opened { answer, update, samples, notices, guard }, hold))
+        Ok((Opened { answer, updates, samples, notices, guard }, hold))
     }
 
     /// Reads what the client says until it ends.
@@ -315,7 +314,7 @@ impl Early {
 
 /// What the output of a haptic stream reads from.
 struct Outlet {
-    update: Option<Update>,
+    updates: Option<Updates>,
     events: Reader<Event>,
     samples: Reader<PacedSample>,
     notices: Notices,
@@ -332,12 +331,12 @@ impl Outlet {
         if let Some(message) = self.ready.pop_front() {
             return Poll::Ready(Some(Ok(message)));
         }
-        if let Some(update) = &mut self.update
-            && let Poll::Ready(told) = update.poll(context)
+        if let Some(updates) = &mut self.updates
+            && let Poll::Ready(told) = updates.poll(context)
         {
-            self.update = None;
-            if let Some(update) = told {
-                return Poll::Ready(Some(Ok(Message::ForceLaw(update))));
+            match told {
+                Some(update) => return Poll::Ready(Some(Ok(Message::ForceLaw(update)))),
+                None => self.updates = None,
             }
         }
         if let Poll::Ready(event) = self.events.poll_pop(context) {
@@ -388,10 +387,10 @@ impl Stream for Output {
         let stage = &mut self.get_mut().stage;
         let message = match stage {
             Stage::Opening(opening, events) => match (ready!(Pin::new(opening).poll(context)), events.take()) {
-                (Ok(Ok(Opened { answer, update, samples, notices, guard })), Some(events)) => {
+                (Ok(Ok(Opened { answer, updates, samples, notices, guard })), Some(events)) => {
                     let (ready, dropped_answers) = (VecDeque::new(), 0);
-                    *stage =
-                        Stage::Open(Outlet { update, events, samples, notices, ready, dropped_answers, _guard: guard });
+                    let _guard = guard;
+                    *stage = Stage::Open(Outlet { updates, events, samples, notices, ready, dropped_answers, _guard });
                     Some(Ok(Message::Opened(answer)))
                 }
                 (Ok(Err(status)), _) => Some(Err(status)),

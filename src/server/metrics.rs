@@ -201,12 +201,15 @@ impl EncodeMetric for Histogram {
 }
 
 /// Counts of the stepping threads: name, what it is, and where.
-type Counts = [(&'static str, &'static str, fn(&Tally) -> &Count); 10];
+type Counts = [(&'static str, &'static str, fn(&Tally) -> &Count); 11];
 
 const COUNTS: Counts = [
     ("rested_steps", "Steps that were passed over at rest", |tally| &tally.rested_steps),
     ("overruns", "Steps that were due and dropped", |tally| &tally.overruns),
     ("late_commands", "Commands that came too late for their step", |tally| &tally.late_commands),
+    ("paused_commands", "Commands without effect: their tool was paused after recoveries", |tally| {
+        &tally.paused_commands
+    }),
     ("lapsed_leases", "Leases of tools that ran out", |tally| &tally.lapsed_leases),
     ("guard_events", "How often the guard went back to a checkpoint", |tally| &tally.guard_events),
     ("recoveries", "How often a tissue was taken back to an earlier state", |tally| &tally.recoveries),

@@ -45,7 +45,8 @@ mod tests {
 
     fn sample(recoveries: u64, step: u64) -> Sample {
         let (state_of_step, reason) = (step - 9, "it grew".to_owned());
-        let recovery = Recovery { step, state_of_step, at_rest: false, undone_commands: 3, reason };
+        let recovery =
+            Recovery { step, state_of_step, at_rest: false, undone_commands: 3, paused_until_step: None, reason };
         let tools = [1, 2].map(|tool| Ended { tool, sequence: 10 + u64::from(tool), undone_commands: 1 }).to_vec();
         Sample {
             step,

@@ -63,8 +63,11 @@ pub struct ToolSample {
     pub stale: bool,
     /// Whether the acknowledged command came too late for its step.
     pub late: bool,
-    /// Whether the tool's action was ended by its time to live, with its lease, for lack of poses, or by a recovery.
+    /// Whether the tool's action was ended by its time to live, with its lease, for lack of poses, or by a recovery; or had
+    /// no effect because the tool is paused.
     pub expired: bool,
+    /// The step before which commands to the tool have no effect, if it was ever paused ([`recovery`]).
+    pub paused_until: Option<u64>,
 }
 
 /// The control point of a tool.
@@ -113,6 +116,7 @@ struct Tool {
     late: bool,
     expired: bool,
     led: Option<Led>,
+    paused_until: Option<u64>,
 }
 
 /// A position-controlled tool.
@@ -129,6 +133,7 @@ pub struct Session {
     tissue: Box<dyn Tissue>,
     tools: Vec<Tool>,
     late_commands: u64,
+    paused_commands: u64,
     path_counts: [u64; 3],
     recoveries: Recoveries,
     hold_reason: Option<String>,
@@ -141,6 +146,7 @@ impl Session {
             tissue: sheet::at_rest(model),
             tools: Vec::new(),
             late_commands: 0,
+            paused_commands: 0,
             path_counts: [0; 3],
             recoveries: Recoveries::default(),
             hold_reason: None,
@@ -181,6 +187,11 @@ impl Session {
     /// Total number of commands that came too late for their step.
     pub fn late_commands(&self) -> u64 {
         self.late_commands
+    }
+
+    /// Number of commands that had no effect because their tool was paused ([`recovery`]).
+    pub fn paused_commands(&self) -> u64 {
+        self.paused_commands
     }
 
     /// The sum of [`Path::counts`] over all position-controlled tools.
@@ -287,7 +298,8 @@ impl Session {
         let index = command.tool as usize;
         let tool = self.tool(index);
         if ends_lease {
-            *tool = Tool { control_point: tool.control_point, expired: true, ..Tool::default() };
+            let (control_point, paused_until) = (tool.control_point, tool.paused_until);
+            *tool = Tool { control_point, paused_until, expired: true, ..Tool::default() };
             return self.tissue.release(index);
         }
         // Commands with a step may take effect in another order than they were sent in.
@@ -296,12 +308,20 @@ impl Session {
             tool.client_time_ns = command.client_time_ns;
             tool.arrival_ns = command.arrival_ns;
         }
+        let releases = command.action == Action::Release;
         tool.late = late;
-        tool.expired = false;
+        tool.expired = !releases && tool.paused_until.is_some_and(|end| step < end);
+        if tool.expired {
+            self.paused_commands += 1;
+            return;
+        }
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
         let lifetime = command.time_to_live_s.map(|seconds| (seconds * rate_hz).ceil().max(1.0) as u64);
         tool.expires_at = lifetime.map(|steps| step.saturating_add(steps));
         self.recoveries.note(step, command.tool);
+        if !releases {
+            self.recoveries.disturb();
+        }
         match command.action {
             Action::Push(poke) => {
                 self.tool(index).led = None;
@@ -353,11 +373,13 @@ impl Session {
 
     /// Applies a force as a continuous law, exact within the step. No command can express this.
     pub fn play_force(&mut self, tool: usize, law: ForceLaw) {
+        self.recoveries.disturb();
         self.tissue.push(tool, Some(Push::Law(law)));
     }
 
     /// Applies a movement as a continuous law.
     pub fn play_move(&mut self, tool: usize, law: MoveLaw) {
+        self.recoveries.disturb();
         let index = self.model().index_of(law.point);
         self.tissue.grasp(tool, index, Grasp::Law(law));
     }
@@ -398,6 +420,7 @@ impl Session {
                 stale: tool.led.as_ref().is_some_and(|led| led.path.is_held(self.time_s())),
                 late: tool.late,
                 expired: tool.expired,
+                paused_until: tool.paused_until,
             }
         };
         let in_use = |number: &u32| self.tools[*number as usize].control_point.is_some();

@@ -5,7 +5,12 @@
 //! recovery depends on steps and commands alone, so the same commands give the same bits.
 //!
 //! A recovery is expensive: the guard has repeated up to [`INTERVAL_SUBSTEPS`] substeps with shorter and shorter ones.
-//! So there are at most [`MOST`] within [`WINDOW_STEPS`] steps. After the next blow-up the session is held.
+//! So at the [`MOST`]th recovery within [`WINDOW_STEPS`] steps the tissue is brought to rest, and the tools that acted are
+//! paused: until the window is over their commands have no effect, except releases. Other tools can still cause a
+//! recovery, which pauses them as well.
+//!
+//! The session is held only if the tissue blows up although nothing has acted on it since it was at rest. Then no
+//! command has caused the fault, and another recovery would not help.
 //!
 //! [`INTERVAL_SUBSTEPS`]: crate::sheet::guard::INTERVAL_SUBSTEPS
 
@@ -16,7 +21,7 @@ use super::Session;
 use crate::scene::record::Recovery;
 use crate::sheet::BlowUp;
 
-/// Most recoveries within [`WINDOW_STEPS`].
+/// As many recoveries within [`WINDOW_STEPS`] pause the tools that acted.
 pub const MOST: usize = 4;
 
 /// Length of the window, steps.
@@ -58,6 +63,8 @@ pub struct Recoveries {
     newest: VecDeque<Arc<Recovered>>,
     /// The commands since the guard's checkpoint, by step. The guard brings the checkpoint forward when there are many.
     acts: VecDeque<Acts>,
+    /// Whether anything has acted on the tissue since it was at rest. A session begins at rest.
+    disturbed: bool,
 }
 
 impl Recoveries {
@@ -84,6 +91,11 @@ impl Recoveries {
         }
     }
 
+    /// Notes that a force, a grasp or a tip acts from now on.
+    pub(super) fn disturb(&mut self) {
+        self.disturbed = true;
+    }
+
     /// Forgets the commands before `step`, whose effect the guard has believed.
     pub(super) fn believe(&mut self, step: u64) {
         while self.acts.front().is_some_and(|acts| acts.step < step) {
@@ -91,14 +103,18 @@ impl Recoveries {
         }
     }
 
-    /// Whether a blow-up at `step` may be recovered from.
-    fn may_recover(&self, step: u64) -> bool {
-        let oldest = self.newest.front().filter(|_| self.newest.len() == MOST);
-        oldest.is_none_or(|oldest| step - oldest.recovery.step >= WINDOW_STEPS)
+    /// The step until which a recovery at `step` pauses the tools that acted: the end of the window, if there are too
+    /// many in it.
+    fn pause_end(&self, step: u64) -> Option<u64> {
+        // The first of the newest [`MOST`], of which the one at `step` is the last.
+        let first = self.newest.iter().rev().nth(MOST - 2)?;
+        let end = first.recovery.step + WINDOW_STEPS;
+        (end > step).then_some(end)
     }
 
     fn add(&mut self, recovered: Recovered) {
         self.count += 1;
+        self.disturbed = !recovered.recovery.at_rest;
         if self.newest.len() == MOST {
             self.newest.pop_front();
         }
@@ -119,19 +135,20 @@ impl Session {
         self.hold_reason().map(str::to_owned).or_else(recovered)
     }
 
-    /// Recovers from a blow-up if there were not too many of late. Otherwise the session is held, and the result is
-    /// false.
+    /// Recovers from a blow-up if something has acted on the tissue since it was at rest. Otherwise the session is held,
+    /// and the result is false.
     pub(super) fn recover(&mut self, blow_up: BlowUp) -> bool {
         let (step, state_of_step) = (blow_up.step, self.step_count());
-        if !self.recoveries.may_recover(step) {
+        if !self.recoveries.disturbed {
             self.hold(format!(
-                "after step {step} {}; shorter substeps did not help, and {MOST} recoveries within {WINDOW_STEPS} steps \
-                 were not enough; the state is that of step {state_of_step}",
+                "after step {step} {}; shorter substeps did not help, and nothing has acted on the tissue since it was at \
+                 rest; the state is that of step {state_of_step}",
                 blow_up.cause
             ));
             return false;
         }
-        let released = self.tissue.recover(step);
+        let paused_until_step = self.recoveries.pause_end(step);
+        let released = self.tissue.recover(step, paused_until_step.is_some());
         // All that took effect since the checkpoint: `believe` has forgotten the others.
         self.recoveries.believe(state_of_step);
         let mut tools = Vec::new();
@@ -142,13 +159,14 @@ impl Session {
             (tool.led, tool.expires_at) = (None, None);
             tool.expired |= acted;
             if acted {
+                tool.paused_until = paused_until_step.or(tool.paused_until);
                 #[allow(clippy::cast_possible_truncation)]
                 tools.push(Ended { tool: index as u32, sequence: tool.acknowledged_sequence, undone_commands });
             }
         }
         let undone_commands = tools.iter().map(|ended| ended.undone_commands).sum();
         let (at_rest, reason) = (released.at_rest, blow_up.cause.to_string());
-        let recovery = Recovery { step, state_of_step, at_rest, undone_commands, reason };
+        let recovery = Recovery { step, state_of_step, at_rest, undone_commands, paused_until_step, reason };
         self.recoveries.add(Recovered { recovery, tools });
         true
     }
@@ -156,10 +174,89 @@ impl Session {
 
 /// A description for people.
 pub fn describe(recovery: &Recovery) -> String {
-    let Recovery { step, state_of_step, at_rest, undone_commands, reason } = recovery;
+    let Recovery { step, state_of_step, at_rest, undone_commands, paused_until_step, reason } = recovery;
     let rest = if *at_rest { ", brought to rest" } else { "" };
+    let pause = paused_until_step.map_or(String::new(), |end| {
+        format!(
+            "; there were {MOST} recoveries within {WINDOW_STEPS} steps, so commands to the tools that acted have no effect \
+             before step {end}"
+        )
+    });
     format!(
         "after step {step} {reason}; shorter substeps did not help; the tissue went back to the state of step \
-         {state_of_step}{rest}, {undone_commands} commands were undone, and all tools were released"
+         {state_of_step}{rest}, {undone_commands} commands were undone, and all tools were released{pause}"
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::script::Action;
+    use crate::session::command::{Command, Due};
+    use crate::sheet::Model;
+    use crate::sheet::guard::Cause;
+
+    fn blow_up(step: u64) -> BlowUp {
+        BlowUp { step, cause: Cause::NotFinite { point: [0, 0] } }
+    }
+
+    fn grasp(tool: u32, sequence: u64) -> Due {
+        let action = Action::Grasp { point: [2, 2], displacement_m: glam::DVec3::Z * 1e-3 };
+        let (at_step, time_to_live_s) = (None, None);
+        let command = Command { tool, sequence, client_time_ns: 0, at_step, time_to_live_s, action, arrival_ns: 0 };
+        Due { command, late: false, late_commands: 0, ends_lease: false }
+    }
+
+    #[test]
+    fn a_session_is_held_only_if_nothing_has_acted_since_it_was_at_rest() {
+        let mut session = Session::new(&Model::paper(&["sheet.points=[5, 5]"]));
+        session.advance(&mut vec![grasp(0, 1)], |_| {});
+        // The first goes back to a state that is not at rest. Nothing acts after it.
+        for at_rest in [false, true] {
+            assert!(session.recover(blow_up(session.step_count())));
+            assert_eq!(session.recoveries().newest().unwrap().recovery.at_rest, at_rest);
+        }
+        assert!(!session.recover(blow_up(session.step_count())));
+        let reason = session.hold_reason().unwrap();
+        assert!(reason.contains("nothing has acted on the tissue since it was at rest"), "{reason}");
+        let mut untouched = Session::new(session.model());
+        assert!(!untouched.recover(blow_up(0)) && untouched.recoveries().count() == 0);
+    }
+
+    #[test]
+    fn a_tool_that_causes_too_many_recoveries_is_paused_and_no_other() {
+        let mut session = Session::new(&Model::paper(&["sheet.points=[5, 5]"]));
+        let mut sequence = 0;
+        for _ in 0..MOST {
+            sequence += 1;
+            session.advance(&mut vec![grasp(0, sequence)], |_| {});
+            assert!(session.tools[0].paused_until.is_none());
+            assert!(session.recover(blow_up(session.step_count())));
+        }
+        let list = session.recoveries().list();
+        let end = list[0].step + WINDOW_STEPS;
+        assert_eq!(list.iter().map(|recovery| recovery.paused_until_step).collect::<Vec<_>>()[MOST - 1], Some(end));
+        assert!(describe(&list[MOST - 1]).contains(&format!("before step {end}")));
+        let sample = |session: &Session, tool: usize| session.sample(Some(&[0, 1])).tools[tool].clone();
+        // The command is acknowledged and has no effect; nor has a new holder's.
+        session.advance(&mut vec![grasp(0, 5)], |_| {});
+        let paused = sample(&session, 0);
+        assert_eq!((paused.acknowledged_sequence, paused.expired, paused.paused_until), (5, true, Some(end)));
+        let released = Due { ends_lease: true, ..grasp(0, 0) };
+        session.advance(&mut vec![released], |_| {});
+        session.advance(&mut vec![grasp(0, 1)], |_| {});
+        assert_eq!((session.paused_commands(), session.tissue().largest_displacement_m()), (2, 0.0));
+        assert!(!session.recoveries.disturbed);
+        // Another tool acts, and so does this one after the pause.
+        session.advance(&mut vec![grasp(1, 1)], |_| {});
+        assert!(!sample(&session, 1).expired && session.tissue().largest_displacement_m() > 0.0);
+        while session.step_count() < end - 1 {
+            session.advance(&mut Vec::new(), |_| {});
+        }
+        session.advance(&mut vec![grasp(0, 6)], |_| {});
+        assert!(sample(&session, 0).expired);
+        session.advance(&mut vec![grasp(0, 7)], |_| {});
+        assert!(!sample(&session, 0).expired);
+        assert_eq!(session.paused_commands(), 3);
+    }
 }

@@ -84,7 +84,7 @@ impl Deadband {
 }
 
 /// The request of a stream.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 pub struct Sampling {
     /// Samples of steps that are multiples of this.
     pub every: u64,
@@ -172,15 +172,15 @@ impl Sampler {
             self.law = number;
             self.foresight.values_mut().for_each(|foresight| foresight.modeller.change_law(number, law.clone()));
         }
-        let (models, is_left) = self.look_ahead(&sample, law);
-        // A better law is news: the client renders by the other one until a model names it.
+        let (models, is_left) = self.look_ahead(&sample, &law);
+        // Another law is news: the client renders by the other one until a model names it.
         if !(is_due || is_left || is_other && !models.is_empty()) {
             return None;
         }
         self.told = Some(sample.clone());
         for (tool, model) in models {
             if let Some(foresight) = self.foresight.get_mut(&tool) {
-                foresight.deadband.send(&model, law);
+                foresight.deadband.send(&model, &law);
             }
             sample.tools.iter_mut().filter(|sample| sample.tool == tool).for_each(|sample| sample.local = Some(model));
         }
@@ -374,6 +374,7 @@ mod tests {
             stale: false,
             late: false,
             expired: false,
+            paused_until: None,
         };
         let deadband = Deadband { force_n: Some(0.1), force_fraction: Some(0.1), ..Deadband::default() };
         for (told_n, now_n, left) in [(0.0, 0.09, false), (0.0, 0.11, true), (10.0, 10.9, false), (10.0, 11.2, true)] {

@@ -198,8 +198,8 @@ pub trait Tissue: Send {
     /// finite.
     fn step(&mut self) -> Result<(), BlowUp>;
     /// After a blow-up: continues at step `step` (of the blow-up) from the state of the last checkpoint, or at rest if
-    /// that has passed no check, with all tools released and the model's own substep.
-    fn recover(&mut self, step: u64) -> Released;
+    /// `to_rest` or if that state has passed no check, with all tools released and the model's own substep.
+    fn recover(&mut self, step: u64, to_rest: bool) -> Released;
     /// The point at `index`.
     fn point(&self, index: usize) -> PointState;
     /// The energies. A pass over what is awake; sleeping tiles use cached values. Earlier calls do not affect the
@@ -523,8 +523,8 @@ impl<T: Real> Tissue for Sheet<T> {
         Ok(())
     }
 
-    fn recover(&mut self, step: u64) -> Released {
-        Sheet::recover(self, step)
+    fn recover(&mut self, step: u64, to_rest: bool) -> Released {
+        Sheet::recover(self, step, to_rest)
     }
 
     fn point(&self, index: usize) -> PointState {

@@ -17,10 +17,10 @@ use super::real::Real;
 use super::{Released, Sheet, rest};
 
 impl<T: Real> Sheet<T> {
-    /// Continues at step `step` from the state of the checkpoint, in which a blow-up has left the sheet, or at rest if
-    /// that state has passed no check.
-    pub(super) fn recover(&mut self, step: u64) -> Released {
-        let at_rest = self.checkpoint.as_ref().is_some_and(|checkpoint| !checkpoint.believed);
+    /// Continues at step `step` from the state of the checkpoint, in which a blow-up has left the sheet; or at rest, if
+    /// `to_rest` or if that state has passed no check.
+    pub(super) fn recover(&mut self, step: u64, to_rest: bool) -> Released {
+        let at_rest = to_rest || self.checkpoint.as_ref().is_some_and(|checkpoint| !checkpoint.believed);
         let pushing = self.applied.slots.iter().enumerate().filter(|(_, slot)| slot.push.is_some());
         let mut tools: Vec<usize> =
             pushing.map(|(tool, _)| tool).chain(self.prescribed.tools()).chain(self.contacts.tools()).collect();

@@ -71,14 +71,18 @@ pub fn from_law(message: &pb::ForceLaw) -> Result<Law> {
     if law.is_sound() { Ok(law) } else { Err(wrong()) }
 }
 
-/// The exact law that takes the place of a coarse one, with its number; or the reason and the message why there is none.
-pub fn law_update(coarse_number: u32, exact: std::result::Result<(u32, &Law), (&str, &str)>) -> pb::ForceLawUpdate {
-    match exact {
-        Ok((number, exact)) => {
-            pb::ForceLawUpdate { coarse_number, law: Some(law(exact, number)), ..Default::default() }
-        }
+/// The law that takes the place of law `before`, with its number; or the reason and the message why there is none.
+/// `tissue_step`: the step from whose beginning on another tissue acts, if that is the cause.
+pub fn law_update(
+    before: u32,
+    tissue_step: Option<u64>,
+    update: std::result::Result<(u32, &Law), (&str, &str)>,
+) -> pb::ForceLawUpdate {
+    let unchanged = pb::ForceLawUpdate { coarse_number: before, tissue_step, ..Default::default() };
+    match update {
+        Ok((number, newer)) => pb::ForceLawUpdate { law: Some(law(newer, number)), ..unchanged },
         Err((reason, message)) => {
-            pb::ForceLawUpdate { coarse_number, law: None, reason: reason.to_owned(), message: message.to_owned() }
+            pb::ForceLawUpdate { reason: reason.to_owned(), message: message.to_owned(), ..unchanged }
         }
     }
 }

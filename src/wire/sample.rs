@@ -84,6 +84,7 @@ fn tool_sample(tool: &ToolSample, due_ns: u64, now_ns: u64) -> pb::ToolSample {
         applied_force_n: contact.and_then(|contact| vector(contact.applied_force_n)),
         late: tool.late,
         expired: tool.expired,
+        paused_until_step: tool.paused_until,
         local_model: tool.local.as_ref().map(super::local::local_model),
         stale: tool.stale,
     }
@@ -195,6 +196,7 @@ pub fn session(live: &Arc<Live>) -> pb::Session {
         overrun_count: status.overrun_count,
         time_dilation: status.dilation.value,
         late_commands: status.late_commands,
+        paused_commands: status.paused_commands,
         hold_reason: status.hold_reason.unwrap_or_default(),
         held_tools,
         lapsed_leases,
@@ -223,14 +225,14 @@ pub fn session(live: &Arc<Live>) -> pb::Session {
 }
 
 fn recovery(recovery: Recovery) -> pb::Recovery {
-    let Recovery { step, state_of_step, at_rest, undone_commands, reason } = recovery;
-    pb::Recovery { step, state_of_step, undone_commands, reason, at_rest }
+    let Recovery { step, state_of_step, at_rest, undone_commands, paused_until_step, reason } = recovery;
+    pb::Recovery { step, state_of_step, undone_commands, reason, at_rest, paused_until_step }
 }
 
 /// A recovery of a session, as a record has it.
 pub fn from_recovery(recovery: pb::Recovery) -> Recovery {
-    let pb::Recovery { step, state_of_step, undone_commands, reason, at_rest } = recovery;
-    Recovery { step, state_of_step, at_rest, undone_commands, reason }
+    let pb::Recovery { step, state_of_step, undone_commands, reason, at_rest, paused_until_step } = recovery;
+    Recovery { step, state_of_step, at_rest, undone_commands, paused_until_step, reason }
 }
 
 /// The results of a session's audits; `None` before the first.

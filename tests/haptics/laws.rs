@@ -189,8 +189,60 @@ async fn a_law_beyond_the_bound_stays_coarse_and_says_so_once() {
             }
         }
         assert_eq!(updates.len(), 1, "{updates:?}");
-        let pb::ForceLawUpdate { coarse_number, law, reason, message } = updates.pop().unwrap();
+        let pb::ForceLawUpdate { coarse_number, law, reason, message, .. } = updates.pop().unwrap();
         assert_eq!((coarse_number, law, reason.as_str()), (0, None, "NOT_AVAILABLE"));
         assert!(message.contains("limits.law_work"), "{message}");
     }
+}
+
+#[tokio::test]
+async fn another_tissue_brings_its_law_which_models_then_name() {
+    let server = limited("");
+    let session = session(&server).await;
+    let mut touch = Touch::open(&server, with_device(&session, &[0])).await.unwrap();
+    let mut laws = vec![wire::local::from_law(&touch.opened.take().unwrap().law.unwrap()).unwrap()];
+    laws.push(touch.exact_law().await);
+    let mut lead = Lead { touch, begun: Instant::now(), sequence: 0 };
+    let request = pb::UpdateTissueRequest {
+        session_id: session.clone(),
+        stiffness_n_per_m: Some(20.0),
+        virtual_stiffness_n_per_m: Some(10.0),
+        ..Default::default()
+    };
+    let changed = server.sessions().await.update_tissue(request).await.unwrap().into_inner();
+    let mut named = [0_u32; 4];
+    tokio::time::timeout(10 * PATIENCE, async {
+        while named[3] < 20 {
+            lead.press(-0.002).await;
+            match lead.touch.hear().await.unwrap().unwrap() {
+                Heard::ForceLaw(update) => {
+                    let of_tissue = (laws.len() == 2).then_some(changed.step);
+                    assert_eq!((update.coarse_number, update.tissue_step), (laws.len() as u32 - 1, of_tissue));
+                    let law = update.law.unwrap();
+                    assert_eq!((law.number as usize, law.coarse), (laws.len(), of_tissue.is_some()));
+                    laws.push(wire::local::from_law(&law).unwrap());
+                }
+                Heard::Sample(sample) => {
+                    let Some(model) = sample.tools.first().and_then(|tool| tool.local_model.as_ref()) else { continue };
+                    let model = wire::local::from_local_model(model, sample.step);
+                    let law = laws.get(model.law as usize).expect("the law comes before the model that names it");
+                    if model.standing != Standing::Free {
+                        let repeated_n = Touching::at_sample(&model, law).force_n(&model, law, model.velocity_m_per_s);
+                        assert!((repeated_n - model.force_n).length() < 1e-6, "{repeated_n} beside {}", model.force_n);
+                    }
+                    named[model.law as usize] += 1;
+                }
+                _ => {}
+            }
+        }
+    })
+    .await
+    .unwrap_or_else(|_| panic!("models that named each law: {named:?}"));
+    assert_eq!(named[0], 0, "a law that was replaced");
+    // It is the law of the tissue as the session has it.
+    let scene = wire::scene::from_scene(&changed.session.unwrap().scene.unwrap()).unwrap();
+    assert_eq!((scene.springs.stiffness_n_per_m, scene.virtual_stiffness_n_per_m), (20.0, 10.0));
+    let exact = Law::of(&model(&scene), 0.005);
+    assert_eq!(laws[3], exact);
+    assert!(apart(&exact, &laws[1])[1] > 0.1, "the tissues hardly differ");
 }

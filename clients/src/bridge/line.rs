@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use glam::DVec3;
 use palpate::haptics::deadband::HEARTBEAT_S;
+use palpate::haptics::renderer::MOST_LAWS;
 use palpate::haptics::{Device, Law, LocalModel};
 use palpate::scene::script::Action;
 use palpate::scene::tip::Tip;
@@ -30,8 +31,8 @@ pub(crate) struct Shared {
 pub(crate) struct Inbound {
     /// The law of a new connection.
     pub(crate) law: Option<Law>,
-    /// A further law of the newest connection, and its number.
-    pub(crate) further: Option<(u32, Law)>,
+    /// Further laws of the newest connection, and their numbers, at most [`MOST_LAWS`].
+    pub(crate) further: Vec<(u32, Law)>,
     /// The middle of the sheet, m.
     pub(crate) middle_m: DVec3,
     /// Of the newest connection.
@@ -169,17 +170,22 @@ async fn connect(
                         let law = wire::local::from_law(law).map_err(|refusal| refusal.to_string())?;
                         let mut inbound = shared.inbound();
                         inbound.connections += 1;
-                        (inbound.law, inbound.further) = (Some(law), None);
+                        (inbound.law, inbound.further) = (Some(law), Vec::new());
                         (inbound.newest, inbound.middle_m) = (None, middle_m);
                     }
                     Some(Heard::ForceLaw(update)) => match update.law {
                         Some(message) => {
                             let law = wire::local::from_law(&message).map_err(|refusal| refusal.to_string())?;
-                            shared.inbound().further = Some((message.number, law));
+                            let further = &mut shared.inbound().further;
+                            if further.len() == MOST_LAWS {
+                                further.remove(0);
+                            }
+                            further.push((message.number, law));
                         }
                         None => {
                             let (message, reason) = (update.message, update.reason);
-                            crate::say!("palpate-client: the force law stays a coarse one: {message} ({reason})");
+                            let stays = if update.tissue_step.is_some() { "that of the old tissue" } else { "a coarse one" };
+                            crate::say!("palpate-client: the force law stays {stays}: {message} ({reason})");
                         }
                     },
                     Some(Heard::Sample(sample)) => {

@@ -140,7 +140,7 @@ fn tick(
         let mut force_n = DVec3::ZERO;
         let (law, further, model, middle_m) = {
             let mut inbound = shared.inbound();
-            (inbound.law.take(), inbound.further.take(), inbound.newest.take(), inbound.middle_m)
+            (inbound.law.take(), std::mem::take(&mut inbound.further), inbound.newest.take(), inbound.middle_m)
         };
         if let Some(law) = law {
             match &mut renderer {
@@ -154,8 +154,8 @@ fn tick(
                 renderer.envelope.reset();
                 renderer.envelope.enable();
             }
-            // Before the models that name it.
-            if let Some((number, law)) = further {
+            // Before the models that name them.
+            for (number, law) in further {
                 renderer.learn(number, law);
             }
             if let Some(model) = model {

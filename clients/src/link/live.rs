@@ -10,6 +10,7 @@ use super::network::Random;
 use super::run::{Outcome, Setup, TICK_S, Totals, fitting_scale};
 use super::task::Task;
 use super::tissue::{Tissue, Twin};
+use super::with_tissue;
 use crate::Failure;
 use crate::bridge;
 use crate::bridge::device::{Part, Simulated};
@@ -23,7 +24,7 @@ const LEAD_S: f64 = 3.0;
 pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failure> {
     let Setup { model, law, tip, hand, device, deadband, duration_s, seed, .. } = setup;
     let middle_m = (model.scene.sheet.extent_m() / 2.0).extend(0.0);
-    let scale = fitting_scale(setup, LEAD_S).map_err(Failure::Failed)?;
+    let scale = with_tissue(|| fitting_scale(setup, LEAD_S))?;
     let task = Task::new(middle_m, LEAD_S, *duration_s, scale, &mut Random::new(*seed, 0));
     let mut simulated = Simulated::new(*device, *hand, task, true);
     let target = Target {
@@ -37,14 +38,17 @@ pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failur
     };
     let lasts = Duration::from_secs_f64(*duration_s);
     let (mut served, shared) = bridge::run(&mut simulated, target, Some(lasts), true).await?;
-    let mut twin = Twin::new(Tissue::new(model, *tip, law.clone()));
     let mut totals = Totals::default();
-    for (step, part) in steps(simulated.course()).enumerate() {
-        let (true_n, touches) = twin.truth(part.place_m).map_err(Failure::Failed)?;
-        totals.moved(part.place_m);
-        #[allow(clippy::cast_precision_loss)]
-        totals.rendered((step + 1) as f64 * TICK_S, part.force_n, true_n, touches, None);
-    }
+    with_tissue(|| {
+        let mut twin = Twin::new(Tissue::new(model, *tip, law.clone()));
+        for (step, part) in steps(simulated.course()).enumerate() {
+            let (true_n, touches) = twin.truth(part.place_m)?;
+            totals.moved(part.place_m);
+            #[allow(clippy::cast_precision_loss)]
+            totals.rendered((step + 1) as f64 * TICK_S, part.force_n, true_n, touches, None);
+        }
+        Ok(())
+    })?;
     totals.ages_s.append(&mut served.ages_s);
     let mut outcome = totals.close();
     outcome.scale = scale;

@@ -17,6 +17,7 @@ use palpate::haptics::Law;
 use palpate::haptics::device::{DEVICES, Device, UNDECLARED};
 use palpate::haptics::hand::{HANDS, Hand};
 use palpate::limits::Limits;
+use palpate::memory;
 use palpate::refusal::{Reason, Refusal, number};
 use palpate::scene::tip::Tip;
 use palpate::scene::{BUILT_IN, Scene};
@@ -134,11 +135,10 @@ pub(crate) async fn link(arguments: &Arguments) -> Result<(), Failure> {
     if let Some(runs) = arguments.random {
         return random::print(arguments, runs);
     }
-    let refused = |refusal: Refusal| Failure::Refused(refusal.to_string());
-    let setup = setup(arguments).map_err(refused)?;
+    let setup = memory::attempt("--scene", || setup(arguments)).map_err(refused)?;
     let outcome = match &arguments.server {
         Some(server) => live::run(&setup, Server::new(server, &arguments.credentials)?).await?,
-        None => run(&setup).map_err(Failure::Failed)?,
+        None => with_tissue(|| run(&setup))?,
     };
     if let Some(path) = &arguments.course {
         let mut text = "time_s,depth_m,rendered_n,true_n\n".to_owned();
@@ -156,6 +156,18 @@ pub(crate) async fn link(arguments: &Arguments) -> Result<(), Failure> {
         }
     }
     Ok(())
+}
+
+fn refused(refusal: Refusal) -> Failure {
+    Failure::Refused(refusal.to_string())
+}
+
+/// Does something with a tissue.
+///
+/// # Errors
+/// Returns an error if the system has no memory for the tissue (exit status 2), or if the guard stops it (1).
+fn with_tissue<T>(work: impl FnOnce() -> Result<T, String>) -> Result<T, Failure> {
+    memory::attempt("--scene", || Ok(work())).map_err(refused)?.map_err(Failure::Failed)
 }
 
 /// The value found for a name, or an error that lists the names.

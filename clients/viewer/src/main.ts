@@ -118,8 +118,18 @@ async function show(session: Session, isNew: boolean): Promise<void> {
 function wellText(session: Session): string {
   const name = session.scene?.name ?? "";
   if (session.state === SessionState.HELD) return `The session is held: ${session.holdReason}`;
-  if (session.state === SessionState.PAUSED) return `Connected to a session of ${name}, which is paused.`;
-  return `Connected to a session of ${name}.`;
+  const paused = session.state === SessionState.PAUSED ? ", which is paused" : "";
+  return `Connected to a session of ${name}${paused}.${recoveredText(session)}`;
+}
+
+/** How often the tissue recovered and why it did the last time; nothing if it never did. */
+function recoveredText({ recoveryCount, recoveries }: Session): string {
+  const newest = recoveries.at(-1);
+  if (!newest) return "";
+  const times = recoveryCount === 1n ? "once" : `${recoveryCount} times`;
+  const end = newest.pausedUntilStep;
+  const pause = end === undefined ? "" : ` Tools that acted are paused until step ${end}.`;
+  return ` The tissue recovered ${times}, the last time because after step ${newest.step} ${newest.reason}.${pause}`;
 }
 
 function trouble(failure: Failure, waitMs: number): void {

@@ -1,11 +1,11 @@
 // The page in a real browser at a real server: `make test-viewer`.
 
 import assert from "node:assert/strict";
-import { mkdtempSync, writeFileSync } from "node:fs";
+import { mkdtempSync, readFileSync, writeFileSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { after, before, describe, test } from "node:test";
-import { launch, makeToken, Page, pageProcesses, Server } from "./harness.mjs";
+import { launch, makeToken, Page, pageProcesses, ROOT, Server } from "./harness.mjs";
 
 /** @type {import("playwright-core").Browser} */
 let browser;
@@ -156,6 +156,23 @@ describe("the page", () => {
     await page.until(({ largestM, forceN }) => largestM < 0.01 && forceN.length === 0);
     assert.deepEqual(page.complaints, []);
     await close(page);
+  });
+
+  test("says that the tissue recovered, how often and why", async () => {
+    const folder = mkdtempSync(join(tmpdir(), "palpate-"));
+    const config = join(folder, "config.toml");
+    // Nobody has to wait for the error of a scene whose every push fails.
+    writeFileSync(config, "[limits]\nrehearsal_work = 1\n");
+    const paper = readFileSync(join(ROOT, "scenes/paper.toml"), "utf8");
+    const stiff = paper.replace("stiffness_n_per_m = 10.0", "stiffness_n_per_m = 1e9");
+    writeFileSync(join(folder, "stiff.toml"), `${stiff}\n[stepping]\nsubsteps = 1\n`);
+    const failing = await Server.start(["--config", config, "--scenes", folder]);
+    const page = await open(`${failing.url}/?scene=stiff`);
+    await page.press();
+    await page.says("connection", /Connected to a session of .*The tissue recovered (once|\d+ times), .* because after step \d+ /);
+    await page.page.mouse.up();
+    await close(page);
+    assert.equal(await failing.stop(), 0);
   });
 
   test("shows the server a token from behind the address, and keeps it out of that", async () => {
