@@ -224,13 +224,6 @@ pub enum Integrator {
     Exponential4,
 }
 
-impl Integrator {
-    /// Whether it is one of the exponential multistep schemes.
-    pub fn is_exponential(self) -> bool {
-        matches!(self, Integrator::Exponential2 | Integrator::Exponential3 | Integrator::Exponential4)
-    }
-}
-
 impl Named for Integrator {
     const NAMES: &'static [(&'static str, Self)] = &[
         ("auto", Integrator::Auto),
