@@ -12,11 +12,15 @@
 //! stamp their commands get the same bits whichever network was faster. A second tool that grasps a point takes it over.
 
 pub mod audit;
+pub mod batch;
 pub mod check;
 pub mod command;
+pub mod intake;
 pub mod laws;
+pub mod lease;
 pub mod local;
 pub mod recovery;
+pub mod rules;
 pub mod run;
 pub mod sampling;
 pub mod schedule;
@@ -28,14 +32,15 @@ use glam::DVec3;
 use crate::haptics::LocalModel;
 use crate::haptics::path::{Path, Play};
 use crate::memory;
+use crate::scene::check::nearest_point;
 use crate::scene::law::{ForceLaw, MoveLaw};
-use crate::scene::record::{EnergyJ, Point, Record};
-use crate::scene::script::{Action, nearest_point};
+use crate::scene::record::{EnergyJ, Point, Record, Recovery};
+use crate::scene::script::Action;
 use crate::scene::tip::Tip;
 use crate::sheet::audit::{Inputs, Mark};
-use crate::sheet::{self, Energy, Feel, Grasp, Model, PointState, Push, Still, Tissue};
+use crate::sheet::{self, BlowUp, Energy, Feel, Grasp, Model, PointState, Push, Still, Tissue};
 use command::Due;
-use recovery::{Recovered, Recoveries};
+use recovery::{Ended, MOST, Recovered, Recoveries, WINDOW_STEPS, describe};
 
 /// The name of a record in messages.
 const RECORD: &str = "a record";
@@ -246,6 +251,50 @@ impl Session {
         }
         self.recoveries.believe(self.tissue.checkpoint_step());
         observe(self);
+    }
+
+    /// The recoveries so far.
+    pub fn recoveries(&self) -> &Recoveries {
+        &self.recoveries
+    }
+
+    /// Why the tissue is not what the commands have made of it: the guard has ended the session, or there was a recovery.
+    pub fn fault(&self) -> Option<String> {
+        let recovered = || self.recoveries.newest().map(|newest| describe(&newest.recovery));
+        self.hold_reason().map(str::to_owned).or_else(recovered)
+    }
+
+    /// Recovers from a blow-up if there were not too many of late. Otherwise the session is held, and the result is
+    /// false.
+    fn recover(&mut self, blow_up: BlowUp) -> bool {
+        let (step, state_of_step) = (blow_up.step, self.step_count());
+        if !self.recoveries.may_recover(step) {
+            self.hold(format!(
+                "after step {step} {}; shorter substeps did not help, and {MOST} recoveries within {WINDOW_STEPS} steps \
+                 were not enough; the state is that of step {state_of_step}",
+                blow_up.cause
+            ));
+            return false;
+        }
+        let released = self.tissue.recover(step);
+        // All that took effect since the checkpoint: `believe` has forgotten the others.
+        self.recoveries.believe(state_of_step);
+        let mut tools = Vec::new();
+        for (index, tool) in self.tools.iter_mut().enumerate() {
+            let undone_commands = self.recoveries.acts_of(index);
+            let acted = undone_commands > 0 || released.tools.binary_search(&index).is_ok() || tool.led.is_some();
+            (tool.led, tool.expires_at) = (None, None);
+            tool.expired |= acted;
+            if acted {
+                #[allow(clippy::cast_possible_truncation)]
+                tools.push(Ended { tool: index as u32, sequence: tool.acknowledged_sequence, undone_commands });
+            }
+        }
+        let undone_commands = tools.iter().map(|ended| ended.undone_commands).sum();
+        let (at_rest, reason) = (released.at_rest, blow_up.cause.to_string());
+        let recovery = Recovery { step, state_of_step, at_rest, undone_commands, reason };
+        self.recoveries.add(Recovered { recovery, tools });
+        true
     }
 
     /// Plays the paths of the tools that have one.

@@ -12,9 +12,7 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use super::Session;
 use crate::scene::record::Recovery;
-use crate::sheet::BlowUp;
 
 /// Most recoveries within [`WINDOW_STEPS`].
 pub const MOST: usize = 4;
@@ -91,66 +89,25 @@ impl Recoveries {
         }
     }
 
+    /// Commands of a tool since the guard's checkpoint.
+    pub(super) fn acts_of(&self, tool: usize) -> u64 {
+        self.acts.iter().filter(|acts| acts.tool as usize == tool).map(|acts| acts.count).sum()
+    }
+
     /// Whether a blow-up at `step` may be recovered from.
-    fn may_recover(&self, step: u64) -> bool {
+    pub(super) fn may_recover(&self, step: u64) -> bool {
         let oldest = self.newest.front().filter(|_| self.newest.len() == MOST);
         oldest.is_none_or(|oldest| step - oldest.recovery.step >= WINDOW_STEPS)
     }
 
-    fn add(&mut self, recovered: Recovered) {
+    /// Counts a recovery, and forgets the commands that it has undone.
+    pub(super) fn add(&mut self, recovered: Recovered) {
         self.count += 1;
         if self.newest.len() == MOST {
             self.newest.pop_front();
         }
         self.newest.push_back(Arc::new(recovered));
         self.acts.clear();
-    }
-}
-
-impl Session {
-    /// The recoveries so far.
-    pub fn recoveries(&self) -> &Recoveries {
-        &self.recoveries
-    }
-
-    /// Why the tissue is not what the commands have made of it: the guard has ended the session, or there was a recovery.
-    pub fn fault(&self) -> Option<String> {
-        let recovered = || self.recoveries.newest().map(|newest| describe(&newest.recovery));
-        self.hold_reason().map(str::to_owned).or_else(recovered)
-    }
-
-    /// Recovers from a blow-up if there were not too many of late. Otherwise the session is held, and the result is
-    /// false.
-    pub(super) fn recover(&mut self, blow_up: BlowUp) -> bool {
-        let (step, state_of_step) = (blow_up.step, self.step_count());
-        if !self.recoveries.may_recover(step) {
-            self.hold(format!(
-                "after step {step} {}; shorter substeps did not help, and {MOST} recoveries within {WINDOW_STEPS} steps \
-                 were not enough; the state is that of step {state_of_step}",
-                blow_up.cause
-            ));
-            return false;
-        }
-        let released = self.tissue.recover(step);
-        // All that took effect since the checkpoint: `believe` has forgotten the others.
-        self.recoveries.believe(state_of_step);
-        let mut tools = Vec::new();
-        for (index, tool) in self.tools.iter_mut().enumerate() {
-            let acts = self.recoveries.acts.iter().filter(|acts| acts.tool as usize == index);
-            let undone_commands = acts.map(|acts| acts.count).sum();
-            let acted = undone_commands > 0 || released.tools.binary_search(&index).is_ok() || tool.led.is_some();
-            (tool.led, tool.expires_at) = (None, None);
-            tool.expired |= acted;
-            if acted {
-                #[allow(clippy::cast_possible_truncation)]
-                tools.push(Ended { tool: index as u32, sequence: tool.acknowledged_sequence, undone_commands });
-            }
-        }
-        let undone_commands = tools.iter().map(|ended| ended.undone_commands).sum();
-        let (at_rest, reason) = (released.at_rest, blow_up.cause.to_string());
-        let recovery = Recovery { step, state_of_step, at_rest, undone_commands, reason };
-        self.recoveries.add(Recovered { recovery, tools });
-        true
     }
 }
 
