@@ -7,10 +7,12 @@
 
 pub mod budget;
 pub mod haptics;
+mod ids;
 pub mod limits;
 mod lock;
 pub mod memory;
 pub mod pace;
+mod priority;
 pub mod refusal;
 pub mod render;
 pub mod scene;

@@ -99,6 +99,9 @@ pub(crate) fn refusal_of(panic: &(dyn Any + Send)) -> Option<&Refusal> {
 }
 
 /// Does something. If there is no memory for it, refuses in the name of `field`; another panic goes on.
+///
+/// # Errors
+/// Refuses as `work` does, and if there is no memory for it.
 pub fn attempt<T>(field: &str, work: impl FnOnce() -> Result<T>) -> Result<T> {
     catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|panic| match panic.downcast::<Refusal>() {
         Ok(refusal) => Err(refusal.within(field)),

@@ -1,5 +1,5 @@
-//! An input that was refused: one type for files, commands and requests, so that each is refused in the
-//! same words wherever it enters.
+//! The refusal of an input: one type for files, commands and requests. So an input is refused in the same words wherever
+//! it enters.
 
 use std::fmt;
 
@@ -139,7 +139,10 @@ impl fmt::Display for Refusal {
 
 impl std::error::Error for Refusal {}
 
-/// `value`, if it is finite and `holds` says so; `range` says in words what does.
+/// `value`, if it is finite and `holds` is true for it; `range` describes those values.
+///
+/// # Errors
+/// Refuses a number that is not finite, or for which `holds` is false.
 pub fn number(field: &str, value: f64, range: &str, holds: impl Fn(f64) -> bool) -> Result<f64> {
     if !value.is_finite() {
         return Err(Refusal::new(Reason::NotFinite, field, format!("must be a finite number, but is {value}")));
@@ -151,21 +154,33 @@ pub fn number(field: &str, value: f64, range: &str, holds: impl Fn(f64) -> bool)
 }
 
 /// `value` if it is finite.
+///
+/// # Errors
+/// Refuses infinity and NaN.
 pub fn finite(field: &str, value: f64) -> Result<f64> {
     number(field, value, "finite", |_| true)
 }
 
 /// `value` if it is finite and above 0.
+///
+/// # Errors
+/// Refuses a number that is not finite, 0 or below.
 pub fn positive(field: &str, value: f64) -> Result<f64> {
     number(field, value, "above 0", |v| v > 0.0)
 }
 
 /// `value` if it is finite and 0 or more.
+///
+/// # Errors
+/// Refuses a number that is not finite or below 0.
 pub fn not_negative(field: &str, value: f64) -> Result<f64> {
     number(field, value, "0 or more", |v| v >= 0.0)
 }
 
 /// `value` if its three components are finite.
+///
+/// # Errors
+/// Refuses a vector with a component that is not finite.
 pub fn finite_vector(field: &str, value: glam::DVec3) -> Result<glam::DVec3> {
     for component in value.to_array() {
         finite(field, component)?;
@@ -173,7 +188,10 @@ pub fn finite_vector(field: &str, value: glam::DVec3) -> Result<glam::DVec3> {
     Ok(value)
 }
 
-/// What people read: short, and on one line.
+/// Checks a text for people: it is short, and on one line.
+///
+/// # Errors
+/// Refuses a text that is too long or has control characters.
 pub fn label(field: &str, label: &str) -> Result<()> {
     const MOST_BYTES: usize = 128;
     if label.len() > MOST_BYTES || label.chars().any(char::is_control) {
@@ -181,6 +199,11 @@ pub fn label(field: &str, label: &str) -> Result<()> {
         return Err(Refusal::new(Reason::OutOfRange, field, message));
     }
     Ok(())
+}
+
+/// The beginning of what a client sent: a message is no place for megabytes.
+pub fn excerpt(text: &str) -> String {
+    text.chars().take(64).collect()
 }
 
 #[cfg(test)]

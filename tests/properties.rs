@@ -13,7 +13,8 @@ use palpate::scene::law::Poke;
 use palpate::scene::script::{Action, Script};
 use palpate::scene::{PAPER, Scene};
 use palpate::session::Session;
-use palpate::session::command::{Command, Intake};
+use palpate::session::command::Command;
+use palpate::session::intake::Intake;
 use proptest::prelude::*;
 
 const SCRIPT: &str = include_str!("../scripts/oblique-60.toml");

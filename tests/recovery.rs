@@ -9,7 +9,8 @@ use palpate::scene::law::Poke;
 use palpate::scene::script::Action;
 use palpate::scene::{Change, PAPER, Scene};
 use palpate::session::Session;
-use palpate::session::command::{Command, Intake};
+use palpate::session::command::Command;
+use palpate::session::intake::Intake;
 use palpate::session::recovery::{MOST, WINDOW_STEPS};
 use palpate::sheet::Model;
 

@@ -23,7 +23,7 @@ use palpate::scene::{PAPER, Scene};
 use palpate::server::config::Config;
 use palpate::server::identity::{self, Credentials, Role};
 use palpate::session::Session;
-use palpate::session::command::Intake;
+use palpate::session::intake::Intake;
 use palpate::session::sampling::Sampler;
 use palpate::sheet::Model;
 use palpate::surface::Refinement;

@@ -58,6 +58,9 @@ pub fn give_back_to_the_system() {
 }
 
 /// Bytes as people write them: `512MiB`, `2GiB`, `1048576`.
+///
+/// # Errors
+/// Returns a message if the text is not a number of bytes.
 pub fn parse_bytes(text: &str) -> Result<u64, String> {
     const UNITS: [(&str, u32); 5] = [("KiB", 10), ("MiB", 20), ("GiB", 30), ("TiB", 40), ("", 0)];
     let number = UNITS.iter().find_map(|(unit, shift)| Some((text.strip_suffix(unit)?, *shift)));

@@ -308,6 +308,9 @@ impl Account {
     }
 
     /// Takes so much of something, until what this returns is dropped. `field` is named by a refusal.
+    ///
+    /// # Errors
+    /// Refuses what is beyond the part of the account or of all, and memory that the system does not have.
     pub fn take(&self, resource: Resource, amount: u64, field: &str) -> Result<Taken> {
         let mut taken = Taken { account: self.clone(), resource, amount: 0 };
         taken.grow_to(amount, field)?;
@@ -356,6 +359,9 @@ impl Taken {
 
     /// Takes more, so that it is `amount`; or is as it was, and tells why. Of memory that is laid out the system must
     /// have as much.
+    ///
+    /// # Errors
+    /// As for [`Account::take`].
     pub fn grow_to(&mut self, amount: u64, field: &str) -> Result<()> {
         let more = amount.saturating_sub(self.amount);
         if more == 0 {

@@ -1,31 +1,36 @@
-//! Who is let in: sessions as they are made, started and changed, by what their steps will take.
+//! Admission: sessions are created, started and changed if their thread has time for their steps.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
 
 use tokio::sync::watch;
 
-use super::auditor::Audited;
+use super::audited::Audited;
 use super::clock::{Dilation, now_ns};
 use super::cost::{Cost, check_asked, check_work};
-use super::inbox::Request;
 use super::laws::KeptLaws;
-use super::streams::Streams;
-use super::thread::{Running, beat_ns};
-use super::{Live, Pacer, State, Status, random_id};
+use super::live::Live;
+use super::pacer::Pacer;
+use super::places::Places;
+use super::running::{Running, beat_ns};
+use super::status::{State, Status};
 use crate::budget::{Account, Purpose, Resource};
+use crate::ids::random_id;
 use crate::lock::lock;
 use crate::memory;
 use crate::refusal::{Reason, Refusal, Result, number};
 use crate::scene::{Change, Scene};
-use crate::session::command::Intake;
+use crate::session::intake::Intake;
 use crate::session::schedule::Schedule;
 use crate::sheet::{Model, choice};
 
 impl Pacer {
     /// Makes a session for `owner`, unless `stop` is set before it is there.
+    ///
+    /// # Errors
+    /// Refuses a scene that is not valid or whose steps are too heavy, memory and sessions beyond the caller's part, a thread
+    /// that has no time left, and when `stop` is set.
     pub fn create(
         &self,
         scene: &Scene,
@@ -69,7 +74,7 @@ impl Pacer {
             model: model.clone(),
         };
         let (cost, thread) = self.place(&model, paused, owner)?;
-        let inbox = self.inboxes[thread].clone();
+        let stepper = &self.steppers[thread];
         let live = Arc::new(Live {
             id: id.clone(),
             intake: Mutex::new(Intake::new(&model.scene, &self.limits).charged_to(owner)),
@@ -79,7 +84,7 @@ impl Pacer {
             number,
             limits: self.limits.clone(),
             status: Mutex::new(status),
-            streams: Mutex::new(Streams::new(&self.limits)),
+            streams: Mutex::new(Places::new(&self.limits)),
             refused: AtomicU64::new(0),
             laws: KeptLaws::default(),
             tissue: watch::Sender::new((0, model.clone())),
@@ -87,7 +92,7 @@ impl Pacer {
             model,
             cost,
             thread,
-            inbox: inbox.clone(),
+            inbox: stepper.inbox.clone(),
             _taken: [slot, memory],
         });
         // Laid out before the lock is taken, on which all calls wait.
@@ -103,7 +108,7 @@ impl Pacer {
         }
         sessions.insert(id, live.clone());
         // Before anybody can name the session: what is asked of it comes after this.
-        inbox.send(number, Request::Adopt(running));
+        stepper.adopt(number, running);
         Ok(live)
     }
 
@@ -118,7 +123,7 @@ impl Pacer {
     fn place(&self, model: &Model, paused: bool, owner: &Account) -> Result<(Cost, usize)> {
         let sessions = lock(&self.sessions);
         let cost = Cost::guess(model, sessions.values().map(|live| &live.cost));
-        let mut taken = vec![(0.0, 0_usize); self.inboxes.len()];
+        let mut taken = vec![(0.0, 0_usize); self.steppers.len()];
         for live in sessions.values() {
             taken[live.thread].0 += live.cost.share();
             taken[live.thread].1 += 1;
@@ -134,6 +139,9 @@ impl Pacer {
     }
 
     /// Another tissue for a session ([`Live::change`]), unless its steps would make others late.
+    ///
+    /// # Errors
+    /// As for [`Live::change`]; and refuses if the steps would make other sessions late.
     pub fn change_tissue(
         &self,
         live: &Live,
@@ -176,6 +184,9 @@ impl Pacer {
     }
 
     /// Lets a session's time go on ([`Live::start`]), unless that would make others late.
+    ///
+    /// # Errors
+    /// As for [`Live::start`]; and refuses if the steps would make other sessions late.
     pub async fn start_session(&self, live: &Live, until: Option<u64>) -> Result<u64> {
         if lock(&live.status).state == State::Paused {
             self.check_share(self.taken_by_others(live), live.cost.awake_share())?;

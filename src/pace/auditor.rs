@@ -14,18 +14,19 @@ use std::sync::mpsc::{Receiver, sync_channel};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::Duration;
 
+use super::audited::AuditTally;
 use super::clock::{now_ns, thread_time_ns};
+use super::cost::check_work;
 use super::inbox::Request;
-use super::tally::Count;
-use super::{Live, check_work};
+use super::live::Live;
 use crate::budget::{Purpose, Resource};
 use crate::lock::lock;
 use crate::memory;
-use crate::refusal::{Refusal, Result};
+use crate::refusal::Result;
 use crate::scene::Named;
-use crate::scene::record::{AuditedError, Correction};
+use crate::scene::record::Correction;
 use crate::sheet::Model;
-use crate::sheet::audit::{Audit, Extent, FINER, Finding, Inputs, Mark, Origin};
+use crate::sheet::audit::{Audit, FINER, Finding, Inputs, Mark, Origin};
 use crate::sheet::guard::INTERVAL_SUBSTEPS;
 
 /// How long to wait where no session is awake.
@@ -36,42 +37,6 @@ const PATIENCE: f64 = 2.0;
 
 /// Between two warnings about one session, ns.
 const WARN_EVERY_NS: u64 = 10_000_000_000;
-
-/// What audits have found of a session.
-#[derive(Debug, Clone, Default)]
-pub struct Audited {
-    /// Windows that were audited.
-    pub windows: u64,
-    /// The steps done at the end of the newest window, and the error that it added.
-    pub newest: Option<(u64, AuditedError)>,
-    /// The largest of each part in any window.
-    pub largest: AuditedError,
-    /// Windows whose error was above the tolerance.
-    pub above: u64,
-    /// Where most of the newest of those errors came from.
-    pub origin: Option<Origin>,
-    /// How often the tissue was corrected.
-    pub corrections: u64,
-    /// The newest of these.
-    pub correction: Option<Correction>,
-    /// Why the newest correction that was needed could not be made.
-    pub refused_correction: Option<Refusal>,
-    extent: Extent,
-    warned_ns: Option<u64>,
-}
-
-/// What the auditor counts, of all sessions, since it began.
-#[derive(Debug, Default)]
-pub struct AuditTally {
-    /// Windows that were audited.
-    pub windows: Count,
-    /// Windows whose error was above the tolerance.
-    pub above: Count,
-    /// Corrections.
-    pub corrections: Count,
-    /// Processor time, ns.
-    pub busy_ns: Count,
-}
 
 /// All sessions of a server.
 pub(super) type Sessions = Arc<Mutex<BTreeMap<String, Arc<Live>>>>;

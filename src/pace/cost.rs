@@ -1,4 +1,4 @@
-//! What steps take, and who bears it when a thread has not enough time for all.
+//! What the steps of a session cost: estimated before it begins, then measured; and the largest step that is allowed.
 //!
 //! A new session's step is estimated from its points and substeps and from what awake sessions take for theirs. Sessions at rest
 //! do not count: a thousand of them are a valid use, and `limits.sessions` bounds them.
@@ -110,34 +110,6 @@ fn check_step(points: usize, substeps: u32, step_s: f64, rate_hz: f64, limits: &
     Ok(())
 }
 
-/// The longest step that a thread did of late: so much anybody may be late through no fault of its own.
-#[derive(Debug, Default)]
-pub(super) struct Longest {
-    /// Of this window, and of the last.
-    now_ns: u64,
-    before_ns: u64,
-    since_ns: u64,
-}
-
-/// Of the windows.
-const WINDOW_NS: u64 = 250_000_000;
-
-/// No step is forgiven more than this.
-const MOST_NS: u64 = 100_000_000;
-
-impl Longest {
-    pub(super) fn observe(&mut self, now_ns: u64, took_ns: u64) {
-        if now_ns.saturating_sub(self.since_ns) > WINDOW_NS {
-            (self.before_ns, self.now_ns, self.since_ns) = (self.now_ns, 0, now_ns);
-        }
-        self.now_ns = self.now_ns.max(took_ns.min(MOST_NS));
-    }
-
-    pub(super) fn ns(&self) -> u64 {
-        self.now_ns.max(self.before_ns)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -160,19 +132,5 @@ mod tests {
         assert!(small.awake_share() < 0.012);
         small.set_awake(false);
         assert_eq!(small.share(), 0.0);
-    }
-
-    #[test]
-    fn a_long_step_is_forgiven_for_a_while_and_within_reason() {
-        let mut longest = Longest::default();
-        longest.observe(1, 5_000_000);
-        longest.observe(2, 1000);
-        assert_eq!(longest.ns(), 5_000_000);
-        longest.observe(3, 10_000_000_000);
-        assert_eq!(longest.ns(), MOST_NS);
-        for window in 1..4 {
-            longest.observe(window * (WINDOW_NS + 1) + 3, 1000);
-        }
-        assert_eq!(longest.ns(), 1000);
     }
 }

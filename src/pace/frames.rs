@@ -1,5 +1,5 @@
-//! Frames, off the stepping threads: a thread that refines and encodes the newest snapshot of each session, once
-//! for all viewers that ask for the same, and hands it to those that have credit.
+//! Frames of viewers: a thread refines and encodes the newest snapshot of each session.
+//! A frame is encoded once for all viewers that ask for the same, and goes to those that have credit.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
@@ -77,6 +77,9 @@ fn moment_bytes(refinement: Refinement) -> usize {
 
 impl Viewer {
     /// A viewer, and where it reads its frames. Their memory is charged to `account`.
+    ///
+    /// # Errors
+    /// Refuses memory beyond the part of `account`.
     #[allow(clippy::too_many_arguments)]
     pub fn new(
         id: String,
@@ -388,6 +391,9 @@ fn serve(session: u64, job: &Job, spent: &mut Spent, watched: &mut Watched) {
         viewer.deliver(job, *frame_id, frame, None);
     }
 }
+
+/// Frames as a stream reads them.
+pub type FrameReader = Reader<Delivery>;
 
 #[cfg(test)]
 mod tests {

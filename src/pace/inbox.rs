@@ -9,9 +9,9 @@ use tokio::sync::oneshot;
 
 use super::clock::now_ns;
 use super::frames::Viewer;
+use super::reading::HashReply;
 use super::tally::Tally;
-use super::taps::{HashReply, ProbeTap, SampleTap};
-use super::thread::Running;
+use super::taps::{ProbeTap, SampleTap};
 use crate::budget::Account;
 use crate::lock::lock;
 use crate::refusal::{Refusal, Result};
@@ -19,7 +19,8 @@ use crate::sheet::audit::{Inputs, Mark};
 
 /// What a stepping thread is asked for.
 pub(super) enum Request {
-    Adopt(Box<Running>),
+    /// New sessions wait for the thread.
+    Adopt,
     Start {
         until: Option<u64>,
         reply: oneshot::Sender<Result<u64>>,

@@ -131,6 +131,9 @@ impl<T> Drop for Writer<T> {
 
 impl<T> Reader<T> {
     /// The oldest item, and how many were dropped so far; the reason when there are no more.
+    ///
+    /// # Errors
+    /// Returns the reason when no more items will come.
     pub async fn pop(&mut self) -> Result<(T, u64), Refusal> {
         poll_fn(|context| self.poll_pop(context)).await
     }

@@ -6,9 +6,10 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
 
+use tokio::sync::oneshot;
+
+use super::paced::{PacedRecord, Recorded};
 use super::queue::Writer;
-use super::taps::HashReply;
-use super::{PacedRecord, Recorded};
 use crate::budget::{Account, Purpose, Resource, Taken, Turns};
 use crate::lock::lock;
 use crate::memory;
@@ -66,6 +67,9 @@ impl Copies {
 
 /// The step and the hash of the state that was hashed last.
 pub(super) type Hashed = Arc<Mutex<Option<(u64, u128)>>>;
+
+/// Who waits for the step and the hash of a state.
+pub(super) type HashReply = oneshot::Sender<Result<(u64, u128)>>;
 
 /// Who gets a record, and how many are on their way there.
 #[derive(Debug)]

@@ -1,46 +1,16 @@
-//! The streams of a session: how many there may be, whose they are, and how one is cut.
+//! The streams of a session: how one is opened, shown to administrators, and cut.
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use tokio_util::sync::CancellationToken;
 
-use super::Live;
 use super::clock::now_ns;
-use crate::budget::{Account, Pool, Purpose, Resource, Taken};
-use crate::limits::Limits;
+use super::live::Live;
+use super::places::{Held, Open, Places};
+use crate::budget::{Account, Purpose, Resource};
 use crate::lock::lock;
 use crate::refusal::{Reason, Refusal, Result};
-
-/// What a stream is for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Held {
-    /// It holds tools: some places of a session are kept for such.
-    Tools,
-    /// It only reads.
-    Nothing,
-}
-
-/// Those of one session.
-#[derive(Debug)]
-pub(super) struct Streams {
-    most: usize,
-    numbers: u64,
-    open: BTreeMap<u64, Open>,
-    /// Places of those that only read, by who reads.
-    readers: Pool,
-}
-
-#[derive(Debug)]
-struct Open {
-    what: &'static str,
-    held: Held,
-    account: Account,
-    since_ns: u64,
-    cut: CancellationToken,
-    _taken: [Taken; 2],
-}
 
 /// Bytes of a stream that the client has not taken: the transport (hyper) asks for no more above 400 KiB, and then holds at most one
 /// more message, which is of 64 KiB or little more.
@@ -59,22 +29,6 @@ pub struct Shown {
     pub caller: String,
     /// For how long it has been open, ns.
     pub age_ns: u64,
-}
-
-impl Streams {
-    pub(super) fn new(limits: &Limits) -> Self {
-        let most = limits.streams_per_session;
-        let readers = most - limits.streams_for_holders.min(most / 8);
-        Streams { most, numbers: 0, open: BTreeMap::new(), readers: Pool::new(readers as u64, 16) }
-    }
-
-    fn close(&mut self, number: u64) -> Option<Open> {
-        let open = self.open.remove(&number)?;
-        if open.held == Held::Nothing {
-            self.readers.give_back(open.account.number(), 1);
-        }
-        Some(open)
-    }
 }
 
 /// Counts a stream of a session until it is dropped or cut.
@@ -105,13 +59,16 @@ pub fn cut() -> Refusal {
 
 impl Live {
     /// Room for one more stream of `account`, opened by the call `what`.
+    ///
+    /// # Errors
+    /// Refuses if all places of the session or of the caller are taken, or memory beyond the caller's part.
     pub fn open_stream(self: &Arc<Self>, what: &'static str, held: Held, account: &Account) -> Result<StreamGuard> {
         let stream = account.take(Resource::Streams, 1, "")?;
         let _taken = [stream, account.take(Resource::Memory(Purpose::Connections), UNSENT_BYTES, "")?];
         let mut streams = lock(&self.streams);
         let all = streams.open.len();
         if all >= streams.most || held == Held::Nothing && !streams.readers.take(account.number(), 1) {
-            let Streams { most, readers, .. } = &*streams;
+            let Places { most, readers, .. } = &*streams;
             let message = format!(
                 "the session has {all} streams of {most} already, {} of those that only read are this caller's; the others \
                  are kept for other callers and for those who hold tools",
@@ -161,6 +118,7 @@ impl Live {
 mod tests {
     use super::*;
     use crate::budget::Budget;
+    use crate::limits::Limits;
     use crate::pace::Pacer;
     use crate::scene::{PAPER, Scene};
     use crate::sheet::choice::NEVER;

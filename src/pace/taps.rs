@@ -1,23 +1,18 @@
-//! Who wants to know of a session's steps, and of which.
+//! Taps: who gets samples, records, frames and hashes of a session, and at which steps.
 
 use std::sync::Arc;
 
-use tokio::sync::oneshot;
-
 use super::clock::now_ns;
 use super::frames::Viewer;
+use super::paced::{PacedRecord, PacedSample, Recorded};
 use super::queue::{Wakes, Writer};
-use super::reading::{Copied, Copies, Piece, Reading, Recipient, is_much};
-use super::{PacedRecord, PacedSample, Recorded};
+use super::reading::{Copied, Copies, HashReply, Piece, Reading, Recipient, is_much};
 use crate::budget::{Account, Purpose, Resource, Taken, Work};
 use crate::memory;
 use crate::refusal::Result;
 use crate::scene::record::{Point, Record};
 use crate::session::Session;
 use crate::session::sampling::Sampler;
-
-/// Who waits for the step and the hash of a state.
-pub(super) type HashReply = oneshot::Sender<Result<(u64, u128)>>;
 
 /// A stream of samples.
 pub(super) struct SampleTap {

@@ -1,6 +1,13 @@
+//! Tests that a fault ends one session alone.
+#![allow(clippy::unwrap_used)]
+
+use super::inbox::Request;
 use super::*;
 use crate::budget::{Account, Budget};
+use crate::limits::Limits;
+use crate::refusal::Reason;
 use crate::scene::{PAPER, Scene};
+use crate::session::sampling::Sampling;
 use crate::sheet::choice::NEVER;
 
 #[tokio::test]

@@ -4,11 +4,12 @@ use std::collections::VecDeque;
 use std::io::Write;
 use std::sync::Arc;
 
-use super::{Arrow, View, picture};
+use super::picture::{Arrow, View, picture};
 use crate::limits::Limits;
 use crate::refusal::Refusal;
+use crate::scene::check::nearest_point;
 use crate::scene::law::{Moment, Poke};
-use crate::scene::script::{Script, nearest_point};
+use crate::scene::script::Script;
 use crate::session::Session;
 use crate::session::run;
 use crate::sheet::Model;

@@ -1,8 +1,11 @@
 //! What a scene is: the tissue, its springs, and how time advances. Read from TOML (or from a protobuf
 //! message, in `wire`), checked, then never changed.
 
+pub mod action;
+pub mod check;
 pub mod document;
 pub mod law;
+mod reader;
 pub mod record;
 pub mod script;
 pub mod tip;
@@ -224,13 +227,6 @@ pub enum Integrator {
     Exponential4,
 }
 
-impl Integrator {
-    /// Whether it is one of the exponential multistep schemes.
-    pub fn is_exponential(self) -> bool {
-        matches!(self, Integrator::Exponential2 | Integrator::Exponential3 | Integrator::Exponential4)
-    }
-}
-
 impl Named for Integrator {
     const NAMES: &'static [(&'static str, Self)] = &[
         ("auto", Integrator::Auto),
@@ -295,6 +291,9 @@ impl Named for Lanes {
 
 impl Scene {
     /// Reads a scene file, with `--set` assignments over it.
+    ///
+    /// # Errors
+    /// Refuses a file that can't be read, and as [`Scene::parse`] does.
     pub fn load(path: &Path, assignments: &[String], limits: &Limits) -> Result<Self> {
         let text = document::read_text(path, limits.file_bytes)?;
         let scene = Self::parse(&path.display().to_string(), &text, assignments, limits)?;
@@ -307,6 +306,9 @@ impl Scene {
     }
 
     /// Reads a scene from TOML; `name` is what refusals call the text.
+    ///
+    /// # Errors
+    /// Refuses a text or an assignment that is not a valid scene.
     pub fn parse(name: &str, text: &str, assignments: &[String], limits: &Limits) -> Result<Self> {
         let mut document = Document::parse(name, text)?;
         for assignment in assignments {
@@ -374,6 +376,9 @@ impl Scene {
     }
 
     /// Everything that a scene promises, wherever it came from.
+    ///
+    /// # Errors
+    /// Refuses a value out of its range, and what is above the limits.
     pub fn check(&self, limits: &Limits) -> Result<()> {
         crate::refusal::label("name", &self.name)?;
         let [nx, ny] = self.sheet.points;
@@ -434,6 +439,9 @@ fn physical(field: &str, value: f64) -> Result<f64> {
 
 impl Sheet {
     /// The place of point [i, j] in arrays over all points: i·ny + j.
+    ///
+    /// # Errors
+    /// Refuses a point that is not on the sheet.
     pub fn index(&self, field: &str, [i, j]: [usize; 2]) -> Result<usize> {
         let [nx, ny] = self.points;
         if i >= nx || j >= ny {

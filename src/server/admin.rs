@@ -5,12 +5,12 @@ use std::sync::Arc;
 use tonic::{Request, Response, Status};
 use tracing::info;
 
-use super::House;
 use super::connections::Register;
+use super::house::House;
 use crate::budget::{Account, Purpose, Resource, Work};
+use crate::pace::Held;
 use crate::pace::clock::now_ns;
-use crate::pace::{Held, excerpt};
-use crate::refusal::{Reason, Refusal};
+use crate::refusal::{Reason, Refusal, excerpt};
 use crate::wire::pb;
 use crate::wire::pb::admin_service_server::AdminService;
 

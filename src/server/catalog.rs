@@ -3,8 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use crate::limits::Limits;
-use crate::pace::excerpt;
-use crate::refusal::{Reason, Refusal, Result};
+use crate::refusal::{Reason, Refusal, Result, excerpt};
 use crate::scene::document::read_text;
 use crate::scene::script::{self, Script};
 use crate::scene::{self, Scene};

@@ -21,13 +21,13 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::transport::server::Connected;
 use tracing::{debug, warn};
 
+use super::address::{address_name, network};
 use super::leases::Leases;
-use super::metrics::{Open, Traffic};
 use super::rate::RateLimiter;
 use super::reload::Reloaded;
 use super::tls::{self, Tls};
+use super::traffic::{Open, Traffic};
 use super::transport::{Frames, Gate, ReadPause};
-use super::visitor::address_name;
 use crate::budget::{Budget, Purpose, Resource, Taken};
 use crate::limits::Limits;
 use crate::lock::lock;
@@ -122,14 +122,6 @@ pub(super) fn incoming(
         }
     });
     ReceiverStream::new(connections)
-}
-
-/// The network that limits per address count: of IPv6 the first 64 bits, because each client there has 2⁶⁴ addresses.
-pub(super) fn network(address: IpAddr) -> IpAddr {
-    match address.to_canonical() {
-        IpAddr::V6(address) => IpAddr::V6((u128::from(address) >> 64 << 64).into()),
-        IpAddr::V4(address) => IpAddr::V4(address),
-    }
 }
 
 /// Limits the number of connections: in all, and from one address.

@@ -12,15 +12,15 @@ use tower::{Layer, Service};
 use tracing::{Instrument, info, info_span};
 
 use super::connections::Peer;
-use super::identity::{Access, Caller, Credentials, access};
-use super::metrics::Traffic;
+use super::identity::{Access, Caller, Credentials, Shown, access};
 use super::price::Price;
 use super::reload::Reloaded;
 use super::request::{RequestBody, TimeLimit};
-use super::revocation::{Calls, Shown};
+use super::revocation::Calls;
+use super::traffic::Traffic;
 use super::visitor::Visitor;
 use crate::budget::Budget;
-use crate::refusal::{Reason, Refusal, Result};
+use crate::refusal::{Reason, Refusal, Result, excerpt};
 
 /// Puts a [`Guard`] in front of a service.
 #[derive(Clone)]
@@ -99,7 +99,7 @@ impl GuardLayer {
             // With authentication disabled, gRPC answers that the call is unknown.
             None if path.starts_with(OWN) && self.credentials.get().is_open() => anonymous(),
             None if path.starts_with(OWN) => {
-                let message = format!("no role allows the call {}", crate::pace::excerpt(path));
+                let message = format!("no role allows the call {}", excerpt(path));
                 Err(Refusal::new(Reason::RoleMissing, "", message))
             }
             // Not one of our calls: a page's file, or nothing.

@@ -1,4 +1,4 @@
-//! `HapticService`.
+//! `HapticService`: streams of commands and samples, single commands, hashes and records.
 
 use std::collections::VecDeque;
 use std::pin::Pin;
@@ -12,24 +12,26 @@ use tokio_util::task::AbortOnDropHandle;
 use tonic::{Request, Response, Status, Streaming};
 use tracing::{Instrument, debug, info};
 
-use super::House;
 use super::connections::Peer;
 use super::cut::until_cut;
 use super::force_law::{Computing, Updates};
+use super::house::House;
 use super::rate::Bucket;
 use super::recovered::Notices;
 use super::revocation::Tenure;
 use super::visitor::Visitor;
 use crate::budget::{Account, Resource, Taken};
 use crate::haptics::device::{Device, UNDECLARED_FORCE_N};
+use crate::ids::random_bits;
 use crate::limits::Limits;
 use crate::pace::clock::now_ns;
 use crate::pace::queue::{Reader, Writer, queue};
-use crate::pace::{Held, Live, PacedSample, StreamGuard, random_bits};
+use crate::pace::{Held, Live, PacedSample, StreamGuard};
 use crate::refusal::{Reason, Refusal, number};
 use crate::scene::script::Action;
-use crate::session::command::{Command, LeaseId};
+use crate::session::command::Command;
 use crate::session::laws::{FIRST, Laws};
+use crate::session::lease::LeaseId;
 use crate::wire::pb::haptic_service_server::HapticService;
 use crate::wire::{self, pb};
 

@@ -1,5 +1,5 @@
-//! Authentication and authorization: roles, the role that each call requires, and the token file, which gives roles to
-//! tokens and client certificates.
+//! Authentication and authorization: roles, the role that each call requires, and the file of tokens. That file gives
+//! roles to tokens and client certificates.
 //!
 //! A call of our own package without an entry in the table is refused on a server that authenticates, and a test goes through
 //! the protocol's descriptors: no call can be forgotten. Ids of sessions and leases are 128 random bits each: a caller with the
@@ -14,7 +14,7 @@ use ring::digest::{SHA256, digest};
 use serde::Deserialize;
 use subtle::ConstantTimeEq;
 
-use crate::pace::random_bits;
+use crate::ids::random_bits;
 use crate::refusal::{Reason, Refusal, Result, label};
 
 /// What a caller may do. Every role includes `Watch`, and `Administer` includes every role.
@@ -304,4 +304,22 @@ fn from_hex(text: &str) -> Option<[u8; 32]> {
         *byte = u8::from_str_radix(&text[2 * index..2 * index + 2], 16).ok()?;
     }
     digits.then_some(bytes)
+}
+
+/// What a caller showed, and for what.
+#[derive(Clone)]
+pub(super) struct Shown {
+    pub(super) authorization: Option<HeaderValue>,
+    /// The names of the certificate.
+    pub(super) certificate: Option<Arc<[String]>>,
+    pub(super) role: Role,
+}
+
+impl Shown {
+    /// Whether that is enough.
+    pub(super) fn check(&self, credentials: &Credentials) -> Result<Caller> {
+        let caller = credentials.caller(self.authorization.as_ref(), self.certificate.as_deref())?;
+        caller.needs(self.role)?;
+        Ok(caller)
+    }
 }

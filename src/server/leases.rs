@@ -3,10 +3,10 @@
 
 use std::sync::{Arc, Mutex, Weak};
 
-use super::revocation::Shown;
+use super::identity::Shown;
 use crate::lock::lock;
 use crate::pace::Live;
-use crate::session::command::LeaseId;
+use crate::session::lease::LeaseId;
 
 struct Lease {
     live: Weak<Live>,

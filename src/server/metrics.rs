@@ -13,102 +13,21 @@ use futures_util::stream::{Stream, StreamExt};
 use prometheus_client::collector::Collector;
 use prometheus_client::encoding::{DescriptorEncoder, EncodeMetric, MetricEncoder, NoLabelSet, text};
 use prometheus_client::metrics::MetricType;
-use prometheus_client::metrics::counter::{ConstCounter, Counter};
-use prometheus_client::metrics::family::Family;
-use prometheus_client::metrics::gauge::{ConstGauge, Gauge};
+use prometheus_client::metrics::counter::ConstCounter;
+use prometheus_client::metrics::gauge::ConstGauge;
 use prometheus_client::registry::{Registry, Unit};
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
-use tracing::{info, warn};
 
 use super::connections::{self, Connection, Seats};
-use super::identity::CALLS;
-use super::transport::Cut;
+use super::traffic::Traffic;
 use super::workshop::Workshop;
 use crate::budget::{Budget, Purpose, Resource};
 use crate::limits::Limits;
 use crate::lock::lock;
 use crate::pace::tally::{Count, Tally, Times};
 use crate::pace::{Pacer, State};
-use crate::refusal::Reason;
 use crate::scene::record::AuditedError;
-
-/// One label.
-type Label = [(&'static str, &'static str); 1];
-
-/// What goes over the network.
-#[derive(Debug, Default)]
-pub(crate) struct Traffic {
-    connections: Gauge,
-    connected: Counter,
-    handshakes_failed: Counter,
-    silent: Counter,
-    cuts: Family<[(&'static str, &'static str); 2], Counter>,
-    useless_files: Family<Label, Gauge>,
-    pub(super) bytes_in: Counter,
-    pub(super) bytes_out: Counter,
-    calls: Family<Label, Counter>,
-    commands: Counter,
-    refusals: Family<Label, Counter>,
-}
-
-/// Counts a connection until it is dropped.
-pub(super) struct Open(Gauge);
-
-impl Drop for Open {
-    fn drop(&mut self) {
-        self.0.dec();
-    }
-}
-
-impl Traffic {
-    /// A connection is open for as long as what this returns.
-    pub(super) fn open(&self) -> Open {
-        self.connected.inc();
-        self.connections.inc();
-        Open(self.connections.clone())
-    }
-
-    pub(super) fn handshake_failed(&self, client: SocketAddr, error: &str) {
-        info!(%client, error, "TLS handshake failed");
-        self.handshakes_failed.inc();
-    }
-
-    /// A connection had to be closed that did not say what it wants.
-    pub(super) fn stayed_silent(&self, client: SocketAddr) {
-        info!(%client, "connection closed: it did not say what it wants");
-        self.silent.inc();
-    }
-
-    /// The transport of `side` has cut a connection.
-    pub(super) fn cut(&self, client: SocketAddr, side: &'static str, cut: &Cut) {
-        let Cut { reason, words } = cut;
-        warn!(%client, reason, "connection cut by the transport of the {side}: {words}");
-        self.cuts.get_or_create(&[("side", side), ("reason", reason)]).inc();
-    }
-
-    /// What these files hold is in force, or not.
-    pub(super) fn files(&self, what: &'static str, are_useless: bool) {
-        self.useless_files.get_or_create(&[("files", what)]).set(are_useless.into());
-    }
-
-    /// A call was let through.
-    pub(super) fn called(&self, path: &str) {
-        if let Some((path, _)) = CALLS.iter().find(|call| call.0 == path) {
-            self.calls.get_or_create(&[("call", path)]).inc();
-        }
-    }
-
-    /// Commands were taken.
-    pub(super) fn commanded(&self, commands: usize) {
-        self.commands.inc_by(commands as u64);
-    }
-
-    /// A call or a command was refused.
-    pub(super) fn refused(&self, reason: Reason) {
-        self.refusals.get_or_create(&[("reason", reason.as_str())]).inc();
-    }
-}
 
 /// Everything, as it is when it is asked for.
 pub(super) fn registry(pacer: &Arc<Pacer>, traffic: &Traffic, workshop: &Workshop) -> Registry {

@@ -1,5 +1,5 @@
-//! A call ends when who made it may not any more: it is looked at whenever a message of it comes or goes, if the file of
-//! tokens has changed, and all calls are looked at when it changes. For a client that does not read would never be asked.
+//! Ends the calls of callers whose credentials are revoked. A call is checked when a message of it comes or goes, if the
+//! file of tokens has changed. When the file changes, all calls are checked: a client that does not read would never be.
 
 use std::collections::HashMap;
 use std::pin::Pin;
@@ -10,41 +10,23 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use futures_util::task::AtomicWaker;
-use http::{HeaderMap, HeaderValue};
+use http::HeaderMap;
 use http_body::Frame;
 use tonic::Status;
 use tonic::body::Body;
 use tracing::{info, warn};
 
 use super::connections::Peer;
-use super::identity::{Caller, Credentials, Role};
+use super::identity::{Credentials, Shown};
 use super::leases::Leases;
 use super::reload::Reloaded;
 use crate::lock::lock;
 use crate::pace::Live;
 use crate::refusal::{Refusal, Result};
-use crate::session::command::LeaseId;
+use crate::session::lease::LeaseId;
 
 /// So long a client may take to read that its call is over; then its connection is closed.
 const GRACE: Duration = Duration::from_secs(1);
-
-/// What a caller showed, and for what.
-#[derive(Clone)]
-pub(super) struct Shown {
-    pub(super) authorization: Option<HeaderValue>,
-    /// The names of the certificate.
-    pub(super) certificate: Option<Arc<[String]>>,
-    pub(super) role: Role,
-}
-
-impl Shown {
-    /// Whether that is enough.
-    pub(super) fn check(&self, credentials: &Credentials) -> Result<Caller> {
-        let caller = credentials.caller(self.authorization.as_ref(), self.certificate.as_deref())?;
-        caller.needs(self.role)?;
-        Ok(caller)
-    }
-}
 
 /// The calls under way of callers that showed something.
 pub(super) struct Calls {

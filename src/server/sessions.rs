@@ -8,9 +8,10 @@ use futures_util::stream::{self, Stream};
 use tonic::{Request, Response, Status};
 use tracing::{info, warn};
 
-use super::House;
 use super::connections::Peer;
 use super::cut::until_cut;
+use super::house::House;
+use super::status;
 use super::visitor::Visitor;
 use super::workshop::CancelFlag;
 use crate::budget::Work;
@@ -65,7 +66,7 @@ impl SessionService for Sessions {
         for warning in &live.model.warnings {
             warn!(session = %live.id, warning);
         }
-        Ok(Response::new(pb::CreateSessionResponse { session: Some(wire::sample::session(&live)) }))
+        Ok(Response::new(pb::CreateSessionResponse { session: Some(status::session(&live)) }))
     }
 
     async fn get_session(
@@ -73,14 +74,14 @@ impl SessionService for Sessions {
         request: Request<pb::GetSessionRequest>,
     ) -> Result<Response<pb::GetSessionResponse>, Status> {
         let live = self.0.pacer.get(&request.get_ref().session_id)?;
-        Ok(Response::new(pb::GetSessionResponse { session: Some(wire::sample::session(&live)) }))
+        Ok(Response::new(pb::GetSessionResponse { session: Some(status::session(&live)) }))
     }
 
     async fn list_sessions(
         &self,
         _: Request<pb::ListSessionsRequest>,
     ) -> Result<Response<pb::ListSessionsResponse>, Status> {
-        let without_scene = |live: &Arc<_>| pb::Session { scene: None, ..wire::sample::session(live) };
+        let without_scene = |live: &Arc<_>| pb::Session { scene: None, ..status::session(live) };
         let sessions = self.0.pacer.list().iter().map(without_scene).collect();
         Ok(Response::new(pb::ListSessionsResponse { sessions }))
     }
@@ -127,7 +128,7 @@ impl SessionService for Sessions {
         for warning in &model.warnings {
             warn!(session = %live.id, warning);
         }
-        let session = Some(wire::sample::with_model(wire::sample::session(&live), &model));
+        let session = Some(status::with_model(status::session(&live), &model));
         Ok(Response::new(pb::UpdateTissueResponse { step, session }))
     }
 

@@ -7,12 +7,15 @@ use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
 use tonic::Status;
 
+use super::catalog::Catalog;
+use super::config::Config;
+use super::page;
 use super::workshop::Workshop;
-use super::{House, page};
 use crate::budget::{Purpose, Resource, Taken};
 use crate::limits::Limits;
 use crate::lock::lock;
 use crate::memory;
+use crate::pace::Pacer;
 use crate::refusal::Refusal;
 use crate::scene::Appearance;
 use crate::texture::{Texture, texture};
@@ -32,17 +35,14 @@ pub(crate) struct Textures {
     kept: Arc<Mutex<Vec<(Appearance, Texture, Taken)>>>,
     /// Separate threads: a texture may take a second, and sessions must not wait for it.
     workshop: Workshop,
-}
-
-impl Textures {
-    pub(super) fn new(limits: &Limits) -> std::io::Result<Self> {
-        Ok(Textures { kept: Arc::default(), workshop: Workshop::open("textures", limits)? })
-    }
+    config: Arc<Config>,
+    catalog: Catalog,
+    pacer: Arc<Pacer>,
 }
 
 /// Answers a browser's request for `NAME.png`. If there is no such texture, the page paints its own.
-pub(super) async fn file(house: House, Path(file): Path<String>, headers: HeaderMap) -> Response {
-    match house.texture(file.strip_suffix(".png").unwrap_or(&file)).await {
+pub(super) async fn file(textures: Textures, Path(file): Path<String>, headers: HeaderMap) -> Response {
+    match textures.texture(file.strip_suffix(".png").unwrap_or(&file)).await {
         // A scene's image may change.
         Ok(texture) => page::cached(texture.png, texture.etag, "image/png", "no-cache", &headers),
         // Not an error status: a browser would log one.
@@ -50,27 +50,46 @@ pub(super) async fn file(house: House, Path(file): Path<String>, headers: Header
     }
 }
 
-impl House {
+impl Textures {
+    /// Starts the threads that make textures.
+    ///
+    /// # Errors
+    /// Returns an error if a thread can't be started.
+    pub(super) fn open(
+        config: &Arc<Config>,
+        catalog: &Catalog,
+        pacer: &Arc<Pacer>,
+        limits: &Limits,
+    ) -> std::io::Result<Self> {
+        Ok(Textures {
+            kept: Arc::default(),
+            workshop: Workshop::open("textures", limits)?,
+            config: config.clone(),
+            catalog: catalog.clone(),
+            pacer: pacer.clone(),
+        })
+    }
+
     /// The texture of a session by its ID, of a scene by its name, or the one named `default`. It is made or read once and
     /// then kept; the first request takes about a second.
     ///
     /// # Errors
     /// Returns an error if there is no such session or scene, if its image is invalid, or if the server is overloaded.
     pub(crate) async fn texture(&self, name: &str) -> Result<Texture, Status> {
-        let (house, name) = (self.clone(), name.to_owned());
+        let (textures, name) = (self.clone(), name.to_owned());
         // One account, so one at a time: the next request may be for the same texture.
         let account = self.pacer.budget.account(ACCOUNT);
-        Ok(self.textures.workshop.work(&account, move |_| house.find_texture(&name)).await??)
+        Ok(self.workshop.work(&account, move |_| textures.find(&name)).await??)
     }
 
-    fn find_texture(&self, name: &str) -> Result<Texture, Refusal> {
+    fn find(&self, name: &str) -> Result<Texture, Refusal> {
         let limits = &self.config.limits;
         let appearance = match (name, self.pacer.get(name)) {
             ("default", _) => Appearance::default(),
             (_, Ok(live)) => live.model.scene.appearance.clone(),
             _ => self.catalog.load(name, &[], limits)?.appearance,
         };
-        let mut kept = lock(&self.textures.kept);
+        let mut kept = lock(&self.kept);
         if let Some((_, texture, _)) = kept.iter().find(|entry| entry.0 == appearance) {
             return Ok(texture.clone());
         }

@@ -1,4 +1,4 @@
-//! `ViewService`.
+//! `ViewService`: streams of frames, textures, and the vertices of a tissue.
 
 use std::collections::VecDeque;
 use std::pin::Pin;
@@ -8,11 +8,12 @@ use futures_util::stream::{self, Stream};
 use tonic::{Request, Response, Status};
 use tracing::info;
 
-use super::House;
 use super::cut::until_cut;
+use super::house::House;
 use super::visitor::Visitor;
+use crate::ids::random_id;
 use crate::pace::frames::Viewer;
-use crate::pace::{FrameReader, Held, StreamGuard, random_id};
+use crate::pace::{FrameReader, Held, StreamGuard};
 use crate::refusal::{Reason, Refusal, number};
 use crate::surface::{Encoding, Refinement};
 use crate::texture::Texture;
@@ -88,7 +89,7 @@ impl ViewService for Views {
         let request = request.into_inner();
         let guard = self.0.pacer.get(&request.session_id)?.open_stream("GetTexture", Held::Nothing, &account)?;
         let cut = guard.cut().clone();
-        let Texture { png, etag } = self.0.texture(&request.session_id).await?;
+        let Texture { png, etag } = self.0.textures.texture(&request.session_id).await?;
         let png = if etag == request.known_etag { Bytes::new() } else { png };
         // Even of nothing there is one part.
         let rest = Some((png, etag, guard));

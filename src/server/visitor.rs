@@ -1,12 +1,11 @@
-//! The caller of a call, as the account that the call is charged to: the name of its token or certificate, or its address
+//! The caller of a call: the account that it is charged to. Its name is that of the token or certificate, or the address
 //! where authentication is disabled.
-
-use std::net::IpAddr;
 
 use http::{Request, Version, header};
 use tonic::Extensions;
 
-use super::connections::{Peer, network};
+use super::address::address_name;
+use super::connections::Peer;
 use crate::budget::Account;
 
 /// The caller. The guard puts it into the extensions of every call that it lets through.
@@ -39,9 +38,4 @@ impl Visitor {
         let known = extensions.get::<Visitor>().cloned();
         known.unwrap_or_else(|| Visitor { account: Account::alone(), may_vanish: true })
     }
-}
-
-/// The name of an address's account. Addresses of one IPv6 network of 64 bits share an account.
-pub(super) fn address_name(address: IpAddr) -> String {
-    format!("address:{}", network(address))
 }

@@ -1,7 +1,7 @@
-//! Runs work that takes milliseconds or more and that a call waits for (a session's scene, a force law, a texture) on
-//! threads of lower priority than the stepping threads. Callers take turns, and each has at most one job running. A caller
-//! with many jobs therefore delays only itself, as long as there are fewer such callers than threads; beyond that, others
-//! wait for at most one job. A job that no call waits for any more is not started, or is told to stop.
+//! Threads of low priority for heavy work that a call waits for: scenes, force laws, textures. Callers take turns,
+//! and each has at most one job running. A caller with many jobs therefore delays only itself, as long as there are
+//! fewer such callers than threads; beyond that, others wait for at most one job. A job that no call waits for any
+//! more is not started, or is told to stop.
 //!
 //! Jobs are bounded by counted work, not by time, so that the same request has the same result on every machine:
 //! `limits.rehearsal_work` (points × substeps of the rehearsals of a choice), `limits.law_work` (springs × iterations of a force
@@ -19,7 +19,7 @@ use crate::budget::{Account, Turns};
 use crate::limits::Limits;
 use crate::lock::lock;
 use crate::pace::clock::now_ns;
-use crate::pace::priority::give_way;
+use crate::priority::give_way;
 use crate::refusal::{Reason, Refusal};
 
 /// Number of threads of a workshop.

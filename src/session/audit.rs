@@ -1,6 +1,7 @@
-//! The audit of a run: a twin in f64 with a quarter of the substep and without sleep gets the same inputs, step by
-//! step, and the records of the two are compared. With `[stepping] correct`, windows of the run are audited one after
-//! the other, as in a server, and an error above the tolerance changes how the tissue is stepped.
+//! The audit of a run: a more accurate twin gets the same inputs, and the records of both are compared. The twin runs in
+//! f64 with a quarter of the substep and without sleep. With
+//! `[stepping] correct`, windows of the run are audited one after the other, as in a server, and an error above the
+//! tolerance changes how the tissue is stepped.
 
 use std::collections::VecDeque;
 use std::sync::Arc;

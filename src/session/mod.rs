@@ -12,11 +12,16 @@
 //! stamp their commands get the same bits whichever network was faster. A second tool that grasps a point takes it over.
 
 pub mod audit;
+pub mod batch;
 pub mod check;
 pub mod command;
+pub mod intake;
 pub mod laws;
+pub mod lease;
 pub mod local;
+pub mod queue;
 pub mod recovery;
+pub mod rules;
 pub mod run;
 pub mod sampling;
 pub mod schedule;
@@ -28,14 +33,15 @@ use glam::DVec3;
 use crate::haptics::LocalModel;
 use crate::haptics::path::{Path, Play};
 use crate::memory;
+use crate::scene::check::nearest_point;
 use crate::scene::law::{ForceLaw, MoveLaw};
-use crate::scene::record::{EnergyJ, Point, Record};
-use crate::scene::script::{Action, nearest_point};
+use crate::scene::record::{EnergyJ, Point, Record, Recovery};
+use crate::scene::script::Action;
 use crate::scene::tip::Tip;
 use crate::sheet::audit::{Inputs, Mark};
-use crate::sheet::{self, Energy, Feel, Grasp, Model, PointState, Push, Still, Tissue};
+use crate::sheet::{self, BlowUp, Energy, Feel, Grasp, Model, PointState, Push, Still, Tissue};
 use command::Due;
-use recovery::{Recovered, Recoveries};
+use recovery::{Ended, Recovered, Recoveries, describe};
 
 /// The name of a record in messages.
 const RECORD: &str = "a record";
@@ -257,6 +263,52 @@ impl Session {
         }
         self.recoveries.believe(self.tissue.checkpoint_step());
         observe(self);
+    }
+
+    /// The recoveries so far.
+    pub fn recoveries(&self) -> &Recoveries {
+        &self.recoveries
+    }
+
+    /// Why the tissue is not what the commands have made of it: the guard has ended the session, or there was a recovery.
+    pub fn fault(&self) -> Option<String> {
+        let recovered = || self.recoveries.newest().map(|newest| describe(&newest.recovery));
+        self.hold_reason().map(str::to_owned).or_else(recovered)
+    }
+
+    /// Recovers from a blow-up if something has acted on the tissue since it was at rest. Otherwise the session is held,
+    /// and the result is false.
+    fn recover(&mut self, blow_up: BlowUp) -> bool {
+        let (step, state_of_step) = (blow_up.step, self.step_count());
+        if !self.recoveries.is_disturbed() {
+            self.hold(format!(
+                "after step {step} {}; shorter substeps did not help, and nothing has acted on the tissue since it was at \
+                 rest; the state is that of step {state_of_step}",
+                blow_up.cause
+            ));
+            return false;
+        }
+        let paused_until_step = self.recoveries.pause_end(step);
+        let released = self.tissue.recover(step, paused_until_step.is_some());
+        // All that took effect since the checkpoint: `believe` has forgotten the others.
+        self.recoveries.believe(state_of_step);
+        let mut tools = Vec::new();
+        for (index, tool) in self.tools.iter_mut().enumerate() {
+            let undone_commands = self.recoveries.acts_of(index);
+            let acted = undone_commands > 0 || released.tools.binary_search(&index).is_ok() || tool.led.is_some();
+            (tool.led, tool.expires_at) = (None, None);
+            tool.expired |= acted;
+            if acted {
+                tool.paused_until = paused_until_step.or(tool.paused_until);
+                #[allow(clippy::cast_possible_truncation)]
+                tools.push(Ended { tool: index as u32, sequence: tool.acknowledged_sequence, undone_commands });
+            }
+        }
+        let undone_commands = tools.iter().map(|ended| ended.undone_commands).sum();
+        let (at_rest, reason) = (released.at_rest, blow_up.cause.to_string());
+        let recovery = Recovery { step, state_of_step, at_rest, undone_commands, paused_until_step, reason };
+        self.recoveries.add(Recovered { recovery, tools });
+        true
     }
 
     /// Plays the paths of the tools that have one.

@@ -17,9 +17,7 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use super::Session;
 use crate::scene::record::Recovery;
-use crate::sheet::BlowUp;
 
 /// As many recoveries within [`WINDOW_STEPS`] pause the tools that acted.
 pub const MOST: usize = 4;
@@ -96,6 +94,11 @@ impl Recoveries {
         self.disturbed = true;
     }
 
+    /// Whether anything has acted on the tissue since it was at rest.
+    pub(super) fn is_disturbed(&self) -> bool {
+        self.disturbed
+    }
+
     /// Forgets the commands before `step`, whose effect the guard has believed.
     pub(super) fn believe(&mut self, step: u64) {
         while self.acts.front().is_some_and(|acts| acts.step < step) {
@@ -103,16 +106,22 @@ impl Recoveries {
         }
     }
 
+    /// Commands of a tool since the guard's checkpoint.
+    pub(super) fn acts_of(&self, tool: usize) -> u64 {
+        self.acts.iter().filter(|acts| acts.tool as usize == tool).map(|acts| acts.count).sum()
+    }
+
     /// The step until which a recovery at `step` pauses the tools that acted: the end of the window, if there are too
     /// many in it.
-    fn pause_end(&self, step: u64) -> Option<u64> {
+    pub(super) fn pause_end(&self, step: u64) -> Option<u64> {
         // The first of the newest [`MOST`], of which the one at `step` is the last.
         let first = self.newest.iter().rev().nth(MOST - 2)?;
         let end = first.recovery.step + WINDOW_STEPS;
         (end > step).then_some(end)
     }
 
-    fn add(&mut self, recovered: Recovered) {
+    /// Counts a recovery, and forgets the commands that it has undone.
+    pub(super) fn add(&mut self, recovered: Recovered) {
         self.count += 1;
         self.disturbed = !recovered.recovery.at_rest;
         if self.newest.len() == MOST {
@@ -120,55 +129,6 @@ impl Recoveries {
         }
         self.newest.push_back(Arc::new(recovered));
         self.acts.clear();
-    }
-}
-
-impl Session {
-    /// The recoveries so far.
-    pub fn recoveries(&self) -> &Recoveries {
-        &self.recoveries
-    }
-
-    /// Why the tissue is not what the commands have made of it: the guard has ended the session, or there was a recovery.
-    pub fn fault(&self) -> Option<String> {
-        let recovered = || self.recoveries.newest().map(|newest| describe(&newest.recovery));
-        self.hold_reason().map(str::to_owned).or_else(recovered)
-    }
-
-    /// Recovers from a blow-up if something has acted on the tissue since it was at rest. Otherwise the session is held,
-    /// and the result is false.
-    pub(super) fn recover(&mut self, blow_up: BlowUp) -> bool {
-        let (step, state_of_step) = (blow_up.step, self.step_count());
-        if !self.recoveries.disturbed {
-            self.hold(format!(
-                "after step {step} {}; shorter substeps did not help, and nothing has acted on the tissue since it was at \
-                 rest; the state is that of step {state_of_step}",
-                blow_up.cause
-            ));
-            return false;
-        }
-        let paused_until_step = self.recoveries.pause_end(step);
-        let released = self.tissue.recover(step, paused_until_step.is_some());
-        // All that took effect since the checkpoint: `believe` has forgotten the others.
-        self.recoveries.believe(state_of_step);
-        let mut tools = Vec::new();
-        for (index, tool) in self.tools.iter_mut().enumerate() {
-            let acts = self.recoveries.acts.iter().filter(|acts| acts.tool as usize == index);
-            let undone_commands = acts.map(|acts| acts.count).sum();
-            let acted = undone_commands > 0 || released.tools.binary_search(&index).is_ok() || tool.led.is_some();
-            (tool.led, tool.expires_at) = (None, None);
-            tool.expired |= acted;
-            if acted {
-                tool.paused_until = paused_until_step.or(tool.paused_until);
-                #[allow(clippy::cast_possible_truncation)]
-                tools.push(Ended { tool: index as u32, sequence: tool.acknowledged_sequence, undone_commands });
-            }
-        }
-        let undone_commands = tools.iter().map(|ended| ended.undone_commands).sum();
-        let (at_rest, reason) = (released.at_rest, blow_up.cause.to_string());
-        let recovery = Recovery { step, state_of_step, at_rest, undone_commands, paused_until_step, reason };
-        self.recoveries.add(Recovered { recovery, tools });
-        true
     }
 }
 
@@ -192,9 +152,10 @@ pub fn describe(recovery: &Recovery) -> String {
 mod tests {
     use super::*;
     use crate::scene::script::Action;
+    use crate::session::Session;
     use crate::session::command::{Command, Due};
-    use crate::sheet::Model;
     use crate::sheet::guard::Cause;
+    use crate::sheet::{BlowUp, Model};
 
     fn blow_up(step: u64) -> BlowUp {
         BlowUp { step, cause: Cause::NotFinite { point: [0, 0] } }

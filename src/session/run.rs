@@ -6,7 +6,8 @@ use std::sync::Arc;
 
 use super::Session;
 use super::audit::{Twin, Windows};
-use super::command::{Command, Intake};
+use super::command::Command;
+use super::intake::Intake;
 use crate::limits::Limits;
 use crate::refusal::{Refusal, Result};
 use crate::scene::Named;

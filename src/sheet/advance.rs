@@ -8,9 +8,10 @@ use std::ops::Range;
 
 use super::applied::{self, Pull};
 use super::field::{BLOCK, Layout};
+use super::integrate::arithmetic::{Arithmetic, MAX_KEPT};
 use super::lanes::Vector;
 use super::real::Real;
-use super::sweep::{ANY, LEAN, MAX_KEPT, PUSHED, Scheme, Stage};
+use super::stage::{ANY, LEAN, PUSHED, Stage};
 
 /// The stage that advances every point.
 pub(super) struct Advance<'a, T: Real, C> {
@@ -31,7 +32,7 @@ pub(super) struct Advance<'a, T: Real, C> {
     pub(super) work: *mut T,
 }
 
-impl<T: Real, C: Scheme<T>> Stage<T> for Advance<'_, T, C> {
+impl<T: Real, C: Arithmetic<T>> Stage<T> for Advance<'_, T, C> {
     #[inline(always)]
     fn duty(&self, row: usize) -> u8 {
         match (self.free.is_null(), self.forced.contains(&row), self.pulls.len()) {
@@ -85,7 +86,7 @@ impl<T: Real, C: Scheme<T>> Stage<T> for Advance<'_, T, C> {
     }
 }
 
-impl<T: Real, C: Scheme<T>> Advance<'_, T, C> {
+impl<T: Real, C: Arithmetic<T>> Advance<'_, T, C> {
     /// Advances a block, with or without a tool's force.
     #[inline(always)]
     unsafe fn put<V: Vector<Real = T>, const DUTY: u8, const FORCED: bool>(

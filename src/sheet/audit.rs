@@ -16,12 +16,16 @@ use std::sync::Arc;
 use glam::DVec3;
 
 use super::applied::Applied;
+use super::checkpoint::Checkpoint;
 use super::field::State;
-use super::guard::{Checkpoint, Input, convert};
+use super::guard::convert;
 use super::integrate::Oscillator;
 use super::model::Model;
+use super::motion::{Sheet, springs_of};
 use super::real::Real;
-use super::{Sheet, Tissue, springs_of};
+use super::tissue::Tissue;
+pub use super::watch::{Inputs, Look, Mark};
+use super::watch::{Replay, Resume, Watch};
 use crate::memory;
 use crate::scene::Precision;
 pub use crate::scene::record::AuditedError;
@@ -31,9 +35,6 @@ pub const FINER: u32 = 4;
 
 /// Longest window, s, before it is rounded up to the next checkpoint.
 const LONGEST_S: f64 = 0.25;
-
-/// Most inputs in a window. With more it ends without a result.
-const MOST_INPUTS: usize = 4096;
 
 /// Points times substeps in a slice of an audit: some milliseconds.
 const SLICE: u64 = 1 << 20;
@@ -105,58 +106,14 @@ impl Extent {
     }
 }
 
-/// The tools' inputs in a window: step they precede, tool, input. Its memory is allocated at the beginning, so that the
-/// sheet need not allocate.
-#[derive(Debug)]
-pub struct Inputs(Vec<(u64, usize, Input)>);
-
-impl Default for Inputs {
-    fn default() -> Self {
-        Inputs(Vec::with_capacity(MOST_INPUTS))
-    }
-}
-
-/// What a sheet reports about the requested window.
-#[derive(Debug)]
-pub enum Mark {
-    /// The window has begun.
-    Begin(Look),
-    /// The window has ended.
-    End(Look, Inputs),
-    /// The window can't be audited: the guard went back, the tissue changed, everything came to rest, or there were too
-    /// many inputs.
-    Dropped,
-}
-
-/// A sheet's state at a checkpoint, shared with the sheet.
-#[derive(Debug)]
-pub struct Look {
-    model: Arc<Model>,
-    checkpoint: SharedCheckpoint,
-}
-
-/// A checkpoint in either format.
-#[derive(Debug)]
-pub(super) enum SharedCheckpoint {
-    Single(Arc<Checkpoint<f32>>),
-    Double(Arc<Checkpoint<f64>>),
-}
-
 /// A copy of a window's beginning.
 #[derive(Debug)]
-pub struct Opening(Copy);
-
-/// A sheet copied from a shared checkpoint. None of it sleeps.
-#[derive(Debug)]
-enum Copy {
-    Single(Box<Sheet<f32>>),
-    Double(Box<Sheet<f64>>),
-}
+pub struct Opening(Box<dyn Replay>);
 
 /// A complete window: everything needed to repeat it.
 #[derive(Debug)]
 pub struct Audit {
-    begin: Copy,
+    begin: Box<dyn Replay>,
     inputs: Inputs,
     end: Observed,
     until: u64,
@@ -167,6 +124,10 @@ pub struct Audit {
 struct Observed(Vec<[DVec3; 2]>);
 
 impl Observed {
+    fn of(sheet: &dyn Replay) -> Self {
+        Observed(sheet.observed())
+    }
+
     fn extent(&self) -> Extent {
         self.over(|point| *point)
     }
@@ -185,41 +146,6 @@ impl Observed {
 
     fn is_finite(&self) -> bool {
         self.0.iter().flatten().all(|vector| vector.is_finite())
-    }
-}
-
-/// How far a sheet is with a requested window.
-#[derive(Debug, Default)]
-pub(super) enum Watch {
-    /// No window is requested.
-    #[default]
-    Off,
-    /// The window begins at the next checkpoint.
-    Wanted(Inputs),
-    /// The window ends at the first checkpoint from this step on.
-    Open(u64, Inputs),
-    /// The end is still to be reported.
-    Closed(Inputs),
-    /// The failure is still to be reported.
-    Dropped,
-}
-
-impl Watch {
-    /// Records an input of a tool.
-    pub(super) fn input(&mut self, step: u64, tool: usize, input: &Input) {
-        let Watch::Open(_, inputs) = self else { return };
-        if inputs.0.len() < MOST_INPUTS {
-            inputs.0.push((step, tool, input.clone()));
-        } else {
-            self.give_up();
-        }
-    }
-
-    /// Drops the window after an event that a twin can't repeat.
-    pub(super) fn give_up(&mut self) {
-        if matches!(self, Watch::Open(..) | Watch::Closed(_)) {
-            *self = Watch::Dropped;
-        }
     }
 }
 
@@ -279,7 +205,7 @@ impl<T: Real> Sheet<T> {
     pub(super) fn take_mark(&mut self) -> Option<Mark> {
         let look = |sheet: &Self| {
             let checkpoint = sheet.checkpoint.clone()?;
-            Some(Look { model: sheet.model.clone(), checkpoint: T::shared(checkpoint) })
+            Some(Look { model: sheet.model.clone(), checkpoint })
         };
         match &self.watch {
             Watch::Open(..) if std::mem::take(&mut self.is_marked) => look(self).map(Mark::Begin),
@@ -363,18 +289,44 @@ impl<T: Real> Sheet<T> {
         self.bench.springs = springs_of(model, &plan);
         self.plan = plan;
     }
+}
 
-    /// The values to compare.
-    fn observed(&self) -> Observed {
+impl<T: Real> Resume for Checkpoint<T> {
+    fn resume(&self, model: &Model) -> Box<dyn Replay> {
+        Sheet::resumed(model, self)
+    }
+}
+
+impl<T: Real> Replay for Sheet<T> {
+    fn model(&self) -> &Arc<Model> {
+        &self.model
+    }
+
+    fn steps(&self) -> u64 {
+        self.steps
+    }
+
+    fn largest(&self) -> f64 {
+        self.tiles.largest
+    }
+
+    fn observed(&self) -> Vec<[DVec3; 2]> {
         let points = (0..self.model.len()).map(|index| {
             let point = self.point(index);
             [point.displacement_m, point.reaction_n()]
         });
-        Observed(memory::collected(points, "an audit"))
+        memory::collected(points, "an audit")
     }
 
-    /// Repeats the recorded inputs up to step `until`, in slices. Calls `go_on` between slices; returns false if that
-    /// did.
+    fn twin(&self, by: u32) -> Box<dyn Replay> {
+        let mut wide = self.widened(&self.model.twin(1, Precision::F64));
+        if by > 1 {
+            let model = wide.model.twin(by, Precision::F64);
+            wide.resample(&model);
+        }
+        Box::new(wide)
+    }
+
     fn repeat(&mut self, inputs: &Inputs, until: u64, go_on: &mut dyn FnMut() -> bool) -> bool {
         let work = self.model.len() as u64 * u64::from(self.plan.substeps);
         let slice = (SLICE / work).max(1);
@@ -393,75 +345,25 @@ impl<T: Real> Sheet<T> {
 }
 
 impl Look {
-    /// The tissue in the window.
-    pub fn model(&self) -> &Arc<Model> {
-        &self.model
-    }
-
     /// Copies the beginning and releases the shared checkpoint.
     pub fn open(self) -> Opening {
-        Opening(match &self.checkpoint {
-            SharedCheckpoint::Single(checkpoint) => Copy::Single(Sheet::resumed(&self.model, checkpoint)),
-            SharedCheckpoint::Double(checkpoint) => Copy::Double(Sheet::resumed(&self.model, checkpoint)),
-        })
+        Opening(self.checkpoint.resume(&self.model))
     }
 }
 
-impl Copy {
-    fn observed(&self) -> Observed {
-        match self {
-            Copy::Single(sheet) => sheet.observed(),
-            Copy::Double(sheet) => sheet.observed(),
-        }
-    }
-
-    fn steps(&self) -> u64 {
-        match self {
-            Copy::Single(sheet) => sheet.steps,
-            Copy::Double(sheet) => sheet.steps,
-        }
-    }
-
-    /// A twin in f64 with 1/`by` of the substep.
-    fn twin(&self, by: u32) -> Sheet<f64> {
-        let wide = match self {
-            Copy::Single(sheet) => sheet.widened(&sheet.model.twin(1, Precision::F64)),
-            Copy::Double(sheet) => sheet.widened(&sheet.model.twin(1, Precision::F64)),
-        };
-        if by == 1 {
-            return wide;
-        }
-        let mut wide = wide;
-        let model = wide.model.twin(by, Precision::F64);
-        wide.resample(&model);
-        wide
-    }
-
-    /// An extent at least as large as the one that sleep is relative to: the recent largest displacement, and a force
-    /// in proportion.
-    fn since_rest(&self, extent: Extent) -> Extent {
-        let largest = match self {
-            Copy::Single(sheet) => sheet.tiles.largest,
-            Copy::Double(sheet) => sheet.tiles.largest,
-        };
-        let ratio = (largest * self.model().scene.sheet.spacing_m / extent.displacement_m).max(1.0);
-        let ratio = if ratio.is_finite() { ratio } else { 1.0 };
-        Extent { displacement_m: ratio * extent.displacement_m, force_n: ratio * extent.force_n }
-    }
-
-    fn model(&self) -> &Arc<Model> {
-        match self {
-            Copy::Single(sheet) => &sheet.model,
-            Copy::Double(sheet) => &sheet.model,
-        }
-    }
+/// An extent at least as large as the one that the sleep of `sheet` is relative to: the recent largest displacement, and
+/// a force in proportion.
+fn since_rest(sheet: &dyn Replay, extent: Extent) -> Extent {
+    let ratio = (sheet.largest() * sheet.model().scene.sheet.spacing_m / extent.displacement_m).max(1.0);
+    let ratio = if ratio.is_finite() { ratio } else { 1.0 };
+    Extent { displacement_m: ratio * extent.displacement_m, force_n: ratio * extent.force_n }
 }
 
 impl Opening {
     /// Ends the window at `end` and releases its shared checkpoint.
     pub fn close(self, end: Look, inputs: Inputs) -> Audit {
         let Opening(end) = end.open();
-        Audit { begin: self.0, inputs, end: end.observed(), until: end.steps() }
+        Audit { begin: self.0, inputs, end: Observed::of(&*end), until: end.steps() }
     }
 }
 
@@ -477,8 +379,8 @@ impl Audit {
     /// `go_on` is called between slices of some milliseconds. `None` if it returned false, if nothing moved, or if the
     /// twin did not stay finite.
     pub fn work(self, finer: u32, largest: Extent, go_on: &mut dyn FnMut() -> bool) -> Option<Finding> {
-        let Audit { begin, inputs, end, until } = self;
-        let first = begin.observed();
+        let Audit { mut begin, inputs, end, until } = self;
+        let first = Observed::of(&*begin);
         if first.differences(&end) == Extent::default() {
             return None;
         }
@@ -488,17 +390,17 @@ impl Audit {
         if !twin.repeat(&inputs, middle, go_on) {
             return None;
         }
-        let extent = twin.observed().extent();
+        let extent = Observed::of(&*twin).extent();
         let rest = Inputs(inputs.0.iter().filter(|(step, ..)| *step >= middle).cloned().collect());
         if !twin.repeat(&rest, until, go_on) {
             return None;
         }
-        let truth = twin.observed();
+        let truth = Observed::of(&*twin);
         if !truth.is_finite() {
             return None;
         }
         let largest = [first.extent(), extent, truth.extent()].into_iter().fold(largest, Extent::max);
-        let largest = begin.since_rest(largest);
+        let largest = since_rest(&*begin, largest);
         let error = |a: &Observed, b: &Observed| a.differences(b).relative_to(largest);
         let found = error(&end, &truth);
         let (tolerance, substeps) = (begin.model().scene.stepping.tolerance, begin.model().plan.substeps);
@@ -508,14 +410,10 @@ impl Audit {
         }
         // From the sheet to the twin, one change at a time: awake, then f64, then the shorter substep.
         let mut wide = begin.twin(1);
-        let (woken, same) = match begin {
-            Copy::Single(mut sheet) => (sheet.repeat(&inputs, until, go_on), sheet.observed()),
-            Copy::Double(mut sheet) => (sheet.repeat(&inputs, until, go_on), sheet.observed()),
-        };
-        if !woken || !wide.repeat(&inputs, until, go_on) {
+        if !begin.repeat(&inputs, until, go_on) || !wide.repeat(&inputs, until, go_on) {
             return None;
         }
-        let wide = wide.observed();
+        let (same, wide) = (Observed::of(&*begin), Observed::of(&*wide));
         let parts = [
             (Origin::Substep, error(&wide, &truth)),
             (Origin::Rounding, error(&same, &wide)),

@@ -7,17 +7,19 @@
 
 use std::sync::Arc;
 
+use super::checkpoint::Work;
 use super::field::{Field, State};
+use super::integrate::with_arithmetic;
 use super::model::Model;
+use super::motion::{Sheet, springs_of};
 use super::real::Real;
 use super::survey::{Forces, Survey, Write};
-use super::{Sheet, Work, central, exponential, rest, rk4, springs_of};
 use crate::scene::Precision;
 
 impl<T: Real> Sheet<T> {
     /// From the coming step on, uses `model`, which has the same points and number format.
     pub(super) fn change(&mut self, model: &Arc<Model>) {
-        self.tiles.begin_anew(rest::tolerance(model));
+        self.tiles.begin_anew(model.tile_tolerance());
         self.watch.give_up();
         if self.is_same_tissue(model) {
             self.resample(model);
@@ -85,6 +87,6 @@ impl<T: Real> Sheet<T> {
         let terms = self.present_terms();
         let Sheet { plan, bench, state, tiles, .. } = self;
         let forces = Forces { terms: &terms, field: 0, part: 1.0, pull: 0.0 };
-        with_scheme!(plan, T, |scheme| Survey::write(bench, scheme, state, forces, &tiles.region, write));
+        with_arithmetic!(&plan.scheme, T, |scheme| Survey::write(bench, scheme, state, forces, &tiles.region, write));
     }
 }

@@ -2,7 +2,7 @@
 
 use std::sync::atomic::AtomicBool;
 
-use super::integrate::Oscillator;
+use super::integrate::{CANDIDATES, Oscillator, entry};
 use super::rehearsal::{self, Rehearsal};
 use super::stability;
 use crate::limits::Limits;
@@ -11,14 +11,6 @@ use crate::scene::{Integrator, Lanes, Precision, Scene, Stepping};
 
 /// Errors that grow with time, where nothing damps them, are expected for so long, s.
 pub const LASTING_S: f64 = rehearsal::LASTING_S;
-
-/// What a substep costs, in those of `central` in f32: integrator, order of the error, cost. Measured (`make bench-kernel`).
-const CANDIDATES: [(Integrator, f64, f64); 4] = [
-    (Integrator::Exponential4, 5.0, 1.6),
-    (Integrator::Exponential3, 4.0, 1.4),
-    (Integrator::Exponential2, 3.0, 1.3),
-    (Integrator::Central, 2.0, 1.0),
-];
 
 /// The number formats and what each costs, in f32.
 const FORMATS: [(Precision, f64); 3] = [(Precision::F32, 1.0), (Precision::Compensated, 1.1), (Precision::F64, 2.6)];
@@ -29,9 +21,7 @@ pub(super) const STEP_NS: f64 = 2000.0;
 
 /// The processor time that a point is expected to take in a substep, ns.
 pub(super) fn point_substep_ns(integrator: Integrator, precision: Precision, lanes: Lanes) -> f64 {
-    let scheme = CANDIDATES.iter().find(|candidate| candidate.0 == integrator).map(|found| found.2);
-    // `rk4` evaluates the springs four times; `lagged` is `central` but for a number.
-    let scheme = scheme.unwrap_or(if integrator == Integrator::Rk4 { 4.0 } else { 1.0 });
+    let scheme = entry(integrator).cost;
     let format = FORMATS.iter().find(|format| format.0 == precision).map_or(1.0, |found| found.1);
     let width = match lanes {
         Lanes::Auto | Lanes::Avx512 => 1.0,
@@ -56,12 +46,6 @@ pub fn given_up() -> Refusal {
 
 /// Rehearsals of one integrator in one format at most.
 const MOST_ROUNDS: u32 = 6;
-
-/// The power of the substep with which the error of an integrator falls.
-pub(super) fn order(integrator: Integrator) -> f64 {
-    let known = CANDIDATES.iter().find(|candidate| candidate.0 == integrator).map(|found| found.1);
-    known.unwrap_or(if integrator == Integrator::Rk4 { 4.0 } else { 1.0 })
-}
 
 /// An integrator, how often it is used in a step, in which format, and what to expect of that.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -154,15 +138,16 @@ impl Chooser<'_> {
     fn formats(&self, integrator: Integrator) -> impl Iterator<Item = (Precision, f64)> {
         let asked = self.stepping.precision;
         FORMATS.into_iter().filter(move |(format, _)| match asked {
-            Precision::Auto => *format != Precision::Compensated || integrator.is_exponential(),
+            Precision::Auto => *format != Precision::Compensated || entry(integrator).compensates,
             asked => *format == asked,
         })
     }
 
-    /// Fewest substeps, at most `most`, with which a scheme of `order` is stable and keeps to the tolerance. None if it is
-    /// not stable with so few.
+    /// Fewest substeps, at most `most`, with which a scheme is stable and keeps to the tolerance. None if it is not stable
+    /// with so few.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    fn fewest(&self, integrator: Integrator, order: f64, precision: Precision, most: u32) -> Option<Fewest> {
+    fn fewest(&self, integrator: Integrator, precision: Precision, most: u32) -> Option<Fewest> {
+        let order = entry(integrator).order;
         if let Some(substeps) = self.stepping.substeps {
             return Some(Fewest { choice: self.tried(integrator, substeps, precision), rounding: false });
         }
@@ -212,9 +197,9 @@ impl Chooser<'_> {
     }
 
     /// Integrators that the scene leaves open.
-    fn integrators(&self) -> impl Iterator<Item = (Integrator, f64, f64)> + Clone + use<> {
+    fn integrators(&self) -> impl Iterator<Item = Integrator> + Clone + use<> {
         let asked = self.stepping.integrator;
-        CANDIDATES.into_iter().filter(move |(integrator, ..)| asked == Integrator::Auto || asked == *integrator)
+        CANDIDATES.into_iter().filter(move |integrator| asked == Integrator::Auto || asked == *integrator)
     }
 
     /// One that is asked for by name and is no candidate: as many substeps as it has to have.
@@ -240,7 +225,7 @@ impl Chooser<'_> {
 /// for absurd scenes.
 pub(super) fn least_substeps(asked: Integrator, step_s: f64, sheet: &Oscillator) -> u32 {
     let is_open = |integrator: Integrator| asked == Integrator::Auto || asked == integrator;
-    let open = CANDIDATES.iter().map(|candidate| candidate.0).filter(|integrator| is_open(*integrator));
+    let open = CANDIDATES.into_iter().filter(|integrator| is_open(*integrator));
     let least = open.map(|integrator| stability::stable_substeps(integrator, step_s, sheet)).min();
     least.unwrap_or_else(|| stability::substeps(asked, step_s, sheet))
 }
@@ -260,14 +245,14 @@ pub fn least_step(scene: &Scene) -> (u32, f64) {
 /// Every integrator that the scene leaves open, each with the cheapest that keeps to the tolerance.
 pub fn candidates(scene: &Scene, limits: &Limits) -> Vec<Choice> {
     let chooser = Chooser::new(scene, limits, &NEVER);
-    let cheapest =
-        |(integrator, order, cost): (Integrator, f64, f64)| chooser.cheapest([(integrator, order, cost)].into_iter());
-    chooser.integrators().filter_map(cheapest).collect()
+    chooser.integrators().filter_map(|integrator| chooser.cheapest(std::iter::once(integrator))).collect()
 }
 
-/// The cheapest that keeps to the tolerance, of what the scene leaves open; if nothing does, what misses it least. Refused
-/// if that would take more work than the limits allow, and when `stop` is set. Also tells the work: points × substeps of
-/// rehearsals.
+/// The cheapest that keeps to the tolerance, of what the scene leaves open; if nothing does, what misses it least. Also
+/// returns the work: points × substeps of rehearsals.
+///
+/// # Errors
+/// Refuses a scene for which that would take more work than the limits allow, and when `stop` is set.
 pub fn choose(scene: &Scene, limits: &Limits, stop: &AtomicBool) -> Result<(Choice, u64)> {
     let chooser = Chooser::new(scene, limits, stop);
     let choice = chooser.cheapest(chooser.integrators()).unwrap_or_else(|| chooser.yardstick());
@@ -276,18 +261,17 @@ pub fn choose(scene: &Scene, limits: &Limits, stop: &AtomicBool) -> Result<(Choi
 
 impl Chooser<'_> {
     /// The cheapest of some integrators.
-    fn cheapest(&self, integrators: impl Iterator<Item = (Integrator, f64, f64)> + Clone) -> Option<Choice> {
+    fn cheapest(&self, integrators: impl Iterator<Item = Integrator> + Clone) -> Option<Choice> {
         let (mut best, mut nearest) = (None::<(f64, Choice)>, None::<Choice>);
         for (format, format_cost) in FORMATS {
-            for (integrator, order, cost) in integrators.clone() {
+            for integrator in integrators.clone() {
                 if !self.formats(integrator).any(|(open, _)| open == format) {
                     continue;
                 }
-                let cost = cost * format_cost;
+                let cost = entry(integrator).cost * format_cost;
                 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
                 let most = best.as_ref().map_or(self.most_substeps, |(least, _)| (least / cost - 1e-9).floor() as u32);
-                let Some(Fewest { choice, rounding }) =
-                    self.fewest(integrator, order, format, most.min(self.most_substeps))
+                let Some(Fewest { choice, rounding }) = self.fewest(integrator, format, most.min(self.most_substeps))
                 else {
                     continue;
                 };

@@ -24,13 +24,11 @@ use std::sync::Arc;
 
 use glam::{DVec2, DVec3};
 
-use super::Sheet;
 use super::field::{Layout, State};
 use super::footprint::{Footprint, Reached};
 use super::model::{Model, Plan};
 use super::real::Real;
 use super::tangent::{Patch, Tangent, Window};
-use crate::memory;
 use crate::scene::tip::{Coupling, Tip};
 
 /// The state of contact between a tool and the sheet.
@@ -70,10 +68,10 @@ pub struct Feel {
 /// A copy of the data from which the stiffness under a tool is computed, for another thread.
 #[derive(Debug)]
 pub struct Surroundings {
-    model: Arc<Model>,
-    footprint: Footprint,
-    window: Window,
-    displacement_m: Vec<DVec3>,
+    pub(super) model: Arc<Model>,
+    pub(super) footprint: Footprint,
+    pub(super) window: Window,
+    pub(super) displacement_m: Vec<DVec3>,
 }
 
 impl Surroundings {
@@ -83,29 +81,31 @@ impl Surroundings {
     }
 }
 
+/// A tool and its disc.
 #[derive(Debug, Clone)]
-struct Tool {
-    number: usize,
-    tip: Tip,
-    footprint: Footprint,
+pub(super) struct Tool {
+    pub(super) number: usize,
+    pub(super) tip: Tip,
+    pub(super) footprint: Footprint,
     /// Place at the step's beginning and at its end, m.
-    from_m: DVec3,
-    to_m: DVec3,
-    standing: Standing,
-    normal: DVec3,
+    pub(super) from_m: DVec3,
+    pub(super) to_m: DVec3,
+    pub(super) standing: Standing,
+    pub(super) normal: DVec3,
     /// The offset that a grasp keeps between the tool and the surface, m.
-    offset_m: DVec3,
+    pub(super) offset_m: DVec3,
     /// Force on the sheet in the last substep, N.
-    force_n: DVec3,
+    pub(super) force_n: DVec3,
     /// The part of that force that continues in the next substep, without the impulse of meeting.
-    steady_n: DVec3,
-    velocity_m_per_s: DVec3,
+    pub(super) steady_n: DVec3,
+    pub(super) velocity_m_per_s: DVec3,
 }
 
 /// All position-controlled tools.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Contacts {
-    tools: Vec<Tool>,
+    /// By ascending number.
+    pub(super) tools: Vec<Tool>,
 }
 
 impl Contacts {
@@ -167,7 +167,7 @@ impl Contacts {
 }
 
 /// The displacement of a point from rest, m. For a multistep scheme, as predicted.
-fn displacement_m<T: Real>(model: &Model, layout: &Layout, state: &State<T>, [i, j]: [usize; 2]) -> DVec3 {
+pub(super) fn displacement_m<T: Real>(model: &Model, layout: &Layout, state: &State<T>, [i, j]: [usize; 2]) -> DVec3 {
     let at = i * layout.stride + j;
     let component = |c: usize| state.u[c * layout.plane + at].wide() * model.scene.sheet.spacing_m;
     DVec3::new(component(0), component(1), component(2))
@@ -175,7 +175,7 @@ fn displacement_m<T: Real>(model: &Model, layout: &Layout, state: &State<T>, [i,
 
 /// Adds to u and d of the disc's points the effect of `force_n` with `[of_u, of_d]` (`Scheme::kick`,
 /// `Scheme::constant`).
-fn push<T: Real>(
+pub(super) fn push<T: Real>(
     model: &Model,
     plan: &Plan,
     layout: &Layout,
@@ -196,7 +196,7 @@ fn push<T: Real>(
 }
 
 /// The movement of the disc in a substep, Σ w·d, m.
-fn movement_m<T: Real>(model: &Model, layout: &Layout, state: &State<T>, footprint: &Footprint) -> DVec3 {
+pub(super) fn movement_m<T: Real>(model: &Model, layout: &Layout, state: &State<T>, footprint: &Footprint) -> DVec3 {
     let mut moved = DVec3::ZERO;
     for Reached { point: [i, j], weight, .. } in footprint.reached().iter().copied() {
         let at = i * layout.stride + j;
@@ -209,7 +209,7 @@ fn movement_m<T: Real>(model: &Model, layout: &Layout, state: &State<T>, footpri
 
 impl Tool {
     /// The points of the disc.
-    fn points(&self) -> impl Iterator<Item = [usize; 2]> {
+    pub(super) fn points(&self) -> impl Iterator<Item = [usize; 2]> {
         self.footprint.reached().iter().map(|reached| reached.point)
     }
 
@@ -218,7 +218,14 @@ impl Tool {
     }
 
     /// Finds the state of contact, and the force of the tool on the sheet, N.
-    fn meet<T: Real>(&mut self, model: &Model, plan: &Plan, layout: &Layout, state: &State<T>, fraction: f64) -> DVec3 {
+    pub(super) fn meet<T: Real>(
+        &mut self,
+        model: &Model,
+        plan: &Plan,
+        layout: &Layout,
+        state: &State<T>,
+        fraction: f64,
+    ) -> DVec3 {
         let place_m = self.place_m(fraction);
         let displacement = |point| displacement_m(model, layout, state, point);
         if self.standing == Standing::Free {
@@ -284,7 +291,7 @@ impl Tool {
     }
 
     /// After the force has acted: a sliding disc stays under the tool.
-    fn follow<T: Real>(&mut self, model: &Model, layout: &Layout, state: &State<T>, fraction: f64) {
+    pub(super) fn follow<T: Real>(&mut self, model: &Model, layout: &Layout, state: &State<T>, fraction: f64) {
         if self.standing != Standing::Sliding {
             return;
         }
@@ -299,7 +306,7 @@ impl Tool {
 }
 
 /// A force on the sheet within the friction cone about −`normal`, and whether it was already inside.
-fn within_cone(force_n: DVec3, normal: DVec3, friction: f64) -> (bool, DVec3) {
+pub(super) fn within_cone(force_n: DVec3, normal: DVec3, friction: f64) -> (bool, DVec3) {
     let pressing_n = force_n.dot(normal) * normal;
     let across_n = force_n - pressing_n;
     let most_n = friction * pressing_n.length();
@@ -307,155 +314,21 @@ fn within_cone(force_n: DVec3, normal: DVec3, friction: f64) -> (bool, DVec3) {
     if length_n <= most_n { (true, force_n) } else { (false, pressing_n + across_n * (most_n / length_n)) }
 }
 
-impl<T: Real> Sheet<T> {
-    /// Makes position-controlled tools act at the end of a substep that ends at `fraction` of the step.
-    pub(super) fn meet(&mut self, fraction: f64) {
-        let Sheet { model, plan, bench, state, contacts, tiles, work, .. } = self;
-        let layout = &bench.layout;
-        for tool in &mut contacts.tools {
-            let (before_n, met) = (tool.steady_n, tool.standing != Standing::Free);
-            if before_n != DVec3::ZERO {
-                tiles.wake_under(tool.points());
-                push(model, plan, layout, state, &tool.footprint, before_n, plan.scheme.constant());
-            }
-            tool.force_n = tool.meet(model, plan, layout, state, fraction);
-            tool.steady_n = if met { tool.force_n } else { DVec3::ZERO };
-            if tool.force_n == DVec3::ZERO {
-                if before_n != DVec3::ZERO {
-                    // The tool has let go: undo the force of this substep.
-                    push(model, plan, layout, state, &tool.footprint, -before_n, plan.scheme.constant());
-                }
-                continue;
-            }
-            // Tiles that slept were at rest in this substep, as if they had been computed.
-            tiles.wake_under(tool.points());
-            push(model, plan, layout, state, &tool.footprint, tool.force_n - before_n, plan.scheme.kick());
-            work.add(tool.force_n.dot(movement_m(model, layout, state, &tool.footprint)));
-            tool.follow(model, layout, state, fraction);
-        }
-    }
-
-    /// The motion of a position-controlled tool and the force on it.
-    pub(super) fn feel(&self, number: usize) -> Option<Feel> {
-        let model = &self.model;
-        let tool = self.contacts.tools.iter().find(|tool| tool.number == number)?;
-        let (surface_m, _) =
-            tool.footprint.surface(|point| displacement_m(model, &self.bench.layout, &self.state, point));
-        let felt_n = match (tool.standing, tool.tip.coupling) {
-            (Standing::Free, _) => DVec3::ZERO,
-            (_, Coupling::Spring { .. }) => -tool.force_n,
-            (standing, Coupling::Constraint) => {
-                let felt_n = self.without_inertia(tool);
-                if standing == Standing::Holding {
-                    felt_n
-                } else if felt_n.dot(tool.normal) <= 0.0 {
-                    DVec3::ZERO
-                } else {
-                    within_cone(felt_n, tool.normal, tool.tip.friction).1
-                }
-            }
-        };
-        Some(Feel {
-            place_m: tool.from_m,
-            velocity_m_per_s: tool.velocity_m_per_s,
-            standing: tool.standing,
-            force_on_tool_n: felt_n,
-            surface_m,
-            anchor_m: tool.footprint.centre_m(),
-            normal: tool.normal,
-            friction: tool.tip.friction,
-        })
-    }
-
-    /// The disc of such a tool, if it touches or holds, and the displacements of the points around it.
-    pub(super) fn surroundings(&self, number: usize) -> Option<Surroundings> {
-        let tool = self.contacts.tools.iter().find(|tool| tool.number == number)?;
-        if tool.standing == Standing::Free {
-            return None;
-        }
-        let window = Window::around(&self.model, &tool.footprint);
-        // Without memory for it, the stiffness of the force law has to do.
-        memory::check(window.bytes(), "the stiffness under a tool").ok()?;
-        let displacement =
-            |index: usize| displacement_m(&self.model, &self.bench.layout, &self.state, self.model.point_of(index));
-        let displacement_m = window.points(&self.model).map(displacement).collect();
-        Some(Surroundings { model: self.model.clone(), footprint: tool.footprint.clone(), window, displacement_m })
-    }
-
-    /// Σ w·f/Σ w², where f is the force of springs, virtual springs, damping and force-controlled tools.
-    fn without_inertia(&self, tool: &Tool) -> DVec3 {
-        let (model, footprint) = (&self.model, &tool.footprint);
-        let scene = &model.scene;
-        let mut sum = DVec3::ZERO;
-        for Reached { point, weight, .. } in footprint.reached().iter().copied().filter(|point| point.free) {
-            let index = model.index_of(point);
-            let applied_n = if self.steps == 0 { DVec3::ZERO } else { self.applied.until(model, index) };
-            let [u, v, spring_n] = self.free_point(index, applied_n);
-            sum += weight * (spring_n - scene.virtual_stiffness_n_per_m * u - scene.damping_n_s_per_m * v + applied_n);
-        }
-        if footprint.mobility() > 0.0 { sum / footprint.mobility() } else { DVec3::ZERO }
-    }
-}
-
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::sheet::Tissue;
-
-    fn sheet(sets: &[&str]) -> Sheet<f64> {
-        let always = ["stepping.precision=f64", "stepping.integrator=central", "stepping.substeps=1"];
-        Sheet::new(&Model::paper(&[&always[..], &["sheet.points=[9, 9]", "sleep.tolerance=0.0"], sets].concat()))
-    }
 
     #[test]
     fn within_a_step_a_tool_moves_straight_and_ends_where_it_is_told_to() {
-        let (sheet, mut contacts) = (sheet(&[]), Contacts::default());
+        let (model, mut contacts) = (Model::paper(&["sheet.points=[9, 9]"]), Contacts::default());
         let [from_m, to_m] = [DVec3::new(0.1, 0.12, 0.01), DVec3::new(0.1007, 0.1193, 0.0087)];
-        contacts.lead(&sheet.model, 3, from_m, Tip::default());
+        contacts.lead(&model, 3, from_m, Tip::default());
         contacts.finish(1000.0);
-        contacts.lead(&sheet.model, 3, to_m, Tip::default());
+        contacts.lead(&model, 3, to_m, Tip::default());
         for fraction in [0.0, 0.25, 0.8] {
             let expected_m = from_m + fraction * (to_m - from_m);
             assert!(contacts.tools[0].place_m(fraction).distance(expected_m) < 1e-15, "{fraction}");
         }
         assert_eq!(contacts.tools[0].place_m(1.0), to_m);
-    }
-
-    #[test]
-    fn a_coupling_pulls_with_its_spring_and_its_damper() {
-        // Points so heavy that they hardly move.
-        let mut sheet = sheet(&["sheet.point_mass_kg=1000"]);
-        let coupling = Coupling::Spring { stiffness_n_per_m: 100.0, damping_n_s_per_m: 3.0 };
-        let tip = Tip { radius_m: 0.03, grasps: true, coupling, ..Tip::default() };
-        let (held_m, step_m) = (DVec3::new(0.13, 0.12, 0.0), DVec3::new(2e-4, -1e-4, 5e-4));
-        sheet.lead(0, held_m, tip);
-        sheet.step().unwrap();
-        for step in 1..=10 {
-            sheet.lead(0, held_m + f64::from(step) * step_m, tip);
-            sheet.step().unwrap();
-            let expected_n = -(100.0 * f64::from(step) * step_m + 3.0 * step_m * 1000.0);
-            let felt_n = sheet.feel(0).unwrap().force_on_tool_n;
-            assert!(felt_n.distance(expected_n) < 1e-3 * expected_n.length(), "{step}: {felt_n} {expected_n}");
-        }
-    }
-
-    #[test]
-    fn a_disc_on_fixed_points_alone_exerts_no_force() {
-        for coupling in [Coupling::Constraint, Coupling::Spring { stiffness_n_per_m: 100.0, damping_n_s_per_m: 1.0 }] {
-            for grasps in [false, true] {
-                let mut sheet = sheet(&["sheet.fixed=[[3, 3], [3, 4], [4, 3], [4, 4]]"]);
-                let spacing_m = sheet.model.scene.sheet.spacing_m;
-                // In the middle of a cell, smaller than it: its four corners alone are under the disc.
-                let place_m = DVec3::new(3.5, 3.5, 0.0) * spacing_m;
-                let tip = Tip { radius_m: 0.1 * spacing_m, grasps, coupling, ..Tip::default() };
-                for step in 0..20 {
-                    sheet.lead(0, place_m - 1e-3 * f64::from(step) * DVec3::Z, tip);
-                    sheet.step().unwrap();
-                    assert_eq!(sheet.feel(0).unwrap().force_on_tool_n, DVec3::ZERO, "{tip:?}");
-                }
-                assert_eq!(sheet.largest_displacement_m(), 0.0);
-            }
-        }
     }
 }

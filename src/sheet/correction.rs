@@ -3,15 +3,15 @@
 //! It is an input like a change of tissue: a recorded correction, applied at the same step, gives the same bits.
 
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
 use super::audit::{Finding, Origin};
 use super::choice::{self, Choice};
+use super::integrate::entry;
 use super::model::Model;
 use crate::limits::Limits;
 use crate::refusal::Result;
 use crate::scene::record::Correction;
-use crate::scene::{Integrator, Precision, Scene, Stepping};
+use crate::scene::{Integrator, Precision, Stepping};
 
 /// A correction aims at this part of the tolerance, so that the next window is not just above it again.
 const AIM: f64 = 0.5;
@@ -34,7 +34,7 @@ impl Model {
         };
         match origin {
             Origin::Substep => {
-                let factor = libm::pow(excess, choice::order(self.plan.integrator).recip());
+                let factor = libm::pow(excess, entry(self.plan.integrator).order.recip());
                 let needed = (f64::from(correction.substeps) * factor).ceil();
                 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
                 let needed = needed.max(f64::from(correction.substeps + 1)) as u32;
@@ -50,7 +50,9 @@ impl Model {
             Origin::Rounding => {
                 correction.precision = match self.precision {
                     Precision::F64 => return None,
-                    Precision::F32 | Precision::Auto if self.plan.integrator.is_exponential() => Precision::Compensated,
+                    Precision::F32 | Precision::Auto if entry(self.plan.integrator).compensates => {
+                        Precision::Compensated
+                    }
                     Precision::F32 | Precision::Auto | Precision::Compensated => Precision::F64,
                 };
             }
@@ -71,7 +73,7 @@ impl Model {
             Stepping { integrator: Integrator::Auto, substeps: None, precision: self.precision, ..stepping.clone() };
         let choice = choice::choose(&open, limits, &choice::NEVER).ok()?.0;
         let keeps = choice.expected_error <= stepping.tolerance && choice.substeps < needed;
-        let fits = self.precision != Precision::Compensated || choice.integrator.is_exponential();
+        let fits = self.precision != Precision::Compensated || entry(choice.integrator).compensates;
         (keeps && fits && choice.integrator != self.plan.integrator).then_some(choice)
     }
 
@@ -89,22 +91,6 @@ impl Model {
         // Keep the request; the plan and the format in force change.
         model.scene.stepping = self.scene.stepping.clone();
         Ok(Arc::new(model))
-    }
-
-    /// Compiles another tissue from this one's scene, with the scheme and at least the substeps of the correction in
-    /// force.
-    pub(super) fn compile_corrected(&self, scene: &Scene, limits: &Limits, stop: &AtomicBool) -> Result<Self> {
-        let Some((integrator, least)) = self.corrected else {
-            return Ok(Arc::unwrap_or_clone(Model::compile_until(scene, limits, stop)?));
-        };
-        let mut scene = scene.clone();
-        (scene.stepping.integrator, scene.stepping.substeps) = (integrator, None);
-        let mut model = Model::compile_until(&scene, limits, stop)?;
-        if model.plan.substeps < least {
-            scene.stepping.substeps = Some(least);
-            model = Model::compile_until(&scene, limits, stop)?;
-        }
-        Ok(Model { corrected: self.corrected, ..Arc::unwrap_or_clone(model) })
     }
 }
 

@@ -3,7 +3,9 @@
 
 use glam::{DVec2, DVec3};
 
-use super::{Model, Push, Real, Sheet, Tissue};
+use super::motion::Sheet;
+use super::real::Real;
+use super::{Model, Push, Tissue};
 use crate::limits::Limits;
 use crate::scene::law::Poke;
 use crate::scene::{PAPER, Scene};

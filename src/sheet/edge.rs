@@ -9,9 +9,9 @@
 #![allow(clippy::needless_range_loop)]
 
 use super::field::{BLOCK, Layout};
+use super::grid::{Grid, difference, excess, load};
 use super::lanes::Vector;
 use super::springs::Springs;
-use super::sweep::{Stage, Sweep, difference, excess, load};
 
 /// The forces of the column to the left of a strip on its first column, for as many rows at a time as a vector has
 /// lanes.
@@ -33,12 +33,12 @@ impl<V: Vector> Edge<V> {
     /// # Safety
     /// As for `Sweep::rows`; `column` is not 0.
     #[inline(always)]
-    pub(super) unsafe fn new<S: Stage<V::Real>>(sweep: &Sweep<'_, V::Real, S>, column: usize, row: usize) -> Self {
-        let Layout { stride, plane, .. } = sweep.layout;
-        debug_assert!((1..=stride).contains(&column) && sweep.layout.holds(stride + column - 1, 1));
+    pub(super) unsafe fn new(grid: &Grid<'_, V::Real>, column: usize, row: usize) -> Self {
+        let Layout { stride, plane, .. } = grid.layout;
+        debug_assert!((1..=stride).contains(&column) && grid.layout.holds(stride + column - 1, 1));
         // SAFETY: the caller's promise: the processor has the instructions, and the carry has a second row.
         let leaves = unsafe {
-            let left = sweep.carry.add(stride + column - 1);
+            let left = grid.carry.add(stride + column - 1);
             [V::of(*left), V::of(*left.add(plane)), V::of(*left.add(2 * plane))]
         };
         Edge { column, from: row, to: row, across: [[V::Real::default(); BLOCK]; 3], leaves }
@@ -49,27 +49,27 @@ impl<V: Vector> Edge<V> {
     /// # Safety
     /// As for `Sweep::rows`; the strip's rows from `i` on have not been advanced.
     #[inline(always)]
-    pub(super) unsafe fn left_of<S: Stage<V::Real>>(&mut self, sweep: &Sweep<'_, V::Real, S>, i: usize) -> [V; 3] {
+    pub(super) unsafe fn left_of(&mut self, grid: &Grid<'_, V::Real>, i: usize) -> [V; 3] {
         if i == self.to {
             // SAFETY: the caller's promise.
-            unsafe { self.evaluate(sweep, i) };
+            unsafe { self.evaluate(grid, i) };
         }
         let (k, proof) = (i - self.from, self.leaves[0]);
         [proof.splat(self.across[0][k]), proof.splat(self.across[1][k]), proof.splat(self.across[2][k])]
     }
 
     #[inline(always)]
-    unsafe fn evaluate<S: Stage<V::Real>>(&mut self, sweep: &Sweep<'_, V::Real, S>, row: usize) {
-        let Layout { rows, stride, plane, .. } = sweep.layout;
-        let Springs { structural, shear, .. } = sweep.springs;
+    unsafe fn evaluate(&mut self, grid: &Grid<'_, V::Real>, row: usize) {
+        let Layout { rows, stride, plane, .. } = grid.layout;
+        let Springs { structural, shear, .. } = grid.springs;
         // Three components of both columns, and one extra row. Values below the sheet are not used.
         const LONG: usize = BLOCK + 1;
         let mut columns = [[V::Real::default(); 3 * LONG]; 2];
         for k in 0..=V::LANES {
             // SAFETY: the caller's promise: a row beyond the last can be read.
             let place = (row + k).min(rows) * stride + self.column - 1;
-            debug_assert!(sweep.layout.holds(place, 2));
-            let at = unsafe { sweep.x.add(place) };
+            debug_assert!(grid.layout.holds(place, 2));
+            let at = unsafe { grid.x.add(place) };
             for c in 0..3 {
                 // SAFETY: as above.
                 unsafe {
@@ -110,14 +110,14 @@ impl<V: Vector> Edge<V> {
     /// # Safety
     /// As for `Sweep::rows`.
     #[inline(always)]
-    pub(super) unsafe fn leave<S: Stage<V::Real>>(&self, sweep: &Sweep<'_, V::Real, S>, end: usize) {
-        let Layout { stride, plane, .. } = sweep.layout;
+    pub(super) unsafe fn leave(&self, grid: &Grid<'_, V::Real>, end: usize) {
+        let Layout { stride, plane, .. } = grid.layout;
         for c in 0..3 {
             let mut leaves = [V::Real::default(); BLOCK];
             // SAFETY: a block is as long as the widest vector; the carry has a second row.
             unsafe {
                 self.leaves[c].store(leaves.as_mut_ptr());
-                *sweep.carry.add(stride + c * plane + self.column - 1) = leaves[end - 1 - self.from];
+                *grid.carry.add(stride + c * plane + self.column - 1) = leaves[end - 1 - self.from];
             }
         }
     }

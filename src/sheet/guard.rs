@@ -10,29 +10,22 @@
 //! substep; observers never see time go back. It keeps the shorter substep. After [`MOST_HALVINGS`] halvings it gives
 //! up, at the checkpoint.
 
-use std::fmt;
 use std::sync::Arc;
 
-use glam::DVec3;
-
-use super::applied::{Applied, Push};
-use super::contact::Contacts;
+use super::applied::Applied;
+pub use super::checkpoint::{Cause, MARGIN};
+use super::checkpoint::{Checkpoint, Input, Work};
 use super::field::{Field, Layout, State};
-use super::integrate::Scheme;
 use super::model::{Model, Plan};
-use super::prescribed::{Grasp, Prescribed};
+use super::motion::{Sheet, springs_of};
 use super::real::Real;
 use super::springs::Springs;
 use super::survey::Survey;
-use super::{BlowUp, Sheet, springs_of};
+use super::tissue::BlowUp;
 use crate::memory;
-use crate::scene::tip::Tip;
 
 /// Substeps between two surveys.
 pub const INTERVAL_SUBSTEPS: u64 = 256;
-
-/// Tolerance of the energy balance, as a fraction of energy and of work: errors of the schemes at the stability bound.
-pub const MARGIN: f64 = 0.05;
 
 /// Largest error of a prediction, as a fraction of the largest displacement.
 pub const MOST_SURPRISE: f64 = 0.5;
@@ -43,111 +36,9 @@ pub const MOST_HALVINGS: u32 = 4;
 /// Most inputs kept since the last checkpoint. More bring the next checkpoint forward.
 pub(super) const MOST_INPUTS: usize = 1024;
 
-/// Why the guard gave up.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Cause {
-    /// A point is not finite, or is displaced by a billion times the sheet's size.
-    NotFinite {
-        /// The point.
-        point: [usize; 2],
-    },
-    /// Energy from nowhere.
-    Energy {
-        /// Energy of springs, virtual springs and motion, J.
-        energy_j: f64,
-        /// That energy at the last survey, J.
-        before_j: f64,
-        /// Work of all tools since, J.
-        work_j: f64,
-    },
-    /// The springs' force is far from its prediction.
-    Surprise {
-        /// The resulting difference of a displacement, as a fraction of the largest.
-        part: f64,
-    },
-}
-
-impl fmt::Display for Cause {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Cause::NotFinite { point: [i, j] } => {
-                write!(f, "point [{i}, {j}] was not finite (or a billion sheets away)")
-            }
-            Cause::Energy { energy_j, before_j, work_j } => {
-                write!(
-                    f,
-                    "the energy rose from {before_j:.3e} J to {energy_j:.3e} J, while the tools did {work_j:.3e} J of work"
-                )
-            }
-            Cause::Surprise { part } => {
-                write!(f, "the springs' force was far from its prediction, by {part:.1e} of the largest displacement")
-            }
-        }
-    }
-}
-
-/// An input of a tool.
-#[derive(Debug, Clone)]
-pub(super) enum Input {
-    Push(Option<Push>),
-    Grasp(usize, Grasp),
-    Lead(DVec3, Tip),
-}
-
-/// The complete state that a sheet goes back to.
-#[derive(Debug)]
-pub(super) struct Checkpoint<T: Real> {
-    pub(super) steps: u64,
-    pub(super) halvings: u32,
-    pub(super) state: State<T>,
-    pub(super) applied: Applied<T>,
-    pub(super) prescribed: Prescribed,
-    pub(super) contacts: Contacts,
-    pub(super) work: Work,
-    /// The recent largest displacement, spacings. Sleep is relative to it.
-    pub(super) largest: f64,
-    /// Whether the motion that led here has passed the checks, under the present tissue.
-    pub(super) believed: bool,
-}
-
-/// Work of the tools, J, and energies at the last survey.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(super) struct Work {
-    /// Work since the last survey, plus what its `present_j` subtracted.
-    done_j: f64,
-    /// Energy at the last survey.
-    energy_j: f64,
-    /// The largest energy at any survey.
-    largest_j: f64,
-}
-
 /// A rise of energy below this fraction of the largest so far is rounding noise in a sheet that has come to rest. So is
 /// a rise below the square of ten times the error that sleeping tiles may have.
 const NOISE: f64 = 1e-10;
-
-impl Work {
-    /// Adds work.
-    pub(super) fn add(&mut self, work_j: f64) {
-        self.done_j += work_j;
-    }
-
-    /// An account that begins with the given energy.
-    pub(super) fn begun(energy_j: f64, present_j: f64) -> Self {
-        Work { done_j: present_j, energy_j, largest_j: energy_j }
-    }
-
-    /// Checks an energy; a rise by `noise` of the largest does not count. `present_j` is subtracted from the work so
-    /// far and belongs to the next interval. The account begins anew.
-    pub(super) fn survey(&mut self, energy_j: f64, present_j: f64, noise: f64) -> Result<(), Cause> {
-        let (work_j, before_j) = (self.done_j - present_j, self.energy_j);
-        let allowed_j = work_j + MARGIN * (before_j + work_j.abs()) + noise * self.largest_j;
-        if energy_j - before_j > allowed_j {
-            return Err(Cause::Energy { energy_j, before_j, work_j });
-        }
-        *self = Work { done_j: present_j, energy_j, largest_j: self.largest_j.max(energy_j) };
-        Ok(())
-    }
-}
 
 impl<T: Real> Sheet<T> {
     /// Returns the cause of a failure, if there is one. Checks in every step that all is finite; the full check is
@@ -221,9 +112,7 @@ impl<T: Real> Sheet<T> {
         self.checkpoint = None;
         self.watch.give_up();
         self.inputs.clear();
-        if let Scheme::Multistep(multistep) = &self.plan.scheme {
-            self.state.share_history(multistep.order);
-        }
+        self.state.share_history(self.plan.scheme.history());
     }
 
     /// Goes back to the checkpoint, with the substep of `halvings`.
@@ -331,51 +220,26 @@ pub(super) fn convert<T: Real>(
         let pushed = applied.force_at(layout, 0, [index / layout.columns, index % layout.columns]);
         for (c, n) in force.iter().enumerate() {
             let at = c * layout.plane + layout.place(index);
-            let (u, d, n) = (state.u[at].wide(), state.d[at].wide(), n.wide());
-            match (&from.scheme, &to.scheme) {
-                (Scheme::TwoStep(two), _) => {
-                    // d = v·dt − ½·acceleration·dt², at the time of u.
-                    let acceleration = (two.p - 1.0) * d - two.q * two.a * u + n + pushed[c];
-                    let velocity = d + 0.5 * acceleration;
-                    state.d[at] = T::of(velocity * ratio - 0.5 * acceleration * ratio * ratio);
-                }
-                (Scheme::Multistep(old), Scheme::Multistep(new)) => {
-                    let history = state.history(n, old.order, at);
-                    let [du, dw] = old.correction.map(|weight| weight * old.surprise(&history));
-                    #[allow(clippy::cast_precision_loss)]
-                    let shorter: Vec<f64> =
-                        (0..history.len()).map(|i| ratio * ratio * through(&history, -(i as f64) * ratio)).collect();
-                    let foretold = new.correction.map(|weight| weight * new.surprise(&shorter));
-                    state.u[at] = T::of(u + du - foretold[0]);
-                    state.d[at] = T::of((d + dw) * ratio - foretold[1]);
-                    for (field, value) in state.kept.iter_mut().zip(&shorter[1..]) {
-                        Arc::make_mut(field)[at] = T::of(*value);
-                    }
-                }
-                _ => state.d[at] = T::of(d * ratio),
+            let mut history = state.history(n.wide(), from.scheme.history(), at);
+            let now = [state.u[at].wide(), state.d[at].wide()];
+            let [u, d] = from.scheme.resample(&to.scheme, ratio, now, pushed[c], &mut history);
+            (state.u[at], state.d[at]) = (T::of(u), T::of(d));
+            for (field, value) in state.kept.iter_mut().zip(&history[1..]) {
+                Arc::make_mut(field)[at] = T::of(*value);
             }
         }
     }
 }
 
-/// The value at `s` of the polynomial that is `values[i]` at −i.
-#[allow(clippy::cast_precision_loss)]
-fn through(values: &[f64], s: f64) -> f64 {
-    let weight = |i: usize| -> f64 {
-        let others = (0..values.len()).filter(|j| *j != i);
-        others.map(|j| (s + j as f64) / (j as f64 - i as f64)).product()
-    };
-    values.iter().enumerate().map(|(i, value)| value * weight(i)).sum()
-}
-
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use glam::DVec2;
+    use glam::{DVec2, DVec3};
 
     use super::*;
     use crate::scene::law::Poke;
-    use crate::sheet::Tissue;
+    use crate::sheet::integrate::Scheme;
+    use crate::sheet::{Push, Tissue};
 
     fn sheet(integrator: &str) -> Sheet<f64> {
         sheet_with(integrator, &[])
@@ -435,37 +299,11 @@ mod tests {
     }
 
     #[test]
-    fn a_polynomial_goes_through_its_values_and_between() {
-        let cube = |s: f64| 2.0 - s + 0.5 * s * s - 0.25 * s * s * s;
-        let values = [0.0, -1.0, -2.0, -3.0].map(cube);
-        for s in [0.0, -1.0, -3.0, -0.5, -2.25, 0.7] {
-            assert!((through(&values, s) - cube(s)).abs() < 1e-12, "{s}");
-        }
-    }
-
-    #[test]
     fn central_differences_show_the_same_velocity_with_half_the_substep_to_the_last_digits() {
         let (as_it_was, mut halved) = (sheet("central"), sheet("central"));
         halved.halve(0, 1);
         let now = apart(&as_it_was, &halved);
         assert!(now.iter().all(|part| *part < 1e-9), "{now:?}");
-    }
-
-    #[test]
-    fn energy_comes_from_work_alone() {
-        let begun = Work::begun(1.0, 0.0);
-        // Up to the margin.
-        assert_eq!({ begun }.survey(1.04, 0.0, 0.0), Ok(()));
-        let found = Cause::Energy { energy_j: 1.2, before_j: 1.0, work_j: 0.0 };
-        assert_eq!({ begun }.survey(1.2, 0.0, 0.0), Err(found));
-        let mut worked = begun;
-        worked.add(0.25);
-        // Work that belongs to the next interval does not count in this one.
-        assert!({ worked }.survey(1.25, 0.2, 0.0).is_err());
-        assert_eq!(worked.survey(1.2, 0.05, 0.0), Ok(()));
-        assert_eq!(worked, Work { done_j: 0.05, energy_j: 1.2, largest_j: 1.2 });
-        // It goes as it likes.
-        assert_eq!(worked.survey(0.01, 0.0, 0.0), Ok(()));
     }
 
     #[test]
@@ -526,9 +364,14 @@ mod tests {
         for integrator in ["exponential2", "exponential3", "exponential4"] {
             let mut sheet = sheet(integrator);
             sheet.steps = 64;
-            let Scheme::Multistep(multistep) = &sheet.plan.scheme else { panic!("{integrator} keeps a history") };
+            let weight = match &sheet.plan.scheme {
+                Scheme::Exponential2(multistep) => multistep.correction[0] * multistep.extrapolation[0],
+                Scheme::Exponential3(multistep) => multistep.correction[0] * multistep.extrapolation[0],
+                Scheme::Exponential4(multistep) => multistep.correction[0] * multistep.extrapolation[0],
+                Scheme::TwoStep(_) | Scheme::Rk4(_) => panic!("{integrator} keeps a history"),
+            };
             // A force of the past that moves the point by 5 spacings.
-            let past = 5.0 / (multistep.correction[0] * multistep.extrapolation[0]);
+            let past = 5.0 / weight;
             let place = sheet.bench.layout.place(31);
             Arc::make_mut(&mut sheet.state.kept[0])[place] += past;
             assert!(matches!(sheet.check(), Err(Cause::Surprise { .. })), "{integrator}");

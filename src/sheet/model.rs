@@ -1,16 +1,9 @@
-//! What of a sheet never changes: compiled from a scene once, checked once, shared by all who read it.
+//! The immutable half of a sheet: its scene, its points, and the scheme with its substep.
 
-use std::collections::VecDeque;
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
-
-use super::choice::{self, Choice};
 use super::field::{BLOCK, Layout};
 use super::integrate::{Node, Oscillator, Scheme};
-use super::{lanes, stability};
-use crate::limits::Limits;
-use crate::refusal::{Reason, Refusal, Result};
-use crate::scene::{Change, Integrator, Lanes, Named, Precision, Scene};
+use super::stability;
+use crate::scene::{Integrator, Lanes, Precision, Scene};
 
 /// The immutable half of a sheet.
 #[derive(Debug, Clone)]
@@ -40,9 +33,6 @@ pub struct Model {
     /// Points × substeps of the rehearsals by which it was chosen: at most `limits.rehearsal_work`.
     pub rehearsed: u64,
 }
-
-/// What sleeping tiles may add to the error, by default, as a part of it.
-const SLEEP_PART: f64 = 0.1;
 
 /// A scheme with its substep.
 #[derive(Debug, Clone, PartialEq)]
@@ -101,77 +91,6 @@ impl Oscillator {
 }
 
 impl Model {
-    /// Compiles a scene, after checking it.
-    pub fn compile(scene: &Scene, limits: &Limits) -> Result<Arc<Self>> {
-        Model::compile_until(scene, limits, &choice::NEVER)
-    }
-
-    /// The same, given up when `stop` is set.
-    pub fn compile_until(scene: &Scene, limits: &Limits, stop: &AtomicBool) -> Result<Arc<Self>> {
-        scene.check(limits)?;
-        let sheet = Oscillator::of(scene);
-        let step_s = scene.stepping.rate_hz.recip();
-        let too_many = |substeps: u32| {
-            let message = format!(
-                "would need {substeps} substeps a step for stability, above the limit of {}: the springs are too stiff \
-                 for points so light at this rate",
-                limits.substeps
-            );
-            Refusal::new(Reason::TooLarge, "stepping.substeps", message)
-        };
-        // Nothing is rehearsed that no scheme could do.
-        let least = choice::least_substeps(scene.stepping.integrator, step_s, &sheet);
-        if scene.stepping.substeps.is_none() && least > limits.substeps {
-            return Err(too_many(least));
-        }
-        let (choice, rehearsed) = choice::choose(scene, limits, stop)?;
-        let Choice { integrator, substeps, precision, expected_error } = choice;
-        if precision == Precision::Compensated && !integrator.is_exponential() {
-            let message = format!("is for exponential schemes; `{}` has f32 and f64", integrator.name());
-            return Err(Refusal::new(Reason::WrongKind, "stepping.precision", message));
-        }
-        if substeps > limits.substeps {
-            return Err(too_many(substeps));
-        }
-        let plan = Plan::new(integrator, substeps, step_s, &sheet);
-        let omega_bound_per_s = sheet.omega_bound_per_s();
-        let mut warnings = Vec::new();
-        if !plan.stable {
-            warnings.push(format!(
-                "stepping.substeps: {} is above the stability bound of the scheme; the sheet may blow up \
-                 (substep × fastest vibration = {:.3})",
-                plan.substeps,
-                plan.substep_s * omega_bound_per_s
-            ));
-        }
-        if expected_error > scene.stepping.tolerance {
-            let expected = if expected_error.is_finite() {
-                format!("an error of {expected_error:.1e} is expected, above")
-            } else {
-                "nothing is known of the error, which may be above".to_owned()
-            };
-            warnings.push(format!(
-                "stepping.tolerance: {expected} the {:.1e} asked for; leave integrator, substeps and precision to `auto`, \
-                 or raise the limit of substeps",
-                scene.stepping.tolerance
-            ));
-        }
-        let Some(lanes) = lanes::available(scene.stepping.lanes) else {
-            let message = format!("this machine's processor has no `{}`", scene.stepping.lanes.name());
-            return Err(Refusal::new(Reason::NotAvailable, "stepping.lanes", message));
-        };
-        let sleep_tolerance = scene.sleep_tolerance.unwrap_or_else(|| {
-            // Who chooses the scheme may want it better than the tolerance.
-            let chosen = scene.stepping.integrator != Integrator::Auto || scene.stepping.substeps.is_some();
-            SLEEP_PART * if chosen { expected_error.min(scene.stepping.tolerance) } else { scene.stepping.tolerance }
-        });
-        let mut scene = scene.clone();
-        (scene.damping_n_s_per_m, scene.virtual_stiffness_n_per_m) =
-            (sheet.damping_n_s_per_m, sheet.virtual_stiffness_n_per_m);
-        let model = Model::planned(scene, plan, precision, lanes);
-        Ok(Arc::new(Model { expected_error, sleep_tolerance, warnings, rehearsed, ..model }))
-    }
-
     /// Of a scene with a scheme that somebody else has chosen: nothing is checked, nothing expected, nothing sleeps.
     pub(super) fn planned(scene: Scene, plan: Plan, precision: Precision, lanes: Lanes) -> Self {
         Model {
@@ -190,64 +109,11 @@ impl Model {
         }
     }
 
-    /// The same sheet with another tissue: integrator and substeps as its tolerance asks for, in the number format that a
-    /// state of this model has. `first` is the scene that the session began with.
-    pub fn changed(&self, change: &Change, first: &Scene, limits: &Limits) -> Result<Arc<Self>> {
-        self.changed_until(change, first, limits, &choice::NEVER)
-    }
-
-    /// The same, given up when `stop` is set.
-    pub fn changed_until(
-        &self,
-        change: &Change,
-        first: &Scene,
-        limits: &Limits,
-        stop: &AtomicBool,
-    ) -> Result<Arc<Self>> {
-        if *change == Change::default() {
-            return Err(Refusal::new(Reason::Missing, "", Change::NOTHING));
-        }
-        let asked = self.scene.stepping.clone();
-        let mut scene = self.scene.changed(change, first);
-        scene.stepping.precision = self.precision;
-        // Compensated is f32 and what its rounding lost: where no exponential scheme will do, f32 goes on alone.
-        let compiled = self.compile_corrected(&scene, limits, stop).or_else(|refusal| {
-            if self.precision != Precision::Compensated || refusal.field != "stepping.precision" {
-                return Err(refusal);
-            }
-            scene.stepping.precision = Precision::F32;
-            self.compile_corrected(&scene, limits, stop)
-        });
-        let mut model = compiled?;
-        model.scene.stepping = asked;
-        Ok(Arc::new(model))
-    }
-
-    /// What a script's changes make of this, each out of the one before it.
-    pub fn course(self: &Arc<Self>, changes: &[(u64, Change)], limits: &Limits) -> Result<VecDeque<(u64, Arc<Self>)>> {
-        self.course_of(&self.scene, changes, limits)
-    }
-
-    /// The same for a session that began with the scene `first`.
-    pub fn course_of(
-        self: &Arc<Self>,
-        first: &Scene,
-        changes: &[(u64, Change)],
-        limits: &Limits,
-    ) -> Result<VecDeque<(u64, Arc<Self>)>> {
-        let mut newest = self.clone();
-        let compiled = changes.iter().map(|(step, change)| {
-            newest = newest.changed(change, first, limits)?;
-            Ok((*step, newest.clone()))
-        });
-        compiled.collect()
-    }
-
-    /// The processor time that a step is expected to take while all of the sheet moves, s.
-    #[allow(clippy::cast_precision_loss)]
-    pub fn predicted_step_s(&self) -> f64 {
-        let point_ns = choice::point_substep_ns(self.plan.integrator, self.precision, self.lanes);
-        1e-9 * (choice::STEP_NS + point_ns * self.swept_points() as f64 * f64::from(self.plan.substeps))
+    /// The tolerance of the sheet's tiles. Without virtual springs nothing bounds how far an omitted force would move a
+    /// sheet, so then only what does not move at all may sleep.
+    pub(super) fn tile_tolerance(&self) -> f64 {
+        let bounded = self.scene.virtual_stiffness_n_per_m > 0.0;
+        if bounded { self.sleep_tolerance } else { self.sleep_tolerance.min(f64::MIN_POSITIVE) }
     }
 
     /// What the model itself takes, bytes.
@@ -302,29 +168,13 @@ impl Model {
 }
 
 #[cfg(test)]
-impl Model {
-    /// Of the paper's scene, with some values set: for tests.
-    pub(crate) fn paper(sets: &[&str]) -> Arc<Self> {
-        let (limits, sets) = (Limits::default(), sets.iter().map(|text| (*text).to_owned()).collect::<Vec<_>>());
-        Model::compile(&Scene::parse("paper", crate::scene::PAPER, &sets, &limits).unwrap(), &limits).unwrap()
-    }
-}
-
-#[cfg(test)]
 mod tests {
-    use super::*;
-    use crate::scene::law::Poke;
+    use std::sync::Arc;
 
-    #[test]
-    fn a_zero_has_no_sign() {
-        let compile = |zero: &str| {
-            let keys = ["damping.coefficient_n_s_per_m", "virtual_springs.stiffness_n_per_m"];
-            Model::paper(&keys.map(|key| format!("{key}={zero}")).each_ref().map(String::as_str))
-        };
-        let (negative, positive) = (compile("-0.0"), compile("0.0"));
-        assert_eq!((&negative.plan, negative.expected_error), (&positive.plan, positive.expected_error));
-        assert!(negative.scene.damping_n_s_per_m.is_sign_positive());
-    }
+    use super::*;
+    use crate::limits::Limits;
+    use crate::scene::law::Poke;
+    use crate::sheet::lanes;
 
     /// Small, and without a rehearsal: for machines that are emulated, and for memcheck.
     #[test]
@@ -368,17 +218,6 @@ mod tests {
         "83a4672a09aa9fcfbccb48193d6e98c8",
         "d8f80cac7b2adfaa3508266eae6561de",
     ];
-
-    #[test]
-    fn an_error_above_the_tolerance_is_warned_of() {
-        let warns = |sets: &[&str]| {
-            let model = Model::paper(&[&["sheet.points=[5, 5]"][..], sets].concat());
-            let is_above = model.expected_error > model.scene.stepping.tolerance;
-            (is_above, model.warnings.iter().any(|warning| warning.starts_with("stepping.tolerance: ")))
-        };
-        assert_eq!(warns(&[]), (false, false));
-        assert_eq!(warns(&["stepping.integrator=lagged", "stepping.substeps=1"]), (true, true));
-    }
 
     #[test]
     fn numbers_and_grid_places_of_points_belong_to_each_other() {

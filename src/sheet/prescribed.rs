@@ -2,11 +2,8 @@
 
 use glam::DVec3;
 
-use super::Sheet;
-use super::integrate::Scheme;
 use super::model::Model;
-use super::real::Real;
-use crate::scene::law::{Moment, Motion, MoveLaw};
+use crate::scene::law::{Motion, MoveLaw};
 
 /// How a tool moves its grasped point.
 #[derive(Debug, Clone, PartialEq)]
@@ -130,68 +127,5 @@ impl Prescribed {
     pub(super) fn motion(&self, model: &Model, index: usize) -> Option<Motion> {
         let fixed = || model.fixed.binary_search(&index).is_ok().then(Motion::default);
         self.grasped.iter().find(|g| g.index == index).map(|g| g.now).or_else(fixed)
-    }
-}
-
-impl<T: Real> Sheet<T> {
-    /// Puts the grasped points at their places at `fraction` of the step, and counts the work if `counted`.
-    pub(super) fn hold(&mut self, step: u64, fraction: f64, counted: bool) {
-        let unit_j = self.unit_of_work_j();
-        let Sheet { model, plan, bench, state, prescribed, work, .. } = self;
-        let spacing_m = model.scene.sheet.spacing_m;
-        for (index, displacement_m, velocity_m_per_s) in prescribed.at(model, step, fraction) {
-            let mut product = 0.0;
-            for c in 0..3 {
-                let at = c * bench.layout.plane + bench.layout.place(index);
-                let (free_u, free_d) = (state.u[at], state.d[at]);
-                state.u[at] = T::of(displacement_m[c] / spacing_m);
-                state.d[at] = if plan.scheme.takes_means() {
-                    // Undo the scheme's own movement: the increment starts from where the point was before.
-                    state.u[at] - (free_u - free_d)
-                } else {
-                    T::of(velocity_m_per_s[c] * plan.substep_s / spacing_m)
-                };
-                product += (state.d[at].wide() - free_d.wide()) * state.d[at].wide();
-            }
-            if counted {
-                work.add(product * unit_j);
-            }
-        }
-    }
-
-    /// The change of u and d of a point that is released with `velocity`, so that it continues smoothly.
-    ///
-    /// For a two-step scheme, a release is a jump: before it the whole force on the point without damping was m·a + C·v
-    /// with the tool's a and v; after it, the force is F = spring + applied − K″·u. At a jump such a scheme needs the
-    /// mean of both (see `applied`), and it uses F with the mean of the applied force. The tool moved at constant
-    /// velocity, so a = 0: the point gets ½(C·v + F) less that. In terms of the increment, this is q times the
-    /// difference.
-    ///
-    /// For a multistep scheme, u and d are predictions that the next substep corrects. The tool's values are already
-    /// right, so the correction is subtracted.
-    pub(super) fn change_at_release(&self, index: usize, velocity_m_per_s: DVec3, moment: Moment) -> [[f64; 2]; 3] {
-        let Sheet { model, plan, bench, state, applied, .. } = self;
-        let springs = bench.springs.gather(&bench.layout, &state.u, model.point_of(index)).map(Real::wide);
-        match &plan.scheme {
-            Scheme::TwoStep(two) => {
-                let (scale, scene) = (plan.force_scale(&model.scene), &model.scene);
-                let applied_n = applied.from(model, index, moment);
-                let force = applied.force_at(&bench.layout, 0, model.point_of(index));
-                std::array::from_fn(|c| {
-                    let at = c * bench.layout.plane + bench.layout.place(index);
-                    let elastic = springs[c] - two.q * two.a * state.u[at].wide();
-                    let used = elastic + force[c];
-                    let lost = scene.damping_n_s_per_m * velocity_m_per_s[c] + applied_n[c];
-                    let kick = 0.5 * (two.q * scale * lost + elastic) - used;
-                    [kick, kick]
-                })
-            }
-            Scheme::Multistep(multistep) => std::array::from_fn(|c| {
-                let at = c * bench.layout.plane + bench.layout.place(index);
-                let surprise = multistep.surprise(&state.history(springs[c], multistep.order, at));
-                multistep.correction.map(|weight| -weight * surprise)
-            }),
-            Scheme::Rk4 { .. } => [[0.0; 2]; 3],
-        }
     }
 }

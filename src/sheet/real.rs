@@ -1,10 +1,7 @@
 //! The number format of the state: the same arithmetic in 4 and in 8 bytes.
 
 use std::ops::{Add, AddAssign, Mul, Neg, Sub, SubAssign};
-use std::sync::Arc;
 
-use super::audit::SharedCheckpoint;
-use super::guard::Checkpoint;
 use super::lanes::Vector;
 
 /// f32 or f64. Only operations that IEEE 754 rounds exactly, so the bits do not depend on the machine.
@@ -85,12 +82,10 @@ pub(super) trait Real:
     fn is_finite(self) -> bool;
     /// Writes the value's bytes, little-endian, to `bytes`, which has the value's size.
     fn write(self, bytes: &mut [u8]);
-    /// A checkpoint in this format.
-    fn shared(checkpoint: Arc<Checkpoint<Self>>) -> SharedCheckpoint;
 }
 
 macro_rules! real {
-    ($t:ty, $bits:ty, $magic:literal, $newton:literal, $wide:ident, $narrow:ident, $neon:ident, $shared:ident, $small:expr, $terms:literal, $series:expr,
+    ($t:ty, $bits:ty, $magic:literal, $newton:literal, $wide:ident, $narrow:ident, $neon:ident, $small:expr, $terms:literal, $series:expr,
      $negligible:literal, $ln_2:expr,
      $degree:literal) => {
         impl Real for $t {
@@ -143,9 +138,6 @@ macro_rules! real {
             fn write(self, bytes: &mut [u8]) {
                 bytes.copy_from_slice(&self.to_le_bytes());
             }
-            fn shared(checkpoint: Arc<Checkpoint<Self>>) -> SharedCheckpoint {
-                SharedCheckpoint::$shared(checkpoint)
-            }
         }
     };
 }
@@ -192,7 +184,6 @@ real!(
     WideF32,
     NarrowF32,
     NeonF32,
-    Single,
     [54, 100],
     6,
     SERIES_F32,
@@ -208,7 +199,6 @@ real!(
     WideF64,
     NarrowF64,
     NeonF64,
-    Double,
     [450, 900],
     14,
     SERIES_F64,

@@ -9,12 +9,13 @@
 //! Then the sheet continues at rest, which any tissue can bear.
 
 use super::applied::Applied;
+use super::checkpoint::Input;
 use super::contact::Contacts;
 use super::field::State;
-use super::guard::Input;
+use super::motion::Sheet;
 use super::prescribed::Prescribed;
 use super::real::Real;
-use super::{Released, Sheet, rest};
+use super::tissue::Released;
 
 impl<T: Real> Sheet<T> {
     /// Continues at step `step` from the state of the checkpoint, in which a blow-up has left the sheet; or at rest, if
@@ -36,7 +37,7 @@ impl<T: Real> Sheet<T> {
             self.tiles.largest = checkpoint.largest;
         }
         let model = self.model.clone();
-        self.tiles.begin_anew(rest::tolerance(&model));
+        self.tiles.begin_anew(model.tile_tolerance());
         self.watch.give_up();
         self.exchange(&model);
         self.steps = step;

@@ -17,7 +17,8 @@ use glam::DVec3;
 use super::applied::Push;
 use super::integrate::Oscillator;
 use super::model::{Model, Plan};
-use super::{at_rest, lanes, stability};
+use super::motion::at_rest;
+use super::{lanes, stability};
 use crate::scene::law::{CentreLaw, ForceLaw, Profile, StrengthLaw};
 use crate::scene::{Fixed, Integrator, PointSet, Precision, Scene};
 

@@ -1,28 +1,11 @@
 //! How a sheet puts tiles to sleep and what wakes them: the physics behind `tiles`.
 
-use super::integrate::Oscillator;
+use super::integrate::{Oscillator, with_arithmetic};
+use super::motion::Sheet;
 use super::real::Real;
 use super::survey::{Forces, Survey, Write};
-use super::tiles::Tiles;
-use super::{Energy, Model, Sheet, central, exponential, rk4};
+use super::tissue::Energy;
 use crate::scene::Precision;
-
-/// The tolerance of a model's tiles. Without virtual springs nothing bounds how far an omitted force would move a
-/// sheet, so then only what does not move at all may sleep.
-pub(super) fn tolerance(model: &Model) -> f64 {
-    let bounded = model.scene.virtual_stiffness_n_per_m > 0.0;
-    if bounded { model.sleep_tolerance } else { model.sleep_tolerance.min(f64::MIN_POSITIVE) }
-}
-
-/// ε_w, in spacings.
-pub(super) fn farthest_unnoticed<T: Real>(model: &Model, tiles: &Tiles<T>) -> f64 {
-    let (epsilon, scene) = (tiles.epsilon(), &model.scene);
-    let ratio = scene.virtual_stiffness_n_per_m / scene.springs.stiffness_n_per_m;
-    // Without springs nothing passes from tile to tile.
-    let unnoticed = if ratio.is_nan() { epsilon } else { epsilon * (20.0 * ratio).clamp(0.1, 1.0) };
-    // A difference in the last digit is rounding noise.
-    if scene.virtual_stiffness_n_per_m > 0.0 { unnoticed.max(T::EPSILON * tiles.largest) } else { unnoticed }
-}
 
 impl<T: Real> Sheet<T> {
     /// Wakes tiles whose force changes in the coming step.
@@ -35,7 +18,7 @@ impl<T: Real> Sheet<T> {
             if stiffness > 0.0 {
                 tiles.largest = tiles.largest.max(touch.peak_n() / (stiffness * spacing_m));
             }
-            let least_n = model.scene.virtual_stiffness_n_per_m * farthest_unnoticed(model, tiles) * spacing_m;
+            let least_n = model.scene.virtual_stiffness_n_per_m * tiles.farthest_unnoticed(&model.scene) * spacing_m;
             tiles.pushed(&touch, spacing_m, least_n);
         }
     }
@@ -50,7 +33,8 @@ impl<T: Real> Sheet<T> {
         for (tile, known) in tiles.sleeping() {
             let [spring_j, virtual_j] = known.unwrap_or_else(|| {
                 tiles.cover(&mut region, std::iter::once(tile));
-                let survey = with_scheme!(plan, T, |scheme| Survey::of(bench, scheme, state, forces, &region));
+                let survey =
+                    with_arithmetic!(&plan.scheme, T, |scheme| Survey::of(bench, scheme, state, forces, &region));
                 let (Energy { spring_j, virtual_j, .. }, _) = self.energy_of(&survey);
                 tiles.keep_energies(tile, [spring_j, virtual_j]);
                 [spring_j, virtual_j]
@@ -100,7 +84,7 @@ impl<T: Real> Sheet<T> {
         let mut sleepers = Vec::new();
         for tile in calm.into_iter().filter(|tile| !held.contains(tile)) {
             tiles.cover(&mut region, std::iter::once(tile));
-            let survey = with_scheme!(plan, T, |scheme| Survey::of(bench, scheme, state, forces, &region));
+            let survey = with_arithmetic!(&plan.scheme, T, |scheme| Survey::of(bench, scheme, state, forces, &region));
             if tiles.is_calm(tile, survey.speed <= slow(epsilon) && balanced(&survey)) {
                 sleepers.push((tile, survey));
             }
@@ -109,7 +93,7 @@ impl<T: Real> Sheet<T> {
             return;
         }
         tiles.cover(&mut region, sleepers.iter().map(|(tile, _)| *tile));
-        with_scheme!(plan, T, |scheme| Survey::write(bench, scheme, state, forces, &region, Write::Rest));
+        with_arithmetic!(&plan.scheme, T, |scheme| Survey::write(bench, scheme, state, forces, &region, Write::Rest));
         let sleepers: Vec<_> = sleepers.into_iter().map(|(tile, survey)| (tile, self.energy_of(&survey).1)).collect();
         self.tiles.sleep(&sleepers, &self.state.u);
     }
@@ -122,7 +106,7 @@ mod tests {
 
     use super::*;
     use crate::scene::law::Poke;
-    use crate::sheet::{Push, Tissue};
+    use crate::sheet::{Model, Push, Tissue};
 
     fn pushed<T: Real>(sets: &[&str], falloff_per_m: f64) -> Sheet<T> {
         let always = ["stepping.integrator=central", "stepping.substeps=1"];

@@ -11,8 +11,8 @@
 
 use super::field::Layout;
 use super::lanes::{Plain, Vector};
-use super::model::Model;
 use super::real::Real;
+use crate::scene;
 
 /// Least 1 + q = (L/L0)². A spring pressed to zero length has no direction. Below a millionth of its rest length its
 /// force fades to 0 in proportion to its length, so nothing divides by 0.
@@ -142,8 +142,7 @@ pub(super) struct Springs<T> {
 
 impl<T: Real> Springs<T> {
     /// Forces are in newtons × `scale` / spacing.
-    pub(super) fn new(model: &Model, scale: f64) -> Self {
-        let springs = &model.scene.springs;
+    pub(super) fn new(springs: &scene::Springs, scale: f64) -> Self {
         let structural = springs.stiffness_n_per_m * scale;
         Springs {
             structural: Kind::new(structural, 1.0),

@@ -1,6 +1,6 @@
 //! How fast the sheet can vibrate, and how many substeps that asks for.
 
-use super::integrate::{Oscillator, Scheme};
+use super::integrate::{Bound, Oscillator, Scheme, entry};
 use crate::scene::{Integrator, Springs};
 
 /// What a substep of central differences may turn the fastest vibration by, rad: dt·ω_b ≤ θ. The scheme is
@@ -92,16 +92,15 @@ pub fn stable_substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) 
 /// Fewest substeps of `step_s` with which a yardstick is stable, and as accurate as it promises. Saturates for absurd
 /// scenes.
 pub fn substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) -> u32 {
-    match integrator {
-        Integrator::Central | Integrator::Lagged => {
-            let decay_s = 2.0 * sheet.mass_kg / sheet.damping_n_s_per_m;
-            let omega = sheet.omega_bound_per_s();
-            let turn = fewest(step_s, omega, THETA / endurance(omega, decay_s));
-            // `lagged`: half the stable damping, so that light points do not ring with the substep.
-            let lag = fewest(step_s, sheet.damping_n_s_per_m / sheet.mass_kg, 1.0);
-            if integrator == Integrator::Lagged { turn.max(lag) } else { turn }
-        }
-        _ => stable_substeps(integrator, step_s, sheet),
+    let decay_s = 2.0 * sheet.mass_kg / sheet.damping_n_s_per_m;
+    let omega = sheet.omega_bound_per_s();
+    let turn = || fewest(step_s, omega, THETA / endurance(omega, decay_s));
+    // Half the stable damping, so that light points do not ring with the substep.
+    let lag = || fewest(step_s, sheet.damping_n_s_per_m / sheet.mass_kg, 1.0);
+    match entry(integrator).bound {
+        Bound::Stable => stable_substeps(integrator, step_s, sheet),
+        Bound::Turn => turn(),
+        Bound::TurnAndLag => turn().max(lag()),
     }
 }
 

@@ -8,57 +8,15 @@ use std::ops::Range;
 
 use xxhash_rust::xxh3::Xxh3;
 
-use super::audit::Watch;
+use super::applied::Applied;
+use super::bench::Bench;
+use super::checkpoint::Work;
 use super::contact::Contacts;
-use super::field::{BLOCK, State};
+use super::field::State;
+use super::motion::Sheet;
 use super::real::Real;
-use super::sweep::Bench;
-use super::{Applied, Model, PointState, Sheet, Tissue, Work};
-
-/// A sheet that stays as it was.
-pub struct Still(Box<dyn Tissue>);
-
-impl Still {
-    /// What it was copied from.
-    pub fn model(&self) -> &Model {
-        self.0.model()
-    }
-
-    /// The point at `index`.
-    pub fn point(&self, index: usize) -> PointState {
-        self.0.point(index)
-    }
-
-    /// Adds so many points, or a few more, to the hash. Returns it when all are in.
-    pub fn hash(&self, hashing: &mut Hashing, points: usize) -> Option<u128> {
-        hashing.add(&*self.0, points)
-    }
-}
-
-/// A hash of a state that is not finished.
-pub struct Hashing {
-    hasher: Box<Xxh3>,
-    /// The next block of points, by rows.
-    next: usize,
-}
-
-impl Default for Hashing {
-    fn default() -> Self {
-        Hashing { hasher: Box::new(Xxh3::new()), next: 0 }
-    }
-}
-
-impl Hashing {
-    /// Adds at least one and at most so many points of a tissue, rounded up to a block. Returns the hash when all are in.
-    pub(super) fn add(&mut self, tissue: &(impl Tissue + ?Sized), points: usize) -> Option<u128> {
-        let [rows, columns] = tissue.model().points;
-        let blocks = rows * columns.div_ceil(BLOCK);
-        let end = self.next.saturating_add(points.div_ceil(BLOCK).max(1)).min(blocks);
-        tissue.hash_blocks(self.next..end, &mut self.hasher);
-        self.next = end;
-        (end == blocks).then(|| self.hasher.digest128())
-    }
-}
+use super::tissue::Still;
+use super::watch::Watch;
 
 impl<T: Real> Sheet<T> {
     /// A copy whose points and hash are those of this sheet. It is not for steps or surveys: it has no tables of fixed
@@ -67,7 +25,7 @@ impl<T: Real> Sheet<T> {
         let Sheet { model, plan, bench, state, tiles, .. } = self;
         let mut copy = State::zero(&bench.layout, state.kept.len());
         copy.fields_mut().zip(state.fields()).for_each(|(to, from)| tiles.copy_moved(to, from));
-        Still(Box::new(Sheet {
+        Still::of(Box::new(Sheet {
             model: model.clone(),
             plan: plan.clone(),
             halvings: self.halvings,
@@ -100,9 +58,9 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use glam::{DVec2, DVec3};
 
-    use super::*;
     use crate::scene::law::Poke;
-    use crate::sheet::{Grasp, Push, at_rest};
+    use crate::sheet::field::BLOCK;
+    use crate::sheet::{Grasp, Hashing, Model, Push, at_rest};
 
     #[test]
     fn a_copy_has_the_points_and_the_hash_of_its_moment_in_slices_of_any_size() {

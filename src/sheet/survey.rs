@@ -1,5 +1,5 @@
-//! A survey of the sheet by a sweep that advances nothing: energies, the largest displacement, and how far the springs'
-//! force is from the force that its history predicts.
+//! A survey of the sheet: energies, the largest displacement, and the error of predicted forces. It is a sweep that
+//! advances nothing.
 //!
 //! Sums are kept apart for each of 16 columns, row by row, so that they too are the same at every width.
 #![allow(unsafe_code)]
@@ -10,12 +10,16 @@
 use std::cell::UnsafeCell;
 
 use super::applied::{self, Pull, Term};
+use super::bench::Bench;
 use super::field::{BLOCK, Layout, State};
+use super::integrate::arithmetic::{Arithmetic, MAX_KEPT};
+use super::integrate::with_arithmetic;
 use super::lanes::Vector;
+use super::motion::Sheet;
 use super::real::Real;
 use super::region::Region;
-use super::sweep::{Bench, MAX_KEPT, Scheme, Stage};
-use super::{Energy, Sheet, central, exponential, rk4};
+use super::stage::Stage;
+use super::tissue::Energy;
 
 /// The result of a survey, in the scheme's units (`integrate`).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -98,7 +102,7 @@ struct Look<'a, T: Real, C> {
 
 impl Survey {
     /// Surveys the awake part of a state in `over`.
-    pub(super) fn of<T: Real, C: Scheme<T>>(
+    pub(super) fn of<T: Real, C: Arithmetic<T>>(
         bench: &Bench<T>,
         scheme: &C,
         state: &State<T>,
@@ -111,7 +115,7 @@ impl Survey {
     }
 
     /// Surveys it and rewrites it.
-    pub(super) fn write<T: Real, C: Scheme<T>>(
+    pub(super) fn write<T: Real, C: Arithmetic<T>>(
         bench: &Bench<T>,
         scheme: &C,
         state: &mut State<T>,
@@ -125,7 +129,7 @@ impl Survey {
     }
 
     /// Reads u, d and the kept fields from one state and writes them to another.
-    fn by<T: Real, C: Scheme<T>>(
+    fn by<T: Real, C: Arithmetic<T>>(
         bench: &Bench<T>,
         scheme: &C,
         ([u, d, kept @ ..], [to_u, to_d, to_kept @ ..]): ([*const T; FIELDS], [*mut T; FIELDS]),
@@ -175,7 +179,7 @@ impl Survey {
     }
 }
 
-impl<T: Real, C: Scheme<T>> Look<'_, T, C> {
+impl<T: Real, C: Arithmetic<T>> Look<'_, T, C> {
     /// Adds to a sum of the row.
     #[inline(always)]
     unsafe fn add<V: Vector<Real = T>>(&self, which: usize, at: usize, value: V) {
@@ -187,7 +191,7 @@ impl<T: Real, C: Scheme<T>> Look<'_, T, C> {
     }
 }
 
-impl<T: Real, C: Scheme<T>> Stage<T> for Look<'_, T, C> {
+impl<T: Real, C: Arithmetic<T>> Stage<T> for Look<'_, T, C> {
     const ENERGY: bool = true;
 
     #[inline(always)]
@@ -293,7 +297,7 @@ impl<T: Real> Sheet<T> {
         let Sheet { model, plan, bench, state, .. } = self;
         let terms = self.present_terms();
         let forces = Forces { terms: &terms, field: 0, part: 1.0, pull: 0.0 };
-        let survey = with_scheme!(plan, T, |scheme| Survey::of(bench, scheme, state, forces, over));
+        let survey = with_arithmetic!(&plan.scheme, T, |scheme| Survey::of(bench, scheme, state, forces, over));
         let (mut energy, kept_j) = self.energy_of(&survey);
         // A grasped point moves with its tool, not as the scheme would move it.
         let own = self.prescribed.grasped().map(|(index, motion)| {

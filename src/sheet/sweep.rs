@@ -30,127 +30,35 @@
 // times slower.
 #![allow(clippy::needless_range_loop)]
 
-use std::cell::RefCell;
 use std::ops::Range;
-use std::sync::Arc;
 
-use super::advance::Advance;
-use super::applied::{self, Pull, Term};
 use super::edge::Edge;
-use super::field::{BLOCK, Field, Layout, State};
-use super::lanes::{self, Run, Vector, Width};
+use super::field::Layout;
+use super::grid::{CARRY_ROWS, Grid, difference, excess, load};
+use super::lanes::{Run, Vector};
 use super::real::Real;
 use super::region::Region;
 use super::springs::{Kind, Springs};
-use crate::scene::Lanes;
-
-/// What to do with the force on a block of points.
-pub(super) trait Stage<T: Real> {
-    /// Whether the sweep also reports the energies of the springs.
-    const ENERGY: bool = false;
-
-    /// The duty of a row (see [`LEAN`]). `finish` gets it at compile time.
-    fn duty(&self, _row: usize) -> u8 {
-        LEAN
-    }
-
-    /// The initial values of the sums.
-    ///
-    /// # Safety
-    /// As for `finish`.
-    #[inline(always)]
-    unsafe fn begin<V: Vector<Real = T>>(&self) -> [V; 2] {
-        [unsafe { V::of(T::default()) }; 2]
-    }
-
-    /// `x`: displacements of the block of row `row` that begins at place `at`; `n`: the springs' forces on it. Adds to
-    /// `sums`; the stage gets the totals at the end.
-    ///
-    /// # Safety
-    /// The pointers of the stage are valid.
-    unsafe fn finish<V: Vector<Real = T>, const DUTY: u8>(
-        &self,
-        row: usize,
-        at: usize,
-        x: [V; 3],
-        n: [V; 3],
-        sums: &mut [V; 2],
-    );
-
-    /// Takes the energies of the springs that begin in the block at `column`.
-    ///
-    /// # Safety
-    /// As for `finish`.
-    unsafe fn energy<V: Vector<Real = T>>(&self, _column: usize, _energy: V) {}
-
-    /// Ends a row.
-    ///
-    /// # Safety
-    /// As for `finish`.
-    unsafe fn end_row(&self) {}
-
-    /// Ends the sweep.
-    ///
-    /// # Safety
-    /// As for `finish`.
-    unsafe fn end<V: Vector<Real = T>>(&self, _sums: [V; 2]) {}
-}
-
-/// Duties of a row ([`Stage::duty`]): springs only, springs and one tool's force, or anything.
-pub(super) const LEAN: u8 = 0;
-pub(super) const PUSHED: u8 = 1;
-pub(super) const ANY: u8 = 2;
+use super::stage::{ANY, LEAN, PUSHED, Stage};
 
 /// A sweep, ready to run at any width.
 pub(super) struct Sweep<'a, T, S> {
-    pub(super) layout: Layout,
-    pub(super) springs: &'a Springs<T>,
-    /// Displacements: three planes, spacings.
-    pub(super) x: *const T,
-    /// Forces that rows leave to those below: three planes of [`CARRY_ROWS`] rows.
-    pub(super) carry: *mut T,
+    pub(super) grid: Grid<'a, T>,
     pub(super) over: &'a Region,
     pub(super) stage: S,
 }
-
-/// Rows of the carry: two for the row before, and two for flexion springs, which reach two rows on.
-const CARRY_ROWS: usize = 4;
 
 impl<T: Real, S: Stage<T>> Run<T> for Sweep<'_, T, S> {
     #[inline(always)]
     unsafe fn run<V: Vector<Real = T>>(&self) {
         // SAFETY: the caller's promise.
         unsafe {
-            match &self.springs.flexion {
-                None => self.rows::<V, false>(&self.springs.structural),
+            match &self.grid.springs.flexion {
+                None => self.rows::<V, false>(&self.grid.springs.structural),
                 Some(flexion) => self.rows::<V, true>(flexion),
             }
         }
     }
-}
-
-/// Q of a spring whose rest vector is `rest` times the unit vector along it: 2·along + Δ·Δ, where `along` is D0·Δ. The
-/// added [`Real::FAINT`] keeps the squares of small Δ across the spring above the subnormal range.
-#[inline(always)]
-pub(super) fn excess<V: Vector>(along: V, delta: &[V; 3], [first, second, third]: [usize; 3]) -> V {
-    let faint = along.mul_add(along.splat(V::Real::of(2.0)), along.splat(V::Real::of(V::Real::FAINT)));
-    let sum = delta[first].mul_add(delta[first], faint);
-    delta[third].mul_add(delta[third], delta[second].mul_add(delta[second], sum))
-}
-
-#[inline(always)]
-pub(super) fn difference<V: Vector>(to: &[V; 3], from: &[V; 3]) -> [V; 3] {
-    [to[0].sub(from[0]), to[1].sub(from[1]), to[2].sub(from[2])]
-}
-
-/// Loads the three components of a block.
-///
-/// # Safety
-/// All three can be read.
-#[inline(always)]
-pub(super) unsafe fn load<V: Vector>(at: *const V::Real, plane: usize) -> [V; 3] {
-    // SAFETY: the caller's promise.
-    unsafe { [V::load(at), V::load(at.add(plane)), V::load(at.add(2 * plane))] }
 }
 
 impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
@@ -160,7 +68,7 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
     unsafe fn rows<V: Vector<Real = T>, const FLEXION: bool>(&self, flexion: &Kind<T>) {
         // SAFETY: the caller's promise; offsets stay within rows + 1 rows and a block.
         unsafe {
-            let Layout { rows, columns, stride, plane } = self.layout;
+            let Layout { rows, columns, stride, plane } = self.grid.layout;
             let zero = V::of(T::default());
             let mut sums = self.stage.begin::<V>();
             for strip in &self.over.strips {
@@ -172,21 +80,22 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                     for row in 0..if FLEXION { CARRY_ROWS } else { 2 } {
                         for c in 0..3 {
                             for column in (beside..to).step_by(V::LANES) {
-                                debug_assert!(self.layout.holds(row * stride + column, V::LANES));
-                                zero.store(self.carry.add(c * plane + row * stride + column));
+                                debug_assert!(self.grid.layout.holds(row * stride + column, V::LANES));
+                                zero.store(self.grid.carry.add(c * plane + row * stride + column));
                             }
                         }
                     }
                 }
                 let all = strip.awake && beside == strip.columns.start && to == columns.next_multiple_of(V::LANES);
                 let whole = V::IS_REGISTER && all;
-                let mut edge = if FLEXION || from == 0 { None } else { Some(Edge::new(self, from, strip.rows.start)) };
+                let mut edge =
+                    if FLEXION || from == 0 { None } else { Some(Edge::new(&self.grid, from, strip.rows.start)) };
                 for i in strip.rows.clone() {
                     // `black_box` hides `i` from the compiler, which would otherwise keep an address for each array and
                     // kind of row and increment all of them for each row.
                     let i = std::hint::black_box(i);
                     let left = match &mut edge {
-                        Some(edge) => edge.left_of(self, i),
+                        Some(edge) => edge.left_of(&self.grid, i),
                         None => [zero; 3],
                     };
                     let span = (from..to, strip.awake && from == strip.columns.start, left);
@@ -202,7 +111,7 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                     }
                 }
                 if let Some(edge) = edge {
-                    edge.leave(self, strip.rows.end);
+                    edge.leave(&self.grid, strip.rows.end);
                 }
             }
             self.stage.end(sums);
@@ -220,12 +129,12 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
     ) {
         // SAFETY: as for `rows`.
         unsafe {
-            let Layout { rows, columns, stride, plane } = self.layout;
-            let Springs { structural, shear, .. } = self.springs;
-            let x = self.x.add(i * stride);
+            let Layout { rows, columns, stride, plane } = self.grid.layout;
+            let Springs { structural, shear, .. } = self.grid.springs;
+            let x = self.grid.x.add(i * stride);
             let zero = V::of(T::default());
-            let (down, diagonal) = (self.carry, self.carry.add(stride));
-            let two_down = self.carry.add((2 + i % 2) * stride);
+            let (down, diagonal) = (self.grid.carry, self.grid.carry.add(stride));
+            let two_down = self.grid.carry.add((2 + i % 2) * stride);
             // The last point has no spring to the next column.
             let full = zero.first(V::LANES);
             let tail = zero.first((columns - 1) % V::LANES);
@@ -237,10 +146,10 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                 let awake = WHOLE || all_awake || self.over.is_awake(i, column);
                 // The farthest place read: a row and a point on, or two of each, and the carry's last row.
                 debug_assert!(
-                    self.layout.holds((i + usize::from(BELOW)) * stride + column + 1, V::LANES)
-                        && (!FLEXION || self.layout.holds(i * stride + column + 2, V::LANES))
-                        && (!FLEXION || i + 2 >= rows || self.layout.holds((i + 2) * stride + column, V::LANES))
-                        && self.layout.holds((CARRY_ROWS - 1) * stride + column, V::LANES)
+                    self.grid.layout.holds((i + usize::from(BELOW)) * stride + column + 1, V::LANES)
+                        && (!FLEXION || self.grid.layout.holds(i * stride + column + 2, V::LANES))
+                        && (!FLEXION || i + 2 >= rows || self.grid.layout.holds((i + 2) * stride + column, V::LANES))
+                        && self.grid.layout.holds((CARRY_ROWS - 1) * stride + column, V::LANES)
                 );
                 let at = x.add(column);
                 let (here, right) = (load::<V>(at, plane), load::<V>(at.add(1), plane));
@@ -330,151 +239,5 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
             }
             self.stage.end_row();
         }
-    }
-}
-
-/// How a scheme advances one component of a block: pure arithmetic on u (here `x`), d, the springs' force `n` and the
-/// values it keeps from earlier steps. Each scheme has a file of its own (`integrate`).
-pub(super) trait Scheme<T: Real> {
-    /// Fields that the scheme keeps beside u and d.
-    const KEPT: usize;
-    /// How many of those, counted from the last, it writes in a step.
-    const WRITTEN: usize;
-    /// Number of force fields that it takes, 1 or 2.
-    const FORCES: usize;
-
-    /// Whether `advance` itself cuts values of u and d below [`Real::LEAST`] to 0.
-    const CUTS: bool = false;
-
-    /// Returns u and d after the (sub)step and updates `kept`. `force`: the tools' part, in the scheme's terms; a
-    /// single field is passed twice.
-    fn advance<V: Vector<Real = T>>(&self, x: V, d: V, n: V, kept: &mut [V; MAX_KEPT], force: Option<[V; 2]>)
-    -> (V, V);
-
-    /// The displacement along which the tools' force (the last of its fields) did work, given u and d before and after.
-    fn travel<V: Vector<Real = T>>(&self, before: [V; 2], after: [V; 2]) -> V;
-
-    /// The present displacement and velocity × substep; `force` is that of the tools, in the springs' units.
-    fn observe<V: Vector<Real = T>>(&self, x: V, d: V, n: V, kept: &[V; MAX_KEPT], force: Option<V>) -> (V, V);
-
-    /// The square of velocity × substep, in the form that the scheme's own conserved energy uses, if it has one.
-    fn vigour<V: Vector<Real = T>>(&self, x: V, d: V, n: V, kept: &[V; MAX_KEPT], force: Option<V>) -> V {
-        let (_, w) = self.observe(x, d, n, kept, force);
-        w.mul(w)
-    }
-}
-
-/// Number of tool forces that need no heap memory.
-const FEW: usize = 4;
-
-/// Upper bound of the fields that any scheme keeps beside u and d.
-pub(super) const MAX_KEPT: usize = 5;
-
-/// The buffers and tables that a sweep needs beside the state. One for each sheet, made once.
-#[derive(Debug)]
-pub(super) struct Bench<T> {
-    width: Width,
-    pub(super) layout: Layout,
-    pub(super) springs: Springs<T>,
-    /// 1 where a point moves, 0 where it is fixed: one plane. `None` if every point moves.
-    pub(super) free: Option<Field<T>>,
-    /// Only the first rows of each plane are used. Planes of the layout's length need no extra address registers.
-    carry: RefCell<Field<T>>,
-    probe: [T; BLOCK],
-    work: [T; BLOCK],
-}
-
-impl<T: Real> Bench<T> {
-    pub(super) fn new(lanes: Lanes, layout: Layout, springs: Springs<T>, fixed: &[usize]) -> Self {
-        let free = (!fixed.is_empty()).then(|| {
-            let mut free = Field::of_length(layout.plane);
-            free.fill(T::of(1.0));
-            fixed.iter().for_each(|index| free[layout.place(*index)] = T::default());
-            free
-        });
-        let zero = [T::default(); BLOCK];
-        Bench {
-            width: Width::of(lanes),
-            layout,
-            springs,
-            free,
-            carry: RefCell::new(Field::zero(&layout)),
-            probe: zero,
-            work: zero,
-        }
-    }
-
-    /// Advances every point with `scheme`. The tools' force is read from field `field` on.
-    pub(super) fn advance<C: Scheme<T>>(
-        &mut self,
-        scheme: &C,
-        state: &mut State<T>,
-        terms: &[Term<T>],
-        field: usize,
-        over: &Region,
-    ) {
-        let mut kept = [std::ptr::null_mut(); MAX_KEPT];
-        for (pointer, field) in kept.iter_mut().zip(&mut state.kept) {
-            *pointer = Arc::make_mut(field).as_mut_ptr();
-        }
-        assert_eq!(state.kept.len(), C::KEPT);
-        // A few forces need no heap memory.
-        let (mut few, mut many) = ([Pull::none(); FEW], Vec::new());
-        let pulls = terms.iter().map(|term| term.pull(field, self.layout.stride));
-        let pulls: &[Pull<'_, T>] = if terms.len() <= FEW {
-            few.iter_mut().zip(pulls).for_each(|(to, pull)| *to = pull);
-            &few[..terms.len()]
-        } else {
-            many.extend(pulls);
-            &many
-        };
-        let u = state.u.as_mut_ptr();
-        let stage = Advance {
-            layout: self.layout,
-            scheme,
-            u,
-            d: state.d.as_mut_ptr(),
-            kept,
-            pulls,
-            forced: applied::rows(terms),
-            free: self.free.as_ref().map_or(std::ptr::null(), |free| free.as_ptr()),
-            probe: self.probe.as_mut_ptr(),
-            work: self.work.as_mut_ptr(),
-        };
-        let of_points = |field: &Field<T>| field.len() == 3 * self.layout.plane;
-        debug_assert!(state.fields().all(of_points) && of_points(self.carry.get_mut()));
-        debug_assert!(self.free.as_ref().is_none_or(|free| free.len() == self.layout.plane));
-        debug_assert!(over.is_within(&self.layout));
-        let carry = self.carry.get_mut().as_mut_ptr();
-        let sweep = Sweep { layout: self.layout, springs: &self.springs, x: u.cast_const(), carry, over, stage };
-        // SAFETY: all fields have the layout's three planes, padded by a row and a block, and the tables have this
-        // layout; u is written behind what the sweep still reads, through the same pointer.
-        unsafe { lanes::run(self.width, &sweep) };
-    }
-
-    /// Sweeps over the displacements `u`.
-    ///
-    /// # Safety
-    /// `u` and the pointers of the stage belong to fields of this layout.
-    pub(super) unsafe fn look<S: Stage<T>>(&self, u: *const T, over: &Region, stage: S) {
-        debug_assert!(over.is_within(&self.layout));
-        let mut carry = self.carry.borrow_mut();
-        let sweep = Sweep { layout: self.layout, springs: &self.springs, x: u, carry: carry.as_mut_ptr(), over, stage };
-        // SAFETY: as above.
-        unsafe { lanes::run(self.width, &sweep) };
-    }
-
-    /// Whether all increments since the last call were finite and below `farthest`. False may also come from a sum of
-    /// many.
-    pub(super) fn is_calm(&mut self, farthest: f64) -> bool {
-        std::mem::take(&mut self.probe).iter().all(|sum| sum.wide() < farthest * farthest)
-    }
-
-    /// Σ force · travel of the tools since the last call, in the scheme's terms.
-    pub(super) fn take_work(&mut self) -> f64 {
-        let work = std::mem::take(&mut self.work);
-        // Four chains of additions at once, in a fixed order.
-        let chains: [f64; 4] = std::array::from_fn(|chain| (0..BLOCK / 4).map(|n| work[4 * n + chain].wide()).sum());
-        (chains[0] + chains[1]) + (chains[2] + chains[3])
     }
 }

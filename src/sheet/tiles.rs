@@ -25,6 +25,7 @@ use super::field::{Field, Layout};
 use super::real::Real;
 use super::region::{Marks, Region, TILE, tiles};
 use crate::memory;
+use crate::scene::Scene;
 
 /// Steps between two checks whether tiles may sleep.
 pub(super) const CHECK_STEPS: u64 = 16;
@@ -149,6 +150,16 @@ impl<T: Real> Tiles<T> {
     /// ε, in spacings.
     pub(super) fn epsilon(&self) -> f64 {
         self.epsilon_of(self.largest)
+    }
+
+    /// ε_w, in spacings.
+    pub(super) fn farthest_unnoticed(&self, scene: &Scene) -> f64 {
+        let epsilon = self.epsilon();
+        let ratio = scene.virtual_stiffness_n_per_m / scene.springs.stiffness_n_per_m;
+        // Without springs nothing passes from tile to tile.
+        let unnoticed = if ratio.is_nan() { epsilon } else { epsilon * (20.0 * ratio).clamp(0.1, 1.0) };
+        // A difference in the last digit is rounding noise.
+        if scene.virtual_stiffness_n_per_m > 0.0 { unnoticed.max(T::EPSILON * self.largest) } else { unnoticed }
     }
 
     fn epsilon_of(&self, largest: f64) -> f64 {

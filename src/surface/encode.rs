@@ -5,9 +5,10 @@
 use bytes::{Bytes, BytesMut};
 use glam::DVec3;
 
+use super::refine::Refinement;
 use super::refine::{COMPONENTS, Points, Rows, Source, Written};
-use super::wide::{Available, LANES, Lanes, Width, Work};
-use super::{Refinement, Snapshot};
+use super::snapshot::Snapshot;
+use super::wide::{Available, Lanes, Width, Work};
 use crate::memory;
 
 /// Number format of displacements.
@@ -207,47 +208,6 @@ impl Patch {
     }
 }
 
-/// The least and the greatest of the values.
-pub(super) fn range(values: &[f32]) -> [f32; 2] {
-    let mut range = [f32::INFINITY, f32::NEG_INFINITY];
-    Width::widest().run(Range { values, range: &mut range });
-    range
-}
-
-struct Range<'v> {
-    values: &'v [f32],
-    range: &'v mut [f32; 2],
-}
-
-impl Work for Range<'_> {
-    #[inline(always)]
-    fn work<L: Lanes>(self, with: Available<L>) {
-        // Enough parallel comparisons to hide their latency.
-        const AT_ONCE: usize = 4;
-        let mut low = [with.splat(f32::INFINITY); AT_ONCE];
-        let mut high = [with.splat(f32::NEG_INFINITY); AT_ONCE];
-        let (chunks, rest) = self.values.as_chunks::<{ AT_ONCE * LANES }>();
-        for chunk in chunks {
-            let (blocks, _) = chunk.as_chunks();
-            for k in 0..AT_ONCE {
-                let values = with.load(&blocks[k]);
-                low[k] = values.smaller(low[k]);
-                high[k] = values.larger(high[k]);
-            }
-        }
-        let mut lanes = [[0.0; LANES]; 2 * AT_ONCE];
-        for k in 0..AT_ONCE {
-            low[k].store(&mut lanes[k]);
-            high[k].store(&mut lanes[AT_ONCE + k]);
-        }
-        let (low, high) = lanes.as_flattened().split_at(AT_ONCE * LANES);
-        *self.range = [
-            low.iter().chain(rest).copied().fold(f32::INFINITY, f32::min),
-            high.iter().chain(rest).copied().fold(f32::NEG_INFINITY, f32::max),
-        ];
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -320,20 +280,6 @@ mod tests {
                     let value = near + (a % cells) as f32 / cells as f32 * (far - near);
                     assert_eq!(bytes[4 * c..4 * c + 4], value.to_le_bytes(), "n = {n}, ({a}, {b})");
                 }
-            }
-        }
-    }
-
-    #[test]
-    fn the_box_reaches_as_far_as_the_values() {
-        for count in [1, 15, 16, 63, 64, 65, 1000] {
-            let values: Vec<f32> = (0..count).map(|k| (k as f32 * 1.7).sin() + 0.1).collect();
-            let least = values.iter().copied().fold(f32::INFINITY, f32::min);
-            let greatest = values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
-            for width in Width::ALL.into_iter().filter(|width| width.is_available()) {
-                let mut range = [f32::INFINITY, f32::NEG_INFINITY];
-                width.run(Range { values: &values, range: &mut range });
-                assert_eq!(range, [least, greatest], "{width:?}, {count}");
             }
         }
     }

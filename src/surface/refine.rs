@@ -1,5 +1,5 @@
-//! Refinement (the paper's bilinear interpolation): n vertices between neighbouring points, so that a side of m
-//! points has M = (m − 1)·n + m vertices.
+//! Refinement: bilinear interpolation between neighbouring points. With n vertices between neighbours, as in the paper,
+//! a side of m points has M = (m − 1)·n + m vertices.
 // The compiler does not always inline iterators over vectors. They then run without the caller's instructions.
 #![allow(clippy::needless_range_loop)]
 

@@ -1,5 +1,6 @@
-//! Frames of changes. A sheet is cut into tiles of 16 × 16 points. A tile is rewritten when its last written state no
-//! longer shows its position, and each viewer gets the tiles that are newer than its own copy.
+//! Frames of changes: which tiles of a sheet a viewer has to get. A sheet is cut into tiles of 16 × 16 points. A tile
+//! is rewritten when its last written state no longer shows its position, and each viewer gets the tiles that are
+//! newer than its own copy.
 //!
 //! A tile keeps the displacements that it was last written from and is compared with those, not with the last frame,
 //! because slow creep adds up. It is rewritten when a point has moved by more than half a quantum since; rounding may
@@ -10,10 +11,10 @@
 
 use std::sync::Arc;
 
-use super::encode::{Frame, Patch, Quanta, fill, lay_out};
-use super::refine::{COMPONENTS, Points, Rows};
+use super::encode::{Encoding, Frame, Patch, Quanta, fill, lay_out};
+use super::refine::{COMPONENTS, Points, Refinement, Rows};
+use super::snapshot::Snapshot;
 use super::wide::{Available, LANES, Lanes, Width, Work};
-use super::{Encoding, Refinement, Snapshot};
 
 /// Points along a side of a tile.
 const SIDE: usize = 16;

@@ -1,4 +1,4 @@
-//! The lining of a stomach seen through an endoscope: broad folds, a relief of small fields, vessels at two depths,
+//! The lining of a stomach seen through an endoscope. It has broad folds, a relief of small fields, vessels at two depths,
 //! capillaries around the fields, redder and paler regions, and a wet film with glints.
 //!
 //! Everything is a function of place (in sides of the image), so another size shows the same picture at another

@@ -1,17 +1,12 @@
-//! Conversion of samples, records, sessions and frames to messages, and of records back.
-
-use std::sync::Arc;
+//! Conversion of samples, records and frames to messages, and of records back.
 
 use super::{every, from_point, from_vector, pb, point, vector};
 use crate::pace::frames::Delivery;
-use crate::pace::{Live, PacedRecord, PacedSample, State};
+use crate::pace::{PacedSample, Recorded};
 use crate::refusal::{Reason, Refusal, Result};
-use crate::scene::Named;
-use crate::scene::record::{AuditedError, EnergyJ, Point, Record, Recovery};
+use crate::scene::record::{EnergyJ, Point, Record, Recovery};
 use crate::session::ToolSample;
 use crate::session::sampling::{Deadband, HEARTBEAT_S, Sampling};
-use crate::sheet::Model;
-use crate::sheet::audit::Origin;
 use crate::surface::Encoding;
 use crate::surface::encode::Patch;
 
@@ -107,7 +102,7 @@ const POINTS_PER_MESSAGE: usize = 1000;
 
 /// Message `part` of a record; `None` after the last. A record without points has one message. The messages are made one
 /// at a time: those of a large sheet together would take a second and a gigabyte.
-pub fn record(paced: &PacedRecord, dropped: u64, part: usize) -> Option<pb::ProbeResponse> {
+pub fn record(paced: &Recorded, dropped: u64, part: usize) -> Option<pb::ProbeResponse> {
     let record = &paced.record;
     let parts = record.points.len().div_ceil(POINTS_PER_MESSAGE).max(1);
     let points = record.points.chunks(POINTS_PER_MESSAGE).nth(part).unwrap_or_default();
@@ -172,59 +167,8 @@ pub fn add_to_record(record: &mut Record, message: &pb::ProbeResponse) -> bool {
     message.last
 }
 
-/// The current state of a session as a message.
-pub fn session(live: &Arc<Live>) -> pb::Session {
-    let status = live.status();
-    let (held_tools, lapsed_leases, counts) = live.at_intake(|intake, _| {
-        let held = intake.holders().map(|(tool, holder)| pb::HeldTool { tool, holder: holder.to_owned() });
-        (held.collect(), intake.lapsed(), intake.counts())
-    });
-    let count = |count: usize| u32::try_from(count).unwrap_or(u32::MAX);
-    let model = &status.model;
-    #[allow(clippy::cast_precision_loss)]
-    let simulation_time_s = status.step as f64 / model.scene.stepping.rate_hz;
-    let session = pb::Session {
-        session_id: live.id.clone(),
-        state: match status.state {
-            State::Running => pb::SessionState::Running,
-            State::Paused => pb::SessionState::Paused,
-            State::Held => pb::SessionState::Held,
-        }
-        .into(),
-        step: status.step,
-        simulation_time_s,
-        overrun_count: status.overrun_count,
-        time_dilation: status.dilation.value,
-        late_commands: status.late_commands,
-        paused_commands: status.paused_commands,
-        hold_reason: status.hold_reason.unwrap_or_default(),
-        held_tools,
-        lapsed_leases,
-        idle_timeout_s: live.idle_timeout_s,
-        guard_events: status.guard_events,
-        recovery_count: status.recovery_count,
-        recoveries: status.recoveries.into_iter().map(recovery).collect(),
-        resting: status.resting,
-        rested_steps: status.rested_steps,
-        commands: Some(pb::CommandCounts {
-            accepted: counts.accepted,
-            applied: counts.applied,
-            superseded: counts.superseded,
-            dropped: counts.dropped,
-            waiting: counts.waiting,
-            refused: live.refused(),
-        }),
-        awake_points: count(status.awake_points),
-        streams: count(live.streams()),
-        scene_name: model.scene.name.clone(),
-        points: count(model.len()),
-        audit: audit(live),
-        ..Default::default()
-    };
-    with_model(session, model)
-}
-
-fn recovery(recovery: Recovery) -> pb::Recovery {
+/// A recovery as a message.
+pub fn recovery(recovery: Recovery) -> pb::Recovery {
     let Recovery { step, state_of_step, at_rest, undone_commands, paused_until_step, reason } = recovery;
     pb::Recovery { step, state_of_step, undone_commands, reason, at_rest, paused_until_step }
 }
@@ -233,46 +177,6 @@ fn recovery(recovery: Recovery) -> pb::Recovery {
 pub fn from_recovery(recovery: pb::Recovery) -> Recovery {
     let pb::Recovery { step, state_of_step, undone_commands, reason, at_rest, paused_until_step } = recovery;
     Recovery { step, state_of_step, at_rest, undone_commands, paused_until_step, reason }
-}
-
-/// The results of a session's audits; `None` before the first.
-fn audit(live: &Live) -> Option<pb::Audit> {
-    let audited = live.audited();
-    let (step, newest) = audited.newest?;
-    let error = |error: AuditedError| Some(pb::AuditedError { displacement: error.displacement, force: error.force });
-    Some(pb::Audit {
-        windows: audited.windows,
-        step,
-        newest_error: error(newest),
-        largest_error: error(audited.largest),
-        windows_above_tolerance: audited.above,
-        reason: audited.origin.map(Origin::describe).unwrap_or_default().to_owned(),
-        corrections: audited.corrections,
-        refused_correction: audited.refused_correction.map(|refusal| refusal.to_string()).unwrap_or_default(),
-        newest_correction: audited.correction.map(|correction| pb::Correction {
-            step: correction.step,
-            audited_error: error(correction.audited_error),
-            reason: correction.reason,
-            integrator: correction.integrator.name().to_owned(),
-            substeps: correction.substeps,
-            precision: correction.precision.name().to_owned(),
-            sleep_tolerance: correction.sleep_tolerance,
-        }),
-    })
-}
-
-/// Adds the fields that describe the tissue's model.
-pub fn with_model(session: pb::Session, model: &Model) -> pb::Session {
-    pb::Session {
-        scene: Some(super::scene::scene(&model.scene)),
-        integrator: model.plan.integrator.name().to_owned(),
-        substeps: model.plan.substeps,
-        precision: model.precision.name().to_owned(),
-        warnings: model.warnings.clone(),
-        // An unknown error counts as the largest possible one.
-        expected_error: if model.expected_error.is_finite() { model.expected_error } else { 1.0 },
-        ..session
-    }
 }
 
 /// Bytes of displacements per message: messages of other streams wait for at most one of these.

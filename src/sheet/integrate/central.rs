@@ -3,10 +3,11 @@
 //! m(u₊ − 2u + u₋)/dt² = F(u) − C(u₊ − u₋)/2dt, with d₊ = u₊ − u, d = u − u₋ and g = C·dt/m:
 //! (1 + g/2)·d₊ = (1 − g/2)·d + (dt²/m)·F(u).
 
-use super::super::lanes::Vector;
-use super::super::real::Real;
-use super::super::sweep::{self, MAX_KEPT};
+use super::arithmetic::{Arithmetic, MAX_KEPT};
+use super::family::{Family, Node, Release};
 use super::matrix::Matrix;
+use crate::sheet::lanes::Vector;
+use crate::sheet::real::Real;
 
 /// The two-step form d ← p·d + q·(N − a·u + F), u ← u + d, where d is the increment of the last substep.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -24,29 +25,77 @@ pub(super) fn fit(a: f64, g: f64) -> TwoStep {
     TwoStep { p: (1.0 - g / 2.0) / (1.0 + g / 2.0), q: 1.0 / (1.0 + g / 2.0), a }
 }
 
-impl TwoStep {
-    pub(super) fn propagator(&self, z: f64) -> Matrix {
+impl Family for TwoStep {
+    type Plain<T: Real> = Advance<T>;
+    type Compensated<T: Real> = Advance<T>;
+
+    fn plain<T: Real>(&self, _: usize) -> Advance<T> {
+        Advance { p: T::of(self.p), pull: T::of(-self.q * self.a), keeps: self.p > 0.98 }
+    }
+
+    fn compensated<T: Real>(&self, sweep: usize) -> Advance<T> {
+        self.plain(sweep)
+    }
+
+    fn takes_means(&self) -> bool {
+        true
+    }
+
+    fn last_field(&self) -> usize {
+        0
+    }
+
+    /// The scheme sees the beginning only, and takes the mean of both sides where the force jumps.
+    fn nodes(&self) -> Vec<Node> {
+        vec![Node { fraction: 0.0, weights: [self.q, 0.0, 0.0] }]
+    }
+
+    fn spring_scale(&self) -> f64 {
+        self.q
+    }
+
+    fn constant(&self) -> [f64; 2] {
+        [self.q; 2]
+    }
+
+    fn kick(&self) -> [f64; 2] {
+        [self.q; 2]
+    }
+
+    fn propagator(&self, z: f64) -> Matrix {
         let pull = -self.q * (z + self.a);
         Matrix::of(2, |i, j| [[1.0 + pull, self.p], [pull, self.p]][i][j])
+    }
+
+    /// A release is a jump: before it the whole force on the point without damping was m·a + C·v with the tool's a and
+    /// v; after it, the force is F = spring + applied − K″·u. At a jump the scheme needs the mean of both (see
+    /// `applied`), and it uses F with the mean of the applied force. The tool moved at constant velocity, so a = 0: the
+    /// point gets ½(C·v + F) less that. In terms of the increment, this is q times the difference.
+    fn release(&self, at: Release<'_>) -> Option<[f64; 2]> {
+        let elastic = at.springs[0] - self.q * self.a * at.u;
+        let used = elastic + at.used;
+        let kick = 0.5 * (self.q * at.scale * at.lost_n + elastic) - used;
+        Some([kick, kick])
+    }
+
+    /// d = v·dt − ½·acceleration·dt², at the time of u.
+    fn resample(&self, _: &Self, ratio: f64, [u, d]: [f64; 2], pushed: f64, springs: &mut [f64]) -> [f64; 2] {
+        let acceleration = (self.p - 1.0) * d - self.q * self.a * u + springs[0] + pushed;
+        let velocity = d + 0.5 * acceleration;
+        [u, velocity * ratio - 0.5 * acceleration * ratio * ratio]
     }
 }
 
 /// The same in the format of the state; q is in the scale of the springs and the tools.
 #[derive(Debug, Clone, Copy)]
-pub(in super::super) struct Advance<T> {
+pub(in crate::sheet) struct Advance<T> {
     p: T,
     pull: T,
     /// Damping is almost zero, so d·d₊ is twice the kinetic energy that the scheme conserves.
     keeps: bool,
 }
 
-impl<T: Real> Advance<T> {
-    pub(in super::super) fn new(two: &TwoStep) -> Self {
-        Advance { p: T::of(two.p), pull: T::of(-two.q * two.a), keeps: two.p > 0.98 }
-    }
-}
-
-impl<T: Real> sweep::Scheme<T> for Advance<T> {
+impl<T: Real> Arithmetic<T> for Advance<T> {
     const KEPT: usize = 0;
     const WRITTEN: usize = 0;
     const FORCES: usize = 1;

@@ -1,5 +1,5 @@
-//! Exponential multistep: the virtual springs, damping and tools exactly, the springs by the polynomial through their
-//! last p values; one evaluation of the springs a substep. Order p + 1 for p = 2, 3, 4.
+//! Exponential multistep schemes: virtual springs, damping and tools exactly, springs by extrapolation. The springs
+//! follow the polynomial through their last p values, with one evaluation a substep. Order p + 1 for p = 2, 3, 4.
 //!
 //! With y = (u, w), w = u̇·dt, A = [[0, 1], [−a, −g]] and b = (0, 1) (times in substeps, see `super`):
 //!
@@ -25,20 +25,18 @@
 //! Literature: exponential Adams methods (Hochbruck and Ostermann, Acta Numerica 19, 2010, section 2.5); predicting and
 //! correcting with one evaluation is PEC mode (Hairer, Nørsett, Wanner I, III.1).
 
-use super::super::lanes::Vector;
-use super::super::real::Real;
-use super::super::sweep::{self, MAX_KEPT};
-use super::Node;
+use super::arithmetic::{Arithmetic, MAX_KEPT};
+use super::family::{Family, Node, Release};
 use super::matrix::Matrix;
+use crate::sheet::lanes::Vector;
+use crate::sheet::real::Real;
 
 /// The largest p.
 const ORDER_MAX: usize = 4;
 
-/// The weights of a scheme, each for u and for w.
+/// The weights of the scheme that keeps p = `ORDER` values of the springs' force, each for u and for w.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Multistep {
-    /// p: the number of kept values of the springs' force.
-    pub order: usize,
+pub struct Multistep<const ORDER: usize> {
     /// E − 1, by rows.
     linear: [[f64; 2]; 2],
     /// Weights of N₀, N₋₁, … N₋p.
@@ -68,11 +66,11 @@ fn integral(moments: &[[f64; 2]], polynomial: &[f64]) -> [f64; 2] {
     std::array::from_fn(|row| polynomial.iter().zip(moments).map(|(c, moment)| c * moment[row]).sum())
 }
 
-/// The scheme that keeps `order` values.
+/// Fits the scheme to a = K″·dt²/m and g = C·dt/m.
 #[allow(clippy::cast_precision_loss)]
-pub(super) fn fit(order: usize, a: f64, g: f64) -> Multistep {
+pub(super) fn fit<const ORDER: usize>(a: f64, g: f64) -> Multistep<ORDER> {
     // y′ = A·y + b·c₀, cⱼ′ = cⱼ₊₁: starting from c = the j-th unit vector, c₀ is sʲ/j!, and y(1) is its integral.
-    let powers = order + 1;
+    let powers = ORDER + 1;
     let system = Matrix::of(2 + powers, |i, j| match (i, j) {
         (0, 1) | (1, 2) => 1.0,
         (1, 0) => -a,
@@ -90,7 +88,7 @@ pub(super) fn fit(order: usize, a: f64, g: f64) -> Multistep {
     let linear = std::array::from_fn(|i| std::array::from_fn(|j| solution.at(i, j) - f64::from(u8::from(i == j))));
 
     // Values are at s = 0, −1, …, 1 − p.
-    let nodes = || (0..order).map(|i| -(i as f64));
+    let nodes = || (0..ORDER).map(|i| -(i as f64));
     let through: Vec<Vec<f64>> = nodes().map(|node| basis(node, nodes().filter(move |other| *other != node))).collect();
     let predictor: Vec<[f64; 2]> = through.iter().map(|polynomial| integral(&moments, polynomial)).collect();
     // A polynomial's value at s = 1 is the sum of its coefficients.
@@ -105,7 +103,7 @@ pub(super) fn fit(order: usize, a: f64, g: f64) -> Multistep {
                 })
                 .sum::<f64>()
     });
-    let springs = (0..=order)
+    let springs = (0..=ORDER)
         .map(|i| {
             std::array::from_fn(|row| {
                 let ahead = predictor.get(i).map_or(0.0, |weights| weights[row]);
@@ -113,13 +111,52 @@ pub(super) fn fit(order: usize, a: f64, g: f64) -> Multistep {
             })
         })
         .collect();
-    Multistep { order, linear, springs, correction, extrapolation, moments }
+    Multistep { linear, springs, correction, extrapolation, moments }
 }
 
-impl Multistep {
+impl<const ORDER: usize> Multistep<ORDER> {
+    /// The difference between the springs' force and its prediction: `history` has p + 1 values, at 0, −1, …, −p.
+    pub fn surprise(&self, history: &[f64]) -> f64 {
+        history[0] - self.extrapolation.iter().zip(&history[1..]).map(|(weight, past)| weight * past).sum::<f64>()
+    }
+
+    fn arithmetic<T: Real, const COMPENSATED: bool>(&self) -> Advance<T, ORDER, COMPENSATED> {
+        let mut springs = [[T::default(); 2]; 1 + ORDER_MAX];
+        for (to, from) in springs.iter_mut().zip(&self.springs) {
+            *to = from.map(T::of);
+        }
+        Advance {
+            linear: self.linear.map(|row| row.map(T::of)),
+            springs,
+            correction: self.correction.map(T::of),
+            extrapolation: std::array::from_fn(|i| T::of(self.extrapolation[i])),
+        }
+    }
+}
+
+impl<const ORDER: usize> Family for Multistep<ORDER> {
+    type Plain<T: Real> = Advance<T, ORDER, false>;
+    type Compensated<T: Real> = Advance<T, ORDER, true>;
+
+    fn plain<T: Real>(&self, _: usize) -> Self::Plain<T> {
+        self.arithmetic()
+    }
+
+    fn compensated<T: Real>(&self, _: usize) -> Self::Compensated<T> {
+        self.arithmetic()
+    }
+
+    fn history(&self) -> usize {
+        ORDER
+    }
+
+    fn last_field(&self) -> usize {
+        1
+    }
+
     /// Three Gauss points. (Two keep the order, but a force oscillating at 20 Hz then has an error of 1e-7 in steps of
     /// 1 ms.)
-    pub(super) fn nodes(&self) -> Vec<Node> {
+    fn nodes(&self) -> Vec<Node> {
         let places = [0.112_701_665_379_258_3, 0.5, 0.887_298_334_620_741_7];
         let node = |&fraction: &f64| {
             let polynomial = basis(fraction, places.iter().copied().filter(|place| *place != fraction));
@@ -129,24 +166,17 @@ impl Multistep {
         places.iter().map(node).collect()
     }
 
-    /// The difference between the springs' force and its prediction: `history` has p + 1 values, at 0, −1, …, −p.
-    pub fn surprise(&self, history: &[f64]) -> f64 {
-        history[0] - self.extrapolation.iter().zip(&history[1..]).map(|(weight, past)| weight * past).sum::<f64>()
-    }
-
-    /// The u and w that a constant force of 1 adds in a substep.
-    pub(super) fn constant(&self) -> [f64; 2] {
+    fn constant(&self) -> [f64; 2] {
         self.moments[0]
     }
 
     /// E·b: the u and w that an impulse adds.
-    pub(super) fn kick(&self) -> [f64; 2] {
+    fn kick(&self) -> [f64; 2] {
         [self.linear[0][1], 1.0 + self.linear[1][1]]
     }
 
-    pub(super) fn propagator(&self, z: f64) -> Matrix {
-        let n = 2 + self.order;
-        Matrix::of(n, |i, j| match (i, j) {
+    fn propagator(&self, z: f64) -> Matrix {
+        Matrix::of(2 + ORDER, |i, j| match (i, j) {
             (0 | 1, 0 | 1) => {
                 let own = if j == 0 { -z * self.springs[0][i] } else { 0.0 };
                 f64::from(u8::from(i == j)) + self.linear[i][j] + own
@@ -162,6 +192,33 @@ impl Multistep {
             _ => f64::from(u8::from(j + 1 == i)),
         })
     }
+
+    /// u and d are predictions that the next substep corrects. The tool's values are already right, so the correction is
+    /// subtracted.
+    fn release(&self, at: Release<'_>) -> Option<[f64; 2]> {
+        let surprise = self.surprise(at.springs);
+        Some(self.correction.map(|weight| -weight * surprise))
+    }
+
+    fn resample(&self, to: &Self, ratio: f64, [u, d]: [f64; 2], _: f64, springs: &mut [f64]) -> [f64; 2] {
+        let [du, dw] = self.correction.map(|weight| weight * self.surprise(springs));
+        #[allow(clippy::cast_precision_loss)]
+        let shorter: Vec<f64> =
+            (0..springs.len()).map(|i| ratio * ratio * through(springs, -(i as f64) * ratio)).collect();
+        springs.copy_from_slice(&shorter);
+        let foretold = to.correction.map(|weight| weight * to.surprise(springs));
+        [u + du - foretold[0], (d + dw) * ratio - foretold[1]]
+    }
+}
+
+/// The value at `s` of the polynomial that is `values[i]` at −i.
+#[allow(clippy::cast_precision_loss)]
+fn through(values: &[f64], s: f64) -> f64 {
+    let weight = |i: usize| -> f64 {
+        let others = (0..values.len()).filter(|j| *j != i);
+        others.map(|j| (s + j as f64) / (j as f64 - i as f64)).product()
+    };
+    values.iter().enumerate().map(|(i, value)| value * weight(i)).sum()
 }
 
 /// The same in the format of the state.
@@ -169,26 +226,11 @@ impl Multistep {
 /// With `COMPENSATED`, the rounding loss of each sum u + increment is kept and added to the next increment (Kahan
 /// 1965). Without it, a displacement that creeps by less than half its last digit per substep stands still.
 #[derive(Debug, Clone, Copy)]
-pub(in super::super) struct Advance<T, const ORDER: usize, const COMPENSATED: bool> {
+pub(in crate::sheet) struct Advance<T, const ORDER: usize, const COMPENSATED: bool> {
     linear: [[T; 2]; 2],
     springs: [[T; 2]; 1 + ORDER_MAX],
     correction: [T; 2],
     extrapolation: [T; ORDER],
-}
-
-impl<T: Real, const ORDER: usize, const COMPENSATED: bool> Advance<T, ORDER, COMPENSATED> {
-    pub(in super::super) fn new(multistep: &Multistep) -> Self {
-        let mut springs = [[T::default(); 2]; 1 + ORDER_MAX];
-        for (to, from) in springs.iter_mut().zip(&multistep.springs) {
-            *to = from.map(T::of);
-        }
-        Advance {
-            linear: multistep.linear.map(|row| row.map(T::of)),
-            springs,
-            correction: multistep.correction.map(T::of),
-            extrapolation: std::array::from_fn(|i| T::of(multistep.extrapolation[i])),
-        }
-    }
 }
 
 impl<T: Real, const ORDER: usize, const COMPENSATED: bool> Advance<T, ORDER, COMPENSATED> {
@@ -211,7 +253,7 @@ impl<T: Real, const ORDER: usize, const COMPENSATED: bool> Advance<T, ORDER, COM
     }
 }
 
-impl<T: Real, const ORDER: usize, const COMPENSATED: bool> sweep::Scheme<T> for Advance<T, ORDER, COMPENSATED> {
+impl<T: Real, const ORDER: usize, const COMPENSATED: bool> Arithmetic<T> for Advance<T, ORDER, COMPENSATED> {
     const KEPT: usize = ORDER + COMPENSATED as usize;
     /// The newest value replaces the oldest, and the others move by renumbering. Beside it, the rounding loss is
     /// written.
@@ -254,5 +296,19 @@ impl<T: Real, const ORDER: usize, const COMPENSATED: bool> sweep::Scheme<T> for 
         }
         let [of_u, of_w] = self.correction;
         (d.splat(of_u).mul_add(surprise, x), d.splat(of_w).mul_add(surprise, d))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_polynomial_goes_through_its_values_and_between() {
+        let cube = |s: f64| 2.0 - s + 0.5 * s * s - 0.25 * s * s * s;
+        let values = [0.0, -1.0, -2.0, -3.0].map(cube);
+        for s in [0.0, -1.0, -3.0, -0.5, -2.25, 0.7] {
+            assert!((through(&values, s) - cube(s)).abs() < 1e-12, "{s}");
+        }
     }
 }

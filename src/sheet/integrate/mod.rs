@@ -1,110 +1,155 @@
-//! The schemes that advance the sheet: one file each, and one line each in [`Scheme::fit`].
+//! The schemes that advance the sheet: one file each, and one line each in the register.
 //!
 //! Units in this module: lengths are in spacings h, time in substeps dt. u is a displacement over h, d is (nearly) the
 //! amount a scheme adds to it in a substep, forces are times dt²/(m·h). The coefficients of the equation of motion are
 //! then a = K″·dt²/m and g = C·dt/m: u̇̇ = N − a·u − g·u̇ + F, with N from the springs and F from the tools. Small
 //! numbers stay small and keep their digits in f32.
 
-pub(super) mod central;
-pub(super) mod exponential;
-pub(super) mod lagged;
+pub(super) mod arithmetic;
+mod central;
+mod exponential;
+pub(super) mod family;
+mod lagged;
 mod matrix;
-pub(super) mod rk4;
+mod oscillator;
+mod rk4;
+
+pub use central::TwoStep;
+pub use exponential::Multistep;
+pub use family::Node;
+pub use oscillator::Oscillator;
+pub use rk4::Rk4;
 
 use crate::scene::Integrator;
-use central::TwoStep;
-use exponential::Multistep;
+use family::{Family, Release};
 use matrix::Matrix;
 
-/// The properties of a sheet that a scheme depends on.
-#[derive(Debug, Clone, Copy)]
-pub struct Oscillator {
-    /// Mass of a point, kg.
-    pub mass_kg: f64,
-    /// C, N·s/m.
-    pub damping_n_s_per_m: f64,
-    /// K″, N/m.
-    pub virtual_stiffness_n_per_m: f64,
-    /// The largest eigenvalue of the springs' stiffness under any deformation, N/m.
-    pub spring_stiffness_n_per_m: f64,
-}
-
-impl Oscillator {
-    /// a and g for a substep.
-    pub fn scaled(&self, substep_s: f64) -> (f64, f64) {
-        let a = self.virtual_stiffness_n_per_m * substep_s * substep_s / self.mass_kg;
-        (a, self.damping_n_s_per_m * substep_s / self.mass_kg)
-    }
-
-    /// The springs' largest stiffness in a substep's terms, (ω·dt)².
-    pub fn scaled_spring_stiffness(&self, substep_s: f64) -> f64 {
-        self.spring_stiffness_n_per_m * substep_s * substep_s / self.mass_kg
-    }
-
-    /// ω_b, rad/s: an upper bound of every vibration's frequency, under any deformation.
-    pub fn omega_bound_per_s(&self) -> f64 {
-        ((self.spring_stiffness_n_per_m + self.virtual_stiffness_n_per_m) / self.mass_kg).sqrt()
-    }
-}
-
-/// A scheme, fitted to a sheet and a substep.
+/// A scheme, fitted to a sheet and a substep: one variant for each arithmetic.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Scheme {
     /// `central` and `lagged`.
     TwoStep(TwoStep),
-    /// The exponential multistep schemes.
-    Multistep(Multistep),
+    /// The exponential multistep scheme that keeps 2 values.
+    Exponential2(Multistep<2>),
+    /// The same with 3.
+    Exponential3(Multistep<3>),
+    /// The same with 4.
+    Exponential4(Multistep<4>),
     /// The classical fourth-order Runge–Kutta scheme.
-    Rk4 {
-        /// K″·dt²/m.
-        a: f64,
-        /// C·dt/m.
-        g: f64,
-    },
+    Rk4(Rk4),
+}
+
+/// Compiles an expression once for each variant of [`Scheme`], with `$family` as the fitted scheme, and runs the one of
+/// `$scheme`.
+macro_rules! each {
+    ($scheme:expr, |$family:ident| $body:expr) => {
+        match $scheme {
+            $crate::sheet::integrate::Scheme::TwoStep($family) => $body,
+            $crate::sheet::integrate::Scheme::Exponential2($family) => $body,
+            $crate::sheet::integrate::Scheme::Exponential3($family) => $body,
+            $crate::sheet::integrate::Scheme::Exponential4($family) => $body,
+            $crate::sheet::integrate::Scheme::Rk4($family) => $body,
+        }
+    };
+}
+pub(super) use each;
+
+/// The same with `$arithmetic` as its arithmetic in number format `$t`, for uses that do not advance the scheme and need
+/// no compensation.
+macro_rules! with_arithmetic {
+    ($scheme:expr, $t:ty, |$arithmetic:ident| $body:expr) => {
+        $crate::sheet::integrate::each!($scheme, |family| {
+            let $arithmetic = &$crate::sheet::integrate::family::Family::plain::<$t>(family, 0);
+            $body
+        })
+    };
+}
+pub(super) use with_arithmetic;
+
+/// What the substep of an integrator must satisfy when its number of substeps is not chosen by rehearsals.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Bound {
+    /// Stability.
+    Stable,
+    /// A small turn of the fastest vibration ([`THETA`](super::stability::THETA)).
+    Turn,
+    /// The same, and half of the damping at which it is stable.
+    TurnAndLag,
+}
+
+/// What the register says of an integrator.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Entry {
+    /// The power of the substep with which its error falls.
+    pub(super) order: f64,
+    /// The cost of a substep, in those of `central`. Measured (`make bench-kernel`).
+    pub(super) cost: f64,
+    /// What its substep must satisfy.
+    pub(super) bound: Bound,
+    /// Whether it can compensate the rounding of f32.
+    pub(super) compensates: bool,
+    /// Fits it to a = K″·dt²/m and g = C·dt/m.
+    fit: fn(f64, f64) -> Scheme,
+}
+
+/// The integrators that `auto` may become, by falling order.
+pub(super) const CANDIDATES: [Integrator; 4] =
+    [Integrator::Exponential4, Integrator::Exponential3, Integrator::Exponential2, Integrator::Central];
+
+/// The register of integrators.
+pub(super) fn entry(integrator: Integrator) -> Entry {
+    type Fit = fn(f64, f64) -> Scheme;
+    let exponential =
+        |order: f64, cost: f64, fit: Fit| Entry { order, cost, bound: Bound::Stable, compensates: true, fit };
+    let other = |order: f64, cost: f64, bound: Bound, fit: Fit| Entry { order, cost, bound, compensates: false, fit };
+    let by_central = |bound: Bound| other(2.0, 1.0, bound, |a, g| Scheme::TwoStep(central::fit(a, g)));
+    match integrator {
+        Integrator::Auto => by_central(Bound::Stable),
+        Integrator::Central => by_central(Bound::Turn),
+        Integrator::Lagged => other(1.0, 1.0, Bound::TurnAndLag, |a, g| Scheme::TwoStep(lagged::fit(a, g))),
+        // It evaluates the springs four times.
+        Integrator::Rk4 => other(4.0, 4.0, Bound::Stable, |a, g| Scheme::Rk4(Rk4 { a, g })),
+        Integrator::Exponential2 => exponential(3.0, 1.3, |a, g| Scheme::Exponential2(exponential::fit(a, g))),
+        Integrator::Exponential3 => exponential(4.0, 1.4, |a, g| Scheme::Exponential3(exponential::fit(a, g))),
+        Integrator::Exponential4 => exponential(5.0, 1.6, |a, g| Scheme::Exponential4(exponential::fit(a, g))),
+    }
 }
 
 impl Scheme {
     /// Fits a scheme to a = K″·dt²/m and g = C·dt/m.
     pub fn fit(integrator: Integrator, a: f64, g: f64) -> Self {
-        match integrator {
-            Integrator::Auto | Integrator::Central => Scheme::TwoStep(central::fit(a, g)),
-            Integrator::Lagged => Scheme::TwoStep(lagged::fit(a, g)),
-            Integrator::Rk4 => Scheme::Rk4 { a, g },
-            Integrator::Exponential2 => Scheme::Multistep(exponential::fit(2, a, g)),
-            Integrator::Exponential3 => Scheme::Multistep(exponential::fit(3, a, g)),
-            Integrator::Exponential4 => Scheme::Multistep(exponential::fit(4, a, g)),
-        }
+        (entry(integrator).fit)(a, g)
+    }
+
+    /// Sweeps over the springs in a substep.
+    pub(super) fn sweeps(&self) -> usize {
+        each!(self, |family| family.sweeps())
+    }
+
+    /// The first field of the tools' force that sweep number `sweep` reads.
+    pub(super) fn field(&self, sweep: usize) -> usize {
+        each!(self, |family| family.field(sweep))
+    }
+
+    /// The fraction of the substep that the state after sweep number `sweep` belongs to; `None` after the last.
+    pub(super) fn fraction_after(&self, sweep: usize) -> Option<f64> {
+        each!(self, |family| family.fraction_after(sweep))
     }
 
     /// How the tools' force enters a substep: the moments (0 to 1) at which a law is evaluated, and the weights with
     /// which each value adds to the scheme's force fields.
     pub fn nodes(&self) -> Vec<Node> {
-        match self {
-            // The scheme sees the beginning only, and takes the mean of both sides where the force jumps.
-            Scheme::TwoStep(two) => vec![Node { fraction: 0.0, weights: [two.q, 0.0, 0.0] }],
-            Scheme::Multistep(multistep) => multistep.nodes(),
-            Scheme::Rk4 { .. } => {
-                let node = |k: usize| {
-                    #[allow(clippy::cast_precision_loss)]
-                    let fraction = k as f64 / 2.0;
-                    Node { fraction, weights: std::array::from_fn(|field| f64::from(u8::from(field == k))) }
-                };
-                (0..3).map(node).collect()
-            }
-        }
+        each!(self, |family| family.nodes())
     }
 
     /// Whether a force that jumps must be given as the mean of both sides.
     pub fn takes_means(&self) -> bool {
-        matches!(self, Scheme::TwoStep(_))
+        each!(self, |family| family.takes_means())
     }
 
     /// The factor that scales the springs' forces beyond dt²/(m·h).
     pub fn spring_scale(&self) -> f64 {
-        match self {
-            Scheme::TwoStep(two) => two.q,
-            _ => 1.0,
-        }
+        each!(self, |family| family.spring_scale())
     }
 
     /// The velocity that a constant force of 1 adds in a substep (nearly), through the last of its fields.
@@ -114,67 +159,71 @@ impl Scheme {
 
     /// The field of the tools' force that adds to the velocity.
     pub fn last_field(&self) -> usize {
-        match self {
-            Scheme::TwoStep(_) => 0,
-            Scheme::Multistep(_) | Scheme::Rk4 { .. } => 1,
-        }
+        each!(self, |family| family.last_field())
     }
 
     /// The u and d that a constant force of 1 adds in a substep.
     pub fn constant(&self) -> [f64; 2] {
-        match self {
-            Scheme::TwoStep(two) => [two.q; 2],
-            Scheme::Multistep(multistep) => multistep.constant(),
-            Scheme::Rk4 { .. } => [0.5, 1.0],
-        }
+        each!(self, |family| family.constant())
     }
 
     /// The u and d that an impulse of 1 at a substep's beginning has added by its end.
     pub fn kick(&self) -> [f64; 2] {
-        match self {
-            Scheme::TwoStep(two) => [two.q; 2],
-            Scheme::Multistep(multistep) => multistep.kick(),
-            Scheme::Rk4 { .. } => [1.0; 2],
-        }
+        each!(self, |family| family.kick())
     }
 
     /// Fields that the scheme keeps beside u and d.
     pub fn kept(&self, compensated: bool) -> usize {
-        match self {
-            Scheme::TwoStep(_) => 0,
-            Scheme::Multistep(multistep) => multistep.order + usize::from(compensated),
-            Scheme::Rk4 { .. } => rk4::KEPT,
-        }
+        each!(self, |family| family.kept(compensated))
     }
 
-    /// Evaluations of the springs' force in a substep.
-    pub fn evaluations(&self) -> u32 {
-        if matches!(self, Scheme::Rk4 { .. }) { 4 } else { 1 }
+    /// How many of those, from the first, are the springs' forces of earlier substeps, newest first.
+    pub fn history(&self) -> usize {
+        each!(self, |family| family.history())
     }
 
     /// The matrix that advances u, d and the kept values of a single vibration whose springs pull with −z·u. Its
     /// eigenvalues determine stability and accuracy.
     pub fn propagator(&self, z: f64) -> Matrix {
-        match self {
-            Scheme::TwoStep(two) => two.propagator(z),
-            Scheme::Multistep(multistep) => multistep.propagator(z),
-            Scheme::Rk4 { a, g } => rk4::propagator(*a + z, *g),
-        }
+        each!(self, |family| family.propagator(z))
     }
 
     /// The largest growth factor of a vibration z in a substep.
     pub fn growth(&self, z: f64) -> f64 {
         self.propagator(z).spectral_radius()
     }
-}
 
-/// A moment of a substep at which a tool's law is evaluated.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Node {
-    /// From 0, its beginning, to 1, its end.
-    pub fraction: f64,
-    /// Weights with which the force (times dt²/(m·h)) adds to each field of the scheme.
-    pub weights: [f64; 3],
+    /// What a point's u and d must change by when a tool releases it ([`Family::release`]).
+    pub(super) fn release(&self, at: Release<'_>) -> Option<[f64; 2]> {
+        each!(self, |family| family.release(at))
+    }
+
+    /// Converts u and d of one component of a point to the same scheme with another substep ([`Family::resample`]).
+    pub(super) fn resample(
+        &self,
+        to: &Self,
+        ratio: f64,
+        state: [f64; 2],
+        pushed: f64,
+        springs: &mut [f64],
+    ) -> [f64; 2] {
+        match (self, to) {
+            (Scheme::TwoStep(from), Scheme::TwoStep(to)) => from.resample(to, ratio, state, pushed, springs),
+            (Scheme::Exponential2(from), Scheme::Exponential2(to)) => from.resample(to, ratio, state, pushed, springs),
+            (Scheme::Exponential3(from), Scheme::Exponential3(to)) => from.resample(to, ratio, state, pushed, springs),
+            (Scheme::Exponential4(from), Scheme::Exponential4(to)) => from.resample(to, ratio, state, pushed, springs),
+            (Scheme::Rk4(from), Scheme::Rk4(to)) => from.resample(to, ratio, state, pushed, springs),
+            // Schemes of two families have only the velocity in common.
+            (
+                Scheme::TwoStep(_)
+                | Scheme::Exponential2(_)
+                | Scheme::Exponential3(_)
+                | Scheme::Exponential4(_)
+                | Scheme::Rk4(_),
+                _,
+            ) => [state[0], state[1] * ratio],
+        }
+    }
 }
 
 #[cfg(test)]

@@ -4,17 +4,17 @@
 //! y₊ = y + (k₁ + 2k₂ + 2k₃ + k₄)/6. Each stage is a sweep that evaluates the springs at the u of the stage before,
 //! adds to the sum, and writes the u and w that the next stage needs.
 
-use super::super::lanes::Vector;
-use super::super::real::Real;
-use super::super::sweep::{self, MAX_KEPT};
+use super::arithmetic::{Arithmetic, MAX_KEPT};
+use super::family::{Family, Node, Release};
 use super::matrix::Matrix;
+use crate::sheet::lanes::Vector;
+use crate::sheet::real::Real;
 
 /// Kept fields: u and w at the beginning, and the sums of the slopes so far.
-pub(super) const KEPT: usize = 4;
+const KEPT: usize = 4;
 
 /// The four stages: how far the next one goes along this slope, and the weight of the slope in the sum.
-pub(in super::super) const STAGES: [(f64, f64); 4] =
-    [(0.5, 1.0 / 6.0), (0.5, 1.0 / 3.0), (1.0, 1.0 / 3.0), (0.0, 1.0 / 6.0)];
+const STAGES: [(f64, f64); 4] = [(0.5, 1.0 / 6.0), (0.5, 1.0 / 3.0), (1.0, 1.0 / 3.0), (0.0, 1.0 / 6.0)];
 
 /// One substep of a single vibration.
 fn step(pull: f64, g: f64, force: f64, y: [f64; 2]) -> [f64; 2] {
@@ -27,14 +27,80 @@ fn step(pull: f64, g: f64, force: f64, y: [f64; 2]) -> [f64; 2] {
     [0, 1].map(|c: usize| y[c] + (k1[c] + 2.0 * k2[c] + 2.0 * k3[c] + k4[c]) / 6.0)
 }
 
-pub(super) fn propagator(pull: f64, g: f64) -> Matrix {
-    let columns = [step(pull, g, 0.0, [1.0, 0.0]), step(pull, g, 0.0, [0.0, 1.0])];
-    Matrix::of(2, |i, j| columns[j][i])
+/// The scheme for y′ = (w, N − a·u − g·w + F).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Rk4 {
+    /// K″·dt²/m.
+    pub a: f64,
+    /// C·dt/m.
+    pub g: f64,
+}
+
+impl Family for Rk4 {
+    type Plain<T: Real> = Advance<T>;
+    type Compensated<T: Real> = Advance<T>;
+
+    fn plain<T: Real>(&self, sweep: usize) -> Advance<T> {
+        let (far, share) = STAGES[sweep];
+        Advance { a: T::of(-self.a), g: T::of(-self.g), far: T::of(far), share: T::of(share), stage: sweep }
+    }
+
+    fn compensated<T: Real>(&self, sweep: usize) -> Advance<T> {
+        self.plain(sweep)
+    }
+
+    fn sweeps(&self) -> usize {
+        STAGES.len()
+    }
+
+    fn last_field(&self) -> usize {
+        1
+    }
+
+    fn field(&self, sweep: usize) -> usize {
+        sweep.div_ceil(2)
+    }
+
+    fn fraction_after(&self, sweep: usize) -> Option<f64> {
+        (sweep + 1 < STAGES.len()).then(|| STAGES[sweep].0)
+    }
+
+    fn nodes(&self) -> Vec<Node> {
+        let node = |k: usize| {
+            #[allow(clippy::cast_precision_loss)]
+            let fraction = k as f64 / 2.0;
+            Node { fraction, weights: std::array::from_fn(|field| f64::from(u8::from(field == k))) }
+        };
+        (0..3).map(node).collect()
+    }
+
+    fn constant(&self) -> [f64; 2] {
+        [0.5, 1.0]
+    }
+
+    fn kick(&self) -> [f64; 2] {
+        [1.0; 2]
+    }
+
+    fn propagator(&self, z: f64) -> Matrix {
+        let pull = self.a + z;
+        let columns = [step(pull, self.g, 0.0, [1.0, 0.0]), step(pull, self.g, 0.0, [0.0, 1.0])];
+        Matrix::of(2, |i, j| columns[j][i])
+    }
+
+    /// u and w are the point's own: it continues with the tool's velocity.
+    fn release(&self, _: Release<'_>) -> Option<[f64; 2]> {
+        None
+    }
+
+    fn resample(&self, _: &Self, ratio: f64, [u, w]: [f64; 2], _: f64, _: &mut [f64]) -> [f64; 2] {
+        [u, w * ratio]
+    }
 }
 
 /// One stage, in the format of the state.
 #[derive(Debug, Clone, Copy)]
-pub(in super::super) struct Advance<T> {
+pub(in crate::sheet) struct Advance<T> {
     a: T,
     g: T,
     far: T,
@@ -42,14 +108,7 @@ pub(in super::super) struct Advance<T> {
     stage: usize,
 }
 
-impl<T: Real> Advance<T> {
-    pub(in super::super) fn new(a: f64, g: f64, stage: usize) -> Self {
-        let (far, share) = STAGES[stage];
-        Advance { a: T::of(-a), g: T::of(-g), far: T::of(far), share: T::of(share), stage }
-    }
-}
-
-impl<T: Real> sweep::Scheme<T> for Advance<T> {
+impl<T: Real> Arithmetic<T> for Advance<T> {
     const KEPT: usize = KEPT;
     const WRITTEN: usize = KEPT;
     const FORCES: usize = 1;

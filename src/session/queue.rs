@@ -2,7 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use super::{Due, Place};
+use super::command::Due;
+use super::lease::Place;
 
 /// Commands by their place: step, then order of arrival.
 type Commands = BTreeMap<Place, Due>;

@@ -1,10 +1,11 @@
-//! What a command has to keep to, whenever it comes: so it is looked at before anybody's turn at the intake.
+//! The rules that a command has to keep to, whenever it comes. So it is checked before its turn at the intake.
 
-use super::Command;
+use super::command::Command;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, positive};
 use crate::scene::Scene;
-use crate::scene::script::{Action, check_poke, check_reach};
+use crate::scene::check::{check_free, check_poke, check_reach};
+use crate::scene::script::Action;
 
 /// The rules of a session.
 #[derive(Debug)]
@@ -19,6 +20,9 @@ pub struct Checked(pub(super) Vec<Command>);
 
 impl Rules {
     /// All of `commands`, if each keeps to the rules.
+    ///
+    /// # Errors
+    /// Refuses too many commands, and the first command that does not keep to the rules.
     pub fn check(&self, commands: Vec<Command>) -> Result<Checked> {
         if commands.len() > self.limits.queued_commands_per_tool {
             let message = format!("{} commands are more than a tool may have waiting", commands.len());
@@ -35,7 +39,7 @@ impl Rules {
         match &command.action {
             Action::Push(poke) => check_poke(poke, &self.scene.sheet, &self.limits),
             Action::Grasp { point, displacement_m } => {
-                crate::scene::script::check_free("position.point", &self.scene.sheet, *point)?;
+                check_free("position.point", &self.scene.sheet, *point)?;
                 crate::refusal::finite_vector("position.displacement_m", *displacement_m)?;
                 let far_m = displacement_m.length();
                 check_reach("position.displacement_m", &self.scene.sheet, far_m, &self.limits)

@@ -1,6 +1,7 @@
-//! The desk in virtual time: rest, stamps, leases.
+//! The intake in virtual time: rest, stamps, leases.
 #![allow(clippy::unwrap_used)]
 
+use super::super::batch::SLICE;
 use super::*;
 use crate::scene::PAPER;
 use crate::scene::tip::Tip;

@@ -1,10 +1,12 @@
-//! Batches of commands: accepted whole or not at all, and put in the queue in slices, so that nobody waits long for the
+//! Batches of commands: accepted whole or not at all, and put in the queue in slices. So no caller waits long for the
 //! intake.
 
 use std::collections::BTreeMap;
 
-use super::rules::{check_tip, tip_radius_m};
-use super::{Checked, Command, Intake, LeaseId, not_holder};
+use super::command::Command;
+use super::intake::Intake;
+use super::lease::{LeaseId, not_holder};
+use super::rules::{Checked, check_tip, tip_radius_m};
 use crate::refusal::{Reason, Refusal, Result};
 
 /// Commands that are put in the queue in one turn at the intake.
@@ -32,14 +34,14 @@ impl Intake {
             self.renew(id, now_ns)?;
             return Ok(Batch { id, commands: commands.into_iter() });
         }
-        if self.leases.values().any(|lease| lease.id == id && lease.batch_since.is_some()) {
+        if self.leases.of(id).any(|lease| lease.batch_since.is_some()) {
             let message = "commands of this lease are being taken in: send them one call after another";
             return Err(Refusal::new(Reason::OutOfTurn, "", message));
         }
         // Of each tool the last sequence number, how many commands come, and the tip after them.
         let mut last: BTreeMap<u32, (u64, usize, Option<f64>)> = BTreeMap::new();
         for command in &commands {
-            let lease = self.leases.get(&command.tool).filter(|lease| lease.id == id);
+            let lease = self.leases.get(command.tool).filter(|lease| lease.id == id);
             let lease = lease.ok_or_else(|| not_holder(format!("tool {} is not held by this client", command.tool)))?;
             let coming = last.get(&command.tool).copied();
             let before = coming.map(|(sequence, ..)| sequence).or(lease.last_sequence);
@@ -62,8 +64,9 @@ impl Intake {
         self.make_room(commands.len())?;
         self.counts.accepted += commands.len() as u64;
         self.coming += commands.len();
-        for lease in self.leases.values_mut().filter(|lease| lease.id == id) {
-            lease.batch_since = Some(self.arrivals);
+        let arrivals = self.arrivals;
+        for lease in self.leases.of_mut(id) {
+            lease.batch_since = Some(arrivals);
         }
         self.renew(id, now_ns)?;
         Ok(Batch { id, commands: commands.into_iter() })
@@ -75,7 +78,7 @@ impl Intake {
         let slice = batch.commands.len().min(SLICE);
         self.coming -= slice;
         for command in batch.commands.by_ref().take(slice) {
-            let is_held = self.leases.get(&command.tool).is_some_and(|lease| lease.id == batch.id);
+            let is_held = self.leases.get(command.tool).is_some_and(|lease| lease.id == batch.id);
             if is_held && self.closed.is_none() {
                 self.enqueue(command, false);
             } else {
@@ -85,7 +88,7 @@ impl Intake {
         if batch.commands.len() > 0 {
             return true;
         }
-        for lease in self.leases.values_mut().filter(|lease| lease.id == batch.id) {
+        for lease in self.leases.of_mut(batch.id) {
             lease.batch_since = None;
         }
         self.changed |= slice > 0;

@@ -1,0 +1,305 @@
+//! A session as the server sees it: requests to its stepping thread, and its intake.
+
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
+
+use tokio::sync::{oneshot, watch};
+
+use super::audited::Audited;
+use super::clock::now_ns;
+use super::cost::{Cost, check_work};
+use super::frames::Viewer;
+use super::inbox::{Inbox, Request};
+use super::laws::{KeptLaws, SoughtLaw};
+use super::paced::{PacedRecord, PacedSample};
+use super::places::Places;
+use super::queue::{Reader, queue};
+use super::reading::Recipient;
+use super::status::Status;
+use super::taps::{ProbeTap, SampleTap};
+use crate::budget::{Account, Taken};
+use crate::limits::Limits;
+use crate::lock::lock;
+use crate::memory;
+use crate::refusal::{Reason, Refusal, Result};
+use crate::scene::Change;
+use crate::scene::record::Point;
+use crate::session::batch::Batch;
+use crate::session::command::Command;
+use crate::session::intake::Intake;
+use crate::session::lease::LeaseId;
+use crate::session::sampling::{HEARTBEAT_S, Sampler, Sampling};
+use crate::sheet::Model;
+
+/// A session as the server sees it.
+pub struct Live {
+    /// Random, not to be guessed.
+    pub id: String,
+    /// The tissue as the session began with it. Points and rate stay; coefficients, scheme and substeps may be others by
+    /// now ([`Status::model`]).
+    pub model: Arc<Model>,
+    /// Who made it, and pays for it.
+    pub owner: Account,
+    pub(super) intake: Mutex<Intake>,
+    /// Deleted when so long nobody asked for it, held a tool or had a stream, s.
+    pub idle_timeout_s: f64,
+    pub(super) asked_ns: AtomicU64,
+    pub(super) number: u64,
+    pub(super) limits: Limits,
+    pub(super) status: Mutex<Status>,
+    pub(super) streams: Mutex<Places>,
+    pub(super) refused: AtomicU64,
+    pub(super) laws: KeptLaws,
+    pub(super) tissue: watch::Sender<(u64, Arc<Model>)>,
+    pub(super) cost: Cost,
+    pub(super) audited: Mutex<Audited>,
+    /// Of the stepping threads, its own, and where that is asked.
+    pub(super) thread: usize,
+    pub(super) inbox: Arc<Inbox>,
+    /// The session, and its memory.
+    pub(super) _taken: [Taken; 2],
+}
+
+impl Live {
+    /// How the session stands now: at rest its steps are done in thought.
+    pub fn status(&self) -> Status {
+        let now = now_ns();
+        let resting = self.at_intake(|intake, _| intake.is_resting().then(|| intake.next_step()));
+        let mut status = lock(&self.status).clone();
+        if let Some(step) = resting.filter(|step| *step >= status.step) {
+            status.rested_steps += step - status.step;
+            status.dilation.observe(now, step, status.schedule.period_ns());
+            (status.resting, status.step, status.awake_points) = (true, step, 0);
+        }
+        status
+    }
+
+    #[allow(clippy::cast_precision_loss)]
+    pub(super) fn is_idle(&self, now_ns: u64) -> bool {
+        let unused_s = now_ns.saturating_sub(self.asked_ns.load(Ordering::Relaxed)) as f64 * 1e-9;
+        unused_s > self.idle_timeout_s
+            && self.streams() == 0
+            && self.at_intake(|intake, _| intake.holders().next().is_none())
+    }
+
+    /// Where commands come in, as it stands now, and the time: also while no step is done that would end the leases that
+    /// have run out. A session at rest wakes if need be.
+    pub fn at_intake<T>(&self, act: impl FnOnce(&mut Intake, u64) -> T) -> T {
+        let mut intake = lock(&self.intake);
+        let now = now_ns();
+        intake.lapse(now);
+        let answer = act(&mut intake, now);
+        let wake = intake.take_wake();
+        drop(intake);
+        if wake {
+            self.inbox.send(self.number, Request::Wake);
+        }
+        answer
+    }
+
+    /// Accepts all of `commands` from the holder of `lease`, or none. The first slice of them is put in the queue.
+    ///
+    /// # Errors
+    /// Refuses commands that do not keep to the rules, and as [`Intake::accept`] does.
+    pub fn submit(&self, lease: LeaseId, commands: Vec<Command>) -> Result<Accepted<'_>> {
+        let rules = lock(&self.intake).rules();
+        let checked = rules.check(commands)?;
+        self.at_intake(|intake, now| {
+            let mut batch = intake.accept(lease, checked, now)?;
+            let goes_on = intake.go_on(&mut batch);
+            Ok(Accepted { live: self, batch, goes_on })
+        })
+    }
+
+    /// So many commands were refused.
+    pub fn count_refused(&self, commands: usize) {
+        self.refused.fetch_add(commands as u64, Ordering::Relaxed);
+    }
+
+    /// What audits have found so far.
+    pub fn audited(&self) -> Audited {
+        lock(&self.audited).clone()
+    }
+
+    /// Commands that were refused, in all.
+    pub fn refused(&self) -> u64 {
+        self.refused.load(Ordering::Relaxed)
+    }
+
+    async fn ask<T>(&self, request: impl FnOnce(oneshot::Sender<Result<T>>) -> Request) -> Result<T> {
+        let (reply, answer) = oneshot::channel();
+        self.inbox.send(self.number, request(reply));
+        answer.await.unwrap_or_else(|_| Err(deleted()))
+    }
+
+    /// Lets time go on, for ever or until so many steps are done; tells the step that comes next.
+    ///
+    /// # Errors
+    /// Refuses a session that is held or deleted, and a step that is done already.
+    pub async fn start(&self, until: Option<u64>) -> Result<u64> {
+        self.ask(|reply| Request::Start { until, reply }).await
+    }
+
+    /// Changes the tissue from the beginning of step `at_step` on, or of the next. Tells the step, and the tissue from then
+    /// on. It is compiled here, by who asks, some milliseconds: no step waits for that.
+    ///
+    /// `admit` is asked whether the thread has the time that the tissue will take of it, as a part of all. It is given up
+    /// when `stop` is set.
+    ///
+    /// # Errors
+    /// Refuses a change that is not valid or whose steps are too heavy, what `admit` refuses, and when `stop` is set.
+    pub fn change(
+        &self,
+        change: &Change,
+        at_step: Option<u64>,
+        admit: impl Fn(f64) -> Result<()>,
+        stop: &AtomicBool,
+    ) -> Result<(u64, Arc<Model>)> {
+        loop {
+            let base = self.at_intake(|intake, _| intake.changed_to());
+            let now = base.as_ref().unwrap_or(&self.model);
+            let model = memory::attempt("", || now.changed_until(change, &self.model.scene, &self.limits, stop))?;
+            check_work(&model, &self.limits)?;
+            // The stepping thread lays out what the new scheme keeps, and a checkpoint.
+            memory::check(2 * model.state_bytes(), "another tissue")?;
+            let (before, after) = (lock(&self.status).model.plan.substeps, model.plan.substeps);
+            if after > before {
+                admit(self.cost.awake_share() * f64::from(after) / f64::from(before))?;
+            }
+            // Somebody may have been quicker; then it is made out of theirs.
+            if let Some(step) = self.at_intake(|intake, now| intake.change(base.as_ref(), &model, at_step, now))? {
+                return Ok((step, model));
+            }
+        }
+    }
+
+    /// Has a session that is held go on: from the step that it was held at, paused, with its tissue at rest, and no tool
+    /// held. What made the tissue fail may make it fail again.
+    ///
+    /// # Errors
+    /// Refuses a session that is not held, or that is deleted.
+    pub async fn revive(&self) -> Result<u64> {
+        self.ask(|reply| Request::Revive { reply }).await
+    }
+
+    /// Stops time.
+    ///
+    /// # Errors
+    /// Refuses a session that is deleted.
+    pub async fn pause(&self) -> Result<()> {
+        self.ask(|reply| Request::Pause { reply }).await
+    }
+
+    /// Waits until `at` steps are done (now, if `None`), and tells the step and the state's hash there.
+    /// `account` is charged for it.
+    ///
+    /// # Errors
+    /// Refuses a step that has passed, a session that is held or deleted, and a caller who has used up their part of the
+    /// reading time.
+    pub async fn hash_at(&self, at: Option<u64>, account: &Account) -> Result<(u64, u128)> {
+        let account = account.clone();
+        self.ask(|reply| Request::Hash { at, account, reply }).await
+    }
+
+    /// The samples that are asked for.
+    ///
+    /// What it takes on the stepping thread is charged to `watcher`, who gets no sample while its share of that time is used
+    /// up; `None` for the stream of who holds a tool.
+    pub fn samples(&self, sampling: Sampling, watcher: Option<&Account>) -> Reader<PacedSample> {
+        self.tap(sampling, watcher, false)
+    }
+
+    /// The next sample; the present one if time stands.
+    ///
+    /// # Errors
+    /// Refuses a session that is held or deleted.
+    pub async fn next_sample(&self, only: Vec<u32>) -> Result<PacedSample> {
+        let (laws, touch_stiffness) = (None, false);
+        let sampling =
+            Sampling { every: 1, only: Some(only), deadband: None, heartbeat_s: HEARTBEAT_S, laws, touch_stiffness };
+        Ok(self.tap(sampling, None, true).pop().await?.0)
+    }
+
+    fn tap(&self, sampling: Sampling, watcher: Option<&Account>, once: bool) -> Reader<PacedSample> {
+        let (writer, reader) = queue(if once { 1 } else { self.limits.queued_samples });
+        let sampler = Sampler::new(sampling, self.model.scene.stepping.rate_hz);
+        let tap = SampleTap { sampler, once, writer, watcher: watcher.cloned(), overrun_count: 0 };
+        self.inbox.send(self.number, Request::Samples(tap));
+        reader
+    }
+
+    /// Records of some points, or of all, every so many steps; refused if there is no memory for one.
+    ///
+    /// # Errors
+    /// Refuses if the system has no memory for a record.
+    pub fn probe(
+        &self,
+        every: u64,
+        points: Option<Vec<[usize; 2]>>,
+        energy: bool,
+        account: &Account,
+    ) -> Result<Reader<PacedRecord>> {
+        let count = points.as_ref().map_or(self.model.len(), Vec::len).max(1);
+        let bytes = count * size_of::<Point>();
+        memory::check(bytes as u64, "a record")?;
+        let room = (self.limits.queued_bytes / bytes).clamp(1, self.limits.queued_records);
+        let (writer, reader) = queue(room);
+        let (recipient, points) = (Recipient::new(writer, room), points.map(Arc::from));
+        let account = account.clone();
+        self.inbox.send(self.number, Request::Probe(ProbeTap { every, points, energy, recipient, account }));
+        Ok(reader)
+    }
+
+    /// The tissue, and the step from whose beginning on it acts. A change of it is noticed when it acts.
+    pub(crate) fn tissue(&self) -> watch::Receiver<(u64, Arc<Model>)> {
+        self.tissue.subscribe()
+    }
+
+    /// The force law of `model`, a tissue of this session, under a tip of `radius_m`. Nothing is computed here.
+    ///
+    /// # Errors
+    /// Refuses if the session's owner can't have the memory of a further law.
+    pub(crate) fn law(&self, model: &Arc<Model>, radius_m: f64) -> Result<Arc<SoughtLaw>> {
+        self.laws.of(radius_m, model, self.limits.law_work, &self.owner)
+    }
+
+    /// Frames for a viewer.
+    pub fn view(&self, viewer: Arc<Viewer>) {
+        self.inbox.send(self.number, Request::View(viewer));
+    }
+}
+
+/// Commands that were accepted. Those that are not in the queue yet are put there when this is dropped.
+pub struct Accepted<'l> {
+    live: &'l Live,
+    batch: Batch,
+    goes_on: bool,
+}
+
+impl Accepted<'_> {
+    fn go_on(&mut self) {
+        let batch = &mut self.batch;
+        self.goes_on = self.live.at_intake(|intake, _| intake.go_on(batch));
+    }
+
+    /// Puts them in the queue slice by slice. Between slices other tasks and the stepping thread have their turns.
+    pub async fn taken_in(mut self) {
+        while self.goes_on {
+            tokio::task::yield_now().await;
+            self.go_on();
+        }
+    }
+}
+
+impl Drop for Accepted<'_> {
+    fn drop(&mut self) {
+        while self.goes_on {
+            self.go_on();
+        }
+    }
+}
+
+/// The refusal of what a deleted session is asked.
+pub(super) fn deleted() -> Refusal {
+    Refusal::new(Reason::SessionDeleted, "session_id", "the session has been deleted")
+}

@@ -1,0 +1,191 @@
+//! All sessions of a server, and the threads that step them.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, Mutex, Weak};
+use std::thread::JoinHandle;
+
+use super::audited::AuditTally;
+use super::auditor::{Auditor, Sessions};
+use super::clock::now_ns;
+use super::frames::{Encoder, Viewer};
+use super::inbox::Request;
+use super::live::{Live, deleted};
+use super::reading::{Piece, Reading};
+use super::tally::Tally;
+use super::thread::{self, Stepper};
+use crate::budget::Budget;
+use crate::limits::Limits;
+use crate::lock::lock;
+use crate::priority::give_way;
+use crate::refusal::{Reason, Refusal, Result, excerpt};
+use crate::session::local::Refinement;
+
+/// Stiffnesses that wait to be computed, of all tools of a server.
+const WAITING_REFINEMENTS: usize = 8;
+
+/// All sessions of a server, and the threads that step them.
+pub struct Pacer {
+    pub(super) limits: Limits,
+    /// What callers share.
+    pub budget: Arc<Budget>,
+    /// One for each stepping thread: where it is asked, and where new sessions wait for it.
+    pub(super) steppers: Vec<Arc<Stepper>>,
+    encoder: Arc<Encoder>,
+    reading: Arc<Reading>,
+    threads: Mutex<Vec<JoinHandle<()>>>,
+    pub(super) sessions: Sessions,
+    auditor: Arc<Auditor>,
+    viewers: Mutex<BTreeMap<String, Weak<Viewer>>>,
+    pub(super) numbers: Mutex<u64>,
+}
+
+impl Pacer {
+    /// Starts `threads` stepping threads, one that encodes frames, one that reads large sheets, and one that measures
+    /// errors with `audit_share` of a core; none if that is 0.
+    ///
+    /// # Errors
+    /// Returns an error if a thread can't be started.
+    pub fn start(threads: usize, audit_share: f64, limits: &Limits, budget: Arc<Budget>) -> std::io::Result<Arc<Self>> {
+        let (encoder, reading) = (Arc::new(Encoder::default()), Arc::new(Reading::default()));
+        let mut handles = Vec::new();
+        let mut steppers = Vec::new();
+        // It ends when the stepping threads have ended, and nobody sends any more.
+        let (refiner, refinements) = std::sync::mpsc::sync_channel::<Refinement>(WAITING_REFINEMENTS);
+        let worker = move || {
+            give_way();
+            refinements.into_iter().for_each(Refinement::work);
+        };
+        handles.push(std::thread::Builder::new().name("stiffness".into()).spawn(worker)?);
+        for index in 0..threads.max(1) {
+            let stepper = Arc::new(Stepper::default());
+            steppers.push(stepper.clone());
+            let (encoder, refiner, reading) = (encoder.clone(), refiner.clone(), reading.clone());
+            let builder = std::thread::Builder::new().name(format!("step-{index}"));
+            handles.push(builder.spawn(move || thread::work(&stepper, &encoder, &refiner, &reading))?);
+        }
+        let (worker, shared) = (encoder.clone(), budget.clone());
+        handles.push(std::thread::Builder::new().name("frames".into()).spawn(move || worker.work(&shared))?);
+        let reader = reading.clone();
+        let worker = move || {
+            give_way();
+            reader.work();
+        };
+        handles.push(std::thread::Builder::new().name("records".into()).spawn(worker)?);
+        let (auditor, sessions) = (Arc::new(Auditor::default()), Sessions::default());
+        if audit_share > 0.0 {
+            let (auditor, sessions) = (auditor.clone(), sessions.clone());
+            let worker = move || {
+                give_way();
+                auditor.work(&sessions, audit_share);
+            };
+            handles.push(std::thread::Builder::new().name("audit".into()).spawn(worker)?);
+        }
+        Ok(Arc::new(Pacer {
+            limits: limits.clone(),
+            budget,
+            steppers,
+            encoder,
+            reading,
+            threads: Mutex::new(handles),
+            sessions,
+            auditor,
+            viewers: Mutex::new(BTreeMap::new()),
+            numbers: Mutex::new(0),
+        }))
+    }
+
+    /// The session of that id.
+    ///
+    /// # Errors
+    /// Refuses an unknown ID.
+    pub fn get(&self, id: &str) -> Result<Arc<Live>> {
+        let live = lock(&self.sessions).get(id).cloned().ok_or_else(|| unknown_session(id))?;
+        live.asked_ns.store(now_ns(), Ordering::Relaxed);
+        Ok(live)
+    }
+
+    /// All sessions, oldest first.
+    pub fn list(&self) -> Vec<Arc<Live>> {
+        let mut all: Vec<_> = lock(&self.sessions).values().cloned().collect();
+        all.sort_by_key(|live| live.number);
+        all
+    }
+
+    /// What each stepping thread counts of itself.
+    pub fn tallies(&self) -> impl Iterator<Item = &Tally> {
+        self.steppers.iter().map(|stepper| &stepper.inbox.tally)
+    }
+
+    /// What the auditor counts.
+    pub fn audit_tally(&self) -> &AuditTally {
+        &self.auditor.tally
+    }
+
+    /// Those who look at some session.
+    pub fn viewers(&self) -> usize {
+        lock(&self.viewers).values().filter(|viewer| viewer.strong_count() > 0).count()
+    }
+
+    /// Ends a session and all its streams.
+    ///
+    /// # Errors
+    /// Refuses an unknown ID.
+    pub fn delete(&self, id: &str) -> Result<()> {
+        let live = lock(&self.sessions).remove(id).ok_or_else(|| unknown_session(id))?;
+        let waited = lock(&live.intake).close(deleted());
+        if !waited.is_empty() {
+            // To free many takes longer than other calls may wait.
+            self.reading.post(&live.owner, Piece::Remains(Box::new(waited)));
+        }
+        live.inbox.send(live.number, Request::Delete(deleted()));
+        Ok(())
+    }
+
+    /// Deletes the sessions that nobody uses any more; tells which.
+    pub fn delete_idle(&self) -> Vec<String> {
+        let now = now_ns();
+        let all: Vec<_> = lock(&self.sessions).values().cloned().collect();
+        let ids: Vec<String> = all.iter().filter(|live| live.is_idle(now)).map(|live| live.id.clone()).collect();
+        ids.into_iter().filter(|id| self.delete(id).is_ok()).collect()
+    }
+
+    /// Adds a viewer to a session.
+    pub fn add_viewer(&self, live: &Live, viewer: &Arc<Viewer>) {
+        let mut viewers = lock(&self.viewers);
+        viewers.retain(|_, viewer| viewer.strong_count() > 0);
+        viewers.insert(viewer.id.clone(), Arc::downgrade(viewer));
+        drop(viewers);
+        live.view(viewer.clone());
+    }
+
+    /// The viewer of that id.
+    ///
+    /// # Errors
+    /// Refuses an unknown ID.
+    pub fn viewer(&self, id: &str) -> Result<Arc<Viewer>> {
+        lock(&self.viewers).get(id).and_then(Weak::upgrade).ok_or_else(|| {
+            Refusal::new(Reason::UnknownViewer, "viewer_id", format!("there is no viewer `{}`", excerpt(id)))
+        })
+    }
+
+    /// Ends all sessions and threads.
+    pub fn stop(&self) {
+        let why = Refusal::new(Reason::ShuttingDown, "", "the server is going down");
+        for live in lock(&self.sessions).values() {
+            drop(lock(&live.intake).close(why.clone()));
+        }
+        self.steppers.iter().for_each(|stepper| stepper.inbox.stop(why.clone()));
+        self.encoder.stop();
+        self.reading.stop();
+        self.auditor.stop();
+        for thread in lock(&self.threads).drain(..) {
+            let _ = thread.join();
+        }
+    }
+}
+
+fn unknown_session(id: &str) -> Refusal {
+    let message = format!("there is no session `{}`", excerpt(id));
+    Refusal::new(Reason::UnknownSession, "session_id", message)
+}

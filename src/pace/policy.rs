@@ -1,0 +1,140 @@
+//! The overrun policy: what a session may catch up, what is dropped, and which session waits when a thread is too slow
+//! for all. Pure: time is an argument.
+//!
+//! **Overruns.** Time steps are fixed. A session that is behind catches up at most [`CATCH_UP_STEPS`] steps, and what the
+//! longest recent step of its thread has made it late. What it is behind beyond that is dropped from its schedule and
+//! counted. Simulated time then runs slower than real time.
+//!
+//! **Fair parts.** The session that is due first is stepped first, so sessions of any rates are all on time while there
+//! is time for all. If there is not, a session that takes no more than its part of the thread is still stepped when it is
+//! due. A session that takes more and is late goes after all that are due. The thread is divided among the callers whose
+//! sessions are awake, and each caller's part among its sessions: a caller who wakes four hundred sessions at once slows
+//! those. So between two steps of a session that is too heavy all others get theirs, and it gets what they leave. A step
+//! can't be interrupted: the longest recent one may have made every session late, and each catches that up however many
+//! steps it is.
+
+/// Steps that a session may be behind before the rest is dropped.
+const CATCH_UP_STEPS: f64 = 2.0;
+
+/// The number of steps to drop from the schedule of a session whose next step was due `late_ns` ago. Of that,
+/// `forgiven_ns` is not the session's fault.
+#[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+pub(super) fn dropped_steps(late_ns: u64, forgiven_ns: u64, period_ns: f64) -> u64 {
+    let behind = (late_ns.saturating_sub(forgiven_ns) as f64 / period_ns).floor();
+    // A negative number becomes 0.
+    (behind - CATCH_UP_STEPS) as u64
+}
+
+/// The number of equal parts that a thread is divided into for one session: `callers` have awake sessions, and the
+/// session's caller has `siblings` of them, itself included.
+pub(super) fn parts(callers: usize, siblings: usize) -> usize {
+    callers * siblings
+}
+
+/// A session that looks for its place among the others of its thread, after a step.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Turn {
+    /// When its next step is due.
+    pub(super) due_ns: u64,
+    /// The time between two steps.
+    pub(super) period_ns: f64,
+    /// The fraction of the thread that its steps take.
+    pub(super) share: f64,
+    /// The number of equal parts of the thread of which one is its own ([`parts`]).
+    pub(super) parts: usize,
+    /// Whether no other session of the thread is due some time.
+    pub(super) is_alone: bool,
+}
+
+impl Turn {
+    /// The time before which the session is not stepped: `now_ns` if it is late and takes more than its part, so that it
+    /// goes after all that are due by then; else 0.
+    #[allow(clippy::cast_precision_loss)]
+    pub(super) fn not_before_ns(&self, now_ns: u64) -> u64 {
+        let is_late = now_ns.saturating_sub(self.due_ns) as f64 > self.period_ns;
+        let takes_more = self.share * self.parts as f64 > 1.0;
+        if !self.is_alone && is_late && takes_more { now_ns } else { 0 }
+    }
+}
+
+/// The longest recent step of a thread: no session is to blame for being late by as much.
+#[derive(Debug, Default)]
+pub(super) struct Longest {
+    /// Of this window, and of the last.
+    now_ns: u64,
+    before_ns: u64,
+    since_ns: u64,
+}
+
+/// Length of the windows.
+const WINDOW_NS: u64 = 250_000_000;
+
+/// Most that is forgiven of a step.
+const MOST_NS: u64 = 100_000_000;
+
+impl Longest {
+    /// Notes a step that ended at `now_ns` and took `took_ns`.
+    pub(super) fn observe(&mut self, now_ns: u64, took_ns: u64) {
+        if now_ns.saturating_sub(self.since_ns) > WINDOW_NS {
+            (self.before_ns, self.now_ns, self.since_ns) = (self.now_ns, 0, now_ns);
+        }
+        self.now_ns = self.now_ns.max(took_ns.min(MOST_NS));
+    }
+
+    /// The length of that step.
+    pub(super) fn ns(&self) -> u64 {
+        self.now_ns.max(self.before_ns)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MS: u64 = 1_000_000;
+
+    #[test]
+    fn a_session_catches_up_two_steps_and_what_is_not_its_fault() {
+        let period_ns = MS as f64;
+        for (late_ms, forgiven_ms, dropped) in [(0, 0, 0), (2, 0, 0), (3, 0, 1), (10, 0, 8), (10, 7, 1), (10, 20, 0)] {
+            assert_eq!(dropped_steps(late_ms * MS, forgiven_ms * MS, period_ns), dropped, "{late_ms} {forgiven_ms}");
+        }
+        // Parts of a step are not dropped.
+        assert_eq!(dropped_steps(4 * MS - 1, 0, period_ns), 1);
+    }
+
+    /// A session whose next step is due at 2 ms, at 1 kHz.
+    fn turn(share: f64, parts: usize) -> Turn {
+        Turn { due_ns: 2 * MS, period_ns: MS as f64, share, parts, is_alone: parts == 1 }
+    }
+
+    #[test]
+    fn a_session_that_is_late_and_takes_more_than_its_part_goes_after_all_that_are_due() {
+        assert_eq!(turn(2.0, 2).not_before_ns(7 * MS), 7 * MS);
+        // Late through no fault of its own, alone on its thread, or heavy but on time.
+        assert_eq!(turn(0.01, 2).not_before_ns(7 * MS), 0);
+        assert_eq!(turn(2.0, 1).not_before_ns(7 * MS), 0);
+        assert_eq!(turn(2.0, 2).not_before_ns(2 * MS), 0);
+    }
+
+    #[test]
+    fn a_thread_is_divided_among_callers_first() {
+        // 40 sessions of one caller take 2 ms of each millisecond together; one session of another keeps its time.
+        let (many, one) = (turn(0.05, parts(2, 40)), turn(0.05, parts(2, 1)));
+        assert_eq!((many.not_before_ns(10 * MS), one.not_before_ns(10 * MS)), (10 * MS, 0));
+    }
+
+    #[test]
+    fn a_long_step_is_forgiven_for_a_while_and_within_reason() {
+        let mut longest = Longest::default();
+        longest.observe(1, 5_000_000);
+        longest.observe(2, 1000);
+        assert_eq!(longest.ns(), 5_000_000);
+        longest.observe(3, 10_000_000_000);
+        assert_eq!(longest.ns(), MOST_NS);
+        for window in 1..4 {
+            longest.observe(window * (WINDOW_NS + 1) + 3, 1000);
+        }
+        assert_eq!(longest.ns(), 1000);
+    }
+}

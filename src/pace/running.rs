@@ -1,0 +1,391 @@
+//! A session on its stepping thread: its schedule, the requests to it, and its steps.
+//!
+//! Rest: while all of a tissue is asleep and no command waits, its steps change nothing but their number. Then only the
+//! steps are done that somebody is to be told of (a heartbeat, a record, a hash); those between are skipped, all at once,
+//! when the next is due. A session of which nobody waits for a step is not in the thread's rota at all, and a thread
+//! whose rota is empty sleeps until it is asked something. What comes in meanwhile is placed where it would be had the
+//! session been stepped ([`Intake::rest`](crate::session::intake::Intake::rest)), and wakes the thread.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+use std::sync::mpsc::SyncSender;
+
+use super::clock::{Dilation, now_ns};
+use super::frames::Encoder;
+use super::inbox::Request;
+use super::live::Live;
+use super::policy::{Longest, Turn, dropped_steps};
+use super::queue::Wakes;
+use super::reading::{Copies, Hashed, Reading};
+use super::taps::{Taps, ViewTap};
+use crate::lock::lock;
+use crate::memory;
+use crate::refusal::{Reason, Refusal, Result};
+use crate::session::Session;
+use crate::session::command::Due;
+use crate::session::local::Refinement;
+use crate::session::schedule::Schedule;
+use crate::sheet::audit::Mark;
+
+/// Sessions begin on the same beat, whose length this is, ns: a thread wakes once for all of a rate, and so does who
+/// carries what they tell.
+const BEAT_NS: u64 = 1_000_000;
+
+/// Every so many steps of a session one is a span of the log, at level debug.
+const STEPS_PER_SPAN: u64 = 1024;
+
+/// How often the stiffness under tools is computed anew, Hz.
+const REFINED_HZ: f64 = 50.0;
+
+/// A session and its schedule.
+pub(super) struct Running {
+    pub(super) live: Arc<Live>,
+    pub(super) session: Session,
+    pub(super) running: bool,
+    pub(super) until: Option<u64>,
+    pub(super) schedule: Schedule,
+    /// The step to do next. At rest, those before it are skipped; `u64::MAX` if there is none.
+    pub(super) next_step: u64,
+    /// When the newest step was due, before what it was late by beyond measure was dropped.
+    pub(super) due_ns: u64,
+    /// It was late, and takes more than its part: it goes after those that were due by then.
+    not_before_ns: u64,
+    /// Steps done when all was asleep first, if it still is.
+    pub(super) still_since: Option<u64>,
+    pub(super) rested_steps: u64,
+    pub(super) overrun_count: u64,
+    pub(super) lapsed_leases: u64,
+    pub(super) dilation: Dilation,
+    due: Vec<Due>,
+    pub(super) hashed: Hashed,
+    pub(super) copies: Copies,
+    pub(super) taps: Taps,
+    /// Who is to be told of the window that the session was asked for.
+    pub(super) audit: Option<SyncSender<Mark>>,
+    deleted: bool,
+}
+
+/// What all sessions of a thread use.
+pub(super) struct Desk<'t> {
+    pub(super) encoder: &'t Encoder,
+    pub(super) refiner: &'t SyncSender<Refinement>,
+    pub(super) reading: &'t Reading,
+    pub(super) wakes: Wakes,
+    pub(super) longest: Longest,
+}
+
+/// The beat at `now_ns`, or the next.
+pub(super) fn beat_ns(now_ns: u64) -> u64 {
+    now_ns.next_multiple_of(BEAT_NS)
+}
+
+impl Running {
+    pub(super) fn new(live: Arc<Live>, running: bool) -> Self {
+        let (schedule, dilation) = {
+            let status = lock(&live.status);
+            (status.schedule, status.dilation)
+        };
+        Running {
+            session: Session::new(&live.model),
+            running,
+            until: None,
+            schedule,
+            next_step: 0,
+            due_ns: 0,
+            not_before_ns: 0,
+            still_since: Some(0),
+            rested_steps: 0,
+            overrun_count: 0,
+            lapsed_leases: 0,
+            dilation,
+            due: Vec::new(),
+            hashed: Hashed::default(),
+            copies: Copies::default(),
+            taps: Taps::default(),
+            audit: None,
+            deleted: false,
+            live,
+        }
+    }
+
+    /// When its next step is due, if time goes on and one is wanted.
+    pub(super) fn due_ns(&self) -> Option<u64> {
+        let due_ns = (self.running && self.next_step < u64::MAX).then(|| self.schedule.due_ns(self.next_step))?;
+        Some(due_ns.max(self.not_before_ns))
+    }
+
+    /// Finds its place among the sessions of the thread, after a step, if one of `parts` of its time is its own.
+    pub(super) fn queue_again(&mut self, begun_ns: u64, now_ns: u64, parts: usize, is_alone: bool) {
+        if self.still_since.is_none() {
+            self.live.cost.observe(now_ns.saturating_sub(begun_ns));
+        }
+        let (due_ns, period_ns) = (self.schedule.due_ns(self.next_step), self.schedule.period_ns());
+        let turn = Turn { due_ns, period_ns, share: self.live.cost.awake_share(), parts, is_alone };
+        self.not_before_ns = turn.not_before_ns(now_ns);
+    }
+
+    /// How late its next step is at `now_ns`.
+    pub(super) fn late_ns(&self, now_ns: u64) -> u64 {
+        now_ns.saturating_sub(self.schedule.due_ns(self.next_step))
+    }
+
+    /// The number of the account of its owner.
+    pub(super) fn owner(&self) -> u64 {
+        self.live.owner.number()
+    }
+
+    /// Whether it was deleted, and is to leave the thread.
+    pub(super) fn is_deleted(&self) -> bool {
+        self.deleted
+    }
+
+    /// Does something with it. A panic ends this session, and no other; so does memory that can't be had.
+    pub(super) fn guarded(&mut self, act: impl FnOnce(&mut Self)) {
+        let Err(panic) = catch_unwind(AssertUnwindSafe(|| act(self))) else { return };
+        let step = self.session.step_count();
+        let reason = if let Some(refusal) = memory::refusal_of(&*panic) {
+            format!("after step {step} {}", refusal.message)
+        } else {
+            let text = panic.downcast_ref::<String>().map(String::as_str);
+            let text = text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("without a message");
+            format!("a fault of the program ended it after step {step}: {text}")
+        };
+        tracing::error!(session = %self.live.id, reason, "session held");
+        self.session.hold(reason.clone());
+        self.end(&Refusal::new(Reason::SessionHeld, "", reason));
+        self.live.cost.set_awake(false);
+        self.publish_status();
+    }
+
+    /// Decides which step comes next: the very next one, or at rest the next one that somebody waits for.
+    pub(super) fn plan(&mut self) {
+        let step = self.session.step_count();
+        let wanted = || {
+            let wanted = self.taps.next_wanted(step, self.still_since, self.live.model.scene.stepping.rate_hz);
+            self.until.map_or(wanted, |until| wanted.min(until - 1))
+        };
+        let rests_until = self.session.rests_until().filter(|_| self.running);
+        let until = rests_until.map_or(step, |until| until.min(wanted()));
+        {
+            let mut intake = lock(&self.live.intake);
+            self.next_step = intake.rest(step, until, &self.schedule);
+            self.lapsed_leases = intake.lapsed();
+        }
+        self.live.cost.set_awake(self.running && self.next_step == step);
+    }
+
+    /// At rest, time has gone on without a step: brings the session to where it stands now.
+    fn catch_up(&mut self) {
+        // Something may have come since that must not be skipped.
+        self.plan();
+        if self.running {
+            self.skip_to(self.schedule.next_step(now_ns()).min(self.next_step));
+        }
+    }
+
+    fn skip_to(&mut self, step: u64) {
+        self.rested_steps += step.saturating_sub(self.session.step_count());
+        self.session.skip_to(step);
+    }
+
+    pub(super) fn serve(&mut self, request: Request, desk: &mut Desk<'_>) {
+        self.catch_up();
+        let step = self.session.step_count();
+        // Also while time stands, when no step does it.
+        self.taps.forget_the_gone();
+        match request {
+            Request::Adopt | Request::Wake => {}
+            Request::Start { until, reply } => {
+                let started = self.start(until);
+                self.plan();
+                self.publish_status();
+                let _ = reply.send(started);
+            }
+            Request::Revive { reply } => {
+                let _ = reply.send(self.revive());
+            }
+            Request::Pause { reply } => {
+                self.stand(desk);
+                let _ = reply.send(Ok(()));
+            }
+            Request::Samples(mut tap) => {
+                tap.overrun_count = self.overrun_count;
+                if !self.running {
+                    self.tell(&mut tap, &mut None, true, &mut desk.wakes);
+                }
+                if self.session.hold_reason().is_some() {
+                    tap.writer.close(self.passed(0));
+                } else if self.running || !tap.once {
+                    self.taps.samples.push(tap);
+                }
+            }
+            Request::Audit(inputs, marks) => {
+                self.session.watch(inputs);
+                self.audit = Some(marks);
+            }
+            Request::Probe(tap) if self.session.hold_reason().is_some() => {
+                tap.recipient.writer().close(self.passed(0));
+            }
+            Request::Probe(tap) => self.taps.probes.push(tap),
+            Request::View(viewer) => {
+                // Who joins late gets a full frame first.
+                let frame_id = viewer.frame_id(step, self.live.model.scene.stepping.rate_hz);
+                self.post(desk.encoder, vec![(viewer.clone(), frame_id)]);
+                self.taps.viewers.push(ViewTap { viewer, shown: step, passed: frame_id });
+            }
+            Request::Hash { at, account, reply } => {
+                let at = at.unwrap_or(step);
+                if at > step && self.session.hold_reason().is_none() {
+                    self.taps.hashes.push((at, account, reply));
+                } else if at == step {
+                    self.hash_for(&account, reply, desk.reading);
+                } else {
+                    let _ = reply.send(Err(self.passed(at)));
+                }
+            }
+            Request::Delete(why) => {
+                self.end(&why);
+                self.deleted = true;
+            }
+            #[cfg(test)]
+            #[allow(clippy::panic)]
+            Request::Panic => panic!("a test"),
+        }
+        self.plan();
+        self.publish_status();
+    }
+
+    /// Time stands from now on. Who reads samples gets the present one.
+    fn stand(&mut self, desk: &mut Desk<'_>) {
+        self.running = false;
+        self.plan();
+        self.publish_status();
+        self.tell_all(true, &mut desk.wakes);
+    }
+
+    fn passed(&self, at: u64) -> Refusal {
+        let step = self.session.step_count();
+        match self.session.hold_reason() {
+            Some(reason) => Refusal::new(Reason::SessionHeld, "", reason),
+            None => Refusal::new(Reason::StepPassed, "at_step", format!("is {at}, but {step} steps are done")),
+        }
+    }
+
+    fn start(&mut self, until: Option<u64>) -> Result<u64> {
+        let step = self.session.step_count();
+        if let Some(until) = until.filter(|until| *until <= step) {
+            return Err(Refusal { field: "until_step".into(), ..self.passed(until) });
+        }
+        if let Some(reason) = self.session.hold_reason() {
+            return Err(Refusal::new(Reason::SessionHeld, "", reason));
+        }
+        self.until = until;
+        if !self.running {
+            let now = beat_ns(now_ns());
+            self.running = true;
+            self.schedule = Schedule::new(step, now, self.live.model.scene.stepping.rate_hz);
+            self.schedule.delay(1.0);
+            self.dilation = Dilation::new(now, step);
+        }
+        Ok(step)
+    }
+
+    /// The same tissue at rest, at the same step; time stands.
+    fn revive(&mut self) -> Result<u64> {
+        if self.session.hold_reason().is_none() {
+            return Err(Refusal::new(Reason::OutOfTurn, "session_id", "is a session that is not held"));
+        }
+        let step = self.session.step_count();
+        let mut session = memory::attempt("session_id", || Ok(Session::new(self.session.model())))?;
+        session.skip_to(step);
+        (self.session, self.hashed, self.audit) = (session, Hashed::default(), None);
+        self.copies.forget();
+        (self.running, self.until, self.still_since) = (false, None, Some(step));
+        lock(&self.live.intake).reopen();
+        lock(&self.live.status).forget_hold();
+        tracing::info!(session = %self.live.id, step, "session revived");
+        Ok(step)
+    }
+
+    /// Drops from the schedule what the policy does not let it catch up.
+    #[allow(clippy::cast_precision_loss)]
+    fn drop_backlog(&mut self, now_ns: u64, forgiven_ns: u64) {
+        let dropped = dropped_steps(self.late_ns(now_ns), forgiven_ns, self.schedule.period_ns());
+        if dropped > 0 {
+            self.schedule.delay(dropped as f64);
+            self.overrun_count += dropped;
+            tracing::debug!(session = %self.live.id, dropped, "steps dropped");
+        }
+    }
+
+    /// The next step, at its time or after it.
+    pub(super) fn step(&mut self, begun_ns: u64, desk: &mut Desk<'_>) {
+        let sampled = self.next_step.is_multiple_of(STEPS_PER_SPAN);
+        let span = sampled.then(|| tracing::debug_span!("step", session = %self.live.id, step = self.next_step));
+        let _span = span.map(tracing::Span::entered);
+        self.due_ns = self.schedule.due_ns(self.next_step);
+        if self.next_step == self.session.step_count() {
+            // Only of steps that cost something can a session be behind.
+            self.drop_backlog(begun_ns, desk.longest.ns());
+        } else {
+            self.plan();
+            self.skip_to(self.next_step);
+        }
+        let step = self.session.step_count();
+        let change = {
+            let mut intake = lock(&self.live.intake);
+            intake.take_due(step, begun_ns, &mut self.due);
+            intake.take_change(step)
+        };
+        if let Some(model) = change {
+            self.session.change(&model);
+            self.live.tissue.send_replace((step, model));
+        }
+
+        let (Running { session, taps, due, copies, .. }, wakes, reading) = (&mut *self, &mut desk.wakes, desk.reading);
+        copies.forget();
+        session.advance(due, |session| taps.record(session, copies, reading, wakes));
+        self.tell_auditor();
+        self.log_recovery();
+        if let Some(reason) = self.session.hold_reason() {
+            tracing::warn!(session = %self.live.id, reason, "session held");
+            self.running = false;
+            drop(lock(&self.live.intake).close(Refusal::new(Reason::SessionHeld, "", reason)));
+            self.publish_status();
+            for (at, _, reply) in std::mem::take(&mut self.taps.hashes) {
+                let _ = reply.send(Err(self.passed(at)));
+            }
+            // No further record will come.
+            let held = self.passed(0);
+            let probes = self.taps.probes.drain(..);
+            probes.for_each(|tap| desk.reading.close(&tap.account, &tap.recipient, held.clone()));
+        }
+        if self.until.is_some_and(|until| self.session.step_count() >= until) {
+            self.running = false;
+        }
+        let step = self.session.step_count();
+        self.still_since = self.session.rests_until().map(|_| self.still_since.unwrap_or(step));
+        self.dilation.observe(begun_ns, step, self.schedule.period_ns());
+        // The status first: who is told of this step may ask for it at once.
+        self.publish_status();
+        self.publish(desk);
+        let every = (self.live.model.scene.stepping.rate_hz / REFINED_HZ).max(1.0) as u64;
+        if self.session.step_count().is_multiple_of(every) {
+            self.refine(desk.refiner);
+        }
+        self.plan();
+    }
+
+    /// Ends every stream, and what waits.
+    pub(super) fn end(&mut self, why: &Refusal) {
+        self.running = false;
+        drop(lock(&self.live.intake).close(why.clone()));
+        let taps = std::mem::take(&mut self.taps);
+        taps.samples.iter().for_each(|tap| tap.writer.close(why.clone()));
+        taps.probes.iter().for_each(|tap| tap.recipient.writer().close(why.clone()));
+        taps.viewers.iter().for_each(|tap| tap.viewer.close(why.clone()));
+        for (_, _, reply) in taps.hashes {
+            let _ = reply.send(Err(why.clone()));
+        }
+    }
+}

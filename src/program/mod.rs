@@ -1,0 +1,85 @@
+//! The program `palpate`: one file for each subcommand, and what they share.
+
+pub(crate) mod check;
+pub(crate) mod client;
+pub(crate) mod render;
+pub(crate) mod run;
+mod scene;
+pub(crate) mod serve;
+pub(crate) mod texture;
+pub(crate) mod token;
+
+use std::io::IsTerminal;
+use std::path::Path;
+
+use palpate::pace::clock::now_ns;
+use palpate::refusal::Refusal;
+use palpate::server::ServeError;
+use palpate::server::config::Config;
+
+/// Writes a line to the standard error. A closed standard error does not end the program.
+macro_rules! say {
+    ($($text:tt)*) => {{
+        let _ = std::io::Write::write_all(&mut std::io::stderr(), (format!($($text)*) + "\n").as_bytes());
+    }};
+}
+pub(crate) use say;
+
+/// Why the program ends early.
+pub(crate) enum Failure {
+    /// Exit status 1.
+    Failed(String),
+    /// Exit status 2.
+    Refused(String),
+}
+
+impl From<Refusal> for Failure {
+    fn from(refusal: Refusal) -> Self {
+        Failure::Refused(refusal.to_string())
+    }
+}
+
+impl From<ServeError> for Failure {
+    fn from(error: ServeError) -> Self {
+        match error {
+            ServeError::Refused(refusal) => refusal.into(),
+            error => Failure::Failed(error.to_string()),
+        }
+    }
+}
+
+/// Does something that may need more memory than there is.
+pub(crate) fn within_memory(work: impl FnOnce() -> Result<(), Failure>) -> Result<(), Failure> {
+    palpate::memory::attempt("", || Ok(work()))?
+}
+
+/// The configuration of a file, or the default one.
+fn load_config(path: Option<&Path>) -> Result<Config, Refusal> {
+    path.map_or_else(|| Ok(Config::default()), Config::load)
+}
+
+/// The time by the server's clock, s.
+#[allow(clippy::cast_precision_loss)]
+fn clock_s() -> f64 {
+    now_ns() as f64 * 1e-9
+}
+
+/// Runs `work` and shows its progress; `work` reports the steps that it has done.
+fn with_progress<T>(steps: u64, work: impl FnOnce(&mut dyn FnMut(u64)) -> T) -> T {
+    let (begun_s, watched) = (clock_s(), std::io::stderr().is_terminal());
+    let done = work(&mut |step| {
+        // Only on a terminal, and after a second.
+        if watched && clock_s() - begun_s > 1.0 {
+            eprint!("\rstep {step} of {steps} ");
+        }
+    });
+    if watched && clock_s() - begun_s > 1.0 {
+        say!("");
+    }
+    done
+}
+
+/// Writes a file whole.
+fn write_file(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
+    std::fs::write(path, bytes).map_err(|e| Failure::Failed(format!("{}: can't be written: {e}", path.display())))
+}

@@ -1,0 +1,58 @@
+//! `palpate run`: plays a script on a scene, offline.
+
+use std::io::{BufWriter, Write};
+use std::path::PathBuf;
+
+use palpate::scene::script::Script;
+use palpate::session::run;
+
+use super::scene::{SceneArguments, compile};
+use super::{Failure, clock_s, say, with_progress};
+
+#[derive(clap::Args)]
+pub(crate) struct RunArguments {
+    #[command(flatten)]
+    scene: SceneArguments,
+    /// A script file, or the name of a script in ./scripts
+    script: PathBuf,
+    /// Write the records here instead of to the standard output
+    #[arg(short, long, value_name = "FILE")]
+    output: Option<PathBuf>,
+    /// Hold forces and paths constant within each step, like a client that sends one command per step
+    #[arg(long)]
+    held: bool,
+    /// Play the script a second time in parallel, in f64 with a quarter of the substep and all points awake. The summary
+    /// then has audited_error: the largest difference of displacement and of force at the sample points and times, each
+    /// relative to its largest. With [stepping] correct = true, the run is corrected where an error exceeds the tolerance
+    #[arg(long)]
+    audit: bool,
+}
+
+/// Plays a script on a scene and writes its records.
+pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
+    let (model, limits) = compile(&arguments.scene)?;
+    let script = Script::load(&arguments.script, &model.scene, &limits)?;
+    for warning in model.warnings.iter().chain(&script.warnings) {
+        say!("palpate: warning: {warning}");
+    }
+    let output: Box<dyn Write> = match &arguments.output {
+        Some(path) => Box::new(
+            std::fs::File::create(path)
+                .map_err(|e| Failure::Refused(format!("{}: can't be written: {e}", path.display())))?,
+        ),
+        None => Box::new(std::io::stdout().lock()),
+    };
+    let mut output = BufWriter::new(output);
+    let run = if arguments.audit { run::audited } else { run::run };
+    let ended = with_progress(script.steps, |progress| {
+        run(&model, &script, arguments.held, &limits, &mut output, &clock_s, progress)
+    });
+    let ended = ended.and_then(|summary| output.flush().map(|()| summary).map_err(run::Failure::Output));
+    match ended {
+        // A reader that closed the pipe is not an error.
+        Err(run::Failure::Output(e)) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
+        Err(run::Failure::Refused(refusal)) => Err(refusal.into()),
+        Err(failure) => Err(Failure::Failed(failure.to_string())),
+        Ok(summary) => summary.fault().map_or(Ok(()), |fault| Err(Failure::Failed(fault))),
+    }
+}

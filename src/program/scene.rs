@@ -1,0 +1,49 @@
+//! The scene that several subcommands take.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use palpate::limits::Limits;
+use palpate::refusal::Refusal;
+use palpate::scene::Scene;
+use palpate::server::catalog::Catalog;
+use palpate::sheet::Model;
+
+use super::{Failure, load_config};
+
+#[derive(clap::Args)]
+pub(crate) struct SceneArguments {
+    /// A scene file, or the name of a scene in --scenes; `paper` is built in
+    scene: PathBuf,
+    /// Folder of the scenes that you can give by name
+    #[arg(long, value_name = "DIR", default_value = "scenes")]
+    scenes: PathBuf,
+    /// Override a key of the scene: a TOML value, or a bare string; may be repeated
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Configuration file (TOML) with other limits, in a section [limits]
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+}
+
+/// Factor by which compiling a scene may take more work here than on a server: reference solutions need a tolerance of
+/// 1e-10.
+const OFFLINE_WORK: u64 = 32;
+
+/// Compiles the scene that the arguments name; returns it with the limits in force.
+pub(super) fn compile(arguments: &SceneArguments) -> Result<(Arc<Model>, Limits), Failure> {
+    let mut limits: Limits = load_config(arguments.config.as_deref())?.limits;
+    // No other caller waits here.
+    limits.rehearsal_work = limits.rehearsal_work.saturating_mul(OFFLINE_WORK);
+    let path = &arguments.scene;
+    let scene = match path.to_str() {
+        // A plain word that is not a file is a scene's name.
+        Some(name) if !path.is_file() && path.components().count() == 1 && path.extension().is_none() => {
+            Catalog::new(&arguments.scenes, Path::new("scripts")).load(name, &arguments.set, &limits)?
+        }
+        _ => Scene::load(path, &arguments.set, &limits)?,
+    };
+    // An error of compilation belongs to no single line.
+    let in_scene = |refusal: Refusal| Refusal { place: Some(path.display().to_string()), ..refusal };
+    Ok((Model::compile(&scene, &limits).map_err(in_scene)?, limits))
+}

@@ -1,0 +1,162 @@
+//! `palpate serve`: serves tissue over gRPC and to browsers.
+
+use std::io::{IsTerminal, Write};
+use std::path::PathBuf;
+use std::time::Duration;
+
+use palpate::budget;
+use palpate::server::{self, Doors, signals};
+use tokio_util::sync::CancellationToken;
+use tracing_subscriber::fmt::format::FmtSpan;
+
+use super::{Failure, load_config};
+
+#[derive(clap::Args)]
+pub(crate) struct ServeArguments {
+    /// Where to listen; port 0 takes a free one [default: 127.0.0.1:7117]
+    #[arg(long, value_name = "ADDRESS:PORT")]
+    listen: Option<String>,
+    /// The server's certificate chain (PEM); enables TLS
+    #[arg(long, value_name = "FILE")]
+    tls_cert: Option<PathBuf>,
+    /// The server's private key (PEM)
+    #[arg(long, value_name = "FILE")]
+    tls_key: Option<PathBuf>,
+    /// Certificate authorities (PEM): clients must present a certificate that one of them has signed
+    #[arg(long, value_name = "FILE")]
+    tls_client_ca: Option<PathBuf>,
+    /// Roles of tokens and client certificates (TOML); `palpate token` writes entries
+    #[arg(long, value_name = "FILE")]
+    tokens: Option<PathBuf>,
+    /// Allow an address that other machines can reach, without TLS or authentication
+    #[arg(long)]
+    insecure: bool,
+    /// Origin of another site whose pages may call, such as https://example.org; may be repeated
+    #[arg(long, value_name = "ORIGIN")]
+    origin: Vec<String>,
+    /// Serve Prometheus metrics at http://ADDRESS:PORT/metrics [default: off]
+    #[arg(long, value_name = "ADDRESS:PORT")]
+    metrics: Option<String>,
+    /// Folder of the scenes that clients can create sessions from by name [default: scenes]
+    #[arg(long, value_name = "DIR")]
+    scenes: Option<PathBuf>,
+    /// Folder of the scripts that clients can ask for by name [default: scripts]
+    #[arg(long, value_name = "DIR")]
+    scripts: Option<PathBuf>,
+    /// Folder of the page that `/` serves, built by `npm run build` in clients/viewer [default: clients/viewer/dist]
+    #[arg(long, value_name = "DIR")]
+    viewer: Option<PathBuf>,
+    /// Configuration file (TOML); docs/palpate.toml lists every key. Options on the command line override it
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Stepping threads [default: one less than the machine has cores]
+    #[arg(long, value_name = "N")]
+    threads: Option<usize>,
+    /// Fraction of a core for measuring the errors of live sessions; 0 disables that [default: 0.02]
+    #[arg(long, value_name = "SHARE")]
+    audit_share: Option<f64>,
+    /// Time that streams get to end at shutdown before they are cut, s [default: 5]
+    #[arg(long, value_name = "SECONDS")]
+    shutdown_deadline_s: Option<f64>,
+    /// Memory that the server may use for all callers together, such as 512MiB or 2GiB [default: half of the machine's, or
+    /// of its control group's]
+    #[arg(long, value_name = "BYTES", value_parser = budget::parse_bytes)]
+    memory: Option<u64>,
+    /// What to log to the standard error: error, warn, info, debug, or palpate=debug,tonic=warn, … [default: info]
+    #[arg(long, value_name = "FILTER")]
+    log: Option<String>,
+    /// Log as JSON Lines
+    #[arg(long)]
+    log_json: bool,
+}
+
+/// Serves until it is told to stop.
+pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
+    let mut config = load_config(arguments.config.as_deref())?;
+    if let Some(listen) = &arguments.listen {
+        config.listen.clone_from(listen);
+    }
+    let files = [
+        (&arguments.tls_cert, &mut config.tls_cert),
+        (&arguments.tls_key, &mut config.tls_key),
+        (&arguments.tls_client_ca, &mut config.tls_client_ca),
+        (&arguments.tokens, &mut config.tokens),
+    ];
+    for (given, configured) in files {
+        if given.is_some() {
+            configured.clone_from(given);
+        }
+    }
+    config.insecure |= arguments.insecure;
+    config.origins.extend(arguments.origin.iter().cloned());
+    if arguments.metrics.is_some() {
+        config.metrics.clone_from(&arguments.metrics);
+    }
+    for (option, folder, key) in [
+        ("--scenes", &arguments.scenes, &mut config.scenes),
+        ("--scripts", &arguments.scripts, &mut config.scripts),
+        ("--viewer", &arguments.viewer, &mut config.viewer),
+    ] {
+        let Some(folder) = folder else { continue };
+        if !folder.is_dir() {
+            return Err(Failure::Refused(format!("{option} {}: is not a folder", folder.display())));
+        }
+        key.clone_from(folder);
+    }
+    if let Some(threads) = arguments.threads {
+        config.threads = threads;
+    }
+    if let Some(share) = arguments.audit_share {
+        config.audit_share = share;
+    }
+    if let Some(deadline_s) = arguments.shutdown_deadline_s {
+        config.shutdown_deadline_s = deadline_s;
+    }
+    if let Some(bytes) = arguments.memory {
+        config.limits.memory_bytes = bytes;
+    }
+    if let Some(log) = &arguments.log {
+        config.log.clone_from(log);
+    }
+    config.check()?;
+    let filter = tracing_subscriber::EnvFilter::try_new(&config.log)
+        .map_err(|e| Failure::Refused(format!("--log {}: {e}", config.log)))?;
+    let detailed = filter.max_level_hint().is_none_or(|level| level >= tracing::Level::DEBUG);
+    // Logging never blocks: lines that do not fit into the queue are dropped.
+    let (writer, _flush) = tracing_appender::non_blocking(std::io::stderr());
+    let subscriber = tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(writer)
+        // At level debug, the duration of each call and sampled step is logged when it ends.
+        .with_span_events(if detailed { FmtSpan::CLOSE } else { FmtSpan::NONE })
+        .with_ansi(std::io::stderr().is_terminal());
+    if arguments.log_json {
+        subscriber.json().init();
+    } else {
+        subscriber.init();
+    }
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(config.serving_threads())
+        .thread_name("network")
+        // Blocking threads read files, twice a second. With the default keep-alive of 10 s these checks would wake every
+        // idle thread in turn before it ends, so that none ever would.
+        .max_blocking_threads(16)
+        .thread_keep_alive(Duration::from_secs(1))
+        .enable_all()
+        .build()
+        .map_err(|e| Failure::Failed(format!("can't start the network threads: {e}")))?;
+    let ended = runtime.block_on(async {
+        let doors = Doors::open(&config).await?;
+        let shutdown = CancellationToken::new();
+        signals::outlive();
+        tokio::spawn(signals::cancel_on(shutdown.clone()));
+        // The standard output may be closed; that does not stop the server.
+        let _ = writeln!(std::io::stdout(), "palpate listens on {}", doors.url());
+        if let Some(url) = doors.metrics_url() {
+            let _ = writeln!(std::io::stdout(), "metrics are at {url}");
+        }
+        Ok(server::serve(doors, config, shutdown).await?)
+    });
+    runtime.shutdown_background();
+    ended
+}

@@ -1,0 +1,257 @@
+//! Draws the sheet at one moment, as a textured surface or as a mesh.
+
+use glam::{DVec2, DVec3};
+
+use super::canvas::{Canvas, Corner, SAMPLES, colour, linear};
+use super::surface::{Surface, Vertex};
+use crate::refusal::{Reason, Refusal, Result, number};
+use crate::scene::Sheet;
+use crate::surface::{Refinement, Snapshot};
+use crate::texture::Image;
+
+/// The camera. It always looks at the middle of the tissue.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Camera {
+    /// Rotation about the tissue's normal from its front side (y = 0), degrees.
+    pub azimuth_deg: f64,
+    /// Elevation above the tissue, degrees; 90 is straight from above.
+    pub elevation_deg: f64,
+    /// Distance of the eye from the middle, in longer sides of the sheet.
+    pub distance: f64,
+}
+
+impl Default for Camera {
+    fn default() -> Self {
+        Camera { azimuth_deg: 25.0, elevation_deg: 32.0, distance: 2.0 }
+    }
+}
+
+impl std::str::FromStr for Camera {
+    type Err = Refusal;
+
+    /// `AZIMUTH,ELEVATION` or `AZIMUTH,ELEVATION,DISTANCE`.
+    fn from_str(text: &str) -> Result<Self> {
+        let wrong = || {
+            let message =
+                format!("must be azimuth,elevation or azimuth,elevation,distance, as in 25,32,2, but is `{text}`");
+            Refusal::new(Reason::WrongKind, "camera", message)
+        };
+        let numbers: Vec<f64> = text
+            .split(',')
+            .map(|part| part.trim().parse())
+            .collect::<std::result::Result<_, _>>()
+            .map_err(|_| wrong())?;
+        let standard = Camera::default();
+        let camera = match numbers[..] {
+            [azimuth_deg, elevation_deg] => Camera { azimuth_deg, elevation_deg, ..standard },
+            [azimuth_deg, elevation_deg, distance] => Camera { azimuth_deg, elevation_deg, distance },
+            _ => return Err(wrong()),
+        };
+        number("camera azimuth", camera.azimuth_deg, "from -360 to 360", |v| (-360.0..=360.0).contains(&v))?;
+        number("camera elevation", camera.elevation_deg, "from 1 to 90", |v| (1.0..=90.0).contains(&v))?;
+        number("camera distance", camera.distance, "from 0.3 to 20 sides", |v| (0.3..=20.0).contains(&v))?;
+        Ok(camera)
+    }
+}
+
+/// How a picture is drawn.
+#[derive(Debug, Clone)]
+pub struct View {
+    /// The camera.
+    pub camera: Camera,
+    /// Pixels along x and y.
+    pub size: [usize; 2],
+    /// Vertices between neighbouring points.
+    pub refinement: Refinement,
+    /// Texture of the surface; `None` shows its mesh.
+    pub texture: Option<Image>,
+}
+
+/// Largest side of a picture, pixels.
+pub const LARGEST_SIDE: usize = 1920;
+
+/// A force drawn as an arrow.
+#[derive(Debug, Clone, Copy)]
+pub struct Arrow {
+    /// The point at its tip.
+    pub point: [usize; 2],
+    /// Its direction.
+    pub towards: DVec3,
+}
+
+/// Half the height of the field of view, at a distance of 1.
+const HALF_VIEW: f64 = 0.30;
+
+/// Length of an arrow, in longer sides of the sheet.
+const ARROW: f64 = 0.16;
+
+/// The eye and its projection.
+struct Eye {
+    at_m: DVec3,
+    /// To the right, up and forward in the picture.
+    axes: [DVec3; 3],
+    middle: DVec2,
+    /// Samples per unit of offset from the axis, at a distance of 1.
+    scale: f64,
+}
+
+impl Eye {
+    fn new(sheet: &Sheet, view: &View) -> Self {
+        let Camera { azimuth_deg, elevation_deg, distance } = view.camera;
+        let (azimuth, elevation) = (azimuth_deg.to_radians(), elevation_deg.to_radians());
+        let across = libm::cos(elevation);
+        let away = DVec3::new(-libm::sin(azimuth) * across, -libm::cos(azimuth) * across, libm::sin(elevation));
+        let right = DVec3::new(libm::cos(azimuth), -libm::sin(azimuth), 0.0);
+        let centre_m = (sheet.extent_m() / 2.0).extend(0.0);
+        let [width, height] = view.size.map(|pixels| (pixels * SAMPLES) as f64);
+        Eye {
+            at_m: centre_m + distance * sheet.longer_side_m() * away,
+            axes: [right, right.cross(-away), -away],
+            // Near parts take more of the picture than far parts, so the middle of the sheet is drawn above the
+            // picture's middle.
+            middle: DVec2::new(0.48 * width, 0.44 * height),
+            scale: width.min(height * 4.0 / 3.0) * 0.375 / HALF_VIEW,
+        }
+    }
+
+    /// Projects a place. `None` if it is behind the eye or nearer than `nearest_m`.
+    fn project(&self, at_m: DVec3, nearest_m: f64) -> Option<Corner> {
+        let [x, y, forward] = self.axes.map(|axis| axis.dot(at_m - self.at_m));
+        (forward > nearest_m)
+            .then(|| Corner { at: self.middle + DVec2::new(x, -y) * (self.scale / forward), nearness: forward.recip() })
+    }
+}
+
+/// Draws the sheet in the state of `snapshot`.
+pub fn picture(sheet: &Sheet, snapshot: &Snapshot, arrows: &[Arrow], view: &View) -> Image {
+    let surface = Surface::new(sheet, snapshot, view.refinement);
+    let eye = Eye::new(sheet, view);
+    let nearest_m = 0.01 * sheet.longer_side_m();
+    let background = if view.texture.is_some() { [20, 14, 13] } else { [255, 255, 255] };
+    let mut canvas = Canvas::new(view.size, colour(background));
+    let corners: Vec<Option<Corner>> =
+        surface.vertices.iter().map(|vertex| eye.project(vertex.at_m, nearest_m)).collect();
+    let [nx, ny] = surface.count;
+    let skin = view.texture.as_ref().map(|image| Skin::new(image, &eye, sheet));
+    for a in 0..nx.saturating_sub(1) {
+        for b in 0..ny.saturating_sub(1) {
+            let corner = a * ny + b;
+            for triangle in [[corner, corner + ny, corner + ny + 1], [corner, corner + ny + 1, corner + 1]] {
+                let [Some(p), Some(q), Some(r)] = triangle.map(|index| corners[index]) else { continue };
+                let vertices = triangle.map(|index| surface.vertices[index]);
+                canvas.triangle([p, q, r], |shares| match &skin {
+                    Some(skin) => skin.shade(&between(&vertices, shares)),
+                    // Pale enough for lines to show, and opaque.
+                    None => DVec3::splat(0.80 + 0.18 * between(&vertices, shares).open),
+                });
+            }
+        }
+    }
+    if skin.is_none() {
+        let ink = colour([96, 36, 34]);
+        // Thinner where lines are dense.
+        let width = (0.055 * view.size[0] as f64 / nx.max(ny) as f64).clamp(0.35, 1.1);
+        for index in 0..nx * ny {
+            let beyond = [(index / ny + 1 < nx).then_some(index + ny), (index % ny + 1 < ny).then_some(index + 1)];
+            for other in beyond.into_iter().flatten() {
+                if let (Some(from), Some(to)) = (corners[index], corners[other]) {
+                    canvas.line(from, to, width, 2e-3, ink);
+                }
+            }
+        }
+    }
+    for arrow in arrows {
+        draw(&mut canvas, &eye, &surface, arrow, view, sheet, nearest_m);
+    }
+    canvas.image()
+}
+
+fn draw(canvas: &mut Canvas, eye: &Eye, surface: &Surface, arrow: &Arrow, view: &View, sheet: &Sheet, nearest_m: f64) {
+    let part = view.refinement.between + 1;
+    let tip_m = surface.vertices[arrow.point[0] * part * surface.count[1] + arrow.point[1] * part].at_m;
+    let tail_m = tip_m - ARROW * sheet.longer_side_m() * arrow.towards.normalize_or_zero();
+    let (Some(tip), Some(tail)) = (eye.project(tip_m, nearest_m), eye.project(tail_m, nearest_m)) else { return };
+    let ink = colour(if view.texture.is_some() { [150, 205, 255] } else { [20, 80, 160] });
+    // In front of everything: the arrow's target may be at the bottom of a dent.
+    let [tip, tail] = [tip, tail].map(|corner| Corner { nearness: 2.0 / nearest_m, ..corner });
+    let along = (tip.at - tail.at).normalize_or_zero();
+    let head = 0.022 * (view.size[0] * SAMPLES) as f64;
+    let base = Corner { at: tip.at - head * along, ..tip };
+    let side = |by: f64| Corner { at: base.at + by * 0.42 * head * along.perp(), ..tip };
+    canvas.line(tail, base, 0.0045 * view.size[0] as f64, 0.0, ink);
+    canvas.triangle([tip, side(1.0), side(-1.0)], |_| ink);
+}
+
+fn between(vertices: &[Vertex; 3], shares: [f64; 3]) -> Vertex {
+    let mut sum = Vertex::default();
+    for (vertex, share) in vertices.iter().zip(shares) {
+        sum.at_m += share * vertex.at_m;
+        sum.normal += share * vertex.normal;
+        sum.share += share * vertex.share;
+        sum.open += share * vertex.open;
+    }
+    sum
+}
+
+/// Wet tissue under a lamp to the left of the eye, low enough to show the relief; its light falls off with distance.
+struct Skin<'a> {
+    image: &'a Image,
+    /// Linear light of each byte.
+    linear: Vec<f64>,
+    eye_m: DVec3,
+    lamp_m: DVec3,
+    /// Distance from the lamp to the middle, m.
+    usual_m: f64,
+}
+
+impl<'a> Skin<'a> {
+    fn new(image: &'a Image, eye: &Eye, sheet: &Sheet) -> Self {
+        let centre_m = (sheet.extent_m() / 2.0).extend(0.0);
+        let [right, up, _] = eye.axes;
+        let away_m = eye.at_m.distance(centre_m);
+        let lamp_m = eye.at_m + away_m * (0.10 * up - 1.05 * right);
+        let linear = (0..=255).map(linear).collect();
+        Skin { image, linear, eye_m: eye.at_m, lamp_m, usual_m: lamp_m.distance(centre_m) }
+    }
+
+    /// The texture's colour. The middles of its corner pixels lie on the sheet's corners, so an image of as many pixels
+    /// as the sheet has vertices puts one on each. Row 0 is at the far side (y largest).
+    fn albedo(&self, share: DVec2) -> DVec3 {
+        let Image { width, height, rgb } = self.image;
+        let x = share.x.clamp(0.0, 1.0) * (width - 1) as f64;
+        let y = (1.0 - share.y.clamp(0.0, 1.0)) * (height - 1) as f64;
+        let (column, row) = (x as usize, y as usize);
+        let at = |column: usize, row: usize| {
+            let from = 3 * (row.min(height - 1) * width + column.min(width - 1));
+            let light = |c: usize| self.linear[usize::from(rgb[from + c])];
+            DVec3::new(light(0), light(1), light(2))
+        };
+        let (s, t) = (x - column as f64, y - row as f64);
+        at(column, row).lerp(at(column + 1, row), s).lerp(at(column, row + 1).lerp(at(column + 1, row + 1), s), t)
+    }
+
+    fn shade(&self, vertex: &Vertex) -> DVec3 {
+        let to_eye = (self.eye_m - vertex.at_m).normalize_or_zero();
+        let mut normal = vertex.normal.normalize_or_zero();
+        if normal.dot(to_eye) < 0.0 {
+            // The underside, seen from below.
+            normal = -normal;
+        }
+        let to_lamp_m = self.lamp_m - vertex.at_m;
+        let to_lamp = to_lamp_m.normalize_or_zero();
+        let light = (self.usual_m * self.usual_m / to_lamp_m.length_squared()).min(2.0);
+        // Light scatters a little way in tissue and comes out beyond the edge of a shadow.
+        let diffuse = ((normal.dot(to_lamp) + 0.18) / 1.18).max(0.0);
+        let around = DVec3::new(0.15, 0.10, 0.09) * normal.z.max(0.0);
+        let albedo = self.albedo(vertex.share);
+        let mut colour = albedo * vertex.open * (around + DVec3::splat(2.3 * light * diffuse * diffuse));
+        // The film of liquid: a broad sheen and a sharp glint, stronger at a grazing view (Schlick's approximation).
+        let half = normal.dot((to_lamp + to_eye).normalize_or_zero()).max(0.0);
+        let graze = 1.0 - normal.dot(to_eye).max(0.0);
+        let mirrored = 0.25 + 0.75 * graze.powi(5);
+        let power = |squarings: u32| (0..squarings).fold(half, |x, _| x * x);
+        let film = 0.14 * power(4) + 1.1 * power(8);
+        colour += DVec3::new(1.0, 0.97, 0.94) * (light * mirrored * film);
+        colour
+    }
+}

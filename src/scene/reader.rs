@@ -1,0 +1,389 @@
+//! Reads a script from TOML and binds it to a scene: converts times to whole steps and points to places.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use glam::{DVec2, DVec3};
+
+use super::check::{check_centre, check_force, check_free, check_reach, is_near, nearest_point};
+use super::document::{self, Document, Fields, Item};
+use super::law::{CentreLaw, ForceLaw, Moment, Move, MoveLaw, Profile, StrengthLaw};
+use super::script::Script;
+use super::{Change, Scene, Sheet};
+use crate::limits::Limits;
+use crate::refusal::{Reason, Refusal, Result, not_negative, number, positive};
+
+impl Script {
+    /// Reads a script, by its file or by its name in ./scripts, and binds it to `scene`.
+    ///
+    /// # Errors
+    /// Refuses a script that can't be read, parsed or bound to the scene.
+    pub fn load(name: &Path, scene: &Scene, limits: &Limits) -> Result<Self> {
+        let mut named = Path::new("scripts").join(name).into_os_string();
+        named.push(".toml");
+        let named = Path::new(&named);
+        let path = if !name.is_file() && named.is_file() { named } else { name };
+        let text = document::read_text(path, limits.file_bytes)?;
+        let folder = path.parent().unwrap_or(Path::new(""));
+        Self::parse(&path.display().to_string(), &text, folder, scene, limits)
+    }
+
+    /// Reads a script from TOML. Refusals call the text `name`; its traces are in `folder`.
+    ///
+    /// # Errors
+    /// Refuses a script that can't be parsed or bound to the scene.
+    pub fn parse(name: &str, text: &str, folder: &Path, scene: &Scene, limits: &Limits) -> Result<Self> {
+        let document = Document::parse(name, text)?;
+        document.read(|fields| Binding { folder, scene, limits, warnings: Vec::new() }.script(fields))
+    }
+}
+
+/// A shorter move would need accelerations beyond the number range.
+const SHORTEST_MOVE_S: f64 = 1e-6;
+
+/// Beyond this a phase has no digits left.
+const HIGHEST_HZ: f64 = 1e6;
+
+/// The inputs of reading a script.
+struct Binding<'s> {
+    folder: &'s Path,
+    scene: &'s Scene,
+    limits: &'s Limits,
+    warnings: Vec<String>,
+}
+
+impl Binding<'_> {
+    fn script(mut self, fields: &mut Fields<'_>) -> Result<Script> {
+        let name = fields.text("name")?.unwrap_or_else(|| "unnamed".to_owned());
+        let duration_s = positive("duration_s", fields.required_number("duration_s")?)?;
+        let steps = self.steps("duration_s", duration_s)?;
+        let sample_every_s = positive("sample_every_s", fields.required_number("sample_every_s")?)?;
+        let sample_every = self.steps("sample_every_s", sample_every_s)?;
+        for (field, steps) in [("duration_s", steps), ("sample_every_s", sample_every)] {
+            if steps == 0 {
+                return Err(Refusal::new(Reason::OutOfRange, field, "is less than half a step"));
+            }
+        }
+        let mut control_points = Vec::new();
+        let forces = items(fields, "force")?
+            .iter()
+            .map(|item| self.force(item, &mut control_points))
+            .collect::<Result<Vec<_>>>()?;
+        for (index, law) in forces.iter().enumerate() {
+            let end = law.at(Moment::start_of(steps), self.scene.stepping.rate_hz);
+            if matches!(law.centre, CentreLaw::Path { .. }) && !is_near(&self.scene.sheet, end.centre_m) {
+                let message = "leaves the sheet; where the force is streamed (--held, a replay) it ends there";
+                self.warnings.push(format!("force[{index}].path: {message}"));
+            }
+        }
+        let moves = items(fields, "tool")?.iter().map(|item| self.tool(item)).collect::<Result<Vec<_>>>()?;
+        control_points.extend(moves.iter().map(|law| law.point));
+        for (index, law) in moves.iter().enumerate() {
+            if moves[..index].iter().any(|other| other.point == law.point) {
+                let message = "is prescribed by two tools";
+                return Err(Refusal::new(Reason::OutOfRange, format!("tool[{index}].point"), message));
+            }
+        }
+        let changes = self.changes(&items(fields, "tissue")?)?;
+        let tools = forces.len() + moves.len();
+        if tools > self.limits.tools as usize {
+            let message = format!("{tools} forces and tools are above the limit of {} in all", self.limits.tools);
+            return Err(Refusal::new(Reason::TooLarge, "force", message));
+        }
+        let [nx, ny] = self.scene.sheet.points;
+        let sample_points = match fields.item("sample_points") {
+            None => control_points,
+            Some(item) if item.as_text() == Some("all") => (0..nx * ny).map(|index| [index / ny, index % ny]).collect(),
+            Some(item) if item.as_text().is_some() => return Err(item.wrong("\"all\" or a list of points")),
+            Some(item) => {
+                item.list()?.iter().map(|item| self.point(item).map(|at| at.0)).collect::<Result<Vec<_>>>()?
+            }
+        };
+        let mut seen = BTreeSet::new();
+        Ok(Script {
+            name,
+            steps,
+            sample_every,
+            sample_points: sample_points.into_iter().filter(|point| seen.insert(*point)).collect(),
+            forces,
+            moves,
+            changes,
+            warnings: self.warnings,
+            rate_hz: self.scene.stepping.rate_hz,
+            sheet: self.scene.sheet.clone(),
+        })
+    }
+
+    /// A time in whole steps, with a warning where rounding moves it by more than a millionth of a step.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn steps(&mut self, field: &str, time_s: f64) -> Result<u64> {
+        let exact = not_negative(field, time_s)? * self.scene.stepping.rate_hz;
+        let whole = exact.round();
+        number(field, whole, "less than 2^52 steps", |v| v < 4.5e15)?;
+        if (exact - whole).abs() > 1e-6 {
+            let rounded_s = whole / self.scene.stepping.rate_hz;
+            self.warnings.push(format!("{field}: {time_s} s is not a whole number of steps; taken as {rounded_s} s"));
+        }
+        Ok(whole as u64)
+    }
+
+    /// A grid point and its place at rest.
+    fn point(&self, item: &Item<'_>) -> Result<([usize; 2], DVec2)> {
+        let point = item.point()?;
+        let sheet: &Sheet = &self.scene.sheet;
+        sheet.index("", point).map_err(|refusal| item.refuse(refusal.reason, refusal.message))?;
+        Ok((point, sheet.rest_m(point)))
+    }
+
+    /// Changes of the tissue. Each is checked with those before it.
+    fn changes(&mut self, list: &[Item<'_>]) -> Result<Vec<(u64, Change)>> {
+        let mut scene = self.scene.clone();
+        let mut changes: Vec<(u64, Change)> = Vec::new();
+        for item in list {
+            let (at, change) = item.table(|fields| {
+                let at = self.steps(&fields.path("at_s"), fields.required_number("at_s")?)?;
+                if changes.last().is_some_and(|last| last.0 >= at) {
+                    return Err(fields.refuse(
+                        Reason::OutOfRange,
+                        "at_s",
+                        "must be later than that of the change before",
+                    ));
+                }
+                let change = Change {
+                    stiffness_n_per_m: fields.number("stiffness_n_per_m")?,
+                    damping_n_s_per_m: fields.number("damping_n_s_per_m")?,
+                    virtual_stiffness_n_per_m: fields.number("virtual_stiffness_n_per_m")?,
+                };
+                Ok((at, change))
+            })?;
+            if change == Change::default() {
+                return Err(item.refuse(Reason::Missing, Change::NOTHING));
+            }
+            scene = scene.changed(&change, self.scene);
+            scene
+                .check(self.limits)
+                .map_err(|refusal| item.refuse(refusal.reason, format!("{}: {}", refusal.field, refusal.message)))?;
+            changes.push((at, change));
+        }
+        Ok(changes)
+    }
+
+    fn force(&mut self, item: &Item<'_>, control_points: &mut Vec<[usize; 2]>) -> Result<ForceLaw> {
+        item.table(|fields| {
+            let centre = self.centre(item, fields, control_points)?;
+            let falloff_per_m = not_negative(&fields.path("falloff_per_m"), fields.required_number("falloff_per_m")?)?;
+            let falloff_offset = fields.required_number("falloff_offset")?;
+            let factor = libm::exp(falloff_offset);
+            let limit_n = self.limits.point_force_n;
+            let within_limit = |field: &str, force_n: DVec3| check_force(field, force_n, factor, limit_n);
+            let profile = fields.required("profile")?;
+            let trace = profile.table(|fields| self.profile(fields))?;
+            let strength = match trace {
+                Ok(profile) => {
+                    let force_n = fields.required("force_n")?.vector()?;
+                    within_limit(&fields.path("force_n"), force_n)?;
+                    StrengthLaw::Scaled(force_n, profile)
+                }
+                Err(rows) => {
+                    // A trace replaces force_n, which may be present all the same.
+                    fields.item("force_n").map(|item| item.vector()).transpose()?;
+                    for (_, force_n) in &rows {
+                        within_limit(&fields.path("profile.file"), *force_n)?;
+                    }
+                    StrengthLaw::Recorded(rows)
+                }
+            };
+            Ok(ForceLaw { centre, strength, falloff_per_m, falloff_offset })
+        })
+    }
+
+    fn centre(
+        &mut self,
+        item: &Item<'_>,
+        fields: &mut Fields<'_>,
+        control_points: &mut Vec<[usize; 2]>,
+    ) -> Result<CentreLaw> {
+        let (point, hops, path) = (fields.item("point"), fields.item("hops"), fields.item("path"));
+        let one = "must have just one of `point`, `hops` and `path`";
+        match (point, hops, path) {
+            (Some(point), None, None) => {
+                let (point, place) = self.point(&point)?;
+                control_points.push(point);
+                Ok(CentreLaw::Hops(vec![(0, place)]))
+            }
+            (None, Some(hops), None) => {
+                let mut entries = Vec::new();
+                for hop in hops.list()? {
+                    entries.push(hop.table(|fields| {
+                        let at = self.steps(&fields.path("at_s"), fields.required_number("at_s")?)?;
+                        let (point, place) = self.point(&fields.required("point")?)?;
+                        control_points.push(point);
+                        Ok((at, place))
+                    })?);
+                }
+                rising(&hops, "at_s", &mut entries)?;
+                Ok(CentreLaw::Hops(entries))
+            }
+            (None, None, Some(path)) => path.table(|fields| {
+                let from_m = fields.required("from_m")?.place()?;
+                let velocity_m_per_s = fields.required("velocity_m_per_s")?.place()?;
+                let speed = velocity_m_per_s.abs().max_element();
+                number(&fields.path("velocity_m_per_s"), speed, "at most 1e6", |v| v <= 1e6)?;
+                let sheet = &self.scene.sheet;
+                check_centre(&fields.path("from_m"), sheet, from_m)?;
+                control_points.push(nearest_point(sheet, from_m));
+                Ok(CentreLaw::Path { from_m, velocity_m_per_s })
+            }),
+            (None, None, None) => Err(item.refuse(Reason::Missing, one)),
+            _ => Err(item.refuse(Reason::OutOfRange, one)),
+        }
+    }
+
+    /// A profile, or the rows of a trace.
+    #[allow(clippy::type_complexity)]
+    fn profile(&mut self, fields: &mut Fields<'_>) -> Result<std::result::Result<Profile, Vec<(u64, DVec3)>>> {
+        let kind = fields.required("type")?;
+        Ok(Ok(match kind.text()?.as_str() {
+            "constant" => Profile::Constant,
+            "pulse" => {
+                let on = self.steps(&fields.path("on_s"), fields.required_number("on_s")?)?;
+                let off = self.steps(&fields.path("off_s"), fields.required_number("off_s")?)?;
+                if off <= on {
+                    return Err(fields.refuse(Reason::OutOfRange, "off_s", "must be at least a step after on_s"));
+                }
+                Profile::Pulse { on, off }
+            }
+            "ramp" => {
+                let from_s = not_negative(&fields.path("from_s"), fields.required_number("from_s")?)?;
+                let to_s = fields.required_number("to_s")?;
+                if to_s < from_s {
+                    return Err(fields.refuse(Reason::OutOfRange, "to_s", "must not be before from_s"));
+                }
+                if to_s > from_s {
+                    Profile::Ramp { from_s, to_s }
+                } else {
+                    // A ramp of zero length is a jump, and jumps are at whole steps.
+                    Profile::Pulse { on: self.steps(&fields.path("from_s"), from_s)?, off: u64::MAX }
+                }
+            }
+            "sine" => {
+                let frequency_hz = fields.required_number("frequency_hz")?;
+                let range = format!("from 0 to {HIGHEST_HZ}");
+                number(&fields.path("frequency_hz"), frequency_hz, &range, |v| (0.0..=HIGHEST_HZ).contains(&v))?;
+                Profile::Sine { frequency_hz }
+            }
+            "trace" => {
+                let file = fields.required("file")?;
+                let path = self.folder.join(file.text()?);
+                return Ok(Err(self.trace(&file, &path)?));
+            }
+            other => {
+                let message = format!("must be one of constant, pulse, ramp, sine, trace, but is `{other}`");
+                return Err(kind.refuse(Reason::WrongKind, message));
+            }
+        }))
+    }
+
+    fn trace(&mut self, item: &Item<'_>, path: &Path) -> Result<Vec<(u64, DVec3)>> {
+        let text = document::read_text(path, self.limits.trace_bytes)
+            .map_err(|refusal| item.refuse(refusal.reason, format!("{} {}", path.display(), refusal.message)))?;
+        let refuse = |line: usize, message: String| {
+            let place = format!("{}:{line}", path.display());
+            Refusal { place: Some(place), ..Refusal::new(Reason::Unreadable, "", message) }
+        };
+        const HEADER: &str = "time_s,fx_n,fy_n,fz_n";
+        let mut lines = text.lines().enumerate().filter(|line| !line.1.trim().is_empty());
+        let header = lines.next().map_or("", |line| line.1);
+        if header.split(',').map(str::trim).ne(HEADER.split(',')) {
+            return Err(refuse(1, format!("must begin with the line `{HEADER}`")));
+        }
+        let mut rows: Vec<(u64, DVec3)> = Vec::new();
+        let (mut last_s, mut rounded) = (f64::NEG_INFINITY, 0_usize);
+        for (index, line) in lines {
+            let line_number = index + 1;
+            let cells: Vec<&str> = line.split(',').map(str::trim).collect();
+            let [time, x, y, z] = cells.as_slice() else {
+                return Err(refuse(line_number, format!("must have the 4 columns {HEADER}, but has {}", cells.len())));
+            };
+            let mut numbers = [0.0; 4];
+            for (number, cell) in numbers.iter_mut().zip([time, x, y, z]) {
+                *number = cell
+                    .parse()
+                    .ok()
+                    .filter(|number: &f64| number.is_finite())
+                    .ok_or_else(|| refuse(line_number, format!("`{cell}` is not a finite number")))?;
+            }
+            let [time_s, x, y, z] = numbers;
+            if time_s < 0.0 || time_s <= last_s {
+                return Err(refuse(line_number, format!("time_s must rise from 0 on, but is {time_s} after {last_s}")));
+            }
+            last_s = time_s;
+            let warnings = self.warnings.len();
+            let step = self.steps("time_s", time_s).map_err(|refusal| refuse(line_number, refusal.message))?;
+            rounded += self.warnings.len() - warnings;
+            self.warnings.truncate(warnings);
+            // Of several rows for one step, the last one applies.
+            if rows.last().is_some_and(|row| row.0 == step) {
+                rows.pop();
+            }
+            rows.push((step, DVec3::new(x, y, z)));
+        }
+        if rows.is_empty() {
+            return Err(refuse(1, "has no rows".to_owned()));
+        }
+        if rounded > 0 {
+            self.warnings.push(format!("{}: the times of {rounded} rows were rounded to whole steps", path.display()));
+        }
+        Ok(rows)
+    }
+
+    fn tool(&mut self, item: &Item<'_>) -> Result<MoveLaw> {
+        item.table(|fields| {
+            let (point, _) = self.point(&fields.required("point")?)?;
+            check_free(&fields.path("point"), &self.scene.sheet, point)?;
+            let mut moves = Vec::new();
+            let list = fields.required("moves")?;
+            for entry in list.list()? {
+                moves.push(entry.table(|fields| {
+                    let from_s = not_negative(&fields.path("from_s"), fields.required_number("from_s")?)?;
+                    let to_s = fields.required_number("to_s")?;
+                    if to_s < from_s + SHORTEST_MOVE_S {
+                        let message = format!("must be at least {SHORTEST_MOVE_S} s after from_s");
+                        return Err(fields.refuse(Reason::OutOfRange, "to_s", message));
+                    }
+                    Ok(Move { from_s, to_s, by_m: fields.required("by_m")?.vector()? })
+                })?);
+            }
+            let law = MoveLaw { point, moves };
+            // The displacement is largest at the end of a move. Where moves overlap, their sum is an upper bound.
+            let farthest: f64 = law.moves.iter().map(|m| m.by_m.length()).sum();
+            check_reach(&fields.path("moves"), &self.scene.sheet, farthest, self.limits)?;
+            Ok(law)
+        })
+    }
+}
+
+/// The entries of `[[key]]`; empty if the key is absent.
+fn items<'a>(fields: &mut Fields<'a>, key: &'static str) -> Result<Vec<Item<'a>>> {
+    fields.item(key).map_or(Ok(Vec::new()), |item| item.list())
+}
+
+/// Requires ascending times. Of two that round to one step, the later one applies.
+fn rising<T>(list: &Item<'_>, key: &str, entries: &mut Vec<(u64, T)>) -> Result<()> {
+    if entries.is_empty() {
+        return Err(list.refuse(Reason::Missing, "must have at least one entry"));
+    }
+    if let Some(index) = entries.windows(2).position(|pair| pair[1].0 < pair[0].0) {
+        let message = format!("{key} of entry {} is before that of the entry before it", index + 1);
+        return Err(list.refuse(Reason::OutOfRange, message));
+    }
+    let mut index = 0;
+    while index + 1 < entries.len() {
+        if entries[index].0 == entries[index + 1].0 {
+            entries.remove(index);
+        } else {
+            index += 1;
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,16 @@
+//! Addresses as callers: which of them count as one.
+
+use std::net::IpAddr;
+
+/// The network that limits per address count: of IPv6 the first 64 bits, because each client there has 2⁶⁴ addresses.
+pub(super) fn network(address: IpAddr) -> IpAddr {
+    match address.to_canonical() {
+        IpAddr::V6(address) => IpAddr::V6((u128::from(address) >> 64 << 64).into()),
+        IpAddr::V4(address) => IpAddr::V4(address),
+    }
+}
+
+/// The name of an address's account. Addresses of one IPv6 network of 64 bits share an account.
+pub(super) fn address_name(address: IpAddr) -> String {
+    format!("address:{}", network(address))
+}

@@ -1,0 +1,96 @@
+//! A server's listeners and its protection, before it serves; and why a server can't run.
+
+use std::net::SocketAddr;
+
+use tokio::net::TcpListener;
+
+use super::config::Config;
+use super::protection::Protection;
+use crate::refusal::{Reason, Refusal};
+
+/// Why a server can't run.
+#[derive(Debug, thiserror::Error)]
+pub enum ServeError {
+    /// The configuration is invalid or not safe.
+    #[error("{0}")]
+    Refused(#[from] Refusal),
+    /// The address is in use, or not one of this machine.
+    #[error("can't listen on {address}: {error}; try another --{field}, or port 0 for any free port")]
+    Listen {
+        /// The configuration's key of the address.
+        field: &'static str,
+        /// The address as it was given.
+        address: String,
+        /// The system's error.
+        error: std::io::Error,
+    },
+    /// A thread can't be started.
+    #[error("can't start a stepping thread: {0}")]
+    Threads(#[from] std::io::Error),
+    /// The transport failed.
+    #[error("the transport failed: {0}")]
+    Transport(#[from] tonic::transport::Error),
+    /// The reflection service can't read its own descriptors.
+    #[error("can't read the descriptors of the protocol: {0}")]
+    Reflection(#[from] tonic_reflection::server::Error),
+}
+
+/// A server's listeners and its protection.
+pub struct Doors {
+    pub(super) listener: TcpListener,
+    pub(super) metrics: Option<TcpListener>,
+    pub(super) protection: Protection,
+}
+
+impl Doors {
+    /// Listens on the configured addresses, if that is safe.
+    ///
+    /// # Errors
+    /// Returns an error if the configuration is invalid or unsafe, a file can't be read, or an address is not available.
+    pub async fn open(config: &Config) -> Result<Self, ServeError> {
+        let listener = listen("listen", &config.listen).await?;
+        let protection = Protection::load(config, local_address("listen", &listener, &config.listen)?)?;
+        let metrics = match &config.metrics {
+            Some(text) => {
+                let listener = listen("metrics", text).await?;
+                let address = local_address("metrics", &listener, text)?;
+                if !address.ip().is_loopback() && !config.insecure {
+                    let why = "and the metrics need no authentication: listen on 127.0.0.1, or pass --insecure";
+                    let message = format!("other machines can reach {address}, {why}");
+                    return Err(Refusal::new(Reason::OutOfRange, "metrics", message).into());
+                }
+                Some(listener)
+            }
+            None => None,
+        };
+        Ok(Doors { listener, metrics, protection })
+    }
+
+    /// The server's URL.
+    pub fn url(&self) -> String {
+        url(self.protection.scheme(), &self.listener)
+    }
+
+    /// The URL of the metrics, if they are served.
+    pub fn metrics_url(&self) -> Option<String> {
+        self.metrics.as_ref().map(|listener| url("http", listener) + "/metrics")
+    }
+}
+
+fn local_address(field: &'static str, listener: &TcpListener, text: &str) -> Result<SocketAddr, ServeError> {
+    listener.local_addr().map_err(|error| ServeError::Listen { field, address: text.to_owned(), error })
+}
+
+fn url(scheme: &str, listener: &TcpListener) -> String {
+    listener.local_addr().map_or_else(|e| e.to_string(), |address| format!("{scheme}://{address}"))
+}
+
+async fn listen(field: &'static str, text: &str) -> Result<TcpListener, ServeError> {
+    TcpListener::bind(text).await.map_err(|error| {
+        if error.kind() == std::io::ErrorKind::InvalidInput {
+            let message = format!("must be address:port, such as 127.0.0.1:7117, but is `{text}`");
+            return Refusal::new(Reason::WrongKind, field, message).into();
+        }
+        ServeError::Listen { field, address: text.to_owned(), error }
+    })
+}

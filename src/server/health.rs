@@ -1,0 +1,98 @@
+//! What the health service reports: the services, the files of tokens, and the workshop.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tonic::server::NamedService;
+use tonic_health::ServingStatus;
+use tonic_health::server::HealthReporter;
+use tracing::warn;
+
+use super::haptics::Haptics;
+use super::protection::Protection;
+use super::sessions::Sessions;
+use super::traffic::Traffic;
+use super::views::Views;
+use super::workshop::Workshop;
+use crate::wire::pb::haptic_service_server::HapticServiceServer;
+use crate::wire::pb::session_service_server::SessionServiceServer;
+use crate::wire::pb::view_service_server::ViewServiceServer;
+
+/// The services that the health service reports. The server itself, "", is serving even while one of the others is not.
+pub(super) const SERVICES: [&str; 6] = [
+    "",
+    <SessionServiceServer<Sessions> as NamedService>::NAME,
+    <HapticServiceServer<Haptics> as NamedService>::NAME,
+    <ViewServiceServer<Views> as NamedService>::NAME,
+    TOKENS,
+    WORKSHOP,
+];
+
+/// The health service that is serving while the tokens in use are those of the file.
+const TOKENS: &str = "palpate.tokens";
+
+/// Reports, to health and metrics, files whose contents are not in use. Never completes.
+pub(super) fn report_files(
+    protection: &Protection,
+    health: HealthReporter,
+    traffic: Arc<Traffic>,
+) -> impl Future<Output = ()> + use<> {
+    let mut tokens = protection.credentials.problems();
+    let tls = protection.tls.as_ref().map(|tls| tls.problems());
+    let token_traffic = traffic.clone();
+    let of_tokens = async move {
+        loop {
+            let are_unused = tokens.borrow_and_update().is_some();
+            token_traffic.files("tokens", are_unused);
+            let status = if are_unused { ServingStatus::NotServing } else { ServingStatus::Serving };
+            health.set_service_status(TOKENS, status).await;
+            if tokens.changed().await.is_err() {
+                return;
+            }
+        }
+    };
+    let of_tls = async move {
+        let Some(mut tls) = tls else { return };
+        loop {
+            traffic.files("TLS", tls.borrow_and_update().is_some());
+            if tls.changed().await.is_err() {
+                return;
+            }
+        }
+    };
+    async {
+        tokio::join!(of_tokens, of_tls);
+    }
+}
+
+/// Reports that the server is not serving any more. Then ends the streams that watch its health: shutdown would wait for
+/// them.
+pub(super) async fn end_health(mut health: HealthReporter) {
+    for service in SERVICES {
+        health.set_service_status(service, ServingStatus::NotServing).await;
+    }
+    for service in SERVICES {
+        health.clear_service_status(service).await;
+    }
+}
+
+/// The health service that is serving while heavy work is done in time.
+const WORKSHOP: &str = "palpate.workshop";
+
+/// Reports by [`WORKSHOP`] whether the workshop's oldest job is within its deadline. Never completes.
+pub(super) async fn report_workshop(workshop: Workshop, health: HealthReporter) {
+    let mut checks = tokio::time::interval(Duration::from_millis(250));
+    let mut was_late = None;
+    loop {
+        checks.tick().await;
+        let load = workshop.load();
+        if was_late.replace(load.is_late) == Some(load.is_late) {
+            continue;
+        }
+        if load.is_late {
+            warn!(oldest_s = load.oldest_s, waiting = load.waiting, "heavy work is past its deadline");
+        }
+        let status = if load.is_late { ServingStatus::NotServing } else { ServingStatus::Serving };
+        health.set_service_status(WORKSHOP, status).await;
+    }
+}

@@ -1,0 +1,22 @@
+//! What every service shares.
+
+use std::sync::Arc;
+
+use super::catalog::Catalog;
+use super::config::Config;
+use super::textures::Textures;
+use super::traffic::Traffic;
+use super::workshop::Workshop;
+use crate::pace::Pacer;
+
+/// What every service needs.
+#[derive(Clone)]
+pub(crate) struct House {
+    pub(crate) config: Arc<Config>,
+    pub(crate) catalog: Catalog,
+    pub(crate) pacer: Arc<Pacer>,
+    pub(crate) textures: Textures,
+    /// Creates and changes sessions, reads scripts and computes force laws.
+    pub(crate) workshop: Workshop,
+    pub(crate) traffic: Arc<Traffic>,
+}

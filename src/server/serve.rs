@@ -1,0 +1,201 @@
+//! Serves: puts the services, the page and the metrics together, and shuts down with a deadline.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use http::{HeaderName, HeaderValue, Method, header};
+use tokio_util::sync::CancellationToken;
+use tonic::service::Routes;
+use tonic::transport::Server;
+use tonic_health::ServingStatus;
+use tonic_web::GrpcWebLayer;
+use tower_http::cors::CorsLayer;
+use tracing::{info, warn};
+
+use super::catalog::Catalog;
+use super::config::Config;
+use super::connections::Seats;
+use super::doors::{Doors, ServeError};
+use super::guard::GuardLayer;
+use super::health::{SERVICES, end_health, report_files, report_workshop};
+use super::house::House;
+use super::revocation::Calls;
+use super::textures::Textures;
+use super::traffic::Traffic;
+use super::workshop::Workshop;
+use super::{admin, connections, descriptors, haptics, metrics, page, sessions, textures, views};
+use crate::budget::{Budget, give_back_to_the_system};
+use crate::pace::Pacer;
+use crate::wire::pb;
+use crate::wire::pb::admin_service_server::AdminServiceServer;
+use crate::wire::pb::haptic_service_server::HapticServiceServer;
+use crate::wire::pb::session_service_server::SessionServiceServer;
+use crate::wire::pb::view_service_server::ViewServiceServer;
+
+/// The headers that pages of these origins may send and read in gRPC-web calls.
+fn cors(origins: &[HeaderValue]) -> CorsLayer {
+    let own = |name| HeaderName::from_static(name);
+    let sent =
+        [header::CONTENT_TYPE, header::AUTHORIZATION, own("x-grpc-web"), own("x-user-agent"), own("grpc-timeout")];
+    let read = [own("grpc-status"), own("grpc-message"), own("grpc-status-details-bin")];
+    CorsLayer::new()
+        .allow_origin(origins.to_vec())
+        .allow_methods([Method::GET, Method::POST])
+        .allow_headers(sent)
+        .expose_headers(read)
+        .max_age(Duration::from_secs(3600))
+}
+
+/// When this many bytes have become free, the allocator is asked to return its free memory to the system.
+const WORTH_GIVING_BACK: u64 = 16 << 20;
+
+/// Serves at `doors` until `shutdown` is cancelled. Then ends all streams, and returns at the latest after the configured
+/// deadline. The caller must end its runtime without waiting (`shutdown_background`).
+///
+/// # Errors
+/// Returns an error if a thread can't be started, or if the transport fails.
+pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) -> Result<(), ServeError> {
+    let Doors { listener, metrics, protection } = doors;
+    let budget = Budget::new(&config.limits, config.stepping_threads(), config.serving_threads());
+    info!(bytes = budget.bytes(), "memory that callers share");
+    let pacer = Pacer::start(config.stepping_threads(), config.audit_share, &config.limits, budget.clone())?;
+    let deadline = Duration::from_secs_f64(config.shutdown_deadline_s);
+    let catalog = Catalog::new(&config.scenes, &config.scripts);
+    for name in catalog.names() {
+        if let Err(refusal) = catalog.load(&name, &[], &config.limits) {
+            warn!(%refusal, "this scene is invalid: no session can be created from it");
+        }
+    }
+    let mut limits = config.limits.clone();
+    let traffic = Arc::new(Traffic::default());
+    descriptors::raise();
+    limits.connections =
+        descriptors::connections(limits.connections, metrics.as_ref().map_or(0, |_| metrics::SCRAPERS));
+    let workshop = Workshop::open("workshop", &limits)?;
+    if let Some(listener) = metrics {
+        let registry = metrics::registry(&pacer, &traffic, &workshop);
+        let (limits, shutdown) = (limits.clone(), shutdown.clone());
+        tokio::spawn(async move { metrics::serve(listener, &limits, registry, shutdown).await });
+    }
+    let open = protection.credentials.get().is_open();
+    if config.insecure && open {
+        warn!("--insecure: everyone who can reach this server may do everything");
+    }
+    let origins: Arc<[HeaderValue]> = config.origins.iter().filter_map(|origin| origin.parse().ok()).collect();
+    let calls = Calls::new(protection.credentials.clone());
+    let guard = GuardLayer {
+        credentials: protection.credentials.clone(),
+        calls: calls.clone(),
+        message_timeout: Duration::from_secs_f64(limits.open_s),
+        traffic: traffic.clone(),
+        budget: budget.clone(),
+        local_only: open && !config.insecure,
+        origins: origins.clone(),
+    };
+    let config = Arc::new(config);
+    let textures = Textures::open(&config, &catalog, &pacer, &limits)?;
+    let house = House {
+        catalog,
+        pacer: pacer.clone(),
+        config,
+        textures: textures.clone(),
+        workshop: workshop.clone(),
+        traffic: traffic.clone(),
+    };
+
+    let (health, health_service) = tonic_health::server::health_reporter();
+    for service in SERVICES {
+        health.set_service_status(service, ServingStatus::Serving).await;
+    }
+    let reporting_files = report_files(&protection, health.clone(), traffic.clone());
+    let reflection = || {
+        tonic_reflection::server::Builder::configure()
+            .register_encoded_file_descriptor_set(pb::DESCRIPTORS)
+            .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+    };
+
+    let reporting_work = report_workshop(workshop, health.clone());
+    let (unused, memory) = (pacer.clone(), budget.clone());
+    let mut most_bytes = 0;
+    let sweeping = async move {
+        let mut sweep = tokio::time::interval(Duration::from_secs(1));
+        loop {
+            sweep.tick().await;
+            for session in unused.delete_idle() {
+                info!(session, "session deleted: it was idle");
+            }
+            let bytes = memory.bytes_taken();
+            most_bytes = most_bytes.max(bytes);
+            if most_bytes - bytes >= WORTH_GIVING_BACK {
+                most_bytes = bytes;
+                let _ = tokio::task::spawn_blocking(give_back_to_the_system).await;
+            }
+        }
+    };
+
+    // Unauthenticated connections leave half of the limit to the others.
+    let most_unauthenticated = (!open).then_some(limits.connections.div_ceil(2));
+    let seats = Arc::new(Seats::new(&limits, most_unauthenticated));
+    let register = Arc::new(connections::Register::default());
+    let tls = protection.tls.clone();
+    let incoming = connections::incoming(listener, tls, seats, &limits, budget.clone(), traffic, register.clone());
+    let silence = Some(Duration::from_secs_f64(limits.keepalive_s));
+    let bytes = limits.message_bytes;
+    let pages = page::Page::of(house.config.viewer.clone());
+    let sessions = SessionServiceServer::new(sessions::Sessions(house.clone())).max_decoding_message_size(bytes);
+    let haptics = HapticServiceServer::new(haptics::Haptics(house.clone())).max_decoding_message_size(bytes);
+    let admin =
+        AdminServiceServer::new(admin::Admin { house: house.clone(), register }).max_decoding_message_size(bytes);
+    let views = ViewServiceServer::new(views::Views(house)).max_decoding_message_size(bytes);
+    let routes = Routes::new(health_service)
+        .add_service(reflection().build_v1()?)
+        .add_service(reflection().build_v1alpha()?)
+        .add_service(sessions)
+        .add_service(haptics)
+        .add_service(views)
+        .add_service(admin)
+        .into_axum_router()
+        // Not for the routes below: the layer refuses what is not gRPC.
+        .route_layer(GrpcWebLayer::new())
+        .route("/textures/{file}", axum::routing::get(move |file, headers| textures::file(textures, file, headers)))
+        .fallback(move |request| page::page(pages.clone(), request));
+    let drain = CancellationToken::new();
+    let serving = Server::builder()
+        // Detects clients whose host has disappeared.
+        .http2_keepalive_interval(silence)
+        .http2_keepalive_timeout(silence)
+        .max_concurrent_streams(limits.streams_per_connection)
+        .initial_connection_window_size(limits.connection_window_bytes)
+        // Browsers speak HTTP/2 only over TLS.
+        .accept_http1(true)
+        .layer(cors(&origins))
+        .layer(guard)
+        .add_routes(routes.into())
+        .serve_with_incoming_shutdown(incoming, drain.clone().cancelled_owned());
+
+    // One deadline for everything that is left to do. A step that takes longer ends with the process.
+    let (stopping, begun) = (pacer.clone(), shutdown.clone());
+    let stop = async move {
+        begun.cancelled().await;
+        info!("shutting down");
+        end_health(health).await;
+        drain.cancel();
+        // Waits for the running steps. Every stream then reads its end from its queue.
+        let _ = tokio::task::spawn_blocking(move || stopping.stop()).await;
+    };
+    let deadline_passed = async {
+        shutdown.cancelled().await;
+        tokio::time::sleep(deadline).await;
+    };
+    tokio::select! {
+        (served, ()) = async { tokio::join!(serving, stop) } => served?,
+        () = sweeping => {}
+        () = reporting_work => {}
+        () = protection.watch() => {}
+        () = calls.watch() => {}
+        () = reporting_files => {}
+        () = deadline_passed => warn!("the shutdown deadline has passed: cutting the remaining steps and streams"),
+    }
+    info!("stopped");
+    Ok(())
+}

@@ -1,0 +1,100 @@
+//! A session as a message: its state, counts, audits and tissue.
+
+use crate::pace::{Live, State};
+use crate::scene::Named;
+use crate::scene::record::AuditedError;
+use crate::sheet::Model;
+use crate::sheet::audit::Origin;
+use crate::wire::{self, pb};
+
+/// The current state of a session as a message.
+pub(super) fn session(live: &Live) -> pb::Session {
+    let status = live.status();
+    let (held_tools, lapsed_leases, counts) = live.at_intake(|intake, _| {
+        let held = intake.holders().map(|(tool, holder)| pb::HeldTool { tool, holder: holder.to_owned() });
+        (held.collect(), intake.lapsed(), intake.counts())
+    });
+    let count = |count: usize| u32::try_from(count).unwrap_or(u32::MAX);
+    let model = &status.model;
+    #[allow(clippy::cast_precision_loss)]
+    let simulation_time_s = status.step as f64 / model.scene.stepping.rate_hz;
+    let session = pb::Session {
+        session_id: live.id.clone(),
+        state: match status.state {
+            State::Running => pb::SessionState::Running,
+            State::Paused => pb::SessionState::Paused,
+            State::Held => pb::SessionState::Held,
+        }
+        .into(),
+        step: status.step,
+        simulation_time_s,
+        overrun_count: status.overrun_count,
+        time_dilation: status.dilation.value,
+        late_commands: status.late_commands,
+        paused_commands: status.paused_commands,
+        hold_reason: status.hold_reason.unwrap_or_default(),
+        held_tools,
+        lapsed_leases,
+        idle_timeout_s: live.idle_timeout_s,
+        guard_events: status.guard_events,
+        recovery_count: status.recovery_count,
+        recoveries: status.recoveries.into_iter().map(wire::sample::recovery).collect(),
+        resting: status.resting,
+        rested_steps: status.rested_steps,
+        commands: Some(pb::CommandCounts {
+            accepted: counts.accepted,
+            applied: counts.applied,
+            superseded: counts.superseded,
+            dropped: counts.dropped,
+            waiting: counts.waiting,
+            refused: live.refused(),
+        }),
+        awake_points: count(status.awake_points),
+        streams: count(live.streams()),
+        scene_name: model.scene.name.clone(),
+        points: count(model.len()),
+        audit: audit(live),
+        ..Default::default()
+    };
+    with_model(session, model)
+}
+
+/// The results of a session's audits; `None` before the first.
+fn audit(live: &Live) -> Option<pb::Audit> {
+    let audited = live.audited();
+    let (step, newest) = audited.newest?;
+    let error = |error: AuditedError| Some(pb::AuditedError { displacement: error.displacement, force: error.force });
+    Some(pb::Audit {
+        windows: audited.windows,
+        step,
+        newest_error: error(newest),
+        largest_error: error(audited.largest),
+        windows_above_tolerance: audited.above,
+        reason: audited.origin.map(Origin::describe).unwrap_or_default().to_owned(),
+        corrections: audited.corrections,
+        refused_correction: audited.refused_correction.map(|refusal| refusal.to_string()).unwrap_or_default(),
+        newest_correction: audited.correction.map(|correction| pb::Correction {
+            step: correction.step,
+            audited_error: error(correction.audited_error),
+            reason: correction.reason,
+            integrator: correction.integrator.name().to_owned(),
+            substeps: correction.substeps,
+            precision: correction.precision.name().to_owned(),
+            sleep_tolerance: correction.sleep_tolerance,
+        }),
+    })
+}
+
+/// Adds the fields that describe the tissue's model.
+pub(super) fn with_model(session: pb::Session, model: &Model) -> pb::Session {
+    pb::Session {
+        scene: Some(wire::scene::scene(&model.scene)),
+        integrator: model.plan.integrator.name().to_owned(),
+        substeps: model.plan.substeps,
+        precision: model.precision.name().to_owned(),
+        warnings: model.warnings.clone(),
+        // An unknown error counts as the largest possible one.
+        expected_error: if model.expected_error.is_finite() { model.expected_error } else { 1.0 },
+        ..session
+    }
+}

@@ -1,0 +1,132 @@
+//! The buffers and tables of a sheet's sweeps, and the calls that run a sweep at the machine's vector width.
+#![allow(unsafe_code)]
+
+use std::cell::RefCell;
+use std::sync::Arc;
+
+use super::advance::Advance;
+use super::applied::{self, Pull, Term};
+use super::field::{BLOCK, Field, Layout, State};
+use super::grid::Grid;
+use super::integrate::arithmetic::{Arithmetic, MAX_KEPT};
+use super::lanes::{self, Width};
+use super::real::Real;
+use super::region::Region;
+use super::springs::Springs;
+use super::stage::Stage;
+use super::sweep::Sweep;
+use crate::scene::Lanes;
+
+/// Number of tool forces that need no heap memory.
+const FEW: usize = 4;
+
+/// The buffers and tables that a sweep needs beside the state. One for each sheet, made once.
+#[derive(Debug)]
+pub(super) struct Bench<T> {
+    width: Width,
+    pub(super) layout: Layout,
+    pub(super) springs: Springs<T>,
+    /// 1 where a point moves, 0 where it is fixed: one plane. `None` if every point moves.
+    pub(super) free: Option<Field<T>>,
+    /// Only the first rows of each plane are used. Planes of the layout's length need no extra address registers.
+    carry: RefCell<Field<T>>,
+    probe: [T; BLOCK],
+    work: [T; BLOCK],
+}
+
+impl<T: Real> Bench<T> {
+    pub(super) fn new(lanes: Lanes, layout: Layout, springs: Springs<T>, fixed: &[usize]) -> Self {
+        let free = (!fixed.is_empty()).then(|| {
+            let mut free = Field::of_length(layout.plane);
+            free.fill(T::of(1.0));
+            fixed.iter().for_each(|index| free[layout.place(*index)] = T::default());
+            free
+        });
+        let zero = [T::default(); BLOCK];
+        Bench {
+            width: Width::of(lanes),
+            layout,
+            springs,
+            free,
+            carry: RefCell::new(Field::zero(&layout)),
+            probe: zero,
+            work: zero,
+        }
+    }
+
+    /// Advances every point with `scheme`. The tools' force is read from field `field` on.
+    pub(super) fn advance<C: Arithmetic<T>>(
+        &mut self,
+        scheme: &C,
+        state: &mut State<T>,
+        terms: &[Term<T>],
+        field: usize,
+        over: &Region,
+    ) {
+        let mut kept = [std::ptr::null_mut(); MAX_KEPT];
+        for (pointer, field) in kept.iter_mut().zip(&mut state.kept) {
+            *pointer = Arc::make_mut(field).as_mut_ptr();
+        }
+        assert_eq!(state.kept.len(), C::KEPT);
+        // A few forces need no heap memory.
+        let (mut few, mut many) = ([Pull::none(); FEW], Vec::new());
+        let pulls = terms.iter().map(|term| term.pull(field, self.layout.stride));
+        let pulls: &[Pull<'_, T>] = if terms.len() <= FEW {
+            few.iter_mut().zip(pulls).for_each(|(to, pull)| *to = pull);
+            &few[..terms.len()]
+        } else {
+            many.extend(pulls);
+            &many
+        };
+        let u = state.u.as_mut_ptr();
+        let stage = Advance {
+            layout: self.layout,
+            scheme,
+            u,
+            d: state.d.as_mut_ptr(),
+            kept,
+            pulls,
+            forced: applied::rows(terms),
+            free: self.free.as_ref().map_or(std::ptr::null(), |free| free.as_ptr()),
+            probe: self.probe.as_mut_ptr(),
+            work: self.work.as_mut_ptr(),
+        };
+        let of_points = |field: &Field<T>| field.len() == 3 * self.layout.plane;
+        debug_assert!(state.fields().all(of_points) && of_points(self.carry.get_mut()));
+        debug_assert!(self.free.as_ref().is_none_or(|free| free.len() == self.layout.plane));
+        debug_assert!(over.is_within(&self.layout));
+        let carry = self.carry.get_mut().as_mut_ptr();
+        let grid = Grid { layout: self.layout, springs: &self.springs, x: u.cast_const(), carry };
+        let sweep = Sweep { grid, over, stage };
+        // SAFETY: all fields have the layout's three planes, padded by a row and a block, and the tables have this
+        // layout; u is written behind what the sweep still reads, through the same pointer.
+        unsafe { lanes::run(self.width, &sweep) };
+    }
+
+    /// Sweeps over the displacements `u`.
+    ///
+    /// # Safety
+    /// `u` and the pointers of the stage belong to fields of this layout.
+    pub(super) unsafe fn look<S: Stage<T>>(&self, u: *const T, over: &Region, stage: S) {
+        debug_assert!(over.is_within(&self.layout));
+        let mut carry = self.carry.borrow_mut();
+        let grid = Grid { layout: self.layout, springs: &self.springs, x: u, carry: carry.as_mut_ptr() };
+        let sweep = Sweep { grid, over, stage };
+        // SAFETY: as above.
+        unsafe { lanes::run(self.width, &sweep) };
+    }
+
+    /// Whether all increments since the last call were finite and below `farthest`. False may also come from a sum of
+    /// many.
+    pub(super) fn is_calm(&mut self, farthest: f64) -> bool {
+        std::mem::take(&mut self.probe).iter().all(|sum| sum.wide() < farthest * farthest)
+    }
+
+    /// Σ force · travel of the tools since the last call, in the scheme's terms.
+    pub(super) fn take_work(&mut self) -> f64 {
+        let work = std::mem::take(&mut self.work);
+        // Four chains of additions at once, in a fixed order.
+        let chains: [f64; 4] = std::array::from_fn(|chain| (0..BLOCK / 4).map(|n| work[4 * n + chain].wide()).sum());
+        (chains[0] + chains[1]) + (chains[2] + chains[3])
+    }
+}

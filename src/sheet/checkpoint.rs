@@ -1,0 +1,139 @@
+//! What the guard goes back to and what it checks by: checkpoints, the tools' inputs, and the account of work.
+
+use std::fmt;
+
+use glam::DVec3;
+
+use super::applied::{Applied, Push};
+use super::contact::Contacts;
+use super::field::State;
+use super::prescribed::{Grasp, Prescribed};
+use super::real::Real;
+use crate::scene::tip::Tip;
+
+/// Tolerance of the energy balance, as a fraction of energy and of work: errors of the schemes at the stability bound.
+pub const MARGIN: f64 = 0.05;
+
+/// Why the guard gave up.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Cause {
+    /// A point is not finite, or is displaced by a billion times the sheet's size.
+    NotFinite {
+        /// The point.
+        point: [usize; 2],
+    },
+    /// Energy from nowhere.
+    Energy {
+        /// Energy of springs, virtual springs and motion, J.
+        energy_j: f64,
+        /// That energy at the last survey, J.
+        before_j: f64,
+        /// Work of all tools since, J.
+        work_j: f64,
+    },
+    /// The springs' force is far from its prediction.
+    Surprise {
+        /// The resulting difference of a displacement, as a fraction of the largest.
+        part: f64,
+    },
+}
+
+impl fmt::Display for Cause {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Cause::NotFinite { point: [i, j] } => {
+                write!(f, "point [{i}, {j}] was not finite (or a billion sheets away)")
+            }
+            Cause::Energy { energy_j, before_j, work_j } => {
+                write!(
+                    f,
+                    "the energy rose from {before_j:.3e} J to {energy_j:.3e} J, while the tools did {work_j:.3e} J of work"
+                )
+            }
+            Cause::Surprise { part } => {
+                write!(f, "the springs' force was far from its prediction, by {part:.1e} of the largest displacement")
+            }
+        }
+    }
+}
+
+/// An input of a tool.
+#[derive(Debug, Clone)]
+pub(super) enum Input {
+    Push(Option<Push>),
+    Grasp(usize, Grasp),
+    Lead(DVec3, Tip),
+}
+
+/// The complete state that a sheet goes back to.
+#[derive(Debug)]
+pub(super) struct Checkpoint<T: Real> {
+    pub(super) steps: u64,
+    pub(super) halvings: u32,
+    pub(super) state: State<T>,
+    pub(super) applied: Applied<T>,
+    pub(super) prescribed: Prescribed,
+    pub(super) contacts: Contacts,
+    pub(super) work: Work,
+    /// The recent largest displacement, spacings. Sleep is relative to it.
+    pub(super) largest: f64,
+    /// Whether the motion that led here has passed the checks, under the present tissue.
+    pub(super) believed: bool,
+}
+
+/// Work of the tools, J, and energies at the last survey.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(super) struct Work {
+    /// Work since the last survey, plus what its `present_j` subtracted.
+    pub(super) done_j: f64,
+    /// Energy at the last survey.
+    energy_j: f64,
+    /// The largest energy at any survey.
+    largest_j: f64,
+}
+
+impl Work {
+    /// Adds work.
+    pub(super) fn add(&mut self, work_j: f64) {
+        self.done_j += work_j;
+    }
+
+    /// An account that begins with the given energy.
+    pub(super) fn begun(energy_j: f64, present_j: f64) -> Self {
+        Work { done_j: present_j, energy_j, largest_j: energy_j }
+    }
+
+    /// Checks an energy; a rise by `noise` of the largest does not count. `present_j` is subtracted from the work so
+    /// far and belongs to the next interval. The account begins anew.
+    pub(super) fn survey(&mut self, energy_j: f64, present_j: f64, noise: f64) -> Result<(), Cause> {
+        let (work_j, before_j) = (self.done_j - present_j, self.energy_j);
+        let allowed_j = work_j + MARGIN * (before_j + work_j.abs()) + noise * self.largest_j;
+        if energy_j - before_j > allowed_j {
+            return Err(Cause::Energy { energy_j, before_j, work_j });
+        }
+        *self = Work { done_j: present_j, energy_j, largest_j: self.largest_j.max(energy_j) };
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn energy_comes_from_work_alone() {
+        let begun = Work::begun(1.0, 0.0);
+        // Up to the margin.
+        assert_eq!({ begun }.survey(1.04, 0.0, 0.0), Ok(()));
+        let found = Cause::Energy { energy_j: 1.2, before_j: 1.0, work_j: 0.0 };
+        assert_eq!({ begun }.survey(1.2, 0.0, 0.0), Err(found));
+        let mut worked = begun;
+        worked.add(0.25);
+        // Work that belongs to the next interval does not count in this one.
+        assert!({ worked }.survey(1.25, 0.2, 0.0).is_err());
+        assert_eq!(worked.survey(1.2, 0.05, 0.0), Ok(()));
+        assert_eq!(worked, Work { done_j: 0.05, energy_j: 1.2, largest_j: 1.2 });
+        // It goes as it likes.
+        assert_eq!(worked.survey(0.01, 0.0, 0.0), Ok(()));
+    }
+}

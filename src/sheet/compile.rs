@@ -1,0 +1,219 @@
+//! Compiles a scene to a model: checks it, chooses a scheme, and expects an error.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use super::choice::{self, Choice};
+use super::integrate::{Oscillator, entry};
+use super::lanes;
+use super::model::{Model, Plan};
+use crate::limits::Limits;
+use crate::refusal::{Reason, Refusal, Result};
+use crate::scene::{Change, Integrator, Named, Precision, Scene};
+
+/// What sleeping tiles may add to the error, by default, as a part of it.
+const SLEEP_PART: f64 = 0.1;
+
+impl Model {
+    /// Compiles a scene, after checking it.
+    ///
+    /// # Errors
+    /// Refuses a scene that is not valid, that no scheme can step within the limits, or that this machine can't run.
+    pub fn compile(scene: &Scene, limits: &Limits) -> Result<Arc<Self>> {
+        Model::compile_until(scene, limits, &choice::NEVER)
+    }
+
+    /// The same, given up when `stop` is set.
+    ///
+    /// # Errors
+    /// As for [`Model::compile`]; and refuses when `stop` is set.
+    pub fn compile_until(scene: &Scene, limits: &Limits, stop: &AtomicBool) -> Result<Arc<Self>> {
+        scene.check(limits)?;
+        let sheet = Oscillator::of(scene);
+        let step_s = scene.stepping.rate_hz.recip();
+        let too_many = |substeps: u32| {
+            let message = format!(
+                "would need {substeps} substeps a step for stability, above the limit of {}: the springs are too stiff \
+                 for points so light at this rate",
+                limits.substeps
+            );
+            Refusal::new(Reason::TooLarge, "stepping.substeps", message)
+        };
+        // Nothing is rehearsed that no scheme could do.
+        let least = choice::least_substeps(scene.stepping.integrator, step_s, &sheet);
+        if scene.stepping.substeps.is_none() && least > limits.substeps {
+            return Err(too_many(least));
+        }
+        let (choice, rehearsed) = choice::choose(scene, limits, stop)?;
+        let Choice { integrator, substeps, precision, expected_error } = choice;
+        if precision == Precision::Compensated && !entry(integrator).compensates {
+            let message = format!("is for exponential schemes; `{}` has f32 and f64", integrator.name());
+            return Err(Refusal::new(Reason::WrongKind, "stepping.precision", message));
+        }
+        if substeps > limits.substeps {
+            return Err(too_many(substeps));
+        }
+        let plan = Plan::new(integrator, substeps, step_s, &sheet);
+        let omega_bound_per_s = sheet.omega_bound_per_s();
+        let mut warnings = Vec::new();
+        if !plan.stable {
+            warnings.push(format!(
+                "stepping.substeps: {} is above the stability bound of the scheme; the sheet may blow up \
+                 (substep × fastest vibration = {:.3})",
+                plan.substeps,
+                plan.substep_s * omega_bound_per_s
+            ));
+        }
+        if expected_error > scene.stepping.tolerance {
+            let expected = if expected_error.is_finite() {
+                format!("an error of {expected_error:.1e} is expected, above")
+            } else {
+                "nothing is known of the error, which may be above".to_owned()
+            };
+            warnings.push(format!(
+                "stepping.tolerance: {expected} the {:.1e} asked for; leave integrator, substeps and precision to `auto`, \
+                 or raise the limit of substeps",
+                scene.stepping.tolerance
+            ));
+        }
+        let Some(lanes) = lanes::available(scene.stepping.lanes) else {
+            let message = format!("this machine's processor has no `{}`", scene.stepping.lanes.name());
+            return Err(Refusal::new(Reason::NotAvailable, "stepping.lanes", message));
+        };
+        let sleep_tolerance = scene.sleep_tolerance.unwrap_or_else(|| {
+            // Who chooses the scheme may want it better than the tolerance.
+            let chosen = scene.stepping.integrator != Integrator::Auto || scene.stepping.substeps.is_some();
+            SLEEP_PART * if chosen { expected_error.min(scene.stepping.tolerance) } else { scene.stepping.tolerance }
+        });
+        let mut scene = scene.clone();
+        (scene.damping_n_s_per_m, scene.virtual_stiffness_n_per_m) =
+            (sheet.damping_n_s_per_m, sheet.virtual_stiffness_n_per_m);
+        let model = Model::planned(scene, plan, precision, lanes);
+        Ok(Arc::new(Model { expected_error, sleep_tolerance, warnings, rehearsed, ..model }))
+    }
+
+    /// The same sheet with another tissue: integrator and substeps as its tolerance asks for, in the number format that a
+    /// state of this model has. `first` is the scene that the session began with.
+    ///
+    /// # Errors
+    /// Refuses a change of nothing, and as [`Model::compile`] does.
+    pub fn changed(&self, change: &Change, first: &Scene, limits: &Limits) -> Result<Arc<Self>> {
+        self.changed_until(change, first, limits, &choice::NEVER)
+    }
+
+    /// The same, given up when `stop` is set.
+    ///
+    /// # Errors
+    /// As for [`Model::changed`]; and refuses when `stop` is set.
+    pub fn changed_until(
+        &self,
+        change: &Change,
+        first: &Scene,
+        limits: &Limits,
+        stop: &AtomicBool,
+    ) -> Result<Arc<Self>> {
+        if *change == Change::default() {
+            return Err(Refusal::new(Reason::Missing, "", Change::NOTHING));
+        }
+        let asked = self.scene.stepping.clone();
+        let mut scene = self.scene.changed(change, first);
+        scene.stepping.precision = self.precision;
+        // Compensated is f32 and what its rounding lost: where no exponential scheme will do, f32 goes on alone.
+        let compiled = self.compile_corrected(&scene, limits, stop).or_else(|refusal| {
+            if self.precision != Precision::Compensated || refusal.field != "stepping.precision" {
+                return Err(refusal);
+            }
+            scene.stepping.precision = Precision::F32;
+            self.compile_corrected(&scene, limits, stop)
+        });
+        let mut model = compiled?;
+        model.scene.stepping = asked;
+        Ok(Arc::new(model))
+    }
+
+    /// What a script's changes make of this, each out of the one before it.
+    ///
+    /// # Errors
+    /// Refuses the first change that [`Model::changed`] refuses.
+    pub fn course(self: &Arc<Self>, changes: &[(u64, Change)], limits: &Limits) -> Result<VecDeque<(u64, Arc<Self>)>> {
+        self.course_of(&self.scene, changes, limits)
+    }
+
+    /// The same for a session that began with the scene `first`.
+    ///
+    /// # Errors
+    /// As for [`Model::course`].
+    pub fn course_of(
+        self: &Arc<Self>,
+        first: &Scene,
+        changes: &[(u64, Change)],
+        limits: &Limits,
+    ) -> Result<VecDeque<(u64, Arc<Self>)>> {
+        let mut newest = self.clone();
+        let compiled = changes.iter().map(|(step, change)| {
+            newest = newest.changed(change, first, limits)?;
+            Ok((*step, newest.clone()))
+        });
+        compiled.collect()
+    }
+
+    /// The processor time that a step is expected to take while all of the sheet moves, s.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn predicted_step_s(&self) -> f64 {
+        let point_ns = choice::point_substep_ns(self.plan.integrator, self.precision, self.lanes);
+        1e-9 * (choice::STEP_NS + point_ns * self.swept_points() as f64 * f64::from(self.plan.substeps))
+    }
+
+    /// Compiles another tissue from this one's scene, with the scheme and at least the substeps of the correction in
+    /// force.
+    fn compile_corrected(&self, scene: &Scene, limits: &Limits, stop: &AtomicBool) -> Result<Self> {
+        let Some((integrator, least)) = self.corrected else {
+            return Ok(Arc::unwrap_or_clone(Model::compile_until(scene, limits, stop)?));
+        };
+        let mut scene = scene.clone();
+        (scene.stepping.integrator, scene.stepping.substeps) = (integrator, None);
+        let mut model = Model::compile_until(&scene, limits, stop)?;
+        if model.plan.substeps < least {
+            scene.stepping.substeps = Some(least);
+            model = Model::compile_until(&scene, limits, stop)?;
+        }
+        Ok(Model { corrected: self.corrected, ..Arc::unwrap_or_clone(model) })
+    }
+}
+
+#[cfg(test)]
+impl Model {
+    /// Of the paper's scene, with some values set: for tests.
+    pub(crate) fn paper(sets: &[&str]) -> Arc<Self> {
+        let (limits, sets) = (Limits::default(), sets.iter().map(|text| (*text).to_owned()).collect::<Vec<_>>());
+        Model::compile(&Scene::parse("paper", crate::scene::PAPER, &sets, &limits).unwrap(), &limits).unwrap()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_zero_has_no_sign() {
+        let compile = |zero: &str| {
+            let keys = ["damping.coefficient_n_s_per_m", "virtual_springs.stiffness_n_per_m"];
+            Model::paper(&keys.map(|key| format!("{key}={zero}")).each_ref().map(String::as_str))
+        };
+        let (negative, positive) = (compile("-0.0"), compile("0.0"));
+        assert_eq!((&negative.plan, negative.expected_error), (&positive.plan, positive.expected_error));
+        assert!(negative.scene.damping_n_s_per_m.is_sign_positive());
+    }
+
+    #[test]
+    fn an_error_above_the_tolerance_is_warned_of() {
+        let warns = |sets: &[&str]| {
+            let model = Model::paper(&[&["sheet.points=[5, 5]"][..], sets].concat());
+            let is_above = model.expected_error > model.scene.stepping.tolerance;
+            (is_above, model.warnings.iter().any(|warning| warning.starts_with("stepping.tolerance: ")))
+        };
+        assert_eq!(warns(&[]), (false, false));
+        assert_eq!(warns(&["stepping.integrator=lagged", "stepping.substeps=1"]), (true, true));
+    }
+}

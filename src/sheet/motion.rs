@@ -1,0 +1,430 @@
+//! A sheet in motion: its state, the step that advances it, and what can be read of it.
+
+use std::ops::Range;
+use std::sync::Arc;
+
+use glam::DVec3;
+use xxhash_rust::xxh3::Xxh3;
+
+use super::applied::{Applied, Push};
+use super::bench::Bench;
+use super::checkpoint::{Checkpoint, Input, Work};
+use super::contact::{Contacts, Feel, Surroundings};
+use super::field::{Layout, State};
+use super::integrate::arithmetic::{Arithmetic, MAX_KEPT};
+use super::integrate::family::{Family, Release};
+use super::integrate::{each, with_arithmetic};
+use super::lanes::Plain;
+use super::model::{Model, Plan};
+use super::prescribed::{Grasp, Prescribed};
+use super::real::Real;
+use super::springs::Springs;
+use super::tiles::{CHECK_STEPS, Tiles};
+use super::tissue::{BlowUp, Energy, PointState, Released, Still, Tissue};
+use super::watch::{Inputs, Mark, Watch};
+use crate::scene::Precision;
+use crate::scene::law::{Moment, Motion};
+use crate::scene::tip::Tip;
+
+/// Creates a sheet at rest.
+pub fn at_rest(model: &Arc<Model>) -> Box<dyn Tissue> {
+    match model.precision {
+        Precision::F64 => Box::new(Sheet::<f64>::new(model)),
+        Precision::Auto | Precision::F32 | Precision::Compensated => Box::new(Sheet::<f32>::new(model)),
+    }
+}
+
+#[derive(Debug)]
+pub(super) struct Sheet<T: Real> {
+    pub(super) model: Arc<Model>,
+    /// The model's plan, or one with a shorter substep.
+    pub(super) plan: Plan,
+    pub(super) halvings: u32,
+    pub(super) bench: Bench<T>,
+    pub(super) state: State<T>,
+    pub(super) applied: Applied<T>,
+    pub(super) prescribed: Prescribed,
+    pub(super) contacts: Contacts,
+    pub(super) steps: u64,
+    pub(super) work: Work,
+    /// `None` means the present state. A sheet at rest needs no copy.
+    pub(super) checkpoint: Option<Arc<Checkpoint<T>>>,
+    /// The inputs of the tools since the checkpoint: step they precede, tool, input.
+    pub(super) inputs: Vec<(u64, usize, Input)>,
+    pub(super) watch: Watch,
+    /// Whether the beginning of the window is still to be reported.
+    pub(super) is_marked: bool,
+    pub(super) tiles: Tiles<T>,
+    pub(super) guard_events: u64,
+    pub(super) substeps_done: u64,
+    /// Points computed, summed over all substeps.
+    pub(super) points_done: u64,
+}
+
+impl<T: Real> Sheet<T> {
+    pub(super) fn new(model: &Arc<Model>) -> Self {
+        let layout = Layout::new::<T>(model.points);
+        let plan = model.plan.clone();
+        Sheet {
+            model: model.clone(),
+            halvings: 0,
+            bench: Bench::new(model.lanes, layout, springs_of(model, &plan), &model.fixed),
+            state: State::at_rest(&layout, plan.scheme.kept(model.precision == Precision::Compensated)),
+            steps: 0,
+            work: Work::default(),
+            checkpoint: None,
+            applied: Applied::new(),
+            prescribed: Prescribed::new(),
+            contacts: Contacts::default(),
+            inputs: Vec::new(),
+            watch: Watch::Off,
+            is_marked: false,
+            tiles: Tiles::new(layout, model.tile_tolerance(), if model.scene.springs.flexion { 2 } else { 1 }),
+            guard_events: 0,
+            substeps_done: 0,
+            points_done: 0,
+            plan,
+        }
+    }
+
+    pub(super) fn do_step(&mut self) {
+        if self.is_still() {
+            return self.skip_steps(1);
+        }
+        let substeps = self.plan.substeps;
+        self.substeps_done += u64::from(substeps);
+        self.wake_what_is_pushed();
+        let fraction = |substep: u32| f64::from(substep) / f64::from(substeps);
+        for substep in 0..substeps {
+            self.substep(Moment { step: self.steps, fraction: fraction(substep) }, fraction(substep + 1));
+        }
+        self.applied.finish(&self.model, self.steps);
+        self.prescribed.finish(&self.model, self.steps);
+        self.contacts.finish(self.model.scene.stepping.rate_hz);
+        self.steps += 1;
+        if self.steps.is_multiple_of(CHECK_STEPS) {
+            self.rest();
+        }
+    }
+
+    /// Advances from `moment` to the fraction `end` of the same step.
+    fn substep(&mut self, moment: Moment, end: f64) {
+        let far = self.tiles.farthest_unnoticed(&self.model.scene);
+        self.tiles.watch(&self.state.u, far);
+        self.points_done += self.tiles.awake_points as u64;
+        let Sheet { model, plan, bench, applied, .. } = self;
+        applied.prepare(model, plan, &bench.layout, moment, end - moment.fraction);
+        let released = self.prescribed.take_released();
+        let released: Vec<_> = released
+            .into_iter()
+            .filter_map(|(index, v)| Some((index, self.change_at_release(index, v, moment)?)))
+            .collect();
+        // A scheme that takes means adds the change to the substep's increment, another to its initial state.
+        let takes_means = self.plan.scheme.takes_means();
+        if !takes_means {
+            released.iter().for_each(|(index, change)| self.shift(*index, change));
+        }
+        for sweep in 0..self.plan.scheme.sweeps() {
+            self.sweep(sweep);
+            if let Some(far) = self.plan.scheme.fraction_after(sweep) {
+                self.hold(moment.step, moment.fraction + far * (end - moment.fraction), false);
+            }
+        }
+        let history = self.plan.scheme.history();
+        if history > 0 {
+            // The newest force takes the place of the oldest.
+            self.state.kept[..history].rotate_right(1);
+        }
+        if takes_means {
+            released.iter().for_each(|(index, change)| self.shift(*index, change));
+        }
+        let unit_j = self.unit_of_work_j();
+        self.work.add(self.bench.take_work() * unit_j);
+        self.hold(moment.step, end, true);
+        self.meet(end);
+    }
+
+    /// Sweep number `sweep` of a substep.
+    fn sweep(&mut self, sweep: usize) {
+        let Sheet { model, plan, bench, state, applied, tiles, .. } = self;
+        let (field, terms, region) = (plan.scheme.field(sweep), &applied.terms, &tiles.region);
+        if model.precision == Precision::Compensated {
+            each!(&plan.scheme, |family| bench.advance(&family.compensated::<T>(sweep), state, terms, field, region));
+        } else {
+            each!(&plan.scheme, |family| bench.advance(&family.plain::<T>(sweep), state, terms, field, region));
+        }
+    }
+
+    /// Puts the grasped points at their places at `fraction` of the step, and counts the work if `counted`.
+    fn hold(&mut self, step: u64, fraction: f64, counted: bool) {
+        let unit_j = self.unit_of_work_j();
+        let Sheet { model, plan, bench, state, prescribed, work, .. } = self;
+        let spacing_m = model.scene.sheet.spacing_m;
+        for (index, displacement_m, velocity_m_per_s) in prescribed.at(model, step, fraction) {
+            let mut product = 0.0;
+            for c in 0..3 {
+                let at = c * bench.layout.plane + bench.layout.place(index);
+                let (free_u, free_d) = (state.u[at], state.d[at]);
+                state.u[at] = T::of(displacement_m[c] / spacing_m);
+                state.d[at] = if plan.scheme.takes_means() {
+                    // Undo the scheme's own movement: the increment starts from where the point was before.
+                    state.u[at] - (free_u - free_d)
+                } else {
+                    T::of(velocity_m_per_s[c] * plan.substep_s / spacing_m)
+                };
+                product += (state.d[at].wide() - free_d.wide()) * state.d[at].wide();
+            }
+            if counted {
+                work.add(product * unit_j);
+            }
+        }
+    }
+
+    /// The change of u and d of a point that is released with `velocity_m_per_s`, if there must be one.
+    fn change_at_release(&self, index: usize, velocity_m_per_s: DVec3, moment: Moment) -> Option<[[f64; 2]; 3]> {
+        let Sheet { model, plan, bench, state, applied, .. } = self;
+        let (point, scene) = (model.point_of(index), &model.scene);
+        let springs = bench.springs.gather(&bench.layout, &state.u, point).map(Real::wide);
+        let scale = plan.force_scale(scene);
+        let applied_n = applied.from(model, index, moment);
+        let used = applied.force_at(&bench.layout, 0, point);
+        let mut changes = [[0.0; 2]; 3];
+        for (c, change) in changes.iter_mut().enumerate() {
+            let at = c * bench.layout.plane + bench.layout.place(index);
+            *change = plan.scheme.release(Release {
+                u: state.u[at].wide(),
+                springs: &state.history(springs[c], plan.scheme.history(), at),
+                used: used[c],
+                scale,
+                lost_n: scene.damping_n_s_per_m * velocity_m_per_s[c] + applied_n[c],
+            })?;
+        }
+        Some(changes)
+    }
+
+    /// Adds to u and d of a point.
+    fn shift(&mut self, index: usize, change: &[[f64; 2]; 3]) {
+        let Sheet { bench, state, .. } = self;
+        for (c, change) in change.iter().enumerate() {
+            let at = c * bench.layout.plane + bench.layout.place(index);
+            state.u[at] += T::of(change[0]);
+            state.d[at] += T::of(change[1]);
+        }
+    }
+
+    /// The work of a force of 1 in the fields of the tools along a displacement of 1, J.
+    pub(super) fn unit_of_work_j(&self) -> f64 {
+        let Sheet { model, plan, .. } = self;
+        model.scene.sheet.spacing_m / (plan.scheme.impulse() * plan.force_scale(&model.scene))
+    }
+
+    /// Displacement, velocity and springs' force of a free point, under the applied force `applied_n`.
+    pub(super) fn free_point(&self, index: usize, applied_n: DVec3) -> [DVec3; 3] {
+        let Sheet { model, plan, bench, state, .. } = self;
+        let (spacing_m, scale) = (model.scene.sheet.spacing_m, plan.force_scale(&model.scene));
+        let unit = plan.scheme.spring_scale() * scale;
+        let springs = bench.springs.gather(&bench.layout, &state.u, model.point_of(index));
+        let [i, j] = model.point_of(index);
+        let still = self.steps == 0 || !self.tiles.region.is_awake(i, j);
+        let mut found = [DVec3::ZERO; 3];
+        for (c, n) in springs.into_iter().enumerate() {
+            let at = c * bench.layout.plane + bench.layout.place(index);
+            let one = Plain::<f64, 1>::one;
+            let mut kept = [one(0.0); MAX_KEPT];
+            kept.iter_mut().zip(&state.kept).for_each(|(value, field)| *value = one(field[at].wide()));
+            let (u, d, n) = (one(state.u[at].wide()), one(state.d[at].wide()), one(n.wide()));
+            let force = one(unit * applied_n[c]);
+            let (u, w) = with_arithmetic!(&plan.scheme, f64, |scheme| scheme.observe(u, d, n, &kept, Some(force)));
+            found[0][c] = u.value() * spacing_m;
+            found[1][c] = if still { 0.0 } else { w.value() * spacing_m / plan.substep_s };
+            found[2][c] = n.value() / unit;
+        }
+        found
+    }
+
+    pub(super) fn tell(&mut self, tool: usize, input: Input) {
+        match input {
+            Input::Push(push) => {
+                self.prescribed.release(tool);
+                self.contacts.release(tool);
+                self.applied.set(tool, push);
+            }
+            Input::Lead(place_m, tip) => {
+                self.prescribed.release(tool);
+                self.applied.set(tool, None);
+                self.contacts.lead(&self.model, tool, place_m, tip);
+            }
+            Input::Grasp(index, grasp) => {
+                self.applied.set(tool, None);
+                self.contacts.release(tool);
+                self.tiles.wake_under([self.model.point_of(index)]);
+                let PointState { displacement_m, velocity_m_per_s, .. } = self.point(index);
+                let now = Motion { displacement_m, velocity_m_per_s, ..Motion::default() };
+                self.prescribed.grasp(tool, index, grasp, now);
+            }
+        }
+    }
+}
+
+pub(super) fn springs_of<T: Real>(model: &Model, plan: &Plan) -> Springs<T> {
+    let unit = plan.substep_s * plan.substep_s / model.scene.sheet.point_mass_kg;
+    Springs::new(&model.scene.springs, unit * plan.scheme.spring_scale())
+}
+
+impl<T: Real> Tissue for Sheet<T> {
+    fn model(&self) -> &Arc<Model> {
+        &self.model
+    }
+
+    fn plan(&self) -> &Plan {
+        &self.plan
+    }
+
+    fn step_count(&self) -> u64 {
+        self.steps
+    }
+
+    fn guard_events(&self) -> u64 {
+        self.guard_events
+    }
+
+    fn checkpoint_step(&self) -> u64 {
+        self.checkpoint.as_ref().map_or(self.steps, |checkpoint| checkpoint.steps)
+    }
+
+    fn substeps_done(&self) -> u64 {
+        self.substeps_done
+    }
+
+    fn push(&mut self, tool: usize, push: Option<Push>) {
+        self.input(tool, Input::Push(push));
+    }
+
+    fn grasp(&mut self, tool: usize, index: usize, grasp: Grasp) {
+        self.input(tool, Input::Grasp(index, grasp));
+    }
+
+    fn lead(&mut self, tool: usize, place_m: DVec3, tip: Tip) {
+        self.input(tool, Input::Lead(place_m, tip));
+    }
+
+    fn feel(&self, tool: usize) -> Option<Feel> {
+        Sheet::feel(self, tool)
+    }
+
+    fn surroundings(&self, tool: usize) -> Option<Surroundings> {
+        Sheet::surroundings(self, tool)
+    }
+
+    fn release(&mut self, tool: usize) {
+        self.push(tool, None);
+    }
+
+    fn change(&mut self, model: &Arc<Model>) {
+        Sheet::change(self, model);
+    }
+
+    fn watch(&mut self, inputs: Inputs) {
+        Sheet::watch(self, inputs);
+    }
+
+    fn take_mark(&mut self) -> Option<Mark> {
+        Sheet::take_mark(self)
+    }
+
+    fn changed(&self, model: &Arc<Model>) -> Option<Box<dyn Tissue>> {
+        Sheet::changed(self, model).map(|sheet| sheet as Box<dyn Tissue>)
+    }
+
+    fn is_still(&self) -> bool {
+        self.tiles.region.tiles().is_empty()
+            && self.applied.is_settled()
+            && self.prescribed.is_empty()
+            && self.contacts.is_empty()
+    }
+
+    fn skip_steps(&mut self, steps: u64) {
+        self.steps += steps;
+        self.substeps_done += steps * u64::from(self.plan.substeps);
+    }
+
+    fn step(&mut self) -> Result<(), BlowUp> {
+        self.do_step();
+        if self.checkpoint.is_some() || !self.is_still() {
+            self.check().or_else(|cause| self.mend(self.steps, cause))?;
+        }
+        if self.checkpoint.is_some() && self.is_still() {
+            self.forget_checkpoint();
+        }
+        Ok(())
+    }
+
+    fn recover(&mut self, step: u64, to_rest: bool) -> Released {
+        Sheet::recover(self, step, to_rest)
+    }
+
+    fn point(&self, index: usize) -> PointState {
+        let scene = &self.model.scene;
+        let applied_n = match self.steps {
+            0 => self.applied.from(&self.model, index, Moment::start_of(0)),
+            _ => self.applied.until(&self.model, index),
+        };
+        let [mut displacement_m, mut velocity_m_per_s, spring_n] = self.free_point(index, applied_n);
+        let motion = self.prescribed.motion(&self.model, index);
+        if let Some(motion) = motion {
+            (displacement_m, velocity_m_per_s) = (motion.displacement_m, motion.velocity_m_per_s);
+        }
+        let virtual_n = -scene.virtual_stiffness_n_per_m * displacement_m;
+        let damping_n = -scene.damping_n_s_per_m * velocity_m_per_s;
+        let constraint_n = motion.map(|motion| {
+            let inertia_n = scene.sheet.point_mass_kg * motion.acceleration_m_per_s2;
+            inertia_n - spring_n - virtual_n - damping_n - applied_n
+        });
+        PointState { displacement_m, velocity_m_per_s, spring_n, virtual_n, damping_n, applied_n, constraint_n }
+    }
+
+    fn awake_points(&self) -> usize {
+        self.tiles.awake_points
+    }
+
+    #[allow(clippy::cast_precision_loss)]
+    fn computed_fraction(&self) -> f64 {
+        match self.substeps_done {
+            0 => 1.0,
+            substeps => self.points_done as f64 / (substeps as f64 * self.model.len() as f64),
+        }
+    }
+
+    fn energy(&self) -> Energy {
+        self.energies()
+    }
+
+    fn largest_displacement_m(&self) -> f64 {
+        let squared = (0..self.model.len()).map(|index| {
+            let at = self.bench.layout.place(index);
+            (0..3).map(|c| self.state.u[c * self.bench.layout.plane + at].wide().powi(2)).sum()
+        });
+        squared.fold(0.0, f64::max).sqrt() * self.model.scene.sheet.spacing_m
+    }
+
+    fn displacements_m(&self, into: &mut [Vec<f32>; 3]) {
+        let Layout { rows, columns, stride, plane } = self.bench.layout;
+        let spacing = T::of(self.model.scene.sheet.spacing_m);
+        for (c, into) in into.iter_mut().enumerate() {
+            into.clear();
+            for i in 0..rows {
+                let from = c * plane + i * stride;
+                #[allow(clippy::cast_possible_truncation)]
+                into.extend(self.state.u[from..from + columns].iter().map(|u| (*u * spacing).wide() as f32));
+            }
+        }
+    }
+
+    fn hash_blocks(&self, blocks: Range<usize>, hasher: &mut Xxh3) {
+        Sheet::hash_blocks(self, blocks, hasher);
+    }
+
+    fn still(&self) -> Still {
+        Sheet::still(self)
+    }
+}

@@ -1,0 +1,194 @@
+//! The trait of a tissue in motion, and the types that it speaks in.
+
+use std::ops::Range;
+use std::sync::Arc;
+
+use glam::DVec3;
+use xxhash_rust::xxh3::Xxh3;
+
+use super::applied::Push;
+use super::checkpoint::Cause;
+use super::contact::{Feel, Surroundings};
+use super::field::BLOCK;
+use super::model::{Model, Plan};
+use super::prescribed::Grasp;
+use super::watch::{Inputs, Mark};
+use crate::scene::tip::Tip;
+
+/// One mass point at the end of a step: displacement, velocity, and the forces on it. Where the applied force jumps,
+/// the value just before the jump; at step 0, just after.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PointState {
+    /// Displacement from rest, m.
+    pub displacement_m: DVec3,
+    /// Velocity, m/s.
+    pub velocity_m_per_s: DVec3,
+    /// Force of all springs, N.
+    pub spring_n: DVec3,
+    /// −K″·u, N.
+    pub virtual_n: DVec3,
+    /// −C·v, N.
+    pub damping_n: DVec3,
+    /// Force of all pushing tools, N.
+    pub applied_n: DVec3,
+    /// For a prescribed point, the force that holds it: m·a − spring − virtual − damping − applied, N.
+    pub constraint_n: Option<DVec3>,
+}
+
+impl PointState {
+    /// The force of the tissue on a tool at the point: spring + virtual + damping, N.
+    pub fn reaction_n(&self) -> DVec3 {
+        self.spring_n + self.virtual_n + self.damping_n
+    }
+}
+
+/// Energies of the whole sheet, J.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Energy {
+    /// ½m·v².
+    pub kinetic_j: f64,
+    /// ½k(L − L0)² of all springs.
+    pub spring_j: f64,
+    /// ½K″·u².
+    pub virtual_j: f64,
+}
+
+/// A failure that the guard could not repair.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct BlowUp {
+    /// Steps done when the guard found it.
+    pub step: u64,
+    /// The cause.
+    pub cause: Cause,
+}
+
+/// How a sheet continues after a blow-up.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Released {
+    /// The tools that acted in the state that it went back to, ascending. They do no longer.
+    pub tools: Vec<usize>,
+    /// Whether it continues at rest.
+    pub at_rest: bool,
+}
+
+/// A sheet in motion, in any precision.
+pub trait Tissue: Send {
+    /// The model that it was made from.
+    fn model(&self) -> &Arc<Model>;
+    /// Steps done.
+    fn step_count(&self) -> u64;
+    /// From the coming step on `tool` exerts `push`, or no force.
+    fn push(&mut self, tool: usize, push: Option<Push>);
+    /// From the coming step on `tool` moves the point at `index`.
+    fn grasp(&mut self, tool: usize, index: usize, grasp: Grasp);
+    /// From the coming step on `tool` meets the sheet with `tip` and is at `place_m` at the step's end.
+    fn lead(&mut self, tool: usize, place_m: DVec3, tip: Tip);
+    /// The motion of a position-controlled tool and the force on it.
+    fn feel(&self, tool: usize) -> Option<Feel>;
+    /// A copy of the sheet around such a tool, if it touches or holds, to compute the stiffness there.
+    fn surroundings(&self, tool: usize) -> Option<Surroundings>;
+    /// From the coming step on `tool` no longer pushes, grasps or touches.
+    fn release(&mut self, tool: usize);
+    /// From the coming step on springs, virtual springs and damping are those of `model` (from [`Model::changed`] of
+    /// this sheet's model). Displacements and velocities stay; all tiles wake.
+    fn change(&mut self, model: &Arc<Model>);
+    /// Requests an audit of a window of steps, which begins at the next checkpoint.
+    fn watch(&mut self, inputs: Inputs);
+    /// Takes the report on that window after a step, once.
+    fn take_mark(&mut self) -> Option<Mark>;
+    /// The result of [`Tissue::change`] if `model` has another number format, as after a correction to f64.
+    fn changed(&self, model: &Arc<Model>) -> Option<Box<dyn Tissue>>;
+    /// The present scheme. The guard may have halved the model's substep.
+    fn plan(&self) -> &Plan;
+    /// How often the guard went back to a checkpoint and continued with half the substep.
+    fn guard_events(&self) -> u64;
+    /// The step whose state a blow-up would go back to.
+    fn checkpoint_step(&self) -> u64;
+    /// Substeps done, including those that the guard repeated.
+    fn substeps_done(&self) -> u64;
+    /// Points that a step computes now; the others are at rest.
+    fn awake_points(&self) -> usize;
+    /// Whether a step changes only the time, until a tool gets a command.
+    fn is_still(&self) -> bool;
+    /// Skips `steps` steps of a still sheet. The result is the same as that of single steps.
+    fn skip_steps(&mut self, steps: u64);
+    /// The fraction of all points in all substeps that was computed.
+    fn computed_fraction(&self) -> f64;
+    /// Advances one step.
+    ///
+    /// # Errors
+    /// Returns a blow-up that the guard could not repair. The state is then that of the last checkpoint, which is
+    /// finite.
+    fn step(&mut self) -> Result<(), BlowUp>;
+    /// After a blow-up: continues at step `step` (of the blow-up) from the state of the last checkpoint, or at rest if
+    /// `to_rest` or if that state has passed no check, with all tools released and the model's own substep.
+    fn recover(&mut self, step: u64, to_rest: bool) -> Released;
+    /// The point at `index`.
+    fn point(&self, index: usize) -> PointState;
+    /// The energies. A pass over what is awake; sleeping tiles use cached values. Earlier calls do not affect the
+    /// result.
+    fn energy(&self) -> Energy;
+    /// Length of the largest displacement, m.
+    fn largest_displacement_m(&self) -> f64;
+    /// Writes the displacements, m, with x, y and z in separate vectors, points by rows.
+    fn displacements_m(&self, into: &mut [Vec<f32>; 3]);
+    /// Adds some blocks of 16 points of a row, counted by rows, to a hash: displacement, increment, and the scheme's kept
+    /// values of each point.
+    fn hash_blocks(&self, blocks: Range<usize>, hasher: &mut Xxh3);
+    /// XXH3-128 of the state of every point.
+    fn state_hash(&self) -> u128 {
+        Hashing::default().add(self, usize::MAX).unwrap_or_default()
+    }
+    /// A copy of the sheet as it is now, to be read by another thread.
+    fn still(&self) -> Still;
+}
+
+/// A sheet that stays as it was.
+pub struct Still(Box<dyn Tissue>);
+
+impl Still {
+    /// `copy` is not stepped any more.
+    pub(super) fn of(copy: Box<dyn Tissue>) -> Self {
+        Still(copy)
+    }
+
+    /// What it was copied from.
+    pub fn model(&self) -> &Model {
+        self.0.model()
+    }
+
+    /// The point at `index`.
+    pub fn point(&self, index: usize) -> PointState {
+        self.0.point(index)
+    }
+
+    /// Adds so many points, or a few more, to the hash. Returns it when all are in.
+    pub fn hash(&self, hashing: &mut Hashing, points: usize) -> Option<u128> {
+        hashing.add(&*self.0, points)
+    }
+}
+
+/// A hash of a state that is not finished.
+pub struct Hashing {
+    hasher: Box<Xxh3>,
+    /// The next block of points, by rows.
+    next: usize,
+}
+
+impl Default for Hashing {
+    fn default() -> Self {
+        Hashing { hasher: Box::new(Xxh3::new()), next: 0 }
+    }
+}
+
+impl Hashing {
+    /// Adds at least one and at most so many points of a tissue, rounded up to a block. Returns the hash when all are in.
+    fn add(&mut self, tissue: &(impl Tissue + ?Sized), points: usize) -> Option<u128> {
+        let [rows, columns] = tissue.model().points;
+        let blocks = rows * columns.div_ceil(BLOCK);
+        let end = self.next.saturating_add(points.div_ceil(BLOCK).max(1)).min(blocks);
+        tissue.hash_blocks(self.next..end, &mut self.hasher);
+        self.next = end;
+        (end == blocks).then(|| self.hasher.digest128())
+    }
+}

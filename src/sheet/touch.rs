@@ -1,0 +1,151 @@
+//! Position-controlled tools on a sheet: how they act in a substep, and what they feel.
+
+use glam::DVec3;
+
+use super::contact::{Feel, Standing, Surroundings, Tool, displacement_m, movement_m, push, within_cone};
+use super::footprint::Reached;
+use super::motion::Sheet;
+use super::real::Real;
+use super::tangent::Window;
+use crate::memory;
+use crate::scene::tip::Coupling;
+
+impl<T: Real> Sheet<T> {
+    /// Makes position-controlled tools act at the end of a substep that ends at `fraction` of the step.
+    pub(super) fn meet(&mut self, fraction: f64) {
+        let Sheet { model, plan, bench, state, contacts, tiles, work, .. } = self;
+        let layout = &bench.layout;
+        for tool in &mut contacts.tools {
+            let (before_n, met) = (tool.steady_n, tool.standing != Standing::Free);
+            if before_n != DVec3::ZERO {
+                tiles.wake_under(tool.points());
+                push(model, plan, layout, state, &tool.footprint, before_n, plan.scheme.constant());
+            }
+            tool.force_n = tool.meet(model, plan, layout, state, fraction);
+            tool.steady_n = if met { tool.force_n } else { DVec3::ZERO };
+            if tool.force_n == DVec3::ZERO {
+                if before_n != DVec3::ZERO {
+                    // The tool has let go: undo the force of this substep.
+                    push(model, plan, layout, state, &tool.footprint, -before_n, plan.scheme.constant());
+                }
+                continue;
+            }
+            // Tiles that slept were at rest in this substep, as if they had been computed.
+            tiles.wake_under(tool.points());
+            push(model, plan, layout, state, &tool.footprint, tool.force_n - before_n, plan.scheme.kick());
+            work.add(tool.force_n.dot(movement_m(model, layout, state, &tool.footprint)));
+            tool.follow(model, layout, state, fraction);
+        }
+    }
+
+    /// The motion of a position-controlled tool and the force on it.
+    pub(super) fn feel(&self, number: usize) -> Option<Feel> {
+        let model = &self.model;
+        let tool = self.contacts.tools.iter().find(|tool| tool.number == number)?;
+        let (surface_m, _) =
+            tool.footprint.surface(|point| displacement_m(model, &self.bench.layout, &self.state, point));
+        let felt_n = match (tool.standing, tool.tip.coupling) {
+            (Standing::Free, _) => DVec3::ZERO,
+            (_, Coupling::Spring { .. }) => -tool.force_n,
+            (standing, Coupling::Constraint) => {
+                let felt_n = self.without_inertia(tool);
+                if standing == Standing::Holding {
+                    felt_n
+                } else if felt_n.dot(tool.normal) <= 0.0 {
+                    DVec3::ZERO
+                } else {
+                    within_cone(felt_n, tool.normal, tool.tip.friction).1
+                }
+            }
+        };
+        Some(Feel {
+            place_m: tool.from_m,
+            velocity_m_per_s: tool.velocity_m_per_s,
+            standing: tool.standing,
+            force_on_tool_n: felt_n,
+            surface_m,
+            anchor_m: tool.footprint.centre_m(),
+            normal: tool.normal,
+            friction: tool.tip.friction,
+        })
+    }
+
+    /// The disc of such a tool, if it touches or holds, and the displacements of the points around it.
+    pub(super) fn surroundings(&self, number: usize) -> Option<Surroundings> {
+        let tool = self.contacts.tools.iter().find(|tool| tool.number == number)?;
+        if tool.standing == Standing::Free {
+            return None;
+        }
+        let window = Window::around(&self.model, &tool.footprint);
+        // Without memory for it, the stiffness of the force law has to do.
+        memory::check(window.bytes(), "the stiffness under a tool").ok()?;
+        let displacement =
+            |index: usize| displacement_m(&self.model, &self.bench.layout, &self.state, self.model.point_of(index));
+        let displacement_m = window.points(&self.model).map(displacement).collect();
+        Some(Surroundings { model: self.model.clone(), footprint: tool.footprint.clone(), window, displacement_m })
+    }
+
+    /// Σ w·f/Σ w², where f is the force of springs, virtual springs, damping and force-controlled tools.
+    fn without_inertia(&self, tool: &Tool) -> DVec3 {
+        let (model, footprint) = (&self.model, &tool.footprint);
+        let scene = &model.scene;
+        let mut sum = DVec3::ZERO;
+        for Reached { point, weight, .. } in footprint.reached().iter().copied().filter(|point| point.free) {
+            let index = model.index_of(point);
+            let applied_n = if self.steps == 0 { DVec3::ZERO } else { self.applied.until(model, index) };
+            let [u, v, spring_n] = self.free_point(index, applied_n);
+            sum += weight * (spring_n - scene.virtual_stiffness_n_per_m * u - scene.damping_n_s_per_m * v + applied_n);
+        }
+        if footprint.mobility() > 0.0 { sum / footprint.mobility() } else { DVec3::ZERO }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::scene::tip::Tip;
+    use crate::sheet::{Model, Tissue};
+
+    fn sheet(sets: &[&str]) -> Sheet<f64> {
+        let always = ["stepping.precision=f64", "stepping.integrator=central", "stepping.substeps=1"];
+        Sheet::new(&Model::paper(&[&always[..], &["sheet.points=[9, 9]", "sleep.tolerance=0.0"], sets].concat()))
+    }
+
+    #[test]
+    fn a_coupling_pulls_with_its_spring_and_its_damper() {
+        // Points so heavy that they hardly move.
+        let mut sheet = sheet(&["sheet.point_mass_kg=1000"]);
+        let coupling = Coupling::Spring { stiffness_n_per_m: 100.0, damping_n_s_per_m: 3.0 };
+        let tip = Tip { radius_m: 0.03, grasps: true, coupling, ..Tip::default() };
+        let (held_m, step_m) = (DVec3::new(0.13, 0.12, 0.0), DVec3::new(2e-4, -1e-4, 5e-4));
+        sheet.lead(0, held_m, tip);
+        sheet.step().unwrap();
+        for step in 1..=10 {
+            sheet.lead(0, held_m + f64::from(step) * step_m, tip);
+            sheet.step().unwrap();
+            let expected_n = -(100.0 * f64::from(step) * step_m + 3.0 * step_m * 1000.0);
+            let felt_n = sheet.feel(0).unwrap().force_on_tool_n;
+            assert!(felt_n.distance(expected_n) < 1e-3 * expected_n.length(), "{step}: {felt_n} {expected_n}");
+        }
+    }
+
+    #[test]
+    fn a_disc_on_fixed_points_alone_exerts_no_force() {
+        for coupling in [Coupling::Constraint, Coupling::Spring { stiffness_n_per_m: 100.0, damping_n_s_per_m: 1.0 }] {
+            for grasps in [false, true] {
+                let mut sheet = sheet(&["sheet.fixed=[[3, 3], [3, 4], [4, 3], [4, 4]]"]);
+                let spacing_m = sheet.model.scene.sheet.spacing_m;
+                // In the middle of a cell, smaller than it: its four corners alone are under the disc.
+                let place_m = DVec3::new(3.5, 3.5, 0.0) * spacing_m;
+                let tip = Tip { radius_m: 0.1 * spacing_m, grasps, coupling, ..Tip::default() };
+                for step in 0..20 {
+                    sheet.lead(0, place_m - 1e-3 * f64::from(step) * DVec3::Z, tip);
+                    sheet.step().unwrap();
+                    assert_eq!(sheet.feel(0).unwrap().force_on_tool_n, DVec3::ZERO, "{tip:?}");
+                }
+                assert_eq!(sheet.largest_displacement_m(), 0.0);
+            }
+        }
+    }
+}

@@ -1,0 +1,102 @@
+//! The displacements of a sheet at one moment, from which frames are made.
+// The compiler does not always inline iterators over vectors. They then run without the caller's instructions.
+#![allow(clippy::needless_range_loop)]
+
+use std::sync::OnceLock;
+
+use super::refine::Points;
+use super::wide::{Available, LANES, Lanes, Width, Work};
+
+/// The displacements of a sheet at one moment, from which frames are made.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Snapshot {
+    /// Steps done.
+    pub step: u64,
+    /// Simulated time, s.
+    pub simulation_time_s: f64,
+    /// Displacements, m: x, y and z separate, point [i, j] at i·ny + j.
+    pub(super) displacement_m: [Vec<f32>; 3],
+    /// The least and the greatest of each component, m, once somebody wants to know.
+    box_m: OnceLock<[[f32; 2]; 3]>,
+    /// Points along x and y.
+    pub(super) points: [usize; 2],
+}
+
+impl Snapshot {
+    /// Creates a snapshot of `points` along x and y. `displacement_m` has nx·ny values for each component, point [i, j]
+    /// at i·ny + j.
+    pub fn new(step: u64, simulation_time_s: f64, points: [usize; 2], displacement_m: [Vec<f32>; 3]) -> Self {
+        Snapshot { step, simulation_time_s, displacement_m, box_m: OnceLock::new(), points }
+    }
+
+    /// The bounding box. Computed once for all encodings, by who encodes: a stepping thread makes the snapshot.
+    pub(super) fn box_m(&self) -> &[[f32; 2]; 3] {
+        self.box_m.get_or_init(|| self.displacement_m.each_ref().map(|values| range(values)))
+    }
+
+    /// All points.
+    pub(super) fn points(&self) -> Points<'_> {
+        let values = self.displacement_m.each_ref().map(Vec::as_slice);
+        Points { values, stride: self.points[1], count: self.points }
+    }
+}
+
+/// The least and the greatest of the values.
+fn range(values: &[f32]) -> [f32; 2] {
+    let mut range = [f32::INFINITY, f32::NEG_INFINITY];
+    Width::widest().run(Range { values, range: &mut range });
+    range
+}
+
+struct Range<'v> {
+    values: &'v [f32],
+    range: &'v mut [f32; 2],
+}
+
+impl Work for Range<'_> {
+    #[inline(always)]
+    fn work<L: Lanes>(self, with: Available<L>) {
+        // Enough parallel comparisons to hide their latency.
+        const AT_ONCE: usize = 4;
+        let mut low = [with.splat(f32::INFINITY); AT_ONCE];
+        let mut high = [with.splat(f32::NEG_INFINITY); AT_ONCE];
+        let (chunks, rest) = self.values.as_chunks::<{ AT_ONCE * LANES }>();
+        for chunk in chunks {
+            let (blocks, _) = chunk.as_chunks();
+            for k in 0..AT_ONCE {
+                let values = with.load(&blocks[k]);
+                low[k] = values.smaller(low[k]);
+                high[k] = values.larger(high[k]);
+            }
+        }
+        let mut lanes = [[0.0; LANES]; 2 * AT_ONCE];
+        for k in 0..AT_ONCE {
+            low[k].store(&mut lanes[k]);
+            high[k].store(&mut lanes[AT_ONCE + k]);
+        }
+        let (low, high) = lanes.as_flattened().split_at(AT_ONCE * LANES);
+        *self.range = [
+            low.iter().chain(rest).copied().fold(f32::INFINITY, f32::min),
+            high.iter().chain(rest).copied().fold(f32::NEG_INFINITY, f32::max),
+        ];
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_box_reaches_as_far_as_the_values() {
+        for count in [1, 15, 16, 63, 64, 65, 1000] {
+            let values: Vec<f32> = (0..count).map(|k| (k as f32 * 1.7).sin() + 0.1).collect();
+            let least = values.iter().copied().fold(f32::INFINITY, f32::min);
+            let greatest = values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+            for width in Width::ALL.into_iter().filter(|width| width.is_available()) {
+                let mut range = [f32::INFINITY, f32::NEG_INFINITY];
+                width.run(Range { values: &values, range: &mut range });
+                assert_eq!(range, [least, greatest], "{width:?}, {count}");
+            }
+        }
+    }
+}
