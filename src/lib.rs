@@ -6,12 +6,11 @@
 //! over displacements and increments of all points; `tests/determinism.rs` keeps golden values.
 
 pub mod budget;
-pub mod haptics;
+pub mod force_law;
 pub mod limits;
 mod lock;
 pub mod memory;
 pub mod pace;
-pub mod refusal;
 pub mod render;
 pub mod scene;
 pub mod server;
@@ -20,3 +19,6 @@ pub mod sheet;
 pub mod surface;
 pub mod texture;
 pub mod wire;
+
+// What is refused is told in the same words everywhere: here and in the protocol.
+pub use palpate_proto::refusal;

@@ -10,7 +10,7 @@ mod server;
 
 use std::time::Duration;
 
-use palpate::wire::pb;
+use palpate_proto::pb;
 use server::{PATIENCE, Server, sheet, told};
 use tonic::Code;
 

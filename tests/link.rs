@@ -12,7 +12,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::time::Duration;
 
 use course::Course;
-use palpate::haptics::envelope::PAUSE_S;
+use palpate_touch::envelope::PAUSE_S;
 use proxy::Proxy;
 use serde_json::Value;
 use server::{Server, client_program};

@@ -5,10 +5,10 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use glam::{DVec2, DVec3};
+use palpate_touch::Tip;
 
 use super::document::{self, Document, Fields, Item};
 use super::law::{CentreLaw, ForceLaw, Moment, Move, MoveLaw, Poke, Profile, StrengthLaw};
-use super::tip::Tip;
 use super::{Change, Scene, Sheet};
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, not_negative, number, positive};

@@ -2,6 +2,8 @@
 
 use std::sync::Arc;
 
+use palpate_proto::pb;
+use palpate_proto::pb::admin_service_server::AdminService;
 use tonic::{Request, Response, Status};
 use tracing::info;
 
@@ -11,8 +13,6 @@ use crate::budget::{Account, Purpose, Resource, Work};
 use crate::pace::clock::now_ns;
 use crate::pace::{Held, excerpt};
 use crate::refusal::{Reason, Refusal};
-use crate::wire::pb;
-use crate::wire::pb::admin_service_server::AdminService;
 
 pub(super) struct Admin {
     pub(super) house: House,

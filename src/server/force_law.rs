@@ -4,6 +4,8 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll, ready};
 
+use palpate_proto::{pb, touch};
+use palpate_touch::Law;
 use tokio::sync::oneshot;
 use tokio_util::task::AbortOnDropHandle;
 use tonic::Status;
@@ -12,10 +14,8 @@ use tracing::{Instrument, debug};
 
 use super::workshop::Workshop;
 use crate::budget::Account;
-use crate::haptics::Law;
 use crate::pace::laws::SoughtLaw;
 use crate::session::laws::{BETTER, FIRST, Laws};
-use crate::wire::{self, pb};
 
 /// The law that a stream begins with.
 pub(super) async fn first(workshop: &Workshop, account: &Account, sought: &Arc<SoughtLaw>) -> Result<Arc<Law>, Status> {
@@ -36,13 +36,13 @@ impl Update {
         let Ok(exact) = ready!(Pin::new(&mut self.exact).poll(context)) else { return Poll::Ready(None) };
         Poll::Ready(Some(match exact {
             Ok(law) => {
-                let update = wire::local::law_update(FIRST, Ok((BETTER, &law)));
+                let update = touch::law_update(FIRST, Ok((BETTER, &law)));
                 self.laws.improve(law);
                 update
             }
             Err(status) => {
                 let reason = status.get_details_error_info().map_or(String::new(), |info| info.reason);
-                wire::local::law_update(FIRST, Err((&reason, status.message())))
+                touch::law_update(FIRST, Err((&reason, status.message())))
             }
         }))
     }
@@ -121,7 +121,7 @@ mod tests {
         let law = update.law.unwrap();
         assert!(!law.coarse && law.number == BETTER);
         let exact = sought.exact().unwrap().unwrap();
-        assert_eq!(wire::local::from_law(&law).unwrap(), *exact);
+        assert_eq!(touch::from_law(&law).unwrap(), *exact);
         assert_eq!(laws.newest(), (BETTER, &exact));
         // Whoever comes later begins with it.
         assert_eq!(super::first(&workshop, &account, &sought).await.unwrap(), exact);

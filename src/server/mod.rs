@@ -35,6 +35,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use palpate_proto::pb;
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 use tonic::server::NamedService;
@@ -49,7 +50,6 @@ use tracing::{info, warn};
 use crate::budget::{Budget, give_back_to_the_system};
 use crate::pace::Pacer;
 use crate::refusal::{Reason, Refusal};
-use crate::wire::pb;
 use catalog::Catalog;
 use config::Config;
 use connections::Seats;

@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, OnceLock};
 
-use crate::haptics::Law;
+use palpate_touch::Law;
 
 /// The number of the law that a stream begins with, as its local models name it.
 pub const FIRST: u32 = 0;

@@ -24,14 +24,13 @@ pub mod schedule;
 use std::sync::Arc;
 
 use glam::DVec3;
+use palpate_touch::path::{Path, Play};
+use palpate_touch::{LocalModel, Tip};
 
-use crate::haptics::LocalModel;
-use crate::haptics::path::{Path, Play};
 use crate::memory;
 use crate::scene::law::{ForceLaw, MoveLaw};
 use crate::scene::record::{EnergyJ, Point, Record};
 use crate::scene::script::{Action, nearest_point};
-use crate::scene::tip::Tip;
 use crate::sheet::audit::{Inputs, Mark};
 use crate::sheet::{self, Energy, Feel, Grasp, Model, PointState, Push, Still, Tissue};
 use command::Due;

@@ -23,6 +23,7 @@
 use std::sync::Arc;
 
 use glam::{DVec2, DVec3};
+use palpate_touch::{Coupling, Standing, Tip};
 
 use super::Sheet;
 use super::field::{Layout, State};
@@ -31,20 +32,6 @@ use super::model::{Model, Plan};
 use super::real::Real;
 use super::tangent::{Patch, Tangent, Window};
 use crate::memory;
-use crate::scene::tip::{Coupling, Tip};
-
-/// The state of contact between a tool and the sheet.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Standing {
-    /// Not touching.
-    Free,
-    /// Touching, and not sliding.
-    Sticking,
-    /// Touching, at the edge of the friction cone.
-    Sliding,
-    /// Holding.
-    Holding,
-}
 
 /// The motion of a tool and the force on it at the end of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -14,6 +14,7 @@ use std::fmt;
 use std::sync::Arc;
 
 use glam::DVec3;
+use palpate_touch::Tip;
 
 use super::applied::{Applied, Push};
 use super::contact::Contacts;
@@ -26,7 +27,6 @@ use super::springs::Springs;
 use super::survey::Survey;
 use super::{BlowUp, Sheet, springs_of};
 use crate::memory;
-use crate::scene::tip::Tip;
 
 /// Substeps between two surveys.
 pub const INTERVAL_SUBSTEPS: u64 = 256;

@@ -67,16 +67,16 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use glam::DVec3;
+use palpate_touch::Tip;
 use xxhash_rust::xxh3::Xxh3;
 
 use crate::scene::Precision;
 use crate::scene::law::{Moment, Motion};
-use crate::scene::tip::Tip;
 use applied::Applied;
 pub use applied::Push;
 use audit::{Inputs, Mark, Watch};
 use contact::Contacts;
-pub use contact::{Feel, Standing, Surroundings};
+pub use contact::{Feel, Surroundings};
 use field::{Layout, State};
 pub use footprint::{Footprint, Reached};
 pub use guard::Cause;

@@ -2,7 +2,10 @@
 
 use std::sync::Arc;
 
-use super::{every, from_point, from_vector, pb, point, vector};
+use palpate_proto::geometry::{from_point, from_vector, point, vector};
+use palpate_proto::{pb, touch};
+
+use super::every;
 use crate::pace::frames::Delivery;
 use crate::pace::{Live, PacedRecord, PacedSample, State};
 use crate::refusal::{Reason, Refusal, Result};
@@ -84,7 +87,7 @@ fn tool_sample(tool: &ToolSample, due_ns: u64, now_ns: u64) -> pb::ToolSample {
         applied_force_n: contact.and_then(|contact| vector(contact.applied_force_n)),
         late: tool.late,
         expired: tool.expired,
-        local_model: tool.local.as_ref().map(super::local::local_model),
+        local_model: tool.local.as_ref().map(touch::local_model),
         stale: tool.stale,
     }
 }

@@ -1,9 +1,10 @@
 //! The desk in virtual time: rest, stamps, leases.
 #![allow(clippy::unwrap_used)]
 
+use palpate_touch::Tip;
+
 use super::*;
 use crate::scene::PAPER;
-use crate::scene::tip::Tip;
 
 const LEASE: LeaseId = 7;
 const MS: u64 = 1_000_000;
