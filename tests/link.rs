@@ -131,6 +131,15 @@ fn a_wrong_argument_is_refused_and_named() {
     }
 }
 
+#[tokio::test]
+async fn a_bridge_to_what_the_server_does_not_have_ends() {
+    let server = Server::start(&[]);
+    let output = client(&format!("bridge --server {} --scene nowhere", server.url));
+    let told = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(2), "{told}");
+    assert!(told.contains("UNKNOWN_SCENE"), "{told}");
+}
+
 /// Commands of a bridge, one a tick: within so many its owner has asked for forces three times, and pressed.
 const TOUCHES: u64 = 1000;
 

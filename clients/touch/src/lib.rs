@@ -14,7 +14,7 @@
 //!
 //! # Example
 //!
-//! A tool that is pressed 2 mm into a tissue of 400 N/m. The envelope lets the force in slowly.
+//! A tool is pressed 2 mm into a tissue of 400 N/m.
 //!
 //! ```
 //! use glam::{DMat3, DVec3};
@@ -23,33 +23,32 @@
 //! let device = Device::named("omega3").expect("a device of the table");
 //! let mut renderer = Renderer::new(Law::linear(400.0, 0.5), Envelope::new(device, DVec3::ZERO));
 //! renderer.envelope.enable();
-//! // What the server sent: the tool was above the surface, which is at z = 0.
-//! let place_m = DVec3::new(0.0, 0.0, 0.001);
-//! let model = LocalModel {
-//!     sequence: 1,
-//!     client_time_s: 0.0,
-//!     step: 1,
+//! // What the server sends of a tool at `place_m`. The surface is at z = 0.
+//! let model = |sequence: u64, client_time_s: f64, place_m: DVec3| LocalModel {
+//!     sequence,
+//!     client_time_s,
+//!     step: sequence,
 //!     place_m,
 //!     velocity_m_per_s: DVec3::ZERO,
-//!     force_n: DVec3::ZERO,
-//!     stiffness_n_per_m: DMat3::ZERO,
-//!     damping_n_s_per_m: DMat3::ZERO,
+//!     force_n: 400.0 * (-place_m.z).max(0.0) * DVec3::Z,
+//!     stiffness_n_per_m: 400.0 * DMat3::IDENTITY,
+//!     damping_n_s_per_m: 0.5 * DMat3::IDENTITY,
 //!     surface_m: DVec3::ZERO,
 //!     normal: DVec3::Z,
 //!     valid_m: 0.01,
 //!     friction: 0.2,
-//!     standing: Standing::Free,
+//!     standing: if place_m.z < 0.0 { Standing::Sticking } else { Standing::Free },
 //!     law: 0,
 //! };
 //! let mut force_n = DVec3::ZERO;
-//! for tick in 0..1000_u32 {
+//! for tick in 0..1500_u32 {
 //!     let now_s = f64::from(tick) * 1e-3;
-//!     renderer.receive(LocalModel { sequence: 1 + u64::from(tick), client_time_s: now_s, ..model }, now_s);
-//!     // The hand moves down by 3 mm in the last tenth of a second.
-//!     let down_m = 0.003 * (10.0 * now_s - 9.0).clamp(0.0, 1.0);
-//!     force_n = renderer.tick(now_s, place_m - down_m * DVec3::Z);
+//!     // Above the surface for a second; then the hand moves down by 3 mm.
+//!     let place_m = DVec3::new(0.0, 0.0, 0.001 - 0.003 * (5.0 * (now_s - 1.0)).clamp(0.0, 1.0));
+//!     renderer.receive(model(1 + u64::from(tick), now_s, place_m), now_s);
+//!     force_n = renderer.tick(now_s, place_m);
 //! }
-//! assert!(force_n.z > 0.5 && force_n.z < 1.0, "{force_n}");
+//! assert!((force_n - 0.8 * DVec3::Z).length() < 1e-3, "{force_n}");
 //! ```
 
 pub mod deadband;
