@@ -20,5 +20,5 @@ pub mod surface;
 pub mod texture;
 pub mod wire;
 
-// What is refused is told in the same words everywhere: here and in the protocol.
+// The error of refused inputs, which is also the protocol's.
 pub use palpate_proto::refusal;

@@ -1,8 +1,8 @@
 //! Palpate's protocol in Rust, for servers and clients.
 //!
 //! - [`pb`]: the messages, clients and servers that are generated from `palpate/v1/*.proto`, which document them. The
-//!   features `client` and `server` choose what is generated beside the messages. Neither connects: use `tonic::transport`
-//!   or, for clients, the crate `palpate-client`.
+//!   features `client` and `server` choose what is generated besides the messages. To connect, use `tonic::transport` or
+//!   the crate `palpate-client`.
 //! - [`refusal`]: the reasons for which inputs are refused, and [`error`]: refusals as gRPC statuses.
 //! - [`codec`]: decodes messages, requests within bounds.
 //! - [`geometry`] and [`touch`]: conversion of vectors, and of the types of the crate `palpate-touch`.

@@ -1,10 +1,10 @@
 //! Clients of a Palpate server.
 //!
 //! - [`connect`]: connections, plain or TLS, with the caller's credentials, deadlines, and errors in words.
-//! - [`touch`]: the haptic stream, for who sends commands and renders forces by themselves.
+//! - [`touch`]: the haptic stream, for programs that send commands and render forces themselves.
 //! - [`device`] and [`bridge`]: the trait of haptic devices, and the loop that connects one to a server at 1 kHz.
 //! - [`watch`]: the samples of a session, without a tool.
-//! - [`view`]: the frames of a session: how the surface moves.
+//! - [`view`]: the frames of a session: how its surface moves.
 //!
 //! The messages are those of the crate `palpate-proto`, which also has clients for the calls that need no help: they take a
 //! [`Channel`]. What is rendered, and its safety limits, is in the crate `palpate-touch`.
@@ -47,7 +47,7 @@ pub use connect::{Channel, Credentials, Server, Token, describe};
 pub use device::{HapticDevice, Reading};
 pub use touch::Touch;
 
-/// Why this library could not do what you asked for.
+/// An error of this library.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// An argument is not valid. Nothing was sent.
@@ -62,7 +62,7 @@ pub enum Error {
     /// The device can't be read or written.
     #[error("the device: {0}")]
     Device(#[from] std::io::Error),
-    /// A fault of this library, or of the device's code.
+    /// A panic in this library or in the device's code.
     #[error("internal error ({0})")]
     Internal(String),
 }

@@ -17,8 +17,8 @@ pub struct Touch {
 }
 
 impl Touch {
-    /// Opens a stream. `messages` are sent as they come, after `open`; their end is the end of what this side says. The
-    /// server may take as long as a force law does: set a time limit around this call.
+    /// Opens a stream. `messages` are sent as they come, after `open`; when they end, so does the stream. The server may
+    /// take some time to compute a force law: set a time limit around this call.
     ///
     /// ```no_run
     /// use palpate_client::{Channel, Touch};
@@ -54,7 +54,7 @@ impl Touch {
         }
     }
 
-    /// What the server told when it opened the stream: the force law, the next step, warnings.
+    /// The server's answer: the force law, the next step, warnings.
     pub fn opened(&self) -> &pb::TouchOpened {
         &self.opened
     }

@@ -36,7 +36,7 @@ impl Frames {
         Ok(Frames { parts, surface: Surface::default() })
     }
 
-    /// The next part of a frame, without reading its displacements; `None` after the last. For who counts frames.
+    /// The next part of a frame, without reading its displacements; `None` after the last. Use it to count frames.
     ///
     /// # Errors
     /// Returns why the server ended the stream, or how the connection broke.

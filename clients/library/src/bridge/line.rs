@@ -1,5 +1,5 @@
-//! The network side of a bridge: connects, opens a haptic stream, passes commands and models on, and when something
-//! breaks begins anew, for ever.
+//! The network side of a bridge: connects, opens a haptic stream, and passes commands and models on. When the connection
+//! breaks, it connects again.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -21,7 +21,7 @@ use crate::Error;
 use crate::connect::Channel;
 use crate::touch::Touch;
 
-/// What the device's loop and the network pass to each other. The newest counts: neither waits.
+/// The data that the network passes to the device's loop. Only the newest counts; neither waits for the other.
 #[derive(Default)]
 pub(super) struct Shared {
     inbound: Mutex<Inbound>,
@@ -68,10 +68,10 @@ pub(super) type Command = (u64, DVec3);
 /// First and longest pause before it connects again.
 const PAUSES: [Duration; 2] = [Duration::from_millis(100), Duration::from_secs(2)];
 
-/// Without a word from the server for so long the connection is given up.
+/// A connection on which the server is silent for longer than this is given up.
 const SILENCE: Duration = Duration::from_secs(2);
 
-/// Commands under way to the network at most: more would be a backlog.
+/// Largest number of commands on their way to the network: more would be a backlog.
 pub(super) const COMMANDS: usize = 64;
 
 /// Keeps a connection until `commands` ends.
@@ -88,7 +88,7 @@ pub(super) async fn keep(
         let before = shared.inbound().traffic.samples;
         match connect(&target, &mut made, &device, shared, &mut commands, warn).await {
             Ok(()) => return,
-            // What is refused at first is refused ever after.
+            // Another attempt would be refused too.
             Err(error) if error.is_refusal() && shared.inbound().traffic.connections == 0 => {
                 shared.inbound().failure = Some(error);
                 return;
@@ -101,7 +101,7 @@ pub(super) async fn keep(
         if shared.inbound().traffic.samples > before {
             pause = PAUSES[0];
         }
-        // What the device says meanwhile is of no use to anybody later.
+        // Commands of the meantime would be old later.
         let over = tokio::time::sleep(pause);
         tokio::pin!(over);
         loop {
@@ -126,7 +126,7 @@ async fn session(target: &Target, made: &mut Option<String>, channel: Channel) -
         let request = pb::GetSessionRequest { session_id: id.clone() };
         known = match sessions.get_session(request).await {
             Ok(answer) => answer.into_inner().session,
-            // A server that was started anew has forgotten what we made.
+            // The server was restarted and no longer has the session.
             Err(status) if status.code() == tonic::Code::NotFound && scene.is_some() => None,
             Err(status) => return Err(status.into()),
         };
@@ -136,7 +136,7 @@ async fn session(target: &Target, made: &mut Option<String>, channel: Channel) -
         let request = pb::CreateSessionRequest { source: Some(source), ..Default::default() };
         known = sessions.create_session(request).await?.into_inner().session;
     }
-    let session = known.ok_or_else(|| broken("the server tells nothing of the session"))?;
+    let session = known.ok_or_else(|| broken("the server sent no session"))?;
     *made = Some(session.session_id.clone());
     Ok(session)
 }
@@ -144,7 +144,7 @@ async fn session(target: &Target, made: &mut Option<String>, channel: Channel) -
 /// The middle of a session's sheet, m.
 fn middle_m(session: &pb::Session) -> Result<DVec3, Error> {
     let sheet = session.scene.as_ref().and_then(|scene| scene.sheet.as_ref());
-    let sheet = sheet.ok_or_else(|| broken("the server does not tell the session's scene"))?;
+    let sheet = sheet.ok_or_else(|| broken("the server sent no scene"))?;
     let spacing_m = sheet.spacing_m.unwrap_or(0.0);
     let middle = |points: Option<u32>| 0.5 * spacing_m * f64::from(points.unwrap_or(1).saturating_sub(1));
     Ok(DVec3::new(middle(sheet.points_x), middle(sheet.points_y), 0.0))
@@ -185,7 +185,7 @@ async fn connect(
         lease_s: Some(SILENCE.as_secs_f64()),
         ..Default::default()
     };
-    let silent = |_| broken("the server says nothing");
+    let silent = |_| broken("the server is silent");
     let opening = Touch::open(channel, open, ReceiverStream::new(messages));
     let mut stream = tokio::time::timeout(SILENCE, opening).await.map_err(silent)??;
     stream.opened().warnings.iter().for_each(|warning| warn(warning));
@@ -197,7 +197,7 @@ async fn connect(
         (inbound.law, inbound.further) = (Some(first), None);
         (inbound.newest, inbound.middle_m) = (None, middle_m);
     }
-    // What waited while the stream was opened is old.
+    // Commands that waited while the stream was opened are old.
     while commands.try_recv().is_ok() {}
     let mut sequence = 0;
     loop {
@@ -221,7 +221,7 @@ async fn connect(
                     }
                     Heard::Rejection(rejection) => {
                         shared.inbound().traffic.refused += 1;
-                        // We were silent for so long that the tool was let go.
+                        // This side was silent for so long that the server released the tool.
                         if rejection.reason == Reason::NotHolder.as_str() {
                             return Err(broken("the lease of the tool has lapsed"));
                         }
@@ -234,7 +234,7 @@ async fn connect(
                 sequence += 1;
                 let action = Some(Action::Pose(touch::pose(place_m, &target.tip)));
                 let command = pb::Command { tool: target.tool, sequence, client_time_ns, action, ..Default::default() };
-                // A network that does not keep up: this one is dropped, the next is newer.
+                // If the network does not keep up, this command is dropped; the next is newer.
                 if let Err(mpsc::error::TrySendError::Closed(_)) = outbound.try_send(Say::Command(command)) {
                     return Err(broken("the stream is closed"));
                 }

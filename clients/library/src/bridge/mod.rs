@@ -1,7 +1,7 @@
 //! Connects a haptic device to a server: a loop at 1 kHz on a thread of its own, and the network beside it.
 //!
-//! The network connects again whenever the connection breaks. Forces return when the operator asks for them. What was not
-//! sent by then is dropped: nothing old is ever replayed.
+//! When the connection breaks, the network side connects again. Forces return when the operator asks for them. Commands that
+//! were not sent by then are dropped: nothing old is replayed.
 
 mod line;
 mod tick;
@@ -35,7 +35,7 @@ pub struct Target {
     pub tip: Tip,
     /// A sample is sent only when the rendered force would be off by more than this fraction; 0: one per step.
     pub deadband: f64,
-    /// Who holds the tool, for other users of the server to see.
+    /// The holder's name, which other users of the server see.
     pub holder: String,
 }
 
@@ -51,17 +51,17 @@ pub enum Session {
     },
 }
 
-/// Is called with a text for people.
+/// A function that shows a text to people.
 pub type Warn = Box<dyn Fn(&str) + Send + Sync>;
 
-/// How a device is served.
+/// Options of [`run`].
 #[derive(Default)]
 pub struct Options {
-    /// Ends after this time.
+    /// Time after which it ends; `None`: no limit.
     pub lasts: Option<Duration>,
     /// Keeps the course and the ages of the models, of at most an hour.
     pub remembers: bool,
-    /// Is told why the connection broke and what the server warns of.
+    /// Called when the connection breaks, and with the server's warnings.
     pub warn: Option<Warn>,
 }
 
@@ -73,7 +73,7 @@ impl fmt::Debug for Options {
     }
 }
 
-/// What has become of a device that was served.
+/// The results of [`run`].
 #[derive(Debug)]
 pub struct Report {
     /// The ticks; empty unless they were to be remembered.
@@ -90,8 +90,8 @@ pub struct Report {
     pub traffic: Traffic,
 }
 
-/// Serves a device until its time is over or `stop` completes; returns it, and what has become of it. The device's force is
-/// zero then, also after an error, and also if the future is dropped.
+/// Connects a device until its time is over or `stop` completes. Returns the device and the results. The last force written
+/// to the device is zero, also after an error and if you drop the future.
 ///
 /// # Errors
 /// Returns an error if the device fails, if the server refuses the session or the tool at first, or if no connection
@@ -106,7 +106,7 @@ pub async fn run<D: HapticDevice + 'static>(
     let shared = Arc::new(Shared::default());
     let (commands, received) = mpsc::channel(line::COMMANDS);
     let descriptor = device.descriptor();
-    // Both end when this future is dropped: the task is aborted, and then the loop finds its channel closed.
+    // If this future is dropped, the task is aborted; the loop then finds its channel closed and ends.
     let mut network = JoinSet::new();
     network.spawn({
         let shared = shared.clone();
@@ -114,7 +114,7 @@ pub async fn run<D: HapticDevice + 'static>(
             let warn = |message: &str| warn.iter().for_each(|warn| warn(message));
             tokio::select! {
                 () = line::keep(target, descriptor, &shared, received, &warn) => {}
-                // The loop notices that its channel of commands is closed.
+                // The loop then finds its channel closed.
                 () = stop => {}
             }
         }
