@@ -10,7 +10,7 @@ mod server;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use palpate::wire::pb;
+use palpate_proto::pb;
 use pb::touch_response::Message as Heard;
 use server::{Server, Touch, force};
 

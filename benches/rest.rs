@@ -9,7 +9,7 @@ mod server;
 
 use std::time::{Duration, Instant};
 
-use palpate::wire::pb;
+use palpate_proto::pb;
 use pb::create_session_request::Source;
 use pb::haptic_service_client::HapticServiceClient;
 use pb::session_service_client::SessionServiceClient;

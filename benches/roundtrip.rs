@@ -17,7 +17,7 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use hdrhistogram::Histogram;
-use palpate::wire::pb;
+use palpate_proto::pb;
 use pb::haptic_service_server::{HapticService, HapticServiceServer};
 use pb::touch_request::Message as Say;
 use pb::touch_response::Message as Heard;

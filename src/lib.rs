@@ -6,14 +6,13 @@
 //! over displacements and increments of all points; `tests/determinism.rs` keeps golden values.
 
 pub mod budget;
-pub mod haptics;
+pub mod force_law;
 mod ids;
 pub mod limits;
 mod lock;
 pub mod memory;
 pub mod pace;
 mod priority;
-pub mod refusal;
 pub mod render;
 pub mod scene;
 pub mod server;
@@ -22,3 +21,6 @@ pub mod sheet;
 pub mod surface;
 pub mod texture;
 pub mod wire;
+
+// The error of refused inputs, which is also the protocol's.
+pub use palpate_proto::refusal;

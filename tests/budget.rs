@@ -10,7 +10,7 @@ mod server;
 
 use std::time::Duration;
 
-use palpate::wire::pb;
+use palpate_proto::pb;
 use server::{PATIENCE, Server, sheet, told};
 use tonic::Code;
 
@@ -134,8 +134,8 @@ async fn force_laws_above_the_budget_are_refused_and_go_with_their_session() {
         sessions.delete_session(pb::DeleteSessionRequest { session_id }).await.unwrap();
         until("a session keeps its memory", || metric(&metrics, TAKEN) < before).await;
     }
-    let device = palpate::haptics::Device::named("omega3").unwrap();
-    let device = Some(palpate::wire::local::device(&device));
+    let device = palpate_touch::Device::named("omega3").unwrap();
+    let device = Some(palpate_proto::touch::device(&device));
     let open = pb::TouchOpen { device, ..server::open(&session_id, &[0]) };
     let refused = server::Touch::open(&server, open.clone()).await.map(drop).unwrap_err();
     assert_eq!(told(&refused), (Code::ResourceExhausted, "OVERLOADED".into(), "device".into()));

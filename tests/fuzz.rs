@@ -12,7 +12,7 @@ use std::collections::BTreeSet;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use fastrand::Rng;
-use palpate::wire::pb;
+use palpate_proto::pb;
 use prost::Message;
 use targets::{REQUESTS, TARGETS, Target};
 

@@ -11,7 +11,7 @@ use std::process::{Command, Stdio};
 use std::sync::{Arc, mpsc};
 
 use palpate::server::identity::{self, Access, CALLS, Role, access};
-use palpate::wire::pb;
+use palpate_proto::pb;
 use prost::Message;
 use rcgen::{BasicConstraints, CertificateParams, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair, SanType};
 use server::{PATIENCE, Server, force, palpate, told};

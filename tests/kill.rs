@@ -20,7 +20,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use course::Course;
-use palpate::wire::pb;
+use palpate_proto::pb;
 use proxy::Proxy;
 use random::Random;
 use server::{PATIENCE, Server, client_program};

@@ -12,7 +12,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::time::Duration;
 
 use course::Course;
-use palpate::haptics::envelope::PAUSE_S;
+use palpate_touch::envelope::PAUSE_S;
 use proxy::Proxy;
 use serde_json::Value;
 use server::{Server, client_program};
@@ -143,6 +143,15 @@ fn a_wrong_argument_is_refused_and_named() {
         assert_eq!(output.status.code(), Some(2), "link {arguments}: {told}");
         assert!(told.contains(named), "link {arguments}: {told}");
     }
+}
+
+#[tokio::test]
+async fn a_bridge_to_what_the_server_does_not_have_ends() {
+    let server = Server::start(&[]);
+    let output = client(&format!("bridge --server {} --scene nowhere", server.url));
+    let told = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(2), "{told}");
+    assert!(told.contains("UNKNOWN_SCENE"), "{told}");
 }
 
 /// Commands of a bridge, one a tick: within so many its owner has asked for forces three times, and pressed.

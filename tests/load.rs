@@ -7,7 +7,7 @@ mod server;
 use std::process::{Command, Output, Stdio};
 use std::time::Duration;
 
-use palpate::wire::pb;
+use palpate_proto::pb;
 use serde_json::Value;
 use server::{PATIENCE, Server, client_program};
 

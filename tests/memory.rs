@@ -10,7 +10,7 @@ mod server;
 
 use std::time::Duration;
 
-use palpate::wire::pb;
+use palpate_proto::pb;
 use pb::session_service_client::SessionServiceClient;
 use rustix::process::{Pid, Resource, Rlimit, prlimit};
 use server::{PATIENCE, Server, Touch, force, sheet, told};

@@ -14,7 +14,8 @@ use palpate::limits::Limits;
 use palpate::scene::Scene;
 use palpate::scene::script::Script;
 use palpate::server::identity::{self, Role};
-use palpate::wire::{self, pb};
+use palpate::wire;
+use palpate_proto::pb;
 use prost::Message;
 use server::{PATIENCE, Server, told};
 

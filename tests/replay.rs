@@ -10,7 +10,7 @@ use std::process::{Command, Output, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
-use palpate::wire::pb;
+use palpate_proto::pb;
 use serde_json::Value;
 use server::{PATIENCE, Server, Touch, client_program, force, open};
 

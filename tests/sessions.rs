@@ -6,7 +6,7 @@ mod server;
 
 use std::process::Command;
 
-use palpate::wire::pb;
+use palpate_proto::pb;
 use pb::create_session_request::Source;
 use server::{PATIENCE, Server, Touch, force, open, palpate, told};
 use tonic::Code;

@@ -10,7 +10,7 @@ mod server;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use palpate::wire::pb;
+use palpate_proto::pb;
 use pb::touch_response::Message as Heard;
 use random::Random;
 use server::{PATIENCE, Server, Touch, force, position};

@@ -16,8 +16,9 @@ use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::scene::Scene;
 use palpate::scene::script::Action;
-use palpate::scene::tip::Tip;
-use palpate::wire::{self, pb};
+use palpate::wire;
+use palpate_proto::{pb, touch};
+use palpate_touch::{Device, Tip};
 use pb::create_session_request::Source;
 use pb::haptic_service_client::HapticServiceClient;
 use pb::touch_request::Message as Say;
@@ -225,8 +226,8 @@ async fn commands_before_a_stream_is_open_are_taken_in_or_refused() {
     let (outbound, messages) = mpsc::channel(1 << 20);
     let say = |message: Say| outbound.try_send(pb::TouchRequest { message: Some(message) }).unwrap();
     // With a device, so that a force law is computed first.
-    let device = palpate::haptics::Device::named("omega3").unwrap();
-    say(Say::Open(pb::TouchOpen { device: Some(wire::local::device(&device)), ..open(&session, &[0]) }));
+    let device = Device::named("omega3").unwrap();
+    say(Say::Open(pb::TouchOpen { device: Some(touch::device(&device)), ..open(&session, &[0]) }));
     const COMMANDS: u64 = 20_000;
     for sequence in 1..=COMMANDS {
         let action = Action::Lead { place_m: DVec3::new(0.04, 0.04, 0.02), tip: Tip::default() };

@@ -4,7 +4,7 @@
 #[path = "common/server.rs"]
 mod server;
 
-use palpate::wire::pb;
+use palpate_proto::pb;
 use server::{PATIENCE, Server, Touch, force, told};
 use tonic::{Code, Streaming};
 

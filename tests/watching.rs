@@ -11,7 +11,7 @@ use std::io::{BufRead, BufReader};
 use std::process::{Command, Output, Stdio};
 
 use metrics::scrape;
-use palpate::wire::pb;
+use palpate_proto::pb;
 use serde_json::Value;
 use server::{Server, Touch, client_program, force};
 

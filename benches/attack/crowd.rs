@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use futures_util::future::join_all;
 use palpate::server::identity::Role;
-use palpate::wire::pb;
+use palpate_proto::pb;
 use pb::touch_request::Message as Say;
 use tokio::io::AsyncWriteExt;
 use tokio::net::TcpStream;

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use futures_util::future::join_all;
-use palpate::wire::pb;
+use palpate_proto::pb;
 use tonic::{Status, Streaming};
 
 use super::Ground;

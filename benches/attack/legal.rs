@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use fastrand::Rng;
-use palpate::wire::pb;
+use palpate_proto::pb;
 use pb::touch_request::Message as Say;
 use tonic::{Status, Streaming};
 

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use bytes::{BufMut, Bytes};
 use futures_util::future::join_all;
-use palpate::wire::pb;
+use palpate_proto::pb;
 use pb::touch_request::Message as Say;
 use prost::Message;
 use tokio_stream::StreamExt;

@@ -13,9 +13,6 @@ use std::path::Path;
 use std::sync::{Arc, OnceLock};
 
 use glam::DVec3;
-use palpate::haptics::device::Device;
-use palpate::haptics::envelope::Envelope;
-use palpate::haptics::{Law, Renderer};
 use palpate::limits::Limits;
 use palpate::scene::record::{Record, write_line};
 use palpate::scene::script::Script;
@@ -27,7 +24,10 @@ use palpate::session::intake::Intake;
 use palpate::session::sampling::Sampler;
 use palpate::sheet::Model;
 use palpate::surface::Refinement;
-use palpate::wire::{self, pb};
+use palpate::wire;
+use palpate_proto::geometry::from_point;
+use palpate_proto::{pb, touch};
+use palpate_touch::{Device, Envelope, Law, Renderer};
 use prost::Message;
 
 /// Whether an input is taken.
@@ -141,11 +141,7 @@ pub const REQUESTS: [(&str, Taker); 28] = [
             let every = wire::every("every_steps", request.every_steps).is_ok();
             match &request.r#where {
                 Some(pb::probe_request::Where::Points(points)) => points.points.iter().all(|point| {
-                    model()
-                        .scene
-                        .sheet
-                        .index("points", wire::from_point(point))
-                        .is_ok_and(|index| index < model().len())
+                    model().scene.sheet.index("points", from_point(point)).is_ok_and(|index| index < model().len())
                 }),
                 _ => every,
             }
@@ -194,14 +190,14 @@ pub fn request(bytes: &[u8]) -> bool {
 
 fn open(open: &pb::TouchOpen) -> bool {
     let sheet = &model().scene.sheet;
-    let device = open.device.as_ref().map(wire::local::from_device);
-    let tip = wire::command::from_tip(open.tip.as_ref());
+    let device = open.device.as_ref().map(touch::from_device);
+    let tip = touch::from_tip(open.tip.as_ref());
     let only = (!open.tools.is_empty()).then(|| open.tools.clone());
     let (every, deadband) = (open.sample_every_steps, open.deadband.as_ref());
     let sampling = wire::sample::sampling(every, only, deadband, open.heartbeat_s, open.device.is_some());
     let mut intake = Intake::new(&model().scene, &limits());
     let held = intake.acquire(&open.tools, &open.holder, open.lease_s.unwrap_or(2.0), 1, 0).is_ok();
-    if tip.check("tip", sheet).is_ok() {
+    if sheet.check_tip("tip", &tip).is_ok() {
         assert!(tip.radius_m.is_finite() && tip.friction.is_finite());
     }
     let taken = sampling.map(|sampling| Sampler::new(sampling, 1000.0).next_due(7));
@@ -275,7 +271,7 @@ fn request_seeds() -> Vec<Vec<u8>> {
         holder: "somebody".into(),
         deadband: Some(deadband),
         heartbeat_s: Some(0.04),
-        device: Some(wire::local::device(&Device::named("omega3").expect("there is one"))),
+        device: Some(touch::device(&Device::named("omega3").expect("there is one"))),
         tip: Some(pb::Tip { radius_m: 0.02, friction: 0.2, ..Default::default() }),
         touch_stiffness: true,
     };
@@ -333,7 +329,7 @@ pub fn sample(bytes: &[u8]) -> bool {
         for tick in 0..4 {
             let now_s = 1e-3 * f64::from(tick);
             if let Some((model, step)) = models.next() {
-                renderer.receive(wire::local::from_local_model(model, step), now_s);
+                renderer.receive(touch::from_local_model(model, step), now_s);
             }
             let force_n = renderer.tick(now_s, DVec3::new(0.0, 0.0, -1e-3 * f64::from(tick)));
             assert!(force_n.is_finite() && force_n.length() <= MOST_N + 1e-9, "{force_n}");
@@ -341,13 +337,13 @@ pub fn sample(bytes: &[u8]) -> bool {
     };
     match response.message {
         Some(pb::touch_response::Message::Opened(pb::TouchOpened { law: Some(law), .. })) => {
-            wire::local::from_law(&law).map(|law| render(law, &mut std::iter::empty())).is_ok()
+            touch::from_law(&law).map(|law| render(law, &mut std::iter::empty())).is_ok()
         }
         Some(pb::touch_response::Message::ForceLaw(pb::ForceLawUpdate { law: Some(law), .. })) => {
-            wire::local::from_law(&law).map(|law| render(law, &mut std::iter::empty())).is_ok()
+            touch::from_law(&law).map(|law| render(law, &mut std::iter::empty())).is_ok()
         }
         Some(pb::touch_response::Message::Sample(sample)) => {
-            let _ = wire::local::wire_bytes(&sample);
+            let _ = touch::wire_bytes(&sample);
             let models = sample.tools.iter().filter_map(|tool| tool.local_model.as_ref());
             render(Law::linear(500.0, 1.0), &mut models.map(|model| (model, sample.step)));
             true
@@ -382,7 +378,7 @@ fn sample_seeds() -> Vec<Vec<u8>> {
         .map(|tool| Heard::Sample(pb::Sample { step: 5, tools: vec![*tool], ..Default::default() }))
         .collect();
     messages.push(Heard::Sample(pb::Sample { step: 7, tools: tools.to_vec(), ..Default::default() }));
-    let law = wire::local::law(&Law::linear(300.0, 1.0), 1);
+    let law = touch::law(&Law::linear(300.0, 1.0), 1);
     let update = pb::ForceLawUpdate { coarse_number: 0, law: Some(law.clone()), ..Default::default() };
     messages.push(Heard::ForceLaw(update));
     messages.push(Heard::Opened(pb::TouchOpened { step: 3, law: Some(law), ..Default::default() }));

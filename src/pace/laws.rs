@@ -7,12 +7,12 @@ use std::sync::{Arc, Mutex, OnceLock};
 use tokio::sync::MutexGuard;
 
 use crate::budget::{Account, Purpose, Resource, Taken};
-use crate::haptics::Law;
-use crate::haptics::law::{Computation, Progress};
+use crate::force_law::{self, Computation, Progress};
 use crate::lock::lock;
 use crate::memory;
 use crate::refusal::{Reason, Refusal, Result};
 use crate::sheet::Model;
+use palpate_touch::Law;
 
 /// Laws that a session keeps.
 const MOST_LAWS: usize = 16;
@@ -107,9 +107,9 @@ impl SoughtLaw {
             return Ok(law.clone());
         }
         let law = memory::attempt("device", || {
-            let law = Law::first(&self.model, self.radius_m, stop);
+            let law = force_law::first(&self.model, self.radius_m, stop);
             // Hardly any tissue has no coarse law; then the exact one is worth its time.
-            Ok(law.or_else(|| Law::within(&self.model, self.radius_m, self.most_work, stop)))
+            Ok(law.or_else(|| force_law::exact_within(&self.model, self.radius_m, self.most_work, stop)))
         });
         match law?.map(Arc::new) {
             Some(law) if law.is_coarse => Ok(self.coarse.get_or_init(|| law).clone()),

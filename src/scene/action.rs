@@ -3,7 +3,7 @@
 use glam::DVec3;
 
 use super::law::Poke;
-use super::tip::Tip;
+use palpate_touch::Tip;
 
 /// The action of a tool, which lasts until the next one.
 #[derive(Debug, Clone, PartialEq)]

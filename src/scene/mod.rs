@@ -8,10 +8,11 @@ pub mod law;
 mod reader;
 pub mod record;
 pub mod script;
-pub mod tip;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+
+use palpate_touch::{Coupling, Tip};
 
 use crate::limits::Limits;
 use crate::memory;
@@ -494,6 +495,22 @@ impl Sheet {
         indices.sort_unstable();
         indices.dedup();
         indices
+    }
+
+    /// Checks whether a tool with this tip fits the sheet.
+    ///
+    /// # Errors
+    /// Refuses a value that is not finite or out of range; `field` is the name that the refusal gives.
+    pub fn check_tip(&self, field: &str, tip: &Tip) -> Result<()> {
+        let longest_m = self.longer_side_m();
+        let range = format!("above 0 and at most {longest_m}, the sheet's longer side");
+        number(&format!("{field}.radius_m"), tip.radius_m, &range, |v| v > 0.0 && v <= longest_m)?;
+        number(&format!("{field}.friction"), tip.friction, "from 0 to 10", |v| (0.0..=10.0).contains(&v))?;
+        if let Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } = tip.coupling {
+            positive(&format!("{field}.spring.stiffness_n_per_m"), stiffness_n_per_m)?;
+            not_negative(&format!("{field}.spring.damping_n_s_per_m"), damping_n_s_per_m)?;
+        }
+        Ok(())
     }
 }
 

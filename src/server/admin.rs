@@ -11,8 +11,8 @@ use crate::budget::{Account, Purpose, Resource, Work};
 use crate::pace::Held;
 use crate::pace::clock::now_ns;
 use crate::refusal::{Reason, Refusal, excerpt};
-use crate::wire::pb;
-use crate::wire::pb::admin_service_server::AdminService;
+use palpate_proto::pb;
+use palpate_proto::pb::admin_service_server::AdminService;
 
 pub(super) struct Admin {
     pub(super) house: House,

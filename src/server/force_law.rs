@@ -12,12 +12,12 @@ use tracing::{Instrument, debug};
 
 use super::workshop::Workshop;
 use crate::budget::Account;
-use crate::haptics::Law;
 use crate::pace::Live;
 use crate::pace::laws::{SoughtLaw, have_same_laws};
 use crate::session::laws::{FIRST, Laws};
 use crate::sheet::Model;
-use crate::wire::{self, pb};
+use palpate_proto::{pb, touch};
+use palpate_touch::Law;
 
 /// A law for a stream, or why there is none.
 struct Told {
@@ -43,13 +43,13 @@ impl Updates {
         };
         Poll::Ready(Some(match law {
             Ok((number, law)) => {
-                let update = wire::local::law_update(before, tissue_step, Ok((number, &law)));
+                let update = touch::law_update(before, tissue_step, Ok((number, &law)));
                 self.laws.change(number, law);
                 update
             }
             Err(status) => {
                 let reason = status.get_details_error_info().map_or(String::new(), |info| info.reason);
-                wire::local::law_update(before, tissue_step, Err((&reason, status.message())))
+                touch::law_update(before, tissue_step, Err((&reason, status.message())))
             }
         }))
     }
@@ -251,7 +251,7 @@ mod tests {
         let law = update.law.unwrap();
         assert!(!law.coarse && law.number == 1);
         let exact = sought.exact().unwrap().unwrap();
-        assert_eq!(wire::local::from_law(&law).unwrap(), *exact);
+        assert_eq!(touch::from_law(&law).unwrap(), *exact);
         assert_eq!(laws.newest(), (1, exact.clone()));
         // Whoever comes later begins with it.
         assert_eq!(course.begin().await.0, exact);
@@ -304,7 +304,7 @@ mod tests {
         assert_eq!((exact.coarse_number, exact.tissue_step), (2, None));
         let exact = exact.law.unwrap();
         assert_eq!((exact.number, exact.coarse), (3, false));
-        assert_eq!(wire::local::from_law(&exact).unwrap(), Law::of(&model, course.radius_m()));
+        assert_eq!(touch::from_law(&exact).unwrap(), crate::force_law::exact(&model, course.radius_m()));
         assert_eq!(laws.newest().0, 3);
         // A stream that opens now begins with it.
         let law = course.begin().await.0;

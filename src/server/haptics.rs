@@ -21,7 +21,6 @@ use super::recovered::Notices;
 use super::revocation::Tenure;
 use super::visitor::Visitor;
 use crate::budget::{Account, Resource, Taken};
-use crate::haptics::device::{Device, UNDECLARED_FORCE_N};
 use crate::ids::random_bits;
 use crate::limits::Limits;
 use crate::pace::clock::now_ns;
@@ -32,8 +31,11 @@ use crate::scene::script::Action;
 use crate::session::command::Command;
 use crate::session::laws::{FIRST, Laws};
 use crate::session::lease::LeaseId;
-use crate::wire::pb::haptic_service_server::HapticService;
-use crate::wire::{self, pb};
+use crate::wire;
+use palpate_proto::geometry::from_point;
+use palpate_proto::pb::haptic_service_server::HapticService;
+use palpate_proto::{pb, touch};
+use palpate_touch::device::{Device, UNDECLARED_FORCE_N};
 
 #[derive(Clone)]
 pub(super) struct Haptics(pub(super) House);
@@ -115,9 +117,9 @@ impl Haptics {
     /// Answers the first message of a haptic stream.
     async fn open(&self, open: &pb::TouchOpen, account: &Account) -> Result<(Opened, Hold), Status> {
         let live = self.0.pacer.get(&open.session_id)?;
-        let device = open.device.as_ref().map(wire::local::from_device).transpose()?;
-        let tip = wire::command::from_tip(open.tip.as_ref());
-        tip.check("tip", &live.model.scene.sheet)?;
+        let device = open.device.as_ref().map(touch::from_device).transpose()?;
+        let tip = touch::from_tip(open.tip.as_ref());
+        live.model.scene.sheet.check_tip("tip", &tip)?;
         let only = (!open.tools.is_empty()).then(|| open.tools.clone());
         let (every, deadband) = (open.sample_every_steps, open.deadband.as_ref());
         let mut sampling = wire::sample::sampling(every, only, deadband, open.heartbeat_s, device.is_some())?;
@@ -151,7 +153,7 @@ impl Haptics {
             rate_hz: live.model.scene.stepping.rate_hz,
             lease_s,
             heartbeat_s: sampling.heartbeat_s,
-            law: law.map(|law| wire::local::law(law, FIRST)),
+            law: law.map(|law| touch::law(law, FIRST)),
             warnings: device.zip(law).map_or(Vec::new(), |(device, law)| device.misgivings(law)),
             max_force_n: device.map_or(UNDECLARED_FORCE_N, |device| device.most_n()),
         };
@@ -534,7 +536,7 @@ impl HapticService for Haptics {
                 }
                 let mut points = Vec::with_capacity(named.points.len());
                 for (index, point) in named.points.iter().enumerate() {
-                    let point = wire::from_point(point);
+                    let point = from_point(point);
                     live.model.scene.sheet.index(&format!("points[{index}]"), point)?;
                     points.push(point);
                 }

@@ -14,9 +14,9 @@ use super::sessions::Sessions;
 use super::traffic::Traffic;
 use super::views::Views;
 use super::workshop::Workshop;
-use crate::wire::pb::haptic_service_server::HapticServiceServer;
-use crate::wire::pb::session_service_server::SessionServiceServer;
-use crate::wire::pb::view_service_server::ViewServiceServer;
+use palpate_proto::pb::haptic_service_server::HapticServiceServer;
+use palpate_proto::pb::session_service_server::SessionServiceServer;
+use palpate_proto::pb::view_service_server::ViewServiceServer;
 
 /// The services that the health service reports. The server itself, "", is serving even while one of the others is not.
 pub(super) const SERVICES: [&str; 6] = [

@@ -1,9 +1,11 @@
 //! What a haptic stream is told of recoveries: a rejection for each of its tools that was released.
 
+use palpate_proto::pb;
+
 use crate::refusal::{Reason, Refusal};
 use crate::session::Sample;
 use crate::session::recovery::describe;
-use crate::wire::{self, pb};
+use crate::wire;
 
 /// What one stream has been told so far.
 #[derive(Debug)]

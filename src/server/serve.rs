@@ -26,11 +26,11 @@ use super::workshop::Workshop;
 use super::{admin, connections, descriptors, haptics, metrics, page, sessions, textures, views};
 use crate::budget::{Budget, give_back_to_the_system};
 use crate::pace::Pacer;
-use crate::wire::pb;
-use crate::wire::pb::admin_service_server::AdminServiceServer;
-use crate::wire::pb::haptic_service_server::HapticServiceServer;
-use crate::wire::pb::session_service_server::SessionServiceServer;
-use crate::wire::pb::view_service_server::ViewServiceServer;
+use palpate_proto::pb;
+use palpate_proto::pb::admin_service_server::AdminServiceServer;
+use palpate_proto::pb::haptic_service_server::HapticServiceServer;
+use palpate_proto::pb::session_service_server::SessionServiceServer;
+use palpate_proto::pb::view_service_server::ViewServiceServer;
 
 /// The headers that pages of these origins may send and read in gRPC-web calls.
 fn cors(origins: &[HeaderValue]) -> CorsLayer {

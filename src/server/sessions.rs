@@ -5,6 +5,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use futures_util::stream::{self, Stream};
+use palpate_proto::pb;
+use palpate_proto::pb::session_service_server::SessionService;
 use tonic::{Request, Response, Status};
 use tracing::{info, warn};
 
@@ -19,8 +21,7 @@ use crate::pace::Held;
 use crate::pace::clock::now_ns;
 use crate::refusal::{Reason, Refusal, number};
 use crate::scene::script::Script;
-use crate::wire::pb::session_service_server::SessionService;
-use crate::wire::{self, pb};
+use crate::wire;
 
 pub(super) struct Sessions(pub(super) House);
 

@@ -5,7 +5,8 @@ use crate::scene::Named;
 use crate::scene::record::AuditedError;
 use crate::sheet::Model;
 use crate::sheet::audit::Origin;
-use crate::wire::{self, pb};
+use crate::wire;
+use palpate_proto::pb;
 
 /// The current state of a session as a message.
 pub(super) fn session(live: &Live) -> pb::Session {

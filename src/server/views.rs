@@ -5,6 +5,8 @@ use std::pin::Pin;
 
 use bytes::Bytes;
 use futures_util::stream::{self, Stream};
+use palpate_proto::pb;
+use palpate_proto::pb::view_service_server::ViewService;
 use tonic::{Request, Response, Status};
 use tracing::info;
 
@@ -17,8 +19,6 @@ use crate::pace::{FrameReader, Held, StreamGuard};
 use crate::refusal::{Reason, Refusal, number};
 use crate::surface::{Encoding, Refinement};
 use crate::texture::Texture;
-use crate::wire::pb;
-use crate::wire::pb::view_service_server::ViewService;
 
 pub(super) struct Views(pub(super) House);
 

@@ -2,8 +2,8 @@
 
 use std::sync::{Arc, Mutex};
 
-use crate::haptics::Law;
 use crate::lock::lock;
+use palpate_touch::Law;
 
 /// The number of the law that a stream begins with, as its local models name it.
 pub const FIRST: u32 = 0;

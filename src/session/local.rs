@@ -1,13 +1,13 @@
-//! Local models of one tool: the content of a sample about the tissue around it (`haptics::local`).
+//! Local models of one tool: the content of a sample about the tissue around it (`palpate_touch::local`).
 
 use std::sync::{Arc, Mutex, PoisonError};
 
 use glam::{DMat3, DVec3};
+use palpate_touch::law::{Law, Row};
+use palpate_touch::local::{self, LocalModel, Standing};
 
-use crate::haptics::local::{self, LocalModel};
-use crate::haptics::{Law, law::Row};
 use crate::sheet::tangent::Tangent;
-use crate::sheet::{Feel, Standing, Surroundings};
+use crate::sheet::{Feel, Surroundings};
 
 /// Smaller forces do not limit the valid distance, N.
 const LEAST_N: f64 = 0.05;

@@ -30,17 +30,17 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
-use crate::haptics::LocalModel;
-use crate::haptics::path::{Path, Play};
 use crate::memory;
 use crate::scene::check::nearest_point;
 use crate::scene::law::{ForceLaw, MoveLaw};
 use crate::scene::record::{EnergyJ, Point, Record, Recovery};
 use crate::scene::script::Action;
-use crate::scene::tip::Tip;
 use crate::sheet::audit::{Inputs, Mark};
 use crate::sheet::{self, BlowUp, Energy, Feel, Grasp, Model, PointState, Push, Still, Tissue};
 use command::Due;
+use palpate_touch::LocalModel;
+use palpate_touch::Tip;
+use palpate_touch::path::{Path, Play};
 use recovery::{Ended, Recovered, Recoveries, describe};
 
 /// The name of a record in messages.

@@ -48,7 +48,7 @@ impl Rules {
                 crate::refusal::finite_vector("place_m", *place_m)?;
                 let centre_m = (self.scene.sheet.extent_m() / 2.0).extend(0.0);
                 check_reach("place_m", &self.scene.sheet, (*place_m - centre_m).length(), &self.limits)?;
-                tip.check("tip", &self.scene.sheet)
+                self.scene.sheet.check_tip("tip", tip)
             }
             Action::Release => Ok(()),
         }

@@ -7,10 +7,11 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use palpate_touch::{Law, LocalModel};
+
 use super::laws::{FIRST, Laws};
 use super::local::{Modeller, Refinement};
 use super::{Sample, Session, ToolSample};
-use crate::haptics::{self, Law, LocalModel};
 use crate::refusal::{Reason, Refusal, Result, number};
 
 /// Default interval between samples while nothing changes, s: 20 a second, so that a client can tell stillness from
@@ -130,7 +131,7 @@ pub struct Sampler {
 #[derive(Debug)]
 struct Foresight {
     modeller: Modeller,
-    deadband: haptics::Deadband,
+    deadband: palpate_touch::Deadband,
 }
 
 impl Sampler {
@@ -200,7 +201,7 @@ impl Sampler {
             };
             let foresight = self.foresight.entry(tool.tool).or_insert_with(|| Foresight {
                 modeller: Modeller::new(self.law, law.clone(), self.sampling.touch_stiffness),
-                deadband: haptics::Deadband::new(fraction.unwrap_or(0.0)),
+                deadband: palpate_touch::Deadband::new(fraction.unwrap_or(0.0)),
             });
             let model = foresight.modeller.model(feel, sample.step, tool.place_time_s);
             is_left |= fraction.is_some() && foresight.deadband.is_left(&model, law);
@@ -243,11 +244,12 @@ impl Sampler {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::force_law;
     use crate::scene::script::Action;
-    use crate::scene::tip::Tip;
     use crate::session::command::{Command, Due};
     use crate::sheet::Model;
     use glam::DVec3;
+    use palpate_touch::Tip;
 
     fn session(assignments: &[&str]) -> Session {
         Session::new(&Model::paper(assignments))
@@ -279,7 +281,7 @@ mod tests {
             // In f32 the last digits tilt the surface's normal.
             let mut session = session(&["stepping.precision=f64"]);
             let tip = Tip { grasps, radius_m: 0.05, ..Tip::default() };
-            let law = Arc::new(Law::of(session.model(), tip.radius_m));
+            let law = Arc::new(force_law::exact(session.model(), tip.radius_m));
             let laws = Some(Arc::new(Laws::new(law.clone())));
             let mut sampler = Sampler::new(Sampling { laws, touch_stiffness, ..sampling() }, 1000.0);
             let middle_m = (session.model().scene.sheet.extent_m() / 2.0).extend(0.0);

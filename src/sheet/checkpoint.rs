@@ -9,7 +9,7 @@ use super::contact::Contacts;
 use super::field::State;
 use super::prescribed::{Grasp, Prescribed};
 use super::real::Real;
-use crate::scene::tip::Tip;
+use palpate_touch::Tip;
 
 /// Tolerance of the energy balance, as a fraction of energy and of work: errors of the schemes at the stability bound.
 pub const MARGIN: f64 = 0.05;

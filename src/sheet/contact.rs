@@ -29,20 +29,7 @@ use super::footprint::{Footprint, Reached};
 use super::model::{Model, Plan};
 use super::real::Real;
 use super::tangent::{Patch, Tangent, Window};
-use crate::scene::tip::{Coupling, Tip};
-
-/// The state of contact between a tool and the sheet.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Standing {
-    /// Not touching.
-    Free,
-    /// Touching, and not sliding.
-    Sticking,
-    /// Touching, at the edge of the friction cone.
-    Sliding,
-    /// Holding.
-    Holding,
-}
+use palpate_touch::{Coupling, Standing, Tip};
 
 /// The motion of a tool and the force on it at the end of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -45,7 +45,7 @@ mod watch;
 
 pub use applied::Push;
 pub use checkpoint::Cause;
-pub use contact::{Feel, Standing, Surroundings};
+pub use contact::{Feel, Surroundings};
 pub use footprint::{Footprint, Reached};
 pub use model::{Model, Plan};
 pub use motion::at_rest;

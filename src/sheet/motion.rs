@@ -24,7 +24,7 @@ use super::tissue::{BlowUp, Energy, PointState, Released, Still, Tissue};
 use super::watch::{Inputs, Mark, Watch};
 use crate::scene::Precision;
 use crate::scene::law::{Moment, Motion};
-use crate::scene::tip::Tip;
+use palpate_touch::Tip;
 
 /// Creates a sheet at rest.
 pub fn at_rest(model: &Arc<Model>) -> Box<dyn Tissue> {

@@ -13,7 +13,7 @@ use super::field::BLOCK;
 use super::model::{Model, Plan};
 use super::prescribed::Grasp;
 use super::watch::{Inputs, Mark};
-use crate::scene::tip::Tip;
+use palpate_touch::Tip;
 
 /// One mass point at the end of a step: displacement, velocity, and the forces on it. Where the applied force jumps,
 /// the value just before the jump; at step 0, just after.

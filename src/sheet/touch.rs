@@ -2,13 +2,15 @@
 
 use glam::DVec3;
 
-use super::contact::{Feel, Standing, Surroundings, Tool, displacement_m, movement_m, push, within_cone};
+use palpate_touch::Standing;
+
+use super::contact::{Feel, Surroundings, Tool, displacement_m, movement_m, push, within_cone};
 use super::footprint::Reached;
 use super::motion::Sheet;
 use super::real::Real;
 use super::tangent::Window;
 use crate::memory;
-use crate::scene::tip::Coupling;
+use palpate_touch::Coupling;
 
 impl<T: Real> Sheet<T> {
     /// Makes position-controlled tools act at the end of a substep that ends at `fraction` of the step.
@@ -104,8 +106,8 @@ impl<T: Real> Sheet<T> {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::scene::tip::Tip;
     use crate::sheet::{Model, Tissue};
+    use palpate_touch::Tip;
 
     fn sheet(sets: &[&str]) -> Sheet<f64> {
         let always = ["stepping.precision=f64", "stepping.integrator=central", "stepping.substeps=1"];

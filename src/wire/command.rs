@@ -1,13 +1,15 @@
 //! Conversion of commands.
 
 use glam::{DQuat, DVec3};
+use palpate_proto::geometry::{from_place, from_point, from_vector, point, vector};
+use palpate_proto::pb;
+use palpate_proto::touch::{from_tip, pose};
 
-use super::{from_place, from_point, from_vector, pb, point, required, vector};
+use super::required;
 use crate::refusal::{Result, number};
 use crate::scene::Sheet;
 use crate::scene::law::Poke;
 use crate::scene::script::Action;
-use crate::scene::tip::{Coupling, Tip};
 use crate::session::command::Command;
 
 /// The command in a message that arrived at `arrival_ns`.
@@ -62,34 +64,6 @@ fn from_pose(pose: &pb::Pose) -> Result<DVec3> {
     Ok(position_m + turn.normalize() * offset_m)
 }
 
-/// The tip in a message; the default tip if it is absent.
-pub fn from_tip(tip: Option<&pb::Tip>) -> Tip {
-    tip.map_or_else(Tip::default, |tip| Tip {
-        radius_m: tip.radius_m,
-        friction: tip.friction,
-        grasps: tip.grasps,
-        coupling: tip.spring.as_ref().map_or(Coupling::Constraint, |spring| Coupling::Spring {
-            stiffness_n_per_m: spring.stiffness_n_per_m,
-            damping_n_s_per_m: spring.damping_n_s_per_m,
-        }),
-    })
-}
-
-/// A tip as a message.
-pub fn tip(tip: &Tip) -> pb::Tip {
-    pb::Tip {
-        radius_m: tip.radius_m,
-        friction: tip.friction,
-        grasps: tip.grasps,
-        spring: match tip.coupling {
-            Coupling::Constraint => None,
-            Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } => {
-                Some(pb::Spring { stiffness_n_per_m, damping_n_s_per_m })
-            }
-        },
-    }
-}
-
 /// The message of a script's command to tool `tool`, which acts at step `at_step`.
 #[allow(clippy::cast_possible_truncation)]
 pub fn scripted(tool: usize, at_step: u64, action: &Action, client_time_ns: u64) -> pb::Command {
@@ -110,12 +84,7 @@ pub fn now(tool: u32, sequence: u64, action: &Action, client_time_ns: u64) -> pb
             point: Some(point(*at)),
             target: Some(pb::position::Target::DisplacementM(pb::Vector3 { x: *x, y: *y, z: *z })),
         }),
-        Action::Lead { place_m, tip } => Message::Pose(pb::Pose {
-            position_m: vector(*place_m),
-            orientation: None,
-            tip_offset_m: None,
-            tip: Some(self::tip(tip)),
-        }),
+        Action::Lead { place_m, tip } => Message::Pose(pose(*place_m, tip)),
         Action::Release => Message::Release(pb::Release {}),
     };
     pb::Command { tool, sequence, client_time_ns, at_step: None, time_to_live_s: None, action: Some(action) }

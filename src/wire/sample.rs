@@ -1,6 +1,6 @@
 //! Conversion of samples, records and frames to messages, and of records back.
 
-use super::{every, from_point, from_vector, pb, point, vector};
+use super::every;
 use crate::pace::frames::Delivery;
 use crate::pace::{PacedSample, Recorded};
 use crate::refusal::{Reason, Refusal, Result};
@@ -9,6 +9,8 @@ use crate::session::ToolSample;
 use crate::session::sampling::{Deadband, HEARTBEAT_S, Sampling};
 use crate::surface::Encoding;
 use crate::surface::encode::Patch;
+use palpate_proto::geometry::{from_point, from_vector, point, vector};
+use palpate_proto::{pb, touch};
 
 /// The samples that a stream asks for. `renders`: the stream has declared a device.
 ///
@@ -80,7 +82,7 @@ fn tool_sample(tool: &ToolSample, due_ns: u64, now_ns: u64) -> pb::ToolSample {
         late: tool.late,
         expired: tool.expired,
         paused_until_step: tool.paused_until,
-        local_model: tool.local.as_ref().map(super::local::local_model),
+        local_model: tool.local.as_ref().map(touch::local_model),
         stale: tool.stale,
     }
 }

@@ -1,6 +1,9 @@
 //! Conversion of scenes: the fields and defaults of a scene file. Ranges are checked when the scene is compiled.
 
-use super::{from_point, pb, point, required};
+use palpate_proto::geometry::{from_point, point};
+use palpate_proto::pb;
+
+use super::required;
 use crate::refusal::{Reason, Refusal, Result};
 use crate::scene::{
     Appearance, Change, Fixed, Integrator, Lanes, Named, PointSet, Precision, Scene, Sheet, Springs, Stepping,

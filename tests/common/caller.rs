@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use std::sync::Mutex;
 
 use palpate::server::identity::{self, Role};
-use palpate::wire::pb;
+use palpate_proto::pb;
 use pb::haptic_service_client::HapticServiceClient;
 use pb::session_service_client::SessionServiceClient;
 use pb::view_service_client::ViewServiceClient;

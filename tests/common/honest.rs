@@ -9,7 +9,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use hdrhistogram::Histogram;
-use palpate::wire::pb;
+use palpate_proto::pb;
 use pb::touch_request::Message as Say;
 use pb::touch_response::Message as Heard;
 use tokio::time::MissedTickBehavior;

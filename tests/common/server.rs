@@ -14,8 +14,8 @@ use std::process::{Child, ChildStdout, Command, Output, Stdio};
 use std::sync::OnceLock;
 use std::time::Duration;
 
-use palpate::haptics::Law;
-use palpate::wire::{self, pb};
+use palpate_proto::{pb, touch};
+use palpate_touch::Law;
 use pb::haptic_service_client::HapticServiceClient;
 use pb::session_service_client::SessionServiceClient;
 use pb::touch_request::Message as Say;
@@ -267,7 +267,7 @@ impl Touch {
     pub async fn exact_law(&mut self) -> Law {
         loop {
             if let Heard::ForceLaw(update) = self.hear().await.unwrap().unwrap() {
-                return wire::local::from_law(&update.law.expect("the coarse law stays")).unwrap();
+                return touch::from_law(&update.law.expect("the coarse law stays")).unwrap();
             }
         }
     }

@@ -2,7 +2,7 @@
 
 use crate::metrics;
 use crate::server::{PATIENCE, Server, Touch, force, open, position, told};
-use palpate::wire::pb;
+use palpate_proto::pb;
 use pb::command::Action;
 use pb::touch_response::Message as Heard;
 use tonic::Code;

@@ -4,10 +4,10 @@ use std::sync::Arc;
 
 use crate::common::{model, scene_with};
 use glam::{DVec2, DVec3};
-use palpate::haptics::Law;
+use palpate::force_law;
 use palpate::scene::BUILT_IN;
-use palpate::scene::tip::{Coupling, Tip};
-use palpate::sheet::{self, Feel, Model, Standing, Tissue, tangent};
+use palpate::sheet::{self, Feel, Model, Tissue, tangent};
+use palpate_touch::{Coupling, Standing, Tip};
 
 /// Flat punches of 5 mm radius, 2aE/(1 − ν²), N/m.
 const FLAT_PUNCH_N_PER_M: [(&str, f64); 3] = [("stomach", 25.3), ("liver", 71.1), ("fibrotic", 354.0)];
@@ -118,7 +118,7 @@ fn the_tissues_are_as_stiff_as_a_flat_punch_finds_them() {
 #[test]
 fn a_slow_press_feels_the_law_that_was_computed() {
     let model = tissue("liver", &[]);
-    let law = Law::of(&model, 0.005);
+    let law = force_law::exact(&model, 0.005);
     assert!(law.is_sound());
     let mut sheet = sheet::at_rest(&model);
     let way = |t: f64| middle(&model) + DVec3::new(0.0, 0.0, 0.001 - 0.009 * smooth(t / 1.5));

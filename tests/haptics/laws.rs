@@ -6,11 +6,13 @@ use std::time::{Duration, Instant};
 
 use crate::common::{model, scene_with};
 use crate::server::{PATIENCE, Server, Touch, open};
-use palpate::haptics::law::Row;
-use palpate::haptics::{Device, Law, Touching};
+use palpate::force_law;
 use palpate::scene::BUILT_IN;
-use palpate::sheet::{Model, Standing};
-use palpate::wire::{self, pb};
+use palpate::sheet::Model;
+use palpate::wire;
+use palpate_proto::{pb, touch};
+use palpate_touch::law::{Law, Row};
+use palpate_touch::{Device, Standing, Touching};
 use pb::touch_response::Message as Heard;
 
 fn tissue(name: &str, sets: &[&str]) -> Arc<Model> {
@@ -44,8 +46,8 @@ fn a_first_law_is_within_a_tenth_of_the_exact_one() {
     ];
     for (name, sets) in cases {
         let model = tissue(name, sets);
-        let first = Law::first(&model, 0.005, &never).unwrap();
-        let [force, of_largest, stiffness] = apart(&Law::of(&model, 0.005), &first);
+        let first = force_law::first(&model, 0.005, &never).unwrap();
+        let [force, of_largest, stiffness] = apart(&force_law::exact(&model, 0.005), &first);
         println!(
             "{name} {sets:?}: coarse {}, force {force:.4} ({of_largest:.4} of the largest), stiffness {stiffness:.4} apart",
             first.is_coarse
@@ -72,11 +74,11 @@ fn every_tissue_has_a_first_law() {
     ];
     for (name, sets, radius_m) in cases {
         let model = tissue(name, sets);
-        let first = Law::first(&model, radius_m, &never);
+        let first = force_law::first(&model, radius_m, &never);
         assert!(first.as_ref().is_some_and(Law::is_sound), "{name} {sets:?}: {first:?}");
     }
     let stopped = AtomicBool::new(true);
-    assert_eq!(Law::first(&tissue("liver", &[]), 0.005, &stopped), None);
+    assert_eq!(force_law::first(&tissue("liver", &[]), 0.005, &stopped), None);
 }
 
 /// Leads tool 0 of a stream by the client's clock.
@@ -103,7 +105,7 @@ impl Lead {
 }
 
 fn with_device(session: &str, tools: &[u32]) -> pb::TouchOpen {
-    let device = wire::local::device(&Device::named("omega3").unwrap());
+    let device = touch::device(&Device::named("omega3").unwrap());
     pb::TouchOpen { device: Some(device), ..open(session, tools) }
 }
 
@@ -129,7 +131,7 @@ async fn a_coarse_law_is_changed_for_the_exact_one_by_a_model_that_names_it() {
     let mut touch = Touch::open(&server, with_device(&session, &[0])).await.unwrap();
     let opened = touch.opened.take().unwrap().law.unwrap();
     assert!(opened.coarse && opened.number == 0, "{opened:?}");
-    let mut laws = vec![wire::local::from_law(&opened).unwrap()];
+    let mut laws = vec![touch::from_law(&opened).unwrap()];
     let mut lead = Lead { touch, begun: Instant::now(), sequence: 0 };
     // Until some models have named either law; the tool is pressed in all the while.
     let mut named = [0_u32; 2];
@@ -141,11 +143,11 @@ async fn a_coarse_law_is_changed_for_the_exact_one_by_a_model_that_names_it() {
                     assert_eq!((update.coarse_number, update.reason.as_str()), (0, ""));
                     let law = update.law.unwrap();
                     assert_eq!((law.number as usize, law.coarse), (laws.len(), false), "it is told once");
-                    laws.push(wire::local::from_law(&law).unwrap());
+                    laws.push(touch::from_law(&law).unwrap());
                 }
                 Heard::Sample(sample) => {
                     let Some(model) = sample.tools.first().and_then(|tool| tool.local_model.as_ref()) else { continue };
-                    let model = wire::local::from_local_model(model, sample.step);
+                    let model = touch::from_local_model(model, sample.step);
                     let law = laws.get(model.law as usize).expect("the law comes before the model that names it");
                     // Server and client mean the same: under a touch the law passes through the sample.
                     if model.standing != Standing::Free {
@@ -166,7 +168,7 @@ async fn a_coarse_law_is_changed_for_the_exact_one_by_a_model_that_names_it() {
     let mut later = Touch::open(&server, with_device(&session, &[1])).await.unwrap();
     let law = later.opened.take().unwrap().law.unwrap();
     assert!(!law.coarse && law.number == 0);
-    assert_eq!(wire::local::from_law(&law).unwrap(), laws[1]);
+    assert_eq!(touch::from_law(&law).unwrap(), laws[1]);
     for _ in 0..10 {
         assert!(matches!(later.hear().await.unwrap(), Some(Heard::Sample(_))));
     }
@@ -200,7 +202,7 @@ async fn another_tissue_brings_its_law_which_models_then_name() {
     let server = limited("");
     let session = session(&server).await;
     let mut touch = Touch::open(&server, with_device(&session, &[0])).await.unwrap();
-    let mut laws = vec![wire::local::from_law(&touch.opened.take().unwrap().law.unwrap()).unwrap()];
+    let mut laws = vec![touch::from_law(&touch.opened.take().unwrap().law.unwrap()).unwrap()];
     laws.push(touch.exact_law().await);
     let mut lead = Lead { touch, begun: Instant::now(), sequence: 0 };
     let request = pb::UpdateTissueRequest {
@@ -220,11 +222,11 @@ async fn another_tissue_brings_its_law_which_models_then_name() {
                     assert_eq!((update.coarse_number, update.tissue_step), (laws.len() as u32 - 1, of_tissue));
                     let law = update.law.unwrap();
                     assert_eq!((law.number as usize, law.coarse), (laws.len(), of_tissue.is_some()));
-                    laws.push(wire::local::from_law(&law).unwrap());
+                    laws.push(touch::from_law(&law).unwrap());
                 }
                 Heard::Sample(sample) => {
                     let Some(model) = sample.tools.first().and_then(|tool| tool.local_model.as_ref()) else { continue };
-                    let model = wire::local::from_local_model(model, sample.step);
+                    let model = touch::from_local_model(model, sample.step);
                     let law = laws.get(model.law as usize).expect("the law comes before the model that names it");
                     if model.standing != Standing::Free {
                         let repeated_n = Touching::at_sample(&model, law).force_n(&model, law, model.velocity_m_per_s);
@@ -242,7 +244,7 @@ async fn another_tissue_brings_its_law_which_models_then_name() {
     // It is the law of the tissue as the session has it.
     let scene = wire::scene::from_scene(&changed.session.unwrap().scene.unwrap()).unwrap();
     assert_eq!((scene.springs.stiffness_n_per_m, scene.virtual_stiffness_n_per_m), (20.0, 10.0));
-    let exact = Law::of(&model(&scene), 0.005);
+    let exact = force_law::exact(&model(&scene), 0.005);
     assert_eq!(laws[3], exact);
     assert!(apart(&exact, &laws[1])[1] > 0.1, "the tissues hardly differ");
 }

@@ -1,4 +1,4 @@
-//! Touch: contact, rendering for a device, and the streams between.
+//! Touch: contact, force laws, and the streams of devices.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 #[path = "../common/mod.rs"]
@@ -12,4 +12,3 @@ mod commands;
 mod contact;
 mod laws;
 mod poses;
-mod rendering;

@@ -1,13 +1,13 @@
 //! Tools controlled by poses over a real server: local models, the force law, deadbands, and refusals.
 
 use crate::server::{Server, Touch, open, told};
-use palpate::haptics::device::DEVICES;
-use palpate::haptics::{Device, Touching};
-use palpate::wire::{self, pb};
+use palpate_proto::{pb, touch};
+use palpate_touch::device::DEVICES;
+use palpate_touch::{Device, Touching};
 use tonic::Code;
 
 fn device() -> pb::Device {
-    wire::local::device(&Device::named("omega3").unwrap())
+    touch::device(&Device::named("omega3").unwrap())
 }
 
 /// A pose above or in the middle of `liver`, by the client's clock.
@@ -52,7 +52,7 @@ async fn a_pressed_tool_gets_local_models_that_agree_with_the_law() {
     });
     let sample = sample.await;
     let tool = &sample.tools[0];
-    let model = wire::local::from_local_model(tool.local_model.as_ref().unwrap(), sample.step);
+    let model = touch::from_local_model(tool.local_model.as_ref().unwrap(), sample.step);
     assert!(model.is_sound() && model.force_n.z > 0.2, "{model:?}");
     assert_eq!(model.force_n.z, tool.force_on_tool_n.as_ref().unwrap().z);
     // The law passes through the sample.
@@ -139,7 +139,7 @@ async fn a_tissue_beyond_the_device_is_told_of() {
     let session =
         server.sessions().await.create_session(request).await.unwrap().into_inner().session.unwrap().session_id;
     for (tool, device, warnings) in [(0, "touch", 1), (1, "lambda7", 0)] {
-        let device = wire::local::device(&Device::named(device).unwrap());
+        let device = touch::device(&Device::named(device).unwrap());
         let opened = Touch::open(&server, pb::TouchOpen { device: Some(device), ..open(&session, &[tool]) }).await;
         let told = opened.unwrap().opened.take().unwrap().warnings;
         assert_eq!(told.len(), warnings, "{told:?}");

@@ -1,4 +1,4 @@
-"""Mutation testing of sheet, haptics and session: how many mutants do the tests catch?
+"""Mutation testing of the tissue, touch and sessions: how many mutants do the tests catch?
 
 cargo-mutants draws up the list of mutants (`cargo install cargo-mutants`). All that are drawn from it are compiled at once
 (src/main.rs), and each is run by the tests that concern it until one fails. Results are kept in target/mutants and continued
@@ -21,15 +21,23 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent.parent
 WORK = ROOT / "target" / "mutants"
 TREE = WORK / "tree"
-ROOMS = ["sheet", "haptics", "session"]
+# What mutants are drawn from: a module by its folder, and the package that it is in.
+MODULES = {
+    "src/sheet": "palpate",
+    "src/force_law": "palpate",
+    "src/session": "palpate",
+    "clients/touch/src": "palpate-touch",
+}
+PACKAGES = {"palpate": ".", "palpate-touch": "clients/touch"}
 
 # Test programs, and which of their tests: quick ones first. `commands` and `poses` need a server and take longer.
-UNIT = ("palpate", [f"{room}::" for room in ROOMS])
-TOUCH = ("haptics", ["contact", "rendering"])
+UNIT = ("palpate", ["sheet::", "force_law::", "session::"])
+CONTACT = ("haptics", ["contact"])
 ORDER = {
-    "sheet": [UNIT, TOUCH, ("determinism", ["golden", "held"]), ("physics", []), ("reference", []), ("audit", [])],
-    "haptics": [UNIT, TOUCH, ("haptics", ["poses"])],
-    "session": [
+    "src/sheet": [UNIT, CONTACT, ("determinism", ["golden", "held"]), ("physics", []), ("reference", []), ("audit", [])],
+    "src/force_law": [UNIT, CONTACT, ("haptics", ["laws"])],
+    "clients/touch/src": [("palpate_touch", []), ("rendering", []), UNIT, CONTACT, ("haptics", ["poses"])],
+    "src/session": [
         UNIT,
         ("determinism", ["golden", "held"]),
         ("haptics", ["commands", "poses"]),
@@ -48,8 +56,8 @@ def drawn(count, seed):
     """The mutants to be tested, numbered from 1. The same as long as the tree is."""
     path = WORK / "drawn.json"
     if not path.exists():
-        files = [part for room in ROOMS for part in ("--file", f"src/{room}/**/*.rs")]
-        command = ["cargo", "mutants", "--list", "--json", "--package", "palpate", *files]
+        files = [part for folder in MODULES for part in ("--file", f"{folder}/**/*.rs")]
+        command = ["cargo", "mutants", "--list", "--json", *selected(), *files]
         listed = json.loads(subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout)
         mutants = [
             {
@@ -79,8 +87,9 @@ def lay_out(mutants):
     (WORK / "fit.json").write_text(json.dumps(mutants))
     fitter = ["cargo", "run", "--quiet", "--manifest-path", HERE / "Cargo.toml", "--target-dir", WORK / "fitter", "--"]
     unplaced = subprocess.run([*fitter, WORK / "fit.json", TREE], check=True, capture_output=True, text=True).stdout
-    with open(TREE / "src/lib.rs", "a") as library:
-        library.write((HERE / "mutant.rs").read_text())
+    for folder in PACKAGES.values():
+        with open(TREE / folder / "src/lib.rs", "a") as library:
+            library.write((HERE / "mutant.rs").read_text())
     return {int(line) for line in unplaced.split()}
 
 
@@ -92,10 +101,15 @@ def compiled(arguments):
     return [json.loads(line) for line in run.stdout.splitlines() if line.startswith("{")]
 
 
+def selected():
+    """The packages, as arguments of cargo."""
+    return [part for package in PACKAGES for part in ("--package", package)]
+
+
 def unviable():
     """The ids of mutants that the compiler names in its errors."""
     found = set()
-    for message in compiled(["check", "--lib"]):
+    for message in compiled(["check", "--lib", *selected()]):
         if message.get("reason") != "compiler-message" or message["message"]["level"] != "error":
             continue
         for span in message["message"]["spans"]:
@@ -111,22 +125,25 @@ def unviable():
 
 def programs():
     """The test programs by name."""
-    tests = {name for order in ORDER.values() for name, _ in order} - {"palpate"}
+    libraries = {package.replace("-", "_") for package in PACKAGES}
+    tests = {name for order in ORDER.values() for name, _ in order} - libraries
     named = [part for test in sorted(tests) for part in ("--test", test)]
     found = {}
-    for message in compiled(["test", "--release", "--no-run", "--lib", *named]):
+    for message in compiled(["test", "--release", "--no-run", "--lib", *selected(), *named]):
         if message.get("executable") and message["profile"]["test"]:
             found[message["target"]["name"]] = message["executable"]
-    if missing := (tests | {"palpate"}) - set(found):
+    if missing := (tests | libraries) - set(found):
         sys.exit(f"Test programs are missing: {sorted(missing)}")
     return found
 
 
 def order_of(mutant):
     """The test programs for a mutant, and which of their tests. Those of its own module come first: they catch most."""
-    parts = Path(mutant["file"]).with_suffix("").parts[1:]
-    own = "::".join(part for part in parts if part != "mod") + "::"
-    return [("palpate", [own]), *ORDER[parts[0]]]
+    folder = next(folder for folder in MODULES if mutant["file"].startswith(folder + "/"))
+    # The path of the module within its crate.
+    parts = Path(mutant["file"]).with_suffix("").parts
+    own = "::".join(part for part in parts[parts.index("src") + 1 :] if part not in ("lib", "mod")) + "::"
+    return [(MODULES[folder].replace("-", "_"), [own]), *ORDER[folder]]
 
 
 def run_tests(program, filters, number, longest_s):

@@ -13,7 +13,7 @@ use palpate::session::command::{Command, Due};
 use palpate::session::intake::Intake;
 use palpate::session::schedule::Schedule;
 use palpate::sheet::{Grasp, Model, Push, Tissue, at_rest};
-use palpate::wire::pb;
+use palpate_proto::pb;
 use tonic::Code;
 
 const SCHEMES: [&[&str]; 7] = [

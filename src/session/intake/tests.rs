@@ -4,7 +4,7 @@
 use super::super::batch::SLICE;
 use super::*;
 use crate::scene::PAPER;
-use crate::scene::tip::Tip;
+use palpate_touch::Tip;
 
 const LEASE: LeaseId = 7;
 const MS: u64 = 1_000_000;

@@ -1,0 +1,255 @@
+//! The network side of a bridge: connects, opens a haptic stream, and passes commands and models on. When the connection
+//! breaks, it connects again.
+
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use glam::DVec3;
+use palpate_proto::refusal::Reason;
+use palpate_proto::{pb, touch};
+use palpate_touch::deadband::HEARTBEAT_S;
+use palpate_touch::renderer::MOST_LAWS;
+use palpate_touch::{Device, Law, LocalModel};
+use pb::command::Action;
+use pb::session_service_client::SessionServiceClient;
+use pb::touch_request::Message as Say;
+use pb::touch_response::Message as Heard;
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+
+use super::{Session, Target};
+use crate::Error;
+use crate::connect::Channel;
+use crate::touch::Touch;
+
+/// The data that the network passes to the device's loop. Only the newest counts; neither waits for the other.
+#[derive(Default)]
+pub(super) struct Shared {
+    inbound: Mutex<Inbound>,
+}
+
+/// What has arrived since it was last asked for.
+#[derive(Default)]
+pub(super) struct Inbound {
+    /// The law of a new connection.
+    pub(super) law: Option<Law>,
+    /// Further laws of the newest connection, and their numbers, at most [`MOST_LAWS`].
+    pub(super) further: Vec<(u32, Law)>,
+    /// The middle of the sheet, m.
+    pub(super) middle_m: DVec3,
+    /// Of the newest connection.
+    pub(super) newest: Option<LocalModel>,
+    pub(super) traffic: Traffic,
+    /// Why the newest connection broke, or never came to be.
+    pub(super) failure: Option<Error>,
+}
+
+/// What went over the network, in all.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Traffic {
+    /// Connections that were opened.
+    pub connections: u64,
+    /// Samples that arrived.
+    pub samples: u64,
+    /// Their bytes, with the headers of the network.
+    pub bytes: u64,
+    /// Commands that the server refused.
+    pub refused: u64,
+}
+
+impl Shared {
+    pub(super) fn inbound(&self) -> MutexGuard<'_, Inbound> {
+        self.inbound.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Where a tool was, and when by the client's clock, ns.
+pub(super) type Command = (u64, DVec3);
+
+/// First and longest pause before it connects again.
+const PAUSES: [Duration; 2] = [Duration::from_millis(100), Duration::from_secs(2)];
+
+/// A connection on which the server is silent for longer than this is given up.
+const SILENCE: Duration = Duration::from_secs(2);
+
+/// Largest number of commands on their way to the network: more would be a backlog.
+pub(super) const COMMANDS: usize = 64;
+
+/// Keeps a connection until `commands` ends.
+pub(super) async fn keep(
+    target: Target,
+    device: Device,
+    shared: &Shared,
+    mut commands: mpsc::Receiver<Command>,
+    warn: &(impl Fn(&str) + Sync),
+) {
+    let mut pause = PAUSES[0];
+    let mut made = None;
+    loop {
+        let before = shared.inbound().traffic.samples;
+        match connect(&target, &mut made, &device, shared, &mut commands, warn).await {
+            Ok(()) => return,
+            // Another attempt would be refused too.
+            Err(error) if error.is_refusal() && shared.inbound().traffic.connections == 0 => {
+                shared.inbound().failure = Some(error);
+                return;
+            }
+            Err(error) => {
+                warn(&format!("{error}; connecting again"));
+                shared.inbound().failure = Some(Error::Connection(format!("never connected: {error}")));
+            }
+        }
+        if shared.inbound().traffic.samples > before {
+            pause = PAUSES[0];
+        }
+        // Commands of the meantime would be old later.
+        let over = tokio::time::sleep(pause);
+        tokio::pin!(over);
+        loop {
+            tokio::select! {
+                () = &mut over => break,
+                command = commands.recv() => if command.is_none() { return },
+            }
+        }
+        pause = (2 * pause).min(PAUSES[1]);
+    }
+}
+
+/// The session of a target; `made` is the ID of the one that was made for it.
+async fn session(target: &Target, made: &mut Option<String>, channel: Channel) -> Result<pb::Session, Error> {
+    let mut sessions = SessionServiceClient::new(channel);
+    let (id, scene) = match &target.session {
+        Session::Existing(id) => (Some(id), None),
+        Session::New { scene } => (made.as_ref(), Some(scene)),
+    };
+    let mut known = None;
+    if let Some(id) = id {
+        let request = pb::GetSessionRequest { session_id: id.clone() };
+        known = match sessions.get_session(request).await {
+            Ok(answer) => answer.into_inner().session,
+            // The server was restarted and no longer has the session.
+            Err(status) if status.code() == tonic::Code::NotFound && scene.is_some() => None,
+            Err(status) => return Err(status.into()),
+        };
+    }
+    if let (None, Some(scene)) = (&known, scene) {
+        let source = pb::create_session_request::Source::SceneName(scene.clone());
+        let request = pb::CreateSessionRequest { source: Some(source), ..Default::default() };
+        known = sessions.create_session(request).await?.into_inner().session;
+    }
+    let session = known.ok_or_else(|| broken("the server sent no session"))?;
+    *made = Some(session.session_id.clone());
+    Ok(session)
+}
+
+/// The middle of a session's sheet, m.
+fn middle_m(session: &pb::Session) -> Result<DVec3, Error> {
+    let sheet = session.scene.as_ref().and_then(|scene| scene.sheet.as_ref());
+    let sheet = sheet.ok_or_else(|| broken("the server sent no scene"))?;
+    let spacing_m = sheet.spacing_m.unwrap_or(0.0);
+    let middle = |points: Option<u32>| 0.5 * spacing_m * f64::from(points.unwrap_or(1).saturating_sub(1));
+    Ok(DVec3::new(middle(sheet.points_x), middle(sheet.points_y), 0.0))
+}
+
+fn broken(why: &str) -> Error {
+    Error::Connection(why.to_owned())
+}
+
+/// The law in a message.
+fn law(message: &pb::ForceLaw) -> Result<Law, Error> {
+    touch::from_law(message).map_err(|refusal| Error::Connection(refusal.to_string()))
+}
+
+/// One connection, until it breaks or `commands` ends.
+async fn connect(
+    target: &Target,
+    made: &mut Option<String>,
+    device: &Device,
+    shared: &Shared,
+    commands: &mut mpsc::Receiver<Command>,
+    warn: &(impl Fn(&str) + Sync),
+) -> Result<(), Error> {
+    let channel = target.server.clone().within(SILENCE).connect().await?;
+    let session = session(target, made, channel.clone()).await?;
+    let middle_m = middle_m(&session)?;
+    let (outbound, messages) = mpsc::channel(COMMANDS);
+    let open = pb::TouchOpen {
+        session_id: session.session_id,
+        tools: vec![target.tool],
+        holder: target.holder.clone(),
+        device: Some(touch::device(device)),
+        deadband: (target.deadband > 0.0)
+            .then(|| pb::Deadband { rendered_fraction: Some(target.deadband), ..Default::default() }),
+        heartbeat_s: Some(HEARTBEAT_S),
+        tip: Some(touch::tip(&target.tip)),
+        // A bridge that hangs must not hold a tool for long.
+        lease_s: Some(SILENCE.as_secs_f64()),
+        ..Default::default()
+    };
+    let silent = |_| broken("the server is silent");
+    let opening = Touch::open(channel, open, ReceiverStream::new(messages));
+    let mut stream = tokio::time::timeout(SILENCE, opening).await.map_err(silent)??;
+    stream.opened().warnings.iter().for_each(|warning| warn(warning));
+    let first = stream.opened().law.as_ref().ok_or_else(|| broken("the server sent no force law"))?;
+    let first = law(first)?;
+    {
+        let mut inbound = shared.inbound();
+        inbound.traffic.connections += 1;
+        (inbound.law, inbound.further) = (Some(first), Vec::new());
+        (inbound.newest, inbound.middle_m) = (None, middle_m);
+    }
+    // Commands that waited while the stream was opened are old.
+    while commands.try_recv().is_ok() {}
+    let mut sequence = 0;
+    loop {
+        tokio::select! {
+            heard = tokio::time::timeout(SILENCE, stream.next()) => {
+                match heard.map_err(silent)??.ok_or_else(|| broken("the server has ended the stream"))? {
+                    Heard::ForceLaw(update) => match update.law {
+                        Some(message) => {
+                            let law = law(&message)?;
+                            let further = &mut shared.inbound().further;
+                            if further.len() == MOST_LAWS {
+                                further.remove(0);
+                            }
+                            further.push((message.number, law));
+                        }
+                        None => {
+                            let stays = if update.tissue_step.is_some() { "that of the old tissue" } else { "a coarse one" };
+                            warn(&format!("the force law stays {stays}: {} ({})", update.message, update.reason));
+                        }
+                    },
+                    Heard::Sample(sample) => {
+                        if sample.held {
+                            return Err(broken("the session was stopped by its guard"));
+                        }
+                        let mut inbound = shared.inbound();
+                        inbound.traffic.samples += 1;
+                        inbound.traffic.bytes += touch::wire_bytes(&sample);
+                        if let Some(model) = sample.tools.first().and_then(|tool| tool.local_model.as_ref()) {
+                            inbound.newest = Some(touch::from_local_model(model, sample.step));
+                        }
+                    }
+                    Heard::Rejection(rejection) => {
+                        shared.inbound().traffic.refused += 1;
+                        // This side was silent for so long that the server released the tool.
+                        if rejection.reason == Reason::NotHolder.as_str() {
+                            return Err(broken("the lease of the tool has lapsed"));
+                        }
+                    }
+                    Heard::Opened(_) | Heard::Renewed(_) => {}
+                }
+            }
+            command = commands.recv() => {
+                let Some((client_time_ns, place_m)) = command else { return Ok(()) };
+                sequence += 1;
+                let action = Some(Action::Pose(touch::pose(place_m, &target.tip)));
+                let command = pb::Command { tool: target.tool, sequence, client_time_ns, action, ..Default::default() };
+                // If the network does not keep up, this command is dropped; the next is newer.
+                if let Err(mpsc::error::TrySendError::Closed(_)) = outbound.try_send(Say::Command(command)) {
+                    return Err(broken("the stream is closed"));
+                }
+            }
+        }
+    }
+}

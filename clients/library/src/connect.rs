@@ -1,0 +1,229 @@
+//! Connections to a server: plain or TLS, with the caller's credentials.
+
+use std::error::Error as _;
+use std::net::IpAddr;
+use std::time::Duration;
+
+use palpate_proto::error;
+use tonic::metadata::{Ascii, MetadataValue};
+use tonic::service::Interceptor;
+use tonic::service::interceptor::InterceptedService;
+use tonic::transport::{Certificate, ClientTlsConfig, Endpoint, Identity, Uri};
+use tonic::{Request, Status};
+use tonic_health::pb::HealthCheckRequest;
+use tonic_health::pb::health_client::HealthClient;
+
+use crate::Error;
+
+/// The caller's credentials, and which servers are trusted. The default has none, and trusts the authorities of the system.
+#[derive(Debug, Clone, Default)]
+pub struct Credentials {
+    /// Your token. A token is sent only over TLS or to this machine.
+    pub token: Option<Token>,
+    /// Certificates (PEM) to trust instead of the system's.
+    pub ca: Option<String>,
+    /// Name that the server's certificate must carry, if it differs from the URL's host.
+    pub tls_name: Option<String>,
+    /// Your client certificate and its private key (PEM), if the server requires one.
+    pub cert_and_key: Option<(String, String)>,
+}
+
+/// A token. It is not shown by `Debug`.
+#[derive(Clone)]
+pub struct Token(MetadataValue<Ascii>);
+
+impl Token {
+    /// The token in a text; space around it does not count.
+    ///
+    /// # Errors
+    /// Returns an error if the text can't be a token. The message does not quote it: it would appear in a log.
+    pub fn new(text: &str) -> Result<Self, Error> {
+        let token = text.trim();
+        let wrong = || Error::Argument("holds no token; `palpate token` makes one".to_owned());
+        if token.is_empty() || token.contains(char::is_whitespace) {
+            return Err(wrong());
+        }
+        let mut value: MetadataValue<Ascii> = format!("Bearer {token}").parse().map_err(|_| wrong())?;
+        value.set_sensitive(true);
+        Ok(Token(value))
+    }
+}
+
+impl std::fmt::Debug for Token {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("Token")
+    }
+}
+
+/// A connection that adds the token, if there is one, to each call. The clients of `palpate_proto::pb` take it.
+pub type Channel = InterceptedService<tonic::transport::Channel, Bearer>;
+
+/// Adds the token to each call.
+#[derive(Debug, Clone)]
+pub struct Bearer(Option<Token>);
+
+impl Interceptor for Bearer {
+    fn call(&mut self, mut request: Request<()>) -> Result<Request<()>, Status> {
+        if let Some(Token(value)) = &self.0 {
+            request.metadata_mut().insert("authorization", value.clone());
+        }
+        Ok(request)
+    }
+}
+
+/// A server's address and how to connect to it.
+#[derive(Clone)]
+pub struct Server {
+    url: String,
+    endpoint: Endpoint,
+    bearer: Bearer,
+    /// Time limit for the connection and the first answer.
+    patience: Duration,
+}
+
+/// Default time limit for the connection and the first answer.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+/// A connection that is silent for so long is pinged, and closed after a further [`PATIENCE`]. That is longer than a server
+/// may stall.
+const SILENCE: Duration = Duration::from_secs(5);
+
+/// Bytes that may wait unread on a connection. The transport closes a connection when unread small messages, counted as 256
+/// bytes each, fill half of it. This size allows a stall of 5 s with samples of several tools at 1 kHz.
+const WINDOW_BYTES: u32 = 16 << 20;
+
+impl std::fmt::Debug for Server {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(&self.url)
+    }
+}
+
+impl Server {
+    /// The server at `url`; you may omit http://.
+    ///
+    /// # Errors
+    /// Returns an error if the URL is not valid, if a token would be sent in the clear, or if the credentials are not those
+    /// of a connection with TLS or can't be read.
+    pub fn new(url: &str, credentials: &Credentials) -> Result<Self, Error> {
+        let refuse = |why: &str| Error::Argument(format!("{url}: {why}"));
+        let url_text = if url.contains("://") { url.to_owned() } else { format!("http://{url}") };
+        let uri = url_text.parse::<Uri>().map_err(|e| refuse(&e.to_string()))?;
+        let secure = match uri.scheme_str() {
+            Some("http") => false,
+            Some("https") => true,
+            _ => return Err(refuse("must begin with http:// or https://")),
+        };
+        let host = uri.host().unwrap_or_default().trim_matches(['[', ']']).to_owned();
+        let is_here = host == "localhost" || host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback());
+        if credentials.token.is_some() && !secure && !is_here {
+            return Err(refuse("a token would be sent in the clear; the URL must begin with https://"));
+        }
+        let mut endpoint = Endpoint::from(uri)
+            .tcp_nodelay(true)
+            .initial_connection_window_size(WINDOW_BYTES)
+            .http2_keep_alive_interval(SILENCE)
+            .keep_alive_timeout(PATIENCE)
+            .keep_alive_while_idle(true);
+        if secure {
+            endpoint = endpoint.tls_config(tls(credentials)).map_err(|e| refuse(&root(&e)))?;
+        } else if credentials.ca.is_some() || credentials.cert_and_key.is_some() || credentials.tls_name.is_some() {
+            let why = "has no TLS, so certificates and their names mean nothing; the URL must begin with https://";
+            return Err(refuse(why));
+        }
+        Ok(Server { url: url_text, endpoint, bearer: Bearer(credentials.token.clone()), patience: PATIENCE })
+    }
+
+    /// Sets the time limit for connecting.
+    #[must_use]
+    pub fn within(mut self, timeout: Duration) -> Self {
+        self.patience = timeout;
+        self
+    }
+
+    /// Connects and waits for a first answer: a listener that accepts connections and stays silent is an error.
+    ///
+    /// # Errors
+    /// Returns an error that says in words why the server can't be reached.
+    pub async fn connect(&self) -> Result<Channel, Error> {
+        let unreached = |why: String| Error::Connection(format!("can't reach {}: {why}", self.url));
+        let connecting = async {
+            let channel = self.endpoint.connect().await.map_err(|e| unreached(in_words(&root(&e))))?;
+            // Any answer will do, also a refusal.
+            match HealthClient::new(channel.clone()).check(HealthCheckRequest::default()).await {
+                Err(status) if status.source().is_some() => Err(unreached(broken(&status))),
+                _ => Ok(channel),
+            }
+        };
+        let within_s = self.patience.as_secs_f64();
+        let silent = |_| unreached(format!("it accepts the connection but has not answered within {within_s} s"));
+        let channel = tokio::time::timeout(self.patience, connecting).await.map_err(silent)??;
+        Ok(InterceptedService::new(channel, self.bearer.clone()))
+    }
+}
+
+/// The text that a program shows for a status: the server's message, or how the connection broke.
+pub fn describe(status: &Status) -> String {
+    if status.source().is_some() { broken(status) } else { error::describe(status) }
+}
+
+fn broken(status: &Status) -> String {
+    let root = status.source().map_or_else(|| status.message().to_owned(), root);
+    let hint = if root.contains("frame with invalid size") || root.contains("invalid HTTP version") {
+        "; if it speaks TLS, the URL must begin with https://"
+    } else {
+        ""
+    };
+    format!("the connection broke: {}{hint}", in_words(&root))
+}
+
+/// The message of an error's innermost cause.
+fn root(error: &(dyn std::error::Error + 'static)) -> String {
+    let mut cause = error;
+    while let Some(deeper) = cause.source() {
+        cause = deeper;
+    }
+    cause.to_string()
+}
+
+/// Library errors in plain words.
+fn in_words(said: &str) -> String {
+    let known = [
+        (
+            "UnknownIssuer",
+            "no authority that is trusted here has signed the server's certificate; the option `ca` adds one",
+        ),
+        (
+            "NotValidForName",
+            "the server's certificate is for another name; the option `tls-name` gives the expected one",
+        ),
+        ("Expired", "the server's certificate has expired"),
+        ("CertificateRequired", "the server requires a client certificate: the options `cert` and `key`"),
+        ("InvalidContentType", "it does not speak TLS; the URL may have to begin with http://"),
+        ("too_many_data_frames", "a transport closed it: too many small messages waited unread"),
+        ("excessive load", "the server's transport closed it: too many requests at once"),
+        ("keep-alive timed out", "the other side was silent for too long"),
+    ];
+    known
+        .iter()
+        .find(|(name, _)| said.contains(name))
+        .map_or_else(|| said.to_owned(), |(_, words)| format!("{words} ({said})"))
+}
+
+/// What a connection with TLS needs.
+fn tls(credentials: &Credentials) -> ClientTlsConfig {
+    let mut tls = ClientTlsConfig::new();
+    tls = match &credentials.ca {
+        Some(pem) => tls.ca_certificate(Certificate::from_pem(pem)),
+        // tonic's own feature for this would make cargo build tonic twice, for the server and for the clients.
+        None => tls.trust_anchors(rustls_native_certs::load_native_certs().certs.iter().filter_map(|certificate| {
+            webpki::anchor_from_trusted_cert(certificate).map(|anchor| anchor.to_owned()).ok()
+        })),
+    };
+    if let Some(name) = &credentials.tls_name {
+        tls = tls.domain_name(name);
+    }
+    if let Some((cert, key)) = &credentials.cert_and_key {
+        tls = tls.identity(Identity::from_pem(cert, key));
+    }
+    tls
+}

@@ -1,0 +1,91 @@
+//! The interface of haptic devices.
+//!
+//! Implement [`HapticDevice`] with your manufacturer's library and pass it to [`crate::bridge::run`], which calls it at 1 kHz
+//! on a thread of its own. Positions are in metres and forces in newtons, in the device's frame: its origin is the middle of
+//! the device's workspace, x points right, y away from the operator, and z up. The bridge places the origin on the middle of
+//! the sheet, whose z points out of the tissue. Forces act on the hand. Convert the library's units (OpenHaptics uses mm, and
+//! degrees for joints) and axes in your adapter:
+//!
+//! - OpenHaptics: `read` is `hdBeginFrame`, `hdGetDoublev(HD_CURRENT_POSITION)`·1e-3, `HD_CURRENT_BUTTONS`; `write` is
+//!   `hdSetDoublev(HD_CURRENT_FORCE)`, `hdEndFrame`; `descriptor` is `HD_NOMINAL_MAX_FORCE`, `HD_NOMINAL_MAX_STIFFNESS`.
+//! - Force Dimension: `read` is `dhdGetPosition`, `dhdGetButton`; `write` is `dhdSetForce`. Do not call
+//!   `dhdEnableExpertMode`.
+//! - Haply Inverse3: `read` is the newest `cursor_position` of its stream; `write` is `set_cursor_force`. Its z axis points
+//!   up, like ours.
+
+use glam::DVec3;
+use palpate_touch::Device;
+
+/// What a device reports at a tick.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Reading {
+    /// Position in the device's frame, m.
+    pub place_m: DVec3,
+    /// The operator asks for forces, by a button or pedal. Only a change from false to true enables them.
+    pub enable: bool,
+}
+
+/// A haptic device.
+///
+/// Each tick calls `read` and then `write` once; both must return within a fraction of a tick. An error of either ends the
+/// loop, which then writes a force of zero once. So does every other end of the loop.
+///
+/// # Example
+///
+/// An adapter for a library that measures in millimetres, with y up and z towards the operator:
+///
+/// ```
+/// use glam::DVec3;
+/// use palpate_client::{HapticDevice, Reading};
+/// use palpate_touch::Device;
+/// # mod maker {
+/// #     pub struct Handle;
+/// #     impl Handle {
+/// #         pub fn position_mm(&self) -> Option<[f64; 3]> { Some([1.0, 2.0, 3.0]) }
+/// #         pub fn is_pressed(&self) -> bool { true }
+/// #         pub fn set_force_n(&mut self, _: [f64; 3]) -> bool { true }
+/// #     }
+/// # }
+///
+/// struct Adapter(maker::Handle);
+///
+/// impl HapticDevice for Adapter {
+///     fn descriptor(&self) -> Device {
+///         Device {
+///             name: "mine",
+///             force_n: 3.3,
+///             continuous_n: 0.9,
+///             stiffness_n_per_m: 700.0,
+///             damping_n_s_per_m: 5.0,
+///             workspace_m: 0.1,
+///         }
+///     }
+///
+///     fn read(&mut self) -> std::io::Result<Reading> {
+///         let [x, y, z] = self.0.position_mm().ok_or(std::io::ErrorKind::NotConnected)?;
+///         Ok(Reading { place_m: 1e-3 * DVec3::new(x, -z, y), enable: self.0.is_pressed() })
+///     }
+///
+///     fn write(&mut self, force_n: DVec3) -> std::io::Result<()> {
+///         let is_set = self.0.set_force_n([force_n.x, force_n.z, -force_n.y]);
+///         is_set.then_some(()).ok_or(std::io::ErrorKind::NotConnected.into())
+///     }
+/// }
+/// # let mut adapter = Adapter(maker::Handle);
+/// # assert_eq!(adapter.read().unwrap().place_m, DVec3::new(0.001, -0.003, 0.002));
+/// # adapter.write(DVec3::Z).unwrap();
+/// ```
+pub trait HapticDevice: Send {
+    /// The device's limits. The server is told them, and no force goes beyond them.
+    fn descriptor(&self) -> Device;
+    /// Reads position and button.
+    ///
+    /// # Errors
+    /// Returns an error if the device can't be read.
+    fn read(&mut self) -> std::io::Result<Reading>;
+    /// Sets the force to render until the next tick, N, in the device's frame.
+    ///
+    /// # Errors
+    /// Returns an error if the force can't be set.
+    fn write(&mut self, force_n: DVec3) -> std::io::Result<()>;
+}

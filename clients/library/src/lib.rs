@@ -1,0 +1,79 @@
+//! Clients of a Palpate server.
+//!
+//! - [`connect`]: connections, plain or TLS, with the caller's credentials, deadlines, and errors in words.
+//! - [`touch`]: the haptic stream, for programs that send commands and render forces themselves.
+//! - [`device`] and [`bridge`]: the trait of haptic devices, and the loop that connects one to a server at 1 kHz.
+//! - [`watch`]: the samples of a session, without a tool.
+//! - [`view`]: the frames of a session: how its surface moves.
+//!
+//! The messages are those of the crate `palpate-proto`, which also has clients for the calls that need no help: they take a
+//! [`Channel`]. What is rendered, and its safety limits, is in the crate `palpate-touch`.
+//!
+//! # Example
+//!
+//! Touches a new session of the scene `liver` with a device, until the program is interrupted:
+//!
+//! ```no_run
+//! use palpate_client::bridge::{Options, Session, Target};
+//! use palpate_client::{Credentials, HapticDevice, Server};
+//! use palpate_touch::Tip;
+//!
+//! async fn touch(device: impl HapticDevice + 'static) -> Result<(), palpate_client::Error> {
+//!     let target = Target {
+//!         server: Server::new("https://server.example:7117", &Credentials::default())?,
+//!         session: Session::New { scene: "liver".to_owned() },
+//!         tool: 0,
+//!         tip: Tip::default(),
+//!         deadband: 0.0,
+//!         holder: "my program".to_owned(),
+//!     };
+//!     let (_device, report) = palpate_client::bridge::run(device, target, Options::default(), std::future::pending()).await?;
+//!     println!("{} connections, {} late ticks", report.traffic.connections, report.late_ticks);
+//!     Ok(())
+//! }
+//! ```
+
+// Clients live in real time; the rule is for what a server computes.
+#![allow(clippy::disallowed_methods)]
+
+pub mod bridge;
+pub mod connect;
+pub mod device;
+pub mod touch;
+pub mod view;
+pub mod watch;
+
+pub use connect::{Channel, Credentials, Server, Token, describe};
+pub use device::{HapticDevice, Reading};
+pub use touch::Touch;
+
+/// An error of this library.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// An argument is not valid. Nothing was sent.
+    #[error("{0}")]
+    Argument(String),
+    /// The server can't be reached, the connection broke, or the server does not keep to the protocol.
+    #[error("{0}")]
+    Connection(String),
+    /// The server refused a call, or the connection broke during it.
+    #[error("{}", describe(.0))]
+    Call(#[from] tonic::Status),
+    /// The device can't be read or written.
+    #[error("the device: {0}")]
+    Device(#[from] std::io::Error),
+    /// A panic in this library or in the device's code.
+    #[error("internal error ({0})")]
+    Internal(String),
+}
+
+impl Error {
+    /// Whether an input was refused, by this library or by the server: the same call would be refused again.
+    pub fn is_refusal(&self) -> bool {
+        match self {
+            Error::Argument(_) => true,
+            Error::Call(status) => matches!(status.code(), tonic::Code::InvalidArgument | tonic::Code::NotFound),
+            Error::Connection(_) | Error::Device(_) | Error::Internal(_) => false,
+        }
+    }
+}

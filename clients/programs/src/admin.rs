@@ -1,0 +1,125 @@
+//! `palpate admin`: shows what callers use of a server, and takes it from them.
+
+use palpate_client::{Channel, describe};
+use palpate_proto::pb;
+use pb::admin_service_client::AdminServiceClient;
+use pb::session_service_client::SessionServiceClient;
+
+use crate::{Failure, credentials};
+
+/// Arguments of `admin`.
+#[derive(clap::Args)]
+pub(crate) struct Arguments {
+    #[command(subcommand)]
+    act: Act,
+    /// The server
+    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7117", global = true)]
+    server: String,
+    #[command(flatten)]
+    credentials: credentials::Arguments,
+}
+
+#[derive(clap::Subcommand)]
+enum Act {
+    /// Show what each caller uses: memory, sessions, streams, tools, recent processor time
+    Callers,
+    /// Show the streams of a session: number, caller, age
+    Streams {
+        /// As `palpate top` shows it
+        session: String,
+    },
+    /// Release a tool whoever holds it; its action ends at the next step
+    FreeTool {
+        /// As `palpate top` shows it
+        session: String,
+        /// The tool's number
+        tool: u32,
+    },
+    /// End a stream and release the tools that it holds
+    CutStream {
+        /// As `palpate top` shows it
+        session: String,
+        /// As `streams` shows it
+        number: u64,
+    },
+    /// End all streams of a caller, release its tools and close its connections; it can come back while its token is valid
+    CutCaller {
+        /// As `callers` shows it: token:NAME or address:IP
+        caller: String,
+        /// Also delete the sessions that it created
+        #[arg(long)]
+        delete_sessions: bool,
+    },
+    /// Recover a session in state HELD: paused at its step, the tissue at rest, all tools released
+    Revive {
+        /// As `palpate top` shows it
+        session: String,
+    },
+    /// Delete a session and end all its streams
+    Delete {
+        /// As `palpate top` shows it
+        session: String,
+    },
+}
+
+/// Performs the action and prints the result.
+pub(crate) async fn admin(arguments: &Arguments) -> Result<(), Failure> {
+    let channel = arguments.credentials.server(&arguments.server)?.connect().await?;
+    let text = act(&arguments.act, channel).await.map_err(|status| Failure::Failed(describe(&status)))?;
+    crate::tell!("{text}");
+    Ok(())
+}
+
+async fn act(act: &Act, channel: Channel) -> Result<String, tonic::Status> {
+    let mut admin = AdminServiceClient::new(channel.clone());
+    Ok(match act {
+        Act::Callers => {
+            let callers = admin.list_callers(pb::ListCallersRequest {}).await?.into_inner().callers;
+            let head = format!(
+                "{:40} {:>8} {:>8} {:>8} {:>6} {:>6}",
+                "caller", "MiB", "sessions", "streams", "tools", "cores"
+            );
+            let line = |caller: &pb::CallerUse| {
+                let pb::CallerUse { caller, memory_bytes, sessions, streams, tools, processor_share } = caller;
+                let mib = memory_bytes >> 20;
+                format!("{caller:40} {mib:>8} {sessions:>8} {streams:>8} {tools:>6} {processor_share:>6.3}")
+            };
+            std::iter::once(head).chain(callers.iter().map(line)).collect::<Vec<_>>().join("\n")
+        }
+        Act::Streams { session } => {
+            let request = pb::ListStreamsRequest { session_id: session.clone() };
+            let streams = admin.list_streams(request).await?.into_inner().streams;
+            let head = format!("{:>6} {:14} {:40} {:>5} {:>9}", "number", "call", "caller", "tools", "open s");
+            let line = |stream: &pb::StreamUse| {
+                let pb::StreamUse { number, call, caller, holds_tools, age_s } = stream;
+                let tools = if *holds_tools { "holds" } else { "-" };
+                format!("{number:>6} {call:14} {caller:40} {tools:>5} {age_s:>9.1}")
+            };
+            std::iter::once(head).chain(streams.iter().map(line)).collect::<Vec<_>>().join("\n")
+        }
+        Act::FreeTool { session, tool } => {
+            admin.free_tool(pb::FreeToolRequest { session_id: session.clone(), tool: *tool }).await?;
+            format!("tool {tool} is free")
+        }
+        Act::CutStream { session, number } => {
+            admin.cut_stream(pb::CutStreamRequest { session_id: session.clone(), number: *number }).await?;
+            format!("stream {number} is cut")
+        }
+        Act::CutCaller { caller, delete_sessions } => {
+            let request = pb::CutCallerRequest { caller: caller.clone(), delete_sessions: *delete_sessions };
+            let pb::CutCallerResponse { streams, tools, connections, sessions } =
+                admin.cut_caller(request).await?.into_inner();
+            format!("{streams} streams, {tools} tools, {connections} connections, {sessions} sessions ended")
+        }
+        Act::Revive { session } => {
+            let request = pb::ReviveSessionRequest { session_id: session.clone() };
+            let step = admin.revive_session(request).await?.into_inner().step;
+            format!("paused at step {step}")
+        }
+        Act::Delete { session } => {
+            let mut sessions = SessionServiceClient::new(channel);
+            sessions.delete_session(pb::DeleteSessionRequest { session_id: session.clone() }).await?;
+            "deleted".to_owned()
+        }
+    })
+}

@@ -1,0 +1,107 @@
+//! `palpate-client bridge`: connects a haptic device to a server at 1 kHz; so far a simulated one.
+
+use std::time::Duration;
+
+use glam::DVec3;
+use palpate_client::bridge::{Options, Session, Target, Tick, run};
+use palpate_proto::refusal::Refusal;
+use palpate_touch::{Reason, State, Tip};
+use serde_json::json;
+
+use crate::simulated::random::Random;
+use crate::simulated::task::{LEAD_S, Task};
+use crate::simulated::{Simulated, device_named, hand_named};
+use crate::{Failure, credentials, interrupted, warn};
+
+/// Arguments of `bridge`.
+#[derive(clap::Args)]
+pub(crate) struct Arguments {
+    /// The server
+    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7117")]
+    server: String,
+    /// ID of an existing session [default: a new session of --scene]
+    #[arg(long, value_name = "ID")]
+    session: Option<String>,
+    /// Name of a scene of the server
+    #[arg(long, value_name = "NAME", default_value = "liver")]
+    scene: String,
+    /// The tool's number
+    #[arg(long, default_value_t = 0)]
+    tool: u32,
+    /// The simulated device: touch, omni, desktop, falcon, omega3, delta3, sigma7, lambda7, inverse3 or undeclared
+    #[arg(long, default_value = "omega3")]
+    device: String,
+    /// The simulated hand that holds the device: light, medium, firm or none
+    #[arg(long, default_value = "medium")]
+    hand: String,
+    /// Receive a sample only when the rendered force would be off by more than this fraction; 0: one per step
+    #[arg(long, value_name = "PART", default_value_t = 0.0)]
+    deadband: f64,
+    /// End after this time, s [default: at Ctrl-C]
+    #[arg(long, value_name = "S")]
+    seconds: Option<f64>,
+    /// Seed of the simulated hand's movements
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Write time, place, force and state of each tick to this file (CSV); at most an hour
+    #[arg(long, value_name = "FILE")]
+    course: Option<std::path::PathBuf>,
+    #[command(flatten)]
+    credentials: credentials::Arguments,
+}
+
+/// Scale of the depths of the simulated hand's presses.
+const SCALE: f64 = 0.2;
+
+/// Runs a simulated device and prints the results.
+///
+/// # Errors
+/// Returns an error if an argument is refused, no connection succeeds, or the course can't be written.
+pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
+    let refused = |refusal: Refusal| Failure::Refused(refusal.to_string());
+    let (hand, device) =
+        (hand_named(&arguments.hand).map_err(refused)?, device_named(&arguments.device).map_err(refused)?);
+    let seconds = arguments.seconds.unwrap_or(3600.0);
+    let task = Task::new(DVec3::ZERO, LEAD_S, seconds, SCALE, &mut Random::new(arguments.seed, 0));
+    let target = Target {
+        server: arguments.credentials.server(&arguments.server)?,
+        session: match &arguments.session {
+            Some(id) => Session::Existing(id.clone()),
+            None => Session::New { scene: arguments.scene.clone() },
+        },
+        tool: arguments.tool,
+        tip: Tip::default(),
+        deadband: arguments.deadband,
+        holder: "palpate-client bridge".to_owned(),
+    };
+    let lasts = arguments.seconds.map(Duration::try_from_secs_f64).transpose();
+    let lasts = lasts.map_err(|error| Failure::Refused(format!("--seconds: {error}")))?;
+    let options = Options { lasts, remembers: arguments.course.is_some(), warn: Some(Box::new(warn)) };
+    let (_, served) = run(Simulated::new(device, hand, task, false), target, options, interrupted()).await?;
+    if let Some(path) = &arguments.course {
+        write_course(path, &served.course)?;
+    }
+    let traffic = served.traffic;
+    let mut report = json!({
+        "connections": traffic.connections, "samples": traffic.samples, "commands_refused": traffic.refused,
+        "late_ticks": served.late_ticks, "missed_ticks": served.missed_ticks,
+    });
+    if let Some(envelope) = &served.envelope {
+        report["energy_j"] = json!(envelope.energy_j());
+        report["enabled"] = json!(envelope.state() == State::Enabled);
+        let counts = Reason::ALL.iter().map(|(reason, name)| ((*name).to_owned(), json!(envelope.count(*reason).0)));
+        report["interventions_ticks"] = serde_json::Value::Object(counts.collect());
+    }
+    crate::tell!("{report}");
+    Ok(())
+}
+
+fn write_course(path: &std::path::Path, course: &[Tick]) -> Result<(), Failure> {
+    let mut text = "time_s,x_m,y_m,z_m,force_x_n,force_y_n,force_z_n,state\n".to_owned();
+    for Tick { time_s, place_m, force_n, state } in course {
+        let state = state.map_or("none".to_owned(), |state| format!("{state:?}").to_lowercase());
+        let [place, force] = [place_m, force_n].map(|v| format!("{:.7},{:.7},{:.7}", v.x, v.y, v.z));
+        text += &format!("{time_s:.9},{place},{force},{state}\n");
+    }
+    std::fs::write(path, text).map_err(|error| Failure::Failed(format!("{}: {error}", path.display())))
+}

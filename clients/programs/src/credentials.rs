@@ -1,0 +1,80 @@
+//! The options that say who calls, and which servers are trusted.
+
+use std::path::{Path, PathBuf};
+
+use palpate_client::{Credentials, Server, Token};
+
+use crate::Failure;
+
+/// The caller's credentials, and which servers are trusted.
+#[derive(clap::Args, Debug, Clone, Default)]
+#[command(next_help_heading = "Credentials (a server on this machine usually needs none)")]
+pub(crate) struct Arguments {
+    /// File with your token [or set the environment variable PALPATE_TOKEN to the token itself]
+    #[arg(long, value_name = "FILE")]
+    token_file: Option<PathBuf>,
+    /// Certificates (PEM) to trust for https URLs instead of the system's
+    #[arg(long, value_name = "FILE")]
+    ca: Option<PathBuf>,
+    /// Name that the server's certificate must carry, if it differs from the URL's host
+    #[arg(long, value_name = "NAME")]
+    tls_name: Option<String>,
+    /// Your client certificate (PEM), if the server requires one
+    #[arg(long, value_name = "FILE", requires = "key")]
+    cert: Option<PathBuf>,
+    /// Private key of the client certificate (PEM)
+    #[arg(long, value_name = "FILE", requires = "cert")]
+    key: Option<PathBuf>,
+}
+
+impl Arguments {
+    /// The server at `url`, with these credentials.
+    ///
+    /// # Errors
+    /// Returns an error if the URL or a file is refused.
+    pub(crate) fn server(&self, url: &str) -> Result<Server, Failure> {
+        let credentials = Credentials {
+            token: self.token()?,
+            ca: self.ca.as_deref().map(|path| read("--ca", path)).transpose()?,
+            tls_name: self.tls_name.clone(),
+            cert_and_key: match (&self.cert, &self.key) {
+                (Some(cert), Some(key)) => Some((read("--cert", cert)?, read("--key", key)?)),
+                _ => None,
+            },
+        };
+        Server::new(url, &credentials).map_err(|error| Failure::Refused(format!("--server {error}")))
+    }
+
+    fn token(&self) -> Result<Option<Token>, Failure> {
+        let (text, place) = match (&self.token_file, std::env::var("PALPATE_TOKEN")) {
+            (Some(path), _) => {
+                warn_if_readable(path);
+                (read("--token-file", path)?, path.display().to_string())
+            }
+            (None, Ok(text)) => (text, "PALPATE_TOKEN".to_owned()),
+            (None, Err(_)) => return Ok(None),
+        };
+        Token::new(&text).map(Some).map_err(|error| Failure::Refused(format!("{place}: {error}")))
+    }
+}
+
+/// Warns if every user of this machine can read the token file.
+fn warn_if_readable(path: &Path) {
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::PermissionsExt;
+        if std::fs::metadata(path).is_ok_and(|meta| meta.permissions().mode() & 0o007 != 0) {
+            let path = path.display();
+            crate::say!(
+                "palpate-client: warning: {path}: every user of this machine can read it; run `chmod o= {path}`"
+            );
+        }
+    }
+    #[cfg(not(unix))]
+    let _ = path;
+}
+
+fn read(option: &str, path: &Path) -> Result<String, Failure> {
+    std::fs::read_to_string(path)
+        .map_err(|e| Failure::Refused(format!("{option} {}: can't be read: {e}", path.display())))
+}

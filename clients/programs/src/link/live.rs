@@ -1,0 +1,104 @@
+//! A run in real time, over a real connection to a real server: it validates the runs in virtual time. The simulated hand,
+//! its task and the twin are those of `run`. The twin follows the tool's course afterwards, step by step of the time that
+//! has passed, whether the client was late or not.
+
+use std::time::Duration;
+
+use glam::DVec3;
+use palpate_client::Server;
+use palpate_client::bridge::{self, Options, Session, Target};
+use palpate_touch::Reason;
+
+use super::run::{Outcome, Setup, TICK_S, Totals, fitting_scale};
+use super::tissue::{Tissue, Twin};
+use super::with_tissue;
+use crate::simulated::random::Random;
+use crate::simulated::task::Task;
+use crate::simulated::{Part, Simulated};
+use crate::{Failure, interrupted, warn};
+
+/// Time before the first press, s: the server computes its force law first.
+const LEAD_S: f64 = 3.0;
+
+/// Performs the run at a server, which must know the scene by its name.
+pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failure> {
+    let Setup { model, law, tip, hand, device, deadband, duration_s, seed, .. } = setup;
+    let middle_m = (model.scene.sheet.extent_m() / 2.0).extend(0.0);
+    let scale = with_tissue(|| fitting_scale(setup, LEAD_S))?;
+    let task = Task::new(DVec3::ZERO, LEAD_S, *duration_s, scale, &mut Random::new(*seed, 0));
+    let simulated = Simulated::new(*device, *hand, task, true);
+    let target = Target {
+        server,
+        session: Session::New { scene: model.scene.name.clone() },
+        tool: 0,
+        tip: *tip,
+        deadband: *deadband,
+        holder: "palpate-client link".to_owned(),
+    };
+    let lasts = Some(Duration::from_secs_f64(*duration_s));
+    let options = Options { lasts, remembers: true, warn: Some(Box::new(warn)) };
+    let (simulated, mut served) = bridge::run(simulated, target, options, interrupted()).await?;
+    let mut totals = Totals::default();
+    with_tissue(|| {
+        let mut twin = Twin::new(Tissue::new(model, *tip, law.clone()));
+        for (step, part) in steps(simulated.course()).enumerate() {
+            // The device's place is relative to the middle of the sheet.
+            let (true_n, touches) = twin.truth(part.place_m + middle_m)?;
+            totals.moved(part.place_m);
+            #[allow(clippy::cast_precision_loss)]
+            totals.rendered((step + 1) as f64 * TICK_S, part.force_n, true_n, touches, None);
+        }
+        Ok(())
+    })?;
+    totals.ages_s.append(&mut served.ages_s);
+    let mut outcome = totals.close();
+    outcome.scale = scale;
+    // From the simulated hand, which is exact between these steps too.
+    outcome.energy_min_j = simulated.energy_min_j();
+    outcome.packets_per_s = served.traffic.samples as f64 / duration_s;
+    outcome.kbit_per_s = served.traffic.bytes as f64 * 8e-3 / duration_s;
+    outcome.commands_per_s = TICK_S.recip();
+    outcome.late_ticks = Some(served.late_ticks);
+    if let Some(envelope) = &served.envelope {
+        let (acted, ticks) = envelope.count(Reason::Passivity);
+        outcome.guard_share = acted as f64 / ticks.max(1) as f64;
+        outcome.interventions = Reason::ALL.iter().map(|(reason, name)| (*name, envelope.count(*reason).0)).collect();
+    }
+    Ok(outcome)
+}
+
+/// A course resampled at each whole tick: the place, interpolated linearly, and the force that the device held.
+fn steps(course: &[Part]) -> impl Iterator<Item = Part> {
+    let (mut at, mut tick) = (1, 0_u32);
+    std::iter::from_fn(move || {
+        tick += 1;
+        let time_s = f64::from(tick) * TICK_S;
+        while course.get(at)?.time_s < time_s {
+            at += 1;
+        }
+        let (before, after) = (&course[at - 1], &course[at]);
+        let part = ((time_s - before.time_s) / (after.time_s - before.time_s)).clamp(0.0, 1.0);
+        Some(Part { time_s, place_m: before.place_m.lerp(after.place_m, part), force_n: after.force_n })
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_course_with_a_stall_is_resampled_by_the_time_that_passed() {
+        let part = |time_s: f64, z_m: f64, z_n: f64| Part {
+            time_s,
+            place_m: DVec3::new(0.0, 0.0, z_m),
+            force_n: DVec3::new(0.0, 0.0, z_n),
+        };
+        // Two parts, a stall of a tenth of a second, and one more.
+        let course =
+            [part(0.0005, 0.0, 1.0), part(0.0015, 1.0, 2.0), part(0.1015, 101.0, 3.0), part(0.1025, 101.5, 4.0)];
+        let steps: Vec<Part> = steps(&course).collect();
+        assert_eq!(steps.len(), 102);
+        assert!((steps[0].place_m.z - 0.5).abs() < 1e-9 && steps[0].force_n.z == 2.0);
+        assert!((steps[50].place_m.z - 50.5).abs() < 1e-6 && steps[50].force_n.z == 3.0);
+    }
+}

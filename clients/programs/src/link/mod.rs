@@ -1,0 +1,261 @@
+//! `palpate-client link`: simulates hand, device, network and tissue in one loop in virtual time. The seed determines the
+//! result. Only this program drives a tissue itself.
+
+mod boundary;
+mod live;
+mod network;
+mod random;
+mod run;
+mod tissue;
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use clap::{Args, ValueEnum};
+use palpate::force_law;
+use palpate::limits::Limits;
+use palpate::memory;
+use palpate::scene::{BUILT_IN, Scene};
+use palpate::sheet::Model;
+use palpate_proto::refusal::{Reason, Refusal, number};
+use palpate_touch::Tip;
+use serde_json::{Value, json};
+
+use crate::simulated::{device_named, hand_named};
+use crate::{Failure, credentials};
+use network::Conditions;
+use run::{Outcome, Scheme, Setup, run};
+
+/// Arguments of `link`.
+#[derive(Args)]
+pub(crate) struct Arguments {
+    /// A scene file, or the name of a scene in ./scenes or built in (fibrotic, liver, paper, stomach)
+    #[arg(long, default_value = "liver")]
+    scene: PathBuf,
+    /// The hand that holds the device: light, medium or firm; or none: a weak string leads the device
+    #[arg(long, default_value = "medium")]
+    hand: String,
+    /// The device: touch, omni, desktop, falcon, omega3, delta3, sigma7, lambda7 or inverse3; or undeclared
+    #[arg(long, default_value = "omega3")]
+    device: String,
+    /// Round-trip time, ms
+    #[arg(long, value_name = "MS", conflicts_with = "profile")]
+    rtt_ms: Option<f64>,
+    /// Standard deviation of the delay each way, ms; messages stay in order
+    #[arg(long, value_name = "MS", conflicts_with = "profile")]
+    jitter_ms: Option<f64>,
+    /// Fraction of the messages that TCP must retransmit, which delays all later ones
+    #[arg(long, value_name = "PART", conflicts_with = "profile")]
+    loss: Option<f64>,
+    /// Stall the client once a second, at a random moment, for this long, ms; the device holds its last force
+    #[arg(long, value_name = "MS", default_value_t = 0.0, conflicts_with = "random")]
+    stall_ms: f64,
+    /// A network by name, instead of the three options above
+    #[arg(long)]
+    profile: Option<Profile>,
+    /// How the client renders samples
+    #[arg(long, default_value = "model")]
+    scheme: Scheme,
+    /// Send a sample only when the force that the client renders is off by more than this fraction; 0 sends one per step
+    #[arg(long, value_name = "PART", default_value_t = 0.0)]
+    deadband: f64,
+    /// Duration in simulated time, s
+    #[arg(long, value_name = "S", default_value_t = 20.0)]
+    seconds: f64,
+    /// Seed of the task and the network
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Radius of the tool's tip, m
+    #[arg(long, value_name = "M", default_value_t = Tip::default().radius_m)]
+    radius_m: f64,
+    /// Friction coefficient of the tip
+    #[arg(long, default_value_t = Tip::default().friction)]
+    friction: f64,
+    /// Print one JSON object instead of a table
+    #[arg(long)]
+    json: bool,
+    /// Write time, depth, rendered and true force of each tick to this file (CSV)
+    #[arg(long, value_name = "FILE")]
+    course: Option<PathBuf>,
+    /// Run in real time against this server, which must know the scene by its name, over the real network
+    #[arg(long, value_name = "URL", conflicts_with_all = ["rtt_ms", "jitter_ms", "loss", "stall_ms", "profile", "random", "boundary"])]
+    server: Option<String>,
+    #[command(flatten)]
+    credentials: credentials::Arguments,
+    /// Run this many random combinations of scene, hand, device, network and task, with seeds from --seed on; report the
+    /// worst value of each figure
+    #[arg(long, value_name = "RUNS", conflicts_with_all = ["course", "boundary"])]
+    random: Option<u64>,
+    /// Find the delay at which hand and spring become unstable, and compare it with theory
+    #[arg(long, conflicts_with = "course")]
+    boundary: bool,
+}
+
+/// Networks by name: round trip, jitter each way, loss.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Profile {
+    /// 0.5 ms
+    Lan,
+    /// 10 ± 2 ms
+    Metro,
+    /// 50 ± 10 ms, one message in a thousand lost
+    Wan,
+    /// 120 ± 40 ms, one message in a hundred lost
+    BadWan,
+}
+
+impl Profile {
+    fn conditions(self) -> Conditions {
+        let (round_trip_s, jitter_s, loss) = match self {
+            Profile::Lan => (0.0005, 0.0, 0.0),
+            Profile::Metro => (0.010, 0.002, 0.0),
+            Profile::Wan => (0.050, 0.010, 0.001),
+            Profile::BadWan => (0.120, 0.040, 0.01),
+        };
+        Conditions { round_trip_s, jitter_s, loss }
+    }
+}
+
+/// Longest simulated time, s.
+const LONGEST_S: f64 = 3600.0;
+
+/// Performs the run or runs and prints the results.
+///
+/// # Errors
+/// Returns an error if an argument is refused, a run fails, or a file can't be written.
+pub(crate) async fn link(arguments: &Arguments) -> Result<(), Failure> {
+    if arguments.boundary {
+        return boundary::print(arguments.json);
+    }
+    if let Some(runs) = arguments.random {
+        return random::print(arguments, runs);
+    }
+    let setup = memory::attempt("--scene", || setup(arguments)).map_err(refused)?;
+    let outcome = match &arguments.server {
+        Some(server) => live::run(&setup, arguments.credentials.server(server)?).await?,
+        None => with_tissue(|| run(&setup))?,
+    };
+    if let Some(path) = &arguments.course {
+        let mut text = "time_s,depth_m,rendered_n,true_n\n".to_owned();
+        for [time_s, depth_m, rendered_n, true_n] in &outcome.course {
+            text += &format!("{time_s:.3},{depth_m:.6},{rendered_n:.6},{true_n:.6}\n");
+        }
+        std::fs::write(path, text).map_err(|error| Failure::Failed(format!("{}: {error}", path.display())))?;
+    }
+    let figures = figures(&setup, &outcome);
+    if arguments.json {
+        crate::tell!("{figures}");
+    } else if let Value::Object(fields) = figures {
+        for (name, value) in fields {
+            crate::tell!("{name:<26} {value}");
+        }
+    }
+    Ok(())
+}
+
+fn refused(refusal: Refusal) -> Failure {
+    Failure::Refused(refusal.to_string())
+}
+
+/// Does something with a tissue.
+///
+/// # Errors
+/// Returns an error if the system has no memory for the tissue (exit status 2), or if the guard stops it (1).
+fn with_tissue<T>(work: impl FnOnce() -> Result<T, String>) -> Result<T, Failure> {
+    memory::attempt("--scene", || Ok(work())).map_err(refused)?.map_err(Failure::Failed)
+}
+
+/// Loads a scene file, a scene in ./scenes, or a built-in scene.
+///
+/// # Errors
+/// Returns an error if there is no such scene, or if it is invalid.
+fn scene_named(name: &std::path::Path, limits: &Limits) -> Result<Scene, Refusal> {
+    let mut beside = std::path::Path::new("scenes").join(name).into_os_string();
+    beside.push(".toml");
+    let beside = PathBuf::from(beside);
+    let built_in = name.to_str().and_then(|name| BUILT_IN.iter().find(|scene| scene.0 == name));
+    match built_in {
+        _ if name.is_file() => Scene::load(name, &[], limits),
+        _ if beside.is_file() => Scene::load(&beside, &[], limits),
+        Some((name, text)) => Scene::parse(name, text, &[], limits),
+        None => {
+            let names: Vec<&str> = BUILT_IN.iter().map(|scene| scene.0).collect();
+            let message = format!("there is no scene `{}`; the built-in ones are {}", name.display(), names.join(", "));
+            Err(Refusal::new(Reason::UnknownScene, "--scene", message))
+        }
+    }
+}
+
+fn setup(arguments: &Arguments) -> Result<Setup, Refusal> {
+    let limits = Limits::default();
+    let hand = hand_named(&arguments.hand)?;
+    let device = device_named(&arguments.device)?;
+    let conditions = match arguments.profile {
+        Some(profile) => profile.conditions(),
+        None => {
+            let part = |field: &str, value: Option<f64>, range: &str, most: f64| {
+                number(field, value.unwrap_or(0.0), range, |v| (0.0..=most).contains(&v))
+            };
+            Conditions {
+                round_trip_s: 1e-3 * part("--rtt-ms", arguments.rtt_ms, "from 0 to 10000", 1e4)?,
+                jitter_s: 1e-3 * part("--jitter-ms", arguments.jitter_ms, "from 0 to 10000", 1e4)?,
+                loss: part("--loss", arguments.loss, "from 0 to 1", 1.0)?,
+            }
+        }
+    };
+    let range = format!("from 0.001 to {LONGEST_S}");
+    let duration_s = number("--seconds", arguments.seconds, &range, |v| (1e-3..=LONGEST_S).contains(&v))?;
+    let stalls = "from 0 to 1000";
+    let stall_s = 1e-3 * number("--stall-ms", arguments.stall_ms, stalls, |v| (0.0..=1000.0).contains(&v))?;
+    let deadband = number("--deadband", arguments.deadband, "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
+    let scene = scene_named(&arguments.scene, &limits)?;
+    let tip = Tip { radius_m: arguments.radius_m, friction: arguments.friction, ..Tip::default() };
+    scene.sheet.check_tip("--tip", &tip)?;
+    let model = Model::compile(&scene, &limits)?;
+    let law = Arc::new(force_law::exact(&model, tip.radius_m));
+    let (scheme, seed) = (arguments.scheme, arguments.seed);
+    Ok(Setup { model, law, tip, hand, device, conditions, stall_s, scheme, deadband, duration_s, seed })
+}
+
+/// The figures of a run that are printed.
+fn figures(setup: &Setup, outcome: &Outcome) -> Value {
+    let interventions: serde_json::Map<String, Value> =
+        outcome.interventions.iter().map(|(name, ticks)| ((*name).to_owned(), json!(ticks))).collect();
+    let [limited, dropped, released] = outcome.path;
+    json!({
+        "scene": setup.model.scene.name,
+        "hand": setup.hand.name,
+        "device": setup.device.name,
+        "scheme": format!("{:?}", setup.scheme).to_lowercase(),
+        "rtt_ms": 1e3 * setup.conditions.round_trip_s,
+        "jitter_ms": 1e3 * setup.conditions.jitter_s,
+        "loss": setup.conditions.loss,
+        "stall_ms": 1e3 * setup.stall_s,
+        "deadband": setup.deadband,
+        "seconds": setup.duration_s,
+        "seed": setup.seed,
+        "scale": outcome.scale,
+        "force_error_rms_percent": outcome.force_error_rms_percent,
+        "force_error_p99_n": outcome.force_error_p99_n,
+        "energy_min_j": outcome.energy_min_j,
+        "jump_max_n": outcome.jump_max_n,
+        "guard_share": outcome.guard_share,
+        "rendered_share": outcome.rendered_share,
+        "packets_per_s": outcome.packets_per_s,
+        "kbit_per_s": outcome.kbit_per_s,
+        "model_age_ms_p99": outcome.model_age_ms_p99,
+        "peak_ratio": outcome.peak_ratio,
+        "unstable": outcome.unstable_at_s.is_some(),
+        "unstable_at_s": outcome.unstable_at_s,
+        "true_force_max_n": outcome.true_force_max_n,
+        "force_max_n": outcome.force_max_n,
+        "pauses": outcome.pauses,
+        "faults": outcome.faults,
+        "commands_per_s": outcome.commands_per_s,
+        "speed_limited_steps": limited,
+        "commands_dropped": dropped,
+        "releases": released,
+        "interventions_ticks": interventions,
+        "late_ticks": outcome.late_ticks,
+    })
+}

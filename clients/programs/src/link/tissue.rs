@@ -1,0 +1,89 @@
+//! The server's side of the loop: a session that plays a tool's commands and returns what the tool felt.
+
+use std::sync::Arc;
+
+use glam::DVec3;
+use palpate::scene::script::Action;
+use palpate::session::Session;
+use palpate::session::command::{Command, Due};
+use palpate::session::laws::FIRST;
+use palpate::session::local::Modeller;
+use palpate::sheet::{Feel, Model};
+use palpate_touch::path::{Path, Play};
+use palpate_touch::{Law, LocalModel, Standing, Tip};
+
+/// A tissue with one tool.
+pub(super) struct Tissue {
+    session: Session,
+    tip: Tip,
+    modeller: Modeller,
+}
+
+impl Tissue {
+    pub(super) fn new(model: &Arc<Model>, tip: Tip, law: Arc<Law>) -> Self {
+        Tissue { session: Session::new(model), tip, modeller: Modeller::new(FIRST, law, false) }
+    }
+
+    /// Performs one step, at the end of which the tool is at `place_m`, or released if that is `None`.
+    pub(super) fn step(&mut self, place_m: Option<DVec3>) -> Result<Option<Feel>, String> {
+        let tip = self.tip;
+        let action = place_m.map_or(Action::Release, |place_m| Action::Lead { place_m, tip });
+        let command = Command {
+            tool: 0,
+            sequence: self.session.step_count() + 1,
+            client_time_ns: 0,
+            at_step: None,
+            time_to_live_s: None,
+            action,
+            arrival_ns: 0,
+        };
+        self.session.advance(&mut vec![Due { command, late: false, late_commands: 0, ends_lease: false }], |_| {});
+        match self.session.fault() {
+            Some(reason) => Err(reason),
+            None => Ok(self.session.tissue().feel(0)),
+        }
+    }
+
+    /// The local model of what the tool felt in the last step.
+    fn model(&mut self, feel: &Feel, client_time_s: f64) -> LocalModel {
+        let step = self.session.step_count();
+        self.modeller.model(feel, step, client_time_s)
+    }
+}
+
+/// A tissue behind a network.
+pub(super) struct Server {
+    tissue: Tissue,
+    pub(super) path: Path,
+}
+
+impl Server {
+    pub(super) fn new(tissue: Tissue) -> Self {
+        Server { tissue, path: Path::default() }
+    }
+
+    /// Performs one step; returns its sample while the tool is in use.
+    pub(super) fn step(&mut self, now_s: f64, step_s: f64) -> Result<Option<LocalModel>, String> {
+        let (place_m, time_s) = match self.path.step(now_s, step_s) {
+            Some(Play::Lead(place_m, time_s)) => (Some(place_m), time_s),
+            Some(Play::Release) | None => (None, 0.0),
+        };
+        let feel = self.tissue.step(place_m)?;
+        Ok(feel.map(|feel| self.tissue.model(&feel, time_s)))
+    }
+}
+
+/// The same tissue without a network: its force is the true one.
+pub(super) struct Twin(Tissue);
+
+impl Twin {
+    pub(super) fn new(tissue: Tissue) -> Self {
+        Twin(tissue)
+    }
+
+    /// The force on the tool at `place_m`, N, and whether the tool touches the tissue.
+    pub(super) fn truth(&mut self, place_m: DVec3) -> Result<(DVec3, bool), String> {
+        let feel = self.0.step(Some(place_m))?;
+        Ok(feel.map_or((DVec3::ZERO, false), |feel| (feel.force_on_tool_n, feel.standing != Standing::Free)))
+    }
+}

@@ -1,0 +1,296 @@
+//! One client of a load: it strokes the tissue with a command each tick and counts the answers.
+
+use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use palpate_client::{Channel, Touch, describe};
+use palpate_proto::pb;
+use pb::touch_request::Message as Say;
+use pb::touch_response::Message as Heard;
+use tokio::sync::watch;
+use tokio_stream::StreamExt;
+use tokio_stream::wrappers::WatchStream;
+
+use super::stroke::Stroke;
+use super::tally::Tally;
+
+pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// The stage of a load, and when the measurement ended, ns.
+pub(crate) struct Stage(AtomicU8, AtomicU64);
+
+impl Stage {
+    /// Sessions and clients start; nothing is counted yet.
+    pub(crate) const RAMP: u8 = 0;
+    pub(crate) const MEASURE: u8 = 1;
+    /// Nothing more is sent; outstanding answers arrive.
+    pub(crate) const DRAIN: u8 = 2;
+
+    pub(crate) fn new() -> Self {
+        Stage(AtomicU8::new(Stage::RAMP), AtomicU64::new(0))
+    }
+
+    pub(crate) fn measure(&self) {
+        self.0.store(Stage::MEASURE, Ordering::Release);
+    }
+
+    pub(crate) fn drain(&self, now_ns: u64) {
+        self.1.store(now_ns, Ordering::Release);
+        self.0.store(Stage::DRAIN, Ordering::Release);
+    }
+
+    pub(crate) fn is(&self, stage: u8) -> bool {
+        self.0.load(Ordering::Acquire) == stage
+    }
+}
+
+/// What all clients of a thread share.
+#[derive(Clone)]
+pub(crate) struct Common {
+    pub(crate) clock: Instant,
+    pub(crate) stage: Arc<Stage>,
+    pub(crate) tally: Arc<Mutex<Tally>>,
+    /// Commands per second.
+    pub(crate) rate_hz: f64,
+}
+
+impl Common {
+    #[allow(clippy::cast_possible_truncation)]
+    pub(crate) fn now_ns(&self) -> u64 {
+        self.clock.elapsed().as_nanos() as u64
+    }
+}
+
+/// Number of commands whose send times are kept.
+const OUTSTANDING: usize = 4096;
+
+/// The commands that a client has sent, with their times.
+struct Sent {
+    /// Sequence number of the newest; the first has 1.
+    sequence: u64,
+    at_ns: Box<[u64; OUTSTANDING]>,
+    /// Newest sequence number that a sample acknowledged.
+    acknowledged: u64,
+    last_tick: Option<u64>,
+    is_open: bool,
+}
+
+impl Sent {
+    #[allow(clippy::cast_possible_truncation)]
+    fn at(&mut self, sequence: u64) -> &mut u64 {
+        &mut self.at_ns[sequence as usize % OUTSTANDING]
+    }
+
+    /// Number of commands that nothing has acknowledged or rejected.
+    fn outstanding(&mut self) -> u64 {
+        let (from, to) = (self.acknowledged + 1, self.sequence);
+        // Older commands than those kept are outstanding too, else they would count as acknowledged.
+        let kept = from.max(to.saturating_sub(OUTSTANDING as u64 - 1));
+        (kept - from) + (kept..=to).filter(|sequence| *self.at(*sequence) > 0).count() as u64
+    }
+}
+
+/// Steps of a session and when this client heard of them.
+#[derive(Default)]
+struct Heartbeat {
+    /// Server's time, ns, and step of the first and the last sample within the measurement.
+    first: Option<(u64, u64)>,
+    last: (u64, u64),
+    last_arrival_ns: u64,
+    /// Samples that were dropped before the measurement.
+    dropped_before: Option<u64>,
+    dropped: u64,
+}
+
+/// Arrival times of a session's samples, from which the age of its frames follows.
+pub(crate) struct Arrivals(Box<[(u64, u64); OUTSTANDING]>);
+
+impl Arrivals {
+    pub(crate) fn new() -> Self {
+        Arrivals(Box::new([(0, 0); OUTSTANDING]))
+    }
+
+    #[allow(clippy::cast_possible_truncation)]
+    fn note(&mut self, step: u64, arrival_ns: u64) {
+        self.0[step as usize % OUTSTANDING] = (step, arrival_ns);
+    }
+
+    #[allow(clippy::cast_possible_truncation)]
+    pub(crate) fn of(&self, step: u64) -> Option<u64> {
+        let (noted, arrival_ns) = self.0[step as usize % OUTSTANDING];
+        (noted == step && arrival_ns > 0).then_some(arrival_ns)
+    }
+}
+
+/// A client with its own tool.
+pub(crate) struct Client {
+    pub(crate) common: Common,
+    pub(crate) session_id: String,
+    pub(crate) tool: u32,
+    pub(crate) rate_hz: f64,
+    pub(crate) stroke: Stroke,
+    /// Present if the session has viewers.
+    pub(crate) arrivals: Option<Arc<Mutex<Arrivals>>>,
+}
+
+/// How long a client waits for outstanding answers.
+const PATIENCE: Duration = Duration::from_secs(2);
+
+/// A session that was silent for longer than this at the end of the measurement had stopped, ns.
+const SILENCE_NS: u64 = 50_000_000;
+
+impl Client {
+    /// Opens the stream; `ticks` tells when to send. The returned future is the client's life.
+    pub(crate) async fn open(
+        self,
+        channel: Channel,
+        ticks: watch::Receiver<u64>,
+    ) -> Result<impl Future<Output = ()>, tonic::Status> {
+        let open = pb::TouchOpen {
+            session_id: self.session_id.clone(),
+            tools: vec![self.tool],
+            lease_s: Some(10.0),
+            holder: format!("palpate-client load {}", self.tool),
+            ..Default::default()
+        };
+        let at_ns = Box::new([0; OUTSTANDING]);
+        let sent = Sent { sequence: 0, at_ns, acknowledged: 0, last_tick: None, is_open: false };
+        let sent = Arc::new(Mutex::new(sent));
+        let commands = {
+            let (sent, common, stroke, tool) = (sent.clone(), self.common.clone(), self.stroke.clone(), self.tool);
+            WatchStream::from_changes(ticks).filter_map(move |tick| command(&common, &stroke, tool, &sent, tick))
+        };
+        let inbound = Touch::open(channel, open, commands.map(Say::Command)).await?;
+        lock(&sent).is_open = true;
+        Ok(self.listen(inbound, sent))
+    }
+
+    async fn listen(self, mut inbound: Touch, sent: Arc<Mutex<Sent>>) {
+        let mut heartbeat = Heartbeat::default();
+        let mut drained = std::pin::pin!(self.drained(&sent));
+        loop {
+            let message = tokio::select! {
+                biased;
+                message = inbound.next() => message,
+                () = &mut drained => break,
+            };
+            match message {
+                Ok(Some(Heard::Sample(sample))) => {
+                    self.sample(&sample, &mut heartbeat, &mut lock(&sent));
+                }
+                Ok(Some(Heard::Rejection(rejection))) => {
+                    // A rejected command never acts, so a later acknowledgement does not count for it.
+                    *lock(&sent).at(rejection.sequence) = 0;
+                    *lock(&self.common.tally).rejected.entry(rejection.reason).or_default() += 1;
+                }
+                Ok(Some(_)) => {}
+                Ok(None) => break lock(&self.common.tally).broke("the server ended a stream".to_owned()),
+                Err(status) => break lock(&self.common.tally).broke(describe(&status)),
+            }
+        }
+        let mut tally = lock(&self.common.tally);
+        tally.lost_commands += lock(&sent).outstanding();
+        tally.lost_samples += heartbeat.dropped - heartbeat.dropped_before.unwrap_or(heartbeat.dropped);
+        tally.dilation_min = tally.dilation_min.min(heartbeat.dilation(self.rate_hz, &self.common.stage));
+    }
+
+    /// Completes when no answer is outstanding any more, or [`PATIENCE`] has passed.
+    async fn drained(&self, sent: &Mutex<Sent>) {
+        let mut begun: Option<Instant> = None;
+        loop {
+            tokio::time::sleep(Duration::from_millis(100)).await;
+            if self.common.stage.is(Stage::DRAIN) {
+                let begun = *begun.get_or_insert_with(Instant::now);
+                if lock(sent).outstanding() == 0 || begun.elapsed() > PATIENCE {
+                    return;
+                }
+            }
+        }
+    }
+
+    fn sample(&self, sample: &pb::Sample, heartbeat: &mut Heartbeat, sent: &mut Sent) {
+        let now_ns = self.common.now_ns();
+        if let Some(arrivals) = &self.arrivals {
+            lock(arrivals).note(sample.step, now_ns);
+        }
+        let acknowledged = sample.tools.first().map_or(0, |tool| tool.acknowledged_sequence);
+        let measures = self.common.stage.is(Stage::MEASURE);
+        let mut tally = measures.then(|| lock(&self.common.tally));
+        for sequence in sent.acknowledged + 1..=acknowledged.min(sent.sequence) {
+            let at_ns = std::mem::take(sent.at(sequence));
+            if let Some(tally) = tally.as_mut().filter(|_| at_ns > 0) {
+                tally.round_trip_ns.saturating_record(now_ns.saturating_sub(at_ns));
+            }
+        }
+        sent.acknowledged = sent.acknowledged.max(acknowledged);
+        if let Some(tally) = &mut tally {
+            if heartbeat.first.is_some() {
+                tally.sample_gap_ns.saturating_record(now_ns - heartbeat.last_arrival_ns);
+            }
+            tally.samples += 1;
+            tally.awake_points += u64::from(sample.awake_points);
+            heartbeat.first.get_or_insert((sample.server_time_ns, sample.step));
+            heartbeat.dropped_before.get_or_insert(sample.dropped_samples);
+            heartbeat.last = (sample.server_time_ns, sample.step);
+            heartbeat.last_arrival_ns = now_ns;
+        }
+        heartbeat.dropped = sample.dropped_samples;
+    }
+}
+
+impl Heartbeat {
+    /// Simulated time over real time: by the server's clock, plus our own for a long silence at the end.
+    #[allow(clippy::cast_precision_loss)]
+    fn dilation(&self, rate_hz: f64, stage: &Stage) -> f64 {
+        let Some(first) = self.first else { return 0.0 };
+        let silent_ns = stage.1.load(Ordering::Acquire).saturating_sub(self.last_arrival_ns);
+        let silent_ns = if silent_ns > SILENCE_NS { silent_ns } else { 0 };
+        let real_s = (self.last.0 - first.0 + silent_ns) as f64 * 1e-9;
+        if real_s > 0.0 { (self.last.1 - first.1) as f64 / rate_hz / real_s } else { 0.0 }
+    }
+}
+
+/// The command of a tick; `None` before the stream is open and after the measurement.
+fn command(common: &Common, stroke: &Stroke, tool: u32, sent: &Mutex<Sent>, tick: u64) -> Option<pb::Command> {
+    let mut sent = lock(sent);
+    let missed = sent.last_tick.replace(tick).map_or(0, |last| tick - last - 1);
+    if !sent.is_open || common.stage.is(Stage::DRAIN) {
+        return None;
+    }
+    sent.sequence += 1;
+    let (sequence, now_ns) = (sent.sequence, common.now_ns());
+    *sent.at(sequence) = now_ns;
+    if common.stage.is(Stage::MEASURE) {
+        let mut tally = lock(&common.tally);
+        tally.commands += 1;
+        tally.unsent += missed;
+    }
+    #[allow(clippy::cast_precision_loss)]
+    let action = Some(stroke.at(tick as f64 / common.rate_hz));
+    Some(pb::Command { tool, sequence, client_time_ns: now_ns, action, ..Default::default() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn dilation_is_simulated_over_real_time_and_silence_counts() {
+        let stage = Stage::new();
+        stage.drain(4_000_000_000);
+        let heartbeat = |last_arrival_ns: u64| Heartbeat {
+            first: Some((1_000_000_000, 500)),
+            last: (3_000_000_000, 2000),
+            last_arrival_ns,
+            ..Heartbeat::default()
+        };
+        // 1500 steps in 2 s; and the session was silent for two more.
+        assert!((heartbeat(4_000_000_000).dilation(1000.0, &stage) - 0.75).abs() < 1e-12);
+        assert!((heartbeat(2_000_000_000).dilation(1000.0, &stage) - 0.375).abs() < 1e-12);
+        assert!((heartbeat(4_000_000_000).dilation(500.0, &stage) - 1.5).abs() < 1e-12);
+        assert!(Heartbeat::default().dilation(1000.0, &stage).abs() < 1e-12);
+    }
+}

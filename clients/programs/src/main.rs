@@ -1,0 +1,162 @@
+//! `palpate-client`: programs that talk to a Palpate server.
+
+// Clients live in real time; the rule is for what a server computes.
+#![allow(clippy::disallowed_methods)]
+
+/// Writes a line to the standard error. A closed standard error does not end the program. Control characters that a server
+/// sent do not reach the terminal.
+macro_rules! say {
+    ($($text:tt)*) => {{
+        let text = format!($($text)*).replace(|c: char| c.is_control() && c != '\n', "?");
+        let _ = std::io::Write::write_all(&mut std::io::stderr(), (text + "\n").as_bytes());
+    }};
+}
+
+/// Writes a line to the standard output. A closed standard output does not end the program.
+macro_rules! tell {
+    ($($text:tt)*) => {{
+        let _ = std::io::Write::write_all(&mut std::io::stdout(), (format!($($text)*) + "\n").as_bytes());
+    }};
+}
+pub(crate) use {say, tell};
+
+mod admin;
+mod bridge;
+mod credentials;
+mod health;
+mod link;
+mod load;
+mod plot;
+mod replay;
+mod scene_file;
+mod simulated;
+mod top;
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+use palpate_client::Error;
+
+/// Programs that talk to a Palpate server.
+#[derive(Parser)]
+#[command(version, about, max_term_width = 100)]
+struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Play a script through a server in real time; write the records that it streams as JSON Lines
+    #[command(after_help = "Examples:\n  \
+        palpate-client replay vertical-60 --server http://127.0.0.1:7117\n  \
+        palpate-client replay my-script.toml --scene my-scene.toml --output poke.jsonl --plot\n\n\
+        The session is created paused. Each command carries the step at which it acts and is sent ahead of time. So the\n\
+        final hash equals that of `palpate run --held`, whatever the network did, unless late commands are reported.\n\n\
+        Exit status: 0; 1 when the replay failed; 2 when an input was refused.")]
+    Replay(replay::Arguments),
+    /// Simulate hand, device, network and tissue in one loop in virtual time; report how accurate and safe the touch is
+    #[command(after_help = "Examples:\n  \
+        palpate-client link --scene fibrotic --hand medium --device omega3 --rtt-ms 50\n  \
+        palpate-client link --scene liver --profile wan --scheme hold --seed 7 --json\n  \
+        palpate-client link --rtt-ms 2 --deadband 0.1\n  \
+        palpate-client link --boundary\n  \
+        palpate-client link --random 1000\n\n\
+        A simulated hand presses and strokes the tissue (minimum jerk, 5 to 15 mm, drawn by the seed; less deep where the\n\
+        true force would exceed 0.8 of the device's). `true` is the same tissue without a delay at the tool's own place.\n\
+        Errors are taken over the ticks in which either is in contact. Energies are measured at the device's port: below 0\n\
+        the port has given energy. A run is unstable, and ends, when the port gave 0.1 J or the tool left three times the\n\
+        task's amplitude. The loop runs the code of the server and of `bridge` itself.\n\n\
+        Exit status: 0; 1 when a run failed; 2 when an input was refused, or the system has no memory for the sheet.")]
+    Link(Box<link::Arguments>),
+    /// Connect a haptic device to a server at 1 kHz; so far a simulated device in a simulated hand
+    #[command(after_help = "Examples:\n  \
+        palpate-client bridge --server http://127.0.0.1:7117 --scene liver --seconds 10\n  \
+        palpate-client bridge --scene fibrotic --device touch --deadband 0.1\n\n\
+        It reconnects by itself when the connection breaks; forces return when the operator asks for them. For a real device,\n\
+        implement `HapticDevice` of the crate palpate-client (clients/library).")]
+    Bridge(bridge::Arguments),
+    /// Load a server with many sessions, haptic clients and viewers; report delays, losses and dilation
+    #[command(after_help = "Examples:\n  \
+        palpate-client load --sessions 50 --seconds 10\n  \
+        palpate-client load --sessions 20 --clients-per-session 2 --viewers 3 --scene liver --json\n  \
+        palpate-client load --find-limit 'p99<2ms,dilation>0.999'\n\n\
+        Each client strokes the tissue with a command every tick of its own clock, whatever comes back: nothing rests, and a\n\
+        late answer delays no later command. The round trip lasts from a command to the first sample that acknowledges it\n\
+        and includes the wait for the step. Lost are commands that nothing acknowledged within 2 s of the end, and samples\n\
+        that the server dropped. The age of a frame is measured against the sample of the same step. On the server's\n\
+        machine the generator takes processor time from it; the report says how much.\n\n\
+        Exit status: 0; 1 when streams broke or the server could not be reached; 2 when an input was refused.")]
+    Load(load::Arguments),
+    /// Check that a server is serving; for scripts and containers
+    #[command(after_help = "Examples:\n  \
+        palpate-client health\n  \
+        palpate-client health https://localhost:7117 --ca /etc/palpate/ca.pem\n\n\
+        Needs no token. Exit status: 0 if the server is serving; 1 if not; 2 when an input was refused.")]
+    Health(health::Arguments),
+    /// Show the sessions of a server once a second: state, step rate, dilation, awake points, holders of tools
+    #[command(after_help = "Examples:\n  \
+        palpate top\n  \
+        palpate top https://server:7117 --token-file admin.token\n  \
+        palpate top --once --json | jq '.sessions[] | select(.time_dilation < 0.999)'\n\n\
+        If the server authenticates clients, your token needs the role `administer`.\n\n\
+        Exit status: 0; 1 when the server can't be reached or refuses; 2 when an input was refused.")]
+    Top(top::Arguments),
+    /// Show what each caller uses of a server; release a tool, cut a stream or a caller, revive or delete a session
+    #[command(after_help = "Examples:\n  \
+        palpate admin callers\n  \
+        palpate admin streams 0123456789abcdef0123456789abcdef\n  \
+        palpate admin cut-caller token:ann --delete-sessions --server https://server:7117 --token-file admin.token\n\n\
+        If the server authenticates clients, your token needs the role `administer`. Callers are named by their token or\n\
+        certificate, without authentication by their address. A caller that you cut can come back: remove its entry from\n\
+        the token file first.\n\n\
+        Exit status: 0; 1 when the server can't be reached or refuses; 2 when an input was refused.")]
+    Admin(admin::Arguments),
+}
+
+/// Why a program ends early.
+pub(crate) enum Failure {
+    /// Exit status 1.
+    Failed(String),
+    /// Exit status 2.
+    Refused(String),
+    /// The reader of our output closed the pipe: exit status 0.
+    Unread,
+}
+
+impl From<Error> for Failure {
+    fn from(error: Error) -> Self {
+        if error.is_refusal() { Failure::Refused(error.to_string()) } else { Failure::Failed(error.to_string()) }
+    }
+}
+
+/// Shows a warning.
+pub(crate) fn warn(message: &str) {
+    say!("palpate-client: warning: {message}");
+}
+
+/// Completes at Ctrl-C.
+pub(crate) async fn interrupted() {
+    let _ = tokio::signal::ctrl_c().await;
+}
+
+// Two threads for the network; a device runs on its own thread.
+#[tokio::main(worker_threads = 2)]
+async fn main() -> ExitCode {
+    let ended = match Arguments::parse().command {
+        Command::Replay(arguments) => replay::replay(&arguments).await,
+        Command::Link(arguments) => link::link(&arguments).await,
+        Command::Bridge(arguments) => bridge::bridge(&arguments).await,
+        Command::Load(arguments) => load::load(&arguments).await,
+        Command::Health(arguments) => health::health(&arguments).await,
+        Command::Top(arguments) => top::top(&arguments).await,
+        Command::Admin(arguments) => admin::admin(&arguments).await,
+    };
+    let (status, message) = match ended {
+        Ok(()) | Err(Failure::Unread) => return ExitCode::SUCCESS,
+        Err(Failure::Failed(message)) => (1, message),
+        Err(Failure::Refused(message)) => (2, message),
+    };
+    crate::say!("palpate-client: {message}");
+    ExitCode::from(status)
+}

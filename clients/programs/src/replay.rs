@@ -1,0 +1,496 @@
+//! `palpate-client replay`: plays a script through a server, each command at its exact step.
+
+mod measured;
+
+use std::collections::VecDeque;
+use std::io::{BufWriter, IsTerminal, Write};
+use std::path::PathBuf;
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use indicatif::{ProgressBar, ProgressStyle};
+use palpate::limits::Limits;
+use palpate::scene::record::{Line, Network, Percentiles, Record, Run, Summary, write_line};
+use palpate::scene::script::Script;
+use palpate::wire;
+use palpate_client::{Channel, Error, Touch, describe};
+use palpate_proto::geometry::point;
+use palpate_proto::pb;
+use palpate_proto::refusal::{Reason, Refusal};
+use pb::haptic_service_client::HapticServiceClient;
+use pb::session_service_client::SessionServiceClient;
+use pb::touch_request::Message as Say;
+use pb::touch_response::Message as Heard;
+use tokio::sync::mpsc;
+use tokio::task::JoinHandle;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::Status;
+
+use crate::scene_file::source;
+use crate::{Failure, credentials, plot};
+use measured::{Measured, percentiles_us};
+
+/// How far ahead of the server's step commands are sent, s: a network may stall for about as long before the session has to
+/// wait.
+const AHEAD_S: f64 = 2.0;
+
+/// Largest number of commands of a tool that are sent ahead: fewer than a session queues.
+const COMMANDS_AHEAD: u64 = 4000;
+
+/// Time between two heartbeats.
+const HEARTBEAT: Duration = Duration::from_millis(5);
+
+/// A server that is silent for longer than this has failed: a running session answers heartbeats at once.
+const SILENCE: Duration = Duration::from_secs(10);
+
+/// Time limit for creating the session.
+const PATIENCE: Duration = Duration::from_secs(120);
+
+#[derive(clap::Args)]
+pub(crate) struct Arguments {
+    /// A script file, or the name of a script in ./scripts
+    script: PathBuf,
+    /// The server
+    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7117")]
+    server: String,
+    /// Name of a scene of the server, or a scene file of your own (ends in .toml)
+    #[arg(long, value_name = "NAME", default_value = "paper")]
+    scene: String,
+    /// Write the records here instead of to the standard output
+    #[arg(short, long, value_name = "FILE")]
+    output: Option<PathBuf>,
+    /// Plot displacement and force of the first control point in the terminal
+    #[arg(long)]
+    plot: bool,
+    /// Show no progress bar
+    #[arg(short, long)]
+    quiet: bool,
+    #[command(flatten)]
+    sampling: Sampling,
+    #[command(flatten)]
+    credentials: credentials::Arguments,
+}
+
+/// The samples that the server is to send. The records do not depend on them.
+#[derive(clap::Args)]
+#[command(next_help_heading = "Samples (forces on the tools, for --plot and the table) [default: one per step]")]
+struct Sampling {
+    /// Sample every Nth step
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    every: u32,
+    /// Skip samples whose force on the tool differs from the last sample's by at most this, N
+    #[arg(long, value_name = "N")]
+    deadband_force_n: Option<f64>,
+    /// The same as a fraction of the force, 0 to 1; the larger of both applies. People notice about a tenth
+    #[arg(long, value_name = "FRACTION")]
+    deadband_force_fraction: Option<f64>,
+    /// Skip samples whose control point has moved by at most this, m. With a force deadband too, a sample is sent when
+    /// either is exceeded
+    #[arg(long, value_name = "M")]
+    deadband_displacement_m: Option<f64>,
+    /// Longest time between two samples when nothing changes, s: above 0 and at most 10 [default: 0.05]
+    #[arg(long, value_name = "SECONDS")]
+    heartbeat_s: Option<f64>,
+}
+
+impl Sampling {
+    fn deadband(&self) -> Option<pb::Deadband> {
+        let deadband = pb::Deadband {
+            force_n: self.deadband_force_n,
+            force_fraction: self.deadband_force_fraction,
+            displacement_m: self.deadband_displacement_m,
+            ..Default::default()
+        };
+        (deadband != pb::Deadband::default()).then_some(deadband)
+    }
+
+    /// Checks that samples arrive at least twice while the commands sent ahead last: samples pace the commands.
+    #[allow(clippy::cast_precision_loss)]
+    fn check(&self, rate_hz: f64, ahead: u64) -> Result<(), Failure> {
+        let most_s = 0.5 * ahead as f64 / rate_hz;
+        let apart_s = f64::from(self.every) / rate_hz;
+        for (option, seconds) in [("--every", apart_s), ("--heartbeat-s", self.heartbeat_s.unwrap_or(0.0) + apart_s)] {
+            if seconds > most_s {
+                let why = "samples pace the commands, so they must be at most";
+                return Err(Failure::Refused(format!("{option}: {why} {most_s} s apart, but would be {seconds} s")));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// When the last message of the server arrived.
+type LastHeard = Mutex<Instant>;
+
+/// The replay's session. It is deleted even when the replay fails.
+struct Session {
+    client: SessionServiceClient<Channel>,
+    id: String,
+}
+
+/// Plays the script; writes the records and a summary.
+///
+/// # Errors
+/// Returns an error if an input is refused, the server fails or is silent, or the output can't be written.
+pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
+    let server = arguments.credentials.server(&arguments.server)?;
+    let source = source(&arguments.scene)?;
+    let unreached = |why| Failure::Failed(format!("{why}; `palpate serve` starts a server"));
+    let channel = server.connect().await.map_err(unreached)?;
+    let mut client = SessionServiceClient::new(channel.clone());
+    let request =
+        pb::CreateSessionRequest { source: Some(source), paused: true, idle_timeout_s: Some(SILENCE.as_secs_f64()) };
+    let silent = |_| Failure::Failed(format!("the server created no session within {} s", PATIENCE.as_secs()));
+    let created = tokio::time::timeout(PATIENCE, client.create_session(request)).await.map_err(silent)?;
+    let created = created.map_err(refused_or_failed)?.into_inner().session;
+    let created = created.ok_or_else(|| Failure::Failed("the server's answer has no session".into()))?;
+    let mut session = Session { client, id: created.session_id.clone() };
+    let sessions = session.client.clone();
+    let heard = LastHeard::new(Instant::now());
+    let ended = tokio::select! {
+        ended = play(arguments, &created, sessions, channel, &heard) => ended,
+        failure = silence(&heard) => Err(failure),
+        _ = tokio::signal::ctrl_c() => Err(Failure::Failed("interrupted".into())),
+    };
+    // The result does not matter: a server that has ended has no sessions any more.
+    let deleted = session.client.delete_session(pb::DeleteSessionRequest { session_id: session.id });
+    let _ = tokio::time::timeout(Duration::from_secs(2), deleted).await;
+    ended
+}
+
+fn refused(refusal: Refusal) -> Failure {
+    Failure::Refused(refusal.to_string())
+}
+
+fn failed(status: Status) -> Failure {
+    Failure::Failed(format!("the server ended the replay: {}", describe(&status)))
+}
+
+fn refused_or_failed(status: Status) -> Failure {
+    Error::Call(status).into()
+}
+
+/// Sends a script's commands over the haptic stream.
+struct Streamer<'s> {
+    script: &'s Script,
+    outbound: mpsc::Sender<Say>,
+    clock: Instant,
+    next_step: u64,
+    /// For each unanswered heartbeat: all commands before this step were sent ahead of it.
+    sent_before: VecDeque<u64>,
+}
+
+impl Streamer<'_> {
+    async fn say(&self, message: Say) -> Result<(), Failure> {
+        let sent = self.outbound.send(message).await;
+        sent.map_err(|_| Failure::Failed("the server closed the haptic stream".into()))
+    }
+
+    #[allow(clippy::cast_possible_truncation)]
+    fn now_ns(&self) -> u64 {
+        self.clock.elapsed().as_nanos() as u64
+    }
+
+    /// Sends the commands of all steps before `step`.
+    async fn send_before(&mut self, step: u64) -> Result<(), Failure> {
+        while self.next_step < step.min(self.script.steps) {
+            for (tool, action) in self.script.actions_at(self.next_step) {
+                let command = wire::command::scripted(tool, self.next_step, &action, self.now_ns());
+                self.say(Say::Command(command)).await?;
+            }
+            self.next_step += 1;
+        }
+        Ok(())
+    }
+
+    async fn heartbeat(&mut self) -> Result<(), Failure> {
+        self.sent_before.push_back(self.next_step);
+        self.say(Say::Renew(pb::Renew { client_time_ns: self.now_ns() })).await
+    }
+
+    /// Called for each answered heartbeat; they are answered in order. Returns the step before which the server has all
+    /// commands.
+    fn heartbeat_answered(&mut self) -> u64 {
+        self.sent_before.pop_front().unwrap_or(0)
+    }
+}
+
+/// Runs the session until `step`. That is only as far as the server has all commands, so that none is ever late.
+fn run_until(sessions: &SessionServiceClient<Channel>, session_id: &str, step: u64) -> JoinHandle<Result<(), Status>> {
+    let mut sessions = sessions.clone();
+    let request = pb::StartSessionRequest { session_id: session_id.to_owned(), until_step: Some(step) };
+    tokio::spawn(async move { sessions.start_session(request).await.map(|_| ()) })
+}
+
+/// The message that `message` waits for.
+async fn next<T>(message: impl Future<Output = Result<Option<T>, Status>>, heard: &LastHeard) -> Result<T, Failure> {
+    let message = message.await;
+    *heard.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now();
+    match message {
+        Ok(Some(message)) => Ok(message),
+        Ok(None) => Err(Failure::Failed("the server ended the stream".into())),
+        Err(status) => Err(failed(status)),
+    }
+}
+
+/// Completes when the server has been silent for too long, whatever the replay waits for.
+async fn silence(heard: &LastHeard) -> Failure {
+    loop {
+        let last = *heard.lock().unwrap_or_else(PoisonError::into_inner);
+        if last.elapsed() >= SILENCE {
+            return Failure::Failed(format!("the server was silent for {} s", SILENCE.as_secs()));
+        }
+        tokio::time::sleep_until((last + SILENCE).into()).await;
+    }
+}
+
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+async fn play(
+    arguments: &Arguments,
+    created: &pb::Session,
+    mut sessions: SessionServiceClient<Channel>,
+    channel: Channel,
+    heard: &LastHeard,
+) -> Result<(), Failure> {
+    let session_id = &created.session_id;
+    let scene = created.scene.as_ref().ok_or_else(|| Failure::Failed("the server sent no scene".into()))?;
+    let scene = wire::scene::from_scene(scene).map_err(refused)?;
+    let limits = Limits::default();
+    let script = Script::load(&arguments.script, &scene, &limits).map_err(refused)?;
+    for warning in created.warnings.iter().chain(&script.warnings) {
+        crate::say!("palpate-client: warning: {warning}");
+    }
+    let mut output: Box<dyn Write> = match &arguments.output {
+        Some(path) => Box::new(BufWriter::new(
+            std::fs::File::create(path)
+                .map_err(|e| Failure::Refused(format!("{}: can't be written: {e}", path.display())))?,
+        )),
+        None => Box::new(BufWriter::new(std::io::stdout())),
+    };
+    let written = |e: std::io::Error| match e.kind() {
+        std::io::ErrorKind::BrokenPipe => Failure::Unread,
+        _ => Failure::Failed(format!("can't write the output: {e}")),
+    };
+    let run = Run {
+        scene: scene.name.clone(),
+        script: script.name.clone(),
+        integrator: created.integrator.clone(),
+        substeps: created.substeps,
+        precision: created.precision.clone(),
+        rate_hz: scene.stepping.rate_hz,
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+    };
+    write_line(&mut output, &Line::Run(&run)).map_err(written)?;
+
+    // A change of the tissue may change the number of substeps.
+    let (mut substeps, mut since, mut a_step) = (0, 0, u64::from(created.substeps));
+    for (step, change) in &script.changes {
+        let update = wire::scene::update_tissue(session_id, change, *step);
+        let changed = sessions.update_tissue(update).await.map_err(refused_or_failed)?.into_inner();
+        substeps += (step - since) * a_step;
+        (since, a_step) = (*step, changed.session.map_or(a_step, |session| u64::from(session.substeps)));
+    }
+    substeps += (script.steps - since) * a_step;
+    let mut haptics = HapticServiceClient::new(channel.clone());
+    let probe = pb::ProbeRequest {
+        session_id: session_id.clone(),
+        r#where: Some(pb::probe_request::Where::Points(pb::GridPoints {
+            points: script.sample_points.iter().copied().map(point).collect(),
+        })),
+        every_steps: Some(script.sample_every.try_into().unwrap_or(u32::MAX)),
+        energy: true,
+    };
+    let [nx, ny] = scene.sheet.points;
+    let probe = if script.sample_points.iter().copied().eq((0..nx * ny).map(|index| [index / ny, index % ny])) {
+        pb::ProbeRequest { r#where: Some(pb::probe_request::Where::AllPoints(true)), ..probe }
+    } else {
+        probe
+    };
+    let mut records = haptics.probe(probe).await.map_err(refused_or_failed)?.into_inner();
+
+    let (outbound, messages) = mpsc::channel(1024);
+    let mut streamer =
+        Streamer { script: &script, outbound, clock: Instant::now(), next_step: 0, sent_before: VecDeque::new() };
+    let open = pb::TouchOpen {
+        session_id: session_id.clone(),
+        tools: (0..script.tools() as u32).collect(),
+        sample_every_steps: Some(arguments.sampling.every),
+        lease_s: Some(SILENCE.as_secs_f64()),
+        holder: "palpate-client replay".to_owned(),
+        deadband: arguments.sampling.deadband(),
+        heartbeat_s: arguments.sampling.heartbeat_s,
+        ..Default::default()
+    };
+    let mut touch = Touch::open(channel, open, ReceiverStream::new(messages)).await.map_err(refused_or_failed)?;
+    let ahead = ((AHEAD_S * scene.stepping.rate_hz) as u64).clamp(1, COMMANDS_AHEAD);
+    arguments.sampling.check(scene.stepping.rate_hz, ahead)?;
+    let mut measured = Measured::new()?;
+    streamer.send_before(ahead).await?;
+    streamer.heartbeat().await?;
+    let mut commands_until = loop {
+        match next(touch.next(), heard).await? {
+            Heard::Renewed(_) => break streamer.heartbeat_answered(),
+            Heard::Rejection(rejection) => return Err(rejected(&rejection)),
+            _ => {}
+        }
+    };
+    let mut hasher = sessions.clone();
+    let asked = pb::GetStateHashRequest { session_id: session_id.clone(), at_step: Some(script.steps) };
+    let mut hash = tokio::spawn(async move { hasher.get_state_hash(asked).await });
+    let started = Instant::now();
+    let mut until = commands_until;
+    let (mut running, mut is_answered) = (run_until(&sessions, session_id, until), false);
+
+    let progress = progress_bar(script.steps, arguments.quiet);
+    let mut heartbeat = tokio::time::interval(HEARTBEAT);
+    heartbeat.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
+    let mut record = Record::default();
+    let mut records_left = script.steps / script.sample_every + 1;
+    let mut final_hash = None;
+    let mut wall_s = 0.0;
+    while records_left > 0 || final_hash.is_none() || measured.last.0 < script.steps {
+        // Not at each heartbeat, but well before the session would have to wait.
+        let is_due = commands_until >= until + ahead / 4 || commands_until == script.steps;
+        if is_answered && commands_until > until && is_due {
+            until = commands_until;
+            (running, is_answered) = (run_until(&sessions, session_id, until), false);
+        }
+        tokio::select! {
+            message = next(touch.next(), heard), if measured.last.0 < script.steps => match message? {
+                Heard::Sample(sample) => {
+                    if sample.held {
+                        let asked = pb::GetSessionRequest { session_id: session_id.clone() };
+                        let session = sessions.get_session(asked).await.map_err(failed)?.into_inner().session;
+                        let reason = session.map(|session| session.hold_reason).unwrap_or_default();
+                        return Err(Failure::Failed(format!("the run was stopped: {reason}")));
+                    }
+                    measured.sample(&sample, arguments.sampling.every);
+                    wall_s = started.elapsed().as_secs_f64();
+                    progress.set_position(sample.step);
+                    streamer.send_before(sample.step + ahead).await?;
+                }
+                Heard::Renewed(renewed) => {
+                    let round_trip_ns = streamer.now_ns().saturating_sub(renewed.client_time_ns);
+                    let _ = measured.round_trip_ns.record(round_trip_ns);
+                    let _ = measured.hold_ns.record(renewed.server_hold_ns);
+                    commands_until = streamer.heartbeat_answered();
+                }
+                Heard::Rejection(rejection) => {
+                    // The samples report recoveries.
+                    measured.rejected += u64::from(rejection.reason != Reason::Recovered.as_str());
+                    progress.suspend(|| crate::say!("palpate-client: warning: {}", rejection_text(&rejection)));
+                }
+                Heard::Opened(_) | Heard::ForceLaw(_) => {}
+            },
+            message = next(records.message(), heard), if records_left > 0 => {
+                let message = message?;
+                if message.dropped_records > 0 {
+                    let why = "records were lost: this client can't keep up with so many points at this rate";
+                    return Err(Failure::Failed(why.into()));
+                }
+                if wire::sample::add_to_record(&mut record, &message) {
+                    let record = std::mem::take(&mut record);
+                    measured.record(&record);
+                    write_line(&mut output, &record).map_err(written)?;
+                    records_left -= 1;
+                }
+            },
+            answer = &mut running, if !is_answered => {
+                answer.map_err(|e| Failure::Failed(e.to_string()))?.map_err(refused_or_failed)?;
+                is_answered = true;
+            }
+            answer = &mut hash, if final_hash.is_none() => {
+                let answer = answer.map_err(|e| Failure::Failed(e.to_string()))?.map_err(failed)?;
+                final_hash = Some(answer.into_inner().state_hash);
+            }
+            _ = heartbeat.tick(), if measured.last.0 < script.steps => streamer.heartbeat().await?,
+        }
+    }
+    progress.finish_and_clear();
+    let mut recoveries = Vec::new();
+    if measured.recovery_count > 0 {
+        let asked = pb::GetSessionRequest { session_id: session_id.clone() };
+        let session = sessions.get_session(asked).await.map_err(failed)?.into_inner().session.unwrap_or_default();
+        recoveries = session.recoveries.into_iter().map(wire::sample::from_recovery).collect();
+    }
+
+    let points = scene.sheet.points[0] * scene.sheet.points[1];
+    let network = Network {
+        late_commands: measured.late,
+        rejected_commands: measured.rejected,
+        overruns: measured.overruns,
+        time_dilation: measured.dilation(scene.stepping.rate_hz),
+        round_trip_us: percentiles_us(&measured.round_trip_ns),
+        server_hold_us: percentiles_us(&measured.hold_ns),
+    };
+    let summary = Summary {
+        audited_error: None,
+        corrections: Vec::new(),
+        recoveries,
+        steps: script.steps,
+        substeps,
+        points,
+        wall_s,
+        ns_per_point_substep: wall_s * 1e9 / (substeps as f64 * points as f64),
+        computed_fraction: measured.computed as f64 / (script.steps * points as u64) as f64,
+        guard_events: 0,
+        final_hash: final_hash.unwrap_or_default(),
+        network: Some(network.clone()),
+    };
+    write_line(&mut output, &Line::Summary(&summary)).map_err(written)?;
+    output.flush().map_err(written)?;
+    if arguments.plot {
+        // The plot must not go where the records go.
+        let show =
+            |text: String| if arguments.output.is_some() { crate::tell!("{text}") } else { crate::say!("{text}") };
+        show(plot::draw("Displacement of the control point along z, m", &measured.displacement));
+        show(plot::draw("Force of the tissue on the tool along z, N", &measured.reaction));
+    }
+    table(arguments, &summary, &network, &measured);
+    if measured.rejected > 0 {
+        let why = "commands were rejected, so the run differs from the script";
+        return Err(Failure::Failed(format!("{} {why}", measured.rejected)));
+    }
+    if let Some(fault) = summary.fault() {
+        return Err(Failure::Failed(fault));
+    }
+    Ok(())
+}
+
+fn rejection_text(rejection: &pb::Rejection) -> String {
+    format!("tool {}, command {}: {} ({})", rejection.tool, rejection.sequence, rejection.message, rejection.reason)
+}
+
+fn rejected(rejection: &pb::Rejection) -> Failure {
+    Failure::Refused(rejection_text(rejection))
+}
+
+fn progress_bar(steps: u64, quiet: bool) -> ProgressBar {
+    if quiet || !std::io::stderr().is_terminal() {
+        return ProgressBar::hidden();
+    }
+    let style = ProgressStyle::with_template("{elapsed_precise} [{wide_bar}] step {pos} of {len}");
+    ProgressBar::new(steps).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
+}
+
+/// Prints the summary as a table, on the output that the records do not go to.
+fn table(arguments: &Arguments, summary: &Summary, network: &Network, measured: &Measured) {
+    let percentiles = |p: &Percentiles| format!("{:.0} / {:.0} / {:.0} µs", p.p50, p.p99, p.max);
+    let rows = [
+        ("steps", format!("{} in {:.2} s", summary.steps, summary.wall_s)),
+        ("overruns", format!("{} (time dilation {:.5})", network.overruns, network.time_dilation)),
+        ("samples", format!("{} for {} steps", measured.samples, summary.steps)),
+        ("late commands", network.late_commands.to_string()),
+        ("largest displacement", format!("{:.6} m", measured.largest_displacement_m)),
+        ("peak reaction", format!("{:.6} N", measured.peak_reaction_n)),
+        ("round trip p50 / p99 / max", percentiles(&network.round_trip_us)),
+        ("final hash", summary.final_hash.clone()),
+    ];
+    for (name, value) in rows {
+        if arguments.output.is_some() {
+            crate::tell!("{name:<28}{value}");
+        } else {
+            crate::say!("{name:<28}{value}");
+        }
+    }
+}

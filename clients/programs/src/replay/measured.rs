@@ -1,0 +1,105 @@
+//! What a replay measures: delays, samples, the largest displacement and force.
+
+use hdrhistogram::Histogram;
+use palpate::scene::record::{Percentiles, Record};
+use palpate_proto::geometry::from_vector;
+use palpate_proto::pb;
+
+use crate::Failure;
+
+/// What a replay has measured.
+pub(super) struct Measured {
+    pub(super) round_trip_ns: Histogram<u64>,
+    pub(super) hold_ns: Histogram<u64>,
+    pub(super) overruns: u64,
+    pub(super) samples: u64,
+    /// Awake points in the last sample.
+    pub(super) awake_points: u64,
+    /// Points × steps that were computed: a sample counts for the steps since the one before, unless all points slept.
+    pub(super) computed: u64,
+    pub(super) late: u64,
+    pub(super) rejected: u64,
+    /// How often the tissue went back to an earlier state.
+    pub(super) recovery_count: u64,
+    pub(super) largest_displacement_m: f64,
+    pub(super) peak_reaction_n: f64,
+    /// Step and server time, ns, of the first sample and of the last.
+    pub(super) first: Option<(u64, u64)>,
+    pub(super) last: (u64, u64),
+    /// Time, s, with the vertical displacement, m, and reaction, N, of the first control point.
+    pub(super) displacement: Vec<(f32, f32)>,
+    pub(super) reaction: Vec<(f32, f32)>,
+}
+
+impl Measured {
+    pub(super) fn new() -> Result<Self, Failure> {
+        let histogram = || Histogram::new(3).map_err(|e| Failure::Failed(e.to_string()));
+        Ok(Measured {
+            round_trip_ns: histogram()?,
+            hold_ns: histogram()?,
+            overruns: 0,
+            samples: 0,
+            awake_points: 0,
+            computed: 0,
+            late: 0,
+            rejected: 0,
+            recovery_count: 0,
+            largest_displacement_m: 0.0,
+            peak_reaction_n: 0.0,
+            first: None,
+            last: (0, 0),
+            displacement: Vec::new(),
+            reaction: Vec::new(),
+        })
+    }
+
+    #[allow(clippy::cast_possible_truncation)]
+    pub(super) fn sample(&mut self, sample: &pb::Sample, every: u32) {
+        self.overruns = sample.overrun_count;
+        self.samples += 1;
+        let steps = sample.step.saturating_sub(self.last.0);
+        let awake_steps = if self.awake_points == 0 { steps.min(u64::from(every)) } else { steps };
+        self.awake_points = u64::from(sample.awake_points);
+        self.computed += self.awake_points * awake_steps;
+        self.late = sample.late_commands;
+        self.recovery_count = sample.recovery_count;
+        self.last = (sample.step, sample.server_time_ns);
+        self.first.get_or_insert(self.last);
+        for (index, tool) in sample.tools.iter().enumerate() {
+            let displacement_m = from_vector(tool.displacement_m.as_ref());
+            let reaction_n = from_vector(tool.force_on_tool_n.as_ref());
+            self.largest_displacement_m = self.largest_displacement_m.max(displacement_m.length());
+            self.peak_reaction_n = self.peak_reaction_n.max(reaction_n.length());
+            if index == 0 && tool.point.is_some() {
+                // The vertical component, as in the paper's figures.
+                self.displacement.push((sample.simulation_time_s as f32, displacement_m.z as f32));
+                self.reaction.push((sample.simulation_time_s as f32, reaction_n.z as f32));
+            }
+        }
+    }
+
+    pub(super) fn record(&mut self, record: &Record) {
+        for point in &record.points {
+            let displacement_m = point.displacement_m.iter().map(|v| v * v).sum::<f64>().sqrt();
+            self.largest_displacement_m = self.largest_displacement_m.max(displacement_m);
+        }
+    }
+
+    #[allow(clippy::cast_precision_loss)]
+    pub(super) fn dilation(&self, rate_hz: f64) -> f64 {
+        let (first, last) = (self.first.unwrap_or(self.last), self.last);
+        let real_s = last.1.saturating_sub(first.1) as f64 * 1e-9;
+        if real_s > 0.0 { (last.0 - first.0) as f64 / rate_hz / real_s } else { 1.0 }
+    }
+}
+
+/// Quantiles in µs of a distribution in ns.
+#[allow(clippy::cast_precision_loss)]
+pub(super) fn percentiles_us(histogram: &Histogram<u64>) -> Percentiles {
+    let us = |ns: u64| ns as f64 / 1e3;
+    Percentiles {
+        p50: us(histogram.value_at_quantile(0.5)),
+        p99: us(histogram.value_at_quantile(0.99)),
+        max: us(histogram.max()),
+    }
+}

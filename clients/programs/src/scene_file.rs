@@ -1,0 +1,23 @@
+//! Scenes by name or from files, as a server takes them.
+
+use std::path::Path;
+
+use palpate::limits::Limits;
+use palpate::scene::Scene;
+use palpate::wire;
+use palpate_proto::pb::create_session_request::Source;
+
+use crate::Failure;
+
+/// The scene of a session: one of the server's by its name, or the contents of a file that ends in .toml.
+///
+/// # Errors
+/// Returns an error if the file can't be read, or if its scene is invalid.
+pub(crate) fn source(scene: &str) -> Result<Source, Failure> {
+    if Path::new(scene).extension().is_none_or(|extension| extension != "toml") {
+        return Ok(Source::SceneName(scene.to_owned()));
+    }
+    let scene = Scene::load(Path::new(scene), &[], &Limits::default());
+    let scene = scene.map_err(|refusal| Failure::Refused(refusal.to_string()))?;
+    Ok(Source::Scene(wire::scene::scene(&scene)))
+}

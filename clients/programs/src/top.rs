@@ -1,0 +1,223 @@
+//! `palpate-client top`: shows the sessions of a server once a second.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::io::{ErrorKind, IsTerminal, Write};
+use std::time::{Duration, Instant};
+
+use palpate_client::{Channel, describe};
+use palpate_proto::pb::session_service_client::SessionServiceClient;
+use palpate_proto::pb::{Audit, AuditedError, ListSessionsRequest, Session, SessionState};
+use serde_json::{Value, json};
+use tonic::Code;
+
+use crate::{Failure, credentials};
+
+/// Arguments of `top`.
+#[derive(clap::Args)]
+pub(crate) struct Arguments {
+    /// The server
+    #[arg(value_name = "URL", default_value = "http://127.0.0.1:7117")]
+    server: String,
+    /// Print one table, after a second, and exit
+    #[arg(long)]
+    once: bool,
+    /// Print one JSON object per line instead of a table
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    credentials: credentials::Arguments,
+}
+
+/// Time between two queries.
+const EVERY: Duration = Duration::from_secs(1);
+
+/// A session with its steps and overruns per second since the last query.
+struct Row {
+    session: Session,
+    steps_per_s: f64,
+    overruns_per_s: f64,
+}
+
+/// Steps and overruns of each session at a moment.
+struct Seen {
+    at: Instant,
+    counts: BTreeMap<String, (u64, u64)>,
+}
+
+/// Shows a server's sessions until it is interrupted or its output is closed.
+pub(crate) async fn top(arguments: &Arguments) -> Result<(), Failure> {
+    let server = arguments.credentials.server(&arguments.server)?;
+    let unreached = |why| Failure::Failed(format!("{why}; `palpate serve` starts a server"));
+    let mut sessions = SessionServiceClient::new(server.connect().await.map_err(unreached)?);
+    let terminal = std::io::stdout().is_terminal() && !arguments.json && !arguments.once;
+    let mut seen = None;
+    let mut ticks = tokio::time::interval(EVERY);
+    loop {
+        tokio::select! {
+            _ = ticks.tick() => {}
+            _ = tokio::signal::ctrl_c() => return Ok(()),
+        }
+        let looked = tokio::time::timeout(PATIENCE, look(&mut sessions, seen.as_ref())).await;
+        let silent = |_| Err(tonic::Status::unavailable(format!("no answer within {} s", PATIENCE.as_secs())));
+        let (rows, now) = match looked.unwrap_or_else(silent) {
+            Ok(looked) => looked,
+            // The channel reconnects by itself.
+            Err(status) if status.code() == Code::Unavailable && !arguments.once => {
+                crate::warn(&format!("{}; trying again", describe(&status)));
+                continue;
+            }
+            Err(status) => return Err(Failure::Failed(describe(&status))),
+        };
+        // A rate needs two queries.
+        if seen.replace(now).is_none() {
+            continue;
+        }
+        let text = match (arguments.json, terminal) {
+            (true, _) => format!("{}\n", as_json(&rows)),
+            (false, false) => table(&arguments.server, &rows, usize::MAX) + if arguments.once { "" } else { "\n" },
+            // Overwrites the last table in place, which does not flicker.
+            (false, true) => {
+                let height = usize::from(console::Term::stdout().size().0);
+                let table = table(&arguments.server, &rows, height.saturating_sub(4));
+                format!("\x1b[H{}\x1b[J", table.replace('\n', "\x1b[K\n"))
+            }
+        };
+        match std::io::stdout().write_all(text.as_bytes()).and_then(|()| std::io::stdout().flush()) {
+            Err(e) if e.kind() == ErrorKind::BrokenPipe => return Err(Failure::Unread),
+            Err(e) => return Err(Failure::Failed(e.to_string())),
+            Ok(()) if arguments.once => return Ok(()),
+            Ok(()) => {}
+        }
+    }
+}
+
+/// Time limit for an answer.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+#[allow(clippy::cast_precision_loss)]
+async fn look(
+    sessions: &mut SessionServiceClient<Channel>,
+    seen: Option<&Seen>,
+) -> Result<(Vec<Row>, Seen), tonic::Status> {
+    let listed = sessions.list_sessions(ListSessionsRequest {}).await?.into_inner().sessions;
+    let at = Instant::now();
+    let counts =
+        listed.iter().map(|session| (session.session_id.clone(), (session.step, session.overrun_count))).collect();
+    let row = |session: Session| {
+        // A new session has no rate yet.
+        let before = seen.and_then(|seen| Some((seen.at, seen.counts.get(&session.session_id)?)));
+        let (steps_per_s, overruns_per_s) = before.map_or((0.0, 0.0), |(before, (steps, overruns))| {
+            let per_s = |count: u64| count as f64 / (at - before).as_secs_f64().max(1e-3);
+            (per_s(session.step.saturating_sub(*steps)), per_s(session.overrun_count.saturating_sub(*overruns)))
+        });
+        Row { session, steps_per_s, overruns_per_s }
+    };
+    Ok((listed.into_iter().map(row).collect(), Seen { at, counts }))
+}
+
+fn state(session: &Session) -> &'static str {
+    match session.state() {
+        SessionState::Running if session.resting => "resting",
+        SessionState::Running => "running",
+        SessionState::Paused => "paused",
+        SessionState::Held => "held",
+        SessionState::Unspecified => "?",
+    }
+}
+
+fn as_json(rows: &[Row]) -> Value {
+    let one = |Row { session, steps_per_s, overruns_per_s }: &Row| {
+        let holders = session.held_tools.iter().map(|held| json!({ "tool": held.tool, "holder": held.holder }));
+        json!({
+            "session_id": session.session_id, "scene": session.scene_name, "state": state(session),
+            "step": session.step, "steps_per_s": steps_per_s, "time_dilation": session.time_dilation,
+            "points": session.points, "awake_points": session.awake_points,
+            "overrun_count": session.overrun_count, "overruns_per_s": overruns_per_s,
+            "late_commands": session.late_commands, "guard_events": session.guard_events,
+            "recoveries": session.recovery_count,
+            "audit": session.audit.as_ref().map(audit), "streams": session.streams, "held_tools": holders.collect::<Vec<_>>(), "hold_reason": session.hold_reason,
+        })
+    };
+    json!({ "sessions": rows.iter().map(one).collect::<Vec<_>>() })
+}
+
+fn audit(audit: &Audit) -> Value {
+    let error = |error: &AuditedError| json!({ "displacement": error.displacement, "force": error.force });
+    json!({
+        "windows": audit.windows, "step": audit.step, "newest_error": audit.newest_error.as_ref().map(error),
+        "largest_error": audit.largest_error.as_ref().map(error),
+        "windows_above_tolerance": audit.windows_above_tolerance, "reason": audit.reason,
+        "corrections": audit.corrections,
+    })
+}
+
+/// A line of totals, a header, and a line for each session; if there are more than `most`, the busiest.
+fn table(server: &str, rows: &[Row], most: usize) -> String {
+    let count = |wanted: &str| rows.iter().filter(|row| state(&row.session) == wanted).count();
+    // Not `sum()`: the sum of nothing is −0 and would be printed with its sign.
+    let sum = |of: &dyn Fn(&Row) -> f64| rows.iter().map(of).fold(0.0, |sum, value| sum + value);
+    let mut text = format!(
+        "{server}: {} sessions ({} running, {} resting, {} paused, {} held), {:.0} awake points, {:.0} steps/s, \
+         {:.0} overruns/s\n\n",
+        rows.len(),
+        count("running"),
+        count("resting"),
+        count("paused"),
+        count("held"),
+        sum(&|row| f64::from(row.session.awake_points)),
+        sum(&|row| row.steps_per_s),
+        sum(&|row| row.overruns_per_s),
+    );
+    let _ = writeln!(
+        text,
+        "{:<32}  {:<12} {:<7} {:>10} {:>7} {:>8} {:>15} {:>8} {:>6} {:>8} {:>7}  held by",
+        "session",
+        "scene",
+        "state",
+        "step",
+        "steps/s",
+        "dilation",
+        "awake/points",
+        "overruns",
+        "late",
+        "error",
+        "streams"
+    );
+    let mut rows: Vec<&Row> = rows.iter().collect();
+    if rows.len() > most {
+        rows.sort_by_key(|row| std::cmp::Reverse((row.session.awake_points, row.session.streams)));
+    }
+    for Row { session, steps_per_s, .. } in rows.iter().take(most) {
+        let holders: Vec<_> = session.held_tools.iter().map(|held| format!("{}: {}", held.tool, held.holder)).collect();
+        let newest = session.audit.as_ref().and_then(|audit| audit.newest_error.as_ref());
+        let error = newest.map_or("-".to_owned(), |error| format!("{:.1e}", error.displacement.max(error.force)));
+        let awake = format!("{}/{}", session.awake_points, session.points);
+        let _ = writeln!(
+            text,
+            "{:<32}  {:<12.12} {:<7} {:>10} {:>7.0} {:>8.4} {:>15} {:>8} {:>6} {:>8} {:>7}  {}",
+            session.session_id,
+            // Clients choose names freely.
+            printable(&session.scene_name),
+            state(session),
+            session.step,
+            steps_per_s,
+            session.time_dilation,
+            awake,
+            session.overrun_count,
+            session.late_commands,
+            error,
+            session.streams,
+            printable(&holders.join(", ")),
+        );
+    }
+    if rows.len() > most {
+        let _ = writeln!(text, "and {} more", rows.len() - most);
+    }
+    text
+}
+
+/// Replaces control characters, which would act on the terminal.
+fn printable(text: &str) -> String {
+    text.chars().map(|c| if c.is_control() { '?' } else { c }).collect()
+}

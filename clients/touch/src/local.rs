@@ -1,0 +1,276 @@
+//! The local model: the content of a sample about the tissue around the tool's place at that time.
+//!
+//! A client is ahead of every sample by the round trip, and knows its own path since. So it starts from the sample's
+//! state and repeats the response of the tissue along that path ([`Touching`]): the depth below the surface gives the
+//! pressure by the force law, less damping; tangentially, the disc sticks with the law's stiffness up to the friction
+//! cone, and slides beyond. The error is that of the law along some millimetres, not that of some milliseconds.
+
+use std::collections::VecDeque;
+
+use glam::{DMat3, DVec3};
+
+use crate::law::{Law, Row};
+
+/// The state of contact between a tool and the tissue.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Standing {
+    /// Not touching.
+    Free,
+    /// Touching, and not sliding.
+    Sticking,
+    /// Touching, at the edge of the friction cone.
+    Sliding,
+    /// Holding.
+    Holding,
+}
+
+/// The content of a sample. Forces are those on the tool.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LocalModel {
+    /// Sequence number; each sample has a higher one.
+    pub sequence: u64,
+    /// Client time of the tool's place, s.
+    pub client_time_s: f64,
+    /// Steps done.
+    pub step: u64,
+    /// x0: place of the tool, m.
+    pub place_m: DVec3,
+    /// Velocity of the tool, m/s.
+    pub velocity_m_per_s: DVec3,
+    /// f0: the force there, N.
+    pub force_n: DVec3,
+    /// K: symmetric, N/m.
+    pub stiffness_n_per_m: DMat3,
+    /// B: symmetric, N·s/m.
+    pub damping_n_s_per_m: DMat3,
+    /// p: a place on the surface under the tool as it would be without the tool, m.
+    pub surface_m: DVec3,
+    /// n: the outward normal there.
+    pub normal: DVec3,
+    /// The distance from x0 within which K is valid, m.
+    pub valid_m: f64,
+    /// μ.
+    pub friction: f64,
+    /// The state of contact between the tool and the tissue.
+    pub standing: Standing,
+    /// The number of the force law that goes with this model: p is placed by it.
+    pub law: u32,
+}
+
+impl LocalModel {
+    /// Whether every number is finite and the normal has unit length.
+    pub fn is_sound(&self) -> bool {
+        let vectors = [self.place_m, self.velocity_m_per_s, self.force_n, self.surface_m];
+        vectors.iter().all(|v| v.is_finite())
+            && self.stiffness_n_per_m.is_finite()
+            && self.damping_n_s_per_m.is_finite()
+            && self.valid_m >= 0.0
+            && self.friction >= 0.0
+            && self.friction.is_finite()
+            && self.client_time_s.is_finite()
+            && (self.normal.length() - 1.0).abs() < 1e-3
+    }
+}
+
+/// The distance within which K is valid: where half its change along the path is a tenth of the force, or of `least_n`
+/// if that is larger. `change` is ‖∂K/∂x‖, N/m².
+pub fn valid_m(force_n: f64, least_n: f64, change_n_per_m2: f64) -> f64 {
+    (2.0 * (0.1 * force_n).max(least_n) / change_n_per_m2.max(1e-9)).sqrt()
+}
+
+/// The newest places of a tool, by the client's own clock.
+#[derive(Debug, Clone, Default)]
+pub struct Track {
+    places: VecDeque<(f64, DVec3)>,
+}
+
+/// Number of places kept: two seconds at 1 kHz.
+const KEPT: usize = 2048;
+
+impl Track {
+    /// Adds the newest place.
+    pub fn push(&mut self, time_s: f64, place_m: DVec3) {
+        if self.places.len() == KEPT {
+            self.places.pop_front();
+        }
+        self.places.push_back((time_s, place_m));
+    }
+
+    /// All places after a time, in order.
+    pub fn after(&self, time_s: f64) -> impl Iterator<Item = DVec3> {
+        // Half a microsecond of tolerance: times return from the wire in whole nanoseconds.
+        let from = self.places.partition_point(|place| place.0 <= time_s + 5e-7);
+        self.places.range(from..).map(|place| place.1)
+    }
+
+    /// Removes all places.
+    pub fn clear(&mut self) {
+        self.places.clear();
+    }
+}
+
+/// A client's usual tick, s.
+const TICK_S: f64 = 1e-3;
+
+/// The state of a touch along a tool's path.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Touching {
+    /// How far the tissue under the disc is displaced tangentially from where it would not pull, m.
+    stretch_m: DVec3,
+    sliding: bool,
+    /// The part of the sample's force that the law does not explain, N.
+    rest_n: DVec3,
+    place_m: DVec3,
+}
+
+impl Touching {
+    /// The state when the sample was taken.
+    pub fn at_sample(model: &LocalModel, law: &Law) -> Self {
+        let mut touching =
+            Touching { stretch_m: DVec3::ZERO, sliding: false, rest_n: DVec3::ZERO, place_m: model.place_m };
+        if matches!(model.standing, Standing::Free | Standing::Holding) {
+            return touching;
+        }
+        touching.sliding = model.standing == Standing::Sliding;
+        let (_, row, _) = touching.pressure(model, law, model.place_m, DVec3::ZERO);
+        let across = |v: DVec3| v - v.dot(model.normal) * model.normal;
+        let moved = across(model.velocity_m_per_s);
+        let mut drawn_n = across(model.force_n);
+        drawn_n += if touching.sliding { row.drag_n_s_per_m } else { row.across_n_s_per_m } * moved;
+        if row.across_n_per_m > 0.0 {
+            let most_m = model.friction * row.force_n / row.across_n_per_m;
+            touching.stretch_m = within(-drawn_n / row.across_n_per_m, most_m);
+            // By the rule of `move_to`, not by the sample: otherwise the force would change with the first move.
+            let ahead_m = touching.stretch_m + moved * TICK_S;
+            touching.sliding = within(ahead_m, most_m) != ahead_m;
+        }
+        touching.rest_n = model.force_n - touching.force_n(model, law, model.velocity_m_per_s);
+        touching
+    }
+
+    /// Depth below the surface, the law at that depth, and the pressure with damping.
+    fn pressure(&self, model: &LocalModel, law: &Law, place_m: DVec3, velocity_m_per_s: DVec3) -> (f64, Row, f64) {
+        let depth_m = (model.surface_m - place_m).dot(model.normal);
+        let row = law.at_depth(depth_m);
+        if depth_m <= 0.0 {
+            return (depth_m, row, 0.0);
+        }
+        (depth_m, row, (row.force_n - row.damping_n_s_per_m * velocity_m_per_s.dot(model.normal)).max(0.0))
+    }
+
+    /// Advances to the tool's next place.
+    pub fn move_to(&mut self, model: &LocalModel, law: &Law, place_m: DVec3) {
+        let moved_m = place_m - self.place_m;
+        self.place_m = place_m;
+        let (depth_m, row, _) = self.pressure(model, law, place_m, DVec3::ZERO);
+        if depth_m <= 0.0 || row.across_n_per_m <= 0.0 {
+            (self.stretch_m, self.sliding) = (DVec3::ZERO, false);
+            return;
+        }
+        let most_m = model.friction * row.force_n / row.across_n_per_m;
+        let stretch_m = self.stretch_m + moved_m - moved_m.dot(model.normal) * model.normal;
+        self.stretch_m = within(stretch_m, most_m);
+        self.sliding = self.stretch_m != stretch_m;
+    }
+
+    /// The force on the tool at its present place, N.
+    pub fn force_n(&self, model: &LocalModel, law: &Law, velocity_m_per_s: DVec3) -> DVec3 {
+        if model.standing == Standing::Holding {
+            let away_m = within(self.place_m - model.place_m, model.valid_m);
+            let faster = velocity_m_per_s - model.velocity_m_per_s;
+            return model.force_n - model.stiffness_n_per_m * away_m - model.damping_n_s_per_m * faster;
+        }
+        let (depth_m, row, pressure_n) = self.pressure(model, law, self.place_m, velocity_m_per_s);
+        if depth_m <= 0.0 {
+            return DVec3::ZERO;
+        }
+        let across_m_per_s = velocity_m_per_s - velocity_m_per_s.dot(model.normal) * model.normal;
+        let mut across_n = -row.across_n_per_m * self.stretch_m;
+        if !self.sliding {
+            across_n -= row.across_n_s_per_m * across_m_per_s;
+        }
+        across_n = within(across_n, model.friction * pressure_n);
+        if self.sliding {
+            across_n -= row.drag_n_s_per_m * across_m_per_s;
+        }
+        let force_n = pressure_n * model.normal + across_n + self.rest_n;
+        // A touch never pulls.
+        force_n - force_n.dot(model.normal).min(0.0) * model.normal
+    }
+}
+
+/// `vector`, shortened to the length `most`.
+fn within(vector: DVec3, most: f64) -> DVec3 {
+    let length = vector.length();
+    if length <= most { vector } else { vector * (most / length) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const NORMAL: DVec3 = DVec3::new(0.6, 0.0, 0.8);
+    /// A direction in the surface.
+    const ALONG: DVec3 = DVec3::new(-0.8, 0.0, 0.6);
+
+    /// 400 N/m and 0.5 N·s/m along the normal; across it 300 N/m and 2 N·s/m of a disc that sticks.
+    fn law() -> Law {
+        let row = |depth_m: f64| Row {
+            force_n: 400.0 * depth_m,
+            stiffness_n_per_m: 400.0,
+            across_n_per_m: 300.0,
+            damping_n_s_per_m: 0.5,
+            across_n_s_per_m: 2.0,
+            drag_n_s_per_m: 1.0,
+        };
+        Law { step_m: 0.1, rows: vec![row(0.0), row(0.1)], is_coarse: false }
+    }
+
+    /// A disc at rest, 4 mm deep, so pressed with 1.6 N, and drawn back along the surface with `drawn_n`.
+    fn model(drawn_n: f64) -> LocalModel {
+        LocalModel {
+            law: 0,
+            sequence: 1,
+            client_time_s: 0.0,
+            step: 1,
+            place_m: -0.004 * NORMAL,
+            velocity_m_per_s: DVec3::ZERO,
+            force_n: 1.6 * NORMAL - drawn_n * ALONG,
+            stiffness_n_per_m: DMat3::IDENTITY,
+            damping_n_s_per_m: DMat3::IDENTITY,
+            surface_m: DVec3::ZERO,
+            normal: NORMAL,
+            valid_m: 0.01,
+            friction: 0.2,
+            standing: Standing::Sticking,
+        }
+    }
+
+    #[test]
+    fn a_disc_that_sticks_goes_on_from_the_samples_stretch_up_to_the_cone_of_friction() {
+        let (law, model) = (law(), model(0.2));
+        let mut touching = Touching::at_sample(&model, &law);
+        // Where it is, it feels the sample's force; a way of 0.1 mm stretches by 0.03 N; the cone is at 0.2·1.6 N.
+        for (way_m, drawn_n) in [(0.0, 0.2), (1e-4, 0.23), (-1e-4, 0.17), (0.0, 0.2), (0.01, 0.32), (0.02, 0.32)] {
+            touching.move_to(&model, &law, model.place_m + way_m * ALONG);
+            let force_n = touching.force_n(&model, &law, DVec3::ZERO);
+            assert!((force_n - (1.6 * NORMAL - drawn_n * ALONG)).length() < 1e-12, "{way_m} m: {force_n}");
+        }
+        // Back from there the stretch gets less at once.
+        touching.move_to(&model, &law, model.place_m + (0.02 - 1e-4) * ALONG);
+        let force_n = touching.force_n(&model, &law, DVec3::ZERO);
+        assert!((force_n.dot(ALONG) + 0.29).abs() < 1e-12, "{force_n}");
+    }
+
+    #[test]
+    fn damping_acts_along_the_movement_and_across_never_beyond_the_cone() {
+        let (law, model) = (law(), model(0.0));
+        let touching = Touching::at_sample(&model, &law);
+        let inward_n = touching.force_n(&model, &law, -0.1 * NORMAL);
+        assert!((inward_n - 1.65 * NORMAL).length() < 1e-12, "{inward_n}");
+        let slow_n = touching.force_n(&model, &law, 0.1 * ALONG);
+        assert!((slow_n - (1.6 * NORMAL - 0.2 * ALONG)).length() < 1e-12, "{slow_n}");
+        let fast_n = touching.force_n(&model, &law, 1.0 * ALONG);
+        assert!((fast_n - (1.6 * NORMAL - 0.32 * ALONG)).length() < 1e-12, "{fast_n}");
+    }
+}

@@ -1,0 +1,237 @@
+//! The rendering law: a thousand times a second, it computes a force from the newest local model and the tool's own
+//! path.
+//!
+//! When a newer model arrives, the force would jump by the error of the old one. That difference is kept as a bias and
+//! decays with [`BIAS_S`], so the hand feels a smooth change, not a knock.
+//!
+//! **A change of law.** A server that needs long for the exact law of a tissue sends a coarse one first, and when the tissue
+//! becomes another it sends that one's. Each model names the law by which the server has placed its surface, so the renderer changes over with the first model of the new law,
+//! and never between two models. Let F be the force by the new model and law along the tool's path, and G that by the old
+//! ones. In the tick of the change, at t0, the bias is b = G(t0) − F(t0), and from then on the force is
+//! F(t) + b·e^{−(t − t0)/τ}, τ = [`BIAS_S`]. At t0 that is G(t0): no jump. In a tick of length h after it, the bias changes
+//! by no more than |b|·h/τ, and all else is the change of F, the tissue's own. Both models pass through the force of
+//! their sample, whatever their law ([`Touching::at_sample`]). So beside the error of the old model, b is not the
+//! difference of the laws' forces, but that of their slopes over the way since the sample: for a coarse law whose slope is
+//! within a tenth of K, and a way s, that is at most 0.1·K·s.
+//!
+//! The bias is not the force of a passive spring: it may give energy, at most |b|·v·τ when the tool moves at v. The
+//! envelope counts it like all other work at the port, and its limits act on the sum: so a change of law can't make the
+//! port active, nor the force faster than the slew.
+
+use glam::DVec3;
+
+use crate::envelope::{Envelope, State, Wanted};
+use crate::law::Law;
+use crate::local::{LocalModel, Standing, Touching, Track};
+
+/// Time constant with which the error of the last model decays, s.
+pub const BIAS_S: f64 = 0.02;
+
+/// Laws that a renderer keeps.
+pub const MOST_LAWS: usize = 16;
+
+/// One tool's renderer.
+#[derive(Debug, Clone)]
+pub struct Renderer {
+    /// With their numbers, the oldest first.
+    laws: Vec<(u32, Law)>,
+    /// The newest model, and the touch that follows from it.
+    newest: Option<(LocalModel, Touching)>,
+    /// A newer model that has arrived since.
+    arrived: Option<LocalModel>,
+    arrived_s: Option<f64>,
+    bias_n: DVec3,
+    biased_s: f64,
+    track: Track,
+    before: Option<(f64, DVec3)>,
+    velocity_m_per_s: DVec3,
+    refused: u64,
+    /// The limits between the law and the device.
+    pub envelope: Envelope,
+}
+
+impl Renderer {
+    /// A renderer for a tissue with `law`, which must be sound and is number 0, behind `envelope`.
+    pub fn new(law: Law, envelope: Envelope) -> Self {
+        Renderer {
+            laws: vec![(0, law)],
+            newest: None,
+            arrived: None,
+            arrived_s: None,
+            bias_n: DVec3::ZERO,
+            biased_s: 0.0,
+            track: Track::default(),
+            before: None,
+            velocity_m_per_s: DVec3::ZERO,
+            refused: 0,
+            envelope,
+        }
+    }
+
+    /// Restarts with another server, whose models start from the beginning. The envelope keeps its state.
+    pub fn begin(&mut self, law: Law) {
+        (self.laws, self.newest, self.arrived, self.arrived_s) = (vec![(0, law)], None, None, None);
+    }
+
+    /// Takes a further law, which models may name from now on. False: it is not sound, or its number is known already. Of
+    /// [`MOST_LAWS`] it takes the place of the oldest that no model at hand names. Models that name a law which is not known
+    /// are rendered with the oldest.
+    pub fn learn(&mut self, number: u32, law: Law) -> bool {
+        if !law.is_sound() || self.laws.iter().any(|known| known.0 == number) {
+            return false;
+        }
+        if self.laws.len() == MOST_LAWS {
+            let in_use = [self.newest.map(|newest| newest.0.law), self.arrived.map(|model| model.law)];
+            let oldest = self.laws.iter().position(|known| !in_use.contains(&Some(known.0)));
+            self.laws.remove(oldest.unwrap_or(0));
+        }
+        self.laws.push((number, law));
+        true
+    }
+
+    /// The number of models refused: out of order, or not finite.
+    pub fn refused(&self) -> u64 {
+        self.refused
+    }
+
+    /// Whether forces are rendered.
+    pub fn state(&self) -> State {
+        self.envelope.state()
+    }
+
+    /// The time of the newest model by the client's clock, s.
+    pub fn model_time_s(&self) -> Option<f64> {
+        self.newest.as_ref().map(|newest| newest.0.client_time_s)
+    }
+
+    /// Takes a model that has just arrived. It takes effect at the next tick.
+    pub fn receive(&mut self, model: LocalModel, now_s: f64) {
+        let newest = self.arrived.as_ref().or(self.newest.as_ref().map(|newest| &newest.0));
+        let late = newest.is_some_and(|newest| model.sequence <= newest.sequence);
+        if late || !model.is_sound() {
+            self.refused += 1;
+            return;
+        }
+        (self.arrived, self.arrived_s) = (Some(model), Some(now_s));
+    }
+
+    /// Switches to a model that has arrived: repeats the tool's path since, and keeps the difference from the last
+    /// model.
+    fn adopt(&mut self, model: LocalModel, now_s: f64) {
+        let before_n = self.newest.is_some().then(|| self.wanted_n(now_s));
+        let law = law_of(&self.laws, &model);
+        let mut touching = Touching::at_sample(&model, law);
+        for place_m in self.track.after(model.client_time_s) {
+            touching.move_to(&model, law, place_m);
+        }
+        self.newest = Some((model, touching));
+        (self.biased_s, self.bias_n) = (now_s, DVec3::ZERO);
+        if let Some(before_n) = before_n {
+            self.bias_n = before_n - self.wanted_n(now_s);
+        }
+    }
+
+    /// The force that the law asks for, before the envelope, N.
+    fn wanted_n(&self, now_s: f64) -> DVec3 {
+        let Some((model, touching)) = &self.newest else { return DVec3::ZERO };
+        let force_n = touching.force_n(model, law_of(&self.laws, model), self.velocity_m_per_s)
+            + self.bias_n * ((self.biased_s - now_s) / BIAS_S).exp();
+        if model.standing == Standing::Holding {
+            return force_n;
+        }
+        force_n - force_n.dot(model.normal).min(0.0) * model.normal
+    }
+
+    /// The force to render until the next tick, for a tool at `place_m` now, N.
+    pub fn tick(&mut self, now_s: f64, place_m: DVec3) -> DVec3 {
+        let known = place_m.is_finite() && now_s.is_finite();
+        if let Some((then_s, from_m)) = self.before.filter(|_| known)
+            && now_s > then_s
+        {
+            self.velocity_m_per_s = (place_m - from_m) / (now_s - then_s);
+        }
+        if known {
+            self.before = Some((now_s, place_m));
+            self.track.push(now_s, place_m);
+            if let Some((model, touching)) = &mut self.newest {
+                touching.move_to(model, law_of(&self.laws, model), place_m);
+            }
+            if let Some(model) = self.arrived.take() {
+                self.adopt(model, now_s);
+            }
+        }
+        let force_n = self.wanted_n(now_s);
+        // Before the first model nothing is stale.
+        let age_s = self.arrived_s.map_or(0.0, |arrived_s| now_s - arrived_s);
+        let wanted = Wanted { now_s, place_m, velocity_m_per_s: self.velocity_m_per_s, force_n, age_s };
+        self.envelope.render(&wanted)
+    }
+}
+
+/// The law that a model names.
+fn law_of<'l>(laws: &'l [(u32, Law)], model: &LocalModel) -> &'l Law {
+    &laws.iter().find(|known| known.0 == model.law).unwrap_or(&laws[0]).1
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DMat3;
+
+    use super::*;
+    use crate::device::UNDECLARED;
+
+    /// Of a tool at rest at `place_m`, on a surface at `height_m` with a spring of 400 N/m.
+    fn model(sequence: u64, time_s: f64, place_m: DVec3, height_m: f64) -> LocalModel {
+        LocalModel {
+            sequence,
+            law: 0,
+            client_time_s: time_s,
+            step: sequence,
+            place_m,
+            velocity_m_per_s: DVec3::ZERO,
+            force_n: 400.0 * (height_m - place_m.z) * DVec3::Z,
+            stiffness_n_per_m: DMat3::IDENTITY,
+            damping_n_s_per_m: DMat3::IDENTITY,
+            surface_m: height_m * DVec3::Z,
+            normal: DVec3::Z,
+            valid_m: 0.01,
+            friction: 0.2,
+            standing: Standing::Sticking,
+        }
+    }
+
+    fn renderer() -> Renderer {
+        Renderer::new(Law::linear(400.0, 0.5), Envelope::new(UNDECLARED, DVec3::ZERO))
+    }
+
+    #[test]
+    fn a_moving_hand_feels_the_spring_where_it_is_and_the_damping_of_its_speed() {
+        let mut renderer = renderer();
+        let place_m = |tick: u32| -DVec3::Z * (0.002 + 1e-4 * f64::from(tick));
+        renderer.receive(model(1, 0.0, place_m(0), 0.0), 0.0);
+        for tick in 0..30 {
+            let now_s = f64::from(tick) * 1e-3;
+            renderer.tick(now_s, place_m(tick));
+            // 0.1 m/s from the second tick on.
+            let damping_n = if tick == 0 { 0.0 } else { 0.05 };
+            let expected_n = 0.8 + 0.04 * f64::from(tick) + damping_n;
+            let wanted_n = renderer.wanted_n(now_s);
+            assert!((wanted_n - expected_n * DVec3::Z).length() < 1e-9, "{tick}: {wanted_n}");
+        }
+    }
+
+    #[test]
+    fn a_newer_model_changes_the_force_without_a_jump() {
+        let (mut renderer, place_m) = (renderer(), -0.004 * DVec3::Z);
+        renderer.receive(model(1, 0.0, place_m, 0.0), 0.0);
+        renderer.tick(0.0, place_m);
+        assert!((renderer.wanted_n(0.0).z - 1.6).abs() < 1e-12);
+        // The surface was told a millimetre too high: 1.6 N instead of 1.2.
+        renderer.receive(model(2, 0.001, place_m, -0.001), 0.001);
+        renderer.tick(0.001, place_m);
+        for (later_s, expected_n) in [(0.0, 1.6), (BIAS_S, 1.2 + 0.4 / std::f64::consts::E), (1.0, 1.2)] {
+            let wanted_n = renderer.wanted_n(0.001 + later_s);
+            assert!((wanted_n - expected_n * DVec3::Z).length() < 1e-9, "{later_s} s: {wanted_n}");
+        }
+    }
+}

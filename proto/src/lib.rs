@@ -1,0 +1,23 @@
+//! Palpate's protocol in Rust, for servers and clients.
+//!
+//! - [`pb`]: the messages, clients and servers that are generated from `palpate/v1/*.proto`, which document them. The
+//!   features `client` and `server` choose what is generated besides the messages. To connect, use `tonic::transport` or
+//!   the crate `palpate-client`.
+//! - [`refusal`]: the reasons for which inputs are refused, and [`error`]: refusals as gRPC statuses.
+//! - [`codec`]: decodes messages, requests within bounds.
+//! - [`geometry`] and [`touch`]: conversion of vectors, and of the types of the crate `palpate-touch`.
+
+pub mod codec;
+pub mod error;
+pub mod geometry;
+pub mod refusal;
+pub mod touch;
+
+/// The generated code: messages, clients and servers of package `palpate.v1`.
+#[allow(missing_docs, clippy::all, clippy::pedantic, clippy::unwrap_used, unreachable_pub, rust_2018_idioms)]
+pub mod pb {
+    tonic::include_proto!("palpate.v1");
+
+    /// Every file of the protocol, for reflection.
+    pub const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/palpate.bin"));
+}

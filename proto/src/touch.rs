@@ -1,0 +1,221 @@
+//! Conversion of devices, tips, force laws and local models.
+
+use glam::{DMat3, DVec3};
+use palpate_touch::law::{Law, Row};
+use palpate_touch::{Coupling, Device, LocalModel, Standing, Tip};
+
+use crate::geometry::{from_vector, point, vector};
+use crate::pb;
+use crate::refusal::{self, Reason, Refusal, Result, number};
+
+/// The device in a message.
+///
+/// # Errors
+/// Returns an error if the name is not fit for a log, or if a limit of the device is out of range.
+pub fn from_device(message: &pb::Device) -> Result<Device> {
+    refusal::label("device.name", &message.name)?;
+    let within = |field: &str, value: f64, most: f64| {
+        let field = format!("device.{field}");
+        number(&field, value, &format!("above 0 and at most {most}"), |v| v > 0.0 && v <= most)
+    };
+    Ok(Device {
+        name: "declared",
+        force_n: within("force_n", message.max_force_n, 1e3)?,
+        continuous_n: within("continuous_n", message.continuous_force_n, 1e3)?,
+        stiffness_n_per_m: within("stiffness_n_per_m", message.max_stiffness_n_per_m, 1e6)?,
+        damping_n_s_per_m: within("damping_n_s_per_m", message.max_damping_n_s_per_m, 1e4)?,
+        workspace_m: within("workspace_m", message.workspace_radius_m, 10.0)?,
+    })
+}
+
+/// A device as a message.
+pub fn device(device: &Device) -> pb::Device {
+    pb::Device {
+        name: device.name.to_owned(),
+        max_force_n: device.force_n,
+        continuous_force_n: device.continuous_n,
+        max_stiffness_n_per_m: device.stiffness_n_per_m,
+        max_damping_n_s_per_m: device.damping_n_s_per_m,
+        workspace_radius_m: device.workspace_m,
+    }
+}
+
+/// The tip in a message; the default tip if it is absent.
+pub fn from_tip(tip: Option<&pb::Tip>) -> Tip {
+    tip.map_or_else(Tip::default, |tip| Tip {
+        radius_m: tip.radius_m,
+        friction: tip.friction,
+        grasps: tip.grasps,
+        coupling: tip.spring.as_ref().map_or(Coupling::Constraint, |spring| Coupling::Spring {
+            stiffness_n_per_m: spring.stiffness_n_per_m,
+            damping_n_s_per_m: spring.damping_n_s_per_m,
+        }),
+    })
+}
+
+/// A tip as a message.
+pub fn tip(tip: &Tip) -> pb::Tip {
+    pb::Tip {
+        radius_m: tip.radius_m,
+        friction: tip.friction,
+        grasps: tip.grasps,
+        spring: match tip.coupling {
+            Coupling::Constraint => None,
+            Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } => {
+                Some(pb::Spring { stiffness_n_per_m, damping_n_s_per_m })
+            }
+        },
+    }
+}
+
+/// The pose of a tool whose tip is at `place_m`, m.
+pub fn pose(place_m: DVec3, tip: &Tip) -> pb::Pose {
+    pb::Pose { position_m: vector(place_m), orientation: None, tip_offset_m: None, tip: Some(self::tip(tip)) }
+}
+
+/// A force law with its number in the stream, as a message.
+pub fn law(law: &Law, number: u32) -> pb::ForceLaw {
+    let row = |row: &Row| pb::ForceLawRow {
+        force_n: row.force_n,
+        stiffness_n_per_m: row.stiffness_n_per_m,
+        across_n_per_m: row.across_n_per_m,
+        damping_n_s_per_m: row.damping_n_s_per_m,
+        across_n_s_per_m: row.across_n_s_per_m,
+        drag_n_s_per_m: row.drag_n_s_per_m,
+    };
+    pb::ForceLaw { step_m: law.step_m, rows: law.rows.iter().map(row).collect(), coarse: law.is_coarse, number }
+}
+
+/// The force law in a message.
+///
+/// # Errors
+/// Returns an error if a client can't use the law ([`Law::is_sound`]).
+pub fn from_law(message: &pb::ForceLaw) -> Result<Law> {
+    let row = |row: &pb::ForceLawRow| Row {
+        force_n: row.force_n,
+        stiffness_n_per_m: row.stiffness_n_per_m,
+        across_n_per_m: row.across_n_per_m,
+        damping_n_s_per_m: row.damping_n_s_per_m,
+        across_n_s_per_m: row.across_n_s_per_m,
+        drag_n_s_per_m: row.drag_n_s_per_m,
+    };
+    let rows = message.rows.iter().map(row).collect();
+    let law = Law { step_m: message.step_m, rows, is_coarse: message.coarse };
+    let range = "must have at least two rows, all numbers finite and at least 0, and forces that never fall";
+    let wrong = || Refusal::new(Reason::OutOfRange, "law", range);
+    if law.is_sound() { Ok(law) } else { Err(wrong()) }
+}
+
+/// The law that takes the place of law `before`, with its number; or the reason and the message why there is none.
+/// `tissue_step`: the step from whose beginning on another tissue acts, if that is the cause.
+pub fn law_update(
+    before: u32,
+    tissue_step: Option<u64>,
+    update: std::result::Result<(u32, &Law), (&str, &str)>,
+) -> pb::ForceLawUpdate {
+    let unchanged = pb::ForceLawUpdate { coarse_number: before, tissue_step, ..Default::default() };
+    match update {
+        Ok((number, newer)) => pb::ForceLawUpdate { law: Some(law(newer, number)), ..unchanged },
+        Err((reason, message)) => {
+            pb::ForceLawUpdate { reason: reason.to_owned(), message: message.to_owned(), ..unchanged }
+        }
+    }
+}
+
+fn symmetric(m: DMat3) -> Option<pb::Symmetric3> {
+    let (x, y, z) = (m.x_axis, m.y_axis, m.z_axis);
+    Some(pb::Symmetric3 { xx: x.x, yy: y.y, zz: z.z, xy: x.y, xz: x.z, yz: y.z })
+}
+
+fn from_symmetric(m: Option<&pb::Symmetric3>) -> DMat3 {
+    m.map_or(DMat3::ZERO, |m| {
+        DMat3::from_cols(DVec3::new(m.xx, m.xy, m.xz), DVec3::new(m.xy, m.yy, m.yz), DVec3::new(m.xz, m.yz, m.zz))
+    })
+}
+
+/// A local model as a message.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+pub fn local_model(model: &LocalModel) -> pb::LocalModel {
+    let contact = match model.standing {
+        Standing::Free => pb::Contact::Free,
+        Standing::Sticking => pb::Contact::Sticking,
+        Standing::Sliding => pb::Contact::Sliding,
+        Standing::Holding => pb::Contact::Holding,
+    };
+    pb::LocalModel {
+        sequence: model.sequence,
+        client_time_ns: (model.client_time_s * 1e9).round().max(0.0) as u64,
+        position_m: vector(model.place_m),
+        velocity_m_per_s: vector(model.velocity_m_per_s),
+        force_on_tool_n: vector(model.force_n),
+        stiffness_n_per_m: symmetric(model.stiffness_n_per_m),
+        damping_n_s_per_m: symmetric(model.damping_n_s_per_m),
+        surface_m: vector(model.surface_m),
+        normal: vector(model.normal),
+        valid_m: model.valid_m,
+        friction: model.friction,
+        contact: contact.into(),
+        law: model.law,
+    }
+}
+
+/// The local model in a message. The renderer refuses models that it can't render.
+pub fn from_local_model(message: &pb::LocalModel, step: u64) -> LocalModel {
+    let standing = match message.contact() {
+        pb::Contact::Unspecified | pb::Contact::Free => Standing::Free,
+        pb::Contact::Sticking => Standing::Sticking,
+        pb::Contact::Sliding => Standing::Sliding,
+        pb::Contact::Holding => Standing::Holding,
+    };
+    #[allow(clippy::cast_precision_loss)]
+    LocalModel {
+        sequence: message.sequence,
+        client_time_s: message.client_time_ns as f64 * 1e-9,
+        step,
+        place_m: from_vector(message.position_m.as_ref()),
+        velocity_m_per_s: from_vector(message.velocity_m_per_s.as_ref()),
+        force_n: from_vector(message.force_on_tool_n.as_ref()),
+        stiffness_n_per_m: from_symmetric(message.stiffness_n_per_m.as_ref()),
+        damping_n_s_per_m: from_symmetric(message.damping_n_s_per_m.as_ref()),
+        surface_m: from_vector(message.surface_m.as_ref()),
+        normal: from_vector(message.normal.as_ref()),
+        valid_m: message.valid_m,
+        friction: message.friction,
+        standing,
+        law: message.law,
+    }
+}
+
+/// Bytes of the headers around a message of a stream: gRPC, HTTP/2, TCP and IP.
+const HEADER_BYTES: u64 = 5 + 9 + 32 + 20;
+
+/// The size of a sample on the wire, bytes.
+pub fn wire_bytes(sample: &pb::Sample) -> u64 {
+    prost::Message::encoded_len(sample) as u64 + HEADER_BYTES
+}
+
+/// The size on the wire of a sample of one tool with this model, bytes.
+pub fn sample_bytes(model: &LocalModel) -> u64 {
+    let tool = pb::ToolSample {
+        acknowledged_sequence: model.sequence,
+        client_time_ns: 1,
+        server_hold_ns: 1 << 20,
+        step_wait_ns: 1 << 19,
+        point: Some(point([15, 15])),
+        displacement_m: vector(model.surface_m),
+        velocity_m_per_s: vector(model.velocity_m_per_s),
+        force_on_tool_n: vector(model.force_n),
+        applied_force_n: vector(-model.force_n),
+        local_model: Some(local_model(model)),
+        ..Default::default()
+    };
+    wire_bytes(&pb::Sample {
+        step: model.step,
+        simulation_time_s: 1.0,
+        server_time_ns: 1,
+        time_dilation: 1.0,
+        awake_points: 961,
+        tools: vec![tool],
+        ..Default::default()
+    })
+}

@@ -1,0 +1,9 @@
+//! Computes the force law of a tissue under a disc from the tissue's model. The crate `palpate-touch` evaluates it.
+//!
+//! An exact law takes seconds for a large sheet, so [`first`] gives a coarse law where the exact one takes too much work.
+
+mod coarse;
+mod exact;
+
+pub use coarse::first;
+pub use exact::{Computation, Progress, exact, exact_within};
