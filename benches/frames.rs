@@ -17,7 +17,7 @@ use palpate::limits::Limits;
 use palpate::pace::frames::Delivery;
 use palpate::scene::law::Poke;
 use palpate::sheet::{Push, at_rest};
-use palpate::surface::{Encoding, Frame, Refinement, Snapshot, Tiles, encode, encode_over};
+use palpate::surface::{Encoding, Frame, FrameTiles, Refinement, Snapshot, encode, encode_over};
 use report::chart::Panel;
 use report::{Report, cells, digits, quick, seconds};
 use serde_json::json;
@@ -161,7 +161,7 @@ fn poke(force_n: DVec3, refinement: u32, report: &mut Report, rows: &mut Vec<Vec
     let grid = Refinement::new([side; 2], refinement, &limits).unwrap();
     let [_, columns] = grid.vertices();
     let full_bytes = grid.vertices().iter().product::<usize>() * Encoding::I16.bytes_per_vertex();
-    let (mut tiles, mut seen, mut shown) = (None::<Tiles>, None, vec![[0.0; 3]; full_bytes / 6]);
+    let (mut tiles, mut seen, mut shown) = (None::<FrameTiles>, None, vec![[0.0; 3]; full_bytes / 6]);
     let mut sent: Vec<Sent> = Vec::new();
     let mut frames = 0;
     for (phase, (name, end)) in PHASES.into_iter().enumerate() {
@@ -178,7 +178,7 @@ fn poke(force_n: DVec3, refinement: u32, report: &mut Report, rows: &mut Vec<Vec
             let mut displacement_m = [(); 3].map(|()| Vec::new());
             tissue.displacements_m(&mut displacement_m);
             let snapshot = Arc::new(Snapshot::new(step, step as f64 * 1e-3, [side; 2], displacement_m));
-            let tiles = tiles.get_or_insert_with(|| Tiles::new(&snapshot, grid, Encoding::I16, spacing_m));
+            let tiles = tiles.get_or_insert_with(|| FrameTiles::new(&snapshot, grid, Encoding::I16, spacing_m));
             tiles.update(&snapshot);
             if tiles.is_newer_than(seen) {
                 let frame = tiles.newer_than(seen);

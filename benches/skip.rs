@@ -8,7 +8,7 @@ mod report;
 mod subject;
 
 use glam::{DVec2, DVec3};
-use palpate::scene::law::{CentreLaw, ForceLaw, Profile, StrengthLaw};
+use palpate::scene::law::{CentreProfile, LoadProfile, Profile, StrengthProfile};
 use palpate::sheet::{Push, at_rest};
 use report::chart::{Look, Panel, Series};
 use report::{Report, cells, digits, quick, rough, seconds};
@@ -24,14 +24,14 @@ const LOOK_STEPS: u64 = 50;
 struct Kind {
     name: &'static str,
     about: &'static str,
-    pushes: fn(length_m: f64) -> Vec<ForceLaw>,
+    pushes: fn(length_m: f64) -> Vec<LoadProfile>,
 }
 
 /// The paper's poke: 3 N, 150 /m, released after a second.
-fn poke(centre_m: DVec2, force_n: DVec3) -> ForceLaw {
-    ForceLaw {
-        centre: CentreLaw::Hops(vec![(0, centre_m)]),
-        strength: StrengthLaw::Scaled(force_n, Profile::Pulse { on: 0, off: 1000 }),
+fn poke(centre_m: DVec2, force_n: DVec3) -> LoadProfile {
+    LoadProfile {
+        centre: CentreProfile::Hops(vec![(0, centre_m)]),
+        strength: StrengthProfile::Scaled(force_n, Profile::Pulse { on: 0, off: 1000 }),
         falloff_per_m: 150.0,
         falloff_offset: 0.0,
     }
@@ -47,12 +47,12 @@ const KINDS: [Kind; 4] = [
         name: "stroke",
         about: "1 N at a slant that moves along y at 0.2 m/s, all the time",
         pushes: |length_m| {
-            vec![ForceLaw {
-                centre: CentreLaw::Path {
+            vec![LoadProfile {
+                centre: CentreProfile::Path {
                     from_m: DVec2::new(length_m / 2.0, length_m / 2.0 - 0.2),
                     velocity_m_per_s: DVec2::new(0.0, 0.2),
                 },
-                strength: StrengthLaw::Scaled(DVec3::new(0.2, 0.3, -1.0), Profile::Constant),
+                strength: StrengthProfile::Scaled(DVec3::new(0.2, 0.3, -1.0), Profile::Constant),
                 falloff_per_m: 60.0,
                 falloff_offset: 0.0,
             }]
@@ -70,9 +70,9 @@ const KINDS: [Kind; 4] = [
         name: "everything",
         about: "a force on all points that swings at 3 Hz, all the time",
         pushes: |length_m| {
-            vec![ForceLaw {
-                centre: CentreLaw::Hops(vec![(0, DVec2::splat(length_m / 2.0))]),
-                strength: StrengthLaw::Scaled(DVec3::new(0.01, 0.0, -0.05), Profile::Sine { frequency_hz: 3.0 }),
+            vec![LoadProfile {
+                centre: CentreProfile::Hops(vec![(0, DVec2::splat(length_m / 2.0))]),
+                strength: StrengthProfile::Scaled(DVec3::new(0.01, 0.0, -0.05), Profile::Sine { frequency_hz: 3.0 }),
                 falloff_per_m: 1.0 / length_m,
                 falloff_offset: 0.0,
             }]

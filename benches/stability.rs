@@ -13,7 +13,7 @@ mod report;
 mod subject;
 
 use glam::{DVec2, DVec3};
-use palpate::scene::law::{CentreLaw, ForceLaw, Poke, Profile, StrengthLaw};
+use palpate::scene::law::{CentreProfile, LoadProfile, Poke, Profile, StrengthProfile};
 use palpate::session::Session;
 use palpate::sheet::{Model, Push, at_rest};
 use report::chart::Panel;
@@ -121,9 +121,9 @@ impl Tissue {
         let model = self.model(step_s).unwrap();
         let sheet = &model.scene.sheet;
         let mut session = Session::new(&model);
-        let law = ForceLaw {
-            centre: CentreLaw::Hops(vec![(0, DVec2::splat(4.0 * sheet.spacing_m))]),
-            strength: StrengthLaw::Scaled(force_n * DVec3::new(0.6, 0.0, -0.8), Profile::Constant),
+        let law = LoadProfile {
+            centre: CentreProfile::Hops(vec![(0, DVec2::splat(4.0 * sheet.spacing_m))]),
+            strength: StrengthProfile::Scaled(force_n * DVec3::new(0.6, 0.0, -0.8), Profile::Constant),
             falloff_per_m: 1.0 / sheet.spacing_m,
             falloff_offset: 0.0,
         };

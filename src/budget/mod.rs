@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, Weak};
 
 pub use machine::{give_back_to_the_system, half_of_the_machine, parse_bytes};
-use time::Spent;
+use time::RecentTime;
 pub use time::Work;
 pub(crate) use turns::Turns;
 
@@ -180,7 +180,7 @@ pub struct Budget {
     pools: [Mutex<Pool>; 4],
     /// Of memory, by [`Purpose`].
     purposes: Mutex<[u64; Purpose::ALL.len()]>,
-    times: Mutex<[Spent; Work::ALL.len()]>,
+    times: Mutex<[RecentTime; Work::ALL.len()]>,
     accounts: Mutex<Accounts>,
 }
 
@@ -210,8 +210,8 @@ impl Budget {
         // Where there are fewer cores than threads, the threads share them.
         let cores = (machine::cores() / threads.iter().sum::<f64>()).min(1.0);
         let times = Work::ALL.map(|work| match work {
-            Work::Reading => Spent::new(cores * threads[0]),
-            Work::Network => Spent::new(cores * threads[1]),
+            Work::Reading => RecentTime::new(cores * threads[0]),
+            Work::Network => RecentTime::new(cores * threads[1]),
         });
         Arc::new(Budget {
             pools: pools.map(Mutex::new),

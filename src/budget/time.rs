@@ -28,7 +28,7 @@ const NOTHING_S: f64 = 1e-9;
 
 /// Time that was spent of late, s, by number of account.
 #[derive(Debug)]
-pub(super) struct Spent {
+pub(super) struct RecentTime {
     /// That threads could have spent.
     most_s: f64,
     at_ns: u64,
@@ -37,10 +37,10 @@ pub(super) struct Spent {
 }
 
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-impl Spent {
+impl RecentTime {
     /// Of threads that have so many cores together.
     pub(super) fn new(cores: f64) -> Self {
-        Spent { most_s: cores * MEMORY_S, at_ns: 0, all_s: 0.0, by: BTreeMap::new() }
+        RecentTime { most_s: cores * MEMORY_S, at_ns: 0, all_s: 0.0, by: BTreeMap::new() }
     }
 
     fn fade(&mut self, now_ns: u64) {
@@ -87,7 +87,7 @@ mod tests {
     /// In virtual time: each of `callers` works in slices of 0.1 ms whenever it need not wait; the part of a thread that
     /// each got.
     fn parts(callers: u64) -> Vec<f64> {
-        let (mut spent, mut got) = (Spent::new(1.0), vec![0.0; callers as usize]);
+        let (mut spent, mut got) = (RecentTime::new(1.0), vec![0.0; callers as usize]);
         let mut now_ns = 0;
         while now_ns < 20_000_000_000 {
             for caller in 0..callers {
@@ -112,7 +112,7 @@ mod tests {
 
     #[test]
     fn who_has_taken_nothing_never_waits_and_who_took_much_does() {
-        let mut spent = Spent::new(1.0);
+        let mut spent = RecentTime::new(1.0);
         spent.add(1, 1, 10_000_000_000);
         assert_eq!(spent.wait_ns(2, 1), 0);
         let wait_ns = spent.wait_ns(1, 1);

@@ -14,7 +14,7 @@ use super::live::Live;
 use super::pacer::Pacer;
 use super::places::Places;
 use super::running::{Running, beat_ns};
-use super::status::{State, Status};
+use super::status::{RunState, Status};
 use crate::budget::{Account, Purpose, Resource};
 use crate::ids::random_id;
 use crate::lock::lock;
@@ -55,7 +55,7 @@ impl Pacer {
         };
         let begin_ns = beat_ns(now_ns());
         let status = Status {
-            state: if paused { State::Paused } else { State::Running },
+            state: if paused { RunState::Paused } else { RunState::Running },
             step: 0,
             resting: false,
             rested_steps: 0,
@@ -188,7 +188,7 @@ impl Pacer {
     /// # Errors
     /// As for [`Live::start`]; and refuses if the steps would make other sessions late.
     pub async fn start_session(&self, live: &Live, until: Option<u64>) -> Result<u64> {
-        if lock(&live.status).state == State::Paused {
+        if lock(&live.status).state == RunState::Paused {
             self.check_share(self.taken_by_others(live), live.cost.awake_share())?;
         }
         live.start(until).await

@@ -10,7 +10,7 @@ use crate::budget::{Account, Budget, Purpose, Resource, Taken};
 use crate::lock::lock;
 use crate::memory;
 use crate::refusal::{Refusal, Result};
-use crate::surface::{Encoding, Frame, Refinement, Snapshot, Tiles, encode, encode_over};
+use crate::surface::{Encoding, Frame, FrameTiles, Refinement, Snapshot, encode, encode_over};
 
 /// One who looks at a session.
 #[derive(Debug)]
@@ -138,7 +138,7 @@ impl Viewer {
     }
 
     /// Sends the tiles that are newer than what it has, if there are any.
-    fn deliver_newer(&self, job: &Job, frame_id: u64, tiles: &mut Tiles) {
+    fn deliver_newer(&self, job: &Job, frame_id: u64, tiles: &mut FrameTiles) {
         let mut since = {
             let mut progress = lock(&self.progress);
             if !tiles.is_newer_than(progress.version) {
@@ -188,7 +188,7 @@ pub struct Job {
 }
 
 #[derive(Debug, Default)]
-struct Board {
+struct JobQueue {
     /// By the number of the session, oldest request first: nobody is served twice before another once.
     jobs: VecDeque<(u64, Job)>,
     stop: bool,
@@ -200,7 +200,7 @@ const IDLE: Duration = Duration::from_millis(500);
 /// The thread that encodes.
 #[derive(Debug, Default)]
 pub struct Encoder {
-    board: Mutex<Board>,
+    board: Mutex<JobQueue>,
     posted: Condvar,
 }
 
@@ -229,7 +229,7 @@ impl Encoder {
 
     /// The thread's work. The memory of frames that are kept for their buffers is taken from `budget`.
     pub fn work(&self, budget: &Arc<Budget>) {
-        let (mut spent, mut watched) = (Spent::of(budget), Watched::default());
+        let (mut spent, mut watched) = (RecycledFrames::of(budget), Watched::default());
         loop {
             let mut board = lock(&self.board);
             let (number, job) = loop {
@@ -275,16 +275,16 @@ const EVERYBODY: &str = "frames";
 
 /// The last frames of a few kinds, newest first. When the next of a kind is due, the viewers are mostly done with it.
 #[derive(Debug)]
-struct Spent {
+struct RecycledFrames {
     frames: Vec<Arc<Frame>>,
     account: Account,
     /// Their memory.
     taken: Option<Taken>,
 }
 
-impl Spent {
+impl RecycledFrames {
     fn of(budget: &Arc<Budget>) -> Self {
-        Spent { frames: Vec::new(), account: budget.account(EVERYBODY), taken: None }
+        RecycledFrames { frames: Vec::new(), account: budget.account(EVERYBODY), taken: None }
     }
 
     fn clear(&mut self) {
@@ -331,7 +331,7 @@ struct Watched(Vec<Kind>);
 #[derive(Debug)]
 struct Kind {
     session: u64,
-    tiles: Tiles,
+    tiles: FrameTiles,
     viewers: Vec<Weak<Viewer>>,
 }
 
@@ -351,14 +351,14 @@ impl Watched {
     }
 
     /// The tiles for a viewer, up to date.
-    fn tiles(&mut self, session: u64, job: &Job, viewer: &Arc<Viewer>) -> &mut Tiles {
+    fn tiles(&mut self, session: u64, job: &Job, viewer: &Arc<Viewer>) -> &mut FrameTiles {
         let (refinement, encoding) = (viewer.refinement, viewer.encoding);
         memory::require((frame_bytes(refinement, encoding) + moment_bytes(refinement)) as u64, "the tiles of a frame");
         let same = |kind: &Kind| {
             (kind.session, kind.tiles.refinement(), kind.tiles.encoding()) == (session, refinement, encoding)
         };
         let place = self.0.iter().position(same).unwrap_or_else(|| {
-            let tiles = Tiles::new(&job.snapshot, refinement, encoding, job.spacing_m);
+            let tiles = FrameTiles::new(&job.snapshot, refinement, encoding, job.spacing_m);
             self.0.push(Kind { session, tiles, viewers: Vec::new() });
             self.0.len() - 1
         });
@@ -371,7 +371,7 @@ impl Watched {
     }
 }
 
-fn serve(session: u64, job: &Job, spent: &mut Spent, watched: &mut Watched) {
+fn serve(session: u64, job: &Job, spent: &mut RecycledFrames, watched: &mut Watched) {
     watched.forget_the_gone();
     let mut encoded: Vec<Arc<Frame>> = Vec::new();
     for (viewer, frame_id) in &job.viewers {
@@ -415,7 +415,7 @@ mod tests {
         let (a, mut read_a) = viewer(2, Encoding::I16, None);
         let (b, mut read_b) = viewer(2, Encoding::I16, Some(3));
         let (c, mut read_c) = viewer(2, Encoding::F32, None);
-        let mut spent = Spent::of(&Budget::new(&Limits::default(), 1, 1));
+        let mut spent = RecycledFrames::of(&Budget::new(&Limits::default(), 1, 1));
         serve(1, &job(vec![(a, 7), (b, 9), (c, 7)]), &mut spent, &mut Watched::default());
         // Of the two kinds one frame each is kept, and counted.
         let account = spent.account.clone();
@@ -434,7 +434,7 @@ mod tests {
         let changes =
             |credit| Viewer::new("viewer".into(), grid, Encoding::F32, 60.0, false, credit, 1 << 20, &account).unwrap();
         let ((slow, mut read_slow), (thrifty, mut read_thrifty)) = (changes(None), changes(Some(1)));
-        let (mut spent, mut watched) = (Spent::of(account.budget()), Watched::default());
+        let (mut spent, mut watched) = (RecycledFrames::of(account.budget()), Watched::default());
         let mut show = |frame_id: u64, z: f32| {
             let snapshot = Snapshot::new(frame_id, 0.001, [3, 3], [vec![0.0; 9], vec![0.0; 9], vec![z; 9]]);
             let viewers = vec![(slow.clone(), frame_id), (thrifty.clone(), frame_id)];

@@ -37,7 +37,7 @@ pub use live::{Accepted, Live};
 pub use paced::{PacedRecord, PacedSample, Recorded};
 pub use pacer::Pacer;
 pub use places::Held;
-pub use status::{State, Status};
+pub use status::{RunState, Status};
 pub use streams::StreamGuard;
 
 #[cfg(test)]

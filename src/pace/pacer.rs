@@ -19,7 +19,7 @@ use crate::limits::Limits;
 use crate::lock::lock;
 use crate::priority::give_way;
 use crate::refusal::{Reason, Refusal, Result, excerpt};
-use crate::session::local::Refinement;
+use crate::session::local::StiffnessJob;
 
 /// Stiffnesses that wait to be computed, of all tools of a server.
 const WAITING_REFINEMENTS: usize = 8;
@@ -51,10 +51,10 @@ impl Pacer {
         let mut handles = Vec::new();
         let mut steppers = Vec::new();
         // It ends when the stepping threads have ended, and nobody sends any more.
-        let (refiner, refinements) = std::sync::mpsc::sync_channel::<Refinement>(WAITING_REFINEMENTS);
+        let (refiner, refinements) = std::sync::mpsc::sync_channel::<StiffnessJob>(WAITING_REFINEMENTS);
         let worker = move || {
             give_way();
-            refinements.into_iter().for_each(Refinement::work);
+            refinements.into_iter().for_each(StiffnessJob::work);
         };
         handles.push(std::thread::Builder::new().name("stiffness".into()).spawn(worker)?);
         for index in 0..threads.max(1) {

@@ -8,15 +8,15 @@ use super::frames::{Encoder, Job, Viewer};
 use super::paced::PacedSample;
 use super::queue::Wakes;
 use super::reading::{Copied, HashReply, Piece, Reading, is_much};
-use super::running::{Desk, Running};
-use super::status::State;
+use super::running::{Running, ThreadContext};
+use super::status::RunState;
 use super::taps::{SampleTap, ViewTap};
 use crate::budget::{Account, Work};
 use crate::lock::lock;
 use crate::memory;
 use crate::refusal::{Reason, Refusal, Result};
 use crate::session::Sample;
-use crate::session::local::Refinement;
+use crate::session::local::StiffnessJob;
 use crate::session::recovery::describe;
 use crate::sheet::Hashing;
 use crate::sheet::audit::Mark;
@@ -41,7 +41,7 @@ impl Running {
     }
 
     /// Has the stiffness computed anew under the tools of which it is told.
-    pub(super) fn refine(&self, refiner: &SyncSender<Refinement>) {
+    pub(super) fn refine(&self, refiner: &SyncSender<StiffnessJob>) {
         for refinement in self.taps.samples.iter().flat_map(|tap| tap.sampler.refinements(&self.session)) {
             // What finds the refiner busy is left: the next is newer.
             let _ = refiner.try_send(refinement);
@@ -79,9 +79,9 @@ impl Running {
     }
 
     /// Tells everybody who wants to know of this step.
-    pub(super) fn publish(&mut self, desk: &mut Desk<'_>) {
+    pub(super) fn publish(&mut self, context: &mut ThreadContext<'_>) {
         let step = self.session.step_count();
-        self.tell_all(!self.running, &mut desk.wakes);
+        self.tell_all(!self.running, &mut context.wakes);
         self.taps.forget_the_gone();
         let (still_since, rate_hz) = (self.still_since, self.live.model.scene.stepping.rate_hz);
         let held = self.session.hold_reason().is_some();
@@ -95,10 +95,10 @@ impl Running {
         };
         let viewers: Vec<_> = self.taps.viewers.iter_mut().filter_map(due_frame).collect();
         if !viewers.is_empty() {
-            self.post(desk.encoder, viewers);
+            self.post(context.encoder, viewers);
         }
         for (_, account, reply) in self.taps.hashes.extract_if(.., |waiting| waiting.0 == step).collect::<Vec<_>>() {
-            self.hash_for(&account, reply, desk.reading);
+            self.hash_for(&account, reply, context.reading);
         }
     }
 
@@ -116,15 +116,15 @@ impl Running {
         tally.guard_events.add(guard_events - before.guard_events);
         let recovery_count = self.session.recoveries().count();
         tally.recoveries.add(recovery_count - before.recovery_count);
-        tally.held_sessions.add(u64::from(is_held && before.state != State::Held));
+        tally.held_sessions.add(u64::from(is_held && before.state != RunState::Held));
         let path_tallies = [&tally.limited_steps, &tally.dropped_poses, &tally.stale_releases];
         for (index, count) in path_tallies.into_iter().enumerate() {
             count.add(path_counts[index] - before.path_counts[index]);
         }
         status.state = match (self.session.hold_reason(), self.running) {
-            (Some(_), _) => State::Held,
-            (None, true) => State::Running,
-            (None, false) => State::Paused,
+            (Some(_), _) => RunState::Held,
+            (None, true) => RunState::Running,
+            (None, false) => RunState::Paused,
         };
         status.step = self.session.step_count();
         status.model.clone_from(self.session.model());

@@ -1,5 +1,5 @@
 //! What is read of large sheets: records of many points and hashes. A stepping thread copies the sheet
-//! ([`Still`](crate::sheet::Still)); a thread with a lower priority reads the copies in slices, callers in turns. What one
+//! ([`SheetCopy`](crate::sheet::SheetCopy)); a thread with a lower priority reads the copies in slices, callers in turns. What one
 //! caller reads is read in order. The same thread frees what deleted sessions leave behind.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -16,7 +16,7 @@ use crate::memory;
 use crate::refusal::{Refusal, Result};
 use crate::scene::record::Record;
 use crate::session::{Session, record_of};
-use crate::sheet::{Hashing, Still};
+use crate::sheet::{Hashing, SheetCopy};
 
 /// So many points are read by the stepping thread itself: some tenths of a millisecond.
 const AT_ONCE_POINTS: usize = 1024;
@@ -34,7 +34,7 @@ pub(super) fn is_much(points: usize, all: usize) -> bool {
 
 /// A copy of a sheet, and its memory.
 pub(super) struct Copied {
-    still: Mutex<Still>,
+    still: Mutex<SheetCopy>,
     _taken: Taken,
 }
 
@@ -175,7 +175,7 @@ impl Piece {
 }
 
 #[derive(Default)]
-struct Board {
+struct PieceQueue {
     waiting: Turns<Piece>,
     stop: bool,
 }
@@ -183,7 +183,7 @@ struct Board {
 /// The thread that reads.
 #[derive(Default)]
 pub(super) struct Reading {
-    board: Mutex<Board>,
+    board: Mutex<PieceQueue>,
     posted: Condvar,
 }
 
@@ -216,7 +216,7 @@ impl Reading {
     /// The thread's work.
     pub(super) fn work(&self) {
         loop {
-            let idle = |board: &mut Board| board.waiting.is_empty() && !board.stop;
+            let idle = |board: &mut PieceQueue| board.waiting.is_empty() && !board.stop;
             let waited = self.posted.wait_while(lock(&self.board), idle).unwrap_or_else(PoisonError::into_inner);
             if waited.stop {
                 return;

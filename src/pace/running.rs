@@ -23,7 +23,7 @@ use crate::memory;
 use crate::refusal::{Reason, Refusal, Result};
 use crate::session::Session;
 use crate::session::command::Due;
-use crate::session::local::Refinement;
+use crate::session::local::StiffnessJob;
 use crate::session::schedule::Schedule;
 use crate::sheet::audit::Mark;
 
@@ -66,9 +66,9 @@ pub(super) struct Running {
 }
 
 /// What all sessions of a thread use.
-pub(super) struct Desk<'t> {
+pub(super) struct ThreadContext<'t> {
     pub(super) encoder: &'t Encoder,
-    pub(super) refiner: &'t SyncSender<Refinement>,
+    pub(super) refiner: &'t SyncSender<StiffnessJob>,
     pub(super) reading: &'t Reading,
     pub(super) wakes: Wakes,
     pub(super) longest: Longest,
@@ -188,7 +188,7 @@ impl Running {
         self.session.skip_to(step);
     }
 
-    pub(super) fn serve(&mut self, request: Request, desk: &mut Desk<'_>) {
+    pub(super) fn serve(&mut self, request: Request, context: &mut ThreadContext<'_>) {
         self.catch_up();
         let step = self.session.step_count();
         // Also while time stands, when no step does it.
@@ -205,13 +205,13 @@ impl Running {
                 let _ = reply.send(self.revive());
             }
             Request::Pause { reply } => {
-                self.stand(desk);
+                self.stand(context);
                 let _ = reply.send(Ok(()));
             }
             Request::Samples(mut tap) => {
                 tap.overrun_count = self.overrun_count;
                 if !self.running {
-                    self.tell(&mut tap, &mut None, true, &mut desk.wakes);
+                    self.tell(&mut tap, &mut None, true, &mut context.wakes);
                 }
                 if self.session.hold_reason().is_some() {
                     tap.writer.close(self.passed(0));
@@ -230,7 +230,7 @@ impl Running {
             Request::View(viewer) => {
                 // Who joins late gets a full frame first.
                 let frame_id = viewer.frame_id(step, self.live.model.scene.stepping.rate_hz);
-                self.post(desk.encoder, vec![(viewer.clone(), frame_id)]);
+                self.post(context.encoder, vec![(viewer.clone(), frame_id)]);
                 self.taps.viewers.push(ViewTap { viewer, shown: step, passed: frame_id });
             }
             Request::Hash { at, account, reply } => {
@@ -238,7 +238,7 @@ impl Running {
                 if at > step && self.session.hold_reason().is_none() {
                     self.taps.hashes.push((at, account, reply));
                 } else if at == step {
-                    self.hash_for(&account, reply, desk.reading);
+                    self.hash_for(&account, reply, context.reading);
                 } else {
                     let _ = reply.send(Err(self.passed(at)));
                 }
@@ -256,11 +256,11 @@ impl Running {
     }
 
     /// Time stands from now on. Who reads samples gets the present one.
-    fn stand(&mut self, desk: &mut Desk<'_>) {
+    fn stand(&mut self, context: &mut ThreadContext<'_>) {
         self.running = false;
         self.plan();
         self.publish_status();
-        self.tell_all(true, &mut desk.wakes);
+        self.tell_all(true, &mut context.wakes);
     }
 
     fn passed(&self, at: u64) -> Refusal {
@@ -319,14 +319,14 @@ impl Running {
     }
 
     /// The next step, at its time or after it.
-    pub(super) fn step(&mut self, begun_ns: u64, desk: &mut Desk<'_>) {
+    pub(super) fn step(&mut self, begun_ns: u64, context: &mut ThreadContext<'_>) {
         let sampled = self.next_step.is_multiple_of(STEPS_PER_SPAN);
         let span = sampled.then(|| tracing::debug_span!("step", session = %self.live.id, step = self.next_step));
         let _span = span.map(tracing::Span::entered);
         self.due_ns = self.schedule.due_ns(self.next_step);
         if self.next_step == self.session.step_count() {
             // Only of steps that cost something can a session be behind.
-            self.drop_backlog(begun_ns, desk.longest.ns());
+            self.drop_backlog(begun_ns, context.longest.ns());
         } else {
             self.plan();
             self.skip_to(self.next_step);
@@ -342,7 +342,8 @@ impl Running {
             self.live.tissue.send_replace((step, model));
         }
 
-        let (Running { session, taps, due, copies, .. }, wakes, reading) = (&mut *self, &mut desk.wakes, desk.reading);
+        let (Running { session, taps, due, copies, .. }, wakes, reading) =
+            (&mut *self, &mut context.wakes, context.reading);
         copies.forget();
         session.advance(due, |session| taps.record(session, copies, reading, wakes));
         self.tell_auditor();
@@ -358,7 +359,7 @@ impl Running {
             // No further record will come.
             let held = self.passed(0);
             let probes = self.taps.probes.drain(..);
-            probes.for_each(|tap| desk.reading.close(&tap.account, &tap.recipient, held.clone()));
+            probes.for_each(|tap| context.reading.close(&tap.account, &tap.recipient, held.clone()));
         }
         if self.until.is_some_and(|until| self.session.step_count() >= until) {
             self.running = false;
@@ -368,10 +369,10 @@ impl Running {
         self.dilation.observe(begun_ns, step, self.schedule.period_ns());
         // The status first: who is told of this step may ask for it at once.
         self.publish_status();
-        self.publish(desk);
+        self.publish(context);
         let every = (self.live.model.scene.stepping.rate_hz / REFINED_HZ).max(1.0) as u64;
         if self.session.step_count().is_multiple_of(every) {
-            self.refine(desk.refiner);
+            self.refine(context.refiner);
         }
         self.plan();
     }

@@ -9,7 +9,7 @@ use crate::sheet::Model;
 
 /// Whether a session's time goes on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum State {
+pub enum RunState {
     /// In real time.
     Running,
     /// Waits to be started.
@@ -22,7 +22,7 @@ pub enum State {
 #[derive(Debug, Clone)]
 pub struct Status {
     /// Whether time goes on.
-    pub state: State,
+    pub state: RunState,
     /// Steps done.
     pub step: u64,
     /// Nothing moves and no command waits: the session is not stepped.
@@ -60,7 +60,7 @@ pub struct Status {
 impl Status {
     /// The session goes on, and what it counts of itself begins anew.
     pub(super) fn forget_hold(&mut self) {
-        (self.hold_reason, self.state) = (None, State::Paused);
+        (self.hold_reason, self.state) = (None, RunState::Paused);
         (self.late_commands, self.guard_events, self.path_counts) = (0, 0, [0; 3]);
         self.paused_commands = 0;
         (self.recovery_count, self.recoveries) = (0, Vec::new());

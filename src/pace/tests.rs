@@ -22,7 +22,7 @@ async fn a_fault_in_one_session_ends_that_one_alone() {
     samples.pop().await.unwrap();
     faulty.inbox.send(faulty.number, Request::Panic);
     let told = faulty.hash_at(Some(1_000_000), &Account::alone()).await.unwrap_err();
-    assert_eq!((told.reason, faulty.status().state), (Reason::SessionHeld, State::Held));
+    assert_eq!((told.reason, faulty.status().state), (Reason::SessionHeld, RunState::Held));
     assert!(told.message.contains("a test"), "{told}");
     let ended = loop {
         if let Err(ended) = samples.pop().await {

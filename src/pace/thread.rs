@@ -15,9 +15,9 @@ use super::policy::Longest;
 use super::queue::Wakes;
 use super::reading::{Piece, Reading};
 use super::rota::Rota;
-use super::running::{Desk, Running};
+use super::running::{Running, ThreadContext};
 use crate::lock::lock;
-use crate::session::local::Refinement;
+use crate::session::local::StiffnessJob;
 
 /// A stepping thread as others see it: where it is asked, and the new sessions that wait for it.
 #[derive(Default)]
@@ -39,24 +39,24 @@ const MOST_WAKES: usize = 32;
 const MOST_ROUND_NS: u64 = 200_000;
 
 /// The thread's work.
-pub(super) fn work(stepper: &Stepper, encoder: &Encoder, refiner: &SyncSender<Refinement>, reading: &Reading) {
+pub(super) fn work(stepper: &Stepper, encoder: &Encoder, refiner: &SyncSender<StiffnessJob>, reading: &Reading) {
     // The default slack of 50 µs would be the larger part of each step's lateness. Best effort.
     #[cfg(target_os = "linux")]
     let _ = rustix::thread::set_current_timer_slack(std::num::NonZeroU64::new(1));
     let inbox = &*stepper.inbox;
     let mut rota = Rota::default();
     let mut requests = VecDeque::new();
-    let mut desk = Desk { encoder, refiner, reading, wakes: Wakes::default(), longest: Longest::default() };
+    let mut context = ThreadContext { encoder, refiner, reading, wakes: Wakes::default(), longest: Longest::default() };
     let mut begun_round_ns = 0;
     loop {
         let next_ns = rota.first().map(|first| first.0);
         let now = now_ns();
         let is_round_over = next_ns.is_none_or(|next_ns| next_ns > now) || now > begun_round_ns + MOST_ROUND_NS;
-        if is_round_over || desk.wakes.len() >= MOST_WAKES {
-            desk.wakes.wake();
+        if is_round_over || context.wakes.len() >= MOST_WAKES {
+            context.wakes.wake();
         }
         if let Some(why) = inbox.wait(next_ns, now, &mut requests) {
-            desk.wakes.wake();
+            context.wakes.wake();
             rota.end(&why);
             return;
         }
@@ -66,7 +66,8 @@ pub(super) fn work(stepper: &Stepper, encoder: &Encoder, refiner: &SyncSender<Re
                 let newcomers = std::mem::take(&mut *lock(&stepper.newcomers));
                 newcomers.into_iter().for_each(|(number, running)| rota.adopt(number, running));
             } else {
-                let deleted = rota.with(number, |running| running.guarded(|running| running.serve(request, &mut desk)));
+                let deleted =
+                    rota.with(number, |running| running.guarded(|running| running.serve(request, &mut context)));
                 if let Some(running) = deleted {
                     // To free what a session has takes longer than a step may wait.
                     let owner = running.live.owner.clone();
@@ -81,16 +82,16 @@ pub(super) fn work(stepper: &Stepper, encoder: &Encoder, refiner: &SyncSender<Re
         if let Some((due_ns, number)) = rota.first()
             && due_ns <= begun_ns
         {
-            if desk.wakes.is_empty() {
+            if context.wakes.is_empty() {
                 begun_round_ns = begun_ns;
             }
             let (parts, is_alone) = (rota.parts(number), rota.is_alone());
             rota.with(number, |running| {
                 let late_ns = running.late_ns(begun_ns);
-                running.guarded(|running| running.step(begun_ns, &mut desk));
+                running.guarded(|running| running.step(begun_ns, &mut context));
                 let ended_ns = now_ns();
                 let taken_ns = ended_ns.saturating_sub(begun_ns);
-                desk.longest.observe(ended_ns, taken_ns);
+                context.longest.observe(ended_ns, taken_ns);
                 inbox.tally.lateness.add(late_ns);
                 inbox.tally.step_time.add(taken_ns);
                 running.queue_again(begun_ns, ended_ns, parts, is_alone);

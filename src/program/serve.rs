@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use palpate::budget;
-use palpate::server::{self, Doors, signals};
+use palpate::server::{self, Listeners, signals};
 use tokio_util::sync::CancellationToken;
 use tracing_subscriber::fmt::format::FmtSpan;
 
@@ -146,16 +146,16 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
         .build()
         .map_err(|e| Failure::Failed(format!("can't start the network threads: {e}")))?;
     let ended = runtime.block_on(async {
-        let doors = Doors::open(&config).await?;
+        let listeners = Listeners::open(&config).await?;
         let shutdown = CancellationToken::new();
         signals::outlive();
         tokio::spawn(signals::cancel_on(shutdown.clone()));
         // The standard output may be closed; that does not stop the server.
-        let _ = writeln!(std::io::stdout(), "palpate listens on {}", doors.url());
-        if let Some(url) = doors.metrics_url() {
+        let _ = writeln!(std::io::stdout(), "palpate listens on {}", listeners.url());
+        if let Some(url) = listeners.metrics_url() {
             let _ = writeln!(std::io::stdout(), "metrics are at {url}");
         }
-        Ok(server::serve(doors, config, shutdown).await?)
+        Ok(server::serve(listeners, config, shutdown).await?)
     });
     runtime.shutdown_background();
     ended

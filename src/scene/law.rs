@@ -43,11 +43,11 @@ pub struct Poke {
 
 /// A surgical force over time.
 #[derive(Debug, Clone, PartialEq)]
-pub struct ForceLaw {
+pub struct LoadProfile {
     /// The control point over time.
-    pub centre: CentreLaw,
+    pub centre: CentreProfile,
     /// The exerting force over time.
-    pub strength: StrengthLaw,
+    pub strength: StrengthProfile,
     /// Falloff c, 1/m.
     pub falloff_per_m: f64,
     /// Offset c′ of the exponent.
@@ -56,7 +56,7 @@ pub struct ForceLaw {
 
 /// The control point over time.
 #[derive(Debug, Clone, PartialEq)]
-pub enum CentreLaw {
+pub enum CentreProfile {
     /// The place from each step on. Before the first there is no force.
     Hops(Vec<(u64, DVec2)>),
     /// A straight line.
@@ -70,7 +70,7 @@ pub enum CentreLaw {
 
 /// The exerting force over time.
 #[derive(Debug, Clone, PartialEq)]
-pub enum StrengthLaw {
+pub enum StrengthProfile {
     /// A fixed vector times a profile.
     Scaled(DVec3, Profile),
     /// The vector from each step on, N. Before the first there is no force.
@@ -121,16 +121,18 @@ impl Profile {
     }
 }
 
-impl ForceLaw {
+impl LoadProfile {
     /// The force at a moment.
     pub fn at(&self, moment: Moment, rate_hz: f64) -> Poke {
         let force_n = match &self.strength {
-            StrengthLaw::Scaled(force, profile) => *force * profile.at(moment, rate_hz),
-            StrengthLaw::Recorded(rows) => begun(rows, moment.step).unwrap_or(DVec3::ZERO),
+            StrengthProfile::Scaled(force, profile) => *force * profile.at(moment, rate_hz),
+            StrengthProfile::Recorded(rows) => begun(rows, moment.step).unwrap_or(DVec3::ZERO),
         };
         let centre = match &self.centre {
-            CentreLaw::Hops(hops) => begun(hops, moment.step),
-            CentreLaw::Path { from_m, velocity_m_per_s } => Some(*from_m + *velocity_m_per_s * moment.time_s(rate_hz)),
+            CentreProfile::Hops(hops) => begun(hops, moment.step),
+            CentreProfile::Path { from_m, velocity_m_per_s } => {
+                Some(*from_m + *velocity_m_per_s * moment.time_s(rate_hz))
+            }
         };
         Poke {
             centre_m: centre.unwrap_or(DVec2::ZERO),
@@ -143,7 +145,7 @@ impl ForceLaw {
 
 /// The movement of a grasped point.
 #[derive(Debug, Clone, PartialEq)]
-pub struct MoveLaw {
+pub struct MotionProfile {
     /// The point.
     pub point: [usize; 2],
     /// Displacements, which add up.
@@ -172,7 +174,7 @@ pub struct Motion {
     pub acceleration_m_per_s2: DVec3,
 }
 
-impl MoveLaw {
+impl MotionProfile {
     /// Displacement, velocity and acceleration at a time.
     pub fn at(&self, time_s: f64) -> Motion {
         let mut motion = Motion::default();

@@ -7,7 +7,7 @@ use glam::{DVec2, DVec3};
 
 use super::check::{check_centre, check_force, check_free, check_reach, is_near, nearest_point};
 use super::document::{self, Document, Fields, Item};
-use super::law::{CentreLaw, ForceLaw, Moment, Move, MoveLaw, Profile, StrengthLaw};
+use super::law::{CentreProfile, LoadProfile, Moment, MotionProfile, Move, Profile, StrengthProfile};
 use super::script::Script;
 use super::{Change, Scene, Sheet};
 use crate::limits::Limits;
@@ -71,7 +71,7 @@ impl Binding<'_> {
             .collect::<Result<Vec<_>>>()?;
         for (index, law) in forces.iter().enumerate() {
             let end = law.at(Moment::start_of(steps), self.scene.stepping.rate_hz);
-            if matches!(law.centre, CentreLaw::Path { .. }) && !is_near(&self.scene.sheet, end.centre_m) {
+            if matches!(law.centre, CentreProfile::Path { .. }) && !is_near(&self.scene.sheet, end.centre_m) {
                 let message = "leaves the sheet; where the force is streamed (--held, a replay) it ends there";
                 self.warnings.push(format!("force[{index}].path: {message}"));
             }
@@ -168,7 +168,7 @@ impl Binding<'_> {
         Ok(changes)
     }
 
-    fn force(&mut self, item: &Item<'_>, control_points: &mut Vec<[usize; 2]>) -> Result<ForceLaw> {
+    fn force(&mut self, item: &Item<'_>, control_points: &mut Vec<[usize; 2]>) -> Result<LoadProfile> {
         item.table(|fields| {
             let centre = self.centre(item, fields, control_points)?;
             let falloff_per_m = not_negative(&fields.path("falloff_per_m"), fields.required_number("falloff_per_m")?)?;
@@ -182,7 +182,7 @@ impl Binding<'_> {
                 Ok(profile) => {
                     let force_n = fields.required("force_n")?.vector()?;
                     within_limit(&fields.path("force_n"), force_n)?;
-                    StrengthLaw::Scaled(force_n, profile)
+                    StrengthProfile::Scaled(force_n, profile)
                 }
                 Err(rows) => {
                     // A trace replaces force_n, which may be present all the same.
@@ -190,10 +190,10 @@ impl Binding<'_> {
                     for (_, force_n) in &rows {
                         within_limit(&fields.path("profile.file"), *force_n)?;
                     }
-                    StrengthLaw::Recorded(rows)
+                    StrengthProfile::Recorded(rows)
                 }
             };
-            Ok(ForceLaw { centre, strength, falloff_per_m, falloff_offset })
+            Ok(LoadProfile { centre, strength, falloff_per_m, falloff_offset })
         })
     }
 
@@ -202,14 +202,14 @@ impl Binding<'_> {
         item: &Item<'_>,
         fields: &mut Fields<'_>,
         control_points: &mut Vec<[usize; 2]>,
-    ) -> Result<CentreLaw> {
+    ) -> Result<CentreProfile> {
         let (point, hops, path) = (fields.item("point"), fields.item("hops"), fields.item("path"));
         let one = "must have just one of `point`, `hops` and `path`";
         match (point, hops, path) {
             (Some(point), None, None) => {
                 let (point, place) = self.point(&point)?;
                 control_points.push(point);
-                Ok(CentreLaw::Hops(vec![(0, place)]))
+                Ok(CentreProfile::Hops(vec![(0, place)]))
             }
             (None, Some(hops), None) => {
                 let mut entries = Vec::new();
@@ -222,7 +222,7 @@ impl Binding<'_> {
                     })?);
                 }
                 rising(&hops, "at_s", &mut entries)?;
-                Ok(CentreLaw::Hops(entries))
+                Ok(CentreProfile::Hops(entries))
             }
             (None, None, Some(path)) => path.table(|fields| {
                 let from_m = fields.required("from_m")?.place()?;
@@ -232,7 +232,7 @@ impl Binding<'_> {
                 let sheet = &self.scene.sheet;
                 check_centre(&fields.path("from_m"), sheet, from_m)?;
                 control_points.push(nearest_point(sheet, from_m));
-                Ok(CentreLaw::Path { from_m, velocity_m_per_s })
+                Ok(CentreProfile::Path { from_m, velocity_m_per_s })
             }),
             (None, None, None) => Err(item.refuse(Reason::Missing, one)),
             _ => Err(item.refuse(Reason::OutOfRange, one)),
@@ -337,7 +337,7 @@ impl Binding<'_> {
         Ok(rows)
     }
 
-    fn tool(&mut self, item: &Item<'_>) -> Result<MoveLaw> {
+    fn tool(&mut self, item: &Item<'_>) -> Result<MotionProfile> {
         item.table(|fields| {
             let (point, _) = self.point(&fields.required("point")?)?;
             check_free(&fields.path("point"), &self.scene.sheet, point)?;
@@ -354,7 +354,7 @@ impl Binding<'_> {
                     Ok(Move { from_s, to_s, by_m: fields.required("by_m")?.vector()? })
                 })?);
             }
-            let law = MoveLaw { point, moves };
+            let law = MotionProfile { point, moves };
             // The displacement is largest at the end of a move. Where moves overlap, their sum is an upper bound.
             let farthest: f64 = law.moves.iter().map(|m| m.by_m.length()).sum();
             check_reach(&fields.path("moves"), &self.scene.sheet, farthest, self.limits)?;

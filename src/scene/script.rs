@@ -4,7 +4,7 @@ use glam::DVec3;
 
 pub use super::action::Action;
 use super::check::is_near;
-use super::law::{ForceLaw, Moment, MoveLaw};
+use super::law::{LoadProfile, Moment, MotionProfile};
 use super::{Change, Sheet};
 
 /// The built-in scripts: name and text.
@@ -26,9 +26,9 @@ pub struct Script {
     /// Points of the records.
     pub sample_points: Vec<[usize; 2]>,
     /// Surgical forces.
-    pub forces: Vec<ForceLaw>,
+    pub forces: Vec<LoadProfile>,
     /// Grasped points.
-    pub moves: Vec<MoveLaw>,
+    pub moves: Vec<MotionProfile>,
     /// Changes of the tissue and the step at whose beginning each takes effect, by ascending step.
     pub changes: Vec<(u64, Change)>,
     /// Descriptions of values that were rounded.
@@ -44,7 +44,7 @@ impl Script {
     /// Force k is tool k, and the grasped points follow. A force is held for the step, from its beginning; a grasped
     /// point reaches its target at the step's end.
     pub fn actions_at(&self, step: u64) -> impl Iterator<Item = (usize, Action)> {
-        let poke = move |law: &ForceLaw, step: u64| {
+        let poke = move |law: &LoadProfile, step: u64| {
             let poke = law.at(Moment::start_of(step), self.rate_hz);
             // A force that has left the sheet can no longer be commanded.
             (poke.force_n != DVec3::ZERO && is_near(&self.sheet, poke.centre_m)).then_some(poke)
@@ -54,7 +54,7 @@ impl Script {
             (before != now).then_some((tool, now.map_or(Action::Release, Action::Push)))
         });
         #[allow(clippy::cast_precision_loss)]
-        let target = move |law: &MoveLaw, end: u64| law.at(end as f64 / self.rate_hz).displacement_m;
+        let target = move |law: &MotionProfile, end: u64| law.at(end as f64 / self.rate_hz).displacement_m;
         let grasps = self.moves.iter().enumerate().filter_map(move |(index, law)| {
             let (before, now) = (target(law, step), target(law, step + 1));
             let action = Action::Grasp { point: law.point, displacement_m: now };

@@ -6,7 +6,7 @@ use tonic::{Request, Response, Status};
 use tracing::info;
 
 use super::connections::Register;
-use super::house::House;
+use super::services::Services;
 use crate::budget::{Account, Purpose, Resource, Work};
 use crate::pace::Held;
 use crate::pace::clock::now_ns;
@@ -15,7 +15,7 @@ use palpate_proto::pb;
 use palpate_proto::pb::admin_service_server::AdminService;
 
 pub(super) struct Admin {
-    pub(super) house: House,
+    pub(super) services: Services,
     pub(super) register: Arc<Register>,
 }
 
@@ -35,7 +35,7 @@ impl AdminService for Admin {
             tools: account.has(Resource::Leases),
             processor_share: Work::ALL.iter().map(|work| account.share(*work, now)).sum(),
         };
-        let callers = self.house.pacer.budget.accounts().iter().map(use_of).collect();
+        let callers = self.services.pacer.budget.accounts().iter().map(use_of).collect();
         Ok(Response::new(pb::ListCallersResponse { callers }))
     }
 
@@ -43,7 +43,7 @@ impl AdminService for Admin {
         &self,
         request: Request<pb::ListStreamsRequest>,
     ) -> Result<Response<pb::ListStreamsResponse>, Status> {
-        let live = self.house.pacer.get(&request.get_ref().session_id)?;
+        let live = self.services.pacer.get(&request.get_ref().session_id)?;
         let shown = live.shown_streams().into_iter().map(|stream| pb::StreamUse {
             number: stream.number,
             call: stream.what.to_owned(),
@@ -56,7 +56,7 @@ impl AdminService for Admin {
 
     async fn free_tool(&self, request: Request<pb::FreeToolRequest>) -> Result<Response<pb::FreeToolResponse>, Status> {
         let pb::FreeToolRequest { session_id, tool } = request.into_inner();
-        let live = self.house.pacer.get(&session_id)?;
+        let live = self.services.pacer.get(&session_id)?;
         if live.at_intake(|intake, _| intake.free(|other, _| other == tool)) == 0 {
             return Err(Refusal::new(Reason::OutOfRange, "tool", format!("nobody holds tool {tool}")).into());
         }
@@ -69,7 +69,7 @@ impl AdminService for Admin {
         request: Request<pb::CutStreamRequest>,
     ) -> Result<Response<pb::CutStreamResponse>, Status> {
         let pb::CutStreamRequest { session_id, number } = request.into_inner();
-        let live = self.house.pacer.get(&session_id)?;
+        let live = self.services.pacer.get(&session_id)?;
         if live.cut_streams(|other, _| other == number) == 0 {
             let message = format!("the session has no stream {number}");
             return Err(Refusal::new(Reason::OutOfRange, "number", message).into());
@@ -83,7 +83,7 @@ impl AdminService for Admin {
         request: Request<pb::CutCallerRequest>,
     ) -> Result<Response<pb::CutCallerResponse>, Status> {
         let pb::CutCallerRequest { caller, delete_sessions } = request.into_inner();
-        let pacer = &self.house.pacer;
+        let pacer = &self.services.pacer;
         let account =
             pacer.budget.accounts().into_iter().find(|account| account.name() == caller).ok_or_else(|| {
                 Refusal::new(Reason::OutOfRange, "caller", format!("unknown caller `{}`", excerpt(&caller)))
@@ -107,7 +107,7 @@ impl AdminService for Admin {
         &self,
         request: Request<pb::ReviveSessionRequest>,
     ) -> Result<Response<pb::ReviveSessionResponse>, Status> {
-        let step = self.house.pacer.get(&request.get_ref().session_id)?.revive().await?;
+        let step = self.services.pacer.get(&request.get_ref().session_id)?.revive().await?;
         Ok(Response::new(pb::ReviveSessionResponse { step }))
     }
 }

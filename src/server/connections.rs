@@ -54,7 +54,7 @@ const QUEUE: usize = 64;
 pub(super) fn incoming(
     listener: TcpListener,
     tls: Option<Arc<Reloaded<Tls>>>,
-    seats: Arc<Seats>,
+    slots: Arc<ConnectionSlots>,
     limits: &Limits,
     budget: Arc<Budget>,
     traffic: Arc<Traffic>,
@@ -80,8 +80,8 @@ pub(super) fn incoming(
                 },
             };
             let gate = Arc::new(Gate::new(limits.connection_window_bytes));
-            let seat = match seats.take(address.ip(), &gate) {
-                Ok(seat) => seat,
+            let slot = match slots.take(address.ip(), &gate) {
+                Ok(slot) => slot,
                 Err(why) => {
                     warn!(%address, "connection closed: {why}");
                     continue;
@@ -99,7 +99,7 @@ pub(super) fn incoming(
             // Nagle's algorithm would delay a sample by milliseconds. An error means that the client has closed the
             // connection; reading will notice that.
             let _ = socket.set_nodelay(true);
-            let entry = Entry::new(address, Arc::new(seat), gate, window, &limits, &traffic, &register);
+            let entry = Entry::new(address, Arc::new(slot), gate, window, &limits, &traffic, &register);
             let Some(tls) = &tls else {
                 let _ = ready.send(Ok(entry.connection(Transport::Plain(socket), None))).await;
                 continue;
@@ -126,7 +126,7 @@ pub(super) fn incoming(
 
 /// Limits the number of connections: in all, and from one address.
 #[derive(Debug)]
-pub(super) struct Seats {
+pub(super) struct ConnectionSlots {
     most: usize,
     most_each: usize,
     /// The largest number of unauthenticated ones; `None` if the server authenticates nobody.
@@ -165,23 +165,23 @@ impl OpenConnections {
 
 /// A connection's place within the limits, until it is dropped.
 #[derive(Debug)]
-pub(super) struct Seat {
-    seats: Arc<Seats>,
+pub(super) struct ConnectionSlot {
+    slots: Arc<ConnectionSlots>,
     address: IpAddr,
     number: u64,
     is_authenticated: AtomicBool,
 }
 
-impl Seats {
+impl ConnectionSlots {
     /// For as many connections as `limits` allow, of which at most `most_unauthenticated` may be unauthenticated. When a
     /// limit is reached, the oldest of those is closed in favour of a new connection.
     pub(super) fn new(limits: &Limits, most_unauthenticated: Option<usize>) -> Self {
         let (most, most_each) = (limits.connections, limits.connections_per_address);
-        Seats { most, most_each, most_unauthenticated, open: Mutex::default() }
+        ConnectionSlots { most, most_each, most_unauthenticated, open: Mutex::default() }
     }
 
     /// Takes a place for a connection, or says why there is none.
-    fn take(self: &Arc<Self>, address: IpAddr, gate: &Arc<Gate>) -> Result<Seat, String> {
+    fn take(self: &Arc<Self>, address: IpAddr, gate: &Arc<Gate>) -> Result<ConnectionSlot, String> {
         let address = network(address);
         let mut open = lock(&self.open);
         let all: usize = open.by_address.values().sum();
@@ -205,22 +205,22 @@ impl Seats {
         if self.most_unauthenticated.is_some() {
             open.unauthenticated.push_back(Unauthenticated { number, address, gate: Arc::downgrade(gate) });
         }
-        Ok(Seat { seats: self.clone(), address, number, is_authenticated: false.into() })
+        Ok(ConnectionSlot { slots: self.clone(), address, number, is_authenticated: false.into() })
     }
 }
 
-impl Seat {
+impl ConnectionSlot {
     /// Marks the connection as authenticated: it is not closed in favour of others any more.
     pub(super) fn mark_authenticated(&self) {
         if !self.is_authenticated.swap(true, Ordering::Relaxed) {
-            lock(&self.seats.open).unauthenticated.retain(|other| other.number != self.number);
+            lock(&self.slots.open).unauthenticated.retain(|other| other.number != self.number);
         }
     }
 }
 
-impl Drop for Seat {
+impl Drop for ConnectionSlot {
     fn drop(&mut self) {
-        let mut open = lock(&self.seats.open);
+        let mut open = lock(&self.slots.open);
         open.unauthenticated.retain(|other| other.number != self.number);
         if let Some(each) = open.by_address.get_mut(&self.address) {
             *each -= 1;
@@ -245,7 +245,7 @@ pub(crate) struct Peer {
     /// Flow control between the connection and its transport.
     pub(super) gate: Arc<Gate>,
     /// The connection's place within the limits.
-    pub(super) seat: Arc<Seat>,
+    pub(super) slot: Arc<ConnectionSlot>,
     /// Leases that end with the connection.
     pub(super) leases: Arc<Leases>,
     /// Numbers of the accounts that have called over it.
@@ -291,14 +291,14 @@ struct Entry {
     deadline: Pin<Box<Sleep>>,
     traffic: Arc<Traffic>,
     register: Arc<Register>,
-    seat: Arc<Seat>,
+    slot: Arc<ConnectionSlot>,
     gate: Arc<Gate>,
 }
 
 impl Entry {
     fn new(
         address: SocketAddr,
-        seat: Arc<Seat>,
+        slot: Arc<ConnectionSlot>,
         gate: Arc<Gate>,
         window: Taken,
         limits: &Limits,
@@ -314,13 +314,13 @@ impl Entry {
             deadline: Box::pin(tokio::time::sleep(Duration::from_secs_f64(limits.handshake_s))),
             traffic: traffic.clone(),
             register: register.clone(),
-            seat,
+            slot,
             gate,
         }
     }
 
     fn connection(self, transport: Transport, certificate: Option<Arc<[String]>>) -> Connection {
-        let Entry { address, window, calls, creations, deadline, traffic, register, seat, gate } = self;
+        let Entry { address, window, calls, creations, deadline, traffic, register, slot, gate } = self;
         debug!(%address, "connected");
         let peer = Peer {
             address,
@@ -329,7 +329,7 @@ impl Entry {
             creations: Arc::new(creations),
             leases: Arc::default(),
             gate,
-            seat,
+            slot,
             callers: Arc::default(),
         };
         Connection {
@@ -496,53 +496,53 @@ impl AsyncWrite for Connection {
 mod tests {
     use super::*;
 
-    fn seats(most_unauthenticated: Option<usize>) -> Arc<Seats> {
+    fn slots(most_unauthenticated: Option<usize>) -> Arc<ConnectionSlots> {
         let limits = Limits { connections: 5, connections_per_address: 3, ..Limits::default() };
-        Arc::new(Seats::new(&limits, most_unauthenticated))
+        Arc::new(ConnectionSlots::new(&limits, most_unauthenticated))
     }
 
-    fn take(seats: &Arc<Seats>, address: &str) -> Result<(Seat, Arc<Gate>), String> {
+    fn take(slots: &Arc<ConnectionSlots>, address: &str) -> Result<(ConnectionSlot, Arc<Gate>), String> {
         let gate = Arc::new(Gate::new(1 << 20));
-        seats.take(address.parse().unwrap(), &gate).map(|seat| (seat, gate))
+        slots.take(address.parse().unwrap(), &gate).map(|slot| (slot, gate))
     }
 
     #[test]
     fn one_address_does_not_get_all_connections_and_a_closed_one_makes_room() {
-        let seats = seats(None);
-        let mut greedy: Vec<_> = (0..3).map(|_| take(&seats, "192.0.2.1").unwrap()).collect();
-        assert!(take(&seats, "::ffff:192.0.2.1").is_err_and(|why| why.contains("per_address")));
+        let slots = slots(None);
+        let mut greedy: Vec<_> = (0..3).map(|_| take(&slots, "192.0.2.1").unwrap()).collect();
+        assert!(take(&slots, "::ffff:192.0.2.1").is_err_and(|why| why.contains("per_address")));
         // Two addresses of one network.
-        let others = [take(&seats, "2001:db8::1").unwrap(), take(&seats, "2001:db8::ffff:1").unwrap()];
-        assert!(take(&seats, "192.0.2.2").is_err_and(|why| why.contains("limits.connections)")));
+        let others = [take(&slots, "2001:db8::1").unwrap(), take(&slots, "2001:db8::ffff:1").unwrap()];
+        assert!(take(&slots, "192.0.2.2").is_err_and(|why| why.contains("limits.connections)")));
         greedy.pop();
-        let third = take(&seats, "2001:db8:0:0:1::").unwrap();
+        let third = take(&slots, "2001:db8:0:0:1::").unwrap();
         drop((greedy, third));
-        assert_eq!(lock(&seats.open).by_address.len(), 1);
+        assert_eq!(lock(&slots.open).by_address.len(), 1);
         drop(others);
-        assert!(lock(&seats.open).by_address.is_empty());
+        assert!(lock(&slots.open).by_address.is_empty());
     }
 
     #[tokio::test]
     async fn unauthenticated_connections_make_room_for_others_and_authenticated_ones_stay() {
-        let seats = seats(Some(2));
+        let slots = slots(Some(2));
         let is_closed = async |gate: &Gate| futures_util::poll!(std::pin::pin!(gate.closed())).is_ready();
-        let known: Vec<_> = (1..=3).map(|host| take(&seats, &format!("192.0.2.{host}")).unwrap()).collect();
+        let known: Vec<_> = (1..=3).map(|host| take(&slots, &format!("192.0.2.{host}")).unwrap()).collect();
         // The third took the place of the first, which had not authenticated yet.
         assert!(is_closed(&known[0].1).await && !is_closed(&known[1].1).await);
-        known.iter().for_each(|(seat, _)| seat.mark_authenticated());
-        let unknown: Vec<_> = (4..=30).map_while(|host| take(&seats, &format!("192.0.2.{host}")).ok()).collect();
+        known.iter().for_each(|(slot, _)| slot.mark_authenticated());
+        let unknown: Vec<_> = (4..=30).map_while(|host| take(&slots, &format!("192.0.2.{host}")).ok()).collect();
         // Connections that were told to close, and do not, take only a few places.
         assert_eq!(known.len() + unknown.len(), 5 + CLOSING);
         for (_, gate) in &known[1..] {
             assert!(!is_closed(gate).await);
         }
         drop(unknown);
-        assert!(lock(&seats.open).unauthenticated.is_empty());
+        assert!(lock(&slots.open).unauthenticated.is_empty());
         // The same within one address: its own unauthenticated connections are closed.
-        let first = take(&seats, "192.0.2.2").unwrap();
-        let _second = take(&seats, "192.0.2.2").unwrap();
+        let first = take(&slots, "192.0.2.2").unwrap();
+        let _second = take(&slots, "192.0.2.2").unwrap();
         drop(known);
-        let _third = take(&seats, "192.0.2.2").unwrap();
+        let _third = take(&slots, "192.0.2.2").unwrap();
         assert!(is_closed(&first.1).await);
     }
 }

@@ -11,6 +11,7 @@ use tonic::body::Body;
 use tower::{Layer, Service};
 use tracing::{Instrument, info, info_span};
 
+use super::charged_caller::ChargedCaller;
 use super::connections::Peer;
 use super::identity::{Access, Caller, Credentials, Shown, access};
 use super::price::Price;
@@ -18,7 +19,6 @@ use super::reload::Reloaded;
 use super::request::{RequestBody, TimeLimit};
 use super::revocation::Calls;
 use super::traffic::Traffic;
-use super::visitor::Visitor;
 use crate::budget::Budget;
 use crate::refusal::{Reason, Refusal, Result, excerpt};
 
@@ -91,7 +91,7 @@ impl GuardLayer {
                 let caller = shown.check(&credentials)?;
                 self.traffic.called(path);
                 if let Some(peer) = peer {
-                    peer.seat.mark_authenticated();
+                    peer.slot.mark_authenticated();
                 }
                 // With authentication disabled there is nothing to check again later.
                 Ok((caller, (!credentials.is_open()).then_some((shown, version))))
@@ -168,7 +168,7 @@ where
                     return Box::pin(async move { Ok(answer) });
                 }
                 let peer = request.extensions().get::<Peer>();
-                let name = Visitor::account_name(shown.is_some().then_some(&*caller.name), peer);
+                let name = ChargedCaller::account_name(shown.is_some().then_some(&*caller.name), peer);
                 let account = self.layer.budget.account(&name);
                 if let Some(peer) = peer {
                     peer.used_by(account.number());
@@ -180,8 +180,8 @@ where
                     _ => TimeLimit::WholeBody(self.layer.message_timeout),
                 };
                 let price = Price::of(request.uri().path(), &account);
-                let visitor = Visitor::new(account, &request);
-                request.extensions_mut().insert(visitor);
+                let charged_caller = ChargedCaller::new(account, &request);
+                request.extensions_mut().insert(charged_caller);
                 let call = shown.map(|(shown, version)| self.layer.calls.begin(shown, from, version));
                 if let Some(call) = &call {
                     request.extensions_mut().insert(call.tenure());

@@ -12,14 +12,14 @@ use tokio_util::task::AbortOnDropHandle;
 use tonic::{Request, Response, Status, Streaming};
 use tracing::{Instrument, debug, info};
 
+use super::charged_caller::ChargedCaller;
 use super::connections::Peer;
 use super::cut::until_cut;
 use super::force_law::{Computing, Updates};
-use super::house::House;
 use super::rate::Bucket;
 use super::recovered::Notices;
 use super::revocation::Tenure;
-use super::visitor::Visitor;
+use super::services::Services;
 use crate::budget::{Account, Resource, Taken};
 use crate::ids::random_bits;
 use crate::limits::Limits;
@@ -38,7 +38,7 @@ use palpate_proto::{pb, touch};
 use palpate_touch::device::{Device, UNDECLARED_FORCE_N};
 
 #[derive(Clone)]
-pub(super) struct Haptics(pub(super) House);
+pub(super) struct Haptics(pub(super) Services);
 
 type Out<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
@@ -421,7 +421,7 @@ impl HapticService for Haptics {
         &self,
         request: Request<Streaming<pb::TouchRequest>>,
     ) -> Result<Response<Self::TouchStream>, Status> {
-        let Visitor { account, .. } = Visitor::of(request.extensions());
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let (writer, events) = queue(self.0.config.limits.queued_samples);
         // The client may wait for our headers before it opens, so its first message is not waited for here.
         let (opened, opening) = oneshot::channel();
@@ -435,7 +435,7 @@ impl HapticService for Haptics {
         &self,
         request: Request<pb::AcquireToolRequest>,
     ) -> Result<Response<pb::AcquireToolResponse>, Status> {
-        let Visitor { account, may_vanish } = Visitor::of(request.extensions());
+        let ChargedCaller { account, may_vanish } = ChargedCaller::of(request.extensions());
         let (peer, tenure) =
             (request.extensions().get::<Peer>().cloned(), request.extensions().get::<Tenure>().cloned());
         let request = request.into_inner();
@@ -500,7 +500,7 @@ impl HapticService for Haptics {
         &self,
         request: Request<pb::WatchSamplesRequest>,
     ) -> Result<Response<Self::WatchSamplesStream>, Status> {
-        let Visitor { account, .. } = Visitor::of(request.extensions());
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
         let (every, deadband) = (request.sample_every_steps, request.deadband.as_ref());
@@ -523,7 +523,7 @@ impl HapticService for Haptics {
 
     async fn probe(&self, request: Request<pb::ProbeRequest>) -> Result<Response<Self::ProbeStream>, Status> {
         use pb::probe_request::Where;
-        let Visitor { account, .. } = Visitor::of(request.extensions());
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
         let every = wire::every("every_steps", request.every_steps)?;

@@ -19,14 +19,14 @@ use prometheus_client::registry::{Registry, Unit};
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 
-use super::connections::{self, Connection, Seats};
+use super::connections::{self, Connection, ConnectionSlots};
 use super::traffic::Traffic;
 use super::workshop::Workshop;
 use crate::budget::{Budget, Purpose, Resource};
 use crate::limits::Limits;
 use crate::lock::lock;
 use crate::pace::tally::{Count, Tally, Times};
-use crate::pace::{Pacer, State};
+use crate::pace::{Pacer, RunState};
 use crate::scene::record::AuditedError;
 
 /// Everything, as it is when it is asked for.
@@ -171,11 +171,11 @@ impl Collector for Stepping {
         for (name, is) in [
             (
                 "running",
-                (|status| status.state == State::Running && !status.resting) as fn(&crate::pace::Status) -> bool,
+                (|status| status.state == RunState::Running && !status.resting) as fn(&crate::pace::Status) -> bool,
             ),
-            ("resting", |status| status.state == State::Running && status.resting),
-            ("paused", |status| status.state == State::Paused),
-            ("held", |status| status.state == State::Held),
+            ("resting", |status| status.state == RunState::Running && status.resting),
+            ("paused", |status| status.state == RunState::Paused),
+            ("held", |status| status.state == RunState::Held),
         ] {
             let count = statuses.iter().filter(|status| is(status)).count();
             states.encode_family(&[("state", name)])?.encode_gauge(&(count as i64))?;
@@ -206,7 +206,7 @@ impl Collector for Stepping {
         let help = "Of the newest audits of all sessions the largest error of a displacement, relative to the largest";
         gauge("audited_displacement_error_max", help, worst.displacement)?;
         gauge("audited_force_error_max", "The same of a force", worst.force)?;
-        let running = statuses.iter().filter(|status| status.state == State::Running);
+        let running = statuses.iter().filter(|status| status.state == RunState::Running);
         let slowest = running.map(|status| status.dilation.value).fold(1.0, f64::min);
         gauge("time_dilation_min", "Simulated over real time of the session that is furthest behind", slowest)
     }
@@ -256,7 +256,7 @@ pub(super) async fn serve(
         }
     };
     let limits = Limits { connections: SCRAPERS, connections_per_address: SCRAPERS, ..limits.clone() };
-    let seats = Arc::new(Seats::new(&limits, Some(SCRAPERS)));
+    let seats = Arc::new(ConnectionSlots::new(&limits, Some(SCRAPERS)));
     // What the server's clients do and take is counted elsewhere.
     let budget = Budget::new(&limits, 1, 1);
     let address = listener.local_addr()?;

@@ -14,12 +14,12 @@ use tracing::{info, warn};
 
 use super::catalog::Catalog;
 use super::config::Config;
-use super::connections::Seats;
-use super::doors::{Doors, ServeError};
+use super::connections::ConnectionSlots;
 use super::guard::GuardLayer;
 use super::health::{SERVICES, end_health, report_files, report_workshop};
-use super::house::House;
+use super::listeners::{Listeners, ServeError};
 use super::revocation::Calls;
+use super::services::Services;
 use super::textures::Textures;
 use super::traffic::Traffic;
 use super::workshop::Workshop;
@@ -49,13 +49,13 @@ fn cors(origins: &[HeaderValue]) -> CorsLayer {
 /// When this many bytes have become free, the allocator is asked to return its free memory to the system.
 const WORTH_GIVING_BACK: u64 = 16 << 20;
 
-/// Serves at `doors` until `shutdown` is cancelled. Then ends all streams, and returns at the latest after the configured
+/// Serves at `listeners` until `shutdown` is cancelled. Then ends all streams, and returns at the latest after the configured
 /// deadline. The caller must end its runtime without waiting (`shutdown_background`).
 ///
 /// # Errors
 /// Returns an error if a thread can't be started, or if the transport fails.
-pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) -> Result<(), ServeError> {
-    let Doors { listener, metrics, protection } = doors;
+pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationToken) -> Result<(), ServeError> {
+    let Listeners { listener, metrics, protection } = listeners;
     let budget = Budget::new(&config.limits, config.stepping_threads(), config.serving_threads());
     info!(bytes = budget.bytes(), "memory that callers share");
     let pacer = Pacer::start(config.stepping_threads(), config.audit_share, &config.limits, budget.clone())?;
@@ -94,7 +94,7 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
     };
     let config = Arc::new(config);
     let textures = Textures::open(&config, &catalog, &pacer, &limits)?;
-    let house = House {
+    let services = Services {
         catalog,
         pacer: pacer.clone(),
         config,
@@ -135,18 +135,18 @@ pub async fn serve(doors: Doors, config: Config, shutdown: CancellationToken) ->
 
     // Unauthenticated connections leave half of the limit to the others.
     let most_unauthenticated = (!open).then_some(limits.connections.div_ceil(2));
-    let seats = Arc::new(Seats::new(&limits, most_unauthenticated));
+    let seats = Arc::new(ConnectionSlots::new(&limits, most_unauthenticated));
     let register = Arc::new(connections::Register::default());
     let tls = protection.tls.clone();
     let incoming = connections::incoming(listener, tls, seats, &limits, budget.clone(), traffic, register.clone());
     let silence = Some(Duration::from_secs_f64(limits.keepalive_s));
     let bytes = limits.message_bytes;
-    let pages = page::Page::of(house.config.viewer.clone());
-    let sessions = SessionServiceServer::new(sessions::Sessions(house.clone())).max_decoding_message_size(bytes);
-    let haptics = HapticServiceServer::new(haptics::Haptics(house.clone())).max_decoding_message_size(bytes);
+    let pages = page::Page::of(services.config.viewer.clone());
+    let sessions = SessionServiceServer::new(sessions::Sessions(services.clone())).max_decoding_message_size(bytes);
+    let haptics = HapticServiceServer::new(haptics::Haptics(services.clone())).max_decoding_message_size(bytes);
     let admin =
-        AdminServiceServer::new(admin::Admin { house: house.clone(), register }).max_decoding_message_size(bytes);
-    let views = ViewServiceServer::new(views::Views(house)).max_decoding_message_size(bytes);
+        AdminServiceServer::new(admin::Admin { services: services.clone(), register }).max_decoding_message_size(bytes);
+    let views = ViewServiceServer::new(views::Views(services)).max_decoding_message_size(bytes);
     let routes = Routes::new(health_service)
         .add_service(reflection().build_v1()?)
         .add_service(reflection().build_v1alpha()?)

@@ -10,11 +10,11 @@ use palpate_proto::pb::session_service_server::SessionService;
 use tonic::{Request, Response, Status};
 use tracing::{info, warn};
 
+use super::charged_caller::ChargedCaller;
 use super::connections::Peer;
 use super::cut::until_cut;
-use super::house::House;
+use super::services::Services;
 use super::status;
-use super::visitor::Visitor;
 use super::workshop::CancelFlag;
 use crate::budget::Work;
 use crate::pace::Held;
@@ -23,7 +23,7 @@ use crate::refusal::{Reason, Refusal, number};
 use crate::scene::script::Script;
 use crate::wire;
 
-pub(super) struct Sessions(pub(super) House);
+pub(super) struct Sessions(pub(super) Services);
 
 #[tonic::async_trait]
 impl SessionService for Sessions {
@@ -46,7 +46,7 @@ impl SessionService for Sessions {
             tokio::time::sleep(wait).await;
             return Err(refusal.into());
         }
-        let Visitor { account, .. } = Visitor::of(request.extensions());
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
         let scene = match &request.source {
             Some(Source::SceneName(name)) => self.0.catalog.load(name, &[], &self.0.config.limits)?,
@@ -111,7 +111,7 @@ impl SessionService for Sessions {
         &self,
         request: Request<pb::UpdateTissueRequest>,
     ) -> Result<Response<pb::UpdateTissueResponse>, Status> {
-        let Visitor { account, .. } = Visitor::of(request.extensions());
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
         let (change, to_change, pacer) = (wire::scene::from_change(&request), live.clone(), self.0.pacer.clone());
@@ -145,7 +145,7 @@ impl SessionService for Sessions {
         &self,
         request: Request<pb::GetStateHashRequest>,
     ) -> Result<Response<pb::GetStateHashResponse>, Status> {
-        let Visitor { account, .. } = Visitor::of(request.extensions());
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
         // A request for the current hash waits for its caller's share. A request for a later step must reach that step.
@@ -168,7 +168,7 @@ impl SessionService for Sessions {
         &self,
         request: Request<pb::GetScriptRequest>,
     ) -> Result<Response<Self::GetScriptStream>, Status> {
-        let Visitor { account, .. } = Visitor::of(request.extensions());
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
         let guard = live.open_stream("GetScript", Held::Nothing, &account)?;

@@ -1,6 +1,6 @@
 //! A session as a message: its state, counts, audits and tissue.
 
-use crate::pace::{Live, State};
+use crate::pace::{Live, RunState};
 use crate::scene::Named;
 use crate::scene::record::AuditedError;
 use crate::sheet::Model;
@@ -22,9 +22,9 @@ pub(super) fn session(live: &Live) -> pb::Session {
     let session = pb::Session {
         session_id: live.id.clone(),
         state: match status.state {
-            State::Running => pb::SessionState::Running,
-            State::Paused => pb::SessionState::Paused,
-            State::Held => pb::SessionState::Held,
+            RunState::Running => pb::SessionState::Running,
+            RunState::Paused => pb::SessionState::Paused,
+            RunState::Held => pb::SessionState::Held,
         }
         .into(),
         step: status.step,

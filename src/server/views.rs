@@ -10,9 +10,9 @@ use palpate_proto::pb::view_service_server::ViewService;
 use tonic::{Request, Response, Status};
 use tracing::info;
 
+use super::charged_caller::ChargedCaller;
 use super::cut::until_cut;
-use super::house::House;
-use super::visitor::Visitor;
+use super::services::Services;
 use crate::ids::random_id;
 use crate::pace::frames::Viewer;
 use crate::pace::{FrameReader, Held, StreamGuard};
@@ -20,7 +20,7 @@ use crate::refusal::{Reason, Refusal, number};
 use crate::surface::{Encoding, Refinement};
 use crate::texture::Texture;
 
-pub(super) struct Views(pub(super) House);
+pub(super) struct Views(pub(super) Services);
 
 type Out<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
@@ -68,7 +68,7 @@ impl ViewService for Views {
     type WatchFramesStream = Out<pb::WatchFramesResponse>;
 
     async fn get_mesh(&self, request: Request<pb::GetMeshRequest>) -> Result<Response<Self::GetMeshStream>, Status> {
-        let Visitor { account, .. } = Visitor::of(request.extensions());
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
         let grid = Refinement::new(live.model.points, request.refinement, &self.0.config.limits)?;
@@ -85,7 +85,7 @@ impl ViewService for Views {
         &self,
         request: Request<pb::GetTextureRequest>,
     ) -> Result<Response<Self::GetTextureStream>, Status> {
-        let Visitor { account, .. } = Visitor::of(request.extensions());
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
         let guard = self.0.pacer.get(&request.session_id)?.open_stream("GetTexture", Held::Nothing, &account)?;
         let cut = guard.cut().clone();
@@ -107,7 +107,7 @@ impl ViewService for Views {
         &self,
         request: Request<pb::WatchFramesRequest>,
     ) -> Result<Response<Self::WatchFramesStream>, Status> {
-        let Visitor { account, .. } = Visitor::of(request.extensions());
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
         let grid = Refinement::new(live.model.points, request.refinement, &self.0.config.limits)?;

@@ -36,12 +36,12 @@ pub struct Modeller {
 
 /// A pending computation of the stiffness under a tool, for a thread where no step waits for it.
 #[derive(Debug)]
-pub struct Refinement {
+pub struct StiffnessJob {
     surroundings: Surroundings,
     tangent: Arc<Mutex<Option<Tangent>>>,
 }
 
-impl Refinement {
+impl StiffnessJob {
     /// Computes the stiffness and passes it to the tool's modeller.
     pub fn work(self) {
         let tangent = self.surroundings.tangent();
@@ -73,8 +73,8 @@ impl Modeller {
     }
 
     /// A computation of the stiffness from the sheet around the tool.
-    pub fn refinement(&self, surroundings: Surroundings) -> Refinement {
-        Refinement { surroundings, tangent: self.tangent.clone() }
+    pub fn refinement(&self, surroundings: Surroundings) -> StiffnessJob {
+        StiffnessJob { surroundings, tangent: self.tangent.clone() }
     }
 
     /// The model after a step. K and B are the newest that were computed at the tool, or else the law's.

@@ -32,11 +32,11 @@ use glam::DVec3;
 
 use crate::memory;
 use crate::scene::check::nearest_point;
-use crate::scene::law::{ForceLaw, MoveLaw};
+use crate::scene::law::{LoadProfile, MotionProfile};
 use crate::scene::record::{EnergyJ, Point, Record, Recovery};
 use crate::scene::script::Action;
 use crate::sheet::audit::{Inputs, Mark};
-use crate::sheet::{self, BlowUp, Energy, Feel, Grasp, Model, PointState, Push, Still, Tissue};
+use crate::sheet::{self, BlowUp, Energy, Feel, Grasp, Model, PointState, Push, SheetCopy, Tissue};
 use command::Due;
 use palpate_touch::LocalModel;
 use palpate_touch::Tip;
@@ -424,13 +424,13 @@ impl Session {
     }
 
     /// Applies a force as a continuous law, exact within the step. No command can express this.
-    pub fn play_force(&mut self, tool: usize, law: ForceLaw) {
+    pub fn play_force(&mut self, tool: usize, law: LoadProfile) {
         self.recoveries.disturb();
         self.tissue.push(tool, Some(Push::Law(law)));
     }
 
     /// Applies a movement as a continuous law.
-    pub fn play_move(&mut self, tool: usize, law: MoveLaw) {
+    pub fn play_move(&mut self, tool: usize, law: MotionProfile) {
         self.recoveries.disturb();
         let index = self.model().index_of(law.point);
         self.tissue.grasp(tool, index, Grasp::Law(law));
@@ -494,7 +494,7 @@ impl Session {
     }
 
     /// A copy of the tissue as it is now, of which [`record_of`] tells the points later.
-    pub fn still(&self) -> Still {
+    pub fn still(&self) -> SheetCopy {
         self.tissue.still()
     }
 
@@ -522,7 +522,7 @@ impl Session {
 }
 
 /// The record of a point (grid indices [i, j]) of a copy.
-pub fn record_of(still: &Still, point: [usize; 2]) -> Point {
+pub fn record_of(still: &SheetCopy, point: [usize; 2]) -> Point {
     point_record(point, &still.point(still.model().index_of(point)))
 }
 

@@ -10,7 +10,7 @@ use std::sync::Arc;
 use palpate_touch::{Law, LocalModel};
 
 use super::laws::{FIRST, Laws};
-use super::local::{Modeller, Refinement};
+use super::local::{Modeller, StiffnessJob};
 use super::{Sample, Session, ToolSample};
 use crate::refusal::{Reason, Refusal, Result, number};
 
@@ -122,16 +122,16 @@ pub struct Sampler {
     heartbeat_steps: u64,
     /// The last sample sent, without its local models.
     told: Option<Sample>,
-    foresight: BTreeMap<u32, Foresight>,
+    followed: BTreeMap<u32, FollowedTool>,
     /// The number of the law that the last local models refer to.
     law: u32,
 }
 
 /// The local models of one tool, and the deadband that follows how the client renders them.
 #[derive(Debug)]
-struct Foresight {
+struct FollowedTool {
     modeller: Modeller,
-    deadband: palpate_touch::Deadband,
+    deadband: palpate_touch::ForceDeadband,
 }
 
 impl Sampler {
@@ -139,7 +139,7 @@ impl Sampler {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub fn new(sampling: Sampling, rate_hz: f64) -> Self {
         let heartbeat_steps = (sampling.heartbeat_s * rate_hz).round().max(1.0) as u64;
-        Sampler { sampling, heartbeat_steps, told: None, foresight: BTreeMap::new(), law: FIRST }
+        Sampler { sampling, heartbeat_steps, told: None, followed: BTreeMap::new(), law: FIRST }
     }
 
     /// The sample of the last step, if the stream should get it. `last`: the stream gets it in any case, because no
@@ -171,7 +171,7 @@ impl Sampler {
         let is_other = number != self.law;
         if is_other {
             self.law = number;
-            self.foresight.values_mut().for_each(|foresight| foresight.modeller.change_law(number, law.clone()));
+            self.followed.values_mut().for_each(|followed| followed.modeller.change_law(number, law.clone()));
         }
         let (models, is_left) = self.look_ahead(&sample, &law);
         // Another law is news: the client renders by the other one until a model names it.
@@ -180,8 +180,8 @@ impl Sampler {
         }
         self.told = Some(sample.clone());
         for (tool, model) in models {
-            if let Some(foresight) = self.foresight.get_mut(&tool) {
-                foresight.deadband.send(&model, &law);
+            if let Some(followed) = self.followed.get_mut(&tool) {
+                followed.deadband.send(&model, &law);
             }
             sample.tools.iter_mut().filter(|sample| sample.tool == tool).for_each(|sample| sample.local = Some(model));
         }
@@ -194,27 +194,27 @@ impl Sampler {
         let (mut models, mut is_left) = (Vec::new(), false);
         for tool in &sample.tools {
             let Some(feel) = &tool.feel else {
-                self.foresight.remove(&tool.tool);
+                self.followed.remove(&tool.tool);
                 // A client can't predict a tool without a model.
                 is_left |= fraction.is_some() && tool.contact.is_some();
                 continue;
             };
-            let foresight = self.foresight.entry(tool.tool).or_insert_with(|| Foresight {
+            let followed = self.followed.entry(tool.tool).or_insert_with(|| FollowedTool {
                 modeller: Modeller::new(self.law, law.clone(), self.sampling.touch_stiffness),
-                deadband: palpate_touch::Deadband::new(fraction.unwrap_or(0.0)),
+                deadband: palpate_touch::ForceDeadband::new(fraction.unwrap_or(0.0)),
             });
-            let model = foresight.modeller.model(feel, sample.step, tool.place_time_s);
-            is_left |= fraction.is_some() && foresight.deadband.is_left(&model, law);
+            let model = followed.modeller.model(feel, sample.step, tool.place_time_s);
+            is_left |= fraction.is_some() && followed.deadband.is_left(&model, law);
             models.push((tool.tool, model));
         }
         (models, is_left)
     }
 
     /// The stiffness computations for the tools whose stiffness the stream requests.
-    pub fn refinements(&self, session: &Session) -> impl Iterator<Item = Refinement> {
-        let wanted = self.foresight.iter().filter(|(_, foresight)| foresight.modeller.wants_refinement());
-        wanted.filter_map(|(tool, foresight)| {
-            Some(foresight.modeller.refinement(session.tissue().surroundings(*tool as usize)?))
+    pub fn refinements(&self, session: &Session) -> impl Iterator<Item = StiffnessJob> {
+        let wanted = self.followed.iter().filter(|(_, followed)| followed.modeller.wants_refinement());
+        wanted.filter_map(|(tool, followed)| {
+            Some(followed.modeller.refinement(session.tissue().surroundings(*tool as usize)?))
         })
     }
 
@@ -299,7 +299,7 @@ mod tests {
                     "grasps {grasps}, asked {touch_stiffness}, step {step}"
                 );
                 touched |= touches;
-                refinements.into_iter().for_each(Refinement::work);
+                refinements.into_iter().for_each(StiffnessJob::work);
             }
             assert!(touched, "grasps {grasps}, asked {touch_stiffness}");
             // Without it they are the law's: one stiffness along the normal, and one across.

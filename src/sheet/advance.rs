@@ -14,7 +14,7 @@ use super::real::Real;
 use super::stage::{ANY, LEAN, PUSHED, Stage};
 
 /// The stage that advances every point.
-pub(super) struct Advance<'a, T: Real, C> {
+pub(super) struct AdvanceStage<'a, T: Real, C> {
     pub(super) layout: Layout,
     pub(super) scheme: &'a C,
     /// u and d, three planes each.
@@ -32,7 +32,7 @@ pub(super) struct Advance<'a, T: Real, C> {
     pub(super) work: *mut T,
 }
 
-impl<T: Real, C: Arithmetic<T>> Stage<T> for Advance<'_, T, C> {
+impl<T: Real, C: Arithmetic<T>> Stage<T> for AdvanceStage<'_, T, C> {
     #[inline(always)]
     fn duty(&self, row: usize) -> u8 {
         match (self.free.is_null(), self.forced.contains(&row), self.pulls.len()) {
@@ -86,7 +86,7 @@ impl<T: Real, C: Arithmetic<T>> Stage<T> for Advance<'_, T, C> {
     }
 }
 
-impl<T: Real, C: Arithmetic<T>> Advance<'_, T, C> {
+impl<T: Real, C: Arithmetic<T>> AdvanceStage<'_, T, C> {
     /// Advances a block, with or without a tool's force.
     #[inline(always)]
     unsafe fn put<V: Vector<Real = T>, const DUTY: u8, const FORCED: bool>(

@@ -21,7 +21,7 @@ use super::field::{BLOCK, Field, Layout};
 use super::lanes::{self, Run, Vector, Width};
 use super::model::{Model, Plan};
 use super::real::Real;
-use crate::scene::law::{ForceLaw, Moment, Poke};
+use crate::scene::law::{LoadProfile, Moment, Poke};
 
 /// The force of a tool.
 #[derive(Debug, Clone, PartialEq)]
@@ -29,7 +29,7 @@ pub enum Push {
     /// Constant until the next command.
     Held(Poke),
     /// A law of time, exact within the step.
-    Law(ForceLaw),
+    Law(LoadProfile),
 }
 
 impl Push {

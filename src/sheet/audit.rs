@@ -46,7 +46,7 @@ pub enum Origin {
     Substep,
     /// The rounding of the number format.
     Rounding,
-    /// Tiles at rest, which are not computed.
+    /// SleepTiles at rest, which are not computed.
     Sleep,
 }
 
@@ -242,7 +242,7 @@ impl<T: Real> Sheet<T> {
         let State { u, d, kept } = &mut sheet.state;
         let pairs = [(u, &self.state.u), (d, &self.state.d)].into_iter();
         let kept = kept.iter_mut().zip(&self.state.kept).map(|(to, from)| (Arc::make_mut(to), &**from));
-        let (from, to) = (self.bench.layout, sheet.bench.layout);
+        let (from, to) = (self.tables.layout, sheet.tables.layout);
         for (number, (wide, narrow)) in pairs.chain(kept).enumerate() {
             for index in 0..self.model.len() {
                 for c in 0..3 {
@@ -283,10 +283,10 @@ impl<T: Real> Sheet<T> {
         // The present force as an acceleration; the scheme's own terms may be the mean of both sides of a jump.
         self.applied.terms = self.present_terms();
         let springs = springs_of(&self.model, &was);
-        convert(&self.bench.layout, &springs, &was, &plan, &self.applied, &mut self.state);
+        convert(&self.tables.layout, &springs, &was, &plan, &self.applied, &mut self.state);
         self.applied.forget();
         self.model = model.clone();
-        self.bench.springs = springs_of(model, &plan);
+        self.tables.springs = springs_of(model, &plan);
         self.plan = plan;
     }
 }

@@ -24,7 +24,7 @@ impl<T: Real> Sheet<T> {
         if self.is_same_tissue(model) {
             self.resample(model);
             // A newly allocated rounding loss begins at 0.
-            let layout = self.bench.layout;
+            let layout = self.tables.layout;
             let kept = self.plan.scheme.kept(model.precision == Precision::Compensated);
             self.state.kept.resize_with(kept, || Arc::new(Field::zero(&layout)));
         } else {
@@ -36,8 +36,8 @@ impl<T: Real> Sheet<T> {
     /// Begins the guard's account and checkpoint anew, after the state or the springs have become others.
     pub(super) fn begin_account(&mut self) {
         self.halvings = 0;
-        self.bench.is_calm(0.0);
-        self.bench.take_work();
+        self.tables.is_calm(0.0);
+        self.tables.take_work();
         let (survey, _, energy_j) = self.survey(&self.tiles.region);
         self.work = Work::begun(energy_j, self.present_work_j(&survey));
         self.checkpoint = None;
@@ -63,10 +63,10 @@ impl<T: Real> Sheet<T> {
         let ratio = T::of(model.plan.substep_s / self.plan.substep_s);
         self.state.d.iter_mut().for_each(|d| *d = *d * ratio);
 
-        let layout = self.bench.layout;
+        let layout = self.tables.layout;
         self.model = model.clone();
         self.plan = model.plan.clone();
-        self.bench.springs = springs_of(model, &self.plan);
+        self.tables.springs = springs_of(model, &self.plan);
         let kept = self.plan.scheme.kept(model.precision == Precision::Compensated);
         self.state.kept = State::at_rest(&layout, kept).kept;
         self.applied.forget();
@@ -85,8 +85,8 @@ impl<T: Real> Sheet<T> {
     /// Rewrites the whole state.
     fn write(&mut self, write: Write) {
         let terms = self.present_terms();
-        let Sheet { plan, bench, state, tiles, .. } = self;
+        let Sheet { plan, tables, state, tiles, .. } = self;
         let forces = Forces { terms: &terms, field: 0, part: 1.0, pull: 0.0 };
-        with_arithmetic!(&plan.scheme, T, |scheme| Survey::write(bench, scheme, state, forces, &tiles.region, write));
+        with_arithmetic!(&plan.scheme, T, |scheme| Survey::write(tables, scheme, state, forces, &tiles.region, write));
     }
 }

@@ -47,8 +47,8 @@ impl<T: Real> Sheet<T> {
         let interval = (INTERVAL_SUBSTEPS / u64::from(self.plan.substeps)).max(1);
         let due = self.steps.is_multiple_of(interval) || self.inputs.len() >= MOST_INPUTS;
         let farthest = farthest_in_spacings(&self.model);
-        let calm = self.bench.is_calm(farthest);
-        let scan = || match broken_point(&self.model, &self.bench.layout, &self.state) {
+        let calm = self.tables.is_calm(farthest);
+        let scan = || match broken_point(&self.model, &self.tables.layout, &self.state) {
             Some(index) => Err(Cause::NotFinite { point: self.model.point_of(index) }),
             None => Ok(()),
         };
@@ -79,7 +79,7 @@ impl<T: Real> Sheet<T> {
 
     /// Stores the present state as the state to go back to.
     pub(super) fn take_checkpoint(&mut self) {
-        let Sheet { bench, state, applied, prescribed, contacts, tiles, .. } = self;
+        let Sheet { tables, state, applied, prescribed, contacts, tiles, .. } = self;
         // A checkpoint that an audit still holds stays as it is.
         if self.checkpoint.as_mut().is_some_and(|checkpoint| Arc::get_mut(checkpoint).is_none()) {
             self.checkpoint = None;
@@ -88,7 +88,7 @@ impl<T: Real> Sheet<T> {
             // Most of a large sheet has never moved. That part is neither copied nor given memory.
             tiles.touch_all();
             state.part_history(|to, from| tiles.copy_moved(to, from));
-            let state = State::zero(&bench.layout, state.kept.len());
+            let state = State::zero(&tables.layout, state.kept.len());
             let (applied, prescribed, contacts) = (applied.clone(), prescribed.clone(), contacts.clone());
             let (work, largest) = (Work::default(), 0.0);
             let (steps, halvings, believed) = (0, 0, true);
@@ -129,17 +129,17 @@ impl<T: Real> Sheet<T> {
         self.work = checkpoint.work;
         let was = checkpoint.halvings;
         self.halve(was, halvings);
-        self.bench.is_calm(0.0);
-        self.bench.take_work();
+        self.tables.is_calm(0.0);
+        self.tables.take_work();
     }
 
     /// Converts the state from the substep of `was` halvings to that of `halvings`.
     pub(super) fn halve(&mut self, was: u32, halvings: u32) {
         let [was, plan] = [was, halvings].map(|halvings| self.model.plan.divided(&self.model.scene, 1 << halvings));
         let springs = springs_of(&self.model, &was);
-        convert(&self.bench.layout, &springs, &was, &plan, &self.applied, &mut self.state);
+        convert(&self.tables.layout, &springs, &was, &plan, &self.applied, &mut self.state);
         self.applied.forget();
-        self.bench.springs = springs_of(&self.model, &plan);
+        self.tables.springs = springs_of(&self.model, &plan);
         (self.halvings, self.plan) = (halvings, plan);
     }
 
@@ -335,7 +335,7 @@ mod tests {
     fn a_point_that_is_not_finite_or_beyond_the_bound_is_named() {
         for broken in [f64::NAN, f64::INFINITY, 2.0 * farthest_in_spacings(&sheet("central").model)] {
             let mut sheet = sheet("central");
-            let layout = sheet.bench.layout;
+            let layout = sheet.tables.layout;
             assert_eq!(broken_point(&sheet.model, &layout, &sheet.state), None);
             let index = sheet.model.index_of([2, 5]);
             sheet.state.u[layout.plane + layout.place(index)] = broken;
@@ -351,11 +351,11 @@ mod tests {
         let farthest = farthest_in_spacings(&sheet("central").model);
         for (increment, calm) in [(1e-3, true), (0.1 * farthest, true), (10.0 * farthest, false), (f64::NAN, false)] {
             let mut sheet = sheet_with("central", &["springs.stiffness_n_per_m=0.0"]);
-            let place = sheet.bench.layout.place(11);
-            sheet.bench.is_calm(0.0);
+            let place = sheet.tables.layout.place(11);
+            sheet.tables.is_calm(0.0);
             sheet.state.d[place] = increment;
             sheet.do_step();
-            assert_eq!(sheet.bench.is_calm(farthest), calm, "{increment}");
+            assert_eq!(sheet.tables.is_calm(farthest), calm, "{increment}");
         }
     }
 
@@ -372,7 +372,7 @@ mod tests {
             };
             // A force of the past that moves the point by 5 spacings.
             let past = 5.0 / weight;
-            let place = sheet.bench.layout.place(31);
+            let place = sheet.tables.layout.place(31);
             Arc::make_mut(&mut sheet.state.kept[0])[place] += past;
             assert!(matches!(sheet.check(), Err(Cause::Surprise { .. })), "{integrator}");
         }

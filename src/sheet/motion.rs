@@ -7,7 +7,6 @@ use glam::DVec3;
 use xxhash_rust::xxh3::Xxh3;
 
 use super::applied::{Applied, Push};
-use super::bench::Bench;
 use super::checkpoint::{Checkpoint, Input, Work};
 use super::contact::{Contacts, Feel, Surroundings};
 use super::field::{Layout, State};
@@ -19,8 +18,9 @@ use super::model::{Model, Plan};
 use super::prescribed::{Grasp, Prescribed};
 use super::real::Real;
 use super::springs::Springs;
-use super::tiles::{CHECK_STEPS, Tiles};
-use super::tissue::{BlowUp, Energy, PointState, Released, Still, Tissue};
+use super::tables::SweepTables;
+use super::tiles::{CHECK_STEPS, SleepTiles};
+use super::tissue::{BlowUp, Energy, PointState, Released, SheetCopy, Tissue};
 use super::watch::{Inputs, Mark, Watch};
 use crate::scene::Precision;
 use crate::scene::law::{Moment, Motion};
@@ -40,7 +40,7 @@ pub(super) struct Sheet<T: Real> {
     /// The model's plan, or one with a shorter substep.
     pub(super) plan: Plan,
     pub(super) halvings: u32,
-    pub(super) bench: Bench<T>,
+    pub(super) tables: SweepTables<T>,
     pub(super) state: State<T>,
     pub(super) applied: Applied<T>,
     pub(super) prescribed: Prescribed,
@@ -54,7 +54,7 @@ pub(super) struct Sheet<T: Real> {
     pub(super) watch: Watch,
     /// Whether the beginning of the window is still to be reported.
     pub(super) is_marked: bool,
-    pub(super) tiles: Tiles<T>,
+    pub(super) tiles: SleepTiles<T>,
     pub(super) guard_events: u64,
     pub(super) substeps_done: u64,
     /// Points computed, summed over all substeps.
@@ -68,7 +68,7 @@ impl<T: Real> Sheet<T> {
         Sheet {
             model: model.clone(),
             halvings: 0,
-            bench: Bench::new(model.lanes, layout, springs_of(model, &plan), &model.fixed),
+            tables: SweepTables::new(model.lanes, layout, springs_of(model, &plan), &model.fixed),
             state: State::at_rest(&layout, plan.scheme.kept(model.precision == Precision::Compensated)),
             steps: 0,
             work: Work::default(),
@@ -79,7 +79,7 @@ impl<T: Real> Sheet<T> {
             inputs: Vec::new(),
             watch: Watch::Off,
             is_marked: false,
-            tiles: Tiles::new(layout, model.tile_tolerance(), if model.scene.springs.flexion { 2 } else { 1 }),
+            tiles: SleepTiles::new(layout, model.tile_tolerance(), if model.scene.springs.flexion { 2 } else { 1 }),
             guard_events: 0,
             substeps_done: 0,
             points_done: 0,
@@ -112,8 +112,8 @@ impl<T: Real> Sheet<T> {
         let far = self.tiles.farthest_unnoticed(&self.model.scene);
         self.tiles.watch(&self.state.u, far);
         self.points_done += self.tiles.awake_points as u64;
-        let Sheet { model, plan, bench, applied, .. } = self;
-        applied.prepare(model, plan, &bench.layout, moment, end - moment.fraction);
+        let Sheet { model, plan, tables, applied, .. } = self;
+        applied.prepare(model, plan, &tables.layout, moment, end - moment.fraction);
         let released = self.prescribed.take_released();
         let released: Vec<_> = released
             .into_iter()
@@ -139,31 +139,31 @@ impl<T: Real> Sheet<T> {
             released.iter().for_each(|(index, change)| self.shift(*index, change));
         }
         let unit_j = self.unit_of_work_j();
-        self.work.add(self.bench.take_work() * unit_j);
+        self.work.add(self.tables.take_work() * unit_j);
         self.hold(moment.step, end, true);
         self.meet(end);
     }
 
     /// Sweep number `sweep` of a substep.
     fn sweep(&mut self, sweep: usize) {
-        let Sheet { model, plan, bench, state, applied, tiles, .. } = self;
+        let Sheet { model, plan, tables, state, applied, tiles, .. } = self;
         let (field, terms, region) = (plan.scheme.field(sweep), &applied.terms, &tiles.region);
         if model.precision == Precision::Compensated {
-            each!(&plan.scheme, |family| bench.advance(&family.compensated::<T>(sweep), state, terms, field, region));
+            each!(&plan.scheme, |family| tables.advance(&family.compensated::<T>(sweep), state, terms, field, region));
         } else {
-            each!(&plan.scheme, |family| bench.advance(&family.plain::<T>(sweep), state, terms, field, region));
+            each!(&plan.scheme, |family| tables.advance(&family.plain::<T>(sweep), state, terms, field, region));
         }
     }
 
     /// Puts the grasped points at their places at `fraction` of the step, and counts the work if `counted`.
     fn hold(&mut self, step: u64, fraction: f64, counted: bool) {
         let unit_j = self.unit_of_work_j();
-        let Sheet { model, plan, bench, state, prescribed, work, .. } = self;
+        let Sheet { model, plan, tables, state, prescribed, work, .. } = self;
         let spacing_m = model.scene.sheet.spacing_m;
         for (index, displacement_m, velocity_m_per_s) in prescribed.at(model, step, fraction) {
             let mut product = 0.0;
             for c in 0..3 {
-                let at = c * bench.layout.plane + bench.layout.place(index);
+                let at = c * tables.layout.plane + tables.layout.place(index);
                 let (free_u, free_d) = (state.u[at], state.d[at]);
                 state.u[at] = T::of(displacement_m[c] / spacing_m);
                 state.d[at] = if plan.scheme.takes_means() {
@@ -182,15 +182,15 @@ impl<T: Real> Sheet<T> {
 
     /// The change of u and d of a point that is released with `velocity_m_per_s`, if there must be one.
     fn change_at_release(&self, index: usize, velocity_m_per_s: DVec3, moment: Moment) -> Option<[[f64; 2]; 3]> {
-        let Sheet { model, plan, bench, state, applied, .. } = self;
+        let Sheet { model, plan, tables, state, applied, .. } = self;
         let (point, scene) = (model.point_of(index), &model.scene);
-        let springs = bench.springs.gather(&bench.layout, &state.u, point).map(Real::wide);
+        let springs = tables.springs.gather(&tables.layout, &state.u, point).map(Real::wide);
         let scale = plan.force_scale(scene);
         let applied_n = applied.from(model, index, moment);
-        let used = applied.force_at(&bench.layout, 0, point);
+        let used = applied.force_at(&tables.layout, 0, point);
         let mut changes = [[0.0; 2]; 3];
         for (c, change) in changes.iter_mut().enumerate() {
-            let at = c * bench.layout.plane + bench.layout.place(index);
+            let at = c * tables.layout.plane + tables.layout.place(index);
             *change = plan.scheme.release(Release {
                 u: state.u[at].wide(),
                 springs: &state.history(springs[c], plan.scheme.history(), at),
@@ -204,9 +204,9 @@ impl<T: Real> Sheet<T> {
 
     /// Adds to u and d of a point.
     fn shift(&mut self, index: usize, change: &[[f64; 2]; 3]) {
-        let Sheet { bench, state, .. } = self;
+        let Sheet { tables, state, .. } = self;
         for (c, change) in change.iter().enumerate() {
-            let at = c * bench.layout.plane + bench.layout.place(index);
+            let at = c * tables.layout.plane + tables.layout.place(index);
             state.u[at] += T::of(change[0]);
             state.d[at] += T::of(change[1]);
         }
@@ -220,15 +220,15 @@ impl<T: Real> Sheet<T> {
 
     /// Displacement, velocity and springs' force of a free point, under the applied force `applied_n`.
     pub(super) fn free_point(&self, index: usize, applied_n: DVec3) -> [DVec3; 3] {
-        let Sheet { model, plan, bench, state, .. } = self;
+        let Sheet { model, plan, tables, state, .. } = self;
         let (spacing_m, scale) = (model.scene.sheet.spacing_m, plan.force_scale(&model.scene));
         let unit = plan.scheme.spring_scale() * scale;
-        let springs = bench.springs.gather(&bench.layout, &state.u, model.point_of(index));
+        let springs = tables.springs.gather(&tables.layout, &state.u, model.point_of(index));
         let [i, j] = model.point_of(index);
         let still = self.steps == 0 || !self.tiles.region.is_awake(i, j);
         let mut found = [DVec3::ZERO; 3];
         for (c, n) in springs.into_iter().enumerate() {
-            let at = c * bench.layout.plane + bench.layout.place(index);
+            let at = c * tables.layout.plane + tables.layout.place(index);
             let one = Plain::<f64, 1>::one;
             let mut kept = [one(0.0); MAX_KEPT];
             kept.iter_mut().zip(&state.kept).for_each(|(value, field)| *value = one(field[at].wide()));
@@ -401,14 +401,14 @@ impl<T: Real> Tissue for Sheet<T> {
 
     fn largest_displacement_m(&self) -> f64 {
         let squared = (0..self.model.len()).map(|index| {
-            let at = self.bench.layout.place(index);
-            (0..3).map(|c| self.state.u[c * self.bench.layout.plane + at].wide().powi(2)).sum()
+            let at = self.tables.layout.place(index);
+            (0..3).map(|c| self.state.u[c * self.tables.layout.plane + at].wide().powi(2)).sum()
         });
         squared.fold(0.0, f64::max).sqrt() * self.model.scene.sheet.spacing_m
     }
 
     fn displacements_m(&self, into: &mut [Vec<f32>; 3]) {
-        let Layout { rows, columns, stride, plane } = self.bench.layout;
+        let Layout { rows, columns, stride, plane } = self.tables.layout;
         let spacing = T::of(self.model.scene.sheet.spacing_m);
         for (c, into) in into.iter_mut().enumerate() {
             into.clear();
@@ -424,7 +424,7 @@ impl<T: Real> Tissue for Sheet<T> {
         Sheet::hash_blocks(self, blocks, hasher);
     }
 
-    fn still(&self) -> Still {
+    fn still(&self) -> SheetCopy {
         Sheet::still(self)
     }
 }

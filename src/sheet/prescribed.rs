@@ -3,7 +3,7 @@
 use glam::DVec3;
 
 use super::model::Model;
-use crate::scene::law::{Motion, MoveLaw};
+use crate::scene::law::{Motion, MotionProfile};
 
 /// How a tool moves its grasped point.
 #[derive(Debug, Clone, PartialEq)]
@@ -11,7 +11,7 @@ pub enum Grasp {
     /// To this displacement by the end of the step, at constant velocity; then it stays.
     Held(DVec3),
     /// A law of time, exact within the step.
-    Law(MoveLaw),
+    Law(MotionProfile),
 }
 
 /// One grasped point.

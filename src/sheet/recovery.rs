@@ -29,7 +29,7 @@ impl<T: Real> Sheet<T> {
         tools.dedup();
         if at_rest {
             // Also without what the end of a force or a grasp would add to the next substep.
-            self.state = State::at_rest(&self.bench.layout, self.state.kept.len());
+            self.state = State::at_rest(&self.tables.layout, self.state.kept.len());
             (self.applied, self.prescribed, self.contacts) = (Applied::new(), Prescribed::new(), Contacts::default());
         }
         // The largest displacement of the failed attempts must not decide what may sleep.

@@ -5,7 +5,7 @@
 //! 10,000 times the true error. So the scheme itself is run, on at most [`SIDE`]² points for half a second, under a few
 //! loads that are harder than most scripts ([`LOADS`]). The truth is the same in f64 with a substep so short that half of it
 //! changes nothing. The true error of a script on the whole sheet is then at most [`MARGIN`] times the rehearsed one
-//! (`make bench-tolerance`). Forces that change smoothly err by 10 to 1000 times less than those that jump, and a choice
+//! (`make tables-tolerance`). Forces that change smoothly err by 10 to 1000 times less than those that jump, and a choice
 //! that is made before the script is known can't use that.
 
 use std::cell::Cell;
@@ -19,7 +19,7 @@ use super::integrate::Oscillator;
 use super::model::{Model, Plan};
 use super::motion::at_rest;
 use super::{lanes, stability};
-use crate::scene::law::{CentreLaw, ForceLaw, Profile, StrengthLaw};
+use crate::scene::law::{CentreProfile, LoadProfile, Profile, StrengthProfile};
 use crate::scene::{Fixed, Integrator, PointSet, Precision, Scene};
 
 /// Points along a side at most. Larger sheets err alike: a force spreads over some points.
@@ -221,9 +221,9 @@ impl<'s> Rehearsal<'s> {
         let free = scene.sheet.point_mass_kg * scene.stepping.rate_hz * scene.stepping.rate_hz;
         let newtons = spacing_m * if stiffness > 0.0 { stiffness } else { free };
         let mut tissue = at_rest(&model);
-        let law = ForceLaw {
-            centre: CentreLaw::Hops(vec![(0, scene.sheet.rest_m(at))]),
-            strength: StrengthLaw::Scaled(load.force * newtons, load.profile),
+        let law = LoadProfile {
+            centre: CentreProfile::Hops(vec![(0, scene.sheet.rest_m(at))]),
+            strength: StrengthProfile::Scaled(load.force * newtons, load.profile),
             falloff_per_m: load.falloff / spacing_m,
             falloff_offset: 0.0,
         };

@@ -26,7 +26,7 @@ impl<T: Real> Sheet<T> {
     /// The energies of the whole sheet: the awake part, and the springs and virtual springs of sleeping tiles. The
     /// latter follow from the positions of their points alone, so it does not matter when they were computed.
     pub(super) fn energies(&self) -> Energy {
-        let Sheet { plan, bench, state, tiles, .. } = self;
+        let Sheet { plan, tables, state, tiles, .. } = self;
         let (_, mut energy, _) = self.survey(&tiles.region);
         let forces = Forces { terms: &[], field: 0, part: 1.0, pull: 0.0 };
         let mut region = tiles.no_region();
@@ -34,7 +34,7 @@ impl<T: Real> Sheet<T> {
             let [spring_j, virtual_j] = known.unwrap_or_else(|| {
                 tiles.cover(&mut region, std::iter::once(tile));
                 let survey =
-                    with_arithmetic!(&plan.scheme, T, |scheme| Survey::of(bench, scheme, state, forces, &region));
+                    with_arithmetic!(&plan.scheme, T, |scheme| Survey::of(tables, scheme, state, forces, &region));
                 let (Energy { spring_j, virtual_j, .. }, _) = self.energy_of(&survey);
                 tiles.keep_energies(tile, [spring_j, virtual_j]);
                 [spring_j, virtual_j]
@@ -50,9 +50,9 @@ impl<T: Real> Sheet<T> {
         if !self.tiles.may_sleep() || self.tiles.region.tiles().is_empty() {
             return;
         }
-        let Sheet { model, plan, bench, state, tiles, prescribed, contacts, applied, .. } = self;
+        let Sheet { model, plan, tables, state, tiles, prescribed, contacts, applied, .. } = self;
         let spacing_m = model.scene.sheet.spacing_m;
-        // Tiles under a tool that holds or touches stay awake.
+        // SleepTiles under a tool that holds or touches stay awake.
         let grasped = prescribed.grasped().map(|(index, _)| model.point_of(index));
         let held: Vec<usize> = grasped.chain(contacts.points()).map(|point| tiles.of(point)).collect();
         for (_, motion) in prescribed.grasped() {
@@ -84,7 +84,7 @@ impl<T: Real> Sheet<T> {
         let mut sleepers = Vec::new();
         for tile in calm.into_iter().filter(|tile| !held.contains(tile)) {
             tiles.cover(&mut region, std::iter::once(tile));
-            let survey = with_arithmetic!(&plan.scheme, T, |scheme| Survey::of(bench, scheme, state, forces, &region));
+            let survey = with_arithmetic!(&plan.scheme, T, |scheme| Survey::of(tables, scheme, state, forces, &region));
             if tiles.is_calm(tile, survey.speed <= slow(epsilon) && balanced(&survey)) {
                 sleepers.push((tile, survey));
             }
@@ -93,7 +93,7 @@ impl<T: Real> Sheet<T> {
             return;
         }
         tiles.cover(&mut region, sleepers.iter().map(|(tile, _)| *tile));
-        with_arithmetic!(&plan.scheme, T, |scheme| Survey::write(bench, scheme, state, forces, &region, Write::Rest));
+        with_arithmetic!(&plan.scheme, T, |scheme| Survey::write(tables, scheme, state, forces, &region, Write::Rest));
         let sleepers: Vec<_> = sleepers.into_iter().map(|(tile, survey)| (tile, self.energy_of(&survey).1)).collect();
         self.tiles.sleep(&sleepers, &self.state.u);
     }

@@ -9,27 +9,27 @@ use std::ops::Range;
 use xxhash_rust::xxh3::Xxh3;
 
 use super::applied::Applied;
-use super::bench::Bench;
 use super::checkpoint::Work;
 use super::contact::Contacts;
 use super::field::State;
 use super::motion::Sheet;
 use super::real::Real;
-use super::tissue::Still;
+use super::tables::SweepTables;
+use super::tissue::SheetCopy;
 use super::watch::Watch;
 
 impl<T: Real> Sheet<T> {
     /// A copy whose points and hash are those of this sheet. It is not for steps or surveys: it has no tables of fixed
     /// points and forces.
-    pub(super) fn still(&self) -> Still {
-        let Sheet { model, plan, bench, state, tiles, .. } = self;
-        let mut copy = State::zero(&bench.layout, state.kept.len());
+    pub(super) fn still(&self) -> SheetCopy {
+        let Sheet { model, plan, tables, state, tiles, .. } = self;
+        let mut copy = State::zero(&tables.layout, state.kept.len());
         copy.fields_mut().zip(state.fields()).for_each(|(to, from)| tiles.copy_moved(to, from));
-        Still::of(Box::new(Sheet {
+        SheetCopy::of(Box::new(Sheet {
             model: model.clone(),
             plan: plan.clone(),
             halvings: self.halvings,
-            bench: Bench::new(model.lanes, bench.layout, bench.springs, &[]),
+            tables: SweepTables::new(model.lanes, tables.layout, tables.springs, &[]),
             state: copy,
             applied: Applied::<T>::like(&self.applied),
             prescribed: self.prescribed.clone(),
@@ -49,7 +49,7 @@ impl<T: Real> Sheet<T> {
 
     /// Adds blocks of the state to a hash ([`State::hash_blocks`]).
     pub(super) fn hash_blocks(&self, blocks: Range<usize>, hasher: &mut Xxh3) {
-        self.state.hash_blocks(&self.bench.layout, |point| self.tiles.has_moved(point), blocks, hasher);
+        self.state.hash_blocks(&self.tables.layout, |point| self.tiles.has_moved(point), blocks, hasher);
     }
 }
 

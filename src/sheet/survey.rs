@@ -10,7 +10,6 @@
 use std::cell::UnsafeCell;
 
 use super::applied::{self, Pull, Term};
-use super::bench::Bench;
 use super::field::{BLOCK, Layout, State};
 use super::integrate::arithmetic::{Arithmetic, MAX_KEPT};
 use super::integrate::with_arithmetic;
@@ -19,6 +18,7 @@ use super::motion::Sheet;
 use super::real::Real;
 use super::region::Region;
 use super::stage::Stage;
+use super::tables::SweepTables;
 use super::tissue::Energy;
 
 /// The result of a survey, in the scheme's units (`integrate`).
@@ -103,7 +103,7 @@ struct Look<'a, T: Real, C> {
 impl Survey {
     /// Surveys the awake part of a state in `over`.
     pub(super) fn of<T: Real, C: Arithmetic<T>>(
-        bench: &Bench<T>,
+        tables: &SweepTables<T>,
         scheme: &C,
         state: &State<T>,
         forces: Forces<'_, T>,
@@ -111,12 +111,12 @@ impl Survey {
     ) -> Survey {
         let mut fields = state.fields().map(|field| field.as_ptr());
         let from = std::array::from_fn(|_| fields.next().unwrap_or(std::ptr::null()));
-        Survey::by(bench, scheme, (from, [std::ptr::null_mut(); FIELDS]), forces, over, Write::Nothing)
+        Survey::by(tables, scheme, (from, [std::ptr::null_mut(); FIELDS]), forces, over, Write::Nothing)
     }
 
     /// Surveys it and rewrites it.
     pub(super) fn write<T: Real, C: Arithmetic<T>>(
-        bench: &Bench<T>,
+        tables: &SweepTables<T>,
         scheme: &C,
         state: &mut State<T>,
         forces: Forces<'_, T>,
@@ -125,12 +125,12 @@ impl Survey {
     ) {
         let mut fields = state.fields_mut().map(|field| field.as_mut_ptr());
         let to: [*mut T; FIELDS] = std::array::from_fn(|_| fields.next().unwrap_or(std::ptr::null_mut()));
-        Survey::by(bench, scheme, (to.map(<*mut T>::cast_const), to), forces, over, write);
+        Survey::by(tables, scheme, (to.map(<*mut T>::cast_const), to), forces, over, write);
     }
 
     /// Reads u, d and the kept fields from one state and writes them to another.
     fn by<T: Real, C: Arithmetic<T>>(
-        bench: &Bench<T>,
+        tables: &SweepTables<T>,
         scheme: &C,
         ([u, d, kept @ ..], [to_u, to_d, to_kept @ ..]): ([*const T; FIELDS], [*mut T; FIELDS]),
         forces: Forces<'_, T>,
@@ -144,10 +144,10 @@ impl Survey {
         );
         let zero = [T::default(); BLOCK];
         let sums = UnsafeCell::new(Sums { row: [zero; 5], total: [[0.0; BLOCK]; 5], largest: [zero; 4] });
-        let pulls = forces.terms.iter().map(|term| term.pull(forces.field, bench.layout.stride));
+        let pulls = forces.terms.iter().map(|term| term.pull(forces.field, tables.layout.stride));
         let pulls: Vec<Pull<'_, T>> = pulls.collect();
         let look = Look {
-            layout: bench.layout,
+            layout: tables.layout,
             scheme,
             d,
             kept,
@@ -156,12 +156,12 @@ impl Survey {
             to_kept,
             forces,
             pulls: &pulls,
-            free: bench.free.as_ref().map_or(std::ptr::null(), |free| free.as_ptr()),
+            free: tables.free.as_ref().map_or(std::ptr::null(), |free| free.as_ptr()),
             sums: &sums,
         };
-        // SAFETY: a state has u, d and at least the fields that the scheme keeps, all of the bench's layout; u is
+        // SAFETY: a state has u, d and at least the fields that the scheme keeps, all of the tables's layout; u is
         // written behind what the sweep still reads.
-        unsafe { bench.look(u, over, look) };
+        unsafe { tables.look(u, over, look) };
         let Sums { total, largest, .. } = sums.into_inner();
         let sum = |which: usize| total[which].iter().sum();
         let most = |which: usize| largest[which].iter().map(|value| value.wide()).fold(0.0, f64::max);
@@ -285,19 +285,19 @@ impl<T: Real> Sheet<T> {
     /// The tools' force at the end of the last step, as the springs' force, if the scheme needs it to observe a
     /// velocity.
     pub(super) fn present_terms(&self) -> Vec<Term<T>> {
-        let Sheet { model, plan, bench, .. } = self;
+        let Sheet { model, plan, tables, .. } = self;
         if !plan.scheme.takes_means() || self.steps == 0 {
             return Vec::new();
         }
-        self.applied.until_now(model, &bench.layout, plan.scheme.spring_scale() * plan.force_scale(&model.scene))
+        self.applied.until_now(model, &tables.layout, plan.scheme.spring_scale() * plan.force_scale(&model.scene))
     }
 
     /// Surveys part of the sheet. Returns the survey, the energies, and the energy that the scheme conserves.
     pub(super) fn survey(&self, over: &Region) -> (Survey, Energy, f64) {
-        let Sheet { model, plan, bench, state, .. } = self;
+        let Sheet { model, plan, tables, state, .. } = self;
         let terms = self.present_terms();
         let forces = Forces { terms: &terms, field: 0, part: 1.0, pull: 0.0 };
-        let survey = with_arithmetic!(&plan.scheme, T, |scheme| Survey::of(bench, scheme, state, forces, over));
+        let survey = with_arithmetic!(&plan.scheme, T, |scheme| Survey::of(tables, scheme, state, forces, over));
         let (mut energy, kept_j) = self.energy_of(&survey);
         // A grasped point moves with its tool, not as the scheme would move it.
         let own = self.prescribed.grasped().map(|(index, motion)| {

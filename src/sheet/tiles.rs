@@ -54,7 +54,7 @@ const TABLES: &str = "the tiles of a sheet";
 
 /// Points next to a sleeping tile, in an awake tile.
 #[derive(Debug, Clone, Copy)]
-struct Watch {
+struct EdgeWatch {
     tile: usize,
     /// The first point, and the distance to the next.
     first: usize,
@@ -66,9 +66,9 @@ struct Watch {
 
 /// Which tiles of a sheet sleep, and the values kept for waking them.
 #[derive(Debug)]
-pub(super) struct Tiles<T> {
+pub(super) struct SleepTiles<T> {
     layout: Layout,
-    /// Tiles along x and along y.
+    /// SleepTiles along x and along y.
     counts: [usize; 2],
     /// Number of rows that a spring reaches on.
     reach: usize,
@@ -89,21 +89,21 @@ pub(super) struct Tiles<T> {
     /// Positions of the points around each tile; allocated when the first tile sleeps.
     snapshots: Vec<T>,
     /// The comparisons of the sleeping tiles next to awake ones.
-    watches: Vec<Watch>,
-    /// Tiles that were awake since the last checkpoint.
+    watches: Vec<EdgeWatch>,
+    /// SleepTiles that were awake since the last checkpoint.
     touched: Marks,
-    /// Tiles that were ever awake, or whose springs reach such a tile. In all others nothing has ever moved: all is 0.
+    /// SleepTiles that were ever awake, or whose springs reach such a tile. In all others nothing has ever moved: all is 0.
     moved: Marks,
     /// The recent largest displacement, spacings.
     pub(super) largest: f64,
 }
 
-impl<T: Real> Tiles<T> {
+impl<T: Real> SleepTiles<T> {
     /// All asleep if there is a tolerance (a sheet at rest). Otherwise all awake, for good.
     pub(super) fn new(layout: Layout, tolerance: f64, reach: usize) -> Self {
         let counts = [tiles(layout.rows), tiles(layout.columns)];
         let count = counts[0] * counts[1];
-        let mut tiles = Tiles {
+        let mut tiles = SleepTiles {
             layout,
             counts,
             reach,
@@ -129,7 +129,7 @@ impl<T: Real> Tiles<T> {
 
     /// Of a copy that stays as it is: what is awake and what has moved, without what a step needs.
     pub(super) fn still(&self) -> Self {
-        Tiles {
+        SleepTiles {
             region: self.region.clone(),
             calm: Vec::new(),
             drift_n: Vec::new(),
@@ -196,7 +196,7 @@ impl<T: Real> Tiles<T> {
                 if let Some(other) = beside.filter(|other| !self.region.awake.has[*other]) {
                     let (first, next, count) = self.beyond(other, side);
                     let then = other * SNAPSHOT + side * 3 * TILE;
-                    self.watches.push(Watch { tile: other, first, next, count, then });
+                    self.watches.push(EdgeWatch { tile: other, first, next, count, then });
                 }
             }
         }
@@ -270,8 +270,8 @@ impl<T: Real> Tiles<T> {
         }
         self.remember();
         let far = T::of(far);
-        let moved = |watch: &&Watch| {
-            let Watch { first, next, count, then, .. } = **watch;
+        let moved = |watch: &&EdgeWatch| {
+            let EdgeWatch { first, next, count, then, .. } = **watch;
             (0..3).any(|c| {
                 let (here, then) = (&u[c * self.layout.plane + first..], &self.snapshots[then + c * TILE..][..count]);
                 // Compares all of them without an early exit, so that it compiles to a few vectors.

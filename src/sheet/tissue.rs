@@ -140,16 +140,16 @@ pub trait Tissue: Send {
         Hashing::default().add(self, usize::MAX).unwrap_or_default()
     }
     /// A copy of the sheet as it is now, to be read by another thread.
-    fn still(&self) -> Still;
+    fn still(&self) -> SheetCopy;
 }
 
 /// A sheet that stays as it was.
-pub struct Still(Box<dyn Tissue>);
+pub struct SheetCopy(Box<dyn Tissue>);
 
-impl Still {
+impl SheetCopy {
     /// `copy` is not stepped any more.
     pub(super) fn of(copy: Box<dyn Tissue>) -> Self {
-        Still(copy)
+        SheetCopy(copy)
     }
 
     /// What it was copied from.

@@ -15,8 +15,8 @@ use palpate_touch::Coupling;
 impl<T: Real> Sheet<T> {
     /// Makes position-controlled tools act at the end of a substep that ends at `fraction` of the step.
     pub(super) fn meet(&mut self, fraction: f64) {
-        let Sheet { model, plan, bench, state, contacts, tiles, work, .. } = self;
-        let layout = &bench.layout;
+        let Sheet { model, plan, tables, state, contacts, tiles, work, .. } = self;
+        let layout = &tables.layout;
         for tool in &mut contacts.tools {
             let (before_n, met) = (tool.steady_n, tool.standing != Standing::Free);
             if before_n != DVec3::ZERO {
@@ -32,7 +32,7 @@ impl<T: Real> Sheet<T> {
                 }
                 continue;
             }
-            // Tiles that slept were at rest in this substep, as if they had been computed.
+            // SleepTiles that slept were at rest in this substep, as if they had been computed.
             tiles.wake_under(tool.points());
             push(model, plan, layout, state, &tool.footprint, tool.force_n - before_n, plan.scheme.kick());
             work.add(tool.force_n.dot(movement_m(model, layout, state, &tool.footprint)));
@@ -45,7 +45,7 @@ impl<T: Real> Sheet<T> {
         let model = &self.model;
         let tool = self.contacts.tools.iter().find(|tool| tool.number == number)?;
         let (surface_m, _) =
-            tool.footprint.surface(|point| displacement_m(model, &self.bench.layout, &self.state, point));
+            tool.footprint.surface(|point| displacement_m(model, &self.tables.layout, &self.state, point));
         let felt_n = match (tool.standing, tool.tip.coupling) {
             (Standing::Free, _) => DVec3::ZERO,
             (_, Coupling::Spring { .. }) => -tool.force_n,
@@ -82,7 +82,7 @@ impl<T: Real> Sheet<T> {
         // Without memory for it, the stiffness of the force law has to do.
         memory::check(window.bytes(), "the stiffness under a tool").ok()?;
         let displacement =
-            |index: usize| displacement_m(&self.model, &self.bench.layout, &self.state, self.model.point_of(index));
+            |index: usize| displacement_m(&self.model, &self.tables.layout, &self.state, self.model.point_of(index));
         let displacement_m = window.points(&self.model).map(displacement).collect();
         Some(Surroundings { model: self.model.clone(), footprint: tool.footprint.clone(), window, displacement_m })
     }

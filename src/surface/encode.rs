@@ -8,7 +8,7 @@ use glam::DVec3;
 use super::refine::Refinement;
 use super::refine::{COMPONENTS, Points, Rows, Source, Written};
 use super::snapshot::Snapshot;
-use super::wide::{Available, Lanes, Width, Work};
+use super::wide::{Available, SixteenLanes, Width, Work};
 use crate::memory;
 
 /// Number format of displacements.
@@ -167,7 +167,7 @@ where
     [u8; BYTES]: Written,
 {
     #[inline(always)]
-    fn work<L: Lanes>(self, with: Available<L>) {
+    fn work<L: SixteenLanes>(self, with: Available<L>) {
         let Fill { patches, rows } = self;
         let [first_x, first_y] = patches.first().map_or([0, 0], |patch| patch.first);
         let mut parted = Vec::new();

@@ -9,4 +9,4 @@ mod wide;
 pub use encode::{Encoding, Frame, encode, encode_over};
 pub use refine::{LARGEST_REFINEMENT, Refinement};
 pub use snapshot::Snapshot;
-pub use tiles::Tiles;
+pub use tiles::FrameTiles;

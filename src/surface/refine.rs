@@ -3,7 +3,7 @@
 // The compiler does not always inline iterators over vectors. They then run without the caller's instructions.
 #![allow(clippy::needless_range_loop)]
 
-use super::wide::{Available, LANES, Lanes};
+use super::wide::{Available, LANES, SixteenLanes};
 use crate::limits::Limits;
 use crate::memory;
 use crate::refusal::{Reason, Refusal, Result};
@@ -60,19 +60,19 @@ pub(super) const COMPONENTS: usize = 3;
 /// The written form of a component.
 pub(super) trait Written: Copy + Default {
     /// Writes displacements in quanta.
-    fn write<L: Lanes>(values: L, to: &mut [Self; LANES]);
+    fn write<L: SixteenLanes>(values: L, to: &mut [Self; LANES]);
     /// Writes x, y and z of points in quanta, point by point.
-    fn weave<L: Lanes>(xyz: [L; COMPONENTS], to: &mut [[Self; LANES]; COMPONENTS]);
+    fn weave<L: SixteenLanes>(xyz: [L; COMPONENTS], to: &mut [[Self; LANES]; COMPONENTS]);
 }
 
 /// Not encoded: refined further.
 impl Written for f32 {
     #[inline(always)]
-    fn write<L: Lanes>(values: L, to: &mut [Self; LANES]) {
+    fn write<L: SixteenLanes>(values: L, to: &mut [Self; LANES]) {
         values.store(to);
     }
     #[inline(always)]
-    fn weave<L: Lanes>(xyz: [L; COMPONENTS], to: &mut [[Self; LANES]; COMPONENTS]) {
+    fn weave<L: SixteenLanes>(xyz: [L; COMPONENTS], to: &mut [[Self; LANES]; COMPONENTS]) {
         L::weave(xyz, to);
     }
 }
@@ -80,7 +80,7 @@ impl Written for f32 {
 /// An IEEE float, little-endian.
 impl Written for [u8; 4] {
     #[inline(always)]
-    fn write<L: Lanes>(values: L, to: &mut [Self; LANES]) {
+    fn write<L: SixteenLanes>(values: L, to: &mut [Self; LANES]) {
         let mut floats = [0.0; LANES];
         values.store(&mut floats);
         for lane in 0..LANES {
@@ -88,7 +88,7 @@ impl Written for [u8; 4] {
         }
     }
     #[inline(always)]
-    fn weave<L: Lanes>(xyz: [L; COMPONENTS], to: &mut [[Self; LANES]; COMPONENTS]) {
+    fn weave<L: SixteenLanes>(xyz: [L; COMPONENTS], to: &mut [[Self; LANES]; COMPONENTS]) {
         let mut floats = [[0.0; LANES]; COMPONENTS];
         L::weave(xyz, &mut floats);
         for c in 0..COMPONENTS {
@@ -102,11 +102,11 @@ impl Written for [u8; 4] {
 /// A signed integer, little-endian; the values are within ±32767.
 impl Written for [u8; 2] {
     #[inline(always)]
-    fn write<L: Lanes>(values: L, to: &mut [Self; LANES]) {
+    fn write<L: SixteenLanes>(values: L, to: &mut [Self; LANES]) {
         values.store_rounded(to);
     }
     #[inline(always)]
-    fn weave<L: Lanes>(xyz: [L; COMPONENTS], to: &mut [[Self; LANES]; COMPONENTS]) {
+    fn weave<L: SixteenLanes>(xyz: [L; COMPONENTS], to: &mut [[Self; LANES]; COMPONENTS]) {
         L::weave_rounded(xyz, to);
     }
 }
@@ -198,7 +198,7 @@ impl<'v> Rows<'v> {
     /// Writes row `a`, three components per vertex, as many as `to` has room for. Call it for consecutive rows from 0.
     #[inline(always)]
     #[allow(clippy::cast_precision_loss)]
-    pub(super) fn write<L: Lanes, W: Written>(&mut self, with: Available<L>, a: usize, row: &mut [W]) {
+    pub(super) fn write<L: SixteenLanes, W: Written>(&mut self, with: Available<L>, a: usize, row: &mut [W]) {
         let cells = self.cells;
         if cells == 1 {
             return weave(with, &self.source, a, row);
@@ -224,7 +224,7 @@ impl<'v> Rows<'v> {
 
     /// Loads row `i` of the points into `far`.
     #[inline(always)]
-    fn load<L: Lanes>(&mut self, with: Available<L>, i: usize) {
+    fn load<L: SixteenLanes>(&mut self, with: Available<L>, i: usize) {
         weave(with, &self.source, i, &mut self.points[..COMPONENTS * self.source.points.count[1]]);
         for (period, row) in self.far.chunks_exact_mut(self.spread.len()).enumerate() {
             let points = &self.points[period * COMPONENTS * LANES..];
@@ -254,7 +254,7 @@ impl Spread {
 
 /// Converts the points of row `i` to quanta, as many as `row` has room for.
 #[inline(always)]
-fn weave<L: Lanes, W: Written>(with: Available<L>, source: &Source<'_>, i: usize, row: &mut [W]) {
+fn weave<L: SixteenLanes, W: Written>(with: Available<L>, source: &Source<'_>, i: usize, row: &mut [W]) {
     let row = row.as_chunks_mut::<COMPONENTS>().0;
     let (count, points) = (row.len(), &source.points);
     let values = [&points.row(0, i)[..count], &points.row(1, i)[..count], &points.row(2, i)[..count]];
@@ -284,7 +284,7 @@ fn weave<L: Lanes, W: Written>(with: Available<L>, source: &Source<'_>, i: usize
 impl Source<'_> {
     /// x, y and z of a block, in quanta.
     #[inline(always)]
-    fn weave<L: Lanes, W: Written>(
+    fn weave<L: SixteenLanes, W: Written>(
         &self,
         with: Available<L>,
         xyz: [&[f32; LANES]; COMPONENTS],
@@ -302,13 +302,13 @@ impl Source<'_> {
 
 /// Interpolates at `part` between `near` and `far`.
 #[inline(always)]
-fn between<L: Lanes>(near: L, far: L, part: L) -> L {
+fn between<L: SixteenLanes>(near: L, far: L, part: L) -> L {
     near.add(part.mul(far.sub(near)))
 }
 
 /// Writes a row without mixing.
 #[inline(always)]
-fn put<L: Lanes, W: Written>(with: Available<L>, values: &[Block<f32>], row: &mut [W]) {
+fn put<L: SixteenLanes, W: Written>(with: Available<L>, values: &[Block<f32>], row: &mut [W]) {
     let (blocks, rest) = row.as_chunks_mut();
     for (block, values) in blocks.iter_mut().zip(values) {
         W::write(with.load(&values.0), block);
@@ -322,7 +322,13 @@ fn put<L: Lanes, W: Written>(with: Available<L>, values: &[Block<f32>], row: &mu
 
 /// Writes a row at `part` between `near` and `far`.
 #[inline(always)]
-fn mix<L: Lanes, W: Written>(with: Available<L>, near: &[Block<f32>], far: &[Block<f32>], part: f32, row: &mut [W]) {
+fn mix<L: SixteenLanes, W: Written>(
+    with: Available<L>,
+    near: &[Block<f32>],
+    far: &[Block<f32>],
+    part: f32,
+    row: &mut [W],
+) {
     let part = with.splat(part);
     let (blocks, rest) = row.as_chunks_mut();
     for ((block, near), far) in blocks.iter_mut().zip(near).zip(far) {

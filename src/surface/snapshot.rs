@@ -5,7 +5,7 @@
 use std::sync::OnceLock;
 
 use super::refine::Points;
-use super::wide::{Available, LANES, Lanes, Width, Work};
+use super::wide::{Available, LANES, SixteenLanes, Width, Work};
 
 /// The displacements of a sheet at one moment, from which frames are made.
 #[derive(Debug, Clone, PartialEq)]
@@ -55,7 +55,7 @@ struct Range<'v> {
 
 impl Work for Range<'_> {
     #[inline(always)]
-    fn work<L: Lanes>(self, with: Available<L>) {
+    fn work<L: SixteenLanes>(self, with: Available<L>) {
         // Enough parallel comparisons to hide their latency.
         const AT_ONCE: usize = 4;
         let mut low = [with.splat(f32::INFINITY); AT_ONCE];

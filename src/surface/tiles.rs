@@ -14,7 +14,7 @@ use std::sync::Arc;
 use super::encode::{Encoding, Frame, Patch, Quanta, fill, lay_out};
 use super::refine::{COMPONENTS, Points, Refinement, Rows};
 use super::snapshot::Snapshot;
-use super::wide::{Available, LANES, Lanes, Width, Work};
+use super::wide::{Available, LANES, SixteenLanes, Width, Work};
 
 /// Points along a side of a tile.
 const SIDE: usize = 16;
@@ -27,7 +27,7 @@ const FINEST: f64 = 1e-6;
 
 /// The state of a sheet as viewers of one refinement and encoding see it.
 #[derive(Debug)]
-pub struct Tiles {
+pub struct FrameTiles {
     refinement: Refinement,
     encoding: Encoding,
     finest_m: f64,
@@ -116,13 +116,13 @@ impl Tile {
     }
 }
 
-impl Tiles {
+impl FrameTiles {
     /// Begins with a keyframe. `spacing_m` is the distance between points, m.
     pub fn new(snapshot: &Arc<Snapshot>, refinement: Refinement, encoding: Encoding, spacing_m: f64) -> Self {
         let [along_x, along_y] = refinement.points.map(tiles_along);
         let place = |number: usize| Area::of(refinement, [number / along_y, number % along_y]);
         let tile = |number| Tile { area: place(number), version: 0, own: None };
-        let mut tiles = Tiles {
+        let mut tiles = FrameTiles {
             refinement,
             encoding,
             finest_m: FINEST * spacing_m,
@@ -219,7 +219,7 @@ impl Tiles {
 
     /// A frame of the tiles newer than `version`. Each tile is written once for all viewers that need it.
     pub fn newer_than(&mut self, version: Option<u64>) -> Frame {
-        let Tiles { refinement, encoding, version: now_at, quanta, key, now, tiles, written, .. } = self;
+        let FrameTiles { refinement, encoding, version: now_at, quanta, key, now, tiles, written, .. } = self;
         let (width, most) = (Width::widest(), SIDE * (refinement.between + 1) + 1);
         let mut rows = Rows::new(refinement.between, most, quanta.source(key.points()));
         let newer = || tiles.iter().zip(0..).filter(|(tile, _)| Some(tile.version) > version);
@@ -256,7 +256,7 @@ struct Compare<'v> {
 
 impl Work for Compare<'_> {
     #[inline(always)]
-    fn work<L: Lanes>(self, with: Available<L>) {
+    fn work<L: SixteenLanes>(self, with: Available<L>) {
         let Compare { now, shown, unseen_m, moved } = self;
         for c in 0..COMPONENTS {
             let (mut low, mut high) = (with.splat(0.0), with.splat(0.0));
@@ -338,7 +338,7 @@ mod tests {
         }
 
         /// Checks that every vertex is within `quanta` quanta of its true place; f32 to the bit.
-        fn check(&self, tiles: &Tiles, truth: &Snapshot, quanta: f64) {
+        fn check(&self, tiles: &FrameTiles, truth: &Snapshot, quanta: f64) {
             let mut exact = Picture::new();
             exact.show(&encode(truth, tiles.refinement, Encoding::F32));
             assert_eq!(exact.vertices.len(), self.vertices.len());
@@ -362,7 +362,7 @@ mod tests {
             for n in [0, 1, 2, 10] {
                 let still = at(points, 0, 0.0, &std::array::from_fn(|_| vec![0.25; points[0] * points[1]]));
                 for encoding in [Encoding::F32, Encoding::I16] {
-                    let mut tiles = Tiles::new(&still, grid(points, n), encoding, SPACING_M);
+                    let mut tiles = FrameTiles::new(&still, grid(points, n), encoding, SPACING_M);
                     let mut picture = Picture::new();
                     let count = picture.show(&tiles.newer_than(None));
                     assert_eq!(count, picture.vertices.len());
@@ -385,7 +385,8 @@ mod tests {
             (3, [16, 20], 2),
             (3, [16, 32], 4),
         ] {
-            let mut tiles = Tiles::new(&at(points, 0, 0.0, &displacement_m), grid(points, n), Encoding::I16, SPACING_M);
+            let mut tiles =
+                FrameTiles::new(&at(points, 0, 0.0, &displacement_m), grid(points, n), Encoding::I16, SPACING_M);
             let first = tiles.version();
             let mut moved = displacement_m.clone();
             moved[2][point[0] * 48 + point[1]] = -0.005;
@@ -402,7 +403,8 @@ mod tests {
         let points = [20, 20];
         let mut displacement_m: [Vec<f32>; 3] = std::array::from_fn(|_| vec![0.0; 400]);
         displacement_m[0][0] = 0.01;
-        let mut tiles = Tiles::new(&at(points, 0, 0.0, &displacement_m), grid(points, 2), Encoding::I16, SPACING_M);
+        let mut tiles =
+            FrameTiles::new(&at(points, 0, 0.0, &displacement_m), grid(points, 2), Encoding::I16, SPACING_M);
         let mut picture = Picture::new();
         picture.show(&tiles.newer_than(None));
         let quantum_m = tiles.quanta.scale_m.x as f32;
@@ -427,7 +429,8 @@ mod tests {
         let points = [40, 40];
         let mut displacement_m: [Vec<f32>; 3] = std::array::from_fn(|_| vec![0.0; 1600]);
         displacement_m[2][820] = -0.01;
-        let mut tiles = Tiles::new(&at(points, 0, 0.0, &displacement_m), grid(points, 0), Encoding::I16, SPACING_M);
+        let mut tiles =
+            FrameTiles::new(&at(points, 0, 0.0, &displacement_m), grid(points, 0), Encoding::I16, SPACING_M);
         let coarse = tiles.quanta.scale_m.z;
         let mut full_at = Vec::new();
         for step in 1..200 {
@@ -456,7 +459,7 @@ mod tests {
             let points = [35, 18];
             let encoding = if i16 { Encoding::I16 } else { Encoding::F32 };
             let mut displacement_m: [Vec<f32>; 3] = std::array::from_fn(|_| vec![0.0; 35 * 18]);
-            let mut tiles = Tiles::new(&at(points, 0, 0.0, &displacement_m), grid(points, n), encoding, SPACING_M);
+            let mut tiles = FrameTiles::new(&at(points, 0, 0.0, &displacement_m), grid(points, n), encoding, SPACING_M);
             let mut pictures = vec![Picture::new(); 3];
             let mut time_s = 0.0;
             for (step, (place, c, power, sign, who, after_s)) in moves.into_iter().enumerate() {

@@ -14,7 +14,7 @@ pub(super) const LANES: usize = 16;
 
 /// Sixteen numbers. A value is the proof that the processor has the instructions: unsafe functions create the first
 /// ones through an [`Available`], and all others come from values.
-pub(super) trait Lanes: Copy {
+pub(super) trait SixteenLanes: Copy {
     /// # Safety
     /// The processor has the instructions.
     unsafe fn load(from: &[f32; LANES]) -> Self;
@@ -31,7 +31,7 @@ pub(super) trait Lanes: Copy {
     fn larger(self, other: Self) -> Self;
     /// Stores x, y and z of sixteen points as x0 y0 z0 x1 …
     fn weave(xyz: [Self; 3], to: &mut [[f32; LANES]; 3]);
-    /// The same, rounded as in [`Lanes::store_rounded`].
+    /// The same, rounded as in [`SixteenLanes::store_rounded`].
     fn weave_rounded(xyz: [Self; 3], to: &mut [[[u8; 2]; LANES]; 3]);
     /// Lane l of the result is lane `from[l]`, below 16.
     fn permute(self, from: &[i32; LANES]) -> Self;
@@ -55,7 +55,7 @@ impl Available<Plain> {
     pub(super) const PLAIN: Self = Available(PhantomData);
 }
 
-impl<L: Lanes> Available<L> {
+impl<L: SixteenLanes> Available<L> {
     /// # Safety
     /// The processor has the instructions.
     #[cfg(target_arch = "x86_64")]
@@ -81,7 +81,7 @@ impl<L: Lanes> Available<L> {
 /// A computation that can run at any width.
 pub(super) trait Work {
     /// Runs it; implement it with `#[inline(always)]`.
-    fn work<L: Lanes>(self, with: Available<L>);
+    fn work<L: SixteenLanes>(self, with: Available<L>);
 }
 
 /// An instruction set.
@@ -142,7 +142,7 @@ macro_rules! each {
     }};
 }
 
-impl Lanes for Plain {
+impl SixteenLanes for Plain {
     #[inline(always)]
     unsafe fn load(from: &[f32; LANES]) -> Self {
         Plain(*from)
@@ -209,7 +209,7 @@ impl Lanes for Plain {
 mod x86 {
     use std::arch::x86_64::*;
 
-    use super::{Available, LANES, Lanes, Work};
+    use super::{Available, LANES, SixteenLanes, Work};
 
     /// # Safety
     /// The processor has these instructions.
@@ -245,7 +245,7 @@ mod x86 {
 
     // SAFETY (of every block below): a value of these types, or the caller's promise, is the proof that the processor
     // has the instructions; memory is an array of that many numbers.
-    impl Lanes for Wide {
+    impl SixteenLanes for Wide {
         #[inline(always)]
         unsafe fn load(from: &[f32; LANES]) -> Self {
             unsafe { Wide(_mm512_loadu_ps(from.as_ptr())) }
@@ -283,7 +283,7 @@ mod x86 {
             const X: [i32; LANES] = sources(0);
             const Y: [i32; LANES] = sources(1);
             const Z: [i32; LANES] = sources(2);
-            // Lanes n, n + 3, …
+            // SixteenLanes n, n + 3, …
             const FIRST: u16 = 0x9249;
             const SECOND: u16 = 0x2492;
             const THIRD: u16 = 0x4924;
@@ -351,7 +351,7 @@ mod x86 {
             const X: [i32; 8] = sources(0);
             const Y: [i32; 8] = sources(1);
             const Z: [i32; 8] = sources(2);
-            // Lanes n, n + 3, …, of eight.
+            // SixteenLanes n, n + 3, …, of eight.
             const FIRST: i32 = 0x49;
             const SECOND: i32 = 0x92;
             const THIRD: i32 = 0x24;
@@ -393,7 +393,7 @@ mod x86 {
         };
     }
 
-    impl Lanes for Narrow {
+    impl SixteenLanes for Narrow {
         #[inline(always)]
         unsafe fn load(from: &[f32; LANES]) -> Self {
             unsafe { Narrow([_mm256_loadu_ps(from.as_ptr()), _mm256_loadu_ps(from.as_ptr().add(8))]) }

@@ -3,7 +3,7 @@
 use crate::common::{SMALL, advance, model, playing, push_on, scene, scene_with, script};
 use glam::DVec3;
 use palpate::scene::Scene;
-use palpate::scene::law::{ForceLaw, Moment};
+use palpate::scene::law::{LoadProfile, Moment};
 use palpate::session::Session;
 use palpate::sheet::{self, Energy, Grasp, Tissue};
 
@@ -85,7 +85,7 @@ fn a_point_without_springs_is_the_damped_oscillator() {
     }
 }
 
-fn constant(scene: &Scene, point: [usize; 2], force_n: DVec3) -> ForceLaw {
+fn constant(scene: &Scene, point: [usize; 2], force_n: DVec3) -> LoadProfile {
     let text = format!(
         "duration_s = 1.0\nsample_every_s = 1.0\n[[force]]\npoint = [{}, {}]\nforce_n = [{}, {}, {}]\n\
          falloff_per_m = 2000.0\nfalloff_offset = 0.0\nprofile = {{ type = \"constant\" }}\n",

@@ -2,7 +2,7 @@
 
 use glam::{DVec2, DVec3};
 use palpate::limits::Limits;
-use palpate::scene::law::{CentreLaw, ForceLaw, Profile, StrengthLaw};
+use palpate::scene::law::{CentreProfile, LoadProfile, Profile, StrengthProfile};
 use palpate::scene::{PAPER, Scene};
 use palpate::sheet::{Grasp, Model, Push, Tissue, at_rest};
 
@@ -26,19 +26,19 @@ fn difference(a: &[Vec<f32>; 3], b: &[Vec<f32>; 3]) -> [f64; 2] {
     })
 }
 
-fn law(centre: CentreLaw, force_n: [f64; 3], falloff_per_m: f64, profile: Profile) -> Push {
-    let strength = StrengthLaw::Scaled(DVec3::from_array(force_n), profile);
-    Push::Law(ForceLaw { centre, strength, falloff_per_m, falloff_offset: 0.0 })
+fn law(centre: CentreProfile, force_n: [f64; 3], falloff_per_m: f64, profile: Profile) -> Push {
+    let strength = StrengthProfile::Scaled(DVec3::from_array(force_n), profile);
+    Push::Law(LoadProfile { centre, strength, falloff_per_m, falloff_offset: 0.0 })
 }
 
-fn at(x: f64, y: f64) -> CentreLaw {
-    CentreLaw::Hops(vec![(0, DVec2::new(x, y))])
+fn at(x: f64, y: f64) -> CentreProfile {
+    CentreProfile::Hops(vec![(0, DVec2::new(x, y))])
 }
 
 /// The pushes on a sheet of 65 × 97 points, each with the settings that it needs.
 fn cases() -> Vec<(&'static str, Vec<&'static str>, Vec<Push>)> {
     let pulse = Profile::Pulse { on: 0, off: 400 };
-    let path = CentreLaw::Path { from_m: DVec2::new(1.0, 0.3), velocity_m_per_s: DVec2::new(0.05, 1.2) };
+    let path = CentreProfile::Path { from_m: DVec2::new(1.0, 0.3), velocity_m_per_s: DVec2::new(0.05, 1.2) };
     vec![
         ("local", vec![], vec![law(at(1.0, 1.5), [0.0, 0.0, -3.0], 150.0, pulse)]),
         ("stiff", vec!["springs.stiffness_n_per_m=200"], vec![law(at(1.0, 1.5), [0.3, 0.0, -1.0], 60.0, pulse)]),
@@ -194,7 +194,7 @@ fn sleeping_is_the_same_at_every_width() {
             // Skip lanes that this machine does not have.
             let model = Model::compile(&scene, &Limits::default()).ok()?;
             let mut tissue = at_rest(&model);
-            let path = CentreLaw::Path { from_m: DVec2::splat(0.4), velocity_m_per_s: DVec2::new(1.5, 2.0) };
+            let path = CentreProfile::Path { from_m: DVec2::splat(0.4), velocity_m_per_s: DVec2::new(1.5, 2.0) };
             tissue.push(0, Some(law(path, [0.2, 0.0, -1.0], 60.0, Profile::Pulse { on: 0, off: 500 })));
             (0..900).for_each(|_| tissue.step().unwrap());
             let part = tissue.computed_fraction();
@@ -245,7 +245,7 @@ fn the_energy_of_tiles_that_sleep_is_counted_to_the_last_digits() {
         let integrator = format!("stepping.integrator={integrator}");
         let settings = [integrator.as_str(), "stepping.precision=f64", "sheet.points=[65, 97]", "sleep.tolerance=1e-4"];
         let (mut asked, mut unasked) = (sheet(&settings), sheet(&settings));
-        let path = CentreLaw::Path { from_m: DVec2::new(0.5, 0.5), velocity_m_per_s: DVec2::new(0.5, 0.9) };
+        let path = CentreProfile::Path { from_m: DVec2::new(0.5, 0.5), velocity_m_per_s: DVec2::new(0.5, 0.9) };
         for tissue in [&mut asked, &mut unasked] {
             tissue.push(0, Some(law(path.clone(), [0.2, 0.3, -1.0], 60.0, Profile::Pulse { on: 0, off: 1500 })));
             tissue.push(1, Some(law(at(1.5, 0.5), [0.0, 0.0, -2.0], 150.0, Profile::Constant)));
@@ -277,7 +277,7 @@ fn a_moving_tool_asks_only_tiles_within_its_reach() {
     // tile.
     let mut tissue = sheet(&["sheet.points=[16, 64]", "springs.stiffness_n_per_m=1e-6", "sleep.tolerance=1e-6"]);
     let hops = (0..20_000).map(|step| (step, DVec2::new(0.2, if step % 2 == 0 { 0.09 } else { 0.11 }))).collect();
-    tissue.push(0, Some(law(CentreLaw::Hops(hops), [0.0, 0.0, -3.0], 60.0, Profile::Constant)));
+    tissue.push(0, Some(law(CentreProfile::Hops(hops), [0.0, 0.0, -3.0], 60.0, Profile::Constant)));
     for step in 0..20_000 {
         tissue.step().unwrap();
         // A bound on the force beyond its reach, summed over all steps, would finally wake the second tile.

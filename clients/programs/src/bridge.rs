@@ -5,7 +5,7 @@ use std::time::Duration;
 use glam::DVec3;
 use palpate_client::bridge::{Options, Session, Target, Tick, run};
 use palpate_proto::refusal::Refusal;
-use palpate_touch::{Reason, State, Tip};
+use palpate_touch::{LimitCause, RenderingState, Tip};
 use serde_json::json;
 
 use crate::simulated::random::Random;
@@ -88,8 +88,9 @@ pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
     });
     if let Some(envelope) = &served.envelope {
         report["energy_j"] = json!(envelope.energy_j());
-        report["enabled"] = json!(envelope.state() == State::Enabled);
-        let counts = Reason::ALL.iter().map(|(reason, name)| ((*name).to_owned(), json!(envelope.count(*reason).0)));
+        report["enabled"] = json!(envelope.state() == RenderingState::Enabled);
+        let counts =
+            LimitCause::ALL.iter().map(|(reason, name)| ((*name).to_owned(), json!(envelope.count(*reason).0)));
         report["interventions_ticks"] = serde_json::Value::Object(counts.collect());
     }
     crate::tell!("{report}");

@@ -17,15 +17,15 @@ pub const HEARTBEAT_S: f64 = 0.04;
 
 /// One tool's deadband.
 #[derive(Debug, Clone)]
-pub struct Deadband {
+pub struct ForceDeadband {
     fraction: f64,
     sent: Option<(LocalModel, Touching)>,
 }
 
-impl Deadband {
+impl ForceDeadband {
     /// A deadband that is left when the force differs by more than `fraction` of itself; 0 means at every step.
     pub fn new(fraction: f64) -> Self {
-        Deadband { fraction, sent: None }
+        ForceDeadband { fraction, sent: None }
     }
 
     /// Whether the client's force is off by too much at the tool's present place, of which `model` is. Call it at each

@@ -54,7 +54,7 @@ const FIRST_N: f64 = 0.2;
 
 /// Whether forces are rendered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum State {
+pub enum RenderingState {
     /// Nothing is rendered until `enable`.
     Disabled,
     /// Rendering, or ramping in.
@@ -67,7 +67,7 @@ pub enum State {
 
 /// The reason why a force differs from the wanted one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Reason {
+pub enum LimitCause {
     /// The newest model is old.
     Stale,
     /// Rendering is not enabled, or ramping in.
@@ -86,17 +86,17 @@ pub enum Reason {
     NotFinite,
 }
 
-impl Reason {
+impl LimitCause {
     /// All reasons, in the order of their counters.
-    pub const ALL: [(Reason, &'static str); 8] = [
-        (Reason::Stale, "stale"),
-        (Reason::Engage, "engage"),
-        (Reason::Force, "force"),
-        (Reason::Continuous, "continuous"),
-        (Reason::Passivity, "passivity"),
-        (Reason::Slew, "slew"),
-        (Reason::Workspace, "workspace"),
-        (Reason::NotFinite, "not_finite"),
+    pub const ALL: [(LimitCause, &'static str); 8] = [
+        (LimitCause::Stale, "stale"),
+        (LimitCause::Engage, "engage"),
+        (LimitCause::Force, "force"),
+        (LimitCause::Continuous, "continuous"),
+        (LimitCause::Passivity, "passivity"),
+        (LimitCause::Slew, "slew"),
+        (LimitCause::Workspace, "workspace"),
+        (LimitCause::NotFinite, "not_finite"),
     ];
 }
 
@@ -121,7 +121,7 @@ pub struct Envelope {
     device: Device,
     /// Middle of the device's workspace, m.
     middle_m: DVec3,
-    state: State,
+    state: RenderingState,
     /// When the ramp began; `None` while it waits for a small force.
     engaged_s: Option<f64>,
     /// The force rendered now, N.
@@ -134,7 +134,7 @@ pub struct Envelope {
     over_s: f64,
     /// The fraction of the force that the model's age leaves.
     share: f64,
-    counts: [u64; Reason::ALL.len()],
+    counts: [u64; LimitCause::ALL.len()],
     ticks: u64,
 }
 
@@ -144,7 +144,7 @@ impl Envelope {
         Envelope {
             device,
             middle_m,
-            state: State::Disabled,
+            state: RenderingState::Disabled,
             engaged_s: None,
             force_n: DVec3::ZERO,
             before: None,
@@ -152,13 +152,13 @@ impl Envelope {
             energy_j: 0.0,
             over_s: 0.0,
             share: 1.0,
-            counts: [0; Reason::ALL.len()],
+            counts: [0; LimitCause::ALL.len()],
             ticks: 0,
         }
     }
 
     /// Whether forces are rendered.
-    pub fn state(&self) -> State {
+    pub fn state(&self) -> RenderingState {
         self.state
     }
 
@@ -168,37 +168,37 @@ impl Envelope {
     }
 
     /// The number of ticks in which `reason` changed the force, and of all ticks.
-    pub fn count(&self, reason: Reason) -> (u64, u64) {
+    pub fn count(&self, reason: LimitCause) -> (u64, u64) {
         (self.counts[reason as usize], self.ticks)
     }
 
     /// Leaves DISABLED or PAUSED. A FAULT must be reset first.
     pub fn enable(&mut self) {
-        if matches!(self.state, State::Disabled | State::Paused) {
-            (self.state, self.engaged_s) = (State::Enabled, None);
+        if matches!(self.state, RenderingState::Disabled | RenderingState::Paused) {
+            (self.state, self.engaged_s) = (RenderingState::Enabled, None);
         }
     }
 
     /// Stops rendering until it is enabled.
     pub fn disable(&mut self) {
-        if self.state != State::Fault {
-            self.state = State::Disabled;
+        if self.state != RenderingState::Fault {
+            self.state = RenderingState::Disabled;
         }
     }
 
     /// Stops rendering until it is reset and enabled.
     pub fn fail(&mut self) {
-        self.state = State::Fault;
+        self.state = RenderingState::Fault;
     }
 
     /// Leaves FAULT for DISABLED.
     pub fn reset(&mut self) {
-        if self.state == State::Fault {
-            self.state = State::Disabled;
+        if self.state == RenderingState::Fault {
+            self.state = RenderingState::Disabled;
         }
     }
 
-    fn acted(&mut self, reason: Reason) {
+    fn acted(&mut self, reason: LimitCause) {
         self.counts[reason as usize] += 1;
     }
 
@@ -208,7 +208,7 @@ impl Envelope {
         let finite = wanted.place_m.is_finite() && wanted.velocity_m_per_s.is_finite() && wanted.now_s.is_finite();
         if !finite {
             // The place of the device is unknown, so there is no work to account for; let go.
-            self.acted(Reason::NotFinite);
+            self.acted(LimitCause::NotFinite);
             self.fail();
             let step_n = SLEW_N_PER_S * NOMINAL_S;
             self.force_n -= self.force_n.clamp_length_max(step_n);
@@ -219,10 +219,10 @@ impl Envelope {
                 let given_j = -self.force_n.dot(wanted.place_m - place_m);
                 self.energy_j += given_j;
                 self.tank_j = (self.tank_j + given_j).min(TANK_J);
-                if wanted.now_s - then_s > PAUSE_S && self.state == State::Enabled {
+                if wanted.now_s - then_s > PAUSE_S && self.state == RenderingState::Enabled {
                     // The client's own loop stood still: the hand is elsewhere and does not expect a force.
-                    self.acted(Reason::Stale);
-                    self.state = State::Paused;
+                    self.acted(LimitCause::Stale);
+                    self.state = RenderingState::Paused;
                 }
                 (wanted.now_s - then_s).clamp(0.0, 10.0 * NOMINAL_S)
             }
@@ -230,12 +230,12 @@ impl Envelope {
         };
         let mut force_n = wanted.force_n;
         if !force_n.is_finite() {
-            self.acted(Reason::NotFinite);
+            self.acted(LimitCause::NotFinite);
             self.fail();
             force_n = DVec3::ZERO;
         }
         if (wanted.place_m - self.middle_m).length() > self.device.workspace_m {
-            self.acted(Reason::Workspace);
+            self.acted(LimitCause::Workspace);
             self.fail();
         }
         force_n = self.fade(wanted, elapsed_s, force_n);
@@ -249,8 +249,8 @@ impl Envelope {
 
     /// Reduces the force by the model's age.
     fn fade(&mut self, wanted: &Wanted, elapsed_s: f64, force_n: DVec3) -> DVec3 {
-        if wanted.age_s > PAUSE_S && self.state == State::Enabled {
-            self.state = State::Paused;
+        if wanted.age_s > PAUSE_S && self.state == RenderingState::Enabled {
+            self.state = RenderingState::Paused;
         }
         let share = match wanted.age_s {
             age_s if age_s <= FRESH_S => 1.0,
@@ -259,18 +259,18 @@ impl Envelope {
         };
         self.share = share.min(self.share + elapsed_s / RETURN_S);
         if self.share < 1.0 {
-            self.acted(Reason::Stale);
+            self.acted(LimitCause::Stale);
         }
         self.share * force_n
     }
 
     fn engage(&mut self, now_s: f64, force_n: DVec3) -> DVec3 {
         match self.state {
-            State::Enabled => {}
+            RenderingState::Enabled => {}
             // While no model arrives, `fade` reduces the force. Here the rest of it is released.
-            State::Disabled | State::Paused | State::Fault => {
+            RenderingState::Disabled | RenderingState::Paused | RenderingState::Fault => {
                 self.engaged_s = None;
-                self.acted(Reason::Engage);
+                self.acted(LimitCause::Engage);
                 let decay = (-NOMINAL_S / DECAY_S).exp();
                 return self.force_n.clamp_length_max(force_n.length()) * decay;
             }
@@ -280,7 +280,7 @@ impl Envelope {
         }
         let share = self.engaged_s.map_or(0.0, |since_s| ((now_s - since_s) / ENGAGE_S).clamp(0.0, 1.0));
         if share < 1.0 {
-            self.acted(Reason::Engage);
+            self.acted(LimitCause::Engage);
         }
         share * force_n
     }
@@ -289,13 +289,13 @@ impl Envelope {
         let wanted_n = force_n.length();
         let mut most_n = self.device.most_n();
         if wanted_n > most_n {
-            self.acted(Reason::Force);
+            self.acted(LimitCause::Force);
         }
         // A motor cools down as fast as it heats up.
         let over = wanted_n.min(most_n) > self.device.continuous_n;
         self.over_s = (self.over_s + if over { elapsed_s } else { -elapsed_s }).clamp(0.0, CONTINUOUS_S);
         if over && self.over_s >= CONTINUOUS_S {
-            self.acted(Reason::Continuous);
+            self.acted(LimitCause::Continuous);
             most_n = self.device.continuous_n;
         }
         force_n.clamp_length_max(most_n)
@@ -306,7 +306,7 @@ impl Envelope {
         if length_n <= most_n {
             return force_n;
         }
-        self.acted(Reason::Passivity);
+        self.acted(LimitCause::Passivity);
         force_n * (most_n / length_n)
     }
 
@@ -326,12 +326,12 @@ impl Envelope {
         if change_n.length() <= step_n {
             return force_n;
         }
-        self.acted(Reason::Slew);
+        self.acted(LimitCause::Slew);
         let next_n = self.force_n + change_n.clamp_length_max(step_n);
         if next_n.length() <= self.bearable_n(velocity_m_per_s, next_n) {
             return next_n;
         }
-        self.acted(Reason::Passivity);
+        self.acted(LimitCause::Passivity);
         self.force_n - self.force_n.clamp_length_max(step_n)
     }
 }
@@ -387,10 +387,12 @@ mod tests {
         assert!((half_n - 0.5).abs() < 1e-9, "{half_n}");
         let whole_n = port.ticks(250, -0.05, 1.0);
         assert!((whole_n - 1.0).abs() < 1e-9, "{whole_n}");
-        assert_eq!(port.envelope.count(Reason::Engage), (500, 501));
+        assert_eq!(port.envelope.count(LimitCause::Engage), (500, 501));
         assert_eq!(port.ticks(100, -0.05, 1.0), 1.0);
-        assert_eq!(port.envelope.count(Reason::Engage), (500, 601));
-        for reason in [Reason::Stale, Reason::Force, Reason::Slew, Reason::Passivity, Reason::NotFinite] {
+        assert_eq!(port.envelope.count(LimitCause::Engage), (500, 601));
+        for reason in
+            [LimitCause::Stale, LimitCause::Force, LimitCause::Slew, LimitCause::Passivity, LimitCause::NotFinite]
+        {
             assert_eq!(port.envelope.count(reason).0, 0, "{reason:?}");
         }
     }
@@ -401,13 +403,13 @@ mod tests {
         port.tick(-0.05, 0.0);
         assert_eq!(port.ticks(600, -0.05, 1.0), 1.0);
         port.envelope.disable();
-        assert_eq!(port.envelope.state(), State::Disabled);
+        assert_eq!(port.envelope.state(), RenderingState::Disabled);
         assert!(port.ticks(300, 0.0, 1.0) < 0.01);
         port.envelope.enable();
-        assert_eq!(port.envelope.state(), State::Enabled);
+        assert_eq!(port.envelope.state(), RenderingState::Enabled);
         port.envelope.fail();
         port.envelope.disable();
-        assert_eq!(port.envelope.state(), State::Fault);
+        assert_eq!(port.envelope.state(), RenderingState::Fault);
     }
 
     #[test]
@@ -416,9 +418,9 @@ mod tests {
         port.tick(-0.01, 0.0);
         // The ramp passes 0.88 N after 0.22 s.
         assert_eq!(port.ticks(2200, -0.01, 2.0), 2.0);
-        assert_eq!(port.envelope.count(Reason::Continuous).0, 0);
+        assert_eq!(port.envelope.count(LimitCause::Continuous).0, 0);
         assert!((port.ticks(60, -0.01, 2.0) - 0.88).abs() < 1e-12);
-        assert!(port.envelope.count(Reason::Continuous).0 > 0);
+        assert!(port.envelope.count(LimitCause::Continuous).0 > 0);
         // A second of rest is good for a second of force.
         assert_eq!(port.ticks(1000, -0.01, 0.5), 0.5);
         assert_eq!(port.ticks(950, -0.01, 2.0), 2.0);
@@ -438,6 +440,6 @@ mod tests {
                 }
             }
         }
-        assert_eq!([Reason::Passivity, Reason::Slew].map(|reason| port.envelope.count(reason).0), [0; 2]);
+        assert_eq!([LimitCause::Passivity, LimitCause::Slew].map(|reason| port.envelope.count(reason).0), [0; 2]);
     }
 }

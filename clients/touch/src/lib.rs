@@ -61,9 +61,9 @@ pub mod path;
 pub mod renderer;
 pub mod tip;
 
-pub use deadband::Deadband;
+pub use deadband::ForceDeadband;
 pub use device::Device;
-pub use envelope::{Envelope, Reason, State};
+pub use envelope::{Envelope, LimitCause, RenderingState};
 pub use law::Law;
 pub use local::{LocalModel, Standing, Touching, Track};
 pub use renderer::Renderer;

@@ -20,7 +20,7 @@
 
 use glam::DVec3;
 
-use crate::envelope::{Envelope, State, Wanted};
+use crate::envelope::{Envelope, RenderingState, Wanted};
 use crate::law::Law;
 use crate::local::{LocalModel, Standing, Touching, Track};
 
@@ -95,7 +95,7 @@ impl Renderer {
     }
 
     /// Whether forces are rendered.
-    pub fn state(&self) -> State {
+    pub fn state(&self) -> RenderingState {
         self.envelope.state()
     }
 

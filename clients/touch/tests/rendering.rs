@@ -7,7 +7,7 @@ use palpate_touch::envelope::{ENGAGE_S, FRESH_S, PAUSE_S, SLEW_N_PER_S, STALE_S,
 use palpate_touch::law::Row;
 use palpate_touch::path::{Path, Play, RELEASE_S, SPEED_M_PER_S};
 use palpate_touch::renderer::{BIAS_S, MOST_LAWS};
-use palpate_touch::{Envelope, Law, LocalModel, Reason, Renderer, Standing, State, Touching};
+use palpate_touch::{Envelope, Law, LimitCause, LocalModel, Renderer, RenderingState, Standing, Touching};
 use proptest::prelude::*;
 
 const TICK_S: f64 = 1e-3;
@@ -68,7 +68,7 @@ fn a_press_is_rendered_as_the_model_says() {
     let (mut renderer, tick) = pressed(0.005);
     let force = renderer.tick(f64::from(tick) * TICK_S, DVec3::new(0.0, 0.0, -0.005));
     assert!((force.z - 2.0).abs() < 1e-6 && force.truncate().length() < 1e-9, "{force}");
-    assert_eq!(renderer.state(), State::Enabled);
+    assert_eq!(renderer.state(), RenderingState::Enabled);
 }
 
 #[test]
@@ -88,10 +88,10 @@ fn a_force_without_news_fades_pauses_decays_and_comes_back_only_on_enable() {
     assert!((at(&mut renderer, FRESH_S).0 - 2.0).abs() < 1e-6);
     let (faded_n, _) = at(&mut renderer, STALE_S);
     assert!(faded_n < 1.1 && faded_n > 0.9, "{faded_n} N at {STALE_S} s");
-    assert_eq!(renderer.state(), State::Enabled);
+    assert_eq!(renderer.state(), RenderingState::Enabled);
     let (decayed_n, _) = at(&mut renderer, PAUSE_S + 0.002);
     assert!(decayed_n < 2.0 * (-3.0_f64).exp(), "{decayed_n} N at {PAUSE_S} s");
-    assert_eq!(renderer.state(), State::Paused);
+    assert_eq!(renderer.state(), RenderingState::Paused);
     // A new model alone does not end the pause.
     let (_, mut tick) = at(&mut renderer, 0.5);
     for _ in 0..200 {
@@ -100,7 +100,7 @@ fn a_force_without_news_fades_pauses_decays_and_comes_back_only_on_enable() {
         assert!(renderer.tick(now_s, place_m).length() < 0.01);
         tick += 1;
     }
-    assert_eq!(renderer.state(), State::Paused);
+    assert_eq!(renderer.state(), RenderingState::Paused);
     // Nor does `enable` while the tool is deep in the tissue: it engages only in the air.
     renderer.envelope.enable();
     for step in 0..1500 {
@@ -131,12 +131,12 @@ fn what_is_not_finite_is_a_fault_that_lets_go_and_needs_a_reset() {
             before = force;
         }
         assert_eq!(before, DVec3::ZERO);
-        assert_eq!(renderer.state(), State::Fault);
+        assert_eq!(renderer.state(), RenderingState::Fault);
         renderer.envelope.enable();
-        assert_eq!(renderer.state(), State::Fault, "a fault is reset first");
+        assert_eq!(renderer.state(), RenderingState::Fault, "a fault is reset first");
         renderer.envelope.reset();
         renderer.envelope.enable();
-        assert_eq!(renderer.state(), State::Enabled);
+        assert_eq!(renderer.state(), RenderingState::Enabled);
     }
 }
 
@@ -184,9 +184,9 @@ fn outside_the_workspace_is_a_fault() {
         age_s: 0.0,
     };
     envelope.render(&wanted(0.07));
-    assert_eq!(envelope.state(), State::Enabled);
+    assert_eq!(envelope.state(), RenderingState::Enabled);
     envelope.render(&wanted(0.08));
-    assert_eq!((envelope.state(), envelope.count(Reason::Workspace).0), (State::Fault, 1));
+    assert_eq!((envelope.state(), envelope.count(LimitCause::Workspace).0), (RenderingState::Fault, 1));
 }
 
 #[test]
@@ -254,7 +254,7 @@ fn rendered_across(share: f64, changed: u32) -> Vec<DVec3> {
         }
         forces.push(renderer.tick(now_s, place(tick)));
     }
-    assert_eq!((renderer.state(), renderer.refused()), (State::Enabled, 0));
+    assert_eq!((renderer.state(), renderer.refused()), (RenderingState::Enabled, 0));
     forces
 }
 
@@ -415,7 +415,7 @@ proptest! {
             prop_assert!(force.is_finite() && force.length() <= device.most_n() + 1e-9);
             prop_assert!((force - before).length() <= SLEW_N_PER_S * TICK_S + 1e-9);
             before = force;
-            if envelope.state() != State::Enabled {
+            if envelope.state() != RenderingState::Enabled {
                 envelope.enable();
             }
         }

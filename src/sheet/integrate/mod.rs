@@ -82,7 +82,7 @@ pub(super) enum Bound {
 pub(super) struct Entry {
     /// The power of the substep with which its error falls.
     pub(super) order: f64,
-    /// The cost of a substep, in those of `central`. Measured (`make bench-kernel`).
+    /// The cost of a substep, in those of `central`. Measured (`make tables-kernel`).
     pub(super) cost: f64,
     /// What its substep must satisfy.
     pub(super) bound: Bound,

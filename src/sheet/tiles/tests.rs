@@ -16,8 +16,8 @@ fn layout() -> Layout {
 }
 
 /// All asleep.
-fn tiles() -> Tiles<f64> {
-    Tiles::new(layout(), 1e-3, 1)
+fn tiles() -> SleepTiles<f64> {
+    SleepTiles::new(layout(), 1e-3, 1)
 }
 
 fn place(c: usize, [i, j]: [usize; 2]) -> usize {

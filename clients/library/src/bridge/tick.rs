@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use glam::DVec3;
-use palpate_touch::{Envelope, Renderer, State};
+use palpate_touch::{Envelope, Renderer, RenderingState};
 use tokio::sync::mpsc;
 
 use super::line::{Command, Shared};
@@ -28,7 +28,7 @@ pub struct Tick {
     /// The rendered force, N.
     pub force_n: DVec3,
     /// `None` before the first connection.
-    pub state: Option<State>,
+    pub state: Option<RenderingState>,
 }
 
 /// The results of a device's loop.

@@ -7,7 +7,7 @@ use std::time::Duration;
 use glam::DVec3;
 use palpate_client::Server;
 use palpate_client::bridge::{self, Options, Session, Target};
-use palpate_touch::Reason;
+use palpate_touch::LimitCause;
 
 use super::run::{Outcome, Setup, TICK_S, Totals, fitting_scale};
 use super::tissue::{Tissue, Twin};
@@ -60,9 +60,10 @@ pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failur
     outcome.commands_per_s = TICK_S.recip();
     outcome.late_ticks = Some(served.late_ticks);
     if let Some(envelope) = &served.envelope {
-        let (acted, ticks) = envelope.count(Reason::Passivity);
+        let (acted, ticks) = envelope.count(LimitCause::Passivity);
         outcome.guard_share = acted as f64 / ticks.max(1) as f64;
-        outcome.interventions = Reason::ALL.iter().map(|(reason, name)| (*name, envelope.count(*reason).0)).collect();
+        outcome.interventions =
+            LimitCause::ALL.iter().map(|(reason, name)| (*name, envelope.count(*reason).0)).collect();
     }
     Ok(outcome)
 }

@@ -24,7 +24,7 @@ use serde_json::{Value, json};
 use crate::simulated::{device_named, hand_named};
 use crate::{Failure, credentials};
 use network::Conditions;
-use run::{Outcome, Scheme, Setup, run};
+use run::{Outcome, Rendering, Setup, run};
 
 /// Arguments of `link`.
 #[derive(Args)]
@@ -55,7 +55,7 @@ pub(crate) struct Arguments {
     profile: Option<Profile>,
     /// How the client renders samples
     #[arg(long, default_value = "model")]
-    scheme: Scheme,
+    scheme: Rendering,
     /// Send a sample only when the force that the client renders is off by more than this fraction; 0 sends one per step
     #[arg(long, value_name = "PART", default_value_t = 0.0)]
     deadband: f64,

@@ -5,10 +5,10 @@ use std::sync::Arc;
 use glam::DVec3;
 use palpate::sheet::Model;
 use palpate_proto::touch::sample_bytes;
-use palpate_touch::deadband::{Deadband, HEARTBEAT_S};
+use palpate_touch::deadband::{ForceDeadband, HEARTBEAT_S};
 use palpate_touch::envelope::{Envelope, Wanted};
 use palpate_touch::hand::{Hand, Held};
-use palpate_touch::{Device, Law, LocalModel, Reason, Renderer, State, Tip};
+use palpate_touch::{Device, Law, LimitCause, LocalModel, Renderer, RenderingState, Tip};
 
 use super::network::{Conditions, Direction};
 use super::tissue::{Server, Tissue, Twin};
@@ -17,7 +17,7 @@ use crate::simulated::task::{self, Task};
 
 /// How the client renders samples.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub(super) enum Scheme {
+pub(super) enum Rendering {
     /// The newest force, unchanged: no model, no safety envelope
     Raw,
     /// The newest force, held until the next, within the safety envelope
@@ -37,7 +37,7 @@ pub(super) struct Setup {
     pub(super) conditions: Conditions,
     /// Once a second the client stalls for this long, s.
     pub(super) stall_s: f64,
-    pub(super) scheme: Scheme,
+    pub(super) scheme: Rendering,
     pub(super) deadband: f64,
     pub(super) duration_s: f64,
     pub(super) seed: u64,
@@ -210,16 +210,16 @@ pub(super) fn run(setup: &Setup) -> Result<Outcome, String> {
     let (mut server, mut twin) = (Server::new(tissue()), Twin::new(tissue()));
     let mut up: Direction<(f64, DVec3)> = Direction::new(*conditions, Random::new(*seed, 1));
     let mut down: Direction<LocalModel> = Direction::new(*conditions, Random::new(*seed, 2));
-    let (mut deadband, mut sent_s) = (Deadband::new(*deadband), f64::NEG_INFINITY);
+    let (mut deadband, mut sent_s) = (ForceDeadband::new(*deadband), f64::NEG_INFINITY);
     let envelope = || {
         let mut envelope = Envelope::new(*device, middle_m);
         envelope.enable();
         envelope
     };
     let mut client = match scheme {
-        Scheme::Raw => Client::Raw(None),
-        Scheme::Hold => Client::Hold(None, None, None, Box::new(envelope())),
-        Scheme::Model => Client::Model(Box::new(Renderer::new((**law).clone(), envelope()))),
+        Rendering::Raw => Client::Raw(None),
+        Rendering::Hold => Client::Hold(None, None, None, Box::new(envelope())),
+        Rendering::Model => Client::Model(Box::new(Renderer::new((**law).clone(), envelope()))),
     };
     let mut held = Held { place_m: task.start_m(), velocity_m_per_s: DVec3::ZERO };
     let mut totals = Totals::default();
@@ -276,9 +276,10 @@ pub(super) fn run(setup: &Setup) -> Result<Outcome, String> {
     outcome.commands_per_s = up.sent() as f64 / lasted_s;
     outcome.path = server.path.counts();
     if let Some(envelope) = client.envelope() {
-        let (acted, ticks) = envelope.count(Reason::Passivity);
+        let (acted, ticks) = envelope.count(LimitCause::Passivity);
         outcome.guard_share = acted as f64 / ticks.max(1) as f64;
-        outcome.interventions = Reason::ALL.iter().map(|(reason, name)| (*name, envelope.count(*reason).0)).collect();
+        outcome.interventions =
+            LimitCause::ALL.iter().map(|(reason, name)| (*name, envelope.count(*reason).0)).collect();
     }
     Ok(outcome)
 }
@@ -286,11 +287,11 @@ pub(super) fn run(setup: &Setup) -> Result<Outcome, String> {
 /// The simulated operator notices that rendering has paused, and enables it again after [`PAUSE_S`].
 fn operate(envelope: &mut Envelope, now_s: f64, paused_s: &mut Option<f64>, outcome: &mut Outcome) {
     match (envelope.state(), *paused_s) {
-        (State::Enabled, _) => *paused_s = None,
+        (RenderingState::Enabled, _) => *paused_s = None,
         (_, None) => {
             *paused_s = Some(now_s);
             outcome.pauses += 1;
-            if envelope.state() == State::Fault {
+            if envelope.state() == RenderingState::Fault {
                 outcome.faults += 1;
             }
         }

@@ -10,14 +10,14 @@ use crate::budget::Account;
 
 /// The caller. The guard puts it into the extensions of every call that it lets through.
 #[derive(Debug, Clone)]
-pub(crate) struct Visitor {
+pub(crate) struct ChargedCaller {
     pub(crate) account: Account,
     /// The client may go away without the server noticing by its connection: HTTP/1.1, and gRPC-web, whose connections a
     /// browser shares among pages.
     pub(crate) may_vanish: bool,
 }
 
-impl Visitor {
+impl ChargedCaller {
     /// The name of a caller's account; `caller` is the authenticated name, if any.
     pub(super) fn account_name(caller: Option<&str>, peer: Option<&Peer>) -> String {
         match (caller, peer) {
@@ -30,12 +30,12 @@ impl Visitor {
     pub(super) fn new<B>(account: Account, request: &Request<B>) -> Self {
         let kind = request.headers().get(header::CONTENT_TYPE).map(http::HeaderValue::as_bytes);
         let is_web = kind.is_some_and(|kind| kind.starts_with(b"application/grpc-web"));
-        Visitor { account, may_vanish: is_web || request.version() < Version::HTTP_2 }
+        ChargedCaller { account, may_vanish: is_web || request.version() < Version::HTTP_2 }
     }
 
     /// The caller of the call with these extensions.
     pub(super) fn of(extensions: &Extensions) -> Self {
-        let known = extensions.get::<Visitor>().cloned();
-        known.unwrap_or_else(|| Visitor { account: Account::alone(), may_vanish: true })
+        let known = extensions.get::<ChargedCaller>().cloned();
+        known.unwrap_or_else(|| ChargedCaller { account: Account::alone(), may_vanish: true })
     }
 }

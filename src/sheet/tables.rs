@@ -4,7 +4,7 @@
 use std::cell::RefCell;
 use std::sync::Arc;
 
-use super::advance::Advance;
+use super::advance::AdvanceStage;
 use super::applied::{self, Pull, Term};
 use super::field::{BLOCK, Field, Layout, State};
 use super::grid::Grid;
@@ -22,7 +22,7 @@ const FEW: usize = 4;
 
 /// The buffers and tables that a sweep needs beside the state. One for each sheet, made once.
 #[derive(Debug)]
-pub(super) struct Bench<T> {
+pub(super) struct SweepTables<T> {
     width: Width,
     pub(super) layout: Layout,
     pub(super) springs: Springs<T>,
@@ -34,7 +34,7 @@ pub(super) struct Bench<T> {
     work: [T; BLOCK],
 }
 
-impl<T: Real> Bench<T> {
+impl<T: Real> SweepTables<T> {
     pub(super) fn new(lanes: Lanes, layout: Layout, springs: Springs<T>, fixed: &[usize]) -> Self {
         let free = (!fixed.is_empty()).then(|| {
             let mut free = Field::of_length(layout.plane);
@@ -43,7 +43,7 @@ impl<T: Real> Bench<T> {
             free
         });
         let zero = [T::default(); BLOCK];
-        Bench {
+        SweepTables {
             width: Width::of(lanes),
             layout,
             springs,
@@ -79,7 +79,7 @@ impl<T: Real> Bench<T> {
             &many
         };
         let u = state.u.as_mut_ptr();
-        let stage = Advance {
+        let stage = AdvanceStage {
             layout: self.layout,
             scheme,
             u,

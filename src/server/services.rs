@@ -11,7 +11,7 @@ use crate::pace::Pacer;
 
 /// What every service needs.
 #[derive(Clone)]
-pub(crate) struct House {
+pub(crate) struct Services {
     pub(crate) config: Arc<Config>,
     pub(crate) catalog: Catalog,
     pub(crate) pacer: Arc<Pacer>,

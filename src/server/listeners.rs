@@ -36,13 +36,13 @@ pub enum ServeError {
 }
 
 /// A server's listeners and its protection.
-pub struct Doors {
+pub struct Listeners {
     pub(super) listener: TcpListener,
     pub(super) metrics: Option<TcpListener>,
     pub(super) protection: Protection,
 }
 
-impl Doors {
+impl Listeners {
     /// Listens on the configured addresses, if that is safe.
     ///
     /// # Errors
@@ -63,7 +63,7 @@ impl Doors {
             }
             None => None,
         };
-        Ok(Doors { listener, metrics, protection })
+        Ok(Listeners { listener, metrics, protection })
     }
 
     /// The server's URL.
