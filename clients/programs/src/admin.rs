@@ -5,7 +5,8 @@ use palpate_proto::pb;
 use pb::admin_service_client::AdminServiceClient;
 use pb::session_service_client::SessionServiceClient;
 
-use crate::{Failure, credentials};
+use crate::Failure;
+use crate::credentials::CredentialOptions;
 
 /// Arguments of `admin`.
 #[derive(clap::Args)]
@@ -16,7 +17,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7117", global = true)]
     server: String,
     #[command(flatten)]
-    credentials: credentials::Arguments,
+    credentials: CredentialOptions,
 }
 
 #[derive(clap::Subcommand)]

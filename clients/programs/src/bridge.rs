@@ -8,10 +8,11 @@ use palpate_proto::refusal::Refusal;
 use palpate_touch::{LimitCause, RenderingState, Tip};
 use serde_json::json;
 
+use crate::credentials::CredentialOptions;
 use crate::simulated::random::Random;
 use crate::simulated::task::{LEAD_S, Task};
 use crate::simulated::{Simulated, device_named, hand_named};
-use crate::{Failure, credentials, interrupted, warn};
+use crate::{Failure, interrupted, warn};
 
 /// Arguments of `bridge`.
 #[derive(clap::Args)]
@@ -47,7 +48,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "FILE")]
     course: Option<std::path::PathBuf>,
     #[command(flatten)]
-    credentials: credentials::Arguments,
+    credentials: CredentialOptions,
 }
 
 /// Scale of the depths of the simulated hand's presses.

@@ -9,7 +9,7 @@ use crate::Failure;
 /// The caller's credentials, and which servers are trusted.
 #[derive(clap::Args, Debug, Clone, Default)]
 #[command(next_help_heading = "Credentials (a server on this machine usually needs none)")]
-pub(crate) struct Arguments {
+pub(crate) struct CredentialOptions {
     /// File with your token [or set the environment variable PALPATE_TOKEN to the token itself]
     #[arg(long, value_name = "FILE")]
     token_file: Option<PathBuf>,
@@ -27,7 +27,7 @@ pub(crate) struct Arguments {
     key: Option<PathBuf>,
 }
 
-impl Arguments {
+impl CredentialOptions {
     /// The server at `url`, with these credentials.
     ///
     /// # Errors

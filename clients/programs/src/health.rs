@@ -7,7 +7,8 @@ use tonic_health::ServingStatus;
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_client::HealthClient;
 
-use crate::{Failure, credentials};
+use crate::Failure;
+use crate::credentials::CredentialOptions;
 
 /// Arguments of `health`.
 #[derive(clap::Args)]
@@ -16,7 +17,7 @@ pub(crate) struct Arguments {
     #[arg(value_name = "URL", default_value = "http://127.0.0.1:7117")]
     server: String,
     #[command(flatten)]
-    credentials: credentials::Arguments,
+    credentials: CredentialOptions,
 }
 
 /// A healthy server answers sooner.

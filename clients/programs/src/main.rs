@@ -160,3 +160,13 @@ async fn main() -> ExitCode {
     crate::say!("palpate-client: {message}");
     ExitCode::from(status)
 }
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    #[test]
+    fn the_arguments_of_all_subcommands_are_sound() {
+        super::Arguments::command().debug_assert();
+    }
+}

@@ -26,8 +26,9 @@ use tokio::task::JoinHandle;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::Status;
 
+use crate::credentials::CredentialOptions;
 use crate::scene_file::source;
-use crate::{Failure, credentials, plot};
+use crate::{Failure, plot};
 use measured::{Measured, percentiles_us};
 
 /// How far ahead of the server's step commands are sent, s: a network may stall for about as long before the session has to
@@ -68,7 +69,7 @@ pub(crate) struct Arguments {
     #[command(flatten)]
     sampling: Sampling,
     #[command(flatten)]
-    credentials: credentials::Arguments,
+    credentials: CredentialOptions,
 }
 
 /// The samples that the server is to send. The records do not depend on them.

@@ -11,7 +11,8 @@ use palpate_proto::pb::{Audit, AuditedError, ListSessionsRequest, Session, Sessi
 use serde_json::{Value, json};
 use tonic::Code;
 
-use crate::{Failure, credentials};
+use crate::Failure;
+use crate::credentials::CredentialOptions;
 
 /// Arguments of `top`.
 #[derive(clap::Args)]
@@ -26,7 +27,7 @@ pub(crate) struct Arguments {
     #[arg(long)]
     json: bool,
     #[command(flatten)]
-    credentials: credentials::Arguments,
+    credentials: CredentialOptions,
 }
 
 /// Time between two queries.

@@ -21,8 +21,9 @@ use palpate_proto::refusal::{Reason, Refusal, number};
 use palpate_touch::Tip;
 use serde_json::{Value, json};
 
+use crate::Failure;
+use crate::credentials::CredentialOptions;
 use crate::simulated::{device_named, hand_named};
-use crate::{Failure, credentials};
 use network::Conditions;
 use run::{Outcome, Rendering, Setup, run};
 
@@ -81,7 +82,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "URL", conflicts_with_all = ["rtt_ms", "jitter_ms", "loss", "stall_ms", "profile", "random", "boundary"])]
     server: Option<String>,
     #[command(flatten)]
-    credentials: credentials::Arguments,
+    credentials: CredentialOptions,
     /// Run this many random combinations of scene, hand, device, network and task, with seeds from --seed on; report the
     /// worst value of each figure
     #[arg(long, value_name = "RUNS", conflicts_with_all = ["course", "boundary"])]

@@ -14,8 +14,9 @@ use palpate_client::Server;
 use palpate_proto::pb::create_session_request::Source;
 use tokio::sync::watch;
 
+use crate::Failure;
+use crate::credentials::CredentialOptions;
 use crate::scene_file::source;
-use crate::{Failure, credentials};
 use client::{Common, Stage, lock};
 use objective::Objective;
 use swarm::{Orders, Stopped, Swarm};
@@ -67,7 +68,7 @@ pub(crate) struct Arguments {
     #[arg(short, long)]
     quiet: bool,
     #[command(flatten)]
-    credentials: credentials::Arguments,
+    credentials: CredentialOptions,
 }
 
 fn seconds(text: &str) -> Result<f64, String> {
