@@ -399,11 +399,15 @@ fn signals_that_mean_nothing_to_a_server_do_not_end_it_and_a_hangup_has_it_look(
     let file = folder.path().join("tokens.toml");
     token(&file, "known", "watch");
     let (mut server, log) = start_logged(&["--tokens", file.to_str().unwrap()]);
-    for signal in ["-USR1", "-USR2", "-XFSZ", "-HUP"] {
-        let id = server.child.id().to_string();
-        assert!(Command::new("kill").args([signal, &id]).status().unwrap().success());
+    let id = server.child.id().to_string();
+    let send = |signal: &str| assert!(Command::new("kill").args([signal, &id]).status().unwrap().success());
+    ["-USR1", "-USR2", "-XFSZ"].into_iter().for_each(send);
+    // A hangup just after the start comes before anything waits for it: the files have only just been read.
+    let begun = std::time::Instant::now();
+    while !log.tells("SIGHUP: checking the files", std::time::Duration::from_secs(1)) {
+        assert!(begun.elapsed() < PATIENCE, "a hangup is not heard");
+        send("-HUP");
     }
-    log.wait_for("SIGHUP: checking the files");
     assert_eq!(server.child.try_wait().unwrap(), None);
 }
 
@@ -432,6 +436,11 @@ async fn a_certificate_near_its_end_is_warned_of() {
 struct Log(mpsc::Receiver<String>);
 
 impl Log {
+    /// Whether it has such a line before none comes for `silence`.
+    fn tells(&self, text: &str, silence: std::time::Duration) -> bool {
+        std::iter::from_fn(|| self.0.recv_timeout(silence).ok()).any(|line| line.contains(text))
+    }
+
     fn wait_for(&self, text: &str) {
         while !self.0.recv_timeout(PATIENCE).unwrap_or_else(|_| panic!("the log lacks `{text}`")).contains(text) {}
     }

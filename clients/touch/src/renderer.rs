@@ -112,7 +112,10 @@ impl Renderer {
             self.refused += 1;
             return;
         }
-        (self.arrived, self.arrived_s) = (Some(model), Some(now_s));
+        // By number, so that a law that is forgotten changes nothing.
+        let is_known = self.laws.iter().any(|known| known.0 == model.law);
+        let law = if is_known { model.law } else { self.laws[0].0 };
+        (self.arrived, self.arrived_s) = (Some(LocalModel { law, ..model }), Some(now_s));
     }
 
     /// Switches to a model that has arrived: repeats the tool's path since, and keeps the difference from the last
