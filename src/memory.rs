@@ -1,8 +1,8 @@
 //! Memory that the system may refuse.
 //!
 //! An allocation that fails ends the process. What grows with a request or a session is therefore laid out here, where a
-//! failure is a [`Refusal`]. Code that returns a `Result` calls [`check`]. Code deep in a computation calls [`zeroed`],
-//! [`filled`], [`with_room`], [`collected`] or [`require`]: these unwind with the refusal, as a fault of the program would, and
+//! failure is a [`Refusal`]. Code that returns a `Result` calls `check`. Code deep in a computation calls `zeroed`,
+//! `filled`, `with_room`, `collected` or `require`: these unwind with the refusal, as a fault of the program would, and
 //! [`attempt`] returns it where the call or session is known.
 //!
 //! Allocations below [`LARGE_BYTES`] and those inside libraries can't be refused. So each large one has to leave

@@ -21,7 +21,7 @@ pub struct Batch {
 }
 
 impl Intake {
-    /// Accepts all of some commands that were looked at before ([`Rules::check`]), or none. They are taken in by
+    /// Accepts all of some commands that were looked at before (`Rules::check`), or none. They are taken in by
     /// [`Intake::go_on`], and act together: none before the last is in the queue. So others have their turns between
     /// slices.
     ///

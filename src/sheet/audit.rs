@@ -159,7 +159,7 @@ impl Model {
         Arc::new(model)
     }
 
-    /// Steps in a window: until the slowest vibration has lost half its amplitude, at most [`LONGEST_S`] s.
+    /// Steps in a window: until the slowest vibration has lost half its amplitude, at most `LONGEST_S` s.
     ///
     /// The amplitude of m·ü + C·u̇ + K·u = 0 falls as e^(−γt), with γ = C/2m, or in the overdamped case
     /// γ = (C − √(C² − 4mK))/2m for the slower part. K is that of the virtual springs alone: the slowest vibration of a

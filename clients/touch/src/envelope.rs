@@ -3,7 +3,7 @@
 //! 1. the age of the model, counted from when the newest *arrived* (a constant delay is not staleness), or the time
 //!    since the last tick if that is longer: up to [`FRESH_S`] no change; up to [`STALE_S`] the force fades to a half;
 //!    beyond, it decays with [`DECAY_S`]; from [`PAUSE_S`] on the state is PAUSED. A model that arrives before brings
-//!    the force back within [`RETURN_S`];
+//!    the force back within `RETURN_S`;
 //! 2. soft engage: after `enable` nothing is rendered until the wanted force is below [`ENGAGE_BELOW_N`]; then the
 //!    force ramps in over [`ENGAGE_S`];
 //! 3. the norm of the force (clamping its components would turn it), and the device's continuous force;
@@ -13,8 +13,8 @@
 //! **Passivity.** The port's energy is exact for a held force: E −= f·Δx at each tick. A force f that moves with the
 //! hand at v, and that slew lets fall no faster than S, still gives f²·v/2S before it is zero. So it is limited to
 //! f ≤ √(2·S·E/v): a spring of K, pressed in and released at v, is not limited as long as its force falls no faster than
-//! the slew allows, K·v ≤ S. A hand at rest may start at any moment, so v counts as at least [`LEAST_SPEED_M_PER_S`].
-//! To allow a first force before any energy has entered, the tank begins with [`CREDIT_J`], and [`FIRST_N`] against a
+//! the slew allows, K·v ≤ S. A hand at rest may start at any moment, so v counts as at least `LEAST_SPEED_M_PER_S`.
+//! To allow a first force before any energy has entered, the tank begins with `CREDIT_J`, and `FIRST_N` against a
 //! hand that presses on is always allowed.
 
 use glam::DVec3;
