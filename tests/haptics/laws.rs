@@ -15,6 +15,18 @@ use palpate_touch::law::{Law, Row};
 use palpate_touch::{Device, Standing, Touching};
 use pb::touch_response::Message as Heard;
 
+/// The number of the law that a sample's local model names, if it has a model. Server and client mean the same: under a
+/// touch the law passes through the sample.
+fn law_of(sample: &pb::Sample, laws: &[Law]) -> Option<usize> {
+    let model = touch::from_local_model(sample.tools.first()?.local_model.as_ref()?, sample.step);
+    let law = laws.get(model.law as usize).expect("the law comes before the model that names it");
+    if model.standing != Standing::Free {
+        let repeated_n = Touching::at_sample(&model, law).force_n(&model, law, model.velocity_m_per_s);
+        assert!((repeated_n - model.force_n).length() < 1e-6, "{repeated_n} beside {}", model.force_n);
+    }
+    Some(model.law as usize)
+}
+
 fn tissue(name: &str, sets: &[&str]) -> Arc<Model> {
     let text = BUILT_IN.iter().find(|scene| scene.0 == name).unwrap().1;
     model(&scene_with(text, sets))
@@ -146,17 +158,10 @@ async fn a_coarse_law_is_changed_for_the_exact_one_by_a_model_that_names_it() {
                     laws.push(touch::from_law(&law).unwrap());
                 }
                 Heard::Sample(sample) => {
-                    let Some(model) = sample.tools.first().and_then(|tool| tool.local_model.as_ref()) else { continue };
-                    let model = touch::from_local_model(model, sample.step);
-                    let law = laws.get(model.law as usize).expect("the law comes before the model that names it");
-                    // Server and client mean the same: under a touch the law passes through the sample.
-                    if model.standing != Standing::Free {
-                        let repeated_n = Touching::at_sample(&model, law).force_n(&model, law, model.velocity_m_per_s);
-                        assert!((repeated_n - model.force_n).length() < 1e-6, "{repeated_n} beside {}", model.force_n);
-                    }
+                    let Some(law) = law_of(&sample, &laws) else { continue };
                     let is_told = laws.len() == 2;
-                    assert!(model.law == 0 || is_told);
-                    named[model.law as usize] += 1;
+                    assert!(law == 0 || is_told);
+                    named[law] += 1;
                 }
                 _ => {}
             }
@@ -225,14 +230,8 @@ async fn another_tissue_brings_its_law_which_models_then_name() {
                     laws.push(touch::from_law(&law).unwrap());
                 }
                 Heard::Sample(sample) => {
-                    let Some(model) = sample.tools.first().and_then(|tool| tool.local_model.as_ref()) else { continue };
-                    let model = touch::from_local_model(model, sample.step);
-                    let law = laws.get(model.law as usize).expect("the law comes before the model that names it");
-                    if model.standing != Standing::Free {
-                        let repeated_n = Touching::at_sample(&model, law).force_n(&model, law, model.velocity_m_per_s);
-                        assert!((repeated_n - model.force_n).length() < 1e-6, "{repeated_n} beside {}", model.force_n);
-                    }
-                    named[model.law as usize] += 1;
+                    let Some(law) = law_of(&sample, &laws) else { continue };
+                    named[law] += 1;
                 }
                 _ => {}
             }

@@ -4,7 +4,6 @@ use std::time::Duration;
 
 use glam::DVec3;
 use palpate_client::bridge::{Options, Session, Target, Tick, run};
-use palpate_proto::refusal::Refusal;
 use palpate_touch::{LimitCause, RenderingState, Tip};
 use serde_json::json;
 
@@ -59,9 +58,7 @@ const SCALE: f64 = 0.2;
 /// # Errors
 /// Returns an error if an argument is refused, no connection succeeds, or the course can't be written.
 pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
-    let refused = |refusal: Refusal| Failure::Refused(refusal.to_string());
-    let (hand, device) =
-        (hand_named(&arguments.hand).map_err(refused)?, device_named(&arguments.device).map_err(refused)?);
+    let (hand, device) = (hand_named(&arguments.hand)?, device_named(&arguments.device)?);
     let seconds = arguments.seconds.unwrap_or(3600.0);
     let task = Task::new(DVec3::ZERO, LEAD_S, seconds, SCALE, &mut Random::new(arguments.seed, 0));
     let target = Target {

@@ -16,7 +16,7 @@ use palpate::wire;
 use palpate_client::{Channel, Error, Touch, describe};
 use palpate_proto::geometry::point;
 use palpate_proto::pb;
-use palpate_proto::refusal::{Reason, Refusal};
+use palpate_proto::refusal::Reason;
 use pb::haptic_service_client::HapticServiceClient;
 use pb::session_service_client::SessionServiceClient;
 use pb::touch_request::Message as Say;
@@ -159,10 +159,6 @@ pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
     ended
 }
 
-fn refused(refusal: Refusal) -> Failure {
-    Failure::Refused(refusal.to_string())
-}
-
 fn failed(status: Status) -> Failure {
     Failure::Failed(format!("the server ended the replay: {}", describe(&status)))
 }
@@ -255,9 +251,9 @@ async fn play(
 ) -> Result<(), Failure> {
     let session_id = &created.session_id;
     let scene = created.scene.as_ref().ok_or_else(|| Failure::Failed("the server sent no scene".into()))?;
-    let scene = wire::scene::from_scene(scene).map_err(refused)?;
+    let scene = wire::scene::from_scene(scene)?;
     let limits = Limits::default();
-    let script = Script::load(&arguments.script, &scene, &limits).map_err(refused)?;
+    let script = Script::load(&arguments.script, &scene, &limits)?;
     for warning in created.warnings.iter().chain(&script.warnings) {
         crate::say!("palpate-client: warning: {warning}");
     }

@@ -17,7 +17,6 @@ pub(crate) fn source(scene: &str) -> Result<Source, Failure> {
     if Path::new(scene).extension().is_none_or(|extension| extension != "toml") {
         return Ok(Source::SceneName(scene.to_owned()));
     }
-    let scene = Scene::load(Path::new(scene), &[], &Limits::default());
-    let scene = scene.map_err(|refusal| Failure::Refused(refusal.to_string()))?;
+    let scene = Scene::load(Path::new(scene), &[], &Limits::default())?;
     Ok(Source::Scene(wire::scene::scene(&scene)))
 }

@@ -131,7 +131,7 @@ pub(crate) async fn link(arguments: &Arguments) -> Result<(), Failure> {
     if let Some(runs) = arguments.random {
         return random::print(arguments, runs);
     }
-    let setup = memory::attempt("--scene", || setup(arguments)).map_err(refused)?;
+    let setup = memory::attempt("--scene", || setup(arguments))?;
     let outcome = match &arguments.server {
         Some(server) => live::run(&setup, arguments.credentials.server(server)?).await?,
         None => with_tissue(|| run(&setup))?,
@@ -154,16 +154,12 @@ pub(crate) async fn link(arguments: &Arguments) -> Result<(), Failure> {
     Ok(())
 }
 
-fn refused(refusal: Refusal) -> Failure {
-    Failure::Refused(refusal.to_string())
-}
-
 /// Does something with a tissue.
 ///
 /// # Errors
 /// Returns an error if the system has no memory for the tissue (exit status 2), or if the guard stops it (1).
 fn with_tissue<T>(work: impl FnOnce() -> Result<T, String>) -> Result<T, Failure> {
-    memory::attempt("--scene", || Ok(work())).map_err(refused)?.map_err(Failure::Failed)
+    memory::attempt("--scene", || Ok(work()))?.map_err(Failure::Failed)
 }
 
 /// Loads a scene file, a scene in ./scenes, or a built-in scene.

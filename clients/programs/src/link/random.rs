@@ -7,7 +7,6 @@ use palpate::force_law;
 use palpate::limits::Limits;
 use palpate::scene::{BUILT_IN, Scene};
 use palpate::sheet::Model;
-use palpate_proto::refusal::Refusal;
 use palpate_touch::Tip;
 use palpate_touch::device::DEVICES;
 use palpate_touch::hand::HANDS;
@@ -39,13 +38,12 @@ struct Worst {
 
 /// Performs the runs on all processors and prints the worst value of each figure.
 pub(super) fn print(arguments: &Arguments, runs: u64) -> Result<(), Failure> {
-    let refused = |refusal: Refusal| Failure::Refused(refusal.to_string());
     let limits = Limits::default();
     let tip = Tip::default();
     let mut tissues = BTreeMap::new();
     for (name, text) in BUILT_IN.iter().filter(|scene| TISSUES.contains(&scene.0)) {
-        let scene = Scene::parse(name, text, &[], &limits).map_err(refused)?;
-        let model = Model::compile(&scene, &limits).map_err(refused)?;
+        let scene = Scene::parse(name, text, &[], &limits)?;
+        let model = Model::compile(&scene, &limits)?;
         let law = Arc::new(force_law::exact(&model, tip.radius_m));
         tissues.insert(*name, (model, law));
     }
