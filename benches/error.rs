@@ -80,8 +80,8 @@ impl Run {
         for _ in 0..self.script.steps {
             session.advance(&mut due, |session| {
                 if session.step_count().is_multiple_of(self.script.sample_every) {
-                    for place in &self.script.sample_points {
-                        let point = session.tissue().point(self.model.index_of(*place));
+                    for point in &self.script.sample_points {
+                        let point = session.tissue().point(*point);
                         trace.displacements_m.push(point.displacement_m);
                         trace.forces_n.push(point.reaction_n());
                     }

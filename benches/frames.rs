@@ -12,10 +12,11 @@ use std::hint::black_box;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use glam::{DVec2, DVec3};
+use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::pace::frames::Delivery;
 use palpate::scene::law::Poke;
+use palpate::scene::{PAPER, Scene};
 use palpate::sheet::{Push, at_rest};
 use palpate::surface::{Encoding, Frame, FrameTiles, Refinement, Snapshot, encode, encode_over};
 use report::chart::Panel;
@@ -76,11 +77,13 @@ fn copy(frame: &Frame, mut to: &mut [u8]) {
 
 fn measure(side: usize, refinement: u32, encoding: Encoding) -> Case {
     let limits = Limits { frame_vertices: usize::MAX, ..Limits::default() };
-    let grid = Refinement::new([side, side], refinement, &limits).unwrap();
-    let vertices = grid.vertices().iter().product::<usize>();
+    let sets = [format!("sheet.points=[{side}, {side}]")];
+    let scene = Scene::parse("frames", PAPER, &sets, &limits).unwrap();
+    let grid = Refinement::new(&scene, refinement, &limits).unwrap();
+    let vertices = grid.vertex_count();
     let bytes = vertices * encoding.bytes_per_vertex();
     let displacement_m = waving(side);
-    let snapshot = Snapshot::new(1, 0.001, [side; 2], displacement_m.clone());
+    let snapshot = Snapshot::new(&scene, 1, 0.001, displacement_m.clone());
     let mut frame = encode(&snapshot, grid, encoding);
     let mut copied = vec![1_u8; bytes];
     let mut least_s = [f64::INFINITY; 3];
@@ -91,7 +94,7 @@ fn measure(side: usize, refinement: u32, encoding: Encoding) -> Case {
         frame = next;
         let (copy_s, ()) = seconds(|| copy(black_box(&frame), black_box(&mut copied)));
         let just_written = displacement_m.clone();
-        let (box_s, _) = seconds(|| black_box(Snapshot::new(1, 0.001, [side; 2], black_box(just_written))));
+        let (box_s, _) = seconds(|| black_box(Snapshot::new(&scene, 1, 0.001, black_box(just_written))));
         for (least, now_s) in least_s.iter_mut().zip([frame_s, copy_s, box_s]) {
             *least = least.min(now_s);
         }
@@ -153,14 +156,14 @@ struct Sent {
 fn poke(force_n: DVec3, refinement: u32, report: &mut Report, rows: &mut Vec<Vec<String>>) {
     let side = 331;
     let model = subject::model(&[subject::set("sheet.points", format!("[{side}, {side}]"))]).unwrap();
-    let (mut tissue, spacing_m) = (at_rest(&model), model.scene.sheet.spacing_m);
-    let centre_m = DVec2::splat((side / 2) as f64 * spacing_m);
+    let mut tissue = at_rest(&model);
+    let centre_m = model.shape().extent().middle_m();
     let push = Poke { centre_m, force_n, falloff_per_m: 150.0, falloff_offset: 0.0 };
     tissue.push(0, Some(Push::Held(push)));
     let limits = Limits { frame_vertices: usize::MAX, ..Limits::default() };
-    let grid = Refinement::new([side; 2], refinement, &limits).unwrap();
+    let grid = Refinement::new(&model.scene, refinement, &limits).unwrap();
     let [_, columns] = grid.vertices();
-    let full_bytes = grid.vertices().iter().product::<usize>() * Encoding::I16.bytes_per_vertex();
+    let full_bytes = grid.vertex_count() * Encoding::I16.bytes_per_vertex();
     let (mut tiles, mut seen, mut shown) = (None::<FrameTiles>, None, vec![[0.0; 3]; full_bytes / 6]);
     let mut sent: Vec<Sent> = Vec::new();
     let mut frames = 0;
@@ -177,8 +180,8 @@ fn poke(force_n: DVec3, refinement: u32, report: &mut Report, rows: &mut Vec<Vec
             frames += 1;
             let mut displacement_m = [(); 3].map(|()| Vec::new());
             tissue.displacements_m(&mut displacement_m);
-            let snapshot = Arc::new(Snapshot::new(step, step as f64 * 1e-3, [side; 2], displacement_m));
-            let tiles = tiles.get_or_insert_with(|| FrameTiles::new(&snapshot, grid, Encoding::I16, spacing_m));
+            let snapshot = Arc::new(Snapshot::new(&model.scene, step, step as f64 * 1e-3, displacement_m));
+            let tiles = tiles.get_or_insert_with(|| FrameTiles::new(&snapshot, grid, Encoding::I16));
             tiles.update(&snapshot);
             if tiles.is_newer_than(seen) {
                 let frame = tiles.newer_than(seen);

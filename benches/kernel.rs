@@ -18,7 +18,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::Command;
 
-use glam::{DVec2, DVec3};
+use glam::DVec3;
 use palpate::scene::law::Poke;
 use palpate::sheet::{Push, Tissue, at_rest};
 use report::chart::{Look, Panel, Series};
@@ -59,7 +59,7 @@ fn tissue(settings: &[String], side: usize) -> Box<dyn Tissue> {
     let pushes = [(1.0, 0.5 / spacing_m), (0.01, 4.0 / (spacing_m * side as f64))];
     for (tool, (strength, falloff_per_m)) in pushes.into_iter().enumerate() {
         let push = Poke {
-            centre_m: DVec2::splat((side / 2) as f64 * spacing_m),
+            centre_m: model.shape().rest_m(model.scene.sheet.point([side / 2; 2])),
             force_n: strength * DVec3::new(0.03, 0.0, -0.1),
             falloff_per_m,
             falloff_offset: 0.0,

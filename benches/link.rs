@@ -183,7 +183,8 @@ fn stiffness(report: &mut Report) {
             scene.damping_n_s_per_m *= share;
             let model = Model::compile(&scene, &Limits::default()).unwrap();
             let places = [0.0, 0.25, 0.5].map(|part| {
-                let centre_m = scene.sheet.extent_m() / 2.0 + glam::DVec2::splat(part * spacing_m);
+                let centre_m =
+                    scene.shape().extent().middle_m() + glam::DVec3::new(part * spacing_m, part * spacing_m, 0.0);
                 let pressed = tangent::press(&model, 0.005, centre_m, 0.0005, 3);
                 [1, 2].map(|row: usize| pressed[row].force_n / pressed[row].depth_m)
             });

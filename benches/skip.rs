@@ -7,7 +7,7 @@
 mod report;
 mod subject;
 
-use glam::{DVec2, DVec3};
+use glam::DVec3;
 use palpate::scene::law::{CentreProfile, LoadProfile, Profile, StrengthProfile};
 use palpate::sheet::{Push, at_rest};
 use report::chart::{Look, Panel, Series};
@@ -27,8 +27,13 @@ struct Kind {
     pushes: fn(length_m: f64) -> Vec<LoadProfile>,
 }
 
+/// The place at a part of the diagonal.
+fn at(length_m: f64, part: f64) -> DVec3 {
+    DVec3::new(length_m * part, length_m * part, 0.0)
+}
+
 /// The paper's poke: 3 N, 150 /m, released after a second.
-fn poke(centre_m: DVec2, force_n: DVec3) -> LoadProfile {
+fn poke(centre_m: DVec3, force_n: DVec3) -> LoadProfile {
     LoadProfile {
         centre: CentreProfile::Hops(vec![(0, centre_m)]),
         strength: StrengthProfile::Scaled(force_n, Profile::Pulse { on: 0, off: 1000 }),
@@ -41,7 +46,7 @@ const KINDS: [Kind; 4] = [
     Kind {
         name: "local",
         about: "3 N straight down at the centre for 1 s, then let go",
-        pushes: |length_m| vec![poke(DVec2::splat(length_m / 2.0), DVec3::new(0.0, 0.0, -3.0))],
+        pushes: |length_m| vec![poke(at(length_m, 0.5), DVec3::new(0.0, 0.0, -3.0))],
     },
     Kind {
         name: "stroke",
@@ -49,8 +54,8 @@ const KINDS: [Kind; 4] = [
         pushes: |length_m| {
             vec![LoadProfile {
                 centre: CentreProfile::Path {
-                    from_m: DVec2::new(length_m / 2.0, length_m / 2.0 - 0.2),
-                    velocity_m_per_s: DVec2::new(0.0, 0.2),
+                    from_m: DVec3::new(length_m / 2.0, length_m / 2.0 - 0.2, 0.0),
+                    velocity_m_per_s: DVec3::new(0.0, 0.2, 0.0),
                 },
                 strength: StrengthProfile::Scaled(DVec3::new(0.2, 0.3, -1.0), Profile::Constant),
                 falloff_per_m: 60.0,
@@ -62,8 +67,10 @@ const KINDS: [Kind; 4] = [
         name: "two tools",
         about: "3 N at a third and at two thirds of the diagonal for 1 s, at a slant and straight down",
         pushes: |length_m| {
-            let at = |part: f64| DVec2::splat(length_m * part);
-            vec![poke(at(1.0 / 3.0), DVec3::new(0.0, 0.0, -3.0)), poke(at(2.0 / 3.0), DVec3::new(1.0, 1.0, -2.6))]
+            vec![
+                poke(at(length_m, 1.0 / 3.0), DVec3::new(0.0, 0.0, -3.0)),
+                poke(at(length_m, 2.0 / 3.0), DVec3::new(1.0, 1.0, -2.6)),
+            ]
         },
     },
     Kind {
@@ -71,7 +78,7 @@ const KINDS: [Kind; 4] = [
         about: "a force on all points that swings at 3 Hz, all the time",
         pushes: |length_m| {
             vec![LoadProfile {
-                centre: CentreProfile::Hops(vec![(0, DVec2::splat(length_m / 2.0))]),
+                centre: CentreProfile::Hops(vec![(0, at(length_m, 0.5))]),
                 strength: StrengthProfile::Scaled(DVec3::new(0.01, 0.0, -0.05), Profile::Sine { frequency_hz: 3.0 }),
                 falloff_per_m: 1.0 / length_m,
                 falloff_offset: 0.0,
@@ -89,7 +96,7 @@ struct Run {
 
 fn run(settings: &[String], kind: &Kind, rounds: usize) -> Run {
     let model = subject::model(settings).unwrap();
-    let length_m = model.scene.sheet.longer_side_m();
+    let length_m = model.shape().longest_side_m();
     let (mut least_s, mut fields, mut computed) = (f64::INFINITY, Vec::new(), 0.0);
     for _ in 0..rounds {
         let mut tissue = at_rest(&model);

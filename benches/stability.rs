@@ -76,7 +76,7 @@ impl Tissue {
         let sheet = &model.scene.sheet;
         let small_m = 1e-9 * sheet.spacing_m;
         let push = Poke {
-            centre_m: sheet.rest_m([3, 4]),
+            centre_m: model.shape().rest_m(sheet.point([3, 4])),
             force_n: sheet.point_mass_kg * small_m / (step_s * step_s) * DVec3::new(1.0, 0.6, 0.3),
             falloff_per_m: 0.7 / sheet.spacing_m,
             falloff_offset: 0.0,
@@ -122,7 +122,7 @@ impl Tissue {
         let sheet = &model.scene.sheet;
         let mut session = Session::new(&model);
         let law = LoadProfile {
-            centre: CentreProfile::Hops(vec![(0, DVec2::splat(4.0 * sheet.spacing_m))]),
+            centre: CentreProfile::Hops(vec![(0, model.shape().rest_m(sheet.point([4, 4])))]),
             strength: StrengthProfile::Scaled(force_n * DVec3::new(0.6, 0.0, -0.8), Profile::Constant),
             falloff_per_m: 1.0 / sheet.spacing_m,
             falloff_offset: 0.0,
@@ -161,7 +161,7 @@ fn largest_s(about_s: f64, holds: impl Fn(f64) -> bool) -> Option<f64> {
 /// stiffness by the power method. At rest a spring resists only along itself, so everything is in the plane.
 fn fastest_per_s(model: &Model) -> f64 {
     let scene = &model.scene;
-    let [nx, ny] = model.points;
+    let [nx, ny] = scene.sheet.points;
     let (k, shear) = (scene.springs.stiffness_n_per_m, scene.springs.shear_stiffness_n_per_m);
     let springs = [((0, 1), k), ((1, 0), k), ((1, 1), shear), ((1, -1), shear)];
     let stiffness_of = |u: &[DVec2]| {

@@ -45,7 +45,7 @@ fn write(name: &str, bytes: &[u8]) {
 fn figure(number: u32, n: u32, mesh: bool, script_name: &str, at_step: u64) {
     let (model, limits) = (model(&[TEXTURE.to_owned()]), Limits::default());
     let script = script(script_name, &model);
-    let refinement = Refinement::new(model.points, n, &limits).unwrap();
+    let refinement = Refinement::new(&model.scene, n, &limits).unwrap();
     let skin = (!mesh).then(|| texture::image(&model.scene.appearance, &limits).unwrap());
     let view = View { camera: Camera::default(), size: SIZE, refinement, texture: skin };
     let still = Film::new(&model, &script, &limits).unwrap().at(at_step).unwrap();
@@ -58,7 +58,7 @@ fn depth(sets: &[String]) -> Vec<(f64, f64)> {
     let script = script("vertical-60", &model);
     let mut session = Session::new(&model);
     run::play(&mut session, &script);
-    let centre = model.index_of([15, 15]);
+    let centre = model.scene.sheet.point([15, 15]);
     let mut course = Vec::new();
     for _ in 0..script.steps {
         session.advance(&mut Vec::new(), |session| {

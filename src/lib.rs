@@ -17,6 +17,7 @@ pub mod render;
 pub mod scene;
 pub mod server;
 pub mod session;
+pub mod shape;
 pub mod sheet;
 pub mod surface;
 pub mod texture;

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// Each module of `palpate` may use those before it.
-const MODULES: [&str; 17] = [
+const MODULES: [&str; 18] = [
     "refusal",
     "limits",
     "lock",
@@ -14,6 +14,7 @@ const MODULES: [&str; 17] = [
     "ids",
     "memory",
     "budget",
+    "shape",
     "scene",
     "texture",
     "sheet",
@@ -43,7 +44,7 @@ const CRATES: [(&str, &str, &[&str], &[&str]); 5] = [
 /// The modules of `palpate` that a module of the programs may use. `link` simulates the far end; the others read files.
 const FOR_PROGRAMS: [(&str, &[&str]); 3] = [
     ("link", &["force_law", "limits", "memory", "scene", "session", "sheet"]),
-    ("replay", &["limits", "scene", "wire"]),
+    ("replay", &["limits", "scene", "shape", "wire"]),
     ("scene_file", &["limits", "scene", "wire"]),
 ];
 
@@ -263,6 +264,25 @@ fn programs_use_the_library_and_not_each_other() {
         }
         for used in named(&text, "crate::") {
             assert!(used == own || !SUBCOMMANDS.contains(&used), "{} uses `{used}`", path.display());
+        }
+    }
+}
+
+/// Words of a grid of points.
+const GRID: [&str; 4] = ["scene.sheet", "scene::Sheet", "place_of(", "GridPoint"];
+
+#[test]
+fn above_the_sheet_a_tissue_is_its_rest_shape() {
+    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
+    for path in rust_files(&source) {
+        let inside = path.strip_prefix(&source).unwrap().to_str().unwrap();
+        let above = ["force_law", "session", "pace", "wire", "server", "render"].contains(&module(&source, &path));
+        // The sheet's own section as a message, and the name of its points.
+        let form = ["wire/scene.rs", "wire/mod.rs"].contains(&inside);
+        let text = std::fs::read_to_string(&path).unwrap();
+        let own = text.split("\nmod tests").next().unwrap();
+        for word in GRID {
+            assert!(!above || form || !own.contains(word), "{inside} has `{word}`: use the shape of the model");
         }
     }
 }

@@ -129,7 +129,13 @@ fn pushing(step: u64) -> Vec<(usize, Action)> {
 
 fn grasping(step: u64) -> Vec<(usize, Action)> {
     let z = 0.02 * (step as f64 / 250.0 * 9.0).sin();
-    vec![(1, Action::Grasp { point: [2, 2], displacement_m: DVec3::new(0.0, 0.5 * z, z) })]
+    vec![(
+        1,
+        Action::Grasp {
+            point: scene_with(SMALL, &[]).sheet.point([2, 2]),
+            displacement_m: DVec3::new(0.0, 0.5 * z, z),
+        },
+    )]
 }
 
 /// Runs a session with commands; `look` is called after each step.

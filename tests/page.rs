@@ -230,7 +230,7 @@ async fn a_script_of_the_server_is_the_commands_that_a_replay_sends() {
         assert!(is_over);
         let wanted: Vec<_> = (0..script.steps)
             .flat_map(|step| script.actions_at(step).map(move |(tool, action)| (tool, step, action)))
-            .map(|(tool, step, action)| wire::command::scripted(tool, step, &action, 0))
+            .map(|(tool, step, action)| wire::command::scripted(&*script.shape, tool, step, &action, 0))
             .collect();
         assert!(commands.len() > 1 && commands == wanted);
         assert!(commands.iter().all(|command| command.encoded_len() < 200));

@@ -7,7 +7,7 @@ mod common;
 use std::path::Path;
 
 use common::{SMALL, model, scene};
-use glam::{DVec2, DVec3};
+use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::scene::law::Poke;
 use palpate::scene::script::{Action, Script};
@@ -15,6 +15,7 @@ use palpate::scene::{PAPER, Scene};
 use palpate::session::Session;
 use palpate::session::command::Command;
 use palpate::session::intake::Intake;
+use palpate::shape::PointId;
 use proptest::prelude::*;
 
 const SCRIPT: &str = include_str!("../scripts/oblique-60.toml");
@@ -50,10 +51,15 @@ fn vector() -> impl Strategy<Value = DVec3> {
 
 fn action() -> impl Strategy<Value = Action> {
     let poke = (0.0..0.35_f64, 0.0..0.25_f64, vector(), number(), number()).prop_map(|(x, y, force_n, c, c1)| {
-        Action::Push(Poke { centre_m: DVec2::new(x, y), force_n, falloff_per_m: c.abs() * 50.0, falloff_offset: c1 })
+        Action::Push(Poke {
+            centre_m: DVec3::new(x, y, 0.0),
+            force_n,
+            falloff_per_m: c.abs() * 50.0,
+            falloff_offset: c1,
+        })
     });
     let grasp = (0..8_usize, 0..6_usize, vector())
-        .prop_map(|(i, j, by)| Action::Grasp { point: [i, j], displacement_m: by * 0.1 });
+        .prop_map(|(i, j, by)| Action::Grasp { point: PointId::new(5 * i + j), displacement_m: by * 0.1 });
     prop_oneof![4 => poke, 4 => grasp, 1 => Just(Action::Release)]
 }
 

@@ -53,7 +53,7 @@ fn play(model: &Arc<Model>, orders: &[Order], steps: u64) -> Course {
         assert_eq!(session.step_count(), step + 1, "time went back");
         hashes.push(session.tissue().state_hash());
     }
-    for index in 0..model.len() {
+    for index in model.points() {
         let point = session.tissue().point(index);
         assert!(point.displacement_m.is_finite() && point.velocity_m_per_s.is_finite(), "{point:?}");
     }
@@ -71,7 +71,7 @@ fn stiff() -> Arc<Model> {
 fn push(model: &Model, point: [usize; 2], z_n: f64) -> Action {
     let sheet = &model.scene.sheet;
     Action::Push(Poke {
-        centre_m: sheet.rest_m(point),
+        centre_m: model.shape().rest_m(sheet.point(point)),
         force_n: DVec3::new(0.0, 0.0, z_n),
         falloff_per_m: 1.0 / sheet.spacing_m,
         falloff_offset: 0.0,

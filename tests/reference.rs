@@ -92,7 +92,7 @@ fn errors(name: &str, assignments: &[&str]) -> Errors {
         }
         let frame = frames.next().unwrap();
         assert!((session.time_s() - number(&frame["t"])).abs() < 1e-9);
-        let at = |place: [usize; 2]| session.tissue().point(session.model().index_of(place));
+        let at = |place: [usize; 2]| session.tissue().point(session.model().scene.sheet.point(place));
         for (index, place) in samples.iter().enumerate() {
             let (u, v) = (vector(&frame["u"][index]), vector(&frame["v"][index]));
             error.displacement = error.displacement.max((at(*place).displacement_m - u).length());
@@ -197,7 +197,7 @@ fn lagged_explodes_where_its_damping_is_too_strong_and_the_guard_mends_it() {
     let mut session = playing(&scene, &script);
     for _ in 0..script.steps {
         session.advance(&mut Vec::new(), |session| {
-            for index in 0..session.model().len() {
+            for index in session.model().points() {
                 let point = session.tissue().point(index);
                 assert!(point.displacement_m.is_finite() && point.reaction_n().is_finite());
             }

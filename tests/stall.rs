@@ -15,7 +15,6 @@ use std::time::{Duration, Instant};
 use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::scene::Scene;
-use palpate::scene::script::Action;
 use palpate::wire;
 use palpate_proto::{pb, touch};
 use palpate_touch::{Device, Tip};
@@ -29,6 +28,12 @@ use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::Streaming;
 use tonic::transport::Channel;
+
+/// A pose of a tool, by the client's time.
+fn pose(tool: u32, sequence: u64, place_m: DVec3, client_time_ns: u64) -> pb::Command {
+    let action = Some(pb::command::Action::Pose(touch::pose(place_m, &Tip::default())));
+    pb::Command { tool, sequence, client_time_ns, action, ..Default::default() }
+}
 
 /// As long as either side stands still, s.
 const STALL: Duration = Duration::from_secs(5);
@@ -74,8 +79,7 @@ impl Led {
         let time_ns = 1 + self.begun.elapsed().as_nanos() as u64;
         let place_m = DVec3::new(0.04, 0.04, 0.02 + 1e-6 * (self.sequence % 100) as f64);
         for tool in 0..self.tools {
-            let action = Action::Lead { place_m, tip: Tip::default() };
-            let command = wire::command::now(tool, self.sequence, &action, time_ns);
+            let command = pose(tool, self.sequence, place_m, time_ns);
             let message = pb::TouchRequest { message: Some(Say::Command(command)) };
             self.outbound.try_send(message).expect("the stream has ended");
         }
@@ -230,8 +234,7 @@ async fn commands_before_a_stream_is_open_are_taken_in_or_refused() {
     say(Say::Open(pb::TouchOpen { device: Some(touch::device(&device)), ..open(&session, &[0]) }));
     const COMMANDS: u64 = 20_000;
     for sequence in 1..=COMMANDS {
-        let action = Action::Lead { place_m: DVec3::new(0.04, 0.04, 0.02), tip: Tip::default() };
-        say(Say::Command(wire::command::now(0, sequence, &action, 1000 * sequence)));
+        say(Say::Command(pose(0, sequence, DVec3::new(0.04, 0.04, 0.02), 1000 * sequence)));
     }
     let channel = server.channel().await;
     let mut inbound =

@@ -65,12 +65,12 @@ fn act(tissue: &mut dyn Tissue, Act { tool, place, towards, manner, .. }: Act) {
     let [nx, ny] = scene.sheet.points;
     let point = [(place[0] * nx as f64) as usize, (place[1] * ny as f64) as usize];
     let (spacing_m, towards) = (scene.sheet.spacing_m, DVec3::from_array(towards));
-    if scene.sheet.is_fixed(point) || manner == 0 {
+    if scene.shape().is_fixed(scene.sheet.point(point)) || manner == 0 {
         return tissue.release(tool);
     }
     if manner < 3 {
         // As far as through its neighbours and out: springs pressed to zero length and inverted.
-        let index = tissue.model().index_of(point);
+        let index = tissue.model().scene.sheet.point(point);
         return tissue.grasp(tool, index, Grasp::Held(2.5 * spacing_m * towards));
     }
     // A force that moves a point by up to some spacings.
@@ -78,7 +78,7 @@ fn act(tissue: &mut dyn Tissue, Act { tool, place, towards, manner, .. }: Act) {
     tissue.push(
         tool,
         Some(Push::Held(Poke {
-            centre_m: scene.sheet.rest_m(point),
+            centre_m: scene.shape().rest_m(scene.sheet.point(point)),
             force_n: 3.0 * stiffness * spacing_m * towards,
             falloff_per_m: 10_f64.powf(2.0 * place[0] - 1.0) / spacing_m,
             falloff_offset: 0.0,
@@ -87,7 +87,7 @@ fn act(tissue: &mut dyn Tissue, Act { tool, place, towards, manner, .. }: Act) {
 }
 
 fn all_finite(tissue: &dyn Tissue) -> bool {
-    (0..tissue.model().len()).all(|index| {
+    tissue.model().points().all(|index| {
         let point = tissue.point(index);
         let whole = point.displacement_m.is_finite() && point.velocity_m_per_s.is_finite();
         whole && point.reaction_n().is_finite() && point.constraint_n.is_none_or(DVec3::is_finite)
@@ -191,10 +191,10 @@ fn adversarial_commands_leave_the_tissue_finite() {
             let corner = [[0, 0], [6, 4], [0, 4], [6, 0]][(step % 4) as usize];
             let place = DVec3::new(sign, -sign, sign) * 0.3;
             match worst {
-                0 => tissue.grasp(0, model.index_of(corner), Grasp::Held(place)),
+                0 => tissue.grasp(0, model.scene.sheet.point(corner), Grasp::Held(place)),
                 1 => tissue.push(0, Some(common::push_on(&scene, corner, [1e4, 1e4 * sign, -1e4]))),
                 2 => tissue.push(0, Some(common::push_on(&scene, [3, 2], [50.0 * sign, 20.0, 100.0 * sign]))),
-                _ => tissue.grasp((step % 3) as usize, model.index_of([3, 2]), Grasp::Held(place)),
+                _ => tissue.grasp((step % 3) as usize, model.scene.sheet.point([3, 2]), Grasp::Held(place)),
             }
             if tissue.step().is_err() {
                 break;
@@ -216,7 +216,7 @@ fn a_sheet_that_wrinkles_stays_bounded() {
     for _ in 0..500 {
         tissue.step().unwrap();
     }
-    assert!(all_finite(&*tissue) && tissue.largest_displacement_m() < 10.0 * scene.sheet.longer_side_m());
+    assert!(all_finite(&*tissue) && tissue.largest_displacement_m() < 10.0 * scene.shape().longest_side_m());
 }
 
 #[test]
@@ -231,7 +231,7 @@ fn ten_million_steps_end_where_they_should() {
         for _ in 0..1_000_000 {
             tissue.step().unwrap();
         }
-        let now = tissue.point(tissue.model().index_of([3, 2])).displacement_m;
+        let now = tissue.point(tissue.model().scene.sheet.point([3, 2])).displacement_m;
         eprintln!("{} million steps: {now}", million + 1);
         assert!(all_finite(&*tissue));
         let settled = *settled.get_or_insert(now);

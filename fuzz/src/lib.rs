@@ -14,6 +14,7 @@ use std::sync::{Arc, OnceLock};
 
 use glam::DVec3;
 use palpate::limits::Limits;
+use palpate::scene::check::check_tip;
 use palpate::scene::record::{Record, write_line};
 use palpate::scene::script::Script;
 use palpate::scene::{PAPER, Scene};
@@ -25,7 +26,6 @@ use palpate::session::sampling::Sampler;
 use palpate::sheet::Model;
 use palpate::surface::Refinement;
 use palpate::wire;
-use palpate_proto::geometry::from_point;
 use palpate_proto::{pb, touch};
 use palpate_touch::{Device, Envelope, Law, Renderer};
 use prost::Message;
@@ -141,7 +141,10 @@ pub const REQUESTS: [(&str, Taker); 28] = [
             let every = wire::every("every_steps", request.every_steps).is_ok();
             match &request.r#where {
                 Some(pb::probe_request::Where::Points(points)) => points.points.iter().all(|point| {
-                    model().scene.sheet.index("points", from_point(point)).is_ok_and(|index| index < model().len())
+                    model()
+                        .shape()
+                        .find("points", wire::from_point(point))
+                        .is_ok_and(|point| point.index() < model().len())
                 }),
                 _ => every,
             }
@@ -149,11 +152,11 @@ pub const REQUESTS: [(&str, Taker); 28] = [
     }),
     ("GetMeshRequest", |bytes| {
         pb::GetMeshRequest::decode(bytes)
-            .is_ok_and(|request| Refinement::new(model().points, request.refinement, &limits()).is_ok())
+            .is_ok_and(|request| Refinement::new(&model().scene, request.refinement, &limits()).is_ok())
     }),
     ("WatchFramesRequest", |bytes| {
         pb::WatchFramesRequest::decode(bytes)
-            .is_ok_and(|request| Refinement::new(model().points, request.refinement, &limits()).is_ok())
+            .is_ok_and(|request| Refinement::new(&model().scene, request.refinement, &limits()).is_ok())
     }),
     ("UpdateTissueRequest", |bytes| {
         pb::UpdateTissueRequest::decode(bytes).is_ok_and(|request| {
@@ -189,7 +192,7 @@ pub fn request(bytes: &[u8]) -> bool {
 }
 
 fn open(open: &pb::TouchOpen) -> bool {
-    let sheet = &model().scene.sheet;
+    let shape = model().shape();
     let device = open.device.as_ref().map(touch::from_device);
     let tip = touch::from_tip(open.tip.as_ref());
     let only = (!open.tools.is_empty()).then(|| open.tools.clone());
@@ -197,7 +200,7 @@ fn open(open: &pb::TouchOpen) -> bool {
     let sampling = wire::sample::sampling(every, only, deadband, open.heartbeat_s, open.device.is_some());
     let mut intake = Intake::new(&model().scene, &limits());
     let held = intake.acquire(&open.tools, &open.holder, open.lease_s.unwrap_or(2.0), 1, 0).is_ok();
-    if sheet.check_tip("tip", &tip).is_ok() {
+    if check_tip("tip", shape, &tip).is_ok() {
         assert!(tip.radius_m.is_finite() && tip.friction.is_finite());
     }
     let taken = sampling.map(|sampling| Sampler::new(sampling, 1000.0).next_due(7));
@@ -210,7 +213,7 @@ fn command_all(messages: &[pb::Command]) -> bool {
     let mut intake = Intake::new(scene, &limits());
     intake.acquire(&[0, 1, 2], "fuzz", 60.0, 1, 0).expect("tools are free");
     let commands: Result<Vec<_>, _> =
-        messages.iter().map(|message| wire::command::from_command(message, &scene.sheet, 1)).collect();
+        messages.iter().map(|message| wire::command::from_command(message, scene.shape(), 1)).collect();
     let Ok(commands) = commands else { return false };
     if intake.submit(1, commands, 1).is_err() {
         return false;

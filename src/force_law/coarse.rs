@@ -97,15 +97,14 @@ fn force_at(depth_m: f64, largest_n: f64, yields: &dyn Fn(f64) -> (f64, f64)) ->
 /// A coarse law, out of sheets with about twice `half` intervals along the longer side; the work is taken from `work`.
 fn coarse(model: &Model, radius_m: f64, half: u32, work: &mut u64, stop: &AtomicBool) -> Option<Law> {
     let mut of = |model: &Model| pressed(model, radius_m, ROWS, Accuracy::COARSE, work, stop);
-    let sheet = &model.scene.sheet;
-    let half_m = tangent::half_window_m(model, radius_m).min(0.5 * sheet.longer_side_m());
+    let (size_m, edge_m) = (model.shape().extent().size_m(), model.shape().edge_m());
+    let half_m = tangent::half_window_m(model, radius_m).min(0.5 * model.shape().longest_side_m());
     // Intervals that end at the rim of the shorter side as well.
-    let shorter_m = half_m.min(0.5 * sheet.extent_m().min_element());
+    let shorter_m = half_m.min(0.5 * size_m.x.min(size_m.y));
     let fitting = if shorter_m > 0.0 { best_half(half, half_m / shorter_m) } else { half };
     let mut spacing_m = half_m / f64::from(fitting);
-    let mut law =
-        if spacing_m <= sheet.spacing_m { of(model)? } else { of(&tangent::stand_in(model, spacing_m, half_m))? };
-    let finest_m = sheet.spacing_m.max(FINE_ENOUGH * radius_m);
+    let mut law = if spacing_m <= edge_m { of(model)? } else { of(&tangent::stand_in(model, spacing_m, half_m))? };
+    let finest_m = edge_m.max(FINE_ENOUGH * radius_m);
     while spacing_m > finest_m {
         let finer_m = (0.5 * spacing_m).max(finest_m);
         let half_m = f64::from(best_half(half, spacing_m / finer_m)) * finer_m;
@@ -148,7 +147,7 @@ mod tests {
         for virtual_stiffness in ["0.01", "0.5"] {
             let virtual_stiffness = format!("virtual_springs.stiffness_n_per_m={virtual_stiffness}");
             let model = Model::paper(&["sheet.points=[25, 25]", "sheet.fixed=\"edges\"", &virtual_stiffness]);
-            let radius_m = model.scene.sheet.spacing_m;
+            let radius_m = model.shape().edge_m();
             let first = first(&model, radius_m, &never).unwrap();
             let [force, stiffness] = apart(&exact(&model, radius_m), &first);
             println!("{virtual_stiffness}: force {force:.4}, stiffness {stiffness:.4} apart");

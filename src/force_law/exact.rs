@@ -48,7 +48,7 @@ impl Computation {
 
 /// In the middle of a sheet.
 fn course(model: &Model, radius_m: f64, rows: u32) -> Course {
-    let (centre_m, step_m) = (model.scene.sheet.extent_m() / 2.0, REACH_IN_RADII * radius_m / f64::from(rows - 1));
+    let (centre_m, step_m) = (model.shape().extent().middle_m(), REACH_IN_RADII * radius_m / f64::from(rows - 1));
     Course { radius_m, centre_m, step_m, count: rows }
 }
 
@@ -104,7 +104,7 @@ mod tests {
     #[test]
     fn a_law_that_would_take_too_long_or_that_nobody_waits_for_is_none() {
         let model = Model::paper(&["sheet.points=[9, 9]"]);
-        let radius_m = 2.0 * model.scene.sheet.spacing_m;
+        let radius_m = 2.0 * model.shape().edge_m();
         let (go_on, stop) = (AtomicBool::new(false), AtomicBool::new(true));
         let exact = exact(&model, radius_m);
         assert!(!exact.is_coarse && exact.rows.len() == 21);

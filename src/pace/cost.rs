@@ -81,8 +81,7 @@ impl Cost {
 pub(super) fn check_asked(scene: &Scene, limits: &Limits) -> Result<()> {
     scene.check(limits)?;
     let (substeps, step_s) = choice::least_step(scene);
-    let [nx, ny] = scene.sheet.points;
-    check_step(nx * ny, substeps, step_s, scene.stepping.rate_hz, limits)
+    check_step(scene.shape().point_count(), substeps, step_s, scene.stepping.rate_hz, limits)
 }
 
 /// Refuses steps that would keep the server from all others.

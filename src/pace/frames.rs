@@ -67,12 +67,12 @@ pub struct Delivery {
 
 /// Bytes of a frame with every vertex.
 fn frame_bytes(refinement: Refinement, encoding: Encoding) -> usize {
-    refinement.vertices().iter().product::<usize>() * encoding.bytes_per_vertex()
+    refinement.vertex_count() * encoding.bytes_per_vertex()
 }
 
 /// Bytes of the displacements of all points at one moment.
 fn moment_bytes(refinement: Refinement) -> usize {
-    refinement.points.iter().product::<usize>() * size_of::<[f32; 3]>()
+    refinement.point_count() * size_of::<[f32; 3]>()
 }
 
 impl Viewer {
@@ -177,8 +177,6 @@ impl Viewer {
 pub struct Job {
     /// The displacements.
     pub snapshot: Arc<Snapshot>,
-    /// Of the points, m.
-    pub spacing_m: f64,
     /// To whom, as which frame.
     pub viewers: Vec<(Arc<Viewer>, u64)>,
     /// Of the session.
@@ -358,7 +356,7 @@ impl Watched {
             (kind.session, kind.tiles.refinement(), kind.tiles.encoding()) == (session, refinement, encoding)
         };
         let place = self.0.iter().position(same).unwrap_or_else(|| {
-            let tiles = FrameTiles::new(&job.snapshot, refinement, encoding, job.spacing_m);
+            let tiles = FrameTiles::new(&job.snapshot, refinement, encoding);
             self.0.push(Kind { session, tiles, viewers: Vec::new() });
             self.0.len() - 1
         });
@@ -399,14 +397,15 @@ pub type FrameReader = Reader<Delivery>;
 mod tests {
     use super::*;
     use crate::limits::Limits;
+    use crate::surface::scene;
 
     fn job(viewers: Vec<(Arc<Viewer>, u64)>) -> Job {
-        let snapshot = Snapshot::new(1, 0.001, [3, 3], std::array::from_fn(|_| vec![0.5; 9]));
-        Job { snapshot: Arc::new(snapshot), spacing_m: 0.01, viewers, overrun_count: 0, time_dilation: 1.0 }
+        let snapshot = Snapshot::new(&scene([3, 3]), 1, 0.001, std::array::from_fn(|_| vec![0.5; 9]));
+        Job { snapshot: Arc::new(snapshot), viewers, overrun_count: 0, time_dilation: 1.0 }
     }
 
     fn viewer(n: u32, encoding: Encoding, credit: Option<u32>) -> (Arc<Viewer>, Reader<Delivery>) {
-        let grid = Refinement::new([3, 3], n, &Limits::default()).unwrap();
+        let grid = Refinement::new(&scene([3, 3]), n, &Limits::default()).unwrap();
         Viewer::new("viewer".into(), grid, encoding, 60.0, true, credit, 1 << 20, &Account::alone()).unwrap()
     }
 
@@ -429,14 +428,14 @@ mod tests {
 
     #[tokio::test]
     async fn who_wants_changes_gets_all_of_them_however_it_reads() {
-        let grid = Refinement::new([3, 3], 0, &Limits::default()).unwrap();
+        let grid = Refinement::new(&scene([3, 3]), 0, &Limits::default()).unwrap();
         let account = Account::alone();
         let changes =
             |credit| Viewer::new("viewer".into(), grid, Encoding::F32, 60.0, false, credit, 1 << 20, &account).unwrap();
         let ((slow, mut read_slow), (thrifty, mut read_thrifty)) = (changes(None), changes(Some(1)));
         let (mut spent, mut watched) = (RecycledFrames::of(account.budget()), Watched::default());
         let mut show = |frame_id: u64, z: f32| {
-            let snapshot = Snapshot::new(frame_id, 0.001, [3, 3], [vec![0.0; 9], vec![0.0; 9], vec![z; 9]]);
+            let snapshot = Snapshot::new(&scene([3, 3]), frame_id, 0.001, [vec![0.0; 9], vec![0.0; 9], vec![z; 9]]);
             let viewers = vec![(slow.clone(), frame_id), (thrifty.clone(), frame_id)];
             serve(1, &Job { snapshot: Arc::new(snapshot), ..job(viewers) }, &mut spent, &mut watched);
         };

@@ -176,7 +176,8 @@ mod tests {
         assert_eq!(taken(), soft.bytes() + LAW_BYTES);
         // The same, also for a tissue that only steps are finer of.
         assert!(Arc::ptr_eq(&first, &of(1, &soft).unwrap()));
-        let same = Model { plan: finer.plan.clone(), ..(*soft).clone() };
+        let mut same = Model::clone(&soft);
+        same.plan = finer.plan.clone();
         assert!(Arc::ptr_eq(&first, &of(1, &Arc::new(same)).unwrap()));
         (2..100).for_each(|radius| _ = of(radius, &soft).unwrap());
         assert_eq!(taken(), soft.bytes() + MOST_LAWS as u64 * LAW_BYTES);

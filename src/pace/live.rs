@@ -29,6 +29,7 @@ use crate::session::command::Command;
 use crate::session::intake::Intake;
 use crate::session::lease::LeaseId;
 use crate::session::sampling::{HEARTBEAT_S, Sampler, Sampling};
+use crate::shape::PointId;
 use crate::sheet::Model;
 
 /// A session as the server sees it.
@@ -235,7 +236,7 @@ impl Live {
     pub fn probe(
         &self,
         every: u64,
-        points: Option<Vec<[usize; 2]>>,
+        points: Option<Vec<PointId>>,
         energy: bool,
         account: &Account,
     ) -> Result<Reader<PacedRecord>> {

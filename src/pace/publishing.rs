@@ -161,10 +161,10 @@ impl Running {
             Ok(displacement_m) => displacement_m,
             Err(refusal) => return viewers.iter().for_each(|(viewer, _)| viewer.close(refusal.clone())),
         };
-        let snapshot = Snapshot::new(self.session.step_count(), self.session.time_s(), model.points, displacement_m);
-        let (snapshot, spacing_m) = (Arc::new(snapshot), model.scene.sheet.spacing_m);
+        let snapshot = Snapshot::new(&model.scene, self.session.step_count(), self.session.time_s(), displacement_m);
+        let snapshot = Arc::new(snapshot);
         let (overrun_count, time_dilation) = (self.overrun_count, self.dilation.value);
-        encoder.post(self.live.number, Job { snapshot, spacing_m, viewers, overrun_count, time_dilation });
+        encoder.post(self.live.number, Job { snapshot, viewers, overrun_count, time_dilation });
     }
 
     /// Answers with the step and the state's hash; whoever has used up their part of the time is refused. Of a large

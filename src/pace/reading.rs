@@ -16,6 +16,7 @@ use crate::memory;
 use crate::refusal::{Refusal, Result};
 use crate::scene::record::Record;
 use crate::session::{Session, record_of};
+use crate::shape::PointId;
 use crate::sheet::{Hashing, SheetCopy};
 
 /// So many points are read by the stepping thread itself: some tenths of a millisecond.
@@ -108,7 +109,7 @@ pub(super) enum Piece {
     Record {
         copied: Arc<Copied>,
         /// All, if none are named.
-        points: Option<Arc<[[usize; 2]]>>,
+        points: Option<Arc<[PointId]>>,
         step: u64,
         /// With the points that were read so far.
         record: Record,
@@ -148,7 +149,7 @@ impl Piece {
                 if from == 0 {
                     record.points = memory::with_room(all, "a record");
                 }
-                let point = |index| points.as_ref().map_or_else(|| still.model().point_of(index), |named| named[index]);
+                let point = |index| points.as_ref().map_or_else(|| PointId::new(index), |named| named[index]);
                 let slice = from..all.min(from + SLICE_POINTS);
                 record.points.extend(slice.map(|index| record_of(&still, point(index))));
                 drop(still);

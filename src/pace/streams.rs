@@ -11,6 +11,7 @@ use super::places::{Held, Open, Places};
 use crate::budget::{Account, Purpose, Resource};
 use crate::lock::lock;
 use crate::refusal::{Reason, Refusal, Result};
+use crate::shape::RestShape;
 
 /// Bytes of a stream that the client has not taken: the transport (hyper) asks for no more above 400 KiB, and then holds at most one
 /// more message, which is of 64 KiB or little more.
@@ -42,6 +43,11 @@ impl StreamGuard {
     /// Cancelled when somebody who administers has cut the stream.
     pub fn cut(&self) -> &CancellationToken {
         &self.cut
+    }
+
+    /// The rest shape of the session's tissue, by which messages name its points.
+    pub fn shape(&self) -> &dyn RestShape {
+        self.live.model.shape()
     }
 }
 

@@ -13,6 +13,7 @@ use crate::refusal::Result;
 use crate::scene::record::{Point, Record};
 use crate::session::Session;
 use crate::session::sampling::Sampler;
+use crate::shape::PointId;
 
 /// A stream of samples.
 pub(super) struct SampleTap {
@@ -29,7 +30,7 @@ pub(super) struct SampleTap {
 pub(super) struct ProbeTap {
     pub(super) every: u64,
     /// All, if none are named.
-    pub(super) points: Option<Arc<[[usize; 2]]>>,
+    pub(super) points: Option<Arc<[PointId]>>,
     pub(super) energy: bool,
     pub(super) recipient: Arc<Recipient>,
     /// Who reads, and pays.

@@ -74,9 +74,9 @@ pub(crate) fn render(arguments: &RenderArguments) -> Result<(), Failure> {
         return Err(refused("at-s", "applies to a .png only: a .gif shows the whole script".to_owned()));
     }
     let camera = arguments.camera.parse()?;
-    let cells = (model.points[0].max(model.points[1]) - 1).max(1) as u32;
+    let cells = (model.shape().longest_side_m() / model.shape().edge_m()).round().max(1.0) as u32;
     let fine = if arguments.wireframe { 0 } else { 300_u32.div_ceil(cells).clamp(1, 11) - 1 };
-    let refinement = Refinement::new(model.points, arguments.refine.unwrap_or(fine), &limits)?;
+    let refinement = Refinement::new(&model.scene, arguments.refine.unwrap_or(fine), &limits)?;
     let skin = if arguments.wireframe { None } else { Some(texture::image(&model.scene.appearance, &limits)?) };
     let view = View { camera, size, refinement, texture: skin };
     let failed = |failure: render::Failure| match failure {

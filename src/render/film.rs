@@ -7,7 +7,6 @@ use std::sync::Arc;
 use super::picture::{Arrow, View, picture};
 use crate::limits::Limits;
 use crate::refusal::Refusal;
-use crate::scene::check::nearest_point;
 use crate::scene::law::{Moment, Poke};
 use crate::scene::script::Script;
 use crate::session::Session;
@@ -80,10 +79,9 @@ impl<'a> Film<'a> {
         let before = step.saturating_sub(1);
         let moment = Moment { step: before, fraction: if step > 0 { 1.0 } else { 0.0 } };
         let pokes = self.script.forces.iter().map(|law| law.at(moment, model.scene.stepping.rate_hz));
-        let arrow =
-            |poke: Poke| Arrow { point: nearest_point(&model.scene.sheet, poke.centre_m), towards: poke.force_n };
+        let arrow = |poke: Poke| Arrow { point: model.shape().nearest(poke.centre_m), towards: poke.force_n };
         let arrows = pokes.filter(|poke| poke.force_n.length() > 0.0).map(arrow).collect();
-        let snapshot = Snapshot::new(step, self.session.time_s(), model.points, displacement_m);
+        let snapshot = Snapshot::new(&model.scene, step, self.session.time_s(), displacement_m);
         Ok(Still { snapshot, arrows })
     }
 
@@ -115,7 +113,7 @@ impl Still {
 
     /// Draws it.
     pub fn picture(&self, model: &Model, view: &View) -> Image {
-        picture(&model.scene.sheet, &self.snapshot, &self.arrows, view)
+        picture(model.shape(), &self.snapshot, &self.arrows, view)
     }
 }
 

@@ -5,7 +5,7 @@ use glam::{DVec2, DVec3};
 use super::canvas::{Canvas, Corner, SAMPLES, colour, linear};
 use super::surface::{Surface, Vertex};
 use crate::refusal::{Reason, Refusal, Result, number};
-use crate::scene::Sheet;
+use crate::shape::{PointId, RestShape};
 use crate::surface::{Refinement, Snapshot};
 use crate::texture::Image;
 
@@ -74,7 +74,7 @@ pub const LARGEST_SIDE: usize = 1920;
 #[derive(Debug, Clone, Copy)]
 pub struct Arrow {
     /// The point at its tip.
-    pub point: [usize; 2],
+    pub point: PointId,
     /// Its direction.
     pub towards: DVec3,
 }
@@ -96,16 +96,16 @@ struct Eye {
 }
 
 impl Eye {
-    fn new(sheet: &Sheet, view: &View) -> Self {
+    fn new(shape: &dyn RestShape, view: &View) -> Self {
         let Camera { azimuth_deg, elevation_deg, distance } = view.camera;
         let (azimuth, elevation) = (azimuth_deg.to_radians(), elevation_deg.to_radians());
         let across = libm::cos(elevation);
         let away = DVec3::new(-libm::sin(azimuth) * across, -libm::cos(azimuth) * across, libm::sin(elevation));
         let right = DVec3::new(libm::cos(azimuth), -libm::sin(azimuth), 0.0);
-        let centre_m = (sheet.extent_m() / 2.0).extend(0.0);
+        let centre_m = shape.extent().middle_m();
         let [width, height] = view.size.map(|pixels| (pixels * SAMPLES) as f64);
         Eye {
-            at_m: centre_m + distance * sheet.longer_side_m() * away,
+            at_m: centre_m + distance * shape.longest_side_m() * away,
             axes: [right, right.cross(-away), -away],
             // Near parts take more of the picture than far parts, so the middle of the sheet is drawn above the
             // picture's middle.
@@ -122,29 +122,27 @@ impl Eye {
     }
 }
 
-/// Draws the sheet in the state of `snapshot`.
-pub fn picture(sheet: &Sheet, snapshot: &Snapshot, arrows: &[Arrow], view: &View) -> Image {
-    let surface = Surface::new(sheet, snapshot, view.refinement);
-    let eye = Eye::new(sheet, view);
-    let nearest_m = 0.01 * sheet.longer_side_m();
+/// Draws the tissue in the state of `snapshot`.
+pub fn picture(shape: &dyn RestShape, snapshot: &Snapshot, arrows: &[Arrow], view: &View) -> Image {
+    let surface = Surface::new(snapshot, view.refinement);
+    let eye = Eye::new(shape, view);
+    let nearest_m = 0.01 * shape.longest_side_m();
     let background = if view.texture.is_some() { [20, 14, 13] } else { [255, 255, 255] };
     let mut canvas = Canvas::new(view.size, colour(background));
     let corners: Vec<Option<Corner>> =
         surface.vertices.iter().map(|vertex| eye.project(vertex.at_m, nearest_m)).collect();
     let [nx, ny] = surface.count;
-    let skin = view.texture.as_ref().map(|image| Skin::new(image, &eye, sheet));
-    for a in 0..nx.saturating_sub(1) {
-        for b in 0..ny.saturating_sub(1) {
-            let corner = a * ny + b;
-            for triangle in [[corner, corner + ny, corner + ny + 1], [corner, corner + ny + 1, corner + 1]] {
-                let [Some(p), Some(q), Some(r)] = triangle.map(|index| corners[index]) else { continue };
-                let vertices = triangle.map(|index| surface.vertices[index]);
-                canvas.triangle([p, q, r], |shares| match &skin {
-                    Some(skin) => skin.shade(&between(&vertices, shares)),
-                    // Pale enough for lines to show, and opaque.
-                    None => DVec3::splat(0.80 + 0.18 * between(&vertices, shares).open),
-                });
-            }
+    let skin = view.texture.as_ref().map(|image| Skin::new(image, &eye, shape));
+    for cell in 0..view.refinement.cell_count() {
+        let [a, b, c, d, e, f] = view.refinement.triangles(cell);
+        for triangle in [[a, b, c], [d, e, f]] {
+            let [Some(p), Some(q), Some(r)] = triangle.map(|index| corners[index]) else { continue };
+            let vertices = triangle.map(|index| surface.vertices[index]);
+            canvas.triangle([p, q, r], |shares| match &skin {
+                Some(skin) => skin.shade(&between(&vertices, shares)),
+                // Pale enough for lines to show, and opaque.
+                None => DVec3::splat(0.80 + 0.18 * between(&vertices, shares).open),
+            });
         }
     }
     if skin.is_none() {
@@ -161,15 +159,22 @@ pub fn picture(sheet: &Sheet, snapshot: &Snapshot, arrows: &[Arrow], view: &View
         }
     }
     for arrow in arrows {
-        draw(&mut canvas, &eye, &surface, arrow, view, sheet, nearest_m);
+        draw(&mut canvas, &eye, &surface, arrow, view, shape, nearest_m);
     }
     canvas.image()
 }
 
-fn draw(canvas: &mut Canvas, eye: &Eye, surface: &Surface, arrow: &Arrow, view: &View, sheet: &Sheet, nearest_m: f64) {
-    let part = view.refinement.between + 1;
-    let tip_m = surface.vertices[arrow.point[0] * part * surface.count[1] + arrow.point[1] * part].at_m;
-    let tail_m = tip_m - ARROW * sheet.longer_side_m() * arrow.towards.normalize_or_zero();
+fn draw(
+    canvas: &mut Canvas,
+    eye: &Eye,
+    surface: &Surface,
+    arrow: &Arrow,
+    view: &View,
+    shape: &dyn RestShape,
+    nearest_m: f64,
+) {
+    let tip_m = surface.vertices[view.refinement.vertex_at(arrow.point)].at_m;
+    let tail_m = tip_m - ARROW * shape.longest_side_m() * arrow.towards.normalize_or_zero();
     let (Some(tip), Some(tail)) = (eye.project(tip_m, nearest_m), eye.project(tail_m, nearest_m)) else { return };
     let ink = colour(if view.texture.is_some() { [150, 205, 255] } else { [20, 80, 160] });
     // In front of everything: the arrow's target may be at the bottom of a dent.
@@ -205,8 +210,8 @@ struct Skin<'a> {
 }
 
 impl<'a> Skin<'a> {
-    fn new(image: &'a Image, eye: &Eye, sheet: &Sheet) -> Self {
-        let centre_m = (sheet.extent_m() / 2.0).extend(0.0);
+    fn new(image: &'a Image, eye: &Eye, shape: &dyn RestShape) -> Self {
+        let centre_m = shape.extent().middle_m();
         let [right, up, _] = eye.axes;
         let away_m = eye.at_m.distance(centre_m);
         let lamp_m = eye.at_m + away_m * (0.10 * up - 1.05 * right);

@@ -2,7 +2,6 @@
 
 use glam::{DVec2, DVec3};
 
-use crate::scene::Sheet;
 use crate::surface::{Encoding, Refinement, Snapshot, encode};
 
 #[derive(Debug, Clone, Copy, Default)]
@@ -25,22 +24,22 @@ pub(super) struct Surface {
 }
 
 impl Surface {
-    pub(super) fn new(sheet: &Sheet, snapshot: &Snapshot, refinement: Refinement) -> Self {
-        let points = Refinement { between: 0, ..refinement };
+    pub(super) fn new(snapshot: &Snapshot, refinement: Refinement) -> Self {
+        let points = refinement.coarsest();
         // Interpolate the points' normals, so that shading is smooth: a bilinear patch has creases of its own.
-        let places_m = places(sheet, snapshot, points);
-        let (normals, open) = (normals(sheet.points, &places_m), openness(sheet, &places_m));
+        let places_m = places(snapshot, points);
+        let grid = points.vertices();
+        let (normals, open) = (normals(grid, &places_m), openness(points, &places_m));
         let count = refinement.vertices();
-        let part = refinement.between + 1;
-        let vertices = places(sheet, snapshot, refinement)
+        let part = refinement.between() + 1;
+        let vertices = places(snapshot, refinement)
             .into_iter()
             .enumerate()
             .map(|(index, at_m)| {
                 let [a, b] = [index / count[1], index % count[1]];
-                let share = |a: usize, vertices: usize| a as f64 / (vertices - 1).max(1) as f64;
-                let normal = bilinear(sheet.points, &normals, [a, b], part).try_normalize().unwrap_or(DVec3::Z);
-                let share = DVec2::new(share(a, count[0]), share(b, count[1]));
-                Vertex { at_m, normal, share, open: bilinear(sheet.points, &open, [a, b], part).x }
+                let normal = bilinear(grid, &normals, [a, b], part).try_normalize().unwrap_or(DVec3::Z);
+                let share = refinement.texture_at(index);
+                Vertex { at_m, normal, share, open: bilinear(grid, &open, [a, b], part).x }
             })
             .collect();
         Surface { count, vertices }
@@ -48,11 +47,9 @@ impl Surface {
 }
 
 /// The positions of the vertices, m, from the data that a viewer gets.
-fn places(sheet: &Sheet, snapshot: &Snapshot, refinement: Refinement) -> Vec<DVec3> {
-    let [nx, ny] = refinement.vertices();
-    let spacing_m = refinement.spacing_m(sheet.spacing_m);
-    let mut places: Vec<DVec3> =
-        (0..nx * ny).map(|index| spacing_m * DVec3::new((index / ny) as f64, (index % ny) as f64, 0.0)).collect();
+fn places(snapshot: &Snapshot, refinement: Refinement) -> Vec<DVec3> {
+    let [_, ny] = refinement.vertices();
+    let mut places: Vec<DVec3> = (0..refinement.vertex_count()).map(|vertex| refinement.rest_m(vertex)).collect();
     for patch in encode(snapshot, refinement, Encoding::F32).patches {
         for (k, bytes) in patch.bytes.chunks_exact(12).enumerate() {
             let (a, b) = (patch.first[0] + k / patch.count[1], patch.first[1] + k % patch.count[1]);
@@ -79,8 +76,8 @@ fn normals([nx, ny]: [usize; 2], places: &[DVec3]) -> Vec<DVec3> {
 }
 
 /// The ambient openness of each point, from the height of its surroundings at some distances. Stored in x.
-fn openness(sheet: &Sheet, places_m: &[DVec3]) -> Vec<DVec3> {
-    let [nx, ny] = sheet.points;
+fn openness(points: Refinement, places_m: &[DVec3]) -> Vec<DVec3> {
+    let [nx, ny] = points.vertices();
     let of = |index: usize| {
         let (i, j) = (index / ny, index % ny);
         let mut slopes = 0.0;
@@ -95,7 +92,7 @@ fn openness(sheet: &Sheet, places_m: &[DVec3]) -> Vec<DVec3> {
                     count += 1.0;
                 }
             }
-            slopes += (rise_m / f64::max(count, 1.0)).max(0.0) / (reach as f64 * sheet.spacing_m);
+            slopes += (rise_m / f64::max(count, 1.0)).max(0.0) / (reach as f64 * points.spacing_m());
         }
         DVec3::splat(1.0 / (1.0 + 0.5 * slopes))
     };

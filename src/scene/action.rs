@@ -3,6 +3,7 @@
 use glam::DVec3;
 
 use super::law::Poke;
+use crate::shape::PointId;
 use palpate_touch::Tip;
 
 /// The action of a tool, which lasts until the next one.
@@ -13,7 +14,7 @@ pub enum Action {
     /// Holds a point and brings it to this displacement by the end of the step.
     Grasp {
         /// The point.
-        point: [usize; 2],
+        point: PointId,
         /// From its rest position, m.
         displacement_m: DVec3,
     },

@@ -1,11 +1,12 @@
-//! Checks of what a tool is asked to do on a sheet, in scripts and in commands.
+//! Checks of what a tool is asked to do on a tissue, in scripts and in commands.
 
-use glam::{DVec2, DVec3};
+use glam::DVec3;
+use palpate_touch::{Coupling, Tip};
 
-use super::Sheet;
 use super::law::Poke;
 use crate::limits::Limits;
-use crate::refusal::{Reason, Refusal, Result, finite, finite_vector, not_negative, number};
+use crate::refusal::{Reason, Refusal, Result, finite, finite_vector, not_negative, number, positive};
+use crate::shape::{PointId, RestShape};
 
 /// Refuses a force whose largest value at a point, |force|·e^{c′}, is above the limit.
 pub(super) fn check_force(field: &str, force_n: DVec3, factor: f64, limit_n: f64) -> Result<()> {
@@ -23,11 +24,11 @@ pub(super) fn check_force(field: &str, force_n: DVec3, factor: f64, limit_n: f64
 /// Checks a poke.
 ///
 /// # Errors
-/// Refuses a poke that is not finite, too strong, or off the sheet.
-pub fn check_poke(poke: &Poke, sheet: &Sheet, limits: &Limits) -> Result<()> {
+/// Refuses a poke that is not finite, too strong, or off the tissue.
+pub fn check_poke(poke: &Poke, shape: &dyn RestShape, limits: &Limits) -> Result<()> {
     not_negative("force.falloff_per_m", poke.falloff_per_m)?;
     finite("force.falloff_offset", poke.falloff_offset)?;
-    check_centre("force.centre_m", sheet, poke.centre_m)?;
+    shape.check_place("force.centre_m", poke.centre_m)?;
     check_force("force.force_n", poke.force_n, libm::exp(poke.falloff_offset), limits.point_force_n)
 }
 
@@ -35,8 +36,8 @@ pub fn check_poke(poke: &Poke, sheet: &Sheet, limits: &Limits) -> Result<()> {
 ///
 /// # Errors
 /// Refuses one beyond the limit.
-pub fn check_reach(field: &str, sheet: &Sheet, displacement_m: f64, limits: &Limits) -> Result<()> {
-    let limit_m = sheet.longer_side_m() * limits.reach_in_sheets;
+pub fn check_reach(field: &str, shape: &dyn RestShape, displacement_m: f64, limits: &Limits) -> Result<()> {
+    let limit_m = shape.longest_side_m() * limits.reach_in_sheets;
     number(field, displacement_m, &format!("at most {limit_m} m from the rest position"), |v| v <= limit_m)?;
     Ok(())
 }
@@ -44,46 +45,27 @@ pub fn check_reach(field: &str, sheet: &Sheet, displacement_m: f64, limits: &Lim
 /// Checks whether a point can be grasped.
 ///
 /// # Errors
-/// Refuses a point that is fixed or not on the sheet.
-pub fn check_free(field: &str, sheet: &Sheet, point: [usize; 2]) -> Result<()> {
-    sheet.index(field, point)?;
-    if sheet.is_fixed(point) {
-        let message = format!("[{}, {}] is fixed, and can't be grasped", point[0], point[1]);
+/// Refuses a point that is fixed.
+pub fn check_free(field: &str, shape: &dyn RestShape, point: PointId) -> Result<()> {
+    if shape.is_fixed(point) {
+        let message = format!("{} is fixed, and can't be grasped", shape.name(point));
         return Err(Refusal::new(Reason::OutOfRange, field, message));
     }
     Ok(())
 }
 
-/// Checks a control point. It may be a little off the sheet, because a tool that strokes over the edge is still felt.
+/// Checks whether a tool with this tip fits the tissue.
 ///
 /// # Errors
-/// Refuses a control point farther from the sheet than a tenth of its longer side.
-pub fn check_centre(field: &str, sheet: &Sheet, centre_m: DVec2) -> Result<()> {
-    for component in centre_m.to_array() {
-        finite(field, component)?;
-    }
-    if !is_near(sheet, centre_m) {
-        let DVec2 { x, y } = sheet.extent_m();
-        let message = format!(
-            "({}, {}) m is off the sheet, which is {x} m × {y} m, by more than a tenth of its longer side",
-            centre_m.x, centre_m.y
-        );
-        return Err(Refusal::new(Reason::OffSheet, field, message));
+/// Refuses a value that is not finite or out of range; `field` is the name that the refusal gives.
+pub fn check_tip(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
+    let longest_m = shape.longest_side_m();
+    let range = format!("above 0 and at most {longest_m}, the sheet's longer side");
+    number(&format!("{field}.radius_m"), tip.radius_m, &range, |v| v > 0.0 && v <= longest_m)?;
+    number(&format!("{field}.friction"), tip.friction, "from 0 to 10", |v| (0.0..=10.0).contains(&v))?;
+    if let Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } = tip.coupling {
+        positive(&format!("{field}.spring.stiffness_n_per_m"), stiffness_n_per_m)?;
+        not_negative(&format!("{field}.spring.damping_n_s_per_m"), damping_n_s_per_m)?;
     }
     Ok(())
-}
-
-/// Whether a control point is on the sheet, or off it by at most a tenth of its longer side.
-pub fn is_near(sheet: &Sheet, centre_m: DVec2) -> bool {
-    let extent_m = sheet.extent_m();
-    let margin_m = DVec2::splat(0.1 * sheet.longer_side_m());
-    centre_m.cmpge(-margin_m).all() && centre_m.cmple(extent_m + margin_m).all()
-}
-
-/// The mass point whose rest position is nearest to a place.
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
-pub fn nearest_point(sheet: &Sheet, place_m: DVec2) -> [usize; 2] {
-    let nearest =
-        |place_m: f64, points: usize| (place_m / sheet.spacing_m).round().clamp(0.0, (points - 1) as f64) as usize;
-    [nearest(place_m.x, sheet.points[0]), nearest(place_m.y, sheet.points[1])]
 }

@@ -3,7 +3,9 @@
 //! Time is counted in whole steps and a fraction of the present step, so that a law that jumps has a value on either
 //! side: just before the jump at (n − 1, 1), just after it at (n, 0).
 
-use glam::{DVec2, DVec3};
+use glam::DVec3;
+
+use crate::shape::PointId;
 
 /// A moment within a step: `fraction` from 0 (its beginning) to 1 (its end).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -28,11 +30,11 @@ impl Moment {
 }
 
 /// A surgical force at one moment (the paper's exerting force and its falloff): point p gets
-/// `force_n`·exp(−`falloff_per_m`·r + `falloff_offset`), where r is the distance at rest from p to `centre_m`.
+/// `force_n`·exp(−`falloff_per_m`·r + `falloff_offset`), where r is the straight distance from where p rests to `centre_m`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Poke {
-    /// The control point, in the rest plane.
-    pub centre_m: DVec2,
+    /// The control point at rest, m. On a sheet z is 0.
+    pub centre_m: DVec3,
     /// The exerting force, N.
     pub force_n: DVec3,
     /// Falloff c, 1/m.
@@ -58,13 +60,13 @@ pub struct LoadProfile {
 #[derive(Debug, Clone, PartialEq)]
 pub enum CentreProfile {
     /// The place from each step on. Before the first there is no force.
-    Hops(Vec<(u64, DVec2)>),
+    Hops(Vec<(u64, DVec3)>),
     /// A straight line.
     Path {
-        /// Place at time 0.
-        from_m: DVec2,
+        /// Place at time 0, m.
+        from_m: DVec3,
         /// Velocity, m/s.
-        velocity_m_per_s: DVec2,
+        velocity_m_per_s: DVec3,
     },
 }
 
@@ -135,7 +137,7 @@ impl LoadProfile {
             }
         };
         Poke {
-            centre_m: centre.unwrap_or(DVec2::ZERO),
+            centre_m: centre.unwrap_or(DVec3::ZERO),
             force_n: if centre.is_some() { force_n } else { DVec3::ZERO },
             falloff_per_m: self.falloff_per_m,
             falloff_offset: self.falloff_offset,
@@ -147,7 +149,7 @@ impl LoadProfile {
 #[derive(Debug, Clone, PartialEq)]
 pub struct MotionProfile {
     /// The point.
-    pub point: [usize; 2],
+    pub point: PointId,
     /// Displacements, which add up.
     pub moves: Vec<Move>,
 }

@@ -8,16 +8,15 @@ pub mod law;
 mod reader;
 pub mod record;
 pub mod script;
+mod sheet;
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-
-use palpate_touch::{Coupling, Tip};
 
 use crate::limits::Limits;
-use crate::memory;
-use crate::refusal::{Reason, Refusal, Result, not_negative, number, positive};
+use crate::refusal::{Reason, Refusal, Result, not_negative, number};
+use crate::shape::RestShape;
 use document::{Document, Item};
+pub use sheet::{Fixed, PointSet, Sheet};
 
 /// The scene of the paper's figures, built in.
 pub const PAPER: &str = include_str!("../../scenes/paper.toml");
@@ -95,55 +94,6 @@ impl Change {
     /// Why one that changes nothing is refused.
     pub const NOTHING: &str =
         "names nothing to change: stiffness_n_per_m, damping_n_s_per_m or virtual_stiffness_n_per_m";
-}
-
-/// The grid: point [i, j] rests at (i·spacing, j·spacing, 0).
-#[derive(Debug, Clone, PartialEq)]
-pub struct Sheet {
-    /// Points along x and along y.
-    pub points: [usize; 2],
-    /// Distance of structural neighbours at rest, m.
-    pub spacing_m: f64,
-    /// Mass of each point, kg.
-    pub point_mass_kg: f64,
-    /// Points that never move.
-    pub fixed: Fixed,
-}
-
-/// Points that never move.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Fixed {
-    /// Every point of the rim.
-    Edges,
-    /// The four corners.
-    Corners,
-    /// Just these; an empty list fixes none.
-    Points(PointSet),
-}
-
-/// Mass points, each once, in order. One in memory for all clones: a scene may name many, and is shared by all that know it.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct PointSet(Arc<[[usize; 2]]>);
-
-impl PointSet {
-    /// Whether a point is one of them.
-    pub fn contains(&self, point: [usize; 2]) -> bool {
-        self.0.binary_search(&point).is_ok()
-    }
-
-    /// All of them.
-    pub fn as_slice(&self) -> &[[usize; 2]] {
-        &self.0
-    }
-}
-
-impl FromIterator<[usize; 2]> for PointSet {
-    fn from_iter<I: IntoIterator<Item = [usize; 2]>>(points: I) -> Self {
-        let mut points: Vec<_> = points.into_iter().collect();
-        points.sort_unstable();
-        points.dedup();
-        PointSet(points.into())
-    }
 }
 
 /// Springs between neighbours: the force on a from a spring a–b is k (L − L0)(x_b − x_a)/L.
@@ -318,16 +268,7 @@ impl Scene {
         let scene = document.read(|fields| {
             Ok(Scene {
                 name: fields.text("name")?.unwrap_or_else(|| "unnamed".to_owned()),
-                sheet: fields.required("sheet")?.table(|fields| {
-                    Ok(Sheet {
-                        points: fields.required("points")?.point()?,
-                        spacing_m: fields.required_number("spacing_m")?,
-                        point_mass_kg: fields.required_number("point_mass_kg")?,
-                        fixed: fields
-                            .item("fixed")
-                            .map_or(Ok(Fixed::Points(PointSet::default())), |item| read_fixed(&item))?,
-                    })
-                })?,
+                sheet: fields.required("sheet")?.table(Sheet::read)?,
                 springs: fields.required("springs")?.table(|fields| {
                     let stiffness_n_per_m = fields.required_number("stiffness_n_per_m")?;
                     Ok(Springs {
@@ -376,37 +317,18 @@ impl Scene {
         scene
     }
 
+    /// The rest shape of the tissue.
+    pub fn shape(&self) -> &dyn RestShape {
+        &self.sheet
+    }
+
     /// Everything that a scene promises, wherever it came from.
     ///
     /// # Errors
     /// Refuses a value out of its range, and what is above the limits.
     pub fn check(&self, limits: &Limits) -> Result<()> {
         crate::refusal::label("name", &self.name)?;
-        let [nx, ny] = self.sheet.points;
-        if nx == 0 || ny == 0 {
-            let message = format!("must be at least 1 along each side, but are {nx} × {ny}");
-            return Err(Refusal::new(Reason::OutOfRange, "sheet.points", message));
-        }
-        if nx.checked_mul(ny).is_none_or(|points| points > limits.points) {
-            let message = format!("are {nx} × {ny}, above the limit of {} points in all", limits.points);
-            return Err(Refusal::new(Reason::TooLarge, "sheet.points", message));
-        }
-        // A narrow sheet takes the memory and the time of one of this width, which may be sixteen times its own.
-        if nx.checked_mul(ny.max(LEAST_WIDTH)).is_none_or(|points| points > limits.points) {
-            let message = format!(
-                "are {nx} × {ny}: rows of fewer than {LEAST_WIDTH} points are computed as if they had so many, and \
-                 {nx} × {LEAST_WIDTH} are above the limit of {} points in all; give the longer side last",
-                limits.points
-            );
-            return Err(Refusal::new(Reason::TooLarge, "sheet.points", message));
-        }
-        physical("sheet.spacing_m", positive("sheet.spacing_m", self.sheet.spacing_m)?)?;
-        physical("sheet.point_mass_kg", positive("sheet.point_mass_kg", self.sheet.point_mass_kg)?)?;
-        if let Fixed::Points(points) = &self.sheet.fixed
-            && let Some(index) = points.as_slice().iter().position(|[i, j]| *i >= nx || *j >= ny)
-        {
-            self.sheet.index(&format!("sheet.fixed[{index}]"), points.as_slice()[index])?;
-        }
+        self.sheet.check(limits)?;
         let coefficients = [
             ("springs.stiffness_n_per_m", self.springs.stiffness_n_per_m),
             ("springs.shear_stiffness_n_per_m", self.springs.shear_stiffness_n_per_m),
@@ -436,91 +358,6 @@ impl Scene {
 /// Squares and products of what a scene holds stay within single precision for values in this range.
 fn physical(field: &str, value: f64) -> Result<f64> {
     number(field, value, "from 1e-12 to 1e12", |v| (1e-12..=1e12).contains(&v))
-}
-
-impl Sheet {
-    /// The place of point [i, j] in arrays over all points: i·ny + j.
-    ///
-    /// # Errors
-    /// Refuses a point that is not on the sheet.
-    pub fn index(&self, field: &str, [i, j]: [usize; 2]) -> Result<usize> {
-        let [nx, ny] = self.points;
-        if i >= nx || j >= ny {
-            let message = format!("[{i}, {j}] is not on the sheet of {nx} × {ny} points");
-            return Err(Refusal::new(Reason::OffSheet, field, message));
-        }
-        Ok(i * ny + j)
-    }
-
-    /// Length along x and along y, m.
-    #[allow(clippy::cast_precision_loss)]
-    pub fn extent_m(&self) -> glam::DVec2 {
-        self.spacing_m * glam::DVec2::new((self.points[0] - 1) as f64, (self.points[1] - 1) as f64)
-    }
-
-    /// The longer side; the spacing of a sheet of one point, m.
-    pub fn longer_side_m(&self) -> f64 {
-        self.extent_m().max_element().max(self.spacing_m)
-    }
-
-    /// Where a point rests, in the rest plane, m.
-    #[allow(clippy::cast_precision_loss)]
-    pub fn rest_m(&self, [i, j]: [usize; 2]) -> glam::DVec2 {
-        self.spacing_m * glam::DVec2::new(i as f64, j as f64)
-    }
-
-    /// Whether a point never moves.
-    pub fn is_fixed(&self, [i, j]: [usize; 2]) -> bool {
-        let [nx, ny] = self.points;
-        let (rim_x, rim_y) = (i == 0 || i + 1 == nx, j == 0 || j + 1 == ny);
-        match &self.fixed {
-            Fixed::Edges => rim_x || rim_y,
-            Fixed::Corners => rim_x && rim_y,
-            Fixed::Points(points) => points.contains([i, j]),
-        }
-    }
-
-    /// The fixed points, as places in arrays over all points, rising.
-    pub fn fixed_indices(&self) -> Vec<usize> {
-        let [nx, ny] = self.points;
-        let mut indices: Vec<usize> = match &self.fixed {
-            Fixed::Points(points) => points.as_slice().iter().map(|[i, j]| i * ny + j).collect(),
-            _ => {
-                // The rim, at most.
-                let mut indices = memory::with_room((2 * (nx + ny)).min(nx * ny), "the fixed points");
-                indices.extend((0..nx * ny).filter(|index| self.is_fixed([index / ny, index % ny])));
-                indices
-            }
-        };
-        indices.sort_unstable();
-        indices.dedup();
-        indices
-    }
-
-    /// Checks whether a tool with this tip fits the sheet.
-    ///
-    /// # Errors
-    /// Refuses a value that is not finite or out of range; `field` is the name that the refusal gives.
-    pub fn check_tip(&self, field: &str, tip: &Tip) -> Result<()> {
-        let longest_m = self.longer_side_m();
-        let range = format!("above 0 and at most {longest_m}, the sheet's longer side");
-        number(&format!("{field}.radius_m"), tip.radius_m, &range, |v| v > 0.0 && v <= longest_m)?;
-        number(&format!("{field}.friction"), tip.friction, "from 0 to 10", |v| (0.0..=10.0).contains(&v))?;
-        if let Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } = tip.coupling {
-            positive(&format!("{field}.spring.stiffness_n_per_m"), stiffness_n_per_m)?;
-            not_negative(&format!("{field}.spring.damping_n_s_per_m"), damping_n_s_per_m)?;
-        }
-        Ok(())
-    }
-}
-
-fn read_fixed(item: &Item<'_>) -> Result<Fixed> {
-    match item.as_text() {
-        Some("edges") => Ok(Fixed::Edges),
-        Some("corners") => Ok(Fixed::Corners),
-        Some(_) => Err(item.wrong("\"edges\", \"corners\" or a list of points")),
-        None => Ok(Fixed::Points(item.list()?.iter().map(Item::point).collect::<Result<_>>()?)),
-    }
 }
 
 fn read_appearance(item: &Item<'_>, limits: &Limits) -> Result<Appearance> {

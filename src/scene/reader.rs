@@ -2,16 +2,18 @@
 
 use std::collections::BTreeSet;
 use std::path::Path;
+use std::sync::Arc;
 
-use glam::{DVec2, DVec3};
+use glam::DVec3;
 
-use super::check::{check_centre, check_force, check_free, check_reach, is_near, nearest_point};
+use super::check::{check_force, check_free, check_reach};
 use super::document::{self, Document, Fields, Item};
 use super::law::{CentreProfile, LoadProfile, Moment, MotionProfile, Move, Profile, StrengthProfile};
 use super::script::Script;
-use super::{Change, Scene, Sheet};
+use super::{Change, Scene};
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, not_negative, number, positive};
+use crate::shape::{self, PointId, PointName};
 
 impl Script {
     /// Reads a script, by its file or by its name in ./scripts, and binds it to `scene`.
@@ -71,7 +73,7 @@ impl Binding<'_> {
             .collect::<Result<Vec<_>>>()?;
         for (index, law) in forces.iter().enumerate() {
             let end = law.at(Moment::start_of(steps), self.scene.stepping.rate_hz);
-            if matches!(law.centre, CentreProfile::Path { .. }) && !is_near(&self.scene.sheet, end.centre_m) {
+            if matches!(law.centre, CentreProfile::Path { .. }) && !self.scene.shape().is_near(end.centre_m) {
                 let message = "leaves the sheet; where the force is streamed (--held, a replay) it ends there";
                 self.warnings.push(format!("force[{index}].path: {message}"));
             }
@@ -90,14 +92,11 @@ impl Binding<'_> {
             let message = format!("{tools} forces and tools are above the limit of {} in all", self.limits.tools);
             return Err(Refusal::new(Reason::TooLarge, "force", message));
         }
-        let [nx, ny] = self.scene.sheet.points;
         let sample_points = match fields.item("sample_points") {
             None => control_points,
-            Some(item) if item.as_text() == Some("all") => (0..nx * ny).map(|index| [index / ny, index % ny]).collect(),
+            Some(item) if item.as_text() == Some("all") => shape::points(self.scene.shape()).collect(),
             Some(item) if item.as_text().is_some() => return Err(item.wrong("\"all\" or a list of points")),
-            Some(item) => {
-                item.list()?.iter().map(|item| self.point(item).map(|at| at.0)).collect::<Result<Vec<_>>>()?
-            }
+            Some(item) => item.list()?.iter().map(|item| self.point(item)).collect::<Result<Vec<_>>>()?,
         };
         let mut seen = BTreeSet::new();
         Ok(Script {
@@ -110,7 +109,7 @@ impl Binding<'_> {
             changes,
             warnings: self.warnings,
             rate_hz: self.scene.stepping.rate_hz,
-            sheet: self.scene.sheet.clone(),
+            shape: Arc::new(self.scene.sheet.clone()),
         })
     }
 
@@ -127,12 +126,10 @@ impl Binding<'_> {
         Ok(whole as u64)
     }
 
-    /// A grid point and its place at rest.
-    fn point(&self, item: &Item<'_>) -> Result<([usize; 2], DVec2)> {
-        let point = item.point()?;
-        let sheet: &Sheet = &self.scene.sheet;
-        sheet.index("", point).map_err(|refusal| item.refuse(refusal.reason, refusal.message))?;
-        Ok((point, sheet.rest_m(point)))
+    /// A point of the tissue.
+    fn point(&self, item: &Item<'_>) -> Result<PointId> {
+        let name = PointName::Point(item.point()?);
+        self.scene.shape().find("", name).map_err(|refusal| item.refuse(refusal.reason, refusal.message))
     }
 
     /// Changes of the tissue. Each is checked with those before it.
@@ -168,7 +165,7 @@ impl Binding<'_> {
         Ok(changes)
     }
 
-    fn force(&mut self, item: &Item<'_>, control_points: &mut Vec<[usize; 2]>) -> Result<LoadProfile> {
+    fn force(&mut self, item: &Item<'_>, control_points: &mut Vec<PointId>) -> Result<LoadProfile> {
         item.table(|fields| {
             let centre = self.centre(item, fields, control_points)?;
             let falloff_per_m = not_negative(&fields.path("falloff_per_m"), fields.required_number("falloff_per_m")?)?;
@@ -201,37 +198,36 @@ impl Binding<'_> {
         &mut self,
         item: &Item<'_>,
         fields: &mut Fields<'_>,
-        control_points: &mut Vec<[usize; 2]>,
+        control_points: &mut Vec<PointId>,
     ) -> Result<CentreProfile> {
         let (point, hops, path) = (fields.item("point"), fields.item("hops"), fields.item("path"));
         let one = "must have just one of `point`, `hops` and `path`";
         match (point, hops, path) {
             (Some(point), None, None) => {
-                let (point, place) = self.point(&point)?;
+                let point = self.point(&point)?;
                 control_points.push(point);
-                Ok(CentreProfile::Hops(vec![(0, place)]))
+                Ok(CentreProfile::Hops(vec![(0, self.scene.shape().rest_m(point))]))
             }
             (None, Some(hops), None) => {
                 let mut entries = Vec::new();
                 for hop in hops.list()? {
                     entries.push(hop.table(|fields| {
                         let at = self.steps(&fields.path("at_s"), fields.required_number("at_s")?)?;
-                        let (point, place) = self.point(&fields.required("point")?)?;
+                        let point = self.point(&fields.required("point")?)?;
                         control_points.push(point);
-                        Ok((at, place))
+                        Ok((at, self.scene.shape().rest_m(point)))
                     })?);
                 }
                 rising(&hops, "at_s", &mut entries)?;
                 Ok(CentreProfile::Hops(entries))
             }
             (None, None, Some(path)) => path.table(|fields| {
-                let from_m = fields.required("from_m")?.place()?;
-                let velocity_m_per_s = fields.required("velocity_m_per_s")?.place()?;
+                let from_m = fields.required("from_m")?.place()?.extend(0.0);
+                let velocity_m_per_s = fields.required("velocity_m_per_s")?.place()?.extend(0.0);
                 let speed = velocity_m_per_s.abs().max_element();
                 number(&fields.path("velocity_m_per_s"), speed, "at most 1e6", |v| v <= 1e6)?;
-                let sheet = &self.scene.sheet;
-                check_centre(&fields.path("from_m"), sheet, from_m)?;
-                control_points.push(nearest_point(sheet, from_m));
+                self.scene.shape().check_place(&fields.path("from_m"), from_m)?;
+                control_points.push(self.scene.shape().nearest(from_m));
                 Ok(CentreProfile::Path { from_m, velocity_m_per_s })
             }),
             (None, None, None) => Err(item.refuse(Reason::Missing, one)),
@@ -339,8 +335,8 @@ impl Binding<'_> {
 
     fn tool(&mut self, item: &Item<'_>) -> Result<MotionProfile> {
         item.table(|fields| {
-            let (point, _) = self.point(&fields.required("point")?)?;
-            check_free(&fields.path("point"), &self.scene.sheet, point)?;
+            let point = self.point(&fields.required("point")?)?;
+            check_free(&fields.path("point"), self.scene.shape(), point)?;
             let mut moves = Vec::new();
             let list = fields.required("moves")?;
             for entry in list.list()? {
@@ -357,7 +353,7 @@ impl Binding<'_> {
             let law = MotionProfile { point, moves };
             // The displacement is largest at the end of a move. Where moves overlap, their sum is an upper bound.
             let farthest: f64 = law.moves.iter().map(|m| m.by_m.length()).sum();
-            check_reach(&fields.path("moves"), &self.scene.sheet, farthest, self.limits)?;
+            check_reach(&fields.path("moves"), self.scene.shape(), farthest, self.limits)?;
             Ok(law)
         })
     }

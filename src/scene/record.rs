@@ -5,6 +5,7 @@ use std::io::Write;
 use serde::Serialize;
 
 use super::{Integrator, Named, Precision};
+use crate::shape::PointName;
 
 /// The first line of a record.
 #[derive(Debug, Clone, Serialize)]
@@ -43,7 +44,9 @@ pub struct Record {
 #[derive(Debug, Clone, Serialize)]
 #[allow(missing_docs)]
 pub struct Point {
-    pub point: [usize; 2],
+    /// What the point is called: `"point": [i, j]` on a sheet.
+    #[serde(flatten)]
+    pub name: PointName,
     pub displacement_m: [f64; 3],
     pub velocity_m_per_s: [f64; 3],
     pub spring_n: [f64; 3],

@@ -1,11 +1,13 @@
 //! Scripts: forces, tool movements and samples over time, bound to a scene: times are whole steps, points are places.
 
+use std::sync::Arc;
+
 use glam::DVec3;
 
+use super::Change;
 pub use super::action::Action;
-use super::check::is_near;
 use super::law::{LoadProfile, Moment, MotionProfile};
-use super::{Change, Sheet};
+use crate::shape::{PointId, RestShape};
 
 /// The built-in scripts: name and text.
 pub const BUILT_IN: [(&str, &str); 3] = [
@@ -24,7 +26,7 @@ pub struct Script {
     /// Steps between two records, the first of which is at step 0.
     pub sample_every: u64,
     /// Points of the records.
-    pub sample_points: Vec<[usize; 2]>,
+    pub sample_points: Vec<PointId>,
     /// Surgical forces.
     pub forces: Vec<LoadProfile>,
     /// Grasped points.
@@ -35,8 +37,8 @@ pub struct Script {
     pub warnings: Vec<String>,
     /// Steps per second, from the scene.
     pub rate_hz: f64,
-    /// The sheet that it is bound to.
-    pub sheet: Sheet,
+    /// The rest shape of the tissue that it is bound to.
+    pub shape: Arc<dyn RestShape>,
 }
 
 impl Script {
@@ -47,7 +49,7 @@ impl Script {
         let poke = move |law: &LoadProfile, step: u64| {
             let poke = law.at(Moment::start_of(step), self.rate_hz);
             // A force that has left the sheet can no longer be commanded.
-            (poke.force_n != DVec3::ZERO && is_near(&self.sheet, poke.centre_m)).then_some(poke)
+            (poke.force_n != DVec3::ZERO && self.shape.is_near(poke.centre_m)).then_some(poke)
         };
         let pushes = self.forces.iter().enumerate().filter_map(move |(tool, law)| {
             let (before, now) = (step.checked_sub(1).and_then(|before| poke(law, before)), poke(law, step));

@@ -209,7 +209,7 @@ mod tests {
         }
 
         fn radius_m(&self) -> f64 {
-            self.live.model.scene.sheet.spacing_m
+            self.live.model.shape().edge_m()
         }
 
         /// The laws of a new stream.

@@ -27,12 +27,12 @@ use crate::pace::clock::now_ns;
 use crate::pace::queue::{Reader, Writer, queue};
 use crate::pace::{Held, Live, PacedSample, StreamGuard};
 use crate::refusal::{Reason, Refusal, number};
+use crate::scene::check::check_tip;
 use crate::scene::script::Action;
 use crate::session::command::Command;
 use crate::session::laws::{FIRST, Laws};
 use crate::session::lease::LeaseId;
 use crate::wire;
-use palpate_proto::geometry::from_point;
 use palpate_proto::pb::haptic_service_server::HapticService;
 use palpate_proto::{pb, touch};
 use palpate_touch::device::{Device, UNDECLARED_FORCE_N};
@@ -105,7 +105,7 @@ fn lease_id(text: &str) -> Result<LeaseId, Refusal> {
 /// A command, unless it leads the tool out of the declared workspace.
 fn within_reach(command: Command, live: &Live, device: Option<&Device>) -> Result<Command, Refusal> {
     if let (Action::Lead { place_m, .. }, Some(device)) = (&command.action, device) {
-        let middle_m = (live.model.scene.sheet.extent_m() / 2.0).extend(0.0);
+        let middle_m = live.model.shape().extent().middle_m();
         let away_m = (*place_m - middle_m).length();
         let range = format!("within {} m of the middle of the sheet, the device's workspace", device.workspace_m);
         number("pose.position_m", away_m, &range, |away_m| away_m <= device.workspace_m)?;
@@ -119,7 +119,7 @@ impl Haptics {
         let live = self.0.pacer.get(&open.session_id)?;
         let device = open.device.as_ref().map(touch::from_device).transpose()?;
         let tip = touch::from_tip(open.tip.as_ref());
-        live.model.scene.sheet.check_tip("tip", &tip)?;
+        check_tip("tip", live.model.shape(), &tip)?;
         let only = (!open.tools.is_empty()).then(|| open.tools.clone());
         let (every, deadband) = (open.sample_every_steps, open.deadband.as_ref());
         let mut sampling = wire::sample::sampling(every, only, deadband, open.heartbeat_s, device.is_some())?;
@@ -220,7 +220,7 @@ impl Haptics {
                     let now = now_ns();
                     let taken = bucket
                         .take(now, "commands of this stream")
-                        .and_then(|()| wire::command::from_command(&command, &live.model.scene.sheet, now))
+                        .and_then(|()| wire::command::from_command(&command, live.model.shape(), now))
                         .and_then(|command| within_reach(command, live, hold.device.as_ref()))
                         .and_then(|command| live.submit(hold.lease, vec![command]).map(drop));
                     self.0.traffic.commanded(usize::from(taken.is_ok()));
@@ -326,7 +326,7 @@ struct Outlet {
     ready: VecDeque<pb::touch_response::Message>,
     /// Answers that the client was too slow for.
     dropped_answers: u64,
-    _guard: StreamGuard,
+    guard: StreamGuard,
 }
 
 impl Outlet {
@@ -365,7 +365,7 @@ impl Outlet {
         let dropped_answers = self.dropped_answers;
         let told = |rejection| Message::Rejection(pb::Rejection { dropped_answers, ..rejection });
         self.ready.extend(self.notices.of(&paced.sample).into_iter().map(told));
-        self.ready.push_back(Message::Sample(wire::sample::sample(&paced, dropped, now_ns())));
+        self.ready.push_back(Message::Sample(wire::sample::sample(&paced, self.guard.shape(), dropped, now_ns())));
         Poll::Ready(self.ready.pop_front().map(Ok))
     }
 }
@@ -393,8 +393,7 @@ impl Stream for Output {
             Stage::Opening(opening, events) => match (ready!(Pin::new(opening).poll(context)), events.take()) {
                 (Ok(Ok(Opened { answer, updates, samples, notices, guard })), Some(events)) => {
                     let (ready, dropped_answers) = (VecDeque::new(), 0);
-                    let _guard = guard;
-                    *stage = Stage::Open(Outlet { updates, events, samples, notices, ready, dropped_answers, _guard });
+                    *stage = Stage::Open(Outlet { updates, events, samples, notices, ready, dropped_answers, guard });
                     Some(Ok(Message::Opened(answer)))
                 }
                 (Ok(Err(status)), _) => Some(Err(status)),
@@ -478,9 +477,9 @@ impl HapticService for Haptics {
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
         let lease = lease_id(&request.lease_id)?;
-        let sheet = &live.model.scene.sheet;
+        let shape = live.model.shape();
         let read = |(index, command): (usize, &pb::Command)| {
-            let command = wire::command::from_command(command, sheet, now);
+            let command = wire::command::from_command(command, shape, now);
             command.map_err(|refusal| refusal.within(&format!("commands[{index}]")))
         };
         let commands: Result<Vec<Command>, Refusal> = request.commands.iter().enumerate().map(read).collect();
@@ -492,7 +491,7 @@ impl HapticService for Haptics {
         let tools = live.at_intake(|intake, _| intake.tools_of(lease).collect());
         self.0.traffic.commanded(request.commands.len());
         let sample = live.next_sample(tools).await?;
-        let sample = Some(wire::sample::sample(&sample, 0, now_ns()));
+        let sample = Some(wire::sample::sample(&sample, shape, 0, now_ns()));
         Ok(Response::new(pb::SendCommandsResponse { sample }))
     }
 
@@ -512,7 +511,7 @@ impl HapticService for Haptics {
             let (mut samples, guard) = state?;
             Some(match samples.pop().await {
                 Ok((sample, dropped)) => {
-                    let sample = Some(wire::sample::sample(&sample, dropped, now_ns()));
+                    let sample = Some(wire::sample::sample(&sample, guard.shape(), dropped, now_ns()));
                     (Ok(pb::WatchSamplesResponse { sample }), Some((samples, guard)))
                 }
                 Err(refusal) => (Err(refusal.into()), None),
@@ -536,9 +535,7 @@ impl HapticService for Haptics {
                 }
                 let mut points = Vec::with_capacity(named.points.len());
                 for (index, point) in named.points.iter().enumerate() {
-                    let point = from_point(point);
-                    live.model.scene.sheet.index(&format!("points[{index}]"), point)?;
-                    points.push(point);
+                    points.push(live.model.shape().find(&format!("points[{index}]"), wire::from_point(point))?);
                 }
                 Some(points)
             }

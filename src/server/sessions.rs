@@ -202,7 +202,9 @@ fn script_part(script: &Script, from: u64) -> (pb::GetScriptResponse, Option<u64
     let end = script.steps.min(from + STEPS_PER_PART);
     let mut step = from;
     while step < end && message.commands.len() < COMMANDS_PER_PART {
-        let commands = script.actions_at(step).map(|(tool, action)| wire::command::scripted(tool, step, &action, 0));
+        let commands = script
+            .actions_at(step)
+            .map(|(tool, action)| wire::command::scripted(&*script.shape, tool, step, &action, 0));
         message.commands.extend(commands);
         step += 1;
     }

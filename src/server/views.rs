@@ -71,12 +71,11 @@ impl ViewService for Views {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
-        let grid = Refinement::new(live.model.points, request.refinement, &self.0.config.limits)?;
+        let grid = Refinement::new(&live.model.scene, request.refinement, &self.0.config.limits)?;
         let guard = live.open_stream("GetMesh", Held::Nothing, &account)?;
         let cut = guard.cut().clone();
-        let spacing_m = grid.spacing_m(live.model.scene.sheet.spacing_m);
         let out = stream::unfold((0, guard), move |(part, guard)| async move {
-            mesh_part(grid, spacing_m, part).map(|message| (Ok(message), (part + 1, guard)))
+            mesh_part(grid, part).map(|message| (Ok(message), (part + 1, guard)))
         });
         Ok(Response::new(until_cut(out, cut)))
     }
@@ -110,7 +109,7 @@ impl ViewService for Views {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
-        let grid = Refinement::new(live.model.points, request.refinement, &self.0.config.limits)?;
+        let grid = Refinement::new(&live.model.scene, request.refinement, &self.0.config.limits)?;
         let encoding = match pb::Encoding::try_from(request.encoding) {
             Ok(pb::Encoding::Unspecified | pb::Encoding::F32) => Encoding::F32,
             Ok(pb::Encoding::I16) => Encoding::I16,
@@ -167,11 +166,11 @@ const BYTES_PER_PART: usize = 64 << 10;
 const CELLS_PER_PART: usize = 2048;
 
 /// Part `part` of a mesh: first the vertices, then the triangles.
-#[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
-fn mesh_part(grid: Refinement, spacing_m: f64, part: usize) -> Option<pb::GetMeshResponse> {
+#[allow(clippy::cast_possible_truncation)]
+fn mesh_part(grid: Refinement, part: usize) -> Option<pb::GetMeshResponse> {
     let [nx, ny] = grid.vertices();
-    let cells = (nx - 1) * (ny - 1);
-    let vertex_parts = (nx * ny).div_ceil(VERTICES_PER_PART);
+    let (vertices, cells) = (grid.vertex_count(), grid.cell_count());
+    let vertex_parts = vertices.div_ceil(VERTICES_PER_PART);
     let parts = vertex_parts + cells.div_ceil(CELLS_PER_PART);
     if part >= parts {
         return None;
@@ -179,25 +178,20 @@ fn mesh_part(grid: Refinement, spacing_m: f64, part: usize) -> Option<pb::GetMes
     let mut message = pb::GetMeshResponse {
         vertices_x: nx as u32,
         vertices_y: ny as u32,
-        vertex_spacing_m: spacing_m,
+        vertex_spacing_m: grid.spacing_m(),
         last: part + 1 == parts,
         ..Default::default()
     };
     if part < vertex_parts {
         let first = part * VERTICES_PER_PART;
-        let share = |a: usize, points: usize| a as f32 / (points - 1).max(1) as f32;
-        for index in first..(first + VERTICES_PER_PART).min(nx * ny) {
-            let (a, b) = (index / ny, index % ny);
-            message.rest_position_m.extend([(a as f64 * spacing_m) as f32, (b as f64 * spacing_m) as f32, 0.0]);
-            message.texture_coordinates.extend([share(a, nx), share(b, ny)]);
+        for vertex in first..(first + VERTICES_PER_PART).min(vertices) {
+            message.rest_position_m.extend(grid.rest_m(vertex).as_vec3().to_array());
+            message.texture_coordinates.extend(grid.texture_at(vertex).as_vec2().to_array());
         }
     } else {
         let first = (part - vertex_parts) * CELLS_PER_PART;
         for cell in first..(first + CELLS_PER_PART).min(cells) {
-            let (a, b) = (cell / (ny - 1), cell % (ny - 1));
-            let corner = (a * ny + b) as u32;
-            let (right, up) = (corner + ny as u32, corner + 1);
-            message.triangles.extend([corner, right, right + 1, corner, right + 1, up]);
+            message.triangles.extend(grid.triangles(cell).map(|vertex| vertex as u32));
         }
     }
     Some(message)

@@ -44,15 +44,17 @@ pub fn check(model: &Arc<Model>, limits: &Limits, clock_s: &dyn Fn() -> f64) -> 
 /// Times the step under a poke that moves the middle by about a tenth of a spacing, so that values have usual sizes.
 fn time(model: &Arc<Model>, clock_s: &dyn Fn() -> f64) -> Option<[f64; 2]> {
     // Measure the cost of a step while the whole sheet moves.
-    let mut session = Session::new(&Arc::new(Model { sleep_tolerance: 0.0, ..Model::clone(model) }));
+    let mut awake = Model::clone(model);
+    awake.sleep_tolerance = 0.0;
+    let mut session = Session::new(&Arc::new(awake));
     let scene = &model.scene;
     let stiffness = scene.virtual_stiffness_n_per_m + 0.1 * scene.springs.stiffness_n_per_m;
     session.tissue.push(
         0,
         Some(Push::Held(Poke {
-            centre_m: scene.sheet.extent_m() / 2.0,
-            force_n: DVec3::new(0.03, 0.0, -0.1) * stiffness * scene.sheet.spacing_m,
-            falloff_per_m: 4.0 / scene.sheet.spacing_m,
+            centre_m: model.shape().extent().middle_m(),
+            force_n: DVec3::new(0.03, 0.0, -0.1) * stiffness * model.shape().edge_m(),
+            falloff_per_m: 4.0 / model.shape().edge_m(),
             falloff_offset: 0.0,
         })),
     );
@@ -77,8 +79,13 @@ impl fmt::Display for Report {
         let model = &self.model;
         let (scene, plan) = (&model.scene, &model.plan);
         let sheet = Oscillator::of(scene);
-        let [nx, ny] = scene.sheet.points;
-        writeln!(f, "scene         {}: {nx} × {ny} points, {} steps a second", scene.name, scene.stepping.rate_hz)?;
+        writeln!(
+            f,
+            "scene         {}: {}, {} steps a second",
+            scene.name,
+            model.shape().describe(),
+            scene.stepping.rate_hz
+        )?;
         let slowest = (sheet.virtual_stiffness_n_per_m / sheet.mass_kg).sqrt();
         writeln!(
             f,

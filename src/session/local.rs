@@ -147,7 +147,6 @@ fn around(normal: DVec3, along: f64, across: f64) -> DMat3 {
 
 #[cfg(test)]
 mod tests {
-    use glam::DVec2;
 
     use super::*;
 
@@ -159,7 +158,7 @@ mod tests {
             standing,
             force_on_tool_n: DVec3::ZERO,
             surface_m: surface_m * DVec3::Z,
-            anchor_m: DVec2::ZERO,
+            anchor_m: DVec3::ZERO,
             normal: DVec3::Z,
             friction: 0.2,
         }

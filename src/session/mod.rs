@@ -31,10 +31,10 @@ use std::sync::Arc;
 use glam::DVec3;
 
 use crate::memory;
-use crate::scene::check::nearest_point;
 use crate::scene::law::{LoadProfile, MotionProfile};
 use crate::scene::record::{EnergyJ, Point, Record, Recovery};
 use crate::scene::script::Action;
+use crate::shape::{self, PointId, PointName};
 use crate::sheet::audit::{Inputs, Mark};
 use crate::sheet::{self, BlowUp, Energy, Feel, Grasp, Model, PointState, Push, SheetCopy, Tissue};
 use command::Due;
@@ -80,7 +80,7 @@ pub struct ToolSample {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Contact {
     /// The mass point.
-    pub point: [usize; 2],
+    pub point: PointId,
     /// From rest, m.
     pub displacement_m: DVec3,
     /// m/s.
@@ -117,7 +117,7 @@ struct Tool {
     acknowledged_sequence: u64,
     client_time_ns: u64,
     arrival_ns: u64,
-    control_point: Option<[usize; 2]>,
+    control_point: Option<PointId>,
     expires_at: Option<u64>,
     late: bool,
     expired: bool,
@@ -377,18 +377,17 @@ impl Session {
         match command.action {
             Action::Push(poke) => {
                 self.tool(index).led = None;
-                let point = nearest_point(&self.model().scene.sheet, poke.centre_m);
+                let point = self.model().shape().nearest(poke.centre_m);
                 self.tool(index).control_point = Some(point);
                 self.tissue.push(index, Some(Push::Held(poke)));
             }
             Action::Grasp { point, displacement_m } => {
                 self.tool(index).led = None;
                 self.tool(index).control_point = Some(point);
-                let place = self.model().index_of(point);
-                self.tissue.grasp(index, place, Grasp::Held(displacement_m));
+                self.tissue.grasp(index, point, Grasp::Held(displacement_m));
             }
             Action::Lead { place_m, tip } => {
-                let point = nearest_point(&self.model().scene.sheet, place_m.truncate());
+                let point = self.model().shape().nearest(place_m);
                 let client_time_s = command.client_time_ns as f64 * 1e-9;
                 let now_s = self.time_s();
                 let tool = self.tool(index);
@@ -432,8 +431,7 @@ impl Session {
     /// Applies a movement as a continuous law.
     pub fn play_move(&mut self, tool: usize, law: MotionProfile) {
         self.recoveries.disturb();
-        let index = self.model().index_of(law.point);
-        self.tissue.grasp(tool, index, Grasp::Law(law));
+        self.tissue.grasp(tool, law.point, Grasp::Law(law));
     }
 
     /// The samples of the tools; only those with a number in `only`, if given.
@@ -442,15 +440,15 @@ impl Session {
             let tool = self.tools.get(number as usize).cloned().unwrap_or_default();
             let feel = self.tissue.feel(number as usize);
             let led = |feel: Feel| Contact {
-                point: nearest_point(&self.model().scene.sheet, feel.anchor_m),
-                displacement_m: feel.surface_m - feel.anchor_m.extend(0.0),
+                point: self.model().shape().nearest(feel.anchor_m),
+                displacement_m: feel.surface_m - feel.anchor_m,
                 velocity_m_per_s: feel.velocity_m_per_s,
                 force_on_tool_n: feel.force_on_tool_n,
                 applied_force_n: -feel.force_on_tool_n,
             };
             let contact = feel.map(led).or_else(|| {
                 tool.control_point.map(|point| {
-                    let state = self.tissue.point(self.model().index_of(point));
+                    let state = self.tissue.point(point);
                     Contact {
                         point,
                         displacement_m: state.displacement_m,
@@ -503,17 +501,15 @@ impl Session {
         energy_record(self.tissue.energy())
     }
 
-    /// A record of `points` (grid indices [i, j]), or of all points, without energies.
-    pub fn record(&self, points: Option<&[[usize; 2]]>) -> Record {
-        let of = |point: &[usize; 2]| point_record(*point, &self.tissue.point(self.model().index_of(*point)));
+    /// A record of `points`, or of all points, without energies.
+    pub fn record(&self, points: Option<&[PointId]>) -> Record {
+        let shape = self.model().shape();
+        let of = |point: PointId| point_record(shape.name(point), &self.tissue.point(point));
         Record {
             time_s: self.time_s(),
             points: match points {
-                Some(points) => memory::collected(points.iter().map(of), RECORD),
-                None => {
-                    let all = (0..self.model().len()).map(|index| of(&self.model().point_of(index)));
-                    memory::collected(all, RECORD)
-                }
+                Some(points) => memory::collected(points.iter().copied().map(of), RECORD),
+                None => memory::collected(shape::points(shape).map(of), RECORD),
             },
             energy_j: None,
             awake_points: self.tissue.awake_points(),
@@ -521,20 +517,20 @@ impl Session {
     }
 }
 
-/// The record of a point (grid indices [i, j]) of a copy.
-pub fn record_of(still: &SheetCopy, point: [usize; 2]) -> Point {
-    point_record(point, &still.point(still.model().index_of(point)))
+/// The record of a point of a copy.
+pub fn record_of(still: &SheetCopy, point: PointId) -> Point {
+    point_record(still.model().shape().name(point), &still.point(point))
 }
 
 fn energy_record(energy: Energy) -> EnergyJ {
     EnergyJ { kinetic: energy.kinetic_j, spring: energy.spring_j, virtual_springs: energy.virtual_j }
 }
 
-fn point_record(point: [usize; 2], state: &PointState) -> Point {
+fn point_record(name: PointName, state: &PointState) -> Point {
     // Write −0 as 0.
     let array = |v: DVec3| (v + DVec3::ZERO).to_array();
     Point {
-        point,
+        name,
         displacement_m: array(state.displacement_m),
         velocity_m_per_s: array(state.velocity_m_per_s),
         spring_n: array(state.spring_n),

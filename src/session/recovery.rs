@@ -154,15 +154,16 @@ mod tests {
     use crate::scene::script::Action;
     use crate::session::Session;
     use crate::session::command::{Command, Due};
+    use crate::shape::{PointId, PointName};
     use crate::sheet::guard::Cause;
     use crate::sheet::{BlowUp, Model};
 
     fn blow_up(step: u64) -> BlowUp {
-        BlowUp { step, cause: Cause::NotFinite { point: [0, 0] } }
+        BlowUp { step, cause: Cause::NotFinite { point: PointName::Point([0, 0]) } }
     }
 
     fn grasp(tool: u32, sequence: u64) -> Due {
-        let action = Action::Grasp { point: [2, 2], displacement_m: glam::DVec3::Z * 1e-3 };
+        let action = Action::Grasp { point: PointId::new(12), displacement_m: glam::DVec3::Z * 1e-3 };
         let (at_step, time_to_live_s) = (None, None);
         let command = Command { tool, sequence, client_time_ns: 0, at_step, time_to_live_s, action, arrival_ns: 0 };
         Due { command, late: false, late_commands: 0, ends_lease: false }

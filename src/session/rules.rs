@@ -4,7 +4,7 @@ use super::command::Command;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, positive};
 use crate::scene::Scene;
-use crate::scene::check::{check_free, check_poke, check_reach};
+use crate::scene::check::{self, check_free, check_poke, check_reach};
 use crate::scene::script::Action;
 
 /// The rules of a session.
@@ -37,18 +37,18 @@ impl Rules {
             positive("time_to_live_s", seconds)?;
         }
         match &command.action {
-            Action::Push(poke) => check_poke(poke, &self.scene.sheet, &self.limits),
+            Action::Push(poke) => check_poke(poke, self.scene.shape(), &self.limits),
             Action::Grasp { point, displacement_m } => {
-                check_free("position.point", &self.scene.sheet, *point)?;
+                check_free("position.point", self.scene.shape(), *point)?;
                 crate::refusal::finite_vector("position.displacement_m", *displacement_m)?;
                 let far_m = displacement_m.length();
-                check_reach("position.displacement_m", &self.scene.sheet, far_m, &self.limits)
+                check_reach("position.displacement_m", self.scene.shape(), far_m, &self.limits)
             }
             Action::Lead { place_m, tip } => {
                 crate::refusal::finite_vector("place_m", *place_m)?;
-                let centre_m = (self.scene.sheet.extent_m() / 2.0).extend(0.0);
-                check_reach("place_m", &self.scene.sheet, (*place_m - centre_m).length(), &self.limits)?;
-                self.scene.sheet.check_tip("tip", tip)
+                let centre_m = self.scene.shape().extent().middle_m();
+                check_reach("place_m", self.scene.shape(), (*place_m - centre_m).length(), &self.limits)?;
+                check::check_tip("tip", self.scene.shape(), tip)
             }
             Action::Release => Ok(()),
         }

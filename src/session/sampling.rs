@@ -247,6 +247,7 @@ mod tests {
     use crate::force_law;
     use crate::scene::script::Action;
     use crate::session::command::{Command, Due};
+    use crate::shape::PointId;
     use crate::sheet::Model;
     use glam::DVec3;
     use palpate_touch::Tip;
@@ -270,7 +271,11 @@ mod tests {
     }
 
     fn grasp(session: &mut Session, sequence: u64, z_m: f64) {
-        tell(session, sequence, Action::Grasp { point: [15, 15], displacement_m: DVec3::new(0.0, 0.0, z_m) });
+        tell(
+            session,
+            sequence,
+            Action::Grasp { point: PointId::new(15 * 31 + 15), displacement_m: DVec3::new(0.0, 0.0, z_m) },
+        );
     }
 
     #[test]
@@ -284,7 +289,7 @@ mod tests {
             let law = Arc::new(force_law::exact(session.model(), tip.radius_m));
             let laws = Some(Arc::new(Laws::new(law.clone())));
             let mut sampler = Sampler::new(Sampling { laws, touch_stiffness, ..sampling() }, 1000.0);
-            let middle_m = (session.model().scene.sheet.extent_m() / 2.0).extend(0.0);
+            let middle_m = session.model().shape().extent().middle_m();
             let (mut model, mut touched) = (None, false);
             for step in 1..=100 {
                 let place_m = middle_m - 1e-4 * step as f64 * DVec3::Z;
@@ -358,7 +363,7 @@ mod tests {
     #[test]
     fn of_two_bounds_of_the_force_the_larger_counts() {
         let contact = |z_n: f64| crate::session::Contact {
-            point: [0, 0],
+            point: PointId::new(0),
             displacement_m: DVec3::ZERO,
             velocity_m_per_s: DVec3::ZERO,
             force_on_tool_n: DVec3::new(0.0, 0.0, z_n),

@@ -151,7 +151,7 @@ fn reached<T: Real>(poke: &Poke, model: &Model) -> [[usize; 2]; 2] {
 
 impl<T: Real> Term<T> {
     fn new() -> Self {
-        let poke = Poke { centre_m: glam::DVec2::ZERO, force_n: DVec3::ZERO, falloff_per_m: 0.0, falloff_offset: 0.0 };
+        let poke = Poke { centre_m: DVec3::ZERO, force_n: DVec3::ZERO, falloff_per_m: 0.0, falloff_offset: 0.0 };
         Term {
             wanted: Wanted { poke, forces_n: [DVec3::ZERO; 3] },
             gain: 1.0,
@@ -175,7 +175,7 @@ impl<T: Real> Term<T> {
         self.gain = libm::exp(poke.falloff_offset);
         self.factors.resize(self.rows.len() * layout.stride);
         let falloff = Falloff {
-            centre: (poke.centre_m / spacing_m).to_array(),
+            centre: (poke.centre_m.truncate() / spacing_m).to_array(),
             per_spacing: poke.falloff_per_m * spacing_m,
             rows: self.rows.clone(),
             columns: self.columns.clone(),

@@ -29,6 +29,7 @@ use super::watch::{Replay, Resume, Watch};
 use crate::memory;
 use crate::scene::Precision;
 pub use crate::scene::record::AuditedError;
+use crate::shape::PointId;
 
 /// The twin's substep is 1/`FINER` of the sheet's.
 pub const FINER: u32 = 4;
@@ -312,7 +313,7 @@ impl<T: Real> Replay for Sheet<T> {
 
     fn observed(&self) -> Vec<[DVec3; 2]> {
         let points = (0..self.model.len()).map(|index| {
-            let point = self.point(index);
+            let point = self.point(PointId::new(index));
             [point.displacement_m, point.reaction_n()]
         });
         memory::collected(points, "an audit")

@@ -9,6 +9,7 @@ use super::contact::Contacts;
 use super::field::State;
 use super::prescribed::{Grasp, Prescribed};
 use super::real::Real;
+use crate::shape::PointName;
 use palpate_touch::Tip;
 
 /// Tolerance of the energy balance, as a fraction of energy and of work: errors of the schemes at the stability bound.
@@ -20,7 +21,7 @@ pub enum Cause {
     /// A point is not finite, or is displaced by a billion times the sheet's size.
     NotFinite {
         /// The point.
-        point: [usize; 2],
+        point: PointName,
     },
     /// Energy from nowhere.
     Energy {
@@ -41,8 +42,8 @@ pub enum Cause {
 impl fmt::Display for Cause {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Cause::NotFinite { point: [i, j] } => {
-                write!(f, "point [{i}, {j}] was not finite (or a billion sheets away)")
+            Cause::NotFinite { point } => {
+                write!(f, "point {point} was not finite (or a billion sheets away)")
             }
             Cause::Energy { energy_j, before_j, work_j } => {
                 write!(

@@ -22,7 +22,7 @@
 
 use std::sync::Arc;
 
-use glam::{DVec2, DVec3};
+use glam::DVec3;
 
 use super::field::{Layout, State};
 use super::footprint::{Footprint, Reached};
@@ -44,8 +44,8 @@ pub struct Feel {
     pub force_on_tool_n: DVec3,
     /// Place of the surface under the tool, m.
     pub surface_m: DVec3,
-    /// The material point there, in the rest plane, m.
-    pub anchor_m: DVec2,
+    /// Where the material point there rests, m.
+    pub anchor_m: DVec3,
     /// Unit normal out of the tissue.
     pub normal: DVec3,
     /// μ of the tool's tip.

@@ -1,7 +1,7 @@
 //! Test of a sheet that rings down: no value becomes so small that the processor handles it slowly.
 #![allow(clippy::unwrap_used)]
 
-use glam::{DVec2, DVec3};
+use glam::DVec3;
 
 use super::motion::Sheet;
 use super::real::Real;
@@ -28,7 +28,7 @@ fn rings_down<T: Real, const CUTS_U: bool>(sets: &[&str]) {
         let Ok(model) = Model::compile(&scene, &Limits::default()) else { continue };
         let mut sheet = Sheet::<T>::new(&model);
         let poke = Poke {
-            centre_m: scene.sheet.spacing_m * DVec2::new(2.0, 7.0),
+            centre_m: scene.sheet.spacing_m * DVec3::new(2.0, 7.0, 0.0),
             force_n: DVec3::new(0.2, -0.1, 1.0),
             falloff_per_m: 1.0 / (1.3 * scene.sheet.spacing_m),
             falloff_offset: 0.0,

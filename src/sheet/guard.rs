@@ -23,6 +23,7 @@ use super::springs::Springs;
 use super::survey::Survey;
 use super::tissue::BlowUp;
 use crate::memory;
+use crate::shape::PointId;
 
 /// Substeps between two surveys.
 pub const INTERVAL_SUBSTEPS: u64 = 256;
@@ -49,7 +50,7 @@ impl<T: Real> Sheet<T> {
         let farthest = farthest_in_spacings(&self.model);
         let calm = self.tables.is_calm(farthest);
         let scan = || match broken_point(&self.model, &self.tables.layout, &self.state) {
-            Some(index) => Err(Cause::NotFinite { point: self.model.point_of(index) }),
+            Some(index) => Err(Cause::NotFinite { point: self.model.shape().name(PointId::new(index)) }),
             None => Ok(()),
         };
         if !calm {
@@ -189,7 +190,7 @@ impl<T: Real> Sheet<T> {
 
 /// Displacements beyond this are a blow-up: far beyond any tissue, and far below what f32 can square.
 pub(super) fn farthest_in_spacings(model: &Model) -> f64 {
-    1e9 * model.scene.sheet.longer_side_m() / model.scene.sheet.spacing_m
+    1e9 * model.shape().longest_side_m() / model.scene.sheet.spacing_m
 }
 
 /// The number of a point that is not finite or beyond the bound, if there is one.
@@ -234,7 +235,8 @@ pub(super) fn convert<T: Real>(
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use glam::{DVec2, DVec3};
+    use crate::shape::PointName;
+    use glam::DVec3;
 
     use super::*;
     use crate::scene::law::Poke;
@@ -253,7 +255,7 @@ mod tests {
         sheet.push(
             0,
             Some(Push::Held(Poke {
-                centre_m: scene.sheet.spacing_m * DVec2::new(3.0, 4.0),
+                centre_m: scene.sheet.spacing_m * DVec3::new(3.0, 4.0, 0.0),
                 force_n: DVec3::new(0.1, -0.2, -1.0),
                 falloff_per_m: 0.7 / scene.sheet.spacing_m,
                 falloff_offset: 0.0,
@@ -267,7 +269,7 @@ mod tests {
     fn apart(a: &Sheet<f64>, b: &Sheet<f64>) -> [f64; 2] {
         let (mut most, mut largest) = ([0.0_f64; 2], [0.0_f64; 2]);
         for index in 0..a.model.len() {
-            let [p, q] = [a, b].map(|sheet| sheet.point(index));
+            let [p, q] = [a, b].map(|sheet| sheet.point(PointId::new(index)));
             let pairs = [(p.displacement_m, q.displacement_m), (p.velocity_m_per_s, q.velocity_m_per_s)];
             for (which, (p, q)) in pairs.into_iter().enumerate() {
                 most[which] = most[which].max(p.distance(q));
@@ -315,7 +317,7 @@ mod tests {
             let work_j = sheet.work.done_j - sheet.present_work_j(&survey);
             assert!((work_j - energy_j).abs() < 0.02 * energy_j, "{integrator}: {work_j} J, {energy_j} J");
             let mass_kg = sheet.model.scene.sheet.point_mass_kg;
-            let points = (0..sheet.model.len()).map(|index| sheet.point(index));
+            let points = (0..sheet.model.len()).map(|index| sheet.point(PointId::new(index)));
             let kinetic_j: f64 = points.map(|point| 0.5 * mass_kg * point.velocity_m_per_s.length_squared()).sum();
             assert!((energy.kinetic_j - kinetic_j).abs() < 1e-9 * kinetic_j, "{integrator}: {energy:?} {kinetic_j}");
             // And goes on so.
@@ -342,7 +344,7 @@ mod tests {
             assert_eq!(broken_point(&sheet.model, &layout, &sheet.state), Some(index));
             // A survey is due at step 64.
             sheet.steps = 64;
-            assert_eq!(sheet.check(), Err(Cause::NotFinite { point: [2, 5] }), "{broken}");
+            assert_eq!(sheet.check(), Err(Cause::NotFinite { point: PointName::Point([2, 5]) }), "{broken}");
         }
     }
 

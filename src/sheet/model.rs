@@ -4,6 +4,7 @@ use super::field::{BLOCK, Layout};
 use super::integrate::{Node, Oscillator, Scheme};
 use super::stability;
 use crate::scene::{Integrator, Lanes, Precision, Scene};
+use crate::shape::{self, PointId, RestShape};
 
 /// The immutable half of a sheet.
 #[derive(Debug, Clone)]
@@ -11,9 +12,9 @@ pub struct Model {
     /// What it was compiled from.
     pub scene: Scene,
     /// Points along x (rows) and along y (within a row).
-    pub points: [usize; 2],
+    pub(super) points: [usize; 2],
     /// Places of the fixed points, rising.
-    pub fixed: Vec<usize>,
+    pub(super) fixed: Vec<usize>,
     /// ω_b = √((largest spring stiffness + K″)/m): no vibration is faster, under any deformation, rad/s.
     pub omega_bound_per_s: f64,
     /// The scheme.
@@ -141,6 +142,16 @@ impl Model {
         (fields * 3 * plane_bytes) as u64
     }
 
+    /// The rest shape.
+    pub fn shape(&self) -> &dyn RestShape {
+        self.scene.shape()
+    }
+
+    /// All points.
+    pub fn points(&self) -> impl ExactSizeIterator<Item = PointId> + Clone + use<> {
+        shape::points(self.shape())
+    }
+
     /// Number of points.
     pub fn len(&self) -> usize {
         self.points[0] * self.points[1]
@@ -157,12 +168,12 @@ impl Model {
     }
 
     /// The grid place of an array place.
-    pub fn point_of(&self, index: usize) -> [usize; 2] {
+    pub(super) fn point_of(&self, index: usize) -> [usize; 2] {
         [index / self.points[1], index % self.points[1]]
     }
 
     /// The array place of a grid place that is on the sheet.
-    pub fn index_of(&self, [i, j]: [usize; 2]) -> usize {
+    pub(super) fn index_of(&self, [i, j]: [usize; 2]) -> usize {
         i * self.points[1] + j
     }
 }
@@ -197,7 +208,7 @@ mod tests {
                 let mut tissue = crate::sheet::at_rest(&model);
                 for (tool, point) in [[0, 0], [3, 11]].into_iter().enumerate() {
                     let force_n = glam::DVec3::new(0.7, 0.2, -0.9) * [1.0, -1.5][tool];
-                    let (centre_m, falloff_per_m) = (scene.sheet.rest_m(point), 25.0);
+                    let (centre_m, falloff_per_m) = (scene.shape().rest_m(scene.sheet.point(point)), 25.0);
                     let poke = Poke { centre_m, force_n, falloff_per_m, falloff_offset: 0.0 };
                     tissue.push(tool, Some(crate::sheet::Push::Held(poke)));
                 }
@@ -218,12 +229,4 @@ mod tests {
         "83a4672a09aa9fcfbccb48193d6e98c8",
         "d8f80cac7b2adfaa3508266eae6561de",
     ];
-
-    #[test]
-    fn numbers_and_grid_places_of_points_belong_to_each_other() {
-        let model = Model::paper(&["sheet.points=[3, 7]", "stepping.integrator=central", "stepping.substeps=1"]);
-        let places: Vec<[usize; 2]> = (0..3).flat_map(|i| (0..7).map(move |j| [i, j])).collect();
-        assert_eq!((0..model.len()).map(|index| model.point_of(index)).collect::<Vec<_>>(), places);
-        assert!(places.iter().enumerate().all(|(index, place)| model.index_of(*place) == index));
-    }
 }

@@ -24,6 +24,7 @@ use super::tissue::{BlowUp, Energy, PointState, Released, SheetCopy, Tissue};
 use super::watch::{Inputs, Mark, Watch};
 use crate::scene::Precision;
 use crate::scene::law::{Moment, Motion};
+use crate::shape::PointId;
 use palpate_touch::Tip;
 
 /// Creates a sheet at rest.
@@ -258,7 +259,7 @@ impl<T: Real> Sheet<T> {
                 self.applied.set(tool, None);
                 self.contacts.release(tool);
                 self.tiles.wake_under([self.model.point_of(index)]);
-                let PointState { displacement_m, velocity_m_per_s, .. } = self.point(index);
+                let PointState { displacement_m, velocity_m_per_s, .. } = self.point(PointId::new(index));
                 let now = Motion { displacement_m, velocity_m_per_s, ..Motion::default() };
                 self.prescribed.grasp(tool, index, grasp, now);
             }
@@ -300,8 +301,8 @@ impl<T: Real> Tissue for Sheet<T> {
         self.input(tool, Input::Push(push));
     }
 
-    fn grasp(&mut self, tool: usize, index: usize, grasp: Grasp) {
-        self.input(tool, Input::Grasp(index, grasp));
+    fn grasp(&mut self, tool: usize, point: PointId, grasp: Grasp) {
+        self.input(tool, Input::Grasp(point.index(), grasp));
     }
 
     fn lead(&mut self, tool: usize, place_m: DVec3, tip: Tip) {
@@ -363,7 +364,8 @@ impl<T: Real> Tissue for Sheet<T> {
         Sheet::recover(self, step, to_rest)
     }
 
-    fn point(&self, index: usize) -> PointState {
+    fn point(&self, point: PointId) -> PointState {
+        let index = point.index();
         let scene = &self.model.scene;
         let applied_n = match self.steps {
             0 => self.applied.from(&self.model, index, Moment::start_of(0)),

@@ -21,6 +21,7 @@ use super::motion::at_rest;
 use super::{lanes, stability};
 use crate::scene::law::{CentreProfile, LoadProfile, Profile, StrengthProfile};
 use crate::scene::{Fixed, Integrator, PointSet, Precision, Scene};
+use crate::shape::PointId;
 
 /// Points along a side at most. Larger sheets err alike: a force spreads over some points.
 const SIDE: usize = 12;
@@ -117,7 +118,7 @@ impl<'s> Rehearsal<'s> {
         if let Fixed::Points(points) = &mut small.sheet.fixed {
             *points = points.as_slice().iter().copied().filter(|[i, j]| *i < SIDE && *j < SIDE).collect();
         }
-        if small.sheet.is_fixed(pushed(&small)) {
+        if small.shape().is_fixed(small.sheet.point(pushed(&small))) {
             small.sheet.fixed = Fixed::Points(PointSet::default());
         }
         small.stepping.rate_hz = scene.stepping.rate_hz * f64::from(parts);
@@ -222,7 +223,7 @@ impl<'s> Rehearsal<'s> {
         let newtons = spacing_m * if stiffness > 0.0 { stiffness } else { free };
         let mut tissue = at_rest(&model);
         let law = LoadProfile {
-            centre: CentreProfile::Hops(vec![(0, scene.sheet.rest_m(at))]),
+            centre: CentreProfile::Hops(vec![(0, scene.shape().rest_m(scene.sheet.point(at)))]),
             strength: StrengthProfile::Scaled(load.force * newtons, load.profile),
             falloff_per_m: load.falloff / spacing_m,
             falloff_offset: 0.0,
@@ -234,7 +235,7 @@ impl<'s> Rehearsal<'s> {
         while is_sound && course.len() < steps {
             is_sound = tissue.step().is_ok() && tissue.guard_events() == 0 && !self.is_stopped();
             course.push(looked_at.map(|index| {
-                let point = tissue.point(index);
+                let point = tissue.point(PointId::new(index));
                 [point.displacement_m, point.reaction_n()]
             }));
         }

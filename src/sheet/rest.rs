@@ -102,7 +102,8 @@ impl<T: Real> Sheet<T> {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use glam::{DVec2, DVec3};
+    use crate::shape::PointId;
+    use glam::DVec3;
 
     use super::*;
     use crate::scene::law::Poke;
@@ -112,7 +113,7 @@ mod tests {
         let always = ["stepping.integrator=central", "stepping.substeps=1"];
         let model = Model::paper(&[&always[..], sets].concat());
         let mut sheet = Sheet::new(&model);
-        let centre_m = model.scene.sheet.spacing_m * DVec2::ONE;
+        let centre_m = model.scene.sheet.spacing_m * DVec3::new(1.0, 1.0, 0.0);
         let force_n = DVec3::new(0.0, 0.0, -1.0);
         sheet.push(0, Some(Push::Held(Poke { centre_m, force_n, falloff_per_m, falloff_offset: 0.0 })));
         sheet
@@ -142,7 +143,7 @@ mod tests {
             sheet.step().unwrap();
         }
         assert!(sheet.is_still());
-        let z_m = sheet.point(4).displacement_m.z;
+        let z_m = sheet.point(PointId::new(4)).displacement_m.z;
         assert!((z_m + 1.0 / 500.0).abs() < 1e-5 / 500.0, "{z_m}");
     }
 }

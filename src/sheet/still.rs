@@ -56,7 +56,8 @@ impl<T: Real> Sheet<T> {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use glam::{DVec2, DVec3};
+    use crate::shape;
+    use glam::DVec3;
 
     use crate::scene::law::Poke;
     use crate::sheet::field::BLOCK;
@@ -72,18 +73,18 @@ mod tests {
             let model = Model::paper(&sets);
             let mut tissue = at_rest(&model);
             let spacing_m = model.scene.sheet.spacing_m;
-            let centre_m = spacing_m * DVec2::new(1.0, 20.0);
+            let centre_m = spacing_m * DVec3::new(1.0, 20.0, 0.0);
             let force_n = DVec3::new(0.2, 0.1, -0.8);
             let falloff_per_m = 1.0 / spacing_m;
             tissue.push(0, Some(Push::Held(Poke { centre_m, force_n, falloff_per_m, falloff_offset: 0.0 })));
-            tissue.grasp(1, model.index_of([1, 30]), Grasp::Held(DVec3::new(0.0, 0.0, 0.3 * spacing_m)));
+            tissue.grasp(1, model.scene.sheet.point([1, 30]), Grasp::Held(DVec3::new(0.0, 0.0, 0.3 * spacing_m)));
             (0..25).for_each(|_| tissue.step().unwrap());
             let still = tissue.still();
-            let (hash, points) = (tissue.state_hash(), (0..model.len()).map(|index| tissue.point(index)));
+            let (hash, points) = (tissue.state_hash(), shape::points(model.shape()).map(|point| tissue.point(point)));
             let points: Vec<_> = points.collect();
             (0..5).for_each(|_| tissue.step().unwrap());
             assert_ne!(tissue.state_hash(), hash);
-            assert!(points.iter().enumerate().all(|(index, point)| still.point(index) == *point), "{sets:?}");
+            assert!(shape::points(model.shape()).zip(&points).all(|(id, point)| still.point(id) == *point), "{sets:?}");
             for slice in [1, 16, 700, usize::MAX] {
                 let (mut hashing, mut slices) = (Hashing::default(), 1);
                 let found = loop {

@@ -19,6 +19,7 @@ use super::footprint::{Footprint, Reached};
 use super::model::Model;
 use crate::memory;
 use crate::scene::{Fixed, Sheet};
+use crate::shape::RestShape;
 
 /// How many times its reach around a disc the sheet is looked at: e⁻⁶ is left.
 const REACHES: f64 = 6.0;
@@ -444,8 +445,8 @@ fn symmetric(of: impl Fn(usize, usize) -> f64) -> DMat3 {
     DMat3::from_cols(column(0), column(1), column(2))
 }
 
-/// A slow press by a disc of `radius_m` at `centre_m`, at `count` depths, `step_m` apart, from 0 on.
-pub fn press(model: &Model, radius_m: f64, centre_m: DVec2, step_m: f64, count: u32) -> Vec<Pressed> {
+/// A slow press by a disc of `radius_m` at `centre_m` (a place at rest), at `count` depths, `step_m` apart, from 0 on.
+pub fn press(model: &Model, radius_m: f64, centre_m: DVec3, step_m: f64, count: u32) -> Vec<Pressed> {
     let course = Course { radius_m, centre_m, step_m, count };
     let mut press = Press::new(model, course, Accuracy::EXACT);
     let never = AtomicBool::new(false);
@@ -458,8 +459,8 @@ pub fn press(model: &Model, radius_m: f64, centre_m: DVec2, step_m: f64, count: 
 pub struct Course {
     /// Of the disc.
     pub radius_m: f64,
-    /// The middle of the disc in the rest plane.
-    pub centre_m: DVec2,
+    /// The middle of the disc at rest, m.
+    pub centre_m: DVec3,
     /// From one depth to the next; the first is 0.
     pub step_m: f64,
     /// Number of depths.
@@ -493,7 +494,7 @@ pub enum Deepened {
 impl Press {
     /// A press by a disc with any amount of work.
     pub fn new(model: &Model, course: Course, accuracy: Accuracy) -> Self {
-        let footprint = Footprint::new(model, course.radius_m, course.centre_m);
+        let footprint = Footprint::new(model, course.radius_m, course.centre_m.truncate());
         let window = Window::around(model, &footprint);
         memory::require(window.bytes(), "a force law");
         let displacement_m = vec![DVec3::ZERO; window.size[0] * window.size[1]];
@@ -505,7 +506,7 @@ impl Press {
     pub fn within(model: &Model, course: Course, accuracy: Accuracy, work: u64) -> Option<Self> {
         // A solution takes as many iterations as there are points from the middle to where nothing is noticed, or nearly
         // so, and each depth some solutions: what can't be done is not begun, and no memory is taken for it.
-        let [rows, columns] = Window::at(model, course.radius_m, course.centre_m).size;
+        let [rows, columns] = Window::at(model, course.radius_m, course.centre_m.truncate()).size;
         let least = (rows * columns) as u64 * 4 * u64::from(course.count) * (rows.max(columns) as u64);
         (least <= work).then(|| Press { left: work, ..Self::new(model, course, accuracy) })
     }
@@ -555,7 +556,7 @@ impl Press {
 pub fn stand_in(model: &Model, spacing_m: f64, half_m: f64) -> Model {
     let fine = &model.scene.sheet;
     let times = spacing_m / fine.spacing_m;
-    let is_cut = fine.longer_side_m() > 2.0 * half_m;
+    let is_cut = fine.longest_side_m() > 2.0 * half_m;
     // As many on either side of the middle.
     let points = [0, 1].map(|axis| {
         let extent_m = fine.extent_m()[axis];

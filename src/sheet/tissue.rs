@@ -13,6 +13,7 @@ use super::field::BLOCK;
 use super::model::{Model, Plan};
 use super::prescribed::Grasp;
 use super::watch::{Inputs, Mark};
+use crate::shape::PointId;
 use palpate_touch::Tip;
 
 /// One mass point at the end of a step: displacement, velocity, and the forces on it. Where the applied force jumps,
@@ -79,8 +80,8 @@ pub trait Tissue: Send {
     fn step_count(&self) -> u64;
     /// From the coming step on `tool` exerts `push`, or no force.
     fn push(&mut self, tool: usize, push: Option<Push>);
-    /// From the coming step on `tool` moves the point at `index`.
-    fn grasp(&mut self, tool: usize, index: usize, grasp: Grasp);
+    /// From the coming step on `tool` moves `point`.
+    fn grasp(&mut self, tool: usize, point: PointId, grasp: Grasp);
     /// From the coming step on `tool` meets the sheet with `tip` and is at `place_m` at the step's end.
     fn lead(&mut self, tool: usize, place_m: DVec3, tip: Tip);
     /// The motion of a position-controlled tool and the force on it.
@@ -123,8 +124,8 @@ pub trait Tissue: Send {
     /// After a blow-up: continues at step `step` (of the blow-up) from the state of the last checkpoint, or at rest if
     /// `to_rest` or if that state has passed no check, with all tools released and the model's own substep.
     fn recover(&mut self, step: u64, to_rest: bool) -> Released;
-    /// The point at `index`.
-    fn point(&self, index: usize) -> PointState;
+    /// A point.
+    fn point(&self, point: PointId) -> PointState;
     /// The energies. A pass over what is awake; sleeping tiles use cached values. Earlier calls do not affect the
     /// result.
     fn energy(&self) -> Energy;
@@ -157,9 +158,9 @@ impl SheetCopy {
         self.0.model()
     }
 
-    /// The point at `index`.
-    pub fn point(&self, index: usize) -> PointState {
-        self.0.point(index)
+    /// A point.
+    pub fn point(&self, point: PointId) -> PointState {
+        self.0.point(point)
     }
 
     /// Adds so many points, or a few more, to the hash. Returns it when all are in.

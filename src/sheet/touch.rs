@@ -66,7 +66,7 @@ impl<T: Real> Sheet<T> {
             standing: tool.standing,
             force_on_tool_n: felt_n,
             surface_m,
-            anchor_m: tool.footprint.centre_m(),
+            anchor_m: tool.footprint.centre_m().extend(0.0),
             normal: tool.normal,
             friction: tool.tip.friction,
         })

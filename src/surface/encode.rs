@@ -212,10 +212,11 @@ impl Patch {
 mod tests {
     use super::*;
     use crate::limits::Limits;
+    use crate::surface::scene;
 
     fn snapshot() -> Snapshot {
         let wave = |k: usize, c: usize| ((k * (c + 3)) as f32 * 0.37).sin() * 10_f32.powi(-(c as i32));
-        Snapshot::new(7, 0.007, [31, 17], std::array::from_fn(|c| (0..31 * 17).map(|k| wave(k, c)).collect()))
+        Snapshot::new(&scene([31, 17]), 7, 0.007, std::array::from_fn(|c| (0..31 * 17).map(|k| wave(k, c)).collect()))
     }
 
     /// Decodes every vertex of a frame as a client does.
@@ -241,7 +242,7 @@ mod tests {
     fn both_encodings_hold_every_vertex_and_i16_within_half_a_quantum() {
         let snapshot = snapshot();
         for n in [0, 1, 3, 10] {
-            let grid = Refinement::new([31, 17], n, &Limits::default()).unwrap();
+            let grid = Refinement::new(&scene([31, 17]), n, &Limits::default()).unwrap();
             let exact = encode(&snapshot, grid, Encoding::F32);
             let coarse = encode(&snapshot, grid, Encoding::I16);
             let [x, y] = grid.vertices();
@@ -266,7 +267,7 @@ mod tests {
         let snapshot = snapshot();
         for n in 0..=10 {
             let cells = n as usize + 1;
-            let grid = Refinement::new([31, 17], n, &Limits::default()).unwrap();
+            let grid = Refinement::new(&scene([31, 17]), n, &Limits::default()).unwrap();
             let frame = encode(&snapshot, grid, Encoding::F32);
             let bytes = frame.patches.iter().flat_map(|patch| patch.bytes.as_chunks::<12>().0);
             for (index, bytes) in bytes.enumerate() {
@@ -288,7 +289,7 @@ mod tests {
     fn a_frame_has_the_same_bits_at_every_width() {
         for encoding in [Encoding::F32, Encoding::I16] {
             for n in 0..=10 {
-                let grid = Refinement::new([31, 17], n, &Limits::default()).unwrap();
+                let grid = Refinement::new(&scene([31, 17]), n, &Limits::default()).unwrap();
                 let at = |width| encode_at(width, &snapshot(), Frame::blank(grid, encoding));
                 let plain = at(Width::Plain);
                 for width in Width::ALL.into_iter().filter(|width| width.is_available()) {
@@ -305,12 +306,12 @@ mod tests {
     #[test]
     fn a_spent_frame_lends_the_buffers_that_nobody_reads() {
         for encoding in [Encoding::F32, Encoding::I16] {
-            let grid = Refinement::new([31, 17], 10, &Limits::default()).unwrap();
+            let grid = Refinement::new(&scene([31, 17]), 10, &Limits::default()).unwrap();
             let first = encode(&snapshot(), grid, encoding);
             let (held, place) = (first.patches[0].bytes.clone(), first.patches[1].bytes.as_ptr());
             let before = held.to_vec();
             let moved = snapshot().displacement_m.map(|values| values.into_iter().map(|v| 1.0 - 2.0 * v).collect());
-            let moved = Snapshot::new(8, 0.008, [31, 17], moved);
+            let moved = Snapshot::new(&scene([31, 17]), 8, 0.008, moved);
             let second = encode_over(&moved, first);
             assert_eq!((second.patches[1].bytes.as_ptr(), held), (place, before.into()));
             assert_eq!(decode(&second), decode(&encode(&moved, grid, encoding)));
@@ -319,7 +320,7 @@ mod tests {
 
     #[test]
     fn patches_are_small_and_tile_the_frame() {
-        let grid = Refinement::new([31, 17], 10, &Limits::default()).unwrap();
+        let grid = Refinement::new(&scene([31, 17]), 10, &Limits::default()).unwrap();
         let frame = encode(&snapshot(), grid, Encoding::F32);
         let mut next = 0;
         for patch in &frame.patches {
@@ -334,8 +335,8 @@ mod tests {
     #[test]
     fn a_long_row_is_split_too() {
         let displacement_m = std::array::from_fn(|c| (0..40_000).map(|k| (k + c) as f32).collect());
-        let snapshot = Snapshot::new(0, 0.0, [2, 20_000], displacement_m);
-        let grid = Refinement::new([2, 20_000], 0, &Limits::default()).unwrap();
+        let snapshot = Snapshot::new(&scene([2, 20_000]), 0, 0.0, displacement_m);
+        let grid = Refinement::new(&scene([2, 20_000]), 0, &Limits::default()).unwrap();
         let frame = encode(&snapshot, grid, Encoding::F32);
         assert!(frame.patches.iter().all(|patch| patch.bytes.len() <= PATCH_BYTES));
         for (vertex, value) in frame.patches.iter().flat_map(|patch| {
@@ -351,8 +352,8 @@ mod tests {
 
     #[test]
     fn a_still_tissue_is_encoded_exactly() {
-        let still = Snapshot::new(0, 0.0, [3, 3], std::array::from_fn(|c| vec![c as f32 * 0.25; 9]));
-        let grid = Refinement::new([3, 3], 1, &Limits::default()).unwrap();
+        let still = Snapshot::new(&scene([3, 3]), 0, 0.0, std::array::from_fn(|c| vec![c as f32 * 0.25; 9]));
+        let grid = Refinement::new(&scene([3, 3]), 1, &Limits::default()).unwrap();
         for vertex in decode(&encode(&still, grid, Encoding::I16)) {
             assert_eq!(vertex, [0.0, 0.25, 0.5]);
         }

@@ -10,3 +10,10 @@ pub use encode::{Encoding, Frame, encode, encode_over};
 pub use refine::{LARGEST_REFINEMENT, Refinement};
 pub use snapshot::Snapshot;
 pub use tiles::FrameTiles;
+
+/// A scene with so many points along x and y, 1 cm apart.
+#[cfg(test)]
+pub(crate) fn scene([nx, ny]: [usize; 2]) -> crate::scene::Scene {
+    let sets = [format!("sheet.points=[{nx}, {ny}]"), "sheet.spacing_m=0.01".to_owned()];
+    crate::scene::Scene::parse("test", crate::scene::PAPER, &sets, &crate::limits::Limits::default()).unwrap()
+}

@@ -3,10 +3,14 @@
 // The compiler does not always inline iterators over vectors. They then run without the caller's instructions.
 #![allow(clippy::needless_range_loop)]
 
+use glam::{DVec2, DVec3};
+
 use super::wide::{Available, LANES, SixteenLanes};
 use crate::limits::Limits;
 use crate::memory;
 use crate::refusal::{Reason, Refusal, Result};
+use crate::scene::{Scene, Sheet};
+use crate::shape::PointId;
 
 /// The name of buffers in messages.
 const ROW: &str = "a row of a frame";
@@ -15,25 +19,28 @@ const ROW: &str = "a row of a frame";
 pub const LARGEST_REFINEMENT: u32 = 10;
 
 /// A refined grid.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Refinement {
     /// Points of the sheet along x and y.
-    pub points: [usize; 2],
+    pub(super) points: [usize; 2],
+    /// Their distance at rest, m.
+    point_spacing_m: f64,
     /// n.
-    pub between: usize,
+    pub(super) between: usize,
 }
 
 impl Refinement {
-    /// Refinement `n` of a sheet with `points` along x and y.
+    /// Refinement `n` of the tissue of a scene.
     ///
     /// # Errors
     /// Refuses an `n` above [`LARGEST_REFINEMENT`] and a grid with too many vertices.
-    pub fn new(points: [usize; 2], n: u32, limits: &Limits) -> Result<Self> {
+    pub fn new(scene: &Scene, n: u32, limits: &Limits) -> Result<Self> {
         if n > LARGEST_REFINEMENT {
             let message = format!("must be from 0 to {LARGEST_REFINEMENT}, but is {n}");
             return Err(Refusal::new(Reason::OutOfRange, "refinement", message));
         }
-        let refinement = Refinement { points, between: n as usize };
+        let Sheet { points, spacing_m, .. } = scene.sheet;
+        let refinement = Refinement { points, point_spacing_m: spacing_m, between: n as usize };
         let [x, y] = refinement.vertices();
         if x * y > limits.frame_vertices {
             let message = format!("makes {x} × {y} vertices, above the limit of {} in all", limits.frame_vertices);
@@ -47,10 +54,66 @@ impl Refinement {
         self.points.map(|points| (points - 1) * (self.between + 1) + 1)
     }
 
-    /// Distance between vertices at rest, for points `spacing_m` apart.
+    /// Without vertices between the points.
+    pub fn coarsest(self) -> Self {
+        Refinement { between: 0, ..self }
+    }
+
+    /// n: vertices between neighbouring points.
+    pub fn between(&self) -> usize {
+        self.between
+    }
+
+    /// Number of points.
+    pub fn point_count(&self) -> usize {
+        self.points[0] * self.points[1]
+    }
+
+    /// Number of vertices.
+    pub fn vertex_count(&self) -> usize {
+        let [nx, ny] = self.vertices();
+        nx * ny
+    }
+
+    /// Distance between vertices at rest, m.
     #[allow(clippy::cast_precision_loss)]
-    pub fn spacing_m(&self, spacing_m: f64) -> f64 {
-        spacing_m / (self.between + 1) as f64
+    pub fn spacing_m(&self) -> f64 {
+        self.point_spacing_m / (self.between + 1) as f64
+    }
+
+    /// The vertex at a point.
+    pub fn vertex_at(&self, point: PointId) -> usize {
+        let (step, [_, ny]) = (self.between + 1, self.vertices());
+        (point.index() / self.points[1]) * step * ny + (point.index() % self.points[1]) * step
+    }
+
+    /// Where a vertex rests, m.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn rest_m(&self, vertex: usize) -> DVec3 {
+        let [_, ny] = self.vertices();
+        self.spacing_m() * DVec3::new((vertex / ny) as f64, (vertex % ny) as f64, 0.0)
+    }
+
+    /// The texture coordinates of a vertex: 0 to 1 along x and along y.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn texture_at(&self, vertex: usize) -> DVec2 {
+        let [nx, ny] = self.vertices();
+        let share = |at: usize, count: usize| at as f64 / (count - 1).max(1) as f64;
+        DVec2::new(share(vertex / ny, nx), share(vertex % ny, ny))
+    }
+
+    /// The number of cells, of two triangles each.
+    pub fn cell_count(&self) -> usize {
+        let [nx, ny] = self.vertices();
+        (nx - 1) * (ny - 1)
+    }
+
+    /// The vertices of the two triangles of a cell, three and three, anticlockwise seen from above the tissue.
+    pub fn triangles(&self, cell: usize) -> [usize; 6] {
+        let [_, ny] = self.vertices();
+        let corner = cell / (ny - 1) * ny + cell % (ny - 1);
+        let (right, up) = (corner + ny, corner + 1);
+        [corner, right, right + 1, corner, right + 1, up]
     }
 }
 
@@ -345,6 +408,7 @@ fn mix<L: SixteenLanes, W: Written>(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::surface::scene;
 
     /// All rows of one component.
     fn refine(grid: Refinement, values: &[f32]) -> Vec<Vec<f32>> {
@@ -363,7 +427,7 @@ mod tests {
     fn a_refined_grid_has_the_papers_size_and_interpolates_bilinearly() {
         for n in 0..=LARGEST_REFINEMENT {
             let (nx, ny) = (4, 3);
-            let grid = Refinement::new([nx, ny], n, &Limits::default()).unwrap();
+            let grid = Refinement::new(&scene([nx, ny]), n, &Limits::default()).unwrap();
             let between = n as usize;
             assert_eq!(grid.vertices(), [(nx - 1) * between + nx, (ny - 1) * between + ny]);
             // A bilinear function is its own bilinear interpolation.
@@ -381,9 +445,9 @@ mod tests {
 
     #[test]
     fn eleven_and_too_many_vertices_are_refused() {
-        let refusal = Refinement::new([31, 31], 11, &Limits::default()).unwrap_err();
+        let refusal = Refinement::new(&scene([31, 31]), 11, &Limits::default()).unwrap_err();
         assert_eq!((refusal.reason, refusal.field.as_str()), (Reason::OutOfRange, "refinement"));
-        let refusal = Refinement::new([1001, 1001], 10, &Limits::default()).unwrap_err();
+        let refusal = Refinement::new(&scene([1001, 1001]), 10, &Limits::default()).unwrap_err();
         assert_eq!(refusal.reason, Reason::TooLarge);
     }
 }

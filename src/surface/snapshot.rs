@@ -6,6 +6,7 @@ use std::sync::OnceLock;
 
 use super::refine::Points;
 use super::wide::{Available, LANES, SixteenLanes, Width, Work};
+use crate::scene::{Scene, Sheet};
 
 /// The displacements of a sheet at one moment, from which frames are made.
 #[derive(Debug, Clone, PartialEq)]
@@ -20,13 +21,15 @@ pub struct Snapshot {
     box_m: OnceLock<[[f32; 2]; 3]>,
     /// Points along x and y.
     pub(super) points: [usize; 2],
+    /// Distance between points, m.
+    pub(super) spacing_m: f64,
 }
 
 impl Snapshot {
-    /// Creates a snapshot of `points` along x and y. `displacement_m` has nx·ny values for each component, point [i, j]
-    /// at i·ny + j.
-    pub fn new(step: u64, simulation_time_s: f64, points: [usize; 2], displacement_m: [Vec<f32>; 3]) -> Self {
-        Snapshot { step, simulation_time_s, displacement_m, box_m: OnceLock::new(), points }
+    /// Creates a snapshot of the tissue of a scene. `displacement_m` has a value for each point and component, m.
+    pub fn new(scene: &Scene, step: u64, simulation_time_s: f64, displacement_m: [Vec<f32>; 3]) -> Self {
+        let Sheet { points, spacing_m, .. } = scene.sheet;
+        Snapshot { step, simulation_time_s, displacement_m, box_m: OnceLock::new(), points, spacing_m }
     }
 
     /// The bounding box. Computed once for all encodings, by who encodes: a stepping thread makes the snapshot.

@@ -117,15 +117,15 @@ impl Tile {
 }
 
 impl FrameTiles {
-    /// Begins with a keyframe. `spacing_m` is the distance between points, m.
-    pub fn new(snapshot: &Arc<Snapshot>, refinement: Refinement, encoding: Encoding, spacing_m: f64) -> Self {
+    /// Begins with a keyframe.
+    pub fn new(snapshot: &Arc<Snapshot>, refinement: Refinement, encoding: Encoding) -> Self {
         let [along_x, along_y] = refinement.points.map(tiles_along);
         let place = |number: usize| Area::of(refinement, [number / along_y, number % along_y]);
         let tile = |number| Tile { area: place(number), version: 0, own: None };
         let mut tiles = FrameTiles {
             refinement,
             encoding,
-            finest_m: FINEST * spacing_m,
+            finest_m: FINEST * snapshot.spacing_m,
             version: 0,
             key: snapshot.clone(),
             changed: false,
@@ -293,11 +293,10 @@ mod tests {
     use super::super::encode;
     use super::*;
     use crate::limits::Limits;
-
-    const SPACING_M: f64 = 0.01;
+    use crate::surface::scene;
 
     fn grid(points: [usize; 2], n: u32) -> Refinement {
-        Refinement::new(points, n, &Limits::default()).unwrap()
+        Refinement::new(&scene(points), n, &Limits::default()).unwrap()
     }
 
     /// A viewer's state: it keeps vertices and writes patches over them.
@@ -353,7 +352,7 @@ mod tests {
     }
 
     fn at(points: [usize; 2], step: u64, time_s: f64, displacement_m: &[Vec<f32>; 3]) -> Arc<Snapshot> {
-        Arc::new(Snapshot::new(step, time_s, points, displacement_m.clone()))
+        Arc::new(Snapshot::new(&scene(points), step, time_s, displacement_m.clone()))
     }
 
     #[test]
@@ -362,7 +361,7 @@ mod tests {
             for n in [0, 1, 2, 10] {
                 let still = at(points, 0, 0.0, &std::array::from_fn(|_| vec![0.25; points[0] * points[1]]));
                 for encoding in [Encoding::F32, Encoding::I16] {
-                    let mut tiles = FrameTiles::new(&still, grid(points, n), encoding, SPACING_M);
+                    let mut tiles = FrameTiles::new(&still, grid(points, n), encoding);
                     let mut picture = Picture::new();
                     let count = picture.show(&tiles.newer_than(None));
                     assert_eq!(count, picture.vertices.len());
@@ -385,8 +384,7 @@ mod tests {
             (3, [16, 20], 2),
             (3, [16, 32], 4),
         ] {
-            let mut tiles =
-                FrameTiles::new(&at(points, 0, 0.0, &displacement_m), grid(points, n), Encoding::I16, SPACING_M);
+            let mut tiles = FrameTiles::new(&at(points, 0, 0.0, &displacement_m), grid(points, n), Encoding::I16);
             let first = tiles.version();
             let mut moved = displacement_m.clone();
             moved[2][point[0] * 48 + point[1]] = -0.005;
@@ -403,8 +401,7 @@ mod tests {
         let points = [20, 20];
         let mut displacement_m: [Vec<f32>; 3] = std::array::from_fn(|_| vec![0.0; 400]);
         displacement_m[0][0] = 0.01;
-        let mut tiles =
-            FrameTiles::new(&at(points, 0, 0.0, &displacement_m), grid(points, 2), Encoding::I16, SPACING_M);
+        let mut tiles = FrameTiles::new(&at(points, 0, 0.0, &displacement_m), grid(points, 2), Encoding::I16);
         let mut picture = Picture::new();
         picture.show(&tiles.newer_than(None));
         let quantum_m = tiles.quanta.scale_m.x as f32;
@@ -429,8 +426,7 @@ mod tests {
         let points = [40, 40];
         let mut displacement_m: [Vec<f32>; 3] = std::array::from_fn(|_| vec![0.0; 1600]);
         displacement_m[2][820] = -0.01;
-        let mut tiles =
-            FrameTiles::new(&at(points, 0, 0.0, &displacement_m), grid(points, 0), Encoding::I16, SPACING_M);
+        let mut tiles = FrameTiles::new(&at(points, 0, 0.0, &displacement_m), grid(points, 0), Encoding::I16);
         let coarse = tiles.quanta.scale_m.z;
         let mut full_at = Vec::new();
         for step in 1..200 {
@@ -459,7 +455,7 @@ mod tests {
             let points = [35, 18];
             let encoding = if i16 { Encoding::I16 } else { Encoding::F32 };
             let mut displacement_m: [Vec<f32>; 3] = std::array::from_fn(|_| vec![0.0; 35 * 18]);
-            let mut tiles = FrameTiles::new(&at(points, 0, 0.0, &displacement_m), grid(points, n), encoding, SPACING_M);
+            let mut tiles = FrameTiles::new(&at(points, 0, 0.0, &displacement_m), grid(points, n), encoding);
             let mut pictures = vec![Picture::new(); 3];
             let mut time_s = 0.0;
             for (step, (place, c, power, sign, who, after_s)) in moves.into_iter().enumerate() {

@@ -1,42 +1,39 @@
 //! Conversion of commands.
 
 use glam::{DQuat, DVec3};
-use palpate_proto::geometry::{from_place, from_point, from_vector, point, vector};
+use palpate_proto::geometry::{from_place, from_vector, vector};
 use palpate_proto::pb;
 use palpate_proto::touch::{from_tip, pose};
 
-use super::required;
+use super::{from_point, point, required};
 use crate::refusal::{Result, number};
-use crate::scene::Sheet;
 use crate::scene::law::Poke;
 use crate::scene::script::Action;
 use crate::session::command::Command;
+use crate::shape::RestShape;
 
 /// The command in a message that arrived at `arrival_ns`.
 ///
 /// # Errors
 /// Returns an error if a field is missing, a point is not on the sheet, or an orientation is not of length 1.
-pub fn from_command(message: &pb::Command, sheet: &Sheet, arrival_ns: u64) -> Result<Command> {
+pub fn from_command(message: &pb::Command, shape: &dyn RestShape, arrival_ns: u64) -> Result<Command> {
     use pb::command::Action as Message;
     let action = match required("action", message.action.as_ref())? {
         Message::Force(force) => Action::Push(Poke {
             centre_m: match required("force.centre", force.centre.as_ref())? {
-                pb::force::Centre::Point(at) => {
-                    sheet.index("force.point", from_point(at))?;
-                    sheet.rest_m(from_point(at))
-                }
-                pb::force::Centre::CentreM(place) => from_place(place),
+                pb::force::Centre::Point(at) => shape.rest_m(shape.find("force.point", from_point(at))?),
+                pb::force::Centre::CentreM(place) => from_place(place).extend(0.0),
             },
             force_n: from_vector(force.force_n.as_ref()),
             falloff_per_m: force.falloff_per_m,
             falloff_offset: force.falloff_offset,
         }),
         Message::Position(position) => {
-            let point = from_point(required("position.point", position.point.as_ref())?);
-            sheet.index("position.point", point)?;
+            let name = from_point(required("position.point", position.point.as_ref())?);
+            let point = shape.find("position.point", name)?;
             let displacement_m = match required("position.target", position.target.as_ref())? {
                 pb::position::Target::DisplacementM(displacement) => from_vector(Some(displacement)),
-                pb::position::Target::PositionM(place) => from_vector(Some(place)) - sheet.rest_m(point).extend(0.0),
+                pb::position::Target::PositionM(place) => from_vector(Some(place)) - shape.rest_m(point),
             };
             Action::Grasp { point, displacement_m }
         }
@@ -66,12 +63,7 @@ fn from_pose(pose: &pb::Pose) -> Result<DVec3> {
 
 /// The message of a script's command to tool `tool`, which acts at step `at_step`.
 #[allow(clippy::cast_possible_truncation)]
-pub fn scripted(tool: usize, at_step: u64, action: &Action, client_time_ns: u64) -> pb::Command {
-    pb::Command { at_step: Some(at_step), ..now(tool as u32, at_step + 1, action, client_time_ns) }
-}
-
-/// The message of a command without a step: it acts when it arrives; a pose acts by the client's time.
-pub fn now(tool: u32, sequence: u64, action: &Action, client_time_ns: u64) -> pb::Command {
+pub fn scripted(shape: &dyn RestShape, tool: usize, at_step: u64, action: &Action, client_time_ns: u64) -> pb::Command {
     use pb::command::Action as Message;
     let action = match action {
         Action::Push(poke) => Message::Force(pb::Force {
@@ -81,11 +73,12 @@ pub fn now(tool: u32, sequence: u64, action: &Action, client_time_ns: u64) -> pb
             falloff_offset: poke.falloff_offset,
         }),
         Action::Grasp { point: at, displacement_m: DVec3 { x, y, z } } => Message::Position(pb::Position {
-            point: Some(point(*at)),
+            point: Some(point(shape.name(*at))),
             target: Some(pb::position::Target::DisplacementM(pb::Vector3 { x: *x, y: *y, z: *z })),
         }),
         Action::Lead { place_m, tip } => Message::Pose(pose(*place_m, tip)),
         Action::Release => Message::Release(pb::Release {}),
     };
-    pb::Command { tool, sequence, client_time_ns, at_step: None, time_to_live_s: None, action: Some(action) }
+    let (tool, sequence, action) = (tool as u32, at_step + 1, Some(action));
+    pb::Command { tool, sequence, client_time_ns, at_step: Some(at_step), time_to_live_s: None, action }
 }

@@ -5,7 +5,10 @@ pub mod command;
 pub mod sample;
 pub mod scene;
 
+use palpate_proto::{geometry, pb};
+
 use crate::refusal::{Reason, Refusal, Result};
+use crate::shape::PointName;
 
 /// The value of a required field.
 ///
@@ -24,4 +27,15 @@ pub fn every(field: &str, steps: Option<u32>) -> Result<u64> {
         Some(0) => Err(Refusal::new(Reason::OutOfRange, field, "must be at least 1, but is 0")),
         steps => Ok(u64::from(steps.unwrap_or(1))),
     }
+}
+
+/// The name of a mass point as a message.
+pub fn point(name: PointName) -> pb::GridPoint {
+    let PointName::Point(place) = name;
+    geometry::point(place)
+}
+
+/// The name of a mass point in a message.
+pub fn from_point(point: &pb::GridPoint) -> PointName {
+    PointName::Point(geometry::from_point(point))
 }

@@ -1,15 +1,16 @@
 //! Conversion of samples, records and frames to messages, and of records back.
 
-use super::every;
+use super::{every, from_point, point};
 use crate::pace::frames::Delivery;
 use crate::pace::{PacedSample, Recorded};
 use crate::refusal::{Reason, Refusal, Result};
 use crate::scene::record::{EnergyJ, Point, Record, Recovery};
 use crate::session::ToolSample;
 use crate::session::sampling::{Deadband, HEARTBEAT_S, Sampling};
+use crate::shape::{PointName, RestShape};
 use crate::surface::Encoding;
 use crate::surface::encode::Patch;
-use palpate_proto::geometry::{from_point, from_vector, point, vector};
+use palpate_proto::geometry::{from_vector, vector};
 use palpate_proto::{pb, touch};
 
 /// The samples that a stream asks for. `renders`: the stream has declared a device.
@@ -44,8 +45,8 @@ pub fn sampling(
     Ok(sampling)
 }
 
-/// A sample as a message that is sent at `now_ns`.
-pub fn sample(paced: &PacedSample, dropped: u64, now_ns: u64) -> pb::Sample {
+/// A sample of a tissue of this shape as a message that is sent at `now_ns`.
+pub fn sample(paced: &PacedSample, shape: &dyn RestShape, dropped: u64, now_ns: u64) -> pb::Sample {
     let sample = &paced.sample;
     #[allow(clippy::cast_possible_truncation)]
     pb::Sample {
@@ -61,11 +62,11 @@ pub fn sample(paced: &PacedSample, dropped: u64, now_ns: u64) -> pb::Sample {
         late_commands: sample.late_commands,
         dropped_samples: dropped,
         recovery_count: sample.recoveries,
-        tools: sample.tools.iter().map(|tool| tool_sample(tool, paced.due_ns, now_ns)).collect(),
+        tools: sample.tools.iter().map(|tool| tool_sample(tool, shape, paced.due_ns, now_ns)).collect(),
     }
 }
 
-fn tool_sample(tool: &ToolSample, due_ns: u64, now_ns: u64) -> pb::ToolSample {
+fn tool_sample(tool: &ToolSample, shape: &dyn RestShape, due_ns: u64, now_ns: u64) -> pb::ToolSample {
     let contact = tool.contact.as_ref();
     let since_arrival_ns = |at_ns: u64| if tool.arrival_ns == 0 { 0 } else { at_ns.saturating_sub(tool.arrival_ns) };
     pb::ToolSample {
@@ -74,7 +75,7 @@ fn tool_sample(tool: &ToolSample, due_ns: u64, now_ns: u64) -> pb::ToolSample {
         client_time_ns: tool.client_time_ns,
         server_hold_ns: since_arrival_ns(now_ns),
         step_wait_ns: since_arrival_ns(due_ns),
-        point: contact.map(|contact| point(contact.point)),
+        point: contact.map(|contact| point(shape.name(contact.point))),
         displacement_m: contact.and_then(|contact| vector(contact.displacement_m)),
         velocity_m_per_s: contact.and_then(|contact| vector(contact.velocity_m_per_s)),
         force_on_tool_n: contact.and_then(|contact| vector(contact.force_on_tool_n)),
@@ -131,7 +132,7 @@ pub fn record(paced: &Recorded, dropped: u64, part: usize) -> Option<pb::ProbeRe
 fn point_record(record: &Point) -> pb::PointRecord {
     let vector = |v: [f64; 3]| vector(v.into());
     pb::PointRecord {
-        point: Some(point(record.point)),
+        point: Some(point(record.name)),
         displacement_m: vector(record.displacement_m),
         velocity_m_per_s: vector(record.velocity_m_per_s),
         spring_n: vector(record.spring_n),
@@ -148,7 +149,7 @@ pub fn add_to_record(record: &mut Record, message: &pb::ProbeResponse) -> bool {
     let array = |v: &Option<pb::Vector3>| from_vector(v.as_ref()).to_array();
     record.time_s = message.simulation_time_s;
     record.points.extend(message.points.iter().map(|point| Point {
-        point: point.point.as_ref().map_or([0, 0], from_point),
+        name: point.point.as_ref().map_or(PointName::Point([0, 0]), from_point),
         displacement_m: array(&point.displacement_m),
         velocity_m_per_s: array(&point.velocity_m_per_s),
         spring_n: array(&point.spring_n),
@@ -194,7 +195,7 @@ pub fn frame(viewer_id: &str, delivery: &Delivery, skipped: u64) -> Vec<pb::Watc
         frame_id: delivery.frame_id,
         step: frame.step,
         simulation_time_s: frame.simulation_time_s,
-        refinement: frame.refinement.between as u32,
+        refinement: frame.refinement.between() as u32,
         vertices_x: vertices_x as u32,
         vertices_y: vertices_y as u32,
         encoding: match frame.encoding {

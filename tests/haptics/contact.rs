@@ -18,7 +18,7 @@ fn tissue(name: &str, sets: &[&str]) -> Arc<Model> {
 }
 
 fn middle(model: &Model) -> DVec3 {
-    (model.scene.sheet.extent_m() / 2.0).extend(0.0)
+    model.shape().extent().middle_m()
 }
 
 /// From 0 to 1 without a jerk.
@@ -89,7 +89,7 @@ fn stiffness_converges_as_the_grid_gets_finer() {
                 &format!("damping.coefficient_n_s_per_m={}", share * base.scene.damping_n_s_per_m),
             ],
         );
-        let pressed = tangent::press(&model, 0.005, middle(&model).truncate(), 0.0005, 2);
+        let pressed = tangent::press(&model, 0.005, middle(&model), 0.0005, 2);
         pressed[1].force_n / pressed[1].depth_m
     };
     let found: Vec<f64> =
@@ -103,8 +103,8 @@ fn the_tissues_are_as_stiff_as_a_flat_punch_finds_them() {
     for (name, punch_n_per_m) in FLAT_PUNCH_N_PER_M {
         let model = tissue(name, &[]);
         let spacing_m = model.scene.sheet.spacing_m;
-        for beside in [DVec2::ZERO, DVec2::splat(0.5 * spacing_m), DVec2::new(0.3 * spacing_m, 0.0)] {
-            let pressed = tangent::press(&model, 0.005, middle(&model).truncate() + beside, 0.0005, 3);
+        for beside in [DVec3::ZERO, DVec3::new(0.5, 0.5, 0.0) * spacing_m, DVec3::new(0.3 * spacing_m, 0.0, 0.0)] {
+            let pressed = tangent::press(&model, 0.005, middle(&model) + beside, 0.0005, 3);
             let stiffness = pressed[1].force_n / pressed[1].depth_m;
             assert!((stiffness / punch_n_per_m - 1.0).abs() < 0.15, "{name}: {stiffness} N/m at 0.5 mm");
             if name == "fibrotic" {
@@ -215,7 +215,7 @@ fn two_tools_press_one_tissue_each_for_itself() {
     }
     let [a, b] = [0, 1].map(|tool| sheet.feel(tool).unwrap().force_on_tool_n);
     assert!((a.z - b.z).abs() < 1e-3 * a.z && (a.x + b.x).abs() < 1e-3 * a.z, "{a} and {b} are not mirror images");
-    let alone = tangent::press(&model, 0.005, middle(&model).truncate(), 0.003, 2)[1].force_n;
+    let alone = tangent::press(&model, 0.005, middle(&model), 0.003, 2)[1].force_n;
     assert!((a.z / alone - 1.0).abs() < 0.1, "{} N beside another tool, {alone} N alone", a.z);
     sheet.release(1);
     sheet.step().unwrap();
@@ -237,9 +237,10 @@ fn the_lattice_passes_the_patch_test() {
     let mut sheet = sheet::at_rest(&model);
     let rim = |[i, j]: [usize; 2]| i % 8 == 0 || j % 8 == 0;
     let mut tool = 0;
-    for index in 0..model.len() {
-        if rim(model.point_of(index)) {
-            sheet.grasp(tool, index, sheet::Grasp::Held(even(model.point_of(index))));
+    for point in model.points() {
+        let place = model.scene.sheet.place_of(point);
+        if rim(place) {
+            sheet.grasp(tool, point, sheet::Grasp::Held(even(place)));
             tool += 1;
         }
     }
@@ -247,8 +248,8 @@ fn the_lattice_passes_the_patch_test() {
         sheet.step().unwrap();
     }
     let mut pull_n = 0.0;
-    for index in 0..model.len() {
-        let (point, state) = (model.point_of(index), sheet.point(index));
+    for point in model.points() {
+        let (point, state) = (model.scene.sheet.place_of(point), sheet.point(point));
         let off = (state.displacement_m - even(point)).length();
         assert!(off < 1e-3 * strain * spacing_m, "{point:?} is {off} m off");
         if point[0] == 8 {

@@ -47,7 +47,7 @@ fn poked(model: &Arc<Model>) -> Box<dyn Tissue> {
     let Push::Held(mut poke) = crate::common::push_on(scene, [15, 15], [0.7, 0.0, -2.0]) else { unreachable!() };
     poke.falloff_per_m = 30.0;
     tissue.push(0, Some(Push::Held(poke)));
-    tissue.grasp(1, model.index_of([22, 8]), Grasp::Held(DVec3::new(0.0, 0.0, 0.02)));
+    tissue.grasp(1, model.scene.sheet.point([22, 8]), Grasp::Held(DVec3::new(0.0, 0.0, 0.02)));
     tissue
 }
 
@@ -64,11 +64,11 @@ fn energy_j(tissue: &dyn Tissue) -> f64 {
 
 /// The largest distance of any point in two states, m.
 fn apart_m(a: &dyn Tissue, b: &[DVec3]) -> f64 {
-    b.iter().enumerate().map(|(index, place)| a.point(index).displacement_m.distance(*place)).fold(0.0, f64::max)
+    a.model().points().zip(b).map(|(point, place)| a.point(point).displacement_m.distance(*place)).fold(0.0, f64::max)
 }
 
 fn places(tissue: &dyn Tissue) -> Vec<DVec3> {
-    (0..tissue.model().len()).map(|index| tissue.point(index).displacement_m).collect()
+    tissue.model().points().map(|index| tissue.point(index).displacement_m).collect()
 }
 
 #[test]
@@ -78,7 +78,7 @@ fn nothing_jumps_but_the_springs() {
         let mut tissue = poked(&model);
         // In full motion.
         step(&mut *tissue, 60);
-        let before: Vec<_> = (0..model.len()).map(|index| tissue.point(index)).collect();
+        let before: Vec<_> = model.points().map(|index| tissue.point(index)).collect();
         let kinetic_j = tissue.energy().kinetic_j;
         let next = changed(&model, other(40.0, 0.2, 9.0));
         tissue.change(&next);
@@ -87,19 +87,19 @@ fn nothing_jumps_but_the_springs() {
         let fastest = before.iter().map(|point| point.velocity_m_per_s.length()).fold(0.0, f64::max);
         assert!(fastest > 0.1, "{sets:?}");
         let mut pulled_n = 0.0_f64;
-        for (index, was) in before.iter().enumerate() {
+        for (index, was) in model.points().zip(&before) {
             let is = tissue.point(index);
             let moved_m = is.displacement_m.distance(was.displacement_m);
-            assert!(moved_m < 1e-7 * tissue.largest_displacement_m(), "{sets:?}: point {index} moved by {moved_m}");
+            assert!(moved_m < 1e-7 * tissue.largest_displacement_m(), "{sets:?}: point {index:?} moved by {moved_m}");
             // (Second order in the substep for two-step schemes, first for the paper's.)
             let kicked = is.velocity_m_per_s.distance(was.velocity_m_per_s);
             let most = if sets.contains(&"stepping.integrator=lagged") { 5e-3 } else { 2e-3 };
-            assert!(kicked < most * fastest, "{sets:?}: point {index} was kicked by {kicked} of {fastest} m/s");
+            assert!(kicked < most * fastest, "{sets:?}: point {index:?} was kicked by {kicked} of {fastest} m/s");
             // The same shape with four times the spring stiffness; the forces are linear in k.
             if !sets.iter().any(|set| set.starts_with("sheet.fixed")) {
                 pulled_n = pulled_n.max(was.spring_n.length());
                 let off_n = is.spring_n.distance(4.0 * was.spring_n);
-                assert!(off_n < 2e-5, "{sets:?}: point {index} is pulled by {off_n} N other than it should");
+                assert!(off_n < 2e-5, "{sets:?}: point {index:?} is pulled by {off_n} N other than it should");
             }
         }
         assert!((tissue.energy().kinetic_j / kinetic_j - 1.0).abs() < 5e-3, "{sets:?}");
@@ -194,8 +194,8 @@ fn a_sheet_at_rest_wakes_for_it_and_sleeps_again() {
     let off_m = apart_m(&*tissue, &places(&*fresh));
     assert!(off_m < 2e-5 * fresh.largest_displacement_m(), "{off_m}");
     // Twice the virtual stiffness, with the other springs unchanged: less deep, and more than half as deep.
-    let centre = model.index_of([15, 15]);
-    let ratio = tissue.point(centre).displacement_m.z / before[centre].z;
+    let centre = model.scene.sheet.point([15, 15]);
+    let ratio = tissue.point(centre).displacement_m.z / before[centre.index()].z;
     assert!((0.5..0.9).contains(&ratio), "{ratio}");
 }
 
@@ -324,7 +324,7 @@ async fn the_same_bits_on_any_number_of_threads_and_offline() {
     let model = compile(&[]);
     let mut session = Session::new(&model);
     let message = pb::Command { at_step: Some(5), ..force(0, 1, -2.0) };
-    let command: Command = palpate::wire::command::from_command(&message, &model.scene.sheet, 0).unwrap();
+    let command: Command = palpate::wire::command::from_command(&message, model.shape(), 0).unwrap();
     advance(&mut session, 5);
     session.advance(&mut vec![Due { command, late: false, late_commands: 0, ends_lease: false }], |_| {});
     advance(&mut session, 44);
@@ -351,7 +351,7 @@ async fn a_running_session_changes_at_once_and_logs_it() {
     let softer = Change { virtual_stiffness_n_per_m: Some(1.0), ..Change::default() };
     let answer = sessions.update_tissue(update(&session_id, softer, None)).await.unwrap().into_inner();
     let mut fresh = Session::new(&changed(&compile(&[]), softer));
-    let command = palpate::wire::command::from_command(&force(0, 1, -2.0), &fresh.model().scene.sheet, 0).unwrap();
+    let command = palpate::wire::command::from_command(&force(0, 1, -2.0), fresh.model().shape(), 0).unwrap();
     fresh.advance(&mut vec![Due { command, late: false, late_commands: 0, ends_lease: false }], |_| {});
     advance(&mut fresh, 20_000);
     let fresh_m = -fresh.sample(None).tools[0].contact.unwrap().displacement_m.z;

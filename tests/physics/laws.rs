@@ -5,6 +5,7 @@ use glam::DVec3;
 use palpate::scene::Scene;
 use palpate::scene::law::{LoadProfile, Moment};
 use palpate::session::Session;
+use palpate::shape::PointId;
 use palpate::sheet::{self, Energy, Grasp, Tissue};
 
 /// A tissue in motion: pushed at a point for some steps, then released.
@@ -62,7 +63,7 @@ fn a_point_without_springs_is_the_damped_oscillator() {
                 // At the same times for both rates: the error is largest in the first milliseconds.
                 for _ in 0..1000 {
                     advance(&mut session, (rate_hz / 1000.0) as u64);
-                    let point = session.tissue().point(session.model().index_of([3, 2]));
+                    let point = session.tissue().point(session.model().scene.sheet.point([3, 2]));
                     let (u, v) = oscillator(mass, damping, virtual_stiffness, -0.2, session.time_s());
                     largest[0] = largest[0].max((point.displacement_m.z - u).abs());
                     largest[1] = largest[1].max((point.velocity_m_per_s.z - v).abs());
@@ -132,7 +133,7 @@ fn momentum_changes_by_the_outer_forces_alone() {
     let sets = ["damping.coefficient_n_s_per_m=0.0", "virtual_springs.stiffness_n_per_m=0.0"];
     let scene = scene_with(SMALL, &sets);
     let momentum = |tissue: &dyn Tissue| -> DVec3 {
-        let velocities = (0..tissue.model().len()).map(|index| tissue.point(index).velocity_m_per_s);
+        let velocities = tissue.model().points().map(|index| tissue.point(index).velocity_m_per_s);
         scene.sheet.point_mass_kg * velocities.sum::<DVec3>()
     };
     let mut tissue = sheet::at_rest(&model(&scene));
@@ -159,7 +160,7 @@ fn a_centred_poke_keeps_the_symmetry_of_the_sheet() {
     for _ in 0..200 {
         tissue.step().unwrap();
     }
-    let at = |i: usize, j: usize| tissue.point(tissue.model().index_of([i, j])).displacement_m;
+    let at = |i: usize, j: usize| tissue.point(tissue.model().scene.sheet.point([i, j])).displacement_m;
     for i in 0..9 {
         for j in 0..9 {
             let u = at(i, j);
@@ -184,7 +185,7 @@ fn equilibrium_is_the_solution_of_newtons_method() {
     }
     let solution = newton(&scene, [3, 2], load);
     for (index, expected) in solution.iter().enumerate() {
-        let u = tissue.point(index).displacement_m;
+        let u = tissue.point(PointId::new(index)).displacement_m;
         assert!((u - *expected).length() < 1e-10, "point {index}: {u}, expected {expected}");
     }
 }
@@ -335,11 +336,11 @@ fn the_force_field_is_minus_the_gradient_of_the_energy() {
     let sets = ["springs.flexion=true", "springs.shear_stiffness_n_per_m=12.0", "stepping.integrator=central"];
     let scene = scene_with(SMALL, &sets);
     let tissue = shaken(&scene, 60);
-    let u: Vec<DVec3> = (0..tissue.model().len()).map(|index| tissue.point(index).displacement_m).collect();
+    let u: Vec<DVec3> = tissue.model().points().map(|index| tissue.point(index).displacement_m).collect();
     assert!(u.iter().any(|u| u.length() > 0.2 * scene.sheet.spacing_m), "the sheet is not deformed");
     let problem = Static { scene: &scene, loaded: 0, load: DVec3::ZERO };
     for (index, expected) in problem.forces_n(&u).chunks(3).enumerate() {
-        let point = tissue.point(index);
+        let point = tissue.point(PointId::new(index));
         let force_n = point.spring_n + point.virtual_n;
         let expected = DVec3::new(expected[0], expected[1], expected[2]);
         assert!((force_n - expected).length() < 1e-8, "point {index}: {force_n}, expected {expected}");
@@ -356,8 +357,8 @@ fn virtual_springs_alone_leave_every_point_to_itself() {
     for _ in 0..5000 {
         tissue.step().unwrap();
     }
-    for index in 0..tissue.model().len() {
-        let expected = if tissue.model().point_of(index) == [3, 2] { -0.5 / 5.0 } else { 0.0 };
+    for index in tissue.model().points() {
+        let expected = if index == tissue.model().scene.sheet.point([3, 2]) { -0.5 / 5.0 } else { 0.0 };
         assert!((tissue.point(index).displacement_m.z - expected).abs() < 1e-9);
     }
 }
@@ -384,7 +385,7 @@ fn fixed_points_never_move_and_carry_the_load() {
         for _ in 0..40_000 {
             tissue.step().unwrap();
         }
-        let held: Vec<_> = (0..tissue.model().len()).map(|index| tissue.point(index)).collect();
+        let held: Vec<_> = tissue.model().points().map(|index| tissue.point(index)).collect();
         let mut carried = DVec3::ZERO;
         for index in scene.sheet.fixed_indices() {
             assert_eq!(held[index].displacement_m, DVec3::ZERO);
@@ -414,7 +415,7 @@ fn a_let_go_point_goes_on_with_its_velocity() {
         ];
         let scene = scene_with(SMALL, &sets);
         let mut tissue = sheet::at_rest(&model(&scene));
-        let index = tissue.model().index_of([3, 2]);
+        let index = tissue.model().scene.sheet.point([3, 2]);
         let steps = (0.1 * rate_hz) as u64;
         for step in 0..steps {
             let target = DVec3::new(0.0, 0.0, -speed * (step + 1) as f64 / rate_hz);
@@ -438,7 +439,7 @@ fn a_let_go_point_goes_on_with_its_velocity() {
 fn a_point_let_go_as_a_force_begins_starts_like_any_free_point() {
     // Held at rest, then released at the step at which a force begins: the same as a force that begins on a free point.
     let scene = scene_with(SMALL, &["stepping.substeps=2"]);
-    let index = model(&scene).index_of([3, 2]);
+    let index = model(&scene).scene.sheet.point([3, 2]);
     let run = |hold: bool| {
         let mut tissue = sheet::at_rest(&model(&scene));
         if hold {
@@ -464,7 +465,7 @@ fn to_grasp_and_let_go_between_two_steps_changes_nothing() {
     let run = |touch: bool| {
         let mut tissue = shaken(&scene, 20);
         if touch {
-            let index = tissue.model().index_of([3, 2]);
+            let index = tissue.model().scene.sheet.point([3, 2]);
             tissue.grasp(0, index, Grasp::Held(DVec3::ZERO));
             tissue.release(0);
         }
@@ -480,7 +481,7 @@ fn to_grasp_and_let_go_between_two_steps_changes_nothing() {
 fn a_grasped_point_taken_over_by_another_tool_follows_that_one() {
     let scene = scene(SMALL);
     let mut tissue = sheet::at_rest(&model(&scene));
-    let index = tissue.model().index_of([3, 2]);
+    let index = tissue.model().scene.sheet.point([3, 2]);
     tissue.grasp(0, index, Grasp::Held(DVec3::new(0.0, 0.0, 0.01)));
     tissue.step().unwrap();
     tissue.grasp(1, index, Grasp::Held(DVec3::new(0.0, 0.0, 0.012)));
@@ -501,7 +502,7 @@ fn a_grasped_point_taken_over_by_another_tool_follows_that_one() {
 fn a_grasp_that_goes_on_as_the_point_went_needs_little_force() {
     let scene = scene(SMALL);
     let mut tissue = shaken(&scene, 20);
-    let index = tissue.model().index_of([3, 2]);
+    let index = tissue.model().scene.sheet.point([3, 2]);
     let free = tissue.point(index);
     let target = free.displacement_m + free.velocity_m_per_s * 1e-3;
     tissue.grasp(0, index, Grasp::Held(target));
@@ -542,7 +543,7 @@ profile = { type = "sine", frequency_hz = 2.5 }
         let z = -0.75 * (-30.0 * distance(0.05 + 0.5 * t, 0.1) - 0.5).exp();
         let sine = (std::f64::consts::TAU * 2.5 * t).sin();
         let expected = DVec3::new(0.2 * sine * (-10.0 * distance(0.2, 0.15)).exp(), 0.0, z);
-        let point = session.tissue().point(session.model().index_of([i, j]));
+        let point = session.tissue().point(session.model().scene.sheet.point([i, j]));
         assert!((point.applied_n - expected).length() < 1e-12, "{}, expected {expected}", point.applied_n);
     }
     // Just before a hop, the force is at its old place.
@@ -564,15 +565,18 @@ fn a_spring_pressed_to_no_length_stays_finite() {
     ] {
         let scene = scene_with(SMALL, &sets);
         let mut tissue = sheet::at_rest(&model(&scene));
-        let (moved, held) = (tissue.model().index_of([3, 2]), tissue.model().index_of([4, 2]));
+        let (moved, held) = (tissue.model().scene.sheet.point([3, 2]), tissue.model().scene.sheet.point([4, 2]));
         let check = |tissue: &dyn Tissue, step: u32| {
-            for index in 0..tissue.model().len() {
+            for index in tissue.model().points() {
                 let point = tissue.point(index);
                 let vectors = [point.displacement_m, point.velocity_m_per_s, point.spring_n, point.reaction_n()];
-                assert!(vectors.iter().all(|v| v.is_finite()), "{sets:?}: point {index} after step {step}: {point:?}");
+                assert!(
+                    vectors.iter().all(|v| v.is_finite()),
+                    "{sets:?}: point {index:?} after step {step}: {point:?}"
+                );
                 // Eight springs, none longer than three times its rest length.
                 let most_n = 8.0 * 2.0 * 2.0_f64.sqrt() * h * scene.springs.stiffness_n_per_m;
-                assert!(point.spring_n.length() < most_n, "{sets:?}: point {index} after step {step}: {point:?}");
+                assert!(point.spring_n.length() < most_n, "{sets:?}: point {index:?} after step {step}: {point:?}");
             }
             assert!(total_j(tissue.energy()).is_finite(), "{sets:?}: after step {step}");
         };
@@ -611,7 +615,7 @@ fn a_vibration_without_damping_keeps_its_phase() {
                 tissue.release(0);
             }
             tissue.step().unwrap();
-            path.push(tissue.point(tissue.model().index_of([7, 7])).displacement_m);
+            path.push(tissue.point(tissue.model().scene.sheet.point([7, 7])).displacement_m);
         }
         (path, tissue.model().plan.substeps)
     };

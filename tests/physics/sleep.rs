@@ -1,6 +1,6 @@
 //! Sleep: the cost in accuracy of not computing what rests, and that every force wakes the tiles it reaches.
 
-use glam::{DVec2, DVec3};
+use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::scene::law::{CentreProfile, LoadProfile, Profile, StrengthProfile};
 use palpate::scene::{PAPER, Scene};
@@ -32,13 +32,13 @@ fn law(centre: CentreProfile, force_n: [f64; 3], falloff_per_m: f64, profile: Pr
 }
 
 fn at(x: f64, y: f64) -> CentreProfile {
-    CentreProfile::Hops(vec![(0, DVec2::new(x, y))])
+    CentreProfile::Hops(vec![(0, DVec3::new(x, y, 0.0))])
 }
 
 /// The pushes on a sheet of 65 × 97 points, each with the settings that it needs.
 fn cases() -> Vec<(&'static str, Vec<&'static str>, Vec<Push>)> {
     let pulse = Profile::Pulse { on: 0, off: 400 };
-    let path = CentreProfile::Path { from_m: DVec2::new(1.0, 0.3), velocity_m_per_s: DVec2::new(0.05, 1.2) };
+    let path = CentreProfile::Path { from_m: DVec3::new(1.0, 0.3, 0.0), velocity_m_per_s: DVec3::new(0.05, 1.2, 0.0) };
     vec![
         ("local", vec![], vec![law(at(1.0, 1.5), [0.0, 0.0, -3.0], 150.0, pulse)]),
         ("stiff", vec!["springs.stiffness_n_per_m=200"], vec![law(at(1.0, 1.5), [0.3, 0.0, -1.0], 60.0, pulse)]),
@@ -105,22 +105,22 @@ fn a_sheet_at_rest_computes_nothing_and_wakes_within_the_step_that_touches_it() 
     tissue.push(0, Some(push));
     tissue.step().unwrap();
     assert!(tissue.awake_points() > 0);
-    assert!(tissue.point(tissue.model().index_of([15, 15])).displacement_m.z < 0.0);
+    assert!(tissue.point(tissue.model().scene.sheet.point([15, 15])).displacement_m.z < 0.0);
     // A held poke comes to rest and stays there.
     for _ in 0..3000 {
         tissue.step().unwrap();
     }
     assert_eq!(tissue.awake_points(), 0);
-    let held = tissue.point(tissue.model().index_of([15, 15]));
+    let held = tissue.point(tissue.model().scene.sheet.point([15, 15]));
     tissue.step().unwrap();
-    assert_eq!(tissue.point(tissue.model().index_of([15, 15])), held);
+    assert_eq!(tissue.point(tissue.model().scene.sheet.point([15, 15])), held);
     assert_eq!(held.velocity_m_per_s, DVec3::ZERO);
     // All forces balance within the tolerance.
     let rest = held.spring_n + held.virtual_n + held.applied_n;
     assert!(rest.length() < 1e-5 * held.applied_n.length(), "{rest}");
     tissue.push(0, None);
     tissue.step().unwrap();
-    assert!(tissue.point(tissue.model().index_of([15, 15])).velocity_m_per_s.z > 0.0);
+    assert!(tissue.point(tissue.model().scene.sheet.point([15, 15])).velocity_m_per_s.z > 0.0);
 }
 
 #[test]
@@ -150,7 +150,7 @@ fn a_tile_wakes_with_the_history_that_it_would_have_had() {
 fn creep(steps: u32, far_m: f64) -> f64 {
     let with = |sleep: &str| sheet(&["sheet.points=[64, 64]", "springs.stiffness_n_per_m=50", sleep]);
     let (mut truth, mut skipping) = (with("sleep.tolerance=0"), with("sleep.tolerance=1e-4"));
-    let index = truth.model().index_of([8, 8]);
+    let index = truth.model().scene.sheet.point([8, 8]);
     let mut most = 0.0;
     for step in 0..steps {
         for tissue in [&mut truth, &mut skipping] {
@@ -194,7 +194,8 @@ fn sleeping_is_the_same_at_every_width() {
             // Skip lanes that this machine does not have.
             let model = Model::compile(&scene, &Limits::default()).ok()?;
             let mut tissue = at_rest(&model);
-            let path = CentreProfile::Path { from_m: DVec2::splat(0.4), velocity_m_per_s: DVec2::new(1.5, 2.0) };
+            let path =
+                CentreProfile::Path { from_m: DVec3::new(0.4, 0.4, 0.0), velocity_m_per_s: DVec3::new(1.5, 2.0, 0.0) };
             tissue.push(0, Some(law(path, [0.2, 0.0, -1.0], 60.0, Profile::Pulse { on: 0, off: 500 })));
             (0..900).for_each(|_| tissue.step().unwrap());
             let part = tissue.computed_fraction();
@@ -211,8 +212,8 @@ fn sleeping_is_the_same_at_every_width() {
 /// The energies from the points' displacements and velocities, J: each spring computed separately.
 fn energies_by_points(tissue: &dyn Tissue) -> [f64; 3] {
     let scene = &tissue.model().scene;
-    let [rows, columns] = tissue.model().points;
-    let points: Vec<_> = (0..rows * columns).map(|index| tissue.point(index)).collect();
+    let [rows, columns] = scene.sheet.points;
+    let points: Vec<_> = tissue.model().points().map(|point| tissue.point(point)).collect();
     let mut spring_j = 0.0;
     for i in 0..rows {
         for j in 0..columns {
@@ -245,7 +246,8 @@ fn the_energy_of_tiles_that_sleep_is_counted_to_the_last_digits() {
         let integrator = format!("stepping.integrator={integrator}");
         let settings = [integrator.as_str(), "stepping.precision=f64", "sheet.points=[65, 97]", "sleep.tolerance=1e-4"];
         let (mut asked, mut unasked) = (sheet(&settings), sheet(&settings));
-        let path = CentreProfile::Path { from_m: DVec2::new(0.5, 0.5), velocity_m_per_s: DVec2::new(0.5, 0.9) };
+        let path =
+            CentreProfile::Path { from_m: DVec3::new(0.5, 0.5, 0.0), velocity_m_per_s: DVec3::new(0.5, 0.9, 0.0) };
         for tissue in [&mut asked, &mut unasked] {
             tissue.push(0, Some(law(path.clone(), [0.2, 0.3, -1.0], 60.0, Profile::Pulse { on: 0, off: 1500 })));
             tissue.push(1, Some(law(at(1.5, 0.5), [0.0, 0.0, -2.0], 150.0, Profile::Constant)));
@@ -276,7 +278,7 @@ fn a_moving_tool_asks_only_tiles_within_its_reach() {
     // Springs too weak to pass anything on, and a trembling tool: its force ends 11 points away (e^−22), in the first
     // tile.
     let mut tissue = sheet(&["sheet.points=[16, 64]", "springs.stiffness_n_per_m=1e-6", "sleep.tolerance=1e-6"]);
-    let hops = (0..20_000).map(|step| (step, DVec2::new(0.2, if step % 2 == 0 { 0.09 } else { 0.11 }))).collect();
+    let hops = (0..20_000).map(|step| (step, DVec3::new(0.2, if step % 2 == 0 { 0.09 } else { 0.11 }, 0.0))).collect();
     tissue.push(0, Some(law(CentreProfile::Hops(hops), [0.0, 0.0, -3.0], 60.0, Profile::Constant)));
     for step in 0..20_000 {
         tissue.step().unwrap();

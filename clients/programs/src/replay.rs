@@ -12,9 +12,9 @@ use indicatif::{ProgressBar, ProgressStyle};
 use palpate::limits::Limits;
 use palpate::scene::record::{Line, Network, Percentiles, Record, Run, Summary, write_line};
 use palpate::scene::script::Script;
+use palpate::shape;
 use palpate::wire;
 use palpate_client::{Channel, Error, Touch, describe};
-use palpate_proto::geometry::point;
 use palpate_proto::pb;
 use palpate_proto::refusal::Reason;
 use pb::haptic_service_client::HapticServiceClient;
@@ -192,7 +192,8 @@ impl Streamer<'_> {
     async fn send_before(&mut self, step: u64) -> Result<(), Failure> {
         while self.next_step < step.min(self.script.steps) {
             for (tool, action) in self.script.actions_at(self.next_step) {
-                let command = wire::command::scripted(tool, self.next_step, &action, self.now_ns());
+                let command =
+                    wire::command::scripted(&*self.script.shape, tool, self.next_step, &action, self.now_ns());
                 self.say(Say::Command(command)).await?;
             }
             self.next_step += 1;
@@ -292,13 +293,12 @@ async fn play(
     let probe = pb::ProbeRequest {
         session_id: session_id.clone(),
         r#where: Some(pb::probe_request::Where::Points(pb::GridPoints {
-            points: script.sample_points.iter().copied().map(point).collect(),
+            points: script.sample_points.iter().map(|point| wire::point(script.shape.name(*point))).collect(),
         })),
         every_steps: Some(script.sample_every.try_into().unwrap_or(u32::MAX)),
         energy: true,
     };
-    let [nx, ny] = scene.sheet.points;
-    let probe = if script.sample_points.iter().copied().eq((0..nx * ny).map(|index| [index / ny, index % ny])) {
+    let probe = if script.sample_points.iter().copied().eq(shape::points(scene.shape())) {
         pb::ProbeRequest { r#where: Some(pb::probe_request::Where::AllPoints(true)), ..probe }
     } else {
         probe
@@ -411,7 +411,7 @@ async fn play(
         recoveries = session.recoveries.into_iter().map(wire::sample::from_recovery).collect();
     }
 
-    let points = scene.sheet.points[0] * scene.sheet.points[1];
+    let points = scene.shape().point_count();
     let network = Network {
         late_commands: measured.late,
         rejected_commands: measured.rejected,

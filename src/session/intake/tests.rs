@@ -4,6 +4,7 @@
 use super::super::batch::SLICE;
 use super::*;
 use crate::scene::PAPER;
+use crate::shape::PointId;
 use palpate_touch::Tip;
 
 const LEASE: LeaseId = 7;
@@ -100,7 +101,7 @@ fn a_tool_keeps_its_tip_until_it_is_released() {
 
 /// A grasp of a free point, for step `at_step`.
 fn grasp(sequence: u64, at_step: u64) -> Command {
-    let action = Action::Grasp { point: [15, 15], displacement_m: glam::DVec3::ZERO };
+    let action = Action::Grasp { point: PointId::new(15 * 31 + 15), displacement_m: glam::DVec3::ZERO };
     Command { action, ..release(sequence, Some(at_step)) }
 }
 

@@ -1,7 +1,5 @@
 //! Falloffs at every width, and the bound of a change of force.
 
-use glam::DVec2;
-
 use super::*;
 use crate::limits::Limits;
 use crate::scene::{Lanes, PAPER, Scene};
@@ -30,7 +28,7 @@ fn a_table_keeps_nothing_of_the_place_before() {
     let places = [(35.2, 45.7, 4.0), (3.0, 88.9, 20.0), (69.0, 0.4, 1.0), (-40.0, 20.0, 9.0), (30.5, 60.0, 0.5)];
     for (x, y, reach) in places.into_iter().chain(places.into_iter().rev()) {
         let poke = Poke {
-            centre_m: glam::DVec2::new(x, y) * spacing_m,
+            centre_m: DVec3::new(x, y, 0.0) * spacing_m,
             force_n: DVec3::ZERO,
             falloff_per_m: 10.0 / (reach * spacing_m),
             falloff_offset: 0.0,
@@ -76,7 +74,7 @@ fn a_change_of_force_on_a_rectangle_is_at_most_its_bound() {
     let spacing_m = 0.05;
     for case in 0..400 {
         let mut poke = || Poke {
-            centre_m: DVec2::new(between(0.0, 1.0), between(0.0, 1.0)),
+            centre_m: DVec3::new(between(0.0, 1.0), between(0.0, 1.0), 0.0),
             force_n: DVec3::new(between(-1.0, 1.0), between(-1.0, 1.0), between(-1.0, 1.0)),
             falloff_per_m: between(0.0, 20.0),
             falloff_offset: between(-1.0, 1.0),

@@ -1,7 +1,7 @@
 //! Windows, and sheets that go on from a checkpoint.
 #![allow(clippy::unwrap_used)]
 
-use glam::DVec2;
+use glam::DVec3;
 
 use super::*;
 use crate::scene::law::Poke;
@@ -36,7 +36,7 @@ fn moving(sets: &[&str], steps: u64) -> Sheet<f64> {
     sheet.push(
         0,
         Some(Push::Held(Poke {
-            centre_m: scene.sheet.spacing_m * DVec2::new(2.0, 3.0),
+            centre_m: scene.sheet.spacing_m * DVec3::new(2.0, 3.0, 0.0),
             force_n: DVec3::new(0.1, -0.2, -1.0),
             falloff_per_m: 0.7 / scene.sheet.spacing_m,
             falloff_offset: 0.0,

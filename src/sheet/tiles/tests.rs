@@ -1,7 +1,7 @@
 //! A sheet of three by three tiles, of which the last ones are not whole.
 #![allow(clippy::unwrap_used)]
 
-use glam::{DVec2, DVec3};
+use glam::DVec3;
 
 use super::*;
 use crate::scene::law::Poke;
@@ -131,7 +131,7 @@ fn tiles_wake_when_the_changes_of_force_since_they_fell_asleep_exceed_the_bound_
     let (mut applied, mut tiles) = (Applied::<f64>::new(), tiles());
     // The same force on each point: so its change is the bound of its change, to the last digit.
     for (z_n, awake) in [(1.0, 0), (1.25, 0), (1.5, 9)] {
-        let (centre_m, force_n) = (DVec2::new(0.4, 0.3), DVec3::new(0.0, 0.0, z_n));
+        let (centre_m, force_n) = (DVec3::new(0.4, 0.3, 0.0), DVec3::new(0.0, 0.0, z_n));
         applied.set(0, Some(Push::Held(Poke { centre_m, force_n, falloff_per_m: 0.0, falloff_offset: 0.0 })));
         for touch in applied.changes(&model, 0).collect::<Vec<_>>() {
             tiles.pushed(&touch, model.scene.sheet.spacing_m, 1.25);

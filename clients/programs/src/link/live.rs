@@ -23,7 +23,7 @@ const LEAD_S: f64 = 3.0;
 /// Performs the run at a server, which must know the scene by its name.
 pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failure> {
     let Setup { model, law, tip, hand, device, deadband, duration_s, seed, .. } = setup;
-    let middle_m = (model.scene.sheet.extent_m() / 2.0).extend(0.0);
+    let middle_m = model.shape().extent().middle_m();
     let scale = with_tissue(|| fitting_scale(setup, LEAD_S))?;
     let task = Task::new(DVec3::ZERO, LEAD_S, *duration_s, scale, &mut Random::new(*seed, 0));
     let simulated = Simulated::new(*device, *hand, task, true);

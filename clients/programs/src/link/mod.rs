@@ -15,6 +15,7 @@ use clap::{Args, ValueEnum};
 use palpate::force_law;
 use palpate::limits::Limits;
 use palpate::memory;
+use palpate::scene::check::check_tip;
 use palpate::scene::{BUILT_IN, Scene};
 use palpate::sheet::Model;
 use palpate_proto::refusal::{Reason, Refusal, number};
@@ -207,7 +208,7 @@ fn setup(arguments: &Arguments) -> Result<Setup, Refusal> {
     let deadband = number("--deadband", arguments.deadband, "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
     let scene = scene_named(&arguments.scene, &limits)?;
     let tip = Tip { radius_m: arguments.radius_m, friction: arguments.friction, ..Tip::default() };
-    scene.sheet.check_tip("--tip", &tip)?;
+    check_tip("--tip", scene.shape(), &tip)?;
     let model = Model::compile(&scene, &limits)?;
     let law = Arc::new(force_law::exact(&model, tip.radius_m));
     let (scheme, seed) = (arguments.scheme, arguments.seed);

@@ -143,7 +143,7 @@ impl Client {
 pub(super) fn fitting_scale(setup: &Setup, lead_s: f64) -> Result<f64, String> {
     let Setup { model, law, tip, hand, device, duration_s, seed, .. } = setup;
     let most_n = task::FORCE_SHARE * device.most_n();
-    let middle_m = (model.scene.sheet.extent_m() / 2.0).extend(0.0);
+    let middle_m = model.shape().extent().middle_m();
     let mut scale = task::scale(hand, law, device.most_n());
     loop {
         let task = Task::new(middle_m, lead_s, *duration_s, scale, &mut Random::new(*seed, 0));
@@ -204,7 +204,7 @@ impl Stalls {
 pub(super) fn run(setup: &Setup) -> Result<Outcome, String> {
     let scale = fitting_scale(setup, task::LEAD_S)?;
     let Setup { model, law, tip, hand, device, conditions, stall_s, scheme, deadband, duration_s, seed } = setup;
-    let middle_m = (model.scene.sheet.extent_m() / 2.0).extend(0.0);
+    let middle_m = model.shape().extent().middle_m();
     let task = Task::new(middle_m, task::LEAD_S, *duration_s, scale, &mut Random::new(*seed, 0));
     let tissue = || Tissue::new(model, *tip, law.clone());
     let (mut server, mut twin) = (Server::new(tissue()), Twin::new(tissue()));

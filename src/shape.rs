@@ -1,0 +1,133 @@
+//! The rest shape of a tissue: its mass points, where they rest, and how they lie together. Everything above `sheet` sees a
+//! tissue this way and no other, so that it does not matter whether its points form a grid.
+
+use std::fmt;
+
+use glam::DVec3;
+use serde::Serialize;
+
+use crate::refusal::{Reason, Refusal, Result, finite};
+
+/// A mass point of a tissue. Which one it is, its shape tells.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct PointId(usize);
+
+impl PointId {
+    /// The point at place `index` in arrays over all points of the tissue.
+    pub fn new(index: usize) -> Self {
+        PointId(index)
+    }
+
+    /// Its place in such arrays.
+    pub fn index(self) -> usize {
+        self.0
+    }
+}
+
+/// What people call a point, in scripts, records and messages.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PointName {
+    /// Point [i, j] of a sheet: column i along x, row j along y.
+    Point([usize; 2]),
+}
+
+impl fmt::Display for PointName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            PointName::Point([i, j]) => write!(f, "[{i}, {j}]"),
+        }
+    }
+}
+
+/// The box around a shape at rest.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Extent {
+    /// The least of each coordinate, m.
+    pub least_m: DVec3,
+    /// The largest of each coordinate, m.
+    pub most_m: DVec3,
+}
+
+impl Extent {
+    /// Its middle, m.
+    pub fn middle_m(&self) -> DVec3 {
+        (self.least_m + self.most_m) / 2.0
+    }
+
+    /// Its length along each axis, m.
+    pub fn size_m(&self) -> DVec3 {
+        self.most_m - self.least_m
+    }
+}
+
+impl fmt::Display for Extent {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let DVec3 { x, y, z } = self.size_m();
+        if z > 0.0 { write!(f, "{x} m × {y} m × {z} m") } else { write!(f, "{x} m × {y} m") }
+    }
+}
+
+/// The rest shape of a tissue. Its points are numbered from 0 without a gap.
+pub trait RestShape: fmt::Debug + Send + Sync {
+    /// Its size in points, for people.
+    fn describe(&self) -> String;
+    /// The number of points, at least 1.
+    fn point_count(&self) -> usize;
+    /// What people call a point.
+    fn name(&self, point: PointId) -> PointName;
+    /// The point that is called so.
+    ///
+    /// # Errors
+    /// Refuses a name that no point has; `field` is the name that the refusal gives.
+    fn find(&self, field: &str, name: PointName) -> Result<PointId>;
+    /// Where a point rests, m.
+    fn rest_m(&self, point: PointId) -> DVec3;
+    /// The unit normal of the surface at a point at rest, out of the tissue.
+    fn normal(&self, point: PointId) -> DVec3;
+    /// Whether a point never moves.
+    fn is_fixed(&self, point: PointId) -> bool;
+    /// The points to which springs lead that keep lengths and angles in the surface, ascending.
+    fn neighbours(&self, point: PointId) -> Vec<PointId>;
+    /// The point that rests nearest to a place.
+    fn nearest(&self, place_m: DVec3) -> PointId;
+    /// The box around all points.
+    fn extent(&self) -> Extent;
+    /// The usual distance between neighbours, m.
+    fn edge_m(&self) -> f64;
+
+    /// Its longest side, or the distance between neighbours if it has a single point, m.
+    fn longest_side_m(&self) -> f64 {
+        self.extent().size_m().max_element().max(self.edge_m())
+    }
+
+    /// Whether a place is within the box around the shape, or off it by at most a tenth of its longest side: a tool that
+    /// strokes over the edge is still felt.
+    fn is_near(&self, place_m: DVec3) -> bool {
+        let Extent { least_m, most_m } = self.extent();
+        let margin_m = DVec3::splat(0.1 * self.longest_side_m());
+        place_m.cmpge(least_m - margin_m).all() && place_m.cmple(most_m + margin_m).all()
+    }
+
+    /// Checks the place of a force.
+    ///
+    /// # Errors
+    /// Refuses a place that is not finite or not near ([`RestShape::is_near`]); `field` is the name that the refusal gives.
+    fn check_place(&self, field: &str, place_m: DVec3) -> Result<()> {
+        for component in place_m.to_array() {
+            finite(field, component)?;
+        }
+        if self.is_near(place_m) {
+            return Ok(());
+        }
+        let (DVec3 { x, y, z }, extent) = (place_m, self.extent());
+        let message =
+            format!("({x}, {y}, {z}) m is off the tissue, which is {extent}, by more than a tenth of its longest side");
+        Err(Refusal::new(Reason::OffSheet, field, message))
+    }
+}
+
+/// All points of a shape, ascending.
+pub fn points(shape: &dyn RestShape) -> impl ExactSizeIterator<Item = PointId> + Clone + use<> {
+    (0..shape.point_count()).map(PointId)
+}
