@@ -77,7 +77,7 @@ enum Command {
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         arguments: Vec<std::ffi::OsString>,
     },
-    /// Show what each caller uses of a server, and take it back (`palpate-client admin`)
+    /// Show what each caller uses of a server, and free it (`palpate-client admin`)
     #[command(disable_help_flag = true, disable_help_subcommand = true)]
     Admin {
         /// See `palpate-client admin --help`

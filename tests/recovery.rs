@@ -1,4 +1,4 @@
-//! A session whose tissue blows up goes back to the newest state that the guard believed, and goes on.
+//! A session whose tissue blows up goes back to the last state that passed the guard's checks, and goes on.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 use std::sync::Arc;

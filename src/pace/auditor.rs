@@ -1,4 +1,5 @@
-//! The auditor: one thread that measures errors of live sessions, with little time and a lower priority than stepping.
+//! The auditor: one thread, named `audit`, that measures errors of live sessions, with little time and a lower priority than
+//! stepping.
 //!
 //! It asks the awake sessions in turns for a window of steps (`sheet::audit`), and repeats that at a quarter of the substep
 //! in f64. The stepping thread shares two checkpoints and writes down what the tools are told; it waits for nothing and

@@ -1,4 +1,4 @@
-//! The only clock of the server: monotonic, from an origin of its own; and how sessions keep time by it.
+//! The clock of stepping: monotonic, from an origin of its own; and how sessions keep time by it.
 
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};

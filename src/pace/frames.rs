@@ -1,4 +1,4 @@
-//! Frames of viewers: a thread refines and encodes the newest snapshot of each session.
+//! Frames of viewers: a thread, named `frames`, refines and encodes the newest snapshot of each session.
 //! A frame is encoded once for all viewers that ask for the same, and goes to those that have credit.
 
 use std::collections::VecDeque;

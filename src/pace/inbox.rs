@@ -1,4 +1,4 @@
-//! Where a stepping thread is asked for something, and waits until it is.
+//! A stepping thread's queue of requests; the thread sleeps here until one comes or a step is due.
 
 use std::collections::VecDeque;
 use std::sync::mpsc::SyncSender;

@@ -42,7 +42,7 @@ pub struct Live {
     /// Who made it, and pays for it.
     pub owner: Account,
     pub(super) intake: Mutex<Intake>,
-    /// Deleted when so long nobody asked for it, held a tool or had a stream, s.
+    /// Time without calls, held tools or streams after which the session is deleted, s.
     pub idle_timeout_s: f64,
     pub(super) asked_ns: AtomicU64,
     pub(super) number: u64,
@@ -54,15 +54,17 @@ pub struct Live {
     pub(super) tissue: watch::Sender<(u64, Arc<Model>)>,
     pub(super) cost: Cost,
     pub(super) audited: Mutex<Audited>,
-    /// Of the stepping threads, its own, and where that is asked.
+    /// Index of its stepping thread.
     pub(super) thread: usize,
+    /// The inbox of that thread.
     pub(super) inbox: Arc<Inbox>,
     /// The session, and its memory.
     pub(super) _taken: [Taken; 2],
 }
 
 impl Live {
-    /// How the session stands now: at rest its steps are done in thought.
+    /// How the session stands now: at rest, the steps that would have been done by now are counted without
+    /// computing them.
     pub fn status(&self) -> Status {
         let now = now_ns();
         let resting = self.at_intake(|intake, _| intake.is_resting().then(|| intake.next_step()));

@@ -1,4 +1,4 @@
-//! Sessions in real time: the only module with a clock. Stepping threads own the sessions; what servers call here
+//! Sessions in real time, and the clock of stepping. Stepping threads own the sessions; what servers call here
 //! posts a request to one, or goes through the session's intake, and never waits for a step.
 //!
 //! **Stepping threads wait for nobody.** Commands wait in the intake, whose lock is held for a queue operation and never for a

@@ -41,8 +41,9 @@ pub struct Pacer {
 }
 
 impl Pacer {
-    /// Starts `threads` stepping threads, one that encodes frames, one that reads large sheets, and one that measures
-    /// errors with `audit_share` of a core; none if that is 0.
+    /// Starts `threads` stepping threads (named `step-0` and so on), and one thread each that computes the stiffness under
+    /// tools (`stiffness`), encodes frames (`frames`), reads large sheets (`records`), and measures errors with `audit_share`
+    /// of a core (`audit`; none if that is 0).
     ///
     /// # Errors
     /// Returns an error if a thread can't be started.

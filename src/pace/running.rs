@@ -46,7 +46,7 @@ pub(super) struct Running {
     pub(super) schedule: Schedule,
     /// The step to do next. At rest, those before it are skipped; `u64::MAX` if there is none.
     pub(super) next_step: u64,
-    /// When the newest step was due, before what it was late by beyond measure was dropped.
+    /// When the newest step was due, before the backlog was dropped.
     pub(super) due_ns: u64,
     /// It was late, and takes more than its part: it goes after those that were due by then.
     not_before_ns: u64,

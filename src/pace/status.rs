@@ -14,7 +14,7 @@ pub enum RunState {
     Running,
     /// Waits to be started.
     Paused,
-    /// Ended by the guard.
+    /// Stopped by a blow-up, a fault of the program or missing memory, until it is revived.
     Held,
 }
 
@@ -51,7 +51,7 @@ pub struct Status {
     pub awake_points: usize,
     /// As [`crate::session::Session::path_counts`].
     pub path_counts: [u64; 3],
-    /// Leases that ran out.
+    /// Tools whose lease lapsed.
     pub lapsed_leases: u64,
     /// The tissue as it is: [`Live::change`](super::Live::change) may have made another of it.
     pub model: Arc<Model>,

@@ -1,4 +1,4 @@
-//! A stepping thread: it owns its sessions, and steps each when its time has come.
+//! A stepping thread (named `step-0` and so on): it owns its sessions, and steps each when its time has come.
 //!
 //! One beat: sessions begin at a whole millisecond, so those of one rate are due together. The thread wakes once for all of
 //! them, and wakes their readers together at the end of the round, after 32 of them, or after 0.2 ms (`queue::Wakes`). So the

@@ -53,7 +53,7 @@ pub(crate) struct ServeArguments {
     #[arg(long, value_name = "N")]
     threads: Option<usize>,
     /// Fraction of a core for measuring the errors of live sessions; 0 disables that [default: 0.02]
-    #[arg(long, value_name = "SHARE")]
+    #[arg(long, value_name = "FRACTION")]
     audit_share: Option<f64>,
     /// Time that streams get to end at shutdown before they are cut, s [default: 5]
     #[arg(long, value_name = "SECONDS")]

@@ -54,7 +54,7 @@ pub struct Scene {
 /// Smallest side of a texture that is made, pixels.
 pub const SMALLEST_TEXTURE: u32 = 16;
 
-/// What a tissue looks like. Nothing that a client's own scene can say: a file is one of the server's.
+/// What a tissue looks like. Clients cannot set it: the file is on the server.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Appearance {
     /// A PNG image for the surface; one is made if `None`.

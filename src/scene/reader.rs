@@ -89,7 +89,10 @@ impl Binding<'_> {
         let changes = self.changes(&items(fields, "tissue")?)?;
         let tools = forces.len() + moves.len();
         if tools > self.limits.tools as usize {
-            let message = format!("{tools} forces and tools are above the limit of {} in all", self.limits.tools);
+            let message = format!(
+                "a script uses {tools} tools (one for each [[force]] and each [[tool]]), above the limit of {}",
+                self.limits.tools
+            );
             return Err(Refusal::new(Reason::TooLarge, "force", message));
         }
         let sample_points = match fields.item("sample_points") {

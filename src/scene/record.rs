@@ -7,7 +7,7 @@ use serde::Serialize;
 use super::{Integrator, Named, Precision};
 use crate::shape::PointName;
 
-/// The first line of a record.
+/// The first line of a file of records.
 #[derive(Debug, Clone, Serialize)]
 pub struct Run {
     /// Name of the scene.
@@ -157,7 +157,7 @@ pub struct Correction {
 }
 
 /// A recovery: the guard found the tissue's motion wrong, and shorter substeps did not help. The tissue went back to the
-/// last state that the guard had believed, and continued without tools.
+/// last state that passed the guard's checks, and continued without tools.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Recovery {
     /// Steps done when it was found. Time continues from there.

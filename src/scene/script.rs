@@ -33,7 +33,7 @@ pub struct Script {
     pub moves: Vec<MotionProfile>,
     /// Changes of the tissue and the step at whose beginning each takes effect, by ascending step.
     pub changes: Vec<(u64, Change)>,
-    /// Descriptions of values that were rounded.
+    /// Warnings for the user: rounded values, forces that leave the sheet.
     pub warnings: Vec<String>,
     /// Steps per second, from the scene.
     pub rate_hz: f64,

@@ -1,5 +1,5 @@
-//! Leases of tools that were taken by calls that are over. They end with the connection over which they were taken, or
-//! when who took them may not hold a tool any more.
+//! Leases that outlast the call that acquired them (`AcquireTool`). They end with the connection over which they were
+//! acquired, or when their holder may not hold a tool any more.
 
 use std::sync::{Arc, Mutex, Weak};
 
@@ -26,7 +26,7 @@ impl Lease {
     }
 }
 
-/// Those of one connection, or of all who showed something.
+/// Those of one connection, or of all authenticated callers.
 #[derive(Default)]
 pub(super) struct Leases(Mutex<Vec<Lease>>);
 

@@ -1,5 +1,5 @@
 //! What Prometheus is told: counts of the stepping threads, the sessions as they stand, and what goes over the network.
-//! Nothing here names a session: who knows an id may go there.
+//! Nothing here names a session: whoever knows a session's id can use it.
 
 use std::net::SocketAddr;
 use std::pin::Pin;
@@ -129,10 +129,10 @@ const COUNTS: Counts = [
     ("paused_commands", "Commands without effect: their tool was paused after recoveries", |tally| {
         &tally.paused_commands
     }),
-    ("lapsed_leases", "Leases of tools that ran out", |tally| &tally.lapsed_leases),
+    ("lapsed_leases", "Tools whose lease lapsed", |tally| &tally.lapsed_leases),
     ("guard_events", "How often the guard went back to a checkpoint", |tally| &tally.guard_events),
     ("recoveries", "How often a tissue was taken back to an earlier state", |tally| &tally.recoveries),
-    ("held_sessions", "Sessions that the guard has ended", |tally| &tally.held_sessions),
+    ("held_sessions", "Sessions stopped by a blow-up, a fault of the program or missing memory", |tally| &tally.held_sessions),
     ("limited_steps", "Steps in which a tool was held to the speed limit", |tally| &tally.limited_steps),
     ("dropped_poses", "Poses that were not newer, or passed over as a backlog", |tally| &tally.dropped_poses),
     ("stale_releases", "Tools let go because nothing came any more", |tally| &tally.stale_releases),

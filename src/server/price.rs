@@ -1,6 +1,7 @@
-//! Every call has a price: the processor time that it takes on the network threads, charged to its caller. The calls of a
-//! caller that has used up its share wait, and are refused if they wait too long. Haptic streams never wait: they have limits
-//! of their own, and are the server's main task.
+//! The price of a call: the processor time that it takes on the network threads, charged to its caller. The calls of a
+//! caller that has used up its share wait, and are refused if they wait too long. Haptic streams, `ReleaseTool`,
+//! `AdminService` and health are not charged and never wait. (Haptic streams have limits of their own, and are the server's
+//! main task.)
 
 use std::pin::Pin;
 use std::task::{Context, Poll, ready};
@@ -16,7 +17,7 @@ use crate::budget::{Account, Work};
 use crate::pace::clock::{now_ns, thread_time_ns};
 use crate::refusal::{Reason, Refusal, Result};
 
-/// Calls whose paths begin with these never wait.
+/// Calls whose paths begin with these are not charged and never wait.
 const NEVER_WAIT: [&str; 4] = [
     "/palpate.v1.HapticService/Touch",
     "/palpate.v1.HapticService/ReleaseTool",
@@ -32,7 +33,7 @@ const PATIENCE: Duration = Duration::from_secs(1);
 pub(super) struct Price(Account);
 
 impl Price {
-    /// For a call of `account`; `None` if the call never waits.
+    /// For a call of `account`; `None` if the call is not charged.
     pub(super) fn of(path: &str, account: &Account) -> Option<Self> {
         let never_waits = NEVER_WAIT.iter().any(|beginning| path.starts_with(beginning));
         (!never_waits).then(|| Price(account.clone()))

@@ -200,7 +200,7 @@ impl Intake {
             lease.tip_radius_m = tip_radius_m(&command);
             let last = lease.last_place.replace(place);
             // The latest position wins: it supersedes an earlier one that has not taken effect. This does not apply to
-            // poses played by client time (`haptics::path`), where each one counts.
+            // poses played by client time (`palpate_touch::path`), where each one counts.
             let is_place = |command: &Command| match command.action {
                 Action::Grasp { .. } => true,
                 Action::Lead { .. } => command.at_step.is_some() || command.client_time_ns == 0,

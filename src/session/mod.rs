@@ -270,7 +270,7 @@ impl Session {
         &self.recoveries
     }
 
-    /// Why the tissue is not what the commands have made of it: the guard has ended the session, or there was a recovery.
+    /// Why the tissue is not what the commands have made of it: the session is held, or there was a recovery.
     pub fn fault(&self) -> Option<String> {
         let recovered = || self.recoveries.newest().map(|newest| describe(&newest.recovery));
         self.hold_reason().map(str::to_owned).or_else(recovered)

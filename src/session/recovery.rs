@@ -1,6 +1,6 @@
 //! Recovery: a session goes on after a blow-up that the guard could not repair.
 //!
-//! The tissue goes back to the last state that the guard believed, and all tools are released. Time does not go back.
+//! The tissue goes back to the last state that passed the guard's checks, and all tools are released. Time does not go back.
 //! The commands that took effect since that state are lost; they are counted, and whoever holds a tool is told. A
 //! recovery depends on steps and commands alone, so the same commands give the same bits.
 //!
@@ -9,8 +9,9 @@
 //! paused: until the window is over their commands have no effect, except releases. Other tools can still cause a
 //! recovery, which pauses them as well.
 //!
-//! The session is held only if the tissue blows up although nothing has acted on it since it was at rest. Then no
-//! command has caused the fault, and another recovery would not help.
+//! After a blow-up, the session is held only if nothing has acted on the tissue since it was at rest. Then no command has
+//! caused the fault, and another recovery would not help. (A fault of the program, or memory that the system refuses,
+//! holds a session too: `pace::running`.)
 //!
 //! [`INTERVAL_SUBSTEPS`]: crate::sheet::guard::INTERVAL_SUBSTEPS
 
@@ -99,7 +100,7 @@ impl Recoveries {
         self.disturbed
     }
 
-    /// Forgets the commands before `step`, whose effect the guard has believed.
+    /// Forgets the commands before `step`: the state after them has passed the guard's checks.
     pub(super) fn believe(&mut self, step: u64) {
         while self.acts.front().is_some_and(|acts| acts.step < step) {
             self.acts.pop_front();

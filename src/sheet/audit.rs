@@ -47,7 +47,7 @@ pub enum Origin {
     Substep,
     /// The rounding of the number format.
     Rounding,
-    /// SleepTiles at rest, which are not computed.
+    /// Tiles at rest, which are not computed.
     Sleep,
 }
 

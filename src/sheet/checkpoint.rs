@@ -15,7 +15,7 @@ use palpate_touch::Tip;
 /// Tolerance of the energy balance, as a fraction of energy and of work: errors of the schemes at the stability bound.
 pub const MARGIN: f64 = 0.05;
 
-/// Why the guard gave up.
+/// Why a check of the guard failed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Cause {
     /// A point is not finite, or is displaced by a billion times the sheet's size.

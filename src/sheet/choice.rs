@@ -9,7 +9,7 @@ use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result};
 use crate::scene::{Integrator, Lanes, Precision, Scene, Stepping};
 
-/// Errors that grow with time, where nothing damps them, are expected for so long, s.
+/// Time over which undamped, growing errors are predicted, s.
 pub const LASTING_S: f64 = rehearsal::LASTING_S;
 
 /// The number formats and what each costs, in f32.

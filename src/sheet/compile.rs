@@ -1,4 +1,4 @@
-//! Compiles a scene to a model: checks it, chooses a scheme, and expects an error.
+//! Compiles a scene to a model: checks it, chooses a scheme, and predicts its error.
 
 use std::collections::VecDeque;
 use std::sync::Arc;

@@ -13,7 +13,7 @@ pub struct Model {
     pub scene: Scene,
     /// Points along x (rows) and along y (within a row).
     pub(super) points: [usize; 2],
-    /// Places of the fixed points, rising.
+    /// Row-major indices of the fixed points, ascending.
     pub(super) fixed: Vec<usize>,
     /// ω_b = √((largest spring stiffness + K″)/m): no vibration is faster, under any deformation, rad/s.
     pub omega_bound_per_s: f64,

@@ -26,7 +26,7 @@ struct Grasped {
     held: bool,
 }
 
-/// All points that do not move freely.
+/// Grasped points, and those just released.
 #[derive(Debug, Clone)]
 pub(super) struct Prescribed {
     grasped: Vec<Grasped>,

@@ -53,7 +53,7 @@ pub(super) struct Region {
     pub(super) strips: Vec<Strip>,
     /// [`Region::cover`] sorts the members and removes those that are no longer awake.
     pub(super) awake: Marks,
-    /// SleepTiles along y.
+    /// Tiles along y.
     columns: usize,
 }
 

@@ -29,7 +29,7 @@ const SIDE: usize = 12;
 /// How long a rehearsal lasts, s. Rounding and phase errors grow with time where little damps them.
 const COURSE_S: f64 = 0.5;
 
-/// Steps of a rehearsal at most and, of slow steps, at least.
+/// Least and largest number of steps of a rehearsal. The least applies to slow steps.
 const STEPS: (f64, f64) = (40.0, 4000.0);
 
 /// Substeps of a rehearsal with the longest stable substep, at most: bounds the work for absurd scenes.
@@ -38,7 +38,7 @@ const SUBSTEPS: f64 = 8000.0;
 /// Where each step needs more substeps than this to be stable, a rehearsal looks at parts of steps.
 const SUBSTEPS_A_LOOK: u32 = 8;
 
-/// Errors that grow with time, where nothing damps them, are expected for so long, s.
+/// Time over which undamped, growing errors are predicted, s.
 pub(super) const LASTING_S: f64 = 2.0;
 
 /// By how much the true error of a script may exceed the rehearsed one.
@@ -82,7 +82,7 @@ const LOADS: [Load; 3] = [
     },
 ];
 
-/// What a substep and a step of a rehearsal cost beside their points, in points: small sheets are not for nothing.
+/// What a substep and a step of a rehearsal cost beside their points, in points: small sheets have a fixed cost too.
 const SUBSTEP_POINTS: u64 = 32;
 const STEP_POINTS: u64 = 500;
 

@@ -1,4 +1,4 @@
-//! How a sheet puts tiles to sleep and what wakes them: the physics behind `tiles`.
+//! How a sheet puts tiles to sleep, and how changes of the tools' forces wake them: the physics behind `tiles`.
 
 use super::integrate::{Oscillator, with_arithmetic};
 use super::motion::Sheet;
@@ -52,7 +52,7 @@ impl<T: Real> Sheet<T> {
         }
         let Sheet { model, plan, tables, state, tiles, prescribed, contacts, applied, .. } = self;
         let spacing_m = model.scene.sheet.spacing_m;
-        // SleepTiles under a tool that holds or touches stay awake.
+        // Tiles under a tool that holds or touches stay awake.
         let grasped = prescribed.grasped().map(|(index, _)| model.point_of(index));
         let held: Vec<usize> = grasped.chain(contacts.points()).map(|point| tiles.of(point)).collect();
         for (_, motion) in prescribed.grasped() {

@@ -3,9 +3,8 @@
 use super::integrate::{Bound, Oscillator, Scheme, entry};
 use crate::scene::{Integrator, Springs};
 
-/// What a substep of central differences may turn the fastest vibration by, rad: dt·ω_b ≤ θ. The scheme is
-/// stable below 2; its error falls with θ². At 0.25 the force of the stiffest scenes is within 5e-3 (ARCHITECTURE.md,
-/// "Figures").
+/// Largest phase of the fastest vibration per substep of central differences, rad: dt·ω_b ≤ θ. The scheme is stable
+/// below 2; its error falls with θ². At 0.25 the force of the stiffest scenes is within 5e-3.
 pub const THETA: f64 = 0.25;
 
 /// By how much smaller than [`THETA`] a turn has to be where vibrations last, from 1 to 8.
@@ -54,7 +53,7 @@ pub fn largest_stiffness_n_per_m(springs: &Springs) -> f64 {
 /// Vibrations between the slowest and the fastest at which stability is looked at: it may fail in between.
 const VIBRATIONS: u32 = 48;
 
-/// By which a vibration may grow in a substep and still count as stable: what rounding leaves of 1.
+/// Largest growth factor of a vibration per substep that counts as stable: 1 plus rounding error.
 const NO_GROWTH: f64 = 1.0 + 1e-7;
 
 /// Whether no vibration grows, of springs up to `stiffness` = (ω·dt)².

@@ -1,7 +1,7 @@
 //! How stiff the sheet is under a disc: its tangent stiffness around the present place, and the force law of a slow press.
 //!
 //! With E the weights of the disc (`footprint`), one column a direction, and K the tangent stiffness of the sheet, a
-//! disc that is moved by ds without haste is pushed back by S·ds, S = (Eᵀ K⁻¹ E)⁻¹: three solutions K·φ = E. The shape
+//! disc that is moved by ds quasi-statically is pushed back by S·ds, S = (Eᵀ K⁻¹ E)⁻¹: three solutions K·φ = E. The shape
 //! φ̂ = φ·S, the displacement of all points for a unit of the disc's, tells the damping and the mass that go with it:
 //! B = C·φ̂ᵀφ̂, the derivative of the disc's impedance at rest, and M = m·φ̂ᵀφ̂. A disc that slides carries its dimple
 //! along, and each point is moved by −∂u/∂x·v: drag D = C·Σ ∂u·∂u.
@@ -397,7 +397,7 @@ impl<'m> Patch<'m> {
         sum / (8.0 * spacing_m * spacing_m)
     }
 
-    /// Brings the disc's z to `-depth_m` without haste (Newton's method); the force on the disc, N.
+    /// Brings the disc's z to `-depth_m` quasi-statically (Newton's method); the force on the disc, N.
     fn press(&mut self, depth_m: f64) -> f64 {
         let own = self.model.scene.virtual_stiffness_n_per_m;
         let mut force_n = 0.0;

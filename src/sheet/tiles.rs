@@ -8,7 +8,9 @@
 //! **Waking.** A sleeping tile remembers where the points around it were when it fell asleep, and wakes when one of
 //! them is more than ε_w from there. (A comparison with the step before would miss a slow creep.) ε_w is ε, or less
 //! where springs are much stiffer than the virtual ones and so pass on more of an omitted force. A tile also wakes when
-//! the tools' force on it may have changed by more than ε_w·K″ since, and when it is grasped.
+//! the tools' force on it may have changed by more than ε_w·K″ since (`rest`), when a point of it is grasped (`motion`), and
+//! when a position-controlled tool pushes on it (`touch`). All tiles wake when the tissue changes (`change`), after a
+//! recovery (`recovery`), and when the guard goes back to a checkpoint (`guard`).
 //!
 //! **Cost.** A step's cost follows what is awake, not the size of the sheet: sets of tiles are lists, memory that nothing has
 //! moved in is never written, a checkpoint copies what was awake since the last one, a record adds the energies that sleeping
@@ -68,7 +70,7 @@ struct EdgeWatch {
 #[derive(Debug)]
 pub(super) struct SleepTiles<T> {
     layout: Layout,
-    /// SleepTiles along x and along y.
+    /// Tiles along x and along y.
     counts: [usize; 2],
     /// Number of rows that a spring reaches on.
     reach: usize,
@@ -90,9 +92,9 @@ pub(super) struct SleepTiles<T> {
     snapshots: Vec<T>,
     /// The comparisons of the sleeping tiles next to awake ones.
     watches: Vec<EdgeWatch>,
-    /// SleepTiles that were awake since the last checkpoint.
+    /// Tiles that were awake since the last checkpoint.
     touched: Marks,
-    /// SleepTiles that were ever awake, or whose springs reach such a tile. In all others nothing has ever moved: all is 0.
+    /// Tiles that were ever awake, or whose springs reach such a tile. In all others nothing has ever moved: all is 0.
     moved: Marks,
     /// The recent largest displacement, spacings.
     pub(super) largest: f64,

@@ -32,7 +32,7 @@ impl<T: Real> Sheet<T> {
                 }
                 continue;
             }
-            // SleepTiles that slept were at rest in this substep, as if they had been computed.
+            // Tiles that slept were at rest in this substep, as if they had been computed.
             tiles.wake_under(tool.points());
             push(model, plan, layout, state, &tool.footprint, tool.force_n - before_n, plan.scheme.kick());
             work.add(tool.force_n.dot(movement_m(model, layout, state, &tool.footprint)));

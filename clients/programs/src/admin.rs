@@ -1,4 +1,4 @@
-//! `palpate admin`: shows what callers use of a server, and takes it from them.
+//! `palpate-client admin`: shows what callers use of a server, and frees it.
 
 use palpate_client::{Channel, describe};
 use palpate_proto::pb;
@@ -26,19 +26,19 @@ enum Act {
     Callers,
     /// Show the streams of a session: number, caller, age
     Streams {
-        /// As `palpate top` shows it
+        /// As `palpate-client top` shows it
         session: String,
     },
     /// Release a tool whoever holds it; its action ends at the next step
     FreeTool {
-        /// As `palpate top` shows it
+        /// As `palpate-client top` shows it
         session: String,
         /// The tool's number
         tool: u32,
     },
     /// End a stream and release the tools that it holds
     CutStream {
-        /// As `palpate top` shows it
+        /// As `palpate-client top` shows it
         session: String,
         /// As `streams` shows it
         number: u64,
@@ -53,12 +53,12 @@ enum Act {
     },
     /// Recover a session in state HELD: paused at its step, the tissue at rest, all tools released
     Revive {
-        /// As `palpate top` shows it
+        /// As `palpate-client top` shows it
         session: String,
     },
     /// Delete a session and end all its streams
     Delete {
-        /// As `palpate top` shows it
+        /// As `palpate-client top` shows it
         session: String,
     },
 }

@@ -35,10 +35,10 @@ pub(crate) struct Arguments {
     #[arg(long, default_value = "medium")]
     hand: String,
     /// Receive a sample only when the rendered force would be off by more than this fraction; 0: one per step
-    #[arg(long, value_name = "PART", default_value_t = 0.0)]
+    #[arg(long, value_name = "FRACTION", default_value_t = 0.0)]
     deadband: f64,
     /// End after this time, s [default: at Ctrl-C]
-    #[arg(long, value_name = "S")]
+    #[arg(long, value_name = "SECONDS")]
     seconds: Option<f64>,
     /// Seed of the simulated hand's movements
     #[arg(long, default_value_t = 1)]

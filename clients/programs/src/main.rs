@@ -97,17 +97,17 @@ enum Command {
     Health(health::Arguments),
     /// Show the sessions of a server once a second: state, step rate, dilation, awake points, holders of tools
     #[command(after_help = "Examples:\n  \
-        palpate top\n  \
-        palpate top https://server:7117 --token-file admin.token\n  \
-        palpate top --once --json | jq '.sessions[] | select(.time_dilation < 0.999)'\n\n\
+        palpate-client top\n  \
+        palpate-client top https://server:7117 --token-file admin.token\n  \
+        palpate-client top --once --json | jq '.sessions[] | select(.time_dilation < 0.999)'\n\n\
         If the server authenticates clients, your token needs the role `administer`.\n\n\
         Exit status: 0; 1 when the server can't be reached or refuses; 2 when an input was refused.")]
     Top(top::Arguments),
     /// Show what each caller uses of a server; release a tool, cut a stream or a caller, revive or delete a session
     #[command(after_help = "Examples:\n  \
-        palpate admin callers\n  \
-        palpate admin streams 0123456789abcdef0123456789abcdef\n  \
-        palpate admin cut-caller token:ann --delete-sessions --server https://server:7117 --token-file admin.token\n\n\
+        palpate-client admin callers\n  \
+        palpate-client admin streams 0123456789abcdef0123456789abcdef\n  \
+        palpate-client admin cut-caller token:ann --delete-sessions --server https://server:7117 --token-file admin.token\n\n\
         If the server authenticates clients, your token needs the role `administer`. Callers are named by their token or\n\
         certificate, without authentication by their address. A caller that you cut can come back: remove its entry from\n\
         the token file first.\n\n\

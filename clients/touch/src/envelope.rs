@@ -1,8 +1,8 @@
 //! The safety envelope: the limits between a wanted force and a device. Every force passes them, in this order:
 //!
-//! 1. the age of the model, counted from when the newest *arrived* (a constant delay is not staleness), or the time
-//!    since the last tick if that is longer: up to [`FRESH_S`] no change; up to [`STALE_S`] the force fades to a half;
-//!    beyond, it decays with [`DECAY_S`]; from [`PAUSE_S`] on the state is PAUSED. A model that arrives before brings
+//! 1. the age of the model, counted from when the newest *arrived* (a constant delay is not staleness): up to [`FRESH_S`]
+//!    no change; up to [`STALE_S`] the force fades to a half; beyond, it decays with [`DECAY_S`]; beyond [`PAUSE_S`] the
+//!    state is PAUSED, as it is after a gap of more than [`PAUSE_S`] between two ticks. A model that arrives before brings
 //!    the force back within `RETURN_S`;
 //! 2. soft engage: after `enable` nothing is rendered until the wanted force is below [`ENGAGE_BELOW_N`]; then the
 //!    force ramps in over [`ENGAGE_S`];
@@ -25,7 +25,8 @@ use crate::device::{CONTINUOUS_S, Device};
 pub const FRESH_S: f64 = 0.05;
 /// From this age on the force decays to zero, s.
 pub const STALE_S: f64 = 0.15;
-/// From this age on rendering pauses until it is enabled, s: a twentieth of half the force is left.
+/// Beyond this age, or this gap between two ticks, rendering pauses until it is enabled, s. At this age a twentieth of half
+/// the force is left.
 pub const PAUSE_S: f64 = 0.3;
 /// A faded force returns within this time, s.
 const RETURN_S: f64 = 0.25;
@@ -59,7 +60,7 @@ pub enum RenderingState {
     Disabled,
     /// Rendering, or ramping in.
     Enabled,
-    /// No model arrived for too long. Nothing is rendered until `enable`.
+    /// No model arrived for too long, or no tick came. Nothing is rendered until `enable`.
     Paused,
     /// An error. Nothing is rendered until `reset` and then `enable`.
     Fault,
@@ -68,7 +69,7 @@ pub enum RenderingState {
 /// The reason why a force differs from the wanted one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LimitCause {
-    /// The newest model is old.
+    /// The newest model is old, or the last tick was long ago.
     Stale,
     /// Rendering is not enabled, or ramping in.
     Engage,

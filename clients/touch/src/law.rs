@@ -1,8 +1,8 @@
-//! The force law of a tissue under a disc that is pressed straight in without haste: what the server sends ahead, once,
+//! The force law of a tissue under a disc that is pressed straight in quasi-statically: what the server sends ahead, once,
 //! so that a client knows before it gets there how the force will rise.
 //!
 //! A stiffness at one place says nothing of the next millimetre, and tissue hardens: with 50 ms of delay and 50 mm/s a
-//! hand is 2.5 mm further than what it last felt. A polynomial through past samples tells wildly wrong things there; the
+//! hand is 2.5 mm further than what it last felt. A polynomial through past samples extrapolates badly there; the
 //! tissue's own law, which the server computes from its model, does not.
 
 /// The law at one depth.

@@ -47,7 +47,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "MS", conflicts_with = "profile")]
     jitter_ms: Option<f64>,
     /// Fraction of the messages that TCP must retransmit, which delays all later ones
-    #[arg(long, value_name = "PART", conflicts_with = "profile")]
+    #[arg(long, value_name = "FRACTION", conflicts_with = "profile")]
     loss: Option<f64>,
     /// Stall the client once a second, at a random moment, for this long, ms; the device holds its last force
     #[arg(long, value_name = "MS", default_value_t = 0.0, conflicts_with = "random")]
@@ -59,10 +59,10 @@ pub(crate) struct Arguments {
     #[arg(long, default_value = "model")]
     scheme: Rendering,
     /// Send a sample only when the force that the client renders is off by more than this fraction; 0 sends one per step
-    #[arg(long, value_name = "PART", default_value_t = 0.0)]
+    #[arg(long, value_name = "FRACTION", default_value_t = 0.0)]
     deadband: f64,
     /// Duration in simulated time, s
-    #[arg(long, value_name = "S", default_value_t = 20.0)]
+    #[arg(long, value_name = "SECONDS", default_value_t = 20.0)]
     seconds: f64,
     /// Seed of the task and the network
     #[arg(long, default_value_t = 1)]
