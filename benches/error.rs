@@ -63,11 +63,11 @@ impl Run {
 
     fn session(&self) -> Session {
         let mut session = Session::new(&self.model);
-        for (tool, law) in self.script.forces.iter().enumerate() {
-            session.play_force(tool, law.clone());
+        for (tool, profile) in self.script.forces.iter().enumerate() {
+            session.play_force(tool, profile.clone());
         }
-        for (index, law) in self.script.moves.iter().enumerate() {
-            session.play_move(self.script.forces.len() + index, law.clone());
+        for (index, profile) in self.script.moves.iter().enumerate() {
+            session.play_move(self.script.forces.len() + index, profile.clone());
         }
         session
     }

@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::pace::frames::Delivery;
-use palpate::scene::law::Poke;
+use palpate::scene::profile::Poke;
 use palpate::scene::{PAPER, Scene};
 use palpate::sheet::{Push, at_rest};
 use palpate::surface::{Encoding, Frame, FrameTiles, Refinement, Snapshot, encode, encode_over};
@@ -159,7 +159,7 @@ fn poke(force_n: DVec3, refinement: u32, report: &mut Report, rows: &mut Vec<Vec
     let mut tissue = at_rest(&model);
     let centre_m = model.shape().extent().middle_m();
     let push = Poke { centre_m, force_n, falloff_per_m: 150.0, falloff_offset: 0.0 };
-    tissue.push(0, Some(Push::Held(push)));
+    tissue.push(0, Some(Push::Constant(push)));
     let limits = Limits { frame_vertices: usize::MAX, ..Limits::default() };
     let grid = Refinement::new(&model.scene, refinement, &limits).unwrap();
     let [_, columns] = grid.vertices();

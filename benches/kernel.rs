@@ -19,7 +19,7 @@ use std::path::Path;
 use std::process::Command;
 
 use glam::DVec3;
-use palpate::scene::law::Poke;
+use palpate::scene::profile::Poke;
 use palpate::sheet::{Push, Tissue, at_rest};
 use report::chart::{Look, Panel, Series};
 use report::{Report, digits, quick, seconds};
@@ -64,7 +64,7 @@ fn tissue(settings: &[String], side: usize) -> Box<dyn Tissue> {
             falloff_per_m,
             falloff_offset: 0.0,
         };
-        tissue.push(tool, Some(Push::Held(push)));
+        tissue.push(tool, Some(Push::Constant(push)));
     }
     tissue
 }

@@ -31,7 +31,7 @@ use attack::Kind;
 use cores::kept_to;
 use glam::DVec3;
 use palpate::limits::Limits;
-use palpate::scene::law::Poke;
+use palpate::scene::profile::Poke;
 use palpate::scene::script::Action;
 use palpate::scene::{PAPER, Scene};
 use palpate::session::Session;

@@ -8,7 +8,7 @@ mod report;
 mod subject;
 
 use glam::DVec3;
-use palpate::scene::law::{CentreProfile, LoadProfile, Profile, StrengthProfile};
+use palpate::scene::profile::{CentreProfile, LoadProfile, Profile, StrengthProfile};
 use palpate::sheet::{Push, at_rest};
 use report::chart::{Look, Panel, Series};
 use report::{Report, cells, digits, quick, rough, seconds};
@@ -100,8 +100,8 @@ fn run(settings: &[String], kind: &Kind, rounds: usize) -> Run {
     let (mut least_s, mut fields, mut computed) = (f64::INFINITY, Vec::new(), 0.0);
     for _ in 0..rounds {
         let mut tissue = at_rest(&model);
-        for (tool, law) in (kind.pushes)(length_m).into_iter().enumerate() {
-            tissue.push(tool, Some(Push::Law(law)));
+        for (tool, profile) in (kind.pushes)(length_m).into_iter().enumerate() {
+            tissue.push(tool, Some(Push::Profile(profile)));
         }
         fields.clear();
         let mut stepping_s = 0.0;

@@ -13,7 +13,7 @@ mod report;
 mod subject;
 
 use glam::{DVec2, DVec3};
-use palpate::scene::law::{CentreProfile, LoadProfile, Poke, Profile, StrengthProfile};
+use palpate::scene::profile::{CentreProfile, LoadProfile, Poke, Profile, StrengthProfile};
 use palpate::session::Session;
 use palpate::sheet::{Model, Push, at_rest};
 use report::chart::Panel;
@@ -82,7 +82,7 @@ impl Tissue {
             falloff_offset: 0.0,
         };
         let mut tissue = at_rest(&model);
-        tissue.push(0, Some(Push::Held(push)));
+        tissue.push(0, Some(Push::Constant(push)));
         let mut largest_m = 0.0;
         for step in 0..STEPS {
             if tissue.step().is_err() {
@@ -121,13 +121,13 @@ impl Tissue {
         let model = self.model(step_s).unwrap();
         let sheet = &model.scene.sheet;
         let mut session = Session::new(&model);
-        let law = LoadProfile {
+        let profile = LoadProfile {
             centre: CentreProfile::Hops(vec![(0, model.shape().rest_m(sheet.point([4, 4])))]),
             strength: StrengthProfile::Scaled(force_n * DVec3::new(0.6, 0.0, -0.8), Profile::Constant),
             falloff_per_m: 1.0 / sheet.spacing_m,
             falloff_offset: 0.0,
         };
-        session.play_force(0, law);
+        session.play_force(0, profile);
         let mut largest_m: f64 = 0.0;
         let mut due = Vec::new();
         for _ in 0..(1.0 / step_s).ceil().max(1000.0) as u32 {

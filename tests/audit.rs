@@ -119,7 +119,7 @@ fn touching(grasps: bool, step: u64) -> Vec<(usize, Action)> {
     let t = step as f64 / 250.0;
     let tip = Tip { radius_m: 0.06, grasps, ..Tip::default() };
     let depth_m = 0.004 * (1.0 - (std::f64::consts::TAU * 1.5 * t).cos());
-    vec![(0, Action::Lead { place_m: DVec3::new(0.13 + 0.02 * t, 0.1, 0.001 - depth_m), tip })]
+    vec![(0, Action::Pose { place_m: DVec3::new(0.13 + 0.02 * t, 0.1, 0.001 - depth_m), tip })]
 }
 
 fn pushing(step: u64) -> Vec<(usize, Action)> {
@@ -170,7 +170,7 @@ fn findings(scene: &Scene, told: Told, steps: u64, finer: u32) -> Vec<Finding> {
             None => {}
         }
         if !std::mem::replace(&mut asked, true) {
-            session.watch(Inputs::default());
+            session.request_audit(Inputs::default());
         }
     });
     found

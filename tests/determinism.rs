@@ -85,7 +85,7 @@ fn every_width_of_vectors_gives_the_same_bits() {
         for _ in 0..40 {
             tissue.step().unwrap();
         }
-        tissue.grasp(1, tissue.model().scene.sheet.point(middle), Grasp::Held(glam::DVec3::new(0.01, 0.0, 0.03)));
+        tissue.grasp(1, tissue.model().scene.sheet.point(middle), Grasp::Target(glam::DVec3::new(0.01, 0.0, 0.03)));
         // Past the first survey of the guard.
         for _ in 0..260 {
             tissue.step().unwrap();

@@ -9,7 +9,7 @@ use std::path::Path;
 use common::{SMALL, model, scene};
 use glam::DVec3;
 use palpate::limits::Limits;
-use palpate::scene::law::Poke;
+use palpate::scene::profile::Poke;
 use palpate::scene::script::{Action, Script};
 use palpate::scene::{PAPER, Scene};
 use palpate::session::Session;

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use glam::DVec3;
 use palpate::limits::Limits;
-use palpate::scene::law::Poke;
+use palpate::scene::profile::Poke;
 use palpate::scene::script::Action;
 use palpate::scene::{Change, PAPER, Scene};
 use palpate::session::Session;

@@ -16,7 +16,7 @@ use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::pace::queue::{Reader, Writer, queue};
 use palpate::refusal::Reason;
-use palpate::scene::law::Poke;
+use palpate::scene::profile::Poke;
 use palpate::scene::script::Action;
 use palpate::session::command::Command;
 use palpate::session::intake::Intake;

@@ -10,7 +10,7 @@ use common::{SMALL, model, scene_with};
 use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::scene::Scene;
-use palpate::scene::law::Poke;
+use palpate::scene::profile::Poke;
 use palpate::sheet::{self, Grasp, Model, Push, Tissue};
 use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
@@ -71,13 +71,13 @@ fn act(tissue: &mut dyn Tissue, Act { tool, place, towards, manner, .. }: Act) {
     if manner < 3 {
         // As far as through its neighbours and out: springs pressed to zero length and inverted.
         let index = tissue.model().scene.sheet.point(point);
-        return tissue.grasp(tool, index, Grasp::Held(2.5 * spacing_m * towards));
+        return tissue.grasp(tool, index, Grasp::Target(2.5 * spacing_m * towards));
     }
     // A force that moves a point by up to some spacings.
     let stiffness = scene.virtual_stiffness_n_per_m + scene.springs.stiffness_n_per_m.min(1e3);
     tissue.push(
         tool,
-        Some(Push::Held(Poke {
+        Some(Push::Constant(Poke {
             centre_m: scene.shape().rest_m(scene.sheet.point(point)),
             force_n: 3.0 * stiffness * spacing_m * towards,
             falloff_per_m: 10_f64.powf(2.0 * place[0] - 1.0) / spacing_m,
@@ -191,10 +191,10 @@ fn adversarial_commands_leave_the_tissue_finite() {
             let corner = [[0, 0], [6, 4], [0, 4], [6, 0]][(step % 4) as usize];
             let place = DVec3::new(sign, -sign, sign) * 0.3;
             match worst {
-                0 => tissue.grasp(0, model.scene.sheet.point(corner), Grasp::Held(place)),
+                0 => tissue.grasp(0, model.scene.sheet.point(corner), Grasp::Target(place)),
                 1 => tissue.push(0, Some(common::push_on(&scene, corner, [1e4, 1e4 * sign, -1e4]))),
                 2 => tissue.push(0, Some(common::push_on(&scene, [3, 2], [50.0 * sign, 20.0, 100.0 * sign]))),
-                _ => tissue.grasp((step % 3) as usize, model.scene.sheet.point([3, 2]), Grasp::Held(place)),
+                _ => tissue.grasp((step % 3) as usize, model.scene.sheet.point([3, 2]), Grasp::Target(place)),
             }
             if tissue.step().is_err() {
                 break;

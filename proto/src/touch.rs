@@ -2,7 +2,7 @@
 
 use glam::{DMat3, DVec3};
 use palpate_touch::law::{Law, Row};
-use palpate_touch::{Coupling, Device, LocalModel, Standing, Tip};
+use palpate_touch::{ContactState, Coupling, Device, LocalModel, Tip};
 
 use crate::geometry::{from_vector, point, vector};
 use crate::pb;
@@ -136,11 +136,11 @@ fn from_symmetric(m: Option<&pb::Symmetric3>) -> DMat3 {
 /// A local model as a message.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub fn local_model(model: &LocalModel) -> pb::LocalModel {
-    let contact = match model.standing {
-        Standing::Free => pb::Contact::Free,
-        Standing::Sticking => pb::Contact::Sticking,
-        Standing::Sliding => pb::Contact::Sliding,
-        Standing::Holding => pb::Contact::Holding,
+    let contact = match model.contact_state {
+        ContactState::Free => pb::Contact::Free,
+        ContactState::Sticking => pb::Contact::Sticking,
+        ContactState::Sliding => pb::Contact::Sliding,
+        ContactState::Holding => pb::Contact::Holding,
     };
     pb::LocalModel {
         sequence: model.sequence,
@@ -161,11 +161,11 @@ pub fn local_model(model: &LocalModel) -> pb::LocalModel {
 
 /// The local model in a message. The renderer refuses models that it can't render.
 pub fn from_local_model(message: &pb::LocalModel, step: u64) -> LocalModel {
-    let standing = match message.contact() {
-        pb::Contact::Unspecified | pb::Contact::Free => Standing::Free,
-        pb::Contact::Sticking => Standing::Sticking,
-        pb::Contact::Sliding => Standing::Sliding,
-        pb::Contact::Holding => Standing::Holding,
+    let contact_state = match message.contact() {
+        pb::Contact::Unspecified | pb::Contact::Free => ContactState::Free,
+        pb::Contact::Sticking => ContactState::Sticking,
+        pb::Contact::Sliding => ContactState::Sliding,
+        pb::Contact::Holding => ContactState::Holding,
     };
     #[allow(clippy::cast_precision_loss)]
     LocalModel {
@@ -181,7 +181,7 @@ pub fn from_local_model(message: &pb::LocalModel, step: u64) -> LocalModel {
         normal: from_vector(message.normal.as_ref()),
         valid_m: message.valid_m,
         friction: message.friction,
-        standing,
+        contact_state,
         law: message.law,
     }
 }

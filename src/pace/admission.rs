@@ -12,8 +12,8 @@ use super::cost::{Cost, check_asked, check_work};
 use super::laws::KeptLaws;
 use super::live::Live;
 use super::pacer::Pacer;
-use super::places::Places;
 use super::running::{Running, beat_ns};
+use super::slots::StreamSlots;
 use super::status::{RunState, Status};
 use crate::budget::{Account, Purpose, Resource};
 use crate::ids::random_id;
@@ -84,7 +84,7 @@ impl Pacer {
             number,
             limits: self.limits.clone(),
             status: Mutex::new(status),
-            streams: Mutex::new(Places::new(&self.limits)),
+            streams: Mutex::new(StreamSlots::new(&self.limits)),
             refused: AtomicU64::new(0),
             laws: KeptLaws::default(),
             tissue: watch::Sender::new((0, model.clone())),

@@ -127,13 +127,13 @@ fn audit(live: &Live, sessions: &Sessions, duty: &mut Duty<'_>, tally: &AuditTal
     let (marks, told) = sync_channel(2);
     live.inbox.send(live.number, Request::Audit(Inputs::default(), marks));
     let Some((model, opening)) = next(&told, longest(&live.model)).and_then(|mark| match mark {
-        Mark::Begin(look) => Some((look.model().clone(), look.open())),
+        Mark::Begin(begin) => Some((begin.model().clone(), begin.open())),
         Mark::End(..) | Mark::Dropped => None,
     }) else {
         return;
     };
-    let Some(Mark::End(look, inputs)) = next(&told, longest(&model)) else { return };
-    let audit = opening.close(look, inputs);
+    let Some(Mark::End(end, inputs)) = next(&told, longest(&model)) else { return };
+    let audit = opening.close(end, inputs);
     let extent = lock(&live.audited).extent;
     // Nobody wants to know of a session that is deleted, and its memory is to be freed.
     let mut goes_on = || duty.rest() && lock(sessions).contains_key(&live.id);

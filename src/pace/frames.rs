@@ -355,12 +355,12 @@ impl Watched {
         let same = |kind: &Kind| {
             (kind.session, kind.tiles.refinement(), kind.tiles.encoding()) == (session, refinement, encoding)
         };
-        let place = self.0.iter().position(same).unwrap_or_else(|| {
+        let index = self.0.iter().position(same).unwrap_or_else(|| {
             let tiles = FrameTiles::new(&job.snapshot, refinement, encoding);
             self.0.push(Kind { session, tiles, viewers: Vec::new() });
             self.0.len() - 1
         });
-        let Kind { tiles, viewers, .. } = &mut self.0[place];
+        let Kind { tiles, viewers, .. } = &mut self.0[index];
         if !viewers.iter().any(|other| std::ptr::eq(other.as_ptr(), Arc::as_ptr(viewer))) {
             viewers.push(Arc::downgrade(viewer));
         }

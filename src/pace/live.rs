@@ -11,10 +11,10 @@ use super::cost::{Cost, check_work};
 use super::frames::Viewer;
 use super::inbox::{Inbox, Request};
 use super::laws::{KeptLaws, SoughtLaw};
-use super::paced::{PacedRecord, PacedSample};
-use super::places::Places;
+use super::paced::{PacedSample, SharedRecord};
 use super::queue::{Reader, queue};
 use super::reading::Recipient;
+use super::slots::StreamSlots;
 use super::status::Status;
 use super::taps::{ProbeTap, SampleTap};
 use crate::budget::{Account, Taken};
@@ -48,7 +48,7 @@ pub struct Live {
     pub(super) number: u64,
     pub(super) limits: Limits,
     pub(super) status: Mutex<Status>,
-    pub(super) streams: Mutex<Places>,
+    pub(super) streams: Mutex<StreamSlots>,
     pub(super) refused: AtomicU64,
     pub(super) laws: KeptLaws,
     pub(super) tissue: watch::Sender<(u64, Arc<Model>)>,
@@ -241,7 +241,7 @@ impl Live {
         points: Option<Vec<PointId>>,
         energy: bool,
         account: &Account,
-    ) -> Result<Reader<PacedRecord>> {
+    ) -> Result<Reader<SharedRecord>> {
         let count = points.as_ref().map_or(self.model.len(), Vec::len).max(1);
         let bytes = count * size_of::<Point>();
         memory::check(bytes as u64, "a record")?;

@@ -19,13 +19,13 @@ pub(crate) mod laws;
 mod live;
 mod paced;
 mod pacer;
-mod places;
 mod policy;
 mod publishing;
 pub mod queue;
 mod reading;
 mod rota;
 mod running;
+mod slots;
 mod status;
 pub mod streams;
 pub mod tally;
@@ -34,9 +34,9 @@ mod thread;
 
 pub use frames::FrameReader;
 pub use live::{Accepted, Live};
-pub use paced::{PacedRecord, PacedSample, Recorded};
+pub use paced::{PacedSample, Recorded, SharedRecord};
 pub use pacer::Pacer;
-pub use places::Held;
+pub use slots::StreamKind;
 pub use status::{RunState, Status};
 pub use streams::StreamGuard;
 

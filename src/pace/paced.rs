@@ -22,7 +22,7 @@ pub struct PacedSample {
 }
 
 /// A record, and its step. All who asked for the same share one.
-pub type PacedRecord = Arc<Recorded>;
+pub type SharedRecord = Arc<Recorded>;
 
 /// What was measured once, for whoever asked for it.
 #[derive(Debug)]

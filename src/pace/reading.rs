@@ -8,7 +8,7 @@ use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
 
 use tokio::sync::oneshot;
 
-use super::paced::{PacedRecord, Recorded};
+use super::paced::{Recorded, SharedRecord};
 use super::queue::Writer;
 use crate::budget::{Account, Purpose, Resource, Taken, Turns};
 use crate::lock::lock;
@@ -35,7 +35,7 @@ pub(super) fn is_much(points: usize, all: usize) -> bool {
 
 /// A copy of a sheet, and its memory.
 pub(super) struct Copied {
-    still: Mutex<SheetCopy>,
+    copy: Mutex<SheetCopy>,
     _taken: Taken,
 }
 
@@ -54,8 +54,8 @@ impl Copies {
             return Ok(copied);
         }
         let _taken = account.take(Resource::Memory(Purpose::Records), session.model().state_bytes(), "")?;
-        let still = memory::attempt("", || Ok(session.still()))?;
-        let copied = Arc::new(Copied { still: Mutex::new(still), _taken });
+        let copy = memory::attempt("", || Ok(session.copy()))?;
+        let copied = Arc::new(Copied { copy: Mutex::new(copy), _taken });
         (self.newest, self.step) = (Arc::downgrade(&copied), step);
         Ok(copied)
     }
@@ -75,19 +75,19 @@ pub(super) type HashReply = oneshot::Sender<Result<(u64, u128)>>;
 /// Who gets a record, and how many are on their way there.
 #[derive(Debug)]
 pub(super) struct Recipient {
-    writer: Writer<PacedRecord>,
+    writer: Writer<SharedRecord>,
     most: usize,
     pending: AtomicUsize,
 }
 
 impl Recipient {
     /// Of at most so many records that are not read yet.
-    pub(super) fn new(writer: Writer<PacedRecord>, most: usize) -> Arc<Self> {
+    pub(super) fn new(writer: Writer<SharedRecord>, most: usize) -> Arc<Self> {
         Arc::new(Recipient { writer, most, pending: AtomicUsize::new(0) })
     }
 
     /// Where its records go.
-    pub(super) fn writer(&self) -> &Writer<PacedRecord> {
+    pub(super) fn writer(&self) -> &Writer<SharedRecord> {
         &self.writer
     }
 
@@ -133,7 +133,7 @@ impl Piece {
                 if reply.is_closed() {
                     return None;
                 }
-                let hash = lock(&copied.still).hash(&mut hashing, SLICE_POINTS);
+                let hash = lock(&copied.copy).hash(&mut hashing, SLICE_POINTS);
                 let Some(hash) = hash else { return Some(Piece::Hash { copied, hashing, step, hashed, reply }) };
                 *lock(&hashed) = Some((step, hash));
                 let _ = reply.send(Ok((step, hash)));
@@ -143,16 +143,16 @@ impl Piece {
                 if to.iter().all(|recipient| recipient.writer.is_abandoned()) {
                     return None;
                 }
-                let still = lock(&copied.still);
-                let all = points.as_ref().map_or(still.model().len(), |points| points.len());
+                let copy = lock(&copied.copy);
+                let all = points.as_ref().map_or(copy.model().len(), |points| points.len());
                 let from = record.points.len();
                 if from == 0 {
                     record.points = memory::with_room(all, "a record");
                 }
                 let point = |index| points.as_ref().map_or_else(|| PointId::new(index), |named| named[index]);
                 let slice = from..all.min(from + SLICE_POINTS);
-                record.points.extend(slice.map(|index| record_of(&still, point(index))));
-                drop(still);
+                record.points.extend(slice.map(|index| record_of(&copy, point(index))));
+                drop(copy);
                 if record.points.len() < all {
                     return Some(Piece::Record { copied, points, step, record, taken, to });
                 }
@@ -274,7 +274,7 @@ mod tests {
         Piece::Record { copied, points: None, step, record, taken, to: vec![to.clone()] }
     }
 
-    fn recipient(most: usize) -> (Arc<Recipient>, Reader<PacedRecord>) {
+    fn recipient(most: usize) -> (Arc<Recipient>, Reader<SharedRecord>) {
         let (writer, reader) = queue(most);
         (Recipient::new(writer, most), reader)
     }

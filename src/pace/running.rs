@@ -220,7 +220,7 @@ impl Running {
                 }
             }
             Request::Audit(inputs, marks) => {
-                self.session.watch(inputs);
+                self.session.request_audit(inputs);
                 self.audit = Some(marks);
             }
             Request::Probe(tap) if self.session.hold_reason().is_some() => {

@@ -7,7 +7,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::clock::now_ns;
 use super::live::Live;
-use super::places::{Held, Open, Places};
+use super::slots::{Open, StreamKind, StreamSlots};
 use crate::budget::{Account, Purpose, Resource};
 use crate::lock::lock;
 use crate::refusal::{Reason, Refusal, Result};
@@ -17,15 +17,15 @@ use crate::shape::RestShape;
 /// more message, which is of 64 KiB or little more.
 const UNSENT_BYTES: u64 = (400 + 80) << 10;
 
-/// A stream as it is shown to who administers.
+/// A stream, as administrators see it.
 #[derive(Debug, Clone)]
-pub struct Shown {
+pub struct StreamInfo {
     /// Names it within its session.
     pub number: u64,
     /// The call that opened it.
     pub what: &'static str,
-    /// Whether it holds tools.
-    pub held: Held,
+    /// What it is for.
+    pub kind: StreamKind,
     /// Whose it is.
     pub caller: String,
     /// For how long it has been open, ns.
@@ -67,14 +67,19 @@ impl Live {
     /// Room for one more stream of `account`, opened by the call `what`.
     ///
     /// # Errors
-    /// Refuses if all places of the session or of the caller are taken, or memory beyond the caller's part.
-    pub fn open_stream(self: &Arc<Self>, what: &'static str, held: Held, account: &Account) -> Result<StreamGuard> {
+    /// Refuses if all slots of the session or of the caller are taken, or memory beyond the caller's part.
+    pub fn open_stream(
+        self: &Arc<Self>,
+        what: &'static str,
+        kind: StreamKind,
+        account: &Account,
+    ) -> Result<StreamGuard> {
         let stream = account.take(Resource::Streams, 1, "")?;
         let _taken = [stream, account.take(Resource::Memory(Purpose::Connections), UNSENT_BYTES, "")?];
         let mut streams = lock(&self.streams);
         let all = streams.open.len();
-        if all >= streams.most || held == Held::Nothing && !streams.readers.take(account.number(), 1) {
-            let Places { most, readers, .. } = &*streams;
+        if all >= streams.most || kind == StreamKind::ReadsOnly && !streams.readers.take(account.number(), 1) {
+            let StreamSlots { most, readers, .. } = &*streams;
             let message = format!(
                 "the session has {all} streams of {most} already, {} of those that only read are this caller's; the others \
                  are kept for other callers and for those who hold tools",
@@ -84,7 +89,7 @@ impl Live {
         }
         streams.numbers += 1;
         let (number, cut) = (streams.numbers, CancellationToken::new());
-        let open = Open { what, held, account: account.clone(), since_ns: now_ns(), cut: cut.clone(), _taken };
+        let open = Open { what, kind, account: account.clone(), since_ns: now_ns(), cut: cut.clone(), _taken };
         streams.open.insert(number, open);
         drop(streams);
         Ok(StreamGuard { live: self.clone(), number, cut })
@@ -96,12 +101,12 @@ impl Live {
     }
 
     /// Each of them, oldest first.
-    pub fn shown_streams(&self) -> Vec<Shown> {
+    pub fn list_streams(&self) -> Vec<StreamInfo> {
         let now = now_ns();
-        let show = |(number, open): (&u64, &Open)| Shown {
+        let show = |(number, open): (&u64, &Open)| StreamInfo {
             number: *number,
             what: open.what,
-            held: open.held,
+            kind: open.kind,
             caller: open.account.name().to_owned(),
             age_ns: now.saturating_sub(open.since_ns),
         };
@@ -130,26 +135,26 @@ mod tests {
     use crate::sheet::choice::NEVER;
 
     #[test]
-    fn who_reads_leaves_places_to_others_and_to_who_holds_tools() {
+    fn who_reads_leaves_slots_to_others_and_to_who_holds_tools() {
         let limits = Limits { streams_per_session: 64, streams_for_holders: 4, ..Limits::default() };
         let scene = Scene::parse("paper", PAPER, &[], &limits).unwrap();
         let budget = Budget::new(&limits, 1, 1);
         let pacer = Pacer::start(1, 0.0, &limits, budget.clone()).unwrap();
         let live = pacer.create(&scene, true, 60.0, &budget.account("owner"), &NEVER).unwrap();
         let [greedy, other] = ["greedy", "other"].map(|name| budget.account(name));
-        let open = |held, account: &Account| live.open_stream("Test", held, account);
-        let mut all: Vec<_> = std::iter::from_fn(|| open(Held::Nothing, &greedy).ok()).collect();
+        let open = |kind, account: &Account| live.open_stream("Test", kind, account);
+        let mut all: Vec<_> = std::iter::from_fn(|| open(StreamKind::ReadsOnly, &greedy).ok()).collect();
         assert_eq!(all.len(), 57);
-        all.push(open(Held::Nothing, &other).unwrap());
-        all.extend(std::iter::from_fn(|| open(Held::Nothing, &other).ok()));
-        // Who holds tools always finds the places that are kept.
-        let holders: Vec<_> = (0..4).map(|_| open(Held::Tools, &other).unwrap()).collect();
+        all.push(open(StreamKind::ReadsOnly, &other).unwrap());
+        all.extend(std::iter::from_fn(|| open(StreamKind::ReadsOnly, &other).ok()));
+        // Who holds tools always finds the slots that are kept.
+        let holders: Vec<_> = (0..4).map(|_| open(StreamKind::HoldsTools, &other).unwrap()).collect();
         assert_eq!(live.streams(), all.len() + 4);
         assert!(budget.taken(Resource::Streams) == live.streams() as u64);
         // Who is cut makes room, whether they notice or not.
         assert_eq!(live.cut_streams(|_, account| account.number() == greedy.number()), 57);
         assert!(all[0].cut().is_cancelled() && !holders[0].cut().is_cancelled());
-        assert!(open(Held::Nothing, &other).is_ok());
+        assert!(open(StreamKind::ReadsOnly, &other).is_ok());
         drop((all, holders));
         assert_eq!((live.streams(), budget.taken(Resource::Streams)), (0, 0));
         pacer.stop();

@@ -68,7 +68,7 @@ pub struct Tally {
     pub late_commands: Count,
     /// Commands that had no effect because their tool was paused.
     pub paused_commands: Count,
-    /// Leases that ran out.
+    /// Tools whose lease lapsed.
     pub lapsed_leases: Count,
     /// How often the guard went back to a checkpoint.
     pub guard_events: Count,

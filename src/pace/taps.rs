@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use super::clock::now_ns;
 use super::frames::Viewer;
-use super::paced::{PacedRecord, PacedSample, Recorded};
+use super::paced::{PacedSample, Recorded, SharedRecord};
 use super::queue::{Wakes, Writer};
 use super::reading::{Copied, Copies, HashReply, Piece, Reading, Recipient, is_much};
 use crate::budget::{Account, Purpose, Resource, Taken, Work};
@@ -38,8 +38,8 @@ pub(super) struct ProbeTap {
 }
 
 /// A record of a moment, or what is to be read for one.
-enum Told {
-    Record(PacedRecord),
+enum ProbeAnswer {
+    Record(SharedRecord),
     Piece(Piece),
 }
 
@@ -121,16 +121,16 @@ impl Taps {
         let step = session.step_count();
         // A pass over the sheet, once for all who want it.
         let mut energy = None;
-        let mut told: Vec<(&ProbeTap, Told)> = Vec::new();
+        let mut told: Vec<(&ProbeTap, ProbeAnswer)> = Vec::new();
         for tap in self.probes.iter().filter(|tap| step.is_multiple_of(tap.every)) {
             let writer = tap.recipient.writer();
             let same = |told: &&mut (&ProbeTap, _)| (&told.0.points, told.0.energy) == (&tap.points, tap.energy);
             match told.iter_mut().find(same) {
-                Some((_, Told::Record(record))) => {
+                Some((_, ProbeAnswer::Record(record))) => {
                     writer.push_quietly(record.clone(), wakes);
                     continue;
                 }
-                Some((_, Told::Piece(Piece::Record { to, .. }))) if !tap.recipient.is_behind() => {
+                Some((_, ProbeAnswer::Piece(Piece::Record { to, .. }))) if !tap.recipient.is_behind() => {
                     to.push(tap.recipient.clone());
                     continue;
                 }
@@ -151,17 +151,17 @@ impl Taps {
             told.push(match copied {
                 Some(copied) => {
                     let (points, to) = (tap.points.clone(), vec![tap.recipient.clone()]);
-                    (tap, Told::Piece(Piece::Record { copied, points, step, record, taken, to }))
+                    (tap, ProbeAnswer::Piece(Piece::Record { copied, points, step, record, taken, to }))
                 }
                 None => {
                     let record = Arc::new(Recorded { step, record, _taken: taken });
                     writer.push_quietly(record.clone(), wakes);
-                    (tap, Told::Record(record))
+                    (tap, ProbeAnswer::Record(record))
                 }
             });
         }
         for (tap, told) in told {
-            if let Told::Piece(piece) = told {
+            if let ProbeAnswer::Piece(piece) = told {
                 reading.post(&tap.account, piece);
             }
         }

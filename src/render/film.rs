@@ -7,7 +7,7 @@ use std::sync::Arc;
 use super::picture::{Arrow, View, picture};
 use crate::limits::Limits;
 use crate::refusal::Refusal;
-use crate::scene::law::{Moment, Poke};
+use crate::scene::profile::{Moment, Poke};
 use crate::scene::script::Script;
 use crate::session::Session;
 use crate::session::run;
@@ -78,7 +78,7 @@ impl<'a> Film<'a> {
         // The force until now: at a jump, the one just before it.
         let before = step.saturating_sub(1);
         let moment = Moment { step: before, fraction: if step > 0 { 1.0 } else { 0.0 } };
-        let pokes = self.script.forces.iter().map(|law| law.at(moment, model.scene.stepping.rate_hz));
+        let pokes = self.script.forces.iter().map(|profile| profile.at(moment, model.scene.stepping.rate_hz));
         let arrow = |poke: Poke| Arrow { point: model.shape().nearest(poke.centre_m), towards: poke.force_n };
         let arrows = pokes.filter(|poke| poke.force_n.length() > 0.0).map(arrow).collect();
         let snapshot = Snapshot::new(&model.scene, step, self.session.time_s(), displacement_m);

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use super::law::Poke;
+use super::profile::Poke;
 use crate::shape::PointId;
 use palpate_touch::Tip;
 
@@ -19,7 +19,7 @@ pub enum Action {
         displacement_m: DVec3,
     },
     /// Reaches this place by the end of the step and meets the sheet with its tip.
-    Lead {
+    Pose {
         /// Place in the frame of the sheet at rest, z out of the tissue, m.
         place_m: DVec3,
         /// The tool's tip.

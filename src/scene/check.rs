@@ -3,7 +3,7 @@
 use glam::DVec3;
 use palpate_touch::{Coupling, Tip};
 
-use super::law::Poke;
+use super::profile::Poke;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, finite, finite_vector, not_negative, number, positive};
 use crate::shape::{PointId, RestShape};

@@ -4,7 +4,7 @@
 pub mod action;
 pub mod check;
 pub mod document;
-pub mod law;
+pub mod profile;
 mod reader;
 pub mod record;
 pub mod script;

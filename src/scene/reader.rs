@@ -8,7 +8,7 @@ use glam::DVec3;
 
 use super::check::{check_force, check_free, check_reach};
 use super::document::{self, Document, Fields, Item};
-use super::law::{CentreProfile, LoadProfile, Moment, MotionProfile, Move, Profile, StrengthProfile};
+use super::profile::{CentreProfile, LoadProfile, Moment, MotionProfile, Move, Profile, StrengthProfile};
 use super::script::Script;
 use super::{Change, Scene};
 use crate::limits::Limits;
@@ -71,17 +71,17 @@ impl Binding<'_> {
             .iter()
             .map(|item| self.force(item, &mut control_points))
             .collect::<Result<Vec<_>>>()?;
-        for (index, law) in forces.iter().enumerate() {
-            let end = law.at(Moment::start_of(steps), self.scene.stepping.rate_hz);
-            if matches!(law.centre, CentreProfile::Path { .. }) && !self.scene.shape().is_near(end.centre_m) {
+        for (index, profile) in forces.iter().enumerate() {
+            let end = profile.at(Moment::start_of(steps), self.scene.stepping.rate_hz);
+            if matches!(profile.centre, CentreProfile::Path { .. }) && !self.scene.shape().is_near(end.centre_m) {
                 let message = "leaves the sheet; where the force is streamed (--held, a replay) it ends there";
                 self.warnings.push(format!("force[{index}].path: {message}"));
             }
         }
         let moves = items(fields, "tool")?.iter().map(|item| self.tool(item)).collect::<Result<Vec<_>>>()?;
-        control_points.extend(moves.iter().map(|law| law.point));
-        for (index, law) in moves.iter().enumerate() {
-            if moves[..index].iter().any(|other| other.point == law.point) {
+        control_points.extend(moves.iter().map(|profile| profile.point));
+        for (index, profile) in moves.iter().enumerate() {
+            if moves[..index].iter().any(|other| other.point == profile.point) {
                 let message = "is prescribed by two tools";
                 return Err(Refusal::new(Reason::OutOfRange, format!("tool[{index}].point"), message));
             }
@@ -353,11 +353,11 @@ impl Binding<'_> {
                     Ok(Move { from_s, to_s, by_m: fields.required("by_m")?.vector()? })
                 })?);
             }
-            let law = MotionProfile { point, moves };
+            let profile = MotionProfile { point, moves };
             // The displacement is largest at the end of a move. Where moves overlap, their sum is an upper bound.
-            let farthest: f64 = law.moves.iter().map(|m| m.by_m.length()).sum();
+            let farthest: f64 = profile.moves.iter().map(|m| m.by_m.length()).sum();
             check_reach(&fields.path("moves"), self.scene.shape(), farthest, self.limits)?;
-            Ok(law)
+            Ok(profile)
         })
     }
 }

@@ -6,7 +6,7 @@ use glam::DVec3;
 
 use super::Change;
 pub use super::action::Action;
-use super::law::{LoadProfile, Moment, MotionProfile};
+use super::profile::{LoadProfile, Moment, MotionProfile};
 use crate::shape::{PointId, RestShape};
 
 /// The built-in scripts: name and text.
@@ -46,20 +46,20 @@ impl Script {
     /// Force k is tool k, and the grasped points follow. A force is held for the step, from its beginning; a grasped
     /// point reaches its target at the step's end.
     pub fn actions_at(&self, step: u64) -> impl Iterator<Item = (usize, Action)> {
-        let poke = move |law: &LoadProfile, step: u64| {
-            let poke = law.at(Moment::start_of(step), self.rate_hz);
+        let poke = move |profile: &LoadProfile, step: u64| {
+            let poke = profile.at(Moment::start_of(step), self.rate_hz);
             // A force that has left the sheet can no longer be commanded.
             (poke.force_n != DVec3::ZERO && self.shape.is_near(poke.centre_m)).then_some(poke)
         };
-        let pushes = self.forces.iter().enumerate().filter_map(move |(tool, law)| {
-            let (before, now) = (step.checked_sub(1).and_then(|before| poke(law, before)), poke(law, step));
+        let pushes = self.forces.iter().enumerate().filter_map(move |(tool, profile)| {
+            let (before, now) = (step.checked_sub(1).and_then(|before| poke(profile, before)), poke(profile, step));
             (before != now).then_some((tool, now.map_or(Action::Release, Action::Push)))
         });
         #[allow(clippy::cast_precision_loss)]
-        let target = move |law: &MotionProfile, end: u64| law.at(end as f64 / self.rate_hz).displacement_m;
-        let grasps = self.moves.iter().enumerate().filter_map(move |(index, law)| {
-            let (before, now) = (target(law, step), target(law, step + 1));
-            let action = Action::Grasp { point: law.point, displacement_m: now };
+        let target = move |profile: &MotionProfile, end: u64| profile.at(end as f64 / self.rate_hz).displacement_m;
+        let grasps = self.moves.iter().enumerate().filter_map(move |(index, profile)| {
+            let (before, now) = (target(profile, step), target(profile, step + 1));
+            let action = Action::Grasp { point: profile.point, displacement_m: now };
             (step == 0 || before != now).then_some((self.forces.len() + index, action))
         });
         pushes.chain(grasps)

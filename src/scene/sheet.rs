@@ -118,7 +118,7 @@ impl Sheet {
         PointId::new(i * self.points[1] + j)
     }
 
-    /// The grid place [i, j] of a point.
+    /// Row and column [i, j] of a point.
     pub fn place_of(&self, point: PointId) -> [usize; 2] {
         [point.index() / self.points[1], point.index() % self.points[1]]
     }
@@ -128,7 +128,7 @@ impl Sheet {
         self.spacing_m * DVec2::new((self.points[0] - 1) as f64, (self.points[1] - 1) as f64)
     }
 
-    /// The fixed points, as places in arrays over all points, rising.
+    /// Row-major indices of the fixed points, ascending.
     pub fn fixed_indices(&self) -> Vec<usize> {
         let [nx, ny] = self.points;
         let mut indices: Vec<usize> = match &self.fixed {

@@ -8,7 +8,7 @@ use tracing::info;
 use super::connections::Register;
 use super::services::Services;
 use crate::budget::{Account, Purpose, Resource, Work};
-use crate::pace::Held;
+use crate::pace::StreamKind;
 use crate::pace::clock::now_ns;
 use crate::refusal::{Reason, Refusal, excerpt};
 use palpate_proto::pb;
@@ -44,14 +44,14 @@ impl AdminService for Admin {
         request: Request<pb::ListStreamsRequest>,
     ) -> Result<Response<pb::ListStreamsResponse>, Status> {
         let live = self.services.pacer.get(&request.get_ref().session_id)?;
-        let shown = live.shown_streams().into_iter().map(|stream| pb::StreamUse {
+        let streams = live.list_streams().into_iter().map(|stream| pb::StreamUse {
             number: stream.number,
             call: stream.what.to_owned(),
             caller: stream.caller,
-            holds_tools: stream.held == Held::Tools,
+            holds_tools: stream.kind == StreamKind::HoldsTools,
             age_s: stream.age_ns as f64 * 1e-9,
         });
-        Ok(Response::new(pb::ListStreamsResponse { streams: shown.collect() }))
+        Ok(Response::new(pb::ListStreamsResponse { streams: streams.collect() }))
     }
 
     async fn free_tool(&self, request: Request<pb::FreeToolRequest>) -> Result<Response<pb::FreeToolResponse>, Status> {

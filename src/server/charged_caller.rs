@@ -8,7 +8,7 @@ use super::address::address_name;
 use super::connections::Peer;
 use crate::budget::Account;
 
-/// The caller. The guard puts it into the extensions of every call that it lets through.
+/// The caller. `authorize` puts it into the extensions of every call that it lets through.
 #[derive(Debug, Clone)]
 pub(crate) struct ChargedCaller {
     pub(crate) account: Account,

@@ -22,7 +22,7 @@ use tonic::transport::server::Connected;
 use tracing::{debug, warn};
 
 use super::address::{address_name, network};
-use super::leases::Leases;
+use super::leases::LastingLeases;
 use super::rate::RateLimiter;
 use super::reload::Reloaded;
 use super::tls::{self, Tls};
@@ -163,7 +163,7 @@ impl OpenConnections {
     }
 }
 
-/// A connection's place within the limits, until it is dropped.
+/// A connection's slot within the limits, until it is dropped.
 #[derive(Debug)]
 pub(super) struct ConnectionSlot {
     slots: Arc<ConnectionSlots>,
@@ -180,7 +180,7 @@ impl ConnectionSlots {
         ConnectionSlots { most, most_each, most_unauthenticated, open: Mutex::default() }
     }
 
-    /// Takes a place for a connection, or says why there is none.
+    /// Takes a slot for a connection, or says why there is none.
     fn take(self: &Arc<Self>, address: IpAddr, gate: &Arc<Gate>) -> Result<ConnectionSlot, String> {
         let address = network(address);
         let mut open = lock(&self.open);
@@ -244,10 +244,10 @@ pub(crate) struct Peer {
     pub(super) creations: Arc<RateLimiter>,
     /// Flow control between the connection and its transport.
     pub(super) gate: Arc<Gate>,
-    /// The connection's place within the limits.
+    /// The connection's slot within the limits.
     pub(super) slot: Arc<ConnectionSlot>,
     /// Leases that end with the connection.
-    pub(super) leases: Arc<Leases>,
+    pub(super) leases: Arc<LastingLeases>,
     /// Numbers of the accounts that have called over it.
     callers: Arc<Mutex<BTreeSet<u64>>>,
 }
@@ -527,11 +527,11 @@ mod tests {
         let slots = slots(Some(2));
         let is_closed = async |gate: &Gate| futures_util::poll!(std::pin::pin!(gate.closed())).is_ready();
         let known: Vec<_> = (1..=3).map(|host| take(&slots, &format!("192.0.2.{host}")).unwrap()).collect();
-        // The third took the place of the first, which had not authenticated yet.
+        // The third took the slot of the first, which had not authenticated yet.
         assert!(is_closed(&known[0].1).await && !is_closed(&known[1].1).await);
         known.iter().for_each(|(slot, _)| slot.mark_authenticated());
         let unknown: Vec<_> = (4..=30).map_while(|host| take(&slots, &format!("192.0.2.{host}")).ok()).collect();
-        // Connections that were told to close, and do not, take only a few places.
+        // Connections that were told to close, and do not, take only a few slots.
         assert_eq!(known.len() + unknown.len(), 5 + CLOSING);
         for (_, gate) in &known[1..] {
             assert!(!is_closed(gate).await);

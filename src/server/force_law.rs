@@ -20,7 +20,7 @@ use palpate_proto::{pb, touch};
 use palpate_touch::Law;
 
 /// A law for a stream, or why there is none.
-struct Told {
+struct LawUpdate {
     /// The number of the law that it replaces, or that stays.
     before: u32,
     /// The step from whose beginning on another tissue acts, if that is the cause.
@@ -30,7 +30,7 @@ struct Told {
 
 /// What a stream is told of its law after its opening.
 pub(super) struct Updates {
-    told: mpsc::Receiver<Told>,
+    told: mpsc::Receiver<LawUpdate>,
     laws: Arc<Laws>,
 }
 
@@ -38,7 +38,7 @@ impl Updates {
     /// The next message. Samples use its law from then on: so none that names it can come before the message. `None`: no
     /// message will follow.
     pub(super) fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<pb::ForceLawUpdate>> {
-        let Some(Told { before, tissue_step, law }) = ready!(self.told.poll_recv(context)) else {
+        let Some(LawUpdate { before, tissue_step, law }) = ready!(self.told.poll_recv(context)) else {
             return Poll::Ready(None);
         };
         Poll::Ready(Some(match law {
@@ -96,7 +96,7 @@ impl Maker {
     }
 
     /// Tells the stream what it does not know of the laws of `model`, the tissue since `step`.
-    async fn tell(&self, known: &mut Known, step: u64, model: &Arc<Model>, tell: &mpsc::Sender<Told>) {
+    async fn tell(&self, known: &mut Known, step: u64, model: &Arc<Model>, tell: &mpsc::Sender<LawUpdate>) {
         if !have_same_laws(&known.model, model) {
             let law = self.first(model).await;
             let is_coarse = law.as_ref().is_ok_and(|law| law.is_coarse);
@@ -115,14 +115,14 @@ impl Maker {
         known: &mut Known,
         tissue_step: Option<u64>,
         law: Result<Arc<Law>, Status>,
-        tell: &mpsc::Sender<Told>,
+        tell: &mpsc::Sender<LawUpdate>,
     ) {
         if let Err(status) = &law {
             debug!(session = %self.live.id, message = status.message(), "a force law can't be had");
         }
         let number = known.number.wrapping_add(u32::from(law.is_ok()));
         // A stream that has ended is told nothing.
-        let _ = tell.send(Told { before: known.number, tissue_step, law: law.map(|law| (number, law)) }).await;
+        let _ = tell.send(LawUpdate { before: known.number, tissue_step, law: law.map(|law| (number, law)) }).await;
         known.number = number;
     }
 }

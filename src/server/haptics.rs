@@ -25,7 +25,7 @@ use crate::ids::random_bits;
 use crate::limits::Limits;
 use crate::pace::clock::now_ns;
 use crate::pace::queue::{Reader, Writer, queue};
-use crate::pace::{Held, Live, PacedSample, StreamGuard};
+use crate::pace::{Live, PacedSample, StreamGuard, StreamKind};
 use crate::refusal::{Reason, Refusal, number};
 use crate::scene::check::check_tip;
 use crate::scene::script::Action;
@@ -64,7 +64,7 @@ enum Event {
 }
 
 /// The tools of a stream, given back when it ends however it ends.
-struct Hold {
+struct StreamTools {
     live: Arc<Live>,
     lease: LeaseId,
     tools: usize,
@@ -73,7 +73,7 @@ struct Hold {
     _computing: Option<AbortOnDropHandle<()>>,
 }
 
-impl Hold {
+impl StreamTools {
     /// How fast commands may come: so many for each step and tool, and at once twice what may wait.
     #[allow(clippy::cast_precision_loss)]
     fn bucket(&self, limits: &Limits) -> Bucket {
@@ -83,7 +83,7 @@ impl Hold {
     }
 }
 
-impl Drop for Hold {
+impl Drop for StreamTools {
     fn drop(&mut self) {
         if self.tools > 0 {
             // A lease that has lapsed already has nothing to give back.
@@ -92,8 +92,8 @@ impl Drop for Hold {
     }
 }
 
-/// So many tools for `account`.
-fn seats(account: &Account, tools: usize) -> Result<Vec<Taken>, Refusal> {
+/// Charges `account` for so many tools.
+fn charges(account: &Account, tools: usize) -> Result<Vec<Taken>, Refusal> {
     (0..tools).map(|_| account.take(Resource::Leases, 1, "tools")).collect()
 }
 
@@ -102,9 +102,9 @@ fn lease_id(text: &str) -> Result<LeaseId, Refusal> {
     LeaseId::from_str_radix(text, 16).map_err(wrong)
 }
 
-/// A command, unless it leads the tool out of the declared workspace.
+/// A command, unless its pose is outside the declared workspace.
 fn within_reach(command: Command, live: &Live, device: Option<&Device>) -> Result<Command, Refusal> {
-    if let (Action::Lead { place_m, .. }, Some(device)) = (&command.action, device) {
+    if let (Action::Pose { place_m, .. }, Some(device)) = (&command.action, device) {
         let middle_m = live.model.shape().extent().middle_m();
         let away_m = (*place_m - middle_m).length();
         let range = format!("within {} m of the middle of the sheet, the device's workspace", device.workspace_m);
@@ -115,7 +115,7 @@ fn within_reach(command: Command, live: &Live, device: Option<&Device>) -> Resul
 
 impl Haptics {
     /// Answers the first message of a haptic stream.
-    async fn open(&self, open: &pb::TouchOpen, account: &Account) -> Result<(Opened, Hold), Status> {
+    async fn open(&self, open: &pb::TouchOpen, account: &Account) -> Result<(Opened, StreamTools), Status> {
         let live = self.0.pacer.get(&open.session_id)?;
         let device = open.device.as_ref().map(touch::from_device).transpose()?;
         let tip = touch::from_tip(open.tip.as_ref());
@@ -128,8 +128,8 @@ impl Haptics {
             return Err(Refusal::new(Reason::Missing, "device", message).into());
         }
         sampling.touch_stiffness = open.touch_stiffness;
-        let held = if open.tools.is_empty() { Held::Nothing } else { Held::Tools };
-        let guard = live.open_stream("Touch", held, account)?;
+        let kind = if open.tools.is_empty() { StreamKind::ReadsOnly } else { StreamKind::HoldsTools };
+        let guard = live.open_stream("Touch", kind, account)?;
         let begun = match device {
             Some(_) => Some(Computing::begin(&self.0.workshop, account, &live, tip.radius_m).await?),
             None => None,
@@ -139,14 +139,14 @@ impl Haptics {
         sampling.laws.clone_from(&laws);
         let lease_s = open.lease_s.unwrap_or(self.0.config.lease_s);
         let lease = random_bits()?;
-        let seats = seats(account, open.tools.len())?;
+        let charges = charges(account, open.tools.len())?;
         let step = live.at_intake(|intake, now| {
             intake.acquire(&open.tools, &open.holder, lease_s, lease, now)?;
-            intake.seat(lease, seats);
+            intake.charge(lease, charges);
             Ok::<_, Refusal>(intake.next_step())
         })?;
         let (updates, _computing) = computing.zip(laws).map(|(computing, laws)| computing.go_on(laws)).unzip();
-        let hold = Hold { live: live.clone(), lease, tools: open.tools.len(), device, _computing };
+        let held = StreamTools { live: live.clone(), lease, tools: open.tools.len(), device, _computing };
         let law = law.as_deref();
         let answer = pb::TouchOpened {
             step,
@@ -154,13 +154,13 @@ impl Haptics {
             lease_s,
             heartbeat_s: sampling.heartbeat_s,
             law: law.map(|law| touch::law(law, FIRST)),
-            warnings: device.zip(law).map_or(Vec::new(), |(device, law)| device.misgivings(law)),
+            warnings: device.zip(law).map_or(Vec::new(), |(device, law)| device.warnings(law)),
             max_force_n: device.map_or(UNDECLARED_FORCE_N, |device| device.most_n()),
         };
         let samples = live.samples(sampling, open.tools.is_empty().then_some(account));
         info!(session = %live.id, tools = ?open.tools, holder = ?open.holder, "haptic stream opened");
         let notices = Notices::new(open.tools.clone(), step);
-        Ok((Opened { answer, updates, samples, notices, guard }, hold))
+        Ok((Opened { answer, updates, samples, notices, guard }, held))
     }
 
     /// Reads what the client says until it ends.
@@ -190,19 +190,19 @@ impl Haptics {
                 return;
             }
         };
-        let (hold, cut) = match first {
-            Ok((opened, hold)) => {
+        let (held, cut) = match first {
+            Ok((opened, held)) => {
                 let cut = opened.guard.cut().clone();
                 let _ = opening.send(Ok(opened));
-                (hold, cut)
+                (held, cut)
             }
             Err(status) => {
                 let _ = opening.send(Err(status));
                 return;
             }
         };
-        let live = &hold.live;
-        let mut bucket = hold.bucket(&self.0.config.limits);
+        let live = &held.live;
+        let mut bucket = held.bucket(&self.0.config.limits);
         for command in early.dropped.drain(..) {
             let message = "was one of too many that came before the stream was open";
             let refusal = Refusal::new(Reason::QueueFull, "command", message);
@@ -221,8 +221,8 @@ impl Haptics {
                     let taken = bucket
                         .take(now, "commands of this stream")
                         .and_then(|()| wire::command::from_command(&command, live.model.shape(), now))
-                        .and_then(|command| within_reach(command, live, hold.device.as_ref()))
-                        .and_then(|command| live.submit(hold.lease, vec![command]).map(drop));
+                        .and_then(|command| within_reach(command, live, held.device.as_ref()))
+                        .and_then(|command| live.submit(held.lease, vec![command]).map(drop));
                     self.0.traffic.commanded(usize::from(taken.is_ok()));
                     if let Err(refusal) = taken {
                         live.count_refused(1);
@@ -244,8 +244,8 @@ impl Haptics {
                         events.push(Event::Rejected(wire::sample::rejection(0, 0, &refusal)));
                         continue;
                     }
-                    if hold.tools > 0
-                        && let Err(refusal) = live.at_intake(|intake, now| intake.renew(hold.lease, now))
+                    if held.tools > 0
+                        && let Err(refusal) = live.at_intake(|intake, now| intake.renew(held.lease, now))
                     {
                         events.push(Event::Rejected(wire::sample::rejection(0, 0, &refusal)));
                     }
@@ -444,10 +444,10 @@ impl HapticService for Haptics {
             lease_s = lease_s.min(self.0.config.limits.browser_lease_s);
         }
         let lease = random_bits()?;
-        let seats = seats(&account, 1)?;
+        let charges = charges(&account, 1)?;
         live.at_intake(|intake, now| {
             intake.acquire(&[request.tool], &request.holder, lease_s, lease, now)?;
-            intake.seat(lease, seats);
+            intake.charge(lease, charges);
             Ok::<_, Refusal>(())
         })?;
         if let Some(peer) = peer.filter(|_| !may_vanish && !request.outlives_connection) {
@@ -504,7 +504,7 @@ impl HapticService for Haptics {
         let live = self.0.pacer.get(&request.session_id)?;
         let (every, deadband) = (request.sample_every_steps, request.deadband.as_ref());
         let sampling = wire::sample::sampling(every, None, deadband, request.heartbeat_s, false)?;
-        let guard = live.open_stream("WatchSamples", Held::Nothing, &account)?;
+        let guard = live.open_stream("WatchSamples", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
         let samples = live.samples(sampling, Some(&account));
         let out = stream::unfold(Some((samples, guard)), |state| async move {
@@ -542,7 +542,7 @@ impl HapticService for Haptics {
             Some(Where::AllPoints(true)) => None,
             _ => return Err(Refusal::new(Reason::Missing, "where", "points or all_points is missing").into()),
         };
-        let guard = live.open_stream("Probe", Held::Nothing, &account)?;
+        let guard = live.open_stream("Probe", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
         let records = live.probe(every, points, request.energy, &account)?;
         let out = stream::unfold(Some((records, guard, None)), |state| async move {

@@ -306,17 +306,17 @@ fn from_hex(text: &str) -> Option<[u8; 32]> {
     digits.then_some(bytes)
 }
 
-/// What a caller showed, and for what.
+/// The credentials that a caller presented, and the role that its call needs.
 #[derive(Clone)]
-pub(super) struct Shown {
+pub(super) struct PresentedCredentials {
     pub(super) authorization: Option<HeaderValue>,
     /// The names of the certificate.
     pub(super) certificate: Option<Arc<[String]>>,
     pub(super) role: Role,
 }
 
-impl Shown {
-    /// Whether that is enough.
+impl PresentedCredentials {
+    /// The caller, if the credentials are enough.
     pub(super) fn check(&self, credentials: &Credentials) -> Result<Caller> {
         let caller = credentials.caller(self.authorization.as_ref(), self.certificate.as_deref())?;
         caller.needs(self.role)?;

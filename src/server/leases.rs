@@ -3,19 +3,19 @@
 
 use std::sync::{Arc, Mutex, Weak};
 
-use super::identity::Shown;
+use super::identity::PresentedCredentials;
 use crate::lock::lock;
 use crate::pace::Live;
 use crate::session::lease::LeaseId;
 
-struct Lease {
+struct LastingLease {
     live: Weak<Live>,
     id: LeaseId,
-    /// What its holder showed, if that decides when it ends.
-    shown: Option<Shown>,
+    /// The credentials of its holder, if they decide when it ends.
+    presented: Option<PresentedCredentials>,
 }
 
-impl Lease {
+impl LastingLease {
     fn is_held(&self) -> bool {
         self.live.upgrade().is_some_and(|live| live.at_intake(|intake, _| intake.tools_of(self.id).next().is_some()))
     }
@@ -28,27 +28,27 @@ impl Lease {
 
 /// Those of one connection, or of all authenticated callers.
 #[derive(Default)]
-pub(super) struct Leases(Mutex<Vec<Lease>>);
+pub(super) struct LastingLeases(Mutex<Vec<LastingLease>>);
 
-impl std::fmt::Debug for Leases {
+impl std::fmt::Debug for LastingLeases {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str("Leases")
+        f.write_str("LastingLeases")
     }
 }
 
-impl Leases {
+impl LastingLeases {
     /// One more. Those that have ended otherwise are forgotten, now and then.
-    pub(super) fn add(&self, live: &Arc<Live>, id: LeaseId, shown: Option<Shown>) {
+    pub(super) fn add(&self, live: &Arc<Live>, id: LeaseId, presented: Option<PresentedCredentials>) {
         let mut leases = lock(&self.0);
         if leases.len().is_power_of_two() && leases.len() >= 64 {
-            leases.retain(Lease::is_held);
+            leases.retain(LastingLease::is_held);
         }
-        leases.push(Lease { live: Arc::downgrade(live), id, shown });
+        leases.push(LastingLease { live: Arc::downgrade(live), id, presented });
     }
 
-    /// Ends those for which `chosen` holds, by what their holder showed; tells how many were still held.
-    pub(super) fn end(&self, chosen: impl Fn(Option<&Shown>) -> bool) -> usize {
-        let ended: Vec<Lease> = lock(&self.0).extract_if(.., |lease| chosen(lease.shown.as_ref())).collect();
+    /// Ends those for which `chosen` holds, by their holder's credentials; tells how many were still held.
+    pub(super) fn end(&self, chosen: impl Fn(Option<&PresentedCredentials>) -> bool) -> usize {
+        let ended: Vec<LastingLease> = lock(&self.0).extract_if(.., |lease| chosen(lease.presented.as_ref())).collect();
         ended.iter().filter(|lease| lease.end()).count()
     }
 }

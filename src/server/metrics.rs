@@ -132,7 +132,9 @@ const COUNTS: Counts = [
     ("lapsed_leases", "Tools whose lease lapsed", |tally| &tally.lapsed_leases),
     ("guard_events", "How often the guard went back to a checkpoint", |tally| &tally.guard_events),
     ("recoveries", "How often a tissue was taken back to an earlier state", |tally| &tally.recoveries),
-    ("held_sessions", "Sessions stopped by a blow-up, a fault of the program or missing memory", |tally| &tally.held_sessions),
+    ("held_sessions", "Sessions stopped by a blow-up, a fault of the program or missing memory", |tally| {
+        &tally.held_sessions
+    }),
     ("limited_steps", "Steps in which a tool was held to the speed limit", |tally| &tally.limited_steps),
     ("dropped_poses", "Poses that were not newer, or passed over as a backlog", |tally| &tally.dropped_poses),
     ("stale_releases", "Tools let go because nothing came any more", |tally| &tally.stale_releases),
@@ -256,11 +258,11 @@ pub(super) async fn serve(
         }
     };
     let limits = Limits { connections: SCRAPERS, connections_per_address: SCRAPERS, ..limits.clone() };
-    let seats = Arc::new(ConnectionSlots::new(&limits, Some(SCRAPERS)));
+    let slots = Arc::new(ConnectionSlots::new(&limits, Some(SCRAPERS)));
     // What the server's clients do and take is counted elsewhere.
     let budget = Budget::new(&limits, 1, 1);
     let address = listener.local_addr()?;
-    let connections = connections::incoming(listener, None, seats, &limits, budget, Arc::default(), Arc::default());
+    let connections = connections::incoming(listener, None, slots, &limits, budget, Arc::default(), Arc::default());
     let router = Router::new().route("/metrics", get(told));
     let serving = axum::serve(Scrapers(address, Box::pin(connections)), router);
     serving.with_graceful_shutdown(shutdown.cancelled_owned()).await

@@ -3,6 +3,7 @@
 
 mod address;
 mod admin;
+mod authorize;
 pub mod catalog;
 mod charged_caller;
 pub mod config;
@@ -10,7 +11,6 @@ mod connections;
 mod cut;
 mod descriptors;
 mod force_law;
-mod guard;
 mod haptics;
 mod health;
 pub mod identity;

@@ -17,8 +17,8 @@ use tonic::body::Body;
 use tracing::{info, warn};
 
 use super::connections::Peer;
-use super::identity::{Credentials, Shown};
-use super::leases::Leases;
+use super::identity::{Credentials, PresentedCredentials};
+use super::leases::LastingLeases;
 use super::reload::Reloaded;
 use crate::lock::lock;
 use crate::pace::Live;
@@ -28,13 +28,13 @@ use crate::session::lease::LeaseId;
 /// So long a client may take to read that its call is over; then its connection is closed.
 const GRACE: Duration = Duration::from_secs(1);
 
-/// The calls under way of callers that showed something.
+/// The calls under way of authenticated callers.
 pub(super) struct Calls {
     credentials: Arc<Reloaded<Credentials>>,
     under_way: Mutex<HashMap<u64, Weak<Call>>>,
     begun: AtomicU64,
     /// What calls that are over have left.
-    leases: Leases,
+    leases: LastingLeases,
 }
 
 impl Calls {
@@ -43,17 +43,22 @@ impl Calls {
             credentials,
             under_way: Mutex::default(),
             begun: AtomicU64::new(0),
-            leases: Leases::default(),
+            leases: LastingLeases::default(),
         })
     }
 
-    /// A call from `peer` by who has shown that, which was enough by the file of `version`.
-    pub(super) fn begin(self: &Arc<Self>, shown: Shown, peer: Option<Peer>, version: u64) -> Arc<Call> {
+    /// A call from `peer` with these credentials, which were enough by the file of `version`.
+    pub(super) fn begin(
+        self: &Arc<Self>,
+        presented: PresentedCredentials,
+        peer: Option<Peer>,
+        version: u64,
+    ) -> Arc<Call> {
         let number = self.begun.fetch_add(1, Ordering::Relaxed);
         let call = Arc::new(Call {
             calls: self.clone(),
             number,
-            shown,
+            presented,
             peer,
             version: AtomicU64::new(version),
             state: Mutex::default(),
@@ -69,7 +74,8 @@ impl Calls {
         let mut changes = self.credentials.changes();
         while changes.changed().await.is_ok() {
             let credentials = self.credentials.get();
-            let released = self.leases.end(|shown| shown.is_some_and(|shown| shown.check(&credentials).is_err()));
+            let released =
+                self.leases.end(|presented| presented.is_some_and(|presented| presented.check(&credentials).is_err()));
             if released > 0 {
                 info!(released, "tools released: who held them may not any more");
             }
@@ -96,7 +102,7 @@ impl Calls {
 #[derive(Clone)]
 pub(super) struct Tenure {
     calls: Arc<Calls>,
-    shown: Shown,
+    presented: PresentedCredentials,
 }
 
 impl Tenure {
@@ -105,9 +111,9 @@ impl Tenure {
     /// # Errors
     /// Refuses, and ends the lease, if that is so already.
     pub(super) fn bind(&self, live: &Arc<Live>, lease: LeaseId) -> Result<()> {
-        self.calls.leases.add(live, lease, Some(self.shown.clone()));
+        self.calls.leases.add(live, lease, Some(self.presented.clone()));
         // The file may have changed since the call was let in. A change from now on finds the lease.
-        self.shown.check(&self.calls.credentials.get()).map(|_| ()).inspect_err(|_| {
+        self.presented.check(&self.calls.credentials.get()).map(|_| ()).inspect_err(|_| {
             let _ = live.at_intake(|intake, _| intake.release(lease));
         })
     }
@@ -117,7 +123,7 @@ impl Tenure {
 pub(super) struct Call {
     calls: Arc<Calls>,
     number: u64,
-    shown: Shown,
+    presented: PresentedCredentials,
     peer: Option<Peer>,
     /// Of the file by which it was looked at last.
     version: AtomicU64,
@@ -135,7 +141,7 @@ struct State {
 impl Call {
     /// Who made it.
     pub(super) fn tenure(&self) -> Tenure {
-        Tenure { calls: self.calls.clone(), shown: self.shown.clone() }
+        Tenure { calls: self.calls.clone(), presented: self.presented.clone() }
     }
 
     /// Why the caller may not go on, if so. Then what the call holds (a tool, perhaps) is given back, and both directions
@@ -144,7 +150,7 @@ impl Call {
         let credentials = &self.calls.credentials;
         let version = credentials.version();
         if self.version.swap(version, Ordering::AcqRel) != version
-            && let Err(refusal) = self.shown.check(&credentials.get())
+            && let Err(refusal) = self.presented.check(&credentials.get())
         {
             let mut state = lock(&self.state);
             if state.refusal.is_none() {

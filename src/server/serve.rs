@@ -12,10 +12,10 @@ use tonic_web::GrpcWebLayer;
 use tower_http::cors::CorsLayer;
 use tracing::{info, warn};
 
+use super::authorize::AuthorizeLayer;
 use super::catalog::Catalog;
 use super::config::Config;
 use super::connections::ConnectionSlots;
-use super::guard::GuardLayer;
 use super::health::{SERVICES, end_health, report_files, report_workshop};
 use super::listeners::{Listeners, ServeError};
 use super::revocation::Calls;
@@ -83,7 +83,7 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
     }
     let origins: Arc<[HeaderValue]> = config.origins.iter().filter_map(|origin| origin.parse().ok()).collect();
     let calls = Calls::new(protection.credentials.clone());
-    let guard = GuardLayer {
+    let authorize = AuthorizeLayer {
         credentials: protection.credentials.clone(),
         calls: calls.clone(),
         message_timeout: Duration::from_secs_f64(limits.open_s),
@@ -135,10 +135,10 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
 
     // Unauthenticated connections leave half of the limit to the others.
     let most_unauthenticated = (!open).then_some(limits.connections.div_ceil(2));
-    let seats = Arc::new(ConnectionSlots::new(&limits, most_unauthenticated));
+    let slots = Arc::new(ConnectionSlots::new(&limits, most_unauthenticated));
     let register = Arc::new(connections::Register::default());
     let tls = protection.tls.clone();
-    let incoming = connections::incoming(listener, tls, seats, &limits, budget.clone(), traffic, register.clone());
+    let incoming = connections::incoming(listener, tls, slots, &limits, budget.clone(), traffic, register.clone());
     let silence = Some(Duration::from_secs_f64(limits.keepalive_s));
     let bytes = limits.message_bytes;
     let pages = page::Page::of(services.config.viewer.clone());
@@ -169,7 +169,7 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
         // Browsers speak HTTP/2 only over TLS.
         .accept_http1(true)
         .layer(cors(&origins))
-        .layer(guard)
+        .layer(authorize)
         .add_routes(routes.into())
         .serve_with_incoming_shutdown(incoming, drain.clone().cancelled_owned());
 

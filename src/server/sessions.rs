@@ -17,7 +17,7 @@ use super::services::Services;
 use super::status;
 use super::workshop::CancelFlag;
 use crate::budget::Work;
-use crate::pace::Held;
+use crate::pace::StreamKind;
 use crate::pace::clock::now_ns;
 use crate::refusal::{Reason, Refusal, number};
 use crate::scene::script::Script;
@@ -171,7 +171,7 @@ impl SessionService for Sessions {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
-        let guard = live.open_stream("GetScript", Held::Nothing, &account)?;
+        let guard = live.open_stream("GetScript", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
         let (catalog, config) = (self.0.catalog.clone(), self.0.config.clone());
         // A script may have megabytes of traces.

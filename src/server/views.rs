@@ -15,7 +15,7 @@ use super::cut::until_cut;
 use super::services::Services;
 use crate::ids::random_id;
 use crate::pace::frames::Viewer;
-use crate::pace::{FrameReader, Held, StreamGuard};
+use crate::pace::{FrameReader, StreamGuard, StreamKind};
 use crate::refusal::{Reason, Refusal, number};
 use crate::surface::{Encoding, Refinement};
 use crate::texture::Texture;
@@ -72,7 +72,7 @@ impl ViewService for Views {
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
         let grid = Refinement::new(&live.model.scene, request.refinement, &self.0.config.limits)?;
-        let guard = live.open_stream("GetMesh", Held::Nothing, &account)?;
+        let guard = live.open_stream("GetMesh", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
         let out = stream::unfold((0, guard), move |(part, guard)| async move {
             mesh_part(grid, part).map(|message| (Ok(message), (part + 1, guard)))
@@ -86,7 +86,8 @@ impl ViewService for Views {
     ) -> Result<Response<Self::GetTextureStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let guard = self.0.pacer.get(&request.session_id)?.open_stream("GetTexture", Held::Nothing, &account)?;
+        let guard =
+            self.0.pacer.get(&request.session_id)?.open_stream("GetTexture", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
         let Texture { png, etag } = self.0.textures.texture(&request.session_id).await?;
         let png = if etag == request.known_etag { Bytes::new() } else { png };
@@ -125,7 +126,7 @@ impl ViewService for Views {
         if let Some(most) = request.max_frames_in_flight {
             number("max_frames_in_flight", f64::from(most), "from 1 to 64", |v| (1.0..=64.0).contains(&v))?;
         }
-        let guard = live.open_stream("WatchFrames", Held::Nothing, &account)?;
+        let guard = live.open_stream("WatchFrames", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
         let room = self.0.config.limits.queued_bytes;
         let viewer_id = random_id()?;

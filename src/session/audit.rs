@@ -94,22 +94,22 @@ impl Windows {
     /// Call after each step, and before the first: audits the window that has ended, if one has.
     pub fn look(&mut self, session: &mut Session) -> Option<Finding> {
         if !std::mem::replace(&mut self.begun, true) {
-            session.watch(Inputs::default());
+            session.request_audit(Inputs::default());
         }
         let mut found = None;
         match session.take_mark()? {
-            Mark::Begin(look) => {
-                self.opening = Some(look.open());
+            Mark::Begin(begin) => {
+                self.opening = Some(begin.open());
                 return None;
             }
-            Mark::End(look, inputs) => {
-                let audit = self.opening.take().map(|opening| opening.close(look, inputs));
+            Mark::End(end, inputs) => {
+                let audit = self.opening.take().map(|opening| opening.close(end, inputs));
                 found = audit.and_then(|audit| audit.work(FINER, self.largest, &mut || true));
             }
             Mark::Dropped => self.opening = None,
         }
         self.largest = found.map_or(self.largest, |finding| finding.largest);
-        session.watch(Inputs::default());
+        session.request_audit(Inputs::default());
         found
     }
 }

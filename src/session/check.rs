@@ -9,7 +9,7 @@ use glam::DVec3;
 use super::Session;
 use crate::limits::Limits;
 use crate::scene::Named;
-use crate::scene::law::Poke;
+use crate::scene::profile::Poke;
 use crate::sheet::choice::{self, Choice};
 use crate::sheet::integrate::Oscillator;
 use crate::sheet::{Model, Push};
@@ -51,7 +51,7 @@ fn time(model: &Arc<Model>, clock_s: &dyn Fn() -> f64) -> Option<[f64; 2]> {
     let stiffness = scene.virtual_stiffness_n_per_m + 0.1 * scene.springs.stiffness_n_per_m;
     session.tissue.push(
         0,
-        Some(Push::Held(Poke {
+        Some(Push::Constant(Poke {
             centre_m: model.shape().extent().middle_m(),
             force_n: DVec3::new(0.03, 0.0, -0.1) * stiffness * model.shape().edge_m(),
             falloff_per_m: 4.0 / model.shape().edge_m(),

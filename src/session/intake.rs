@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use super::command::{Command, Due};
-use super::lease::{LeaseId, Leases, Place, not_held};
+use super::lease::{LeaseId, Leases, QueueKey, not_held};
 use super::queue::{Discarded, Queue};
 use super::rules::{Rules, tip_radius_m};
 use super::schedule::Schedule;
@@ -22,7 +22,7 @@ pub struct Counts {
     pub accepted: u64,
     /// Commands that took effect at their step.
     pub applied: u64,
-    /// Commands replaced by a later place of the same tool before their step.
+    /// Commands replaced by a later position of the same tool before their step.
     pub superseded: u64,
     /// Commands whose lease or session ended before their step.
     pub dropped: u64,
@@ -193,27 +193,27 @@ impl Intake {
         let step = command.at_step.map_or(self.next_step, |at| at.max(self.next_step));
         let late = command.at_step.is_some_and(|at| at < self.next_step);
         let mut late_commands = u64::from(late);
-        let place = (step, self.arrivals);
+        let key = (step, self.arrivals);
         self.arrivals += 1;
         if let Some(lease) = self.leases.get_mut(command.tool) {
             lease.last_sequence = Some(command.sequence);
             lease.tip_radius_m = tip_radius_m(&command);
-            let last = lease.last_place.replace(place);
+            let last = lease.last_key.replace(key);
             // The latest position wins: it supersedes an earlier one that has not taken effect. This does not apply to
             // poses played by client time (`palpate_touch::path`), where each one counts.
-            let is_place = |command: &Command| match command.action {
+            let is_position = |command: &Command| match command.action {
                 Action::Grasp { .. } => true,
-                Action::Lead { .. } => command.at_step.is_some() || command.client_time_ns == 0,
+                Action::Pose { .. } => command.at_step.is_some() || command.client_time_ns == 0,
                 Action::Push(_) | Action::Release => false,
             };
-            if let Some(last) = last.filter(|last| last.0 == step && is_place(&command))
-                && let Some(superseded) = self.queue.remove_if(command.tool, last, |due| is_place(&due.command))
+            if let Some(last) = last.filter(|last| last.0 == step && is_position(&command))
+                && let Some(superseded) = self.queue.remove_if(command.tool, last, |due| is_position(&due.command))
             {
                 late_commands += superseded.late_commands;
                 self.counts.superseded += 1;
             }
         }
-        self.queue.insert(place, Due { command, late, late_commands, ends_lease });
+        self.queue.insert(key, Due { command, late, late_commands, ends_lease });
         self.changed = true;
     }
 
@@ -306,9 +306,9 @@ impl Intake {
         self.lapse(now_ns);
         self.resting = None;
         let leases = &self.leases;
-        let is_held_back = |place: &Place, due: &Due| {
+        let is_held_back = |key: &QueueKey, due: &Due| {
             let lease = leases.get(due.command.tool).filter(|_| !due.ends_lease);
-            lease.and_then(|lease| lease.batch_since).is_some_and(|since| place.1 >= since)
+            lease.and_then(|lease| lease.batch_since).is_some_and(|since| key.1 >= since)
         };
         self.counts.applied += self.queue.take_due(step, is_held_back, due) as u64;
         self.give_back();
@@ -362,9 +362,9 @@ impl Intake {
         tools.len()
     }
 
-    /// The tools of a lease are charged to who took them, one of `seats` each.
-    pub fn seat(&mut self, id: LeaseId, seats: Vec<Taken>) {
-        self.leases.seat(id, seats);
+    /// Charges the tools of a lease to who took them, one of `charges` each.
+    pub fn charge(&mut self, id: LeaseId, charges: Vec<Taken>) {
+        self.leases.charge(id, charges);
     }
 
     pub(super) fn check_open(&self) -> Result<()> {
@@ -378,7 +378,7 @@ const PIECE_BYTES: u64 = 64 << 10;
 
 /// What so many commands are charged: they are in a tree, whose nodes are two thirds full.
 fn bytes_of(commands: usize) -> u64 {
-    let bytes = commands * size_of::<(Place, Due)>() * 3 / 2;
+    let bytes = commands * size_of::<(QueueKey, Due)>() * 3 / 2;
     (bytes as u64 / PIECE_BYTES) * PIECE_BYTES
 }
 

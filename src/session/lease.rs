@@ -9,31 +9,31 @@ use crate::refusal::{Reason, Refusal, Result, label, number};
 /// Identifies a lease. Random, so that it can't be guessed.
 pub type LeaseId = u128;
 
-/// The lease of one tool.
+/// One tool of a lease.
 #[derive(Debug)]
-pub(super) struct Lease {
+pub(super) struct LeasedTool {
     pub(super) id: LeaseId,
     holder: String,
     duration_ns: u64,
     expires_ns: u64,
     pub(super) last_sequence: Option<u64>,
-    /// Radius of the tip by which the newest command leads the tool, m.
+    /// Radius of the tip that the newest command gives the tool, m.
     pub(super) tip_radius_m: Option<f64>,
-    /// Place of the tool's newest command in the queue.
-    pub(super) last_place: Option<Place>,
+    /// Key of the tool's newest command in the queue.
+    pub(super) last_key: Option<QueueKey>,
     /// A batch of commands is being taken in: those of the tool that came since this arrival wait for the rest of it.
     pub(super) batch_since: Option<u64>,
-    /// Counts it among those of who holds it.
-    seat: Option<Taken>,
+    /// What the holder's account is charged for this tool.
+    charge: Option<Taken>,
 }
 
-/// Place in the queue: step, then order of arrival.
-pub(super) type Place = (u64, u64);
+/// Key of a command in the queue: step, then order of arrival.
+pub(super) type QueueKey = (u64, u64);
 
 /// The leases of a session, by tool.
 #[derive(Debug, Default)]
 pub(super) struct Leases {
-    held: BTreeMap<u32, Lease>,
+    held: BTreeMap<u32, LeasedTool>,
     lapsed: u64,
 }
 
@@ -71,16 +71,16 @@ impl Leases {
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
         let duration_ns = (lease_s * 1e9) as u64;
         for tool in tools {
-            let lease = Lease {
+            let lease = LeasedTool {
                 id,
                 holder: holder.to_owned(),
                 duration_ns,
                 expires_ns: now_ns.saturating_add(duration_ns),
                 last_sequence: None,
                 tip_radius_m: None,
-                last_place: None,
+                last_key: None,
                 batch_since: None,
-                seat: None,
+                charge: None,
             };
             self.held.insert(*tool, lease);
         }
@@ -105,27 +105,27 @@ impl Leases {
         self.held.iter().filter(move |lease| lease.1.id == id).map(|lease| *lease.0)
     }
 
-    /// The parts of a lease, one for each tool.
-    pub(super) fn of(&self, id: LeaseId) -> impl Iterator<Item = &Lease> {
+    /// The same, with what is known of each.
+    pub(super) fn of(&self, id: LeaseId) -> impl Iterator<Item = &LeasedTool> {
         self.held.values().filter(move |lease| lease.id == id)
     }
 
     /// The same, to change them.
-    pub(super) fn of_mut(&mut self, id: LeaseId) -> impl Iterator<Item = &mut Lease> {
+    pub(super) fn of_mut(&mut self, id: LeaseId) -> impl Iterator<Item = &mut LeasedTool> {
         self.held.values_mut().filter(move |lease| lease.id == id)
     }
 
-    /// The lease of a tool, if it is held.
-    pub(super) fn get(&self, tool: u32) -> Option<&Lease> {
+    /// A tool, if it is held.
+    pub(super) fn get(&self, tool: u32) -> Option<&LeasedTool> {
         self.held.get(&tool)
     }
 
     /// The same, to change it.
-    pub(super) fn get_mut(&mut self, tool: u32) -> Option<&mut Lease> {
+    pub(super) fn get_mut(&mut self, tool: u32) -> Option<&mut LeasedTool> {
         self.held.get_mut(&tool)
     }
 
-    /// Removes the lease of a tool.
+    /// Takes a tool out of its lease.
     pub(super) fn remove(&mut self, tool: u32) {
         self.held.remove(&tool);
     }
@@ -160,14 +160,14 @@ impl Leases {
 
     /// The tools for which `chosen` holds, by number and by who pays for them.
     pub(super) fn chosen(&self, chosen: impl Fn(u32, Option<&Account>) -> bool) -> Vec<u32> {
-        let payer = |lease: &Lease| lease.seat.as_ref().map(Taken::account).cloned();
-        let is_chosen = |(tool, lease): &(&u32, &Lease)| chosen(**tool, payer(lease).as_ref());
+        let payer = |lease: &LeasedTool| lease.charge.as_ref().map(Taken::account).cloned();
+        let is_chosen = |(tool, lease): &(&u32, &LeasedTool)| chosen(**tool, payer(lease).as_ref());
         self.held.iter().filter(is_chosen).map(|lease| *lease.0).collect()
     }
 
-    /// The tools of a lease are charged to who took them, one of `seats` each.
-    pub(super) fn seat(&mut self, id: LeaseId, seats: Vec<Taken>) {
-        self.of_mut(id).zip(seats).for_each(|(lease, seat)| lease.seat = Some(seat));
+    /// Charges the tools of a lease to who took them, one of `charges` each.
+    pub(super) fn charge(&mut self, id: LeaseId, charges: Vec<Taken>) {
+        self.of_mut(id).zip(charges).for_each(|(lease, charge)| lease.charge = Some(charge));
     }
 }
 

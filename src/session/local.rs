@@ -4,7 +4,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use glam::{DMat3, DVec3};
 use palpate_touch::law::{Law, Row};
-use palpate_touch::local::{self, LocalModel, Standing};
+use palpate_touch::local::{self, ContactState, LocalModel};
 
 use crate::sheet::tangent::Tangent;
 use crate::sheet::{Feel, Surroundings};
@@ -12,8 +12,8 @@ use crate::sheet::{Feel, Surroundings};
 /// Smaller forces do not limit the valid distance, N.
 const LEAST_N: f64 = 0.05;
 
-/// A tissue may lose contact with the tool for this many samples after it was met.
-const KNOCKED_SAMPLES: u32 = 5;
+/// After first contact the tissue may bounce off the tool for this many samples.
+const BOUNCE_SAMPLES: u32 = 5;
 
 /// Makes the local models of one tool.
 #[derive(Debug, Clone)]
@@ -24,11 +24,11 @@ pub struct Modeller {
     /// Whether K and B are those of the sheet around the tool also under a touch.
     touches_too: bool,
     /// The state of contact in the newest model.
-    standing: Standing,
+    contact_state: ContactState,
     /// The surface and its normal when the tool last did not touch it.
     surface: Option<(DVec3, DVec3)>,
     /// Consecutive samples in which the tool was below the surface and did not touch it.
-    knocked: u32,
+    bounced: u32,
     sequence: u64,
     /// The newest stiffness computed at the tool.
     tangent: Arc<Mutex<Option<Tangent>>>,
@@ -54,8 +54,8 @@ impl Modeller {
     /// and B of the sheet around it, which are recomputed continually; a touch is rendered with the law, and K and B are
     /// computed only if `touches_too`.
     pub fn new(number: u32, law: Arc<Law>, touches_too: bool) -> Self {
-        let (standing, tangent) = (Standing::Free, Arc::default());
-        Modeller { law, number, touches_too, standing, surface: None, knocked: 0, sequence: 0, tangent }
+        let (contact_state, tangent) = (ContactState::Free, Arc::default());
+        Modeller { law, number, touches_too, contact_state, surface: None, bounced: 0, sequence: 0, tangent }
     }
 
     /// Has the models from the next one on refer to another law.
@@ -65,10 +65,10 @@ impl Modeller {
 
     /// Whether K and B should be computed at the tool's present place.
     pub fn wants_refinement(&self) -> bool {
-        match self.standing {
-            Standing::Free => false,
-            Standing::Sticking | Standing::Sliding => self.touches_too,
-            Standing::Holding => true,
+        match self.contact_state {
+            ContactState::Free => false,
+            ContactState::Sticking | ContactState::Sliding => self.touches_too,
+            ContactState::Holding => true,
         }
     }
 
@@ -80,13 +80,13 @@ impl Modeller {
     /// The model after a step. K and B are the newest that were computed at the tool, or else the law's.
     pub fn model(&mut self, feel: &Feel, step: u64, client_time_s: f64) -> LocalModel {
         self.sequence += 1;
-        self.standing = feel.standing;
-        let touches = matches!(feel.standing, Standing::Sticking | Standing::Sliding);
+        self.contact_state = feel.contact_state;
+        let touches = matches!(feel.contact_state, ContactState::Sticking | ContactState::Sliding);
         let below = self.surface.is_some_and(|(surface_m, normal)| (surface_m - feel.place_m).dot(normal) > 0.0);
         // On contact, the tissue moves away from the tool for a moment. Its place then is not where the tool will meet
         // it.
-        self.knocked = if below && feel.standing == Standing::Free { self.knocked + 1 } else { 0 };
-        if !touches && !(1..=KNOCKED_SAMPLES).contains(&self.knocked) {
+        self.bounced = if below && feel.contact_state == ContactState::Free { self.bounced + 1 } else { 0 };
+        if !touches && !(1..=BOUNCE_SAMPLES).contains(&self.bounced) {
             self.surface = Some((feel.surface_m, feel.normal));
         }
         let (mut surface_m, normal) = self.surface.unwrap_or((feel.surface_m, DVec3::Z));
@@ -127,7 +127,7 @@ impl Modeller {
             normal,
             valid_m: local::valid_m(force_n, LEAST_N, self.hardening(depth_m, &row)),
             friction: feel.friction,
-            standing: feel.standing,
+            contact_state: feel.contact_state,
             law: self.number,
         }
     }
@@ -151,11 +151,11 @@ mod tests {
     use super::*;
 
     /// Of a tool at a height, over a surface that is level at `surface_m`.
-    fn feel(height_m: f64, surface_m: f64, standing: Standing) -> Feel {
+    fn feel(height_m: f64, surface_m: f64, contact_state: ContactState) -> Feel {
         Feel {
             place_m: height_m * DVec3::Z,
             velocity_m_per_s: DVec3::ZERO,
-            standing,
+            contact_state,
             force_on_tool_n: DVec3::ZERO,
             surface_m: surface_m * DVec3::Z,
             anchor_m: DVec3::ZERO,
@@ -181,16 +181,16 @@ mod tests {
     #[test]
     fn a_surface_that_the_tool_knocks_away_stays_in_the_model_for_some_samples() {
         let mut modeller = modeller();
-        assert_eq!(modeller.model(&feel(0.001, 0.0, Standing::Free), 0, 0.0).surface_m, DVec3::ZERO);
+        assert_eq!(modeller.model(&feel(0.001, 0.0, ContactState::Free), 0, 0.0).surface_m, DVec3::ZERO);
         // Above the surface it is where it is.
-        assert_eq!(modeller.model(&feel(0.001, -0.0005, Standing::Free), 1, 0.0).surface_m.z, -0.0005);
+        assert_eq!(modeller.model(&feel(0.001, -0.0005, ContactState::Free), 1, 0.0).surface_m.z, -0.0005);
         // Knocked: the tool is below where the surface was, and does not touch it.
-        for step in 0..KNOCKED_SAMPLES {
-            let model = modeller.model(&feel(-0.001, -0.002, Standing::Free), 2 + u64::from(step), 0.0);
+        for step in 0..BOUNCE_SAMPLES {
+            let model = modeller.model(&feel(-0.001, -0.002, ContactState::Free), 2 + u64::from(step), 0.0);
             assert_eq!(model.surface_m.z, -0.0005, "sample {step}");
         }
         // It did not come back: that is where it is now.
-        assert_eq!(modeller.model(&feel(-0.001, -0.002, Standing::Free), 20, 0.0).surface_m.z, -0.002);
+        assert_eq!(modeller.model(&feel(-0.001, -0.002, ContactState::Free), 20, 0.0).surface_m.z, -0.002);
     }
 
     #[test]
@@ -198,7 +198,7 @@ mod tests {
         let mut modeller = modeller();
         let by_law = DMat3::IDENTITY * 400.0;
         let near = |a: DMat3, b: DMat3| (a - b).abs_diff_eq(DMat3::ZERO, 1e-9);
-        assert!(near(modeller.model(&feel(0.0, 0.0, Standing::Holding), 0, 0.0).stiffness_n_per_m, by_law));
+        assert!(near(modeller.model(&feel(0.0, 0.0, ContactState::Holding), 0, 0.0).stiffness_n_per_m, by_law));
         let tangent = Tangent {
             stiffness_n_per_m: DMat3::IDENTITY * 123.0,
             damping_n_s_per_m: DMat3::IDENTITY * 4.0,
@@ -207,11 +207,11 @@ mod tests {
             iterations: 1,
         };
         *modeller.tangent.lock().unwrap_or_else(PoisonError::into_inner) = Some(tangent);
-        let model = modeller.model(&feel(0.0, 0.0, Standing::Holding), 1, 0.0);
+        let model = modeller.model(&feel(0.0, 0.0, ContactState::Holding), 1, 0.0);
         assert_eq!(model.stiffness_n_per_m, tangent.stiffness_n_per_m);
         assert_eq!(model.damping_n_s_per_m, tangent.damping_n_s_per_m);
         // It belongs to the place that was grasped.
-        modeller.model(&feel(0.001, 0.0, Standing::Free), 2, 0.0);
-        assert!(near(modeller.model(&feel(0.0, 0.0, Standing::Holding), 3, 0.0).stiffness_n_per_m, by_law));
+        modeller.model(&feel(0.001, 0.0, ContactState::Free), 2, 0.0);
+        assert!(near(modeller.model(&feel(0.0, 0.0, ContactState::Holding), 3, 0.0).stiffness_n_per_m, by_law));
     }
 }

@@ -31,7 +31,7 @@ use std::sync::Arc;
 use glam::DVec3;
 
 use crate::memory;
-use crate::scene::law::{LoadProfile, MotionProfile};
+use crate::scene::profile::{LoadProfile, MotionProfile};
 use crate::scene::record::{EnergyJ, Point, Record, Recovery};
 use crate::scene::script::Action;
 use crate::shape::{self, PointId, PointName};
@@ -121,13 +121,13 @@ struct Tool {
     expires_at: Option<u64>,
     late: bool,
     expired: bool,
-    led: Option<Led>,
+    posed: Option<Posed>,
     paused_until: Option<u64>,
 }
 
 /// A position-controlled tool.
 #[derive(Debug, Clone)]
-struct Led {
+struct Posed {
     tip: Tip,
     path: Path,
     /// Client time of its place, s.
@@ -209,7 +209,7 @@ impl Session {
     pub fn rests_until(&self) -> Option<u64> {
         let expiry = self.tools.iter().filter_map(|tool| tool.expires_at).min();
         // A path may move a tool at any time.
-        let still = self.tissue.is_still() && self.tools.iter().all(|tool| tool.led.is_none());
+        let still = self.tissue.is_still() && self.tools.iter().all(|tool| tool.posed.is_none());
         still.then(|| expiry.unwrap_or(u64::MAX))
     }
 
@@ -229,8 +229,8 @@ impl Session {
     }
 
     /// Requests an audit of a window of steps ([`sheet::audit`]).
-    pub fn watch(&mut self, inputs: Inputs) {
-        self.tissue.watch(inputs);
+    pub fn request_audit(&mut self, inputs: Inputs) {
+        self.tissue.request_audit(inputs);
     }
 
     /// Takes the report on that window after a step, once.
@@ -261,7 +261,7 @@ impl Session {
         {
             return;
         }
-        self.recoveries.believe(self.tissue.checkpoint_step());
+        self.recoveries.accept_until(self.tissue.checkpoint_step());
         observe(self);
     }
 
@@ -290,13 +290,13 @@ impl Session {
         }
         let paused_until_step = self.recoveries.pause_end(step);
         let released = self.tissue.recover(step, paused_until_step.is_some());
-        // All that took effect since the checkpoint: `believe` has forgotten the others.
-        self.recoveries.believe(state_of_step);
+        // All that took effect since the checkpoint: `accept_until` has forgotten the others.
+        self.recoveries.accept_until(state_of_step);
         let mut tools = Vec::new();
         for (index, tool) in self.tools.iter_mut().enumerate() {
             let undone_commands = self.recoveries.acts_of(index);
-            let acted = undone_commands > 0 || released.tools.binary_search(&index).is_ok() || tool.led.is_some();
-            (tool.led, tool.expires_at) = (None, None);
+            let acted = undone_commands > 0 || released.tools.binary_search(&index).is_ok() || tool.posed.is_some();
+            (tool.posed, tool.expires_at) = (None, None);
             tool.expired |= acted;
             if acted {
                 tool.paused_until = paused_until_step.or(tool.paused_until);
@@ -316,19 +316,19 @@ impl Session {
         let step_s = self.model().scene.stepping.rate_hz.recip();
         let end_s = self.time_s() + step_s;
         for (index, tool) in self.tools.iter_mut().enumerate() {
-            let Some(led) = &mut tool.led else { continue };
-            let before = led.path.counts();
-            let play = led.path.step(end_s, step_s);
-            for (index, count) in led.path.counts().into_iter().enumerate() {
+            let Some(posed) = &mut tool.posed else { continue };
+            let before = posed.path.counts();
+            let play = posed.path.step(end_s, step_s);
+            for (index, count) in posed.path.counts().into_iter().enumerate() {
                 self.path_counts[index] += count - before[index];
             }
             match play {
-                Some(Play::Lead(place_m, client_time_s)) => {
-                    led.client_time_s = client_time_s;
-                    self.tissue.lead(index, place_m, led.tip);
+                Some(Play::Pose(place_m, client_time_s)) => {
+                    posed.client_time_s = client_time_s;
+                    self.tissue.pose(index, place_m, posed.tip);
                 }
                 Some(Play::Release) => {
-                    (tool.led, tool.expired) = (None, true);
+                    (tool.posed, tool.expired) = (None, true);
                     self.tissue.release(index);
                 }
                 None => {}
@@ -376,34 +376,34 @@ impl Session {
         }
         match command.action {
             Action::Push(poke) => {
-                self.tool(index).led = None;
+                self.tool(index).posed = None;
                 let point = self.model().shape().nearest(poke.centre_m);
                 self.tool(index).control_point = Some(point);
-                self.tissue.push(index, Some(Push::Held(poke)));
+                self.tissue.push(index, Some(Push::Constant(poke)));
             }
             Action::Grasp { point, displacement_m } => {
-                self.tool(index).led = None;
+                self.tool(index).posed = None;
                 self.tool(index).control_point = Some(point);
-                self.tissue.grasp(index, point, Grasp::Held(displacement_m));
+                self.tissue.grasp(index, point, Grasp::Target(displacement_m));
             }
-            Action::Lead { place_m, tip } => {
+            Action::Pose { place_m, tip } => {
                 let point = self.model().shape().nearest(place_m);
                 let client_time_s = command.client_time_ns as f64 * 1e-9;
                 let now_s = self.time_s();
                 let tool = self.tool(index);
                 tool.control_point = Some(point);
-                let led = tool.led.get_or_insert(Led { tip, path: Path::default(), client_time_s });
-                led.tip = tip;
+                let posed = tool.posed.get_or_insert(Posed { tip, path: Path::default(), client_time_s });
+                posed.tip = tip;
                 // A pose with a step is played at that step; a pose with client time only is played by that time.
                 if command.at_step.is_some() || command.client_time_ns == 0 {
-                    led.path.go_to(client_time_s, place_m);
-                } else if !led.path.receive(client_time_s, place_m, now_s) {
+                    posed.path.go_to(client_time_s, place_m);
+                } else if !posed.path.receive(client_time_s, place_m, now_s) {
                     self.path_counts[1] += 1;
                 }
             }
             Action::Release => {
                 let tool = self.tool(index);
-                (tool.expires_at, tool.led) = (None, None);
+                (tool.expires_at, tool.posed) = (None, None);
                 self.tissue.release(index);
             }
         }
@@ -416,22 +416,22 @@ impl Session {
             if self.tools[index].expires_at.is_some_and(|at| at <= step) {
                 self.tools[index].expires_at = None;
                 self.tools[index].expired = true;
-                self.tools[index].led = None;
+                self.tools[index].posed = None;
                 self.tissue.release(index);
             }
         }
     }
 
-    /// Applies a force as a continuous law, exact within the step. No command can express this.
-    pub fn play_force(&mut self, tool: usize, law: LoadProfile) {
+    /// Applies a force as a function of time, exact within the step. No command can express this.
+    pub fn play_force(&mut self, tool: usize, profile: LoadProfile) {
         self.recoveries.disturb();
-        self.tissue.push(tool, Some(Push::Law(law)));
+        self.tissue.push(tool, Some(Push::Profile(profile)));
     }
 
-    /// Applies a movement as a continuous law.
-    pub fn play_move(&mut self, tool: usize, law: MotionProfile) {
+    /// Applies a movement as a function of time.
+    pub fn play_move(&mut self, tool: usize, profile: MotionProfile) {
         self.recoveries.disturb();
-        self.tissue.grasp(tool, law.point, Grasp::Law(law));
+        self.tissue.grasp(tool, profile.point, Grasp::Profile(profile));
     }
 
     /// The samples of the tools; only those with a number in `only`, if given.
@@ -439,14 +439,14 @@ impl Session {
         let sample_of = |number: u32| {
             let tool = self.tools.get(number as usize).cloned().unwrap_or_default();
             let feel = self.tissue.feel(number as usize);
-            let led = |feel: Feel| Contact {
+            let contact_of = |feel: Feel| Contact {
                 point: self.model().shape().nearest(feel.anchor_m),
                 displacement_m: feel.surface_m - feel.anchor_m,
                 velocity_m_per_s: feel.velocity_m_per_s,
                 force_on_tool_n: feel.force_on_tool_n,
                 applied_force_n: -feel.force_on_tool_n,
             };
-            let contact = feel.map(led).or_else(|| {
+            let contact = feel.map(contact_of).or_else(|| {
                 tool.control_point.map(|point| {
                     let state = self.tissue.point(point);
                     Contact {
@@ -465,9 +465,9 @@ impl Session {
                 arrival_ns: tool.arrival_ns,
                 contact,
                 feel,
-                place_time_s: tool.led.as_ref().map_or(0.0, |led| led.client_time_s),
+                place_time_s: tool.posed.as_ref().map_or(0.0, |posed| posed.client_time_s),
                 local: None,
-                stale: tool.led.as_ref().is_some_and(|led| led.path.is_held(self.time_s())),
+                stale: tool.posed.as_ref().is_some_and(|posed| posed.path.is_held(self.time_s())),
                 late: tool.late,
                 expired: tool.expired,
                 paused_until: tool.paused_until,
@@ -492,8 +492,8 @@ impl Session {
     }
 
     /// A copy of the tissue as it is now, of which [`record_of`] tells the points later.
-    pub fn still(&self) -> SheetCopy {
-        self.tissue.still()
+    pub fn copy(&self) -> SheetCopy {
+        self.tissue.copy()
     }
 
     /// The energies of the whole sheet, for a record: a pass over it.
@@ -518,8 +518,8 @@ impl Session {
 }
 
 /// The record of a point of a copy.
-pub fn record_of(still: &SheetCopy, point: PointId) -> Point {
-    point_record(still.model().shape().name(point), &still.point(point))
+pub fn record_of(copy: &SheetCopy, point: PointId) -> Point {
+    point_record(copy.model().shape().name(point), &copy.point(point))
 }
 
 fn energy_record(energy: Energy) -> EnergyJ {

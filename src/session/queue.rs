@@ -3,10 +3,10 @@
 use std::collections::BTreeMap;
 
 use super::command::Due;
-use super::lease::Place;
+use super::lease::QueueKey;
 
-/// Commands by their place: step, then order of arrival.
-type Commands = BTreeMap<Place, Due>;
+/// Commands by their key: step, then order of arrival.
+type Commands = BTreeMap<QueueKey, Due>;
 
 /// Commands that have no effect any more. To free them takes time.
 #[derive(Debug, Default)]
@@ -32,7 +32,7 @@ pub(super) struct Queue {
     waiting: usize,
     left_over: usize,
     /// What is due of all tools, before it is in order.
-    due: Vec<(Place, Due)>,
+    due: Vec<(QueueKey, Due)>,
 }
 
 impl Queue {
@@ -52,19 +52,19 @@ impl Queue {
     }
 
     /// Adds an entry.
-    pub(super) fn insert(&mut self, place: Place, due: Due) {
+    pub(super) fn insert(&mut self, key: QueueKey, due: Due) {
         if due.ends_lease {
-            self.endings.insert(place, due);
+            self.endings.insert(key, due);
         } else {
-            self.by_tool.entry(due.command.tool).or_default().insert(place, due);
+            self.by_tool.entry(due.command.tool).or_default().insert(key, due);
             self.waiting += 1;
         }
     }
 
-    /// Removes the command of a tool at a place if `is_chosen` says so.
-    pub(super) fn remove_if(&mut self, tool: u32, place: Place, is_chosen: impl Fn(&Due) -> bool) -> Option<Due> {
+    /// Removes the command of a tool with a key if `is_chosen` says so.
+    pub(super) fn remove_if(&mut self, tool: u32, key: QueueKey, is_chosen: impl Fn(&Due) -> bool) -> Option<Due> {
         let commands = self.by_tool.get_mut(&tool)?;
-        let removed = commands.get(&place).is_some_and(is_chosen).then(|| commands.remove(&place)).flatten()?;
+        let removed = commands.get(&key).is_some_and(is_chosen).then(|| commands.remove(&key)).flatten()?;
         self.waiting -= 1;
         Some(removed)
     }
@@ -107,7 +107,7 @@ impl Queue {
     /// The first step for which something waits.
     pub(super) fn first_step(&self) -> Option<u64> {
         let all = self.by_tool.values().chain([&self.endings]);
-        all.filter_map(|commands| commands.first_key_value()).map(|(place, _)| place.0).min()
+        all.filter_map(|commands| commands.first_key_value()).map(|(key, _)| key.0).min()
     }
 
     /// Moves what is due at the beginning of step `step` into `due`, in order of effect, but for what is held back. Tells how
@@ -115,33 +115,33 @@ impl Queue {
     pub(super) fn take_due(
         &mut self,
         step: u64,
-        is_held_back: impl Fn(&Place, &Due) -> bool,
+        is_held_back: impl Fn(&QueueKey, &Due) -> bool,
         due: &mut Vec<Due>,
     ) -> usize {
         for commands in self.by_tool.values_mut().chain([&mut self.endings]) {
             let mut from = (0, 0);
-            while let Some((place, entry)) = commands.range(from..=(step, u64::MAX)).next() {
-                let place = *place;
-                if is_held_back(&place, entry) {
-                    from = (place.0, place.1 + 1);
-                } else if let Some(entry) = commands.remove(&place) {
-                    self.due.push((place, entry));
+            while let Some((key, entry)) = commands.range(from..=(step, u64::MAX)).next() {
+                let key = *key;
+                if is_held_back(&key, entry) {
+                    from = (key.0, key.1 + 1);
+                } else if let Some(entry) = commands.remove(&key) {
+                    self.due.push((key, entry));
                 }
             }
         }
         let count = self.due.iter().filter(|(_, entry)| !entry.ends_lease).count();
         self.waiting -= count;
-        self.due.sort_unstable_by_key(|(place, _)| *place);
+        self.due.sort_unstable_by_key(|(key, _)| *key);
         due.extend(self.due.drain(..).map(|(_, entry)| entry));
         count
     }
 
     /// Everything that waits, in order.
     #[cfg(test)]
-    pub(super) fn in_order(&self) -> Vec<(Place, &Due)> {
+    pub(super) fn in_order(&self) -> Vec<(QueueKey, &Due)> {
         let all = self.by_tool.values().chain([&self.endings]);
-        let mut all: Vec<_> = all.flatten().map(|(place, due)| (*place, due)).collect();
-        all.sort_unstable_by_key(|(place, _)| *place);
+        let mut all: Vec<_> = all.flatten().map(|(key, due)| (*key, due)).collect();
+        all.sort_unstable_by_key(|(key, _)| *key);
         all
     }
 }

@@ -101,7 +101,7 @@ impl Recoveries {
     }
 
     /// Forgets the commands before `step`: the state after them has passed the guard's checks.
-    pub(super) fn believe(&mut self, step: u64) {
+    pub(super) fn accept_until(&mut self, step: u64) {
         while self.acts.front().is_some_and(|acts| acts.step < step) {
             self.acts.pop_front();
         }
@@ -156,11 +156,11 @@ mod tests {
     use crate::session::Session;
     use crate::session::command::{Command, Due};
     use crate::shape::{PointId, PointName};
-    use crate::sheet::guard::Cause;
+    use crate::sheet::guard::CheckFailure;
     use crate::sheet::{BlowUp, Model};
 
     fn blow_up(step: u64) -> BlowUp {
-        BlowUp { step, cause: Cause::NotFinite { point: PointName::Point([0, 0]) } }
+        BlowUp { step, cause: CheckFailure::NotFinite { point: PointName::Point([0, 0]) } }
     }
 
     fn grasp(tool: u32, sequence: u64) -> Due {

@@ -44,7 +44,7 @@ impl Rules {
                 let far_m = displacement_m.length();
                 check_reach("position.displacement_m", self.scene.shape(), far_m, &self.limits)
             }
-            Action::Lead { place_m, tip } => {
+            Action::Pose { place_m, tip } => {
                 crate::refusal::finite_vector("place_m", *place_m)?;
                 let centre_m = self.scene.shape().extent().middle_m();
                 check_reach("place_m", self.scene.shape(), (*place_m - centre_m).length(), &self.limits)?;
@@ -55,9 +55,9 @@ impl Rules {
     }
 }
 
-/// Radius of the tip by which a command leads its tool, m.
+/// Radius of the tip that a command gives its tool, m.
 pub(super) fn tip_radius_m(command: &Command) -> Option<f64> {
-    if let Action::Lead { tip, .. } = &command.action { Some(tip.radius_m) } else { None }
+    if let Action::Pose { tip, .. } = &command.action { Some(tip.radius_m) } else { None }
 }
 
 /// Refuses another tip in the tissue: the surface under a larger one lies elsewhere, and to meet it at once is a blow that no

@@ -58,13 +58,13 @@ pub fn command(tool: usize, step: u64, action: Action) -> Command {
     }
 }
 
-/// Applies the laws of a script to a session that has not begun.
+/// Applies the profiles of a script to a session that has not begun.
 pub fn play(session: &mut Session, script: &Script) {
-    for (tool, law) in script.forces.iter().enumerate() {
-        session.play_force(tool, law.clone());
+    for (tool, profile) in script.forces.iter().enumerate() {
+        session.play_force(tool, profile.clone());
     }
-    for (index, law) in script.moves.iter().enumerate() {
-        session.play_move(script.forces.len() + index, law.clone());
+    for (index, profile) in script.moves.iter().enumerate() {
+        session.play_move(script.forces.len() + index, profile.clone());
     }
 }
 
@@ -132,7 +132,7 @@ impl Playing<'_> {
         let Playing { model, script, held, limits, .. } = self;
         let mut session = Session::new(model);
         let mut changes = model.course(&script.changes, limits)?;
-        // Held forces are commands, through the same intake as in a server; laws are set once.
+        // Held forces are commands, through the same intake as in a server; profiles are set once.
         let mut intake = held.then(|| intake(model, script, limits)).transpose()?;
         if !held {
             play(&mut session, script);

@@ -65,7 +65,7 @@ impl Deadband {
         self.force_n.or(self.force_fraction).or(self.displacement_m).is_some()
     }
 
-    fn is_left(&self, told: &ToolSample, now: &ToolSample) -> bool {
+    fn is_exceeded(&self, told: &ToolSample, now: &ToolSample) -> bool {
         if (told.tool, told.late, told.expired) != (now.tool, now.late, now.expired) {
             return true;
         }
@@ -173,9 +173,9 @@ impl Sampler {
             self.law = number;
             self.followed.values_mut().for_each(|followed| followed.modeller.change_law(number, law.clone()));
         }
-        let (models, is_left) = self.look_ahead(&sample, &law);
+        let (models, is_exceeded) = self.look_ahead(&sample, &law);
         // Another law is news: the client renders by the other one until a model names it.
-        if !(is_due || is_left || is_other && !models.is_empty()) {
+        if !(is_due || is_exceeded || is_other && !models.is_empty()) {
             return None;
         }
         self.told = Some(sample.clone());
@@ -191,12 +191,12 @@ impl Sampler {
     /// The local models of the position-controlled tools, and whether a client's force is off by too much.
     fn look_ahead(&mut self, sample: &Sample, law: &Arc<Law>) -> (Vec<(u32, LocalModel)>, bool) {
         let fraction = self.sampling.deadband.as_ref().and_then(|deadband| deadband.rendered_fraction);
-        let (mut models, mut is_left) = (Vec::new(), false);
+        let (mut models, mut is_exceeded) = (Vec::new(), false);
         for tool in &sample.tools {
             let Some(feel) = &tool.feel else {
                 self.followed.remove(&tool.tool);
                 // A client can't predict a tool without a model.
-                is_left |= fraction.is_some() && tool.contact.is_some();
+                is_exceeded |= fraction.is_some() && tool.contact.is_some();
                 continue;
             };
             let followed = self.followed.entry(tool.tool).or_insert_with(|| FollowedTool {
@@ -204,10 +204,10 @@ impl Sampler {
                 deadband: palpate_touch::ForceDeadband::new(fraction.unwrap_or(0.0)),
             });
             let model = followed.modeller.model(feel, sample.step, tool.place_time_s);
-            is_left |= fraction.is_some() && followed.deadband.is_left(&model, law);
+            is_exceeded |= fraction.is_some() && followed.deadband.is_exceeded(&model, law);
             models.push((tool.tool, model));
         }
-        (models, is_left)
+        (models, is_exceeded)
     }
 
     /// The stiffness computations for the tools whose stiffness the stream requests.
@@ -228,7 +228,7 @@ impl Sampler {
             None => !asleep || told.tools != now.tools,
             Some(deadband) => {
                 let mut pairs = told.tools.iter().zip(&now.tools);
-                told.tools.len() != now.tools.len() || pairs.any(|(told, now)| deadband.is_left(told, now))
+                told.tools.len() != now.tools.len() || pairs.any(|(told, now)| deadband.is_exceeded(told, now))
             }
         }
     }
@@ -293,7 +293,7 @@ mod tests {
             let (mut model, mut touched) = (None, false);
             for step in 1..=100 {
                 let place_m = middle_m - 1e-4 * step as f64 * DVec3::Z;
-                tell(&mut session, step, Action::Lead { place_m, tip });
+                tell(&mut session, step, Action::Pose { place_m, tip });
                 model = sampler.pick(&session, false).and_then(|sample| sample.tools[0].local);
                 let refinements: Vec<_> = sampler.refinements(&session).collect();
                 // A touch begins where the tool meets the surface.
@@ -385,12 +385,12 @@ mod tests {
         };
         let deadband = Deadband { force_n: Some(0.1), force_fraction: Some(0.1), ..Deadband::default() };
         for (told_n, now_n, left) in [(0.0, 0.09, false), (0.0, 0.11, true), (10.0, 10.9, false), (10.0, 11.2, true)] {
-            assert_eq!(deadband.is_left(&tool(told_n), &tool(now_n)), left, "{told_n} N to {now_n} N");
+            assert_eq!(deadband.is_exceeded(&tool(told_n), &tool(now_n)), left, "{told_n} N to {now_n} N");
         }
         // A new acknowledgement alone is not a change; an expired action is.
         let later = ToolSample { acknowledged_sequence: 2, ..tool(0.0) };
-        assert!(!deadband.is_left(&tool(0.0), &later));
-        assert!(deadband.is_left(&tool(0.0), &ToolSample { expired: true, ..tool(0.0) }));
+        assert!(!deadband.is_exceeded(&tool(0.0), &later));
+        assert!(deadband.is_exceeded(&tool(0.0), &ToolSample { expired: true, ..tool(0.0) }));
     }
 
     #[test]

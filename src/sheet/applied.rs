@@ -1,6 +1,6 @@
 //! Surgical forces: how the forces of all tools act on the points.
 //!
-//! A scheme says at which moments of a substep it evaluates a law, and with which weights the values add to its fields.
+//! A scheme says at which moments of a substep it evaluates a force, and with which weights the values add to its fields.
 //! A two-step scheme sees the substep's beginning only. Where the force jumps there, it must see the mean of the values
 //! just before and just after (as if the substep before had ended, and this one begun, with a half kick each): with the
 //! new value alone the error is first order, with the mean second. The other schemes take the new value.
@@ -21,22 +21,22 @@ use super::field::{BLOCK, Field, Layout};
 use super::lanes::{self, Run, Vector, Width};
 use super::model::{Model, Plan};
 use super::real::Real;
-use crate::scene::law::{LoadProfile, Moment, Poke};
+use crate::scene::profile::{LoadProfile, Moment, Poke};
 
 /// The force of a tool.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Push {
     /// Constant until the next command.
-    Held(Poke),
-    /// A law of time, exact within the step.
-    Law(LoadProfile),
+    Constant(Poke),
+    /// A function of time, exact within the step.
+    Profile(LoadProfile),
 }
 
 impl Push {
     fn at(&self, moment: Moment, rate_hz: f64) -> Poke {
         match self {
-            Push::Held(poke) => *poke,
-            Push::Law(law) => law.at(moment, rate_hz),
+            Push::Constant(poke) => *poke,
+            Push::Profile(profile) => profile.at(moment, rate_hz),
         }
     }
 }
@@ -47,18 +47,18 @@ pub(super) struct Slot {
     pub(super) push: Option<Push>,
     before: Option<Poke>,
     /// The force that the sleeping tiles were last compared with.
-    told: Option<Poke>,
+    compared: Option<Poke>,
 }
 
 /// A change of a tool's force.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Touch {
+pub(super) struct ForceChange {
     old: Option<Poke>,
     new: Option<Poke>,
     reached: [[[usize; 2]; 2]; 2],
 }
 
-impl Touch {
+impl ForceChange {
     /// Upper bound of the change of force on any point of a rectangle, N; `sides`: its ends along x and along y, m.
     pub(super) fn most_n(&self, sides: [[f64; 2]; 2]) -> f64 {
         let nearest = |poke: &Poke| {
@@ -440,13 +440,13 @@ impl<T: Real> Applied<T> {
     }
 
     /// The changes of force since the last call, up to the end of step `step`.
-    pub(super) fn changes(&mut self, model: &Model, step: u64) -> impl Iterator<Item = Touch> {
+    pub(super) fn changes(&mut self, model: &Model, step: u64) -> impl Iterator<Item = ForceChange> {
         let end = Moment { step, fraction: 1.0 };
         let change = move |slot: &mut Slot| {
             let new = slot.push.as_ref().map(|push| push.at(end, model.scene.stepping.rate_hz));
-            let old = std::mem::replace(&mut slot.told, new);
+            let old = std::mem::replace(&mut slot.compared, new);
             let reached = |poke: Option<Poke>| poke.map_or_else(Default::default, |poke| reached::<T>(&poke, model));
-            (old != new).then(|| Touch { old, new, reached: [old, new].map(reached) })
+            (old != new).then(|| ForceChange { old, new, reached: [old, new].map(reached) })
         };
         let slots = if self.settled { 0 } else { self.slots.len() };
         self.slots[..slots].iter_mut().filter_map(change)
@@ -463,7 +463,7 @@ impl<T: Real> Applied<T> {
         for slot in &self.slots {
             self.settled &= match (&slot.before, &slot.push) {
                 (None, None) => true,
-                (Some(before), Some(Push::Held(poke))) => before == poke,
+                (Some(before), Some(Push::Constant(poke))) => before == poke,
                 _ => false,
             };
             // Forces of one tool that differ only in the vector are merged.

@@ -2,8 +2,8 @@
 //!
 //! The sheet marks where a window begins and ends. Both are checkpoints of the guard, which are shared for this, not
 //! copied. Between them the sheet records its tools' inputs. The slow work happens on copies, in any thread:
-//! [`Look::open`] copies the beginning and releases the checkpoint, [`Opening::close`] does the same with the end, and
-//! [`Audit::work`] repeats the window in slices.
+//! [`SharedCheckpoint::open`] copies the beginning and releases the checkpoint, [`Opening::close`] does the same with
+//! the end, and [`Audit::work`] repeats the window in slices.
 //!
 //! The result is the error that the window added. Two errors stay unseen: that of the state in which the window began,
 //! and the error that the twin shares with the sheet, which for a scheme of order p is 4^−p of the error.
@@ -16,6 +16,8 @@ use std::sync::Arc;
 use glam::DVec3;
 
 use super::applied::Applied;
+use super::audit_window::{AuditWindow, Replay, Resume};
+pub use super::audit_window::{Inputs, Mark, SharedCheckpoint};
 use super::checkpoint::Checkpoint;
 use super::field::State;
 use super::guard::convert;
@@ -24,8 +26,6 @@ use super::model::Model;
 use super::motion::{Sheet, springs_of};
 use super::real::Real;
 use super::tissue::Tissue;
-pub use super::watch::{Inputs, Look, Mark};
-use super::watch::{Replay, Resume, Watch};
 use crate::memory;
 use crate::scene::Precision;
 pub use crate::scene::record::AuditedError;
@@ -179,44 +179,44 @@ impl Model {
 
 impl<T: Real> Sheet<T> {
     /// Requests a window, which begins at the next checkpoint.
-    pub(super) fn watch(&mut self, mut inputs: Inputs) {
+    pub(super) fn request_audit(&mut self, mut inputs: Inputs) {
         inputs.0.clear();
-        (self.watch, self.is_marked) = (Watch::Wanted(inputs), false);
+        (self.audit_window, self.is_marked) = (AuditWindow::Wanted(inputs), false);
     }
 
     /// Handles a new checkpoint, at which a window may begin or end.
     pub(super) fn mark(&mut self) {
-        self.watch = match std::mem::take(&mut self.watch) {
-            Watch::Wanted(inputs) => {
+        self.audit_window = match std::mem::take(&mut self.audit_window) {
+            AuditWindow::Wanted(inputs) => {
                 self.is_marked = true;
-                Watch::Open(self.steps + self.model.window_steps(), inputs)
+                AuditWindow::Open(self.steps + self.model.window_steps(), inputs)
             }
             // The beginning has not been reported yet, and its checkpoint is gone.
-            Watch::Open(_, mut inputs) if self.is_marked => {
+            AuditWindow::Open(_, mut inputs) if self.is_marked => {
                 inputs.0.clear();
-                Watch::Open(self.steps + self.model.window_steps(), inputs)
+                AuditWindow::Open(self.steps + self.model.window_steps(), inputs)
             }
-            Watch::Open(until, inputs) if self.steps >= until => Watch::Closed(inputs),
-            Watch::Closed(_) => Watch::Dropped,
+            AuditWindow::Open(until, inputs) if self.steps >= until => AuditWindow::Closed(inputs),
+            AuditWindow::Closed(_) => AuditWindow::Dropped,
             other => other,
         };
     }
 
     /// Takes the report on the window, once.
     pub(super) fn take_mark(&mut self) -> Option<Mark> {
-        let look = |sheet: &Self| {
+        let share = |sheet: &Self| {
             let checkpoint = sheet.checkpoint.clone()?;
-            Some(Look { model: sheet.model.clone(), checkpoint })
+            Some(SharedCheckpoint { model: sheet.model.clone(), checkpoint })
         };
-        match &self.watch {
-            Watch::Open(..) if std::mem::take(&mut self.is_marked) => look(self).map(Mark::Begin),
-            Watch::Closed(_) => {
-                let look = look(self);
-                let Watch::Closed(inputs) = std::mem::take(&mut self.watch) else { return None };
-                Some(look.map_or(Mark::Dropped, |look| Mark::End(look, inputs)))
+        match &self.audit_window {
+            AuditWindow::Open(..) if std::mem::take(&mut self.is_marked) => share(self).map(Mark::Begin),
+            AuditWindow::Closed(_) => {
+                let end = share(self);
+                let AuditWindow::Closed(inputs) = std::mem::take(&mut self.audit_window) else { return None };
+                Some(end.map_or(Mark::Dropped, |end| Mark::End(end, inputs)))
             }
-            Watch::Dropped => {
-                self.watch = Watch::Off;
+            AuditWindow::Dropped => {
+                self.audit_window = AuditWindow::Off;
                 Some(Mark::Dropped)
             }
             _ => None,
@@ -247,10 +247,10 @@ impl<T: Real> Sheet<T> {
         for (number, (wide, narrow)) in pairs.chain(kept).enumerate() {
             for index in 0..self.model.len() {
                 for c in 0..3 {
-                    let at = c * from.plane + from.place(index);
+                    let at = c * from.plane + from.offset(index);
                     // The rounding loss of a compensated displacement belongs to it.
                     let lost = lost.filter(|_| number == 0).map_or(0.0, |lost| lost[at].wide());
-                    wide[c * to.plane + to.place(index)] = narrow[at].wide() + lost;
+                    wide[c * to.plane + to.offset(index)] = narrow[at].wide() + lost;
                 }
             }
         }
@@ -271,8 +271,8 @@ impl<T: Real> Sheet<T> {
         sheet.tiles.largest = self.tiles.largest;
         sheet.guard_events = self.guard_events;
         (sheet.substeps_done, sheet.points_done) = (self.substeps_done, self.points_done);
-        if !matches!(self.watch, Watch::Off) {
-            sheet.watch = Watch::Dropped;
+        if !matches!(self.audit_window, AuditWindow::Off) {
+            sheet.audit_window = AuditWindow::Dropped;
         }
         sheet.change(model);
         Some(sheet)
@@ -345,7 +345,7 @@ impl<T: Real> Replay for Sheet<T> {
     }
 }
 
-impl Look {
+impl SharedCheckpoint {
     /// Copies the beginning and releases the shared checkpoint.
     pub fn open(self) -> Opening {
         Opening(self.checkpoint.resume(&self.model))
@@ -362,7 +362,7 @@ fn since_rest(sheet: &dyn Replay, extent: Extent) -> Extent {
 
 impl Opening {
     /// Ends the window at `end` and releases its shared checkpoint.
-    pub fn close(self, end: Look, inputs: Inputs) -> Audit {
+    pub fn close(self, end: SharedCheckpoint, inputs: Inputs) -> Audit {
         let Opening(end) = end.open();
         Audit { begin: self.0, inputs, end: Observed::of(&*end), until: end.steps() }
     }

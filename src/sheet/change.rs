@@ -20,7 +20,7 @@ impl<T: Real> Sheet<T> {
     /// From the coming step on, uses `model`, which has the same points and number format.
     pub(super) fn change(&mut self, model: &Arc<Model>) {
         self.tiles.begin_anew(model.tile_tolerance());
-        self.watch.give_up();
+        self.audit_window.give_up();
         if self.is_same_tissue(model) {
             self.resample(model);
             // A newly allocated rounding loss begins at 0.
@@ -43,7 +43,7 @@ impl<T: Real> Sheet<T> {
         self.checkpoint = None;
         self.take_checkpoint();
         if let Some(checkpoint) = self.checkpoint.as_mut().and_then(Arc::get_mut) {
-            checkpoint.believed = false;
+            checkpoint.passed_checks = false;
         }
     }
 
@@ -74,7 +74,7 @@ impl<T: Real> Sheet<T> {
         // The scheme does not produce the visible motion of a grasped point, so restore it.
         for (index, motion) in self.prescribed.grasped() {
             for c in 0..3 {
-                let at = c * layout.plane + layout.place(index);
+                let at = c * layout.plane + layout.offset(index);
                 self.state.u[at] = T::of(motion.displacement_m[c] / spacing_m);
                 self.state.d[at] = T::of(motion.velocity_m_per_s[c] * self.plan.substep_s / spacing_m);
             }

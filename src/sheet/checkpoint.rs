@@ -17,7 +17,7 @@ pub const MARGIN: f64 = 0.05;
 
 /// Why a check of the guard failed.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Cause {
+pub enum CheckFailure {
     /// A point is not finite, or is displaced by a billion times the sheet's size.
     NotFinite {
         /// The point.
@@ -33,25 +33,25 @@ pub enum Cause {
         work_j: f64,
     },
     /// The springs' force is far from its prediction.
-    Surprise {
+    Prediction {
         /// The resulting difference of a displacement, as a fraction of the largest.
         part: f64,
     },
 }
 
-impl fmt::Display for Cause {
+impl fmt::Display for CheckFailure {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Cause::NotFinite { point } => {
+            CheckFailure::NotFinite { point } => {
                 write!(f, "point {point} was not finite (or a billion sheets away)")
             }
-            Cause::Energy { energy_j, before_j, work_j } => {
+            CheckFailure::Energy { energy_j, before_j, work_j } => {
                 write!(
                     f,
                     "the energy rose from {before_j:.3e} J to {energy_j:.3e} J, while the tools did {work_j:.3e} J of work"
                 )
             }
-            Cause::Surprise { part } => {
+            CheckFailure::Prediction { part } => {
                 write!(f, "the springs' force was far from its prediction, by {part:.1e} of the largest displacement")
             }
         }
@@ -63,7 +63,7 @@ impl fmt::Display for Cause {
 pub(super) enum Input {
     Push(Option<Push>),
     Grasp(usize, Grasp),
-    Lead(DVec3, Tip),
+    Pose(DVec3, Tip),
 }
 
 /// The complete state that a sheet goes back to.
@@ -79,7 +79,7 @@ pub(super) struct Checkpoint<T: Real> {
     /// The recent largest displacement, spacings. Sleep is relative to it.
     pub(super) largest: f64,
     /// Whether the motion that led here has passed the checks, under the present tissue.
-    pub(super) believed: bool,
+    pub(super) passed_checks: bool,
 }
 
 /// Work of the tools, J, and energies at the last survey.
@@ -106,11 +106,11 @@ impl Work {
 
     /// Checks an energy; a rise by `noise` of the largest does not count. `present_j` is subtracted from the work so
     /// far and belongs to the next interval. The account begins anew.
-    pub(super) fn survey(&mut self, energy_j: f64, present_j: f64, noise: f64) -> Result<(), Cause> {
+    pub(super) fn survey(&mut self, energy_j: f64, present_j: f64, noise: f64) -> Result<(), CheckFailure> {
         let (work_j, before_j) = (self.done_j - present_j, self.energy_j);
         let allowed_j = work_j + MARGIN * (before_j + work_j.abs()) + noise * self.largest_j;
         if energy_j - before_j > allowed_j {
-            return Err(Cause::Energy { energy_j, before_j, work_j });
+            return Err(CheckFailure::Energy { energy_j, before_j, work_j });
         }
         *self = Work { done_j: present_j, energy_j, largest_j: self.largest_j.max(energy_j) };
         Ok(())
@@ -126,7 +126,7 @@ mod tests {
         let begun = Work::begun(1.0, 0.0);
         // Up to the margin.
         assert_eq!({ begun }.survey(1.04, 0.0, 0.0), Ok(()));
-        let found = Cause::Energy { energy_j: 1.2, before_j: 1.0, work_j: 0.0 };
+        let found = CheckFailure::Energy { energy_j: 1.2, before_j: 1.0, work_j: 0.0 };
         assert_eq!({ begun }.survey(1.2, 0.0, 0.0), Err(found));
         let mut worked = begun;
         worked.add(0.25);

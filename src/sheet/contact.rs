@@ -29,7 +29,7 @@ use super::footprint::{Footprint, Reached};
 use super::model::{Model, Plan};
 use super::real::Real;
 use super::tangent::{Patch, Tangent, Window};
-use palpate_touch::{Coupling, Standing, Tip};
+use palpate_touch::{ContactState, Coupling, Tip};
 
 /// The motion of a tool and the force on it at the end of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -39,7 +39,7 @@ pub struct Feel {
     /// Velocity in the last step, m/s.
     pub velocity_m_per_s: DVec3,
     /// The state of contact.
-    pub standing: Standing,
+    pub contact_state: ContactState,
     /// Force of the tissue on the tool, N.
     pub force_on_tool_n: DVec3,
     /// Place of the surface under the tool, m.
@@ -77,7 +77,7 @@ pub(super) struct Tool {
     /// Place at the step's beginning and at its end, m.
     pub(super) from_m: DVec3,
     pub(super) to_m: DVec3,
-    pub(super) standing: Standing,
+    pub(super) contact_state: ContactState,
     pub(super) normal: DVec3,
     /// The offset that a grasp keeps between the tool and the surface, m.
     pub(super) offset_m: DVec3,
@@ -97,47 +97,47 @@ pub(super) struct Contacts {
 
 impl Contacts {
     /// From the coming step on the tool is at `to_m` at the step's end. A new tool begins there.
-    pub(super) fn lead(&mut self, model: &Model, number: usize, to_m: DVec3, tip: Tip) {
+    pub(super) fn pose(&mut self, model: &Model, number: usize, to_m: DVec3, tip: Tip) {
         if let Some(tool) = self.tools.iter_mut().find(|tool| tool.number == number) {
             let is_other = tool.tip.radius_m != tip.radius_m;
             if is_other {
                 tool.footprint = Footprint::new(model, tip.radius_m, tool.footprint.centre_m());
             }
             if is_other || tool.tip.grasps != tip.grasps {
-                (tool.standing, tool.steady_n) = (Standing::Free, DVec3::ZERO);
+                (tool.contact_state, tool.steady_n) = (ContactState::Free, DVec3::ZERO);
             }
             (tool.to_m, tool.tip) = (to_m, tip);
             return;
         }
-        let place = self.tools.partition_point(|tool| tool.number < number);
+        let index = self.tools.partition_point(|tool| tool.number < number);
         let tool = Tool {
             number,
             tip,
             footprint: Footprint::new(model, tip.radius_m, to_m.truncate()),
             from_m: to_m,
             to_m,
-            standing: Standing::Free,
+            contact_state: ContactState::Free,
             normal: DVec3::Z,
             offset_m: DVec3::ZERO,
             force_n: DVec3::ZERO,
             steady_n: DVec3::ZERO,
             velocity_m_per_s: DVec3::ZERO,
         };
-        self.tools.insert(place, tool);
+        self.tools.insert(index, tool);
     }
 
     pub(super) fn is_empty(&self) -> bool {
         self.tools.is_empty()
     }
 
-    /// The tools that are led.
+    /// The numbers of these tools.
     pub(super) fn tools(&self) -> impl Iterator<Item = usize> {
         self.tools.iter().map(|tool| tool.number)
     }
 
     /// The points under tools that touch or hold. Some occur more than once.
     pub(super) fn points(&self) -> impl Iterator<Item = [usize; 2]> {
-        self.tools.iter().filter(|tool| tool.standing != Standing::Free).flat_map(Tool::points)
+        self.tools.iter().filter(|tool| tool.contact_state != ContactState::Free).flat_map(Tool::points)
     }
 
     pub(super) fn release(&mut self, number: usize) {
@@ -215,7 +215,7 @@ impl Tool {
     ) -> DVec3 {
         let place_m = self.place_m(fraction);
         let displacement = |point| displacement_m(model, layout, state, point);
-        if self.standing == Standing::Free {
+        if self.contact_state == ContactState::Free {
             // Finds the tool's place on the sheet. A contraction, as long as the sheet is not folded.
             for _ in 0..2 {
                 let (surface_m, _) = self.footprint.surface(displacement);
@@ -226,35 +226,35 @@ impl Tool {
         let (surface_m, along) = self.footprint.surface(displacement);
         self.normal = along[0].cross(along[1]).try_normalize().unwrap_or(DVec3::Z);
         let mut gap_m = place_m - surface_m;
-        match self.standing {
-            Standing::Free => {
+        match self.contact_state {
+            ContactState::Free => {
                 // A disc that is farther off the sheet's edge than its radius does not meet it.
                 if gap_m.truncate().length() > self.tip.radius_m {
                     return DVec3::ZERO;
                 }
                 if self.tip.grasps {
-                    (self.standing, self.offset_m) = (Standing::Holding, gap_m);
+                    (self.contact_state, self.offset_m) = (ContactState::Holding, gap_m);
                     gap_m = DVec3::ZERO;
                 } else if gap_m.dot(self.normal) >= 0.0 {
                     return DVec3::ZERO;
                 } else {
-                    self.standing = Standing::Sticking;
+                    self.contact_state = ContactState::Sticking;
                 }
             }
-            Standing::Holding => gap_m -= self.offset_m,
-            Standing::Sticking | Standing::Sliding => {}
+            ContactState::Holding => gap_m -= self.offset_m,
+            ContactState::Sticking | ContactState::Sliding => {}
         }
         let force_n = self.force(model, plan, layout, state, gap_m);
-        if self.standing == Standing::Holding {
+        if self.contact_state == ContactState::Holding {
             return force_n;
         }
         let pressure_n = -force_n.dot(self.normal);
         if pressure_n <= 0.0 || self.footprint.mobility() == 0.0 {
-            self.standing = Standing::Free;
+            self.contact_state = ContactState::Free;
             return DVec3::ZERO;
         }
         let (inside, force_n) = within_cone(force_n, self.normal, self.tip.friction);
-        self.standing = if inside { Standing::Sticking } else { Standing::Sliding };
+        self.contact_state = if inside { ContactState::Sticking } else { ContactState::Sliding };
         force_n
     }
 
@@ -279,7 +279,7 @@ impl Tool {
 
     /// After the force has acted: a sliding disc stays under the tool.
     pub(super) fn follow<T: Real>(&mut self, model: &Model, layout: &Layout, state: &State<T>, fraction: f64) {
-        if self.standing != Standing::Sliding {
+        if self.contact_state != ContactState::Sliding {
             return;
         }
         let (surface_m, _) = self.footprint.surface(|point| displacement_m(model, layout, state, point));
@@ -309,9 +309,9 @@ mod tests {
     fn within_a_step_a_tool_moves_straight_and_ends_where_it_is_told_to() {
         let (model, mut contacts) = (Model::paper(&["sheet.points=[9, 9]"]), Contacts::default());
         let [from_m, to_m] = [DVec3::new(0.1, 0.12, 0.01), DVec3::new(0.1007, 0.1193, 0.0087)];
-        contacts.lead(&model, 3, from_m, Tip::default());
+        contacts.pose(&model, 3, from_m, Tip::default());
         contacts.finish(1000.0);
-        contacts.lead(&model, 3, to_m, Tip::default());
+        contacts.pose(&model, 3, to_m, Tip::default());
         for fraction in [0.0, 0.25, 0.8] {
             let expected_m = from_m + fraction * (to_m - from_m);
             assert!(contacts.tools[0].place_m(fraction).distance(expected_m) < 1e-15, "{fraction}");

@@ -7,7 +7,7 @@ use super::motion::Sheet;
 use super::real::Real;
 use super::{Model, Push, Tissue};
 use crate::limits::Limits;
-use crate::scene::law::Poke;
+use crate::scene::profile::Poke;
 use crate::scene::{PAPER, Scene};
 
 /// Counts the nonzero values below `least` among the displacements, and in the rest of the state.
@@ -33,7 +33,7 @@ fn rings_down<T: Real, const CUTS_U: bool>(sets: &[&str]) {
             falloff_per_m: 1.0 / (1.3 * scene.sheet.spacing_m),
             falloff_offset: 0.0,
         };
-        sheet.push(0, Some(Push::Held(poke)));
+        sheet.push(0, Some(Push::Constant(poke)));
         (0..50).for_each(|_| sheet.step().unwrap());
         sheet.push(0, None);
         // From 1 down to what rounding and the smallest number that counts leave of a vibration.

@@ -67,9 +67,9 @@ impl<V: Vector> Edge<V> {
         let mut columns = [[V::Real::default(); 3 * LONG]; 2];
         for k in 0..=V::LANES {
             // SAFETY: the caller's promise: a row beyond the last can be read.
-            let place = (row + k).min(rows) * stride + self.column - 1;
-            debug_assert!(grid.layout.holds(place, 2));
-            let at = unsafe { grid.x.add(place) };
+            let offset = (row + k).min(rows) * stride + self.column - 1;
+            debug_assert!(grid.layout.holds(offset, 2));
+            let at = unsafe { grid.x.add(offset) };
             for c in 0..3 {
                 // SAFETY: as above.
                 unsafe {

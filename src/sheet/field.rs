@@ -45,13 +45,13 @@ impl Layout {
         Layout { rows, columns, stride, plane }
     }
 
-    /// Whether `count` values from `place` on lie within one plane.
-    pub(super) fn holds(&self, place: usize, count: usize) -> bool {
-        place + count <= self.plane
+    /// Whether `count` values from `offset` on lie within one plane.
+    pub(super) fn holds(&self, offset: usize, count: usize) -> bool {
+        offset + count <= self.plane
     }
 
-    /// The place of the x component of the point with row-major number `index`.
-    pub(super) fn place(&self, index: usize) -> usize {
+    /// The offset of the x component of the point with row-major number `index`.
+    pub(super) fn offset(&self, index: usize) -> usize {
         index / self.columns * self.stride + index % self.columns
     }
 }

@@ -13,7 +13,7 @@
 use std::sync::Arc;
 
 use super::applied::Applied;
-pub use super::checkpoint::{Cause, MARGIN};
+pub use super::checkpoint::{CheckFailure, MARGIN};
 use super::checkpoint::{Checkpoint, Input, Work};
 use super::field::{Field, Layout, State};
 use super::model::{Model, Plan};
@@ -29,7 +29,7 @@ use crate::shape::PointId;
 pub const INTERVAL_SUBSTEPS: u64 = 256;
 
 /// Largest error of a prediction, as a fraction of the largest displacement.
-pub const MOST_SURPRISE: f64 = 0.5;
+pub const MOST_PREDICTION_ERROR: f64 = 0.5;
 
 /// Number of times a substep is halved before the guard gives up.
 pub const MOST_HALVINGS: u32 = 4;
@@ -44,13 +44,13 @@ const NOISE: f64 = 1e-10;
 impl<T: Real> Sheet<T> {
     /// Returns the cause of a failure, if there is one. Checks in every step that all is finite; the full check is
     /// periodic, and takes a checkpoint.
-    pub(super) fn check(&mut self) -> Result<(), Cause> {
+    pub(super) fn check(&mut self) -> Result<(), CheckFailure> {
         let interval = (INTERVAL_SUBSTEPS / u64::from(self.plan.substeps)).max(1);
         let due = self.steps.is_multiple_of(interval) || self.inputs.len() >= MOST_INPUTS;
         let farthest = farthest_in_spacings(&self.model);
         let calm = self.tables.is_calm(farthest);
         let scan = || match broken_point(&self.model, &self.tables.layout, &self.state) {
-            Some(index) => Err(Cause::NotFinite { point: self.model.shape().name(PointId::new(index)) }),
+            Some(index) => Err(CheckFailure::NotFinite { point: self.model.shape().name(PointId::new(index)) }),
             None => Ok(()),
         };
         if !calm {
@@ -64,8 +64,8 @@ impl<T: Real> Sheet<T> {
         if !(survey.largest < farthest && energy_j.is_finite()) {
             scan()?;
         }
-        if survey.surprise > MOST_SURPRISE * survey.largest {
-            return Err(Cause::Surprise { part: survey.surprise / survey.largest });
+        if survey.prediction_error > MOST_PREDICTION_ERROR * survey.largest {
+            return Err(CheckFailure::Prediction { part: survey.prediction_error / survey.largest });
         }
         let present_j = self.present_work_j(&survey);
         self.work.survey(energy_j, present_j, NOISE.max((10.0 * self.model.sleep_tolerance).powi(2)))?;
@@ -92,12 +92,12 @@ impl<T: Real> Sheet<T> {
             let state = State::zero(&tables.layout, state.kept.len());
             let (applied, prescribed, contacts) = (applied.clone(), prescribed.clone(), contacts.clone());
             let (work, largest) = (Work::default(), 0.0);
-            let (steps, halvings, believed) = (0, 0, true);
-            Arc::new(Checkpoint { steps, halvings, state, applied, prescribed, contacts, work, largest, believed })
+            let (steps, halvings, passed_checks) = (0, 0, true);
+            Arc::new(Checkpoint { steps, halvings, state, applied, prescribed, contacts, work, largest, passed_checks })
         });
         let Some(checkpoint) = Arc::get_mut(checkpoint) else { return };
         checkpoint.largest = tiles.largest;
-        (checkpoint.steps, checkpoint.believed) = (self.steps, true);
+        (checkpoint.steps, checkpoint.passed_checks) = (self.steps, true);
         checkpoint.halvings = self.halvings;
         tiles.copy_touched(checkpoint.state.fields_mut().zip(self.state.fields()));
         checkpoint.applied.clone_from(&self.applied);
@@ -111,7 +111,7 @@ impl<T: Real> Sheet<T> {
     /// Frees the checkpoint of a still sheet: nothing can go wrong until a tool gets a command.
     pub(super) fn forget_checkpoint(&mut self) {
         self.checkpoint = None;
-        self.watch.give_up();
+        self.audit_window.give_up();
         self.inputs.clear();
         self.state.share_history(self.plan.scheme.history());
     }
@@ -120,7 +120,7 @@ impl<T: Real> Sheet<T> {
     fn go_back(&mut self, halvings: u32) {
         // Without a checkpoint there is nothing to go back to.
         let Some(checkpoint) = &self.checkpoint else { return };
-        self.watch.give_up();
+        self.audit_window.give_up();
         self.steps = checkpoint.steps;
         self.tiles.wake_all();
         self.state.copy_from(&checkpoint.state);
@@ -149,13 +149,13 @@ impl<T: Real> Sheet<T> {
             self.take_checkpoint();
         }
         self.inputs.push((self.steps, tool, input.clone()));
-        self.watch.input(self.steps, tool, &input);
+        self.audit_window.input(self.steps, tool, &input);
         self.tell(tool, input);
     }
 
     /// Repeats from the checkpoint to `steps` with shorter substeps, until the checks pass or the substep is the
     /// shortest.
-    pub(super) fn mend(&mut self, steps: u64, mut cause: Cause) -> Result<(), BlowUp> {
+    pub(super) fn mend(&mut self, steps: u64, mut cause: CheckFailure) -> Result<(), BlowUp> {
         let inputs = std::mem::take(&mut self.inputs);
         let blow_up = |cause| BlowUp { step: steps, cause };
         for halvings in self.halvings + 1..=MOST_HALVINGS {
@@ -198,8 +198,8 @@ pub(super) fn broken_point<T: Real>(model: &Model, layout: &Layout, state: &Stat
     let farthest = T::of(farthest_in_spacings(model));
     let is_good = |field: &Field<T>, at: usize| field[at].is_finite() && field[at].magnitude() < farthest;
     (0..model.len()).find(|index| {
-        let places = (0..3).map(|c| c * layout.plane + layout.place(*index));
-        !places.into_iter().all(|at| state.fields().all(|field| is_good(field, at)))
+        let offsets = (0..3).map(|c| c * layout.plane + layout.offset(*index));
+        !offsets.into_iter().all(|at| state.fields().all(|field| is_good(field, at)))
     })
 }
 
@@ -220,7 +220,7 @@ pub(super) fn convert<T: Real>(
     for (index, force) in forces.iter().enumerate() {
         let pushed = applied.force_at(layout, 0, [index / layout.columns, index % layout.columns]);
         for (c, n) in force.iter().enumerate() {
-            let at = c * layout.plane + layout.place(index);
+            let at = c * layout.plane + layout.offset(index);
             let mut history = state.history(n.wide(), from.scheme.history(), at);
             let now = [state.u[at].wide(), state.d[at].wide()];
             let [u, d] = from.scheme.resample(&to.scheme, ratio, now, pushed[c], &mut history);
@@ -239,7 +239,7 @@ mod tests {
     use glam::DVec3;
 
     use super::*;
-    use crate::scene::law::Poke;
+    use crate::scene::profile::Poke;
     use crate::sheet::integrate::Scheme;
     use crate::sheet::{Push, Tissue};
 
@@ -254,7 +254,7 @@ mod tests {
         let (scene, mut sheet) = (&model.scene, Sheet::new(&model));
         sheet.push(
             0,
-            Some(Push::Held(Poke {
+            Some(Push::Constant(Poke {
                 centre_m: scene.sheet.spacing_m * DVec3::new(3.0, 4.0, 0.0),
                 force_n: DVec3::new(0.1, -0.2, -1.0),
                 falloff_per_m: 0.7 / scene.sheet.spacing_m,
@@ -340,11 +340,11 @@ mod tests {
             let layout = sheet.tables.layout;
             assert_eq!(broken_point(&sheet.model, &layout, &sheet.state), None);
             let index = sheet.model.index_of([2, 5]);
-            sheet.state.u[layout.plane + layout.place(index)] = broken;
+            sheet.state.u[layout.plane + layout.offset(index)] = broken;
             assert_eq!(broken_point(&sheet.model, &layout, &sheet.state), Some(index));
             // A survey is due at step 64.
             sheet.steps = 64;
-            assert_eq!(sheet.check(), Err(Cause::NotFinite { point: PointName::Point([2, 5]) }), "{broken}");
+            assert_eq!(sheet.check(), Err(CheckFailure::NotFinite { point: PointName::Point([2, 5]) }), "{broken}");
         }
     }
 
@@ -353,9 +353,9 @@ mod tests {
         let farthest = farthest_in_spacings(&sheet("central").model);
         for (increment, calm) in [(1e-3, true), (0.1 * farthest, true), (10.0 * farthest, false), (f64::NAN, false)] {
             let mut sheet = sheet_with("central", &["springs.stiffness_n_per_m=0.0"]);
-            let place = sheet.tables.layout.place(11);
+            let offset = sheet.tables.layout.offset(11);
             sheet.tables.is_calm(0.0);
-            sheet.state.d[place] = increment;
+            sheet.state.d[offset] = increment;
             sheet.do_step();
             assert_eq!(sheet.tables.is_calm(farthest), calm, "{increment}");
         }
@@ -374,9 +374,9 @@ mod tests {
             };
             // A force of the past that moves the point by 5 spacings.
             let past = 5.0 / weight;
-            let place = sheet.tables.layout.place(31);
-            Arc::make_mut(&mut sheet.state.kept[0])[place] += past;
-            assert!(matches!(sheet.check(), Err(Cause::Surprise { .. })), "{integrator}");
+            let offset = sheet.tables.layout.offset(31);
+            Arc::make_mut(&mut sheet.state.kept[0])[offset] += past;
+            assert!(matches!(sheet.check(), Err(CheckFailure::Prediction { .. })), "{integrator}");
         }
     }
 }

@@ -7,11 +7,13 @@
 mod advance;
 mod applied;
 pub mod audit;
+mod audit_window;
 mod change;
 mod checkpoint;
 pub mod choice;
 mod compile;
 mod contact;
+mod copy;
 mod correction;
 #[cfg(test)]
 mod decay;
@@ -33,7 +35,6 @@ mod rest;
 mod springs;
 pub mod stability;
 mod stage;
-mod still;
 mod survey;
 mod sweep;
 mod tables;
@@ -41,10 +42,9 @@ pub mod tangent;
 mod tiles;
 mod tissue;
 mod touch;
-mod watch;
 
 pub use applied::Push;
-pub use checkpoint::Cause;
+pub use checkpoint::CheckFailure;
 pub use contact::{Feel, Surroundings};
 pub use footprint::{Footprint, Reached};
 pub use model::{Model, Plan};

@@ -167,12 +167,12 @@ impl Model {
         false
     }
 
-    /// The grid place of an array place.
+    /// Row and column of the point with a row-major index.
     pub(super) fn point_of(&self, index: usize) -> [usize; 2] {
         [index / self.points[1], index % self.points[1]]
     }
 
-    /// The array place of a grid place that is on the sheet.
+    /// The row-major index of the point at a row and column of the sheet.
     pub(super) fn index_of(&self, [i, j]: [usize; 2]) -> usize {
         i * self.points[1] + j
     }
@@ -184,7 +184,7 @@ mod tests {
 
     use super::*;
     use crate::limits::Limits;
-    use crate::scene::law::Poke;
+    use crate::scene::profile::Poke;
     use crate::sheet::lanes;
 
     /// Small, and without a rehearsal: for machines that are emulated, and for memcheck.
@@ -210,7 +210,7 @@ mod tests {
                     let force_n = glam::DVec3::new(0.7, 0.2, -0.9) * [1.0, -1.5][tool];
                     let (centre_m, falloff_per_m) = (scene.shape().rest_m(scene.sheet.point(point)), 25.0);
                     let poke = Poke { centre_m, force_n, falloff_per_m, falloff_offset: 0.0 };
-                    tissue.push(tool, Some(crate::sheet::Push::Held(poke)));
+                    tissue.push(tool, Some(crate::sheet::Push::Constant(poke)));
                 }
                 (0..20).for_each(|_| tissue.step().unwrap());
                 format!("{:032x}", tissue.state_hash())

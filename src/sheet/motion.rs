@@ -7,6 +7,7 @@ use glam::DVec3;
 use xxhash_rust::xxh3::Xxh3;
 
 use super::applied::{Applied, Push};
+use super::audit_window::{AuditWindow, Inputs, Mark};
 use super::checkpoint::{Checkpoint, Input, Work};
 use super::contact::{Contacts, Feel, Surroundings};
 use super::field::{Layout, State};
@@ -21,9 +22,8 @@ use super::springs::Springs;
 use super::tables::SweepTables;
 use super::tiles::{CHECK_STEPS, SleepTiles};
 use super::tissue::{BlowUp, Energy, PointState, Released, SheetCopy, Tissue};
-use super::watch::{Inputs, Mark, Watch};
 use crate::scene::Precision;
-use crate::scene::law::{Moment, Motion};
+use crate::scene::profile::{Moment, Motion};
 use crate::shape::PointId;
 use palpate_touch::Tip;
 
@@ -52,7 +52,7 @@ pub(super) struct Sheet<T: Real> {
     pub(super) checkpoint: Option<Arc<Checkpoint<T>>>,
     /// The inputs of the tools since the checkpoint: step they precede, tool, input.
     pub(super) inputs: Vec<(u64, usize, Input)>,
-    pub(super) watch: Watch,
+    pub(super) audit_window: AuditWindow,
     /// Whether the beginning of the window is still to be reported.
     pub(super) is_marked: bool,
     pub(super) tiles: SleepTiles<T>,
@@ -78,7 +78,7 @@ impl<T: Real> Sheet<T> {
             prescribed: Prescribed::new(),
             contacts: Contacts::default(),
             inputs: Vec::new(),
-            watch: Watch::Off,
+            audit_window: AuditWindow::Off,
             is_marked: false,
             tiles: SleepTiles::new(layout, model.tile_tolerance(), if model.scene.springs.flexion { 2 } else { 1 }),
             guard_events: 0,
@@ -104,14 +104,14 @@ impl<T: Real> Sheet<T> {
         self.contacts.finish(self.model.scene.stepping.rate_hz);
         self.steps += 1;
         if self.steps.is_multiple_of(CHECK_STEPS) {
-            self.rest();
+            self.put_to_sleep();
         }
     }
 
     /// Advances from `moment` to the fraction `end` of the same step.
     fn substep(&mut self, moment: Moment, end: f64) {
         let far = self.tiles.farthest_unnoticed(&self.model.scene);
-        self.tiles.watch(&self.state.u, far);
+        self.tiles.wake_beside_moved(&self.state.u, far);
         self.points_done += self.tiles.awake_points as u64;
         let Sheet { model, plan, tables, applied, .. } = self;
         applied.prepare(model, plan, &tables.layout, moment, end - moment.fraction);
@@ -164,7 +164,7 @@ impl<T: Real> Sheet<T> {
         for (index, displacement_m, velocity_m_per_s) in prescribed.at(model, step, fraction) {
             let mut product = 0.0;
             for c in 0..3 {
-                let at = c * tables.layout.plane + tables.layout.place(index);
+                let at = c * tables.layout.plane + tables.layout.offset(index);
                 let (free_u, free_d) = (state.u[at], state.d[at]);
                 state.u[at] = T::of(displacement_m[c] / spacing_m);
                 state.d[at] = if plan.scheme.takes_means() {
@@ -191,7 +191,7 @@ impl<T: Real> Sheet<T> {
         let used = applied.force_at(&tables.layout, 0, point);
         let mut changes = [[0.0; 2]; 3];
         for (c, change) in changes.iter_mut().enumerate() {
-            let at = c * tables.layout.plane + tables.layout.place(index);
+            let at = c * tables.layout.plane + tables.layout.offset(index);
             *change = plan.scheme.release(Release {
                 u: state.u[at].wide(),
                 springs: &state.history(springs[c], plan.scheme.history(), at),
@@ -207,7 +207,7 @@ impl<T: Real> Sheet<T> {
     fn shift(&mut self, index: usize, change: &[[f64; 2]; 3]) {
         let Sheet { tables, state, .. } = self;
         for (c, change) in change.iter().enumerate() {
-            let at = c * tables.layout.plane + tables.layout.place(index);
+            let at = c * tables.layout.plane + tables.layout.offset(index);
             state.u[at] += T::of(change[0]);
             state.d[at] += T::of(change[1]);
         }
@@ -229,7 +229,7 @@ impl<T: Real> Sheet<T> {
         let still = self.steps == 0 || !self.tiles.region.is_awake(i, j);
         let mut found = [DVec3::ZERO; 3];
         for (c, n) in springs.into_iter().enumerate() {
-            let at = c * tables.layout.plane + tables.layout.place(index);
+            let at = c * tables.layout.plane + tables.layout.offset(index);
             let one = Plain::<f64, 1>::one;
             let mut kept = [one(0.0); MAX_KEPT];
             kept.iter_mut().zip(&state.kept).for_each(|(value, field)| *value = one(field[at].wide()));
@@ -250,10 +250,10 @@ impl<T: Real> Sheet<T> {
                 self.contacts.release(tool);
                 self.applied.set(tool, push);
             }
-            Input::Lead(place_m, tip) => {
+            Input::Pose(place_m, tip) => {
                 self.prescribed.release(tool);
                 self.applied.set(tool, None);
-                self.contacts.lead(&self.model, tool, place_m, tip);
+                self.contacts.pose(&self.model, tool, place_m, tip);
             }
             Input::Grasp(index, grasp) => {
                 self.applied.set(tool, None);
@@ -305,8 +305,8 @@ impl<T: Real> Tissue for Sheet<T> {
         self.input(tool, Input::Grasp(point.index(), grasp));
     }
 
-    fn lead(&mut self, tool: usize, place_m: DVec3, tip: Tip) {
-        self.input(tool, Input::Lead(place_m, tip));
+    fn pose(&mut self, tool: usize, place_m: DVec3, tip: Tip) {
+        self.input(tool, Input::Pose(place_m, tip));
     }
 
     fn feel(&self, tool: usize) -> Option<Feel> {
@@ -325,8 +325,8 @@ impl<T: Real> Tissue for Sheet<T> {
         Sheet::change(self, model);
     }
 
-    fn watch(&mut self, inputs: Inputs) {
-        Sheet::watch(self, inputs);
+    fn request_audit(&mut self, inputs: Inputs) {
+        Sheet::request_audit(self, inputs);
     }
 
     fn take_mark(&mut self) -> Option<Mark> {
@@ -403,7 +403,7 @@ impl<T: Real> Tissue for Sheet<T> {
 
     fn largest_displacement_m(&self) -> f64 {
         let squared = (0..self.model.len()).map(|index| {
-            let at = self.tables.layout.place(index);
+            let at = self.tables.layout.offset(index);
             (0..3).map(|c| self.state.u[c * self.tables.layout.plane + at].wide().powi(2)).sum()
         });
         squared.fold(0.0, f64::max).sqrt() * self.model.scene.sheet.spacing_m
@@ -426,7 +426,7 @@ impl<T: Real> Tissue for Sheet<T> {
         Sheet::hash_blocks(self, blocks, hasher);
     }
 
-    fn still(&self) -> SheetCopy {
-        Sheet::still(self)
+    fn copy(&self) -> SheetCopy {
+        Sheet::copy(self)
     }
 }

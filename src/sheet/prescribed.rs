@@ -3,15 +3,15 @@
 use glam::DVec3;
 
 use super::model::Model;
-use crate::scene::law::{Motion, MotionProfile};
+use crate::scene::profile::{Motion, MotionProfile};
 
 /// How a tool moves its grasped point.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Grasp {
     /// To this displacement by the end of the step, at constant velocity; then it stays.
-    Held(DVec3),
-    /// A law of time, exact within the step.
-    Law(MotionProfile),
+    Target(DVec3),
+    /// A function of time, exact within the step.
+    Profile(MotionProfile),
 }
 
 /// One grasped point.
@@ -47,23 +47,23 @@ impl Prescribed {
     /// From the coming step on `tool` moves the point at `index`, which now moves like `now`, and releases the point it
     /// held before. A point that another tool holds is taken over.
     pub(super) fn grasp(&mut self, tool: usize, index: usize, grasp: Grasp, now: Motion) {
-        if let Some(place) = self.grasped.iter().position(|g| g.index == index) {
-            let taken = Grasped { tool, grasp, ..self.grasped.remove(place) };
+        if let Some(at) = self.grasped.iter().position(|g| g.index == index) {
+            let taken = Grasped { tool, grasp, ..self.grasped.remove(at) };
             self.release(tool);
             return self.grasped.push(taken);
         }
         self.release(tool);
         let now = match &grasp {
-            Grasp::Held(_) => now,
-            Grasp::Law(law) => law.at(0.0),
+            Grasp::Target(_) => now,
+            Grasp::Profile(profile) => profile.at(0.0),
         };
         self.grasped.push(Grasped { tool, index, grasp, now, held: false });
     }
 
     /// `tool` releases its point. The point keeps its velocity.
     pub(super) fn release(&mut self, tool: usize) {
-        let Some(place) = self.grasped.iter().position(|g| g.tool == tool) else { return };
-        let grasped = self.grasped.remove(place);
+        let Some(at) = self.grasped.iter().position(|g| g.tool == tool) else { return };
+        let grasped = self.grasped.remove(at);
         // A point that was grasped and released at the same boundary was never held.
         if grasped.held {
             self.released.push((grasped.index, grasped.now.velocity_m_per_s));
@@ -86,13 +86,13 @@ impl Prescribed {
         let rate_hz = model.scene.stepping.rate_hz;
         self.grasped.iter().map(move |grasped| {
             let (displacement_m, velocity_m_per_s) = match &grasped.grasp {
-                Grasp::Held(target_m) => {
+                Grasp::Target(target_m) => {
                     let now_m = grasped.now.displacement_m;
                     let place_m = if fraction >= 1.0 { *target_m } else { now_m.lerp(*target_m, fraction) };
                     (place_m, (*target_m - now_m) * rate_hz)
                 }
-                Grasp::Law(law) => {
-                    let motion = law.at((step as f64 + fraction) / rate_hz);
+                Grasp::Profile(profile) => {
+                    let motion = profile.at((step as f64 + fraction) / rate_hz);
                     (motion.displacement_m, motion.velocity_m_per_s)
                 }
             };
@@ -108,12 +108,12 @@ impl Prescribed {
             let before = grasped.now;
             grasped.held = true;
             grasped.now = match &grasped.grasp {
-                Grasp::Held(target_m) => {
+                Grasp::Target(target_m) => {
                     let velocity_m_per_s = (*target_m - before.displacement_m) * rate_hz;
                     let acceleration_m_per_s2 = (velocity_m_per_s - before.velocity_m_per_s) * rate_hz;
                     Motion { displacement_m: *target_m, velocity_m_per_s, acceleration_m_per_s2 }
                 }
-                Grasp::Law(law) => law.at((step + 1) as f64 / rate_hz),
+                Grasp::Profile(profile) => profile.at((step + 1) as f64 / rate_hz),
             };
         }
     }

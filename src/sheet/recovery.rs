@@ -21,7 +21,7 @@ impl<T: Real> Sheet<T> {
     /// Continues at step `step` from the state of the checkpoint, in which a blow-up has left the sheet; or at rest, if
     /// `to_rest` or if that state has passed no check.
     pub(super) fn recover(&mut self, step: u64, to_rest: bool) -> Released {
-        let at_rest = to_rest || self.checkpoint.as_ref().is_some_and(|checkpoint| !checkpoint.believed);
+        let at_rest = to_rest || self.checkpoint.as_ref().is_some_and(|checkpoint| !checkpoint.passed_checks);
         let pushing = self.applied.slots.iter().enumerate().filter(|(_, slot)| slot.push.is_some());
         let mut tools: Vec<usize> =
             pushing.map(|(tool, _)| tool).chain(self.prescribed.tools()).chain(self.contacts.tools()).collect();
@@ -38,7 +38,7 @@ impl<T: Real> Sheet<T> {
         }
         let model = self.model.clone();
         self.tiles.begin_anew(model.tile_tolerance());
-        self.watch.give_up();
+        self.audit_window.give_up();
         self.exchange(&model);
         self.steps = step;
         self.begin_account();

@@ -19,7 +19,7 @@ use super::integrate::Oscillator;
 use super::model::{Model, Plan};
 use super::motion::at_rest;
 use super::{lanes, stability};
-use crate::scene::law::{CentreProfile, LoadProfile, Profile, StrengthProfile};
+use crate::scene::profile::{CentreProfile, LoadProfile, Profile, StrengthProfile};
 use crate::scene::{Fixed, Integrator, PointSet, Precision, Scene};
 use crate::shape::PointId;
 
@@ -222,13 +222,13 @@ impl<'s> Rehearsal<'s> {
         let free = scene.sheet.point_mass_kg * scene.stepping.rate_hz * scene.stepping.rate_hz;
         let newtons = spacing_m * if stiffness > 0.0 { stiffness } else { free };
         let mut tissue = at_rest(&model);
-        let law = LoadProfile {
+        let profile = LoadProfile {
             centre: CentreProfile::Hops(vec![(0, scene.shape().rest_m(scene.sheet.point(at)))]),
             strength: StrengthProfile::Scaled(load.force * newtons, load.profile),
             falloff_per_m: load.falloff / spacing_m,
             falloff_offset: 0.0,
         };
-        tissue.push(0, Some(Push::Law(law)));
+        tissue.push(0, Some(Push::Profile(profile)));
         let looked_at = looked_at(scene).map(|point| model.index_of(point));
         let mut course = Vec::with_capacity(steps);
         let mut is_sound = true;

@@ -12,14 +12,14 @@ impl<T: Real> Sheet<T> {
     pub(super) fn wake_what_is_pushed(&mut self) {
         let Sheet { model, applied, tiles, steps, .. } = self;
         let spacing_m = model.scene.sheet.spacing_m;
-        for touch in applied.changes(model, *steps) {
+        for change in applied.changes(model, *steps) {
             // No force moves its centre less than it would if all springs held the centre.
             let stiffness = model.omega_bound_per_s.powi(2) * model.scene.sheet.point_mass_kg;
             if stiffness > 0.0 {
-                tiles.largest = tiles.largest.max(touch.peak_n() / (stiffness * spacing_m));
+                tiles.largest = tiles.largest.max(change.peak_n() / (stiffness * spacing_m));
             }
             let least_n = model.scene.virtual_stiffness_n_per_m * tiles.farthest_unnoticed(&model.scene) * spacing_m;
-            tiles.pushed(&touch, spacing_m, least_n);
+            tiles.pushed(&change, spacing_m, least_n);
         }
     }
 
@@ -46,7 +46,7 @@ impl<T: Real> Sheet<T> {
     }
 
     /// Puts calm tiles to sleep.
-    pub(super) fn rest(&mut self) {
+    pub(super) fn put_to_sleep(&mut self) {
         if !self.tiles.may_sleep() || self.tiles.region.tiles().is_empty() {
             return;
         }
@@ -60,16 +60,16 @@ impl<T: Real> Sheet<T> {
         }
         // In the scheme's units of force and velocity.
         let sheet = Oscillator::of(&model.scene);
-        let (pull, drag) = sheet.scaled(plan.substep_s);
+        let (virtual_stiffness, drag) = sheet.scaled(plan.substep_s);
         // A displacement is known to half its last digit. The spring force that this rounding causes moves nothing: it
         // differs from point to point, and a point between its neighbours gives way by as little. Nor does a substep
         // move anything by less than that digit, unless the scheme keeps the rounding loss. (Without virtual springs
         // all of it may matter.)
-        let half_digit = if pull > 0.0 { 0.5 * T::EPSILON } else { 0.0 };
+        let half_digit = if virtual_stiffness > 0.0 { 0.5 * T::EPSILON } else { 0.0 };
         let creep = if model.precision == Precision::Compensated { 0.0 } else { half_digit };
         let unknown = half_digit * sheet.scaled_spring_stiffness(plan.substep_s) + creep * drag;
         let creep = creep * tiles.largest;
-        let slow = |epsilon: f64| (epsilon * pull.sqrt()).max(creep);
+        let slow = |epsilon: f64| (epsilon * virtual_stiffness.sqrt()).max(creep);
         let calm = tiles.glance(&state.u, &state.d, slow);
         let epsilon = tiles.epsilon();
         let scale = plan.scheme.spring_scale();
@@ -77,9 +77,10 @@ impl<T: Real> Sheet<T> {
             terms: &applied.terms,
             field: plan.scheme.last_field(),
             part: scale / plan.scheme.impulse(),
-            pull: pull * scale,
+            pull: virtual_stiffness * scale,
         };
-        let balanced = |survey: &Survey| survey.imbalance <= scale * (epsilon * pull + unknown * survey.largest);
+        let balanced =
+            |survey: &Survey| survey.imbalance <= scale * (epsilon * virtual_stiffness + unknown * survey.largest);
         let mut region = tiles.no_region();
         let mut sleepers = Vec::new();
         for tile in calm.into_iter().filter(|tile| !held.contains(tile)) {
@@ -106,7 +107,7 @@ mod tests {
     use glam::DVec3;
 
     use super::*;
-    use crate::scene::law::Poke;
+    use crate::scene::profile::Poke;
     use crate::sheet::{Model, Push, Tissue};
 
     fn pushed<T: Real>(sets: &[&str], falloff_per_m: f64) -> Sheet<T> {
@@ -115,7 +116,7 @@ mod tests {
         let mut sheet = Sheet::new(&model);
         let centre_m = model.scene.sheet.spacing_m * DVec3::new(1.0, 1.0, 0.0);
         let force_n = DVec3::new(0.0, 0.0, -1.0);
-        sheet.push(0, Some(Push::Held(Poke { centre_m, force_n, falloff_per_m, falloff_offset: 0.0 })));
+        sheet.push(0, Some(Push::Constant(Poke { centre_m, force_n, falloff_per_m, falloff_offset: 0.0 })));
         sheet
     }
 

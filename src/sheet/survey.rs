@@ -27,7 +27,7 @@ pub(super) struct Survey {
     /// Σ w².
     pub(super) speed_squared: f64,
     /// The same, in the form that the scheme's conserved energy uses.
-    pub(super) vigour: f64,
+    pub(super) conserved_speed_squared: f64,
     /// Σ u².
     pub(super) displacement_squared: f64,
     /// Energy of all springs.
@@ -35,7 +35,7 @@ pub(super) struct Survey {
     /// The largest component of any displacement.
     pub(super) largest: f64,
     /// The largest difference between a corrected displacement and the predicted one.
-    pub(super) surprise: f64,
+    pub(super) prediction_error: f64,
     /// The largest component of any w.
     pub(super) speed: f64,
     /// The largest component of the force imbalance of any free point: N − a·u + F.
@@ -44,7 +44,7 @@ pub(super) struct Survey {
     pub(super) power: f64,
 }
 
-/// The sums w², u², spring energy, vigour, F·d; and the maxima.
+/// The sums w², u², spring energy, conserved w², F·d; and the maxima.
 #[derive(Debug)]
 struct Sums<T> {
     row: [[T; BLOCK]; 5],
@@ -83,7 +83,7 @@ pub(super) enum Write {
 /// u, d, and the largest number of kept fields.
 const FIELDS: usize = 2 + MAX_KEPT;
 
-struct Look<'a, T: Real, C> {
+struct SurveyStage<'a, T: Real, C> {
     layout: Layout,
     scheme: &'a C,
     /// d and the kept fields.
@@ -146,7 +146,7 @@ impl Survey {
         let sums = UnsafeCell::new(Sums { row: [zero; 5], total: [[0.0; BLOCK]; 5], largest: [zero; 4] });
         let pulls = forces.terms.iter().map(|term| term.pull(forces.field, tables.layout.stride));
         let pulls: Vec<Pull<'_, T>> = pulls.collect();
-        let look = Look {
+        let stage = SurveyStage {
             layout: tables.layout,
             scheme,
             d,
@@ -161,7 +161,7 @@ impl Survey {
         };
         // SAFETY: a state has u, d and at least the fields that the scheme keeps, all of the tables's layout; u is
         // written behind what the sweep still reads.
-        unsafe { tables.look(u, over, look) };
+        unsafe { tables.survey(u, over, stage) };
         let Sums { total, largest, .. } = sums.into_inner();
         let sum = |which: usize| total[which].iter().sum();
         let most = |which: usize| largest[which].iter().map(|value| value.wide()).fold(0.0, f64::max);
@@ -169,9 +169,9 @@ impl Survey {
             speed_squared: sum(0),
             displacement_squared: sum(1),
             spring_energy: sum(2),
-            vigour: sum(3),
+            conserved_speed_squared: sum(3),
             largest: most(0),
-            surprise: most(1),
+            prediction_error: most(1),
             speed: most(2),
             imbalance: most(3),
             power: sum(4),
@@ -179,7 +179,7 @@ impl Survey {
     }
 }
 
-impl<T: Real, C: Arithmetic<T>> Look<'_, T, C> {
+impl<T: Real, C: Arithmetic<T>> SurveyStage<'_, T, C> {
     /// Adds to a sum of the row.
     #[inline(always)]
     unsafe fn add<V: Vector<Real = T>>(&self, which: usize, at: usize, value: V) {
@@ -191,7 +191,7 @@ impl<T: Real, C: Arithmetic<T>> Look<'_, T, C> {
     }
 }
 
-impl<T: Real, C: Arithmetic<T>> Stage<T> for Look<'_, T, C> {
+impl<T: Real, C: Arithmetic<T>> Stage<T> for SurveyStage<'_, T, C> {
     const ENERGY: bool = true;
 
     #[inline(always)]
@@ -213,7 +213,7 @@ impl<T: Real, C: Arithmetic<T>> Stage<T> for Look<'_, T, C> {
             let free = if self.free.is_null() { None } else { Some(V::load(self.free.add(at))) };
             let (part, pull) = (V::of(T::of(part)), V::of(T::of(pull)));
             let zero = V::of(T::default());
-            let (mut speed, mut place, mut vigour, mut power) = (zero, zero, zero, zero);
+            let (mut speed, mut displacement, mut conserved, mut power) = (zero, zero, zero, zero);
             let mut most = [zero; 4];
             for c in 0..3 {
                 let at = at + c * self.layout.plane;
@@ -226,8 +226,8 @@ impl<T: Real, C: Arithmetic<T>> Stage<T> for Look<'_, T, C> {
                 let force = if terms.is_empty() { None } else { Some(pushed) };
                 let (u, w) = self.scheme.observe(x[c], d, n[c], &kept, force);
                 speed = w.mul_add(w, speed);
-                vigour = vigour.add(self.scheme.vigour(x[c], d, n[c], &kept, force));
-                place = u.mul_add(u, place);
+                conserved = conserved.add(self.scheme.conserved_speed_squared(x[c], d, n[c], &kept, force));
+                displacement = u.mul_add(u, displacement);
                 power = pushed.mul_add(d, power);
                 let mut short = n[c].minus(pull, u).add(pushed);
                 let (mut seen, mut speed_seen) = (u, w);
@@ -254,8 +254,8 @@ impl<T: Real, C: Arithmetic<T>> Stage<T> for Look<'_, T, C> {
                 most = [most[0].farther(u), most[1].farther(u.sub(x[c])), most[2].farther(w), most[3].farther(short)];
             }
             self.add(0, column, speed);
-            self.add(1, column, place);
-            self.add(3, column, vigour);
+            self.add(1, column, displacement);
+            self.add(3, column, conserved);
             self.add(4, column, power);
             for (which, most) in most.into_iter().enumerate() {
                 let largest = (&raw mut (*self.sums.get()).largest[which]).cast::<T>().add(column % BLOCK);
@@ -321,6 +321,6 @@ impl<T: Real> Sheet<T> {
             spring_j: unit_j / plan.scheme.spring_scale() * survey.spring_energy,
             virtual_j: 0.5 * stiffness * survey.displacement_squared,
         };
-        (energy, 0.5 * unit_j * survey.vigour + energy.spring_j + energy.virtual_j)
+        (energy, 0.5 * unit_j * survey.conserved_speed_squared + energy.spring_j + energy.virtual_j)
     }
 }

@@ -39,7 +39,7 @@ impl<T: Real> SweepTables<T> {
         let free = (!fixed.is_empty()).then(|| {
             let mut free = Field::of_length(layout.plane);
             free.fill(T::of(1.0));
-            fixed.iter().for_each(|index| free[layout.place(*index)] = T::default());
+            fixed.iter().for_each(|index| free[layout.offset(*index)] = T::default());
             free
         });
         let zero = [T::default(); BLOCK];
@@ -107,7 +107,7 @@ impl<T: Real> SweepTables<T> {
     ///
     /// # Safety
     /// `u` and the pointers of the stage belong to fields of this layout.
-    pub(super) unsafe fn look<S: Stage<T>>(&self, u: *const T, over: &Region, stage: S) {
+    pub(super) unsafe fn survey<S: Stage<T>>(&self, u: *const T, over: &Region, stage: S) {
         debug_assert!(over.is_within(&self.layout));
         let mut carry = self.carry.borrow_mut();
         let grid = Grid { layout: self.layout, springs: &self.springs, x: u, carry: carry.as_mut_ptr() };

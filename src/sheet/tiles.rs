@@ -22,7 +22,7 @@
 use std::cell::Cell;
 use std::ops::Range;
 
-use super::applied::Touch;
+use super::applied::ForceChange;
 use super::field::{Field, Layout};
 use super::real::Real;
 use super::region::{Marks, Region, TILE, tiles};
@@ -33,7 +33,7 @@ use crate::scene::Scene;
 pub(super) const CHECK_STEPS: u64 = 16;
 
 /// Consecutive checks at which a tile must be calm.
-const CALM_LOOKS: u8 = 2;
+const CALM_CHECKS: u8 = 2;
 
 /// Part of the tolerance that a tile may be from its rest: errors of neighbours add up. (Measured: up to three and a
 /// half times the ε of a tile, where a whole sheet creeps one way.)
@@ -62,7 +62,7 @@ struct EdgeWatch {
     first: usize,
     next: usize,
     count: usize,
-    /// Their earlier positions: the place in the snapshots.
+    /// Their earlier positions: the offset in the snapshots.
     then: usize,
 }
 
@@ -130,7 +130,7 @@ impl<T: Real> SleepTiles<T> {
     }
 
     /// Of a copy that stays as it is: what is awake and what has moved, without what a step needs.
-    pub(super) fn still(&self) -> Self {
+    pub(super) fn for_copy(&self) -> Self {
         SleepTiles {
             region: self.region.clone(),
             calm: Vec::new(),
@@ -210,7 +210,7 @@ impl<T: Real> SleepTiles<T> {
         (i < self.counts[0] && j < self.counts[1]).then_some(i * self.counts[1] + j)
     }
 
-    /// The points beyond a side or corner: the first place, the distance to the next, and their number.
+    /// The points beyond a side or corner: the first offset, the distance to the next, and their number.
     fn beyond(&self, tile: usize, side: usize) -> (usize, usize, usize) {
         let Layout { stride, .. } = self.layout;
         let (rows, columns) = (self.rows(tile), self.columns(tile));
@@ -266,7 +266,7 @@ impl<T: Real> SleepTiles<T> {
     }
 
     /// Wakes tiles whose neighbours have moved by more than `far`.
-    pub(super) fn watch(&mut self, u: &Field<T>, far: f64) {
+    pub(super) fn wake_beside_moved(&mut self, u: &Field<T>, far: f64) {
         if self.watches.is_empty() {
             return;
         }
@@ -297,13 +297,13 @@ impl<T: Real> SleepTiles<T> {
     }
 
     /// Adds a change of the tools' force, and wakes tiles for which all changes since they fell asleep may exceed
-    /// `least_n`. `touch` gives the bound for a tile by its distance from the centres. Beyond the points it reaches,
+    /// `least_n`. `change` gives the bound for a tile by its distance from the centres. Beyond the points it reaches,
     /// nothing has changed. With `least_n` = 0 it wakes the whole sheet: anything that moves must not meet a sleeping
     /// tile.
-    pub(super) fn pushed(&mut self, touch: &Touch, spacing_m: f64, least_n: f64) {
+    pub(super) fn pushed(&mut self, change: &ForceChange, spacing_m: f64, least_n: f64) {
         let mut waking = Vec::new();
         let within = |sides: [Range<usize>; 2]| sides.map(|points| points.start / TILE..tiles(points.end));
-        let [old, new] = match touch.reached() {
+        let [old, new] = match change.reached() {
             reached if least_n > 0.0 => reached.map(within),
             _ => [self.counts.map(|count| 0..count), [0..0, 0..0]],
         };
@@ -317,7 +317,7 @@ impl<T: Real> SleepTiles<T> {
                 #[allow(clippy::cast_precision_loss)]
                 let sides = [self.rows(tile), self.columns(tile)]
                     .map(|range| [range.start as f64 * spacing_m, (range.end - 1) as f64 * spacing_m]);
-                self.drift_n[tile] += touch.most_n(sides);
+                self.drift_n[tile] += change.most_n(sides);
                 if self.drift_n[tile] > least_n {
                     waking.push(tile);
                 }
@@ -329,7 +329,7 @@ impl<T: Real> SleepTiles<T> {
     /// Counts the consecutive checks at which a tile was calm. Returns whether it may sleep.
     pub(super) fn is_calm(&mut self, tile: usize, calm: bool) -> bool {
         self.calm[tile] = if calm { self.calm[tile].saturating_add(1) } else { 0 };
-        self.calm[tile] >= CALM_LOOKS
+        self.calm[tile] >= CALM_CHECKS
     }
 
     /// Samples a few points of each awake tile: updates the largest displacement, and returns the tiles that may be

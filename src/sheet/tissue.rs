@@ -7,12 +7,12 @@ use glam::DVec3;
 use xxhash_rust::xxh3::Xxh3;
 
 use super::applied::Push;
-use super::checkpoint::Cause;
+use super::audit_window::{Inputs, Mark};
+use super::checkpoint::CheckFailure;
 use super::contact::{Feel, Surroundings};
 use super::field::BLOCK;
 use super::model::{Model, Plan};
 use super::prescribed::Grasp;
-use super::watch::{Inputs, Mark};
 use crate::shape::PointId;
 use palpate_touch::Tip;
 
@@ -60,7 +60,7 @@ pub struct BlowUp {
     /// Steps done when the guard found it.
     pub step: u64,
     /// The cause.
-    pub cause: Cause,
+    pub cause: CheckFailure,
 }
 
 /// How a sheet continues after a blow-up.
@@ -83,7 +83,7 @@ pub trait Tissue: Send {
     /// From the coming step on `tool` moves `point`.
     fn grasp(&mut self, tool: usize, point: PointId, grasp: Grasp);
     /// From the coming step on `tool` meets the sheet with `tip` and is at `place_m` at the step's end.
-    fn lead(&mut self, tool: usize, place_m: DVec3, tip: Tip);
+    fn pose(&mut self, tool: usize, place_m: DVec3, tip: Tip);
     /// The motion of a position-controlled tool and the force on it.
     fn feel(&self, tool: usize) -> Option<Feel>;
     /// A copy of the sheet around such a tool, if it touches or holds, to compute the stiffness there.
@@ -94,7 +94,7 @@ pub trait Tissue: Send {
     /// this sheet's model). Displacements and velocities stay; all tiles wake.
     fn change(&mut self, model: &Arc<Model>);
     /// Requests an audit of a window of steps, which begins at the next checkpoint.
-    fn watch(&mut self, inputs: Inputs);
+    fn request_audit(&mut self, inputs: Inputs);
     /// Takes the report on that window after a step, once.
     fn take_mark(&mut self) -> Option<Mark>;
     /// The result of [`Tissue::change`] if `model` has another number format, as after a correction to f64.
@@ -141,7 +141,7 @@ pub trait Tissue: Send {
         Hashing::default().add(self, usize::MAX).unwrap_or_default()
     }
     /// A copy of the sheet as it is now, to be read by another thread.
-    fn still(&self) -> SheetCopy;
+    fn copy(&self) -> SheetCopy;
 }
 
 /// A sheet that stays as it was.

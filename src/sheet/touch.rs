@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use palpate_touch::Standing;
+use palpate_touch::ContactState;
 
 use super::contact::{Feel, Surroundings, Tool, displacement_m, movement_m, push, within_cone};
 use super::footprint::Reached;
@@ -18,7 +18,7 @@ impl<T: Real> Sheet<T> {
         let Sheet { model, plan, tables, state, contacts, tiles, work, .. } = self;
         let layout = &tables.layout;
         for tool in &mut contacts.tools {
-            let (before_n, met) = (tool.steady_n, tool.standing != Standing::Free);
+            let (before_n, met) = (tool.steady_n, tool.contact_state != ContactState::Free);
             if before_n != DVec3::ZERO {
                 tiles.wake_under(tool.points());
                 push(model, plan, layout, state, &tool.footprint, before_n, plan.scheme.constant());
@@ -46,12 +46,12 @@ impl<T: Real> Sheet<T> {
         let tool = self.contacts.tools.iter().find(|tool| tool.number == number)?;
         let (surface_m, _) =
             tool.footprint.surface(|point| displacement_m(model, &self.tables.layout, &self.state, point));
-        let felt_n = match (tool.standing, tool.tip.coupling) {
-            (Standing::Free, _) => DVec3::ZERO,
+        let felt_n = match (tool.contact_state, tool.tip.coupling) {
+            (ContactState::Free, _) => DVec3::ZERO,
             (_, Coupling::Spring { .. }) => -tool.force_n,
-            (standing, Coupling::Constraint) => {
+            (contact_state, Coupling::Constraint) => {
                 let felt_n = self.without_inertia(tool);
-                if standing == Standing::Holding {
+                if contact_state == ContactState::Holding {
                     felt_n
                 } else if felt_n.dot(tool.normal) <= 0.0 {
                     DVec3::ZERO
@@ -63,7 +63,7 @@ impl<T: Real> Sheet<T> {
         Some(Feel {
             place_m: tool.from_m,
             velocity_m_per_s: tool.velocity_m_per_s,
-            standing: tool.standing,
+            contact_state: tool.contact_state,
             force_on_tool_n: felt_n,
             surface_m,
             anchor_m: tool.footprint.centre_m().extend(0.0),
@@ -75,7 +75,7 @@ impl<T: Real> Sheet<T> {
     /// The disc of such a tool, if it touches or holds, and the displacements of the points around it.
     pub(super) fn surroundings(&self, number: usize) -> Option<Surroundings> {
         let tool = self.contacts.tools.iter().find(|tool| tool.number == number)?;
-        if tool.standing == Standing::Free {
+        if tool.contact_state == ContactState::Free {
             return None;
         }
         let window = Window::around(&self.model, &tool.footprint);
@@ -121,10 +121,10 @@ mod tests {
         let coupling = Coupling::Spring { stiffness_n_per_m: 100.0, damping_n_s_per_m: 3.0 };
         let tip = Tip { radius_m: 0.03, grasps: true, coupling, ..Tip::default() };
         let (held_m, step_m) = (DVec3::new(0.13, 0.12, 0.0), DVec3::new(2e-4, -1e-4, 5e-4));
-        sheet.lead(0, held_m, tip);
+        sheet.pose(0, held_m, tip);
         sheet.step().unwrap();
         for step in 1..=10 {
-            sheet.lead(0, held_m + f64::from(step) * step_m, tip);
+            sheet.pose(0, held_m + f64::from(step) * step_m, tip);
             sheet.step().unwrap();
             let expected_n = -(100.0 * f64::from(step) * step_m + 3.0 * step_m * 1000.0);
             let felt_n = sheet.feel(0).unwrap().force_on_tool_n;
@@ -142,7 +142,7 @@ mod tests {
                 let place_m = DVec3::new(3.5, 3.5, 0.0) * spacing_m;
                 let tip = Tip { radius_m: 0.1 * spacing_m, grasps, coupling, ..Tip::default() };
                 for step in 0..20 {
-                    sheet.lead(0, place_m - 1e-3 * f64::from(step) * DVec3::Z, tip);
+                    sheet.pose(0, place_m - 1e-3 * f64::from(step) * DVec3::Z, tip);
                     sheet.step().unwrap();
                     assert_eq!(sheet.feel(0).unwrap().force_on_tool_n, DVec3::ZERO, "{tip:?}");
                 }

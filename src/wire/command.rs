@@ -7,7 +7,7 @@ use palpate_proto::touch::{from_tip, pose};
 
 use super::{from_point, point, required};
 use crate::refusal::{Result, number};
-use crate::scene::law::Poke;
+use crate::scene::profile::Poke;
 use crate::scene::script::Action;
 use crate::session::command::Command;
 use crate::shape::RestShape;
@@ -37,7 +37,7 @@ pub fn from_command(message: &pb::Command, shape: &dyn RestShape, arrival_ns: u6
             };
             Action::Grasp { point, displacement_m }
         }
-        Message::Pose(pose) => Action::Lead { place_m: from_pose(pose)?, tip: from_tip(pose.tip.as_ref()) },
+        Message::Pose(pose) => Action::Pose { place_m: from_pose(pose)?, tip: from_tip(pose.tip.as_ref()) },
         Message::Release(_) => Action::Release,
     };
     Ok(Command {
@@ -76,7 +76,7 @@ pub fn scripted(shape: &dyn RestShape, tool: usize, at_step: u64, action: &Actio
             point: Some(point(shape.name(*at))),
             target: Some(pb::position::Target::DisplacementM(pb::Vector3 { x: *x, y: *y, z: *z })),
         }),
-        Action::Lead { place_m, tip } => Message::Pose(pose(*place_m, tip)),
+        Action::Pose { place_m, tip } => Message::Pose(pose(*place_m, tip)),
         Action::Release => Message::Release(pb::Release {}),
     };
     let (tool, sequence, action) = (tool as u32, at_step + 1, Some(action));

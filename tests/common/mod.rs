@@ -13,7 +13,7 @@ use std::sync::Arc;
 
 use palpate::limits::Limits;
 use palpate::scene::Scene;
-use palpate::scene::law::Poke;
+use palpate::scene::profile::Poke;
 use palpate::scene::script::Script;
 use palpate::session::Session;
 use palpate::sheet::{Model, Push};
@@ -35,14 +35,14 @@ pub fn script(text: &str, scene: &Scene) -> Script {
     Script::parse("test script", text, Path::new("scripts"), scene, &Limits::default()).unwrap()
 }
 
-/// A session with a script's laws acting.
+/// A session with a script's profiles acting.
 pub fn playing(scene: &Scene, script: &Script) -> Session {
     let mut session = Session::new(&model(scene));
-    for (tool, law) in script.forces.iter().enumerate() {
-        session.play_force(tool, law.clone());
+    for (tool, profile) in script.forces.iter().enumerate() {
+        session.play_force(tool, profile.clone());
     }
-    for (index, law) in script.moves.iter().enumerate() {
-        session.play_move(script.forces.len() + index, law.clone());
+    for (index, profile) in script.moves.iter().enumerate() {
+        session.play_move(script.forces.len() + index, profile.clone());
     }
     session
 }
@@ -57,7 +57,7 @@ pub fn advance(session: &mut Session, steps: u64) {
 
 /// A force on one point alone.
 pub fn push_on(scene: &Scene, [i, j]: [usize; 2], force_n: [f64; 3]) -> Push {
-    Push::Held(Poke {
+    Push::Constant(Poke {
         centre_m: scene.shape().rest_m(scene.sheet.point([i, j])),
         force_n: force_n.into(),
         falloff_per_m: 100.0 / scene.sheet.spacing_m,

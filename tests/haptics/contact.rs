@@ -7,7 +7,7 @@ use glam::{DVec2, DVec3};
 use palpate::force_law;
 use palpate::scene::BUILT_IN;
 use palpate::sheet::{self, Feel, Model, Tissue, tangent};
-use palpate_touch::{Coupling, Standing, Tip};
+use palpate_touch::{ContactState, Coupling, Tip};
 
 /// Flat punches of 5 mm radius, 2aE/(1 − ν²), N/m.
 const FLAT_PUNCH_N_PER_M: [(&str, f64); 3] = [("stomach", 25.3), ("liver", 71.1), ("fibrotic", 354.0)];
@@ -31,7 +31,7 @@ fn smooth(x: f64) -> f64 {
 fn lead(sheet: &mut dyn Tissue, tip: Tip, steps: u32, way: impl Fn(f64) -> DVec3, mut look: impl FnMut(f64, &Feel)) {
     for step in 1..=steps {
         let time_s = f64::from(step) * 1e-3;
-        sheet.lead(0, way(time_s), tip);
+        sheet.pose(0, way(time_s), tip);
         sheet.step().unwrap();
         look(time_s, &sheet.feel(0).unwrap());
     }
@@ -59,7 +59,7 @@ fn a_touch_enters_slides_and_leaves_without_a_jump_and_never_pulls() {
             assert!(pressure >= 0.0, "{name} pulls with {pressure} N at {time_s} s");
             let across = (force - pressure * feel.normal).length();
             assert!(across <= friction * pressure * (1.0 + 1e-9) + 1e-12, "{name}: {across} N across {pressure} N");
-            slid |= feel.standing == Standing::Sliding;
+            slid |= feel.contact_state == ContactState::Sliding;
             if (force - before).length() > jump.0 {
                 jump = ((force - before).length(), time_s);
             }
@@ -69,7 +69,7 @@ fn a_touch_enters_slides_and_leaves_without_a_jump_and_never_pulls() {
         assert!(largest > 0.5 && slid, "{name}: {largest} N, slid: {slid}");
         assert!(jump.0 < 0.03 * largest, "{name}: a jump of {jump:?} (N, s) where {largest} N is the most");
         assert_eq!(before, DVec3::ZERO, "{name} is still felt in the air");
-        assert_eq!(sheet.feel(0).unwrap().standing, Standing::Free);
+        assert_eq!(sheet.feel(0).unwrap().contact_state, ContactState::Free);
     }
 }
 
@@ -142,12 +142,12 @@ fn a_grasp_pulls_as_well_as_it_pushes_and_a_touch_does_not() {
         let tip = Tip { grasps, ..Tip::default() };
         let mut last = DVec3::ZERO;
         lead(&mut *sheet, tip, 700, up, |_, feel| last = feel.force_on_tool_n);
-        (last, sheet.feel(0).unwrap().standing)
+        (last, sheet.feel(0).unwrap().contact_state)
     };
-    let (held, standing) = force(true);
-    assert_eq!(standing, Standing::Holding);
+    let (held, contact_state) = force(true);
+    assert_eq!(contact_state, ContactState::Holding);
     assert!(held.z < -0.3, "a grasp that lifts is pulled down, but feels {held}");
-    assert_eq!(force(false), (DVec3::ZERO, Standing::Free));
+    assert_eq!(force(false), (DVec3::ZERO, ContactState::Free));
 }
 
 #[test]
@@ -187,7 +187,7 @@ fn a_disc_that_slides_lags_by_what_its_coupling_spring_stretches() {
         if time_s < 0.9 {
             return;
         }
-        assert_eq!(feel.standing, Standing::Sliding, "{time_s} s");
+        assert_eq!(feel.contact_state, ContactState::Sliding, "{time_s} s");
         let across = |v: DVec3| v - v.dot(feel.normal) * feel.normal;
         let (apart_m, felt_n) = (across(feel.place_m - feel.surface_m), across(feel.force_on_tool_n));
         let pressure_n = feel.force_on_tool_n.dot(feel.normal);
@@ -209,7 +209,7 @@ fn two_tools_press_one_tissue_each_for_itself() {
     for step in 1..=800 {
         let down = 0.003 * smooth(f64::from(step) * 1e-3 / 0.5);
         for (tool, x) in [(0, -0.018), (1, 0.018)] {
-            sheet.lead(tool, middle(&model) + DVec3::new(x, 0.0, -down), Tip::default());
+            sheet.pose(tool, middle(&model) + DVec3::new(x, 0.0, -down), Tip::default());
         }
         sheet.step().unwrap();
     }
@@ -240,7 +240,7 @@ fn the_lattice_passes_the_patch_test() {
     for point in model.points() {
         let place = model.scene.sheet.place_of(point);
         if rim(place) {
-            sheet.grasp(tool, point, sheet::Grasp::Held(even(place)));
+            sheet.grasp(tool, point, sheet::Grasp::Target(even(place)));
             tool += 1;
         }
     }
@@ -275,7 +275,7 @@ fn a_touch_beside_the_sheet_or_far_above_feels_nothing() {
             50,
             |_| place,
             |_, feel| {
-                assert_eq!((feel.force_on_tool_n, feel.standing), (DVec3::ZERO, Standing::Free));
+                assert_eq!((feel.force_on_tool_n, feel.contact_state), (DVec3::ZERO, ContactState::Free));
             },
         );
         assert!(sheet.largest_displacement_m() < 1e-12);

@@ -12,7 +12,7 @@ use palpate::sheet::Model;
 use palpate::wire;
 use palpate_proto::{pb, touch};
 use palpate_touch::law::{Law, Row};
-use palpate_touch::{Device, Standing, Touching};
+use palpate_touch::{ContactState, Device, Touching};
 use pb::touch_response::Message as Heard;
 
 /// The number of the law that a sample's local model names, if it has a model. Server and client mean the same: under a
@@ -20,7 +20,7 @@ use pb::touch_response::Message as Heard;
 fn law_of(sample: &pb::Sample, laws: &[Law]) -> Option<usize> {
     let model = touch::from_local_model(sample.tools.first()?.local_model.as_ref()?, sample.step);
     let law = laws.get(model.law as usize).expect("the law comes before the model that names it");
-    if model.standing != Standing::Free {
+    if model.contact_state != ContactState::Free {
         let repeated_n = Touching::at_sample(&model, law).force_n(&model, law, model.velocity_m_per_s);
         assert!((repeated_n - model.force_n).length() < 1e-6, "{repeated_n} beside {}", model.force_n);
     }

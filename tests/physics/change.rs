@@ -44,10 +44,10 @@ fn other(k: f64, c: f64, virtual_k: f64) -> Change {
 fn poked(model: &Arc<Model>) -> Box<dyn Tissue> {
     let mut tissue = at_rest(model);
     let scene = &model.scene;
-    let Push::Held(mut poke) = crate::common::push_on(scene, [15, 15], [0.7, 0.0, -2.0]) else { unreachable!() };
+    let Push::Constant(mut poke) = crate::common::push_on(scene, [15, 15], [0.7, 0.0, -2.0]) else { unreachable!() };
     poke.falloff_per_m = 30.0;
-    tissue.push(0, Some(Push::Held(poke)));
-    tissue.grasp(1, model.scene.sheet.point([22, 8]), Grasp::Held(DVec3::new(0.0, 0.0, 0.02)));
+    tissue.push(0, Some(Push::Constant(poke)));
+    tissue.grasp(1, model.scene.sheet.point([22, 8]), Grasp::Target(DVec3::new(0.0, 0.0, 0.02)));
     tissue
 }
 

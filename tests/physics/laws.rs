@@ -3,7 +3,7 @@
 use crate::common::{SMALL, advance, model, playing, push_on, scene, scene_with, script};
 use glam::DVec3;
 use palpate::scene::Scene;
-use palpate::scene::law::{LoadProfile, Moment};
+use palpate::scene::profile::{LoadProfile, Moment};
 use palpate::session::Session;
 use palpate::shape::PointId;
 use palpate::sheet::{self, Energy, Grasp, Tissue};
@@ -419,7 +419,7 @@ fn a_let_go_point_goes_on_with_its_velocity() {
         let steps = (0.1 * rate_hz) as u64;
         for step in 0..steps {
             let target = DVec3::new(0.0, 0.0, -speed * (step + 1) as f64 / rate_hz);
-            tissue.grasp(0, index, Grasp::Held(target));
+            tissue.grasp(0, index, Grasp::Target(target));
             tissue.step().unwrap();
         }
         tissue.release(0);
@@ -443,7 +443,7 @@ fn a_point_let_go_as_a_force_begins_starts_like_any_free_point() {
     let run = |hold: bool| {
         let mut tissue = sheet::at_rest(&model(&scene));
         if hold {
-            tissue.grasp(0, index, Grasp::Held(DVec3::ZERO));
+            tissue.grasp(0, index, Grasp::Target(DVec3::ZERO));
         }
         for _ in 0..50 {
             tissue.step().unwrap();
@@ -466,7 +466,7 @@ fn to_grasp_and_let_go_between_two_steps_changes_nothing() {
         let mut tissue = shaken(&scene, 20);
         if touch {
             let index = tissue.model().scene.sheet.point([3, 2]);
-            tissue.grasp(0, index, Grasp::Held(DVec3::ZERO));
+            tissue.grasp(0, index, Grasp::Target(DVec3::ZERO));
             tissue.release(0);
         }
         for _ in 0..20 {
@@ -482,9 +482,9 @@ fn a_grasped_point_taken_over_by_another_tool_follows_that_one() {
     let scene = scene(SMALL);
     let mut tissue = sheet::at_rest(&model(&scene));
     let index = tissue.model().scene.sheet.point([3, 2]);
-    tissue.grasp(0, index, Grasp::Held(DVec3::new(0.0, 0.0, 0.01)));
+    tissue.grasp(0, index, Grasp::Target(DVec3::new(0.0, 0.0, 0.01)));
     tissue.step().unwrap();
-    tissue.grasp(1, index, Grasp::Held(DVec3::new(0.0, 0.0, 0.012)));
+    tissue.grasp(1, index, Grasp::Target(DVec3::new(0.0, 0.0, 0.012)));
     tissue.step().unwrap();
     let point = tissue.point(index);
     assert!((point.displacement_m.z - 0.012).abs() < 1e-15);
@@ -505,7 +505,7 @@ fn a_grasp_that_goes_on_as_the_point_went_needs_little_force() {
     let index = tissue.model().scene.sheet.point([3, 2]);
     let free = tissue.point(index);
     let target = free.displacement_m + free.velocity_m_per_s * 1e-3;
-    tissue.grasp(0, index, Grasp::Held(target));
+    tissue.grasp(0, index, Grasp::Target(target));
     tissue.step().unwrap();
     let held = tissue.point(index);
     let inertia_n = scene.sheet.point_mass_kg * free.velocity_m_per_s.length() * 1000.0;
@@ -580,9 +580,9 @@ fn a_spring_pressed_to_no_length_stays_finite() {
             }
             assert!(total_j(tissue.energy()).is_finite(), "{sets:?}: after step {step}");
         };
-        tissue.grasp(1, held, Grasp::Held(DVec3::ZERO));
+        tissue.grasp(1, held, Grasp::Target(DVec3::ZERO));
         for step in 1..=400 {
-            tissue.grasp(0, moved, Grasp::Held(DVec3::new(2.0 * h * f64::from(step) / 400.0, 0.0, 0.0)));
+            tissue.grasp(0, moved, Grasp::Target(DVec3::new(2.0 * h * f64::from(step) / 400.0, 0.0, 0.0)));
             tissue.step().unwrap();
             check(&*tissue, step);
             if step == 200 {

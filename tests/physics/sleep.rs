@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 use palpate::limits::Limits;
-use palpate::scene::law::{CentreProfile, LoadProfile, Profile, StrengthProfile};
+use palpate::scene::profile::{CentreProfile, LoadProfile, Profile, StrengthProfile};
 use palpate::scene::{PAPER, Scene};
 use palpate::sheet::{Grasp, Model, Push, Tissue, at_rest};
 
@@ -26,9 +26,9 @@ fn difference(a: &[Vec<f32>; 3], b: &[Vec<f32>; 3]) -> [f64; 2] {
     })
 }
 
-fn law(centre: CentreProfile, force_n: [f64; 3], falloff_per_m: f64, profile: Profile) -> Push {
+fn push(centre: CentreProfile, force_n: [f64; 3], falloff_per_m: f64, profile: Profile) -> Push {
     let strength = StrengthProfile::Scaled(DVec3::from_array(force_n), profile);
-    Push::Law(LoadProfile { centre, strength, falloff_per_m, falloff_offset: 0.0 })
+    Push::Profile(LoadProfile { centre, strength, falloff_per_m, falloff_offset: 0.0 })
 }
 
 fn at(x: f64, y: f64) -> CentreProfile {
@@ -40,25 +40,25 @@ fn cases() -> Vec<(&'static str, Vec<&'static str>, Vec<Push>)> {
     let pulse = Profile::Pulse { on: 0, off: 400 };
     let path = CentreProfile::Path { from_m: DVec3::new(1.0, 0.3, 0.0), velocity_m_per_s: DVec3::new(0.05, 1.2, 0.0) };
     vec![
-        ("local", vec![], vec![law(at(1.0, 1.5), [0.0, 0.0, -3.0], 150.0, pulse)]),
-        ("stiff", vec!["springs.stiffness_n_per_m=200"], vec![law(at(1.0, 1.5), [0.3, 0.0, -1.0], 60.0, pulse)]),
-        ("flexion", vec!["springs.flexion=true"], vec![law(at(0.53, 0.53), [1.0, 0.5, -2.0], 100.0, pulse)]),
-        ("stroke", vec![], vec![law(path, [0.2, 0.3, -1.0], 60.0, Profile::Constant)]),
+        ("local", vec![], vec![push(at(1.0, 1.5), [0.0, 0.0, -3.0], 150.0, pulse)]),
+        ("stiff", vec!["springs.stiffness_n_per_m=200"], vec![push(at(1.0, 1.5), [0.3, 0.0, -1.0], 60.0, pulse)]),
+        ("flexion", vec!["springs.flexion=true"], vec![push(at(0.53, 0.53), [1.0, 0.5, -2.0], 100.0, pulse)]),
+        ("stroke", vec![], vec![push(path, [0.2, 0.3, -1.0], 60.0, Profile::Constant)]),
         (
             "two tools",
             vec!["springs.stiffness_n_per_m=100"],
             vec![
-                law(at(0.5, 0.6), [0.0, 0.0, -3.0], 150.0, pulse),
-                law(at(1.6, 2.4), [1.0, 1.0, -2.6], 150.0, Profile::Pulse { on: 100, off: 600 }),
+                push(at(0.5, 0.6), [0.0, 0.0, -3.0], 150.0, pulse),
+                push(at(1.6, 2.4), [1.0, 1.0, -2.6], 150.0, Profile::Pulse { on: 100, off: 600 }),
             ],
         ),
         (
             "slow creep",
             vec!["damping.coefficient_n_s_per_m=5"],
-            vec![law(at(1.0, 1.5), [0.0, 0.2, -2.0], 80.0, Profile::Ramp { from_s: 0.0, to_s: 1.0 })],
+            vec![push(at(1.0, 1.5), [0.0, 0.2, -2.0], 80.0, Profile::Ramp { from_s: 0.0, to_s: 1.0 })],
         ),
-        ("central", vec!["stepping.integrator=central"], vec![law(at(1.0, 1.5), [0.0, 0.0, -3.0], 150.0, pulse)]),
-        ("f64", vec!["stepping.precision=f64"], vec![law(at(1.0, 1.5), [0.0, 0.0, -3.0], 150.0, pulse)]),
+        ("central", vec!["stepping.integrator=central"], vec![push(at(1.0, 1.5), [0.0, 0.0, -3.0], 150.0, pulse)]),
+        ("f64", vec!["stepping.precision=f64"], vec![push(at(1.0, 1.5), [0.0, 0.0, -3.0], 150.0, pulse)]),
     ]
 }
 
@@ -101,7 +101,7 @@ fn a_sheet_at_rest_computes_nothing_and_wakes_within_the_step_that_touches_it() 
         tissue.step().unwrap();
     }
     assert_eq!((tissue.step_count(), tissue.computed_fraction()), (1_000_000, 0.0));
-    let push = law(at(0.5, 0.5), [0.0, 0.0, -3.0], 150.0, Profile::Constant);
+    let push = push(at(0.5, 0.5), [0.0, 0.0, -3.0], 150.0, Profile::Constant);
     tissue.push(0, Some(push));
     tissue.step().unwrap();
     assert!(tissue.awake_points() > 0);
@@ -129,7 +129,7 @@ fn a_tile_wakes_with_the_history_that_it_would_have_had() {
     let with = |sleep: &str| sheet(&["stepping.integrator=exponential3", "stepping.substeps=1", sleep]);
     let (mut truth, mut skipping) = (with("sleep.tolerance=0"), with("sleep.tolerance=1e-6"));
     for tissue in [&mut truth, &mut skipping] {
-        tissue.push(0, Some(law(at(0.5, 0.5), [0.0, 0.0, -3.0], 150.0, Profile::Constant)));
+        tissue.push(0, Some(push(at(0.5, 0.5), [0.0, 0.0, -3.0], 150.0, Profile::Constant)));
         (0..2000).for_each(|_| tissue.step().unwrap());
     }
     assert_eq!(skipping.awake_points(), 0);
@@ -155,7 +155,7 @@ fn creep(steps: u32, far_m: f64) -> f64 {
     for step in 0..steps {
         for tissue in [&mut truth, &mut skipping] {
             let to_m = far_m * f64::from(step) / f64::from(steps);
-            tissue.grasp(0, index, Grasp::Held(DVec3::new(to_m, to_m, -to_m)));
+            tissue.grasp(0, index, Grasp::Target(DVec3::new(to_m, to_m, -to_m)));
             tissue.step().unwrap();
         }
         // Compare once the error comes from the creep, not from its first steps.
@@ -196,7 +196,7 @@ fn sleeping_is_the_same_at_every_width() {
             let mut tissue = at_rest(&model);
             let path =
                 CentreProfile::Path { from_m: DVec3::new(0.4, 0.4, 0.0), velocity_m_per_s: DVec3::new(1.5, 2.0, 0.0) };
-            tissue.push(0, Some(law(path, [0.2, 0.0, -1.0], 60.0, Profile::Pulse { on: 0, off: 500 })));
+            tissue.push(0, Some(push(path, [0.2, 0.0, -1.0], 60.0, Profile::Pulse { on: 0, off: 500 })));
             (0..900).for_each(|_| tissue.step().unwrap());
             let part = tissue.computed_fraction();
             assert!(part > 0.0 && part < 1.0);
@@ -249,8 +249,8 @@ fn the_energy_of_tiles_that_sleep_is_counted_to_the_last_digits() {
         let path =
             CentreProfile::Path { from_m: DVec3::new(0.5, 0.5, 0.0), velocity_m_per_s: DVec3::new(0.5, 0.9, 0.0) };
         for tissue in [&mut asked, &mut unasked] {
-            tissue.push(0, Some(law(path.clone(), [0.2, 0.3, -1.0], 60.0, Profile::Pulse { on: 0, off: 1500 })));
-            tissue.push(1, Some(law(at(1.5, 0.5), [0.0, 0.0, -2.0], 150.0, Profile::Constant)));
+            tissue.push(0, Some(push(path.clone(), [0.2, 0.3, -1.0], 60.0, Profile::Pulse { on: 0, off: 1500 })));
+            tissue.push(1, Some(push(at(1.5, 0.5), [0.0, 0.0, -2.0], 150.0, Profile::Constant)));
         }
         let mut partly = 0;
         for step in 1..=2000 {
@@ -279,7 +279,7 @@ fn a_moving_tool_asks_only_tiles_within_its_reach() {
     // tile.
     let mut tissue = sheet(&["sheet.points=[16, 64]", "springs.stiffness_n_per_m=1e-6", "sleep.tolerance=1e-6"]);
     let hops = (0..20_000).map(|step| (step, DVec3::new(0.2, if step % 2 == 0 { 0.09 } else { 0.11 }, 0.0))).collect();
-    tissue.push(0, Some(law(CentreProfile::Hops(hops), [0.0, 0.0, -3.0], 60.0, Profile::Constant)));
+    tissue.push(0, Some(push(CentreProfile::Hops(hops), [0.0, 0.0, -3.0], 60.0, Profile::Constant)));
     for step in 0..20_000 {
         tissue.step().unwrap();
         // A bound on the force beyond its reach, summed over all steps, would finally wake the second tile.

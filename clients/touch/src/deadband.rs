@@ -23,14 +23,14 @@ pub struct ForceDeadband {
 }
 
 impl ForceDeadband {
-    /// A deadband that is left when the force differs by more than `fraction` of itself; 0 means at every step.
+    /// A deadband that is exceeded when the force differs by more than `fraction` of itself; 0 means at every step.
     pub fn new(fraction: f64) -> Self {
         ForceDeadband { fraction, sent: None }
     }
 
     /// Whether the client's force is off by too much at the tool's present place, of which `model` is. Call it at each
     /// step: it follows the client along its path.
-    pub fn is_left(&mut self, model: &LocalModel, law: &Law) -> bool {
+    pub fn is_exceeded(&mut self, model: &LocalModel, law: &Law) -> bool {
         let Some((sent, touching)) = &mut self.sent else { return true };
         touching.move_to(sent, law, model.place_m);
         let rendered_n: DVec3 = touching.force_n(sent, law, model.velocity_m_per_s);

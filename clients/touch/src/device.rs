@@ -69,7 +69,7 @@ impl Device {
     /// Describes in what the tissue exceeds the limits of stable rendering, up to the largest force requested. The
     /// tissue is rendered all the same: a softer one would be another tissue. An unstable loop gives energy, and the
     /// envelope removes that.
-    pub fn misgivings(&self, law: &Law) -> Vec<String> {
+    pub fn warnings(&self, law: &Law) -> Vec<String> {
         let reached = law.rows.iter().position(|row| row.force_n >= self.most_n()).unwrap_or(law.rows.len() - 1);
         let most = |of: fn(&Row) -> f64| law.rows[..=reached].iter().map(of).fold(0.0, f64::max);
         let stiffness = ("stiffness", "N/m", most(|row| row.stiffness_n_per_m), self.stiffness_n_per_m);
@@ -100,20 +100,20 @@ mod tests {
     }
 
     #[test]
-    fn misgivings_name_what_a_device_is_asked_for_beyond_its_limits() {
+    fn warnings_name_what_a_device_is_asked_for_beyond_its_limits() {
         // The largest force is met in the row of 400 N/m. The harder rows are never rendered.
         let device = Device { force_n: 2.0, stiffness_n_per_m: 400.0, ..UNDECLARED };
-        assert!(device.misgivings(&hardening(10)).is_empty());
+        assert!(device.warnings(&hardening(10)).is_empty());
         let softer = Device { stiffness_n_per_m: 300.0, ..device };
-        let said = softer.misgivings(&hardening(10));
+        let said = softer.warnings(&hardening(10));
         assert!(
             said.len() == 1 && said[0].contains("stiffness reaches 400 N/m, above the device's 300 N/m"),
             "{said:?}"
         );
         // A law that ends below the largest force counts up to its last row.
-        assert!(softer.misgivings(&hardening(4)).is_empty());
-        assert_eq!(Device { stiffness_n_per_m: 200.0, ..device }.misgivings(&hardening(4)).len(), 1);
-        let said = Device { stiffness_n_per_m: 10.0, damping_n_s_per_m: 0.5, ..device }.misgivings(&hardening(10));
+        assert!(softer.warnings(&hardening(4)).is_empty());
+        assert_eq!(Device { stiffness_n_per_m: 200.0, ..device }.warnings(&hardening(4)).len(), 1);
+        let said = Device { stiffness_n_per_m: 10.0, damping_n_s_per_m: 0.5, ..device }.warnings(&hardening(10));
         assert!(said.len() == 2 && said[1].contains("damping reaches 1 N·s/m"), "{said:?}");
     }
 }

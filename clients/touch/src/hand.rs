@@ -34,7 +34,7 @@ const STRING_N: f64 = 0.5;
 
 /// The state of a hand.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Held {
+pub struct HandState {
     /// Place, m.
     pub place_m: DVec3,
     /// Velocity, m/s.
@@ -57,7 +57,7 @@ impl Hand {
 
     /// The state after `time_s` under a constant force, with a target that moves straight from `from_m` to `to_m`.
     /// Exact except for the target, which is taken at its mean.
-    pub fn advance(&self, held: Held, from_m: DVec3, to_m: DVec3, force_n: DVec3, time_s: f64) -> Held {
+    pub fn advance(&self, held: HandState, from_m: DVec3, to_m: DVec3, force_n: DVec3, time_s: f64) -> HandState {
         const PARTS: u32 = 4;
         let part_s = time_s / f64::from(PARTS);
         (0..PARTS).fold(held, |held, part| {
@@ -67,15 +67,15 @@ impl Hand {
     }
 
     /// The exact solution for a target at rest.
-    fn coast(&self, held: Held, target_m: DVec3, force_n: DVec3, t: f64) -> Held {
+    fn coast(&self, held: HandState, target_m: DVec3, force_n: DVec3, t: f64) -> HandState {
         let (m, b, k) = (self.mass_kg, self.damping_n_s_per_m, self.stiffness_n_per_m);
         let rate = b / (2.0 * m);
-        let Held { place_m: x, velocity_m_per_s: v } = held;
+        let HandState { place_m: x, velocity_m_per_s: v } = held;
         if k == 0.0 {
             // Without a spring, the speed tends to force/b.
             let (last, decay) = (force_n / b, (-b / m * t).exp());
             let place_m = x + last * t + (v - last) * (1.0 - decay) * (m / b);
-            return Held { place_m, velocity_m_per_s: last + (v - last) * decay };
+            return HandState { place_m, velocity_m_per_s: last + (v - last) * decay };
         }
         let rest_m = target_m + force_n / k;
         let square = k / m - rate * rate;
@@ -92,7 +92,7 @@ impl Hand {
         let away = x - rest_m;
         let place_m = rest_m + decay * (away * c + (v + rate * away) * s);
         let velocity_m_per_s = decay * (v * c - (rate * v + (k / m) * away) * s);
-        Held { place_m, velocity_m_per_s }
+        HandState { place_m, velocity_m_per_s }
     }
 
     /// The delay at which the loop with a spring of `stiffness` becomes unstable, s; infinite if it never does: the
@@ -124,7 +124,7 @@ mod tests {
     const CREEPING: Hand = hand("creeping", 0.1, 20.0, 300.0);
 
     /// The equation of motion integrated to fourth order in steps too short to matter.
-    fn integrated(hand: &Hand, held: Held, from_m: DVec3, to_m: DVec3, force_n: DVec3, time_s: f64) -> Held {
+    fn integrated(hand: &Hand, held: HandState, from_m: DVec3, to_m: DVec3, force_n: DVec3, time_s: f64) -> HandState {
         const STEPS: u32 = 2000;
         let dt = time_s / f64::from(STEPS);
         let slope = |[x, v]: [DVec3; 2], part: f64| {
@@ -140,12 +140,12 @@ mod tests {
             let k4 = slope(along(y, k3, dt), part(1.0));
             [0, 1].map(|c: usize| y[c] + dt / 6.0 * (k1[c] + 2.0 * k2[c] + 2.0 * k3[c] + k4[c]))
         });
-        Held { place_m, velocity_m_per_s }
+        HandState { place_m, velocity_m_per_s }
     }
 
     #[test]
     fn a_hand_obeys_its_equation() {
-        let held = Held { place_m: DVec3::new(0.01, -0.02, 0.003), velocity_m_per_s: DVec3::new(-0.1, 0.05, 0.2) };
+        let held = HandState { place_m: DVec3::new(0.01, -0.02, 0.003), velocity_m_per_s: DVec3::new(-0.1, 0.05, 0.2) };
         let (force_n, target_m) = (DVec3::new(0.4, -0.3, 1.1), DVec3::new(0.02, 0.01, -0.015));
         for hand in HANDS.into_iter().chain([CREEPING]) {
             for time_s in [0.001, 0.02, 0.3] {
@@ -170,7 +170,8 @@ mod tests {
     fn a_hand_comes_to_rest_where_its_spring_bears_the_force() {
         for hand in HANDS.into_iter().filter(|hand| hand.stiffness_n_per_m > 0.0) {
             let (target_m, force_n) = (DVec3::new(0.0, 0.01, 0.02), DVec3::new(0.0, 0.0, 1.0));
-            let end = (0..200).fold(Held::default(), |held, _| hand.advance(held, target_m, target_m, force_n, 0.05));
+            let end =
+                (0..200).fold(HandState::default(), |held, _| hand.advance(held, target_m, target_m, force_n, 0.05));
             assert!(end.place_m.distance(target_m + force_n / hand.stiffness_n_per_m) < 1e-12);
             assert_eq!(hand.string_n(target_m, DVec3::ZERO), DVec3::ZERO);
         }

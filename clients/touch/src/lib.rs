@@ -18,7 +18,7 @@
 //!
 //! ```
 //! use glam::{DMat3, DVec3};
-//! use palpate_touch::{Device, Envelope, Law, LocalModel, Renderer, Standing};
+//! use palpate_touch::{Device, Envelope, Law, LocalModel, Renderer, ContactState};
 //!
 //! let device = Device::named("omega3").expect("a device of the table");
 //! let mut renderer = Renderer::new(Law::linear(400.0, 0.5), Envelope::new(device, DVec3::ZERO));
@@ -37,7 +37,7 @@
 //!     normal: DVec3::Z,
 //!     valid_m: 0.01,
 //!     friction: 0.2,
-//!     standing: if place_m.z < 0.0 { Standing::Sticking } else { Standing::Free },
+//!     contact_state: if place_m.z < 0.0 { ContactState::Sticking } else { ContactState::Free },
 //!     law: 0,
 //! };
 //! let mut force_n = DVec3::ZERO;
@@ -65,6 +65,6 @@ pub use deadband::ForceDeadband;
 pub use device::Device;
 pub use envelope::{Envelope, LimitCause, RenderingState};
 pub use law::Law;
-pub use local::{LocalModel, Standing, Touching, Track};
+pub use local::{ContactState, LocalModel, Touching, Track};
 pub use renderer::Renderer;
 pub use tip::{Coupling, Tip};

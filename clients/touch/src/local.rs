@@ -13,7 +13,7 @@ use crate::law::{Law, Row};
 
 /// The state of contact between a tool and the tissue.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Standing {
+pub enum ContactState {
     /// Not touching.
     Free,
     /// Touching, and not sliding.
@@ -52,7 +52,7 @@ pub struct LocalModel {
     /// μ.
     pub friction: f64,
     /// The state of contact between the tool and the tissue.
-    pub standing: Standing,
+    pub contact_state: ContactState,
     /// The number of the force law that goes with this model: p is placed by it.
     pub law: u32,
 }
@@ -128,10 +128,10 @@ impl Touching {
     pub fn at_sample(model: &LocalModel, law: &Law) -> Self {
         let mut touching =
             Touching { stretch_m: DVec3::ZERO, sliding: false, rest_n: DVec3::ZERO, place_m: model.place_m };
-        if matches!(model.standing, Standing::Free | Standing::Holding) {
+        if matches!(model.contact_state, ContactState::Free | ContactState::Holding) {
             return touching;
         }
-        touching.sliding = model.standing == Standing::Sliding;
+        touching.sliding = model.contact_state == ContactState::Sliding;
         let (_, row, _) = touching.pressure(model, law, model.place_m, DVec3::ZERO);
         let across = |v: DVec3| v - v.dot(model.normal) * model.normal;
         let moved = across(model.velocity_m_per_s);
@@ -175,7 +175,7 @@ impl Touching {
 
     /// The force on the tool at its present place, N.
     pub fn force_n(&self, model: &LocalModel, law: &Law, velocity_m_per_s: DVec3) -> DVec3 {
-        if model.standing == Standing::Holding {
+        if model.contact_state == ContactState::Holding {
             let away_m = within(self.place_m - model.place_m, model.valid_m);
             let faster = velocity_m_per_s - model.velocity_m_per_s;
             return model.force_n - model.stiffness_n_per_m * away_m - model.damping_n_s_per_m * faster;
@@ -242,7 +242,7 @@ mod tests {
             normal: NORMAL,
             valid_m: 0.01,
             friction: 0.2,
-            standing: Standing::Sticking,
+            contact_state: ContactState::Sticking,
         }
     }
 

@@ -33,7 +33,7 @@ const MOST: usize = 1024;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Play {
     /// Reach this place by the step's end; the client's time there, s.
-    Lead(DVec3, f64),
+    Pose(DVec3, f64),
     /// Let go.
     Release,
 }
@@ -111,7 +111,7 @@ impl Path {
         }
         let place_m = from_m + way_m.clamp_length_max(most_m);
         self.place_m = Some(place_m);
-        Some(Play::Lead(place_m, time_s))
+        Some(Play::Pose(place_m, time_s))
     }
 
     fn play(&mut self, newest: (f64, DVec3), now_s: f64, step_s: f64) {
@@ -167,7 +167,7 @@ mod tests {
                 path.receive(f64::from(sent) * STEP_S, DVec3::ZERO, now_s);
                 sent += 1;
             }
-            if let Some(Play::Lead(_, time_s)) = path.step(now_s, STEP_S) {
+            if let Some(Play::Pose(_, time_s)) = path.step(now_s, STEP_S) {
                 times.push(time_s);
             }
         }

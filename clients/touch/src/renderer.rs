@@ -22,7 +22,7 @@ use glam::DVec3;
 
 use crate::envelope::{Envelope, RenderingState, Wanted};
 use crate::law::Law;
-use crate::local::{LocalModel, Standing, Touching, Track};
+use crate::local::{ContactState, LocalModel, Touching, Track};
 
 /// Time constant with which the error of the last model decays, s.
 pub const BIAS_S: f64 = 0.02;
@@ -139,7 +139,7 @@ impl Renderer {
         let Some((model, touching)) = &self.newest else { return DVec3::ZERO };
         let force_n = touching.force_n(model, law_of(&self.laws, model), self.velocity_m_per_s)
             + self.bias_n * ((self.biased_s - now_s) / BIAS_S).exp();
-        if model.standing == Standing::Holding {
+        if model.contact_state == ContactState::Holding {
             return force_n;
         }
         force_n - force_n.dot(model.normal).min(0.0) * model.normal
@@ -199,7 +199,7 @@ mod tests {
             normal: DVec3::Z,
             valid_m: 0.01,
             friction: 0.2,
-            standing: Standing::Sticking,
+            contact_state: ContactState::Sticking,
         }
     }
 

@@ -7,7 +7,7 @@ use palpate_touch::envelope::{ENGAGE_S, FRESH_S, PAUSE_S, SLEW_N_PER_S, STALE_S,
 use palpate_touch::law::Row;
 use palpate_touch::path::{Path, Play, RELEASE_S, SPEED_M_PER_S};
 use palpate_touch::renderer::{BIAS_S, MOST_LAWS};
-use palpate_touch::{Envelope, Law, LimitCause, LocalModel, Renderer, RenderingState, Standing, Touching};
+use palpate_touch::{ContactState, Envelope, Law, LimitCause, LocalModel, Renderer, RenderingState, Touching};
 use proptest::prelude::*;
 
 const TICK_S: f64 = 1e-3;
@@ -37,7 +37,7 @@ fn model(sequence: u64, time_s: f64, place_m: DVec3) -> LocalModel {
         normal: DVec3::Z,
         valid_m: 0.01,
         friction: 0.2,
-        standing: if depth_m > 0.0 { Standing::Sticking } else { Standing::Free },
+        contact_state: if depth_m > 0.0 { ContactState::Sticking } else { ContactState::Free },
         law: 0,
     }
 }
@@ -326,7 +326,7 @@ fn a_path_is_played_as_it_was_walked_and_never_faster_than_allowed() {
                 path.receive(time_s, walked(time_s), now_s);
             }
         }
-        let Some(Play::Lead(place_m, time_s)) = path.step(now_s, TICK_S) else { continue };
+        let Some(Play::Pose(place_m, time_s)) = path.step(now_s, TICK_S) else { continue };
         if step > 1000 {
             assert!((place_m - walked(time_s)).length() < 1e-6, "step {step}");
             let before = before.replace(place_m).unwrap_or(place_m);
@@ -342,7 +342,7 @@ fn a_path_is_played_as_it_was_walked_and_never_faster_than_allowed() {
     for step in 4000..4600_u32 {
         let now_s = f64::from(step) * TICK_S;
         match path.step(now_s, TICK_S) {
-            Some(Play::Lead(place_m, _)) => {
+            Some(Play::Pose(place_m, _)) => {
                 assert!(now_s < 4.0 + RELEASE_S);
                 last = place_m;
             }
@@ -356,7 +356,7 @@ fn a_path_is_played_as_it_was_walked_and_never_faster_than_allowed() {
     }
     let mut before: Option<DVec3> = None;
     for step in 4600..5000_u32 {
-        let Some(Play::Lead(place_m, _)) = path.step(f64::from(step) * TICK_S, TICK_S) else { break };
+        let Some(Play::Pose(place_m, _)) = path.step(f64::from(step) * TICK_S, TICK_S) else { break };
         if let Some(before) = before {
             assert!((place_m - before).length() <= SPEED_M_PER_S * TICK_S * 1.001);
         }
@@ -374,7 +374,7 @@ fn broken_and_stale_commands_change_nothing() {
     assert!(!path.receive(2.0, DVec3::NAN, 0.0));
     assert!(!path.receive(f64::INFINITY, DVec3::ZERO, 0.0));
     assert_eq!(path.counts()[1], 4);
-    assert_eq!(path.step(0.001, TICK_S), Some(Play::Lead(DVec3::Z, 1.0)));
+    assert_eq!(path.step(0.001, TICK_S), Some(Play::Pose(DVec3::Z, 1.0)));
 }
 
 proptest! {

@@ -25,7 +25,7 @@ fn release(sequence: u64, at_step: Option<u64>) -> Command {
 }
 
 fn steps(intake: &Intake) -> Vec<u64> {
-    intake.queue.in_order().iter().map(|(place, _)| place.0).collect()
+    intake.queue.in_order().iter().map(|(key, _)| key.0).collect()
 }
 
 #[test]
@@ -88,7 +88,7 @@ fn renewing_wakes_nobody() {
 fn a_tool_keeps_its_tip_until_it_is_released() {
     let (mut intake, _) = intake();
     let lead = |sequence, radius_m| Command {
-        action: Action::Lead { place_m: glam::DVec3::ZERO, tip: Tip { radius_m, ..Tip::default() } },
+        action: Action::Pose { place_m: glam::DVec3::ZERO, tip: Tip { radius_m, ..Tip::default() } },
         ..release(sequence, None)
     };
     intake.submit(LEASE, vec![lead(1, 0.005)], 0).unwrap();

@@ -87,23 +87,23 @@ fn a_change_of_force_on_a_rectangle_is_at_most_its_bound() {
             2 => Poke { centre_m: other.centre_m, ..old },
             _ => Poke { force_n: 1.01 * old.force_n, centre_m: old.centre_m + 0.01 * other.centre_m, ..old },
         };
-        let touch = Touch { old: Some(old), new: Some(new), reached: Default::default() };
+        let change = ForceChange { old: Some(old), new: Some(new), reached: Default::default() };
         let force_n = |poke: &Poke, point| poke.force_n * factor(poke, point, spacing_m, f64::NEG_INFINITY);
         let change_n = |point| force_n(&new, point).distance(force_n(&old, point));
         let most_n = |rows: Range<usize>, columns: Range<usize>| {
             let changes = rows.flat_map(|i| columns.clone().map(move |j| [i, j])).map(change_n);
             changes.fold(0.0, f64::max)
         };
-        let bound_n = touch.most_n([[0.2, 0.45], [0.4, 0.65]]);
+        let bound_n = change.most_n([[0.2, 0.45], [0.4, 0.65]]);
         assert!(most_n(4..10, 8..14) <= bound_n * (1.0 + 1e-12), "{old:?} {new:?}: {bound_n}");
         // Of a rectangle that is one point the bound is the change itself, if only the vector changes.
         if case % 4 == 1 {
-            let bound_n = touch.most_n([[0.2, 0.2], [0.4, 0.4]]);
+            let bound_n = change.most_n([[0.2, 0.2], [0.4, 0.4]]);
             assert!((bound_n - change_n([4, 8])).abs() <= 1e-12, "{old:?} {new:?}: {bound_n}");
         }
         // A force that begins or ends changes by itself.
-        for touch in [Touch { old: None, ..touch }, Touch { new: None, old: Some(new), ..touch }] {
-            let bound_n = touch.most_n([[0.2, 0.2], [0.4, 0.4]]);
+        for change in [ForceChange { old: None, ..change }, ForceChange { new: None, old: Some(new), ..change }] {
+            let bound_n = change.most_n([[0.2, 0.2], [0.4, 0.4]]);
             assert!((bound_n - force_n(&new, [4, 8]).length()).abs() <= 1e-12, "{new:?}: {bound_n}");
         }
     }

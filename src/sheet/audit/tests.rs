@@ -4,7 +4,7 @@
 use glam::DVec3;
 
 use super::*;
-use crate::scene::law::Poke;
+use crate::scene::profile::Poke;
 use crate::sheet::Push;
 
 #[test]
@@ -35,7 +35,7 @@ fn moving(sets: &[&str], steps: u64) -> Sheet<f64> {
     let (scene, mut sheet) = (&model.scene, Sheet::new(&model));
     sheet.push(
         0,
-        Some(Push::Held(Poke {
+        Some(Push::Constant(Poke {
             centre_m: scene.sheet.spacing_m * DVec3::new(2.0, 3.0, 0.0),
             force_n: DVec3::new(0.1, -0.2, -1.0),
             falloff_per_m: 0.7 / scene.sheet.spacing_m,
@@ -62,7 +62,7 @@ fn a_window_begins_at_a_checkpoint_and_ends_at_the_first_one_after_its_length() 
     // Four substeps: a checkpoint every 64 steps. The window of this tissue is 51 steps long.
     let mut sheet = moving(&["sheet.points=[5, 5]", "stepping.substeps=4"], 130);
     assert_eq!(sheet.model.window_steps(), 51);
-    sheet.watch(Inputs::default());
+    sheet.request_audit(Inputs::default());
     assert!(matches!(next_mark(&mut sheet), Mark::Begin(_)));
     assert_eq!(sheet.steps, 192);
     assert!(matches!(next_mark(&mut sheet), Mark::End(..)));
@@ -90,7 +90,7 @@ fn a_sheet_resumed_from_a_checkpoint_goes_on_as_the_first_does_also_with_a_halve
 fn an_audit_asks_between_slices_whether_to_go_on_and_finds_nothing_if_not() {
     let work = |answer: bool| {
         let mut sheet = moving(&["stepping.substeps=24"], 1);
-        sheet.watch(Inputs::default());
+        sheet.request_audit(Inputs::default());
         let Mark::Begin(begin) = next_mark(&mut sheet) else { panic!("no window") };
         let opening = begin.open();
         let Mark::End(end, inputs) = next_mark(&mut sheet) else { panic!("no end") };

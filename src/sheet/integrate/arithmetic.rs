@@ -30,7 +30,14 @@ pub(in crate::sheet) trait Arithmetic<T: Real> {
     fn observe<V: Vector<Real = T>>(&self, x: V, d: V, n: V, kept: &[V; MAX_KEPT], force: Option<V>) -> (V, V);
 
     /// The square of velocity × substep, in the form that the scheme's own conserved energy uses, if it has one.
-    fn vigour<V: Vector<Real = T>>(&self, x: V, d: V, n: V, kept: &[V; MAX_KEPT], force: Option<V>) -> V {
+    fn conserved_speed_squared<V: Vector<Real = T>>(
+        &self,
+        x: V,
+        d: V,
+        n: V,
+        kept: &[V; MAX_KEPT],
+        force: Option<V>,
+    ) -> V {
         let (_, w) = self.observe(x, d, n, kept, force);
         w.mul(w)
     }

@@ -126,7 +126,14 @@ impl<T: Real> Arithmetic<T> for Advance<T> {
     }
 
     #[inline(always)]
-    fn vigour<V: Vector<Real = T>>(&self, x: V, d: V, n: V, kept: &[V; MAX_KEPT], force: Option<V>) -> V {
+    fn conserved_speed_squared<V: Vector<Real = T>>(
+        &self,
+        x: V,
+        d: V,
+        n: V,
+        kept: &[V; MAX_KEPT],
+        force: Option<V>,
+    ) -> V {
         // Without damping and tools, the scheme conserves ½·d·d₊ + the elastic energy to the last bit, however large
         // the substep; with the square of the velocity instead, the sum oscillates by (dt·ω)²/8. Strong damping hides
         // that oscillation, and may let d·d₊ rise.

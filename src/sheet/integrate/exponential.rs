@@ -116,7 +116,7 @@ pub(super) fn fit<const ORDER: usize>(a: f64, g: f64) -> Multistep<ORDER> {
 
 impl<const ORDER: usize> Multistep<ORDER> {
     /// The difference between the springs' force and its prediction: `history` has p + 1 values, at 0, −1, …, −p.
-    pub fn surprise(&self, history: &[f64]) -> f64 {
+    pub fn prediction_error(&self, history: &[f64]) -> f64 {
         history[0] - self.extrapolation.iter().zip(&history[1..]).map(|(weight, past)| weight * past).sum::<f64>()
     }
 
@@ -196,17 +196,17 @@ impl<const ORDER: usize> Family for Multistep<ORDER> {
     /// u and d are predictions that the next substep corrects. The tool's values are already right, so the correction is
     /// subtracted.
     fn release(&self, at: Release<'_>) -> Option<[f64; 2]> {
-        let surprise = self.surprise(at.springs);
-        Some(self.correction.map(|weight| -weight * surprise))
+        let prediction_error = self.prediction_error(at.springs);
+        Some(self.correction.map(|weight| -weight * prediction_error))
     }
 
     fn resample(&self, to: &Self, ratio: f64, [u, d]: [f64; 2], _: f64, springs: &mut [f64]) -> [f64; 2] {
-        let [du, dw] = self.correction.map(|weight| weight * self.surprise(springs));
+        let [du, dw] = self.correction.map(|weight| weight * self.prediction_error(springs));
         #[allow(clippy::cast_precision_loss)]
         let shorter: Vec<f64> =
             (0..springs.len()).map(|i| ratio * ratio * through(springs, -(i as f64) * ratio)).collect();
         springs.copy_from_slice(&shorter);
-        let foretold = to.correction.map(|weight| weight * to.surprise(springs));
+        let foretold = to.correction.map(|weight| weight * to.prediction_error(springs));
         [u + du - foretold[0], (d + dw) * ratio - foretold[1]]
     }
 }
@@ -290,12 +290,12 @@ impl<T: Real, const ORDER: usize, const COMPENSATED: bool> Arithmetic<T> for Adv
 
     #[inline(always)]
     fn observe<V: Vector<Real = T>>(&self, x: V, d: V, n: V, kept: &[V; MAX_KEPT], _: Option<V>) -> (V, V) {
-        let mut surprise = n;
+        let mut prediction_error = n;
         for (weight, past) in self.extrapolation.iter().zip(kept) {
-            surprise = surprise.sub(d.splat(*weight).mul(*past));
+            prediction_error = prediction_error.sub(d.splat(*weight).mul(*past));
         }
         let [of_u, of_w] = self.correction;
-        (d.splat(of_u).mul_add(surprise, x), d.splat(of_w).mul_add(surprise, d))
+        (d.splat(of_u).mul_add(prediction_error, x), d.splat(of_w).mul_add(prediction_error, d))
     }
 }
 

@@ -4,7 +4,7 @@ use super::arithmetic::Arithmetic;
 use super::matrix::Matrix;
 use crate::sheet::real::Real;
 
-/// A moment of a substep at which a tool's law is evaluated.
+/// A moment of a substep at which a tool's force is evaluated.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Node {
     /// From 0, its beginning, to 1, its end.
@@ -74,7 +74,7 @@ pub(in crate::sheet) trait Family {
         None
     }
 
-    /// The moments (0 to 1) at which a tool's law is evaluated, and the weights with which each value adds to the
+    /// The moments (0 to 1) at which a tool's force is evaluated, and the weights with which each value adds to the
     /// scheme's force fields.
     fn nodes(&self) -> Vec<Node>;
 

@@ -136,7 +136,7 @@ impl Scheme {
         each!(self, |family| family.fraction_after(sweep))
     }
 
-    /// How the tools' force enters a substep: the moments (0 to 1) at which a law is evaluated, and the weights with
+    /// How the tools' force enters a substep: the moments (0 to 1) at which it is evaluated, and the weights with
     /// which each value adds to the scheme's force fields.
     pub fn nodes(&self) -> Vec<Node> {
         each!(self, |family| family.nodes())

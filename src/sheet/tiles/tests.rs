@@ -4,7 +4,7 @@
 use glam::DVec3;
 
 use super::*;
-use crate::scene::law::Poke;
+use crate::scene::profile::Poke;
 use crate::sheet::Model;
 use crate::sheet::applied::{Applied, Push};
 
@@ -20,7 +20,7 @@ fn tiles() -> SleepTiles<f64> {
     SleepTiles::new(layout(), 1e-3, 1)
 }
 
-fn place(c: usize, [i, j]: [usize; 2]) -> usize {
+fn offset(c: usize, [i, j]: [usize; 2]) -> usize {
     let Layout { stride, plane, .. } = layout();
     c * plane + i * stride + j
 }
@@ -61,13 +61,13 @@ fn neighbours_are_the_tiles_around_that_are_on_the_sheet() {
 fn a_tile_wakes_when_a_point_beside_it_is_too_far_from_where_it_was_as_it_fell_asleep() {
     let mut u = Field::zero(&layout());
     for (number, point) in points().enumerate() {
-        (0..3).for_each(|c| u[place(c, point)] = (number + 7 * c) as f64);
+        (0..3).for_each(|c| u[offset(c, point)] = (number + 7 * c) as f64);
     }
     let mut tiles = tiles();
     tiles.wake_all();
     tiles.sleep(&[(MIDDLE, 0.0)], &u);
     assert_eq!(tiles.region.tiles(), [0, 1, 2, 3, 5, 6, 7, 8]);
-    tiles.watch(&u, 0.01);
+    tiles.wake_beside_moved(&u, 0.01);
     assert!(!tiles.region.awake.has[MIDDLE], "nothing has moved");
     // The middle tile has rows 16 to 31 and columns 16 to 31.
     let is_beside = |at: usize| at == 15 || at == 32;
@@ -75,10 +75,10 @@ fn a_tile_wakes_when_a_point_beside_it_is_too_far_from_where_it_was_as_it_fell_a
         let is_outside = point.iter().any(|at| !(16..=31).contains(at));
         let wakes = is_outside && point.iter().all(|at| is_beside(*at) || (16..=31).contains(at));
         for c in 0..3 {
-            let at = place(c, point);
+            let at = offset(c, point);
             for (far, expected) in [(0.009, false), (0.011, wakes)] {
                 u[at] += far;
-                tiles.watch(&u, 0.01);
+                tiles.wake_beside_moved(&u, 0.01);
                 assert_eq!(tiles.region.awake.has[MIDDLE], expected, "{point:?} {c} {far}");
                 u[at] -= far;
                 tiles.sleep(&[(MIDDLE, 0.0)], &u);
@@ -95,7 +95,7 @@ fn a_movement_at_an_end_or_in_the_middle_of_a_tile_is_seen() {
         let sides = [tiles().rows(tile), tiles().columns(tile)];
         let [rows, columns] = sides.map(|side| [side.start, side.start + side.len() / 2, side.end - 1]);
         for (n, point) in rows.into_iter().flat_map(|i| columns.map(|j| [i, j])).enumerate() {
-            let (mut tiles, at) = (tiles(), place(n % 3, point));
+            let (mut tiles, at) = (tiles(), offset(n % 3, point));
             tiles.wake_all();
             moved[at] = -3.0;
             let calm = tiles.glance(&zero, &moved, |_| 0.5);
@@ -132,9 +132,9 @@ fn tiles_wake_when_the_changes_of_force_since_they_fell_asleep_exceed_the_bound_
     // The same force on each point: so its change is the bound of its change, to the last digit.
     for (z_n, awake) in [(1.0, 0), (1.25, 0), (1.5, 9)] {
         let (centre_m, force_n) = (DVec3::new(0.4, 0.3, 0.0), DVec3::new(0.0, 0.0, z_n));
-        applied.set(0, Some(Push::Held(Poke { centre_m, force_n, falloff_per_m: 0.0, falloff_offset: 0.0 })));
-        for touch in applied.changes(&model, 0).collect::<Vec<_>>() {
-            tiles.pushed(&touch, model.scene.sheet.spacing_m, 1.25);
+        applied.set(0, Some(Push::Constant(Poke { centre_m, force_n, falloff_per_m: 0.0, falloff_offset: 0.0 })));
+        for change in applied.changes(&model, 0).collect::<Vec<_>>() {
+            tiles.pushed(&change, model.scene.sheet.spacing_m, 1.25);
         }
         assert_eq!(tiles.region.tiles().len(), awake, "{z_n} N");
     }

@@ -29,7 +29,7 @@ pub struct Target {
     pub server: Server,
     /// The session to touch.
     pub session: Session,
-    /// The number of the tool that the device leads.
+    /// The number of the tool that the device moves.
     pub tool: u32,
     /// The tool's tip.
     pub tip: Tip,

@@ -2,7 +2,7 @@
 //! and a spring in place of the tissue, and predicted by theory. This validates the loop.
 
 use glam::DVec3;
-use palpate_touch::hand::{HANDS, Hand, Held};
+use palpate_touch::hand::{HANDS, Hand, HandState};
 use serde_json::{Value, json};
 
 use super::network::{Conditions, Direction};
@@ -36,7 +36,7 @@ fn growth_per_s(hand: &Hand, stiffness_n_per_m: f64, ticks: u32) -> f64 {
         |ticks: u32| Conditions { round_trip_s: 2.0 * f64::from(ticks) * TICK_S, jitter_s: 0.0, loss: 0.0 };
     let mut up: Direction<DVec3> = Direction::new(conditions(ticks), Random::new(0, 0));
     let mut down: Direction<DVec3> = Direction::new(conditions(0), Random::new(0, 1));
-    let mut held = Held { place_m: DVec3::new(0.0, 0.0, 1e-3), velocity_m_per_s: DVec3::ZERO };
+    let mut held = HandState { place_m: DVec3::new(0.0, 0.0, 1e-3), velocity_m_per_s: DVec3::ZERO };
     let (mut place_m, mut force_n) = (DVec3::ZERO, DVec3::ZERO);
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     let whole = (DURATION_S / TICK_S) as u32;

@@ -7,7 +7,7 @@ use palpate::sheet::Model;
 use palpate_proto::touch::sample_bytes;
 use palpate_touch::deadband::{ForceDeadband, HEARTBEAT_S};
 use palpate_touch::envelope::{Envelope, Wanted};
-use palpate_touch::hand::{Hand, Held};
+use palpate_touch::hand::{Hand, HandState};
 use palpate_touch::{Device, Law, LimitCause, LocalModel, Renderer, RenderingState, Tip};
 
 use super::network::{Conditions, Direction};
@@ -148,7 +148,7 @@ pub(super) fn fitting_scale(setup: &Setup, lead_s: f64) -> Result<f64, String> {
     loop {
         let task = Task::new(middle_m, lead_s, *duration_s, scale, &mut Random::new(*seed, 0));
         let mut twin = Twin::new(Tissue::new(model, *tip, law.clone()));
-        let mut held = Held { place_m: task.start_m(), velocity_m_per_s: DVec3::ZERO };
+        let mut held = HandState { place_m: task.start_m(), velocity_m_per_s: DVec3::ZERO };
         let mut largest_n = 0.0_f64;
         for tick in 0..ticks(*duration_s) {
             let now_s = f64::from(tick) * TICK_S;
@@ -221,7 +221,7 @@ pub(super) fn run(setup: &Setup) -> Result<Outcome, String> {
         Rendering::Hold => Client::Hold(None, None, None, Box::new(envelope())),
         Rendering::Model => Client::Model(Box::new(Renderer::new((**law).clone(), envelope()))),
     };
-    let mut held = Held { place_m: task.start_m(), velocity_m_per_s: DVec3::ZERO };
+    let mut held = HandState { place_m: task.start_m(), velocity_m_per_s: DVec3::ZERO };
     let mut totals = Totals::default();
     totals.outcome.scale = scale;
     let mut paused_s: Option<f64> = None;
@@ -244,7 +244,7 @@ pub(super) fn run(setup: &Setup) -> Result<Outcome, String> {
             server.path.receive(time_s, place_m, now_s);
         }
         if let Some(model) = server.step(now_s, TICK_S)?
-            && (deadband.is_left(&model, law) || now_s - sent_s >= HEARTBEAT_S - 1e-9)
+            && (deadband.is_exceeded(&model, law) || now_s - sent_s >= HEARTBEAT_S - 1e-9)
         {
             deadband.send(&model, law);
             sent_s = now_s;

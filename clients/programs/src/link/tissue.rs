@@ -10,7 +10,7 @@ use palpate::session::laws::FIRST;
 use palpate::session::local::Modeller;
 use palpate::sheet::{Feel, Model};
 use palpate_touch::path::{Path, Play};
-use palpate_touch::{Law, LocalModel, Standing, Tip};
+use palpate_touch::{ContactState, Law, LocalModel, Tip};
 
 /// A tissue with one tool.
 pub(super) struct Tissue {
@@ -27,7 +27,7 @@ impl Tissue {
     /// Performs one step, at the end of which the tool is at `place_m`, or released if that is `None`.
     pub(super) fn step(&mut self, place_m: Option<DVec3>) -> Result<Option<Feel>, String> {
         let tip = self.tip;
-        let action = place_m.map_or(Action::Release, |place_m| Action::Lead { place_m, tip });
+        let action = place_m.map_or(Action::Release, |place_m| Action::Pose { place_m, tip });
         let command = Command {
             tool: 0,
             sequence: self.session.step_count() + 1,
@@ -65,7 +65,7 @@ impl Server {
     /// Performs one step; returns its sample while the tool is in use.
     pub(super) fn step(&mut self, now_s: f64, step_s: f64) -> Result<Option<LocalModel>, String> {
         let (place_m, time_s) = match self.path.step(now_s, step_s) {
-            Some(Play::Lead(place_m, time_s)) => (Some(place_m), time_s),
+            Some(Play::Pose(place_m, time_s)) => (Some(place_m), time_s),
             Some(Play::Release) | None => (None, 0.0),
         };
         let feel = self.tissue.step(place_m)?;
@@ -84,6 +84,6 @@ impl Twin {
     /// The force on the tool at `place_m`, N, and whether the tool touches the tissue.
     pub(super) fn truth(&mut self, place_m: DVec3) -> Result<(DVec3, bool), String> {
         let feel = self.0.step(Some(place_m))?;
-        Ok(feel.map_or((DVec3::ZERO, false), |feel| (feel.force_on_tool_n, feel.standing != Standing::Free)))
+        Ok(feel.map_or((DVec3::ZERO, false), |feel| (feel.force_on_tool_n, feel.contact_state != ContactState::Free)))
     }
 }

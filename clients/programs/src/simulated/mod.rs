@@ -10,7 +10,7 @@ use palpate_client::{HapticDevice, Reading};
 use palpate_proto::refusal::{Reason, Refusal};
 use palpate_touch::Device;
 use palpate_touch::device::{DEVICES, UNDECLARED};
-use palpate_touch::hand::{HANDS, Hand, Held};
+use palpate_touch::hand::{HANDS, Hand, HandState};
 
 use task::Task;
 
@@ -57,7 +57,7 @@ pub(crate) struct Part {
 pub(crate) struct Simulated {
     device: Device,
     hand: Hand,
-    held: Held,
+    held: HandState,
     task: Task,
     force_n: DVec3,
     begun: Option<Instant>,
@@ -73,7 +73,7 @@ const PART_S: f64 = 1e-3;
 
 impl Simulated {
     pub(crate) fn new(device: Device, hand: Hand, task: Task, remember: bool) -> Self {
-        let held = Held { place_m: task.start_m(), velocity_m_per_s: DVec3::ZERO };
+        let held = HandState { place_m: task.start_m(), velocity_m_per_s: DVec3::ZERO };
         let (force_n, course) = (DVec3::ZERO, remember.then(Vec::new));
         let (begun, time_s, energy_j, energy_min_j) = (None, 0.0, 0.0, 0.0);
         Simulated { device, hand, held, task, force_n, begun, time_s, energy_j, energy_min_j, course }

@@ -9,6 +9,7 @@ use std::ops::Range;
 use xxhash_rust::xxh3::Xxh3;
 
 use super::applied::Applied;
+use super::audit_window::AuditWindow;
 use super::checkpoint::Work;
 use super::contact::Contacts;
 use super::field::State;
@@ -16,21 +17,20 @@ use super::motion::Sheet;
 use super::real::Real;
 use super::tables::SweepTables;
 use super::tissue::SheetCopy;
-use super::watch::Watch;
 
 impl<T: Real> Sheet<T> {
     /// A copy whose points and hash are those of this sheet. It is not for steps or surveys: it has no tables of fixed
     /// points and forces.
-    pub(super) fn still(&self) -> SheetCopy {
+    pub(super) fn copy(&self) -> SheetCopy {
         let Sheet { model, plan, tables, state, tiles, .. } = self;
-        let mut copy = State::zero(&tables.layout, state.kept.len());
-        copy.fields_mut().zip(state.fields()).for_each(|(to, from)| tiles.copy_moved(to, from));
+        let mut state_copy = State::zero(&tables.layout, state.kept.len());
+        state_copy.fields_mut().zip(state.fields()).for_each(|(to, from)| tiles.copy_moved(to, from));
         SheetCopy::of(Box::new(Sheet {
             model: model.clone(),
             plan: plan.clone(),
             halvings: self.halvings,
             tables: SweepTables::new(model.lanes, tables.layout, tables.springs, &[]),
-            state: copy,
+            state: state_copy,
             applied: Applied::<T>::like(&self.applied),
             prescribed: self.prescribed.clone(),
             contacts: Contacts::default(),
@@ -38,9 +38,9 @@ impl<T: Real> Sheet<T> {
             work: Work::default(),
             checkpoint: None,
             inputs: Vec::new(),
-            watch: Watch::Off,
+            audit_window: AuditWindow::Off,
             is_marked: false,
-            tiles: tiles.still(),
+            tiles: tiles.for_copy(),
             guard_events: self.guard_events,
             substeps_done: self.substeps_done,
             points_done: self.points_done,
@@ -59,7 +59,7 @@ mod tests {
     use crate::shape;
     use glam::DVec3;
 
-    use crate::scene::law::Poke;
+    use crate::scene::profile::Poke;
     use crate::sheet::field::BLOCK;
     use crate::sheet::{Grasp, Hashing, Model, Push, at_rest};
 
@@ -76,19 +76,19 @@ mod tests {
             let centre_m = spacing_m * DVec3::new(1.0, 20.0, 0.0);
             let force_n = DVec3::new(0.2, 0.1, -0.8);
             let falloff_per_m = 1.0 / spacing_m;
-            tissue.push(0, Some(Push::Held(Poke { centre_m, force_n, falloff_per_m, falloff_offset: 0.0 })));
-            tissue.grasp(1, model.scene.sheet.point([1, 30]), Grasp::Held(DVec3::new(0.0, 0.0, 0.3 * spacing_m)));
+            tissue.push(0, Some(Push::Constant(Poke { centre_m, force_n, falloff_per_m, falloff_offset: 0.0 })));
+            tissue.grasp(1, model.scene.sheet.point([1, 30]), Grasp::Target(DVec3::new(0.0, 0.0, 0.3 * spacing_m)));
             (0..25).for_each(|_| tissue.step().unwrap());
-            let still = tissue.still();
+            let copy = tissue.copy();
             let (hash, points) = (tissue.state_hash(), shape::points(model.shape()).map(|point| tissue.point(point)));
             let points: Vec<_> = points.collect();
             (0..5).for_each(|_| tissue.step().unwrap());
             assert_ne!(tissue.state_hash(), hash);
-            assert!(shape::points(model.shape()).zip(&points).all(|(id, point)| still.point(id) == *point), "{sets:?}");
+            assert!(shape::points(model.shape()).zip(&points).all(|(id, point)| copy.point(id) == *point), "{sets:?}");
             for slice in [1, 16, 700, usize::MAX] {
                 let (mut hashing, mut slices) = (Hashing::default(), 1);
                 let found = loop {
-                    if let Some(found) = still.hash(&mut hashing, slice) {
+                    if let Some(found) = copy.hash(&mut hashing, slice) {
                         break found;
                     }
                     slices += 1;

@@ -1,6 +1,6 @@
 //! Forces and tool movements as functions of time: a script's meaning, bound to a sheet and a step rate.
 //!
-//! Time is counted in whole steps and a fraction of the present step, so that a law that jumps has a value on either
+//! Time is counted in whole steps and a fraction of the present step, so that a profile that jumps has a value on either
 //! side: just before the jump at (n − 1, 1), just after it at (n, 0).
 
 use glam::DVec3;

@@ -1,4 +1,4 @@
-//! The places for streams in a session: how many there are, and who has them.
+//! The slots for streams in a session: how many there are, and who has them.
 
 use std::collections::BTreeMap;
 
@@ -9,20 +9,20 @@ use crate::limits::Limits;
 
 /// What a stream is for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Held {
-    /// It holds tools: some places of a session are kept for such.
-    Tools,
+pub enum StreamKind {
+    /// It holds tools: some slots of a session are kept for such.
+    HoldsTools,
     /// It only reads.
-    Nothing,
+    ReadsOnly,
 }
 
-/// The places for streams in one session.
+/// The slots for streams in one session.
 #[derive(Debug)]
-pub(super) struct Places {
+pub(super) struct StreamSlots {
     pub(super) most: usize,
     pub(super) numbers: u64,
     pub(super) open: BTreeMap<u64, Open>,
-    /// Places of those that only read, by who reads.
+    /// Slots of those that only read, by who reads.
     pub(super) readers: Pool,
 }
 
@@ -30,24 +30,24 @@ pub(super) struct Places {
 #[derive(Debug)]
 pub(super) struct Open {
     pub(super) what: &'static str,
-    pub(super) held: Held,
+    pub(super) kind: StreamKind,
     pub(super) account: Account,
     pub(super) since_ns: u64,
     pub(super) cut: CancellationToken,
     pub(super) _taken: [Taken; 2],
 }
 
-impl Places {
+impl StreamSlots {
     pub(super) fn new(limits: &Limits) -> Self {
         let most = limits.streams_per_session;
         let readers = most - limits.streams_for_holders.min(most / 8);
-        Places { most, numbers: 0, open: BTreeMap::new(), readers: Pool::new(readers as u64, 16) }
+        StreamSlots { most, numbers: 0, open: BTreeMap::new(), readers: Pool::new(readers as u64, 16) }
     }
 
-    /// Gives back the place of a stream.
+    /// Gives back the slot of a stream.
     pub(super) fn close(&mut self, number: u64) -> Option<Open> {
         let open = self.open.remove(&number)?;
-        if open.held == Held::Nothing {
+        if open.kind == StreamKind::ReadsOnly {
             self.readers.give_back(open.account.number(), 1);
         }
         Some(open)

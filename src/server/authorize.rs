@@ -13,7 +13,7 @@ use tracing::{Instrument, info, info_span};
 
 use super::charged_caller::ChargedCaller;
 use super::connections::Peer;
-use super::identity::{Access, Caller, Credentials, Shown, access};
+use super::identity::{Access, Caller, Credentials, PresentedCredentials, access};
 use super::price::Price;
 use super::reload::Reloaded;
 use super::request::{RequestBody, TimeLimit};
@@ -22,9 +22,9 @@ use super::traffic::Traffic;
 use crate::budget::Budget;
 use crate::refusal::{Reason, Refusal, Result, excerpt};
 
-/// Puts a [`Guard`] in front of a service.
+/// Puts a [`CallAuthorizer`] in front of a service.
 #[derive(Clone)]
-pub(super) struct GuardLayer {
+pub(super) struct AuthorizeLayer {
     pub(super) credentials: Arc<Reloaded<Credentials>>,
     /// The running calls of authenticated callers.
     pub(super) calls: Arc<Calls>,
@@ -38,18 +38,18 @@ pub(super) struct GuardLayer {
     pub(super) origins: Arc<[HeaderValue]>,
 }
 
-impl<S> Layer<S> for GuardLayer {
-    type Service = Guard<S>;
+impl<S> Layer<S> for AuthorizeLayer {
+    type Service = CallAuthorizer<S>;
 
-    fn layer(&self, inner: S) -> Guard<S> {
-        Guard { layer: self.clone(), inner }
+    fn layer(&self, inner: S) -> CallAuthorizer<S> {
+        CallAuthorizer { layer: self.clone(), inner }
     }
 }
 
 /// Lets a call through if its caller has the required role.
 #[derive(Clone)]
-pub(super) struct Guard<S> {
-    layer: GuardLayer,
+pub(super) struct CallAuthorizer<S> {
+    layer: AuthorizeLayer,
     inner: S,
 }
 
@@ -57,7 +57,7 @@ pub(super) struct Guard<S> {
 type Answer<E> = Pin<Box<dyn Future<Output = std::result::Result<Response<Body>, E>> + Send>>;
 
 /// A caller; if it was authenticated, with its credentials and the version of the token file that accepted them.
-type Identified = (Caller, Option<(Shown, u64)>);
+type Identified = (Caller, Option<(PresentedCredentials, u64)>);
 
 /// Calls of this server's own protocol.
 const OWN: &str = "/palpate.";
@@ -68,7 +68,7 @@ const TOUCH: &str = "/palpate.v1.HapticService/Touch";
 /// Calls without authentication and with many messages.
 const REFLECTION: &str = "/grpc.reflection.";
 
-impl GuardLayer {
+impl AuthorizeLayer {
     /// The caller, if the call is allowed; otherwise the refusal, and for how long to delay it.
     fn admit<B>(&self, request: &Request<B>) -> std::result::Result<Identified, (Refusal, Duration)> {
         let peer = request.extensions().get::<Peer>();
@@ -86,15 +86,15 @@ impl GuardLayer {
                 let authorization = request.headers().get(header::AUTHORIZATION).cloned();
                 let version = self.credentials.version();
                 let certificate = peer.and_then(|peer| peer.certificate.clone());
-                let shown = Shown { authorization, certificate, role };
+                let presented = PresentedCredentials { authorization, certificate, role };
                 let credentials = self.credentials.get();
-                let caller = shown.check(&credentials)?;
+                let caller = presented.check(&credentials)?;
                 self.traffic.called(path);
                 if let Some(peer) = peer {
                     peer.slot.mark_authenticated();
                 }
                 // With authentication disabled there is nothing to check again later.
-                Ok((caller, (!credentials.is_open()).then_some((shown, version))))
+                Ok((caller, (!credentials.is_open()).then_some((presented, version))))
             }
             // With authentication disabled, gRPC answers that the call is unknown.
             None if path.starts_with(OWN) && self.credentials.get().is_open() => anonymous(),
@@ -146,7 +146,7 @@ fn answer_if_not_grpc<B>(request: &Request<B>) -> Option<Response<Body>> {
     Some(answer)
 }
 
-impl<S> Service<Request<Body>> for Guard<S>
+impl<S> Service<Request<Body>> for CallAuthorizer<S>
 where
     S: Service<Request<Body>, Response = Response<Body>>,
     S::Future: Send + 'static,
@@ -162,13 +162,13 @@ where
 
     fn call(&mut self, mut request: Request<Body>) -> Self::Future {
         match self.layer.admit(&request) {
-            Ok((caller, shown)) => {
+            Ok((caller, presented)) => {
                 // After the check of the role: an unauthorized caller gets that refusal first.
                 if let Some(answer) = answer_if_not_grpc(&request) {
                     return Box::pin(async move { Ok(answer) });
                 }
                 let peer = request.extensions().get::<Peer>();
-                let name = ChargedCaller::account_name(shown.is_some().then_some(&*caller.name), peer);
+                let name = ChargedCaller::account_name(presented.is_some().then_some(&*caller.name), peer);
                 let account = self.layer.budget.account(&name);
                 if let Some(peer) = peer {
                     peer.used_by(account.number());
@@ -182,7 +182,7 @@ where
                 let price = Price::of(request.uri().path(), &account);
                 let charged_caller = ChargedCaller::new(account, &request);
                 request.extensions_mut().insert(charged_caller);
-                let call = shown.map(|(shown, version)| self.layer.calls.begin(shown, from, version));
+                let call = presented.map(|(presented, version)| self.layer.calls.begin(presented, from, version));
                 if let Some(call) = &call {
                     request.extensions_mut().insert(call.tenure());
                 }

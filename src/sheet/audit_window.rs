@@ -26,9 +26,9 @@ impl Default for Inputs {
 #[derive(Debug)]
 pub enum Mark {
     /// The window has begun.
-    Begin(Look),
+    Begin(SharedCheckpoint),
     /// The window has ended.
-    End(Look, Inputs),
+    End(SharedCheckpoint, Inputs),
     /// The window can't be audited: the guard went back, the tissue changed, everything came to rest, or there were too
     /// many inputs.
     Dropped,
@@ -36,12 +36,12 @@ pub enum Mark {
 
 /// A sheet's state at a checkpoint, shared with the sheet.
 #[derive(Debug)]
-pub struct Look {
+pub struct SharedCheckpoint {
     pub(super) model: Arc<Model>,
     pub(super) checkpoint: Arc<dyn Resume>,
 }
 
-impl Look {
+impl SharedCheckpoint {
     /// The tissue in the window.
     pub fn model(&self) -> &Arc<Model> {
         &self.model
@@ -73,7 +73,7 @@ pub(super) trait Replay: fmt::Debug + Send {
 
 /// How far a sheet is with a requested window.
 #[derive(Debug, Default)]
-pub(super) enum Watch {
+pub(super) enum AuditWindow {
     /// No window is requested.
     #[default]
     Off,
@@ -87,10 +87,10 @@ pub(super) enum Watch {
     Dropped,
 }
 
-impl Watch {
+impl AuditWindow {
     /// Records an input of a tool.
     pub(super) fn input(&mut self, step: u64, tool: usize, input: &Input) {
-        let Watch::Open(_, inputs) = self else { return };
+        let AuditWindow::Open(_, inputs) = self else { return };
         if inputs.0.len() < MOST_INPUTS {
             inputs.0.push((step, tool, input.clone()));
         } else {
@@ -100,8 +100,8 @@ impl Watch {
 
     /// Drops the window after an event that a twin can't repeat.
     pub(super) fn give_up(&mut self) {
-        if matches!(self, Watch::Open(..) | Watch::Closed(_)) {
-            *self = Watch::Dropped;
+        if matches!(self, AuditWindow::Open(..) | AuditWindow::Closed(_)) {
+            *self = AuditWindow::Dropped;
         }
     }
 }
