@@ -6,7 +6,7 @@ NODE ?= node
 NPM ?= npm
 # Where `make run` listens.
 LISTEN ?= 127.0.0.1:7117
-SCRIPT ?= scripts/vertical-60.toml
+SCRIPT ?= scripts/press.toml
 
 VENV := target/venv
 

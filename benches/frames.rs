@@ -158,7 +158,7 @@ fn poke(force_n: DVec3, refinement: u32, report: &mut Report, rows: &mut Vec<Vec
     let model = subject::model(&[subject::set("sheet.points", format!("[{side}, {side}]"))]).unwrap();
     let mut tissue = at_rest(&model);
     let centre_m = model.shape().extent().middle_m();
-    let push = Poke { centre_m, force_n, falloff_per_m: 150.0, falloff_offset: 0.0 };
+    let push = Poke { point: None, centre_m, force_n, falloff_per_m: 150.0, falloff_offset: 0.0 };
     tissue.push(0, Some(Push::Constant(push)));
     let limits = Limits { frame_vertices: usize::MAX, ..Limits::default() };
     let grid = Refinement::new(&model.scene, refinement, &limits).unwrap();

@@ -59,6 +59,7 @@ fn tissue(settings: &[String], side: usize) -> Box<dyn Tissue> {
     let pushes = [(1.0, 0.5 / spacing_m), (0.01, 4.0 / (spacing_m * side as f64))];
     for (tool, (strength, falloff_per_m)) in pushes.into_iter().enumerate() {
         let push = Poke {
+            point: None,
             centre_m: model.shape().rest_m(model.scene.sheet.point([side / 2; 2])),
             force_n: strength * DVec3::new(0.03, 0.0, -0.1),
             falloff_per_m,

@@ -131,6 +131,7 @@ fn kernel_alone_s(count: usize, rounds: u64) -> f64 {
         for (number, session) in sessions.iter_mut().enumerate() {
             let turn = TAU * (0.0005 * step as f64 + 0.618 * number as f64);
             let action = Action::Push(Poke {
+                point: None,
                 centre_m: scene.shape().extent().middle_m() + 0.25 * DVec3::new(turn.cos(), turn.sin(), 0.0),
                 force_n: DVec3::new(0.0, 0.0, -0.05),
                 falloff_per_m: 4.0 / scene.sheet.spacing_m,

@@ -76,6 +76,7 @@ impl Tissue {
         let sheet = &model.scene.sheet;
         let small_m = 1e-9 * sheet.spacing_m;
         let push = Poke {
+            point: None,
             centre_m: model.shape().rest_m(sheet.point([3, 4])),
             force_n: sheet.point_mass_kg * small_m / (step_s * step_s) * DVec3::new(1.0, 0.6, 0.3),
             falloff_per_m: 0.7 / sheet.spacing_m,

@@ -211,8 +211,8 @@ async fn a_script_of_the_server_is_the_commands_that_a_replay_sends() {
     let server = Server::start(&[]);
     let session_id = server.paper(true).await;
     let mut sessions = server.sessions().await;
-    let listed = sessions.list_scripts(pb::ListScriptsRequest {}).await.unwrap().into_inner().script_names;
-    assert_eq!(listed, ["oblique-100", "oblique-60", "vertical-60"]);
+    let listed = sessions.list_scripts(pb::ListScriptsRequest::default()).await.unwrap().into_inner().script_names;
+    assert_eq!(listed, ["grasp", "oblique-100", "oblique-60", "press", "push", "stroke", "vertical-60"]);
     let limits = Limits::default();
     let scene = Scene::load(Path::new("scenes/paper.toml"), &[], &limits).unwrap();
     for script_name in listed {

@@ -52,6 +52,7 @@ fn vector() -> impl Strategy<Value = DVec3> {
 fn action() -> impl Strategy<Value = Action> {
     let poke = (0.0..0.35_f64, 0.0..0.25_f64, vector(), number(), number()).prop_map(|(x, y, force_n, c, c1)| {
         Action::Push(Poke {
+            point: None,
             centre_m: DVec3::new(x, y, 0.0),
             force_n,
             falloff_per_m: c.abs() * 50.0,

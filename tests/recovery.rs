@@ -71,6 +71,7 @@ fn stiff() -> Arc<Model> {
 fn push(model: &Model, point: [usize; 2], z_n: f64) -> Action {
     let sheet = &model.scene.sheet;
     Action::Push(Poke {
+        point: None,
         centre_m: model.shape().rest_m(sheet.point(point)),
         force_n: DVec3::new(0.0, 0.0, z_n),
         falloff_per_m: 1.0 / sheet.spacing_m,

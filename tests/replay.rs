@@ -39,15 +39,20 @@ fn lines(bytes: &[u8]) -> Vec<Value> {
     String::from_utf8_lossy(bytes).lines().map(|line| serde_json::from_str(line).unwrap()).collect()
 }
 
-fn shipped_scripts() -> Vec<PathBuf> {
+/// Each with the first scene that it is made for.
+fn shipped_scripts() -> Vec<(String, PathBuf)> {
     let mut scripts: Vec<_> = std::fs::read_dir(Path::new(ROOT).join("scripts"))
         .unwrap()
         .map(|entry| entry.unwrap().path())
         .filter(|path| path.extension().is_some_and(|extension| extension == "toml"))
         .collect();
     scripts.sort();
-    assert!(scripts.len() >= 3);
-    scripts
+    assert!(scripts.len() >= 7);
+    let scene = |script: &Path| {
+        let text: toml::Table = std::fs::read_to_string(script).unwrap().parse().unwrap();
+        text["scenes"][0].as_str().unwrap().to_owned()
+    };
+    scripts.into_iter().map(|script| (scene(&script), script)).collect()
 }
 
 /// Replays and compares every record, and the hash, with the run offline.
@@ -74,8 +79,8 @@ fn assert_same(server: &Server, scene: &str, script: &Path) {
 #[test]
 fn every_shipped_script_gives_the_hash_of_the_run_offline() {
     let server = Server::start(&[]);
-    for script in shipped_scripts() {
-        assert_same(&server, "paper", &script);
+    for (scene, script) in shipped_scripts() {
+        assert_same(&server, &scene, &script);
     }
 }
 
@@ -117,8 +122,8 @@ fn a_replay_is_exact_while_another_client_hammers_another_session() {
     server::client_program();
     let server = Server::start(&["--log", "error"]);
     let hammer = hammer(server.url.clone());
-    for script in shipped_scripts() {
-        assert_same(&server, "paper", &script);
+    for (scene, script) in shipped_scripts() {
+        assert_same(&server, &scene, &script);
     }
     hammer.stop.store(true, Ordering::Relaxed);
     hammer.thread.join().unwrap();

@@ -357,7 +357,9 @@ fn the_formats_page_tells_the_truth() {
     // Its scene and its script are read as they stand there.
     let page = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/formats.md")).unwrap();
     let blocks: Vec<&str> = page.split("```toml\n").skip(1).map(|rest| rest.split("```").next().unwrap()).collect();
-    let [scene, script, ..] = blocks.as_slice() else { panic!("{} blocks", blocks.len()) };
+    let [scene, script, people, ..] = blocks.as_slice() else { panic!("{} blocks", blocks.len()) };
+    let liver = palpate::scene::BUILT_IN.iter().find(|scene| scene.0 == "liver").unwrap().1;
+    assert_eq!(lines(&run(liver, people, &[])).len(), 1 + 21 + 1);
     let output = run(scene, script, &[]);
     assert_eq!(lines(&output).len(), 1 + 21 + 1);
     // Every key of a record and of a summary is in its tables.

@@ -152,7 +152,13 @@ fn course(seed: u64) -> Course {
                     } else {
                         let falloff_per_m = 100.0 / scene.sheet.spacing_m;
                         let centre_m = scene.shape().rest_m(point);
-                        Action::Push(Poke { centre_m, force_n: 10.0 * depth_m, falloff_per_m, falloff_offset: 0.0 })
+                        Action::Push(Poke {
+                            point: None,
+                            centre_m,
+                            force_n: 10.0 * depth_m,
+                            falloff_per_m,
+                            falloff_offset: 0.0,
+                        })
                     };
                     let (at_step, time_to_live_s, client_time_ns) = (None, None, 0);
                     let command =

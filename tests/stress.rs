@@ -78,6 +78,7 @@ fn act(tissue: &mut dyn Tissue, Act { tool, place, towards, manner, .. }: Act) {
     tissue.push(
         tool,
         Some(Push::Constant(Poke {
+            point: None,
             centre_m: scene.shape().rest_m(scene.sheet.point(point)),
             force_n: 3.0 * stiffness * spacing_m * towards,
             falloff_per_m: 10_f64.powf(2.0 * place[0] - 1.0) / spacing_m,

@@ -140,7 +140,7 @@ async fn call(
             };
             sessions(door).update_tissue(request).await.map(drop)
         }
-        6 => sessions(door).list_scripts(pb::ListScriptsRequest {}).await.map(drop),
+        6 => sessions(door).list_scripts(pb::ListScriptsRequest::default()).await.map(drop),
         7 => sessions(door).list_scenes(pb::ListScenesRequest {}).await.map(drop),
         8 => {
             let script_name = "vertical-60".to_owned();

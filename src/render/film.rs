@@ -10,7 +10,7 @@ use crate::refusal::Refusal;
 use crate::scene::profile::{Moment, Poke};
 use crate::scene::script::Script;
 use crate::session::Session;
-use crate::session::run;
+use crate::session::run::{self, Player};
 use crate::sheet::Model;
 use crate::surface::Snapshot;
 use crate::texture::Image;
@@ -32,6 +32,7 @@ pub enum Failure {
 /// A script being played.
 pub struct Film<'a> {
     session: Session,
+    player: Player<'a>,
     script: &'a Script,
     changes: VecDeque<(u64, Arc<Model>)>,
 }
@@ -50,15 +51,18 @@ impl<'a> Film<'a> {
     pub fn new(model: &Arc<Model>, script: &'a Script, limits: &Limits) -> Result<Self, Failure> {
         let changes = model.course(&script.changes, limits)?;
         let mut session = Session::new(model);
-        run::play(&mut session, script);
-        Ok(Film { session, script, changes })
+        let player = Player::new(model, script, false, limits)?;
+        player.begin(&mut session);
+        Ok(Film { session, player, script, changes })
     }
 
     /// Advances until `step` steps are done.
     fn advance(&mut self, step: u64) -> Result<(), Failure> {
         while self.session.step_count() < step {
             run::change(&mut self.session, &mut self.changes);
-            self.session.advance(&mut Vec::new(), |_| {});
+            let mut due = Vec::new();
+            self.player.commands(self.session.step_count(), &mut due)?;
+            self.session.advance(&mut due, |_| {});
             if let Some(reason) = self.session.fault() {
                 return Err(Failure::Held(reason));
             }

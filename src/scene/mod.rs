@@ -5,7 +5,7 @@ pub mod action;
 pub mod check;
 pub mod document;
 pub mod profile;
-mod reader;
+pub mod reader;
 pub mod record;
 pub mod script;
 mod sheet;

@@ -5,6 +5,8 @@
 
 use glam::DVec3;
 
+use palpate_touch::Tip;
+
 use crate::shape::PointId;
 
 /// A moment within a step: `fraction` from 0 (its beginning) to 1 (its end).
@@ -33,6 +35,9 @@ impl Moment {
 /// `force_n`·exp(−`falloff_per_m`·r + `falloff_offset`), where r is the straight distance from where p rests to `centre_m`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Poke {
+    /// The mass point at the centre, if it is given by one. Then that point's reaction is told, otherwise the mean of the
+    /// reactions around the centre.
+    pub point: Option<PointId>,
     /// The control point at rest, m. On a sheet z is 0.
     pub centre_m: DVec3,
     /// The exerting force, N.
@@ -61,6 +66,8 @@ pub struct LoadProfile {
 pub enum CentreProfile {
     /// The place from each step on. Before the first there is no force.
     Hops(Vec<(u64, DVec3)>),
+    /// The same for mass points and where they rest.
+    Points(Vec<(u64, (PointId, DVec3))>),
     /// A straight line.
     Path {
         /// Place at time 0, m.
@@ -123,6 +130,17 @@ impl Profile {
     }
 }
 
+impl CentreProfile {
+    /// The first place, m.
+    pub fn begins_at_m(&self) -> DVec3 {
+        match self {
+            CentreProfile::Hops(hops) => hops.first().map_or(DVec3::ZERO, |hop| hop.1),
+            CentreProfile::Points(hops) => hops.first().map_or(DVec3::ZERO, |hop| hop.1.1),
+            CentreProfile::Path { from_m, .. } => *from_m,
+        }
+    }
+}
+
 impl LoadProfile {
     /// The force at a moment.
     pub fn at(&self, moment: Moment, rate_hz: f64) -> Poke {
@@ -130,13 +148,19 @@ impl LoadProfile {
             StrengthProfile::Scaled(force, profile) => *force * profile.at(moment, rate_hz),
             StrengthProfile::Recorded(rows) => begun(rows, moment.step).unwrap_or(DVec3::ZERO),
         };
+        let point = match &self.centre {
+            CentreProfile::Points(hops) => begun(hops, moment.step),
+            CentreProfile::Hops(_) | CentreProfile::Path { .. } => None,
+        };
         let centre = match &self.centre {
             CentreProfile::Hops(hops) => begun(hops, moment.step),
+            CentreProfile::Points(_) => point.map(|point| point.1),
             CentreProfile::Path { from_m, velocity_m_per_s } => {
                 Some(*from_m + *velocity_m_per_s * moment.time_s(rate_hz))
             }
         };
         Poke {
+            point: point.map(|point| point.0),
             centre_m: centre.unwrap_or(DVec3::ZERO),
             force_n: if centre.is_some() { force_n } else { DVec3::ZERO },
             falloff_per_m: self.falloff_per_m,
@@ -163,6 +187,32 @@ pub struct Move {
     pub to_s: f64,
     /// Displacement, m.
     pub by_m: DVec3,
+}
+
+/// The movement of a tool with a tip, from pose to pose.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PoseProfile {
+    /// How it meets the tissue.
+    pub tip: Tip,
+    /// Times, s, and places of the tip, m, by ascending time; at least one. Between two of them the tip moves on a straight
+    /// line as smoothly as in a [`Move`].
+    pub poses: Vec<(f64, DVec3)>,
+    /// When the tool is taken away, s.
+    pub until_s: f64,
+}
+
+impl PoseProfile {
+    /// The place of the tip at a time, m; none before the first pose and from the end on.
+    pub fn at(&self, time_s: f64) -> Option<DVec3> {
+        let after = self.poses.partition_point(|pose| pose.0 <= time_s);
+        let (begun_s, from_m) = *self.poses.get(after.checked_sub(1)?)?;
+        if time_s >= self.until_s {
+            return None;
+        }
+        let Some((end_s, to_m)) = self.poses.get(after) else { return Some(from_m) };
+        let x = (time_s - begun_s) / (end_s - begun_s);
+        Some(from_m + (*to_m - from_m) * (x * x * x * (10.0 + x * (6.0 * x - 15.0))))
+    }
 }
 
 /// The position and motion of a prescribed point.

@@ -1,14 +1,15 @@
 //! Reads a script from TOML and binds it to a scene: converts times to whole steps and points to places.
 
 use std::collections::BTreeSet;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use glam::DVec3;
+use palpate_touch::{Coupling, Tip};
 
-use super::check::{check_force, check_free, check_reach};
+use super::check::{check_force, check_free, check_reach, check_tip};
 use super::document::{self, Document, Fields, Item};
-use super::profile::{CentreProfile, LoadProfile, Moment, MotionProfile, Move, Profile, StrengthProfile};
+use super::profile::{CentreProfile, LoadProfile, Moment, MotionProfile, Move, PoseProfile, Profile, StrengthProfile};
 use super::script::Script;
 use super::{Change, Scene};
 use crate::limits::Limits;
@@ -21,10 +22,7 @@ impl Script {
     /// # Errors
     /// Refuses a script that can't be read, parsed or bound to the scene.
     pub fn load(name: &Path, scene: &Scene, limits: &Limits) -> Result<Self> {
-        let mut named = Path::new("scripts").join(name).into_os_string();
-        named.push(".toml");
-        let named = Path::new(&named);
-        let path = if !name.is_file() && named.is_file() { named } else { name };
+        let path = &found(name);
         let text = document::read_text(path, limits.file_bytes)?;
         let folder = path.parent().unwrap_or(Path::new(""));
         Self::parse(&path.display().to_string(), &text, folder, scene, limits)
@@ -40,8 +38,19 @@ impl Script {
     }
 }
 
+/// The file of a script that is called by its file or by its name in ./scripts.
+pub fn found(name: &Path) -> PathBuf {
+    let mut named = Path::new("scripts").join(name).into_os_string();
+    named.push(".toml");
+    let named = PathBuf::from(named);
+    if !name.is_file() && named.is_file() { named } else { name.to_owned() }
+}
+
 /// A shorter move would need accelerations beyond the number range.
 const SHORTEST_MOVE_S: f64 = 1e-6;
+
+/// The least sum of the weights of a force with a radius.
+const LEAST_WEIGHT: f64 = 1e-3;
 
 /// Beyond this a phase has no digits left.
 const HIGHEST_HZ: f64 = 1e6;
@@ -57,6 +66,11 @@ struct Binding<'s> {
 impl Binding<'_> {
     fn script(mut self, fields: &mut Fields<'_>) -> Result<Script> {
         let name = fields.text("name")?.unwrap_or_else(|| "unnamed".to_owned());
+        let scenes = read_scenes(fields)?;
+        if !is_made_for(&scenes, &self.scene.name) {
+            let (made_for, is) = (scenes.join(", "), &self.scene.name);
+            self.warnings.push(format!("scenes: made for {made_for}; on `{is}` it may be too strong or too weak"));
+        }
         let duration_s = positive("duration_s", fields.required_number("duration_s")?)?;
         let steps = self.steps("duration_s", duration_s)?;
         let sample_every_s = positive("sample_every_s", fields.required_number("sample_every_s")?)?;
@@ -78,8 +92,16 @@ impl Binding<'_> {
                 self.warnings.push(format!("force[{index}].path: {message}"));
             }
         }
-        let moves = items(fields, "tool")?.iter().map(|item| self.tool(item)).collect::<Result<Vec<_>>>()?;
+        let (mut moves, mut poses) = (Vec::new(), Vec::new());
+        for item in items(fields, "tool")? {
+            match self.tool(&item)? {
+                Tool::Moves(profile) => moves.push(profile),
+                Tool::Poses(profile) => poses.push(profile),
+            }
+        }
         control_points.extend(moves.iter().map(|profile| profile.point));
+        let places = poses.iter().flat_map(|profile: &PoseProfile| &profile.poses);
+        control_points.extend(places.map(|(_, place_m)| self.scene.shape().nearest(*place_m)));
         for (index, profile) in moves.iter().enumerate() {
             if moves[..index].iter().any(|other| other.point == profile.point) {
                 let message = "is prescribed by two tools";
@@ -87,7 +109,7 @@ impl Binding<'_> {
             }
         }
         let changes = self.changes(&items(fields, "tissue")?)?;
-        let tools = forces.len() + moves.len();
+        let tools = forces.len() + moves.len() + poses.len();
         if tools > self.limits.tools as usize {
             let message = format!(
                 "a script uses {tools} tools (one for each [[force]] and each [[tool]]), above the limit of {}",
@@ -109,6 +131,7 @@ impl Binding<'_> {
             sample_points: sample_points.into_iter().filter(|point| seen.insert(*point)).collect(),
             forces,
             moves,
+            poses,
             changes,
             warnings: self.warnings,
             rate_hz: self.scene.stepping.rate_hz,
@@ -171,8 +194,7 @@ impl Binding<'_> {
     fn force(&mut self, item: &Item<'_>, control_points: &mut Vec<PointId>) -> Result<LoadProfile> {
         item.table(|fields| {
             let centre = self.centre(item, fields, control_points)?;
-            let falloff_per_m = not_negative(&fields.path("falloff_per_m"), fields.required_number("falloff_per_m")?)?;
-            let falloff_offset = fields.required_number("falloff_offset")?;
+            let Field { unit, key, falloff_per_m, falloff_offset } = self.field(fields, &centre)?;
             let factor = libm::exp(falloff_offset);
             let limit_n = self.limits.point_force_n;
             let within_limit = |field: &str, force_n: DVec3| check_force(field, force_n, factor, limit_n);
@@ -180,13 +202,14 @@ impl Binding<'_> {
             let trace = profile.table(|fields| self.profile(fields))?;
             let strength = match trace {
                 Ok(profile) => {
-                    let force_n = fields.required("force_n")?.vector()?;
-                    within_limit(&fields.path("force_n"), force_n)?;
+                    let force_n = unit * fields.required(key)?.vector()?;
+                    within_limit(&fields.path(key), force_n)?;
                     StrengthProfile::Scaled(force_n, profile)
                 }
                 Err(rows) => {
-                    // A trace replaces force_n, which may be present all the same.
-                    fields.item("force_n").map(|item| item.vector()).transpose()?;
+                    // A trace replaces the force, which may be present all the same.
+                    fields.item(key).map(|item| item.vector()).transpose()?;
+                    let rows: Vec<_> = rows.into_iter().map(|(step, force_n)| (step, unit * force_n)).collect();
                     for (_, force_n) in &rows {
                         within_limit(&fields.path("profile.file"), *force_n)?;
                     }
@@ -197,6 +220,32 @@ impl Binding<'_> {
         })
     }
 
+    /// How a force spreads: as in the paper by `falloff_per_m` and `falloff_offset`, or by `radius_m`, where the weight is
+    /// 1/e; then what is given is the force on all points together, at the first place.
+    fn field(&self, fields: &mut Fields<'_>, centre: &CentreProfile) -> Result<Field> {
+        let Some(radius_m) = fields.number("radius_m")? else {
+            let falloff_per_m = not_negative(&fields.path("falloff_per_m"), fields.required_number("falloff_per_m")?)?;
+            let falloff_offset = fields.required_number("falloff_offset")?;
+            return Ok(Field { unit: 1.0, key: "force_n", falloff_per_m, falloff_offset });
+        };
+        positive(&fields.path("radius_m"), radius_m)?;
+        for key in ["force_n", "falloff_per_m", "falloff_offset"] {
+            if fields.item(key).is_some() {
+                let message = "does not go with radius_m: a force in all (total_n) with a radius, or the paper's force_n with \
+                               falloff_per_m and falloff_offset";
+                return Err(fields.refuse(Reason::WrongKind, key, message));
+            }
+        }
+        let (shape, at_m) = (self.scene.shape(), centre.begins_at_m());
+        let weights = shape::points(shape).map(|point| libm::exp(-shape.rest_m(point).distance(at_m) / radius_m));
+        let sum: f64 = weights.sum();
+        if sum < LEAST_WEIGHT {
+            let message = format!("is so small that no point is reached: points are {} m apart", shape.edge_m());
+            return Err(fields.refuse(Reason::OutOfRange, "radius_m", message));
+        }
+        Ok(Field { unit: sum.recip(), key: "total_n", falloff_per_m: radius_m.recip(), falloff_offset: 0.0 })
+    }
+
     fn centre(
         &mut self,
         item: &Item<'_>,
@@ -204,12 +253,21 @@ impl Binding<'_> {
         control_points: &mut Vec<PointId>,
     ) -> Result<CentreProfile> {
         let (point, hops, path) = (fields.item("point"), fields.item("hops"), fields.item("path"));
-        let one = "must have just one of `point`, `hops` and `path`";
+        let one = "must have just one of `point`, `at_m`, `hops` and `path`";
+        if let Some(at) = fields.item("at_m") {
+            if point.is_some() || hops.is_some() || path.is_some() {
+                return Err(item.refuse(Reason::OutOfRange, one));
+            }
+            let at_m = at.place()?.extend(0.0);
+            self.scene.shape().check_place(&fields.path("at_m"), at_m)?;
+            control_points.push(self.scene.shape().nearest(at_m));
+            return Ok(CentreProfile::Hops(vec![(0, at_m)]));
+        }
         match (point, hops, path) {
             (Some(point), None, None) => {
                 let point = self.point(&point)?;
                 control_points.push(point);
-                Ok(CentreProfile::Hops(vec![(0, self.scene.shape().rest_m(point))]))
+                Ok(CentreProfile::Points(vec![(0, (point, self.scene.shape().rest_m(point)))]))
             }
             (None, Some(hops), None) => {
                 let mut entries = Vec::new();
@@ -218,11 +276,11 @@ impl Binding<'_> {
                         let at = self.steps(&fields.path("at_s"), fields.required_number("at_s")?)?;
                         let point = self.point(&fields.required("point")?)?;
                         control_points.push(point);
-                        Ok((at, self.scene.shape().rest_m(point)))
+                        Ok((at, (point, self.scene.shape().rest_m(point))))
                     })?);
                 }
                 rising(&hops, "at_s", &mut entries)?;
-                Ok(CentreProfile::Hops(entries))
+                Ok(CentreProfile::Points(entries))
             }
             (None, None, Some(path)) => path.table(|fields| {
                 let from_m = fields.required("from_m")?.place()?.extend(0.0);
@@ -336,8 +394,11 @@ impl Binding<'_> {
         Ok(rows)
     }
 
-    fn tool(&mut self, item: &Item<'_>) -> Result<MotionProfile> {
+    fn tool(&mut self, item: &Item<'_>) -> Result<Tool> {
         item.table(|fields| {
+            if let Some(list) = fields.item("poses") {
+                return self.poses(fields, &list).map(Tool::Poses);
+            }
             let point = self.point(&fields.required("point")?)?;
             check_free(&fields.path("point"), self.scene.shape(), point)?;
             let mut moves = Vec::new();
@@ -357,9 +418,98 @@ impl Binding<'_> {
             // The displacement is largest at the end of a move. Where moves overlap, their sum is an upper bound.
             let farthest: f64 = profile.moves.iter().map(|m| m.by_m.length()).sum();
             check_reach(&fields.path("moves"), self.scene.shape(), farthest, self.limits)?;
-            Ok(profile)
+            Ok(Tool::Moves(profile))
         })
     }
+
+    /// A tool with a tip.
+    fn poses(&self, fields: &mut Fields<'_>, list: &Item<'_>) -> Result<PoseProfile> {
+        let shape = self.scene.shape();
+        let tip = fields.item("tip").map_or(Ok(Tip::default()), |item| item.table(read_tip))?;
+        check_tip(&fields.path("tip"), shape, &tip)?;
+        let mut poses: Vec<(f64, DVec3)> = Vec::new();
+        for entry in list.list()? {
+            poses.push(entry.table(|fields| {
+                let at_s = not_negative(&fields.path("at_s"), fields.required_number("at_s")?)?;
+                if poses.last().is_some_and(|last| at_s < last.0 + SHORTEST_MOVE_S) {
+                    return Err(fields.refuse(
+                        Reason::OutOfRange,
+                        "at_s",
+                        "must be later than that of the pose before",
+                    ));
+                }
+                let place_m = fields.required("place_m")?.vector()?;
+                let far_m = place_m.distance(shape.extent().middle_m());
+                check_reach(&fields.path("place_m"), shape, far_m, self.limits)?;
+                Ok((at_s, place_m))
+            })?);
+        }
+        let Some((begin_s, _)) = poses.first().copied() else {
+            return Err(list.refuse(Reason::Missing, "must have at least one pose"));
+        };
+        let until_s = fields.number("until_s")?.unwrap_or(f64::INFINITY);
+        if until_s <= begin_s {
+            return Err(fields.refuse(Reason::OutOfRange, "until_s", "must be later than the first pose"));
+        }
+        Ok(PoseProfile { tip, poses, until_s })
+    }
+}
+
+/// A `[[tool]]`.
+enum Tool {
+    Moves(MotionProfile),
+    Poses(PoseProfile),
+}
+
+/// How a force spreads over the points.
+struct Field {
+    /// What the given vector is multiplied by.
+    unit: f64,
+    /// The name of that vector.
+    key: &'static str,
+    falloff_per_m: f64,
+    falloff_offset: f64,
+}
+
+fn read_tip(fields: &mut Fields<'_>) -> Result<Tip> {
+    let standard = Tip::default();
+    let coupling = match fields.item("spring") {
+        None => standard.coupling,
+        Some(item) => item.table(|fields| {
+            let stiffness_n_per_m = fields.required_number("stiffness_n_per_m")?;
+            let damping_n_s_per_m = fields.required_number("damping_n_s_per_m")?;
+            Ok(Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m })
+        })?,
+    };
+    Ok(Tip {
+        radius_m: fields.number("radius_m")?.unwrap_or(standard.radius_m),
+        friction: fields.number("friction")?.unwrap_or(standard.friction),
+        grasps: fields.item("grasps").map_or(Ok(standard.grasps), |item| item.flag())?,
+        coupling,
+    })
+}
+
+/// The scenes that a script is made for: all, if it names none.
+fn read_scenes(fields: &mut Fields<'_>) -> Result<Vec<String>> {
+    let Some(item) = fields.item("scenes") else { return Ok(Vec::new()) };
+    item.list()?.iter().map(Item::text).collect()
+}
+
+fn is_made_for(scenes: &[String], name: &str) -> bool {
+    scenes.is_empty() || scenes.iter().any(|scene| scene == name)
+}
+
+/// The scenes that the script of a text is made for. None is named by a script for all of them, and by a text that can't be
+/// read: whoever plays it learns why.
+pub fn made_for(text: &str) -> Vec<String> {
+    let Ok(table) = text.parse::<toml::Table>() else { return Vec::new() };
+    let scenes = table.get("scenes").and_then(|scenes| scenes.as_array());
+    scenes.into_iter().flatten().filter_map(|name| name.as_str().map(str::to_owned)).collect()
+}
+
+/// Whether the script of a text is made for the scene of that name.
+pub fn fits(text: &str, scene: &str) -> bool {
+    is_made_for(&made_for(text), scene)
 }
 
 /// The entries of `[[key]]`; empty if the key is absent.

@@ -6,13 +6,17 @@ use glam::DVec3;
 
 use super::Change;
 pub use super::action::Action;
-use super::profile::{LoadProfile, Moment, MotionProfile};
+use super::profile::{LoadProfile, Moment, MotionProfile, PoseProfile};
 use crate::shape::{PointId, RestShape};
 
 /// The built-in scripts: name and text.
-pub const BUILT_IN: [(&str, &str); 3] = [
+pub const BUILT_IN: [(&str, &str); 7] = [
+    ("grasp", include_str!("../../scripts/grasp.toml")),
     ("oblique-100", include_str!("../../scripts/oblique-100.toml")),
     ("oblique-60", include_str!("../../scripts/oblique-60.toml")),
+    ("press", include_str!("../../scripts/press.toml")),
+    ("push", include_str!("../../scripts/push.toml")),
+    ("stroke", include_str!("../../scripts/stroke.toml")),
     ("vertical-60", include_str!("../../scripts/vertical-60.toml")),
 ];
 
@@ -31,6 +35,8 @@ pub struct Script {
     pub forces: Vec<LoadProfile>,
     /// Grasped points.
     pub moves: Vec<MotionProfile>,
+    /// Tools with a tip.
+    pub poses: Vec<PoseProfile>,
     /// Changes of the tissue and the step at whose beginning each takes effect, by ascending step.
     pub changes: Vec<(u64, Change)>,
     /// Warnings for the user: rounded values, forces that leave the sheet.
@@ -43,8 +49,8 @@ pub struct Script {
 
 impl Script {
     /// The actions that a client streaming this script commands at step `step`: only differences from the step before.
-    /// Force k is tool k, and the grasped points follow. A force is held for the step, from its beginning; a grasped
-    /// point reaches its target at the step's end.
+    /// Force k is tool k; the grasped points and then the tools with a tip follow. A force is held for the step, from its
+    /// beginning; a grasped point reaches its target at the step's end.
     pub fn actions_at(&self, step: u64) -> impl Iterator<Item = (usize, Action)> {
         let poke = move |profile: &LoadProfile, step: u64| {
             let poke = profile.at(Moment::start_of(step), self.rate_hz);
@@ -62,11 +68,26 @@ impl Script {
             let action = Action::Grasp { point: profile.point, displacement_m: now };
             (step == 0 || before != now).then_some((self.forces.len() + index, action))
         });
-        pushes.chain(grasps)
+        pushes.chain(grasps).chain(self.poses_at(step))
+    }
+
+    /// Of these, the poses: at every step, because a tool of which nothing is heard is taken away. A tip reaches its place
+    /// at the step's end.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn poses_at(&self, step: u64) -> impl Iterator<Item = (usize, Action)> {
+        let first = self.forces.len() + self.moves.len();
+        let place_m = move |profile: &PoseProfile, end: u64| profile.at(end as f64 / self.rate_hz);
+        self.poses.iter().enumerate().filter_map(move |(index, profile)| {
+            let action = match place_m(profile, step + 1) {
+                Some(place_m) => Action::Pose { place_m, tip: profile.tip },
+                None => place_m(profile, step).map(|_| Action::Release)?,
+            };
+            Some((first + index, action))
+        })
     }
 
     /// The number of tools that the script uses.
     pub fn tools(&self) -> usize {
-        self.forces.len() + self.moves.len()
+        self.forces.len() + self.moves.len() + self.poses.len()
     }
 }

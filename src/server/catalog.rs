@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, excerpt};
 use crate::scene::document::read_text;
+use crate::scene::reader::fits;
 use crate::scene::script::{self, Script};
 use crate::scene::{self, Scene};
 
@@ -72,6 +73,15 @@ impl Catalog {
     /// The names of all scripts, sorted.
     pub fn script_names(&self) -> Vec<String> {
         self.scripts.names()
+    }
+
+    /// The names of the scripts that are made for the scene of that name, sorted.
+    pub fn script_names_for(&self, scene: &str, limits: &Limits) -> Vec<String> {
+        let fits = |name: &String| match self.scripts.text(name, limits) {
+            Ok(Some((_, text))) => fits(&text, scene),
+            _ => true,
+        };
+        self.script_names().into_iter().filter(fits).collect()
     }
 
     /// Loads the scene of that name; `--set` assignments override its keys.

@@ -159,9 +159,16 @@ impl SessionService for Sessions {
 
     async fn list_scripts(
         &self,
-        _: Request<pb::ListScriptsRequest>,
+        request: Request<pb::ListScriptsRequest>,
     ) -> Result<Response<pb::ListScriptsResponse>, Status> {
-        Ok(Response::new(pb::ListScriptsResponse { script_names: self.0.catalog.script_names() }))
+        let pb::ListScriptsRequest { session_id } = request.into_inner();
+        let script_names = if session_id.is_empty() {
+            self.0.catalog.script_names()
+        } else {
+            let live = self.0.pacer.get(&session_id)?;
+            self.0.catalog.script_names_for(&live.model.scene.name, &self.0.config.limits)
+        };
+        Ok(Response::new(pb::ListScriptsResponse { script_names }))
     }
 
     async fn get_script(

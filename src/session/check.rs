@@ -52,6 +52,7 @@ fn time(model: &Arc<Model>, clock_s: &dyn Fn() -> f64) -> Option<[f64; 2]> {
     session.tissue.push(
         0,
         Some(Push::Constant(Poke {
+            point: None,
             centre_m: model.shape().extent().middle_m(),
             force_n: DVec3::new(0.03, 0.0, -0.1) * stiffness * model.shape().edge_m(),
             falloff_per_m: 4.0 / model.shape().edge_m(),

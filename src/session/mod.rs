@@ -31,7 +31,7 @@ use std::sync::Arc;
 use glam::DVec3;
 
 use crate::memory;
-use crate::scene::profile::{LoadProfile, MotionProfile};
+use crate::scene::profile::{LoadProfile, MotionProfile, Poke};
 use crate::scene::record::{EnergyJ, Point, Record, Recovery};
 use crate::scene::script::Action;
 use crate::shape::{self, PointId, PointName};
@@ -81,8 +81,10 @@ pub struct ToolSample {
 pub struct Contact {
     /// The mass point.
     pub point: PointId,
-    /// From rest, m.
+    /// From rest, m. Under the tip of a tool led by poses the mean over its disc.
     pub displacement_m: DVec3,
+    /// How far the surface is moved just under the control point, m.
+    pub surface_displacement_m: DVec3,
     /// m/s.
     pub velocity_m_per_s: DVec3,
     /// Force of the tissue on the tool: springs + virtual spring + damping, N.
@@ -118,6 +120,8 @@ struct Tool {
     client_time_ns: u64,
     arrival_ns: u64,
     control_point: Option<PointId>,
+    /// The force whose reaction is told, if it was given by a place.
+    around: Option<Poke>,
     expires_at: Option<u64>,
     late: bool,
     expired: bool,
@@ -350,8 +354,8 @@ impl Session {
         let index = command.tool as usize;
         let tool = self.tool(index);
         if ends_lease {
-            let (control_point, paused_until) = (tool.control_point, tool.paused_until);
-            *tool = Tool { control_point, paused_until, expired: true, ..Tool::default() };
+            let Tool { control_point, around, paused_until, .. } = *tool;
+            *tool = Tool { control_point, around, paused_until, expired: true, ..Tool::default() };
             return self.tissue.release(index);
         }
         // Commands with a step may take effect in another order than they were sent in.
@@ -377,13 +381,16 @@ impl Session {
         match command.action {
             Action::Push(poke) => {
                 self.tool(index).posed = None;
-                let point = self.model().shape().nearest(poke.centre_m);
-                self.tool(index).control_point = Some(point);
-                self.tissue.push(index, Some(Push::Constant(poke)));
+                let nearest = self.model().shape().nearest(poke.centre_m);
+                self.tool(index).control_point = Some(poke.point.unwrap_or(nearest));
+                self.tool(index).around = poke.point.is_none().then_some(poke);
+                // To the tissue it is all the same.
+                self.tissue.push(index, Some(Push::Constant(Poke { point: None, ..poke })));
             }
             Action::Grasp { point, displacement_m } => {
                 self.tool(index).posed = None;
                 self.tool(index).control_point = Some(point);
+                self.tool(index).around = None;
                 self.tissue.grasp(index, point, Grasp::Target(displacement_m));
             }
             Action::Pose { place_m, tip } => {
@@ -391,7 +398,7 @@ impl Session {
                 let client_time_s = command.client_time_ns as f64 * 1e-9;
                 let now_s = self.time_s();
                 let tool = self.tool(index);
-                tool.control_point = Some(point);
+                (tool.control_point, tool.around) = (Some(point), None);
                 let posed = tool.posed.get_or_insert(Posed { tip, path: Path::default(), client_time_s });
                 posed.tip = tip;
                 // A pose with a step is played at that step; a pose with client time only is played by that time.
@@ -442,6 +449,7 @@ impl Session {
             let contact_of = |feel: Feel| Contact {
                 point: self.model().shape().nearest(feel.anchor_m),
                 displacement_m: feel.surface_m - feel.anchor_m,
+                surface_displacement_m: self.tissue.surface_displacement_m(feel.anchor_m),
                 velocity_m_per_s: feel.velocity_m_per_s,
                 force_on_tool_n: feel.force_on_tool_n,
                 applied_force_n: -feel.force_on_tool_n,
@@ -449,11 +457,14 @@ impl Session {
             let contact = feel.map(contact_of).or_else(|| {
                 tool.control_point.map(|point| {
                     let state = self.tissue.point(point);
+                    let reaction_n = |poke| self.tissue.reaction_around_n(&poke);
+                    let moved_m = |poke: Poke| self.tissue.surface_displacement_m(poke.centre_m);
                     Contact {
                         point,
                         displacement_m: state.displacement_m,
+                        surface_displacement_m: tool.around.map_or(state.displacement_m, moved_m),
                         velocity_m_per_s: state.velocity_m_per_s,
-                        force_on_tool_n: state.reaction_n(),
+                        force_on_tool_n: tool.around.map_or_else(|| state.reaction_n(), reaction_n),
                         applied_force_n: state.applied_n,
                     }
                 })

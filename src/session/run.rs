@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use super::Session;
 use super::audit::{Twin, Windows};
-use super::command::Command;
+use super::command::{Command, Due};
 use super::intake::Intake;
 use crate::limits::Limits;
 use crate::refusal::{Refusal, Result};
@@ -58,13 +58,56 @@ pub fn command(tool: usize, step: u64, action: Action) -> Command {
     }
 }
 
-/// Applies the profiles of a script to a session that has not begun.
+/// Sets the forces and moves of a script in a session that has not begun, as continuous profiles.
 pub fn play(session: &mut Session, script: &Script) {
     for (tool, profile) in script.forces.iter().enumerate() {
         session.play_force(tool, profile.clone());
     }
     for (index, profile) in script.moves.iter().enumerate() {
         session.play_move(script.forces.len() + index, profile.clone());
+    }
+}
+
+/// Plays a script into sessions: forces and moves as continuous profiles, set once, or everything as the commands that a
+/// client streams (`held`). Poses are commands in both cases.
+pub struct Player<'s> {
+    script: &'s Script,
+    /// For commands: the same intake as in a server.
+    intake: Option<Intake>,
+    held: bool,
+}
+
+impl<'s> Player<'s> {
+    /// A player of `script` that has not begun.
+    ///
+    /// # Errors
+    /// Refuses a script with more tools than there may be.
+    pub fn new(model: &Model, script: &'s Script, held: bool, limits: &Limits) -> Result<Self> {
+        let commands = held || !script.poses.is_empty();
+        let intake = commands.then(|| intake(model, script, limits)).transpose()?;
+        Ok(Player { script, intake, held })
+    }
+
+    /// Sets the profiles in a session that has not begun.
+    pub fn begin(&self, session: &mut Session) {
+        if !self.held {
+            play(session, self.script);
+        }
+    }
+
+    /// Adds the commands that act at `step`.
+    ///
+    /// # Errors
+    /// Refuses what a server would.
+    pub fn commands(&mut self, step: u64, due: &mut Vec<Due>) -> Result<()> {
+        let Some(intake) = &mut self.intake else { return Ok(()) };
+        let actions: Vec<_> =
+            if self.held { self.script.actions_at(step).collect() } else { self.script.poses_at(step).collect() };
+        for (tool, action) in actions {
+            intake.submit(LEASE, vec![command(tool, step, action)], 0)?;
+        }
+        intake.take_due(step, 0, due);
+        Ok(())
     }
 }
 
@@ -132,24 +175,16 @@ impl Playing<'_> {
         let Playing { model, script, held, limits, .. } = self;
         let mut session = Session::new(model);
         let mut changes = model.course(&script.changes, limits)?;
-        // Held forces are commands, through the same intake as in a server; profiles are set once.
-        let mut intake = held.then(|| intake(model, script, limits)).transpose()?;
-        if !held {
-            play(&mut session, script);
-            self.twin.iter_mut().for_each(|twin| play(twin.session(), script));
-        }
+        let mut player = Player::new(model, script, held, limits)?;
+        player.begin(&mut session);
+        self.twin.iter_mut().for_each(|twin| player.begin(twin.session()));
         write_line(output, &Line::Run(&header(model, &script.name)))?;
         let mut due = Vec::new();
         let mut written: std::io::Result<()> = Ok(());
         let mut windows = (self.twin.is_some() && model.scene.stepping.correct).then(Windows::default);
         let (mut stepping_s, mut resumed_s) = (0.0, clock_s());
         for step in 0..script.steps {
-            if let Some(intake) = &mut intake {
-                for (tool, action) in script.actions_at(step) {
-                    intake.submit(LEASE, vec![command(tool, step, action)], 0)?;
-                }
-                intake.take_due(step, 0, &mut due);
-            }
+            player.commands(step, &mut due)?;
             // The summary's clock stops during everything other than the session's own stepping.
             stepping_s += clock_s() - resumed_s;
             if let Some(windows) = &mut windows

@@ -365,6 +365,7 @@ mod tests {
         let contact = |z_n: f64| crate::session::Contact {
             point: PointId::new(0),
             displacement_m: DVec3::ZERO,
+            surface_displacement_m: DVec3::ZERO,
             velocity_m_per_s: DVec3::ZERO,
             force_on_tool_n: DVec3::new(0.0, 0.0, z_n),
             applied_force_n: DVec3::ZERO,

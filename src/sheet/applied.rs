@@ -132,7 +132,7 @@ pub(super) struct Term<T: Real> {
 
 /// Whether two pokes differ only in the force.
 fn same_falloff(a: &Poke, b: &Poke) -> bool {
-    Poke { force_n: b.force_n, ..*a } == *b
+    Poke { force_n: b.force_n, point: b.point, ..*a } == *b
 }
 
 /// The points that a force reaches, along x and along y. Beyond them its factor is 0.
@@ -151,7 +151,8 @@ fn reached<T: Real>(poke: &Poke, model: &Model) -> [[usize; 2]; 2] {
 
 impl<T: Real> Term<T> {
     fn new() -> Self {
-        let poke = Poke { centre_m: DVec3::ZERO, force_n: DVec3::ZERO, falloff_per_m: 0.0, falloff_offset: 0.0 };
+        let poke =
+            Poke { point: None, centre_m: DVec3::ZERO, force_n: DVec3::ZERO, falloff_per_m: 0.0, falloff_offset: 0.0 };
         Term {
             wanted: Wanted { poke, forces_n: [DVec3::ZERO; 3] },
             gain: 1.0,

@@ -76,7 +76,10 @@ mod tests {
             let centre_m = spacing_m * DVec3::new(1.0, 20.0, 0.0);
             let force_n = DVec3::new(0.2, 0.1, -0.8);
             let falloff_per_m = 1.0 / spacing_m;
-            tissue.push(0, Some(Push::Constant(Poke { centre_m, force_n, falloff_per_m, falloff_offset: 0.0 })));
+            tissue.push(
+                0,
+                Some(Push::Constant(Poke { point: None, centre_m, force_n, falloff_per_m, falloff_offset: 0.0 })),
+            );
             tissue.grasp(1, model.scene.sheet.point([1, 30]), Grasp::Target(DVec3::new(0.0, 0.0, 0.3 * spacing_m)));
             (0..25).for_each(|_| tissue.step().unwrap());
             let copy = tissue.copy();

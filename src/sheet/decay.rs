@@ -28,6 +28,7 @@ fn rings_down<T: Real, const CUTS_U: bool>(sets: &[&str]) {
         let Ok(model) = Model::compile(&scene, &Limits::default()) else { continue };
         let mut sheet = Sheet::<T>::new(&model);
         let poke = Poke {
+            point: None,
             centre_m: scene.sheet.spacing_m * DVec3::new(2.0, 7.0, 0.0),
             force_n: DVec3::new(0.2, -0.1, 1.0),
             falloff_per_m: 1.0 / (1.3 * scene.sheet.spacing_m),

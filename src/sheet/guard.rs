@@ -255,6 +255,7 @@ mod tests {
         sheet.push(
             0,
             Some(Push::Constant(Poke {
+                point: None,
                 centre_m: scene.sheet.spacing_m * DVec3::new(3.0, 4.0, 0.0),
                 force_n: DVec3::new(0.1, -0.2, -1.0),
                 falloff_per_m: 0.7 / scene.sheet.spacing_m,

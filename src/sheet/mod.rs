@@ -6,6 +6,7 @@
 
 mod advance;
 mod applied;
+mod around;
 pub mod audit;
 mod audit_window;
 mod change;

@@ -209,7 +209,7 @@ mod tests {
                 for (tool, point) in [[0, 0], [3, 11]].into_iter().enumerate() {
                     let force_n = glam::DVec3::new(0.7, 0.2, -0.9) * [1.0, -1.5][tool];
                     let (centre_m, falloff_per_m) = (scene.shape().rest_m(scene.sheet.point(point)), 25.0);
-                    let poke = Poke { centre_m, force_n, falloff_per_m, falloff_offset: 0.0 };
+                    let poke = Poke { point: None, centre_m, force_n, falloff_per_m, falloff_offset: 0.0 };
                     tissue.push(tool, Some(crate::sheet::Push::Constant(poke)));
                 }
                 (0..20).for_each(|_| tissue.step().unwrap());

@@ -23,7 +23,7 @@ use super::tables::SweepTables;
 use super::tiles::{CHECK_STEPS, SleepTiles};
 use super::tissue::{BlowUp, Energy, PointState, Released, SheetCopy, Tissue};
 use crate::scene::Precision;
-use crate::scene::profile::{Moment, Motion};
+use crate::scene::profile::{Moment, Motion, Poke};
 use crate::shape::PointId;
 use palpate_touch::Tip;
 
@@ -362,6 +362,14 @@ impl<T: Real> Tissue for Sheet<T> {
 
     fn recover(&mut self, step: u64, to_rest: bool) -> Released {
         Sheet::recover(self, step, to_rest)
+    }
+
+    fn surface_displacement_m(&self, place_m: DVec3) -> DVec3 {
+        self.surface_displacement(place_m)
+    }
+
+    fn reaction_around_n(&self, poke: &Poke) -> DVec3 {
+        self.reaction_around(poke)
     }
 
     fn point(&self, point: PointId) -> PointState {

@@ -116,7 +116,8 @@ mod tests {
         let mut sheet = Sheet::new(&model);
         let centre_m = model.scene.sheet.spacing_m * DVec3::new(1.0, 1.0, 0.0);
         let force_n = DVec3::new(0.0, 0.0, -1.0);
-        sheet.push(0, Some(Push::Constant(Poke { centre_m, force_n, falloff_per_m, falloff_offset: 0.0 })));
+        sheet
+            .push(0, Some(Push::Constant(Poke { point: None, centre_m, force_n, falloff_per_m, falloff_offset: 0.0 })));
         sheet
     }
 

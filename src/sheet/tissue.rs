@@ -13,6 +13,7 @@ use super::contact::{Feel, Surroundings};
 use super::field::BLOCK;
 use super::model::{Model, Plan};
 use super::prescribed::Grasp;
+use crate::scene::profile::Poke;
 use crate::shape::PointId;
 use palpate_touch::Tip;
 
@@ -126,6 +127,11 @@ pub trait Tissue: Send {
     fn recover(&mut self, step: u64, to_rest: bool) -> Released;
     /// A point.
     fn point(&self, point: PointId) -> PointState;
+    /// How far the surface is moved at a place of the rest shape, m: interpolated between points as in frames.
+    fn surface_displacement_m(&self, place_m: DVec3) -> DVec3;
+    /// The force of the tissue on a tool whose force acts around a place, N: the mean of the points' reactions r by the
+    /// weights w of the force, Σ w·r/Σ w. It changes smoothly while the place moves.
+    fn reaction_around_n(&self, poke: &Poke) -> DVec3;
     /// The energies. A pass over what is awake; sleeping tiles use cached values. Earlier calls do not affect the
     /// result.
     fn energy(&self) -> Energy;

@@ -19,15 +19,18 @@ use crate::shape::RestShape;
 pub fn from_command(message: &pb::Command, shape: &dyn RestShape, arrival_ns: u64) -> Result<Command> {
     use pb::command::Action as Message;
     let action = match required("action", message.action.as_ref())? {
-        Message::Force(force) => Action::Push(Poke {
-            centre_m: match required("force.centre", force.centre.as_ref())? {
-                pb::force::Centre::Point(at) => shape.rest_m(shape.find("force.point", from_point(at))?),
-                pb::force::Centre::CentreM(place) => from_place(place).extend(0.0),
-            },
-            force_n: from_vector(force.force_n.as_ref()),
-            falloff_per_m: force.falloff_per_m,
-            falloff_offset: force.falloff_offset,
-        }),
+        Message::Force(force) => {
+            let (point, centre_m) = match required("force.centre", force.centre.as_ref())? {
+                pb::force::Centre::Point(at) => {
+                    let point = shape.find("force.point", from_point(at))?;
+                    (Some(point), shape.rest_m(point))
+                }
+                pb::force::Centre::CentreM(place) => (None, from_place(place).extend(0.0)),
+            };
+            let force_n = from_vector(force.force_n.as_ref());
+            let pb::Force { falloff_per_m, falloff_offset, .. } = *force;
+            Action::Push(Poke { point, centre_m, force_n, falloff_per_m, falloff_offset })
+        }
         Message::Position(position) => {
             let name = from_point(required("position.point", position.point.as_ref())?);
             let point = shape.find("position.point", name)?;
@@ -67,7 +70,10 @@ pub fn scripted(shape: &dyn RestShape, tool: usize, at_step: u64, action: &Actio
     use pb::command::Action as Message;
     let action = match action {
         Action::Push(poke) => Message::Force(pb::Force {
-            centre: Some(pb::force::Centre::CentreM(pb::Vector2 { x: poke.centre_m.x, y: poke.centre_m.y })),
+            centre: Some(match poke.point {
+                Some(at) => pb::force::Centre::Point(point(shape.name(at))),
+                None => pb::force::Centre::CentreM(pb::Vector2 { x: poke.centre_m.x, y: poke.centre_m.y }),
+            }),
             force_n: vector(poke.force_n),
             falloff_per_m: poke.falloff_per_m,
             falloff_offset: poke.falloff_offset,

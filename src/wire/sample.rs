@@ -77,6 +77,7 @@ fn tool_sample(tool: &ToolSample, shape: &dyn RestShape, due_ns: u64, now_ns: u6
         step_wait_ns: since_arrival_ns(due_ns),
         point: contact.map(|contact| point(shape.name(contact.point))),
         displacement_m: contact.and_then(|contact| vector(contact.displacement_m)),
+        surface_displacement_m: contact.and_then(|contact| vector(contact.surface_displacement_m)),
         velocity_m_per_s: contact.and_then(|contact| vector(contact.velocity_m_per_s)),
         force_on_tool_n: contact.and_then(|contact| vector(contact.force_on_tool_n)),
         applied_force_n: contact.and_then(|contact| vector(contact.applied_force_n)),

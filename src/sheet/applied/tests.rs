@@ -28,6 +28,7 @@ fn a_table_keeps_nothing_of_the_place_before() {
     let places = [(35.2, 45.7, 4.0), (3.0, 88.9, 20.0), (69.0, 0.4, 1.0), (-40.0, 20.0, 9.0), (30.5, 60.0, 0.5)];
     for (x, y, reach) in places.into_iter().chain(places.into_iter().rev()) {
         let poke = Poke {
+            point: None,
             centre_m: DVec3::new(x, y, 0.0) * spacing_m,
             force_n: DVec3::ZERO,
             falloff_per_m: 10.0 / (reach * spacing_m),
@@ -74,6 +75,7 @@ fn a_change_of_force_on_a_rectangle_is_at_most_its_bound() {
     let spacing_m = 0.05;
     for case in 0..400 {
         let mut poke = || Poke {
+            point: None,
             centre_m: DVec3::new(between(0.0, 1.0), between(0.0, 1.0), 0.0),
             force_n: DVec3::new(between(-1.0, 1.0), between(-1.0, 1.0), between(-1.0, 1.0)),
             falloff_per_m: between(0.0, 20.0),

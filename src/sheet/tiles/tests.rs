@@ -132,7 +132,10 @@ fn tiles_wake_when_the_changes_of_force_since_they_fell_asleep_exceed_the_bound_
     // The same force on each point: so its change is the bound of its change, to the last digit.
     for (z_n, awake) in [(1.0, 0), (1.25, 0), (1.5, 9)] {
         let (centre_m, force_n) = (DVec3::new(0.4, 0.3, 0.0), DVec3::new(0.0, 0.0, z_n));
-        applied.set(0, Some(Push::Constant(Poke { centre_m, force_n, falloff_per_m: 0.0, falloff_offset: 0.0 })));
+        applied.set(
+            0,
+            Some(Push::Constant(Poke { point: None, centre_m, force_n, falloff_per_m: 0.0, falloff_offset: 0.0 })),
+        );
         for change in applied.changes(&model, 0).collect::<Vec<_>>() {
             tiles.pushed(&change, model.scene.sheet.spacing_m, 1.25);
         }

@@ -1,0 +1,267 @@
+//! Scripts in people's terms: tools with a tip, forces in newtons in all, scripts made for a scene, and what a moving force
+//! feels.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
+
+mod common;
+
+use std::path::Path;
+use std::sync::Arc;
+
+use common::{model, scene_with, script};
+use glam::DVec3;
+use palpate::limits::Limits;
+use palpate::scene::record::Summary;
+use palpate::scene::script::{Action, BUILT_IN, Script};
+use palpate::scene::{self, Scene, reader};
+use palpate::session::Session;
+use palpate::session::command::Command;
+use palpate::session::run;
+use palpate::sheet::Model;
+
+fn built_in(scene: &str, sets: &[&str]) -> Scene {
+    let (_, text) = scene::BUILT_IN.iter().find(|(name, _)| *name == scene).unwrap();
+    scene_with(text, sets)
+}
+
+fn shipped(name: &str, scene: &Scene) -> Script {
+    let (_, text) = BUILT_IN.iter().find(|(other, _)| *other == name).unwrap();
+    Script::parse(name, text, Path::new("scripts"), scene, &Limits::default()).unwrap()
+}
+
+fn run_whole(model: &Arc<Model>, script: &Script, held: bool) -> (Vec<serde_json::Value>, Summary) {
+    let (mut out, limits) = (Vec::new(), Limits::default());
+    let summary = run::run(model, script, held, &limits, &mut out, &|| 0.0, &mut |_| {}).unwrap();
+    let lines = String::from_utf8(out).unwrap();
+    (lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect(), summary)
+}
+
+/// The largest and the least z of the first point of all records, mm.
+fn range_mm(records: &[serde_json::Value]) -> [f64; 2] {
+    let depths = records.iter().filter_map(|record| record["points"][0]["displacement_m"][2].as_f64());
+    depths.fold([0.0, 0.0], |[most, least], z_m| [f64::max(most, 1e3 * z_m), f64::min(least, 1e3 * z_m)])
+}
+
+#[test]
+fn every_shipped_script_fits_the_scenes_that_it_is_made_for_and_says_so_elsewhere() {
+    for (name, text) in BUILT_IN {
+        let made_for: Vec<&str> =
+            scene::BUILT_IN.iter().map(|scene| scene.0).filter(|scene| reader::fits(text, scene)).collect();
+        assert!(!made_for.is_empty() && made_for.len() < scene::BUILT_IN.len(), "{name}: {made_for:?}");
+        for (scene, _) in scene::BUILT_IN {
+            let warnings = shipped(name, &built_in(scene, &[])).warnings;
+            let warned = warnings.iter().any(|warning| warning.starts_with("scenes: made for"));
+            assert_eq!(warned, !made_for.contains(&scene), "{name} on {scene}: {warnings:?}");
+        }
+    }
+    assert!(reader::fits("no TOML [", "liver") && reader::fits("duration_s = 1.0", "liver"));
+}
+
+#[test]
+fn shipped_scripts_move_each_tissue_by_some_millimetres() {
+    for scene in ["liver", "fibrotic", "stomach"] {
+        let scene = built_in(scene, &[]);
+        let model = model(&scene);
+        for (name, at_least_mm, at_most_mm) in [
+            ("press", [0.0, -4.5], [0.5, -3.0]),
+            ("grasp", [3.0, -0.5], [4.5, 0.0]),
+            ("push", [0.0, -9.0], [0.5, -0.3]),
+        ] {
+            let [most, least] = range_mm(&run_whole(&model, &shipped(name, &scene), false).0);
+            assert!((at_least_mm[0]..=at_most_mm[0]).contains(&most), "{}, {name}: {most} mm", scene.name);
+            assert!((at_least_mm[1]..=at_most_mm[1]).contains(&least), "{}, {name}: {least} mm", scene.name);
+        }
+    }
+}
+
+#[test]
+fn poses_are_commands_so_that_a_run_is_the_same_bits_held_or_not() {
+    let scene = built_in("liver", &[]);
+    let model = model(&scene);
+    for name in ["press", "stroke", "grasp"] {
+        let script = shipped(name, &scene);
+        let [free, held] = [false, true].map(|held| run_whole(&model, &script, held).1);
+        assert_eq!(free.final_hash, held.final_hash, "{name}");
+        assert_ne!(free.substeps, 0);
+    }
+}
+
+#[test]
+fn a_pose_is_reached_at_the_end_of_its_step_and_the_tool_leaves_at_the_end() {
+    let scene = built_in("liver", &[]);
+    let text = "duration_s = 0.2\nsample_every_s = 0.1\n[[tool]]\ntip = { radius_m = 0.004, friction = 0.0 }\nposes = [\
+                { at_s = 0.05, place_m = [0.03, 0.04, 0.002] }, { at_s = 0.15, place_m = [0.03, 0.05, -0.002] }]\n\
+                until_s = 0.18\n";
+    let script = script(text, &scene);
+    let place = |step: u64| match script.actions_at(step).collect::<Vec<_>>().as_slice() {
+        [] => None,
+        [(0, Action::Pose { place_m, tip })] if tip.radius_m == 0.004 => Some(Some(*place_m)),
+        [(0, Action::Release)] => Some(None),
+        other => panic!("{step}: {other:?}"),
+    };
+    assert_eq!(place(48), None);
+    assert_eq!(place(49), Some(Some(DVec3::new(0.03, 0.04, 0.002))));
+    let half = place(99).unwrap().unwrap();
+    assert!(half.distance(DVec3::new(0.03, 0.045, 0.0)) < 1e-15, "{half}");
+    assert_eq!(place(149), Some(Some(DVec3::new(0.03, 0.05, -0.002))));
+    assert_eq!(place(170), place(149));
+    assert_eq!((place(179), place(180)), (Some(None), None));
+    // The control points are those under the poses.
+    assert_eq!(script.sample_points, [[12, 16], [12, 20]].map(|point| scene.sheet.point(point)));
+}
+
+#[test]
+fn a_force_in_all_is_that_force_wherever_the_points_are() {
+    for (spacing_m, points, at_m) in [(0.0025, 31, [0.0375, 0.0375]), (0.00125, 61, [0.0312, 0.0403])] {
+        let sets = [format!("sheet.spacing_m={spacing_m}"), format!("sheet.points=[{points}, {points}]")];
+        let scene = built_in("liver", &sets.each_ref().map(String::as_str));
+        let text = format!(
+            "duration_s = 0.01\nsample_every_s = 0.01\nsample_points = \"all\"\n[[force]]\nat_m = {at_m:?}\n\
+             total_n = [0.1, 0.0, -0.5]\nradius_m = 0.004\nprofile = {{ type = \"constant\" }}\n"
+        );
+        let script = script(&text, &scene);
+        let (records, _) = run_whole(&model(&scene), &script, false);
+        let applied = |c: usize| -> f64 {
+            let points = records[1]["points"].as_array().unwrap();
+            points.iter().map(|point| point["applied_n"][c].as_f64().unwrap()).sum()
+        };
+        // What f32 leaves of it.
+        assert!((applied(2) + 0.5).abs() < 1e-6 && (applied(0) - 0.1).abs() < 1e-6, "{} {}", applied(0), applied(2));
+    }
+}
+
+/// Liver with points twice as close: mass, virtual springs and damping are those of an area.
+fn finer(scene: &Scene) -> Scene {
+    let mut finer = scene.clone();
+    finer.sheet.points = scene.sheet.points.map(|points| 2 * points - 1);
+    finer.sheet.spacing_m /= 2.0;
+    finer.sheet.point_mass_kg /= 4.0;
+    finer.virtual_stiffness_n_per_m /= 4.0;
+    finer.damping_n_s_per_m /= 4.0;
+    finer
+}
+
+#[test]
+fn a_force_in_all_means_the_same_at_half_the_spacing() {
+    let text = "duration_s = 0.5\nsample_every_s = 0.5\n[[force]]\nat_m = [0.0375, 0.0375]\n\
+                total_n = [0.0, 0.0, -0.3]\nradius_m = 0.005\nprofile = { type = \"ramp\", from_s = 0.0, to_s = 0.2 }\n";
+    let depth_m = |scene: &Scene| {
+        let (records, _) = run_whole(&model(scene), &script(text, scene), false);
+        records[2]["points"][0]["displacement_m"][2].as_f64().unwrap()
+    };
+    let liver = built_in("liver", &[]);
+    let [coarse, fine] = [depth_m(&liver), depth_m(&finer(&liver))];
+    assert!(coarse < -1e-3 && (coarse / fine - 1.0).abs() < 0.02, "{coarse} m and {fine} m");
+}
+
+#[test]
+fn what_is_wrong_with_a_force_or_a_pose_is_named() {
+    let scene = built_in("liver", &[]);
+    let force = |lines: &str| format!("[[force]]\n{lines}\nprofile = {{ type = \"constant\" }}\n");
+    let tool = |lines: &str| format!("[[tool]]\n{lines}\n");
+    let poses = "poses = [{ at_s = 0.0, place_m = [0.03, 0.03, 0.0] }]";
+    for (text, expected) in [
+        (force("at_m = [0.03, 0.03]\ntotal_n = [0.0, 0.0, -1.0]"), "force[0].falloff_per_m: is missing"),
+        (
+            force("at_m = [0.03, 0.03]\ntotal_n = [0.0, 0.0, -1.0]\nradius_m = 0.004\nfalloff_per_m = 3.0"),
+            "force[0].falloff_per_m: does not go with radius_m",
+        ),
+        (force("at_m = [0.03, 0.03]\nforce_n = [0.0, 0.0, -1.0]\nradius_m = 0.004"), "force[0].force_n: does not go"),
+        (force("at_m = [0.03, 0.03]\nradius_m = 0.004"), "force[0].total_n: is missing"),
+        (force("at_m = [0.031, 0.031]\ntotal_n = [0.0, 0.0, -1.0]\nradius_m = 1e-5"), "force[0].radius_m: is so small"),
+        (
+            force("at_m = [0.3, 0.03]\ntotal_n = [0.0, 0.0, -1.0]\nradius_m = 0.004"),
+            "force[0].at_m: (0.3, 0.03, 0) m is off",
+        ),
+        (
+            force("at_m = [0.03, 0.03]\npoint = [3, 3]\ntotal_n = [0.0, 0.0, -1.0]\nradius_m = 0.004"),
+            "just one of `point`, `at_m`, `hops` and `path`",
+        ),
+        (tool("poses = []"), "tool[0].poses: must have at least one pose"),
+        (
+            tool("poses = [{ at_s = 0.1, place_m = [0.0, 0.0, 0.0] }, { at_s = 0.1, place_m = [0.0, 0.0, 0.0] }]"),
+            "tool[0].poses[1].at_s: must be later",
+        ),
+        (tool("poses = [{ at_s = 0.1, place_m = [0.0, 0.0, 99.0] }]"), "tool[0].poses[0].place_m"),
+        (tool(&format!("{poses}\nuntil_s = 0.0")), "tool[0].until_s: must be later than the first pose"),
+        (tool(&format!("{poses}\ntip = {{ radius_m = -1.0 }}")), "tool[0].tip.radius_m"),
+        (tool(&format!("{poses}\ntip = {{ sharp = true }}")), "tool[0].tip.sharp"),
+        (tool(&format!("{poses}\npoint = [3, 3]")), "tool[0].point"),
+    ] {
+        let text = format!("duration_s = 0.1\nsample_every_s = 0.1\n{text}");
+        let refusal = Script::parse("s", &text, Path::new(""), &scene, &Limits::default()).unwrap_err().to_string();
+        assert!(refusal.contains(expected), "{refusal}\nexpected: {expected}");
+    }
+}
+
+/// A session of liver, and what a command for the coming step tells in the sample after it.
+fn told(session: &mut Session, sequence: u64, action: Action) -> palpate::session::Contact {
+    let at_step = Some(session.step_count());
+    let command =
+        Command { tool: 0, sequence, client_time_ns: 0, at_step, time_to_live_s: None, action, arrival_ns: 0 };
+    let due = palpate::session::command::Due { command, late: false, late_commands: 0, ends_lease: false };
+    session.advance(&mut vec![due], |_| {});
+    session.sample(None).tools[0].contact.unwrap()
+}
+
+#[test]
+fn a_force_that_moves_between_points_feels_smooth_and_one_on_a_point_feels_that_point() {
+    use palpate::scene::profile::Poke;
+    let scene = built_in("liver", &[]);
+    let model = model(&scene);
+    let spacing_m = scene.sheet.spacing_m;
+    // Slowly over three points, after it has settled; the ripple relative to the mean force.
+    let ripple = |by_point: bool| {
+        let mut session = Session::new(&model);
+        let (mut least, mut most) = (f64::INFINITY, 0.0_f64);
+        for step in 0..2000_u64 {
+            let along_m = 0.03 + 3.0 * spacing_m * (step.max(500) - 500) as f64 / 1500.0;
+            let centre_m = DVec3::new(along_m, 0.0375, 0.0);
+            let nearest = model.shape().nearest(centre_m);
+            let point = by_point.then_some(nearest);
+            let poke = Poke {
+                point,
+                centre_m,
+                force_n: DVec3::new(0.0, 0.0, -0.02),
+                falloff_per_m: 250.0,
+                falloff_offset: 0.0,
+            };
+            let contact = told(&mut session, step + 1, Action::Push(poke));
+            assert_eq!(contact.point, nearest);
+            if by_point {
+                let state = session.tissue().point(nearest);
+                assert_eq!(
+                    (contact.force_on_tool_n, contact.surface_displacement_m),
+                    (state.reaction_n(), state.displacement_m)
+                );
+            }
+            if step >= 500 {
+                least = least.min(contact.force_on_tool_n.z);
+                most = most.max(contact.force_on_tool_n.z);
+            }
+        }
+        (most - least) / (0.5 * (most + least))
+    };
+    let [smooth, saw] = [ripple(false), ripple(true)];
+    assert!(smooth < 0.3 * saw && smooth < 0.15, "{smooth} and {saw}");
+}
+
+#[test]
+fn the_surface_under_a_tip_is_deeper_than_the_mean_over_it() {
+    let scene = built_in("liver", &[]);
+    let model = model(&scene);
+    let mut session = Session::new(&model);
+    let mut contact = None;
+    for step in 0..400_u64 {
+        let z_m = -0.004 * (step as f64 / 300.0).min(1.0);
+        let action = Action::Pose { place_m: DVec3::new(0.0375, 0.0375, z_m), tip: palpate_touch::Tip::default() };
+        contact = Some(told(&mut session, step + 1, action));
+    }
+    let contact = contact.unwrap();
+    let middle = session.tissue().point(scene.sheet.point([15, 15])).displacement_m;
+    assert!((contact.surface_displacement_m - middle).length() < 1e-4, "{contact:?}, {middle}");
+    assert!(contact.surface_displacement_m.z < 1.03 * contact.displacement_m.z, "{contact:?}");
+    // Between points it is bilinear, and beyond the rim that of the rim.
+    let at = |i: f64, j: f64| session.tissue().surface_displacement_m(scene.sheet.spacing_m * DVec3::new(i, j, 0.0));
+    assert!((at(14.5, 15.0) - 0.5 * (at(14.0, 15.0) + at(15.0, 15.0))).length() < 1e-12);
+    assert_eq!(at(-3.0, 15.0), at(0.0, 15.0));
+}
