@@ -8,11 +8,12 @@ use glam::DVec3;
 
 use super::check::{check_force, check_free, check_reach};
 use super::document::{self, Document, Fields, Item};
+use super::kind::Kind;
 use super::profile::{CentreProfile, LoadProfile, Moment, MotionProfile, Move, Profile, StrengthProfile};
 use super::script::Script;
 use super::{Change, Scene};
 use crate::limits::Limits;
-use crate::refusal::{Reason, Refusal, Result, not_negative, number, positive};
+use crate::refusal::{Reason, Refusal, Result, did_you_mean, not_negative, number, positive};
 use crate::shape::{self, PointId, PointName};
 
 impl Script {
@@ -36,6 +37,7 @@ impl Script {
     /// Refuses a script that can't be parsed or bound to the scene.
     pub fn parse(name: &str, text: &str, folder: &Path, scene: &Scene, limits: &Limits) -> Result<Self> {
         let document = Document::parse(name, text)?;
+        Kind::Script.check(&document)?;
         document.read(|fields| Binding { folder, scene, limits, warnings: Vec::new() }.script(fields))
     }
 }
@@ -277,7 +279,8 @@ impl Binding<'_> {
                 return Ok(Err(self.trace(&file, &path)?));
             }
             other => {
-                let message = format!("must be one of constant, pulse, ramp, sine, trace, but is `{other}`");
+                let meant = did_you_mean(other, ["constant", "pulse", "ramp", "sine", "trace"]);
+                let message = format!("must be one of constant, pulse, ramp, sine, trace, but is `{other}`{meant}");
                 return Err(kind.refuse(Reason::WrongKind, message));
             }
         }))
