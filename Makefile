@@ -17,12 +17,13 @@ MODULES := $(VIEWER)/node_modules/.package-lock.json
 PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/*.yaml $(VIEWER)/index.html $(VIEWER)/src/*.ts \
 	$(VIEWER)/src/*.css $(VIEWER)/public/* proto/palpate/v1/*.proto)
 
-.PHONY: help run build viewer page-if-node test test-viewer test-arm test-asan test-valgrind test-debug test-mutants need-arm stress libfuzzer lint picture figures screenshot bench-roundtrip bench-duty \
+.PHONY: help run build release viewer page-if-node test test-viewer test-arm test-asan test-valgrind test-debug test-mutants need-arm stress libfuzzer lint picture figures screenshot bench-roundtrip bench-duty \
 	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-rest bench-link bench-viewer bench-load soak siege fuzz need-rust \
 	need-python need-node
 
 help:
 	@echo 'make run             build, serve on $(LISTEN), poke the tissue, draw what it felt, go on serving: see it in a browser'
+	@echo 'make release         static server, client, container image and checksums in target/release-files; says what it can not make'
 	@echo 'make viewer          the page that shows the tissue, clients/viewer/dist (Node.js; make run does it by itself)'
 	@echo 'make test            every test (Rust, Python 3, and the page in a browser)'
 	@echo 'make test-viewer     the page alone; its screenshots are in target/viewer'
@@ -71,6 +72,9 @@ need-node:
 build: need-rust
 	$(CARGO) build --release --workspace
 
+release: need-rust page-if-node
+	CARGO=$(CARGO) sh contrib/release.sh
+
 $(MODULES): $(VIEWER)/package-lock.json | need-node
 	cd $(VIEWER) && $(NPM) ci
 	@touch $@
@@ -89,7 +93,8 @@ run: build page-if-node
 	@rm -f target/serving.txt; \
 	./target/release/palpate serve --listen $(LISTEN) --log warn > target/serving.txt & server=$$!; \
 	trap 'kill $$server 2>/dev/null; wait $$server; exit 0' INT TERM; \
-	until grep -q http target/serving.txt; do kill -0 $$server 2>/dev/null || exit 1; sleep 0.05; done; \
+	until grep -q http target/serving.txt; do kill -0 $$server 2>/dev/null || \
+		{ echo 'No server, so nothing to see. Another port: make run LISTEN=127.0.0.1:0' >&2; exit 1; }; sleep 0.05; done; \
 	url=$$(grep -o 'http.*' target/serving.txt); \
 	./target/release/palpate-client replay $(SCRIPT) --server $$url --output target/poke.jsonl --plot \
 		|| { kill $$server; exit 1; }; \

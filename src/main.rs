@@ -5,7 +5,7 @@ mod program;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use program::{Failure, check, client, render, run, say, serve, texture, token, within_memory};
+use program::{Failure, certificate, check, client, render, run, say, serve, texture, token, within_memory};
 
 /// A server for touching soft tissue over a network.
 #[derive(Parser)]
@@ -23,26 +23,30 @@ enum Command {
         palpate run my-scene.toml my-script.toml --output poke.jsonl --set stepping.integrator=lagged\n\n\
         Exit status: 0; 1 when the run failed; 2 when an input was refused.")]
     Run(run::RunArguments),
-    /// Report what a scene needs: frequencies, integrator, substeps, expected error, time per step, sessions per core
+    /// Report what a scene needs and what to expect of it: size, mass, stiffness under a fingertip, time to rest, integrator,
+    /// expected error, time per step, sessions per core; warns of what can't be meant
     #[command(after_help = "Examples:\n  \
         palpate check paper\n  \
+        palpate check my-scene.toml my-script.toml\n  \
         palpate check my-scene.toml --set stepping.tolerance=1e-8\n\n\
-        Exit status: 0; 2 when the scene was refused.")]
+        The deepest sensible force presses a disc of 5 mm radius in by half the shorter side, or as far as the force law \
+        reaches.\n\n\
+        Exit status: 0, with warnings too; 2 when an input was refused.")]
     Check(check::CheckArguments),
     /// Draw a tissue while a script acts on it, without a screen: a PNG image of one moment, or a GIF of the whole script
     #[command(after_help = "Examples:\n  \
         palpate render paper oblique-100 --output poke.png\n  \
         palpate render paper vertical-60 --output mesh.png --wireframe --refine 1 --at-s 0.3 --camera 0,25\n  \
         palpate render liver my-script.toml --output poke.gif --size 480x360 --frames-hz 20\n\n\
-        The scene's section [appearance] defines the texture. An arrow at its control point shows each force.\n\
+        The scene's section [appearance] defines the texture. An arrow at its control point shows each force.\n\n\
         Exit status: 0; 1 when the run failed or the file can't be written; 2 when an input was refused.")]
     Render(render::RenderArguments),
     /// Paint an image for a tissue's surface: the lining of a stomach as an endoscope shows it
     #[command(after_help = "Examples:\n  \
         palpate texture --output mucosa.png\n  \
         palpate texture --seed 7 --size 4096 --output mucosa.png\n\n\
-        The same seed and size give the same bytes; another size gives the same tissue at another resolution. To use a\n\
-        texture in a scene, set texture_seed and texture_size in its section [appearance], or texture = \"FILE.png\".\n\
+        The same seed and size give the same bytes; another size gives the same tissue at another resolution. To use a \
+        texture in a scene, set texture_seed and texture_size in its section [appearance], or texture = \"FILE.png\".\n\n\
         Exit status: 0; 1 when the file can't be written; 2 when an input was refused.")]
     Texture(texture::TextureArguments),
     /// Serve tissue over gRPC and to browsers: sessions in real time, commands in, forces and frames out
@@ -52,24 +56,32 @@ enum Command {
         palpate token --name ann --role create,touch --tokens tokens.toml > ann.token\n  \
         palpate serve --listen 0.0.0.0:7117 --tls-cert server.pem --tls-key server.key --tokens tokens.toml\n  \
         palpate-client replay vertical-60 --server https://server:7117 --token-file ann.token\n\n\
-        The server prints its address to the standard output when it is ready. Ctrl-C or SIGTERM ends it: all streams end\n\
+        The server prints its address to the standard output when it is ready. Ctrl-C or SIGTERM ends it: all streams end \
         with the reason, and what remains after the deadline is cut.\n\n\
-        On a loopback address every caller may do everything. At any other address the server starts only with TLS and\n\
-        with tokens or client certificates, or with --insecure. A client sends its token with every call, as\n\
-        `authorization: Bearer TOKEN`. Roles are watch, touch (hold a tool, change the tissue), create (create,\n\
-        start, pause and delete sessions) and administer (everything, including the list of sessions). Health, reflection\n\
-        and the page's files need no token; give the page one as in https://server:7117/#token=TOKEN.\n\
-        The server checks certificates, keys and tokens twice a second, and at once on SIGHUP. Valid changes apply at once\n\
-        to new connections and calls. Invalid files are logged and the old ones stay in use; for tokens, the health\n\
+        On a loopback address every caller may do everything. At any other address the server starts only with TLS and \
+        with tokens or client certificates, or with --insecure. A client sends its token with every call, as \
+        `authorization: Bearer TOKEN`. Roles are watch, touch (hold a tool, change the tissue), create (create, \
+        start, pause and delete sessions) and administer (everything, including the list of sessions). Health, reflection \
+        and the page's files need no token; give the page one as in https://server:7117/#token=TOKEN.\n\n\
+        The server checks certificates, keys and tokens twice a second, and at once on SIGHUP. Valid changes apply at once \
+        to new connections and calls. Invalid files are logged and the old ones stay in use; for tokens, the health \
         service `palpate.tokens` reports it.")]
     Serve(Box<serve::ServeArguments>),
     /// Create a token for clients of a server; prints the token once and stores only its hash
     #[command(after_help = "Examples:\n  \
         palpate token --name ann --role create,touch --tokens tokens.toml > ann.token\n  \
         palpate token --name screen --role watch\n\n\
-        Roles: watch (every role includes it), touch (hold a tool, change the tissue), create (create, start, pause and\n\
+        Roles: watch (every role includes it), touch (hold a tool, change the tissue), create (create, start, pause and \
         delete sessions), administer (everything). To revoke a token, delete its entry; the server notices within 1 s.")]
     Token(token::TokenArguments),
+    /// Make a certificate and its key for trials with TLS: cert.pem and key.pem
+    #[command(after_help = "Examples:\n  \
+        palpate certificate\n  \
+        palpate certificate server.example 192.0.2.7 --days 30\n\n\
+        The certificate signs itself: clients trust it by --ca cert.pem. For more than trials, use one of your own \
+        authority; docs/security.md has a recipe with openssl. Only the owner can read key.pem.\n\n\
+        Exit status: 0; 1 when a file can't be written; 2 when an input was refused, or a file exists already.")]
+    Certificate(certificate::CertificateArguments),
     /// Show the sessions of a server once a second (`palpate-client top`)
     #[command(disable_help_flag = true)]
     Top {
@@ -94,6 +106,7 @@ fn main() -> ExitCode {
         Command::Texture(arguments) => within_memory(|| texture::make_texture(&arguments)),
         Command::Serve(arguments) => serve::serve(&arguments),
         Command::Token(arguments) => token::token(&arguments),
+        Command::Certificate(arguments) => certificate::certificate(&arguments),
         Command::Top { arguments } => return client::client("top", &arguments),
         Command::Admin { arguments } => return client::client("admin", &arguments),
     };
@@ -104,4 +117,41 @@ fn main() -> ExitCode {
     };
     say!("palpate: {message}");
     ExitCode::from(status)
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    /// What is wider than `width` columns, other than single words and the names of options.
+    fn too_wide(width: usize) -> Vec<String> {
+        let mut found = Vec::new();
+        for subcommand in super::Arguments::command().get_subcommands() {
+            let help = subcommand.clone().term_width(width).render_long_help().to_string();
+            let is_one = |line: &str| !line.trim().contains(' ') || line.trim().starts_with('-');
+            let lines = help.lines().filter(|line| line.chars().count() > width && !is_one(line));
+            found.extend(lines.map(|line| format!("{}: {line}", subcommand.get_name())));
+        }
+        found
+    }
+
+    #[test]
+    fn help_fits_into_a_terminal_of_any_width() {
+        super::Arguments::command().debug_assert();
+        for width in [40, 80, 100, 160] {
+            assert_eq!(too_wide(width), [""; 0], "{width} columns");
+        }
+    }
+
+    #[test]
+    fn paragraphs_of_help_are_wrapped_by_the_terminal_alone() {
+        for subcommand in super::Arguments::command().get_subcommands() {
+            let text = subcommand.get_after_help().map(ToString::to_string).unwrap_or_default();
+            let lines: Vec<&str> = text.lines().collect();
+            for pair in lines.windows(2) {
+                let is_text = |line: &str| !line.is_empty() && !line.starts_with(' ');
+                assert!(!(is_text(pair[0]) && is_text(pair[1])), "{}: {pair:?}", subcommand.get_name());
+            }
+        }
+    }
 }

@@ -814,3 +814,57 @@ fn the_clients_programs_show_their_token_and_check_the_server() {
     let (status, said) = replay(&["--server", "http://192.0.2.1:7117", "--token-file", &strong], None);
     assert!(status == Some(2) && said.contains("in the clear"), "{said}");
 }
+
+#[cfg(unix)]
+#[test]
+fn a_certificate_for_trials_serves_and_the_wrong_scheme_is_named() {
+    use std::os::unix::fs::PermissionsExt;
+    let folder = tempfile::tempdir().unwrap();
+    let dir = folder.path().to_str().unwrap();
+    let [cert, key] = ["cert.pem", "key.pem"].map(|name| folder.path().join(name).to_str().unwrap().to_owned());
+    // A key that others could read is not written over, but replaced.
+    std::fs::write(&key, "old").unwrap();
+    let refused = palpate(&["certificate", "--dir", dir]);
+    assert_eq!(refused.status.code(), Some(2));
+    let said = String::from_utf8(refused.stderr).unwrap();
+    assert!(said.contains("key.pem: exists already; --force overwrites it"), "{said}");
+    assert_eq!(std::fs::read_to_string(&key).unwrap(), "old");
+    let made = palpate(&["certificate", "localhost", "127.0.0.1", "--dir", dir, "--force"]);
+    let told = String::from_utf8(made.stdout).unwrap();
+    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    assert!(told.contains("palpate serve --listen 127.0.0.1:7117 --tls-cert ") && told.contains(" --ca "), "{told}");
+    assert_eq!(std::fs::metadata(&key).unwrap().permissions().mode() & 0o777, 0o600);
+    let wrong = palpate(&["certificate", "https://server", "--dir", dir, "--force"]);
+    assert_eq!(wrong.status.code(), Some(2));
+
+    let health = |arguments: &[&str]| {
+        let ended = Command::new(server::client_program()).arg("health").args(arguments).output().unwrap();
+        (ended.status.code(), String::from_utf8(ended.stderr).unwrap())
+    };
+    let secure = Server::start(&["--tls-cert", &cert, "--tls-key", &key]);
+    let address = secure.url.strip_prefix("https://").unwrap();
+    for name in ["localhost", "127.0.0.1"] {
+        let url = format!("https://{}", address.replace("127.0.0.1", name));
+        let (status, said) = health(&[&url, "--ca", &cert]);
+        assert_eq!(status, Some(0), "{name}: {said}");
+    }
+    let (status, said) = health(&[&format!("http://{address}")]);
+    assert_eq!(status, Some(1));
+    assert!(said.contains(&format!("the server at {address} speaks TLS: use https://{address}")), "{said}");
+    let plain = Server::start(&[]);
+    let address = plain.url.strip_prefix("http://").unwrap();
+    let (status, said) = health(&[&format!("https://{address}"), "--ca", &cert]);
+    assert_eq!(status, Some(1));
+    assert!(said.contains(&format!("the server at {address} does not speak TLS: use http://{address}")), "{said}");
+}
+
+#[test]
+fn an_address_that_is_in_use_is_told_with_what_to_do() {
+    let taken = Server::start(&[]);
+    let address = taken.url.strip_prefix("http://").unwrap();
+    let ended = palpate(&["serve", "--listen", address]);
+    let said = String::from_utf8(ended.stderr).unwrap();
+    assert_eq!(ended.status.code(), Some(1), "{said}");
+    assert!(said.contains(&format!("can't listen on {address}: another program")), "{said}");
+    assert!(said.contains("give another --listen"), "{said}");
+}

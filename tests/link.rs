@@ -154,12 +154,64 @@ async fn a_bridge_to_what_the_server_does_not_have_ends() {
     assert!(told.contains("UNKNOWN_SCENE"), "{told}");
 }
 
+#[test]
+fn a_bridge_to_nobody_fails_and_says_how_often_it_tried() {
+    // A port on which nobody listens any more.
+    let address = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+    let output = client(&format!("bridge --server http://{address} --seconds 0.5"));
+    let told = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(1), "{told}");
+    assert!(output.stdout.is_empty());
+    assert!(told.contains("attempt 2, the next in 0.2 s"), "{told}");
+    let last = told.lines().last().unwrap();
+    assert!(
+        last.starts_with("palpate-client: never connected, in ") && last.contains("attempts: can't reach"),
+        "{told}"
+    );
+}
+
+#[cfg(unix)]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_bridge_deletes_the_session_that_it_made_and_no_other() {
+    let scene = || palpate_proto::pb::create_session_request::Source::SceneName("liver".to_owned());
+    for (keeps, given, left) in [(false, false, 0), (true, false, 1), (false, true, 1)] {
+        let server = Server::start(&[]);
+        let mut more = if keeps { vec!["--keep-session"] } else { Vec::new() };
+        let session = if given { server.create(scene(), false).await.unwrap().session_id } else { String::new() };
+        if given {
+            more.extend(["--session", &session]);
+        }
+        let bridge = bridge(&server.url, &more);
+        server.until_applied("liver", 10).await;
+        let table = String::from_utf8(interrupted(bridge).await.stdout).unwrap();
+        assert!(table.contains("connections") && table.contains("late ticks") && !table.contains('{'), "{table}");
+        let listed = server.sessions().await.list_sessions(palpate_proto::pb::ListSessionsRequest {}).await.unwrap();
+        assert_eq!(listed.into_inner().sessions.len(), left, "keeps {keeps}, given {given}");
+    }
+}
+
+#[test]
+fn a_run_of_link_is_a_table_with_units_for_people() {
+    let output = client("link --scene liver --rtt-ms 50 --seconds 1");
+    let table = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert!(table.contains("50 ms round trip, ± 0 ms each way, 0 % lost"), "{table}");
+    for (name, unit) in [("largest force", "N rendered"), ("force error", "% rms"), ("least energy", "J (below 0")] {
+        let line = table.lines().find(|line| line.starts_with(name)).unwrap_or_else(|| panic!("no {name}: {table}"));
+        assert!(line.contains(unit), "{line}");
+    }
+    // Rounded: no number has more than four digits behind its point.
+    let digits =
+        |word: &str| word.split_once('.').map_or(0, |(_, part)| part.chars().filter(char::is_ascii_digit).count());
+    assert!(table.split_whitespace().all(|word| digits(word) <= 5), "{table}");
+}
+
 /// Commands of a bridge, one a tick: within so many its owner has asked for forces three times, and pressed.
 const TOUCHES: u64 = 1000;
 
-fn bridge(proxy: &Proxy, more: &[&str]) -> Child {
+fn bridge(url: &str, more: &[&str]) -> Child {
     Command::new(client_program())
-        .args(["bridge", "--scene", "liver", "--server", &proxy.url()])
+        .args(["bridge", "--scene", "liver", "--server", url])
         .args(more)
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
@@ -189,7 +241,7 @@ fn address(server: &Server) -> String {
 async fn a_bridge_outlives_a_cut() {
     let server = Server::start(&[]);
     let proxy = Proxy::start(address(&server), Duration::from_millis(5)).await;
-    let bridge = bridge(&proxy, &[]);
+    let bridge = bridge(&proxy.url(), &["--json"]);
     server.until_applied("liver", TOUCHES).await;
     proxy.cut();
     server.until_let_go().await;
@@ -213,7 +265,7 @@ async fn forces_stay_within_the_envelope_whatever_breaks() {
     let proxy = Proxy::start(address(&first), Duration::from_millis(5)).await;
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("course.csv");
-    let bridge = bridge(&proxy, &["--course", file.to_str().unwrap()]);
+    let bridge = bridge(&proxy.url(), &["--course", file.to_str().unwrap()]);
     first.until_applied("liver", TOUCHES).await;
     drop(first);
     // Long enough without a server that forces pause, however soon the next one is there.

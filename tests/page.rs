@@ -12,7 +12,7 @@ use std::path::Path;
 
 use palpate::limits::Limits;
 use palpate::scene::Scene;
-use palpate::scene::script::Script;
+use palpate::scene::collection::find_script;
 use palpate::server::identity::{self, Role};
 use palpate::wire;
 use palpate_proto::pb;
@@ -216,7 +216,7 @@ async fn a_script_of_the_server_is_the_commands_that_a_replay_sends() {
     let limits = Limits::default();
     let scene = Scene::load(Path::new("scenes/paper.toml"), &[], &limits).unwrap();
     for script_name in listed {
-        let script = Script::load(Path::new(&script_name), &scene, &limits).unwrap();
+        let script = find_script(Path::new(&script_name), &scene, &limits).unwrap();
         let request = pb::GetScriptRequest { session_id: session_id.clone(), script_name };
         let mut parts = sessions.get_script(request).await.unwrap().into_inner();
         let mut commands = Vec::new();

@@ -138,11 +138,16 @@ fn a_bad_scene_is_refused_with_file_line_and_key() {
         ),
         ("spacing_m = 0.05", "spacing_m = 0.05\ncolour = 1", "scene.toml:6: sheet.colour: unknown key"),
         ("spacing_m = 0.05\n", "", "scene.toml:3: sheet.spacing_m: is missing"),
-        ("spacing_m = 0.05", "spacingm = 0.05", "scene.toml:5: sheet.spacingm: unknown key; `spacing_m` is meant?"),
+        ("spacing_m = 0.05", "spacingm = 0.05", "scene.toml:5: sheet.spacingm: unknown key; did you mean `spacing_m`?"),
         ("points = [9, 7]", "points = [0, 7]", "scene.toml:4: sheet.points: must be at least 1"),
         ("points = [9, 7]", "points = [1000000000, 1]", "scene.toml:4: sheet.points"),
         ("points = [9, 7]", "points = [9, 7, 1]", "scene.toml:4: sheet.points: must be a list of two"),
-        ("points = [9, 7]", "points = [9.5, 7]", "scene.toml:4: sheet.points[0]"),
+        ("points = [9, 7]", "points = [9.5, 7]", "scene.toml:4: sheet.points[0]: must be a whole number, but is 9.5"),
+        ("points = [9, 7]", "points = [61.0, 7]", "sheet.points[0]: must be a whole number, but is 61.0: write 61"),
+        ("spacing_m = 0.05", "spacing_m = \"0.05\"", "must be a number, but is a string: write 0.05 without"),
+        ("[springs]", "[spring]", "scene.toml:8: spring: unknown key; did you mean `springs`?"),
+        ("[springs]", "fixed = \"edge\"\n[springs]", "but is `edge`; did you mean `edges`?"),
+        ("[damping]", "[stepping]\nintegrator = \"centrl\"\n[damping]", "but is `centrl`; did you mean `central`?"),
         ("points = [9, 7]", "points = [-9, 7]", "scene.toml:4: sheet.points[0]: must be 0 or more"),
         ("[damping]", "[friction]", "scene.toml:1: damping: is missing"),
         ("[damping]", "[friction]\n[damping]", "scene.toml:14: friction: unknown key; known here: name, sheet"),
@@ -190,6 +195,8 @@ fn a_bad_script_is_refused_with_file_line_and_key() {
         ("falloff_offset = 0.0", "falloff_offset = 10.0", "above the limit of 10000 N"),
         ("falloff_per_m = 60.0", "falloff_per_m = -1.0", "script.toml:8: force[0].falloff_per_m"),
         ("falloff_per_m = 60.0", "falloff = 60.0", "script.toml:8: force[0].falloff: unknown key"),
+        (profile, "profile = { type = \"puls\" }", "but is `puls`; did you mean `pulse`?"),
+        (profile, "profile = { type = \"pulse\", on_s = 0.1 }", "force[0].profile.off_s: is missing"),
         (profile, "profile = { type = \"wave\" }", "force[0].profile.type: must be one of constant, pulse"),
         (profile, "profile = { type = \"constant\", on_s = 1.0 }", "force[0].profile.on_s: unknown key"),
         (profile, "profile = { type = \"pulse\", on_s = 0.2, off_s = 0.1 }", "force[0].profile.off_s"),
@@ -339,6 +346,72 @@ fn scenes_and_scripts_are_found_by_name() {
         &palpate(&["run", "yours", "mine"]),
         &["there is no scene `yours`; there are fibrotic, liver, mine, paper, stomach"],
     );
+    refused(&palpate(&["run", "liverr", "mine"]), &["there is no scene `liverr`", "; did you mean `liver`?"]);
+    refused(
+        &palpate(&["run", "paper", "vertcal-60"]),
+        &["there is no script `vertcal-60`; there are mine, oblique", "; did you mean `vertical-60`?"],
+    );
+    // Built in, without a file of that name.
+    assert_eq!(lines(&palpate(&["run", "paper", "vertical-60"]))[0]["run"]["script"], "vertical-60");
+}
+
+#[test]
+fn a_scene_and_a_script_that_are_swapped_are_told_apart() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("scene.toml"), SCENE).unwrap();
+    std::fs::write(folder.path().join("script.toml"), SCRIPT).unwrap();
+    let palpate = |arguments: &[&str]| {
+        Command::new(env!("CARGO_BIN_EXE_palpate")).args(arguments).current_dir(folder.path()).output().unwrap()
+    };
+    let order = "give the scene first, then the script";
+    refused(&palpate(&["run", "script.toml", "scene.toml"]), &["script.toml: is a script: ", order]);
+    refused(&palpate(&["run", "paper", "scene.toml"]), &["scene.toml: is a scene: ", order]);
+    refused(&palpate(&["run", "vertical-60", "paper"]), &["there is no scene `vertical-60`", "is a script: ", order]);
+    refused(&palpate(&["run", "paper", "liver"]), &["there is no script `liver`", "`liver` is a scene: ", order]);
+}
+
+/// What `palpate check` prints.
+fn checked(folder: &Path, arguments: &[&str]) -> String {
+    let mut program = Command::new(env!("CARGO_BIN_EXE_palpate"));
+    let output = program.arg("check").args(arguments).current_dir(folder).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout).unwrap()
+}
+
+#[test]
+fn check_tells_what_to_expect_and_warns_of_what_can_not_be_meant() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let liver = checked(folder, &["liver"]);
+    for part in
+        ["size          0.075 m × 0.075 m (75 mm × 75 mm), 63.7 g in all", "N/m where a disc of 5 mm radius", "rest  "]
+    {
+        assert!(liver.contains(part), "no `{part}` in: {liver}");
+    }
+    assert!(!liver.contains("warning"), "{liver}");
+    // The documentation's stiffness of liver under a flat punch of 5 mm.
+    let line = liver.lines().find(|line| line.starts_with("fingertip")).unwrap();
+    let stiffness: f64 = line.split_whitespace().nth(1).unwrap().parse().unwrap();
+    assert!((60.0..82.0).contains(&stiffness), "{line}");
+    let wrong = checked(folder, &["liver", "--set", "sheet.spacing_m=2.5", "--set", "sheet.point_mass_kg=0.6"]);
+    assert!(wrong.contains("warning: the sheet is 75 m long, more than 10 m"), "{wrong}");
+    assert!(wrong.contains("warning: a point weighs 0.6 kg, more than 0.1 kg"), "{wrong}");
+    std::fs::write(folder.join("script.toml"), SCRIPT.replace("-1.0]", "-1000.0]").replace("60.0", "300.0")).unwrap();
+    let through = checked(folder, &["liver", "script.toml"]);
+    assert!(through.contains("warning: force[0]: ") && through.contains("it goes through"), "{through}");
+}
+
+#[test]
+fn a_run_that_leaves_its_sheet_warns_at_the_end() {
+    let warned = |force: &str| {
+        let output = run(SCENE, &SCRIPT.replace("-1.0]", force), &[]);
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        String::from_utf8(output.stderr).unwrap()
+    };
+    assert_eq!(warned("-1.0]"), "");
+    let far = warned("-1000.0]");
+    assert!(far.contains("palpate: warning: the largest displacement was "), "{far}");
+    assert!(far.contains("more than the tissue's longest side, 0.400 m"), "{far}");
 }
 
 #[test]

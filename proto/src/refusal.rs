@@ -201,6 +201,38 @@ pub fn label(field: &str, label: &str) -> Result<()> {
     Ok(())
 }
 
+/// The name that `given` is probably meant to be: one that begins with it, or the nearest by its letters, of which the last
+/// may be left out. None if no name is near.
+pub fn nearest<'n>(given: &str, names: impl IntoIterator<Item = &'n str>) -> Option<&'n str> {
+    // A shorter beginning could be that of anything.
+    const LEAST_BEGINNING: usize = 3;
+    const LEAST_MISSPELT: usize = 5;
+    let given = given.trim().to_lowercase();
+    let letters = given.chars().count();
+    let most = (letters / 3).clamp(1, 3);
+    let misses = |name: &str| {
+        let begins = letters >= LEAST_BEGINNING && name.starts_with(&given);
+        // A beginning is nearer than any misspelling.
+        let apart = if begins { 0 } else { strsim::damerau_levenshtein(&given, &name.to_lowercase()) };
+        let beginning = |count: usize| name.chars().take(count).collect::<String>().to_lowercase();
+        let of_beginning = if letters < LEAST_MISSPELT {
+            usize::MAX
+        } else {
+            let counts = [letters - 1, letters, letters + 1].into_iter();
+            counts.map(|count| 1 + strsim::damerau_levenshtein(&given, &beginning(count))).min().unwrap_or(usize::MAX)
+        };
+        let apart = apart.min(of_beginning);
+        (apart <= most && apart < name.chars().count().max(letters)).then_some(apart)
+    };
+    let near = names.into_iter().filter_map(|name| Some((misses(name)?, name)));
+    near.min_by_key(|(apart, _)| *apart).map(|(_, name)| name)
+}
+
+/// "; did you mean `NAME`?", to be put behind a refusal of `given`; empty if no name is near.
+pub fn did_you_mean<'n>(given: &str, names: impl IntoIterator<Item = &'n str>) -> String {
+    nearest(given, names).map_or(String::new(), |name| format!("; did you mean `{name}`?"))
+}
+
 /// The beginning of what a client sent: a message is no place for megabytes.
 pub fn excerpt(text: &str) -> String {
     text.chars().take(64).collect()
@@ -209,6 +241,27 @@ pub fn excerpt(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_name_is_meant_that_begins_so_or_differs_by_a_letter_or_two() {
+        let names = ["edges", "corners", "vertical-60", "exponential2", "exponential4", "k"];
+        for (given, meant) in [
+            ("edge", Some("edges")),
+            ("Edges", Some("edges")),
+            ("cornres", Some("corners")),
+            ("vertcal-60", Some("vertical-60")),
+            ("vertical", Some("vertical-60")),
+            ("vertcal", Some("vertical-60")),
+            ("exponentail4", Some("exponential4")),
+            ("middle", None),
+            ("c", None),
+            ("", None),
+        ] {
+            assert_eq!(nearest(given, names), meant, "{given}");
+        }
+        assert_eq!(did_you_mean("edge", names), "; did you mean `edges`?");
+        assert_eq!(did_you_mean("middle", names), "");
+    }
 
     #[test]
     fn what_a_client_sent_moves_no_cursor_and_begins_no_line() {

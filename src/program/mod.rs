@@ -1,5 +1,6 @@
 //! The program `palpate`: one file for each subcommand, and what they share.
 
+pub(crate) mod certificate;
 pub(crate) mod check;
 pub(crate) mod client;
 pub(crate) mod render;

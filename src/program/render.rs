@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use palpate::render::{self, Film, View};
-use palpate::scene::script::Script;
+use palpate::scene::collection::find_script;
 use palpate::surface::Refinement;
 use palpate::texture;
 
@@ -57,7 +57,7 @@ pub(crate) fn render(arguments: &RenderArguments) -> Result<(), Failure> {
         return Err(refused("frames-hz", format!("must be from 1 to 50, but is {}", arguments.frames_hz)));
     }
     let (model, limits) = compile(&arguments.scene)?;
-    let script = Script::load(&arguments.script, &model.scene, &limits)?;
+    let script = find_script(&arguments.script, &model.scene, &limits)?;
     for warning in model.warnings.iter().chain(&script.warnings) {
         say!("palpate: warning: {warning}");
     }

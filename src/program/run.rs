@@ -3,7 +3,7 @@
 use std::io::{BufWriter, Write};
 use std::path::PathBuf;
 
-use palpate::scene::script::Script;
+use palpate::scene::collection::find_script;
 use palpate::session::run;
 
 use super::scene::{SceneArguments, compile};
@@ -31,7 +31,7 @@ pub(crate) struct RunArguments {
 /// Plays a script on a scene and writes its records.
 pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     let (model, limits) = compile(&arguments.scene)?;
-    let script = Script::load(&arguments.script, &model.scene, &limits)?;
+    let script = find_script(&arguments.script, &model.scene, &limits)?;
     for warning in model.warnings.iter().chain(&script.warnings) {
         say!("palpate: warning: {warning}");
     }
@@ -53,6 +53,11 @@ pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
         Err(run::Failure::Output(e)) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
         Err(run::Failure::Refused(refusal)) => Err(refusal.into()),
         Err(failure) => Err(Failure::Failed(failure.to_string())),
-        Ok(summary) => summary.fault().map_or(Ok(()), |fault| Err(Failure::Failed(fault))),
+        Ok(summary) => {
+            for warning in &summary.warnings {
+                say!("palpate: warning: {warning}");
+            }
+            summary.fault().map_or(Ok(()), |fault| Err(Failure::Failed(fault)))
+        }
     }
 }

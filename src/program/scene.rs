@@ -1,12 +1,11 @@
 //! The scene that several subcommands take.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use palpate::limits::Limits;
 use palpate::refusal::Refusal;
-use palpate::scene::Scene;
-use palpate::server::catalog::Catalog;
+use palpate::scene::collection::find_scene;
 use palpate::sheet::Model;
 
 use super::{Failure, load_config};
@@ -36,13 +35,7 @@ pub(super) fn compile(arguments: &SceneArguments) -> Result<(Arc<Model>, Limits)
     // No other caller waits here.
     limits.rehearsal_work = limits.rehearsal_work.saturating_mul(OFFLINE_WORK);
     let path = &arguments.scene;
-    let scene = match path.to_str() {
-        // A plain word that is not a file is a scene's name.
-        Some(name) if !path.is_file() && path.components().count() == 1 && path.extension().is_none() => {
-            Catalog::new(&arguments.scenes, Path::new("scripts")).load(name, &arguments.set, &limits)?
-        }
-        _ => Scene::load(path, &arguments.set, &limits)?,
-    };
+    let scene = find_scene(path, &arguments.scenes, &arguments.set, &limits)?;
     // An error of compilation belongs to no single line.
     let in_scene = |refusal: Refusal| Refusal { place: Some(path.display().to_string()), ..refusal };
     Ok((Model::compile(&scene, &limits).map_err(in_scene)?, limits))

@@ -8,7 +8,7 @@ use std::path::Path;
 use glam::{DVec2, DVec3};
 use toml::de::{DeTable, DeValue};
 
-use crate::refusal::{Reason, Refusal, Result, finite};
+use crate::refusal::{Reason, Refusal, Result, did_you_mean, excerpt, finite, nearest};
 
 /// A parsed text.
 #[derive(Debug)]
@@ -122,6 +122,16 @@ impl Document {
         Ok(())
     }
 
+    /// Whether it has this key.
+    pub fn has(&self, key: &str) -> bool {
+        matches!(&self.root.value, Value::Table(entries) if entries.contains_key(key))
+    }
+
+    /// A refusal of the whole document.
+    pub fn refuse(&self, reason: Reason, message: impl Into<String>) -> Refusal {
+        Refusal { place: Some(self.name.clone()), ..Refusal::new(reason, "", message) }
+    }
+
     /// Reads the whole document as fields.
     ///
     /// # Errors
@@ -232,7 +242,8 @@ impl<'a> Fields<'a> {
     /// # Errors
     /// Refuses the table if the key is missing.
     pub fn required(&mut self, key: &'static str) -> Result<Item<'a>> {
-        self.item(key).ok_or_else(|| match self.entries.keys().find(|there| is_meant(there, key)) {
+        let unknown: Vec<&String> = self.entries.keys().filter(|there| !self.known.contains(&there.as_str())).collect();
+        self.item(key).ok_or_else(|| match unknown.into_iter().find(|there| meant(there, [key]).is_some()) {
             Some(there) => self.misspelt(there, key),
             None => self.refuse(Reason::Missing, key, "is missing"),
         })
@@ -240,8 +251,8 @@ impl<'a> Fields<'a> {
 
     fn misspelt(&self, there: &str, key: &str) -> Refusal {
         let message = match key.strip_prefix(there) {
-            Some(_) => format!("unknown key: the unit belongs to the name, `{key}`"),
-            None => format!("unknown key; `{key}` is meant?"),
+            Some(unit) if unit.starts_with('_') => format!("unknown key: the unit belongs to the name, `{key}`"),
+            _ => format!("unknown key; did you mean `{key}`?"),
         };
         self.refuse(Reason::UnknownKey, there, message)
     }
@@ -273,7 +284,8 @@ impl<'a> Fields<'a> {
     /// Refuses every key that was not asked for.
     fn done(&self) -> Result<()> {
         let Some(key) = self.entries.keys().find(|key| !self.known.contains(&key.as_str())) else { return Ok(()) };
-        Err(match self.known.iter().find(|known| !self.entries.contains_key(**known) && is_meant(key, known)) {
+        let absent = self.known.iter().copied().filter(|known| !self.entries.contains_key(*known));
+        Err(match meant(key, absent) {
             Some(known) => self.misspelt(key, known),
             None => {
                 let message = format!("unknown key; known here: {}", self.known.join(", "));
@@ -283,9 +295,11 @@ impl<'a> Fields<'a> {
     }
 }
 
-/// Whether `there` looks like `key` misspelt, or without its unit.
-fn is_meant(there: &str, key: &str) -> bool {
-    key.strip_prefix(there).is_some_and(|rest| rest.starts_with('_')) || strsim::damerau_levenshtein(there, key) <= 2
+/// The key that `there` is without its unit, or misspelt.
+fn meant<'k>(there: &str, keys: impl IntoIterator<Item = &'k str>) -> Option<&'k str> {
+    let keys: Vec<&str> = keys.into_iter().collect();
+    let unit_is_missing = |key: &&&str| key.strip_prefix(there).is_some_and(|rest| rest.starts_with('_'));
+    keys.iter().find(unit_is_missing).copied().or_else(|| nearest(there, keys.iter().copied()))
 }
 
 impl<'a> Item<'a> {
@@ -294,9 +308,27 @@ impl<'a> Item<'a> {
         Refusal::new(reason, &self.path, message)
     }
 
-    /// A refusal that says what was expected.
+    /// A refusal that says what was expected, and what was probably meant. Words that are allowed are in quotation marks.
     pub fn wrong(&self, expected: &str) -> Refusal {
-        self.refuse(Reason::WrongKind, format!("must be {expected}, but is {}", self.node.value.kind()))
+        let words: Vec<&str> = expected.split('"').skip(1).step_by(2).collect();
+        let is = match &self.node.value {
+            Value::Text(text) if !words.is_empty() => {
+                format!("`{}`{}", excerpt(text), did_you_mean(text, words.iter().copied()))
+            }
+            Value::Text(text) if expected.ends_with("number") && text.trim().parse::<f64>().is_ok() => {
+                format!("a string: write {} without quotation marks", text.trim())
+            }
+            Value::Text(text) if expected == "true or false" && ["true", "false"].contains(&text.as_str()) => {
+                format!("a string: write {text} without quotation marks")
+            }
+            #[allow(clippy::cast_possible_truncation)]
+            Value::Number(number) if expected.ends_with("a whole number") => {
+                let is_whole = number.fract() == 0.0 && number.abs() < 1e15;
+                if is_whole { format!("{number:?}: write {}", *number as i64) } else { format!("{number:?}") }
+            }
+            other => other.kind().to_owned(),
+        };
+        self.refuse(Reason::WrongKind, format!("must be {expected}, but is {is}"))
     }
 
     /// A finite number.

@@ -3,7 +3,9 @@
 
 pub mod action;
 pub mod check;
+pub mod collection;
 pub mod document;
+pub mod kind;
 pub mod profile;
 pub mod reader;
 pub mod record;
@@ -13,9 +15,10 @@ mod sheet;
 use std::path::{Path, PathBuf};
 
 use crate::limits::Limits;
-use crate::refusal::{Reason, Refusal, Result, not_negative, number};
+use crate::refusal::{Reason, Refusal, Result, did_you_mean, excerpt, not_negative, number};
 use crate::shape::RestShape;
 use document::{Document, Item};
+use kind::Kind;
 pub use sheet::{Fixed, PointSet, Sheet};
 
 /// The scene of the paper's figures, built in.
@@ -149,7 +152,9 @@ pub trait Named: Sized + Copy + PartialEq + 'static {
     fn named(field: &str, name: &str) -> Result<Self> {
         Self::NAMES.iter().find(|entry| entry.0 == name).map(|entry| entry.1).ok_or_else(|| {
             let names: Vec<_> = Self::NAMES.iter().map(|entry| entry.0).collect();
-            Refusal::new(Reason::WrongKind, field, format!("must be one of {}, but is `{name}`", names.join(", ")))
+            let meant = did_you_mean(name, names.iter().copied());
+            let message = format!("must be one of {}, but is `{}`{meant}", names.join(", "), excerpt(name));
+            Refusal::new(Reason::WrongKind, field, message)
         })
     }
 
@@ -262,6 +267,7 @@ impl Scene {
     /// Refuses a text or an assignment that is not a valid scene.
     pub fn parse(name: &str, text: &str, assignments: &[String], limits: &Limits) -> Result<Self> {
         let mut document = Document::parse(name, text)?;
+        Kind::Scene.check(&document)?;
         for assignment in assignments {
             document.set(assignment)?;
         }

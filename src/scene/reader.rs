@@ -1,7 +1,7 @@
 //! Reads a script from TOML and binds it to a scene: converts times to whole steps and points to places.
 
 use std::collections::BTreeSet;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
 use glam::DVec3;
@@ -9,20 +9,20 @@ use palpate_touch::{Coupling, Tip};
 
 use super::check::{check_force, check_free, check_reach, check_tip};
 use super::document::{self, Document, Fields, Item};
+use super::kind::Kind;
 use super::profile::{CentreProfile, LoadProfile, Moment, MotionProfile, Move, PoseProfile, Profile, StrengthProfile};
 use super::script::Script;
 use super::{Change, Scene};
 use crate::limits::Limits;
-use crate::refusal::{Reason, Refusal, Result, not_negative, number, positive};
+use crate::refusal::{Reason, Refusal, Result, did_you_mean, not_negative, number, positive};
 use crate::shape::{self, PointId, PointName};
 
 impl Script {
-    /// Reads a script, by its file or by its name in ./scripts, and binds it to `scene`.
+    /// Reads a script's file and binds it to `scene`.
     ///
     /// # Errors
     /// Refuses a script that can't be read, parsed or bound to the scene.
-    pub fn load(name: &Path, scene: &Scene, limits: &Limits) -> Result<Self> {
-        let path = &found(name);
+    pub fn load(path: &Path, scene: &Scene, limits: &Limits) -> Result<Self> {
         let text = document::read_text(path, limits.file_bytes)?;
         let folder = path.parent().unwrap_or(Path::new(""));
         Self::parse(&path.display().to_string(), &text, folder, scene, limits)
@@ -34,16 +34,9 @@ impl Script {
     /// Refuses a script that can't be parsed or bound to the scene.
     pub fn parse(name: &str, text: &str, folder: &Path, scene: &Scene, limits: &Limits) -> Result<Self> {
         let document = Document::parse(name, text)?;
+        Kind::Script.check(&document)?;
         document.read(|fields| Binding { folder, scene, limits, warnings: Vec::new() }.script(fields))
     }
-}
-
-/// The file of a script that is called by its file or by its name in ./scripts.
-pub fn found(name: &Path) -> PathBuf {
-    let mut named = Path::new("scripts").join(name).into_os_string();
-    named.push(".toml");
-    let named = PathBuf::from(named);
-    if !name.is_file() && named.is_file() { named } else { name.to_owned() }
 }
 
 /// A shorter move would need accelerations beyond the number range.
@@ -335,7 +328,8 @@ impl Binding<'_> {
                 return Ok(Err(self.trace(&file, &path)?));
             }
             other => {
-                let message = format!("must be one of constant, pulse, ramp, sine, trace, but is `{other}`");
+                let meant = did_you_mean(other, ["constant", "pulse", "ramp", "sine", "trace"]);
+                let message = format!("must be one of constant, pulse, ramp, sine, trace, but is `{other}`{meant}");
                 return Err(kind.refuse(Reason::WrongKind, message));
             }
         }))

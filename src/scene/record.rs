@@ -5,7 +5,7 @@ use std::io::Write;
 use serde::Serialize;
 
 use super::{Integrator, Named, Precision};
-use crate::shape::PointName;
+use crate::shape::{PointName, RestShape};
 
 /// The first line of a file of records.
 #[derive(Debug, Clone, Serialize)]
@@ -98,6 +98,9 @@ pub struct Summary {
     /// The newest recoveries, by ascending step.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub recoveries: Vec<Recovery>,
+    /// What a user should know of the run, in words. Not written.
+    #[serde(skip)]
+    pub warnings: Vec<String>,
     /// The additional measurements of a replay.
     #[serde(flatten, skip_serializing_if = "Option::is_none")]
     pub network: Option<Network>,
@@ -111,6 +114,17 @@ impl Summary {
             "the guard released all tools after step {step}, because {reason}: from there on the run differs from the script"
         ))
     }
+}
+
+/// Warns if a point moved farther than the tissue is long: then a unit is probably wrong.
+pub fn far_warning(largest_m: f64, shape: &dyn RestShape) -> Option<String> {
+    let longest_m = shape.longest_side_m();
+    (largest_m > longest_m).then(|| {
+        format!(
+            "the largest displacement was {largest_m:.3} m, more than the tissue's longest side, {longest_m:.3} m: look at the \
+             forces and the stiffness (`palpate check SCENE SCRIPT`)"
+        )
+    })
 }
 
 /// A measured error. Each part is relative to the largest component of its kind.

@@ -69,6 +69,7 @@ impl Fixed {
             Some("edges") => Ok(Fixed::Edges),
             Some("corners") => Ok(Fixed::Corners),
             Some(_) => Err(item.wrong("\"edges\", \"corners\" or a list of points")),
+            None if item.list().is_err() => Err(item.wrong("\"edges\", \"corners\" or a list of points")),
             None => Ok(Fixed::Points(item.list()?.iter().map(Item::point).collect::<Result<_>>()?)),
         }
     }

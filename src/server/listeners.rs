@@ -15,7 +15,7 @@ pub enum ServeError {
     #[error("{0}")]
     Refused(#[from] Refusal),
     /// The address is in use, or not one of this machine.
-    #[error("can't listen on {address}: {error}; try another --{field}, or port 0 for any free port")]
+    #[error("can't listen on {address}: {}", unavailable(.field, .error))]
     Listen {
         /// The configuration's key of the address.
         field: &'static str,
@@ -33,6 +33,25 @@ pub enum ServeError {
     /// The reflection service can't read its own descriptors.
     #[error("can't read the descriptors of the protocol: {0}")]
     Reflection(#[from] tonic_reflection::server::Error),
+}
+
+/// Why an address is not available, and what to do.
+fn unavailable(field: &str, error: &std::io::Error) -> String {
+    match error.kind() {
+        std::io::ErrorKind::AddrInUse => format!(
+            "another program, perhaps a server that still runs, listens there already ({error}); end it, or give another \
+             --{field}, such as port 0 for any free port"
+        ),
+        std::io::ErrorKind::AddrNotAvailable => {
+            format!(
+                "it is no address of this machine ({error}); give another --{field}, such as 0.0.0.0:7117 for all of them"
+            )
+        }
+        std::io::ErrorKind::PermissionDenied => {
+            format!("this user may not ({error}); give a --{field} with a port from 1024 on")
+        }
+        _ => format!("{error}; give another --{field}, such as port 0 for any free port"),
+    }
 }
 
 /// A server's listeners and its protection.

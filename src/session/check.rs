@@ -7,9 +7,11 @@ use std::sync::Arc;
 use glam::DVec3;
 
 use super::Session;
+use super::prospect::Prospect;
 use crate::limits::Limits;
 use crate::scene::Named;
 use crate::scene::profile::Poke;
+use crate::scene::script::Script;
 use crate::sheet::choice::{self, Choice};
 use crate::sheet::integrate::Oscillator;
 use crate::sheet::{Model, Push};
@@ -20,6 +22,7 @@ pub struct Report {
     model: Arc<Model>,
     /// The choices that could keep the tolerance.
     candidates: Vec<Choice>,
+    prospect: Prospect,
     /// Least and median time of a step, s; `None` if the step failed or would take too long.
     step_s: Option<[f64; 2]>,
 }
@@ -31,12 +34,13 @@ const LONGEST_STEP_S: f64 = 0.2;
 const WINDOWS: usize = 50;
 const WINDOW_S: f64 = 0.004;
 
-/// Reports on a scene, and times its step under a poke. `clock_s` returns the time.
-pub fn check(model: &Arc<Model>, limits: &Limits, clock_s: &dyn Fn() -> f64) -> Report {
+/// Reports on a scene and on a script for it, and times a step under a poke. `clock_s` returns the time.
+pub fn check(model: &Arc<Model>, script: Option<&Script>, limits: &Limits, clock_s: &dyn Fn() -> f64) -> Report {
     let candidates = choice::candidates(&model.scene, limits);
     Report {
         model: model.clone(),
         candidates,
+        prospect: Prospect::new(model, script),
         step_s: (model.predicted_step_s() <= LONGEST_STEP_S).then(|| time(model, clock_s)).flatten(),
     }
 }
@@ -87,6 +91,7 @@ impl fmt::Display for Report {
             model.shape().describe(),
             scene.stepping.rate_hz
         )?;
+        write!(f, "{}", self.prospect)?;
         let slowest = (sheet.virtual_stiffness_n_per_m / sheet.mass_kg).sqrt();
         writeln!(
             f,
@@ -140,7 +145,7 @@ impl fmt::Display for Report {
             let (integrator, precision) = (integrator.name(), precision.name());
             writeln!(f, "  {integrator:<15} {substeps:>8}  {precision:<11}  {expected_error:.1e}")?;
         }
-        for warning in &model.warnings {
+        for warning in model.warnings.iter().chain(&self.prospect.warnings) {
             writeln!(f, "\nwarning: {warning}")?;
         }
         Ok(())
@@ -161,7 +166,7 @@ mod tests {
         // Between two looks at this clock a whole window passes, whatever is done.
         let now_s = Cell::new(100.0);
         let clock_s = || now_s.replace(now_s.get() + WINDOW_S);
-        let report = check(&model, &Limits::default(), &clock_s);
+        let report = check(&model, None, &Limits::default(), &clock_s);
         assert!(report.step_s.unwrap().iter().all(|step_s| (step_s - WINDOW_S).abs() < 1e-9), "{:?}", report.step_s);
         let text = report.to_string();
         assert!(text.contains("vibrations decay by e in 0.0500 s"), "{text}");

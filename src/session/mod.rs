@@ -19,6 +19,7 @@ pub mod intake;
 pub mod laws;
 pub mod lease;
 pub mod local;
+mod prospect;
 pub mod queue;
 pub mod recovery;
 pub mod rules;

@@ -11,7 +11,7 @@ use super::intake::Intake;
 use crate::limits::Limits;
 use crate::refusal::{Refusal, Result};
 use crate::scene::Named;
-use crate::scene::record::{Correction, Line, Record, Run, Summary, write_line};
+use crate::scene::record::{Correction, Line, Record, Run, Summary, far_warning, write_line};
 use crate::scene::script::{Action, Script};
 use crate::sheet::audit::Finding;
 use crate::sheet::{Model, Tissue};
@@ -183,6 +183,7 @@ impl Playing<'_> {
         let mut written: std::io::Result<()> = Ok(());
         let mut windows = (self.twin.is_some() && model.scene.stepping.correct).then(Windows::default);
         let (mut stepping_s, mut resumed_s) = (0.0, clock_s());
+        let mut largest_m = 0.0_f64;
         for step in 0..script.steps {
             player.commands(step, &mut due)?;
             // The summary's clock stops during everything other than the session's own stepping.
@@ -209,6 +210,7 @@ impl Playing<'_> {
                     stepping_s += clock_s() - resumed_s;
                     if written.is_ok() {
                         let record = session.record(Some(&script.sample_points));
+                        largest_m = largest_m.max(session.tissue().largest_displacement_m());
                         self.twin.iter_mut().for_each(|twin| twin.compare(&record));
                         written = write_line(output, &Record { energy_j: Some(session.energy()), ..record });
                     }
@@ -228,7 +230,9 @@ impl Playing<'_> {
         stepping_s += clock_s() - resumed_s;
         let audited_error = self.twin.as_ref().map(Twin::error);
         let (corrections, recoveries) = (self.corrections, session.recoveries().list());
-        let summary = Summary { audited_error, corrections, recoveries, ..summary(session.tissue(), stepping_s) };
+        let warnings = far_warning(largest_m, model.shape()).into_iter().collect();
+        let summary =
+            Summary { audited_error, corrections, recoveries, warnings, ..summary(session.tissue(), stepping_s) };
         write_line(output, &Line::Summary(&summary))?;
         Ok(summary)
     }
@@ -282,6 +286,7 @@ pub fn summary(tissue: &dyn Tissue, wall_s: f64) -> Summary {
         audited_error: None,
         corrections: Vec::new(),
         recoveries: Vec::new(),
+        warnings: Vec::new(),
         network: None,
     }
 }

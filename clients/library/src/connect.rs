@@ -5,6 +5,7 @@ use std::net::IpAddr;
 use std::time::Duration;
 
 use palpate_proto::error;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tonic::metadata::{Ascii, MetadataValue};
 use tonic::service::Interceptor;
 use tonic::service::interceptor::InterceptedService;
@@ -79,6 +80,9 @@ pub struct Server {
     bearer: Bearer,
     /// Time limit for the connection and the first answer.
     patience: Duration,
+    is_secure: bool,
+    /// Host and port.
+    host: (String, u16),
 }
 
 /// Default time limit for the connection and the first answer.
@@ -114,6 +118,7 @@ impl Server {
             _ => return Err(refuse("must begin with http:// or https://")),
         };
         let host = uri.host().unwrap_or_default().trim_matches(['[', ']']).to_owned();
+        let port = uri.port_u16().unwrap_or(if secure { 443 } else { 80 });
         let is_here = host == "localhost" || host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback());
         if credentials.token.is_some() && !secure && !is_here {
             return Err(refuse("a token would be sent in the clear; the URL must begin with https://"));
@@ -130,7 +135,8 @@ impl Server {
             let why = "has no TLS, so certificates and their names mean nothing; the URL must begin with https://";
             return Err(refuse(why));
         }
-        Ok(Server { url: url_text, endpoint, bearer: Bearer(credentials.token.clone()), patience: PATIENCE })
+        let bearer = Bearer(credentials.token.clone());
+        Ok(Server { url: url_text, endpoint, bearer, patience: PATIENCE, is_secure: secure, host: (host, port) })
     }
 
     /// Sets the time limit for connecting.
@@ -147,18 +153,49 @@ impl Server {
     pub async fn connect(&self) -> Result<Channel, Error> {
         let unreached = |why: String| Error::Connection(format!("can't reach {}: {why}", self.url));
         let connecting = async {
-            let channel = self.endpoint.connect().await.map_err(|e| unreached(in_words(&root(&e))))?;
+            let channel = self.endpoint.connect().await.map_err(|e| (root(&e), in_words(&root(&e))))?;
             // Any answer will do, also a refusal.
             match HealthClient::new(channel.clone()).check(HealthCheckRequest::default()).await {
-                Err(status) if status.source().is_some() => Err(unreached(broken(&status))),
+                Err(status) if status.source().is_some() => Err((root(&status), broken(&status))),
                 _ => Ok(channel),
             }
         };
         let within_s = self.patience.as_secs_f64();
         let silent = |_| unreached(format!("it accepts the connection but has not answered within {within_s} s"));
-        let channel = tokio::time::timeout(self.patience, connecting).await.map_err(silent)??;
+        let connected = tokio::time::timeout(self.patience, connecting).await.map_err(silent)?;
+        let channel = match connected {
+            Ok(channel) => channel,
+            Err((root, _)) if self.is_secure && root.contains("InvalidContentType") => {
+                return Err(Error::Connection(self.other_scheme("does not speak TLS", "https", "http")));
+            }
+            Err((_, why)) => {
+                let speaks_tls = !self.is_secure && speaks_tls(&self.host).await;
+                let wrong = || Error::Connection(self.other_scheme("speaks TLS", "http", "https"));
+                return Err(if speaks_tls { wrong() } else { unreached(why) });
+            }
+        };
         Ok(InterceptedService::new(channel, self.bearer.clone()))
     }
+
+    /// What to say of a URL whose scheme is not the server's.
+    fn other_scheme(&self, does: &str, from: &str, to: &str) -> String {
+        let address = self.url.trim_start_matches(from).trim_start_matches("://").trim_end_matches('/');
+        format!("can't reach {}: the server at {address} {does}: use {to}://{address}", self.url)
+    }
+}
+
+/// Whether a server speaks TLS: it answers what is not TLS with an alert of TLS.
+async fn speaks_tls((host, port): &(String, u16)) -> bool {
+    const ALERT: [u8; 2] = [0x15, 0x03];
+    const PATIENCE: Duration = Duration::from_secs(1);
+    let asked = async {
+        let mut stream = tokio::net::TcpStream::connect((host.as_str(), *port)).await?;
+        stream.write_all(b"GET / HTTP/1.0\r\n\r\n").await?;
+        let mut answer = [0; 2];
+        stream.read_exact(&mut answer).await?;
+        Ok::<bool, std::io::Error>(answer == ALERT)
+    };
+    matches!(tokio::time::timeout(PATIENCE, asked).await, Ok(Ok(true)))
 }
 
 /// The text that a program shows for a status: the server's message, or how the connection broke.

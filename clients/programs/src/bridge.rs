@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use glam::DVec3;
-use palpate_client::bridge::{Options, Session, Target, Tick, run};
+use palpate_client::bridge::{Options, Report, Session, Target, Tick, Traffic, run};
 use palpate_touch::{LimitCause, RenderingState, Tip};
 use serde_json::json;
 
@@ -11,7 +11,7 @@ use crate::credentials::CredentialOptions;
 use crate::simulated::random::Random;
 use crate::simulated::task::{LEAD_S, Task};
 use crate::simulated::{Simulated, device_named, hand_named};
-use crate::{Failure, interrupted, warn};
+use crate::{Failure, interrupted, table, warn};
 
 /// Arguments of `bridge`.
 #[derive(clap::Args)]
@@ -43,6 +43,12 @@ pub(crate) struct Arguments {
     /// Seed of the simulated hand's movements
     #[arg(long, default_value_t = 1)]
     seed: u64,
+    /// Keep the session that it made, for others: the server deletes it when nobody has used it for long
+    #[arg(long)]
+    keep_session: bool,
+    /// Print one JSON object instead of a table
+    #[arg(long)]
+    json: bool,
     /// Write time, place, force and state of each tick to this file (CSV); at most an hour
     #[arg(long, value_name = "FILE")]
     course: Option<std::path::PathBuf>,
@@ -56,7 +62,8 @@ const SCALE: f64 = 0.2;
 /// Runs a simulated device and prints the results.
 ///
 /// # Errors
-/// Returns an error if an argument is refused, no connection succeeds, or the course can't be written.
+/// Returns an error if an argument is refused, no connection succeeds or none stands at the end, or the course can't be
+/// written.
 pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
     let (hand, device) = (hand_named(&arguments.hand)?, device_named(&arguments.device)?);
     let seconds = arguments.seconds.unwrap_or(3600.0);
@@ -74,15 +81,26 @@ pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
     };
     let lasts = arguments.seconds.map(Duration::try_from_secs_f64).transpose();
     let lasts = lasts.map_err(|error| Failure::Refused(format!("--seconds: {error}")))?;
-    let options = Options { lasts, remembers: arguments.course.is_some(), warn: Some(Box::new(warn)) };
+    let (remembers, keeps_session) = (arguments.course.is_some(), arguments.keep_session);
+    let options = Options { lasts, remembers, keeps_session, warn: Some(Box::new(warn)) };
     let (_, served) = run(Simulated::new(device, hand, task, false), target, options, interrupted()).await?;
     if let Some(path) = &arguments.course {
         write_course(path, &served.course)?;
     }
+    if arguments.json {
+        crate::tell!("{}", as_json(&served));
+    } else {
+        table::print(&rows(&served));
+    }
+    served.lost.map_or(Ok(()), |error| Err(error.into()))
+}
+
+/// The results for programs.
+fn as_json(served: &Report) -> serde_json::Value {
     let traffic = served.traffic;
     let mut report = json!({
         "connections": traffic.connections, "samples": traffic.samples, "commands_refused": traffic.refused,
-        "late_ticks": served.late_ticks, "missed_ticks": served.missed_ticks,
+        "failed_attempts": traffic.failed, "late_ticks": served.late_ticks, "missed_ticks": served.missed_ticks,
     });
     if let Some(envelope) = &served.envelope {
         report["energy_j"] = json!(envelope.energy_j());
@@ -91,8 +109,28 @@ pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
             LimitCause::ALL.iter().map(|(reason, name)| ((*name).to_owned(), json!(envelope.count(*reason).0)));
         report["interventions_ticks"] = serde_json::Value::Object(counts.collect());
     }
-    crate::tell!("{report}");
-    Ok(())
+    report
+}
+
+/// The results for people.
+fn rows(served: &Report) -> Vec<(&'static str, String)> {
+    let Traffic { connections, samples, bytes, refused, failed } = served.traffic;
+    #[allow(clippy::cast_precision_loss)]
+    let kilobytes = bytes as f64 / 1e3;
+    let mut rows = vec![
+        ("connections", format!("{connections} (attempts that failed, and breaks: {failed})")),
+        ("samples received", format!("{samples}, {} kB", table::rounded(kilobytes))),
+        ("commands refused", refused.to_string()),
+        ("late ticks", format!("{} (skipped: {})", served.late_ticks, served.missed_ticks)),
+    ];
+    if let Some(envelope) = &served.envelope {
+        let is_on = envelope.state() == RenderingState::Enabled;
+        rows.push(("energy into the device", table::with_unit(envelope.energy_j(), "J")));
+        rows.push(("forces at the end", if is_on { "on" } else { "off" }.to_owned()));
+        let counts = LimitCause::ALL.iter().map(|(reason, name)| (*name, envelope.count(*reason).0));
+        rows.push(("limits that acted", table::acted(counts)));
+    }
+    rows
 }
 
 fn write_course(path: &std::path::Path, course: &[Tick]) -> Result<(), Failure> {

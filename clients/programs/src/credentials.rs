@@ -8,7 +8,7 @@ use crate::Failure;
 
 /// The caller's credentials, and which servers are trusted.
 #[derive(clap::Args, Debug, Clone, Default)]
-#[command(next_help_heading = "Credentials (a server on this machine usually needs none)")]
+#[command(next_help_heading = "Credentials, if the server wants any")]
 pub(crate) struct CredentialOptions {
     /// File with your token [or set the environment variable PALPATE_TOKEN to the token itself]
     #[arg(long, value_name = "FILE")]

@@ -30,6 +30,7 @@ mod plot;
 mod replay;
 mod scene_file;
 mod simulated;
+mod table;
 mod top;
 
 use std::process::ExitCode;
@@ -52,7 +53,7 @@ enum Command {
     #[command(after_help = "Examples:\n  \
         palpate-client replay vertical-60 --server http://127.0.0.1:7117\n  \
         palpate-client replay my-script.toml --scene my-scene.toml --output poke.jsonl --plot\n\n\
-        The session is created paused. Each command carries the step at which it acts and is sent ahead of time. So the\n\
+        The session is created paused. Each command carries the step at which it acts and is sent ahead of time. So the \
         final hash equals that of `palpate run --held`, whatever the network did, unless late commands are reported.\n\n\
         Exit status: 0; 1 when the replay failed; 2 when an input was refused.")]
     Replay(replay::Arguments),
@@ -63,10 +64,10 @@ enum Command {
         palpate-client link --rtt-ms 2 --deadband 0.1\n  \
         palpate-client link --boundary\n  \
         palpate-client link --random 1000\n\n\
-        A simulated hand presses and strokes the tissue (minimum jerk, 5 to 15 mm, drawn by the seed; less deep where the\n\
-        true force would exceed 0.8 of the device's). `true` is the same tissue without a delay at the tool's own place.\n\
-        Errors are taken over the ticks in which either is in contact. Energies are measured at the device's port: below 0\n\
-        the port has given energy. A run is unstable, and ends, when the port gave 0.1 J or the tool left three times the\n\
+        A simulated hand presses and strokes the tissue (minimum jerk, 5 to 15 mm, drawn by the seed; less deep where the \
+        true force would exceed 0.8 of the device's). `true` is the same tissue without a delay at the tool's own place. \
+        Errors are taken over the ticks in which either is in contact. Energies are measured at the device's port: below 0 \
+        the port has given energy. A run is unstable, and ends, when the port gave 0.1 J or the tool left three times the \
         task's amplitude. The loop runs the code of the server and of `bridge` itself.\n\n\
         Exit status: 0; 1 when a run failed; 2 when an input was refused, or the system has no memory for the sheet.")]
     Link(Box<link::Arguments>),
@@ -74,18 +75,20 @@ enum Command {
     #[command(after_help = "Examples:\n  \
         palpate-client bridge --server http://127.0.0.1:7117 --scene liver --seconds 10\n  \
         palpate-client bridge --scene fibrotic --device touch --deadband 0.1\n\n\
-        It reconnects by itself when the connection breaks; forces return when the operator asks for them. For a real device,\n\
-        implement `HapticDevice` of the crate palpate-client (clients/library).")]
+        It reconnects by itself when the connection breaks; forces return when the operator asks for them. It deletes the \
+        session that it made when it ends. For a real device, implement `HapticDevice` of the crate palpate-client \
+        (clients/library).\n\n\
+        Exit status: 0; 1 when no connection succeeded or none stood at the end; 2 when an input was refused.")]
     Bridge(bridge::Arguments),
     /// Load a server with many sessions, haptic clients and viewers; report delays, losses and dilation
     #[command(after_help = "Examples:\n  \
         palpate-client load --sessions 50 --seconds 10\n  \
         palpate-client load --sessions 20 --clients-per-session 2 --viewers 3 --scene liver --json\n  \
         palpate-client load --find-limit 'p99<2ms,dilation>0.999'\n\n\
-        Each client strokes the tissue with a command every tick of its own clock, whatever comes back: nothing rests, and a\n\
-        late answer delays no later command. The round trip lasts from a command to the first sample that acknowledges it\n\
-        and includes the wait for the step. Lost are commands that nothing acknowledged within 2 s of the end, and samples\n\
-        that the server dropped. The age of a frame is measured against the sample of the same step. On the server's\n\
+        Each client strokes the tissue with a command every tick of its own clock, whatever comes back: nothing rests, and a \
+        late answer delays no later command. The round trip lasts from a command to the first sample that acknowledges it \
+        and includes the wait for the step. Lost are commands that nothing acknowledged within 2 s of the end, and samples \
+        that the server dropped. The age of a frame is measured against the sample of the same step. On the server's \
         machine the generator takes processor time from it; the report says how much.\n\n\
         Exit status: 0; 1 when streams broke or the server could not be reached; 2 when an input was refused.")]
     Load(load::Arguments),
@@ -108,8 +111,8 @@ enum Command {
         palpate-client admin callers\n  \
         palpate-client admin streams 0123456789abcdef0123456789abcdef\n  \
         palpate-client admin cut-caller token:ann --delete-sessions --server https://server:7117 --token-file admin.token\n\n\
-        If the server authenticates clients, your token needs the role `administer`. Callers are named by their token or\n\
-        certificate, without authentication by their address. A caller that you cut can come back: remove its entry from\n\
+        If the server authenticates clients, your token needs the role `administer`. Callers are named by their token or \
+        certificate, without authentication by their address. A caller that you cut can come back: remove its entry from \
         the token file first.\n\n\
         Exit status: 0; 1 when the server can't be reached or refuses; 2 when an input was refused.")]
     Admin(admin::Arguments),
@@ -175,5 +178,32 @@ mod tests {
     #[test]
     fn the_arguments_of_all_subcommands_are_sound() {
         super::Arguments::command().debug_assert();
+    }
+
+    #[test]
+    fn help_fits_into_a_terminal_of_any_width() {
+        for width in [40, 80, 100, 160] {
+            for subcommand in super::Arguments::command().get_subcommands() {
+                let help = subcommand.clone().term_width(width).render_long_help().to_string();
+                for line in help.lines() {
+                    // Single words and the names of options can't be broken.
+                    let is_one = !line.trim().contains(' ') || line.trim().starts_with('-');
+                    let fits = line.chars().count() <= width || is_one;
+                    assert!(fits, "{} at {width} columns: {line}", subcommand.get_name());
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn paragraphs_of_help_are_wrapped_by_the_terminal_alone() {
+        for subcommand in super::Arguments::command().get_subcommands() {
+            let text = subcommand.get_after_help().map(ToString::to_string).unwrap_or_default();
+            let lines: Vec<&str> = text.lines().collect();
+            for pair in lines.windows(2) {
+                let is_text = |line: &str| !line.is_empty() && !line.starts_with(' ');
+                assert!(!(is_text(pair[0]) && is_text(pair[1])), "{}: {pair:?}", subcommand.get_name());
+            }
+        }
     }
 }

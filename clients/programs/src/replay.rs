@@ -10,7 +10,8 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 use palpate::limits::Limits;
-use palpate::scene::record::{Line, Network, Percentiles, Record, Run, Summary, write_line};
+use palpate::scene::collection::{find_script, scenes_of};
+use palpate::scene::record::{Line, Network, Percentiles, Record, Run, Summary, far_warning, write_line};
 use palpate::scene::script::Script;
 use palpate::shape;
 use palpate::wire;
@@ -54,9 +55,10 @@ pub(crate) struct Arguments {
     /// The server
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7117")]
     server: String,
-    /// Name of a scene of the server, or a scene file of your own (ends in .toml)
-    #[arg(long, value_name = "NAME", default_value = "paper")]
-    scene: String,
+    /// Name of a scene of the server, or a scene file of your own (ends in .toml) [default: the first that the script is made
+    /// for, or paper]
+    #[arg(long, value_name = "NAME")]
+    scene: Option<String>,
     /// Write the records here instead of to the standard output
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
@@ -74,9 +76,9 @@ pub(crate) struct Arguments {
 
 /// The samples that the server is to send. The records do not depend on them.
 #[derive(clap::Args)]
-#[command(next_help_heading = "Samples (forces on the tools, for --plot and the table) [default: one per step]")]
+#[command(next_help_heading = "Samples, for --plot and the table")]
 struct Sampling {
-    /// Sample every Nth step
+    /// Sample the forces on the tools every Nth step
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     every: u32,
     /// Skip samples whose force on the tool differs from the last sample's by at most this, N
@@ -135,7 +137,13 @@ struct Session {
 /// Returns an error if an input is refused, the server fails or is silent, or the output can't be written.
 pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
     let server = arguments.credentials.server(&arguments.server)?;
-    let source = source(&arguments.scene)?;
+    let scene = match &arguments.scene {
+        Some(scene) => scene.clone(),
+        None => {
+            scenes_of(&arguments.script, &Limits::default())?.into_iter().next().unwrap_or_else(|| "paper".to_owned())
+        }
+    };
+    let source = source(&scene)?;
     let unreached = |why| Failure::Failed(format!("{why}; `palpate serve` starts a server"));
     let channel = server.connect().await.map_err(unreached)?;
     let mut client = SessionServiceClient::new(channel.clone());
@@ -254,7 +262,7 @@ async fn play(
     let scene = created.scene.as_ref().ok_or_else(|| Failure::Failed("the server sent no scene".into()))?;
     let scene = wire::scene::from_scene(scene)?;
     let limits = Limits::default();
-    let script = Script::load(&arguments.script, &scene, &limits)?;
+    let script = find_script(&arguments.script, &scene, &limits)?;
     for warning in created.warnings.iter().chain(&script.warnings) {
         crate::say!("palpate-client: warning: {warning}");
     }
@@ -424,6 +432,7 @@ async fn play(
         audited_error: None,
         corrections: Vec::new(),
         recoveries,
+        warnings: far_warning(measured.largest_displacement_m, scene.shape()).into_iter().collect(),
         steps: script.steps,
         substeps,
         points,
@@ -444,6 +453,7 @@ async fn play(
         show(plot::draw("Force of the tissue on the tool along z, N", &measured.reaction));
     }
     table(arguments, &summary, &network, &measured);
+    summary.warnings.iter().for_each(|warning| crate::warn(warning));
     if measured.rejected > 0 {
         let why = "commands were rejected, so the run differs from the script";
         return Err(Failure::Failed(format!("{} {why}", measured.rejected)));

@@ -19,7 +19,7 @@ use tokio_stream::wrappers::ReceiverStream;
 
 use super::{Session, Target};
 use crate::Error;
-use crate::connect::Channel;
+use crate::connect::{Channel, Server};
 use crate::touch::Touch;
 
 /// The data that the network passes to the device's loop. Only the newest counts; neither waits for the other.
@@ -40,8 +40,10 @@ pub(super) struct Inbound {
     /// Of the newest connection.
     pub(super) newest: Option<LocalModel>,
     pub(super) traffic: Traffic,
-    /// Why the newest connection broke, or never came to be.
+    /// Why the newest connection broke, or never came to be; `None` while one stands.
     pub(super) failure: Option<Error>,
+    /// The session that was made for the target.
+    pub(super) made: Option<String>,
 }
 
 /// What went over the network, in all.
@@ -55,6 +57,8 @@ pub struct Traffic {
     pub bytes: u64,
     /// Commands that the server refused.
     pub refused: u64,
+    /// Attempts to connect that failed, and connections that broke.
+    pub failed: u64,
 }
 
 impl Shared {
@@ -84,24 +88,38 @@ pub(super) async fn keep(
     warn: &(impl Fn(&str) + Sync),
 ) {
     let mut pause = PAUSES[0];
-    let mut made = None;
+    // Attempts in a row.
+    let mut attempts = 0_u64;
     loop {
-        let before = shared.inbound().traffic.samples;
-        match connect(&target, &mut made, &device, shared, &mut commands, warn).await {
-            Ok(()) => return,
-            // Another attempt would be refused too.
-            Err(error) if error.is_refusal() && shared.inbound().traffic.connections == 0 => {
-                shared.inbound().failure = Some(error);
-                return;
-            }
-            Err(error) => {
-                warn(&format!("{error}; connecting again"));
-                shared.inbound().failure = Some(Error::Connection(format!("never connected: {error}")));
-            }
+        let before = shared.inbound().traffic;
+        let ended = connect(&target, &device, shared, &mut commands, warn).await;
+        let Err(error) = ended else { return };
+        let traffic = {
+            let mut inbound = shared.inbound();
+            inbound.traffic.failed += 1;
+            inbound.traffic
+        };
+        // Another attempt would be refused too.
+        if traffic.connections == 0 && (error.is_refusal() || is_denied(&error)) {
+            shared.inbound().failure = Some(error);
+            return;
         }
-        if shared.inbound().traffic.samples > before {
+        attempts = if traffic.connections > before.connections { 0 } else { attempts + 1 };
+        if traffic.samples > before.samples {
             pause = PAUSES[0];
         }
+        let tried = if attempts == 1 { "1 attempt".to_owned() } else { format!("{attempts} attempts") };
+        let since = match (traffic.connections, attempts) {
+            (0, _) => format!("never connected, in {tried}"),
+            (_, 0) => "the connection was lost".to_owned(),
+            _ => format!("the connection was lost, and {tried} to connect again failed"),
+        };
+        shared.inbound().failure = Some(Error::Connection(format!("{since}: {error}")));
+        let pause_s = pause.as_secs_f64();
+        warn(&match attempts {
+            0 => format!("{error}; connecting again in {pause_s:.1} s"),
+            _ => format!("{error}; attempt {attempts}, the next in {pause_s:.1} s"),
+        });
         // Commands of the meantime would be old later.
         let over = tokio::time::sleep(pause);
         tokio::pin!(over);
@@ -115,9 +133,29 @@ pub(super) async fn keep(
     }
 }
 
-/// The session of a target; `made` is the ID of the one that was made for it.
-async fn session(target: &Target, made: &mut Option<String>, channel: Channel) -> Result<pb::Session, Error> {
+/// Whether the server does not let the caller in.
+fn is_denied(error: &Error) -> bool {
+    use tonic::Code::{PermissionDenied, Unauthenticated};
+    matches!(error, Error::Call(status) if [Unauthenticated, PermissionDenied].contains(&status.code()))
+}
+
+/// Deletes the session that was made for the target, if there is one. A server that can't be reached deletes it later by
+/// itself.
+pub(super) async fn delete_made(server: Server, shared: &Shared) {
+    let made = shared.inbound().made.take();
+    let Some(session_id) = made else { return };
+    let deleting = async {
+        let mut sessions = SessionServiceClient::new(server.within(SILENCE).connect().await?);
+        sessions.delete_session(pb::DeleteSessionRequest { session_id }).await?;
+        Ok::<(), Error>(())
+    };
+    let _ = tokio::time::timeout(SILENCE, deleting).await;
+}
+
+/// The session of a target.
+async fn session(target: &Target, shared: &Shared, channel: Channel) -> Result<pb::Session, Error> {
     let mut sessions = SessionServiceClient::new(channel);
+    let made = shared.inbound().made.clone();
     let (id, scene) = match &target.session {
         Session::Existing(id) => (Some(id), None),
         Session::New { scene } => (made.as_ref(), Some(scene)),
@@ -136,10 +174,9 @@ async fn session(target: &Target, made: &mut Option<String>, channel: Channel) -
         let source = pb::create_session_request::Source::SceneName(scene.clone());
         let request = pb::CreateSessionRequest { source: Some(source), ..Default::default() };
         known = sessions.create_session(request).await?.into_inner().session;
+        shared.inbound().made = known.as_ref().map(|session| session.session_id.clone());
     }
-    let session = known.ok_or_else(|| broken("the server sent no session"))?;
-    *made = Some(session.session_id.clone());
-    Ok(session)
+    known.ok_or_else(|| broken("the server sent no session"))
 }
 
 /// The middle of a session's sheet, m.
@@ -163,14 +200,13 @@ fn law(message: &pb::ForceLaw) -> Result<Law, Error> {
 /// One connection, until it breaks or `commands` ends.
 async fn connect(
     target: &Target,
-    made: &mut Option<String>,
     device: &Device,
     shared: &Shared,
     commands: &mut mpsc::Receiver<Command>,
     warn: &(impl Fn(&str) + Sync),
 ) -> Result<(), Error> {
     let channel = target.server.clone().within(SILENCE).connect().await?;
-    let session = session(target, made, channel.clone()).await?;
+    let session = session(target, shared, channel.clone()).await?;
     let middle_m = middle_m(&session)?;
     let (outbound, messages) = mpsc::channel(COMMANDS);
     let open = pb::TouchOpen {
@@ -195,6 +231,7 @@ async fn connect(
     {
         let mut inbound = shared.inbound();
         inbound.traffic.connections += 1;
+        inbound.failure = None;
         (inbound.law, inbound.further) = (Some(first), Vec::new());
         (inbound.newest, inbound.middle_m) = (None, middle_m);
     }

@@ -44,7 +44,7 @@ pub struct Target {
 pub enum Session {
     /// The session with this ID.
     Existing(String),
-    /// A new one, and again a new one if the server has forgotten it.
+    /// A new one, and again a new one if the server has forgotten it. It is deleted at the end.
     New {
         /// The name of a scene of the server.
         scene: String,
@@ -61,15 +61,18 @@ pub struct Options {
     pub lasts: Option<Duration>,
     /// Keeps the course and the ages of the models, of at most an hour.
     pub remembers: bool,
+    /// Keeps the session that was made for the target, for others; the server deletes it when nobody has used it for long.
+    pub keeps_session: bool,
     /// Called when the connection breaks, and with the server's warnings.
     pub warn: Option<Warn>,
 }
 
 impl fmt::Debug for Options {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Options { lasts, remembers, warn } = self;
-        let warns = warn.is_some();
-        f.debug_struct("Options").field("lasts", lasts).field("remembers", remembers).field("warn", &warns).finish()
+        let Options { lasts, remembers, keeps_session, warn } = self;
+        let mut fields = f.debug_struct("Options");
+        fields.field("lasts", lasts).field("remembers", remembers).field("keeps_session", keeps_session);
+        fields.field("warn", &warn.is_some()).finish()
     }
 }
 
@@ -88,6 +91,8 @@ pub struct Report {
     pub missed_ticks: u64,
     /// What went over the network.
     pub traffic: Traffic,
+    /// Why there was no connection any more at the end.
+    pub lost: Option<Error>,
 }
 
 /// Connects a device until its time is over or `stop` completes. Returns the device and the results. The last force written
@@ -102,7 +107,8 @@ pub async fn run<D: HapticDevice + 'static>(
     options: Options,
     stop: impl Future<Output = ()> + Send + 'static,
 ) -> Result<(D, Report), Error> {
-    let Options { lasts, remembers, warn } = options;
+    let Options { lasts, remembers, keeps_session, warn } = options;
+    let server = target.server.clone();
     let shared = Arc::new(Shared::default());
     let (commands, received) = mpsc::channel(line::COMMANDS);
     let descriptor = device.descriptor();
@@ -131,12 +137,15 @@ pub async fn run<D: HapticDevice + 'static>(
     let (device, served) = ended.await.map_err(|_| Error::Internal("the device's loop panicked".to_owned()))?;
     // The task may wait for an answer that never arrives.
     network.shutdown().await;
+    if !keeps_session {
+        line::delete_made(server, &shared).await;
+    }
     let tick::Served { course, envelope, late_ticks, missed_ticks, ages_s } = served?;
     let mut inbound = shared.inbound();
-    let traffic = inbound.traffic;
+    let (traffic, lost) = (inbound.traffic, inbound.failure.take());
     if traffic.connections == 0 {
         let silent = || Error::Connection("never connected: the server did not answer in time".to_owned());
-        return Err(inbound.failure.take().unwrap_or_else(silent));
+        return Err(lost.unwrap_or_else(silent));
     }
-    Ok((device, Report { course, ages_s, envelope, late_ticks, missed_ticks, traffic }))
+    Ok((device, Report { course, ages_s, envelope, late_ticks, missed_ticks, traffic, lost }))
 }

@@ -36,8 +36,11 @@ pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failur
         holder: "palpate-client link".to_owned(),
     };
     let lasts = Some(Duration::from_secs_f64(*duration_s));
-    let options = Options { lasts, remembers: true, warn: Some(Box::new(warn)) };
+    let options = Options { lasts, remembers: true, warn: Some(Box::new(warn)), ..Options::default() };
     let (simulated, mut served) = bridge::run(simulated, target, options, interrupted()).await?;
+    if let Some(error) = &served.lost {
+        warn(&error.to_string());
+    }
     let mut totals = Totals::default();
     with_tissue(|| {
         let mut twin = Twin::new(Tissue::new(model, *tip, law.clone()));

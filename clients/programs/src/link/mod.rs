@@ -8,7 +8,7 @@ mod random;
 mod run;
 mod tissue;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use clap::{Args, ValueEnum};
@@ -16,15 +16,16 @@ use palpate::force_law;
 use palpate::limits::Limits;
 use palpate::memory;
 use palpate::scene::check::check_tip;
-use palpate::scene::{BUILT_IN, Scene};
+use palpate::scene::collection::find_scene;
 use palpate::sheet::Model;
-use palpate_proto::refusal::{Reason, Refusal, number};
+use palpate_proto::refusal::{Refusal, number};
 use palpate_touch::Tip;
 use serde_json::{Value, json};
 
 use crate::Failure;
 use crate::credentials::CredentialOptions;
 use crate::simulated::{device_named, hand_named};
+use crate::table;
 use network::Conditions;
 use run::{Outcome, Rendering, Setup, run};
 
@@ -144,15 +145,91 @@ pub(crate) async fn link(arguments: &Arguments) -> Result<(), Failure> {
         }
         std::fs::write(path, text).map_err(|error| Failure::Failed(format!("{}: {error}", path.display())))?;
     }
-    let figures = figures(&setup, &outcome);
     if arguments.json {
-        crate::tell!("{figures}");
-    } else if let Value::Object(fields) = figures {
-        for (name, value) in fields {
-            crate::tell!("{name:<26} {value}");
-        }
+        crate::tell!("{}", figures(&setup, &outcome));
+    } else {
+        table::print(&rows(&setup, &outcome, arguments.server.as_deref()));
     }
     Ok(())
+}
+
+/// The figures of a run for people; `server` is that of a run in real time.
+fn rows(setup: &Setup, outcome: &Outcome, server: Option<&str>) -> Vec<(&'static str, String)> {
+    let (scene, hand, device) = (&setup.model.scene.name, setup.hand.name, setup.device.name);
+    let scheme = format!("{:?}", setup.scheme).to_lowercase();
+    let Conditions { round_trip_s, jitter_s, loss } = setup.conditions;
+    let network = match server {
+        Some(url) => format!("the real one, to {url}"),
+        None => {
+            let [round_trip, jitter] = [round_trip_s, jitter_s].map(|time_s| table::rounded(1e3 * time_s));
+            format!("{round_trip} ms round trip, ± {jitter} ms each way, {} lost", table::percent(loss))
+        }
+    };
+    let unstable =
+        outcome.unstable_at_s.map_or("no".to_owned(), |at_s| format!("yes, after {} s", table::rounded(at_s)));
+    let or_none = |value: Option<f64>, show: &dyn Fn(f64) -> String| value.map_or("none".to_owned(), show);
+    let [limited, dropped, released] = outcome.path;
+    let mut rows = vec![
+        ("scene", format!("{scene}, {hand} hand, device {device}, rendering {scheme}")),
+        ("network", network),
+        ("duration", format!("{} s, seed {}", table::rounded(setup.duration_s), setup.seed)),
+        ("depths of the task", format!("{} of the whole", table::percent(outcome.scale))),
+        (
+            "force error",
+            format!(
+                "{} rms, {} in the 99th percentile",
+                or_none(outcome.force_error_rms_percent, &|error| format!("{} %", table::rounded(error))),
+                table::with_unit(outcome.force_error_p99_n, "N")
+            ),
+        ),
+        (
+            "largest force",
+            format!(
+                "{} rendered, {} true",
+                table::with_unit(outcome.force_max_n, "N"),
+                table::with_unit(outcome.true_force_max_n, "N")
+            ),
+        ),
+        ("force rendered", format!("{} of the true one", or_none(outcome.rendered_share, &table::percent))),
+        ("largest jump", format!("{} in a tick", table::with_unit(outcome.jump_max_n, "N"))),
+        (
+            "least energy at the port",
+            format!("{} (below 0: it gave some)", table::with_unit(outcome.energy_min_j, "J")),
+        ),
+        ("passivity acted", format!("in {} of the ticks", table::percent(outcome.guard_share))),
+        ("unstable", unstable),
+        ("pauses, faults", format!("{}, {}", outcome.pauses, outcome.faults)),
+        (
+            "samples",
+            format!(
+                "{} a second, {} kbit/s",
+                table::rounded(outcome.packets_per_s),
+                table::rounded(outcome.kbit_per_s)
+            ),
+        ),
+        ("commands", format!("{} a second", table::rounded(outcome.commands_per_s))),
+        (
+            "age of the model",
+            or_none(outcome.model_age_ms_p99, &|age_ms| {
+                format!("{} ms in the 99th percentile", table::rounded(age_ms))
+            }),
+        ),
+        (
+            "path of the tool",
+            format!("{limited} steps at the speed limit, {dropped} commands dropped, {released} releases"),
+        ),
+        ("limits that acted", table::acted(outcome.interventions.iter().copied())),
+    ];
+    if setup.stall_s > 0.0 {
+        rows.insert(2, ("stalls of the client", format!("{} ms once a second", table::rounded(1e3 * setup.stall_s))));
+    }
+    if setup.deadband > 0.0 {
+        rows.insert(2, ("deadband", table::percent(setup.deadband)));
+    }
+    if let Some(late) = outcome.late_ticks {
+        rows.push(("late ticks", late.to_string()));
+    }
+    rows
 }
 
 /// Does something with a tissue.
@@ -161,27 +238,6 @@ pub(crate) async fn link(arguments: &Arguments) -> Result<(), Failure> {
 /// Returns an error if the system has no memory for the tissue (exit status 2), or if the guard stops it (1).
 fn with_tissue<T>(work: impl FnOnce() -> Result<T, String>) -> Result<T, Failure> {
     memory::attempt("--scene", || Ok(work()))?.map_err(Failure::Failed)
-}
-
-/// Loads a scene file, a scene in ./scenes, or a built-in scene.
-///
-/// # Errors
-/// Returns an error if there is no such scene, or if it is invalid.
-fn scene_named(name: &std::path::Path, limits: &Limits) -> Result<Scene, Refusal> {
-    let mut beside = std::path::Path::new("scenes").join(name).into_os_string();
-    beside.push(".toml");
-    let beside = PathBuf::from(beside);
-    let built_in = name.to_str().and_then(|name| BUILT_IN.iter().find(|scene| scene.0 == name));
-    match built_in {
-        _ if name.is_file() => Scene::load(name, &[], limits),
-        _ if beside.is_file() => Scene::load(&beside, &[], limits),
-        Some((name, text)) => Scene::parse(name, text, &[], limits),
-        None => {
-            let names: Vec<&str> = BUILT_IN.iter().map(|scene| scene.0).collect();
-            let message = format!("there is no scene `{}`; the built-in ones are {}", name.display(), names.join(", "));
-            Err(Refusal::new(Reason::UnknownScene, "--scene", message))
-        }
-    }
 }
 
 fn setup(arguments: &Arguments) -> Result<Setup, Refusal> {
@@ -206,7 +262,9 @@ fn setup(arguments: &Arguments) -> Result<Setup, Refusal> {
     let stalls = "from 0 to 1000";
     let stall_s = 1e-3 * number("--stall-ms", arguments.stall_ms, stalls, |v| (0.0..=1000.0).contains(&v))?;
     let deadband = number("--deadband", arguments.deadband, "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
-    let scene = scene_named(&arguments.scene, &limits)?;
+    let scene = find_scene(&arguments.scene, Path::new("scenes"), &[], &limits).map_err(|refusal| {
+        if refusal.place.is_none() { Refusal { field: "--scene".to_owned(), ..refusal } } else { refusal }
+    })?;
     let tip = Tip { radius_m: arguments.radius_m, friction: arguments.friction, ..Tip::default() };
     check_tip("--tip", scene.shape(), &tip)?;
     let model = Model::compile(&scene, &limits)?;

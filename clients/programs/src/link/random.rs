@@ -17,6 +17,7 @@ use super::run::{Outcome, Setup, run};
 use super::{Arguments, figures};
 use crate::Failure;
 use crate::simulated::random::Random;
+use crate::table;
 
 /// Tissues of the random runs.
 const TISSUES: [&str; 3] = ["fibrotic", "liver", "stomach"];
@@ -155,7 +156,13 @@ fn report(arguments: &Arguments, results: &[(u64, Setup, Result<Outcome, String>
         crate::tell!("\n{} runs, {unstable} unstable. Worst values:", results.len());
         for worst in &all {
             let Some((value, run)) = &worst.found else { continue };
-            crate::tell!("{:<26} {value:<12.5} seed {}", worst.name, run["seed"]);
+            let value = match worst.name.rsplit_once('_') {
+                Some((_, "j")) => table::with_unit(*value, "J"),
+                Some((_, "n")) => table::with_unit(*value, "N"),
+                Some((_, "percent")) => format!("{} %", table::rounded(*value)),
+                _ => table::percent(*value),
+            };
+            crate::tell!("{:<26} {value:<12} seed {}", worst.name, run["seed"]);
         }
     }
     Ok(())

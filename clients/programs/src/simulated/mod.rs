@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use glam::DVec3;
 use palpate_client::{HapticDevice, Reading};
-use palpate_proto::refusal::{Reason, Refusal};
+use palpate_proto::refusal::{Reason, Refusal, did_you_mean};
 use palpate_touch::Device;
 use palpate_touch::device::{DEVICES, UNDECLARED};
 use palpate_touch::hand::{HANDS, Hand, HandState};
@@ -17,7 +17,8 @@ use task::Task;
 /// The value found for a name, or an error that lists the names.
 fn named<T>(field: &str, name: &str, found: Option<T>, names: &[&str]) -> Result<T, Refusal> {
     found.ok_or_else(|| {
-        Refusal::new(Reason::WrongKind, field, format!("must be one of {}, but is `{name}`", names.join(", ")))
+        let meant = did_you_mean(name, names.iter().copied());
+        Refusal::new(Reason::WrongKind, field, format!("must be one of {}, but is `{name}`{meant}", names.join(", ")))
     })
 }
 

@@ -1,0 +1,176 @@
+//! Scenes and scripts by name: the files `NAME.toml` of a folder, and the built-in texts.
+
+use std::path::{Path, PathBuf};
+
+use super::document::read_text;
+use super::kind::{Kind, ORDER};
+use super::reader::made_for;
+use super::script::{self, Script};
+use super::{BUILT_IN, Scene};
+use crate::limits::Limits;
+use crate::refusal::{Reason, Refusal, Result, did_you_mean, excerpt};
+
+/// Texts by name.
+#[derive(Debug, Clone)]
+pub struct Collection {
+    folder: PathBuf,
+    built_in: &'static [(&'static str, &'static str)],
+    kind: Kind,
+}
+
+impl Collection {
+    /// The scenes or scripts of a folder, which may be missing, and the built-in ones.
+    pub fn new(kind: Kind, folder: &Path) -> Self {
+        let built_in: &'static [_] = match kind {
+            Kind::Scene => &BUILT_IN,
+            Kind::Script => &script::BUILT_IN,
+        };
+        Collection { folder: folder.to_owned(), built_in, kind }
+    }
+
+    /// The folder.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// Every name, sorted.
+    pub fn names(&self) -> Vec<String> {
+        let mut names: Vec<String> = self.built_in.iter().map(|text| text.0.to_owned()).collect();
+        for entry in std::fs::read_dir(&self.folder).into_iter().flatten().flatten() {
+            let path = entry.path();
+            if path.extension().is_some_and(|extension| extension == "toml")
+                && let Some(name) = path.file_stem().and_then(|name| name.to_str())
+                && is_name(name)
+            {
+                names.push(name.to_owned());
+            }
+        }
+        names.sort_unstable();
+        names.dedup();
+        names
+    }
+
+    /// The file of that name in the folder.
+    fn file(&self, name: &str) -> Option<PathBuf> {
+        let path = self.folder.join(format!("{name}.toml"));
+        (is_name(name) && path.is_file()).then_some(path)
+    }
+
+    fn has(&self, name: &str) -> bool {
+        self.file(name).is_some() || self.built_in.iter().any(|text| text.0 == name)
+    }
+
+    /// The text of that name, after the name that refusals use for it. A file of the folder overrides a built-in text.
+    /// Refusals name the file without its folder: clients do not learn the server's paths. `others` are the texts of the
+    /// other kind, for the refusal of a name that is one of theirs.
+    ///
+    /// # Errors
+    /// Refuses a name that it does not have, and a file that can't be read.
+    pub fn text(&self, name: &str, others: &Collection, limits: &Limits) -> Result<(String, String)> {
+        if let Some(path) = self.file(name) {
+            let file = format!("{name}.toml");
+            let text = read_text(&path, limits.file_bytes)
+                .map_err(|refusal| Refusal { place: Some(file.clone()), ..refusal })?;
+            return Ok((file, text));
+        }
+        let built_in = self.built_in.iter().find(|text| text.0 == name);
+        built_in.map(|(name, text)| ((*name).to_owned(), (*text).to_owned())).ok_or_else(|| self.unknown(name, others))
+    }
+
+    fn unknown(&self, name: &str, others: &Collection) -> Refusal {
+        let (kind, names) = (self.kind.name(), self.names());
+        let hint = if others.has(name) {
+            format!("; `{name}` is a {}: {ORDER}", self.kind.other().name())
+        } else {
+            did_you_mean(name, names.iter().map(String::as_str))
+        };
+        let message = format!("there is no {kind} `{}`; there are {}{hint}", excerpt(name), names.join(", "));
+        let (reason, field) = match self.kind {
+            Kind::Scene => (Reason::UnknownScene, "scene_name"),
+            Kind::Script => (Reason::UnknownScript, "script_name"),
+        };
+        Refusal::new(reason, field, message)
+    }
+}
+
+/// Whether `name` is a plain word, which can't lead out of the folder.
+fn is_name(name: &str) -> bool {
+    !name.is_empty() && name.chars().all(|c| c.is_ascii_alphanumeric() || c == '-' || c == '_')
+}
+
+/// The name in a path that a user gave, if it is one: a plain word that is not a file.
+fn name_in(path: &Path) -> Option<&str> {
+    path.to_str().filter(|name| is_name(name) && !path.is_file())
+}
+
+/// Where the scripts are that a user of the programs can give by name.
+const SCRIPTS: &str = "scripts";
+
+/// Reads the scene that a user gave: a file, or the name of one in `folder` or built in. `--set` assignments override its
+/// keys.
+///
+/// # Errors
+/// Refuses what is no scene, and as [`Scene::parse`] does.
+pub fn find_scene(path: &Path, folder: &Path, assignments: &[String], limits: &Limits) -> Result<Scene> {
+    let Some(name) = name_in(path) else { return Scene::load(path, assignments, limits) };
+    let scenes = Collection::new(Kind::Scene, folder);
+    let (file, text) = scenes.text(name, &Collection::new(Kind::Script, Path::new(SCRIPTS)), limits)?;
+    Ok(Scene::parse(&file, &text, assignments, limits)?.found_in(folder))
+}
+
+/// The text of the script that a user gave, a file or the name of one in ./scripts or built in, after the name that refusals
+/// use for it; and the folder of its traces.
+fn script_text(path: &Path, limits: &Limits) -> Result<(String, String, PathBuf)> {
+    let of_file = |path: &Path| {
+        let folder = path.parent().unwrap_or(Path::new("")).to_owned();
+        Ok((path.display().to_string(), read_text(path, limits.file_bytes)?, folder))
+    };
+    let Some(name) = name_in(path) else { return of_file(path) };
+    let scripts = Collection::new(Kind::Script, Path::new(SCRIPTS));
+    if let Some(file) = scripts.file(name) {
+        return of_file(&file);
+    }
+    let (file, text) = scripts.text(name, &Collection::new(Kind::Scene, Path::new("scenes")), limits)?;
+    Ok((file, text, PathBuf::from(SCRIPTS)))
+}
+
+/// Reads the script that a user gave, and binds it to `scene`.
+///
+/// # Errors
+/// Refuses what is no script, and as [`Script::parse`] does.
+pub fn find_script(path: &Path, scene: &Scene, limits: &Limits) -> Result<Script> {
+    let (name, text, folder) = script_text(path, limits)?;
+    Script::parse(&name, &text, &folder, scene, limits)
+}
+
+/// The scenes that the script that a user gave is made for; none, if it names none.
+///
+/// # Errors
+/// Refuses what can't be read.
+pub fn scenes_of(path: &Path, limits: &Limits) -> Result<Vec<String>> {
+    Ok(made_for(&script_text(path, limits)?.1))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_unknown_name_is_refused_with_all_names_and_the_nearest() {
+        let folder = Path::new("no-such-folder");
+        let [scenes, scripts] = [Kind::Scene, Kind::Script].map(|kind| Collection::new(kind, folder));
+        let limits = Limits::default();
+        let refused = scenes.text("papr", &scripts, &limits).unwrap_err();
+        assert_eq!(refused.reason, Reason::UnknownScene);
+        assert!(
+            refused.message.ends_with("there are fibrotic, liver, paper, stomach; did you mean `paper`?"),
+            "{refused}"
+        );
+        let refused = scripts.text("vertical", &scenes, &limits).unwrap_err();
+        assert!(refused.message.ends_with("vertical-60; did you mean `vertical-60`?"), "{refused}");
+        let swapped = scenes.text("vertical-60", &scripts, &limits).unwrap_err();
+        assert!(swapped.message.contains("`vertical-60` is a script: give the scene first"), "{swapped}");
+        assert!(scenes.text("../paper", &scripts, &limits).is_err());
+        assert!(scripts.text("vertical-60", &scenes, &limits).is_ok());
+    }
+}
