@@ -28,7 +28,7 @@ use report::chart::{Look, Panel, Series};
 use report::{Report, cells, digits, least, quick, rough, seconds};
 use scenes::{CASES, Case};
 use serde_json::json;
-use subject::{INTEGRATOR, INTEGRATORS, PRECISION, PRECISIONS, known, set};
+use subject::{INTEGRATOR, PRECISION, PRECISIONS, integrators, known, set};
 
 /// How far the steps are refined, and how often each run is timed.
 struct Effort {
@@ -202,10 +202,11 @@ fn panel(case: &Case, curves: &[Curve]) -> Panel {
     let mut best: Vec<_> = curves.iter().flatten().filter(|trial| is_best(trial, curves)).collect();
     best.sort_by(|a, b| a.cost.total_cmp(&b.cost));
     let line = |trials: &[&Trial]| trials.iter().map(|trial| (trial.error(), trial.cost)).collect();
-    let mut series = vec![Series { name: "cheapest".into(), hue: 6, look: Look::Broad, points: line(&best) }];
+    let mut series =
+        vec![Series { name: "cheapest".into(), hue: integrators().len(), look: Look::Broad, points: line(&best) }];
     series.extend(curves.iter().map(|curve| Series {
         name: format!("{} {}", curve[0].integrator, curve[0].precision),
-        hue: INTEGRATORS.iter().position(|name| *name == curve[0].integrator).unwrap(),
+        hue: integrators().iter().position(|name| *name == curve[0].integrator).unwrap(),
         look: if curve[0].precision == "f32" { Look::Full } else { Look::Hollow },
         points: line(&curve.iter().collect::<Vec<_>>()),
     }));
@@ -273,7 +274,7 @@ fn main() {
     } else {
         Effort { rounds: 3, longest_run_s: 0.6, least_error: 1e-9 }
     };
-    let schemes = known(INTEGRATOR, &INTEGRATORS);
+    let schemes = known(INTEGRATOR, &integrators());
     let knows_rk4 = schemes.contains(&"rk4");
     let mut results = Vec::new();
     let mut truths = Vec::new();

@@ -19,7 +19,7 @@ use palpate::sheet::{Model, Push, at_rest};
 use report::chart::Panel;
 use report::{Report, cells, digits};
 use serde_json::{Value, json};
-use subject::{INTEGRATOR, INTEGRATORS, known, set};
+use subject::{INTEGRATOR, integrators, known, set};
 
 /// A small sheet; everything else is varied.
 const SHEET: [&str; 3] = ["sheet.points=[9, 9]", "stepping.substeps=1", "stepping.precision=f64"];
@@ -320,7 +320,7 @@ fn main() {
     let mut limits = Vec::new();
     let mut panels = Vec::new();
     let mut fates = Vec::new();
-    for integrator in known(INTEGRATOR, &INTEGRATORS) {
+    for integrator in known(INTEGRATOR, &integrators()) {
         eprintln!("{integrator}: limits");
         for damping_n_s_per_m in DAMPINGS_N_S_PER_M {
             for spring_n_per_m in SPRINGS_N_PER_M {

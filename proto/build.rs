@@ -1,5 +1,6 @@
 //! Compiles the protocol in Rust alone: no protoc is needed.
 
+use std::collections::BTreeSet;
 use std::error::Error;
 use std::path::PathBuf;
 
@@ -10,6 +11,13 @@ fn main() -> Result<(), Box<dyn Error>> {
     let descriptors = protox::compile(FILES, ["."])?;
     let out = PathBuf::from(std::env::var("OUT_DIR")?);
     std::fs::write(out.join("palpate.bin"), prost::Message::encode_to_vec(&descriptors))?;
+    let requests = descriptors.file.iter().flat_map(|file| &file.service).flat_map(|service| &service.method);
+    let names: BTreeSet<_> = requests.filter_map(|method| method.input_type().rsplit('.').next()).collect();
+    let decoders: String = names
+        .iter()
+        .map(|name| format!("(\"{name}\", |bytes| <{name} as ::prost::Message>::decode(bytes).is_ok()),\n"))
+        .collect();
+    std::fs::write(out.join("decoders.rs"), format!("&[\n{decoders}]\n"))?;
     // Frames are shared between viewers, not copied for each.
     let shared = [".palpate.v1.Patch.displacement", ".palpate.v1.GetTextureResponse.png"];
     let configured = shared.iter().fold(tonic_prost_build::configure(), tonic_prost_build::Builder::bytes);

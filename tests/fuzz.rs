@@ -14,7 +14,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use fastrand::Rng;
 use palpate_proto::pb;
 use prost::Message;
-use targets::{REQUESTS, TARGETS, Target};
+use targets::{REQUESTS, TARGETS, Taker, Target, requests};
 
 /// Inputs that were taken and are bent further.
 const CORPUS: usize = 512;
@@ -163,7 +163,11 @@ fn every_request_of_the_protocol_is_tried() {
             asked.insert(method.input_type().rsplit('.').next().unwrap().to_owned());
         }
     }
-    let tried: BTreeSet<_> =
-        REQUESTS.iter().map(|request| request.0.to_owned()).filter(|name| !name.is_empty()).collect();
-    assert_eq!(tried, asked);
+    let names = |requests: &[(&str, Taker)]| {
+        requests.iter().map(|request| request.0.to_owned()).filter(|name| !name.is_empty()).collect::<BTreeSet<_>>()
+    };
+    assert_eq!(names(requests()), asked);
+    assert!(names(REQUESTS).is_subset(&asked) && requests().len() == asked.len() + 1);
+    // The first byte of an input chooses one.
+    assert!(requests().len() < 256);
 }

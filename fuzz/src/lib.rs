@@ -106,8 +106,8 @@ fn script_seeds() -> Vec<Vec<u8>> {
     scripts.iter().map(|text| text.as_bytes().to_vec()).collect()
 }
 
-/// Every request of the protocol: decodes one, and does with it what can be done without a server.
-pub const REQUESTS: [(&str, Taker); 28] = [
+/// The requests of the protocol with which more can be done without a server than to decode them.
+pub const REQUESTS: &[(&str, Taker)] = &[
     ("CreateSessionRequest", |bytes| {
         use pb::create_session_request::Source;
         match pb::CreateSessionRequest::decode(bytes).map(|request| request.source) {
@@ -164,31 +164,24 @@ pub const REQUESTS: [(&str, Taker); 28] = [
             model().changed(&change, &model().scene, &limits()).is_ok()
         })
     }),
-    ("GetTextureRequest", |bytes| pb::GetTextureRequest::decode(bytes).is_ok()),
-    ("ListScriptsRequest", |bytes| pb::ListScriptsRequest::decode(bytes).is_ok()),
-    ("GetScriptRequest", |bytes| pb::GetScriptRequest::decode(bytes).is_ok()),
-    ("AcknowledgeFramesRequest", |bytes| pb::AcknowledgeFramesRequest::decode(bytes).is_ok()),
-    ("ReleaseToolRequest", |bytes| pb::ReleaseToolRequest::decode(bytes).is_ok()),
-    ("ListScenesRequest", |bytes| pb::ListScenesRequest::decode(bytes).is_ok()),
-    ("GetSessionRequest", |bytes| pb::GetSessionRequest::decode(bytes).is_ok()),
-    ("ListSessionsRequest", |bytes| pb::ListSessionsRequest::decode(bytes).is_ok()),
-    ("DeleteSessionRequest", |bytes| pb::DeleteSessionRequest::decode(bytes).is_ok()),
-    ("StartSessionRequest", |bytes| pb::StartSessionRequest::decode(bytes).is_ok()),
-    ("PauseSessionRequest", |bytes| pb::PauseSessionRequest::decode(bytes).is_ok()),
-    ("GetStateHashRequest", |bytes| pb::GetStateHashRequest::decode(bytes).is_ok()),
-    ("ListCallersRequest", |bytes| pb::ListCallersRequest::decode(bytes).is_ok()),
-    ("ListStreamsRequest", |bytes| pb::ListStreamsRequest::decode(bytes).is_ok()),
-    ("FreeToolRequest", |bytes| pb::FreeToolRequest::decode(bytes).is_ok()),
-    ("CutStreamRequest", |bytes| pb::CutStreamRequest::decode(bytes).is_ok()),
-    ("CutCallerRequest", |bytes| pb::CutCallerRequest::decode(bytes).is_ok()),
-    ("ReviveSessionRequest", |bytes| pb::ReviveSessionRequest::decode(bytes).is_ok()),
     // Of a client that writes what no request is.
     ("", |bytes| pb::Scene::decode(bytes).is_ok_and(|scene| wire::scene::from_scene(&scene).is_ok())),
 ];
 
+/// Every request of the protocol.
+pub fn requests() -> &'static [(&'static str, Taker)] {
+    static ALL: OnceLock<Vec<(&str, Taker)>> = OnceLock::new();
+    ALL.get_or_init(|| {
+        let is_own = |name: &str| REQUESTS.iter().any(|request| request.0 == name);
+        let others = pb::DECODERS.iter().filter(|decoder| !is_own(decoder.0));
+        REQUESTS.iter().chain(others).copied().collect()
+    })
+}
+
 /// The first byte says which request the others are.
 pub fn request(bytes: &[u8]) -> bool {
-    bytes.split_first().is_some_and(|(which, bytes)| REQUESTS[usize::from(*which) % REQUESTS.len()].1(bytes))
+    let all = requests();
+    bytes.split_first().is_some_and(|(which, bytes)| all[usize::from(*which) % all.len()].1(bytes))
 }
 
 fn open(open: &pb::TouchOpen) -> bool {
@@ -315,7 +308,7 @@ fn request_seeds() -> Vec<Vec<u8>> {
     for command in commands {
         seeds.push(("TouchRequest", touch(pb::touch_request::Message::Command(command))));
     }
-    let which = |name: &str| REQUESTS.iter().position(|request| request.0 == name).expect("is in the table") as u8;
+    let which = |name: &str| requests().iter().position(|request| request.0 == name).expect("is in the table") as u8;
     seeds.into_iter().map(|(name, bytes)| [vec![which(name)], bytes].concat()).collect()
 }
 

@@ -20,4 +20,7 @@ pub mod pb {
 
     /// Every file of the protocol, for reflection.
     pub const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/palpate.bin"));
+
+    /// The request of every call, by its name: whether bytes can be decoded as one.
+    pub const DECODERS: &[(&str, fn(&[u8]) -> bool)] = include!(concat!(env!("OUT_DIR"), "/decoders.rs"));
 }

@@ -16,13 +16,19 @@
 /// Steps that a session may be behind before the rest is dropped.
 const CATCH_UP_STEPS: f64 = 2.0;
 
-/// The number of steps to drop from the schedule of a session whose next step was due `late_ns` ago. Of that,
-/// `forgiven_ns` is not the session's fault.
-#[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-pub(super) fn dropped_steps(late_ns: u64, forgiven_ns: u64, period_ns: f64) -> u64 {
-    let behind = (late_ns.saturating_sub(forgiven_ns) as f64 / period_ns).floor();
-    // A negative number becomes 0.
-    (behind - CATCH_UP_STEPS) as u64
+/// What the rule on overruns remembers of a session since it was started: so far, nothing.
+#[derive(Debug, Default)]
+pub(super) struct Backlog {}
+
+impl Backlog {
+    /// The number of steps to drop from the schedule of a session whose next step was due `late_ns` ago. Of that,
+    /// `forgiven_ns` is not the session's fault. Called before each step.
+    #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    pub(super) fn dropped_steps(&mut self, late_ns: u64, forgiven_ns: u64, period_ns: f64) -> u64 {
+        let behind = (late_ns.saturating_sub(forgiven_ns) as f64 / period_ns).floor();
+        // A negative number becomes 0.
+        (behind - CATCH_UP_STEPS) as u64
+    }
 }
 
 /// The number of equal parts that a thread is divided into for one session: `callers` have awake sessions, and the
@@ -97,10 +103,18 @@ mod tests {
     fn a_session_catches_up_two_steps_and_what_is_not_its_fault() {
         let period_ns = MS as f64;
         for (late_ms, forgiven_ms, dropped) in [(0, 0, 0), (2, 0, 0), (3, 0, 1), (10, 0, 8), (10, 7, 1), (10, 20, 0)] {
-            assert_eq!(dropped_steps(late_ms * MS, forgiven_ms * MS, period_ns), dropped, "{late_ms} {forgiven_ms}");
+            let found = Backlog::default().dropped_steps(late_ms * MS, forgiven_ms * MS, period_ns);
+            assert_eq!(found, dropped, "{late_ms} {forgiven_ms}");
         }
         // Parts of a step are not dropped.
-        assert_eq!(dropped_steps(4 * MS - 1, 0, period_ns), 1);
+        assert_eq!(Backlog::default().dropped_steps(4 * MS - 1, 0, period_ns), 1);
+    }
+
+    #[test]
+    fn the_page_on_the_protocol_tells_how_many_steps_a_session_catches_up() {
+        let words: Vec<_> = include_str!("../../docs/protocol.md").split_whitespace().collect();
+        let number = ["no", "one", "two", "three", "four"][CATCH_UP_STEPS as usize];
+        assert!(words.join(" ").contains(&format!("that is late catches up {number} steps")), "{number}");
     }
 
     /// A session whose next step is due at 2 ms, at 1 kHz.

@@ -14,7 +14,7 @@ use super::clock::{Dilation, now_ns};
 use super::frames::Encoder;
 use super::inbox::Request;
 use super::live::Live;
-use super::policy::{Longest, Turn, dropped_steps};
+use super::policy::{Backlog, Longest, Turn};
 use super::queue::Wakes;
 use super::reading::{Copies, Hashed, Reading};
 use super::taps::{Taps, ViewTap};
@@ -50,6 +50,7 @@ pub(super) struct Running {
     pub(super) due_ns: u64,
     /// It was late, and takes more than its part: it goes after those that were due by then.
     not_before_ns: u64,
+    backlog: Backlog,
     /// Steps done when all was asleep first, if it still is.
     pub(super) still_since: Option<u64>,
     pub(super) rested_steps: u64,
@@ -93,6 +94,7 @@ impl Running {
             next_step: 0,
             due_ns: 0,
             not_before_ns: 0,
+            backlog: Backlog::default(),
             still_since: Some(0),
             rested_steps: 0,
             overrun_count: 0,
@@ -285,6 +287,7 @@ impl Running {
             self.running = true;
             self.schedule = Schedule::new(step, now, self.live.model.scene.stepping.rate_hz);
             self.schedule.delay(1.0);
+            self.backlog = Backlog::default();
             self.dilation = Dilation::new(now, step);
         }
         Ok(step)
@@ -310,7 +313,8 @@ impl Running {
     /// Drops from the schedule what the policy does not let it catch up.
     #[allow(clippy::cast_precision_loss)]
     fn drop_backlog(&mut self, now_ns: u64, forgiven_ns: u64) {
-        let dropped = dropped_steps(self.late_ns(now_ns), forgiven_ns, self.schedule.period_ns());
+        let (late_ns, period_ns) = (self.late_ns(now_ns), self.schedule.period_ns());
+        let dropped = self.backlog.dropped_steps(late_ns, forgiven_ns, period_ns);
         if dropped > 0 {
             self.schedule.delay(dropped as f64);
             self.overrun_count += dropped;

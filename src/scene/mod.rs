@@ -164,85 +164,72 @@ pub trait Named: Sized + Copy + PartialEq + 'static {
     }
 }
 
-/// The schemes (`sheet::integrate`).
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Integrator {
-    /// Palpate's choice.
-    Auto,
-    /// Central differences, damping implicit: second order.
-    Central,
-    /// The paper's: damping with the velocity of the last step, first order.
-    Lagged,
-    /// The classical scheme of Runge and Kutta: fourth order, four evaluations a substep.
-    Rk4,
-    /// Exponential multistep with the springs' last 2 forces: third order.
-    Exponential2,
-    /// With the last 3: fourth order.
-    Exponential3,
-    /// With the last 4: fifth order.
-    Exponential4,
+/// Writes an enum whose values scenes give by names, and its [`Named::NAMES`], from one list.
+macro_rules! named {
+    ($(#[$of_enum:meta])* pub enum $Enum:ident { $($(#[$of_value:meta])* $Value:ident = $name:literal,)+ }) => {
+        $(#[$of_enum])*
+        #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+        pub enum $Enum {
+            $($(#[$of_value])* $Value,)+
+        }
+
+        impl Named for $Enum {
+            const NAMES: &'static [(&'static str, Self)] = &[$(($name, $Enum::$Value)),+];
+        }
+    };
 }
 
-impl Named for Integrator {
-    const NAMES: &'static [(&'static str, Self)] = &[
-        ("auto", Integrator::Auto),
-        ("central", Integrator::Central),
-        ("lagged", Integrator::Lagged),
-        ("rk4", Integrator::Rk4),
-        ("exponential2", Integrator::Exponential2),
-        ("exponential3", Integrator::Exponential3),
-        ("exponential4", Integrator::Exponential4),
-    ];
+named! {
+    /// The schemes (`sheet::integrate`).
+    pub enum Integrator {
+        /// Palpate's choice.
+        Auto = "auto",
+        /// Central differences, damping implicit: second order.
+        Central = "central",
+        /// The paper's: damping with the velocity of the last step, first order.
+        Lagged = "lagged",
+        /// The classical scheme of Runge and Kutta: fourth order, four evaluations a substep.
+        Rk4 = "rk4",
+        /// Exponential multistep with the springs' last 2 forces: third order.
+        Exponential2 = "exponential2",
+        /// With the last 3: fourth order.
+        Exponential3 = "exponential3",
+        /// With the last 4: fifth order.
+        Exponential4 = "exponential4",
+    }
 }
 
 /// Points of a row that are computed at least: the lanes of the widest vector.
 pub const LEAST_WIDTH: usize = 16;
 
-/// The number format of the state.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Precision {
-    /// Palpate's choice.
-    Auto,
-    /// 4 bytes.
-    F32,
-    /// 4 bytes, and 4 for what a displacement loses in rounding: for exponential schemes.
-    Compensated,
-    /// 8 bytes.
-    F64,
+named! {
+    /// The number format of the state.
+    pub enum Precision {
+        /// Palpate's choice.
+        Auto = "auto",
+        /// 4 bytes.
+        F32 = "f32",
+        /// 4 bytes, and 4 for what a displacement loses in rounding: for exponential schemes.
+        Compensated = "compensated",
+        /// 8 bytes.
+        F64 = "f64",
+    }
 }
 
-impl Named for Precision {
-    const NAMES: &'static [(&'static str, Self)] = &[
-        ("auto", Precision::Auto),
-        ("f32", Precision::F32),
-        ("compensated", Precision::Compensated),
-        ("f64", Precision::F64),
-    ];
-}
-
-/// How many numbers the processor works on at once. The results have the same bits whichever it is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Lanes {
-    /// The most that the machine has.
-    Auto,
-    /// 64 bytes.
-    Avx512,
-    /// 32 bytes.
-    Avx2,
-    /// 16 bytes: on ARM.
-    Neon,
-    /// One by one: on any machine.
-    Plain,
-}
-
-impl Named for Lanes {
-    const NAMES: &'static [(&'static str, Self)] = &[
-        ("auto", Lanes::Auto),
-        ("avx512", Lanes::Avx512),
-        ("avx2", Lanes::Avx2),
-        ("neon", Lanes::Neon),
-        ("plain", Lanes::Plain),
-    ];
+named! {
+    /// How many numbers the processor works on at once. The results have the same bits whichever it is.
+    pub enum Lanes {
+        /// The most that the machine has.
+        Auto = "auto",
+        /// 64 bytes.
+        Avx512 = "avx512",
+        /// 32 bytes.
+        Avx2 = "avx2",
+        /// 16 bytes: on ARM.
+        Neon = "neon",
+        /// One by one: on any machine.
+        Plain = "plain",
+    }
 }
 
 impl Scene {

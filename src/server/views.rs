@@ -16,9 +16,10 @@ use super::services::Services;
 use crate::ids::random_id;
 use crate::pace::frames::Viewer;
 use crate::pace::{FrameReader, StreamGuard, StreamKind};
-use crate::refusal::{Reason, Refusal, number};
-use crate::surface::{Encoding, Refinement};
+use crate::refusal::number;
+use crate::surface::Refinement;
 use crate::texture::Texture;
+use crate::wire;
 
 pub(super) struct Views(pub(super) Services);
 
@@ -48,7 +49,7 @@ impl Frames {
                         frame_id.saturating_sub(last.0 + 1).saturating_sub(unchanged.saturating_sub(last.1))
                     });
                     self.last = Some((frame_id, unchanged));
-                    self.messages.extend(crate::wire::sample::frame(&self.viewer_id, &delivery, self.skipped));
+                    self.messages.extend(wire::sample::frame(&self.viewer_id, &delivery, self.skipped));
                 }
                 Err(refusal) => return Some((Err(refusal.into()), None)),
             }
@@ -111,14 +112,7 @@ impl ViewService for Views {
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
         let grid = Refinement::new(&live.model.scene, request.refinement, &self.0.config.limits)?;
-        let encoding = match pb::Encoding::try_from(request.encoding) {
-            Ok(pb::Encoding::Unspecified | pb::Encoding::F32) => Encoding::F32,
-            Ok(pb::Encoding::I16) => Encoding::I16,
-            Err(_) => {
-                let message = format!("{} is no encoding", request.encoding);
-                return Err(Refusal::new(Reason::WrongKind, "encoding", message).into());
-            }
-        };
+        let encoding = wire::sample::from_encoding(request.encoding)?;
         let most_hz = live.model.scene.stepping.rate_hz;
         let rate_hz = request.rate_hz.unwrap_or(DEFAULT_RATE_HZ.min(most_hz));
         let range = format!("above 0 and at most the session's {most_hz}");

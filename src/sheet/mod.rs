@@ -48,6 +48,7 @@ pub use applied::Push;
 pub use checkpoint::CheckFailure;
 pub use contact::{Feel, Surroundings};
 pub use footprint::{Footprint, Reached};
+pub use integrate::order;
 pub use model::{Model, Plan};
 pub use motion::at_rest;
 pub use prescribed::Grasp;

@@ -193,6 +193,7 @@ mod tests {
         let scene =
             Scene::parse("paper", crate::scene::PAPER, &["sheet.points=[5, 18]".to_owned()], &Limits::default());
         let (scene, mut hashes) = (scene.unwrap(), Vec::new());
+        // One or two of each family: their bits are written down below.
         for (integrator, precision) in [
             (Integrator::Central, Precision::F32),
             (Integrator::Rk4, Precision::F64),

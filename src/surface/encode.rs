@@ -21,11 +21,22 @@ pub enum Encoding {
 }
 
 impl Encoding {
+    /// Every encoding.
+    pub const ALL: [Encoding; 2] = [Encoding::F32, Encoding::I16];
+
     /// Bytes of the three components of a vertex.
     pub fn bytes_per_vertex(self) -> usize {
         match self {
             Encoding::F32 => 12,
             Encoding::I16 => 6,
+        }
+    }
+
+    /// The largest integer q in displacement = origin + scale·q, the least being its negative; `None` for floats.
+    pub fn largest_integer(self) -> Option<f64> {
+        match self {
+            Encoding::F32 => None,
+            Encoding::I16 => Some(f64::from(i16::MAX)),
         }
     }
 }
@@ -44,7 +55,7 @@ pub struct Frame {
     pub refinement: Refinement,
     /// The encoding.
     pub encoding: Encoding,
-    /// Scale and origin of the integers of `I16`.
+    /// Scale and origin of the encoding's integers.
     pub quanta: Quanta,
     /// Whether every vertex is in the patches.
     pub full: bool,
@@ -55,9 +66,9 @@ pub struct Frame {
 /// Scale and origin: a displacement is origin + scale·q for each component; m.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Quanta {
-    /// Middle of the bounding box for `I16`, else 0.
+    /// Middle of the bounding box for integers, 0 for floats.
     pub origin_m: DVec3,
-    /// Quantum for `I16`, else 1.
+    /// Quantum of integers, 1 for floats.
     pub scale_m: DVec3,
 }
 
@@ -68,16 +79,26 @@ impl Default for Quanta {
 }
 
 impl Quanta {
-    /// The finest quanta that integers allow in a box, but none finer than `finest_m`. Interpolation between values in
-    /// the box stays in the box. `box_m`: least and greatest value of each component.
-    pub(super) fn over(box_m: &[[f32; 2]; COMPONENTS], finest_m: f64) -> Self {
+    /// The finest quanta that the integers of `encoding` allow in a box, but none finer than `finest_m`. Interpolation
+    /// between values in the box stays in the box. `box_m`: least and greatest value of each component.
+    pub(super) fn over(encoding: Encoding, box_m: &[[f32; 2]; COMPONENTS], finest_m: f64) -> Self {
+        let Some(largest) = encoding.largest_integer() else { return Quanta::default() };
         let spans = box_m.map(|[low, high]| {
             // Round to f32, the encoder's format. The box then reaches as far as its farther side.
             let middle = 0.5 * low + 0.5 * high;
-            let quantum = f64::from((high - middle).max(middle - low)) / f64::from(i16::MAX);
+            let quantum = f64::from((high - middle).max(middle - low)) / largest;
             (f64::from(middle), quantum.max(finest_m))
         });
         Quanta { origin_m: spans.map(|span| span.0).into(), scale_m: spans.map(|span| span.1).into() }
+    }
+
+    /// How far a point may move along each axis before `encoding` shows it: half a quantum, not at all for floats.
+    #[allow(clippy::cast_possible_truncation)]
+    pub(super) fn unseen_m(&self, encoding: Encoding) -> [f32; COMPONENTS] {
+        match encoding.largest_integer() {
+            None => [0.0; COMPONENTS],
+            Some(_) => self.scale_m.to_array().map(|scale_m| (0.5 * scale_m) as f32),
+        }
     }
 
     /// A source that writes `points` in these quanta.
@@ -139,9 +160,7 @@ pub fn encode_over(snapshot: &Snapshot, spent: Frame) -> Frame {
 
 fn encode_at(width: Width, snapshot: &Snapshot, spent: Frame) -> Frame {
     let mut frame = Frame { step: snapshot.step, simulation_time_s: snapshot.simulation_time_s, ..spent };
-    if frame.encoding == Encoding::I16 {
-        frame.quanta = Quanta::over(snapshot.box_m(), 0.0);
-    }
+    frame.quanta = Quanta::over(frame.encoding, snapshot.box_m(), 0.0);
     let grid = frame.refinement;
     let mut rows = Rows::new(grid.between, grid.vertices()[1], frame.quanta.source(snapshot.points()));
     fill(width, frame.encoding, &mut frame.patches, &mut rows);
@@ -209,7 +228,7 @@ impl Patch {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
     use crate::limits::Limits;
     use crate::surface::scene;
@@ -219,32 +238,38 @@ mod tests {
         Snapshot::new(&scene([31, 17]), 7, 0.007, std::array::from_fn(|c| (0..31 * 17).map(|k| wave(k, c)).collect()))
     }
 
-    /// Decodes every vertex of a frame as a client does.
+    /// A signed integer of any length, little-endian.
+    fn integer(bytes: &[u8]) -> i64 {
+        let sign = if bytes.last().is_some_and(|byte| *byte >= 0x80) { -1 } else { 0 };
+        bytes.iter().rev().fold(sign, |q, byte| q << 8 | i64::from(*byte))
+    }
+
+    /// Decodes the vertices of a patch of a frame as a client does.
+    pub(in crate::surface) fn decoded(frame: &Frame, patch: &Patch) -> Vec<[f64; 3]> {
+        let size = frame.encoding.bytes_per_vertex();
+        assert_eq!(patch.bytes.len(), patch.count[0] * patch.count[1] * size);
+        let component = |c: usize, bytes: &[u8]| match frame.encoding.largest_integer() {
+            None => f64::from(f32::from_le_bytes(bytes.try_into().unwrap())),
+            Some(_) => frame.quanta.origin_m[c] + frame.quanta.scale_m[c] * integer(bytes) as f64,
+        };
+        let part = size / COMPONENTS;
+        let vertex = |bytes: &[u8]| std::array::from_fn(|c| component(c, &bytes[c * part..(c + 1) * part]));
+        patch.bytes.chunks(size).map(vertex).collect()
+    }
+
+    /// Decodes every vertex of a frame.
     fn decode(frame: &Frame) -> Vec<[f64; 3]> {
-        let mut vertices = Vec::new();
-        for patch in &frame.patches {
-            match frame.encoding {
-                Encoding::F32 => vertices.extend(patch.bytes.as_chunks::<12>().0.iter().map(|v| {
-                    std::array::from_fn(|c| f64::from(f32::from_le_bytes(v[4 * c..4 * c + 4].try_into().unwrap())))
-                })),
-                Encoding::I16 => vertices.extend(patch.bytes.as_chunks::<6>().0.iter().map(|v| {
-                    std::array::from_fn(|c| {
-                        let q = i16::from_le_bytes(v[2 * c..2 * c + 2].try_into().unwrap());
-                        frame.quanta.origin_m[c] + frame.quanta.scale_m[c] * f64::from(q)
-                    })
-                })),
-            }
-        }
-        vertices
+        frame.patches.iter().flat_map(|patch| decoded(frame, patch)).collect()
     }
 
     #[test]
-    fn both_encodings_hold_every_vertex_and_i16_within_half_a_quantum() {
+    fn every_encoding_holds_every_vertex_and_integers_within_half_a_quantum() {
         let snapshot = snapshot();
-        for n in [0, 1, 3, 10] {
+        let integers = Encoding::ALL.into_iter().filter(|encoding| encoding.largest_integer().is_some());
+        for (encoding, n) in integers.flat_map(|encoding| [0, 1, 3, 10].map(|n| (encoding, n))) {
             let grid = Refinement::new(&scene([31, 17]), n, &Limits::default()).unwrap();
             let exact = encode(&snapshot, grid, Encoding::F32);
-            let coarse = encode(&snapshot, grid, Encoding::I16);
+            let coarse = encode(&snapshot, grid, encoding);
             let [x, y] = grid.vertices();
             let (exact, decoded) = (decode(&exact), decode(&coarse));
             assert_eq!((exact.len(), decoded.len()), (x * y, x * y));
@@ -287,7 +312,7 @@ mod tests {
 
     #[test]
     fn a_frame_has_the_same_bits_at_every_width() {
-        for encoding in [Encoding::F32, Encoding::I16] {
+        for encoding in Encoding::ALL {
             for n in 0..=10 {
                 let grid = Refinement::new(&scene([31, 17]), n, &Limits::default()).unwrap();
                 let at = |width| encode_at(width, &snapshot(), Frame::blank(grid, encoding));
@@ -305,7 +330,7 @@ mod tests {
 
     #[test]
     fn a_spent_frame_lends_the_buffers_that_nobody_reads() {
-        for encoding in [Encoding::F32, Encoding::I16] {
+        for encoding in Encoding::ALL {
             let grid = Refinement::new(&scene([31, 17]), 10, &Limits::default()).unwrap();
             let first = encode(&snapshot(), grid, encoding);
             let (held, place) = (first.patches[0].bytes.clone(), first.patches[1].bytes.as_ptr());
@@ -354,8 +379,10 @@ mod tests {
     fn a_still_tissue_is_encoded_exactly() {
         let still = Snapshot::new(&scene([3, 3]), 0, 0.0, std::array::from_fn(|c| vec![c as f32 * 0.25; 9]));
         let grid = Refinement::new(&scene([3, 3]), 1, &Limits::default()).unwrap();
-        for vertex in decode(&encode(&still, grid, Encoding::I16)) {
-            assert_eq!(vertex, [0.0, 0.25, 0.5]);
+        for encoding in Encoding::ALL {
+            for vertex in decode(&encode(&still, grid, encoding)) {
+                assert_eq!(vertex, [0.0, 0.25, 0.5]);
+            }
         }
     }
 }

@@ -175,12 +175,7 @@ impl FrameTiles {
             *whole = [whole[0].min(now[0]), whole[1].max(now[1])];
         }
         self.fit();
-        // f32 shows the smallest change.
-        let unseen_m = match self.encoding {
-            Encoding::F32 => [0.0; COMPONENTS],
-            #[allow(clippy::cast_possible_truncation)]
-            Encoding::I16 => self.quanta.scale_m.to_array().map(|scale_m| (0.5 * scale_m) as f32),
-        };
+        let unseen_m = self.quanta.unseen_m(self.encoding);
         let width = Width::widest();
         for tile in &mut self.tiles {
             let (now, shown, mut moved) = (tile.area.of_sheet(snapshot), tile.shown(&self.key), false);
@@ -207,9 +202,7 @@ impl FrameTiles {
     }
 
     fn fit(&mut self) {
-        if self.encoding == Encoding::I16 {
-            self.quanta = Quanta::over(&self.box_m, self.finest_m);
-        }
+        self.quanta = Quanta::over(self.encoding, &self.box_m, self.finest_m);
     }
 
     /// Whether any tile is newer than `version`; `None` is older than all.
@@ -291,6 +284,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::super::encode;
+    use super::super::encode::tests::decoded;
     use super::*;
     use crate::limits::Limits;
     use crate::surface::scene;
@@ -315,20 +309,12 @@ mod tests {
         fn show(&mut self, frame: &Frame) -> usize {
             let [x, y] = frame.refinement.vertices();
             self.vertices.resize(x * y, None);
-            let (mut count, size) = (0, frame.encoding.bytes_per_vertex());
+            let mut count = 0;
             for patch in &frame.patches {
-                assert_eq!(patch.bytes.len(), patch.count[0] * patch.count[1] * size);
-                for (index, bytes) in patch.bytes.chunks(size).enumerate() {
+                for (index, shown) in decoded(frame, patch).into_iter().enumerate() {
                     let (a, b) = (index / patch.count[1], index % patch.count[1]);
-                    let component = |c: usize| match &bytes[c * size / 3..(c + 1) * size / 3] {
-                        [a, b] => {
-                            let q = f64::from(i16::from_le_bytes([*a, *b]));
-                            frame.quanta.origin_m[c] + frame.quanta.scale_m[c] * q
-                        }
-                        bytes => f64::from(f32::from_le_bytes(bytes.try_into().unwrap())),
-                    };
                     let vertex = (patch.first[0] + a) * y + patch.first[1] + b;
-                    self.vertices[vertex] = Some(std::array::from_fn(component));
+                    self.vertices[vertex] = Some(shown);
                     count += 1;
                 }
             }
@@ -336,16 +322,23 @@ mod tests {
             count
         }
 
-        /// Checks that every vertex is within `quanta` quanta of its true place; f32 to the bit.
+        /// Checks that every vertex is within `quanta` quanta of its true place, floats to the bit, and that quanta are no
+        /// larger than they have to be.
         fn check(&self, tiles: &FrameTiles, truth: &Snapshot, quanta: f64) {
             let mut exact = Picture::new();
             exact.show(&encode(truth, tiles.refinement, Encoding::F32));
             assert_eq!(exact.vertices.len(), self.vertices.len());
+            let bounds_m: [f64; 3] = std::array::from_fn(|c| {
+                let Some(largest) = tiles.encoding.largest_integer() else { return 0.0 };
+                let ([low, high], quantum_m) = (tiles.box_m[c].map(f64::from), tiles.quanta.scale_m[c]);
+                let finest_m = tiles.finest_m.max(0.5 * (high - low) / largest);
+                assert!(quantum_m <= 1.01 * finest_m, "{quantum_m} where {finest_m} would do");
+                quanta * quantum_m
+            });
             for (shown, exact) in self.vertices.iter().zip(&exact.vertices) {
                 let (shown, exact) = (shown.unwrap(), exact.unwrap());
                 for c in 0..3 {
-                    let bound_m = if tiles.encoding == Encoding::F32 { 0.0 } else { quanta * tiles.quanta.scale_m[c] };
-                    assert!((shown[c] - exact[c]).abs() <= bound_m, "{} and {}", shown[c], exact[c]);
+                    assert!((shown[c] - exact[c]).abs() <= bounds_m[c], "{} and {}", shown[c], exact[c]);
                 }
             }
         }
@@ -360,7 +353,7 @@ mod tests {
         for points in [[1, 1], [1, 40], [2, 16], [16, 17], [17, 18], [33, 32], [50, 49]] {
             for n in [0, 1, 2, 10] {
                 let still = at(points, 0, 0.0, &std::array::from_fn(|_| vec![0.25; points[0] * points[1]]));
-                for encoding in [Encoding::F32, Encoding::I16] {
+                for encoding in Encoding::ALL {
                     let mut tiles = FrameTiles::new(&still, grid(points, n), encoding);
                     let mut picture = Picture::new();
                     let count = picture.show(&tiles.newer_than(None));
@@ -448,12 +441,11 @@ mod tests {
         #[test]
         fn a_viewer_sees_the_present_whichever_frames_it_got(
             n in 0_u32..4,
-            i16 in any::<bool>(),
+            encoding in prop::sample::select(&Encoding::ALL[..]),
             // Few points and strides, so that some movements also go back.
             moves in prop::collection::vec((0_usize..6, 0_usize..3, -7..-1, any::<bool>(), 0_u8..8, 0.0..0.5), 1..60),
         ) {
             let points = [35, 18];
-            let encoding = if i16 { Encoding::I16 } else { Encoding::F32 };
             let mut displacement_m: [Vec<f32>; 3] = std::array::from_fn(|_| vec![0.0; 35 * 18]);
             let mut tiles = FrameTiles::new(&at(points, 0, 0.0, &displacement_m), grid(points, n), encoding);
             let mut pictures = vec![Picture::new(); 3];

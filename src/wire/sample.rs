@@ -183,6 +183,26 @@ pub fn from_recovery(recovery: pb::Recovery) -> Recovery {
     Recovery { step, state_of_step, at_rest, undone_commands, paused_until_step, reason }
 }
 
+/// An encoding as a message has it.
+pub fn encoding(encoding: Encoding) -> pb::Encoding {
+    match encoding {
+        Encoding::F32 => pb::Encoding::F32,
+        Encoding::I16 => pb::Encoding::I16,
+    }
+}
+
+/// The encoding that a viewer asks for.
+///
+/// # Errors
+/// Refuses a number that no encoding has.
+pub fn from_encoding(encoding: i32) -> Result<Encoding> {
+    match pb::Encoding::try_from(encoding) {
+        Ok(pb::Encoding::Unspecified | pb::Encoding::F32) => Ok(Encoding::F32),
+        Ok(pb::Encoding::I16) => Ok(Encoding::I16),
+        Err(_) => Err(Refusal::new(Reason::WrongKind, "encoding", format!("unknown encoding {encoding}"))),
+    }
+}
+
 /// Bytes of displacements per message: messages of other streams wait for at most one of these.
 const FRAME_BYTES_PER_MESSAGE: usize = 64 << 10;
 
@@ -199,11 +219,7 @@ pub fn frame(viewer_id: &str, delivery: &Delivery, skipped: u64) -> Vec<pb::Watc
         refinement: frame.refinement.between() as u32,
         vertices_x: vertices_x as u32,
         vertices_y: vertices_y as u32,
-        encoding: match frame.encoding {
-            Encoding::F32 => pb::Encoding::F32,
-            Encoding::I16 => pb::Encoding::I16,
-        }
-        .into(),
+        encoding: encoding(frame.encoding).into(),
         origin_m: vector(frame.quanta.origin_m),
         scale_m: vector(frame.quanta.scale_m),
         full: frame.full,
@@ -239,5 +255,22 @@ fn patch(patch: &Patch) -> pb::Patch {
         count_x: patch.count[0] as u32,
         count_y: patch.count[1] as u32,
         displacement: patch.bytes.clone(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_encoding_has_a_number_and_every_number_an_encoding() {
+        let numbers = (0..).take_while(|number| pb::Encoding::try_from(*number).is_ok());
+        let known: Vec<Encoding> = numbers.skip(1).map(|number| from_encoding(number).unwrap()).collect();
+        assert_eq!(known, Encoding::ALL);
+        for each in Encoding::ALL {
+            assert_eq!(from_encoding(encoding(each).into()).unwrap(), each);
+        }
+        assert_eq!(from_encoding(0).unwrap(), Encoding::F32);
+        assert_eq!(from_encoding(7).unwrap_err().message, "unknown encoding 7");
     }
 }

@@ -149,6 +149,27 @@ mod tests {
         }
     }
 
+    /// The names in quotes in the comment above a field of `scene.proto`.
+    fn told(field: &str) -> Vec<&'static str> {
+        let (before, _) = include_str!("../../proto/palpate/v1/scene.proto").split_once(field).unwrap();
+        let comment = before.trim_end().lines().rev().take_while(|line| line.trim_start().starts_with("//"));
+        let mut lines: Vec<_> = comment.collect();
+        lines.reverse();
+        let mut names: Vec<_> = lines.into_iter().flat_map(|line| line.split('"').skip(1).step_by(2)).collect();
+        // The default is told once more.
+        names.pop_if(|last| *last == "auto");
+        names
+    }
+
+    #[test]
+    fn the_protocol_tells_every_name() {
+        fn names<T: Named>() -> Vec<&'static str> {
+            T::NAMES.iter().map(|entry| entry.0).collect()
+        }
+        assert_eq!(told("string integrator ="), names::<Integrator>());
+        assert_eq!(told("string precision ="), names::<Precision>());
+    }
+
     #[test]
     fn a_missing_coefficient_is_named() {
         let paper = Scene::parse("paper", crate::scene::PAPER, &[], &Limits::default()).unwrap();

@@ -12,9 +12,9 @@ use std::path::Path;
 use std::sync::Arc;
 
 use palpate::limits::Limits;
-use palpate::scene::Scene;
 use palpate::scene::profile::Poke;
 use palpate::scene::script::Script;
+use palpate::scene::{Integrator, Named, Scene};
 use palpate::session::Session;
 use palpate::sheet::{Model, Push};
 
@@ -33,6 +33,11 @@ pub fn model(scene: &Scene) -> Arc<Model> {
 
 pub fn script(text: &str, scene: &Scene) -> Script {
     Script::parse("test script", text, Path::new("scripts"), scene, &Limits::default()).unwrap()
+}
+
+/// The names of all schemes.
+pub fn schemes() -> impl Iterator<Item = &'static str> {
+    Integrator::NAMES.iter().map(|entry| entry.0).filter(|name| *name != "auto")
 }
 
 /// A session with a script's profiles acting.

@@ -185,6 +185,7 @@ fn a_million_steps_of_creep_stay_within_the_tolerance() {
 
 #[test]
 fn sleeping_is_the_same_at_every_width() {
+    // One of each family.
     for integrator in ["central", "exponential3", "rk4"] {
         let hash = |lanes: &str| {
             let (integrator, lanes) = (format!("stepping.integrator={integrator}"), format!("stepping.lanes={lanes}"));

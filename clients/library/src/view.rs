@@ -73,9 +73,10 @@ impl Surface {
             *self = Surface { vertices, displacement_m: vec![[0.0; 3]; count] };
         }
         let array = |v: Option<&pb::Vector3>| from_vector(v).to_array();
-        let (bytes, component, [origin_m, scale_m]): (usize, Component, _) = match part.encoding() {
-            pb::Encoding::Unspecified | pb::Encoding::F32 => (12, as_f32, [[0.0; 3], [1.0; 3]]),
-            pb::Encoding::I16 => (6, as_i16, [array(part.origin_m.as_ref()), array(part.scale_m.as_ref())]),
+        let (bytes, component, [origin_m, scale_m]): (usize, Component, _) = match part.encoding.try_into() {
+            Ok(pb::Encoding::Unspecified | pb::Encoding::F32) => (12, as_f32, [[0.0; 3], [1.0; 3]]),
+            Ok(pb::Encoding::I16) => (6, as_i16, [array(part.origin_m.as_ref()), array(part.scale_m.as_ref())]),
+            Err(_) => return Err(format!("unknown encoding {}", part.encoding)),
         };
         for patch in &part.patches {
             let [first_x, first_y] = [patch.first_x as usize, patch.first_y as usize];
@@ -156,6 +157,9 @@ mod tests {
         ] {
             assert!(surface.write(&part(pb::Encoding::F32, patch(first, count, vec![0; bytes]))).is_err(), "{first:?}");
         }
+        let unknown =
+            pb::WatchFramesResponse { encoding: 7, ..part(pb::Encoding::F32, patch([0, 0], [1, 1], vec![0; 12])) };
+        assert_eq!(surface.write(&unknown).unwrap_err(), "unknown encoding 7");
         let huge = pb::WatchFramesResponse { vertices_x: u32::MAX, vertices_y: u32::MAX, ..Default::default() };
         assert!(surface.write(&huge).is_err());
         // A patch of nothing is no error, and neither is an empty surface.

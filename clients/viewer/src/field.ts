@@ -11,6 +11,20 @@ export interface Rectangle {
   b1: number;
 }
 
+/** Whether an encoding writes integers, with origin and scale, or floats. */
+function hasIntegers(encoding: Encoding): boolean {
+  switch (encoding) {
+    case Encoding.UNSPECIFIED:
+    case Encoding.F32:
+      return false;
+    case Encoding.I16:
+      return true;
+    default:
+      // Of a newer server.
+      throw new RangeError(`unknown encoding ${String(encoding)}`);
+  }
+}
+
 export class Field {
   /** Vertex (a, b) has its three components from 3·(a·ny + b) on. */
   readonly displacementM: Float32Array<ArrayBuffer>;
@@ -27,7 +41,7 @@ export class Field {
   /** Writes a patch of a frame. */
   write(part: WatchFramesResponse, patch: Patch): void {
     const { displacement: bytes, firstX, firstY, countX, countY } = patch;
-    const isWhole = part.encoding === Encoding.I16;
+    const isWhole = hasIntegers(part.encoding);
     const size = 3 * countX * countY;
     if (bytes.byteLength !== size * (isWhole ? 2 : 4) || firstX + countX > this.nx || firstY + countY > this.ny) {
       throw new RangeError("a patch is not of this surface");

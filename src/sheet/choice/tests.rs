@@ -62,6 +62,7 @@ fn the_choice_keeps_its_tolerance_and_nothing_that_keeps_it_is_much_cheaper() {
 
 #[test]
 fn an_integrator_takes_hardly_more_substeps_than_it_needs() {
+    // Of those that `auto` may become.
     for (integrator, tolerance) in [
         (Integrator::Central, "3e-3"),
         (Integrator::Exponential2, "1e-4"),

@@ -20,6 +20,8 @@ pub use family::Node;
 pub use oscillator::Oscillator;
 pub use rk4::Rk4;
 
+use std::any::Any;
+
 use crate::scene::Integrator;
 use family::{Family, Release};
 use matrix::Matrix;
@@ -115,6 +117,16 @@ pub(super) fn entry(integrator: Integrator) -> Entry {
     }
 }
 
+/// `to`, if it is of the same type as `_from`.
+fn like<'t, F: 'static>(_from: &F, to: &'t dyn Any) -> Option<&'t F> {
+    to.downcast_ref()
+}
+
+/// The power of the substep with which the error of an integrator falls.
+pub fn order(integrator: Integrator) -> f64 {
+    entry(integrator).order
+}
+
 impl Scheme {
     /// Fits a scheme to a = K″·dt²/m and g = C·dt/m.
     pub fn fit(integrator: Integrator, a: f64, g: f64) -> Self {
@@ -198,7 +210,8 @@ impl Scheme {
         each!(self, |family| family.release(at))
     }
 
-    /// Converts u and d of one component of a point to the same scheme with another substep ([`Family::resample`]).
+    /// Converts u and d of one component of a point to the same scheme with another substep ([`Family::resample`]), or to
+    /// another scheme.
     pub(super) fn resample(
         &self,
         to: &Self,
@@ -207,22 +220,11 @@ impl Scheme {
         pushed: f64,
         springs: &mut [f64],
     ) -> [f64; 2] {
-        match (self, to) {
-            (Scheme::TwoStep(from), Scheme::TwoStep(to)) => from.resample(to, ratio, state, pushed, springs),
-            (Scheme::Exponential2(from), Scheme::Exponential2(to)) => from.resample(to, ratio, state, pushed, springs),
-            (Scheme::Exponential3(from), Scheme::Exponential3(to)) => from.resample(to, ratio, state, pushed, springs),
-            (Scheme::Exponential4(from), Scheme::Exponential4(to)) => from.resample(to, ratio, state, pushed, springs),
-            (Scheme::Rk4(from), Scheme::Rk4(to)) => from.resample(to, ratio, state, pushed, springs),
+        each!(self, |from| each!(to, |to| match like(from, to) {
+            Some(to) => from.resample(to, ratio, state, pushed, springs),
             // Schemes of two families have only the velocity in common.
-            (
-                Scheme::TwoStep(_)
-                | Scheme::Exponential2(_)
-                | Scheme::Exponential3(_)
-                | Scheme::Exponential4(_)
-                | Scheme::Rk4(_),
-                _,
-            ) => [state[0], state[1] * ratio],
-        }
+            None => [state[0], state[1] * ratio],
+        }))
     }
 }
 
