@@ -112,7 +112,7 @@ async function show(session: Session, isNew: boolean): Promise<void> {
   next.hand.strength = Number(part("strength", HTMLInputElement).value);
   next.hand.onRefused = notice;
   next.hand.onChange = holding;
-  next.frames.onFrame = () => stage.draw();
+  next.frames.onFrame = () => stage.drawFrame();
   next.samples.onSample = () => felt(next);
   const slider = part("refinement", HTMLInputElement);
   slider.max = String(next.mostRefinement);

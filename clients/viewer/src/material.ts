@@ -100,8 +100,10 @@ export class Skin extends ShaderMaterial {
           // A shadow in tissue is never black: light comes through from the side.
           vec3 key = diffuse * mix(vec3(0.26, 0.13, 0.12), vec3(1.0), share);
           // The lamp, and a weak light beside the eye.
-          float beside = 0.30 * max(dot(n, eye), 0.0) * near * vOpen;
-          vec3 shown = colour * (around + beside + 1.12 * vec3(1.0, 0.965, 0.92) * key * mix(0.55, 1.0, vOpen * near));
+          float beside = 0.24 * max(dot(n, eye), 0.0) * near * vOpen;
+          vec3 shown = colour * (around + beside + 1.0 * vec3(1.0, 0.965, 0.92) * key * mix(0.55, 1.0, vOpen * near));
+          // Bright tissue keeps its colour.
+          shown = 1.0 - exp(-1.15 * shown);
           vec3 half_ = normalize(lamp + eye);
           float h = max(dot(n, half_), 0.0);
           float graze = 1.0 - max(dot(n, eye), 0.0);

@@ -66,13 +66,11 @@ class Plot {
         high = Math.max(high, of(moment));
       }
     }
-    // Half a pixel of overshoot is no reason for another tick.
-    if (-low < 0.03 * (high - low)) low = 0;
     const tick = tickDistance(high - low);
-    const [first, last] = [Math.floor(low / tick + 1e-6), Math.ceil(high / tick - 1e-6)];
-    const y = (v: number) => bottom - ((v / tick - first) / (last - first)) * (bottom - TOP);
+    const [first, last] = [Math.ceil(low / tick - 1e-6), Math.ceil(high / tick - 1e-6)];
+    const y = (v: number) => bottom - ((v - low) / (last * tick - low)) * (bottom - TOP);
     const x = (t: number) => LEFT + (width - LEFT - 1) * (1 - (nowS - t) / HISTORY_S);
-    const [factor, prefix] = prefixed(Math.max(-first, last) * tick);
+    const [factor, prefix] = prefixed(Math.max(-low, last * tick));
     pen.font = "11px system-ui, sans-serif";
     pen.lineWidth = 1;
     pen.fillStyle = style.getPropertyValue("--faint");
@@ -85,7 +83,7 @@ class Plot {
       pen.moveTo(LEFT, at);
       pen.lineTo(width, at);
       pen.stroke();
-      if (k % 2 !== 0 && (bottom - TOP) / (last - first) < 13) continue;
+      if (k % 2 !== 0 && ((bottom - TOP) * tick) / (last * tick - low) < 13) continue;
       pen.fillText(String(Number((k * tick * factor).toPrecision(3))).replace("-", "−"), LEFT - 5, at);
     }
     pen.textBaseline = "alphabetic";
@@ -110,7 +108,8 @@ class Plot {
     for (const { name, colour, of } of this.lines) {
       pen.strokeStyle = pen.fillStyle = style.getPropertyValue(colour);
       const value = now && nowS - now.timeS < 0.5 ? of(now) : 0;
-      const text = `${name} ${(value * factor).toFixed(Math.max(0, Math.ceil(-Math.log10(tick * factor)) + 1)).replace("-", "−")}`;
+      const digits = Math.max(0, Math.ceil(-Math.log10(tick * factor)) + 1);
+      const text = `${name} ${(value * factor).toFixed(digits).replace(/^-(?=[0.]*$)/, "").replace("-", "−")}`;
       pen.fillText(text, at, 11);
       at += pen.measureText(text).width + 14;
       pen.lineWidth = 1.75;

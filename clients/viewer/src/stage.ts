@@ -34,6 +34,8 @@ const ALONE_MS = 40;
 const CALM_MS = 350;
 /** Pixels a side of that for each pixel of the screen, without a graphics processor: it smooths edges. */
 const CALM_PIXELS = 1.5;
+/** Movements of the tissue that nobody sees, of its size. */
+const UNSEEN = 2e-5;
 const FIELD_OF_VIEW = 28;
 /** The tissue fills the picture up to these margins, pixels: the words at the top and the bottom stay free. */
 const MARGIN = { top: 14, bottom: 46, side: 12 };
@@ -76,6 +78,9 @@ export class Stage {
   private held = false;
   private isSoftware: boolean;
   private isFine = false;
+  /** Whether more than the tissue changed since the last picture; and how far it moved since, m. */
+  private isDue = false;
+  private unseenM = 0;
   /** A pending picture of tools, drawn if no frame causes one first; and one in full. */
   private later: ReturnType<typeof setTimeout> | undefined;
   private calm: ReturnType<typeof setTimeout> | undefined;
@@ -347,8 +352,16 @@ export class Stage {
     return [right.x / length, right.y / length];
   }
 
+  /** Requests a picture of a frame. One that moves nothing visibly is not worth drawing what stands there in full again. */
+  drawFrame(): void {
+    const wasDue = this.isDue;
+    this.draw();
+    this.isDue = wasDue;
+  }
+
   /** Requests a picture. */
   draw(): void {
+    this.isDue = true;
     if (this.wanted) return;
     this.wanted = true;
     const askedMs = performance.now();
@@ -359,6 +372,13 @@ export class Stage {
     this.wanted = false;
     clearTimeout(this.later);
     this.later = undefined;
+    this.surface?.refresh();
+    this.unseenM += this.surface?.takeMoved() ?? 0;
+    if (this.isFine && !this.isDue && !this.held && this.unseenM < UNSEEN * this.extentM.length()) {
+      this.drawn += 1;
+      return;
+    }
+    this.isDue = false;
     clearTimeout(this.calm);
     if (this.isFine) this.fit(false);
     this.paint();
@@ -380,6 +400,8 @@ export class Stage {
 
   private paint(): void {
     this.surface?.refresh();
+    this.surface?.takeMoved();
+    this.unseenM = 0;
     this.stayAbove();
     this.placeTools();
     this.renderer.render(this.scene, this.camera);

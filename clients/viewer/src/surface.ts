@@ -27,6 +27,8 @@ export class Surface {
   /** The fraction of light from around that reaches each vertex: less in a dent. */
   private open = this.position;
   private readonly found = new Vector3();
+  /** The largest movement of a drawn vertex along an axis since `takeMoved`, m, if each refresh adds its largest. */
+  private movedM = 0;
 
   /**
    * Vertex (a, b) rests at (a, b, 0)·spacing, and has texture coordinates (a/(nx − 1), b/(ny − 1)). `GetMesh` would
@@ -125,16 +127,27 @@ export class Surface {
     const { rows, columns, spacingM } = this;
     const { ny, displacementM: d } = this.field;
     const p = this.position.array as Float32Array;
+    let most = 0;
     for (let a = a0; a <= a1; a++) {
       const row = rows[a]!;
       for (let b = b0, i = 3 * (a * columns.length + b0); b <= b1; b++, i += 3) {
         const column = columns[b]!;
         const k = 3 * (row * ny + column);
-        p[i] = row * spacingM + d[k]!;
-        p[i + 1] = column * spacingM + d[k + 1]!;
-        p[i + 2] = d[k + 2]!;
+        const [x, y, z] = [row * spacingM + d[k]!, column * spacingM + d[k + 1]!, d[k + 2]!];
+        most = Math.max(most, Math.abs(x - p[i]!), Math.abs(y - p[i + 1]!), Math.abs(z - p[i + 2]!));
+        p[i] = x;
+        p[i + 1] = y;
+        p[i + 2] = z;
       }
     }
+    this.movedM += most;
+  }
+
+  /** How far vertices moved at most since the last call, m. */
+  takeMoved(): number {
+    const moved = this.movedM;
+    this.movedM = 0;
+    return moved;
   }
 
   /**
