@@ -77,7 +77,7 @@ async function open(sessionId: string | undefined, scene: string | undefined): P
       // A refusal with any other reason would be repeated.
       if (!["", "SHUTTING_DOWN", "TOO_MANY"].includes(reasonOf(error))) return over(`${refused}.`);
       const waitMs = backoffMs(failures);
-      status.shine("lost");
+      status.lose();
       status.say(`Unexpected answer from the server (${refused}). Trying again in ${(waitMs / 1000).toFixed(1)} s.`);
       await sleep(waitMs);
     }
@@ -88,7 +88,7 @@ async function open(sessionId: string | undefined, scene: string | undefined): P
 function over(why: string): void {
   visit?.leave();
   visit = undefined;
-  status.shine("lost");
+  status.lose();
   status.say(why);
   notice(`${why} `, 0);
   const again = document.createElement("button");
@@ -105,7 +105,7 @@ async function show(session: Session, isNew: boolean): Promise<void> {
   const next = new Visit(session, holder, askedNumber("refinement", 0, 10), {
     onSession: heard,
     onTrouble: trouble,
-    onWell: () => visit === next && status.say(wellText(next.session)),
+    onWell: () => visit === next && status.found(wellText(next.session)),
   });
   visit = next;
   next.hand.mode = chosenMode();
@@ -149,7 +149,7 @@ function recoveredText({ recoveryCount, recoveries }: Session): string {
 
 function trouble(failure: Failure, waitMs: number): void {
   if (failure.isGone) return over("The session has ended.");
-  status.shine("lost");
+  status.lose();
   status.say(`Connection lost (${failure.text}). Trying again in ${(waitMs / 1000).toFixed(1)} s.`);
 }
 

@@ -85,6 +85,7 @@ export class Stage {
   private later: ReturnType<typeof setTimeout> | undefined;
   private calm: ReturnType<typeof setTimeout> | undefined;
   private readonly spot = new Vector3();
+  private readonly projected = new Vector3();
 
   /** With `isFixed`, always uses the greatest effort, however long a picture takes. */
   constructor(
@@ -341,7 +342,7 @@ export class Stage {
   inWindow(at: Vec3): [number, number] {
     const box = this.canvas.getBoundingClientRect();
     this.camera.updateMatrixWorld();
-    const p = new Vector3(...at).project(this.camera);
+    const p = this.projected.set(...at).project(this.camera);
     return [box.left + ((p.x + 1) / 2) * box.width, box.top + ((1 - p.y) / 2) * box.height];
   }
 

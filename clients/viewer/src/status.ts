@@ -33,6 +33,8 @@ type Light = "wait" | "good" | "slow" | "lost";
 const WORDS: Record<Light, string> = { wait: "Connecting", good: "Good", slow: "Slow", lost: "Lost" };
 
 export class Status {
+  /** Whether a stream failed and nothing came since. */
+  private isLost = false;
   /** Seconds in a row that something was slow. */
   private slowTimes = 0;
   private readonly word: HTMLElement;
@@ -52,16 +54,30 @@ export class Status {
     });
   }
 
-  /** Shows the light, and why if it is not good. */
-  shine(light: Light, why = ""): void {
+  /** The server is lost, until it answers. */
+  lose(): void {
+    this.isLost = true;
+    this.shine("lost");
+  }
+
+  /** The server answers. */
+  found(text: string): void {
+    this.isLost = false;
+    this.say(text);
+  }
+
+  /** Shows the light, and why if it is not good. What is lost is drawn without colour: nobody knows whether it still holds. */
+  private shine(light: Light, why = ""): void {
     const text = WORDS[light] + (why && `: ${why}`);
     if (this.light.dataset.light !== light) this.light.dataset.light = light;
     if (this.word.textContent !== text) this.word.textContent = text;
+    document.body.dataset.light = light;
   }
 
   /** Judges the figures. One slow second does not count. */
   private judge(figures: Figures, taken: number, drawn: number): void {
     const { roundTripMs = 0, dilation, silentMs, frameAgeMs = 0, isStill } = figures;
+    if (this.isLost) return;
     if (silentMs > LOST_MS) return this.shine("lost", `no answer for ${(silentMs / 1000).toFixed(0)} s`);
     const reasons = [
       roundTripMs > SLOW.roundTripMs ? `answers take ${(roundTripMs / 1000).toFixed(1)} s` : "",
