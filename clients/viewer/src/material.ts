@@ -3,8 +3,8 @@
 
 import { Color, DoubleSide, ShaderMaterial, type Texture, Vector2, Vector3, Vector4 } from "three";
 
-/** Tools that cast a shadow. */
-export const SHADOWS = 2;
+/** Tools that cast a shadow: each costs every pixel. */
+export const SHADOWS = 1;
 
 /** What the programs share; `Stage` and `ToolMark` write it. */
 export const light = {
@@ -108,7 +108,12 @@ export class Skin extends ShaderMaterial {
           float h = max(dot(n, half_), 0.0);
           float graze = 1.0 - max(dot(n, eye), 0.0);
           float mirror = 0.04 + 0.96 * graze * graze * graze * graze * graze;
-          float glint = 0.8 * smoothstep(0.9984, 0.9994, h) + 0.055 * pow(h, 48.0);
+          float sheen = h * h;
+          sheen *= sheen;
+          sheen *= sheen;
+          sheen *= sheen;
+          sheen *= sheen * sheen;
+          float glint = 0.8 * smoothstep(0.9984, 0.9994, h) + 0.055 * sheen;
           vec3 seen = reflect(-eye, n);
           float sky = 0.30 * smoothstep(0.15, 0.9, seen.z) * (0.25 + 2.4 * mirror);
           shown += (glint * share + 0.16 * sky * vOpen) * near * vec3(1.0, 0.98, 0.95);

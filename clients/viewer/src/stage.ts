@@ -31,9 +31,11 @@ import { type ShownTool, ToolMark } from "./tool";
 /** After this time without a frame, tool changes are drawn on their own. */
 const ALONE_MS = 40;
 /** After this time without a change, a picture of less effort is drawn again in full. */
-const CALM_MS = 350;
+const CALM_MS = 450;
 /** Pixels a side of that for each pixel of the screen, without a graphics processor: it smooths edges. */
 const CALM_PIXELS = 1.5;
+/** If that would take longer, one has to do: a press must not wait for it. */
+const CALM_TAKES_MS = 500;
 /** Movements of the tissue that nobody sees, of its size. */
 const UNSEEN = 2e-5;
 const FIELD_OF_VIEW = 28;
@@ -73,6 +75,8 @@ export class Stage {
   private isHome = true;
   private wanted = false;
   private before = 0;
+  /** Time that the last picture of what moves took, ms. */
+  private tookMs = 0;
   private readonly effort: Effort;
   private wireframe = false;
   private held = false;
@@ -392,6 +396,7 @@ export class Stage {
       // Only pictures that the page waited for count.
       const tookMs = now - Math.max(this.before, askedMs);
       this.before = now;
+      if (!this.isFine) this.tookMs = tookMs;
       this.adapt(tookMs);
       clearTimeout(this.calm);
       const isLess = this.effort.now.pixels < 1 || (this.isSoftware && !this.isFixed);
@@ -467,7 +472,8 @@ export class Stage {
   private fit(isFine: boolean): void {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     const ratio = Math.min(devicePixelRatio, 2);
-    const fine = this.isSoftware ? Math.max(ratio, CALM_PIXELS) : ratio;
+    const takesMs = this.tookMs * ((CALM_PIXELS / ratio / this.effort.now.pixels) ** 2);
+    const fine = this.isSoftware && takesMs < CALM_TAKES_MS ? Math.max(ratio, CALM_PIXELS) : ratio;
     this.isFine = isFine;
     this.renderer.setPixelRatio(isFine ? fine : ratio * this.effort.now.pixels);
     this.renderer.setSize(width, height, false);
