@@ -6,8 +6,8 @@ use std::process::{Command, Output};
 
 use palpate::limits::Limits;
 use palpate::refusal::Reason;
-use palpate::scene::{Appearance, PAPER, Scene};
-use palpate::texture::{Image, image, mucosa, texture};
+use palpate::scene::{Appearance, Named, PAPER, Scene, Surface};
+use palpate::texture::{Image, image, painted, texture};
 
 fn palpate(arguments: &[&str]) -> Output {
     let program = env!("CARGO_BIN_EXE_palpate");
@@ -62,7 +62,7 @@ fn a_texture_is_made_by_its_seed() {
     let small = decoded(&first);
     assert_eq!((small.width, small.height), (96, 96));
     // The lining of a stomach: red, and neither flat nor noise.
-    let large = mucosa(5, 384, &Limits::default()).unwrap();
+    let large = painted(Surface::Mucosa, 5, 384, &Limits::default()).unwrap();
     let mut spread = 0.0_f64;
     for part in (0..64).map(|k| [k % 8, k / 8]) {
         let [a, b] = [mean(&small, 8, part), mean(&large, 8, part)];
@@ -76,6 +76,27 @@ fn a_texture_is_made_by_its_seed() {
     refused(&["texture", "--size", "3", "--output", "never.png"], "from 16 to 4096");
     let nowhere = palpate(&["texture", "--size", "16", "--output", "no/such/folder/a.png"]);
     assert_eq!(nowhere.status.code(), Some(1));
+}
+
+#[test]
+fn each_tissue_has_a_surface_of_its_own() {
+    let limits = Limits::default();
+    let mut means = Vec::new();
+    for (name, surface) in [("liver", "liver"), ("fibrotic", "nodular"), ("stomach", "mucosa")] {
+        let scene = Scene::load(&Path::new("scenes").join(format!("{name}.toml")), &[], &limits).unwrap();
+        assert_eq!(scene.appearance.surface.name(), surface);
+        let small = Appearance { texture_size: 192, ..scene.appearance };
+        let painted = image(&small, &limits).unwrap();
+        let program = made("a.png", &["texture", "--surface", surface, "--size", "192"]);
+        assert_eq!(painted, decoded(&program), "{name}");
+        means.push(mean(&painted, 1, [0, 0]));
+    }
+    // A liver is dark, its scarred one paler and yellower, the lining of a stomach pink.
+    let [liver, nodular, mucosa] = [means[0], means[1], means[2]];
+    assert!(liver[0] < nodular[0] - 20.0 && nodular[0] < mucosa[0] - 15.0, "{means:?}");
+    assert!(nodular[1] / nodular[2] > 1.05 * liver[1] / liver[2], "{means:?}");
+    assert_eq!(Appearance::default().surface, Surface::Mucosa);
+    refused(&["texture", "--surface", "spleen", "--output", "never.png"], "surface");
 }
 
 /// A scene whose own image is of these pixels, rows from the top.
@@ -114,6 +135,8 @@ fn a_scene_may_have_an_image_of_its_own() {
         ("texture_seed = -1", Reason::OutOfRange, "appearance.texture_seed"),
         ("texture = 7", Reason::WrongKind, "appearance.texture"),
         ("texture = \"own.png\"\ntexture_seed = 3", Reason::WrongKind, "appearance.texture"),
+        ("texture = \"own.png\"\nsurface = \"liver\"", Reason::WrongKind, "appearance.texture"),
+        ("surface = \"spleen\"", Reason::WrongKind, "appearance.surface"),
         ("colour = \"red\"", Reason::UnknownKey, "appearance.colour"),
     ] {
         let text = format!("{PAPER}\n[appearance]\n{lines}\n");

@@ -3,12 +3,16 @@
 use std::path::PathBuf;
 
 use palpate::limits::Limits;
+use palpate::scene::{Named, Surface};
 use palpate::texture;
 
 use super::{Failure, write_file};
 
 #[derive(clap::Args)]
 pub(crate) struct TextureArguments {
+    /// What it shows: mucosa, liver or nodular
+    #[arg(long, value_name = "NAME", default_value = "mucosa")]
+    surface: String,
     /// Seed of the texture, an integer
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
@@ -22,6 +26,7 @@ pub(crate) struct TextureArguments {
 
 /// Paints a texture.
 pub(crate) fn make_texture(arguments: &TextureArguments) -> Result<(), Failure> {
-    let image = texture::mucosa(arguments.seed, arguments.size, &Limits::default())?;
+    let surface = Surface::named("surface", &arguments.surface)?;
+    let image = texture::painted(surface, arguments.seed, arguments.size, &Limits::default())?;
     write_file(&arguments.output, &image.png()?)
 }

@@ -62,7 +62,9 @@ pub const SMALLEST_TEXTURE: u32 = 16;
 pub struct Appearance {
     /// A PNG image for the surface; one is made if `None`.
     pub texture: Option<PathBuf>,
-    /// Which one is made.
+    /// What the one that is made shows.
+    pub surface: Surface,
+    /// Which one of these is made.
     pub texture_seed: u64,
     /// Pixels along each side of that.
     pub texture_size: u32,
@@ -70,7 +72,7 @@ pub struct Appearance {
 
 impl Default for Appearance {
     fn default() -> Self {
-        Appearance { texture: None, texture_seed: 1, texture_size: 1024 }
+        Appearance { texture: None, surface: Surface::Mucosa, texture_seed: 1, texture_size: 1024 }
     }
 }
 
@@ -80,6 +82,22 @@ impl Appearance {
         self.texture = self.texture.map(|path| folder.join(path));
         self
     }
+}
+
+/// Surfaces that can be painted (`texture`).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Surface {
+    /// The lining of a stomach.
+    Mucosa,
+    /// The capsule of a liver.
+    Liver,
+    /// A fibrotic liver: nodules in a net of scar.
+    Nodular,
+}
+
+impl Named for Surface {
+    const NAMES: &'static [(&'static str, Self)] =
+        &[("mucosa", Surface::Mucosa), ("liver", Surface::Liver), ("nodular", Surface::Nodular)];
 }
 
 /// What of a tissue may change while it is in use. What is `None` stays.
@@ -357,10 +375,14 @@ fn read_appearance(item: &Item<'_>, limits: &Limits) -> Result<Appearance> {
     item.table(|fields| {
         let standard = Appearance::default();
         let texture = fields.text("texture")?.map(PathBuf::from);
+        let surface = match fields.text("surface")? {
+            Some(name) => Some(Surface::named(&fields.path("surface"), &name)?),
+            None => None,
+        };
         let seed = fields.item("texture_seed").map(|item| item.whole()).transpose()?;
         let size = fields.item("texture_size").map(|item| item.whole()).transpose()?;
-        if texture.is_some() && (seed.is_some() || size.is_some()) {
-            let message = "names an image: texture_seed and texture_size are for one that is made";
+        if texture.is_some() && (surface.is_some() || seed.is_some() || size.is_some()) {
+            let message = "names an image: surface, texture_seed and texture_size are for one that is made";
             return Err(fields.refuse(Reason::WrongKind, "texture", message));
         }
         let texture_size = match size {
@@ -372,7 +394,12 @@ fn read_appearance(item: &Item<'_>, limits: &Limits) -> Result<Appearance> {
             }
             None => standard.texture_size,
         };
-        Ok(Appearance { texture, texture_seed: seed.unwrap_or(standard.texture_seed), texture_size })
+        Ok(Appearance {
+            texture,
+            surface: surface.unwrap_or(standard.surface),
+            texture_seed: seed.unwrap_or(standard.texture_seed),
+            texture_size,
+        })
     })
 }
 

@@ -7,7 +7,7 @@ use glam::DVec3;
 
 use palpate_touch::Tip;
 
-use crate::shape::PointId;
+use crate::shape::{self, PointId, RestShape};
 
 /// A moment within a step: `fraction` from 0 (its beginning) to 1 (its end).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -128,6 +128,12 @@ impl Profile {
             Profile::Sine { frequency_hz } => libm::sin(std::f64::consts::TAU * frequency_hz * moment.time_s(rate_hz)),
         }
     }
+}
+
+/// Σ exp(−c·r) over all points of a shape: what a force on all of them together is divided by. r is the distance at rest to
+/// `centre_m`, c is `falloff_per_m`.
+pub fn weights(shape: &dyn RestShape, centre_m: DVec3, falloff_per_m: f64) -> f64 {
+    shape::points(shape).map(|point| libm::exp(-falloff_per_m * shape.rest_m(point).distance(centre_m))).sum()
 }
 
 impl CentreProfile {

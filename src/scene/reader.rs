@@ -10,7 +10,9 @@ use palpate_touch::{Coupling, Tip};
 use super::check::{check_force, check_free, check_reach, check_tip};
 use super::document::{self, Document, Fields, Item};
 use super::kind::Kind;
-use super::profile::{CentreProfile, LoadProfile, Moment, MotionProfile, Move, PoseProfile, Profile, StrengthProfile};
+use super::profile::{
+    CentreProfile, LoadProfile, Moment, MotionProfile, Move, PoseProfile, Profile, StrengthProfile, weights,
+};
 use super::script::Script;
 use super::{Change, Scene};
 use crate::limits::Limits;
@@ -229,9 +231,8 @@ impl Binding<'_> {
                 return Err(fields.refuse(Reason::WrongKind, key, message));
             }
         }
-        let (shape, at_m) = (self.scene.shape(), centre.begins_at_m());
-        let weights = shape::points(shape).map(|point| libm::exp(-shape.rest_m(point).distance(at_m) / radius_m));
-        let sum: f64 = weights.sum();
+        let shape = self.scene.shape();
+        let sum = weights(shape, centre.begins_at_m(), radius_m.recip());
         if sum < LEAST_WEIGHT {
             let message = format!("is so small that no point is reached: points are {} m apart", shape.edge_m());
             return Err(fields.refuse(Reason::OutOfRange, "radius_m", message));

@@ -8,9 +8,9 @@ use glam::DVec3;
 use palpate_touch::{Law, Tip};
 
 use crate::force_law;
-use crate::scene::profile::{CentreProfile, LoadProfile, StrengthProfile};
+use crate::scene::profile::{LoadProfile, StrengthProfile, weights};
 use crate::scene::script::Script;
-use crate::shape::{self, RestShape};
+use crate::shape::RestShape;
 use crate::sheet::Model;
 use crate::sheet::integrate::Oscillator;
 
@@ -180,15 +180,8 @@ fn total_n(shape: &dyn RestShape, profile: &LoadProfile) -> f64 {
         StrengthProfile::Scaled(force_n, _) => force_n.length(),
         StrengthProfile::Recorded(rows) => rows.iter().map(|row| row.1.length()).fold(0.0, f64::max),
     };
-    let centre_m = match &profile.centre {
-        CentreProfile::Hops(hops) => hops.first().map_or(DVec3::ZERO, |hop| hop.1),
-        CentreProfile::Path { from_m, .. } => *from_m,
-    };
-    let share = |point| {
-        let distance_m = shape.rest_m(point).distance(centre_m);
-        libm::exp(profile.falloff_offset - profile.falloff_per_m * distance_m)
-    };
-    largest_n * shape::points(shape).map(share).sum::<f64>()
+    let weights = weights(shape, profile.centre.begins_at_m(), profile.falloff_per_m);
+    largest_n * libm::exp(profile.falloff_offset) * weights
 }
 
 /// Three significant digits.

@@ -1,7 +1,11 @@
 //! The appearance of a tissue: an image of its surface, generated from a seed or supplied by the user. The same seed
-//! and size give the same bytes on any machine.
+//! and size give the same bytes on any machine. A painted image has colour only, no relief and no light: viewers shade the
+//! surface by its true shape.
 
+mod colour;
+mod liver;
 mod mucosa;
+mod nodular;
 mod noise;
 mod vessels;
 
@@ -13,7 +17,7 @@ use bytes::Bytes;
 use crate::limits::Limits;
 use crate::memory;
 use crate::refusal::{Reason, Refusal, Result, number};
-use crate::scene::{Appearance, SMALLEST_TEXTURE};
+use crate::scene::{Appearance, SMALLEST_TEXTURE, Surface};
 
 /// An image: rows of pixels from the top, sRGB.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -35,16 +39,21 @@ pub struct Texture {
     pub etag: String,
 }
 
-/// The lining of a stomach as in an endoscope, `size` × `size` pixels.
+/// An image of a kind of surface, `size` × `size` pixels.
 ///
 /// # Errors
 /// Refuses a size outside the limits.
-pub fn mucosa(seed: u64, size: u32, limits: &Limits) -> Result<Image> {
+pub fn painted(surface: Surface, seed: u64, size: u32, limits: &Limits) -> Result<Image> {
     let range = format!("from {SMALLEST_TEXTURE} to {} pixels", limits.texture_side);
     let holds = |v| v >= f64::from(SMALLEST_TEXTURE) && v <= f64::from(limits.texture_side);
     number("texture_size", f64::from(size), &range, holds)?;
     let side = size as usize;
-    Ok(Image { width: side, height: side, rgb: mucosa::paint(seed, side) })
+    let rgb = match surface {
+        Surface::Mucosa => mucosa::paint(seed, side),
+        Surface::Liver => liver::paint(seed, side),
+        Surface::Nodular => nodular::paint(seed, side),
+    };
+    Ok(Image { width: side, height: side, rgb })
 }
 
 /// The image of a scene's tissue.
@@ -54,7 +63,7 @@ pub fn mucosa(seed: u64, size: u32, limits: &Limits) -> Result<Image> {
 pub fn image(appearance: &Appearance, limits: &Limits) -> Result<Image> {
     match &appearance.texture {
         Some(path) => Image::decode(path, &read(path, limits)?, limits),
-        None => mucosa(appearance.texture_seed, appearance.texture_size, limits),
+        None => painted(appearance.surface, appearance.texture_seed, appearance.texture_size, limits),
     }
 }
 

@@ -74,3 +74,44 @@ pub(super) fn cells(seed: u32, x: f32, y: f32) -> [f32; 2] {
     }
     nearest.map(f32::sqrt)
 }
+
+/// A tile of a mosaic.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Tile {
+    /// Distance to its middle.
+    pub(super) middle: f32,
+    /// How much farther the next tile's middle is: 0 on the edge.
+    pub(super) edge: f32,
+    /// Bits that are its own.
+    pub(super) name: u32,
+}
+
+/// A mosaic of hexagons, their middles 1 apart. `disorder` moves the middles by up to half of itself along each axis;
+/// `spread` makes tiles larger and smaller.
+pub(super) fn mosaic(seed: u32, x: f32, y: f32, disorder: f32, spread: f32) -> Tile {
+    /// Distance of two rows: half the square root of 3.
+    const ROW: f32 = 0.866_025_4;
+    let j = (y / ROW + 0.5).floor() as i32;
+    let mut nearest = Tile { middle: f32::MAX, edge: f32::MAX, name: 0 };
+    let (mut first, mut second) = (f32::MAX, f32::MAX);
+    for row in j - 2..=j + 2 {
+        let shift = if row % 2 == 0 { 0.0 } else { 0.5 };
+        let i = (x - shift + 0.5).floor() as i32;
+        for column in i - 2..=i + 2 {
+            let bits = bits(seed, column, row);
+            let off = |part: u32| disorder * ((part & 0xffff) as f32 / 65536.0 - 0.5);
+            let dx = column as f32 + shift + off(bits) - x;
+            let dy = row as f32 * ROW + off(bits >> 16) - y;
+            let away = (dx * dx + dy * dy).sqrt();
+            let reach = away - spread * unit(bits.wrapping_mul(0x9e37_79b1));
+            if reach < first {
+                second = first;
+                first = reach;
+                nearest = Tile { middle: away, edge: 0.0, name: bits };
+            } else if reach < second {
+                second = reach;
+            }
+        }
+    }
+    Tile { edge: second - first, ..nearest }
+}

@@ -1,14 +1,13 @@
 // Adapts the effort for a picture to the time available.
 
-/** Efforts, greatest first. Without a graphics processor, each takes about two thirds of the time of the one before. */
+/** Efforts, greatest first. The light is the same in all. */
 export const EFFORTS = [
-  { pixels: 1, isPhysical: true, every: 1 },
-  { pixels: 0.7, isPhysical: true, every: 1 },
-  { pixels: 0.7, isPhysical: false, every: 1 },
-  { pixels: 0.7, isPhysical: false, every: 2 },
-  { pixels: 0.5, isPhysical: false, every: 2 },
-  { pixels: 0.5, isPhysical: false, every: 4 },
-] as const satisfies { pixels: number; isPhysical: boolean; every: number }[];
+  { pixels: 1, every: 1 },
+  { pixels: 0.75, every: 1 },
+  { pixels: 0.75, every: 2 },
+  { pixels: 0.55, every: 2 },
+  { pixels: 0.45, every: 4 },
+] as const satisfies { pixels: number; every: number }[];
 
 /** Pictures that take longer are late, ms: with a graphics processor, and with software rendering. */
 const LATE_MS = { hardware: 45, software: 40 };
@@ -34,7 +33,7 @@ export class Effort {
     private readonly isFixed: boolean,
   ) {
     this.lateMs = isSoftware ? LATE_MS.software : LATE_MS.hardware;
-    this.index = isSoftware && !isFixed ? 3 : 0;
+    this.index = isSoftware && !isFixed ? 2 : 0;
   }
 
   get now(): (typeof EFFORTS)[number] {
@@ -71,11 +70,10 @@ export class Effort {
 
   /** Text for the status line: what is reduced. */
   describe(every: number): string {
-    const { pixels, isPhysical } = this.now;
+    const { pixels } = this.now;
     const less = [
       pixels < 1 ? `${Math.round(100 * pixels)} % of the pixels a side` : "",
       every > 1 ? `1 vertex in ${every} a side` : "",
-      isPhysical ? "" : "simple lighting",
       this.isSoftware ? "no graphics processor" : "",
     ].filter((what) => what !== "");
     return less.join(", ") || "in full";

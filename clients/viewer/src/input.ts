@@ -121,7 +121,7 @@ export class Input {
       const to = (v: number, along: number, most: number) => Math.min(Math.max(v + along * reach.spacingM, 0), most);
       this.aimM = [to(x, by[0], extentM[0]), to(y, by[1], extentM[1])];
       if (hand.touches) this.lead(this.aimM, touched);
-      this.stage.setAim(this.onSurface(this.aimM));
+      this.stage.setAim(this.aimM);
     } else if (event.key === " ") {
       if (!event.repeat && !hand.touches) {
         this.aimM ??= [extentM[0] / 2, extentM[1] / 2];
@@ -129,7 +129,7 @@ export class Input {
         this.begin(hand, this.aimM);
         // A pull by key lifts the point.
         if (hand.mode === "pull") hand.lean([0, 0, reach.depthM * hand.strength]);
-        this.stage.setAim(this.onSurface(this.aimM));
+        this.stage.setAim(this.aimM);
       }
     } else if (event.key === "Escape") {
       void hand.letGo();

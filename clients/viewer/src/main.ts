@@ -11,9 +11,10 @@ import { SessionState } from "./gen/palpate/v1/session_pb";
 import type { Mode } from "./hand";
 import { Input } from "./input";
 import { Latency } from "./latency";
+import { depthText, Overlay } from "./overlay";
 import { asked, askedNumber, holderName, part, writeAddress } from "./page";
 import { Plots, quantity } from "./plot";
-import { norm, type Vec3 } from "./samples";
+import { norm } from "./samples";
 import { playScript } from "./script";
 import { backoffMs, describe, type Failure, isGone, PATIENCE_MS, reasonOf, received, sessions, sleep } from "./server";
 import { Stage } from "./stage";
@@ -23,12 +24,21 @@ import { TissueValues } from "./tissue";
 import { Visit } from "./visit";
 
 /** The scene of a new session, if the server has it and the address names no other. */
-const DEFAULT_SCENE = "paper";
+const DEFAULT_SCENE = "liver";
+
+/** When samples are so much newer than the newest frame, nothing moves: frames come 60 times a second. */
+const STILL_S = 0.25;
 
 const canvas = part("tissue", HTMLCanvasElement);
 const stage = new Stage(canvas, asked.get("quality") === "high");
+const overlay = new Overlay(stage);
 const latency = new Latency(stage);
-const status = new Status(part("connection", HTMLElement), part("figures", HTMLElement));
+const status = new Status(
+  part("light", HTMLElement),
+  part("connection", HTMLElement),
+  part("figures", HTMLElement),
+  part("details", HTMLButtonElement),
+);
 const plots = new Plots(part("plot-displacement", HTMLCanvasElement), part("plot-force", HTMLCanvasElement));
 const tissue = new TissueValues(heard, notice);
 const holder = holderName();
@@ -67,6 +77,7 @@ async function open(sessionId: string | undefined, scene: string | undefined): P
       // A refusal with any other reason would be repeated.
       if (!["", "SHUTTING_DOWN", "TOO_MANY"].includes(reasonOf(error))) return over(`${refused}.`);
       const waitMs = backoffMs(failures);
+      status.lose();
       status.say(`Unexpected answer from the server (${refused}). Trying again in ${(waitMs / 1000).toFixed(1)} s.`);
       await sleep(waitMs);
     }
@@ -77,6 +88,7 @@ async function open(sessionId: string | undefined, scene: string | undefined): P
 function over(why: string): void {
   visit?.leave();
   visit = undefined;
+  status.lose();
   status.say(why);
   notice(`${why} `, 0);
   const again = document.createElement("button");
@@ -93,26 +105,30 @@ async function show(session: Session, isNew: boolean): Promise<void> {
   const next = new Visit(session, holder, askedNumber("refinement", 0, 10), {
     onSession: heard,
     onTrouble: trouble,
-    onWell: () => visit === next && status.say(wellText(next.session)),
+    onWell: () => visit === next && status.found(wellText(next.session)),
   });
   visit = next;
+  void listScripts(session.sessionId);
   next.hand.mode = chosenMode();
   next.hand.strength = Number(part("strength", HTMLInputElement).value);
   next.hand.onRefused = notice;
   next.hand.onChange = holding;
-  next.frames.onFrame = () => stage.draw();
+  next.frames.onFrame = () => stage.drawFrame();
   next.samples.onSample = () => felt(next);
   const slider = part("refinement", HTMLInputElement);
   slider.max = String(next.mostRefinement);
   slider.value = String(next.refinement);
   tellControls();
   tissue.begin(session);
-  stage.show(next.surface, next.extentM, undefined, false);
+  // Shaded by its shape at once; the texture comes when it is painted.
+  stage.show(next.surface, next.extentM, false);
   stage.setTools([], 1);
+  part("arriving", HTMLElement).hidden = true;
   next.begin();
   if (document.hidden) next.lookAway();
   const texture = await tissueTexture(session.sessionId);
-  if (visit === next) stage.show(next.surface, next.extentM, texture, true);
+  if (visit !== next) texture?.dispose();
+  else if (texture) stage.setTexture(texture);
 }
 
 function wellText(session: Session): string {
@@ -134,6 +150,7 @@ function recoveredText({ recoveryCount, recoveries }: Session): string {
 
 function trouble(failure: Failure, waitMs: number): void {
   if (failure.isGone) return over("The session has ended.");
+  status.lose();
   status.say(`Connection lost (${failure.text}). Trying again in ${(waitMs / 1000).toFixed(1)} s.`);
 }
 
@@ -150,7 +167,7 @@ function holding(): void {
   const mine = visit.hand.holds;
   const others = visit.session.heldTools.filter((tool) => !mine || tool.tool !== 0);
   const names = others.map((tool) => `${tool.holder || "Somebody"} holds ${tool.tool === 0 ? "the tool" : `tool ${tool.tool}`}`);
-  part("holder", HTMLElement).textContent = mine ? `You (${holder}) hold the tool` : names.join(", ") || "The tool is free";
+  part("holder", HTMLElement).textContent = mine ? `You (${holder}) hold the tool` : names.join(", ") || "Nobody touches: press to begin";
   part("release", HTMLButtonElement).disabled = !mine;
 }
 
@@ -158,9 +175,9 @@ function holding(): void {
 function felt(of: Visit): void {
   if (of !== visit) return;
   const { spacingM, mostN } = of.reach;
-  const shown = of.samples.tools.map(({ point, displacementM: [x, y, z], forceN }) => {
-    const placeM: Vec3 = [(point?.x ?? 0) * spacingM + x, (point?.y ?? 0) * spacingM + y, z];
-    return { placeM, forceN };
+  const shown = of.samples.tools.map(({ point, forceN }) => {
+    const restM: [number, number] = [(point?.x ?? 0) * spacingM, (point?.y ?? 0) * spacingM];
+    return { restM, forceN };
   });
   stage.setTools(shown, mostN);
 }
@@ -172,6 +189,11 @@ function tellControls(): void {
   part("strength-value", HTMLOutputElement).value = text;
   part("strength", HTMLInputElement).setAttribute("aria-valuetext", text);
   part("refinement-value", HTMLOutputElement).value = String(visit.refinement);
+  const range = quantity(reach.spacingM, "m");
+  part("meaning", HTMLElement).textContent =
+    "Strength is the push in the middle of the tool. It fades out over about " +
+    `${range}, so the tissue around takes part of it. What pushes back is the one point of the tissue that is nearest to ` +
+    "the tool: at most the strength while nothing moves, and less beside the middle. While the tissue moves it may be more.";
 }
 
 function chosenMode(): Mode {
@@ -196,7 +218,7 @@ part("wireframe", HTMLInputElement).addEventListener("change", (event) => {
 part("refinement", HTMLInputElement).addEventListener("input", (event) => {
   if (!visit) return;
   const surface = visit.refine(Number((event.target as HTMLInputElement).value));
-  stage.show(surface, visit.extentM, undefined, true);
+  stage.show(surface, visit.extentM, true);
   tellControls();
 });
 part("scene", HTMLSelectElement).addEventListener("change", (event) => {
@@ -234,7 +256,10 @@ async function play(): Promise<void> {
   }
 }
 
-stage.onDrawn = () => latency.drawn();
+stage.onDrawn = () => {
+  latency.drawn();
+  overlay.drawn();
+};
 
 // A hidden window releases its connections for visible ones.
 document.addEventListener("visibilitychange", () => (document.hidden ? visit?.lookAway() : visit?.look()));
@@ -247,12 +272,12 @@ addEventListener("popstate", () => {
 // Ten times a second for values read as they change, once a second for figures.
 setInterval(() => {
   if (!visit || document.hidden) return;
-  const { samples } = visit;
-  plots.draw(samples.history, samples.newest?.simulationTimeS ?? 0);
+  const { samples, reach } = visit;
+  plots.draw(samples.history, samples.newest?.simulationTimeS ?? 0, 0.4 * reach.spacingM, 0.1 * reach.mostN);
   const tool = samples.tools[0];
+  overlay.tell(tool);
   part("felt", HTMLElement).textContent = tool
-    ? `Point (${tool.point?.x}, ${tool.point?.y}): ${quantity(norm(tool.displacementM), "m")} away from rest, ` +
-      `pushes back with ${quantity(norm(tool.forceN), "N")}.`
+    ? `${depthText(tool.displacementM)}, pushes back ${quantity(norm(tool.forceN), "N")}`
     : "Nothing touches the tissue.";
 }, 100);
 setInterval(() => {
@@ -264,6 +289,8 @@ setInterval(() => {
     roundTripMs: visit.roundTripMs,
     networkMs: visit.hand.networkMs,
     frameAgeMs: frameAgeMs(),
+    isStill: isStill(visit),
+    silentMs: performance.now() - visit.heardMs,
     framesTaken: frames.taken,
     framesDrawn: stage.drawn,
     framesSkipped: frames.skipped,
@@ -277,14 +304,24 @@ setInterval(() => {
   });
 }, 1000);
 
+/** Fills the list of scripts with those that are made for the session's scene. */
+async function listScripts(sessionId: string): Promise<void> {
+  for (let failures = 0; visit?.session.sessionId === sessionId; failures++) {
+    try {
+      const { scriptNames } = await sessions.listScripts({ sessionId }, { timeoutMs: PATIENCE_MS });
+      part("script", HTMLSelectElement).replaceChildren(...scriptNames.map((name) => new Option(name)));
+      return;
+    } catch {
+      await sleep(backoffMs(failures));
+    }
+  }
+}
+
 async function lists(): Promise<void> {
   for (let failures = 0; ; failures++) {
     try {
       const { sceneNames } = await sessions.listScenes({}, { timeoutMs: PATIENCE_MS });
-      const { scriptNames } = await sessions.listScripts({}, { timeoutMs: PATIENCE_MS });
-      const options = (names: string[]) => names.map((name) => new Option(name));
-      part("scene", HTMLSelectElement).replaceChildren(...options(sceneNames));
-      part("script", HTMLSelectElement).replaceChildren(...options(scriptNames));
+      part("scene", HTMLSelectElement).replaceChildren(...sceneNames.map((name) => new Option(name)));
       part("scene", HTMLSelectElement).value = visit?.session.scene?.name ?? asked.get("scene") ?? DEFAULT_SCENE;
       return;
     } catch {
@@ -297,6 +334,13 @@ async function lists(): Promise<void> {
 function frameAgeMs(): number | undefined {
   const [now, newest] = [visit?.nowS(), visit?.frames.newest];
   return now === undefined || !newest ? undefined : Math.max(0, 1000 * (now - newest.timeS));
+}
+
+/** Whether no frame is due: the server sends none while nothing moves, and samples go on. */
+function isStill({ frames, samples, session }: Visit): boolean {
+  const { newest } = samples;
+  if (newest?.asleep ?? session.resting) return true;
+  return newest !== undefined && frames.newest !== undefined && newest.simulationTimeS - frames.newest.timeS > STILL_S;
 }
 
 /** The page's state as numbers, for tests and measurements. */
@@ -326,6 +370,23 @@ const inside = {
   },
   get holds() {
     return visit?.hand.holds ?? false;
+  },
+  /** The least room between a tool and the tissue as drawn, of the width of the tissue; undefined without a tool. */
+  get clear() {
+    const { clearM } = stage;
+    return clearM === undefined || !visit ? undefined : clearM / visit.extentM[0];
+  },
+  /** Whether the first picture of the tissue was drawn, and had a texture; and whether it has one now. */
+  get drawing() {
+    return { ...stage.began, hasTexture: stage.isTextured };
+  },
+  /** The camera's height above the table and the tissue beneath it, of the width of the tissue. */
+  get cameraHeight() {
+    return visit ? stage.heightM / visit.extentM[0] : 0;
+  },
+  /** Width of the tissue, m. */
+  get widthM() {
+    return visit?.extentM[0] ?? 0;
   },
   /** The window point of the tissue at (x, y), in fractions of the sheet. */
   at(x: number, y: number): [number, number] | undefined {

@@ -1,6 +1,6 @@
-// Two small plots of the last seconds: one line per quantity, an axis, and the largest value.
+// Two small plots of the last seconds: one line per quantity, axes with ticks and values, and what is now.
 
-import { HISTORY_S, type Moment, norm } from "./samples";
+import { HISTORY_S, type Moment } from "./samples";
 
 interface Line {
   name: string;
@@ -9,32 +9,46 @@ interface Line {
   of: (moment: Moment) => number;
 }
 
-/** The SI prefix for a magnitude: its factor and letters. */
+/** The SI prefix for a size: its factor and letters. */
 function prefixed(most: number): [number, string] {
   if (most >= 1) return [1, ""];
-  if (most >= 1e-3) return [1e3, "m"];
+  if (most >= 1e-3 || most < 1e-9) return [1e3, "m"];
   return [1e6, "µ"];
 }
 
 /** A number with its unit, for display. */
 export function quantity(value: number, unit: string): string {
   const [factor, prefix] = prefixed(Math.abs(value));
-  return `${(value * factor).toPrecision(3)} ${prefix}${unit}`;
+  return `${value === 0 ? "0" : (value * factor).toPrecision(3)} ${prefix}${unit}`;
 }
+
+/** The distance of ticks, 1, 2 or 5 times a power of ten, so that at most four are in a span. */
+function tickDistance(span: number): number {
+  const least = span / 4;
+  const power = 10 ** Math.floor(Math.log10(least));
+  return power * ([1, 2, 5].find((times) => times * power >= least) ?? 10);
+}
+
+/** Room for the values of the axes, pixels. */
+const LEFT = 38;
+const TOP = 19;
+const BOTTOM = 15;
+/** Seconds between two ticks. */
+const TICK_S = 2;
 
 class Plot {
   private readonly pen: CanvasRenderingContext2D | null;
 
   constructor(
     private readonly canvas: HTMLCanvasElement,
-    private readonly title: string,
     private readonly unit: string,
     private readonly lines: Line[],
   ) {
     this.pen = canvas.getContext("2d");
   }
 
-  draw(history: Moment[], nowS: number): void {
+  /** `least` is the least span that is shown: less than that is noise. */
+  draw(history: Moment[], nowS: number, least: number): void {
     const { pen, canvas } = this;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
     if (!pen || width === 0) return;
@@ -44,39 +58,62 @@ class Plot {
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
     pen.clearRect(0, 0, width, height);
     const style = getComputedStyle(canvas);
-    const [top, bottom] = [20, height - 4];
-    let [low, high] = [0, 0];
+    const bottom = height - BOTTOM;
+    let [low, high] = [0, least];
     for (const moment of history) {
       for (const { of } of this.lines) {
         low = Math.min(low, of(moment));
         high = Math.max(high, of(moment));
       }
     }
-    const span = high - low || 1e-6;
-    const y = (v: number) => bottom - ((v - low) / span) * (bottom - top);
-    const x = (t: number) => width * (1 - (nowS - t) / HISTORY_S);
-    pen.strokeStyle = style.getPropertyValue("--line");
-    pen.lineWidth = 1;
-    pen.beginPath();
-    for (let s = Math.ceil(nowS - HISTORY_S); s <= nowS; s++) {
-      pen.moveTo(x(s), top);
-      pen.lineTo(x(s), bottom);
-    }
-    pen.moveTo(0, y(0));
-    pen.lineTo(width, y(0));
-    pen.stroke();
+    const tick = tickDistance(high - low);
+    const [first, last] = [Math.ceil(low / tick - 1e-6), Math.ceil(high / tick - 1e-6)];
+    const y = (v: number) => bottom - ((v - low) / (last * tick - low)) * (bottom - TOP);
+    const x = (t: number) => LEFT + (width - LEFT - 1) * (1 - (nowS - t) / HISTORY_S);
+    const [factor, prefix] = prefixed(Math.max(-low, last * tick));
     pen.font = "11px system-ui, sans-serif";
+    pen.lineWidth = 1;
     pen.fillStyle = style.getPropertyValue("--faint");
     pen.textAlign = "right";
-    if (high - low > 0) pen.fillText(`${quantity(low, this.unit)} … ${quantity(high, this.unit)}`, width, 11);
+    pen.textBaseline = "middle";
+    for (let k = first; k <= last; k++) {
+      const at = Math.round(y(k * tick)) + 0.5;
+      pen.strokeStyle = style.getPropertyValue(k === 0 ? "--faint" : "--line");
+      pen.beginPath();
+      pen.moveTo(LEFT, at);
+      pen.lineTo(width, at);
+      pen.stroke();
+      if (k % 2 !== 0 && ((bottom - TOP) * tick) / (last * tick - low) < 13) continue;
+      pen.fillText(String(Number((k * tick * factor).toPrecision(3))).replace("-", "−"), LEFT - 5, at);
+    }
+    pen.textBaseline = "alphabetic";
+    pen.strokeStyle = style.getPropertyValue("--faint");
+    for (let s = 0; s <= HISTORY_S; s += TICK_S) {
+      const at = Math.round(x(nowS - s)) - 0.5;
+      pen.beginPath();
+      pen.moveTo(at, bottom);
+      pen.lineTo(at, bottom + 3);
+      pen.stroke();
+      pen.textAlign = s === 0 ? "right" : s === HISTORY_S ? "left" : "center";
+      pen.fillText(s === 0 ? "now" : `−${s} s`, at + (s === 0 ? 1 : 0), height - 2);
+    }
     pen.textAlign = "left";
-    pen.fillText(this.title, 0, 11);
-    let at = pen.measureText(this.title).width + 8;
+    pen.fillText(`${prefix}${this.unit}`, 0, 11);
+    let at = LEFT;
+    const now = history.at(-1);
+    pen.save();
+    pen.beginPath();
+    pen.rect(LEFT, 0, width - LEFT, height);
+    pen.clip();
     for (const { name, colour, of } of this.lines) {
       pen.strokeStyle = pen.fillStyle = style.getPropertyValue(colour);
-      pen.fillText(name, at, 11);
-      at += pen.measureText(name).width + 8;
-      pen.lineWidth = 1.5;
+      const value = now && nowS - now.timeS < 0.5 ? of(now) : 0;
+      const digits = Math.max(0, Math.ceil(-Math.log10(tick * factor)) + 1);
+      const text = `${name} ${(value * factor).toFixed(digits).replace(/^-(?=[0.]*$)/, "").replace("-", "−")}`;
+      pen.fillText(text, at, 11);
+      at += pen.measureText(text).width + 14;
+      pen.lineWidth = 1.75;
+      pen.lineJoin = "round";
       pen.beginPath();
       let before = -Infinity;
       for (const moment of history) {
@@ -87,28 +124,28 @@ class Plot {
       }
       pen.stroke();
     }
+    pen.restore();
   }
 }
 
 export class Plots {
-  private readonly plots: Plot[];
+  private readonly depth: Plot;
+  private readonly force: Plot;
 
   constructor(displacement: HTMLCanvasElement, force: HTMLCanvasElement) {
-    const up = (name: string, of: (moment: Moment) => number): Line => ({ name, colour: "--accent", of });
-    const size = (name: string, of: (moment: Moment) => number): Line => ({ name, colour: "--second", of });
-    this.plots = [
-      new Plot(displacement, "Displacement", "m", [
-        size("length", (moment) => norm(moment.displacementM)),
-        up("up", (moment) => moment.displacementM[2]),
-      ]),
-      new Plot(force, "Reaction", "N", [
-        size("length", (moment) => norm(moment.forceN)),
-        up("up", (moment) => moment.forceN[2]),
-      ]),
-    ];
+    this.depth = new Plot(displacement, "m", [
+      { name: "deep", colour: "--depth", of: ({ displacementM }) => -displacementM[2] },
+      { name: "sideways", colour: "--faint", of: ({ displacementM: [x, y] }) => Math.hypot(x, y) },
+    ]);
+    this.force = new Plot(force, "N", [
+      { name: "pushes up", colour: "--force", of: ({ forceN }) => forceN[2] },
+      { name: "sideways", colour: "--faint", of: ({ forceN: [x, y] }) => Math.hypot(x, y) },
+    ]);
   }
 
-  draw(history: Moment[], nowS: number): void {
-    for (const plot of this.plots) plot.draw(history, nowS);
+  /** `leastM` and `leastN` are the least spans of the axes. */
+  draw(history: Moment[], nowS: number, leastM: number, leastN: number): void {
+    this.depth.draw(history, nowS, leastM);
+    this.force.draw(history, nowS, leastN);
   }
 }

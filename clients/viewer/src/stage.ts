@@ -1,30 +1,20 @@
-// The picture: tissue, light, tools and camera. Drawn on changes, at most once per display frame.
+// The picture: tissue, table, tools and camera. Drawn on changes, at most once per display frame.
 
 import {
-  AmbientLight,
-  ArrowHelper,
+  BufferAttribute,
+  BufferGeometry,
   Color,
-  CylinderGeometry,
-  DirectionalLight,
-  Group,
+  DoubleSide,
   LineBasicMaterial,
   LineSegments,
   Mesh,
-  MeshPhongMaterial,
-  MeshPhysicalMaterial,
-  MeshStandardMaterial,
+  MeshBasicMaterial,
   MOUSE,
   PerspectiveCamera,
   Plane,
-  PMREMGenerator,
   Raycaster,
-  RingGeometry,
   Scene,
-  SphereGeometry,
   SRGBColorSpace,
-  ACESFilmicToneMapping,
-  DoubleSide,
-  MeshBasicMaterial,
   type Texture,
   TOUCH,
   Vector2,
@@ -32,157 +22,262 @@ import {
   WebGLRenderer,
 } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
-import { RoomEnvironment } from "three/addons/environments/RoomEnvironment.js";
 import { Effort, isDrawnBySoftware } from "./effort";
+import { light, Skin, SHADOWS, Table } from "./material";
 import type { Vec3 } from "./samples";
 import type { Surface } from "./surface";
+import { type ShownTool, ToolMark } from "./tool";
 
 /** After this time without a frame, tool changes are drawn on their own. */
 const ALONE_MS = 40;
-
-/** A tool in the state of the server's sample. */
-export interface ShownTool {
-  placeM: Vec3;
-  /** Force of the tissue on the tool. */
-  forceN: Vec3;
-}
+/** After this time without a change, a picture of less effort is drawn again in full. */
+const CALM_MS = 450;
+/** Pixels a side of that for each pixel of the screen, without a graphics processor: it smooths edges. */
+const CALM_PIXELS = 1.5;
+/** If that would take longer, one has to do: a press must not wait for it. */
+const CALM_TAKES_MS = 500;
+/** Movements of the tissue that nobody sees, of its size. */
+const UNSEEN = 2e-5;
+const FIELD_OF_VIEW = 28;
+/** The tissue fills the picture up to these margins, pixels: the words at the top and the bottom stay free. */
+const MARGIN = { top: 14, bottom: 46, side: 12 };
+/** Least height of the camera above the tissue, of its size. */
+const LEAST_HEIGHT = 0.06;
 
 export class Stage {
-  readonly camera = new PerspectiveCamera(38, 1, 0.01, 10);
+  readonly camera = new PerspectiveCamera(FIELD_OF_VIEW, 1, 0.01, 10);
   /** Called after each picture. */
   onDrawn: () => void = () => {};
   /** Number of pictures drawn. */
   drawn = 0;
+  /** Whether the tissue was ever drawn, and whether its texture was then there: for tests. */
+  /** Grows whenever the view changes. */
+  views = 0;
+  readonly began = { isDrawn: false, isTextured: false };
   private readonly renderer: WebGLRenderer;
   private readonly scene = new Scene();
   private readonly orbit: OrbitControls;
-  private readonly skin: MeshPhysicalMaterial;
-  /** A simple material for the same tissue, at a tenth of the cost. */
-  private readonly plain = new MeshPhongMaterial({ specular: 0x9a8f8c, shininess: 90, side: DoubleSide });
-  private readonly hidden: MeshBasicMaterial;
-  private readonly wires: LineBasicMaterial;
+  private readonly skin = new Skin();
+  private readonly cloth = new Table();
+  private readonly hidden = new MeshBasicMaterial({ side: DoubleSide, polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 });
+  private readonly wires = new LineBasicMaterial();
   private mesh: Mesh | undefined;
+  private flank: Mesh | undefined;
   private lines: LineSegments | undefined;
+  private table: Mesh | undefined;
   private surface: Surface | undefined;
   private readonly marks: ToolMark[] = [];
-  private readonly aim: Mesh;
+  private tools: ShownTool[] = [];
+  private mostN = 1;
+  private aimM: [number, number] | undefined;
   private extentM = new Vector2(1, 1);
+  /** Whether the camera is where the page put it. */
+  private isHome = true;
   private wanted = false;
   private before = 0;
+  /** Time that the last picture of what moves took, ms. */
+  private tookMs = 0;
   private readonly effort: Effort;
   private wireframe = false;
   private held = false;
-  /** A pending picture of tools, drawn if no frame causes one first. */
+  private isSoftware: boolean;
+  private isFine = false;
+  /** Whether more than the tissue changed since the last picture; and how far it moved since, m. */
+  private isDue = false;
+  private unseenM = 0;
+  /** A pending picture of tools, drawn if no frame causes one first; and one in full. */
   private later: ReturnType<typeof setTimeout> | undefined;
+  private calm: ReturnType<typeof setTimeout> | undefined;
+  private readonly spot = new Vector3();
+  private readonly projected = new Vector3();
 
   /** With `isFixed`, always uses the greatest effort, however long a picture takes. */
   constructor(
     private readonly canvas: HTMLCanvasElement,
-    isFixed: boolean,
+    private readonly isFixed: boolean,
   ) {
-    const isSoftware = isDrawnBySoftware();
-    this.effort = new Effort(isSoftware, isFixed);
+    this.isSoftware = isDrawnBySoftware();
+    this.effort = new Effort(this.isSoftware, isFixed);
     // Smooth edges cost nothing with a graphics processor; without one, they cost several times everything else.
-    this.renderer = new WebGLRenderer({ canvas, antialias: isFixed || !isSoftware });
+    this.renderer = new WebGLRenderer({ canvas, antialias: isFixed || !this.isSoftware });
     this.renderer.outputColorSpace = SRGBColorSpace;
-    this.renderer.toneMapping = ACESFilmicToneMapping;
-    const room = new PMREMGenerator(this.renderer);
-    this.scene.environment = room.fromScene(new RoomEnvironment(), 0.04).texture;
-    this.scene.environmentIntensity = 0.35;
-    room.dispose();
-    this.skin = new MeshPhysicalMaterial({
-      roughness: 0.55,
-      clearcoat: 0.9,
-      clearcoatRoughness: 0.22,
-      side: DoubleSide,
-    });
-    // Behind the lines of the mesh, the tissue hides the lines that are further away.
-    this.hidden = new MeshBasicMaterial({ side: DoubleSide });
-    for (const material of [this.skin, this.plain, this.hidden]) {
-      material.polygonOffset = true;
-      material.polygonOffsetFactor = 1;
-      material.polygonOffsetUnits = 1;
-    }
-    this.wires = new LineBasicMaterial();
-    // An endoscope's light is beside its lens.
     this.camera.up.set(0, 0, 1);
-    const lamp = new DirectionalLight(0xfff3e6, 1.9);
-    lamp.position.set(-0.35, 0.25, 0.3);
-    this.camera.add(lamp, lamp.target);
-    lamp.target.position.set(0, 0, -1);
-    this.aim = new Mesh(new RingGeometry(0.8, 1, 32), new MeshBasicMaterial({ depthTest: false, transparent: true }));
-    this.aim.renderOrder = 2;
-    this.aim.visible = false;
-    this.scene.add(this.camera, new AmbientLight(0xffffff, 0.25), this.aim);
+    this.scene.add(this.camera);
     this.orbit = new OrbitControls(this.camera, canvas);
     // The left button and one finger control the tool.
     this.orbit.mouseButtons = { LEFT: null, MIDDLE: MOUSE.DOLLY, RIGHT: MOUSE.ROTATE };
     this.orbit.touches = { ONE: null, TWO: TOUCH.DOLLY_ROTATE };
-    this.orbit.maxPolarAngle = 0.49 * Math.PI;
-    this.orbit.addEventListener("change", () => this.draw());
+    this.orbit.maxPolarAngle = 0.46 * Math.PI;
+    this.orbit.screenSpacePanning = false;
+    this.orbit.addEventListener("start", () => (this.isHome = false));
+    this.orbit.addEventListener("change", () => {
+      this.views += 1;
+      this.draw();
+    });
+    canvas.addEventListener("wheel", () => (this.isHome = false), { passive: true });
     new ResizeObserver(() => this.resize()).observe(canvas);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.colours());
     this.colours();
   }
 
-  /** Shows a surface of `extentM` metres. `keepView` keeps the camera. */
-  show(surface: Surface, extentM: [number, number], texture: Texture | undefined, keepView: boolean): void {
-    if (this.mesh && this.lines) this.scene.remove(this.mesh, this.lines);
+  /** Shows a surface of `extentM` metres. `keepView` keeps the camera and the texture. */
+  show(surface: Surface, extentM: [number, number], keepView: boolean): void {
+    for (const old of [this.mesh, this.flank, this.lines, this.table]) if (old) this.scene.remove(old);
     this.surface?.dispose();
+    this.table?.geometry.dispose();
     this.surface = surface;
     surface.drawEvery(this.effort.now.every);
-    if (texture) {
-      this.skin.map?.dispose();
-      this.skin.map = this.skin.bumpMap = this.plain.map = texture;
-      this.skin.needsUpdate = this.plain.needsUpdate = true;
-    }
+    if (!keepView) this.skin.dropTexture();
     this.mesh = new Mesh(surface.geometry, this.skin);
+    this.flank = new Mesh(surface.flank.geometry, this.skin);
     this.lines = new LineSegments(surface.lines, this.wires);
-    // Bounds of a moving surface are not worth computing.
-    this.mesh.frustumCulled = this.lines.frustumCulled = false;
-    this.scene.add(this.mesh, this.lines);
     this.extentM.set(...extentM);
     const size = this.extentM.length();
-    this.skin.bumpScale = 1.2;
-    this.camera.near = size / 200;
+    this.table = new Mesh(tableGeometry(extentM, surface.flank.roundM, surface.flank.heightM, 8 * size), this.cloth);
+    const { middle, half_, height } = this.cloth.uniforms as Record<string, { value: unknown }>;
+    (middle!.value as Vector2).set(extentM[0] / 2, extentM[1] / 2);
+    (half_!.value as Vector2).set(extentM[0] / 2, extentM[1] / 2).addScalar(0.6 * surface.flank.roundM);
+    height!.value = surface.flank.heightM;
+    // Bounds of a moving surface are not worth computing.
+    for (const part of [this.mesh, this.flank, this.lines, this.table]) part.frustumCulled = false;
+    this.scene.add(this.mesh, this.flank, this.lines, this.table);
+    this.camera.near = size / 60;
     this.camera.far = size * 20;
-    this.orbit.minDistance = size / 8;
-    this.orbit.maxDistance = size * 4;
-    if (!keepView) {
-      // Near parts look larger, so the picture's middle is slightly in front of the sheet's middle.
-      const middle = new Vector3(extentM[0] / 2, 0.42 * extentM[1], -0.04 * size);
-      this.orbit.target.copy(middle);
-      this.camera.position.copy(middle).add(new Vector3(0, -0.86 * size, 0.66 * size));
+    this.orbit.minDistance = size / 4;
+    this.orbit.maxDistance = size * 5;
+    if (!keepView) this.isHome = true;
+    if (this.isHome) this.goHome();
+    this.setWireframe(this.wireframe);
+  }
+
+  /** The tissue's texture has arrived. */
+  setTexture(texture: Texture): void {
+    if (!this.isSoftware) texture.anisotropy = 8;
+    this.skin.setTexture(texture);
+    this.draw();
+  }
+
+  /** Puts the camera where the whole tissue fills the picture: lower in a wide one, higher in a narrow one. */
+  private goHome(): void {
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    const surface = this.surface;
+    if (!surface || width === 0 || height === 0) return;
+    const [w, l] = [this.extentM.x, this.extentM.y];
+    const { roundM, heightM } = surface.flank;
+    const aspect = (width - 2 * MARGIN.side) / Math.max(height - MARGIN.top - MARGIN.bottom, 1);
+    const elevation = Math.asin(Math.min(Math.max((0.98 * w) / Math.max(l, 1e-9) / aspect, 0.64), 0.9));
+    const target = this.orbit.target.set(w / 2, l / 2, 0);
+    const away = new Vector3(0, -Math.cos(elevation), Math.sin(elevation));
+    const tangent = Math.tan(((FIELD_OF_VIEW / 2) * Math.PI) / 180);
+    const part = { x: 1 - (2 * MARGIN.side) / width, y: 1 - (MARGIN.top + MARGIN.bottom) / height };
+    let distance = 3 * Math.max(w, l);
+    let [low, high] = [0, 0];
+    for (let round = 0; round < 12; round++) {
+      let widest = 0;
+      [low, high] = [Infinity, -Infinity];
+      for (const x of [-roundM - w / 2, w / 2 + roundM]) {
+        for (const [y, z] of [[-l / 2 - roundM, -roundM], [-l / 2 - roundM, -heightM], [l / 2 + roundM, 0]] as const) {
+          const depth = distance - (y * away.y + z * away.z);
+          const up = (y * Math.sin(elevation) + z * Math.cos(elevation)) / depth / tangent;
+          low = Math.min(low, up);
+          high = Math.max(high, up);
+          widest = Math.max(widest, (Math.abs(x) / depth / tangent) * (height / width));
+        }
+      }
+      distance *= Math.max(widest / part.x, (high - low) / 2 / part.y);
     }
+    this.camera.position.copy(target).addScaledVector(away, distance);
+    // The middle of what is seen goes to the middle of what is free.
+    const lift = (MARGIN.bottom - MARGIN.top) / 2 - ((low + high) / 2) * (height / 2);
+    this.camera.setViewOffset(width, height, 0, lift, width, height);
     this.camera.updateProjectionMatrix();
     this.orbit.update();
-    this.setWireframe(this.wireframe);
+    this.views += 1;
+    this.draw();
   }
 
   setWireframe(on: boolean): void {
     this.wireframe = on;
-    const skin = this.effort.now.isPhysical ? this.skin : this.plain;
-    if (this.mesh) this.mesh.material = on ? this.hidden : skin;
+    if (this.mesh) this.mesh.material = on ? this.hidden : this.skin;
     if (this.lines) this.lines.visible = on;
+    if (this.flank) this.flank.visible = !on;
+    if (this.table) this.table.visible = !on;
     this.draw();
   }
 
   setTools(tools: ShownTool[], mostN: number): void {
-    const size = this.extentM.length();
+    this.mostN = mostN;
+    const least = 2e-3 * mostN;
+    const isSame =
+      tools.length === this.tools.length &&
+      tools.every(({ restM, forceN }, index) => {
+        const old = this.tools[index]!;
+        return restM.every((v, c) => v === old.restM[c]) && forceN.every((v, c) => Math.abs(v - old.forceN[c]!) < least);
+      });
+    if (isSame) return;
+    this.tools = tools;
     while (this.marks.length < tools.length) {
-      const mark = new ToolMark();
+      const mark = new ToolMark(this.marks.length);
       this.marks.push(mark);
       this.scene.add(mark.group);
     }
-    this.marks.forEach((mark, index) => mark.show(this.held ? undefined : tools[index], size, mostN));
     // A tool's movement also moves tissue. A picture of the tool alone would only delay the one that shows both.
     this.later ??= setTimeout(() => this.draw(), ALONE_MS);
+  }
+
+  /** Puts the tools on the tissue as it is drawn now. */
+  private placeTools(): void {
+    const size = this.extentM.length();
+    this.spot.setFromMatrixColumn(this.camera.matrixWorld, 0);
+    for (let index = 0; index < this.marks.length; index++) {
+      const tool = this.held || !this.surface ? undefined : this.tools[index];
+      if (tool) this.marks[index]!.show(tool, this.surface!, size, this.mostN, this.spot);
+      else this.marks[index]!.hide();
+    }
+    const aim = light.rings.value[SHADOWS]!;
+    aim.w = 0;
+    if (!this.aimM || !this.surface || this.held) return;
+    const moved = this.surface.displacementAt(...this.aimM);
+    aim.set(this.aimM[0] + moved.x, this.aimM[1] + moved.y, moved.z, size / 42);
+  }
+
+  /** The first tool's tip in the window; undefined if there is none. */
+  tipInWindow(): [number, number] | undefined {
+    return this.tools.length > 0 && this.marks[0] ? this.inWindow(this.marks[0].tipM.toArray()) : undefined;
+  }
+
+  /** The least room between a drawn tool and the drawn tissue, m; undefined without a tool. */
+  get clearM(): number | undefined {
+    const { surface } = this;
+    if (!surface || this.tools.length === 0) return undefined;
+    return Math.min(...this.marks.slice(0, this.tools.length).map((mark) => mark.clearM(surface)));
+  }
+
+  /** Height of the camera above the tissue beneath it, m. */
+  get heightM(): number {
+    const { x, y, z } = this.camera.position;
+    return z - Math.max(this.surface?.heightAt(x, y) ?? 0, 0);
+  }
+
+  /** Whether the tissue is drawn with its texture. */
+  get isTextured(): boolean {
+    return this.skin.uniforms.mapped!.value === 1;
+  }
+
+  /** Pixels of the window for a metre across, at the middle of the tissue. */
+  pixelsPerMetre(): number {
+    const middle: Vec3 = [this.extentM.x / 2, this.extentM.y / 2, 0];
+    const step = 0.01 * this.extentM.length();
+    const right = this.spot.setFromMatrixColumn(this.camera.matrixWorld, 0);
+    const [rx, ry, rz] = [right.x, right.y, right.z];
+    const [x0, y0] = this.inWindow([middle[0] - step * rx, middle[1] - step * ry, middle[2] - step * rz]);
+    const [x1, y1] = this.inWindow([middle[0] + step * rx, middle[1] + step * ry, middle[2] + step * rz]);
+    return Math.hypot(x1 - x0, y1 - y0) / (2 * step);
   }
 
   /** For measurements: hides everything but tissue, and makes each picture like the one before. */
   hold(on: boolean): void {
     this.held = on;
-    if (on) for (const mark of this.marks) mark.group.visible = false;
   }
 
   /** Text for the status line: what is reduced in the picture. */
@@ -190,10 +285,9 @@ export class Stage {
     return this.effort.describe(this.surface?.every ?? 1);
   }
 
-  setAim(at: Vec3 | undefined): void {
-    this.aim.visible = at !== undefined;
-    if (at) this.aim.position.set(...at);
-    this.aim.scale.setScalar(this.extentM.length() / 60);
+  /** Marks a place in the rest plane, where the keys aim. */
+  setAim(atM: [number, number] | undefined): void {
+    this.aimM = atM;
     this.draw();
   }
 
@@ -202,10 +296,11 @@ export class Stage {
     const offset = this.camera.position.clone().sub(this.orbit.target);
     const flat = Math.hypot(offset.x, offset.y);
     const about = Math.atan2(offset.y, offset.x) + azimuth;
-    const up = Math.min(Math.max(Math.atan2(offset.z, flat) + polar, 0.05), 1.55);
+    const up = Math.min(Math.max(Math.atan2(offset.z, flat) + polar, 0.13), 1.55);
     const far = offset.length() / nearer;
     const away = new Vector3(Math.cos(up) * Math.cos(about), Math.cos(up) * Math.sin(about), Math.sin(up));
     this.camera.position.copy(this.orbit.target).addScaledVector(away, far);
+    this.isHome = false;
     this.orbit.update();
     this.draw();
   }
@@ -251,7 +346,7 @@ export class Stage {
   inWindow(at: Vec3): [number, number] {
     const box = this.canvas.getBoundingClientRect();
     this.camera.updateMatrixWorld();
-    const p = new Vector3(...at).project(this.camera);
+    const p = this.projected.set(...at).project(this.camera);
     return [box.left + ((p.x + 1) / 2) * box.width, box.top + ((1 - p.y) / 2) * box.height];
   }
 
@@ -262,8 +357,16 @@ export class Stage {
     return [right.x / length, right.y / length];
   }
 
+  /** Requests a picture of a frame. One that moves nothing visibly is not worth drawing what stands there in full again. */
+  drawFrame(): void {
+    const wasDue = this.isDue;
+    this.draw();
+    this.isDue = wasDue;
+  }
+
   /** Requests a picture. */
   draw(): void {
+    this.isDue = true;
     if (this.wanted) return;
     this.wanted = true;
     const askedMs = performance.now();
@@ -275,8 +378,17 @@ export class Stage {
     clearTimeout(this.later);
     this.later = undefined;
     this.surface?.refresh();
-    this.renderer.render(this.scene, this.camera);
+    this.unseenM += this.surface?.takeMoved() ?? 0;
+    if (this.isFine && !this.isDue && !this.held && this.unseenM < UNSEEN * this.extentM.length()) {
+      this.drawn += 1;
+      return;
+    }
+    this.isDue = false;
+    clearTimeout(this.calm);
+    if (this.isFine) this.fit(false);
+    this.paint();
     this.drawn += 1;
+    if (this.mesh && !this.began.isDrawn) Object.assign(this.began, { isDrawn: true, isTextured: this.isTextured });
     this.onDrawn();
     // The browser may block the page until the picture is done, so measure its time afterwards.
     setTimeout(() => {
@@ -284,8 +396,46 @@ export class Stage {
       // Only pictures that the page waited for count.
       const tookMs = now - Math.max(this.before, askedMs);
       this.before = now;
+      if (!this.isFine) this.tookMs = tookMs;
       this.adapt(tookMs);
+      clearTimeout(this.calm);
+      const isLess = this.effort.now.pixels < 1 || (this.isSoftware && !this.isFixed);
+      if (isLess) this.calm = setTimeout(() => this.paintInFull(), CALM_MS);
     });
+  }
+
+  private paint(): void {
+    this.surface?.refresh();
+    this.surface?.takeMoved();
+    this.unseenM = 0;
+    this.stayAbove();
+    this.placeTools();
+    this.renderer.render(this.scene, this.camera);
+  }
+
+  /** Keeps the camera above the tissue and the table, and its target in the tissue; and the lamp to the left behind it. */
+  private stayAbove(): void {
+    const { position } = this.camera;
+    const { target } = this.orbit;
+    const size = this.extentM.length();
+    target.x = Math.min(Math.max(target.x, 0), this.extentM.x);
+    target.y = Math.min(Math.max(target.y, 0), this.extentM.y);
+    const floor = Math.max(this.surface?.heightAt(position.x, position.y) ?? 0, 0) + LEAST_HEIGHT * size;
+    if (position.z < floor) {
+      position.z = floor;
+      this.camera.lookAt(target);
+    }
+    this.camera.updateMatrixWorld();
+    // From the left and behind the tissue, as seen: dents turn a dark flank to the eye, and the far ones shine.
+    const ahead = this.spot.copy(target).sub(position).setZ(0).normalize();
+    light.lamp.value.set(0.5 * ahead.x - 0.62 * ahead.y, 0.5 * ahead.y + 0.62 * ahead.x, 0.98).normalize();
+  }
+
+  /** Draws again what stands still, with all pixels and smooth edges. */
+  private paintInFull(): void {
+    if (this.held || this.wanted || document.hidden) return;
+    this.fit(true);
+    this.paint();
   }
 
   /** One pixel of the picture, right after drawing; waits for the graphics processor. */
@@ -309,68 +459,56 @@ export class Stage {
   private resize(): void {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     if (width === 0 || height === 0) return;
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2) * this.effort.now.pixels);
-    this.renderer.setSize(width, height, false);
+    this.fit(false);
     this.camera.aspect = width / height;
-    // A narrow window also shows the whole sheet.
-    this.camera.fov = width < height ? 38 * Math.min(height / width, 1.8) : 38;
+    this.camera.setViewOffset(width, height, 0, this.camera.view?.offsetY ?? 0, width, height);
     this.camera.updateProjectionMatrix();
+    this.views += 1;
+    if (this.isHome) this.goHome();
     this.draw();
+  }
+
+  /** Sets the number of pixels: as many as there is time for, or all. */
+  private fit(isFine: boolean): void {
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    const ratio = Math.min(devicePixelRatio, 2);
+    const takesMs = this.tookMs * ((CALM_PIXELS / ratio / this.effort.now.pixels) ** 2);
+    const fine = this.isSoftware && takesMs < CALM_TAKES_MS ? Math.max(ratio, CALM_PIXELS) : ratio;
+    this.isFine = isFine;
+    this.renderer.setPixelRatio(isFine ? fine : ratio * this.effort.now.pixels);
+    this.renderer.setSize(width, height, false);
   }
 
   private colours(): void {
     const style = getComputedStyle(this.canvas.parentElement ?? this.canvas);
-    this.scene.background = new Color(style.backgroundColor);
-    this.hidden.color.set(style.backgroundColor);
+    const background = new Color(style.backgroundColor);
+    this.scene.background = background;
+    this.hidden.color.copy(background);
     this.wires.color.set(style.color);
-    (this.aim.material as MeshBasicMaterial).color.set(style.color);
+    (this.cloth.uniforms.background!.value as Color).copy(background);
+    (this.cloth.uniforms.colour!.value as Color).set(style.getPropertyValue("--table").trim() || style.backgroundColor);
+    light.ink.value.set(0xfff4ec);
     this.draw();
   }
 }
 
-/** A tool: its tip on the tissue, the force on it, and the mark of the contact. */
-class ToolMark {
-  readonly group = new Group();
-  private readonly shaft: Mesh;
-  private readonly ring: Mesh;
-  private readonly arrow = new ArrowHelper(new Vector3(0, 0, 1), new Vector3(), 1, 0x2f9e6e);
-
-  constructor() {
-    const steel = new MeshStandardMaterial({ color: 0xc9ced6, metalness: 0.8, roughness: 0.35 });
-    const rod = new CylinderGeometry(0.6, 0.6, 14, 16).rotateX(Math.PI / 2).translate(0, 0, 8);
-    this.shaft = new Mesh(rod, steel);
-    this.shaft.add(new Mesh(new SphereGeometry(1, 20, 14).translate(0, 0, 1), steel));
-    this.ring = new Mesh(
-      new RingGeometry(1.5, 1.9, 32),
-      new MeshBasicMaterial({ color: 0x2f9e6e, depthTest: false, transparent: true, opacity: 0.8, side: DoubleSide }),
-    );
-    this.ring.renderOrder = 1;
-    for (const part of [this.arrow.line, this.arrow.cone]) {
-      const material = part.material as MeshBasicMaterial | LineBasicMaterial;
-      material.depthTest = false;
-      part.renderOrder = 1;
+/** The table, with a hole where the tissue stands: a dent may reach below it. */
+function tableGeometry([width, length]: [number, number], roundM: number, heightM: number, farM: number): BufferGeometry {
+  const places: number[] = [];
+  const corners = [[0, 0], [width, 0], [width, length], [0, length]] as const;
+  const segments = 8;
+  for (let corner = 0; corner <= 4; corner++) {
+    const [x, y] = corners[corner % 4]!;
+    for (let k = 0; k <= segments; k++) {
+      const angle = Math.PI + (corner % 4) * (Math.PI / 2) + (k / segments) * (Math.PI / 2);
+      const [ox, oy] = [Math.cos(angle), Math.sin(angle)];
+      places.push(x + 0.8 * roundM * ox, y + 0.8 * roundM * oy, -heightM, x + farM * ox, y + farM * oy, -heightM);
     }
-    this.group.add(this.shaft, this.ring, this.arrow);
   }
-
-  show(tool: ShownTool | undefined, size: number, mostN: number): void {
-    this.group.visible = tool !== undefined;
-    if (!tool) return;
-    const force = new Vector3(...tool.forceN);
-    const strength = force.length();
-    this.group.position.set(...tool.placeM);
-    this.shaft.scale.setScalar(size / 110);
-    this.ring.scale.setScalar(size / 110);
-    this.arrow.visible = this.ring.visible = strength > 1e-3 * mostN;
-    if (!this.arrow.visible) return;
-    // The tool approaches from the side and leans against the force on it. When the force pulls it, it does not turn
-    // round.
-    const axis = force.clone().normalize();
-    if (axis.z < 0) axis.negate();
-    axis.add(new Vector3(0.55, 0.2, 0)).normalize();
-    if (axis.z > 0.2) this.shaft.quaternion.setFromUnitVectors(new Vector3(0, 0, 1), axis);
-    const length = Math.min(strength / mostN, 1) * 0.28 * size + 0.03 * size;
-    this.arrow.setDirection(force.normalize());
-    this.arrow.setLength(length, 0.03 * size, 0.018 * size);
-  }
+  const triangles: number[] = [];
+  for (let i = 0; i + 3 < places.length / 3; i += 2) triangles.push(i, i + 1, i + 3, i, i + 3, i + 2);
+  const geometry = new BufferGeometry();
+  geometry.setAttribute("position", new BufferAttribute(new Float32Array(places), 3));
+  geometry.setIndex(triangles);
+  return geometry;
 }

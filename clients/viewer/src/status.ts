@@ -1,4 +1,4 @@
-// The status line: the actual state of the connection and the server.
+// The status line: a light (good, slow, lost), what the session says, and on demand the figures behind it.
 
 import { received } from "./server";
 
@@ -7,6 +7,10 @@ export interface Figures {
   roundTripMs?: number;
   networkMs?: number;
   frameAgeMs?: number;
+  /** Whether nothing moves, so that no frame is due. */
+  isStill: boolean;
+  /** Time since the server last answered. */
+  silentMs: number;
   framesTaken: number;
   framesDrawn: number;
   framesSkipped: bigint;
@@ -21,14 +25,71 @@ export interface Figures {
   tolerance?: number;
 }
 
+/** What makes the light slow, and what lost. */
+const SLOW = { roundTripMs: 300, dilation: 0.8, frameAgeMs: 600, drawn: 6, taken: 12 };
+const LOST_MS = 4000;
+
+type Light = "wait" | "good" | "slow" | "lost";
+const WORDS: Record<Light, string> = { wait: "Connecting", good: "Good", slow: "Slow", lost: "Lost" };
+
 export class Status {
+  /** Whether a stream failed and nothing came since. */
+  private isLost = false;
+  /** Seconds in a row that something was slow. */
+  private slowTimes = 0;
+  private readonly word: HTMLElement;
   private readonly values = new Map<string, HTMLElement>();
   private before = { ms: performance.now(), bytes: 0, taken: 0, drawn: 0 };
 
   constructor(
+    private readonly light: HTMLElement,
     private readonly line: HTMLElement,
     private readonly list: HTMLElement,
-  ) {}
+    button: HTMLButtonElement,
+  ) {
+    this.word = light.firstElementChild as HTMLElement;
+    button.addEventListener("click", () => {
+      list.hidden = !list.hidden;
+      button.setAttribute("aria-expanded", String(!list.hidden));
+    });
+  }
+
+  /** The server is lost, until it answers. */
+  lose(): void {
+    this.isLost = true;
+    this.shine("lost");
+  }
+
+  /** The server answers. */
+  found(text: string): void {
+    this.isLost = false;
+    this.say(text);
+  }
+
+  /** Shows the light, and why if it is not good. What is lost is drawn without colour: nobody knows whether it still holds. */
+  private shine(light: Light, why = ""): void {
+    const text = WORDS[light] + (why && `: ${why}`);
+    if (this.light.dataset.light !== light) this.light.dataset.light = light;
+    if (this.word.textContent !== text) this.word.textContent = text;
+    document.body.dataset.light = light;
+  }
+
+  /** Judges the figures. One slow second does not count. */
+  private judge(figures: Figures, taken: number, drawn: number): void {
+    const { roundTripMs = 0, dilation, silentMs, frameAgeMs = 0, isStill } = figures;
+    if (this.isLost) return;
+    if (silentMs > LOST_MS) return this.shine("lost", `no answer for ${(silentMs / 1000).toFixed(0)} s`);
+    const reasons = [
+      roundTripMs > SLOW.roundTripMs ? `answers take ${(roundTripMs / 1000).toFixed(1)} s` : "",
+      dilation < SLOW.dilation ? `the tissue's time runs at ${Math.round(100 * dilation)} %` : "",
+      !isStill && frameAgeMs > SLOW.frameAgeMs ? `the picture is ${(frameAgeMs / 1000).toFixed(1)} s old` : "",
+      taken >= SLOW.taken && drawn < SLOW.drawn ? `this machine draws ${drawn.toFixed(0)} pictures a second` : "",
+    ].filter((reason) => reason !== "");
+    this.slowTimes = reasons.length > 0 ? this.slowTimes + 1 : 0;
+    if (this.slowTimes === 1 && this.light.dataset.light === "good") return;
+    if (reasons.length > 0) this.shine("slow", reasons[0]);
+    else this.shine("good");
+  }
 
   /** Screen readers announce it, so only changes are written. */
   say(text: string): void {
@@ -43,10 +104,11 @@ export class Status {
     const taken = (figures.framesTaken - this.before.taken) / seconds;
     const drawn = (figures.framesDrawn - this.before.drawn) / seconds;
     this.before = { ms, bytes: received.bytes, taken: figures.framesTaken, drawn: figures.framesDrawn };
+    this.judge(figures, taken, drawn);
     const inMs = (value: number | undefined) => (value === undefined ? "–" : `${value.toFixed(1)} ms`);
     this.set("round trip", inMs(figures.roundTripMs));
     this.set("commands, network only", inMs(figures.networkMs));
-    this.set("frame age", figures.isAsleep ? "still" : inMs(figures.frameAgeMs));
+    this.set("frame age", figures.isStill ? "still" : inMs(figures.frameAgeMs));
     this.set("frames", `${taken.toFixed(0)}/s, drawn ${drawn.toFixed(0)}/s, skipped ${figures.framesSkipped}`);
     this.set("picture", figures.picture);
     this.set("received", bytes >= 1e6 ? `${(bytes / 1e6).toFixed(2)} MB/s` : `${(bytes / 1e3).toFixed(1)} kB/s`);

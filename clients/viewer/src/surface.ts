@@ -1,10 +1,14 @@
-// The surface as drawn: positions and normals of all vertices, or of every second or fourth one per side.
+// The surface as drawn: positions and normals of all vertices, or of every second or fourth one per side; and around it the
+// flank of the tissue, as high as the body that is drawn.
 
-import { BufferAttribute, BufferGeometry, DynamicDrawUsage } from "three";
+import { BufferAttribute, BufferGeometry, DynamicDrawUsage, Vector3 } from "three";
 import { Field, type Rectangle } from "./field";
+import { Flank } from "./flank";
 
 /** With fewer vertices than this, a sheet shows its coarse drawing. */
 const LEAST_VERTICES = 6000;
+/** How many spacings of mass points away the surroundings count for the light in a dent. */
+const WIDEST = 4;
 
 export class Surface {
   readonly field: Field;
@@ -12,6 +16,7 @@ export class Surface {
   readonly geometry = new BufferGeometry();
   /** Geometry of the lines between mass points. */
   readonly lines = new BufferGeometry();
+  readonly flank: Flank;
   /** One in `every` vertices per side is drawn, and always the last one. */
   every = 0;
   /** Rows of the drawn vertices: row i is row `rows[i]` of all. */
@@ -19,6 +24,11 @@ export class Surface {
   private columns = new Uint32Array();
   private position = new BufferAttribute(new Float32Array(), 3);
   private normal = this.position;
+  /** The fraction of light from around that reaches each vertex: less in a dent. */
+  private open = this.position;
+  private readonly found = new Vector3();
+  /** The largest movement of a drawn vertex along an axis since `takeMoved`, m, if each refresh adds its largest. */
+  private movedM = 0;
 
   /**
    * Vertex (a, b) rests at (a, b, 0)·spacing, and has texture coordinates (a/(nx − 1), b/(ny − 1)). `GetMesh` would
@@ -31,6 +41,7 @@ export class Surface {
     private readonly pointEvery: number,
   ) {
     this.field = new Field(nx, ny);
+    this.flank = new Flank((nx - 1) * spacingM, (ny - 1) * spacingM);
     this.drawEvery(1);
   }
 
@@ -49,6 +60,7 @@ export class Surface {
     const [mx, my] = [rows.length, columns.length];
     this.position = new BufferAttribute(new Float32Array(3 * mx * my), 3).setUsage(DynamicDrawUsage);
     this.normal = new BufferAttribute(new Float32Array(3 * mx * my), 3).setUsage(DynamicDrawUsage);
+    this.open = new BufferAttribute(new Float32Array(mx * my), 1).setUsage(DynamicDrawUsage);
     const uv = new Float32Array(2 * mx * my);
     for (let a = 0, i = 0; a < mx; a++) {
       for (let b = 0; b < my; b++, i++) {
@@ -65,10 +77,12 @@ export class Surface {
     }
     this.geometry.setAttribute("position", this.position);
     this.geometry.setAttribute("normal", this.normal);
+    this.geometry.setAttribute("open", this.open);
     this.geometry.setAttribute("uv", new BufferAttribute(uv, 2));
     this.geometry.setIndex(new BufferAttribute(triangles, 1));
     this.lines.setAttribute("position", this.position);
     this.lines.setIndex(new BufferAttribute(gridLines(rows, columns, this.pointEvery), 1));
+    this.flank.begin(this.position, this.normal, mx, my);
     this.work({ a0: 0, a1: mx - 1, b0: 0, b1: my - 1 });
     return true;
   }
@@ -88,47 +102,74 @@ export class Surface {
     });
   }
 
+  /** Drawn vertices between neighbouring mass points. */
+  private get stride(): number {
+    return Math.max(1, Math.round(this.pointEvery / this.every));
+  }
+
   private work({ a0, a1, b0, b1 }: Rectangle): void {
     if (a1 < a0 || b1 < b0) return;
     this.place({ a0, a1, b0, b1 });
-    // The normals around the changed part change as well.
+    // Normals and openness around the changed part change as well.
     const [mx, my] = [this.rows.length, this.columns.length];
-    const [first, last] = [Math.max(a0 - 1, 0), Math.min(a1 + 1, mx - 1)];
-    this.turn({ a0: first, a1: last, b0: Math.max(b0 - 1, 0), b1: Math.min(b1 + 1, my - 1) });
-    for (const attribute of [this.position, this.normal]) {
-      attribute.addUpdateRange(3 * first * my, 3 * (last - first + 1) * my);
+    const far = WIDEST * this.stride;
+    const [first, last] = [Math.max(a0 - far, 0), Math.min(a1 + far, mx - 1)];
+    const [left, right] = [Math.max(b0 - far, 0), Math.min(b1 + far, my - 1)];
+    this.turn(first, last, left, right);
+    for (const attribute of [this.position, this.normal, this.open]) {
+      attribute.addUpdateRange(attribute.itemSize * first * my, attribute.itemSize * (last - first + 1) * my);
       attribute.needsUpdate = true;
     }
+    if (first === 0 || left === 0 || last === mx - 1 || right === my - 1) this.flank.follow();
   }
 
   private place({ a0, a1, b0, b1 }: Rectangle): void {
     const { rows, columns, spacingM } = this;
     const { ny, displacementM: d } = this.field;
     const p = this.position.array as Float32Array;
+    let most = 0;
     for (let a = a0; a <= a1; a++) {
       const row = rows[a]!;
       for (let b = b0, i = 3 * (a * columns.length + b0); b <= b1; b++, i += 3) {
         const column = columns[b]!;
         const k = 3 * (row * ny + column);
-        p[i] = row * spacingM + d[k]!;
-        p[i + 1] = column * spacingM + d[k + 1]!;
-        p[i + 2] = d[k + 2]!;
+        const [x, y, z] = [row * spacingM + d[k]!, column * spacingM + d[k + 1]!, d[k + 2]!];
+        most = Math.max(most, Math.abs(x - p[i]!), Math.abs(y - p[i + 1]!), Math.abs(z - p[i + 2]!));
+        p[i] = x;
+        p[i + 1] = y;
+        p[i + 2] = z;
       }
     }
+    this.movedM += most;
   }
 
-  /** Normals: the cross product of the differences across each vertex along x and along y. */
-  private turn({ a0, a1, b0, b1 }: Rectangle): void {
+  /** How far vertices moved at most since the last call, m. */
+  takeMoved(): number {
+    const moved = this.movedM;
+    this.movedM = 0;
+    return moved;
+  }
+
+  /**
+   * Normals: the cross product of the differences across each vertex along x and along y. They reach to the neighbouring
+   * mass points: between these the surface is bilinear, and narrower ones would show its creases.
+   */
+  private turn(a0: number, a1: number, b0: number, b1: number): void {
     const p = this.position.array as Float32Array;
     const n = this.normal.array as Float32Array;
+    const o = this.open.array as Float32Array;
     const [nx, ny] = [this.rows.length, this.columns.length];
+    const reach = this.stride;
+    const wide = WIDEST * reach;
+    const spanM = WIDEST * this.pointEvery * this.spacingM;
     for (let a = a0; a <= a1; a++) {
-      const before = a > 0 ? -3 * ny : 0;
-      const after = a + 1 < nx ? 3 * ny : 0;
+      const before = -3 * ny * Math.min(reach, a);
+      const after = 3 * ny * Math.min(reach, nx - 1 - a);
+      const [far, near] = [3 * ny * Math.min(wide, nx - 1 - a), -3 * ny * Math.min(wide, a)];
       for (let b = b0, i = 3 * (a * ny + b0); b <= b1; b++, i += 3) {
         const [l, r] = [i + before, i + after];
-        const d = b > 0 ? i - 3 : i;
-        const u = b + 1 < ny ? i + 3 : i;
+        const d = i - 3 * Math.min(reach, b);
+        const u = i + 3 * Math.min(reach, ny - 1 - b);
         const ex = p[r]! - p[l]!;
         const ey = p[r + 1]! - p[l + 1]!;
         const ez = p[r + 2]! - p[l + 2]!;
@@ -142,8 +183,55 @@ export class Surface {
         n[i] = x / length;
         n[i + 1] = y / length;
         n[i + 2] = z / length;
+        // How far the surroundings rise above it, near and far.
+        const height = p[i + 2]!;
+        const close = (p[l + 2]! + p[r + 2]! + p[d + 2]! + p[u + 2]!) / 4 - height;
+        const across = 3 * Math.min(wide, ny - 1 - b);
+        const along = -3 * Math.min(wide, b);
+        const around = (p[i + far + 2]! + p[i + near + 2]! + p[i + across + 2]! + p[i + along + 2]!) / 4 - height;
+        const slopes = (WIDEST * Math.max(close, 0) + Math.max(around, 0)) / spanM;
+        o[i / 3] = 1 / (1 + 0.55 * slopes);
       }
     }
+  }
+
+  /** Displacement at a place in the rest plane, between vertices as well. The result is valid until the next call. */
+  displacementAt(xM: number, yM: number): Vector3 {
+    const { nx, ny, displacementM: d } = this.field;
+    const u = Math.min(Math.max(xM / this.spacingM, 0), nx - 1);
+    const v = Math.min(Math.max(yM / this.spacingM, 0), ny - 1);
+    const a = Math.min(Math.floor(u), Math.max(nx - 2, 0));
+    const b = Math.min(Math.floor(v), Math.max(ny - 2, 0));
+    const [s, t] = [u - a, v - b];
+    const i = 3 * (a * ny + b);
+    const [right, up] = [a + 1 < nx ? 3 * ny : 0, b + 1 < ny ? 3 : 0];
+    const of = (c: number) =>
+      (1 - s) * ((1 - t) * d[i + c]! + t * d[i + up + c]!) + s * ((1 - t) * d[i + right + c]! + t * d[i + right + up + c]!);
+    return this.found.set(of(0), of(1), of(2));
+  }
+
+  /** Height of the tissue above or below a place; beside the tissue, that of its edge. */
+  heightAt(xM: number, yM: number): number {
+    let [u, v] = [xM, yM];
+    for (let round = 0; round < 4; round++) {
+      const moved = this.displacementAt(u, v);
+      [u, v] = [xM - moved.x, yM - moved.y];
+    }
+    return this.displacementAt(u, v).z;
+  }
+
+  /** Height of the middle of a ball above (x, y) that rests on the tissue. */
+  restOn(xM: number, yM: number, radiusM: number): number {
+    let height = this.heightAt(xM, yM) + radiusM;
+    for (let ring = 1; ring <= 4; ring++) {
+      const out = (ring / 4.2) * radiusM;
+      const over = Math.sqrt(radiusM * radiusM - out * out);
+      for (let k = 0; k < 8; k++) {
+        const angle = (k + 0.5 * (ring % 2)) * (Math.PI / 4);
+        height = Math.max(height, this.heightAt(xM + out * Math.cos(angle), yM + out * Math.sin(angle)) + over);
+      }
+    }
+    return height;
   }
 
   /** Displacement of the vertex nearest to a place in the rest plane. */
@@ -165,6 +253,7 @@ export class Surface {
   dispose(): void {
     this.geometry.dispose();
     this.lines.dispose();
+    this.flank.geometry.dispose();
   }
 }
 

@@ -40,7 +40,7 @@ export class TissueValues {
       const slider = this.sliders[index]!;
       slider.addEventListener("input", () => this.set({ [name]: this.base[name] * 10 ** Number(slider.value) }));
     });
-    part("reset", HTMLButtonElement).addEventListener("click", () => this.set(this.begun));
+    part("original", HTMLButtonElement).addEventListener("click", () => this.set(this.begun));
   }
 
   /** Begins with another session: its present values are the middle of the sliders. */

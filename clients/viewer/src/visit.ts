@@ -33,6 +33,8 @@ export class Visit {
   surface: Surface;
   refinement: number;
   roundTripMs: number | undefined;
+  /** When the server last answered, of this window's clock. */
+  heardMs = performance.now();
   private readonly points: [number, number];
   private readonly ended = new AbortController();
   private seen = new AbortController();
@@ -148,6 +150,7 @@ export class Visit {
 
   private heard(session: Session, begunMs: number, endedMs: number): void {
     this.session = session;
+    this.heardMs = endedMs;
     const roundTripMs = endedMs - begunMs;
     this.roundTripMs = roundTripMs;
     // The fastest answer gives the most exact time. After a while slower ones count again, because clocks drift, and

@@ -108,6 +108,7 @@ export class Server {
 /**
  * @typedef {{
  *   frames: { taken: number, skipped: number, drawn: number, timeS: number }, received: number, largestM: number, deepestM: number, forceN: number[],
+ *   clear: number | undefined, cameraHeight: number, widthM: number, drawing: { isDrawn: boolean, isTextured: boolean, hasTexture: boolean },
  *   ageMs: number | undefined, picture: string, holds: boolean, at: (x: number, y: number) => [number, number], pixelAfterPress: (x: number, y: number) => Promise<number>,
  * }} Inside What the page tells of itself (src/main.ts).
  */

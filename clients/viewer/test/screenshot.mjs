@@ -17,7 +17,7 @@ const MOST_AGE_MS = 150;
 
 const server = await Server.start();
 const browser = await launch();
-const context = await browser.newContext({ viewport: { width: 1100, height: 640 }, colorScheme: "light" });
+const context = await browser.newContext({ viewport: { width: 1280, height: 800 }, colorScheme: "light" });
 
 /**
  * Without a graphics processor the browser draws on the cores that the server steps on: the server goes first. Each thread
@@ -60,7 +60,7 @@ async function take() {
   await giveWay();
   await page.page.fill("#strength", "0.8");
   const [left, top] = await page.press(0.48, 0.45);
-  await page.until(({ largestM }) => largestM > 0.02);
+  await page.until(({ largestM }) => largestM > 0.004);
   const begun = Date.now();
   let wrong = ["it did not begin"];
   let [turn, healthy] = [0, 0];

@@ -14,8 +14,11 @@ let server;
 
 const VIEWPORT = { viewport: { width: 820, height: 540 } };
 
+/** The tissue of most tests: a push moves it by centimetres. @param {Server} server */
+const paper = ({ url }) => `${url}/?scene=paper`;
+
 /** A page of its own, in a profile of its own: other pages' connections are not counted with its. */
-async function open(url = server.url, options = {}) {
+async function open(url = paper(server), options = {}) {
   return await Page.open(await browser.newContext({ ...VIEWPORT, ...options }), url);
 }
 
@@ -40,7 +43,7 @@ describe("the page", () => {
     const rest = await page.picture("rest");
     const [left, top] = await page.press();
     await page.until(({ largestM, forceN }) => largestM > 0.02 && forceN[0] > 0.3);
-    await page.says("felt", /pushes back with/);
+    await page.says("felt", /pushes back/);
     await page.says("holder", /^You/);
     const pressed = await page.picture("pressed");
     assert.notDeepEqual(rest, pressed);
@@ -53,7 +56,7 @@ describe("the page", () => {
     await page.until(({ largestM, forceN }) => largestM < 0.004 && forceN.length === 0);
     await page.page.keyboard.press("Escape");
     await page.until(({ holds }) => !holds);
-    await page.says("holder", /free/);
+    await page.says("holder", /Nobody touches/);
     assert.deepEqual(page.complaints, [], "the console stays clean");
     await close(page);
   });
@@ -133,7 +136,8 @@ describe("the page", () => {
   });
 
   test("says when a picture is drawn with less effort, and draws in full if asked", async () => {
-    const page = await open(`${server.url}/?refinement=5`);
+    const page = await open(`${paper(server)}&refinement=5`);
+    await page.page.click("#details");
     await page.says("figures", /1 vertex in 2 a side.*no graphics processor/);
     const rest = await page.picture("coarse-rest");
     await page.press();
@@ -141,6 +145,7 @@ describe("the page", () => {
     assert.notDeepEqual(rest, await page.picture("coarse-pressed"));
     await page.page.goto(`${page.page.url()}&refinement=5&quality=high`);
     await page.shows();
+    await page.page.click("#details");
     await page.says("figures", /picture\s*no graphics processor/);
     assert.deepEqual(page.complaints, []);
     await close(page);
@@ -182,7 +187,7 @@ describe("the page", () => {
     const page = new Page(await (await browser.newContext(VIEWPORT)).newPage());
     await page.page.goto(asking.url);
     await page.says("notice", /asks who you are/);
-    await page.page.goto(`${asking.url}/#token=${token}`);
+    await page.page.goto(`${paper(asking)}#token=${token}`);
     await page.shows();
     assert.match(page.page.url(), /\?session=[0-9a-f]+$/);
     await page.page.reload();
@@ -194,20 +199,154 @@ describe("the page", () => {
     assert.equal(await asking.stop(), 0);
   });
 
-  test("fits a phone, light and dark", async () => {
+  test("fits a phone, light and dark, and tells the force while a finger touches", async () => {
+    const [width, height] = [390, 844];
     for (const colorScheme of /** @type {const} */ (["light", "dark"])) {
-      const page = await open(server.url, { viewport: { width: 360, height: 720 }, colorScheme, hasTouch: true });
+      const page = await open(server.url, { viewport: { width, height }, colorScheme, hasTouch: true, isMobile: true });
       await page.says("connection", /Connected/);
-      const wide = await page.page.evaluate("document.documentElement.scrollWidth - innerWidth");
-      assert.equal(wide, 0, "nothing is wider than the window");
+      await page.says("hint", /One finger touches/);
       const [left, top] = await page.at(0.5, 0.5);
-      assert.ok(left > 0 && left < 360 && top > 0 && top < 720, "the tissue is in sight");
+      assert.ok(left > 0 && left < width && top > 0 && top < height, "the tissue is in sight");
+      assert.deepEqual(await cut(page), [], "nothing is cut");
+      await page.press();
+      await page.says("touch", /deep\s*.*N back/);
+      const { x, y, width: wide, height: high } = (await page.page.locator("#touch").boundingBox()) ?? assert.fail();
+      assert.ok(x >= 0 && y >= 0 && x + wide <= width && y + high <= height, "the force is in sight");
+      assert.deepEqual(await cut(page), [], "nor while somebody touches");
       await page.picture(`phone-${colorScheme}`);
+      await page.page.mouse.up();
+      await page.page.click("#details");
+      assert.deepEqual(await cut(page), [], "nor are the figures");
       assert.deepEqual(page.complaints, []);
       await close(page);
     }
   });
+
+  test("begins with a liver, without one word of what the server's makers call things", async () => {
+    const page = await open(server.url, { viewport: { width: 1280, height: 800 } });
+    await page.says("connection", /session of liver/);
+    assert.equal(await page.page.inputValue("#scene"), "liver");
+    assert.deepEqual(await cut(page), []);
+    const [panel, room] = await page.page.evaluate(
+      "[document.querySelector('aside').scrollHeight, document.querySelector('aside').clientHeight]",
+    );
+    assert.ok(panel <= room, "scripts and looks are in sight without scrolling");
+    const words = await page.page.evaluate("document.body.innerText");
+    assert.doesNotMatch(words, /\b(reset|magnitude|z|free to take)\b/i);
+    await close(page);
+  });
+
+  test("has a right scale bar, also after a turn of the wheel", async () => {
+    const page = await open(server.url);
+    for (const turns of [0, -400]) {
+      if (turns !== 0) {
+        const before = await across(page, 0.2);
+        const [left, top] = await page.at(0.5, 0.5);
+        await page.page.mouse.move(left, top);
+        await page.page.mouse.wheel(0, turns);
+        await page.until(({ at }, before) => Math.abs(at(0.6, 0.5)[0] - at(0.4, 0.5)[0]) > 1.05 * before, before);
+      }
+      await page.page.waitForTimeout(500);
+      const said = /^([\d.]+) mm/.exec((await page.text("scale-text")).trim())?.[1];
+      const bar = await page.page.locator("#scale-bar").boundingBox();
+      const pixels = await across(page, Number(said) / 1000 / (await page.ask(({ widthM }) => widthM)));
+      assert.ok(Math.abs((bar?.width ?? 0) / pixels - 1) < 0.05, `${said} mm are ${pixels} pixels, not ${bar?.width}`);
+    }
+    assert.deepEqual(page.complaints, []);
+    await close(page);
+  });
+
+  test("never draws the tool in the tissue, nor looks from below", async () => {
+    const page = await open(server.url);
+    /** @param {string} when */
+    const isClear = async (when) => {
+      const clear = await page.ask((inside) => inside.clear);
+      if (clear !== undefined) assert.ok(clear > -0.003, `${when}: ${clear}`);
+    };
+    await page.page.fill("#strength", "1");
+    const [left, top] = await page.press();
+    await page.until(({ forceN }) => forceN[0] > 0.1);
+    for (let k = 0; k < 8; k++) {
+      await page.page.mouse.move(left + 90 * Math.cos(k), top + 60 * Math.sin(k), { steps: 3 });
+      await isClear(`leaning ${k}`);
+    }
+    await page.page.mouse.up();
+    await page.page.check("input[value=pull]", { force: true });
+    await page.page.mouse.move(left, top);
+    await page.page.mouse.down();
+    await page.page.mouse.move(left, top - 60, { steps: 6 });
+    await page.until(({ largestM }) => largestM > 0.004);
+    await isClear("pulling");
+    await page.page.focus("#tissue");
+    for (let k = 0; k < 30; k++) await page.page.keyboard.press("Shift+ArrowDown");
+    for (let k = 0; k < 20; k++) await page.page.keyboard.press("+");
+    await page.page.waitForTimeout(300);
+    const height = await page.ask(({ cameraHeight }) => cameraHeight);
+    assert.ok(height > 0.02, `the camera is ${height} of the width above the tissue`);
+    await page.picture("low");
+    await page.page.mouse.up();
+    assert.deepEqual(page.complaints, []);
+    await close(page);
+  });
+
+  test("draws the tissue in light and shade before its texture comes", async () => {
+    const page = new Page(await (await browser.newContext(VIEWPORT)).newPage());
+    /** @type {() => void} */
+    let answer = () => {};
+    const held = new Promise((done) => (answer = () => done(undefined)));
+    await page.page.route("**/textures/**", async (route) => {
+      await held;
+      await route.continue();
+    });
+    await page.page.goto(paper(server));
+    await page.shows();
+    await page.until(({ drawing }) => drawing.isDrawn && !drawing.hasTexture);
+    const rest = await page.picture("untextured");
+    await page.press();
+    await page.until(({ largestM }) => largestM > 0.02);
+    assert.notDeepEqual(rest, await page.picture("untextured-pressed"));
+    answer();
+    await page.until(({ drawing }) => drawing.hasTexture);
+    await page.page.mouse.up();
+    assert.deepEqual(page.complaints, []);
+    await close(page);
+  });
+
+  test("shows one light: good, and slow when answers take long", async () => {
+    const page = await open(server.url);
+    await page.says("light", /^Good$/);
+    assert.equal(await page.page.locator("#figures").isVisible(), false, "figures come on demand");
+    // A tissue at rest has no picture that gets older.
+    await page.page.click("#details");
+    await page.says("figures", /frame age\s*still/);
+    const wire = await page.page.context().newCDPSession(page.page);
+    const slower = { offline: false, latency: 600, downloadThroughput: -1, uploadThroughput: -1 };
+    await wire.send("Network.enable");
+    await wire.send("Network.emulateNetworkConditions", slower);
+    await page.says("light", /^Slow: answers take/);
+    await wire.send("Network.emulateNetworkConditions", { ...slower, latency: 0 });
+    await page.says("light", /^Good$/);
+    assert.deepEqual(page.complaints, []);
+    await close(page);
+  });
 });
+
+/** Pixels from one side of the tissue's middle to the other, this part of its width. @param {Page} page @param {number} part */
+async function across(page, part) {
+  const [from, to] = [await page.at(0.5 - part / 2, 0.5), await page.at(0.5 + part / 2, 0.5)];
+  return Math.hypot(to[0] - from[0], to[1] - from[1]);
+}
+
+/** Elements that are seen and reach beyond the window's sides, or whose text does not fit. @param {Page} page @returns {Promise<string[]>} */
+function cut(page) {
+  return page.page.evaluate(`[...document.body.querySelectorAll("*")].filter((element) => {
+    if (!element.checkVisibility() || element.closest("option") || element.tagName === "INPUT") return false;
+    const { left, right, width } = element.getBoundingClientRect();
+    if (width === 0) return false;
+    const fits = element.tagName === "SELECT" || element.id === "view" || element.scrollWidth <= element.clientWidth + 1 || getComputedStyle(element).display === "inline";
+    return left < -0.5 || right > innerWidth + 0.5 || !fits;
+  }).map((element) => element.tagName + "#" + element.id + ": " + element.textContent.slice(0, 40))`);
+}
 
 /** Nobody presses. @param {Page} page */
 async function rests(page) {
@@ -227,7 +366,7 @@ async function pressAgain(page) {
 
 describe("several pages on one session", () => {
   test("see the same, and only one may touch", async () => {
-    const holder = await open(`${server.url}/?name=first`);
+    const holder = await open(`${paper(server)}&name=first`);
     const other = await open(holder.page.url().replace("first", "second"));
     await holder.press();
     await holder.until(({ largestM, forceN }) => largestM > 0.02 && forceN[0] > 0.3);
@@ -244,7 +383,7 @@ describe("several pages on one session", () => {
     await other.until(({ largestM }) => largestM < 0.004);
     await holder.page.keyboard.press("Escape");
     // Free again: the other may.
-    await other.says("holder", /free/);
+    await other.says("holder", /Nobody touches/);
     await other.press();
     await holder.until(({ largestM, forceN }) => largestM > 0.02 && forceN[0] > 0.3);
     for (const page of [holder, other]) assert.deepEqual(page.complaints, []);
@@ -259,7 +398,7 @@ describe("several pages on one session", () => {
     const config = join(mkdtempSync(join(tmpdir(), "palpate-")), "config.toml");
     writeFileSync(config, "[limits]\nstreams_per_session = 5\n");
     const strict = await Server.start(["--config", config]);
-    const well = await open(strict.url);
+    const well = await open(paper(strict));
     const others = await pageProcesses(browser);
     const ill = await open(well.page.url());
     await well.press();
@@ -317,9 +456,10 @@ describe("several pages on one session", () => {
 
   test("come back by themselves when the server does", async () => {
     const first = await Server.start();
-    const page = await open(first.url);
+    const page = await open(paper(first));
     await first.stop();
     await page.says("connection", /Connection lost.*Trying again in/);
+    await page.says("light", /^Lost/);
     await page.picture("lost");
     const second = await Server.start([], new URL(first.url).host);
     // Its session went with the first server, and the page says so and offers another.

@@ -1,0 +1,216 @@
+// Light: how tissue, table and instruments are shaded. One light and one sky for all, always by the true normal. The same
+// programs run with and without a graphics processor, and one picture's worth of them is all that is compiled.
+
+import { Color, DoubleSide, ShaderMaterial, type Texture, Vector2, Vector3, Vector4 } from "three";
+
+/** Tools that cast a shadow: each costs every pixel. */
+export const SHADOWS = 1;
+
+/** What the programs share; `Stage` and `ToolMark` write it. */
+export const light = {
+  /** Direction to the lamp. */
+  lamp: { value: new Vector3(0, 0, 1) },
+  /** Middle of each tool's tip, and its radius; 0 for none. m. */
+  tips: { value: Array.from({ length: SHADOWS }, () => new Vector4(0, 0, 0, 0)) },
+  /** Far end of each tool's shaft, and its radius, m. */
+  shafts: { value: Array.from({ length: SHADOWS }, () => new Vector4(0, 0, 0, 0)) },
+  /** Rings on the tissue, where a ball's surface meets it: middle and radius; 0 for none. m. The last one is the aim. */
+  rings: { value: Array.from({ length: SHADOWS + 1 }, () => new Vector4(0, 0, 0, 0)) },
+  ink: { value: new Color() },
+};
+
+/** Soft shadows of capsules under a lamp (after Inigo Quilez), and the dark where a tip is near. */
+const SHADOW = `
+uniform vec3 lamp;
+uniform vec4 tips[${SHADOWS}];
+uniform vec4 shafts[${SHADOWS}];
+float shadow(vec3 from, vec4 tip, vec4 end) {
+  vec3 along = end.xyz - tip.xyz;
+  vec3 to = from - tip.xyz;
+  float a = dot(along, along), b = dot(along, lamp), c = dot(to, lamp), d = dot(to, along);
+  vec2 t = vec2(b * d - a * c, d - b * c) / max(a - b * b, 1e-12);
+  t = vec2(max(t.x, 1e-9), clamp(t.y, 0.0, 1.0));
+  vec3 apart = from + lamp * t.x - tip.xyz - along * t.y;
+  float radius = mix(tip.w, end.w, smoothstep(0.0, 0.12, t.y));
+  float edge = 0.35 * radius + 0.16 * t.x;
+  return smoothstep(-edge, edge, length(apart) - radius);
+}
+float lit(vec3 at) {
+  float share = 1.0;
+  for (int i = 0; i < ${SHADOWS}; i++) if (tips[i].w > 0.0) share *= shadow(at, tips[i], shafts[i]);
+  return share;
+}
+float contact(vec3 at) {
+  float open = 1.0;
+  for (int i = 0; i < ${SHADOWS}; i++) if (tips[i].w > 0.0) {
+    vec3 to = (at - tips[i].xyz) / tips[i].w;
+    open *= 1.0 - 0.75 * exp(0.9 - 0.9 * dot(to, to));
+  }
+  return max(open, 0.0);
+}`;
+
+/** Wet tissue: red light scatters the furthest, so shadows have warm edges; a thin film of liquid mirrors lamp and sky. */
+export class Skin extends ShaderMaterial {
+  constructor() {
+    super({
+      side: DoubleSide,
+      polygonOffset: true,
+      polygonOffsetFactor: 1,
+      polygonOffsetUnits: 1,
+      uniforms: {
+        ...light,
+        map: { value: null },
+        mapped: { value: 0 },
+        tone: { value: new Color(0x8e4538) },
+      },
+      vertexShader: `
+        attribute float open;
+        varying vec3 vAt;
+        varying vec3 vNormal;
+        varying vec2 vUv;
+        varying float vOpen;
+        void main() {
+          vAt = position;
+          vNormal = normal;
+          vUv = uv;
+          vOpen = open;
+          gl_Position = projectionMatrix * viewMatrix * vec4(position, 1.0);
+        }`,
+      fragmentShader: `
+        uniform sampler2D map;
+        uniform float mapped;
+        uniform vec3 tone;
+        uniform vec4 rings[${SHADOWS + 1}];
+        uniform vec3 ink;
+        varying vec3 vAt;
+        varying vec3 vNormal;
+        varying vec2 vUv;
+        varying float vOpen;
+        ${SHADOW}
+        void main() {
+          vec3 eye = normalize(cameraPosition - vAt);
+          vec3 n = normalize(vNormal);
+          if (dot(n, eye) < 0.0 && !gl_FrontFacing) n = -n;
+          vec3 colour = mix(tone, texture2D(map, vUv).rgb, mapped);
+          float share = lit(vAt);
+          float near = contact(vAt);
+          vec3 wrap = vec3(0.28, 0.10, 0.07);
+          vec3 diffuse = max((dot(n, lamp) + wrap) / (1.0 + wrap), 0.0);
+          vec3 around = mix(vec3(0.17, 0.09, 0.08), vec3(0.30, 0.32, 0.36), 0.5 + 0.5 * n.z) * vOpen * near;
+          // A shadow in tissue is never black: light comes through from the side.
+          vec3 key = diffuse * mix(vec3(0.26, 0.13, 0.12), vec3(1.0), share);
+          // The lamp, and a weak light beside the eye.
+          float beside = 0.24 * max(dot(n, eye), 0.0) * near * vOpen;
+          vec3 shown = colour * (around + beside + 1.0 * vec3(1.0, 0.965, 0.92) * key * mix(0.55, 1.0, vOpen * near));
+          // Bright tissue keeps its colour.
+          shown = 1.0 - exp(-1.15 * shown);
+          vec3 half_ = normalize(lamp + eye);
+          float h = max(dot(n, half_), 0.0);
+          float graze = 1.0 - max(dot(n, eye), 0.0);
+          float mirror = 0.04 + 0.96 * graze * graze * graze * graze * graze;
+          float sheen = h * h;
+          sheen *= sheen;
+          sheen *= sheen;
+          sheen *= sheen;
+          sheen *= sheen * sheen;
+          float glint = 0.8 * smoothstep(0.9984, 0.9994, h) + 0.055 * sheen;
+          vec3 seen = reflect(-eye, n);
+          float sky = 0.30 * smoothstep(0.15, 0.9, seen.z) * (0.25 + 2.4 * mirror);
+          shown += (glint * share + 0.16 * sky * vOpen) * near * vec3(1.0, 0.98, 0.95);
+          for (int i = 0; i <= ${SHADOWS}; i++) if (rings[i].w > 0.0) {
+            float apart = abs(length(vAt - rings[i].xyz) / rings[i].w - 1.0);
+            shown = mix(shown, ink, (i < ${SHADOWS} ? 0.35 : 0.9) * (1.0 - smoothstep(0.03, 0.09, apart)));
+          }
+          gl_FragColor = vec4(shown, 1.0);
+          #include <colorspace_fragment>
+        }`,
+    });
+  }
+
+  setTexture(texture: Texture): void {
+    (this.uniforms.map!.value as Texture | null)?.dispose();
+    this.uniforms.map!.value = texture;
+    this.uniforms.mapped!.value = 1;
+  }
+
+  /** Before another tissue's texture arrives, none is shown. */
+  dropTexture(): void {
+    this.uniforms.mapped!.value = 0;
+  }
+}
+
+/** The table that the tissue lies on: it fades into the background, and the tissue's shadow lies on it. */
+export class Table extends ShaderMaterial {
+  constructor() {
+    super({
+      uniforms: {
+        ...light,
+        colour: { value: new Color() },
+        background: { value: new Color() },
+        middle: { value: new Vector2() },
+        half_: { value: new Vector2(1, 1) },
+        height: { value: 1 },
+      },
+      vertexShader: `
+        varying vec3 vAt;
+        void main() {
+          vAt = position;
+          gl_Position = projectionMatrix * viewMatrix * vec4(position, 1.0);
+        }`,
+      fragmentShader: `
+        uniform vec3 colour;
+        uniform vec3 background;
+        uniform vec2 middle;
+        uniform vec2 half_;
+        uniform float height;
+        varying vec3 vAt;
+        ${SHADOW}
+        float away(vec2 at) {
+          vec2 q = abs(at - middle) - half_;
+          return length(max(q, 0.0)) + min(max(q.x, q.y), 0.0);
+        }
+        void main() {
+          float near = exp(-max(away(vAt.xy), 0.0) / (0.30 * height));
+          float fallen = 1.0 - smoothstep(-0.35 * height, 0.45 * height, away(vAt.xy + lamp.xy / lamp.z * 0.62 * height));
+          vec3 shown = colour * (1.0 - 0.55 * near) * (1.0 - 0.38 * fallen) * mix(0.6, 1.0, lit(vAt));
+          float size = max(half_.x, half_.y);
+          shown = mix(shown, background, smoothstep(0.5 * size, 2.6 * size, length(vAt.xy - middle) - size));
+          gl_FragColor = vec4(shown, 1.0);
+          #include <colorspace_fragment>
+        }`,
+    });
+  }
+}
+
+/** Polished steel in a bright room. */
+export class Steel extends ShaderMaterial {
+  constructor(colour: number) {
+    super({
+      uniforms: { ...light, colour: { value: new Color(colour) } },
+      vertexShader: `
+        varying vec3 vAt;
+        varying vec3 vNormal;
+        void main() {
+          vec4 at = modelMatrix * vec4(position, 1.0);
+          vAt = at.xyz;
+          vNormal = mat3(modelMatrix) * normal;
+          gl_Position = projectionMatrix * viewMatrix * at;
+        }`,
+      fragmentShader: `
+        uniform vec3 colour;
+        uniform vec3 lamp;
+        varying vec3 vAt;
+        varying vec3 vNormal;
+        void main() {
+          vec3 eye = normalize(cameraPosition - vAt);
+          vec3 n = normalize(vNormal);
+          vec3 seen = reflect(-eye, n);
+          float room = mix(0.10, 0.75, smoothstep(-0.4, 0.7, seen.z)) + 0.35 * smoothstep(0.55, 0.8, dot(seen, lamp));
+          float h = max(dot(n, normalize(lamp + eye)), 0.0);
+          vec3 shown = colour * (room + 0.35 * max(dot(n, lamp), 0.0)) + 0.8 * smoothstep(0.985, 0.996, h);
+          gl_FragColor = vec4(shown, 1.0);
+          #include <colorspace_fragment>
+        }`,
+    });
+  }
+}

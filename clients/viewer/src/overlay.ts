@@ -1,0 +1,75 @@
+// What stands over the picture: the scale bar, and beside the tool how deep it is and how hard the tissue pushes back.
+
+import { part } from "./page";
+import { quantity } from "./plot";
+import { norm, type Vec3 } from "./samples";
+import type { Stage } from "./stage";
+
+/** Longest scale bar, pixels, and of the picture's width. */
+const LONGEST = { pixels: 150, part: 0.28 };
+/** Distance of the words from the tip, pixels. */
+const BESIDE = 46;
+
+/** A depth or height in words. */
+export function depthText([, , z]: Vec3): string {
+  return z > 0 ? `${quantity(z, "m")} lifted` : `${quantity(Math.max(-z, 0), "m")} deep`;
+}
+
+export class Overlay {
+  private readonly touch = part("touch", HTMLElement);
+  private readonly depth = part("touch-depth", HTMLElement);
+  private readonly force = part("touch-force", HTMLElement);
+  private readonly bar = part("scale-bar", HTMLElement);
+  private readonly length = part("scale-text", HTMLElement);
+  /** The view that the bar was measured in. */
+  private measured = -1;
+
+  constructor(private readonly stage: Stage) {}
+
+  /** Tells what the first tool feels; nothing if there is none. */
+  tell(felt: { displacementM: Vec3; forceN: Vec3 } | undefined): void {
+    if (this.touch.hidden === (felt === undefined)) return void (felt && this.write(felt));
+    this.touch.hidden = felt === undefined;
+    if (felt) {
+      this.write(felt);
+      this.place();
+    }
+  }
+
+  private write(felt: { displacementM: Vec3; forceN: Vec3 }): void {
+    this.depth.textContent = depthText(felt.displacementM);
+    this.force.textContent = `${quantity(norm(felt.forceN), "N")} back`;
+  }
+
+  /** Call after each picture. */
+  drawn(): void {
+    this.measure();
+    if (!this.touch.hidden) this.place();
+  }
+
+  private place(): void {
+    const at = this.stage.tipInWindow();
+    if (!at) return;
+    const view = this.touch.parentElement!.getBoundingClientRect();
+    const [width, height] = [this.touch.offsetWidth, this.touch.offsetHeight];
+    const [x, y] = [at[0] - view.left, at[1] - view.top];
+    // To the left of the tool, which comes from the right; where there is no room, to the right and below.
+    const hasRoom = x - BESIDE - width > 8;
+    const left = hasRoom ? x - BESIDE - width : x + BESIDE;
+    const top = Math.min(Math.max(hasRoom ? y - height / 2 : y + BESIDE / 2, 8), view.height - height - 8);
+    this.touch.style.transform = `translate(${Math.round(left)}px, ${Math.round(top)}px)`;
+  }
+
+  private measure(): void {
+    if (this.stage.views === this.measured) return;
+    const pixels = this.stage.pixelsPerMetre();
+    if (!Number.isFinite(pixels) || pixels <= 0) return;
+    this.measured = this.stage.views;
+    const most = Math.min(LONGEST.pixels, LONGEST.part * this.touch.parentElement!.clientWidth) / pixels;
+    const power = 10 ** Math.floor(Math.log10(most));
+    const lengthM = power * ([5, 2].find((times) => times * power <= most) ?? 1);
+    this.bar.style.width = `${(lengthM * pixels).toFixed(1)}px`;
+    // Lengths of tissue are told in millimetres.
+    this.length.textContent = `${Number((1000 * lengthM).toPrecision(3))} mm`;
+  }
+}
