@@ -50,9 +50,9 @@ export class Stage {
   onDrawn: () => void = () => {};
   /** Number of pictures drawn. */
   drawn = 0;
-  /** Whether the tissue was ever drawn, and whether its texture was then there: for tests. */
   /** Grows whenever the view changes. */
   views = 0;
+  /** Whether the tissue was ever drawn, and whether its texture was then there: for tests. */
   readonly began = { isDrawn: false, isTextured: false };
   private readonly renderer: WebGLRenderer;
   private readonly scene = new Scene();
