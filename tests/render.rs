@@ -61,7 +61,7 @@ fn a_texture_is_made_by_its_seed() {
     assert_ne!(first, made("c.png", &["texture", "--seed", "6", "--size", "96"]));
     let small = decoded(&first);
     assert_eq!((small.width, small.height), (96, 96));
-    // The lining of a stomach: red, and neither flat nor noise.
+    // The lining of a stomach: red, and neither flat nor noise. Only colour differs, not light.
     let large = painted(Surface::Mucosa, 5, 384, &Limits::default()).unwrap();
     let mut spread = 0.0_f64;
     for part in (0..64).map(|k| [k % 8, k / 8]) {
@@ -71,7 +71,7 @@ fn a_texture_is_made_by_its_seed() {
         assert!((0..3).all(|c| (a[c] - b[c]).abs() < 14.0), "{part:?}: {a:?} and {b:?}");
         spread = spread.max((a[0] - mean(&small, 1, [0, 0])[0]).abs());
     }
-    assert!(spread > 12.0, "{spread}");
+    assert!(spread > 7.0, "{spread}");
     refused(&["texture", "--size", "4097", "--output", "never.png"], "texture_size");
     refused(&["texture", "--size", "3", "--output", "never.png"], "from 16 to 4096");
     let nowhere = palpate(&["texture", "--size", "16", "--output", "no/such/folder/a.png"]);

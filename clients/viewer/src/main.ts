@@ -135,7 +135,7 @@ function wellText(session: Session): string {
   const name = session.scene?.name ?? "";
   if (session.state === SessionState.HELD) return `The session is held: ${session.holdReason}`;
   const paused = session.state === SessionState.PAUSED ? ", which is paused" : "";
-  return `Connected to a session of ${name}${paused}.${recoveredText(session)}`;
+  return `Connected to ${name}${paused}.${recoveredText(session)}`;
 }
 
 /** How often the tissue recovered and why it did the last time; nothing if it never did. */

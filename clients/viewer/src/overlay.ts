@@ -55,16 +55,17 @@ export class Overlay {
     const [x, y] = [at[0] - view.left, at[1] - view.top];
     // To the left of the tool, which comes from the right; where there is no room, to the right and below.
     const hasRoom = x - BESIDE - width > 8;
-    const left = hasRoom ? x - BESIDE - width : x + BESIDE;
+    const left = hasRoom ? x - BESIDE - width : Math.min(x + BESIDE, view.width - width - 8);
     const top = Math.min(Math.max(hasRoom ? y - height / 2 : y + BESIDE / 2, 8), view.height - height - 8);
     this.touch.style.transform = `translate(${Math.round(left)}px, ${Math.round(top)}px)`;
   }
 
   private measure(): void {
-    if (this.stage.views === this.measured) return;
+    if (this.stage.views === this.measured || !this.stage.began.isDrawn) return;
     const pixels = this.stage.pixelsPerMetre();
     if (!Number.isFinite(pixels) || pixels <= 0) return;
     this.measured = this.stage.views;
+    this.length.parentElement!.hidden = false;
     const most = Math.min(LONGEST.pixels, LONGEST.part * this.touch.parentElement!.clientWidth) / pixels;
     const power = 10 ** Math.floor(Math.log10(most));
     const lengthM = power * ([5, 2].find((times) => times * power <= most) ?? 1);

@@ -50,9 +50,9 @@ export class Stage {
   onDrawn: () => void = () => {};
   /** Number of pictures drawn. */
   drawn = 0;
-  /** Whether the tissue was ever drawn, and whether its texture was then there: for tests. */
   /** Grows whenever the view changes. */
   views = 0;
+  /** Whether the tissue was ever drawn, and whether its texture was then there: for tests. */
   readonly began = { isDrawn: false, isTextured: false };
   private readonly renderer: WebGLRenderer;
   private readonly scene = new Scene();
@@ -492,7 +492,7 @@ export class Stage {
   }
 }
 
-/** The table, with a hole where the tissue stands: a dent may reach below it. */
+/** The table, with a hole beneath the tissue: a dent may reach below it. */
 function tableGeometry([width, length]: [number, number], roundM: number, heightM: number, farM: number): BufferGeometry {
   const places: number[] = [];
   const corners = [[0, 0], [width, 0], [width, length], [0, length]] as const;
@@ -502,7 +502,7 @@ function tableGeometry([width, length]: [number, number], roundM: number, height
     for (let k = 0; k <= segments; k++) {
       const angle = Math.PI + (corner % 4) * (Math.PI / 2) + (k / segments) * (Math.PI / 2);
       const [ox, oy] = [Math.cos(angle), Math.sin(angle)];
-      places.push(x + 0.8 * roundM * ox, y + 0.8 * roundM * oy, -heightM, x + farM * ox, y + farM * oy, -heightM);
+      places.push(x + 0.5 * roundM * ox, y + 0.5 * roundM * oy, -heightM, x + farM * ox, y + farM * oy, -heightM);
     }
   }
   const triangles: number[] = [];

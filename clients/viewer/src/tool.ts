@@ -63,10 +63,10 @@ export class ToolMark {
     this.rod = new Mesh(new CylinderGeometry(0.2, 0.2, 1, 12).rotateX(Math.PI / 2).translate(0, 0, 0.5), green);
     this.head = new Mesh(new ConeGeometry(0.62, 1.7, 20).rotateX(Math.PI / 2).translate(0, 0, -0.85), green);
     this.arrow.add(this.rod, this.head);
-    this.gauge = new Mesh(new CylinderGeometry(0.09, 0.09, 1, 8).rotateX(Math.PI / 2).translate(0, 0, -0.5), white);
+    this.gauge = new Mesh(new CylinderGeometry(0.12, 0.12, 1, 8).rotateX(Math.PI / 2).translate(0, 0, -0.5), white);
     this.level = new Mesh(new RingGeometry(1.7, 1.86, 48), white);
     for (const part of [this.rod, this.head]) part.renderOrder = 3;
-    this.foot = new Mesh(new SphereGeometry(0.2, 12, 8), white);
+    this.foot = new Mesh(new SphereGeometry(0.26, 12, 8), white);
     for (const part of [this.gauge, this.foot, this.level]) part.renderOrder = 2;
     this.group.add(this.probe, this.arrow, this.gauge, this.foot, this.level);
   }

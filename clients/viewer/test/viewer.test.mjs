@@ -179,7 +179,7 @@ describe("the page", () => {
     const page = await open(`${failing.url}/?scene=stiff`);
     await page.page.selectOption("#script", "vertical-60");
     await page.page.click("#play");
-    await page.says("connection", /Connected to a session of .*The tissue recovered (once|\d+ times), .* because after step \d+ /);
+    await page.says("connection", /Connected to .*The tissue recovered (once|\d+ times), .* because after step \d+ /);
     await close(page);
     assert.equal(await failing.stop(), 0);
   });
@@ -228,7 +228,7 @@ describe("the page", () => {
 
   test("begins with a liver, without one word of what the server's makers call things", async () => {
     const page = await open(server.url, { viewport: { width: 1280, height: 800 } });
-    await page.says("connection", /session of liver/);
+    await page.says("connection", /Connected to liver/);
     assert.equal(await page.page.inputValue("#scene"), "liver");
     assert.deepEqual(await cut(page), []);
     const [panel, room] = await page.page.evaluate(
