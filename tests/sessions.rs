@@ -615,3 +615,14 @@ async fn an_expected_error_is_always_finite() {
     let known = server.create(Source::SceneName("paper".into()), true).await.unwrap();
     assert!(known.expected_error > 0.0 && known.expected_error < 1e-2, "{}", known.expected_error);
 }
+
+#[tokio::test]
+async fn a_session_tells_where_its_tissue_rests() {
+    let server = Server::start(&[]);
+    let session = server.create(Source::SceneName("liver".into()), false).await.unwrap();
+    let extent = session.extent.unwrap();
+    let place = |place: Option<pb::Vector3>| place.map(|place| [place.x, place.y, place.z]);
+    assert_eq!(place(extent.least_m), Some([0.0, 0.0, 0.0]));
+    assert_eq!(place(extent.most_m), Some([0.075, 0.075, 0.0]));
+    assert_eq!(place(extent.middle_m), Some([0.0375, 0.0375, 0.0]));
+}

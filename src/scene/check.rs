@@ -8,6 +8,11 @@ use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, finite, finite_vector, not_negative, number, positive};
 use crate::shape::{PointId, RestShape};
 
+/// Squares and products of what a scene holds stay within single precision for values in this range.
+pub(super) fn physical(field: &str, value: f64) -> Result<f64> {
+    number(field, value, "from 1e-12 to 1e12", |v| (1e-12..=1e12).contains(&v))
+}
+
 /// Refuses a force whose largest value at a point, |force|·e^{c′}, is above the limit.
 pub(super) fn check_force(field: &str, force_n: DVec3, factor: f64, limit_n: f64) -> Result<()> {
     finite_vector(field, force_n)?;

@@ -17,9 +17,10 @@ use std::path::{Path, PathBuf};
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, did_you_mean, excerpt, not_negative, number};
 use crate::shape::RestShape;
+use check::physical;
 use document::{Document, Item};
 use kind::Kind;
-pub use sheet::{Fixed, PointSet, Sheet};
+pub use sheet::{Fixed, LEAST_WIDTH, PointSet, Sheet};
 
 /// The scene of the paper's figures, built in.
 pub const PAPER: &str = include_str!("../../scenes/paper.toml");
@@ -217,9 +218,6 @@ named! {
     }
 }
 
-/// Points of a row that are computed at least: the lanes of the widest vector.
-pub const LEAST_WIDTH: usize = 16;
-
 named! {
     /// The number format of the state.
     pub enum Precision {
@@ -364,11 +362,6 @@ impl Scene {
         }
         Ok(())
     }
-}
-
-/// Squares and products of what a scene holds stay within single precision for values in this range.
-fn physical(field: &str, value: f64) -> Result<f64> {
-    number(field, value, "from 1e-12 to 1e12", |v| (1e-12..=1e12).contains(&v))
 }
 
 fn read_appearance(item: &Item<'_>, limits: &Limits) -> Result<Appearance> {

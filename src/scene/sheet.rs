@@ -6,12 +6,15 @@ use std::sync::Arc;
 
 use glam::{DVec2, DVec3};
 
+use super::check::physical;
 use super::document::{Fields, Item};
-use super::{LEAST_WIDTH, physical};
 use crate::limits::Limits;
 use crate::memory;
 use crate::refusal::{Reason, Refusal, Result, positive};
 use crate::shape::{Extent, PointId, PointName, RestShape};
+
+/// Points of a row that are computed at least: the lanes of the widest vector.
+pub const LEAST_WIDTH: usize = 16;
 
 /// The grid: point [i, j] rests at (i·spacing, j·spacing, 0).
 #[derive(Debug, Clone, PartialEq)]

@@ -54,6 +54,7 @@ pub(super) fn session(live: &Live) -> pb::Session {
         streams: count(live.streams()),
         scene_name: model.scene.name.clone(),
         points: count(model.len()),
+        extent: Some(wire::extent(&model.shape().extent())),
         audit: audit(live),
         ..Default::default()
     };

@@ -8,7 +8,7 @@ pub mod scene;
 use palpate_proto::{geometry, pb};
 
 use crate::refusal::{Reason, Refusal, Result};
-use crate::shape::PointName;
+use crate::shape::{Extent, PointName};
 
 /// The value of a required field.
 ///
@@ -38,4 +38,10 @@ pub fn point(name: PointName) -> pb::GridPoint {
 /// The name of a mass point in a message.
 pub fn from_point(point: &pb::GridPoint) -> PointName {
     PointName::Point(geometry::from_point(point))
+}
+
+/// Where a tissue rests, as a message.
+pub fn extent(extent: &Extent) -> pb::Extent {
+    let vector = geometry::vector;
+    pb::Extent { least_m: vector(extent.least_m), most_m: vector(extent.most_m), middle_m: vector(extent.middle_m()) }
 }

@@ -5,6 +5,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use glam::DVec3;
+use palpate_proto::geometry::from_vector;
 use palpate_proto::refusal::Reason;
 use palpate_proto::{pb, touch};
 use palpate_touch::deadband::HEARTBEAT_S;
@@ -179,13 +180,10 @@ async fn session(target: &Target, shared: &Shared, channel: Channel) -> Result<p
     known.ok_or_else(|| broken("the server sent no session"))
 }
 
-/// The middle of a session's sheet, m.
+/// The middle of a session's tissue at rest, m.
 fn middle_m(session: &pb::Session) -> Result<DVec3, Error> {
-    let sheet = session.scene.as_ref().and_then(|scene| scene.sheet.as_ref());
-    let sheet = sheet.ok_or_else(|| broken("the server sent no scene"))?;
-    let spacing_m = sheet.spacing_m.unwrap_or(0.0);
-    let middle = |points: Option<u32>| 0.5 * spacing_m * f64::from(points.unwrap_or(1).saturating_sub(1));
-    Ok(DVec3::new(middle(sheet.points_x), middle(sheet.points_y), 0.0))
+    let extent = session.extent.as_ref().ok_or_else(|| broken("the server does not tell where the tissue is"))?;
+    Ok(from_vector(extent.middle_m.as_ref()))
 }
 
 fn broken(why: &str) -> Error {
