@@ -63,7 +63,8 @@ impl Extent {
 
 impl fmt::Display for Extent {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let DVec3 { x, y, z } = self.size_m();
+        // Without the last digits, which a product of spacing and number may have.
+        let [x, y, z] = self.size_m().to_array().map(|size_m| (size_m * 1e9).round() / 1e9);
         if z > 0.0 { write!(f, "{x} m × {y} m × {z} m") } else { write!(f, "{x} m × {y} m") }
     }
 }

@@ -188,7 +188,7 @@ fn a_bad_script_is_refused_with_file_line_and_key() {
         (
             "point = [4, 3]",
             "path = { from_m = [9.0, 0.0], velocity_m_per_s = [0.0, 0.0] }",
-            "script.toml:6: force[0].path.from_m: (9, 0) m is off the sheet",
+            "script.toml:6: force[0].path.from_m: (9, 0, 0) m is off the tissue, which is 0.4 m × 0.3 m",
         ),
         ("force_n = [0.0, 0.0, -1.0]", "force_n = [0.0, nan, -1.0]", "script.toml:7: force[0].force_n[1]"),
         ("force_n = [0.0, 0.0, -1.0]", "force_n = [0.0, 0.0, -2e4]", "script.toml:7: force[0].force_n: is 2.0"),
@@ -349,7 +349,7 @@ fn scenes_and_scripts_are_found_by_name() {
     refused(&palpate(&["run", "liverr", "mine"]), &["there is no scene `liverr`", "; did you mean `liver`?"]);
     refused(
         &palpate(&["run", "paper", "vertcal-60"]),
-        &["there is no script `vertcal-60`; there are mine, oblique", "; did you mean `vertical-60`?"],
+        &["there is no script `vertcal-60`; there are grasp, mine, oblique", "; did you mean `vertical-60`?"],
     );
     // Built in, without a file of that name.
     assert_eq!(lines(&palpate(&["run", "paper", "vertical-60"]))[0]["run"]["script"], "vertical-60");
