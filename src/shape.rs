@@ -63,8 +63,9 @@ impl Extent {
 
 impl fmt::Display for Extent {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        // Without the last digits, which a product of spacing and number may have.
-        let [x, y, z] = self.size_m().to_array().map(|size_m| (size_m * 1e9).round() / 1e9);
+        // Ten digits: the last ones are those of a product of spacing and number.
+        let rounded = |size_m: f64| format!("{size_m:.9e}").parse().unwrap_or(size_m);
+        let [x, y, z] = self.size_m().to_array().map(rounded);
         if z > 0.0 { write!(f, "{x} m × {y} m × {z} m") } else { write!(f, "{x} m × {y} m") }
     }
 }
