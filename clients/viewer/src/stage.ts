@@ -248,9 +248,8 @@ export class Stage {
 
   /** The least room between a drawn tool and the drawn tissue, m; undefined without a tool. */
   get clearM(): number | undefined {
-    const { surface } = this;
-    if (!surface || this.tools.length === 0) return undefined;
-    return Math.min(...this.marks.slice(0, this.tools.length).map((mark) => mark.clearM(surface)));
+    if (!this.surface || this.tools.length === 0) return undefined;
+    return Math.min(...this.marks.slice(0, this.tools.length).map((mark) => mark.clearM));
   }
 
   /** Height of the camera above the tissue beneath it, m. */

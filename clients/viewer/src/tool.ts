@@ -48,6 +48,7 @@ export class ToolMark {
   private readonly force = new Vector3();
   private radiusM = 0;
   private lengthM = 0;
+  private roomM = Infinity;
 
   constructor(private readonly index: number) {
     const steel = new Steel(0xd5d9de);
@@ -89,6 +90,7 @@ export class ToolMark {
     this.tipM.set(x + dx, y + dy, 0);
     this.tipM.z = surface.restOn(this.tipM.x, this.tipM.y, r);
     this.direct(surface, dx, dy);
+    this.roomM = Math.min(this.tipM.z - surface.restOn(this.tipM.x, this.tipM.y, r), this.room(surface, this.axis));
     this.probe.position.copy(this.tipM);
     this.probe.scale.setScalar(r);
     this.probe.quaternion.setFromUnitVectors(UP, this.axis);
@@ -151,9 +153,8 @@ export class ToolMark {
     return least;
   }
 
-  /** The least room between the tool and the tissue, m: of tip and shaft. */
-  clearM(surface: Surface): number {
-    const tip = this.tipM.z - surface.restOn(this.tipM.x, this.tipM.y, this.radiusM);
-    return Math.min(tip, this.room(surface, this.axis));
+  /** The least room between tip or shaft and the tissue when the tool was placed on it, m: what came since is not drawn. */
+  get clearM(): number {
+    return this.roomM;
   }
 }
