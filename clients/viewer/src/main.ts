@@ -192,8 +192,8 @@ function tellControls(): void {
   const range = quantity(reach.spacingM, "m");
   part("meaning", HTMLElement).textContent =
     "Strength is the push in the middle of the tool. It fades out over about " +
-    `${range}, so the tissue around takes part of it. What pushes back is the one point of the tissue that is nearest to ` +
-    "the tool: at most the strength while nothing moves, and less beside the middle. While the tissue moves it may be more.";
+    `${range}. What pushes back is the mean over the tissue around, weighted as the push is. The push is strongest in the ` +
+    "middle, so that mean is less than the strength while nothing moves. While the tissue moves it may be more.";
 }
 
 function chosenMode(): Mode {
