@@ -199,6 +199,23 @@ fn what_is_wrong_with_a_force_or_a_pose_is_named() {
     }
 }
 
+#[test]
+fn a_pose_beside_the_tissue_is_warned_of() {
+    let scene = built_in("liver", &[]);
+    let warnings = |x_m: f64, z_m: f64| {
+        let text = format!(
+            "duration_s = 0.1\nsample_every_s = 0.1\n[[tool]]\nposes = [{{ at_s = 0.0, place_m = [{x_m}, 0.03, {z_m}] }}]\n"
+        );
+        script(&text, &scene).warnings
+    };
+    assert_eq!(warnings(0.075, 0.02), [""; 0]);
+    let [warning] = warnings(0.085, -0.002).try_into().unwrap();
+    assert!(
+        warning.starts_with("tool[0].poses[0].place_m: is 0.01") && warning.contains("beside the tissue"),
+        "{warning}"
+    );
+}
+
 /// A session of liver, and what a command for the coming step tells in the sample after it.
 fn told(session: &mut Session, sequence: u64, action: Action) -> palpate::session::Contact {
     let at_step = Some(session.step_count());

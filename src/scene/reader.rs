@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::Arc;
 
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 use palpate_touch::{Coupling, Tip};
 
 use super::check::{check_force, check_free, check_reach, check_tip};
@@ -418,7 +418,7 @@ impl Binding<'_> {
     }
 
     /// A tool with a tip.
-    fn poses(&self, fields: &mut Fields<'_>, list: &Item<'_>) -> Result<PoseProfile> {
+    fn poses(&mut self, fields: &mut Fields<'_>, list: &Item<'_>) -> Result<PoseProfile> {
         let shape = self.scene.shape();
         let tip = fields.item("tip").map_or(Ok(Tip::default()), |item| item.table(read_tip))?;
         check_tip(&fields.path("tip"), shape, &tip)?;
@@ -435,7 +435,16 @@ impl Binding<'_> {
                 }
                 let place_m = fields.required("place_m")?.vector()?;
                 let far_m = place_m.distance(shape.extent().middle_m());
-                check_reach(&fields.path("place_m"), shape, far_m, self.limits)?;
+                let field = fields.path("place_m");
+                check_reach(&field, shape, far_m, self.limits)?;
+                let extent = shape.extent();
+                let beside_m = (extent.least_m - place_m).max(place_m - extent.most_m).max(DVec3::ZERO).truncate();
+                if beside_m != DVec2::ZERO {
+                    let off_m = beside_m.length();
+                    self.warnings.push(format!(
+                        "{field}: is {off_m} m beside the tissue: a tip that touches goes on with the edge, and drags it along"
+                    ));
+                }
                 Ok((at_s, place_m))
             })?);
         }

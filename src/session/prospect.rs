@@ -226,7 +226,7 @@ impl fmt::Display for Prospect {
                 )?;
                 let force = rounded(law.at_depth(self.deepest_m).force_n);
                 let why = if self.is_by_law { "as far as its force law reaches" } else { "half the shorter side" };
-                writeln!(f, "deepest       {force} N, which press that disc in by {}, {why}", length(self.deepest_m))?;
+                writeln!(f, "deepest       {} at {force} N: {why}", length(self.deepest_m))?;
             }
             _ => writeln!(f, "fingertip     unknown: the force law of a disc of {radius} radius takes too much work")?,
         }
@@ -281,7 +281,7 @@ mod tests {
         // 2m/C is 6.6 ms, below the critical damping; ln 100 of these.
         assert!(text.contains("0.0304 s until the slowest vibration"), "{text}");
         // Half of 20 mm, which the law, of 4 radii, covers.
-        assert!(text.contains("press that disc in by 10 mm, half the shorter side"), "{text}");
+        assert!(text.contains("deepest       10 mm at ") && text.contains(" N: half the shorter side"), "{text}");
         let stiffness = found.stiffness_n_per_m().unwrap();
         // Some twelve points share a disc of 5 mm, each on a virtual spring of 5 N/m.
         assert!((50.0..80.0).contains(&stiffness), "{stiffness} N/m");
