@@ -232,7 +232,7 @@ impl fmt::Display for Prospect {
         }
         match self.rest_s {
             Ok(rest_s) => {
-                writeln!(f, "rest          {} s until the slowest vibration has decayed to 1 %", rounded(rest_s))?
+                writeln!(f, "rest          {} s until the slowest vibration has decayed to 1 %", rounded(rest_s))?;
             }
             Err(why) => writeln!(f, "rest          {why}")?,
         }
