@@ -88,8 +88,10 @@ viewer: need-node $(PAGE)
 page-if-node:
 	@$(MAKE) --no-print-directory viewer || echo 'So there is no page to look at; gRPC is served all the same.' >&2
 
-# The server runs until Ctrl-C, which reaches it as well as this shell.
-run: build page-if-node
+# The server runs until Ctrl-C, which reaches it as well as this shell. The page is built beside the programs: each has
+# parts that keep one core busy alone.
+run:
+	@$(MAKE) --no-print-directory -j2 build page-if-node
 	@rm -f target/serving.txt; \
 	./target/release/palpate serve --listen $(LISTEN) --log warn > target/serving.txt & server=$$!; \
 	trap 'kill $$server 2>/dev/null; wait $$server; exit 0' INT TERM; \

@@ -33,6 +33,8 @@ pub(super) trait Real:
     type Neon: Vector<Real = Self>;
     /// An integer with the same number of bits.
     type Bits;
+    /// Whether sums in it can be compensated: there is no need in the widest format, and no code is made for it.
+    const COMPENSATES: bool;
     /// Number of terms of [`Real::SERIES`], even.
     const TERMS: usize;
     /// The polynomial in q nearest to (1 − 1/√(1 + q))/q on |q| ≤ 1/8 in relative error: within 5.2e-8 (degree 5) for
@@ -96,6 +98,7 @@ macro_rules! real {
             #[cfg(target_arch = "aarch64")]
             type Neon = super::lanes::$neon;
             type Bits = $bits;
+            const COMPENSATES: bool = size_of::<$t>() < 8;
             const LEAST: f64 = f64::from_bits(((1023 + (<$t>::MIN_EXP - 1) / 2) as u64) << 52);
             const LEAST_BITS: $bits = 3 << (<$bits>::BITS - 3);
             const LEAST_EXCESS: f64 = f64::from_bits(((1023 - $small[0]) as u64) << 52);

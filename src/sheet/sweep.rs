@@ -99,9 +99,25 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                         None => [zero; 3],
                     };
                     let span = (from..to, strip.awake && from == strip.columns.start, left);
-                    let duty = if FLEXION || S::ENERGY || !V::IS_REGISTER { ANY } else { self.stage.duty(i) };
-                    // The common rows have loops of their own, without the code that only other rows need.
-                    match (i + 1 < rows, whole, duty) {
+                    // The common rows have loops of their own, without the code that only other rows need. No code is
+                    // made for loops that can't be used: most of the build is this function's.
+                    if const { !V::IS_REGISTER } {
+                        if i + 1 < rows {
+                            self.row::<V, FLEXION, true, false, ANY>(flexion, i, span, &mut sums);
+                        } else {
+                            self.row::<V, FLEXION, false, false, ANY>(flexion, i, span, &mut sums);
+                        }
+                        continue;
+                    }
+                    if const { FLEXION || S::ENERGY } {
+                        match (i + 1 < rows, whole) {
+                            (true, true) => self.row::<V, FLEXION, true, true, ANY>(flexion, i, span, &mut sums),
+                            (true, false) => self.row::<V, FLEXION, true, false, ANY>(flexion, i, span, &mut sums),
+                            (false, _) => self.row::<V, FLEXION, false, false, ANY>(flexion, i, span, &mut sums),
+                        }
+                        continue;
+                    }
+                    match (i + 1 < rows, whole, self.stage.duty(i)) {
                         (true, true, LEAN) => self.row::<V, FLEXION, true, true, LEAN>(flexion, i, span, &mut sums),
                         (true, true, PUSHED) => self.row::<V, FLEXION, true, true, PUSHED>(flexion, i, span, &mut sums),
                         (true, true, _) => self.row::<V, FLEXION, true, true, ANY>(flexion, i, span, &mut sums),
