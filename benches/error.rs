@@ -122,7 +122,7 @@ fn step_of(halvings: u32) -> (f64, Vec<String>) {
 fn truth(case: &Case, knows_rk4: bool) -> (Trace, [f64; 2], &'static str) {
     let one_step = subject::model(&case.with(&[])).unwrap();
     let scene = &one_step.scene;
-    let fastest_per_s = one_step.omega_bound_per_s.max(scene.damping_n_s_per_m / scene.sheet.point_mass_kg);
+    let fastest_per_s = one_step.omega_bound_per_s.max(scene.damping_n_s_per_m / scene.sheet().unwrap().point_mass_kg);
     // Even, for the coarser extrapolation.
     let substeps = 2 * (64.0 * fastest_per_s / 1000.0).ceil().max(32.0) as u32;
     let trace = |integrator: &str, substeps: u32| {

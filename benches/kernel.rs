@@ -54,13 +54,13 @@ fn tissue(settings: &[String], side: usize) -> Box<dyn Tissue> {
     let size = set("sheet.points", format!("[{side}, {side}]"));
     let settings: Vec<String> = settings.iter().cloned().chain([size, set("stepping.substeps", 1)]).collect();
     let model = subject::model(&settings).unwrap();
-    let spacing_m = model.scene.sheet.spacing_m;
+    let spacing_m = model.scene.sheet().unwrap().spacing_m;
     let mut tissue = at_rest(&model);
     let pushes = [(1.0, 0.5 / spacing_m), (0.01, 4.0 / (spacing_m * side as f64))];
     for (tool, (strength, falloff_per_m)) in pushes.into_iter().enumerate() {
         let push = Poke {
             point: None,
-            centre_m: model.shape().rest_m(model.scene.sheet.point([side / 2; 2])),
+            centre_m: model.shape().rest_m(model.scene.sheet().unwrap().point([side / 2; 2])),
             force_n: strength * DVec3::new(0.03, 0.0, -0.1),
             falloff_per_m,
             falloff_offset: 0.0,

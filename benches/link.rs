@@ -173,12 +173,12 @@ fn stiffness(report: &mut Report) {
         let base = Scene::parse(name, text, &[], &Limits::default()).unwrap();
         let spacings = if quick() { &[0.01, 0.005, 0.0025][..] } else { &[0.01, 0.005, 0.0025, 0.00125] };
         for &spacing_m in spacings {
-            let share = (spacing_m / base.sheet.spacing_m).powi(2);
+            let share = (spacing_m / base.sheet().unwrap().spacing_m).powi(2);
             let points = (0.08 / spacing_m).round() as usize + 1;
             let mut scene = base.clone();
-            scene.sheet.points = [points; 2];
-            scene.sheet.spacing_m = spacing_m;
-            scene.sheet.point_mass_kg *= share;
+            scene.sheet_mut().unwrap().points = [points; 2];
+            scene.sheet_mut().unwrap().spacing_m = spacing_m;
+            scene.sheet_mut().unwrap().point_mass_kg *= share;
             scene.virtual_stiffness_n_per_m *= share;
             scene.damping_n_s_per_m *= share;
             let model = Model::compile(&scene, &Limits::default()).unwrap();

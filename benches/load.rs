@@ -134,7 +134,7 @@ fn kernel_alone_s(count: usize, rounds: u64) -> f64 {
                 point: None,
                 centre_m: scene.shape().extent().middle_m() + 0.25 * DVec3::new(turn.cos(), turn.sin(), 0.0),
                 force_n: DVec3::new(0.0, 0.0, -0.05),
-                falloff_per_m: 4.0 / scene.sheet.spacing_m,
+                falloff_per_m: 4.0 / scene.sheet().unwrap().spacing_m,
                 falloff_offset: 0.0,
             });
             let command = Order {

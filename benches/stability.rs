@@ -73,7 +73,7 @@ impl Tissue {
     /// The failure after a small kick, if there is one.
     fn after_kick(self, step_s: f64) -> Option<&'static str> {
         let model = self.model(step_s).unwrap();
-        let sheet = &model.scene.sheet;
+        let sheet = model.scene.sheet().unwrap();
         let small_m = 1e-9 * sheet.spacing_m;
         let push = Poke {
             point: None,
@@ -120,7 +120,7 @@ impl Tissue {
     /// the session.
     fn pushed(self, step_s: f64, force_n: f64) -> Option<(f64, u64)> {
         let model = self.model(step_s).unwrap();
-        let sheet = &model.scene.sheet;
+        let sheet = model.scene.sheet().unwrap();
         let mut session = Session::new(&model);
         let profile = LoadProfile {
             centre: CentreProfile::Hops(vec![(0, model.shape().rest_m(sheet.point([4, 4])))]),
@@ -162,7 +162,7 @@ fn largest_s(about_s: f64, holds: impl Fn(f64) -> bool) -> Option<f64> {
 /// stiffness by the power method. At rest a spring resists only along itself, so everything is in the plane.
 fn fastest_per_s(model: &Model) -> f64 {
     let scene = &model.scene;
-    let [nx, ny] = scene.sheet.points;
+    let [nx, ny] = scene.sheet().unwrap().points;
     let (k, shear) = (scene.springs.stiffness_n_per_m, scene.springs.shear_stiffness_n_per_m);
     let springs = [((0, 1), k), ((1, 0), k), ((1, 1), shear), ((1, -1), shear)];
     let stiffness_of = |u: &[DVec2]| {
@@ -191,7 +191,7 @@ fn fastest_per_s(model: &Model) -> f64 {
         u = stiffness_of(&u);
         eigenvalue = length(&u);
     }
-    (eigenvalue / scene.sheet.point_mass_kg).sqrt()
+    (eigenvalue / scene.sheet().unwrap().point_mass_kg).sqrt()
 }
 
 /// dt·ω at the limit by the textbook, for the schemes that it covers.
@@ -221,7 +221,7 @@ struct Limit {
 impl Limit {
     fn find(tissue: Tissue) -> Self {
         let model = tissue.model(1e-3).unwrap();
-        let mass_kg = model.scene.sheet.point_mass_kg;
+        let mass_kg = model.scene.sheet().unwrap().point_mass_kg;
         let omega_per_s = fastest_per_s(&model);
         let observed_s = tissue.observed_s(omega_per_s);
         Limit {

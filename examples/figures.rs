@@ -58,7 +58,7 @@ fn depth(sets: &[String]) -> Vec<(f64, f64)> {
     let script = script("vertical-60", &model);
     let mut session = Session::new(&model);
     run::play(&mut session, &script);
-    let centre = model.scene.sheet.point([15, 15]);
+    let centre = model.scene.sheet().unwrap().point([15, 15]);
     let mut course = Vec::new();
     for _ in 0..script.steps {
         session.advance(&mut Vec::new(), |session| {

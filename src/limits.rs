@@ -19,6 +19,8 @@ pub struct Limits {
     pub file_bytes: u64,
     /// Bytes of a trace file.
     pub trace_bytes: u64,
+    /// Bytes of a file with a mesh.
+    pub mesh_bytes: u64,
     /// Tools of a session: their numbers are below this.
     pub tools: u32,
     /// Commands that wait for their step, per tool.
@@ -109,6 +111,7 @@ impl Default for Limits {
             reach_in_sheets: 10.0,
             file_bytes: 16 << 20,
             trace_bytes: 64 << 20,
+            mesh_bytes: 64 << 20,
             tools: 64,
             queued_commands_per_tool: 4096,
             queued_samples: 64,

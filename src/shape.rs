@@ -30,12 +30,15 @@ impl PointId {
 pub enum PointName {
     /// Point [i, j] of a sheet: column i along x, row j along y.
     Point([usize; 2]),
+    /// A vertex of a mesh, numbered from 0 as in its file.
+    Vertex(u32),
 }
 
 impl fmt::Display for PointName {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             PointName::Point([i, j]) => write!(f, "[{i}, {j}]"),
+            PointName::Vertex(vertex) => write!(f, "vertex {vertex}"),
         }
     }
 }
@@ -93,10 +96,17 @@ pub trait RestShape: fmt::Debug + Send + Sync {
     fn neighbours(&self, point: PointId) -> Vec<PointId>;
     /// The point that rests nearest to a place.
     fn nearest(&self, place_m: DVec3) -> PointId;
+    /// The points that rest within a distance of a place, ascending; a sheet also gives some beyond it.
+    fn around(&self, place_m: DVec3, radius_m: f64) -> Vec<PointId>;
     /// The box around all points.
     fn extent(&self) -> Extent;
     /// The usual distance between neighbours, m.
     fn edge_m(&self) -> f64;
+
+    /// How many numbers give a place on it: 3, or 2 if all of it rests in the plane z = 0.
+    fn dimensions(&self) -> usize {
+        3
+    }
 
     /// Its longest side, or the distance between neighbours if it has a single point, m.
     fn longest_side_m(&self) -> f64 {

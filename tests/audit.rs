@@ -132,7 +132,7 @@ fn grasping(step: u64) -> Vec<(usize, Action)> {
     vec![(
         1,
         Action::Grasp {
-            point: scene_with(SMALL, &[]).sheet.point([2, 2]),
+            point: scene_with(SMALL, &[]).sheet().unwrap().point([2, 2]),
             displacement_m: DVec3::new(0.0, 0.5 * z, z),
         },
     )]

@@ -80,12 +80,16 @@ fn every_width_of_vectors_gives_the_same_bits() {
         let mut tissue = sheet::at_rest(&common::model(&scene));
         // Strong enough to strain springs beyond the polynomial's range, and for rounding to matter.
         tissue.push(0, Some(common::push_on(&scene, [0, 0], [0.7, 0.2, -0.9])));
-        let middle = [scene.sheet.points[0] / 2, scene.sheet.points[1] / 2];
+        let middle = [scene.sheet().unwrap().points[0] / 2, scene.sheet().unwrap().points[1] / 2];
         tissue.push(1, Some(common::push_on(&scene, middle, [-0.1, 0.5, 1.5])));
         for _ in 0..40 {
             tissue.step().unwrap();
         }
-        tissue.grasp(1, tissue.model().scene.sheet.point(middle), Grasp::Target(glam::DVec3::new(0.01, 0.0, 0.03)));
+        tissue.grasp(
+            1,
+            tissue.model().scene.sheet().unwrap().point(middle),
+            Grasp::Target(glam::DVec3::new(0.01, 0.0, 0.03)),
+        );
         // Past the first survey of the guard.
         for _ in 0..260 {
             tissue.step().unwrap();

@@ -13,7 +13,7 @@ use palpate::budget::Budget;
 use palpate::limits::Limits;
 use palpate::pace::Pacer;
 use palpate::refusal::Reason;
-use palpate::scene::{Fixed, Integrator, Lanes, Named, PointSet, Precision, Scene, Sheet, Springs, Stepping};
+use palpate::scene::{Body, Fixed, Integrator, Lanes, Named, PointSet, Precision, Scene, Sheet, Springs, Stepping};
 use palpate::sheet;
 use palpate::sheet::choice::NEVER;
 
@@ -42,7 +42,7 @@ fn legal(seed: u64, limits: &Limits) -> Scene {
     let shear_stiffness_n_per_m = if random.bool() { stiffness_n_per_m } else { or_zero(&mut random) };
     Scene {
         name: format!("legal {seed}"),
-        sheet: Sheet { points, spacing_m: any(&mut random), point_mass_kg: any(&mut random), fixed },
+        body: Body::Sheet(Sheet { points, spacing_m: any(&mut random), point_mass_kg: any(&mut random), fixed }),
         springs: Springs { stiffness_n_per_m, shear_stiffness_n_per_m, flexion: random.bool() },
         virtual_stiffness_n_per_m: or_zero(&mut random),
         damping_n_s_per_m: or_zero(&mut random),

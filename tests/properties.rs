@@ -141,5 +141,5 @@ proptest! {
 
 #[test]
 fn the_small_scene_is_a_scene() {
-    assert_eq!(scene(SMALL).sheet.points, [7, 5]);
+    assert_eq!(scene(SMALL).sheet().unwrap().points, [7, 5]);
 }

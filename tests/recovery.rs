@@ -69,7 +69,7 @@ fn stiff() -> Arc<Model> {
 }
 
 fn push(model: &Model, point: [usize; 2], z_n: f64) -> Action {
-    let sheet = &model.scene.sheet;
+    let sheet = model.scene.sheet().unwrap();
     Action::Push(Poke {
         point: None,
         centre_m: model.shape().rest_m(sheet.point(point)),

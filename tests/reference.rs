@@ -4,13 +4,15 @@
 
 mod common;
 
-use common::{playing, scene_with, script};
+use common::{playing, script};
 use glam::DVec3;
-use palpate::scene::{Integrator, Named};
+use palpate::limits::Limits;
+use palpate::scene::{Files, Integrator, Named, Scene};
 use palpate::session::Session;
+use palpate::shape::PointName;
 use serde_json::Value;
 
-const SCENES: [&str; 4] = ["poke31", "ringdown9x14", "overdamped19", "tool15"];
+const SCENES: [&str; 5] = ["poke31", "ringdown9x14", "overdamped19", "tool15", "icosphere"];
 
 fn load(name: &str) -> Value {
     let path = format!("{}/tests/reference/{name}.json", env!("CARGO_MANIFEST_DIR"));
@@ -25,22 +27,45 @@ fn vector(value: &Value) -> DVec3 {
     DVec3::new(number(&value[0]), number(&value[1]), number(&value[2]))
 }
 
-fn point(value: &Value) -> [usize; 2] {
-    [value[0].as_u64().unwrap() as usize, value[1].as_u64().unwrap() as usize]
+/// [i, j] on a sheet, the number of a vertex on a mesh.
+fn point(value: &Value) -> PointName {
+    let whole = |value: &Value| value.as_u64().unwrap() as usize;
+    if value.is_array() {
+        PointName::Point([whole(&value[0]), whole(&value[1])])
+    } else {
+        PointName::Vertex(u32::try_from(whole(value)).unwrap())
+    }
 }
 
 /// The scene of a reference as a scene file.
 fn scene_text(scene: &Value) -> String {
+    let mass = &scene["mass"];
+    let body = if scene.get("mesh").is_some() {
+        format!("[mesh]\nfile = {}\nunit = \"m\"\npoint_mass_kg = {mass}\n", scene["mesh"])
+    } else {
+        let [nx, ny, spacing] = ["nx", "ny", "spacing"].map(|key| &scene[key]);
+        format!("[sheet]\npoints = [{nx}, {ny}]\nspacing_m = {spacing}\npoint_mass_kg = {mass}\n")
+    };
+    let flexion = scene.get("flexion").and_then(Value::as_bool).unwrap_or(false);
     format!(
-        "[sheet]\npoints = [{}, {}]\nspacing_m = {}\npoint_mass_kg = {}\n[springs]\nstiffness_n_per_m = {}\n\
-         flexion = {}\n[virtual_springs]\nstiffness_n_per_m = {}\n[damping]\ncoefficient_n_s_per_m = {}\n",
-        scene["nx"], scene["ny"], scene["spacing"], scene["mass"], scene["k"], scene["flexion"], scene["K"], scene["C"]
+        "{body}[springs]\nstiffness_n_per_m = {}\nflexion = {flexion}\n[virtual_springs]\nstiffness_n_per_m = {}\n\
+         [damping]\ncoefficient_n_s_per_m = {}\n",
+        scene["k"], scene["K"], scene["C"]
     )
+}
+
+/// The scene of a reference.
+fn scene_of(scene: &Value, assignments: &[&str]) -> Scene {
+    let assignments: Vec<String> = assignments.iter().map(|text| (*text).to_owned()).collect();
+    let folder = format!("{}/tests/reference", env!("CARGO_MANIFEST_DIR"));
+    let files = Files::In(std::path::Path::new(&folder));
+    Scene::parse_with("reference", &scene_text(scene), &assignments, files, &Limits::default()).unwrap()
 }
 
 /// Its forces and tool as a script.
 fn script_text(scene: &Value) -> String {
     let times = scene["times"].as_array().unwrap();
+    let key = if scene.get("mesh").is_some() { "vertex" } else { "point" };
     let mut text = format!("duration_s = {}\nsample_every_s = {}\n", scene["t_end"], times[1]);
     for force in scene["forces"].as_array().unwrap() {
         let profile = match force["profile"]["type"].as_str().unwrap() {
@@ -52,7 +77,7 @@ fn script_text(scene: &Value) -> String {
             other => panic!("{other}"),
         };
         text += &format!(
-            "[[force]]\npoint = {}\nforce_n = {}\nfalloff_per_m = {}\nfalloff_offset = {}\nprofile = {profile}\n",
+            "[[force]]\n{key} = {}\nforce_n = {}\nfalloff_per_m = {}\nfalloff_offset = {}\nprofile = {profile}\n",
             force["point"], force["vector"], force["c"], force["c_prime"]
         );
     }
@@ -63,7 +88,7 @@ fn script_text(scene: &Value) -> String {
             .iter()
             .map(|m| format!("{{ from_s = {}, to_s = {}, by_m = {} }}", m["t0"], m["t1"], m["by"]))
             .collect();
-        text += &format!("[[tool]]\npoint = {}\nmoves = [{}]\n", tool["point"], moves.join(", "));
+        text += &format!("[[tool]]\n{key} = {}\nmoves = [{}]\n", tool["point"], moves.join(", "));
     }
     text
 }
@@ -80,7 +105,7 @@ struct Errors {
 /// Runs a reference scene with `assignments` and compares every value in the reference.
 fn errors(name: &str, assignments: &[&str]) -> Errors {
     let reference = load(name);
-    let scene = scene_with(&scene_text(&reference["scene"]), assignments);
+    let scene = scene_of(&reference["scene"], assignments);
     let script = script(&script_text(&reference["scene"]), &scene);
     let mut session = playing(&scene, &script);
     let mut frames = reference["frames"].as_array().unwrap().iter();
@@ -93,7 +118,7 @@ fn errors(name: &str, assignments: &[&str]) -> Errors {
         }
         let frame = frames.next().unwrap();
         assert!((session.time_s() - number(&frame["t"])).abs() < 1e-9);
-        let at = |place: [usize; 2]| session.tissue().point(session.model().scene.sheet.point(place));
+        let at = |name| session.tissue().point(session.model().shape().find("", name).unwrap());
         for (index, place) in samples.iter().enumerate() {
             let (u, v) = (vector(&frame["u"][index]), vector(&frame["v"][index]));
             error.displacement = error.displacement.max((at(*place).displacement_m - u).length());
@@ -194,7 +219,7 @@ fn lagged_is_first_order_within_its_stable_range() {
 fn lagged_explodes_where_its_damping_is_too_strong_and_the_guard_mends_it() {
     let sets = ["stepping.integrator=lagged", "stepping.substeps=1"];
     let reference = load("overdamped19");
-    let scene = scene_with(&scene_text(&reference["scene"]), &sets);
+    let scene = scene_of(&reference["scene"], &sets);
     let script = script(&script_text(&reference["scene"]), &scene);
     let mut session = playing(&scene, &script);
     for _ in 0..script.steps {

@@ -107,7 +107,7 @@ fn a_pose_is_reached_at_the_end_of_its_step_and_the_tool_leaves_at_the_end() {
     assert_eq!(place(170), place(149));
     assert_eq!((place(179), place(180)), (Some(None), None));
     // The control points are those under the poses.
-    assert_eq!(script.sample_points, [[12, 16], [12, 20]].map(|point| scene.sheet.point(point)));
+    assert_eq!(script.sample_points, [[12, 16], [12, 20]].map(|point| scene.sheet().unwrap().point(point)));
 }
 
 #[test]
@@ -133,9 +133,9 @@ fn a_force_in_all_is_that_force_wherever_the_points_are() {
 /// Liver with points twice as close: mass, virtual springs and damping are those of an area.
 fn finer(scene: &Scene) -> Scene {
     let mut finer = scene.clone();
-    finer.sheet.points = scene.sheet.points.map(|points| 2 * points - 1);
-    finer.sheet.spacing_m /= 2.0;
-    finer.sheet.point_mass_kg /= 4.0;
+    finer.sheet_mut().unwrap().points = scene.sheet().unwrap().points.map(|points| 2 * points - 1);
+    finer.sheet_mut().unwrap().spacing_m /= 2.0;
+    finer.sheet_mut().unwrap().point_mass_kg /= 4.0;
     finer.virtual_stiffness_n_per_m /= 4.0;
     finer.damping_n_s_per_m /= 4.0;
     finer
@@ -231,7 +231,7 @@ fn a_force_that_moves_between_points_feels_smooth_and_one_on_a_point_feels_that_
     use palpate::scene::profile::Poke;
     let scene = built_in("liver", &[]);
     let model = model(&scene);
-    let spacing_m = scene.sheet.spacing_m;
+    let spacing_m = scene.sheet().unwrap().spacing_m;
     // Slowly over three points, after it has settled; the ripple relative to the mean force.
     let ripple = |by_point: bool| {
         let mut session = Session::new(&model);
@@ -280,11 +280,13 @@ fn the_surface_under_a_tip_is_deeper_than_the_mean_over_it() {
         contact = Some(told(&mut session, step + 1, action));
     }
     let contact = contact.unwrap();
-    let middle = session.tissue().point(scene.sheet.point([15, 15])).displacement_m;
+    let middle = session.tissue().point(scene.sheet().unwrap().point([15, 15])).displacement_m;
     assert!((contact.surface_displacement_m - middle).length() < 1e-4, "{contact:?}, {middle}");
     assert!(contact.surface_displacement_m.z < 1.03 * contact.displacement_m.z, "{contact:?}");
     // Between points it is bilinear, and beyond the rim that of the rim.
-    let at = |i: f64, j: f64| session.tissue().surface_displacement_m(scene.sheet.spacing_m * DVec3::new(i, j, 0.0));
+    let at = |i: f64, j: f64| {
+        session.tissue().surface_displacement_m(scene.sheet().unwrap().spacing_m * DVec3::new(i, j, 0.0))
+    };
     assert!((at(14.5, 15.0) - 0.5 * (at(14.0, 15.0) + at(15.0, 15.0))).length() < 1e-12);
     assert_eq!(at(-3.0, 15.0), at(0.0, 15.0));
 }

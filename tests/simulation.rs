@@ -144,13 +144,13 @@ fn course(seed: u64) -> Course {
                 Said::Release(lease) => intake.release(lease),
                 Said::Press(tool, lease, sequence, deep_mm) => {
                     submitted += 1;
-                    let point = scene.sheet.point([tool as usize + 1, 2]);
+                    let point = scene.sheet().unwrap().point([tool as usize + 1, 2]);
                     let depth_m = DVec3::new(0.0, 0.0, -1e-3 * deep_mm as f64);
                     // Places supersede each other, forces all act: each tool on a point of its own, and nowhere else.
                     let action = if deep_mm % 2 == 0 {
                         Action::Grasp { point, displacement_m: depth_m }
                     } else {
-                        let falloff_per_m = 100.0 / scene.sheet.spacing_m;
+                        let falloff_per_m = 100.0 / scene.sheet().unwrap().spacing_m;
                         let centre_m = scene.shape().rest_m(point);
                         Action::Push(Poke {
                             point: None,

@@ -63,15 +63,15 @@ fn any_act() -> impl Strategy<Value = Act> {
 
 fn act(tissue: &mut dyn Tissue, Act { tool, place, towards, manner, .. }: Act) {
     let scene = tissue.model().scene.clone();
-    let [nx, ny] = scene.sheet.points;
+    let [nx, ny] = scene.sheet().unwrap().points;
     let point = [(place[0] * nx as f64) as usize, (place[1] * ny as f64) as usize];
-    let (spacing_m, towards) = (scene.sheet.spacing_m, DVec3::from_array(towards));
-    if scene.shape().is_fixed(scene.sheet.point(point)) || manner == 0 {
+    let (spacing_m, towards) = (scene.sheet().unwrap().spacing_m, DVec3::from_array(towards));
+    if scene.shape().is_fixed(scene.sheet().unwrap().point(point)) || manner == 0 {
         return tissue.release(tool);
     }
     if manner < 3 {
         // As far as through its neighbours and out: springs pressed to zero length and inverted.
-        let index = tissue.model().scene.sheet.point(point);
+        let index = tissue.model().scene.sheet().unwrap().point(point);
         return tissue.grasp(tool, index, Grasp::Target(2.5 * spacing_m * towards));
     }
     // A force that moves a point by up to some spacings.
@@ -80,7 +80,7 @@ fn act(tissue: &mut dyn Tissue, Act { tool, place, towards, manner, .. }: Act) {
         tool,
         Some(Push::Constant(Poke {
             point: None,
-            centre_m: scene.shape().rest_m(scene.sheet.point(point)),
+            centre_m: scene.shape().rest_m(scene.sheet().unwrap().point(point)),
             force_n: 3.0 * stiffness * spacing_m * towards,
             falloff_per_m: 10_f64.powf(2.0 * place[0] - 1.0) / spacing_m,
             falloff_offset: 0.0,
@@ -193,10 +193,12 @@ fn adversarial_commands_leave_the_tissue_finite() {
             let corner = [[0, 0], [6, 4], [0, 4], [6, 0]][(step % 4) as usize];
             let place = DVec3::new(sign, -sign, sign) * 0.3;
             match worst {
-                0 => tissue.grasp(0, model.scene.sheet.point(corner), Grasp::Target(place)),
+                0 => tissue.grasp(0, model.scene.sheet().unwrap().point(corner), Grasp::Target(place)),
                 1 => tissue.push(0, Some(common::push_on(&scene, corner, [1e4, 1e4 * sign, -1e4]))),
                 2 => tissue.push(0, Some(common::push_on(&scene, [3, 2], [50.0 * sign, 20.0, 100.0 * sign]))),
-                _ => tissue.grasp((step % 3) as usize, model.scene.sheet.point([3, 2]), Grasp::Target(place)),
+                _ => {
+                    tissue.grasp((step % 3) as usize, model.scene.sheet().unwrap().point([3, 2]), Grasp::Target(place))
+                }
             }
             if tissue.step().is_err() {
                 break;
@@ -233,7 +235,7 @@ fn ten_million_steps_end_where_they_should() {
         for _ in 0..1_000_000 {
             tissue.step().unwrap();
         }
-        let now = tissue.point(tissue.model().scene.sheet.point([3, 2])).displacement_m;
+        let now = tissue.point(tissue.model().scene.sheet().unwrap().point([3, 2])).displacement_m;
         eprintln!("{} million steps: {now}", million + 1);
         assert!(all_finite(&*tissue));
         let settled = *settled.get_or_insert(now);
@@ -243,5 +245,5 @@ fn ten_million_steps_end_where_they_should() {
     for _ in 0..1_000_000 {
         tissue.step().unwrap();
     }
-    assert!(tissue.largest_displacement_m() < 1e-9 * scene.sheet.spacing_m);
+    assert!(tissue.largest_displacement_m() < 1e-9 * scene.sheet().unwrap().spacing_m);
 }

@@ -60,7 +60,7 @@ const COMPILED_POINTS: usize = 64;
 
 /// Compiles a small scene and steps it.
 fn step(scene: &Scene) -> bool {
-    if scene.sheet.points[0] * scene.sheet.points[1] > COMPILED_POINTS {
+    if scene.sheet().unwrap().points[0] * scene.sheet().unwrap().points[1] > COMPILED_POINTS {
         return true;
     }
     let small = Limits { substeps: 20, ..limits() };
@@ -87,7 +87,7 @@ fn model() -> &'static Arc<Model> {
     MODEL.get_or_init(|| {
         let text = PAPER.replace("[31, 31]", "[5, 5]");
         let scene = Scene::parse("fuzz", &text, &[], &limits()).expect("the scene is sound");
-        assert_eq!(scene.sheet.points, [5, 5], "the paper's scene has other points");
+        assert_eq!(scene.sheet().unwrap().points, [5, 5], "the paper's scene has other points");
         Model::compile(&scene, &limits()).expect("the scene is sound")
     })
 }

@@ -64,6 +64,10 @@ pub fn check_free(field: &str, shape: &dyn RestShape, point: PointId) -> Result<
 /// # Errors
 /// Refuses a value that is not finite or out of range; `field` is the name that the refusal gives.
 pub fn check_tip(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
+    if shape.dimensions() > 2 {
+        let message = "can't touch a mesh yet: push with a force, or grasp a vertex";
+        return Err(Refusal::new(Reason::NotAvailable, field, message));
+    }
     let longest_m = shape.longest_side_m();
     let range = format!("above 0 and at most {longest_m}, the sheet's longer side");
     number(&format!("{field}.radius_m"), tip.radius_m, &range, |v| v > 0.0 && v <= longest_m)?;

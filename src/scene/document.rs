@@ -9,6 +9,7 @@ use glam::{DVec2, DVec3};
 use toml::de::{DeTable, DeValue};
 
 use crate::refusal::{Reason, Refusal, Result, did_you_mean, excerpt, finite, nearest};
+use crate::shape::PointName;
 
 /// A parsed text.
 #[derive(Debug)]
@@ -54,6 +55,17 @@ impl Value {
 /// # Errors
 /// Refuses a path that can't be read, a longer text, and text that is not UTF-8.
 pub fn read_text(path: &Path, limit: u64) -> Result<String> {
+    String::from_utf8(read_bytes(path, limit)?).map_err(|e| Refusal {
+        place: Some(path.display().to_string()),
+        ..Refusal::new(Reason::Unreadable, "", format!("is not UTF-8 text: {e}"))
+    })
+}
+
+/// Reads at most `limit` bytes, also from a pipe or device.
+///
+/// # Errors
+/// Refuses a path that can't be read, and a longer file.
+pub fn read_bytes(path: &Path, limit: u64) -> Result<Vec<u8>> {
     let place = path.display().to_string();
     let refuse = |reason, message: String| Refusal { place: Some(place.clone()), ..Refusal::new(reason, "", message) };
     let file = std::fs::File::open(path).map_err(|e| refuse(Reason::Unreadable, format!("can't be opened: {e}")))?;
@@ -68,7 +80,7 @@ pub fn read_text(path: &Path, limit: u64) -> Result<String> {
     if bytes.len() as u64 > limit {
         return Err(too_large());
     }
-    String::from_utf8(bytes).map_err(|e| refuse(Reason::Unreadable, format!("is not UTF-8 text: {e}")))
+    Ok(bytes)
 }
 
 impl Document {
@@ -437,6 +449,20 @@ impl<'a> Item<'a> {
             usize::try_from(item.whole()?).map_err(|_| item.refuse(Reason::OutOfRange, "is too large"))
         };
         Ok([index(i)?, index(j)?])
+    }
+
+    /// The name of a point of a tissue, of whichever kind.
+    ///
+    /// # Errors
+    /// Refuses any other value.
+    pub fn point_name(&self) -> Result<PointName> {
+        match self.node.value {
+            Value::List(_) => Ok(PointName::Point(self.point()?)),
+            _ => match self.whole().ok().and_then(|whole| u32::try_from(whole).ok()) {
+                Some(vertex) => Ok(PointName::Vertex(vertex)),
+                None => Err(self.wrong("[i, j] on a sheet, the number of a vertex on a mesh")),
+            },
+        }
     }
 
     /// Reads this as a table.

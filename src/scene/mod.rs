@@ -6,6 +6,7 @@ pub mod check;
 pub mod collection;
 pub mod document;
 pub mod kind;
+mod mesh;
 pub mod profile;
 pub mod reader;
 pub mod record;
@@ -13,13 +14,15 @@ pub mod script;
 mod sheet;
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, did_you_mean, excerpt, not_negative, number};
-use crate::shape::RestShape;
+use crate::shape::{PointId, RestShape};
 use check::physical;
-use document::{Document, Item};
+use document::{Document, Fields, Item};
 use kind::Kind;
+pub use mesh::{Files, Mesh, MeshShape, Stiffest};
 pub use sheet::{Fixed, LEAST_WIDTH, PointSet, Sheet};
 
 /// The scene of the paper's figures, built in.
@@ -33,13 +36,13 @@ pub const BUILT_IN: [(&str, &str); 4] = [
     ("stomach", include_str!("../../scenes/stomach.toml")),
 ];
 
-/// A tissue sheet and how it is stepped. The fields are those of a scene file; SI units.
+/// A tissue and how it is stepped. The fields are those of a scene file; SI units.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Scene {
     /// Any name, for people.
     pub name: String,
-    /// The grid of mass points.
-    pub sheet: Sheet,
+    /// The mass points, and how they lie together.
+    pub body: Body,
     /// Springs between neighbours.
     pub springs: Springs,
     /// K″ of the springs of zero rest length that pull each point to its rest position, N/m (the paper's eq. 4).
@@ -53,6 +56,32 @@ pub struct Scene {
     pub sleep_tolerance: Option<f64>,
     /// What viewers see.
     pub appearance: Appearance,
+}
+
+/// What a tissue is made of.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Body {
+    /// A rectangular grid.
+    Sheet(Sheet),
+    /// The surface of a triangle mesh.
+    Mesh(Mesh),
+}
+
+impl Body {
+    /// A part that moves like the whole where vibrations are fastest, of at most `side`² points, not all of them fixed; and
+    /// three of its points, the first of which is free: to be pushed.
+    pub fn part(&self, side: usize) -> (Body, [PointId; 3]) {
+        match self {
+            Body::Sheet(sheet) => {
+                let (part, points) = sheet.part(side);
+                (Body::Sheet(part), points)
+            }
+            Body::Mesh(mesh) => {
+                let (part, points) = mesh.part(side * side);
+                (Body::Mesh(part), points)
+            }
+        }
+    }
 }
 
 /// Smallest side of a texture that is made, pixels.
@@ -255,8 +284,9 @@ impl Scene {
     /// Refuses a file that can't be read, and as [`Scene::parse`] does.
     pub fn load(path: &Path, assignments: &[String], limits: &Limits) -> Result<Self> {
         let text = document::read_text(path, limits.file_bytes)?;
-        let scene = Self::parse(&path.display().to_string(), &text, assignments, limits)?;
-        Ok(scene.found_in(path.parent().unwrap_or(Path::new(""))))
+        let folder = path.parent().unwrap_or(Path::new(""));
+        let scene = Self::parse_with(&path.display().to_string(), &text, assignments, Files::In(folder), limits)?;
+        Ok(scene.found_in(folder))
     }
 
     /// The same, with the paths of other files from `folder`, where its own is.
@@ -269,23 +299,32 @@ impl Scene {
     /// # Errors
     /// Refuses a text or an assignment that is not a valid scene.
     pub fn parse(name: &str, text: &str, assignments: &[String], limits: &Limits) -> Result<Self> {
+        Self::parse_with(name, text, assignments, Files::None, limits)
+    }
+
+    /// The same; it may name `files`.
+    ///
+    /// # Errors
+    /// As for [`Scene::parse`]; refuses a file that can't be read.
+    pub fn parse_with(
+        name: &str,
+        text: &str,
+        assignments: &[String],
+        files: Files<'_>,
+        limits: &Limits,
+    ) -> Result<Self> {
         let mut document = Document::parse(name, text)?;
         Kind::Scene.check(&document)?;
         for assignment in assignments {
             document.set(assignment)?;
         }
         let scene = document.read(|fields| {
+            let name = fields.text("name")?.unwrap_or_else(|| "unnamed".to_owned());
+            let mut body = read_body(fields, files, limits)?;
             Ok(Scene {
-                name: fields.text("name")?.unwrap_or_else(|| "unnamed".to_owned()),
-                sheet: fields.required("sheet")?.table(Sheet::read)?,
-                springs: fields.required("springs")?.table(|fields| {
-                    let stiffness_n_per_m = fields.required_number("stiffness_n_per_m")?;
-                    Ok(Springs {
-                        stiffness_n_per_m,
-                        shear_stiffness_n_per_m: fields.number("shear_stiffness_n_per_m")?.unwrap_or(stiffness_n_per_m),
-                        flexion: fields.item("flexion").map_or(Ok(false), |item| item.flag())?,
-                    })
-                })?,
+                name,
+                springs: fields.required("springs")?.table(|fields| read_springs(fields, &mut body))?,
+                body,
                 virtual_stiffness_n_per_m: fields
                     .required("virtual_springs")?
                     .table(|fields| fields.required_number("stiffness_n_per_m"))?,
@@ -328,7 +367,42 @@ impl Scene {
 
     /// The rest shape of the tissue.
     pub fn shape(&self) -> &dyn RestShape {
-        &self.sheet
+        match &self.body {
+            Body::Sheet(sheet) => sheet,
+            Body::Mesh(mesh) => &*mesh.shape,
+        }
+    }
+
+    /// The grid, if the tissue is a sheet.
+    pub fn sheet(&self) -> Option<&Sheet> {
+        match &self.body {
+            Body::Sheet(sheet) => Some(sheet),
+            Body::Mesh(_) => None,
+        }
+    }
+
+    /// The same, to change it.
+    pub fn sheet_mut(&mut self) -> Option<&mut Sheet> {
+        match &mut self.body {
+            Body::Sheet(sheet) => Some(sheet),
+            Body::Mesh(_) => None,
+        }
+    }
+
+    /// The mass of each point, kg.
+    pub fn point_mass_kg(&self) -> f64 {
+        match &self.body {
+            Body::Sheet(sheet) => sheet.point_mass_kg,
+            Body::Mesh(mesh) => mesh.point_mass_kg,
+        }
+    }
+
+    /// The rest shape, for who keeps it without the scene.
+    pub fn shared_shape(&self) -> Arc<dyn RestShape> {
+        match &self.body {
+            Body::Sheet(sheet) => Arc::new(sheet.clone()),
+            Body::Mesh(mesh) => mesh.shape.clone(),
+        }
     }
 
     /// Everything that a scene promises, wherever it came from.
@@ -337,7 +411,10 @@ impl Scene {
     /// Refuses a value out of its range, and what is above the limits.
     pub fn check(&self, limits: &Limits) -> Result<()> {
         crate::refusal::label("name", &self.name)?;
-        self.sheet.check(limits)?;
+        match &self.body {
+            Body::Sheet(sheet) => sheet.check(limits)?,
+            Body::Mesh(mesh) => mesh.check(limits)?,
+        }
         let coefficients = [
             ("springs.stiffness_n_per_m", self.springs.stiffness_n_per_m),
             ("springs.shear_stiffness_n_per_m", self.springs.shear_stiffness_n_per_m),
@@ -361,6 +438,41 @@ impl Scene {
             number("sleep.tolerance", tolerance, "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
         }
         Ok(())
+    }
+}
+
+/// Reads the section `[sheet]` or `[mesh]`.
+fn read_body(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) -> Result<Body> {
+    match (fields.item("sheet"), fields.item("mesh")) {
+        (Some(_), Some(mesh)) => {
+            Err(mesh.refuse(Reason::WrongKind, "does not go with [sheet]: a tissue is one of them"))
+        }
+        (None, Some(mesh)) => Ok(Body::Mesh(mesh.table(|fields| Mesh::read(fields, files, limits))?)),
+        (_, None) => Ok(Body::Sheet(fields.required("sheet")?.table(Sheet::read)?)),
+    }
+}
+
+/// Reads the section `[springs]`. A mesh has springs along its edges; those of flexion may be a part as stiff.
+fn read_springs(fields: &mut Fields<'_>, body: &mut Body) -> Result<Springs> {
+    let stiffness_n_per_m = fields.required_number("stiffness_n_per_m")?;
+    let (shear, flexion) = (fields.item("shear_stiffness_n_per_m"), fields.item("flexion"));
+    match body {
+        Body::Sheet(_) => Ok(Springs {
+            stiffness_n_per_m,
+            shear_stiffness_n_per_m: shear.map_or(Ok(stiffness_n_per_m), |item| item.number())?,
+            flexion: flexion.map_or(Ok(false), |item| item.flag())?,
+        }),
+        Body::Mesh(mesh) => {
+            if let Some(shear) = shear {
+                return Err(shear.refuse(Reason::WrongKind, "is for sheets: the edges of a mesh resist shear as well"));
+            }
+            if let Some(item) = flexion {
+                let part = item.flag().map(|flag| if flag { 1.0 } else { 0.0 }).or_else(|_| item.number())?;
+                let part = number("springs.flexion", part, "from 0 to 10", |v| (0.0..=10.0).contains(&v))?;
+                *mesh = Mesh::new(mesh.point_mass_kg, part, mesh.shape.clone());
+            }
+            Ok(Springs { stiffness_n_per_m, shear_stiffness_n_per_m: stiffness_n_per_m, flexion: false })
+        }
     }
 }
 

@@ -2,7 +2,6 @@
 
 use std::collections::BTreeSet;
 use std::path::Path;
-use std::sync::Arc;
 
 use glam::{DVec2, DVec3};
 use palpate_touch::{Coupling, Tip};
@@ -17,7 +16,7 @@ use super::script::Script;
 use super::{Change, Scene};
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, did_you_mean, not_negative, number, positive};
-use crate::shape::{self, PointId, PointName};
+use crate::shape::{self, PointId};
 
 impl Script {
     /// Reads a script's file and binds it to `scene`.
@@ -130,7 +129,7 @@ impl Binding<'_> {
             changes,
             warnings: self.warnings,
             rate_hz: self.scene.stepping.rate_hz,
-            shape: Arc::new(self.scene.sheet.clone()),
+            shape: self.scene.shared_shape(),
         })
     }
 
@@ -149,8 +148,25 @@ impl Binding<'_> {
 
     /// A point of the tissue.
     fn point(&self, item: &Item<'_>) -> Result<PointId> {
-        let name = PointName::Point(item.point()?);
-        self.scene.shape().find("", name).map_err(|refusal| item.refuse(refusal.reason, refusal.message))
+        self.scene.shape().find("", item.point_name()?).map_err(|refusal| item.refuse(refusal.reason, refusal.message))
+    }
+
+    /// The point that a table names: `point` on a sheet, `vertex` on a mesh, or the one nearest to `at_m`.
+    fn point_of(&self, fields: &mut Fields<'_>) -> Result<PointId> {
+        if let Some(at) = fields.item("at_m") {
+            let at_m = self.place(&at)?;
+            self.scene.shape().check_place(&fields.path("at_m"), at_m)?;
+            return Ok(self.scene.shape().nearest(at_m));
+        }
+        match fields.item("vertex") {
+            Some(vertex) => self.point(&vertex),
+            None => self.point(&fields.required("point")?),
+        }
+    }
+
+    /// A place on the tissue: [x, y] on a sheet, [x, y, z] on a mesh, m.
+    fn place(&self, item: &Item<'_>) -> Result<DVec3> {
+        if self.scene.shape().dimensions() == 2 { Ok(item.place()?.extend(0.0)) } else { item.vector() }
     }
 
     /// Changes of the tissue. Each is checked with those before it.
@@ -246,13 +262,14 @@ impl Binding<'_> {
         fields: &mut Fields<'_>,
         control_points: &mut Vec<PointId>,
     ) -> Result<CentreProfile> {
-        let (point, hops, path) = (fields.item("point"), fields.item("hops"), fields.item("path"));
-        let one = "must have just one of `point`, `at_m`, `hops` and `path`";
+        let point = fields.item("point").or_else(|| fields.item("vertex"));
+        let (hops, path) = (fields.item("hops"), fields.item("path"));
+        let one = "must have just one of `point` (`vertex` on a mesh), `at_m`, `hops` and `path`";
         if let Some(at) = fields.item("at_m") {
             if point.is_some() || hops.is_some() || path.is_some() {
                 return Err(item.refuse(Reason::OutOfRange, one));
             }
-            let at_m = at.place()?.extend(0.0);
+            let at_m = self.place(&at)?;
             self.scene.shape().check_place(&fields.path("at_m"), at_m)?;
             control_points.push(self.scene.shape().nearest(at_m));
             return Ok(CentreProfile::Hops(vec![(0, at_m)]));
@@ -268,7 +285,7 @@ impl Binding<'_> {
                 for hop in hops.list()? {
                     entries.push(hop.table(|fields| {
                         let at = self.steps(&fields.path("at_s"), fields.required_number("at_s")?)?;
-                        let point = self.point(&fields.required("point")?)?;
+                        let point = self.point_of(fields)?;
                         control_points.push(point);
                         Ok((at, (point, self.scene.shape().rest_m(point))))
                     })?);
@@ -277,8 +294,8 @@ impl Binding<'_> {
                 Ok(CentreProfile::Points(entries))
             }
             (None, None, Some(path)) => path.table(|fields| {
-                let from_m = fields.required("from_m")?.place()?.extend(0.0);
-                let velocity_m_per_s = fields.required("velocity_m_per_s")?.place()?.extend(0.0);
+                let from_m = self.place(&fields.required("from_m")?)?;
+                let velocity_m_per_s = self.place(&fields.required("velocity_m_per_s")?)?;
                 let speed = velocity_m_per_s.abs().max_element();
                 number(&fields.path("velocity_m_per_s"), speed, "at most 1e6", |v| v <= 1e6)?;
                 self.scene.shape().check_place(&fields.path("from_m"), from_m)?;
@@ -394,7 +411,7 @@ impl Binding<'_> {
             if let Some(list) = fields.item("poses") {
                 return self.poses(fields, &list).map(Tool::Poses);
             }
-            let point = self.point(&fields.required("point")?)?;
+            let point = self.point_of(fields)?;
             check_free(&fields.path("point"), self.scene.shape(), point)?;
             let mut moves = Vec::new();
             let list = fields.required("moves")?;
@@ -439,7 +456,7 @@ impl Binding<'_> {
                 check_reach(&field, shape, far_m, self.limits)?;
                 let extent = shape.extent();
                 let beside_m = (extent.least_m - place_m).max(place_m - extent.most_m).max(DVec3::ZERO).truncate();
-                if beside_m != DVec2::ZERO {
+                if shape.dimensions() == 2 && beside_m != DVec2::ZERO {
                     let off_m = beside_m.length();
                     self.warnings.push(format!(
                         "{field}: is {off_m} m beside the tissue: a tip that touches goes on with the edge, and drags it along"

@@ -132,6 +132,22 @@ impl Sheet {
         self.spacing_m * DVec2::new((self.points[0] - 1) as f64, (self.points[1] - 1) as f64)
     }
 
+    /// A corner of at most `side` points along each side; and three of its points: one that is free, its middle, and one at
+    /// a corner, where springs are fewer.
+    pub(super) fn part(&self, side: usize) -> (Self, [PointId; 3]) {
+        let points @ [nx, ny] = self.points.map(|points| points.min(side));
+        let mut part = Sheet { points, ..self.clone() };
+        if let Fixed::Points(points) = &mut part.fixed {
+            *points = points.as_slice().iter().copied().filter(|[i, j]| *i < side && *j < side).collect();
+        }
+        let pushed = part.point([nx / 3, 2 * ny / 5]);
+        if part.is_fixed(pushed) {
+            part.fixed = Fixed::Points(PointSet::default());
+        }
+        let others = [[nx / 2, ny / 2], [1.min(nx - 1), 1.min(ny - 1)]].map(|place| part.point(place));
+        (part, [pushed, others[0], others[1]])
+    }
+
     /// Row-major indices of the fixed points, ascending.
     pub fn fixed_indices(&self) -> Vec<usize> {
         let [nx, ny] = self.points;
@@ -172,6 +188,10 @@ impl RestShape for Sheet {
                 let message = format!("{name} is not on the sheet of {nx} × {ny} points");
                 Err(Refusal::new(Reason::OffSheet, field, message))
             }
+            PointName::Vertex(_) => {
+                let message = format!("is the number of a vertex; a point of a sheet is [i, j], here of {nx} × {ny}");
+                Err(Refusal::new(Reason::WrongKind, field, message))
+            }
         }
     }
 
@@ -209,12 +229,27 @@ impl RestShape for Sheet {
         self.point([along(0), along(1)])
     }
 
+    /// Those of the square around the circle.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn around(&self, place_m: DVec3, radius_m: f64) -> Vec<PointId> {
+        let within = |axis: usize| {
+            let [from, to] = [-radius_m, radius_m].map(|off_m| (place_m[axis] + off_m) / self.spacing_m);
+            let last = self.points[axis] - 1;
+            (from.ceil().max(0.0) as usize).min(last)..=(to.floor().max(0.0) as usize).min(last)
+        };
+        within(0).flat_map(|i| within(1).map(move |j| [i, j])).map(|place| self.point(place)).collect()
+    }
+
     fn extent(&self) -> Extent {
         Extent { least_m: DVec3::ZERO, most_m: self.extent_m().extend(0.0) }
     }
 
     fn edge_m(&self) -> f64 {
         self.spacing_m
+    }
+
+    fn dimensions(&self) -> usize {
+        2
     }
 }
 
@@ -253,6 +288,21 @@ mod tests {
                 assert!(sheet.neighbours(other).contains(&point));
                 let apart_m = sheet.rest_m(point).distance(sheet.rest_m(other));
                 assert!((0.99..1.5).contains(&(apart_m / sheet.edge_m())));
+            }
+        }
+    }
+
+    #[test]
+    fn a_part_of_a_sheet_is_a_corner_and_one_of_its_points_is_its_middle() {
+        for points in [[1, 1], [1, 2], [2, 1], [9, 1], [1, 8], [2, 2], [11, 4], [12, 12], [40, 13]] {
+            let (part, looked_at) = Sheet { points, ..SHEET(Fixed::Corners) }.part(12);
+            assert_eq!(part.points, points.map(|count| count.min(12)));
+            assert!(looked_at.iter().all(|point| point.index() < part.point_count()) && !part.is_fixed(looked_at[0]));
+            let middle = part.place_of(looked_at[1]);
+            for axis in 0..2 {
+                // As far from either end, or nearer to the last by one point.
+                let after = part.points[axis] - 1 - middle[axis];
+                assert!(middle[axis] == after || middle[axis] == after + 1, "{points:?}: {middle:?}");
             }
         }
     }

@@ -324,7 +324,7 @@ mod tests {
         play(&mut session, &script(&model, ""));
         (0..10).for_each(|_| session.advance(&mut Vec::new(), |_| {}));
         for (point, is_grasped) in [([2, 2], false), ([2, 12], false), ([12, 2], true), ([12, 12], true)] {
-            let state = session.tissue().point(model.scene.sheet.point(point));
+            let state = session.tissue().point(model.scene.sheet().unwrap().point(point));
             assert!(state.displacement_m.z < -1e-4, "{point:?}: {state:?}");
             assert_eq!(state.constraint_n.is_some(), is_grasped, "{point:?}");
             assert_eq!(state.applied_n.z < -0.09, !is_grasped, "{point:?}: {state:?}");

@@ -18,6 +18,7 @@ use std::ops::Range;
 use glam::DVec3;
 
 use super::field::{BLOCK, Field, Layout};
+use super::graph::Graph;
 use super::lanes::{self, Run, Vector, Width};
 use super::model::{Model, Plan};
 use super::real::Real;
@@ -59,16 +60,15 @@ pub(super) struct ForceChange {
 }
 
 impl ForceChange {
-    /// Upper bound of the change of force on any point of a rectangle, N; `sides`: its ends along x and along y, m.
-    pub(super) fn most_n(&self, sides: [[f64; 2]; 2]) -> f64 {
+    /// Upper bound of the change of force on any point of a rectangle or box, N; `sides`: its ends along each axis, m.
+    pub(super) fn most_n(&self, sides: &[[f64; 2]]) -> f64 {
         let nearest = |poke: &Poke| {
-            let away: [f64; 2] = std::array::from_fn(|axis| {
-                let [from, to] = sides[axis];
+            let away = sides.iter().enumerate().map(|(axis, [from, to])| {
                 let centre = poke.centre_m[axis];
                 (from - centre).max(centre - to).max(0.0)
             });
-            let exponent = poke.falloff_offset - poke.falloff_per_m * (away[0] * away[0] + away[1] * away[1]).sqrt();
-            libm::exp(exponent)
+            let away_m = away.map(|away| away * away).sum::<f64>().sqrt();
+            libm::exp(poke.falloff_offset - poke.falloff_per_m * away_m)
         };
         let [p, q] = [&self.old, &self.new].map(|poke| poke.as_ref().map_or(0.0, nearest));
         let each = |poke: &Option<Poke>, factor: f64| poke.map_or(0.0, |poke| poke.force_n.length() * factor);
@@ -137,8 +137,12 @@ fn same_falloff(a: &Poke, b: &Poke) -> bool {
 
 /// The points that a force reaches, along x and along y. Beyond them its factor is 0.
 fn reached<T: Real>(poke: &Poke, model: &Model) -> [[usize; 2]; 2] {
-    let spacing_m = model.scene.sheet.spacing_m;
+    let spacing_m = model.unit_m;
     let reach_m = -T::NEGLIGIBLE_EXPONENT / poke.falloff_per_m;
+    if let Some(graph) = &model.graph {
+        let rows = graph.rows_within(poke.centre_m, reach_m);
+        return [[rows.start, rows.end], [0, if rows.is_empty() { 0 } else { BLOCK }]];
+    }
     std::array::from_fn(|axis| {
         let (centre_m, points) = (poke.centre_m[axis], model.points[axis]);
         // Saturating casts: an infinite reach covers the whole sheet.
@@ -166,7 +170,7 @@ impl<T: Real> Term<T> {
 
     /// Writes the falloff of `poke` to the table. Costs as much as the points that the old falloff and the new one reach.
     fn place(&mut self, poke: &Poke, model: &Model, layout: &Layout) {
-        let spacing_m = model.scene.sheet.spacing_m;
+        let spacing_m = model.unit_m;
         // Beyond its spans the table is 0, also where it was longer before.
         for (row, span) in self.factors.chunks_exact_mut(layout.stride).zip(&self.spans) {
             row[span.clone()].fill(T::default());
@@ -175,6 +179,9 @@ impl<T: Real> Term<T> {
         // `libm` gives the same bits on every machine; the platform's exponential does not.
         self.gain = libm::exp(poke.falloff_offset);
         self.factors.resize(self.rows.len() * layout.stride);
+        if let Some(graph) = &model.graph {
+            return self.place_on_mesh(poke, graph, layout);
+        }
         let falloff = Falloff {
             centre: (poke.centre_m.truncate() / spacing_m).to_array(),
             per_spacing: poke.falloff_per_m * spacing_m,
@@ -196,6 +203,22 @@ impl<T: Real> Term<T> {
                 _ => 0..0,
             }
         }));
+    }
+
+    /// The same for points anywhere in space: a row is a block of slots.
+    fn place_on_mesh(&mut self, poke: &Poke, graph: &Graph, layout: &Layout) {
+        self.spans.clear();
+        for (factors, row) in self.factors.chunks_exact_mut(layout.stride).zip(self.rows.clone()) {
+            let mut any = false;
+            for (factor, place_m) in factors.iter_mut().zip(graph.rest_in_row(row)) {
+                let exponent = -poke.falloff_per_m * place_m.distance(poke.centre_m);
+                // An empty slot is nowhere.
+                let reaches = exponent >= T::NEGLIGIBLE_EXPONENT && place_m.is_finite();
+                *factor = if reaches { T::of(libm::exp(exponent)) } else { T::default() };
+                any |= *factor != T::default();
+            }
+            self.spans.push(if any { 0..BLOCK } else { 0..0 });
+        }
     }
 
     fn set(&mut self, wanted: Wanted, scale: f64) {
@@ -408,11 +431,22 @@ pub(super) fn rows<T: Real>(terms: &[Term<T>]) -> Range<usize> {
     rows.reduce(|a, b| a.start.min(b.start)..a.end.max(b.end)).unwrap_or(0..0)
 }
 
-/// e^{−c·r + c′} at a point, 0 where it is negligible.
+/// How far the point in a place in memory rests from a control point, m.
 #[allow(clippy::cast_precision_loss)]
-fn factor(poke: &Poke, [i, j]: [usize; 2], spacing_m: f64, negligible: f64) -> f64 {
-    let (x, y) = (i as f64 * spacing_m - poke.centre_m.x, j as f64 * spacing_m - poke.centre_m.y);
-    let exponent = -poke.falloff_per_m * (x * x + y * y).sqrt();
+fn away_m(model: &Model, index: usize, centre_m: DVec3) -> f64 {
+    match &model.graph {
+        Some(graph) => graph.rest_m(index).distance(centre_m),
+        None => {
+            let ([i, j], spacing_m) = (model.point_of(index), model.unit_m);
+            let (x, y) = (i as f64 * spacing_m - centre_m.x, j as f64 * spacing_m - centre_m.y);
+            (x * x + y * y).sqrt()
+        }
+    }
+}
+
+/// e^{−c·r + c′} at a distance, 0 where it is negligible.
+fn factor(poke: &Poke, away_m: f64, negligible: f64) -> f64 {
+    let exponent = -poke.falloff_per_m * away_m;
     if exponent < negligible { 0.0 } else { libm::exp(exponent + poke.falloff_offset) }
 }
 
@@ -567,8 +601,7 @@ impl<T: Real> Applied<T> {
 }
 
 fn sum_at(model: &Model, index: usize, pokes: impl Iterator<Item = Poke>, negligible: f64) -> DVec3 {
-    let (point, spacing_m) = (model.point_of(index), model.scene.sheet.spacing_m);
-    pokes.map(|poke| poke.force_n * factor(&poke, point, spacing_m, negligible)).sum()
+    pokes.map(|poke| poke.force_n * factor(&poke, away_m(model, index, poke.centre_m), negligible)).sum()
 }
 
 #[cfg(test)]

@@ -8,7 +8,6 @@ use super::contact::displacement_m;
 use super::motion::Sheet;
 use super::real::Real;
 use crate::scene::profile::Poke;
-use crate::shape::RestShape;
 
 /// The exponent of a weight below which a point does not count.
 const LEAST_EXPONENT: f64 = 7.0;
@@ -18,10 +17,13 @@ const LEAST_EXPONENT: f64 = 7.0;
 const RADIUS: [f64; 2] = [1.5, 4.0];
 
 impl<T: Real> Sheet<T> {
-    /// Bilinear between the four points around a place. Beyond the rim it is that of the rim.
+    /// On a sheet bilinear between the four points around the place, beyond the rim that of the rim; on a mesh that of the
+    /// nearest point.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     pub(super) fn surface_displacement(&self, place_m: DVec3) -> DVec3 {
-        let sheet = &self.model.scene.sheet;
+        let Some(sheet) = self.model.scene.sheet() else {
+            return self.point(self.model.shape().nearest(place_m)).displacement_m;
+        };
         let along = |axis: usize| {
             let last = sheet.points[axis] - 1;
             let at = (place_m[axis] / sheet.spacing_m).clamp(0.0, last as f64);
@@ -34,30 +36,21 @@ impl<T: Real> Sheet<T> {
     }
 
     /// The weights are those of the force, tapered to 0 at a radius, so that no point comes or goes with a jump.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     pub(super) fn reaction_around(&self, poke: &Poke) -> DVec3 {
-        let sheet = &self.model.scene.sheet;
-        let [least, most] = RADIUS.map(|spacings| spacings * sheet.spacing_m);
+        let shape = self.model.shape();
+        let [least, most] = RADIUS.map(|spacings| spacings * shape.edge_m());
         let radius_m = (LEAST_EXPONENT / poke.falloff_per_m).clamp(least, most);
-        let within = |axis: usize| {
-            let [from, to] = [-radius_m, radius_m].map(|off_m| (poke.centre_m[axis] + off_m) / sheet.spacing_m);
-            let last = sheet.points[axis] - 1;
-            (from.ceil().max(0.0) as usize).min(last)..=(to.floor().max(0.0) as usize).min(last)
-        };
         let (mut sum_n, mut weights) = (DVec3::ZERO, 0.0);
-        for i in within(0) {
-            for j in within(1) {
-                let point = sheet.point([i, j]);
-                let away_m = sheet.rest_m(point).distance(poke.centre_m);
-                let taper = 1.0 - (away_m / radius_m).powi(2);
-                if taper > 0.0 {
-                    let weight = libm::exp(-poke.falloff_per_m * away_m) * taper * taper;
-                    sum_n += weight * self.point(point).reaction_n();
-                    weights += weight;
-                }
+        for point in shape.around(poke.centre_m, radius_m) {
+            let away_m = shape.rest_m(point).distance(poke.centre_m);
+            let taper = 1.0 - (away_m / radius_m).powi(2);
+            if taper > 0.0 {
+                let weight = libm::exp(-poke.falloff_per_m * away_m) * taper * taper;
+                sum_n += weight * self.point(point).reaction_n();
+                weights += weight;
             }
         }
-        // A place off the rim may have no point around it.
-        if weights > 0.0 { sum_n / weights } else { self.point(sheet.nearest(poke.centre_m)).reaction_n() }
+        // A place off the tissue may have no point around it.
+        if weights > 0.0 { sum_n / weights } else { self.point(shape.nearest(poke.centre_m)).reaction_n() }
     }
 }

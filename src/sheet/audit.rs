@@ -29,7 +29,6 @@ use super::tissue::Tissue;
 use crate::memory;
 use crate::scene::Precision;
 pub use crate::scene::record::AuditedError;
-use crate::shape::PointId;
 
 /// The twin's substep is 1/`FINER` of the sheet's.
 pub const FINER: u32 = 4;
@@ -245,7 +244,7 @@ impl<T: Real> Sheet<T> {
         let kept = kept.iter_mut().zip(&self.state.kept).map(|(to, from)| (Arc::make_mut(to), &**from));
         let (from, to) = (self.tables.layout, sheet.tables.layout);
         for (number, (wide, narrow)) in pairs.chain(kept).enumerate() {
-            for index in 0..self.model.len() {
+            for index in 0..self.model.places() {
                 for c in 0..3 {
                     let at = c * from.plane + from.offset(index);
                     // The rounding loss of a compensated displacement belongs to it.
@@ -312,8 +311,8 @@ impl<T: Real> Replay for Sheet<T> {
     }
 
     fn observed(&self) -> Vec<[DVec3; 2]> {
-        let points = (0..self.model.len()).map(|index| {
-            let point = self.point(PointId::new(index));
+        let points = self.model.points().map(|point| {
+            let point = self.point(point);
             [point.displacement_m, point.reaction_n()]
         });
         memory::collected(points, "an audit")
@@ -355,7 +354,7 @@ impl SharedCheckpoint {
 /// An extent at least as large as the one that the sleep of `sheet` is relative to: the recent largest displacement, and
 /// a force in proportion.
 fn since_rest(sheet: &dyn Replay, extent: Extent) -> Extent {
-    let ratio = (sheet.largest() * sheet.model().scene.sheet.spacing_m / extent.displacement_m).max(1.0);
+    let ratio = (sheet.largest() * sheet.model().unit_m / extent.displacement_m).max(1.0);
     let ratio = if ratio.is_finite() { ratio } else { 1.0 };
     Extent { displacement_m: ratio * extent.displacement_m, force_n: ratio * extent.force_n }
 }

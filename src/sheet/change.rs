@@ -70,7 +70,7 @@ impl<T: Real> Sheet<T> {
         let kept = self.plan.scheme.kept(model.precision == Precision::Compensated);
         self.state.kept = State::at_rest(&layout, kept).kept;
         self.applied.forget();
-        let spacing_m = model.scene.sheet.spacing_m;
+        let spacing_m = model.unit_m;
         // The scheme does not produce the visible motion of a grasped point, so restore it.
         for (index, motion) in self.prescribed.grasped() {
             for c in 0..3 {

@@ -238,8 +238,8 @@ pub fn least_step(scene: &Scene) -> (u32, f64) {
     let least = || least_substeps(integrator, rate_hz.recip(), &Oscillator::of(scene));
     let substeps = substeps.unwrap_or_else(least);
     let point_ns = point_substep_ns(integrator, precision, super::lanes::available(lanes).unwrap_or(lanes));
-    let [nx, ny] = scene.sheet.points;
-    (substeps, 1e-9 * (STEP_NS + point_ns * (nx * ny) as f64 * f64::from(substeps)))
+    let points = scene.shape().point_count();
+    (substeps, 1e-9 * (STEP_NS + point_ns * points as f64 * f64::from(substeps)))
 }
 
 /// Every integrator that the scene leaves open, each with the cheapest that keeps to the tolerance.

@@ -156,7 +156,7 @@ impl Contacts {
 /// The displacement of a point from rest, m. For a multistep scheme, as predicted.
 pub(super) fn displacement_m<T: Real>(model: &Model, layout: &Layout, state: &State<T>, [i, j]: [usize; 2]) -> DVec3 {
     let at = i * layout.stride + j;
-    let component = |c: usize| state.u[c * layout.plane + at].wide() * model.scene.sheet.spacing_m;
+    let component = |c: usize| state.u[c * layout.plane + at].wide() * model.unit_m;
     DVec3::new(component(0), component(1), component(2))
 }
 
@@ -191,7 +191,7 @@ pub(super) fn movement_m<T: Real>(model: &Model, layout: &Layout, state: &State<
             moved[c] += weight * state.d[c * layout.plane + at].wide();
         }
     }
-    moved * model.scene.sheet.spacing_m
+    moved * model.unit_m
 }
 
 impl Tool {
@@ -260,7 +260,7 @@ impl Tool {
 
     /// The force that closes a gap, N.
     fn force<T: Real>(&self, model: &Model, plan: &Plan, layout: &Layout, state: &State<T>, gap_m: DVec3) -> DVec3 {
-        let spacing_m = model.scene.sheet.spacing_m;
+        let spacing_m = model.unit_m;
         let moves_m_per_n =
             plan.scheme.kick()[0] * plan.force_scale(&model.scene) * spacing_m * self.footprint.mobility();
         let gap_m = gap_m + moves_m_per_n * self.steady_n;

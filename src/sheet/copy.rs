@@ -15,7 +15,6 @@ use super::contact::Contacts;
 use super::field::State;
 use super::motion::Sheet;
 use super::real::Real;
-use super::tables::SweepTables;
 use super::tissue::SheetCopy;
 
 impl<T: Real> Sheet<T> {
@@ -29,7 +28,7 @@ impl<T: Real> Sheet<T> {
             model: model.clone(),
             plan: plan.clone(),
             halvings: self.halvings,
-            tables: SweepTables::new(model.lanes, tables.layout, tables.springs, &[]),
+            tables: tables.for_copy(),
             state: state_copy,
             applied: Applied::<T>::like(&self.applied),
             prescribed: self.prescribed.clone(),
@@ -72,7 +71,7 @@ mod tests {
         ] {
             let model = Model::paper(&sets);
             let mut tissue = at_rest(&model);
-            let spacing_m = model.scene.sheet.spacing_m;
+            let spacing_m = model.scene.sheet().unwrap().spacing_m;
             let centre_m = spacing_m * DVec3::new(1.0, 20.0, 0.0);
             let force_n = DVec3::new(0.2, 0.1, -0.8);
             let falloff_per_m = 1.0 / spacing_m;
@@ -80,7 +79,11 @@ mod tests {
                 0,
                 Some(Push::Constant(Poke { point: None, centre_m, force_n, falloff_per_m, falloff_offset: 0.0 })),
             );
-            tissue.grasp(1, model.scene.sheet.point([1, 30]), Grasp::Target(DVec3::new(0.0, 0.0, 0.3 * spacing_m)));
+            tissue.grasp(
+                1,
+                model.scene.sheet().unwrap().point([1, 30]),
+                Grasp::Target(DVec3::new(0.0, 0.0, 0.3 * spacing_m)),
+            );
             (0..25).for_each(|_| tissue.step().unwrap());
             let copy = tissue.copy();
             let (hash, points) = (tissue.state_hash(), shape::points(model.shape()).map(|point| tissue.point(point)));

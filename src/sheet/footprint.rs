@@ -63,7 +63,7 @@ pub struct Reached {
 impl Footprint {
     /// A disc of `radius_m` about `centre_m`, which is moved onto the sheet if it is beside it.
     pub fn new(model: &Model, radius_m: f64, centre_m: DVec2) -> Self {
-        let spacing_m = model.scene.sheet.spacing_m;
+        let spacing_m = model.unit_m;
         let drawn = drawn_radius(radius_m / spacing_m);
         let mut footprint = Footprint {
             radius_m,
@@ -90,7 +90,8 @@ impl Footprint {
 
     /// Moves the disc to another material place.
     pub fn move_to(&mut self, model: &Model, centre_m: DVec2) {
-        let sheet = &model.scene.sheet;
+        // Tools with a tip are refused on a mesh.
+        let Some(sheet) = model.scene.sheet() else { return };
         let centre_m = centre_m.clamp(DVec2::ZERO, sheet.extent_m());
         if !self.reached.is_empty() && centre_m == self.centre_m {
             return;
@@ -260,7 +261,7 @@ mod tests {
     #[test]
     fn a_disc_gives_way_like_its_own_area_of_a_foundation() {
         let model = model(&["sheet.points=[21, 21]"]);
-        let spacing_m = model.scene.sheet.spacing_m;
+        let spacing_m = model.unit_m;
         for radius in RADII.into_iter().filter(|radius| *radius >= 1.0) {
             // h²/Σ w² is the area, in the mean over places in a cell.
             let places = (0..16).map(|place| DVec2::new(f64::from(place / 4), f64::from(place % 4)) / 4.0);
@@ -275,7 +276,7 @@ mod tests {
     #[test]
     fn weights_add_up_to_1_about_the_centre_and_follow_a_plane_exactly() {
         let model = model(&["sheet.points=[13, 17]"]);
-        let spacing_m = model.scene.sheet.spacing_m;
+        let spacing_m = model.unit_m;
         for radius in RADII {
             let centre_m = DVec2::new(6.13, 8.71) * spacing_m;
             let footprint = Footprint::new(&model, radius * spacing_m, centre_m);
@@ -294,7 +295,7 @@ mod tests {
     #[test]
     fn the_slopes_are_the_change_of_place_also_where_the_disc_leaves_the_sheet() {
         let model = model(&["sheet.points=[7, 9]"]);
-        let spacing_m = model.scene.sheet.spacing_m;
+        let spacing_m = model.unit_m;
         let displacement_m = |[i, j]: [usize; 2]| {
             let (x, y) = (i as f64, j as f64);
             1e-3 * DVec3::new((1.3 * x + y).sin(), (x - 0.7 * y).cos(), (0.9 * x * y).sin())

@@ -19,11 +19,10 @@ use super::field::{Field, Layout, State};
 use super::model::{Model, Plan};
 use super::motion::{Sheet, springs_of};
 use super::real::Real;
-use super::springs::Springs;
 use super::survey::Survey;
+use super::tables::Elastic;
 use super::tissue::BlowUp;
 use crate::memory;
-use crate::shape::PointId;
 
 /// Substeps between two surveys.
 pub const INTERVAL_SUBSTEPS: u64 = 256;
@@ -50,7 +49,7 @@ impl<T: Real> Sheet<T> {
         let farthest = farthest_in_spacings(&self.model);
         let calm = self.tables.is_calm(farthest);
         let scan = || match broken_point(&self.model, &self.tables.layout, &self.state) {
-            Some(index) => Err(CheckFailure::NotFinite { point: self.model.shape().name(PointId::new(index)) }),
+            Some(index) => Err(CheckFailure::NotFinite { point: self.model.shape().name(self.model.point_at(index)) }),
             None => Ok(()),
         };
         if !calm {
@@ -190,14 +189,14 @@ impl<T: Real> Sheet<T> {
 
 /// Displacements beyond this are a blow-up: far beyond any tissue, and far below what f32 can square.
 pub(super) fn farthest_in_spacings(model: &Model) -> f64 {
-    1e9 * model.shape().longest_side_m() / model.scene.sheet.spacing_m
+    1e9 * model.shape().longest_side_m() / model.unit_m
 }
 
 /// The number of a point that is not finite or beyond the bound, if there is one.
 pub(super) fn broken_point<T: Real>(model: &Model, layout: &Layout, state: &State<T>) -> Option<usize> {
     let farthest = T::of(farthest_in_spacings(model));
     let is_good = |field: &Field<T>, at: usize| field[at].is_finite() && field[at].magnitude() < farthest;
-    (0..model.len()).find(|index| {
+    (0..model.places()).find(|index| {
         let offsets = (0..3).map(|c| c * layout.plane + layout.offset(*index));
         !offsets.into_iter().all(|at| state.fields().all(|field| is_good(field, at)))
     })
@@ -206,7 +205,7 @@ pub(super) fn broken_point<T: Real>(model: &Model, layout: &Layout, state: &Stat
 /// Converts a state from one substep to another: `from` and `to` are plans of the same scheme, `springs` of `from`.
 pub(super) fn convert<T: Real>(
     layout: &Layout,
-    springs: &Springs<T>,
+    springs: &Elastic<T>,
     from: &Plan,
     to: &Plan,
     applied: &Applied<T>,
@@ -241,6 +240,7 @@ mod tests {
     use super::*;
     use crate::scene::profile::Poke;
     use crate::scene::{Integrator, Named};
+    use crate::shape::PointId;
     use crate::sheet::integrate::Scheme;
     use crate::sheet::{Push, Tissue};
 
@@ -262,9 +262,9 @@ mod tests {
             0,
             Some(Push::Constant(Poke {
                 point: None,
-                centre_m: scene.sheet.spacing_m * DVec3::new(3.0, 4.0, 0.0),
+                centre_m: scene.sheet().unwrap().spacing_m * DVec3::new(3.0, 4.0, 0.0),
                 force_n: DVec3::new(0.1, -0.2, -1.0),
-                falloff_per_m: 0.7 / scene.sheet.spacing_m,
+                falloff_per_m: 0.7 / scene.sheet().unwrap().spacing_m,
                 falloff_offset: 0.0,
             })),
         );
@@ -324,7 +324,7 @@ mod tests {
             let (survey, energy, energy_j) = sheet.survey(&sheet.tiles.region);
             let work_j = sheet.work.done_j - sheet.present_work_j(&survey);
             assert!((work_j - energy_j).abs() < 0.02 * energy_j, "{integrator}: {work_j} J, {energy_j} J");
-            let mass_kg = sheet.model.scene.sheet.point_mass_kg;
+            let mass_kg = sheet.model.scene.sheet().unwrap().point_mass_kg;
             let points = (0..sheet.model.len()).map(|index| sheet.point(PointId::new(index)));
             let kinetic_j: f64 = points.map(|point| 0.5 * mass_kg * point.velocity_m_per_s.length_squared()).sum();
             assert!((energy.kinetic_j - kinetic_j).abs() < 1e-9 * kinetic_j, "{integrator}: {energy:?} {kinetic_j}");

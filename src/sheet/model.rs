@@ -1,9 +1,12 @@
 //! The immutable half of a sheet: its scene, its points, and the scheme with its substep.
 
+use std::sync::Arc;
+
 use super::field::{BLOCK, Layout};
+use super::graph::Graph;
 use super::integrate::{Node, Oscillator, Scheme};
 use super::stability;
-use crate::scene::{Integrator, Lanes, Precision, Scene};
+use crate::scene::{Body, Integrator, Lanes, Precision, Scene};
 use crate::shape::{self, PointId, RestShape};
 
 /// The immutable half of a sheet.
@@ -11,10 +14,14 @@ use crate::shape::{self, PointId, RestShape};
 pub struct Model {
     /// What it was compiled from.
     pub scene: Scene,
-    /// Points along x (rows) and along y (within a row).
+    /// Rows and columns in memory: those of a sheet, or slots of a mesh in rows of [`BLOCK`].
     pub(super) points: [usize; 2],
     /// Row-major indices of the fixed points, ascending.
     pub(super) fixed: Vec<usize>,
+    /// The unit of length: the distance between neighbours, m.
+    pub(super) unit_m: f64,
+    /// Where the points of a mesh are in memory, and its springs; none for a sheet.
+    pub(super) graph: Option<Arc<Graph>>,
     /// ω_b = √((largest spring stiffness + K″)/m): no vibration is faster, under any deformation, rad/s.
     pub omega_bound_per_s: f64,
     /// The scheme.
@@ -75,7 +82,7 @@ impl Plan {
 
     /// What turns newtons into the scheme's unit of force: dt²/(m·h), 1/N.
     pub(super) fn force_scale(&self, scene: &Scene) -> f64 {
-        self.substep_s * self.substep_s / (scene.sheet.point_mass_kg * scene.sheet.spacing_m)
+        self.substep_s * self.substep_s / (scene.point_mass_kg() * scene.shape().edge_m())
     }
 }
 
@@ -83,10 +90,10 @@ impl Oscillator {
     /// Of a scene. A zero is positive here, whatever its sign was: what is divided by it is infinite, not below all.
     pub fn of(scene: &Scene) -> Self {
         Oscillator {
-            mass_kg: scene.sheet.point_mass_kg,
+            mass_kg: scene.point_mass_kg(),
             damping_n_s_per_m: scene.damping_n_s_per_m + 0.0,
             virtual_stiffness_n_per_m: scene.virtual_stiffness_n_per_m + 0.0,
-            spring_stiffness_n_per_m: stability::largest_stiffness_n_per_m(&scene.springs),
+            spring_stiffness_n_per_m: stability::largest_stiffness_n_per_m(scene),
         }
     }
 }
@@ -94,9 +101,21 @@ impl Oscillator {
 impl Model {
     /// Of a scene with a scheme that somebody else has chosen: nothing is checked, nothing expected, nothing sleeps.
     pub(super) fn planned(scene: Scene, plan: Plan, precision: Precision, lanes: Lanes) -> Self {
+        let (points, fixed, graph) = match &scene.body {
+            Body::Sheet(sheet) => (sheet.points, sheet.fixed_indices(), None),
+            Body::Mesh(mesh) => {
+                let graph = Graph::of(mesh);
+                let points = shape::points(&*mesh.shape).filter(|point| mesh.shape.is_fixed(*point));
+                let mut fixed: Vec<usize> = points.map(|point| graph.slot_of(point)).collect();
+                fixed.sort_unstable();
+                ([graph.rows(), BLOCK], fixed, Some(Arc::new(graph)))
+            }
+        };
         Model {
-            points: scene.sheet.points,
-            fixed: scene.sheet.fixed_indices(),
+            points,
+            fixed,
+            graph,
+            unit_m: scene.shape().edge_m(),
             omega_bound_per_s: Oscillator::of(&scene).omega_bound_per_s(),
             plan,
             precision,
@@ -154,7 +173,22 @@ impl Model {
 
     /// Number of points.
     pub fn len(&self) -> usize {
+        self.shape().point_count()
+    }
+
+    /// Places of points in memory; some of those of a mesh are empty.
+    pub(super) fn places(&self) -> usize {
         self.points[0] * self.points[1]
+    }
+
+    /// The place of a point in memory, by rows.
+    pub(super) fn place_of(&self, point: PointId) -> usize {
+        self.graph.as_ref().map_or(point.index(), |graph| graph.slot_of(point))
+    }
+
+    /// The point at a place in memory; of an empty one, any.
+    pub(super) fn point_at(&self, index: usize) -> PointId {
+        self.graph.as_ref().map_or(PointId::new(index), |graph| graph.point_in(index))
     }
 
     /// What a substep computes, in points: rows are padded, and a short one costs what one of a vector's width does.
@@ -180,8 +214,6 @@ impl Model {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::Arc;
-
     use super::*;
     use crate::limits::Limits;
     use crate::scene::profile::Poke;
@@ -209,7 +241,7 @@ mod tests {
                 let mut tissue = crate::sheet::at_rest(&model);
                 for (tool, point) in [[0, 0], [3, 11]].into_iter().enumerate() {
                     let force_n = glam::DVec3::new(0.7, 0.2, -0.9) * [1.0, -1.5][tool];
-                    let (centre_m, falloff_per_m) = (scene.shape().rest_m(scene.sheet.point(point)), 25.0);
+                    let (centre_m, falloff_per_m) = (scene.shape().rest_m(scene.sheet().unwrap().point(point)), 25.0);
                     let poke = Poke { point: None, centre_m, force_n, falloff_per_m, falloff_offset: 0.0 };
                     tissue.push(tool, Some(crate::sheet::Push::Constant(poke)));
                 }

@@ -10,16 +10,17 @@ use super::applied::{Applied, Push};
 use super::audit_window::{AuditWindow, Inputs, Mark};
 use super::checkpoint::{Checkpoint, Input, Work};
 use super::contact::{Contacts, Feel, Surroundings};
-use super::field::{Layout, State};
+use super::field::{BLOCK, Layout, State};
 use super::integrate::arithmetic::{Arithmetic, MAX_KEPT};
 use super::integrate::family::{Family, Release};
 use super::integrate::{each, with_arithmetic};
 use super::lanes::Plain;
+use super::mesh::MeshSprings;
 use super::model::{Model, Plan};
 use super::prescribed::{Grasp, Prescribed};
 use super::real::Real;
 use super::springs::Springs;
-use super::tables::SweepTables;
+use super::tables::{Elastic, SweepTables};
 use super::tiles::{CHECK_STEPS, SleepTiles};
 use super::tissue::{BlowUp, Energy, PointState, Released, SheetCopy, Tissue};
 use crate::scene::Precision;
@@ -69,7 +70,7 @@ impl<T: Real> Sheet<T> {
         Sheet {
             model: model.clone(),
             halvings: 0,
-            tables: SweepTables::new(model.lanes, layout, springs_of(model, &plan), &model.fixed),
+            tables: SweepTables::new(model, layout, springs_of(model, &plan)),
             state: State::at_rest(&layout, plan.scheme.kept(model.precision == Precision::Compensated)),
             steps: 0,
             work: Work::default(),
@@ -80,7 +81,7 @@ impl<T: Real> Sheet<T> {
             inputs: Vec::new(),
             audit_window: AuditWindow::Off,
             is_marked: false,
-            tiles: SleepTiles::new(layout, model.tile_tolerance(), if model.scene.springs.flexion { 2 } else { 1 }),
+            tiles: SleepTiles::new(layout, model),
             guard_events: 0,
             substeps_done: 0,
             points_done: 0,
@@ -149,18 +150,21 @@ impl<T: Real> Sheet<T> {
     fn sweep(&mut self, sweep: usize) {
         let Sheet { model, plan, tables, state, applied, tiles, .. } = self;
         let (field, terms, region) = (plan.scheme.field(sweep), &applied.terms, &tiles.region);
-        if model.precision == Precision::Compensated {
-            each!(&plan.scheme, |family| tables.advance(&family.compensated::<T>(sweep), state, terms, field, region));
-        } else {
-            each!(&plan.scheme, |family| tables.advance(&family.plain::<T>(sweep), state, terms, field, region));
+        if const { T::COMPENSATES } {
+            if model.precision == Precision::Compensated {
+                return each!(&plan.scheme, |family| {
+                    tables.advance(&family.compensated::<T>(sweep), state, terms, field, region);
+                });
+            }
         }
+        each!(&plan.scheme, |family| tables.advance(&family.plain::<T>(sweep), state, terms, field, region));
     }
 
     /// Puts the grasped points at their places at `fraction` of the step, and counts the work if `counted`.
     fn hold(&mut self, step: u64, fraction: f64, counted: bool) {
         let unit_j = self.unit_of_work_j();
         let Sheet { model, plan, tables, state, prescribed, work, .. } = self;
-        let spacing_m = model.scene.sheet.spacing_m;
+        let spacing_m = model.unit_m;
         for (index, displacement_m, velocity_m_per_s) in prescribed.at(model, step, fraction) {
             let mut product = 0.0;
             for c in 0..3 {
@@ -216,13 +220,13 @@ impl<T: Real> Sheet<T> {
     /// The work of a force of 1 in the fields of the tools along a displacement of 1, J.
     pub(super) fn unit_of_work_j(&self) -> f64 {
         let Sheet { model, plan, .. } = self;
-        model.scene.sheet.spacing_m / (plan.scheme.impulse() * plan.force_scale(&model.scene))
+        model.unit_m / (plan.scheme.impulse() * plan.force_scale(&model.scene))
     }
 
     /// Displacement, velocity and springs' force of a free point, under the applied force `applied_n`.
     pub(super) fn free_point(&self, index: usize, applied_n: DVec3) -> [DVec3; 3] {
         let Sheet { model, plan, tables, state, .. } = self;
-        let (spacing_m, scale) = (model.scene.sheet.spacing_m, plan.force_scale(&model.scene));
+        let (spacing_m, scale) = (model.unit_m, plan.force_scale(&model.scene));
         let unit = plan.scheme.spring_scale() * scale;
         let springs = tables.springs.gather(&tables.layout, &state.u, model.point_of(index));
         let [i, j] = model.point_of(index);
@@ -259,7 +263,7 @@ impl<T: Real> Sheet<T> {
                 self.applied.set(tool, None);
                 self.contacts.release(tool);
                 self.tiles.wake_under([self.model.point_of(index)]);
-                let PointState { displacement_m, velocity_m_per_s, .. } = self.point(PointId::new(index));
+                let PointState { displacement_m, velocity_m_per_s, .. } = self.point(self.model.point_at(index));
                 let now = Motion { displacement_m, velocity_m_per_s, ..Motion::default() };
                 self.prescribed.grasp(tool, index, grasp, now);
             }
@@ -267,9 +271,13 @@ impl<T: Real> Sheet<T> {
     }
 }
 
-pub(super) fn springs_of<T: Real>(model: &Model, plan: &Plan) -> Springs<T> {
-    let unit = plan.substep_s * plan.substep_s / model.scene.sheet.point_mass_kg;
-    Springs::new(&model.scene.springs, unit * plan.scheme.spring_scale())
+/// The springs of a model, in the terms of a plan.
+pub(super) fn springs_of<T: Real>(model: &Model, plan: &Plan) -> Elastic<T> {
+    let unit = plan.substep_s * plan.substep_s / model.scene.point_mass_kg() * plan.scheme.spring_scale();
+    match &model.graph {
+        None => Elastic::Sheet(Springs::new(&model.scene.springs, unit)),
+        Some(graph) => Elastic::Mesh(Arc::new(MeshSprings::new(graph, unit * model.scene.springs.stiffness_n_per_m))),
+    }
 }
 
 impl<T: Real> Tissue for Sheet<T> {
@@ -302,7 +310,7 @@ impl<T: Real> Tissue for Sheet<T> {
     }
 
     fn grasp(&mut self, tool: usize, point: PointId, grasp: Grasp) {
-        self.input(tool, Input::Grasp(point.index(), grasp));
+        self.input(tool, Input::Grasp(self.model.place_of(point), grasp));
     }
 
     fn pose(&mut self, tool: usize, place_m: DVec3, tip: Tip) {
@@ -373,7 +381,7 @@ impl<T: Real> Tissue for Sheet<T> {
     }
 
     fn point(&self, point: PointId) -> PointState {
-        let index = point.index();
+        let index = self.model.place_of(point);
         let scene = &self.model.scene;
         let applied_n = match self.steps {
             0 => self.applied.from(&self.model, index, Moment::start_of(0)),
@@ -387,7 +395,7 @@ impl<T: Real> Tissue for Sheet<T> {
         let virtual_n = -scene.virtual_stiffness_n_per_m * displacement_m;
         let damping_n = -scene.damping_n_s_per_m * velocity_m_per_s;
         let constraint_n = motion.map(|motion| {
-            let inertia_n = scene.sheet.point_mass_kg * motion.acceleration_m_per_s2;
+            let inertia_n = scene.point_mass_kg() * motion.acceleration_m_per_s2;
             inertia_n - spring_n - virtual_n - damping_n - applied_n
         });
         PointState { displacement_m, velocity_m_per_s, spring_n, virtual_n, damping_n, applied_n, constraint_n }
@@ -410,24 +418,36 @@ impl<T: Real> Tissue for Sheet<T> {
     }
 
     fn largest_displacement_m(&self) -> f64 {
-        let squared = (0..self.model.len()).map(|index| {
+        let squared = (0..self.model.places()).map(|index| {
             let at = self.tables.layout.offset(index);
             (0..3).map(|c| self.state.u[c * self.tables.layout.plane + at].wide().powi(2)).sum()
         });
-        squared.fold(0.0, f64::max).sqrt() * self.model.scene.sheet.spacing_m
+        squared.fold(0.0, f64::max).sqrt() * self.model.unit_m
     }
 
     fn displacements_m(&self, into: &mut [Vec<f32>; 3]) {
         let Layout { rows, columns, stride, plane } = self.tables.layout;
-        let spacing = T::of(self.model.scene.sheet.spacing_m);
+        let spacing = T::of(self.model.unit_m);
+        #[allow(clippy::cast_possible_truncation)]
+        let metres = |u: &T| (*u * spacing).wide() as f32;
         for (c, into) in into.iter_mut().enumerate() {
             into.clear();
+            if self.model.graph.is_some() {
+                let place = |point| c * plane + self.tables.layout.offset(self.model.place_of(point));
+                into.extend(self.model.points().map(|point| metres(&self.state.u[place(point)])));
+                continue;
+            }
             for i in 0..rows {
                 let from = c * plane + i * stride;
-                #[allow(clippy::cast_possible_truncation)]
-                into.extend(self.state.u[from..from + columns].iter().map(|u| (*u * spacing).wide() as f32));
+                into.extend(self.state.u[from..from + columns].iter().map(metres));
             }
         }
+    }
+
+    /// Blocks of a row, by rows.
+    fn hash_block_count(&self) -> usize {
+        let Layout { rows, columns, .. } = self.tables.layout;
+        rows * columns.div_ceil(BLOCK)
     }
 
     fn hash_blocks(&self, blocks: Range<usize>, hasher: &mut Xxh3) {

@@ -20,7 +20,7 @@ use super::model::{Model, Plan};
 use super::motion::at_rest;
 use super::{lanes, stability};
 use crate::scene::profile::{CentreProfile, LoadProfile, Profile, StrengthProfile};
-use crate::scene::{Fixed, Integrator, PointSet, Precision, Scene};
+use crate::scene::{Integrator, Precision, Scene};
 use crate::shape::PointId;
 
 /// Points along a side at most. Larger sheets err alike: a force spreads over some points.
@@ -92,6 +92,8 @@ type Course = Vec<[[DVec3; 2]; 3]>;
 /// The small sheet, and how it truly moves.
 pub(super) struct Rehearsal<'s> {
     scene: Scene,
+    /// The points that are compared; the first is pushed.
+    looked_at: [PointId; 3],
     sheet: Oscillator,
     /// Parts of the scene's step that count as a step here.
     parts: u32,
@@ -114,13 +116,8 @@ impl<'s> Rehearsal<'s> {
         let parts = stability::stable_substeps(Integrator::Exponential4, step_s, &sheet) / SUBSTEPS_A_LOOK;
         let parts = parts.min(scene.stepping.substeps.unwrap_or(u32::MAX)).max(1);
         let mut small = scene.clone();
-        small.sheet.points = scene.sheet.points.map(|points| points.min(SIDE));
-        if let Fixed::Points(points) = &mut small.sheet.fixed {
-            *points = points.as_slice().iter().copied().filter(|[i, j]| *i < SIDE && *j < SIDE).collect();
-        }
-        if small.shape().is_fixed(small.sheet.point(pushed(&small))) {
-            small.sheet.fixed = Fixed::Points(PointSet::default());
-        }
+        let (body, looked_at) = scene.body.part(SIDE);
+        small.body = body;
         small.stepping.rate_hz = scene.stepping.rate_hz * f64::from(parts);
         let least = stability::stable_substeps(Integrator::Exponential4, small.stepping.rate_hz.recip(), &sheet);
         let most_steps = STEPS.1.min(SUBSTEPS / f64::from(least)).max(STEPS.0);
@@ -128,6 +125,7 @@ impl<'s> Rehearsal<'s> {
         let steps = (COURSE_S * small.stepping.rate_hz).clamp(STEPS.0, most_steps) as usize;
         let mut rehearsal = Rehearsal {
             scene: small,
+            looked_at,
             sheet,
             parts,
             steps,
@@ -207,7 +205,7 @@ impl<'s> Rehearsal<'s> {
         let scene = &self.scene;
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
         let steps = (load.part * self.steps as f64) as usize;
-        let points = scene.sheet.points[0] as u64 * scene.sheet.points[1] as u64 + SUBSTEP_POINTS;
+        let points = scene.shape().point_count() as u64 + SUBSTEP_POINTS;
         let work = |substeps: u64| points.saturating_mul(substeps) + STEP_POINTS * steps as u64;
         if work((steps as u64).saturating_mul(u64::from(substeps))) > self.left.get() {
             self.is_cut.set(true);
@@ -216,26 +214,25 @@ impl<'s> Rehearsal<'s> {
         let plan = Plan::unjudged(integrator, substeps, scene.stepping.rate_hz.recip(), &self.sheet);
         let lanes = lanes::available(scene.stepping.lanes).unwrap_or(crate::scene::Lanes::Plain);
         let model = Arc::new(Model::planned(scene.clone(), plan, precision, lanes));
-        let (spacing_m, at) = (scene.sheet.spacing_m, pushed(scene));
+        let (spacing_m, [pushed, ..]) = (scene.shape().edge_m(), self.looked_at);
         let stiffness = scene.virtual_stiffness_n_per_m + 0.3 * scene.springs.stiffness_n_per_m;
         // Without any spring, what brings a point about as far within a step.
-        let free = scene.sheet.point_mass_kg * scene.stepping.rate_hz * scene.stepping.rate_hz;
+        let free = scene.point_mass_kg() * scene.stepping.rate_hz * scene.stepping.rate_hz;
         let newtons = spacing_m * if stiffness > 0.0 { stiffness } else { free };
         let mut tissue = at_rest(&model);
         let profile = LoadProfile {
-            centre: CentreProfile::Hops(vec![(0, scene.shape().rest_m(scene.sheet.point(at)))]),
+            centre: CentreProfile::Hops(vec![(0, scene.shape().rest_m(pushed))]),
             strength: StrengthProfile::Scaled(load.force * newtons, load.profile),
             falloff_per_m: load.falloff / spacing_m,
             falloff_offset: 0.0,
         };
         tissue.push(0, Some(Push::Profile(profile)));
-        let looked_at = looked_at(scene).map(|point| model.index_of(point));
         let mut course = Vec::with_capacity(steps);
         let mut is_sound = true;
         while is_sound && course.len() < steps {
             is_sound = tissue.step().is_ok() && tissue.guard_events() == 0 && !self.is_stopped();
-            course.push(looked_at.map(|index| {
-                let point = tissue.point(PointId::new(index));
+            course.push(self.looked_at.map(|point| {
+                let point = tissue.point(point);
                 [point.displacement_m, point.reaction_n()]
             }));
         }
@@ -277,18 +274,6 @@ impl<'s> Rehearsal<'s> {
     }
 }
 
-/// The point that is pushed.
-fn pushed(scene: &Scene) -> [usize; 2] {
-    let [nx, ny] = scene.sheet.points;
-    [nx / 3, 2 * ny / 5]
-}
-
-/// The points that are compared: the one that is pushed, the middle, and one at a corner, where springs are fewer.
-fn looked_at(scene: &Scene) -> [[usize; 2]; 3] {
-    let [nx, ny] = scene.sheet.points;
-    [pushed(scene), [nx / 2, ny / 2], [1.min(nx - 1), 1.min(ny - 1)]]
-}
-
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
@@ -299,21 +284,6 @@ mod tests {
     fn scene(sets: &[&str]) -> Scene {
         let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
         Scene::parse("paper", PAPER, &sets, &Limits::default()).unwrap()
-    }
-
-    #[test]
-    fn points_that_are_looked_at_are_on_the_sheet_and_one_is_its_middle() {
-        for points in [[1, 1], [1, 2], [2, 1], [9, 1], [1, 8], [2, 2], [11, 4], [12, 12]] {
-            let scene = scene(&[&format!("sheet.points={points:?}")]);
-            let looked_at = looked_at(&scene);
-            let on_sheet = looked_at.iter().all(|point| point[0] < points[0] && point[1] < points[1]);
-            assert!(on_sheet && looked_at[0] == pushed(&scene), "{points:?}: {looked_at:?}");
-            for axis in 0..2 {
-                // As far from either end, or nearer to the last by one point.
-                let after = points[axis] - 1 - looked_at[1][axis];
-                assert!(looked_at[1][axis] == after || looked_at[1][axis] == after + 1, "{points:?}: {looked_at:?}");
-            }
-        }
     }
 
     /// A course of values that depend on the part of the course that is over.

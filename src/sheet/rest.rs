@@ -11,10 +11,10 @@ impl<T: Real> Sheet<T> {
     /// Wakes tiles whose force changes in the coming step.
     pub(super) fn wake_what_is_pushed(&mut self) {
         let Sheet { model, applied, tiles, steps, .. } = self;
-        let spacing_m = model.scene.sheet.spacing_m;
+        let spacing_m = model.unit_m;
         for change in applied.changes(model, *steps) {
             // No force moves its centre less than it would if all springs held the centre.
-            let stiffness = model.omega_bound_per_s.powi(2) * model.scene.sheet.point_mass_kg;
+            let stiffness = model.omega_bound_per_s.powi(2) * model.scene.point_mass_kg();
             if stiffness > 0.0 {
                 tiles.largest = tiles.largest.max(change.peak_n() / (stiffness * spacing_m));
             }
@@ -51,7 +51,7 @@ impl<T: Real> Sheet<T> {
             return;
         }
         let Sheet { model, plan, tables, state, tiles, prescribed, contacts, applied, .. } = self;
-        let spacing_m = model.scene.sheet.spacing_m;
+        let spacing_m = model.unit_m;
         // Tiles under a tool that holds or touches stay awake.
         let grasped = prescribed.grasped().map(|(index, _)| model.point_of(index));
         let held: Vec<usize> = grasped.chain(contacts.points()).map(|point| tiles.of(point)).collect();
@@ -114,7 +114,7 @@ mod tests {
         let always = ["stepping.integrator=central", "stepping.substeps=1"];
         let model = Model::paper(&[&always[..], sets].concat());
         let mut sheet = Sheet::new(&model);
-        let centre_m = model.scene.sheet.spacing_m * DVec3::new(1.0, 1.0, 0.0);
+        let centre_m = model.scene.sheet().unwrap().spacing_m * DVec3::new(1.0, 1.0, 0.0);
         let force_n = DVec3::new(0.0, 0.0, -1.0);
         sheet
             .push(0, Some(Push::Constant(Poke { point: None, centre_m, force_n, falloff_per_m, falloff_offset: 0.0 })));
@@ -127,7 +127,7 @@ mod tests {
         sheet.step().unwrap();
         // The fastest vibration of a sheet without flexion springs is as stiff as 12 k + K″ (`stability`).
         let expected_m = 1.0 / (12.0 * 10.0 + 5.0);
-        let found_m = sheet.tiles.largest * sheet.model.scene.sheet.spacing_m;
+        let found_m = sheet.tiles.largest * sheet.model.scene.sheet().unwrap().spacing_m;
         assert!((found_m - expected_m).abs() < 1e-9, "{found_m} {expected_m}");
     }
 

@@ -50,6 +50,11 @@ impl<T: Real> Kind<T> {
         }
     }
 
+    /// Of length and stiffness 1.
+    pub(super) fn unit() -> Self {
+        Kind::new(1.0, 1.0)
+    }
+
     /// Lanes where [`Kind::near`] does not hold, given the magnitude of Q.
     #[inline(always)]
     pub(super) fn is_far<V: Vector<Real = T>>(&self, magnitude: V) -> V::Mask {

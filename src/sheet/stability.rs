@@ -1,7 +1,7 @@
 //! How fast the sheet can vibrate, and how many substeps that asks for.
 
 use super::integrate::{Bound, Oscillator, Scheme, entry};
-use crate::scene::{Integrator, Springs};
+use crate::scene::{Body, Integrator, Scene, Springs};
 
 /// Largest phase of the fastest vibration per substep of central differences, rad: dt·ω_b ≤ θ. The scheme is stable
 /// below 2; its error falls with θ². At 0.25 the force of the stiffest scenes is within 5e-3.
@@ -21,6 +21,14 @@ pub fn endurance(omega_per_s: f64, decay_s: f64) -> f64 {
 }
 
 /// Largest eigenvalue of the springs' stiffness matrix under any deformation, N/m.
+pub fn largest_stiffness_n_per_m(scene: &Scene) -> f64 {
+    match &scene.body {
+        Body::Sheet(_) => largest_stiffness_of_a_sheet_n_per_m(&scene.springs),
+        Body::Mesh(mesh) => scene.springs.stiffness_n_per_m * mesh.stiffest.bound,
+    }
+}
+
+/// The same of the springs of a sheet, N/m.
 ///
 /// A spring with unit direction n contributes k(nnᵀ + (1 − L0/L)(I − nnᵀ)) to the tangent stiffness, which is at
 /// most k·I: so no deformation makes the matrix larger than the graph Laplacian with weights k. On the unbounded
@@ -30,7 +38,7 @@ pub fn endurance(omega_per_s: f64, decay_s: f64) -> f64 {
 ///
 /// k₁ structural, k₂ shear, k₃ flexion; a finite sheet has fewer springs, and smaller eigenvalues. With all k equal
 /// the largest is 12k without and 16⅓·k with flexion.
-pub fn largest_stiffness_n_per_m(springs: &Springs) -> f64 {
+pub fn largest_stiffness_of_a_sheet_n_per_m(springs: &Springs) -> f64 {
     let (k1, k2) = (springs.stiffness_n_per_m, springs.shear_stiffness_n_per_m);
     let k3 = if springs.flexion { k1 } else { 0.0 };
     let eigenvalue =
@@ -138,7 +146,7 @@ mod tests {
                 };
                 let angles = (0..=720).map(|n| f64::from(n) * std::f64::consts::PI / 720.0);
                 let most = angles.clone().flat_map(|a| angles.clone().map(move |b| wave(a, b))).fold(0.0, f64::max);
-                let found = largest_stiffness_n_per_m(&springs(k, shear, flexion));
+                let found = largest_stiffness_of_a_sheet_n_per_m(&springs(k, shear, flexion));
                 assert!(found >= most - 1e-12 && found <= most * (1.0 + 1e-4), "{k} {shear} {flexion}: {found} {most}");
             }
         }

@@ -304,7 +304,7 @@ impl<T: Real> Sheet<T> {
             let [_, free, _] = self.free_point(index, self.applied.until(model, index));
             motion.velocity_m_per_s.length_squared() - free.length_squared()
         });
-        let grasped_j = 0.5 * model.scene.sheet.point_mass_kg * own.sum::<f64>();
+        let grasped_j = 0.5 * model.scene.point_mass_kg() * own.sum::<f64>();
         energy.kinetic_j += grasped_j;
         (survey, energy, kept_j + grasped_j)
     }
@@ -312,10 +312,9 @@ impl<T: Real> Sheet<T> {
     /// The energies of a survey, and the energy that the scheme conserves.
     pub(super) fn energy_of(&self, survey: &Survey) -> (Energy, f64) {
         let Sheet { model, plan, .. } = self;
-        let sheet = &model.scene.sheet;
         // Twice the energy of a point that moves by a spacing in a substep.
-        let unit_j = sheet.point_mass_kg * (sheet.spacing_m / plan.substep_s).powi(2);
-        let stiffness = model.scene.virtual_stiffness_n_per_m * sheet.spacing_m * sheet.spacing_m;
+        let unit_j = model.scene.point_mass_kg() * (model.unit_m / plan.substep_s).powi(2);
+        let stiffness = model.scene.virtual_stiffness_n_per_m * model.unit_m * model.unit_m;
         let energy = Energy {
             kinetic_j: 0.5 * unit_j * survey.speed_squared,
             spring_j: unit_j / plan.scheme.spring_scale() * survey.spring_energy,

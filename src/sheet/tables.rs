@@ -7,25 +7,46 @@ use std::sync::Arc;
 use super::advance::AdvanceStage;
 use super::applied::{self, Pull, Term};
 use super::field::{BLOCK, Field, Layout, State};
+use super::graph::Graph;
 use super::grid::Grid;
 use super::integrate::arithmetic::{Arithmetic, MAX_KEPT};
 use super::lanes::{self, Width};
+use super::mesh::{MeshSprings, MeshSweep, Records};
+use super::model::Model;
 use super::real::Real;
 use super::region::Region;
 use super::springs::Springs;
 use super::stage::Stage;
 use super::sweep::Sweep;
-use crate::scene::Lanes;
 
 /// Number of tool forces that need no heap memory.
 const FEW: usize = 4;
+
+/// The springs of a tissue, their forces in a scheme's terms.
+#[derive(Debug, Clone)]
+pub(super) enum Elastic<T> {
+    Sheet(Springs<T>),
+    Mesh(Arc<MeshSprings<T>>),
+}
+
+impl<T: Real> Elastic<T> {
+    /// The force of all springs on a point, gathered: for the few points that a caller asks about.
+    pub(super) fn gather(&self, layout: &Layout, u: &[T], point: [usize; 2]) -> [T; 3] {
+        match self {
+            Elastic::Sheet(springs) => springs.gather(layout, u, point),
+            Elastic::Mesh(springs) => springs.gather(layout, u, point[0] * BLOCK + point[1]),
+        }
+    }
+}
 
 /// The buffers and tables that a sweep needs beside the state. One for each sheet, made once.
 #[derive(Debug)]
 pub(super) struct SweepTables<T> {
     width: Width,
     pub(super) layout: Layout,
-    pub(super) springs: Springs<T>,
+    pub(super) springs: Elastic<T>,
+    /// How the points of a mesh lie together, and its displacements as records; none of a sheet.
+    mesh: Option<(Arc<Graph>, RefCell<Records<T>>)>,
     /// 1 where a point moves, 0 where it is fixed: one plane. `None` if every point moves.
     pub(super) free: Option<Field<T>>,
     /// Only the first rows of each plane are used. Planes of the layout's length need no extra address registers.
@@ -35,22 +56,38 @@ pub(super) struct SweepTables<T> {
 }
 
 impl<T: Real> SweepTables<T> {
-    pub(super) fn new(lanes: Lanes, layout: Layout, springs: Springs<T>, fixed: &[usize]) -> Self {
-        let free = (!fixed.is_empty()).then(|| {
+    pub(super) fn new(model: &Model, layout: Layout, springs: Elastic<T>) -> Self {
+        let free = (!model.fixed.is_empty()).then(|| {
             let mut free = Field::of_length(layout.plane);
             free.fill(T::of(1.0));
-            fixed.iter().for_each(|index| free[layout.offset(*index)] = T::default());
+            model.fixed.iter().for_each(|index| free[layout.offset(*index)] = T::default());
             free
         });
         let zero = [T::default(); BLOCK];
+        let carry = if model.graph.is_some() { Field::of_length(0) } else { Field::zero(&layout) };
         SweepTables {
-            width: Width::of(lanes),
+            width: Width::of(model.lanes),
             layout,
             springs,
+            mesh: model.graph.clone().map(|graph| (graph, RefCell::new(Records::new(layout.rows)))),
             free,
-            carry: RefCell::new(Field::zero(&layout)),
+            carry: RefCell::new(carry),
             probe: zero,
             work: zero,
+        }
+    }
+
+    /// Of a copy that stays as it is: without what a sweep needs.
+    pub(super) fn for_copy(&self) -> Self {
+        SweepTables {
+            width: self.width,
+            layout: self.layout,
+            springs: self.springs.clone(),
+            mesh: None,
+            free: None,
+            carry: RefCell::new(Field::of_length(0)),
+            probe: self.probe,
+            work: self.work,
         }
     }
 
@@ -92,15 +129,12 @@ impl<T: Real> SweepTables<T> {
             work: self.work.as_mut_ptr(),
         };
         let of_points = |field: &Field<T>| field.len() == 3 * self.layout.plane;
-        debug_assert!(state.fields().all(of_points) && of_points(self.carry.get_mut()));
+        debug_assert!(state.fields().all(of_points));
         debug_assert!(self.free.as_ref().is_none_or(|free| free.len() == self.layout.plane));
         debug_assert!(over.is_within(&self.layout));
-        let carry = self.carry.get_mut().as_mut_ptr();
-        let grid = Grid { layout: self.layout, springs: &self.springs, x: u.cast_const(), carry };
-        let sweep = Sweep { grid, over, stage };
         // SAFETY: all fields have the layout's three planes, padded by a row and a block, and the tables have this
         // layout; u is written behind what the sweep still reads, through the same pointer.
-        unsafe { lanes::run(self.width, &sweep) };
+        unsafe { self.run(u.cast_const(), over, stage) };
     }
 
     /// Sweeps over the displacements `u`.
@@ -109,11 +143,32 @@ impl<T: Real> SweepTables<T> {
     /// `u` and the pointers of the stage belong to fields of this layout.
     pub(super) unsafe fn survey<S: Stage<T>>(&self, u: *const T, over: &Region, stage: S) {
         debug_assert!(over.is_within(&self.layout));
-        let mut carry = self.carry.borrow_mut();
-        let grid = Grid { layout: self.layout, springs: &self.springs, x: u, carry: carry.as_mut_ptr() };
-        let sweep = Sweep { grid, over, stage };
         // SAFETY: as above.
-        unsafe { lanes::run(self.width, &sweep) };
+        unsafe { self.run(u, over, stage) };
+    }
+
+    /// Runs a sweep over the springs.
+    ///
+    /// # Safety
+    /// As for [`SweepTables::survey`].
+    unsafe fn run<S: Stage<T>>(&self, x: *const T, over: &Region, stage: S) {
+        let layout = self.layout;
+        match (&self.springs, &self.mesh) {
+            (Elastic::Mesh(springs), Some((graph, records))) => {
+                let sweep = MeshSweep { layout, springs, graph, x, records, over, stage };
+                // SAFETY: the caller's promise.
+                unsafe { lanes::run(self.width, &sweep) };
+            }
+            (Elastic::Sheet(springs), _) => {
+                let mut carry = self.carry.borrow_mut();
+                debug_assert!(carry.len() == 3 * layout.plane);
+                let grid = Grid { layout, springs, x, carry: carry.as_mut_ptr() };
+                // SAFETY: the caller's promise.
+                unsafe { lanes::run(self.width, &Sweep { grid, over, stage }) };
+            }
+            // The springs of a mesh come with its graph.
+            (Elastic::Mesh(_), None) => {}
+        }
     }
 
     /// Whether all increments since the last call were finite and below `farthest`. False may also come from a sum of

@@ -18,7 +18,7 @@ use glam::{DMat3, DVec2, DVec3};
 use super::footprint::{Footprint, Reached};
 use super::model::Model;
 use crate::memory;
-use crate::scene::{Fixed, Sheet};
+use crate::scene::{Body, Fixed, Sheet};
 use crate::shape::RestShape;
 
 /// How many times its reach around a disc the sheet is looked at: e⁻⁶ is left.
@@ -154,16 +154,15 @@ impl Window {
     }
 
     fn at(model: &Model, radius_m: f64, centre_m: DVec2) -> Self {
-        let scene = &model.scene;
-        let centre = centre_m / scene.sheet.spacing_m;
+        let centre = centre_m / model.unit_m;
         let half = half_window(model, radius_m);
         let (mut origin, mut size) = ([0; 2], [0; 2]);
         for axis in 0..2 {
             // Saturating casts: no virtual springs, no end.
             #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
             let [low, high] = [centre[axis] - half, centre[axis] + half].map(|edge| edge.round().max(0.0) as usize);
-            origin[axis] = low.min(scene.sheet.points[axis] - 1);
-            size[axis] = high.min(scene.sheet.points[axis] - 1) + 1 - origin[axis];
+            origin[axis] = low.min(model.points[axis] - 1);
+            size[axis] = high.min(model.points[axis] - 1) + 1 - origin[axis];
         }
         Window { origin, size }
     }
@@ -188,12 +187,12 @@ fn half_window(model: &Model, radius_m: f64) -> f64 {
     let springs = &scene.springs;
     let stiffest = springs.stiffness_n_per_m.max(springs.shear_stiffness_n_per_m);
     let reach = (stiffest / scene.virtual_stiffness_n_per_m).sqrt().max(1.0);
-    radius_m / scene.sheet.spacing_m + REACHES * reach + 2.0
+    radius_m / model.unit_m + REACHES * reach + 2.0
 }
 
 /// The same in m.
 pub fn half_window_m(model: &Model, radius_m: f64) -> f64 {
-    half_window(model, radius_m) * model.scene.sheet.spacing_m
+    half_window(model, radius_m) * model.unit_m
 }
 
 impl<'m> Patch<'m> {
@@ -254,7 +253,7 @@ impl<'m> Patch<'m> {
                             continue;
                         }
                         #[allow(clippy::cast_precision_loss)]
-                        let rest_m = self.model.scene.sheet.spacing_m * DVec3::new(di as f64, dj as f64, 0.0);
+                        let rest_m = self.model.unit_m * DVec3::new(di as f64, dj as f64, 0.0);
                         let (tangent, force_n) = (DMat3::ZERO, DVec3::ZERO);
                         self.springs.push(Spring { ends, rest_m, stiffness_n_per_m, tangent, force_n });
                     }
@@ -378,14 +377,14 @@ impl<'m> Patch<'m> {
             stiffness_n_per_m,
             damping_n_s_per_m: scene.damping_n_s_per_m * unit,
             drag_n_s_per_m: scene.damping_n_s_per_m * self.slopes(),
-            mass_kg: scene.sheet.point_mass_kg * unit.z_axis.z,
+            mass_kg: scene.point_mass_kg() * unit.z_axis.z,
             iterations,
         }
     }
 
     /// Σ |∂u/∂x|², the mean of both directions.
     fn slopes(&self) -> f64 {
-        let spacing_m = self.model.scene.sheet.spacing_m;
+        let spacing_m = self.model.unit_m;
         let mut sum = 0.0;
         for i in 1..self.size[0].saturating_sub(1) {
             for j in 1..self.size[1].saturating_sub(1) {
@@ -427,7 +426,7 @@ impl<'m> Patch<'m> {
                 largest_m = largest_m.max(change.abs().max_element());
             }
             self.linearise();
-            if largest_m < self.accuracy.arrived * self.model.scene.sheet.spacing_m || self.allowance.is_spent() {
+            if largest_m < self.accuracy.arrived * self.model.unit_m || self.allowance.is_spent() {
                 break;
             }
         }
@@ -506,6 +505,8 @@ impl Press {
     pub fn within(model: &Model, course: Course, accuracy: Accuracy, work: u64) -> Option<Self> {
         // A solution takes as many iterations as there are points from the middle to where nothing is noticed, or nearly
         // so, and each depth some solutions: what can't be done is not begun, and no memory is taken for it.
+        // There is none yet for a mesh.
+        model.scene.sheet()?;
         let [rows, columns] = Window::at(model, course.radius_m, course.centre_m.truncate()).size;
         let least = (rows * columns) as u64 * 4 * u64::from(course.count) * (rows.max(columns) as u64);
         (least <= work).then(|| Press { left: work, ..Self::new(model, course, accuracy) })
@@ -554,7 +555,7 @@ impl Press {
 /// springs are of an area.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
 pub fn stand_in(model: &Model, spacing_m: f64, half_m: f64) -> Model {
-    let fine = &model.scene.sheet;
+    let Some(fine) = model.scene.sheet() else { return model.clone() };
     let times = spacing_m / fine.spacing_m;
     let is_cut = fine.longest_side_m() > 2.0 * half_m;
     // As many on either side of the middle.
@@ -574,10 +575,12 @@ pub fn stand_in(model: &Model, spacing_m: f64, half_m: f64) -> Model {
     };
     let mut scene = model.scene.clone();
     let area = times * times;
-    scene.sheet = Sheet { points, spacing_m, point_mass_kg: area * fine.point_mass_kg, fixed };
+    let sheet = Sheet { points, spacing_m, point_mass_kg: area * fine.point_mass_kg, fixed };
+    let fixed = sheet.fixed_indices();
+    scene.body = Body::Sheet(sheet);
     scene.virtual_stiffness_n_per_m *= area;
     scene.damping_n_s_per_m *= area;
-    Model { points, fixed: scene.sheet.fixed_indices(), scene, ..model.clone() }
+    Model { points, fixed, unit_m: spacing_m, scene, ..model.clone() }
 }
 
 #[cfg(test)]

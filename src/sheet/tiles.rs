@@ -21,9 +21,12 @@
 
 use std::cell::Cell;
 use std::ops::Range;
+use std::sync::Arc;
 
 use super::applied::ForceChange;
 use super::field::{Field, Layout};
+use super::graph::Graph;
+use super::model::Model;
 use super::real::Real;
 use super::region::{Marks, Region, TILE, tiles};
 use crate::memory;
@@ -54,7 +57,7 @@ const SNAPSHOT: usize = NEIGHBOURS.len() * 3 * TILE;
 /// The name of the tables in messages.
 const TABLES: &str = "the tiles of a sheet";
 
-/// Points next to a sleeping tile, in an awake tile.
+/// Points next to a sleeping tile of a sheet, in an awake tile.
 #[derive(Debug, Clone, Copy)]
 struct EdgeWatch {
     tile: usize,
@@ -74,6 +77,10 @@ pub(super) struct SleepTiles<T> {
     counts: [usize; 2],
     /// Number of rows that a spring reaches on.
     reach: usize,
+    /// Which tiles of a mesh have springs between them; none of a sheet.
+    graph: Option<Arc<Graph>>,
+    /// Number of points.
+    points: usize,
     /// Without a tolerance, nothing sleeps.
     tolerance: f64,
     pub(super) region: Region,
@@ -90,8 +97,10 @@ pub(super) struct SleepTiles<T> {
     elastic_j: Vec<Cell<Option<[f64; 2]>>>,
     /// Positions of the points around each tile; allocated when the first tile sleeps.
     snapshots: Vec<T>,
-    /// The comparisons of the sleeping tiles next to awake ones.
+    /// The comparisons of the sleeping tiles next to awake ones, on a sheet.
     watches: Vec<EdgeWatch>,
+    /// The sleeping tiles that have springs to awake ones, on a mesh.
+    watched: Vec<usize>,
     /// Tiles that were awake since the last checkpoint.
     touched: Marks,
     /// Tiles that were ever awake, or whose springs reach such a tile. In all others nothing has ever moved: all is 0.
@@ -102,13 +111,21 @@ pub(super) struct SleepTiles<T> {
 
 impl<T: Real> SleepTiles<T> {
     /// All asleep if there is a tolerance (a sheet at rest). Otherwise all awake, for good.
-    pub(super) fn new(layout: Layout, tolerance: f64, reach: usize) -> Self {
+    pub(super) fn new(layout: Layout, model: &Model) -> Self {
+        let reach = if model.scene.springs.flexion { 2 } else { 1 };
+        let joined = (model.graph.clone(), model.len());
+        SleepTiles::asleep(layout, model.tile_tolerance(), reach, joined)
+    }
+
+    fn asleep(layout: Layout, tolerance: f64, reach: usize, (graph, points): (Option<Arc<Graph>>, usize)) -> Self {
         let counts = [tiles(layout.rows), tiles(layout.columns)];
         let count = counts[0] * counts[1];
         let mut tiles = SleepTiles {
             layout,
             counts,
             reach,
+            graph,
+            points,
             tolerance,
             region: Region::none(&layout),
             awake_points: 0,
@@ -119,6 +136,7 @@ impl<T: Real> SleepTiles<T> {
             elastic_j: memory::filled(count, Cell::new(None), TABLES),
             snapshots: Vec::new(),
             watches: Vec::new(),
+            watched: Vec::new(),
             touched: Marks::none_of(count),
             moved: Marks::none_of(count),
             largest: 0.0,
@@ -139,8 +157,10 @@ impl<T: Real> SleepTiles<T> {
             elastic_j: Vec::new(),
             snapshots: Vec::new(),
             watches: Vec::new(),
+            watched: Vec::new(),
             touched: Marks::default(),
             moved: self.moved.clone(),
+            graph: self.graph.clone(),
             ..*self
         }
     }
@@ -188,10 +208,15 @@ impl<T: Real> SleepTiles<T> {
         self.region.cover(&self.layout, self.reach);
         self.awake_points = 0;
         self.watches.clear();
+        self.watched.clear();
         for index in 0..self.region.tiles().len() {
             let tile = self.region.tiles()[index];
             self.awake_points += self.rows(tile).len() * self.columns(tile).len();
             self.touched.add(tile);
+            if let Some(graph) = &self.graph {
+                self.watched.extend(graph.beside(tile).iter().filter(|other| !self.region.awake.has[**other]));
+                continue;
+            }
             // The order of neighbours is the reverse of that of their opposites.
             for (side, opposite) in (0..NEIGHBOURS.len()).zip((0..NEIGHBOURS.len()).rev()) {
                 let beside = self.neighbour(tile, opposite);
@@ -202,6 +227,24 @@ impl<T: Real> SleepTiles<T> {
                 }
             }
         }
+        self.watched.sort_unstable();
+        self.watched.dedup();
+        // The last tile of a mesh has empty places.
+        self.awake_points = self.awake_points.min(self.points);
+    }
+
+    /// The tiles that springs join to a tile.
+    fn beside(&self, tile: usize) -> impl Iterator<Item = usize> + '_ {
+        let of_mesh = self.graph.as_ref().map_or(&[][..], |graph| graph.beside(tile));
+        let sides = if self.graph.is_some() { 0 } else { NEIGHBOURS.len() };
+        of_mesh.iter().copied().chain((0..sides).filter_map(move |side| self.neighbour(tile, side)))
+    }
+
+    /// The tiles where springs begin that reach a tile: all that are joined to it, on a mesh.
+    fn pulling(&self, tile: usize) -> impl Iterator<Item = usize> + '_ {
+        let of_mesh = self.graph.as_ref().map_or(&[][..], |graph| graph.beside(tile));
+        let sides = if self.graph.is_some() { &[][..] } else { &PULLING };
+        of_mesh.iter().copied().chain(sides.iter().filter_map(move |side| self.neighbour(tile, *side)))
     }
 
     fn neighbour(&self, tile: usize, side: usize) -> Option<usize> {
@@ -236,10 +279,10 @@ impl<T: Real> SleepTiles<T> {
                 any = true;
                 self.asleep_j -= self.energy_j[tile];
                 self.calm[tile] = 0;
-                let around = (0..NEIGHBOURS.len()).filter_map(|side| self.neighbour(tile, side));
-                around.chain([tile]).for_each(|other| self.elastic_j[other].set(None));
-                let pulling = PULLING.map(|side| self.neighbour(tile, side));
-                pulling.into_iter().flatten().chain([tile]).for_each(|other| _ = self.moved.add(other));
+                self.beside(tile).chain([tile]).for_each(|other| self.elastic_j[other].set(None));
+                let mut moved = std::mem::take(&mut self.moved);
+                self.pulling(tile).chain([tile]).for_each(|other| _ = moved.add(other));
+                self.moved = moved;
             }
         }
         if any {
@@ -267,11 +310,27 @@ impl<T: Real> SleepTiles<T> {
 
     /// Wakes tiles whose neighbours have moved by more than `far`.
     pub(super) fn wake_beside_moved(&mut self, u: &Field<T>, far: f64) {
-        if self.watches.is_empty() {
+        if self.watches.is_empty() && self.watched.is_empty() {
             return;
         }
         self.remember();
         let far = T::of(far);
+        if let Some(graph) = &self.graph {
+            let moved = |tile: &&usize| {
+                let around = graph.around(**tile);
+                let then = &self.snapshots[3 * around.start..3 * around.end];
+                (0..3).any(|c| {
+                    let here = graph
+                        .slots_around(**tile)
+                        .iter()
+                        .map(|slot| &u[c * self.layout.plane + self.layout.offset(*slot)]);
+                    let then = &then[c * around.len()..(c + 1) * around.len()];
+                    here.zip(then).fold(false, |any, (now, then)| any | ((*now - *then).magnitude() > far))
+                })
+            };
+            let waking: Vec<usize> = self.watched.iter().filter(moved).copied().collect();
+            return self.wake(waking);
+        }
         let moved = |watch: &&EdgeWatch| {
             let EdgeWatch { first, next, count, then, .. } = **watch;
             (0..3).any(|c| {
@@ -292,7 +351,8 @@ impl<T: Real> SleepTiles<T> {
     /// Allocates the snapshots. Before the first sleep, all points were at 0.
     fn remember(&mut self) {
         if self.snapshots.is_empty() {
-            self.snapshots = memory::zeroed(self.calm.len() * SNAPSHOT, TABLES);
+            let values = self.graph.as_ref().map_or(self.calm.len() * SNAPSHOT, |graph| 3 * graph.watched_slots());
+            self.snapshots = memory::zeroed(values, TABLES);
         }
     }
 
@@ -302,6 +362,15 @@ impl<T: Real> SleepTiles<T> {
     /// tile.
     pub(super) fn pushed(&mut self, change: &ForceChange, spacing_m: f64, least_n: f64) {
         let mut waking = Vec::new();
+        if let Some(graph) = self.graph.clone() {
+            for tile in (0..self.calm.len()).filter(|tile| !self.region.awake.has[*tile]) {
+                self.drift_n[tile] += change.most_n(graph.box_of(tile));
+                if self.drift_n[tile] > least_n {
+                    waking.push(tile);
+                }
+            }
+            return self.wake(waking);
+        }
         let within = |sides: [Range<usize>; 2]| sides.map(|points| points.start / TILE..tiles(points.end));
         let [old, new] = match change.reached() {
             reached if least_n > 0.0 => reached.map(within),
@@ -317,7 +386,7 @@ impl<T: Real> SleepTiles<T> {
                 #[allow(clippy::cast_precision_loss)]
                 let sides = [self.rows(tile), self.columns(tile)]
                     .map(|range| [range.start as f64 * spacing_m, (range.end - 1) as f64 * spacing_m]);
-                self.drift_n[tile] += change.most_n(sides);
+                self.drift_n[tile] += change.most_n(&sides);
                 if self.drift_n[tile] > least_n {
                     waking.push(tile);
                 }
@@ -379,8 +448,7 @@ impl<T: Real> SleepTiles<T> {
     /// Caches the energies of a sleeping tile if nothing can change them before it or a neighbour wakes. (In a
     /// multistep scheme the observed displacement depends on the springs' force, and so on all tiles around.)
     pub(super) fn keep_energies(&self, tile: usize, elastic_j: [f64; 2]) {
-        let mut beyond = (0..NEIGHBOURS.len()).filter_map(|side| self.neighbour(tile, side));
-        if !beyond.any(|other| self.region.awake.has[other]) {
+        if !self.beside(tile).any(|other| self.region.awake.has[other]) {
             self.elastic_j[tile].set(Some(elastic_j));
         }
     }
@@ -393,6 +461,16 @@ impl<T: Real> SleepTiles<T> {
             self.energy_j[tile] = energy_j;
             self.asleep_j += energy_j;
             self.drift_n[tile] = 0.0;
+            if let Some(graph) = &self.graph {
+                let around = graph.around(tile);
+                for c in 0..3 {
+                    for (slot, k) in graph.slots_around(tile).iter().zip(0..) {
+                        self.snapshots[3 * around.start + c * around.len() + k] =
+                            u[c * self.layout.plane + self.layout.offset(*slot)];
+                    }
+                }
+                continue;
+            }
             for side in 0..NEIGHBOURS.len() {
                 if self.neighbour(tile, side).is_none() {
                     continue;

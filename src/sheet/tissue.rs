@@ -137,10 +137,11 @@ pub trait Tissue: Send {
     fn energy(&self) -> Energy;
     /// Length of the largest displacement, m.
     fn largest_displacement_m(&self) -> f64;
-    /// Writes the displacements, m, with x, y and z in separate vectors, points by rows.
+    /// Writes the displacements, m, with x, y and z in separate vectors, in the order of the points.
     fn displacements_m(&self, into: &mut [Vec<f32>; 3]);
-    /// Adds some blocks of 16 points of a row, counted by rows, to a hash: displacement, increment, and the scheme's kept
-    /// values of each point.
+    /// Blocks of at most 16 points, in the order in which they are hashed.
+    fn hash_block_count(&self) -> usize;
+    /// Adds some of these blocks to a hash: all that the future of each point depends on.
     fn hash_blocks(&self, blocks: Range<usize>, hasher: &mut Xxh3);
     /// XXH3-128 of the state of every point.
     fn state_hash(&self) -> u128 {
@@ -178,7 +179,7 @@ impl SheetCopy {
 /// A hash of a state that is not finished.
 pub struct Hashing {
     hasher: Box<Xxh3>,
-    /// The next block of points, by rows.
+    /// The next block of points.
     next: usize,
 }
 
@@ -191,8 +192,7 @@ impl Default for Hashing {
 impl Hashing {
     /// Adds at least one and at most so many points of a tissue, rounded up to a block. Returns the hash when all are in.
     fn add(&mut self, tissue: &(impl Tissue + ?Sized), points: usize) -> Option<u128> {
-        let [rows, columns] = tissue.model().points;
-        let blocks = rows * columns.div_ceil(BLOCK);
+        let blocks = tissue.hash_block_count();
         let end = self.next.saturating_add(points.div_ceil(BLOCK).max(1)).min(blocks);
         tissue.hash_blocks(self.next..end, &mut self.hasher);
         self.next = end;

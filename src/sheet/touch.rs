@@ -137,7 +137,7 @@ mod tests {
         for coupling in [Coupling::Constraint, Coupling::Spring { stiffness_n_per_m: 100.0, damping_n_s_per_m: 1.0 }] {
             for grasps in [false, true] {
                 let mut sheet = sheet(&["sheet.fixed=[[3, 3], [3, 4], [4, 3], [4, 4]]"]);
-                let spacing_m = sheet.model.scene.sheet.spacing_m;
+                let spacing_m = sheet.model.unit_m;
                 // In the middle of a cell, smaller than it: its four corners alone are under the disc.
                 let place_m = DVec3::new(3.5, 3.5, 0.0) * spacing_m;
                 let tip = Tip { radius_m: 0.1 * spacing_m, grasps, coupling, ..Tip::default() };

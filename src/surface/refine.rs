@@ -39,7 +39,10 @@ impl Refinement {
             let message = format!("must be from 0 to {LARGEST_REFINEMENT}, but is {n}");
             return Err(Refusal::new(Reason::OutOfRange, "refinement", message));
         }
-        let Sheet { points, spacing_m, .. } = scene.sheet;
+        let Some(Sheet { points, spacing_m, .. }) = scene.sheet().cloned() else {
+            let message = "there are no frames of a mesh yet: probe or sample its points";
+            return Err(Refusal::new(Reason::NotAvailable, "session_id", message));
+        };
         let refinement = Refinement { points, point_spacing_m: spacing_m, between: n as usize };
         let [x, y] = refinement.vertices();
         if x * y > limits.frame_vertices {

@@ -6,7 +6,7 @@ use std::sync::OnceLock;
 
 use super::refine::Points;
 use super::wide::{Available, LANES, SixteenLanes, Width, Work};
-use crate::scene::{Scene, Sheet};
+use crate::scene::Scene;
 
 /// The displacements of a sheet at one moment, from which frames are made.
 #[derive(Debug, Clone, PartialEq)]
@@ -28,7 +28,10 @@ pub struct Snapshot {
 impl Snapshot {
     /// Creates a snapshot of the tissue of a scene. `displacement_m` has a value for each point and component, m.
     pub fn new(scene: &Scene, step: u64, simulation_time_s: f64, displacement_m: [Vec<f32>; 3]) -> Self {
-        let Sheet { points, spacing_m, .. } = scene.sheet;
+        let (points, spacing_m) = match scene.sheet() {
+            Some(sheet) => (sheet.points, sheet.spacing_m),
+            None => ([scene.shape().point_count(), 1], scene.shape().edge_m()),
+        };
         Snapshot { step, simulation_time_s, displacement_m, box_m: OnceLock::new(), points, spacing_m }
     }
 

@@ -31,8 +31,11 @@ pub fn every(field: &str, steps: Option<u32>) -> Result<u64> {
 
 /// The name of a mass point as a message.
 pub fn point(name: PointName) -> pb::GridPoint {
-    let PointName::Point(place) = name;
-    geometry::point(place)
+    match name {
+        PointName::Point(place) => geometry::point(place),
+        // Until the protocol has vertices: as the first of two indices.
+        PointName::Vertex(vertex) => pb::GridPoint { x: vertex, y: 0 },
+    }
 }
 
 /// The name of a mass point in a message.

@@ -6,7 +6,7 @@ use palpate_proto::pb;
 use super::required;
 use crate::refusal::{Reason, Refusal, Result};
 use crate::scene::{
-    Appearance, Change, Fixed, Integrator, Lanes, Named, PointSet, Precision, Scene, Sheet, Springs, Stepping,
+    Appearance, Body, Change, Fixed, Integrator, Lanes, Named, PointSet, Precision, Scene, Sheet, Springs, Stepping,
 };
 
 /// The scene in a message.
@@ -21,7 +21,7 @@ pub fn from_scene(message: &pb::Scene) -> Result<Scene> {
     let stiffness_n_per_m = required("springs.stiffness_n_per_m", springs.stiffness_n_per_m)?;
     Ok(Scene {
         name: if message.name.is_empty() { "unnamed".to_owned() } else { message.name.clone() },
-        sheet: Sheet {
+        body: Body::Sheet(Sheet {
             points: [
                 required("sheet.points_x", sheet.points_x)? as usize,
                 required("sheet.points_y", sheet.points_y)? as usize,
@@ -29,7 +29,7 @@ pub fn from_scene(message: &pb::Scene) -> Result<Scene> {
             spacing_m: required("sheet.spacing_m", sheet.spacing_m)?,
             point_mass_kg: required("sheet.point_mass_kg", sheet.point_mass_kg)?,
             fixed: from_fixed(sheet.fixed.as_ref())?,
-        },
+        }),
         springs: Springs {
             stiffness_n_per_m,
             shear_stiffness_n_per_m: springs.shear_stiffness_n_per_m.unwrap_or(stiffness_n_per_m),
@@ -95,26 +95,9 @@ pub fn update_tissue(session_id: &str, change: &Change, step: u64) -> pb::Update
 
 /// A scene as a message, with all defaults filled in.
 pub fn scene(scene: &Scene) -> pb::Scene {
-    #[allow(clippy::cast_possible_truncation)]
-    let [points_x, points_y] = scene.sheet.points.map(|points| Some(points as u32));
-    let fixed = match &scene.sheet.fixed {
-        Fixed::Edges => Some(pb::sheet::Fixed::FixedSet(pb::FixedSet::Edges.into())),
-        Fixed::Corners => Some(pb::sheet::Fixed::FixedSet(pb::FixedSet::Corners.into())),
-        Fixed::Points(points) if points.as_slice().is_empty() => None,
-        Fixed::Points(points) => {
-            let points = points.as_slice().iter().copied().map(point).collect();
-            Some(pb::sheet::Fixed::FixedPoints(pb::GridPoints { points }))
-        }
-    };
     pb::Scene {
         name: scene.name.clone(),
-        sheet: Some(pb::Sheet {
-            points_x,
-            points_y,
-            spacing_m: Some(scene.sheet.spacing_m),
-            point_mass_kg: Some(scene.sheet.point_mass_kg),
-            fixed,
-        }),
+        sheet: scene.sheet().map(sheet),
         springs: Some(pb::Springs {
             stiffness_n_per_m: Some(scene.springs.stiffness_n_per_m),
             shear_stiffness_n_per_m: Some(scene.springs.shear_stiffness_n_per_m),
@@ -134,6 +117,23 @@ pub fn scene(scene: &Scene) -> pb::Scene {
     }
 }
 
+/// A sheet as a message.
+fn sheet(sheet: &Sheet) -> pb::Sheet {
+    #[allow(clippy::cast_possible_truncation)]
+    let [points_x, points_y] = sheet.points.map(|points| Some(points as u32));
+    let fixed = match &sheet.fixed {
+        Fixed::Edges => Some(pb::sheet::Fixed::FixedSet(pb::FixedSet::Edges.into())),
+        Fixed::Corners => Some(pb::sheet::Fixed::FixedSet(pb::FixedSet::Corners.into())),
+        Fixed::Points(points) if points.as_slice().is_empty() => None,
+        Fixed::Points(points) => {
+            let points = points.as_slice().iter().copied().map(point).collect();
+            Some(pb::sheet::Fixed::FixedPoints(pb::GridPoints { points }))
+        }
+    };
+    let Sheet { spacing_m, point_mass_kg, .. } = *sheet;
+    pb::Sheet { points_x, points_y, spacing_m: Some(spacing_m), point_mass_kg: Some(point_mass_kg), fixed }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -144,7 +144,7 @@ mod tests {
         let mut paper = Scene::parse("paper", crate::scene::PAPER, &[], &Limits::default()).unwrap();
         let points = |points: &[[usize; 2]]| Fixed::Points(points.iter().copied().collect());
         for fixed in [Fixed::Edges, Fixed::Corners, points(&[]), points(&[[30, 0], [1, 2], [30, 0]])] {
-            paper.sheet.fixed = fixed;
+            paper.sheet_mut().unwrap().fixed = fixed;
             assert_eq!(from_scene(&scene(&paper)).unwrap(), paper);
         }
     }

@@ -64,9 +64,9 @@ pub fn advance(session: &mut Session, steps: u64) {
 pub fn push_on(scene: &Scene, [i, j]: [usize; 2], force_n: [f64; 3]) -> Push {
     Push::Constant(Poke {
         point: None,
-        centre_m: scene.shape().rest_m(scene.sheet.point([i, j])),
+        centre_m: scene.shape().rest_m(scene.sheet().unwrap().point([i, j])),
         force_n: force_n.into(),
-        falloff_per_m: 100.0 / scene.sheet.spacing_m,
+        falloff_per_m: 100.0 / scene.sheet().unwrap().spacing_m,
         falloff_offset: 0.0,
     })
 }

@@ -78,13 +78,13 @@ fn stiffness_converges_as_the_grid_gets_finer() {
     // The same tissue on finer grids: masses, virtual springs and damping scale with h², springs stay.
     let stiffness = |spacing_m: f64, points: usize| {
         let base = tissue("liver", &[]);
-        let share = (spacing_m / base.scene.sheet.spacing_m).powi(2);
+        let share = (spacing_m / base.scene.sheet().unwrap().spacing_m).powi(2);
         let model = tissue(
             "liver",
             &[
                 &format!("sheet.points=[{points}, {points}]"),
                 &format!("sheet.spacing_m={spacing_m}"),
-                &format!("sheet.point_mass_kg={}", share * base.scene.sheet.point_mass_kg),
+                &format!("sheet.point_mass_kg={}", share * base.scene.sheet().unwrap().point_mass_kg),
                 &format!("virtual_springs.stiffness_n_per_m={}", share * base.scene.virtual_stiffness_n_per_m),
                 &format!("damping.coefficient_n_s_per_m={}", share * base.scene.damping_n_s_per_m),
             ],
@@ -102,7 +102,7 @@ fn stiffness_converges_as_the_grid_gets_finer() {
 fn the_tissues_are_as_stiff_as_a_flat_punch_finds_them() {
     for (name, punch_n_per_m) in FLAT_PUNCH_N_PER_M {
         let model = tissue(name, &[]);
-        let spacing_m = model.scene.sheet.spacing_m;
+        let spacing_m = model.scene.sheet().unwrap().spacing_m;
         for beside in [DVec3::ZERO, DVec3::new(0.5, 0.5, 0.0) * spacing_m, DVec3::new(0.3 * spacing_m, 0.0, 0.0)] {
             let pressed = tangent::press(&model, 0.005, middle(&model) + beside, 0.0005, 3);
             let stiffness = pressed[1].force_n / pressed[1].depth_m;
@@ -231,14 +231,14 @@ fn the_lattice_passes_the_patch_test() {
         &["sheet.points=[9, 9]", "sheet.fixed=[]", "virtual_springs.stiffness_n_per_m=0.0", "stepping.precision=f64"],
     );
     let (strain, contraction) = (1e-4, -1e-4 / 3.0);
-    let spacing_m = model.scene.sheet.spacing_m;
+    let spacing_m = model.scene.sheet().unwrap().spacing_m;
     let even =
         |[i, j]: [usize; 2]| spacing_m * DVec3::new(strain * (i as f64 - 4.0), contraction * (j as f64 - 4.0), 0.0);
     let mut sheet = sheet::at_rest(&model);
     let rim = |[i, j]: [usize; 2]| i % 8 == 0 || j % 8 == 0;
     let mut tool = 0;
     for point in model.points() {
-        let place = model.scene.sheet.place_of(point);
+        let place = model.scene.sheet().unwrap().place_of(point);
         if rim(place) {
             sheet.grasp(tool, point, sheet::Grasp::Target(even(place)));
             tool += 1;
@@ -249,7 +249,7 @@ fn the_lattice_passes_the_patch_test() {
     }
     let mut pull_n = 0.0;
     for point in model.points() {
-        let (point, state) = (model.scene.sheet.place_of(point), sheet.point(point));
+        let (point, state) = (model.scene.sheet().unwrap().place_of(point), sheet.point(point));
         let off = (state.displacement_m - even(point)).length();
         assert!(off < 1e-3 * strain * spacing_m, "{point:?} is {off} m off");
         if point[0] == 8 {
@@ -264,7 +264,7 @@ fn the_lattice_passes_the_patch_test() {
 #[test]
 fn a_touch_beside_the_sheet_or_far_above_feels_nothing() {
     let model = tissue("liver", &[]);
-    let extent = model.scene.sheet.extent_m();
+    let extent = model.scene.sheet().unwrap().extent_m();
     for place in
         [DVec3::new(-0.02, 0.02, -0.01), (extent + DVec2::splat(0.02)).extend(-0.01), (extent / 2.0).extend(0.05)]
     {

@@ -47,7 +47,7 @@ fn poked(model: &Arc<Model>) -> Box<dyn Tissue> {
     let Push::Constant(mut poke) = crate::common::push_on(scene, [15, 15], [0.7, 0.0, -2.0]) else { unreachable!() };
     poke.falloff_per_m = 30.0;
     tissue.push(0, Some(Push::Constant(poke)));
-    tissue.grasp(1, model.scene.sheet.point([22, 8]), Grasp::Target(DVec3::new(0.0, 0.0, 0.02)));
+    tissue.grasp(1, model.scene.sheet().unwrap().point([22, 8]), Grasp::Target(DVec3::new(0.0, 0.0, 0.02)));
     tissue
 }
 
@@ -194,7 +194,7 @@ fn a_sheet_at_rest_wakes_for_it_and_sleeps_again() {
     let off_m = apart_m(&*tissue, &places(&*fresh));
     assert!(off_m < 2e-5 * fresh.largest_displacement_m(), "{off_m}");
     // Twice the virtual stiffness, with the other springs unchanged: less deep, and more than half as deep.
-    let centre = model.scene.sheet.point([15, 15]);
+    let centre = model.scene.sheet().unwrap().point([15, 15]);
     let ratio = tissue.point(centre).displacement_m.z / before[centre.index()].z;
     assert!((0.5..0.9).contains(&ratio), "{ratio}");
 }

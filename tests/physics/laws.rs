@@ -63,7 +63,7 @@ fn a_point_without_springs_is_the_damped_oscillator() {
                 // At the same times for both rates: the error is largest in the first milliseconds.
                 for _ in 0..1000 {
                     advance(&mut session, (rate_hz / 1000.0) as u64);
-                    let point = session.tissue().point(session.model().scene.sheet.point([3, 2]));
+                    let point = session.tissue().point(session.model().scene.sheet().unwrap().point([3, 2]));
                     let (u, v) = oscillator(mass, damping, virtual_stiffness, -0.2, session.time_s());
                     largest[0] = largest[0].max((point.displacement_m.z - u).abs());
                     largest[1] = largest[1].max((point.velocity_m_per_s.z - v).abs());
@@ -134,7 +134,7 @@ fn momentum_changes_by_the_outer_forces_alone() {
     let scene = scene_with(SMALL, &sets);
     let momentum = |tissue: &dyn Tissue| -> DVec3 {
         let velocities = tissue.model().points().map(|index| tissue.point(index).velocity_m_per_s);
-        scene.sheet.point_mass_kg * velocities.sum::<DVec3>()
+        scene.sheet().unwrap().point_mass_kg * velocities.sum::<DVec3>()
     };
     let mut tissue = sheet::at_rest(&model(&scene));
     let force_n = DVec3::new(0.4, 0.3, -0.6);
@@ -160,7 +160,7 @@ fn a_centred_poke_keeps_the_symmetry_of_the_sheet() {
     for _ in 0..200 {
         tissue.step().unwrap();
     }
-    let at = |i: usize, j: usize| tissue.point(tissue.model().scene.sheet.point([i, j])).displacement_m;
+    let at = |i: usize, j: usize| tissue.point(tissue.model().scene.sheet().unwrap().point([i, j])).displacement_m;
     for i in 0..9 {
         for j in 0..9 {
             let u = at(i, j);
@@ -200,8 +200,8 @@ struct Static<'a> {
 
 impl Static<'_> {
     fn energy_j(&self, u: &[DVec3]) -> f64 {
-        let [nx, ny] = self.scene.sheet.points;
-        let h = self.scene.sheet.spacing_m;
+        let [nx, ny] = self.scene.sheet().unwrap().points;
+        let h = self.scene.sheet().unwrap().spacing_m;
         let springs = &self.scene.springs;
         let mut links = vec![
             (1, 0, springs.stiffness_n_per_m),
@@ -252,7 +252,7 @@ impl Static<'_> {
 }
 
 fn newton(scene: &Scene, [i, j]: [usize; 2], load: DVec3) -> Vec<DVec3> {
-    let [nx, ny] = scene.sheet.points;
+    let [nx, ny] = scene.sheet().unwrap().points;
     let problem = Static { scene, loaded: i * ny + j, load };
     // Small loads first: Newton's method converges from a nearby start.
     let mut u = vec![DVec3::ZERO; nx * ny];
@@ -284,7 +284,7 @@ fn newton(scene: &Scene, [i, j]: [usize; 2], load: DVec3) -> Vec<DVec3> {
 /// The same forces by their formula, k(L − L0)(x_b − x_a)/L.
 fn exact_forces_n(problem: &Static<'_>, u: &[DVec3]) -> Vec<f64> {
     let scene = problem.scene;
-    let [nx, ny] = scene.sheet.points;
+    let [nx, ny] = scene.sheet().unwrap().points;
     let springs = &scene.springs;
     let mut forces = vec![DVec3::ZERO; nx * ny];
     for a in 0..nx * ny {
@@ -296,7 +296,7 @@ fn exact_forces_n(problem: &Static<'_>, u: &[DVec3]) -> Vec<f64> {
                 (2.0, 0.0) | (0.0, 2.0) if springs.flexion => springs.stiffness_n_per_m,
                 _ => continue,
             };
-            let rest = scene.sheet.spacing_m * DVec3::new(di, dj, 0.0);
+            let rest = scene.sheet().unwrap().spacing_m * DVec3::new(di, dj, 0.0);
             let now = rest + u[b] - u[a];
             forces[a] += k * (now.length() - rest.length()) / now.length() * now;
         }
@@ -337,7 +337,7 @@ fn the_force_field_is_minus_the_gradient_of_the_energy() {
     let scene = scene_with(SMALL, &sets);
     let tissue = shaken(&scene, 60);
     let u: Vec<DVec3> = tissue.model().points().map(|index| tissue.point(index).displacement_m).collect();
-    assert!(u.iter().any(|u| u.length() > 0.2 * scene.sheet.spacing_m), "the sheet is not deformed");
+    assert!(u.iter().any(|u| u.length() > 0.2 * scene.sheet().unwrap().spacing_m), "the sheet is not deformed");
     let problem = Static { scene: &scene, loaded: 0, load: DVec3::ZERO };
     for (index, expected) in problem.forces_n(&u).chunks(3).enumerate() {
         let point = tissue.point(PointId::new(index));
@@ -358,7 +358,7 @@ fn virtual_springs_alone_leave_every_point_to_itself() {
         tissue.step().unwrap();
     }
     for index in tissue.model().points() {
-        let expected = if index == tissue.model().scene.sheet.point([3, 2]) { -0.5 / 5.0 } else { 0.0 };
+        let expected = if index == tissue.model().scene.sheet().unwrap().point([3, 2]) { -0.5 / 5.0 } else { 0.0 };
         assert!((tissue.point(index).displacement_m.z - expected).abs() < 1e-9);
     }
 }
@@ -387,7 +387,7 @@ fn fixed_points_never_move_and_carry_the_load() {
         }
         let held: Vec<_> = tissue.model().points().map(|index| tissue.point(index)).collect();
         let mut carried = DVec3::ZERO;
-        for index in scene.sheet.fixed_indices() {
+        for index in scene.sheet().unwrap().fixed_indices() {
             assert_eq!(held[index].displacement_m, DVec3::ZERO);
             carried += held[index].constraint_n.unwrap();
         }
@@ -415,7 +415,7 @@ fn a_let_go_point_goes_on_with_its_velocity() {
         ];
         let scene = scene_with(SMALL, &sets);
         let mut tissue = sheet::at_rest(&model(&scene));
-        let index = tissue.model().scene.sheet.point([3, 2]);
+        let index = tissue.model().scene.sheet().unwrap().point([3, 2]);
         let steps = (0.1 * rate_hz) as u64;
         for step in 0..steps {
             let target = DVec3::new(0.0, 0.0, -speed * (step + 1) as f64 / rate_hz);
@@ -439,7 +439,7 @@ fn a_let_go_point_goes_on_with_its_velocity() {
 fn a_point_let_go_as_a_force_begins_starts_like_any_free_point() {
     // Held at rest, then released at the step at which a force begins: the same as a force that begins on a free point.
     let scene = scene_with(SMALL, &["stepping.substeps=2"]);
-    let index = model(&scene).scene.sheet.point([3, 2]);
+    let index = model(&scene).scene.sheet().unwrap().point([3, 2]);
     let run = |hold: bool| {
         let mut tissue = sheet::at_rest(&model(&scene));
         if hold {
@@ -465,7 +465,7 @@ fn to_grasp_and_let_go_between_two_steps_changes_nothing() {
     let run = |touch: bool| {
         let mut tissue = shaken(&scene, 20);
         if touch {
-            let index = tissue.model().scene.sheet.point([3, 2]);
+            let index = tissue.model().scene.sheet().unwrap().point([3, 2]);
             tissue.grasp(0, index, Grasp::Target(DVec3::ZERO));
             tissue.release(0);
         }
@@ -481,7 +481,7 @@ fn to_grasp_and_let_go_between_two_steps_changes_nothing() {
 fn a_grasped_point_taken_over_by_another_tool_follows_that_one() {
     let scene = scene(SMALL);
     let mut tissue = sheet::at_rest(&model(&scene));
-    let index = tissue.model().scene.sheet.point([3, 2]);
+    let index = tissue.model().scene.sheet().unwrap().point([3, 2]);
     tissue.grasp(0, index, Grasp::Target(DVec3::new(0.0, 0.0, 0.01)));
     tissue.step().unwrap();
     tissue.grasp(1, index, Grasp::Target(DVec3::new(0.0, 0.0, 0.012)));
@@ -502,13 +502,13 @@ fn a_grasped_point_taken_over_by_another_tool_follows_that_one() {
 fn a_grasp_that_goes_on_as_the_point_went_needs_little_force() {
     let scene = scene(SMALL);
     let mut tissue = shaken(&scene, 20);
-    let index = tissue.model().scene.sheet.point([3, 2]);
+    let index = tissue.model().scene.sheet().unwrap().point([3, 2]);
     let free = tissue.point(index);
     let target = free.displacement_m + free.velocity_m_per_s * 1e-3;
     tissue.grasp(0, index, Grasp::Target(target));
     tissue.step().unwrap();
     let held = tissue.point(index);
-    let inertia_n = scene.sheet.point_mass_kg * free.velocity_m_per_s.length() * 1000.0;
+    let inertia_n = scene.sheet().unwrap().point_mass_kg * free.velocity_m_per_s.length() * 1000.0;
     let elastic_n = (held.reaction_n() + held.applied_n).length();
     let force_n = held.constraint_n.unwrap().length();
     assert!(force_n < 1.01 * elastic_n + 1e-6 && elastic_n < 0.5 * inertia_n, "{force_n}, {elastic_n}, {inertia_n}");
@@ -543,7 +543,7 @@ profile = { type = "sine", frequency_hz = 2.5 }
         let z = -0.75 * (-30.0 * distance(0.05 + 0.5 * t, 0.1) - 0.5).exp();
         let sine = (std::f64::consts::TAU * 2.5 * t).sin();
         let expected = DVec3::new(0.2 * sine * (-10.0 * distance(0.2, 0.15)).exp(), 0.0, z);
-        let point = session.tissue().point(session.model().scene.sheet.point([i, j]));
+        let point = session.tissue().point(session.model().scene.sheet().unwrap().point([i, j]));
         assert!((point.applied_n - expected).length() < 1e-12, "{}, expected {expected}", point.applied_n);
     }
     // Just before a hop, the force is at its old place.
@@ -565,7 +565,8 @@ fn a_spring_pressed_to_no_length_stays_finite() {
     ] {
         let scene = scene_with(SMALL, &sets);
         let mut tissue = sheet::at_rest(&model(&scene));
-        let (moved, held) = (tissue.model().scene.sheet.point([3, 2]), tissue.model().scene.sheet.point([4, 2]));
+        let (moved, held) =
+            (tissue.model().scene.sheet().unwrap().point([3, 2]), tissue.model().scene.sheet().unwrap().point([4, 2]));
         let check = |tissue: &dyn Tissue, step: u32| {
             for index in tissue.model().points() {
                 let point = tissue.point(index);
@@ -615,7 +616,7 @@ fn a_vibration_without_damping_keeps_its_phase() {
                 tissue.release(0);
             }
             tissue.step().unwrap();
-            path.push(tissue.point(tissue.model().scene.sheet.point([7, 7])).displacement_m);
+            path.push(tissue.point(tissue.model().scene.sheet().unwrap().point([7, 7])).displacement_m);
         }
         (path, tissue.model().plan.substeps)
     };
@@ -628,7 +629,7 @@ fn a_vibration_without_damping_keeps_its_phase() {
 
 #[test]
 fn substeps_follow_the_bound_and_a_bound_is_never_below_a_vibration() {
-    use palpate::sheet::stability::largest_stiffness_n_per_m;
+    use palpate::sheet::stability::largest_stiffness_of_a_sheet_n_per_m;
     // λ over the whole infinite grid, by brute force.
     for (k1, k2, flexion) in
         [(1.0, 1.0, false), (1.0, 1.0, true), (1.0, 0.3, true), (0.2, 1.0, false), (1.0, 0.0, true)]
@@ -646,7 +647,7 @@ fn substeps_follow_the_bound_and_a_bound_is_never_below_a_vibration() {
                 largest = largest.max(value);
             }
         }
-        let bound = largest_stiffness_n_per_m(&springs);
+        let bound = largest_stiffness_of_a_sheet_n_per_m(&springs);
         assert!(bound >= largest - 1e-12 && bound < largest * 1.001, "{k1}, {k2}, {flexion}: {bound} and {largest}");
     }
 }

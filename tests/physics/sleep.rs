@@ -105,22 +105,22 @@ fn a_sheet_at_rest_computes_nothing_and_wakes_within_the_step_that_touches_it() 
     tissue.push(0, Some(push));
     tissue.step().unwrap();
     assert!(tissue.awake_points() > 0);
-    assert!(tissue.point(tissue.model().scene.sheet.point([15, 15])).displacement_m.z < 0.0);
+    assert!(tissue.point(tissue.model().scene.sheet().unwrap().point([15, 15])).displacement_m.z < 0.0);
     // A held poke comes to rest and stays there.
     for _ in 0..3000 {
         tissue.step().unwrap();
     }
     assert_eq!(tissue.awake_points(), 0);
-    let held = tissue.point(tissue.model().scene.sheet.point([15, 15]));
+    let held = tissue.point(tissue.model().scene.sheet().unwrap().point([15, 15]));
     tissue.step().unwrap();
-    assert_eq!(tissue.point(tissue.model().scene.sheet.point([15, 15])), held);
+    assert_eq!(tissue.point(tissue.model().scene.sheet().unwrap().point([15, 15])), held);
     assert_eq!(held.velocity_m_per_s, DVec3::ZERO);
     // All forces balance within the tolerance.
     let rest = held.spring_n + held.virtual_n + held.applied_n;
     assert!(rest.length() < 1e-5 * held.applied_n.length(), "{rest}");
     tissue.push(0, None);
     tissue.step().unwrap();
-    assert!(tissue.point(tissue.model().scene.sheet.point([15, 15])).velocity_m_per_s.z > 0.0);
+    assert!(tissue.point(tissue.model().scene.sheet().unwrap().point([15, 15])).velocity_m_per_s.z > 0.0);
 }
 
 #[test]
@@ -150,7 +150,7 @@ fn a_tile_wakes_with_the_history_that_it_would_have_had() {
 fn creep(steps: u32, far_m: f64) -> f64 {
     let with = |sleep: &str| sheet(&["sheet.points=[64, 64]", "springs.stiffness_n_per_m=50", sleep]);
     let (mut truth, mut skipping) = (with("sleep.tolerance=0"), with("sleep.tolerance=1e-4"));
-    let index = truth.model().scene.sheet.point([8, 8]);
+    let index = truth.model().scene.sheet().unwrap().point([8, 8]);
     let mut most = 0.0;
     for step in 0..steps {
         for tissue in [&mut truth, &mut skipping] {
@@ -213,7 +213,7 @@ fn sleeping_is_the_same_at_every_width() {
 /// The energies from the points' displacements and velocities, J: each spring computed separately.
 fn energies_by_points(tissue: &dyn Tissue) -> [f64; 3] {
     let scene = &tissue.model().scene;
-    let [rows, columns] = scene.sheet.points;
+    let [rows, columns] = scene.sheet().unwrap().points;
     let points: Vec<_> = tissue.model().points().map(|point| tissue.point(point)).collect();
     let mut spring_j = 0.0;
     for i in 0..rows {
@@ -225,7 +225,7 @@ fn energies_by_points(tissue: &dyn Tissue) -> [f64; 3] {
                 (1, -1, scene.springs.shear_stiffness_n_per_m),
             ] {
                 let Some(to) = j.checked_add_signed(dj).filter(|to| *to < columns && i + di < rows) else { continue };
-                let rest_m = DVec3::new(di as f64, dj as f64, 0.0) * scene.sheet.spacing_m;
+                let rest_m = DVec3::new(di as f64, dj as f64, 0.0) * scene.sheet().unwrap().spacing_m;
                 let delta_m = points[(i + di) * columns + to].displacement_m - points[i * columns + j].displacement_m;
                 // L − L0 = (L² − L0²)/(L + L0), without cancellation.
                 let longer_m = (2.0 * rest_m + delta_m).dot(delta_m) / ((rest_m + delta_m).length() + rest_m.length());
@@ -234,7 +234,7 @@ fn energies_by_points(tissue: &dyn Tissue) -> [f64; 3] {
         }
     }
     let kinetic_j =
-        points.iter().map(|point| 0.5 * scene.sheet.point_mass_kg * point.velocity_m_per_s.length_squared());
+        points.iter().map(|point| 0.5 * scene.sheet().unwrap().point_mass_kg * point.velocity_m_per_s.length_squared());
     let virtual_j =
         points.iter().map(|point| 0.5 * scene.virtual_stiffness_n_per_m * point.displacement_m.length_squared());
     [kinetic_j.sum(), spring_j, virtual_j.sum()]

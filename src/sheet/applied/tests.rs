@@ -24,7 +24,7 @@ fn a_table_keeps_nothing_of_the_place_before() {
     let model = Model::compile(&scene, &Limits::default()).unwrap();
     let layout = Layout::new::<f32>(model.points);
     let mut term = Term::<f32>::new();
-    let spacing_m = scene.sheet.spacing_m;
+    let spacing_m = scene.sheet().unwrap().spacing_m;
     let places = [(35.2, 45.7, 4.0), (3.0, 88.9, 20.0), (69.0, 0.4, 1.0), (-40.0, 20.0, 9.0), (30.5, 60.0, 0.5)];
     for (x, y, reach) in places.into_iter().chain(places.into_iter().rev()) {
         let poke = Poke {
@@ -90,22 +90,25 @@ fn a_change_of_force_on_a_rectangle_is_at_most_its_bound() {
             _ => Poke { force_n: 1.01 * old.force_n, centre_m: old.centre_m + 0.01 * other.centre_m, ..old },
         };
         let change = ForceChange { old: Some(old), new: Some(new), reached: Default::default() };
-        let force_n = |poke: &Poke, point| poke.force_n * factor(poke, point, spacing_m, f64::NEG_INFINITY);
+        let force_n = |poke: &Poke, [i, j]: [usize; 2]| {
+            let (x, y) = (i as f64 * spacing_m - poke.centre_m.x, j as f64 * spacing_m - poke.centre_m.y);
+            poke.force_n * factor(poke, x.hypot(y), f64::NEG_INFINITY)
+        };
         let change_n = |point| force_n(&new, point).distance(force_n(&old, point));
         let most_n = |rows: Range<usize>, columns: Range<usize>| {
             let changes = rows.flat_map(|i| columns.clone().map(move |j| [i, j])).map(change_n);
             changes.fold(0.0, f64::max)
         };
-        let bound_n = change.most_n([[0.2, 0.45], [0.4, 0.65]]);
+        let bound_n = change.most_n(&[[0.2, 0.45], [0.4, 0.65]]);
         assert!(most_n(4..10, 8..14) <= bound_n * (1.0 + 1e-12), "{old:?} {new:?}: {bound_n}");
         // Of a rectangle that is one point the bound is the change itself, if only the vector changes.
         if case % 4 == 1 {
-            let bound_n = change.most_n([[0.2, 0.2], [0.4, 0.4]]);
+            let bound_n = change.most_n(&[[0.2, 0.2], [0.4, 0.4]]);
             assert!((bound_n - change_n([4, 8])).abs() <= 1e-12, "{old:?} {new:?}: {bound_n}");
         }
         // A force that begins or ends changes by itself.
         for change in [ForceChange { old: None, ..change }, ForceChange { new: None, old: Some(new), ..change }] {
-            let bound_n = change.most_n([[0.2, 0.2], [0.4, 0.4]]);
+            let bound_n = change.most_n(&[[0.2, 0.2], [0.4, 0.4]]);
             assert!((bound_n - force_n(&new, [4, 8]).length()).abs() <= 1e-12, "{new:?}: {bound_n}");
         }
     }

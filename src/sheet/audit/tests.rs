@@ -37,9 +37,9 @@ fn moving(sets: &[&str], steps: u64) -> Sheet<f64> {
         0,
         Some(Push::Constant(Poke {
             point: None,
-            centre_m: scene.sheet.spacing_m * DVec3::new(2.0, 3.0, 0.0),
+            centre_m: scene.sheet().unwrap().spacing_m * DVec3::new(2.0, 3.0, 0.0),
             force_n: DVec3::new(0.1, -0.2, -1.0),
-            falloff_per_m: 0.7 / scene.sheet.spacing_m,
+            falloff_per_m: 0.7 / scene.sheet().unwrap().spacing_m,
             falloff_offset: 0.0,
         })),
     );

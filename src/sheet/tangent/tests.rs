@@ -12,7 +12,7 @@ fn model(sets: &[&str]) -> Arc<Model> {
 
 /// The whole sheet around a disc of some spacings near its middle, its points displaced so.
 fn patch<'m>(model: &'m Model, radius: f64, displacement_m: impl Fn([usize; 2]) -> DVec3) -> Patch<'m> {
-    let sheet = &model.scene.sheet;
+    let sheet = model.scene.sheet().unwrap();
     let centre_m = 0.5 * sheet.extent_m() + DVec2::new(0.13, -0.21) * sheet.spacing_m;
     let footprint = Footprint::new(model, radius * sheet.spacing_m, centre_m);
     let window = Window { origin: [0, 0], size: model.points };
@@ -33,7 +33,7 @@ fn stretched(spacing_m: f64) -> impl Fn([usize; 2]) -> DVec3 {
 
 /// The force of springs and virtual springs on each point, by lengths and roots.
 fn forces_n(model: &Model, displacement_m: &[DVec3]) -> Vec<DVec3> {
-    let (springs, spacing_m) = (&model.scene.springs, model.scene.sheet.spacing_m);
+    let (springs, spacing_m) = (&model.scene.springs, model.scene.sheet().unwrap().spacing_m);
     let (k, shear) = (springs.stiffness_n_per_m, springs.shear_stiffness_n_per_m);
     let kinds = [([1, 0], k), ([0, 1], k), ([1, 1], shear), ([1, -1], shear), ([2, 0], k), ([0, 2], k)];
     let kinds = &kinds[..if springs.flexion { 6 } else { 4 }];
@@ -61,7 +61,7 @@ const SPRINGS: [&str; 2] = ["springs.flexion=true", "springs.shear_stiffness_n_p
 #[test]
 fn the_linearised_springs_have_the_springs_forces_and_their_derivative() {
     let model = model(&[&SPRINGS[..], &["sheet.points=[6, 7]"]].concat());
-    let spacing_m = model.scene.sheet.spacing_m;
+    let spacing_m = model.scene.sheet().unwrap().spacing_m;
     let patch = patch(&model, 1.0, stretched(spacing_m));
     let mut found: Vec<DVec3> =
         patch.displacement_m.iter().map(|u| -model.scene.virtual_stiffness_n_per_m * *u).collect();
@@ -91,7 +91,7 @@ fn the_linearised_springs_have_the_springs_forces_and_their_derivative() {
 #[test]
 fn a_solution_leaves_no_more_than_the_part_it_may_of_any_load() {
     let model = model(&[&SPRINGS[..], &["sheet.points=[9, 8]", "sheet.fixed=corners"]].concat());
-    let patch = patch(&model, 1.0, stretched(model.scene.sheet.spacing_m));
+    let patch = patch(&model, 1.0, stretched(model.scene.sheet().unwrap().spacing_m));
     // A faint load is solved as exactly as a strong one.
     for size in [1e-9, 1.0] {
         let load: Vec<Triple> =
@@ -122,7 +122,7 @@ fn without_springs_a_disc_moves_each_point_against_its_own_virtual_spring() {
     let is = |found: DMat3, expected: f64| found.abs_diff_eq(DMat3::IDENTITY * expected, 1e-6 * expected);
     assert!(is(tangent.stiffness_n_per_m, scene.virtual_stiffness_n_per_m / shared), "{tangent:?}");
     assert!(is(tangent.damping_n_s_per_m, scene.damping_n_s_per_m / shared), "{tangent:?}");
-    let mass_kg = scene.sheet.point_mass_kg / shared;
+    let mass_kg = scene.sheet().unwrap().point_mass_kg / shared;
     assert!((tangent.mass_kg - mass_kg).abs() < 1e-6 * mass_kg, "{tangent:?}");
     assert_eq!(tangent.drag_n_s_per_m, 0.0);
 }
@@ -130,7 +130,7 @@ fn without_springs_a_disc_moves_each_point_against_its_own_virtual_spring() {
 #[test]
 fn drag_is_what_the_points_are_moved_as_the_dimple_passes() {
     let model = model(&["sheet.points=[8, 11]"]);
-    let spacing_m = model.scene.sheet.spacing_m;
+    let spacing_m = model.scene.sheet().unwrap().spacing_m;
     // Zero at the rim, where a dimple has no slope.
     let rim = |[i, j]: [usize; 2]| i < 2 || j < 2 || i >= 6 || j >= 9;
     let dimple_m = |point| if rim(point) { DVec3::ZERO } else { 1e-3 * scattered(point) };
@@ -151,7 +151,7 @@ fn drag_is_what_the_points_are_moved_as_the_dimple_passes() {
 fn after_a_press_every_point_is_in_balance() {
     let model = model(&["sheet.points=[9, 9]", "virtual_springs.stiffness_n_per_m=0.5", "sheet.fixed=edges"]);
     let mut patch = patch(&model, 1.0, |_| DVec3::ZERO);
-    let depth_m = 1.5 * model.scene.sheet.spacing_m;
+    let depth_m = 1.5 * model.scene.sheet().unwrap().spacing_m;
     let force_n = patch.press(depth_m);
     let place_m: f64 = patch.weights.iter().zip(&patch.displacement_m).map(|(weight, u)| weight * u.z).sum();
     assert!((place_m + depth_m).abs() < 1e-6 * depth_m, "{place_m}");
@@ -166,7 +166,7 @@ fn after_a_press_every_point_is_in_balance() {
 fn a_window_holds_all_that_notices_the_disc_and_not_much_more() {
     // Virtual springs as stiff as the others: a press is felt within a spacing.
     let model = model(&["sheet.points=[50, 44]", "virtual_springs.stiffness_n_per_m=10.0"]);
-    let spacing_m = model.scene.sheet.spacing_m;
+    let spacing_m = model.scene.sheet().unwrap().spacing_m;
     for (centre, radius) in [([22.3, 20.1], 5.5), ([3.0, 41.0], 2.0), ([24.0, 21.0], 0.3)] {
         let footprint = Footprint::new(&model, radius * spacing_m, DVec2::from(centre) * spacing_m);
         let points: Vec<usize> = Window::around(&model, &footprint).points(&model).collect();

@@ -17,7 +17,7 @@ fn layout() -> Layout {
 
 /// All asleep.
 fn tiles() -> SleepTiles<f64> {
-    SleepTiles::new(layout(), 1e-3, 1)
+    SleepTiles::asleep(layout(), 1e-3, 1, (None, POINTS[0] * POINTS[1]))
 }
 
 fn offset(c: usize, [i, j]: [usize; 2]) -> usize {
@@ -137,7 +137,7 @@ fn tiles_wake_when_the_changes_of_force_since_they_fell_asleep_exceed_the_bound_
             Some(Push::Constant(Poke { point: None, centre_m, force_n, falloff_per_m: 0.0, falloff_offset: 0.0 })),
         );
         for change in applied.changes(&model, 0).collect::<Vec<_>>() {
-            tiles.pushed(&change, model.scene.sheet.spacing_m, 1.25);
+            tiles.pushed(&change, model.scene.sheet().unwrap().spacing_m, 1.25);
         }
         assert_eq!(tiles.region.tiles().len(), awake, "{z_n} N");
     }

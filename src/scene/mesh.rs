@@ -1,0 +1,688 @@
+//! The section `[mesh]` of a scene: tissue on the surface of a triangle mesh, and its rest shape.
+
+use std::cmp::Ordering;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use glam::{DQuat, DVec3};
+use palpate_mesh::TriangleMesh;
+
+use super::check::physical;
+use super::document::{Fields, Item};
+use crate::limits::Limits;
+use crate::refusal::{Reason, Refusal, Result, did_you_mean, finite, positive};
+use crate::shape::{Extent, PointId, PointName, RestShape};
+
+/// A triangle mesh with a mass point at each vertex and a spring along each edge.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Mesh {
+    /// Mass of each point, kg.
+    pub point_mass_kg: f64,
+    /// k of the springs between the two vertices opposite an edge, as a part of that of an edge; 0 without such springs.
+    pub flexion: f64,
+    /// Where the points rest and how they lie together.
+    pub shape: Arc<MeshShape>,
+    /// The largest stiffness of its springs.
+    pub stiffest: Stiffest,
+}
+
+/// The largest eigenvalue of the stiffness of springs under any deformation, and where it comes from.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Stiffest {
+    /// The eigenvalue is at most this, over the k of an edge.
+    pub bound: f64,
+    /// The vertex that has most of it.
+    pub vertex: u32,
+}
+
+/// The rest shape of a mesh: point n is vertex n of the file.
+#[derive(Debug, PartialEq)]
+pub struct MeshShape {
+    vertices_m: Vec<DVec3>,
+    triangles: Vec<[u32; 3]>,
+    normals: Vec<DVec3>,
+    /// The vertices of each edge, ascending; edges ascending.
+    edges: Vec<[u32; 2]>,
+    /// The vertices opposite each edge that has two triangles, ascending.
+    opposite: Vec<[u32; 2]>,
+    neighbours: Neighbours,
+    is_fixed: Vec<bool>,
+    edge_m: f64,
+    extent: Extent,
+    cells: Cells,
+}
+
+/// What files a scene may name.
+#[derive(Debug, Clone, Copy)]
+pub enum Files<'a> {
+    /// None: it came from a client.
+    None,
+    /// Those in a folder.
+    In(&'a Path),
+}
+
+impl Files<'_> {
+    fn read(self, item: &Item<'_>, limits: &Limits) -> Result<(PathBuf, Vec<u8>)> {
+        let Files::In(folder) = self else {
+            let message = "names a file: a scene that a client sends must carry its mesh itself";
+            return Err(item.refuse(Reason::WrongKind, message));
+        };
+        let path = folder.join(item.text()?);
+        let bytes = super::document::read_bytes(&path, limits.mesh_bytes)
+            .map_err(|refusal| item.refuse(refusal.reason, format!("{}: {}", path.display(), refusal.message)))?;
+        Ok((path, bytes))
+    }
+}
+
+impl Mesh {
+    pub(super) fn read(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) -> Result<Self> {
+        let unit = fields.required("unit")?;
+        let unit_m = match unit.as_text() {
+            Some("m") => 1.0,
+            Some("cm") => 1e-2,
+            Some("mm") => 1e-3,
+            Some(_) => return Err(unit.wrong("\"m\", \"cm\", \"mm\" or the metres of a unit")),
+            None => unit.number()?,
+        };
+        physical(&fields.path("unit"), positive(&fields.path("unit"), unit_m)?)?;
+        let file = fields.required("file")?;
+        let (path, bytes) = files.read(&file, limits)?;
+        let mesh = read_obj(&bytes, unit_m)
+            .map_err(|message| file.refuse(Reason::Unreadable, format!("{}: {message}", path.display())))?;
+        let point_mass_kg = fields.required_number("point_mass_kg")?;
+        let fixed = fields.item("fixed").map_or(Ok(Fixed::None), |item| Fixed::read(&item, &mesh))?;
+        let shape = MeshShape::new(mesh.vertices_m, mesh.triangles, |rim, place_m, vertex| match &fixed {
+            Fixed::None => false,
+            Fixed::Rim => rim,
+            Fixed::Group(members) => members.binary_search(&vertex).is_ok(),
+            Fixed::Balls(balls) => balls.iter().any(|(centre_m, radius_m)| place_m.distance(*centre_m) <= *radius_m),
+        });
+        let shape = shape.map_err(|refusal| file.refuse(refusal.reason, refusal.message))?;
+        Ok(Mesh::new(point_mass_kg, 0.0, Arc::new(shape)))
+    }
+
+    /// Of a shape, a mass and the stiffness of its springs of flexion relative to that of its edges.
+    pub fn new(point_mass_kg: f64, flexion: f64, shape: Arc<MeshShape>) -> Self {
+        let stiffest = shape.stiffest(flexion);
+        Mesh { point_mass_kg, flexion, shape, stiffest }
+    }
+
+    /// The vertices around the one that the fastest vibration has most of, at most so many, turned so that its normal is
+    /// along z; and three of them: that one, one about half way to the rim of the part, and one at the rim.
+    #[allow(clippy::cast_possible_truncation)]
+    pub(super) fn part(&self, most: usize) -> (Self, [PointId; 3]) {
+        let shape = &self.shape;
+        let (first, count) = (self.stiffest.vertex as usize, shape.vertices_m.len());
+        let mut number_of = vec![u32::MAX; count];
+        let mut found = vec![first];
+        number_of[first] = 0;
+        let mut next = 0;
+        while next < found.len() && found.len() < most {
+            for vertex in shape.neighbours.of(found[next]) {
+                if found.len() < most && number_of[*vertex as usize] == u32::MAX {
+                    number_of[*vertex as usize] = found.len() as u32;
+                    found.push(*vertex as usize);
+                }
+            }
+            next += 1;
+        }
+        let turn = DQuat::from_rotation_arc(shape.normals[first], DVec3::Z);
+        let vertices_m =
+            found.iter().map(|vertex| turn * (shape.vertices_m[*vertex] - shape.vertices_m[first])).collect();
+        let numbered = shape.triangles.iter().map(|triangle| triangle.map(|vertex| number_of[vertex as usize]));
+        let triangles: Vec<_> = numbered.filter(|triangle| triangle.iter().all(|vertex| *vertex != u32::MAX)).collect();
+        let is_fixed = |_: bool, _: DVec3, vertex: u32| vertex != 0 && shape.is_fixed[found[vertex as usize]];
+        let looked_at = [0, found.len() / 4, found.len() - 1].map(PointId::new);
+        match MeshShape::new(vertices_m, triangles, is_fixed) {
+            Ok(part) => (Mesh::new(self.point_mass_kg, self.flexion, Arc::new(part)), looked_at),
+            // Parts of a mesh that is sound are sound.
+            Err(_) => (self.clone(), [PointId::new(first); 3]),
+        }
+    }
+
+    pub(super) fn check(&self, limits: &Limits) -> Result<()> {
+        let count = self.shape.point_count();
+        if count > limits.points {
+            let message = format!("has {count} vertices, above the limit of {} points in all", limits.points);
+            return Err(Refusal::new(Reason::TooLarge, "mesh.file", message));
+        }
+        physical("mesh.point_mass_kg", positive("mesh.point_mass_kg", self.point_mass_kg)?)?;
+        physical("mesh.unit", self.shape.edge_m)?;
+        Ok(())
+    }
+}
+
+/// Which vertices never move.
+enum Fixed {
+    None,
+    /// Those of edges with a single triangle.
+    Rim,
+    /// Those of a group of the file, ascending.
+    Group(Vec<u32>),
+    /// Those within balls: centre and radius, m.
+    Balls(Vec<(DVec3, f64)>),
+}
+
+impl Fixed {
+    fn read(item: &Item<'_>, mesh: &TriangleMesh) -> Result<Self> {
+        const EXPECTED: &str = "\"none\", \"rim\", { group = \"…\" } or a list of balls { centre_m, radius_m }";
+        match item.as_text() {
+            Some("none") => return Ok(Fixed::None),
+            Some("rim") => return Ok(Fixed::Rim),
+            Some(_) => return Err(item.wrong(EXPECTED)),
+            None => {}
+        }
+        if let Ok(list) = item.list() {
+            let ball = |item: &Item<'_>| {
+                item.table(|fields| {
+                    let centre_m = fields.required("centre_m")?.vector()?;
+                    Ok((centre_m, positive(&fields.path("radius_m"), fields.required_number("radius_m")?)?))
+                })
+            };
+            return Ok(Fixed::Balls(list.iter().map(ball).collect::<Result<_>>()?));
+        }
+        item.table(|fields| {
+            let group = fields.required("group")?;
+            let name = group.text()?;
+            match mesh.groups.iter().find(|group| group.name == name) {
+                Some(found) => Ok(Fixed::Group(found.vertices.clone())),
+                None => {
+                    let meant = did_you_mean(&name, mesh.groups.iter().map(|group| group.name.as_str()));
+                    Err(group.refuse(Reason::WrongKind, format!("is no group of the mesh{meant}")))
+                }
+            }
+        })
+    }
+}
+
+impl MeshShape {
+    /// Of vertices and triangles; `is_fixed` says whether a vertex never moves: whether it is on a rim, where it rests, and
+    /// its number.
+    ///
+    /// # Errors
+    /// Refuses a mesh without an edge, with an edge of no length, with an edge of more than two triangles, and with numbers
+    /// of vertices or places that are no good.
+    pub fn new(
+        vertices_m: Vec<DVec3>,
+        triangles: Vec<[u32; 3]>,
+        is_fixed: impl Fn(bool, DVec3, u32) -> bool,
+    ) -> Result<Self> {
+        Self::braced(vertices_m, triangles, &[], is_fixed)
+    }
+
+    /// The same with `braces`: springs like those of edges between other vertices, as along both diagonals of a square.
+    ///
+    /// # Errors
+    /// As for [`MeshShape::new`].
+    pub fn braced(
+        vertices_m: Vec<DVec3>,
+        triangles: Vec<[u32; 3]>,
+        braces: &[[u32; 2]],
+        is_fixed: impl Fn(bool, DVec3, u32) -> bool,
+    ) -> Result<Self> {
+        let refuse = |message: String| Refusal::new(Reason::Unreadable, "mesh", message);
+        if let Some(vertex) = vertices_m.iter().position(|place_m| !place_m.is_finite()) {
+            return Err(refuse(format!("vertex {vertex} is not finite")));
+        }
+        let count = vertices_m.len();
+        let is_out = |triangle: &[u32; 3]| triangle.iter().any(|vertex| *vertex as usize >= count);
+        if let Some(which) = triangles.iter().position(is_out) {
+            return Err(refuse(format!("triangle {which} names a vertex beyond the last of {count}")));
+        }
+        // Each side of each triangle, and the vertex opposite it.
+        let mut sides: Vec<([u32; 2], u32)> = triangles
+            .iter()
+            .flat_map(|[a, b, c]| [([*a, *b], *c), ([*b, *c], *a), ([*c, *a], *b)])
+            .map(|([a, b], opposite)| ([a.min(b), a.max(b)], opposite))
+            .collect();
+        sides.sort_unstable();
+        let (mut edges, mut opposite, mut on_rim) = (Vec::new(), Vec::new(), vec![false; count]);
+        for of_edge in sides.chunk_by(|a, b| a.0 == b.0) {
+            let edge @ [a, b] = of_edge[0].0;
+            let [from_m, to_m] = edge.map(|vertex| vertices_m[vertex as usize]);
+            let length_m = from_m.distance(to_m);
+            if length_m == 0.0 {
+                return Err(refuse(format!("the edge between vertices {a} and {b} at {from_m} m has no length")));
+            }
+            match of_edge {
+                [_] => edge.iter().for_each(|vertex| on_rim[*vertex as usize] = true),
+                [(_, c), (_, d)] => opposite.push([*c.min(d), *c.max(d)]),
+                more => {
+                    let message =
+                        format!("the edge between vertices {a} and {b} at {from_m} m has {} triangles", more.len());
+                    return Err(refuse(message));
+                }
+            }
+            edges.push(edge);
+        }
+        edges.extend(braces.iter().map(|[a, b]| [*a.min(b), *a.max(b)]));
+        edges.sort_unstable();
+        edges.dedup();
+        if edges.is_empty() {
+            return Err(refuse("has no triangle".to_owned()));
+        }
+        opposite.retain(|[c, d]| c != d);
+        opposite.sort_unstable();
+        opposite.dedup();
+        let length_m = |[a, b]: &[u32; 2]| vertices_m[*a as usize].distance(vertices_m[*b as usize]);
+        #[allow(clippy::cast_precision_loss)]
+        let edge_m = edges.iter().map(length_m).sum::<f64>() / edges.len() as f64;
+        finite("mesh", edge_m)?;
+        let mut normals = vec![DVec3::ZERO; count];
+        for triangle in &triangles {
+            let [a, b, c] = triangle.map(|vertex| vertices_m[vertex as usize]);
+            let area = (b - a).cross(c - a);
+            triangle.iter().for_each(|vertex| normals[*vertex as usize] += area);
+        }
+        normals.iter_mut().for_each(|normal| *normal = normal.try_normalize().unwrap_or(DVec3::Z));
+        let least_m = vertices_m.iter().copied().fold(DVec3::INFINITY, DVec3::min);
+        let most_m = vertices_m.iter().copied().fold(DVec3::NEG_INFINITY, DVec3::max);
+        let extent = Extent { least_m, most_m };
+        #[allow(clippy::cast_possible_truncation)]
+        let is_fixed = (0..count).map(|vertex| is_fixed(on_rim[vertex], vertices_m[vertex], vertex as u32)).collect();
+        let neighbours = Neighbours::new(count, &edges);
+        let cells = Cells::new(&vertices_m, extent, edge_m);
+        Ok(MeshShape { vertices_m, triangles, normals, edges, opposite, neighbours, is_fixed, edge_m, extent, cells })
+    }
+
+    /// Where each vertex rests, m.
+    pub fn vertices_m(&self) -> &[DVec3] {
+        &self.vertices_m
+    }
+
+    /// Three vertices each, counterclockwise seen from outside.
+    pub fn triangles(&self) -> &[[u32; 3]] {
+        &self.triangles
+    }
+
+    /// The two vertices of each edge, ascending.
+    pub fn edges(&self) -> &[[u32; 2]] {
+        &self.edges
+    }
+
+    /// The vertices opposite each edge that has two triangles, ascending.
+    pub fn opposite(&self) -> &[[u32; 2]] {
+        &self.opposite
+    }
+
+    /// Every spring: its ends, and its k over that of an edge.
+    pub fn springs(&self, flexion: f64) -> impl Iterator<Item = ([u32; 2], f64)> + '_ {
+        let bending: &[[u32; 2]] = if flexion > 0.0 { &self.opposite } else { &[] };
+        self.edges.iter().map(|ends| (*ends, 1.0)).chain(bending.iter().map(move |ends| (*ends, flexion)))
+    }
+
+    /// A spring along n contributes at most k·I to the stiffness matrix, whatever the deformation (`sheet::stability`), so
+    /// the matrix is at most the weighted Laplacian of the graph. Its largest eigenvalue is at most the largest of
+    ///
+    /// w_i + w_j − Σ min(k_il, k_jl) over the common neighbours l of i and j,  w_i = Σ k_il,
+    ///
+    /// over all springs i–j (Das and Bapat, A sharp upper bound on the largest Laplacian eigenvalue of weighted graphs,
+    /// 2005). On a mesh of equal triangles that is 10 k, where 9 k is true and Gershgorin's bound says 12 k.
+    fn stiffest(&self, flexion: f64) -> Stiffest {
+        let count = self.vertices_m.len();
+        let mut around: Vec<Vec<(u32, f64)>> = vec![Vec::new(); count];
+        for ([a, b], k) in self.springs(flexion) {
+            around[a as usize].push((b, k));
+            around[b as usize].push((a, k));
+        }
+        for of_vertex in &mut around {
+            of_vertex.sort_unstable_by_key(|(other, _)| *other);
+            // An edge and a spring of flexion may join the same two vertices.
+            of_vertex.dedup_by(|next, kept| {
+                let same = next.0 == kept.0;
+                kept.1 += if same { next.1 } else { 0.0 };
+                same
+            });
+        }
+        let weight: Vec<f64> = around.iter().map(|of_vertex| of_vertex.iter().map(|(_, k)| k).sum()).collect();
+        let mut stiffest = Stiffest { bound: 0.0, vertex: 0 };
+        for ([a, b], _) in self.springs(flexion) {
+            let [mut one, mut other] = [a, b].map(|end| around[end as usize].iter().peekable());
+            let mut common = 0.0;
+            while let (Some((l, of_a)), Some((m, of_b))) = (one.peek(), other.peek()) {
+                match l.cmp(m) {
+                    Ordering::Less => _ = one.next(),
+                    Ordering::Greater => _ = other.next(),
+                    Ordering::Equal => {
+                        common += of_a.min(*of_b);
+                        (one.next(), other.next());
+                    }
+                }
+            }
+            let [of_a, of_b] = [a, b].map(|end| weight[end as usize]);
+            let bound = of_a + of_b - common;
+            if bound > stiffest.bound {
+                stiffest = Stiffest { bound, vertex: if of_a >= of_b { a } else { b } };
+            }
+        }
+        stiffest
+    }
+}
+
+impl RestShape for MeshShape {
+    fn describe(&self) -> String {
+        format!("{} vertices", self.vertices_m.len())
+    }
+
+    fn point_count(&self) -> usize {
+        self.vertices_m.len()
+    }
+
+    #[allow(clippy::cast_possible_truncation)]
+    fn name(&self, point: PointId) -> PointName {
+        PointName::Vertex(point.index() as u32)
+    }
+
+    fn find(&self, field: &str, name: PointName) -> Result<PointId> {
+        let count = self.vertices_m.len();
+        match name {
+            PointName::Vertex(vertex) if (vertex as usize) < count => Ok(PointId::new(vertex as usize)),
+            PointName::Vertex(_) => {
+                Err(Refusal::new(Reason::OffSheet, field, format!("{name} is not on the mesh of {count} vertices")))
+            }
+            PointName::Point(_) => {
+                let message = format!("{name} is a point of a sheet; a point of a mesh is the number of a vertex");
+                Err(Refusal::new(Reason::WrongKind, field, message))
+            }
+        }
+    }
+
+    fn rest_m(&self, point: PointId) -> DVec3 {
+        self.vertices_m[point.index()]
+    }
+
+    fn normal(&self, point: PointId) -> DVec3 {
+        self.normals[point.index()]
+    }
+
+    fn is_fixed(&self, point: PointId) -> bool {
+        self.is_fixed[point.index()]
+    }
+
+    fn neighbours(&self, point: PointId) -> Vec<PointId> {
+        self.neighbours.of(point.index()).iter().map(|vertex| PointId::new(*vertex as usize)).collect()
+    }
+
+    fn nearest(&self, place_m: DVec3) -> PointId {
+        PointId::new(self.cells.nearest(&self.vertices_m, place_m))
+    }
+
+    fn around(&self, place_m: DVec3, radius_m: f64) -> Vec<PointId> {
+        self.cells.around(&self.vertices_m, place_m, radius_m).into_iter().map(PointId::new).collect()
+    }
+
+    fn extent(&self) -> Extent {
+        self.extent
+    }
+
+    fn edge_m(&self) -> f64 {
+        self.edge_m
+    }
+}
+
+/// The ends of the edges at each vertex, ascending.
+#[derive(Debug, PartialEq)]
+struct Neighbours {
+    /// Where each vertex's begin; one more for the end.
+    from: Vec<u32>,
+    members: Vec<u32>,
+}
+
+impl Neighbours {
+    #[allow(clippy::cast_possible_truncation)]
+    fn new(count: usize, edges: &[[u32; 2]]) -> Self {
+        let mut both: Vec<[u32; 2]> = edges.iter().flat_map(|[a, b]| [[*a, *b], [*b, *a]]).collect();
+        both.sort_unstable();
+        let mut from = vec![0; count + 1];
+        both.iter().for_each(|[a, _]| from[*a as usize + 1] += 1);
+        (0..count).for_each(|vertex| from[vertex + 1] += from[vertex]);
+        Neighbours { from, members: both.into_iter().map(|[_, b]| b).collect() }
+    }
+
+    fn of(&self, vertex: usize) -> &[u32] {
+        &self.members[self.from[vertex] as usize..self.from[vertex + 1] as usize]
+    }
+}
+
+/// The vertices by cells of space, to find those near a place.
+#[derive(Debug, PartialEq)]
+struct Cells {
+    least_m: DVec3,
+    most_m: DVec3,
+    side_m: f64,
+    counts: [usize; 3],
+    /// Where each cell's members begin; one more for the end.
+    from: Vec<u32>,
+    members: Vec<u32>,
+}
+
+/// Cells at most, for each vertex: a mesh far larger than its edges has larger cells.
+const CELLS_PER_VERTEX: f64 = 4.0;
+
+impl Cells {
+    #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn new(vertices_m: &[DVec3], Extent { least_m, most_m }: Extent, edge_m: f64) -> Self {
+        let size_m = most_m - least_m;
+        let most = CELLS_PER_VERTEX * vertices_m.len() as f64 + 8.0;
+        let mut side_m = edge_m;
+        let cells = |side_m: f64| (size_m / side_m).floor() + 1.0;
+        while cells(side_m).element_product() > most {
+            side_m *= 1.25;
+        }
+        let counts = cells(side_m).to_array().map(|count| count as usize);
+        let mut found = Cells { least_m, most_m, side_m, counts, from: Vec::new(), members: Vec::new() };
+        let mut by_cell: Vec<(usize, u32)> =
+            vertices_m.iter().zip(0..).map(|(place_m, vertex)| (found.index(found.cell(*place_m)), vertex)).collect();
+        by_cell.sort_unstable();
+        found.from = vec![0; counts.iter().product::<usize>() + 1];
+        by_cell.iter().for_each(|(cell, _)| found.from[cell + 1] += 1);
+        (1..found.from.len()).for_each(|cell| found.from[cell] += found.from[cell - 1]);
+        found.members = by_cell.into_iter().map(|(_, vertex)| vertex).collect();
+        found
+    }
+
+    /// The cell of a place within the extent.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn cell(&self, place_m: DVec3) -> [usize; 3] {
+        let at = ((place_m - self.least_m) / self.side_m).to_array();
+        std::array::from_fn(|axis| (at[axis] as usize).min(self.counts[axis] - 1))
+    }
+
+    fn index(&self, [i, j, k]: [usize; 3]) -> usize {
+        (i * self.counts[1] + j) * self.counts[2] + k
+    }
+
+    /// The vertices within a distance of a place, ascending.
+    fn around(&self, vertices_m: &[DVec3], place_m: DVec3, radius_m: f64) -> Vec<usize> {
+        let [from, to] = [place_m - radius_m, place_m + radius_m].map(|corner_m| self.cell(corner_m.max(self.least_m)));
+        let mut found = Vec::new();
+        for i in from[0]..=to[0] {
+            for j in from[1]..=to[1] {
+                for k in from[2]..=to[2] {
+                    let cell = self.index([i, j, k]);
+                    let members = &self.members[self.from[cell] as usize..self.from[cell + 1] as usize];
+                    let is_within = |vertex: &usize| vertices_m[*vertex].distance(place_m) <= radius_m;
+                    found.extend(members.iter().map(|vertex| *vertex as usize).filter(is_within));
+                }
+            }
+        }
+        found.sort_unstable();
+        found
+    }
+
+    /// The vertex nearest to a place; of several, that with the least number.
+    #[allow(clippy::cast_precision_loss)]
+    fn nearest(&self, vertices_m: &[DVec3], place_m: DVec3) -> usize {
+        let inside_m = place_m.clamp(self.least_m, self.most_m);
+        let middle = self.cell(inside_m);
+        let beyond = place_m.distance_squared(inside_m);
+        let mut best = (f64::INFINITY, usize::MAX);
+        let farthest = self.counts.iter().max().copied().unwrap_or(1);
+        for ring in 0..=farthest {
+            // No place of a ring is nearer: the extent is convex.
+            let gap_m = ring.saturating_sub(1) as f64 * self.side_m;
+            if beyond + gap_m * gap_m > best.0 {
+                break;
+            }
+            let span =
+                |axis: usize| middle[axis].saturating_sub(ring)..=(middle[axis] + ring).min(self.counts[axis] - 1);
+            for i in span(0) {
+                for j in span(1) {
+                    for k in span(2) {
+                        let cell = [i, j, k];
+                        if (0..3).all(|axis| cell[axis].abs_diff(middle[axis]) < ring) {
+                            continue;
+                        }
+                        let index = self.index(cell);
+                        for vertex in &self.members[self.from[index] as usize..self.from[index + 1] as usize] {
+                            let vertex = *vertex as usize;
+                            let away = vertices_m[vertex].distance_squared(place_m);
+                            if (away, vertex) < best {
+                                best = (away, vertex);
+                            }
+                        }
+                    }
+                }
+            }
+        }
+        best.1
+    }
+}
+
+/// Reads the vertices and faces of an OBJ file; places are times `unit_m`.
+fn read_obj(bytes: &[u8], unit_m: f64) -> std::result::Result<TriangleMesh, String> {
+    let text = std::str::from_utf8(bytes).map_err(|e| format!("is not UTF-8 text: {e}"))?;
+    let mut mesh = TriangleMesh::default();
+    for (line, text) in text.lines().enumerate() {
+        let mut words = text.split_ascii_whitespace();
+        let wrong = || format!("line {}: `{text}` is not understood", line + 1);
+        match words.next() {
+            Some("v") => {
+                let numbers: Vec<f64> = words.filter_map(|word| word.parse().ok()).collect();
+                let [x, y, z, ..] = numbers[..] else { return Err(wrong()) };
+                mesh.vertices_m.push(unit_m * DVec3::new(x, y, z));
+            }
+            Some("f") => {
+                let of =
+                    |word: &str| word.split('/').next().and_then(|index| index.parse::<u32>().ok()?.checked_sub(1));
+                let corners: Vec<u32> = words.map(of).collect::<Option<_>>().ok_or_else(wrong)?;
+                let (Some(first), true) = (corners.first(), corners.len() >= 3) else { return Err(wrong()) };
+                mesh.triangles.extend(corners[1..].windows(2).map(|pair| [*first, pair[0], pair[1]]));
+            }
+            _ => {}
+        }
+    }
+    Ok(mesh)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::shape;
+
+    /// A tetrahedron and, apart from it, a square of two triangles.
+    fn shape() -> MeshShape {
+        let vertices_m = [
+            [0.0, 0.0, 0.0],
+            [0.1, 0.0, 0.0],
+            [0.0, 0.1, 0.0],
+            [0.0, 0.0, 0.1],
+            [1.0, 0.0, 0.0],
+            [1.1, 0.0, 0.0],
+            [1.1, 0.1, 0.0],
+            [1.0, 0.1, 0.0],
+        ];
+        let triangles = vec![[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3], [4, 5, 6], [4, 6, 7]];
+        MeshShape::new(vertices_m.map(DVec3::from_array).to_vec(), triangles, |rim, _, _| rim).unwrap()
+    }
+
+    #[test]
+    fn a_mesh_knows_its_edges_its_rim_and_what_lies_opposite() {
+        let shape = shape();
+        assert_eq!(shape.edges().len(), 6 + 5);
+        assert_eq!(shape.opposite().len(), 6 + 1);
+        assert!(shape.opposite().contains(&[5, 7]));
+        let fixed: Vec<bool> = shape::points(&shape).map(|point| shape.is_fixed(point)).collect();
+        assert_eq!(fixed, [false, false, false, false, true, true, true, true]);
+        assert_eq!(shape.neighbours(PointId::new(4)), [5, 6, 7].map(PointId::new));
+        assert!(shape.normal(PointId::new(6)).distance(DVec3::Z) < 1e-12);
+        assert!(shape.normal(PointId::new(0)).dot(DVec3::ONE) < 0.0, "outward");
+    }
+
+    #[test]
+    fn the_nearest_vertex_is_that_of_a_search_through_all() {
+        let mut dice = fastrand::Rng::with_seed(19);
+        let place =
+            |dice: &mut fastrand::Rng, size: f64| DVec3::from_array([(); 3].map(|()| size * (dice.f64() - 0.5)));
+        let vertices_m: Vec<DVec3> = (0..400).map(|_| place(&mut dice, 1.0) * DVec3::new(1.0, 0.3, 0.01)).collect();
+        let triangles = (0..133).map(|k| [3 * k, 3 * k + 1, 3 * k + 2]).collect();
+        let shape = MeshShape::new(vertices_m.clone(), triangles, |_, _, _| false).unwrap();
+        for round in 0..500 {
+            let place_m = place(&mut dice, if round % 2 == 0 { 1.0 } else { 9.0 });
+            let away = |vertex: &usize| vertices_m[*vertex].distance_squared(place_m);
+            let expected = (0..400).min_by(|a, b| away(a).total_cmp(&away(b))).unwrap();
+            assert_eq!(shape.nearest(place_m).index(), expected, "{place_m}");
+            let radius_m = 0.2 * dice.f64();
+            let within: Vec<usize> = (0..400).filter(|vertex| away(vertex).sqrt() <= radius_m).collect();
+            let found: Vec<usize> = shape.around(place_m, radius_m).into_iter().map(PointId::index).collect();
+            assert_eq!(found, within, "{place_m} {radius_m}");
+        }
+    }
+
+    #[test]
+    fn the_bound_of_the_stiffness_holds_and_is_not_far_above_it() {
+        let mut dice = fastrand::Rng::with_seed(7);
+        for round in 0..20 {
+            // A strip of triangles with some left out.
+            let vertices_m = (0..60)
+                .map(|k| DVec3::new(f64::from(k / 6), f64::from(k % 6) + 0.5 * f64::from(k / 6 % 2), 0.1 * dice.f64()))
+                .collect();
+            let cells = (0..54).filter(|k| k % 6 != 5);
+            let triangles: Vec<[u32; 3]> = cells.flat_map(|k| [[k, k + 6, k + 1], [k + 1, k + 6, k + 7]]).collect();
+            let triangles = triangles.into_iter().filter(|_| round == 0 || dice.f64() < 0.8).collect();
+            let shape = MeshShape::new(vertices_m, triangles, |_, _, _| false).unwrap();
+            for flexion in [0.0, 0.3, 1.0] {
+                // Power iteration on the Laplacian.
+                let (mut x, mut largest): (Vec<f64>, f64) = ((0..60).map(|_| dice.f64() - 0.5).collect(), 0.0);
+                for _ in 0..400 {
+                    let mut y = vec![0.0; 60];
+                    for ([a, b], k) in shape.springs(flexion) {
+                        let pull = k * (x[a as usize] - x[b as usize]);
+                        y[a as usize] += pull;
+                        y[b as usize] -= pull;
+                    }
+                    largest = y.iter().map(|y| y * y).sum::<f64>().sqrt();
+                    x = y.into_iter().map(|y| y / largest).collect();
+                }
+                let Stiffest { bound, .. } = shape.stiffest(flexion);
+                assert!(bound >= largest && bound < 1.6 * largest, "{round} {flexion}: {bound} {largest}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_part_of_a_mesh_is_turned_and_has_its_springs() {
+        let mesh = Mesh::new(0.1, 0.5, Arc::new(shape()));
+        let (part, [pushed, ..]) = mesh.part(3);
+        assert_eq!((part.shape.vertices_m.len(), part.shape.edges.len()), (3, 3));
+        assert!(part.shape.rest_m(pushed).length() < 1e-12 && !part.shape.is_fixed(pushed));
+        let (all, _) = mesh.part(100);
+        assert_eq!(all.shape.vertices_m.len(), 4, "what is not joined does not belong to it");
+        assert!(all.shape.normal(pushed).distance(DVec3::Z) < 1e-9);
+    }
+
+    #[test]
+    fn a_mesh_that_is_none_is_refused_by_element_and_place() {
+        let square = || vec![DVec3::ZERO, DVec3::X, DVec3::Y, DVec3::new(1.0, 1.0, 0.0), DVec3::Z];
+        for (vertices_m, triangles, message) in [
+            (square(), vec![], "has no triangle"),
+            (square(), vec![[0, 1, 5]], "triangle 0 names a vertex beyond the last of 5"),
+            (square(), vec![[0, 1, 1]], "the edge between vertices 1 and 1"),
+            (square(), vec![[0, 1, 2], [1, 0, 3], [0, 1, 4]], "the edge between vertices 0 and 1 at [0, 0, 0] m has 3"),
+            (vec![DVec3::NAN; 3], vec![[0, 1, 2]], "vertex 0 is not finite"),
+        ] {
+            let refused = MeshShape::new(vertices_m, triangles, |_, _, _| false).unwrap_err();
+            assert!(refused.message.contains(message), "{}", refused.message);
+        }
+    }
+}

@@ -1,0 +1,246 @@
+//! Tissue on meshes: the same laws as on the sheet, and the sheet itself where a mesh has its points and springs.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
+
+mod common;
+
+use std::sync::Arc;
+
+use glam::DVec3;
+use palpate::limits::Limits;
+use palpate::scene::profile::Poke;
+use palpate::scene::{Body, Mesh, MeshShape, Scene};
+use palpate::shape::{PointId, RestShape};
+use palpate::sheet::{Grasp, Model, Push, Tissue, at_rest};
+
+/// The paper's scene with another body, and with some values set.
+fn scene(body: Option<Body>, sets: &[&str]) -> Scene {
+    let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
+    let mut scene = Scene::parse("paper", palpate::scene::PAPER, &sets, &Limits::default()).unwrap();
+    if let Some(body) = body {
+        scene.body = body;
+    }
+    scene
+}
+
+fn tissue(scene: &Scene) -> Box<dyn Tissue> {
+    at_rest(&Model::compile(scene, &Limits::default()).unwrap())
+}
+
+/// A sphere of `rings` × 2·`rings` vertices and two poles, dented a little here and there so that no two edges are alike.
+fn sphere(rings: u32, radius_m: f64) -> MeshShape {
+    let mut dice = fastrand::Rng::with_seed(5);
+    let around = 2 * rings;
+    let mut vertices_m = vec![];
+    for ring in 0..rings {
+        for k in 0..around {
+            let (down, turn) = (
+                std::f64::consts::PI * f64::from(ring + 1) / f64::from(rings + 1),
+                std::f64::consts::TAU * (f64::from(k) + 0.5 * f64::from(ring % 2)) / f64::from(around),
+            );
+            let place =
+                DVec3::new(libm::sin(down) * libm::cos(turn), libm::sin(down) * libm::sin(turn), libm::cos(down));
+            vertices_m.push(radius_m * (0.97 + 0.06 * dice.f64()) * place);
+        }
+    }
+    let [top, bottom] = [rings * around, rings * around + 1];
+    vertices_m.extend([DVec3::Z * radius_m, -DVec3::Z * radius_m]);
+    let mut triangles = vec![];
+    for k in 0..around {
+        let next = (k + 1) % around;
+        triangles.push([top, k, next]);
+        triangles.push([bottom, (rings - 1) * around + next, (rings - 1) * around + k]);
+        for ring in 1..rings {
+            let [a, b, c, d] =
+                [(ring - 1, k), (ring - 1, next), (ring, k), (ring, next)].map(|(ring, k)| ring * around + k);
+            if ring % 2 == 1 {
+                triangles.extend([[a, c, b], [b, c, d]])
+            } else {
+                triangles.extend([[a, c, d], [a, d, b]])
+            }
+        }
+    }
+    MeshShape::new(vertices_m, triangles, |_, _, _| false).unwrap()
+}
+
+fn body(shape: MeshShape, point_mass_kg: f64, flexion: f64) -> Option<Body> {
+    Some(Body::Mesh(Mesh::new(point_mass_kg, flexion, Arc::new(shape))))
+}
+
+fn poke(centre_m: DVec3, force_n: DVec3, falloff_per_m: f64) -> Option<Push> {
+    Some(Push::Constant(Poke { point: None, centre_m, force_n, falloff_per_m, falloff_offset: 0.0 }))
+}
+
+#[test]
+fn a_flat_mesh_with_the_springs_of_a_sheet_is_that_sheet() {
+    const NX: u32 = 19;
+    const NY: u32 = 33;
+    let of_sheet = scene(None, &[&format!("sheet.points=[{NX}, {NY}]"), "sheet.fixed=corners"]);
+    let sheet = of_sheet.sheet().unwrap();
+    let at = |i: u32, j: u32| i * NY + j;
+    let vertices_m = (0..NX * NY).map(|k| sheet.rest_m(PointId::new(k as usize))).collect();
+    let (mut triangles, mut braces) = (vec![], vec![]);
+    for (i, j) in (0..NX - 1).flat_map(|i| (0..NY - 1).map(move |j| (i, j))) {
+        triangles.extend([[at(i, j), at(i + 1, j), at(i + 1, j + 1)], [at(i, j), at(i + 1, j + 1), at(i, j + 1)]]);
+        braces.push([at(i + 1, j), at(i, j + 1)]);
+    }
+    let is_fixed = |_: bool, _: DVec3, vertex: u32| sheet.is_fixed(PointId::new(vertex as usize));
+    let shape = MeshShape::braced(vertices_m, triangles, &braces, is_fixed).unwrap();
+    let like = |scene: &Scene| {
+        let mut scene = scene.clone();
+        scene.body = body(shape_of(&shape), sheet.point_mass_kg, 0.0).unwrap();
+        scene
+    };
+    for sets in [
+        &["stepping.integrator=central", "stepping.precision=f64", "stepping.substeps=2"][..],
+        &["stepping.integrator=exponential4", "stepping.precision=f32", "stepping.substeps=1"],
+        &["stepping.integrator=rk4", "stepping.precision=f64", "stepping.substeps=1"],
+    ] {
+        let points = format!("sheet.points=[{NX}, {NY}]");
+        let sets = [&[points.as_str(), "sheet.fixed=corners", "springs.shear_stiffness_n_per_m=10"], sets].concat();
+        let of_sheet = scene(None, &sets);
+        let (mut flat, mut mesh) = (tissue(&of_sheet), tissue(&like(&of_sheet)));
+        let centre_m = sheet.rest_m(sheet.point([7, 12])) + DVec3::new(0.004, 0.007, 0.0);
+        let (mut largest, mut apart) = ([0.0_f64; 2], [0.0_f64; 2]);
+        for step in 0..400 {
+            for tissue in [&mut flat, &mut mesh] {
+                if step == 10 {
+                    tissue.push(0, poke(centre_m, DVec3::new(0.2, -0.1, -0.9), 20.0));
+                    tissue.grasp(1, sheet.point([12, 25]), Grasp::Target(DVec3::new(0.0, 0.005, 0.01)));
+                }
+                if step == 250 {
+                    tissue.push(0, None);
+                    tissue.release(1);
+                }
+                tissue.step().unwrap();
+            }
+            for point in palpate::shape::points(sheet).step_by(7) {
+                let [a, b] = [flat.point(point), mesh.point(point)];
+                for (which, [a, b]) in
+                    [[a.displacement_m, b.displacement_m], [a.reaction_n(), b.reaction_n()]].into_iter().enumerate()
+                {
+                    largest[which] = largest[which].max(a.length());
+                    apart[which] = apart[which].max(a.distance(b));
+                }
+            }
+        }
+        println!("{sets:?}: {:e} of displacement, {:e} of force", apart[0] / largest[0], apart[1] / largest[1]);
+        assert!(largest[0] > 1e-3 && apart[0] < 1e-6 * largest[0], "{sets:?}: {apart:?} of {largest:?}");
+        // The sum of springs in f32 rounds in another order.
+        assert!(apart[1] < 1e-5 * largest[1], "{sets:?}: {apart:?} of {largest:?}");
+    }
+}
+
+/// The same shape once more.
+fn shape_of(shape: &MeshShape) -> MeshShape {
+    let known: std::collections::BTreeSet<[u32; 2]> = shape
+        .triangles()
+        .iter()
+        .flat_map(|[a, b, c]| [[*a, *b], [*b, *c], [*c, *a]])
+        .map(|[a, b]| [a.min(b), a.max(b)])
+        .collect();
+    let braces: Vec<[u32; 2]> = shape.edges().iter().filter(|edge| !known.contains(*edge)).copied().collect();
+    let fixed = |_: bool, _: DVec3, vertex: u32| shape.is_fixed(PointId::new(vertex as usize));
+    MeshShape::braced(shape.vertices_m().to_vec(), shape.triangles().to_vec(), &braces, fixed).unwrap()
+}
+
+#[test]
+fn without_damping_energy_is_kept_and_springs_change_no_momentum() {
+    for flexion in [0.0, 0.4] {
+        let sets = ["damping.coefficient_n_s_per_m=0", "virtual_springs.stiffness_n_per_m=0", "stepping.precision=f64"];
+        let sets =
+            [&sets[..], &["sleep.tolerance=0", "stepping.integrator=exponential4", "stepping.substeps=4"]].concat();
+        let scene = scene(body(sphere(9, 0.1), 0.01, flexion), &sets);
+        let mut tissue = tissue(&scene);
+        let points: Vec<PointId> = tissue.model().points().collect();
+        tissue.push(0, poke(DVec3::new(0.0, 0.1, 0.0), DVec3::new(0.1, -0.6, 0.2), 15.0));
+        (0..30).for_each(|_| tissue.step().unwrap());
+        tissue.push(0, None);
+        (0..3).for_each(|_| tissue.step().unwrap());
+        let momentum =
+            |tissue: &dyn Tissue| -> DVec3 { points.iter().map(|point| tissue.point(*point).velocity_m_per_s).sum() };
+        let turn = |tissue: &dyn Tissue| -> DVec3 {
+            let of = |point: &PointId| {
+                let state = tissue.point(*point);
+                (scene.shape().rest_m(*point) + state.displacement_m).cross(state.velocity_m_per_s)
+            };
+            points.iter().map(of).sum()
+        };
+        let total = |tissue: &dyn Tissue| {
+            let energy = tissue.energy();
+            energy.kinetic_j + energy.spring_j + energy.virtual_j
+        };
+        let (begun_j, begun, begun_turn) = (total(&*tissue), momentum(&*tissue), turn(&*tissue));
+        for _ in 0..500 {
+            tissue.step().unwrap();
+            let largest: f64 = points.iter().map(|point| tissue.point(*point).velocity_m_per_s.length()).sum();
+            assert!((total(&*tissue) - begun_j).abs() < 1e-5 * begun_j, "{} {begun_j}", total(&*tissue));
+            assert!(momentum(&*tissue).distance(begun) < 1e-9 * largest, "{} {begun}", momentum(&*tissue));
+            assert!(turn(&*tissue).distance(begun_turn) < 1e-5 * 0.1 * largest, "{} {begun_turn}", turn(&*tissue));
+        }
+        assert!(tissue.energy().spring_j > 1e-3 * begun_j && begun.length() > 0.0);
+    }
+}
+
+#[test]
+fn the_bits_of_a_mesh_are_those_of_any_width() {
+    for (integrator, precision) in
+        [("central", "f32"), ("exponential3", "compensated"), ("exponential4", "f64"), ("rk4", "f32")]
+    {
+        let hash = |lanes: &str| {
+            let [integrator, precision, lanes] =
+                [("integrator", integrator), ("precision", precision), ("lanes", lanes)]
+                    .map(|(key, value)| format!("stepping.{key}={value}"));
+            let scene =
+                scene(body(sphere(13, 0.1), 0.01, 0.3), &[&integrator, &precision, &lanes, "stepping.substeps=2"]);
+            let model = Model::compile(&scene, &Limits::default()).ok()?;
+            let mut tissue = at_rest(&model);
+            tissue.push(0, poke(DVec3::new(0.07, 0.07, 0.02), DVec3::new(0.4, -0.6, 0.2), 25.0));
+            tissue.grasp(1, PointId::new(40), Grasp::Target(DVec3::new(0.0, 0.01, -0.02)));
+            (0..60).for_each(|_| tissue.step().unwrap());
+            Some((tissue.state_hash(), tissue.awake_points()))
+        };
+        let hashes: Vec<_> = ["plain", "avx2", "avx512", "neon"].into_iter().filter_map(hash).collect();
+        assert!(
+            hashes.len() > 1 && hashes.iter().all(|hash| *hash == hashes[0]),
+            "{integrator} {precision}: {hashes:?}"
+        );
+    }
+}
+
+#[test]
+fn a_mesh_sleeps_where_nothing_moves_and_wakes_where_something_does() {
+    let sets = ["damping.coefficient_n_s_per_m=0.3", "virtual_springs.stiffness_n_per_m=20"];
+    let with_sleep = |sleep: &str| scene(body(sphere(45, 0.1), 0.01, 0.0), &[&sets[..], &[sleep]].concat());
+    let (mut sleeper, mut awake) =
+        (tissue(&with_sleep("sleep.tolerance=1e-4")), tissue(&with_sleep("sleep.tolerance=0")));
+    assert!(sleeper.is_still() && sleeper.awake_points() == 0);
+    let (mut largest, mut apart, mut fewest) = (0.0_f64, 0.0_f64, usize::MAX);
+    for step in 0..1500 {
+        for tissue in [&mut sleeper, &mut awake] {
+            match step {
+                0 => tissue.push(0, poke(DVec3::new(0.0, 0.0, 0.1), DVec3::new(0.0, 0.0, -0.3), 150.0)),
+                700 => tissue.push(0, poke(DVec3::new(0.0, 0.0, -0.1), DVec3::new(0.1, 0.0, 0.2), 150.0)),
+                _ => {}
+            }
+            tissue.step().unwrap();
+        }
+        if step == 4 {
+            fewest = sleeper.awake_points();
+        }
+        for point in awake.model().points().step_by(17) {
+            let [a, b] = [&sleeper, &awake].map(|tissue| tissue.point(point).displacement_m);
+            largest = largest.max(b.length());
+            apart = apart.max(a.distance(b));
+        }
+    }
+    println!("{fewest} of {} points awake; {:e} apart", awake.model().len(), apart / largest);
+    assert!(fewest > 0 && 2 * fewest < awake.model().len(), "{fewest}");
+    assert!(largest > 1e-4 && apart < 1e-4 * largest, "{apart} of {largest}");
+    for _ in 0..6000 {
+        sleeper.step().unwrap();
+        if sleeper.is_still() {
+            return;
+        }
+    }
+    panic!("{} awake", sleeper.awake_points());
+}
