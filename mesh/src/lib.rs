@@ -1,5 +1,11 @@
 //! Triangle meshes of organs: read from files, checked, mended, written, generated. No tissue, no network, no clock.
 
 pub mod mesh;
+pub mod problem;
+pub mod read;
+pub mod unit;
 
 pub use mesh::{Group, TriangleMesh};
+pub use problem::{Element, MeshError, Problem};
+pub use read::{ReadLimits, ReadMesh, read};
+pub use unit::Unit;
