@@ -3,9 +3,13 @@
 pub mod mesh;
 pub mod problem;
 pub mod read;
+pub mod report;
+pub mod topology;
+mod tree;
 pub mod unit;
 
 pub use mesh::{Group, TriangleMesh};
 pub use problem::{Element, MeshError, Problem};
 pub use read::{ReadLimits, ReadMesh, read};
+pub use report::{Report, report};
 pub use unit::Unit;
