@@ -1,8 +1,10 @@
 //! Triangle meshes of organs: read from files, checked, mended, written, generated. No tissue, no network, no clock.
 
+pub mod delaunay;
 pub mod mesh;
 pub mod problem;
 pub mod read;
+pub mod repair;
 pub mod report;
 pub mod topology;
 mod tree;
