@@ -10,6 +10,7 @@ pub mod report;
 pub mod topology;
 mod tree;
 pub mod unit;
+pub mod write;
 
 pub use mesh::{Group, TriangleMesh};
 pub use problem::{Element, MeshError, Problem};
