@@ -4,6 +4,7 @@
 //! counts are wrong.
 
 use std::borrow::Cow;
+use std::cell::Cell;
 use std::fmt;
 use std::marker::PhantomData;
 
@@ -177,6 +178,8 @@ struct File<'a> {
     name: &'a str,
     root: Root,
     buffers: Vec<Cow<'a, [u8]>>,
+    /// Primitives so far, counted again for each node that has them.
+    primitives: Cell<usize>,
 }
 
 /// The JSON and the binary part of a GLB file, or all of a glTF file.
@@ -242,7 +245,7 @@ pub(super) fn read(
             _ => Problem::Syntax { message: e.to_string() },
         },
     })?;
-    let mut file = File { name, root, buffers: Vec::new() };
+    let mut file = File { name, root, buffers: Vec::new(), primitives: Cell::new(0) };
     let mut buffers: Vec<Cow<'_, [u8]>> = Vec::new();
     for (number, buffer) in file.root.buffers.0.iter().enumerate() {
         let fail = |problem| file.fail("buffer", number, problem);
@@ -347,6 +350,10 @@ impl File<'_> {
     fn mesh(&self, number: usize, node: Option<&str>, place: DMat4, draft: &mut Draft<'_>) -> Result<(), MeshError> {
         let mesh = self.root.meshes.0.get(number).ok_or_else(|| self.missing("mesh", number))?;
         for primitive in &mesh.primitives.0 {
+            self.primitives.set(self.primitives.get() + 1);
+            if self.primitives.get() > MOST {
+                return Err(self.fail("mesh", number, Problem::TooLarge { what: "primitives", limit: MOST }));
+            }
             let mode = primitive.mode.unwrap_or(4);
             if !(4..=6).contains(&mode) {
                 draft.lines += 1;
@@ -464,7 +471,7 @@ impl File<'_> {
             let (indices, _) = self.view(sparse.indices.buffer_view, sparse.indices.byte_offset)?;
             let (replaced, _) = self.view(sparse.values.buffer_view, sparse.values.byte_offset)?;
             let have = (indices.len() / index.size()).min(replaced.len() / width);
-            if sparse.count > have {
+            if sparse.count > have.min(accessor.count) {
                 return Err(cut());
             }
             let pairs = indices.chunks_exact(index.size()).zip(replaced.chunks_exact(width));

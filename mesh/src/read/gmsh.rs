@@ -1,12 +1,15 @@
 //! Gmsh, formats 1, 2 and 4.1, text and binary; physical names and numbers as groups.
 //!
-//! An own reader: of the crates, `mshio` alone reads Gmsh, only format 4.1, and ends the program at what it does not know.
+//! No crate is used: `mshio` alone reads Gmsh, only format 4.1, and ends the program at what it does not know.
 
 use std::collections::{BTreeMap, HashMap};
 
 use super::draft::{Cell, Draft};
 use super::source::{Order, Scalar, Source, named, parsed, shown};
 use crate::{MeshError, Problem};
+
+/// Physical tags of an entity that count.
+const PHYSICAL: usize = 16;
 
 /// What an element is, by its corners.
 #[derive(Clone, Copy)]
@@ -209,8 +212,12 @@ impl File<'_, '_, '_> {
                 let tags = self.count(self.size, 1, 4, "physical tags")?;
                 let mut physical = Vec::new();
                 for _ in 0..tags {
-                    physical.push(self.int("a physical tag")?);
+                    // Negative where the entity faces the other way.
+                    physical.push(self.int("a physical tag")?.saturating_abs());
                 }
+                physical.sort_unstable();
+                physical.dedup();
+                physical.truncate(PHYSICAL);
                 if !physical.is_empty() {
                     self.physical.insert((dimension, tag), physical);
                 }

@@ -109,10 +109,11 @@ impl<'a> Document<'a> {
                             has_begun = true;
                             document.root(&element).map_err(fail)?;
                         }
-                        "Piece" => document.pieces.push(Vec::new()),
+                        "Piece" if document.pieces.len() < MOST => document.pieces.push(Vec::new()),
+                        "Piece" => return Err(fail(Problem::TooLarge { what: "pieces", limit: MOST })),
                         "DataArray" => {
                             arrays += 1;
-                            if arrays > MOST || document.pieces.len() > MOST {
+                            if arrays > MOST {
                                 return Err(fail(Problem::TooLarge { what: "arrays", limit: MOST }));
                             }
                             let array = document.array(&element, &section, byte).map_err(fail)?;
