@@ -187,9 +187,11 @@ impl fmt::Display for Problem {
             Problem::TooLarge { what, limit } => write!(f, "more than {limit} {what}: give a smaller mesh"),
             Problem::NotFinite => write!(f, "a coordinate is not a finite number"),
             Problem::IndexOutOfRange { index, vertices } => {
-                write!(f, "vertex {index} does not exist: there are {vertices} vertices here")
+                write!(f, "vertex {index} does not exist (vertices here: {vertices})")
             }
-            Problem::TooFewVertices { vertices } => write!(f, "{vertices} vertices: at least 4 are needed"),
+            Problem::TooFewVertices { vertices } => {
+                write!(f, "too few vertices ({vertices}): a tissue needs at least 4")
+            }
             Problem::OnlyDegenerate => write!(f, "no triangle has an area: there is no surface to touch"),
             Problem::NonManifoldEdge { triangles } => {
                 write!(f, "{triangles} triangles share this edge, at most 2 can: --repair drops the others")

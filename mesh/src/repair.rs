@@ -102,7 +102,7 @@ struct Work {
 impl Work {
     fn tell(&mut self, count: usize, what: &str) {
         if count > 0 {
-            self.told.push(format!("{count} {what}."));
+            self.told.push(format!("{what}: {count}."));
         }
     }
 
@@ -143,7 +143,7 @@ impl Work {
         let is_valid = |vertex: &u32| vertices.get(*vertex as usize).is_some_and(|at| at.is_finite());
         let keep: Vec<bool> = self.mesh.triangles.iter().map(|triangle| triangle.iter().all(is_valid)).collect();
         let dropped = self.keep(&keep);
-        self.tell(dropped, "triangles were dropped: their vertices do not exist or are not finite");
+        self.tell(dropped, "Triangles dropped because their vertices do not exist or are not finite");
     }
 
     fn weld(&mut self, weld_m: Option<f64>) {
@@ -190,23 +190,23 @@ impl Work {
         }
         if welded > 0 {
             self.renumber(&new_of);
-            self.tell(welded, "vertices were welded with an earlier one");
+            self.tell(welded, "Vertices welded with an earlier one");
         }
     }
 
     fn drop_degenerate(&mut self) {
         let flipped = flip_degenerate(&mut self.mesh);
-        self.tell(flipped, "edges were flipped beside triangles without area");
+        self.tell(flipped, "Edges flipped beside triangles without area");
         let vertices = &self.mesh.vertices_m;
         let keep: Vec<bool> = self.mesh.triangles.iter().map(|triangle| has_area(vertices, *triangle)).collect();
         let dropped = self.keep(&keep);
-        self.tell(dropped, "triangles without area were dropped");
+        self.tell(dropped, "Triangles without area dropped");
         let mut keep = vec![true; self.mesh.triangles.len()];
         for triangle in self.topology().duplicates {
             keep[triangle as usize] = false;
         }
         let dropped = self.keep(&keep);
-        self.tell(dropped, "triangles were dropped that have the vertices of an earlier one");
+        self.tell(dropped, "Triangles dropped that have the vertices of an earlier one");
     }
 
     /// Drops the triangles that an edge has beyond two: the first one stays, and the next one that faces the same side.
@@ -226,7 +226,7 @@ impl Work {
             }
         }
         let dropped = self.keep(&keep);
-        self.tell(dropped, "triangles were dropped at edges that more than two had");
+        self.tell(dropped, "Triangles dropped at edges that more than two had");
     }
 
     /// Gives each fan of triangles at a vertex its own vertex; the first one keeps the old one.
@@ -254,7 +254,7 @@ impl Work {
                 group.vertices.sort_unstable();
             }
         }
-        self.tell(count, "vertices were added where surfaces touched at a vertex alone");
+        self.tell(count, "Vertices added where surfaces touched at a vertex alone");
     }
 
     /// Turns triangles so that neighbours face the same side as the first one of their surface.
@@ -301,7 +301,7 @@ impl Work {
         for triangle in &turned {
             self.turn(*triangle);
         }
-        self.tell(turned.len(), "triangles were turned to the side that the others face");
+        self.tell(turned.len(), "Triangles turned to the side that the others face");
         if !is_orientable {
             self.told.push(
                 "The surface has one side only, like a Möbius strip: no way of turning triangles fits.".to_owned(),
@@ -325,7 +325,7 @@ impl Work {
         if sizes.len() > 1 {
             let keep: Vec<bool> = topology.component.iter().map(|component| *component == largest).collect();
             let dropped = self.keep(&keep);
-            self.told.push(format!("{} smaller surfaces with {dropped} triangles were dropped.", sizes.len() - 1));
+            self.told.push(format!("Smaller surfaces dropped: {}, with their triangles: {dropped}.", sizes.len() - 1));
         }
     }
 
@@ -384,8 +384,8 @@ impl Work {
             }
             filled += 1;
         }
-        self.tell(filled, "holes were filled");
-        self.tell(added, "vertices were added in the middle of holes");
+        self.tell(filled, "Holes filled");
+        self.tell(added, "Vertices added in the middle of holes");
     }
 
     fn face_outward(&mut self) {
@@ -415,7 +415,7 @@ impl Work {
         self.mesh.vertices_m.retain(|_| is_kept.next().unwrap_or(true));
         self.renumber(&new_of);
         self.mesh.groups.retain(|group: &Group| !group.vertices.is_empty());
-        self.tell(dropped, "vertices were dropped that no triangle has");
+        self.tell(dropped, "Vertices dropped that no triangle has");
     }
 }
 

@@ -84,16 +84,16 @@ fn what_was_done_to_a_file_is_told() {
         let sample = samples().into_iter().find(|sample| sample.name == name).unwrap();
         read_mm(name, sample.bytes).unwrap().notes.join(" ")
     };
-    assert!(notes("binary.stl").contains("24 corners of 8 triangles were welded"), "{}", notes("binary.stl"));
+    assert!(notes("binary.stl").contains("24 became 6 vertices"), "{}", notes("binary.stl"));
     let volume = notes("two-volume.msh");
-    assert!(volume.contains("8 volume elements: their outer surface of 8 triangles"), "{volume}");
-    assert!(volume.contains("6 of 7 vertices are corners of the surface"), "{volume}");
-    assert!(notes("embedded.gltf").contains("1 points and lines are left out"));
+    assert!(volume.contains("Volume elements: 8; triangles: 8."), "{volume}");
+    assert!(volume.contains("corners of the surface: 6 of 7;"), "{volume}");
+    assert!(notes("embedded.gltf").contains("Points and lines left out: 1."));
     let squares = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nf 1 2 3 4\nl 1 2\nf -5 -4 -1\n";
     let found = read_mm("squares.obj", squares).unwrap();
     assert_eq!(found.mesh.triangles, [[0, 1, 2], [0, 2, 3], [0, 1, 4]]);
     assert_eq!(found.notes.len(), 2, "{:?}", found.notes);
-    assert!(found.notes[0].contains("1 polygons were split"));
+    assert!(found.notes[0].contains("from their first vertex: 1."));
     // The content decides.
     let other = read_mm("wrong.obj", common::stl_binary()).unwrap();
     assert!(other.notes[0].contains("Stl"), "{:?}", other.notes);
@@ -235,6 +235,24 @@ fn limits_hold_however_much_a_file_claims() {
     assert!(read_mm("a.gltf", format!("{{\"nodes\":{deep}")).is_err());
     let deep = "<a>".repeat(1 << 20);
     assert!(read_mm("a.vtp", format!("<VTKFile type=\"PolyData\">{deep}")).is_err());
+    // Little text, much work: many nodes with the same many primitives.
+    let primitives = [r#"{"attributes":{"POSITION":0}}"#; 2000].join(",");
+    let nodes = [r#"{"mesh":0}"#; 2000].join(",");
+    let many = format!(
+        r#"{{"nodes":[{nodes}],"meshes":[{{"primitives":[{primitives}]}}],
+        "accessors":[{{"componentType":5126,"count":0,"type":"VEC3"}}]}}"#
+    );
+    assert_eq!(read_mm("a.gltf", many).unwrap_err().problem.name(), "too_large");
+    // An entity with many physical tags and many elements.
+    let tags = "3 ".repeat(100_000);
+    let elements = "2 1 15 1 1 1\n".repeat(20_000);
+    let many = format!(
+        "$MeshFormat\n4.1 0 8\n$EndMeshFormat\n$Entities\n1 0 0 0\n1 0 0 0 100000 {tags}\n$EndEntities\n\
+         $Nodes\n1 1 1 1\n0 1 0 1\n1\n0 0 0\n$EndNodes\n$Elements\n20000 20000 1 1\n{}$EndElements\n",
+        elements.replace("2 1 15", "0 1 15")
+    );
+    let found = read_mm("a.msh", many).unwrap();
+    assert_eq!((found.mesh.groups.len(), found.mesh.groups[0].vertices.len()), (1, 1));
     // A node that contains itself.
     let circle = r#"{"scenes":[{"nodes":[0]}],"nodes":[{"children":[0]}]}"#;
     assert_eq!(read_mm("a.gltf", circle).unwrap_err().element, Element::Part("node", 0));
@@ -279,7 +297,7 @@ fn meshes_made_elsewhere_are_checked_as_well() {
     assert_eq!(found.problems[1].element, Element::Triangle(8));
     let repaired = repair(&mesh, &Repair::default());
     assert_eq!(repaired.mesh.vertices_m.len(), 5);
-    assert!(repaired.told[0].starts_with("5 triangles were dropped"), "{:?}", repaired.told);
+    assert!(repaired.told[0].ends_with("not finite: 5."), "{:?}", repaired.told);
     assert_eq!(repaired.vertex_of[2], None);
 }
 
@@ -296,7 +314,7 @@ fn holes_are_counted_and_small_ones_filled() {
     let after = report(&repaired.mesh);
     assert_eq!((after.holes, after.problems.len()), (0, 0), "{after:?}");
     assert!((after.volume_m3.unwrap() / report(&sphere(3)).volume_m3.unwrap() - 1.0).abs() < 0.01);
-    assert!(repaired.told.iter().any(|line| line.starts_with("2 holes were filled")), "{:?}", repaired.told);
+    assert!(repaired.told.iter().any(|line| line == "Holes filled: 2."), "{:?}", repaired.told);
     // The rim of a sheet is no hole to fill.
     let flat = sheet(4, || 0.0);
     let repaired = mended(&flat);
@@ -351,7 +369,7 @@ fn duplicates_are_found_and_dropped() {
     assert!(refused(&found).contains(&"non_manifold_edge"));
     let repaired = mended(&mesh);
     assert_eq!(shape(&repaired.mesh), shape(&sphere(2)));
-    assert_eq!(repaired.told, ["2 triangles were dropped that have the vertices of an earlier one."]);
+    assert_eq!(repaired.told, ["Triangles dropped that have the vertices of an earlier one: 2."]);
     // Each triangle with its own vertices, one of them a little off.
     let whole = sphere(2);
     let mut soup = TriangleMesh::default();

@@ -112,7 +112,7 @@ impl<'l> Draft<'l> {
         Ok(group)
     }
 
-    /// The vertex of an index, which the file counts from `first`.
+    /// The vertex of an index, if it exists.
     fn index(&self, index: i64) -> Result<u32, Problem> {
         let vertices = self.vertices.len();
         u32::try_from(index)
@@ -218,7 +218,7 @@ impl<'l> Draft<'l> {
         if !self.triangles.is_empty() {
             let number = self.triangles.len();
             self.notes
-                .push(format!("{number} surface triangles are left out: the outer surface of the volume is used."));
+                .push(format!("Surface triangles left out, since the outer surface of the volume is used: {number}."));
         }
         (self.split, self.has_uv) = (0, false);
         self.triangles.clear();
@@ -230,7 +230,9 @@ impl<'l> Draft<'l> {
             }
         }
         let (cells, triangles) = (self.cells, self.triangles.len());
-        self.notes.push(format!("{cells} volume elements: their outer surface of {triangles} triangles is the mesh."));
+        self.notes.push(format!(
+            "The mesh is the outer surface of a volume. Volume elements: {cells}; triangles: {triangles}."
+        ));
         Ok(())
     }
 
@@ -260,7 +262,7 @@ impl<'l> Draft<'l> {
             group.vertices.iter_mut().for_each(|vertex| *vertex = number[*vertex as usize]);
         }
         self.notes.push(format!(
-            "{kept} of {all} vertices are corners of the surface; they are numbered from 0 in the order of the file."
+            "Vertices kept, since they are corners of the surface: {kept} of {all}; numbered from 0 in the order of the file."
         ));
     }
 
@@ -285,10 +287,10 @@ impl<'l> Draft<'l> {
         }
         self.groups.retain(|group| !group.vertices.is_empty());
         if self.split > 0 {
-            self.notes.push(format!("{} polygons were split into triangles, from their first vertex.", self.split));
+            self.notes.push(format!("Polygons split into triangles, from their first vertex: {}.", self.split));
         }
         if self.lines > 0 {
-            self.notes.push(format!("{} points and lines are left out.", self.lines));
+            self.notes.push(format!("Points and lines left out: {}.", self.lines));
         }
         let has_finite_uv = self.uv.iter().flatten().flatten().all(|part| part.is_finite());
         if self.has_uv && !has_finite_uv {

@@ -1,6 +1,6 @@
 //! Wavefront OBJ: vertices, texture coordinates, faces, and groups, objects and materials as groups.
 //!
-//! An own reader, since the crates number vertices anew in each object and say no line.
+//! No crate is used: they number vertices anew in each object and say no line.
 
 use super::draft::Draft;
 use super::source::{Source, named, parsed, shown};
@@ -103,7 +103,7 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
         }
     }
     if ignored > 0 {
-        draft.notes.push(format!("{ignored} curves and free-form surfaces are left out: export triangles instead."));
+        draft.notes.push(format!("Curves and free-form surfaces left out, export triangles instead: {ignored}."));
     }
     Ok(())
 }

@@ -1,6 +1,6 @@
 //! PLY, text and binary of both byte orders.
 //!
-//! An own reader, since `ply-rs-bw` allocates what a header counts and panics at a count that is too long.
+//! `ply-rs-bw` is not used: it allocates what a header counts and panics at a count that is too long.
 
 use super::draft::Draft;
 use super::source::{Order, Scalar, Source, named, parsed, shown};

@@ -1,6 +1,6 @@
 //! STL, text and binary. Each triangle has its own vertices there; those at one position become one vertex.
 //!
-//! An own reader, since `stl_io` takes a binary file that begins with "solid" for text and says no triangle.
+//! `stl_io` is not used: it takes a binary file that begins with "solid" for text and says no triangle.
 
 use std::collections::HashMap;
 
@@ -50,8 +50,8 @@ pub(super) fn read(source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), Mesh
         if is_binary(bytes) || !is_text { binary(source, &mut welder)? } else { text(source, &mut welder)? };
     let vertices = draft.vertices();
     draft.notes.push(format!(
-        "The {} corners of {triangles} triangles were welded by their exact positions: {vertices} vertices, numbered from \
-         0 as they first appear.",
+        "Corners of triangles welded by their exact positions: {} became {vertices} vertices, numbered from 0 as they first \
+         appear.",
         3 * triangles
     ));
     Ok(())
@@ -74,7 +74,7 @@ fn binary(mut source: Source<'_>, welder: &mut Welder<'_, '_>) -> Result<usize, 
         welder.draft.polygon(&corners, &[], &[]).map_err(fail)?;
     }
     if !source.rest().is_empty() {
-        welder.draft.notes.push(format!("{} bytes after the last triangle are left out.", source.rest().len()));
+        welder.draft.notes.push(format!("Bytes left out after the last triangle: {}.", source.rest().len()));
     }
     Ok(count)
 }

@@ -1,6 +1,6 @@
 //! VTK's legacy format, text and binary: POLYDATA and UNSTRUCTURED_GRID; and what it shares with VTK's XML.
 //!
-//! An own reader, since `vtkio` reserves what a file counts, unpacks without bound and says no element.
+//! `vtkio` is not used: it reserves what a file counts, unpacks without bound and says no element.
 
 use super::draft::{Cell, Draft};
 use super::source::{Order, Scalar, Source, shown};
