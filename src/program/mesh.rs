@@ -83,7 +83,7 @@ pub(crate) fn mesh(arguments: &MeshArguments) -> Result<(), Failure> {
     if let Some(vertices) = arguments.vertices.filter(|vertices| *vertices < mesh.vertices_m.len()) {
         let before = mesh.vertices_m.len();
         mesh = decimate(&mesh, vertices).mesh;
-        done.push(format!("{before} vertices were decimated to {}.", mesh.vertices_m.len()));
+        done.push(format!("Vertices decimated: {before} to {}.", mesh.vertices_m.len()));
         if mesh.vertices_m.len() > vertices {
             done.push("Fewer would fold the surface: --repair may help.".to_owned());
         }
