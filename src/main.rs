@@ -5,7 +5,7 @@ mod program;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use program::{Failure, certificate, check, client, render, run, say, serve, texture, token, within_memory};
+use program::{Failure, certificate, check, client, mesh, render, run, say, serve, texture, token, within_memory};
 
 /// A server for touching soft tissue over a network.
 #[derive(Parser)]
@@ -49,6 +49,22 @@ enum Command {
         texture in a scene, set texture_seed and texture_size in its section [appearance], or texture = \"FILE.png\".\n\n\
         Exit status: 0; 1 when the file can't be written; 2 when an input was refused.")]
     Texture(texture::TextureArguments),
+    /// Check a mesh of an organ: size, holes, volume, how even it is, and what is wrong with it; mend it, make it coarser,
+    /// write it anew
+    #[command(after_help = "Examples:\n  \
+        palpate mesh liver.obj --unit mm\n  \
+        palpate mesh scan.stl --unit mm --repair --vertices 5000 --output liver.obj\n  \
+        palpate mesh organ.msh --unit 0.0254 --json\n\n\
+        Reads OBJ, STL, PLY, glTF (.gltf and .glb), Gmsh 1, 2 and 4.1 (.msh) and VTK (.vtk, .vtp and .vtu). A volume mesh \
+        gives its outer surface. Mesh files do not state their unit, so you do: m, cm, mm, or the metres of one unit.\n\n\
+        A tissue needs a surface in which each edge has one or two triangles that face the same side. --repair welds \
+        vertices at one position, drops triangles without area and those that an edge has beyond two, turns triangles to \
+        one side, keeps the largest surface, fills small holes and drops unused vertices. It tells what it did. Vertices \
+        are numbered from 0 in the order of the file.\n\n\
+        With --json: vertices, triangles, components, holes, volume_m3, extent_m, problems with what, element and place_m, \
+        and more.\n\n\
+        Exit status: 0 when the mesh is usable, with warnings too; 1 when a file can't be written; 2 when it was refused.")]
+    Mesh(mesh::MeshArguments),
     /// Serve tissue over gRPC and to browsers: sessions in real time, commands in, forces and frames out
     #[command(after_help = "Examples:\n  \
         palpate serve\n  \
@@ -104,6 +120,7 @@ fn main() -> ExitCode {
         Command::Check(arguments) => within_memory(|| check::check(&arguments)),
         Command::Render(arguments) => within_memory(|| render::render(&arguments)),
         Command::Texture(arguments) => within_memory(|| texture::make_texture(&arguments)),
+        Command::Mesh(arguments) => within_memory(|| mesh::mesh(&arguments)),
         Command::Serve(arguments) => serve::serve(&arguments),
         Command::Token(arguments) => token::token(&arguments),
         Command::Certificate(arguments) => certificate::certificate(&arguments),

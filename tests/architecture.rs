@@ -28,10 +28,11 @@ const MODULES: [&str; 18] = [
 ];
 
 /// The crates: folder, name, the other crates that it may use, and what must not be in its tree of dependencies.
-const CRATES: [(&str, &str, &[&str], &[&str]); 5] = [
+const CRATES: [(&str, &str, &[&str], &[&str]); 6] = [
+    ("mesh", "palpate-mesh", &[], &["axum", "clap", "prost", "tokio", "tonic"]),
     ("clients/touch", "palpate-touch", &[], &["axum", "prost", "tokio", "tonic"]),
     ("proto", "palpate-proto", &["palpate-touch"], &["axum", "clap", "hyper", "tokio-rustls"]),
-    (".", "palpate", &["palpate-proto", "palpate-touch"], &["indicatif", "rustls-native-certs"]),
+    (".", "palpate", &["palpate-mesh", "palpate-proto", "palpate-touch"], &["indicatif", "rustls-native-certs"]),
     (
         "clients/library",
         "palpate-client",

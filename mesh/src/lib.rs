@@ -1,5 +1,19 @@
 //! Triangle meshes of organs: read from files, checked, mended, written, generated. No tissue, no network, no clock.
 
+pub mod decimate;
+pub mod delaunay;
 pub mod mesh;
+pub mod problem;
+pub mod read;
+pub mod repair;
+pub mod report;
+pub mod topology;
+mod tree;
+pub mod unit;
+pub mod write;
 
 pub use mesh::{Group, TriangleMesh};
+pub use problem::{Element, MeshError, Problem};
+pub use read::{ReadLimits, ReadMesh, read};
+pub use report::{Report, report};
+pub use unit::Unit;

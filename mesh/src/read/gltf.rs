@@ -1,0 +1,517 @@
+//! glTF 2.0, as JSON with buffers and as GLB: nodes with their transforms, primitives, indices of every type.
+//!
+//! The JSON is read by `serde_json`. The crate `gltf` slices buffers without checks and panics where a file's offsets and
+//! counts are wrong.
+
+use std::borrow::Cow;
+use std::cell::Cell;
+use std::fmt;
+use std::marker::PhantomData;
+
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use glam::{DMat4, DQuat, DVec3};
+use serde::Deserialize;
+use serde::de::{SeqAccess, Visitor};
+
+use super::draft::Draft;
+use super::source::{Order, Scalar, named};
+use crate::{Element, MeshError, Problem};
+
+/// Nodes, meshes, accessors and so on of a file. They take more memory than the text that they are from.
+const MOST: usize = 1 << 16;
+
+/// A list of at most [`MOST`] entries.
+struct Few<T>(Vec<T>);
+
+impl<T> Default for Few<T> {
+    fn default() -> Self {
+        Self(Vec::new())
+    }
+}
+
+impl<'de, T: Deserialize<'de>> Deserialize<'de> for Few<T> {
+    fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct List<T>(PhantomData<T>);
+        impl<'de, T: Deserialize<'de>> Visitor<'de> for List<T> {
+            type Value = Few<T>;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                write!(f, "a list of at most {MOST} entries")
+            }
+
+            fn visit_seq<A: SeqAccess<'de>>(self, mut entries: A) -> Result<Few<T>, A::Error> {
+                let mut list = Vec::new();
+                while let Some(entry) = entries.next_element()? {
+                    if list.len() >= MOST {
+                        return Err(serde::de::Error::invalid_length(MOST + 1, &self));
+                    }
+                    list.push(entry);
+                }
+                Ok(Few(list))
+            }
+        }
+        deserializer.deserialize_seq(List(PhantomData))
+    }
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Root {
+    #[serde(default)]
+    scene: usize,
+    #[serde(default)]
+    scenes: Few<Scene>,
+    #[serde(default)]
+    nodes: Few<Node>,
+    #[serde(default)]
+    meshes: Few<Mesh>,
+    #[serde(default)]
+    materials: Few<Named>,
+    #[serde(default)]
+    accessors: Few<Accessor>,
+    #[serde(default)]
+    buffer_views: Few<View>,
+    #[serde(default)]
+    buffers: Few<Buffer>,
+    #[serde(default)]
+    extensions_required: Few<String>,
+}
+
+#[derive(Deserialize)]
+struct Scene {
+    #[serde(default)]
+    nodes: Few<u32>,
+}
+
+#[derive(Deserialize)]
+struct Node {
+    name: Option<String>,
+    mesh: Option<usize>,
+    #[serde(default)]
+    children: Few<u32>,
+    matrix: Option<Box<[f64; 16]>>,
+    translation: Option<[f64; 3]>,
+    rotation: Option<[f64; 4]>,
+    scale: Option<[f64; 3]>,
+}
+
+#[derive(Deserialize)]
+struct Named {
+    name: Option<String>,
+}
+
+#[derive(Deserialize)]
+struct Mesh {
+    name: Option<String>,
+    #[serde(default)]
+    primitives: Few<Primitive>,
+}
+
+#[derive(Deserialize)]
+struct Primitive {
+    attributes: Attributes,
+    indices: Option<usize>,
+    material: Option<usize>,
+    mode: Option<u32>,
+}
+
+// Required, so that no short text makes many primitives.
+#[derive(Deserialize)]
+struct Attributes {
+    #[serde(rename = "POSITION")]
+    position: usize,
+    #[serde(rename = "TEXCOORD_0")]
+    uv: Option<usize>,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Accessor {
+    buffer_view: Option<usize>,
+    #[serde(default)]
+    byte_offset: usize,
+    component_type: u32,
+    #[serde(default)]
+    normalized: bool,
+    count: usize,
+    #[serde(rename = "type")]
+    kind: String,
+    sparse: Option<Box<Sparse>>,
+}
+
+#[derive(Deserialize)]
+struct Sparse {
+    count: usize,
+    indices: SparsePart,
+    values: SparsePart,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct SparsePart {
+    buffer_view: usize,
+    #[serde(default)]
+    byte_offset: usize,
+    component_type: Option<u32>,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct View {
+    buffer: usize,
+    #[serde(default)]
+    byte_offset: usize,
+    byte_length: usize,
+    byte_stride: Option<usize>,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Buffer {
+    uri: Option<String>,
+    byte_length: usize,
+}
+
+/// A file that is being read.
+struct File<'a> {
+    name: &'a str,
+    root: Root,
+    buffers: Vec<Cow<'a, [u8]>>,
+    /// Primitives so far, counted again for each node that has them.
+    primitives: Cell<usize>,
+}
+
+/// The JSON and the binary part of a GLB file, or all of a glTF file.
+fn parts<'a>(name: &str, bytes: &'a [u8]) -> Result<(&'a [u8], Option<&'a [u8]>), MeshError> {
+    if !bytes.starts_with(b"glTF") {
+        return Ok((bytes, None));
+    }
+    let fail = |at: usize, problem| MeshError {
+        file: name.to_owned(),
+        element: Element::Byte(at as u64),
+        place_m: None,
+        problem,
+    };
+    let word = |at: usize| bytes.get(at..at + 4).map(|word| Scalar::U32.integer(word, Order::Little));
+    if word(4) != Some(2) {
+        return Err(fail(4, Problem::Unsupported { message: "not version 2 of glTF: export it again".to_owned() }));
+    }
+    let (mut json, mut binary, mut at) = (None, None, 12);
+    while let Some((length, kind)) = word(at).zip(word(at + 4)) {
+        let start = at + 8;
+        let end = usize::try_from(length).ok().and_then(|length| start.checked_add(length));
+        let chunk = end.and_then(|end| bytes.get(start..end));
+        let Some(chunk) = chunk else {
+            return Err(fail(at, Problem::Truncated { missing: "a part of a chunk".to_owned() }));
+        };
+        match &kind.to_le_bytes()[..4] {
+            b"JSON" if json.is_none() => json = Some(chunk),
+            b"BIN\0" if binary.is_none() => binary = Some(chunk),
+            _ => {}
+        }
+        at = start + chunk.len();
+    }
+    let json = json.ok_or_else(|| fail(at, Problem::Truncated { missing: "the JSON chunk".to_owned() }))?;
+    Ok((json, binary))
+}
+
+/// A URI's name of a file: with `%20` and the like as the characters that they mean.
+fn unescaped(uri: &str) -> String {
+    let mut bytes = Vec::new();
+    let mut rest = uri.as_bytes();
+    while let Some((first, after)) = rest.split_first() {
+        let hexadecimal = (*first == b'%').then(|| after.get(..2)).flatten();
+        let code = hexadecimal.and_then(|digits| u8::from_str_radix(std::str::from_utf8(digits).ok()?, 16).ok());
+        bytes.push(code.unwrap_or(*first));
+        rest = if code.is_some() { &after[2..] } else { after };
+    }
+    String::from_utf8_lossy(&bytes).into_owned()
+}
+
+pub(super) fn read(
+    name: &str,
+    bytes: &[u8],
+    neighbours: &dyn Fn(&str) -> Option<Vec<u8>>,
+    draft: &mut Draft<'_>,
+) -> Result<(), MeshError> {
+    let (json, binary) = parts(name, bytes)?;
+    let root: Root = serde_json::from_slice(json).map_err(|e| MeshError {
+        file: name.to_owned(),
+        element: Element::Line(e.line() as u64),
+        place_m: None,
+        problem: match e.classify() {
+            serde_json::error::Category::Eof => Problem::Truncated { missing: "a part of the JSON text".to_owned() },
+            _ => Problem::Syntax { message: e.to_string() },
+        },
+    })?;
+    let mut file = File { name, root, buffers: Vec::new(), primitives: Cell::new(0) };
+    let mut buffers: Vec<Cow<'_, [u8]>> = Vec::new();
+    for (number, buffer) in file.root.buffers.0.iter().enumerate() {
+        let fail = |problem| file.fail("buffer", number, problem);
+        let content = match &buffer.uri {
+            None => {
+                Cow::Borrowed(binary.ok_or_else(|| fail(Problem::Truncated { missing: "its content".to_owned() }))?)
+            }
+            Some(uri) => Cow::Owned(match uri.strip_prefix("data:").and_then(|data| data.split_once("base64,")) {
+                Some((_, text)) => {
+                    STANDARD.decode(text).map_err(|e| fail(Problem::Syntax { message: e.to_string() }))?
+                }
+                None => {
+                    let named = unescaped(uri);
+                    let is_bare = !named.contains(['/', '\\', ':', '\0']) && named != ".." && named != ".";
+                    let found = is_bare.then(|| neighbours(&named)).flatten();
+                    found.ok_or_else(|| fail(Problem::NeighbourMissing { name: named.chars().take(256).collect() }))?
+                }
+            }),
+        };
+        let used: usize = buffers.iter().map(|content| content.len()).sum();
+        if used + content.len() > draft.limits.bytes {
+            return Err(fail(Problem::TooLarge { what: "bytes", limit: draft.limits.bytes }));
+        }
+        if content.len() < buffer.byte_length {
+            let missing = format!("{} of {} bytes", buffer.byte_length - content.len(), buffer.byte_length);
+            return Err(fail(Problem::Truncated { missing }));
+        }
+        buffers.push(content);
+    }
+    file.buffers = buffers;
+    file.nodes(draft)
+}
+
+impl File<'_> {
+    fn fail(&self, part: &'static str, number: usize, problem: Problem) -> MeshError {
+        MeshError { file: self.name.to_owned(), element: Element::Part(part, number as u64), place_m: None, problem }
+    }
+
+    fn missing(&self, part: &'static str, number: usize) -> MeshError {
+        self.fail(part, number, Problem::Syntax { message: "it is named, but does not exist".to_owned() })
+    }
+
+    /// Walks through the nodes of the scene.
+    fn nodes(&self, draft: &mut Draft<'_>) -> Result<(), MeshError> {
+        let root = &self.root;
+        let needed = root.extensions_required.0.iter().find(|name| !name.starts_with("KHR_materials"));
+        match needed.map(String::as_str) {
+            None | Some("KHR_mesh_quantization" | "KHR_texture_transform" | "KHR_lights_punctual") => {}
+            Some(other) => {
+                let message = format!("needs the extension {}: export it without compression", named(other.as_bytes()));
+                let problem = Problem::Unsupported { message };
+                return Err(MeshError { file: self.name.to_owned(), element: Element::Whole, place_m: None, problem });
+            }
+        }
+        if root.nodes.0.is_empty() {
+            for mesh in 0..root.meshes.0.len() {
+                self.mesh(mesh, None, DMat4::IDENTITY, draft)?;
+            }
+            return Ok(());
+        }
+        let mut is_child = vec![false; root.nodes.0.len()];
+        for child in root.nodes.0.iter().flat_map(|node| &node.children.0) {
+            let child = *child as usize;
+            *is_child.get_mut(child).ok_or_else(|| self.missing("node", child))? = true;
+        }
+        let mut waiting: Vec<(usize, DMat4)> = match root.scenes.0.get(root.scene) {
+            Some(scene) => scene.nodes.0.iter().rev().map(|node| (*node as usize, DMat4::IDENTITY)).collect(),
+            None => (0..is_child.len()).rev().filter(|node| !is_child[*node]).map(|n| (n, DMat4::IDENTITY)).collect(),
+        };
+        let mut is_done = vec![false; root.nodes.0.len()];
+        while let Some((number, parent)) = waiting.pop() {
+            let node = root.nodes.0.get(number).ok_or_else(|| self.missing("node", number))?;
+            if std::mem::replace(&mut is_done[number], true) {
+                let message = "it is in two places of the tree, or contains itself".to_owned();
+                return Err(self.fail("node", number, Problem::Syntax { message }));
+            }
+            let own = node.matrix.as_ref().map_or_else(
+                || {
+                    let rotation = node.rotation.map_or(DQuat::IDENTITY, DQuat::from_array);
+                    let scale = node.scale.map_or(DVec3::ONE, DVec3::from_array);
+                    let translation = node.translation.map_or(DVec3::ZERO, DVec3::from_array);
+                    // Not by glam's function, which asserts in some builds that the rotation has unit length.
+                    let axes = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| rotated(rotation, axis));
+                    DMat4::from_cols(
+                        (axes[0] * scale.x).extend(0.0),
+                        (axes[1] * scale.y).extend(0.0),
+                        (axes[2] * scale.z).extend(0.0),
+                        translation.extend(1.0),
+                    )
+                },
+                |matrix| DMat4::from_cols_array(matrix),
+            );
+            let whole = parent * own;
+            if let Some(mesh) = node.mesh {
+                self.mesh(mesh, node.name.as_deref(), whole, draft)?;
+            }
+            waiting.extend(node.children.0.iter().rev().map(|child| (*child as usize, whole)));
+        }
+        Ok(())
+    }
+
+    fn mesh(&self, number: usize, node: Option<&str>, place: DMat4, draft: &mut Draft<'_>) -> Result<(), MeshError> {
+        let mesh = self.root.meshes.0.get(number).ok_or_else(|| self.missing("mesh", number))?;
+        for primitive in &mesh.primitives.0 {
+            self.primitives.set(self.primitives.get() + 1);
+            if self.primitives.get() > MOST {
+                return Err(self.fail("mesh", number, Problem::TooLarge { what: "primitives", limit: MOST }));
+            }
+            let mode = primitive.mode.unwrap_or(4);
+            if !(4..=6).contains(&mode) {
+                draft.lines += 1;
+                continue;
+            }
+            let fail = |problem| self.fail("mesh", number, problem);
+            let material = primitive.material.and_then(|material| self.root.materials.0.get(material));
+            let mut groups = Vec::new();
+            for name in [node.or(mesh.name.as_deref()), material.and_then(|material| material.name.as_deref())] {
+                let name = name.map(|name| named(name.as_bytes())).filter(|name| !name.is_empty());
+                groups.extend(name.map(|name| draft.group(&name)).transpose().map_err(fail)?);
+            }
+            groups.dedup();
+            let most = draft.limits.vertices.saturating_sub(draft.vertices());
+            let positions =
+                self.numbers::<3>(primitive.attributes.position, most, "vertices", draft.limits.vertices)?;
+            let first = draft.vertices() as i64;
+            for at in &positions {
+                let at = place.transform_point3(DVec3::from_array(*at));
+                draft.vertex(at.to_array()).map_err(fail)?;
+            }
+            let uv = primitive.attributes.uv;
+            let of_uv = |uv| self.numbers::<2>(uv, positions.len(), "texture coordinates", positions.len());
+            let uv = uv.map(of_uv).transpose()?;
+            let corners: Vec<i64> = match primitive.indices {
+                #[allow(clippy::cast_possible_truncation)]
+                Some(indices) => {
+                    let most = draft.limits.triangles.saturating_mul(3);
+                    let indices = self.numbers::<1>(indices, most, "indices", most)?;
+                    indices.into_iter().map(|[index]| index as i64).collect()
+                }
+                None => (0..positions.len() as i64).collect(),
+            };
+            // A mirrored node turns its triangles inside out.
+            let is_mirrored = place.determinant() < 0.0;
+            let triangles: Box<dyn Iterator<Item = [i64; 3]>> = match mode {
+                4 => Box::new(corners.chunks_exact(3).map(|c| [c[0], c[1], c[2]])),
+                5 => Box::new(
+                    corners
+                        .windows(3)
+                        .zip(0..)
+                        .map(|(c, n)| if n % 2 == 0 { [c[0], c[1], c[2]] } else { [c[1], c[0], c[2]] }),
+                ),
+                _ => Box::new(corners.windows(2).skip(1).map(|c| [corners[0], c[0], c[1]])),
+            };
+            for [a, b, c] in triangles {
+                let triangle = if is_mirrored { [a, c, b] } else { [a, b, c] };
+                if let Some(index) = triangle.into_iter().find(|index| *index >= positions.len() as i64) {
+                    return Err(fail(Problem::IndexOutOfRange { index, vertices: positions.len() }));
+                }
+                #[allow(clippy::cast_possible_truncation)]
+                let uv: Vec<[f32; 2]> = triangle
+                    .iter()
+                    .filter_map(|corner| uv.as_ref()?.get(usize::try_from(*corner).ok()?))
+                    .map(|uv| [uv[0] as f32, uv[1] as f32])
+                    .collect();
+                draft.polygon(&triangle.map(|corner| corner + first), &uv, &groups).map_err(fail)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// The bytes of a view from an offset on.
+    fn view(&self, number: usize, offset: usize) -> Result<(&[u8], Option<usize>), MeshError> {
+        let view = self.root.buffer_views.0.get(number).ok_or_else(|| self.missing("bufferView", number))?;
+        let buffer = self.buffers.get(view.buffer).ok_or_else(|| self.missing("buffer", view.buffer))?;
+        let end = view.byte_offset.checked_add(view.byte_length);
+        let bytes = end.and_then(|end| buffer.get(view.byte_offset..end)?.get(offset..));
+        let missing =
+            || self.fail("bufferView", number, Problem::Truncated { missing: "a part of its bytes".to_owned() });
+        Ok((bytes.ok_or_else(missing)?, view.byte_stride))
+    }
+
+    /// The numbers of an accessor, `N` in each entry, at most `most` of them.
+    fn numbers<const N: usize>(
+        &self,
+        number: usize,
+        most: usize,
+        what: &'static str,
+        limit: usize,
+    ) -> Result<Vec<[f64; N]>, MeshError> {
+        let accessor = self.root.accessors.0.get(number).ok_or_else(|| self.missing("accessor", number))?;
+        let fail = |problem| self.fail("accessor", number, problem);
+        let syntax = |message: String| fail(Problem::Syntax { message });
+        let kind = ["SCALAR", "VEC2", "VEC3"][N.clamp(1, 3) - 1];
+        if accessor.kind != kind {
+            return Err(syntax(format!("its type is not {kind}")));
+        }
+        if accessor.count > most {
+            return Err(fail(Problem::TooLarge { what, limit }));
+        }
+        let known = |component: u32| scalar(component).ok_or_else(|| syntax(format!("component type {component}")));
+        let component = known(accessor.component_type)?;
+        let factor = if accessor.normalized { normal_factor(component) } else { 1.0 };
+        let entry = |bytes: &[u8]| -> [f64; N] {
+            let size = component.size();
+            std::array::from_fn(|part| {
+                component.real(bytes.get(part * size..).unwrap_or_default(), Order::Little) * factor
+            })
+        };
+        let width = N * component.size();
+        let cut = || fail(Problem::Truncated { missing: format!("a part of its {} entries", accessor.count) });
+        let mut values = match accessor.buffer_view {
+            None => vec![[0.0; N]; accessor.count],
+            Some(view) => {
+                let (bytes, stride) = self.view(view, accessor.byte_offset)?;
+                let stride = stride.unwrap_or(width).max(1);
+                let starts = (0..accessor.count).map(|entry| entry.checked_mul(stride));
+                let entries = starts.map(|start| bytes.get(start?..)?.get(..width).map(entry));
+                entries.collect::<Option<Vec<_>>>().ok_or_else(cut)?
+            }
+        };
+        if let Some(sparse) = &accessor.sparse {
+            let index = known(sparse.indices.component_type.unwrap_or(0))?;
+            let (indices, _) = self.view(sparse.indices.buffer_view, sparse.indices.byte_offset)?;
+            let (replaced, _) = self.view(sparse.values.buffer_view, sparse.values.byte_offset)?;
+            let have = (indices.len() / index.size()).min(replaced.len() / width);
+            if sparse.count > have.min(accessor.count) {
+                return Err(cut());
+            }
+            let pairs = indices.chunks_exact(index.size()).zip(replaced.chunks_exact(width));
+            for (at, value) in pairs.take(sparse.count) {
+                let at = usize::try_from(index.integer(at, Order::Little)).ok();
+                let at =
+                    at.and_then(|at| values.get_mut(at)).ok_or_else(|| syntax("a sparse index is too large".into()))?;
+                *at = entry(value);
+            }
+        }
+        Ok(values)
+    }
+}
+
+/// A vector turned by a quaternion that need not have unit length.
+fn rotated(rotation: DQuat, vector: DVec3) -> DVec3 {
+    let (axis, w) = (DVec3::new(rotation.x, rotation.y, rotation.z), rotation.w);
+    let squared = axis.length_squared() + w * w;
+    if squared > 0.0 { vector + 2.0 * axis.cross(axis.cross(vector) + w * vector) / squared } else { vector }
+}
+
+fn scalar(component: u32) -> Option<Scalar> {
+    Some(match component {
+        5120 => Scalar::I8,
+        5121 => Scalar::U8,
+        5122 => Scalar::I16,
+        5123 => Scalar::U16,
+        5125 => Scalar::U32,
+        5126 => Scalar::F32,
+        _ => return None,
+    })
+}
+
+/// What a normalized integer is multiplied with.
+fn normal_factor(component: Scalar) -> f64 {
+    match component {
+        Scalar::I8 => 1.0 / 127.0,
+        Scalar::U8 => 1.0 / 255.0,
+        Scalar::I16 => 1.0 / 32767.0,
+        Scalar::U16 => 1.0 / 65535.0,
+        _ => 1.0,
+    }
+}

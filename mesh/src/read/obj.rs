@@ -1,0 +1,109 @@
+//! Wavefront OBJ: vertices, texture coordinates, faces, and groups, objects and materials as groups.
+//!
+//! No crate is used: they number vertices anew in each object and say no line.
+
+use super::draft::Draft;
+use super::source::{Source, named, parsed, shown};
+use crate::{MeshError, Problem};
+
+/// Names of one `g` line that count.
+const NAMES: usize = 8;
+
+/// Which vertex an index means: from 1, or from the last backwards.
+fn resolved(index: i64, count: usize) -> i64 {
+    if index < 0 { index.saturating_add(i64::try_from(count).unwrap_or(i64::MAX)) } else { index - 1 }
+}
+
+pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), MeshError> {
+    let mut places: Vec<[f32; 2]> = Vec::new();
+    let (mut group, mut object, mut material): (Vec<usize>, Option<usize>, Option<usize>) = (Vec::new(), None, None);
+    let mut active: Vec<usize> = Vec::new();
+    let (mut corners, mut uv): (Vec<i64>, Vec<[f32; 2]>) = (Vec::new(), Vec::new());
+    let mut ignored = 0_usize;
+    let mut joined: Vec<u8>;
+    while let Some(mut line) = source.line() {
+        // A backslash at its end continues a line.
+        if line.ends_with(b"\\") {
+            joined = Vec::new();
+            while let Some(part) = line.strip_suffix(b"\\") {
+                joined.extend_from_slice(part);
+                joined.push(b' ');
+                line = source.line().unwrap_or_default();
+            }
+            joined.extend_from_slice(line);
+            line = &joined;
+        }
+        let line = line.split(|byte| *byte == b'#').next().unwrap_or_default();
+        let mut words = line.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
+        let Some(keyword) = words.next() else { continue };
+        match keyword {
+            b"v" => {
+                let mut at = [0.0; 3];
+                for coordinate in &mut at {
+                    *coordinate = words
+                        .next()
+                        .and_then(parsed)
+                        .ok_or_else(|| source.syntax("a vertex needs three numbers: v x y z"))?;
+                }
+                draft.vertex(at).map_err(|problem| source.fail(problem))?;
+            }
+            b"vt" => {
+                let mut part = || words.next().and_then(parsed::<f32>);
+                let u = part().ok_or_else(|| source.syntax("texture coordinates are numbers: vt u v"))?;
+                places.push([u, part().unwrap_or(0.0)]);
+            }
+            b"f" => {
+                corners.clear();
+                uv.clear();
+                for word in words {
+                    let mut parts = word.split(|byte| *byte == b'/');
+                    let index: i64 = parts.next().and_then(parsed).ok_or_else(|| {
+                        source.syntax(format!("`{}` is no corner of a face: f 1 2 3 or f 1/1 2/2 3/3", shown(word)))
+                    })?;
+                    if index == 0 {
+                        return Err(source.syntax("a face names vertex 0: OBJ counts vertices from 1"));
+                    }
+                    corners.push(resolved(index, draft.vertices()));
+                    let place = parts.next().and_then(parsed::<i64>);
+                    let place = place.map(|place| resolved(place, places.len()));
+                    uv.extend(place.and_then(|place| places.get(usize::try_from(place).ok()?)));
+                }
+                draft.polygon(&corners, &uv, &active).map_err(|problem| {
+                    // As the file counts.
+                    source.fail(match problem {
+                        Problem::IndexOutOfRange { index, vertices } if index >= 0 => {
+                            Problem::IndexOutOfRange { index: index.saturating_add(1), vertices }
+                        }
+                        problem => problem,
+                    })
+                })?;
+            }
+            b"g" | b"o" | b"usemtl" => {
+                let mut names = Vec::new();
+                if keyword == b"g" {
+                    for name in words.take(NAMES) {
+                        names.push(draft.group(&named(name)).map_err(|problem| source.fail(problem))?);
+                    }
+                    group = names;
+                } else {
+                    let name = named(&line[keyword.len() + line.len() - line.trim_ascii_start().len()..]);
+                    let found = if name.is_empty() { None } else { Some(draft.group(&name)) };
+                    let found = found.transpose().map_err(|problem| source.fail(problem))?;
+                    *if keyword == b"o" { &mut object } else { &mut material } = found;
+                }
+                active = group.iter().copied().chain(object).chain(material).collect();
+                active.sort_unstable();
+                active.dedup();
+            }
+            b"l" | b"p" => draft.lines += 1,
+            b"vn" | b"vp" | b"s" | b"mtllib" | b"usemap" | b"maplib" | b"lod" | b"mg" => {}
+            b"curv" | b"curv2" | b"surf" | b"bzp" | b"bsp" => ignored += 1,
+            _ if keyword.iter().all(u8::is_ascii_alphabetic) => {}
+            _ => return Err(source.syntax(format!("`{}` is no keyword of OBJ", shown(keyword)))),
+        }
+    }
+    if ignored > 0 {
+        draft.notes.push(format!("Curves and free-form surfaces left out, export triangles instead: {ignored}."));
+    }
+    Ok(())
+}

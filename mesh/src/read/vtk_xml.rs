@@ -1,0 +1,361 @@
+//! VTK's XML formats `.vtp` and `.vtu`: arrays as text, base64 or appended, and compressed by zlib.
+//!
+//! `quick-xml` reads the XML as events, so that nested elements take no stack; `miniz_oxide` unpacks within a bound.
+
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use quick_xml::Reader;
+use quick_xml::events::{BytesStart, Event};
+
+use super::draft::Draft;
+use super::source::{Order, Scalar, Source, shown};
+use super::vtk::{Cells, Faces};
+use crate::{Element, MeshError, Problem};
+
+/// Arrays and pieces of a file; no mesh has as many.
+const MOST: usize = 1 << 12;
+
+/// The arrays that make a surface: section and name. The points may have any name.
+const WANTED: [(&str, &str); 8] = [
+    ("Points", ""),
+    ("Polys", "connectivity"),
+    ("Polys", "offsets"),
+    ("Strips", "connectivity"),
+    ("Strips", "offsets"),
+    ("Cells", "connectivity"),
+    ("Cells", "offsets"),
+    ("Cells", "types"),
+];
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Format {
+    Text,
+    Base64,
+    Appended,
+}
+
+struct Array {
+    /// Which of `WANTED`.
+    role: usize,
+    scalar: Scalar,
+    format: Format,
+    /// Within the appended data.
+    offset: usize,
+    text: Vec<u8>,
+    /// Where it begins, for messages.
+    byte: u64,
+}
+
+/// How the file writes binary arrays.
+struct Coding {
+    order: Order,
+    header: Scalar,
+    is_compressed: bool,
+    /// Of the appended data.
+    is_raw: bool,
+}
+
+fn attribute(element: &BytesStart<'_>, name: &str) -> Option<String> {
+    let found = element.attributes().with_checks(false).flatten().find(|found| found.key.as_ref() == name)?;
+    Some(found.value.into_owned())
+}
+
+fn scalar(name: &str) -> Option<Scalar> {
+    Some(match name {
+        "Int8" => Scalar::I8,
+        "UInt8" => Scalar::U8,
+        "Int16" => Scalar::I16,
+        "UInt16" => Scalar::U16,
+        "Int32" => Scalar::I32,
+        "UInt32" => Scalar::U32,
+        "Int64" => Scalar::I64,
+        "UInt64" => Scalar::U64,
+        "Float32" => Scalar::F32,
+        "Float64" => Scalar::F64,
+        _ => return None,
+    })
+}
+
+/// The file's arrays, before they are decoded.
+struct Document<'a> {
+    file: &'a str,
+    coding: Coding,
+    /// One list for each piece.
+    pieces: Vec<Vec<Array>>,
+    appended: &'a [u8],
+}
+
+impl<'a> Document<'a> {
+    fn parse(file: &'a str, bytes: &'a [u8]) -> Result<Self, MeshError> {
+        let coding = Coding { order: Order::Little, header: Scalar::U32, is_compressed: false, is_raw: true };
+        let mut document = Self { file, coding, pieces: Vec::new(), appended: &[] };
+        let mut reader = Reader::from_reader(bytes);
+        let mut section = String::new();
+        // The array whose text follows.
+        let mut is_open = false;
+        let mut arrays = 0;
+        let (mut has_begun, mut has_ended) = (false, false);
+        loop {
+            let byte = reader.buffer_position();
+            let fail =
+                |problem| MeshError { file: file.to_owned(), element: Element::Byte(byte), place_m: None, problem };
+            let event = reader.read_event().map_err(|e| fail(Problem::Syntax { message: e.to_string() }))?;
+            let is_empty = matches!(event, Event::Empty(_));
+            match event {
+                Event::Start(element) | Event::Empty(element) => {
+                    is_open = false;
+                    match element.name().as_ref() {
+                        "VTKFile" => {
+                            has_begun = true;
+                            document.root(&element).map_err(fail)?;
+                        }
+                        "Piece" if document.pieces.len() < MOST => document.pieces.push(Vec::new()),
+                        "Piece" => return Err(fail(Problem::TooLarge { what: "pieces", limit: MOST })),
+                        "DataArray" => {
+                            arrays += 1;
+                            if arrays > MOST {
+                                return Err(fail(Problem::TooLarge { what: "arrays", limit: MOST }));
+                            }
+                            let array = document.array(&element, &section, byte).map_err(fail)?;
+                            if let Some((array, piece)) = array.zip(document.pieces.last_mut()) {
+                                piece.push(array);
+                                is_open = !is_empty;
+                            }
+                        }
+                        "AppendedData" => {
+                            document.coding.is_raw = attribute(&element, "encoding").as_deref() != Some("base64");
+                            // What follows need not be XML.
+                            let at = usize::try_from(reader.buffer_position()).unwrap_or(usize::MAX);
+                            let rest = bytes.get(at..).unwrap_or_default();
+                            let start = rest.iter().position(|byte| *byte == b'_').map_or(rest.len(), |at| at + 1);
+                            document.appended = &rest[start..];
+                            has_ended = true;
+                        }
+                        "InformationKey" => {}
+                        name => section = shown(name.as_bytes()),
+                    }
+                }
+                Event::Text(text) if is_open => {
+                    if let Some(array) = document.pieces.last_mut().and_then(|piece| piece.last_mut()) {
+                        array.text.extend_from_slice(text.as_bytes());
+                    }
+                }
+                Event::End(element) => {
+                    is_open &= element.name().as_ref() != "DataArray";
+                    has_ended |= element.name().as_ref() == "VTKFile";
+                }
+                Event::Eof => break,
+                _ => {}
+            }
+            if has_ended {
+                break;
+            }
+        }
+        let fail = |problem| MeshError { file: file.to_owned(), element: Element::Whole, place_m: None, problem };
+        if !has_begun {
+            return Err(fail(Problem::Syntax { message: "no VTKFile: this is other XML than VTK's".to_owned() }));
+        }
+        if !has_ended || document.pieces.is_empty() {
+            return Err(fail(Problem::Truncated { missing: "`</VTKFile>`".to_owned() }));
+        }
+        Ok(document)
+    }
+
+    fn root(&mut self, element: &BytesStart<'_>) -> Result<(), Problem> {
+        let unsupported = |message: String| Err(Problem::Unsupported { message });
+        match attribute(element, "type").as_deref() {
+            Some("PolyData" | "UnstructuredGrid") => {}
+            other => {
+                let other = shown(other.unwrap_or_default().as_bytes());
+                return unsupported(format!(
+                    "`{other}` is not read: save it as PolyData (.vtp) or UnstructuredGrid (.vtu)"
+                ));
+            }
+        }
+        if attribute(element, "byte_order").as_deref() == Some("BigEndian") {
+            self.coding.order = Order::Big;
+        }
+        if attribute(element, "header_type").as_deref() == Some("UInt64") {
+            self.coding.header = Scalar::U64;
+        }
+        match attribute(element, "compressor").as_deref() {
+            None | Some("") => {}
+            Some("vtkZLibDataCompressor") => self.coding.is_compressed = true,
+            Some(other) => {
+                let other = shown(other.as_bytes());
+                return unsupported(format!("compressed by {other}: save it with zlib or without compression"));
+            }
+        }
+        Ok(())
+    }
+
+    /// An array, if it makes the surface.
+    fn array(&self, element: &BytesStart<'_>, section: &str, byte: u64) -> Result<Option<Array>, Problem> {
+        let name = attribute(element, "Name").unwrap_or_default();
+        let is_wanted = |wanted: &(&str, &str)| wanted.0 == section && (wanted.1.is_empty() || wanted.1 == name);
+        let Some(role) = WANTED.iter().position(is_wanted) else { return Ok(None) };
+        let syntax = |message: String| Problem::Syntax { message };
+        let kind = attribute(element, "type").unwrap_or_default();
+        let scalar =
+            scalar(&kind).ok_or_else(|| syntax(format!("`{}` is no type of an array", shown(kind.as_bytes()))))?;
+        let format = match attribute(element, "format").as_deref() {
+            None | Some("ascii") => Format::Text,
+            Some("binary") => Format::Base64,
+            Some("appended") => Format::Appended,
+            Some(other) => return Err(syntax(format!("`{}` is no format of an array", shown(other.as_bytes())))),
+        };
+        let offset = attribute(element, "offset").and_then(|offset| offset.parse().ok()).unwrap_or(0);
+        Ok(Some(Array { role, scalar, format, offset, text: Vec::new(), byte }))
+    }
+
+    fn fail(&self, array: &Array, problem: Problem) -> MeshError {
+        MeshError { file: self.file.to_owned(), element: Element::Byte(array.byte), place_m: None, problem }
+    }
+
+    /// The bytes of a binary array, at most `budget` of them, which is reduced.
+    fn bytes(&self, array: &Array, budget: &mut usize) -> Result<Vec<u8>, MeshError> {
+        let fail = |problem| self.fail(array, problem);
+        let text: Vec<u8> = array.text.iter().copied().filter(|byte| !byte.is_ascii_whitespace()).collect();
+        let (stored, is_base64) = match array.format {
+            Format::Appended => (self.appended.get(array.offset..).unwrap_or_default(), !self.coding.is_raw),
+            _ => (text.as_slice(), true),
+        };
+        let mut stored = Stored { bytes: stored, is_base64 };
+        let Coding { order, header, is_compressed, .. } = self.coding;
+        let width = header.size();
+        let size = |bytes: &[u8]| usize::try_from(header.integer(bytes, order)).unwrap_or(usize::MAX);
+        let too_large = Problem::TooLarge { what: "unpacked bytes", limit: *budget };
+        if !is_compressed {
+            // The length and the data are coded together.
+            let length = size(&stored.peek(width).map_err(fail)?);
+            if length > *budget {
+                return Err(fail(too_large));
+            }
+            *budget -= length;
+            let mut bytes = stored.take(width + length).map_err(fail)?;
+            bytes.drain(..width);
+            return Ok(bytes);
+        }
+        // Blocks, their size, the size of the last one if it differs, and the packed size of each; then the blocks.
+        let start = stored.peek(3 * width).map_err(fail)?;
+        let blocks = size(&start);
+        let length = blocks.checked_add(3).and_then(|words| words.checked_mul(width)).unwrap_or(usize::MAX);
+        let sizes = stored.take(length).map_err(fail)?;
+        let packed: Vec<usize> = sizes[3 * width..].chunks_exact(width).map(size).collect();
+        let all = packed.iter().try_fold(0_usize, |sum, size| sum.checked_add(*size)).unwrap_or(usize::MAX);
+        if length.saturating_add(all) > *budget {
+            return Err(fail(too_large));
+        }
+        *budget -= length + all;
+        let data = stored.take(all).map_err(fail)?;
+        let (mut rest, mut bytes) = (data.as_slice(), Vec::new());
+        for size in packed {
+            let (block, after) = rest.split_at_checked(size).unwrap_or((rest, &[]));
+            let unpacked = miniz_oxide::inflate::decompress_to_vec_zlib_with_limit(block, *budget).map_err(|e| {
+                let is_large = e.status == miniz_oxide::inflate::TINFLStatus::HasMoreOutput;
+                let message = "a block that zlib can't unpack".to_owned();
+                fail(if is_large { too_large.clone() } else { Problem::Syntax { message } })
+            })?;
+            *budget -= unpacked.len().min(*budget);
+            bytes.extend_from_slice(&unpacked);
+            rest = after;
+        }
+        Ok(bytes)
+    }
+
+    fn text<T: std::str::FromStr>(&self, array: &Array) -> Result<Vec<T>, MeshError> {
+        let mut source = Source::new(self.file, &array.text);
+        let mut numbers = Vec::new();
+        while let Some(word) = source.word() {
+            let number = super::source::parsed(word);
+            let message = || format!("number {} of an array is `{}`", numbers.len(), shown(word));
+            numbers.push(number.ok_or_else(|| self.fail(array, Problem::Syntax { message: message() }))?);
+        }
+        Ok(numbers)
+    }
+
+    fn reals(&self, array: &Array, budget: &mut usize) -> Result<Vec<f64>, MeshError> {
+        if array.format == Format::Text {
+            return self.text(array);
+        }
+        let bytes = self.bytes(array, budget)?;
+        Ok(bytes.chunks_exact(array.scalar.size()).map(|bytes| array.scalar.real(bytes, self.coding.order)).collect())
+    }
+
+    fn integers(&self, array: &Array, budget: &mut usize) -> Result<Vec<i64>, MeshError> {
+        if array.format == Format::Text {
+            return self.text(array);
+        }
+        let bytes = self.bytes(array, budget)?;
+        Ok(bytes
+            .chunks_exact(array.scalar.size())
+            .map(|bytes| array.scalar.integer(bytes, self.coding.order))
+            .collect())
+    }
+}
+
+/// Bytes as they are or in base64.
+struct Stored<'a> {
+    bytes: &'a [u8],
+    is_base64: bool,
+}
+
+impl Stored<'_> {
+    /// The first `count` bytes, and how much of the stored bytes they take.
+    fn first(&self, count: usize) -> Result<(Vec<u8>, usize), Problem> {
+        let missing = || Problem::Truncated { missing: format!("a part of {count} bytes of an array") };
+        let taken = if self.is_base64 { count.div_ceil(3).checked_mul(4) } else { Some(count) };
+        let stored = taken.and_then(|taken| self.bytes.get(..taken)).ok_or_else(missing)?;
+        let mut bytes = if self.is_base64 {
+            STANDARD.decode(stored).map_err(|e| Problem::Syntax { message: format!("an array is no base64: {e}") })?
+        } else {
+            stored.to_vec()
+        };
+        if bytes.len() < count {
+            return Err(missing());
+        }
+        bytes.truncate(count);
+        Ok((bytes, stored.len()))
+    }
+
+    /// The first `count` bytes, of more that are coded together with them.
+    fn peek(&self, count: usize) -> Result<Vec<u8>, Problem> {
+        Ok(self.first(count)?.0)
+    }
+
+    /// The first `count` bytes, which are coded by themselves.
+    fn take(&mut self, count: usize) -> Result<Vec<u8>, Problem> {
+        let (bytes, taken) = self.first(count)?;
+        self.bytes = &self.bytes[taken..];
+        Ok(bytes)
+    }
+}
+
+pub(super) fn read(file: &str, bytes: &[u8], draft: &mut Draft<'_>) -> Result<(), MeshError> {
+    let document = Document::parse(file, bytes)?;
+    // Packed and unpacked, so that arrays that share stored bytes are no way around the limit.
+    let mut budget = draft.limits.bytes.saturating_mul(2);
+    for piece in &document.pieces {
+        let first = draft.vertices();
+        let find = |role: usize| piece.iter().find(|array| array.role == role);
+        if let Some(array) = find(0) {
+            for (number, at) in document.reals(array, &mut budget)?.chunks_exact(3).enumerate() {
+                draft.vertex([at[0], at[1], at[2]]).map_err(|problem| MeshError {
+                    file: file.to_owned(),
+                    element: Element::Vertex(u32::try_from(first + number).unwrap_or(u32::MAX)),
+                    place_m: None,
+                    problem,
+                })?;
+            }
+        }
+        let mut integers = |role: usize| -> Result<Vec<i64>, MeshError> {
+            find(role).map_or_else(|| Ok(Vec::new()), |array| document.integers(array, &mut budget))
+        };
+        let polygons = Cells { connectivity: integers(1)?, ends: integers(2)? };
+        let strips = Cells { connectivity: integers(3)?, ends: integers(4)? };
+        let grid = Cells { connectivity: integers(5)?, ends: integers(6)? };
+        let faces = Faces { polygons, strips, grid, types: integers(7)? };
+        faces.add(file, first, draft)?;
+    }
+    Ok(())
+}

@@ -1,0 +1,165 @@
+//! `palpate mesh`: reads a mesh file, reports what it is and what is wrong with it, mends it and writes it.
+
+use std::fmt::{self, Display};
+use std::io::{ErrorKind, Read, Write};
+use std::path::{Path, PathBuf};
+
+use palpate_mesh::decimate::decimate;
+use palpate_mesh::repair::{Repair, repair};
+use palpate_mesh::report::{Finding, LISTED, Report, Spread};
+use palpate_mesh::write::{Format, write};
+use palpate_mesh::{MeshError, ReadLimits, TriangleMesh, Unit, read, report};
+use serde::Serialize;
+
+use super::{Failure, write_file};
+
+#[derive(clap::Args)]
+pub(crate) struct MeshArguments {
+    /// The mesh file
+    file: PathBuf,
+    /// Unit of the file's lengths: m, cm, mm, or the metres of one unit; required
+    #[arg(long, value_name = "UNIT")]
+    unit: Option<String>,
+    /// Write the report as JSON
+    #[arg(long)]
+    json: bool,
+    /// Mend what can be mended, and tell what was done
+    #[arg(long)]
+    repair: bool,
+    /// Make it coarser: at most so many vertices
+    #[arg(long, value_name = "N")]
+    vertices: Option<usize>,
+    /// Write the mesh to a file that ends in .obj, .stl or .ply; its lengths are metres
+    #[arg(short, long, value_name = "FILE")]
+    output: Option<PathBuf>,
+}
+
+/// What is told of a mesh.
+#[derive(Serialize)]
+struct Told {
+    file: String,
+    /// What reading changed or left out.
+    notes: Vec<String>,
+    /// What mending and decimation did.
+    done: Vec<String>,
+    #[serde(flatten)]
+    report: Report,
+}
+
+/// Reads at most as many bytes as a mesh file may have, and one more.
+fn bytes_of(path: &Path, limits: &ReadLimits) -> std::io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    std::fs::File::open(path)?.take(limits.bytes as u64 + 1).read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
+
+/// Checks a mesh; mends and writes it if asked to.
+pub(crate) fn mesh(arguments: &MeshArguments) -> Result<(), Failure> {
+    let name = arguments.file.display().to_string();
+    let Some(unit) = &arguments.unit else {
+        let message = "no unit: mesh files do not state theirs; give --unit mm, cm, m, or the metres of one unit";
+        return Err(Failure::Refused(format!("{name}: {message}")));
+    };
+    let unit: Unit = unit.parse().map_err(|problem| Failure::Refused(format!("--unit: {problem}")))?;
+    let output = arguments.output.as_ref().map(|path| Ok((path, Format::of(&path.display().to_string())?)));
+    let output = output
+        .transpose()
+        .map_err(|problem: palpate_mesh::Problem| Failure::Refused(format!("--output: {problem}")))?;
+    let limits = ReadLimits::default();
+    let bytes = bytes_of(&arguments.file, &limits)
+        .map_err(|e| Failure::Refused(format!("{name}: can't be read: {e}; give an existing mesh file")))?;
+    let folder = arguments.file.parent().unwrap_or(Path::new(""));
+    let neighbours = |name: &str| bytes_of(&folder.join(name), &limits).ok();
+    let found = match read(&name, &bytes, unit, &neighbours, &limits) {
+        Ok(found) => found,
+        Err(error) => return refuse(arguments, &name, error),
+    };
+    drop(bytes);
+    let (mut mesh, mut done) = (found.mesh, Vec::new());
+    if arguments.repair {
+        let repaired = repair(&mesh, &Repair::default());
+        (mesh, done) = (repaired.mesh, repaired.told);
+    }
+    if let Some(vertices) = arguments.vertices.filter(|vertices| *vertices < mesh.vertices_m.len()) {
+        let before = mesh.vertices_m.len();
+        mesh = decimate(&mesh, vertices).mesh;
+        done.push(format!("Vertices decimated: {before} to {}.", mesh.vertices_m.len()));
+        if mesh.vertices_m.len() > vertices {
+            done.push("Fewer would fold the surface: --repair may help.".to_owned());
+        }
+    }
+    let told = Told { file: name, notes: found.notes, done, report: report(&mesh) };
+    print(arguments, &told)?;
+    if let Some(finding) = told.report.refusal() {
+        return Err(Failure::Refused(format!("{}: {finding}", told.file)));
+    }
+    output.map_or(Ok(()), |(path, format)| write_mesh(path, &mesh, format))
+}
+
+fn write_mesh(path: &Path, mesh: &TriangleMesh, format: Format) -> Result<(), Failure> {
+    write_file(path, &write(mesh, format))
+}
+
+/// Refuses a file that can't be read as a mesh; as JSON, too, if that was asked for.
+fn refuse(arguments: &MeshArguments, name: &str, error: MeshError) -> Result<(), Failure> {
+    let message = error.to_string();
+    if arguments.json {
+        let report = Report { problems: vec![Finding::from(error)], ..Report::default() };
+        print(arguments, &Told { file: name.to_owned(), notes: Vec::new(), done: Vec::new(), report })?;
+    }
+    Err(Failure::Refused(message))
+}
+
+fn print(arguments: &MeshArguments, told: &Told) -> Result<(), Failure> {
+    let text = if arguments.json {
+        serde_json::to_string_pretty(told).map_err(|e| Failure::Failed(e.to_string()))? + "\n"
+    } else {
+        told.to_string()
+    };
+    match std::io::stdout().write_all(text.as_bytes()) {
+        // A reader that closed the pipe is not an error.
+        Err(e) if e.kind() != ErrorKind::BrokenPipe => Err(Failure::Failed(e.to_string())),
+        _ => Ok(()),
+    }
+}
+
+/// The width of the names in the table.
+const NAMES: usize = 16;
+
+impl Display for Told {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let report = &self.report;
+        let mut row = |name: &str, value: &dyn Display| writeln!(f, "{name:NAMES$}{value}");
+        let spread = |spread: &Spread, factor: f64, unit: &str| {
+            let Spread { least, median, largest } = spread;
+            format!("{:.3} to {:.3} {unit}, median {:.3}", least * factor, largest * factor, median * factor)
+        };
+        row("vertices", &report.vertices)?;
+        row("triangles", &report.triangles)?;
+        row("surfaces", &report.components)?;
+        row("holes", &report.holes)?;
+        let [x, y, z] = report.extent_m.map(|side| side * 1e3);
+        row("size", &format!("{x:.2} × {y:.2} × {z:.2} mm"))?;
+        row("area", &format!("{:.3} cm²", report.area_m2 * 1e4))?;
+        match report.volume_m3 {
+            Some(volume) => row("volume", &format!("{:.3} ml", volume * 1e6))?,
+            None => row("volume", &"not closed")?,
+        }
+        row("edges", &spread(&report.edge_m, 1e3, "mm"))?;
+        row("triangle areas", &spread(&report.triangle_m2, 1e6, "mm²"))?;
+        let Spread { least, median, largest } = report.valence;
+        row("edges a vertex", &format!("{least:.0} to {largest:.0}, median {median:.0}"))?;
+        for (name, lines) in [("read", &self.notes), ("done", &self.done)] {
+            for line in lines {
+                row(name, line)?;
+            }
+        }
+        for finding in &report.problems {
+            row(if finding.problem.is_refused() { "refused" } else { "warning" }, finding)?;
+        }
+        for (name, count) in report.counts.iter().filter(|(_, count)| **count > LISTED) {
+            row("and more", &format!("{count} of `{name}` in all"))?;
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,79 @@
+//! `palpate mesh`: what it tells of a mesh file, what it mends and writes, and how it ends.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods, missing_docs)]
+
+use std::path::Path;
+use std::process::Command;
+
+use serde_json::Value;
+
+/// An octahedron, mm.
+const OCTAHEDRON: &str = "v 50 0 0\nv -50 0 0\nv 0 50 0\nv 0 -50 0\nv 0 0 50\nv 0 0 -50\n\
+    f 1 3 5\nf 3 2 5\nf 2 4 5\nf 4 1 5\nf 3 1 6\nf 2 3 6\nf 4 2 6\nf 1 4 6\n";
+
+/// Exit status, standard output and standard error.
+fn palpate(folder: &Path, arguments: &[&str]) -> (i32, String, String) {
+    let program = env!("CARGO_BIN_EXE_palpate");
+    let output = Command::new(program).arg("mesh").args(arguments).current_dir(folder).output().unwrap();
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+    (output.status.code().unwrap(), text(output.stdout), text(output.stderr))
+}
+
+#[test]
+fn a_sound_mesh_is_reported() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("organ.obj"), OCTAHEDRON).unwrap();
+    let (status, table, told) = palpate(folder.path(), &["organ.obj", "--unit", "mm"]);
+    assert_eq!((status, told.as_str()), (0, ""));
+    for row in ["vertices        6", "holes           0", "100.00 × 100.00 × 100.00 mm", "166.667 ml"] {
+        assert!(table.contains(row), "{row} is not in\n{table}");
+    }
+    let (status, json, _) = palpate(folder.path(), &["organ.obj", "--unit", "mm", "--json"]);
+    let json: Value = serde_json::from_str(&json).unwrap();
+    assert_eq!((status, json["vertices"].as_u64(), json["triangles"].as_u64()), (0, Some(6), Some(8)));
+    assert_eq!((json["components"].as_u64(), json["holes"].as_u64()), (Some(1), Some(0)));
+    assert!((json["volume_m3"].as_f64().unwrap() - 0.05_f64.powi(3) * 4.0 / 3.0).abs() < 1e-12);
+    assert_eq!((json["extent_m"][0].as_f64(), json["problems"].as_array().map(Vec::len)), (Some(0.1), Some(0)));
+}
+
+#[test]
+fn what_is_refused_says_element_place_and_what_to_do() {
+    let folder = tempfile::tempdir().unwrap();
+    let refused = |text: &str, arguments: &[&str], says: &[&str]| {
+        std::fs::write(folder.path().join("organ.obj"), text).unwrap();
+        let (status, output, told) = palpate(folder.path(), arguments);
+        assert_eq!(status, 2, "{told}");
+        says.iter().for_each(|says| assert!(told.contains(says), "`{says}` is not in {told}"));
+        output
+    };
+    refused(OCTAHEDRON, &["organ.obj"], &["no unit", "--unit mm"]);
+    refused(OCTAHEDRON, &["organ.obj", "--unit", "inch"], &["`inch` is no unit", "0.0254"]);
+    refused(OCTAHEDRON, &["other.obj", "--unit", "mm"], &["other.obj: can't be read"]);
+    refused(OCTAHEDRON, &["organ.obj", "--unit", "mm", "--output", "a.vtk"], &["--output", ".ply"]);
+    refused("v 1 2\n", &["organ.obj", "--unit", "mm"], &["organ.obj: line 1:", "v x y z"]);
+    let turned = OCTAHEDRON.replace("f 3 1 6", "f 1 3 6");
+    let turned = refused(&turned, &["organ.obj", "--unit", "mm", "--json"], &["edge ", "--repair"]);
+    let problems: Value = serde_json::from_str::<Value>(&turned).unwrap()["problems"].take();
+    assert_eq!(problems[0]["what"], "orientation");
+    assert_eq!((problems[0]["element"].as_str(), problems[0]["place_m"][2].as_f64()), (Some("edge 0-2"), Some(0.0)));
+    let broken = refused("v nan 0 0\n", &["organ.obj", "--unit", "mm", "--json"], &["vertex 0"]);
+    let problems: Value = serde_json::from_str::<Value>(&broken).unwrap()["problems"].take();
+    assert_eq!((&problems[0]["what"], &problems[0]["element"]), (&"not_finite".into(), &"vertex 0".into()));
+}
+
+#[test]
+fn a_mesh_is_mended_made_coarser_and_written() {
+    let folder = tempfile::tempdir().unwrap();
+    // One triangle turned, another one twice, and a vertex that none has.
+    let text = OCTAHEDRON.replace("f 3 1 6", "f 1 3 6") + "f 1 4 6\nv 1 1 1\n";
+    std::fs::write(folder.path().join("organ.obj"), text).unwrap();
+    let (status, table, _) = palpate(folder.path(), &["organ.obj", "--unit", "mm", "--repair", "-o", "organ.stl"]);
+    assert_eq!(status, 0, "{table}");
+    for line in ["Triangles turned to the side that the others face: 1.", "an earlier one: 1.", "no triangle has: 1."] {
+        assert!(table.contains(line), "{line} is not in\n{table}");
+    }
+    let (status, json, _) = palpate(folder.path(), &["organ.stl", "--unit", "m", "--vertices", "5", "--json"]);
+    let json: Value = serde_json::from_str(&json).unwrap();
+    assert_eq!((status, json["holes"].as_u64()), (0, Some(0)), "{json}");
+    assert!(json["notes"][0].as_str().unwrap().contains("welded"));
+    assert!(json["done"][0].as_str().unwrap().starts_with("Vertices decimated: 6 to"));
+}
