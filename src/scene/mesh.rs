@@ -1,14 +1,14 @@
 //! The section `[mesh]` of a scene: tissue on the surface of a triangle mesh, and its rest shape.
 
 use std::cmp::Ordering;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
 use glam::{DQuat, DVec3};
-use palpate_mesh::TriangleMesh;
+use palpate_mesh::{ReadLimits, TriangleMesh, Unit};
 
 use super::check::physical;
-use super::document::{Fields, Item};
+use super::document::{Fields, Item, read_bytes};
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, did_you_mean, finite, positive};
 use crate::shape::{Extent, PointId, PointName, RestShape};
@@ -62,33 +62,37 @@ pub enum Files<'a> {
 }
 
 impl Files<'_> {
-    fn read(self, item: &Item<'_>, limits: &Limits) -> Result<(PathBuf, Vec<u8>)> {
+    /// Reads the mesh that an item names. The files that this names in turn have bare names, in the same folder.
+    fn read(self, item: &Item<'_>, unit: Unit, limits: &Limits) -> Result<TriangleMesh> {
         let Files::In(folder) = self else {
-            let message = "names a file: a scene that a client sends must carry its mesh itself";
+            let message = "names a file: a scene that a client sends can't";
             return Err(item.refuse(Reason::WrongKind, message));
         };
         let path = folder.join(item.text()?);
-        let bytes = super::document::read_bytes(&path, limits.mesh_bytes)
+        let bytes = read_bytes(&path, limits.mesh_bytes)
             .map_err(|refusal| item.refuse(refusal.reason, format!("{}: {}", path.display(), refusal.message)))?;
-        Ok((path, bytes))
+        let beside = |name: &str| read_bytes(&path.parent()?.join(name), limits.mesh_bytes).ok();
+        let most = usize::try_from(limits.mesh_bytes).unwrap_or(usize::MAX);
+        let within = ReadLimits { bytes: most, vertices: limits.points, triangles: limits.points.saturating_mul(4) };
+        let found = palpate_mesh::read(&path.display().to_string(), &bytes, unit, &beside, &within);
+        Ok(found.map_err(|error| item.refuse(Reason::Unreadable, error.to_string()))?.mesh)
     }
 }
 
 impl Mesh {
     pub(super) fn read(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) -> Result<Self> {
-        let unit = fields.required("unit")?;
-        let unit_m = match unit.as_text() {
-            Some("m") => 1.0,
-            Some("cm") => 1e-2,
-            Some("mm") => 1e-3,
-            Some(_) => return Err(unit.wrong("\"m\", \"cm\", \"mm\" or the metres of a unit")),
-            None => unit.number()?,
-        };
-        physical(&fields.path("unit"), positive(&fields.path("unit"), unit_m)?)?;
+        let item = fields.required("unit")?;
+        let text =
+            item.as_text().map_or_else(|| item.number().map(|metres| metres.to_string()), |text| Ok(text.to_owned()));
+        let unit = text?.parse::<Unit>();
+        let unit = unit.map_err(|_| item.wrong("\"m\", \"cm\", \"mm\" or the metres of a unit"))?;
         let file = fields.required("file")?;
-        let (path, bytes) = files.read(&file, limits)?;
-        let mesh = read_obj(&bytes, unit_m)
-            .map_err(|message| file.refuse(Reason::Unreadable, format!("{}: {message}", path.display())))?;
+        let mesh = files.read(&file, unit, limits)?;
+        let report = palpate_mesh::report(&mesh);
+        if let Some(finding) = report.refusal() {
+            let hint = "`palpate mesh FILE --repair` may mend it";
+            return Err(file.refuse(Reason::Unreadable, format!("{}: {finding}; {hint}", file.text()?)));
+        }
         let point_mass_kg = fields.required_number("point_mass_kg")?;
         let fixed = fields.item("fixed").map_or(Ok(Fixed::None), |item| Fixed::read(&item, &mesh))?;
         let shape = MeshShape::new(mesh.vertices_m, mesh.triangles, |rim, place_m, vertex| match &fixed {
@@ -547,32 +551,6 @@ impl Cells {
         }
         best.1
     }
-}
-
-/// Reads the vertices and faces of an OBJ file; places are times `unit_m`.
-fn read_obj(bytes: &[u8], unit_m: f64) -> std::result::Result<TriangleMesh, String> {
-    let text = std::str::from_utf8(bytes).map_err(|e| format!("is not UTF-8 text: {e}"))?;
-    let mut mesh = TriangleMesh::default();
-    for (line, text) in text.lines().enumerate() {
-        let mut words = text.split_ascii_whitespace();
-        let wrong = || format!("line {}: `{text}` is not understood", line + 1);
-        match words.next() {
-            Some("v") => {
-                let numbers: Vec<f64> = words.filter_map(|word| word.parse().ok()).collect();
-                let [x, y, z, ..] = numbers[..] else { return Err(wrong()) };
-                mesh.vertices_m.push(unit_m * DVec3::new(x, y, z));
-            }
-            Some("f") => {
-                let of =
-                    |word: &str| word.split('/').next().and_then(|index| index.parse::<u32>().ok()?.checked_sub(1));
-                let corners: Vec<u32> = words.map(of).collect::<Option<_>>().ok_or_else(wrong)?;
-                let (Some(first), true) = (corners.first(), corners.len() >= 3) else { return Err(wrong()) };
-                mesh.triangles.extend(corners[1..].windows(2).map(|pair| [*first, pair[0], pair[1]]));
-            }
-            _ => {}
-        }
-    }
-    Ok(mesh)
 }
 
 #[cfg(test)]
