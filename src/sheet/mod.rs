@@ -25,6 +25,7 @@ mod grid;
 pub mod guard;
 pub mod integrate;
 mod lanes;
+pub mod mesh;
 pub mod model;
 mod motion;
 mod prescribed;
