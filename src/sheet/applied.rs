@@ -18,8 +18,8 @@ use std::ops::Range;
 use glam::DVec3;
 
 use super::field::{BLOCK, Field, Layout};
-use super::graph::Graph;
 use super::lanes::{self, Run, Vector, Width};
+use super::mesh::MeshPlaces;
 use super::model::{Model, Plan};
 use super::real::Real;
 use crate::scene::profile::{LoadProfile, Moment, Poke};
@@ -206,7 +206,7 @@ impl<T: Real> Term<T> {
     }
 
     /// The same for points anywhere in space: a row is a block of slots.
-    fn place_on_mesh(&mut self, poke: &Poke, graph: &Graph, layout: &Layout) {
+    fn place_on_mesh(&mut self, poke: &Poke, graph: &MeshPlaces, layout: &Layout) {
         self.spans.clear();
         for (factors, row) in self.factors.chunks_exact_mut(layout.stride).zip(self.rows.clone()) {
             let mut any = false;

@@ -89,7 +89,8 @@ impl Model {
         let mut scene = scene.clone();
         (scene.damping_n_s_per_m, scene.virtual_stiffness_n_per_m) =
             (sheet.damping_n_s_per_m, sheet.virtual_stiffness_n_per_m);
-        let model = Model::planned(scene, plan, precision, lanes);
+        let model = Model::planned(scene, plan, precision, lanes)
+            .map_err(|fault| Refusal::new(Reason::OutOfRange, "mesh.file", fault.to_string()))?;
         Ok(Arc::new(Model { expected_error, sleep_tolerance, warnings, rehearsed, ..model }))
     }
 

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use super::field::{BLOCK, Layout};
-use super::graph::Graph;
 use super::integrate::{Node, Oscillator, Scheme};
+use super::mesh::{GraphFault, MeshPlaces};
 use super::stability;
 use crate::scene::{Body, Integrator, Lanes, Precision, Scene};
 use crate::shape::{self, PointId, RestShape};
@@ -21,7 +21,7 @@ pub struct Model {
     /// The unit of length: the distance between neighbours, m.
     pub(super) unit_m: f64,
     /// Where the points of a mesh are in memory, and its springs; none for a sheet.
-    pub(super) graph: Option<Arc<Graph>>,
+    pub(super) graph: Option<Arc<MeshPlaces>>,
     /// ω_b = √((largest spring stiffness + K″)/m): no vibration is faster, under any deformation, rad/s.
     pub omega_bound_per_s: f64,
     /// The scheme.
@@ -100,18 +100,21 @@ impl Oscillator {
 
 impl Model {
     /// Of a scene with a scheme that somebody else has chosen: nothing is checked, nothing expected, nothing sleeps.
-    pub(super) fn planned(scene: Scene, plan: Plan, precision: Precision, lanes: Lanes) -> Self {
+    ///
+    /// # Errors
+    /// What is wrong with the springs of a mesh.
+    pub(super) fn planned(scene: Scene, plan: Plan, precision: Precision, lanes: Lanes) -> Result<Self, GraphFault> {
         let (points, fixed, graph) = match &scene.body {
             Body::Sheet(sheet) => (sheet.points, sheet.fixed_indices(), None),
             Body::Mesh(mesh) => {
-                let graph = Graph::of(mesh);
+                let graph = MeshPlaces::of(mesh)?;
                 let points = shape::points(&*mesh.shape).filter(|point| mesh.shape.is_fixed(*point));
                 let mut fixed: Vec<usize> = points.map(|point| graph.slot_of(point)).collect();
                 fixed.sort_unstable();
                 ([graph.rows(), BLOCK], fixed, Some(Arc::new(graph)))
             }
         };
-        Model {
+        Ok(Model {
             points,
             fixed,
             graph,
@@ -126,7 +129,7 @@ impl Model {
             corrected: None,
             rehearsed: 0,
             scene,
-        }
+        })
     }
 
     /// The tolerance of the sheet's tiles. Without virtual springs nothing bounds how far an omitted force would move a
@@ -237,7 +240,7 @@ mod tests {
             let widths =
                 [Lanes::Plain, Lanes::Neon, Lanes::Avx2, Lanes::Avx512].into_iter().filter_map(lanes::available);
             let hash = |lanes| {
-                let model = Arc::new(Model::planned(scene.clone(), plan.clone(), precision, lanes));
+                let model = Arc::new(Model::planned(scene.clone(), plan.clone(), precision, lanes).unwrap());
                 let mut tissue = crate::sheet::at_rest(&model);
                 for (tool, point) in [[0, 0], [3, 11]].into_iter().enumerate() {
                     let force_n = glam::DVec3::new(0.7, 0.2, -0.9) * [1.0, -1.5][tool];

@@ -15,11 +15,10 @@ use super::integrate::arithmetic::{Arithmetic, MAX_KEPT};
 use super::integrate::family::{Family, Release};
 use super::integrate::{each, with_arithmetic};
 use super::lanes::Plain;
-use super::mesh::MeshSprings;
 use super::model::{Model, Plan};
 use super::prescribed::{Grasp, Prescribed};
 use super::real::Real;
-use super::springs::Springs;
+use super::springs::{Kind, Springs};
 use super::tables::{Elastic, SweepTables};
 use super::tiles::{CHECK_STEPS, SleepTiles};
 use super::tissue::{BlowUp, Energy, PointState, Released, SheetCopy, Tissue};
@@ -276,7 +275,7 @@ pub(super) fn springs_of<T: Real>(model: &Model, plan: &Plan) -> Elastic<T> {
     let unit = plan.substep_s * plan.substep_s / model.scene.point_mass_kg() * plan.scheme.spring_scale();
     match &model.graph {
         None => Elastic::Sheet(Springs::new(&model.scene.springs, unit)),
-        Some(graph) => Elastic::Mesh(Arc::new(MeshSprings::new(graph, unit * model.scene.springs.stiffness_n_per_m))),
+        Some(graph) => Elastic::Mesh(graph.clone(), Kind::new(unit * model.scene.springs.stiffness_n_per_m, 1.0)),
     }
 }
 

@@ -213,7 +213,7 @@ impl<'s> Rehearsal<'s> {
         }
         let plan = Plan::unjudged(integrator, substeps, scene.stepping.rate_hz.recip(), &self.sheet);
         let lanes = lanes::available(scene.stepping.lanes).unwrap_or(crate::scene::Lanes::Plain);
-        let model = Arc::new(Model::planned(scene.clone(), plan, precision, lanes));
+        let model = Arc::new(Model::planned(scene.clone(), plan, precision, lanes).ok()?);
         let (spacing_m, [pushed, ..]) = (scene.shape().edge_m(), self.looked_at);
         let stiffness = scene.virtual_stiffness_n_per_m + 0.3 * scene.springs.stiffness_n_per_m;
         // Without any spring, what brings a point about as far within a step.

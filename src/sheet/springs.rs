@@ -36,7 +36,7 @@ pub(super) struct Kind<T> {
 
 impl<T: Real> Kind<T> {
     /// `stiffness` is k times any factor; `length_squared` is L0², in spacings squared.
-    fn new(stiffness: f64, length_squared: f64) -> Self {
+    pub(super) fn new(stiffness: f64, length_squared: f64) -> Self {
         let mut power = stiffness;
         let series = T::SERIES.map(|coefficient| {
             power /= length_squared;
@@ -50,11 +50,6 @@ impl<T: Real> Kind<T> {
         }
     }
 
-    /// Of length and stiffness 1.
-    pub(super) fn unit() -> Self {
-        Kind::new(1.0, 1.0)
-    }
-
     /// Lanes where [`Kind::near`] does not hold, given the magnitude of Q.
     #[inline(always)]
     pub(super) fn is_far<V: Vector<Real = T>>(&self, magnitude: V) -> V::Mask {
@@ -65,13 +60,28 @@ impl<T: Real> Kind<T> {
     /// spring whose strain is too small to count does not pull: at rest, the force is exactly 0.
     #[inline(always)]
     pub(super) fn near<V: Vector<Real = T>>(&self, excess: V) -> V {
-        self.series(excess).keep(Self::counts(excess))
+        self.series(excess, Self::square(excess)).keep(Self::counts(excess))
+    }
+
+    /// The same, and a square that tells where it does not hold ([`Kind::is_square_far`]). Which springs are too little
+    /// strained to count is told by the square as well, so their bound is rounded otherwise than in [`Kind::near`].
+    #[inline(always)]
+    pub(super) fn near_and_square<V: Vector<Real = T>>(&self, excess: V) -> (V, V) {
+        let square = Self::square(excess);
+        let least = T::of(T::LEAST_EXCESS * T::LEAST_EXCESS + T::FAINT);
+        (self.series(excess, square).keep(square.above(excess.splat(least))), square)
+    }
+
+    /// Lanes where [`Kind::near_and_square`] does not hold, given its square or the largest of several.
+    #[inline(always)]
+    pub(super) fn is_square_far<V: Vector<Real = T>>(&self, square: V) -> V::Mask {
+        square.above(square.splat(self.near * self.near))
     }
 
     /// The same for the springs of `mask`; the others do not pull.
     #[inline(always)]
     pub(super) fn near_of<V: Vector<Real = T>>(&self, mask: V::Mask, excess: V) -> V {
-        self.series(excess).keep(V::both(Self::counts(excess), mask))
+        self.series(excess, Self::square(excess)).keep(V::both(Self::counts(excess), mask))
     }
 
     #[inline(always)]
@@ -79,9 +89,14 @@ impl<T: Real> Kind<T> {
         excess.beyond(excess.splat(T::of(T::LEAST_EXCESS)))
     }
 
+    /// Q², but never below the normal range.
     #[inline(always)]
-    fn series<V: Vector<Real = T>>(&self, excess: V) -> V {
-        let square = excess.mul_add(excess, excess.splat(T::of(T::FAINT)));
+    fn square<V: Vector<Real = T>>(excess: V) -> V {
+        excess.mul_add(excess, excess.splat(T::of(T::FAINT)))
+    }
+
+    #[inline(always)]
+    fn series<V: Vector<Real = T>>(&self, excess: V, square: V) -> V {
         let (mut even, mut odd) = (excess.splat(self.series[T::TERMS - 2]), excess.splat(self.series[T::TERMS - 1]));
         for term in (0..T::TERMS / 2 - 1).rev() {
             even = even.mul_add(square, excess.splat(self.series[2 * term]));

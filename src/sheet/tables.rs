@@ -7,15 +7,14 @@ use std::sync::Arc;
 use super::advance::AdvanceStage;
 use super::applied::{self, Pull, Term};
 use super::field::{BLOCK, Field, Layout, State};
-use super::graph::Graph;
 use super::grid::Grid;
 use super::integrate::arithmetic::{Arithmetic, MAX_KEPT};
 use super::lanes::{self, Width};
-use super::mesh::{MeshSprings, MeshSweep, Records};
+use super::mesh::{self, MeshGrid, MeshPlaces, MeshSprings, MeshSweep, Snapshot};
 use super::model::Model;
 use super::real::Real;
 use super::region::Region;
-use super::springs::Springs;
+use super::springs::{Kind, Springs};
 use super::stage::Stage;
 use super::sweep::Sweep;
 
@@ -26,7 +25,8 @@ const FEW: usize = 4;
 #[derive(Debug, Clone)]
 pub(super) enum Elastic<T> {
     Sheet(Springs<T>),
-    Mesh(Arc<MeshSprings<T>>),
+    /// The places of a mesh, and a spring of length 1 with the k of an edge; those of the mesh are that times their own.
+    Mesh(Arc<MeshPlaces>, Kind<T>),
 }
 
 impl<T: Real> Elastic<T> {
@@ -34,9 +34,18 @@ impl<T: Real> Elastic<T> {
     pub(super) fn gather(&self, layout: &Layout, u: &[T], point: [usize; 2]) -> [T; 3] {
         match self {
             Elastic::Sheet(springs) => springs.gather(layout, u, point),
-            Elastic::Mesh(springs) => springs.gather(layout, u, point[0] * BLOCK + point[1]),
+            Elastic::Mesh(places, unit) => {
+                mesh::gather(&places.slots, unit, T::default(), u, point[0] * BLOCK + point[1])
+            }
         }
     }
+}
+
+/// The springs of a mesh as its sweeps read them, and room for a snapshot.
+#[derive(Debug)]
+struct MeshTables<T> {
+    springs: MeshSprings<T>,
+    snapshot: RefCell<Snapshot<T>>,
 }
 
 /// The buffers and tables that a sweep needs beside the state. One for each sheet, made once.
@@ -45,8 +54,8 @@ pub(super) struct SweepTables<T> {
     width: Width,
     pub(super) layout: Layout,
     pub(super) springs: Elastic<T>,
-    /// How the points of a mesh lie together, and its displacements as records; none of a sheet.
-    mesh: Option<(Arc<Graph>, RefCell<Records<T>>)>,
+    /// None of a sheet.
+    mesh: Option<MeshTables<T>>,
     /// 1 where a point moves, 0 where it is fixed: one plane. `None` if every point moves.
     pub(super) free: Option<Field<T>>,
     /// Only the first rows of each plane are used. Planes of the layout's length need no extra address registers.
@@ -69,7 +78,10 @@ impl<T: Real> SweepTables<T> {
             width: Width::of(model.lanes),
             layout,
             springs,
-            mesh: model.graph.clone().map(|graph| (graph, RefCell::new(Records::new(layout.rows)))),
+            mesh: model.graph.as_ref().map(|graph| MeshTables {
+                springs: MeshSprings::new(&graph.slots, lanes::shape::<T>(Width::of(model.lanes))),
+                snapshot: RefCell::new(Snapshot::of(&graph.slots)),
+            }),
             free,
             carry: RefCell::new(carry),
             probe: zero,
@@ -154,10 +166,10 @@ impl<T: Real> SweepTables<T> {
     unsafe fn run<S: Stage<T>>(&self, x: *const T, over: &Region, stage: S) {
         let layout = self.layout;
         match (&self.springs, &self.mesh) {
-            (Elastic::Mesh(springs), Some((graph, records))) => {
-                let sweep = MeshSweep { layout, springs, graph, x, records, over, stage };
-                // SAFETY: the caller's promise.
-                unsafe { lanes::run(self.width, &sweep) };
+            (Elastic::Mesh(places, unit), Some(MeshTables { springs, snapshot })) => {
+                let grid = MeshGrid { layout, slots: &places.slots, springs, unit, pull: T::default(), x, snapshot };
+                // SAFETY: the caller's promise; the springs and the snapshot were made for these slots and this width.
+                unsafe { lanes::run(self.width, &MeshSweep { grid, over, stage }) };
             }
             (Elastic::Sheet(springs), _) => {
                 let mut carry = self.carry.borrow_mut();
@@ -166,8 +178,8 @@ impl<T: Real> SweepTables<T> {
                 // SAFETY: the caller's promise.
                 unsafe { lanes::run(self.width, &Sweep { grid, over, stage }) };
             }
-            // The springs of a mesh come with its graph.
-            (Elastic::Mesh(_), None) => {}
+            // A copy that stays as it is has no tables, and is not swept.
+            (Elastic::Mesh(..), None) => {}
         }
     }
 

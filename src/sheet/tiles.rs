@@ -25,7 +25,7 @@ use std::sync::Arc;
 
 use super::applied::ForceChange;
 use super::field::{Field, Layout};
-use super::graph::Graph;
+use super::mesh::MeshPlaces;
 use super::model::Model;
 use super::real::Real;
 use super::region::{Marks, Region, TILE, tiles};
@@ -78,7 +78,7 @@ pub(super) struct SleepTiles<T> {
     /// Number of rows that a spring reaches on.
     reach: usize,
     /// Which tiles of a mesh have springs between them; none of a sheet.
-    graph: Option<Arc<Graph>>,
+    graph: Option<Arc<MeshPlaces>>,
     /// Number of points.
     points: usize,
     /// Without a tolerance, nothing sleeps.
@@ -117,7 +117,7 @@ impl<T: Real> SleepTiles<T> {
         SleepTiles::asleep(layout, model.tile_tolerance(), reach, joined)
     }
 
-    fn asleep(layout: Layout, tolerance: f64, reach: usize, (graph, points): (Option<Arc<Graph>>, usize)) -> Self {
+    fn asleep(layout: Layout, tolerance: f64, reach: usize, (graph, points): (Option<Arc<MeshPlaces>>, usize)) -> Self {
         let counts = [tiles(layout.rows), tiles(layout.columns)];
         let count = counts[0] * counts[1];
         let mut tiles = SleepTiles {
@@ -214,7 +214,7 @@ impl<T: Real> SleepTiles<T> {
             self.awake_points += self.rows(tile).len() * self.columns(tile).len();
             self.touched.add(tile);
             if let Some(graph) = &self.graph {
-                self.watched.extend(graph.beside(tile).iter().filter(|other| !self.region.awake.has[**other]));
+                self.watched.extend(graph.beside(tile).filter(|other| !self.region.awake.has[*other]));
                 continue;
             }
             // The order of neighbours is the reverse of that of their opposites.
@@ -235,16 +235,16 @@ impl<T: Real> SleepTiles<T> {
 
     /// The tiles that springs join to a tile.
     fn beside(&self, tile: usize) -> impl Iterator<Item = usize> + '_ {
-        let of_mesh = self.graph.as_ref().map_or(&[][..], |graph| graph.beside(tile));
+        let of_mesh = self.graph.iter().flat_map(move |graph| graph.beside(tile));
         let sides = if self.graph.is_some() { 0 } else { NEIGHBOURS.len() };
-        of_mesh.iter().copied().chain((0..sides).filter_map(move |side| self.neighbour(tile, side)))
+        of_mesh.chain((0..sides).filter_map(move |side| self.neighbour(tile, side)))
     }
 
     /// The tiles where springs begin that reach a tile: all that are joined to it, on a mesh.
     fn pulling(&self, tile: usize) -> impl Iterator<Item = usize> + '_ {
-        let of_mesh = self.graph.as_ref().map_or(&[][..], |graph| graph.beside(tile));
+        let of_mesh = self.graph.iter().flat_map(move |graph| graph.beside(tile));
         let sides = if self.graph.is_some() { &[][..] } else { &PULLING };
-        of_mesh.iter().copied().chain(sides.iter().filter_map(move |side| self.neighbour(tile, *side)))
+        of_mesh.chain(sides.iter().filter_map(move |side| self.neighbour(tile, *side)))
     }
 
     fn neighbour(&self, tile: usize, side: usize) -> Option<usize> {
@@ -317,15 +317,12 @@ impl<T: Real> SleepTiles<T> {
         let far = T::of(far);
         if let Some(graph) = &self.graph {
             let moved = |tile: &&usize| {
-                let around = graph.around(**tile);
-                let then = &self.snapshots[3 * around.start..3 * around.end];
+                let (slots, first) = graph.around(**tile);
                 (0..3).any(|c| {
-                    let here = graph
-                        .slots_around(**tile)
-                        .iter()
-                        .map(|slot| &u[c * self.layout.plane + self.layout.offset(*slot)]);
-                    let then = &then[c * around.len()..(c + 1) * around.len()];
-                    here.zip(then).fold(false, |any, (now, then)| any | ((*now - *then).magnitude() > far))
+                    let place = |slot: &u32| c * self.layout.plane + self.layout.offset(*slot as usize);
+                    let then = &self.snapshots[3 * first + c * slots.len()..][..slots.len()];
+                    let any = |any: bool, (slot, then): (&u32, &T)| any | ((u[place(slot)] - *then).magnitude() > far);
+                    slots.iter().zip(then).fold(false, any)
                 })
             };
             let waking: Vec<usize> = self.watched.iter().filter(moved).copied().collect();
@@ -462,11 +459,11 @@ impl<T: Real> SleepTiles<T> {
             self.asleep_j += energy_j;
             self.drift_n[tile] = 0.0;
             if let Some(graph) = &self.graph {
-                let around = graph.around(tile);
+                let (slots, first) = graph.around(tile);
                 for c in 0..3 {
-                    for (slot, k) in graph.slots_around(tile).iter().zip(0..) {
-                        self.snapshots[3 * around.start + c * around.len() + k] =
-                            u[c * self.layout.plane + self.layout.offset(*slot)];
+                    for (slot, k) in slots.iter().zip(0..) {
+                        let place = c * self.layout.plane + self.layout.offset(*slot as usize);
+                        self.snapshots[3 * first + c * slots.len() + k] = u[place];
                     }
                 }
                 continue;

@@ -7,6 +7,8 @@
 //! that require the instructions create the first vectors, and all others come from vectors.
 #![allow(unsafe_code)]
 
+use std::cell::Cell;
+
 use super::real::Real;
 use crate::scene::Lanes;
 
@@ -18,6 +20,8 @@ pub(super) trait Vector: Copy {
     const LANES: usize;
     /// Whether the lanes form one register. If so, separate loops for the usual rows are worth their code size.
     const IS_REGISTER: bool = true;
+    /// Whether [`Vector::pick`] is a few instructions.
+    const PICKS: bool = false;
 
     /// # Safety
     /// The processor has the instructions, and `LANES` values can be read at `from`.
@@ -76,6 +80,142 @@ pub(super) trait Vector: Copy {
     fn shift(self, before: Self) -> Self;
     /// Shifts each lane up by two; the last two lanes of `before` come in.
     fn shift_two(self, before: Self) -> Self;
+
+    /// x, y and z of the records whose places, counted in values from `from`, stand at `places`, one for each lane.
+    ///
+    /// # Safety
+    /// The processor has the instructions; `LANES` places can be read, and the four values of each record.
+    #[inline(always)]
+    unsafe fn records(from: *const Self::Real, places: *const u32) -> [Self; 3] {
+        let mut values = [[Self::Real::default(); MOST_LANES]; 3];
+        // SAFETY: the caller's promise; no vector has more lanes.
+        unsafe {
+            for lane in 0..Self::LANES {
+                let record = from.add(*places.add(lane) as usize);
+                for (c, values) in values.iter_mut().enumerate() {
+                    values[lane] = *record.add(c);
+                }
+            }
+            [Self::load(values[0].as_ptr()), Self::load(values[1].as_ptr()), Self::load(values[2].as_ptr())]
+        }
+    }
+
+    /// Writes x, y and z of `LANES` slots, the first of which is `slot`, to the records that begin at `to`
+    /// ([`record_place`]). The fourth value of a record is not specified.
+    ///
+    /// # Safety
+    /// `slot` is a multiple of `LANES`; there are records up to the end of its 16 slots.
+    #[inline(always)]
+    unsafe fn store_records(xyz: [Self; 3], to: *mut Self::Real, slot: usize) {
+        let mut values = [[Self::Real::default(); MOST_LANES]; 3];
+        // SAFETY: the caller's promise; no vector has more lanes.
+        unsafe {
+            for (vector, values) in xyz.into_iter().zip(&mut values) {
+                vector.store(values.as_mut_ptr());
+            }
+            for lane in 0..Self::LANES {
+                for (c, values) in values.iter().enumerate() {
+                    *to.add(record_place(slot + lane) + c) = values[lane];
+                }
+            }
+        }
+    }
+
+    /// The same for every fourth lane and the one after it, in which records are that few vectors need. The others are
+    /// not specified, and their places not used.
+    ///
+    /// # Safety
+    /// As for [`Vector::records`].
+    #[inline(always)]
+    unsafe fn half_of_records(from: *const Self::Real, places: *const u32) -> [Self; 3] {
+        // SAFETY: the caller's promise.
+        unsafe { Self::records(from, places) }
+    }
+
+    /// For each lane, the lane that `names` tells of each of N vectors: of `own` below `LANES`, of `others[0]` below
+    /// 2·`LANES`, and so on.
+    ///
+    /// # Safety
+    /// The names can be read.
+    #[inline(always)]
+    unsafe fn pick<const N: usize, const G: usize>(
+        names: *const Names,
+        own: &[Self; N],
+        others: &[[Self; N]; G],
+    ) -> [Self; N] {
+        let mut picked = *own;
+        // SAFETY: the caller's promise; no vector has more lanes, and at most three others are used.
+        unsafe {
+            for n in 0..N {
+                let (mut from, mut to) = ([Self::Real::default(); 4 * MOST_LANES], [Self::Real::default(); MOST_LANES]);
+                own[n].store(from.as_mut_ptr());
+                for (g, other) in others.iter().take(3).enumerate() {
+                    other[n].store(from.as_mut_ptr().add((g + 1) * Self::LANES));
+                }
+                for (to, name) in to.iter_mut().zip((*names).lanes) {
+                    *to = from[usize::from(name) % from.len()];
+                }
+                picked[n] = Self::load(to.as_ptr());
+            }
+        }
+        picked
+    }
+
+    /// The lanes that have a name ([`Names::of_some`]).
+    ///
+    /// # Safety
+    /// The processor has the instructions, and the names can be read.
+    #[inline(always)]
+    unsafe fn named(names: *const Names) -> Self::Mask {
+        let mut named = [Self::Real::default(); MOST_LANES];
+        // SAFETY: the caller's promise; no vector has more lanes.
+        unsafe {
+            for (lane, named) in named.iter_mut().enumerate() {
+                *named = Self::Real::of(f64::from((*names).mask >> lane & 1));
+            }
+            Self::load(named.as_ptr()).above(Self::of(Self::Real::default()))
+        }
+    }
+
+    /// Asks for the cache line at `at`, which need not exist.
+    #[inline(always)]
+    fn prefetch(_at: *const Self::Real) {}
+}
+
+/// For each lane of a vector, a lane of one of several vectors ([`Vector::pick`]).
+#[derive(Debug, Clone, Copy)]
+#[repr(C)]
+pub(super) struct Names {
+    lanes: [u8; MOST_LANES],
+    /// Lanes that pick from the third vector or a later one; or, if some have no name, those that have.
+    mask: u16,
+}
+
+impl Names {
+    /// Names for vectors of `count` lanes.
+    pub(super) fn of(lanes: [u8; MOST_LANES], count: usize) -> Self {
+        Names { lanes, mask: mask(|lane| usize::from(lanes[lane]) >= 2 * count) }
+    }
+
+    /// Names for some lanes.
+    pub(super) fn of_some(lanes: [Option<u8>; MOST_LANES]) -> Self {
+        Names { lanes: lanes.map(Option::unwrap_or_default), mask: mask(|lane| lanes[lane].is_some()) }
+    }
+}
+
+/// The lanes for which something holds.
+fn mask(holds: impl Fn(usize) -> bool) -> u16 {
+    (0..MOST_LANES).map(|lane| u16::from(holds(lane)) << lane).sum()
+}
+
+/// Lanes of the widest vector.
+const MOST_LANES: usize = 16;
+
+/// Where the record (x, y, z and one value more) of a slot begins, in values. Within 16 slots, records are in the order in which
+/// registers hold them while they are transposed: those of slots 0, 4, 8 and 12, then those of 1, 5, 9 and 13, …
+#[inline(always)]
+pub(super) const fn record_place(slot: usize) -> usize {
+    4 * (slot & !15 | (slot & 3) << 2 | slot >> 2 & 3)
 }
 
 /// A program that can run at any width.
@@ -274,6 +414,33 @@ impl Width {
     }
 }
 
+/// What a width means for a number format: the lanes of its vectors, and [`Vector::PICKS`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Shape {
+    pub(super) lanes: usize,
+    pub(super) picks: bool,
+}
+
+impl Shape {
+    pub(super) const fn of<V: Vector>() -> Self {
+        Shape { lanes: V::LANES, picks: V::PICKS }
+    }
+}
+
+/// The shape of a width's vectors of `T`.
+pub(super) fn shape<T: Real>(width: Width) -> Shape {
+    struct Told(Cell<Shape>);
+    impl<T: Real> Run<T> for Told {
+        unsafe fn run<V: Vector<Real = T>>(&self) {
+            self.0.set(Shape::of::<V>());
+        }
+    }
+    let told = Told(Cell::new(Shape::of::<Plain<T, 1>>()));
+    // SAFETY: the program has no pointers.
+    unsafe { run::<T>(width, &told) };
+    told.0.get()
+}
+
 /// Runs `program` at a width.
 ///
 /// # Safety
@@ -367,6 +534,105 @@ mod tests {
         a: &'a [T; 16],
         b: &'a [T; 16],
         out: *mut T,
+    }
+
+    /// Records written, read in another order, and picked.
+    struct Records<'a, T> {
+        xyz: &'a [[T; 16]; 3],
+        out: *mut T,
+    }
+
+    impl<T: Real> Run<T> for Records<'_, T> {
+        #[inline(always)]
+        unsafe fn run<V: Vector<Real = T>>(&self) {
+            let places: [u32; 16] = std::array::from_fn(|lane| record_place(lane * 7 % 16) as u32);
+            let mut records = [T::default(); 64];
+            unsafe {
+                for slot in (0..16).step_by(V::LANES) {
+                    let xyz = self.xyz.each_ref().map(|values| V::load(values.as_ptr().add(slot)));
+                    V::store_records(xyz, records.as_mut_ptr(), slot);
+                }
+                for slot in (0..16).step_by(V::LANES) {
+                    let read = V::records(records.as_ptr(), places.as_ptr().add(slot));
+                    for (c, read) in read.into_iter().enumerate() {
+                        read.store(self.out.add(16 * c + slot));
+                    }
+                    let read = V::half_of_records(records.as_ptr(), places.as_ptr().add(slot));
+                    for (c, read) in read.into_iter().enumerate() {
+                        read.store(self.out.add(48 + 16 * c + slot));
+                    }
+                }
+            }
+        }
+    }
+
+    fn records_are_read_where_they_were_written<T: Real>() {
+        let xyz: [[T; 16]; 3] = std::array::from_fn(|c| std::array::from_fn(|slot| T::of((100 * c + slot) as f64)));
+        for lanes in [Lanes::Plain, Lanes::Avx2, Lanes::Avx512, Lanes::Neon] {
+            let mut out = [T::default(); 96];
+            unsafe { run(Width::of(lanes), &Records { xyz: &xyz, out: out.as_mut_ptr() }) };
+            for (at, value) in out.into_iter().enumerate() {
+                let is_read = at < 48 || at % 4 < 2;
+                assert!(!is_read || value == xyz[at % 48 / 16][at % 16 * 7 % 16], "{lanes:?} {at}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_record_holds_the_three_components_of_a_slot() {
+        records_are_read_where_they_were_written::<f32>();
+        records_are_read_where_they_were_written::<f64>();
+        let mut places: Vec<usize> = (0..48).map(record_place).collect();
+        places.sort_unstable();
+        assert!(places.into_iter().eq((0..48).map(|slot| 4 * slot)));
+    }
+
+    /// What each lane picks of one to four vectors, and what those with a name do.
+    struct Picks<'a, T> {
+        from: &'a [T],
+        names: Names,
+        some: Names,
+        out: *mut T,
+    }
+
+    impl<T: Real> Run<T> for Picks<'_, T> {
+        #[inline(always)]
+        unsafe fn run<V: Vector<Real = T>>(&self) {
+            unsafe {
+                let all: [[V; 1]; 4] = std::array::from_fn(|n| [V::load(self.from.as_ptr().add(n * V::LANES))]);
+                let (names, some): (*const Names, *const Names) = (&raw const self.names, &raw const self.some);
+                let picked = [
+                    V::pick::<1, 0>(some, &all[0], &[])[0].keep(V::named(some)),
+                    V::pick::<1, 1>(names, &all[0], &[all[1]])[0],
+                    V::pick::<1, 2>(names, &all[0], &[all[1], all[2]])[0],
+                    V::pick::<1, 3>(names, &all[0], &[all[1], all[2], all[3]])[0],
+                ];
+                for (n, picked) in picked.into_iter().enumerate() {
+                    picked.store(self.out.add(16 * n));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_lane_picks_the_lane_that_it_names() {
+        let from: Vec<f32> = (0..64).map(|n| n as f32 + 1.0).collect();
+        for lanes in [Lanes::Plain, Lanes::Avx2, Lanes::Avx512, Lanes::Neon] {
+            let width = Width::of(lanes);
+            let Shape { lanes: count, .. } = shape::<f32>(width);
+            for vectors in 2..=4 {
+                let named: [u8; 16] = std::array::from_fn(|lane| (lane * 11 % (vectors * count)) as u8);
+                let some = named.map(|name| (usize::from(name) < count).then_some(name));
+                let mut out = [0.0; 64];
+                let (names, some_names) = (Names::of(named, count), Names::of_some(some));
+                unsafe { run(width, &Picks { from: &from, names, some: some_names, out: out.as_mut_ptr() }) };
+                for lane in 0..count {
+                    let truth = from[usize::from(named[lane])];
+                    assert_eq!(out[16 * (vectors - 1) + lane], truth, "{lanes:?} {vectors} {lane}");
+                    assert_eq!(out[lane], if some[lane].is_some() { truth } else { 0.0 }, "{lanes:?} {lane}");
+                }
+            }
+        }
     }
 
     impl<T: Real> Run<T> for Everything<'_, T> {

@@ -1,0 +1,133 @@
+//! Where the points of a mesh rest, by slots, and what its tiles border on: what forces and sleep ask of a mesh.
+
+use std::ops::Range;
+
+use glam::DVec3;
+
+use super::graph::{GraphFault, MeshGraph, MeshSpring};
+use super::order::{TABLES, TILE_SLOTS};
+use super::slots::{MeshSlots, NO_VERTEX};
+use crate::memory;
+use crate::scene::Mesh;
+use crate::shape::{PointId, RestShape};
+use crate::sheet::field::BLOCK;
+use crate::sheet::region::TILE;
+
+/// The slots of a mesh, and where they are in space.
+#[derive(Debug)]
+pub(in crate::sheet) struct MeshPlaces {
+    pub(in crate::sheet) slots: MeshSlots,
+    /// Where the point of each slot rests, m; not a number where there is none.
+    rest_m: Vec<DVec3>,
+    /// The middle of each row's points, m, and the radius of the ball around them.
+    balls: Vec<(DVec3, f64)>,
+    /// The ends of the box around each tile's points, m.
+    boxes: Vec<[[f64; 2]; 3]>,
+    /// The slots beyond each tile that its springs lead to, ascending; and where each tile's begin, and the last end.
+    around: Vec<u32>,
+    firsts_around: Vec<usize>,
+}
+
+impl MeshPlaces {
+    /// Of the mesh of a scene. The k of a spring is that over the k of an edge.
+    ///
+    /// # Errors
+    /// What is wrong with its springs.
+    pub(in crate::sheet) fn of(mesh: &Mesh) -> Result<Self, GraphFault> {
+        let springs = mesh.shape.springs(mesh.flexion);
+        let graph = MeshGraph {
+            rest_m: mesh.shape.vertices_m().to_vec(),
+            springs: springs.map(|(ends, stiffness_n_per_m)| MeshSpring { ends, stiffness_n_per_m }).collect(),
+            spacing_m: mesh.shape.edge_m(),
+            ..MeshGraph::default()
+        };
+        let slots = MeshSlots::new(&graph)?;
+        let place_m = |vertex: &u32| if *vertex == NO_VERTEX { DVec3::NAN } else { graph.rest_m[*vertex as usize] };
+        let rest_m = memory::collected(slots.vertex_of().iter().map(place_m), TABLES);
+        let within =
+            |range: Range<usize>| rest_m[range.start..range.end.min(rest_m.len())].iter().filter(|m| m.is_finite());
+        #[allow(clippy::cast_precision_loss)]
+        let ball = |row: usize| {
+            let places = || within(row * BLOCK..(row + 1) * BLOCK);
+            let centre_m = places().sum::<DVec3>() / places().count() as f64;
+            (centre_m, places().map(|place_m| place_m.distance(centre_m)).fold(0.0, f64::max))
+        };
+        let box_of = |tile: usize| {
+            let places = || within(tile * TILE_SLOTS..(tile + 1) * TILE_SLOTS).copied();
+            let (least_m, most_m) =
+                (places().fold(DVec3::INFINITY, DVec3::min), places().fold(DVec3::NEG_INFINITY, DVec3::max));
+            std::array::from_fn(|axis| [least_m[axis], most_m[axis]])
+        };
+        let (mut around, mut firsts_around) = (Vec::new(), vec![0]);
+        for tile in 0..slots.tiles() {
+            let own = tile * TILE_SLOTS..((tile + 1) * TILE_SLOTS).min(rest_m.len());
+            let ends = own.clone().flat_map(|slot| slots.springs(slot)).map(|half| half.to);
+            let mut beyond: Vec<u32> = ends.filter(|slot| !own.contains(&(*slot as usize))).collect();
+            beyond.sort_unstable();
+            beyond.dedup();
+            around.extend(beyond);
+            firsts_around.push(around.len());
+        }
+        let (balls, boxes) = ((0..slots.blocks()).map(ball).collect(), (0..slots.tiles()).map(box_of).collect());
+        Ok(MeshPlaces { balls, boxes, around, firsts_around, slots, rest_m })
+    }
+
+    /// Rows of memory.
+    pub(in crate::sheet) fn rows(&self) -> usize {
+        self.slots.blocks()
+    }
+
+    /// The slot of a point.
+    pub(in crate::sheet) fn slot_of(&self, point: PointId) -> usize {
+        self.slots.slot_of()[point.index()] as usize
+    }
+
+    /// The point in a slot; in an empty one, the first.
+    pub(in crate::sheet) fn point_in(&self, slot: usize) -> PointId {
+        let vertex = self.slots.vertex_of()[slot];
+        PointId::new(if vertex == NO_VERTEX { 0 } else { vertex as usize })
+    }
+
+    /// Where the point of a slot rests, m.
+    pub(in crate::sheet) fn rest_m(&self, slot: usize) -> DVec3 {
+        self.rest_m[slot]
+    }
+
+    /// Where the points of a row rest, m.
+    pub(in crate::sheet) fn rest_in_row(&self, row: usize) -> &[DVec3] {
+        &self.rest_m[row * BLOCK..(row + 1) * BLOCK]
+    }
+
+    /// The rows from the first to the last that may have a point within a ball.
+    pub(in crate::sheet) fn rows_within(&self, centre_m: DVec3, radius_m: f64) -> Range<usize> {
+        let is_near = |(middle_m, ball_m): &(DVec3, f64)| middle_m.distance(centre_m) - ball_m <= radius_m;
+        match (self.balls.iter().position(is_near), self.balls.iter().rposition(is_near)) {
+            (Some(first), Some(last)) => first..last + 1,
+            _ => 0..0,
+        }
+    }
+
+    /// The ends of the box around the points of a tile along each axis, m.
+    pub(in crate::sheet) fn box_of(&self, tile: usize) -> &[[f64; 2]; 3] {
+        &self.boxes[tile]
+    }
+
+    /// The tiles that springs join to a tile, ascending.
+    pub(in crate::sheet) fn beside(&self, tile: usize) -> impl Iterator<Item = usize> + '_ {
+        self.slots.neighbours(tile).iter().map(|other| *other as usize)
+    }
+
+    /// The slots beyond a tile that its springs lead to, ascending, and the place of the first in the list of all tiles.
+    pub(in crate::sheet) fn around(&self, tile: usize) -> (&[u32], usize) {
+        let [from, to] = [self.firsts_around[tile], self.firsts_around[tile + 1]];
+        (&self.around[from..to], from)
+    }
+
+    /// The length of that list.
+    pub(in crate::sheet) fn watched_slots(&self) -> usize {
+        self.around.len()
+    }
+}
+
+// A row of slots is a row of the tiles' memory.
+const _: () = assert!(TILE_SLOTS == TILE * BLOCK);
