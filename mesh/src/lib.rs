@@ -3,6 +3,7 @@
 pub mod decimate;
 pub mod delaunay;
 pub mod mesh;
+pub mod organ;
 pub mod problem;
 pub mod read;
 pub mod repair;

@@ -4,6 +4,7 @@ pub(crate) mod certificate;
 pub(crate) mod check;
 pub(crate) mod client;
 pub(crate) mod mesh;
+pub(crate) mod organ;
 pub(crate) mod render;
 pub(crate) mod run;
 mod scene;

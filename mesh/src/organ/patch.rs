@@ -1,0 +1,49 @@
+//! A square of tissue that is slightly curved, with the rises that lumps beneath make.
+
+use glam::{BVec3, DVec2, DVec3};
+
+use super::dice::Dice;
+use super::field::{Unevenness, bump};
+use super::shape::{Shape, sides};
+
+/// Half its side, mm.
+const HALF: f64 = 50.0;
+
+/// A rise over a lump.
+struct Lump {
+    centre: DVec2,
+    radius: f64,
+    height: f64,
+}
+
+/// It lies in x and y; the side that is touched is above (z).
+pub(super) fn shape(dice: &mut Dice) -> Shape {
+    let curvature = dice.within(1.0 / 500.0, 1.0 / 260.0);
+    // One lump in each third of the patch: they stay apart.
+    let lumps = [-1.0, 0.0, 1.0].map(|third| Lump {
+        centre: DVec2::new(27.0 * third + dice.within(-3.0, 3.0), dice.within(-28.0, 28.0)),
+        radius: dice.within(8.0, 13.0),
+        height: dice.within(1.4, 2.8),
+    });
+    let within = lumps.iter().map(|lump| (lump.centre, lump.radius)).collect::<Vec<_>>();
+    let uneven = Unevenness::new(0.35, 38.0, dice);
+    let distance = move |place: DVec3| {
+        let flat = place.truncate();
+        let rise = |lump: &Lump| lump.height * bump((flat - lump.centre).length() / (1.5 * lump.radius));
+        let height = lumps.iter().map(rise).sum::<f64>() - 0.5 * curvature * flat.length_squared();
+        place.z - height - uneven.at(flat.extend(0.0))
+    };
+    let extent = [DVec3::new(-HALF, -HALF, -20.0), DVec3::new(HALF, HALF, 13.0)];
+    Shape {
+        distance: Box::new(distance),
+        extent,
+        cut: BVec3::new(true, true, false),
+        cell: 3.0,
+        coarsest: 10.0,
+        parts: vec![(
+            "lumps",
+            Box::new(move |place| within.iter().any(|lump| (place.truncate() - lump.0).length() < lump.1)),
+        )],
+        chart: sides(extent),
+    }
+}
