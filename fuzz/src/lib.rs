@@ -402,7 +402,9 @@ fn record_seeds() -> Vec<Vec<u8>> {
         ..Default::default()
     };
     let energy = Some(pb::Energy { kinetic_j: 1.0, spring_j: 2.0, virtual_j: 3.0 });
-    let last = pb::ProbeResponse { step: 9, points: vec![point; 3], energy, last: true, ..Default::default() };
+    let tool = pb::ToolRecord { tool: 1, place_m: vector, displacement_m: vector, force_on_tool_n: vector };
+    let (points, tools) = (vec![point; 3], vec![tool]);
+    let last = pb::ProbeResponse { step: 9, points, tools, energy, last: true, ..Default::default() };
     vec![last.encode_to_vec(), pb::ProbeResponse { last: false, ..last }.encode_to_vec()]
 }
 

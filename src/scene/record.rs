@@ -26,13 +26,16 @@ pub struct Run {
     pub version: String,
 }
 
-/// One line per sample time. Forces are those on the tissue point, N.
+/// One line per sample time. Forces on points are those on the tissue, N.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Record {
     /// Simulated time.
     pub time_s: f64,
     /// The points, in the order requested.
     pub points: Vec<Point>,
+    /// The tools with a tip, by ascending number.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub tools: Vec<ToolRecord>,
     /// Energies of the whole sheet.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub energy_j: Option<EnergyJ>,
@@ -58,6 +61,19 @@ pub struct Point {
     /// For a prescribed point, the force that holds it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub constraint_n: Option<[f64; 3]>,
+}
+
+/// A tool with a tip, which is led by poses.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct ToolRecord {
+    /// The tool's number: forces come first, then grasped points, then tools with a tip.
+    pub tool: u32,
+    /// Place of the tip in the frame of the sheet at rest, m.
+    pub place_m: [f64; 3],
+    /// Displacement of the tissue under the tip, the mean over its disc, m.
+    pub displacement_m: [f64; 3],
+    /// Force of the tissue on the tool, N: what a device gets. 0 while the tip does not touch.
+    pub force_on_tool_n: [f64; 3],
 }
 
 /// Energies, J.

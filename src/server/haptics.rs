@@ -544,7 +544,7 @@ impl HapticService for Haptics {
         };
         let guard = live.open_stream("Probe", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
-        let records = live.probe(every, points, request.energy, &account)?;
+        let records = live.probe(every, points, request.energy, request.tools, &account)?;
         let out = stream::unfold(Some((records, guard, None)), |state| async move {
             let (mut records, guard, begun) = state?;
             let (record, dropped, part) = match begun {

@@ -212,7 +212,8 @@ impl Playing<'_> {
                         let record = session.record(Some(&script.sample_points));
                         largest_m = largest_m.max(session.tissue().largest_displacement_m());
                         self.twin.iter_mut().for_each(|twin| twin.compare(&record));
-                        written = write_line(output, &Record { energy_j: Some(session.energy()), ..record });
+                        let (energy_j, tools) = (Some(session.energy()), session.tool_records());
+                        written = write_line(output, &Record { energy_j, tools, ..record });
                     }
                     resumed_s = clock_s();
                 }

@@ -4,7 +4,7 @@ use super::{every, from_point, point};
 use crate::pace::frames::Delivery;
 use crate::pace::{PacedSample, Recorded};
 use crate::refusal::{Reason, Refusal, Result};
-use crate::scene::record::{EnergyJ, Point, Record, Recovery};
+use crate::scene::record::{EnergyJ, Point, Record, Recovery, ToolRecord};
 use crate::session::ToolSample;
 use crate::session::sampling::{Deadband, HEARTBEAT_S, Sampling};
 use crate::shape::{PointName, RestShape};
@@ -126,6 +126,7 @@ pub fn record(paced: &Recorded, dropped: u64, part: usize) -> Option<pb::ProbeRe
             spring_j: energy.spring,
             virtual_j: energy.virtual_springs,
         });
+        message.tools = record.tools.iter().map(tool_record).collect();
     }
     (part < parts).then_some(message)
 }
@@ -142,6 +143,15 @@ fn point_record(record: &Point) -> pb::PointRecord {
         applied_n: vector(record.applied_n),
         reaction_n: vector(record.reaction_n),
         constraint_n: record.constraint_n.and_then(vector),
+    }
+}
+
+fn tool_record(record: &ToolRecord) -> pb::ToolRecord {
+    pb::ToolRecord {
+        tool: record.tool,
+        place_m: vector(record.place_m.into()),
+        displacement_m: vector(record.displacement_m.into()),
+        force_on_tool_n: vector(record.force_on_tool_n.into()),
     }
 }
 
@@ -167,6 +177,16 @@ pub fn add_to_record(record: &mut Record, message: &pb::ProbeResponse) -> bool {
             spring: energy.spring_j,
             virtual_springs: energy.virtual_j,
         });
+        record.tools = message
+            .tools
+            .iter()
+            .map(|tool| ToolRecord {
+                tool: tool.tool,
+                place_m: array(&tool.place_m),
+                displacement_m: array(&tool.displacement_m),
+                force_on_tool_n: array(&tool.force_on_tool_n),
+            })
+            .collect();
     }
     message.last
 }

@@ -548,6 +548,7 @@ async fn probes_tell_every_part_of_the_force_from_step_0_on() {
         r#where: Some(pb::probe_request::Where::Points(pb::GridPoints { points: points.clone() })),
         every_steps: Some(10),
         energy: true,
+        tools: true,
     };
     let mut haptics = server.haptics().await;
     let mut records = haptics.probe(request.clone()).await.unwrap().into_inner();

@@ -305,6 +305,7 @@ async fn play(
         })),
         every_steps: Some(script.sample_every.try_into().unwrap_or(u32::MAX)),
         energy: true,
+        tools: !script.poses.is_empty(),
     };
     let probe = if script.sample_points.iter().copied().eq(shape::points(scene.shape())) {
         pb::ProbeRequest { r#where: Some(pb::probe_request::Where::AllPoints(true)), ..probe }
