@@ -415,6 +415,34 @@ fn a_run_that_leaves_its_sheet_warns_at_the_end() {
 }
 
 #[test]
+fn a_run_plots_and_sums_up_where_its_records_do_not_go() {
+    let folder = tempfile::tempdir().unwrap();
+    let records = folder.path().join("records.jsonl");
+    let told = |more: &[&str]| {
+        let output = run_in(folder.path(), SCENE, SCRIPT, more);
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        [output.stdout, output.stderr].map(|bytes| String::from_utf8(bytes).unwrap())
+    };
+    let titles = ["Displacement of the control point along z, m\n", "Force of the tissue on the tool along z, N\n"];
+    let [out, err] = told(&["--plot"]);
+    assert!(out.lines().all(|line| line.starts_with('{')), "{out}");
+    assert!(titles.iter().all(|title| err.contains(title)) && !err.contains("final hash"), "{err}");
+    let [out, err] = told(&["--plot", "--output", records.to_str().unwrap()]);
+    let hash = lines_of(&records).pop().unwrap()["summary"]["final_hash"].as_str().unwrap().to_owned();
+    for part in titles.iter().chain(&["steps  ", "largest displacement  ", "peak reaction  ", "final hash  ", &hash]) {
+        assert!(out.contains(part), "no `{part}` in: {out}");
+    }
+    assert_eq!(err, "");
+    assert_eq!(told(&["--quiet", "--output", records.to_str().unwrap()]), ["", ""]);
+    assert_eq!(told(&["-q"])[1], "");
+}
+
+/// The lines of a file of records.
+fn lines_of(path: &Path) -> Vec<Value> {
+    std::fs::read_to_string(path).unwrap().lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+}
+
+#[test]
 fn a_sheet_of_one_point_is_a_pendulum_and_a_line_is_a_string() {
     for points in ["[1, 1]", "[1, 9]", "[9, 1]", "[2, 2]"] {
         let scene = SCENE.replace("[9, 7]", points);

@@ -6,6 +6,7 @@ pub mod check;
 pub mod collection;
 pub mod document;
 pub mod kind;
+pub mod plot;
 pub mod profile;
 pub mod reader;
 pub mod record;

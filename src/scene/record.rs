@@ -4,6 +4,7 @@ use std::io::Write;
 
 use serde::Serialize;
 
+use super::plot::Curves;
 use super::{Integrator, Named, Precision};
 use crate::shape::{PointName, RestShape};
 
@@ -41,6 +42,22 @@ pub struct Record {
     pub energy_j: Option<EnergyJ>,
     /// Points computed in the step.
     pub awake_points: usize,
+}
+
+impl Record {
+    /// Displacement, m, and force of the tissue, N, of the first tool with a tip; without such tools, of the first point.
+    pub fn first(&self) -> Option<([f64; 3], [f64; 3])> {
+        let tool = self.tools.first().map(|tool| (tool.displacement_m, tool.force_on_tool_n));
+        tool.or_else(|| self.points.first().map(|point| (point.displacement_m, point.reaction_n)))
+    }
+
+    /// The largest force of the tissue on a tool with a tip; without such tools, at a point. N.
+    pub fn peak_n(&self) -> f64 {
+        let length = |v: [f64; 3]| v.iter().map(|c| c * c).sum::<f64>().sqrt();
+        let tools = self.tools.iter().map(|tool| length(tool.force_on_tool_n));
+        let points = self.points.iter().filter(|_| self.tools.is_empty()).map(|point| length(point.reaction_n));
+        tools.chain(points).fold(0.0, f64::max)
+    }
 }
 
 /// One mass point.
@@ -117,6 +134,15 @@ pub struct Summary {
     /// What a user should know of the run, in words. Not written.
     #[serde(skip)]
     pub warnings: Vec<String>,
+    /// Length of the largest displacement, m. Not written.
+    #[serde(skip)]
+    pub largest_displacement_m: f64,
+    /// The largest force of the tissue that was told, N. Not written.
+    #[serde(skip)]
+    pub peak_reaction_n: f64,
+    /// What the first tool or point felt over time. Not written.
+    #[serde(skip)]
+    pub curves: Curves,
     /// The additional measurements of a replay.
     #[serde(flatten, skip_serializing_if = "Option::is_none")]
     pub network: Option<Network>,
