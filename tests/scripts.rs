@@ -274,7 +274,7 @@ fn a_pose_beside_the_tissue_is_warned_of() {
 
 /// A session of liver, and what a command for the coming step tells in the sample after it.
 fn told(session: &mut Session, sequence: u64, action: Action) -> palpate::session::Contact {
-    let at_step = Some(session.step_count());
+    let (sequence, at_step) = (Some(sequence), Some(session.step_count()));
     let command =
         Command { tool: 0, sequence, client_time_ns: 0, at_step, time_to_live_s: None, action, arrival_ns: 0 };
     let due = palpate::session::command::Due { command, late: false, late_commands: 0, ends_lease: false };

@@ -40,11 +40,11 @@ pub fn device(device: &Device) -> pb::Device {
     }
 }
 
-/// The tip in a message; the default tip if it is absent.
+/// The tip in a message; the default tip if it is absent, and the default friction if that is.
 pub fn from_tip(tip: Option<&pb::Tip>) -> Tip {
     tip.map_or_else(Tip::default, |tip| Tip {
         radius_m: tip.radius_m,
-        friction: tip.friction,
+        friction: tip.friction.unwrap_or(Tip::default().friction),
         grasps: tip.grasps,
         coupling: tip.spring.as_ref().map_or(Coupling::Constraint, |spring| Coupling::Spring {
             stiffness_n_per_m: spring.stiffness_n_per_m,
@@ -57,7 +57,7 @@ pub fn from_tip(tip: Option<&pb::Tip>) -> Tip {
 pub fn tip(tip: &Tip) -> pb::Tip {
     pb::Tip {
         radius_m: tip.radius_m,
-        friction: tip.friction,
+        friction: Some(tip.friction),
         grasps: tip.grasps,
         spring: match tip.coupling {
             Coupling::Constraint => None,

@@ -228,7 +228,8 @@ impl Haptics {
                         live.count_refused(1);
                         self.0.traffic.refused(refusal.reason);
                         debug!(session = %live.id, reason = refusal.reason.as_str(), %refusal, "command refused");
-                        events.push(Event::Rejected(wire::sample::rejection(command.tool, command.sequence, &refusal)));
+                        let sequence = command.sequence.unwrap_or_default();
+                        events.push(Event::Rejected(wire::sample::rejection(command.tool, sequence, &refusal)));
                         if bucket.is_abused() {
                             info!(session = %live.id, "haptic stream ended: its commands come far too fast");
                             return events.close(refusal);
@@ -299,7 +300,7 @@ impl Early {
                 && let Some(Ok(Some(pb::TouchRequest { message: Some(Message::Command(old)) }))) = self.said.pop_front()
             {
                 self.refused += 1;
-                self.dropped.push_back((old.tool, old.sequence));
+                self.dropped.push_back((old.tool, old.sequence.unwrap_or_default()));
                 if self.dropped.len() > most {
                     self.dropped.pop_front();
                 }

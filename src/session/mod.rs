@@ -360,8 +360,8 @@ impl Session {
             return self.tissue.release(index);
         }
         // Commands with a step may take effect in another order than they were sent in.
-        if command.sequence > tool.acknowledged_sequence {
-            tool.acknowledged_sequence = command.sequence;
+        if let Some(sequence) = command.sequence.filter(|sequence| *sequence >= tool.acknowledged_sequence) {
+            tool.acknowledged_sequence = sequence;
             tool.client_time_ns = command.client_time_ns;
             tool.arrival_ns = command.arrival_ns;
         }

@@ -50,7 +50,7 @@ pub fn command(tool: usize, step: u64, action: Action) -> Command {
         #[allow(clippy::cast_possible_truncation)]
         tool: tool as u32,
         // At most one command per step, so steps serve as sequence numbers.
-        sequence: step + 1,
+        sequence: Some(step + 1),
         client_time_ns: 0,
         at_step: Some(step),
         time_to_live_s: None,

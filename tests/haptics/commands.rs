@@ -46,10 +46,10 @@ async fn bad_commands_are_refused_with_a_reason_and_change_nothing() {
         (|c| force_of(c).force_n.as_mut().unwrap().x = f64::NAN, "NOT_FINITE", "force.force_n"),
         (|c| force_of(c).force_n.as_mut().unwrap().z = f64::INFINITY, "NOT_FINITE", "force.force_n"),
         (|c| force_of(c).force_n.as_mut().unwrap().z = 1.1e4, "FORCE_TOO_LARGE", "force.force_n"),
-        (|c| force_of(c).falloff_offset = 10.0, "FORCE_TOO_LARGE", "force.force_n"),
-        (|c| force_of(c).falloff_offset = 1e9, "FORCE_TOO_LARGE", "force.force_n"),
-        (|c| force_of(c).falloff_offset = f64::NAN, "NOT_FINITE", "force.falloff_offset"),
-        (|c| force_of(c).falloff_per_m = -1.0, "OUT_OF_RANGE", "force.falloff_per_m"),
+        (|c| force_of(c).falloff_offset = Some(10.0), "FORCE_TOO_LARGE", "force.force_n"),
+        (|c| force_of(c).falloff_offset = Some(1e9), "FORCE_TOO_LARGE", "force.force_n"),
+        (|c| force_of(c).falloff_offset = Some(f64::NAN), "NOT_FINITE", "force.falloff_offset"),
+        (|c| force_of(c).falloff_per_m = Some(-1.0), "OUT_OF_RANGE", "force.falloff_per_m"),
         (|c| force_of(c).centre = None, "MISSING", "force.centre"),
         (
             |c| force_of(c).centre = Some(pb::force::Centre::Point(pb::GridPoint { x: 31, y: 0 })),
@@ -141,6 +141,59 @@ async fn stale_sequences_are_refused() {
     let sample = touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == 11).await;
     let later = touch.sample_with(|later| later.step > sample.step).await;
     assert_eq!(later.tools[0].applied_force_n.unwrap().z, -0.5);
+}
+
+/// The hash after 60 steps in which tool 0 gets these commands, one a step.
+async fn hash_after(server: &Server, scene: &str, actions: Vec<Action>) -> String {
+    let source = pb::create_session_request::Source::SceneName(scene.into());
+    let session = server.create(source, true).await.unwrap().session_id;
+    let mut touch = Touch::hold(server, &session).await;
+    for (step, action) in (0..).zip(actions) {
+        touch.command(pb::Command { at_step: Some(step), action: Some(action), ..Default::default() }).await;
+    }
+    touch.settle().await;
+    server.start_until(&session, 60).await;
+    server.hash_at(&session, 60).await
+}
+
+#[tokio::test]
+async fn fields_that_a_command_leaves_out_have_defaults_and_zeros_count_as_zeros() {
+    let server = Server::start(&[]);
+    let mut forces = Vec::new();
+    for (falloff_per_m, falloff_offset) in [(None, None), (Some(200.0), Some(0.0)), (Some(0.0), None)] {
+        let Some(Action::Force(force)) = force(0, 1, -1e-3).action else { unreachable!() };
+        let force = Action::Force(pb::Force { falloff_per_m, falloff_offset, ..force });
+        forces.push(hash_after(&server, "liver", vec![force]).await);
+    }
+    assert_eq!(forces[0], forces[1]);
+    assert_ne!(forces[0], forces[2]);
+    // A tip that presses and then strokes.
+    let mut strokes = Vec::new();
+    for friction in [None, Some(0.2), Some(0.0)] {
+        let pose = |step: u32| {
+            let (down, along) = (step.min(20), step.saturating_sub(20));
+            let (x, z) = (0.03 + 2e-4 * f64::from(along), -1e-4 * f64::from(down));
+            let tip = Some(pb::Tip { radius_m: 0.005, friction, ..Default::default() });
+            Action::Pose(pb::Pose { position_m: Some(pb::Vector3 { x, y: 0.0375, z }), tip, ..Default::default() })
+        };
+        strokes.push(hash_after(&server, "liver", (0..50).map(pose).collect()).await);
+    }
+    assert_eq!(strokes[0], strokes[1]);
+    assert_ne!(strokes[0], strokes[2]);
+}
+
+#[tokio::test]
+async fn commands_without_a_sequence_are_acknowledged_by_their_time_and_their_count() {
+    let server = Server::start(&[]);
+    let session = server.paper(false).await;
+    let mut touch = Touch::hold(&server, &session).await;
+    for (client_time_ns, sequence) in [(700, 0), (800, 1), (900, 2)] {
+        touch.command(pb::Command { sequence: None, client_time_ns, ..force(0, 0, -1.0) }).await;
+        let sample = touch.sample_with(|sample| sample.tools[0].client_time_ns == client_time_ns).await;
+        assert_eq!(sample.tools[0].acknowledged_sequence, sequence);
+    }
+    touch.command(force(0, 2, -2.0)).await;
+    assert_eq!(touch.rejection().await.reason, "STALE_SEQUENCE");
 }
 
 #[tokio::test]

@@ -14,7 +14,7 @@ fn device() -> pb::Device {
 fn pose(sequence: u64, time_ms: u64, z_m: f64) -> pb::Command {
     pb::Command {
         tool: 0,
-        sequence,
+        sequence: Some(sequence),
         client_time_ns: time_ms * 1_000_000,
         action: Some(pb::command::Action::Pose(pb::Pose {
             position_m: Some(pb::Vector3 { x: 0.0375, y: 0.0375, z: z_m }),
