@@ -351,6 +351,16 @@ fn scenes_and_scripts_are_found_by_name() {
         &palpate(&["run", "paper", "vertcal-60"]),
         &["there is no script `vertcal-60`; there are grasp, mine, oblique", "; did you mean `vertical-60`?"],
     );
+    // A file in the folder, whose ending was left out.
+    for name in ["firm", "poke"] {
+        std::fs::copy(folder.path().join("scenes/mine.toml"), folder.path().join(format!("{name}.toml"))).unwrap();
+    }
+    let meant = "there are fibrotic, liver, mine, paper, stomach; did you mean the file `firm.toml`?";
+    refused(&palpate(&["check", "firm"]), &["there is no scene `firm`", meant]);
+    refused(
+        &palpate(&["run", "paper", "poke"]),
+        &["there is no script `poke`", "; did you mean the file `poke.toml`?"],
+    );
     // Built in, without a file of that name.
     assert_eq!(lines(&palpate(&["run", "paper", "vertical-60"]))[0]["run"]["script"], "vertical-60");
 }

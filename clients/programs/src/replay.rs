@@ -29,7 +29,7 @@ use tonic::Status;
 
 use crate::Failure;
 use crate::credentials::CredentialOptions;
-use crate::scene_file::source;
+use crate::scene_file::{source, with_hint};
 use measured::{Measured, percentiles_us};
 
 /// How far ahead of the server's step commands are sent, s: a network may stall for about as long before the session has to
@@ -151,7 +151,7 @@ pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
         pb::CreateSessionRequest { source: Some(source), paused: true, idle_timeout_s: Some(SILENCE.as_secs_f64()) };
     let silent = |_| Failure::Failed(format!("the server created no session within {} s", PATIENCE.as_secs()));
     let created = tokio::time::timeout(PATIENCE, client.create_session(request)).await.map_err(silent)?;
-    let created = created.map_err(refused_or_failed)?.into_inner().session;
+    let created = created.map_err(|status| with_hint(&scene, refused_or_failed(status)))?.into_inner().session;
     let created = created.ok_or_else(|| Failure::Failed("the server's answer has no session".into()))?;
     let mut session = Session { client, id: created.session_id.clone() };
     let sessions = session.client.clone();
