@@ -266,6 +266,9 @@ fn a_pose_beside_the_tissue_is_warned_of() {
     };
     assert_eq!(warnings(0.075, 0.02), [""; 0]);
     let [warning] = warnings(0.085, -0.002).try_into().unwrap();
+    // On the rim, which is fixed.
+    let [rim] = warnings(0.075, -0.002).try_into().unwrap();
+    assert!(rim.starts_with("tool[0].poses[0].place_m: is at a fixed point"), "{rim}");
     assert!(
         warning.starts_with("tool[0].poses[0].place_m: is 0.01") && warning.contains("beside the tissue"),
         "{warning}"

@@ -20,11 +20,11 @@ pub fn from_device(message: &pb::Device) -> Result<Device> {
     };
     Ok(Device {
         name: "declared",
-        force_n: within("force_n", message.max_force_n, 1e3)?,
-        continuous_n: within("continuous_n", message.continuous_force_n, 1e3)?,
-        stiffness_n_per_m: within("stiffness_n_per_m", message.max_stiffness_n_per_m, 1e6)?,
-        damping_n_s_per_m: within("damping_n_s_per_m", message.max_damping_n_s_per_m, 1e4)?,
-        workspace_m: within("workspace_m", message.workspace_radius_m, 10.0)?,
+        force_n: within("max_force_n", message.max_force_n, 1e3)?,
+        continuous_n: within("continuous_force_n", message.continuous_force_n, 1e3)?,
+        stiffness_n_per_m: within("max_stiffness_n_per_m", message.max_stiffness_n_per_m, 1e6)?,
+        damping_n_s_per_m: within("max_damping_n_s_per_m", message.max_damping_n_s_per_m, 1e4)?,
+        workspace_m: within("workspace_radius_m", message.workspace_radius_m, 10.0)?,
     })
 }
 

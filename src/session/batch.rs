@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use super::command::Command;
 use super::intake::Intake;
-use super::lease::{LeaseId, not_holder};
+use super::lease::LeaseId;
 use super::rules::{Checked, check_tip, tip_radius_m};
 use crate::refusal::{Reason, Refusal, Result};
 
@@ -42,7 +42,9 @@ impl Intake {
         let mut last: BTreeMap<u32, (u64, usize, Option<f64>)> = BTreeMap::new();
         for command in &mut commands {
             let lease = self.leases.get(command.tool).filter(|lease| lease.id == id);
-            let lease = lease.ok_or_else(|| not_holder(format!("tool {} is not held by this client", command.tool)))?;
+            let lease = lease.ok_or_else(|| {
+                Refusal::new(Reason::NotHolder, "tool", format!("{} is not held by this client", command.tool))
+            })?;
             let coming = last.get(&command.tool).copied();
             let before = coming.map(|(sequence, ..)| sequence).or(lease.last_sequence);
             let sequence = command.sequence.unwrap_or_else(|| before.map_or(0, |before| before.saturating_add(1)));

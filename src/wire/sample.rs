@@ -25,8 +25,8 @@ pub fn sampling(
     renders: bool,
 ) -> Result<Sampling> {
     if !renders && deadband.is_some_and(|deadband| deadband.rendered_fraction.is_some()) {
-        let message = "is missing, but deadband.rendered_fraction requires it";
-        return Err(Refusal::new(Reason::Missing, "device", message));
+        let message = "requires a device, but the request declares none";
+        return Err(Refusal::new(Reason::Missing, "deadband.rendered_fraction", message));
     }
     let sampling = Sampling {
         every: every("sample_every_steps", every_steps)?,
@@ -86,6 +86,7 @@ fn tool_sample(tool: &ToolSample, shape: &dyn RestShape, due_ns: u64, now_ns: u6
         paused_until_step: tool.paused_until,
         local_model: tool.local.as_ref().map(touch::local_model),
         stale: tool.stale,
+        on_fixed_point: contact.is_some_and(|contact| shape.is_fixed(contact.point)),
     }
 }
 
