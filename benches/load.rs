@@ -139,7 +139,7 @@ fn kernel_alone_s(count: usize, rounds: u64) -> f64 {
             });
             let command = Order {
                 tool: 0,
-                sequence: step,
+                sequence: Some(step),
                 client_time_ns: 0,
                 at_step: None,
                 time_to_live_s: None,

@@ -39,7 +39,7 @@ fn no<T>() -> Result<Response<T>, Status> {
 
 fn echoed(request: &pb::TouchRequest, server_hold_ns: u64) -> pb::TouchResponse {
     let (sequence, client_time_ns) = match &request.message {
-        Some(Say::Command(command)) => (command.sequence, command.client_time_ns),
+        Some(Say::Command(command)) => (command.sequence.unwrap_or_default(), command.client_time_ns),
         _ => return pb::TouchResponse { message: Some(Heard::Opened(pb::TouchOpened::default())) },
     };
     let vector = Some(pb::Vector3 { x: 0.125, y: 0.25, z: -0.5 });

@@ -22,6 +22,7 @@ enum Command {
     /// Play a script on a scene, offline and as fast as possible; write the records as JSON Lines
     #[command(after_help = "Examples:\n  \
         palpate run paper vertical-60\n  \
+        palpate run liver press --output press.jsonl --plot\n  \
         palpate run my-scene.toml my-script.toml --output poke.jsonl --set stepping.integrator=lagged\n\n\
         Exit status: 0; 1 when the run failed; 2 when an input was refused.")]
     Run(run::RunArguments),

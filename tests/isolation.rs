@@ -381,7 +381,7 @@ fn heavy() -> Source {
 fn everywhere(sequence: u64) -> pb::Command {
     let mut command = force(0, sequence, -1.0);
     let Some(pb::command::Action::Force(force)) = &mut command.action else { unreachable!() };
-    force.falloff_per_m = 0.0;
+    force.falloff_per_m = Some(0.0);
     command
 }
 

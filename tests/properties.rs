@@ -70,7 +70,7 @@ fn command() -> impl Strategy<Value = Command> {
     (0..4_u32, 0..400_u64, at_step, time_to_live_s, action()).prop_map(
         |(tool, sequence, at_step, time_to_live_s, action)| Command {
             tool,
-            sequence,
+            sequence: Some(sequence),
             client_time_ns: 0,
             at_step,
             time_to_live_s,

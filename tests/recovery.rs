@@ -36,7 +36,7 @@ fn play(model: &Arc<Model>, orders: &[Order], steps: u64) -> Course {
         while let Some((index, (_, tool, action))) = waiting.next_if(|(_, order)| order.0 == step) {
             let command = Command {
                 tool: *tool,
-                sequence: index as u64 + 1,
+                sequence: Some(index as u64 + 1),
                 client_time_ns: 0,
                 at_step: None,
                 time_to_live_s: None,

@@ -380,6 +380,11 @@ fn what_a_replay_can_not_play_is_refused() {
         assert!(message.contains(expected), "{message}");
     };
     refused(replay(&server, &script, &["--scene", "nothing"]), 2, "UNKNOWN_SCENE");
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("stiff.toml"), STIFF).unwrap();
+    let name = folder.path().join("stiff");
+    let meant = format!("; did you mean the file `{}.toml`?", name.display());
+    refused(replay(&server, &script, &["--scene", name.to_str().unwrap()]), 2, &meant);
     refused(replay(&server, Path::new("no-such-script.toml"), &[]), 2, "no-such-script.toml");
     refused(replay(&server, &script, &["--output", "/no/such/folder/file"]), 2, "/no/such/folder/file");
     refused(replay(&server, &script, &["--deadband-force-n=-1"]), 2, "deadband.force_n");

@@ -351,6 +351,16 @@ fn scenes_and_scripts_are_found_by_name() {
         &palpate(&["run", "paper", "vertcal-60"]),
         &["there is no script `vertcal-60`; there are grasp, mine, oblique", "; did you mean `vertical-60`?"],
     );
+    // A file in the folder, whose ending was left out.
+    for name in ["firm", "poke"] {
+        std::fs::copy(folder.path().join("scenes/mine.toml"), folder.path().join(format!("{name}.toml"))).unwrap();
+    }
+    let meant = "there are fibrotic, liver, mine, paper, stomach; did you mean the file `firm.toml`?";
+    refused(&palpate(&["check", "firm"]), &["there is no scene `firm`", meant]);
+    refused(
+        &palpate(&["run", "paper", "poke"]),
+        &["there is no script `poke`", "; did you mean the file `poke.toml`?"],
+    );
     // Built in, without a file of that name.
     assert_eq!(lines(&palpate(&["run", "paper", "vertical-60"]))[0]["run"]["script"], "vertical-60");
 }
@@ -412,6 +422,34 @@ fn a_run_that_leaves_its_sheet_warns_at_the_end() {
     let far = warned("-1000.0]");
     assert!(far.contains("palpate: warning: the largest displacement was "), "{far}");
     assert!(far.contains("more than the tissue's longest side, 0.400 m"), "{far}");
+}
+
+#[test]
+fn a_run_plots_and_sums_up_where_its_records_do_not_go() {
+    let folder = tempfile::tempdir().unwrap();
+    let records = folder.path().join("records.jsonl");
+    let told = |more: &[&str]| {
+        let output = run_in(folder.path(), SCENE, SCRIPT, more);
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        [output.stdout, output.stderr].map(|bytes| String::from_utf8(bytes).unwrap())
+    };
+    let titles = ["Displacement of the control point along z, m\n", "Force of the tissue on the tool along z, N\n"];
+    let [out, err] = told(&["--plot"]);
+    assert!(out.lines().all(|line| line.starts_with('{')), "{out}");
+    assert!(titles.iter().all(|title| err.contains(title)) && !err.contains("final hash"), "{err}");
+    let [out, err] = told(&["--plot", "--output", records.to_str().unwrap()]);
+    let hash = lines_of(&records).pop().unwrap()["summary"]["final_hash"].as_str().unwrap().to_owned();
+    for part in titles.iter().chain(&["steps  ", "largest displacement  ", "peak reaction  ", "final hash  ", &hash]) {
+        assert!(out.contains(part), "no `{part}` in: {out}");
+    }
+    assert_eq!(err, "");
+    assert_eq!(told(&["--quiet", "--output", records.to_str().unwrap()]), ["", ""]);
+    assert_eq!(told(&["-q"])[1], "");
+}
+
+/// The lines of a file of records.
+fn lines_of(path: &Path) -> Vec<Value> {
+    std::fs::read_to_string(path).unwrap().lines().map(|line| serde_json::from_str(line).unwrap()).collect()
 }
 
 #[test]

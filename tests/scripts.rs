@@ -75,6 +75,62 @@ fn shipped_scripts_move_each_tissue_by_some_millimetres() {
 }
 
 #[test]
+fn records_tell_what_a_tip_feels_and_where_it_is() {
+    let scene = built_in("liver", &[]);
+    let model = model(&scene);
+    // A grasped point comes before the tip, whatever their order in the script.
+    let text = "duration_s = 0.5\nsample_every_s = 0.05\n[[tool]]\nposes = [{ at_s = 0.05, place_m = [0.03, 0.04, 0.001] }, \
+                { at_s = 0.25, place_m = [0.03, 0.04, -0.003] }]\nuntil_s = 0.42\n\
+                [[tool]]\npoint = [2, 2]\nmoves = [{ from_s = 0.0, to_s = 0.2, by_m = [0.0, 0.0, -0.001] }]\n";
+    let script = script(text, &scene);
+    let (records, _) = run_whole(&model, &script, true);
+    // The same steps, and what a stream tells at the same times.
+    let mut session = Session::new(&model);
+    let mut told = Vec::new();
+    for step in 0..script.steps {
+        let due = script.actions_at(step).map(|(tool, action)| palpate::session::command::Due {
+            command: run::command(tool, step, action),
+            late: false,
+            late_commands: 0,
+            ends_lease: false,
+        });
+        session.advance(&mut due.collect::<Vec<_>>(), |session| {
+            if session.step_count().is_multiple_of(script.sample_every) {
+                let felt = session.sample(None).tools.into_iter().find(|tool| tool.tool == 1 && tool.feel.is_some());
+                told.push(felt.map(|tool| (tool.feel.unwrap().place_m, tool.contact.unwrap())));
+            }
+        });
+    }
+    let records = &records[1..records.len() - 1];
+    assert_eq!((records.len(), told.len()), (11, 11));
+    let vector = |value: &serde_json::Value| DVec3::from_array(serde_json::from_value(value.clone()).unwrap());
+    for (record, told) in records.iter().zip(told) {
+        let time_s = record["time_s"].as_f64().unwrap();
+        assert_eq!(told.is_some(), (0.05..0.42).contains(&time_s), "{time_s} s");
+        let Some((place_m, contact)) = told else {
+            assert!(record.get("tools").is_none(), "{record}");
+            continue;
+        };
+        let [tool] = record["tools"].as_array().unwrap().as_slice() else { panic!("{record}") };
+        assert_eq!(tool["tool"], 1);
+        // The text of a number may be read with another last digit.
+        for (key, expected) in [
+            ("place_m", place_m),
+            ("displacement_m", contact.displacement_m),
+            ("force_on_tool_n", contact.force_on_tool_n),
+        ] {
+            assert!((vector(&tool[key]) - expected).length() < 1e-12, "{key} at {time_s} s: {record}");
+        }
+        let force_n = contact.force_on_tool_n;
+        assert!(place_m.z < 0.0005 || force_n == DVec3::ZERO, "{time_s} s: {force_n}");
+        assert!(place_m.z > -0.002 || force_n.z > 0.1, "{time_s} s: {force_n}");
+    }
+    // A script without tips has the records that it had.
+    let (records, _) = run_whole(&model, &shipped("push", &scene), false);
+    assert!(records.iter().all(|record| record.get("tools").is_none()));
+}
+
+#[test]
 fn poses_are_commands_so_that_a_run_is_the_same_bits_held_or_not() {
     let scene = built_in("liver", &[]);
     let model = model(&scene);
@@ -210,6 +266,9 @@ fn a_pose_beside_the_tissue_is_warned_of() {
     };
     assert_eq!(warnings(0.075, 0.02), [""; 0]);
     let [warning] = warnings(0.085, -0.002).try_into().unwrap();
+    // On the rim, which is fixed.
+    let [rim] = warnings(0.075, -0.002).try_into().unwrap();
+    assert!(rim.starts_with("tool[0].poses[0].place_m: is at a fixed point"), "{rim}");
     assert!(
         warning.starts_with("tool[0].poses[0].place_m: is 0.01") && warning.contains("beside the tissue"),
         "{warning}"
@@ -218,7 +277,7 @@ fn a_pose_beside_the_tissue_is_warned_of() {
 
 /// A session of liver, and what a command for the coming step tells in the sample after it.
 fn told(session: &mut Session, sequence: u64, action: Action) -> palpate::session::Contact {
-    let at_step = Some(session.step_count());
+    let (sequence, at_step) = (Some(sequence), Some(session.step_count()));
     let command =
         Command { tool: 0, sequence, client_time_ns: 0, at_step, time_to_live_s: None, action, arrival_ns: 0 };
     let due = palpate::session::command::Due { command, late: false, late_commands: 0, ends_lease: false };

@@ -212,7 +212,7 @@ async fn a_session_too_heavy_for_its_rate_slows_its_own_time_and_says_so() {
     let touch = Touch::hold(&server, &session).await;
     let mut everywhere = force(0, 1, -1.0);
     let Some(pb::command::Action::Force(force)) = &mut everywhere.action else { unreachable!() };
-    force.falloff_per_m = 0.0;
+    force.falloff_per_m = Some(0.0);
     touch.command(everywhere).await;
     let mut last: Option<pb::Sample> = None;
     loop {
@@ -324,7 +324,7 @@ async fn a_command_wakes_a_session_at_the_step_that_is_next() {
         sequence += 1;
         // A release changes nothing: the session goes on resting.
         let release = Some(pb::command::Action::Release(pb::Release {}));
-        touch.command(pb::Command { sequence, at_step, action: release, ..Default::default() }).await;
+        touch.command(pb::Command { sequence: Some(sequence), at_step, action: release, ..Default::default() }).await;
         let sample = touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == sequence).await;
         let after = server.status(&session).await;
         assert!((before.step..=after.step).contains(&sample.step), "{} {} {}", before.step, sample.step, after.step);

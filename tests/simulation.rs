@@ -160,7 +160,7 @@ fn course(seed: u64) -> Course {
                             falloff_offset: 0.0,
                         })
                     };
-                    let (at_step, time_to_live_s, client_time_ns) = (None, None, 0);
+                    let (sequence, at_step, time_to_live_s, client_time_ns) = (Some(sequence), None, None, 0);
                     let command =
                         Command { tool, sequence, client_time_ns, at_step, time_to_live_s, action, arrival_ns: now };
                     let taken = intake.submit(lease, vec![command], now);

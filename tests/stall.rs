@@ -32,7 +32,7 @@ use tonic::transport::Channel;
 /// A pose of a tool, by the client's time.
 fn pose(tool: u32, sequence: u64, place_m: DVec3, client_time_ns: u64) -> pb::Command {
     let action = Some(pb::command::Action::Pose(touch::pose(place_m, &Tip::default())));
-    pb::Command { tool, sequence, client_time_ns, action, ..Default::default() }
+    pb::Command { tool, sequence: Some(sequence), client_time_ns, action, ..Default::default() }
 }
 
 /// As long as either side stands still, s.

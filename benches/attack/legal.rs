@@ -156,7 +156,8 @@ async fn call(
         10 => {
             let r#where = Some(pb::probe_request::Where::AllPoints(true));
             let every_steps = Some(random.u32(1..20));
-            let request = pb::ProbeRequest { session_id, r#where, every_steps, energy: random.bool() };
+            let request =
+                pb::ProbeRequest { session_id, r#where, every_steps, energy: random.bool(), tools: random.bool() };
             streams.push(Stream::Records(haptics(door).probe(request).await?.into_inner()));
             Ok(())
         }

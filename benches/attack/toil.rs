@@ -75,7 +75,7 @@ pub async fn fixed_positions(ground: &Ground) -> Result<(), Status> {
     let mut first = 1;
     loop {
         let command = |sequence| pb::Command {
-            sequence,
+            sequence: Some(sequence),
             action: Some(pb::command::Action::Position(position)),
             ..Default::default()
         };

@@ -230,8 +230,8 @@ fn request_seeds() -> Vec<Vec<u8>> {
     let force = pb::command::Action::Force(pb::Force {
         centre: Some(pb::force::Centre::Point(point)),
         force_n: vector(0.1, 0.0, -1.0),
-        falloff_per_m: 150.0,
-        falloff_offset: 0.0,
+        falloff_per_m: Some(150.0),
+        falloff_offset: Some(0.0),
     });
     let position = pb::command::Action::Position(pb::Position {
         point: Some(point),
@@ -243,7 +243,7 @@ fn request_seeds() -> Vec<Vec<u8>> {
         tip_offset_m: vector(0.0, 0.0, 0.01),
         tip: Some(pb::Tip {
             radius_m: 0.02,
-            friction: 0.3,
+            friction: Some(0.3),
             grasps: true,
             spring: Some(pb::Spring { stiffness_n_per_m: 100.0, damping_n_s_per_m: 1.0 }),
         }),
@@ -251,7 +251,7 @@ fn request_seeds() -> Vec<Vec<u8>> {
     let actions = [force, position, pose, pb::command::Action::Release(pb::Release {})];
     let command = |index: usize| pb::Command {
         tool: index as u32 % 3,
-        sequence: index as u64 + 1,
+        sequence: Some(index as u64 + 1),
         client_time_ns: index as u64 * 1_000_000,
         at_step: (index == 1).then_some(1),
         time_to_live_s: (index == 2).then_some(0.001),
@@ -268,7 +268,7 @@ fn request_seeds() -> Vec<Vec<u8>> {
         deadband: Some(deadband),
         heartbeat_s: Some(0.04),
         device: Some(touch::device(&Device::named("omega3").expect("there is one"))),
-        tip: Some(pb::Tip { radius_m: 0.02, friction: 0.2, ..Default::default() }),
+        tip: Some(pb::Tip { radius_m: 0.02, friction: Some(0.2), ..Default::default() }),
         touch_stiffness: true,
     };
     let touch = |message| pb::TouchRequest { message: Some(message) }.encode_to_vec();
@@ -402,7 +402,9 @@ fn record_seeds() -> Vec<Vec<u8>> {
         ..Default::default()
     };
     let energy = Some(pb::Energy { kinetic_j: 1.0, spring_j: 2.0, virtual_j: 3.0 });
-    let last = pb::ProbeResponse { step: 9, points: vec![point; 3], energy, last: true, ..Default::default() };
+    let tool = pb::ToolRecord { tool: 1, place_m: vector, displacement_m: vector, force_on_tool_n: vector };
+    let (points, tools) = (vec![point; 3], vec![tool]);
+    let last = pb::ProbeResponse { step: 9, points, tools, energy, last: true, ..Default::default() };
     vec![last.encode_to_vec(), pb::ProbeResponse { last: false, ..last }.encode_to_vec()]
 }
 

@@ -144,7 +144,7 @@ mod tests {
     fn a_full_batch_of_commands_passes_and_a_flood_of_empty_parts_does_not() {
         let command = pb::Command {
             tool: 63,
-            sequence: u64::MAX,
+            sequence: Some(u64::MAX),
             client_time_ns: u64::MAX,
             at_step: Some(u64::MAX),
             time_to_live_s: Some(1.0),

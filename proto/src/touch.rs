@@ -20,11 +20,11 @@ pub fn from_device(message: &pb::Device) -> Result<Device> {
     };
     Ok(Device {
         name: "declared",
-        force_n: within("force_n", message.max_force_n, 1e3)?,
-        continuous_n: within("continuous_n", message.continuous_force_n, 1e3)?,
-        stiffness_n_per_m: within("stiffness_n_per_m", message.max_stiffness_n_per_m, 1e6)?,
-        damping_n_s_per_m: within("damping_n_s_per_m", message.max_damping_n_s_per_m, 1e4)?,
-        workspace_m: within("workspace_m", message.workspace_radius_m, 10.0)?,
+        force_n: within("max_force_n", message.max_force_n, 1e3)?,
+        continuous_n: within("continuous_force_n", message.continuous_force_n, 1e3)?,
+        stiffness_n_per_m: within("max_stiffness_n_per_m", message.max_stiffness_n_per_m, 1e6)?,
+        damping_n_s_per_m: within("max_damping_n_s_per_m", message.max_damping_n_s_per_m, 1e4)?,
+        workspace_m: within("workspace_radius_m", message.workspace_radius_m, 10.0)?,
     })
 }
 
@@ -40,11 +40,11 @@ pub fn device(device: &Device) -> pb::Device {
     }
 }
 
-/// The tip in a message; the default tip if it is absent.
+/// The tip in a message; the default tip if it is absent, and the default friction if that is.
 pub fn from_tip(tip: Option<&pb::Tip>) -> Tip {
     tip.map_or_else(Tip::default, |tip| Tip {
         radius_m: tip.radius_m,
-        friction: tip.friction,
+        friction: tip.friction.unwrap_or(Tip::default().friction),
         grasps: tip.grasps,
         coupling: tip.spring.as_ref().map_or(Coupling::Constraint, |spring| Coupling::Spring {
             stiffness_n_per_m: spring.stiffness_n_per_m,
@@ -57,7 +57,7 @@ pub fn from_tip(tip: Option<&pb::Tip>) -> Tip {
 pub fn tip(tip: &Tip) -> pb::Tip {
     pb::Tip {
         radius_m: tip.radius_m,
-        friction: tip.friction,
+        friction: Some(tip.friction),
         grasps: tip.grasps,
         spring: match tip.coupling {
             Coupling::Constraint => None,

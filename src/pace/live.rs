@@ -23,7 +23,7 @@ use crate::lock::lock;
 use crate::memory;
 use crate::refusal::{Reason, Refusal, Result};
 use crate::scene::Change;
-use crate::scene::record::Point;
+use crate::scene::record::{Point, ToolRecord};
 use crate::session::batch::Batch;
 use crate::session::command::Command;
 use crate::session::intake::Intake;
@@ -231,7 +231,8 @@ impl Live {
         reader
     }
 
-    /// Records of some points, or of all, every so many steps; refused if there is no memory for one.
+    /// Records of some points, or of all, every so many steps, with energies and with tools if asked for; refused if there
+    /// is no memory for one.
     ///
     /// # Errors
     /// Refuses if the system has no memory for a record.
@@ -240,16 +241,18 @@ impl Live {
         every: u64,
         points: Option<Vec<PointId>>,
         energy: bool,
+        tools: bool,
         account: &Account,
     ) -> Result<Reader<SharedRecord>> {
         let count = points.as_ref().map_or(self.model.len(), Vec::len).max(1);
-        let bytes = count * size_of::<Point>();
+        let most_tools = if tools { self.limits.tools as usize } else { 0 };
+        let bytes = count * size_of::<Point>() + most_tools * size_of::<ToolRecord>();
         memory::check(bytes as u64, "a record")?;
         let room = (self.limits.queued_bytes / bytes).clamp(1, self.limits.queued_records);
         let (writer, reader) = queue(room);
         let (recipient, points) = (Recipient::new(writer, room), points.map(Arc::from));
         let account = account.clone();
-        self.inbox.send(self.number, Request::Probe(ProbeTap { every, points, energy, recipient, account }));
+        self.inbox.send(self.number, Request::Probe(ProbeTap { every, points, energy, tools, recipient, account }));
         Ok(reader)
     }
 

@@ -10,7 +10,7 @@ use super::reading::{Copied, Copies, HashReply, Piece, Reading, Recipient, is_mu
 use crate::budget::{Account, Purpose, Resource, Taken, Work};
 use crate::memory;
 use crate::refusal::Result;
-use crate::scene::record::{Point, Record};
+use crate::scene::record::{Point, Record, ToolRecord};
 use crate::session::Session;
 use crate::session::sampling::Sampler;
 use crate::shape::PointId;
@@ -32,6 +32,8 @@ pub(super) struct ProbeTap {
     /// All, if none are named.
     pub(super) points: Option<Arc<[PointId]>>,
     pub(super) energy: bool,
+    /// Also the tools with a tip.
+    pub(super) tools: bool,
     pub(super) recipient: Arc<Recipient>,
     /// Who reads, and pays.
     pub(super) account: Account,
@@ -48,14 +50,15 @@ impl ProbeTap {
     fn read(&self, session: &Session, copies: &mut Copies) -> Result<(Record, Taken, Option<Arc<Copied>>)> {
         let all = session.model().len();
         let points = self.points.as_ref().map_or(all, |points| points.len());
-        let bytes = (points * size_of::<Point>()) as u64;
+        let tools = if self.tools { session.tool_records() } else { Vec::new() };
+        let bytes = (points * size_of::<Point>() + tools.len() * size_of::<ToolRecord>()) as u64;
         let taken = self.account.take(Resource::Memory(Purpose::Records), bytes, "")?;
         if is_much(points, all) {
             let copied = copies.of(session, &self.account)?;
-            return Ok((session.record(Some(&[])), taken, Some(copied)));
+            return Ok((Record { tools, ..session.record(Some(&[])) }, taken, Some(copied)));
         }
         let record = memory::attempt("", || Ok(session.record(self.points.as_deref())))?;
-        Ok((record, taken, None))
+        Ok((Record { tools, ..record }, taken, None))
     }
 }
 
@@ -124,7 +127,9 @@ impl Taps {
         let mut told: Vec<(&ProbeTap, ProbeAnswer)> = Vec::new();
         for tap in self.probes.iter().filter(|tap| step.is_multiple_of(tap.every)) {
             let writer = tap.recipient.writer();
-            let same = |told: &&mut (&ProbeTap, _)| (&told.0.points, told.0.energy) == (&tap.points, tap.energy);
+            let same = |told: &&mut (&ProbeTap, _)| {
+                (&told.0.points, told.0.energy, told.0.tools) == (&tap.points, tap.energy, tap.tools)
+            };
             match told.iter_mut().find(same) {
                 Some((_, ProbeAnswer::Record(record))) => {
                     writer.push_quietly(record.clone(), wakes);

@@ -67,9 +67,9 @@ fn clock_s() -> f64 {
     now_ns() as f64 * 1e-9
 }
 
-/// Runs `work` and shows its progress; `work` reports the steps that it has done.
-fn with_progress<T>(steps: u64, work: impl FnOnce(&mut dyn FnMut(u64)) -> T) -> T {
-    let (begun_s, watched) = (clock_s(), std::io::stderr().is_terminal());
+/// Runs `work` and, unless `quiet`, shows its progress; `work` reports the steps that it has done.
+fn with_progress<T>(steps: u64, quiet: bool, work: impl FnOnce(&mut dyn FnMut(u64)) -> T) -> T {
+    let (begun_s, watched) = (clock_s(), !quiet && std::io::stderr().is_terminal());
     let done = work(&mut |step| {
         // Only on a terminal, and after a second.
         if watched && clock_s() - begun_s > 1.0 {

@@ -1,9 +1,10 @@
 //! `palpate run`: plays a script on a scene, offline.
 
-use std::io::{BufWriter, Write};
+use std::io::{BufWriter, IsTerminal, Write};
 use std::path::PathBuf;
 
 use palpate::scene::collection::find_script;
+use palpate::scene::record::Summary;
 use palpate::session::run;
 
 use super::scene::{SceneArguments, compile};
@@ -26,6 +27,12 @@ pub(crate) struct RunArguments {
     /// relative to its largest. With [stepping] correct = true, the run is corrected where an error exceeds the tolerance
     #[arg(long)]
     audit: bool,
+    /// Plot displacement and force of the first tool with a tip, or of the first point, in the terminal
+    #[arg(long)]
+    plot: bool,
+    /// Show no progress and no summary
+    #[arg(short, long)]
+    quiet: bool,
 }
 
 /// Plays a script on a scene and writes its records.
@@ -44,7 +51,7 @@ pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     };
     let mut output = BufWriter::new(output);
     let run = if arguments.audit { run::audited } else { run::run };
-    let ended = with_progress(script.steps, |progress| {
+    let ended = with_progress(script.steps, arguments.quiet, |progress| {
         run(&model, &script, arguments.held, &limits, &mut output, &clock_s, progress)
     });
     let ended = ended.and_then(|summary| output.flush().map(|()| summary).map_err(run::Failure::Output));
@@ -54,10 +61,33 @@ pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
         Err(run::Failure::Refused(refusal)) => Err(refusal.into()),
         Err(failure) => Err(Failure::Failed(failure.to_string())),
         Ok(summary) => {
+            tell(arguments, &summary);
             for warning in &summary.warnings {
                 say!("palpate: warning: {warning}");
             }
             summary.fault().map_or(Ok(()), |fault| Err(Failure::Failed(fault)))
         }
     }
+}
+
+/// Shows the plot and the summary where the records do not go. Without a file for the records, the summary is for a terminal
+/// only: a program that reads the records does not want it.
+fn tell(arguments: &RunArguments, summary: &Summary) {
+    let to_file = arguments.output.is_some();
+    let mut text = if arguments.plot { format!("{}\n", summary.curves) } else { String::new() };
+    if !arguments.quiet && (to_file || std::io::stderr().is_terminal()) {
+        let rows = [
+            ("steps", format!("{} in {:.2} s", summary.steps, summary.wall_s)),
+            ("largest displacement", format!("{:.6} m", summary.largest_displacement_m)),
+            ("peak reaction", format!("{:.6} N", summary.peak_reaction_n)),
+            ("final hash", summary.final_hash.clone()),
+        ];
+        text.extend(rows.map(|(name, value)| format!("{name:<28}{value}\n")));
+    }
+    // A closed output does not end the program.
+    let _ = if to_file {
+        std::io::stdout().write_all(text.as_bytes())
+    } else {
+        std::io::stderr().write_all(text.as_bytes())
+    };
 }

@@ -16,6 +16,8 @@ pub struct Collection {
     folder: PathBuf,
     built_in: &'static [(&'static str, &'static str)],
     kind: Kind,
+    /// Whether refusals may name files of the present folder.
+    names_files: bool,
 }
 
 impl Collection {
@@ -25,7 +27,14 @@ impl Collection {
             Kind::Scene => &BUILT_IN,
             Kind::Script => &script::BUILT_IN,
         };
-        Collection { folder: folder.to_owned(), built_in, kind }
+        Collection { folder: folder.to_owned(), built_in, kind, names_files: false }
+    }
+
+    /// The same for a user of the program in whose folder it runs, not for clients: an unknown name may be meant as a file
+    /// of that folder.
+    #[must_use]
+    fn for_user(self) -> Self {
+        Collection { names_files: true, ..self }
     }
 
     /// The folder.
@@ -79,7 +88,10 @@ impl Collection {
 
     fn unknown(&self, name: &str, others: &Collection) -> Refusal {
         let (kind, names) = (self.kind.name(), self.names());
-        let hint = if others.has(name) {
+        let file = format!("{name}.toml");
+        let hint = if self.names_files && is_name(name) && Path::new(&file).is_file() {
+            format!("; did you mean the file `{file}`?")
+        } else if others.has(name) {
             format!("; `{name}` is a {}: {ORDER}", self.kind.other().name())
         } else {
             did_you_mean(name, names.iter().map(String::as_str))
@@ -113,7 +125,7 @@ const SCRIPTS: &str = "scripts";
 /// Refuses what is no scene, and as [`Scene::parse`] does.
 pub fn find_scene(path: &Path, folder: &Path, assignments: &[String], limits: &Limits) -> Result<Scene> {
     let Some(name) = name_in(path) else { return Scene::load(path, assignments, limits) };
-    let scenes = Collection::new(Kind::Scene, folder);
+    let scenes = Collection::new(Kind::Scene, folder).for_user();
     let (file, text) = scenes.text(name, &Collection::new(Kind::Script, Path::new(SCRIPTS)), limits)?;
     Ok(Scene::parse(&file, &text, assignments, limits)?.found_in(folder))
 }
@@ -126,7 +138,7 @@ fn script_text(path: &Path, limits: &Limits) -> Result<(String, String, PathBuf)
         Ok((path.display().to_string(), read_text(path, limits.file_bytes)?, folder))
     };
     let Some(name) = name_in(path) else { return of_file(path) };
-    let scripts = Collection::new(Kind::Script, Path::new(SCRIPTS));
+    let scripts = Collection::new(Kind::Script, Path::new(SCRIPTS)).for_user();
     if let Some(file) = scripts.file(name) {
         return of_file(&file);
     }

@@ -7,6 +7,7 @@ pub mod collection;
 pub mod document;
 pub mod kind;
 mod mesh;
+pub mod plot;
 pub mod profile;
 pub mod reader;
 pub mod record;

@@ -462,6 +462,11 @@ impl Binding<'_> {
                         "{field}: is {off_m} m beside the tissue: a tip that touches goes on with the edge, and drags it along"
                     ));
                 }
+                let touches = tip.grasps || place_m.z <= 0.0;
+                if beside_m == DVec2::ZERO && touches && shape.is_fixed(shape.nearest(place_m)) {
+                    let message = "is at a fixed point: the tissue does not move there, and the tool feels nothing";
+                    self.warnings.push(format!("{field}: {message}"));
+                }
                 Ok((at_s, place_m))
             })?);
         }

@@ -4,6 +4,7 @@ use std::io::Write;
 
 use serde::Serialize;
 
+use super::plot::Curves;
 use super::{Integrator, Named, Precision};
 use crate::shape::{PointName, RestShape};
 
@@ -26,18 +27,37 @@ pub struct Run {
     pub version: String,
 }
 
-/// One line per sample time. Forces are those on the tissue point, N.
+/// One line per sample time. Forces on points are those on the tissue, N.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Record {
     /// Simulated time.
     pub time_s: f64,
     /// The points, in the order requested.
     pub points: Vec<Point>,
+    /// The tools with a tip, by ascending number.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub tools: Vec<ToolRecord>,
     /// Energies of the whole sheet.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub energy_j: Option<EnergyJ>,
     /// Points computed in the step.
     pub awake_points: usize,
+}
+
+impl Record {
+    /// Displacement, m, and force of the tissue, N, of the first tool with a tip; without such tools, of the first point.
+    pub fn first(&self) -> Option<([f64; 3], [f64; 3])> {
+        let tool = self.tools.first().map(|tool| (tool.displacement_m, tool.force_on_tool_n));
+        tool.or_else(|| self.points.first().map(|point| (point.displacement_m, point.reaction_n)))
+    }
+
+    /// The largest force of the tissue on a tool with a tip; without such tools, at a point. N.
+    pub fn peak_n(&self) -> f64 {
+        let length = |v: [f64; 3]| v.iter().map(|c| c * c).sum::<f64>().sqrt();
+        let tools = self.tools.iter().map(|tool| length(tool.force_on_tool_n));
+        let points = self.points.iter().filter(|_| self.tools.is_empty()).map(|point| length(point.reaction_n));
+        tools.chain(points).fold(0.0, f64::max)
+    }
 }
 
 /// One mass point.
@@ -58,6 +78,19 @@ pub struct Point {
     /// For a prescribed point, the force that holds it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub constraint_n: Option<[f64; 3]>,
+}
+
+/// A tool with a tip, which is led by poses.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct ToolRecord {
+    /// The tool's number: forces come first, then grasped points, then tools with a tip.
+    pub tool: u32,
+    /// Place of the tip in the frame of the sheet at rest, m.
+    pub place_m: [f64; 3],
+    /// Displacement of the tissue under the tip, the mean over its disc, m.
+    pub displacement_m: [f64; 3],
+    /// Force of the tissue on the tool, N: what a device gets. 0 while the tip does not touch.
+    pub force_on_tool_n: [f64; 3],
 }
 
 /// Energies, J.
@@ -101,6 +134,15 @@ pub struct Summary {
     /// What a user should know of the run, in words. Not written.
     #[serde(skip)]
     pub warnings: Vec<String>,
+    /// Length of the largest displacement, m. Not written.
+    #[serde(skip)]
+    pub largest_displacement_m: f64,
+    /// The largest force of the tissue that was told, N. Not written.
+    #[serde(skip)]
+    pub peak_reaction_n: f64,
+    /// What the first tool or point felt over time. Not written.
+    #[serde(skip)]
+    pub curves: Curves,
     /// The additional measurements of a replay.
     #[serde(flatten, skip_serializing_if = "Option::is_none")]
     pub network: Option<Network>,

@@ -97,6 +97,11 @@ fn charges(account: &Account, tools: usize) -> Result<Vec<Taken>, Refusal> {
     (0..tools).map(|_| account.take(Resource::Leases, 1, "tools")).collect()
 }
 
+/// The refusal of a call for a single tool, whose field is called `tool`.
+fn of_one_tool(refusal: Refusal) -> Refusal {
+    if refusal.field == "tools" { Refusal { field: "tool".to_owned(), ..refusal } } else { refusal }
+}
+
 fn lease_id(text: &str) -> Result<LeaseId, Refusal> {
     let wrong = |_| Refusal::new(Reason::NotHolder, "lease_id", "is none that this server gave");
     LeaseId::from_str_radix(text, 16).map_err(wrong)
@@ -228,7 +233,8 @@ impl Haptics {
                         live.count_refused(1);
                         self.0.traffic.refused(refusal.reason);
                         debug!(session = %live.id, reason = refusal.reason.as_str(), %refusal, "command refused");
-                        events.push(Event::Rejected(wire::sample::rejection(command.tool, command.sequence, &refusal)));
+                        let sequence = command.sequence.unwrap_or_default();
+                        events.push(Event::Rejected(wire::sample::rejection(command.tool, sequence, &refusal)));
                         if bucket.is_abused() {
                             info!(session = %live.id, "haptic stream ended: its commands come far too fast");
                             return events.close(refusal);
@@ -247,6 +253,8 @@ impl Haptics {
                     if held.tools > 0
                         && let Err(refusal) = live.at_intake(|intake, now| intake.renew(held.lease, now))
                     {
+                        // A lease is not named in a stream.
+                        let refusal = Refusal { field: String::new(), ..refusal };
                         events.push(Event::Rejected(wire::sample::rejection(0, 0, &refusal)));
                     }
                     events.push(Event::Renewed(renew.client_time_ns, now));
@@ -299,7 +307,7 @@ impl Early {
                 && let Some(Ok(Some(pb::TouchRequest { message: Some(Message::Command(old)) }))) = self.said.pop_front()
             {
                 self.refused += 1;
-                self.dropped.push_back((old.tool, old.sequence));
+                self.dropped.push_back((old.tool, old.sequence.unwrap_or_default()));
                 if self.dropped.len() > most {
                     self.dropped.pop_front();
                 }
@@ -444,12 +452,13 @@ impl HapticService for Haptics {
             lease_s = lease_s.min(self.0.config.limits.browser_lease_s);
         }
         let lease = random_bits()?;
-        let charges = charges(&account, 1)?;
+        let charges = charges(&account, 1).map_err(of_one_tool)?;
         live.at_intake(|intake, now| {
             intake.acquire(&[request.tool], &request.holder, lease_s, lease, now)?;
             intake.charge(lease, charges);
             Ok::<_, Refusal>(())
-        })?;
+        })
+        .map_err(of_one_tool)?;
         if let Some(peer) = peer.filter(|_| !may_vanish && !request.outlives_connection) {
             peer.leases.add(&live, lease, None);
         }
@@ -544,7 +553,7 @@ impl HapticService for Haptics {
         };
         let guard = live.open_stream("Probe", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
-        let records = live.probe(every, points, request.energy, &account)?;
+        let records = live.probe(every, points, request.energy, request.tools, &account)?;
         let out = stream::unfold(Some((records, guard, None)), |state| async move {
             let (mut records, guard, begun) = state?;
             let (record, dropped, part) = match begun {

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use super::command::Command;
 use super::intake::Intake;
-use super::lease::{LeaseId, not_holder};
+use super::lease::LeaseId;
 use super::rules::{Checked, check_tip, tip_radius_m};
 use crate::refusal::{Reason, Refusal, Result};
 
@@ -27,7 +27,7 @@ impl Intake {
     ///
     /// # Errors
     /// As for [`Intake::submit`]; and refuses commands of a lease of which a batch is being taken in.
-    pub fn accept(&mut self, id: LeaseId, Checked(commands): Checked, now_ns: u64) -> Result<Batch> {
+    pub fn accept(&mut self, id: LeaseId, Checked(mut commands): Checked, now_ns: u64) -> Result<Batch> {
         self.check_open()?;
         self.lapse(now_ns);
         if commands.is_empty() {
@@ -40,18 +40,22 @@ impl Intake {
         }
         // Of each tool the last sequence number, how many commands come, and the tip after them.
         let mut last: BTreeMap<u32, (u64, usize, Option<f64>)> = BTreeMap::new();
-        for command in &commands {
+        for command in &mut commands {
             let lease = self.leases.get(command.tool).filter(|lease| lease.id == id);
-            let lease = lease.ok_or_else(|| not_holder(format!("tool {} is not held by this client", command.tool)))?;
+            let lease = lease.ok_or_else(|| {
+                Refusal::new(Reason::NotHolder, "tool", format!("{} is not held by this client", command.tool))
+            })?;
             let coming = last.get(&command.tool).copied();
             let before = coming.map(|(sequence, ..)| sequence).or(lease.last_sequence);
-            if let Some(before) = before.filter(|before| command.sequence <= *before) {
-                let message = format!("must be above {before}, the last one, but is {}", command.sequence);
+            let sequence = command.sequence.unwrap_or_else(|| before.map_or(0, |before| before.saturating_add(1)));
+            if let Some(before) = before.filter(|before| sequence <= *before) {
+                let message = format!("must be above {before}, the last one, but is {sequence}");
                 return Err(Refusal::new(Reason::StaleSequence, "sequence", message));
             }
+            command.sequence = Some(sequence);
             let tip_radius_m = tip_radius_m(command);
             check_tip(coming.map_or(lease.tip_radius_m, |coming| coming.2), tip_radius_m)?;
-            last.insert(command.tool, (command.sequence, coming.map_or(0, |coming| coming.1) + 1, tip_radius_m));
+            last.insert(command.tool, (sequence, coming.map_or(0, |coming| coming.1) + 1, tip_radius_m));
         }
         // A limit per tool, so that no holder fills the queue for the others.
         for (tool, (_, coming, _)) in &last {

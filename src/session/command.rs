@@ -7,8 +7,8 @@ use crate::scene::script::Action;
 pub struct Command {
     /// The tool's number.
     pub tool: u32,
-    /// Must rise with each command to the tool.
-    pub sequence: u64,
+    /// Must rise with each command to the tool. `None`: one more than that of the command before; the intake fills it in.
+    pub sequence: Option<u64>,
     /// Time by the client's clock, returned with the sample that acknowledges the command.
     pub client_time_ns: u64,
     /// The step at whose beginning it takes effect; the next one if `None`.

@@ -146,7 +146,7 @@ impl Intake {
         self.counts.dropped += self.queue.discard(tool) as u64;
         let command = Command {
             tool,
-            sequence: 0,
+            sequence: None,
             client_time_ns: 0,
             at_step: None,
             time_to_live_s: None,
@@ -196,7 +196,7 @@ impl Intake {
         let key = (step, self.arrivals);
         self.arrivals += 1;
         if let Some(lease) = self.leases.get_mut(command.tool) {
-            lease.last_sequence = Some(command.sequence);
+            lease.last_sequence = command.sequence;
             lease.tip_radius_m = tip_radius_m(&command);
             let last = lease.last_key.replace(key);
             // The latest position wins: it supersedes an earlier one that has not taken effect. This does not apply to

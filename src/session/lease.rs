@@ -57,7 +57,7 @@ impl Leases {
         for (index, tool) in tools.iter().enumerate() {
             if *tool >= limits.tools {
                 let message = format!("must be below {}, but is {tool}", limits.tools);
-                return Err(Refusal::new(Reason::OutOfRange, "tool", message));
+                return Err(Refusal::new(Reason::OutOfRange, "tools", message));
             }
             if tools[..index].contains(tool) {
                 return Err(Refusal::new(Reason::OutOfRange, "tools", format!("names tool {tool} twice")));
@@ -65,7 +65,7 @@ impl Leases {
             if let Some(lease) = self.held.get(tool) {
                 let holder = if lease.holder.is_empty() { "somebody" } else { &lease.holder };
                 let message = format!("tool {tool} is held by `{holder}`");
-                return Err(Refusal::new(Reason::ToolHeld, "tool", message));
+                return Err(Refusal::new(Reason::ToolHeld, "tools", message));
             }
         }
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
@@ -173,10 +173,6 @@ impl Leases {
 
 /// The refusal of a lease that holds nothing.
 pub(super) fn not_held() -> Refusal {
-    not_holder("no tool is held by this lease: it lapsed or was given back".into())
-}
-
-/// The refusal of a caller who does not hold what a call needs.
-pub(super) fn not_holder(message: String) -> Refusal {
+    let message = "no tool is held by this lease: it lapsed or was given back";
     Refusal::new(Reason::NotHolder, "lease_id", message)
 }

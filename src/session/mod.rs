@@ -33,7 +33,7 @@ use glam::DVec3;
 
 use crate::memory;
 use crate::scene::profile::{LoadProfile, MotionProfile, Poke};
-use crate::scene::record::{EnergyJ, Point, Record, Recovery};
+use crate::scene::record::{EnergyJ, Point, Record, Recovery, ToolRecord};
 use crate::scene::script::Action;
 use crate::shape::{self, PointId, PointName};
 use crate::sheet::audit::{Inputs, Mark};
@@ -360,8 +360,8 @@ impl Session {
             return self.tissue.release(index);
         }
         // Commands with a step may take effect in another order than they were sent in.
-        if command.sequence > tool.acknowledged_sequence {
-            tool.acknowledged_sequence = command.sequence;
+        if let Some(sequence) = command.sequence.filter(|sequence| *sequence >= tool.acknowledged_sequence) {
+            tool.acknowledged_sequence = sequence;
             tool.client_time_ns = command.client_time_ns;
             tool.arrival_ns = command.arrival_ns;
         }
@@ -513,7 +513,22 @@ impl Session {
         energy_record(self.tissue.energy())
     }
 
-    /// A record of `points`, or of all points, without energies.
+    /// The records of the tools with a tip, by ascending number.
+    #[allow(clippy::cast_possible_truncation)]
+    pub fn tool_records(&self) -> Vec<ToolRecord> {
+        let of = |number: usize| {
+            let feel = self.tissue.feel(number)?;
+            Some(ToolRecord {
+                tool: number as u32,
+                place_m: array(feel.place_m),
+                displacement_m: array(feel.surface_m - feel.anchor_m),
+                force_on_tool_n: array(feel.force_on_tool_n),
+            })
+        };
+        (0..self.tools.len()).filter_map(of).collect()
+    }
+
+    /// A record of `points`, or of all points, without energies and tools.
     pub fn record(&self, points: Option<&[PointId]>) -> Record {
         let shape = self.model().shape();
         let of = |point: PointId| point_record(shape.name(point), &self.tissue.point(point));
@@ -523,6 +538,7 @@ impl Session {
                 Some(points) => memory::collected(points.iter().copied().map(of), RECORD),
                 None => memory::collected(shape::points(shape).map(of), RECORD),
             },
+            tools: Vec::new(),
             energy_j: None,
             awake_points: self.tissue.awake_points(),
         }
@@ -538,9 +554,12 @@ fn energy_record(energy: Energy) -> EnergyJ {
     EnergyJ { kinetic: energy.kinetic_j, spring: energy.spring_j, virtual_springs: energy.virtual_j }
 }
 
+/// A vector in a record: −0 is written as 0.
+fn array(v: DVec3) -> [f64; 3] {
+    (v + DVec3::ZERO).to_array()
+}
+
 fn point_record(name: PointName, state: &PointState) -> Point {
-    // Write −0 as 0.
-    let array = |v: DVec3| (v + DVec3::ZERO).to_array();
     Point {
         name,
         displacement_m: array(state.displacement_m),

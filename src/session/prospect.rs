@@ -5,12 +5,12 @@ use std::fmt;
 use std::sync::atomic::AtomicBool;
 
 use glam::DVec3;
-use palpate_touch::{Law, Tip};
+use palpate_touch::{Coupling, Law, Tip};
 
 use crate::force_law;
-use crate::scene::profile::{LoadProfile, StrengthProfile, weights};
+use crate::scene::profile::{LoadProfile, PoseProfile, StrengthProfile, weights};
 use crate::scene::script::Script;
-use crate::shape::RestShape;
+use crate::shape::{Extent, RestShape};
 use crate::sheet::Model;
 use crate::sheet::integrate::Oscillator;
 
@@ -24,7 +24,7 @@ const STIFFNESS_N_PER_M: [f64; 2] = [0.1, 1e5];
 /// Vibrations are at rest when they have decayed to this part.
 const AT_REST: f64 = 0.01;
 
-/// Forces of a script that are shown.
+/// Forces of a script that are shown, and tools with a tip.
 const MOST_SHOWN: usize = 8;
 
 /// What to expect of a tissue.
@@ -41,6 +41,7 @@ pub(super) struct Prospect {
     /// Time to rest, s, or why there is none.
     rest_s: Result<f64, &'static str>,
     forces: Vec<Force>,
+    tips: Vec<TipUse>,
     /// What can't be meant, in words.
     pub(super) warnings: Vec<String>,
 }
@@ -54,13 +55,63 @@ struct Force {
     depth_m: Option<f64>,
 }
 
+/// A tool with a tip.
+#[derive(Debug)]
+struct TipUse {
+    /// The tool's number.
+    tool: usize,
+    meeting: Meeting,
+}
+
+/// How a tip meets the tissue at rest.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Meeting {
+    /// Its first pose is later than the end of the script.
+    Unused,
+    /// No part of its way is over the tissue.
+    Beside,
+    /// It stays above the tissue.
+    Above { gap_m: f64 },
+    /// It touches, and presses the tissue in.
+    Pressed {
+        /// Of the deepest place, m.
+        depth_m: f64,
+        /// There, N; `None` if the law takes too much work.
+        force_n: Option<f64>,
+        /// A spring between tool and surface makes the depth and the force smaller.
+        is_bound: bool,
+    },
+    /// It grasps the tissue, and moves it.
+    Held { moved_m: f64 },
+}
+
+/// The force laws of a tissue under discs in the middle; each is computed once.
+struct Laws<'m> {
+    model: &'m Model,
+    known: Vec<(f64, Option<Law>)>,
+}
+
+impl Laws<'_> {
+    /// The first law under a disc, coarse where the exact one takes too much work.
+    fn of(&mut self, radius_m: f64) -> Option<&Law> {
+        let known = self.known.iter().position(|known| known.0 == radius_m);
+        let place = known.unwrap_or_else(|| {
+            let law = force_law::first(self.model, radius_m, &AtomicBool::new(false)).filter(Law::is_sound);
+            self.known.push((radius_m, law));
+            self.known.len() - 1
+        });
+        self.known[place].1.as_ref()
+    }
+}
+
 impl Prospect {
     /// Of a tissue, and of a script on it.
     pub(super) fn new(model: &Model, script: Option<&Script>) -> Self {
         let (shape, sheet) = (model.shape(), Oscillator::of(&model.scene));
         let size_m = shape.extent().size_m();
         let radius_m = Tip::default().radius_m;
-        let law = law(model, radius_m);
+        let mut laws = Laws { model, known: Vec::new() };
+        let law = laws.of(radius_m).cloned();
         let half_m = 0.5 * size_m.x.min(size_m.y);
         let reach_m = law.as_ref().map_or(f64::INFINITY, Law::reach_m);
         #[allow(clippy::cast_precision_loss)]
@@ -73,7 +124,8 @@ impl Prospect {
             deepest_m: half_m.min(reach_m),
             is_by_law: reach_m < half_m,
             rest_s: rest_s(&sheet),
-            forces: script.map_or(Vec::new(), |script| forces(model, script)),
+            forces: script.map_or(Vec::new(), |script| forces(model, script, &mut laws)),
+            tips: script.map_or(Vec::new(), |script| tips(shape, script, &mut laws)),
             warnings: Vec::new(),
         };
         prospect.warnings = prospect.doubts(shape, sheet.mass_kg);
@@ -129,13 +181,20 @@ impl Prospect {
                 ));
             }
         }
+        for TipUse { tool, meeting } in &self.tips {
+            match meeting {
+                Meeting::Pressed { depth_m, .. } if *depth_m > longest_m => doubts.push(format!(
+                    "tool {tool} goes {} deep, more than the tissue's longest side: it goes through",
+                    length(*depth_m)
+                )),
+                Meeting::Unused | Meeting::Beside | Meeting::Above { .. } => {
+                    doubts.push(format!("tool {tool} {meeting}"));
+                }
+                Meeting::Pressed { .. } | Meeting::Held { .. } => {}
+            }
+        }
         doubts
     }
-}
-
-/// The first law under a disc in the middle, coarse where the exact one takes too much work.
-fn law(model: &Model, radius_m: f64) -> Option<Law> {
-    force_law::first(model, radius_m, &AtomicBool::new(false)).filter(Law::is_sound)
 }
 
 /// When the slowest vibration has decayed to [`AT_REST`], s. That is the one of all points together straight out of the sheet:
@@ -157,21 +216,77 @@ fn rest_s(sheet: &Oscillator) -> Result<f64, &'static str> {
 
 /// How deep each force of a script goes: as a disc that presses with all of the force, its area that of the falloff, in the
 /// middle of the sheet; beyond the law's reach straight on.
-fn forces(model: &Model, script: &Script) -> Vec<Force> {
+fn forces(model: &Model, script: &Script, laws: &mut Laws<'_>) -> Vec<Force> {
     let shape = model.shape();
-    let mut laws: Vec<(f64, Option<Law>)> = Vec::new();
     let force = |profile: &LoadProfile| {
         let total_n = total_n(shape, profile);
         let widest_m = 0.5 * shape.longest_side_m();
         // ∫ exp(−c·r) over the plane is the area of a disc of this radius.
         let radius_m = (std::f64::consts::SQRT_2 / profile.falloff_per_m).clamp(0.5 * shape.edge_m(), widest_m);
-        if !laws.iter().any(|known| known.0 == radius_m) {
-            laws.push((radius_m, law(model, radius_m)));
-        }
-        let law = laws.iter().find(|known| known.0 == radius_m).and_then(|known| known.1.as_ref());
-        Force { total_n, depth_m: law.map(|law| law.depth_of(total_n)) }
+        Force { total_n, depth_m: laws.of(radius_m).map(|law| law.depth_of(total_n)) }
     };
     script.forces.iter().map(force).collect()
+}
+
+/// How each tool with a tip meets the tissue, as if the tissue were at rest: no other tool has moved it.
+#[allow(clippy::cast_precision_loss)]
+fn tips(shape: &dyn RestShape, script: &Script, laws: &mut Laws<'_>) -> Vec<TipUse> {
+    let first = script.tools() - script.poses.len();
+    let end_s = script.steps as f64 / script.rate_hz;
+    let of = |(tool, profile): (usize, &PoseProfile)| TipUse { tool, meeting: meeting(shape, profile, end_s, laws) };
+    (first..).zip(&script.poses).map(of).collect()
+}
+
+/// How a tool meets the tissue at rest until `end_s`. The force is by the law under a disc of its radius in the middle.
+fn meeting(shape: &dyn RestShape, profile: &PoseProfile, end_s: f64, laws: &mut Laws<'_>) -> Meeting {
+    let end_s = end_s.min(profile.until_s);
+    let endless = PoseProfile { until_s: f64::INFINITY, ..profile.clone() };
+    let reached = profile.poses.iter().take_while(|pose| pose.0 <= end_s).map(|pose| pose.1);
+    let way: Vec<DVec3> = reached.chain(endless.at(end_s)).collect();
+    // A disc meets the tissue while its edge is over it.
+    let Extent { least_m, most_m } = shape.extent();
+    let (tip, radius_m) = (profile.tip, DVec3::splat(profile.tip.radius_m));
+    let over = |pair: &[DVec3]| part_within(pair[0], pair[1], least_m - radius_m, most_m + radius_m);
+    let Some(begin) = way.windows(2).position(|pair| over(pair).is_some()) else {
+        return if way.is_empty() { Meeting::Unused } else { Meeting::Beside };
+    };
+    let mut parts = way[begin..].windows(2).filter_map(over).flatten();
+    if tip.grasps {
+        let held_m = parts.next().unwrap_or(way[begin]);
+        let moved_m = way[begin + 1..].iter().map(|place_m| place_m.distance(held_m)).fold(0.0, f64::max);
+        return Meeting::Held { moved_m };
+    }
+    let lowest_m = parts.map(|place_m| place_m.z).fold(f64::INFINITY, f64::min);
+    // The surface at rest is at the upper side of the extent.
+    let depth_m = most_m.z - lowest_m;
+    if depth_m <= 0.0 {
+        return Meeting::Above { gap_m: -depth_m };
+    }
+    let by_law_n = laws.of(tip.radius_m).map(|law| law.at_depth(depth_m).force_n);
+    match tip.coupling {
+        Coupling::Constraint => Meeting::Pressed { depth_m, force_n: by_law_n, is_bound: false },
+        Coupling::Spring { stiffness_n_per_m, .. } => {
+            let force_n = by_law_n.map(|force_n| force_n.min(stiffness_n_per_m * depth_m));
+            Meeting::Pressed { depth_m, force_n, is_bound: true }
+        }
+    }
+}
+
+/// The ends of the part of a straight way whose x and y are within a box; `None` if no part is.
+fn part_within(from_m: DVec3, to_m: DVec3, least_m: DVec3, most_m: DVec3) -> Option<[DVec3; 2]> {
+    let (mut begin, mut end) = (0.0_f64, 1.0_f64);
+    for c in 0..2 {
+        let way_m = to_m[c] - from_m[c];
+        if way_m == 0.0 {
+            if !(least_m[c]..=most_m[c]).contains(&from_m[c]) {
+                return None;
+            }
+            continue;
+        }
+        let [a, b] = [least_m[c], most_m[c]].map(|edge_m| (edge_m - from_m[c]) / way_m);
+        (begin, end) = (begin.max(a.min(b)), end.min(a.max(b)));
+    }
+    (begin <= end).then(|| [from_m.lerp(to_m, begin), from_m.lerp(to_m, end)])
 }
 
 /// The largest force of a profile on all points together, N.
@@ -201,6 +316,27 @@ fn rounded(value: f64) -> String {
 /// In mm if it is less than 0.1 m.
 fn length(length_m: f64) -> String {
     if length_m < 0.1 { format!("{} mm", rounded(1e3 * length_m)) } else { format!("{} m", rounded(length_m)) }
+}
+
+impl fmt::Display for Meeting {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match *self {
+            Meeting::Unused => write!(f, "is not used: its first pose is later than the end of the script"),
+            Meeting::Beside => write!(f, "never meets the tissue: it is beside it all the time"),
+            Meeting::Above { gap_m } => {
+                write!(f, "never meets the tissue: its lowest place is {} above it", length(gap_m))
+            }
+            Meeting::Pressed { depth_m, force_n, is_bound } => {
+                let (most, about) = if is_bound { ("at most ", "at most") } else { ("", "about") };
+                write!(f, "presses the tissue in by {most}{}, with ", length(depth_m))?;
+                match force_n {
+                    Some(force_n) => write!(f, "{about} {} N", rounded(force_n)),
+                    None => write!(f, "an unknown force: its force law takes too much work"),
+                }
+            }
+            Meeting::Held { moved_m } => write!(f, "grasps the tissue, and moves it by {}", length(moved_m)),
+        }
+    }
 }
 
 impl fmt::Display for Prospect {
@@ -245,6 +381,13 @@ impl fmt::Display for Prospect {
         }
         if self.forces.len() > MOST_SHOWN {
             writeln!(f, "              … and {} more forces", self.forces.len() - MOST_SHOWN)?;
+        }
+        for TipUse { tool, meeting } in self.tips.iter().take(MOST_SHOWN) {
+            let name = format!("tool {tool}");
+            writeln!(f, "{name:<13} {meeting}")?;
+        }
+        if self.tips.len() > MOST_SHOWN {
+            writeln!(f, "              … and {} more tools", self.tips.len() - MOST_SHOWN)?;
         }
         Ok(())
     }
@@ -314,6 +457,69 @@ mod tests {
             let found = prospect(&[set, "stepping.substeps=8"], "").warnings;
             assert!(found.iter().any(|warning| warning.contains(named)), "{set}: {found:?}");
         }
+    }
+
+    /// A second of tools with a tip on the soft sheet.
+    fn tools(model: &Model, tools: &[&str]) -> Script {
+        let tools: String = tools.iter().map(|tool| format!("[[tool]]\n{tool}\n")).collect();
+        let text = format!("duration_s = 1.0\nsample_every_s = 0.1\n{tools}");
+        Script::parse("test", &text, Path::new(""), &model.scene, &Limits::default()).unwrap()
+    }
+
+    /// From 2 mm above the middle to 4 mm below.
+    const PRESS: &str =
+        "poses = [{ at_s = 0.0, place_m = [0.01, 0.02, 0.002] }, { at_s = 0.5, place_m = [0.01, 0.02, -0.004] }]\n";
+
+    #[test]
+    fn a_tip_presses_as_deep_as_its_lowest_place_over_the_tissue() {
+        let model = Model::paper(&SOFT);
+        let spring = PRESS.to_owned() + "tip = { spring = { stiffness_n_per_m = 5.0, damping_n_s_per_m = 0.0 } }";
+        let half_way = PRESS.to_owned() + "until_s = 0.25";
+        // The sheet is 20 mm wide: this one leaves it at half of its depth.
+        let across = "tip = { radius_m = 0.005 }\nposes = [{ at_s = 0.0, place_m = [-0.005, 0.02, 0.0] }, \
+                      { at_s = 0.5, place_m = [0.055, 0.02, -0.01] }]";
+        let grasp = "tip = { grasps = true }\nposes = [{ at_s = 0.0, place_m = [0.01, 0.02, 0.003] }, \
+                     { at_s = 0.5, place_m = [0.01, 0.02, 0.007] }]";
+        let script = tools(&model, &[PRESS, &spring, &half_way, across, grasp]);
+        let mut laws = Laws { model: &model, known: Vec::new() };
+        let [press, spring, half_way, across, grasp] = tips(model.shape(), &script, &mut laws).try_into().unwrap();
+        assert_eq!([press.tool, spring.tool, half_way.tool, across.tool, grasp.tool], [0, 1, 2, 3, 4]);
+        let pressed = |tip: &TipUse| match tip.meeting {
+            Meeting::Pressed { depth_m, force_n, .. } => [depth_m, force_n.unwrap()],
+            other => panic!("{other:?}"),
+        };
+        // By 50 to 80 N/m, and more where it goes deeper.
+        let [depth_m, force_n] = pressed(&press);
+        assert!((depth_m - 0.004).abs() < 1e-12 && (0.2..0.5).contains(&force_n), "{press:?}");
+        assert!(press.meeting.to_string().starts_with("presses the tissue in by 4 mm, with about 0."), "{press:?}");
+        // A soft spring bears at most 5 N/m of 4 mm.
+        assert_eq!(spring.meeting.to_string(), "presses the tissue in by at most 4 mm, with at most 0.02 N");
+        // It is taken away in the middle of its way.
+        assert!((pressed(&half_way)[0] - 0.001).abs() < 1e-12, "{half_way:?}");
+        assert!((pressed(&across)[0] - 0.005).abs() < 1e-12, "{across:?}");
+        // A grasp takes hold wherever it is over the tissue.
+        assert_eq!(grasp.meeting.to_string(), "grasps the tissue, and moves it by 4 mm");
+    }
+
+    #[test]
+    fn a_tip_that_never_meets_the_tissue_or_goes_through_is_warned_of() {
+        let poses =
+            |at_s: f64, x_m: f64, z_m: f64| format!("poses = [{{ at_s = {at_s:?}, place_m = [{x_m}, 0.02, {z_m}] }}]");
+        let wrong =
+            [poses(0.0, 0.01, 0.003), poses(0.0, 0.03, -0.003), poses(1.5, 0.01, -0.003), poses(0.0, 0.01, -0.06)];
+        let model = Model::paper(&SOFT);
+        let script = tools(&model, &[&wrong[0], &wrong[1], &wrong[2], &wrong[3], PRESS]);
+        let found = Prospect::new(&model, Some(&script));
+        let expected = [
+            "tool 0 never meets the tissue: its lowest place is 3 mm above it",
+            "tool 1 never meets the tissue: it is beside it all the time",
+            "tool 2 is not used: its first pose is later than the end of the script",
+            "tool 3 goes 60 mm deep, more than the tissue's longest side: it goes through",
+        ];
+        assert_eq!(found.warnings, expected);
+        let text = found.to_string();
+        assert!(text.contains("\ntool 0        never meets the tissue: "), "{text}");
+        assert!(text.contains("\ntool 4        presses the tissue in by 4 mm, with about "), "{text}");
     }
 
     #[test]

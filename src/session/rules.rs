@@ -40,15 +40,16 @@ impl Rules {
             Action::Push(poke) => check_poke(poke, self.scene.shape(), &self.limits),
             Action::Grasp { point, displacement_m } => {
                 check_free("position.point", self.scene.shape(), *point)?;
-                crate::refusal::finite_vector("position.displacement_m", *displacement_m)?;
+                // A client gives a displacement or a position.
+                crate::refusal::finite_vector("position", *displacement_m)?;
                 let far_m = displacement_m.length();
-                check_reach("position.displacement_m", self.scene.shape(), far_m, &self.limits)
+                check_reach("position", self.scene.shape(), far_m, &self.limits)
             }
             Action::Pose { place_m, tip } => {
-                crate::refusal::finite_vector("place_m", *place_m)?;
+                crate::refusal::finite_vector("pose.position_m", *place_m)?;
                 let centre_m = self.scene.shape().extent().middle_m();
-                check_reach("place_m", self.scene.shape(), (*place_m - centre_m).length(), &self.limits)?;
-                check::check_tip("tip", self.scene.shape(), tip)
+                check_reach("pose.position_m", self.scene.shape(), (*place_m - centre_m).length(), &self.limits)?;
+                check::check_tip("pose.tip", self.scene.shape(), tip)
             }
             Action::Release => Ok(()),
         }

@@ -11,6 +11,7 @@ use super::intake::Intake;
 use crate::limits::Limits;
 use crate::refusal::{Refusal, Result};
 use crate::scene::Named;
+use crate::scene::plot::Curves;
 use crate::scene::record::{Correction, Line, Record, Run, Summary, far_warning, write_line};
 use crate::scene::script::{Action, Script};
 use crate::sheet::audit::Finding;
@@ -49,7 +50,7 @@ pub fn command(tool: usize, step: u64, action: Action) -> Command {
         #[allow(clippy::cast_possible_truncation)]
         tool: tool as u32,
         // At most one command per step, so steps serve as sequence numbers.
-        sequence: step + 1,
+        sequence: Some(step + 1),
         client_time_ns: 0,
         at_step: Some(step),
         time_to_live_s: None,
@@ -183,7 +184,7 @@ impl Playing<'_> {
         let mut written: std::io::Result<()> = Ok(());
         let mut windows = (self.twin.is_some() && model.scene.stepping.correct).then(Windows::default);
         let (mut stepping_s, mut resumed_s) = (0.0, clock_s());
-        let mut largest_m = 0.0_f64;
+        let (mut largest_displacement_m, mut peak_reaction_n, mut curves) = (0.0_f64, 0.0_f64, Curves::default());
         for step in 0..script.steps {
             player.commands(step, &mut due)?;
             // The summary's clock stops during everything other than the session's own stepping.
@@ -209,10 +210,15 @@ impl Playing<'_> {
                 if session.step_count().is_multiple_of(script.sample_every) {
                     stepping_s += clock_s() - resumed_s;
                     if written.is_ok() {
-                        let record = session.record(Some(&script.sample_points));
-                        largest_m = largest_m.max(session.tissue().largest_displacement_m());
+                        let (energy_j, tools) = (Some(session.energy()), session.tool_records());
+                        let record = Record { energy_j, tools, ..session.record(Some(&script.sample_points)) };
+                        largest_displacement_m = largest_displacement_m.max(session.tissue().largest_displacement_m());
+                        peak_reaction_n = peak_reaction_n.max(record.peak_n());
+                        if let Some((displacement_m, force_n)) = record.first() {
+                            curves.add(record.time_s, displacement_m[2], force_n[2]);
+                        }
                         self.twin.iter_mut().for_each(|twin| twin.compare(&record));
-                        written = write_line(output, &Record { energy_j: Some(session.energy()), ..record });
+                        written = write_line(output, &record);
                     }
                     resumed_s = clock_s();
                 }
@@ -230,9 +236,17 @@ impl Playing<'_> {
         stepping_s += clock_s() - resumed_s;
         let audited_error = self.twin.as_ref().map(Twin::error);
         let (corrections, recoveries) = (self.corrections, session.recoveries().list());
-        let warnings = far_warning(largest_m, model.shape()).into_iter().collect();
-        let summary =
-            Summary { audited_error, corrections, recoveries, warnings, ..summary(session.tissue(), stepping_s) };
+        let warnings = far_warning(largest_displacement_m, model.shape()).into_iter().collect();
+        let summary = Summary {
+            audited_error,
+            corrections,
+            recoveries,
+            warnings,
+            largest_displacement_m,
+            peak_reaction_n,
+            curves,
+            ..summary(session.tissue(), stepping_s)
+        };
         write_line(output, &Line::Summary(&summary))?;
         Ok(summary)
     }
@@ -287,6 +301,9 @@ pub fn summary(tissue: &dyn Tissue, wall_s: f64) -> Summary {
         corrections: Vec::new(),
         recoveries: Vec::new(),
         warnings: Vec::new(),
+        largest_displacement_m: 0.0,
+        peak_reaction_n: 0.0,
+        curves: Curves::default(),
         network: None,
     }
 }

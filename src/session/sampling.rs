@@ -266,7 +266,8 @@ mod tests {
 
     fn tell(session: &mut Session, sequence: u64, action: Action) {
         let (at_step, time_to_live_s) = (None, None);
-        let command = Command { tool: 0, sequence, client_time_ns: 0, at_step, time_to_live_s, action, arrival_ns: 1 };
+        let (sequence, client_time_ns, arrival_ns) = (Some(sequence), 0, 1);
+        let command = Command { tool: 0, sequence, client_time_ns, at_step, time_to_live_s, action, arrival_ns };
         session.advance(&mut vec![Due { command, late: false, late_commands: 0, ends_lease: false }], |_| {});
     }
 

@@ -4,6 +4,7 @@ use glam::{DQuat, DVec3};
 use palpate_proto::geometry::{from_place, from_vector, vector};
 use palpate_proto::pb;
 use palpate_proto::touch::{from_tip, pose};
+use palpate_touch::Tip;
 
 use super::{from_point, point, required};
 use crate::refusal::{Result, number};
@@ -28,7 +29,8 @@ pub fn from_command(message: &pb::Command, shape: &dyn RestShape, arrival_ns: u6
                 pb::force::Centre::CentreM(place) => (None, from_place(place).extend(0.0)),
             };
             let force_n = from_vector(force.force_n.as_ref());
-            let pb::Force { falloff_per_m, falloff_offset, .. } = *force;
+            let falloff_per_m = force.falloff_per_m.unwrap_or_else(|| Tip::default().radius_m.recip());
+            let falloff_offset = force.falloff_offset.unwrap_or(0.0);
             Action::Push(Poke { point, centre_m, force_n, falloff_per_m, falloff_offset })
         }
         Message::Position(position) => {
@@ -75,8 +77,8 @@ pub fn scripted(shape: &dyn RestShape, tool: usize, at_step: u64, action: &Actio
                 None => pb::force::Centre::CentreM(pb::Vector2 { x: poke.centre_m.x, y: poke.centre_m.y }),
             }),
             force_n: vector(poke.force_n),
-            falloff_per_m: poke.falloff_per_m,
-            falloff_offset: poke.falloff_offset,
+            falloff_per_m: Some(poke.falloff_per_m),
+            falloff_offset: Some(poke.falloff_offset),
         }),
         Action::Grasp { point: at, displacement_m: DVec3 { x, y, z } } => Message::Position(pb::Position {
             point: Some(point(shape.name(*at))),
@@ -85,6 +87,6 @@ pub fn scripted(shape: &dyn RestShape, tool: usize, at_step: u64, action: &Actio
         Action::Pose { place_m, tip } => Message::Pose(pose(*place_m, tip)),
         Action::Release => Message::Release(pb::Release {}),
     };
-    let (tool, sequence, action) = (tool as u32, at_step + 1, Some(action));
+    let (tool, sequence, action) = (tool as u32, Some(at_step + 1), Some(action));
     pb::Command { tool, sequence, client_time_ns, at_step: Some(at_step), time_to_live_s: None, action }
 }

@@ -4,7 +4,7 @@ use super::{every, from_point, point};
 use crate::pace::frames::Delivery;
 use crate::pace::{PacedSample, Recorded};
 use crate::refusal::{Reason, Refusal, Result};
-use crate::scene::record::{EnergyJ, Point, Record, Recovery};
+use crate::scene::record::{EnergyJ, Point, Record, Recovery, ToolRecord};
 use crate::session::ToolSample;
 use crate::session::sampling::{Deadband, HEARTBEAT_S, Sampling};
 use crate::shape::RestShape;
@@ -25,8 +25,8 @@ pub fn sampling(
     renders: bool,
 ) -> Result<Sampling> {
     if !renders && deadband.is_some_and(|deadband| deadband.rendered_fraction.is_some()) {
-        let message = "is missing, but deadband.rendered_fraction requires it";
-        return Err(Refusal::new(Reason::Missing, "device", message));
+        let message = "requires a device, but the request declares none";
+        return Err(Refusal::new(Reason::Missing, "deadband.rendered_fraction", message));
     }
     let sampling = Sampling {
         every: every("sample_every_steps", every_steps)?,
@@ -86,6 +86,7 @@ fn tool_sample(tool: &ToolSample, shape: &dyn RestShape, due_ns: u64, now_ns: u6
         paused_until_step: tool.paused_until,
         local_model: tool.local.as_ref().map(touch::local_model),
         stale: tool.stale,
+        on_fixed_point: contact.is_some_and(|contact| shape.is_fixed(contact.point)),
     }
 }
 
@@ -126,6 +127,7 @@ pub fn record(paced: &Recorded, dropped: u64, part: usize) -> Option<pb::ProbeRe
             spring_j: energy.spring,
             virtual_j: energy.virtual_springs,
         });
+        message.tools = record.tools.iter().map(tool_record).collect();
     }
     (part < parts).then_some(message)
 }
@@ -142,6 +144,15 @@ fn point_record(record: &Point) -> pb::PointRecord {
         applied_n: vector(record.applied_n),
         reaction_n: vector(record.reaction_n),
         constraint_n: record.constraint_n.and_then(vector),
+    }
+}
+
+fn tool_record(record: &ToolRecord) -> pb::ToolRecord {
+    pb::ToolRecord {
+        tool: record.tool,
+        place_m: vector(record.place_m.into()),
+        displacement_m: vector(record.displacement_m.into()),
+        force_on_tool_n: vector(record.force_on_tool_n.into()),
     }
 }
 
@@ -167,6 +178,16 @@ pub fn add_to_record(record: &mut Record, message: &pb::ProbeResponse) -> bool {
             spring: energy.spring_j,
             virtual_springs: energy.virtual_j,
         });
+        record.tools = message
+            .tools
+            .iter()
+            .map(|tool| ToolRecord {
+                tool: tool.tool,
+                place_m: array(&tool.place_m),
+                displacement_m: array(&tool.displacement_m),
+                force_on_tool_n: array(&tool.force_on_tool_n),
+            })
+            .collect();
     }
     message.last
 }

@@ -159,9 +159,10 @@ pub fn push(tool: u32, sequence: u64, [x, y]: [u32; 2], z_n: f64) -> pb::Command
     let force = pb::Force {
         centre: Some(pb::force::Centre::Point(pb::GridPoint { x, y })),
         force_n: Some(pb::Vector3 { x: 0.0, y: 0.0, z: z_n }),
-        falloff_per_m: 150.0,
-        falloff_offset: 0.0,
+        falloff_per_m: Some(150.0),
+        falloff_offset: None,
     };
+    let sequence = Some(sequence);
     pb::Command { tool, sequence, action: Some(pb::command::Action::Force(force)), ..Default::default() }
 }
 
@@ -169,7 +170,7 @@ pub fn push(tool: u32, sequence: u64, [x, y]: [u32; 2], z_n: f64) -> pb::Command
 pub fn push_all(tool: u32, sequence: u64, z_n: f64) -> pb::Command {
     let mut command = push(tool, sequence, [0, 0], z_n);
     if let Some(pb::command::Action::Force(force)) = &mut command.action {
-        force.falloff_per_m = 0.0;
+        force.falloff_per_m = Some(0.0);
     }
     command
 }

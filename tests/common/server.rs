@@ -307,9 +307,10 @@ pub fn force(tool: u32, sequence: u64, z_n: f64) -> pb::Command {
     let force = pb::Force {
         centre: Some(pb::force::Centre::Point(pb::GridPoint { x: 15, y: 15 })),
         force_n: Some(pb::Vector3 { x: 0.0, y: 0.0, z: z_n }),
-        falloff_per_m: 150.0,
-        falloff_offset: 0.0,
+        falloff_per_m: Some(150.0),
+        falloff_offset: None,
     };
+    let sequence = Some(sequence);
     pb::Command { tool, sequence, action: Some(pb::command::Action::Force(force)), ..Default::default() }
 }
 
@@ -318,6 +319,7 @@ pub fn position(tool: u32, sequence: u64, z_m: f64) -> pb::Command {
         point: Some(pb::GridPoint { x: 15, y: 15 }),
         target: Some(pb::position::Target::DisplacementM(pb::Vector3 { x: 0.0, y: 0.0, z: z_m })),
     };
+    let sequence = Some(sequence);
     pb::Command { tool, sequence, action: Some(pb::command::Action::Position(position)), ..Default::default() }
 }
 

@@ -107,7 +107,7 @@ impl Lead {
         let pose = pb::Pose { position_m: Some(pb::Vector3 { x: 0.5, y: 0.5, z: z_m }), ..Default::default() };
         let command = pb::Command {
             tool: 0,
-            sequence: self.sequence,
+            sequence: Some(self.sequence),
             client_time_ns: u64::try_from((Duration::from_secs(1) + self.begun.elapsed()).as_nanos()).unwrap(),
             action: Some(pb::command::Action::Pose(pose)),
             ..Default::default()

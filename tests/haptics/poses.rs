@@ -14,7 +14,7 @@ fn device() -> pb::Device {
 fn pose(sequence: u64, time_ms: u64, z_m: f64) -> pb::Command {
     pb::Command {
         tool: 0,
-        sequence,
+        sequence: Some(sequence),
         client_time_ns: time_ms * 1_000_000,
         action: Some(pb::command::Action::Pose(pb::Pose {
             position_m: Some(pb::Vector3 { x: 0.0375, y: 0.0375, z: z_m }),
@@ -90,9 +90,9 @@ async fn what_makes_no_sense_is_refused() {
     };
     let tip = pb::Tip { radius_m: -1.0, ..Default::default() };
     for (request, reason, field) in [
-        (broken(|device| device.max_force_n = f64::NAN), "NOT_FINITE", "device.force_n"),
-        (broken(|device| device.workspace_radius_m = 0.0), "OUT_OF_RANGE", "device.workspace_m"),
-        (pb::TouchOpen { deadband: Some(foretold()), ..open(&session, &[0]) }, "MISSING", "device"),
+        (broken(|device| device.max_force_n = f64::NAN), "NOT_FINITE", "device.max_force_n"),
+        (broken(|device| device.workspace_radius_m = 0.0), "OUT_OF_RANGE", "device.workspace_radius_m"),
+        (pb::TouchOpen { deadband: Some(foretold()), ..open(&session, &[0]) }, "MISSING", "deadband.rendered_fraction"),
         (pb::TouchOpen { tip: Some(tip), ..open(&session, &[0]) }, "OUT_OF_RANGE", "tip.radius_m"),
         (pb::TouchOpen { touch_stiffness: true, ..open(&session, &[0]) }, "MISSING", "device"),
     ] {
@@ -105,9 +105,25 @@ async fn what_makes_no_sense_is_refused() {
         Touch::open(&server, pb::TouchOpen { device: Some(device()), ..open(&session, &[0]) }).await.unwrap();
     for (sequence, z_m, reason) in [(1, f64::NAN, "NOT_FINITE"), (2, 0.08, "OUT_OF_RANGE"), (3, 1e9, "OUT_OF_RANGE")] {
         touch.command(pose(sequence, sequence, z_m)).await;
-        assert_eq!(touch.rejection().await.reason, reason, "z = {z_m}");
+        let rejection = touch.rejection().await;
+        assert_eq!((rejection.reason.as_str(), rejection.field.as_str()), (reason, "pose.position_m"), "z = {z_m}");
     }
     assert_eq!(DEVICES.len(), 9);
+}
+
+#[tokio::test]
+async fn a_tool_at_the_fixed_rim_says_so() {
+    let server = Server::start(&[]);
+    let session = liver(&server).await;
+    let mut touch = Touch::open(&server, open(&session, &[0, 1])).await.unwrap();
+    for (tool, x) in [(0, 0.0375), (1, 0.0)] {
+        let position_m = Some(pb::Vector3 { x, y: 0.0375, z: -0.001 });
+        let action = Some(pb::command::Action::Pose(pb::Pose { position_m, ..Default::default() }));
+        touch.command(pb::Command { tool, action, ..Default::default() }).await;
+        let sample = touch.sample_with(|sample| sample.tools[tool as usize].point.is_some()).await;
+        let told = &sample.tools[tool as usize];
+        assert_eq!((told.point.unwrap().x, told.on_fixed_point), ([15, 0][tool as usize], tool == 1));
+    }
 }
 
 /// A deadband on the force that a client renders.

@@ -26,7 +26,6 @@ mod credentials;
 mod health;
 mod link;
 mod load;
-mod plot;
 mod replay;
 mod scene_file;
 mod simulated;

@@ -27,9 +27,9 @@ use tokio::task::JoinHandle;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::Status;
 
+use crate::Failure;
 use crate::credentials::CredentialOptions;
-use crate::scene_file::source;
-use crate::{Failure, plot};
+use crate::scene_file::{source, with_hint};
 use measured::{Measured, percentiles_us};
 
 /// How far ahead of the server's step commands are sent, s: a network may stall for about as long before the session has to
@@ -151,7 +151,7 @@ pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
         pb::CreateSessionRequest { source: Some(source), paused: true, idle_timeout_s: Some(SILENCE.as_secs_f64()) };
     let silent = |_| Failure::Failed(format!("the server created no session within {} s", PATIENCE.as_secs()));
     let created = tokio::time::timeout(PATIENCE, client.create_session(request)).await.map_err(silent)?;
-    let created = created.map_err(refused_or_failed)?.into_inner().session;
+    let created = created.map_err(|status| with_hint(&scene, refused_or_failed(status)))?.into_inner().session;
     let created = created.ok_or_else(|| Failure::Failed("the server's answer has no session".into()))?;
     let mut session = Session { client, id: created.session_id.clone() };
     let sessions = session.client.clone();
@@ -305,6 +305,7 @@ async fn play(
         })),
         every_steps: Some(script.sample_every.try_into().unwrap_or(u32::MAX)),
         energy: true,
+        tools: !script.poses.is_empty(),
     };
     let probe = if script.sample_points.iter().copied().eq(shape::points(scene.shape())) {
         pb::ProbeRequest { r#where: Some(pb::probe_request::Where::AllPoints(true)), ..probe }
@@ -433,6 +434,9 @@ async fn play(
         corrections: Vec::new(),
         recoveries,
         warnings: far_warning(measured.largest_displacement_m, scene.shape()).into_iter().collect(),
+        largest_displacement_m: measured.largest_displacement_m,
+        peak_reaction_n: measured.peak_reaction_n,
+        curves: std::mem::take(&mut measured.curves),
         steps: script.steps,
         substeps,
         points,
@@ -447,10 +451,11 @@ async fn play(
     output.flush().map_err(written)?;
     if arguments.plot {
         // The plot must not go where the records go.
-        let show =
-            |text: String| if arguments.output.is_some() { crate::tell!("{text}") } else { crate::say!("{text}") };
-        show(plot::draw("Displacement of the control point along z, m", &measured.displacement));
-        show(plot::draw("Force of the tissue on the tool along z, N", &measured.reaction));
+        if arguments.output.is_some() {
+            crate::tell!("{}", summary.curves);
+        } else {
+            crate::say!("{}", summary.curves);
+        }
     }
     table(arguments, &summary, &network, &measured);
     summary.warnings.iter().for_each(|warning| crate::warn(warning));
@@ -488,8 +493,8 @@ fn table(arguments: &Arguments, summary: &Summary, network: &Network, measured: 
         ("overruns", format!("{} (time dilation {:.5})", network.overruns, network.time_dilation)),
         ("samples", format!("{} for {} steps", measured.samples, summary.steps)),
         ("late commands", network.late_commands.to_string()),
-        ("largest displacement", format!("{:.6} m", measured.largest_displacement_m)),
-        ("peak reaction", format!("{:.6} N", measured.peak_reaction_n)),
+        ("largest displacement", format!("{:.6} m", summary.largest_displacement_m)),
+        ("peak reaction", format!("{:.6} N", summary.peak_reaction_n)),
         ("round trip p50 / p99 / max", percentiles(&network.round_trip_us)),
         ("final hash", summary.final_hash.clone()),
     ];

@@ -6,6 +6,7 @@ use palpate::limits::Limits;
 use palpate::scene::Scene;
 use palpate::wire;
 use palpate_proto::pb::create_session_request::Source;
+use palpate_proto::refusal::Reason;
 
 use crate::Failure;
 
@@ -19,4 +20,15 @@ pub(crate) fn source(scene: &str) -> Result<Source, Failure> {
     }
     let scene = Scene::load(Path::new(scene), &[], &Limits::default())?;
     Ok(Source::Scene(wire::scene::scene(&scene)))
+}
+
+/// The failure of a session with this scene. If the server does not know the name, it may be meant as a file.
+pub(crate) fn with_hint(scene: &str, failure: Failure) -> Failure {
+    let file = format!("{scene}.toml");
+    match failure {
+        Failure::Refused(why) if why.contains(Reason::UnknownScene.as_str()) && Path::new(&file).is_file() => {
+            Failure::Refused(format!("{why}; did you mean the file `{file}`?"))
+        }
+        failure => failure,
+    }
 }

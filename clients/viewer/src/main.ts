@@ -256,6 +256,15 @@ async function play(): Promise<void> {
   }
 }
 
+/** The visit in which the user was warned. */
+let warnedIn: Visit | undefined;
+/** Warns once if the tissue moved farther than it is long: then a unit is probably wrong. */
+function warnIfFar(of: Visit): void {
+  if (of === warnedIn || of.surface.largestM() <= Math.max(...of.extentM, of.reach.spacingM)) return;
+  warnedIn = of;
+  notice("The tissue moved farther than its longest side. Look at the forces and the stiffness: a unit may be wrong.", 15);
+}
+
 stage.onDrawn = () => {
   latency.drawn();
   overlay.drawn();
@@ -282,6 +291,7 @@ setInterval(() => {
 }, 100);
 setInterval(() => {
   if (!visit || document.hidden) return;
+  warnIfFar(visit);
   const { session, samples, frames } = visit;
   const { newest } = samples;
   const audited = session.audit?.newestError;

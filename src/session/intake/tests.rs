@@ -21,6 +21,7 @@ fn intake() -> (Intake, Schedule) {
 
 fn release(sequence: u64, at_step: Option<u64>) -> Command {
     let (client_time_ns, time_to_live_s, arrival_ns) = (0, None, 0);
+    let sequence = Some(sequence);
     Command { tool: 0, sequence, client_time_ns, at_step, time_to_live_s, action: Action::Release, arrival_ns }
 }
 
@@ -85,6 +86,21 @@ fn renewing_wakes_nobody() {
 }
 
 #[test]
+fn a_command_without_a_sequence_follows_the_one_before() {
+    let (mut intake, _) = intake();
+    let unnumbered = || Command { sequence: None, ..release(0, Some(2)) };
+    intake.submit(LEASE, vec![unnumbered(), unnumbered()], 0).unwrap();
+    assert_eq!(intake.submit(LEASE, vec![release(1, Some(2))], 0).unwrap_err().reason, Reason::StaleSequence);
+    intake.submit(LEASE, vec![release(7, Some(2)), unnumbered()], 0).unwrap();
+    intake.submit(LEASE, vec![unnumbered()], 0).unwrap();
+    let sequences: Vec<_> = due(&mut intake, 2).iter().map(|due| due.command.sequence).collect();
+    assert_eq!(sequences, [0, 1, 7, 8, 9].map(Some));
+    // Nothing follows the last number.
+    intake.submit(LEASE, vec![release(u64::MAX, Some(3))], 0).unwrap();
+    assert_eq!(intake.submit(LEASE, vec![unnumbered()], 0).unwrap_err().reason, Reason::StaleSequence);
+}
+
+#[test]
 fn a_tool_keeps_its_tip_until_it_is_released() {
     let (mut intake, _) = intake();
     let lead = |sequence, radius_m| Command {
@@ -119,7 +135,7 @@ fn commands_of_one_step_act_in_the_order_in_which_they_came() {
     {
         intake.submit(LEASE, commands, 0).unwrap();
     }
-    let order = |due: Vec<Due>| due.iter().map(|due| due.command.sequence).collect::<Vec<_>>();
+    let order = |due: Vec<Due>| due.iter().filter_map(|due| due.command.sequence).collect::<Vec<_>>();
     assert_eq!(order(due(&mut intake, 0)), [0; 0]);
     assert_eq!(order(due(&mut intake, 1)), [2]);
     assert_eq!(order(due(&mut intake, 2)), [1, 3, 4]);
@@ -196,14 +212,15 @@ fn a_batch_is_taken_in_slices_and_acts_whole() {
     // What came before the batch acts at its step.
     let mut due = Vec::new();
     intake.take_due(4, 0, &mut due);
-    assert_eq!(due.iter().map(|due| (due.command.tool, due.command.sequence)).collect::<Vec<_>>(), [(0, 1), (1, 1)]);
+    let came = due.iter().map(|due| (due.command.tool, due.command.sequence));
+    assert_eq!(came.collect::<Vec<_>>(), [(0, Some(1)), (1, Some(1))]);
     while intake.go_on(&mut batch) {
         slices += 1;
     }
     assert_eq!(slices + 1, 900_usize.div_ceil(SLICE));
     due.clear();
     intake.take_due(5, 0, &mut due);
-    let mut sequences: Vec<_> = due.iter().map(|due| due.command.sequence).collect();
+    let mut sequences: Vec<_> = due.iter().filter_map(|due| due.command.sequence).collect();
     sequences.sort_unstable();
     assert_eq!(sequences, (2..902).collect::<Vec<_>>());
     assert_eq!(intake.counts(), Counts { accepted: 902, applied: 902, ..Counts::default() });

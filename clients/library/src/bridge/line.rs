@@ -279,7 +279,8 @@ async fn connect(
                 let Some((client_time_ns, place_m)) = command else { return Ok(()) };
                 sequence += 1;
                 let action = Some(Action::Pose(touch::pose(place_m, &target.tip)));
-                let command = pb::Command { tool: target.tool, sequence, client_time_ns, action, ..Default::default() };
+                let (tool, sequence) = (target.tool, Some(sequence));
+                let command = pb::Command { tool, sequence, client_time_ns, action, ..Default::default() };
                 // If the network does not keep up, this command is dropped; the next is newer.
                 if let Err(mpsc::error::TrySendError::Closed(_)) = outbound.try_send(Say::Command(command)) {
                     return Err(broken("the stream is closed"));

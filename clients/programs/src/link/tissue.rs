@@ -30,7 +30,7 @@ impl Tissue {
         let action = place_m.map_or(Action::Release, |place_m| Action::Pose { place_m, tip });
         let command = Command {
             tool: 0,
-            sequence: self.session.step_count() + 1,
+            sequence: Some(self.session.step_count() + 1),
             client_time_ns: 0,
             at_step: None,
             time_to_live_s: None,

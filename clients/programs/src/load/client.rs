@@ -270,7 +270,8 @@ fn command(common: &Common, stroke: &Stroke, tool: u32, sent: &Mutex<Sent>, tick
     }
     #[allow(clippy::cast_precision_loss)]
     let action = Some(stroke.at(tick as f64 / common.rate_hz));
-    Some(pb::Command { tool, sequence, client_time_ns: now_ns, action, ..Default::default() })
+    let (sequence, client_time_ns) = (Some(sequence), now_ns);
+    Some(pb::Command { tool, sequence, client_time_ns, action, ..Default::default() })
 }
 
 #[cfg(test)]

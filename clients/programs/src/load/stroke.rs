@@ -45,8 +45,8 @@ impl Stroke {
         Action::Force(pb::Force {
             centre: Some(pb::force::Centre::CentreM(pb::Vector2 { x: centre_m.x, y: centre_m.y })),
             force_n: vector(DVec3::new(0.0, 0.0, -self.force_n * (0.6 + 0.4 * (3.0 * turn).sin()))),
-            falloff_per_m: self.falloff_per_m,
-            falloff_offset: 0.0,
+            falloff_per_m: Some(self.falloff_per_m),
+            falloff_offset: None,
         })
     }
 }

@@ -223,7 +223,7 @@ async fn keep_awake(
     let command = |index: u64| {
         let at_step = step + index * apart;
         let action = Some(stroke.at(at_step as f64 / rate_hz));
-        pb::Command { at_step: Some(at_step), sequence: index + 1, action, ..Default::default() }
+        pb::Command { at_step: Some(at_step), sequence: Some(index + 1), action, ..Default::default() }
     };
     let commands = (0..steps.div_ceil(apart)).map(command).collect();
     haptics.send_commands(pb::SendCommandsRequest { session_id: id.to_owned(), lease_id, commands }).await?;

@@ -1,6 +1,7 @@
 //! What a replay measures: delays, samples, the largest displacement and force.
 
 use hdrhistogram::Histogram;
+use palpate::scene::plot::Curves;
 use palpate::scene::record::{Percentiles, Record};
 use palpate_proto::geometry::from_vector;
 use palpate_proto::pb;
@@ -26,9 +27,8 @@ pub(super) struct Measured {
     /// Step and server time, ns, of the first sample and of the last.
     pub(super) first: Option<(u64, u64)>,
     pub(super) last: (u64, u64),
-    /// Time, s, with the vertical displacement, m, and reaction, N, of the first control point.
-    pub(super) displacement: Vec<(f32, f32)>,
-    pub(super) reaction: Vec<(f32, f32)>,
+    /// Of the first control point.
+    pub(super) curves: Curves,
 }
 
 impl Measured {
@@ -48,12 +48,10 @@ impl Measured {
             peak_reaction_n: 0.0,
             first: None,
             last: (0, 0),
-            displacement: Vec::new(),
-            reaction: Vec::new(),
+            curves: Curves::default(),
         })
     }
 
-    #[allow(clippy::cast_possible_truncation)]
     pub(super) fn sample(&mut self, sample: &pb::Sample, every: u32) {
         self.overruns = sample.overrun_count;
         self.samples += 1;
@@ -72,8 +70,7 @@ impl Measured {
             self.peak_reaction_n = self.peak_reaction_n.max(reaction_n.length());
             if index == 0 && tool.point.is_some() {
                 // The vertical component, as in the paper's figures.
-                self.displacement.push((sample.simulation_time_s as f32, displacement_m.z as f32));
-                self.reaction.push((sample.simulation_time_s as f32, reaction_n.z as f32));
+                self.curves.add(sample.simulation_time_s, displacement_m.z, reaction_n.z);
             }
         }
     }
