@@ -53,6 +53,10 @@ impl SessionService for Sessions {
             Some(Source::Scene(scene)) => wire::scene::from_scene(scene).map_err(|refusal| refusal.within("scene"))?,
             None => return Err(Refusal::new(Reason::Missing, "source", "scene_name or scene is missing").into()),
         };
+        if scene.shape().dimensions() > 2 {
+            let message = "is on a mesh: `palpate run` runs it offline; a server has no frames and no touch for meshes yet";
+            return Err(Refusal::new(Reason::NotAvailable, "scene_name", message).into());
+        }
         let most_s = self.0.config.idle_session_s;
         let idle_timeout_s = request.idle_timeout_s.unwrap_or(most_s);
         let range = format!("above 0 and at most {most_s}");
