@@ -29,7 +29,7 @@ use crate::sheet::stage::{ANY, LEAN, PUSHED, Stage};
 /// Bytes of a cache line.
 const LINE: usize = 64;
 
-/// How far ahead coefficients are asked for, bytes: about two blocks. (Measured: saves a tenth at 10,000 at_hand.)
+/// How far ahead coefficients are asked for, bytes: about two blocks. (Measured: saves a tenth at 10,000 points.)
 const AHEAD: usize = 4096;
 
 /// What a sweep reads, and where it keeps its snapshot.
@@ -44,6 +44,7 @@ pub(in crate::sheet) struct MeshGrid<'a, T> {
     pub(in crate::sheet) pull: T,
     /// Displacements: three planes, spacings.
     pub(in crate::sheet) x: *const T,
+    /// Room of this mesh's size.
     pub(in crate::sheet) snapshot: &'a RefCell<Snapshot<T>>,
 }
 
@@ -107,8 +108,7 @@ impl<T: Real, S: Stage<T>> Run<T> for MeshSweep<'_, T, S> {
         assert!(springs.shape == Shape::of::<V>() && springs.slots == slot_count && slots.blocks() == layout.rows);
         assert!(records.len() == record_place(slot_count) && copied.len() == slots.tiles());
         let of = |field: &Option<Field<T>>| field.as_ref().map_or(std::ptr::null(), |field| field.as_ptr());
-        let at_hand =
-            AtHand { unit: **unit, pull: *pull, extra: of(&springs.extra), masses: of(&springs.masses) };
+        let at_hand = AtHand { unit: **unit, pull: *pull, extra: of(&springs.extra), masses: of(&springs.masses) };
         let records = records.as_mut_ptr();
         // SAFETY: the caller's promise, and the springs and records are those of the slots.
         unsafe {
@@ -231,12 +231,8 @@ trait Gather<V: Vector> {
     ///
     /// # Safety
     /// The records have been written, and belong to the same mesh.
-    unsafe fn sum<const NEAR: bool, const ENERGY: bool>(
-        &self,
-        unit: &Kind<V::Real>,
-        at: usize,
-        own: &[V; 3],
-    ) -> Sum<V>;
+    unsafe fn sum<const NEAR: bool, const ENERGY: bool>(&self, unit: &Kind<V::Real>, at: usize, own: &[V; 3])
+    -> Sum<V>;
 }
 
 /// Where the tables of [`Rows`] begin.
