@@ -288,8 +288,8 @@ fn passes(row: &[(usize, usize)]) -> usize {
     (0..BLOCK).map(|lane| row.iter().filter(|spring| spring.0 == lane).count()).max().unwrap_or(0)
 }
 
-/// The number of plain rows that costs least. (Measured: a packed row takes 1.5 times as long as a plain one, and a
-/// quarter more for each pass.)
+/// The number of plain rows that costs least, if a packed row takes 1.5 times as long as a plain one and a quarter more
+/// for each pass. (Estimates; with 1.1 or 2.2 a step takes as long.)
 #[allow(clippy::cast_precision_loss)]
 fn plain_rows(springs: &[&[HalfSpring]; BLOCK]) -> usize {
     let most = springs.iter().map(|springs| springs.len()).max().unwrap_or(0);

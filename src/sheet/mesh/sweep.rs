@@ -44,6 +44,7 @@ pub(in crate::sheet) struct MeshGrid<'a, T> {
     pub(in crate::sheet) pull: T,
     /// Displacements: three planes, spacings.
     pub(in crate::sheet) x: *const T,
+    /// Room of this mesh's size.
     pub(in crate::sheet) snapshot: &'a RefCell<Snapshot<T>>,
 }
 
@@ -77,8 +78,12 @@ pub(in crate::sheet) struct MeshSweep<'a, T, S> {
     pub(in crate::sheet) stage: S,
 }
 
-/// Values of the slots, null if all are the same ([`MeshSprings`]).
-struct OfPoints<T> {
+/// What a sweep has at hand. The compiler keeps in registers what it knows that no store changes: so the numbers are
+/// copies.
+struct AtHand<T> {
+    unit: Kind<T>,
+    pull: T,
+    /// Values of the slots, null if all are the same ([`MeshSprings`]).
     extra: *const T,
     masses: *const T,
 }
@@ -95,7 +100,7 @@ struct Sum<V> {
 impl<T: Real, S: Stage<T>> Run<T> for MeshSweep<'_, T, S> {
     #[inline(always)]
     unsafe fn run<V: Vector<Real = T>>(&self) {
-        let MeshGrid { layout, slots, springs, snapshot, .. } = &self.grid;
+        let MeshGrid { layout, slots, springs, unit, pull, snapshot, .. } = &self.grid;
         let mut snapshot = snapshot.borrow_mut();
         let Snapshot { records, copied } = &mut *snapshot;
         copied.fill(false);
@@ -103,7 +108,7 @@ impl<T: Real, S: Stage<T>> Run<T> for MeshSweep<'_, T, S> {
         assert!(springs.shape == Shape::of::<V>() && springs.slots == slot_count && slots.blocks() == layout.rows);
         assert!(records.len() == record_place(slot_count) && copied.len() == slots.tiles());
         let of = |field: &Option<Field<T>>| field.as_ref().map_or(std::ptr::null(), |field| field.as_ptr());
-        let points = OfPoints { extra: of(&springs.extra), masses: of(&springs.masses) };
+        let at_hand = AtHand { unit: **unit, pull: *pull, extra: of(&springs.extra), masses: of(&springs.masses) };
         let records = records.as_mut_ptr();
         // SAFETY: the caller's promise, and the springs and records are those of the slots.
         unsafe {
@@ -111,10 +116,10 @@ impl<T: Real, S: Stage<T>> Run<T> for MeshSweep<'_, T, S> {
             // Each width has one of both, and needs no code for the other.
             match &springs.arrangement {
                 Arrangement::Rows(rows) if !V::PICKS => {
-                    self.tiles::<V>(&ByRows::of(rows, records), &points, (records, copied), &mut sums);
+                    self.tiles::<V>(&ByRows::of(rows, records), &at_hand, (records, copied), &mut sums);
                 }
                 Arrangement::Halo(halo) if V::PICKS => {
-                    self.tiles::<V>(&ByHalo::of(halo, records), &points, (records, copied), &mut sums);
+                    self.tiles::<V>(&ByHalo::of(halo, records), &at_hand, (records, copied), &mut sums);
                 }
                 _ => debug_assert!(false, "springs arranged for another width"),
             }
@@ -143,7 +148,7 @@ impl<T: Real, S: Stage<T>> MeshSweep<'_, T, S> {
     unsafe fn tiles<V: Vector<Real = T>>(
         &self,
         gather: &impl Gather<V>,
-        points: &OfPoints<T>,
+        at_hand: &AtHand<T>,
         (records, copied): (*mut T, &mut [bool]),
         sums: &mut [V; 2],
     ) {
@@ -164,7 +169,7 @@ impl<T: Real, S: Stage<T>> MeshSweep<'_, T, S> {
                     // SAFETY: the caller's promise; all slots of a row are in the layout.
                     unsafe {
                         let x = load::<V>(x.add(at), plane);
-                        let n = self.force(gather, points, at, &x);
+                        let n = self.force(gather, at_hand, at, &x);
                         match duty {
                             LEAN => self.stage.finish::<V, LEAN>(row, at, x, n, sums),
                             PUSHED => self.stage.finish::<V, PUSHED>(row, at, x, n, sums),
@@ -183,23 +188,23 @@ impl<T: Real, S: Stage<T>> MeshSweep<'_, T, S> {
     unsafe fn force<V: Vector<Real = T>>(
         &self,
         gather: &impl Gather<V>,
-        points: &OfPoints<T>,
+        at_hand: &AtHand<T>,
         at: usize,
         x: &[V; 3],
     ) -> [V; 3] {
-        let MeshGrid { unit, pull, .. } = &self.grid;
+        let unit = &at_hand.unit;
         // SAFETY: the caller's promise.
         unsafe {
             let mut sum = if S::ENERGY {
-                gather.sum::<false, true>(&self.grid, at, x)
+                gather.sum::<false, true>(&at_hand.unit, at, x)
             } else {
-                gather.sum::<true, false>(&self.grid, at, x)
+                gather.sum::<true, false>(&at_hand.unit, at, x)
             };
             if !S::ENERGY && V::any(unit.is_square_far(sum.farthest)) {
-                sum = gather.sum::<false, false>(&self.grid, at, x);
+                sum = gather.sum::<false, false>(&at_hand.unit, at, x);
             }
-            if !points.extra.is_null() {
-                let pull = x[0].splat(*pull).mul(V::load(points.extra.add(at)));
+            if !at_hand.extra.is_null() {
+                let pull = x[0].splat(at_hand.pull).mul(V::load(at_hand.extra.add(at)));
                 for c in 0..3 {
                     sum.force[c] = sum.force[c].minus(pull, x[c]);
                     if S::ENERGY {
@@ -210,8 +215,8 @@ impl<T: Real, S: Stage<T>> MeshSweep<'_, T, S> {
             if S::ENERGY {
                 // Half of each spring belongs to each end.
                 let mut part = x[0].splat(T::of(0.5));
-                if !points.masses.is_null() {
-                    part = part.mul(V::load(points.masses.add(at)));
+                if !at_hand.masses.is_null() {
+                    part = part.mul(V::load(at_hand.masses.add(at)));
                 }
                 self.stage.energy(at % BLOCK, sum.energy.mul(part));
             }
@@ -226,12 +231,8 @@ trait Gather<V: Vector> {
     ///
     /// # Safety
     /// The records have been written, and belong to the same mesh.
-    unsafe fn sum<const NEAR: bool, const ENERGY: bool>(
-        &self,
-        grid: &MeshGrid<'_, V::Real>,
-        at: usize,
-        own: &[V; 3],
-    ) -> Sum<V>;
+    unsafe fn sum<const NEAR: bool, const ENERGY: bool>(&self, unit: &Kind<V::Real>, at: usize, own: &[V; 3])
+    -> Sum<V>;
 }
 
 /// Where the tables of [`Rows`] begin.
@@ -253,7 +254,7 @@ impl<V: Vector> Gather<V> for ByRows<V::Real> {
     #[inline(always)]
     unsafe fn sum<const NEAR: bool, const ENERGY: bool>(
         &self,
-        grid: &MeshGrid<'_, V::Real>,
+        unit: &Kind<V::Real>,
         at: usize,
         own: &[V; 3],
     ) -> Sum<V> {
@@ -263,7 +264,7 @@ impl<V: Vector> Gather<V> for ByRows<V::Real> {
             let first = self.firsts.add(at / V::LANES);
             let rows = [*first as usize, *first.add(1) as usize];
             let ends = Anywhere { records: self.records, places: self.places };
-            sum_rows::<V, NEAR, ENERGY>(grid.unit, rows, &ends, self.coefficients, own, &mut sum);
+            sum_rows::<V, NEAR, ENERGY>(unit, rows, &ends, self.coefficients, own, &mut sum);
         }
         sum
     }
@@ -302,7 +303,7 @@ impl<V: Vector> Gather<V> for ByHalo<V::Real> {
     #[inline(always)]
     unsafe fn sum<const NEAR: bool, const ENERGY: bool>(
         &self,
-        grid: &MeshGrid<'_, V::Real>,
+        unit: &Kind<V::Real>,
         at: usize,
         own: &[V; 3],
     ) -> Sum<V> {
@@ -316,17 +317,17 @@ impl<V: Vector> Gather<V> for ByHalo<V::Real> {
                 let places = self.places.add(part.place as usize);
                 let first = V::records(self.records, places);
                 if part.halves < ONE_AND_A_HALF {
-                    self.part::<V, 1, NEAR, ENERGY>(grid, part, own, &[first], &mut sum);
+                    self.part::<V, 1, NEAR, ENERGY>(unit, part, own, &[first], &mut sum);
                 } else if part.halves == ONE_AND_A_HALF {
                     let second = V::half_of_records(self.records, places.add(BLOCK));
-                    self.part::<V, 2, NEAR, ENERGY>(grid, part, own, &[first, second], &mut sum);
+                    self.part::<V, 2, NEAR, ENERGY>(unit, part, own, &[first, second], &mut sum);
                 } else {
                     let second = V::records(self.records, places.add(BLOCK));
                     if part.halves == 4 {
-                        self.part::<V, 2, NEAR, ENERGY>(grid, part, own, &[first, second], &mut sum);
+                        self.part::<V, 2, NEAR, ENERGY>(unit, part, own, &[first, second], &mut sum);
                     } else {
                         let third = V::records(self.records, places.add(2 * BLOCK));
-                        self.part::<V, 3, NEAR, ENERGY>(grid, part, own, &[first, second, third], &mut sum);
+                        self.part::<V, 3, NEAR, ENERGY>(unit, part, own, &[first, second, third], &mut sum);
                     }
                 }
                 number += 1;
@@ -341,7 +342,7 @@ impl<T: Real> ByHalo<T> {
     #[inline(always)]
     unsafe fn part<V: Vector<Real = T>, const G: usize, const NEAR: bool, const ENERGY: bool>(
         &self,
-        grid: &MeshGrid<'_, T>,
+        unit: &Kind<T>,
         part: &Part,
         own: &[V; 3],
         around: &[[V; 3]; G],
@@ -354,14 +355,14 @@ impl<T: Real> ByHalo<T> {
         // ends, and passes.
         unsafe {
             let ends = Around { names: self.others, own, around };
-            sum_rows::<V, NEAR, ENERGY>(grid.unit, [first, middle], &ends, self.coefficients, own, sum);
+            sum_rows::<V, NEAR, ENERGY>(unit, [first, middle], &ends, self.coefficients, own, sum);
             let mut row = middle;
             while row < end {
                 let owner = V::pick(self.owners.add(packed), own, &[]);
                 let coefficients = self.coefficients.add(row * BLOCK * COEFFICIENTS);
                 let strain = Strain::of(&ends.others(row), &owner, coefficients);
-                let weight = strain.weight::<NEAR>(grid.unit, coefficients, &mut sum.farthest);
-                let energy = if ENERGY { strain.energy(grid.unit, coefficients) } else { weight };
+                let weight = strain.weight::<NEAR>(unit, coefficients, &mut sum.farthest);
+                let energy = if ENERGY { strain.energy(unit, coefficients) } else { weight };
                 let [x, y, z] = strain.span;
                 let end_of_passes = pass + usize::from(*self.passes.add(packed));
                 while pass < end_of_passes {

@@ -340,13 +340,13 @@ fn awake_tiles_move_as_if_all_were_awake_and_sleeping_ones_stay() {
 }
 
 fn moves_alike_at_every_width<T: Real>() {
-    let graph = uneven(700, 10, &mut fastrand::Rng::with_seed(6));
+    let graph = uneven(300, 10, &mut fastrand::Rng::with_seed(6));
     let run = |lanes| {
         let mut motion = FreeMotion::<T>::new(MeshSlots::new(&graph).unwrap(), 0.1, SCALE, lanes);
         (0..3).for_each(|_| motion.step());
         assert!(motion.state.u.iter().all(|u| u.wide() == 0.0), "what is at rest stays there");
         motion.displace(|vertex| 0.02 * DVec3::new((vertex as f64).sin(), (vertex as f64 * 0.3).cos(), 0.5));
-        (0..200).for_each(|_| motion.step());
+        (0..60).for_each(|_| motion.step());
         for (slot, _) in motion.slots.vertex_of().iter().enumerate().filter(|(_, vertex)| **vertex == NO_VERTEX) {
             assert!((0..3).all(|c| motion.state.u[c * motion.layout.plane + slot].wide() == 0.0), "{slot}");
         }
@@ -354,7 +354,7 @@ fn moves_alike_at_every_width<T: Real>() {
     };
     let plain = run(Lanes::Plain);
     assert!(plain.iter().all(|u| u.wide().abs() < 0.2) && plain.iter().any(|u| u.wide().abs() > 1e-3));
-    for lanes in ALL_LANES {
+    for lanes in ALL_LANES.into_iter().filter(|lanes| available(*lanes).is_some()) {
         assert!(run(lanes) == plain, "{lanes:?}");
     }
 }
