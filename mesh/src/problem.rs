@@ -222,7 +222,11 @@ impl fmt::Display for Problem {
                  steps; --vertices N makes triangles more even"
             ),
             Problem::Size { longest_m, instead } => {
-                write!(f, "the longest side is {longest_m:.3e} m, organs are 0.005 to 5 m long: check the unit")?;
+                write!(
+                    f,
+                    "the longest side is {} m, organs are 0.005 to 5 m long: check the unit",
+                    rounded(*longest_m)
+                )?;
                 instead.map_or(Ok(()), |instead| write!(f, " ({instead})"))
             }
             Problem::SelfIntersection { by } => write!(f, "triangle {by} cuts through this one"),
@@ -234,6 +238,13 @@ impl fmt::Display for Problem {
             }
         }
     }
+}
+
+/// Three digits of a length.
+fn rounded(length: f64) -> String {
+    let text = format!("{length:.2e}");
+    let is_short = (1e-6..1e6).contains(&length.abs());
+    text.parse::<f64>().ok().filter(|_| is_short).map_or(text, |number| number.to_string())
 }
 
 /// A part of a file or of a mesh. Vertices, faces and triangles are numbered from 0, lines from 1.

@@ -29,7 +29,8 @@ pub struct Repair {
     pub orient: bool,
     /// Keep the connected surface with the most triangles.
     pub largest: bool,
-    /// Fill holes with at most so many edges, and with a border shorter than the diagonal of the bounding box.
+    /// Fill holes with at most so many edges: those with three, and those with a border shorter than the diagonal of the
+    /// bounding box.
     pub hole_edges: usize,
     /// Drop vertices that no triangle has.
     pub unused: bool,
@@ -346,8 +347,9 @@ impl Work {
             sorted.sort_unstable();
             sorted.dedup();
             let is_loop = hole.len() >= 3 && sorted.len() == hole.len() && is_border(&topology, &hole);
-            // The rim of an open sheet is longer than the sheet.
-            if !is_loop || hole.len() > most_edges || border >= longest {
+            // The rim of an open sheet is longer than the sheet. A missing triangle of a coarse mesh may be, too.
+            let is_small = hole.len() <= most_edges && (hole.len() == 3 || border < longest);
+            if !is_loop || !is_small {
                 continue;
             }
             let uv = |vertex: u32| uv_of.get(&vertex).copied().unwrap_or_default();

@@ -132,7 +132,9 @@ fn lengths_are_in_the_unit_that_is_given() {
     let large = read("a.obj", common::obj().as_bytes(), Unit::METRE, &|_| None, &ReadLimits::default()).unwrap();
     let report = report(&large.mesh);
     let size = report.problems.iter().find(|found| found.problem.name() == "size").unwrap();
-    assert!(size.problem.to_string().contains("mm instead of m"), "{}", size.problem);
+    let says =
+        "the longest side is 200 m, organs are 0.005 to 5 m long: check the unit (1000 times smaller: mm instead of m)";
+    assert_eq!(size.problem.to_string(), says);
     assert_eq!(refused(&report), [""; 0]);
 }
 
@@ -315,6 +317,10 @@ fn holes_are_counted_and_small_ones_filled() {
     assert_eq!((after.holes, after.problems.len()), (0, 0), "{after:?}");
     assert!((after.volume_m3.unwrap() / report(&sphere(3)).volume_m3.unwrap() - 1.0).abs() < 0.01);
     assert!(repaired.told.iter().any(|line| line == "Holes filled: 2."), "{:?}", repaired.told);
+    // Of a coarse mesh, too.
+    let mut coarse = octahedron();
+    coarse.triangles.remove(3);
+    assert_eq!(shape(&mended(&coarse).mesh), shape(&octahedron()));
     // The rim of a sheet is no hole to fill.
     let flat = sheet(4, || 0.0);
     let repaired = mended(&flat);
