@@ -99,7 +99,7 @@ mod tests {
 
     #[test]
     fn a_file_has_all_vertices_triangles_and_groups() {
-        let mesh = organ::generate(Organ::Gallbladder, 4e-3, 1).unwrap();
+        let mesh = organ::generate(Organ::Gallbladder, 3.5e-3, 1).unwrap();
         let text = obj(Organ::Gallbladder, &mesh);
         let lines = |kind: &str| text.lines().filter(|line| line.split(' ').next() == Some(kind)).count();
         assert_eq!((lines("v"), lines("f")), (mesh.vertices_m.len(), mesh.triangles.len()));

@@ -44,7 +44,7 @@ pub(super) fn shape(dice: &mut Dice) -> Shape {
         extent,
         cut: BVec3::FALSE,
         cell: 2.0,
-        coarsest: 5.0,
+        coarsest: 4.0,
         parts: vec![("hilum", Box::new(|place| place.y < -20.0 && place.x.abs() < 22.0))],
         chart: sides(extent),
     }
