@@ -54,7 +54,8 @@ impl SessionService for Sessions {
             None => return Err(Refusal::new(Reason::Missing, "source", "scene_name or scene is missing").into()),
         };
         if scene.shape().dimensions() > 2 {
-            let message = "is on a mesh: `palpate run` runs it offline; a server has no frames and no touch for meshes yet";
+            let message =
+                "is on a mesh: `palpate run` runs it offline; a server has no frames and no touch for meshes yet";
             return Err(Refusal::new(Reason::NotAvailable, "scene_name", message).into());
         }
         let most_s = self.0.config.idle_session_s;

@@ -33,8 +33,10 @@ pub(super) struct Prospect {
     size_m: DVec3,
     mass_kg: f64,
     radius_m: f64,
-    /// The law under a fingertip in the middle; `None` if it takes too much work.
+    /// The law under a fingertip in the middle; `None` if there is none.
     law: Option<Law>,
+    /// Why there is none.
+    no_law: &'static str,
     /// The deepest sensible press by a fingertip, m: half the shorter side, or as far as the law reaches.
     deepest_m: f64,
     is_by_law: bool,
@@ -121,6 +123,11 @@ impl Prospect {
             mass_kg,
             radius_m,
             law,
+            no_law: if shape.dimensions() > 2 {
+                "there is no force law of a mesh yet"
+            } else {
+                "its force law takes too much work"
+            },
             deepest_m: half_m.min(reach_m),
             is_by_law: reach_m < half_m,
             rest_s: rest_s(&sheet),
@@ -364,7 +371,7 @@ impl fmt::Display for Prospect {
                 let why = if self.is_by_law { "as far as its force law reaches" } else { "half the shorter side" };
                 writeln!(f, "deepest       {} at {force} N: {why}", length(self.deepest_m))?;
             }
-            _ => writeln!(f, "fingertip     unknown: the force law of a disc of {radius} radius takes too much work")?,
+            _ => writeln!(f, "fingertip     unknown under a disc of {radius} radius: {}", self.no_law)?,
         }
         match self.rest_s {
             Ok(rest_s) => {
@@ -373,9 +380,9 @@ impl fmt::Display for Prospect {
             Err(why) => writeln!(f, "rest          {why}")?,
         }
         for (index, force) in self.forces.iter().enumerate().take(MOST_SHOWN) {
-            let depth = force.depth_m.map_or("unknown, its force law takes too much work".to_owned(), |depth_m| {
-                format!("about {}", length(depth_m))
-            });
+            let depth = force
+                .depth_m
+                .map_or(format!("unknown, {}", self.no_law), |depth_m| format!("about {}", length(depth_m)));
             let name = format!("force[{index}]");
             writeln!(f, "{name:<13} {} N in all at most; depth: {depth}", rounded(force.total_n))?;
         }

@@ -1,5 +1,5 @@
-//! Even triangles on the surface of a shape: long edges are split, short ones collapse, edges flip to Delaunay, vertices move
-//! along the surface to the middle of their neighbours (Botsch and Kobbelt, "A remeshing approach to multiresolution
+//! Even triangles on the surface of a shape. Long edges are split, short ones collapse, edges flip to Delaunay, vertices
+//! move along the surface to the middle of their neighbours (Botsch and Kobbelt, "A remeshing approach to multiresolution
 //! modeling", 2004).
 
 use glam::{BVec3, DVec3};
