@@ -1,5 +1,6 @@
 //! Mesh files from meshes: OBJ, STL and PLY. Lengths are metres.
 
+use std::collections::BTreeMap;
 use std::fmt::Write;
 
 use crate::{Problem, TriangleMesh};
@@ -65,8 +66,14 @@ fn obj(mesh: &TriangleMesh) -> String {
     for at in &mesh.vertices_m {
         let _ = writeln!(text, "v {} {} {}", at.x, at.y, at.z);
     }
-    for [u, v] in mesh.uv.iter().flatten().flatten() {
-        let _ = writeln!(text, "vt {u} {v}");
+    // Corners that meet share their texture coordinates.
+    let mut numbers = BTreeMap::new();
+    for uv in mesh.uv.iter().flatten().flatten() {
+        let count = numbers.len() + 1;
+        numbers.entry(uv.map(f32::to_bits)).or_insert_with(|| {
+            let _ = writeln!(text, "vt {} {}", uv[0], uv[1]);
+            count
+        });
     }
     let groups = groups_of(mesh);
     let mut current: &[usize] = &[];
@@ -83,10 +90,11 @@ fn obj(mesh: &TriangleMesh) -> String {
         }
         text.push('f');
         for (corner, vertex) in triangle.iter().enumerate() {
-            let _ = match mesh.uv {
-                Some(_) => write!(text, " {}/{}", u64::from(*vertex) + 1, 3 * number + corner + 1),
-                None => write!(text, " {}", u64::from(*vertex) + 1),
-            };
+            let _ = write!(text, " {}", u64::from(*vertex) + 1);
+            let uv = mesh.uv.as_ref().and_then(|uv| numbers.get(&uv.get(number)?[corner].map(f32::to_bits)));
+            if let Some(uv) = uv {
+                let _ = write!(text, "/{uv}");
+            }
         }
         text.push('\n');
     }
