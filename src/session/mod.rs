@@ -400,7 +400,9 @@ impl Session {
                 let now_s = self.time_s();
                 let tool = self.tool(index);
                 (tool.control_point, tool.around) = (Some(point), None);
-                let posed = tool.posed.get_or_insert(Posed { tip, path: Path::default(), client_time_s });
+                let begun =
+                    || Posed { tip, path: if tip.grasps { Path::of_grasp() } else { Path::default() }, client_time_s };
+                let posed = tool.posed.get_or_insert_with(begun);
                 posed.tip = tip;
                 // A pose with a step is played at that step; a pose with client time only is played by that time.
                 if command.at_step.is_some() || command.client_time_ns == 0 {

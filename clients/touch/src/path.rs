@@ -41,6 +41,8 @@ pub enum Play {
 /// The commands of one tool.
 #[derive(Debug, Clone, Default)]
 pub struct Path {
+    /// Whether the tool begins at its first place, not above it.
+    at_once: bool,
     waiting: VecDeque<(f64, DVec3)>,
     played: Option<(f64, DVec3)>,
     place_m: Option<DVec3>,
@@ -54,6 +56,12 @@ pub struct Path {
 }
 
 impl Path {
+    /// Of a grasp, which takes hold where its first place is. (The tool of another path comes from above: it meets the
+    /// tissue as a hand does, not from within.)
+    pub fn of_grasp() -> Self {
+        Path { at_once: true, ..Path::default() }
+    }
+
     /// Takes a command that has arrived: the tool's place at client time `time_s`. Returns false if it refuses one that
     /// is not newer or not finite.
     pub fn receive(&mut self, time_s: f64, place_m: DVec3, now_s: f64) -> bool {
@@ -102,8 +110,8 @@ impl Path {
             }
             return Some(Play::Release);
         }
-        // A new tool comes from above.
-        let from_m = self.place_m.unwrap_or(DVec3::new(target_m.x, target_m.y, target_m.z.max(ABOVE_M)));
+        let above_m = DVec3::new(target_m.x, target_m.y, target_m.z.max(ABOVE_M));
+        let from_m = self.place_m.unwrap_or(if self.at_once { target_m } else { above_m });
         let way_m = target_m - from_m;
         let most_m = SPEED_M_PER_S * step_s;
         if way_m.length() > most_m {
@@ -148,7 +156,7 @@ impl Path {
     }
 }
 
-/// A new tool begins at least this high above the sheet at rest, m.
+/// A new tool that touches begins at least this high above the sheet at rest, m.
 const ABOVE_M: f64 = 0.002;
 
 #[cfg(test)]
