@@ -460,7 +460,7 @@ impl<'a> Item<'a> {
             Value::List(_) => Ok(PointName::Point(self.point()?)),
             _ => match self.whole().ok().and_then(|whole| u32::try_from(whole).ok()) {
                 Some(vertex) => Ok(PointName::Vertex(vertex)),
-                None => Err(self.wrong("[i, j] on a sheet, the number of a vertex on a mesh")),
+                None => Err(self.wrong("[i, j] on a sheet, or on a mesh the number of a vertex, 0 or more")),
             },
         }
     }

@@ -10,7 +10,7 @@ use palpate_mesh::{ReadLimits, TriangleMesh, Unit};
 use super::check::physical;
 use super::document::{Fields, Item, read_bytes};
 use crate::limits::Limits;
-use crate::refusal::{Reason, Refusal, Result, did_you_mean, finite, positive};
+use crate::refusal::{Reason, Refusal, Result, did_you_mean, excerpt, finite, positive};
 use crate::shape::{Extent, PointId, PointName, RestShape};
 
 /// A triangle mesh with a mass point at each vertex and a spring along each edge.
@@ -192,7 +192,14 @@ impl Fixed {
                 Some(found) => Ok(Fixed::Group(found.vertices.clone())),
                 None => {
                     let meant = did_you_mean(&name, mesh.groups.iter().map(|group| group.name.as_str()));
-                    Err(group.refuse(Reason::WrongKind, format!("is no group of the mesh{meant}")))
+                    let names: Vec<&str> = mesh.groups.iter().map(|group| group.name.as_str()).take(8).collect();
+                    let all = if names.is_empty() {
+                        "it has none".to_owned()
+                    } else {
+                        format!("it has {}", names.join(", "))
+                    };
+                    let message = format!("`{}` is no group of the mesh{meant}; {all}", excerpt(&name));
+                    Err(group.refuse(Reason::WrongKind, message))
                 }
             }
         })
@@ -381,9 +388,11 @@ impl RestShape for MeshShape {
         let count = self.vertices_m.len();
         match name {
             PointName::Vertex(vertex) if (vertex as usize) < count => Ok(PointId::new(vertex as usize)),
-            PointName::Vertex(_) => {
-                Err(Refusal::new(Reason::OffSheet, field, format!("{name} is not on the mesh of {count} vertices")))
-            }
+            PointName::Vertex(_) => Err(Refusal::new(
+                Reason::OffSheet,
+                field,
+                format!("{name} is not on the mesh, whose vertices are numbered from 0 to {}", count - 1),
+            )),
             PointName::Point(_) => {
                 let message = format!("{name} is a point of a sheet; a point of a mesh is the number of a vertex");
                 Err(Refusal::new(Reason::WrongKind, field, message))

@@ -41,7 +41,7 @@ impl Refinement {
         }
         let Some(Sheet { points, spacing_m, .. }) = scene.sheet().cloned() else {
             let message = "there are no frames of a mesh yet: probe or sample its points";
-            return Err(Refusal::new(Reason::NotAvailable, "session_id", message));
+            return Err(Refusal::new(Reason::NotAvailable, "", message));
         };
         let refinement = Refinement { points, point_spacing_m: spacing_m, between: n as usize };
         let [x, y] = refinement.vertices();

@@ -144,7 +144,7 @@ pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
         }
     };
     let source = source(&scene)?;
-    let unreached = |why| Failure::Failed(format!("{why}; `palpate serve` starts a server"));
+    let unreached = |why| Failure::Failed(format!("{why}; `palpate serve` starts a server, --server names another"));
     let channel = server.connect().await.map_err(unreached)?;
     let mut client = SessionServiceClient::new(channel.clone());
     let request =

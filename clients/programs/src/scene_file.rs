@@ -18,7 +18,12 @@ pub(crate) fn source(scene: &str) -> Result<Source, Failure> {
     if Path::new(scene).extension().is_none_or(|extension| extension != "toml") {
         return Ok(Source::SceneName(scene.to_owned()));
     }
-    let scene = Scene::load(Path::new(scene), &[], &Limits::default())?;
+    let file = scene;
+    let scene = Scene::load(Path::new(file), &[], &Limits::default())?;
+    if scene.shape().dimensions() > 2 {
+        let message = "is on a mesh: a server can't make a session of one yet, `palpate run` runs it offline";
+        return Err(Failure::Refused(format!("{file}: {message}")));
+    }
     Ok(Source::Scene(wire::scene::scene(&scene)))
 }
 

@@ -49,7 +49,7 @@ struct Seen {
 /// Shows a server's sessions until it is interrupted or its output is closed.
 pub(crate) async fn top(arguments: &Arguments) -> Result<(), Failure> {
     let server = arguments.credentials.server(&arguments.server)?;
-    let unreached = |why| Failure::Failed(format!("{why}; `palpate serve` starts a server"));
+    let unreached = |why| Failure::Failed(format!("{why}; `palpate serve` starts a server, --server names another"));
     let mut sessions = SessionServiceClient::new(server.connect().await.map_err(unreached)?);
     let terminal = std::io::stdout().is_terminal() && !arguments.json && !arguments.once;
     let mut seen = None;
