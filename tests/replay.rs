@@ -380,6 +380,8 @@ fn what_a_replay_can_not_play_is_refused() {
         assert!(message.contains(expected), "{message}");
     };
     refused(replay(&server, &script, &["--scene", "nothing"]), 2, "UNKNOWN_SCENE");
+    let own = "; give your own scene by its path, --scene FILE.toml";
+    refused(replay(&server, &script, &["--scene", "nothing"]), 2, own);
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("stiff.toml"), STIFF).unwrap();
     let name = folder.path().join("stiff");
