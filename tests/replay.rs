@@ -84,6 +84,44 @@ fn every_shipped_script_gives_the_hash_of_the_run_offline() {
     }
 }
 
+/// A force, and beside it a tip that never touches.
+const HOVERING: &str = r#"
+name = "hovering"
+duration_s = 0.1
+sample_every_s = 0.01
+[[force]]
+point = [5, 4]
+force_n = [0.0, 0.0, -1.0]
+falloff_per_m = 150.0
+falloff_offset = 0.0
+profile = { type = "constant" }
+[[tool]]
+poses = [{ at_s = 0.02, place_m = [0.1, 0.1, 0.5] }]
+until_s = 0.08
+"#;
+
+#[test]
+fn a_replay_plots_the_first_tool_with_a_tip_as_a_run_does() {
+    let server = Server::start(&[]);
+    let folder = tempfile::tempdir().unwrap();
+    let (scene, script) = (folder.path().join("stiff.toml"), folder.path().join("hovering.toml"));
+    std::fs::write(&scene, STIFF).unwrap();
+    std::fs::write(&script, HOVERING).unwrap();
+    let scene = scene.to_str().unwrap();
+    assert_same(&server, scene, &script);
+    let through = replay(&server, &script, &["--scene", scene, "--plot"]);
+    let offline = Command::new(env!("CARGO_BIN_EXE_palpate"))
+        .args(["run", scene, script.to_str().unwrap(), "--held", "--plot"])
+        .output()
+        .unwrap();
+    for ended in [through, offline] {
+        let said = String::from_utf8_lossy(&ended.stderr);
+        assert!(said.contains("Force of the tissue on the tool along z, N: 0 throughout"), "{said}");
+        // Records still go to a pipe.
+        assert_eq!(lines(&ended.stdout).len(), 1 + 11 + 1);
+    }
+}
+
 /// Commands and sessions without rest, beside what is tested.
 struct Hammer {
     stop: Arc<AtomicBool>,
@@ -380,6 +418,8 @@ fn what_a_replay_can_not_play_is_refused() {
         assert!(message.contains(expected), "{message}");
     };
     refused(replay(&server, &script, &["--scene", "nothing"]), 2, "UNKNOWN_SCENE");
+    let own = "; give your own scene by its path, --scene FILE.toml";
+    refused(replay(&server, &script, &["--scene", "nothing"]), 2, own);
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("stiff.toml"), STIFF).unwrap();
     let name = folder.path().join("stiff");

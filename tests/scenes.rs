@@ -145,6 +145,7 @@ fn a_bad_scene_is_refused_with_file_line_and_key() {
         ("points = [9, 7]", "points = [9.5, 7]", "scene.toml:4: sheet.points[0]: must be a whole number, but is 9.5"),
         ("points = [9, 7]", "points = [61.0, 7]", "sheet.points[0]: must be a whole number, but is 61.0: write 61"),
         ("spacing_m = 0.05", "spacing_m = \"0.05\"", "must be a number, but is a string: write 0.05 without"),
+        ("[virtual_springs]", "[virtual]", "virtual: unknown key; did you mean `virtual_springs`?"),
         ("[springs]", "[spring]", "scene.toml:8: spring: unknown key; did you mean `springs`?"),
         ("[springs]", "fixed = \"edge\"\n[springs]", "but is `edge`; did you mean `edges`?"),
         ("[damping]", "[stepping]\nintegrator = \"centrl\"\n[damping]", "but is `centrl`; did you mean `central`?"),
@@ -173,6 +174,7 @@ fn a_bad_script_is_refused_with_file_line_and_key() {
         ("duration_s = 0.1", "duration_s = inf", "script.toml:2: duration_s"),
         ("sample_every_s = 0.05", "sample_every_s = 0.0001", "script.toml:3: sample_every_s: is less than half a step"),
         ("point = [4, 3]", "point = [9, 3]", "script.toml:6: force[0].point: [9, 3] is not on the sheet"),
+        ("[[force]]", "[force]", "script.toml:5: force: must be a list, but is a table: write [[force]]"),
         ("point = [4, 3]\n", "", "script.toml:5: force[0]: must have just one of"),
         (
             "point = [4, 3]",
@@ -344,7 +346,9 @@ fn scenes_and_scripts_are_found_by_name() {
     assert_eq!(lines(&palpate(&["run", "paper", "mine"]))[0]["run"]["scene"], "paper");
     refused(
         &palpate(&["run", "yours", "mine"]),
-        &["there is no scene `yours`; there are fibrotic, liver, mine, paper, stomach"],
+        &[
+            "there is no scene `yours`; there are fibrotic, liver, mine, paper, stomach; give your own scene by its path",
+        ],
     );
     refused(&palpate(&["run", "liverr", "mine"]), &["there is no scene `liverr`", "; did you mean `liver`?"]);
     refused(

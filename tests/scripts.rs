@@ -125,6 +125,11 @@ fn records_tell_what_a_tip_feels_and_where_it_is() {
         assert!(place_m.z < 0.0005 || force_n == DVec3::ZERO, "{time_s} s: {force_n}");
         assert!(place_m.z > -0.002 || force_n.z > 0.1, "{time_s} s: {force_n}");
     }
+    // While the tip is away, what a point feels is not plotted as the tip's, and is no peak of it.
+    let away = text.replace("duration_s = 0.5\nsample_every_s = 0.05", "duration_s = 0.5\nsample_every_s = 0.5");
+    let (_, summary) = run_whole(&model, &common::script(&away, &scene), true);
+    assert!(summary.curves.to_string().contains("Force of the tissue on the tool along z, N: nothing"));
+    assert_eq!(summary.peak_reaction_n, 0.0);
     // A script without tips has the records that it had.
     let (records, _) = run_whole(&model, &shipped("push", &scene), false);
     assert!(records.iter().all(|record| record.get("tools").is_none()));

@@ -1,10 +1,10 @@
 //! `palpate run`: plays a script on a scene, offline.
 
-use std::io::{BufWriter, IsTerminal, Write};
+use std::io::{IsTerminal, Write};
 use std::path::PathBuf;
 
 use palpate::scene::collection::find_script;
-use palpate::scene::record::Summary;
+use palpate::scene::record::{self, Summary};
 use palpate::session::run;
 
 use super::scene::{SceneArguments, compile};
@@ -27,7 +27,8 @@ pub(crate) struct RunArguments {
     /// relative to its largest. With [stepping] correct = true, the run is corrected where an error exceeds the tolerance
     #[arg(long)]
     audit: bool,
-    /// Plot displacement and force of the first tool with a tip, or of the first point, in the terminal
+    /// Plot displacement and force of the first tool with a tip, or of the first point, in the terminal; without --output
+    /// the records are then not written to a terminal
     #[arg(long)]
     plot: bool,
     /// Show no progress and no summary
@@ -42,14 +43,7 @@ pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     for warning in model.warnings.iter().chain(&script.warnings) {
         say!("palpate: warning: {warning}");
     }
-    let output: Box<dyn Write> = match &arguments.output {
-        Some(path) => Box::new(
-            std::fs::File::create(path)
-                .map_err(|e| Failure::Refused(format!("{}: can't be written: {e}", path.display())))?,
-        ),
-        None => Box::new(std::io::stdout().lock()),
-    };
-    let mut output = BufWriter::new(output);
+    let mut output = record::output(arguments.output.as_deref(), arguments.plot)?;
     let run = if arguments.audit { run::audited } else { run::run };
     let ended = with_progress(script.steps, arguments.quiet, |progress| {
         run(&model, &script, arguments.held, &limits, &mut output, &clock_s, progress)

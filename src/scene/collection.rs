@@ -94,7 +94,10 @@ impl Collection {
         } else if others.has(name) {
             format!("; `{name}` is a {}: {ORDER}", self.kind.other().name())
         } else {
-            did_you_mean(name, names.iter().map(String::as_str))
+            let meant = did_you_mean(name, names.iter().map(String::as_str));
+            let own =
+                if self.names_files { format!("; give your own {kind} by its path, FILE.toml") } else { String::new() };
+            meant + &own
         };
         let message = format!("there is no {kind} `{}`; there are {}{hint}", excerpt(name), names.join(", "));
         let (reason, field) = match self.kind {

@@ -262,8 +262,12 @@ impl<'a> Fields<'a> {
     }
 
     fn misspelt(&self, there: &str, key: &str) -> Refusal {
+        // A table has no unit.
+        let is_value = self.entries.get(there).is_some_and(|node| !matches!(node.value, Value::Table(_)));
         let message = match key.strip_prefix(there) {
-            Some(unit) if unit.starts_with('_') => format!("unknown key: the unit belongs to the name, `{key}`"),
+            Some(unit) if unit.starts_with('_') && is_value => {
+                format!("unknown key: the unit belongs to the name, `{key}`")
+            }
             _ => format!("unknown key; did you mean `{key}`?"),
         };
         self.refuse(Reason::UnknownKey, there, message)
@@ -411,6 +415,17 @@ impl<'a> Item<'a> {
                 .collect()),
             _ => Err(self.wrong("a list")),
         }
+    }
+
+    /// A list of tables.
+    ///
+    /// # Errors
+    /// Refuses any other value. For a single table the message says how to write the list.
+    pub fn tables(&self) -> Result<Vec<Item<'a>>> {
+        self.list().map_err(|refusal| match &self.node.value {
+            Value::Table(_) => Refusal { message: format!("{}: write [[{}]]", refusal.message, self.path), ..refusal },
+            _ => refusal,
+        })
     }
 
     fn numbers<const N: usize>(&self, expected: &str) -> Result<[f64; N]> {

@@ -540,7 +540,7 @@ pub fn fits(text: &str, scene: &str) -> bool {
 
 /// The entries of `[[key]]`; empty if the key is absent.
 fn items<'a>(fields: &mut Fields<'a>, key: &'static str) -> Result<Vec<Item<'a>>> {
-    fields.item(key).map_or(Ok(Vec::new()), |item| item.list())
+    fields.item(key).map_or(Ok(Vec::new()), |item| item.tables())
 }
 
 /// Requires ascending times. Of two that round to one step, the later one applies.

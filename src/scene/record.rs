@@ -1,11 +1,13 @@
 //! The records of `palpate run` and of a replay: JSON Lines, one schema.
 
-use std::io::Write;
+use std::io::{BufWriter, IsTerminal, Write};
+use std::path::Path;
 
 use serde::Serialize;
 
 use super::plot::Curves;
 use super::{Integrator, Named, Precision};
+use crate::refusal::{Reason, Refusal};
 use crate::shape::{PointName, RestShape};
 
 /// The first line of a file of records.
@@ -45,17 +47,22 @@ pub struct Record {
 }
 
 impl Record {
-    /// Displacement, m, and force of the tissue, N, of the first tool with a tip; without such tools, of the first point.
-    pub fn first(&self) -> Option<([f64; 3], [f64; 3])> {
-        let tool = self.tools.first().map(|tool| (tool.displacement_m, tool.force_on_tool_n));
-        tool.or_else(|| self.points.first().map(|point| (point.displacement_m, point.reaction_n)))
+    /// Displacement, m, and force of the tissue, N, of the script's first tool with a tip; without such tools, of the first
+    /// point. `None` while that tool is away: a point's force is not the tip's.
+    pub fn first(&self, tip: Option<usize>) -> Option<([f64; 3], [f64; 3])> {
+        let Some(tip) = tip else {
+            return self.points.first().map(|point| (point.displacement_m, point.reaction_n));
+        };
+        let tool = self.tools.iter().find(|tool| tool.tool as usize == tip);
+        tool.map(|tool| (tool.displacement_m, tool.force_on_tool_n))
     }
 
-    /// The largest force of the tissue on a tool with a tip; without such tools, at a point. N.
-    pub fn peak_n(&self) -> f64 {
+    /// The largest force of the tissue on a tool with a tip, 0 while all are away; if the script has no such tools, at a
+    /// point. N.
+    pub fn peak_n(&self, has_tips: bool) -> f64 {
         let length = |v: [f64; 3]| v.iter().map(|c| c * c).sum::<f64>().sqrt();
         let tools = self.tools.iter().map(|tool| length(tool.force_on_tool_n));
-        let points = self.points.iter().filter(|_| self.tools.is_empty()).map(|point| length(point.reaction_n));
+        let points = self.points.iter().filter(|_| !has_tips).map(|point| length(point.reaction_n));
         tools.chain(points).fold(0.0, f64::max)
     }
 }
@@ -134,10 +141,11 @@ pub struct Summary {
     /// What a user should know of the run, in words. Not written.
     #[serde(skip)]
     pub warnings: Vec<String>,
-    /// Length of the largest displacement, m. Not written.
+    /// Length of the largest displacement, m: of a run, of all points at the times of the records; of a replay, of what the
+    /// server sent. Not written.
     #[serde(skip)]
     pub largest_displacement_m: f64,
-    /// The largest force of the tissue that was told, N. Not written.
+    /// The largest force of the tissue in the records, N. Not written.
     #[serde(skip)]
     pub peak_reaction_n: f64,
     /// What the first tool or point felt over time. Not written.
@@ -269,6 +277,22 @@ pub enum Line<'a> {
     Run(&'a Run),
     /// The last line.
     Summary(&'a Summary),
+}
+
+/// The output of the records: `file`, or else the standard output. A terminal that is to show a plot gets no records.
+///
+/// # Errors
+/// Refuses a file that can't be written.
+pub fn output(file: Option<&Path>, plots: bool) -> Result<Box<dyn Write>, Refusal> {
+    let Some(path) = file else {
+        let out = std::io::stdout();
+        return Ok(if plots && out.is_terminal() { Box::new(std::io::sink()) } else { Box::new(BufWriter::new(out)) });
+    };
+    let file = std::fs::File::create(path).map_err(|e| Refusal {
+        place: Some(path.display().to_string()),
+        ..Refusal::new(Reason::Unreadable, "", format!("can't be written: {e}"))
+    })?;
+    Ok(Box::new(BufWriter::new(file)))
 }
 
 /// Writes one JSON object on one line.

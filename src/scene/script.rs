@@ -75,7 +75,7 @@ impl Script {
     /// at the step's end.
     #[allow(clippy::cast_precision_loss)]
     pub fn poses_at(&self, step: u64) -> impl Iterator<Item = (usize, Action)> {
-        let first = self.forces.len() + self.moves.len();
+        let first = self.first_tip().unwrap_or_default();
         let place_m = move |profile: &PoseProfile, end: u64| profile.at(end as f64 / self.rate_hz);
         self.poses.iter().enumerate().filter_map(move |(index, profile)| {
             let action = match place_m(profile, step + 1) {
@@ -84,6 +84,11 @@ impl Script {
             };
             Some((first + index, action))
         })
+    }
+
+    /// The number of the first tool with a tip, if the script has one.
+    pub fn first_tip(&self) -> Option<usize> {
+        (!self.poses.is_empty()).then_some(self.forces.len() + self.moves.len())
     }
 
     /// The number of tools that the script uses.

@@ -185,6 +185,7 @@ impl Playing<'_> {
         let mut windows = (self.twin.is_some() && model.scene.stepping.correct).then(Windows::default);
         let (mut stepping_s, mut resumed_s) = (0.0, clock_s());
         let (mut largest_displacement_m, mut peak_reaction_n, mut curves) = (0.0_f64, 0.0_f64, Curves::default());
+        let tip = script.first_tip();
         for step in 0..script.steps {
             player.commands(step, &mut due)?;
             // The summary's clock stops during everything other than the session's own stepping.
@@ -213,8 +214,8 @@ impl Playing<'_> {
                         let (energy_j, tools) = (Some(session.energy()), session.tool_records());
                         let record = Record { energy_j, tools, ..session.record(Some(&script.sample_points)) };
                         largest_displacement_m = largest_displacement_m.max(session.tissue().largest_displacement_m());
-                        peak_reaction_n = peak_reaction_n.max(record.peak_n());
-                        if let Some((displacement_m, force_n)) = record.first() {
+                        peak_reaction_n = peak_reaction_n.max(record.peak_n(tip.is_some()));
+                        if let Some((displacement_m, force_n)) = record.first(tip) {
                             curves.add(record.time_s, displacement_m[2], force_n[2]);
                         }
                         self.twin.iter_mut().for_each(|twin| twin.compare(&record));

@@ -3,7 +3,7 @@
 mod measured;
 
 use std::collections::VecDeque;
-use std::io::{BufWriter, IsTerminal, Write};
+use std::io::{IsTerminal, Write};
 use std::path::PathBuf;
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle};
 use palpate::limits::Limits;
 use palpate::scene::collection::{find_script, scenes_of};
-use palpate::scene::record::{Line, Network, Percentiles, Record, Run, Summary, far_warning, write_line};
+use palpate::scene::record::{Line, Network, Percentiles, Record, Run, Summary, far_warning, output, write_line};
 use palpate::scene::script::Script;
 use palpate::shape;
 use palpate::wire;
@@ -62,7 +62,8 @@ pub(crate) struct Arguments {
     /// Write the records here instead of to the standard output
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// Plot displacement and force of the first control point in the terminal
+    /// Plot displacement and force of the first tool with a tip, or of the first tool, in the terminal; without --output the
+    /// records are then not written to a terminal
     #[arg(long)]
     plot: bool,
     /// Show no progress bar
@@ -266,13 +267,7 @@ async fn play(
     for warning in created.warnings.iter().chain(&script.warnings) {
         crate::say!("palpate-client: warning: {warning}");
     }
-    let mut output: Box<dyn Write> = match &arguments.output {
-        Some(path) => Box::new(BufWriter::new(
-            std::fs::File::create(path)
-                .map_err(|e| Failure::Refused(format!("{}: can't be written: {e}", path.display())))?,
-        )),
-        None => Box::new(BufWriter::new(std::io::stdout())),
-    };
+    let mut output = output(arguments.output.as_deref(), arguments.plot)?;
     let written = |e: std::io::Error| match e.kind() {
         std::io::ErrorKind::BrokenPipe => Failure::Unread,
         _ => Failure::Failed(format!("can't write the output: {e}")),
@@ -330,7 +325,7 @@ async fn play(
     let mut touch = Touch::open(channel, open, ReceiverStream::new(messages)).await.map_err(refused_or_failed)?;
     let ahead = ((AHEAD_S * scene.stepping.rate_hz) as u64).clamp(1, COMMANDS_AHEAD);
     arguments.sampling.check(scene.stepping.rate_hz, ahead)?;
-    let mut measured = Measured::new()?;
+    let mut measured = Measured::new(&script)?;
     streamer.send_before(ahead).await?;
     streamer.heartbeat().await?;
     let mut commands_until = loop {
@@ -486,14 +481,14 @@ fn progress_bar(steps: u64, quiet: bool) -> ProgressBar {
 }
 
 /// Prints the summary as a table, on the output that the records do not go to.
-fn table(arguments: &Arguments, summary: &Summary, network: &Network, measured: &Measured) {
+fn table(arguments: &Arguments, summary: &Summary, network: &Network, measured: &Measured<'_>) {
     let percentiles = |p: &Percentiles| format!("{:.0} / {:.0} / {:.0} µs", p.p50, p.p99, p.max);
     let rows = [
         ("steps", format!("{} in {:.2} s", summary.steps, summary.wall_s)),
         ("overruns", format!("{} (time dilation {:.5})", network.overruns, network.time_dilation)),
         ("samples", format!("{} for {} steps", measured.samples, summary.steps)),
         ("late commands", network.late_commands.to_string()),
-        ("largest displacement", format!("{:.6} m", summary.largest_displacement_m)),
+        ("largest displacement seen", format!("{:.6} m", summary.largest_displacement_m)),
         ("peak reaction", format!("{:.6} N", summary.peak_reaction_n)),
         ("round trip p50 / p99 / max", percentiles(&network.round_trip_us)),
         ("final hash", summary.final_hash.clone()),

@@ -27,12 +27,18 @@ pub(crate) fn source(scene: &str) -> Result<Source, Failure> {
     Ok(Source::Scene(wire::scene::scene(&scene)))
 }
 
-/// The failure of a session with this scene. If the server does not know the name, it may be meant as a file.
+/// The failure of a session with this scene. If the server does not know the name, it may be meant as a file: the message
+/// says how to give one.
 pub(crate) fn with_hint(scene: &str, failure: Failure) -> Failure {
     let file = format!("{scene}.toml");
     match failure {
-        Failure::Refused(why) if why.contains(Reason::UnknownScene.as_str()) && Path::new(&file).is_file() => {
-            Failure::Refused(format!("{why}; did you mean the file `{file}`?"))
+        Failure::Refused(why) if why.contains(Reason::UnknownScene.as_str()) => {
+            let hint = if Path::new(&file).is_file() {
+                format!("did you mean the file `{file}`?")
+            } else {
+                "give your own scene by its path, --scene FILE.toml".to_owned()
+            };
+            Failure::Refused(format!("{why}; {hint}"))
         }
         failure => failure,
     }

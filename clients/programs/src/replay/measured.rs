@@ -3,13 +3,15 @@
 use hdrhistogram::Histogram;
 use palpate::scene::plot::Curves;
 use palpate::scene::record::{Percentiles, Record};
+use palpate::scene::script::Script;
 use palpate_proto::geometry::from_vector;
 use palpate_proto::pb;
 
 use crate::Failure;
 
 /// What a replay has measured.
-pub(super) struct Measured {
+pub(super) struct Measured<'s> {
+    script: &'s Script,
     pub(super) round_trip_ns: Histogram<u64>,
     pub(super) hold_ns: Histogram<u64>,
     pub(super) overruns: u64,
@@ -27,14 +29,15 @@ pub(super) struct Measured {
     /// Step and server time, ns, of the first sample and of the last.
     pub(super) first: Option<(u64, u64)>,
     pub(super) last: (u64, u64),
-    /// Of the first control point.
+    /// Of the first tool with a tip, or of the first tool.
     pub(super) curves: Curves,
 }
 
-impl Measured {
-    pub(super) fn new() -> Result<Self, Failure> {
+impl<'s> Measured<'s> {
+    pub(super) fn new(script: &'s Script) -> Result<Self, Failure> {
         let histogram = || Histogram::new(3).map_err(|e| Failure::Failed(e.to_string()));
         Ok(Measured {
+            script,
             round_trip_ns: histogram()?,
             hold_ns: histogram()?,
             overruns: 0,
@@ -63,12 +66,15 @@ impl Measured {
         self.recovery_count = sample.recovery_count;
         self.last = (sample.step, sample.server_time_ns);
         self.first.get_or_insert(self.last);
-        for (index, tool) in sample.tools.iter().enumerate() {
+        let plotted = self.script.first_tip().unwrap_or(0);
+        // A tip that has been taken away leaves its tool a point that no one touches.
+        let mut poses = self.script.poses.iter();
+        let is_there = poses.next().is_none_or(|profile| profile.at(sample.simulation_time_s).is_some());
+        for tool in &sample.tools {
             let displacement_m = from_vector(tool.displacement_m.as_ref());
             let reaction_n = from_vector(tool.force_on_tool_n.as_ref());
             self.largest_displacement_m = self.largest_displacement_m.max(displacement_m.length());
-            self.peak_reaction_n = self.peak_reaction_n.max(reaction_n.length());
-            if index == 0 && tool.point.is_some() {
+            if tool.tool as usize == plotted && is_there && tool.point.is_some() {
                 // The vertical component, as in the paper's figures.
                 self.curves.add(sample.simulation_time_s, displacement_m.z, reaction_n.z);
             }
@@ -76,6 +82,7 @@ impl Measured {
     }
 
     pub(super) fn record(&mut self, record: &Record) {
+        self.peak_reaction_n = self.peak_reaction_n.max(record.peak_n(!self.script.poses.is_empty()));
         for point in &record.points {
             let displacement_m = point.displacement_m.iter().map(|v| v * v).sum::<f64>().sqrt();
             self.largest_displacement_m = self.largest_displacement_m.max(displacement_m);
