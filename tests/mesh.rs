@@ -53,9 +53,9 @@ fn sphere(rings: u32, radius_m: f64) -> MeshShape {
             let [a, b, c, d] =
                 [(ring - 1, k), (ring - 1, next), (ring, k), (ring, next)].map(|(ring, k)| ring * around + k);
             if ring % 2 == 1 {
-                triangles.extend([[a, c, b], [b, c, d]])
+                triangles.extend([[a, c, b], [b, c, d]]);
             } else {
-                triangles.extend([[a, c, d], [a, d, b]])
+                triangles.extend([[a, c, d], [a, d, b]]);
             }
         }
     }
@@ -218,13 +218,13 @@ fn a_mesh_sleeps_where_nothing_moves_and_wakes_where_something_does() {
     for step in 0..1500 {
         for tissue in [&mut sleeper, &mut awake] {
             match step {
-                0 => tissue.push(0, poke(DVec3::new(0.0, 0.0, 0.1), DVec3::new(0.0, 0.0, -0.3), 150.0)),
-                700 => tissue.push(0, poke(DVec3::new(0.0, 0.0, -0.1), DVec3::new(0.1, 0.0, 0.2), 150.0)),
+                0 => tissue.push(0, poke(DVec3::new(0.0, 0.0, 0.1), DVec3::new(0.0, 0.0, -0.6), 600.0)),
+                700 => tissue.push(0, poke(DVec3::new(0.0, 0.0, -0.1), DVec3::new(0.2, 0.0, 0.4), 600.0)),
                 _ => {}
             }
             tissue.step().unwrap();
         }
-        if step == 4 {
+        if step == 2 {
             fewest = sleeper.awake_points();
         }
         for point in awake.model().points().step_by(17) {

@@ -356,7 +356,8 @@ impl MeshShape {
                     Ordering::Greater => _ = other.next(),
                     Ordering::Equal => {
                         common += of_a.min(*of_b);
-                        (one.next(), other.next());
+                        one.next();
+                        other.next();
                     }
                 }
             }
