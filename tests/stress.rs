@@ -197,7 +197,7 @@ fn adversarial_commands_leave_the_tissue_finite() {
                 1 => tissue.push(0, Some(common::push_on(&scene, corner, [1e4, 1e4 * sign, -1e4]))),
                 2 => tissue.push(0, Some(common::push_on(&scene, [3, 2], [50.0 * sign, 20.0, 100.0 * sign]))),
                 _ => {
-                    tissue.grasp((step % 3) as usize, model.scene.sheet().unwrap().point([3, 2]), Grasp::Target(place))
+                    tissue.grasp((step % 3) as usize, model.scene.sheet().unwrap().point([3, 2]), Grasp::Target(place));
                 }
             }
             if tissue.step().is_err() {
