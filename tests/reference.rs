@@ -199,7 +199,8 @@ fn each_scheme_has_its_order() {
                 println!("{integrator} {name}: {:.2}", gain.log2() / 2.0);
                 // Damping that takes five times a point's momentum in a step reaches the fifth order only at finer
                 // steps.
-                let order = if name == "overdamped19" { f64::min(order, 4.0) } else { order };
+                // The third derivative of a tool's move jumps where it begins and ends, which a fifth order notices.
+                let order = if ["overdamped19", "icosphere"].contains(&name) { f64::min(order, 4.0) } else { order };
                 assert!(gain.log2() / 2.0 > order - 0.75, "{integrator}, {name}: {gain}");
             }
         }

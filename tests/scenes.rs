@@ -324,8 +324,10 @@ fn missing_files_and_folders_are_told() {
     refused(&palpate(&["run", "paper", "no-script.toml"]), &["no-script.toml: can't be opened"]);
     let folder = tempfile::tempdir().unwrap();
     refused(&run_in(folder.path(), SCENE, SCRIPT, &["--output", "no/such/file"]), &["no/such/file: can't be written"]);
-    let output = run_in(folder.path(), SCENE, SCRIPT, &["--output", "out.jsonl"]);
+    let output = run_in(folder.path(), SCENE, SCRIPT, &["--output", "out.jsonl", "--quiet"]);
     assert!(output.status.success() && output.stdout.is_empty());
+    let output = run_in(folder.path(), SCENE, SCRIPT, &["--output", "out.jsonl"]);
+    assert!(output.status.success() && String::from_utf8_lossy(&output.stdout).contains("final hash"));
     assert_eq!(std::fs::read_to_string(folder.path().join("out.jsonl")).unwrap().lines().count(), 5);
 }
 

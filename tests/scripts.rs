@@ -241,7 +241,7 @@ fn what_is_wrong_with_a_force_or_a_pose_is_named() {
         ),
         (
             force("at_m = [0.03, 0.03]\npoint = [3, 3]\ntotal_n = [0.0, 0.0, -1.0]\nradius_m = 0.004"),
-            "just one of `point`, `at_m`, `hops` and `path`",
+            "just one of `point` (`vertex` on a mesh), `at_m`, `hops` and `path`",
         ),
         (tool("poses = []"), "tool[0].poses: must have at least one pose"),
         (
