@@ -61,10 +61,10 @@ fn shipped_scripts_move_each_tissue_by_some_millimetres() {
     for scene in ["liver", "fibrotic", "stomach"] {
         let scene = built_in(scene, &[]);
         let model = model(&scene);
-        // A tip presses by its mean depth: the point in the middle is deeper. What a grasp lets go swings.
+        // A tip moves the tissue by its mean: the point in the middle goes farther. What a grasp lets go may swing.
         for (name, at_least_mm, at_most_mm) in [
             ("press", [0.0, -5.6], [0.5, -4.5]),
-            ("grasp", [3.9, -4.0], [5.6, -0.3]),
+            ("grasp", [3.9, -4.0], [5.6, 0.1]),
             ("push", [0.0, -4.0], [0.5, -0.2]),
         ] {
             let [most, least] = range_mm(&run_whole(&model, &shipped(name, &scene), false).0);
