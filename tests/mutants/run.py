@@ -119,9 +119,13 @@ def unviable():
             continue
         for span in message["message"]["spans"]:
             if span["is_primary"]:
-                line = (TREE / span["file_name"]).read_text().split("\n")[span["line_start"] - 1]
+                lines = (TREE / span["file_name"]).read_text().split("\n")
                 # The innermost of those before the error.
-                before = re.findall(r"crate::mutant\((\d+)\)", line[: span["column_end"]])
+                before = re.findall(r"crate::mutant\((\d+)\)", lines[span["line_start"] - 1][: span["column_end"]])
+                if not before and "non-exhaustive" in message["message"]["message"]:
+                    # An arm that nothing replaces, further down.
+                    arms = "\n".join(lines[span["line_start"] :])
+                    before = re.findall(r" if !crate::mutant\((\d+)\) =>", arms)[:1]
                 if not before:
                     sys.exit(f"The tree does not compile: {message['message']['rendered']}")
                 found.add(int(before[-1]))
