@@ -357,7 +357,7 @@ impl Work {
         mesh.groups.retain(|group| !group.vertices.is_empty());
         let all = (0..).take(mesh.triangles.len());
         let tree = Tree::new(&mesh.vertices_m, &mesh.triangles, all);
-        let nearest = before.vertices_m.iter().filter_map(|at| tree.nearest(*at));
+        let nearest = before.vertices_m.iter().filter_map(|at| tree.nearest((&mesh.vertices_m, &mesh.triangles), *at));
         let places = nearest.map(|found| Place { triangle: found.triangle, barycentric: found.barycentric }).collect();
         drop(tree);
         Decimated { mesh, places }

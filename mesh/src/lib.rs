@@ -8,6 +8,7 @@ pub mod problem;
 pub mod read;
 pub mod repair;
 pub mod report;
+pub mod surface;
 pub mod topology;
 mod tree;
 pub mod unit;

@@ -340,7 +340,7 @@ fn check_cuts(mesh: &TriangleMesh, findings: &mut Findings) {
         let at = corners(vertices, own);
         let (least, most) = (at[0].min(at[1]).min(at[2]), at[0].max(at[1]).max(at[2]));
         let (mut looked, mut by) = (0, None);
-        let boxes = tree.overlapping(least, most, |other| {
+        let boxes = tree.overlapping((vertices, triangles), [least, most], |other| {
             looked += 1;
             let triangle = triangles[other as usize];
             // Each pair once; neighbours touch anyway.

@@ -5,7 +5,7 @@ use glam::DVec3;
 /// Triangles in a leaf.
 const LEAF: usize = 4;
 
-#[derive(Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 struct Node {
     least: DVec3,
     most: DVec3,
@@ -16,10 +16,9 @@ struct Node {
     second: Option<usize>,
 }
 
-/// The tree.
-pub(crate) struct Tree<'m> {
-    vertices: &'m [DVec3],
-    triangles: &'m [[u32; 3]],
+/// The tree. Its methods are given the vertices and triangles that it was made of, so that the owner of both can keep it.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Tree {
     nodes: Vec<Node>,
     order: Vec<u32>,
 }
@@ -37,10 +36,10 @@ pub(crate) fn corners(vertices: &[DVec3], triangle: [u32; 3]) -> [DVec3; 3] {
     triangle.map(|vertex| vertices[vertex as usize])
 }
 
-impl<'m> Tree<'m> {
+impl Tree {
     /// A tree over some triangles. All coordinates are finite, all indices in range.
-    pub(crate) fn new(vertices: &'m [DVec3], triangles: &'m [[u32; 3]], of: impl Iterator<Item = u32>) -> Self {
-        let mut tree = Self { vertices, triangles, nodes: Vec::new(), order: of.collect() };
+    pub(crate) fn new(vertices: &[DVec3], triangles: &[[u32; 3]], of: impl Iterator<Item = u32>) -> Self {
+        let mut tree = Self { nodes: Vec::new(), order: of.collect() };
         if tree.order.is_empty() {
             return tree;
         }
@@ -77,9 +76,19 @@ impl<'m> Tree<'m> {
         tree
     }
 
+    /// What it takes for each triangle, bytes: leaves hold some of them, and there are as many nodes between.
+    pub(crate) fn bytes_per_triangle(&self) -> usize {
+        size_of::<Node>() * self.nodes.len() / self.order.len().max(1) + size_of::<u32>()
+    }
+
     /// Calls `found` for the triangles whose boxes overlap a box, until it returns false. Returns how many boxes were looked
     /// at.
-    pub(crate) fn overlapping(&self, least: DVec3, most: DVec3, mut found: impl FnMut(u32) -> bool) -> u64 {
+    pub(crate) fn overlapping(
+        &self,
+        (vertices, triangles): (&[DVec3], &[[u32; 3]]),
+        [least, most]: [DVec3; 2],
+        mut found: impl FnMut(u32) -> bool,
+    ) -> u64 {
         let mut looked = 0;
         let mut waiting = if self.nodes.is_empty() { Vec::new() } else { vec![0] };
         while let Some(number) = waiting.pop() {
@@ -95,7 +104,7 @@ impl<'m> Tree<'m> {
             }
             for triangle in &self.order[node.start..node.end] {
                 looked += 1;
-                let at = corners(self.vertices, self.triangles[*triangle as usize]);
+                let at = corners(vertices, triangles[*triangle as usize]);
                 let is_apart =
                     at[0].min(at[1]).min(at[2]).cmpgt(most).any() || at[0].max(at[1]).max(at[2]).cmplt(least).any();
                 if !is_apart && !found(*triangle) {
@@ -107,7 +116,7 @@ impl<'m> Tree<'m> {
     }
 
     /// The place nearest to a point; of several as near, that of the least triangle.
-    pub(crate) fn nearest(&self, point: DVec3) -> Option<Nearest> {
+    pub(crate) fn nearest(&self, (vertices, triangles): (&[DVec3], &[[u32; 3]]), point: DVec3) -> Option<Nearest> {
         let distance = |node: &Node| (point - point.clamp(node.least, node.most)).length_squared();
         let mut best: Option<Nearest> = None;
         let mut waiting = if self.nodes.is_empty() { Vec::new() } else { vec![0] };
@@ -123,7 +132,7 @@ impl<'m> Tree<'m> {
                 continue;
             }
             for triangle in &self.order[node.start..node.end] {
-                let at = corners(self.vertices, self.triangles[*triangle as usize]);
+                let at = corners(vertices, triangles[*triangle as usize]);
                 let barycentric = nearest_place(point, at);
                 let place = at[0] * barycentric[0] + at[1] * barycentric[1] + at[2] * barycentric[2];
                 let squared = (point - place).length_squared();

@@ -4,14 +4,16 @@
 //! of it as notices the disc, in few points: it knows the rim. Then come smaller and smaller ones around the disc, whose
 //! points are half as far apart each time. Under a given force, each of these lets the disc go deeper than the same piece
 //! of tissue does in the points before; these differences are added to the depth in the first.
+//!
+//! On a mesh it is that of the points around the disc, as many as time allows: those beyond are held.
 
 use std::sync::atomic::AtomicBool;
 
 use palpate_touch::law::{Law, Row};
 
-use super::exact::{ROWS as EXACT_ROWS, pressed};
+use super::exact::{ROWS as EXACT_ROWS, course, follow, pressed};
 use crate::sheet::Model;
-use crate::sheet::tangent::{self, Accuracy};
+use crate::sheet::tangent::{self, Accuracy, Course};
 
 /// The most work of a first law, springs times iterations: 46 ms of processor time, at the 27 ns that one takes on an AMD
 /// EPYC (family 26). Work is counted, not timed, so that every machine gives the same law.
@@ -28,6 +30,9 @@ const ROWS: u32 = 6;
 /// where the work for many does not suffice.
 const HALF_INTERVALS: [(u32, u64); 2] = [(6, 400_000), (4, 0)];
 
+/// Points of a mesh that are looked at.
+const POINTS: [usize; 3] = [800, 400, 200];
+
 /// Points so many radii of the disc apart know what is under it.
 const FINE_ENOUGH: f64 = 0.7;
 
@@ -38,6 +43,9 @@ pub fn first(model: &Model, radius_m: f64, stop: &AtomicBool) -> Option<Law> {
     let exact = pressed(model, radius_m, EXACT_ROWS, Accuracy::EXACT, &mut work, stop);
     let mut left = WORK - EXACT_WORK + work;
     exact.or_else(|| {
+        if model.scene.sheet().is_none() {
+            return POINTS.iter().find_map(|points| on_mesh(model, radius_m, *points, &mut left, stop));
+        }
         HALF_INTERVALS.iter().find_map(|(half, kept)| {
             let most = left.saturating_sub(*kept);
             let mut work = most;
@@ -46,6 +54,13 @@ pub fn first(model: &Model, radius_m: f64, stop: &AtomicBool) -> Option<Law> {
             law
         })
     })
+}
+
+/// A law of so many points of a mesh; the work is taken from `work`.
+fn on_mesh(model: &Model, radius_m: f64, points: usize, work: &mut u64, stop: &AtomicBool) -> Option<Law> {
+    let course = Course { points, ..course(model, radius_m, ROWS) };
+    let law = follow(model, course, Accuracy::COARSE, work, stop)?;
+    law.is_sound().then_some(Law { is_coarse: true, ..law })
 }
 
 /// The law `first`, where by each force the disc goes deeper as `fine` gives way more than `coarse`.

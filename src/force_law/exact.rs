@@ -46,10 +46,10 @@ impl Computation {
     }
 }
 
-/// In the middle of a sheet.
-fn course(model: &Model, radius_m: f64, rows: u32) -> Course {
+/// In the middle of a sheet; on a mesh at the place of its surface that is nearest to the middle of its box.
+pub(super) fn course(model: &Model, radius_m: f64, rows: u32) -> Course {
     let (centre_m, step_m) = (model.shape().extent().middle_m(), REACH_IN_RADII * radius_m / f64::from(rows - 1));
-    Course { radius_m, centre_m, step_m, count: rows }
+    Course { radius_m, centre_m, step_m, count: rows, points: usize::MAX }
 }
 
 /// The exact law of a disc of `radius_m` in the middle of a sheet: some tenths of a second of work for a thousand points.
@@ -72,7 +72,18 @@ pub(super) fn pressed(
     work: &mut u64,
     stop: &AtomicBool,
 ) -> Option<Law> {
-    let mut press = Press::within(model, course(model, radius_m, rows), accuracy, *work)?;
+    follow(model, course(model, radius_m, rows), accuracy, work, stop)
+}
+
+/// The law of a course.
+pub(super) fn follow(
+    model: &Model,
+    course: Course,
+    accuracy: Accuracy,
+    work: &mut u64,
+    stop: &AtomicBool,
+) -> Option<Law> {
+    let mut press = Press::within(model, course, accuracy, *work)?;
     let mut deepened = Deepened::Further;
     while deepened == Deepened::Further {
         deepened = press.deepen(model, stop);

@@ -59,18 +59,22 @@ pub fn check_free(field: &str, shape: &dyn RestShape, point: PointId) -> Result<
     Ok(())
 }
 
+/// The largest radius of a tip on a mesh, in lengths of an edge.
+const MOST_EDGES: f64 = 32.0;
+
 /// Checks whether a tool with this tip fits the tissue.
 ///
 /// # Errors
 /// Refuses a value that is not finite or out of range; `field` is the name that the refusal gives.
 pub fn check_tip(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
-    if shape.dimensions() > 2 {
-        let message = "can't touch a mesh yet: push with a force, or grasp a vertex";
-        return Err(Refusal::new(Reason::NotAvailable, field, message));
-    }
     let longest_m = shape.longest_side_m();
-    let range = format!("above 0 and at most {longest_m}, the sheet's longer side");
-    number(&format!("{field}.radius_m"), tip.radius_m, &range, |v| v > 0.0 && v <= longest_m)?;
+    let (most_m, what) = match MOST_EDGES * shape.edge_m() {
+        // What a disc covers is looked up at each step.
+        edges_m if shape.dimensions() > 2 && edges_m < longest_m => (edges_m, "32 lengths of an edge"),
+        _ => (longest_m, "the longest side of the tissue"),
+    };
+    let range = format!("above 0 and at most {most_m}, {what}");
+    number(&format!("{field}.radius_m"), tip.radius_m, &range, |v| v > 0.0 && v <= most_m)?;
     number(&format!("{field}.friction"), tip.friction, "from 0 to 10", |v| (0.0..=10.0).contains(&v))?;
     if let Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } = tip.coupling {
         positive(&format!("{field}.spring.stiffness_n_per_m"), stiffness_n_per_m)?;

@@ -2,9 +2,10 @@
 
 use std::cmp::Ordering;
 use std::path::Path;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use glam::{DQuat, DVec3};
+use palpate_mesh::surface::Surface;
 use palpate_mesh::{ReadLimits, TriangleMesh, Unit};
 
 use super::check::physical;
@@ -50,6 +51,7 @@ pub struct MeshShape {
     edge_m: f64,
     extent: Extent,
     cells: Cells,
+    surface: OnceLock<Surface>,
 }
 
 /// What files a scene may name.
@@ -293,7 +295,19 @@ impl MeshShape {
         let is_fixed = (0..count).map(|vertex| is_fixed(on_rim[vertex], vertices_m[vertex], vertex as u32)).collect();
         let neighbours = Neighbours::new(count, &edges);
         let cells = Cells::new(&vertices_m, extent, edge_m);
-        Ok(MeshShape { vertices_m, triangles, normals, edges, opposite, neighbours, is_fixed, edge_m, extent, cells })
+        Ok(MeshShape {
+            vertices_m,
+            triangles,
+            normals,
+            edges,
+            opposite,
+            neighbours,
+            is_fixed,
+            edge_m,
+            extent,
+            cells,
+            surface: OnceLock::new(),
+        })
     }
 
     /// Where each vertex rests, m.
@@ -304,6 +318,11 @@ impl MeshShape {
     /// Three vertices each, counterclockwise seen from outside.
     pub fn triangles(&self) -> &[[u32; 3]] {
         &self.triangles
+    }
+
+    /// Its triangles, to walk on: made when somebody first asks.
+    pub fn surface(&self) -> &Surface {
+        self.surface.get_or_init(|| Surface::new(&self.vertices_m, &self.triangles))
     }
 
     /// The two vertices of each edge, ascending.

@@ -78,7 +78,10 @@ pub(super) struct Tool {
     pub(super) from_m: DVec3,
     pub(super) to_m: DVec3,
     pub(super) contact_state: ContactState,
+    /// Out of the tissue, on the side where the tool is.
     pub(super) normal: DVec3,
+    /// That side: 1 outside, -1 inside; none while the tool is beside the tissue.
+    pub(super) side: Option<f64>,
     /// The offset that a grasp keeps between the tool and the surface, m.
     pub(super) offset_m: DVec3,
     /// Force on the sheet in the last substep, N.
@@ -101,7 +104,7 @@ impl Contacts {
         if let Some(tool) = self.tools.iter_mut().find(|tool| tool.number == number) {
             let is_other = tool.tip.radius_m != tip.radius_m;
             if is_other {
-                tool.footprint = Footprint::new(model, tip.radius_m, tool.footprint.centre_m());
+                tool.footprint = Footprint::new(model, tip.radius_m, tool.footprint.anchor_m());
             }
             if is_other || tool.tip.grasps != tip.grasps {
                 (tool.contact_state, tool.steady_n) = (ContactState::Free, DVec3::ZERO);
@@ -113,11 +116,12 @@ impl Contacts {
         let tool = Tool {
             number,
             tip,
-            footprint: Footprint::new(model, tip.radius_m, to_m.truncate()),
+            footprint: Footprint::new(model, tip.radius_m, to_m),
             from_m: to_m,
             to_m,
             contact_state: ContactState::Free,
             normal: DVec3::Z,
+            side: None,
             offset_m: DVec3::ZERO,
             force_n: DVec3::ZERO,
             steady_n: DVec3::ZERO,
@@ -172,10 +176,10 @@ pub(super) fn push<T: Real>(
     [of_u, of_d]: [f64; 2],
 ) {
     let scale = plan.force_scale(&model.scene);
-    for Reached { point: [i, j], weight, .. } in footprint.reached().iter().copied().filter(|point| point.free) {
+    for Reached { point: [i, j], mass, weight, .. } in footprint.reached().iter().copied().filter(|point| point.free) {
         for c in 0..3 {
             let at = c * layout.plane + i * layout.stride + j;
-            let change = scale * weight * force_n[c];
+            let change = scale * weight * force_n[c] / mass;
             state.u[at] += T::of(of_u * change);
             state.d[at] += T::of(of_d * change);
         }
@@ -216,20 +220,19 @@ impl Tool {
         let place_m = self.place_m(fraction);
         let displacement = |point| displacement_m(model, layout, state, point);
         if self.contact_state == ContactState::Free {
-            // Finds the tool's place on the sheet. A contraction, as long as the sheet is not folded.
-            for _ in 0..2 {
-                let (surface_m, _) = self.footprint.surface(displacement);
-                let beside = (place_m - surface_m).truncate();
-                self.footprint.move_to(model, self.footprint.centre_m() + beside);
-            }
+            self.footprint.seek(model, place_m, displacement);
         }
         let (surface_m, along) = self.footprint.surface(displacement);
-        self.normal = along[0].cross(along[1]).try_normalize().unwrap_or(DVec3::Z);
+        let outward = self.footprint.outward(&along);
         let mut gap_m = place_m - surface_m;
+        let side = self.side.unwrap_or_else(|| self.footprint.side(gap_m.dot(outward)));
+        self.normal = side * outward;
         match self.contact_state {
             ContactState::Free => {
-                // A disc that is farther off the sheet's edge than its radius does not meet it.
-                if gap_m.truncate().length() > self.tip.radius_m {
+                // Beside the tissue it may go over to the other side.
+                let is_beside = self.footprint.is_beside(gap_m, outward);
+                self.side = (!is_beside).then_some(side);
+                if is_beside {
                     return DVec3::ZERO;
                 }
                 if self.tip.grasps {
@@ -282,13 +285,13 @@ impl Tool {
         if self.contact_state != ContactState::Sliding {
             return;
         }
-        let (surface_m, _) = self.footprint.surface(|point| displacement_m(model, layout, state, point));
+        let (surface_m, along) = self.footprint.surface(|point| displacement_m(model, layout, state, point));
         let mut beside_m = self.place_m(fraction) - surface_m;
         beside_m -= beside_m.dot(self.normal) * self.normal;
         if let Coupling::Spring { stiffness_n_per_m, .. } = self.tip.coupling {
             beside_m -= (self.force_n - self.force_n.dot(self.normal) * self.normal) / stiffness_n_per_m;
         }
-        self.footprint.move_to(model, self.footprint.centre_m() + beside_m.truncate());
+        self.footprint.shift(model, beside_m, &along);
     }
 }
 

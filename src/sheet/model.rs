@@ -194,6 +194,12 @@ impl Model {
         self.graph.as_ref().map_or(PointId::new(index), |graph| graph.point_in(index))
     }
 
+    /// Mass and K″ of the point at a place in memory, over those of the scene.
+    pub(super) fn relative(&self, index: usize) -> (f64, f64) {
+        let [mass, extra] = self.graph.as_ref().map_or([1.0, 0.0], |graph| graph.relative(index));
+        (mass, mass * (1.0 + extra))
+    }
+
     /// What a substep computes, in points: rows are padded, and a short one costs what one of a vector's width does.
     pub fn swept_points(&self) -> usize {
         self.points[0] * self.points[1].max(BLOCK)

@@ -13,13 +13,17 @@
 use std::cell::Cell;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use glam::{DMat3, DVec2, DVec3};
+use glam::{DMat3, DQuat, DVec3};
 
 use super::footprint::{Footprint, Reached};
 use super::model::Model;
 use crate::memory;
 use crate::scene::{Body, Fixed, Sheet};
 use crate::shape::RestShape;
+
+mod window;
+
+pub use window::{Window, half_window_m};
 
 /// How many times its reach around a disc the sheet is looked at: e⁻⁶ is left.
 const REACHES: f64 = 6.0;
@@ -91,13 +95,16 @@ type Triple = [DVec3; 3];
 #[derive(Debug)]
 pub struct Patch<'m> {
     model: &'m Model,
-    size: [usize; 2],
+    window: Window,
     /// From rest, m.
     displacement_m: Vec<DVec3>,
     /// Whether a point moves.
     free: Vec<bool>,
     /// E, by points.
     weights: Vec<f64>,
+    /// Mass and K″ of each point over those of reference.
+    masses: Vec<f64>,
+    stiffness: Vec<f64>,
     springs: Vec<Spring>,
     inverses: Vec<DMat3>,
     accuracy: Accuracy,
@@ -112,6 +119,12 @@ struct Spring {
     tangent: DMat3,
     /// On the first end, N.
     force_n: DVec3,
+}
+
+impl Spring {
+    fn new(ends: [usize; 2], rest_m: DVec3, stiffness_n_per_m: f64) -> Self {
+        Spring { ends, rest_m, stiffness_n_per_m, tangent: DMat3::ZERO, force_n: DVec3::ZERO }
+    }
 }
 
 /// What a disc feels of slow and small movements.
@@ -140,133 +153,52 @@ pub struct Pressed {
     pub tangent: Tangent,
 }
 
-/// The points around a disc that notice what it does.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Window {
-    origin: [usize; 2],
-    size: [usize; 2],
-}
-
-impl Window {
-    /// Around a footprint.
-    pub fn around(model: &Model, footprint: &Footprint) -> Self {
-        Self::at(model, footprint.radius_m(), footprint.centre_m())
-    }
-
-    fn at(model: &Model, radius_m: f64, centre_m: DVec2) -> Self {
-        let centre = centre_m / model.unit_m;
-        let half = half_window(model, radius_m);
-        let (mut origin, mut size) = ([0; 2], [0; 2]);
-        for axis in 0..2 {
-            // Saturating casts: no virtual springs, no end.
-            #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-            let [low, high] = [centre[axis] - half, centre[axis] + half].map(|edge| edge.round().max(0.0) as usize);
-            origin[axis] = low.min(model.points[axis] - 1);
-            size[axis] = high.min(model.points[axis] - 1) + 1 - origin[axis];
-        }
-        Window { origin, size }
-    }
-
-    /// What a patch of it and a solution take, bytes.
-    pub(super) fn bytes(&self) -> u64 {
-        (self.size[0] * self.size[1] * BYTES_PER_POINT) as u64
-    }
-
-    /// The numbers of its points, by rows.
-    pub fn points(self, model: &Model) -> impl Iterator<Item = usize> {
-        let Window { origin, size } = self;
-        let columns = model.points[1];
-        (0..size[0] * size[1]).map(move |at| (origin[0] + at / size[1]) * columns + origin[1] + at % size[1])
-    }
-}
-
-/// How far from the middle of a disc of `radius_m` points notice what it does, in spacings; infinite without virtual
-/// springs.
-fn half_window(model: &Model, radius_m: f64) -> f64 {
-    let scene = &model.scene;
-    let springs = &scene.springs;
-    let stiffest = springs.stiffness_n_per_m.max(springs.shear_stiffness_n_per_m);
-    let reach = (stiffest / scene.virtual_stiffness_n_per_m).sqrt().max(1.0);
-    radius_m / model.unit_m + REACHES * reach + 2.0
-}
-
-/// The same in m.
-pub fn half_window_m(model: &Model, radius_m: f64) -> f64 {
-    half_window(model, radius_m) * model.unit_m
-}
-
 impl<'m> Patch<'m> {
-    /// A window around a footprint, its points displaced so, by rows.
-    pub fn new(model: &'m Model, footprint: &Footprint, window: Window, displacement_m: Vec<DVec3>) -> Self {
-        let springs = &model.scene.springs;
-        let Window { origin, size } = window;
-        let layers = if springs.flexion { 2 } else { 1 };
-        let index_of = |at: usize| (origin[0] + at / size[1]) * model.points[1] + origin[1] + at % size[1];
-        let count = size[0] * size[1];
-        let is_free = |at: usize| {
-            let inside = |axis: usize, place: usize| {
-                (origin[axis] == 0 || place >= layers)
-                    && (origin[axis] + size[axis] == model.points[axis] || place + layers < size[axis])
-            };
-            inside(0, at / size[1]) && inside(1, at % size[1]) && model.fixed.binary_search(&index_of(at)).is_err()
-        };
-        let mut weights = vec![0.0; count];
-        for Reached { point: [i, j], weight, .. } in footprint.reached().iter().copied() {
-            let place = (i.wrapping_sub(origin[0]), j.wrapping_sub(origin[1]));
-            if place.0 < size[0] && place.1 < size[1] {
-                weights[place.0 * size[1] + place.1] = weight;
+    /// A window around a footprint, its points displaced so, in their order. Displacements and all that is found are in
+    /// directions turned by `turn`.
+    fn turned(
+        model: &'m Model,
+        footprint: &Footprint,
+        window: Window,
+        displacement_m: Vec<DVec3>,
+        turn: &DMat3,
+    ) -> Self {
+        let mut weights = vec![0.0; window.len()];
+        for Reached { point, weight, .. } in footprint.reached().iter().copied() {
+            if let Some(at) = window.find(model, point) {
+                weights[at] = weight;
             }
         }
+        let free = window.free(model);
+        let springs = window.springs(model, &free, turn);
+        let (masses, stiffness) = window.points(model).map(|index| model.relative(index)).unzip();
         let mut patch = Patch {
             model,
-            size,
+            window,
             displacement_m,
-            free: (0..count).map(is_free).collect(),
+            free,
             weights,
-            springs: Vec::new(),
+            masses,
+            stiffness,
+            springs,
             inverses: Vec::new(),
             accuracy: Accuracy::EXACT,
             allowance: Allowance::default(),
         };
-        patch.connect();
         patch.linearise();
         patch
     }
 
-    fn connect(&mut self) {
-        let springs = &self.model.scene.springs;
-        let (structural, shear) = (springs.stiffness_n_per_m, springs.shear_stiffness_n_per_m);
-        let flexion = if springs.flexion { structural } else { 0.0 };
-        let kinds = [(structural, [[1, 0], [0, 1]]), (shear, [[1, 1], [1, -1]]), (flexion, [[2, 0], [0, 2]])];
-        for (stiffness_n_per_m, reach) in kinds.into_iter().filter(|kind| kind.0 > 0.0) {
-            for [di, dj] in reach {
-                for i in 0..self.size[0] {
-                    for j in 0..self.size[1] {
-                        let (Some(i1), Some(j1)) = (i.checked_add_signed(di), j.checked_add_signed(dj)) else {
-                            continue;
-                        };
-                        if i1 >= self.size[0] || j1 >= self.size[1] {
-                            continue;
-                        }
-                        let ends = [i * self.size[1] + j, i1 * self.size[1] + j1];
-                        if !(self.free[ends[0]] || self.free[ends[1]]) {
-                            continue;
-                        }
-                        #[allow(clippy::cast_precision_loss)]
-                        let rest_m = self.model.unit_m * DVec3::new(di as f64, dj as f64, 0.0);
-                        let (tangent, force_n) = (DMat3::ZERO, DVec3::ZERO);
-                        self.springs.push(Spring { ends, rest_m, stiffness_n_per_m, tangent, force_n });
-                    }
-                }
-            }
-        }
+    /// The same, not turned.
+    pub fn new(model: &'m Model, footprint: &Footprint, window: Window, displacement_m: Vec<DVec3>) -> Self {
+        Self::turned(model, footprint, window, displacement_m, &DMat3::IDENTITY)
     }
 
     /// Forms the springs' tangents and forces where the points are.
     fn linearise(&mut self) {
-        let own = DMat3::from_diagonal(DVec3::splat(self.model.scene.virtual_stiffness_n_per_m));
+        let own = self.model.scene.virtual_stiffness_n_per_m;
         self.inverses.clear();
-        self.inverses.resize(self.free.len(), own);
+        self.inverses.extend(self.stiffness.iter().map(|part| DMat3::from_diagonal(DVec3::splat(own * part))));
         for spring in &mut self.springs {
             let [a, b] = spring.ends;
             let delta = self.displacement_m[b] - self.displacement_m[a];
@@ -293,8 +225,8 @@ impl<'m> Patch<'m> {
     /// K·x of three vectors at once.
     fn times(&self, x: &[Triple], product: &mut [Triple]) {
         let own = self.model.scene.virtual_stiffness_n_per_m;
-        for (product, x) in product.iter_mut().zip(x) {
-            *product = x.map(|x| own * x);
+        for ((product, x), part) in product.iter_mut().zip(x).zip(&self.stiffness) {
+            *product = x.map(|x| own * part * x);
         }
         for Spring { ends: [a, b], tangent, .. } in &self.springs {
             for system in 0..3 {
@@ -370,7 +302,9 @@ impl<'m> Patch<'m> {
         };
         let compliance = symmetric(compliance);
         let stiffness_n_per_m = if compliance.determinant() > 0.0 { compliance.inverse() } else { DMat3::ZERO };
-        let overlap = symmetric(|a, b| shapes.iter().map(|shape| shape[a].dot(shape[b])).sum());
+        // Damping is in proportion to the mass.
+        let overlap =
+            symmetric(|a, b| shapes.iter().zip(&self.masses).map(|(shape, mass)| mass * shape[a].dot(shape[b])).sum());
         let unit = stiffness_n_per_m * overlap * stiffness_n_per_m;
         let scene = &self.model.scene;
         Tangent {
@@ -384,16 +318,37 @@ impl<'m> Patch<'m> {
 
     /// Σ |∂u/∂x|², the mean of both directions.
     fn slopes(&self) -> f64 {
+        match &self.window {
+            Window::Grid { size, .. } => self.slopes_of_grid(*size),
+            Window::Ball(_) => self.slopes_along_springs(),
+        }
+    }
+
+    fn slopes_of_grid(&self, size: [usize; 2]) -> f64 {
         let spacing_m = self.model.unit_m;
         let mut sum = 0.0;
-        for i in 1..self.size[0].saturating_sub(1) {
-            for j in 1..self.size[1].saturating_sub(1) {
-                let at = i * self.size[1] + j;
+        for i in 1..size[0].saturating_sub(1) {
+            for j in 1..size[1].saturating_sub(1) {
+                let at = i * size[1] + j;
                 let slope = |step: usize| self.displacement_m[at + step] - self.displacement_m[at - step];
-                sum += slope(1).length_squared() + slope(self.size[1]).length_squared();
+                sum += slope(1).length_squared() + slope(size[1]).length_squared();
             }
         }
         sum / (8.0 * spacing_m * spacing_m)
+    }
+
+    /// At each point the mean over its springs.
+    fn slopes_along_springs(&self) -> f64 {
+        let mut of_points = vec![(0.0, 0.0); self.free.len()];
+        for Spring { ends: [a, b], rest_m, .. } in &self.springs {
+            let slope = (self.displacement_m[*b] - self.displacement_m[*a]).length_squared() / rest_m.length_squared();
+            for end in [*a, *b] {
+                of_points[end].0 += slope;
+                of_points[end].1 += 1.0;
+            }
+        }
+        let with_mass = of_points.iter().zip(&self.masses).filter(|((_, count), _)| *count > 0.0);
+        with_mass.map(|((slopes, count), mass)| mass * slopes / count).sum()
     }
 
     /// Brings the disc's z to `-depth_m` quasi-statically (Newton's method); the force on the disc, N.
@@ -405,7 +360,8 @@ impl<'m> Patch<'m> {
                 .displacement_m
                 .iter()
                 .zip(&self.weights)
-                .map(|(u, weight)| [-own * *u, *weight * DVec3::Z, DVec3::ZERO])
+                .zip(&self.stiffness)
+                .map(|((u, weight), part)| [-own * part * *u, *weight * DVec3::Z, DVec3::ZERO])
                 .collect();
             for spring in &self.springs {
                 right[spring.ends[0]][0] += spring.force_n;
@@ -446,7 +402,7 @@ fn symmetric(of: impl Fn(usize, usize) -> f64) -> DMat3 {
 
 /// A slow press by a disc of `radius_m` at `centre_m` (a place at rest), at `count` depths, `step_m` apart, from 0 on.
 pub fn press(model: &Model, radius_m: f64, centre_m: DVec3, step_m: f64, count: u32) -> Vec<Pressed> {
-    let course = Course { radius_m, centre_m, step_m, count };
+    let course = Course { radius_m, centre_m, step_m, count, points: usize::MAX };
     let mut press = Press::new(model, course, Accuracy::EXACT);
     let never = AtomicBool::new(false);
     while press.deepen(model, &never) == Deepened::Further {}
@@ -458,12 +414,14 @@ pub fn press(model: &Model, radius_m: f64, centre_m: DVec3, step_m: f64, count: 
 pub struct Course {
     /// Of the disc.
     pub radius_m: f64,
-    /// The middle of the disc at rest, m.
+    /// The middle of the disc at rest, m: the place of the surface that is nearest to this.
     pub centre_m: DVec3,
     /// From one depth to the next; the first is 0.
     pub step_m: f64,
     /// Number of depths.
     pub count: u32,
+    /// About how many points of a mesh are looked at; those beyond are held.
+    pub points: usize,
 }
 
 /// A slow press under way, one depth after another: between two of them whoever computes it may do something else.
@@ -471,6 +429,8 @@ pub struct Course {
 pub struct Press {
     footprint: Footprint,
     window: Window,
+    /// Turns the outward normal under the disc to z.
+    turn: DMat3,
     course: Course,
     accuracy: Accuracy,
     /// Springs times iterations that are left.
@@ -493,22 +453,22 @@ pub enum Deepened {
 impl Press {
     /// A press by a disc with any amount of work.
     pub fn new(model: &Model, course: Course, accuracy: Accuracy) -> Self {
-        let footprint = Footprint::new(model, course.radius_m, course.centre_m.truncate());
-        let window = Window::around(model, &footprint);
+        let footprint = Footprint::new(model, course.radius_m, course.centre_m);
+        let window = Window::at(model, course.radius_m, footprint.anchor_m(), course.points);
         memory::require(window.bytes(), "a force law");
-        let displacement_m = vec![DVec3::ZERO; window.size[0] * window.size[1]];
+        let (_, along) = footprint.surface(|_| DVec3::ZERO);
+        let turn = DMat3::from_quat(DQuat::from_rotation_arc(footprint.outward(&along), DVec3::Z));
+        let displacement_m = vec![DVec3::ZERO; window.len()];
         let (left, pressed) = (u64::MAX, Vec::new());
-        Press { footprint, window, course, accuracy, left, displacement_m, pressed }
+        Press { footprint, window, turn, course, accuracy, left, displacement_m, pressed }
     }
 
     /// The same with at most `work` springs times iterations; none if that can't suffice.
     pub fn within(model: &Model, course: Course, accuracy: Accuracy, work: u64) -> Option<Self> {
         // A solution takes as many iterations as there are points from the middle to where nothing is noticed, or nearly
         // so, and each depth some solutions: what can't be done is not begun, and no memory is taken for it.
-        // There is none yet for a mesh.
-        model.scene.sheet()?;
-        let [rows, columns] = Window::at(model, course.radius_m, course.centre_m.truncate()).size;
-        let least = (rows * columns) as u64 * 4 * u64::from(course.count) * (rows.max(columns) as u64);
+        let window = Window::at(model, course.radius_m, course.centre_m, course.points);
+        let least = window.len() as u64 * 4 * u64::from(course.count) * (window.across() as u64);
         (least <= work).then(|| Press { left: work, ..Self::new(model, course, accuracy) })
     }
 
@@ -529,7 +489,7 @@ impl Press {
         }
         let Some(depth_m) = self.next_depth_m() else { return Deepened::Done };
         let displacement_m = std::mem::take(&mut self.displacement_m);
-        let patch = Patch::new(model, &self.footprint, self.window, displacement_m);
+        let patch = Patch::turned(model, &self.footprint, self.window.clone(), displacement_m, &self.turn);
         let mut patch = Patch { accuracy: self.accuracy, allowance: Allowance::of(self.left, stop), ..patch };
         let force_n = if depth_m > 0.0 { patch.press(depth_m) } else { 0.0 };
         let tangent = patch.tangent();

@@ -37,7 +37,7 @@ PACKAGES = {"palpate": ".", "palpate-touch": "clients/touch"}
 UNIT = ("palpate", ["sheet::", "force_law::", "session::"])
 CONTACT = ("haptics", ["contact"])
 ORDER = {
-    "src/sheet": [UNIT, CONTACT, ("determinism", ["golden", "held"]), ("physics", []), ("reference", []), ("audit", [])],
+    "src/sheet": [("determinism", ["golden", "held"]), CONTACT, ("reference", []), UNIT, ("physics", []), ("audit", [])],
     "src/force_law": [UNIT, CONTACT, ("haptics", ["laws"])],
     "clients/touch/src": [("palpate_touch", []), ("rendering", []), UNIT, CONTACT, ("haptics", ["poses"])],
     "src/session": [
@@ -203,8 +203,12 @@ def limits(found, mutants):
     longest_s = {}
     for name, filters in {(name, tuple(filters)) for mutant in mutants for name, filters in order_of(mutant)}:
         begun_s = children_s()
-        if failed := run_tests(found[name], filters, 0, None):
-            sys.exit(f"The tests fail without a mutant: {name}: {failed}")
+        failed = run_tests(found[name], filters, 0, None)
+        if failed and run_tests(found[name], filters, 0, None):
+            # They tell nothing then: on a machine that is busy, servers may be too slow for their tests.
+            print(f"left out, because it fails without a mutant: {name}: {failed}", flush=True)
+            longest_s[name, filters] = None
+            continue
         taken_s = children_s() - begun_s
         longest_s[name, filters] = LONGEST_S + LONGEST_RATIO * taken_s
         print(f"{name} {' '.join(filters)}: {taken_s:.1f} s without a mutant", flush=True)
@@ -213,8 +217,10 @@ def limits(found, mutants):
 
 def tested(found, mutant, longest_s):
     """Runs the tests on a mutant until one fails."""
-    begun = time.time()
+    begun, failed = time.time(), None
     for name, filters in order_of(mutant):
+        if not longest_s[name, tuple(filters)]:
+            continue
         if failed := run_tests(found[name], filters, mutant["id"], longest_s[name, tuple(filters)]):
             break
     caught_by = f"{name}: {failed}" if failed else None

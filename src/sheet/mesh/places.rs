@@ -88,6 +88,19 @@ impl MeshPlaces {
         PointId::new(if vertex == NO_VERTEX { 0 } else { vertex as usize })
     }
 
+    /// The springs of a slot: the slot of the other end, the vector to it at rest in units of length, and k over that of an
+    /// edge.
+    pub(in crate::sheet) fn joined(&self, slot: usize) -> impl Iterator<Item = (usize, DVec3, f64)> + '_ {
+        let [mass, _] = self.relative(slot);
+        self.slots.springs(slot).iter().map(move |half| (half.to as usize, half.rest, half.stiffness * mass))
+    }
+
+    /// The mass of a slot over that of reference, and its extra K″/m over that of reference.
+    pub(in crate::sheet) fn relative(&self, slot: usize) -> [f64; 2] {
+        let of = |list: &[f64], otherwise| list.get(slot).copied().unwrap_or(otherwise);
+        [of(self.slots.masses(), 1.0), of(self.slots.extra(), 0.0)]
+    }
+
     /// Where the point of a slot rests, m.
     pub(in crate::sheet) fn rest_m(&self, slot: usize) -> DVec3 {
         self.rest_m[slot]

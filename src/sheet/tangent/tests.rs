@@ -3,6 +3,8 @@
 
 use std::sync::Arc;
 
+use glam::DVec2;
+
 use super::*;
 
 fn model(sets: &[&str]) -> Arc<Model> {
@@ -14,8 +16,8 @@ fn model(sets: &[&str]) -> Arc<Model> {
 fn patch<'m>(model: &'m Model, radius: f64, displacement_m: impl Fn([usize; 2]) -> DVec3) -> Patch<'m> {
     let sheet = model.scene.sheet().unwrap();
     let centre_m = 0.5 * sheet.extent_m() + DVec2::new(0.13, -0.21) * sheet.spacing_m;
-    let footprint = Footprint::new(model, radius * sheet.spacing_m, centre_m);
-    let window = Window { origin: [0, 0], size: model.points };
+    let footprint = Footprint::new(model, radius * sheet.spacing_m, centre_m.extend(0.0));
+    let window = Window::Grid { origin: [0, 0], size: model.points };
     let displacement_m = (0..model.len()).map(|index| displacement_m(model.point_of(index))).collect();
     Patch::new(model, &footprint, window, displacement_m)
 }
@@ -168,7 +170,7 @@ fn a_window_holds_all_that_notices_the_disc_and_not_much_more() {
     let model = model(&["sheet.points=[50, 44]", "virtual_springs.stiffness_n_per_m=10.0"]);
     let spacing_m = model.scene.sheet().unwrap().spacing_m;
     for (centre, radius) in [([22.3, 20.1], 5.5), ([3.0, 41.0], 2.0), ([24.0, 21.0], 0.3)] {
-        let footprint = Footprint::new(&model, radius * spacing_m, DVec2::from(centre) * spacing_m);
+        let footprint = Footprint::new(&model, radius * spacing_m, (DVec2::from(centre) * spacing_m).extend(0.0));
         let points: Vec<usize> = Window::around(&model, &footprint).points(&model).collect();
         assert!(points.is_sorted_by(|a, b| a < b) && points.last().is_some_and(|last| *last < model.len()));
         for index in 0..model.len() {

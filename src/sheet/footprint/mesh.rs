@@ -1,0 +1,89 @@
+//! A disc on a mesh: its place, found by walking, and by a search where a tool may have come near another part.
+
+use std::sync::Arc;
+
+use glam::{DVec2, DVec3};
+use palpate_mesh::surface::{Disc, Place};
+
+use crate::scene::MeshShape;
+use crate::shape::PointId;
+use crate::sheet::model::Model;
+
+/// A tool that touches nothing goes over to another place of the surface if that is nearer by this part of the radius: it
+/// must not hop to and fro between two.
+const NEARER: f64 = 0.1;
+
+/// A disc on a mesh, at a place.
+#[derive(Debug, Clone)]
+pub(super) struct MeshDisc {
+    shape: Arc<MeshShape>,
+    disc: Disc,
+    place: Place,
+}
+
+impl MeshDisc {
+    /// A disc anywhere.
+    pub(super) fn new(shape: &Arc<MeshShape>, radius_m: f64) -> Self {
+        let surface = shape.surface();
+        let nowhere = Place { triangle: 0, barycentric: [1.0 / 3.0; 3], frame: [DVec3::X, DVec3::Y] };
+        let place = surface.nearest(DVec3::ZERO).unwrap_or(nowhere);
+        MeshDisc { shape: shape.clone(), disc: Disc::new(radius_m, surface.edge_m()), place }
+    }
+
+    /// Where the place rests, m.
+    pub(super) fn anchor_m(&self) -> DVec3 {
+        self.shape.surface().at_m(&self.place)
+    }
+
+    /// The outward normal of its triangle at rest.
+    pub(super) fn outward(&self) -> DVec3 {
+        let [along, across] = self.place.frame;
+        along.cross(across)
+    }
+
+    pub(super) fn is_closed(&self) -> bool {
+        self.shape.surface().is_closed()
+    }
+
+    /// Goes to the place of the rest surface that is nearest to `at_m`.
+    pub(super) fn put(&mut self, at_m: DVec3) {
+        self.place = self.shape.surface().nearest(at_m).unwrap_or(self.place);
+    }
+
+    /// Walks by `by_m` in the directions of the place.
+    pub(super) fn walk(&mut self, by_m: DVec2) {
+        self.place = self.shape.surface().walk(&self.place, by_m);
+    }
+
+    /// Goes over to the place that is nearest to `place_m` by the rest surface, if the moved surface is nearer there than
+    /// where the disc is. Tells whether it did.
+    pub(super) fn leap(&mut self, model: &Model, place_m: DVec3, displacement_m: impl Fn([usize; 2]) -> DVec3) -> bool {
+        let (surface, Some(graph)) = (self.shape.surface(), &model.graph) else { return false };
+        let Some(other) = surface.nearest(place_m) else { return false };
+        let away_m = |place: &Place| {
+            let vertices = surface.triangle(place).map(|vertex| PointId::new(vertex as usize));
+            let moved_m: DVec3 = (0..3)
+                .map(|corner| {
+                    let point = model.point_of(graph.slot_of(vertices[corner]));
+                    place.barycentric[corner] * displacement_m(point)
+                })
+                .sum();
+            place_m.distance(surface.at_m(place) + moved_m)
+        };
+        let is_nearer = away_m(&other) < away_m(&self.place) - NEARER * self.disc.radius_m();
+        if is_nearer {
+            self.place = other;
+        }
+        is_nearer
+    }
+
+    /// The vertices that the disc covers, their weights, how these change with the place, and where they rest.
+    pub(super) fn cover(&mut self) -> impl Iterator<Item = (PointId, f64, DVec2, DVec3)> + '_ {
+        let surface = self.shape.surface();
+        self.disc.lay(surface, &self.place);
+        self.disc.covered().iter().map(|covered| {
+            let vertex = covered.vertex as usize;
+            (PointId::new(vertex), covered.weight, covered.gradient, surface.vertices_m()[vertex])
+        })
+    }
+}
