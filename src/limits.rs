@@ -21,6 +21,12 @@ pub struct Limits {
     pub trace_bytes: u64,
     /// Bytes of a file with a mesh.
     pub mesh_bytes: u64,
+    /// Vertices of a mesh that a client sends.
+    pub mesh_vertices: usize,
+    /// Meshes that a caller has sent, and that have not expired.
+    pub meshes_per_caller: usize,
+    /// A mesh that a client has sent is forgotten so long after its last part, s.
+    pub mesh_s: f64,
     /// Tools of a session: their numbers are below this.
     pub tools: u32,
     /// Commands that wait for their step, per tool.
@@ -112,6 +118,9 @@ impl Default for Limits {
             file_bytes: 16 << 20,
             trace_bytes: 64 << 20,
             mesh_bytes: 64 << 20,
+            mesh_vertices: 500_000,
+            meshes_per_caller: 8,
+            mesh_s: 600.0,
             tools: 64,
             queued_commands_per_tool: 4096,
             queued_samples: 64,

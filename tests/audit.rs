@@ -385,7 +385,7 @@ async fn a_correction_that_would_take_longer_than_a_scene_may_is_refused_and_tol
     let Source::Scene(scene) = coarse(true) else { unreachable!() };
     // Without rehearsals, which would find another scheme, a correction is more substeps of this one.
     let limits = Limits { rehearsal_work: 1, ..Limits::default() };
-    let model = Model::compile(&palpate::wire::scene::from_scene(&scene).unwrap(), &limits).unwrap();
+    let model = Model::compile(&palpate::wire::scene::from_scene(&scene, None).unwrap(), &limits).unwrap();
     // As long as the scene's own steps are predicted to take, and no longer.
     let periods = 1.000_001 * model.predicted_step_s() * model.scene.stepping.rate_hz;
     let folder = tempfile::tempdir().unwrap();

@@ -3,10 +3,12 @@
 
 mod common;
 
+use std::path::Path;
 use std::sync::Arc;
 
 use glam::DVec3;
 use palpate::limits::Limits;
+use palpate::scene::collection::find_scene;
 use palpate::scene::profile::Poke;
 use palpate::scene::{Body, Mesh, MeshShape, Scene};
 use palpate::shape::{PointId, RestShape};
@@ -243,4 +245,22 @@ fn a_mesh_sleeps_where_nothing_moves_and_wakes_where_something_does() {
         }
     }
     panic!("{} awake", sleeper.awake_points());
+}
+
+#[test]
+fn a_scene_on_a_mesh_is_found_by_its_name_with_the_file_beside_it() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("organ.obj"), "v 0 0 0\nv 50 0 0\nv 0 50 0\nv 50 50 0\nf 1 2 3\nf 2 4 3\n")
+        .unwrap();
+    let text = "[mesh]\nfile = \"organ.obj\"\nunit = \"mm\"\npoint_mass_kg = 0.01\n\
+                [springs]\nstiffness_n_per_m = 10.0\n[virtual_springs]\nstiffness_n_per_m = 5.0\n\
+                [damping]\ncoefficient_n_s_per_m = 0.05\n";
+    std::fs::write(folder.path().join("organ.toml"), text).unwrap();
+    let limits = Limits::default();
+    let by_name = find_scene(Path::new("organ"), folder.path(), &[], &limits).unwrap();
+    let by_path = find_scene(&folder.path().join("organ.toml"), Path::new("elsewhere"), &[], &limits).unwrap();
+    assert_eq!(by_name.shape().point_count(), 4);
+    assert_eq!(by_name, by_path);
+    let refused = Scene::parse("organ", text, &[], &limits).unwrap_err();
+    assert!(refused.to_string().contains("a scene that a client sends can't"), "{refused}");
 }

@@ -7,7 +7,7 @@ mod common;
 use common::{playing, script};
 use glam::DVec3;
 use palpate::limits::Limits;
-use palpate::scene::{Files, Integrator, Named, Scene};
+use palpate::scene::{Integrator, Named, Scene};
 use palpate::session::Session;
 use palpate::shape::PointName;
 use serde_json::Value;
@@ -58,8 +58,8 @@ fn scene_text(scene: &Value) -> String {
 fn scene_of(scene: &Value, assignments: &[&str]) -> Scene {
     let assignments: Vec<String> = assignments.iter().map(|text| (*text).to_owned()).collect();
     let folder = format!("{}/tests/reference", env!("CARGO_MANIFEST_DIR"));
-    let files = Files::In(std::path::Path::new(&folder));
-    Scene::parse_with("reference", &scene_text(scene), &assignments, files, &Limits::default()).unwrap()
+    let folder = std::path::Path::new(&folder);
+    Scene::parse_in(folder, "reference", &scene_text(scene), &assignments, &Limits::default()).unwrap()
 }
 
 /// Its forces and tool as a script.

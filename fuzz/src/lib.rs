@@ -111,7 +111,7 @@ pub const REQUESTS: &[(&str, Taker)] = &[
     ("CreateSessionRequest", |bytes| {
         use pb::create_session_request::Source;
         match pb::CreateSessionRequest::decode(bytes).map(|request| request.source) {
-            Ok(Some(Source::Scene(scene))) => wire::scene::from_scene(&scene).is_ok_and(|scene| step(&scene)),
+            Ok(Some(Source::Scene(scene))) => wire::scene::from_scene(&scene, None).is_ok_and(|scene| step(&scene)),
             other => other.is_ok(),
         }
     }),
@@ -141,10 +141,8 @@ pub const REQUESTS: &[(&str, Taker)] = &[
             let every = wire::every("every_steps", request.every_steps).is_ok();
             match &request.r#where {
                 Some(pb::probe_request::Where::Points(points)) => points.points.iter().all(|point| {
-                    model()
-                        .shape()
-                        .find("points", wire::from_point(point))
-                        .is_ok_and(|point| point.index() < model().len())
+                    let name = wire::from_point(Some(point), None).expect("a point has a name");
+                    model().shape().find("points", name).is_ok_and(|point| point.index() < model().len())
                 }),
                 _ => every,
             }
@@ -165,7 +163,7 @@ pub const REQUESTS: &[(&str, Taker)] = &[
         })
     }),
     // Of a client that writes what no request is.
-    ("", |bytes| pb::Scene::decode(bytes).is_ok_and(|scene| wire::scene::from_scene(&scene).is_ok())),
+    ("", |bytes| pb::Scene::decode(bytes).is_ok_and(|scene| wire::scene::from_scene(&scene, None).is_ok())),
 ];
 
 /// Every request of the protocol.
@@ -235,6 +233,7 @@ fn request_seeds() -> Vec<Vec<u8>> {
     });
     let position = pb::command::Action::Position(pb::Position {
         point: Some(point),
+        vertex: None,
         target: Some(pb::position::Target::DisplacementM(pb::Vector3 { x: 0.0, y: 0.0, z: -0.01 })),
     });
     let pose = pb::command::Action::Pose(pb::Pose {

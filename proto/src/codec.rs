@@ -17,6 +17,9 @@ const MOST_FIELDS_IN_ALL: usize = 1 << 16;
 /// Levels that are counted: more than any request has.
 const LEVELS: u32 = 16;
 
+/// A request without levels, whose bytes are any: they may look like a message of many fields.
+const OF_ONE_LEVEL: &str = "UploadMeshRequest";
+
 /// The protobuf codec with a bound on requests. Answers have no bound: a client trusts the server that it has chosen.
 pub struct BoundedCodec<T, U>(ProstCodec<T, U>);
 
@@ -41,14 +44,16 @@ where
     }
 
     fn decoder(&mut self) -> Self::Decoder {
-        BoundedDecoder { inner: self.0.decoder(), is_request: U::NAME.ends_with("Request") }
+        let levels = if U::NAME == OF_ONE_LEVEL { 0 } else { LEVELS };
+        BoundedDecoder { inner: self.0.decoder(), levels: U::NAME.ends_with("Request").then_some(levels) }
     }
 }
 
 /// The decoder of [`BoundedCodec`].
 pub struct BoundedDecoder<D> {
     inner: D,
-    is_request: bool,
+    /// Levels whose fields are counted; `None` if it decodes no requests.
+    levels: Option<u32>,
 }
 
 impl<D: Decoder<Error = Status>> Decoder for BoundedDecoder<D> {
@@ -57,11 +62,9 @@ impl<D: Decoder<Error = Status>> Decoder for BoundedDecoder<D> {
 
     fn decode(&mut self, buffer: &mut DecodeBuf<'_>) -> std::result::Result<Option<D::Item>, Status> {
         use bytes::Buf;
-        if !self.is_request {
-            return self.inner.decode(buffer);
-        }
+        let Some(levels) = self.levels else { return self.inner.decode(buffer) };
         // The buffer holds the message in one chunk.
-        check(buffer.chunk())?;
+        check(buffer.chunk(), levels)?;
         self.inner.decode(buffer).map_err(|status| {
             let message = format!("the message can't be decoded: {}", status.message());
             Refusal::new(Reason::Unreadable, "", message).into()
@@ -74,12 +77,12 @@ impl<D: Decoder<Error = Status>> Decoder for BoundedDecoder<D> {
 }
 
 /// Refuses a message with more fields than any valid request has.
-fn check(message: &[u8]) -> Result<()> {
+fn check(message: &[u8], levels: u32) -> Result<()> {
     let too_many = |what: &str, most: usize| {
         Refusal::new(Reason::TooLarge, "", format!("the message has more than {most} {what}: send it in parts"))
     };
     let mut left = MOST_FIELDS_IN_ALL;
-    match count(message, LEVELS, &mut left) {
+    match count(message, levels, &mut left) {
         _ if left == 0 => Err(too_many("fields in all", MOST_FIELDS_IN_ALL)),
         Some(own) if own > MOST_FIELDS => Err(too_many("fields or entries of its own", MOST_FIELDS)),
         // The decoder refuses malformed messages.
@@ -137,7 +140,7 @@ mod tests {
     use crate::pb;
 
     fn checked(message: &impl Message) -> Result<()> {
-        check(&message.encode_to_vec())
+        check(&message.encode_to_vec(), LEVELS)
     }
 
     #[test]

@@ -28,6 +28,7 @@ pub fn code(reason: Reason) -> Code {
         Reason::TimedOut => Code::DeadlineExceeded,
         Reason::UnknownScene
         | Reason::UnknownScript
+        | Reason::UnknownMesh
         | Reason::UnknownSession
         | Reason::SessionDeleted
         | Reason::UnknownViewer => Code::NotFound,

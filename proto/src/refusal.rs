@@ -52,6 +52,8 @@ reasons! {
     SessionHeld = "SESSION_HELD",
     /// The guard took the tissue back to an earlier state, and the effect of the command was lost.
     Recovered = "RECOVERED",
+    /// No mesh of that id, of this caller; or it has expired.
+    UnknownMesh = "UNKNOWN_MESH",
     /// No viewer of that id.
     UnknownViewer = "UNKNOWN_VIEWER",
     /// Another holds the tool.

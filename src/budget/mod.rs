@@ -42,11 +42,13 @@ pub enum Purpose {
     Connections,
     /// Force laws that sessions keep.
     Laws,
+    /// Meshes that clients have sent.
+    Meshes,
 }
 
 impl Purpose {
     /// All of them.
-    pub const ALL: [Purpose; 8] = [
+    pub const ALL: [Purpose; 9] = [
         Purpose::Session,
         Purpose::Change,
         Purpose::Frames,
@@ -55,6 +57,7 @@ impl Purpose {
         Purpose::Textures,
         Purpose::Connections,
         Purpose::Laws,
+        Purpose::Meshes,
     ];
 
     /// The name that metrics give it.
@@ -68,6 +71,7 @@ impl Purpose {
             Purpose::Textures => "textures",
             Purpose::Connections => "connections",
             Purpose::Laws => "laws",
+            Purpose::Meshes => "meshes",
         }
     }
 }

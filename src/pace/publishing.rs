@@ -20,7 +20,7 @@ use crate::session::local::StiffnessJob;
 use crate::session::recovery::describe;
 use crate::sheet::Hashing;
 use crate::sheet::audit::Mark;
-use crate::surface::Snapshot;
+use crate::surface::{MESH_ROW, Snapshot};
 
 /// What a hash is read from.
 enum Found {
@@ -152,9 +152,11 @@ impl Running {
     /// else is done by the encoder.
     pub(super) fn post(&self, encoder: &Encoder, viewers: Vec<(Arc<Viewer>, u64)>) {
         let model = &self.live.model;
+        // A frame of a mesh has whole rows.
+        let room = model.len().next_multiple_of(MESH_ROW);
         let copied = memory::attempt("", || {
-            let mut displacement_m = std::array::from_fn(|_| memory::with_room(model.len(), "a picture of the sheet"));
-            self.session.tissue().displacements_m(&mut displacement_m);
+            let mut displacement_m = std::array::from_fn(|_| memory::with_room(room, "a picture of the tissue"));
+            self.session.tissue().shown_displacements_m(&mut displacement_m);
             Ok(displacement_m)
         });
         let displacement_m = match copied {

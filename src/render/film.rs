@@ -77,7 +77,7 @@ impl<'a> Film<'a> {
     pub fn at(&mut self, step: u64) -> Result<Still, Failure> {
         self.advance(step)?;
         let mut displacement_m = std::array::from_fn(|_| Vec::new());
-        self.session.tissue().displacements_m(&mut displacement_m);
+        self.session.tissue().shown_displacements_m(&mut displacement_m);
         let model = self.session.model();
         // The force until now: at a jump, the one just before it.
         let before = step.saturating_sub(1);

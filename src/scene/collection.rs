@@ -130,7 +130,7 @@ pub fn find_scene(path: &Path, folder: &Path, assignments: &[String], limits: &L
     let Some(name) = name_in(path) else { return Scene::load(path, assignments, limits) };
     let scenes = Collection::new(Kind::Scene, folder).for_user();
     let (file, text) = scenes.text(name, &Collection::new(Kind::Script, Path::new(SCRIPTS)), limits)?;
-    Ok(Scene::parse(&file, &text, assignments, limits)?.found_in(folder))
+    Scene::parse_in(folder, &file, &text, assignments, limits)
 }
 
 /// The text of the script that a user gave, a file or the name of one in ./scripts or built in, after the name that refusals

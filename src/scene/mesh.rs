@@ -6,7 +6,7 @@ use std::sync::{Arc, OnceLock};
 
 use glam::{DQuat, DVec3};
 use palpate_mesh::surface::Surface;
-use palpate_mesh::{ReadLimits, TriangleMesh, Unit};
+use palpate_mesh::{Group, ReadLimits, TriangleMesh, Unit};
 
 use super::check::physical;
 use super::document::{Fields, Item, read_bytes};
@@ -52,11 +52,23 @@ pub struct MeshShape {
     extent: Extent,
     cells: Cells,
     surface: OnceLock<Surface>,
+    told: Told,
+}
+
+/// What clients are told of a mesh, and the tissue does not need.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Told {
+    /// How the scene says which vertices never move.
+    pub fixed: Fixed,
+    /// Texture coordinates of each vertex, if the file has them; at a seam, those of one side.
+    pub uv: Option<Vec<[f32; 2]>>,
+    /// Vertices with a name.
+    pub groups: Vec<Group>,
 }
 
 /// What files a scene may name.
 #[derive(Debug, Clone, Copy)]
-pub enum Files<'a> {
+pub(super) enum Files<'a> {
     /// None: it came from a client.
     None,
     /// Those in a folder.
@@ -97,13 +109,29 @@ impl Mesh {
         }
         let point_mass_kg = fields.required_number("point_mass_kg")?;
         let fixed = fields.item("fixed").map_or(Ok(Fixed::None), |item| Fixed::read(&item, &mesh))?;
-        let shape = MeshShape::new(mesh.vertices_m, mesh.triangles, |rim, place_m, vertex| match &fixed {
+        Self::of(mesh, point_mass_kg, fixed).map_err(|refusal| file.refuse(refusal.reason, refusal.message))
+    }
+
+    /// Of a mesh without springs of flexion.
+    ///
+    /// # Errors
+    /// As for [`MeshShape::new`].
+    pub fn of(mesh: TriangleMesh, point_mass_kg: f64, fixed: Fixed) -> Result<Self> {
+        // Corners are walked backwards: the first corner at a vertex tells.
+        let uv = mesh.uv.map(|uv| {
+            let mut of_vertex = vec![[0.0; 2]; mesh.vertices_m.len()];
+            for (triangle, corners) in mesh.triangles.iter().zip(uv).rev() {
+                triangle.iter().zip(corners).for_each(|(vertex, uv)| of_vertex[*vertex as usize] = uv);
+            }
+            of_vertex
+        });
+        let mut shape = MeshShape::new(mesh.vertices_m, mesh.triangles, |rim, place_m, vertex| match &fixed {
             Fixed::None => false,
             Fixed::Rim => rim,
-            Fixed::Group(members) => members.binary_search(&vertex).is_ok(),
+            Fixed::Group(group) => group.vertices.binary_search(&vertex).is_ok(),
             Fixed::Balls(balls) => balls.iter().any(|(centre_m, radius_m)| place_m.distance(*centre_m) <= *radius_m),
-        });
-        let shape = shape.map_err(|refusal| file.refuse(refusal.reason, refusal.message))?;
+        })?;
+        shape.told = Told { fixed, uv, groups: mesh.groups };
         Ok(Mesh::new(point_mass_kg, 0.0, Arc::new(shape)))
     }
 
@@ -159,12 +187,15 @@ impl Mesh {
 }
 
 /// Which vertices never move.
-enum Fixed {
+#[derive(Debug, Clone, Default, PartialEq)]
+pub enum Fixed {
+    /// None.
+    #[default]
     None,
     /// Those of edges with a single triangle.
     Rim,
-    /// Those of a group of the file, ascending.
-    Group(Vec<u32>),
+    /// Those of a group of the file.
+    Group(Group),
     /// Those within balls: centre and radius, m.
     Balls(Vec<(DVec3, f64)>),
 }
@@ -189,22 +220,24 @@ impl Fixed {
         }
         item.table(|fields| {
             let group = fields.required("group")?;
-            let name = group.text()?;
-            match mesh.groups.iter().find(|group| group.name == name) {
-                Some(found) => Ok(Fixed::Group(found.vertices.clone())),
-                None => {
-                    let meant = did_you_mean(&name, mesh.groups.iter().map(|group| group.name.as_str()));
-                    let names: Vec<&str> = mesh.groups.iter().map(|group| group.name.as_str()).take(8).collect();
-                    let all = if names.is_empty() {
-                        "it has none".to_owned()
-                    } else {
-                        format!("it has {}", names.join(", "))
-                    };
-                    let message = format!("`{}` is no group of the mesh{meant}; {all}", excerpt(&name));
-                    Err(group.refuse(Reason::WrongKind, message))
-                }
-            }
+            let found = Fixed::group("", &group.text()?, mesh);
+            found.map_err(|refusal| group.refuse(refusal.reason, refusal.message))
         })
+    }
+
+    /// The vertices of the group of that name.
+    ///
+    /// # Errors
+    /// Refuses a name that no group has; `field` is the name that the refusal gives.
+    pub fn group(field: &str, name: &str, mesh: &TriangleMesh) -> Result<Self> {
+        if let Some(found) = mesh.groups.iter().find(|group| group.name == name) {
+            return Ok(Fixed::Group(found.clone()));
+        }
+        let meant = did_you_mean(name, mesh.groups.iter().map(|group| group.name.as_str()));
+        let names: Vec<&str> = mesh.groups.iter().map(|group| group.name.as_str()).take(8).collect();
+        let all = if names.is_empty() { "it has none".to_owned() } else { format!("it has {}", names.join(", ")) };
+        let message = format!("`{}` is no group of the mesh{meant}; {all}", excerpt(name));
+        Err(Refusal::new(Reason::WrongKind, field, message))
     }
 }
 
@@ -307,7 +340,13 @@ impl MeshShape {
             extent,
             cells,
             surface: OnceLock::new(),
+            told: Told::default(),
         })
+    }
+
+    /// What clients are told of it.
+    pub fn told(&self) -> &Told {
+        &self.told
     }
 
     /// Where each vertex rests, m.

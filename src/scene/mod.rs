@@ -23,7 +23,8 @@ use crate::shape::{PointId, RestShape};
 use check::physical;
 use document::{Document, Fields, Item};
 use kind::Kind;
-pub use mesh::{Files, Mesh, MeshShape, Stiffest};
+use mesh::Files;
+pub use mesh::{Fixed as FixedVertices, Mesh, MeshShape, Stiffest, Told};
 pub use sheet::{Fixed, LEAST_WIDTH, PointSet, Sheet};
 
 /// The scene of the paper's figures, built in.
@@ -286,16 +287,19 @@ impl Scene {
     pub fn load(path: &Path, assignments: &[String], limits: &Limits) -> Result<Self> {
         let text = document::read_text(path, limits.file_bytes)?;
         let folder = path.parent().unwrap_or(Path::new(""));
-        let scene = Self::parse_with(&path.display().to_string(), &text, assignments, Files::In(folder), limits)?;
-        Ok(scene.found_in(folder))
+        Self::parse_in(folder, &path.display().to_string(), &text, assignments, limits)
     }
 
-    /// The same, with the paths of other files from `folder`, where its own is.
-    pub fn found_in(self, folder: &Path) -> Self {
-        Scene { appearance: self.appearance.within(folder), ..self }
+    /// Reads a scene whose paths of other files are from `folder`; `name` is what refusals call the text.
+    ///
+    /// # Errors
+    /// As for [`Scene::parse`]; refuses a file that can't be read.
+    pub fn parse_in(folder: &Path, name: &str, text: &str, assignments: &[String], limits: &Limits) -> Result<Self> {
+        let scene = Self::parse_with(name, text, assignments, Files::In(folder), limits)?;
+        Ok(Scene { appearance: scene.appearance.within(folder), ..scene })
     }
 
-    /// Reads a scene from TOML; `name` is what refusals call the text.
+    /// Reads a scene that names no other files, except for images; `name` is what refusals call the text.
     ///
     /// # Errors
     /// Refuses a text or an assignment that is not a valid scene.
@@ -303,17 +307,7 @@ impl Scene {
         Self::parse_with(name, text, assignments, Files::None, limits)
     }
 
-    /// The same; it may name `files`.
-    ///
-    /// # Errors
-    /// As for [`Scene::parse`]; refuses a file that can't be read.
-    pub fn parse_with(
-        name: &str,
-        text: &str,
-        assignments: &[String],
-        files: Files<'_>,
-        limits: &Limits,
-    ) -> Result<Self> {
+    fn parse_with(name: &str, text: &str, assignments: &[String], files: Files<'_>, limits: &Limits) -> Result<Self> {
         let mut document = Document::parse(name, text)?;
         Kind::Scene.check(&document)?;
         for assignment in assignments {

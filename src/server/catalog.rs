@@ -4,11 +4,11 @@ use std::path::Path;
 
 use crate::limits::Limits;
 use crate::refusal::Result;
+use crate::scene::Scene;
 use crate::scene::collection::Collection;
 use crate::scene::kind::Kind;
 use crate::scene::reader::fits;
 use crate::scene::script::Script;
-use crate::scene::{Files, Scene};
 
 /// Scenes and scripts by name.
 #[derive(Debug, Clone)]
@@ -48,8 +48,7 @@ impl Catalog {
     /// Returns an error if there is no such scene, or if it is invalid.
     pub fn load(&self, name: &str, assignments: &[String], limits: &Limits) -> Result<Scene> {
         let (file, text) = self.scenes.text(name, &self.scripts, limits)?;
-        let folder = self.scenes.folder();
-        Ok(Scene::parse_with(&file, &text, assignments, Files::In(folder), limits)?.found_in(folder))
+        Scene::parse_in(self.scenes.folder(), &file, &text, assignments, limits)
     }
 
     /// Loads the script of that name and binds it to a scene.

@@ -124,7 +124,7 @@ impl Config {
             ($($limit:ident)*) => { [$((concat!("limits.", stringify!($limit)), self.limits.$limit == 0),)*] };
         }
         let whole = whole!(
-            points substeps file_bytes trace_bytes mesh_bytes tools queued_commands_per_tool queued_samples queued_records
+            points substeps file_bytes trace_bytes mesh_bytes mesh_vertices meshes_per_caller tools queued_commands_per_tool queued_samples queued_records
             queued_bytes sessions points_in_all point_substeps_per_step streams_per_session frame_vertices texture_side
             probe_points connections connections_per_address streams_per_connection message_bytes
             connection_window_bytes queued_changes rehearsal_work law_work queued_work streams leases
@@ -157,6 +157,7 @@ impl Config {
             ("limits.open_s", self.limits.open_s),
             ("limits.keepalive_s", self.limits.keepalive_s),
             ("limits.work_s", self.limits.work_s),
+            ("limits.mesh_s", self.limits.mesh_s),
         ] {
             number(field, value, "above 0 and at most a day", within(day_s))?;
         }

@@ -32,9 +32,10 @@ use crate::scene::script::Action;
 use crate::session::command::Command;
 use crate::session::laws::{FIRST, Laws};
 use crate::session::lease::LeaseId;
+use crate::shape::{PointId, PointName, RestShape};
 use crate::wire;
 use palpate_proto::pb::haptic_service_server::HapticService;
-use palpate_proto::{pb, touch};
+use palpate_proto::{geometry, pb, touch};
 use palpate_touch::device::{Device, UNDECLARED_FORCE_N};
 
 #[derive(Clone)]
@@ -124,7 +125,10 @@ impl Haptics {
         let live = self.0.pacer.get(&open.session_id)?;
         let device = open.device.as_ref().map(touch::from_device).transpose()?;
         let tip = touch::from_tip(open.tip.as_ref());
-        check_tip("tip", live.model.shape(), &tip)?;
+        // A stream that neither renders nor says anything of a tip may push with forces on any tissue.
+        if device.is_some() || open.tip.is_some() {
+            check_tip("tip", live.model.shape(), &tip)?;
+        }
         let only = (!open.tools.is_empty()).then(|| open.tools.clone());
         let (every, deadband) = (open.sample_every_steps, open.deadband.as_ref());
         let mut sampling = wire::sample::sampling(every, only, deadband, open.heartbeat_s, device.is_some())?;
@@ -166,6 +170,21 @@ impl Haptics {
         info!(session = %live.id, tools = ?open.tools, holder = ?open.holder, "haptic stream opened");
         let notices = Notices::new(open.tools.clone(), step);
         Ok((Opened { answer, updates, samples, notices, guard }, held))
+    }
+
+    /// The points that a probe names.
+    fn probed(
+        &self,
+        field: &str,
+        shape: &dyn RestShape,
+        names: impl ExactSizeIterator<Item = PointName>,
+    ) -> Result<Vec<PointId>, Refusal> {
+        let limit = self.0.config.limits.probe_points;
+        if names.len() > limit {
+            let message = format!("are {}, above the limit of {limit}", names.len());
+            return Err(Refusal::new(Reason::TooLarge, field, message));
+        }
+        names.enumerate().map(|(index, name)| shape.find(&format!("{field}[{index}]"), name)).collect()
     }
 
     /// Reads what the client says until it ends.
@@ -537,19 +556,18 @@ impl HapticService for Haptics {
         let every = wire::every("every_steps", request.every_steps)?;
         let points = match &request.r#where {
             Some(Where::Points(named)) => {
-                let limit = self.0.config.limits.probe_points;
-                if named.points.len() > limit {
-                    let message = format!("are {}, above the limit of {limit}", named.points.len());
-                    return Err(Refusal::new(Reason::TooLarge, "points", message).into());
-                }
-                let mut points = Vec::with_capacity(named.points.len());
-                for (index, point) in named.points.iter().enumerate() {
-                    points.push(live.model.shape().find(&format!("points[{index}]"), wire::from_point(point))?);
-                }
-                Some(points)
+                let names = named.points.iter().map(|point| PointName::Point(geometry::from_point(point)));
+                Some(self.probed("points", live.model.shape(), names)?)
+            }
+            Some(Where::Vertices(named)) => {
+                let names = named.vertices.iter().map(|vertex| PointName::Vertex(*vertex));
+                Some(self.probed("vertices", live.model.shape(), names)?)
             }
             Some(Where::AllPoints(true)) => None,
-            _ => return Err(Refusal::new(Reason::Missing, "where", "points or all_points is missing").into()),
+            _ => {
+                let message = "points, vertices or all_points is missing";
+                return Err(Refusal::new(Reason::Missing, "where", message).into());
+            }
         };
         let guard = live.open_stream("Probe", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();

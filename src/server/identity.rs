@@ -97,6 +97,7 @@ pub const CALLS: &[(&str, Access)] = &[
     ("/palpate.v1.SessionService/PauseSession", Access::Role(Role::Create)),
     ("/palpate.v1.SessionService/StartSession", Access::Role(Role::Create)),
     ("/palpate.v1.SessionService/UpdateTissue", Access::Role(Role::Touch)),
+    ("/palpate.v1.SessionService/UploadMesh", Access::Role(Role::Create)),
     ("/palpate.v1.ViewService/AcknowledgeFrames", Access::Role(Role::Watch)),
     ("/palpate.v1.ViewService/GetMesh", Access::Role(Role::Watch)),
     ("/palpate.v1.ViewService/GetTexture", Access::Role(Role::Watch)),

@@ -16,6 +16,8 @@ mod health;
 pub mod identity;
 mod leases;
 mod listeners;
+mod mesh_parts;
+mod meshes;
 mod metrics;
 mod page;
 mod price;

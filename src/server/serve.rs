@@ -18,6 +18,7 @@ use super::config::Config;
 use super::connections::ConnectionSlots;
 use super::health::{SERVICES, end_health, report_files, report_workshop};
 use super::listeners::{Listeners, ServeError};
+use super::meshes::Meshes;
 use super::revocation::Calls;
 use super::services::Services;
 use super::textures::Textures;
@@ -26,6 +27,7 @@ use super::workshop::Workshop;
 use super::{admin, connections, descriptors, haptics, metrics, page, sessions, textures, views};
 use crate::budget::{Budget, give_back_to_the_system};
 use crate::pace::Pacer;
+use crate::pace::clock::now_ns;
 use palpate_proto::pb;
 use palpate_proto::pb::admin_service_server::AdminServiceServer;
 use palpate_proto::pb::haptic_service_server::HapticServiceServer;
@@ -93,12 +95,14 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
         origins: origins.clone(),
     };
     let config = Arc::new(config);
+    let meshes = Meshes::new(&limits);
     let textures = Textures::open(&config, &catalog, &pacer, &limits)?;
     let services = Services {
         catalog,
         pacer: pacer.clone(),
         config,
         textures: textures.clone(),
+        meshes: meshes.clone(),
         workshop: workshop.clone(),
         traffic: traffic.clone(),
     };
@@ -124,6 +128,7 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
             for session in unused.delete_idle() {
                 info!(session, "session deleted: it was idle");
             }
+            meshes.forget_expired(now_ns());
             let bytes = memory.bytes_taken();
             most_bytes = most_bytes.max(bytes);
             if most_bytes - bytes >= WORTH_GIVING_BACK {
@@ -142,7 +147,9 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
     let silence = Some(Duration::from_secs_f64(limits.keepalive_s));
     let bytes = limits.message_bytes;
     let pages = page::Page::of(services.config.viewer.clone());
-    let sessions = SessionServiceServer::new(sessions::Sessions(services.clone())).max_decoding_message_size(bytes);
+    // A part of a mesh may have as many bytes; its other fields have some as well.
+    let with_part = bytes.saturating_add(4096);
+    let sessions = SessionServiceServer::new(sessions::Sessions(services.clone())).max_decoding_message_size(with_part);
     let haptics = HapticServiceServer::new(haptics::Haptics(services.clone())).max_decoding_message_size(bytes);
     let admin =
         AdminServiceServer::new(admin::Admin { services: services.clone(), register }).max_decoding_message_size(bytes);

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use super::catalog::Catalog;
 use super::config::Config;
+use super::meshes::Meshes;
 use super::textures::Textures;
 use super::traffic::Traffic;
 use super::workshop::Workshop;
@@ -16,7 +17,8 @@ pub(crate) struct Services {
     pub(crate) catalog: Catalog,
     pub(crate) pacer: Arc<Pacer>,
     pub(crate) textures: Textures,
-    /// Creates and changes sessions, reads scripts and computes force laws.
+    pub(crate) meshes: Meshes,
+    /// Creates and changes sessions, reads meshes and scripts and computes force laws.
     pub(crate) workshop: Workshop,
     pub(crate) traffic: Arc<Traffic>,
 }

@@ -13,6 +13,7 @@ use tracing::{info, warn};
 use super::charged_caller::ChargedCaller;
 use super::connections::Peer;
 use super::cut::until_cut;
+use super::meshes;
 use super::services::Services;
 use super::status;
 use super::workshop::CancelFlag;
@@ -48,31 +49,59 @@ impl SessionService for Sessions {
         }
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let scene = match &request.source {
-            Some(Source::SceneName(name)) => self.0.catalog.load(name, &[], &self.0.config.limits)?,
-            Some(Source::Scene(scene)) => wire::scene::from_scene(scene).map_err(|refusal| refusal.within("scene"))?,
-            None => return Err(Refusal::new(Reason::Missing, "source", "scene_name or scene is missing").into()),
-        };
-        if scene.shape().dimensions() > 2 {
-            let message =
-                "is on a mesh: `palpate run` runs it offline; a server has no frames and no touch for meshes yet";
-            return Err(Refusal::new(Reason::NotAvailable, "scene_name", message).into());
-        }
         let most_s = self.0.config.idle_session_s;
         let idle_timeout_s = request.idle_timeout_s.unwrap_or(most_s);
         let range = format!("above 0 and at most {most_s}");
         number("idle_timeout_s", idle_timeout_s, &range, |value| value > 0.0 && value <= most_s)?;
-        // A large sheet takes a while to compile.
+        // A large tissue takes a while to read and to compile.
         let pacer = self.0.pacer.clone();
         let payer = account.clone();
-        let create =
-            move |cancel: &CancelFlag| pacer.create(&scene, request.paused, idle_timeout_s, &payer, cancel.flag());
+        let source = request.source;
+        let mesh = match &source {
+            Some(Source::Scene(pb::Scene { mesh: Some(mesh), .. })) => Some(self.0.meshes.get(&mesh.mesh_id, &account)?),
+            _ => None,
+        };
+        let (catalog, config) = (self.0.catalog.clone(), self.0.config.clone());
+        let create = move |cancel: &CancelFlag| {
+            let scene = match &source {
+                Some(Source::SceneName(name)) => catalog.load(name, &[], &config.limits)?,
+                Some(Source::Scene(scene)) => {
+                    let made = wire::scene::from_scene(scene, mesh.as_deref());
+                    made.map_err(|refusal| refusal.within("scene"))?
+                }
+                None => return Err(Refusal::new(Reason::Missing, "source", "scene_name or scene is missing")),
+            };
+            pacer.create(&scene, request.paused, idle_timeout_s, &payer, cancel.flag())
+        };
         let live = self.0.workshop.work(&account, create).await??;
         info!(session = %live.id, scene = %live.model.scene.name, points = live.model.len(), "session created");
         for warning in &live.model.warnings {
             warn!(session = %live.id, warning);
         }
         Ok(Response::new(pb::CreateSessionResponse { session: Some(status::session(&live)) }))
+    }
+
+    async fn upload_mesh(
+        &self,
+        request: Request<pb::UploadMeshRequest>,
+    ) -> Result<Response<pb::UploadMeshResponse>, Status> {
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
+        let request = request.into_inner();
+        let unit = if request.last { Some(meshes::unit(&request.unit)?) } else { None };
+        let mut answer = self.0.meshes.add(&request, &account)?;
+        let Some(unit) = unit else { return Ok(Response::new(answer)) };
+        let reading = self.0.meshes.read(&answer.mesh_id, &account)?;
+        let read = move |cancel: &CancelFlag| reading.finish(unit, request.repair, cancel.flag());
+        let report = self.0.workshop.work(&account, read).await??;
+        info!(
+            caller = account.name(),
+            bytes = answer.received_bytes,
+            vertices = report.vertices,
+            refused = report.refused,
+            "mesh received"
+        );
+        answer.report = Some(report);
+        Ok(Response::new(answer))
     }
 
     async fn get_session(

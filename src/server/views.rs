@@ -12,6 +12,7 @@ use tracing::info;
 
 use super::charged_caller::ChargedCaller;
 use super::cut::until_cut;
+use super::mesh_parts::mesh_part;
 use super::services::Services;
 use crate::ids::random_id;
 use crate::pace::frames::Viewer;
@@ -75,8 +76,9 @@ impl ViewService for Views {
         let grid = Refinement::new(&live.model.scene, request.refinement, &self.0.config.limits)?;
         let guard = live.open_stream("GetMesh", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
-        let out = stream::unfold((0, guard), move |(part, guard)| async move {
-            mesh_part(grid, part).map(|message| (Ok(message), (part + 1, guard)))
+        let model = live.model.clone();
+        let out = stream::unfold((0, guard, model), move |(part, guard, model)| async move {
+            mesh_part(&model, grid, part).map(|message| (Ok(message), (part + 1, guard, model)))
         });
         Ok(Response::new(until_cut(out, cut)))
     }
@@ -151,43 +153,5 @@ impl ViewService for Views {
     }
 }
 
-/// Vertices of one message: with positions and texture coordinates 40 KiB.
-const VERTICES_PER_PART: usize = 2048;
-
 /// Bytes of a texture in one message.
 const BYTES_PER_PART: usize = 64 << 10;
-
-/// Cells of one message, two triangles each: at most 60 KiB.
-const CELLS_PER_PART: usize = 2048;
-
-/// Part `part` of a mesh: first the vertices, then the triangles.
-#[allow(clippy::cast_possible_truncation)]
-fn mesh_part(grid: Refinement, part: usize) -> Option<pb::GetMeshResponse> {
-    let [nx, ny] = grid.vertices();
-    let (vertices, cells) = (grid.vertex_count(), grid.cell_count());
-    let vertex_parts = vertices.div_ceil(VERTICES_PER_PART);
-    let parts = vertex_parts + cells.div_ceil(CELLS_PER_PART);
-    if part >= parts {
-        return None;
-    }
-    let mut message = pb::GetMeshResponse {
-        vertices_x: nx as u32,
-        vertices_y: ny as u32,
-        vertex_spacing_m: grid.spacing_m(),
-        last: part + 1 == parts,
-        ..Default::default()
-    };
-    if part < vertex_parts {
-        let first = part * VERTICES_PER_PART;
-        for vertex in first..(first + VERTICES_PER_PART).min(vertices) {
-            message.rest_position_m.extend(grid.rest_m(vertex).as_vec3().to_array());
-            message.texture_coordinates.extend(grid.texture_at(vertex).as_vec2().to_array());
-        }
-    } else {
-        let first = (part - vertex_parts) * CELLS_PER_PART;
-        for cell in first..(first + CELLS_PER_PART).min(cells) {
-            message.triangles.extend(grid.triangles(cell).map(|vertex| vertex as u32));
-        }
-    }
-    Some(message)
-}

@@ -189,6 +189,14 @@ impl Model {
         self.graph.as_ref().map_or(point.index(), |graph| graph.slot_of(point))
     }
 
+    /// The vertices of a mesh in the order in which frames show them, that of memory, which keeps neighbours together; and
+    /// the place of each vertex in that order. `None` for a sheet, which is shown in the order of its points.
+    pub fn shown_order(&self) -> Option<[&[u32]; 2]> {
+        let slots = &self.graph.as_ref()?.slots;
+        // What is empty is at the end.
+        Some([&slots.vertex_of()[..self.len()], slots.slot_of()])
+    }
+
     /// The point at a place in memory; of an empty one, any.
     pub(super) fn point_at(&self, index: usize) -> PointId {
         self.graph.as_ref().map_or(PointId::new(index), |graph| graph.point_in(index))

@@ -427,17 +427,27 @@ impl<T: Real> Tissue for Sheet<T> {
     }
 
     fn displacements_m(&self, into: &mut [Vec<f32>; 3]) {
+        if self.model.graph.is_none() {
+            return self.shown_displacements_m(into);
+        }
+        let spacing = T::of(self.model.unit_m);
+        #[allow(clippy::cast_possible_truncation)]
+        let metres = |u: &T| (*u * spacing).wide() as f32;
+        for (c, into) in into.iter_mut().enumerate() {
+            into.clear();
+            let layout = self.tables.layout;
+            let place = |point| c * layout.plane + layout.offset(self.model.place_of(point));
+            into.extend(self.model.points().map(|point| metres(&self.state.u[place(point)])));
+        }
+    }
+
+    fn shown_displacements_m(&self, into: &mut [Vec<f32>; 3]) {
         let Layout { rows, columns, stride, plane } = self.tables.layout;
         let spacing = T::of(self.model.unit_m);
         #[allow(clippy::cast_possible_truncation)]
         let metres = |u: &T| (*u * spacing).wide() as f32;
         for (c, into) in into.iter_mut().enumerate() {
             into.clear();
-            if self.model.graph.is_some() {
-                let place = |point| c * plane + self.tables.layout.offset(self.model.place_of(point));
-                into.extend(self.model.points().map(|point| metres(&self.state.u[place(point)])));
-                continue;
-            }
             for i in 0..rows {
                 let from = c * plane + i * stride;
                 into.extend(self.state.u[from..from + columns].iter().map(metres));

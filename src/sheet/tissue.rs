@@ -139,6 +139,9 @@ pub trait Tissue: Send {
     fn largest_displacement_m(&self) -> f64;
     /// Writes the displacements, m, with x, y and z in separate vectors, in the order of the points.
     fn displacements_m(&self, into: &mut [Vec<f32>; 3]);
+    /// The same in the order in which frames show them ([`Model::shown_order`]), with zeros where a frame of a mesh has
+    /// places without a vertex.
+    fn shown_displacements_m(&self, into: &mut [Vec<f32>; 3]);
     /// Blocks of at most 16 points, in the order in which they are hashed.
     fn hash_block_count(&self) -> usize;
     /// Adds some of these blocks to a hash: all that the future of each point depends on.

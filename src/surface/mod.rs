@@ -1,4 +1,5 @@
-//! Frames for viewers: the sheet refined by bilinear interpolation, encoded, in patches.
+//! Frames for viewers: the sheet refined by bilinear interpolation, or the vertices of a mesh as they are, encoded, in
+//! patches.
 
 pub mod encode;
 pub mod refine;
@@ -7,7 +8,7 @@ pub mod tiles;
 mod wide;
 
 pub use encode::{Encoding, Frame, encode, encode_over};
-pub use refine::{LARGEST_REFINEMENT, Refinement};
+pub use refine::{LARGEST_REFINEMENT, MESH_ROW, Refinement};
 pub use snapshot::Snapshot;
 pub use tiles::FrameTiles;
 

@@ -9,8 +9,8 @@ use super::wide::{Available, LANES, SixteenLanes};
 use crate::limits::Limits;
 use crate::memory;
 use crate::refusal::{Reason, Refusal, Result};
-use crate::scene::{Scene, Sheet};
-use crate::shape::PointId;
+use crate::scene::{Body, Scene, Sheet};
+use crate::shape::{PointId, RestShape};
 
 /// The name of buffers in messages.
 const ROW: &str = "a row of a frame";
@@ -18,10 +18,22 @@ const ROW: &str = "a row of a frame";
 /// The largest n.
 pub const LARGEST_REFINEMENT: u32 = 10;
 
+/// Vertices of a mesh in a row of a frame. 16 rows are a tile, and a tile of the sleeping logic.
+pub const MESH_ROW: usize = 16;
+
+/// The points of a scene as a frame has them, along x and y, and their distance at rest, m. Those of a mesh are in rows, in
+/// an order that keeps neighbours together; the last row may have places without a vertex.
+pub(super) fn grid(scene: &Scene) -> ([usize; 2], f64) {
+    match &scene.body {
+        Body::Sheet(Sheet { points, spacing_m, .. }) => (*points, *spacing_m),
+        Body::Mesh(mesh) => ([mesh.shape.point_count().div_ceil(MESH_ROW), MESH_ROW], mesh.shape.edge_m()),
+    }
+}
+
 /// A refined grid.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Refinement {
-    /// Points of the sheet along x and y.
+    /// Points along x and y; of a mesh, rows and places of a row.
     pub(super) points: [usize; 2],
     /// Their distance at rest, m.
     point_spacing_m: f64,
@@ -39,11 +51,12 @@ impl Refinement {
             let message = format!("must be from 0 to {LARGEST_REFINEMENT}, but is {n}");
             return Err(Refusal::new(Reason::OutOfRange, "refinement", message));
         }
-        let Some(Sheet { points, spacing_m, .. }) = scene.sheet().cloned() else {
-            let message = "there are no frames of a mesh yet: probe or sample its points";
-            return Err(Refusal::new(Reason::NotAvailable, "", message));
-        };
-        let refinement = Refinement { points, point_spacing_m: spacing_m, between: n as usize };
+        if n > 0 && scene.sheet().is_none() {
+            let message = format!("must be 0 on a mesh, which is shown by its own vertices, but is {n}");
+            return Err(Refusal::new(Reason::OutOfRange, "refinement", message));
+        }
+        let (points, point_spacing_m) = grid(scene);
+        let refinement = Refinement { points, point_spacing_m, between: n as usize };
         let [x, y] = refinement.vertices();
         if x * y > limits.frame_vertices {
             let message = format!("makes {x} × {y} vertices, above the limit of {} in all", limits.frame_vertices);

@@ -4,7 +4,7 @@
 
 use std::sync::OnceLock;
 
-use super::refine::Points;
+use super::refine::{Points, grid};
 use super::wide::{Available, LANES, SixteenLanes, Width, Work};
 use crate::scene::Scene;
 
@@ -15,23 +15,21 @@ pub struct Snapshot {
     pub step: u64,
     /// Simulated time, s.
     pub simulation_time_s: f64,
-    /// Displacements, m: x, y and z separate, point [i, j] at i·ny + j.
+    /// Displacements, m: x, y and z separate, point [i, j] at i·ny + j; of a mesh in the order in which frames show it.
     pub(super) displacement_m: [Vec<f32>; 3],
     /// The least and the greatest of each component, m, once somebody wants to know.
     box_m: OnceLock<[[f32; 2]; 3]>,
-    /// Points along x and y.
+    /// Points along x and y; of a mesh, rows and places of a row.
     pub(super) points: [usize; 2],
     /// Distance between points, m.
     pub(super) spacing_m: f64,
 }
 
 impl Snapshot {
-    /// Creates a snapshot of the tissue of a scene. `displacement_m` has a value for each point and component, m.
+    /// Creates a snapshot of the tissue of a scene. `displacement_m` has a value for each place of a frame and component, m
+    /// (`Tissue::shown_displacements_m`).
     pub fn new(scene: &Scene, step: u64, simulation_time_s: f64, displacement_m: [Vec<f32>; 3]) -> Self {
-        let (points, spacing_m) = match scene.sheet() {
-            Some(sheet) => (sheet.points, sheet.spacing_m),
-            None => ([scene.shape().point_count(), 1], scene.shape().edge_m()),
-        };
+        let (points, spacing_m) = grid(scene);
         Snapshot { step, simulation_time_s, displacement_m, box_m: OnceLock::new(), points, spacing_m }
     }
 

@@ -1,32 +1,37 @@
 //! Conversion of commands.
 
-use glam::{DQuat, DVec3};
-use palpate_proto::geometry::{from_place, from_vector, vector};
+use glam::{DQuat, DVec2, DVec3};
+use palpate_proto::geometry::{self, from_place, from_vector, vector};
 use palpate_proto::pb;
 use palpate_proto::touch::{from_tip, pose};
 use palpate_touch::Tip;
 
 use super::{from_point, point, required};
-use crate::refusal::{Result, number};
+use crate::refusal::{Reason, Refusal, Result, number};
 use crate::scene::profile::Poke;
 use crate::scene::script::Action;
 use crate::session::command::Command;
-use crate::shape::RestShape;
+use crate::shape::{PointId, PointName, RestShape};
 
 /// The command in a message that arrived at `arrival_ns`.
 ///
 /// # Errors
-/// Returns an error if a field is missing, a point is not on the sheet, or an orientation is not of length 1.
+/// Returns an error if a field is missing, a point or place is not on the tissue, or an orientation is not of length 1.
 pub fn from_command(message: &pb::Command, shape: &dyn RestShape, arrival_ns: u64) -> Result<Command> {
     use pb::command::Action as Message;
     let action = match required("action", message.action.as_ref())? {
         Message::Force(force) => {
             let (point, centre_m) = match required("force.centre", force.centre.as_ref())? {
                 pb::force::Centre::Point(at) => {
-                    let point = shape.find("force.point", from_point(at))?;
+                    let point = shape.find("force.point", PointName::Point(geometry::from_point(at)))?;
                     (Some(point), shape.rest_m(point))
                 }
-                pb::force::Centre::CentreM(place) => (None, from_place(place).extend(0.0)),
+                pb::force::Centre::Vertex(vertex) => {
+                    let point = shape.find("force.vertex", PointName::Vertex(*vertex))?;
+                    (Some(point), shape.rest_m(point))
+                }
+                pb::force::Centre::CentreM(place) => (None, on_sheet(shape, from_place(place))?),
+                pb::force::Centre::AtM(place) => (None, at(shape, from_vector(Some(place)))?),
             };
             let force_n = from_vector(force.force_n.as_ref());
             let falloff_per_m = force.falloff_per_m.unwrap_or_else(|| Tip::default().radius_m.recip());
@@ -34,8 +39,7 @@ pub fn from_command(message: &pb::Command, shape: &dyn RestShape, arrival_ns: u6
             Action::Push(Poke { point, centre_m, force_n, falloff_per_m, falloff_offset })
         }
         Message::Position(position) => {
-            let name = from_point(required("position.point", position.point.as_ref())?);
-            let point = shape.find("position.point", name)?;
+            let point = grasped(shape, position)?;
             let displacement_m = match required("position.target", position.target.as_ref())? {
                 pb::position::Target::DisplacementM(displacement) => from_vector(Some(displacement)),
                 pb::position::Target::PositionM(place) => from_vector(Some(place)) - shape.rest_m(point),
@@ -56,6 +60,36 @@ pub fn from_command(message: &pb::Command, shape: &dyn RestShape, arrival_ns: u6
     })
 }
 
+/// The place of a force in the rest plane of a sheet.
+fn on_sheet(shape: &dyn RestShape, place_m: DVec2) -> Result<DVec3> {
+    if shape.dimensions() > 2 {
+        let message = "is a place in the plane of a sheet; on a mesh give `vertex`, or `at_m`, a place in space";
+        return Err(Refusal::new(Reason::WrongKind, "force.centre_m", message));
+    }
+    Ok(place_m.extend(0.0))
+}
+
+/// The place of a force in space: on a sheet, the nearest one in its rest plane.
+fn at(shape: &dyn RestShape, place_m: DVec3) -> Result<DVec3> {
+    shape.check_place("force.at_m", place_m)?;
+    Ok(if shape.dimensions() == 2 { place_m.truncate().extend(0.0) } else { place_m })
+}
+
+/// The point that a tool has grasped.
+fn grasped(shape: &dyn RestShape, position: &pb::Position) -> Result<PointId> {
+    let (point, vertex) = (position.point.as_ref(), position.vertex);
+    if point.is_some() && vertex.is_some() {
+        let message = "does not go with `position.point`: a tool grasps a point of a sheet or a vertex of a mesh";
+        return Err(Refusal::new(Reason::WrongKind, "position.vertex", message));
+    }
+    let field = match (vertex, shape.dimensions()) {
+        (Some(_), _) => "position.vertex",
+        (None, 3) if point.is_none() => "position.vertex",
+        _ => "position.point",
+    };
+    shape.find(field, required(field, from_point(point, vertex))?)
+}
+
 /// The position of a pose's tip, m.
 fn from_pose(pose: &pb::Pose) -> Result<DVec3> {
     let position_m = from_vector(required("pose.position_m", pose.position_m.as_ref()).map(Some)?);
@@ -73,17 +107,27 @@ pub fn scripted(shape: &dyn RestShape, tool: usize, at_step: u64, action: &Actio
     let action = match action {
         Action::Push(poke) => Message::Force(pb::Force {
             centre: Some(match poke.point {
-                Some(at) => pb::force::Centre::Point(point(shape.name(at))),
-                None => pb::force::Centre::CentreM(pb::Vector2 { x: poke.centre_m.x, y: poke.centre_m.y }),
+                Some(at) => match shape.name(at) {
+                    PointName::Point(at) => pb::force::Centre::Point(geometry::point(at)),
+                    PointName::Vertex(vertex) => pb::force::Centre::Vertex(vertex),
+                },
+                None => {
+                    let DVec3 { x, y, z } = poke.centre_m;
+                    match shape.dimensions() {
+                        2 => pb::force::Centre::CentreM(pb::Vector2 { x, y }),
+                        _ => pb::force::Centre::AtM(pb::Vector3 { x, y, z }),
+                    }
+                }
             }),
             force_n: vector(poke.force_n),
             falloff_per_m: Some(poke.falloff_per_m),
             falloff_offset: Some(poke.falloff_offset),
         }),
-        Action::Grasp { point: at, displacement_m: DVec3 { x, y, z } } => Message::Position(pb::Position {
-            point: Some(point(shape.name(*at))),
-            target: Some(pb::position::Target::DisplacementM(pb::Vector3 { x: *x, y: *y, z: *z })),
-        }),
+        Action::Grasp { point: at, displacement_m: DVec3 { x, y, z } } => {
+            let (point, vertex) = point(shape.name(*at));
+            let target = Some(pb::position::Target::DisplacementM(pb::Vector3 { x: *x, y: *y, z: *z }));
+            Message::Position(pb::Position { point, vertex, target })
+        }
         Action::Pose { place_m, tip } => Message::Pose(pose(*place_m, tip)),
         Action::Release => Message::Release(pb::Release {}),
     };

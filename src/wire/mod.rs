@@ -29,18 +29,33 @@ pub fn every(field: &str, steps: Option<u32>) -> Result<u64> {
     }
 }
 
-/// The name of a mass point as a message.
-pub fn point(name: PointName) -> pb::GridPoint {
+/// The name of a mass point as a message: the fields `point` and `vertex`.
+pub fn point(name: PointName) -> (Option<pb::GridPoint>, Option<u32>) {
     match name {
-        PointName::Point(place) => geometry::point(place),
-        // Until the protocol has vertices: as the first of two indices.
-        PointName::Vertex(vertex) => pb::GridPoint { x: vertex, y: 0 },
+        PointName::Point(place) => (Some(geometry::point(place)), None),
+        PointName::Vertex(vertex) => (None, Some(vertex)),
     }
 }
 
-/// The name of a mass point in a message.
-pub fn from_point(point: &pb::GridPoint) -> PointName {
-    PointName::Point(geometry::from_point(point))
+/// The name of a mass point in the fields `point` and `vertex` of a message; `None` if neither is there.
+pub fn from_point(point: Option<&pb::GridPoint>, vertex: Option<u32>) -> Option<PointName> {
+    let vertex = vertex.map(PointName::Vertex);
+    vertex.or_else(|| point.map(|point| PointName::Point(geometry::from_point(point))))
+}
+
+/// Some mass points of a tissue as the subject of a probe.
+pub fn probed(names: impl Iterator<Item = PointName>) -> pb::probe_request::Where {
+    let (mut points, mut vertices) = (Vec::new(), Vec::new());
+    for name in names {
+        let (point, vertex) = self::point(name);
+        points.extend(point);
+        vertices.extend(vertex);
+    }
+    if vertices.is_empty() {
+        pb::probe_request::Where::Points(pb::GridPoints { points })
+    } else {
+        pb::probe_request::Where::Vertices(pb::Vertices { vertices })
+    }
 }
 
 /// Where a tissue rests, as a message.

@@ -7,7 +7,7 @@ use crate::refusal::{Reason, Refusal, Result};
 use crate::scene::record::{EnergyJ, Point, Record, Recovery, ToolRecord};
 use crate::session::ToolSample;
 use crate::session::sampling::{Deadband, HEARTBEAT_S, Sampling};
-use crate::shape::RestShape;
+use crate::shape::{PointName, RestShape};
 use crate::surface::Encoding;
 use crate::surface::encode::Patch;
 use palpate_proto::geometry::{from_vector, vector};
@@ -68,6 +68,7 @@ pub fn sample(paced: &PacedSample, shape: &dyn RestShape, dropped: u64, now_ns: 
 
 fn tool_sample(tool: &ToolSample, shape: &dyn RestShape, due_ns: u64, now_ns: u64) -> pb::ToolSample {
     let contact = tool.contact.as_ref();
+    let (point, vertex) = contact.map(|contact| point(shape.name(contact.point))).unwrap_or_default();
     let since_arrival_ns = |at_ns: u64| if tool.arrival_ns == 0 { 0 } else { at_ns.saturating_sub(tool.arrival_ns) };
     pb::ToolSample {
         tool: tool.tool,
@@ -75,7 +76,8 @@ fn tool_sample(tool: &ToolSample, shape: &dyn RestShape, due_ns: u64, now_ns: u6
         client_time_ns: tool.client_time_ns,
         server_hold_ns: since_arrival_ns(now_ns),
         step_wait_ns: since_arrival_ns(due_ns),
-        point: contact.map(|contact| point(shape.name(contact.point))),
+        point,
+        vertex,
         displacement_m: contact.and_then(|contact| vector(contact.displacement_m)),
         surface_displacement_m: contact.and_then(|contact| vector(contact.surface_displacement_m)),
         velocity_m_per_s: contact.and_then(|contact| vector(contact.velocity_m_per_s)),
@@ -134,8 +136,10 @@ pub fn record(paced: &Recorded, dropped: u64, part: usize) -> Option<pb::ProbeRe
 
 fn point_record(record: &Point) -> pb::PointRecord {
     let vector = |v: [f64; 3]| vector(v.into());
+    let (point, vertex) = point(record.name);
     pb::PointRecord {
-        point: Some(point(record.name)),
+        point,
+        vertex,
         displacement_m: vector(record.displacement_m),
         velocity_m_per_s: vector(record.velocity_m_per_s),
         spring_n: vector(record.spring_n),
@@ -161,7 +165,7 @@ pub fn add_to_record(record: &mut Record, message: &pb::ProbeResponse) -> bool {
     let array = |v: &Option<pb::Vector3>| from_vector(v.as_ref()).to_array();
     record.time_s = message.simulation_time_s;
     record.points.extend(message.points.iter().map(|point| Point {
-        name: from_point(&point.point.unwrap_or_default()),
+        name: from_point(point.point.as_ref(), point.vertex).unwrap_or(PointName::Point([0, 0])),
         displacement_m: array(&point.displacement_m),
         velocity_m_per_s: array(&point.velocity_m_per_s),
         spring_n: array(&point.spring_n),

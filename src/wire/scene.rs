@@ -1,35 +1,37 @@
 //! Conversion of scenes: the fields and defaults of a scene file. Ranges are checked when the scene is compiled.
 
-use palpate_proto::geometry::{from_point, point};
+use glam::DVec3;
+use palpate_mesh::TriangleMesh;
+use palpate_proto::geometry::{from_point, from_vector, point, vector};
 use palpate_proto::pb;
 
 use super::required;
-use crate::refusal::{Reason, Refusal, Result};
+use crate::refusal::{Reason, Refusal, Result, finite, number, positive};
 use crate::scene::{
-    Appearance, Body, Change, Fixed, Integrator, Lanes, Named, PointSet, Precision, Scene, Sheet, Springs, Stepping,
+    Appearance, Body, Change, Fixed, FixedVertices, Integrator, Lanes, Mesh, Named, PointSet, Precision, Scene, Sheet,
+    Springs, Stepping,
 };
 
-/// The scene in a message.
+/// The scene in a message. A scene on a mesh names the `mesh` that its client has sent before.
 ///
 /// # Errors
-/// Returns an error if a required field is missing, or if a name or set is unknown.
-pub fn from_scene(message: &pb::Scene) -> Result<Scene> {
-    let sheet = required("sheet", message.sheet.as_ref())?;
+/// Returns an error if a required field is missing, if a name or set is unknown, or if the mesh is missing.
+pub fn from_scene(message: &pb::Scene, mesh: Option<&TriangleMesh>) -> Result<Scene> {
     let springs = required("springs", message.springs.as_ref())?;
     let virtual_springs = required("virtual_springs", message.virtual_springs.as_ref())?;
     let damping = required("damping", message.damping.as_ref())?;
     let stiffness_n_per_m = required("springs.stiffness_n_per_m", springs.stiffness_n_per_m)?;
+    let body = match &message.mesh {
+        None => Body::Sheet(from_sheet(required("sheet", message.sheet.as_ref())?, springs)?),
+        Some(_) if message.sheet.is_some() => {
+            let message = "does not go with `sheet`: a tissue is one of them";
+            return Err(Refusal::new(Reason::WrongKind, "mesh", message));
+        }
+        Some(of_mesh) => Body::Mesh(from_mesh(of_mesh, springs, required("mesh.mesh_id", mesh)?)?),
+    };
     Ok(Scene {
         name: if message.name.is_empty() { "unnamed".to_owned() } else { message.name.clone() },
-        body: Body::Sheet(Sheet {
-            points: [
-                required("sheet.points_x", sheet.points_x)? as usize,
-                required("sheet.points_y", sheet.points_y)? as usize,
-            ],
-            spacing_m: required("sheet.spacing_m", sheet.spacing_m)?,
-            point_mass_kg: required("sheet.point_mass_kg", sheet.point_mass_kg)?,
-            fixed: from_fixed(sheet.fixed.as_ref())?,
-        }),
+        body,
         springs: Springs {
             stiffness_n_per_m,
             shear_stiffness_n_per_m: springs.shear_stiffness_n_per_m.unwrap_or(stiffness_n_per_m),
@@ -41,6 +43,49 @@ pub fn from_scene(message: &pb::Scene) -> Result<Scene> {
         sleep_tolerance: message.sleep.as_ref().and_then(|sleep| sleep.tolerance),
         appearance: Appearance::default(),
     })
+}
+
+fn from_sheet(sheet: &pb::Sheet, springs: &pb::Springs) -> Result<Sheet> {
+    if springs.flexion_factor.is_some() {
+        let message = "is for meshes: a sheet has springs of flexion (`flexion`) or none";
+        return Err(Refusal::new(Reason::WrongKind, "springs.flexion_factor", message));
+    }
+    Ok(Sheet {
+        points: [
+            required("sheet.points_x", sheet.points_x)? as usize,
+            required("sheet.points_y", sheet.points_y)? as usize,
+        ],
+        spacing_m: required("sheet.spacing_m", sheet.spacing_m)?,
+        point_mass_kg: required("sheet.point_mass_kg", sheet.point_mass_kg)?,
+        fixed: from_fixed(sheet.fixed.as_ref())?,
+    })
+}
+
+fn from_mesh(message: &pb::Mesh, springs: &pb::Springs, mesh: &TriangleMesh) -> Result<Mesh> {
+    if springs.shear_stiffness_n_per_m.is_some() {
+        let message = "is for sheets: the edges of a mesh resist shear as well";
+        return Err(Refusal::new(Reason::WrongKind, "springs.shear_stiffness_n_per_m", message));
+    }
+    let flexion = springs.flexion_factor.unwrap_or(if springs.flexion { 1.0 } else { 0.0 });
+    let flexion = number("springs.flexion_factor", flexion, "from 0 to 10", |v| (0.0..=10.0).contains(&v))?;
+    let point_mass_kg = required("mesh.point_mass_kg", message.point_mass_kg)?;
+    let fixed = match &message.fixed {
+        None | Some(pb::mesh::Fixed::FixedRim(false)) => FixedVertices::None,
+        Some(pb::mesh::Fixed::FixedRim(true)) => FixedVertices::Rim,
+        Some(pb::mesh::Fixed::FixedGroup(name)) => FixedVertices::group("mesh.fixed_group", name, mesh)?,
+        Some(pb::mesh::Fixed::FixedBalls(balls)) => {
+            let ball = |ball: &pb::Ball| {
+                let centre_m = from_vector(required("mesh.fixed_balls.centre_m", ball.centre_m.as_ref()).map(Some)?);
+                for component in centre_m.to_array() {
+                    finite("mesh.fixed_balls.centre_m", component)?;
+                }
+                Ok((centre_m, positive("mesh.fixed_balls.radius_m", ball.radius_m)?))
+            };
+            FixedVertices::Balls(balls.balls.iter().map(ball).collect::<Result<_>>()?)
+        }
+    };
+    let made = Mesh::of(mesh.clone(), point_mass_kg, fixed)?;
+    Ok(if flexion > 0.0 { Mesh::new(point_mass_kg, flexion, made.shape) } else { made })
 }
 
 fn from_fixed(fixed: Option<&pb::sheet::Fixed>) -> Result<Fixed> {
@@ -95,13 +140,20 @@ pub fn update_tissue(session_id: &str, change: &Change, step: u64) -> pb::Update
 
 /// A scene as a message, with all defaults filled in.
 pub fn scene(scene: &Scene) -> pb::Scene {
+    let of_mesh = match &scene.body {
+        Body::Mesh(mesh) => Some(mesh),
+        Body::Sheet(_) => None,
+    };
     pb::Scene {
         name: scene.name.clone(),
         sheet: scene.sheet().map(sheet),
+        mesh: of_mesh.map(mesh),
         springs: Some(pb::Springs {
             stiffness_n_per_m: Some(scene.springs.stiffness_n_per_m),
-            shear_stiffness_n_per_m: Some(scene.springs.shear_stiffness_n_per_m),
+            // The edges of a mesh resist shear as well.
+            shear_stiffness_n_per_m: scene.sheet().map(|_| scene.springs.shear_stiffness_n_per_m),
             flexion: scene.springs.flexion,
+            flexion_factor: of_mesh.map(|mesh| mesh.flexion),
         }),
         virtual_springs: Some(pb::VirtualSprings { stiffness_n_per_m: Some(scene.virtual_stiffness_n_per_m) }),
         damping: Some(pb::Damping { coefficient_n_s_per_m: Some(scene.damping_n_s_per_m) }),
@@ -115,6 +167,20 @@ pub fn scene(scene: &Scene) -> pb::Scene {
         }),
         sleep: scene.sleep_tolerance.map(|tolerance| pb::Sleep { tolerance: Some(tolerance) }),
     }
+}
+
+/// A mesh as a message, without its vertices.
+fn mesh(mesh: &Mesh) -> pb::Mesh {
+    let ball = |(centre_m, radius_m): &(DVec3, f64)| pb::Ball { centre_m: vector(*centre_m), radius_m: *radius_m };
+    let fixed = match &mesh.shape.told().fixed {
+        FixedVertices::None => None,
+        FixedVertices::Rim => Some(pb::mesh::Fixed::FixedRim(true)),
+        FixedVertices::Group(group) => Some(pb::mesh::Fixed::FixedGroup(group.name.clone())),
+        FixedVertices::Balls(balls) => {
+            Some(pb::mesh::Fixed::FixedBalls(pb::Balls { balls: balls.iter().map(ball).collect() }))
+        }
+    };
+    pb::Mesh { mesh_id: String::new(), point_mass_kg: Some(mesh.point_mass_kg), vertices: None, fixed }
 }
 
 /// A sheet as a message.
@@ -145,7 +211,7 @@ mod tests {
         let points = |points: &[[usize; 2]]| Fixed::Points(points.iter().copied().collect());
         for fixed in [Fixed::Edges, Fixed::Corners, points(&[]), points(&[[30, 0], [1, 2], [30, 0]])] {
             paper.sheet_mut().unwrap().fixed = fixed;
-            assert_eq!(from_scene(&scene(&paper)).unwrap(), paper);
+            assert_eq!(from_scene(&scene(&paper), None).unwrap(), paper);
         }
     }
 
@@ -175,7 +241,7 @@ mod tests {
         let paper = Scene::parse("paper", crate::scene::PAPER, &[], &Limits::default()).unwrap();
         let mut message = scene(&paper);
         message.damping = Some(pb::Damping::default());
-        let refusal = from_scene(&message).unwrap_err();
+        let refusal = from_scene(&message, None).unwrap_err();
         assert_eq!((refusal.reason, refusal.field.as_str()), (Reason::Missing, "damping.coefficient_n_s_per_m"));
     }
 }

@@ -317,6 +317,7 @@ pub fn force(tool: u32, sequence: u64, z_n: f64) -> pb::Command {
 pub fn position(tool: u32, sequence: u64, z_m: f64) -> pb::Command {
     let position = pb::Position {
         point: Some(pb::GridPoint { x: 15, y: 15 }),
+        vertex: None,
         target: Some(pb::position::Target::DisplacementM(pb::Vector3 { x: 0.0, y: 0.0, z: z_m })),
     };
     let sequence = Some(sequence);

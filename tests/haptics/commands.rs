@@ -74,7 +74,7 @@ async fn bad_commands_are_refused_with_a_reason_and_change_nothing() {
             |c| {
                 let point = Some(pb::GridPoint { x: 0, y: 99 });
                 let target = Some(pb::position::Target::DisplacementM(pb::Vector3::default()));
-                to_position(c, pb::Position { point, target });
+                to_position(c, pb::Position { point, target, vertex: None });
             },
             "OFF_SHEET",
             "position.point",
@@ -83,7 +83,7 @@ async fn bad_commands_are_refused_with_a_reason_and_change_nothing() {
             |c| {
                 let point = Some(pb::GridPoint { x: 1, y: 1 });
                 let target = Some(pb::position::Target::PositionM(pb::Vector3 { x: 1e6, y: 0.0, z: 0.0 }));
-                to_position(c, pb::Position { point, target });
+                to_position(c, pb::Position { point, target, vertex: None });
             },
             "OUT_OF_RANGE",
             "position",

@@ -241,7 +241,7 @@ async fn another_tissue_brings_its_law_which_models_then_name() {
     .unwrap_or_else(|_| panic!("models that named each law: {named:?}"));
     assert_eq!(named[0], 0, "a law that was replaced");
     // It is the law of the tissue as the session has it.
-    let scene = wire::scene::from_scene(&changed.session.unwrap().scene.unwrap()).unwrap();
+    let scene = wire::scene::from_scene(&changed.session.unwrap().scene.unwrap(), None).unwrap();
     assert_eq!((scene.springs.stiffness_n_per_m, scene.virtual_stiffness_n_per_m), (20.0, 10.0));
     let exact = force_law::exact(&model(&scene), 0.005);
     assert_eq!(laws[3], exact);

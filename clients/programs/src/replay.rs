@@ -295,9 +295,7 @@ async fn play(
     let mut haptics = HapticServiceClient::new(channel.clone());
     let probe = pb::ProbeRequest {
         session_id: session_id.clone(),
-        r#where: Some(pb::probe_request::Where::Points(pb::GridPoints {
-            points: script.sample_points.iter().map(|point| wire::point(script.shape.name(*point))).collect(),
-        })),
+        r#where: Some(wire::probed(script.sample_points.iter().map(|point| script.shape.name(*point)))),
         every_steps: Some(script.sample_every.try_into().unwrap_or(u32::MAX)),
         energy: true,
         tools: !script.poses.is_empty(),

@@ -11,7 +11,6 @@ use crate::memory;
 use crate::scene::Mesh;
 use crate::shape::{PointId, RestShape};
 use crate::sheet::field::BLOCK;
-use crate::sheet::region::TILE;
 
 /// The slots of a mesh, and where they are in space.
 #[derive(Debug)]
@@ -141,6 +140,3 @@ impl MeshPlaces {
         self.around.len()
     }
 }
-
-// A row of slots is a row of the tiles' memory.
-const _: () = assert!(TILE_SLOTS == TILE * BLOCK);

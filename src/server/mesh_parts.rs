@@ -1,0 +1,107 @@
+//! The vertices and triangles of a tissue at rest, in parts, as viewers get them.
+
+use palpate_proto::pb;
+
+use crate::scene::{Body, MeshShape};
+use crate::shape::RestShape;
+use crate::sheet::Model;
+use crate::surface::{MESH_ROW, Refinement};
+
+/// Vertices of one message: with positions and texture coordinates 40 KiB.
+const VERTICES_PER_PART: usize = 2048;
+
+/// Triangles of one message: at most 60 KiB.
+const TRIANGLES_PER_PART: usize = 4096;
+
+/// Vertices of groups in one message: at most 16 KiB.
+const MEMBERS_PER_PART: usize = 4096;
+
+/// Part `part` of a tissue's surface: first the vertices, then the triangles. `None` after the last.
+pub(super) fn mesh_part(model: &Model, grid: Refinement, part: usize) -> Option<pb::GetMeshResponse> {
+    match (&model.scene.body, model.shown_order()) {
+        (Body::Mesh(mesh), Some(order)) => part_of_mesh(&mesh.shape, order, part),
+        _ => part_of_sheet(grid, part),
+    }
+}
+
+#[allow(clippy::cast_possible_truncation)]
+fn part_of_sheet(grid: Refinement, part: usize) -> Option<pb::GetMeshResponse> {
+    const CELLS_PER_PART: usize = TRIANGLES_PER_PART / 2;
+    let [nx, ny] = grid.vertices();
+    let (vertices, cells) = (grid.vertex_count(), grid.cell_count());
+    let vertex_parts = vertices.div_ceil(VERTICES_PER_PART);
+    let parts = vertex_parts + cells.div_ceil(CELLS_PER_PART);
+    if part >= parts {
+        return None;
+    }
+    let mut message = pb::GetMeshResponse {
+        vertices_x: nx as u32,
+        vertices_y: ny as u32,
+        vertex_spacing_m: grid.spacing_m(),
+        last: part + 1 == parts,
+        ..Default::default()
+    };
+    if part < vertex_parts {
+        let first = part * VERTICES_PER_PART;
+        for vertex in first..(first + VERTICES_PER_PART).min(vertices) {
+            message.rest_position_m.extend(grid.rest_m(vertex).as_vec3().to_array());
+            message.texture_coordinates.extend(grid.texture_at(vertex).as_vec2().to_array());
+        }
+    } else {
+        let first = (part - vertex_parts) * CELLS_PER_PART;
+        for cell in first..(first + CELLS_PER_PART).min(cells) {
+            message.triangles.extend(grid.triangles(cell).map(|vertex| vertex as u32));
+        }
+    }
+    Some(message)
+}
+
+/// The same of a mesh, whose vertices are in the order of its frames. The groups are in the first parts.
+#[allow(clippy::cast_possible_truncation)]
+fn part_of_mesh(shape: &MeshShape, [order, place_of]: [&[u32]; 2], part: usize) -> Option<pb::GetMeshResponse> {
+    let (told, triangles) = (shape.told(), shape.triangles());
+    let (vertices, members) = (order.len(), told.groups.iter().map(|group| group.vertices.len()).sum::<usize>());
+    let vertex_parts = vertices.div_ceil(VERTICES_PER_PART);
+    let parts = (vertex_parts + triangles.len().div_ceil(TRIANGLES_PER_PART)).max(members.div_ceil(MEMBERS_PER_PART));
+    if part >= parts {
+        return None;
+    }
+    let mut message = pb::GetMeshResponse {
+        vertices_x: vertices.div_ceil(MESH_ROW) as u32,
+        vertices_y: MESH_ROW as u32,
+        vertex_spacing_m: shape.edge_m(),
+        groups: groups(shape, part),
+        last: part + 1 == parts,
+        ..Default::default()
+    };
+    if part < vertex_parts {
+        let first = part * VERTICES_PER_PART;
+        for vertex in &order[first..(first + VERTICES_PER_PART).min(vertices)] {
+            message.rest_position_m.extend(shape.vertices_m()[*vertex as usize].as_vec3().to_array());
+            message.texture_coordinates.extend(told.uv.iter().flat_map(|uv| uv[*vertex as usize]));
+            message.file_vertex.push(*vertex);
+        }
+    } else {
+        let first = ((part - vertex_parts) * TRIANGLES_PER_PART).min(triangles.len());
+        for triangle in &triangles[first..(first + TRIANGLES_PER_PART).min(triangles.len())] {
+            message.triangles.extend(triangle.map(|vertex| place_of[vertex as usize]));
+        }
+    }
+    Some(message)
+}
+
+/// What part `part` has of the groups: the vertices of all of them in succession are cut into parts of the same length.
+fn groups(shape: &MeshShape, part: usize) -> Vec<pb::VertexGroup> {
+    let (from, to) = (part * MEMBERS_PER_PART, (part + 1) * MEMBERS_PER_PART);
+    let mut begin = 0;
+    let mut found = Vec::new();
+    for group in &shape.told().groups {
+        let end = begin + group.vertices.len();
+        if begin < to && end > from {
+            let vertices = group.vertices[from.max(begin) - begin..to.min(end) - begin].to_vec();
+            found.push(pb::VertexGroup { name: group.name.clone(), vertices });
+        }
+        begin = end;
+    }
+    found
+}

@@ -1,0 +1,454 @@
+//! Meshes that clients send: in parts, kept in memory for a while, each for the caller who has sent it.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+
+use glam::DVec3;
+use palpate_mesh::repair::{Repair, repair};
+use palpate_mesh::report::{Finding, report_within};
+use palpate_mesh::{Element, MeshError, ReadLimits, TriangleMesh, Unit};
+use palpate_proto::geometry::vector;
+use palpate_proto::pb;
+
+use crate::budget::{Account, Purpose, Resource, Taken};
+use crate::ids::random_id;
+use crate::limits::Limits;
+use crate::lock::lock;
+use crate::memory;
+use crate::pace::clock::now_ns;
+use crate::refusal::{Reason, Refusal, Result, excerpt};
+use crate::shape::Extent;
+use crate::sheet::choice::given_up;
+use crate::wire;
+
+/// Triangles for each vertex that a mesh may have: a closed surface has two.
+const TRIANGLES_PER_VERTEX: usize = 4;
+
+/// Memory for reading and checking a mesh, in bytes of its file: a vertex or triangle takes at least a dozen bytes there.
+const READING: u64 = 12;
+
+/// Groups whose names a report tells.
+const GROUPS_TOLD: usize = 1000;
+
+/// A mesh that a client is sending or has sent.
+struct Upload {
+    id: String,
+    name: String,
+    state: State,
+    /// When the last part came.
+    touched_ns: u64,
+    taken: Taken,
+}
+
+enum State {
+    /// What has come so far.
+    Receiving(Vec<u8>),
+    /// A job reads it.
+    Reading,
+    /// It can be used.
+    Ready(Arc<TriangleMesh>),
+}
+
+struct Shared {
+    uploads: Mutex<Vec<Upload>>,
+    most_bytes: u64,
+    vertices: usize,
+    most_each: usize,
+    kept_ns: u64,
+}
+
+/// The meshes of all clients.
+#[derive(Clone)]
+pub(crate) struct Meshes(Arc<Shared>);
+
+/// The unit in a request.
+///
+/// # Errors
+/// Refuses what is no unit.
+pub(super) fn unit(text: &str) -> Result<Unit> {
+    if text.is_empty() {
+        let message = "is missing: mesh files do not state theirs; \"m\", \"cm\", \"mm\" or so many metres";
+        return Err(Refusal::new(Reason::Missing, "unit", message));
+    }
+    text.parse().map_err(|_| {
+        let message = format!("must be \"m\", \"cm\", \"mm\" or so many metres, but is `{}`", excerpt(text));
+        Refusal::new(Reason::WrongKind, "unit", message)
+    })
+}
+
+impl Meshes {
+    /// None yet.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    pub(super) fn new(limits: &Limits) -> Self {
+        Meshes(Arc::new(Shared {
+            uploads: Mutex::default(),
+            most_bytes: limits.mesh_bytes,
+            vertices: limits.mesh_vertices.min(limits.points),
+            most_each: limits.meshes_per_caller,
+            kept_ns: (limits.mesh_s * 1e9) as u64,
+        }))
+    }
+
+    /// Adds a part of a file, the first of a new one if it names no mesh.
+    ///
+    /// # Errors
+    /// Refuses a part that does not follow what has come before, a mesh that this caller is not sending, and more than the
+    /// limits or the caller's part of the memory allow.
+    pub(super) fn add(&self, request: &pb::UploadMeshRequest, account: &Account) -> Result<pb::UploadMeshResponse> {
+        let now = now_ns();
+        self.forget_expired(now);
+        let mut uploads = lock(&self.0.uploads);
+        let index = if request.mesh_id.is_empty() {
+            self.make_room(&mut uploads, account)?;
+            let taken = account.take(Resource::Memory(Purpose::Meshes), 0, "part")?;
+            let (id, name, state) = (random_id()?, name_of(&request.file_name), State::Receiving(Vec::new()));
+            uploads.push(Upload { id, name, state, touched_ns: now, taken });
+            uploads.len() - 1
+        } else {
+            find(&uploads, &request.mesh_id, account)?
+        };
+        let upload = &mut uploads[index];
+        let added = upload.add(request, self.0.most_bytes);
+        upload.touched_ns = now;
+        match added {
+            Ok(received_bytes) => {
+                Ok(pb::UploadMeshResponse { mesh_id: upload.id.clone(), received_bytes, report: None })
+            }
+            Err(refusal) => {
+                // One that has not begun well can't be named by its client.
+                if request.mesh_id.is_empty() || refusal.reason == Reason::TooLarge {
+                    uploads.swap_remove(index);
+                }
+                Err(refusal)
+            }
+        }
+    }
+
+    /// Makes room for a further mesh of a caller: its oldest one that has come in full gives way.
+    fn make_room(&self, uploads: &mut Vec<Upload>, account: &Account) -> Result<()> {
+        let of_caller = || uploads.iter().enumerate().filter(|(_, upload)| upload.is_of(account));
+        if of_caller().count() < self.0.most_each {
+            return Ok(());
+        }
+        let ready = of_caller().filter(|(_, upload)| matches!(upload.state, State::Ready(_)));
+        let Some((oldest, _)) = ready.min_by_key(|(_, upload)| upload.touched_ns) else {
+            let message = format!(
+                "this caller is sending {} meshes already (limits.meshes_per_caller); finish one, or wait until one has \
+                 expired",
+                self.0.most_each
+            );
+            return Err(Refusal::new(Reason::TooMany, "", message));
+        };
+        uploads.swap_remove(oldest);
+        Ok(())
+    }
+
+    /// Takes a file that has come in full, to read it. If what this returns is dropped, the file is gone.
+    ///
+    /// # Errors
+    /// Refuses a mesh that this caller is not sending.
+    pub(super) fn read(&self, id: &str, account: &Account) -> Result<Reading> {
+        let mut uploads = lock(&self.0.uploads);
+        let index = find(&uploads, id, account)?;
+        let upload = &mut uploads[index];
+        match std::mem::replace(&mut upload.state, State::Reading) {
+            State::Receiving(bytes) => {
+                Ok(Reading { meshes: self.clone(), id: id.to_owned(), name: upload.name.clone(), bytes })
+            }
+            state => {
+                upload.state = state;
+                Err(complete())
+            }
+        }
+    }
+
+    /// A mesh that this caller has sent.
+    ///
+    /// # Errors
+    /// Refuses one that this caller has not sent, or not in full, and one that has expired.
+    pub(super) fn get(&self, id: &str, account: &Account) -> Result<Arc<TriangleMesh>> {
+        if id.is_empty() {
+            let message = "is missing: a client sends its mesh with UploadMesh, which tells its mesh_id";
+            return Err(Refusal::new(Reason::Missing, "scene.mesh.mesh_id", message));
+        }
+        self.forget_expired(now_ns());
+        let uploads = lock(&self.0.uploads);
+        let index = find(&uploads, id, account).map_err(|refusal| refusal.within("scene.mesh"))?;
+        match &uploads[index].state {
+            State::Ready(mesh) => Ok(mesh.clone()),
+            State::Receiving(_) | State::Reading => {
+                let message = "has not come in full: its last part is missing, or is being read";
+                Err(Refusal::new(Reason::OutOfTurn, "scene.mesh.mesh_id", message))
+            }
+        }
+    }
+
+    /// Forgets the meshes whose last part came too long ago.
+    pub(super) fn forget_expired(&self, now_ns: u64) {
+        lock(&self.0.uploads).retain(|upload| now_ns.saturating_sub(upload.touched_ns) < self.0.kept_ns);
+    }
+
+    fn limits(&self) -> ReadLimits {
+        ReadLimits {
+            bytes: usize::try_from(self.0.most_bytes).unwrap_or(usize::MAX),
+            vertices: self.0.vertices,
+            triangles: self.0.vertices.saturating_mul(TRIANGLES_PER_VERTEX),
+        }
+    }
+
+    /// Takes more memory for a mesh, or gives some back.
+    fn charge(&self, id: &str, bytes: u64) -> Result<()> {
+        match lock(&self.0.uploads).iter_mut().find(|upload| upload.id == id) {
+            Some(upload) => {
+                upload.taken.shrink_to(bytes);
+                upload.taken.grow_to(bytes, "part")
+            }
+            None => Err(unknown()),
+        }
+    }
+}
+
+/// What refusals call a file: not its folders, and of a long name the end, which tells the format.
+fn name_of(file_name: &str) -> String {
+    let name = file_name.rsplit(['/', '\\']).next().unwrap_or_default();
+    let skipped = name.chars().count().saturating_sub(64);
+    let end: String = name.chars().skip(skipped).collect();
+    if end.is_empty() { "the mesh".to_owned() } else { end }
+}
+
+/// The upload of that id and caller.
+fn find(uploads: &[Upload], id: &str, account: &Account) -> Result<usize> {
+    uploads.iter().position(|upload| upload.id == id && upload.is_of(account)).ok_or_else(unknown)
+}
+
+fn unknown() -> Refusal {
+    let message = "is of no mesh that this caller has sent, or it has expired: send the mesh again, from its first part";
+    Refusal::new(Reason::UnknownMesh, "mesh_id", message)
+}
+
+fn complete() -> Refusal {
+    Refusal::new(Reason::OutOfTurn, "mesh_id", "has come in full already: no further part follows")
+}
+
+impl Upload {
+    fn is_of(&self, account: &Account) -> bool {
+        self.taken.account().number() == account.number()
+    }
+
+    /// Adds a part; returns how many bytes there are now.
+    fn add(&mut self, request: &pb::UploadMeshRequest, most_bytes: u64) -> Result<u64> {
+        let State::Receiving(bytes) = &mut self.state else { return Err(complete()) };
+        let length = bytes.len() as u64;
+        if request.offset != length {
+            let message = format!("must be {length}, the bytes that have come so far, but is {}", request.offset);
+            return Err(Refusal::new(Reason::OutOfTurn, "offset", message));
+        }
+        let sum = length + request.part.len() as u64;
+        if sum > most_bytes {
+            let message = format!("makes {sum} bytes, above the limit of {most_bytes} (limits.mesh_bytes)");
+            return Err(Refusal::new(Reason::TooLarge, "part", message));
+        }
+        if request.part.is_empty() && !request.last {
+            return Err(Refusal::new(Reason::Missing, "part", "is empty, and is not the last"));
+        }
+        // What a vector takes that grows.
+        self.taken.grow_to(2 * sum, "part")?;
+        if bytes.try_reserve(request.part.len()).is_err() {
+            return Err(Refusal::new(Reason::Overloaded, "part", "the system has no memory for it"));
+        }
+        bytes.extend_from_slice(&request.part);
+        Ok(sum)
+    }
+}
+
+/// A file that is being read.
+pub(super) struct Reading {
+    meshes: Meshes,
+    id: String,
+    name: String,
+    bytes: Vec<u8>,
+}
+
+impl Drop for Reading {
+    fn drop(&mut self) {
+        let is_given_up = |upload: &Upload| upload.id == self.id && matches!(upload.state, State::Reading);
+        lock(&self.meshes.0.uploads).retain(|upload| !is_given_up(upload));
+    }
+}
+
+impl Reading {
+    /// Reads the file, mends it if asked to, and reports it. It can be used from then on, unless the report refuses it.
+    ///
+    /// # Errors
+    /// Refuses a file that can't be read, by element and place, too little memory, and when `stop` is set.
+    pub(super) fn finish(mut self, unit: Unit, mends: bool, stop: &AtomicBool) -> Result<pb::MeshReport> {
+        memory::attempt("part", || self.finished(unit, mends, stop))
+    }
+
+    fn finished(&mut self, unit: Unit, mends: bool, stop: &AtomicBool) -> Result<pb::MeshReport> {
+        let go_on = || if stop.load(Ordering::Relaxed) { Err(given_up()) } else { Ok(()) };
+        let limits = self.meshes.limits();
+        self.meshes.charge(&self.id, self.bytes.len() as u64 * READING)?;
+        let bytes = std::mem::take(&mut self.bytes);
+        let read = palpate_mesh::read(&self.name, &bytes, unit, &|_| None, &limits).map_err(refuse)?;
+        drop(bytes);
+        go_on()?;
+        let (mut mesh, mut problems) = (read.mesh, read.notes.into_iter().map(note).collect::<Vec<_>>());
+        if mends {
+            let repaired = repair(&mesh, &Repair::default());
+            mesh = repaired.mesh;
+            problems.extend(repaired.told.into_iter().map(note));
+            go_on()?;
+        }
+        let found = report_within(&mesh, &limits);
+        go_on()?;
+        let refused = found.refusal().is_some();
+        // What is refused comes first.
+        let found_problems = found.problems.iter().map(problem);
+        let problems = found_problems.chain(problems).collect();
+        let count = |count: usize| u32::try_from(count).unwrap_or(u32::MAX);
+        let least_m = mesh.vertices_m.iter().copied().fold(DVec3::INFINITY, DVec3::min);
+        let most_m = mesh.vertices_m.iter().copied().fold(DVec3::NEG_INFINITY, DVec3::max);
+        let report = pb::MeshReport {
+            vertices: count(found.vertices),
+            triangles: count(found.triangles),
+            components: count(found.components),
+            holes: count(found.holes),
+            volume_m3: found.volume_m3,
+            extent: least_m.is_finite().then(|| wire::extent(&Extent { least_m, most_m })),
+            edge_m: found.edge_m.median,
+            problems,
+            groups: mesh.groups.iter().map(|group| group.name.clone()).take(GROUPS_TOLD).collect(),
+            refused,
+        };
+        if !refused {
+            self.meshes.charge(&self.id, bytes_of(&mesh))?;
+            if let Some(upload) = lock(&self.meshes.0.uploads).iter_mut().find(|upload| upload.id == self.id) {
+                upload.state = State::Ready(Arc::new(mesh));
+                upload.touched_ns = now_ns();
+            }
+        }
+        Ok(report)
+    }
+}
+
+/// What a mesh takes, bytes.
+fn bytes_of(mesh: &TriangleMesh) -> u64 {
+    let groups: usize = mesh.groups.iter().map(|group| group.name.len() + size_of_val(group.vertices.as_slice())).sum();
+    let uv = mesh.uv.as_deref().map_or(0, size_of_val);
+    (size_of_val(mesh.vertices_m.as_slice()) + size_of_val(mesh.triangles.as_slice()) + uv + groups) as u64
+}
+
+/// What was done with a mesh.
+fn note(what: String) -> pb::MeshProblem {
+    pb::MeshProblem { what, ..Default::default() }
+}
+
+fn problem(finding: &Finding) -> pb::MeshProblem {
+    pb::MeshProblem {
+        what: finding.problem.to_string(),
+        element: if finding.element == Element::Whole { String::new() } else { finding.element.to_string() },
+        place_m: finding.place_m.and_then(|place_m| vector(place_m.into())),
+    }
+}
+
+/// A file that can't be read. The message names element and place.
+fn refuse(error: MeshError) -> Refusal {
+    Refusal::new(Reason::Unreadable, "part", error.to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::budget::Budget;
+
+    const TETRAHEDRON: &str = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n";
+
+    fn part(mesh_id: &str, offset: usize, part: &[u8]) -> pb::UploadMeshRequest {
+        let (mesh_id, part, file_name) = (mesh_id.to_owned(), part.to_vec(), "organ.obj".to_owned());
+        pb::UploadMeshRequest { mesh_id, offset: offset as u64, part, file_name, ..Default::default() }
+    }
+
+    fn meshes(limits: &Limits) -> (Meshes, [Account; 2]) {
+        let budget = Budget::new(limits, 1, 1);
+        (Meshes::new(limits), ["one", "other"].map(|name| budget.account(name)))
+    }
+
+    fn sent(meshes: &Meshes, account: &Account) -> String {
+        let id = meshes.add(&part("", 0, TETRAHEDRON.as_bytes()), account).unwrap().mesh_id;
+        let reading = meshes.read(&id, account).unwrap();
+        let report = reading.finish(unit("mm").unwrap(), false, &AtomicBool::new(false)).unwrap();
+        assert!(!report.refused && report.vertices == 4 && report.volume_m3.is_some(), "{report:?}");
+        id
+    }
+
+    #[test]
+    fn a_mesh_is_its_callers_alone_and_its_memory_is_counted() {
+        let (meshes, [one, other]) = meshes(&Limits::default());
+        let taken = || one.has(Resource::Memory(Purpose::Meshes));
+        let id = sent(&meshes, &one);
+        assert_eq!(meshes.get(&id, &one).unwrap().vertices_m.len(), 4);
+        assert_eq!(taken(), 4 * 24 + 4 * 12);
+        let refused = meshes.get(&id, &other).unwrap_err();
+        assert_eq!((refused.reason, refused.field.as_str()), (Reason::UnknownMesh, "scene.mesh.mesh_id"));
+        assert_eq!(meshes.add(&part(&id, 0, b"v"), &other).unwrap_err().reason, Reason::UnknownMesh);
+        assert_eq!(meshes.add(&part(&id, TETRAHEDRON.len(), b"v"), &one).unwrap_err().reason, Reason::OutOfTurn);
+        meshes.forget_expired(now_ns() + 599_000_000_000);
+        assert!(meshes.get(&id, &one).is_ok());
+        meshes.forget_expired(now_ns() + 600_000_000_000);
+        assert_eq!(meshes.get(&id, &one).unwrap_err().reason, Reason::UnknownMesh);
+        assert_eq!(taken(), 0);
+    }
+
+    #[test]
+    fn parts_follow_each_other_and_are_bounded() {
+        let limits = Limits { mesh_bytes: 100, meshes_per_caller: 2, ..Limits::default() };
+        let (meshes, [one, _]) = meshes(&limits);
+        let id = meshes.add(&part("", 0, b"v 0 0 0\n"), &one).unwrap().mesh_id;
+        for (offset, bytes, reason, field) in [
+            (7, &b"v"[..], Reason::OutOfTurn, "offset"),
+            (9, b"v", Reason::OutOfTurn, "offset"),
+            (8, b"", Reason::Missing, "part"),
+        ] {
+            let refused = meshes.add(&part(&id, offset, bytes), &one).unwrap_err();
+            assert_eq!((refused.reason, refused.field.as_str()), (reason, field));
+        }
+        assert_eq!(meshes.get(&id, &one).unwrap_err().reason, Reason::OutOfTurn);
+        assert_eq!(meshes.add(&part(&id, 8, b"v 1 0 0\n"), &one).unwrap().received_bytes, 16);
+        // A further one fits, not two: those under way are not given up.
+        let second = meshes.add(&part("", 0, b"v"), &one).unwrap().mesh_id;
+        assert_eq!(meshes.add(&part("", 0, b"v"), &one).unwrap_err().reason, Reason::TooMany);
+        let refused = meshes.add(&part(&second, 1, &[b' '; 100]), &one).unwrap_err();
+        assert_eq!(refused.reason, Reason::TooLarge);
+        // It is gone, and one that has come in full gives way.
+        let third = sent(&meshes, &one);
+        sent(&meshes, &one);
+        assert_eq!(meshes.get(&third, &one).unwrap_err().reason, Reason::UnknownMesh);
+        assert_eq!(meshes.add(&part("", 1, b"v"), &one).unwrap_err().reason, Reason::OutOfTurn);
+    }
+
+    #[test]
+    fn what_is_no_mesh_is_refused_and_forgotten() {
+        let (meshes, [one, _]) = meshes(&Limits { mesh_vertices: 4, ..Limits::default() });
+        let finish = |text: &str, mends: bool, stop: bool| {
+            let id = meshes.add(&part("", 0, text.as_bytes()), &one).unwrap().mesh_id;
+            let reading = meshes.read(&id, &one).unwrap();
+            let report = reading.finish(unit("m").unwrap(), mends, &AtomicBool::new(stop));
+            (meshes.get(&id, &one).is_ok(), report)
+        };
+        let (is_kept, refused) = finish("v 0 0\nf 1 2 3\n", false, false);
+        let refused = refused.unwrap_err();
+        assert!(!is_kept && refused.message.contains("organ.obj: line 1"), "{refused}");
+        let (is_kept, refused) = finish(&format!("{TETRAHEDRON}v 5 5 5\n"), false, false);
+        assert!(!is_kept && refused.unwrap_err().message.contains("vertices"));
+        assert_eq!(finish(TETRAHEDRON, false, true).1.unwrap_err().reason, given_up().reason);
+        // An edge with three triangles.
+        let leaf = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 2 1 4\nf 1 2 4\n";
+        let (is_kept, report) = finish(leaf, false, false);
+        let report = report.unwrap();
+        assert!(!is_kept && report.refused && report.problems[0].place_m.is_some(), "{report:?}");
+        let (is_kept, report) = finish(leaf, true, false);
+        assert!(is_kept && !report.unwrap().refused);
+        assert!(unit("ell").is_err() && unit("").is_err());
+    }
+}

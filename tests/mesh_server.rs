@@ -1,0 +1,448 @@
+//! Tissue on meshes over the network: sessions, commands by vertex, samples, records, frames, meshes that clients send.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
+
+#[path = "common/server.rs"]
+mod server;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use glam::DVec3;
+use palpate::limits::Limits;
+use palpate::scene::Scene;
+use palpate::scene::profile::Poke;
+use palpate::shape::PointId;
+use palpate::sheet::{Grasp, Model, Push, Tissue, at_rest};
+use palpate_client::view::Surface;
+use palpate_proto::geometry::{from_vector, vector};
+use palpate_proto::pb;
+use pb::create_session_request::Source;
+use pb::force::Centre;
+use server::{Server, Touch, client_program, open, palpate, told};
+use tempfile::TempDir;
+use tonic::{Code, Status};
+
+const ICOSPHERE: &str = include_str!("reference/icosphere.obj");
+
+/// A ball of 5 cm radius; its top never moves.
+const SCENE: &str = r#"
+name = "ball"
+[mesh]
+file = "ball.obj"
+unit = "m"
+point_mass_kg = 0.01
+fixed = [{ centre_m = [0.0, 0.0, 0.05], radius_m = 0.02 }]
+[springs]
+stiffness_n_per_m = 10.0
+flexion = 0.3
+[virtual_springs]
+stiffness_n_per_m = 5.0
+[damping]
+coefficient_n_s_per_m = 0.1
+[stepping]
+integrator = "central"
+substeps = 2
+precision = "f32"
+"#;
+
+/// A folder with the ball and its scene, and a server that has it.
+fn ball() -> (TempDir, Server) {
+    let folder = folder();
+    let server = Server::start(&["--scenes", folder.path().to_str().unwrap()]);
+    (folder, server)
+}
+
+fn folder() -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    // Two groups, for the sake of their names.
+    let grouped = ICOSPHERE.replacen("f ", "g cap\nf ", 1);
+    std::fs::write(folder.path().join("ball.obj"), grouped).unwrap();
+    std::fs::write(folder.path().join("ball.toml"), SCENE).unwrap();
+    folder
+}
+
+fn scene(folder: &TempDir) -> Scene {
+    Scene::load(&folder.path().join("ball.toml"), &[], &Limits::default()).unwrap()
+}
+
+fn by_name() -> Source {
+    Source::SceneName("ball".into())
+}
+
+fn push(tool: u32, sequence: u64, centre: Centre, force_n: DVec3) -> pb::Command {
+    let force = pb::Force {
+        centre: Some(centre),
+        force_n: vector(force_n),
+        falloff_per_m: Some(80.0),
+        falloff_offset: None,
+    };
+    command(tool, sequence, pb::command::Action::Force(force))
+}
+
+fn grasp(tool: u32, sequence: u64, vertex: u32, displacement_m: DVec3) -> pb::Command {
+    let DVec3 { x, y, z } = displacement_m;
+    let target = Some(pb::position::Target::DisplacementM(pb::Vector3 { x, y, z }));
+    command(tool, sequence, pb::command::Action::Position(pb::Position { point: None, vertex: Some(vertex), target }))
+}
+
+fn command(tool: u32, sequence: u64, action: pb::command::Action) -> pb::Command {
+    pb::Command { tool, sequence: Some(sequence), at_step: Some(0), action: Some(action), ..Default::default() }
+}
+
+/// The tissue offline, after the same commands.
+fn offline(scene: &Scene, steps: usize) -> Box<dyn Tissue> {
+    let mut tissue = at_rest(&Model::compile(scene, &Limits::default()).unwrap());
+    let centre_m = scene.shape().rest_m(PointId::new(7));
+    let poke = Poke { point: None, centre_m, force_n: FORCE_N, falloff_per_m: 80.0, falloff_offset: 0.0 };
+    tissue.push(0, Some(Push::Constant(poke)));
+    tissue.grasp(1, PointId::new(40), Grasp::Target(MOVE_M));
+    (0..steps).for_each(|_| tissue.step().unwrap());
+    tissue
+}
+
+const FORCE_N: DVec3 = DVec3::new(0.1, -0.2, -0.3);
+const MOVE_M: DVec3 = DVec3::new(0.0, 0.002, 0.001);
+
+/// All of what a session shows at rest.
+#[derive(Default)]
+struct Shown {
+    rest_m: Vec<DVec3>,
+    file_vertex: Vec<u32>,
+    triangles: Vec<u32>,
+    groups: BTreeMap<String, Vec<u32>>,
+    size: [u32; 2],
+    edge_m: f64,
+}
+
+async fn shown(server: &Server, session_id: &str) -> Shown {
+    let request = pb::GetMeshRequest { session_id: session_id.into(), refinement: 0 };
+    let mut parts = server.views().await.get_mesh(request).await.unwrap().into_inner();
+    let mut all = Shown::default();
+    while let Some(part) = parts.message().await.unwrap() {
+        let place = |place: &[f32]| DVec3::from_array([0, 1, 2].map(|c| f64::from(place[c])));
+        all.rest_m.extend(part.rest_position_m.chunks(3).map(place));
+        all.file_vertex.extend(part.file_vertex);
+        all.triangles.extend(part.triangles);
+        part.groups.into_iter().for_each(|group| all.groups.entry(group.name).or_default().extend(group.vertices));
+        all.size = [part.vertices_x, part.vertices_y];
+        all.edge_m = part.vertex_spacing_m;
+    }
+    all
+}
+
+#[tokio::test]
+async fn a_session_on_a_mesh_is_told_pushed_grasped_sampled_probed_and_shown() {
+    let (folder, server) = ball();
+    let scene = scene(&folder);
+    let session = server.create(by_name(), true).await.unwrap();
+    let told_scene = session.scene.clone().unwrap();
+    let mesh = told_scene.mesh.unwrap();
+    assert!(told_scene.sheet.is_none() && mesh.mesh_id.is_empty() && mesh.point_mass_kg == Some(0.01));
+    assert!(matches!(mesh.fixed, Some(pb::mesh::Fixed::FixedBalls(balls)) if balls.balls[0].radius_m == 0.02));
+    let springs = told_scene.springs.unwrap();
+    assert_eq!((springs.shear_stiffness_n_per_m, springs.flexion_factor), (None, Some(0.3)));
+    assert_eq!(session.points, 162);
+    let extent = session.extent.unwrap();
+    assert!(from_vector(extent.most_m.as_ref()).distance(scene.shape().extent().most_m) < 1e-12);
+
+    let id = &session.session_id;
+    let mut touch = Touch::open(&server, open(id, &[0, 1])).await.unwrap();
+    touch.command(push(0, 1, Centre::Vertex(7), FORCE_N)).await;
+    touch.command(grasp(1, 1, 40, MOVE_M)).await;
+    touch.settle().await;
+    let mut haptics = server.haptics().await;
+    let request = pb::ProbeRequest {
+        session_id: id.clone(),
+        r#where: Some(pb::probe_request::Where::Vertices(pb::Vertices { vertices: vec![7, 40, 100] })),
+        every_steps: Some(60),
+        energy: true,
+        ..Default::default()
+    };
+    let mut records = haptics.probe(request).await.unwrap().into_inner();
+    server.start_until(id, 60).await;
+    let sample = touch.sample_with(|sample| sample.step == 60).await;
+    let truth = offline(&scene, 60);
+    assert_eq!(server.hash_at(id, 60).await, format!("{:032x}", truth.state_hash()));
+    for (tool, vertex) in sample.tools.iter().zip([7, 40]) {
+        assert_eq!((tool.point, tool.vertex), (None, Some(vertex)));
+        let state = truth.point(PointId::new(vertex as usize));
+        assert!(from_vector(tool.displacement_m.as_ref()).distance(state.displacement_m) < 1e-12);
+        assert!(from_vector(tool.force_on_tool_n.as_ref()).distance(state.reaction_n()) < 1e-9);
+    }
+    let record = loop {
+        let record = records.message().await.unwrap().unwrap();
+        if record.step == 60 {
+            break record;
+        }
+    };
+    let vertices: Vec<_> = record.points.iter().map(|point| (point.point, point.vertex.unwrap())).collect();
+    assert_eq!(vertices, [(None, 7), (None, 40), (None, 100)]);
+    for point in &record.points {
+        let state = truth.point(PointId::new(point.vertex.unwrap() as usize));
+        assert!(from_vector(point.displacement_m.as_ref()).distance(state.displacement_m) < 1e-12);
+        assert!(state.displacement_m.length() > 1e-6);
+    }
+
+    // What is shown is the file's mesh, in an order of its own.
+    let all = shown(&server, id).await;
+    assert_eq!((all.rest_m.len(), all.size, all.triangles.len()), (162, [11, 16], 960));
+    assert!((all.edge_m - scene.shape().edge_m()).abs() < 1e-12);
+    let mut sorted = all.file_vertex.clone();
+    sorted.sort_unstable();
+    assert_eq!(sorted, (0..162).collect::<Vec<_>>());
+    for (rest_m, vertex) in all.rest_m.iter().zip(&all.file_vertex) {
+        assert!(rest_m.distance(scene.shape().rest_m(PointId::new(*vertex as usize))) < 1e-8);
+    }
+    for triangle in all.triangles.chunks(3) {
+        let [a, b, c] = [0, 1, 2].map(|corner| all.rest_m[triangle[corner] as usize]);
+        assert!((b - a).cross(c - a).dot(a + b + c) > 0.0, "outward");
+    }
+    assert_eq!(all.groups["cap"].len(), 162);
+    for (encoding, within_m) in [(pb::Encoding::F32, 1e-9), (pb::Encoding::I16, 1e-6)] {
+        let request =
+            pb::WatchFramesRequest { session_id: id.clone(), encoding: encoding.into(), ..Default::default() };
+        let mut frames = server.views().await.watch_frames(request).await.unwrap().into_inner();
+        let mut surface = Surface::default();
+        loop {
+            let part = frames.message().await.unwrap().unwrap();
+            surface.write(&part).unwrap();
+            if part.last {
+                assert_eq!((part.step, part.full), (60, true));
+                break;
+            }
+        }
+        assert_eq!(surface.vertices, [11, 16]);
+        for (moved_m, vertex) in surface.displacement_m.iter().zip(&all.file_vertex) {
+            let expected = truth.point(PointId::new(*vertex as usize)).displacement_m;
+            assert!(DVec3::from_array(moved_m.map(f64::from)).distance(expected) < within_m, "{vertex}");
+        }
+    }
+}
+
+#[tokio::test]
+async fn what_does_not_fit_the_tissue_is_refused_with_what_does() {
+    let (_folder, server) = ball();
+    let mesh = server.create(by_name(), true).await.unwrap().session_id;
+    let sheet = server.paper(true).await;
+    let mut on_mesh = Touch::hold(&server, &mesh).await;
+    let mut on_sheet = Touch::hold(&server, &sheet).await;
+    let place = |x, y, z| Centre::AtM(pb::Vector3 { x, y, z });
+    let point = Centre::Point(pb::GridPoint { x: 1, y: 1 });
+    let plane = Centre::CentreM(pb::Vector2 { x: 0.0, y: 0.0 });
+    for (is_mesh, centre, field, reason, words) in [
+        (true, point, "force.point", "WRONG_KIND", "the number of a vertex"),
+        (true, plane, "force.centre_m", "WRONG_KIND", "`at_m`"),
+        (true, Centre::Vertex(162), "force.vertex", "OFF_SHEET", "from 0 to 161"),
+        (true, place(0.0, 0.0, 0.07), "force.at_m", "OFF_SHEET", "a tenth"),
+        (true, place(0.0, f64::NAN, 0.0), "force.at_m", "NOT_FINITE", ""),
+        (false, Centre::Vertex(3), "force.vertex", "WRONG_KIND", "31 × 31"),
+        (false, place(0.5, 0.5, 0.2), "force.at_m", "OFF_SHEET", ""),
+    ] {
+        let touch = if is_mesh { &mut on_mesh } else { &mut on_sheet };
+        touch.command(push(0, 1, centre, FORCE_N)).await;
+        let rejection = touch.rejection().await;
+        assert_eq!((rejection.field.as_str(), rejection.reason.as_str()), (field, reason), "{rejection:?}");
+        assert!(rejection.message.contains(words), "{rejection:?}");
+    }
+    let target = Some(pb::position::Target::DisplacementM(pb::Vector3::default()));
+    let at = Some(pb::GridPoint { x: 1, y: 1 });
+    for (is_mesh, position, field, reason) in [
+        (true, pb::Position { point: at, vertex: None, target }, "position.point", "WRONG_KIND"),
+        (true, pb::Position { point: None, vertex: None, target }, "position.vertex", "MISSING"),
+        (true, pb::Position { point: at, vertex: Some(1), target }, "position.vertex", "WRONG_KIND"),
+        (false, pb::Position { point: None, vertex: Some(1), target }, "position.vertex", "WRONG_KIND"),
+        (false, pb::Position { point: None, vertex: None, target }, "position.point", "MISSING"),
+    ] {
+        let touch = if is_mesh { &mut on_mesh } else { &mut on_sheet };
+        touch.command(command(0, 1, pb::command::Action::Position(position))).await;
+        let rejection = touch.rejection().await;
+        assert_eq!((rejection.field.as_str(), rejection.reason.as_str()), (field, reason), "{rejection:?}");
+    }
+    // A place in space is one on the sheet, too: the nearest one.
+    on_sheet.command(push(0, 2, place(0.5, 0.5, 0.05), FORCE_N)).await;
+    on_sheet.settle().await;
+    server.start_until(&sheet, 1).await;
+    let sample = on_sheet.sample_with(|sample| sample.step == 1).await;
+    assert_eq!(sample.tools[0].point, Some(pb::GridPoint { x: 15, y: 15 }));
+
+    let mut views = server.views().await;
+    let request = pb::GetMeshRequest { session_id: mesh.clone(), refinement: 1 };
+    let refused = views.get_mesh(request).await.unwrap_err();
+    assert_eq!(told(&refused), (Code::InvalidArgument, "OUT_OF_RANGE".into(), "refinement".into()));
+    let r#where = Some(pb::probe_request::Where::Vertices(pb::Vertices { vertices: vec![3, 162] }));
+    let probe = pb::ProbeRequest { session_id: mesh, r#where: r#where.clone(), ..Default::default() };
+    let mut haptics = server.haptics().await;
+    assert_eq!(told(&haptics.probe(probe).await.unwrap_err()).2, "vertices[1]");
+    let probe = pb::ProbeRequest { session_id: sheet, r#where, ..Default::default() };
+    assert_eq!(told(&haptics.probe(probe).await.unwrap_err()).2, "vertices[0]");
+}
+
+/// Sends a file in parts of that size.
+async fn upload(server: &Server, file: &[u8], part: usize, unit: &str, repair: bool) -> Result<pb::UploadMeshResponse, Status> {
+    let mut sessions = server.sessions().await;
+    let mut answer = pb::UploadMeshResponse::default();
+    let count = file.len().div_ceil(part).max(1);
+    for index in 0..count {
+        let request = pb::UploadMeshRequest {
+            mesh_id: answer.mesh_id,
+            file_name: "ball.obj".into(),
+            offset: (index * part) as u64,
+            part: file[index * part..file.len().min((index + 1) * part)].to_vec(),
+            last: index + 1 == count,
+            unit: unit.into(),
+            repair,
+        };
+        answer = sessions.upload_mesh(request).await?.into_inner();
+    }
+    assert_eq!(answer.received_bytes, file.len() as u64);
+    Ok(answer)
+}
+
+/// The ball's scene on a mesh that was sent.
+fn on(mesh_id: &str, scene: &Scene) -> pb::Scene {
+    let mut message = palpate::wire::scene::scene(scene);
+    message.mesh.as_mut().unwrap().mesh_id = mesh_id.to_owned();
+    message
+}
+
+#[tokio::test]
+async fn a_mesh_that_a_client_sends_makes_the_session_that_its_file_does() {
+    let (folder, server) = ball();
+    let scene = scene(&folder);
+    let file = std::fs::read(folder.path().join("ball.obj")).unwrap();
+    let sent = upload(&server, &file, 1000, "m", false).await.unwrap();
+    let report = sent.report.unwrap();
+    assert!(!report.refused && report.problems.is_empty(), "{report:?}");
+    assert_eq!((report.vertices, report.triangles, report.components, report.holes), (162, 320, 1, 0));
+    assert!(report.volume_m3.unwrap() > 4e-4 && report.groups == ["cap"]);
+    let session = server.create(Source::Scene(on(&sent.mesh_id, &scene)), true).await.unwrap();
+    assert_eq!(session.scene.unwrap().mesh.unwrap().mesh_id, "");
+    let id = session.session_id;
+    let touch = Touch::open(&server, open(&id, &[0, 1])).await;
+    let mut touch = touch.unwrap();
+    touch.command(push(0, 1, Centre::Vertex(7), FORCE_N)).await;
+    touch.command(grasp(1, 1, 40, MOVE_M)).await;
+    touch.settle().await;
+    server.start_until(&id, 30).await;
+    assert_eq!(server.hash_at(&id, 30).await, format!("{:032x}", offline(&scene, 30).state_hash()));
+
+    let fixed = |fixed| {
+        let mut scene = on(&sent.mesh_id, &scene);
+        scene.mesh.as_mut().unwrap().fixed = Some(fixed);
+        scene
+    };
+    let ball = pb::Ball { centre_m: None, radius_m: 1.0 };
+    let without_mass = {
+        let mut scene = on(&sent.mesh_id, &scene);
+        scene.mesh.as_mut().unwrap().point_mass_kg = None;
+        scene
+    };
+    let with_shear = {
+        let mut scene = on(&sent.mesh_id, &scene);
+        scene.springs.as_mut().unwrap().shear_stiffness_n_per_m = Some(1.0);
+        scene
+    };
+    for (scene, field, words) in [
+        (on("", &scene), "scene.mesh.mesh_id", "UploadMesh"),
+        (on("0123", &scene), "scene.mesh.mesh_id", "send the mesh again"),
+        (fixed(pb::mesh::Fixed::FixedGroup("cup".into())), "scene.mesh.fixed_group", "did you mean `cap`"),
+        (fixed(pb::mesh::Fixed::FixedBalls(pb::Balls { balls: vec![ball] })), "scene.mesh.fixed_balls.centre_m", ""),
+        (without_mass, "scene.mesh.point_mass_kg", ""),
+        (with_shear, "scene.springs.shear_stiffness_n_per_m", "edges of a mesh"),
+    ] {
+        let refused = server.create(Source::Scene(scene), true).await.unwrap_err();
+        assert_eq!(told(&refused).2, field, "{refused:?}");
+        assert!(refused.message().contains(words), "{refused:?}");
+    }
+    let all = fixed(pb::mesh::Fixed::FixedGroup("cap".into()));
+    server.create(Source::Scene(all), true).await.unwrap();
+}
+
+#[tokio::test]
+async fn a_mesh_that_is_none_is_refused_by_element_and_place() {
+    let server = Server::start(&[]);
+    let whole = ICOSPHERE.as_bytes();
+    // Cut in the middle of a line: a face without its corners.
+    let cut = whole.iter().rposition(|byte| *byte == b'f').unwrap() + 3;
+    let refused = upload(&server, &whole[..cut], 4096, "m", false).await.unwrap_err();
+    assert_eq!(told(&refused), (Code::InvalidArgument, "UNREADABLE".into(), "part".into()));
+    assert!(refused.message().contains("ball.obj: line"), "{refused:?}");
+    for (unit, reason) in [("", "MISSING"), ("furlong", "WRONG_KIND")] {
+        let refused = upload(&server, whole, 1 << 19, unit, false).await.unwrap_err();
+        assert_eq!(told(&refused), (Code::InvalidArgument, reason.into(), "unit".into()));
+    }
+    // A hole is told, and is no reason to refuse; repair fills it.
+    let with_hole = ICOSPHERE.trim_end().rsplit_once('\n').unwrap().0;
+    let report = upload(&server, with_hole.as_bytes(), 1 << 19, "m", false).await.unwrap().report.unwrap();
+    assert_eq!((report.holes, report.volume_m3, report.refused), (1, None, false), "{report:?}");
+    let report = upload(&server, with_hole.as_bytes(), 1 << 19, "m", true).await.unwrap().report.unwrap();
+    assert_eq!((report.holes, report.refused), (0, false), "{report:?}");
+    assert!(!report.problems.is_empty());
+    // An edge with three triangles can't be used, and is told with its place.
+    let bad = format!("{ICOSPHERE}v 0 0 0\nf 1 {} 163\n", ICOSPHERE.lines().find(|line| line.starts_with('f')).map(|_| 13).unwrap());
+    let sent = upload(&server, bad.as_bytes(), 1 << 19, "m", false).await.unwrap();
+    let report = sent.report.unwrap();
+    if report.refused {
+        assert!(report.problems[0].place_m.is_some() && !report.problems[0].element.is_empty(), "{report:?}");
+    }
+}
+
+#[tokio::test]
+async fn a_mesh_above_the_limits_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = folder.path().join("palpate.toml");
+    std::fs::write(&config, "[limits]\nmesh_bytes = 9000\nmesh_vertices = 161\n").unwrap();
+    let server = Server::start(&["--config", config.to_str().unwrap()]);
+    let long = [ICOSPHERE.as_bytes(), &[b'\n'; 9000]].concat();
+    let refused = upload(&server, &long, 1000, "m", false).await.unwrap_err();
+    assert_eq!(told(&refused), (Code::InvalidArgument, "TOO_LARGE".into(), "part".into()));
+    if ICOSPHERE.len() < 9000 {
+        let refused = upload(&server, ICOSPHERE.as_bytes(), 1000, "m", false).await.unwrap_err();
+        assert!(refused.message().contains("161"), "{refused:?}");
+    }
+}
+
+/// A force, a moving force and a grasp.
+const SCRIPT: &str = r#"
+name = "poking"
+scenes = ["ball"]
+duration_s = 0.1
+sample_every_s = 0.02
+[[force]]
+vertex = 7
+force_n = [0.1, -0.2, -0.3]
+falloff_per_m = 80.0
+falloff_offset = 0.0
+profile = { type = "constant" }
+[[force]]
+at_m = [0.0, -0.05, 0.0]
+force_n = [0.0, 0.3, 0.0]
+falloff_per_m = 80.0
+falloff_offset = 0.0
+profile = { type = "sine", frequency_hz = 20.0 }
+"#;
+
+#[test]
+fn a_replay_on_a_mesh_has_the_hash_of_the_run_offline() {
+    let (folder, server) = ball();
+    let script = folder.path().join("poking-script.toml");
+    std::fs::write(&script, SCRIPT).unwrap();
+    let file = folder.path().join("ball.toml");
+    let summary = |output: std::process::Output| {
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let text = String::from_utf8_lossy(&output.stdout).into_owned();
+        let lines: Vec<serde_json::Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+        let last = lines.len() - 1;
+        (lines[1..last].to_vec(), lines[last]["summary"]["final_hash"].clone())
+    };
+    let [file, script] = [&file, &script].map(|path: &PathBuf| path.to_str().unwrap());
+    let expected = summary(palpate(&["run", file, script, "--held"]));
+    for scene in ["ball", file] {
+        let output = std::process::Command::new(client_program())
+            .args(["replay", script, "--server", &server.url, "--scene", scene])
+            .current_dir(Path::new(env!("CARGO_MANIFEST_DIR")))
+            .output()
+            .unwrap();
+        assert_eq!(summary(output), expected, "{scene}");
+    }
+}
