@@ -10,7 +10,7 @@ use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::scene::collection::find_scene;
 use palpate::scene::profile::Poke;
-use palpate::scene::{Body, Mesh, MeshShape, Scene};
+use palpate::scene::{Body, Differences, Inclusion, Material, Mesh, MeshShape, Region, Scene};
 use palpate::shape::{PointId, RestShape};
 use palpate::sheet::{Grasp, Model, Push, Tissue, at_rest};
 
@@ -66,6 +66,20 @@ fn sphere(rings: u32, radius_m: f64) -> MeshShape {
 
 fn body(shape: MeshShape, point_mass_kg: f64, flexion: f64) -> Option<Body> {
     Some(Body::Mesh(Mesh::new(point_mass_kg, flexion, Arc::new(shape))))
+}
+
+/// The same where masses, springs and virtual springs differ from vertex to vertex.
+fn uneven_body(shape: MeshShape, point_mass_kg: f64, flexion: f64) -> Option<Body> {
+    let mut dice = fastrand::Rng::with_seed(8);
+    let mut list = |count: usize, least: f64| (0..count).map(|_| least + dice.f64()).collect::<Vec<f64>>();
+    let count = shape.vertices_m().len();
+    let differences = Differences {
+        relative_mass: list(count, 0.4),
+        extra_virtual: list(count, -0.3),
+        edges: list(shape.edges().len(), 0.5),
+        flexion: list(shape.opposite().len(), 0.5),
+    };
+    Some(Body::Mesh(Mesh::uneven(point_mass_kg, flexion, Arc::new(shape), differences)))
 }
 
 fn poke(centre_m: DVec3, force_n: DVec3, falloff_per_m: f64) -> Option<Push> {
@@ -147,23 +161,26 @@ fn shape_of(shape: &MeshShape) -> MeshShape {
 
 #[test]
 fn without_damping_energy_is_kept_and_springs_change_no_momentum() {
-    for flexion in [0.0, 0.4] {
+    for (flexion, is_uneven) in [(0.0, false), (0.4, false), (0.4, true)] {
         let sets = ["damping.coefficient_n_s_per_m=0", "virtual_springs.stiffness_n_per_m=0", "stepping.precision=f64"];
         let sets =
             [&sets[..], &["sleep.tolerance=0", "stepping.integrator=exponential4", "stepping.substeps=4"]].concat();
-        let scene = scene(body(sphere(9, 0.1), 0.01, flexion), &sets);
+        let of = if is_uneven { uneven_body } else { body };
+        let scene = scene(of(sphere(9, 0.1), 0.01, flexion), &sets);
         let mut tissue = tissue(&scene);
         let points: Vec<PointId> = tissue.model().points().collect();
         tissue.push(0, poke(DVec3::new(0.0, 0.1, 0.0), DVec3::new(0.1, -0.6, 0.2), 15.0));
         (0..30).for_each(|_| tissue.step().unwrap());
         tissue.push(0, None);
         (0..3).for_each(|_| tissue.step().unwrap());
-        let momentum =
-            |tissue: &dyn Tissue| -> DVec3 { points.iter().map(|point| tissue.point(*point).velocity_m_per_s).sum() };
+        let mass = |point: &PointId| scene.relative_mass(*point);
+        let momentum = |tissue: &dyn Tissue| -> DVec3 {
+            points.iter().map(|point| mass(point) * tissue.point(*point).velocity_m_per_s).sum()
+        };
         let turn = |tissue: &dyn Tissue| -> DVec3 {
             let of = |point: &PointId| {
                 let state = tissue.point(*point);
-                (scene.shape().rest_m(*point) + state.displacement_m).cross(state.velocity_m_per_s)
+                mass(point) * (scene.shape().rest_m(*point) + state.displacement_m).cross(state.velocity_m_per_s)
             };
             points.iter().map(of).sum()
         };
@@ -185,15 +202,20 @@ fn without_damping_energy_is_kept_and_springs_change_no_momentum() {
 
 #[test]
 fn the_bits_of_a_mesh_are_those_of_any_width() {
-    for (integrator, precision) in
+    for (index, (integrator, precision)) in
         [("central", "f32"), ("exponential3", "compensated"), ("exponential4", "f64"), ("rk4", "f32")]
+            .into_iter()
+            .cycle()
+            .take(8)
+            .enumerate()
     {
+        let of = if index < 4 { body } else { uneven_body };
         let hash = |lanes: &str| {
             let [integrator, precision, lanes] =
                 [("integrator", integrator), ("precision", precision), ("lanes", lanes)]
                     .map(|(key, value)| format!("stepping.{key}={value}"));
             let scene =
-                scene(body(sphere(13, 0.1), 0.01, 0.3), &[&integrator, &precision, &lanes, "stepping.substeps=2"]);
+                scene(of(sphere(13, 0.1), 0.01, 0.3), &[&integrator, &precision, &lanes, "stepping.substeps=2"]);
             let model = Model::compile(&scene, &Limits::default()).ok()?;
             let mut tissue = at_rest(&model);
             tissue.push(0, poke(DVec3::new(0.07, 0.07, 0.02), DVec3::new(0.4, -0.6, 0.2), 25.0));
@@ -263,4 +285,150 @@ fn a_scene_on_a_mesh_is_found_by_its_name_with_the_file_beside_it() {
     assert_eq!(by_name, by_path);
     let refused = Scene::parse("organ", text, &[], &limits).unwrap_err();
     assert!(refused.to_string().contains("a scene that a client sends can't"), "{refused}");
+}
+
+#[test]
+fn forces_move_each_vertex_by_its_own_mass() {
+    for integrator in ["central", "exponential4", "rk4"] {
+        let sets =
+            ["damping.coefficient_n_s_per_m=0.03", "virtual_springs.stiffness_n_per_m=9", "stepping.precision=f64"];
+        let [integrator, rate] = [format!("stepping.integrator={integrator}"), "stepping.rate_hz=20000".to_owned()];
+        let sets = [&sets[..], &["sleep.tolerance=0", &integrator, &rate, "stepping.substeps=1"]].concat();
+        let scene = scene(uneven_body(sphere(7, 0.1), 0.01, 0.4), &sets);
+        let model = Model::compile(&scene, &Limits::default()).unwrap();
+        let mut tissue = at_rest(&model);
+        tissue.push(0, poke(DVec3::new(0.0, 0.1, 0.0), DVec3::new(0.1, -0.6, 0.2), 15.0));
+        let held = PointId::new(30);
+        tissue.grasp(1, held, Grasp::Target(DVec3::new(0.002, 0.0, 0.0)));
+        let mut before: Vec<DVec3> = Vec::new();
+        for step in 0..600 {
+            let now: Vec<_> = model.points().map(|point| tissue.point(point)).collect();
+            tissue.step().unwrap();
+            let (mut largest, mut apart) = (0.0_f64, 0.0_f64);
+            for (point, state) in model.points().zip(&now) {
+                let after = tissue.point(point);
+                assert!(after.constraint_n.is_none() || point == held);
+                if step % 60 != 59 || point == held {
+                    continue;
+                }
+                assert!(
+                    (after.virtual_n + model.virtual_stiffness_n_per_m(point) * after.displacement_m).length() < 1e-12
+                );
+                assert!((after.damping_n + model.damping_n_s_per_m(point) * after.velocity_m_per_s).length() < 1e-12);
+                let acceleration = (after.velocity_m_per_s - before[point.index()]) / 2.0 * 20_000.0;
+                let force_n = state.reaction_n() + state.applied_n;
+                largest = largest.max(force_n.length());
+                apart = apart.max((model.mass_kg(point) * acceleration - force_n).length());
+            }
+            assert!(apart <= 2e-3 * largest, "{integrator} {step}: {apart} of {largest}");
+            before = now.iter().map(|state| state.velocity_m_per_s).collect();
+        }
+        let (energy, mass_kg) = (tissue.energy(), |point| model.mass_kg(point));
+        let kinetic_j: f64 = model
+            .points()
+            .map(|point| 0.5 * mass_kg(point) * tissue.point(point).velocity_m_per_s.length_squared())
+            .sum();
+        let virtual_j: f64 = model
+            .points()
+            .map(|point| {
+                0.5 * model.virtual_stiffness_n_per_m(point) * tissue.point(point).displacement_m.length_squared()
+            })
+            .sum();
+        assert!((energy.kinetic_j - kinetic_j).abs() < 1e-9 * kinetic_j, "{integrator}: {energy:?} {kinetic_j}");
+        assert!((energy.virtual_j - virtual_j).abs() < 1e-9 * virtual_j, "{integrator}: {energy:?} {virtual_j}");
+        assert_eq!(tissue.guard_events(), 0);
+    }
+}
+
+/// An icosahedron, all of whose vertices are alike.
+fn icosahedron(radius_m: f64) -> MeshShape {
+    let long = 0.5 * (1.0 + 5.0_f64.sqrt());
+    let of =
+        |a: f64, b: f64| [DVec3::new(0.0, a, b * long), DVec3::new(a, b * long, 0.0), DVec3::new(b * long, 0.0, a)];
+    let signs = [(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)];
+    let vertices: Vec<DVec3> =
+        signs.into_iter().flat_map(|(a, b)| of(a, b)).map(|place| radius_m * place.normalize()).collect();
+    let mut triangles = vec![];
+    let is_edge = |a: usize, b: usize| vertices[a].distance(vertices[b]) < 1.1 * radius_m;
+    for (a, b) in (0..12).flat_map(|a| (a + 1..12).map(move |b| (a, b))).filter(|(a, b)| is_edge(*a, *b)) {
+        for c in (b + 1..12).filter(|c| is_edge(a, *c) && is_edge(b, *c)) {
+            let outward = (vertices[b] - vertices[a]).cross(vertices[c] - vertices[a]).dot(vertices[a]) > 0.0;
+            triangles.push(if outward { [a, b, c] } else { [a, c, b] }.map(|vertex| vertex as u32));
+        }
+    }
+    assert_eq!(triangles.len(), 20);
+    MeshShape::new(vertices, triangles, |_, _, _| false).unwrap()
+}
+
+const MATERIAL: Material = Material {
+    youngs_modulus_pa: 8000.0,
+    thickness_m: 0.004,
+    density_kg_per_m3: 1060.0,
+    depth_m: 0.03,
+    bed_n_per_m3: 4e5,
+    damping_ratio: 0.5,
+};
+
+#[test]
+fn where_all_vertices_are_alike_a_material_is_the_coefficients_of_the_paper() {
+    let made = MATERIAL.applied(0.0, Arc::new(icosahedron(0.02))).unwrap();
+    let sets = ["stepping.integrator=exponential4", "stepping.precision=f64", "stepping.substeps=2"];
+    let with = |mesh: Mesh| {
+        let mut scene = scene(Some(Body::Mesh(mesh)), &sets);
+        scene.springs.stiffness_n_per_m = made.stiffness_n_per_m;
+        scene.virtual_stiffness_n_per_m = made.virtual_stiffness_n_per_m;
+        scene.damping_n_s_per_m = made.damping_n_s_per_m;
+        scene
+    };
+    let even = Mesh::new(made.mesh.point_mass_kg, 0.0, made.mesh.shape.clone());
+    assert!((made.mesh.stiffest.bound / even.stiffest.bound - 1.0).abs() < 1e-9);
+    let area_m2 = 20.0 * 3.0_f64.sqrt() / 4.0 * made.mesh.shape.edge_m().powi(2);
+    assert!((made.virtual_stiffness_n_per_m / (4e5 * area_m2 / 12.0) - 1.0).abs() < 1e-12);
+    assert!((made.mesh.mass_kg() / (1060.0 * 0.03 / 3.0 * area_m2) - 1.0).abs() < 1e-12);
+    // Nothing gives way where all is alike.
+    assert!((made.stiffness_n_per_m / (3.0_f64.sqrt() / 2.0 * 32.0) - 1.0).abs() < 1e-9, "{}", made.stiffness_n_per_m);
+    let [mut a, mut b] = [with(made.mesh.clone()), with(even)].map(|scene| tissue(&scene));
+    let (mut largest, mut apart) = (0.0_f64, 0.0_f64);
+    for _ in 0..100 {
+        for tissue in [&mut a, &mut b] {
+            tissue.push(0, poke(DVec3::new(0.02, 0.0, 0.0), DVec3::new(-0.2, 0.05, 0.0), 60.0));
+            tissue.step().unwrap();
+        }
+        for point in a.model().points() {
+            let [p, q] = [&a, &b].map(|tissue| tissue.point(point).displacement_m);
+            largest = largest.max(p.length());
+            apart = apart.max(p.distance(q));
+        }
+    }
+    assert!(largest > 1e-4 && apart < 1e-11 * largest, "{apart} of {largest}");
+}
+
+#[test]
+fn an_inclusion_makes_a_mesh_stiffer_where_it_is_and_nowhere_else() {
+    let sets =
+        ["damping.coefficient_n_s_per_m=0.4", "virtual_springs.stiffness_n_per_m=20", "springs.stiffness_n_per_m=10"];
+    let shape = Arc::new(sphere(13, 0.1));
+    let plain = Mesh::new(0.01, 0.2, shape.clone());
+    let lump = Inclusion {
+        region: Region::Ball { centre_m: DVec3::new(0.09, 0.0, 0.0), radius_m: 0.03 },
+        stiffness_factor: 4.0,
+        virtual_stiffness_factor: 3.0,
+        edge_m: 0.01,
+    };
+    let with = Inclusion::put_into(&[lump], &plain);
+    let depth_m = |mesh: &Mesh, place_m: DVec3| {
+        let mut tissue =
+            tissue(&scene(Some(Body::Mesh(mesh.clone())), &[&sets[..], &["stepping.tolerance=1e-3"]].concat()));
+        let point = shape.nearest(place_m);
+        tissue.push(0, poke(shape.rest_m(point), -0.05 * shape.normal(point), 100.0));
+        (0..400).for_each(|_| tissue.step().unwrap());
+        tissue.point(point).displacement_m.length()
+    };
+    let ratio = |place_m: DVec3| depth_m(&with, place_m) / depth_m(&plain, place_m);
+    let within = ratio(DVec3::new(0.1, 0.0, 0.0));
+    assert!((0.2..0.5).contains(&within), "{within}");
+    for place_m in [DVec3::new(-0.1, 0.0, 0.0), DVec3::new(0.0, 0.1, 0.0), DVec3::new(0.0, 0.0, -0.1)] {
+        let beyond = ratio(place_m);
+        assert!((beyond - 1.0).abs() < 0.01, "{place_m}: {beyond}");
+    }
 }

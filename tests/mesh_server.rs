@@ -70,12 +70,8 @@ fn by_name() -> Source {
 }
 
 fn push(tool: u32, sequence: u64, centre: Centre, force_n: DVec3) -> pb::Command {
-    let force = pb::Force {
-        centre: Some(centre),
-        force_n: vector(force_n),
-        falloff_per_m: Some(80.0),
-        falloff_offset: None,
-    };
+    let force =
+        pb::Force { centre: Some(centre), force_n: vector(force_n), falloff_per_m: Some(80.0), falloff_offset: None };
     command(tool, sequence, pb::command::Action::Force(force))
 }
 
@@ -278,7 +274,13 @@ async fn what_does_not_fit_the_tissue_is_refused_with_what_does() {
 }
 
 /// Sends a file in parts of that size.
-async fn upload(server: &Server, file: &[u8], part: usize, unit: &str, repair: bool) -> Result<pb::UploadMeshResponse, Status> {
+async fn upload(
+    server: &Server,
+    file: &[u8],
+    part: usize,
+    unit: &str,
+    repair: bool,
+) -> Result<pb::UploadMeshResponse, Status> {
     let mut sessions = server.sessions().await;
     let mut answer = pb::UploadMeshResponse::default();
     let count = file.len().div_ceil(part).max(1);
@@ -379,7 +381,10 @@ async fn a_mesh_that_is_none_is_refused_by_element_and_place() {
     assert_eq!((report.holes, report.refused), (0, false), "{report:?}");
     assert!(!report.problems.is_empty());
     // An edge with three triangles can't be used, and is told with its place.
-    let bad = format!("{ICOSPHERE}v 0 0 0\nf 1 {} 163\n", ICOSPHERE.lines().find(|line| line.starts_with('f')).map(|_| 13).unwrap());
+    let bad = format!(
+        "{ICOSPHERE}v 0 0 0\nf 1 {} 163\n",
+        ICOSPHERE.lines().find(|line| line.starts_with('f')).map(|_| 13).unwrap()
+    );
     let sent = upload(&server, bad.as_bytes(), 1 << 19, "m", false).await.unwrap();
     let report = sent.report.unwrap();
     if report.refused {

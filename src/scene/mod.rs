@@ -6,6 +6,8 @@ pub mod check;
 pub mod collection;
 pub mod document;
 pub mod kind;
+mod material;
+mod membrane;
 mod mesh;
 pub mod plot;
 pub mod profile;
@@ -13,6 +15,8 @@ pub mod reader;
 pub mod record;
 pub mod script;
 mod sheet;
+mod shown;
+mod source;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -23,9 +27,12 @@ use crate::shape::{PointId, RestShape};
 use check::physical;
 use document::{Document, Fields, Item};
 use kind::Kind;
-use mesh::Files;
-pub use mesh::{Fixed as FixedVertices, Mesh, MeshShape, Stiffest, Told};
+pub use material::{Inclusion, MadeOf, Material, Region};
+pub use mesh::{Differences, Fixed as FixedVertices, Mesh, MeshShape, Stiffest, Told, simulated};
+
 pub use sheet::{Fixed, LEAST_WIDTH, PointSet, Sheet};
+pub use shown::{BoundPlace, Shown};
+use source::Files;
 
 /// The scene of the paper's figures, built in.
 pub const PAPER: &str = include_str!("../../scenes/paper.toml");
@@ -315,17 +322,14 @@ impl Scene {
         }
         let scene = document.read(|fields| {
             let name = fields.text("name")?.unwrap_or_else(|| "unnamed".to_owned());
-            let mut body = read_body(fields, files, limits)?;
+            let Substance { body, springs, virtual_stiffness_n_per_m, damping_n_s_per_m } =
+                read_substance(fields, files, limits)?;
             Ok(Scene {
                 name,
-                springs: fields.required("springs")?.table(|fields| read_springs(fields, &mut body))?,
+                springs,
                 body,
-                virtual_stiffness_n_per_m: fields
-                    .required("virtual_springs")?
-                    .table(|fields| fields.required_number("stiffness_n_per_m"))?,
-                damping_n_s_per_m: fields
-                    .required("damping")?
-                    .table(|fields| fields.required_number("coefficient_n_s_per_m"))?,
+                virtual_stiffness_n_per_m,
+                damping_n_s_per_m,
                 stepping: fields.item("stepping").map_or(Ok(Stepping::default()), |item| read_stepping(&item))?,
                 sleep_tolerance: match fields.item("sleep") {
                     Some(item) => item.table(|fields| fields.number("tolerance"))?,
@@ -384,11 +388,37 @@ impl Scene {
         }
     }
 
-    /// The mass of each point, kg.
+    /// The mass of each point, or on a mesh that of reference, kg.
     pub fn point_mass_kg(&self) -> f64 {
         match &self.body {
             Body::Sheet(sheet) => sheet.point_mass_kg,
             Body::Mesh(mesh) => mesh.point_mass_kg,
+        }
+    }
+
+    /// The mass of a point over that of reference, which [`Scene::point_mass_kg`] is. C of a point is `damping_n_s_per_m` times
+    /// this.
+    pub fn relative_mass(&self, point: PointId) -> f64 {
+        match &self.body {
+            Body::Sheet(_) => 1.0,
+            Body::Mesh(mesh) => mesh.relative_mass(point),
+        }
+    }
+
+    /// K″ of a point over that of reference, which is `virtual_stiffness_n_per_m`.
+    pub fn relative_virtual_stiffness(&self, point: PointId) -> f64 {
+        match &self.body {
+            Body::Sheet(_) => 1.0,
+            Body::Mesh(mesh) => mesh.relative_mass(point) * (1.0 + mesh.extra_virtual(point)),
+        }
+    }
+
+    /// The mass of all points, kg.
+    pub fn mass_kg(&self) -> f64 {
+        #[allow(clippy::cast_precision_loss)]
+        match &self.body {
+            Body::Sheet(sheet) => sheet.point_mass_kg * sheet.point_count() as f64,
+            Body::Mesh(mesh) => mesh.mass_kg(),
         }
     }
 
@@ -436,15 +466,107 @@ impl Scene {
     }
 }
 
-/// Reads the section `[sheet]` or `[mesh]`.
-fn read_body(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) -> Result<Body> {
-    match (fields.item("sheet"), fields.item("mesh")) {
+/// What a tissue consists of.
+struct Substance {
+    body: Body,
+    springs: Springs,
+    virtual_stiffness_n_per_m: f64,
+    damping_n_s_per_m: f64,
+}
+
+/// Reads the section `[sheet]` or `[mesh]`, and what says how stiff, heavy and damped it is.
+fn read_substance(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) -> Result<Substance> {
+    let (sheet, mesh) = (fields.item("sheet"), fields.item("mesh"));
+    let (material, inclusions) = (fields.item("material"), fields.item("inclusion"));
+    match (&sheet, &mesh) {
         (Some(_), Some(mesh)) => {
-            Err(mesh.refuse(Reason::WrongKind, "does not go with [sheet]: a tissue is one of them"))
+            return Err(mesh.refuse(Reason::WrongKind, "does not go with [sheet]: a tissue is one of them"));
         }
-        (None, Some(mesh)) => Ok(Body::Mesh(mesh.table(|fields| Mesh::read(fields, files, limits))?)),
-        (_, None) => Ok(Body::Sheet(fields.required("sheet")?.table(Sheet::read)?)),
+        (_, None) => {
+            for item in [&material, &inclusions].into_iter().flatten() {
+                return Err(
+                    item.refuse(Reason::WrongKind, "is for a mesh: a sheet has the same points and springs all over")
+                );
+            }
+            let body = Body::Sheet(fields.required("sheet")?.table(Sheet::read)?);
+            return read_coefficients(fields, body);
+        }
+        (None, Some(_)) => {}
     }
+    let of_material = material.is_some();
+    let mesh = fields.required("mesh")?.table(|fields| Mesh::read(fields, files, of_material, limits))?;
+    if mesh.shape.point_count() > limits.points {
+        mesh.check(limits)?;
+    }
+    let mut substance = match material {
+        None => read_coefficients(fields, Body::Mesh(mesh))?,
+        Some(item) => read_material(fields, &item, &mesh)?,
+    };
+    if let (Body::Mesh(mesh), Some(inclusions)) = (&mut substance.body, inclusions) {
+        let found = inclusions.tables()?;
+        if found.len() > MOST_INCLUSIONS {
+            let message = format!("are {}, more than {MOST_INCLUSIONS}", found.len());
+            return Err(inclusions.refuse(Reason::TooLarge, message));
+        }
+        let found = found.iter().map(|item| Inclusion::read(item, mesh)).collect::<Result<Vec<_>>>()?;
+        *mesh = Inclusion::put_into(&found, mesh);
+    }
+    Ok(substance)
+}
+
+/// Inclusions of a scene at most: each looks at all vertices.
+const MOST_INCLUSIONS: usize = 256;
+
+/// Reads the sections that give the coefficients as in the paper.
+fn read_coefficients(fields: &mut Fields<'_>, mut body: Body) -> Result<Substance> {
+    Ok(Substance {
+        springs: fields.required("springs")?.table(|fields| read_springs(fields, &mut body))?,
+        body,
+        virtual_stiffness_n_per_m: fields
+            .required("virtual_springs")?
+            .table(|fields| fields.required_number("stiffness_n_per_m"))?,
+        damping_n_s_per_m: fields
+            .required("damping")?
+            .table(|fields| fields.required_number("coefficient_n_s_per_m"))?,
+    })
+}
+
+/// Reads the section `[material]`, and of `[springs]` what it leaves open.
+fn read_material(fields: &mut Fields<'_>, item: &Item<'_>, mesh: &Mesh) -> Result<Substance> {
+    let material = item.table(Material::read)?;
+    for other in [fields.item("virtual_springs"), fields.item("damping")].into_iter().flatten() {
+        return Err(other.refuse(Reason::WrongKind, FROM_MATERIAL));
+    }
+    let flexion = match fields.item("springs") {
+        None => 0.0,
+        Some(springs) => springs.table(|fields| {
+            for key in ["stiffness_n_per_m", "shear_stiffness_n_per_m"] {
+                if let Some(item) = fields.item(key) {
+                    return Err(item.refuse(Reason::WrongKind, FROM_MATERIAL));
+                }
+            }
+            fields.item("flexion").map_or(Ok(0.0), |item| read_flexion(&item))
+        })?,
+    };
+    let made = material
+        .applied(flexion, mesh.shape.clone())
+        .map_err(|refusal| item.refuse(refusal.reason, refusal.message))?;
+    let stiffness_n_per_m = made.stiffness_n_per_m;
+    Ok(Substance {
+        body: Body::Mesh(made.mesh),
+        springs: Springs { stiffness_n_per_m, shear_stiffness_n_per_m: stiffness_n_per_m, flexion: false },
+        virtual_stiffness_n_per_m: made.virtual_stiffness_n_per_m,
+        damping_n_s_per_m: made.damping_n_s_per_m,
+    })
+}
+
+/// Why a coefficient is refused beside a material.
+const FROM_MATERIAL: &str = "does not go with [material], from which it follows";
+
+/// k of springs of flexion on a mesh, as a part of that of edges.
+fn read_flexion(item: &Item<'_>) -> Result<f64> {
+    let part = item.flag().map(|flag| if flag { 1.0 } else { 0.0 }).or_else(|_| item.number())?;
+    number("springs.flexion", part, "from 0 to 10", |v| (0.0..=10.0).contains(&v))
 }
 
 /// Reads the section `[springs]`. A mesh has springs along its edges; those of flexion may be a part as stiff.
@@ -462,9 +584,7 @@ fn read_springs(fields: &mut Fields<'_>, body: &mut Body) -> Result<Springs> {
                 return Err(shear.refuse(Reason::WrongKind, "is for sheets: the edges of a mesh resist shear as well"));
             }
             if let Some(item) = flexion {
-                let part = item.flag().map(|flag| if flag { 1.0 } else { 0.0 }).or_else(|_| item.number())?;
-                let part = number("springs.flexion", part, "from 0 to 10", |v| (0.0..=10.0).contains(&v))?;
-                *mesh = Mesh::new(mesh.point_mass_kg, part, mesh.shape.clone());
+                *mesh = Mesh::new(mesh.point_mass_kg, read_flexion(&item)?, mesh.shape.clone());
             }
             Ok(Springs { stiffness_n_per_m, shear_stiffness_n_per_m: stiffness_n_per_m, flexion: false })
         }

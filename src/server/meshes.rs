@@ -222,7 +222,8 @@ fn find(uploads: &[Upload], id: &str, account: &Account) -> Result<usize> {
 }
 
 fn unknown() -> Refusal {
-    let message = "is of no mesh that this caller has sent, or it has expired: send the mesh again, from its first part";
+    let message =
+        "is of no mesh that this caller has sent, or it has expired: send the mesh again, from its first part";
     Refusal::new(Reason::UnknownMesh, "mesh_id", message)
 }
 

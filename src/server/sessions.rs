@@ -58,7 +58,9 @@ impl SessionService for Sessions {
         let payer = account.clone();
         let source = request.source;
         let mesh = match &source {
-            Some(Source::Scene(pb::Scene { mesh: Some(mesh), .. })) => Some(self.0.meshes.get(&mesh.mesh_id, &account)?),
+            Some(Source::Scene(pb::Scene { mesh: Some(mesh), .. })) => {
+                Some(self.0.meshes.get(&mesh.mesh_id, &account)?)
+            }
             _ => None,
         };
         let (catalog, config) = (self.0.catalog.clone(), self.0.config.clone());

@@ -116,8 +116,7 @@ impl Prospect {
         let law = laws.of(radius_m).cloned();
         let half_m = 0.5 * size_m.x.min(size_m.y);
         let reach_m = law.as_ref().map_or(f64::INFINITY, Law::reach_m);
-        #[allow(clippy::cast_precision_loss)]
-        let mass_kg = sheet.mass_kg * shape.point_count() as f64;
+        let mass_kg = model.scene.mass_kg();
         let mut prospect = Prospect {
             size_m,
             mass_kg,

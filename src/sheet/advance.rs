@@ -26,6 +26,8 @@ pub(super) struct AdvanceStage<'a, T: Real, C> {
     pub(super) forced: Range<usize>,
     /// 1 where a point moves, 0 where it is fixed; null if every point moves.
     pub(super) free: *const T,
+    /// The mass of each point over that of reference; null if all are 1.
+    pub(super) masses: *const T,
     /// A block that sums the squares of increments: finite and small only if all of them are.
     pub(super) probe: *mut T,
     /// A block that sums the work of the tools, kept apart for each of 16 columns: the same at every width.
@@ -106,8 +108,11 @@ impl<T: Real, C: Arithmetic<T>> AdvanceStage<'_, T, C> {
             // In a vector as wide as a block, each column has a lane of its own.
             let apart = V::LANES < BLOCK;
             let mut work = sums[1];
-            let mut forces = None;
+            let (mut forces, mut mass) = (None, None);
             if FORCED {
+                if !self.masses.is_null() {
+                    mass = Some(V::load(self.masses.add(at)));
+                }
                 if apart {
                     work = V::load(self.work.add(column % BLOCK));
                 }
@@ -142,6 +147,8 @@ impl<T: Real, C: Arithmetic<T>> AdvanceStage<'_, T, C> {
                 }
                 sums[0] = d.mul_add(d, sums[0]);
                 if let Some([_, force]) = force {
+                    // What moves a point is its force over its mass.
+                    let force = if let Some(mass) = mass { force.mul(mass) } else { force };
                     work = force.mul_add(self.scheme.travel(before, [x, d]), work);
                 }
             }

@@ -126,7 +126,7 @@ pub(super) struct Term<T: Real> {
     columns: Range<usize>,
     /// The columns in each of those rows, in whole blocks.
     spans: Vec<Range<usize>>,
-    /// e^{−c·r} for those rows, each as long as a row of the sheet; 0 elsewhere.
+    /// e^{−c·r} over the relative mass for those rows, each as long as a row of the sheet; 0 elsewhere.
     factors: Field<T>,
 }
 
@@ -210,11 +210,12 @@ impl<T: Real> Term<T> {
         self.spans.clear();
         for (factors, row) in self.factors.chunks_exact_mut(layout.stride).zip(self.rows.clone()) {
             let mut any = false;
-            for (factor, place_m) in factors.iter_mut().zip(graph.rest_in_row(row)) {
+            for ((factor, place_m), slot) in factors.iter_mut().zip(graph.rest_in_row(row)).zip(row * BLOCK..) {
                 let exponent = -poke.falloff_per_m * place_m.distance(poke.centre_m);
                 // An empty slot is nowhere.
                 let reaches = exponent >= T::NEGLIGIBLE_EXPONENT && place_m.is_finite();
-                *factor = if reaches { T::of(libm::exp(exponent)) } else { T::default() };
+                let moves = || libm::exp(exponent) / graph.slots.mass(slot);
+                *factor = if reaches { T::of(moves()) } else { T::default() };
                 any |= *factor != T::default();
             }
             self.spans.push(if any { 0..BLOCK } else { 0..0 });
@@ -226,7 +227,7 @@ impl<T: Real> Term<T> {
         self.wanted = wanted;
     }
 
-    /// e^{−c·r} at a point.
+    /// e^{−c·r} over the relative mass at a point.
     fn factor(&self, layout: &Layout, [i, j]: [usize; 2]) -> T {
         if self.rows.contains(&i) { self.factors[(i - self.rows.start) * layout.stride + j] } else { T::default() }
     }
@@ -563,7 +564,7 @@ impl<T: Real> Applied<T> {
         pokes.map(term).collect()
     }
 
-    /// The force that the present substep adds to a point in one field.
+    /// The force that the present substep adds to a point in one field, over its relative mass.
     pub(super) fn force_at(&self, layout: &Layout, field: usize, point: [usize; 2]) -> [f64; 3] {
         let mut sum = [0.0; 3];
         for term in &self.terms {

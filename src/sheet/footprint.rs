@@ -159,7 +159,7 @@ impl Footprint {
         (self.rest_m, self.along) = (DVec3::ZERO, [DVec3::ZERO; 2]);
         for (vertex, weight, gradient, at_m) in disc.cover() {
             let index = graph.slot_of(vertex);
-            let (free, (mass, _)) = (is_free(model, index), model.relative(index));
+            let (free, mass) = (is_free(model, index), model.relative_mass_at(index));
             self.reached.push(Reached { point: model.point_of(index), free, mass, weight, gradient });
             self.rest_m += weight * at_m;
             self.along[0] += gradient.x * at_m;

@@ -80,7 +80,7 @@ impl Plan {
         Plan::new(self.integrator, self.substeps * by, scene.stepping.rate_hz.recip(), &Oscillator::of(scene))
     }
 
-    /// What turns newtons into the scheme's unit of force: dt²/(m·h), 1/N.
+    /// What turns newtons on a point of the mass of reference into the scheme's unit of force: dt²/(m·h), 1/N.
     pub(super) fn force_scale(&self, scene: &Scene) -> f64 {
         self.substep_s * self.substep_s / (scene.point_mass_kg() * scene.shape().edge_m())
     }
@@ -202,10 +202,35 @@ impl Model {
         self.graph.as_ref().map_or(PointId::new(index), |graph| graph.point_in(index))
     }
 
-    /// Mass and K″ of the point at a place in memory, over those of the scene.
-    pub(super) fn relative(&self, index: usize) -> (f64, f64) {
-        let [mass, extra] = self.graph.as_ref().map_or([1.0, 0.0], |graph| graph.relative(index));
-        (mass, mass * (1.0 + extra))
+    /// The mass of a point, kg.
+    pub fn mass_kg(&self, point: PointId) -> f64 {
+        self.scene.point_mass_kg() * self.scene.relative_mass(point)
+    }
+
+    /// K″ of a point, N/m.
+    pub fn virtual_stiffness_n_per_m(&self, point: PointId) -> f64 {
+        self.scene.virtual_stiffness_n_per_m * self.scene.relative_virtual_stiffness(point)
+    }
+
+    /// C of a point, N·s/m.
+    pub fn damping_n_s_per_m(&self, point: PointId) -> f64 {
+        self.scene.damping_n_s_per_m * self.scene.relative_mass(point)
+    }
+
+    /// The mass at a place in memory over that of reference: what divides a force on it in the scheme's units
+    /// ([`Plan::force_scale`]), and multiplies C.
+    pub(super) fn relative_mass_at(&self, index: usize) -> f64 {
+        self.graph.as_ref().map_or(1.0, |graph| graph.slots.mass(index))
+    }
+
+    /// K″/m at a place in memory over that of reference, minus 1.
+    pub(super) fn extra_virtual_at(&self, index: usize) -> f64 {
+        self.graph.as_ref().map_or(0.0, |graph| graph.slots.extra_at(index))
+    }
+
+    /// K″ at a place in memory over that of reference.
+    pub(super) fn relative_virtual_stiffness_at(&self, index: usize) -> f64 {
+        self.relative_mass_at(index) * (1.0 + self.extra_virtual_at(index))
     }
 
     /// What a substep computes, in points: rows are padded, and a short one costs what one of a vector's width does.

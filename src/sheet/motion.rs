@@ -181,7 +181,7 @@ impl<T: Real> Sheet<T> {
                 product += (state.d[at].wide() - free_d.wide()) * state.d[at].wide();
             }
             if counted {
-                work.add(product * unit_j);
+                work.add(product * model.relative_mass_at(index) * unit_j);
             }
         }
     }
@@ -193,7 +193,7 @@ impl<T: Real> Sheet<T> {
         let springs = tables.springs.gather(&tables.layout, &state.u, point).map(Real::wide);
         let scale = plan.force_scale(scene);
         let applied_n = applied.from(model, index, moment);
-        let used = applied.force_at(&tables.layout, 0, point);
+        let (used, mass) = (applied.force_at(&tables.layout, 0, point), model.relative_mass_at(index));
         let mut changes = [[0.0; 2]; 3];
         for (c, change) in changes.iter_mut().enumerate() {
             let at = c * tables.layout.plane + tables.layout.offset(index);
@@ -202,7 +202,7 @@ impl<T: Real> Sheet<T> {
                 springs: &state.history(springs[c], plan.scheme.history(), at),
                 used: used[c],
                 scale,
-                lost_n: scene.damping_n_s_per_m * velocity_m_per_s[c] + applied_n[c],
+                lost_n: scene.damping_n_s_per_m * velocity_m_per_s[c] + applied_n[c] / mass,
             })?;
         }
         Some(changes)
@@ -231,6 +231,7 @@ impl<T: Real> Sheet<T> {
         let unit = plan.scheme.spring_scale() * scale;
         let springs = tables.springs.gather(&tables.layout, &state.u, model.point_of(index));
         let [i, j] = model.point_of(index);
+        let (mass, extra) = (model.relative_mass_at(index), model.extra_virtual_at(index));
         let still = self.steps == 0 || !self.tiles.region.is_awake(i, j);
         let mut found = [DVec3::ZERO; 3];
         for (c, n) in springs.into_iter().enumerate() {
@@ -239,11 +240,16 @@ impl<T: Real> Sheet<T> {
             let mut kept = [one(0.0); MAX_KEPT];
             kept.iter_mut().zip(&state.kept).for_each(|(value, field)| *value = one(field[at].wide()));
             let (u, d, n) = (one(state.u[at].wide()), one(state.d[at].wide()), one(n.wide()));
-            let force = one(unit * applied_n[c]);
+            let force = one(unit * applied_n[c] / mass);
             let (u, w) = with_arithmetic!(&plan.scheme, f64, |scheme| scheme.observe(u, d, n, &kept, Some(force)));
             found[0][c] = u.value() * spacing_m;
             found[1][c] = if still { 0.0 } else { w.value() * spacing_m / plan.substep_s };
             found[2][c] = n.value() / unit;
+            if model.graph.is_some() {
+                // What pulls beyond the K″ of reference is none of the springs.
+                let pulled_n = model.scene.virtual_stiffness_n_per_m * extra * state.u[at].wide() * spacing_m;
+                found[2][c] = mass * (found[2][c] + pulled_n);
+            }
         }
         found
     }
@@ -277,7 +283,11 @@ pub(super) fn springs_of<T: Real>(model: &Model, plan: &Plan) -> Elastic<T> {
     let unit = plan.substep_s * plan.substep_s / model.scene.point_mass_kg() * plan.scheme.spring_scale();
     match &model.graph {
         None => Elastic::Sheet(Springs::new(&model.scene.springs, unit)),
-        Some(graph) => Elastic::Mesh(graph.clone(), Kind::new(unit * model.scene.springs.stiffness_n_per_m, 1.0)),
+        Some(graph) => Elastic::Mesh(
+            graph.clone(),
+            Kind::new(unit * model.scene.springs.stiffness_n_per_m, 1.0),
+            T::of(unit * model.scene.virtual_stiffness_n_per_m),
+        ),
     }
 }
 
@@ -393,10 +403,12 @@ impl<T: Real> Tissue for Sheet<T> {
         if let Some(motion) = motion {
             (displacement_m, velocity_m_per_s) = (motion.displacement_m, motion.velocity_m_per_s);
         }
-        let virtual_n = -scene.virtual_stiffness_n_per_m * displacement_m;
-        let damping_n = -scene.damping_n_s_per_m * velocity_m_per_s;
+        let mass = self.model.relative_mass_at(index);
+        let virtual_n =
+            -scene.virtual_stiffness_n_per_m * self.model.relative_virtual_stiffness_at(index) * displacement_m;
+        let damping_n = -scene.damping_n_s_per_m * mass * velocity_m_per_s;
         let constraint_n = motion.map(|motion| {
-            let inertia_n = scene.point_mass_kg() * motion.acceleration_m_per_s2;
+            let inertia_n = scene.point_mass_kg() * mass * motion.acceleration_m_per_s2;
             inertia_n - spring_n - virtual_n - damping_n - applied_n
         });
         PointState { displacement_m, velocity_m_per_s, spring_n, virtual_n, damping_n, applied_n, constraint_n }

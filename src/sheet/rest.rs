@@ -14,7 +14,8 @@ impl<T: Real> Sheet<T> {
         let spacing_m = model.unit_m;
         for change in applied.changes(model, *steps) {
             // No force moves its centre less than it would if all springs held the centre.
-            let stiffness = model.omega_bound_per_s.powi(2) * model.scene.point_mass_kg();
+            let heaviest = model.graph.as_ref().map_or(1.0, |graph| graph.largest_mass);
+            let stiffness = model.omega_bound_per_s.powi(2) * model.scene.point_mass_kg() * heaviest;
             if stiffness > 0.0 {
                 tiles.largest = tiles.largest.max(change.peak_n() / (stiffness * spacing_m));
             }
@@ -79,8 +80,10 @@ impl<T: Real> Sheet<T> {
             part: scale / plan.scheme.impulse(),
             pull: virtual_stiffness * scale,
         };
-        let balanced =
-            |survey: &Survey| survey.imbalance <= scale * (epsilon * virtual_stiffness + unknown * survey.largest);
+        // Where K″ is less, the same imbalance moves a point farther.
+        let least =
+            model.graph.as_ref().map_or(virtual_stiffness, |graph| virtual_stiffness * (1.0 + graph.least_extra));
+        let balanced = |survey: &Survey| survey.imbalance <= scale * (epsilon * least + unknown * survey.largest);
         let mut region = tiles.no_region();
         let mut sleepers = Vec::new();
         for tile in calm.into_iter().filter(|tile| !held.contains(tile)) {

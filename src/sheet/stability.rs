@@ -1,7 +1,7 @@
 //! How fast the sheet can vibrate, and how many substeps that asks for.
 
 use super::integrate::{Bound, Oscillator, Scheme, entry};
-use crate::scene::{Body, Integrator, Scene, Springs};
+use crate::scene::{Body, Integrator, Scene, Springs, Stiffest};
 
 /// Largest phase of the fastest vibration per substep of central differences, rad: dt·ω_b ≤ θ. The scheme is stable
 /// below 2; its error falls with θ². At 0.25 the force of the stiffest scenes is within 5e-3.
@@ -20,11 +20,15 @@ pub fn endurance(omega_per_s: f64, decay_s: f64) -> f64 {
     if turns.is_nan() { 1.0 } else { (turns / 27.0).sqrt().clamp(1.0, 8.0) }
 }
 
-/// Largest eigenvalue of the springs' stiffness matrix under any deformation, N/m.
+/// Largest eigenvalue of the springs' stiffness matrix under any deformation, with the masses of reference, N/m.
 pub fn largest_stiffness_n_per_m(scene: &Scene) -> f64 {
     match &scene.body {
         Body::Sheet(_) => largest_stiffness_of_a_sheet_n_per_m(&scene.springs),
-        Body::Mesh(mesh) => scene.springs.stiffness_n_per_m * mesh.stiffest.bound,
+        // What pulls back beyond the K″ of reference counts among the springs.
+        Body::Mesh(mesh) => {
+            let Stiffest { bound, extra_virtual, .. } = mesh.stiffest;
+            scene.springs.stiffness_n_per_m * bound + scene.virtual_stiffness_n_per_m * extra_virtual
+        }
     }
 }
 

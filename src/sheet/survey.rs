@@ -24,11 +24,11 @@ use super::tissue::Energy;
 /// The result of a survey, in the scheme's units (`integrate`).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Survey {
-    /// Σ w².
+    /// Σ w², each point by its relative mass.
     pub(super) speed_squared: f64,
     /// The same, in the form that the scheme's conserved energy uses.
     pub(super) conserved_speed_squared: f64,
-    /// Σ u².
+    /// Σ u², each point by its relative K″.
     pub(super) displacement_squared: f64,
     /// Energy of all springs.
     pub(super) spring_energy: f64,
@@ -38,7 +38,7 @@ pub(super) struct Survey {
     pub(super) prediction_error: f64,
     /// The largest component of any w.
     pub(super) speed: f64,
-    /// The largest component of the force imbalance of any free point: N − a·u + F.
+    /// The largest component of the force imbalance of any free point over its relative mass: N − a·u + F.
     pub(super) imbalance: f64,
     /// Σ F·d of the tools.
     pub(super) power: f64,
@@ -97,6 +97,9 @@ struct SurveyStage<'a, T: Real, C> {
     /// The same forces in the form that the sweep uses.
     pulls: &'a [Pull<'a, T>],
     free: *const T,
+    /// Relative mass and extra K″/m of each point; null if all are 1, or 0.
+    masses: *const T,
+    extra: *const T,
     sums: &'a UnsafeCell<Sums<T>>,
 }
 
@@ -146,7 +149,10 @@ impl Survey {
         let sums = UnsafeCell::new(Sums { row: [zero; 5], total: [[0.0; BLOCK]; 5], largest: [zero; 4] });
         let pulls = forces.terms.iter().map(|term| term.pull(forces.field, tables.layout.stride));
         let pulls: Vec<Pull<'_, T>> = pulls.collect();
+        let [masses, extra] = tables.masses_and_extra();
         let stage = SurveyStage {
+            masses,
+            extra,
             layout: tables.layout,
             scheme,
             d,
@@ -253,6 +259,14 @@ impl<T: Real, C: Arithmetic<T>> Stage<T> for SurveyStage<'_, T, C> {
                 }
                 most = [most[0].farther(u), most[1].farther(u.sub(x[c])), most[2].farther(w), most[3].farther(short)];
             }
+            if !self.masses.is_null() {
+                let mass = V::load(self.masses.add(at));
+                [speed, displacement] = [speed.mul(mass), displacement.mul(mass)];
+                [conserved, power] = [conserved.mul(mass), power.mul(mass)];
+            }
+            if !self.extra.is_null() {
+                displacement = displacement.mul_add(V::load(self.extra.add(at)), displacement);
+            }
             self.add(0, column, speed);
             self.add(1, column, displacement);
             self.add(3, column, conserved);
@@ -302,7 +316,7 @@ impl<T: Real> Sheet<T> {
         // A grasped point moves with its tool, not as the scheme would move it.
         let own = self.prescribed.grasped().map(|(index, motion)| {
             let [_, free, _] = self.free_point(index, self.applied.until(model, index));
-            motion.velocity_m_per_s.length_squared() - free.length_squared()
+            model.relative_mass_at(index) * (motion.velocity_m_per_s.length_squared() - free.length_squared())
         });
         let grasped_j = 0.5 * model.scene.point_mass_kg() * own.sum::<f64>();
         energy.kinetic_j += grasped_j;

@@ -25,17 +25,19 @@ const FEW: usize = 4;
 #[derive(Debug, Clone)]
 pub(super) enum Elastic<T> {
     Sheet(Springs<T>),
-    /// The places of a mesh, and a spring of length 1 with the k of an edge; those of the mesh are that times their own.
-    Mesh(Arc<MeshPlaces>, Kind<T>),
+    /// The places of a mesh; a spring of length 1 with the k of reference, of which those of the mesh are multiples; and what
+    /// the extra virtual stiffness multiplies.
+    Mesh(Arc<MeshPlaces>, Kind<T>, T),
 }
 
 impl<T: Real> Elastic<T> {
-    /// The force of all springs on a point, gathered: for the few points that a caller asks about.
+    /// The force of all springs, and of the extra virtual stiffness, on a point, over its relative mass; gathered: for the few
+    /// points that a caller asks about.
     pub(super) fn gather(&self, layout: &Layout, u: &[T], point: [usize; 2]) -> [T; 3] {
         match self {
             Elastic::Sheet(springs) => springs.gather(layout, u, point),
-            Elastic::Mesh(places, unit) => {
-                mesh::gather(&places.slots, unit, T::default(), u, point[0] * BLOCK + point[1])
+            Elastic::Mesh(places, unit, pull) => {
+                mesh::gather(&places.slots, unit, *pull, u, point[0] * BLOCK + point[1])
             }
         }
     }
@@ -103,6 +105,11 @@ impl<T: Real> SweepTables<T> {
         }
     }
 
+    /// The relative mass of each place, and its extra K″/m; null if all are 1, or 0.
+    pub(super) fn masses_and_extra(&self) -> [*const T; 2] {
+        self.mesh.as_ref().map_or([std::ptr::null(); 2], |mesh| mesh.springs.masses_and_extra())
+    }
+
     /// Advances every point with `scheme`. The tools' force is read from field `field` on.
     pub(super) fn advance<C: Arithmetic<T>>(
         &mut self,
@@ -137,6 +144,7 @@ impl<T: Real> SweepTables<T> {
             pulls,
             forced: applied::rows(terms),
             free: self.free.as_ref().map_or(std::ptr::null(), |free| free.as_ptr()),
+            masses: self.masses_and_extra()[0],
             probe: self.probe.as_mut_ptr(),
             work: self.work.as_mut_ptr(),
         };
@@ -166,8 +174,8 @@ impl<T: Real> SweepTables<T> {
     unsafe fn run<S: Stage<T>>(&self, x: *const T, over: &Region, stage: S) {
         let layout = self.layout;
         match (&self.springs, &self.mesh) {
-            (Elastic::Mesh(places, unit), Some(MeshTables { springs, snapshot })) => {
-                let grid = MeshGrid { layout, slots: &places.slots, springs, unit, pull: T::default(), x, snapshot };
+            (Elastic::Mesh(places, unit, pull), Some(MeshTables { springs, snapshot })) => {
+                let grid = MeshGrid { layout, slots: &places.slots, springs, unit, pull: *pull, x, snapshot };
                 // SAFETY: the caller's promise; the springs and the snapshot were made for these slots and this width.
                 unsafe { lanes::run(self.width, &MeshSweep { grid, over, stage }) };
             }

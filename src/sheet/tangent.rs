@@ -171,7 +171,8 @@ impl<'m> Patch<'m> {
         }
         let free = window.free(model);
         let springs = window.springs(model, &free, turn);
-        let (masses, stiffness) = window.points(model).map(|index| model.relative(index)).unzip();
+        let masses = window.points(model).map(|index| model.relative_mass_at(index)).collect();
+        let stiffness = window.points(model).map(|index| model.relative_virtual_stiffness_at(index)).collect();
         let mut patch = Patch {
             model,
             window,

@@ -30,7 +30,7 @@ use super::model::Model;
 use super::real::Real;
 use super::region::{Marks, Region, TILE, tiles};
 use crate::memory;
-use crate::scene::Scene;
+use crate::scene::{Body, Scene};
 
 /// Steps between two checks whether tiles may sleep.
 pub(super) const CHECK_STEPS: u64 = 16;
@@ -41,6 +41,9 @@ const CALM_CHECKS: u8 = 2;
 /// Part of the tolerance that a tile may be from its rest: errors of neighbours add up. (Measured: up to three and a
 /// half times the ε of a tile, where a whole sheet creeps one way.)
 const PART: f64 = 0.25;
+
+/// The bound of the stiffness of an even mesh, over k (`Stiffest`).
+const EVEN: f64 = 12.0;
 
 /// The recent largest displacement decays by this factor from one check to the next.
 const FORGET: f64 = 0.99;
@@ -177,7 +180,11 @@ impl<T: Real> SleepTiles<T> {
     /// ε_w, in spacings.
     pub(super) fn farthest_unnoticed(&self, scene: &Scene) -> f64 {
         let epsilon = self.epsilon();
-        let ratio = scene.virtual_stiffness_n_per_m / scene.springs.stiffness_n_per_m;
+        let mut ratio = scene.virtual_stiffness_n_per_m / scene.springs.stiffness_n_per_m;
+        if let Body::Mesh(mesh) = &scene.body {
+            // As far as its springs are stiffer than those of a mesh that is even.
+            ratio /= (mesh.stiffest.bound / EVEN).max(1.0);
+        }
         // Without springs nothing passes from tile to tile.
         let unnoticed = if ratio.is_nan() { epsilon } else { epsilon * (20.0 * ratio).clamp(0.1, 1.0) };
         // A difference in the last digit is rounding noise.
@@ -361,7 +368,7 @@ impl<T: Real> SleepTiles<T> {
         let mut waking = Vec::new();
         if let Some(graph) = self.graph.clone() {
             for tile in (0..self.calm.len()).filter(|tile| !self.region.awake.has[*tile]) {
-                self.drift_n[tile] += change.most_n(graph.box_of(tile));
+                self.drift_n[tile] += change.most_n(graph.box_of(tile)) / graph.least_pull(tile);
                 if self.drift_n[tile] > least_n {
                     waking.push(tile);
                 }

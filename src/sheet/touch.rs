@@ -87,18 +87,19 @@ impl<T: Real> Sheet<T> {
         Some(Surroundings { model: self.model.clone(), footprint: tool.footprint.clone(), window, displacement_m })
     }
 
-    /// Σ(w·f/mass)/Σ(w²/mass): the force under which the disc is not accelerated. Here f is the force of springs, virtual springs, damping and force-controlled tools.
+    /// Σ(w·f/mass)/Σ(w²/mass): the force under which the disc is not accelerated. f is that of springs, virtual springs,
+    /// damping and force-controlled tools.
     fn without_inertia(&self, tool: &Tool) -> DVec3 {
         let (model, footprint) = (&self.model, &tool.footprint);
         let scene = &model.scene;
         let mut sum = DVec3::ZERO;
         for Reached { point, mass, weight, .. } in footprint.reached().iter().copied().filter(|point| point.free) {
             let index = model.index_of(point);
-            let (of_mass, of_stiffness) = model.relative(index);
+            let of_stiffness = model.relative_virtual_stiffness_at(index);
             let applied_n = if self.steps == 0 { DVec3::ZERO } else { self.applied.until(model, index) };
             let [u, v, spring_n] = self.free_point(index, applied_n);
             let virtual_n = -of_stiffness * scene.virtual_stiffness_n_per_m * u;
-            let damping_n = -of_mass * scene.damping_n_s_per_m * v;
+            let damping_n = -mass * scene.damping_n_s_per_m * v;
             sum += weight / mass * (spring_n + virtual_n + damping_n + applied_n);
         }
         if footprint.mobility() > 0.0 { sum / footprint.mobility() } else { DVec3::ZERO }

@@ -128,9 +128,9 @@ pub enum OrganError {
         /// The edge length that was asked for, m.
         edge_m: f64,
     },
-    /// The mesh would have more than [`MOST_VERTICES`].
+    /// The mesh would have more vertices than it may.
     #[error(
-        "with edges of {} mm the {organ} would have about {vertices} vertices, more than {MOST_VERTICES}: edges of {} mm fit",
+        "with edges of {} mm the {organ} would have about {vertices} vertices, more than {most}: edges of {} mm fit",
         in_mm(*edge_m),
         in_mm(*fits_m)
     )]
@@ -141,6 +141,8 @@ pub enum OrganError {
         edge_m: f64,
         /// How many vertices it would give.
         vertices: u64,
+        /// How many it may have.
+        most: usize,
         /// The least edge length that is accepted, m.
         fits_m: f64,
     },
@@ -181,6 +183,15 @@ fn in_mm(length_m: f64) -> f64 {
 /// Refuses an edge length that is not a number above 0, that would give more than [`MOST_VERTICES`], or that is too long for
 /// the thinnest part of the organ; the refusal tells the nearest one that fits.
 pub fn generate(organ: Organ, edge_m: f64, seed: u64) -> Result<TriangleMesh, OrganError> {
+    generate_within(organ, edge_m, seed, MOST_VERTICES)
+}
+
+/// The same with another bound of the number of vertices, if it is less than [`MOST_VERTICES`].
+///
+/// # Errors
+/// As for [`generate`].
+pub fn generate_within(organ: Organ, edge_m: f64, seed: u64, most: usize) -> Result<TriangleMesh, OrganError> {
+    let most = most.min(MOST_VERTICES);
     if !(edge_m.is_finite() && edge_m > 0.0) {
         return Err(OrganError::NotALength { edge_m });
     }
@@ -193,10 +204,10 @@ pub fn generate(organ: Organ, edge_m: f64, seed: u64) -> Result<TriangleMesh, Or
     let net = Net::new(&shape);
     let vertices = |edge: f64| net.area() / (2.0 * EQUILATERAL * edge * edge);
     // A tenth more than counted, because a mesh has some more or less; rounded up to what the message shows.
-    let fits = (vertices(1.0) * 1.1 / MOST_VERTICES as f64).sqrt();
+    let fits = (vertices(1.0) * 1.1 / most.max(1) as f64).sqrt();
     let fits = (fits * 1e3).ceil() / 1e3;
     if edge < fits - 1e-7 {
-        return Err(OrganError::TooFine { organ, edge_m, vertices: vertices(edge) as u64, fits_m: fits * 1e-3 });
+        return Err(OrganError::TooFine { organ, edge_m, vertices: vertices(edge) as u64, most, fits_m: fits * 1e-3 });
     }
     let mesh = Remesh::new(&shape, &net, edge).ok_or(OrganError::NotAManifold { organ, seed })?.even();
 

@@ -102,6 +102,11 @@ fn halo_lane(number: usize, halves: usize) -> usize {
 }
 
 impl<T: Real> MeshSprings<T> {
+    /// The relative mass of each slot, and the extra K″/m of each; null if all are 1, or 0.
+    pub(in crate::sheet) fn masses_and_extra(&self) -> [*const T; 2] {
+        [&self.masses, &self.extra].map(|field| field.as_ref().map_or(std::ptr::null(), |field| field.as_ptr()))
+    }
+
     /// Arranges the springs of a mesh.
     pub(in crate::sheet) fn new(slots: &MeshSlots, shape: Shape) -> Self {
         let of_slots = |values: &[f64]| {

@@ -25,6 +25,11 @@ pub(in crate::sheet) struct MeshPlaces {
     /// The slots beyond each tile that its springs lead to, ascending; and where each tile's begin, and the last end.
     around: Vec<u32>,
     firsts_around: Vec<usize>,
+    /// For each tile, the least K″ of a point over that of reference. Empty if all are 1.
+    least_pulls: Vec<f64>,
+    /// The least extra K″/m of any point, at most 0; and the largest relative mass.
+    pub(in crate::sheet) least_extra: f64,
+    pub(in crate::sheet) largest_mass: f64,
 }
 
 impl MeshPlaces {
@@ -33,12 +38,13 @@ impl MeshPlaces {
     /// # Errors
     /// What is wrong with its springs.
     pub(in crate::sheet) fn of(mesh: &Mesh) -> Result<Self, GraphFault> {
-        let springs = mesh.shape.springs(mesh.flexion);
+        let springs = mesh.springs();
         let graph = MeshGraph {
             rest_m: mesh.shape.vertices_m().to_vec(),
             springs: springs.map(|(ends, stiffness_n_per_m)| MeshSpring { ends, stiffness_n_per_m }).collect(),
             spacing_m: mesh.shape.edge_m(),
-            ..MeshGraph::default()
+            relative_mass: mesh.differences.relative_mass.clone(),
+            extra_virtual: mesh.differences.extra_virtual.clone(),
         };
         let slots = MeshSlots::new(&graph)?;
         let place_m = |vertex: &u32| if *vertex == NO_VERTEX { DVec3::NAN } else { graph.rest_m[*vertex as usize] };
@@ -67,8 +73,17 @@ impl MeshPlaces {
             around.extend(beyond);
             firsts_around.push(around.len());
         }
+        let pulled = |tile: usize| {
+            let own = tile * TILE_SLOTS..((tile + 1) * TILE_SLOTS).min(rest_m.len());
+            let own = own.filter(|slot| slots.vertex_of()[*slot] != NO_VERTEX);
+            own.map(|slot| slots.mass(slot) * (1.0 + slots.extra_at(slot))).fold(f64::INFINITY, f64::min)
+        };
+        let is_even = slots.masses().is_empty() && slots.extra().is_empty();
+        let least_pulls = if is_even { Vec::new() } else { (0..slots.tiles()).map(pulled).collect() };
+        let least_extra = slots.extra().iter().copied().fold(0.0, f64::min);
+        let largest_mass = slots.masses().iter().copied().reduce(f64::max).unwrap_or(1.0);
         let (balls, boxes) = ((0..slots.blocks()).map(ball).collect(), (0..slots.tiles()).map(box_of).collect());
-        Ok(MeshPlaces { balls, boxes, around, firsts_around, slots, rest_m })
+        Ok(MeshPlaces { balls, boxes, around, firsts_around, least_pulls, least_extra, largest_mass, slots, rest_m })
     }
 
     /// Rows of memory.
@@ -90,14 +105,8 @@ impl MeshPlaces {
     /// The springs of a slot: the slot of the other end, the vector to it at rest in units of length, and k over that of an
     /// edge.
     pub(in crate::sheet) fn joined(&self, slot: usize) -> impl Iterator<Item = (usize, DVec3, f64)> + '_ {
-        let [mass, _] = self.relative(slot);
+        let mass = self.slots.mass(slot);
         self.slots.springs(slot).iter().map(move |half| (half.to as usize, half.rest, half.stiffness * mass))
-    }
-
-    /// The mass of a slot over that of reference, and its extra K″/m over that of reference.
-    pub(in crate::sheet) fn relative(&self, slot: usize) -> [f64; 2] {
-        let of = |list: &[f64], otherwise| list.get(slot).copied().unwrap_or(otherwise);
-        [of(self.slots.masses(), 1.0), of(self.slots.extra(), 0.0)]
     }
 
     /// Where the point of a slot rests, m.
@@ -122,6 +131,11 @@ impl MeshPlaces {
     /// The ends of the box around the points of a tile along each axis, m.
     pub(in crate::sheet) fn box_of(&self, tile: usize) -> &[[f64; 2]; 3] {
         &self.boxes[tile]
+    }
+
+    /// The least K″ of a tile's points over that of reference.
+    pub(in crate::sheet) fn least_pull(&self, tile: usize) -> f64 {
+        self.least_pulls.get(tile).copied().unwrap_or(1.0)
     }
 
     /// The tiles that springs join to a tile, ascending.

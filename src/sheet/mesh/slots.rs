@@ -167,6 +167,16 @@ impl MeshSlots {
         &self.masses
     }
 
+    /// The mass of a slot over that of reference; 0 without a point, if not all are 1.
+    pub(in crate::sheet) fn mass(&self, slot: usize) -> f64 {
+        self.masses.get(slot).copied().unwrap_or(1.0)
+    }
+
+    /// K″/m of a slot over that of reference, minus 1.
+    pub(in crate::sheet) fn extra_at(&self, slot: usize) -> f64 {
+        self.extra.get(slot).copied().unwrap_or(0.0)
+    }
+
     /// The extra K″/m of the slots over that of reference. Empty if all are 0.
     pub(super) fn extra(&self) -> &[f64] {
         &self.extra

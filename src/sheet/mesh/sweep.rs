@@ -207,9 +207,6 @@ impl<T: Real, S: Stage<T>> MeshSweep<'_, T, S> {
                 let pull = x[0].splat(at_hand.pull).mul(V::load(at_hand.extra.add(at)));
                 for c in 0..3 {
                     sum.force[c] = sum.force[c].minus(pull, x[c]);
-                    if S::ENERGY {
-                        sum.energy = pull.mul(x[c]).mul_add(x[c], sum.energy);
-                    }
                 }
             }
             if S::ENERGY {

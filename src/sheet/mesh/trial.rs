@@ -122,6 +122,7 @@ impl<T: Real> FreeMotion<T> {
             pulls: &[],
             forced: 0..0,
             free: std::ptr::null(),
+            masses: std::ptr::null(),
             probe: self.probe.as_mut_ptr(),
             work: self.work.as_mut_ptr(),
         };

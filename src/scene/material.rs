@@ -1,0 +1,398 @@
+//! The sections `[material]` and `[[inclusion]]` of a scene on a mesh: what the tissue is made of, and where it differs.
+
+use std::sync::Arc;
+
+use glam::{DMat3, DVec3};
+
+use super::document::{Fields, Item};
+use super::membrane::settled_energy_j;
+use super::mesh::{Differences, Mesh, MeshShape};
+use crate::refusal::{Reason, Refusal, Result, did_you_mean, excerpt, not_negative, number, positive};
+use crate::shape::{PointId, RestShape};
+
+/// k of an edge between equal triangles with equal sides, over E·t: such springs resist as a membrane with ν = 1/3.
+const EQUAL_SIDES: f64 = 0.866_025_403_784_438_6;
+
+/// ν of a membrane of springs.
+const POISSON: f64 = 1.0 / 3.0;
+
+/// A third of what is beneath the surface moves along: its displacement falls linearly with depth.
+const MOVES_ALONG: f64 = 1.0 / 3.0;
+
+/// What a tissue on a mesh is made of.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Material {
+    /// E of the capsule, Pa. Its ν is 1/3.
+    pub youngs_modulus_pa: f64,
+    /// Thickness t of the capsule, m.
+    pub thickness_m: f64,
+    /// ρ of what moves along, kg/m³.
+    pub density_kg_per_m3: f64,
+    /// How deep that is, m.
+    pub depth_m: f64,
+    /// What pulls back to the rest shape, N/m for each m² of surface.
+    pub bed_n_per_m3: f64,
+    /// Damping of a point on its virtual spring, over the critical.
+    pub damping_ratio: f64,
+}
+
+/// A tissue of a material: the mesh, and the coefficients of reference.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MadeOf {
+    /// The mesh.
+    pub mesh: Mesh,
+    /// k of an edge between triangles with equal sides, N/m.
+    pub stiffness_n_per_m: f64,
+    /// K″ of a vertex of mean area, N/m.
+    pub virtual_stiffness_n_per_m: f64,
+    /// C of a vertex of mean area, N·s/m.
+    pub damping_n_s_per_m: f64,
+}
+
+impl Material {
+    pub(super) fn read(fields: &mut Fields<'_>) -> Result<Self> {
+        let above_0 = |fields: &mut Fields<'_>, key: &'static str, standard: Option<f64>| {
+            let value = fields.number(key)?.or(standard);
+            positive(&fields.path(key), value.map_or_else(|| fields.required_number(key), Ok)?)
+        };
+        let youngs_modulus_pa = above_0(fields, "youngs_modulus_pa", None)?;
+        let thickness_m = above_0(fields, "thickness_m", None)?;
+        let density_kg_per_m3 = above_0(fields, "density_kg_per_m3", Some(1060.0))?;
+        let depth_m = above_0(fields, "depth_m", Some(0.03))?;
+        let bed_n_per_m3 = not_negative(&fields.path("bed_n_per_m3"), fields.required_number("bed_n_per_m3")?)?;
+        let damping_ratio = fields.number("damping_ratio")?.unwrap_or(0.5);
+        let damping_ratio =
+            number(&fields.path("damping_ratio"), damping_ratio, "from 0 to 100", |v| (0.0..=100.0).contains(&v))?;
+        Ok(Material { youngs_modulus_pa, thickness_m, density_kg_per_m3, depth_m, bed_n_per_m3, damping_ratio })
+    }
+
+    /// A tissue of this material, with springs of flexion whose k is the part `flexion` of that of the edge they cross.
+    ///
+    /// A vertex has a third of the area of its triangles, and mass, K″ and C by that; an edge has k = E·t·(A₁ + A₂)/L² (van
+    /// Gelder 1998), times one factor for the mesh that makes its springs, those of flexion included, store what the material
+    /// does when it is stretched alike to all sides (`membrane`).
+    ///
+    /// # Errors
+    /// Refuses a mesh with a vertex without area.
+    pub fn applied(&self, flexion: f64, shape: Arc<MeshShape>) -> Result<MadeOf> {
+        let Spread { of_vertices_m2, beside_edges_m2 } = Spread::of(&shape);
+        let whole_m2: f64 = of_vertices_m2.iter().sum();
+        #[allow(clippy::cast_precision_loss)]
+        let mean_m2 = whole_m2 / of_vertices_m2.len() as f64;
+        let none = |area_m2: &f64| !area_m2.is_finite() || *area_m2 <= mean_m2 * 1e-9;
+        if let Some(vertex) = of_vertices_m2.iter().position(none) {
+            let (name, place_m) = (shape.name(PointId::new(vertex)), shape.vertices_m()[vertex]);
+            let message = format!(
+                "{name} at {place_m} m has no area, so [material] gives it no mass: `palpate mesh FILE --repair` may mend it"
+            );
+            return Err(Refusal::new(Reason::Unreadable, "mesh", message));
+        }
+        let squared_m2 = |[a, b]: &[u32; 2]| {
+            let [a, b] = [a, b].map(|end| shape.vertices_m()[*end as usize]);
+            a.distance_squared(b)
+        };
+        let edges: Vec<f64> = shape.edges().iter().zip(&beside_edges_m2).map(|(e, a)| a / squared_m2(e)).collect();
+        let crossed = |edge: &[u32; 2]| shape.edges().binary_search(edge).map_or(0.0, |at| edges[at]);
+        let across: Vec<f64> = shape.crossed().iter().map(crossed).collect();
+        let relative = |list: &[f64]| list.iter().map(|factor| factor / EQUAL_SIDES).collect::<Vec<f64>>();
+        let differences = Differences {
+            relative_mass: of_vertices_m2.iter().map(|area_m2| area_m2 / mean_m2).collect(),
+            extra_virtual: Vec::new(),
+            edges: relative(&edges),
+            flexion: relative(&across),
+        };
+        let (mass_per_m2, bed) = (MOVES_ALONG * self.density_kg_per_m3 * self.depth_m, self.bed_n_per_m3);
+        let mesh = Mesh::uneven(mass_per_m2 * mean_m2, flexion, shape, differences);
+        let membrane_n_per_m = self.youngs_modulus_pa * self.thickness_m;
+        Ok(MadeOf {
+            stiffness_n_per_m: EQUAL_SIDES * membrane_n_per_m / modulus(&mesh, whole_m2),
+            virtual_stiffness_n_per_m: bed * mean_m2,
+            damping_n_s_per_m: 2.0 * self.damping_ratio * (bed * mass_per_m2).sqrt() * mean_m2,
+            mesh,
+        })
+    }
+}
+
+/// E·t of a membrane of the springs of a mesh, where an edge between triangles with equal sides has k = √3/2: a strain of 1
+/// to all sides stores E·t/(1 − ν) on each m².
+fn modulus(mesh: &Mesh, whole_m2: f64) -> f64 {
+    let shape = &mesh.shape;
+    let springs = mesh.springs().map(|(ends, k)| (ends, EQUAL_SIDES * k));
+    let held = |vertex: usize| shape.is_on_rim(vertex);
+    let stored_j = settled_energy_j([shape.vertices_m(), shape.normals()], springs, held, DMat3::IDENTITY);
+    let modulus = stored_j * (1.0 - POISSON) / whole_m2;
+    // A mesh of so few triangles that all of it gives way is left as it is.
+    if modulus > 0.1 { modulus } else { 1.0 }
+}
+
+/// How the area of a mesh is spread.
+struct Spread {
+    /// A third of the area of each vertex's triangles.
+    of_vertices_m2: Vec<f64>,
+    /// The area of the triangles beside each edge.
+    beside_edges_m2: Vec<f64>,
+}
+
+impl Spread {
+    fn of(shape: &MeshShape) -> Self {
+        let (vertices_m, edges) = (shape.vertices_m(), shape.edges());
+        let (mut of_vertices_m2, mut beside_edges_m2) = (vec![0.0; vertices_m.len()], vec![0.0; edges.len()]);
+        for triangle in shape.triangles() {
+            let [a, b, c] = triangle.map(|vertex| vertices_m[vertex as usize]);
+            let area_m2 = 0.5 * (b - a).cross(c - a).length();
+            triangle.iter().for_each(|vertex| of_vertices_m2[*vertex as usize] += area_m2 / 3.0);
+            let [a, b, c] = *triangle;
+            for edge in [[a, b], [b, c], [c, a]].map(|[a, b]| [a.min(b), a.max(b)]) {
+                if let Ok(at) = edges.binary_search(&edge) {
+                    beside_edges_m2[at] += area_m2;
+                }
+            }
+        }
+        Spread { of_vertices_m2, beside_edges_m2 }
+    }
+}
+
+/// A region of a mesh that is stiffer or softer.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Inclusion {
+    /// Where it is.
+    pub region: Region,
+    /// k of the springs there over that around.
+    pub stiffness_factor: f64,
+    /// K″ of the points there over that around.
+    pub virtual_stiffness_factor: f64,
+    /// So far beyond the region the factors fall to 1, m.
+    pub edge_m: f64,
+}
+
+/// Some of a surface.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Region {
+    /// What is within a ball.
+    Ball {
+        /// Its centre, m.
+        centre_m: DVec3,
+        /// Its radius, m.
+        radius_m: f64,
+    },
+    /// Some vertices, ascending.
+    Vertices(Vec<u32>),
+}
+
+impl Inclusion {
+    pub(super) fn read(item: &Item<'_>, mesh: &Mesh) -> Result<Self> {
+        item.table(|fields| {
+            let factor = |fields: &mut Fields<'_>, key: &'static str| {
+                let value = fields.number(key)?.unwrap_or(1.0);
+                number(&fields.path(key), value, "from 0.01 to 100", |v| (0.01..=100.0).contains(&v))
+            };
+            let (centre, group) = (fields.item("centre_m"), fields.item("group"));
+            let region = match (centre, group) {
+                (Some(centre), None) => {
+                    let radius_m = fields.required_number("radius_m")?;
+                    Region::Ball { centre_m: centre.vector()?, radius_m: positive(&fields.path("radius_m"), radius_m)? }
+                }
+                (None, Some(group)) => {
+                    let (name, groups) = (group.text()?, &mesh.shape.told().groups);
+                    let found = groups.iter().find(|group| group.name == name).ok_or_else(|| {
+                        let meant = did_you_mean(&name, groups.iter().map(|group| group.name.as_str()));
+                        let message = format!("`{}` is no group of the mesh{meant}", excerpt(&name));
+                        group.refuse(Reason::WrongKind, message)
+                    })?;
+                    Region::Vertices(found.vertices.clone())
+                }
+                (Some(_), Some(group)) => {
+                    let message = "does not go with centre_m: an inclusion is a ball or a group";
+                    return Err(group.refuse(Reason::WrongKind, message));
+                }
+                (None, None) => {
+                    let message = "is missing, or else `group`: where the inclusion is";
+                    return Err(fields.refuse(Reason::Missing, "centre_m", message));
+                }
+            };
+            let edge_m = fields.number("edge_m")?.unwrap_or(0.0);
+            let inclusion = Inclusion {
+                region,
+                stiffness_factor: factor(fields, "stiffness_factor")?,
+                virtual_stiffness_factor: factor(fields, "virtual_stiffness_factor")?,
+                edge_m: not_negative(&fields.path("edge_m"), edge_m)?,
+            };
+            if let Region::Ball { centre_m, radius_m } = inclusion.region {
+                let nearest_m = mesh.shape.rest_m(mesh.shape.nearest(centre_m));
+                if nearest_m.distance(centre_m) > radius_m + inclusion.edge_m {
+                    let message = format!(
+                        "no vertex is within the ball: the nearest is at {nearest_m} m, {:.4} m from its centre",
+                        nearest_m.distance(centre_m)
+                    );
+                    return Err(fields.refuse(Reason::OutOfRange, "radius_m", message));
+                }
+            }
+            Ok(inclusion)
+        })
+    }
+
+    /// How much a vertex belongs to it: 1 within, 0 beyond its edge, smooth between.
+    fn part_of(&self, vertices_m: &[DVec3], vertex: usize) -> f64 {
+        let place_m = vertices_m[vertex];
+        let beyond_m = match &self.region {
+            Region::Ball { centre_m, radius_m } => place_m.distance(*centre_m) - radius_m,
+            Region::Vertices(members) => {
+                let is_member = u32::try_from(vertex).is_ok_and(|vertex| members.binary_search(&vertex).is_ok());
+                if is_member {
+                    0.0
+                } else if self.edge_m > 0.0 {
+                    let away_m = |member: &u32| vertices_m[*member as usize].distance_squared(place_m);
+                    members.iter().map(away_m).fold(f64::INFINITY, f64::min).sqrt()
+                } else {
+                    f64::INFINITY
+                }
+            }
+        };
+        if beyond_m <= 0.0 {
+            return 1.0;
+        }
+        let x = beyond_m / self.edge_m;
+        if x < 1.0 { 1.0 - x * x * (3.0 - 2.0 * x) } else { 0.0 }
+    }
+
+    /// The same mesh with some inclusions; where several are, their factors multiply.
+    pub fn put_into(inclusions: &[Inclusion], mesh: &Mesh) -> Mesh {
+        if inclusions.is_empty() {
+            return mesh.clone();
+        }
+        let shape = &mesh.shape;
+        let count = shape.vertices_m().len();
+        let or = |list: &[f64], value: f64, length: usize| {
+            if list.is_empty() { vec![value; length] } else { list.to_vec() }
+        };
+        let known = &mesh.differences;
+        let mut differences = Differences {
+            relative_mass: known.relative_mass.clone(),
+            extra_virtual: or(&known.extra_virtual, 0.0, count),
+            edges: or(&known.edges, 1.0, shape.edges().len()),
+            flexion: or(&known.flexion, 1.0, shape.opposite().len()),
+        };
+        for inclusion in inclusions {
+            let parts: Vec<f64> = (0..count).map(|vertex| inclusion.part_of(shape.vertices_m(), vertex)).collect();
+            for (extra, part) in differences.extra_virtual.iter_mut().zip(&parts) {
+                *extra = (1.0 + *extra) * (1.0 + (inclusion.virtual_stiffness_factor - 1.0) * part) - 1.0;
+            }
+            let between = |[a, b]: &[u32; 2]| 0.5 * (parts[*a as usize] + parts[*b as usize]);
+            let both = [(&mut differences.edges, shape.edges()), (&mut differences.flexion, shape.opposite())];
+            for (factors, ends) in both {
+                for (factor, ends) in factors.iter_mut().zip(ends) {
+                    *factor *= 1.0 + (inclusion.stiffness_factor - 1.0) * between(ends);
+                }
+            }
+        }
+        if differences.extra_virtual.iter().all(|extra| *extra == 0.0) {
+            differences.extra_virtual = Vec::new();
+        }
+        Mesh::uneven(mesh.point_mass_kg, mesh.flexion, shape.clone(), differences)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use palpate_mesh::TriangleMesh;
+    use palpate_mesh::delaunay::flip_to_delaunay;
+
+    use super::*;
+
+    const SOFT: Material = Material {
+        youngs_modulus_pa: 5000.0,
+        thickness_m: 0.01,
+        density_kg_per_m3: 1000.0,
+        depth_m: 0.03,
+        bed_n_per_m3: 9e5,
+        damping_ratio: 0.5,
+    };
+
+    /// A flat patch of triangles with equal sides, its inner points moved by up to `jitter` edges.
+    fn patch(side: u32, jitter: f64) -> MeshShape {
+        let mut dice = fastrand::Rng::with_seed(23);
+        let at = |i: u32, j: u32| i * side + j;
+        let mut mesh = TriangleMesh::default();
+        for (i, j) in (0..side).flat_map(|i| (0..side).map(move |j| (i, j))) {
+            let inner = (1..side - 1).contains(&i) && (1..side - 1).contains(&j);
+            let moved = DVec3::new(dice.f64() - 0.5, dice.f64() - 0.5, 0.0) * if inner { 2.0 * jitter } else { 0.0 };
+            let place = DVec3::new(f64::from(j) + 0.5 * f64::from(i % 2), EQUAL_SIDES * f64::from(i), 0.0);
+            mesh.vertices_m.push(0.002 * (place + moved));
+        }
+        for (i, j) in (0..side - 1).flat_map(|i| (0..side - 1).map(move |j| (i, j))) {
+            let [a, b, c, d] = [at(i, j), at(i, j + 1), at(i + 1, j), at(i + 1, j + 1)];
+            let both = if i % 2 == 0 { [[a, b, c], [b, d, c]] } else { [[a, b, d], [a, d, c]] };
+            mesh.triangles.extend(both);
+        }
+        flip_to_delaunay(&mut mesh);
+        MeshShape::new(mesh.vertices_m, mesh.triangles, |_, _, _| false).unwrap()
+    }
+
+    #[test]
+    fn a_patch_that_is_stretched_resists_as_the_material_says() {
+        for jitter in [0.0, 0.15, 0.3] {
+            for flexion in [0.0, 0.3] {
+                let shape = Arc::new(patch(30, jitter));
+                let made = SOFT.applied(flexion, shape.clone()).unwrap();
+                let area_m2: f64 = Spread::of(&shape).of_vertices_m2.iter().sum();
+                let springs = || made.mesh.springs().map(|(ends, k)| (ends, k * made.stiffness_n_per_m));
+                // Stretched along one side while the other gives way, by E·t; to all sides alike; and sheared.
+                for (strain, expected) in [
+                    (DVec3::new(1.0, -POISSON, 0.0), 50.0),
+                    (DVec3::new(-POISSON, 1.0, 0.0), 50.0),
+                    (DVec3::new(1.0, 1.0, 0.0), 50.0 * 2.0 / (1.0 - POISSON)),
+                    (DVec3::new(1.0, -1.0, 0.0), 50.0 * 2.0 / (1.0 + POISSON)),
+                ] {
+                    let at = [shape.vertices_m(), shape.normals()];
+                    let held = |vertex: usize| shape.is_on_rim(vertex);
+                    let energy_j = settled_energy_j(at, springs(), held, DMat3::from_diagonal(strain));
+                    let found = 2.0 * energy_j / area_m2;
+                    let within = if flexion > 0.0 { 0.06 } else { 0.035 };
+                    assert!((found / expected - 1.0).abs() < within, "{jitter} {flexion} {strain}: {found} {expected}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn an_uneven_patch_has_mass_and_bed_by_its_area() {
+        let shape = Arc::new(patch(12, 0.2));
+        let made = SOFT.applied(0.0, shape.clone()).unwrap();
+        let area_m2: f64 = Spread::of(&shape).of_vertices_m2.iter().sum();
+        assert!((made.mesh.mass_kg() / (1000.0 * 0.03 / 3.0 * area_m2) - 1.0).abs() < 1e-12);
+        let bed: f64 =
+            made.mesh.differences.relative_mass.iter().map(|mass| mass * made.virtual_stiffness_n_per_m).sum();
+        assert!((bed / (9e5 * area_m2) - 1.0).abs() < 1e-12);
+        // 2ζ√(k″·ρH/3) on each m².
+        let damping = made.damping_n_s_per_m / made.virtual_stiffness_n_per_m * 9e5;
+        assert!((damping - (9e5_f64 * 10.0).sqrt()).abs() < 1e-6 * damping, "{damping}");
+    }
+
+    #[test]
+    fn inclusions_have_a_smooth_edge_and_multiply() {
+        let shape = Arc::new(patch(20, 0.0));
+        let mesh = Mesh::new(0.001, 0.5, shape.clone());
+        let centre_m = shape.extent().middle_m();
+        let inclusion = |stiffness_factor: f64| Inclusion {
+            region: Region::Ball { centre_m, radius_m: 0.005 },
+            stiffness_factor,
+            virtual_stiffness_factor: 5.0,
+            edge_m: 0.006,
+        };
+        let found = Inclusion::put_into(&[inclusion(3.0), inclusion(2.0)], &mesh).differences;
+        for (vertex, extra) in found.extra_virtual.iter().enumerate() {
+            let away_m = shape.vertices_m()[vertex].distance(centre_m);
+            let factor = extra + 1.0;
+            let holds = match away_m {
+                m if m <= 0.005 - 1e-9 => (factor - 25.0).abs() < 1e-9,
+                m if m >= 0.011 + 1e-9 => factor == 1.0,
+                _ => (1.0..=25.0).contains(&factor),
+            };
+            assert!(holds, "{away_m}: {factor}");
+        }
+        let most = found.edges.iter().chain(&found.flexion).copied().fold(0.0, f64::max);
+        let least = found.edges.iter().copied().fold(f64::INFINITY, f64::min);
+        assert!((most - 6.0).abs() < 1e-9 && least == 1.0, "{most} {least}");
+    }
+}

@@ -1,0 +1,159 @@
+//! A mesh that is shown where a coarser one is simulated: each of its vertices moves with a place on that one.
+
+use glam::DVec3;
+use palpate_mesh::TriangleMesh;
+use palpate_mesh::decimate::{Place, decimate};
+use palpate_mesh::delaunay::flip_to_delaunay;
+
+/// The mesh of the file, and how it is bound to the simulated one.
+#[derive(Debug, PartialEq)]
+pub struct Shown {
+    /// The mesh of the file, with its own numbers of vertices.
+    pub mesh: TriangleMesh,
+    /// For each of its vertices, the place on the simulated mesh.
+    pub places: Vec<BoundPlace>,
+    /// For each of its vertices, the nearest simulated one.
+    pub(super) nearest: Vec<u32>,
+    /// For each simulated vertex, a vertex of the file whose nearest one it is, the closest of them; if there is none, the
+    /// closest of all that are bound to a triangle of it.
+    pub(super) names: Vec<u32>,
+}
+
+/// A place at a height over a triangle. It turns with the triangle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct BoundPlace {
+    /// The triangle of the simulated mesh.
+    pub triangle: u32,
+    /// Weights of its vertices; their sum is 1.
+    pub barycentric: [f64; 3],
+    /// How far the place is off the triangle, along its normal, m.
+    pub height_m: f64,
+}
+
+/// A mesh of at most so many vertices, if it can be, whose triangles are Delaunay if `flips`; and what is shown in its place.
+pub(super) fn coarser(mesh: TriangleMesh, vertices: usize, flips: bool) -> (TriangleMesh, Shown) {
+    let decimated = decimate(&mesh, vertices);
+    let (mut coarse, before) = (decimated.mesh.clone(), decimated.mesh.triangles);
+    if flips {
+        flip_to_delaunay(&mut coarse);
+    }
+    let shown = Shown::new(mesh, &coarse, &before, &decimated.places);
+    (coarse, shown)
+}
+
+impl Shown {
+    /// Binds a mesh to a coarser one, given places on its triangles before edges were flipped.
+    #[allow(clippy::cast_possible_truncation)]
+    fn new(mesh: TriangleMesh, coarse: &TriangleMesh, before: &[[u32; 3]], places: &[Place]) -> Self {
+        let mut around: Vec<Vec<u32>> = vec![Vec::new(); coarse.vertices_m.len()];
+        for (number, triangle) in (0..).zip(&coarse.triangles) {
+            triangle.iter().for_each(|vertex| around[*vertex as usize].push(number));
+        }
+        let at = |vertex: u32| coarse.vertices_m[vertex as usize];
+        let bind = |(place_m, place): (&DVec3, &Place)| {
+            let old = before[place.triangle as usize];
+            let own = [old, coarse.triangles[place.triangle as usize]];
+            let mut candidates: Vec<u32> = vec![place.triangle];
+            if own[0] != own[1] {
+                candidates = old.iter().flat_map(|vertex| &around[*vertex as usize]).copied().collect();
+                candidates.sort_unstable();
+                candidates.dedup();
+            }
+            let on = |triangle: u32| {
+                let [a, b, c] = coarse.triangles[triangle as usize].map(at);
+                let barycentric = if own[0] == own[1] { place.barycentric } else { closest_on([a, b, c], *place_m) };
+                let [u, v, w] = barycentric;
+                (place_m.distance_squared(u * a + v * b + w * c), triangle, barycentric)
+            };
+            let best = candidates.into_iter().map(on).min_by(|a, b| a.0.total_cmp(&b.0));
+            let (_, triangle, barycentric) = best.unwrap_or((0.0, place.triangle, place.barycentric));
+            let [a, b, c] = coarse.triangles[triangle as usize].map(at);
+            let normal = (b - a).cross(c - a).normalize_or_zero();
+            BoundPlace { triangle, barycentric, height_m: normal.dot(*place_m - a) }
+        };
+        let places: Vec<BoundPlace> = mesh.vertices_m.iter().zip(places).map(bind).collect();
+        let mut nearest = Vec::with_capacity(places.len());
+        let mut closest = vec![[(f64::INFINITY, 0_u32); 2]; coarse.vertices_m.len()];
+        for ((place_m, place), number) in mesh.vertices_m.iter().zip(&places).zip(0_u32..) {
+            let corners = coarse.triangles[place.triangle as usize];
+            let away = |vertex: u32| at(vertex).distance_squared(*place_m);
+            let mut best = corners[0];
+            for corner in corners {
+                if away(corner) < away(best) {
+                    best = corner;
+                }
+                let any = &mut closest[corner as usize][1];
+                if away(corner) < any.0 {
+                    *any = (away(corner), number);
+                }
+            }
+            let own = &mut closest[best as usize][0];
+            if away(best) < own.0 {
+                *own = (away(best), number);
+            }
+            nearest.push(best);
+        }
+        let names = closest.iter().map(|[own, any]| if own.0.is_finite() { own.1 } else { any.1 }).collect();
+        Shown { mesh, places, nearest, names }
+    }
+}
+
+/// The weights of the corners at the place of a triangle that is closest to a point.
+fn closest_on([a, b, c]: [DVec3; 3], point: DVec3) -> [f64; 3] {
+    let (ab, ac) = (b - a, c - a);
+    let normal = ab.cross(ac);
+    let doubled = normal.length_squared();
+    if doubled > 0.0 {
+        let to = point - a;
+        let (v, w) = (to.cross(ac).dot(normal) / doubled, ab.cross(to).dot(normal) / doubled);
+        if v >= 0.0 && w >= 0.0 && v + w <= 1.0 {
+            return [1.0 - v - w, v, w];
+        }
+    }
+    let side = |from: DVec3, to: DVec3| {
+        let along = to - from;
+        let squared = along.length_squared();
+        let t = if squared > 0.0 { ((point - from).dot(along) / squared).clamp(0.0, 1.0) } else { 0.0 };
+        (t, (from + t * along).distance_squared(point))
+    };
+    let (on_ab, on_bc, on_ca) = (side(a, b), side(b, c), side(c, a));
+    if on_ab.1 <= on_bc.1 && on_ab.1 <= on_ca.1 {
+        [1.0 - on_ab.0, on_ab.0, 0.0]
+    } else if on_bc.1 <= on_ca.1 {
+        [0.0, 1.0 - on_bc.0, on_bc.0]
+    } else {
+        [on_ca.0, 0.0, 1.0 - on_ca.0]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use palpate_mesh::organ::{Organ, generate};
+
+    use super::*;
+
+    #[test]
+    fn a_place_on_the_coarser_mesh_and_its_height_give_the_vertex_back() {
+        let mesh = generate(Organ::Gallbladder, 0.0035, 2).unwrap();
+        let count = mesh.vertices_m.len();
+        for flips in [false, true] {
+            let (coarse, shown) = coarser(mesh.clone(), count / 3, flips);
+            assert!(coarse.vertices_m.len() <= count / 3 + 1 && shown.places.len() == count);
+            let mut off_m: Vec<f64> = Vec::new();
+            for (place_m, place) in shown.mesh.vertices_m.iter().zip(&shown.places) {
+                let [a, b, c] = coarse.triangles[place.triangle as usize].map(|v| coarse.vertices_m[v as usize]);
+                let [u, v, w] = place.barycentric;
+                assert!(u + v + w > 1.0 - 1e-9 && u.min(v).min(w) >= -1e-9, "{place:?}");
+                let normal = (b - a).cross(c - a).normalize();
+                off_m.push(place_m.distance(u * a + v * b + w * c + place.height_m * normal));
+            }
+            off_m.sort_by(f64::total_cmp);
+            // Beside an edge or a corner a place is not straight over its triangle.
+            assert!(off_m[count / 2] < 1e-6 && off_m[count - 1] < 1e-3, "{} {}", off_m[count / 2], off_m[count - 1]);
+            for (vertex, name) in shown.names.iter().enumerate() {
+                assert!(coarse.vertices_m[vertex].distance(shown.mesh.vertices_m[*name as usize]) < 0.006, "{vertex}");
+            }
+        }
+    }
+}
