@@ -1,4 +1,15 @@
-//! The priority of threads: heavy work gives way to stepping and to the network.
+//! Threads: heavy work gives way to stepping and to the network; all have a stack that the kernel fits on.
+
+use std::thread::Builder;
+
+/// The stack of a thread that steps a tissue, bytes. The kernel is inlined into one function for each scheme and width. Without
+/// optimization each of its thousands of intermediate vectors has a place of its own there: 2 MB in all.
+const STACK_BYTES: usize = if cfg!(debug_assertions) { 32 << 20 } else { 2 << 20 };
+
+/// A thread of that name, to be spawned.
+pub(crate) fn thread(name: impl Into<String>) -> Builder {
+    Builder::new().name(name.into()).stack_size(STACK_BYTES)
+}
 
 /// About a tenth of what the others get where there is not enough for all: no thread is ever shut out.
 #[cfg(target_os = "linux")]

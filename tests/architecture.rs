@@ -39,7 +39,12 @@ const CRATES: [(&str, &str, &[&str], &[&str]); 6] = [
         &["palpate-proto", "palpate-touch"],
         &["axum", "clap", "indicatif", "tower-http"],
     ),
-    ("clients/programs", "palpate-programs", &["palpate", "palpate-client", "palpate-proto", "palpate-touch"], &[]),
+    (
+        "clients/programs",
+        "palpate-programs",
+        &["palpate", "palpate-client", "palpate-mesh", "palpate-proto", "palpate-touch"],
+        &[],
+    ),
 ];
 
 /// The modules of `palpate` that a module of the programs may use. `link` simulates the far end; the others read files.

@@ -9,9 +9,9 @@ use std::path::{Path, PathBuf};
 
 use glam::DVec3;
 use palpate::limits::Limits;
-use palpate::scene::Scene;
 use palpate::scene::profile::Poke;
-use palpate::shape::PointId;
+use palpate::scene::{Body, Scene};
+use palpate::shape::{PointId, PointName, RestShape};
 use palpate::sheet::{Grasp, Model, Push, Tissue, at_rest};
 use palpate_client::view::Surface;
 use palpate_proto::geometry::{from_vector, vector};
@@ -126,6 +126,25 @@ async fn shown(server: &Server, session_id: &str) -> Shown {
     all
 }
 
+/// The first frame, which is full.
+async fn surface(server: &Server, session_id: &str, encoding: pb::Encoding) -> Surface {
+    let request = pb::WatchFramesRequest {
+        session_id: session_id.to_owned(),
+        encoding: encoding.into(),
+        ..Default::default()
+    };
+    let mut frames = server.views().await.watch_frames(request).await.unwrap().into_inner();
+    let mut surface = Surface::default();
+    loop {
+        let part = frames.message().await.unwrap().unwrap();
+        surface.write(&part).unwrap();
+        if part.last {
+            assert!(part.full);
+            return surface;
+        }
+    }
+}
+
 #[tokio::test]
 async fn a_session_on_a_mesh_is_told_pushed_grasped_sampled_probed_and_shown() {
     let (folder, server) = ball();
@@ -195,24 +214,62 @@ async fn a_session_on_a_mesh_is_told_pushed_grasped_sampled_probed_and_shown() {
     }
     assert_eq!(all.groups["cap"].len(), 162);
     for (encoding, within_m) in [(pb::Encoding::F32, 1e-9), (pb::Encoding::I16, 1e-6)] {
-        let request =
-            pb::WatchFramesRequest { session_id: id.clone(), encoding: encoding.into(), ..Default::default() };
-        let mut frames = server.views().await.watch_frames(request).await.unwrap().into_inner();
-        let mut surface = Surface::default();
-        loop {
-            let part = frames.message().await.unwrap().unwrap();
-            surface.write(&part).unwrap();
-            if part.last {
-                assert_eq!((part.step, part.full), (60, true));
-                break;
-            }
-        }
+        let surface = surface(&server, id, encoding).await;
         assert_eq!(surface.vertices, [11, 16]);
         for (moved_m, vertex) in surface.displacement_m.iter().zip(&all.file_vertex) {
             let expected = truth.point(PointId::new(*vertex as usize)).displacement_m;
             assert!(DVec3::from_array(moved_m.map(f64::from)).distance(expected) < within_m, "{vertex}");
         }
     }
+}
+
+#[tokio::test]
+async fn frames_of_a_coarser_tissue_show_the_mesh_of_its_file() {
+    let (folder, server) = ball();
+    let coarse = SCENE.replacen("fixed =", "vertices = 80\nfixed =", 1).replace("\"ball\"", "\"coarse\"");
+    let file = folder.path().join("coarse.toml");
+    std::fs::write(&file, coarse).unwrap();
+    let scene = Scene::load(&file, &[], &Limits::default()).unwrap();
+    let Body::Mesh(mesh) = &scene.body else { panic!("no mesh") };
+    let (shape, bound) = (&mesh.shape, mesh.shape.shown().unwrap());
+    let session = server.create(Source::SceneName("coarse".into()), true).await.unwrap();
+    let id = &session.session_id;
+    assert_eq!(session.points as usize, shape.point_count());
+    assert_eq!(session.scene.unwrap().mesh.unwrap().vertices, Some(session.points));
+    let mut touch = Touch::hold(&server, id).await;
+    // Any vertex of the file has a name.
+    touch.command(push(0, 1, Centre::Vertex(161), FORCE_N)).await;
+    touch.settle().await;
+    server.start_until(id, 40).await;
+    let sample = touch.sample_with(|sample| sample.step == 40).await;
+    let point = shape.find("", PointName::Vertex(161)).unwrap();
+    assert_eq!(PointName::Vertex(sample.tools[0].vertex.unwrap()), shape.name(point));
+
+    let mut truth = at_rest(&Model::compile(&scene, &Limits::default()).unwrap());
+    let (centre_m, falloff_per_m) = (shape.rest_m(point), 80.0);
+    let poke = Poke { point: None, centre_m, force_n: FORCE_N, falloff_per_m, falloff_offset: 0.0 };
+    truth.push(0, Some(Push::Constant(poke)));
+    (0..40).for_each(|_| truth.step().unwrap());
+    assert_eq!(server.hash_at(id, 40).await, format!("{:032x}", truth.state_hash()));
+    let all = shown(&server, id).await;
+    assert_eq!((all.rest_m.len(), all.size, all.triangles.len()), (162, [11, 16], 960));
+    let surface = surface(&server, id, pb::Encoding::F32).await;
+    let mut farthest_m = 0.0_f64;
+    for ((rest_m, vertex), moved_m) in all.rest_m.iter().zip(&all.file_vertex).zip(&surface.displacement_m) {
+        assert!(rest_m.distance(bound.mesh.vertices_m[*vertex as usize]) < 1e-8);
+        let place = bound.places[*vertex as usize];
+        let corners = shape.triangles()[place.triangle as usize].map(|corner| PointId::new(corner as usize));
+        let over = |at: &dyn Fn(PointId) -> DVec3| {
+            let [a, b, c] = corners.map(at);
+            let [u, v, w] = place.barycentric;
+            u * a + v * b + w * c + place.height_m * (b - a).cross(c - a).normalize()
+        };
+        let now = |corner: PointId| shape.rest_m(corner) + truth.point(corner).displacement_m;
+        let expected_m = over(&now) - over(&|corner| shape.rest_m(corner));
+        assert!(DVec3::from_array(moved_m.map(f64::from)).distance(expected_m) < 1e-7, "{vertex}");
+        farthest_m = farthest_m.max(expected_m.length());
+    }
+    assert!(farthest_m > 1e-4);
 }
 
 #[tokio::test]
@@ -364,8 +421,8 @@ async fn a_mesh_that_a_client_sends_makes_the_session_that_its_file_does() {
 async fn a_mesh_that_is_none_is_refused_by_element_and_place() {
     let server = Server::start(&[]);
     let whole = ICOSPHERE.as_bytes();
-    // Cut in the middle of a line: a face without its corners.
-    let cut = whole.iter().rposition(|byte| *byte == b'f').unwrap() + 3;
+    // Cut in the middle of a vertex: one of its coordinates is missing.
+    let cut = ICOSPHERE.find("\nf ").unwrap() - 20;
     let refused = upload(&server, &whole[..cut], 4096, "m", false).await.unwrap_err();
     assert_eq!(told(&refused), (Code::InvalidArgument, "UNREADABLE".into(), "part".into()));
     assert!(refused.message().contains("ball.obj: line"), "{refused:?}");
@@ -381,30 +438,24 @@ async fn a_mesh_that_is_none_is_refused_by_element_and_place() {
     assert_eq!((report.holes, report.refused), (0, false), "{report:?}");
     assert!(!report.problems.is_empty());
     // An edge with three triangles can't be used, and is told with its place.
-    let bad = format!(
-        "{ICOSPHERE}v 0 0 0\nf 1 {} 163\n",
-        ICOSPHERE.lines().find(|line| line.starts_with('f')).map(|_| 13).unwrap()
-    );
+    let bad = format!("{ICOSPHERE}v 0 0 0\nf 1 43 163\n");
     let sent = upload(&server, bad.as_bytes(), 1 << 19, "m", false).await.unwrap();
     let report = sent.report.unwrap();
-    if report.refused {
-        assert!(report.problems[0].place_m.is_some() && !report.problems[0].element.is_empty(), "{report:?}");
-    }
+    assert!(report.refused && report.problems[0].place_m.is_some(), "{report:?}");
+    assert_eq!(report.problems[0].element, "edge 0-42");
 }
 
 #[tokio::test]
 async fn a_mesh_above_the_limits_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("palpate.toml");
-    std::fs::write(&config, "[limits]\nmesh_bytes = 9000\nmesh_vertices = 161\n").unwrap();
+    std::fs::write(&config, "[limits]\nmesh_bytes = 14000\nmesh_vertices = 161\n").unwrap();
     let server = Server::start(&["--config", config.to_str().unwrap()]);
-    let long = [ICOSPHERE.as_bytes(), &[b'\n'; 9000]].concat();
+    let long = [ICOSPHERE.as_bytes(), &[b'\n'; 1000]].concat();
     let refused = upload(&server, &long, 1000, "m", false).await.unwrap_err();
-    assert_eq!(told(&refused), (Code::InvalidArgument, "TOO_LARGE".into(), "part".into()));
-    if ICOSPHERE.len() < 9000 {
-        let refused = upload(&server, ICOSPHERE.as_bytes(), 1000, "m", false).await.unwrap_err();
-        assert!(refused.message().contains("161"), "{refused:?}");
-    }
+    assert_eq!(told(&refused), (Code::ResourceExhausted, "TOO_LARGE".into(), "part".into()));
+    let refused = upload(&server, ICOSPHERE.as_bytes(), 1000, "m", false).await.unwrap_err();
+    assert!(refused.message().contains("161"), "{refused:?}");
 }
 
 /// A force, a moving force and a grasp.
@@ -425,6 +476,9 @@ force_n = [0.0, 0.3, 0.0]
 falloff_per_m = 80.0
 falloff_offset = 0.0
 profile = { type = "sine", frequency_hz = 20.0 }
+[[tool]]
+vertex = 40
+moves = [{ from_s = 0.01, to_s = 0.06, by_m = [0.0, 0.002, 0.001] }]
 "#;
 
 #[test]

@@ -71,7 +71,7 @@ pub async fn fixed_positions(ground: &Ground) -> Result<(), Status> {
     let session_id = create(&door, fixed(ground.count(500_000)), false).await?;
     let lease_id = lease(&door, &session_id, 0).await?;
     let target = Some(pb::position::Target::DisplacementM(pb::Vector3::default()));
-    let position = pb::Position { point: Some(pb::GridPoint { x: SIDE / 2, y: SIDE / 2 }), target };
+    let position = pb::Position { point: Some(pb::GridPoint { x: SIDE / 2, y: SIDE / 2 }), vertex: None, target };
     let mut first = 1;
     loop {
         let command = |sequence| pb::Command {

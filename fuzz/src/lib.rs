@@ -16,16 +16,18 @@ use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::scene::check::check_tip;
 use palpate::scene::record::{Record, write_line};
-use palpate::scene::script::Script;
-use palpate::scene::{PAPER, Scene};
+use palpate::scene::script::{Action, Script};
+use palpate::scene::{FixedVertices, Mesh, MeshShape, PAPER, Scene};
 use palpate::server::config::Config;
 use palpate::server::identity::{self, Credentials, Role};
 use palpate::session::Session;
 use palpate::session::intake::Intake;
 use palpate::session::sampling::Sampler;
+use palpate::shape::RestShape;
 use palpate::sheet::Model;
 use palpate::surface::Refinement;
 use palpate::wire;
+use palpate_mesh::{Group, TriangleMesh};
 use palpate_proto::{pb, touch};
 use palpate_touch::{Device, Envelope, Law, Renderer};
 use prost::Message;
@@ -111,7 +113,9 @@ pub const REQUESTS: &[(&str, Taker)] = &[
     ("CreateSessionRequest", |bytes| {
         use pb::create_session_request::Source;
         match pb::CreateSessionRequest::decode(bytes).map(|request| request.source) {
-            Ok(Some(Source::Scene(scene))) => wire::scene::from_scene(&scene, None).is_ok_and(|scene| step(&scene)),
+            Ok(Some(Source::Scene(scene))) => {
+                wire::scene::from_scene(&scene, scene.mesh.as_ref().map(|_| tetrahedron())).is_ok_and(|scene| step(&scene))
+            }
             other => other.is_ok(),
         }
     }),
@@ -144,6 +148,10 @@ pub const REQUESTS: &[(&str, Taker)] = &[
                     let name = wire::from_point(Some(point), None).expect("a point has a name");
                     model().shape().find("points", name).is_ok_and(|point| point.index() < model().len())
                 }),
+                Some(pb::probe_request::Where::Vertices(vertices)) => vertices.vertices.iter().all(|vertex| {
+                    let name = wire::from_point(None, Some(*vertex)).expect("a vertex has a name");
+                    ball().find("vertices", name).is_ok_and(|point| point.index() < ball().point_count())
+                }),
                 _ => every,
             }
         })
@@ -155,6 +163,16 @@ pub const REQUESTS: &[(&str, Taker)] = &[
     ("WatchFramesRequest", |bytes| {
         pb::WatchFramesRequest::decode(bytes)
             .is_ok_and(|request| Refinement::new(&model().scene, request.refinement, &limits()).is_ok())
+    }),
+    ("UploadMeshRequest", |bytes| {
+        pb::UploadMeshRequest::decode(bytes).is_ok_and(|request| {
+            let Ok(unit) = request.unit.parse() else { return false };
+            let within = palpate_mesh::ReadLimits { bytes: 1 << 16, vertices: 1000, triangles: 4000 };
+            palpate_mesh::read(&request.file_name, &request.part, unit, &|_| None, &within).is_ok_and(|read| {
+                let report = palpate_mesh::report(&read.mesh);
+                report.refusal().is_some() || Mesh::of(read.mesh, 0.01, FixedVertices::Rim).is_ok()
+            })
+        })
     }),
     ("UpdateTissueRequest", |bytes| {
         pb::UpdateTissueRequest::decode(bytes).is_ok_and(|request| {
@@ -198,9 +216,33 @@ fn open(open: &pb::TouchOpen) -> bool {
     held && taken.is_ok() && device.is_none_or(|device| device.is_ok())
 }
 
+/// The smallest closed mesh.
+fn tetrahedron() -> &'static TriangleMesh {
+    static MESH: OnceLock<TriangleMesh> = OnceLock::new();
+    MESH.get_or_init(|| TriangleMesh {
+        vertices_m: [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]].map(Into::into).to_vec(),
+        triangles: vec![[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]],
+        uv: None,
+        groups: vec![Group { name: "base".into(), vertices: vec![0, 1, 2] }],
+    })
+}
+
+/// Its shape, as a tissue.
+fn ball() -> &'static MeshShape {
+    static SHAPE: OnceLock<Mesh> = OnceLock::new();
+    let made = || Mesh::of(tetrahedron().clone(), 0.01, FixedVertices::None).expect("the mesh is sound");
+    &SHAPE.get_or_init(made).shape
+}
+
 /// All of them at one session, all or none, and two steps after them.
 fn command_all(messages: &[pb::Command]) -> bool {
     let scene = &model().scene;
+    let on_mesh: Vec<_> = messages.iter().map(|message| wire::command::from_command(message, ball(), 1)).collect();
+    for command in on_mesh.into_iter().flatten() {
+        if let Action::Push(poke) = command.action {
+            assert!(poke.centre_m.is_finite(), "{poke:?}");
+        }
+    }
     let mut intake = Intake::new(scene, &limits());
     intake.acquire(&[0, 1, 2], "fuzz", 60.0, 1, 0).expect("tools are free");
     let commands: Result<Vec<_>, _> =
@@ -272,12 +314,51 @@ fn request_seeds() -> Vec<Vec<u8>> {
     };
     let touch = |message| pb::TouchRequest { message: Some(message) }.encode_to_vec();
     let scene = pb::create_session_request::Source::Scene(wire::scene::scene(&model().scene));
+    let on_mesh = pb::create_session_request::Source::Scene(pb::Scene {
+        sheet: None,
+        mesh: Some(pb::Mesh {
+            mesh_id: "0123456789abcdef".into(),
+            point_mass_kg: Some(0.01),
+            vertices: None,
+            fixed: Some(pb::mesh::Fixed::FixedGroup("base".into())),
+        }),
+        springs: Some(pb::Springs { stiffness_n_per_m: Some(10.0), flexion_factor: Some(0.2), ..Default::default() }),
+        ..wire::scene::scene(&model().scene)
+    });
+    let places = [
+        pb::force::Centre::Vertex(3),
+        pb::force::Centre::AtM(pb::Vector3 { x: 0.01, y: 0.02, z: 0.0 }),
+        pb::force::Centre::CentreM(pb::Vector2 { x: 0.01, y: 0.02 }),
+    ];
+    let pushes = places.map(|centre| pb::Command {
+        sequence: Some(1),
+        action: Some(pb::command::Action::Force(pb::Force { centre: Some(centre), force_n: vector(0.0, 0.1, 0.0), ..Default::default() })),
+        ..Default::default()
+    });
+    let upload = pb::UploadMeshRequest {
+        file_name: "organ.obj".into(),
+        part: b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n".to_vec(),
+        last: true,
+        unit: "mm".into(),
+        ..Default::default()
+    };
+    let vertices = pb::probe_request::Where::Vertices(pb::Vertices { vertices: vec![2, 0] });
     let watch = pb::WatchSamplesRequest { deadband: Some(deadband), heartbeat_s: Some(1.0), ..Default::default() };
     let points = pb::probe_request::Where::Points(pb::GridPoints { points: vec![point] });
     let mut seeds = vec![
         (
             "CreateSessionRequest",
             pb::CreateSessionRequest { source: Some(scene), ..Default::default() }.encode_to_vec(),
+        ),
+        (
+            "CreateSessionRequest",
+            pb::CreateSessionRequest { source: Some(on_mesh), ..Default::default() }.encode_to_vec(),
+        ),
+        ("UploadMeshRequest", upload.encode_to_vec()),
+        ("ProbeRequest", pb::ProbeRequest { r#where: Some(vertices), ..Default::default() }.encode_to_vec()),
+        (
+            "SendCommandsRequest",
+            pb::SendCommandsRequest { commands: pushes.to_vec(), ..Default::default() }.encode_to_vec(),
         ),
         ("TouchRequest", touch(pb::touch_request::Message::Open(open))),
         ("TouchRequest", touch(pb::touch_request::Message::Renew(pb::Renew { client_time_ns: 7 }))),

@@ -11,6 +11,7 @@ use std::sync::atomic::AtomicBool;
 
 use palpate_touch::law::{Law, Row};
 
+use super::Disc;
 use super::exact::{ROWS as EXACT_ROWS, course, follow, pressed};
 use crate::sheet::Model;
 use crate::sheet::tangent::{self, Accuracy, Course};
@@ -38,18 +39,18 @@ const FINE_ENOUGH: f64 = 0.7;
 
 /// The law to begin with: the exact one if it takes little work, else a coarse one. None if that takes more than 50 ms as
 /// well, or if `stop` is set.
-pub fn first(model: &Model, radius_m: f64, stop: &AtomicBool) -> Option<Law> {
+pub fn first(model: &Model, disc: Disc, stop: &AtomicBool) -> Option<Law> {
     let mut work = EXACT_WORK;
-    let exact = pressed(model, radius_m, EXACT_ROWS, Accuracy::EXACT, &mut work, stop);
+    let exact = pressed(model, disc, EXACT_ROWS, Accuracy::EXACT, &mut work, stop);
     let mut left = WORK - EXACT_WORK + work;
     exact.or_else(|| {
         if model.scene.sheet().is_none() {
-            return POINTS.iter().find_map(|points| on_mesh(model, radius_m, *points, &mut left, stop));
+            return POINTS.iter().find_map(|points| on_mesh(model, disc, *points, &mut left, stop));
         }
         HALF_INTERVALS.iter().find_map(|(half, kept)| {
             let most = left.saturating_sub(*kept);
             let mut work = most;
-            let law = coarse(model, radius_m, *half, &mut work, stop);
+            let law = coarse(model, disc.radius_m, *half, &mut work, stop);
             left -= most - work;
             law
         })
@@ -57,8 +58,8 @@ pub fn first(model: &Model, radius_m: f64, stop: &AtomicBool) -> Option<Law> {
 }
 
 /// A law of so many points of a mesh; the work is taken from `work`.
-fn on_mesh(model: &Model, radius_m: f64, points: usize, work: &mut u64, stop: &AtomicBool) -> Option<Law> {
-    let course = Course { points, ..course(model, radius_m, ROWS) };
+fn on_mesh(model: &Model, disc: Disc, points: usize, work: &mut u64, stop: &AtomicBool) -> Option<Law> {
+    let course = Course { points, ..course(disc, ROWS) };
     let law = follow(model, course, Accuracy::COARSE, work, stop)?;
     law.is_sound().then_some(Law { is_coarse: true, ..law })
 }
@@ -111,7 +112,7 @@ fn force_at(depth_m: f64, largest_n: f64, yields: &dyn Fn(f64) -> (f64, f64)) ->
 
 /// A coarse law, out of sheets with about twice `half` intervals along the longer side; the work is taken from `work`.
 fn coarse(model: &Model, radius_m: f64, half: u32, work: &mut u64, stop: &AtomicBool) -> Option<Law> {
-    let mut of = |model: &Model| pressed(model, radius_m, ROWS, Accuracy::COARSE, work, stop);
+    let mut of = |model: &Model| pressed(model, Disc::in_middle(model, radius_m), ROWS, Accuracy::COARSE, work, stop);
     let (size_m, edge_m) = (model.shape().extent().size_m(), model.shape().edge_m());
     let half_m = tangent::half_window_m(model, radius_m).min(0.5 * model.shape().longest_side_m());
     // Intervals that end at the rim of the shorter side as well.
@@ -163,7 +164,7 @@ mod tests {
             let virtual_stiffness = format!("virtual_springs.stiffness_n_per_m={virtual_stiffness}");
             let model = Model::paper(&["sheet.points=[25, 25]", "sheet.fixed=\"edges\"", &virtual_stiffness]);
             let radius_m = model.shape().edge_m();
-            let first = first(&model, radius_m, &never).unwrap();
+            let first = first(&model, Disc::in_middle(&model, radius_m), &never).unwrap();
             let [force, stiffness] = apart(&exact(&model, radius_m), &first);
             println!("{virtual_stiffness}: force {force:.4}, stiffness {stiffness:.4} apart");
             assert!(first.is_coarse && first.is_sound());

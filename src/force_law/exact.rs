@@ -4,6 +4,7 @@ use std::sync::atomic::AtomicBool;
 
 use palpate_touch::law::{Law, Row};
 
+use super::Disc;
 use crate::sheet::Model;
 use crate::sheet::tangent::{self, Accuracy, Course, Deepened, Press, Pressed};
 
@@ -29,11 +30,9 @@ pub enum Progress {
 }
 
 impl Computation {
-    /// Of the law under a disc of `radius_m` in the middle of the sheet, with at most `most_work` springs times iterations;
-    /// none if they can't suffice.
-    pub fn new(model: &Model, radius_m: f64, most_work: u64) -> Option<Self> {
-        Press::within(model, course(model, radius_m, ROWS), Accuracy::EXACT, most_work)
-            .map(|press| Computation(Box::new(press)))
+    /// Of the law under a disc, with at most `most_work` springs times iterations; none if they can't suffice.
+    pub fn new(model: &Model, disc: Disc, most_work: u64) -> Option<Self> {
+        Press::within(model, course(disc, ROWS), Accuracy::EXACT, most_work).map(|press| Computation(Box::new(press)))
     }
 
     /// Computes the next depth, unless `stop` is set. `model` is the one that it was begun for.
@@ -46,33 +45,32 @@ impl Computation {
     }
 }
 
-/// In the middle of a sheet; on a mesh at the place of its surface that is nearest to the middle of its box.
-pub(super) fn course(model: &Model, radius_m: f64, rows: u32) -> Course {
-    let (centre_m, step_m) = (model.shape().extent().middle_m(), REACH_IN_RADII * radius_m / f64::from(rows - 1));
-    Course { radius_m, centre_m, step_m, count: rows, points: usize::MAX }
+pub(super) fn course(Disc { radius_m, at_m }: Disc, rows: u32) -> Course {
+    let step_m = REACH_IN_RADII * radius_m / f64::from(rows - 1);
+    Course { radius_m, centre_m: at_m, step_m, count: rows, points: usize::MAX }
 }
 
 /// The exact law of a disc of `radius_m` in the middle of a sheet: some tenths of a second of work for a thousand points.
 pub fn exact(model: &Model, radius_m: f64) -> Law {
-    let Course { centre_m, step_m, count, .. } = course(model, radius_m, ROWS);
+    let Course { centre_m, step_m, count, .. } = course(Disc::in_middle(model, radius_m), ROWS);
     from_pressed(&tangent::press(model, radius_m, centre_m, step_m, count))
 }
 
 /// The same with at most `most_work` springs times iterations; none if they don't suffice, or if `stop` is set.
-pub fn exact_within(model: &Model, radius_m: f64, most_work: u64, stop: &AtomicBool) -> Option<Law> {
-    pressed(model, radius_m, ROWS, Accuracy::EXACT, &mut { most_work }, stop)
+pub fn exact_within(model: &Model, disc: Disc, most_work: u64, stop: &AtomicBool) -> Option<Law> {
+    pressed(model, disc, ROWS, Accuracy::EXACT, &mut { most_work }, stop)
 }
 
 /// A law of so many rows, whose work is taken from `work`.
 pub(super) fn pressed(
     model: &Model,
-    radius_m: f64,
+    disc: Disc,
     rows: u32,
     accuracy: Accuracy,
     work: &mut u64,
     stop: &AtomicBool,
 ) -> Option<Law> {
-    follow(model, course(model, radius_m, rows), accuracy, work, stop)
+    follow(model, course(disc, rows), accuracy, work, stop)
 }
 
 /// The law of a course.
@@ -117,17 +115,17 @@ mod tests {
         let model = Model::paper(&["sheet.points=[9, 9]"]);
         let radius_m = 2.0 * model.shape().edge_m();
         let (go_on, stop) = (AtomicBool::new(false), AtomicBool::new(true));
-        let exact = exact(&model, radius_m);
+        let (exact, disc) = (exact(&model, radius_m), Disc::in_middle(&model, radius_m));
         assert!(!exact.is_coarse && exact.rows.len() == 21);
-        assert_eq!(exact_within(&model, radius_m, u64::MAX, &go_on).as_ref(), Some(&exact));
-        assert!(exact_within(&model, radius_m, u64::MAX, &stop).is_none());
+        assert_eq!(exact_within(&model, disc, u64::MAX, &go_on).as_ref(), Some(&exact));
+        assert!(exact_within(&model, disc, u64::MAX, &stop).is_none());
         // Too little for certain, and too little as it turns out.
-        assert!(exact_within(&model, radius_m, 1000, &go_on).is_none());
-        assert!(Computation::new(&model, radius_m, 1000).is_none());
-        assert!(Computation::new(&model, radius_m, 100_000).is_some());
-        assert!(exact_within(&model, radius_m, 100_000, &go_on).is_none());
+        assert!(exact_within(&model, disc, 1000, &go_on).is_none());
+        assert!(Computation::new(&model, disc, 1000).is_none());
+        assert!(Computation::new(&model, disc, 100_000).is_some());
+        assert!(exact_within(&model, disc, 100_000, &go_on).is_none());
         // Depth by depth it has the same bits, and once stopped it stays given up.
-        let mut computation = Computation::new(&model, radius_m, u64::MAX).unwrap();
+        let mut computation = Computation::new(&model, disc, u64::MAX).unwrap();
         for depth in 1.. {
             match computation.advance(&model, &go_on) {
                 Progress::UnderWay(further) => computation = further,
@@ -138,8 +136,7 @@ mod tests {
                 Progress::GivenUp => panic!("given up at depth {depth}"),
             }
         }
-        let Progress::UnderWay(computation) =
-            Computation::new(&model, radius_m, u64::MAX).unwrap().advance(&model, &go_on)
+        let Progress::UnderWay(computation) = Computation::new(&model, disc, u64::MAX).unwrap().advance(&model, &go_on)
         else {
             panic!("one depth is not all");
         };

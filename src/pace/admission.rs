@@ -24,6 +24,7 @@ use crate::scene::{Change, Scene};
 use crate::session::intake::Intake;
 use crate::session::schedule::Schedule;
 use crate::sheet::{Model, choice};
+use crate::surface::Skin;
 
 impl Pacer {
     /// Makes a session for `owner`, unless `stop` is set before it is there.
@@ -47,7 +48,9 @@ impl Pacer {
         let model = memory::attempt("sheet.points", || self.compile(scene, stop))?;
         let id = random_id()?;
         check_work(&model, &self.limits)?;
-        let memory = owner.take(Resource::Memory(Purpose::Session), model.session_bytes(), "sheet.points")?;
+        let skin = memory::attempt("sheet.points", || Ok(Skin::of(&model)))?;
+        let bytes = model.session_bytes() + skin.as_ref().map_or(0, |skin| skin.bytes());
+        let memory = owner.take(Resource::Memory(Purpose::Session), bytes, "sheet.points")?;
         let number = {
             let mut numbers = lock(&self.numbers);
             *numbers += 1;
@@ -90,6 +93,7 @@ impl Pacer {
             tissue: watch::Sender::new((0, model.clone())),
             audited: Mutex::new(Audited::default()),
             model,
+            skin,
             cost,
             thread,
             inbox: stepper.inbox.clone(),

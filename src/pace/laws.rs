@@ -1,5 +1,5 @@
-//! The force laws of a session's tissue, one for each radius of a tip: computed once, whoever asks. With another tissue they
-//! are forgotten.
+//! The force laws of a session's tissue, one for each radius of a tip and place: computed once, whoever asks. With another
+//! tissue they are forgotten.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
@@ -7,10 +7,11 @@ use std::sync::{Arc, Mutex, OnceLock};
 use tokio::sync::MutexGuard;
 
 use crate::budget::{Account, Purpose, Resource, Taken};
-use crate::force_law::{self, Computation, Progress};
+use crate::force_law::{self, Computation, Disc, Progress};
 use crate::lock::lock;
 use crate::memory;
 use crate::refusal::{Reason, Refusal, Result};
+use crate::shape::PointId;
 use crate::sheet::Model;
 use palpate_touch::Law;
 
@@ -41,7 +42,7 @@ pub(crate) fn have_same_laws(a: &Model, b: &Model) -> bool {
 }
 
 impl KeptLaws {
-    /// The law of `model` under a tip of `radius_m`, for which at most `most_work` springs times iterations are done. Its
+    /// The law of `model` under a tip of `radius_m` at a point, or where the middle is ([`Disc::in_middle`]), for which at most `most_work` springs times iterations are done. Its
     /// memory is charged to `payer`.
     ///
     /// # Errors
@@ -49,6 +50,7 @@ impl KeptLaws {
     pub(crate) fn of(
         &self,
         radius_m: f64,
+        at: Option<PointId>,
         model: &Arc<Model>,
         most_work: u64,
         payer: &Account,
@@ -63,7 +65,7 @@ impl KeptLaws {
                 other.insert(Kept { model: model.clone(), laws: Vec::new(), taken })
             }
         };
-        if let Some(law) = kept.laws.iter().find(|law| law.radius_m == radius_m) {
+        if let Some(law) = kept.laws.iter().find(|law| (law.radius_m, law.at) == (radius_m, at)) {
             return Ok(law.clone());
         }
         if kept.laws.len() == MOST_LAWS {
@@ -71,7 +73,7 @@ impl KeptLaws {
         }
         kept.taken.grow_to(kept.model.bytes() + (kept.laws.len() as u64 + 1) * LAW_BYTES, "device")?;
         let (coarse, exact, turn) = (OnceLock::new(), OnceLock::new(), tokio::sync::Mutex::default());
-        let law = Arc::new(SoughtLaw { radius_m, model: kept.model.clone(), most_work, coarse, exact, turn });
+        let law = Arc::new(SoughtLaw { radius_m, at, model: kept.model.clone(), most_work, coarse, exact, turn });
         kept.laws.push(law.clone());
         Ok(law)
     }
@@ -81,6 +83,7 @@ impl KeptLaws {
 #[derive(Debug)]
 pub(crate) struct SoughtLaw {
     radius_m: f64,
+    at: Option<PointId>,
     model: Arc<Model>,
     most_work: u64,
     coarse: OnceLock<Arc<Law>>,
@@ -90,6 +93,11 @@ pub(crate) struct SoughtLaw {
 }
 
 impl SoughtLaw {
+    fn disc(&self) -> Disc {
+        let in_middle = Disc::in_middle(&self.model, self.radius_m);
+        self.at.map_or(in_middle, |at| Disc { at_m: self.model.shape().rest_m(at), ..in_middle })
+    }
+
     /// The exact law, or why it can't be had, if that is known.
     pub(crate) fn exact(&self) -> Option<Result<Arc<Law>>> {
         self.exact.get().cloned()
@@ -107,9 +115,9 @@ impl SoughtLaw {
             return Ok(law.clone());
         }
         let law = memory::attempt("device", || {
-            let law = force_law::first(&self.model, self.radius_m, stop);
+            let law = force_law::first(&self.model, self.disc(), stop);
             // Hardly any tissue has no coarse law; then the exact one is worth its time.
-            Ok(law.or_else(|| force_law::exact_within(&self.model, self.radius_m, self.most_work, stop)))
+            Ok(law.or_else(|| force_law::exact_within(&self.model, self.disc(), self.most_work, stop)))
         });
         match law?.map(Arc::new) {
             Some(law) if law.is_coarse => Ok(self.coarse.get_or_init(|| law).clone()),
@@ -136,7 +144,7 @@ impl SoughtLaw {
     /// next call. None: [`Self::exact`] tells the result, unless it was stopped.
     pub(crate) fn advance(&self, computation: Option<Computation>, stop: &AtomicBool) -> Option<Computation> {
         let progress = memory::attempt("law", || {
-            let computation = computation.or_else(|| Computation::new(&self.model, self.radius_m, self.most_work));
+            let computation = computation.or_else(|| Computation::new(&self.model, self.disc(), self.most_work));
             Ok(computation.map_or(Progress::GivenUp, |computation| computation.advance(&self.model, stop)))
         });
         match progress {
@@ -170,7 +178,7 @@ mod tests {
                 .map(|set| Model::paper(&["sheet.points=[5, 5]", "stepping.integrator=central", set]));
         let budget = Budget::new(&Limits { memory_bytes: 64 << 10, ..Limits::default() }, 1, 1);
         let (account, kept) = (budget.account("one"), KeptLaws::default());
-        let of = |radius: u32, model: &Arc<Model>| kept.of(f64::from(radius), model, 1, &account);
+        let of = |radius: u32, model: &Arc<Model>| kept.of(f64::from(radius), None, model, 1, &account);
         let taken = || budget.bytes_for(Purpose::Laws);
         let first = of(1, &soft).unwrap();
         assert_eq!(taken(), soft.bytes() + LAW_BYTES);

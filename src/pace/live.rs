@@ -31,6 +31,7 @@ use crate::session::lease::LeaseId;
 use crate::session::sampling::{HEARTBEAT_S, Sampler, Sampling};
 use crate::shape::PointId;
 use crate::sheet::Model;
+use crate::surface::Skin;
 
 /// A session as the server sees it.
 pub struct Live {
@@ -39,6 +40,8 @@ pub struct Live {
     /// The tissue as the session began with it. Points and rate stay; coefficients, scheme and substeps may be others by
     /// now ([`Status::model`]).
     pub model: Arc<Model>,
+    /// How frames show the tissue, if it is a mesh.
+    pub skin: Option<Arc<Skin>>,
     /// Who made it, and pays for it.
     pub owner: Account,
     pub(super) intake: Mutex<Intake>,
@@ -265,8 +268,8 @@ impl Live {
     ///
     /// # Errors
     /// Refuses if the session's owner can't have the memory of a further law.
-    pub(crate) fn law(&self, model: &Arc<Model>, radius_m: f64) -> Result<Arc<SoughtLaw>> {
-        self.laws.of(radius_m, model, self.limits.law_work, &self.owner)
+    pub(crate) fn law(&self, model: &Arc<Model>, radius_m: f64, at: Option<PointId>) -> Result<Arc<SoughtLaw>> {
+        self.laws.of(radius_m, at, model, self.limits.law_work, &self.owner)
     }
 
     /// Frames for a viewer.

@@ -17,7 +17,7 @@ use super::thread::{self, Stepper};
 use crate::budget::Budget;
 use crate::limits::Limits;
 use crate::lock::lock;
-use crate::priority::give_way;
+use crate::priority::{self, give_way};
 use crate::refusal::{Reason, Refusal, Result, excerpt};
 use crate::session::local::StiffnessJob;
 
@@ -57,22 +57,22 @@ impl Pacer {
             give_way();
             refinements.into_iter().for_each(StiffnessJob::work);
         };
-        handles.push(std::thread::Builder::new().name("stiffness".into()).spawn(worker)?);
+        handles.push(priority::thread("stiffness").spawn(worker)?);
         for index in 0..threads.max(1) {
             let stepper = Arc::new(Stepper::default());
             steppers.push(stepper.clone());
             let (encoder, refiner, reading) = (encoder.clone(), refiner.clone(), reading.clone());
-            let builder = std::thread::Builder::new().name(format!("step-{index}"));
+            let builder = priority::thread(format!("step-{index}"));
             handles.push(builder.spawn(move || thread::work(&stepper, &encoder, &refiner, &reading))?);
         }
         let (worker, shared) = (encoder.clone(), budget.clone());
-        handles.push(std::thread::Builder::new().name("frames".into()).spawn(move || worker.work(&shared))?);
+        handles.push(priority::thread("frames").spawn(move || worker.work(&shared))?);
         let reader = reading.clone();
         let worker = move || {
             give_way();
             reader.work();
         };
-        handles.push(std::thread::Builder::new().name("records".into()).spawn(worker)?);
+        handles.push(priority::thread("records").spawn(worker)?);
         let (auditor, sessions) = (Arc::new(Auditor::default()), Sessions::default());
         if audit_share > 0.0 {
             let (auditor, sessions) = (auditor.clone(), sessions.clone());
@@ -80,7 +80,7 @@ impl Pacer {
                 give_way();
                 auditor.work(&sessions, audit_share);
             };
-            handles.push(std::thread::Builder::new().name("audit".into()).spawn(worker)?);
+            handles.push(priority::thread("audit").spawn(worker)?);
         }
         Ok(Arc::new(Pacer {
             limits: limits.clone(),

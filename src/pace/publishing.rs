@@ -164,7 +164,7 @@ impl Running {
             Err(refusal) => return viewers.iter().for_each(|(viewer, _)| viewer.close(refusal.clone())),
         };
         let snapshot = Snapshot::new(&model.scene, self.session.step_count(), self.session.time_s(), displacement_m);
-        let snapshot = Arc::new(snapshot);
+        let snapshot = Arc::new(snapshot.with_skin(self.live.skin.as_ref()));
         let (overrun_count, time_dilation) = (self.overrun_count, self.dilation.value);
         encoder.post(self.live.number, Job { snapshot, viewers, overrun_count, time_dilation });
     }

@@ -12,7 +12,7 @@ use crate::scene::script::Script;
 use crate::session::Session;
 use crate::session::run::{self, Player};
 use crate::sheet::Model;
-use crate::surface::Snapshot;
+use crate::surface::{Skin, Snapshot};
 use crate::texture::Image;
 
 /// The reason why there is no picture.
@@ -35,11 +35,13 @@ pub struct Film<'a> {
     player: Player<'a>,
     script: &'a Script,
     changes: VecDeque<(u64, Arc<Model>)>,
+    shown: Option<Arc<Skin>>,
 }
 
 /// The tissue at one moment, and the forces that act on it.
 pub struct Still {
     snapshot: Snapshot,
+    shown: Option<Arc<Skin>>,
     arrows: Vec<Arrow>,
 }
 
@@ -53,7 +55,7 @@ impl<'a> Film<'a> {
         let mut session = Session::new(model);
         let player = Player::new(model, script, false, limits)?;
         player.begin(&mut session);
-        Ok(Film { session, player, script, changes })
+        Ok(Film { session, player, script, changes, shown: Skin::of(model) })
     }
 
     /// Advances until `step` steps are done.
@@ -86,7 +88,7 @@ impl<'a> Film<'a> {
         let arrow = |poke: Poke| Arrow { point: model.shape().nearest(poke.centre_m), towards: poke.force_n };
         let arrows = pokes.filter(|poke| poke.force_n.length() > 0.0).map(arrow).collect();
         let snapshot = Snapshot::new(&model.scene, step, self.session.time_s(), displacement_m);
-        Ok(Still { snapshot, arrows })
+        Ok(Still { snapshot: snapshot.with_skin(self.shown.as_ref()), shown: self.shown.clone(), arrows })
     }
 
     /// The tissue at the script's sample time with the largest displacement.
@@ -117,7 +119,7 @@ impl Still {
 
     /// Draws it.
     pub fn picture(&self, model: &Model, view: &View) -> Image {
-        picture(model.shape(), &self.snapshot, &self.arrows, view)
+        picture(model.shape(), self.shown.as_deref(), &self.snapshot, &self.arrows, view)
     }
 }
 

@@ -1,12 +1,12 @@
-//! Draws the sheet at one moment, as a textured surface or as a mesh.
+//! Draws the tissue at one moment, as a textured surface or as a mesh.
 
-use glam::{DVec2, DVec3};
+use glam::{DVec2, DVec3, Vec3Swizzles};
 
 use super::canvas::{Canvas, Corner, SAMPLES, colour, linear};
 use super::surface::{Surface, Vertex};
 use crate::refusal::{Reason, Refusal, Result, number};
-use crate::shape::{PointId, RestShape};
-use crate::surface::{Refinement, Snapshot};
+use crate::shape::{PointId, PointName, RestShape};
+use crate::surface::{Refinement, Skin as Shown, Snapshot};
 use crate::texture::Image;
 
 /// The camera. It always looks at the middle of the tissue.
@@ -122,44 +122,47 @@ impl Eye {
     }
 }
 
-/// Draws the tissue in the state of `snapshot`.
-pub fn picture(shape: &dyn RestShape, snapshot: &Snapshot, arrows: &[Arrow], view: &View) -> Image {
-    let surface = Surface::new(snapshot, view.refinement);
+/// Draws the tissue in the state of `snapshot`; `shown` is what frames show of a mesh.
+pub fn picture(
+    shape: &dyn RestShape,
+    shown: Option<&Shown>,
+    snapshot: &Snapshot,
+    arrows: &[Arrow],
+    view: &View,
+) -> Image {
+    let surface = Surface::new(shape, shown, snapshot, view.refinement);
     let eye = Eye::new(shape, view);
     let nearest_m = 0.01 * shape.longest_side_m();
     let background = if view.texture.is_some() { [20, 14, 13] } else { [255, 255, 255] };
     let mut canvas = Canvas::new(view.size, colour(background));
     let corners: Vec<Option<Corner>> =
         surface.vertices.iter().map(|vertex| eye.project(vertex.at_m, nearest_m)).collect();
-    let [nx, ny] = surface.count;
     let skin = view.texture.as_ref().map(|image| Skin::new(image, &eye, shape));
-    for cell in 0..view.refinement.cell_count() {
-        let [a, b, c, d, e, f] = view.refinement.triangles(cell);
-        for triangle in [[a, b, c], [d, e, f]] {
-            let [Some(p), Some(q), Some(r)] = triangle.map(|index| corners[index]) else { continue };
-            let vertices = triangle.map(|index| surface.vertices[index]);
-            canvas.triangle([p, q, r], |shares| match &skin {
-                Some(skin) => skin.shade(&between(&vertices, shares)),
-                // Pale enough for lines to show, and opaque.
-                None => DVec3::splat(0.80 + 0.18 * between(&vertices, shares).open),
-            });
-        }
+    for triangle in &surface.triangles {
+        let [Some(p), Some(q), Some(r)] = triangle.map(|index| corners[index]) else { continue };
+        let vertices = triangle.map(|index| surface.vertices[index]);
+        canvas.triangle([p, q, r], |shares| match &skin {
+            Some(skin) => skin.shade(&between(&vertices, shares)),
+            // Pale enough for lines to show, and opaque.
+            None => DVec3::splat(0.80 + 0.18 * between(&vertices, shares).open),
+        });
     }
     if skin.is_none() {
         let ink = colour([96, 36, 34]);
         // Thinner where lines are dense.
-        let width = (0.055 * view.size[0] as f64 / nx.max(ny) as f64).clamp(0.35, 1.1);
-        for index in 0..nx * ny {
-            let beyond = [(index / ny + 1 < nx).then_some(index + ny), (index % ny + 1 < ny).then_some(index + 1)];
-            for other in beyond.into_iter().flatten() {
-                if let (Some(from), Some(to)) = (corners[index], corners[other]) {
-                    canvas.line(from, to, width, 2e-3, ink);
-                }
+        let width = (0.055 * view.size[0] as f64 / surface.along as f64).clamp(0.35, 1.1);
+        for line in &surface.lines {
+            if let [Some(from), Some(to)] = line.map(|index| corners[index]) {
+                canvas.line(from, to, width, 2e-3, ink);
             }
         }
     }
     for arrow in arrows {
-        draw(&mut canvas, &eye, &surface, arrow, view, shape, nearest_m);
+        let vertex = match (shown, shape.name(arrow.point)) {
+            (Some(shown), PointName::Vertex(vertex)) => shown.places()[vertex as usize] as usize,
+            _ => view.refinement.vertex_at(arrow.point),
+        };
+        draw(&mut canvas, &eye, surface.vertices[vertex].at_m, arrow, view, shape, nearest_m);
     }
     canvas.image()
 }
@@ -167,13 +170,12 @@ pub fn picture(shape: &dyn RestShape, snapshot: &Snapshot, arrows: &[Arrow], vie
 fn draw(
     canvas: &mut Canvas,
     eye: &Eye,
-    surface: &Surface,
+    tip_m: DVec3,
     arrow: &Arrow,
     view: &View,
     shape: &dyn RestShape,
     nearest_m: f64,
 ) {
-    let tip_m = surface.vertices[view.refinement.vertex_at(arrow.point)].at_m;
     let tail_m = tip_m - ARROW * shape.longest_side_m() * arrow.towards.normalize_or_zero();
     let (Some(tip), Some(tail)) = (eye.project(tip_m, nearest_m), eye.project(tail_m, nearest_m)) else { return };
     let ink = colour(if view.texture.is_some() { [150, 205, 255] } else { [20, 80, 160] });
@@ -193,6 +195,8 @@ fn between(vertices: &[Vertex; 3], shares: [f64; 3]) -> Vertex {
         sum.at_m += share * vertex.at_m;
         sum.normal += share * vertex.normal;
         sum.share += share * vertex.share;
+        sum.rest += share * vertex.rest;
+        sum.facing += share * vertex.facing;
         sum.open += share * vertex.open;
     }
     sum
@@ -235,6 +239,19 @@ impl<'a> Skin<'a> {
         at(column, row).lerp(at(column + 1, row), s).lerp(at(column, row + 1).lerp(at(column + 1, row + 1), s), t)
     }
 
+    /// The texture's colour at a vertex. One without texture coordinates has that of the texture seen along each axis, as far as
+    /// it faces there.
+    fn albedo_at(&self, vertex: &Vertex) -> DVec3 {
+        let Vertex { rest, facing, .. } = *vertex;
+        let weights = facing * facing * facing * facing;
+        let sum = weights.element_sum();
+        if sum <= 0.0 {
+            return self.albedo(vertex.share);
+        }
+        let seen = [(rest.yz(), weights.x), (rest.xz(), weights.y), (rest.xy(), weights.z)];
+        seen.into_iter().filter(|(_, weight)| *weight > 0.01 * sum).map(|(share, w)| w / sum * self.albedo(share)).sum()
+    }
+
     fn shade(&self, vertex: &Vertex) -> DVec3 {
         let to_eye = (self.eye_m - vertex.at_m).normalize_or_zero();
         let mut normal = vertex.normal.normalize_or_zero();
@@ -248,7 +265,7 @@ impl<'a> Skin<'a> {
         // Light scatters a little way in tissue and comes out beyond the edge of a shadow.
         let diffuse = ((normal.dot(to_lamp) + 0.18) / 1.18).max(0.0);
         let around = DVec3::new(0.15, 0.10, 0.09) * normal.z.max(0.0);
-        let albedo = self.albedo(vertex.share);
+        let albedo = self.albedo_at(vertex);
         let mut colour = albedo * vertex.open * (around + DVec3::splat(2.3 * light * diffuse * diffuse));
         // The film of liquid: a broad sheen and a sharp glint, stronger at a grazing view (Schlick's approximation).
         let half = normal.dot((to_lamp + to_eye).normalize_or_zero()).max(0.0);

@@ -1,8 +1,9 @@
-//! The sheet as vertices in space, refined as for viewers, with normals and texture coordinates.
+//! The tissue as vertices in space, refined as for viewers, with normals and texture coordinates.
 
 use glam::{DVec2, DVec3};
 
-use crate::surface::{Encoding, Refinement, Snapshot, encode};
+use crate::shape::RestShape;
+use crate::surface::{Encoding, Refinement, Skin, Snapshot, encode};
 
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Vertex {
@@ -12,19 +13,72 @@ pub(super) struct Vertex {
     pub(super) normal: DVec3,
     /// Texture coordinates, 0 to 1 along x and along y.
     pub(super) share: DVec2,
+    /// Without these, on a mesh: place at rest, 0 to 1 over the longest side, and how far the surface there faces along each axis.
+    pub(super) rest: DVec3,
+    pub(super) facing: DVec3,
     /// The fraction of ambient light that reaches the vertex: less in a dent.
     pub(super) open: f64,
 }
 
-/// Vertex (a, b) at a·count[1] + b.
+/// What is drawn.
 #[derive(Debug)]
 pub(super) struct Surface {
-    pub(super) count: [usize; 2],
     pub(super) vertices: Vec<Vertex>,
+    pub(super) triangles: Vec<[usize; 3]>,
+    /// The ends of the lines that show its mesh.
+    pub(super) lines: Vec<[usize; 2]>,
+    /// Vertices along a side, about.
+    pub(super) along: usize,
 }
 
 impl Surface {
-    pub(super) fn new(snapshot: &Snapshot, refinement: Refinement) -> Self {
+    /// Of what a frame shows.
+    pub(super) fn new(shape: &dyn RestShape, skin: Option<&Skin>, snapshot: &Snapshot, refinement: Refinement) -> Self {
+        match skin {
+            None => Self::of_sheet(snapshot, refinement),
+            Some(skin) => Self::of_mesh(shape, skin, snapshot, refinement),
+        }
+    }
+
+    fn of_mesh(shape: &dyn RestShape, skin: &Skin, snapshot: &Snapshot, refinement: Refinement) -> Self {
+        let moved_m = displacements(snapshot, refinement);
+        let (least_m, longest_m) = (shape.extent().least_m, shape.longest_side_m());
+        let rest_m: Vec<DVec3> = skin.vertices().iter().map(|vertex| skin.rest_m(*vertex)).collect();
+        let places_m: Vec<DVec3> = rest_m.iter().zip(&moved_m).map(|(rest_m, moved_m)| *rest_m + *moved_m).collect();
+        let of_file = |vertex: u32| skin.places()[vertex as usize] as usize;
+        let triangles: Vec<[usize; 3]> = skin.triangles().iter().map(|triangle| triangle.map(of_file)).collect();
+        let normals = |places_m: &[DVec3]| {
+            let mut normals = vec![DVec3::ZERO; places_m.len()];
+            for triangle in &triangles {
+                let [a, b, c] = triangle.map(|vertex| places_m[vertex]);
+                triangle.iter().for_each(|vertex| normals[*vertex] += (b - a).cross(c - a));
+            }
+            normals.into_iter().map(|normal| normal.try_normalize().unwrap_or(DVec3::Z)).collect::<Vec<_>>()
+        };
+        let (at_rest, now) = (normals(&rest_m), normals(&places_m));
+        let vertex = |place: usize| {
+            let uv = skin.texture_at(skin.vertices()[place]);
+            Vertex {
+                at_m: places_m[place],
+                normal: now[place],
+                share: uv.map_or(DVec2::ZERO, |[u, v]| DVec2::new(f64::from(u), f64::from(v))),
+                rest: (rest_m[place] - least_m) / longest_m,
+                facing: if uv.is_some() { DVec3::ZERO } else { at_rest[place].abs() },
+                open: 1.0,
+            }
+        };
+        let mut lines: Vec<[usize; 2]> = triangles
+            .iter()
+            .flat_map(|[a, b, c]| [[*a, *b], [*b, *c], [*c, *a]])
+            .map(|[a, b]| [a.min(b), a.max(b)])
+            .collect();
+        lines.sort_unstable();
+        lines.dedup();
+        let along = (longest_m / skin.edge_m()).ceil() as usize;
+        Surface { vertices: (0..places_m.len()).map(vertex).collect(), triangles, lines, along }
+    }
+
+    fn of_sheet(snapshot: &Snapshot, refinement: Refinement) -> Self {
         let points = refinement.coarsest();
         // Interpolate the points' normals, so that shading is smooth: a bilinear patch has creases of its own.
         let places_m = places(snapshot, points);
@@ -39,17 +93,35 @@ impl Surface {
                 let [a, b] = [index / count[1], index % count[1]];
                 let normal = bilinear(grid, &normals, [a, b], part).try_normalize().unwrap_or(DVec3::Z);
                 let share = refinement.texture_at(index);
-                Vertex { at_m, normal, share, open: bilinear(grid, &open, [a, b], part).x }
+                Vertex { at_m, normal, share, open: bilinear(grid, &open, [a, b], part).x, ..Vertex::default() }
             })
             .collect();
-        Surface { count, vertices }
+        let halves = |[a, b, c, d, e, f]: [usize; 6]| [[a, b, c], [d, e, f]];
+        let [nx, ny] = count;
+        let beyond = |index: usize| {
+            [(index / ny + 1 < nx).then_some(index + ny), (index % ny + 1 < ny).then_some(index + 1)]
+        };
+        Surface {
+            vertices,
+            triangles: (0..refinement.cell_count()).flat_map(|cell| halves(refinement.triangles(cell))).collect(),
+            lines: (0..nx * ny)
+                .flat_map(|index| beyond(index).into_iter().flatten().map(move |other| [index, other]))
+                .collect(),
+            along: nx.max(ny),
+        }
     }
 }
 
 /// The positions of the vertices, m, from the data that a viewer gets.
 fn places(snapshot: &Snapshot, refinement: Refinement) -> Vec<DVec3> {
+    let rest = |(vertex, moved_m)| refinement.rest_m(vertex) + moved_m;
+    displacements(snapshot, refinement).into_iter().enumerate().map(rest).collect()
+}
+
+/// The displacements of the vertices, m, from the data that a viewer gets.
+fn displacements(snapshot: &Snapshot, refinement: Refinement) -> Vec<DVec3> {
     let [_, ny] = refinement.vertices();
-    let mut places: Vec<DVec3> = (0..refinement.vertex_count()).map(|vertex| refinement.rest_m(vertex)).collect();
+    let mut displacements = vec![DVec3::ZERO; refinement.vertex_count()];
     for patch in encode(snapshot, refinement, Encoding::F32).patches {
         for (k, bytes) in patch.bytes.chunks_exact(12).enumerate() {
             let (a, b) = (patch.first[0] + k / patch.count[1], patch.first[1] + k % patch.count[1]);
@@ -57,10 +129,10 @@ fn places(snapshot: &Snapshot, refinement: Refinement) -> Vec<DVec3> {
                 let four = [bytes[4 * c], bytes[4 * c + 1], bytes[4 * c + 2], bytes[4 * c + 3]];
                 f64::from(f32::from_le_bytes(four))
             };
-            places[a * ny + b] += DVec3::new(component(0), component(1), component(2));
+            displacements[a * ny + b] = DVec3::new(component(0), component(1), component(2));
         }
     }
-    places
+    displacements
 }
 
 fn normals([nx, ny]: [usize; 2], places: &[DVec3]) -> Vec<DVec3> {

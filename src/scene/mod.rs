@@ -14,6 +14,7 @@ pub mod profile;
 pub mod reader;
 pub mod record;
 pub mod script;
+pub mod sent;
 mod sheet;
 mod shown;
 mod source;
@@ -29,7 +30,6 @@ use document::{Document, Fields, Item};
 use kind::Kind;
 pub use material::{Inclusion, MadeOf, Material, Region};
 pub use mesh::{Differences, Fixed as FixedVertices, Mesh, MeshShape, Stiffest, Told, simulated};
-
 pub use sheet::{Fixed, LEAST_WIDTH, PointSet, Sheet};
 pub use shown::{BoundPlace, Shown};
 use source::Files;

@@ -1,10 +1,14 @@
 //! The force laws of a haptic stream: first one that is there at once, then the exact one, when it is computed; and the same
-//! again when another tissue acts.
+//! again when another tissue acts, and on a mesh when a tool has moved by more than its radius: a mesh is not the same
+//! everywhere.
 
 use std::sync::Arc;
 use std::task::{Context, Poll, ready};
+use std::time::Duration;
 
+use glam::DVec3;
 use tokio::sync::{mpsc, watch};
+use tokio::time::Instant;
 use tokio_util::task::AbortOnDropHandle;
 use tonic::Status;
 use tonic_types::StatusExt;
@@ -15,9 +19,17 @@ use crate::budget::Account;
 use crate::pace::Live;
 use crate::pace::laws::{SoughtLaw, have_same_laws};
 use crate::session::laws::{FIRST, Laws};
+use crate::shape::PointId;
 use crate::sheet::Model;
 use palpate_proto::{pb, touch};
 use palpate_touch::Law;
+
+/// A tool so many radii away from the surface wants no law of the place.
+const NEAR_IN_RADII: f64 = 4.0;
+
+/// After the laws of a place so many times as long passes until those of another are begun, but not longer than this.
+const PAUSES: u32 = 3;
+const LONGEST_PAUSE: Duration = Duration::from_secs(2);
 
 /// A law for a stream, or why there is none.
 struct LawUpdate {
@@ -60,6 +72,8 @@ struct Known {
     number: u32,
     /// The tissue that it is of, or for which there is none.
     model: Arc<Model>,
+    /// Where it is of; none where the stream begins.
+    at: Option<PointId>,
     /// Whether the exact law may follow.
     is_coarse: bool,
 }
@@ -74,15 +88,15 @@ struct Maker {
 
 impl Maker {
     /// The law to begin with: at most 50 ms of work.
-    async fn first(&self, model: &Arc<Model>) -> Result<Arc<Law>, Status> {
-        let sought = self.live.law(model, self.radius_m)?;
+    async fn first(&self, model: &Arc<Model>, at: Option<PointId>) -> Result<Arc<Law>, Status> {
+        let sought = self.live.law(model, self.radius_m, at)?;
         Ok(self.workshop.work(&self.account, move |stop| sought.first(stop.flag())).await??)
     }
 
     /// The exact law. It is computed depth by depth: between two of them it is the turn of other work, also of the same
     /// caller.
-    async fn exact(&self, model: &Arc<Model>) -> Result<Arc<Law>, Status> {
-        let sought = self.live.law(model, self.radius_m)?;
+    async fn exact(&self, model: &Arc<Model>, at: Option<PointId>) -> Result<Arc<Law>, Status> {
+        let sought = self.live.law(model, self.radius_m, at)?;
         let _turn = sought.turn().await;
         let mut computation = None;
         loop {
@@ -95,19 +109,41 @@ impl Maker {
         }
     }
 
-    /// Tells the stream what it does not know of the laws of `model`, the tissue since `step`.
-    async fn tell(&self, known: &mut Known, step: u64, model: &Arc<Model>, tell: &mpsc::Sender<LawUpdate>) {
-        if !have_same_laws(&known.model, model) {
-            let law = self.first(model).await;
+    /// Tells the stream what it does not know of the laws of `model`, the tissue since `step`, where its tool is.
+    async fn tell(
+        &self,
+        known: &mut Known,
+        step: u64,
+        model: &Arc<Model>,
+        place_m: Option<DVec3>,
+        tell: &mpsc::Sender<LawUpdate>,
+    ) {
+        let at = self.place(known, model, place_m);
+        let is_other = !have_same_laws(&known.model, model);
+        if is_other || at != known.at {
+            let law = self.first(model, at).await;
             let is_coarse = law.as_ref().is_ok_and(|law| law.is_coarse);
-            self.say(known, Some(step), law, tell).await;
-            (known.model, known.is_coarse) = (model.clone(), is_coarse);
+            self.say(known, is_other.then_some(step), law, tell).await;
+            (known.model, known.at, known.is_coarse) = (model.clone(), at, is_coarse);
         }
         if known.is_coarse {
-            let law = self.exact(model).await;
+            let law = self.exact(model, at).await;
             self.say(known, None, law, tell).await;
             known.is_coarse = false;
         }
+    }
+
+    /// The point whose law serves a tool at a place: the one that is known, as long as the tool is within a radius of it. On
+    /// a sheet it is the middle everywhere.
+    fn place(&self, known: &Known, model: &Model, place_m: Option<DVec3>) -> Option<PointId> {
+        let shape = model.shape();
+        let place_m = place_m.filter(|_| shape.dimensions() > 2);
+        let Some(place_m) = place_m else { return known.at };
+        let nearest = shape.nearest(place_m);
+        let nearest_m = shape.rest_m(nearest);
+        let is_near = |at: PointId| shape.rest_m(at).distance(nearest_m) <= self.radius_m;
+        let is_far = nearest_m.distance(place_m) > NEAR_IN_RADII * self.radius_m;
+        if is_far || known.at.is_some_and(is_near) { known.at } else { Some(nearest) }
     }
 
     async fn say(
@@ -148,22 +184,43 @@ impl Computing {
         let mut tissue = live.tissue();
         let model = tissue.borrow_and_update().1.clone();
         let maker = Maker { workshop: workshop.clone(), account: account.clone(), live: live.clone(), radius_m };
-        let law = maker.first(&model).await?;
-        let known = Known { number: FIRST, model, is_coarse: law.is_coarse };
+        let law = maker.first(&model, None).await?;
+        let known = Known { number: FIRST, model, at: None, is_coarse: law.is_coarse };
         Ok((law, Computing { maker, tissue, known }))
     }
 
-    /// Goes on until the handle is dropped: tells the exact law, and those of other tissues. A computation ends when a
-    /// newer tissue acts.
-    pub(super) fn go_on(self, laws: Arc<Laws>) -> (Updates, AbortOnDropHandle<()>) {
+    /// Goes on until the handle is dropped: tells the exact law, and those of other tissues and of other places, as `places`
+    /// tells them. A computation ends when a newer tissue acts.
+    pub(super) fn go_on(
+        self,
+        laws: Arc<Laws>,
+        mut places: watch::Receiver<Option<DVec3>>,
+    ) -> (Updates, AbortOnDropHandle<()>) {
         let Computing { maker, mut tissue, mut known } = self;
         let (tell, told) = mpsc::channel(1);
         let work = async move {
             loop {
                 let (step, model) = tissue.borrow_and_update().clone();
+                let place_m = *places.borrow_and_update();
+                let begun = Instant::now();
                 let changed = tokio::select! {
                     changed = tissue.changed() => changed,
-                    () = maker.tell(&mut known, step, &model, &tell) => tissue.changed().await,
+                    () = maker.tell(&mut known, step, &model, place_m, &tell) => {
+                        // A tool that moves on and on takes a part of a core for its laws, not all of it.
+                        let pause = (PAUSES * begun.elapsed()).min(LONGEST_PAUSE);
+                        let moved = async {
+                            tokio::time::sleep(pause).await;
+                            // Who tells no further place still has tissues that change.
+                            if places.changed().await.is_err() {
+                                std::future::pending::<()>().await;
+                            }
+                            Ok(())
+                        };
+                        tokio::select! {
+                            changed = tissue.changed() => changed,
+                            moved = moved => moved,
+                        }
+                    }
                 };
                 if changed.is_err() {
                     return;
@@ -220,7 +277,7 @@ mod tests {
         }
 
         fn sought(&self) -> Arc<SoughtLaw> {
-            self.live.law(&self.live.model, self.radius_m()).unwrap()
+            self.live.law(&self.live.model, self.radius_m(), None).unwrap()
         }
 
         /// Changes the tissue; tells the step from which on the other acts.
@@ -228,6 +285,11 @@ mod tests {
             let change = Change { virtual_stiffness_n_per_m: Some(virtual_stiffness_n_per_m), ..Change::default() };
             self.live.change(&change, at_step, |_| Ok(()), &NEVER).unwrap()
         }
+    }
+
+    /// Of a stream whose tool is nowhere.
+    fn nowhere() -> watch::Receiver<Option<DVec3>> {
+        watch::channel(None).1
     }
 
     async fn told(updates: &mut Updates) -> pb::ForceLawUpdate {
@@ -240,7 +302,7 @@ mod tests {
         let (first, laws, computing) = course.begin().await;
         let sought = course.sought();
         assert!(first.is_coarse && sought.exact().is_none());
-        let (mut updates, _computing) = computing.go_on(laws.clone());
+        let (mut updates, _computing) = computing.go_on(laws.clone(), nowhere());
         // Local models refer to it when it was told, not before.
         while sought.exact().is_none() {
             tokio::task::yield_now().await;
@@ -262,7 +324,7 @@ mod tests {
         let course = Course::new(&Limits { law_work: 1 << 20, ..Limits::default() });
         for _ in 0..2 {
             let (_, laws, computing) = course.begin().await;
-            let (mut updates, _computing) = computing.go_on(laws.clone());
+            let (mut updates, _computing) = computing.go_on(laws.clone(), nowhere());
             let update = told(&mut updates).await;
             assert_eq!((update.law, update.reason.as_str()), (None, "NOT_AVAILABLE"));
             assert!(update.message.contains("limits.law_work"), "{}", update.message);
@@ -275,7 +337,7 @@ mod tests {
         let course = Course::new(&Limits::default());
         let (_, laws, computing) = course.begin().await;
         let sought = course.sought();
-        let (mut updates, handle) = computing.go_on(laws.clone());
+        let (mut updates, handle) = computing.go_on(laws.clone(), nowhere());
         // It is under way when its turn is taken.
         while sought.is_free() {
             tokio::task::yield_now().await;
@@ -286,7 +348,7 @@ mod tests {
         drop(sought.turn().await);
         assert!(sought.exact().is_none() && laws.newest().0 == FIRST);
         let (_, laws, computing) = course.begin().await;
-        let (mut updates, _computing) = computing.go_on(laws);
+        let (mut updates, _computing) = computing.go_on(laws, nowhere());
         assert!(told(&mut updates).await.law.is_some());
     }
 
@@ -294,7 +356,7 @@ mod tests {
     async fn another_tissue_has_its_laws_told_when_it_acts() {
         let course = Course::new(&Limits::default());
         let (_, laws, computing) = course.begin().await;
-        let (mut updates, _computing) = computing.go_on(laws.clone());
+        let (mut updates, _computing) = computing.go_on(laws.clone(), nowhere());
         assert_eq!(told(&mut updates).await.law.unwrap().number, 1);
         let (step, model) = course.change(1.5, None);
         let first = told(&mut updates).await;
@@ -316,7 +378,7 @@ mod tests {
         let course = Course::new(&Limits::default());
         let (_, laws, computing) = course.begin().await;
         let old = course.sought();
-        let (mut updates, _computing) = computing.go_on(laws.clone());
+        let (mut updates, _computing) = computing.go_on(laws.clone(), nowhere());
         while old.is_free() {
             tokio::task::yield_now().await;
         }

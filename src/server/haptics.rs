@@ -7,7 +7,8 @@ use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
 use futures_util::stream::{self, Stream};
-use tokio::sync::oneshot;
+use glam::DVec3;
+use tokio::sync::{oneshot, watch};
 use tokio_util::task::AbortOnDropHandle;
 use tonic::{Request, Response, Status, Streaming};
 use tracing::{Instrument, debug, info};
@@ -70,8 +71,30 @@ struct StreamTools {
     lease: LeaseId,
     tools: usize,
     device: Option<Device>,
+    place: ToolPlace,
     /// Computes further laws as long as the stream is there.
     _computing: Option<AbortOnDropHandle<()>>,
+}
+
+/// Where the tool of a stream is, as the computation of its laws is told.
+struct ToolPlace {
+    /// Of the tip, m.
+    radius_m: f64,
+    told: watch::Sender<Option<DVec3>>,
+}
+
+impl ToolPlace {
+    /// Tells the place of a pose that is half a radius away from the last that was told.
+    fn follow(&self, command: &Command) {
+        let Action::Pose { place_m, .. } = command.action else { return };
+        self.told.send_if_modified(|told| {
+            let is_news = told.is_none_or(|told_m| told_m.distance(place_m) > 0.5 * self.radius_m);
+            if is_news {
+                *told = Some(place_m);
+            }
+            is_news
+        });
+    }
 }
 
 impl StreamTools {
@@ -154,8 +177,10 @@ impl Haptics {
             intake.charge(lease, charges);
             Ok::<_, Refusal>(intake.next_step())
         })?;
-        let (updates, _computing) = computing.zip(laws).map(|(computing, laws)| computing.go_on(laws)).unzip();
-        let held = StreamTools { live: live.clone(), lease, tools: open.tools.len(), device, _computing };
+        let (place, places) = watch::channel(None);
+        let (updates, _computing) = computing.zip(laws).map(|(computing, laws)| computing.go_on(laws, places)).unzip();
+        let place = ToolPlace { radius_m: tip.radius_m, told: place };
+        let held = StreamTools { live: live.clone(), lease, tools: open.tools.len(), device, place, _computing };
         let law = law.as_deref();
         let answer = pb::TouchOpened {
             step,
@@ -246,6 +271,7 @@ impl Haptics {
                         .take(now, "commands of this stream")
                         .and_then(|()| wire::command::from_command(&command, live.model.shape(), now))
                         .and_then(|command| within_reach(command, live, held.device.as_ref()))
+                        .inspect(|command| held.place.follow(command))
                         .and_then(|command| live.submit(held.lease, vec![command]).map(drop));
                     self.0.traffic.commanded(usize::from(taken.is_ok()));
                     if let Err(refusal) = taken {

@@ -1,11 +1,9 @@
 //! The vertices and triangles of a tissue at rest, in parts, as viewers get them.
 
+use palpate_mesh::Group;
 use palpate_proto::pb;
 
-use crate::scene::{Body, MeshShape};
-use crate::shape::RestShape;
-use crate::sheet::Model;
-use crate::surface::{MESH_ROW, Refinement};
+use crate::surface::{MESH_ROW, Refinement, Skin};
 
 /// Vertices of one message: with positions and texture coordinates 40 KiB.
 const VERTICES_PER_PART: usize = 2048;
@@ -17,11 +15,8 @@ const TRIANGLES_PER_PART: usize = 4096;
 const MEMBERS_PER_PART: usize = 4096;
 
 /// Part `part` of a tissue's surface: first the vertices, then the triangles. `None` after the last.
-pub(super) fn mesh_part(model: &Model, grid: Refinement, part: usize) -> Option<pb::GetMeshResponse> {
-    match (&model.scene.body, model.shown_order()) {
-        (Body::Mesh(mesh), Some(order)) => part_of_mesh(&mesh.shape, order, part),
-        _ => part_of_sheet(grid, part),
-    }
+pub(super) fn mesh_part(skin: Option<&Skin>, grid: Refinement, part: usize) -> Option<pb::GetMeshResponse> {
+    skin.map_or_else(|| part_of_sheet(grid, part), |skin| part_of_mesh(skin, part))
 }
 
 #[allow(clippy::cast_possible_truncation)]
@@ -58,9 +53,9 @@ fn part_of_sheet(grid: Refinement, part: usize) -> Option<pb::GetMeshResponse> {
 
 /// The same of a mesh, whose vertices are in the order of its frames. The groups are in the first parts.
 #[allow(clippy::cast_possible_truncation)]
-fn part_of_mesh(shape: &MeshShape, [order, place_of]: [&[u32]; 2], part: usize) -> Option<pb::GetMeshResponse> {
-    let (told, triangles) = (shape.told(), shape.triangles());
-    let (vertices, members) = (order.len(), told.groups.iter().map(|group| group.vertices.len()).sum::<usize>());
+fn part_of_mesh(skin: &Skin, part: usize) -> Option<pb::GetMeshResponse> {
+    let (order, triangles) = (skin.vertices(), skin.triangles());
+    let (vertices, members) = (order.len(), skin.groups().iter().map(|group| group.vertices.len()).sum::<usize>());
     let vertex_parts = vertices.div_ceil(VERTICES_PER_PART);
     let parts = (vertex_parts + triangles.len().div_ceil(TRIANGLES_PER_PART)).max(members.div_ceil(MEMBERS_PER_PART));
     if part >= parts {
@@ -69,33 +64,33 @@ fn part_of_mesh(shape: &MeshShape, [order, place_of]: [&[u32]; 2], part: usize) 
     let mut message = pb::GetMeshResponse {
         vertices_x: vertices.div_ceil(MESH_ROW) as u32,
         vertices_y: MESH_ROW as u32,
-        vertex_spacing_m: shape.edge_m(),
-        groups: groups(shape, part),
+        vertex_spacing_m: skin.edge_m(),
+        groups: groups(skin.groups(), part),
         last: part + 1 == parts,
         ..Default::default()
     };
     if part < vertex_parts {
         let first = part * VERTICES_PER_PART;
         for vertex in &order[first..(first + VERTICES_PER_PART).min(vertices)] {
-            message.rest_position_m.extend(shape.vertices_m()[*vertex as usize].as_vec3().to_array());
-            message.texture_coordinates.extend(told.uv.iter().flat_map(|uv| uv[*vertex as usize]));
+            message.rest_position_m.extend(skin.rest_m(*vertex).as_vec3().to_array());
+            message.texture_coordinates.extend(skin.texture_at(*vertex).into_iter().flatten());
             message.file_vertex.push(*vertex);
         }
     } else {
         let first = ((part - vertex_parts) * TRIANGLES_PER_PART).min(triangles.len());
         for triangle in &triangles[first..(first + TRIANGLES_PER_PART).min(triangles.len())] {
-            message.triangles.extend(triangle.map(|vertex| place_of[vertex as usize]));
+            message.triangles.extend(triangle.map(|vertex| skin.places()[vertex as usize]));
         }
     }
     Some(message)
 }
 
 /// What part `part` has of the groups: the vertices of all of them in succession are cut into parts of the same length.
-fn groups(shape: &MeshShape, part: usize) -> Vec<pb::VertexGroup> {
+fn groups(groups: &[Group], part: usize) -> Vec<pb::VertexGroup> {
     let (from, to) = (part * MEMBERS_PER_PART, (part + 1) * MEMBERS_PER_PART);
     let mut begin = 0;
     let mut found = Vec::new();
-    for group in &shape.told().groups {
+    for group in groups {
         let end = begin + group.vertices.len();
         if begin < to && end > from {
             let vertices = group.vertices[from.max(begin) - begin..to.min(end) - begin].to_vec();

@@ -35,7 +35,7 @@ struct Upload {
     id: String,
     name: String,
     state: State,
-    /// When the last part came.
+    /// When the last part came, or the mesh was used last.
     touched_ns: u64,
     taken: Taken,
 }
@@ -172,8 +172,9 @@ impl Meshes {
             return Err(Refusal::new(Reason::Missing, "scene.mesh.mesh_id", message));
         }
         self.forget_expired(now_ns());
-        let uploads = lock(&self.0.uploads);
+        let mut uploads = lock(&self.0.uploads);
         let index = find(&uploads, id, account).map_err(|refusal| refusal.within("scene.mesh"))?;
+        uploads[index].touched_ns = now_ns();
         match &uploads[index].state {
             State::Ready(mesh) => Ok(mesh.clone()),
             State::Receiving(_) | State::Reading => {

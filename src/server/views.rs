@@ -76,9 +76,9 @@ impl ViewService for Views {
         let grid = Refinement::new(&live.model.scene, request.refinement, &self.0.config.limits)?;
         let guard = live.open_stream("GetMesh", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
-        let model = live.model.clone();
-        let out = stream::unfold((0, guard, model), move |(part, guard, model)| async move {
-            mesh_part(&model, grid, part).map(|message| (Ok(message), (part + 1, guard, model)))
+        let skin = live.skin.clone();
+        let out = stream::unfold((0, guard, skin), move |(part, guard, skin)| async move {
+            mesh_part(skin.as_deref(), grid, part).map(|message| (Ok(message), (part + 1, guard, skin)))
         });
         Ok(Response::new(until_cut(out, cut)))
     }

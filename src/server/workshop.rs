@@ -19,7 +19,7 @@ use crate::budget::{Account, Turns};
 use crate::limits::Limits;
 use crate::lock::lock;
 use crate::pace::clock::now_ns;
-use crate::priority::give_way;
+use crate::priority::{give_way, thread};
 use crate::refusal::{Reason, Refusal};
 
 /// Number of threads of a workshop.
@@ -143,7 +143,7 @@ impl Workshop {
         let close = Arc::new(CloseOnDrop(shared.clone()));
         for index in 0..THREADS {
             let shared = shared.clone();
-            std::thread::Builder::new().name(format!("{name}-{index}")).spawn(move || {
+            thread(format!("{name}-{index}")).spawn(move || {
                 give_way();
                 shared.work();
             })?;

@@ -7,7 +7,7 @@ use std::sync::atomic::AtomicBool;
 use glam::DVec3;
 use palpate_touch::{Coupling, Law, Tip};
 
-use crate::force_law;
+use crate::force_law::{self, Disc};
 use crate::scene::profile::{LoadProfile, PoseProfile, StrengthProfile, weights};
 use crate::scene::script::Script;
 use crate::shape::{Extent, RestShape};
@@ -98,7 +98,8 @@ impl Laws<'_> {
     fn of(&mut self, radius_m: f64) -> Option<&Law> {
         let known = self.known.iter().position(|known| known.0 == radius_m);
         let place = known.unwrap_or_else(|| {
-            let law = force_law::first(self.model, radius_m, &AtomicBool::new(false)).filter(Law::is_sound);
+            let law = force_law::first(self.model, Disc::in_middle(self.model, radius_m), &AtomicBool::new(false))
+                .filter(Law::is_sound);
             self.known.push((radius_m, law));
             self.known.len() - 1
         });
@@ -122,11 +123,7 @@ impl Prospect {
             mass_kg,
             radius_m,
             law,
-            no_law: if shape.dimensions() > 2 {
-                "there is no force law of a mesh yet"
-            } else {
-                "its force law takes too much work"
-            },
+            no_law: "its force law takes too much work",
             deepest_m: half_m.min(reach_m),
             is_by_law: reach_m < half_m,
             rest_s: rest_s(&sheet),

@@ -143,7 +143,22 @@ impl Model {
     pub fn bytes(&self) -> u64 {
         let fixed = self.fixed.len() * (size_of::<usize>() + size_of::<[usize; 2]>());
         let vectors = self.warnings.iter().map(String::len).sum::<usize>() + self.plan.nodes.len() * size_of::<Node>();
-        (size_of::<Model>() + fixed + vectors) as u64
+        (size_of::<Model>() + fixed + vectors) as u64 + self.mesh_bytes()
+    }
+
+    /// What the tables of a mesh take, bytes, about: places, neighbours, and each spring from both of its ends, as the file of
+    /// the scene has it and as the kernel reads it.
+    fn mesh_bytes(&self) -> u64 {
+        const OF_A_VERTEX: usize = 256;
+        const OF_A_SPRING: usize = 192;
+        match &self.scene.body {
+            Body::Sheet(_) => 0,
+            Body::Mesh(mesh) => {
+                let springs = mesh.shape.edges().len() + mesh.shape.opposite().len();
+                let shown = mesh.shape.shown().map_or(0, |shown| shown.places.len());
+                (OF_A_VERTEX * (self.len() + shown) + OF_A_SPRING * springs) as u64
+            }
+        }
     }
 
     /// What a session of it may take, bytes: its state, the checkpoint, and one more that an audit begins from.

@@ -3,12 +3,14 @@
 
 pub mod encode;
 pub mod refine;
+pub mod skin;
 mod snapshot;
 pub mod tiles;
 mod wide;
 
 pub use encode::{Encoding, Frame, encode, encode_over};
 pub use refine::{LARGEST_REFINEMENT, MESH_ROW, Refinement};
+pub use skin::Skin;
 pub use snapshot::Snapshot;
 pub use tiles::FrameTiles;
 

@@ -26,7 +26,10 @@ pub const MESH_ROW: usize = 16;
 pub(super) fn grid(scene: &Scene) -> ([usize; 2], f64) {
     match &scene.body {
         Body::Sheet(Sheet { points, spacing_m, .. }) => (*points, *spacing_m),
-        Body::Mesh(mesh) => ([mesh.shape.point_count().div_ceil(MESH_ROW), MESH_ROW], mesh.shape.edge_m()),
+        Body::Mesh(mesh) => {
+            let shown = mesh.shape.shown().map_or(mesh.shape.point_count(), |shown| shown.places.len());
+            ([shown.div_ceil(MESH_ROW), MESH_ROW], mesh.shape.edge_m())
+        }
     }
 }
 

@@ -2,9 +2,10 @@
 // The compiler does not always inline iterators over vectors. They then run without the caller's instructions.
 #![allow(clippy::needless_range_loop)]
 
-use std::sync::OnceLock;
+use std::sync::{Arc, OnceLock};
 
 use super::refine::{Points, grid};
+use super::skin::Skin;
 use super::wide::{Available, LANES, SixteenLanes, Width, Work};
 use crate::scene::Scene;
 
@@ -15,8 +16,11 @@ pub struct Snapshot {
     pub step: u64,
     /// Simulated time, s.
     pub simulation_time_s: f64,
-    /// Displacements, m: x, y and z separate, point [i, j] at i·ny + j; of a mesh in the order in which frames show it.
-    pub(super) displacement_m: [Vec<f32>; 3],
+    /// Displacements, m: x, y and z separate, point [i, j] at i·ny + j; of a mesh in the order of memory.
+    displacement_m: [Vec<f32>; 3],
+    /// What moves with those points, if other ones are shown, and by how much, once somebody wants to know.
+    skin: Option<Arc<Skin>>,
+    shown_m: OnceLock<[Vec<f32>; 3]>,
     /// The least and the greatest of each component, m, once somebody wants to know.
     box_m: OnceLock<[[f32; 2]; 3]>,
     /// Points along x and y; of a mesh, rows and places of a row.
@@ -30,17 +34,43 @@ impl Snapshot {
     /// (`Tissue::shown_displacements_m`).
     pub fn new(scene: &Scene, step: u64, simulation_time_s: f64, displacement_m: [Vec<f32>; 3]) -> Self {
         let (points, spacing_m) = grid(scene);
-        Snapshot { step, simulation_time_s, displacement_m, box_m: OnceLock::new(), points, spacing_m }
+        Snapshot {
+            step,
+            simulation_time_s,
+            displacement_m,
+            skin: None,
+            shown_m: OnceLock::new(),
+            box_m: OnceLock::new(),
+            points,
+            spacing_m,
+        }
+    }
+
+    /// The same of a tissue on a mesh. If other vertices are shown than are simulated, who encodes finds out where they are.
+    #[must_use]
+    pub fn with_skin(self, skin: Option<&Arc<Skin>>) -> Self {
+        Snapshot { skin: skin.filter(|skin| skin.is_bound()).cloned(), ..self }
+    }
+
+    /// The displacements of what is shown, m.
+    pub(super) fn displacement_m(&self) -> &[Vec<f32>; 3] {
+        match &self.skin {
+            None => &self.displacement_m,
+            Some(skin) => {
+                let [rows, columns] = self.points;
+                self.shown_m.get_or_init(|| skin.displacement_m(&self.displacement_m, rows * columns))
+            }
+        }
     }
 
     /// The bounding box. Computed once for all encodings, by who encodes: a stepping thread makes the snapshot.
     pub(super) fn box_m(&self) -> &[[f32; 2]; 3] {
-        self.box_m.get_or_init(|| self.displacement_m.each_ref().map(|values| range(values)))
+        self.box_m.get_or_init(|| self.displacement_m().each_ref().map(|values| range(values)))
     }
 
     /// All points.
     pub(super) fn points(&self) -> Points<'_> {
-        let values = self.displacement_m.each_ref().map(Vec::as_slice);
+        let values = self.displacement_m().each_ref().map(Vec::as_slice);
         Points { values, stride: self.points[1], count: self.points }
     }
 }

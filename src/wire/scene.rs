@@ -9,8 +9,9 @@ use super::required;
 use crate::refusal::{Reason, Refusal, Result, finite, number, positive};
 use crate::scene::{
     Appearance, Body, Change, Fixed, FixedVertices, Integrator, Lanes, Mesh, Named, PointSet, Precision, Scene, Sheet,
-    Springs, Stepping,
+    Springs, Stepping, simulated,
 };
+use crate::shape::RestShape;
 
 /// The scene in a message. A scene on a mesh names the `mesh` that its client has sent before.
 ///
@@ -69,10 +70,16 @@ fn from_mesh(message: &pb::Mesh, springs: &pb::Springs, mesh: &TriangleMesh) -> 
     let flexion = springs.flexion_factor.unwrap_or(if springs.flexion { 1.0 } else { 0.0 });
     let flexion = number("springs.flexion_factor", flexion, "from 0 to 10", |v| (0.0..=10.0).contains(&v))?;
     let point_mass_kg = required("mesh.point_mass_kg", message.point_mass_kg)?;
+    let vertices = message.vertices.map(|vertices| vertices as usize);
+    if let Some(vertices) = vertices {
+        #[allow(clippy::cast_precision_loss)]
+        number("mesh.vertices", vertices as f64, "at least 4", |vertices| vertices >= 4.0)?;
+    }
+    let (mesh, shown) = simulated(mesh.clone(), vertices, false);
     let fixed = match &message.fixed {
         None | Some(pb::mesh::Fixed::FixedRim(false)) => FixedVertices::None,
         Some(pb::mesh::Fixed::FixedRim(true)) => FixedVertices::Rim,
-        Some(pb::mesh::Fixed::FixedGroup(name)) => FixedVertices::group("mesh.fixed_group", name, mesh)?,
+        Some(pb::mesh::Fixed::FixedGroup(name)) => FixedVertices::group("mesh.fixed_group", name, &mesh)?,
         Some(pb::mesh::Fixed::FixedBalls(balls)) => {
             let ball = |ball: &pb::Ball| {
                 let centre_m = from_vector(required("mesh.fixed_balls.centre_m", ball.centre_m.as_ref()).map(Some)?);
@@ -84,7 +91,7 @@ fn from_mesh(message: &pb::Mesh, springs: &pb::Springs, mesh: &TriangleMesh) -> 
             FixedVertices::Balls(balls.balls.iter().map(ball).collect::<Result<_>>()?)
         }
     };
-    let made = Mesh::of(mesh.clone(), point_mass_kg, fixed)?;
+    let made = Mesh::shown_as(mesh, shown, point_mass_kg, fixed)?;
     Ok(if flexion > 0.0 { Mesh::new(point_mass_kg, flexion, made.shape) } else { made })
 }
 
@@ -180,7 +187,9 @@ fn mesh(mesh: &Mesh) -> pb::Mesh {
             Some(pb::mesh::Fixed::FixedBalls(pb::Balls { balls: balls.iter().map(ball).collect() }))
         }
     };
-    pb::Mesh { mesh_id: String::new(), point_mass_kg: Some(mesh.point_mass_kg), vertices: None, fixed }
+    #[allow(clippy::cast_possible_truncation)]
+    let vertices = mesh.shape.shown().map(|_| mesh.shape.point_count() as u32);
+    pb::Mesh { mesh_id: String::new(), point_mass_kg: Some(mesh.point_mass_kg), vertices, fixed }
 }
 
 /// A sheet as a message.

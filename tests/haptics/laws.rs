@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use crate::common::{model, scene_with};
 use crate::server::{PATIENCE, Server, Touch, open};
-use palpate::force_law;
+use palpate::force_law::{self, Disc};
 use palpate::scene::BUILT_IN;
 use palpate::sheet::Model;
 use palpate::wire;
@@ -58,7 +58,7 @@ fn a_first_law_is_within_a_tenth_of_the_exact_one() {
     ];
     for (name, sets) in cases {
         let model = tissue(name, sets);
-        let first = force_law::first(&model, 0.005, &never).unwrap();
+        let first = force_law::first(&model, Disc::in_middle(&model, 0.005), &never).unwrap();
         let [force, of_largest, stiffness] = apart(&force_law::exact(&model, 0.005), &first);
         println!(
             "{name} {sets:?}: coarse {}, force {force:.4} ({of_largest:.4} of the largest), stiffness {stiffness:.4} apart",
@@ -86,11 +86,12 @@ fn every_tissue_has_a_first_law() {
     ];
     for (name, sets, radius_m) in cases {
         let model = tissue(name, sets);
-        let first = force_law::first(&model, radius_m, &never);
+        let first = force_law::first(&model, Disc::in_middle(&model, radius_m), &never);
         assert!(first.as_ref().is_some_and(Law::is_sound), "{name} {sets:?}: {first:?}");
     }
     let stopped = AtomicBool::new(true);
-    assert_eq!(force_law::first(&tissue("liver", &[]), 0.005, &stopped), None);
+    let liver = tissue("liver", &[]);
+    assert_eq!(force_law::first(&liver, Disc::in_middle(&liver, 0.005), &stopped), None);
 }
 
 /// Leads tool 0 of a stream by the client's clock.

@@ -40,6 +40,7 @@ pub mod bridge;
 pub mod connect;
 pub mod device;
 pub mod touch;
+pub mod upload;
 pub mod view;
 pub mod watch;
 

@@ -29,7 +29,7 @@ use tonic::Status;
 
 use crate::Failure;
 use crate::credentials::CredentialOptions;
-use crate::scene_file::{source, with_hint};
+use crate::scene_file::{SceneFile, with_hint};
 use measured::{Measured, percentiles_us};
 
 /// How far ahead of the server's step commands are sent, s: a network may stall for about as long before the session has to
@@ -144,10 +144,11 @@ pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
             scenes_of(&arguments.script, &Limits::default())?.into_iter().next().unwrap_or_else(|| "paper".to_owned())
         }
     };
-    let source = source(&scene)?;
+    let file = SceneFile::read(&scene)?;
     let unreached = |why| Failure::Failed(format!("{why}; `palpate serve` starts a server, --server names another"));
     let channel = server.connect().await.map_err(unreached)?;
     let mut client = SessionServiceClient::new(channel.clone());
+    let source = file.source(channel.clone()).await?;
     let request =
         pb::CreateSessionRequest { source: Some(source), paused: true, idle_timeout_s: Some(SILENCE.as_secs_f64()) };
     let silent = |_| Failure::Failed(format!("the server created no session within {} s", PATIENCE.as_secs()));
@@ -158,7 +159,7 @@ pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
     let sessions = session.client.clone();
     let heard = LastHeard::new(Instant::now());
     let ended = tokio::select! {
-        ended = play(arguments, &created, sessions, channel, &heard) => ended,
+        ended = play(arguments, &file, &created, sessions, channel, &heard) => ended,
         failure = silence(&heard) => Err(failure),
         _ = tokio::signal::ctrl_c() => Err(Failure::Failed("interrupted".into())),
     };
@@ -254,14 +255,14 @@ async fn silence(heard: &LastHeard) -> Failure {
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
 async fn play(
     arguments: &Arguments,
+    file: &SceneFile,
     created: &pb::Session,
     mut sessions: SessionServiceClient<Channel>,
     channel: Channel,
     heard: &LastHeard,
 ) -> Result<(), Failure> {
     let session_id = &created.session_id;
-    let scene = created.scene.as_ref().ok_or_else(|| Failure::Failed("the server sent no scene".into()))?;
-    let scene = wire::scene::from_scene(scene)?;
+    let scene = file.scene(created, channel.clone()).await?;
     let limits = Limits::default();
     let script = find_script(&arguments.script, &scene, &limits)?;
     for warning in created.warnings.iter().chain(&script.warnings) {

@@ -1,30 +1,161 @@
-//! Scenes by name or from files, as a server takes them.
+//! Scenes by name or from files, as a server takes them. The mesh of a scene file is sent to the server before the scene.
 
 use std::path::Path;
 
+use glam::DVec3;
 use palpate::limits::Limits;
-use palpate::scene::Scene;
+use palpate::scene::sent::mesh_file;
+use palpate::scene::{Body, Differences, Mesh, Scene};
 use palpate::wire;
-use palpate_proto::pb::create_session_request::Source;
+use palpate_client::upload::upload_mesh;
+use palpate_client::{Channel, Error};
+use palpate_mesh::write::{Format, write};
+use palpate_mesh::{Group, TriangleMesh};
+use palpate_proto::pb;
 use palpate_proto::refusal::Reason;
+use pb::create_session_request::Source;
+use pb::view_service_client::ViewServiceClient;
+use tonic::Status;
 
 use crate::Failure;
 
-/// The scene of a session: one of the server's by its name, or the contents of a file that ends in .toml.
-///
-/// # Errors
-/// Returns an error if the file can't be read, or if its scene is invalid.
-pub(crate) fn source(scene: &str) -> Result<Source, Failure> {
-    if Path::new(scene).extension().is_none_or(|extension| extension != "toml") {
-        return Ok(Source::SceneName(scene.to_owned()));
+/// The scene of a session.
+pub(crate) struct SceneFile {
+    source: Source,
+    /// The scene of a file of our own.
+    own: Option<Scene>,
+    /// The mesh to be sent.
+    mesh: Option<MeshToSend>,
+}
+
+struct MeshToSend {
+    name: String,
+    bytes: Vec<u8>,
+    unit: String,
+}
+
+impl SceneFile {
+    /// One of the server's by its name, or the contents of a file that ends in .toml.
+    ///
+    /// # Errors
+    /// Returns an error if the file can't be read, or if its scene is invalid.
+    pub(crate) fn read(scene: &str) -> Result<Self, Failure> {
+        let file = Path::new(scene);
+        if file.extension().is_none_or(|extension| extension != "toml") {
+            return Ok(SceneFile { source: Source::SceneName(scene.to_owned()), own: None, mesh: None });
+        }
+        let limits = Limits::default();
+        let own = Scene::load(file, &[], &limits)?;
+        let mut message = wire::scene::scene(&own);
+        let mesh = match &own.body {
+            Body::Sheet(_) => None,
+            Body::Mesh(mesh) => {
+                if *mesh.differences != Differences::default() {
+                    let why = "a client can't send a scene with [material] or [[inclusion]]: put it into the server's folder of \
+                               scenes, and give its name";
+                    return Err(Failure::Refused(format!("{scene}: {why}")));
+                }
+                let said = mesh_file(file, &limits)?.unwrap_or_default();
+                if let Some(told) = &mut message.mesh {
+                    told.vertices = said.vertices.map(|vertices| vertices.try_into().unwrap_or(u32::MAX));
+                }
+                // What a glTF file of text names in turn is not sent; one that is written anew has all.
+                let whole = said.path.filter(|path| path.extension().is_none_or(|extension| extension != "gltf"));
+                Some(match whole {
+                    Some(path) => {
+                        let unread = |e| Failure::Refused(format!("{}: can't be read: {e}", path.display()));
+                        let bytes = std::fs::read(&path).map_err(unread)?;
+                        let name = path.file_name().map(|name| name.to_string_lossy().into_owned());
+                        MeshToSend { name: name.unwrap_or_default(), bytes, unit: said.unit }
+                    }
+                    None => MeshToSend {
+                        name: "mesh.obj".to_owned(),
+                        bytes: write(&written(mesh), Format::Obj),
+                        unit: "m".to_owned(),
+                    },
+                })
+            }
+        };
+        Ok(SceneFile { source: Source::Scene(message), own: Some(own), mesh })
     }
-    let file = scene;
-    let scene = Scene::load(Path::new(file), &[], &Limits::default())?;
-    if scene.shape().dimensions() > 2 {
-        let message = "is on a mesh: a server can't make a session of one yet, `palpate run` runs it offline";
-        return Err(Failure::Refused(format!("{file}: {message}")));
+
+    /// What a session is to be made of; sends the mesh, if there is one.
+    ///
+    /// # Errors
+    /// Returns the server's refusal, or how the connection broke.
+    pub(crate) async fn source(&self, channel: Channel) -> Result<Source, Failure> {
+        let mut source = self.source.clone();
+        if let (Source::Scene(scene), Some(MeshToSend { name, bytes, unit })) = (&mut source, &self.mesh) {
+            let sent = upload_mesh(channel, name, bytes, unit, false).await.map_err(Error::Call)?;
+            if let Some(report) = sent.report.filter(|report| report.refused) {
+                let what = report.problems.first().map(|problem| format!("{}: {}", problem.element, problem.what));
+                return Err(Failure::Refused(format!("{name}: {}", what.unwrap_or_default())));
+            }
+            if let Some(mesh) = &mut scene.mesh {
+                mesh.mesh_id = sent.mesh_id;
+            }
+        }
+        Ok(source)
     }
-    Ok(Source::Scene(wire::scene::scene(&scene)))
+
+    /// The scene of a session that the server has made of this. Of a mesh of the server's own, places at rest are known to
+    /// seven digits only.
+    ///
+    /// # Errors
+    /// Returns an error if the server's scene or mesh can't be read.
+    pub(crate) async fn scene(&self, session: &pb::Session, channel: Channel) -> Result<Scene, Failure> {
+        let told = session.scene.as_ref().ok_or_else(|| Failure::Failed("the server sent no scene".into()))?;
+        match (&self.own, &told.mesh) {
+            (_, None) => Ok(wire::scene::from_scene(told, None)?),
+            (Some(own), Some(_)) => Ok(own.clone()),
+            (None, Some(_)) => {
+                let mesh = server_mesh(&session.session_id, channel).await.map_err(Error::Call)?;
+                Ok(wire::scene::from_scene(told, Some(&mesh))?)
+            }
+        }
+    }
+}
+
+/// The mesh of a scene, before it was made coarser.
+fn written(mesh: &Mesh) -> TriangleMesh {
+    if let Some(shown) = mesh.shape.shown() {
+        return shown.mesh.clone();
+    }
+    TriangleMesh {
+        vertices_m: mesh.shape.vertices_m().to_vec(),
+        triangles: mesh.shape.triangles().to_vec(),
+        uv: None,
+        groups: mesh.shape.told().groups.clone(),
+    }
+}
+
+/// The mesh of a session, with the numbers of its file.
+async fn server_mesh(session_id: &str, channel: Channel) -> Result<TriangleMesh, Status> {
+    let request = pb::GetMeshRequest { session_id: session_id.to_owned(), refinement: 0 };
+    let mut parts = ViewServiceClient::new(channel).get_mesh(request).await?.into_inner();
+    let (mut rest_m, mut file_vertex, mut triangles, mut mesh) =
+        (Vec::new(), Vec::new(), Vec::new(), TriangleMesh::default());
+    while let Some(part) = parts.message().await? {
+        rest_m.extend(part.rest_position_m.as_chunks().0.iter().map(|place: &[f32; 3]| place.map(f64::from)));
+        file_vertex.extend(part.file_vertex);
+        triangles.extend_from_slice(part.triangles.as_chunks::<3>().0);
+        for group in part.groups {
+            match mesh.groups.last_mut().filter(|last| last.name == group.name) {
+                Some(last) => last.vertices.extend(group.vertices),
+                None => mesh.groups.push(Group { name: group.name, vertices: group.vertices }),
+            }
+        }
+    }
+    let wrong = || Status::data_loss("the server's mesh has a vertex beyond its last");
+    mesh.vertices_m = vec![DVec3::ZERO; rest_m.len()];
+    for (place_m, vertex) in rest_m.iter().zip(&file_vertex) {
+        *mesh.vertices_m.get_mut(*vertex as usize).ok_or_else(wrong)? = DVec3::from_array(*place_m);
+    }
+    let number = |place: u32| file_vertex.get(place as usize).copied().ok_or_else(wrong);
+    for [a, b, c] in triangles {
+        mesh.triangles.push([number(a)?, number(b)?, number(c)?]);
+    }
+    Ok(mesh)
 }
 
 /// The failure of a session with this scene. If the server does not know the name, it may be meant as a file: the message

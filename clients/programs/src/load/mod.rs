@@ -16,7 +16,7 @@ use tokio::sync::watch;
 
 use crate::Failure;
 use crate::credentials::CredentialOptions;
-use crate::scene_file::source;
+use crate::scene_file::SceneFile;
 use client::{Common, Stage, lock};
 use objective::Objective;
 use swarm::{Orders, Stopped, Swarm};
@@ -99,7 +99,8 @@ const MOST_SESSIONS: usize = 1 << 16;
 
 pub(crate) async fn load(arguments: &Arguments) -> Result<(), Failure> {
     let server = arguments.credentials.server(&arguments.server)?;
-    let source = source(&arguments.scene)?;
+    let file = SceneFile::read(&arguments.scene)?;
+    let source = file.source(server.connect().await.map_err(Failure::from)?).await?;
     let sessions = arguments.sessions as usize;
     let ended = async {
         match &arguments.find_limit {

@@ -1,49 +1,78 @@
-//! What a client of a load does with its tool: a circle about the middle of the sheet with a varying force, never at rest.
+//! What a client of a load does with its tool: a circle about the middle of a sheet, or one vertex of a mesh after another, with a
+//! varying force, never at rest.
 
 use std::f64::consts::TAU;
 
 use glam::{DVec2, DVec3};
-use palpate_proto::geometry::vector;
+use palpate_proto::geometry::{from_vector, vector};
 use palpate_proto::pb;
 use pb::command::Action;
 
-/// A stroke over the sheet of a session.
+/// A stroke over the tissue of a session.
 #[derive(Clone)]
 pub(crate) struct Stroke {
-    middle_m: DVec2,
-    radius_m: f64,
+    over: Over,
     force_n: f64,
     falloff_per_m: f64,
     /// Where the stroke begins, as a fraction of a turn; it differs from client to client.
     begin: f64,
 }
 
+#[derive(Clone)]
+enum Over {
+    Sheet { middle_m: DVec2, radius_m: f64 },
+    Mesh { vertices: u32 },
+}
+
+/// Vertices of a mesh that are pushed, one after the other, in a turn.
+const VERTICES_PER_TURN: f64 = 20.0;
+
 impl Stroke {
-    /// A stroke over a scene as the server tells it, with all fields.
-    pub(crate) fn new(scene: &pb::Scene, begin: f64) -> Self {
-        let sheet = scene.sheet.clone().unwrap_or_default();
-        let spacing_m = sheet.spacing_m.unwrap_or(1.0);
-        let extent_m =
-            spacing_m * DVec2::from([sheet.points_x, sheet.points_y].map(|n| f64::from(n.unwrap_or(1)) - 1.0));
+    /// A stroke over a session's tissue as the server tells it, with all fields.
+    pub(crate) fn new(session: &pb::Session, begin: f64) -> Self {
+        let scene = session.scene.clone().unwrap_or_default();
+        let (over, spacing_m) = match scene.sheet {
+            Some(sheet) => {
+                let spacing_m = sheet.spacing_m.unwrap_or(1.0);
+                let extent_m =
+                    spacing_m * DVec2::from([sheet.points_x, sheet.points_y].map(|n| f64::from(n.unwrap_or(1)) - 1.0));
+                (Over::Sheet { middle_m: extent_m / 2.0, radius_m: 0.25 * extent_m.min_element() }, spacing_m)
+            }
+            None => {
+                let extent = session.extent.unwrap_or_default();
+                let size_m = from_vector(extent.most_m.as_ref()) - from_vector(extent.least_m.as_ref());
+                let vertices = session.points.max(1);
+                (Over::Mesh { vertices }, 2.0 * size_m.max_element().max(1e-6) / f64::from(vertices).sqrt())
+            }
+        };
         let springs = scene.springs.as_ref().and_then(|springs| springs.stiffness_n_per_m);
         let virtual_springs = scene.virtual_springs.as_ref().and_then(|springs| springs.stiffness_n_per_m);
         // With this force the middle moves by about a third of a spacing.
         let stiffness_n_per_m = virtual_springs.unwrap_or(0.0) + 0.1 * springs.unwrap_or(0.0);
-        Stroke {
-            middle_m: extent_m / 2.0,
-            radius_m: 0.25 * extent_m.min_element(),
-            force_n: 0.3 * stiffness_n_per_m * spacing_m,
-            falloff_per_m: 4.0 / spacing_m,
-            begin,
-        }
+        Stroke { over, force_n: 0.3 * stiffness_n_per_m * spacing_m, falloff_per_m: 4.0 / spacing_m, begin }
+    }
+
+    /// The same, beginning elsewhere.
+    pub(crate) fn beginning(&self, begin: f64) -> Self {
+        Stroke { begin, ..self.clone() }
     }
 
     /// The tool's action at `time_s`: one turn in 2 s, with three presses.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub(crate) fn at(&self, time_s: f64) -> Action {
-        let turn = TAU * (0.5 * time_s + self.begin);
-        let centre_m = self.middle_m + self.radius_m * DVec2::new(turn.cos(), turn.sin());
+        let turns = 0.5 * time_s + self.begin;
+        let turn = TAU * turns;
+        let centre = match self.over {
+            Over::Sheet { middle_m, radius_m } => {
+                let centre_m = middle_m + radius_m * DVec2::new(turn.cos(), turn.sin());
+                pb::force::Centre::CentreM(pb::Vector2 { x: centre_m.x, y: centre_m.y })
+            }
+            Over::Mesh { vertices } => {
+                pb::force::Centre::Vertex(((VERTICES_PER_TURN * turns) as u64 % u64::from(vertices)) as u32)
+            }
+        };
         Action::Force(pb::Force {
-            centre: Some(pb::force::Centre::CentreM(pb::Vector2 { x: centre_m.x, y: centre_m.y })),
+            centre: Some(centre),
             force_n: vector(DVec3::new(0.0, 0.0, -self.force_n * (0.6 + 0.4 * (3.0 * turn).sin()))),
             falloff_per_m: Some(self.falloff_per_m),
             falloff_offset: None,

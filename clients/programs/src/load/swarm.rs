@@ -111,8 +111,9 @@ impl Swarm {
                 idle_timeout_s: Some(10.0),
             };
             let created = self.client.create_session(request).await?.into_inner().session.unwrap_or_default();
+            let scene = created.scene.clone().unwrap_or_default();
+            let whole = Stroke::new(&created, 0.0);
             let (id, step) = (created.session_id, created.step);
-            let scene = created.scene.unwrap_or_default();
             let rate_hz = scene.stepping.as_ref().and_then(|stepping| stepping.rate_hz).unwrap_or(1000.0);
             self.made.push(Made { id: id.clone(), rate_hz, begin: None });
             let arrivals = (orders.viewers_per_session > 0).then(|| Arc::new(Mutex::new(Arrivals::new())));
@@ -123,7 +124,7 @@ impl Swarm {
                     tool,
                     rate_hz,
                     #[allow(clippy::cast_precision_loss)]
-                    stroke: Stroke::new(&scene, 0.618 * (number + tool as usize) as f64),
+                    stroke: whole.beginning(0.618 * (number + tool as usize) as f64),
                     arrivals: arrivals.clone(),
                 };
                 let ticks = phases[(number + tool as usize) % phases.len()].clone();
@@ -131,7 +132,7 @@ impl Swarm {
             }
             if orders.clients_per_session == 0 {
                 let channel = connections.next().await?;
-                keep_awake(channel, &id, Stroke::new(&scene, 0.0), rate_hz, step, orders.lasts_s).await?;
+                keep_awake(channel, &id, whole, rate_hz, step, orders.lasts_s).await?;
             }
             for _ in 0..orders.viewers_per_session {
                 let request = pb::WatchFramesRequest {
