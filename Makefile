@@ -18,7 +18,7 @@ PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/*.yaml $(VI
 	$(VIEWER)/src/*.css $(VIEWER)/public/* proto/palpate/v1/*.proto)
 
 .PHONY: help run build release viewer page-if-node test test-viewer test-arm test-asan test-valgrind test-debug test-mutants need-arm stress libfuzzer lint picture figures screenshot bench-roundtrip bench-duty \
-	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-rest bench-link bench-viewer bench-load soak siege fuzz need-rust \
+	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-rest bench-link bench-viewer bench-load soak siege fuzz need-rust \
 	need-python need-node
 
 help:
@@ -50,6 +50,8 @@ help:
 	@echo 'make bench-viewer    331 × 331 points at 60 frames a second in a browser, and from a press to its pixel'
 	@echo 'make bench-stability the largest stable step, predicted and observed'
 	@echo 'make bench-skip      what it saves to leave out what is at rest, and its error'
+	@echo 'make bench-mesh      the time of a step on meshes, at every width'
+	@echo 'make bench-organ     organs: time of a step, sleep, tips, and how even touch is: docs/benchmarks/organ.md'
 	@echo 'make bench-load      sessions that one core bears, with clients and without: docs/benchmarks/load.md'
 	@echo '                     ATTACK=all: what a client notices of 41 attacks (an hour): docs/benchmarks/attacks.md;'
 	@echo '                     one attack alone: make bench-load ATTACK=endless-scene'
@@ -231,6 +233,12 @@ bench-stability: need-rust
 
 bench-skip: need-rust
 	$(CARGO) bench --quiet --bench skip -- $(ARGUMENTS)
+
+bench-mesh: need-rust
+	$(CARGO) bench --quiet --bench mesh -- $(ARGUMENTS)
+
+bench-organ: need-rust
+	$(CARGO) bench --quiet --bench organ -- $(ARGUMENTS)
 
 # `make bench-viewer SECONDS=60 PRESSES=500`: these are the environment's.
 bench-viewer: build viewer

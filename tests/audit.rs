@@ -103,7 +103,8 @@ fn an_audit_finds_an_error_that_is_there() {
 
 #[test]
 fn an_audit_of_a_good_scene_is_within_its_tolerance() {
-    for (name, text) in BUILT_IN {
+    // The script names a point of a sheet.
+    for (name, text) in BUILT_IN.into_iter().filter(|scene| scene.1.contains("[sheet]")) {
         let scene = scene_with(text, &[]);
         let file = format!("{}/scripts/vertical-60.toml", env!("CARGO_MANIFEST_DIR"));
         let error = play(&scene, &std::fs::read_to_string(file).unwrap(), false, true).0.audited_error.unwrap();

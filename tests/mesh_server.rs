@@ -6,8 +6,11 @@ mod server;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+use std::time::Duration;
 
 use glam::DVec3;
+use palpate::force_law::{self, Disc};
 use palpate::limits::Limits;
 use palpate::scene::profile::Poke;
 use palpate::scene::{Body, Scene};
@@ -15,9 +18,12 @@ use palpate::shape::{PointId, PointName, RestShape};
 use palpate::sheet::{Grasp, Model, Push, Tissue, at_rest};
 use palpate_client::view::Surface;
 use palpate_proto::geometry::{from_vector, vector};
-use palpate_proto::pb;
+use palpate_proto::{pb, touch};
+use palpate_touch::Tip;
+use palpate_touch::device::Device;
 use pb::create_session_request::Source;
 use pb::force::Centre;
+use pb::touch_response::Message as Heard;
 use server::{Server, Touch, client_program, open, palpate, told};
 use tempfile::TempDir;
 use tonic::{Code, Status};
@@ -48,7 +54,11 @@ precision = "f32"
 /// A folder with the ball and its scene, and a server that has it.
 fn ball() -> (TempDir, Server) {
     let folder = folder();
-    let server = Server::start(&["--scenes", folder.path().to_str().unwrap()]);
+    // A server that was not optimized takes long to lay out a session.
+    let config = folder.path().join("patient.conf");
+    std::fs::write(&config, "[limits]\nwork_s = 600.0\n").unwrap();
+    let [scenes, config] = [folder.path(), &config].map(|path| path.to_str().unwrap());
+    let server = Server::start(&["--scenes", scenes, "--config", config]);
     (folder, server)
 }
 
@@ -67,6 +77,14 @@ fn scene(folder: &TempDir) -> Scene {
 
 fn by_name() -> Source {
     Source::SceneName("ball".into())
+}
+
+/// The paper's tissue, 40 cm wide.
+fn small_sheet() -> Source {
+    let sets = ["sheet.points=[5, 5]", "sheet.spacing_m=0.1", "stepping.integrator=central", "stepping.substeps=2"];
+    let sets = sets.map(str::to_owned);
+    let scene = Scene::parse("small", palpate::scene::PAPER, &sets, &Limits::default()).unwrap();
+    Source::Scene(palpate::wire::scene::scene(&scene))
 }
 
 fn push(tool: u32, sequence: u64, centre: Centre, force_n: DVec3) -> pb::Command {
@@ -128,11 +146,8 @@ async fn shown(server: &Server, session_id: &str) -> Shown {
 
 /// The first frame, which is full.
 async fn surface(server: &Server, session_id: &str, encoding: pb::Encoding) -> Surface {
-    let request = pb::WatchFramesRequest {
-        session_id: session_id.to_owned(),
-        encoding: encoding.into(),
-        ..Default::default()
-    };
+    let request =
+        pb::WatchFramesRequest { session_id: session_id.to_owned(), encoding: encoding.into(), ..Default::default() };
     let mut frames = server.views().await.watch_frames(request).await.unwrap().into_inner();
     let mut surface = Surface::default();
     loop {
@@ -276,7 +291,7 @@ async fn frames_of_a_coarser_tissue_show_the_mesh_of_its_file() {
 async fn what_does_not_fit_the_tissue_is_refused_with_what_does() {
     let (_folder, server) = ball();
     let mesh = server.create(by_name(), true).await.unwrap().session_id;
-    let sheet = server.paper(true).await;
+    let sheet = server.create(small_sheet(), true).await.unwrap().session_id;
     let mut on_mesh = Touch::hold(&server, &mesh).await;
     let mut on_sheet = Touch::hold(&server, &sheet).await;
     let place = |x, y, z| Centre::AtM(pb::Vector3 { x, y, z });
@@ -288,8 +303,8 @@ async fn what_does_not_fit_the_tissue_is_refused_with_what_does() {
         (true, Centre::Vertex(162), "force.vertex", "OFF_SHEET", "from 0 to 161"),
         (true, place(0.0, 0.0, 0.07), "force.at_m", "OFF_SHEET", "a tenth"),
         (true, place(0.0, f64::NAN, 0.0), "force.at_m", "NOT_FINITE", ""),
-        (false, Centre::Vertex(3), "force.vertex", "WRONG_KIND", "31 × 31"),
-        (false, place(0.5, 0.5, 0.2), "force.at_m", "OFF_SHEET", ""),
+        (false, Centre::Vertex(3), "force.vertex", "WRONG_KIND", "5 × 5"),
+        (false, place(0.2, 0.2, 0.2), "force.at_m", "OFF_SHEET", ""),
     ] {
         let touch = if is_mesh { &mut on_mesh } else { &mut on_sheet };
         touch.command(push(0, 1, centre, FORCE_N)).await;
@@ -312,11 +327,11 @@ async fn what_does_not_fit_the_tissue_is_refused_with_what_does() {
         assert_eq!((rejection.field.as_str(), rejection.reason.as_str()), (field, reason), "{rejection:?}");
     }
     // A place in space is one on the sheet, too: the nearest one.
-    on_sheet.command(push(0, 2, place(0.5, 0.5, 0.05), FORCE_N)).await;
+    on_sheet.command(push(0, 2, place(0.2, 0.2, 0.03), FORCE_N)).await;
     on_sheet.settle().await;
     server.start_until(&sheet, 1).await;
     let sample = on_sheet.sample_with(|sample| sample.step == 1).await;
-    assert_eq!(sample.tools[0].point, Some(pb::GridPoint { x: 15, y: 15 }));
+    assert_eq!(sample.tools[0].point, Some(pb::GridPoint { x: 2, y: 2 }));
 
     let mut views = server.views().await;
     let request = pb::GetMeshRequest { session_id: mesh.clone(), refinement: 1 };
@@ -504,4 +519,67 @@ fn a_replay_on_a_mesh_has_the_hash_of_the_run_offline() {
             .unwrap();
         assert_eq!(summary(output), expected, "{scene}");
     }
+}
+
+#[tokio::test]
+async fn a_tip_touches_a_mesh_by_the_law_of_the_place_where_it_is() {
+    let (folder, server) = ball();
+    let scene = scene(&folder);
+    let model = Model::compile(&scene, &Limits::default()).unwrap();
+    let session = server.create(by_name(), false).await.unwrap().session_id;
+    let tip = Tip { radius_m: 0.02, friction: 0.0, ..Tip::default() };
+    let device = touch::device(&Device::named("omega3").unwrap());
+    let tip_message = pb::Tip { radius_m: tip.radius_m, friction: Some(0.0), ..Default::default() };
+    let wanted = pb::TouchOpen { device: Some(device), tip: Some(tip_message), ..open(&session, &[0]) };
+    let mut stream = Touch::open(&server, wanted).await.unwrap();
+    let first = touch::from_law(&stream.opened.take().unwrap().law.unwrap()).unwrap();
+    let mut laws = vec![first];
+    // Below, and then from the side.
+    for (sequence, outward) in [(1, -DVec3::Z), (1_000_001, DVec3::new(0.6, -0.8, 0.0))] {
+        let nearest = scene.shape().nearest(0.05 * outward);
+        let disc = Disc { radius_m: tip.radius_m, at_m: scene.shape().rest_m(nearest) };
+        let expected = force_law::exact_within(&model, disc, u64::MAX, &AtomicBool::new(false)).unwrap();
+        let (mut is_told, mut felt_n, mut step) = (false, DVec3::ZERO, 0_u32);
+        tokio::time::timeout(Duration::from_secs(60), async {
+            while !(is_told && felt_n.length() > 0.01) {
+                step += 1;
+                // Inward by 4 mm, after it has come near from outside; then it stays.
+                let away_m = 0.055 - 1e-5 * f64::from(step.min(900));
+                let position_m = vector(away_m * outward);
+                let tip = Some(tip_message);
+                let pose = pb::Pose { position_m, tip, ..Default::default() };
+                let action = Some(pb::command::Action::Pose(pose));
+                let sequence = Some(sequence + u64::from(step));
+                stream.command(pb::Command { tool: 0, sequence, action, ..Default::default() }).await;
+                match stream.hear().await.unwrap().unwrap() {
+                    Heard::ForceLaw(update) => {
+                        assert_eq!((update.reason.as_str(), update.tissue_step), ("", None));
+                        let law = update.law.unwrap();
+                        assert_eq!(law.number as usize, laws.len());
+                        laws.push(touch::from_law(&law).unwrap());
+                    }
+                    Heard::Sample(sample) => {
+                        let Some(tool) = sample.tools.first() else { continue };
+                        let Some(model) = &tool.local_model else { continue };
+                        is_told = laws[model.law as usize] == expected;
+                        felt_n = from_vector(tool.force_on_tool_n.as_ref());
+                        if felt_n.length() > 0.01 {
+                            let radial = felt_n.normalize().dot(outward);
+                            assert!(radial > 0.9, "{felt_n} of {outward}");
+                        }
+                    }
+                    _ => {}
+                }
+            }
+        })
+        .await
+        .unwrap_or_else(|_| panic!("{outward}: {felt_n} N, {} laws", laws.len()));
+        // Away from the surface, so that the way to the next place is free.
+        stream.command(command_now(pb::command::Action::Release(pb::Release {}), sequence + 999_999)).await;
+    }
+    assert!(laws.len() >= 3, "one for each place");
+}
+
+fn command_now(action: pb::command::Action, sequence: u64) -> pb::Command {
+    pb::Command { tool: 0, sequence: Some(sequence), action: Some(action), ..Default::default() }
 }

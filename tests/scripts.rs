@@ -47,7 +47,8 @@ fn every_shipped_script_fits_the_scenes_that_it_is_made_for_and_says_so_elsewher
         let made_for: Vec<&str> =
             scene::BUILT_IN.iter().map(|scene| scene.0).filter(|scene| reader::fits(text, scene)).collect();
         assert!(!made_for.is_empty() && made_for.len() < scene::BUILT_IN.len(), "{name}: {made_for:?}");
-        for (scene, _) in scene::BUILT_IN {
+        // Those of sheets name points by row and column.
+        for (scene, _) in scene::BUILT_IN.into_iter().filter(|scene| scene.1.contains("[sheet]")) {
             let warnings = shipped(name, &built_in(scene, &[])).warnings;
             let warned = warnings.iter().any(|warning| warning.starts_with("scenes: made for"));
             assert_eq!(warned, !made_for.contains(&scene), "{name} on {scene}: {warnings:?}");

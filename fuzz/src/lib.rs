@@ -114,7 +114,8 @@ pub const REQUESTS: &[(&str, Taker)] = &[
         use pb::create_session_request::Source;
         match pb::CreateSessionRequest::decode(bytes).map(|request| request.source) {
             Ok(Some(Source::Scene(scene))) => {
-                wire::scene::from_scene(&scene, scene.mesh.as_ref().map(|_| tetrahedron())).is_ok_and(|scene| step(&scene))
+                wire::scene::from_scene(&scene, scene.mesh.as_ref().map(|_| tetrahedron()))
+                    .is_ok_and(|scene| step(&scene))
             }
             other => other.is_ok(),
         }
@@ -332,7 +333,11 @@ fn request_seeds() -> Vec<Vec<u8>> {
     ];
     let pushes = places.map(|centre| pb::Command {
         sequence: Some(1),
-        action: Some(pb::command::Action::Force(pb::Force { centre: Some(centre), force_n: vector(0.0, 0.1, 0.0), ..Default::default() })),
+        action: Some(pb::command::Action::Force(pb::Force {
+            centre: Some(centre),
+            force_n: vector(0.0, 0.1, 0.0),
+            ..Default::default()
+        })),
         ..Default::default()
     });
     let upload = pb::UploadMeshRequest {

@@ -174,9 +174,17 @@ mod tests {
     }
 
     #[test]
+    fn the_bytes_of_a_file_are_no_fields() {
+        // Zeros would be fields, had they levels: half a million.
+        let request = pb::UploadMeshRequest { part: vec![0; 1 << 20], ..Default::default() };
+        check(&request.encode_to_vec(), 0).unwrap();
+        assert!(check(&request.encode_to_vec(), LEVELS).is_err());
+    }
+
+    #[test]
     fn malformed_messages_are_left_to_the_decoder() {
         for bytes in [&[0xff; 100][..], &[0x0a, 0xff, 0xff, 0xff, 0x7f], &[0x0b], &[0x80; 20], &[]] {
-            check(bytes).unwrap();
+            check(bytes, LEVELS).unwrap();
         }
     }
 }

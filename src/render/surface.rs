@@ -98,9 +98,8 @@ impl Surface {
             .collect();
         let halves = |[a, b, c, d, e, f]: [usize; 6]| [[a, b, c], [d, e, f]];
         let [nx, ny] = count;
-        let beyond = |index: usize| {
-            [(index / ny + 1 < nx).then_some(index + ny), (index % ny + 1 < ny).then_some(index + 1)]
-        };
+        let beyond =
+            |index: usize| [(index / ny + 1 < nx).then_some(index + ny), (index % ny + 1 < ny).then_some(index + 1)];
         Surface {
             vertices,
             triangles: (0..refinement.cell_count()).flat_map(|cell| halves(refinement.triangles(cell))).collect(),

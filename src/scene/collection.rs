@@ -178,7 +178,9 @@ mod tests {
         let refused = scenes.text("papr", &scripts, &limits).unwrap_err();
         assert_eq!(refused.reason, Reason::UnknownScene);
         assert!(
-            refused.message.ends_with("there are fibrotic, liver, paper, stomach; did you mean `paper`?"),
+            refused.message.ends_with(
+                "there are colon, fibrotic, gallbladder, liver, liver-organ, paper, stomach; did you mean `paper`?"
+            ),
             "{refused}"
         );
         let refused = scripts.text("vertical", &scenes, &limits).unwrap_err();

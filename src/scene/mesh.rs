@@ -52,6 +52,8 @@ pub struct Stiffest {
     pub bound: f64,
     /// The vertex that has most of it.
     pub vertex: u32,
+    /// What the bound would be by half of the springs.
+    pub usual: f64,
     /// The largest of what K″/m of a point is above that of reference, over that, at least 0.
     pub extra_virtual: f64,
 }
@@ -164,7 +166,7 @@ impl Mesh {
 
     /// The same where points and springs differ.
     pub fn uneven(point_mass_kg: f64, flexion: f64, shape: Arc<MeshShape>, differences: Differences) -> Self {
-        let stiffest = Stiffest { bound: 0.0, vertex: 0, extra_virtual: 0.0 };
+        let stiffest = Stiffest { bound: 0.0, vertex: 0, usual: 0.0, extra_virtual: 0.0 };
         let mut mesh = Mesh { point_mass_kg, flexion, shape, differences: Arc::new(differences), stiffest };
         mesh.stiffest = mesh.find_stiffest();
         mesh
@@ -279,7 +281,8 @@ impl Mesh {
         }
         let weight: Vec<f64> = around.iter().map(|of_vertex| of_vertex.iter().map(|(_, k)| k).sum()).collect();
         let extra_virtual = self.differences.extra_virtual.iter().copied().fold(0.0, f64::max);
-        let mut stiffest = Stiffest { bound: 0.0, vertex: 0, extra_virtual };
+        let mut stiffest = Stiffest { bound: 0.0, vertex: 0, usual: 0.0, extra_virtual };
+        let mut bounds = Vec::new();
         for ([a, b], _) in self.springs() {
             let [mut one, mut other] = [a, b].map(|end| around[end as usize].iter().peekable());
             let mut common = 0.0;
@@ -296,11 +299,47 @@ impl Mesh {
             }
             let [of_a, of_b] = [a, b].map(|end| weight[end as usize]);
             let bound = of_a + of_b - common;
+            bounds.push(bound);
             if bound > stiffest.bound {
                 stiffest = Stiffest { bound, vertex: if of_a >= of_b { a } else { b }, ..stiffest };
             }
         }
+        if !bounds.is_empty() {
+            let half = bounds.len() / 2;
+            stiffest.usual = *bounds.select_nth_unstable_by(half, f64::total_cmp).1;
+        }
         stiffest
+    }
+
+    /// Where the fastest vibration is, in words that end a message.
+    pub fn fastest_place(&self) -> String {
+        let point = PointId::new(self.stiffest.vertex as usize);
+        format!(", most of all at {}, {:.4} m", self.shape.name(point), self.shape.rest_m(point))
+    }
+
+    /// What a user should know of the mesh, in words.
+    pub fn warnings(&self) -> Vec<String> {
+        let mut warnings = Vec::new();
+        let shape = &self.shape;
+        if shape.told.fixed == Fixed::Rim && shape.is_closed() {
+            warnings.push("mesh.fixed: the mesh is closed and has no rim: \"rim\" fixes nothing".to_owned());
+        }
+        if shape.told.fixed != Fixed::None && shape.is_fixed.iter().all(|fixed| *fixed) {
+            warnings.push("mesh.fixed: every vertex is fixed: nothing moves".to_owned());
+        }
+        let Stiffest { bound, usual, vertex, .. } = self.stiffest;
+        let faster = (bound / usual).sqrt();
+        if faster > MUCH_FASTER {
+            let point = PointId::new(vertex as usize);
+            warnings.push(format!(
+                "mesh: {} at {:.4} m, with its short edges or small triangles, vibrates {faster:.1} times as fast as half of \
+                 the mesh: without such vertices a step would take as many fewer substeps (`palpate mesh FILE --repair`, or \
+                 mesh.vertices)",
+                shape.name(point),
+                shape.rest_m(point),
+            ));
+        }
+        warnings
     }
 
     pub(super) fn check(&self, limits: &Limits) -> Result<()> {
@@ -314,6 +353,9 @@ impl Mesh {
         Ok(())
     }
 }
+
+/// A vertex that vibrates so much faster than half of a mesh is warned of.
+const MUCH_FASTER: f64 = 2.5;
 
 /// Vertices that a decimated mesh has at least.
 const LEAST_VERTICES: usize = 4;

@@ -38,9 +38,12 @@ use source::Files;
 pub const PAPER: &str = include_str!("../../scenes/paper.toml");
 
 /// Every scene that is built in, by its name.
-pub const BUILT_IN: [(&str, &str); 4] = [
+pub const BUILT_IN: [(&str, &str); 7] = [
+    ("colon", include_str!("../../scenes/colon.toml")),
     ("fibrotic", include_str!("../../scenes/fibrotic.toml")),
+    ("gallbladder", include_str!("../../scenes/gallbladder.toml")),
     ("liver", include_str!("../../scenes/liver.toml")),
+    ("liver-organ", include_str!("../../scenes/liver-organ.toml")),
     ("paper", PAPER),
     ("stomach", include_str!("../../scenes/stomach.toml")),
 ];
@@ -483,10 +486,9 @@ fn read_substance(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) ->
             return Err(mesh.refuse(Reason::WrongKind, "does not go with [sheet]: a tissue is one of them"));
         }
         (_, None) => {
-            for item in [&material, &inclusions].into_iter().flatten() {
-                return Err(
-                    item.refuse(Reason::WrongKind, "is for a mesh: a sheet has the same points and springs all over")
-                );
+            if let Some(item) = material.or(inclusions) {
+                let message = "is for a mesh: a sheet has the same points and springs all over";
+                return Err(item.refuse(Reason::WrongKind, message));
             }
             let body = Body::Sheet(fields.required("sheet")?.table(Sheet::read)?);
             return read_coefficients(fields, body);
@@ -534,16 +536,16 @@ fn read_coefficients(fields: &mut Fields<'_>, mut body: Body) -> Result<Substanc
 /// Reads the section `[material]`, and of `[springs]` what it leaves open.
 fn read_material(fields: &mut Fields<'_>, item: &Item<'_>, mesh: &Mesh) -> Result<Substance> {
     let material = item.table(Material::read)?;
-    for other in [fields.item("virtual_springs"), fields.item("damping")].into_iter().flatten() {
+    let (virtual_springs, damping) = (fields.item("virtual_springs"), fields.item("damping"));
+    if let Some(other) = virtual_springs.or(damping) {
         return Err(other.refuse(Reason::WrongKind, FROM_MATERIAL));
     }
     let flexion = match fields.item("springs") {
         None => 0.0,
         Some(springs) => springs.table(|fields| {
-            for key in ["stiffness_n_per_m", "shear_stiffness_n_per_m"] {
-                if let Some(item) = fields.item(key) {
-                    return Err(item.refuse(Reason::WrongKind, FROM_MATERIAL));
-                }
+            let (stiffness, shear) = (fields.item("stiffness_n_per_m"), fields.item("shear_stiffness_n_per_m"));
+            if let Some(item) = stiffness.or(shear) {
+                return Err(item.refuse(Reason::WrongKind, FROM_MATERIAL));
             }
             fields.item("flexion").map_or(Ok(0.0), |item| read_flexion(&item))
         })?,

@@ -44,13 +44,15 @@ impl Files<'_> {
             let message = "names a file: a scene that a client sends can't";
             return Err(item.refuse(Reason::WrongKind, message));
         };
-        let path = folder.join(item.text()?);
+        // Refusals name it as the scene does: clients do not learn where the server's files are.
+        let name = item.text()?;
+        let path = folder.join(&name);
         let bytes = read_bytes(&path, limits.mesh_bytes)
-            .map_err(|refusal| item.refuse(refusal.reason, format!("{}: {}", path.display(), refusal.message)))?;
+            .map_err(|refusal| item.refuse(refusal.reason, format!("{name}: {}", refusal.message)))?;
         let beside = |name: &str| read_bytes(&path.parent()?.join(name), limits.mesh_bytes).ok();
         let most = usize::try_from(limits.mesh_bytes).unwrap_or(usize::MAX);
         let within = ReadLimits { bytes: most, vertices: limits.points, triangles: limits.points.saturating_mul(4) };
-        let found = palpate_mesh::read(&path.display().to_string(), &bytes, unit, &beside, &within);
+        let found = palpate_mesh::read(&name, &bytes, unit, &beside, &within);
         Ok(found.map_err(|error| item.refuse(Reason::Unreadable, error.to_string()))?.mesh)
     }
 }

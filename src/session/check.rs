@@ -9,9 +9,10 @@ use glam::DVec3;
 use super::Session;
 use super::prospect::Prospect;
 use crate::limits::Limits;
-use crate::scene::Named;
 use crate::scene::profile::Poke;
 use crate::scene::script::Script;
+use crate::scene::{Body, Named, Stiffest};
+use crate::shape::PointId;
 use crate::sheet::choice::{self, Choice};
 use crate::sheet::integrate::Oscillator;
 use crate::sheet::{Model, Push};
@@ -57,7 +58,8 @@ fn time(model: &Arc<Model>, clock_s: &dyn Fn() -> f64) -> Option<[f64; 2]> {
         0,
         Some(Push::Constant(Poke {
             point: None,
-            centre_m: model.shape().extent().middle_m(),
+            // The middle of a mesh may be far from its surface.
+            centre_m: model.shape().rest_m(model.shape().nearest(model.shape().extent().middle_m())),
             force_n: DVec3::new(0.03, 0.0, -0.1) * stiffness * model.shape().edge_m(),
             falloff_per_m: 4.0 / model.shape().edge_m(),
             falloff_offset: 0.0,
@@ -101,6 +103,17 @@ impl fmt::Display for Report {
             model.omega_bound_per_s / TAU,
             model.omega_bound_per_s
         )?;
+        if let Body::Mesh(mesh) = &scene.body {
+            let Stiffest { bound, usual, vertex, .. } = mesh.stiffest;
+            let point = PointId::new(vertex as usize);
+            writeln!(
+                f,
+                "fastest       {} at {:.4} m: {:.2} times as fast as at half of the springs; it decides the substeps",
+                model.shape().name(point),
+                model.shape().rest_m(point),
+                (bound / usual).sqrt()
+            )?;
+        }
         let decay_s = 2.0 * sheet.mass_kg / sheet.damping_n_s_per_m;
         if decay_s.is_finite() {
             writeln!(f, "damping       vibrations decay by e in {decay_s:.4} s")?;

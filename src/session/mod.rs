@@ -15,6 +15,7 @@ pub mod audit;
 pub mod batch;
 pub mod check;
 pub mod command;
+mod dent;
 pub mod intake;
 pub mod laws;
 pub mod lease;

@@ -7,8 +7,10 @@ use std::sync::atomic::AtomicBool;
 use glam::DVec3;
 use palpate_touch::{Coupling, Law, Tip};
 
+use super::dent;
 use crate::force_law::{self, Disc};
-use crate::scene::profile::{LoadProfile, PoseProfile, StrengthProfile, weights};
+use crate::scene::Body;
+use crate::scene::profile::{LoadProfile, Poke, PoseProfile, StrengthProfile, weights};
 use crate::scene::script::Script;
 use crate::shape::{Extent, RestShape};
 use crate::sheet::Model;
@@ -53,8 +55,10 @@ pub(super) struct Prospect {
 struct Force {
     /// At its largest, of all points together, N.
     total_n: f64,
-    /// How deep it goes, m; `None` if the law takes too much work.
+    /// How deep it goes, m; on a mesh at most. `None` if the law takes too much work, or if nothing pulls back.
     depth_m: Option<f64>,
+    /// What is deeper goes through, m: the longest side, or how thick a mesh is there.
+    through_m: f64,
 }
 
 /// A tool with a tip.
@@ -115,7 +119,7 @@ impl Prospect {
         let radius_m = Tip::default().radius_m;
         let mut laws = Laws { model, known: Vec::new() };
         let law = laws.of(radius_m).cloned();
-        let half_m = 0.5 * size_m.x.min(size_m.y);
+        let half_m = 0.5 * shorter_m(size_m);
         let reach_m = law.as_ref().map_or(f64::INFINITY, Law::reach_m);
         let mass_kg = model.scene.mass_kg();
         let mut prospect = Prospect {
@@ -145,12 +149,17 @@ impl Prospect {
         let (longest_m, edge_m) = (shape.longest_side_m(), shape.edge_m());
         if longest_m > LONGEST_SIDE_M {
             let most = rounded(LONGEST_SIDE_M);
-            doubts
-                .push(format!("the sheet is {} long, more than {most} m: sheet.spacing_m is in m", length(longest_m)));
+            let (what, unit) = if shape.dimensions() == 2 {
+                ("sheet", "sheet.spacing_m is in m")
+            } else {
+                ("mesh", "mesh.unit says which unit its file is in")
+            };
+            doubts.push(format!("the {what} is {} long, more than {most} m: {unit}", length(longest_m)));
         }
         if point_mass_kg > HEAVIEST_POINT_KG {
             let (mass, most) = (rounded(point_mass_kg), rounded(HEAVIEST_POINT_KG));
-            doubts.push(format!("a point weighs {mass} kg, more than {most} kg: sheet.point_mass_kg is in kg"));
+            let key = if shape.dimensions() == 2 { "sheet" } else { "mesh" };
+            doubts.push(format!("a point weighs {mass} kg, more than {most} kg: {key}.point_mass_kg is in kg"));
         }
         if edge_m > self.radius_m {
             let (edge, radius) = (length(edge_m), length(self.radius_m));
@@ -159,7 +168,7 @@ impl Prospect {
                  were larger"
             ));
         }
-        if self.size_m.x.min(self.size_m.y) < 2.0 * self.radius_m {
+        if shorter_m(self.size_m) < 2.0 * self.radius_m && shape.dimensions() == 2 {
             doubts.push(format!("a fingertip, {} across, is wider than the sheet", length(2.0 * self.radius_m)));
         }
         let [least, most] = STIFFNESS_N_PER_M;
@@ -176,11 +185,15 @@ impl Prospect {
             ));
         }
         for (index, force) in self.forces.iter().enumerate() {
-            if let Some(depth_m) = force.depth_m.filter(|depth_m| *depth_m > longest_m) {
+            if let Some(depth_m) = force.depth_m.filter(|depth_m| *depth_m > force.through_m) {
+                let (total, depth) = (rounded(force.total_n), length(depth_m));
+                let bound = if force.through_m < longest_m {
+                    format!("more than the {} that it is thick there", length(force.through_m))
+                } else {
+                    "more than its longest side".to_owned()
+                };
                 doubts.push(format!(
-                    "force[{index}]: {} N would push the tissue in by {}, more than its longest side: it goes through",
-                    rounded(force.total_n),
-                    length(depth_m)
+                    "force[{index}]: {total} N would push the tissue in by {depth}, {bound}: it goes through"
                 ));
             }
         }
@@ -218,15 +231,23 @@ fn rest_s(sheet: &Oscillator) -> Result<f64, &'static str> {
 }
 
 /// How deep each force of a script goes: as a disc that presses with all of the force, its area that of the falloff, in the
-/// middle of the sheet; beyond the law's reach straight on.
+/// middle of the sheet; beyond the law's reach straight on. On a mesh where it begins (`dent`).
 fn forces(model: &Model, script: &Script, laws: &mut Laws<'_>) -> Vec<Force> {
     let shape = model.shape();
     let force = |profile: &LoadProfile| {
         let total_n = total_n(shape, profile);
-        let widest_m = 0.5 * shape.longest_side_m();
+        let longest_m = shape.longest_side_m();
+        if let Body::Mesh(mesh) = &model.scene.body {
+            let (centre_m, factor) = (profile.centre.begins_at_m(), profile.falloff_offset);
+            let (falloff_per_m, force_n) = (profile.falloff_per_m, largest_n(profile));
+            let poke = Poke { point: None, centre_m, force_n, falloff_per_m, falloff_offset: factor };
+            let through_m = dent::thickness_m(mesh, shape.nearest(centre_m)).unwrap_or(longest_m);
+            return Force { total_n, depth_m: dent::depth_m(&model.scene, &poke), through_m };
+        }
+        let widest_m = 0.5 * longest_m;
         // ∫ exp(−c·r) over the plane is the area of a disc of this radius.
         let radius_m = (std::f64::consts::SQRT_2 / profile.falloff_per_m).clamp(0.5 * shape.edge_m(), widest_m);
-        Force { total_n, depth_m: laws.of(radius_m).map(|law| law.depth_of(total_n)) }
+        Force { total_n, depth_m: laws.of(radius_m).map(|law| law.depth_of(total_n)), through_m: longest_m }
     };
     script.forces.iter().map(force).collect()
 }
@@ -294,12 +315,23 @@ fn part_within(from_m: DVec3, to_m: DVec3, least_m: DVec3, most_m: DVec3) -> Opt
 
 /// The largest force of a profile on all points together, N.
 fn total_n(shape: &dyn RestShape, profile: &LoadProfile) -> f64 {
-    let largest_n = match &profile.strength {
-        StrengthProfile::Scaled(force_n, _) => force_n.length(),
-        StrengthProfile::Recorded(rows) => rows.iter().map(|row| row.1.length()).fold(0.0, f64::max),
-    };
     let weights = weights(shape, profile.centre.begins_at_m(), profile.falloff_per_m);
-    largest_n * libm::exp(profile.falloff_offset) * weights
+    largest_n(profile).length() * libm::exp(profile.falloff_offset) * weights
+}
+
+/// The largest force of a profile, N.
+fn largest_n(profile: &LoadProfile) -> DVec3 {
+    let larger = |a: DVec3, b: DVec3| if b.length() > a.length() { b } else { a };
+    match &profile.strength {
+        StrengthProfile::Scaled(force_n, _) => *force_n,
+        StrengthProfile::Recorded(rows) => rows.iter().map(|row| row.1).fold(DVec3::ZERO, larger),
+    }
+}
+
+/// The shorter side, of a sheet in its plane, m.
+fn shorter_m(size_m: DVec3) -> f64 {
+    let side_m = size_m.x.min(size_m.y);
+    if size_m.z > 0.0 { side_m.min(size_m.z) } else { side_m }
 }
 
 /// Three significant digits.
@@ -344,15 +376,21 @@ impl fmt::Display for Meeting {
 
 impl fmt::Display for Prospect {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let (x_m, y_m) = (self.size_m.x, self.size_m.y);
+        let sides_m = self.size_m.to_array();
+        let sides_m = if self.size_m.z > 0.0 { &sides_m[..] } else { &sides_m[..2] };
+        let sides = |factor: f64, unit: &str| {
+            let sides: Vec<String> =
+                sides_m.iter().map(|side_m| format!("{} {unit}", rounded(factor * side_m))).collect();
+            sides.join(" × ")
+        };
         let mass = if self.mass_kg < 1.0 {
             format!("{} g", rounded(1e3 * self.mass_kg))
         } else {
             format!("{} kg", rounded(self.mass_kg))
         };
-        write!(f, "size          {} m × {} m", rounded(x_m), rounded(y_m))?;
-        if x_m.min(y_m) < 0.1 {
-            write!(f, " ({} mm × {} mm)", rounded(1e3 * x_m), rounded(1e3 * y_m))?;
+        write!(f, "size          {}", sides(1.0, "m"))?;
+        if shorter_m(self.size_m) < 0.1 {
+            write!(f, " ({})", sides(1e3, "mm"))?;
         }
         writeln!(f, ", {mass} in all")?;
         let radius = length(self.radius_m);
@@ -376,9 +414,10 @@ impl fmt::Display for Prospect {
             Err(why) => writeln!(f, "rest          {why}")?,
         }
         for (index, force) in self.forces.iter().enumerate().take(MOST_SHOWN) {
+            let about = if sides_m.len() > 2 { "at most about" } else { "about" };
             let depth = force
                 .depth_m
-                .map_or(format!("unknown, {}", self.no_law), |depth_m| format!("about {}", length(depth_m)));
+                .map_or(format!("unknown, {}", self.no_law), |depth_m| format!("{about} {}", length(depth_m)));
             let name = format!("force[{index}]");
             writeln!(f, "{name:<13} {} N in all at most; depth: {depth}", rounded(force.total_n))?;
         }
@@ -539,7 +578,7 @@ mod tests {
         let [warning] = rough.warnings.as_slice() else { panic!("{:?}", rough.warnings) };
         assert!(warning.starts_with("force[0]: ") && warning.ends_with("it goes through"), "{warning}");
         // The linear model of the same: depth and force have the stiffness of the disc between them.
-        let Force { total_n, depth_m } = gentle.forces[0];
+        let Force { total_n, depth_m, .. } = gentle.forces[0];
         let stiffness = total_n / depth_m.unwrap();
         assert!((30.0..120.0).contains(&stiffness), "{stiffness} N/m");
     }

@@ -10,7 +10,7 @@ use super::lanes;
 use super::model::{Model, Plan};
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result};
-use crate::scene::{Change, Integrator, Named, Precision, Scene};
+use crate::scene::{Body, Change, Integrator, Named, Precision, Scene};
 
 /// What sleeping tiles may add to the error, by default, as a part of it.
 const SLEEP_PART: f64 = 0.1;
@@ -35,8 +35,9 @@ impl Model {
         let too_many = |substeps: u32| {
             let message = format!(
                 "would need {substeps} substeps a step for stability, above the limit of {}: the springs are too stiff \
-                 for points so light at this rate",
-                limits.substeps
+                 for points so light at this rate{}",
+                limits.substeps,
+                if let Body::Mesh(mesh) = &scene.body { mesh.fastest_place() } else { String::new() }
             );
             Refusal::new(Reason::TooLarge, "stepping.substeps", message)
         };
@@ -56,7 +57,7 @@ impl Model {
         }
         let plan = Plan::new(integrator, substeps, step_s, &sheet);
         let omega_bound_per_s = sheet.omega_bound_per_s();
-        let mut warnings = Vec::new();
+        let mut warnings = if let Body::Mesh(mesh) = &scene.body { mesh.warnings() } else { Vec::new() };
         if !plan.stable {
             warnings.push(format!(
                 "stepping.substeps: {} is above the stability bound of the scheme; the sheet may blow up \
@@ -162,7 +163,7 @@ impl Model {
     /// The processor time that a step is expected to take while all of the sheet moves, s.
     #[allow(clippy::cast_precision_loss)]
     pub fn predicted_step_s(&self) -> f64 {
-        let point_ns = choice::point_substep_ns(self.plan.integrator, self.precision, self.lanes);
+        let point_ns = choice::point_substep_ns(&self.scene, self.plan.integrator, self.precision, self.lanes);
         1e-9 * (choice::STEP_NS + point_ns * self.swept_points() as f64 * f64::from(self.plan.substeps))
     }
 

@@ -22,8 +22,8 @@ const LEAD_S: f64 = 3.0;
 
 /// Performs the run at a server, which must know the scene by its name.
 pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failure> {
-    let Setup { model, law, tip, hand, device, deadband, duration_s, seed, .. } = setup;
-    let middle_m = model.shape().extent().middle_m();
+    let Setup { model, law, tip, spot, hand, device, deadband, duration_s, seed, .. } = setup;
+    let middle_m = spot.at_m;
     let scale = with_tissue(|| fitting_scale(setup, LEAD_S))?;
     let task = Task::new(DVec3::ZERO, LEAD_S, *duration_s, scale, &mut Random::new(*seed, 0));
     let simulated = Simulated::new(*device, *hand, task, true);
@@ -43,7 +43,7 @@ pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failur
     }
     let mut totals = Totals::default();
     with_tissue(|| {
-        let mut twin = Twin::new(Tissue::new(model, *tip, law.clone()));
+        let mut twin = Twin::new(Tissue::new(model, *tip, *spot, law.clone()));
         for (step, part) in steps(simulated.course()).enumerate() {
             // The device's place is relative to the middle of the sheet.
             let (true_n, touches) = twin.truth(part.place_m + middle_m)?;

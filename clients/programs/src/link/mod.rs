@@ -10,16 +10,18 @@ mod tissue;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 use clap::{Args, ValueEnum};
-use palpate::force_law;
+use glam::DVec3;
+use palpate::force_law::{self, Disc};
 use palpate::limits::Limits;
 use palpate::memory;
 use palpate::scene::check::check_tip;
 use palpate::scene::collection::find_scene;
 use palpate::sheet::Model;
-use palpate_proto::refusal::{Refusal, number};
-use palpate_touch::Tip;
+use palpate_proto::refusal::{Reason, Refusal, number};
+use palpate_touch::{Law, Tip};
 use serde_json::{Value, json};
 
 use crate::Failure;
@@ -28,6 +30,7 @@ use crate::simulated::{device_named, hand_named};
 use crate::table;
 use network::Conditions;
 use run::{Outcome, Rendering, Setup, run};
+use tissue::Spot;
 
 /// Arguments of `link`.
 #[derive(Args)]
@@ -68,6 +71,10 @@ pub(crate) struct Arguments {
     /// Seed of the task and the network
     #[arg(long, default_value_t = 1)]
     seed: u64,
+    /// Where the task is done, m: the place of the tissue's rest surface that is nearest to this; of a sheet X,Y. The middle,
+    /// if absent
+    #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', allow_negative_numbers = true, conflicts_with_all = ["server", "random", "boundary"])]
+    place: Vec<f64>,
     /// Radius of the tool's tip, m
     #[arg(long, value_name = "M", default_value_t = Tip::default().radius_m)]
     radius_m: f64,
@@ -268,9 +275,32 @@ fn setup(arguments: &Arguments) -> Result<Setup, Refusal> {
     let tip = Tip { radius_m: arguments.radius_m, friction: arguments.friction, ..Tip::default() };
     check_tip("--tip", scene.shape(), &tip)?;
     let model = Model::compile(&scene, &limits)?;
-    let law = Arc::new(force_law::exact(&model, tip.radius_m));
+    let near_m = match (arguments.place.as_slice(), model.shape().dimensions()) {
+        ([], _) => model.shape().extent().middle_m(),
+        ([x, y], 2) => DVec3::new(*x, *y, 0.0),
+        ([x, y, z], _) => DVec3::new(*x, *y, *z),
+        (_, count) => {
+            let names = if count == 2 { "X,Y" } else { "X,Y,Z" };
+            let message = format!("must be {count} numbers, {names}");
+            return Err(Refusal::new(Reason::WrongKind, "--place", message));
+        }
+    };
+    model.shape().check_place("--place", near_m)?;
+    if arguments.server.is_some() && model.shape().dimensions() > 2 {
+        let message = "works on sheets only: on a mesh leave it out, and the loop runs in virtual time";
+        return Err(Refusal::new(Reason::NotAvailable, "--server", message));
+    }
+    let spot = Spot::new(&model, near_m, tip.radius_m);
+    // A sheet has one law, that of its middle.
+    let at_m = if model.shape().dimensions() > 2 { spot.at_m } else { model.shape().extent().middle_m() };
+    let disc = Disc { radius_m: tip.radius_m, at_m };
+    let law = force_law::exact_within(&model, disc, u64::MAX, &AtomicBool::new(false));
+    let law = law.filter(Law::is_sound).ok_or_else(|| {
+        Refusal::new(Reason::NotAvailable, "--scene", "has no force law: nothing holds it, or it is too large")
+    })?;
+    let law = Arc::new(law);
     let (scheme, seed) = (arguments.scheme, arguments.seed);
-    Ok(Setup { model, law, tip, hand, device, conditions, stall_s, scheme, deadband, duration_s, seed })
+    Ok(Setup { model, law, tip, spot, hand, device, conditions, stall_s, scheme, deadband, duration_s, seed })
 }
 
 /// The figures of a run that are printed.
@@ -290,6 +320,7 @@ fn figures(setup: &Setup, outcome: &Outcome) -> Value {
         "deadband": setup.deadband,
         "seconds": setup.duration_s,
         "seed": setup.seed,
+        "place_m": setup.spot.at_m.to_array(),
         "scale": outcome.scale,
         "force_error_rms_percent": outcome.force_error_rms_percent,
         "force_error_p99_n": outcome.force_error_p99_n,

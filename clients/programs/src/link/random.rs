@@ -14,6 +14,7 @@ use serde_json::{Value, json};
 
 use super::network::Conditions;
 use super::run::{Outcome, Setup, run};
+use super::tissue::Spot;
 use super::{Arguments, figures};
 use crate::Failure;
 use crate::simulated::random::Random;
@@ -62,6 +63,7 @@ pub(super) fn print(arguments: &Arguments, runs: u64) -> Result<(), Failure> {
             model: model.clone(),
             law: law.clone(),
             tip,
+            spot: Spot::new(model, model.shape().extent().middle_m(), tip.radius_m),
             hand,
             device,
             conditions,

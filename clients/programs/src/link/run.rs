@@ -11,7 +11,7 @@ use palpate_touch::hand::{Hand, HandState};
 use palpate_touch::{Device, Law, LimitCause, LocalModel, Renderer, RenderingState, Tip};
 
 use super::network::{Conditions, Direction};
-use super::tissue::{Server, Tissue, Twin};
+use super::tissue::{Server, Spot, Tissue, Twin};
 use crate::simulated::random::Random;
 use crate::simulated::task::{self, Task};
 
@@ -32,6 +32,8 @@ pub(super) struct Setup {
     pub(super) model: Arc<Model>,
     pub(super) law: Arc<Law>,
     pub(super) tip: Tip,
+    /// Where the task is done.
+    pub(super) spot: Spot,
     pub(super) hand: Hand,
     pub(super) device: Device,
     pub(super) conditions: Conditions,
@@ -141,13 +143,13 @@ impl Client {
 /// # Errors
 /// Returns the reason if the guard stops the tissue.
 pub(super) fn fitting_scale(setup: &Setup, lead_s: f64) -> Result<f64, String> {
-    let Setup { model, law, tip, hand, device, duration_s, seed, .. } = setup;
+    let Setup { model, law, tip, spot, hand, device, duration_s, seed, .. } = setup;
     let most_n = task::FORCE_SHARE * device.most_n();
-    let middle_m = model.shape().extent().middle_m();
+    let middle_m = spot.at_m;
     let mut scale = task::scale(hand, law, device.most_n());
     loop {
         let task = Task::new(middle_m, lead_s, *duration_s, scale, &mut Random::new(*seed, 0));
-        let mut twin = Twin::new(Tissue::new(model, *tip, law.clone()));
+        let mut twin = Twin::new(Tissue::new(model, *tip, *spot, law.clone()));
         let mut held = HandState { place_m: task.start_m(), velocity_m_per_s: DVec3::ZERO };
         let mut largest_n = 0.0_f64;
         for tick in 0..ticks(*duration_s) {
@@ -203,10 +205,10 @@ impl Stalls {
 /// Returns the reason if the guard stops the tissue.
 pub(super) fn run(setup: &Setup) -> Result<Outcome, String> {
     let scale = fitting_scale(setup, task::LEAD_S)?;
-    let Setup { model, law, tip, hand, device, conditions, stall_s, scheme, deadband, duration_s, seed } = setup;
-    let middle_m = model.shape().extent().middle_m();
+    let Setup { model, law, tip, spot, hand, device, conditions, stall_s, scheme, deadband, duration_s, seed } = setup;
+    let middle_m = spot.at_m;
     let task = Task::new(middle_m, task::LEAD_S, *duration_s, scale, &mut Random::new(*seed, 0));
-    let tissue = || Tissue::new(model, *tip, law.clone());
+    let tissue = || Tissue::new(model, *tip, *spot, law.clone());
     let (mut server, mut twin) = (Server::new(tissue()), Twin::new(tissue()));
     let mut up: Direction<(f64, DVec3)> = Direction::new(*conditions, Random::new(*seed, 1));
     let mut down: Direction<LocalModel> = Direction::new(*conditions, Random::new(*seed, 2));

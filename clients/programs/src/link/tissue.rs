@@ -2,32 +2,74 @@
 
 use std::sync::Arc;
 
-use glam::DVec3;
+use glam::{DMat3, DQuat, DVec3};
 use palpate::scene::script::Action;
 use palpate::session::Session;
 use palpate::session::command::{Command, Due};
 use palpate::session::laws::FIRST;
 use palpate::session::local::Modeller;
-use palpate::sheet::{Feel, Model};
+use palpate::sheet::{Feel, Footprint, Model};
 use palpate_touch::path::{Path, Play};
 use palpate_touch::{ContactState, Law, LocalModel, Tip};
+
+/// The place of a surface at which a task is done, seen by the hand: the task's own place is there, and z is out of the
+/// tissue.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Spot {
+    /// The place at rest, m.
+    pub(super) at_m: DVec3,
+    /// From directions of the tissue to those of the hand.
+    turn: DMat3,
+}
+
+impl Spot {
+    /// The place of the rest surface that is nearest to `near_m`, as a disc of `radius_m` finds it.
+    pub(super) fn new(model: &Model, near_m: DVec3, radius_m: f64) -> Self {
+        if model.shape().dimensions() == 2 {
+            return Spot { at_m: near_m, turn: DMat3::IDENTITY };
+        }
+        let (at_m, [one, other]) = Footprint::new(model, radius_m, near_m).surface(|_| DVec3::ZERO);
+        let outward = one.cross(other).try_normalize().unwrap_or(DVec3::Z);
+        Spot { at_m, turn: DMat3::from_quat(DQuat::from_rotation_arc(outward, DVec3::Z)) }
+    }
+
+    /// Of the hand's place, which has the same middle.
+    fn of_tissue(&self, place_m: DVec3) -> DVec3 {
+        self.at_m + self.turn.transpose() * (place_m - self.at_m)
+    }
+
+    fn of_hand(&self, feel: Feel) -> Feel {
+        let place = |place_m: DVec3| self.at_m + self.turn * (place_m - self.at_m);
+        Feel {
+            place_m: place(feel.place_m),
+            velocity_m_per_s: self.turn * feel.velocity_m_per_s,
+            force_on_tool_n: self.turn * feel.force_on_tool_n,
+            surface_m: place(feel.surface_m),
+            anchor_m: place(feel.anchor_m),
+            normal: self.turn * feel.normal,
+            ..feel
+        }
+    }
+}
 
 /// A tissue with one tool.
 pub(super) struct Tissue {
     session: Session,
     tip: Tip,
+    spot: Spot,
     modeller: Modeller,
 }
 
 impl Tissue {
-    pub(super) fn new(model: &Arc<Model>, tip: Tip, law: Arc<Law>) -> Self {
-        Tissue { session: Session::new(model), tip, modeller: Modeller::new(FIRST, law, false) }
+    pub(super) fn new(model: &Arc<Model>, tip: Tip, spot: Spot, law: Arc<Law>) -> Self {
+        Tissue { session: Session::new(model), tip, spot, modeller: Modeller::new(FIRST, law, false) }
     }
 
-    /// Performs one step, at the end of which the tool is at `place_m`, or released if that is `None`.
+    /// Performs one step, at the end of which the tool is at the hand's `place_m`, or released if that is `None`.
     pub(super) fn step(&mut self, place_m: Option<DVec3>) -> Result<Option<Feel>, String> {
-        let tip = self.tip;
-        let action = place_m.map_or(Action::Release, |place_m| Action::Pose { place_m, tip });
+        let (tip, spot) = (self.tip, self.spot);
+        let pose = |place_m| Action::Pose { place_m: spot.of_tissue(place_m), tip };
+        let action = place_m.map_or(Action::Release, pose);
         let command = Command {
             tool: 0,
             sequence: Some(self.session.step_count() + 1),
@@ -40,7 +82,7 @@ impl Tissue {
         self.session.advance(&mut vec![Due { command, late: false, late_commands: 0, ends_lease: false }], |_| {});
         match self.session.fault() {
             Some(reason) => Err(reason),
-            None => Ok(self.session.tissue().feel(0)),
+            None => Ok(self.session.tissue().feel(0).map(|feel| spot.of_hand(feel))),
         }
     }
 
