@@ -32,7 +32,7 @@ help:
 	@echo 'make test-valgrind   the kernel under memcheck of valgrind, plain and AVX2'
 	@echo 'make test-debug      the kernel with debug assertions'
 	@echo 'make test-mutants    how many of 300 mutants of the kernel, touch and sessions the tests catch (an hour or two)'
-	@echo 'make stress          ten thousand random scenes, ten million steps (some minutes)'
+	@echo 'make stress          ten thousand random scenes, a million steps on 200 meshes, ten million steps (some minutes)'
 	@echo 'make fuzz            a million bent inputs for every decoder (some minutes)'
 	@echo 'make libfuzzer       one decoder under libFuzzer: TARGET=request (or scene, script, …) FUZZ_SECONDS=60'
 	@echo 'make lint            formatting, compiler and clippy warnings'
@@ -152,7 +152,7 @@ bench-frames: need-rust
 
 # Ten thousand random scenes, as many that are merely legal, and a soak of ten million steps.
 stress: need-rust
-	PALPATE_STRESS_SCENES=10000 $(CARGO) test --release --test stress --test legal --test physics -- --include-ignored --nocapture
+	PALPATE_STRESS_SCENES=10000 PALPATE_STRESS_MESHES=200 $(CARGO) test --release --test stress --test legal --test physics -- --include-ignored --nocapture
 
 # Another processor, the same bits. The compiler and the standard library for ARM are Debian's. An emulated vector takes some
 # thousand times as long: `make test-arm ARM_TESTS="--test determinism"` for whole courses, and hours.

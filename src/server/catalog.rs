@@ -1,31 +1,47 @@
 //! The scenes and scripts that a server knows by name: those of its folders, and the built-in ones.
 
 use std::path::Path;
+use std::sync::{Arc, Mutex};
 
 use crate::limits::Limits;
+use crate::lock::lock;
 use crate::refusal::Result;
-use crate::scene::Scene;
 use crate::scene::collection::Collection;
 use crate::scene::kind::Kind;
 use crate::scene::reader::fits;
 use crate::scene::script::Script;
+use crate::scene::{BUILT_IN, Scene};
 
 /// Scenes and scripts by name.
 #[derive(Debug, Clone)]
 pub struct Catalog {
     scenes: Collection,
     scripts: Collection,
+    /// The built-in scenes that were asked for so far: to lay out an organ takes a second.
+    built_in: Arc<Mutex<Vec<(String, Scene)>>>,
 }
 
 impl Catalog {
     /// The scenes and scripts of two folders, either of which may be missing, and the built-in ones.
     pub fn new(scenes: &Path, scripts: &Path) -> Self {
-        Catalog { scenes: Collection::new(Kind::Scene, scenes), scripts: Collection::new(Kind::Script, scripts) }
+        Catalog {
+            scenes: Collection::new(Kind::Scene, scenes),
+            scripts: Collection::new(Kind::Script, scripts),
+            built_in: Arc::default(),
+        }
     }
 
     /// The names of all scenes, sorted.
     pub fn names(&self) -> Vec<String> {
         self.scenes.names()
+    }
+
+    /// The names of the scenes that are not built in word for word: nobody has looked yet whether they are valid.
+    pub fn foreign_names(&self, limits: &Limits) -> Vec<String> {
+        let is_foreign = |name: &String| {
+            self.scenes.text(name, &self.scripts, limits).map_or(true, |(_, text)| !is_built_in(name, &text))
+        };
+        self.names().into_iter().filter(is_foreign).collect()
     }
 
     /// The names of all scripts, sorted.
@@ -48,7 +64,17 @@ impl Catalog {
     /// Returns an error if there is no such scene, or if it is invalid.
     pub fn load(&self, name: &str, assignments: &[String], limits: &Limits) -> Result<Scene> {
         let (file, text) = self.scenes.text(name, &self.scripts, limits)?;
-        Scene::parse_in(self.scenes.folder(), &file, &text, assignments, limits)
+        let is_built_in = assignments.is_empty() && is_built_in(name, &text);
+        if is_built_in && let Some((_, scene)) = lock(&self.built_in).iter().find(|known| known.0 == name) {
+            return scene.check(limits).map(|()| scene.clone());
+        }
+        let scene = Scene::parse_in(self.scenes.folder(), &file, &text, assignments, limits)?;
+        if is_built_in {
+            let mut built_in = lock(&self.built_in);
+            built_in.retain(|known| known.0 != name);
+            built_in.push((name.to_owned(), scene.clone()));
+        }
+        Ok(scene)
     }
 
     /// Loads the script of that name and binds it to a scene.
@@ -59,4 +85,9 @@ impl Catalog {
         let (file, text) = self.scripts.text(name, &self.scenes, limits)?;
         Script::parse(&file, &text, self.scripts.folder(), scene, limits)
     }
+}
+
+/// Whether this is the text of the built-in scene of that name.
+fn is_built_in(name: &str, text: &str) -> bool {
+    BUILT_IN.iter().any(|(other, own)| *other == name && *own == text)
 }

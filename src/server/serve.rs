@@ -63,7 +63,7 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
     let pacer = Pacer::start(config.stepping_threads(), config.audit_share, &config.limits, budget.clone())?;
     let deadline = Duration::from_secs_f64(config.shutdown_deadline_s);
     let catalog = Catalog::new(&config.scenes, &config.scripts);
-    for name in catalog.names() {
+    for name in catalog.foreign_names(&config.limits) {
         if let Err(refusal) = catalog.load(&name, &[], &config.limits) {
             warn!(%refusal, "this scene is invalid: no session can be created from it");
         }

@@ -20,6 +20,10 @@ use crate::scene::Body;
 use grid::GridDisc;
 use mesh::MeshDisc;
 
+/// A disc on a mesh does not move by a smaller part of its radius: to lay it takes as long as to step some thousand points,
+/// and the tool is off its place by no more than this.
+const LEAST_PART: f64 = 1e-6;
+
 /// A disc on a tissue, at a place. Lengths in m.
 #[derive(Debug, Clone)]
 pub struct Footprint {
@@ -109,7 +113,7 @@ impl Footprint {
             }
             Ground::Mesh(disc) => {
                 let by_m = within(beside_m, along);
-                if by_m != DVec2::ZERO {
+                if by_m.length() > LEAST_PART * self.radius_m {
                     disc.walk(by_m);
                     self.lay(model);
                 }

@@ -2,12 +2,13 @@
 //
 // A push is the paper's surgical force at the place where the drag began, leaning in the direction of the drag. A
 // stroke moves that place along, leaning in its direction of movement. A pull grasps a mass point and brings it where
-// you drag it. Tools controlled by poses would work as well, but they need a command every 50 ms, which no browser
+// you drag it. A place has a side on which it is touched, and pushes go into the tissue from there. Tools controlled by poses would work as well, but they need a command every 50 ms, which no browser
 // guarantees.
 
 import type { MessageInitShape } from "@bufbuild/protobuf";
 import type { CommandSchema, Sample } from "./gen/palpate/v1/haptic_pb";
 import type { Vec3 } from "./samples";
+import type { Place, Surface } from "./surface";
 import { describe, haptics, isGone, PATIENCE_MS, reasonOf } from "./server";
 
 export type Mode = "push" | "pull" | "stroke";
@@ -29,13 +30,15 @@ const IN_FLIGHT = 2;
 
 /** The effect of strength 1 on the tissue. */
 export interface Reach {
-  spacingM: number;
-  /** Force of a push, N. */
+  /** A push falls off over this length: on a sheet the spacing of its points. */
+  lengthM: number;
+  /** Force of a push: on a sheet in the middle of the tool, on a body all of it together, N. */
   mostN: number;
+  /** Force of the strongest push on the point in the middle of the tool, about, N. */
+  pointN: number;
   /** Length of a drag that leans a push fully, and of a pull by keys, m. */
   depthM: number;
 }
-
 
 export class Hand {
   mode: Mode = "push";
@@ -49,7 +52,7 @@ export class Hand {
   private taking: Promise<boolean> | undefined;
   private sequence = 0n;
   private pressed = false;
-  private placeM: [number, number] = [0, 0];
+  private place: Place | undefined;
   private onSurfaceM: Vec3 = [0, 0, 0];
   private leanM: Vec3 = [0, 0, 0];
   private released = true;
@@ -63,6 +66,7 @@ export class Hand {
     readonly sessionId: string,
     private readonly name: string,
     readonly reach: Reach,
+    private readonly surface: () => Surface,
   ) {}
 
   get holds(): boolean {
@@ -71,6 +75,16 @@ export class Hand {
 
   get touches(): boolean {
     return this.pressed;
+  }
+
+  /** The side of the tissue that it touches, or touched last. */
+  get outward(): Vec3 | undefined {
+    return this.place?.outward;
+  }
+
+  /** What forces on the tool are told times: a push on a body is told by all of it. */
+  get share(): number {
+    return this.place && this.mode !== "pull" ? this.surface().push(this.place, this.reach.lengthM).share : 1;
   }
 
   /** Takes the tool if it is free. */
@@ -98,11 +112,11 @@ export class Hand {
     }
   }
 
-  /** Begins to touch at `placeM` in the rest plane; its tissue is at `onSurfaceM` on the surface. */
-  async press(placeM: [number, number], onSurfaceM: Vec3): Promise<void> {
+  /** Begins to touch at `place`; its tissue is at `onSurfaceM` now. */
+  async press(place: Place, onSurfaceM: Vec3): Promise<void> {
     this.pressed = true;
     this.released = false;
-    this.placeM = placeM;
+    this.place = place;
     this.onSurfaceM = onSurfaceM;
     this.leanM = [0, 0, 0];
     this.touchedMs = performance.now();
@@ -111,12 +125,13 @@ export class Hand {
   }
 
   /** Moves to another place, leaning in the direction of the movement. */
-  goOn(placeM: [number, number]): void {
-    const way = [placeM[0] - this.placeM[0], placeM[1] - this.placeM[1]] as const;
+  goOn(place: Place): void {
+    const [from, to] = [this.place?.restM ?? place.restM, place.restM];
+    const way = [to[0] - from[0], to[1] - from[1], to[2] - from[2]] as const;
     // The earlier lean fades over the length that leans a push fully.
     const kept = Math.exp(-Math.hypot(...way) / this.reach.depthM);
-    this.placeM = placeM;
-    this.lean([kept * this.leanM[0] + way[0], kept * this.leanM[1] + way[1], 0]);
+    this.place = place;
+    this.lean([kept * this.leanM[0] + way[0], kept * this.leanM[1] + way[1], kept * this.leanM[2] + way[2]]);
   }
 
   /** Leans by `leanM` from the place of the press. */
@@ -175,29 +190,30 @@ export class Hand {
   private command(now: number): Command {
     this.sequence += 1n;
     const command = { tool: TOOL, sequence: this.sequence, clientTimeNs: BigInt(Math.round(now * 1e6)) };
-    if (!this.pressed) return { ...command, action: { case: "release", value: {} } };
-    const [x, y] = this.placeM;
-    const { spacingM, mostN } = this.reach;
+    const { place, reach } = this;
+    if (!this.pressed || !place) return { ...command, action: { case: "release", value: {} } };
+    const surface = this.surface();
     const timeToLiveS = TIME_TO_LIVE_S;
     if (this.mode === "pull") {
-      const point = { x: Math.round(x / spacingM), y: Math.round(y / spacingM) };
       const [from, lean] = [this.onSurfaceM, this.leanM];
       const positionM = { x: from[0] + lean[0], y: from[1] + lean[1], z: from[2] + lean[2] };
       const target = { case: "positionM" as const, value: positionM };
-      return { ...command, timeToLiveS, action: { case: "position", value: { point, target } } };
+      return { ...command, timeToLiveS, action: { case: "position", value: { ...surface.point(place), target } } };
     }
-    const centre = { case: "centreM" as const, value: { x, y } };
-    const value = { centre, forceN: this.forceN(mostN * this.strength), falloffPerM: 1 / spacingM };
+    const middleN = (reach.mostN * this.strength) / surface.push(place, reach.lengthM).sum;
+    const value = { centre: surface.centre(place), forceN: this.forceN(middleN, place), falloffPerM: 1 / reach.lengthM };
     return { ...command, timeToLiveS, action: { case: "force", value } };
   }
 
-  /** Downwards, plus the direction of the drag: at 45° when the drag is as long as the reach. */
-  private forceN(strengthN: number): { x: number; y: number; z: number } {
-    const across = [this.leanM[0] / this.reach.depthM, this.leanM[1] / this.reach.depthM] as const;
+  /** Into the tissue, plus the direction of the drag across: at 45° when the drag is as long as the reach. */
+  private forceN(strengthN: number, { outward: n }: Place): { x: number; y: number; z: number } {
+    const { leanM: lean, reach } = this;
+    const out = lean[0] * n[0] + lean[1] * n[1] + lean[2] * n[2];
+    const across = [0, 1, 2].map((c) => (lean[c]! - out * n[c]!) / reach.depthM);
     const most = Math.max(1, Math.hypot(...across));
-    const way = [across[0] / most, across[1] / most, -1] as const;
-    const norm = strengthN / Math.hypot(...way);
-    return { x: way[0] * norm, y: way[1] * norm, z: way[2] * norm };
+    const [x, y, z] = across.map((v, c) => v / most - n[c]!) as [number, number, number];
+    const scale = strengthN / Math.hypot(x, y, z);
+    return { x: x * scale, y: y * scale, z: z * scale };
   }
 
   private async send(leaseId: string, commands: Command[]): Promise<void> {

@@ -1,17 +1,17 @@
 // Mouse, fingers and keys on the tissue.
 
+import { Vector3 } from "three";
 import type { Hand, Reach } from "./hand";
 import type { Latency } from "./latency";
 import type { Vec3 } from "./samples";
 import type { Stage } from "./stage";
-import type { Surface } from "./surface";
+import type { Place, Surface } from "./surface";
 
 /** What the user can touch. */
 export interface Touched {
   hand: Hand;
   surface: Surface;
   reach: Reach;
-  extentM: [number, number];
 }
 
 /** Rotation of the view per key press, radians. */
@@ -20,9 +20,9 @@ const TURN = 0.08;
 export class Input {
   private dragging: number | undefined;
   private fingers = new Set<number>();
-  /** Where the drag began: in the rest plane, and on the surface. */
-  private from: { placeM: [number, number]; onSurfaceM: Vec3 } | undefined;
-  private aimM: [number, number] | undefined;
+  /** Where the drag began: the place, and where its tissue was. */
+  private from: { place: Place; onSurfaceM: Vec3 } | undefined;
+  private aim: Place | undefined;
 
   constructor(
     private readonly canvas: HTMLCanvasElement,
@@ -30,7 +30,8 @@ export class Input {
     private readonly latency: Latency,
     private readonly touched: () => Touched | undefined,
   ) {
-    canvas.addEventListener("pointerdown", (event) => this.down(event));
+    // Before the view's own: what it turns by depends on whether there is tissue.
+    canvas.addEventListener("pointerdown", (event) => this.down(event), { capture: true });
     canvas.addEventListener("pointermove", (event) => this.moved(event));
     for (const end of ["pointerup", "pointercancel", "lostpointercapture"] as const) {
       canvas.addEventListener(end, (event) => this.up(event));
@@ -41,7 +42,7 @@ export class Input {
       if (event.key === " ") this.touched()?.hand.lift();
     });
     canvas.addEventListener("blur", () => {
-      this.aimM = undefined;
+      this.aim = undefined;
       this.stage.setAim(undefined);
       if (this.dragging === undefined) this.touched()?.hand.lift();
     });
@@ -54,33 +55,33 @@ export class Input {
     // A second finger turns the view instead.
     if (this.fingers.size > 1) return this.finish();
     if (event.button !== 0 || this.dragging !== undefined) return;
-    const placeM = this.stage.pick(event.clientX, event.clientY);
-    if (!placeM) return;
+    const place = this.stage.pick(event.clientX, event.clientY);
+    // Beside the tissue a drag turns the view.
+    this.stage.turnByDrag(!place);
+    if (!place) return;
     this.latency.pressed(event.timeStamp);
     this.canvas.setPointerCapture(event.pointerId);
     this.dragging = event.pointerId;
-    this.begin(hand, placeM);
+    this.begin(hand, place);
   }
 
-  private begin(hand: Hand, placeM: [number, number]): void {
-    const { spacingM } = hand.reach;
+  private begin(hand: Hand, place: Place): void {
+    const { surface } = this.touched() ?? {};
+    if (!surface) return;
     // A grasp holds a mass point and begins at that point.
-    if (hand.mode === "pull") placeM = [spacingM * Math.round(placeM[0] / spacingM), spacingM * Math.round(placeM[1] / spacingM)];
-    this.from = { placeM, onSurfaceM: this.onSurface(placeM) };
-    void hand.press(placeM, this.from.onSurfaceM);
-  }
-
-  private onSurface([x, y]: [number, number]): Vec3 {
-    const [dx, dy, dz] = this.touched()?.surface.displacementAtM(x, y) ?? [0, 0, 0];
-    return [x + dx, y + dy, dz];
+    const held = hand.mode === "pull" ? surface.nearest(place) : place;
+    const moved = surface.displacementAt(held);
+    const [x, y, z] = held.restM;
+    this.from = { place: held, onSurfaceM: [x + moved.x, y + moved.y, z + moved.z] };
+    void hand.press(held, this.from.onSurfaceM);
   }
 
   private moved(event: PointerEvent): void {
     const { hand } = this.touched() ?? {};
     if (event.pointerId !== this.dragging || !hand || !this.from) return;
     if (hand.mode === "stroke") {
-      const placeM = this.stage.pick(event.clientX, event.clientY);
-      if (placeM) hand.goOn(placeM);
+      const place = this.stage.pick(event.clientX, event.clientY);
+      if (place) hand.goOn(place);
       return;
     }
     const at = this.stage.onFacingPlane(event.clientX, event.clientY, this.from.onSurfaceM);
@@ -97,13 +98,14 @@ export class Input {
   private finish(): void {
     this.dragging = undefined;
     this.from = undefined;
+    this.stage.turnByDrag(false);
     this.touched()?.hand.lift();
   }
 
   private key(event: KeyboardEvent): void {
     const touched = this.touched();
     if (!touched || event.ctrlKey || event.metaKey || event.altKey) return;
-    const { hand, reach, extentM } = touched;
+    const { hand, reach } = touched;
     const ways: Record<string, [number, number]> = {
       ArrowLeft: [-1, 0],
       ArrowRight: [1, 0],
@@ -115,21 +117,18 @@ export class Input {
       this.stage.turn(-way[0] * TURN, way[1] * TURN, 1);
     } else if (way) {
       // Right is the right side of the view.
-      const [rx, ry] = this.stage.rightwards();
-      const [x, y] = this.aimM ?? [extentM[0] / 2, extentM[1] / 2];
-      const by: [number, number] = [way[0] * rx - way[1] * ry, way[0] * ry + way[1] * rx];
-      const to = (v: number, along: number, most: number) => Math.min(Math.max(v + along * reach.spacingM, 0), most);
-      this.aimM = [to(x, by[0], extentM[0]), to(y, by[1], extentM[1])];
-      if (hand.touches) this.lead(this.aimM, touched);
-      this.stage.setAim(this.aimM);
+      const from = this.aim ?? this.first(touched);
+      this.aim = touched.surface.beside(from, this.stage.across(from, way).multiplyScalar(reach.lengthM));
+      if (hand.touches) this.lead(this.aim, touched);
+      this.stage.setAim(this.aim);
     } else if (event.key === " ") {
       if (!event.repeat && !hand.touches) {
-        this.aimM ??= [extentM[0] / 2, extentM[1] / 2];
+        this.aim ??= this.first(touched);
         this.latency.pressed(event.timeStamp);
-        this.begin(hand, this.aimM);
+        this.begin(hand, this.aim);
         // A pull by key lifts the point.
-        if (hand.mode === "pull") hand.lean([0, 0, reach.depthM * hand.strength]);
-        this.stage.setAim(this.aimM);
+        if (hand.mode === "pull") hand.lean(this.lifted([0, 0, 0], this.aim, touched));
+        this.stage.setAim(this.aim);
       }
     } else if (event.key === "Escape") {
       void hand.letGo();
@@ -141,11 +140,22 @@ export class Input {
     event.preventDefault();
   }
 
-  /** Arrow keys while Space is down: a stroke moves on, a push leans, a pull moves sideways. */
-  private lead(aimM: [number, number], { hand, reach }: Touched): void {
-    if (hand.mode === "stroke") return hand.goOn(aimM);
-    const from = this.from?.placeM ?? aimM;
+  /** What keys aim at first: the middle of what is seen. */
+  private first({ surface }: Touched): Place {
+    return (surface.flank ? undefined : this.stage.pickMiddle()) ?? surface.middle();
+  }
+
+  /** A way, and out of the tissue besides as far as a pull lifts. */
+  private lifted([x, y, z]: Vec3, { outward: n }: Place, { hand, reach }: Touched): Vec3 {
     const up = hand.mode === "pull" ? reach.depthM * hand.strength : 0;
-    hand.lean([aimM[0] - from[0], aimM[1] - from[1], up]);
+    return [x + up * n[0], y + up * n[1], z + up * n[2]];
+  }
+
+  /** Arrow keys while Space is down: a stroke moves on, a push leans, a pull moves sideways. */
+  private lead(aim: Place, touched: Touched): void {
+    if (touched.hand.mode === "stroke") return touched.hand.goOn(aim);
+    const from = this.from?.place ?? aim;
+    const way = new Vector3(...aim.restM).sub(new Vector3(...from.restM));
+    touched.hand.lean(this.lifted(way.toArray(), from, touched));
   }
 }

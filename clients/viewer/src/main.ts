@@ -6,25 +6,32 @@
 // time to live, each lease four seconds. Without TLS a browser speaks HTTP/1.1 with six connections: hence one stream of
 // frames, one of samples, and one acknowledgement at a time.
 
-import type { Session } from "./gen/palpate/v1/session_pb";
+import type { MessageInitShape } from "@bufbuild/protobuf";
+import type { CreateSessionRequestSchema, Session } from "./gen/palpate/v1/session_pb";
 import { SessionState } from "./gen/palpate/v1/session_pb";
 import type { Mode } from "./hand";
 import { Input } from "./input";
 import { Latency } from "./latency";
 import { depthText, Overlay } from "./overlay";
 import { asked, askedNumber, holderName, part, writeAddress } from "./page";
+import { entryOf, keepPicture, pictureOf } from "./pictures";
 import { Plots, quantity } from "./plot";
-import { norm } from "./samples";
+import { norm, type Vec3 } from "./samples";
 import { playScript } from "./script";
 import { backoffMs, describe, type Failure, isGone, PATIENCE_MS, reasonOf, received, sessions, sleep } from "./server";
 import { Stage } from "./stage";
+import { Sheet } from "./sheet";
 import { Status } from "./status";
 import { tissueTexture } from "./texture";
 import { TissueValues } from "./tissue";
+import { FileOpener } from "./upload";
 import { Visit } from "./visit";
 
 /** The scene of a new session, if the server has it and the address names no other. */
 const DEFAULT_SCENE = "liver";
+
+/** So long after its texture has come a tissue's picture is taken for the list. */
+const PICTURE_MS = 1500;
 
 /** When samples are so much newer than the newest frame, nothing moves: frames come 60 times a second. */
 const STILL_S = 0.25;
@@ -57,17 +64,28 @@ function notice(text: string, seconds = 5): void {
   if (seconds > 0) noticed = setTimeout(() => (line.hidden = true), 1000 * seconds);
 }
 
-/** Opens a session: an existing one, or a new one of a scene. */
-async function open(sessionId: string | undefined, scene: string | undefined): Promise<void> {
+/** What a new session is made of: that of the last one, if somebody wants another. */
+type Source = NonNullable<MessageInitShape<typeof CreateSessionRequestSchema>["source"]>;
+let made: Source = { case: "sceneName", value: DEFAULT_SCENE };
+
+const named = (value: string | undefined): Source => ({ case: "sceneName", value: value || DEFAULT_SCENE });
+
+/** Opens a session: an existing one, or a new one. */
+async function open(sessionId: string | undefined, source: Source): Promise<void> {
   visit?.leave();
   visit = undefined;
   playing?.abort();
+  made = source;
   for (let failures = 0; ; failures++) {
     try {
       const session = sessionId
         ? (await sessions.getSession({ sessionId }, { timeoutMs: PATIENCE_MS })).session
-        : (await sessions.createSession({ source: { case: "sceneName", value: scene ?? DEFAULT_SCENE } }, {})).session;
-      if (session) return await show(session, sessionId === undefined);
+        : (await sessions.createSession({ source }, {})).session;
+      if (!session) continue;
+      const isNew = sessionId === undefined;
+      // If what follows fails, the session is there all the same.
+      sessionId = session.sessionId;
+      return await show(session, isNew);
     } catch (error) {
       const refused = describe(error);
       if (isGone(error)) return over("This session no longer exists.");
@@ -95,18 +113,23 @@ function over(why: string): void {
   again.textContent = "Start a new session";
   again.addEventListener("click", () => {
     notice("", 0);
-    void open(undefined, part("scene", HTMLSelectElement).value || undefined);
+    void open(undefined, made);
   });
   part("notice", HTMLElement).append(again);
 }
 
+/** How many sessions were opened: of several that are asked for one after the other the last counts. */
+let opening = 0;
+
 async function show(session: Session, isNew: boolean): Promise<void> {
   writeAddress(session.sessionId, isNew && new URLSearchParams(location.search).has("session"));
-  const next = new Visit(session, holder, askedNumber("refinement", 0, 10), {
+  const wanted = (opening += 1);
+  const next = await Visit.to(session, holder, askedNumber("refinement", 0, 10), {
     onSession: heard,
     onTrouble: trouble,
     onWell: () => visit === next && status.found(wellText(next.session)),
   });
+  if (wanted !== opening) return;
   visit = next;
   void listScripts(session.sessionId);
   next.hand.mode = chosenMode();
@@ -118,10 +141,12 @@ async function show(session: Session, isNew: boolean): Promise<void> {
   const slider = part("refinement", HTMLInputElement);
   slider.max = String(next.mostRefinement);
   slider.value = String(next.refinement);
+  part("fineness", HTMLElement).hidden = next.mostRefinement === 0;
   tellControls();
   tissue.begin(session);
+  mark(session.scene?.name ?? "");
   // Shaded by its shape at once; the texture comes when it is painted.
-  stage.show(next.surface, next.extentM, false);
+  stage.show(next.surface, false);
   stage.setTools([], 1);
   part("arriving", HTMLElement).hidden = true;
   next.begin();
@@ -129,6 +154,19 @@ async function show(session: Session, isNew: boolean): Promise<void> {
   const texture = await tissueTexture(session.sessionId);
   if (visit !== next) texture?.dispose();
   else if (texture) stage.setTexture(texture);
+  setTimeout(() => visit === next && takePicture(next), PICTURE_MS);
+}
+
+/** Takes a picture of a scene that has none in the list, if nobody has touched it or turned the view. */
+function takePicture(of: Visit): void {
+  const scene = of.session.scene?.name ?? "";
+  const entry = [...part("scene", HTMLSelectElement).options].find(({ value, disabled }) => value === scene && !disabled);
+  if (!entry || pictureOf(scene) || document.hidden || of.samples.history.length > 0 || !stage.isAtHome) return;
+  stage.snap((drawn) => keepPicture(scene, drawn));
+  const { selected } = entry;
+  const pictured = entryOf(scene);
+  entry.replaceWith(pictured);
+  pictured.selected = selected;
 }
 
 function wellText(session: Session): string {
@@ -174,12 +212,21 @@ function holding(): void {
 /** Shows the tools and the forces on them. */
 function felt(of: Visit): void {
   if (of !== visit) return;
-  const { spacingM, mostN } = of.reach;
-  const shown = of.samples.tools.map(({ point, forceN }) => {
-    const restM: [number, number] = [(point?.x ?? 0) * spacingM, (point?.y ?? 0) * spacingM];
-    return { restM, forceN };
+  const { surface, hand, reach } = of;
+  const shown = of.samples.tools.flatMap((tool) => {
+    const found = surface.ofTool(tool);
+    if (!found) return [];
+    // The own hand knows which side it touches.
+    const isMine = tool.tool === 0 && hand.holds;
+    const place = isMine && hand.outward ? { ...found, outward: sameSide(found.outward, hand.outward) } : found;
+    return [{ place, forceN: tool.forceN }];
   });
-  stage.setTools(shown, mostN);
+  stage.setTools(shown, reach.pointN);
+}
+
+/** A direction or its opposite: that which is more like another. */
+function sameSide([x, y, z]: Vec3, [ox, oy, oz]: Vec3): Vec3 {
+  return x * ox + y * oy + z * oz < 0 ? [-x, -y, -z] : [x, y, z];
 }
 
 function tellControls(): void {
@@ -189,11 +236,13 @@ function tellControls(): void {
   part("strength-value", HTMLOutputElement).value = text;
   part("strength", HTMLInputElement).setAttribute("aria-valuetext", text);
   part("refinement-value", HTMLOutputElement).value = String(visit.refinement);
-  const range = quantity(reach.spacingM, "m");
-  part("meaning", HTMLElement).textContent =
-    "Strength is the push in the middle of the tool. It fades out over about " +
-    `${range}. What pushes back is the mean over the tissue around, weighted as the push is. The push is strongest in the ` +
-    "middle, so that mean is less than the strength while nothing moves. While the tissue moves it may be more.";
+  const range = quantity(reach.lengthM, "m");
+  part("meaning", HTMLElement).textContent = visit.surface.flank
+    ? "Strength is the push in the middle of the tool. It fades out over about " +
+      `${range}. What pushes back is the mean over the tissue around, weighted as the push is. The push is strongest in the ` +
+      "middle, so that mean is less than the strength while nothing moves. While the tissue moves it may be more."
+    : `Strength is the whole push of the tool. It fades out over about ${range}. What pushes back is told for all the tissue ` +
+      "that the push meets: as much as the strength while nothing moves, more or less while the tissue moves.";
 }
 
 function chosenMode(): Mode {
@@ -218,11 +267,11 @@ part("wireframe", HTMLInputElement).addEventListener("change", (event) => {
 part("refinement", HTMLInputElement).addEventListener("input", (event) => {
   if (!visit) return;
   const surface = visit.refine(Number((event.target as HTMLInputElement).value));
-  stage.show(surface, visit.extentM, true);
+  stage.show(surface, true);
   tellControls();
 });
 part("scene", HTMLSelectElement).addEventListener("change", (event) => {
-  void open(undefined, (event.target as HTMLSelectElement).value);
+  void open(undefined, named((event.target as HTMLSelectElement).value));
 });
 part("share", HTMLButtonElement).addEventListener("click", () => {
   // Browsers offer the clipboard only to pages from a secure origin or from this machine.
@@ -232,6 +281,13 @@ part("share", HTMLButtonElement).addEventListener("click", () => {
   void navigator.clipboard.writeText(location.href).then(copied, failed);
 });
 part("play", HTMLButtonElement).addEventListener("click", () => void play());
+new FileOpener((session, scene) => {
+  visit?.leave();
+  visit = undefined;
+  playing?.abort();
+  made = { case: "scene", value: scene };
+  show(session, true).catch((error: unknown) => over(`${describe(error)}.`));
+});
 
 async function play(): Promise<void> {
   const button = part("play", HTMLButtonElement);
@@ -260,7 +316,7 @@ async function play(): Promise<void> {
 let warnedIn: Visit | undefined;
 /** Warns once if the tissue moved farther than it is long: then a unit is probably wrong. */
 function warnIfFar(of: Visit): void {
-  if (of === warnedIn || of.surface.largestM() <= Math.max(...of.extentM, of.reach.spacingM)) return;
+  if (of === warnedIn || of.surface.largestM() <= Math.max(of.surface.sizeM, of.reach.lengthM)) return;
   warnedIn = of;
   notice("The tissue moved farther than its longest side. Look at the forces and the stiffness: a unit may be wrong.", 15);
 }
@@ -275,18 +331,19 @@ document.addEventListener("visibilitychange", () => (document.hidden ? visit?.lo
 addEventListener("pagehide", () => void visit?.hand.letGo());
 addEventListener("popstate", () => {
   const sessionId = new URLSearchParams(location.search).get("session") ?? undefined;
-  if (sessionId !== visit?.session.sessionId) void open(sessionId, undefined);
+  if (sessionId !== visit?.session.sessionId) void open(sessionId, made);
 });
 
 // Ten times a second for values read as they change, once a second for figures.
 setInterval(() => {
   if (!visit || document.hidden) return;
   const { samples, reach } = visit;
-  plots.draw(samples.history, samples.newest?.simulationTimeS ?? 0, 0.4 * reach.spacingM, 0.1 * reach.mostN);
+  plots.draw(samples.history, samples.newest?.simulationTimeS ?? 0, 0.4 * reach.lengthM, 0.1 * reach.mostN);
   const tool = samples.tools[0];
-  overlay.tell(tool);
-  part("felt", HTMLElement).textContent = tool
-    ? `${depthText(tool.displacementM)}, pushes back ${quantity(norm(tool.forceN), "N")}`
+  const told = tool && samples.tell(tool);
+  overlay.tell(told);
+  part("felt", HTMLElement).textContent = told
+    ? `${depthText(told)}, pushes back ${quantity(told.allN, "N")}`
     : "Nothing touches the tissue.";
 }, 100);
 setInterval(() => {
@@ -320,6 +377,7 @@ async function listScripts(sessionId: string): Promise<void> {
     try {
       const { scriptNames } = await sessions.listScripts({ sessionId }, { timeoutMs: PATIENCE_MS });
       part("script", HTMLSelectElement).replaceChildren(...scriptNames.map((name) => new Option(name)));
+      part("scripts", HTMLElement).hidden = scriptNames.length === 0;
       return;
     } catch {
       await sleep(backoffMs(failures));
@@ -331,13 +389,25 @@ async function lists(): Promise<void> {
   for (let failures = 0; ; failures++) {
     try {
       const { sceneNames } = await sessions.listScenes({}, { timeoutMs: PATIENCE_MS });
-      part("scene", HTMLSelectElement).replaceChildren(...sceneNames.map((name) => new Option(name)));
-      part("scene", HTMLSelectElement).value = visit?.session.scene?.name ?? asked.get("scene") ?? DEFAULT_SCENE;
+      part("scene", HTMLSelectElement).replaceChildren(...sceneNames.map(entryOf));
+      mark(visit?.session.scene?.name ?? asked.get("scene") ?? DEFAULT_SCENE);
       return;
     } catch {
       await sleep(backoffMs(failures));
     }
   }
+}
+
+/** Selects a scene in the list; one that the server does not have, such as a file of one's own, joins the list. */
+function mark(scene: string): void {
+  const list = part("scene", HTMLSelectElement);
+  for (const option of [...list.options]) if (option.disabled) option.remove();
+  list.value = scene;
+  if (list.value === scene) return;
+  const own = new Option(scene, scene);
+  own.disabled = true;
+  list.add(own);
+  list.value = scene;
 }
 
 /** Age of the newest frame here. */
@@ -384,7 +454,7 @@ const inside = {
   /** The least room between a tool and the tissue as drawn, of the width of the tissue; undefined without a tool. */
   get clear() {
     const { clearM } = stage;
-    return clearM === undefined || !visit ? undefined : clearM / visit.extentM[0];
+    return clearM === undefined || !visit ? undefined : clearM / visit.widthM;
   },
   /** Whether the first picture of the tissue was drawn, and had a texture; and whether it has one now. */
   get drawing() {
@@ -392,18 +462,18 @@ const inside = {
   },
   /** The camera's height above the table and the tissue beneath it, of the width of the tissue. */
   get cameraHeight() {
-    return visit ? stage.heightM / visit.extentM[0] : 0;
+    return visit ? stage.heightM / visit.widthM : 0;
   },
   /** Width of the tissue, m. */
   get widthM() {
-    return visit?.extentM[0] ?? 0;
+    return visit?.widthM ?? 0;
   },
-  /** The window point of the tissue at (x, y), in fractions of the sheet. */
+  /** The window point of the tissue at (x, y): in fractions of a sheet; of a body near there in the picture. */
   at(x: number, y: number): [number, number] | undefined {
     if (!visit) return undefined;
-    const placeM = [x * visit.extentM[0], y * visit.extentM[1]] as const;
-    const [dx, dy, dz] = visit.surface.displacementAtM(...placeM);
-    return stage.inWindow([placeM[0] + dx, placeM[1] + dy, dz]);
+    const { surface } = visit;
+    const place = surface instanceof Sheet ? surface.placeAt(x, y) : stage.pickNear(x, 1 - y);
+    return place && stage.placeInWindow(place);
   },
   pixelAfterPress: (x: number, y: number) => latency.next(x, y),
 };
@@ -416,5 +486,5 @@ const mode = asked.get("tool");
 for (const choice of document.querySelectorAll<HTMLInputElement>("input[name=mode]")) {
   if (choice.value === mode) choice.checked = true;
 }
-void open(asked.get("session") ?? undefined, asked.get("scene") ?? undefined);
+void open(asked.get("session") ?? undefined, named(asked.get("scene") ?? undefined));
 void lists();

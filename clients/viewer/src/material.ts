@@ -49,10 +49,47 @@ float contact(vec3 at) {
   return max(open, 0.0);
 }`;
 
+/** Sheets: seen from above, with an image that lies flat on them. */
+const SHEET = `
+vec3 image() { return texture2D(map, vUv).rgb; }
+float openness() { return vOpen; }
+bool isTurned() { return true; }
+float within() { return 0.0; }
+float window_(vec3 seen, vec3 lamp) { return 0.0; }`;
+
+/**
+ * Bodies: the image lies by the file's coordinates, or is projected from three sides where it has none; each of the two sides
+ * has light of its own; and what is within, such as the inside of a tube, is lit by a lamp beside the eye.
+ */
+const BODY = `
+uniform float projected;
+uniform float period;
+uniform float closed;
+varying vec3 vRest;
+varying vec3 vRestNormal;
+varying float vInner;
+vec3 image() {
+  if (projected < 0.5) return texture2D(map, vUv).rgb;
+  vec3 lie = pow(abs(normalize(vRestNormal)), vec3(5.0));
+  lie /= lie.x + lie.y + lie.z;
+  // Turned, so that the mirror images of the three sides do not line up.
+  vec3 at = vRest / period;
+  vec3 a = texture2D(map, mat2(0.94, 0.34, -0.34, 0.94) * at.yz + 0.21).rgb;
+  vec3 b = texture2D(map, mat2(0.77, -0.64, 0.64, 0.77) * at.zx + 0.47).rgb;
+  vec3 c = texture2D(map, mat2(0.87, 0.49, -0.49, 0.87) * at.xy + 0.73).rgb;
+  return a * lie.x + b * lie.y + c * lie.z;
+}
+float openness() { return gl_FrontFacing || closed > 0.5 ? vOpen : vInner; }
+bool isTurned() { return closed < 0.5; }
+float within() { return 1.0 - smoothstep(0.02, 0.42, openness()); }
+// A broad lamp, of which a smooth body shows more than a point.
+float window_(vec3 seen, vec3 lamp) { return smoothstep(0.80, 0.93, dot(seen, lamp)); }`;
+
 /** Wet tissue: red light scatters the furthest, so shadows have warm edges; a thin film of liquid mirrors lamp and sky. */
 export class Skin extends ShaderMaterial {
-  constructor() {
+  constructor(isBody: boolean) {
     super({
+      defines: isBody ? { BODY: "" } : {},
       side: DoubleSide,
       polygonOffset: true,
       polygonOffsetFactor: 1,
@@ -62,8 +99,22 @@ export class Skin extends ShaderMaterial {
         map: { value: null },
         mapped: { value: 0 },
         tone: { value: new Color(0x8e4538) },
+        projected: { value: 1 },
+        period: { value: 1 },
+        /** Of a body: whether its inner side is never seen, but for slivers at its outline. */
+        closed: { value: 0 },
+        /** Of a body: how far a lamp beside the eye shines, m. */
+        reach: { value: 1 },
       },
       vertexShader: `
+        #ifdef BODY
+        attribute vec3 rest;
+        attribute vec3 restNormal;
+        attribute float inner;
+        varying vec3 vRest;
+        varying vec3 vRestNormal;
+        varying float vInner;
+        #endif
         attribute float open;
         varying vec3 vAt;
         varying vec3 vNormal;
@@ -74,6 +125,11 @@ export class Skin extends ShaderMaterial {
           vNormal = normal;
           vUv = uv;
           vOpen = open;
+          #ifdef BODY
+          vRest = rest;
+          vRestNormal = restNormal;
+          vInner = inner;
+          #endif
           gl_Position = projectionMatrix * viewMatrix * vec4(position, 1.0);
         }`,
       fragmentShader: `
@@ -82,26 +138,33 @@ export class Skin extends ShaderMaterial {
         uniform vec3 tone;
         uniform vec4 rings[${SHADOWS + 1}];
         uniform vec3 ink;
+        uniform float reach;
         varying vec3 vAt;
         varying vec3 vNormal;
         varying vec2 vUv;
         varying float vOpen;
+        ${isBody ? BODY : SHEET}
         ${SHADOW}
         void main() {
           vec3 eye = normalize(cameraPosition - vAt);
           vec3 n = normalize(vNormal);
-          if (dot(n, eye) < 0.0 && !gl_FrontFacing) n = -n;
-          vec3 colour = mix(tone, texture2D(map, vUv).rgb, mapped);
+          if (dot(n, eye) < 0.0 && !gl_FrontFacing && isTurned()) n = -n;
+          vec3 colour = mix(tone, image(), mapped);
+          float open = openness();
+          float inside = within();
           float share = lit(vAt);
           float near = contact(vAt);
           vec3 wrap = vec3(0.28, 0.10, 0.07);
           vec3 diffuse = max((dot(n, lamp) + wrap) / (1.0 + wrap), 0.0);
-          vec3 around = mix(vec3(0.17, 0.09, 0.08), vec3(0.30, 0.32, 0.36), 0.5 + 0.5 * n.z) * vOpen * near;
+          vec3 around = mix(vec3(0.17, 0.09, 0.08), vec3(0.30, 0.32, 0.36), 0.5 + 0.5 * n.z) * open * near;
           // A shadow in tissue is never black: light comes through from the side.
-          vec3 key = diffuse * mix(vec3(0.26, 0.13, 0.12), vec3(1.0), share);
-          // The lamp, and a weak light beside the eye.
-          float beside = 0.24 * max(dot(n, eye), 0.0) * near * vOpen;
-          vec3 shown = colour * (around + beside + 1.0 * vec3(1.0, 0.965, 0.92) * key * mix(0.55, 1.0, vOpen * near));
+          vec3 key = diffuse * mix(vec3(0.26, 0.13, 0.12), vec3(1.0), share) * (1.0 - inside);
+          // The lamp, and a weak light beside the eye. Where the lamp can't reach, a stronger one, which fades with distance.
+          float beside = 0.24 * max(dot(n, eye), 0.0) * near * open;
+          float apart = length(cameraPosition - vAt) / reach;
+          float scope = inside / (0.25 + 1.5 * apart * apart);
+          beside += (0.15 + max(dot(n, eye), 0.0)) * near * scope;
+          vec3 shown = colour * (around + beside + 1.0 * vec3(1.0, 0.965, 0.92) * key * mix(0.55, 1.0, open * near));
           // Bright tissue keeps its colour.
           shown = 1.0 - exp(-1.15 * shown);
           vec3 half_ = normalize(lamp + eye);
@@ -115,11 +178,13 @@ export class Skin extends ShaderMaterial {
           sheen *= sheen * sheen;
           float glint = 0.8 * smoothstep(0.9984, 0.9994, h) + 0.055 * sheen;
           vec3 seen = reflect(-eye, n);
-          float sky = 0.30 * smoothstep(0.15, 0.9, seen.z) * (0.25 + 2.4 * mirror);
-          shown += (glint * share + 0.16 * sky * vOpen) * near * vec3(1.0, 0.98, 0.95);
+          float sky = (0.30 * smoothstep(0.15, 0.9, seen.z) + 0.85 * window_(seen, lamp) * share * (1.0 - inside)) * (0.25 + 2.4 * mirror);
+          float inner = max(dot(n, eye), 0.0);
+          glint = glint * (1.0 - inside) + 0.35 * min(scope, 1.0) * smoothstep(0.985, 0.9985, inner);
+          shown += (glint * share + 0.16 * sky * open) * near * vec3(1.0, 0.98, 0.95);
           for (int i = 0; i <= ${SHADOWS}; i++) if (rings[i].w > 0.0) {
-            float apart = abs(length(vAt - rings[i].xyz) / rings[i].w - 1.0);
-            shown = mix(shown, ink, (i < ${SHADOWS} ? 0.35 : 0.9) * (1.0 - smoothstep(0.03, 0.09, apart)));
+            float off = abs(length(vAt - rings[i].xyz) / rings[i].w - 1.0);
+            shown = mix(shown, ink, (i < ${SHADOWS} ? 0.35 : 0.9) * (1.0 - smoothstep(0.03, 0.09, off)));
           }
           gl_FragColor = vec4(shown, 1.0);
           #include <colorspace_fragment>
@@ -141,10 +206,13 @@ export class Skin extends ShaderMaterial {
 
 /** The table that the tissue lies on: it fades into the background, and the tissue's shadow lies on it. */
 export class Table extends ShaderMaterial {
-  constructor() {
+  constructor(isBody: boolean) {
     super({
+      defines: isBody ? { BODY: "" } : {},
       uniforms: {
         ...light,
+        /** Of a body: how dark the table is beneath it, over `half_` to each side of the middle. */
+        dark: { value: null },
         colour: { value: new Color() },
         background: { value: new Color() },
         middle: { value: new Vector2() },
@@ -165,13 +233,21 @@ export class Table extends ShaderMaterial {
         uniform float height;
         varying vec3 vAt;
         ${SHADOW}
+        #ifdef BODY
+        uniform sampler2D dark;
+        #endif
         float away(vec2 at) {
           vec2 q = abs(at - middle) - half_;
           return length(max(q, 0.0)) + min(max(q.x, q.y), 0.0);
         }
         void main() {
+          #ifdef BODY
+          float near = texture2D(dark, 0.5 + 0.5 * (vAt.xy - middle) / half_).r;
+          float fallen = texture2D(dark, 0.5 + 0.5 * (vAt.xy + 0.3 * height * lamp.xy - middle) / half_).g;
+          #else
           float near = exp(-max(away(vAt.xy), 0.0) / (0.30 * height));
           float fallen = 1.0 - smoothstep(-0.35 * height, 0.45 * height, away(vAt.xy + lamp.xy / lamp.z * 0.62 * height));
+          #endif
           vec3 shown = colour * (1.0 - 0.55 * near) * (1.0 - 0.38 * fallen) * mix(0.6, 1.0, lit(vAt));
           float size = max(half_.x, half_.y);
           shown = mix(shown, background, smoothstep(0.5 * size, 2.6 * size, length(vAt.xy - middle) - size));

@@ -2,7 +2,7 @@
 
 import { part } from "./page";
 import { quantity } from "./plot";
-import { norm, type Vec3 } from "./samples";
+import type { Told } from "./samples";
 import type { Stage } from "./stage";
 
 /** Longest scale bar, pixels, and of the picture's width. */
@@ -11,8 +11,8 @@ const LONGEST = { pixels: 150, part: 0.28 };
 const BESIDE = 46;
 
 /** A depth or height in words. */
-export function depthText([, , z]: Vec3): string {
-  return z > 0 ? `${quantity(z, "m")} lifted` : `${quantity(Math.max(-z, 0), "m")} deep`;
+export function depthText({ deepM }: Told): string {
+  return deepM < 0 ? `${quantity(-deepM, "m")} lifted` : `${quantity(deepM, "m")} deep`;
 }
 
 export class Overlay {
@@ -27,7 +27,7 @@ export class Overlay {
   constructor(private readonly stage: Stage) {}
 
   /** Tells what the first tool feels; nothing if there is none. */
-  tell(felt: { displacementM: Vec3; forceN: Vec3 } | undefined): void {
+  tell(felt: Told | undefined): void {
     if (this.touch.hidden === (felt === undefined)) return void (felt && this.write(felt));
     this.touch.hidden = felt === undefined;
     if (felt) {
@@ -36,9 +36,9 @@ export class Overlay {
     }
   }
 
-  private write(felt: { displacementM: Vec3; forceN: Vec3 }): void {
-    this.depth.textContent = depthText(felt.displacementM);
-    this.force.textContent = `${quantity(norm(felt.forceN), "N")} back`;
+  private write(felt: Told): void {
+    this.depth.textContent = depthText(felt);
+    this.force.textContent = `${quantity(felt.allN, "N")} back`;
   }
 
   /** Call after each picture. */

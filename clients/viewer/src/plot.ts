@@ -134,12 +134,12 @@ export class Plots {
 
   constructor(displacement: HTMLCanvasElement, force: HTMLCanvasElement) {
     this.depth = new Plot(displacement, "m", [
-      { name: "deep", colour: "--depth", of: ({ displacementM }) => -displacementM[2] },
-      { name: "sideways", colour: "--faint", of: ({ displacementM: [x, y] }) => Math.hypot(x, y) },
+      { name: "deep", colour: "--depth", of: ({ deepM }) => deepM },
+      { name: "sideways", colour: "--faint", of: ({ asideM }) => asideM },
     ]);
     this.force = new Plot(force, "N", [
-      { name: "pushes up", colour: "--force", of: ({ forceN }) => forceN[2] },
-      { name: "sideways", colour: "--faint", of: ({ forceN: [x, y] }) => Math.hypot(x, y) },
+      { name: "pushes back", colour: "--force", of: ({ outN }) => outN },
+      { name: "sideways", colour: "--faint", of: ({ acrossN }) => acrossN },
     ]);
   }
 

@@ -17,18 +17,35 @@ export function norm([x, y, z]: Vec3): number {
 /** The sample of a tool at the end of a step. */
 export interface Felt {
   tool: number;
-  /** The control point's indices in the grid. */
+  /** The control point: its indices in the grid of a sheet, or its number in the file of a mesh. */
   point: GridPoint | undefined;
+  vertex: number | undefined;
   displacementM: Vec3;
   forceN: Vec3;
   appliedN: Vec3;
 }
 
+/** What a tool feels, by the direction out of the tissue where it is. */
+export interface Told {
+  /** Displacement of the control point: into the tissue, and across. */
+  deepM: number;
+  asideM: number;
+  /** Force of the tissue on the tool: out of the tissue, and across; and all of it. */
+  outN: number;
+  acrossN: number;
+  allN: number;
+}
+
 /** One moment in the plots. */
-export interface Moment {
+export interface Moment extends Told {
   timeS: number;
   displacementM: Vec3;
-  forceN: Vec3;
+}
+
+/** How a tool feels: the direction out of the tissue at a tool, and what forces on it are told times. */
+export interface Sense {
+  outward: Vec3;
+  share: number;
 }
 
 /** Samples per second: more than a screen shows, few enough for any network. */
@@ -47,7 +64,20 @@ export class Samples {
   readonly history: Moment[] = [];
   onSample: (sample: Sample) => void = () => {};
 
-  constructor(private readonly mostN: number) {}
+  /** Forces of the tissue on a tool that are worth telling come to about a hundredth of `pointN`. */
+  constructor(
+    private readonly pointN: number,
+    private readonly sense: (tool: Felt) => Sense,
+  ) {}
+
+  /** A tool's sample in words of the place that it touches. */
+  tell(tool: Felt): Told {
+    const { outward: n, share } = this.sense(tool);
+    const [u, f] = [tool.displacementM, tool.forceN];
+    const along = (v: Vec3) => v[0] * n[0] + v[1] * n[1] + v[2] * n[2];
+    const across = (v: Vec3) => norm([v[0] - along(v) * n[0], v[1] - along(v) * n[1], v[2] - along(v) * n[2]]);
+    return { deepM: -along(u), asideM: across(u), outN: share * along(f), acrossN: share * across(f), allN: share * norm(f) };
+  }
 
   /** Reads until `signal` aborts. */
   run(
@@ -72,20 +102,21 @@ export class Samples {
   private take(sample: Sample): void {
     this.newest = sample;
     const felt = sample.tools
-      .filter((tool) => tool.point !== undefined)
+      .filter((tool) => tool.point !== undefined || tool.vertex !== undefined)
       .map((tool) => ({
         tool: tool.tool,
         point: tool.point,
+        vertex: tool.vertex,
         displacementM: vec(tool.displacementM),
         forceN: vec(tool.forceOnToolN),
         appliedN: vec(tool.appliedForceN),
       }));
     // The server reports a released tool while its point still moves, so the plots show it come to rest.
-    const least = FELT * this.mostN;
+    const least = FELT * this.pointN;
     this.tools = felt.filter((tool) => norm(tool.appliedN) > least || norm(tool.forceN) > least);
     const timeS = sample.simulationTimeS;
     const first = this.tools[0] ?? felt[0];
-    if (first) this.history.push({ timeS, displacementM: first.displacementM, forceN: first.forceN });
+    if (first) this.history.push({ timeS, displacementM: first.displacementM, ...this.tell(first) });
     // A gap of a second or more stays visible. Older samples are dropped.
     while (this.history.length > 0 && this.history[0]!.timeS < timeS - HISTORY_S) this.history.shift();
     this.onSample(sample);

@@ -1,8 +1,7 @@
 // The picture: tissue, table, tools and camera. Drawn on changes, at most once per display frame.
 
 import {
-  BufferAttribute,
-  BufferGeometry,
+  Box3,
   Color,
   DoubleSide,
   LineBasicMaterial,
@@ -12,6 +11,7 @@ import {
   MOUSE,
   PerspectiveCamera,
   Plane,
+  Ray,
   Raycaster,
   Scene,
   SRGBColorSpace,
@@ -22,11 +22,14 @@ import {
   WebGLRenderer,
 } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+import { Body } from "./body";
 import { Effort, isDrawnBySoftware } from "./effort";
-import { light, Skin, SHADOWS, Table } from "./material";
+import { Ground } from "./ground";
+import { homeOfBody, homeOfSheet } from "./home";
+import { light, Skin, SHADOWS } from "./material";
 import type { Vec3 } from "./samples";
-import type { Surface } from "./surface";
-import { type ShownTool, ToolMark } from "./tool";
+import type { Place, Surface } from "./surface";
+import { type Seen, type ShownTool, ToolMark } from "./tool";
 
 /** After this time without a frame, tool changes are drawn on their own. */
 const ALONE_MS = 40;
@@ -39,10 +42,17 @@ const CALM_TAKES_MS = 500;
 /** Movements of the tissue that nobody sees, of its size. */
 const UNSEEN = 2e-5;
 const FIELD_OF_VIEW = 28;
-/** The tissue fills the picture up to these margins, pixels: the words at the top and the bottom stay free. */
-const MARGIN = { top: 14, bottom: 46, side: 12 };
-/** Least height of the camera above the tissue, of its size. */
+/** Least height of the camera above a sheet, of its size. */
 const LEAST_HEIGHT = 0.06;
+/** The least distance of the camera from a closed body, and of what it turns about in an open one, of its size. */
+const NEAREST = 0.05;
+const AHEAD = 0.15;
+/** The camera's range of heights about its target, from straight above: of a sheet, and of a body. */
+const POLAR = { sheet: [0, 0.46 * Math.PI], body: [0.02, Math.PI - 0.02] } as const;
+/** Where the lamp of a body is, to the right of the eye, above and behind it. */
+const LAMP = [-0.66, 0.78, 0.34] as const;
+/** The length of a texture on a body that has none of its own coordinates, m: where its details have their natural size. */
+const PERIOD_M = 0.075;
 
 export class Stage {
   readonly camera = new PerspectiveCamera(FIELD_OF_VIEW, 1, 0.01, 10);
@@ -57,20 +67,21 @@ export class Stage {
   private readonly renderer: WebGLRenderer;
   private readonly scene = new Scene();
   private readonly orbit: OrbitControls;
-  private readonly skin = new Skin();
-  private readonly cloth = new Table();
+  /** Of sheets and of bodies: each is compiled when it is first used. */
+  private readonly skins = { sheet: new Skin(false), body: new Skin(true) };
+  private skin = this.skins.sheet;
+  private ground: Ground | undefined;
+  private readonly colour = { table: new Color(), background: new Color() };
   private readonly hidden = new MeshBasicMaterial({ side: DoubleSide, polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 });
   private readonly wires = new LineBasicMaterial();
   private mesh: Mesh | undefined;
   private flank: Mesh | undefined;
   private lines: LineSegments | undefined;
-  private table: Mesh | undefined;
   private surface: Surface | undefined;
   private readonly marks: ToolMark[] = [];
   private tools: ShownTool[] = [];
   private mostN = 1;
-  private aimM: [number, number] | undefined;
-  private extentM = new Vector2(1, 1);
+  private aim: Place | undefined;
   /** Whether the camera is where the page put it. */
   private isHome = true;
   private wanted = false;
@@ -89,6 +100,8 @@ export class Stage {
   private later: ReturnType<typeof setTimeout> | undefined;
   private calm: ReturnType<typeof setTimeout> | undefined;
   private readonly spot = new Vector3();
+  private readonly bounds = new Box3();
+  private readonly seen: Seen = { eye: new Vector3(), right: new Vector3() };
   private readonly projected = new Vector3();
 
   /** With `isFixed`, always uses the greatest effort, however long a picture takes. */
@@ -105,10 +118,8 @@ export class Stage {
     this.scene.add(this.camera);
     this.orbit = new OrbitControls(this.camera, canvas);
     // The left button and one finger control the tool.
-    this.orbit.mouseButtons = { LEFT: null, MIDDLE: MOUSE.DOLLY, RIGHT: MOUSE.ROTATE };
+    this.orbit.mouseButtons = { LEFT: null, MIDDLE: MOUSE.PAN, RIGHT: MOUSE.ROTATE };
     this.orbit.touches = { ONE: null, TWO: TOUCH.DOLLY_ROTATE };
-    this.orbit.maxPolarAngle = 0.46 * Math.PI;
-    this.orbit.screenSpacePanning = false;
     this.orbit.addEventListener("start", () => (this.isHome = false));
     this.orbit.addEventListener("change", () => {
       this.views += 1;
@@ -120,31 +131,45 @@ export class Stage {
     this.colours();
   }
 
-  /** Shows a surface of `extentM` metres. `keepView` keeps the camera and the texture. */
-  show(surface: Surface, extentM: [number, number], keepView: boolean): void {
-    for (const old of [this.mesh, this.flank, this.lines, this.table]) if (old) this.scene.remove(old);
+  /** Shows a surface. `keepView` keeps the camera and the texture. */
+  show(surface: Surface, keepView: boolean): void {
+    for (const old of [this.mesh, this.flank, this.lines, this.ground?.mesh]) if (old) this.scene.remove(old);
     this.surface?.dispose();
-    this.table?.geometry.dispose();
+    this.ground?.dispose();
     this.surface = surface;
     surface.drawEvery(this.effort.now.every);
-    if (!keepView) this.skin.dropTexture();
-    this.mesh = new Mesh(surface.geometry, this.skin);
-    this.flank = new Mesh(surface.flank.geometry, this.skin);
+    const isBody = surface instanceof Body;
+    const skin = isBody ? this.skins.body : this.skins.sheet;
+    if (!keepView || skin !== this.skin) this.skin.dropTexture();
+    this.skin = skin;
+    const size = surface.sizeM;
+    if (isBody) {
+      skin.uniforms.projected!.value = surface.isMapped ? 0 : 1;
+      // A body of another size than an organ has as many details.
+      skin.uniforms.period!.value = size > 0.4 * PERIOD_M && size < 10 * PERIOD_M ? PERIOD_M : size / 3;
+      skin.uniforms.reach!.value = size;
+      skin.uniforms.closed!.value = surface.isOpen ? 0 : 1;
+      surface.onLight = () => this.draw();
+    }
+    this.mesh = new Mesh(surface.geometry, skin);
+    this.flank = surface.flank && new Mesh(surface.flank.geometry, skin);
     this.lines = new LineSegments(surface.lines, this.wires);
-    this.extentM.set(...extentM);
-    const size = this.extentM.length();
-    this.table = new Mesh(tableGeometry(extentM, surface.flank.roundM, surface.flank.heightM, 8 * size), this.cloth);
-    const { middle, half_, height } = this.cloth.uniforms as Record<string, { value: unknown }>;
-    (middle!.value as Vector2).set(extentM[0] / 2, extentM[1] / 2);
-    (half_!.value as Vector2).set(extentM[0] / 2, extentM[1] / 2).addScalar(0.6 * surface.flank.roundM);
-    height!.value = surface.flank.heightM;
-    // Bounds of a moving surface are not worth computing.
-    for (const part of [this.mesh, this.flank, this.lines, this.table]) part.frustumCulled = false;
-    this.scene.add(this.mesh, this.flank, this.lines, this.table);
-    this.camera.near = size / 60;
+    this.ground = new Ground(surface, this.colour.table, this.colour.background);
+    for (const part of [this.mesh, this.flank, this.lines, this.ground.mesh]) {
+      if (!part) continue;
+      // Bounds of a moving surface are not worth computing.
+      part.frustumCulled = false;
+      this.scene.add(part);
+    }
+    this.camera.near = isBody ? size / 300 : size / 60;
     this.camera.far = size * 20;
-    this.orbit.minDistance = size / 4;
+    this.orbit.minDistance = isBody ? size / 40 : size / 4;
     this.orbit.maxDistance = size * 5;
+    [this.orbit.minPolarAngle, this.orbit.maxPolarAngle] = POLAR[isBody ? "body" : "sheet"];
+    this.orbit.screenSpacePanning = isBody;
+    // What is under the pointer comes nearer.
+    this.orbit.zoomToCursor = isBody;
+    this.aim = undefined;
     if (!keepView) this.isHome = true;
     if (this.isHome) this.goHome();
     this.setWireframe(this.wireframe);
@@ -157,40 +182,14 @@ export class Stage {
     this.draw();
   }
 
-  /** Puts the camera where the whole tissue fills the picture: lower in a wide one, higher in a narrow one. */
+  /** Puts the camera where the whole tissue fills the picture. */
   private goHome(): void {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     const surface = this.surface;
     if (!surface || width === 0 || height === 0) return;
-    const [w, l] = [this.extentM.x, this.extentM.y];
-    const { roundM, heightM } = surface.flank;
-    const aspect = (width - 2 * MARGIN.side) / Math.max(height - MARGIN.top - MARGIN.bottom, 1);
-    const elevation = Math.asin(Math.min(Math.max((0.98 * w) / Math.max(l, 1e-9) / aspect, 0.64), 0.9));
-    const target = this.orbit.target.set(w / 2, l / 2, 0);
-    const away = new Vector3(0, -Math.cos(elevation), Math.sin(elevation));
-    const tangent = Math.tan(((FIELD_OF_VIEW / 2) * Math.PI) / 180);
-    const part = { x: 1 - (2 * MARGIN.side) / width, y: 1 - (MARGIN.top + MARGIN.bottom) / height };
-    let distance = 3 * Math.max(w, l);
-    let [low, high] = [0, 0];
-    for (let round = 0; round < 12; round++) {
-      let widest = 0;
-      [low, high] = [Infinity, -Infinity];
-      for (const x of [-roundM - w / 2, w / 2 + roundM]) {
-        for (const [y, z] of [[-l / 2 - roundM, -roundM], [-l / 2 - roundM, -heightM], [l / 2 + roundM, 0]] as const) {
-          const depth = distance - (y * away.y + z * away.z);
-          const up = (y * Math.sin(elevation) + z * Math.cos(elevation)) / depth / tangent;
-          low = Math.min(low, up);
-          high = Math.max(high, up);
-          widest = Math.max(widest, (Math.abs(x) / depth / tangent) * (height / width));
-        }
-      }
-      distance *= Math.max(widest / part.x, (high - low) / 2 / part.y);
-    }
-    this.camera.position.copy(target).addScaledVector(away, distance);
-    // The middle of what is seen goes to the middle of what is free.
-    const lift = (MARGIN.bottom - MARGIN.top) / 2 - ((low + high) / 2) * (height / 2);
-    this.camera.setViewOffset(width, height, 0, lift, width, height);
-    this.camera.updateProjectionMatrix();
+    const home = [this.camera, this.orbit.target, { width, height }] as const;
+    if (surface instanceof Body) homeOfBody(surface, ...home);
+    else homeOfSheet(surface, ...home);
     this.orbit.update();
     this.views += 1;
     this.draw();
@@ -201,7 +200,7 @@ export class Stage {
     if (this.mesh) this.mesh.material = on ? this.hidden : this.skin;
     if (this.lines) this.lines.visible = on;
     if (this.flank) this.flank.visible = !on;
-    if (this.table) this.table.visible = !on;
+    if (this.ground) this.ground.mesh.visible = !on;
     this.draw();
   }
 
@@ -210,9 +209,9 @@ export class Stage {
     const least = 2e-3 * mostN;
     const isSame =
       tools.length === this.tools.length &&
-      tools.every(({ restM, forceN }, index) => {
+      tools.every(({ place, forceN }, index) => {
         const old = this.tools[index]!;
-        return restM.every((v, c) => v === old.restM[c]) && forceN.every((v, c) => Math.abs(v - old.forceN[c]!) < least);
+        return place.restM.every((v, c) => v === old.place.restM[c]) && forceN.every((v, c) => Math.abs(v - old.forceN[c]!) < least);
       });
     if (isSame) return;
     this.tools = tools;
@@ -227,18 +226,19 @@ export class Stage {
 
   /** Puts the tools on the tissue as it is drawn now. */
   private placeTools(): void {
-    const size = this.extentM.length();
-    this.spot.setFromMatrixColumn(this.camera.matrixWorld, 0);
+    const surface = this.surface;
+    this.seen.right.setFromMatrixColumn(this.camera.matrixWorld, 0);
+    this.seen.eye.copy(this.camera.position);
     for (let index = 0; index < this.marks.length; index++) {
-      const tool = this.held || !this.surface ? undefined : this.tools[index];
-      if (tool) this.marks[index]!.show(tool, this.surface!, size, this.mostN, this.spot);
+      const tool = this.held ? undefined : this.tools[index];
+      if (tool && surface) this.marks[index]!.show(tool, surface, surface.sizeM, this.mostN, this.seen);
       else this.marks[index]!.hide();
     }
-    const aim = light.rings.value[SHADOWS]!;
-    aim.w = 0;
-    if (!this.aimM || !this.surface || this.held) return;
-    const moved = this.surface.displacementAt(...this.aimM);
-    aim.set(this.aimM[0] + moved.x, this.aimM[1] + moved.y, moved.z, size / 42);
+    const ring = light.rings.value[SHADOWS]!;
+    ring.w = 0;
+    if (!this.aim || !surface || this.held) return;
+    const at = this.spot.set(...this.aim.restM).add(surface.displacementAt(this.aim));
+    ring.set(at.x, at.y, at.z, surface.sizeM / 42);
   }
 
   /** The first tool's tip in the window; undefined if there is none. */
@@ -265,8 +265,9 @@ export class Stage {
 
   /** Pixels of the window for a metre across, at the middle of the tissue. */
   pixelsPerMetre(): number {
-    const middle: Vec3 = [this.extentM.x / 2, this.extentM.y / 2, 0];
-    const step = 0.01 * this.extentM.length();
+    if (!this.surface) return NaN;
+    const middle = this.surface.box.getCenter(new Vector3()).toArray();
+    const step = 0.01 * this.surface.sizeM;
     const right = this.spot.setFromMatrixColumn(this.camera.matrixWorld, 0);
     const [rx, ry, rz] = [right.x, right.y, right.z];
     const [x0, y0] = this.inWindow([middle[0] - step * rx, middle[1] - step * ry, middle[2] - step * rz]);
@@ -284,9 +285,9 @@ export class Stage {
     return this.effort.describe(this.surface?.every ?? 1);
   }
 
-  /** Marks a place in the rest plane, where the keys aim. */
-  setAim(atM: [number, number] | undefined): void {
-    this.aimM = atM;
+  /** Marks the place where the keys aim. */
+  setAim(place: Place | undefined): void {
+    this.aim = place;
     this.draw();
   }
 
@@ -295,7 +296,8 @@ export class Stage {
     const offset = this.camera.position.clone().sub(this.orbit.target);
     const flat = Math.hypot(offset.x, offset.y);
     const about = Math.atan2(offset.y, offset.x) + azimuth;
-    const up = Math.min(Math.max(Math.atan2(offset.z, flat) + polar, 0.13), 1.55);
+    const least = this.surface instanceof Body ? -1.55 : 0.13;
+    const up = Math.min(Math.max(Math.atan2(offset.z, flat) + polar, least), 1.55);
     const far = offset.length() / nearer;
     const away = new Vector3(Math.cos(up) * Math.cos(about), Math.cos(up) * Math.sin(about), Math.sin(up));
     this.camera.position.copy(this.orbit.target).addScaledVector(away, far);
@@ -313,25 +315,36 @@ export class Stage {
     return caster;
   }
 
-  /** The place in the rest plane whose tissue is under a point of the window; undefined beside the sheet. */
-  pick(x: number, y: number): [number, number] | undefined {
-    const surface = this.surface;
-    if (!surface) return undefined;
-    const { ray } = this.ray(x, y);
-    const level = new Plane(new Vector3(0, 0, 1), 0);
-    const hit = new Vector3();
-    let moved: Vec3 = [0, 0, 0];
-    // Intersect the ray with the level of the tissue found in the last round; dents are flat enough for a few rounds.
-    for (let round = 0; round < 6; round++) {
-      level.constant = -moved[2];
-      if (!ray.intersectPlane(level, hit)) return undefined;
-      moved = surface.displacementAtM(hit.x - moved[0], hit.y - moved[1]);
+  /** The place of the tissue under a point of the window; undefined where there is none. */
+  pick(x: number, y: number): Place | undefined {
+    return this.surface?.pick(this.ray(x, y).ray);
+  }
+
+  /** The place in the middle of the window, or next to it. */
+  pickMiddle(): Place | undefined {
+    return this.pickNear(0.5, 0.5);
+  }
+
+  /** The place nearest to a point of the picture, in fractions of its width and height. */
+  pickNear(fx: number, fy: number): Place | undefined {
+    const box = this.canvas.getBoundingClientRect();
+    const step = Math.min(box.width, box.height) / 24;
+    for (let ring = 0; ring < 24; ring++) {
+      for (let k = 0; k < Math.max(1, 8 * ring); k++) {
+        const angle = (k / Math.max(1, 8 * ring)) * 2 * Math.PI;
+        const x = box.left + fx * box.width + ring * step * Math.cos(angle);
+        const y = box.top + fy * box.height + ring * step * Math.sin(angle);
+        const place = this.pick(x, y);
+        if (place) return place;
+      }
     }
-    const [px, py] = [hit.x - moved[0], hit.y - moved[1]];
-    const margin = 0.01 * this.extentM.length();
-    const inside = px > -margin && py > -margin && px < this.extentM.x + margin && py < this.extentM.y + margin;
-    const clamped = (v: number, most: number) => Math.min(Math.max(v, 0), most);
-    return inside ? [clamped(px, this.extentM.x), clamped(py, this.extentM.y)] : undefined;
+    return undefined;
+  }
+
+  /** Whether a drag with the left button or one finger turns the view. */
+  turnByDrag(on: boolean): void {
+    this.orbit.mouseButtons.LEFT = on ? MOUSE.ROTATE : null;
+    this.orbit.touches.ONE = on ? TOUCH.ROTATE : null;
   }
 
   /** The place of a window point on the plane through `at` that faces the camera. */
@@ -349,11 +362,20 @@ export class Stage {
     return [box.left + ((p.x + 1) / 2) * box.width, box.top + ((1 - p.y) / 2) * box.height];
   }
 
-  /** The direction in the rest plane that points right in the window; one metre long. */
-  rightwards(): [number, number] {
+  /** A direction across the tissue at a place, of length 1: `way` to the right and up, as seen. */
+  across({ outward }: Place, way: [number, number]): Vector3 {
+    const out = new Vector3(...outward);
     const right = new Vector3().setFromMatrixColumn(this.camera.matrixWorld, 0);
-    const length = Math.hypot(right.x, right.y) || 1;
-    return [right.x / length, right.y / length];
+    right.addScaledVector(out, -right.dot(out));
+    if (right.lengthSq() < 1e-6) right.set(1, 0, 0).addScaledVector(out, -out.x);
+    right.normalize();
+    return out.cross(right).multiplyScalar(way[1]).addScaledVector(right, way[0]);
+  }
+
+  /** Where a place is now, in the window. */
+  placeInWindow(place: Place): [number, number] | undefined {
+    if (!this.surface) return undefined;
+    return this.inWindow(new Vector3(...place.restM).add(this.surface.displacementAt(place)).toArray());
   }
 
   /** Requests a picture of a frame. One that moves nothing visibly is not worth drawing what stands there in full again. */
@@ -378,7 +400,7 @@ export class Stage {
     this.later = undefined;
     this.surface?.refresh();
     this.unseenM += this.surface?.takeMoved() ?? 0;
-    if (this.isFine && !this.isDue && !this.held && this.unseenM < UNSEEN * this.extentM.length()) {
+    if (this.isFine && !this.isDue && !this.held && this.unseenM < UNSEEN * (this.surface?.sizeM ?? 1)) {
       this.drawn += 1;
       return;
     }
@@ -412,22 +434,75 @@ export class Stage {
     this.renderer.render(this.scene, this.camera);
   }
 
-  /** Keeps the camera above the tissue and the table, and its target in the tissue; and the lamp to the left behind it. */
+  /** Keeps the camera's target in the tissue, and the camera above a sheet and its table; and puts the lamp where it belongs. */
   private stayAbove(): void {
+    const surface = this.surface;
+    if (!surface) return;
     const { position } = this.camera;
     const { target } = this.orbit;
-    const size = this.extentM.length();
-    target.x = Math.min(Math.max(target.x, 0), this.extentM.x);
-    target.y = Math.min(Math.max(target.y, 0), this.extentM.y);
-    const floor = Math.max(this.surface?.heightAt(position.x, position.y) ?? 0, 0) + LEAST_HEIGHT * size;
-    if (position.z < floor) {
-      position.z = floor;
-      this.camera.lookAt(target);
+    if (surface.flank) {
+      target.x = Math.min(Math.max(target.x, surface.box.min.x), surface.box.max.x);
+      target.y = Math.min(Math.max(target.y, surface.box.min.y), surface.box.max.y);
+      const floor = Math.max(surface.heightAt(position.x, position.y) ?? 0, 0) + LEAST_HEIGHT * surface.sizeM;
+      if (position.z < floor) {
+        position.z = floor;
+        this.camera.lookAt(target);
+      }
+      this.camera.updateMatrixWorld();
+      // From the left and behind the tissue, as seen: dents turn a dark flank to the eye, and the far ones shine.
+      const ahead = this.spot.copy(target).sub(position).setZ(0).normalize();
+      light.lamp.value.set(0.5 * ahead.x - 0.62 * ahead.y, 0.5 * ahead.y + 0.62 * ahead.x, 0.98).normalize();
+      return;
     }
+    if (surface.isOpen) this.goIn(surface, target);
+    else this.stayOutside(surface);
     this.camera.updateMatrixWorld();
-    // From the left and behind the tissue, as seen: dents turn a dark flank to the eye, and the far ones shine.
-    const ahead = this.spot.copy(target).sub(position).setZ(0).normalize();
-    light.lamp.value.set(0.5 * ahead.x - 0.62 * ahead.y, 0.5 * ahead.y + 0.62 * ahead.x, 0.98).normalize();
+    // Over the left shoulder, whatever is looked at.
+    const lamp = light.lamp.value.set(0, 0, 0);
+    LAMP.forEach((part, column) => lamp.addScaledVector(this.spot.setFromMatrixColumn(this.camera.matrixWorld, column), part));
+    lamp.normalize();
+  }
+
+  /** An open body is entered: what the camera turns about stays ahead of it. */
+  private goIn(surface: Surface, target: Vector3): void {
+    const { position } = this.camera;
+    const ahead = this.spot.copy(target).sub(position);
+    const least = AHEAD * surface.sizeM;
+    if (ahead.length() < least) target.copy(position).addScaledVector(ahead.normalize(), least);
+    this.bounds.copy(surface.box).expandByScalar(0.2 * surface.sizeM).clampPoint(target, target);
+  }
+
+  /** A closed body is not entered. */
+  private stayOutside(surface: Surface): void {
+    const { position } = this.camera;
+    surface.box.clampPoint(this.orbit.target, this.orbit.target);
+    const ahead = this.camera.getWorldDirection(new Vector3());
+    const toEye = new Ray(position, ahead);
+    const hit = surface.pick(toEye);
+    if (!hit) return;
+    const at = surface.displacementAt(hit).add(this.spot.set(...hit.restM));
+    const apart = at.distanceTo(position);
+    const normal = surface.outerAt(hit);
+    const least = NEAREST * surface.sizeM;
+    // The eye sees an inner side, or is about to.
+    if (normal.dot(ahead) > 0) {
+      const back = surface.pick(new Ray(position.clone(), ahead.clone().negate()));
+      const out = back ? surface.displacementAt(back).add(this.spot.set(...back.restM)).distanceTo(position) : 0;
+      position.addScaledVector(ahead, -out - least);
+    } else if (apart < least) {
+      position.addScaledVector(ahead, apart - least);
+    }
+  }
+
+  /** Whether the camera is where the page put it. */
+  get isAtHome(): boolean {
+    return this.isHome;
+  }
+
+  /** Gives a picture right after drawing it, when it can be read. */
+  snap(take: (drawn: HTMLCanvasElement) => void): void {
+    this.paint();
+    take(this.canvas);
   }
 
   /** Draws again what stands still, with all pixels and smooth edges. */
@@ -484,30 +559,10 @@ export class Stage {
     this.scene.background = background;
     this.hidden.color.copy(background);
     this.wires.color.set(style.color);
-    (this.cloth.uniforms.background!.value as Color).copy(background);
-    (this.cloth.uniforms.colour!.value as Color).set(style.getPropertyValue("--table").trim() || style.backgroundColor);
+    this.colour.background.copy(background);
+    this.colour.table.set(style.getPropertyValue("--table").trim() || style.backgroundColor);
+    this.ground?.colours(this.colour.table, this.colour.background);
     light.ink.value.set(0xfff4ec);
     this.draw();
   }
-}
-
-/** The table, with a hole beneath the tissue: a dent may reach below it. */
-function tableGeometry([width, length]: [number, number], roundM: number, heightM: number, farM: number): BufferGeometry {
-  const places: number[] = [];
-  const corners = [[0, 0], [width, 0], [width, length], [0, length]] as const;
-  const segments = 8;
-  for (let corner = 0; corner <= 4; corner++) {
-    const [x, y] = corners[corner % 4]!;
-    for (let k = 0; k <= segments; k++) {
-      const angle = Math.PI + (corner % 4) * (Math.PI / 2) + (k / segments) * (Math.PI / 2);
-      const [ox, oy] = [Math.cos(angle), Math.sin(angle)];
-      places.push(x + 0.5 * roundM * ox, y + 0.5 * roundM * oy, -heightM, x + farM * ox, y + farM * oy, -heightM);
-    }
-  }
-  const triangles: number[] = [];
-  for (let i = 0; i + 3 < places.length / 3; i += 2) triangles.push(i, i + 1, i + 3, i, i + 3, i + 2);
-  const geometry = new BufferGeometry();
-  geometry.setAttribute("position", new BufferAttribute(new Float32Array(places), 3));
-  geometry.setIndex(triangles);
-  return geometry;
 }

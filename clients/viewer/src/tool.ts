@@ -13,21 +13,28 @@ import {
 } from "three";
 import { light, SHADOWS, Steel } from "./material";
 import { norm, type Vec3 } from "./samples";
-import type { Surface } from "./surface";
+import type { Place, Surface } from "./surface";
 
 /** A tool in the state of the server's sample. */
 export interface ShownTool {
-  /** The control point's place at rest. */
-  restM: [number, number];
+  /** The control point. */
+  place: Place;
   /** Force of the tissue on the tool. */
   forceN: Vec3;
+}
+
+/** How one looks at it: where the eye is, and what is to the right. */
+export interface Seen {
+  eye: Vector3;
+  right: Vector3;
 }
 
 /** Radius of the shaft, of that of the tip; length of the shaft, of the size of the tissue. */
 const SHAFT = 0.42;
 const LENGTH = 0.75;
-/** Places of the shaft that must be clear of tissue. */
-const CHECKED = 16;
+/** A tool that is closer to the eye than this part of the tissue's size is drawn smaller, down to this part of itself. */
+const NEAR = 0.9;
+const LEAST = 0.25;
 /** How far the shaft leans aside, as long as there is room. */
 const LEAN = new Vector3(0.5, 0.28, 0.82).normalize();
 const UP = new Vector3(0, 0, 1);
@@ -45,6 +52,12 @@ export class ToolMark {
   private readonly foot: Mesh;
   private readonly level: Mesh;
   private readonly tried = new Vector3();
+  /** Out of the tissue where the tool is, and two directions across. */
+  private readonly out = new Vector3(0, 0, 1);
+  private readonly across = new Vector3();
+  private readonly aside = new Vector3();
+  private isNew = true;
+  private readonly moved = new Vector3();
   private readonly force = new Vector3();
   private radiusM = 0;
   private lengthM = 0;
@@ -74,23 +87,27 @@ export class ToolMark {
 
   hide(): void {
     this.group.visible = false;
+    this.isNew = true;
     if (this.index >= SHADOWS) return;
     light.tips.value[this.index]!.w = 0;
     light.rings.value[this.index]!.w = 0;
   }
 
-  /** Puts the tool on the tissue as it is drawn. `size` is the tissue's, m; `right` is to the right as seen. */
-  show(tool: ShownTool, surface: Surface, size: number, mostN: number, right: Vector3): void {
+  /** Puts the tool on the tissue as it is drawn. `size` is the tissue's, m. */
+  show(tool: ShownTool, surface: Surface, size: number, mostN: number, { right, eye }: Seen): void {
     this.group.visible = true;
-    const [x, y] = tool.restM;
-    const moved = surface.displacementAt(x, y);
-    const [dx, dy, dz] = [moved.x, moved.y, moved.z];
-    const r = (this.radiusM = size / 64);
+    const { place } = tool;
+    const moved = this.moved.copy(surface.displacementAt(place));
+    // From within a body one looks at it from close by.
+    const apart = this.tipM.set(...place.restM).add(moved).distanceTo(eye);
+    const near = surface.flank ? 1 : Math.min(1, Math.max(apart / (NEAR * size), LEAST));
+    const r = (this.radiusM = (near * size) / 64);
     this.lengthM = LENGTH * size;
-    this.tipM.set(x + dx, y + dy, 0);
-    this.tipM.z = surface.restOn(this.tipM.x, this.tipM.y, r);
-    this.direct(surface, dx, dy);
-    this.roomM = Math.min(this.tipM.z - surface.restOn(this.tipM.x, this.tipM.y, r), this.room(surface, this.axis));
+    surface.restOn(place, r, this.tipM);
+    this.turn(place, right);
+    this.direct(surface, eye);
+    // The tip rests on the tissue, so it has none to spare.
+    this.roomM = Math.min(0, this.roomOf(surface, this.axis));
     this.probe.position.copy(this.tipM);
     this.probe.scale.setScalar(r);
     this.probe.quaternion.setFromUnitVectors(UP, this.axis);
@@ -99,23 +116,26 @@ export class ToolMark {
     this.arrow.visible = acts;
     if (acts) {
       this.force.set(...tool.forceN).divideScalar(strength);
-      const long = Math.min(strength / mostN, 1.2) * 0.26 * size + 2.4 * r;
+      const long = near * Math.min(strength / mostN, 1.2) * 0.26 * size + 2.4 * r;
       this.arrow.position.copy(this.tipM);
       this.arrow.quaternion.setFromUnitVectors(UP, this.force);
       this.rod.scale.set(r, r, long - 1.5 * r);
       this.head.position.z = long;
       this.head.scale.setScalar(r);
     }
-    const deep = Math.abs(dz) > 0.8 * r;
+    const high = moved.dot(this.out);
+    const deep = Math.abs(high) > 0.8 * r;
     this.gauge.visible = this.foot.visible = this.level.visible = deep;
     if (deep) {
-      this.level.position.set(x + dx, y + dy, 0);
+      this.level.position.set(...place.restM).add(moved).addScaledVector(this.out, -high);
       this.level.scale.setScalar(r);
+      this.level.quaternion.setFromUnitVectors(UP, this.out);
       // Beside the arrow, from the level of rest to the tissue.
-      this.gauge.position.copy(this.level.position).addScaledVector(right, -1.78 * r);
-      this.gauge.scale.set(r, r, -dz);
-      this.foot.position.copy(this.gauge.position);
-      this.foot.position.z = dz;
+      this.tried.copy(right).addScaledVector(this.out, -right.dot(this.out)).normalize();
+      this.gauge.position.copy(this.level.position).addScaledVector(this.tried, -1.78 * r);
+      this.gauge.quaternion.copy(this.level.quaternion);
+      this.gauge.scale.set(r, r, -high);
+      this.foot.position.copy(this.gauge.position).addScaledVector(this.out, high);
       this.foot.scale.setScalar(r);
     }
     if (this.index >= SHADOWS) return;
@@ -125,14 +145,40 @@ export class ToolMark {
     light.rings.value[this.index]!.copy(light.tips.value[this.index]!).setW(2.1 * r);
   }
 
-  /** Turns the shaft as far aside as the tissue leaves room; else upright, or towards where the tissue came from. */
-  private direct(surface: Surface, dx: number, dy: number): void {
+  /** The directions of the place: a shaft that stands on it goes on leaning as it did. */
+  private turn(place: Place, right: Vector3): void {
+    const before = this.tried.copy(this.out);
+    this.out.set(...place.outward);
+    if (!this.isNew && before.distanceToSquared(this.out) < 1e-12) return;
+    if (this.isNew || before.dot(this.out) < -0.9) {
+      // On a sheet along its sides, so that the shaft does not turn with the view.
+      if (this.out.z > 0.9999) this.across.set(1, 0, 0);
+      else this.across.copy(right);
+    }
+    this.across.addScaledVector(this.out, -this.across.dot(this.out));
+    if (this.across.lengthSq() < 1e-6) this.across.set(0, 0, 1).addScaledVector(this.out, -this.out.z);
+    this.across.normalize();
+    this.aside.crossVectors(this.out, this.across);
+    this.isNew = false;
+  }
+
+  /** A direction of the place: to the right, ahead, and out. */
+  private along(x: number, y: number, z: number): Vector3 {
+    return this.tried.set(0, 0, 0).addScaledVector(this.across, x).addScaledVector(this.aside, y).addScaledVector(this.out, z).normalize();
+  }
+
+  /** Turns the shaft as far aside as the tissue leaves room; else upright, towards where the tissue came from, or to the eye. */
+  private direct(surface: Surface, eye: Vector3): void {
     let best = -Infinity;
+    const [dx, dy] = [this.moved.dot(this.across), this.moved.dot(this.aside)];
     const back = Math.hypot(dx, dy) / this.radiusM;
-    for (let k = 0; k < 8; k++) {
-      if (k < 5) this.tried.copy(LEAN).lerp(UP, k / 4).normalize();
-      else this.tried.set(-dx, -dy, 0).multiplyScalar((0.3 * (k - 4)) / (this.radiusM * Math.max(back, 1))).add(UP).normalize();
-      const room = this.room(surface, this.tried);
+    for (let k = 0; k < 9; k++) {
+      const part = (0.3 * (k - 4)) / (this.radiusM * Math.max(back, 1));
+      if (k < 5) this.along(LEAN.x * (1 - k / 4), LEAN.y * (1 - k / 4), LEAN.z * (1 - k / 4) + k / 4);
+      else if (k < 8) this.along(-dx * part, -dy * part, 1);
+      // Where the eye is there is room: within a tube, beside the line of sight.
+      else this.tried.copy(eye).addScaledVector(this.across, 0.25 * this.lengthM).sub(this.tipM).normalize();
+      const room = this.roomOf(surface, this.tried);
       if (room > best) {
         best = room;
         this.axis.copy(this.tried);
@@ -141,16 +187,8 @@ export class ToolMark {
     }
   }
 
-  /** The least distance of the shaft's underside above the tissue, m; negative if the shaft is in it. */
-  private room(surface: Surface, axis: Vector3): number {
-    let least = Infinity;
-    for (let k = 1; k <= CHECKED; k++) {
-      const t = this.radiusM + (this.lengthM - this.radiusM) * (k / CHECKED) ** 2;
-      const z = this.tipM.z + t * axis.z;
-      const below = surface.heightAt(this.tipM.x + t * axis.x, this.tipM.y + t * axis.y);
-      least = Math.min(least, z - below - (1.25 * SHAFT * this.radiusM) / Math.max(axis.z, 0.4));
-    }
-    return least;
+  private roomOf(surface: Surface, axis: Vector3): number {
+    return surface.room(this.tipM, axis, this.lengthM, this.radiusM, 1.25 * SHAFT);
   }
 
   /** The least room between tip or shaft and the tissue when the tool was placed on it, m: what came since is not drawn. */

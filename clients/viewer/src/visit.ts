@@ -1,11 +1,15 @@
 // A visit to a session: its streams, its surface and the hand, until the user leaves.
 
+import { Body } from "./body";
+import { fingerM } from "./coefficients";
 import { Frames } from "./frames";
 import type { Session } from "./gen/palpate/v1/session_pb";
+import { fetchMesh, type MeshData } from "./geometry";
 import { Hand, type Reach } from "./hand";
-import { Samples } from "./samples";
+import { type Felt, norm, Samples, type Sense } from "./samples";
 import { type Failure, keepOpen, PATIENCE_MS, sessions, sleep } from "./server";
-import { Surface } from "./surface";
+import { Sheet } from "./sheet";
+import type { Surface } from "./surface";
 
 /** Interval between two requests for the session's status. */
 const ASK_MS = 1000;
@@ -27,14 +31,16 @@ export class Visit {
   readonly samples: Samples;
   readonly hand: Hand;
   readonly reach: Reach;
-  readonly extentM: [number, number];
+  /** Width of the tissue, m. */
+  readonly widthM: number;
   readonly rateHz: number;
   readonly mostRefinement: number;
   surface: Surface;
-  refinement: number;
+  refinement = 0;
   roundTripMs: number | undefined;
   /** When the server last answered, of this window's clock. */
   heardMs = performance.now();
+  /** Points of a sheet along its sides; vertices and 1 of a body. */
   private readonly points: [number, number];
   private readonly ended = new AbortController();
   private seen = new AbortController();
@@ -42,40 +48,72 @@ export class Visit {
   /** Simulated time minus local time, s, from the fastest recent answer, and that answer's round trip. */
   private clock: { offsetS: number; roundTripMs: number; atMs: number; overruns: bigint } | undefined;
 
-  constructor(
+  /** Finds out what the session shows, which for a body is its mesh. */
+  static async to(session: Session, holder: string, refinement: number | undefined, told: Told): Promise<Visit> {
+    const mesh = session.scene?.mesh && (await fetchMesh(session.sessionId));
+    return new Visit(session, holder, refinement, told, mesh);
+  }
+
+  private constructor(
     public session: Session,
     holder: string,
     refinement: number | undefined,
     private readonly told: Told,
+    mesh: MeshData | undefined,
   ) {
     const sheet = session.scene?.sheet;
-    this.points = [sheet?.pointsX ?? 1, sheet?.pointsY ?? 1];
-    const spacingM = sheet?.spacingM ?? 1;
-    this.extentM = [(this.points[0] - 1) * spacingM, (this.points[1] - 1) * spacingM];
+    const count = mesh ? mesh.restM.length / 3 : 1;
+    this.points = mesh ? [count, 1] : [sheet?.pointsX ?? 1, sheet?.pointsY ?? 1];
     this.rateHz = session.scene?.stepping?.rateHz ?? 1000;
-    // A push falls off over a spacing, so that a few points share it: it sinks in by about two spacings.
     const k = session.scene?.springs?.stiffnessNPerM ?? 0;
     const virtual = session.scene?.virtualSprings?.stiffnessNPerM ?? 0;
-    this.reach = { spacingM, mostN: 2 * spacingM * (2 * k + virtual) || spacingM, depthM: 3 * spacingM };
-    this.samples = new Samples(this.reach.mostN);
-    this.hand = new Hand(session.sessionId, holder, this.reach);
-    this.mostRefinement = 10;
+    if (mesh) {
+      const sizeM = boxOf(mesh.restM);
+      const lengthM = fingerM(sizeM, mesh.edgeM);
+      // Springs across carry the less of a push, the more points share it.
+      const aPointN = 2 * lengthM * (virtual + 2 * k * Math.min(1, (mesh.edgeM / lengthM) ** 2));
+      this.surface = new Body(mesh, lengthM, session.points);
+      const { sum } = this.surface.push(this.surface.middle(), lengthM);
+      // Of a tissue whose springs are not all alike nothing is told.
+      const mostN = rounded(sum * aPointN || 2);
+      this.reach = { lengthM, mostN, pointN: mostN / sum, depthM: 3 * lengthM };
+      this.widthM = sizeM;
+    } else {
+      // A push falls off over a spacing, so that a few points share it: it sinks in by about two spacings.
+      const lengthM = sheet?.spacingM ?? 1;
+      const mostN = 2 * lengthM * (2 * k + virtual) || lengthM;
+      this.reach = { lengthM, mostN, pointN: mostN, depthM: 3 * lengthM };
+      this.widthM = (this.points[0] - 1) * lengthM;
+    }
+    // A mesh is shown with its own vertices.
+    this.mostRefinement = mesh ? 0 : 10;
     while (this.mostRefinement > 0 && this.vertices(this.mostRefinement) > MOST_VERTICES) this.mostRefinement -= 1;
-    let chosen = 3;
-    while (chosen > 0 && this.vertices(chosen) > CHOSEN_VERTICES) chosen -= 1;
-    this.refinement = Math.min(refinement ?? chosen, this.mostRefinement);
-    this.surface = this.newSurface();
+    if (!mesh) {
+      let chosen = 3;
+      while (chosen > 0 && this.vertices(chosen) > CHOSEN_VERTICES) chosen -= 1;
+      this.refinement = Math.min(refinement ?? chosen, this.mostRefinement);
+    }
+    this.surface ??= this.newSheet();
+    this.samples = new Samples(this.reach.pointN, (tool) => this.sense(tool));
+    this.hand = new Hand(session.sessionId, holder, this.reach, () => this.surface);
   }
 
-  /** Vertices of refinement n: M = (m − 1)·n + m along a side. */
+  /** Vertices of refinement n: M = (m − 1)·n + m along a side of a sheet. */
   private vertices(n: number): number {
     return this.points.map((m) => (m - 1) * n + m).reduce((x, y) => x * y);
   }
 
-  private newSurface(): Surface {
+  private newSheet(): Surface {
     const n = this.refinement;
     const [nx, ny] = this.points.map((m) => (m - 1) * n + m) as [number, number];
-    return new Surface(nx, ny, this.reach.spacingM / (n + 1), n + 1);
+    return new Sheet(nx, ny, this.reach.lengthM / (n + 1), n + 1);
+  }
+
+  /** The side that a tool touches. Only of the own hand is known how a force is spread. */
+  private sense(tool: Felt): Sense {
+    const isMine = tool.tool === 0 && this.hand.holds;
+    const outward = (isMine && this.hand.outward) || this.surface.ofTool(tool)?.outward || [0, 0, 1];
+    return { outward, share: isMine ? this.hand.share : 1 };
   }
 
   begin(): void {
@@ -106,10 +144,11 @@ export class Visit {
     this.seen.abort();
   }
 
-  /** Switches to another refinement, with a new surface. */
+  /** Switches to another refinement of a sheet, with a new surface. */
   refine(n: number): Surface {
+    if (this.session.scene?.mesh) return this.surface;
     this.refinement = n;
-    this.surface = this.newSurface();
+    this.surface = this.newSheet();
     if (!this.seen.signal.aborted) this.watch();
     return this.surface;
   }
@@ -165,4 +204,20 @@ export class Visit {
     this.told.onSession(session);
     this.told.onWell();
   }
+}
+
+/** The diagonal of the box around places, m. */
+function boxOf(restM: Float32Array): number {
+  const low = [Infinity, Infinity, Infinity];
+  const high = [-Infinity, -Infinity, -Infinity];
+  restM.forEach((v, i) => {
+    low[i % 3] = Math.min(low[i % 3]!, v);
+    high[i % 3] = Math.max(high[i % 3]!, v);
+  });
+  return norm([high[0]! - low[0]!, high[1]! - low[1]!, high[2]! - low[2]!]);
+}
+
+/** One or two digits of a force: a slider goes up to it. */
+function rounded(force: number): number {
+  return Number(force.toPrecision(2));
 }

@@ -5,6 +5,7 @@ import { existsSync, mkdirSync } from "node:fs";
 import { delimiter, join, resolve } from "node:path";
 import { createInterface } from "node:readline";
 import { fileURLToPath } from "node:url";
+import { constants, inflateSync } from "node:zlib";
 import { chromium } from "playwright-core";
 
 export const ROOT = resolve(fileURLToPath(new URL(".", import.meta.url)), "../../..");
@@ -62,13 +63,30 @@ function whileLoading(error) {
   throw error;
 }
 
-const PROGRAM = join(ROOT, "target/release/palpate");
+/** The server: what `make build` has built, or another one. */
+const PROGRAM = process.env.SERVER_PROGRAM ?? join(ROOT, "target/release/palpate");
 
 /** A new token, added to a file. @param {string} file @param {string} roles */
 export function makeToken(file, roles) {
   const made = spawnSync(PROGRAM, ["token", "--name", "page", "--role", roles, "--tokens", file], { encoding: "utf8" });
   if (made.status !== 0) throw new Error(made.stderr);
   return made.stdout.trim();
+}
+
+/** An organ's surface as an OBJ file. @param {string} organ @param {string} edgeMm @param {string} file */
+export function makeOrgan(organ, edgeMm, file) {
+  const made = spawnSync(PROGRAM, ["organ", organ, "--edge-mm", edgeMm, "--output", file], { encoding: "utf8" });
+  if (made.status !== 0) throw new Error(made.stderr);
+}
+
+/** Red, green and blue of a pixel of a screenshot. @param {import("playwright-core").Page} page @param {number} x @param {number} y */
+export async function colourAt(page, x, y) {
+  const png = await page.screenshot({ clip: { x: Math.round(x), y: Math.round(y), width: 1, height: 1 } });
+  // Its first chunk of data: a byte for the row's filter, which does nothing to the first pixel, then the pixel.
+  const at = png.indexOf("IDAT");
+  const data = png.subarray(at + 4, at + 4 + png.readUInt32BE(at - 4));
+  const [, red = 0, green = 0, blue = 0] = inflateSync(data, { finishFlush: constants.Z_SYNC_FLUSH });
+  return { red, green, blue };
 }
 
 /** `palpate serve` on a free port, or on `listen`. */

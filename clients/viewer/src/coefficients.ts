@@ -1,0 +1,63 @@
+// The tissue that the page makes of a mesh of one's own: coefficients that follow from its size, so that an organ of any size
+// and any number of vertices gives way alike under a finger.
+
+import type { MessageInitShape } from "@bufbuild/protobuf";
+import type { SceneSchema } from "./gen/palpate/v1/scene_pb";
+import type { MeshReport } from "./gen/palpate/v1/session_pb";
+
+/** A finger's push falls off over this part of the tissue's size (the diagonal of the box around it); 5 mm on a liver. */
+const FINGER = 0.02;
+/** A push of so many newtons dents the tissue by this part of its size: 1 N and nearly 4 mm on a liver. */
+const PUSH_N = 1;
+const DENT = 0.015;
+/** Of soft tissue. */
+const DENSITY_KG_PER_M3 = 1060;
+/** How deep the tissue is that moves along with the surface, of its size: 30 mm in a liver. */
+const DEPTH = 0.12;
+/** Part of the damping at which nothing swings any more. */
+const DAMPING_RATIO = 0.5;
+/** With more vertices than this the server is asked to compute with so many. Frames show all of them. */
+export const MOST_VERTICES = 12_000;
+
+/** The length over which a push falls off: a finger's, but no less than an edge. */
+export function fingerM(sizeM: number, edgeM: number): number {
+  return Math.max(FINGER * sizeM, edgeM) || 1;
+}
+
+/** The diagonal of a report's extent, m. */
+export function sizeOf({ extent }: MeshReport): number {
+  const [a, b] = [extent?.leastM, extent?.mostM];
+  return a && b ? Math.hypot(b.x - a.x, b.y - a.y, b.z - a.z) : 0;
+}
+
+/**
+ * A scene of a mesh that was sent. With n vertices, edges of the usual length L, T triangles, and ℓ the length over which a
+ * push falls off:
+ *
+ * - The area is about T·(√3/4)·L², of one vertex A = that / n.
+ * - A push F in the middle is F·exp(−r/ℓ) at a distance r: together F·Σexp(−r/ℓ) ≈ F·2πℓ²/A. Borne by the virtual springs
+ *   alone, it dents the middle by d = F/K″. For a dent d₀ under a push of 1 N altogether, K″ = 1 N·A/(2πℓ²·d₀).
+ * - A dent as deep as it is wide stretches the net of springs as well, which draws each vertex back with about
+ *   2k·(L/ℓ)²·d. It shall bear as much as the virtual springs: k = K″·(ℓ/L)²/2.
+ * - A third of what lies beneath moves along (docs/formats.md, "Tissue"): m = ρ·H·A/3.
+ * - C = 2ζ·√(K″·m).
+ *
+ * A and K″ shrink alike with more vertices, so the dent does not depend on how fine the mesh is.
+ */
+export function sceneOf(name: string, meshId: string, report: MeshReport, vertices: number): MessageInitShape<typeof SceneSchema> {
+  const sizeM = sizeOf(report) || 1;
+  // Of a decimated mesh edges are longer, with the same area.
+  const edgeM = (report.edgeM || sizeM) * Math.sqrt(report.vertices / vertices);
+  const areaM2 = (report.triangles * Math.sqrt(3) * (report.edgeM || sizeM) ** 2) / 4 / vertices;
+  const lengthM = fingerM(sizeM, edgeM);
+  const virtual = (PUSH_N * areaM2) / (2 * Math.PI * lengthM ** 2 * DENT * sizeM);
+  const mass = (DENSITY_KG_PER_M3 * DEPTH * sizeM * areaM2) / 3;
+  return {
+    name,
+    mesh: { meshId, pointMassKg: mass, ...(vertices < report.vertices ? { vertices } : {}) },
+    springs: { stiffnessNPerM: (virtual * (lengthM / edgeM) ** 2) / 2, flexionFactor: 0.2 },
+    virtualSprings: { stiffnessNPerM: virtual },
+    damping: { coefficientNSPerM: 2 * DAMPING_RATIO * Math.sqrt(virtual * mass) },
+    stepping: { tolerance: 1e-3 },
+  };
+}

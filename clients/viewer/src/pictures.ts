@@ -1,0 +1,44 @@
+// Small pictures of scenes for the list of them: taken at the first visit of each, and kept by the browser.
+
+/** Pixels of a picture. */
+const SIZE = { width: 96, height: 64 };
+
+const key = (scene: string) => `picture of ${scene}`;
+
+/** The picture of a scene, if it was visited. */
+export function pictureOf(scene: string): string | undefined {
+  try {
+    return localStorage.getItem(key(scene)) ?? undefined;
+  } catch {
+    // Some browsers keep nothing.
+    return undefined;
+  }
+}
+
+/** Keeps the middle of what was just drawn. */
+export function keepPicture(scene: string, drawn: HTMLCanvasElement): void {
+  const small = document.createElement("canvas");
+  Object.assign(small, SIZE);
+  const { width, height } = drawn;
+  const scale = Math.min(width / SIZE.width, height / SIZE.height);
+  const [w, h] = [scale * SIZE.width, scale * SIZE.height];
+  small.getContext("2d")?.drawImage(drawn, (width - w) / 2, (height - h) / 2, w, h, 0, 0, SIZE.width, SIZE.height);
+  try {
+    localStorage.setItem(key(scene), small.toDataURL("image/jpeg", 0.8));
+  } catch {
+    // It is full, or the browser keeps nothing.
+  }
+}
+
+/** An entry of the list. Browsers that show text only in lists show the name. */
+export function entryOf(scene: string): HTMLOptionElement {
+  const entry = new Option(scene, scene);
+  const picture = pictureOf(scene);
+  if (picture) {
+    const image = new Image(SIZE.width / 2, SIZE.height / 2);
+    image.src = picture;
+    image.alt = "";
+    entry.prepend(image);
+  }
+  return entry;
+}

@@ -1,0 +1,268 @@
+// A file of one's own: dropped on the page or chosen, sent in parts, reported, and made into a session that can be touched.
+//
+// Mesh files do not state their unit, so the page asks for it. It does not read the file: the server does, at first as if in
+// metres, and from the size that it reports follows that in every other unit.
+
+import type { MessageInitShape } from "@bufbuild/protobuf";
+import { MOST_VERTICES, sceneOf } from "./coefficients";
+import type { SceneSchema } from "./gen/palpate/v1/scene_pb";
+import type { MeshProblem, MeshReport, Session } from "./gen/palpate/v1/session_pb";
+import { part } from "./page";
+import { describe, PATIENCE_MS, sessions } from "./server";
+
+/** Bytes of a part. */
+const PART_BYTES = 1 << 20;
+/** Reading and checking a large mesh takes a while, after its last part. */
+const READING_MS = 120_000;
+/** Problems that are told, at most. */
+const TOLD = 12;
+/** The longest side of an organ is about this, m: for the guess. */
+const USUAL_M = 0.15;
+
+const UNITS = [
+  { unit: "mm", name: "millimetres", metres: 1e-3 },
+  { unit: "cm", name: "centimetres", metres: 1e-2 },
+  { unit: "m", name: "metres", metres: 1 },
+] as const;
+
+type Scene = MessageInitShape<typeof SceneSchema>;
+
+/** A mesh that the server has, with what it is like. */
+interface Sent {
+  meshId: string;
+  report: MeshReport;
+}
+
+/** The sides of a box in words. */
+export function sidesText(sidesM: readonly number[]): string {
+  const most = Math.max(...sidesM);
+  const [factor, unit] = most >= 1 ? [1, "m"] : most >= 1e-3 || most === 0 ? [1e3, "mm"] : [1e6, "µm"];
+  return `${sidesM.map((side) => Number((side * factor).toPrecision(3))).join(" × ")} ${unit}`;
+}
+
+/** The unit in which a file is about as large as an organ, by its longest side. */
+export function likelyUnit(longest: number): (typeof UNITS)[number]["unit"] {
+  const far = ({ metres }: { metres: number }) => Math.abs(Math.log(Math.max(longest * metres, 1e-30) / USUAL_M));
+  return UNITS.reduce((best, unit) => (far(unit) < far(best) ? unit : best)).unit;
+}
+
+/** A problem with where it is, in the unit of lengths of tissue. */
+function problemText({ what, element, placeM }: MeshProblem): string {
+  // What the command line calls an option is a button here.
+  const words = what.replace(/[;,:] --vertices N [^;]*/, "").replace(/--repair/g, "“Mend it”");
+  const at = placeM ? ` at (${[placeM.x, placeM.y, placeM.z].map((v) => Number((1000 * v).toPrecision(4))).join(", ")}) mm` : "";
+  return element ? `${element}${at}: ${words}` : `${words}${at}`;
+}
+
+function reportText(report: MeshReport): string {
+  const { vertices, triangles, components, holes, volumeM3 } = report;
+  const parts = [
+    sidesText(sidesOf(report)),
+    `${vertices.toLocaleString("en")} vertices`,
+    `${triangles.toLocaleString("en")} triangles`,
+    components > 1 ? `${components} separate pieces` : "",
+    holes > 0 ? `open, ${holes} ${holes === 1 ? "border" : "borders"}` : "closed",
+    volumeM3 !== undefined && volumeM3 > 0 ? `${Number((1e6 * volumeM3).toPrecision(3)).toLocaleString("en")} ml` : "",
+  ];
+  return parts.filter((text) => text !== "").join(", ");
+}
+
+/** The user has closed the dialog. */
+class Ended extends Error {}
+
+export class FileOpener {
+  private readonly dialog = part("own", HTMLDialogElement);
+  private readonly said = part("own-said", HTMLElement);
+  private readonly units = part("own-units", HTMLElement);
+  private readonly progress = part("own-progress", HTMLProgressElement);
+  private readonly problems = part("own-problems", HTMLElement);
+  private readonly buttons = part("own-buttons", HTMLElement);
+  /** Ends what is under way when the dialog closes. */
+  private ending = new AbortController();
+
+  constructor(private readonly onSession: (session: Session, scene: Scene) => void) {
+    const chosen = part("own-file", HTMLInputElement);
+    part("open-file", HTMLButtonElement).addEventListener("click", () => chosen.click());
+    chosen.addEventListener("change", () => {
+      const file = chosen.files?.[0];
+      // The same file may be chosen again.
+      chosen.value = "";
+      if (file) void this.take(file);
+    });
+    this.dialog.addEventListener("close", () => this.ending.abort());
+    this.dropping();
+  }
+
+  /** Takes files that are dropped anywhere on the page. */
+  private dropping(): void {
+    const hint = part("drop-hint", HTMLElement);
+    const hasFile = (event: DragEvent) => event.dataTransfer?.types.includes("Files") ?? false;
+    let hiding: ReturnType<typeof setTimeout> | undefined;
+    addEventListener("dragover", (event) => {
+      if (!hasFile(event)) return;
+      event.preventDefault();
+      hint.hidden = false;
+      // Browsers do not tell reliably that a drag has left, but repeat this while it is there.
+      clearTimeout(hiding);
+      hiding = setTimeout(() => (hint.hidden = true), 400);
+    });
+    addEventListener("drop", (event) => {
+      if (!hasFile(event)) return;
+      event.preventDefault();
+      hint.hidden = true;
+      const file = event.dataTransfer?.files[0];
+      if (file) void this.take(file);
+    });
+  }
+
+  /** Leads a file all the way to a session. */
+  private async take(file: File): Promise<void> {
+    this.ending.abort();
+    this.ending = new AbortController();
+    const { signal } = this.ending;
+    part("own-name", HTMLElement).textContent = file.name;
+    if (!this.dialog.open) this.dialog.showModal();
+    try {
+      await this.lead(file, signal);
+    } catch (error) {
+      if (signal.aborted || error instanceof Ended) return;
+      this.show(`This does not work: ${describe(error).replace(/[.]$/, "")}.`);
+      this.offer([], "Close");
+    }
+  }
+
+  private async lead(file: File, signal: AbortSignal): Promise<void> {
+    if (file.size === 0) throw new Error("the file is empty");
+    let sent = await this.send(file, "m", false, signal);
+    const raw = sidesOf(sent.report);
+    const { unit } = await this.askUnit(raw, signal);
+    if (unit !== "m") sent = await this.send(file, unit, false, signal);
+    if ((await this.showReport(sent.report, false, signal)) === "mend") {
+      sent = await this.send(file, unit, true, signal);
+      await this.showReport(sent.report, true, signal);
+    }
+    this.show("Making the tissue …");
+    this.progress.hidden = false;
+    this.progress.removeAttribute("value");
+    const [session, scene] = await this.make(file.name, sent, signal);
+    this.dialog.close();
+    if (session) this.onSession(session, scene);
+  }
+
+  /** Sends a file in parts, one after the other. */
+  private async send(file: File, unit: string, repair: boolean, signal: AbortSignal): Promise<Sent> {
+    this.show(`Sending ${(file.size / 1e6).toFixed(1)} MB …`);
+    this.progress.hidden = false;
+    this.progress.value = 0;
+    let meshId = "";
+    for (let offset = 0; ; offset += PART_BYTES) {
+      const bytes = new Uint8Array(await file.slice(offset, offset + PART_BYTES).arrayBuffer());
+      const last = offset + PART_BYTES >= file.size;
+      if (last) this.said.textContent = repair ? "The server mends the mesh …" : "The server reads the mesh …";
+      const request = { meshId, fileName: file.name, offset: BigInt(offset), part: bytes, last, unit, repair };
+      const answer = await sessions.uploadMesh(request, { signal, timeoutMs: last ? READING_MS : PATIENCE_MS });
+      meshId = answer.meshId;
+      this.progress.value = Math.min(1, (offset + bytes.length) / file.size);
+      if (!last) continue;
+      if (!answer.report) throw new Error("the server has not reported on the mesh");
+      return { meshId, report: answer.report };
+    }
+  }
+
+  /** Asks what a length of 1 is, and says what size results for each unit. */
+  private async askUnit(raw: number[], signal: AbortSignal): Promise<(typeof UNITS)[number]> {
+    this.show("Mesh files do not say in which unit they are. How large is it?");
+    const likely = likelyUnit(Math.max(...raw));
+    const choices = UNITS.map(({ unit, name, metres }) => {
+      const label = document.createElement("label");
+      const choice = document.createElement("input");
+      Object.assign(choice, { type: "radio", name: "unit", value: unit, checked: unit === likely });
+      const size = document.createElement("b");
+      size.textContent = sidesText(raw.map((side) => side * metres));
+      label.append(choice, size, ` in ${name}`);
+      return label;
+    });
+    this.units.replaceChildren(...choices);
+    this.units.hidden = false;
+    await this.ask([["use", "Go on"]], signal);
+    const chosen = this.units.querySelector<HTMLInputElement>("input:checked")?.value;
+    return UNITS.find(({ unit }) => unit === chosen) ?? UNITS[0];
+  }
+
+  /** Shows a report. One without a flaw needs no answer. */
+  private async showReport(report: MeshReport, isMended: boolean, signal: AbortSignal): Promise<"touch" | "mend"> {
+    const { problems, refused } = report;
+    if (!refused && problems.length === 0) return "touch";
+    const told = problems.slice(0, TOLD).map(problemText);
+    if (problems.length > TOLD) told.push(`and ${problems.length - TOLD} more`);
+    const mendable = "It can't be used as it is. “Mend it” lets the server repair what can be repaired:";
+    const beyond = "It can't be used, and the server could not mend all of it. A program that edits meshes may:";
+    const usable = isMended ? "Mended:" : "It can be used. Worth knowing:";
+    this.show(`${reportText(report)}. ${refused ? (isMended ? beyond : mendable) : usable}`, told);
+    const answers = [["touch", "Touch it"], ["mend", "Mend it"]] as const;
+    return await this.ask(answers.filter(([value]) => (value === "touch" ? !refused : !isMended)), signal);
+  }
+
+  /** Makes a session, with fewer points than vertices if there are many and the server can. */
+  private async make(fileName: string, { meshId, report }: Sent, signal: AbortSignal): Promise<[Session | undefined, Scene]> {
+    const name = fileName.replace(/\.[^.]*$/, "") || fileName;
+    const call = { signal, timeoutMs: READING_MS };
+    const fewer = Math.min(report.vertices, MOST_VERTICES);
+    const scene = sceneOf(name, meshId, report, fewer);
+    const create = async (value: Scene) => (await sessions.createSession({ source: { case: "scene", value } }, call)).session;
+    const session = await create(scene);
+    if (!session || session.points <= 1.5 * fewer) return [session, scene];
+    // A server that does not decimate computes all of them: their coefficients are others.
+    await sessions.deleteSession({ sessionId: session.sessionId }, call);
+    const whole = sceneOf(name, meshId, report, session.points);
+    return [await create(whole), whole];
+  }
+
+  private show(text: string, problems: string[] = []): void {
+    this.said.textContent = text;
+    this.progress.hidden = true;
+    this.units.hidden = true;
+    this.problems.replaceChildren(
+      ...problems.map((problem) => {
+        const line = document.createElement("li");
+        line.textContent = problem;
+        return line;
+      }),
+    );
+    this.problems.hidden = problems.length === 0;
+    this.offer([]);
+  }
+
+  /** Offers buttons; there is always one to cancel. */
+  private offer(choices: HTMLButtonElement[], cancelText = "Cancel"): void {
+    const cancel = document.createElement("button");
+    cancel.textContent = cancelText;
+    cancel.type = "button";
+    cancel.addEventListener("click", () => this.dialog.close());
+    this.buttons.replaceChildren(...choices, cancel);
+  }
+
+  /** Waits for one of several answers. */
+  private ask<T extends string>(answers: readonly (readonly [T, string])[], signal: AbortSignal): Promise<T> {
+    return new Promise((answer, end) => {
+      const made = answers.map(([value, text]) => {
+        const button = document.createElement("button");
+        button.type = "button";
+        button.textContent = text;
+        button.addEventListener("click", () => answer(value));
+        return button;
+      });
+      made[0]?.classList.add("main");
+      this.offer(made);
+      made[0]?.focus();
+      signal.addEventListener("abort", () => end(new Ended()));
+    });
+  }
+}
+
+/** The sides of what a report is about, m. */
+function sidesOf({ extent }: MeshReport): number[] {
+  const [a, b] = [extent?.leastM, extent?.mostM];
+  if (!a || !b) throw new Error("there is no vertex in it");
+  return [b.x - a.x, b.y - a.y, b.z - a.z];
+}
