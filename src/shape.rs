@@ -103,6 +103,12 @@ pub trait RestShape: fmt::Debug + Send + Sync {
     /// The usual distance between neighbours, m.
     fn edge_m(&self) -> f64;
 
+    /// Where a tool with a tip of `radius_m` begins that comes new and is to be at a place, if not above that: outside the
+    /// tissue or within it, but not in the surface, which it meets as a hand does.
+    fn approach_m(&self, _place_m: DVec3, _radius_m: f64) -> Option<DVec3> {
+        None
+    }
+
     /// How many numbers give a place on it: 3, or 2 if all of it rests in the plane z = 0.
     fn dimensions(&self) -> usize {
         3

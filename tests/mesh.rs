@@ -577,11 +577,11 @@ fn the_organs_that_are_built_in_give_way_under_a_fingertip_and_less_so_at_a_lump
         };
         let depth = depth_mm(at_m);
         println!("{name}: {depth} mm");
-        assert!((1.5..12.0).contains(&depth), "{name}: {depth} mm");
+        assert!((1.0..15.0).contains(&depth), "{name}: {depth} mm");
         for lump_m in lumps_m {
             let found = depth_mm(*lump_m);
             println!("{name}: {found} mm at a lump");
-            assert!(found < 0.7 * depth, "{name}: {found} of {depth} mm");
+            assert!(found < 0.8 * depth, "{name}: {found} of {depth} mm");
         }
     }
 }

@@ -137,6 +137,13 @@ impl Surface {
         self.is_closed
     }
 
+    /// The side of it on which something of `radius_m` is that comes new, `height_m` above its nearest place: 1 outside, -1
+    /// inside. What is below a closed surface by at most its radius counts as outside.
+    pub fn side(&self, height_m: f64, radius_m: f64) -> f64 {
+        let below_m = if self.is_closed { radius_m } else { 0.0 };
+        if height_m >= -below_m { 1.0 } else { -1.0 }
+    }
+
     /// What it takes, bytes.
     pub fn bytes(&self) -> usize {
         self.vertices_m.len() * (size_of::<DVec3>() + size_of::<f64>())

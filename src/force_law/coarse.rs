@@ -11,7 +11,7 @@ use std::sync::atomic::AtomicBool;
 
 use palpate_touch::law::{Law, Row};
 
-use super::Disc;
+use super::disc::Disc;
 use super::exact::{ROWS as EXACT_ROWS, course, follow, pressed};
 use crate::sheet::Model;
 use crate::sheet::tangent::{self, Accuracy, Course};
@@ -44,7 +44,7 @@ pub fn first(model: &Model, disc: Disc, stop: &AtomicBool) -> Option<Law> {
     let exact = pressed(model, disc, EXACT_ROWS, Accuracy::EXACT, &mut work, stop);
     let mut left = WORK - EXACT_WORK + work;
     exact.or_else(|| {
-        if model.scene.sheet().is_none() {
+        if model.shape().dimensions() > 2 {
             return POINTS.iter().find_map(|points| on_mesh(model, disc, *points, &mut left, stop));
         }
         HALF_INTERVALS.iter().find_map(|(half, kept)| {

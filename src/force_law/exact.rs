@@ -4,7 +4,7 @@ use std::sync::atomic::AtomicBool;
 
 use palpate_touch::law::{Law, Row};
 
-use super::Disc;
+use super::disc::Disc;
 use crate::sheet::Model;
 use crate::sheet::tangent::{self, Accuracy, Course, Deepened, Press, Pressed};
 

@@ -354,6 +354,9 @@ impl Mesh {
     }
 }
 
+/// A new tool begins at least this far off the surface at rest, m.
+const APPROACH_M: f64 = 0.002;
+
 /// A vertex that vibrates so much faster than half of a mesh is warned of.
 const MUCH_FASTER: f64 = 2.5;
 
@@ -646,6 +649,16 @@ impl RestShape for MeshShape {
 
     fn nearest(&self, place_m: DVec3) -> PointId {
         PointId::new(self.cells.nearest(&self.vertices_m, place_m))
+    }
+
+    fn approach_m(&self, place_m: DVec3, radius_m: f64) -> Option<DVec3> {
+        let surface = self.surface();
+        let nearest = surface.nearest(place_m)?;
+        let (at_m, outward) = (surface.at_m(&nearest), nearest.frame[0].cross(nearest.frame[1]));
+        let side = surface.side((place_m - at_m).dot(outward), radius_m);
+        // One that is beside a rim, or far enough off the surface, begins where it is.
+        let is_off = (place_m - at_m).dot(side * outward) >= APPROACH_M;
+        Some(if is_off { place_m } else { at_m + APPROACH_M * side * outward })
     }
 
     fn around(&self, place_m: DVec3, radius_m: f64) -> Vec<PointId> {

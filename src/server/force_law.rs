@@ -1,6 +1,7 @@
-//! The force laws of a haptic stream: first one that is there at once, then the exact one, when it is computed; and the same
-//! again when another tissue acts, and on a mesh when a tool has moved by more than its radius: a mesh is not the same
-//! everywhere.
+//! The force laws of a haptic stream: first one that is there at once, then the exact one, when it is computed.
+//!
+//! The same again when another tissue acts, and on a mesh when a tool has moved by more than its radius: a mesh is not the
+//! same everywhere.
 
 use std::sync::Arc;
 use std::task::{Context, Poll, ready};

@@ -36,7 +36,7 @@ use crate::session::lease::LeaseId;
 use crate::shape::{PointId, PointName, RestShape};
 use crate::wire;
 use palpate_proto::pb::haptic_service_server::HapticService;
-use palpate_proto::{geometry, pb, touch};
+use palpate_proto::{pb, touch};
 use palpate_touch::device::{Device, UNDECLARED_FORCE_N};
 
 #[derive(Clone)]
@@ -198,18 +198,13 @@ impl Haptics {
     }
 
     /// The points that a probe names.
-    fn probed(
-        &self,
-        field: &str,
-        shape: &dyn RestShape,
-        names: impl ExactSizeIterator<Item = PointName>,
-    ) -> Result<Vec<PointId>, Refusal> {
+    fn probed(&self, field: &str, shape: &dyn RestShape, names: Vec<PointName>) -> Result<Vec<PointId>, Refusal> {
         let limit = self.0.config.limits.probe_points;
         if names.len() > limit {
             let message = format!("are {}, above the limit of {limit}", names.len());
             return Err(Refusal::new(Reason::TooLarge, field, message));
         }
-        names.enumerate().map(|(index, name)| shape.find(&format!("{field}[{index}]"), name)).collect()
+        names.into_iter().enumerate().map(|(index, name)| shape.find(&format!("{field}[{index}]"), name)).collect()
     }
 
     /// Reads what the client says until it ends.
@@ -575,25 +570,13 @@ impl HapticService for Haptics {
     }
 
     async fn probe(&self, request: Request<pb::ProbeRequest>) -> Result<Response<Self::ProbeStream>, Status> {
-        use pb::probe_request::Where;
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
         let live = self.0.pacer.get(&request.session_id)?;
         let every = wire::every("every_steps", request.every_steps)?;
-        let points = match &request.r#where {
-            Some(Where::Points(named)) => {
-                let names = named.points.iter().map(|point| PointName::Point(geometry::from_point(point)));
-                Some(self.probed("points", live.model.shape(), names)?)
-            }
-            Some(Where::Vertices(named)) => {
-                let names = named.vertices.iter().map(|vertex| PointName::Vertex(*vertex));
-                Some(self.probed("vertices", live.model.shape(), names)?)
-            }
-            Some(Where::AllPoints(true)) => None,
-            _ => {
-                let message = "points, vertices or all_points is missing";
-                return Err(Refusal::new(Reason::Missing, "where", message).into());
-            }
+        let points = match wire::from_probed(request.r#where.as_ref())? {
+            Some((field, names)) => Some(self.probed(field, live.model.shape(), names)?),
+            None => None,
         };
         let guard = live.open_stream("Probe", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();

@@ -399,11 +399,17 @@ impl Session {
                 let point = self.model().shape().nearest(place_m);
                 let client_time_s = command.client_time_ns as f64 * 1e-9;
                 let now_s = self.time_s();
+                if self.tool(index).posed.is_none() {
+                    let path = match self.model().shape().approach_m(place_m, tip.radius_m) {
+                        _ if tip.grasps => Path::of_grasp(),
+                        Some(begins_m) => Path::beginning_at(begins_m),
+                        None => Path::default(),
+                    };
+                    self.tool(index).posed = Some(Posed { tip, path, client_time_s });
+                }
                 let tool = self.tool(index);
                 (tool.control_point, tool.around) = (Some(point), None);
-                let begun =
-                    || Posed { tip, path: if tip.grasps { Path::of_grasp() } else { Path::default() }, client_time_s };
-                let posed = tool.posed.get_or_insert_with(begun);
+                let Some(posed) = &mut tool.posed else { return };
                 posed.tip = tip;
                 // A pose with a step is played at that step; a pose with client time only is played by that time.
                 if command.at_step.is_some() || command.client_time_ns == 0 {

@@ -218,15 +218,11 @@ impl Footprint {
     }
 
     /// The side of the surface on which a tool is that comes new, `height_m` above the surface: 1 outside, -1 inside. One
-    /// that is below a sheet presses on it from above. So does one that is below a closed surface by at most a radius;
-    /// farther down it is inside.
+    /// that is below a sheet presses on it from above.
     pub(super) fn side(&self, height_m: f64) -> f64 {
         match &self.ground {
             Ground::Grid(_) => 1.0,
-            Ground::Mesh(disc) => {
-                let below_m = if disc.is_closed() { self.radius_m } else { 0.0 };
-                if height_m >= -below_m { 1.0 } else { -1.0 }
-            }
+            Ground::Mesh(disc) => disc.side(height_m),
         }
     }
 }

@@ -23,10 +23,8 @@ use crate::shape::RestShape;
 
 mod window;
 
+use window::{Spring, Triple};
 pub use window::{Window, half_window_m};
-
-/// How many times its reach around a disc the sheet is looked at: e⁻⁶ is left.
-const REACHES: f64 = 6.0;
 
 /// When a solution is good enough.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -48,11 +46,6 @@ impl Accuracy {
 
 /// Most iterations of conjugate gradients.
 const MOST_ITERATIONS: u32 = 400;
-
-/// A point of a patch with six springs, and the vectors of a solution. The work of a force law is bounded, and so is its memory:
-/// 20 MB for the 116² points that 2^27 springs times iterations allow.
-const BYTES_PER_POINT: usize =
-    6 * size_of::<Spring>() + size_of::<DMat3>() + size_of::<DVec3>() + 8 * size_of::<Triple>() + 16;
 
 /// How much may be computed, and whether it is still wanted.
 #[derive(Debug, Clone)]
@@ -88,9 +81,6 @@ impl<'a> Allowance<'a> {
     }
 }
 
-/// Three vectors a point: one of each system.
-type Triple = [DVec3; 3];
-
 /// The sheet around a disc, linearised where it is.
 #[derive(Debug)]
 pub struct Patch<'m> {
@@ -109,22 +99,6 @@ pub struct Patch<'m> {
     inverses: Vec<DMat3>,
     accuracy: Accuracy,
     allowance: Allowance<'m>,
-}
-
-#[derive(Debug, Clone, Copy)]
-struct Spring {
-    ends: [usize; 2],
-    rest_m: DVec3,
-    stiffness_n_per_m: f64,
-    tangent: DMat3,
-    /// On the first end, N.
-    force_n: DVec3,
-}
-
-impl Spring {
-    fn new(ends: [usize; 2], rest_m: DVec3, stiffness_n_per_m: f64) -> Self {
-        Spring { ends, rest_m, stiffness_n_per_m, tangent: DMat3::ZERO, force_n: DVec3::ZERO }
-    }
 }
 
 /// What a disc feels of slow and small movements.

@@ -1,7 +1,7 @@
 //! Conversion of commands.
 
 use glam::{DQuat, DVec2, DVec3};
-use palpate_proto::geometry::{self, from_place, from_vector, vector};
+use palpate_proto::geometry::{from_place, from_vector, vector};
 use palpate_proto::pb;
 use palpate_proto::touch::{from_tip, pose};
 use palpate_touch::Tip;
@@ -11,7 +11,7 @@ use crate::refusal::{Reason, Refusal, Result, number};
 use crate::scene::profile::Poke;
 use crate::scene::script::Action;
 use crate::session::command::Command;
-use crate::shape::{PointId, PointName, RestShape};
+use crate::shape::{PointId, RestShape};
 
 /// The command in a message that arrived at `arrival_ns`.
 ///
@@ -23,11 +23,12 @@ pub fn from_command(message: &pb::Command, shape: &dyn RestShape, arrival_ns: u6
         Message::Force(force) => {
             let (point, centre_m) = match required("force.centre", force.centre.as_ref())? {
                 pb::force::Centre::Point(at) => {
-                    let point = shape.find("force.point", PointName::Point(geometry::from_point(at)))?;
+                    let point = shape.find("force.point", required("force.point", from_point(Some(at), None))?)?;
                     (Some(point), shape.rest_m(point))
                 }
                 pb::force::Centre::Vertex(vertex) => {
-                    let point = shape.find("force.vertex", PointName::Vertex(*vertex))?;
+                    let point =
+                        shape.find("force.vertex", required("force.vertex", from_point(None, Some(*vertex)))?)?;
                     (Some(point), shape.rest_m(point))
                 }
                 pb::force::Centre::CentreM(place) => (None, on_sheet(shape, from_place(place))?),
@@ -107,9 +108,9 @@ pub fn scripted(shape: &dyn RestShape, tool: usize, at_step: u64, action: &Actio
     let action = match action {
         Action::Push(poke) => Message::Force(pb::Force {
             centre: Some(match poke.point {
-                Some(at) => match shape.name(at) {
-                    PointName::Point(at) => pb::force::Centre::Point(geometry::point(at)),
-                    PointName::Vertex(vertex) => pb::force::Centre::Vertex(vertex),
+                Some(at) => match point(shape.name(at)) {
+                    (Some(point), _) => pb::force::Centre::Point(point),
+                    (None, vertex) => pb::force::Centre::Vertex(vertex.unwrap_or_default()),
                 },
                 None => {
                     let DVec3 { x, y, z } = poke.centre_m;

@@ -43,6 +43,32 @@ pub fn from_point(point: Option<&pb::GridPoint>, vertex: Option<u32>) -> Option<
     vertex.or_else(|| point.map(|point| PointName::Point(geometry::from_point(point))))
 }
 
+/// The name of a mass point of a record; the first point's if it has none.
+fn from_record(point: &pb::PointRecord) -> PointName {
+    from_point(point.point.as_ref(), point.vertex).unwrap_or(PointName::Point([0, 0]))
+}
+
+/// The names of the mass points that a probe is of, and the field that has them; `None` for all points.
+///
+/// # Errors
+/// Returns an error if the request does not say which.
+pub fn from_probed(r#where: Option<&pb::probe_request::Where>) -> Result<Option<(&'static str, Vec<PointName>)>> {
+    use pb::probe_request::Where;
+    match r#where {
+        Some(Where::Points(named)) => {
+            let names = named.points.iter().map(|point| PointName::Point(geometry::from_point(point)));
+            Ok(Some(("points", names.collect())))
+        }
+        Some(Where::Vertices(named)) => {
+            Ok(Some(("vertices", named.vertices.iter().copied().map(PointName::Vertex).collect())))
+        }
+        Some(Where::AllPoints(true)) => Ok(None),
+        Some(Where::AllPoints(false)) | None => {
+            Err(Refusal::new(Reason::Missing, "where", "points, vertices or all_points is missing"))
+        }
+    }
+}
+
 /// Some mass points of a tissue as the subject of a probe.
 pub fn probed(names: impl Iterator<Item = PointName>) -> pb::probe_request::Where {
     let (mut points, mut vertices) = (Vec::new(), Vec::new());

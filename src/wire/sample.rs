@@ -1,13 +1,13 @@
 //! Conversion of samples, records and frames to messages, and of records back.
 
-use super::{every, from_point, point};
+use super::{every, from_record, point};
 use crate::pace::frames::Delivery;
 use crate::pace::{PacedSample, Recorded};
 use crate::refusal::{Reason, Refusal, Result};
 use crate::scene::record::{EnergyJ, Point, Record, Recovery, ToolRecord};
 use crate::session::ToolSample;
 use crate::session::sampling::{Deadband, HEARTBEAT_S, Sampling};
-use crate::shape::{PointName, RestShape};
+use crate::shape::RestShape;
 use crate::surface::Encoding;
 use crate::surface::encode::Patch;
 use palpate_proto::geometry::{from_vector, vector};
@@ -165,7 +165,7 @@ pub fn add_to_record(record: &mut Record, message: &pb::ProbeResponse) -> bool {
     let array = |v: &Option<pb::Vector3>| from_vector(v.as_ref()).to_array();
     record.time_s = message.simulation_time_s;
     record.points.extend(message.points.iter().map(|point| Point {
-        name: from_point(point.point.as_ref(), point.vertex).unwrap_or(PointName::Point([0, 0])),
+        name: from_record(point),
         displacement_m: array(&point.displacement_m),
         velocity_m_per_s: array(&point.velocity_m_per_s),
         spring_n: array(&point.spring_n),

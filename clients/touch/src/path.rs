@@ -43,6 +43,8 @@ pub enum Play {
 pub struct Path {
     /// Whether the tool begins at its first place, not above it.
     at_once: bool,
+    /// Where it begins, if neither there nor above it.
+    begins_m: Option<DVec3>,
     waiting: VecDeque<(f64, DVec3)>,
     played: Option<(f64, DVec3)>,
     place_m: Option<DVec3>,
@@ -60,6 +62,11 @@ impl Path {
     /// tissue as a hand does, not from within.)
     pub fn of_grasp() -> Self {
         Path { at_once: true, ..Path::default() }
+    }
+
+    /// Of a tool that begins at a place of its own: where the tissue is not below it.
+    pub fn beginning_at(place_m: DVec3) -> Self {
+        Path { begins_m: Some(place_m), ..Path::default() }
     }
 
     /// Takes a command that has arrived: the tool's place at client time `time_s`. Returns false if it refuses one that
@@ -111,7 +118,8 @@ impl Path {
             return Some(Play::Release);
         }
         let above_m = DVec3::new(target_m.x, target_m.y, target_m.z.max(ABOVE_M));
-        let from_m = self.place_m.unwrap_or(if self.at_once { target_m } else { above_m });
+        let begins_m = if self.at_once { target_m } else { self.begins_m.unwrap_or(above_m) };
+        let from_m = self.place_m.unwrap_or(begins_m);
         let way_m = target_m - from_m;
         let most_m = SPEED_M_PER_S * step_s;
         if way_m.length() > most_m {

@@ -19,7 +19,7 @@ const DENT = 0.28;
 /** The server tells the mean force within so many lengths of a push, at least and at most so many edges (src/sheet/around.rs). */
 const TOLD_WITHIN = { lengths: 7, least: 1.5, most: 4 };
 /** A texture whose scale differs by more than this from the usual, on more than this part of the triangles, has seams. */
-const SEAM = { times: 6, part: 0.005 };
+const SEAM = { times: 6, part: 0.001 };
 
 /** Whether a texture lies on the triangles without seams, where neighbours in space are far from each other in the image. */
 function isSeamless({ uv, restM, triangles }: MeshData): boolean {

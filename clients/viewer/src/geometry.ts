@@ -1,6 +1,6 @@
 // The mesh of a session, as `GetMesh` tells it: what does not change while the tissue moves.
 
-import { type GetMeshResponse } from "./gen/palpate/v1/view_pb";
+import type { GetMeshResponse } from "./gen/palpate/v1/view_pb";
 import { PATIENCE_MS, views } from "./server";
 
 export interface MeshData {
@@ -29,8 +29,14 @@ function joined<A extends Float32Array<ArrayBuffer> | Uint32Array<ArrayBuffer>>(
   return whole;
 }
 
+/** What the page reads of a part. */
+type Part = Pick<
+  GetMeshResponse,
+  "restPositionM" | "textureCoordinates" | "triangles" | "fileVertex" | "verticesX" | "verticesY" | "vertexSpacingM"
+>;
+
 /** Puts the parts together. Throws if a triangle has a vertex that is not there. */
-export function meshOf(parts: Pick<GetMeshResponse, "restPositionM" | "textureCoordinates" | "triangles" | "fileVertex" | "verticesX" | "verticesY" | "vertexSpacingM">[]): MeshData {
+export function meshOf(parts: Part[]): MeshData {
   const floats = (length: number) => new Float32Array(length);
   const whole = (length: number) => new Uint32Array(length);
   const restM = joined(parts.map((part) => part.restPositionM), floats);

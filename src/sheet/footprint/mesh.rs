@@ -41,8 +41,9 @@ impl MeshDisc {
         along.cross(across)
     }
 
-    pub(super) fn is_closed(&self) -> bool {
-        self.shape.surface().is_closed()
+    /// The side on which it is ([`palpate_mesh::surface::Surface::side`]).
+    pub(super) fn side(&self, height_m: f64) -> f64 {
+        self.shape.surface().side(height_m, self.disc.radius_m())
     }
 
     /// Goes to the place of the rest surface that is nearest to `at_m`.

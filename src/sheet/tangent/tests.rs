@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use glam::DVec2;
 
+use super::window::REACHES;
 use super::*;
 
 fn model(sets: &[&str]) -> Arc<Model> {

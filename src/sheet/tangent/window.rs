@@ -2,10 +2,37 @@
 
 use glam::{DMat3, DVec2, DVec3};
 
-use super::{BYTES_PER_POINT, REACHES, Spring};
 use crate::sheet::footprint::Footprint;
 use crate::sheet::mesh::MeshPlaces;
 use crate::sheet::model::Model;
+
+/// How many times its reach around a disc the sheet is looked at: e⁻⁶ is left.
+pub(super) const REACHES: f64 = 6.0;
+
+/// A point of a patch with six springs, and the vectors of a solution. The work of a force law is bounded, and so is its memory:
+/// 20 MB for the 116² points that 2^27 springs times iterations allow.
+const BYTES_PER_POINT: usize =
+    6 * size_of::<Spring>() + size_of::<DMat3>() + size_of::<DVec3>() + 8 * size_of::<Triple>() + 16;
+
+/// Three vectors a point: one of each system.
+pub(super) type Triple = [DVec3; 3];
+
+/// A spring of the part, linearised where it is.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Spring {
+    pub(super) ends: [usize; 2],
+    pub(super) rest_m: DVec3,
+    pub(super) stiffness_n_per_m: f64,
+    pub(super) tangent: DMat3,
+    /// On the first end, N.
+    pub(super) force_n: DVec3,
+}
+
+impl Spring {
+    fn new(ends: [usize; 2], rest_m: DVec3, stiffness_n_per_m: f64) -> Self {
+        Spring { ends, rest_m, stiffness_n_per_m, tangent: DMat3::ZERO, force_n: DVec3::ZERO }
+    }
+}
 
 /// The points around a disc that notice what it does.
 #[derive(Debug, Clone, PartialEq)]

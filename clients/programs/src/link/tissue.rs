@@ -33,6 +33,11 @@ impl Spot {
         Spot { at_m, turn: DMat3::from_quat(DQuat::from_rotation_arc(outward, DVec3::Z)) }
     }
 
+    /// A place above it, as the hand sees it, where no tool touches.
+    fn above_m(&self) -> DVec3 {
+        self.at_m + 0.01 * DVec3::Z
+    }
+
     /// Of the hand's place, which has the same middle.
     fn of_tissue(&self, place_m: DVec3) -> DVec3 {
         self.at_m + self.turn.transpose() * (place_m - self.at_m)
@@ -101,7 +106,11 @@ pub(super) struct Server {
 
 impl Server {
     pub(super) fn new(tissue: Tissue) -> Self {
-        Server { tissue, path: Path::default() }
+        let spot = tissue.spot;
+        // A task begins above the place where it is done; of a sheet, that is where a path begins by itself.
+        let is_sheet = tissue.session.model().shape().dimensions() == 2;
+        let path = if is_sheet { Path::default() } else { Path::beginning_at(spot.above_m()) };
+        Server { tissue, path }
     }
 
     /// Performs one step; returns its sample while the tool is in use.
