@@ -212,9 +212,10 @@ impl Surface {
             let out = -((c - a) - (c - a).dot(along) * along).normalize();
             let into = ((far_m - a) - (far_m - a).dot(along) * along).normalize();
             let unfold = |way: DVec3| way.dot(along) * along + way.dot(out) * into;
-            left_m = unfold(left_m);
+            let [ahead, one_way, other_way] = [left_m, place.frame[0], place.frame[1]].map(unfold);
+            left_m = ahead;
             let [one, other, _] = side(k).map(|corner| (self.triangle(&place)[corner], place.barycentric[corner]));
-            place.frame = place.frame.map(unfold);
+            place.frame = [one_way, other_way];
             place.barycentric = next.map(|vertex| match vertex {
                 _ if vertex == one.0 => one.1,
                 _ if vertex == other.0 => other.1,
@@ -423,9 +424,9 @@ impl Disc {
                 (excess, slope) = self.weigh(rho_m, target_m2);
                 for _ in 0..40 {
                     if excess > 0.0 {
-                        low = rho_m
+                        low = rho_m;
                     } else {
-                        high = rho_m
+                        high = rho_m;
                     }
                     let next_m = rho_m - excess / slope;
                     let next_m = if next_m > low && next_m < high { next_m } else { 0.5 * (low + high) };

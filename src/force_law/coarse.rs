@@ -31,8 +31,8 @@ const ROWS: u32 = 6;
 /// where the work for many does not suffice.
 const HALF_INTERVALS: [(u32, u64); 2] = [(6, 400_000), (4, 0)];
 
-/// Points of a mesh that are looked at.
-const POINTS: [usize; 3] = [800, 400, 200];
+/// Points of a mesh that are looked at, and the work that is left to those with fewer.
+const POINTS: [(usize, u64); 3] = [(500, 650_000), (250, 200_000), (120, 0)];
 
 /// Points so many radii of the disc apart know what is under it.
 const FINE_ENOUGH: f64 = 0.7;
@@ -45,7 +45,13 @@ pub fn first(model: &Model, disc: Disc, stop: &AtomicBool) -> Option<Law> {
     let mut left = WORK - EXACT_WORK + work;
     exact.or_else(|| {
         if model.shape().dimensions() > 2 {
-            return POINTS.iter().find_map(|points| on_mesh(model, disc, *points, &mut left, stop));
+            return POINTS.iter().find_map(|(points, kept)| {
+                let most = left.saturating_sub(*kept);
+                let mut work = most;
+                let law = on_mesh(model, disc, *points, &mut work, stop);
+                left -= most - work;
+                law
+            });
         }
         HALF_INTERVALS.iter().find_map(|(half, kept)| {
             let most = left.saturating_sub(*kept);
