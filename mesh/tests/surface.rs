@@ -1,5 +1,10 @@
 //! Walking on a surface, and laying a disc on it.
-#![allow(clippy::unwrap_used, clippy::cast_possible_truncation, clippy::disallowed_methods, clippy::cast_precision_loss)]
+#![allow(
+    clippy::unwrap_used,
+    clippy::cast_possible_truncation,
+    clippy::disallowed_methods,
+    clippy::cast_precision_loss
+)]
 
 use glam::{DVec2, DVec3};
 use palpate_mesh::surface::{Disc, Place, Surface};
