@@ -66,7 +66,9 @@ fn speed(report: &mut Report, rounds: usize) {
     report.heading("Time of a step");
     report.say(
         "`liver-organ` at its default tolerance and 1 kHz. All awake: a force reaches every vertex. A poke: a force of 0.3 N that \
-         falls off by e in 5 mm, on the organ at rest; a tip: 5 mm radius, pressed 2 mm deep. Asleep: nothing touches it.",
+         falls off by e in 5 mm, on the organ at rest; a tip: 5 mm radius, pressed 2 mm deep. Both are timed 0.4 s \
+         later: a force that does not change lets all of it sleep by then, a tip keeps what is around it awake. Asleep: nothing \
+         touches it.",
     );
     let sizes: &[f64] = if quick() { &[0.002] } else { &[0.002, 0.00177, 0.00124] };
     let mut rows = Vec::new();
