@@ -97,7 +97,8 @@ impl Pacer {
             cost,
             thread,
             inbox: stepper.inbox.clone(),
-            _taken: [slot, memory],
+            slot: Mutex::new(slot),
+            _memory: memory,
         });
         // Laid out before the lock is taken, on which all calls wait.
         let running = memory::attempt("sheet.points", || Ok(Box::new(Running::new(live.clone(), !paused))))?;

@@ -61,8 +61,10 @@ pub struct Live {
     pub(super) thread: usize,
     /// The inbox of that thread.
     pub(super) inbox: Arc<Inbox>,
-    /// The session, and its memory.
-    pub(super) _taken: [Taken; 2],
+    /// Its place among the sessions: given back when it is deleted, while others may still read it.
+    pub(super) slot: Mutex<Taken>,
+    /// Its memory, until nobody reads it any more.
+    pub(super) _memory: Taken,
 }
 
 impl Live {

@@ -134,6 +134,7 @@ impl Pacer {
     /// Refuses an unknown ID.
     pub fn delete(&self, id: &str) -> Result<()> {
         let live = lock(&self.sessions).remove(id).ok_or_else(|| unknown_session(id))?;
+        lock(&live.slot).shrink_to(0);
         let waited = lock(&live.intake).close(deleted());
         if !waited.is_empty() {
             // To free many takes longer than other calls may wait.

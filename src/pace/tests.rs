@@ -1,4 +1,4 @@
-//! Tests that a fault ends one session alone.
+//! Tests of the threads that step, and of who may have a session.
 #![allow(clippy::unwrap_used)]
 
 use super::inbox::Request;
@@ -35,5 +35,20 @@ async fn a_fault_in_one_session_ends_that_one_alone() {
     // On the same thread.
     let step = sound.status().step;
     assert_eq!(sound.hash_at(Some(step + 20), &Account::alone()).await.unwrap().0, step + 20);
+    pacer.stop();
+}
+
+#[tokio::test]
+async fn the_place_of_a_deleted_session_is_free_while_others_still_read_it() {
+    let limits = Limits { sessions: 1, ..Limits::default() };
+    let scene = Scene::parse("paper", PAPER, &[], &limits).unwrap();
+    let budget = Budget::new(&limits, 1, 1);
+    let caller = budget.account("a caller");
+    let pacer = Pacer::start(1, 0.02, &limits, budget).unwrap();
+    let read = pacer.create(&scene, false, 60.0, &caller, &NEVER).unwrap();
+    let refused = pacer.create(&scene, false, 60.0, &caller, &NEVER).err().map(|refusal| refusal.reason);
+    assert_eq!(refused, Some(Reason::TooMany));
+    pacer.delete(&read.id).unwrap();
+    pacer.create(&scene, false, 60.0, &caller, &NEVER).unwrap();
     pacer.stop();
 }
