@@ -53,6 +53,12 @@ pub struct Extent {
 }
 
 impl Extent {
+    /// Around places; of none, its ends are infinite.
+    pub fn around(places_m: impl Iterator<Item = DVec3> + Clone) -> Self {
+        let least_m = places_m.clone().fold(DVec3::INFINITY, DVec3::min);
+        Extent { least_m, most_m: places_m.fold(DVec3::NEG_INFINITY, DVec3::max) }
+    }
+
     /// Its middle, m.
     pub fn middle_m(&self) -> DVec3 {
         (self.least_m + self.most_m) / 2.0

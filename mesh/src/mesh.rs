@@ -15,6 +15,16 @@ pub struct TriangleMesh {
     pub groups: Vec<Group>,
 }
 
+impl TriangleMesh {
+    /// Writes the texture coordinates of each vertex, if the file has them; at a seam those of the first corner there.
+    pub fn write_vertex_uv(&self, into: &mut [[f32; 2]]) {
+        // Backwards, so that the first corner is written last.
+        for (triangle, corners) in self.triangles.iter().zip(self.uv.as_deref().unwrap_or_default()).rev() {
+            triangle.iter().zip(corners).for_each(|(vertex, uv)| into[*vertex as usize] = *uv);
+        }
+    }
+}
+
 /// A named set of vertices of a mesh.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Group {

@@ -6,6 +6,7 @@
 
 use glam::{DVec2, DVec3};
 
+pub use crate::tree::nearest_place;
 use crate::tree::{Tree, corners};
 
 /// What there is beyond a side of a triangle.
@@ -132,22 +133,11 @@ impl Surface {
         self.edge_m
     }
 
-    /// Whether it has no rim.
-    pub fn is_closed(&self) -> bool {
-        self.is_closed
-    }
-
     /// The side of it on which something of `radius_m` is that comes new, `height_m` above its nearest place: 1 outside, -1
     /// inside. What is below a closed surface by at most its radius counts as outside.
     pub fn side(&self, height_m: f64, radius_m: f64) -> f64 {
         let below_m = if self.is_closed { radius_m } else { 0.0 };
         if height_m >= -below_m { 1.0 } else { -1.0 }
-    }
-
-    /// What it takes, bytes.
-    pub fn bytes(&self) -> usize {
-        self.vertices_m.len() * (size_of::<DVec3>() + size_of::<f64>())
-            + self.triangles.len() * (size_of::<[u32; 3]>() + size_of::<[Beyond; 3]>() + self.tree.bytes_per_triangle())
     }
 
     /// Where a place is in space, m.
@@ -374,6 +364,32 @@ struct Part {
     hats: [[f64; 3]; 2],
 }
 
+impl Part {
+    /// What is within a radius, as a share of the whole part, which begins within it.
+    fn share_within(&self, rho_m: f64) -> f64 {
+        let whole_m = self.to_m - self.from_m;
+        if whole_m > 0.0 { (self.to_m.min(rho_m) - self.from_m) / whole_m } else { 0.0 }
+    }
+
+    /// The hats after a share of it, and the places in `covered` of their vertices.
+    fn hats_at(&self, share: f64) -> impl Iterator<Item = (usize, f64)> {
+        let [first, last] = self.hats;
+        let hat = move |corner: usize| first[corner] + share * (last[corner] - first[corner]);
+        let covered = self.covered;
+        (0..3).map(move |corner| (covered[corner] as usize, hat(corner)))
+    }
+}
+
+/// The parts of each way that begin within a radius.
+fn ways<'c>(
+    crossings: &'c [Part],
+    ends: &'c [usize],
+    rho_m: f64,
+) -> impl Iterator<Item = impl Iterator<Item = &'c Part>> {
+    let begins = std::iter::once(0).chain(ends.iter().copied());
+    begins.zip(ends).map(move |(begin, end)| crossings[begin..*end].iter().take_while(move |part| part.from_m < rho_m))
+}
+
 impl Disc {
     /// A disc on a surface whose edges are about `edge_m` long.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
@@ -478,33 +494,23 @@ impl Disc {
         covered.iter_mut().for_each(|covered| covered.weight = 0.0);
         widening.fill(0.0);
         let (mut area, mut rim) = (0.0, 0.0);
-        let mut begin = 0;
-        for end in ends.iter() {
-            for part in &crossings[begin..*end] {
-                let Part { from_m, to_m, hats: [first, last], .. } = part;
-                if *from_m >= rho_m {
-                    break;
-                }
-                let whole_m = to_m - from_m;
-                let length_m = to_m.min(rho_m) - from_m;
-                let share = if whole_m > 0.0 { length_m / whole_m } else { 0.0 };
-                // ∫ r dr, and ∫ of the part of the way that is done, times r.
-                let (even, rising) =
-                    (length_m * (from_m + 0.5 * length_m), share * length_m * (0.5 * from_m + length_m / 3.0));
-                area += even;
-                for corner in 0..3 {
-                    let slope = last[corner] - first[corner];
-                    covered[part.covered[corner] as usize].weight += first[corner] * even + slope * rising;
-                }
-                if *to_m >= rho_m {
-                    rim += rho_m;
-                    for corner in 0..3 {
-                        let hat = first[corner] + share * (last[corner] - first[corner]);
-                        widening[part.covered[corner] as usize] += hat * rho_m;
-                    }
+        for part in ways(crossings, ends, rho_m).flatten() {
+            let Part { from_m, to_m, hats: [first, last], .. } = part;
+            let (length_m, share) = (to_m.min(rho_m) - from_m, part.share_within(rho_m));
+            // ∫ r dr, and ∫ of the part of the way that is done, times r.
+            let (even, rising) =
+                (length_m * (from_m + 0.5 * length_m), share * length_m * (0.5 * from_m + length_m / 3.0));
+            area += even;
+            for corner in 0..3 {
+                let slope = last[corner] - first[corner];
+                covered[part.covered[corner] as usize].weight += first[corner] * even + slope * rising;
+            }
+            if *to_m >= rho_m {
+                rim += rho_m;
+                for (vertex, hat) in part.hats_at(share) {
+                    widening[vertex] += hat * rho_m;
                 }
             }
-            begin = *end;
         }
         let (mut sum, mut slope) = (0.0, 0.0);
         for ((covered, widening), area_m2) in covered.iter_mut().zip(widening).zip(areas_m2) {
@@ -521,27 +527,18 @@ impl Disc {
         let Disc { directions, crossings, ends, covered, .. } = self;
         covered.iter_mut().for_each(|covered| covered.gradient = DVec2::ZERO);
         let (mut area, mut whole) = (0.0, DVec2::ZERO);
-        let mut begin = 0;
-        for (end, direction) in ends.iter().zip(directions) {
+        for (way, direction) in ways(crossings, ends, rho_m).zip(directions) {
             let mut reached_m = 0.0;
-            for part in &crossings[begin..*end] {
-                if part.from_m >= rho_m {
-                    break;
-                }
+            for part in way {
                 reached_m = part.to_m.min(rho_m);
                 if part.to_m >= rho_m {
                     whole += rho_m * *direction;
-                    let whole_m = part.to_m - part.from_m;
-                    let share = if whole_m > 0.0 { (rho_m - part.from_m) / whole_m } else { 0.0 };
-                    for corner in 0..3 {
-                        let [first, last] = part.hats.map(|hats| hats[corner]);
-                        let hat = first + share * (last - first);
-                        covered[part.covered[corner] as usize].gradient += hat * rho_m * *direction;
+                    for (vertex, hat) in part.hats_at(part.share_within(rho_m)) {
+                        covered[vertex].gradient += hat * rho_m * *direction;
                     }
                 }
             }
             area += 0.5 * reached_m * reached_m;
-            begin = *end;
         }
         for covered in covered {
             covered.gradient = (covered.gradient - covered.weight * whole) / area;

@@ -76,11 +76,6 @@ impl Tree {
         tree
     }
 
-    /// What it takes for each triangle, bytes: leaves hold some of them, and there are as many nodes between.
-    pub(crate) fn bytes_per_triangle(&self) -> usize {
-        size_of::<Node>() * self.nodes.len() / self.order.len().max(1) + size_of::<u32>()
-    }
-
     /// Calls `found` for the triangles whose boxes overlap a box, until it returns false. Returns how many boxes were looked
     /// at.
     pub(crate) fn overlapping(
@@ -147,7 +142,7 @@ impl Tree {
 }
 
 /// The barycentric place of a triangle that is nearest to a point (Ericson, Real-Time Collision Detection, 5.1.5).
-pub(crate) fn nearest_place(point: DVec3, [a, b, c]: [DVec3; 3]) -> [f64; 3] {
+pub fn nearest_place(point: DVec3, [a, b, c]: [DVec3; 3]) -> [f64; 3] {
     let (ab, ac, ap) = (b - a, c - a, point - a);
     let (d1, d2) = (ab.dot(ap), ac.dot(ap));
     if d1 <= 0.0 && d2 <= 0.0 {

@@ -6,6 +6,8 @@
     clippy::cast_precision_loss
 )]
 
+mod common;
+
 use glam::{DVec2, DVec3};
 use palpate_mesh::surface::{Disc, Place, Surface};
 
@@ -32,27 +34,11 @@ fn flat(side: u32, jitter: f64, seed: u64) -> Surface {
     Surface::new(&vertices, &triangles)
 }
 
-/// An octahedron divided, on a sphere of radius 1.
-fn sphere(times: u32) -> Surface {
-    let mut vertices = vec![DVec3::X, DVec3::Y, DVec3::Z, -DVec3::X, -DVec3::Y, -DVec3::Z];
-    let mut triangles = vec![[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]];
-    for _ in 0..times {
-        let mut middles = std::collections::BTreeMap::new();
-        let mut middle = |a: u32, b: u32, vertices: &mut Vec<DVec3>| {
-            *middles.entry([a.min(b), a.max(b)]).or_insert_with(|| {
-                vertices.push((vertices[a as usize] + vertices[b as usize]).normalize());
-                vertices.len() as u32 - 1
-            })
-        };
-        triangles = triangles
-            .into_iter()
-            .flat_map(|[a, b, c]: [u32; 3]| {
-                let [ab, bc, ca] = [[a, b], [b, c], [c, a]].map(|[a, b]| middle(a, b, &mut vertices));
-                [[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]
-            })
-            .collect();
-    }
-    Surface::new(&vertices, &triangles)
+/// A sphere of radius 1: an octahedron with its edges halved so often.
+fn sphere(times: usize) -> Surface {
+    let mesh = common::sphere(times);
+    let vertices: Vec<DVec3> = mesh.vertices_m.iter().map(|place| place.normalize()).collect();
+    Surface::new(&vertices, &mesh.triangles)
 }
 
 fn place(surface: &Surface, x: f64, y: f64) -> Place {

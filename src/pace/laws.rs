@@ -42,8 +42,8 @@ pub(crate) fn have_same_laws(a: &Model, b: &Model) -> bool {
 }
 
 impl KeptLaws {
-    /// The law of `model` under a tip of `radius_m` at a point, or where the middle is ([`Disc::in_middle`]), for which at most `most_work` springs times iterations are done. Its
-    /// memory is charged to `payer`.
+    /// The law of `model` under a tip of `radius_m` at a point, or in the middle ([`Disc::in_middle`]), for which at most
+    /// `most_work` springs times iterations are done. Its memory is charged to `payer`.
     ///
     /// # Errors
     /// Refuses if `payer` can't have the memory.

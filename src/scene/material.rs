@@ -6,8 +6,8 @@ use glam::{DMat3, DVec3};
 
 use super::document::{Fields, Item};
 use super::membrane::settled_energy_j;
-use super::mesh::{Differences, Mesh, MeshShape};
-use crate::refusal::{Reason, Refusal, Result, did_you_mean, excerpt, not_negative, number, positive};
+use super::mesh::{Differences, Mesh, MeshShape, group_named};
+use crate::refusal::{Reason, Refusal, Result, not_negative, number, positive};
 use crate::shape::{PointId, RestShape};
 
 /// k of an edge between equal triangles with equal sides, over E·t: such springs resist as a membrane with ν = 1/3.
@@ -193,12 +193,8 @@ impl Inclusion {
                     Region::Ball { centre_m: centre.vector()?, radius_m: positive(&fields.path("radius_m"), radius_m)? }
                 }
                 (None, Some(group)) => {
-                    let (name, groups) = (group.text()?, &mesh.shape.told().groups);
-                    let found = groups.iter().find(|group| group.name == name).ok_or_else(|| {
-                        let meant = did_you_mean(&name, groups.iter().map(|group| group.name.as_str()));
-                        let message = format!("`{}` is no group of the mesh{meant}", excerpt(&name));
-                        group.refuse(Reason::WrongKind, message)
-                    })?;
+                    let found = group_named("", &group.text()?, &mesh.shape.told().groups);
+                    let found = found.map_err(|refusal| group.refuse(refusal.reason, refusal.message))?;
                     Region::Vertices(found.vertices.clone())
                 }
                 (Some(_), Some(group)) => {

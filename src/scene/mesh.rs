@@ -139,12 +139,9 @@ impl Mesh {
     /// # Errors
     /// As for [`MeshShape::new`].
     pub fn shown_as(mesh: TriangleMesh, shown: Option<Shown>, point_mass_kg: f64, fixed: Fixed) -> Result<Self> {
-        // Corners are walked backwards: the first corner at a vertex tells.
-        let uv = mesh.uv.map(|uv| {
+        let uv = mesh.uv.as_ref().map(|_| {
             let mut of_vertex = vec![[0.0; 2]; mesh.vertices_m.len()];
-            for (triangle, corners) in mesh.triangles.iter().zip(uv).rev() {
-                triangle.iter().zip(corners).for_each(|(vertex, uv)| of_vertex[*vertex as usize] = uv);
-            }
+            mesh.write_vertex_uv(&mut of_vertex);
             of_vertex
         });
         let mut shape = MeshShape::new(mesh.vertices_m, mesh.triangles, |rim, place_m, vertex| match &fixed {
@@ -420,15 +417,22 @@ impl Fixed {
     /// # Errors
     /// Refuses a name that no group has; `field` is the name that the refusal gives.
     pub fn group(field: &str, name: &str, mesh: &TriangleMesh) -> Result<Self> {
-        if let Some(found) = mesh.groups.iter().find(|group| group.name == name) {
-            return Ok(Fixed::Group(found.clone()));
-        }
-        let meant = did_you_mean(name, mesh.groups.iter().map(|group| group.name.as_str()));
-        let names: Vec<&str> = mesh.groups.iter().map(|group| group.name.as_str()).take(8).collect();
+        group_named(field, name, &mesh.groups).map(|group| Fixed::Group(group.clone()))
+    }
+}
+
+/// The group of that name.
+///
+/// # Errors
+/// Refuses a name that no group has; `field` is the name that the refusal gives.
+pub(super) fn group_named<'g>(field: &str, name: &str, groups: &'g [Group]) -> Result<&'g Group> {
+    groups.iter().find(|group| group.name == name).ok_or_else(|| {
+        let meant = did_you_mean(name, groups.iter().map(|group| group.name.as_str()));
+        let names: Vec<&str> = groups.iter().map(|group| group.name.as_str()).take(8).collect();
         let all = if names.is_empty() { "it has none".to_owned() } else { format!("it has {}", names.join(", ")) };
         let message = format!("`{}` is no group of the mesh{meant}; {all}", excerpt(name));
-        Err(Refusal::new(Reason::WrongKind, field, message))
-    }
+        Refusal::new(Reason::WrongKind, field, message)
+    })
 }
 
 impl MeshShape {
@@ -512,9 +516,7 @@ impl MeshShape {
             triangle.iter().for_each(|vertex| normals[*vertex as usize] += area);
         }
         normals.iter_mut().for_each(|normal| *normal = normal.try_normalize().unwrap_or(DVec3::Z));
-        let least_m = vertices_m.iter().copied().fold(DVec3::INFINITY, DVec3::min);
-        let most_m = vertices_m.iter().copied().fold(DVec3::NEG_INFINITY, DVec3::max);
-        let extent = Extent { least_m, most_m };
+        let extent = Extent::around(vertices_m.iter().copied());
         #[allow(clippy::cast_possible_truncation)]
         let is_fixed = (0..count).map(|vertex| is_fixed(on_rim[vertex], vertices_m[vertex], vertex as u32)).collect();
         let neighbours = Neighbours::new(count, &edges);

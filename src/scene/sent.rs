@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use super::document::{Document, Fields, read_text};
+use super::source::unit_text;
 use crate::limits::Limits;
 use crate::refusal::Result;
 
@@ -26,12 +27,10 @@ pub fn mesh_file(scene: &Path, limits: &Limits) -> Result<Option<MeshFile>> {
     let document = Document::parse(&scene.display().to_string(), &text)?;
     let mut found = None;
     let read = |fields: &mut Fields<'_>| {
-        let unit = fields.item("unit");
-        let number = unit.as_ref().and_then(|unit| unit.number().ok());
-        let unit = unit.and_then(|unit| unit.as_text().map(str::to_owned));
+        let unit = fields.item("unit").and_then(|item| unit_text(&item).ok());
         found = Some(MeshFile {
             path: fields.text("file")?.map(|file| scene.parent().unwrap_or(Path::new("")).join(file)),
-            unit: unit.or(number.map(|metres| metres.to_string())).unwrap_or_default(),
+            unit: unit.unwrap_or_default(),
             vertices: fields.item("vertices").map(|item| item.whole()).transpose()?,
         });
         Ok(())

@@ -4,6 +4,7 @@ use glam::DVec3;
 use palpate_mesh::TriangleMesh;
 use palpate_mesh::decimate::{Place, decimate};
 use palpate_mesh::delaunay::flip_to_delaunay;
+use palpate_mesh::surface::nearest_place;
 
 /// The mesh of the file, and how it is bound to the simulated one.
 #[derive(Debug, PartialEq)]
@@ -61,7 +62,7 @@ impl Shown {
             }
             let on = |triangle: u32| {
                 let [a, b, c] = coarse.triangles[triangle as usize].map(at);
-                let barycentric = if own[0] == own[1] { place.barycentric } else { closest_on([a, b, c], *place_m) };
+                let barycentric = if own[0] == own[1] { place.barycentric } else { nearest_place(*place_m, [a, b, c]) };
                 let [u, v, w] = barycentric;
                 (place_m.distance_squared(u * a + v * b + w * c), triangle, barycentric)
             };
@@ -95,34 +96,6 @@ impl Shown {
         }
         let names = closest.iter().map(|[own, any]| if own.0.is_finite() { own.1 } else { any.1 }).collect();
         Shown { mesh, places, nearest, names }
-    }
-}
-
-/// The weights of the corners at the place of a triangle that is closest to a point.
-fn closest_on([a, b, c]: [DVec3; 3], point: DVec3) -> [f64; 3] {
-    let (ab, ac) = (b - a, c - a);
-    let normal = ab.cross(ac);
-    let doubled = normal.length_squared();
-    if doubled > 0.0 {
-        let to = point - a;
-        let (v, w) = (to.cross(ac).dot(normal) / doubled, ab.cross(to).dot(normal) / doubled);
-        if v >= 0.0 && w >= 0.0 && v + w <= 1.0 {
-            return [1.0 - v - w, v, w];
-        }
-    }
-    let side = |from: DVec3, to: DVec3| {
-        let along = to - from;
-        let squared = along.length_squared();
-        let t = if squared > 0.0 { ((point - from).dot(along) / squared).clamp(0.0, 1.0) } else { 0.0 };
-        (t, (from + t * along).distance_squared(point))
-    };
-    let (on_ab, on_bc, on_ca) = (side(a, b), side(b, c), side(c, a));
-    if on_ab.1 <= on_bc.1 && on_ab.1 <= on_ca.1 {
-        [1.0 - on_ab.0, on_ab.0, 0.0]
-    } else if on_bc.1 <= on_ca.1 {
-        [0.0, 1.0 - on_bc.0, on_bc.0]
-    } else {
-        [on_ca.0, 0.0, 1.0 - on_ca.0]
     }
 }
 

@@ -30,9 +30,7 @@ impl Files<'_> {
             return Ok((made(&organ, limits)?, organ));
         }
         let item = fields.required("unit")?;
-        let text =
-            item.as_text().map_or_else(|| item.number().map(|metres| metres.to_string()), |text| Ok(text.to_owned()));
-        let unit = text?.parse::<Unit>();
+        let unit = unit_text(&item)?.parse::<Unit>();
         let unit = unit.map_err(|_| item.wrong("\"m\", \"cm\", \"mm\" or the metres of a unit"))?;
         let file = fields.required("file")?;
         Ok((self.read(&file, unit, limits)?, file))
@@ -55,6 +53,11 @@ impl Files<'_> {
         let found = palpate_mesh::read(&name, &bytes, unit, &beside, &within);
         Ok(found.map_err(|error| item.refuse(Reason::Unreadable, error.to_string()))?.mesh)
     }
+}
+
+/// The unit that an item gives: a name, or the metres of it.
+pub(super) fn unit_text(item: &Item<'_>) -> Result<String> {
+    item.as_text().map_or_else(|| item.number().map(|metres| metres.to_string()), |text| Ok(text.to_owned()))
 }
 
 /// An organ: which one, the bits of its edge length, its seed.

@@ -134,12 +134,10 @@ impl Maker {
         }
     }
 
-    /// The point whose law serves a tool at a place: the one that is known, as long as the tool is within a radius of it. On
-    /// a sheet it is the middle everywhere.
+    /// The point whose law serves a tool at a place: the one that is known, as long as the tool is within a radius of it.
     fn place(&self, known: &Known, model: &Model, place_m: Option<DVec3>) -> Option<PointId> {
-        let shape = model.shape();
-        let place_m = place_m.filter(|_| shape.dimensions() > 2);
         let Some(place_m) = place_m else { return known.at };
+        let shape = model.shape();
         let nearest = shape.nearest(place_m);
         let nearest_m = shape.rest_m(nearest);
         let is_near = |at: PointId| shape.rest_m(at).distance(nearest_m) <= self.radius_m;

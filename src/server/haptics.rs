@@ -71,7 +71,7 @@ struct StreamTools {
     lease: LeaseId,
     tools: usize,
     device: Option<Device>,
-    place: ToolPlace,
+    place: Option<ToolPlace>,
     /// Computes further laws as long as the stream is there.
     _computing: Option<AbortOnDropHandle<()>>,
 }
@@ -177,9 +177,11 @@ impl Haptics {
             intake.charge(lease, charges);
             Ok::<_, Refusal>(intake.next_step())
         })?;
-        let (place, places) = watch::channel(None);
+        let (told, places) = watch::channel(None);
         let (updates, _computing) = computing.zip(laws).map(|(computing, laws)| computing.go_on(laws, places)).unzip();
-        let place = ToolPlace { radius_m: tip.radius_m, told: place };
+        // Only a mesh has other laws at other places.
+        let has_places = device.is_some() && live.model.shape().dimensions() > 2;
+        let place = has_places.then_some(ToolPlace { radius_m: tip.radius_m, told });
         let held = StreamTools { live: live.clone(), lease, tools: open.tools.len(), device, place, _computing };
         let law = law.as_deref();
         let answer = pb::TouchOpened {
@@ -266,7 +268,7 @@ impl Haptics {
                         .take(now, "commands of this stream")
                         .and_then(|()| wire::command::from_command(&command, live.model.shape(), now))
                         .and_then(|command| within_reach(command, live, held.device.as_ref()))
-                        .inspect(|command| held.place.follow(command))
+                        .inspect(|command| held.place.iter().for_each(|place| place.follow(command)))
                         .and_then(|command| live.submit(held.lease, vec![command]).map(drop));
                     self.0.traffic.commanded(usize::from(taken.is_ok()));
                     if let Err(refusal) = taken {

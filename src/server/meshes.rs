@@ -3,7 +3,6 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 
-use glam::DVec3;
 use palpate_mesh::repair::{Repair, repair};
 use palpate_mesh::report::{Finding, report_within};
 use palpate_mesh::{Element, MeshError, ReadLimits, TriangleMesh, Unit};
@@ -309,15 +308,14 @@ impl Reading {
         let found_problems = found.problems.iter().map(problem);
         let problems = found_problems.chain(problems).collect();
         let count = |count: usize| u32::try_from(count).unwrap_or(u32::MAX);
-        let least_m = mesh.vertices_m.iter().copied().fold(DVec3::INFINITY, DVec3::min);
-        let most_m = mesh.vertices_m.iter().copied().fold(DVec3::NEG_INFINITY, DVec3::max);
+        let extent = Extent::around(mesh.vertices_m.iter().copied());
         let report = pb::MeshReport {
             vertices: count(found.vertices),
             triangles: count(found.triangles),
             components: count(found.components),
             holes: count(found.holes),
             volume_m3: found.volume_m3,
-            extent: least_m.is_finite().then(|| wire::extent(&Extent { least_m, most_m })),
+            extent: extent.least_m.is_finite().then(|| wire::extent(&extent)),
             edge_m: found.edge_m.median,
             problems,
             groups: mesh.groups.iter().map(|group| group.name.clone()).take(GROUPS_TOLD).collect(),

@@ -400,10 +400,11 @@ impl Session {
                 let client_time_s = command.client_time_ns as f64 * 1e-9;
                 let now_s = self.time_s();
                 if self.tool(index).posed.is_none() {
-                    let path = match self.model().shape().approach_m(place_m, tip.radius_m) {
-                        _ if tip.grasps => Path::of_grasp(),
-                        Some(begins_m) => Path::beginning_at(begins_m),
-                        None => Path::default(),
+                    let path = if tip.grasps {
+                        Path::of_grasp()
+                    } else {
+                        let begins_m = self.model().shape().approach_m(place_m, tip.radius_m);
+                        begins_m.map_or_else(Path::default, Path::beginning_at)
                     };
                     self.tool(index).posed = Some(Posed { tip, path, client_time_s });
                 }

@@ -199,6 +199,11 @@ impl Footprint {
         (place, along)
     }
 
+    /// Where the disc is on the tissue at rest, m, and the unit normal out of the tissue there.
+    pub fn at_rest(&self) -> (DVec3, DVec3) {
+        (self.rest_m, self.outward(&self.along))
+    }
+
     /// The unit normal out of the tissue: ∂s/∂c₁ × ∂s/∂c₂ is the only choice whose work equals what the tissue gets when
     /// the disc slides over a slope.
     pub(super) fn outward(&self, along: &[DVec3; 2]) -> DVec3 {

@@ -428,11 +428,21 @@ pub enum Deepened {
 impl Press {
     /// A press by a disc with any amount of work.
     pub fn new(model: &Model, course: Course, accuracy: Accuracy) -> Self {
+        let (footprint, window) = Self::laid(model, &course);
+        Self::begun(footprint, window, course, accuracy)
+    }
+
+    /// The disc at its place, and what notices it.
+    fn laid(model: &Model, course: &Course) -> (Footprint, Window) {
         let footprint = Footprint::new(model, course.radius_m, course.centre_m);
         let window = Window::at(model, course.radius_m, footprint.anchor_m(), course.points);
+        (footprint, window)
+    }
+
+    fn begun(footprint: Footprint, window: Window, course: Course, accuracy: Accuracy) -> Self {
         memory::require(window.bytes(), "a force law");
-        let (_, along) = footprint.surface(|_| DVec3::ZERO);
-        let turn = DMat3::from_quat(DQuat::from_rotation_arc(footprint.outward(&along), DVec3::Z));
+        let (_, outward) = footprint.at_rest();
+        let turn = DMat3::from_quat(DQuat::from_rotation_arc(outward, DVec3::Z));
         let displacement_m = vec![DVec3::ZERO; window.len()];
         let (left, pressed) = (u64::MAX, Vec::new());
         Press { footprint, window, turn, course, accuracy, left, displacement_m, pressed }
@@ -442,9 +452,9 @@ impl Press {
     pub fn within(model: &Model, course: Course, accuracy: Accuracy, work: u64) -> Option<Self> {
         // A solution takes as many iterations as there are points from the middle to where nothing is noticed, or nearly
         // so, and each depth some solutions: what can't be done is not begun, and no memory is taken for it.
-        let window = Window::at(model, course.radius_m, course.centre_m, course.points);
+        let (footprint, window) = Self::laid(model, &course);
         let least = window.len() as u64 * 4 * u64::from(course.count) * (window.across() as u64);
-        (least <= work).then(|| Press { left: work, ..Self::new(model, course, accuracy) })
+        (least <= work).then(|| Press { left: work, ..Self::begun(footprint, window, course, accuracy) })
     }
 
     /// Springs times iterations that are left.

@@ -65,12 +65,9 @@ impl Skin {
         });
         let bound = memory::collected(bound, TABLES);
         let rest_m = memory::collected(order.iter().map(|vertex| shape.vertices_m()[*vertex as usize]), TABLES);
-        let uv = shown.mesh.uv.as_ref().map(|uv| {
+        let uv = shown.mesh.uv.as_ref().map(|_| {
             let mut of_vertex = memory::filled(count, [0.0; 2], TABLES);
-            // Corners are walked backwards: the first corner at a vertex tells.
-            for (triangle, corners) in shown.mesh.triangles.iter().zip(uv).rev() {
-                triangle.iter().zip(corners).for_each(|(vertex, uv)| of_vertex[*vertex as usize] = *uv);
-            }
+            shown.mesh.write_vertex_uv(&mut of_vertex);
             of_vertex
         });
         Some(Arc::new(Skin { vertices, places, uv, bound, rest_m, shape }))

@@ -9,7 +9,7 @@ use super::order::{TABLES, TILE_SLOTS};
 use super::slots::{MeshSlots, NO_VERTEX};
 use crate::memory;
 use crate::scene::Mesh;
-use crate::shape::{PointId, RestShape};
+use crate::shape::{Extent, PointId, RestShape};
 use crate::sheet::field::BLOCK;
 
 /// The slots of a mesh, and where they are in space.
@@ -59,8 +59,7 @@ impl MeshPlaces {
         };
         let box_of = |tile: usize| {
             let places = || within(tile * TILE_SLOTS..(tile + 1) * TILE_SLOTS).copied();
-            let (least_m, most_m) =
-                (places().fold(DVec3::INFINITY, DVec3::min), places().fold(DVec3::NEG_INFINITY, DVec3::max));
+            let Extent { least_m, most_m } = Extent::around(places());
             std::array::from_fn(|axis| [least_m[axis], most_m[axis]])
         };
         let (mut around, mut firsts_around) = (Vec::new(), vec![0]);

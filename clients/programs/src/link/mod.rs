@@ -292,8 +292,8 @@ fn setup(arguments: &Arguments) -> Result<Setup, Refusal> {
     }
     let spot = Spot::new(&model, near_m, tip.radius_m);
     // A sheet has one law, that of its middle.
-    let at_m = if model.shape().dimensions() > 2 { spot.at_m } else { model.shape().extent().middle_m() };
-    let disc = Disc { radius_m: tip.radius_m, at_m };
+    let in_middle = Disc::in_middle(&model, tip.radius_m);
+    let disc = if model.shape().dimensions() > 2 { Disc { at_m: spot.at_m, ..in_middle } } else { in_middle };
     let law = force_law::exact_within(&model, disc, u64::MAX, &AtomicBool::new(false));
     let law = law.filter(Law::is_sound).ok_or_else(|| {
         Refusal::new(Reason::NotAvailable, "--scene", "has no force law: nothing holds it, or it is too large")

@@ -28,8 +28,7 @@ impl Spot {
         if model.shape().dimensions() == 2 {
             return Spot { at_m: near_m, turn: DMat3::IDENTITY };
         }
-        let (at_m, [one, other]) = Footprint::new(model, radius_m, near_m).surface(|_| DVec3::ZERO);
-        let outward = one.cross(other).try_normalize().unwrap_or(DVec3::Z);
+        let (at_m, outward) = Footprint::new(model, radius_m, near_m).at_rest();
         Spot { at_m, turn: DMat3::from_quat(DQuat::from_rotation_arc(outward, DVec3::Z)) }
     }
 
