@@ -92,6 +92,14 @@ fn what_a_client_gives_that_stands_still_is_counted() {
     }
 }
 
+/// A plane in place of the curved surface would be off by four times the bound.
+#[test]
+fn over_a_curved_organ_the_force_turns_with_the_surface() {
+    let found = link("--scene liver-organ --rtt-ms 50 --seconds 8");
+    assert!(number(&found, "force_error_rms_percent") <= 1.0, "{found}");
+    assert_eq!(found["unstable"], false);
+}
+
 #[test]
 fn a_deadband_sends_a_twentieth_and_is_not_felt() {
     for scene in ["liver", "fibrotic", "stomach"] {

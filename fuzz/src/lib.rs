@@ -444,6 +444,7 @@ fn sample_seeds() -> Vec<Vec<u8>> {
         damping_n_s_per_m: matrix(1.0),
         surface_m: vector(0.0, 0.0, 0.0),
         normal: vector(0.0, 0.0, 1.0),
+        curvature_per_m: matrix(20.0),
         valid_m: 0.005,
         friction: 0.2,
         contact: contact.into(),

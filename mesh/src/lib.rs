@@ -1,5 +1,6 @@
 //! Triangle meshes of organs: read from files, checked, mended, written, generated. No tissue, no network, no clock.
 
+mod curvature;
 pub mod decimate;
 pub mod delaunay;
 pub mod mesh;

@@ -4,8 +4,9 @@
 //! of at most its radius lead to. Where the surface is curved, ways that pass a vertex on either side part a little: by the
 //! angle that is missing at the vertex, so by less the finer the mesh is.
 
-use glam::{DVec2, DVec3};
+use glam::{DMat3, DVec2, DVec3};
 
+use crate::curvature::curvatures;
 pub use crate::tree::nearest_place;
 use crate::tree::{Tree, corners};
 
@@ -50,6 +51,7 @@ pub struct Surface {
     /// Side k of a triangle is from its corner k to the next.
     beyond: Vec<[Beyond; 3]>,
     areas_m2: Vec<f64>,
+    curvatures_per_m: Vec<[f32; 6]>,
     is_closed: bool,
     edge_m: f64,
     tree: Tree,
@@ -110,7 +112,9 @@ impl Surface {
         // That of equilateral triangles of the same area.
         let mean_m2 = areas_m2.iter().sum::<f64>() / kept.len().max(1) as f64;
         let edge_m = (mean_m2 * 4.0 / 3.0_f64.sqrt()).sqrt();
-        Surface { vertices_m: vertices_m.to_vec(), triangles: kept, beyond, areas_m2, is_closed, edge_m, tree }
+        let curvatures_per_m = curvatures(vertices_m, &kept);
+        let vertices_m = vertices_m.to_vec();
+        Surface { vertices_m, triangles: kept, beyond, areas_m2, curvatures_per_m, is_closed, edge_m, tree }
     }
 
     /// Where the vertices are, m.
@@ -126,6 +130,13 @@ impl Surface {
     /// The area of each vertex: a third of that of the triangles around it, m².
     pub fn areas_m2(&self) -> &[f64] {
         &self.areas_m2
+    }
+
+    /// How the outward normal changes per metre along the surface at a vertex, 1/m: symmetric, 1/R along a sphere. Its mean
+    /// over a disc is that of the surface there.
+    pub fn curvature_per_m(&self, vertex: usize) -> DMat3 {
+        let [xx, yy, zz, xy, xz, yz] = self.curvatures_per_m[vertex].map(f64::from);
+        DMat3::from_cols(DVec3::new(xx, xy, xz), DVec3::new(xy, yy, yz), DVec3::new(xz, yz, zz))
     }
 
     /// The usual length of an edge, m.

@@ -181,3 +181,22 @@ fn half_a_disc_over_the_rim_has_the_weights_of_what_is_on_the_surface() {
         assert!(disc.covered().iter().all(|covered| covered.weight >= 0.0 && covered.gradient.is_finite()));
     }
 }
+
+#[test]
+fn the_mean_curvature_under_a_disc_on_a_sphere_is_that_of_its_radius() {
+    let surface = sphere(5);
+    let mut dice = fastrand::Rng::with_seed(3);
+    let mut disc = Disc::new(0.25, surface.edge_m());
+    for _ in 0..50 {
+        let [x, y, z] = [(); 3].map(|()| dice.f64() - 0.5);
+        let place = surface.nearest(DVec3::new(x, y, z).normalize()).unwrap();
+        disc.lay(&surface, &place);
+        let normal = surface.at_m(&place).normalize();
+        let along = normal.any_orthonormal_vector();
+        for way in [along, normal.cross(along)] {
+            let turns = disc.covered().iter().map(|on| on.weight * (surface.curvature_per_m(on.vertex as usize) * way));
+            let turn: DVec3 = turns.sum();
+            assert!((turn - turn.dot(normal) * normal - way).length() < 0.05, "{normal}: {turn} for {way}");
+        }
+    }
+}

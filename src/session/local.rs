@@ -86,7 +86,10 @@ impl Modeller {
         // On contact, the tissue moves away from the tool for a moment. Its place then is not where the tool will meet
         // it.
         self.bounced = if below && feel.contact_state == ContactState::Free { self.bounced + 1 } else { 0 };
-        if !touches && !(1..=BOUNCE_SAMPLES).contains(&self.bounced) {
+        if touches {
+            // A dent turns the surface under a tool; the law is about the surface at rest.
+            self.surface = feel.rest.map(|rest| (rest.place_m, rest.normal)).or(self.surface);
+        } else if !(1..=BOUNCE_SAMPLES).contains(&self.bounced) {
             self.surface = Some((feel.surface_m, feel.normal));
         }
         let (mut surface_m, normal) = self.surface.unwrap_or((feel.surface_m, DVec3::Z));
@@ -125,6 +128,7 @@ impl Modeller {
             damping_n_s_per_m,
             surface_m,
             normal,
+            curvature_per_m: feel.rest.map_or(DMat3::ZERO, |rest| rest.curvature_per_m),
             valid_m: local::valid_m(force_n, LEAST_N, self.hardening(depth_m, &row)),
             friction: feel.friction,
             contact_state: feel.contact_state,
@@ -160,6 +164,7 @@ mod tests {
             surface_m: surface_m * DVec3::Z,
             anchor_m: DVec3::ZERO,
             normal: DVec3::Z,
+            rest: None,
             friction: 0.2,
         }
     }

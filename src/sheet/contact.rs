@@ -25,7 +25,7 @@ use std::sync::Arc;
 use glam::DVec3;
 
 use super::field::{Layout, State};
-use super::footprint::{Footprint, Reached};
+use super::footprint::{Footprint, Reached, RestSurface};
 use super::model::{Model, Plan};
 use super::real::Real;
 use super::tangent::{Patch, Tangent, Window};
@@ -48,6 +48,8 @@ pub struct Feel {
     pub anchor_m: DVec3,
     /// Unit normal out of the tissue.
     pub normal: DVec3,
+    /// The surface at rest there; none of a sheet, which is a plane at rest.
+    pub rest: Option<RestSurface>,
     /// μ of the tool's tip.
     pub friction: f64,
 }

@@ -13,7 +13,7 @@
 mod grid;
 mod mesh;
 
-use glam::{DVec2, DVec3};
+use glam::{DMat3, DVec2, DVec3};
 
 use super::model::Model;
 use crate::scene::Body;
@@ -204,6 +204,14 @@ impl Footprint {
         (self.rest_m, self.outward(&self.along))
     }
 
+    /// The surface at rest about the disc, as a tool sees it that is on this side of it (1 outside, -1 inside); `None` on a
+    /// sheet, which is a plane.
+    pub(super) fn rest_surface(&self, side: f64) -> Option<RestSurface> {
+        let Ground::Mesh(disc) = &self.ground else { return None };
+        let (normal, curvature_per_m) = (side * self.outward(&self.along), side * disc.curvature_per_m());
+        Some(RestSurface { place_m: self.rest_m, normal, curvature_per_m })
+    }
+
     /// The unit normal out of the tissue: ∂s/∂c₁ × ∂s/∂c₂ is the only choice whose work equals what the tissue gets when
     /// the disc slides over a slope.
     pub(super) fn outward(&self, along: &[DVec3; 2]) -> DVec3 {
@@ -230,6 +238,18 @@ impl Footprint {
             Ground::Mesh(disc) => disc.side(height_m),
         }
     }
+}
+
+/// The surface at rest about a tool's place.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RestSurface {
+    /// The place where the disc is, m.
+    pub place_m: DVec3,
+    /// The unit normal there, towards the tool.
+    pub normal: DVec3,
+    /// How the normal changes per metre along the surface, 1/m: symmetric, 1/R on a sphere of radius R. Valid for ways
+    /// across the normal.
+    pub curvature_per_m: DMat3,
 }
 
 fn is_free(model: &Model, index: usize) -> bool {

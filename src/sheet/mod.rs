@@ -48,7 +48,7 @@ mod touch;
 pub use applied::Push;
 pub use checkpoint::CheckFailure;
 pub use contact::{Feel, Surroundings};
-pub use footprint::{Footprint, Reached};
+pub use footprint::{Footprint, Reached, RestSurface};
 pub use integrate::order;
 pub use model::{Model, Plan};
 pub use motion::at_rest;

@@ -68,6 +68,7 @@ impl<T: Real> Sheet<T> {
             surface_m,
             anchor_m: tool.footprint.anchor_m(),
             normal: tool.normal,
+            rest: tool.footprint.rest_surface(tool.side.unwrap_or(1.0)),
             friction: tool.tip.friction,
         })
     }

@@ -35,6 +35,7 @@
 //!     damping_n_s_per_m: 0.5 * DMat3::IDENTITY,
 //!     surface_m: DVec3::ZERO,
 //!     normal: DVec3::Z,
+//!     curvature_per_m: DMat3::ZERO,
 //!     valid_m: 0.01,
 //!     friction: 0.2,
 //!     contact_state: if place_m.z < 0.0 { ContactState::Sticking } else { ContactState::Free },

@@ -197,6 +197,7 @@ mod tests {
             damping_n_s_per_m: DMat3::IDENTITY,
             surface_m: height_m * DVec3::Z,
             normal: DVec3::Z,
+            curvature_per_m: DMat3::ZERO,
             valid_m: 0.01,
             friction: 0.2,
             contact_state: ContactState::Sticking,

@@ -35,6 +35,7 @@ fn model(sequence: u64, time_s: f64, place_m: DVec3) -> LocalModel {
         damping_n_s_per_m: DMat3::IDENTITY * 0.5,
         surface_m: DVec3::new(place_m.x, place_m.y, 0.0),
         normal: DVec3::Z,
+        curvature_per_m: DMat3::ZERO,
         valid_m: 0.01,
         friction: 0.2,
         contact_state: if depth_m > 0.0 { ContactState::Sticking } else { ContactState::Free },

@@ -2,8 +2,8 @@
 
 use std::sync::Arc;
 
-use glam::{DVec2, DVec3};
-use palpate_mesh::surface::{Disc, Place};
+use glam::{DMat3, DVec2, DVec3};
+use palpate_mesh::surface::{Covered, Disc, Place};
 
 use crate::scene::MeshShape;
 use crate::shape::PointId;
@@ -39,6 +39,13 @@ impl MeshDisc {
     pub(super) fn outward(&self) -> DVec3 {
         let [along, across] = self.place.frame;
         along.cross(across)
+    }
+
+    /// How the outward normal changes along the surface at rest, 1/m: the mean over the disc.
+    pub(super) fn curvature_per_m(&self) -> DMat3 {
+        let surface = self.shape.surface();
+        let of = |covered: &Covered| covered.weight * surface.curvature_per_m(covered.vertex as usize);
+        self.disc.covered().iter().map(of).fold(DMat3::ZERO, |sum, part| sum + part)
     }
 
     /// The side on which it is ([`palpate_mesh::surface::Surface::side`]).

@@ -8,7 +8,7 @@ use palpate::session::Session;
 use palpate::session::command::{Command, Due};
 use palpate::session::laws::FIRST;
 use palpate::session::local::Modeller;
-use palpate::sheet::{Feel, Footprint, Model};
+use palpate::sheet::{Feel, Footprint, Model, RestSurface};
 use palpate_touch::path::{Path, Play};
 use palpate_touch::{ContactState, Law, LocalModel, Tip};
 
@@ -51,6 +51,11 @@ impl Spot {
             surface_m: place(feel.surface_m),
             anchor_m: place(feel.anchor_m),
             normal: self.turn * feel.normal,
+            rest: feel.rest.map(|rest| RestSurface {
+                place_m: place(rest.place_m),
+                normal: self.turn * rest.normal,
+                curvature_per_m: self.turn * rest.curvature_per_m * self.turn.transpose(),
+            }),
             ..feel
         }
     }
