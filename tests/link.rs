@@ -100,6 +100,45 @@ fn over_a_curved_organ_the_force_turns_with_the_surface() {
     assert_eq!(found["unstable"], false);
 }
 
+/// Over a stream the same losses cost a third of the force.
+#[test]
+fn over_datagrams_a_lost_packet_costs_nothing() {
+    for (scene, network) in [
+        ("liver", "--rtt-ms 50 --loss 0.1"),
+        ("fibrotic", "--rtt-ms 50 --loss 0.01 --loss-burst 5"),
+        ("liver", "--rtt-ms 50 --jitter-ms 40"),
+        ("fibrotic", "--profile bad-wan"),
+    ] {
+        let found = link(&format!("--scene {scene} --transport datagram {network} --seconds 8"));
+        assert!(number(&found, "force_error_rms_percent") <= 0.7, "{found}");
+        assert_eq!((number(&found, "energy_min_j"), number(&found, "pauses")), (0.0, 0.0), "{found}");
+    }
+}
+
+#[test]
+fn an_outage_lets_go_of_the_force_and_gives_no_energy() {
+    for outage_ms in [100, 200] {
+        let found =
+            link(&format!("--scene fibrotic --transport datagram --rtt-ms 50 --outage-ms {outage_ms} --seconds 8"));
+        assert!(number(&found, "energy_min_j") >= -1e-3, "{found}");
+        assert_eq!((&found["unstable"], number(&found, "faults")), (&Value::Bool(false), 0.0), "{found}");
+    }
+}
+
+/// Of a thousand each way a second, and with no more than half a per cent of error beside what 1000 have.
+#[test]
+fn news_alone_are_a_tenth_of_the_packets_each_way() {
+    for (transport, network) in [("stream", ""), ("datagram", "--loss 0.01"), ("datagram", "--jitter-ms 10")] {
+        let run = |news: &str| {
+            link(&format!("--scene liver --transport {transport} --rtt-ms 50 {network} {news} --seconds 8"))
+        };
+        let (all, news) = (run(""), run("--up-deadband 0.05 --deadband 0.1"));
+        let error = |found: &Value| number(found, "force_error_rms_percent");
+        assert!(error(&news) <= error(&all) + 0.5, "{news}");
+        assert!(number(&news, "packets_per_s") <= 100.0 && number(&news, "commands_per_s") <= 100.0, "{news}");
+    }
+}
+
 #[test]
 fn a_deadband_sends_a_twentieth_and_is_not_felt() {
     for scene in ["liver", "fibrotic", "stomach"] {

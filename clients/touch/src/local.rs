@@ -9,7 +9,7 @@ use std::collections::VecDeque;
 
 use glam::{DMat3, DVec3};
 
-use crate::law::Law;
+use crate::law::{Law, Row};
 
 /// The state of contact between a tool and the tissue.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -186,6 +186,12 @@ impl Touching {
         (depth_m, normal)
     }
 
+    /// The depth of the disc, m, and the law there.
+    pub fn at_law(&self, model: &LocalModel, law: &Law) -> (f64, Row) {
+        let (depth_m, _) = self.under(model);
+        (depth_m, law.at_depth(depth_m))
+    }
+
     /// Advances to the tool's next place.
     pub fn move_to(&mut self, model: &LocalModel, law: &Law, place_m: DVec3) {
         let moved_m = place_m - self.place_m;
@@ -246,7 +252,6 @@ mod tests {
     use glam::DQuat;
 
     use super::*;
-    use crate::law::Row;
 
     const NORMAL: DVec3 = DVec3::new(0.6, 0.0, 0.8);
     /// A direction in the surface.

@@ -9,6 +9,14 @@
 //! goes there no faster than [`SPEED_M_PER_S`]. After [`RELEASE_S`] without a command the tool lets go. A command
 //! without a time, or stamped with its step, takes effect at once and the path does not wait for a successor; but no
 //! tool ever leaps.
+//!
+//! **News alone.** A command may say how fast the tool moves. Then its client sends the next one only when the tool is not
+//! where this movement leads ([`crate::news`]), and over a gap the tool goes on along it, for [`EXTRAPOLATE_S`] at most. So the
+//! played moment need not stop when nothing newer is there. It keeps to the arrivals instead: it falls back by a tenth while
+//! commands come too late for it, and catches up as above.
+//!
+//! **Datagrams** may overtake each other and be lost. A place that comes late fills its gap if it has not been played; else
+//! nothing needs it any more ([`Path::fill`]).
 
 use std::collections::VecDeque;
 
@@ -22,6 +30,10 @@ pub const BACKLOG_S: f64 = 0.1;
 pub const HOLD_S: f64 = 0.05;
 /// Without a command for this long the tool lets go, s.
 pub const RELEASE_S: f64 = 0.25;
+/// Longest time over which a movement is extrapolated, s: as long as a tool moves that is not held.
+pub const EXTRAPOLATE_S: f64 = HOLD_S;
+/// The played moment falls back while commands with a velocity come later than this for it, s.
+const LATE_S: f64 = 0.002;
 /// The played moment catches up by this fraction of a step.
 const CATCH_UP: f64 = 0.1;
 /// Before it catches up, something newer must have been available for this long, s.
@@ -46,6 +58,8 @@ pub struct Path {
     /// Where it begins, if neither there nor above it.
     begins_m: Option<DVec3>,
     waiting: VecDeque<(f64, DVec3)>,
+    /// The newest command, if it says how fast the tool moves, m/s.
+    heading: Option<(f64, DVec3, DVec3)>,
     played: Option<(f64, DVec3)>,
     place_m: Option<DVec3>,
     arrived_s: f64,
@@ -77,18 +91,58 @@ impl Path {
             self.dropped += 1;
             return false;
         }
-        if self.waiting.len() == MOST {
+        self.wait(self.waiting.len(), time_s, place_m);
+        (self.heading, self.arrived_s) = (None, now_s);
+        true
+    }
+
+    /// The same of a tool that moves at `velocity_m_per_s` then: until something newer comes, it goes on so.
+    pub fn receive_moving(&mut self, time_s: f64, place_m: DVec3, velocity_m_per_s: DVec3, now_s: f64) -> bool {
+        let newest_s = self.newest_s().unwrap_or(f64::NEG_INFINITY);
+        let is_finite = place_m.is_finite() && velocity_m_per_s.is_finite() && time_s.is_finite();
+        if !is_finite || time_s <= newest_s {
+            self.dropped += 1;
+            return false;
+        }
+        if let Some((played_s, _)) = self.played {
+            self.spare_s = self.spare_s.min(time_s - played_s);
+        }
+        // It may have been played past already, along what was known.
+        if self.played.is_none_or(|played| time_s > played.0) {
+            self.wait(self.waiting.len(), time_s, place_m);
+        }
+        let velocity_m_per_s = velocity_m_per_s.clamp_length_max(SPEED_M_PER_S);
+        (self.heading, self.arrived_s) = (Some((time_s, place_m, velocity_m_per_s)), now_s);
+        true
+    }
+
+    /// Fills a gap with a place that comes late, if it has not been played.
+    pub fn fill(&mut self, time_s: f64, place_m: DVec3) {
+        let is_due = time_s.is_finite() && self.played.is_some_and(|played| time_s > played.0);
+        let at = self.waiting.partition_point(|waiting| waiting.0 < time_s);
+        // What is newer than all is no gap; and each fills it once.
+        if is_due && place_m.is_finite() && self.waiting.get(at).is_some_and(|after| after.0 > time_s) {
+            self.wait(at, time_s, place_m);
+        }
+    }
+
+    /// The client's time of the newest command, s.
+    pub fn newest_s(&self) -> Option<f64> {
+        let known = [self.heading.map(|heading| heading.0), self.waiting.back().map(|waiting| waiting.0)];
+        known.into_iter().flatten().reduce(f64::max).or(self.played.map(|played| played.0))
+    }
+
+    fn wait(&mut self, at: usize, time_s: f64, place_m: DVec3) {
+        self.waiting.insert(at, (time_s, place_m));
+        if self.waiting.len() > MOST {
             self.waiting.pop_front();
         }
-        self.waiting.push_back((time_s, place_m));
-        self.arrived_s = now_s;
-        true
     }
 
     /// Takes a command that takes effect at once, whatever its time: the tool's place at client time `time_s`.
     pub fn go_to(&mut self, time_s: f64, place_m: DVec3) {
         self.waiting.clear();
-        (self.played, self.arrived_s) = (Some((time_s, place_m)), f64::INFINITY);
+        (self.played, self.heading, self.arrived_s) = (Some((time_s, place_m)), None, f64::INFINITY);
     }
 
     /// Steps in which the speed limit acted; commands that were refused or skipped; releases.
@@ -104,7 +158,9 @@ impl Path {
     /// The action of the tool in the step of `step_s` that ends at `now_s`; `None` before the first command.
     pub fn step(&mut self, now_s: f64, step_s: f64) -> Option<Play> {
         let newest = self.waiting.back().copied();
-        if let Some(newest) = newest {
+        if let Some(heading) = self.heading {
+            self.go_on(heading, now_s, step_s);
+        } else if let Some(newest) = newest {
             self.play(newest, now_s, step_s);
         } else {
             self.spare_s = 0.0;
@@ -149,19 +205,55 @@ impl Path {
             }
         }
         let next_s = next_s.min(newest.0);
-        let mut before = self.played.unwrap_or(newest);
-        while let Some(place) = self.waiting.front().copied().filter(|place| place.0 <= next_s + 1e-9) {
-            before = place;
-            self.waiting.pop_front();
-        }
+        let before = self.pass(next_s).unwrap_or(newest);
         self.played = Some(match self.waiting.front() {
-            Some(after) if next_s > before.0 => {
-                let part = (next_s - before.0) / (after.0 - before.0);
-                (next_s, before.1.lerp(after.1, part))
-            }
+            Some(after) if next_s > before.0 => (next_s, between(before, *after, next_s)),
             _ => before,
         });
     }
+
+    /// Plays commands that say how fast the tool moves, the newest of which is `heading`.
+    fn go_on(&mut self, heading: (f64, DVec3, DVec3), now_s: f64, step_s: f64) {
+        let (newest_s, newest_m, velocity_m_per_s) = heading;
+        let Some((played_s, _)) = self.played.filter(|played| newest_s - played.0 <= BACKLOG_S) else {
+            self.waiting.clear();
+            (self.played, self.spare_s, self.watched_s) = (Some((newest_s, newest_m)), f64::INFINITY, now_s);
+            return;
+        };
+        let mut pace = 1.0;
+        if self.spare_s < -LATE_S {
+            pace -= CATCH_UP;
+        } else if now_s - self.watched_s >= WATCHED_S && self.spare_s.is_finite() && self.spare_s > 0.5 * step_s {
+            pace += CATCH_UP;
+        }
+        if pace != 1.0 {
+            self.spare_s += (1.0 - pace) * step_s;
+        } else if now_s - self.watched_s >= WATCHED_S {
+            (self.spare_s, self.watched_s) = (f64::INFINITY, now_s);
+        }
+        let next_s = (played_s + pace * step_s).min((newest_s + EXTRAPOLATE_S).max(played_s));
+        let before = self.pass(next_s);
+        self.played = Some(match (before, self.waiting.front()) {
+            (Some(before), Some(after)) => (next_s, between(before, *after, next_s)),
+            // Beyond all that is known.
+            _ => (next_s, newest_m + velocity_m_per_s * (next_s - newest_s)),
+        });
+    }
+
+    /// What was played last by a moment, and leaves the queue.
+    fn pass(&mut self, until_s: f64) -> Option<(f64, DVec3)> {
+        let mut before = self.played;
+        while let Some(place) = self.waiting.front().copied().filter(|place| place.0 <= until_s + 1e-9) {
+            before = Some(place);
+            self.waiting.pop_front();
+        }
+        before
+    }
+}
+
+/// The place between two at a moment between them.
+fn between(before: (f64, DVec3), after: (f64, DVec3), at_s: f64) -> DVec3 {
+    before.1.lerp(after.1, (at_s - before.0) / (after.0 - before.0))
 }
 
 /// A new tool that touches begins at least this high above the sheet at rest, m.

@@ -30,6 +30,10 @@ pub const BIAS_S: f64 = 0.02;
 /// Laws that a renderer keeps.
 pub const MOST_LAWS: usize = 16;
 
+/// A way that nobody feels, and one that everybody does, m: [`Renderer::way_m`] is between them.
+const LEAST_WAY_M: f64 = 2e-5;
+const MOST_WAY_M: f64 = 1e-3;
+
 /// One tool's renderer.
 #[derive(Debug, Clone)]
 pub struct Renderer {
@@ -143,6 +147,19 @@ impl Renderer {
             return force_n;
         }
         force_n - force_n.dot(model.normal).min(0.0) * model.normal
+    }
+
+    /// The way by which a server may be wrong about the tool so that the force is off by no more than `share` of itself, m. Above
+    /// the tissue half the way to it counts, as far as a hand would notice.
+    pub fn way_m(&self, share: f64) -> f64 {
+        let Some((model, touching)) = &self.newest else { return LEAST_WAY_M };
+        let (depth_m, row) = touching.at_law(model, law_of(&self.laws, model));
+        let way_m = if depth_m > 0.0 {
+            share * row.force_n / row.stiffness_n_per_m.max(row.across_n_per_m).max(f64::MIN_POSITIVE)
+        } else {
+            share * -depth_m
+        };
+        way_m.clamp(LEAST_WAY_M, MOST_WAY_M)
     }
 
     /// The force to render until the next tick, for a tool at `place_m` now, N.

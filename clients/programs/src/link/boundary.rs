@@ -8,7 +8,6 @@ use serde_json::{Value, json};
 use super::network::{Conditions, Direction};
 use super::run::TICK_S;
 use crate::Failure;
-use crate::simulated::random::Random;
 
 /// Stiffnesses to try, N/m.
 pub(super) const STIFFNESSES_N_PER_M: [f64; 9] = [150.0, 250.0, 300.0, 400.0, 500.0, 700.0, 1000.0, 1500.0, 3000.0];
@@ -32,10 +31,9 @@ pub(super) struct Boundary {
 /// Growth rate of the vibration's energy in the loop, 1/s.
 fn growth_per_s(hand: &Hand, stiffness_n_per_m: f64, ticks: u32) -> f64 {
     // The whole delay is on one way: with half of an odd number on each, each half would be rounded up to a tick.
-    let conditions =
-        |ticks: u32| Conditions { round_trip_s: 2.0 * f64::from(ticks) * TICK_S, jitter_s: 0.0, loss: 0.0 };
-    let mut up: Direction<DVec3> = Direction::new(conditions(ticks), Random::new(0, 0));
-    let mut down: Direction<DVec3> = Direction::new(conditions(0), Random::new(0, 1));
+    let conditions = |ticks: u32| Conditions { round_trip_s: 2.0 * f64::from(ticks) * TICK_S, ..Conditions::default() };
+    let mut up: Direction<DVec3> = Direction::new(conditions(ticks), 0, 0, 0.0);
+    let mut down: Direction<DVec3> = Direction::new(conditions(0), 0, 1, 0.0);
     let mut held = HandState { place_m: DVec3::new(0.0, 0.0, 1e-3), velocity_m_per_s: DVec3::ZERO };
     let (mut place_m, mut force_n) = (DVec3::ZERO, DVec3::ZERO);
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]

@@ -28,7 +28,7 @@ use crate::Failure;
 use crate::credentials::CredentialOptions;
 use crate::simulated::{device_named, hand_named};
 use crate::table;
-use network::Conditions;
+use network::{Conditions, Transport};
 use run::{Outcome, Rendering, Setup, run};
 use tissue::Spot;
 
@@ -47,12 +47,21 @@ pub(crate) struct Arguments {
     /// Round-trip time, ms
     #[arg(long, value_name = "MS", conflicts_with = "profile")]
     rtt_ms: Option<f64>,
-    /// Standard deviation of the delay each way, ms; messages stay in order
+    /// Standard deviation of the delay each way, ms; messages of a stream stay in order
     #[arg(long, value_name = "MS", conflicts_with = "profile")]
     jitter_ms: Option<f64>,
-    /// Fraction of the messages that TCP must retransmit, which delays all later ones
+    /// Fraction of the packets that are lost. A stream sends them again, which delays all later ones
     #[arg(long, value_name = "FRACTION", conflicts_with = "profile")]
     loss: Option<f64>,
+    /// How samples and poses travel
+    #[arg(long, default_value = "stream", conflicts_with = "boundary")]
+    transport: Transport,
+    /// Mean number of packets that are lost in a row; 1: each by itself
+    #[arg(long, value_name = "PACKETS", default_value_t = 1.0, conflicts_with = "boundary")]
+    loss_burst: f64,
+    /// Once a second nothing gets through for this long, ms
+    #[arg(long, value_name = "MS", default_value_t = 0.0, conflicts_with = "boundary")]
+    outage_ms: f64,
     /// Stall the client once a second, at a random moment, for this long, ms; the device holds its last force
     #[arg(long, value_name = "MS", default_value_t = 0.0, conflicts_with = "random")]
     stall_ms: f64,
@@ -65,6 +74,10 @@ pub(crate) struct Arguments {
     /// Send a sample only when the force that the client renders is off by more than this fraction; 0 sends one per step
     #[arg(long, value_name = "FRACTION", default_value_t = 0.0)]
     deadband: f64,
+    /// Send a place of the tool only when the server would be wrong about it by more than this fraction of the force; 0
+    /// sends one per tick
+    #[arg(long, value_name = "FRACTION", default_value_t = 0.0, conflicts_with = "boundary")]
+    up_deadband: f64,
     /// Duration in simulated time, s
     #[arg(long, value_name = "SECONDS", default_value_t = 20.0)]
     seconds: f64,
@@ -88,7 +101,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "FILE")]
     course: Option<PathBuf>,
     /// Run in real time against this server, which must know the scene by its name, over the real network
-    #[arg(long, value_name = "URL", conflicts_with_all = ["rtt_ms", "jitter_ms", "loss", "stall_ms", "profile", "random", "boundary"])]
+    #[arg(long, value_name = "URL", conflicts_with_all = ["rtt_ms", "jitter_ms", "loss", "transport", "loss_burst", "outage_ms", "up_deadband", "stall_ms", "profile", "random", "boundary"])]
     server: Option<String>,
     #[command(flatten)]
     credentials: CredentialOptions,
@@ -122,7 +135,15 @@ impl Profile {
             Profile::Wan => (0.050, 0.010, 0.001),
             Profile::BadWan => (0.120, 0.040, 0.01),
         };
-        Conditions { round_trip_s, jitter_s, loss }
+        Conditions { round_trip_s, jitter_s, loss, ..Conditions::default() }
+    }
+}
+
+impl Arguments {
+    /// A network, with what is asked for beside it.
+    fn on(&self, conditions: Conditions) -> Conditions {
+        let outage_s = 1e-3 * self.outage_ms;
+        Conditions { transport: self.transport, burst: self.loss_burst, outage_s, ..conditions }
     }
 }
 
@@ -164,12 +185,23 @@ pub(crate) async fn link(arguments: &Arguments) -> Result<(), Failure> {
 fn rows(setup: &Setup, outcome: &Outcome, server: Option<&str>) -> Vec<(&'static str, String)> {
     let (scene, hand, device) = (&setup.model.scene.name, setup.hand.name, setup.device.name);
     let scheme = format!("{:?}", setup.scheme).to_lowercase();
-    let Conditions { round_trip_s, jitter_s, loss } = setup.conditions;
+    let Conditions { transport, round_trip_s, jitter_s, loss, burst, outage_s } = setup.conditions;
     let network = match server {
         Some(url) => format!("the real one, to {url}"),
         None => {
             let [round_trip, jitter] = [round_trip_s, jitter_s].map(|time_s| table::rounded(1e3 * time_s));
-            format!("{round_trip} ms round trip, ± {jitter} ms each way, {} lost", table::percent(loss))
+            let mut text = format!(
+                "{}, {round_trip} ms round trip, ± {jitter} ms each way, {} lost",
+                transport.name(),
+                table::percent(loss)
+            );
+            if burst > 1.0 {
+                text += &format!(", {} in a row", table::rounded(burst));
+            }
+            if outage_s > 0.0 {
+                text += &format!(", {} ms once a second nothing", table::rounded(1e3 * outage_s));
+            }
+            text
         }
     };
     let unstable =
@@ -230,6 +262,9 @@ fn rows(setup: &Setup, outcome: &Outcome, server: Option<&str>) -> Vec<(&'static
     if setup.stall_s > 0.0 {
         rows.insert(2, ("stalls of the client", format!("{} ms once a second", table::rounded(1e3 * setup.stall_s))));
     }
+    if setup.up_deadband > 0.0 {
+        rows.insert(2, ("deadband of poses", table::percent(setup.up_deadband)));
+    }
     if setup.deadband > 0.0 {
         rows.insert(2, ("deadband", table::percent(setup.deadband)));
     }
@@ -261,9 +296,14 @@ fn setup(arguments: &Arguments) -> Result<Setup, Refusal> {
                 round_trip_s: 1e-3 * part("--rtt-ms", arguments.rtt_ms, "from 0 to 10000", 1e4)?,
                 jitter_s: 1e-3 * part("--jitter-ms", arguments.jitter_ms, "from 0 to 10000", 1e4)?,
                 loss: part("--loss", arguments.loss, "from 0 to 1", 1.0)?,
+                ..Conditions::default()
             }
         }
     };
+    let conditions = arguments.on(conditions);
+    number("--loss-burst", conditions.burst, "from 1 to 1000", |v| (1.0..=1000.0).contains(&v))?;
+    number("--outage-ms", arguments.outage_ms, "from 0 to 1000", |v| (0.0..=1000.0).contains(&v))?;
+    let up_deadband = number("--up-deadband", arguments.up_deadband, "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
     let range = format!("from 0.001 to {LONGEST_S}");
     let duration_s = number("--seconds", arguments.seconds, &range, |v| (1e-3..=LONGEST_S).contains(&v))?;
     let stalls = "from 0 to 1000";
@@ -300,7 +340,21 @@ fn setup(arguments: &Arguments) -> Result<Setup, Refusal> {
     })?;
     let law = Arc::new(law);
     let (scheme, seed) = (arguments.scheme, arguments.seed);
-    Ok(Setup { model, law, tip, spot, hand, device, conditions, stall_s, scheme, deadband, duration_s, seed })
+    Ok(Setup {
+        model,
+        law,
+        tip,
+        spot,
+        hand,
+        device,
+        conditions,
+        stall_s,
+        scheme,
+        deadband,
+        up_deadband,
+        duration_s,
+        seed,
+    })
 }
 
 /// The figures of a run that are printed.
@@ -316,8 +370,12 @@ fn figures(setup: &Setup, outcome: &Outcome) -> Value {
         "rtt_ms": 1e3 * setup.conditions.round_trip_s,
         "jitter_ms": 1e3 * setup.conditions.jitter_s,
         "loss": setup.conditions.loss,
+        "transport": setup.conditions.transport.name(),
+        "loss_burst": setup.conditions.burst,
+        "outage_ms": 1e3 * setup.conditions.outage_s,
         "stall_ms": 1e3 * setup.stall_s,
         "deadband": setup.deadband,
+        "up_deadband": setup.up_deadband,
         "seconds": setup.duration_s,
         "seed": setup.seed,
         "place_m": setup.spot.at_m.to_array(),

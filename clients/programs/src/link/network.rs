@@ -1,52 +1,141 @@
-//! A network with TCP in virtual time: nothing is lost and messages stay in order, but a lost packet delays all later ones
-//! until it has been retransmitted.
+//! A network in virtual time.
 //!
-//! arrival = max(arrival of the message before, sent + delay + jitter + (RTT … RTO if lost)).
+//! **A stream** (TCP): nothing is lost and messages stay in order, but a lost packet delays all later ones until it has been
+//! retransmitted: arrival = max(arrival of the message before, sent + delay + jitter + (RTT … RTO if lost)).
+//!
+//! **Datagrams**: what is lost is lost, and messages overtake each other: arrival = sent + delay + jitter.
+//!
+//! Losses are independent, or come in bursts (Gilbert 1960): a state in which all is lost, left with 1/length at each
+//! message. An outage loses all that is sent meanwhile; a stream sends it again after its end.
 
 use std::collections::VecDeque;
 
 use crate::simulated::random::Random;
 
+/// How messages travel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
+pub(super) enum Transport {
+    /// A gRPC stream over TCP: a lost packet holds up all that follow it
+    #[default]
+    Stream,
+    /// Datagrams over UDP: a lost packet is lost alone. In virtual time only: the server speaks gRPC
+    Datagram,
+}
+
+impl Transport {
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            Transport::Stream => "stream",
+            Transport::Datagram => "datagram",
+        }
+    }
+}
+
 /// The conditions of a network.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Conditions {
+    pub(super) transport: Transport,
     /// Round-trip time without jitter, s.
     pub(super) round_trip_s: f64,
     /// Standard deviation of the delay each way, s.
     pub(super) jitter_s: f64,
-    /// Fraction of the messages that are retransmitted.
+    /// Fraction of the packets that are lost.
     pub(super) loss: f64,
+    /// Mean number of packets lost in a row; up to 1, each is lost by itself.
+    pub(super) burst: f64,
+    /// Once a second nothing gets through for this long, s.
+    pub(super) outage_s: f64,
 }
 
 /// Least retransmission timeout of TCP, s (RFC 6298 requires 1 s, Linux uses 200 ms).
 const LEAST_RTO_S: f64 = 0.2;
 
+/// The moments at which something stands still, once a second.
+pub(super) struct Stalls {
+    stall_s: f64,
+    random: Random,
+    begin_s: f64,
+}
+
+impl Stalls {
+    /// Each of `stall_s`, the first not before `from_s`.
+    pub(super) fn new(stall_s: f64, from_s: f64, mut random: Random) -> Self {
+        let begin_s = from_s + random.between(0.0, 1.0);
+        Stalls { stall_s, random, begin_s }
+    }
+
+    /// The end of the stall at `now_s`, s, if there is one.
+    pub(super) fn at(&mut self, now_s: f64) -> Option<f64> {
+        while now_s >= self.begin_s + self.stall_s {
+            self.begin_s = self.begin_s.ceil() + self.random.between(0.0, 1.0);
+        }
+        (self.stall_s > 0.0 && now_s >= self.begin_s).then_some(self.begin_s + self.stall_s)
+    }
+}
+
 /// One direction of a connection.
 pub(super) struct Direction<T> {
     conditions: Conditions,
     random: Random,
+    outages: Stalls,
+    is_bursting: bool,
+    /// By arrival.
     under_way: VecDeque<(f64, T)>,
     last_s: f64,
     sent: u64,
 }
 
 impl<T> Direction<T> {
-    pub(super) fn new(conditions: Conditions, random: Random) -> Self {
-        Direction { conditions, random, under_way: VecDeque::new(), last_s: f64::NEG_INFINITY, sent: 0 }
+    /// One of the directions of a seed, which have their outages together; the first of these not before `from_s`.
+    pub(super) fn new(conditions: Conditions, seed: u64, direction: u64, from_s: f64) -> Self {
+        Direction {
+            conditions,
+            random: Random::new(seed, direction),
+            outages: Stalls::new(conditions.outage_s, from_s, Random::new(seed, 5)),
+            is_bursting: false,
+            under_way: VecDeque::new(),
+            last_s: f64::NEG_INFINITY,
+            sent: 0,
+        }
+    }
+
+    fn is_lost(&mut self) -> bool {
+        let Conditions { loss, burst, .. } = self.conditions;
+        if loss <= 0.0 {
+            return false;
+        }
+        let dice = self.random.between(0.0, 1.0);
+        if burst <= 1.0 {
+            return dice < loss;
+        }
+        let (begins, ends) = (loss / (burst * (1.0 - loss).max(1e-9)), 1.0 / burst);
+        self.is_bursting = if self.is_bursting { dice >= ends } else { dice < begins };
+        self.is_bursting
     }
 
     pub(super) fn send(&mut self, now_s: f64, message: T) {
-        let Conditions { round_trip_s, jitter_s, loss } = self.conditions;
-        let mut delay_s = round_trip_s / 2.0;
-        if jitter_s > 0.0 {
-            delay_s = (delay_s + jitter_s * self.random.normal()).max(0.0);
-        }
-        if loss > 0.0 && self.random.between(0.0, 1.0) < loss {
-            delay_s += self.random.between(round_trip_s, (2.0 * round_trip_s).max(LEAST_RTO_S));
-        }
-        self.last_s = self.last_s.max(now_s + delay_s);
+        let Conditions { transport, round_trip_s, jitter_s, .. } = self.conditions;
         self.sent += 1;
-        self.under_way.push_back((self.last_s, message));
+        let mut arrives_s = now_s + round_trip_s / 2.0;
+        if jitter_s > 0.0 {
+            arrives_s = (arrives_s + jitter_s * self.random.normal()).max(now_s);
+        }
+        let (is_lost, outage) = (self.is_lost(), self.outages.at(now_s));
+        match transport {
+            Transport::Datagram if is_lost || outage.is_some() => return,
+            Transport::Datagram => {}
+            Transport::Stream => {
+                if is_lost {
+                    arrives_s += self.random.between(round_trip_s, (2.0 * round_trip_s).max(LEAST_RTO_S));
+                }
+                // The timer of the retransmission that meets no outage any more may run for another timeout.
+                let again_s = outage.map_or(now_s, |end_s| end_s + self.random.between(0.0, LEAST_RTO_S));
+                arrives_s = (arrives_s + again_s - now_s).max(self.last_s);
+                self.last_s = arrives_s;
+            }
+        }
+        let at = self.under_way.partition_point(|entry| entry.0 <= arrives_s);
+        self.under_way.insert(at, (arrives_s, message));
     }
 
     /// The next message that has arrived.
@@ -60,5 +149,40 @@ impl<T> Direction<T> {
 
     pub(super) fn sent(&self) -> u64 {
         self.sent
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn arrivals(conditions: Conditions) -> Vec<u32> {
+        let mut direction = Direction::new(conditions, 1, 1, 0.0);
+        (0..20_000).for_each(|number| direction.send(f64::from(number) * 1e-3, number));
+        std::iter::from_fn(|| direction.receive(1e9)).collect()
+    }
+
+    #[test]
+    fn datagrams_are_lost_as_often_and_in_runs_as_long_as_is_asked_for() {
+        for burst in [1.0, 5.0] {
+            let conditions = Conditions { transport: Transport::Datagram, loss: 0.05, burst, ..Conditions::default() };
+            let arrived = arrivals(conditions);
+            let gaps: Vec<u32> = arrived.windows(2).map(|pair| pair[1] - pair[0] - 1).filter(|gap| *gap > 0).collect();
+            let share = f64::from(gaps.iter().sum::<u32>()) / 20_000.0;
+            let mean = f64::from(gaps.iter().sum::<u32>()) / gaps.len() as f64;
+            assert!((0.04..0.06).contains(&share), "{burst}: {share} lost");
+            assert!((0.85 * burst..1.15 * burst.max(1.05)).contains(&mean), "{burst}: {mean} in a row");
+        }
+    }
+
+    #[test]
+    fn datagrams_overtake_each_other_and_a_stream_loses_nothing() {
+        let conditions = Conditions { jitter_s: 0.01, loss: 0.01, outage_s: 0.1, ..Conditions::default() };
+        let arrived = arrivals(conditions);
+        assert!(arrived.len() == 20_000 && arrived.is_sorted());
+        let arrived = arrivals(Conditions { transport: Transport::Datagram, ..conditions });
+        assert!(!arrived.is_sorted());
+        // A tenth of the time nothing gets through, and of the rest a hundredth is lost.
+        assert!((17_000..18_600).contains(&arrived.len()), "{}", arrived.len());
     }
 }

@@ -56,8 +56,9 @@ pub(super) fn print(arguments: &Arguments, runs: u64) -> Result<(), Failure> {
         let conditions = if random.between(0.0, 1.0) < 0.5 {
             random.one_of(profiles).conditions()
         } else {
-            Conditions { round_trip_s: *random.one_of(&ROUND_TRIPS_S), jitter_s: 0.0, loss: 0.0 }
+            Conditions { round_trip_s: *random.one_of(&ROUND_TRIPS_S), ..Conditions::default() }
         };
+        let conditions = arguments.on(conditions);
         let (hand, device) = (*random.one_of(&HANDS), *random.one_of(&DEVICES));
         Setup {
             model: model.clone(),
@@ -70,6 +71,7 @@ pub(super) fn print(arguments: &Arguments, runs: u64) -> Result<(), Failure> {
             stall_s: 0.0,
             scheme: arguments.scheme,
             deadband: arguments.deadband,
+            up_deadband: arguments.up_deadband,
             duration_s: arguments.seconds,
             seed,
         }

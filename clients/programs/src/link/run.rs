@@ -1,5 +1,6 @@
 //! One run in virtual time, tick by tick: hand, device, network, tissue, and the tissue's twin without a network.
 
+use std::collections::VecDeque;
 use std::sync::Arc;
 
 use glam::DVec3;
@@ -8,9 +9,10 @@ use palpate_proto::touch::sample_bytes;
 use palpate_touch::deadband::{ForceDeadband, HEARTBEAT_S};
 use palpate_touch::envelope::{Envelope, Wanted};
 use palpate_touch::hand::{Hand, HandState};
-use palpate_touch::{Device, Law, LimitCause, LocalModel, Renderer, RenderingState, Tip};
+use palpate_touch::path::Path;
+use palpate_touch::{Device, Law, LimitCause, LocalModel, News, Pulse, Renderer, RenderingState, Tip, Told};
 
-use super::network::{Conditions, Direction};
+use super::network::{Conditions, Direction, Stalls, Transport};
 use super::tissue::{Server, Spot, Tissue, Twin};
 use crate::simulated::random::Random;
 use crate::simulated::task::{self, Task};
@@ -41,6 +43,8 @@ pub(super) struct Setup {
     pub(super) stall_s: f64,
     pub(super) scheme: Rendering,
     pub(super) deadband: f64,
+    /// The client sends its place only if the server would be wrong about it by more than this part of the force; 0: always.
+    pub(super) up_deadband: f64,
     pub(super) duration_s: f64,
     pub(super) seed: u64,
 }
@@ -137,6 +141,94 @@ impl Client {
     }
 }
 
+/// A message to the server.
+struct Up {
+    number: u64,
+    sent_s: f64,
+    told: Vec<Told>,
+    /// How often the client wants a sample at least, s.
+    heartbeat_s: f64,
+}
+
+/// A message to the client.
+struct Down {
+    number: u64,
+    sent_s: f64,
+    model: LocalModel,
+    /// How often the server wants a place at least, s.
+    heartbeat_s: f64,
+}
+
+/// The tool's places on their way to the server.
+struct Poses {
+    transport: Transport,
+    /// Part of the force; 0: each place is told.
+    deadband: f64,
+    news: News,
+    /// What the server may not have yet, the newest last.
+    unanswered: VecDeque<Told>,
+    /// Of the samples.
+    pulse: Pulse,
+    heartbeat_s: f64,
+}
+
+/// Places in a datagram.
+const PLACES: usize = 8;
+
+impl Poses {
+    fn new(transport: Transport, deadband: f64) -> Self {
+        Poses {
+            transport,
+            deadband,
+            news: News::default(),
+            unanswered: VecDeque::new(),
+            pulse: Pulse::default(),
+            heartbeat_s: HEARTBEAT_S,
+        }
+    }
+
+    /// Tells a place, if it is news.
+    fn tell(&mut self, now_s: f64, place_m: DVec3, client: &Client, up: &mut Direction<Up>) {
+        let told = if self.deadband > 0.0 {
+            let most_m = match client {
+                Client::Model(renderer) => renderer.way_m(self.deadband),
+                Client::Raw(_) | Client::Hold(..) => 0.0,
+            };
+            self.news.tell(now_s, place_m, most_m, self.heartbeat_s)
+        } else {
+            Some(Told { time_s: now_s, place_m, velocity_m_per_s: DVec3::ZERO })
+        };
+        let Some(told) = told else { return };
+        self.unanswered.push_back(told);
+        if self.unanswered.len() > if self.transport == Transport::Stream { 1 } else { PLACES } {
+            self.unanswered.pop_front();
+        }
+        let told = self.unanswered.iter().copied().collect();
+        let heartbeat_s = self.pulse.heartbeat_s(now_s);
+        up.send(now_s, Up { number: up.sent() + 1, sent_s: now_s, told, heartbeat_s });
+    }
+
+    /// A sample tells what has arrived, and how often the server wants to hear.
+    fn answered(&mut self, message: &Down, now_s: f64) {
+        self.unanswered.retain(|told| told.time_s > message.model.client_time_s);
+        self.pulse.arrive(message.number, message.sent_s, now_s);
+        self.heartbeat_s = message.heartbeat_s;
+    }
+
+    fn arrive(&self, told: &[Told], path: &mut Path, now_s: f64) {
+        for Told { time_s, place_m, velocity_m_per_s } in told.iter().copied() {
+            let is_newer = path.newest_s().is_none_or(|newest_s| time_s > newest_s);
+            match is_newer {
+                true if self.deadband > 0.0 => _ = path.receive_moving(time_s, place_m, velocity_m_per_s, now_s),
+                true => _ = path.receive(time_s, place_m, now_s),
+                // A stream has them in order: what is older than the newest is refused there.
+                false if self.transport == Transport::Stream => _ = path.receive(time_s, place_m, now_s),
+                false => path.fill(time_s, place_m),
+            }
+        }
+    }
+}
+
 /// The scale of the task's depths: reduced until a hand that feels the tissue directly, without network and client, meets no
 /// more than [`task::FORCE_SHARE`] of the device's force. So it does not depend on how the client renders samples.
 ///
@@ -178,40 +270,35 @@ fn ticks(duration_s: f64) -> u32 {
     (duration_s / TICK_S).round() as u32
 }
 
-/// The moments at which a client stalls, once a second.
-struct Stalls {
-    stall_s: f64,
-    random: Random,
-    begin_s: f64,
-}
-
-impl Stalls {
-    fn new(stall_s: f64, mut random: Random) -> Self {
-        let begin_s = task::LEAD_S + random.between(0.0, 1.0);
-        Stalls { stall_s, random, begin_s }
-    }
-
-    fn is_at(&mut self, now_s: f64) -> bool {
-        while now_s >= self.begin_s + self.stall_s {
-            self.begin_s = self.begin_s.ceil() + self.random.between(0.0, 1.0);
-        }
-        self.stall_s > 0.0 && now_s >= self.begin_s
-    }
-}
-
 /// Performs a run.
 ///
 /// # Errors
 /// Returns the reason if the guard stops the tissue.
 pub(super) fn run(setup: &Setup) -> Result<Outcome, String> {
     let scale = fitting_scale(setup, task::LEAD_S)?;
-    let Setup { model, law, tip, spot, hand, device, conditions, stall_s, scheme, deadband, duration_s, seed } = setup;
+    let Setup {
+        model,
+        law,
+        tip,
+        spot,
+        hand,
+        device,
+        conditions,
+        stall_s,
+        scheme,
+        deadband,
+        up_deadband,
+        duration_s,
+        seed,
+    } = setup;
     let middle_m = spot.at_m;
     let task = Task::new(middle_m, task::LEAD_S, *duration_s, scale, &mut Random::new(*seed, 0));
     let tissue = || Tissue::new(model, *tip, *spot, law.clone());
     let (mut server, mut twin) = (Server::new(tissue()), Twin::new(tissue()));
-    let mut up: Direction<(f64, DVec3)> = Direction::new(*conditions, Random::new(*seed, 1));
-    let mut down: Direction<LocalModel> = Direction::new(*conditions, Random::new(*seed, 2));
+    let mut up: Direction<Up> = Direction::new(*conditions, *seed, 1, task::LEAD_S);
+    let mut down: Direction<Down> = Direction::new(*conditions, *seed, 2, task::LEAD_S);
+    let (mut at_server, mut down_heartbeat_s) = (Pulse::default(), HEARTBEAT_S);
+    let mut poses = Poses::new(conditions.transport, *up_deadband);
     let (mut deadband, mut sent_s) = (ForceDeadband::new(*deadband), f64::NEG_INFINITY);
     let envelope = || {
         let mut envelope = Envelope::new(*device, middle_m);
@@ -227,7 +314,7 @@ pub(super) fn run(setup: &Setup) -> Result<Outcome, String> {
     let mut totals = Totals::default();
     totals.outcome.scale = scale;
     let mut paused_s: Option<f64> = None;
-    let mut stalls = Stalls::new(*stall_s, Random::new(*seed, 4));
+    let mut stalls = Stalls::new(*stall_s, task::LEAD_S, Random::new(*seed, 4));
     let mut force_n = DVec3::ZERO;
     for tick in 0..ticks(*duration_s) {
         let now_s = f64::from(tick) * TICK_S;
@@ -238,24 +325,28 @@ pub(super) fn run(setup: &Setup) -> Result<Outcome, String> {
             totals.outcome.unstable_at_s = Some(now_s);
             break;
         }
-        let is_stalled = stalls.is_at(now_s);
+        let is_stalled = stalls.at(now_s).is_some();
         if !is_stalled {
-            up.send(now_s, (now_s, place_m));
+            poses.tell(now_s, place_m, &client, &mut up);
         }
-        while let Some((time_s, place_m)) = up.receive(now_s) {
-            server.path.receive(time_s, place_m, now_s);
+        while let Some(message) = up.receive(now_s) {
+            poses.arrive(&message.told, &mut server.path, now_s);
+            at_server.arrive(message.number, message.sent_s, now_s);
+            down_heartbeat_s = message.heartbeat_s;
         }
         if let Some(model) = server.step(now_s, TICK_S)?
-            && (deadband.is_exceeded(&model, law) || now_s - sent_s >= HEARTBEAT_S - 1e-9)
+            && (deadband.is_exceeded(&model, law) || now_s - sent_s >= down_heartbeat_s - 1e-9)
         {
             deadband.send(&model, law);
             sent_s = now_s;
             totals.bytes += sample_bytes(&model);
-            down.send(now_s, model);
+            let heartbeat_s = at_server.heartbeat_s(now_s);
+            down.send(now_s, Down { number: down.sent() + 1, sent_s: now_s, model, heartbeat_s });
         }
         // While the client is stalled, the device holds the last force, and samples wait.
-        while !is_stalled && let Some(model) = down.receive(now_s) {
-            client.receive(model, now_s);
+        while !is_stalled && let Some(message) = down.receive(now_s) {
+            poses.answered(&message, now_s);
+            client.receive(message.model, now_s);
         }
         if !is_stalled {
             force_n = client.tick(now_s, place_m);
