@@ -43,6 +43,8 @@ fn legal(seed: u64, limits: &Limits) -> Scene {
     Scene {
         name: format!("legal {seed}"),
         body: Body::Sheet(Sheet { points, spacing_m: any(&mut random), point_mass_kg: any(&mut random), fixed }),
+        material: None,
+        inclusions: Arc::default(),
         springs: Springs { stiffness_n_per_m, shear_stiffness_n_per_m, flexion: random.bool() },
         virtual_stiffness_n_per_m: or_zero(&mut random),
         damping_n_s_per_m: or_zero(&mut random),

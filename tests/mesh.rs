@@ -422,7 +422,7 @@ fn an_inclusion_makes_a_mesh_stiffer_where_it_is_and_nowhere_else() {
         virtual_stiffness_factor: 3.0,
         edge_m: 0.01,
     };
-    let with = Inclusion::put_into(&[lump], &plain);
+    let with = Inclusion::put_into(&[lump], "inclusion", &plain).unwrap();
     let depth_m = |mesh: &Mesh, place_m: DVec3| {
         let mut tissue =
             tissue(&scene(Some(Body::Mesh(mesh.clone())), &[&sets[..], &["stepping.tolerance=1e-3"]].concat()));
@@ -485,6 +485,8 @@ fn what_a_scene_says_of_a_mesh_and_its_material_is_refused_by_key() {
         (inclusion("stiffness_factor = 2.0"), "inclusion[0].centre_m", "or else `group`"),
         (inclusion("group = \"lump\""), "inclusion[0].group", "is no group"),
         (inclusion("group = \"lump\"\ncentre_m = [0, 0, 0]"), "inclusion[0].group", "a ball or a group"),
+        (inclusion("group = \"lump\"\nradius_m = 0.01"), "inclusion[0].radius_m", "a ball or a group"),
+        (inclusion("centre_m = [0, 0, 0]\nradius = 0.01"), "inclusion[0].radius", "the unit belongs to the name"),
         (inclusion("centre_m = [0, 0, 0]\nradius_m = 0.001"), "inclusion[0].radius_m", "no vertex is within"),
         (
             inclusion("centre_m = [0, 0, 0]\nradius_m = 0.1\nstiffness_factor = 0"),

@@ -327,6 +327,30 @@ fn request_seeds() -> Vec<Vec<u8>> {
         springs: Some(pb::Springs { stiffness_n_per_m: Some(10.0), flexion_factor: Some(0.2), ..Default::default() }),
         ..wire::scene::scene(&model().scene)
     });
+    let of_material = pb::create_session_request::Source::Scene(pb::Scene {
+        mesh: Some(pb::Mesh { mesh_id: "0123456789abcdef".into(), ..Default::default() }),
+        material: Some(pb::Material {
+            youngs_modulus_pa: Some(5000.0),
+            thickness_m: Some(0.002),
+            density_kg_per_m3: Some(1000.0),
+            depth_m: Some(0.02),
+            bed_n_per_m3: Some(4e5),
+            damping_ratio: Some(0.7),
+        }),
+        inclusions: vec![
+            pb::Inclusion {
+                centre_m: vector(0.1, 0.0, 0.0),
+                radius_m: Some(0.02),
+                stiffness_factor: Some(3.0),
+                virtual_stiffness_factor: Some(2.0),
+                edge_m: Some(0.1),
+                ..Default::default()
+            },
+            pb::Inclusion { group: Some("base".into()), stiffness_factor: Some(0.5), ..Default::default() },
+        ],
+        springs: Some(pb::Springs { flexion_factor: Some(0.2), ..Default::default() }),
+        ..Default::default()
+    });
     let places = [pb::force::Centre::Vertex(3), pb::force::Centre::AtM(pb::Vector3 { x: 0.01, y: 0.02, z: 0.0 })];
     let pushes = places.map(|centre| pb::Command {
         sequence: Some(1),
@@ -355,6 +379,10 @@ fn request_seeds() -> Vec<Vec<u8>> {
         (
             "CreateSessionRequest",
             pb::CreateSessionRequest { source: Some(on_mesh), ..Default::default() }.encode_to_vec(),
+        ),
+        (
+            "CreateSessionRequest",
+            pb::CreateSessionRequest { source: Some(of_material), ..Default::default() }.encode_to_vec(),
         ),
         ("UploadMeshRequest", upload.encode_to_vec()),
         ("ProbeRequest", pb::ProbeRequest { r#where: Some(vertices), ..Default::default() }.encode_to_vec()),

@@ -4,10 +4,11 @@ use std::sync::Arc;
 
 use glam::{DMat3, DVec3};
 
+use super::check::physical;
 use super::document::{Fields, Item};
 use super::membrane::settled_energy_j;
 use super::mesh::{Differences, Mesh, MeshShape, group_named};
-use crate::refusal::{Reason, Refusal, Result, not_negative, number, positive};
+use crate::refusal::{Reason, Refusal, Result, finite_vector, not_negative, number, positive};
 use crate::shape::{PointId, RestShape};
 
 /// k of an edge between equal triangles with equal sides, over E·t: such springs resist as a membrane with ν = 1/3.
@@ -50,20 +51,45 @@ pub struct MadeOf {
 }
 
 impl Material {
+    /// Why a coefficient is refused beside a material.
+    pub const FOLLOWS: &str = "does not go with [material], from which it follows";
+
+    /// Why a sheet has no material and no inclusions.
+    pub const OF_A_MESH: &str = "is for a mesh: a sheet has the same points and springs all over";
+
+    /// One of the usual density, depth and damping.
+    pub fn new(youngs_modulus_pa: f64, thickness_m: f64, bed_n_per_m3: f64) -> Self {
+        let (density_kg_per_m3, depth_m, damping_ratio) = (1060.0, 0.03, 0.5);
+        Material { youngs_modulus_pa, thickness_m, density_kg_per_m3, depth_m, bed_n_per_m3, damping_ratio }
+    }
+
     pub(super) fn read(fields: &mut Fields<'_>) -> Result<Self> {
-        let above_0 = |fields: &mut Fields<'_>, key: &'static str, standard: Option<f64>| {
-            let value = fields.number(key)?.or(standard);
-            positive(&fields.path(key), value.map_or_else(|| fields.required_number(key), Ok)?)
-        };
-        let youngs_modulus_pa = above_0(fields, "youngs_modulus_pa", None)?;
-        let thickness_m = above_0(fields, "thickness_m", None)?;
-        let density_kg_per_m3 = above_0(fields, "density_kg_per_m3", Some(1060.0))?;
-        let depth_m = above_0(fields, "depth_m", Some(0.03))?;
-        let bed_n_per_m3 = not_negative(&fields.path("bed_n_per_m3"), fields.required_number("bed_n_per_m3")?)?;
-        let damping_ratio = fields.number("damping_ratio")?.unwrap_or(0.5);
-        let damping_ratio =
-            number(&fields.path("damping_ratio"), damping_ratio, "from 0 to 100", |v| (0.0..=100.0).contains(&v))?;
-        Ok(Material { youngs_modulus_pa, thickness_m, density_kg_per_m3, depth_m, bed_n_per_m3, damping_ratio })
+        let youngs_modulus_pa = fields.required_number("youngs_modulus_pa")?;
+        let thickness_m = fields.required_number("thickness_m")?;
+        let bed_n_per_m3 = fields.required_number("bed_n_per_m3")?;
+        let usual = Material::new(youngs_modulus_pa, thickness_m, bed_n_per_m3);
+        Ok(Material {
+            density_kg_per_m3: fields.number("density_kg_per_m3")?.unwrap_or(usual.density_kg_per_m3),
+            depth_m: fields.number("depth_m")?.unwrap_or(usual.depth_m),
+            damping_ratio: fields.number("damping_ratio")?.unwrap_or(usual.damping_ratio),
+            ..usual
+        })
+    }
+
+    fn check(&self) -> Result<()> {
+        for (field, value) in [
+            ("material.youngs_modulus_pa", self.youngs_modulus_pa),
+            ("material.thickness_m", self.thickness_m),
+            ("material.density_kg_per_m3", self.density_kg_per_m3),
+            ("material.depth_m", self.depth_m),
+        ] {
+            physical(field, positive(field, value)?)?;
+        }
+        if not_negative("material.bed_n_per_m3", self.bed_n_per_m3)? > 0.0 {
+            physical("material.bed_n_per_m3", self.bed_n_per_m3)?;
+        }
+        number("material.damping_ratio", self.damping_ratio, "from 0 to 100", |v| (0.0..=100.0).contains(&v))?;
+        Ok(())
     }
 
     /// A tissue of this material, with springs of flexion whose k is the part `flexion` of that of the edge they cross.
@@ -73,8 +99,9 @@ impl Material {
     /// does when it is stretched alike to all sides (`membrane`).
     ///
     /// # Errors
-    /// Refuses a mesh with a vertex without area.
+    /// Refuses a number out of its range, and a mesh with a vertex without area.
     pub fn applied(&self, flexion: f64, shape: Arc<MeshShape>) -> Result<MadeOf> {
+        self.check()?;
         let Spread { of_vertices_m2, beside_edges_m2 } = Spread::of(&shape);
         let whole_m2: f64 = of_vertices_m2.iter().sum();
         #[allow(clippy::cast_precision_loss)]
@@ -85,7 +112,7 @@ impl Material {
             let message = format!(
                 "{name} at {place_m} m has no area, so [material] gives it no mass: `palpate mesh FILE --repair` may mend it"
             );
-            return Err(Refusal::new(Reason::Unreadable, "mesh", message));
+            return Err(Refusal::new(Reason::Unreadable, "material", message));
         }
         let squared_m2 = |[a, b]: &[u32; 2]| {
             let [a, b] = [a, b].map(|end| shape.vertices_m()[*end as usize]);
@@ -175,89 +202,140 @@ pub enum Region {
         /// Its radius, m.
         radius_m: f64,
     },
-    /// Some vertices, ascending.
-    Vertices(Vec<u32>),
+    /// The group of the mesh that has this name.
+    Group(String),
 }
 
-impl Inclusion {
-    pub(super) fn read(item: &Item<'_>, mesh: &Mesh) -> Result<Self> {
-        item.table(|fields| {
-            let factor = |fields: &mut Fields<'_>, key: &'static str| {
-                let value = fields.number(key)?.unwrap_or(1.0);
-                number(&fields.path(key), value, "from 0.01 to 100", |v| (0.01..=100.0).contains(&v))
-            };
-            let (centre, group) = (fields.item("centre_m"), fields.item("group"));
-            let region = match (centre, group) {
-                (Some(centre), None) => {
-                    let radius_m = fields.required_number("radius_m")?;
-                    Region::Ball { centre_m: centre.vector()?, radius_m: positive(&fields.path("radius_m"), radius_m)? }
-                }
-                (None, Some(group)) => {
-                    let found = group_named("", &group.text()?, &mesh.shape.told().groups);
-                    let found = found.map_err(|refusal| group.refuse(refusal.reason, refusal.message))?;
-                    Region::Vertices(found.vertices.clone())
-                }
-                (Some(_), Some(group)) => {
-                    let message = "does not go with centre_m: an inclusion is a ball or a group";
-                    return Err(group.refuse(Reason::WrongKind, message));
-                }
-                (None, None) => {
-                    let message = "is missing, or else `group`: where the inclusion is";
-                    return Err(fields.refuse(Reason::Missing, "centre_m", message));
-                }
-            };
-            let edge_m = fields.number("edge_m")?.unwrap_or(0.0);
-            let inclusion = Inclusion {
-                region,
-                stiffness_factor: factor(fields, "stiffness_factor")?,
-                virtual_stiffness_factor: factor(fields, "virtual_stiffness_factor")?,
-                edge_m: not_negative(&fields.path("edge_m"), edge_m)?,
-            };
-            if let Region::Ball { centre_m, radius_m } = inclusion.region {
-                let nearest_m = mesh.shape.rest_m(mesh.shape.nearest(centre_m));
-                if nearest_m.distance(centre_m) > radius_m + inclusion.edge_m {
-                    let message = format!(
-                        "no vertex is within the ball: the nearest is at {nearest_m} m, {:.4} m from its centre",
-                        nearest_m.distance(centre_m)
-                    );
-                    return Err(fields.refuse(Reason::OutOfRange, "radius_m", message));
-                }
+impl Region {
+    /// A ball or a group.
+    ///
+    /// # Errors
+    /// Refuses both, neither, and half a ball.
+    pub fn of(centre_m: Option<DVec3>, radius_m: Option<f64>, group: Option<String>) -> Result<Self> {
+        let refuse = |reason, key, message| Err(Refusal::new(reason, key, message));
+        match (centre_m, radius_m, group) {
+            (Some(centre_m), Some(radius_m), None) => Ok(Region::Ball { centre_m, radius_m }),
+            (None, None, Some(group)) => Ok(Region::Group(group)),
+            (Some(_), None, None) => refuse(Reason::Missing, "radius_m", "is missing"),
+            (Some(_), _, Some(_)) => {
+                refuse(Reason::WrongKind, "group", "does not go with centre_m: an inclusion is a ball or a group")
             }
-            Ok(inclusion)
+            (None, Some(_), Some(_)) => {
+                refuse(Reason::WrongKind, "radius_m", "does not go with group: an inclusion is a ball or a group")
+            }
+            (None, _, None) => {
+                refuse(Reason::Missing, "centre_m", "is missing, or else `group`: where the inclusion is")
+            }
+        }
+    }
+
+    /// How far each vertex is beyond it, m: 0 or less within, any number above `most_m` farther away than that.
+    fn beyond_m(&self, shape: &MeshShape, most_m: f64) -> Vec<f64> {
+        match self {
+            Region::Ball { centre_m, radius_m } => {
+                shape.vertices_m().iter().map(|place_m| place_m.distance(*centre_m) - radius_m).collect()
+            }
+            Region::Group(name) => {
+                let named = group_named("", name, &shape.told().groups);
+                shape.away_m(named.map_or(&[], |group| &group.vertices), most_m)
+            }
+        }
+    }
+}
+
+/// Inclusions of a scene at most.
+const MOST_INCLUSIONS: usize = 256;
+
+/// Vertices that all of them together look at, at most: each looks at every one.
+const MOST_LOOKED_AT: usize = 8_000_000;
+
+impl Inclusion {
+    /// One that makes no difference.
+    pub fn even(region: Region) -> Self {
+        Inclusion { region, stiffness_factor: 1.0, virtual_stiffness_factor: 1.0, edge_m: 0.0 }
+    }
+
+    pub(super) fn read(item: &Item<'_>) -> Result<Self> {
+        item.table(|fields| {
+            let (centre, group) = (fields.item("centre_m"), fields.text("group")?);
+            let radius_m = match (&centre, &group) {
+                (Some(_), None) => Some(fields.required_number("radius_m")?),
+                _ => fields.number("radius_m")?,
+            };
+            let centre_m = centre.map(|centre| centre.vector()).transpose()?;
+            let region = Region::of(centre_m, radius_m, group);
+            let region = region.map_err(|refusal| fields.refuse(refusal.reason, &refusal.field, refusal.message))?;
+            let even = Inclusion::even(region);
+            Ok(Inclusion {
+                stiffness_factor: fields.number("stiffness_factor")?.unwrap_or(even.stiffness_factor),
+                virtual_stiffness_factor: fields
+                    .number("virtual_stiffness_factor")?
+                    .unwrap_or(even.virtual_stiffness_factor),
+                edge_m: fields.number("edge_m")?.unwrap_or(even.edge_m),
+                ..even
+            })
         })
     }
 
-    /// How much a vertex belongs to it: 1 within, 0 beyond its edge, smooth between.
-    fn part_of(&self, vertices_m: &[DVec3], vertex: usize) -> f64 {
-        let place_m = vertices_m[vertex];
-        let beyond_m = match &self.region {
-            Region::Ball { centre_m, radius_m } => place_m.distance(*centre_m) - radius_m,
-            Region::Vertices(members) => {
-                let is_member = u32::try_from(vertex).is_ok_and(|vertex| members.binary_search(&vertex).is_ok());
-                if is_member {
-                    0.0
-                } else if self.edge_m > 0.0 {
-                    let away_m = |member: &u32| vertices_m[*member as usize].distance_squared(place_m);
-                    members.iter().map(away_m).fold(f64::INFINITY, f64::min).sqrt()
-                } else {
-                    f64::INFINITY
+    /// Checks one that refusals call `field`.
+    fn check(&self, field: &str, shape: &MeshShape) -> Result<()> {
+        let named = |key: &str| format!("{field}.{key}");
+        let factors =
+            [("stiffness_factor", self.stiffness_factor), ("virtual_stiffness_factor", self.virtual_stiffness_factor)];
+        for (key, factor) in factors {
+            number(&named(key), factor, "from 0.01 to 100", |v| (0.01..=100.0).contains(&v))?;
+        }
+        not_negative(&named("edge_m"), self.edge_m)?;
+        match &self.region {
+            Region::Ball { centre_m, radius_m } => {
+                finite_vector(&named("centre_m"), *centre_m)?;
+                positive(&named("radius_m"), *radius_m)?;
+                let nearest_m = shape.rest_m(shape.nearest(*centre_m));
+                let away_m = nearest_m.distance(*centre_m);
+                if away_m > radius_m + self.edge_m {
+                    let message = format!(
+                        "no vertex is within the ball: the nearest is at {nearest_m} m, {away_m:.4} m from its centre"
+                    );
+                    return Err(Refusal::new(Reason::OutOfRange, named("radius_m"), message));
                 }
             }
-        };
-        if beyond_m <= 0.0 {
-            return 1.0;
+            Region::Group(name) => _ = group_named(&named("group"), name, &shape.told().groups)?,
         }
-        let x = beyond_m / self.edge_m;
-        if x < 1.0 { 1.0 - x * x * (3.0 - 2.0 * x) } else { 0.0 }
+        Ok(())
     }
 
-    /// The same mesh with some inclusions; where several are, their factors multiply.
-    pub fn put_into(inclusions: &[Inclusion], mesh: &Mesh) -> Mesh {
-        if inclusions.is_empty() {
-            return mesh.clone();
+    /// How much each vertex belongs to it: 1 within, 0 beyond its edge, smooth between.
+    fn parts(&self, shape: &MeshShape) -> Vec<f64> {
+        let mut parts = self.region.beyond_m(shape, self.edge_m);
+        for part in &mut parts {
+            *part = if *part <= 0.0 {
+                1.0
+            } else {
+                let x = *part / self.edge_m;
+                if x < 1.0 { 1.0 - x * x * (3.0 - 2.0 * x) } else { 0.0 }
+            };
         }
+        parts
+    }
+
+    /// The same mesh with some inclusions; where several are, their factors multiply. `field` is what refusals call the list.
+    ///
+    /// # Errors
+    /// Refuses too many, a number out of its range, a group that the mesh has not got, and a ball without a vertex.
+    pub fn put_into(inclusions: &[Inclusion], field: &str, mesh: &Mesh) -> Result<Mesh> {
         let shape = &mesh.shape;
         let count = shape.vertices_m().len();
+        let most = MOST_INCLUSIONS.min(MOST_LOOKED_AT / count);
+        if inclusions.len() > most {
+            let message = format!("are {}, more than {most} on a mesh of {count} vertices", inclusions.len());
+            return Err(Refusal::new(Reason::TooLarge, field, message));
+        }
+        for (index, inclusion) in inclusions.iter().enumerate() {
+            inclusion.check(&format!("{field}[{index}]"), shape)?;
+        }
+        if inclusions.is_empty() {
+            return Ok(mesh.clone());
+        }
         let or = |list: &[f64], value: f64, length: usize| {
             if list.is_empty() { vec![value; length] } else { list.to_vec() }
         };
@@ -269,7 +347,7 @@ impl Inclusion {
             flexion: or(&known.flexion, 1.0, shape.opposite().len()),
         };
         for inclusion in inclusions {
-            let parts: Vec<f64> = (0..count).map(|vertex| inclusion.part_of(shape.vertices_m(), vertex)).collect();
+            let parts = inclusion.parts(shape);
             for (extra, part) in differences.extra_virtual.iter_mut().zip(&parts) {
                 *extra = (1.0 + *extra) * (1.0 + (inclusion.virtual_stiffness_factor - 1.0) * part) - 1.0;
             }
@@ -284,7 +362,7 @@ impl Inclusion {
         if differences.extra_virtual.iter().all(|extra| *extra == 0.0) {
             differences.extra_virtual = Vec::new();
         }
-        Mesh::uneven(mesh.point_mass_kg, mesh.flexion, shape.clone(), differences)
+        Ok(Mesh::uneven(mesh.point_mass_kg, mesh.flexion, shape.clone(), differences))
     }
 }
 
@@ -376,7 +454,7 @@ mod tests {
             virtual_stiffness_factor: 5.0,
             edge_m: 0.006,
         };
-        let found = Inclusion::put_into(&[inclusion(3.0), inclusion(2.0)], &mesh).differences;
+        let found = Inclusion::put_into(&[inclusion(3.0), inclusion(2.0)], "inclusion", &mesh).unwrap().differences;
         for (vertex, extra) in found.extra_virtual.iter().enumerate() {
             let away_m = shape.vertices_m()[vertex].distance(centre_m);
             let factor = extra + 1.0;
@@ -390,5 +468,14 @@ mod tests {
         let most = found.edges.iter().chain(&found.flexion).copied().fold(0.0, f64::max);
         let least = found.edges.iter().copied().fold(f64::INFINITY, f64::min);
         assert!((most - 6.0).abs() < 1e-9 && least == 1.0, "{most} {least}");
+    }
+
+    #[test]
+    fn there_are_fewer_inclusions_on_a_larger_mesh() {
+        let mesh = Mesh::new(0.001, 0.0, Arc::new(patch(300, 0.0)));
+        let ball = Region::Ball { centre_m: mesh.shape.extent().middle_m(), radius_m: 0.005 };
+        let refused = Inclusion::put_into(&vec![Inclusion::even(ball); 89], "inclusion", &mesh).unwrap_err();
+        assert_eq!((refused.reason, refused.field.as_str()), (Reason::TooLarge, "inclusion"));
+        assert_eq!(refused.message, "are 89, more than 88 on a mesh of 90000 vertices");
     }
 }

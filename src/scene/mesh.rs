@@ -1,6 +1,7 @@
 //! The section `[mesh]` of a scene: tissue on the surface of a triangle mesh, and its rest shape.
 
-use std::cmp::Ordering;
+use std::cmp::{Ordering, Reverse};
+use std::collections::BinaryHeap;
 use std::sync::{Arc, OnceLock};
 
 use glam::{DQuat, DVec3};
@@ -93,6 +94,9 @@ pub struct Told {
 }
 
 impl Mesh {
+    /// Why the mass of a point is refused beside a material.
+    pub const WEIGHED: &str = "does not go with [material], which says what a point weighs";
+
     /// Reads the section `[mesh]`; with a material, which says what a point weighs, its edges are flipped to Delaunay.
     pub(super) fn read(fields: &mut Fields<'_>, files: Files<'_>, of_material: bool, limits: &Limits) -> Result<Self> {
         let (mesh, source) = files.mesh(fields, limits)?;
@@ -104,8 +108,7 @@ impl Mesh {
         }
         let point_mass_kg = match fields.item("point_mass_kg") {
             Some(mass) if of_material => {
-                let message = "does not go with [material], which says what a point weighs";
-                return Err(mass.refuse(Reason::WrongKind, message));
+                return Err(mass.refuse(Reason::WrongKind, Self::WEIGHED));
             }
             Some(mass) => mass.number()?,
             None if of_material => 1.0,
@@ -585,6 +588,34 @@ impl MeshShape {
         self.on_rim[vertex]
     }
 
+    /// How far each vertex is from the nearest of `members`, m; infinite where that is `most_m` or more. Which of them is the
+    /// nearest is handed on along the edges, so that the work is bounded by the size of the mesh; now and then it is another
+    /// that is farther away by a part of an edge.
+    pub(super) fn away_m(&self, members: &[u32], most_m: f64) -> Vec<f64> {
+        let count = self.vertices_m.len();
+        let (mut away_m, mut is_done) = (vec![f64::INFINITY; count], vec![false; count]);
+        // Distances are ordered as their bits.
+        let mut waiting = BinaryHeap::new();
+        for member in members {
+            away_m[*member as usize] = 0.0;
+            waiting.push(Reverse((0, *member, *member)));
+        }
+        while let Some(Reverse((_, vertex, member))) = waiting.pop() {
+            if std::mem::replace(&mut is_done[vertex as usize], true) {
+                continue;
+            }
+            for next in self.neighbours.of(vertex as usize) {
+                let next_m = self.vertices_m[*next as usize].distance(self.vertices_m[member as usize]);
+                let known_m = &mut away_m[*next as usize];
+                if !is_done[*next as usize] && next_m < *known_m && next_m < most_m {
+                    *known_m = next_m;
+                    waiting.push(Reverse((next_m.to_bits(), *next, member)));
+                }
+            }
+        }
+        away_m
+    }
+
     /// Whether no edge has a single triangle.
     pub fn is_closed(&self) -> bool {
         !self.on_rim.contains(&true)
@@ -856,6 +887,32 @@ mod tests {
             let within: Vec<usize> = (0..400).filter(|vertex| away(vertex).sqrt() <= radius_m).collect();
             let found: Vec<usize> = shape.around(place_m, radius_m).into_iter().map(PointId::index).collect();
             assert_eq!(found, within, "{place_m} {radius_m}");
+        }
+    }
+
+    #[test]
+    fn vertices_are_nearly_as_far_from_some_as_a_search_through_all_finds() {
+        let mut dice = fastrand::Rng::with_seed(31);
+        let side = 30;
+        let mut off = || 0.4 * dice.f64();
+        let place = |k: u32| DVec3::new(f64::from(k / side) + off(), f64::from(k % side) + off(), off());
+        let vertices_m: Vec<DVec3> = (0..side * side).map(place).collect();
+        let cells = (0..side * (side - 1)).filter(|k| k % side != side - 1);
+        let triangles = cells.flat_map(|k| [[k, k + side, k + 1], [k + 1, k + side, k + side + 1]]).collect();
+        let shape = MeshShape::new(vertices_m.clone(), triangles, |_, _, _| false).unwrap();
+        for (count, most_m) in [(1, 9.0), (12, 3.0), (200, 2.0), (5, 0.0)] {
+            let members: Vec<u32> = (0..count).map(|_| dice.u32(..side * side)).collect();
+            let mut same = 0;
+            for (vertex, away_m) in shape.away_m(&members, most_m).into_iter().enumerate() {
+                let to = |member: &u32| vertices_m[*member as usize].distance(vertices_m[vertex]);
+                let nearest_m = members.iter().map(to).fold(f64::INFINITY, f64::min);
+                let expected_m = if nearest_m < most_m || nearest_m == 0.0 { nearest_m } else { f64::INFINITY };
+                same += u32::from(away_m == expected_m);
+                // Where a region is cut off by others' for a part of an edge.
+                let is_near = away_m >= nearest_m && away_m.min(most_m) < nearest_m + 0.4;
+                assert!(away_m == expected_m || is_near, "{vertex}: {away_m} {expected_m}");
+            }
+            assert!(same > side * side * 98 / 100, "{same}");
         }
     }
 

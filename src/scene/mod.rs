@@ -55,6 +55,10 @@ pub struct Scene {
     pub name: String,
     /// The mass points, and how they lie together.
     pub body: Body,
+    /// What gave masses and coefficients at the beginning.
+    pub material: Option<Material>,
+    /// Regions whose springs in `body` differ.
+    pub inclusions: Arc<[Inclusion]>,
     /// Springs between neighbours.
     pub springs: Springs,
     /// K″ of the springs of zero rest length that pull each point to its rest position, N/m (the paper's eq. 4).
@@ -325,14 +329,15 @@ impl Scene {
         }
         let scene = document.read(|fields| {
             let name = fields.text("name")?.unwrap_or_else(|| "unnamed".to_owned());
-            let Substance { body, springs, virtual_stiffness_n_per_m, damping_n_s_per_m } =
-                read_substance(fields, files, limits)?;
+            let substance = read_substance(fields, files, limits)?;
             Ok(Scene {
                 name,
-                springs,
-                body,
-                virtual_stiffness_n_per_m,
-                damping_n_s_per_m,
+                body: substance.body,
+                material: substance.material,
+                inclusions: substance.inclusions,
+                springs: substance.springs,
+                virtual_stiffness_n_per_m: substance.virtual_stiffness_n_per_m,
+                damping_n_s_per_m: substance.damping_n_s_per_m,
                 stepping: fields.item("stepping").map_or(Ok(Stepping::default()), |item| read_stepping(&item))?,
                 sleep_tolerance: match fields.item("sleep") {
                     Some(item) => item.table(|fields| fields.number("tolerance"))?,
@@ -469,12 +474,51 @@ impl Scene {
     }
 }
 
-/// What a tissue consists of.
-struct Substance {
-    body: Body,
-    springs: Springs,
-    virtual_stiffness_n_per_m: f64,
-    damping_n_s_per_m: f64,
+/// What a tissue consists of: a part of a [`Scene`].
+pub struct Substance {
+    /// The mass points.
+    pub body: Body,
+    /// What gave masses and coefficients.
+    pub material: Option<Material>,
+    /// Regions whose springs in `body` differ.
+    pub inclusions: Arc<[Inclusion]>,
+    /// Springs between neighbours.
+    pub springs: Springs,
+    /// K″, N/m.
+    pub virtual_stiffness_n_per_m: f64,
+    /// C, N·s/m.
+    pub damping_n_s_per_m: f64,
+}
+
+impl Substance {
+    /// A mesh of a material, with springs of flexion whose k is the part `flexion` of that of the edge they cross.
+    ///
+    /// # Errors
+    /// As for [`Material::applied`].
+    pub fn of_material(material: Material, flexion: f64, shape: Arc<MeshShape>) -> Result<Self> {
+        let made = material.applied(flexion, shape)?;
+        let stiffness_n_per_m = made.stiffness_n_per_m;
+        Ok(Substance {
+            body: Body::Mesh(made.mesh),
+            material: Some(material),
+            inclusions: Arc::default(),
+            springs: Springs { stiffness_n_per_m, shear_stiffness_n_per_m: stiffness_n_per_m, flexion: false },
+            virtual_stiffness_n_per_m: made.virtual_stiffness_n_per_m,
+            damping_n_s_per_m: made.damping_n_s_per_m,
+        })
+    }
+
+    /// The same with inclusions, if it is a mesh. `field` is what refusals call the list.
+    ///
+    /// # Errors
+    /// As for [`Inclusion::put_into`].
+    pub fn with(mut self, inclusions: Vec<Inclusion>, field: &str) -> Result<Self> {
+        if let Body::Mesh(mesh) = &mut self.body {
+            *mesh = Inclusion::put_into(&inclusions, field, mesh)?;
+            self.inclusions = inclusions.into();
+        }
+        Ok(self)
+    }
 }
 
 /// Reads the section `[sheet]` or `[mesh]`, and what says how stiff, heavy and damped it is.
@@ -487,8 +531,7 @@ fn read_substance(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) ->
         }
         (_, None) => {
             if let Some(item) = material.or(inclusions) {
-                let message = "is for a mesh: a sheet has the same points and springs all over";
-                return Err(item.refuse(Reason::WrongKind, message));
+                return Err(item.refuse(Reason::WrongKind, Material::OF_A_MESH));
             }
             let body = Body::Sheet(fields.required("sheet")?.table(Sheet::read)?);
             return read_coefficients(fields, body);
@@ -500,30 +543,22 @@ fn read_substance(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) ->
     if mesh.shape.point_count() > limits.points {
         mesh.check(limits)?;
     }
-    let mut substance = match material {
+    let substance = match material {
         None => read_coefficients(fields, Body::Mesh(mesh))?,
         Some(item) => read_material(fields, &item, &mesh)?,
     };
-    if let (Body::Mesh(mesh), Some(inclusions)) = (&mut substance.body, inclusions) {
-        let found = inclusions.tables()?;
-        if found.len() > MOST_INCLUSIONS {
-            let message = format!("are {}, more than {MOST_INCLUSIONS}", found.len());
-            return Err(inclusions.refuse(Reason::TooLarge, message));
-        }
-        let found = found.iter().map(|item| Inclusion::read(item, mesh)).collect::<Result<Vec<_>>>()?;
-        *mesh = Inclusion::put_into(&found, mesh);
-    }
-    Ok(substance)
+    let Some(inclusions) = inclusions else { return Ok(substance) };
+    let inclusions = inclusions.tables()?.iter().map(Inclusion::read).collect::<Result<_>>()?;
+    substance.with(inclusions, "inclusion")
 }
-
-/// Inclusions of a scene at most: each looks at all vertices.
-const MOST_INCLUSIONS: usize = 256;
 
 /// Reads the sections that give the coefficients as in the paper.
 fn read_coefficients(fields: &mut Fields<'_>, mut body: Body) -> Result<Substance> {
     Ok(Substance {
         springs: fields.required("springs")?.table(|fields| read_springs(fields, &mut body))?,
         body,
+        material: None,
+        inclusions: Arc::default(),
         virtual_stiffness_n_per_m: fields
             .required("virtual_springs")?
             .table(|fields| fields.required_number("stiffness_n_per_m"))?,
@@ -538,32 +573,20 @@ fn read_material(fields: &mut Fields<'_>, item: &Item<'_>, mesh: &Mesh) -> Resul
     let material = item.table(Material::read)?;
     let (virtual_springs, damping) = (fields.item("virtual_springs"), fields.item("damping"));
     if let Some(other) = virtual_springs.or(damping) {
-        return Err(other.refuse(Reason::WrongKind, FROM_MATERIAL));
+        return Err(other.refuse(Reason::WrongKind, Material::FOLLOWS));
     }
     let flexion = match fields.item("springs") {
         None => 0.0,
         Some(springs) => springs.table(|fields| {
             let (stiffness, shear) = (fields.item("stiffness_n_per_m"), fields.item("shear_stiffness_n_per_m"));
             if let Some(item) = stiffness.or(shear) {
-                return Err(item.refuse(Reason::WrongKind, FROM_MATERIAL));
+                return Err(item.refuse(Reason::WrongKind, Material::FOLLOWS));
             }
             fields.item("flexion").map_or(Ok(0.0), |item| read_flexion(&item))
         })?,
     };
-    let made = material
-        .applied(flexion, mesh.shape.clone())
-        .map_err(|refusal| item.refuse(refusal.reason, refusal.message))?;
-    let stiffness_n_per_m = made.stiffness_n_per_m;
-    Ok(Substance {
-        body: Body::Mesh(made.mesh),
-        springs: Springs { stiffness_n_per_m, shear_stiffness_n_per_m: stiffness_n_per_m, flexion: false },
-        virtual_stiffness_n_per_m: made.virtual_stiffness_n_per_m,
-        damping_n_s_per_m: made.damping_n_s_per_m,
-    })
+    Substance::of_material(material, flexion, mesh.shape.clone())
 }
-
-/// Why a coefficient is refused beside a material.
-const FROM_MATERIAL: &str = "does not go with [material], from which it follows";
 
 /// k of springs of flexion on a mesh, as a part of that of edges.
 fn read_flexion(item: &Item<'_>) -> Result<f64> {

@@ -1,5 +1,7 @@
 //! Conversion of scenes: the fields and defaults of a scene file. Ranges are checked when the scene is compiled.
 
+use std::sync::Arc;
+
 use glam::DVec3;
 use palpate_mesh::TriangleMesh;
 use palpate_proto::geometry::{from_point, from_vector, point, vector};
@@ -8,31 +10,49 @@ use palpate_proto::pb;
 use super::required;
 use crate::refusal::{Reason, Refusal, Result, finite, number, positive};
 use crate::scene::{
-    Appearance, Body, Change, Fixed, FixedVertices, Integrator, Lanes, Mesh, Named, PointSet, Precision, Scene, Sheet,
-    Springs, Stepping, simulated,
+    Appearance, Body, Change, Fixed, FixedVertices, Inclusion, Integrator, Lanes, Material, Mesh, Named, PointSet,
+    Precision, Region, Scene, Sheet, Springs, Stepping, Substance, simulated,
 };
 use crate::shape::RestShape;
 
 /// The scene in a message. A scene on a mesh names the `mesh` that its client has sent before.
 ///
 /// # Errors
-/// Returns an error if a required field is missing, if a name or set is unknown, or if the mesh is missing.
+/// Returns an error if a required field is missing, if a name or set is unknown, if the mesh is missing, or if a material or
+/// inclusions do not fit it.
 pub fn from_scene(message: &pb::Scene, mesh: Option<&TriangleMesh>) -> Result<Scene> {
-    let springs = required("springs", message.springs.as_ref())?;
-    let virtual_springs = required("virtual_springs", message.virtual_springs.as_ref())?;
-    let damping = required("damping", message.damping.as_ref())?;
-    let stiffness_n_per_m = required("springs.stiffness_n_per_m", springs.stiffness_n_per_m)?;
-    let body = match &message.mesh {
-        None => Body::Sheet(from_sheet(required("sheet", message.sheet.as_ref())?, springs)?),
+    let substance = match &message.mesh {
+        None => from_sheet(message)?,
         Some(_) if message.sheet.is_some() => {
             let message = "does not go with `sheet`: a tissue is one of them";
             return Err(Refusal::new(Reason::WrongKind, "mesh", message));
         }
-        Some(of_mesh) => Body::Mesh(from_mesh(of_mesh, springs, required("mesh.mesh_id", mesh)?)?),
+        Some(of_mesh) => from_mesh(message, of_mesh, required("mesh.mesh_id", mesh)?)?,
     };
     Ok(Scene {
         name: if message.name.is_empty() { "unnamed".to_owned() } else { message.name.clone() },
+        body: substance.body,
+        material: substance.material,
+        inclusions: substance.inclusions,
+        springs: substance.springs,
+        virtual_stiffness_n_per_m: substance.virtual_stiffness_n_per_m,
+        damping_n_s_per_m: substance.damping_n_s_per_m,
+        stepping: message.stepping.as_ref().map_or(Ok(Stepping::default()), from_stepping)?,
+        sleep_tolerance: message.sleep.as_ref().and_then(|sleep| sleep.tolerance),
+        appearance: Appearance::default(),
+    })
+}
+
+/// A tissue whose coefficients the message gives.
+fn from_coefficients(message: &pb::Scene, body: Body) -> Result<Substance> {
+    let springs = required("springs", message.springs.as_ref())?;
+    let virtual_springs = required("virtual_springs", message.virtual_springs.as_ref())?;
+    let damping = required("damping", message.damping.as_ref())?;
+    let stiffness_n_per_m = required("springs.stiffness_n_per_m", springs.stiffness_n_per_m)?;
+    Ok(Substance {
         body,
+        material: None,
+        inclusions: Arc::default(),
         springs: Springs {
             stiffness_n_per_m,
             shear_stiffness_n_per_m: springs.shear_stiffness_n_per_m.unwrap_or(stiffness_n_per_m),
@@ -40,18 +60,20 @@ pub fn from_scene(message: &pb::Scene, mesh: Option<&TriangleMesh>) -> Result<Sc
         },
         virtual_stiffness_n_per_m: required("virtual_springs.stiffness_n_per_m", virtual_springs.stiffness_n_per_m)?,
         damping_n_s_per_m: required("damping.coefficient_n_s_per_m", damping.coefficient_n_s_per_m)?,
-        stepping: message.stepping.as_ref().map_or(Ok(Stepping::default()), from_stepping)?,
-        sleep_tolerance: message.sleep.as_ref().and_then(|sleep| sleep.tolerance),
-        appearance: Appearance::default(),
     })
 }
 
-fn from_sheet(sheet: &pb::Sheet, springs: &pb::Springs) -> Result<Sheet> {
-    if springs.flexion_factor.is_some() {
+fn from_sheet(message: &pb::Scene) -> Result<Substance> {
+    let for_a_mesh = [("material", message.material.is_some()), ("inclusions", !message.inclusions.is_empty())];
+    if let Some((field, _)) = for_a_mesh.iter().find(|(_, is_there)| *is_there) {
+        return Err(Refusal::new(Reason::WrongKind, *field, Material::OF_A_MESH));
+    }
+    if message.springs.is_some_and(|springs| springs.flexion_factor.is_some()) {
         let message = "is for meshes: a sheet has springs of flexion (`flexion`) or none";
         return Err(Refusal::new(Reason::WrongKind, "springs.flexion_factor", message));
     }
-    Ok(Sheet {
+    let sheet = required("sheet", message.sheet.as_ref())?;
+    let body = Body::Sheet(Sheet {
         points: [
             required("sheet.points_x", sheet.points_x)? as usize,
             required("sheet.points_y", sheet.points_y)? as usize,
@@ -59,24 +81,31 @@ fn from_sheet(sheet: &pb::Sheet, springs: &pb::Springs) -> Result<Sheet> {
         spacing_m: required("sheet.spacing_m", sheet.spacing_m)?,
         point_mass_kg: required("sheet.point_mass_kg", sheet.point_mass_kg)?,
         fixed: from_fixed(sheet.fixed.as_ref())?,
-    })
+    });
+    from_coefficients(message, body)
 }
 
-fn from_mesh(message: &pb::Mesh, springs: &pb::Springs, mesh: &TriangleMesh) -> Result<Mesh> {
+fn from_mesh(message: &pb::Scene, of_mesh: &pb::Mesh, mesh: &TriangleMesh) -> Result<Substance> {
+    let material = message.material.as_ref().map(from_material).transpose()?;
+    if material.is_some() {
+        refuse_coefficients(message, of_mesh)?;
+    }
+    let springs = message.springs.unwrap_or_default();
     if springs.shear_stiffness_n_per_m.is_some() {
         let message = "is for sheets: the edges of a mesh resist shear as well";
         return Err(Refusal::new(Reason::WrongKind, "springs.shear_stiffness_n_per_m", message));
     }
     let flexion = springs.flexion_factor.unwrap_or(if springs.flexion { 1.0 } else { 0.0 });
     let flexion = number("springs.flexion_factor", flexion, "from 0 to 10", |v| (0.0..=10.0).contains(&v))?;
-    let point_mass_kg = required("mesh.point_mass_kg", message.point_mass_kg)?;
-    let vertices = message.vertices.map(|vertices| vertices as usize);
+    // A material says later what a point weighs.
+    let point_mass_kg = required("mesh.point_mass_kg", of_mesh.point_mass_kg.or(material.map(|_| 1.0)))?;
+    let vertices = of_mesh.vertices.map(|vertices| vertices as usize);
     if let Some(vertices) = vertices {
         #[allow(clippy::cast_precision_loss)]
         number("mesh.vertices", vertices as f64, "at least 4", |vertices| vertices >= 4.0)?;
     }
-    let (mesh, shown) = simulated(mesh.clone(), vertices, false);
-    let fixed = match &message.fixed {
+    let (mesh, shown) = simulated(mesh.clone(), vertices, material.is_some());
+    let fixed = match &of_mesh.fixed {
         None | Some(pb::mesh::Fixed::FixedRim(false)) => FixedVertices::None,
         Some(pb::mesh::Fixed::FixedRim(true)) => FixedVertices::Rim,
         Some(pb::mesh::Fixed::FixedGroup(name)) => FixedVertices::group("mesh.fixed_group", name, &mesh)?,
@@ -92,7 +121,55 @@ fn from_mesh(message: &pb::Mesh, springs: &pb::Springs, mesh: &TriangleMesh) -> 
         }
     };
     let made = Mesh::shown_as(mesh, shown, point_mass_kg, fixed)?;
-    Ok(if flexion > 0.0 { Mesh::new(point_mass_kg, flexion, made.shape) } else { made })
+    let substance = match material {
+        Some(material) => Substance::of_material(material, flexion, made.shape)?,
+        None if flexion > 0.0 => from_coefficients(message, Body::Mesh(Mesh::new(point_mass_kg, flexion, made.shape)))?,
+        None => from_coefficients(message, Body::Mesh(made))?,
+    };
+    substance.with(message.inclusions.iter().enumerate().map(from_inclusion).collect::<Result<_>>()?, "inclusions")
+}
+
+fn from_material(message: &pb::Material) -> Result<Material> {
+    let usual = Material::new(
+        required("material.youngs_modulus_pa", message.youngs_modulus_pa)?,
+        required("material.thickness_m", message.thickness_m)?,
+        required("material.bed_n_per_m3", message.bed_n_per_m3)?,
+    );
+    Ok(Material {
+        density_kg_per_m3: message.density_kg_per_m3.unwrap_or(usual.density_kg_per_m3),
+        depth_m: message.depth_m.unwrap_or(usual.depth_m),
+        damping_ratio: message.damping_ratio.unwrap_or(usual.damping_ratio),
+        ..usual
+    })
+}
+
+/// Refuses what follows from a material.
+fn refuse_coefficients(message: &pb::Scene, of_mesh: &pb::Mesh) -> Result<()> {
+    let springs = message.springs.unwrap_or_default();
+    for (field, is_there, why) in [
+        ("mesh.point_mass_kg", of_mesh.point_mass_kg.is_some(), Mesh::WEIGHED),
+        ("virtual_springs", message.virtual_springs.is_some(), Material::FOLLOWS),
+        ("damping", message.damping.is_some(), Material::FOLLOWS),
+        ("springs.stiffness_n_per_m", springs.stiffness_n_per_m.is_some(), Material::FOLLOWS),
+        ("springs.shear_stiffness_n_per_m", springs.shear_stiffness_n_per_m.is_some(), Material::FOLLOWS),
+    ] {
+        if is_there {
+            return Err(Refusal::new(Reason::WrongKind, field, why));
+        }
+    }
+    Ok(())
+}
+
+fn from_inclusion((index, message): (usize, &pb::Inclusion)) -> Result<Inclusion> {
+    let centre_m = message.centre_m.as_ref().map(|centre_m| from_vector(Some(centre_m)));
+    let region = Region::of(centre_m, message.radius_m, message.group.clone());
+    let even = Inclusion::even(region.map_err(|refusal| refusal.within(&format!("inclusions[{index}]")))?);
+    Ok(Inclusion {
+        stiffness_factor: message.stiffness_factor.unwrap_or(even.stiffness_factor),
+        virtual_stiffness_factor: message.virtual_stiffness_factor.unwrap_or(even.virtual_stiffness_factor),
+        edge_m: message.edge_m.unwrap_or(even.edge_m),
+        ..even
+    })
 }
 
 fn from_fixed(fixed: Option<&pb::sheet::Fixed>) -> Result<Fixed> {
@@ -145,7 +222,21 @@ pub fn update_tissue(session_id: &str, change: &Change, step: u64) -> pb::Update
     }
 }
 
-/// A scene as a message, with all defaults filled in.
+/// A scene as a client sends it: without what follows from a material.
+pub fn sent(scene: &Scene) -> pb::Scene {
+    let mut message = self::scene(scene);
+    if message.material.is_some() {
+        message.virtual_springs = None;
+        message.damping = None;
+        if let (Some(springs), Some(mesh)) = (&mut message.springs, &mut message.mesh) {
+            springs.stiffness_n_per_m = None;
+            mesh.point_mass_kg = None;
+        }
+    }
+    message
+}
+
+/// A scene as a message, with all defaults filled in, and what follows from a material.
 pub fn scene(scene: &Scene) -> pb::Scene {
     let of_mesh = match &scene.body {
         Body::Mesh(mesh) => Some(mesh),
@@ -155,6 +246,8 @@ pub fn scene(scene: &Scene) -> pb::Scene {
         name: scene.name.clone(),
         sheet: scene.sheet().map(sheet),
         mesh: of_mesh.map(mesh),
+        material: scene.material.as_ref().map(material),
+        inclusions: scene.inclusions.iter().map(inclusion).collect(),
         springs: Some(pb::Springs {
             stiffness_n_per_m: Some(scene.springs.stiffness_n_per_m),
             // The edges of a mesh resist shear as well.
@@ -192,6 +285,32 @@ fn mesh(mesh: &Mesh) -> pb::Mesh {
     pb::Mesh { mesh_id: String::new(), point_mass_kg: Some(mesh.point_mass_kg), vertices, fixed }
 }
 
+fn material(material: &Material) -> pb::Material {
+    pb::Material {
+        youngs_modulus_pa: Some(material.youngs_modulus_pa),
+        thickness_m: Some(material.thickness_m),
+        density_kg_per_m3: Some(material.density_kg_per_m3),
+        depth_m: Some(material.depth_m),
+        bed_n_per_m3: Some(material.bed_n_per_m3),
+        damping_ratio: Some(material.damping_ratio),
+    }
+}
+
+fn inclusion(inclusion: &Inclusion) -> pb::Inclusion {
+    let (centre_m, radius_m, group) = match &inclusion.region {
+        Region::Ball { centre_m, radius_m } => (vector(*centre_m), Some(*radius_m), None),
+        Region::Group(name) => (None, None, Some(name.clone())),
+    };
+    pb::Inclusion {
+        centre_m,
+        radius_m,
+        group,
+        stiffness_factor: Some(inclusion.stiffness_factor),
+        virtual_stiffness_factor: Some(inclusion.virtual_stiffness_factor),
+        edge_m: Some(inclusion.edge_m),
+    }
+}
+
 /// A sheet as a message.
 fn sheet(sheet: &Sheet) -> pb::Sheet {
     #[allow(clippy::cast_possible_truncation)]
@@ -211,12 +330,14 @@ fn sheet(sheet: &Sheet) -> pb::Sheet {
 
 #[cfg(test)]
 mod tests {
+    use palpate_mesh::Group;
+
     use super::*;
     use crate::limits::Limits;
 
     #[test]
     fn a_scene_survives_conversion_both_ways() {
-        let mut paper = Scene::parse("paper", crate::scene::PAPER, &[], &Limits::default()).unwrap();
+        let mut paper = paper();
         let points = |points: &[[usize; 2]]| Fixed::Points(points.iter().copied().collect());
         for fixed in [Fixed::Edges, Fixed::Corners, points(&[]), points(&[[30, 0], [1, 2], [30, 0]])] {
             paper.sheet_mut().unwrap().fixed = fixed;
@@ -245,10 +366,180 @@ mod tests {
         assert_eq!(told("string precision ="), names::<Precision>());
     }
 
+    /// The smallest closed mesh.
+    fn tetrahedron() -> TriangleMesh {
+        TriangleMesh {
+            vertices_m: [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]].map(DVec3::from).to_vec(),
+            triangles: vec![[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]],
+            uv: None,
+            groups: vec![Group { name: "lump".to_owned(), vertices: vec![1, 2] }],
+        }
+    }
+
+    /// Of a material, with a ball and a group that differ.
+    fn of_a_material() -> pb::Scene {
+        pb::Scene {
+            mesh: Some(pb::Mesh::default()),
+            material: Some(pb::Material {
+                youngs_modulus_pa: Some(5000.0),
+                thickness_m: Some(0.002),
+                bed_n_per_m3: Some(4e5),
+                ..Default::default()
+            }),
+            inclusions: vec![
+                pb::Inclusion {
+                    centre_m: vector(DVec3::ZERO),
+                    radius_m: Some(0.01),
+                    stiffness_factor: Some(3.0),
+                    ..Default::default()
+                },
+                pb::Inclusion {
+                    group: Some("lump".to_owned()),
+                    virtual_stiffness_factor: Some(4.0),
+                    edge_m: Some(0.15),
+                    ..Default::default()
+                },
+            ],
+            springs: Some(pb::Springs { flexion_factor: Some(0.2), ..Default::default() }),
+            ..Default::default()
+        }
+    }
+
+    #[test]
+    fn a_material_and_inclusions_survive_conversion_both_ways_and_what_follows_is_told() {
+        let read = |message: &pb::Scene| from_scene(message, Some(&tetrahedron())).unwrap();
+        let made = read(&of_a_material());
+        let Body::Mesh(mesh) = &made.body else { panic!("of another kind") };
+        let [edges, flexion] = [&mesh.differences.edges, &mesh.differences.flexion];
+        assert!(edges.len() == 6 && flexion.len() == 6 && mesh.flexion == 0.2, "{mesh:?}");
+        assert_eq!(mesh.differences.extra_virtual[1], 3.0);
+        assert_eq!(read(&sent(&made)), made);
+        let told = scene(&made);
+        let material = told.material.unwrap();
+        assert_eq!((material.density_kg_per_m3, material.damping_ratio), (Some(1060.0), Some(0.5)));
+        assert_eq!((told.inclusions[0].virtual_stiffness_factor, told.inclusions[1].radius_m), (Some(1.0), None));
+        assert_eq!(told.springs.unwrap().stiffness_n_per_m, Some(made.springs.stiffness_n_per_m));
+        assert_eq!(told.mesh.as_ref().unwrap().point_mass_kg, Some(made.point_mass_kg()));
+        let change = Change { stiffness_n_per_m: Some(1.0), ..Change::default() };
+        let changed = scene(&made.changed(&change, &made));
+        assert_eq!((changed.springs.unwrap().stiffness_n_per_m, changed.material), (Some(1.0), Some(material)));
+        // Inclusions alone go with coefficients.
+        let even = pb::Scene { material: None, ..told };
+        assert_eq!(scene(&read(&even)), even);
+    }
+
+    #[test]
+    fn what_is_wrong_with_a_material_or_an_inclusion_is_named() {
+        type Change = fn(&mut pb::Scene);
+        let changes: [(Change, &str, Reason, &str); 33] = [
+            (|s| material_of(s).youngs_modulus_pa = None, "material.youngs_modulus_pa", Reason::Missing, ""),
+            (|s| material_of(s).thickness_m = None, "material.thickness_m", Reason::Missing, ""),
+            (|s| material_of(s).bed_n_per_m3 = None, "material.bed_n_per_m3", Reason::Missing, ""),
+            (
+                |s| material_of(s).youngs_modulus_pa = Some(0.0),
+                "material.youngs_modulus_pa",
+                Reason::OutOfRange,
+                "above 0",
+            ),
+            (
+                |s| material_of(s).youngs_modulus_pa = Some(1e300),
+                "material.youngs_modulus_pa",
+                Reason::OutOfRange,
+                "1e12",
+            ),
+            (|s| material_of(s).thickness_m = Some(-1.0), "material.thickness_m", Reason::OutOfRange, "above 0"),
+            (|s| material_of(s).thickness_m = Some(f64::NAN), "material.thickness_m", Reason::NotFinite, ""),
+            (
+                |s| material_of(s).density_kg_per_m3 = Some(0.0),
+                "material.density_kg_per_m3",
+                Reason::OutOfRange,
+                "above 0",
+            ),
+            (|s| material_of(s).depth_m = Some(f64::INFINITY), "material.depth_m", Reason::NotFinite, ""),
+            (|s| material_of(s).bed_n_per_m3 = Some(-1.0), "material.bed_n_per_m3", Reason::OutOfRange, "0 or more"),
+            (|s| material_of(s).bed_n_per_m3 = Some(1e300), "material.bed_n_per_m3", Reason::OutOfRange, "1e12"),
+            (|s| material_of(s).damping_ratio = Some(101.0), "material.damping_ratio", Reason::OutOfRange, "100"),
+            (|s| material_of(s).damping_ratio = Some(-0.1), "material.damping_ratio", Reason::OutOfRange, "from 0"),
+            (|s| mesh_of(s).point_mass_kg = Some(1.0), "mesh.point_mass_kg", Reason::WrongKind, "what a point weighs"),
+            (|s| s.springs = scene(&paper()).springs, "springs.stiffness_n_per_m", Reason::WrongKind, "follows"),
+            (|s| s.damping = scene(&paper()).damping, "damping", Reason::WrongKind, "follows"),
+            (|s| s.virtual_springs = scene(&paper()).virtual_springs, "virtual_springs", Reason::WrongKind, "follows"),
+            (|s| s.material = None, "mesh.point_mass_kg", Reason::Missing, ""),
+            (|s| s.mesh = None, "material", Reason::WrongKind, "is for a mesh"),
+            (|s| (s.mesh, s.material) = (None, None), "inclusions", Reason::WrongKind, "is for a mesh"),
+            (|s| s.inclusions[0].radius_m = None, "inclusions[0].radius_m", Reason::Missing, ""),
+            (|s| s.inclusions[0].radius_m = Some(0.0), "inclusions[0].radius_m", Reason::OutOfRange, "above 0"),
+            (
+                |s| s.inclusions[0].centre_m = vector(DVec3::ONE),
+                "inclusions[0].radius_m",
+                Reason::OutOfRange,
+                "no vertex",
+            ),
+            (|s| s.inclusions[0].centre_m = vector(DVec3::NAN), "inclusions[0].centre_m", Reason::NotFinite, ""),
+            (|s| s.inclusions[0].centre_m = None, "inclusions[0].centre_m", Reason::Missing, "or else `group`"),
+            (
+                |s| s.inclusions[0].group = Some("lump".into()),
+                "inclusions[0].group",
+                Reason::WrongKind,
+                "a ball or a group",
+            ),
+            (
+                |s| s.inclusions[1].radius_m = Some(1.0),
+                "inclusions[1].radius_m",
+                Reason::WrongKind,
+                "a ball or a group",
+            ),
+            (
+                |s| s.inclusions[1].group = Some("lamp".into()),
+                "inclusions[1].group",
+                Reason::WrongKind,
+                "did you mean `lump`",
+            ),
+            (|s| s.inclusions[1].edge_m = Some(-1.0), "inclusions[1].edge_m", Reason::OutOfRange, "0 or more"),
+            (|s| s.inclusions[1].edge_m = Some(f64::INFINITY), "inclusions[1].edge_m", Reason::NotFinite, ""),
+            (
+                |s| s.inclusions[1].stiffness_factor = Some(0.0),
+                "inclusions[1].stiffness_factor",
+                Reason::OutOfRange,
+                "0.01",
+            ),
+            (
+                |s| s.inclusions[1].virtual_stiffness_factor = Some(f64::NAN),
+                "inclusions[1].virtual_stiffness_factor",
+                Reason::NotFinite,
+                "",
+            ),
+            (
+                |s| s.inclusions = vec![s.inclusions[0].clone(); 257],
+                "inclusions",
+                Reason::TooLarge,
+                "257, more than 256",
+            ),
+        ];
+        for (change, field, reason, words) in changes {
+            let mut message = of_a_material();
+            change(&mut message);
+            let refused = from_scene(&message, Some(&tetrahedron())).unwrap_err();
+            assert_eq!((refused.field.as_str(), refused.reason), (field, reason), "{refused}");
+            assert!(refused.message.contains(words), "{refused}");
+        }
+    }
+
+    fn paper() -> Scene {
+        Scene::parse("paper", crate::scene::PAPER, &[], &Limits::default()).unwrap()
+    }
+
+    fn material_of(scene: &mut pb::Scene) -> &mut pb::Material {
+        scene.material.as_mut().unwrap()
+    }
+
+    fn mesh_of(scene: &mut pb::Scene) -> &mut pb::Mesh {
+        scene.mesh.as_mut().unwrap()
+    }
+
     #[test]
     fn a_missing_coefficient_is_named() {
-        let paper = Scene::parse("paper", crate::scene::PAPER, &[], &Limits::default()).unwrap();
-        let mut message = scene(&paper);
+        let mut message = scene(&paper());
         message.damping = Some(pb::Damping::default());
         let refusal = from_scene(&message, None).unwrap_err();
         assert_eq!((refusal.reason, refusal.field.as_str()), (Reason::Missing, "damping.coefficient_n_s_per_m"));

@@ -5,7 +5,7 @@ use std::path::Path;
 use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::scene::sent::mesh_file;
-use palpate::scene::{Body, Differences, Mesh, Scene};
+use palpate::scene::{Body, Mesh, Scene};
 use palpate::wire;
 use palpate_client::upload::upload_mesh;
 use palpate_client::{Channel, Error};
@@ -46,15 +46,10 @@ impl SceneFile {
         }
         let limits = Limits::default();
         let own = Scene::load(file, &[], &limits)?;
-        let mut message = wire::scene::scene(&own);
+        let mut message = wire::scene::sent(&own);
         let mesh = match &own.body {
             Body::Sheet(_) => None,
             Body::Mesh(mesh) => {
-                if *mesh.differences != Differences::default() {
-                    let why = "a client can't send a scene with [material] or [[inclusion]]: put it into the server's folder of \
-                               scenes, and give its name";
-                    return Err(Failure::Refused(format!("{scene}: {why}")));
-                }
                 let said = mesh_file(file, &limits)?.unwrap_or_default();
                 if let Some(told) = &mut message.mesh {
                     told.vertices = said.vertices.map(|vertices| vertices.try_into().unwrap_or(u32::MAX));
@@ -99,7 +94,7 @@ impl SceneFile {
     }
 
     /// The scene of a session that the server has made of this. Of a mesh of the server's own, places at rest are known to
-    /// seven digits only.
+    /// seven digits only, and all points and springs are those of reference.
     ///
     /// # Errors
     /// Returns an error if the server's scene or mesh can't be read.
@@ -110,7 +105,9 @@ impl SceneFile {
             (Some(own), Some(_)) => Ok(own.clone()),
             (None, Some(_)) => {
                 let mesh = server_mesh(&session.session_id, channel).await.map_err(Error::Call)?;
-                Ok(wire::scene::from_scene(told, Some(&mesh))?)
+                // The coefficients that follow from a material are told as well.
+                let even = pb::Scene { material: None, inclusions: Vec::new(), ..told.clone() };
+                Ok(wire::scene::from_scene(&even, Some(&mesh))?)
             }
         }
     }
