@@ -149,6 +149,7 @@ fn best_half(half: u32, ratio: f64) -> u32 {
 
 #[cfg(test)]
 mod tests {
+
     use super::super::exact;
     use super::*;
 

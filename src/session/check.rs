@@ -185,4 +185,21 @@ mod tests {
         assert!(text.contains("vibrations decay by e in 0.0500 s"), "{text}");
         assert!(text.contains("4000.00 µs a step at best"), "{text}");
     }
+
+    #[test]
+    fn a_report_tells_how_often_a_step_is_divided_and_what_a_point_takes_of_it() {
+        let now_s = Cell::new(0.0);
+        let clock_s = || now_s.replace(now_s.get() + WINDOW_S);
+        let text = |substeps: u32| {
+            let set = format!("stepping.substeps={substeps}");
+            let model = Model::paper(&["sheet.points=[3, 3]", "stepping.integrator=central", &set]);
+            check(&model, None, &Limits::default(), &clock_s).to_string()
+        };
+        let (once, four) = (text(1), text(4));
+        assert!(once.contains("central, once a step (dt·ω_b = "), "{once}");
+        assert!(four.contains("central, 4 times a step (dt·ω_b = "), "{four}");
+        // A window of 4 ms among nine points, and among as many four times.
+        assert!(once.contains("(444444.44 ns a point and substep)"), "{once}");
+        assert!(four.contains("(111111.11 ns a point and substep)"), "{four}");
+    }
 }

@@ -219,4 +219,25 @@ mod tests {
         modeller.model(&feel(0.001, 0.0, ContactState::Free), 2, 0.0);
         assert!(near(modeller.model(&feel(0.0, 0.0, ContactState::Holding), 3, 0.0).stiffness_n_per_m, by_law));
     }
+
+    #[test]
+    fn a_stiffness_is_valid_as_far_as_half_its_change_is_a_tenth_of_the_force() {
+        let holding = Feel { force_on_tool_n: DVec3::new(0.0, 1.2, 1.6), ..feel(0.0, 0.0, ContactState::Holding) };
+        // That of a spring does not change.
+        assert!(modeller().model(&holding, 0, 0.0).valid_m > 1.0);
+        // This one gets 3 N/m stiffer with each millimetre.
+        let row = |depth_m: f64| Row {
+            force_n: 50.0 * depth_m + 1500.0 * depth_m * depth_m,
+            stiffness_n_per_m: 50.0 + 3000.0 * depth_m,
+            ..Law::linear(50.0, 0.5).at_depth(0.0)
+        };
+        let law = Law { step_m: 0.002, rows: [0.0, 0.002, 0.004, 0.006].map(row).to_vec(), is_coarse: false };
+        let mut modeller = Modeller::new(0, Arc::new(law), false);
+        for depth_m in [0.0, 0.002] {
+            let feel = Feel { place_m: -depth_m * DVec3::Z, ..holding };
+            let valid_m = modeller.model(&feel, 0, 0.0).valid_m;
+            let change_n = 0.5 * 3000.0 * valid_m * valid_m;
+            assert!((change_n - 0.2).abs() < 1e-6, "{depth_m} m deep: {valid_m} m, {change_n} N");
+        }
+    }
 }

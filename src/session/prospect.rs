@@ -442,6 +442,7 @@ mod tests {
 
     use super::*;
     use crate::limits::Limits;
+    use crate::scene::Scene;
 
     /// A soft sheet of 20 mm × 40 mm that a fingertip fits.
     const SOFT: [&str; 4] = [
@@ -581,5 +582,46 @@ mod tests {
         let Force { total_n, depth_m, .. } = gentle.forces[0];
         let stiffness = total_n / depth_m.unwrap();
         assert!((30.0..120.0).contains(&stiffness), "{stiffness} N/m");
+    }
+
+    #[test]
+    fn a_force_is_summed_over_all_points_and_only_some_of_many_forces_are_shown() {
+        let force = "[[force]]\npoint = [4, 8]\nforce_n = [0.0, 0.003, -0.004]\nfalloff_per_m = 300.0\n\
+                     falloff_offset = 0.3\nprofile = { type = \"constant\" }\n";
+        let of =
+            |count: usize| prospect(&[], &format!("duration_s = 0.1\nsample_every_s = 0.1\n{}", force.repeat(count)));
+        let found = of(MOST_SHOWN);
+        let place_m = |i: usize, j: usize| 0.0025 * DVec3::new(i as f64, j as f64, 0.0);
+        let points = (0..9).flat_map(|i| (0..17).map(move |j| place_m(i, j)));
+        let total_n: f64 = points.map(|point| 0.005 * (0.3 - 300.0 * point.distance(place_m(4, 8))).exp()).sum();
+        assert!((found.forces[0].total_n - total_n).abs() < 1e-9 * total_n, "{:?}, not {total_n}", found.forces[0]);
+        let last = format!("force[{}]", MOST_SHOWN - 1);
+        let shown = found.to_string();
+        assert!(shown.contains(&last) && !shown.contains("more forces"), "{shown}");
+        let shown = of(MOST_SHOWN + 2).to_string();
+        assert!(shown.contains(&last) && shown.contains("… and 2 more forces"), "{shown}");
+        assert!(!shown.contains(&format!("force[{MOST_SHOWN}]")), "{shown}");
+    }
+
+    #[test]
+    fn a_force_that_goes_through_a_mesh_is_named_with_how_thick_it_is_there() {
+        let text = "[mesh]\norgan = { name = \"gallbladder\", edge_m = 0.0035 }\n[material]\nyoungs_modulus_pa = 2e4\n\
+                    thickness_m = 0.003\nbed_n_per_m3 = 5e5\n[stepping]\nsubsteps = 8\n";
+        let scene = Scene::parse("test", text, &[], &Limits::default()).unwrap();
+        let model = Model::compile(&scene, &Limits::default()).unwrap();
+        let Body::Mesh(mesh) = &model.scene.body else { panic!("of another kind") };
+        let point = mesh.shape.nearest(DVec3::new(0.02, 0.0, -0.05));
+        let (at_m, force_n) = (mesh.shape.rest_m(point), -100.0 * mesh.shape.normal(point));
+        let script = format!(
+            "duration_s = 0.1\nsample_every_s = 0.1\n[[force]]\nat_m = {:?}\nforce_n = {:?}\nfalloff_per_m = 200.0\n\
+             falloff_offset = 0.0\nprofile = {{ type = \"constant\" }}\n",
+            at_m.to_array(),
+            force_n.to_array()
+        );
+        let script = Script::parse("test", &script, Path::new(""), &model.scene, &Limits::default()).unwrap();
+        let warnings = Prospect::new(&model, Some(&script)).warnings;
+        let thick = length(dent::thickness_m(mesh, point).unwrap());
+        let named = format!("more than the {thick} that it is thick there: it goes through");
+        assert!(warnings.iter().any(|warning| warning.ends_with(&named)), "{named}: {warnings:?}");
     }
 }

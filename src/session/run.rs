@@ -360,12 +360,18 @@ mod tests {
             let summary = run(&model, &script, false, &Limits::default(), &mut output, &clock_s, &mut |_| {}).unwrap();
             let passed_s = now_s.get() - begun_s;
             assert!(summary.wall_s > 0.0 && summary.wall_s <= passed_s, "{} of {passed_s} s", summary.wall_s);
+            let point_substeps = summary.points as f64 * summary.substeps as f64;
+            assert!((summary.ns_per_point_substep * point_substeps / (1e9 * summary.wall_s) - 1.0).abs() < 1e-12);
             summary
         };
         let plain = run_with("");
         let changed = run_with("[[tissue]]\nat_s = 0.01\nvirtual_stiffness_n_per_m = 50.0\n");
         assert_eq!((plain.steps, changed.steps), (20, 20));
         assert_ne!(plain.final_hash, changed.final_hash);
+        // While a clock stands still, nothing takes time.
+        let script = script(&model, "");
+        let summary = run(&model, &script, false, &Limits::default(), &mut Vec::new(), &|| 1e6, &mut |_| {}).unwrap();
+        assert_eq!(summary.wall_s, 0.0);
         // At the very end it changes nothing any more.
         let late = run_with("[[tissue]]\nat_s = 0.02\nvirtual_stiffness_n_per_m = 50.0\n");
         assert_eq!(plain.final_hash, late.final_hash);

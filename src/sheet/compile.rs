@@ -218,4 +218,16 @@ mod tests {
         assert_eq!(warns(&[]), (false, false));
         assert_eq!(warns(&["stepping.integrator=lagged", "stepping.substeps=1"]), (true, true));
     }
+
+    #[test]
+    fn as_many_substeps_as_the_limit_are_taken_and_more_are_refused() {
+        let sets = ["sheet.points=[5, 5]", "springs.stiffness_n_per_m=5000", "stepping.integrator=central"];
+        let sets = sets.map(str::to_owned);
+        let scene = Scene::parse("paper", crate::scene::PAPER, &sets, &Limits::default()).unwrap();
+        let least = choice::least_substeps(Integrator::Central, 1e-3, &Oscillator::of(&scene));
+        assert!(least > 1);
+        let limited = |substeps: u32| Model::compile(&scene, &Limits { substeps, ..Limits::default() });
+        assert_eq!(limited(least).unwrap().plan.substeps, least);
+        assert_eq!(limited(least - 1).unwrap_err().field, "stepping.substeps");
+    }
 }

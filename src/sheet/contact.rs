@@ -323,4 +323,15 @@ mod tests {
         }
         assert_eq!(contacts.tools[0].place_m(1.0), to_m);
     }
+
+    #[test]
+    fn tools_come_by_their_number_and_one_that_is_released_goes_alone() {
+        let (model, mut contacts) = (Model::paper(&["sheet.points=[9, 9]"]), Contacts::default());
+        for number in [5, 1, 3, 1] {
+            contacts.pose(&model, number, DVec3::new(0.1, 0.1, 0.01), Tip::default());
+        }
+        assert_eq!(contacts.tools().collect::<Vec<_>>(), [1, 3, 5]);
+        contacts.release(3);
+        assert_eq!(contacts.tools().collect::<Vec<_>>(), [1, 5]);
+    }
 }

@@ -316,4 +316,29 @@ mod tests {
         let still = course(rehearsal.steps, |_| 0.0);
         assert_eq!(rehearsal.difference(&LOADS[2], &still, &still), 0.0);
     }
+
+    #[test]
+    fn a_course_takes_the_work_of_its_points_its_substeps_and_its_steps() {
+        const WORK: u64 = 1 << 40;
+        let scene = scene(&["sheet.points=[4, 3]"]);
+        let never = &crate::sheet::choice::NEVER;
+        let work = |load: &Load, substeps: u32| {
+            let rehearsal = Rehearsal::new(&scene, 1e-3, WORK, never);
+            let before = rehearsal.left();
+            assert!(before < WORK && rehearsal.course(load, Integrator::Central, substeps, Precision::F64).is_some());
+            (before - rehearsal.left(), rehearsal.steps as u64, rehearsal.scene.shape().point_count() as u64)
+        };
+        let ((few, steps, points), (many, ..)) = (work(&LOADS[0], 5), work(&LOADS[0], 10));
+        assert_eq!(many - few, 5 * steps * (points + SUBSTEP_POINTS));
+        assert_eq!(2 * few - many, steps * STEP_POINTS);
+        // The course of a force that swings is a quarter as long.
+        assert_eq!(work(&LOADS[2], 5).0, few / steps * (steps / 4));
+        // What it would need more than there is, it is not begun for.
+        let rehearsal = Rehearsal::new(&scene, 1e-3, 0, never);
+        rehearsal.left.set(few - 1);
+        assert!(rehearsal.course(&LOADS[0], Integrator::Central, 5, Precision::F64).is_none() && rehearsal.is_cut());
+        rehearsal.left.set(few);
+        assert!(rehearsal.course(&LOADS[0], Integrator::Central, 5, Precision::F64).is_some());
+        assert_eq!(rehearsal.left(), 0);
+    }
 }

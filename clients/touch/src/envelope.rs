@@ -443,4 +443,60 @@ mod tests {
         }
         assert_eq!([LimitCause::Passivity, LimitCause::Slew].map(|reason| port.envelope.count(reason).0), [0; 2]);
     }
+
+    /// A force that is rendered as it is wanted, and so faint that no other limit acts on it, N.
+    const FAINT_N: f64 = 0.1;
+
+    /// What is rendered of `FAINT_N`, told at a moment by a model of an age: a share of it.
+    fn share(envelope: &mut Envelope, now_s: f64, age_s: f64) -> f64 {
+        let (place_m, velocity_m_per_s, force_n) = (DVec3::ZERO, DVec3::ZERO, FAINT_N * DVec3::Z);
+        envelope.render(&Wanted { now_s, place_m, velocity_m_per_s, force_n, age_s }).z / FAINT_N
+    }
+
+    #[test]
+    fn a_force_fades_in_a_straight_line_to_its_half_and_then_decays_and_returns_as_time_passes() {
+        let faded = |age_s: f64| {
+            let mut port = Port::new("omega3");
+            assert_eq!(port.ticks(600, 0.0, FAINT_N), FAINT_N);
+            let now_s = f64::from(port.tick) * 1e-3;
+            let share = share(&mut port.envelope, now_s, age_s);
+            (port.envelope, now_s, share)
+        };
+        let middle_s = 0.5 * (FRESH_S + STALE_S);
+        let decayed = 0.5 / std::f64::consts::E;
+        for (age_s, expected) in [(FRESH_S, 1.0), (middle_s, 0.75), (STALE_S, 0.5), (STALE_S + DECAY_S, decayed)] {
+            let (envelope, _, share) = faded(age_s);
+            assert!((share - expected).abs() < 1e-9, "{share} of the force at an age of {age_s} s");
+            assert_eq!(envelope.count(LimitCause::Stale).0, u64::from(expected < 1.0));
+        }
+        // Half the force comes back in half the time of all of it.
+        let (mut envelope, mut now_s, mut found) = faded(STALE_S);
+        for _ in 0..(250.0 * RETURN_S) as u32 {
+            now_s += 1e-3;
+            found = share(&mut envelope, now_s, 0.0);
+        }
+        assert!((found - 0.75).abs() < 0.01, "{found}");
+        // A gap between two ticks counts as ten of them at most.
+        let (mut envelope, now_s, _) = faded(STALE_S);
+        let after_gap = share(&mut envelope, now_s + 0.04, 0.0);
+        assert!((after_gap - 0.54).abs() < 1e-9, "{after_gap}");
+    }
+
+    #[test]
+    fn a_force_falls_at_every_tick_in_which_a_hand_is_pushed_faster_than_its_energy_bears() {
+        let mut port = Port::new("omega3");
+        port.ticks(600, 0.0, 0.0);
+        for tick in 0..100 {
+            port.tick(-0.05, 0.03 * f64::from(tick));
+        }
+        let mut last_n = port.ticks(500, -0.05, 3.0);
+        assert_eq!(last_n, 3.0);
+        // The law goes on wanting all of it.
+        for tick in 0..25 {
+            let force_n = port.tick(1.0, 3.0);
+            assert!((0.0..last_n).contains(&force_n), "tick {tick}: {last_n}, then {force_n} N");
+            last_n = force_n;
+        }
+        assert!(port.envelope.count(LimitCause::Passivity).0 >= 25 && port.envelope.energy_j() > 0.0);
+    }
 }

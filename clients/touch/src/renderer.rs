@@ -255,4 +255,17 @@ mod tests {
             assert!((wanted_n - expected_n * DVec3::Z).length() < 1e-9, "{later_s} s: {wanted_n}");
         }
     }
+
+    #[test]
+    fn the_time_of_the_newest_model_is_that_of_the_one_that_is_rendered() {
+        let (mut renderer, place_m) = (renderer(), -0.004 * DVec3::Z);
+        assert_eq!(renderer.model_time_s(), None);
+        renderer.receive(model(1, 0.25, place_m, 0.0), 0.5);
+        // It takes effect at the next tick.
+        assert_eq!(renderer.model_time_s(), None);
+        renderer.tick(0.5, place_m);
+        assert_eq!(renderer.model_time_s(), Some(0.25));
+        renderer.begin(Law::linear(400.0, 0.5));
+        assert_eq!(renderer.model_time_s(), None);
+    }
 }

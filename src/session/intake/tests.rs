@@ -244,3 +244,29 @@ fn a_batch_whose_tool_is_released_meanwhile_is_dropped_whole() {
     assert!(due.iter().all(|due| due.ends_lease) && due.len() == 1);
     assert_eq!(intake.counts(), Counts { accepted: 600, dropped: 600, ..Counts::default() });
 }
+
+#[test]
+fn the_memory_of_commands_that_wait_is_charged_and_given_back_as_they_are_done_or_discarded() {
+    let account = Account::alone();
+    let mut intake = intake().0.charged_to(&account);
+    let charged = || account.has(Resource::Memory(Purpose::Commands));
+    // In whole pieces, and the first is free. Nodes of a tree are two thirds full.
+    let is_charged = |count: u64| {
+        let bytes = 3 * count * size_of::<(QueueKey, Due)>() as u64 / 2;
+        charged().is_multiple_of(PIECE_BYTES) && (charged()..charged() + PIECE_BYTES).contains(&bytes)
+    };
+    for sequence in 0..3000 {
+        intake.submit(LEASE, vec![release(sequence, Some(10 + sequence / 1000))], 0).unwrap();
+        assert!(is_charged(sequence + 1), "{} bytes for {}", charged(), sequence + 1);
+    }
+    assert!(charged() > 4 * PIECE_BYTES, "{}", charged());
+    for (step, left) in [(10, 2000), (11, 1000), (12, 0)] {
+        assert_eq!((due(&mut intake, step).len(), is_charged(left)), (1000, true), "{} bytes for {left}", charged());
+    }
+    // All of a batch at once, and the end of its lease discards it.
+    intake.submit(LEASE, (3000..6000).map(|sequence| release(sequence, Some(100))).collect(), 0).unwrap();
+    assert!(is_charged(3000), "{}", charged());
+    intake.release(LEASE).unwrap();
+    due(&mut intake, 13);
+    assert_eq!(charged(), 0);
+}

@@ -105,3 +105,23 @@ fn a_choice_that_nobody_waits_for_is_given_up_before_anything_is_rehearsed() {
     let (choice, work) = choose(&scene, &limits, &NEVER).unwrap();
     assert!(choice.expected_error <= scene.stepping.tolerance && work > 0);
 }
+
+#[test]
+fn a_step_takes_a_time_of_its_own_and_more_for_each_point_in_each_substep() {
+    let of = |points: &str, substeps: u32| {
+        let scene = scene(&[points, &format!("stepping.substeps={substeps}"), "stepping.integrator=central"]);
+        let (found, step_s) = least_step(&scene);
+        assert_eq!(found, substeps);
+        step_s - 1e-9 * STEP_NS
+    };
+    let one_s = of("sheet.points=[5, 4]", 2);
+    assert!(one_s > 0.0);
+    for (points, substeps, times) in [("[5, 4]", 6, 3.0), ("[10, 4]", 2, 2.0), ("[10, 8]", 1, 2.0)] {
+        let step_s = of(&format!("sheet.points={points}"), substeps);
+        assert!((step_s / one_s - times).abs() < 1e-9, "{points} {substeps}: {step_s} {one_s}");
+    }
+    // Without a number of substeps, as few as any integrator can do with.
+    let scene = scene(&["springs.stiffness_n_per_m=2000"]);
+    let each = CANDIDATES.map(|integrator| stability::stable_substeps(integrator, 1e-3, &Oscillator::of(&scene)));
+    assert_eq!(Some(least_step(&scene).0), each.into_iter().min());
+}

@@ -190,4 +190,19 @@ mod tests {
             assert!(places.iter().all(|place| place.length() < radius));
         }
     }
+
+    #[test]
+    fn the_rings_of_a_disc_are_turned_against_each_other_by_different_parts() {
+        let places = disc(6.0);
+        let rings = 12;
+        let count = places.len() / rings;
+        // How far the first place of each ring is turned, in parts of the way to the next one of it.
+        let mut parts: Vec<f64> =
+            (0..rings).map(|ring| (places[ring * count].to_angle() / TAU * count as f64).rem_euclid(1.0)).collect();
+        parts.sort_by(f64::total_cmp);
+        let around = parts[1..].iter().copied().chain([parts[0] + 1.0]);
+        let widest = parts.iter().zip(around).map(|(a, b)| b - a).fold(0.0, f64::max);
+        // Evenly turned, these are a twelfth apart.
+        assert!(widest < 2.0 / rings as f64, "{parts:?}");
+    }
 }

@@ -7,6 +7,8 @@ use glam::DVec2;
 
 use super::window::REACHES;
 use super::*;
+use crate::limits::Limits;
+use crate::scene::Scene;
 
 fn model(sets: &[&str]) -> Arc<Model> {
     let always = ["stepping.integrator=central", "stepping.substeps=1", "sheet.spacing_m=0.02"];
@@ -172,6 +174,8 @@ fn a_window_holds_all_that_notices_the_disc_and_not_much_more() {
     let spacing_m = model.scene.sheet().unwrap().spacing_m;
     for (centre, radius) in [([22.3, 20.1], 5.5), ([3.0, 41.0], 2.0), ([24.0, 21.0], 0.3)] {
         let footprint = Footprint::new(&model, radius * spacing_m, (DVec2::from(centre) * spacing_m).extend(0.0));
+        let half = half_window_m(&model, radius * spacing_m) / spacing_m - radius;
+        assert!((REACHES..REACHES + 4.0).contains(&half), "{half} spacings beyond the disc");
         let points: Vec<usize> = Window::around(&model, &footprint).points(&model).collect();
         assert!(points.is_sorted_by(|a, b| a < b) && points.last().is_some_and(|last| *last < model.len()));
         for index in 0..model.len() {
@@ -182,4 +186,58 @@ fn a_window_holds_all_that_notices_the_disc_and_not_much_more() {
             assert!(!is_inside || away < radius + REACHES + 4.0, "{centre:?}: {i} {j} is in");
         }
     }
+}
+
+#[test]
+fn a_window_of_a_mesh_is_a_ball_which_shrinks_to_the_disc_until_it_has_few_enough_points() {
+    let text = "[mesh]\norgan = { name = \"gallbladder\", edge_m = 0.0035 }\n[material]\nyoungs_modulus_pa = 2e4\n\
+                thickness_m = 0.003\nbed_n_per_m3 = 5e6\n[stepping]\nsubsteps = 8\n";
+    let scene = Scene::parse("test", text, &[], &Limits::default()).unwrap();
+    let model = Model::compile(&scene, &Limits::default()).unwrap();
+    let (shape, radius_m) = (model.shape(), 0.006);
+    let centre_m = shape.rest_m(shape.nearest(shape.extent().middle_m()));
+    let of = |most: usize| -> Vec<usize> { Window::at(&model, radius_m, centre_m, most).points(&model).collect() };
+    // Every point that is within a distance and none else.
+    let is_ball = |found: &[usize], within_m: f64| {
+        model.points().all(|point| {
+            let is_near = shape.rest_m(point).distance(centre_m) <= within_m;
+            found.contains(&model.place_of(point)) == is_near
+        })
+    };
+    let (all, few, least) = (of(usize::MAX), of(60), of(1));
+    let reach_m = half_window_m(&model, radius_m);
+    assert!(is_ball(&all, reach_m), "{} points", all.len());
+    assert!(all.len() > 60 && (30..=60).contains(&few.len()), "{} and {} points", all.len(), few.len());
+    let shrunk = |found: &[usize]| (0..60).map(|times| reach_m * 0.9_f64.powi(times)).find(|m| is_ball(found, *m));
+    assert!(shrunk(&few).is_some_and(|within_m| within_m > radius_m), "{few:?}");
+    assert!(shrunk(&least).is_some_and(|within_m| within_m > 0.9 * radius_m), "{least:?}");
+    assert!(least.len() > 1 && !Window::at(&model, radius_m, centre_m, 1).is_empty());
+    assert!(Window::at(&model, radius_m, DVec3::splat(10.0), usize::MAX).is_empty());
+}
+
+#[test]
+fn a_sheet_that_stands_in_for_another_has_its_tissue_and_its_fixed_points_as_far_as_it_reaches() {
+    let model = model(&["sheet.points=[17, 25]", "sheet.fixed=[[0, 0], [16, 24], [8, 12], [3, 24]]"]);
+    let of = |model: &Model| (model.scene.sheet().unwrap().clone(), model.scene.clone());
+    let (fine, fine_scene) = of(&model);
+    let points = |sheet: &Sheet| -> Vec<[usize; 2]> {
+        sheet.fixed_indices().iter().map(|index| [index / sheet.points[1], index % sheet.points[1]]).collect()
+    };
+    // All of it, in points twice as far apart.
+    let all = stand_in(&model, 0.04, 10.0);
+    let (sheet, scene) = of(&all);
+    assert_eq!((all.points, sheet.points, sheet.extent_m()), ([9, 13], [9, 13], fine.extent_m()));
+    assert_eq!(points(&sheet), [[0, 0], [2, 12], [4, 6], [8, 12]]);
+    assert_eq!(all.fixed, sheet.fixed_indices());
+    assert_eq!((all.unit_m, sheet.spacing_m), (0.04, 0.04));
+    // Of the same area the same mass, damping and virtual springs; the springs are the membrane's.
+    assert_eq!(sheet.point_mass_kg, 4.0 * fine.point_mass_kg);
+    assert_eq!(scene.damping_n_s_per_m, 4.0 * fine_scene.damping_n_s_per_m);
+    assert_eq!(scene.virtual_stiffness_n_per_m, 4.0 * fine_scene.virtual_stiffness_n_per_m);
+    assert_eq!(scene.springs, fine_scene.springs);
+    // The middle of it, held at its edges.
+    let (sheet, _) = of(&stand_in(&model, 0.02, 0.1));
+    assert_eq!((sheet.points, sheet.fixed), ([11, 11], Fixed::Edges));
+    // Where the sheet is narrower than that, it goes as far as the sheet does.
+    assert_eq!(of(&stand_in(&model, 0.02, 0.2)).0.points, [17, 21]);
 }
