@@ -141,6 +141,7 @@ fn kernel_alone_s(count: usize, rounds: u64) -> f64 {
                 tool: 0,
                 sequence: Some(step),
                 client_time_ns: 0,
+                by_datagram: false,
                 at_step: None,
                 time_to_live_s: None,
                 action,

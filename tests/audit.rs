@@ -120,7 +120,7 @@ fn touching(grasps: bool, step: u64) -> Vec<(usize, Action)> {
     let t = step as f64 / 250.0;
     let tip = Tip { radius_m: 0.06, grasps, ..Tip::default() };
     let depth_m = 0.004 * (1.0 - (std::f64::consts::TAU * 1.5 * t).cos());
-    vec![(0, Action::Pose { place_m: DVec3::new(0.13 + 0.02 * t, 0.1, 0.001 - depth_m), tip })]
+    vec![(0, Action::Pose { place_m: DVec3::new(0.13 + 0.02 * t, 0.1, 0.001 - depth_m), velocity_m_per_s: None, tip })]
 }
 
 fn pushing(step: u64) -> Vec<(usize, Action)> {

@@ -72,6 +72,7 @@ fn command() -> impl Strategy<Value = Command> {
             tool,
             sequence: Some(sequence),
             client_time_ns: 0,
+            by_datagram: false,
             at_step,
             time_to_live_s,
             action,

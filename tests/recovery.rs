@@ -38,6 +38,7 @@ fn play(model: &Arc<Model>, orders: &[Order], steps: u64) -> Course {
                 tool: *tool,
                 sequence: Some(index as u64 + 1),
                 client_time_ns: 0,
+                by_datagram: false,
                 at_step: None,
                 time_to_live_s: None,
                 action: action.clone(),

@@ -157,7 +157,7 @@ fn a_pose_is_reached_at_the_end_of_its_step_and_the_tool_leaves_at_the_end() {
     let script = script(text, &scene);
     let place = |step: u64| match script.actions_at(step).collect::<Vec<_>>().as_slice() {
         [] => None,
-        [(0, Action::Pose { place_m, tip })] if tip.radius_m == 0.004 => Some(Some(*place_m)),
+        [(0, Action::Pose { place_m, tip, .. })] if tip.radius_m == 0.004 => Some(Some(*place_m)),
         [(0, Action::Release)] => Some(None),
         other => panic!("{step}: {other:?}"),
     };
@@ -284,8 +284,16 @@ fn a_pose_beside_the_tissue_is_warned_of() {
 /// A session of liver, and what a command for the coming step tells in the sample after it.
 fn told(session: &mut Session, sequence: u64, action: Action) -> palpate::session::Contact {
     let (sequence, at_step) = (Some(sequence), Some(session.step_count()));
-    let command =
-        Command { tool: 0, sequence, client_time_ns: 0, at_step, time_to_live_s: None, action, arrival_ns: 0 };
+    let command = Command {
+        tool: 0,
+        sequence,
+        client_time_ns: 0,
+        by_datagram: false,
+        at_step,
+        time_to_live_s: None,
+        action,
+        arrival_ns: 0,
+    };
     let due = palpate::session::command::Due { command, late: false, late_commands: 0, ends_lease: false };
     session.advance(&mut vec![due], |_| {});
     session.sample(None).tools[0].contact.unwrap()
@@ -341,7 +349,11 @@ fn the_surface_under_a_tip_is_deeper_than_the_mean_over_it() {
     let mut contact = None;
     for step in 0..400_u64 {
         let z_m = -0.004 * (step as f64 / 300.0).min(1.0);
-        let action = Action::Pose { place_m: DVec3::new(0.0375, 0.0375, z_m), tip: palpate_touch::Tip::default() };
+        let action = Action::Pose {
+            place_m: DVec3::new(0.0375, 0.0375, z_m),
+            velocity_m_per_s: None,
+            tip: palpate_touch::Tip::default(),
+        };
         contact = Some(told(&mut session, step + 1, action));
     }
     let contact = contact.unwrap();

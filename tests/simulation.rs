@@ -161,8 +161,16 @@ fn course(seed: u64) -> Course {
                         })
                     };
                     let (sequence, at_step, time_to_live_s, client_time_ns) = (Some(sequence), None, None, 0);
-                    let command =
-                        Command { tool, sequence, client_time_ns, at_step, time_to_live_s, action, arrival_ns: now };
+                    let command = Command {
+                        tool,
+                        sequence,
+                        client_time_ns,
+                        by_datagram: false,
+                        at_step,
+                        time_to_live_s,
+                        action,
+                        arrival_ns: now,
+                    };
                     let taken = intake.submit(lease, vec![command], now);
                     refused += u64::from(taken.is_err());
                     if taken.is_ok() {

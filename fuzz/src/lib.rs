@@ -284,6 +284,7 @@ fn request_seeds() -> Vec<Vec<u8>> {
         position_m: vector(0.05, 0.05, -0.002),
         orientation: Some(pb::Quaternion { w: 1.0, ..Default::default() }),
         tip_offset_m: vector(0.0, 0.0, 0.01),
+        velocity_m_per_s: vector(0.01, 0.0, -0.02),
         tip: Some(pb::Tip {
             radius_m: 0.02,
             friction: Some(0.3),

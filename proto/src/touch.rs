@@ -70,7 +70,13 @@ pub fn tip(tip: &Tip) -> pb::Tip {
 
 /// The pose of a tool whose tip is at `place_m`, m.
 pub fn pose(place_m: DVec3, tip: &Tip) -> pb::Pose {
-    pb::Pose { position_m: vector(place_m), orientation: None, tip_offset_m: None, tip: Some(self::tip(tip)) }
+    pb::Pose {
+        position_m: vector(place_m),
+        orientation: None,
+        tip_offset_m: None,
+        tip: Some(self::tip(tip)),
+        velocity_m_per_s: None,
+    }
 }
 
 /// A force law with its number in the stream, as a message.

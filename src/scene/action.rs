@@ -22,6 +22,8 @@ pub enum Action {
     Pose {
         /// Place in the frame of the sheet at rest, z out of the tissue, m.
         place_m: DVec3,
+        /// How fast it moves then, m/s, if the client says so: the tool goes on like that over a gap.
+        velocity_m_per_s: Option<DVec3>,
         /// The tool's tip.
         tip: Tip,
     },

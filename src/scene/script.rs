@@ -79,7 +79,7 @@ impl Script {
         let place_m = move |profile: &PoseProfile, end: u64| profile.at(end as f64 / self.rate_hz);
         self.poses.iter().enumerate().filter_map(move |(index, profile)| {
             let action = match place_m(profile, step + 1) {
-                Some(place_m) => Action::Pose { place_m, tip: profile.tip },
+                Some(place_m) => Action::Pose { place_m, velocity_m_per_s: None, tip: profile.tip },
                 None => place_m(profile, step).map(|_| Action::Release)?,
             };
             Some((first + index, action))

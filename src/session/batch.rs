@@ -48,14 +48,15 @@ impl Intake {
             let coming = last.get(&command.tool).copied();
             let before = coming.map(|(sequence, ..)| sequence).or(lease.last_sequence);
             let sequence = command.sequence.unwrap_or_else(|| before.map_or(0, |before| before.saturating_add(1)));
-            if let Some(before) = before.filter(|before| sequence <= *before) {
+            if let Some(before) = before.filter(|before| sequence <= *before && !command.by_datagram) {
                 let message = format!("must be above {before}, the last one, but is {sequence}");
                 return Err(Refusal::new(Reason::StaleSequence, "sequence", message));
             }
             command.sequence = Some(sequence);
             let tip_radius_m = tip_radius_m(command);
             check_tip(coming.map_or(lease.tip_radius_m, |coming| coming.2), tip_radius_m)?;
-            last.insert(command.tool, (sequence, coming.map_or(0, |coming| coming.1) + 1, tip_radius_m));
+            let newest = before.map_or(sequence, |before| before.max(sequence));
+            last.insert(command.tool, (newest, coming.map_or(0, |coming| coming.1) + 1, tip_radius_m));
         }
         // A limit per tool, so that no holder fills the queue for the others.
         for (tool, (_, coming, _)) in &last {

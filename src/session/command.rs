@@ -11,6 +11,9 @@ pub struct Command {
     pub sequence: Option<u64>,
     /// Time by the client's clock, returned with the sample that acknowledges the command.
     pub client_time_ns: u64,
+    /// It came by datagram, so that later poses may have overtaken it: its sequence number need not rise. Of poses by client
+    /// time only.
+    pub by_datagram: bool,
     /// The step at whose beginning it takes effect; the next one if `None`.
     pub at_step: Option<u64>,
     /// Simulated time after which its action ends.

@@ -148,6 +148,7 @@ impl Intake {
             tool,
             sequence: None,
             client_time_ns: 0,
+            by_datagram: false,
             at_step: None,
             time_to_live_s: None,
             action: Action::Release,
@@ -196,7 +197,7 @@ impl Intake {
         let key = (step, self.arrivals);
         self.arrivals += 1;
         if let Some(lease) = self.leases.get_mut(command.tool) {
-            lease.last_sequence = command.sequence;
+            lease.last_sequence = lease.last_sequence.max(command.sequence);
             lease.tip_radius_m = tip_radius_m(&command);
             let last = lease.last_key.replace(key);
             // The latest position wins: it supersedes an earlier one that has not taken effect. This does not apply to

@@ -395,7 +395,7 @@ impl Session {
                 self.tool(index).around = None;
                 self.tissue.grasp(index, point, Grasp::Target(displacement_m));
             }
-            Action::Pose { place_m, tip } => {
+            Action::Pose { place_m, velocity_m_per_s, tip } => {
                 let point = self.model().shape().nearest(place_m);
                 let client_time_s = command.client_time_ns as f64 * 1e-9;
                 let now_s = self.time_s();
@@ -415,9 +415,15 @@ impl Session {
                 // A pose with a step is played at that step; a pose with client time only is played by that time.
                 if command.at_step.is_some() || command.client_time_ns == 0 {
                     posed.path.go_to(client_time_s, place_m);
-                } else if !posed.path.receive(client_time_s, place_m, now_s) {
-                    self.path_counts[1] += 1;
+                    return;
                 }
+                let is_overtaken = posed.path.newest_s().is_some_and(|newest_s| client_time_s <= newest_s);
+                let is_taken = match velocity_m_per_s {
+                    _ if command.by_datagram && is_overtaken => posed.path.fill(client_time_s, place_m),
+                    Some(velocity) => posed.path.receive_moving(client_time_s, place_m, velocity, now_s),
+                    None => posed.path.receive(client_time_s, place_m, now_s),
+                };
+                self.path_counts[1] += u64::from(!is_taken);
             }
             Action::Release => {
                 let tool = self.tool(index);

@@ -170,6 +170,7 @@ mod tests {
             tool,
             sequence: Some(sequence),
             client_time_ns: 0,
+            by_datagram: false,
             at_step,
             time_to_live_s,
             action,

@@ -45,8 +45,12 @@ impl Rules {
                 let far_m = displacement_m.length();
                 check_reach("position", self.scene.shape(), far_m, &self.limits)
             }
-            Action::Pose { place_m, tip } => {
+            Action::Pose { place_m, velocity_m_per_s, tip } => {
                 crate::refusal::finite_vector("pose.position_m", *place_m)?;
+                if let Some(velocity_m_per_s) = velocity_m_per_s {
+                    crate::refusal::finite_vector("pose.velocity_m_per_s", *velocity_m_per_s)?;
+                    check_played_by_time(command)?;
+                }
                 let centre_m = self.scene.shape().extent().middle_m();
                 check_reach("pose.position_m", self.scene.shape(), (*place_m - centre_m).length(), &self.limits)?;
                 check::check_tip("pose.tip", self.scene.shape(), tip)
@@ -54,6 +58,13 @@ impl Rules {
             Action::Release => Ok(()),
         }
     }
+}
+
+/// A velocity is for poses that are played by the client's time.
+fn check_played_by_time(command: &Command) -> Result<()> {
+    let message = "goes with a pose that is played by the client's time: give client_time_ns, and no at_step";
+    let is_played = command.client_time_ns != 0 && command.at_step.is_none();
+    if is_played { Ok(()) } else { Err(Refusal::new(Reason::Missing, "pose.velocity_m_per_s", message)) }
 }
 
 /// Radius of the tip that a command gives its tool, m.

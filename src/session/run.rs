@@ -52,6 +52,7 @@ pub fn command(tool: usize, step: u64, action: Action) -> Command {
         // At most one command per step, so steps serve as sequence numbers.
         sequence: Some(step + 1),
         client_time_ns: 0,
+        by_datagram: false,
         at_step: Some(step),
         time_to_live_s: None,
         action,

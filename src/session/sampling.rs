@@ -267,7 +267,16 @@ mod tests {
     fn tell(session: &mut Session, sequence: u64, action: Action) {
         let (at_step, time_to_live_s) = (None, None);
         let (sequence, client_time_ns, arrival_ns) = (Some(sequence), 0, 1);
-        let command = Command { tool: 0, sequence, client_time_ns, at_step, time_to_live_s, action, arrival_ns };
+        let command = Command {
+            tool: 0,
+            sequence,
+            client_time_ns,
+            by_datagram: false,
+            at_step,
+            time_to_live_s,
+            action,
+            arrival_ns,
+        };
         session.advance(&mut vec![Due { command, late: false, late_commands: 0, ends_lease: false }], |_| {});
     }
 
@@ -294,7 +303,7 @@ mod tests {
             let (mut model, mut touched) = (None, false);
             for step in 1..=100 {
                 let place_m = middle_m - 1e-4 * step as f64 * DVec3::Z;
-                tell(&mut session, step, Action::Pose { place_m, tip });
+                tell(&mut session, step, Action::Pose { place_m, velocity_m_per_s: None, tip });
                 model = sampler.pick(&session, false).and_then(|sample| sample.tools[0].local);
                 let refinements: Vec<_> = sampler.refinements(&session).collect();
                 // A touch begins where the tool meets the surface.

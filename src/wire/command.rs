@@ -47,13 +47,18 @@ pub fn from_command(message: &pb::Command, shape: &dyn RestShape, arrival_ns: u6
             };
             Action::Grasp { point, displacement_m }
         }
-        Message::Pose(pose) => Action::Pose { place_m: from_pose(pose)?, tip: from_tip(pose.tip.as_ref()) },
+        Message::Pose(pose) => Action::Pose {
+            place_m: from_pose(pose)?,
+            velocity_m_per_s: pose.velocity_m_per_s.as_ref().map(|velocity| from_vector(Some(velocity))),
+            tip: from_tip(pose.tip.as_ref()),
+        },
         Message::Release(_) => Action::Release,
     };
     Ok(Command {
         tool: message.tool,
         sequence: message.sequence,
         client_time_ns: message.client_time_ns,
+        by_datagram: false,
         at_step: message.at_step,
         time_to_live_s: message.time_to_live_s,
         action,
@@ -129,7 +134,9 @@ pub fn scripted(shape: &dyn RestShape, tool: usize, at_step: u64, action: &Actio
             let target = Some(pb::position::Target::DisplacementM(pb::Vector3 { x: *x, y: *y, z: *z }));
             Message::Position(pb::Position { point, vertex, target })
         }
-        Action::Pose { place_m, tip } => Message::Pose(pose(*place_m, tip)),
+        Action::Pose { place_m, velocity_m_per_s, tip } => {
+            Message::Pose(pb::Pose { velocity_m_per_s: velocity_m_per_s.and_then(vector), ..pose(*place_m, tip) })
+        }
         Action::Release => Message::Release(pb::Release {}),
     };
     let (tool, sequence, action) = (tool as u32, Some(at_step + 1), Some(action));

@@ -116,14 +116,18 @@ impl Path {
         true
     }
 
-    /// Fills a gap with a place that comes late, if it has not been played.
-    pub fn fill(&mut self, time_s: f64, place_m: DVec3) {
+    /// Fills a gap with a place that comes late. Returns false if it has been played past, is known, or is not finite.
+    pub fn fill(&mut self, time_s: f64, place_m: DVec3) -> bool {
         let is_due = time_s.is_finite() && self.played.is_some_and(|played| time_s > played.0);
         let at = self.waiting.partition_point(|waiting| waiting.0 < time_s);
         // What is newer than all is no gap; and each fills it once.
-        if is_due && place_m.is_finite() && self.waiting.get(at).is_some_and(|after| after.0 > time_s) {
+        let fills = is_due && place_m.is_finite() && self.waiting.get(at).is_some_and(|after| after.0 > time_s);
+        if fills {
             self.wait(at, time_s, place_m);
+        } else {
+            self.dropped += 1;
         }
+        fills
     }
 
     /// The client's time of the newest command, s.

@@ -22,7 +22,16 @@ fn intake() -> (Intake, Schedule) {
 fn release(sequence: u64, at_step: Option<u64>) -> Command {
     let (client_time_ns, time_to_live_s, arrival_ns) = (0, None, 0);
     let sequence = Some(sequence);
-    Command { tool: 0, sequence, client_time_ns, at_step, time_to_live_s, action: Action::Release, arrival_ns }
+    Command {
+        tool: 0,
+        sequence,
+        client_time_ns,
+        by_datagram: false,
+        at_step,
+        time_to_live_s,
+        action: Action::Release,
+        arrival_ns,
+    }
 }
 
 fn steps(intake: &Intake) -> Vec<u64> {
@@ -104,7 +113,11 @@ fn a_command_without_a_sequence_follows_the_one_before() {
 fn a_tool_keeps_its_tip_until_it_is_released() {
     let (mut intake, _) = intake();
     let lead = |sequence, radius_m| Command {
-        action: Action::Pose { place_m: glam::DVec3::ZERO, tip: Tip { radius_m, ..Tip::default() } },
+        action: Action::Pose {
+            place_m: glam::DVec3::ZERO,
+            velocity_m_per_s: None,
+            tip: Tip { radius_m, ..Tip::default() },
+        },
         ..release(sequence, None)
     };
     intake.submit(LEASE, vec![lead(1, 0.005)], 0).unwrap();
@@ -113,6 +126,29 @@ fn a_tool_keeps_its_tip_until_it_is_released() {
     // Of a batch that is refused nothing is taken in.
     intake.submit(LEASE, vec![lead(2, 0.005), release(3, None), lead(4, 0.006)], 0).unwrap();
     assert!(intake.submit(LEASE, vec![lead(5, 0.005)], 0).is_err());
+}
+
+#[test]
+fn poses_that_came_by_datagram_may_have_been_overtaken_and_no_others() {
+    let (mut intake, _) = intake();
+    let pose = |sequence: u64, by_datagram| Command {
+        action: Action::Pose { place_m: glam::DVec3::ZERO, velocity_m_per_s: None, tip: Tip::default() },
+        client_time_ns: sequence * 1_000_000,
+        by_datagram,
+        ..release(sequence, None)
+    };
+    intake.submit(LEASE, vec![pose(5, true)], 0).unwrap();
+    intake.submit(LEASE, vec![pose(3, true), pose(4, true)], 0).unwrap();
+    // What came late does not lower the newest number.
+    assert_eq!(intake.submit(LEASE, vec![pose(5, false)], 0).unwrap_err().reason, Reason::StaleSequence);
+    intake.submit(LEASE, vec![pose(6, false)], 0).unwrap();
+    let sequences: Vec<_> = due(&mut intake, 1).iter().map(|due| due.command.sequence).collect();
+    assert_eq!(sequences, [5, 3, 4, 6].map(Some));
+    // A velocity is for poses that are played by the client's time.
+    let action =
+        Action::Pose { place_m: glam::DVec3::ZERO, velocity_m_per_s: Some(glam::DVec3::X), tip: Tip::default() };
+    let refused = intake.submit(LEASE, vec![Command { action, ..release(7, Some(9)) }], 0).unwrap_err();
+    assert_eq!(refused.field, "pose.velocity_m_per_s");
 }
 
 /// A grasp of a free point, for step `at_step`.

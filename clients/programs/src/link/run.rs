@@ -223,7 +223,7 @@ impl Poses {
                 true => _ = path.receive(time_s, place_m, now_s),
                 // A stream has them in order: what is older than the newest is refused there.
                 false if self.transport == Transport::Stream => _ = path.receive(time_s, place_m, now_s),
-                false => path.fill(time_s, place_m),
+                false => _ = path.fill(time_s, place_m),
             }
         }
     }

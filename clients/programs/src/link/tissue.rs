@@ -77,12 +77,13 @@ impl Tissue {
     /// Performs one step, at the end of which the tool is at the hand's `place_m`, or released if that is `None`.
     pub(super) fn step(&mut self, place_m: Option<DVec3>) -> Result<Option<Feel>, String> {
         let (tip, spot) = (self.tip, self.spot);
-        let pose = |place_m| Action::Pose { place_m: spot.of_tissue(place_m), tip };
+        let pose = |place_m| Action::Pose { place_m: spot.of_tissue(place_m), velocity_m_per_s: None, tip };
         let action = place_m.map_or(Action::Release, pose);
         let command = Command {
             tool: 0,
             sequence: Some(self.session.step_count() + 1),
             client_time_ns: 0,
+            by_datagram: false,
             at_step: None,
             time_to_live_s: None,
             action,
