@@ -108,6 +108,12 @@ impl HapticService for Echo {
     ) -> Result<Response<pb::SendCommandsResponse>, Status> {
         no()
     }
+    async fn open_datagrams(
+        &self,
+        _: Request<pb::OpenDatagramsRequest>,
+    ) -> Result<Response<pb::OpenDatagramsResponse>, Status> {
+        no()
+    }
     async fn watch_samples(
         &self,
         _: Request<pb::WatchSamplesRequest>,

@@ -103,7 +103,16 @@ fn pressing() -> (Pressing, Arc<Notify>) {
 
 fn target(server: &Server, session: Session) -> Target {
     let holder = "test".to_owned();
-    Target { server: at(server), session, tool: 0, tip: Tip::default(), deadband: 0.0, holder }
+    Target {
+        server: at(server),
+        session,
+        tool: 0,
+        tip: Tip::default(),
+        deadband: 0.0,
+        up_deadband: 0.0,
+        datagrams: true,
+        holder,
+    }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

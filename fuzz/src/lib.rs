@@ -314,6 +314,7 @@ fn request_seeds() -> Vec<Vec<u8>> {
         device: Some(touch::device(&Device::named("omega3").expect("there is one"))),
         tip: Some(pb::Tip { radius_m: 0.02, friction: Some(0.2), ..Default::default() }),
         touch_stiffness: true,
+        datagrams: true,
     };
     let touch = |message| pb::TouchRequest { message: Some(message) }.encode_to_vec();
     let scene = pb::create_session_request::Source::Scene(wire::scene::scene(&model().scene));

@@ -5,9 +5,12 @@
 //!   the crate `palpate-client`.
 //! - [`refusal`]: the reasons for which inputs are refused, and [`error`]: refusals as gRPC statuses.
 //! - [`codec`]: decodes messages, requests within bounds.
+//! - `datagram` (feature `datagrams`): what both ends of datagrams agree on.
 //! - [`geometry`] and [`touch`]: conversion of vectors, and of the types of the crate `palpate-touch`.
 
 pub mod codec;
+#[cfg(feature = "datagrams")]
+pub mod datagram;
 pub mod error;
 pub mod geometry;
 pub mod refusal;

@@ -223,8 +223,15 @@ impl Live {
     /// Refuses a session that is held or deleted.
     pub async fn next_sample(&self, only: Vec<u32>) -> Result<PacedSample> {
         let (laws, touch_stiffness) = (None, false);
-        let sampling =
-            Sampling { every: 1, only: Some(only), deadband: None, heartbeat_s: HEARTBEAT_S, laws, touch_stiffness };
+        let sampling = Sampling {
+            every: 1,
+            only: Some(only),
+            deadband: None,
+            heartbeat_s: HEARTBEAT_S,
+            laws,
+            touch_stiffness,
+            wanted: None,
+        };
         Ok(self.tap(sampling, None, true).pop().await?.0)
     }
 

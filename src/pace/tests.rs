@@ -17,8 +17,10 @@ async fn a_fault_in_one_session_ends_that_one_alone() {
     let pacer = Pacer::start(1, 0.02, &limits, Budget::new(&limits, 1, 1)).unwrap();
     let [faulty, sound] = [(); 2].map(|()| pacer.create(&scene, false, 60.0, &Account::alone(), &NEVER).unwrap());
     let (laws, touch_stiffness) = (None, false);
-    let mut samples = faulty
-        .samples(Sampling { every: 1, only: None, deadband: None, heartbeat_s: 0.01, laws, touch_stiffness }, None);
+    let mut samples = faulty.samples(
+        Sampling { every: 1, only: None, deadband: None, heartbeat_s: 0.01, laws, touch_stiffness, wanted: None },
+        None,
+    );
     samples.pop().await.unwrap();
     faulty.inbox.send(faulty.number, Request::Panic);
     let told = faulty.hash_at(Some(1_000_000), &Account::alone()).await.unwrap_err();

@@ -34,6 +34,13 @@ pub(crate) struct ServeArguments {
     /// Origin of another site whose pages may call, such as https://example.org; may be repeated
     #[arg(long, value_name = "ORIGIN")]
     origin: Vec<String>,
+    /// No touch by datagram (WebTransport over UDP); else it is served on the UDP port of the same number
+    #[arg(long)]
+    no_datagrams: bool,
+    /// Tell clients this address for datagrams, if they reach the UDP port under another than the server's own: behind a proxy,
+    /// in a container
+    #[arg(long, value_name = "HOST:PORT", conflicts_with = "no_datagrams")]
+    datagrams_advertise: Option<String>,
     /// Serve Prometheus metrics at http://ADDRESS:PORT/metrics [default: off]
     #[arg(long, value_name = "ADDRESS:PORT")]
     metrics: Option<String>,
@@ -89,6 +96,10 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     }
     config.insecure |= arguments.insecure;
     config.origins.extend(arguments.origin.iter().cloned());
+    config.datagrams &= !arguments.no_datagrams;
+    if arguments.datagrams_advertise.is_some() {
+        config.datagrams_advertise.clone_from(&arguments.datagrams_advertise);
+    }
     if arguments.metrics.is_some() {
         config.metrics.clone_from(&arguments.metrics);
     }

@@ -111,15 +111,30 @@ impl AuthorizeLayer {
     /// its pages seem to come from this server. Such an origin is a name, never an address or `localhost`.
     fn check_origin<B>(&self, request: &Request<B>) -> Result<()> {
         let Some(origin) = request.headers().get(header::ORIGIN).filter(|_| self.local_only) else { return Ok(()) };
-        let uri = origin.to_str().ok().and_then(|origin| origin.parse::<http::Uri>().ok());
-        let host = uri.as_ref().and_then(http::Uri::host).unwrap_or_default();
-        let is_address = host.trim_matches(['[', ']']).parse::<std::net::IpAddr>().is_ok();
-        if is_address || host == "localhost" || self.origins.contains(origin) {
+        if is_here(origin.to_str().unwrap_or_default()) || self.origins.contains(origin) {
             return Ok(());
         }
         let message = "must be this machine, or one of `origins` in the configuration";
         Err(Refusal::new(Reason::OriginNotAllowed, "origin", message))
     }
+}
+
+/// The host of an origin.
+fn host(origin: &str) -> Option<String> {
+    Some(origin.parse::<http::Uri>().ok()?.host()?.to_owned())
+}
+
+/// Whether the host of an origin is an address or `localhost`, which no site can give to its own name.
+fn is_here(origin: &str) -> bool {
+    host(origin)
+        .is_some_and(|host| host == "localhost" || host.trim_matches(['[', ']']).parse::<std::net::IpAddr>().is_ok())
+}
+
+/// Whether a page of that origin may open datagrams at `authority`: it is of the same host, of an address, or of an origin that
+/// may call.
+pub(super) fn is_own_or_among(origin: &str, authority: &str, origins: &[HeaderValue]) -> bool {
+    let own = format!("https://{authority}");
+    is_here(origin) || host(origin).is_some_and(|of| host(&own) == Some(of)) || origins.iter().any(|of| of == origin)
 }
 
 /// The answer to a request for a gRPC call that is not gRPC itself: a status of gRPC would be invisible to such a client.

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
+use super::datagrams::host_and_port;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, number, positive};
 use crate::scene::document::read_text;
@@ -27,6 +28,12 @@ pub struct Config {
     pub insecure: bool,
     /// Origins of other sites whose pages may call, such as `https://example.org`.
     pub origins: Vec<String>,
+    /// Touch by datagram (WebTransport) beside gRPC, on the UDP port of the same number, where there is TLS or only this machine
+    /// can reach the server.
+    pub datagrams: bool,
+    /// HOST:PORT that clients are told for datagrams, if they reach it under another than the server's own: behind a proxy, in a
+    /// container.
+    pub datagrams_advertise: Option<String>,
     /// Where to serve `/metrics` for Prometheus, without authentication: address:port. `None` disables it.
     pub metrics: Option<String>,
     /// Folder of the scenes that clients can create sessions from by name.
@@ -63,6 +70,8 @@ impl Default for Config {
             tokens: None,
             insecure: false,
             origins: Vec::new(),
+            datagrams: true,
+            datagrams_advertise: None,
             metrics: None,
             scenes: PathBuf::from("scenes"),
             scripts: PathBuf::from("scripts"),
@@ -146,6 +155,12 @@ impl Config {
                 let message = format!("must be scheme://host or scheme://host:port, but is `{origin}`");
                 return Err(Refusal::new(Reason::WrongKind, format!("origins[{index}]"), message));
             }
+        }
+        if let Some(text) = &self.datagrams_advertise
+            && host_and_port(text).is_none()
+        {
+            let message = format!("must be host:port, such as tissue.example:7117, but is `{text}`");
+            return Err(Refusal::new(Reason::WrongKind, "datagrams_advertise", message));
         }
         let (most_s, day_s) = (self.limits.lease_s, 86400.0);
         let within = |most: f64| move |value: f64| value > 0.0 && value <= most;

@@ -80,6 +80,7 @@ pub const CALLS: &[(&str, Access)] = &[
     ("/palpate.v1.AdminService/ListStreams", Access::Role(Role::Administer)),
     ("/palpate.v1.AdminService/ReviveSession", Access::Role(Role::Administer)),
     ("/palpate.v1.HapticService/AcquireTool", Access::Role(Role::Touch)),
+    ("/palpate.v1.HapticService/OpenDatagrams", Access::Role(Role::Touch)),
     ("/palpate.v1.HapticService/Probe", Access::Role(Role::Watch)),
     ("/palpate.v1.HapticService/ReleaseTool", Access::Role(Role::Touch)),
     ("/palpate.v1.HapticService/SendCommands", Access::Role(Role::Touch)),

@@ -3,8 +3,10 @@
 use std::net::SocketAddr;
 
 use tokio::net::TcpListener;
+use tracing::warn;
 
 use super::config::Config;
+use super::datagrams::Socket;
 use super::protection::Protection;
 use crate::refusal::{Reason, Refusal};
 
@@ -58,6 +60,7 @@ fn unavailable(field: &str, error: &std::io::Error) -> String {
 pub struct Listeners {
     pub(super) listener: TcpListener,
     pub(super) metrics: Option<TcpListener>,
+    pub(super) datagrams: Option<Socket>,
     pub(super) protection: Protection,
 }
 
@@ -68,7 +71,12 @@ impl Listeners {
     /// Returns an error if the configuration is invalid or unsafe, a file can't be read, or an address is not available.
     pub async fn open(config: &Config) -> Result<Self, ServeError> {
         let listener = listen("listen", &config.listen).await?;
-        let protection = Protection::load(config, local_address("listen", &listener, &config.listen)?)?;
+        let address = local_address("listen", &listener, &config.listen)?;
+        let protection = Protection::load(config, address)?;
+        let datagrams = Socket::open(config, address).unwrap_or_else(|error| {
+            warn!(%address, %error, "no touch by datagram: the UDP port is not free. --no-datagrams does without");
+            None
+        });
         let metrics = match &config.metrics {
             Some(text) => {
                 let listener = listen("metrics", text).await?;
@@ -82,7 +90,7 @@ impl Listeners {
             }
             None => None,
         };
-        Ok(Listeners { listener, metrics, protection })
+        Ok(Listeners { listener, metrics, datagrams, protection })
     }
 
     /// The server's URL.

@@ -48,6 +48,10 @@ pub(super) fn registry(pacer: &Arc<Pacer>, traffic: &Traffic, workshop: &Worksho
     registry.register_with_unit("sent", "What clients were sent, before encryption", Unit::Bytes, bytes_out);
     registry.register("calls", "Calls that were let through", traffic.calls.clone());
     registry.register("commands", "Commands to tools that were taken", traffic.commands.clone());
+    let sessions = "Sessions for datagrams that were let in";
+    registry.register("datagram_sessions", sessions, traffic.datagram_sessions.clone());
+    let refused = "Sessions for datagrams that were refused: without a good ticket, of another site, or too slow";
+    registry.register("datagram_sessions_refused", refused, traffic.datagram_sessions_refused.clone());
     let refusals = "Calls and commands that were refused, by reason";
     registry.register("refusals", refusals, traffic.refusals.clone());
     registry.register_collector(Box::new(Stepping(pacer.clone())));

@@ -9,6 +9,7 @@ mod charged_caller;
 pub mod config;
 mod connections;
 mod cut;
+mod datagrams;
 mod descriptors;
 mod force_law;
 mod haptics;

@@ -16,6 +16,7 @@ use super::authorize::AuthorizeLayer;
 use super::catalog::Catalog;
 use super::config::Config;
 use super::connections::ConnectionSlots;
+use super::datagrams::{self, Datagrams};
 use super::health::{SERVICES, end_health, report_files, report_workshop};
 use super::listeners::{Listeners, ServeError};
 use super::meshes::Meshes;
@@ -57,7 +58,7 @@ const WORTH_GIVING_BACK: u64 = 16 << 20;
 /// # Errors
 /// Returns an error if a thread can't be started, or if the transport fails.
 pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationToken) -> Result<(), ServeError> {
-    let Listeners { listener, metrics, protection } = listeners;
+    let Listeners { listener, metrics, datagrams: socket, protection } = listeners;
     let budget = Budget::new(&config.limits, config.stepping_threads(), config.serving_threads());
     info!(bytes = budget.bytes(), "memory that callers share");
     let pacer = Pacer::start(config.stepping_threads(), config.audit_share, &config.limits, budget.clone())?;
@@ -97,7 +98,11 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
     let config = Arc::new(config);
     let meshes = Meshes::new(&limits);
     let textures = Textures::open(&config, &catalog, &pacer, &limits)?;
+    let datagrams = Datagrams::at(socket.as_ref());
+    let (pages, counted) = (origins.clone(), traffic.clone());
+    tokio::spawn(datagrams::serve(socket, datagrams.clone(), pages, counted, shutdown.child_token()));
     let services = Services {
+        datagrams,
         catalog,
         pacer: pacer.clone(),
         config,

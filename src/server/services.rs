@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use super::catalog::Catalog;
 use super::config::Config;
+use super::datagrams::Datagrams;
 use super::meshes::Meshes;
 use super::textures::Textures;
 use super::traffic::Traffic;
@@ -14,6 +15,7 @@ use crate::pace::Pacer;
 #[derive(Clone)]
 pub(crate) struct Services {
     pub(crate) config: Arc<Config>,
+    pub(super) datagrams: Datagrams,
     pub(crate) catalog: Catalog,
     pub(crate) pacer: Arc<Pacer>,
     pub(crate) textures: Textures,

@@ -27,6 +27,8 @@ pub(crate) struct Traffic {
     pub(super) bytes_out: Counter,
     pub(super) calls: Family<Label, Counter>,
     pub(super) commands: Counter,
+    pub(super) datagram_sessions: Counter,
+    pub(super) datagram_sessions_refused: Counter,
     pub(super) refusals: Family<Label, Counter>,
 }
 

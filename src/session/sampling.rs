@@ -6,6 +6,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use palpate_touch::{Law, LocalModel};
 
@@ -99,6 +100,28 @@ pub struct Sampling {
     pub laws: Option<Arc<Laws>>,
     /// Whether stiffness and damping are those of the sheet around the tool also under a touch, not only under a grasp.
     pub touch_stiffness: bool,
+    /// Samples come more often than by `heartbeat_s` while the reader wants them so.
+    pub wanted: Option<Arc<WantedHeartbeat>>,
+}
+
+/// The interval between samples that a reader wants at present, by what it measures of the network.
+#[derive(Debug, Default)]
+pub struct WantedHeartbeat(AtomicU64);
+
+/// The shortest heartbeat that a reader may want at present, s.
+const LEAST_HEARTBEAT_S: f64 = 0.01;
+
+impl WantedHeartbeat {
+    /// From now on the reader wants this, s; anything not above 0: nothing of its own.
+    pub fn set(&self, heartbeat_s: f64) {
+        let bits = if heartbeat_s > 0.0 { heartbeat_s.max(LEAST_HEARTBEAT_S).to_bits() } else { 0 };
+        self.0.store(bits, Ordering::Relaxed);
+    }
+
+    fn get(&self) -> Option<f64> {
+        let bits = self.0.load(Ordering::Relaxed);
+        (bits != 0).then(|| f64::from_bits(bits))
+    }
 }
 
 impl Sampling {
@@ -119,7 +142,7 @@ impl Sampling {
 #[derive(Debug)]
 pub struct Sampler {
     sampling: Sampling,
-    heartbeat_steps: u64,
+    rate_hz: f64,
     /// The last sample sent, without its local models.
     told: Option<Sample>,
     followed: BTreeMap<u32, FollowedTool>,
@@ -136,10 +159,15 @@ struct FollowedTool {
 
 impl Sampler {
     /// A sampler for a session with `rate_hz` steps per second.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub fn new(sampling: Sampling, rate_hz: f64) -> Self {
-        let heartbeat_steps = (sampling.heartbeat_s * rate_hz).round().max(1.0) as u64;
-        Sampler { sampling, heartbeat_steps, told: None, followed: BTreeMap::new(), law: FIRST }
+        Sampler { sampling, rate_hz, told: None, followed: BTreeMap::new(), law: FIRST }
+    }
+
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn heartbeat_steps(&self) -> u64 {
+        let asked_s = self.sampling.heartbeat_s;
+        let wanted_s = self.sampling.wanted.as_ref().and_then(|wanted| wanted.get());
+        (wanted_s.map_or(asked_s, |wanted_s| wanted_s.min(asked_s)) * self.rate_hz).round().max(1.0) as u64
     }
 
     /// The sample of the last step, if the stream should get it. `last`: the stream gets it in any case, because no
@@ -160,7 +188,7 @@ impl Sampler {
             None => all.get_or_insert_with(|| session.sample(None)).clone(),
         };
         let is_due = |told: &Sample| {
-            last || step.saturating_sub(told.step) >= self.heartbeat_steps || self.is_news(told, &sample)
+            last || step.saturating_sub(told.step) >= self.heartbeat_steps() || self.is_news(told, &sample)
         };
         let is_due = told.is_none_or(is_due);
         let Some(laws) = self.sampling.laws.clone() else {
@@ -236,7 +264,7 @@ impl Sampler {
     /// The next step after `step` whose sample the stream gets even if nothing changes from now on.
     pub fn next_due(&self, step: u64) -> u64 {
         let told = self.told.as_ref().filter(|told| told.awake_points == 0);
-        let heartbeat = told.map_or(0, |told| told.step + self.heartbeat_steps);
+        let heartbeat = told.map_or(0, |told| told.step + self.heartbeat_steps());
         heartbeat.max(step + 1).next_multiple_of(self.sampling.every)
     }
 }
@@ -261,7 +289,15 @@ mod tests {
     }
 
     fn sampling() -> Sampling {
-        Sampling { every: 1, only: None, deadband: None, heartbeat_s: HEARTBEAT_S, laws: None, touch_stiffness: false }
+        Sampling {
+            every: 1,
+            only: None,
+            deadband: None,
+            heartbeat_s: HEARTBEAT_S,
+            laws: None,
+            touch_stiffness: false,
+            wanted: None,
+        }
     }
 
     fn tell(session: &mut Session, sequence: u64, action: Action) {

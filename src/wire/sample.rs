@@ -40,6 +40,7 @@ pub fn sampling(
         heartbeat_s: heartbeat_s.unwrap_or(HEARTBEAT_S),
         laws: None,
         touch_stiffness: false,
+        wanted: None,
     };
     sampling.check()?;
     Ok(sampling)

@@ -139,6 +139,11 @@ impl Server {
         Ok(Server { url: url_text, endpoint, bearer, patience: PATIENCE, is_secure: secure, host: (host, port) })
     }
 
+    /// Its host, as in the URL, without brackets.
+    pub fn host(&self) -> &str {
+        &self.host.0
+    }
+
     /// Sets the time limit for connecting.
     #[must_use]
     pub fn within(mut self, timeout: Duration) -> Self {

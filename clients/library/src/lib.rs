@@ -2,6 +2,7 @@
 //!
 //! - [`connect`]: connections, plain or TLS, with the caller's credentials, deadlines, and errors in words.
 //! - [`touch`]: the haptic stream, for programs that send commands and render forces themselves.
+//! - [`datagrams`]: the datagrams of such a stream, which no lost packet holds up.
 //! - [`device`] and [`bridge`]: the trait of haptic devices, and the loop that connects one to a server at 1 kHz.
 //! - [`watch`]: the samples of a session, without a tool.
 //! - [`view`]: the frames of a session: how its surface moves.
@@ -25,6 +26,8 @@
 //!         tool: 0,
 //!         tip: Tip::default(),
 //!         deadband: 0.0,
+//!         up_deadband: 0.0,
+//!         datagrams: true,
 //!         holder: "my program".to_owned(),
 //!     };
 //!     let (_device, report) = palpate_client::bridge::run(device, target, Options::default(), std::future::pending()).await?;
@@ -38,6 +41,7 @@
 
 pub mod bridge;
 pub mod connect;
+pub mod datagrams;
 pub mod device;
 pub mod touch;
 pub mod upload;

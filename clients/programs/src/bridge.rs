@@ -37,6 +37,12 @@ pub(crate) struct Arguments {
     /// Receive a sample only when the rendered force would be off by more than this fraction; 0: one per step
     #[arg(long, value_name = "FRACTION", default_value_t = 0.0)]
     deadband: f64,
+    /// Send a pose only when the server would be wrong about the tool by more than this fraction of the force; 0: one per tick
+    #[arg(long, value_name = "FRACTION", default_value_t = 0.0)]
+    up_deadband: f64,
+    /// Touch by the stream alone, also where the server has datagrams
+    #[arg(long)]
+    no_datagrams: bool,
     /// End after this time, s [default: at Ctrl-C]
     #[arg(long, value_name = "SECONDS")]
     seconds: Option<f64>,
@@ -77,6 +83,8 @@ pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
         tool: arguments.tool,
         tip: Tip::default(),
         deadband: arguments.deadband,
+        up_deadband: arguments.up_deadband,
+        datagrams: !arguments.no_datagrams,
         holder: "palpate-client bridge".to_owned(),
     };
     let lasts = arguments.seconds.map(Duration::try_from_secs_f64).transpose();
@@ -100,7 +108,8 @@ fn as_json(served: &Report) -> serde_json::Value {
     let traffic = served.traffic;
     let mut report = json!({
         "connections": traffic.connections, "samples": traffic.samples, "commands_refused": traffic.refused,
-        "failed_attempts": traffic.failed, "late_ticks": served.late_ticks, "missed_ticks": served.missed_ticks,
+        "failed_attempts": traffic.failed, "poses": traffic.poses, "datagrams_up": traffic.carried.sent,
+        "datagrams_down": traffic.carried.came, "fell_back": traffic.carried.fell_back, "late_ticks": served.late_ticks, "missed_ticks": served.missed_ticks,
     });
     if let Some(envelope) = &served.envelope {
         report["energy_j"] = json!(envelope.energy_j());
@@ -114,12 +123,17 @@ fn as_json(served: &Report) -> serde_json::Value {
 
 /// The results for people.
 fn rows(served: &Report) -> Vec<(&'static str, String)> {
-    let Traffic { connections, samples, bytes, refused, failed } = served.traffic;
+    let Traffic { connections, samples, bytes, refused, failed, poses, carried } = served.traffic;
     #[allow(clippy::cast_precision_loss)]
     let kilobytes = bytes as f64 / 1e3;
     let mut rows = vec![
         ("connections", format!("{connections} (attempts that failed, and breaks: {failed})")),
         ("samples received", format!("{samples}, {} kB", table::rounded(kilobytes))),
+        ("poses sent", poses.to_string()),
+        (
+            "datagrams",
+            format!("{} up, {} down; the stream took over {} times", carried.sent, carried.came, carried.fell_back),
+        ),
         ("commands refused", refused.to_string()),
         ("late ticks", format!("{} (skipped: {})", served.late_ticks, served.missed_ticks)),
     ];

@@ -52,6 +52,7 @@
 //! assert!((force_n - 0.8 * DVec3::Z).length() < 1e-3, "{force_n}");
 //! ```
 
+pub mod carrier;
 pub mod deadband;
 pub mod device;
 pub mod envelope;

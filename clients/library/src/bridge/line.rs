@@ -5,9 +5,10 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use glam::DVec3;
-use palpate_proto::geometry::from_vector;
+use palpate_proto::geometry::{from_vector, vector};
 use palpate_proto::refusal::Reason;
 use palpate_proto::{pb, touch};
+use palpate_touch::carrier::Carried;
 use palpate_touch::deadband::HEARTBEAT_S;
 use palpate_touch::renderer::MOST_LAWS;
 use palpate_touch::{Device, Law, LocalModel};
@@ -21,6 +22,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use super::{Session, Target};
 use crate::Error;
 use crate::connect::{Channel, Server};
+use crate::datagrams::Datagrams;
 use crate::touch::Touch;
 
 /// The data that the network passes to the device's loop. Only the newest counts; neither waits for the other.
@@ -41,6 +43,8 @@ pub(super) struct Inbound {
     /// Of the newest connection.
     pub(super) newest: Option<LocalModel>,
     pub(super) traffic: Traffic,
+    /// The longest time between two poses that the server wants, s; 0 before it has said so.
+    pub(super) wanted_s: f64,
     /// Why the newest connection broke, or never came to be; `None` while one stands.
     pub(super) failure: Option<Error>,
     /// The session that was made for the target.
@@ -60,6 +64,10 @@ pub struct Traffic {
     pub refused: u64,
     /// Attempts to connect that failed, and connections that broke.
     pub failed: u64,
+    /// Poses that were sent, by whichever way.
+    pub poses: u64,
+    /// What went by datagram, and how often the stream took over again.
+    pub carried: Carried,
 }
 
 impl Shared {
@@ -68,8 +76,16 @@ impl Shared {
     }
 }
 
-/// Where a tool was, and when by the client's clock, ns.
-pub(super) type Command = (u64, DVec3);
+/// Where a tool was.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Command {
+    /// By the client's clock.
+    pub(super) client_time_ns: u64,
+    /// m.
+    pub(super) place_m: DVec3,
+    /// How it moved, m/s, if the server is to go on like that.
+    pub(super) velocity_m_per_s: Option<DVec3>,
+}
 
 /// First and longest pause before it connects again.
 const PAUSES: [Duration; 2] = [Duration::from_millis(100), Duration::from_secs(2)];
@@ -218,6 +234,7 @@ async fn connect(
         tip: Some(touch::tip(&target.tip)),
         // A bridge that hangs must not hold a tool for long.
         lease_s: Some(SILENCE.as_secs_f64()),
+        datagrams: target.datagrams,
         ..Default::default()
     };
     let silent = |_| broken("the server is silent");
@@ -236,6 +253,27 @@ async fn connect(
     // Commands that waited while the stream was opened are old.
     while commands.try_recv().is_ok() {}
     let mut sequence = 0;
+    let mut datagrams = Datagrams::dial(stream.opened().datagrams.as_ref(), &target.server);
+    // Those of earlier connections.
+    let before = shared.inbound().traffic.carried;
+    let take = |sample: &pb::Sample, datagrams: &mut Datagrams| {
+        let now = datagrams.carried();
+        let mut inbound = shared.inbound();
+        inbound.traffic.samples += 1;
+        inbound.traffic.bytes += touch::wire_bytes(sample);
+        inbound.traffic.carried = Carried {
+            sent: before.sent + now.sent,
+            came: before.came + now.came,
+            fell_back: before.fell_back + now.fell_back,
+        };
+        inbound.wanted_s = datagrams.wanted_s();
+        if let Some(model) = sample.tools.first().and_then(|tool| tool.local_model.as_ref()) {
+            let model = touch::from_local_model(model, sample.step);
+            if inbound.newest.as_ref().is_none_or(|newest| newest.sequence < model.sequence) {
+                inbound.newest = Some(model);
+            }
+        }
+    };
     loop {
         tokio::select! {
             heard = tokio::time::timeout(SILENCE, stream.next()) => {
@@ -258,11 +296,8 @@ async fn connect(
                         if sample.held {
                             return Err(broken("the session was stopped by its guard"));
                         }
-                        let mut inbound = shared.inbound();
-                        inbound.traffic.samples += 1;
-                        inbound.traffic.bytes += touch::wire_bytes(&sample);
-                        if let Some(model) = sample.tools.first().and_then(|tool| tool.local_model.as_ref()) {
-                            inbound.newest = Some(touch::from_local_model(model, sample.step));
+                        if datagrams.is_newer(&sample) {
+                            take(&sample, &mut datagrams);
                         }
                     }
                     Heard::Rejection(rejection) => {
@@ -275,12 +310,19 @@ async fn connect(
                     Heard::Opened(_) | Heard::Renewed(_) => {}
                 }
             }
+            sample = datagrams.next() => take(&sample, &mut datagrams),
             command = commands.recv() => {
-                let Some((client_time_ns, place_m)) = command else { return Ok(()) };
+                let Some(Command { client_time_ns, place_m, velocity_m_per_s }) = command else { return Ok(()) };
                 sequence += 1;
-                let action = Some(Action::Pose(touch::pose(place_m, &target.tip)));
+                let velocity_m_per_s = velocity_m_per_s.and_then(vector);
+                let pose = pb::Pose { velocity_m_per_s, ..touch::pose(place_m, &target.tip) };
+                let action = Some(Action::Pose(pose));
                 let (tool, sequence) = (target.tool, Some(sequence));
                 let command = pb::Command { tool, sequence, client_time_ns, action, ..Default::default() };
+                shared.inbound().traffic.poses += 1;
+                if datagrams.send(&command) {
+                    continue;
+                }
                 // If the network does not keep up, this command is dropped; the next is newer.
                 if let Err(mpsc::error::TrySendError::Closed(_)) = outbound.try_send(Say::Command(command)) {
                     return Err(broken("the stream is closed"));

@@ -35,6 +35,10 @@ pub struct Target {
     pub tip: Tip,
     /// A sample is sent only when the rendered force would be off by more than this fraction; 0: one per step.
     pub deadband: f64,
+    /// A pose is sent only when the server would be wrong about the tool by more than this fraction of the force; 0: one per tick.
+    pub up_deadband: f64,
+    /// Whether poses and samples go by datagram where the server has them.
+    pub datagrams: bool,
     /// The holder's name, which other users of the server see.
     pub holder: String,
 }
@@ -112,6 +116,7 @@ pub async fn run<D: HapticDevice + 'static>(
     let shared = Arc::new(Shared::default());
     let (commands, received) = mpsc::channel(line::COMMANDS);
     let descriptor = device.descriptor();
+    let up_deadband = target.up_deadband;
     // If this future is dropped, the task is aborted; the loop then finds its channel closed and ends.
     let mut network = JoinSet::new();
     network.spawn({
@@ -129,7 +134,7 @@ pub async fn run<D: HapticDevice + 'static>(
     std::thread::Builder::new().name("device".to_owned()).spawn({
         let shared = shared.clone();
         move || {
-            let served = tick::serve(&mut device, &shared, &commands, lasts, remembers);
+            let served = tick::serve(&mut device, &shared, &commands, up_deadband, lasts, remembers);
             drop(commands);
             let _ = tell.send((device, served));
         }

@@ -3,10 +3,12 @@
 use std::time::{Duration, Instant};
 
 use glam::DVec3;
+use palpate_touch::deadband::HEARTBEAT_S;
+use palpate_touch::news::News;
 use palpate_touch::{Envelope, Renderer, RenderingState};
 use tokio::sync::mpsc;
 
-use super::line::{Command, Shared};
+use super::line::{Command, Inbound, Shared};
 use crate::device::HapticDevice;
 
 /// Period of the device's loop, s.
@@ -54,10 +56,11 @@ pub(super) fn serve(
     device: &mut dyn HapticDevice,
     shared: &Shared,
     commands: &mpsc::Sender<Command>,
+    up_deadband: f64,
     lasts: Option<Duration>,
     remember: bool,
 ) -> std::io::Result<Served> {
-    let ended = tick(device, shared, commands, lasts, remember);
+    let ended = tick(device, shared, commands, up_deadband, lasts, remember);
     // A device holds its last force until it is told another.
     let _ = device.write(DVec3::ZERO);
     ended
@@ -67,6 +70,7 @@ fn tick(
     device: &mut dyn HapticDevice,
     shared: &Shared,
     commands: &mpsc::Sender<Command>,
+    up_deadband: f64,
     lasts: Option<Duration>,
     remember: bool,
 ) -> std::io::Result<Served> {
@@ -74,6 +78,7 @@ fn tick(
     let mut renderer: Option<Renderer> = None;
     let mut served = Served { course: Vec::new(), envelope: None, late_ticks: 0, missed_ticks: 0, ages_s: Vec::new() };
     let (start, mut was_asked) = (Instant::now(), false);
+    let mut news = News::default();
     // The clock begins at 1 s, because 0 means "no time" in the protocol.
     let clock_s = |at: Instant| 1.0 + at.duration_since(start).as_secs_f64();
     let mut due = start;
@@ -94,9 +99,10 @@ fn tick(
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
         let now_ns = (now_s * 1e9) as u64;
         let mut force_n = DVec3::ZERO;
-        let (law, further, model, middle_m) = {
+        let (law, further, model, middle_m, wanted_s) = {
             let mut inbound = shared.inbound();
-            (inbound.law.take(), std::mem::take(&mut inbound.further), inbound.newest.take(), inbound.middle_m)
+            let Inbound { middle_m, wanted_s, .. } = *inbound;
+            (inbound.law.take(), std::mem::take(&mut inbound.further), inbound.newest.take(), middle_m, wanted_s)
         };
         // The middle of the device's workspace is on the middle of the sheet.
         let place_m = reading.place_m + middle_m;
@@ -132,8 +138,19 @@ fn tick(
         }
         // Before the first connection it is not known where the sheet is. If the network does not keep up, this position is
         // dropped; the next one replaces it.
-        if renderer.is_some() {
-            let _ = commands.try_send((now_ns, place_m));
+        if let Some(renderer) = &renderer {
+            let command = if up_deadband > 0.0 {
+                let heartbeat_s = if wanted_s > 0.0 { wanted_s } else { HEARTBEAT_S };
+                let told = news.tell(now_s, place_m, renderer.way_m(up_deadband), heartbeat_s);
+                told.map(|told| Command {
+                    client_time_ns: now_ns,
+                    place_m,
+                    velocity_m_per_s: Some(told.velocity_m_per_s),
+                })
+            } else {
+                Some(Command { client_time_ns: now_ns, place_m, velocity_m_per_s: None })
+            };
+            command.map(|command| commands.try_send(command));
         }
     }
     served.envelope = renderer.map(|renderer| renderer.envelope);
@@ -192,7 +209,7 @@ mod tests {
         let shared = Shared::default();
         shared.inbound().law = Some(Law::linear(400.0, 0.5));
         let mut device = Failing { ticks: 0, force_n: DVec3::X };
-        let ended = serve(&mut device, &shared, &commands, None, false);
+        let ended = serve(&mut device, &shared, &commands, 0.0, None, false);
         assert!(ended.is_err());
         assert_eq!((device.ticks, device.force_n), (20, DVec3::ZERO));
     }

@@ -9,6 +9,7 @@ use palpate_client::Server;
 use palpate_client::bridge::{self, Options, Session, Target};
 use palpate_touch::LimitCause;
 
+use super::network::Transport;
 use super::run::{Outcome, Setup, TICK_S, Totals, fitting_scale};
 use super::tissue::{Tissue, Twin};
 use super::with_tissue;
@@ -22,7 +23,7 @@ const LEAD_S: f64 = 3.0;
 
 /// Performs the run at a server, which must know the scene by its name.
 pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failure> {
-    let Setup { model, law, tip, spot, hand, device, deadband, duration_s, seed, .. } = setup;
+    let Setup { model, law, tip, spot, hand, device, deadband, up_deadband, conditions, duration_s, seed, .. } = setup;
     let middle_m = spot.at_m;
     let scale = with_tissue(|| fitting_scale(setup, LEAD_S))?;
     let task = Task::new(DVec3::ZERO, LEAD_S, *duration_s, scale, &mut Random::new(*seed, 0));
@@ -33,6 +34,8 @@ pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failur
         tool: 0,
         tip: *tip,
         deadband: *deadband,
+        up_deadband: *up_deadband,
+        datagrams: conditions.transport == Transport::Datagram,
         holder: "palpate-client link".to_owned(),
     };
     let lasts = Some(Duration::from_secs_f64(*duration_s));
@@ -60,7 +63,8 @@ pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failur
     outcome.energy_min_j = simulated.energy_min_j();
     outcome.packets_per_s = served.traffic.samples as f64 / duration_s;
     outcome.kbit_per_s = served.traffic.bytes as f64 * 8e-3 / duration_s;
-    outcome.commands_per_s = TICK_S.recip();
+    outcome.commands_per_s = served.traffic.poses as f64 / duration_s;
+    outcome.carried = Some(served.traffic.carried);
     outcome.late_ticks = Some(served.late_ticks);
     if let Some(envelope) = &served.envelope {
         let (acted, ticks) = envelope.count(LimitCause::Passivity);

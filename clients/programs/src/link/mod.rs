@@ -21,6 +21,7 @@ use palpate::scene::check::check_tip;
 use palpate::scene::collection::find_scene;
 use palpate::sheet::Model;
 use palpate_proto::refusal::{Reason, Refusal, number};
+use palpate_touch::carrier::Carried;
 use palpate_touch::{Law, Tip};
 use serde_json::{Value, json};
 
@@ -101,7 +102,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "FILE")]
     course: Option<PathBuf>,
     /// Run in real time against this server, which must know the scene by its name, over the real network
-    #[arg(long, value_name = "URL", conflicts_with_all = ["rtt_ms", "jitter_ms", "loss", "transport", "loss_burst", "outage_ms", "up_deadband", "stall_ms", "profile", "random", "boundary"])]
+    #[arg(long, value_name = "URL", conflicts_with_all = ["rtt_ms", "jitter_ms", "loss", "loss_burst", "outage_ms", "stall_ms", "profile", "random", "boundary"])]
     server: Option<String>,
     #[command(flatten)]
     credentials: CredentialOptions,
@@ -271,6 +272,9 @@ fn rows(setup: &Setup, outcome: &Outcome, server: Option<&str>) -> Vec<(&'static
     if let Some(late) = outcome.late_ticks {
         rows.push(("late ticks", late.to_string()));
     }
+    if let Some(Carried { sent, came, fell_back }) = outcome.carried {
+        rows.push(("datagrams", format!("{sent} up, {came} down; the stream took over {fell_back} times")));
+    }
     rows
 }
 
@@ -362,7 +366,7 @@ fn figures(setup: &Setup, outcome: &Outcome) -> Value {
     let interventions: serde_json::Map<String, Value> =
         outcome.interventions.iter().map(|(name, ticks)| ((*name).to_owned(), json!(ticks))).collect();
     let [limited, dropped, released] = outcome.path;
-    json!({
+    let mut figures = json!({
         "scene": setup.model.scene.name,
         "hand": setup.hand.name,
         "device": setup.device.name,
@@ -402,5 +406,11 @@ fn figures(setup: &Setup, outcome: &Outcome) -> Value {
         "releases": released,
         "interventions_ticks": interventions,
         "late_ticks": outcome.late_ticks,
-    })
+    });
+    if let Some(Carried { sent, came, fell_back }) = outcome.carried {
+        figures["datagrams_up"] = json!(sent);
+        figures["datagrams_down"] = json!(came);
+        figures["fell_back"] = json!(fell_back);
+    }
+    figures
 }

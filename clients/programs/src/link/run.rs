@@ -6,6 +6,7 @@ use std::sync::Arc;
 use glam::DVec3;
 use palpate::sheet::Model;
 use palpate_proto::touch::sample_bytes;
+use palpate_touch::carrier::Carried;
 use palpate_touch::deadband::{ForceDeadband, HEARTBEAT_S};
 use palpate_touch::envelope::{Envelope, Wanted};
 use palpate_touch::hand::{Hand, HandState};
@@ -88,6 +89,8 @@ pub(super) struct Outcome {
     pub(super) path: [u64; 3],
     /// Only for a run in real time.
     pub(super) late_ticks: Option<u64>,
+    /// What went by datagram in a run in real time.
+    pub(super) carried: Option<Carried>,
     /// For each tick: time, s, the tool's depth below the rest plane, m, rendered and true force, N.
     pub(super) course: Vec<[f64; 4]>,
 }

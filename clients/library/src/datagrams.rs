@@ -1,0 +1,199 @@
+//! The datagrams of a haptic stream: poses and samples go by them while they get through, and by the stream else.
+//!
+//! ```no_run
+//! use palpate_client::datagrams::Datagrams;
+//! use palpate_client::{Server, Touch};
+//! use palpate_proto::pb;
+//!
+//! # async fn example(server: &Server, mut touch: Touch, command: pb::Command) -> Result<(), tonic::Status> {
+//! // The stream was opened with `TouchOpen.datagrams`. The session opens beside it; the stream does not wait.
+//! let mut datagrams = Datagrams::dial(touch.opened().datagrams.as_ref(), server);
+//! loop {
+//!     if !datagrams.send(&command) {
+//!         // By the stream.
+//!     }
+//!     tokio::select! {
+//!         sample = datagrams.next() => println!("{sample:?}"),
+//!         message = touch.next() => println!("{:?}", message?),
+//!     }
+//! }
+//! # }
+//! ```
+
+use std::collections::{BTreeMap, VecDeque};
+use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use palpate_proto::datagram::{self, MOST_BYTES, MOST_EARLIER, Posed};
+use palpate_proto::pb;
+use palpate_touch::carrier::{Carried, Carrier, LIFE_S};
+use palpate_touch::deadband::HEARTBEAT_S;
+use palpate_touch::news::Pulse;
+use prost::Message;
+use tokio::task::JoinSet;
+use tokio::time::{Interval, MissedTickBehavior, interval};
+use wtransport::tls::Sha256Digest;
+use wtransport::{ClientConfig, Connection, Endpoint};
+
+use crate::connect::Server;
+
+/// Time for the session to open; the stream carries everything until then.
+const PATIENCE: Duration = Duration::from_secs(5);
+
+/// The datagrams of one stream.
+#[derive(Debug)]
+pub struct Datagrams {
+    opening: JoinSet<Option<Connection>>,
+    connection: Option<Connection>,
+    carrier: Carrier,
+    pulse: Pulse,
+    begun: Instant,
+    life: Interval,
+    /// Of each tool the newest poses, newest first: what was lost goes out again with the next.
+    recent: BTreeMap<u32, VecDeque<Posed>>,
+    wanted_s: f64,
+    newest_step: Option<u64>,
+}
+
+impl Datagrams {
+    /// Opens the session that a stream was offered, in the background. Without an offer nothing ever goes by datagram.
+    pub fn dial(offer: Option<&pb::DatagramOffer>, server: &Server) -> Self {
+        let mut opening = JoinSet::new();
+        if let Some(offer) = offer.cloned() {
+            let host = if offer.host.is_empty() { server.host().to_owned() } else { offer.host.clone() };
+            opening.spawn(async move { tokio::time::timeout(PATIENCE, open(&host, &offer)).await.ok().flatten() });
+        }
+        let mut life = interval(Duration::from_secs_f64(0.5 * LIFE_S));
+        life.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        Datagrams {
+            opening,
+            connection: None,
+            carrier: Carrier::default(),
+            pulse: Pulse::default(),
+            begun: Instant::now(),
+            life,
+            recent: BTreeMap::new(),
+            wanted_s: HEARTBEAT_S,
+            newest_step: None,
+        }
+    }
+
+    fn now_s(&self) -> f64 {
+        self.begun.elapsed().as_secs_f64()
+    }
+
+    /// Sends a pose that is played by the client's time (`client_time_ns` and `sequence` given, no `at_step`). Returns false
+    /// if the stream has to carry it: datagrams do not get through at present, or it is another command.
+    pub fn send(&mut self, command: &pb::Command) -> bool {
+        let (Some(pb::command::Action::Pose(pose)), Some(sequence), None) =
+            (&command.action, command.sequence, command.at_step)
+        else {
+            return false;
+        };
+        if self.connection.is_none() || command.client_time_ns == 0 {
+            return false;
+        }
+        let newest = Posed { sequence, client_time_ns: command.client_time_ns, pose: pose.clone() };
+        let recent = self.recent.entry(command.tool).or_default();
+        let message = datagram::tool_poses(command.tool, &newest, recent.iter());
+        recent.push_front(newest);
+        recent.truncate(MOST_EARLIER);
+        let now_s = self.now_s();
+        self.carrier.carries(now_s) && self.datagram(vec![message], now_s)
+    }
+
+    /// Sends a datagram; false if it is too long, or the session is over.
+    fn datagram(&mut self, tools: Vec<pb::ToolPoses>, now_s: f64) -> bool {
+        let Some(connection) = &self.connection else { return false };
+        let (number, acknowledges) = self.carrier.send(now_s);
+        let heartbeat_s = self.pulse.heartbeat_s(now_s) as f32;
+        let message = pb::PosesDatagram { number, acknowledges, heartbeat_s, tools, sent_ns: (now_s * 1e9) as u64 };
+        let most = connection.max_datagram_size().map_or(0, |most| most.min(MOST_BYTES));
+        message.encoded_len() <= most && connection.send_datagram(message.encode_to_vec()).is_ok()
+    }
+
+    /// The next sample that comes by datagram. Samples that were overtaken are left out. Waits for ever when there is no session.
+    /// Call it all the time: it keeps the session alive. Nothing is lost if you drop the future.
+    pub async fn next(&mut self) -> pb::Sample {
+        loop {
+            let connection = self.connection.clone();
+            let datagram = async {
+                match &connection {
+                    Some(connection) => connection.receive_datagram().await,
+                    None => std::future::pending().await,
+                }
+            };
+            tokio::select! {
+                Some(opened) = self.opening.join_next() => self.connection = opened.ok().flatten(),
+                received = datagram => match received {
+                    Ok(datagram) => {
+                        if let Some(sample) = self.take(&datagram.payload()) {
+                            return sample;
+                        }
+                    }
+                    // The stream goes on.
+                    Err(_) => self.connection = None,
+                },
+                _ = self.life.tick() => {
+                    let now_s = self.now_s();
+                    if self.connection.is_some() && self.carrier.is_silent(now_s) {
+                        self.datagram(Vec::new(), now_s);
+                    }
+                    // Notices that nothing is confirmed any more, also while nothing is sent.
+                    self.carrier.carries(now_s);
+                }
+            }
+        }
+    }
+
+    fn take(&mut self, bytes: &[u8]) -> Option<pb::Sample> {
+        let message = pb::SampleDatagram::decode(bytes).ok()?;
+        let now_s = self.now_s();
+        self.carrier.arrive(message.number, message.acknowledges, now_s);
+        self.pulse.arrive(message.number, message.sent_ns as f64 * 1e-9, now_s);
+        if message.heartbeat_s > 0.0 {
+            self.wanted_s = f64::from(message.heartbeat_s).max(0.01);
+        }
+        message.sample.filter(|sample| self.is_newer(sample))
+    }
+
+    /// Whether a sample is newer than all that came by here and that were shown to this before: by whichever way they come.
+    pub fn is_newer(&mut self, sample: &pb::Sample) -> bool {
+        let is_newer = self.newest_step.is_none_or(|newest| sample.step >= newest);
+        if is_newer {
+            self.newest_step = Some(sample.step);
+        }
+        is_newer
+    }
+
+    /// The longest time between two poses that the server wants, s.
+    pub fn wanted_s(&self) -> f64 {
+        self.wanted_s
+    }
+
+    /// What was carried so far.
+    pub fn carried(&self) -> Carried {
+        self.carrier.carried()
+    }
+}
+
+/// Opens a session; `None` if it can't be opened.
+async fn open(host: &str, offer: &pb::DatagramOffer) -> Option<Connection> {
+    let hash: [u8; 32] = offer.certificate_sha256.as_slice().try_into().ok()?;
+    let ticket: [u8; 16] = offer.ticket.as_slice().try_into().ok()?;
+    let port = u16::try_from(offer.port).ok()?;
+    let host = host.trim_matches(['[', ']']);
+    let address = tokio::net::lookup_host((host, port)).await.ok()?.next()?;
+    let any: SocketAddr = match address {
+        SocketAddr::V4(_) => (Ipv4Addr::UNSPECIFIED, 0).into(),
+        SocketAddr::V6(_) => (Ipv6Addr::UNSPECIFIED, 0).into(),
+    };
+    // The stream has told the hash of the certificate.
+    let config = ClientConfig::builder().with_bind_address(any);
+    let mut config = config.with_server_certificate_hashes([Sha256Digest::new(hash)]).build();
+    config.quic_config_mut().transport_config(Arc::new(datagram::transport()));
+    let endpoint = Endpoint::client(config).ok()?;
+    let url = format!("https://{address}/touch/{:032x}", u128::from_be_bytes(ticket));
+    endpoint.connect(url).await.ok()
+}

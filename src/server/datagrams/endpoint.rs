@@ -1,0 +1,173 @@
+//! Accepts datagram sessions: those that present a ticket, from pages of allowed origins. Bounds the handshakes at a time, and
+//! how many a network begins.
+
+use std::collections::HashMap;
+use std::net::{IpAddr, SocketAddr};
+use std::sync::Arc;
+use std::time::Duration;
+
+use http::HeaderValue;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::time::{Interval, interval, timeout};
+use tokio_util::sync::CancellationToken;
+use tracing::{debug, warn};
+use wtransport::endpoint::{IncomingSession, endpoint_side};
+use wtransport::{Endpoint, ServerConfig, VarInt};
+
+use super::certificate::{self, ROTATED};
+use super::{Datagrams, Offers, Socket};
+use crate::lock::lock;
+use crate::pace::clock::now_ns;
+use crate::server::address::network;
+use crate::server::authorize::is_own_or_among;
+use crate::server::rate::Bucket;
+use crate::server::traffic::Traffic;
+use palpate_proto::datagram;
+
+/// Handshakes at a time; more are ignored, and their clients try again.
+const HANDSHAKES: usize = 64;
+
+/// Time for a handshake and the ticket.
+const PATIENCE: Duration = Duration::from_secs(5);
+
+/// Handshakes of a network: so many a second, and at once.
+const EACH: (f64, f64) = (10.0, 40.0);
+
+/// Networks whose handshakes are counted. When they are more, all are forgotten: what is left is bounded by [`HANDSHAKES`].
+const NETWORKS: usize = 1024;
+
+/// Receives at `socket` until `shutdown` is cancelled. Without datagrams it only waits for that.
+pub(in crate::server) async fn serve(
+    socket: Option<Socket>,
+    datagrams: Datagrams,
+    origins: Arc<[HeaderValue]>,
+    traffic: Arc<Traffic>,
+    shutdown: CancellationToken,
+) {
+    let (Some(socket), Datagrams(Some(offers))) = (socket, datagrams) else { return shutdown.cancelled().await };
+    let listener = match Listener::open(socket, offers, origins, traffic) {
+        Ok(listener) => listener,
+        Err(error) => {
+            warn!(%error, "no datagrams: touch goes by gRPC alone");
+            return shutdown.cancelled().await;
+        }
+    };
+    listener.run(shutdown).await;
+}
+
+struct Listener {
+    endpoint: Endpoint<endpoint_side::Server>,
+    rotation: Interval,
+    handshakes: Arc<Semaphore>,
+    begun: HashMap<IpAddr, Bucket>,
+    door: Arc<Door>,
+}
+
+/// What decides about a session.
+struct Door {
+    offers: Arc<Offers>,
+    origins: Arc<[HeaderValue]>,
+    traffic: Arc<Traffic>,
+}
+
+impl Listener {
+    fn open(
+        socket: Socket,
+        offers: Arc<Offers>,
+        origins: Arc<[HeaderValue]>,
+        traffic: Arc<Traffic>,
+    ) -> Result<Self, Box<dyn std::error::Error + Send + Sync>> {
+        let (identity, hash) = certificate::make()?;
+        let config = ServerConfig::builder().with_bind_socket(socket.socket);
+        let endpoint = Endpoint::server(settled(config.with_identity(identity).build()))?;
+        *lock(&offers.certificate_sha256) = hash;
+        let handshakes = Arc::new(Semaphore::new(HANDSHAKES));
+        let door = Arc::new(Door { offers, origins, traffic });
+        let mut rotation = interval(ROTATED);
+        // The first tick is at once.
+        rotation.reset();
+        Ok(Listener { endpoint, rotation, handshakes, begun: HashMap::new(), door })
+    }
+
+    async fn run(mut self, shutdown: CancellationToken) {
+        loop {
+            tokio::select! {
+                incoming = self.endpoint.accept() => self.take(incoming),
+                _ = self.rotation.tick() => self.rotate(),
+                () = shutdown.cancelled() => return self.endpoint.close(VarInt::from_u32(0), b"the server is shutting down"),
+            }
+        }
+    }
+
+    /// Begins a handshake with a client that has shown that it is where it says: so nobody makes the server answer to others.
+    fn take(&mut self, incoming: IncomingSession) {
+        if !incoming.remote_address_validated() {
+            return incoming.retry();
+        }
+        let address = incoming.remote_address();
+        if self.begun.len() >= NETWORKS {
+            self.begun.clear();
+        }
+        let bucket = self.begun.entry(network(address.ip())).or_insert_with(|| Bucket::new(EACH.0, EACH.1));
+        let is_slow = bucket.take(now_ns(), "handshakes").is_ok();
+        match self.handshakes.clone().try_acquire_owned() {
+            Ok(slot) if is_slow => drop(tokio::spawn(self.door.clone().admit(incoming, address, slot))),
+            _ => incoming.ignore(),
+        }
+    }
+
+    /// Another certificate for sessions from now on. Those that are open keep theirs; of the offers that are out the few that
+    /// nobody has taken fail, and their streams go on without datagrams.
+    fn rotate(&self) {
+        let made = certificate::make().map_err(|error| error.to_string());
+        let reloaded = made.and_then(|(identity, hash)| {
+            // The address has no meaning: the endpoint keeps its socket.
+            let config = ServerConfig::builder().with_bind_default(0).with_identity(identity).build();
+            self.endpoint.reload_config(settled(config), false).map_err(|error| error.to_string())?;
+            *lock(&self.door.offers.certificate_sha256) = hash;
+            Ok(())
+        });
+        if let Err(error) = reloaded {
+            warn!(error, "the certificate for datagrams stays: can't make another");
+        }
+    }
+}
+
+/// With the settings of touch.
+fn settled(mut config: ServerConfig) -> ServerConfig {
+    config.quic_config_mut().transport_config(Arc::new(datagram::transport()));
+    // What waits for a decision about its address is retried at once.
+    config.quic_config_mut().max_incoming(HANDSHAKES).incoming_buffer_size_total(1 << 20);
+    config
+}
+
+impl Door {
+    /// Lets a session in that presents a good ticket.
+    async fn admit(self: Arc<Self>, incoming: IncomingSession, address: SocketAddr, _slot: OwnedSemaphorePermit) {
+        let refused = match timeout(PATIENCE, self.enter(incoming)).await {
+            Ok(Ok(())) => return,
+            Ok(Err(why)) => why,
+            Err(_) => "timed out".to_owned(),
+        };
+        debug!(%address, "datagram session refused: {refused}");
+        self.traffic.datagram_sessions_refused.inc();
+    }
+
+    async fn enter(&self, incoming: IncomingSession) -> Result<(), String> {
+        let request = incoming.await.map_err(|error| error.to_string())?;
+        if let Some(origin) = request.origin()
+            && !is_own_or_among(origin, request.authority(), &self.origins)
+        {
+            request.forbidden().await;
+            return Err("its page is of another site".to_owned());
+        }
+        let whose = lock(&self.offers.tickets).take(request.path(), now_ns());
+        let Some(whose) = whose else {
+            request.forbidden().await;
+            return Err("it has no ticket that is good".to_owned());
+        };
+        let connection = request.accept().await.map_err(|error| error.to_string())?;
+        self.traffic.datagram_sessions.inc();
+        whose.send(connection).map_err(|_| "its stream has ended".to_owned())
+    }
+}

@@ -1,0 +1,91 @@
+//! Tickets for datagram sessions: 128 random bits, each for one session, within ten seconds.
+
+use std::collections::HashMap;
+
+use tokio::sync::oneshot;
+use wtransport::Connection;
+
+use super::Arrival;
+use crate::ids::random_bits;
+use crate::refusal::Result;
+
+/// A ticket is good for so long, ns.
+const GOOD_NS: u64 = 10_000_000_000;
+
+/// The most tickets that are out at a time; each belongs to a stream or a call.
+const MOST: usize = 4096;
+
+/// The tickets that are out.
+#[derive(Debug, Default)]
+pub(super) struct Tickets(HashMap<[u8; 16], Ticket>);
+
+#[derive(Debug)]
+struct Ticket {
+    given_ns: u64,
+    whose: oneshot::Sender<Connection>,
+}
+
+impl Tickets {
+    /// A new ticket, and the session that will present it; `None` if too many are out.
+    pub(super) fn give(&mut self, now_ns: u64) -> Result<Option<([u8; 16], Arrival)>> {
+        if self.0.len() >= MOST {
+            self.0.retain(|_, ticket| ticket.is_good(now_ns));
+        }
+        if self.0.len() >= MOST {
+            return Ok(None);
+        }
+        let number = random_bits()?.to_be_bytes();
+        let (whose, arrival) = oneshot::channel();
+        self.0.insert(number, Ticket { given_ns: now_ns, whose });
+        Ok(Some((number, arrival)))
+    }
+
+    /// Takes the ticket in a path, `/touch/` and 32 hexadecimal digits: where its session goes. `None` if there is none that is
+    /// good.
+    pub(super) fn take(&mut self, path: &str, now_ns: u64) -> Option<oneshot::Sender<Connection>> {
+        let digits = path.strip_prefix("/touch/").filter(|digits| digits.len() == 32 && digits.is_ascii())?;
+        let number = u128::from_str_radix(digits, 16).ok()?.to_be_bytes();
+        self.0.remove(&number).filter(|ticket| ticket.is_good(now_ns)).map(|ticket| ticket.whose)
+    }
+}
+
+impl Ticket {
+    fn is_good(&self, now_ns: u64) -> bool {
+        now_ns.saturating_sub(self.given_ns) <= GOOD_NS && !self.whose.is_closed()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn path(number: [u8; 16]) -> String {
+        format!("/touch/{:032x}", u128::from_be_bytes(number))
+    }
+
+    #[test]
+    fn a_ticket_is_good_once_for_ten_seconds_and_as_long_as_its_stream_is_there() {
+        let mut tickets = Tickets::default();
+        let (number, arrival) = tickets.give(0).unwrap().unwrap();
+        for wrong in ["", "/touch/", "/touch/1", "/touch/+0000000000000000000000000000001", &path([7; 16])] {
+            assert!(tickets.take(wrong, 1).is_none(), "{wrong}");
+        }
+        assert!(tickets.take(&path(number), GOOD_NS).is_some());
+        assert!(tickets.take(&path(number), GOOD_NS).is_none(), "once");
+        let (number, old) = tickets.give(0).unwrap().unwrap();
+        assert!(tickets.take(&path(number), GOOD_NS + 1).is_none(), "too old");
+        let (number, gone) = tickets.give(0).unwrap().unwrap();
+        drop((arrival, old, gone));
+        assert!(tickets.take(&path(number), 1).is_none(), "its stream has ended");
+    }
+
+    #[test]
+    fn tickets_are_bounded_and_make_room_as_they_lapse() {
+        let mut tickets = Tickets::default();
+        let kept: Vec<_> = std::iter::from_fn(|| tickets.give(0).unwrap()).collect();
+        assert_eq!(kept.len(), MOST);
+        assert!(tickets.give(GOOD_NS).unwrap().is_none());
+        assert!(tickets.give(GOOD_NS + 1).unwrap().is_some());
+        assert_eq!(tickets.0.len(), 1);
+    }
+}

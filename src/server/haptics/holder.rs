@@ -1,0 +1,167 @@
+//! Who holds tools: takes in what is said to them, by the stream or by datagram.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use glam::DVec3;
+use palpate_proto::{datagram, pb};
+use palpate_touch::carrier::Seen;
+use palpate_touch::device::Device;
+use tokio::sync::watch;
+use tracing::{debug, info};
+
+use super::Event;
+use crate::limits::Limits;
+use crate::pace::Live;
+use crate::pace::clock::now_ns;
+use crate::pace::queue::Writer;
+use crate::refusal::{Refusal, Result, number};
+use crate::scene::script::Action;
+use crate::server::rate::Bucket;
+use crate::server::traffic::Traffic;
+use crate::session::command::Command;
+use crate::session::lease::LeaseId;
+use crate::wire;
+
+/// Whoever holds the tools of a lease.
+pub(super) struct Holder {
+    pub(super) live: Arc<Live>,
+    pub(super) lease: LeaseId,
+    device: Option<Device>,
+    place: Option<ToolPlace>,
+    traffic: Arc<Traffic>,
+    commands: Bucket,
+    datagrams: Bucket,
+    /// Of each tool whose poses may come more than once those that have come.
+    seen: BTreeMap<u32, Seen>,
+}
+
+/// Where the tool of a stream is, as the computation of its laws is told.
+pub(super) struct ToolPlace {
+    /// Of the tip, m.
+    pub(super) radius_m: f64,
+    pub(super) told: watch::Sender<Option<DVec3>>,
+}
+
+impl ToolPlace {
+    /// Tells the place of a pose that is half a radius away from the last that was told.
+    fn follow(&self, command: &Command) {
+        let Action::Pose { place_m, .. } = command.action else { return };
+        self.told.send_if_modified(|told| {
+            let is_news = told.is_none_or(|told_m| told_m.distance(place_m) > 0.5 * self.radius_m);
+            if is_news {
+                *told = Some(place_m);
+            }
+            is_news
+        });
+    }
+}
+
+/// A command, unless its pose is outside the declared workspace.
+fn within_reach(command: Command, live: &Live, device: Option<&Device>) -> Result<Command> {
+    if let (Action::Pose { place_m, .. }, Some(device)) = (&command.action, device) {
+        let middle_m = live.model.shape().extent().middle_m();
+        let away_m = (*place_m - middle_m).length();
+        let range = format!("within {} m of the middle of the sheet, the device's workspace", device.workspace_m);
+        number("pose.position_m", away_m, &range, |away_m| away_m <= device.workspace_m)?;
+    }
+    Ok(command)
+}
+
+/// Whether a command may also come by datagram: a pose that is played by the client's time.
+fn may_overtake(command: &pb::Command) -> bool {
+    let is_pose = matches!(command.action, Some(pb::command::Action::Pose(_)));
+    is_pose && command.client_time_ns != 0 && command.at_step.is_none() && command.sequence.is_some()
+}
+
+impl Holder {
+    /// Of the tools of a lease. `by_datagram`: their poses may come by datagram as well.
+    #[allow(clippy::cast_precision_loss)]
+    pub(super) fn new(
+        live: Arc<Live>,
+        lease: LeaseId,
+        tools: &[u32],
+        (device, place): (Option<Device>, Option<ToolPlace>),
+        by_datagram: bool,
+        limits: &Limits,
+        traffic: Arc<Traffic>,
+    ) -> Self {
+        // So many for each step and tool, and at once twice what may wait.
+        let seen = tools.iter().filter(|_| by_datagram).map(|tool| (*tool, Seen::default())).collect();
+        let tools = tools.len().max(1) as f64;
+        let per_s = limits.commands_per_step * live.model.scene.stepping.rate_hz * tools;
+        let commands = Bucket::new(per_s, per_s.max(2.0 * limits.queued_commands_per_tool as f64 * tools));
+        Holder { live, lease, device, place, traffic, datagrams: commands.clone(), commands, seen }
+    }
+
+    /// Takes in a command of the stream. Tells `events` if it is refused.
+    ///
+    /// # Errors
+    /// Returns a refusal that ends the stream: commands come far too fast.
+    pub(super) fn command(&mut self, command: &pb::Command, events: &Writer<Event>) -> Result<()> {
+        let by_datagram = self.seen.contains_key(&command.tool) && may_overtake(command);
+        // It may have come by datagram before.
+        if by_datagram && !self.is_new(command) {
+            return Ok(());
+        }
+        self.take(command, by_datagram, events)
+    }
+
+    /// Takes in the poses of a datagram.
+    ///
+    /// # Errors
+    /// As for a command.
+    pub(super) fn poses(&mut self, message: &pb::PosesDatagram, events: &Writer<Event>) -> Result<()> {
+        for command in message.tools.iter().flat_map(datagram::commands) {
+            if may_overtake(&command) && self.is_new(&command) {
+                self.take(&command, true, events)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Whether a datagram comes at a rate that can be borne; else it is dropped unread.
+    pub(super) fn has_time_for_datagram(&mut self) -> bool {
+        self.datagrams.take(now_ns(), "datagrams of this stream").is_ok()
+    }
+
+    /// Counts something else that came with the commands.
+    ///
+    /// # Errors
+    /// Refuses it if too much comes; the flag tells whether that ends the stream.
+    pub(super) fn message(&mut self, now_ns: u64) -> std::result::Result<(), (Refusal, bool)> {
+        self.commands.take(now_ns, "messages of this stream").map_err(|refusal| (refusal, self.commands.is_abused()))
+    }
+
+    fn is_new(&mut self, command: &pb::Command) -> bool {
+        // A tool of somebody else is refused below.
+        let seen = self.seen.get_mut(&command.tool).zip(command.sequence);
+        seen.is_none_or(|(seen, sequence)| seen.take(sequence))
+    }
+
+    fn take(&mut self, message: &pb::Command, by_datagram: bool, events: &Writer<Event>) -> Result<()> {
+        let (live, now) = (&self.live, now_ns());
+        let taken = self
+            .commands
+            .take(now, "commands of this stream")
+            .and_then(|()| wire::command::from_command(message, live.model.shape(), now))
+            .and_then(|command| within_reach(command, live, self.device.as_ref()))
+            .inspect(|command| self.place.iter().for_each(|place| place.follow(command)))
+            .and_then(|command| live.submit(self.lease, vec![Command { by_datagram, ..command }]).map(drop));
+        self.traffic.commanded(usize::from(taken.is_ok()));
+        let Err(refusal) = taken else { return Ok(()) };
+        live.count_refused(1);
+        self.traffic.refused(refusal.reason);
+        debug!(session = %live.id, reason = refusal.reason.as_str(), %refusal, "command refused");
+        events.push(Event::Rejected(wire::sample::rejection(
+            message.tool,
+            message.sequence.unwrap_or_default(),
+            &refusal,
+        )));
+        if self.commands.is_abused() {
+            info!(session = %live.id, "haptic stream ended: its commands come far too fast");
+            return Err(refusal);
+        }
+        Ok(())
+    }
+}

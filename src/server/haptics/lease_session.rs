@@ -1,0 +1,118 @@
+//! Datagrams for a client that can't open a haptic stream: poses of the tools of a lease, and samples.
+
+use std::future::poll_fn;
+use std::sync::Arc;
+
+use palpate_proto::pb;
+use prost::Message;
+use tracing::{Instrument, debug, info};
+
+use super::holder::Holder;
+use super::outlet::Outlet;
+use super::stream::Life;
+use super::{Haptics, lease_id};
+use crate::budget::Account;
+use crate::pace::StreamKind;
+use crate::pace::queue::{Writer, queue};
+use crate::refusal::{Refusal, Result};
+use crate::server::datagrams::{Arrival, Way, not_available};
+use crate::server::recovered::Notices;
+use crate::wire;
+
+/// A session that was offered for a lease.
+struct LeaseSession {
+    holder: Holder,
+    outlet: Outlet,
+    way: Arc<Way>,
+    arrival: Option<Arrival>,
+    events: Writer<super::Event>,
+}
+
+impl Haptics {
+    /// Offers datagrams for the tools of a lease.
+    pub(super) fn offer_datagrams(
+        &self,
+        request: &pb::OpenDatagramsRequest,
+        account: &Account,
+    ) -> Result<pb::DatagramOffer> {
+        let live = self.0.pacer.get(&request.session_id)?;
+        let lease = lease_id(&request.lease_id)?;
+        let (every, deadband) = (request.sample_every_steps, request.deadband.as_ref());
+        let (tools, step) = live.at_intake(|intake, now| {
+            intake.renew(lease, now)?;
+            Ok::<_, Refusal>((intake.tools_of(lease).collect::<Vec<u32>>(), intake.next_step()))
+        })?;
+        let mut sampling = wire::sample::sampling(every, Some(tools.clone()), deadband, request.heartbeat_s, false)?;
+        let guard = live.open_stream("OpenDatagrams", StreamKind::HoldsTools, account)?;
+        let (offer, arrival) = self.0.datagrams.offer()?.ok_or_else(not_available)?;
+        let (limits, traffic) = (&self.0.config.limits, self.0.traffic.clone());
+        let holder = Holder::new(live.clone(), lease, &tools, (None, None), true, limits, traffic);
+        let way = Arc::new(Way::default());
+        sampling.wanted = Some(way.wanted());
+        let (events, heard) = queue(limits.queued_samples);
+        let cut = guard.cut().clone();
+        let samples = live.samples(sampling, Some(account));
+        let outlet = Outlet::new(None, heard, samples, Notices::new(tools, step), guard, way.clone());
+        let session = LeaseSession { holder, outlet, way, arrival: Some(arrival), events };
+        let serving = async move {
+            tokio::select! {
+                why = session.serve() => debug!("datagrams of a lease ended: {why}"),
+                () = cut.cancelled() => info!("datagrams of a lease were cut"),
+            }
+        };
+        tokio::spawn(serving.in_current_span());
+        Ok(offer)
+    }
+}
+
+impl LeaseSession {
+    /// Serves until the lease or the session ends; says why it did.
+    async fn serve(self) -> String {
+        let LeaseSession { mut holder, mut outlet, way, mut arrival, events } = self;
+        let Some(connection) = way.arrive(&mut arrival).await else { return "nobody took the ticket".to_owned() };
+        let telling = async {
+            let mut stream = match connection.open_uni().await {
+                Ok(opening) => opening.await.map_err(|error| error.to_string())?,
+                Err(error) => return Err(error.to_string()),
+            };
+            loop {
+                let message = match poll_fn(|context| outlet.poll(context)).await {
+                    Some(Ok(message)) => pb::TouchResponse { message: Some(message) },
+                    Some(Err(status)) => return Err(status.message().to_owned()),
+                    None => return Ok(()),
+                };
+                let mut bytes = Vec::with_capacity(4 + message.encoded_len());
+                bytes.extend(u32::try_from(message.encoded_len()).unwrap_or(u32::MAX).to_le_bytes());
+                message.encode(&mut bytes).map_err(|error| error.to_string())?;
+                stream.write_all(&bytes).await.map_err(|error| error.to_string())?;
+            }
+        };
+        let mut life = Life::of(true);
+        let (live, lease) = (holder.live.clone(), holder.lease);
+        let listening = async {
+            loop {
+                tokio::select! {
+                    datagram = way.next(&mut arrival) => {
+                        if holder.has_time_for_datagram()
+                            && let Ok(poses) = datagram
+                            && let Err(refusal) = holder.poses(&poses, &events)
+                        {
+                            return refusal.to_string();
+                        }
+                    }
+                    () = life.tick() => {
+                        way.stay_alive();
+                        if live.at_intake(|intake, _| intake.tools_of(lease).next().is_none()) {
+                            return "the lease is over".to_owned();
+                        }
+                    }
+                }
+            }
+        };
+        tokio::select! {
+            told = telling => told.err().unwrap_or_default(),
+            why = listening => why,
+            closed = connection.closed() => closed.to_string(),
+        }
+    }
+}

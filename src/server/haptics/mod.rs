@@ -1,0 +1,216 @@
+//! `HapticService`: streams of commands and samples, single commands, hashes and records.
+
+mod early;
+mod holder;
+mod lease_session;
+mod outlet;
+mod stream;
+
+use std::pin::Pin;
+
+use futures_util::stream::{Stream, unfold};
+use tonic::{Request, Response, Status, Streaming};
+use tracing::info;
+
+use super::charged_caller::ChargedCaller;
+use super::connections::Peer;
+use super::cut::until_cut;
+use super::revocation::Tenure;
+use super::services::Services;
+use crate::budget::{Account, Resource, Taken};
+use crate::ids::random_bits;
+use crate::pace::StreamKind;
+use crate::pace::clock::now_ns;
+use crate::refusal::{Reason, Refusal};
+use crate::session::command::Command;
+use crate::session::lease::LeaseId;
+use crate::shape::{PointId, PointName, RestShape};
+use crate::wire;
+use palpate_proto::pb;
+use palpate_proto::pb::haptic_service_server::HapticService;
+
+#[derive(Clone)]
+pub(super) struct Haptics(pub(super) Services);
+
+type Out<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
+
+/// What a haptic stream is told besides samples.
+enum Event {
+    Rejected(pb::Rejection),
+    /// The client's time, and when it came.
+    Renewed(u64, u64),
+    /// What the client sent can't be read.
+    Failed(Status),
+    /// The client has said all it wanted to say.
+    Finished,
+}
+
+/// Charges `account` for so many tools.
+fn charges(account: &Account, tools: usize) -> Result<Vec<Taken>, Refusal> {
+    (0..tools).map(|_| account.take(Resource::Leases, 1, "tools")).collect()
+}
+
+/// The refusal of a call for a single tool, whose field is called `tool`.
+fn of_one_tool(refusal: Refusal) -> Refusal {
+    if refusal.field == "tools" { Refusal { field: "tool".to_owned(), ..refusal } } else { refusal }
+}
+
+fn lease_id(text: &str) -> Result<LeaseId, Refusal> {
+    let wrong = |_| Refusal::new(Reason::NotHolder, "lease_id", "is none that this server gave");
+    LeaseId::from_str_radix(text, 16).map_err(wrong)
+}
+
+impl Haptics {
+    /// The points that a probe names.
+    fn probed(&self, field: &str, shape: &dyn RestShape, names: Vec<PointName>) -> Result<Vec<PointId>, Refusal> {
+        let limit = self.0.config.limits.probe_points;
+        if names.len() > limit {
+            let message = format!("are {}, above the limit of {limit}", names.len());
+            return Err(Refusal::new(Reason::TooLarge, field, message));
+        }
+        names.into_iter().enumerate().map(|(index, name)| shape.find(&format!("{field}[{index}]"), name)).collect()
+    }
+}
+
+#[tonic::async_trait]
+impl HapticService for Haptics {
+    type TouchStream = Out<pb::TouchResponse>;
+    type WatchSamplesStream = Out<pb::WatchSamplesResponse>;
+    type ProbeStream = Out<pb::ProbeResponse>;
+
+    async fn touch(
+        &self,
+        request: Request<Streaming<pb::TouchRequest>>,
+    ) -> Result<Response<Self::TouchStream>, Status> {
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
+        Ok(Response::new(Box::pin(self.stream(request.into_inner(), account))))
+    }
+
+    async fn acquire_tool(
+        &self,
+        request: Request<pb::AcquireToolRequest>,
+    ) -> Result<Response<pb::AcquireToolResponse>, Status> {
+        let ChargedCaller { account, may_vanish } = ChargedCaller::of(request.extensions());
+        let (peer, tenure) =
+            (request.extensions().get::<Peer>().cloned(), request.extensions().get::<Tenure>().cloned());
+        let request = request.into_inner();
+        let live = self.0.pacer.get(&request.session_id)?;
+        let mut lease_s = request.lease_s.unwrap_or(self.0.config.lease_s);
+        if may_vanish && !request.outlives_connection {
+            lease_s = lease_s.min(self.0.config.limits.browser_lease_s);
+        }
+        let lease = random_bits()?;
+        let charges = charges(&account, 1).map_err(of_one_tool)?;
+        live.at_intake(|intake, now| {
+            intake.acquire(&[request.tool], &request.holder, lease_s, lease, now)?;
+            intake.charge(lease, charges);
+            Ok::<_, Refusal>(())
+        })
+        .map_err(of_one_tool)?;
+        if let Some(peer) = peer.filter(|_| !may_vanish && !request.outlives_connection) {
+            peer.leases.add(&live, lease, None);
+        }
+        tenure.map_or(Ok(()), |tenure| tenure.bind(&live, lease))?;
+        info!(session = %live.id, tool = request.tool, holder = ?request.holder, "tool acquired");
+        Ok(Response::new(pb::AcquireToolResponse { lease_id: format!("{lease:032x}"), lease_s }))
+    }
+
+    async fn release_tool(
+        &self,
+        request: Request<pb::ReleaseToolRequest>,
+    ) -> Result<Response<pb::ReleaseToolResponse>, Status> {
+        let request = request.into_inner();
+        let live = self.0.pacer.get(&request.session_id)?;
+        let lease = lease_id(&request.lease_id)?;
+        live.at_intake(|intake, _| intake.release(lease))?;
+        Ok(Response::new(pb::ReleaseToolResponse {}))
+    }
+
+    async fn send_commands(
+        &self,
+        request: Request<pb::SendCommandsRequest>,
+    ) -> Result<Response<pb::SendCommandsResponse>, Status> {
+        let now = now_ns();
+        let request = request.into_inner();
+        let live = self.0.pacer.get(&request.session_id)?;
+        let lease = lease_id(&request.lease_id)?;
+        let shape = live.model.shape();
+        let read = |(index, command): (usize, &pb::Command)| {
+            let command = wire::command::from_command(command, shape, now);
+            command.map_err(|refusal| refusal.within(&format!("commands[{index}]")))
+        };
+        let commands: Result<Vec<Command>, Refusal> = request.commands.iter().enumerate().map(read).collect();
+        let accepted = commands.and_then(|commands| live.submit(lease, commands)).inspect_err(|refusal| {
+            live.count_refused(request.commands.len());
+            self.0.traffic.refused(refusal.reason);
+        })?;
+        accepted.taken_in().await;
+        let tools = live.at_intake(|intake, _| intake.tools_of(lease).collect());
+        self.0.traffic.commanded(request.commands.len());
+        let sample = live.next_sample(tools).await?;
+        let sample = Some(wire::sample::sample(&sample, shape, 0, now_ns()));
+        Ok(Response::new(pb::SendCommandsResponse { sample }))
+    }
+
+    async fn open_datagrams(
+        &self,
+        request: Request<pb::OpenDatagramsRequest>,
+    ) -> Result<Response<pb::OpenDatagramsResponse>, Status> {
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
+        let offer = self.offer_datagrams(&request.into_inner(), &account)?;
+        Ok(Response::new(pb::OpenDatagramsResponse { offer: Some(offer) }))
+    }
+
+    async fn watch_samples(
+        &self,
+        request: Request<pb::WatchSamplesRequest>,
+    ) -> Result<Response<Self::WatchSamplesStream>, Status> {
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
+        let request = request.into_inner();
+        let live = self.0.pacer.get(&request.session_id)?;
+        let (every, deadband) = (request.sample_every_steps, request.deadband.as_ref());
+        let sampling = wire::sample::sampling(every, None, deadband, request.heartbeat_s, false)?;
+        let guard = live.open_stream("WatchSamples", StreamKind::ReadsOnly, &account)?;
+        let cut = guard.cut().clone();
+        let samples = live.samples(sampling, Some(&account));
+        let out = unfold(Some((samples, guard)), |state| async move {
+            let (mut samples, guard) = state?;
+            Some(match samples.pop().await {
+                Ok((sample, dropped)) => {
+                    let sample = Some(wire::sample::sample(&sample, guard.shape(), dropped, now_ns()));
+                    (Ok(pb::WatchSamplesResponse { sample }), Some((samples, guard)))
+                }
+                Err(refusal) => (Err(refusal.into()), None),
+            })
+        });
+        Ok(Response::new(until_cut(out, cut)))
+    }
+
+    async fn probe(&self, request: Request<pb::ProbeRequest>) -> Result<Response<Self::ProbeStream>, Status> {
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
+        let request = request.into_inner();
+        let live = self.0.pacer.get(&request.session_id)?;
+        let every = wire::every("every_steps", request.every_steps)?;
+        let points = match wire::from_probed(request.r#where.as_ref())? {
+            Some((field, names)) => Some(self.probed(field, live.model.shape(), names)?),
+            None => None,
+        };
+        let guard = live.open_stream("Probe", StreamKind::ReadsOnly, &account)?;
+        let cut = guard.cut().clone();
+        let records = live.probe(every, points, request.energy, request.tools, &account)?;
+        let out = unfold(Some((records, guard, None)), |state| async move {
+            let (mut records, guard, begun) = state?;
+            let (record, dropped, part) = match begun {
+                Some(begun) => begun,
+                None => match records.pop().await {
+                    Ok((record, dropped)) => (record, dropped, 0),
+                    Err(refusal) => return Some((Err(refusal.into()), None)),
+                },
+            };
+            let message = wire::sample::record(&record, dropped, part)?;
+            let begun = (!message.last).then_some((record, dropped, part + 1));
+            Some((Ok(message), Some((records, guard, begun))))
+        });
+        Ok(Response::new(until_cut(out, cut)))
+    }
+}

@@ -1,0 +1,91 @@
+//! What a haptic stream tells its client: samples, laws, rejections.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::task::{Context, Poll, ready};
+
+use palpate_proto::pb;
+use tonic::Status;
+
+use super::Event;
+use crate::pace::clock::now_ns;
+use crate::pace::queue::Reader;
+use crate::pace::{PacedSample, StreamGuard};
+use crate::server::datagrams::Way;
+use crate::server::force_law::Updates;
+use crate::server::recovered::Notices;
+use crate::wire;
+
+/// What the output of a haptic stream reads from. Samples go by datagram while those get through.
+pub(super) struct Outlet {
+    updates: Option<Updates>,
+    events: Reader<Event>,
+    samples: Reader<PacedSample>,
+    notices: Notices,
+    way: Arc<Way>,
+    /// What goes before the next sample, and that sample.
+    ready: VecDeque<pb::touch_response::Message>,
+    /// Answers that the client was too slow for.
+    dropped_answers: u64,
+    guard: StreamGuard,
+}
+
+impl Outlet {
+    pub(super) fn new(
+        updates: Option<Updates>,
+        events: Reader<Event>,
+        samples: Reader<PacedSample>,
+        notices: Notices,
+        guard: StreamGuard,
+        way: Arc<Way>,
+    ) -> Self {
+        Outlet { updates, events, samples, notices, way, ready: VecDeque::new(), dropped_answers: 0, guard }
+    }
+
+    /// The next message of the stream; `None` at its end.
+    pub(super) fn poll(
+        &mut self,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<pb::touch_response::Message, Status>>> {
+        use pb::touch_response::Message;
+        loop {
+            if let Some(message) = self.ready.pop_front() {
+                return Poll::Ready(Some(Ok(message)));
+            }
+            if let Some(updates) = &mut self.updates
+                && let Poll::Ready(told) = updates.poll(context)
+            {
+                match told {
+                    Some(update) => return Poll::Ready(Some(Ok(Message::ForceLaw(update)))),
+                    None => self.updates = None,
+                }
+            }
+            if let Poll::Ready(event) = self.events.poll_pop(context) {
+                return Poll::Ready(match event {
+                    Ok((Event::Rejected(rejection), dropped_answers)) => {
+                        self.dropped_answers = dropped_answers;
+                        Some(Ok(Message::Rejection(pb::Rejection { dropped_answers, ..rejection })))
+                    }
+                    Ok((Event::Renewed(client_time_ns, arrival_ns), _)) => {
+                        let server_hold_ns = now_ns().saturating_sub(arrival_ns);
+                        Some(Ok(Message::Renewed(pb::Renewed { client_time_ns, server_hold_ns })))
+                    }
+                    Ok((Event::Failed(status), _)) => Some(Err(status)),
+                    Ok((Event::Finished, _)) => None,
+                    Err(refusal) => Some(Err(refusal.into())),
+                });
+            }
+            let (paced, dropped) = match ready!(self.samples.poll_pop(context)) {
+                Ok(popped) => popped,
+                Err(refusal) => return Poll::Ready(Some(Err(refusal.into()))),
+            };
+            let dropped_answers = self.dropped_answers;
+            let told = |rejection| Message::Rejection(pb::Rejection { dropped_answers, ..rejection });
+            self.ready.extend(self.notices.of(&paced.sample).into_iter().map(told));
+            let sample = wire::sample::sample(&paced, self.guard.shape(), dropped, now_ns());
+            if !self.way.send(&sample) {
+                self.ready.push_back(Message::Sample(sample));
+            }
+        }
+    }
+}
