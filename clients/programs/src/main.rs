@@ -26,6 +26,7 @@ mod credentials;
 mod health;
 mod link;
 mod load;
+mod proxy;
 mod replay;
 mod scene_file;
 mod simulated;
@@ -79,6 +80,15 @@ enum Command {
         (clients/library).\n\n\
         Exit status: 0; 1 when no connection succeeded or none stood at the end; 2 when an input was refused.")]
     Bridge(bridge::Arguments),
+    /// A bad network on this machine: relay TCP and UDP to a server with delay, jitter, loss and outages
+    #[command(after_help = "Examples:\n  \
+        palpate-client proxy 127.0.0.1:7200 127.0.0.1:7117 --delay-ms 25 --loss 0.01\n  \
+        palpate-client proxy 127.0.0.1:7200 127.0.0.1:7117 --udp --jitter-ms 10 --seed 7\n\n\
+        Start the server with --datagrams-advertise 127.0.0.1:7200, so that clients send their datagrams through the proxy \
+        as well. What is lost on TCP is sent again by the rule of RFC 6298, which holds up all that follows it. It ends at \
+        Ctrl-C, and tells then what went through.\n\n\
+        Exit status: 0; 1 when it can't listen; 2 when an input was refused.")]
+    Proxy(proxy::Arguments),
     /// Load a server with many sessions, haptic clients and viewers; report delays, losses and dilation
     #[command(after_help = "Examples:\n  \
         palpate-client load --sessions 50 --seconds 10\n  \
@@ -156,6 +166,7 @@ async fn main() -> ExitCode {
         Command::Replay(arguments) => replay::replay(&arguments).await,
         Command::Link(arguments) => link::link(&arguments).await,
         Command::Bridge(arguments) => bridge::bridge(&arguments).await,
+        Command::Proxy(arguments) => proxy::proxy(&arguments).await,
         Command::Load(arguments) => load::load(&arguments).await,
         Command::Health(arguments) => health::health(&arguments).await,
         Command::Top(arguments) => top::top(&arguments).await,

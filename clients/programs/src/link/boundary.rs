@@ -5,9 +5,9 @@ use glam::DVec3;
 use palpate_touch::hand::{HANDS, Hand, HandState};
 use serde_json::{Value, json};
 
-use super::network::{Conditions, Direction};
 use super::run::TICK_S;
 use crate::Failure;
+use crate::simulated::network::{Conditions, Direction};
 
 /// Stiffnesses to try, N/m.
 pub(super) const STIFFNESSES_N_PER_M: [f64; 9] = [150.0, 250.0, 300.0, 400.0, 500.0, 700.0, 1000.0, 1500.0, 3000.0];

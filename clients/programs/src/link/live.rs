@@ -9,10 +9,10 @@ use palpate_client::Server;
 use palpate_client::bridge::{self, Options, Session, Target};
 use palpate_touch::LimitCause;
 
-use super::network::Transport;
 use super::run::{Outcome, Setup, TICK_S, Totals, fitting_scale};
 use super::tissue::{Tissue, Twin};
 use super::with_tissue;
+use crate::simulated::network::Transport;
 use crate::simulated::random::Random;
 use crate::simulated::task::Task;
 use crate::simulated::{Part, Simulated};

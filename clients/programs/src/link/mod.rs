@@ -3,7 +3,6 @@
 
 mod boundary;
 mod live;
-mod network;
 mod random;
 mod run;
 mod tissue;
@@ -27,9 +26,9 @@ use serde_json::{Value, json};
 
 use crate::Failure;
 use crate::credentials::CredentialOptions;
+use crate::simulated::network::{Conditions, Transport};
 use crate::simulated::{device_named, hand_named};
 use crate::table;
-use network::{Conditions, Transport};
 use run::{Outcome, Rendering, Setup, run};
 use tissue::Spot;
 

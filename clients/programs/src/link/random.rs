@@ -12,11 +12,11 @@ use palpate_touch::device::DEVICES;
 use palpate_touch::hand::HANDS;
 use serde_json::{Value, json};
 
-use super::network::Conditions;
 use super::run::{Outcome, Setup, run};
 use super::tissue::Spot;
 use super::{Arguments, figures};
 use crate::Failure;
+use crate::simulated::network::Conditions;
 use crate::simulated::random::Random;
 use crate::table;
 

@@ -13,8 +13,8 @@ use palpate_touch::hand::{Hand, HandState};
 use palpate_touch::path::Path;
 use palpate_touch::{Device, Law, LimitCause, LocalModel, News, Pulse, Renderer, RenderingState, Tip, Told};
 
-use super::network::{Conditions, Direction, Stalls, Transport};
 use super::tissue::{Server, Spot, Tissue, Twin};
+use crate::simulated::network::{Conditions, Direction, Stalls, Transport};
 use crate::simulated::random::Random;
 use crate::simulated::task::{self, Task};
 

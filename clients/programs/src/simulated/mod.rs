@@ -1,5 +1,6 @@
 //! Simulated devices in simulated hands, in real time, and the tasks that the hands perform.
 
+pub(crate) mod network;
 pub(crate) mod random;
 pub(crate) mod task;
 

@@ -1,4 +1,4 @@
-//! A network in virtual time.
+//! A network: when what is sent arrives, if it does. Time is an argument, virtual in `link`, real in `proxy`.
 //!
 //! **A stream** (TCP): nothing is lost and messages stay in order, but a lost packet delays all later ones until it has been
 //! retransmitted: arrival = max(arrival of the message before, sent + delay + jitter + (RTT … RTO if lost)).
@@ -10,20 +10,20 @@
 
 use std::collections::VecDeque;
 
-use crate::simulated::random::Random;
+use super::random::Random;
 
 /// How messages travel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
-pub(super) enum Transport {
+pub(crate) enum Transport {
     /// A gRPC stream over TCP: a lost packet holds up all that follow it
     #[default]
     Stream,
-    /// Datagrams over UDP: a lost packet is lost alone. In virtual time only: the server speaks gRPC
+    /// Datagrams over UDP: a lost packet is lost alone.
     Datagram,
 }
 
 impl Transport {
-    pub(super) fn name(self) -> &'static str {
+    pub(crate) fn name(self) -> &'static str {
         match self {
             Transport::Stream => "stream",
             Transport::Datagram => "datagram",
@@ -33,25 +33,25 @@ impl Transport {
 
 /// The conditions of a network.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(super) struct Conditions {
-    pub(super) transport: Transport,
+pub(crate) struct Conditions {
+    pub(crate) transport: Transport,
     /// Round-trip time without jitter, s.
-    pub(super) round_trip_s: f64,
+    pub(crate) round_trip_s: f64,
     /// Standard deviation of the delay each way, s.
-    pub(super) jitter_s: f64,
+    pub(crate) jitter_s: f64,
     /// Fraction of the packets that are lost.
-    pub(super) loss: f64,
+    pub(crate) loss: f64,
     /// Mean number of packets lost in a row; up to 1, each is lost by itself.
-    pub(super) burst: f64,
+    pub(crate) burst: f64,
     /// Once a second nothing gets through for this long, s.
-    pub(super) outage_s: f64,
+    pub(crate) outage_s: f64,
 }
 
 /// Least retransmission timeout of TCP, s (RFC 6298 requires 1 s, Linux uses 200 ms).
 const LEAST_RTO_S: f64 = 0.2;
 
 /// The moments at which something stands still, once a second.
-pub(super) struct Stalls {
+pub(crate) struct Stalls {
     stall_s: f64,
     random: Random,
     begin_s: f64,
@@ -59,13 +59,13 @@ pub(super) struct Stalls {
 
 impl Stalls {
     /// Each of `stall_s`, the first not before `from_s`.
-    pub(super) fn new(stall_s: f64, from_s: f64, mut random: Random) -> Self {
+    pub(crate) fn new(stall_s: f64, from_s: f64, mut random: Random) -> Self {
         let begin_s = from_s + random.between(0.0, 1.0);
         Stalls { stall_s, random, begin_s }
     }
 
     /// The end of the stall at `now_s`, s, if there is one.
-    pub(super) fn at(&mut self, now_s: f64) -> Option<f64> {
+    pub(crate) fn at(&mut self, now_s: f64) -> Option<f64> {
         while now_s >= self.begin_s + self.stall_s {
             self.begin_s = self.begin_s.ceil() + self.random.between(0.0, 1.0);
         }
@@ -74,7 +74,7 @@ impl Stalls {
 }
 
 /// One direction of a connection.
-pub(super) struct Direction<T> {
+pub(crate) struct Direction<T> {
     conditions: Conditions,
     random: Random,
     outages: Stalls,
@@ -87,7 +87,7 @@ pub(super) struct Direction<T> {
 
 impl<T> Direction<T> {
     /// One of the directions of a seed, which have their outages together; the first of these not before `from_s`.
-    pub(super) fn new(conditions: Conditions, seed: u64, direction: u64, from_s: f64) -> Self {
+    pub(crate) fn new(conditions: Conditions, seed: u64, direction: u64, from_s: f64) -> Self {
         Direction {
             conditions,
             random: Random::new(seed, direction),
@@ -113,7 +113,7 @@ impl<T> Direction<T> {
         self.is_bursting
     }
 
-    pub(super) fn send(&mut self, now_s: f64, message: T) {
+    pub(crate) fn send(&mut self, now_s: f64, message: T) {
         let Conditions { transport, round_trip_s, jitter_s, .. } = self.conditions;
         self.sent += 1;
         let mut arrives_s = now_s + round_trip_s / 2.0;
@@ -139,7 +139,7 @@ impl<T> Direction<T> {
     }
 
     /// The next message that has arrived.
-    pub(super) fn receive(&mut self, now_s: f64) -> Option<T> {
+    pub(crate) fn receive(&mut self, now_s: f64) -> Option<T> {
         // The nanosecond allows for rounding: times are sums of milliseconds.
         if self.under_way.front()?.0 > now_s + 1e-9 {
             return None;
@@ -147,7 +147,17 @@ impl<T> Direction<T> {
         self.under_way.pop_front().map(|entry| entry.1)
     }
 
-    pub(super) fn sent(&self) -> u64 {
+    /// When the next message arrives, s.
+    pub(crate) fn next_s(&self) -> Option<f64> {
+        self.under_way.front().map(|entry| entry.0)
+    }
+
+    /// Messages that are under way.
+    pub(crate) fn under_way(&self) -> usize {
+        self.under_way.len()
+    }
+
+    pub(crate) fn sent(&self) -> u64 {
         self.sent
     }
 }
