@@ -32,7 +32,7 @@ const CRATES: [(&str, &str, &[&str], &[&str]); 6] = [
     ("mesh", "palpate-mesh", &[], &["axum", "clap", "prost", "tokio", "tonic"]),
     ("clients/touch", "palpate-touch", &[], &["axum", "prost", "tokio", "tonic"]),
     ("proto", "palpate-proto", &["palpate-touch"], &["axum", "clap", "hyper", "tokio-rustls"]),
-    (".", "palpate", &["palpate-mesh", "palpate-proto", "palpate-touch"], &["indicatif", "rustls-native-certs"]),
+    (".", "palpate", &["palpate-mesh", "palpate-proto", "palpate-touch"], &["indicatif"]),
     (
         "clients/library",
         "palpate-client",
@@ -55,7 +55,7 @@ const FOR_PROGRAMS: [(&str, &[&str]); 3] = [
 ];
 
 /// The subcommands: none uses another.
-const SUBCOMMANDS: [&str; 7] = ["admin", "bridge", "health", "link", "load", "replay", "top"];
+const SUBCOMMANDS: [&str; 8] = ["admin", "bridge", "health", "link", "load", "proxy", "replay", "top"];
 
 fn rust_files(folder: &Path) -> Vec<PathBuf> {
     let mut files = Vec::new();

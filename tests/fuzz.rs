@@ -153,7 +153,7 @@ macro_rules! decoders {
     };
 }
 
-decoders! { scene script request sample record frame config }
+decoders! { scene script request datagram sample record frame config }
 
 #[test]
 fn every_request_of_the_protocol_is_tried() {

@@ -21,6 +21,7 @@ use palpate::scene::{FixedVertices, Mesh, MeshShape, PAPER, Scene};
 use palpate::server::config::Config;
 use palpate::server::identity::{self, Credentials, Role};
 use palpate::session::Session;
+use palpate::session::command::Command;
 use palpate::session::intake::Intake;
 use palpate::session::sampling::Sampler;
 use palpate::shape::RestShape;
@@ -28,7 +29,7 @@ use palpate::sheet::Model;
 use palpate::surface::Refinement;
 use palpate::wire;
 use palpate_mesh::{Group, TriangleMesh};
-use palpate_proto::{pb, touch};
+use palpate_proto::{datagram as of_touch, pb, touch};
 use palpate_touch::{Device, Envelope, Law, Renderer};
 use prost::Message;
 
@@ -43,10 +44,11 @@ pub struct Target {
     pub seeds: fn() -> Vec<Vec<u8>>,
 }
 
-pub const TARGETS: [Target; 7] = [
+pub const TARGETS: [Target; 8] = [
     Target { name: "scene", run: scene, seeds: scene_seeds },
     Target { name: "script", run: script, seeds: script_seeds },
     Target { name: "request", run: request, seeds: request_seeds },
+    Target { name: "datagram", run: datagram, seeds: datagram_seeds },
     Target { name: "sample", run: sample, seeds: sample_seeds },
     Target { name: "record", run: record, seeds: record_seeds },
     Target { name: "frame", run: frame, seeds: frame_seeds },
@@ -428,6 +430,60 @@ fn request_seeds() -> Vec<Vec<u8>> {
 const MOST_N: f64 = 3.3;
 
 /// What a client hears in a haptic stream, up to the force at the device.
+/// A datagram of a client, and one of a server.
+pub fn datagram(bytes: &[u8]) -> bool {
+    use palpate_touch::carrier::Carrier;
+    let mut carrier = Carrier::default();
+    let from_server = pb::SampleDatagram::decode(bytes).is_ok_and(|message| {
+        carrier.arrive(message.number, message.acknowledges, 0.0);
+        assert!(!carrier.carries(0.0), "nothing was sent that could be confirmed");
+        message.sample.is_some()
+    });
+    let Ok(message) = pb::PosesDatagram::decode(bytes) else { return from_server };
+    let commands: Vec<pb::Command> = message.tools.iter().flat_map(of_touch::commands).collect();
+    assert!(commands.len() <= message.tools.len() * (1 + of_touch::MOST_EARLIER));
+    let mut intake = Intake::new(&model().scene, &limits());
+    intake.acquire(&[0, 1, 2], "fuzz", 60.0, 1, 0).expect("tools are free");
+    let mut session = Session::new(model());
+    let mut taken = false;
+    for command in &commands {
+        // One by one, as the server does: what comes late is no reason to refuse the others.
+        let Ok(command) = wire::command::from_command(command, model().scene.shape(), 1) else { continue };
+        taken |= intake.submit(1, vec![Command { by_datagram: true, ..command }], 1).is_ok();
+    }
+    let mut due = Vec::new();
+    for _ in 0..3 {
+        intake.take_due(session.step_count(), 2, &mut due);
+        session.advance(&mut due, |_| {});
+        for contact in session.sample(None).tools.iter().filter_map(|tool| tool.contact) {
+            assert!(contact.displacement_m.is_finite() && contact.force_on_tool_n.is_finite(), "{contact:?}");
+        }
+    }
+    taken || from_server
+}
+
+fn datagram_seeds() -> Vec<Vec<u8>> {
+    let posed = |sequence: u64, moves: bool| {
+        let place_m = DVec3::new(0.1, 0.1, 1e-4 * sequence as f64);
+        let velocity_m_per_s = moves.then_some(pb::Vector3 { x: 0.01, y: 0.0, z: -0.1 });
+        let pose = pb::Pose { velocity_m_per_s, ..touch::pose(place_m, &palpate_touch::Tip::default()) };
+        of_touch::Posed { sequence, client_time_ns: 1_000_000 * (1 + sequence), pose }
+    };
+    let poses = |tool: u32, moves: bool| {
+        let all: Vec<_> = (0..9).rev().map(|sequence| posed(sequence, moves)).collect();
+        of_touch::tool_poses(tool, &all[0], all[1..].iter())
+    };
+    let datagram = |tools| pb::PosesDatagram { number: 9, acknowledges: 7, heartbeat_s: 0.04, tools, sent_ns: 1 << 40 };
+    let sample = pb::Sample { step: 5, tools: vec![pb::ToolSample::default()], ..Default::default() };
+    let answer =
+        pb::SampleDatagram { number: 7, acknowledges: 9, heartbeat_s: 0.0125, sample: Some(sample), sent_ns: 1 << 41 };
+    vec![
+        datagram(vec![poses(0, false)]).encode_to_vec(),
+        datagram(vec![poses(0, true), poses(2, false)]).encode_to_vec(),
+        answer.encode_to_vec(),
+    ]
+}
+
 pub fn sample(bytes: &[u8]) -> bool {
     let Ok(response) = pb::TouchResponse::decode(bytes) else { return false };
     let device = Device::named("omega3").expect("there is one");

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use super::datagrams::host_and_port;
+use super::address::host_and_port;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, number, positive};
 use crate::scene::document::read_text;

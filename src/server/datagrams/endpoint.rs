@@ -15,7 +15,7 @@ use wtransport::endpoint::{IncomingSession, endpoint_side};
 use wtransport::{Endpoint, ServerConfig, VarInt};
 
 use super::certificate::{self, ROTATED};
-use super::{Datagrams, Offers, Socket};
+use super::offers::{Datagrams, Offers, Socket};
 use crate::lock::lock;
 use crate::pace::clock::now_ns;
 use crate::server::address::network;

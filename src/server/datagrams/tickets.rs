@@ -5,9 +5,11 @@ use std::collections::HashMap;
 use tokio::sync::oneshot;
 use wtransport::Connection;
 
-use super::Arrival;
 use crate::ids::random_bits;
 use crate::refusal::Result;
+
+/// The session that presents a ticket, once it does.
+pub(in crate::server) type Arrival = oneshot::Receiver<Connection>;
 
 /// A ticket is good for so long, ns.
 const GOOD_NS: u64 = 10_000_000_000;

@@ -9,7 +9,7 @@ use palpate_touch::news::Pulse;
 use prost::Message;
 use wtransport::{Connection, VarInt};
 
-use super::Arrival;
+use super::tickets::Arrival;
 use crate::lock::lock;
 use crate::pace::clock::now_ns;
 use crate::refusal::{Reason, Refusal, Result};

@@ -10,7 +10,7 @@ use palpate_touch::device::Device;
 use tokio::sync::watch;
 use tracing::{debug, info};
 
-use super::Event;
+use super::event::Event;
 use crate::limits::Limits;
 use crate::pace::Live;
 use crate::pace::clock::now_ns;

@@ -7,16 +7,18 @@ use palpate_proto::pb;
 use prost::Message;
 use tracing::{Instrument, debug, info};
 
+use super::event::Event;
 use super::holder::Holder;
 use super::outlet::Outlet;
 use super::stream::Life;
-use super::{Haptics, lease_id};
+use super::tools::lease_id;
 use crate::budget::Account;
 use crate::pace::StreamKind;
 use crate::pace::queue::{Writer, queue};
 use crate::refusal::{Refusal, Result};
 use crate::server::datagrams::{Arrival, Way, not_available};
 use crate::server::recovered::Notices;
+use crate::server::services::Services;
 use crate::wire;
 
 /// A session that was offered for a lease.
@@ -25,44 +27,42 @@ struct LeaseSession {
     outlet: Outlet,
     way: Arc<Way>,
     arrival: Option<Arrival>,
-    events: Writer<super::Event>,
+    events: Writer<Event>,
 }
 
-impl Haptics {
-    /// Offers datagrams for the tools of a lease.
-    pub(super) fn offer_datagrams(
-        &self,
-        request: &pb::OpenDatagramsRequest,
-        account: &Account,
-    ) -> Result<pb::DatagramOffer> {
-        let live = self.0.pacer.get(&request.session_id)?;
-        let lease = lease_id(&request.lease_id)?;
-        let (every, deadband) = (request.sample_every_steps, request.deadband.as_ref());
-        let (tools, step) = live.at_intake(|intake, now| {
-            intake.renew(lease, now)?;
-            Ok::<_, Refusal>((intake.tools_of(lease).collect::<Vec<u32>>(), intake.next_step()))
-        })?;
-        let mut sampling = wire::sample::sampling(every, Some(tools.clone()), deadband, request.heartbeat_s, false)?;
-        let guard = live.open_stream("OpenDatagrams", StreamKind::HoldsTools, account)?;
-        let (offer, arrival) = self.0.datagrams.offer()?.ok_or_else(not_available)?;
-        let (limits, traffic) = (&self.0.config.limits, self.0.traffic.clone());
-        let holder = Holder::new(live.clone(), lease, &tools, (None, None), true, limits, traffic);
-        let way = Arc::new(Way::default());
-        sampling.wanted = Some(way.wanted());
-        let (events, heard) = queue(limits.queued_samples);
-        let cut = guard.cut().clone();
-        let samples = live.samples(sampling, Some(account));
-        let outlet = Outlet::new(None, heard, samples, Notices::new(tools, step), guard, way.clone());
-        let session = LeaseSession { holder, outlet, way, arrival: Some(arrival), events };
-        let serving = async move {
-            tokio::select! {
-                why = session.serve() => debug!("datagrams of a lease ended: {why}"),
-                () = cut.cancelled() => info!("datagrams of a lease were cut"),
-            }
-        };
-        tokio::spawn(serving.in_current_span());
-        Ok(offer)
-    }
+/// Offers datagrams for the tools of a lease.
+pub(super) fn offer(
+    services: &Services,
+    request: &pb::OpenDatagramsRequest,
+    account: &Account,
+) -> Result<pb::DatagramOffer> {
+    let live = services.pacer.get(&request.session_id)?;
+    let lease = lease_id(&request.lease_id)?;
+    let (every, deadband) = (request.sample_every_steps, request.deadband.as_ref());
+    let (tools, step) = live.at_intake(|intake, now| {
+        intake.renew(lease, now)?;
+        Ok::<_, Refusal>((intake.tools_of(lease).collect::<Vec<u32>>(), intake.next_step()))
+    })?;
+    let mut sampling = wire::sample::sampling(every, Some(tools.clone()), deadband, request.heartbeat_s, false)?;
+    let guard = live.open_stream("OpenDatagrams", StreamKind::HoldsTools, account)?;
+    let (offer, arrival) = services.datagrams.offer()?.ok_or_else(not_available)?;
+    let (limits, traffic) = (&services.config.limits, services.traffic.clone());
+    let holder = Holder::new(live.clone(), lease, &tools, (None, None), true, limits, traffic);
+    let way = Arc::new(Way::default());
+    sampling.wanted = Some(way.wanted());
+    let (events, heard) = queue(limits.queued_samples);
+    let cut = guard.cut().clone();
+    let samples = live.samples(sampling, Some(account));
+    let outlet = Outlet::new(None, heard, samples, Notices::new(tools, step), guard, way.clone());
+    let session = LeaseSession { holder, outlet, way, arrival: Some(arrival), events };
+    let serving = async move {
+        tokio::select! {
+            why = session.serve() => debug!("datagrams of a lease ended: {why}"),
+            () = cut.cancelled() => info!("datagrams of a lease were cut"),
+        }
+    };
+    tokio::spawn(serving.in_current_span());
+    Ok(offer)
 }
 
 impl LeaseSession {

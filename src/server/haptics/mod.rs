@@ -1,10 +1,12 @@
 //! `HapticService`: streams of commands and samples, single commands, hashes and records.
 
 mod early;
+mod event;
 mod holder;
 mod lease_session;
 mod outlet;
 mod stream;
+mod tools;
 
 use std::pin::Pin;
 
@@ -12,18 +14,18 @@ use futures_util::stream::{Stream, unfold};
 use tonic::{Request, Response, Status, Streaming};
 use tracing::info;
 
+use tools::{charges, lease_id};
+
 use super::charged_caller::ChargedCaller;
 use super::connections::Peer;
 use super::cut::until_cut;
 use super::revocation::Tenure;
 use super::services::Services;
-use crate::budget::{Account, Resource, Taken};
 use crate::ids::random_bits;
 use crate::pace::StreamKind;
 use crate::pace::clock::now_ns;
 use crate::refusal::{Reason, Refusal};
 use crate::session::command::Command;
-use crate::session::lease::LeaseId;
 use crate::shape::{PointId, PointName, RestShape};
 use crate::wire;
 use palpate_proto::pb;
@@ -34,30 +36,9 @@ pub(super) struct Haptics(pub(super) Services);
 
 type Out<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
-/// What a haptic stream is told besides samples.
-enum Event {
-    Rejected(pb::Rejection),
-    /// The client's time, and when it came.
-    Renewed(u64, u64),
-    /// What the client sent can't be read.
-    Failed(Status),
-    /// The client has said all it wanted to say.
-    Finished,
-}
-
-/// Charges `account` for so many tools.
-fn charges(account: &Account, tools: usize) -> Result<Vec<Taken>, Refusal> {
-    (0..tools).map(|_| account.take(Resource::Leases, 1, "tools")).collect()
-}
-
 /// The refusal of a call for a single tool, whose field is called `tool`.
 fn of_one_tool(refusal: Refusal) -> Refusal {
     if refusal.field == "tools" { Refusal { field: "tool".to_owned(), ..refusal } } else { refusal }
-}
-
-fn lease_id(text: &str) -> Result<LeaseId, Refusal> {
-    let wrong = |_| Refusal::new(Reason::NotHolder, "lease_id", "is none that this server gave");
-    LeaseId::from_str_radix(text, 16).map_err(wrong)
 }
 
 impl Haptics {
@@ -83,7 +64,7 @@ impl HapticService for Haptics {
         request: Request<Streaming<pb::TouchRequest>>,
     ) -> Result<Response<Self::TouchStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
-        Ok(Response::new(Box::pin(self.stream(request.into_inner(), account))))
+        Ok(Response::new(Box::pin(stream::open(self.0.clone(), request.into_inner(), account))))
     }
 
     async fn acquire_tool(
@@ -157,7 +138,7 @@ impl HapticService for Haptics {
         request: Request<pb::OpenDatagramsRequest>,
     ) -> Result<Response<pb::OpenDatagramsResponse>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
-        let offer = self.offer_datagrams(&request.into_inner(), &account)?;
+        let offer = lease_session::offer(&self.0, &request.into_inner(), &account)?;
         Ok(Response::new(pb::OpenDatagramsResponse { offer: Some(offer) }))
     }
 

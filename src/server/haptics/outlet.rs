@@ -7,7 +7,7 @@ use std::task::{Context, Poll, ready};
 use palpate_proto::pb;
 use tonic::Status;
 
-use super::Event;
+use super::event::Event;
 use crate::pace::clock::now_ns;
 use crate::pace::queue::Reader;
 use crate::pace::{PacedSample, StreamGuard};

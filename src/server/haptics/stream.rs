@@ -16,9 +16,10 @@ use tonic::{Status, Streaming};
 use tracing::{Instrument, debug, info};
 
 use super::early::Early;
+use super::event::Event;
 use super::holder::{Holder, ToolPlace};
 use super::outlet::Outlet;
-use super::{Event, Haptics, charges};
+use super::tools::charges;
 use crate::budget::Account;
 use crate::ids::random_bits;
 use crate::pace::clock::now_ns;
@@ -29,6 +30,7 @@ use crate::scene::check::check_tip;
 use crate::server::datagrams::{Arrival, Way};
 use crate::server::force_law::{Computing, Updates};
 use crate::server::recovered::Notices;
+use crate::server::services::Services;
 use crate::session::laws::{FIRST, Laws};
 use crate::session::lease::LeaseId;
 use crate::wire;
@@ -85,184 +87,182 @@ impl Life {
     }
 }
 
-impl Haptics {
-    /// Answers the first message of a haptic stream.
-    async fn open(&self, open: &pb::TouchOpen, account: &Account) -> Result<(Opened, StreamTools), Status> {
-        let live = self.0.pacer.get(&open.session_id)?;
-        let device = open.device.as_ref().map(touch::from_device).transpose()?;
-        let tip = touch::from_tip(open.tip.as_ref());
-        // A stream that neither renders nor says anything of a tip may push with forces on any tissue.
-        if device.is_some() || open.tip.is_some() {
-            check_tip("tip", live.model.shape(), &tip)?;
-        }
-        let only = (!open.tools.is_empty()).then(|| open.tools.clone());
-        let (every, deadband) = (open.sample_every_steps, open.deadband.as_ref());
-        let mut sampling = wire::sample::sampling(every, only, deadband, open.heartbeat_s, device.is_some())?;
-        if open.touch_stiffness && device.is_none() {
-            let message = "is missing: touch_stiffness is of its local models";
-            return Err(Refusal::new(Reason::Missing, "device", message).into());
-        }
-        sampling.touch_stiffness = open.touch_stiffness;
-        let kind = if open.tools.is_empty() { StreamKind::ReadsOnly } else { StreamKind::HoldsTools };
-        let guard = live.open_stream("Touch", kind, account)?;
-        let begun = match device {
-            Some(_) => Some(Computing::begin(&self.0.workshop, account, &live, tip.radius_m).await?),
-            None => None,
-        };
-        let (law, computing) = begun.unzip();
-        let laws = law.clone().map(|law| Arc::new(Laws::new(law)));
-        sampling.laws.clone_from(&laws);
-        let lease_s = open.lease_s.unwrap_or(self.0.config.lease_s);
-        let lease = random_bits()?;
-        let charges = charges(account, open.tools.len())?;
-        let step = live.at_intake(|intake, now| {
-            intake.acquire(&open.tools, &open.holder, lease_s, lease, now)?;
-            intake.charge(lease, charges);
-            Ok::<_, Refusal>(intake.next_step())
-        })?;
-        let (told, places) = watch::channel(None);
-        let (updates, _computing) = computing.zip(laws).map(|(computing, laws)| computing.go_on(laws, places)).unzip();
-        // Only a mesh has other laws at other places.
-        let has_places = device.is_some() && live.model.shape().dimensions() > 2;
-        let place = has_places.then_some(ToolPlace { radius_m: tip.radius_m, told });
-        // Held from here on: what fails below gives the tools back.
-        let tools = open.tools.len();
-        let (limits, traffic) = (&self.0.config.limits, self.0.traffic.clone());
-        let holder = Holder::new(live.clone(), lease, &open.tools, (device, place), open.datagrams, limits, traffic);
-        let way = Arc::new(Way::default());
-        let mut held =
-            StreamTools { live: live.clone(), lease, tools, holder, way: way.clone(), arrival: None, _computing };
-        let offered = if open.datagrams { self.0.datagrams.offer()? } else { None };
-        let (datagrams, arrival) = offered.unzip();
-        held.arrival = arrival;
-        if datagrams.is_some() {
-            sampling.wanted = Some(way.wanted());
-        }
-        let law = law.as_deref();
-        let answer = pb::TouchOpened {
-            step,
-            rate_hz: live.model.scene.stepping.rate_hz,
-            lease_s,
-            heartbeat_s: sampling.heartbeat_s,
-            law: law.map(|law| touch::law(law, FIRST)),
-            warnings: device.zip(law).map_or(Vec::new(), |(device, law)| device.warnings(law)),
-            max_force_n: device.map_or(UNDECLARED_FORCE_N, |device| device.most_n()),
-            datagrams,
-        };
-        let samples = live.samples(sampling, open.tools.is_empty().then_some(account));
-        info!(session = %live.id, tools = ?open.tools, holder = ?open.holder, "haptic stream opened");
-        let notices = Notices::new(open.tools.clone(), step);
-        Ok((Opened { answer, updates, samples, notices, guard, way }, held))
+/// Answers the first message of a haptic stream.
+async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> Result<(Opened, StreamTools), Status> {
+    let live = services.pacer.get(&open.session_id)?;
+    let device = open.device.as_ref().map(touch::from_device).transpose()?;
+    let tip = touch::from_tip(open.tip.as_ref());
+    // A stream that neither renders nor says anything of a tip may push with forces on any tissue.
+    if device.is_some() || open.tip.is_some() {
+        check_tip("tip", live.model.shape(), &tip)?;
     }
-
-    /// Opens a stream and reads what the client says, until it ends.
-    pub(super) fn stream(&self, inbound: Streaming<pb::TouchRequest>, account: Account) -> Output {
-        let (writer, events) = queue(self.0.config.limits.queued_samples);
-        // The client may wait for our headers before it opens, so its first message is not waited for here.
-        let (opened, opening) = oneshot::channel();
-        let listening = tokio::spawn(self.clone().listen(inbound, account, opened, writer).in_current_span());
-        let _listening = AbortOnDropHandle::new(listening);
-        Output { stage: Stage::Opening(opening, Some(events)), _listening }
+    let only = (!open.tools.is_empty()).then(|| open.tools.clone());
+    let (every, deadband) = (open.sample_every_steps, open.deadband.as_ref());
+    let mut sampling = wire::sample::sampling(every, only, deadband, open.heartbeat_s, device.is_some())?;
+    if open.touch_stiffness && device.is_none() {
+        let message = "is missing: touch_stiffness is of its local models";
+        return Err(Refusal::new(Reason::Missing, "device", message).into());
     }
+    sampling.touch_stiffness = open.touch_stiffness;
+    let kind = if open.tools.is_empty() { StreamKind::ReadsOnly } else { StreamKind::HoldsTools };
+    let guard = live.open_stream("Touch", kind, account)?;
+    let begun = match device {
+        Some(_) => Some(Computing::begin(&services.workshop, account, &live, tip.radius_m).await?),
+        None => None,
+    };
+    let (law, computing) = begun.unzip();
+    let laws = law.clone().map(|law| Arc::new(Laws::new(law)));
+    sampling.laws.clone_from(&laws);
+    let lease_s = open.lease_s.unwrap_or(services.config.lease_s);
+    let lease = random_bits()?;
+    let charges = charges(account, open.tools.len())?;
+    let step = live.at_intake(|intake, now| {
+        intake.acquire(&open.tools, &open.holder, lease_s, lease, now)?;
+        intake.charge(lease, charges);
+        Ok::<_, Refusal>(intake.next_step())
+    })?;
+    let (told, places) = watch::channel(None);
+    let (updates, _computing) = computing.zip(laws).map(|(computing, laws)| computing.go_on(laws, places)).unzip();
+    // Only a mesh has other laws at other places.
+    let has_places = device.is_some() && live.model.shape().dimensions() > 2;
+    let place = has_places.then_some(ToolPlace { radius_m: tip.radius_m, told });
+    // Held from here on: what fails below gives the tools back.
+    let tools = open.tools.len();
+    let (limits, traffic) = (&services.config.limits, services.traffic.clone());
+    let holder = Holder::new(live.clone(), lease, &open.tools, (device, place), open.datagrams, limits, traffic);
+    let way = Arc::new(Way::default());
+    let mut held =
+        StreamTools { live: live.clone(), lease, tools, holder, way: way.clone(), arrival: None, _computing };
+    let offered = if open.datagrams { services.datagrams.offer()? } else { None };
+    let (datagrams, arrival) = offered.unzip();
+    held.arrival = arrival;
+    if datagrams.is_some() {
+        sampling.wanted = Some(way.wanted());
+    }
+    let law = law.as_deref();
+    let answer = pb::TouchOpened {
+        step,
+        rate_hz: live.model.scene.stepping.rate_hz,
+        lease_s,
+        heartbeat_s: sampling.heartbeat_s,
+        law: law.map(|law| touch::law(law, FIRST)),
+        warnings: device.zip(law).map_or(Vec::new(), |(device, law)| device.warnings(law)),
+        max_force_n: device.map_or(UNDECLARED_FORCE_N, |device| device.most_n()),
+        datagrams,
+    };
+    let samples = live.samples(sampling, open.tools.is_empty().then_some(account));
+    info!(session = %live.id, tools = ?open.tools, holder = ?open.holder, "haptic stream opened");
+    let notices = Notices::new(open.tools.clone(), step);
+    Ok((Opened { answer, updates, samples, notices, guard, way }, held))
+}
 
-    /// Reads what the client says until it ends.
-    async fn listen(
-        self,
-        mut inbound: Streaming<pb::TouchRequest>,
-        account: Account,
-        opening: oneshot::Sender<Result<Opened, Status>>,
-        events: Writer<Event>,
-    ) {
-        use pb::touch_request::Message;
-        let patience = Duration::from_secs_f64(self.0.config.limits.open_s);
-        let Ok(first) = tokio::time::timeout(patience, inbound.message()).await else {
-            let message = format!("did not come within {} s", patience.as_secs_f64());
-            let _ = opening.send(Err(Refusal::new(Reason::TimedOut, "open", message).into()));
+/// Opens a stream and reads what the client says, until it ends.
+pub(super) fn open(services: Services, inbound: Streaming<pb::TouchRequest>, account: Account) -> Output {
+    let (writer, events) = queue(services.config.limits.queued_samples);
+    // The client may wait for our headers before it opens, so its first message is not waited for here.
+    let (opened, opening) = oneshot::channel();
+    let listening = tokio::spawn(listen(services, inbound, account, opened, writer).in_current_span());
+    let _listening = AbortOnDropHandle::new(listening);
+    Output { stage: Stage::Opening(opening, Some(events)), _listening }
+}
+
+/// Reads what the client says until it ends.
+async fn listen(
+    services: Services,
+    mut inbound: Streaming<pb::TouchRequest>,
+    account: Account,
+    opening: oneshot::Sender<Result<Opened, Status>>,
+    events: Writer<Event>,
+) {
+    use pb::touch_request::Message;
+    let patience = Duration::from_secs_f64(services.config.limits.open_s);
+    let Ok(first) = tokio::time::timeout(patience, inbound.message()).await else {
+        let message = format!("did not come within {} s", patience.as_secs_f64());
+        let _ = opening.send(Err(Refusal::new(Reason::TimedOut, "open", message).into()));
+        return;
+    };
+    let mut early = Early::default();
+    let first = match first {
+        Ok(Some(pb::TouchRequest { message: Some(Message::Open(open)) })) => {
+            let opening = begin(&services, &open, &account);
+            early.gather(opening, &mut inbound, services.config.limits.queued_commands_per_tool).await
+        }
+        Ok(_) => Err(Refusal::new(Reason::OutOfTurn, "open", "the first message must be `open`").into()),
+        Err(status) => {
+            let _ = opening.send(Err(status));
             return;
-        };
-        let mut early = Early::default();
-        let first = match first {
-            Ok(Some(pb::TouchRequest { message: Some(Message::Open(open)) })) => {
-                let opening = self.open(&open, &account);
-                early.gather(opening, &mut inbound, self.0.config.limits.queued_commands_per_tool).await
-            }
-            Ok(_) => Err(Refusal::new(Reason::OutOfTurn, "open", "the first message must be `open`").into()),
-            Err(status) => {
-                let _ = opening.send(Err(status));
-                return;
-            }
-        };
-        let (mut held, cut) = match first {
-            Ok((opened, held)) => {
-                let cut = opened.guard.cut().clone();
-                let _ = opening.send(Ok(opened));
-                (held, cut)
-            }
-            Err(status) => {
-                let _ = opening.send(Err(status));
-                return;
-            }
-        };
-        let (live, way) = (held.live.clone(), held.way.clone());
-        for command in early.dropped.drain(..) {
-            let message = "was one of too many that came before the stream was open";
-            let refusal = Refusal::new(Reason::QueueFull, "command", message);
-            self.0.traffic.refused(refusal.reason);
-            events.push(Event::Rejected(wire::sample::rejection(command.0, command.1, &refusal)));
         }
-        live.count_refused(early.refused);
-        let mut life = Life::of(held.arrival.is_some());
-        loop {
-            let message = tokio::select! {
-                message = early.next(&mut inbound) => message,
-                datagram = way.next(&mut held.arrival) => {
-                    if held.holder.has_time_for_datagram()
-                        && let Ok(poses) = datagram
-                        && let Err(refusal) = held.holder.poses(&poses, &events)
-                    {
-                        return events.close(refusal);
-                    }
-                    continue;
-                }
-                () = life.tick() => {
-                    way.stay_alive();
-                    continue;
-                }
-                () = cut.cancelled() => return events.close(crate::pace::streams::cut()),
-            };
-            match message {
-                Ok(Some(pb::TouchRequest { message: Some(Message::Command(command)) })) => {
-                    if let Err(refusal) = held.holder.command(&command, &events) {
-                        return events.close(refusal);
-                    }
-                }
-                Ok(Some(pb::TouchRequest { message: Some(Message::Renew(renew)) })) => {
-                    let now = now_ns();
-                    if let Err((refusal, is_abuse)) = held.holder.message(now) {
-                        if is_abuse {
-                            return events.close(refusal);
-                        }
-                        events.push(Event::Rejected(wire::sample::rejection(0, 0, &refusal)));
-                        continue;
-                    }
-                    if held.tools > 0
-                        && let Err(refusal) = live.at_intake(|intake, now| intake.renew(held.lease, now))
-                    {
-                        // A lease is not named in a stream.
-                        let refusal = Refusal { field: String::new(), ..refusal };
-                        events.push(Event::Rejected(wire::sample::rejection(0, 0, &refusal)));
-                    }
-                    events.push(Event::Renewed(renew.client_time_ns, now));
-                }
-                Ok(Some(_)) => {
-                    let refusal = Refusal::new(Reason::OutOfTurn, "message", "must be a command or `renew`");
+    };
+    let (mut held, cut) = match first {
+        Ok((opened, held)) => {
+            let cut = opened.guard.cut().clone();
+            let _ = opening.send(Ok(opened));
+            (held, cut)
+        }
+        Err(status) => {
+            let _ = opening.send(Err(status));
+            return;
+        }
+    };
+    let (live, way) = (held.live.clone(), held.way.clone());
+    for command in early.dropped.drain(..) {
+        let message = "was one of too many that came before the stream was open";
+        let refusal = Refusal::new(Reason::QueueFull, "command", message);
+        services.traffic.refused(refusal.reason);
+        events.push(Event::Rejected(wire::sample::rejection(command.0, command.1, &refusal)));
+    }
+    live.count_refused(early.refused);
+    let mut life = Life::of(held.arrival.is_some());
+    loop {
+        let message = tokio::select! {
+            message = early.next(&mut inbound) => message,
+            datagram = way.next(&mut held.arrival) => {
+                if held.holder.has_time_for_datagram()
+                    && let Ok(poses) = datagram
+                    && let Err(refusal) = held.holder.poses(&poses, &events)
+                {
                     return events.close(refusal);
                 }
-                Ok(None) => return events.push(Event::Finished),
-                Err(status) => {
-                    debug!(session = %live.id, %status, "a client vanished, or sent what can't be read");
-                    return events.push(Event::Failed(status));
+                continue;
+            }
+            () = life.tick() => {
+                way.stay_alive();
+                continue;
+            }
+            () = cut.cancelled() => return events.close(crate::pace::streams::cut()),
+        };
+        match message {
+            Ok(Some(pb::TouchRequest { message: Some(Message::Command(command)) })) => {
+                if let Err(refusal) = held.holder.command(&command, &events) {
+                    return events.close(refusal);
                 }
+            }
+            Ok(Some(pb::TouchRequest { message: Some(Message::Renew(renew)) })) => {
+                let now = now_ns();
+                if let Err((refusal, is_abuse)) = held.holder.message(now) {
+                    if is_abuse {
+                        return events.close(refusal);
+                    }
+                    events.push(Event::Rejected(wire::sample::rejection(0, 0, &refusal)));
+                    continue;
+                }
+                if held.tools > 0
+                    && let Err(refusal) = live.at_intake(|intake, now| intake.renew(held.lease, now))
+                {
+                    // A lease is not named in a stream.
+                    let refusal = Refusal { field: String::new(), ..refusal };
+                    events.push(Event::Rejected(wire::sample::rejection(0, 0, &refusal)));
+                }
+                events.push(Event::Renewed(renew.client_time_ns, now));
+            }
+            Ok(Some(_)) => {
+                let refusal = Refusal::new(Reason::OutOfTurn, "message", "must be a command or `renew`");
+                return events.close(refusal);
+            }
+            Ok(None) => return events.push(Event::Finished),
+            Err(status) => {
+                debug!(session = %live.id, %status, "a client vanished, or sent what can't be read");
+                return events.push(Event::Failed(status));
             }
         }
     }

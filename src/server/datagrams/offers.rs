@@ -1,0 +1,81 @@
+//! Offers of datagram sessions: where to go, and with which ticket.
+
+use std::net::{SocketAddr, UdpSocket};
+use std::sync::{Arc, Mutex};
+
+use palpate_proto::pb;
+
+use super::tickets::{Arrival, Tickets};
+use crate::lock::lock;
+use crate::pace::clock::now_ns;
+use crate::refusal::{Reason, Refusal, Result};
+use crate::server::address::host_and_port;
+use crate::server::config::Config;
+
+/// Where datagrams are received, if at all.
+pub(in crate::server) struct Socket {
+    pub(super) socket: UdpSocket,
+    advertised: (String, u16),
+}
+
+impl Socket {
+    /// The UDP socket beside the listener at `address`. `None` where datagrams are disabled, or where tickets would be sent in
+    /// the clear.
+    ///
+    /// # Errors
+    /// Returns why the port can't be had: touch works without it.
+    pub(in crate::server) fn open(config: &Config, address: SocketAddr) -> std::io::Result<Option<Socket>> {
+        let is_private = config.tls_cert.is_some() || address.ip().is_loopback();
+        if !config.datagrams || !is_private {
+            return Ok(None);
+        }
+        let socket = UdpSocket::bind(address)?;
+        let advertised = config.datagrams_advertise.as_deref().and_then(host_and_port);
+        let advertised = advertised.unwrap_or((String::new(), address.port()));
+        Ok(Some(Socket { socket, advertised }))
+    }
+}
+
+/// Offers sessions for datagrams, or none if the server has none.
+#[derive(Clone, Default)]
+pub(in crate::server) struct Datagrams(pub(super) Option<Arc<Offers>>);
+
+/// The tickets that are out, and where they are good.
+pub(super) struct Offers {
+    advertised: (String, u16),
+    pub(super) tickets: Mutex<Tickets>,
+    pub(super) certificate_sha256: Mutex<[u8; 32]>,
+}
+
+impl Datagrams {
+    /// Of what `socket` receives.
+    pub(in crate::server) fn at(socket: Option<&Socket>) -> Self {
+        Datagrams(socket.map(|socket| {
+            Arc::new(Offers {
+                advertised: socket.advertised.clone(),
+                tickets: Mutex::default(),
+                certificate_sha256: Mutex::default(),
+            })
+        }))
+    }
+
+    /// An offer for one stream or lease, and the session that takes it. `None` if the server has no datagrams, or too many
+    /// tickets are out.
+    ///
+    /// # Errors
+    /// Returns an error if the system has no random numbers.
+    pub(in crate::server) fn offer(&self) -> Result<Option<(pb::DatagramOffer, Arrival)>> {
+        let Some(offers) = &self.0 else { return Ok(None) };
+        let Some((ticket, arrival)) = lock(&offers.tickets).give(now_ns())? else { return Ok(None) };
+        let (host, port) = offers.advertised.clone();
+        let certificate_sha256 = lock(&offers.certificate_sha256).to_vec();
+        let offer = pb::DatagramOffer { host, port: port.into(), ticket: ticket.to_vec(), certificate_sha256 };
+        Ok(Some((offer, arrival)))
+    }
+}
+
+/// The refusal of a call for datagrams that the server does not have.
+pub(in crate::server) fn not_available() -> Refusal {
+    let message = "this server has no datagrams at the moment: samples come by WatchSamples, poses go by SendCommands";
+    Refusal::new(Reason::NotAvailable, "", message)
+}

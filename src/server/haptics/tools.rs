@@ -1,0 +1,16 @@
+//! What calls that hold tools share.
+
+use crate::budget::{Account, Resource, Taken};
+use crate::refusal::{Reason, Refusal};
+use crate::session::lease::LeaseId;
+
+/// Charges `account` for so many tools.
+pub(super) fn charges(account: &Account, tools: usize) -> Result<Vec<Taken>, Refusal> {
+    (0..tools).map(|_| account.take(Resource::Leases, 1, "tools")).collect()
+}
+
+/// The lease that a text names.
+pub(super) fn lease_id(text: &str) -> Result<LeaseId, Refusal> {
+    let wrong = |_| Refusal::new(Reason::NotHolder, "lease_id", "is none that this server gave");
+    LeaseId::from_str_radix(text, 16).map_err(wrong)
+}
