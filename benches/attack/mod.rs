@@ -4,6 +4,7 @@
 
 mod bytes;
 mod crowd;
+mod datagrams;
 mod hoard;
 mod legal;
 mod toil;
@@ -192,6 +193,18 @@ pub const KINDS: &[Kind] = &[
     kind("flood-priority", "PRIORITY frames as fast as they go", |g| Box::pin(bytes::frames(g, &bytes::PRIORITY))),
     kind("flood-ping", "PING frames as fast as they go", |g| Box::pin(bytes::frames(g, &bytes::PING))),
     kind("flood-settings", "SETTINGS frames as fast as they go", |g| Box::pin(bytes::frames(g, &bytes::SETTINGS))),
+    kind("datagram-noise", "UDP packets of random bytes as fast as they go", |g| {
+        Box::pin(datagrams::packets(g, false))
+    }),
+    kind("datagram-beginnings", "UDP packets that look like the first of a handshake, as fast as they go", |g| {
+        Box::pin(datagrams::packets(g, true))
+    }),
+    kind("datagram-tickets", "datagram sessions with forged tickets, 32 at a time", |g| {
+        Box::pin(datagrams::forged_tickets(g))
+    }),
+    kind("datagram-chatter", "a datagram session that says a hundred times what it may", |g| {
+        Box::pin(datagrams::chatter(g))
+    }),
     kind("stalled-viewer", "a viewer that asks for 1000 full frames a second and reads none", |g| {
         Box::pin(hoard::stalled_viewer(g))
     }),

@@ -14,6 +14,7 @@ use tokio_stream::wrappers::WatchStream;
 
 use super::stroke::Stroke;
 use super::tally::Tally;
+use super::tip::{self, Deadbands, Led};
 
 pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
@@ -55,6 +56,8 @@ pub(crate) struct Common {
     pub(crate) tally: Arc<Mutex<Tally>>,
     /// Commands per second.
     pub(crate) rate_hz: f64,
+    /// Clients lead tools with a tip.
+    pub(crate) touches: Option<Deadbands>,
 }
 
 impl Common {
@@ -76,6 +79,9 @@ struct Sent {
     acknowledged: u64,
     last_tick: Option<u64>,
     is_open: bool,
+    /// The tool of a client that leads one with a tip, and the command that a sample acknowledged last, with its time, ns.
+    led: Option<Led>,
+    newest: (u64, u64),
 }
 
 impl Sent {
@@ -156,15 +162,28 @@ impl Client {
             holder: format!("palpate-client load {}", self.tool),
             ..Default::default()
         };
+        let touches = self.common.touches;
+        if touches.is_some() && self.stroke.place_m(0.0).is_none() {
+            return Err(tonic::Status::invalid_argument("--touch is for sheets: this scene has a mesh"));
+        }
+        let open = touches.map_or(open.clone(), |deadbands| tip::opening(open, deadbands));
         let at_ns = Box::new([0; OUTSTANDING]);
-        let sent = Sent { sequence: 0, at_ns, acknowledged: 0, last_tick: None, is_open: false };
+        let sent =
+            Sent { sequence: 0, at_ns, acknowledged: 0, last_tick: None, is_open: false, led: None, newest: (0, 0) };
         let sent = Arc::new(Mutex::new(sent));
         let commands = {
             let (sent, common, stroke, tool) = (sent.clone(), self.common.clone(), self.stroke.clone(), self.tool);
             WatchStream::from_changes(ticks).filter_map(move |tick| command(&common, &stroke, tool, &sent, tick))
         };
         let inbound = Touch::open(channel, open, commands.map(Say::Command)).await?;
-        lock(&sent).is_open = true;
+        {
+            let mut sent = lock(&sent);
+            sent.led = touches.and_then(|deadbands| Led::new(inbound.opened(), deadbands));
+            if touches.is_some() && sent.led.is_none() {
+                return Err(tonic::Status::failed_precondition("the server tells no force law for --touch"));
+            }
+            sent.is_open = true;
+        }
         Ok(self.listen(inbound, sent))
     }
 
@@ -185,6 +204,9 @@ impl Client {
                     // A rejected command never acts, so a later acknowledgement does not count for it.
                     *lock(&sent).at(rejection.sequence) = 0;
                     *lock(&self.common.tally).rejected.entry(rejection.reason).or_default() += 1;
+                }
+                Ok(Some(Heard::ForceLaw(update))) => {
+                    lock(&sent).led.iter_mut().for_each(|led| led.learn(&update));
                 }
                 Ok(Some(_)) => {}
                 Ok(None) => break lock(&self.common.tally).broke("the server ended a stream".to_owned()),
@@ -221,8 +243,17 @@ impl Client {
         let mut tally = measures.then(|| lock(&self.common.tally));
         for sequence in sent.acknowledged + 1..=acknowledged.min(sent.sequence) {
             let at_ns = std::mem::take(sent.at(sequence));
-            if let Some(tally) = tally.as_mut().filter(|_| at_ns > 0) {
+            sent.newest = (sequence, at_ns);
+            if let Some(tally) = tally.as_mut().filter(|_| at_ns > 0 && sent.led.is_none()) {
                 tally.round_trip_ns.saturating_record(now_ns.saturating_sub(at_ns));
+            }
+        }
+        if let Some(led) = &mut sent.led {
+            led.hear(sample, now_ns as f64 * 1e-9);
+            // Samples that change little are not sent: how late is one that is? The wait for its step is by design.
+            let waited_ns = sample.tools.first().map_or(0, |tool| tool.step_wait_ns);
+            if let Some(tally) = tally.as_mut().filter(|_| sent.newest.0 == acknowledged && sent.newest.1 > 0) {
+                tally.round_trip_ns.saturating_record(now_ns.saturating_sub(sent.newest.1 + waited_ns));
             }
         }
         sent.acknowledged = sent.acknowledged.max(acknowledged);
@@ -260,16 +291,22 @@ fn command(common: &Common, stroke: &Stroke, tool: u32, sent: &Mutex<Sent>, tick
     if !sent.is_open || common.stage.is(Stage::DRAIN) {
         return None;
     }
+    #[allow(clippy::cast_precision_loss)]
+    let time_s = tick as f64 / common.rate_hz;
+    let now_ns = common.now_ns();
+    let action = match &mut sent.led {
+        Some(led) => led.tick(stroke, time_s, now_ns as f64 * 1e-9)?,
+        None => stroke.at(time_s),
+    };
     sent.sequence += 1;
-    let (sequence, now_ns) = (sent.sequence, common.now_ns());
+    let sequence = sent.sequence;
     *sent.at(sequence) = now_ns;
     if common.stage.is(Stage::MEASURE) {
         let mut tally = lock(&common.tally);
         tally.commands += 1;
         tally.unsent += missed;
     }
-    #[allow(clippy::cast_precision_loss)]
-    let action = Some(stroke.at(tick as f64 / common.rate_hz));
+    let action = Some(action);
     let (sequence, client_time_ns) = (Some(sequence), now_ns);
     Some(pb::Command { tool, sequence, client_time_ns, action, ..Default::default() })
 }

@@ -5,6 +5,7 @@ mod objective;
 mod stroke;
 mod swarm;
 mod tally;
+mod tip;
 
 use std::io::IsTerminal;
 use std::sync::{Arc, Mutex};
@@ -21,6 +22,7 @@ use client::{Common, Stage, lock};
 use objective::Objective;
 use swarm::{Orders, Stopped, Swarm};
 use tally::{Outcome, Tally};
+use tip::Deadbands;
 
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
@@ -51,6 +53,16 @@ pub(crate) struct Arguments {
     /// Frames per second of each viewer
     #[arg(long, value_name = "HZ", default_value_t = 60.0, value_parser = rate)]
     frame_rate_hz: f64,
+    /// Clients lead tools with a tip and render forces, as devices do, in place of pushing. Of a round trip, the wait for the step
+    /// of the sample does not count: that is what a deadband is for. Sheets only, such as --scene liver
+    #[arg(long)]
+    touch: bool,
+    /// With --touch: clients get a sample only when the rendered force would be off by more than this fraction
+    #[arg(long, value_name = "FRACTION", default_value_t = 0.0, requires = "touch", value_parser = fraction)]
+    deadband: f64,
+    /// With --touch: clients send a pose only when the server would be wrong about the tool by more than this fraction of the force
+    #[arg(long, value_name = "FRACTION", default_value_t = 0.0, requires = "touch", value_parser = fraction)]
+    up_deadband: f64,
     /// Clients that share a connection. With 1 each client has its own, like clients on separate machines
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     clients_per_connection: u32,
@@ -74,6 +86,11 @@ pub(crate) struct Arguments {
 fn seconds(text: &str) -> Result<f64, String> {
     let value: f64 = text.parse().map_err(|_| "is no number".to_owned())?;
     if (0.0..=36_000.0).contains(&value) { Ok(value) } else { Err("must be from 0 to 36000".to_owned()) }
+}
+
+fn fraction(text: &str) -> Result<f64, String> {
+    let value: f64 = text.parse().map_err(|_| "is no number".to_owned())?;
+    if (0.0..=1.0).contains(&value) { Ok(value) } else { Err("must be from 0 to 1".to_owned()) }
 }
 
 fn rate(text: &str) -> Result<f64, String> {
@@ -224,7 +241,9 @@ async fn trial(arguments: &Arguments, server: &Server, source: &Source, sessions
             frame_rate_hz: arguments.frame_rate_hz,
             lasts_s: (arguments.ramp_s + arguments.seconds + 30.0).min(600.0),
         };
-        let common = Common { clock, stage: stage.clone(), tally, rate_hz: arguments.rate_hz };
+        let deadbands = Deadbands { down: arguments.deadband, up: arguments.up_deadband };
+        let touches = arguments.touch.then_some(deadbands);
+        let common = Common { clock, stage: stage.clone(), tally, rate_hz: arguments.rate_hz, touches };
         let (phases, ready, told) = (phases.clone(), ready.clone(), told.clone());
         workers.push(std::thread::spawn(move || work(&orders, &common, &phases, &ready, told)));
     }

@@ -13,6 +13,8 @@ use pb::command::Action;
 pub(crate) struct Stroke {
     over: Over,
     force_n: f64,
+    /// How deep a tip presses, at most, m.
+    depth_m: f64,
     falloff_per_m: f64,
     /// Where the stroke begins, as a fraction of a turn; it differs from client to client.
     begin: f64,
@@ -49,12 +51,26 @@ impl Stroke {
         let virtual_springs = scene.virtual_springs.as_ref().and_then(|springs| springs.stiffness_n_per_m);
         // With this force the middle moves by about a third of a spacing.
         let stiffness_n_per_m = virtual_springs.unwrap_or(0.0) + 0.1 * springs.unwrap_or(0.0);
-        Stroke { over, force_n: 0.3 * stiffness_n_per_m * spacing_m, falloff_per_m: 4.0 / spacing_m, begin }
+        Stroke {
+            over,
+            force_n: 0.3 * stiffness_n_per_m * spacing_m,
+            depth_m: 0.3 * spacing_m,
+            falloff_per_m: 4.0 / spacing_m,
+            begin,
+        }
     }
 
     /// The same, beginning elsewhere.
     pub(crate) fn beginning(&self, begin: f64) -> Self {
         Stroke { begin, ..self.clone() }
+    }
+
+    /// Where a tip is at `time_s`, m: the same turn, pressed in as the force would; `None` on a mesh.
+    pub(crate) fn place_m(&self, time_s: f64) -> Option<DVec3> {
+        let Over::Sheet { middle_m, radius_m } = self.over else { return None };
+        let turn = TAU * (0.5 * time_s + self.begin);
+        let place_m = middle_m + radius_m * DVec2::new(turn.cos(), turn.sin());
+        Some(place_m.extend(-self.depth_m * (0.6 + 0.4 * (3.0 * turn).sin())))
     }
 
     /// The tool's action at `time_s`: one turn in 2 s, with three presses.
