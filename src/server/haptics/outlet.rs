@@ -16,6 +16,9 @@ use crate::server::force_law::Updates;
 use crate::server::recovered::Notices;
 use crate::wire;
 
+/// While samples go by datagram, one goes by the stream as well after so long.
+const HEARTBEAT_NS: u64 = 1_000_000_000;
+
 /// What the output of a haptic stream reads from. Samples go by datagram while those get through.
 pub(super) struct Outlet {
     updates: Option<Updates>,
@@ -23,6 +26,8 @@ pub(super) struct Outlet {
     samples: Reader<PacedSample>,
     notices: Notices,
     way: Arc<Way>,
+    /// When the last sample went by the stream.
+    streamed_ns: u64,
     /// What goes before the next sample, and that sample.
     ready: VecDeque<pb::touch_response::Message>,
     /// Answers that the client was too slow for.
@@ -39,7 +44,17 @@ impl Outlet {
         guard: StreamGuard,
         way: Arc<Way>,
     ) -> Self {
-        Outlet { updates, events, samples, notices, way, ready: VecDeque::new(), dropped_answers: 0, guard }
+        Outlet {
+            updates,
+            events,
+            samples,
+            notices,
+            way,
+            streamed_ns: 0,
+            ready: VecDeque::new(),
+            dropped_answers: 0,
+            guard,
+        }
     }
 
     /// The next message of the stream; `None` at its end.
@@ -83,7 +98,10 @@ impl Outlet {
             let told = |rejection| Message::Rejection(pb::Rejection { dropped_answers, ..rejection });
             self.ready.extend(self.notices.of(&paced.sample).into_iter().map(told));
             let sample = wire::sample::sample(&paced, self.guard.shape(), dropped, now_ns());
-            if !self.way.send(&sample) {
+            // The stream has a heartbeat of its own, by which a client knows that it is alive.
+            let (now, by_datagram) = (now_ns(), self.way.send(&sample));
+            if !by_datagram || now.saturating_sub(self.streamed_ns) >= HEARTBEAT_NS {
+                self.streamed_ns = now;
                 self.ready.push_back(Message::Sample(sample));
             }
         }
