@@ -16,8 +16,8 @@ use glam::DVec3;
 use crate::deadband::HEARTBEAT_S;
 use crate::path::EXTRAPOLATE_S;
 
-/// Shortest time between two heartbeats, s: four of them in the 50 ms after which the other end holds.
-pub const FASTEST_S: f64 = 0.0125;
+/// Shortest time between two heartbeats, s: five of them in the 50 ms after which the other end holds.
+pub const FASTEST_S: f64 = 0.01;
 
 /// A loss or a delay is remembered for this long, s.
 const MEMORY_S: f64 = 5.0;
