@@ -120,9 +120,9 @@ fn main() {
          `scale`. Figures of a run that became unstable are those until then.",
     );
     report.say(
-        "**Where it is measured.** The force law is that of the middle of the sheet, and every task stays within 1 cm of the \
-         middle: these figures are those of the place where the law is exact. Elsewhere, near edges and fixed points, the \
-         law is not that of the tissue under the tool, and errors are larger; that is not measured here.",
+        "**Where it is measured.** Every task stays within 1 cm of the middle of the sheet. The force law follows the tool, but \
+         near a fixed rim the force also changes along the tool's way, and the rim draws a pressed tip aside; models do \
+         not tell that, and errors are larger (docs/devices.md). `palpate-client link --place X,Y` measures it.",
     );
     boundary(&mut report);
     stiffness(&mut report);

@@ -5,6 +5,7 @@
 mod coarse;
 mod disc;
 mod exact;
+mod place;
 
 pub use coarse::first;
 pub use disc::Disc;

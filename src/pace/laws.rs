@@ -11,17 +11,16 @@ use crate::force_law::{self, Computation, Disc, Progress};
 use crate::lock::lock;
 use crate::memory;
 use crate::refusal::{Reason, Refusal, Result};
-use crate::shape::PointId;
 use crate::sheet::Model;
 use palpate_touch::Law;
 
-/// Laws that a session keeps.
-const MOST_LAWS: usize = 16;
+/// Laws that a session keeps: of a stroke about a corner of a sheet, and back.
+const MOST_LAWS: usize = 64;
 
 /// What a coarse and an exact law take: some tens of rows of six numbers.
 const LAW_BYTES: u64 = 2 << 10;
 
-/// What a session keeps of laws; the oldest goes when there are too many.
+/// What a session keeps of laws; the one that was asked for least lately goes when there are too many.
 #[derive(Default)]
 pub(crate) struct KeptLaws(Mutex<Option<Kept>>);
 
@@ -42,19 +41,12 @@ pub(crate) fn have_same_laws(a: &Model, b: &Model) -> bool {
 }
 
 impl KeptLaws {
-    /// The law of `model` under a tip of `radius_m` at a point, or in the middle ([`Disc::in_middle`]), for which at most
-    /// `most_work` springs times iterations are done. Its memory is charged to `payer`.
+    /// The law of `model` under a disc, for which at most `most_work` springs times iterations are done. Its memory is charged
+    /// to `payer`.
     ///
     /// # Errors
     /// Refuses if `payer` can't have the memory.
-    pub(crate) fn of(
-        &self,
-        radius_m: f64,
-        at: Option<PointId>,
-        model: &Arc<Model>,
-        most_work: u64,
-        payer: &Account,
-    ) -> Result<Arc<SoughtLaw>> {
+    pub(crate) fn of(&self, disc: Disc, model: &Arc<Model>, most_work: u64, payer: &Account) -> Result<Arc<SoughtLaw>> {
         let mut kept = lock(&self.0);
         let kept = match &mut *kept {
             Some(kept) if have_same_laws(&kept.model, model) => kept,
@@ -65,15 +57,17 @@ impl KeptLaws {
                 other.insert(Kept { model: model.clone(), laws: Vec::new(), taken })
             }
         };
-        if let Some(law) = kept.laws.iter().find(|law| (law.radius_m, law.at) == (radius_m, at)) {
-            return Ok(law.clone());
+        if let Some(known) = kept.laws.iter().position(|law| law.disc == disc) {
+            // The newest is the last.
+            kept.laws[known..].rotate_left(1);
+            return Ok(kept.laws[kept.laws.len() - 1].clone());
         }
         if kept.laws.len() == MOST_LAWS {
             kept.laws.remove(0);
         }
         kept.taken.grow_to(kept.model.bytes() + (kept.laws.len() as u64 + 1) * LAW_BYTES, "device")?;
         let (coarse, exact, turn) = (OnceLock::new(), OnceLock::new(), tokio::sync::Mutex::default());
-        let law = Arc::new(SoughtLaw { radius_m, at, model: kept.model.clone(), most_work, coarse, exact, turn });
+        let law = Arc::new(SoughtLaw { disc, model: kept.model.clone(), most_work, coarse, exact, turn });
         kept.laws.push(law.clone());
         Ok(law)
     }
@@ -82,8 +76,7 @@ impl KeptLaws {
 /// The law of a tissue under a tip: a coarse one at once, the exact one when it is computed.
 #[derive(Debug)]
 pub(crate) struct SoughtLaw {
-    radius_m: f64,
-    at: Option<PointId>,
+    disc: Disc,
     model: Arc<Model>,
     most_work: u64,
     coarse: OnceLock<Arc<Law>>,
@@ -93,11 +86,6 @@ pub(crate) struct SoughtLaw {
 }
 
 impl SoughtLaw {
-    fn disc(&self) -> Disc {
-        let in_middle = Disc::in_middle(&self.model, self.radius_m);
-        self.at.map_or(in_middle, |at| Disc { at_m: self.model.shape().rest_m(at), ..in_middle })
-    }
-
     /// The exact law, or why it can't be had, if that is known.
     pub(crate) fn exact(&self) -> Option<Result<Arc<Law>>> {
         self.exact.get().cloned()
@@ -115,9 +103,9 @@ impl SoughtLaw {
             return Ok(law.clone());
         }
         let law = memory::attempt("device", || {
-            let law = force_law::first(&self.model, self.disc(), stop);
+            let law = force_law::first(&self.model, self.disc, stop);
             // Hardly any tissue has no coarse law; then the exact one is worth its time.
-            Ok(law.or_else(|| force_law::exact_within(&self.model, self.disc(), self.most_work, stop)))
+            Ok(law.or_else(|| force_law::exact_within(&self.model, self.disc, self.most_work, stop)))
         });
         match law?.map(Arc::new) {
             Some(law) if law.is_coarse => Ok(self.coarse.get_or_init(|| law).clone()),
@@ -144,7 +132,7 @@ impl SoughtLaw {
     /// next call. None: [`Self::exact`] tells the result, unless it was stopped.
     pub(crate) fn advance(&self, computation: Option<Computation>, stop: &AtomicBool) -> Option<Computation> {
         let progress = memory::attempt("law", || {
-            let computation = computation.or_else(|| Computation::new(&self.model, self.disc(), self.most_work));
+            let computation = computation.or_else(|| Computation::new(&self.model, self.disc, self.most_work));
             Ok(computation.map_or(Progress::GivenUp, |computation| computation.advance(&self.model, stop)))
         });
         match progress {
@@ -167,6 +155,8 @@ impl SoughtLaw {
 
 #[cfg(test)]
 mod tests {
+    use glam::DVec3;
+
     use super::*;
     use crate::budget::Budget;
     use crate::limits::Limits;
@@ -176,9 +166,10 @@ mod tests {
         let [soft, hard, finer] =
             ["damping.coefficient_n_s_per_m=0.3", "damping.coefficient_n_s_per_m=0.6", "stepping.substeps=9"]
                 .map(|set| Model::paper(&["sheet.points=[5, 5]", "stepping.integrator=central", set]));
-        let budget = Budget::new(&Limits { memory_bytes: 64 << 10, ..Limits::default() }, 1, 1);
+        let budget = Budget::new(&Limits { memory_bytes: 256 << 10, ..Limits::default() }, 1, 1);
         let (account, kept) = (budget.account("one"), KeptLaws::default());
-        let of = |radius: u32, model: &Arc<Model>| kept.of(f64::from(radius), None, model, 1, &account);
+        let disc = |radius_m: f64| Disc { radius_m, at_m: DVec3::ZERO };
+        let of = |radius: u32, model: &Arc<Model>| kept.of(disc(f64::from(radius)), model, 1, &account);
         let taken = || budget.bytes_for(Purpose::Laws);
         let first = of(1, &soft).unwrap();
         assert_eq!(taken(), soft.bytes() + LAW_BYTES);

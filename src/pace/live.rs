@@ -18,6 +18,7 @@ use super::slots::StreamSlots;
 use super::status::Status;
 use super::taps::{ProbeTap, SampleTap};
 use crate::budget::{Account, Taken};
+use crate::force_law::Disc;
 use crate::limits::Limits;
 use crate::lock::lock;
 use crate::memory;
@@ -273,12 +274,12 @@ impl Live {
         self.tissue.subscribe()
     }
 
-    /// The force law of `model`, a tissue of this session, under a tip of `radius_m`. Nothing is computed here.
+    /// The force law of `model`, a tissue of this session, under a disc. Nothing is computed here.
     ///
     /// # Errors
     /// Refuses if the session's owner can't have the memory of a further law.
-    pub(crate) fn law(&self, model: &Arc<Model>, radius_m: f64, at: Option<PointId>) -> Result<Arc<SoughtLaw>> {
-        self.laws.of(radius_m, at, model, self.limits.law_work, &self.owner)
+    pub(crate) fn law(&self, model: &Arc<Model>, disc: Disc) -> Result<Arc<SoughtLaw>> {
+        self.laws.of(disc, model, self.limits.law_work, &self.owner)
     }
 
     /// Frames for a viewer.

@@ -1,7 +1,6 @@
 //! The force laws of a haptic stream: first one that is there at once, then the exact one, when it is computed.
 //!
-//! The same again when another tissue acts, and on a mesh when a tool has moved by more than its radius: a mesh is not the
-//! same everywhere.
+//! The same again when another tissue acts, and when the tool has come to a place whose law is another ([`Disc::follow`]).
 
 use std::sync::Arc;
 use std::task::{Context, Poll, ready};
@@ -17,16 +16,13 @@ use tracing::{Instrument, debug};
 
 use super::workshop::Workshop;
 use crate::budget::Account;
+use crate::force_law::Disc;
 use crate::pace::Live;
 use crate::pace::laws::{SoughtLaw, have_same_laws};
 use crate::session::laws::{FIRST, Laws};
-use crate::shape::PointId;
 use crate::sheet::Model;
 use palpate_proto::{pb, touch};
 use palpate_touch::Law;
-
-/// A tool so many radii away from the surface wants no law of the place.
-const NEAR_IN_RADII: f64 = 4.0;
 
 /// After the laws of a place so many times as long passes until those of another are begun, but not longer than this.
 const PAUSES: u32 = 3;
@@ -73,31 +69,32 @@ struct Known {
     number: u32,
     /// The tissue that it is of, or for which there is none.
     model: Arc<Model>,
-    /// Where it is of; none where the stream begins.
-    at: Option<PointId>,
+    /// Where it is of.
+    disc: Disc,
     /// Whether the exact law may follow.
     is_coarse: bool,
+    /// Whether the tissue has laws of other places: of a sheet only exact ones, so none if one of them can't be had.
+    has_places: bool,
 }
 
-/// Who computes the laws of a stream, and for which tip.
+/// Who computes the laws of a stream.
 struct Maker {
     workshop: Workshop,
     account: Account,
     live: Arc<Live>,
-    radius_m: f64,
 }
 
 impl Maker {
     /// The law to begin with: at most 50 ms of work.
-    async fn first(&self, model: &Arc<Model>, at: Option<PointId>) -> Result<Arc<Law>, Status> {
-        let sought = self.live.law(model, self.radius_m, at)?;
+    async fn first(&self, model: &Arc<Model>, disc: Disc) -> Result<Arc<Law>, Status> {
+        let sought = self.live.law(model, disc)?;
         Ok(self.workshop.work(&self.account, move |stop| sought.first(stop.flag())).await??)
     }
 
     /// The exact law. It is computed depth by depth: between two of them it is the turn of other work, also of the same
     /// caller.
-    async fn exact(&self, model: &Arc<Model>, at: Option<PointId>) -> Result<Arc<Law>, Status> {
-        let sought = self.live.law(model, self.radius_m, at)?;
+    async fn exact(&self, model: &Arc<Model>, disc: Disc) -> Result<Arc<Law>, Status> {
+        let sought = self.live.law(model, disc)?;
         let _turn = sought.turn().await;
         let mut computation = None;
         loop {
@@ -119,30 +116,23 @@ impl Maker {
         place_m: Option<DVec3>,
         tell: &mpsc::Sender<LawUpdate>,
     ) {
-        let at = self.place(known, model, place_m);
         let is_other = !have_same_laws(&known.model, model);
-        if is_other || at != known.at {
-            let law = self.first(model, at).await;
-            let is_coarse = law.as_ref().is_ok_and(|law| law.is_coarse);
+        let place_m = place_m.filter(|_| known.has_places || is_other);
+        let disc = place_m.map_or(known.disc, |place_m| known.disc.follow(model, place_m));
+        if is_other || disc != known.disc {
+            // A coarse law of a sheet is that of the middle.
+            let is_exact = !is_other && model.shape().dimensions() == 2;
+            let law = if is_exact { self.exact(model, disc).await } else { self.first(model, disc).await };
+            let (is_coarse, has_places) = (law.as_ref().is_ok_and(|law| law.is_coarse), !is_exact || law.is_ok());
             self.say(known, is_other.then_some(step), law, tell).await;
-            (known.model, known.at, known.is_coarse) = (model.clone(), at, is_coarse);
+            *known = Known { number: known.number, model: model.clone(), disc, is_coarse, has_places };
         }
         if known.is_coarse {
-            let law = self.exact(model, at).await;
+            let law = self.exact(model, disc).await;
+            known.has_places = law.is_ok() || model.shape().dimensions() > 2;
             self.say(known, None, law, tell).await;
             known.is_coarse = false;
         }
-    }
-
-    /// The point whose law serves a tool at a place: the one that is known, as long as the tool is within a radius of it.
-    fn place(&self, known: &Known, model: &Model, place_m: Option<DVec3>) -> Option<PointId> {
-        let Some(place_m) = place_m else { return known.at };
-        let shape = model.shape();
-        let nearest = shape.nearest(place_m);
-        let nearest_m = shape.rest_m(nearest);
-        let is_near = |at: PointId| shape.rest_m(at).distance(nearest_m) <= self.radius_m;
-        let is_far = nearest_m.distance(place_m) > NEAR_IN_RADII * self.radius_m;
-        if is_far || known.at.is_some_and(is_near) { known.at } else { Some(nearest) }
     }
 
     async fn say(
@@ -182,9 +172,10 @@ impl Computing {
     ) -> Result<(Arc<Law>, Self), Status> {
         let mut tissue = live.tissue();
         let model = tissue.borrow_and_update().1.clone();
-        let maker = Maker { workshop: workshop.clone(), account: account.clone(), live: live.clone(), radius_m };
-        let law = maker.first(&model, None).await?;
-        let known = Known { number: FIRST, model, at: None, is_coarse: law.is_coarse };
+        let maker = Maker { workshop: workshop.clone(), account: account.clone(), live: live.clone() };
+        let disc = Disc::in_middle(&model, radius_m);
+        let law = maker.first(&model, disc).await?;
+        let known = Known { number: FIRST, model, disc, is_coarse: law.is_coarse, has_places: true };
         Ok((law, Computing { maker, tissue, known }))
     }
 
@@ -276,7 +267,7 @@ mod tests {
         }
 
         fn sought(&self) -> Arc<SoughtLaw> {
-            self.live.law(&self.live.model, self.radius_m(), None).unwrap()
+            self.live.law(&self.live.model, Disc::in_middle(&self.live.model, self.radius_m())).unwrap()
         }
 
         /// Changes the tissue; tells the step from which on the other acts.

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use crate::common::{model, scene_with};
 use crate::server::{PATIENCE, Server, Touch, open};
+use glam::DVec3;
 use palpate::force_law::{self, Disc};
 use palpate::scene::BUILT_IN;
 use palpate::sheet::Model;
@@ -104,8 +105,13 @@ struct Lead {
 impl Lead {
     /// Into the middle of `paper`.
     async fn press(&mut self, z_m: f64) {
+        self.lead(DVec3::new(0.5, 0.5, z_m)).await;
+    }
+
+    async fn lead(&mut self, place_m: DVec3) {
         self.sequence += 1;
-        let pose = pb::Pose { position_m: Some(pb::Vector3 { x: 0.5, y: 0.5, z: z_m }), ..Default::default() };
+        let DVec3 { x, y, z } = place_m;
+        let pose = pb::Pose { position_m: Some(pb::Vector3 { x, y, z }), ..Default::default() };
         let command = pb::Command {
             tool: 0,
             sequence: Some(self.sequence),
@@ -247,4 +253,47 @@ async fn another_tissue_brings_its_law_which_models_then_name() {
     let exact = force_law::exact(&model(&scene), 0.005);
     assert_eq!(laws[3], exact);
     assert!(apart(&exact, &laws[1])[1] > 0.1, "the tissues hardly differ");
+}
+
+#[tokio::test]
+async fn a_tool_that_goes_to_the_rim_gets_the_law_of_the_rim_and_none_on_the_way_through_the_middle() {
+    let server = limited("");
+    let scene = scene_with(BUILT_IN.iter().find(|scene| scene.0 == "liver").unwrap().1, &[]);
+    let source = pb::create_session_request::Source::Scene(wire::scene::scene(&scene));
+    let session = server.create(source, false).await.unwrap().session_id;
+    let model = model(&scene);
+    let in_middle = Disc::in_middle(&model, 0.005);
+    let mut touch = Touch::open(&server, with_device(&session, &[0])).await.unwrap();
+    let mut laws = vec![touch::from_law(&touch.opened.take().unwrap().law.unwrap()).unwrap()];
+    let mut lead = Lead { touch, begun: Instant::now(), sequence: 0 };
+    // The middle, a place that is as the middle, one radius from the fixed rim, and a place with that distance elsewhere.
+    // The tool is above them: the law comes before it touches.
+    let course = [(0.0375, 0.0375, 1), (0.03, 0.045, 1), (0.005, 0.0375, 2), (0.045, 0.07, 2)];
+    for (x_m, y_m, law) in course {
+        let mut named = 0_u32;
+        tokio::time::timeout(10 * PATIENCE, async {
+            let from = lead.sequence + 1;
+            while named < 20 {
+                lead.lead(DVec3::new(x_m, y_m, 0.002)).await;
+                match lead.touch.hear().await.unwrap().unwrap() {
+                    Heard::ForceLaw(update) => {
+                        let told = update.law.unwrap();
+                        assert_eq!((told.number as usize, told.coarse, update.tissue_step), (laws.len(), false, None));
+                        laws.push(touch::from_law(&told).unwrap());
+                    }
+                    Heard::Sample(sample) => {
+                        let Some(of_model) = law_of(&sample, &laws) else { continue };
+                        named += u32::from(of_model == law && sample.tools[0].acknowledged_sequence >= from);
+                    }
+                    _ => {}
+                }
+            }
+        })
+        .await
+        .unwrap_or_else(|_| panic!("({x_m}, {y_m}): {named} models named law {law} of {}", laws.len()));
+    }
+    let at_rim = in_middle.follow(&model, DVec3::new(0.005, 0.0375, 0.0));
+    let expected =
+        [in_middle, at_rim].map(|disc| force_law::exact_within(&model, disc, u64::MAX, &AtomicBool::new(false)));
+    assert_eq!(laws[1..], expected.map(Option::unwrap));
 }

@@ -36,8 +36,9 @@ pub(super) struct Holder {
     seen: BTreeMap<u32, Seen>,
 }
 
-/// Where the tool of a stream is, as the computation of its laws is told.
+/// Where the tool of a stream is, of several the first, as the computation of its laws is told.
 pub(super) struct ToolPlace {
+    pub(super) tool: u32,
     /// Of the tip, m.
     pub(super) radius_m: f64,
     pub(super) told: watch::Sender<Option<DVec3>>,
@@ -47,6 +48,9 @@ impl ToolPlace {
     /// Tells the place of a pose that is half a radius away from the last that was told.
     fn follow(&self, command: &Command) {
         let Action::Pose { place_m, .. } = command.action else { return };
+        if command.tool != self.tool {
+            return;
+        }
         self.told.send_if_modified(|told| {
             let is_news = told.is_none_or(|told_m| told_m.distance(place_m) > 0.5 * self.radius_m);
             if is_news {

@@ -123,9 +123,8 @@ async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> 
     })?;
     let (told, places) = watch::channel(None);
     let (updates, _computing) = computing.zip(laws).map(|(computing, laws)| computing.go_on(laws, places)).unzip();
-    // Only a mesh has other laws at other places.
-    let has_places = device.is_some() && live.model.shape().dimensions() > 2;
-    let place = has_places.then_some(ToolPlace { radius_m: tip.radius_m, told });
+    let led = open.tools.first().filter(|_| device.is_some());
+    let place = led.map(|tool| ToolPlace { tool: *tool, radius_m: tip.radius_m, told });
     // Held from here on: what fails below gives the tools back.
     let tools = open.tools.len();
     let (limits, traffic) = (&services.config.limits, services.traffic.clone());
