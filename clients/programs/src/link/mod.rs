@@ -8,20 +8,18 @@ mod run;
 mod tissue;
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
 use clap::{Args, ValueEnum};
 use glam::DVec3;
-use palpate::force_law::{self, Disc};
+use palpate::force_law::Disc;
 use palpate::limits::Limits;
 use palpate::memory;
 use palpate::scene::check::check_tip;
 use palpate::scene::collection::find_scene;
 use palpate::sheet::Model;
 use palpate_proto::refusal::{Reason, Refusal, number};
+use palpate_touch::Tip;
 use palpate_touch::carrier::Carried;
-use palpate_touch::{Law, Tip};
 use serde_json::{Value, json};
 
 use crate::Failure;
@@ -334,18 +332,16 @@ fn setup(arguments: &Arguments) -> Result<Setup, Refusal> {
         return Err(Refusal::new(Reason::NotAvailable, "--server", message));
     }
     let spot = Spot::new(&model, near_m, tip.radius_m);
-    // A sheet has one law, that of its middle.
-    let in_middle = Disc::in_middle(&model, tip.radius_m);
-    let disc = if model.shape().dimensions() > 2 { Disc { at_m: spot.at_m, ..in_middle } } else { in_middle };
-    let law = force_law::exact_within(&model, disc, u64::MAX, &AtomicBool::new(false));
-    let law = law.filter(Law::is_sound).ok_or_else(|| {
+    // With a server the first law is that of the middle, but before the first press it tells that of the place.
+    let disc = Disc::in_middle(&model, tip.radius_m).follow(&model, spot.at_m);
+    let law = tissue::law_at(&model, disc).ok_or_else(|| {
         Refusal::new(Reason::NotAvailable, "--scene", "has no force law: nothing holds it, or it is too large")
     })?;
-    let law = Arc::new(law);
     let (scheme, seed) = (arguments.scheme, arguments.seed);
     Ok(Setup {
         model,
         law,
+        disc,
         tip,
         spot,
         hand,

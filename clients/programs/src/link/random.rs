@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use palpate::force_law;
+use palpate::force_law::{self, Disc};
 use palpate::limits::Limits;
 use palpate::scene::{BUILT_IN, Scene};
 use palpate::sheet::Model;
@@ -63,6 +63,7 @@ pub(super) fn print(arguments: &Arguments, runs: u64) -> Result<(), Failure> {
         Setup {
             model: model.clone(),
             law: law.clone(),
+            disc: Disc::in_middle(model, tip.radius_m),
             tip,
             spot: Spot::new(model, model.shape().extent().middle_m(), tip.radius_m),
             hand,

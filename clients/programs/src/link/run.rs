@@ -4,6 +4,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use glam::DVec3;
+use palpate::force_law::Disc;
 use palpate::sheet::Model;
 use palpate_proto::touch::sample_bytes;
 use palpate_touch::carrier::Carried;
@@ -13,7 +14,7 @@ use palpate_touch::hand::{Hand, HandState};
 use palpate_touch::path::Path;
 use palpate_touch::{Device, Law, LimitCause, LocalModel, News, Pulse, Renderer, RenderingState, Tip, Told};
 
-use super::tissue::{Server, Spot, Tissue, Twin};
+use super::tissue::{PlaceLaws, Server, Spot, Tissue, Twin};
 use crate::simulated::network::{Conditions, Direction, Stalls, Transport};
 use crate::simulated::random::Random;
 use crate::simulated::task::{self, Task};
@@ -33,7 +34,9 @@ pub(super) enum Rendering {
 #[derive(Debug, Clone)]
 pub(super) struct Setup {
     pub(super) model: Arc<Model>,
+    /// The law to begin with, and where it is of.
     pub(super) law: Arc<Law>,
+    pub(super) disc: Disc,
     pub(super) tip: Tip,
     /// Where the task is done.
     pub(super) spot: Spot,
@@ -108,6 +111,13 @@ impl Client {
             Client::Raw(newest) => *newest = Some(model),
             Client::Hold(newest, arrived_s, ..) => (*newest, *arrived_s) = (Some(model), Some(now_s)),
             Client::Model(renderer) => renderer.receive(model, now_s),
+        }
+    }
+
+    /// A law comes before the first model that names it.
+    fn learn(&mut self, number: u32, law: &Law) {
+        if let Client::Model(renderer) = self {
+            renderer.learn(number, law.clone());
         }
     }
 
@@ -282,6 +292,7 @@ pub(super) fn run(setup: &Setup) -> Result<Outcome, String> {
     let Setup {
         model,
         law,
+        disc,
         tip,
         spot,
         hand,
@@ -297,7 +308,8 @@ pub(super) fn run(setup: &Setup) -> Result<Outcome, String> {
     let middle_m = spot.at_m;
     let task = Task::new(middle_m, task::LEAD_S, *duration_s, scale, &mut Random::new(*seed, 0));
     let tissue = || Tissue::new(model, *tip, *spot, law.clone());
-    let (mut server, mut twin) = (Server::new(tissue()), Twin::new(tissue()));
+    let laws = PlaceLaws::new(*disc, law.clone());
+    let (mut server, mut twin) = (Server::new(tissue(), laws), Twin::new(tissue()));
     let mut up: Direction<Up> = Direction::new(*conditions, *seed, 1, task::LEAD_S);
     let mut down: Direction<Down> = Direction::new(*conditions, *seed, 2, task::LEAD_S);
     let (mut at_server, mut down_heartbeat_s) = (Pulse::default(), HEARTBEAT_S);
@@ -338,9 +350,9 @@ pub(super) fn run(setup: &Setup) -> Result<Outcome, String> {
             down_heartbeat_s = message.heartbeat_s;
         }
         if let Some(model) = server.step(now_s, TICK_S)?
-            && (deadband.is_exceeded(&model, law) || now_s - sent_s >= down_heartbeat_s - 1e-9)
+            && (deadband.is_exceeded(&model, server.laws.law(model.law)) || now_s - sent_s >= down_heartbeat_s - 1e-9)
         {
-            deadband.send(&model, law);
+            deadband.send(&model, server.laws.law(model.law));
             sent_s = now_s;
             totals.bytes += sample_bytes(&model);
             let heartbeat_s = at_server.heartbeat_s(now_s);
@@ -349,6 +361,7 @@ pub(super) fn run(setup: &Setup) -> Result<Outcome, String> {
         // While the client is stalled, the device holds the last force, and samples wait.
         while !is_stalled && let Some(message) = down.receive(now_s) {
             poses.answered(&message, now_s);
+            client.learn(message.model.law, server.laws.law(message.model.law));
             client.receive(message.model, now_s);
         }
         if !is_stalled {

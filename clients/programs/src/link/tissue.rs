@@ -1,8 +1,10 @@
 //! The server's side of the loop: a session that plays a tool's commands and returns what the tool felt.
 
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 use glam::{DMat3, DQuat, DVec3};
+use palpate::force_law::{self, Disc};
 use palpate::scene::script::Action;
 use palpate::session::Session;
 use palpate::session::command::{Command, Due};
@@ -103,19 +105,63 @@ impl Tissue {
     }
 }
 
+/// The laws that a client is told, numbered from [`FIRST`] on: of each place one. Computing them takes no virtual time.
+pub(super) struct PlaceLaws {
+    /// Of the tool's place.
+    disc: Disc,
+    told: Vec<(Disc, Arc<Law>)>,
+}
+
+impl PlaceLaws {
+    /// Of a client that begins with `law`, which is of `disc`.
+    pub(super) fn new(disc: Disc, law: Arc<Law>) -> Self {
+        PlaceLaws { disc, told: vec![(disc, law)] }
+    }
+
+    /// The law of a number.
+    pub(super) fn law(&self, number: u32) -> &Arc<Law> {
+        &self.told.get(number as usize).unwrap_or(&self.told[0]).1
+    }
+
+    /// The law that a tool at a place of the tissue wants from now on, and its number, if that is another.
+    fn follow(&mut self, model: &Model, place_m: DVec3) -> Option<(u32, Arc<Law>)> {
+        let disc = self.disc.follow(model, place_m);
+        if disc == self.disc {
+            return None;
+        }
+        self.disc = disc;
+        let number = match self.told.iter().position(|told| told.0 == disc) {
+            Some(number) => number,
+            None => {
+                let law = law_at(model, disc)?;
+                self.told.push((disc, law));
+                self.told.len() - 1
+            }
+        };
+        Some((u32::try_from(number).ok()?, self.told[number].1.clone()))
+    }
+}
+
+/// The exact law under a disc; none if nothing holds the tissue.
+pub(super) fn law_at(model: &Model, disc: Disc) -> Option<Arc<Law>> {
+    let law = force_law::exact_within(model, disc, u64::MAX, &AtomicBool::new(false));
+    law.filter(Law::is_sound).map(Arc::new)
+}
+
 /// A tissue behind a network.
 pub(super) struct Server {
     tissue: Tissue,
     pub(super) path: Path,
+    pub(super) laws: PlaceLaws,
 }
 
 impl Server {
-    pub(super) fn new(tissue: Tissue) -> Self {
+    pub(super) fn new(tissue: Tissue, laws: PlaceLaws) -> Self {
         let spot = tissue.spot;
         // A task begins above the place where it is done; of a sheet, that is where a path begins by itself.
         let is_sheet = tissue.session.model().shape().dimensions() == 2;
         let path = if is_sheet { Path::default() } else { Path::beginning_at(spot.above_m()) };
-        Server { tissue, path }
+        Server { tissue, path, laws }
     }
 
     /// Performs one step; returns its sample while the tool is in use.
@@ -125,6 +171,10 @@ impl Server {
             Some(Play::Release) | None => (None, 0.0),
         };
         let feel = self.tissue.step(place_m)?;
+        let Tissue { session, spot, modeller, .. } = &mut self.tissue;
+        if let Some((number, law)) = place_m.and_then(|at_m| self.laws.follow(session.model(), spot.of_tissue(at_m))) {
+            modeller.change_law(number, law);
+        }
         Ok(feel.map(|feel| self.tissue.model(&feel, time_s)))
     }
 }
