@@ -48,14 +48,14 @@ fn on_sheet(sheet: &Sheet, radius_m: f64, at_m: DVec2) -> DVec2 {
 fn folded(sheet: &Sheet, radius_m: f64, far_m: f64, at_m: DVec2) -> DVec2 {
     let (extent_m, spacing_m) = (sheet.extent_m(), sheet.spacing_m);
     let middle_m = 0.5 * extent_m;
-    let mut inward_m = (at_m - middle_m).abs();
+    let mut inward_m = (rounded(sheet, radius_m, at_m) - middle_m).abs();
     for axis in 0..2 {
-        if middle_m[axis] - inward_m[axis] >= far_m {
+        if middle_m[axis] - (at_m - middle_m)[axis].abs() >= far_m {
             // By whole cells.
             inward_m[axis] = (inward_m[axis] - spacing_m * (inward_m[axis] / spacing_m).round()).abs();
         }
     }
-    let folded_m = rounded(sheet, radius_m, middle_m - inward_m);
+    let folded_m = middle_m - inward_m;
     // Of a square both sides are alike.
     let is_square = sheet.points[0] == sheet.points[1];
     if is_square { DVec2::new(folded_m.min_element(), folded_m.max_element()) } else { folded_m }
