@@ -2,16 +2,21 @@
 //
 // A push is the paper's surgical force at the place where the drag began, leaning in the direction of the drag. A
 // stroke moves that place along, leaning in its direction of movement. A pull grasps a mass point and brings it where
-// you drag it. A place has a side on which it is touched, and pushes go into the tissue from there. Tools controlled by poses would work as well, but they need a command every 50 ms, which no browser
-// guarantees.
+// you drag it. A tip is led at a depth, and glides. A place has a side on which it is touched, and pushes go into the
+// tissue from there.
+//
+// Commands go by calls. Poses of a tip go by datagram while datagrams get through (datagrams.ts); they have times, by which
+// the server plays them. Poses that go by calls have none, and act when they come: a page can't promise one every 50 ms.
 
 import type { MessageInitShape } from "@bufbuild/protobuf";
 import type { CommandSchema, Sample } from "./gen/palpate/v1/haptic_pb";
+import { Datagrams } from "./datagrams";
+import { poseOf, type Lead } from "./poses";
 import type { Vec3 } from "./samples";
 import type { Place, Surface } from "./surface";
 import { describe, haptics, isGone, PATIENCE_MS, reasonOf } from "./server";
 
-export type Mode = "push" | "pull" | "stroke";
+export type Mode = "push" | "pull" | "stroke" | "tip";
 type Command = MessageInitShape<typeof CommandSchema>;
 
 /** The number of the tool that all pages use. */
@@ -25,6 +30,10 @@ const TICK_MS = 15;
 const LEASE_S = 4;
 /** After this time without a touch the hand releases the tool. */
 const IDLE_MS = 5000;
+/** A tip goes down over this time from beside the tissue: so the server knows from which side it comes. */
+const SINK_MS = 250;
+/** Between sequences of what goes different ways: datagrams count on from theirs. */
+const APART = 1n << 32n;
 /** Batches in flight: a round trip does not slow the hand down, and connections stay free for other calls. */
 const IN_FLIGHT = 2;
 
@@ -45,7 +54,7 @@ export class Hand {
   /** Strength, 0 to 1. */
   strength = 0.5;
   /** Round trip of the last batch minus the time that the server held it, ms. */
-  networkMs: number | undefined;
+  private callMs: number | undefined;
   onChange: () => void = () => {};
   onRefused: (message: string) => void = () => {};
   private leaseId: string | undefined;
@@ -60,14 +69,33 @@ export class Hand {
   private sentMs = 0;
   private touchedMs = 0;
   private timer: ReturnType<typeof setInterval> | undefined;
+  private pressedMs = 0;
   private fresh = false;
+  readonly datagrams: Datagrams;
+  /** The sequence from which datagrams count, while poses go by them. */
+  private from: bigint | undefined;
 
   constructor(
     readonly sessionId: string,
     private readonly name: string,
     readonly reach: Reach,
     private readonly surface: () => Surface,
-  ) {}
+    sampleEverySteps: number,
+  ) {
+    this.datagrams = new Datagrams(sessionId, TOOL, sampleEverySteps);
+    this.datagrams.onChange = () => {
+      this.fresh = true;
+      this.tick();
+    };
+    this.datagrams.onRejected = (reason, message) => {
+      if (!["STALE_SEQUENCE", "NOT_HOLDER"].includes(reason)) this.onRefused(message);
+    };
+  }
+
+  /** Round trip of commands minus the time that the server held them, ms. */
+  get networkMs(): number | undefined {
+    return this.datagrams.networkMs ?? this.callMs;
+  }
 
   get holds(): boolean {
     return this.leaseId !== undefined;
@@ -84,7 +112,7 @@ export class Hand {
 
   /** What forces on the tool are told times: a push on a body is told by all of it. */
   get share(): number {
-    return this.place && this.mode !== "pull" ? this.surface().push(this.place, this.reach.lengthM).share : 1;
+    return this.place && ["push", "stroke"].includes(this.mode) ? this.surface().push(this.place, this.reach.lengthM).share : 1;
   }
 
   /** Takes the tool if it is free. */
@@ -100,6 +128,8 @@ export class Hand {
       const { leaseId } = await haptics.acquireTool(request, { timeoutMs: PATIENCE_MS });
       this.leaseId = leaseId;
       this.sequence = 0n;
+      this.from = undefined;
+      void this.datagrams.open(leaseId);
       this.touchedMs = performance.now();
       this.timer ??= setInterval(() => this.tick(), TICK_MS);
       this.onChange();
@@ -119,7 +149,7 @@ export class Hand {
     this.place = place;
     this.onSurfaceM = onSurfaceM;
     this.leanM = [0, 0, 0];
-    this.touchedMs = performance.now();
+    this.touchedMs = this.pressedMs = performance.now();
     this.fresh = true;
     if (await this.take()) this.tick();
   }
@@ -147,6 +177,7 @@ export class Hand {
   lift(): void {
     if (!this.pressed) return;
     this.pressed = false;
+    this.datagrams.rest();
     this.touchedMs = performance.now();
     this.fresh = true;
     this.tick();
@@ -167,6 +198,7 @@ export class Hand {
 
   private lost(): void {
     this.leaseId = undefined;
+    this.datagrams.close();
     clearInterval(this.timer);
     this.timer = undefined;
     this.onChange();
@@ -174,21 +206,43 @@ export class Hand {
 
   /** Sends the present action, if it is due. */
   private tick(): void {
-    if (!this.leaseId || this.underWay >= IN_FLIGHT) return;
+    if (!this.leaseId) return;
     const now = performance.now();
+    if (this.pressed && this.mode === "tip" && this.datagrams.carries) return this.leadTip(now);
+    if (this.underWay >= IN_FLIGHT) return;
     const isRest = !this.pressed && this.released;
     if (isRest && now - this.touchedMs > IDLE_MS) return void this.letGo();
     // At rest, send just often enough to keep the lease.
     if (!this.fresh && now - this.sentMs < (isRest ? (LEASE_S * 1000) / 4 : REPEAT_MS)) return;
-    this.fresh = false;
+    // A tip that sinks is news at each tick.
+    this.fresh = this.mode === "tip" && this.pressed && now - this.pressedMs < SINK_MS;
     this.sentMs = now;
     const commands = isRest ? [] : [this.command(now)];
     this.released = !this.pressed;
     void this.send(this.leaseId, commands);
   }
 
+  private leadTip(now: number): void {
+    if (!this.place) return;
+    this.from ??= this.sequence += APART;
+    this.datagrams.lead({ lead: this.tip(this.place, now), from: this.from });
+    // They keep the lease.
+    this.sentMs = now;
+    this.fresh = false;
+  }
+
+  /** Where the tip is at a place: on its way from beside the tissue, or at its depth. */
+  private tip({ restM, outward: n }: Place, now: number): Lead {
+    const radiusM = this.reach.lengthM;
+    const part = Math.min(1, (now - this.pressedMs) / SINK_MS);
+    const outM = (1 - part) * 1.1 * radiusM - part * this.strength * this.reach.depthM;
+    return { positionM: [restM[0] + outM * n[0], restM[1] + outM * n[1], restM[2] + outM * n[2]], radiusM };
+  }
+
   private command(now: number): Command {
-    this.sequence += 1n;
+    this.datagrams.rest();
+    this.sequence += this.from === undefined ? 1n : APART;
+    this.from = undefined;
     const command = { tool: TOOL, sequence: this.sequence, clientTimeNs: BigInt(Math.round(now * 1e6)) };
     const { place, reach } = this;
     if (!this.pressed || !place) return { ...command, action: { case: "release", value: {} } };
@@ -199,6 +253,9 @@ export class Hand {
       const positionM = { x: from[0] + lean[0], y: from[1] + lean[1], z: from[2] + lean[2] };
       const target = { case: "positionM" as const, value: positionM };
       return { ...command, timeToLiveS, action: { case: "position", value: { ...surface.point(place), target } } };
+    }
+    if (this.mode === "tip") {
+      return { ...command, clientTimeNs: 0n, timeToLiveS, action: { case: "pose", value: poseOf(this.tip(place, now)) } };
     }
     const middleN = (reach.mostN * this.strength) / surface.push(place, reach.lengthM).sum;
     const value = { centre: surface.centre(place), forceN: this.forceN(middleN, place), falloffPerM: 1 / reach.lengthM };
@@ -235,7 +292,7 @@ export class Hand {
   private measure(sample: Sample, tookMs: number): void {
     const tool = sample.tools[0];
     if (tool && tool.acknowledgedSequence === this.sequence) {
-      this.networkMs = Math.max(0, tookMs - Number(tool.serverHoldNs) / 1e6);
+      this.callMs = Math.max(0, tookMs - Number(tool.serverHoldNs) / 1e6);
     }
   }
 

@@ -14,6 +14,11 @@ export interface Touched {
   reach: Reach;
 }
 
+/** Whether it goes to the places that a drag meets. */
+function glides({ mode }: Hand): boolean {
+  return mode === "stroke" || mode === "tip";
+}
+
 /** Rotation of the view per key press, radians. */
 const TURN = 0.08;
 
@@ -79,7 +84,7 @@ export class Input {
   private moved(event: PointerEvent): void {
     const { hand } = this.touched() ?? {};
     if (event.pointerId !== this.dragging || !hand || !this.from) return;
-    if (hand.mode === "stroke") {
+    if (glides(hand)) {
       const place = this.stage.pick(event.clientX, event.clientY);
       if (place) hand.goOn(place);
       return;
@@ -151,9 +156,9 @@ export class Input {
     return [x + up * n[0], y + up * n[1], z + up * n[2]];
   }
 
-  /** Arrow keys while Space is down: a stroke moves on, a push leans, a pull moves sideways. */
+  /** Arrow keys while Space is down: a stroke or tip moves on, a push leans, a pull moves sideways. */
   private lead(aim: Place, touched: Touched): void {
-    if (touched.hand.mode === "stroke") return touched.hand.goOn(aim);
+    if (glides(touched.hand)) return touched.hand.goOn(aim);
     const from = this.from?.place ?? aim;
     const way = new Vector3(...aim.restM).sub(new Vector3(...from.restM));
     touched.hand.lean(this.lifted(way.toArray(), from, touched));

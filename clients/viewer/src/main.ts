@@ -3,7 +3,7 @@
 // It shows only what frames and samples say. A worker receives frames and returns credit (four in flight), so a page that
 // draws slowly is not sent less. Positions and normals are computed once for each picture, for what is drawn; picking and
 // figures use all vertices. Commands go in batches of one with at most two in flight, the newest place only; each push has a
-// time to live, each lease four seconds. Without TLS a browser speaks HTTP/1.1 with six connections: hence one stream of
+// time to live, each lease four seconds. While a tool is held, another worker carries poses and samples by datagram, if it can. Without TLS a browser speaks HTTP/1.1 with six connections: hence one stream of
 // frames, one of samples, and one acknowledgement at a time.
 
 import type { MessageInitShape } from "@bufbuild/protobuf";
@@ -232,12 +232,15 @@ function sameSide([x, y, z]: Vec3, [ox, oy, oz]: Vec3): Vec3 {
 function tellControls(): void {
   if (!visit) return;
   const { hand, reach } = visit;
-  const text = hand.mode === "pull" ? "as you drag" : quantity(hand.strength * reach.mostN, "N");
+  const depth = () => quantity(hand.strength * reach.depthM, "m");
+  const text = hand.mode === "pull" ? "as you drag" : hand.mode === "tip" ? depth() : quantity(hand.strength * reach.mostN, "N");
   part("strength-value", HTMLOutputElement).value = text;
   part("strength", HTMLInputElement).setAttribute("aria-valuetext", text);
   part("refinement-value", HTMLOutputElement).value = String(visit.refinement);
   const range = quantity(reach.lengthM, "m");
-  part("meaning", HTMLElement).textContent = visit.surface.flank
+  part("meaning", HTMLElement).textContent = hand.mode === "tip"
+    ? `The tip is a disc of ${range} radius. Strength is its depth below the tissue at rest; what pushes back follows from that.`
+    : visit.surface.flank
     ? "Strength is the push in the middle of the tool. It fades out over about " +
       `${range}. What pushes back is the mean over the tissue around, weighted as the push is. The push is strongest in the ` +
       "middle, so that mean is less than the strength while nothing moves. While the tissue moves it may be more."
@@ -355,6 +358,7 @@ setInterval(() => {
   status.show({
     roundTripMs: visit.roundTripMs,
     networkMs: visit.hand.networkMs,
+    way: wayText(visit),
     frameAgeMs: frameAgeMs(),
     isStill: isStill(visit),
     silentMs: performance.now() - visit.heardMs,
@@ -410,6 +414,12 @@ function mark(scene: string): void {
   list.value = scene;
 }
 
+/** Datagrams belong to a lease. */
+function wayText({ hand }: Visit): string {
+  if (!hand.holds) return "no tool is held";
+  return hand.datagrams.carries ? "datagrams" : "gRPC-web";
+}
+
 /** Age of the newest frame here. */
 function frameAgeMs(): number | undefined {
   const [now, newest] = [visit?.nowS(), visit?.frames.newest];
@@ -450,6 +460,11 @@ const inside = {
   },
   get holds() {
     return visit?.hand.holds ?? false;
+  },
+  /** Whether datagrams get through, and how many were sent and came in this session; poses and samples in them. */
+  get datagrams() {
+    const { carries, counts } = visit?.hand.datagrams ?? {};
+    return { carries: carries ?? false, sent: 0, came: 0, poses: 0, samples: 0, fellBack: 0, ...counts };
   },
   /** The least room between a tool and the tissue as drawn, of the width of the tissue; undefined without a tool. */
   get clear() {

@@ -1,7 +1,7 @@
 // The samples of the tools: the newest, and those of the last seconds.
 
 import type { GridPoint, Vector3 } from "./gen/palpate/v1/geometry_pb";
-import type { Sample } from "./gen/palpate/v1/haptic_pb";
+import type { Sample, ToolSample } from "./gen/palpate/v1/haptic_pb";
 import { type Failure, haptics, keepOpen } from "./server";
 
 export type Vec3 = [number, number, number];
@@ -51,6 +51,11 @@ export interface Sense {
 /** Samples per second: more than a screen shows, few enough for any network. */
 const RATE_HZ = 100;
 
+/** Steps between two samples. */
+export function sampleEvery(stepRateHz: number): number {
+  return Math.max(1, Math.round(stepRateHz / RATE_HZ));
+}
+
 /** Length of the plots, s. */
 export const HISTORY_S = 6;
 
@@ -63,6 +68,8 @@ export class Samples {
   tools: Felt[] = [];
   readonly history: Moment[] = [];
   onSample: (sample: Sample) => void = () => {};
+  /** The tools of the newest sample that had those of everybody. */
+  private all: ToolSample[] = [];
 
   /** Forces of the tissue on a tool that are worth telling come to about a hundredth of `pointN`. */
   constructor(
@@ -86,12 +93,14 @@ export class Samples {
     signal: AbortSignal,
     onFailure: (failure: Failure, waitMs: number) => void,
   ): Promise<void> {
-    const sampleEverySteps = Math.max(1, Math.round(stepRateHz / RATE_HZ));
+    const sampleEverySteps = sampleEvery(stepRateHz);
     return keepOpen(
       async (signal, alive) => {
         for await (const { sample } of haptics.watchSamples({ sessionId, sampleEverySteps }, { signal })) {
           alive();
-          if (sample) this.take(sample);
+          if (!sample) continue;
+          this.all = sample.tools;
+          this.take(sample, sample.tools);
         }
       },
       signal,
@@ -99,9 +108,17 @@ export class Samples {
     );
   }
 
-  private take(sample: Sample): void {
+  /** Takes a sample of the own tool alone, which came another way. */
+  takeOwn(sample: Sample): void {
+    const isOwn = ({ tool }: ToolSample) => sample.tools.some((own) => own.tool === tool);
+    this.take(sample, [...sample.tools, ...this.all.filter((tool) => !isOwn(tool))]);
+  }
+
+  /** Takes a sample, unless a newer one came the other way. */
+  private take(sample: Sample, tools: ToolSample[]): void {
+    if (this.newest && sample.step < this.newest.step) return;
     this.newest = sample;
-    const felt = sample.tools
+    const felt = tools
       .filter((tool) => tool.point !== undefined || tool.vertex !== undefined)
       .map((tool) => ({
         tool: tool.tool,
@@ -116,6 +133,8 @@ export class Samples {
     this.tools = felt.filter((tool) => norm(tool.appliedN) > least || norm(tool.forceN) > least);
     const timeS = sample.simulationTimeS;
     const first = this.tools[0] ?? felt[0];
+    // The same step may come both ways.
+    if (this.history.at(-1)?.timeS === timeS) this.history.pop();
     if (first) this.history.push({ timeS, displacementM: first.displacementM, ...this.tell(first) });
     // A gap of a second or more stays visible. Older samples are dropped.
     while (this.history.length > 0 && this.history[0]!.timeS < timeS - HISTORY_S) this.history.shift();

@@ -6,6 +6,8 @@ import { received } from "./server";
 export interface Figures {
   roundTripMs?: number;
   networkMs?: number;
+  /** How touch goes to the server and back. */
+  way: string;
   frameAgeMs?: number;
   /** Whether nothing moves, so that no frame is due. */
   isStill: boolean;
@@ -108,6 +110,7 @@ export class Status {
     const inMs = (value: number | undefined) => (value === undefined ? "–" : `${value.toFixed(1)} ms`);
     this.set("round trip", inMs(figures.roundTripMs));
     this.set("commands, network only", inMs(figures.networkMs));
+    this.set("touch goes by", figures.way);
     this.set("frame age", figures.isStill ? "still" : inMs(figures.frameAgeMs));
     this.set("frames", `${taken.toFixed(0)}/s, drawn ${drawn.toFixed(0)}/s, skipped ${figures.framesSkipped}`);
     this.set("picture", figures.picture);

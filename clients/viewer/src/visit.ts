@@ -6,7 +6,7 @@ import { Frames } from "./frames";
 import type { Session } from "./gen/palpate/v1/session_pb";
 import { fetchMesh, type MeshData } from "./geometry";
 import { Hand, type Reach } from "./hand";
-import { type Felt, norm, Samples, type Sense } from "./samples";
+import { type Felt, norm, sampleEvery, Samples, type Sense } from "./samples";
 import { type Failure, keepOpen, PATIENCE_MS, sessions, sleep } from "./server";
 import { Sheet } from "./sheet";
 import type { Surface } from "./surface";
@@ -95,7 +95,8 @@ export class Visit {
     }
     this.surface ??= this.newSheet();
     this.samples = new Samples(this.reach.pointN, (tool) => this.sense(tool));
-    this.hand = new Hand(session.sessionId, holder, this.reach, () => this.surface);
+    this.hand = new Hand(session.sessionId, holder, this.reach, () => this.surface, sampleEvery(this.rateHz));
+    this.hand.datagrams.onSample = (sample) => this.samples.takeOwn(sample);
   }
 
   /** Vertices of refinement n: M = (m − 1)·n + m along a side of a sheet. */

@@ -48,7 +48,6 @@ export function launch() {
       "--no-sandbox",
       "--disable-gpu",
       "--enable-unsafe-swiftshader",
-      "--disable-quic",
       "--no-first-run",
       "--disable-background-networking",
       "--disable-component-update",
@@ -127,6 +126,7 @@ export class Server {
  * @typedef {{
  *   frames: { taken: number, skipped: number, drawn: number, timeS: number }, received: number, largestM: number, deepestM: number, forceN: number[],
  *   clear: number | undefined, cameraHeight: number, widthM: number, drawing: { isDrawn: boolean, isTextured: boolean, hasTexture: boolean },
+ *   datagrams: { carries: boolean, sent: number, came: number, poses: number, samples: number, fellBack: number },
  *   ageMs: number | undefined, picture: string, holds: boolean, at: (x: number, y: number) => [number, number], pixelAfterPress: (x: number, y: number) => Promise<number>,
  * }} Inside What the page tells of itself (src/main.ts).
  */

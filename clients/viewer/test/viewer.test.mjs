@@ -336,6 +336,70 @@ describe("the page", () => {
   });
 });
 
+describe("touch", () => {
+  /** Shows figures, chooses the tip, presses, and slides a way. @param {Page} page */
+  const glide = async (page) => {
+    await page.page.click("#details");
+    await page.says("figures", /touch goes by\s*no tool is held/);
+    await page.page.check("input[value=tip]");
+    await page.press(0.4, 0.5);
+    await page.until(({ largestM, forceN }) => largestM > 0.01 && forceN[0] > 0.05);
+    const [left, top] = await page.at(0.6, 0.5);
+    await page.page.mouse.move(left, top, { steps: 10 });
+    await page.until(({ forceN, deepestM }) => forceN[0] > 0.05 && deepestM > 0.005);
+  };
+
+  test("goes by datagram where browser and server have them, and the tip is led by poses", async () => {
+    const page = await open();
+    await glide(page);
+    await page.says("figures", /touch goes by\s*datagrams/);
+    const before = await page.ask(({ datagrams }) => datagrams);
+    await page.until(
+      ({ datagrams: { carries, sent, came, poses, samples } }, before) =>
+        carries && sent > before.sent + 20 && came > before.came + 20 && poses > before.poses + 20 && samples > before.samples + 20,
+      before,
+    );
+    await page.until(({ largestM, forceN }) => largestM > 0.01 && forceN[0] > 0.05);
+    await page.says("felt", /deep, pushes back/);
+    await page.picture("datagrams");
+    await rests(page);
+    // A push and a pull go by calls, and what they feel comes by datagram.
+    await page.page.check("input[value=push]");
+    const { poses, samples } = await page.ask(({ datagrams }) => datagrams);
+    await page.press();
+    await page.until(({ largestM, forceN, datagrams }, samples) => largestM > 0.02 && forceN[0] > 0.3 && datagrams.samples > samples + 20, samples);
+    assert.equal(await page.ask(({ datagrams }) => datagrams.poses), poses);
+    await rests(page);
+    await page.page.keyboard.press("Escape");
+    await page.says("figures", /touch goes by\s*no tool is held/);
+    const closed = await page.ask(({ datagrams }) => datagrams);
+    assert.equal(closed.carries, false);
+    // Another lease has a session of its own.
+    await page.page.check("input[value=tip]");
+    await page.press(0.5, 0.4);
+    await page.until(({ datagrams, forceN }, closed) => datagrams.poses > closed.poses + 20 && forceN[0] > 0.05, closed);
+    await rests(page);
+    assert.deepEqual(page.complaints, []);
+    await close(page);
+  });
+
+  test("goes by calls where the browser or the server has no datagrams", async () => {
+    const without = await Server.start(["--no-datagrams"]);
+    const bare = await browser.newContext(VIEWPORT);
+    await bare.addInitScript("delete window.WebTransport");
+    for (const page of [await open(paper(without)), await Page.open(bare, paper(server))]) {
+      await glide(page);
+      await page.says("figures", /touch goes by\s*gRPC-web/);
+      const { sent, came, carries } = await page.ask(({ datagrams }) => datagrams);
+      assert.deepEqual({ sent, came, carries }, { sent: 0, came: 0, carries: false });
+      await rests(page);
+      assert.deepEqual(page.complaints, []);
+      await close(page);
+    }
+    assert.equal(await without.stop(), 0);
+  });
+});
+
 /** Pixels from one side of the tissue's middle to the other, this part of its width. @param {Page} page @param {number} part */
 async function across(page, part) {
   const [from, to] = [await page.at(0.5 - part / 2, 0.5), await page.at(0.5 + part / 2, 0.5)];

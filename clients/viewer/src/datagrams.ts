@@ -1,0 +1,118 @@
+// The datagrams of a lease: poses and samples by WebTransport (courier.ts), where browser, server and network let them
+// through. Nothing depends on that: calls carry everything else, and everything if there are none.
+
+import { fromBinary } from "@bufbuild/protobuf";
+import type { Counts, Heard, Led, Order, Word } from "./courier";
+import { type DatagramOffer, type Sample, SampleSchema } from "./gen/palpate/v1/haptic_pb";
+import { haptics, PATIENCE_MS, reasonOf } from "./server";
+
+/** A session that could not be opened is not tried again for so long: a network that blocks it still will. */
+const AVOID_MS = 60_000;
+
+/** When sessions are tried again; never where the browser or the server has none. */
+let avoidedMs = typeof WebTransport === "undefined" ? Infinity : 0;
+
+export class Datagrams {
+  onSample: (sample: Sample) => void = () => {};
+  onRejected: (reason: string, message: string) => void = () => {};
+  /** The way changed. */
+  onChange: () => void = () => {};
+  networkMs: number | undefined;
+  /** Whether they get through. */
+  carries = false;
+  private worker: Worker | undefined;
+  /** Rises with each session that is to be opened. */
+  private opened = 0;
+  private now = none();
+  private before = none();
+
+  constructor(
+    private readonly sessionId: string,
+    private readonly tool: number,
+    private readonly sampleEverySteps: number,
+  ) {}
+
+  /** What was carried, over all leases. */
+  get counts(): Counts {
+    return sum(this.before, this.now);
+  }
+
+  /** Opens a session for a lease, if it can. */
+  async open(leaseId: string): Promise<void> {
+    this.close();
+    const { opened, sessionId, sampleEverySteps } = this;
+    if (performance.now() < avoidedMs) return;
+    try {
+      const { offer } = await haptics.openDatagrams({ sessionId, leaseId, sampleEverySteps }, { timeoutMs: PATIENCE_MS });
+      if (offer && opened === this.opened) this.start(offer);
+    } catch (error) {
+      // Any other refusal is of this lease, or of the moment.
+      if (["NOT_AVAILABLE", ""].includes(reasonOf(error))) avoidedMs = performance.now() + AVOID_MS;
+    }
+  }
+
+  private start(offer: DatagramOffer): void {
+    const host = offer.host || location.hostname;
+    const ticket = [...offer.ticket].map((byte) => byte.toString(16).padStart(2, "0")).join("");
+    const worker = new Worker(new URL("./courier.ts", import.meta.url), { type: "module", name: "datagrams" });
+    this.worker = worker;
+    worker.onmessage = ({ data }: MessageEvent<Heard>) => {
+      if (this.worker === worker) this.heard(data);
+    };
+    worker.onerror = () => this.worker === worker && this.close();
+    const url = `https://${host}:${offer.port}/touch/${ticket}`;
+    worker.postMessage({ url, certificateSha256: offer.certificateSha256.slice(), tool: this.tool } satisfies Order);
+  }
+
+  private heard({ carries, counts, networkMs, sample, rejection, isOver }: Heard): void {
+    this.now = counts;
+    this.networkMs = networkMs;
+    if (isOver) {
+      if (counts.came === 0) avoidedMs = performance.now() + AVOID_MS;
+      this.close();
+      return this.onChange();
+    }
+    if (sample) this.onSample(fromBinary(SampleSchema, sample));
+    if (rejection) this.onRejected(rejection.reason, rejection.message);
+    if (carries === this.carries) return;
+    this.carries = carries;
+    this.onChange();
+  }
+
+  /** Leads the tip, until `rest`. Sequences rise from `from` on. */
+  lead(led: Led): void {
+    this.worker?.postMessage(led);
+  }
+
+  rest(): void {
+    this.say("rest");
+  }
+
+  /** Closes the session. */
+  close(): void {
+    this.opened += 1;
+    this.say("close");
+    this.worker = undefined;
+    this.carries = false;
+    this.networkMs = undefined;
+    [this.before, this.now] = [this.counts, none()];
+  }
+
+  private say(word: Word): void {
+    this.worker?.postMessage(word);
+  }
+}
+
+function none(): Counts {
+  return { sent: 0, came: 0, poses: 0, samples: 0, fellBack: 0 };
+}
+
+function sum(a: Counts, b: Counts): Counts {
+  return {
+    sent: a.sent + b.sent,
+    came: a.came + b.came,
+    poses: a.poses + b.poses,
+    samples: a.samples + b.samples,
+    fellBack: a.fellBack + b.fellBack,
+  };
+}
