@@ -13,20 +13,19 @@ use std::time::SystemTime;
 
 use axum::body::Body;
 use axum::extract::Request;
-use axum::http::{HeaderMap, Method, StatusCode, header};
+use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
 use tracing::warn;
 use xxhash_rust::xxh3::xxh3_128;
 
-/// What a browser may do with the page: nothing from elsewhere, no script but its own, and no word of the session's
-/// name to other sites.
+/// What a browser may do with the page: nothing from elsewhere, no script but its own.
+const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; \
+                      connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'";
+
+/// The policy; and no word of the session's name to other sites.
 const GUARDS: [(header::HeaderName, &str); 3] = [
-    (
-        header::CONTENT_SECURITY_POLICY,
-        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; \
-         base-uri 'none'; form-action 'none'; frame-ancestors 'self'",
-    ),
+    (header::CONTENT_SECURITY_POLICY, POLICY),
     (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
     (header::REFERRER_POLICY, "no-referrer"),
 ];
@@ -78,6 +77,7 @@ struct File {
 pub(super) struct Page {
     folder: PathBuf,
     kept: Arc<tokio::sync::Mutex<Kept>>,
+    policy: HeaderValue,
 }
 
 /// Files by their paths.
@@ -85,9 +85,17 @@ pub(super) struct Page {
 struct Kept(BTreeMap<String, File>);
 
 impl Page {
-    /// The page in a folder.
-    pub(super) fn of(folder: PathBuf) -> Arc<Self> {
-        Arc::new(Page { folder, kept: Arc::default() })
+    /// The page in a folder. It may open datagrams at its own port; `datagrams` is HOST:PORT of another, if they are there.
+    pub(super) fn of(folder: PathBuf, datagrams: Option<&str>) -> Arc<Self> {
+        let connects = datagrams.map(|at| format!("connect-src 'self' https://{at}"));
+        let policy = connects.and_then(|connects| POLICY.replace("connect-src 'self'", &connects).try_into().ok());
+        Arc::new(Page { folder, kept: Arc::default(), policy: policy.unwrap_or(HeaderValue::from_static(POLICY)) })
+    }
+
+    /// An answer with the page's own policy.
+    fn guarded(&self, mut answer: Response) -> Response {
+        answer.headers_mut().insert(header::CONTENT_SECURITY_POLICY, self.policy.clone());
+        answer
     }
 
     /// A file. They are looked up one at a time, so requests take one thread for files, and none reads what another is
@@ -194,9 +202,9 @@ pub(super) async fn page(page: Arc<Page>, request: Request) -> Response {
     match page.file(&path).await {
         // Names in assets/ have a hash of what is in them.
         Some(File { bytes, tag, .. }) if path.starts_with("assets/") => {
-            cached(bytes, tag, content_type(&path), "public, max-age=31536000, immutable", headers)
+            page.guarded(cached(bytes, tag, content_type(&path), "public, max-age=31536000, immutable", headers))
         }
-        Some(File { bytes, tag, .. }) => cached(bytes, tag, content_type(&path), "no-cache", headers),
+        Some(File { bytes, tag, .. }) => page.guarded(cached(bytes, tag, content_type(&path), "no-cache", headers)),
         None if path == "index.html" => {
             let html = [(header::CONTENT_TYPE, content_type(&path)), (header::CACHE_CONTROL, "no-store")];
             // Without this the policy would keep the page's own few rules out.
@@ -219,7 +227,15 @@ mod tests {
 
     fn page() -> (Arc<Page>, tempfile::TempDir) {
         let folder = tempfile::tempdir().unwrap();
-        (Page::of(folder.path().to_owned()), folder)
+        (Page::of(folder.path().to_owned(), None), folder)
+    }
+
+    #[test]
+    fn the_page_may_open_datagrams_where_they_are_advertised() {
+        let policy = |datagrams| Page::of(PathBuf::new(), datagrams).policy.clone();
+        assert_eq!(policy(None), POLICY);
+        let advertised = policy(Some("udp.example:7117"));
+        assert!(advertised.to_str().unwrap().contains("; connect-src 'self' https://udp.example:7117; base-uri"));
     }
 
     #[tokio::test]

@@ -151,7 +151,7 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
     let incoming = connections::incoming(listener, tls, slots, &limits, budget.clone(), traffic, register.clone());
     let silence = Some(Duration::from_secs_f64(limits.keepalive_s));
     let bytes = limits.message_bytes;
-    let pages = page::Page::of(services.config.viewer.clone());
+    let pages = page::Page::of(services.config.viewer.clone(), services.config.datagrams_advertise.as_deref());
     // A part of a mesh may have as many bytes; its other fields have some as well.
     let with_part = bytes.saturating_add(4096);
     let sessions = SessionServiceServer::new(sessions::Sessions(services.clone())).max_decoding_message_size(with_part);

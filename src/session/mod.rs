@@ -355,6 +355,12 @@ impl Session {
         self.late_commands += late_commands;
         let index = command.tool as usize;
         let tool = self.tool(index);
+        // A pose that was overtaken fills a gap in a path; it does not begin a touch that something newer has ended.
+        let is_overtaken =
+            command.by_datagram && command.sequence.is_some_and(|sequence| sequence < tool.acknowledged_sequence);
+        if is_overtaken && tool.posed.is_none() {
+            return;
+        }
         if ends_lease {
             let Tool { control_point, around, paused_until, .. } = *tool;
             *tool = Tool { control_point, around, paused_until, expired: true, ..Tool::default() };
