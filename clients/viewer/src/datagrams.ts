@@ -6,11 +6,15 @@ import type { Counts, Heard, Led, Order, Word } from "./courier";
 import { type DatagramOffer, type Sample, SampleSchema } from "./gen/palpate/v1/haptic_pb";
 import { haptics, PATIENCE_MS, reasonOf } from "./server";
 
-/** A session that could not be opened is not tried again for so long: a network that blocks it still will. */
+/** Longest wait before a session is tried again: a network that blocks it still will. */
 const AVOID_MS = 60_000;
+/** First wait for another session where one has worked. A browser gives one up that hears nothing for some seconds. */
+const AGAIN_MS = 1000;
 
-/** When sessions are tried again; never where the browser or the server has none. */
+/** When sessions are tried again; never where the browser has none. */
 let avoidedMs = typeof WebTransport === "undefined" ? Infinity : 0;
+/** The wait after the next failure. */
+let waitMs = AVOID_MS;
 
 export class Datagrams {
   onSample: (sample: Sample) => void = () => {};
@@ -21,8 +25,8 @@ export class Datagrams {
   /** Whether they get through. */
   carries = false;
   private worker: Worker | undefined;
-  /** Rises with each session that is to be opened. */
-  private opened = 0;
+  private leaseId = "";
+  private again: ReturnType<typeof setTimeout> | undefined;
   private now = none();
   private before = none();
 
@@ -37,18 +41,34 @@ export class Datagrams {
     return sum(this.before, this.now);
   }
 
-  /** Opens a session for a lease, if it can. */
-  async open(leaseId: string): Promise<void> {
+  /** Opens a session for a lease, as soon as it can, and another if it fails; until `close`. */
+  open(leaseId: string): void {
     this.close();
-    const { opened, sessionId, sampleEverySteps } = this;
-    if (performance.now() < avoidedMs) return;
+    this.leaseId = leaseId;
+    const dueMs = avoidedMs - performance.now();
+    if (dueMs === Infinity) return;
+    if (dueMs > 0) this.again = setTimeout(() => void this.ask(leaseId), dueMs);
+    else void this.ask(leaseId);
+  }
+
+  private async ask(leaseId: string): Promise<void> {
+    const { sessionId, sampleEverySteps } = this;
     try {
       const { offer } = await haptics.openDatagrams({ sessionId, leaseId, sampleEverySteps }, { timeoutMs: PATIENCE_MS });
-      if (offer && opened === this.opened) this.start(offer);
+      if (offer && leaseId === this.leaseId) this.start(offer);
     } catch (error) {
-      // Any other refusal is of this lease, or of the moment.
+      // The server has none, or is older than they are. Any other refusal is of this lease, or of the moment.
       if (["NOT_AVAILABLE", ""].includes(reasonOf(error))) avoidedMs = performance.now() + AVOID_MS;
     }
+  }
+
+  /** A session has ended by itself. */
+  private failed(worked: boolean): void {
+    if (worked) waitMs = AGAIN_MS;
+    avoidedMs = performance.now() + waitMs;
+    waitMs = Math.min(AVOID_MS, 2 * waitMs);
+    this.open(this.leaseId);
+    this.onChange();
   }
 
   private start(offer: DatagramOffer): void {
@@ -59,7 +79,7 @@ export class Datagrams {
     worker.onmessage = ({ data }: MessageEvent<Heard>) => {
       if (this.worker === worker) this.heard(data);
     };
-    worker.onerror = () => this.worker === worker && this.close();
+    worker.onerror = () => this.worker === worker && this.failed(false);
     const url = `https://${host}:${offer.port}/touch/${ticket}`;
     worker.postMessage({ url, certificateSha256: offer.certificateSha256.slice(), tool: this.tool } satisfies Order);
   }
@@ -67,11 +87,7 @@ export class Datagrams {
   private heard({ carries, counts, networkMs, sample, rejection, isOver }: Heard): void {
     this.now = counts;
     this.networkMs = networkMs;
-    if (isOver) {
-      if (counts.came === 0) avoidedMs = performance.now() + AVOID_MS;
-      this.close();
-      return this.onChange();
-    }
+    if (isOver) return this.failed(counts.came > 0);
     if (sample) this.onSample(fromBinary(SampleSchema, sample));
     if (rejection) this.onRejected(rejection.reason, rejection.message);
     if (carries === this.carries) return;
@@ -90,7 +106,8 @@ export class Datagrams {
 
   /** Closes the session. */
   close(): void {
-    this.opened += 1;
+    clearTimeout(this.again);
+    this.leaseId = "";
     this.say("close");
     this.worker = undefined;
     this.carries = false;

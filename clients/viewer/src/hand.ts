@@ -129,7 +129,7 @@ export class Hand {
       this.leaseId = leaseId;
       this.sequence = 0n;
       this.from = undefined;
-      void this.datagrams.open(leaseId);
+      this.datagrams.open(leaseId);
       this.touchedMs = performance.now();
       this.timer ??= setInterval(() => this.tick(), TICK_MS);
       this.onChange();

@@ -6,6 +6,7 @@ import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { after, before, describe, test } from "node:test";
 import { colourAt, launch, makeOrgan, makeToken, Page, pageProcesses, ROOT, Server } from "./harness.mjs";
+import { Lossy } from "./lossy.mjs";
 
 /** @type {import("playwright-core").Browser} */
 let browser;
@@ -383,6 +384,35 @@ describe("touch", () => {
     await close(page);
   });
 
+  test("changes to calls and back without a word as a network swallows datagrams and lets them through", async () => {
+    const network = await Lossy.open();
+    const behind = await Server.start(["--datagrams-advertise", `127.0.0.1:${network.port}`]);
+    network.to = Number(new URL(behind.url).port);
+    const page = await open(`http://127.0.0.1:${network.port}/?scene=paper`);
+    await glide(page);
+    await page.until(({ datagrams }) => datagrams.carries && datagrams.poses > 20);
+    network.isCut = true;
+    await page.until(({ datagrams }) => !datagrams.carries);
+    const { poses } = await page.ask(({ datagrams }) => datagrams);
+    await page.page.mouse.move(...(await page.at(0.4, 0.4)), { steps: 3 });
+    // It is led, and felt, by calls alone.
+    await page.until(({ forceN, largestM }) => largestM > 0.01 && forceN[0] > 0.05);
+    assert.equal(await page.ask(({ datagrams }) => datagrams.poses), poses);
+    network.isCut = false;
+    await page.until(({ datagrams }, poses) => datagrams.carries && datagrams.poses > poses + 20, poses);
+    await page.says("figures", /touch goes by\s*datagrams/);
+    await page.until(({ forceN, largestM }) => largestM > 0.01 && forceN[0] > 0.05);
+    const { fellBack } = await page.ask(({ datagrams }) => datagrams);
+    assert.ok(fellBack >= 1);
+    assert.equal(await page.page.locator("#notice").isVisible(), false);
+    await rests(page);
+    // After some seconds the browser gives the session up. It tells its console if another can't be opened yet.
+    assert.deepEqual(page.complaints.filter((text) => !text.includes("Failed to establish a connection")), []);
+    await close(page);
+    assert.equal(await behind.stop(), 0);
+    network.close();
+  });
+
   test("goes by calls where the browser or the server has no datagrams", async () => {
     const without = await Server.start(["--no-datagrams"]);
     const bare = await browser.newContext(VIEWPORT);
@@ -623,7 +653,7 @@ describe("a body of any shape", () => {
     await page.picture("colon-within");
     await page.page.mouse.up();
     await page.until(({ forceN }) => forceN.length === 0);
-    for (const tool of ["pull", "stroke"]) {
+    for (const tool of ["pull", "stroke", "tip"]) {
       await page.page.check(`input[value=${tool}]`, { force: true });
       const [left, top] = await page.press();
       await page.page.mouse.move(left + 25, top + 25, { steps: 5 });
