@@ -4,7 +4,7 @@
 import { fromBinary } from "@bufbuild/protobuf";
 import type { Counts, Heard, Led, Order, Word } from "./courier";
 import { type DatagramOffer, type Sample, SampleSchema } from "./gen/palpate/v1/haptic_pb";
-import { haptics, PATIENCE_MS, reasonOf } from "./server";
+import { haptics, isUnimplemented, PATIENCE_MS, reasonOf } from "./server";
 
 /** Longest wait before a session is tried again: a network that blocks it still will. */
 const AVOID_MS = 60_000;
@@ -58,7 +58,7 @@ export class Datagrams {
       if (offer && leaseId === this.leaseId) this.start(offer);
     } catch (error) {
       // The server has none, or is older than they are. Any other refusal is of this lease, or of the moment.
-      if (["NOT_AVAILABLE", ""].includes(reasonOf(error))) avoidedMs = performance.now() + AVOID_MS;
+      if (reasonOf(error) === "NOT_AVAILABLE" || isUnimplemented(error)) avoidedMs = performance.now() + AVOID_MS;
     }
   }
 

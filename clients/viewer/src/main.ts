@@ -3,8 +3,9 @@
 // It shows only what frames and samples say. A worker receives frames and returns credit (four in flight), so a page that
 // draws slowly is not sent less. Positions and normals are computed once for each picture, for what is drawn; picking and
 // figures use all vertices. Commands go in batches of one with at most two in flight, the newest place only; each push has a
-// time to live, each lease four seconds. While a tool is held, another worker carries poses and samples by datagram, if it can. Without TLS a browser speaks HTTP/1.1 with six connections: hence one stream of
-// frames, one of samples, and one acknowledgement at a time.
+// time to live, each lease four seconds. While a tool is held, another worker carries poses and samples by datagram, if it
+// can. Without TLS a browser speaks HTTP/1.1 with six connections: hence one stream of frames, one of samples, and one
+// acknowledgement at a time.
 
 import type { MessageInitShape } from "@bufbuild/protobuf";
 import type { CreateSessionRequestSchema, Session } from "./gen/palpate/v1/session_pb";
@@ -229,18 +230,27 @@ function sameSide([x, y, z]: Vec3, [ox, oy, oz]: Vec3): Vec3 {
   return x * ox + y * oy + z * oz < 0 ? [-x, -y, -z] : [x, y, z];
 }
 
+/** What the strength is of the present tool. */
+function strengthText({ hand: { mode, strength }, reach }: Visit): string {
+  if (mode === "pull") return "as you drag";
+  return mode === "tip" ? quantity(strength * reach.depthM, "m") : quantity(strength * reach.mostN, "N");
+}
+
 function tellControls(): void {
   if (!visit) return;
-  const { hand, reach } = visit;
-  const depth = () => quantity(hand.strength * reach.depthM, "m");
-  const text = hand.mode === "pull" ? "as you drag" : hand.mode === "tip" ? depth() : quantity(hand.strength * reach.mostN, "N");
+  const text = strengthText(visit);
   part("strength-value", HTMLOutputElement).value = text;
   part("strength", HTMLInputElement).setAttribute("aria-valuetext", text);
   part("refinement-value", HTMLOutputElement).value = String(visit.refinement);
+  part("meaning", HTMLElement).textContent = meaningText(visit);
+}
+
+function meaningText({ hand, reach, surface }: Visit): string {
   const range = quantity(reach.lengthM, "m");
-  part("meaning", HTMLElement).textContent = hand.mode === "tip"
-    ? `The tip is a disc of ${range} radius. Strength is its depth below the tissue at rest; what pushes back follows from that.`
-    : visit.surface.flank
+  if (hand.mode === "tip") {
+    return `The tip is a disc of ${range} radius. Strength is its depth below the tissue at rest; what pushes back follows from that.`;
+  }
+  return surface.flank
     ? "Strength is the push in the middle of the tool. It fades out over about " +
       `${range}. What pushes back is the mean over the tissue around, weighted as the push is. The push is strongest in the ` +
       "middle, so that mean is less than the strength while nothing moves. While the tissue moves it may be more."
