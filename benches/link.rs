@@ -82,7 +82,7 @@ const COLUMNS: [(&str, &str); 11] = [
     ("p99, N", "force_error_p99_n"),
     ("least energy, J", "energy_min_j"),
     ("largest jump, N", "jump_max_n"),
-    ("guard acts, share of ticks", "guard_share"),
+    ("guard acts, share of ticks in contact", "guard_share"),
     ("rendered / true", "rendered_share"),
     ("peak / true peak", "peak_ratio"),
     ("model age p99, ms", "model_age_ms_p99"),
@@ -120,9 +120,9 @@ fn main() {
          `scale`. Figures of a run that became unstable are those until then.",
     );
     report.say(
-        "**Where it is measured.** Every task stays within 1 cm of the middle of the sheet. The force law follows the tool, but \
-         near a fixed rim the force also changes along the tool's way, and the rim draws a pressed tip aside; models do \
-         not tell that, and errors are larger (docs/devices.md). `palpate-client link --place X,Y` measures it.",
+        "**Where it is measured.** Tasks stay within 1 cm of the middle of the sheet but where a table says otherwise. The force \
+         law follows the tool, but near a fixed rim the force also changes along the tool's way, and the rim draws a pressed \
+         tip aside; models do not tell that, and errors are larger (docs/devices.md).",
     );
     boundary(&mut report);
     stiffness(&mut report);
@@ -130,6 +130,8 @@ fn main() {
     live(&mut report);
     let panels = delays(&mut report, seeds);
     others(&mut report, seeds);
+    lossy(&mut report, seeds);
+    places(&mut report, seeds);
     random(&mut report);
     report.write(3, &panels);
 }
@@ -329,13 +331,121 @@ fn live(report: &mut Report) {
     report.figure("real time", Value::Array(figures));
 }
 
+/// What the tables of both transports show, by title.
+const BOTH: [(&str, &str); 11] = [
+    ("force error, % RMS", "force_error_rms_percent"),
+    ("after outages, % RMS", "force_error_after_outages_percent"),
+    ("over this part of the contact", "after_outages_share"),
+    ("p99, N", "force_error_p99_n"),
+    ("bias, N", "force_bias_n"),
+    ("gain", "force_gain"),
+    ("depth error, m RMS", "depth_error_rms_m"),
+    ("p99, m", "depth_error_p99_m"),
+    ("of the depth, %", "depth_error_percent"),
+    ("guard acts, share of ticks in contact", "guard_share"),
+    ("least energy, J", "energy_min_j"),
+];
+
+/// A table of runs over a stream beside the same over datagrams, of liver and fibrotic tissue: by label and arguments.
+fn beside(report: &mut Report, name: &str, label: &str, runs: &[(String, String)], seeds: u64) {
+    let transports = ["stream", "datagram"];
+    let tissues = ["liver", "fibrotic"];
+    let mut all = Vec::new();
+    for tissue in tissues {
+        for (_, run) in runs {
+            for transport in transports {
+                let run = format!("--scene {tissue} --transport {transport} {run}");
+                all.extend((1..=seeds).map(|seed| words(&format!("{run} --seed {seed}"))));
+            }
+        }
+    }
+    let found = links(&all);
+    let mut groups = found.chunks(seeds as usize);
+    let mut rows = Vec::new();
+    for tissue in tissues {
+        for (label, _) in runs {
+            for transport in transports {
+                let Some(runs) = groups.next() else { return };
+                let mut row = cells([tissue, label, transport]);
+                row.extend(BOTH.iter().map(|(_, name)| match *name {
+                    "energy_min_j" => rough(merged(runs, name)),
+                    _ => digits(merged(runs, name)),
+                }));
+                let sum = |name: &str| runs.iter().map(|run| number(&run[name])).sum::<f64>();
+                row.push(format!("{} / {}", sum("pauses"), sum("faults")));
+                rows.push(row);
+            }
+        }
+    }
+    let mut header = cells(["tissue", label, "transport"]);
+    header.extend(BOTH.iter().map(|(title, _)| (*title).to_owned()));
+    header.push("pauses / faults, all seeds".to_owned());
+    report.table(&header, &rows);
+    report.figure(name, Value::Array(found));
+}
+
+/// Loss, jitter and outages.
+fn lossy(report: &mut Report, seeds: u64) {
+    report.heading("Stream beside datagrams: 50 ms, medium hand, omega3");
+    report.say(
+        "Over a stream a lost packet holds up all that follow it. Over datagrams it is lost alone; each repeats up to eight \
+         places that the server may not have yet. Outages are once a second, at a random moment. *After outages* leaves out \
+         each outage and the 50 ms after its end, and pauses until rendering has engaged again. The *depth error* is how far \
+         the tool is from where the same hand would be that feels the tissue itself, with no network; it depends on what the \
+         hand was given before, so it is not that of a force at this moment.",
+    );
+    let named = |(label, run): (&str, &str)| (label.to_owned(), format!("--rtt-ms 50 {run}"));
+    let mut runs: Vec<_> = [
+        ("nothing lost", ""),
+        ("0.1 % lost", "--loss 0.001"),
+        ("1 % lost", "--loss 0.01"),
+        ("5 % lost", "--loss 0.05"),
+        ("10 % lost", "--loss 0.1"),
+        ("1 % lost, 5 in a row", "--loss 0.01 --loss-burst 5"),
+        ("± 10 ms", "--jitter-ms 10"),
+        ("± 40 ms", "--jitter-ms 40"),
+    ]
+    .map(named)
+    .into();
+    runs.extend(["wan", "bad-wan"].map(|profile| (profile.to_owned(), format!("--profile {profile}"))));
+    runs.extend(
+        [
+            ("outages of 100 ms", "--outage-ms 100"),
+            ("outages of 200 ms", "--outage-ms 200"),
+            ("outages of 400 ms", "--outage-ms 400"),
+            ("3 Mbit/s each way, queue of 100 ms", "--bandwidth-kbit 3000"),
+            ("1 Mbit/s, both deadbands", "--bandwidth-kbit 1000 --deadband 0.1 --up-deadband 0.05"),
+        ]
+        .map(named),
+    );
+    beside(report, "lossy", "network", &runs, seeds);
+}
+
+/// Places of a sheet of 75 mm, a second tool, and a tissue that changes.
+fn places(report: &mut Report, seeds: u64) {
+    report.heading("Elsewhere, and not alone: 50 ms, medium hand, omega3");
+    report.say(
+        "*Half-way* is between the middle and the rim, *at the rim* one radius of the tip (5 mm) from it; the rim is fixed. The \
+         second tool presses by a task of its own, 15 mm from the middle of the first one's, to half the depths. The tissue \
+         changes after 10 s to springs of half as much stiffness again; its law reaches the client 100 ms and one way later.",
+    );
+    let runs = [
+        ("half-way", "--place 0.01875,0.0375"),
+        ("at the rim", "--place 0.005,0.0375"),
+        ("second tool", "--second-tool-mm 15"),
+        ("changing tissue", "--tissue-change-s 10 --tissue-change-factor 1.5"),
+    ]
+    .map(|(label, run)| (label.to_owned(), format!("--rtt-ms 50 {run}")));
+    beside(report, "places", "where, or with what", &runs, seeds);
+}
+
 fn random(report: &mut Report) {
     let runs = if quick() { 20 } else { 1000 };
     report.heading("Random combinations");
     let found = link(&words(&format!("--random {runs} --seconds 10")));
     report.say(&format!(
-        "`palpate-client link --random {runs} --seconds 10`: scene, hand, device, network and task drawn by seed, {} \
-         unstable. Worst of each figure, and whose it is:",
+        "`palpate-client link --random {runs} --seconds 10`: scene, hand, device, task and place, network and transport, deadbands, \
+         a second tool and a change of the tissue drawn by seed, {} unstable. Worst of each figure, and whose it is:",
         found["unstable"]
     ));
     let mut rows = Vec::new();

@@ -115,6 +115,43 @@ fn over_datagrams_a_lost_packet_costs_nothing() {
     }
 }
 
+/// The gain is that of a tissue as stiff as it is, and the hand is where it would be without a network.
+#[test]
+fn a_hand_is_as_deep_as_one_that_feels_the_tissue_itself() {
+    for scene in ["liver", "fibrotic"] {
+        let found = link(&format!("--scene {scene} --rtt-ms 50 --seconds 8"));
+        assert!((number(&found, "force_gain") - 1.0).abs() < 0.01, "{found}");
+        assert!(number(&found, "force_bias_n").abs() < 0.01, "{found}");
+        assert!(number(&found, "depth_error_percent") < 1.0, "{found}");
+        let [rms_m, p99_m] = ["depth_error_rms_m", "depth_error_p99_m"].map(|name| number(&found, name));
+        assert!(rms_m > 0.0 && rms_m < p99_m && p99_m < 2e-4, "{found}");
+    }
+}
+
+/// Samples of each step are 4 Mbit/s: a queue that is always full costs its length. What is news fits.
+#[test]
+fn a_link_that_is_too_slow_for_all_is_fast_enough_for_news() {
+    let run = |more: &str| {
+        link(&format!("--scene liver --transport datagram --rtt-ms 50 --bandwidth-kbit 1000 {more} --seconds 8"))
+    };
+    let (all, news) = (run(""), run("--deadband 0.1 --up-deadband 0.05"));
+    assert!(number(&all, "overflowed") > 1000.0 && number(&all, "model_age_ms_p99") > 140.0, "{all}");
+    assert_eq!(number(&news, "overflowed"), 0.0, "{news}");
+    assert!(number(&news, "force_error_rms_percent") < 1.5, "{news}");
+}
+
+/// The truth has the second tool and the change of the tissue at the same moments as the server.
+#[test]
+fn what_else_happens_to_a_tissue_is_felt_by_the_truth_too() {
+    for (what, most_percent) in [("--second-tool-mm 15", 5.0), ("--tissue-change-s 4 --tissue-change-factor 1.5", 5.0)]
+    {
+        let found = link(&format!("--scene liver --transport datagram --rtt-ms 50 {what} --seconds 8"));
+        assert!(number(&found, "force_error_rms_percent") < most_percent, "{found}");
+        assert!(number(&found, "energy_min_j") >= -1e-3, "{found}");
+        assert_eq!(found["unstable"], false);
+    }
+}
+
 #[test]
 fn an_outage_lets_go_of_the_force_and_gives_no_energy() {
     for outage_ms in [100, 200] {
@@ -123,6 +160,15 @@ fn an_outage_lets_go_of_the_force_and_gives_no_energy() {
         assert!(number(&found, "energy_min_j") >= -1e-3, "{found}");
         assert_eq!((&found["unstable"], number(&found, "faults")), (&Value::Bool(false), 0.0), "{found}");
     }
+}
+
+/// The tool lets go on the server meanwhile, and rendering pauses. What comes after it is another touch, which is felt.
+#[test]
+fn after_a_long_outage_touch_is_enabled_again_without_a_jump() {
+    let found = link("--scene liver --transport datagram --rtt-ms 50 --outage-ms 400 --seconds 8");
+    assert!(number(&found, "pauses") >= 5.0 && number(&found, "releases") >= 5.0, "{found}");
+    assert!(number(&found, "model_age_ms_p99") < 500.0, "{found}");
+    assert!(number(&found, "jump_max_n") <= 0.1 && number(&found, "energy_min_j") >= -3e-4, "{found}");
 }
 
 /// Of a thousand each way a second, and with no more than half a per cent of error beside what 1000 have.
@@ -154,9 +200,10 @@ fn random_combinations_are_passive() {
     let found = link("--random 24 --seconds 5 --seed 100");
     assert_eq!((&found["runs"], &found["unstable"]), (&Value::from(24), &Value::from(0)));
     let worst = |name: &str| found[name]["worst"].as_f64().unwrap();
-    assert!(worst("energy_min_j") >= -3e-4, "{found}");
+    assert!(worst("energy_min_j") >= -1e-3, "{found}");
     assert!(worst("jump_max_n") <= 0.1 + 1e-9, "{found}");
-    assert!(worst("force_max_n") <= 2.6, "{found}");
+    // The envelope's largest force: a second tool and a stiffer tissue push a hand that is not prepared for it.
+    assert!(worst("force_max_n") <= 3.3, "{found}");
 }
 
 #[cfg(target_os = "linux")]
@@ -184,6 +231,9 @@ fn a_wrong_argument_is_refused_and_named() {
         ("--seconds nan", "--seconds"),
         ("--radius-m 0", "radius_m"),
         ("--profile wan --rtt-ms 5", "--rtt-ms"),
+        ("--bandwidth-kbit 0", "--bandwidth-kbit"),
+        ("--second-tool-mm 60", "--second-tool-mm"),
+        ("--tissue-change-s 1 --tissue-change-factor 0", "--tissue-change-factor"),
     ] {
         let output = client(&format!("link {arguments}"));
         let told = String::from_utf8_lossy(&output.stderr).into_owned();

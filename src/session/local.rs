@@ -58,6 +58,13 @@ impl Modeller {
         Modeller { law, number, touches_too, contact_state, surface: None, bounced: 0, sequence: 0, tangent }
     }
 
+    /// The tool has let go: what follows is another touch. Its models go on counting, because a client refuses one that is not
+    /// newer than the last.
+    pub fn let_go(&mut self) {
+        let first = Modeller::new(self.number, self.law.clone(), self.touches_too);
+        *self = Modeller { sequence: self.sequence, ..first };
+    }
+
     /// Has the models from the next one on refer to another law.
     pub fn change_law(&mut self, number: u32, law: Arc<Law>) {
         (self.number, self.law) = (number, law);

@@ -222,7 +222,10 @@ impl Sampler {
         let (mut models, mut is_exceeded) = (Vec::new(), false);
         for tool in &sample.tools {
             let Some(feel) = &tool.feel else {
-                self.followed.remove(&tool.tool);
+                if let Some(followed) = self.followed.get_mut(&tool.tool) {
+                    followed.modeller.let_go();
+                    followed.deadband = palpate_touch::ForceDeadband::new(fraction.unwrap_or(0.0));
+                }
                 // A client can't predict a tool without a model.
                 is_exceeded |= fraction.is_some() && tool.contact.is_some();
                 continue;
@@ -404,6 +407,40 @@ mod tests {
             steps.extend(sampler.pick(&session, false).map(|sample| sample.step));
         }
         assert_eq!(steps, [1, 4, 7, 10, 30, 50]);
+    }
+
+    #[test]
+    fn the_models_of_a_tool_that_has_let_go_and_touches_again_are_newer() {
+        let mut session = session(&[]);
+        let law = Arc::new(force_law::exact(session.model(), 0.05));
+        let laws = Some(Arc::new(Laws::new(law)));
+        let mut sampler = Sampler::new(Sampling { laws, ..sampling() }, 1000.0);
+        let place_m = session.model().shape().extent().middle_m();
+        let pose = Action::Pose { place_m, velocity_m_per_s: None, tip: Tip { radius_m: 0.05, ..Tip::default() } };
+        let mut sequences = Vec::new();
+        for step in 1..=30 {
+            let action = if (11..=20).contains(&step) { Action::Release } else { pose.clone() };
+            tell(&mut session, step, action);
+            let local = sampler.pick(&session, false).and_then(|sample| sample.tools[0].local);
+            sequences.extend(local.map(|model| model.sequence));
+        }
+        assert!(sequences.len() > 10 && sequences.is_sorted_by(|a, b| a < b), "{sequences:?}");
+    }
+
+    #[test]
+    fn a_reader_may_want_samples_more_often_for_a_while() {
+        let mut session = session(&[]);
+        let wanted = Arc::new(WantedHeartbeat::default());
+        let deadband = Some(Deadband { displacement_m: Some(1.0), ..Deadband::default() });
+        let sampling = Sampling { deadband, heartbeat_s: 0.02, wanted: Some(wanted.clone()), ..sampling() };
+        let mut sampler = Sampler::new(sampling, 1000.0);
+        grasp(&mut session, 1, -0.01);
+        assert_eq!(picked(&mut session, &mut sampler, 41), [2, 22, 42]);
+        // Not more often than a hundred times a second.
+        wanted.set(0.005);
+        assert_eq!(picked(&mut session, &mut sampler, 20), [52, 62]);
+        wanted.set(0.0);
+        assert_eq!(picked(&mut session, &mut sampler, 20), [82]);
     }
 
     #[test]

@@ -181,7 +181,7 @@ impl Way {
         if inner.is_over || inner.direction.under_way() >= MOST_UNDER_WAY {
             return;
         }
-        inner.direction.send(self.now_s(), packet.to_vec());
+        inner.direction.send(self.now_s(), packet.len() as u64, packet.to_vec());
         self.changed.notify_all();
     }
 

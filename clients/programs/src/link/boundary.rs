@@ -5,7 +5,7 @@ use glam::DVec3;
 use palpate_touch::hand::{HANDS, Hand, HandState};
 use serde_json::{Value, json};
 
-use super::run::TICK_S;
+use super::setup::TICK_S;
 use crate::Failure;
 use crate::simulated::network::{Conditions, Direction};
 
@@ -41,11 +41,11 @@ fn growth_per_s(hand: &Hand, stiffness_n_per_m: f64, ticks: u32) -> f64 {
     let mut halves = [0.0; 2];
     for tick in 0..whole {
         let now_s = f64::from(tick) * TICK_S;
-        up.send(now_s, held.place_m);
+        up.send(now_s, 0, held.place_m);
         while let Some(place) = up.receive(now_s) {
             place_m = place;
         }
-        down.send(now_s, -stiffness_n_per_m * place_m);
+        down.send(now_s, 0, -stiffness_n_per_m * place_m);
         while let Some(force) = down.receive(now_s) {
             force_n = force;
         }

@@ -7,10 +7,11 @@ use std::time::Duration;
 use glam::DVec3;
 use palpate_client::Server;
 use palpate_client::bridge::{self, Options, Session, Target};
-use palpate_touch::LimitCause;
 
-use super::run::{Outcome, Setup, TICK_S, Totals, fitting_scale};
-use super::tissue::{Tissue, Twin};
+use super::direct::Direct;
+use super::measure::{Outcome, Tick, Totals};
+use super::setup::{Setup, TICK_S};
+use super::tissue::Tissue;
 use super::with_tissue;
 use crate::simulated::network::Transport;
 use crate::simulated::random::Random;
@@ -23,10 +24,10 @@ const LEAD_S: f64 = 3.0;
 
 /// Performs the run at a server, which must know the scene by its name.
 pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failure> {
-    let Setup { model, law, tip, spot, hand, device, deadband, up_deadband, conditions, duration_s, seed, .. } = setup;
+    let Setup { model, tip, spot, hand, device, deadband, up_deadband, conditions, duration_s, seed, .. } = setup;
     let middle_m = spot.at_m;
-    let scale = with_tissue(|| fitting_scale(setup, LEAD_S))?;
-    let task = Task::new(DVec3::ZERO, LEAD_S, *duration_s, scale, &mut Random::new(*seed, 0));
+    let direct = with_tissue(|| Direct::new(setup, LEAD_S))?;
+    let task = Task::new(DVec3::ZERO, LEAD_S, *duration_s, direct.scale, &mut Random::new(*seed, 0));
     let simulated = Simulated::new(*device, *hand, task, true);
     let target = Target {
         server,
@@ -46,19 +47,23 @@ pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failur
     }
     let mut totals = Totals::default();
     with_tissue(|| {
-        let mut twin = Twin::new(Tissue::new(model, *tip, *spot, law.clone()));
-        for (step, part) in steps(simulated.course()).enumerate() {
+        let mut twin = Tissue::new(setup)?;
+        for (tick, part) in (0_u32..).zip(steps(simulated.course())) {
+            let Part { time_s: now_s, place_m, force_n } = part;
             // The device's place is relative to the middle of the sheet.
-            let (true_n, touches) = twin.truth(part.place_m + middle_m)?;
-            totals.moved(part.place_m);
-            #[allow(clippy::cast_precision_loss)]
-            totals.rendered((step + 1) as f64 * TICK_S, part.force_n, true_n, touches, None);
+            let (true_n, touches) = twin.truth(place_m + middle_m, f64::from(tick) * TICK_S)?;
+            totals.moved(place_m);
+            let (depth_m, direct_m) = (-place_m.z, direct.depth_m(tick + 1));
+            totals.rendered(&Tick { now_s, depth_m, direct_m, force_n, true_n, touches, age_s: None }, None);
         }
         Ok(())
     })?;
     totals.ages_s.append(&mut served.ages_s);
+    if let Some(envelope) = &served.envelope {
+        totals.limited(envelope);
+    }
     let mut outcome = totals.close();
-    outcome.scale = scale;
+    outcome.scale = direct.scale;
     // From the simulated hand, which is exact between these steps too.
     outcome.energy_min_j = simulated.energy_min_j();
     outcome.packets_per_s = served.traffic.samples as f64 / duration_s;
@@ -66,12 +71,6 @@ pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failur
     outcome.commands_per_s = served.traffic.poses as f64 / duration_s;
     outcome.carried = Some(served.traffic.carried);
     outcome.late_ticks = Some(served.late_ticks);
-    if let Some(envelope) = &served.envelope {
-        let (acted, ticks) = envelope.count(LimitCause::Passivity);
-        outcome.guard_share = acted as f64 / ticks.max(1) as f64;
-        outcome.interventions =
-            LimitCause::ALL.iter().map(|(reason, name)| (*name, envelope.count(*reason).0)).collect();
-    }
     Ok(outcome)
 }
 

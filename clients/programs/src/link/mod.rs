@@ -2,33 +2,45 @@
 //! result. Only this program drives a tissue itself.
 
 mod boundary;
+mod client;
+mod direct;
+mod figures;
+mod laws;
 mod live;
+mod measure;
+mod poses;
 mod random;
 mod run;
+mod server;
+mod setup;
+mod spot;
 mod tissue;
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use clap::{Args, ValueEnum};
 use glam::DVec3;
 use palpate::force_law::Disc;
 use palpate::limits::Limits;
 use palpate::memory;
+use palpate::scene::Change;
 use palpate::scene::check::check_tip;
 use palpate::scene::collection::find_scene;
 use palpate::sheet::Model;
 use palpate_proto::refusal::{Reason, Refusal, number};
-use palpate_touch::Tip;
-use palpate_touch::carrier::Carried;
-use serde_json::{Value, json};
+use palpate_touch::{Law, Tip};
 
 use crate::Failure;
 use crate::credentials::CredentialOptions;
 use crate::simulated::network::{Conditions, Transport};
 use crate::simulated::{device_named, hand_named};
 use crate::table;
-use run::{Outcome, Rendering, Setup, run};
-use tissue::Spot;
+use figures::{figures, rows};
+use laws::PlaceLaws;
+use run::run;
+use setup::{Rendering, Setup, TissueChange};
+use spot::Spot;
 
 /// Arguments of `link`.
 #[derive(Args)]
@@ -52,14 +64,29 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "FRACTION", conflicts_with = "profile")]
     loss: Option<f64>,
     /// How samples and poses travel
-    #[arg(long, default_value = "stream", conflicts_with = "boundary")]
+    #[arg(long, default_value = "stream", conflicts_with_all = ["random", "boundary"])]
     transport: Transport,
     /// Mean number of packets that are lost in a row; 1: each by itself
-    #[arg(long, value_name = "PACKETS", default_value_t = 1.0, conflicts_with = "boundary")]
+    #[arg(long, value_name = "PACKETS", default_value_t = 1.0, conflicts_with_all = ["random", "boundary"])]
     loss_burst: f64,
     /// Once a second nothing gets through for this long, ms
-    #[arg(long, value_name = "MS", default_value_t = 0.0, conflicts_with = "boundary")]
+    #[arg(long, value_name = "MS", default_value_t = 0.0, conflicts_with_all = ["random", "boundary"])]
     outage_ms: f64,
+    /// Limit of the rate each way, kbit/s
+    #[arg(long, value_name = "KBIT", conflicts_with_all = ["random", "boundary"])]
+    bandwidth_kbit: Option<f64>,
+    /// With --bandwidth-kbit: a datagram that would wait longer than this for the link is dropped, ms
+    #[arg(long, value_name = "MS", default_value_t = 100.0, requires = "bandwidth_kbit")]
+    queue_ms: f64,
+    /// A second tool, which moves by a seed of its own, presses so far from the place of the task, mm
+    #[arg(long, value_name = "MM", default_value_t = 0.0, conflicts_with_all = ["random", "boundary"])]
+    second_tool_mm: f64,
+    /// The tissue changes at this time, s
+    #[arg(long, value_name = "SECONDS", conflicts_with_all = ["random", "boundary"])]
+    tissue_change_s: Option<f64>,
+    /// With --tissue-change-s: by which factor all springs are stiffer then
+    #[arg(long, value_name = "FACTOR", default_value_t = 1.5, requires = "tissue_change_s")]
+    tissue_change_factor: f64,
     /// Stall the client once a second, at a random moment, for this long, ms; the device holds its last force
     #[arg(long, value_name = "MS", default_value_t = 0.0, conflicts_with = "random")]
     stall_ms: f64,
@@ -70,11 +97,11 @@ pub(crate) struct Arguments {
     #[arg(long, default_value = "model")]
     scheme: Rendering,
     /// Send a sample only when the force that the client renders is off by more than this fraction; 0 sends one per step
-    #[arg(long, value_name = "FRACTION", default_value_t = 0.0)]
+    #[arg(long, value_name = "FRACTION", default_value_t = 0.0, conflicts_with = "random")]
     deadband: f64,
     /// Send a place of the tool only when the server would be wrong about it by more than this fraction of the force; 0
     /// sends one per tick
-    #[arg(long, value_name = "FRACTION", default_value_t = 0.0, conflicts_with = "boundary")]
+    #[arg(long, value_name = "FRACTION", default_value_t = 0.0, conflicts_with_all = ["random", "boundary"])]
     up_deadband: f64,
     /// Duration in simulated time, s
     #[arg(long, value_name = "SECONDS", default_value_t = 20.0)]
@@ -99,12 +126,12 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "FILE")]
     course: Option<PathBuf>,
     /// Run in real time against this server, which must know the scene by its name, over the real network
-    #[arg(long, value_name = "URL", conflicts_with_all = ["rtt_ms", "jitter_ms", "loss", "loss_burst", "outage_ms", "stall_ms", "profile", "random", "boundary"])]
+    #[arg(long, value_name = "URL", conflicts_with_all = ["rtt_ms", "jitter_ms", "loss", "loss_burst", "outage_ms", "bandwidth_kbit", "second_tool_mm", "tissue_change_s", "stall_ms", "profile", "random", "boundary"])]
     server: Option<String>,
     #[command(flatten)]
     credentials: CredentialOptions,
-    /// Run this many random combinations of scene, hand, device, network and task, with seeds from --seed on; report the
-    /// worst value of each figure
+    /// Run this many random combinations of scene, hand, device, task and place, network and transport, deadbands, a second
+    /// tool and a change of the tissue, with seeds from --seed on; report the worst value of each figure
     #[arg(long, value_name = "RUNS", conflicts_with_all = ["course", "boundary"])]
     random: Option<u64>,
     /// Find the delay at which hand and spring become unstable, and compare it with theory
@@ -134,14 +161,6 @@ impl Profile {
             Profile::BadWan => (0.120, 0.040, 0.01),
         };
         Conditions { round_trip_s, jitter_s, loss, ..Conditions::default() }
-    }
-}
-
-impl Arguments {
-    /// A network, with what is asked for beside it.
-    fn on(&self, conditions: Conditions) -> Conditions {
-        let outage_s = 1e-3 * self.outage_ms;
-        Conditions { transport: self.transport, burst: self.loss_burst, outage_s, ..conditions }
     }
 }
 
@@ -179,102 +198,6 @@ pub(crate) async fn link(arguments: &Arguments) -> Result<(), Failure> {
     Ok(())
 }
 
-/// The figures of a run for people; `server` is that of a run in real time.
-fn rows(setup: &Setup, outcome: &Outcome, server: Option<&str>) -> Vec<(&'static str, String)> {
-    let (scene, hand, device) = (&setup.model.scene.name, setup.hand.name, setup.device.name);
-    let scheme = format!("{:?}", setup.scheme).to_lowercase();
-    let Conditions { transport, round_trip_s, jitter_s, loss, burst, outage_s } = setup.conditions;
-    let network = match server {
-        Some(url) => format!("the real one, to {url}"),
-        None => {
-            let [round_trip, jitter] = [round_trip_s, jitter_s].map(|time_s| table::rounded(1e3 * time_s));
-            let mut text = format!(
-                "{}, {round_trip} ms round trip, ± {jitter} ms each way, {} lost",
-                transport.name(),
-                table::percent(loss)
-            );
-            if burst > 1.0 {
-                text += &format!(", {} in a row", table::rounded(burst));
-            }
-            if outage_s > 0.0 {
-                text += &format!(", {} ms once a second nothing", table::rounded(1e3 * outage_s));
-            }
-            text
-        }
-    };
-    let unstable =
-        outcome.unstable_at_s.map_or("no".to_owned(), |at_s| format!("yes, after {} s", table::rounded(at_s)));
-    let or_none = |value: Option<f64>, show: &dyn Fn(f64) -> String| value.map_or("none".to_owned(), show);
-    let [limited, dropped, released] = outcome.path;
-    let mut rows = vec![
-        ("scene", format!("{scene}, {hand} hand, device {device}, rendering {scheme}")),
-        ("network", network),
-        ("duration", format!("{} s, seed {}", table::rounded(setup.duration_s), setup.seed)),
-        ("depths of the task", format!("{} of the whole", table::percent(outcome.scale))),
-        (
-            "force error",
-            format!(
-                "{} rms, {} in the 99th percentile",
-                or_none(outcome.force_error_rms_percent, &|error| format!("{} %", table::rounded(error))),
-                table::with_unit(outcome.force_error_p99_n, "N")
-            ),
-        ),
-        (
-            "largest force",
-            format!(
-                "{} rendered, {} true",
-                table::with_unit(outcome.force_max_n, "N"),
-                table::with_unit(outcome.true_force_max_n, "N")
-            ),
-        ),
-        ("force rendered", format!("{} of the true one", or_none(outcome.rendered_share, &table::percent))),
-        ("largest jump", format!("{} in a tick", table::with_unit(outcome.jump_max_n, "N"))),
-        (
-            "least energy at the port",
-            format!("{} (below 0: it gave some)", table::with_unit(outcome.energy_min_j, "J")),
-        ),
-        ("passivity acted", format!("in {} of the ticks", table::percent(outcome.guard_share))),
-        ("unstable", unstable),
-        ("pauses, faults", format!("{}, {}", outcome.pauses, outcome.faults)),
-        (
-            "samples",
-            format!(
-                "{} a second, {} kbit/s",
-                table::rounded(outcome.packets_per_s),
-                table::rounded(outcome.kbit_per_s)
-            ),
-        ),
-        ("commands", format!("{} a second", table::rounded(outcome.commands_per_s))),
-        (
-            "age of the model",
-            or_none(outcome.model_age_ms_p99, &|age_ms| {
-                format!("{} ms in the 99th percentile", table::rounded(age_ms))
-            }),
-        ),
-        (
-            "path of the tool",
-            format!("{limited} steps at the speed limit, {dropped} commands dropped, {released} releases"),
-        ),
-        ("limits that acted", table::acted(outcome.interventions.iter().copied())),
-    ];
-    if setup.stall_s > 0.0 {
-        rows.insert(2, ("stalls of the client", format!("{} ms once a second", table::rounded(1e3 * setup.stall_s))));
-    }
-    if setup.up_deadband > 0.0 {
-        rows.insert(2, ("deadband of poses", table::percent(setup.up_deadband)));
-    }
-    if setup.deadband > 0.0 {
-        rows.insert(2, ("deadband", table::percent(setup.deadband)));
-    }
-    if let Some(late) = outcome.late_ticks {
-        rows.push(("late ticks", late.to_string()));
-    }
-    if let Some(Carried { sent, came, fell_back }) = outcome.carried {
-        rows.push(("datagrams", format!("{sent} up, {came} down; the stream took over {fell_back} times")));
-    }
-    rows
-}
-
 /// Does something with a tissue.
 ///
 /// # Errors
@@ -301,9 +224,15 @@ fn setup(arguments: &Arguments) -> Result<Setup, Refusal> {
             }
         }
     };
-    let conditions = arguments.on(conditions);
-    number("--loss-burst", conditions.burst, "from 1 to 1000", |v| (1.0..=1000.0).contains(&v))?;
-    number("--outage-ms", arguments.outage_ms, "from 0 to 1000", |v| (0.0..=1000.0).contains(&v))?;
+    let rate_kbit = arguments.bandwidth_kbit.map(|kbit| number("--bandwidth-kbit", kbit, "at least 1", |v| v >= 1.0));
+    let conditions = Conditions {
+        transport: arguments.transport,
+        burst: number("--loss-burst", arguments.loss_burst, "from 1 to 1000", |v| (1.0..=1000.0).contains(&v))?,
+        outage_s: 1e-3 * number("--outage-ms", arguments.outage_ms, "from 0 to 1000", |v| (0.0..=1000.0).contains(&v))?,
+        rate_bit_per_s: 1e3 * rate_kbit.transpose()?.unwrap_or(0.0),
+        queue_s: 1e-3 * number("--queue-ms", arguments.queue_ms, "from 0 to 10000", |v| (0.0..=1e4).contains(&v))?,
+        ..conditions
+    };
     let up_deadband = number("--up-deadband", arguments.up_deadband, "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
     let range = format!("from 0.001 to {LONGEST_S}");
     let duration_s = number("--seconds", arguments.seconds, &range, |v| (1e-3..=LONGEST_S).contains(&v))?;
@@ -334,12 +263,24 @@ fn setup(arguments: &Arguments) -> Result<Setup, Refusal> {
     let spot = Spot::new(&model, near_m, tip.radius_m);
     // With a server the first law is that of the middle, but before the first press it tells that of the place.
     let disc = Disc::in_middle(&model, tip.radius_m).follow(&model, spot.at_m);
-    let law = tissue::law_at(&model, disc).ok_or_else(|| {
-        Refusal::new(Reason::NotAvailable, "--scene", "has no force law: nothing holds it, or it is too large")
-    })?;
+    let laws = Arc::new(PlaceLaws::new(&model));
+    let law = law_of(&laws, disc)?;
+    let second = "from 0 to 1000";
+    let second_m = 1e-3 * number("--second-tool-mm", arguments.second_tool_mm, second, |v| (0.0..=1e3).contains(&v))?;
+    if second_m > 0.0 {
+        model.shape().check_place("--second-tool-mm", spot.of_tissue(spot.at_m + DVec3::new(second_m, 0.0, 0.0)))?;
+    }
+    let change = arguments.tissue_change_s.map(|at_s| {
+        let at_s = number("--tissue-change-s", at_s, &range, |v| (0.0..=LONGEST_S).contains(&v))?;
+        let factor = arguments.tissue_change_factor;
+        let factor = number("--tissue-change-factor", factor, "from 0.01 to 100", |v| (0.01..=100.0).contains(&v))?;
+        changed(&model, at_s, factor)
+    });
+    let change = change.transpose()?;
     let (scheme, seed) = (arguments.scheme, arguments.seed);
     Ok(Setup {
         model,
+        laws,
         law,
         disc,
         tip,
@@ -351,61 +292,28 @@ fn setup(arguments: &Arguments) -> Result<Setup, Refusal> {
         scheme,
         deadband,
         up_deadband,
+        second_m,
+        change,
         duration_s,
         seed,
     })
 }
 
-/// The figures of a run that are printed.
-fn figures(setup: &Setup, outcome: &Outcome) -> Value {
-    let interventions: serde_json::Map<String, Value> =
-        outcome.interventions.iter().map(|(name, ticks)| ((*name).to_owned(), json!(ticks))).collect();
-    let [limited, dropped, released] = outcome.path;
-    let mut figures = json!({
-        "scene": setup.model.scene.name,
-        "hand": setup.hand.name,
-        "device": setup.device.name,
-        "scheme": format!("{:?}", setup.scheme).to_lowercase(),
-        "rtt_ms": 1e3 * setup.conditions.round_trip_s,
-        "jitter_ms": 1e3 * setup.conditions.jitter_s,
-        "loss": setup.conditions.loss,
-        "transport": setup.conditions.transport.name(),
-        "loss_burst": setup.conditions.burst,
-        "outage_ms": 1e3 * setup.conditions.outage_s,
-        "stall_ms": 1e3 * setup.stall_s,
-        "deadband": setup.deadband,
-        "up_deadband": setup.up_deadband,
-        "seconds": setup.duration_s,
-        "seed": setup.seed,
-        "place_m": setup.spot.at_m.to_array(),
-        "scale": outcome.scale,
-        "force_error_rms_percent": outcome.force_error_rms_percent,
-        "force_error_p99_n": outcome.force_error_p99_n,
-        "energy_min_j": outcome.energy_min_j,
-        "jump_max_n": outcome.jump_max_n,
-        "guard_share": outcome.guard_share,
-        "rendered_share": outcome.rendered_share,
-        "packets_per_s": outcome.packets_per_s,
-        "kbit_per_s": outcome.kbit_per_s,
-        "model_age_ms_p99": outcome.model_age_ms_p99,
-        "peak_ratio": outcome.peak_ratio,
-        "unstable": outcome.unstable_at_s.is_some(),
-        "unstable_at_s": outcome.unstable_at_s,
-        "true_force_max_n": outcome.true_force_max_n,
-        "force_max_n": outcome.force_max_n,
-        "pauses": outcome.pauses,
-        "faults": outcome.faults,
-        "commands_per_s": outcome.commands_per_s,
-        "speed_limited_steps": limited,
-        "commands_dropped": dropped,
-        "releases": released,
-        "interventions_ticks": interventions,
-        "late_ticks": outcome.late_ticks,
-    });
-    if let Some(Carried { sent, came, fell_back }) = outcome.carried {
-        figures["datagrams_up"] = json!(sent);
-        figures["datagrams_down"] = json!(came);
-        figures["fell_back"] = json!(fell_back);
-    }
-    figures
+/// The exact force law of a tissue under a disc.
+fn law_of(laws: &PlaceLaws, disc: Disc) -> Result<Arc<Law>, Refusal> {
+    laws.law(disc).ok_or_else(|| {
+        Refusal::new(Reason::NotAvailable, "--scene", "has no force law: nothing holds it, or it is too large")
+    })
+}
+
+/// A tissue whose springs are stiffer by `factor` from `at_s` on.
+fn changed(model: &Model, at_s: f64, factor: f64) -> Result<TissueChange, Refusal> {
+    let scene = &model.scene;
+    let change = Change {
+        stiffness_n_per_m: Some(factor * scene.springs.stiffness_n_per_m),
+        virtual_stiffness_n_per_m: Some(factor * scene.virtual_stiffness_n_per_m),
+        ..Change::default()
+    };
+    let model = model.changed(&change, scene, &Limits::default())?;
+    Ok(TissueChange { at_s, factor, laws: Arc::new(PlaceLaws::new(&model)), model })
 }

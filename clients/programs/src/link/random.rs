@@ -3,20 +3,26 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use palpate::force_law::{self, Disc};
+use glam::DVec3;
+use palpate::force_law::Disc;
 use palpate::limits::Limits;
 use palpate::scene::{BUILT_IN, Scene};
 use palpate::sheet::Model;
-use palpate_touch::Tip;
+use palpate_proto::refusal::Refusal;
 use palpate_touch::device::DEVICES;
 use palpate_touch::hand::HANDS;
+use palpate_touch::{Law, Tip};
 use serde_json::{Value, json};
 
-use super::run::{Outcome, Setup, run};
-use super::tissue::Spot;
-use super::{Arguments, figures};
+use super::figures::figures;
+use super::laws::PlaceLaws;
+use super::measure::Outcome;
+use super::run::run;
+use super::setup::{Setup, TissueChange};
+use super::spot::Spot;
+use super::{Arguments, changed, law_of};
 use crate::Failure;
-use crate::simulated::network::Conditions;
+use crate::simulated::network::{Conditions, Transport};
 use crate::simulated::random::Random;
 use crate::table;
 
@@ -25,6 +31,50 @@ const TISSUES: [&str; 3] = ["fibrotic", "liver", "stomach"];
 
 /// Constant round-trip times of the random runs, s. Half of the runs use one of the four profiles instead.
 const ROUND_TRIPS_S: [f64; 6] = [0.0, 0.002, 0.01, 0.02, 0.05, 0.1];
+
+/// What is drawn of the rest; the first of each is what most networks and sessions are like.
+const TRANSPORTS: [Transport; 2] = [Transport::Stream, Transport::Datagram];
+const MORE_LOSS: [f64; 4] = [0.0, 0.001, 0.01, 0.1];
+const BURSTS: [f64; 2] = [1.0, 5.0];
+const OUTAGES_S: [f64; 6] = [0.0, 0.0, 0.0, 0.1, 0.2, 0.4];
+const RATES_BIT_PER_S: [f64; 6] = [0.0, 0.0, 0.0, 1e6, 3e6, 10e6];
+const QUEUE_S: f64 = 0.1;
+const DEADBANDS: [[f64; 2]; 2] = [[0.0, 0.0], [0.1, 0.05]];
+const SECOND_TOOLS_M: [f64; 4] = [0.0, 0.0, 0.015, 0.025];
+/// How much stiffer a tissue becomes that changes.
+const FACTORS: [f64; 2] = [0.7, 1.5];
+/// Part of the runs in which it does.
+const CHANGES: f64 = 0.3;
+/// Places, as parts of the way from the middle to one radius from the rim.
+const PLACES: [f64; 4] = [0.0, 0.0, 0.5, 1.0];
+
+/// A tissue of the random runs.
+struct Choice {
+    model: Arc<Model>,
+    laws: Arc<PlaceLaws>,
+    law: Arc<Law>,
+    disc: Disc,
+    /// By the factors above; their time is drawn.
+    changes: Vec<TissueChange>,
+}
+
+impl Choice {
+    fn new(name: &str, text: &str, tip: &Tip) -> Result<Self, Refusal> {
+        let limits = Limits::default();
+        let model = Model::compile(&Scene::parse(name, text, &[], &limits)?, &limits)?;
+        let disc = Disc::in_middle(&model, tip.radius_m);
+        let changes = FACTORS.iter().map(|factor| changed(&model, 0.0, *factor)).collect::<Result<_, _>>()?;
+        let laws = Arc::new(PlaceLaws::new(&model));
+        Ok(Choice { law: law_of(&laws, disc)?, laws, disc, model, changes })
+    }
+
+    /// A place so far on the way from the middle to one radius from the rim.
+    fn place_m(&self, part: f64, tip: &Tip) -> DVec3 {
+        let extent = self.model.shape().extent();
+        let to_rim_m = 0.5 * (extent.most_m.x - extent.least_m.x) - tip.radius_m;
+        extent.middle_m() - part * to_rim_m * DVec3::X
+    }
+}
 
 /// Number of runs between two reports of the progress.
 const REPORT_EVERY: usize = 50;
@@ -40,43 +90,12 @@ struct Worst {
 
 /// Performs the runs on all processors and prints the worst value of each figure.
 pub(super) fn print(arguments: &Arguments, runs: u64) -> Result<(), Failure> {
-    let limits = Limits::default();
     let tip = Tip::default();
     let mut tissues = BTreeMap::new();
     for (name, text) in BUILT_IN.iter().filter(|scene| TISSUES.contains(&scene.0)) {
-        let scene = Scene::parse(name, text, &[], &limits)?;
-        let model = Model::compile(&scene, &limits)?;
-        let law = Arc::new(force_law::exact(&model, tip.radius_m));
-        tissues.insert(*name, (model, law));
+        tissues.insert(*name, Choice::new(name, text, &tip)?);
     }
-    let setup = |seed: u64| {
-        let mut random = Random::new(seed, 3);
-        let (model, law) = &tissues[random.one_of(&TISSUES)];
-        let profiles = <super::Profile as clap::ValueEnum>::value_variants();
-        let conditions = if random.between(0.0, 1.0) < 0.5 {
-            random.one_of(profiles).conditions()
-        } else {
-            Conditions { round_trip_s: *random.one_of(&ROUND_TRIPS_S), ..Conditions::default() }
-        };
-        let conditions = arguments.on(conditions);
-        let (hand, device) = (*random.one_of(&HANDS), *random.one_of(&DEVICES));
-        Setup {
-            model: model.clone(),
-            law: law.clone(),
-            disc: Disc::in_middle(model, tip.radius_m),
-            tip,
-            spot: Spot::new(model, model.shape().extent().middle_m(), tip.radius_m),
-            hand,
-            device,
-            conditions,
-            stall_s: 0.0,
-            scheme: arguments.scheme,
-            deadband: arguments.deadband,
-            up_deadband: arguments.up_deadband,
-            duration_s: arguments.seconds,
-            seed,
-        }
-    };
+    let setup = |seed: u64| drawn(arguments, &tissues, tip, seed);
     let next = std::sync::atomic::AtomicU64::new(0);
     let results = std::sync::Mutex::new(Vec::new());
     let workers = std::thread::available_parallelism().map_or(1, usize::from);
@@ -105,6 +124,54 @@ pub(super) fn print(arguments: &Arguments, runs: u64) -> Result<(), Failure> {
     report(arguments, &results)
 }
 
+/// The run of a seed.
+fn drawn(arguments: &Arguments, tissues: &BTreeMap<&str, Choice>, tip: Tip, seed: u64) -> Setup {
+    let mut random = Random::new(seed, 3);
+    let choice = &tissues[random.one_of(&TISSUES)];
+    let profiles = <super::Profile as clap::ValueEnum>::value_variants();
+    let conditions = if random.between(0.0, 1.0) < 0.5 {
+        random.one_of(profiles).conditions()
+    } else {
+        Conditions { round_trip_s: *random.one_of(&ROUND_TRIPS_S), ..Conditions::default() }
+    };
+    let (hand, device) = (*random.one_of(&HANDS), *random.one_of(&DEVICES));
+    let conditions = Conditions {
+        transport: *random.one_of(&TRANSPORTS),
+        loss: conditions.loss.max(*random.one_of(&MORE_LOSS)),
+        burst: *random.one_of(&BURSTS),
+        outage_s: *random.one_of(&OUTAGES_S),
+        rate_bit_per_s: *random.one_of(&RATES_BIT_PER_S),
+        queue_s: QUEUE_S,
+        ..conditions
+    };
+    let [deadband, up_deadband] = *random.one_of(&DEADBANDS);
+    let second_m = *random.one_of(&SECOND_TOOLS_M);
+    let change = (random.between(0.0, 1.0) < CHANGES).then(|| TissueChange {
+        at_s: random.between(0.0, arguments.seconds),
+        ..random.one_of(&choice.changes).clone()
+    });
+    let place_m = choice.place_m(*random.one_of(&PLACES), &tip);
+    Setup {
+        model: choice.model.clone(),
+        laws: choice.laws.clone(),
+        law: choice.law.clone(),
+        disc: choice.disc,
+        tip,
+        spot: Spot::new(&choice.model, place_m, tip.radius_m),
+        hand,
+        device,
+        conditions,
+        stall_s: 0.0,
+        scheme: arguments.scheme,
+        deadband,
+        up_deadband,
+        second_m,
+        change,
+        duration_s: arguments.seconds,
+        seed,
+    }
+}
+
 fn report(arguments: &Arguments, results: &[(u64, Setup, Result<Outcome, String>)]) -> Result<(), Failure> {
     let worst = |name, largest, of| Worst { name, largest, of, found: None };
     let mut all = [
@@ -112,6 +179,7 @@ fn report(arguments: &Arguments, results: &[(u64, Setup, Result<Outcome, String>
         worst("jump_max_n", true, |outcome| Some(outcome.jump_max_n)),
         worst("force_error_rms_percent", true, |outcome| outcome.force_error_rms_percent),
         worst("rendered_share", false, |outcome| outcome.rendered_share),
+        worst("depth_error_percent", true, |outcome| outcome.depth_error_percent),
         worst("guard_share", true, |outcome| Some(outcome.guard_share)),
         worst("force_max_n", true, |outcome| Some(outcome.force_max_n)),
     ];
@@ -129,11 +197,12 @@ fn report(arguments: &Arguments, results: &[(u64, Setup, Result<Outcome, String>
         if !arguments.json {
             let f = outcome;
             crate::tell!(
-                "{seed:>6} {:<9} {:<7} {:<9} rtt {:>5.1} ms jitter {:>4.1} loss {:<6} error {:>7.2} % energy {:>10.2e} J jump \
+                "{seed:>6} {:<9} {:<7} {:<9} {:<8} rtt {:>5.1} ms jitter {:>4.1} loss {:<6} error {:>7.2} % energy {:>10.2e} J jump \
                  {:.3} N guard {:.4} share {:.3} pauses {} faults {} {}",
                 setup.model.scene.name,
                 setup.hand.name,
                 setup.device.name,
+                setup.conditions.transport.name(),
                 1e3 * setup.conditions.round_trip_s,
                 1e3 * setup.conditions.jitter_s,
                 setup.conditions.loss,

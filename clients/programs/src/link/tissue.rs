@@ -1,195 +1,158 @@
-//! The server's side of the loop: a session that plays a tool's commands and returns what the tool felt.
+//! A tissue in use, as a server has it: commands go through an intake, and the session takes what is due. Beside the hand's tool
+//! there is what the setup has put there: a second tool, and a change of the tissue. So the truth and the server have both at
+//! the same moments.
 
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
-use glam::{DMat3, DQuat, DVec3};
-use palpate::force_law::{self, Disc};
+use glam::DVec3;
+use palpate::limits::Limits;
 use palpate::scene::script::Action;
 use palpate::session::Session;
 use palpate::session::command::{Command, Due};
-use palpate::session::laws::FIRST;
-use palpate::session::local::Modeller;
-use palpate::sheet::{Feel, Footprint, Model, RestSurface};
-use palpate_touch::path::{Path, Play};
-use palpate_touch::{ContactState, Law, LocalModel, Tip};
+use palpate::session::intake::Intake;
+use palpate::session::lease::LeaseId;
+use palpate::sheet::Model;
+use palpate_touch::{ContactState, Tip};
 
-/// The place of a surface at which a task is done, seen by the hand: the task's own place is there, and z is out of the
-/// tissue.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Spot {
-    /// The place at rest, m.
-    pub(super) at_m: DVec3,
-    /// From directions of the tissue to those of the hand.
-    turn: DMat3,
-}
+use super::setup::{Setup, TICK_S};
+use super::spot::Spot;
+use crate::simulated::random::Random;
+use crate::simulated::task::{self, Task};
 
-impl Spot {
-    /// The place of the rest surface that is nearest to `near_m`, as a disc of `radius_m` finds it.
-    pub(super) fn new(model: &Model, near_m: DVec3, radius_m: f64) -> Self {
-        if model.shape().dimensions() == 2 {
-            return Spot { at_m: near_m, turn: DMat3::IDENTITY };
-        }
-        let (at_m, outward) = Footprint::new(model, radius_m, near_m).at_rest();
-        Spot { at_m, turn: DMat3::from_quat(DQuat::from_rotation_arc(outward, DVec3::Z)) }
-    }
+/// The hand's tool and the second one, with their leases.
+pub(super) const TOOL: u32 = 0;
+pub(super) const LEASE: LeaseId = 1;
+const SECOND_TOOL: u32 = 1;
+const SECOND_LEASE: LeaseId = 2;
 
-    /// A place above it, as the hand sees it, where no tool touches.
-    fn above_m(&self) -> DVec3 {
-        self.at_m + 0.01 * DVec3::Z
-    }
+/// The second tool presses to this part of the task's depths: so deep, about, does a hand get that yields.
+const SECOND_DEPTHS: f64 = 0.5;
 
-    /// Of the hand's place, which has the same middle.
-    fn of_tissue(&self, place_m: DVec3) -> DVec3 {
-        self.at_m + self.turn.transpose() * (place_m - self.at_m)
-    }
-
-    fn of_hand(&self, feel: Feel) -> Feel {
-        let place = |place_m: DVec3| self.at_m + self.turn * (place_m - self.at_m);
-        Feel {
-            place_m: place(feel.place_m),
-            velocity_m_per_s: self.turn * feel.velocity_m_per_s,
-            force_on_tool_n: self.turn * feel.force_on_tool_n,
-            surface_m: place(feel.surface_m),
-            anchor_m: place(feel.anchor_m),
-            normal: self.turn * feel.normal,
-            rest: feel.rest.map(|rest| RestSurface {
-                place_m: place(rest.place_m),
-                normal: self.turn * rest.normal,
-                curvature_per_m: self.turn * rest.curvature_per_m * self.turn.transpose(),
-            }),
-            ..feel
-        }
-    }
-}
-
-/// A tissue with one tool.
+/// A tissue with its tools.
 pub(super) struct Tissue {
     session: Session,
+    intake: Intake,
+    due: Vec<Due>,
     tip: Tip,
     spot: Spot,
-    modeller: Modeller,
+    second: Option<Second>,
+    change: Option<(f64, Arc<Model>)>,
+}
+
+/// A tool that presses by a task of its own, and never leaves its place: nothing holds it up.
+struct Second {
+    /// From where the hand's task is done, m.
+    apart_m: DVec3,
+    task: Task,
+}
+
+impl Second {
+    fn new(setup: &Setup) -> Self {
+        let scale = SECOND_DEPTHS * task::scale(&setup.hand, &setup.law, setup.device.most_n());
+        let random = &mut Random::new(setup.seed, 6);
+        let task = Task::new(DVec3::ZERO, task::LEAD_S, setup.duration_s, scale, random);
+        Second { apart_m: DVec3::new(setup.second_m, 0.0, 0.0), task }
+    }
+
+    /// As the hand sees it.
+    fn place_m(&self, spot: &Spot, now_s: f64) -> DVec3 {
+        spot.at_m + self.apart_m + self.task.at(now_s).z * DVec3::Z
+    }
 }
 
 impl Tissue {
-    pub(super) fn new(model: &Arc<Model>, tip: Tip, spot: Spot, law: Arc<Law>) -> Self {
-        Tissue { session: Session::new(model), tip, spot, modeller: Modeller::new(FIRST, law, false) }
+    /// At rest, before anything has touched it.
+    ///
+    /// # Errors
+    /// Returns why the intake refuses the tools.
+    pub(super) fn new(setup: &Setup) -> Result<Self, String> {
+        let limits = Limits::default();
+        let mut intake = Intake::new(&setup.model.scene, &limits);
+        for (tool, lease) in [(TOOL, LEASE), (SECOND_TOOL, SECOND_LEASE)] {
+            let acquired = intake.acquire(&[tool], "palpate-client link", limits.lease_s, lease, 0);
+            acquired.map_err(|refusal| refusal.to_string())?;
+        }
+        Ok(Tissue {
+            session: Session::new(&setup.model),
+            intake,
+            due: Vec::new(),
+            tip: setup.tip,
+            spot: setup.spot,
+            second: (setup.second_m > 0.0).then(|| Second::new(setup)),
+            change: setup.change.as_ref().map(|change| (change.at_s, change.model.clone())),
+        })
     }
 
-    /// Performs one step, at the end of which the tool is at the hand's `place_m`, or released if that is `None`.
-    pub(super) fn step(&mut self, place_m: Option<DVec3>) -> Result<Option<Feel>, String> {
-        let (tip, spot) = (self.tip, self.spot);
-        let pose = |place_m| Action::Pose { place_m: spot.of_tissue(place_m), velocity_m_per_s: None, tip };
-        let action = place_m.map_or(Action::Release, pose);
-        let command = Command {
-            tool: 0,
-            sequence: Some(self.session.step_count() + 1),
+    /// The session.
+    pub(super) fn session(&self) -> &Session {
+        &self.session
+    }
+
+    /// A command that leads the tool to a place of the hand's. Its client time 0 says: at once.
+    pub(super) fn pose(&self, place_m: DVec3) -> Command {
+        Command {
+            tool: TOOL,
+            sequence: None,
             client_time_ns: 0,
             by_datagram: false,
             at_step: None,
             time_to_live_s: None,
-            action,
+            action: Action::Pose { place_m: self.spot.of_tissue(place_m), velocity_m_per_s: None, tip: self.tip },
             arrival_ns: 0,
-        };
-        self.session.advance(&mut vec![Due { command, late: false, late_commands: 0, ends_lease: false }], |_| {});
-        match self.session.fault() {
-            Some(reason) => Err(reason),
-            None => Ok(self.session.tissue().feel(0).map(|feel| spot.of_hand(feel))),
         }
     }
 
-    /// The local model of what the tool felt in the last step.
-    fn model(&mut self, feel: &Feel, client_time_s: f64) -> LocalModel {
-        let step = self.session.step_count();
-        self.modeller.model(feel, step, client_time_s)
-    }
-}
-
-/// The laws that a client is told, numbered from [`FIRST`] on: of each place one. Computing them takes no virtual time.
-pub(super) struct PlaceLaws {
-    /// Of the tool's place.
-    disc: Disc,
-    told: Vec<(Disc, Arc<Law>)>,
-}
-
-impl PlaceLaws {
-    /// Of a client that begins with `law`, which is of `disc`.
-    pub(super) fn new(disc: Disc, law: Arc<Law>) -> Self {
-        PlaceLaws { disc, told: vec![(disc, law)] }
+    /// Takes in commands that arrive together.
+    ///
+    /// # Errors
+    /// Returns why the intake refuses them.
+    pub(super) fn submit(&mut self, lease: LeaseId, commands: Vec<Command>, now_s: f64) -> Result<(), String> {
+        self.intake.submit(lease, commands, ns(now_s)).map_err(|refusal| refusal.to_string())
     }
 
-    /// The law of a number.
-    pub(super) fn law(&self, number: u32) -> &Arc<Law> {
-        &self.told.get(number as usize).unwrap_or(&self.told[0]).1
-    }
-
-    /// The law that a tool at a place of the tissue wants from now on, and its number, if that is another.
-    fn follow(&mut self, model: &Model, place_m: DVec3) -> Option<(u32, Arc<Law>)> {
-        let disc = self.disc.follow(model, place_m);
-        if disc == self.disc {
-            return None;
-        }
-        self.disc = disc;
-        let number = match self.told.iter().position(|told| told.0 == disc) {
-            Some(number) => number,
-            None => {
-                let law = law_at(model, disc)?;
-                self.told.push((disc, law));
-                self.told.len() - 1
+    /// Does the steps of the tick that begins at `now_s`.
+    ///
+    /// # Errors
+    /// Returns the reason if the guard stops the tissue, or why a command of the second tool is refused.
+    pub(super) fn step(&mut self, now_s: f64) -> Result<(), String> {
+        // Rounding must not make a step more of it.
+        while self.session.time_s() < now_s + TICK_S - 1e-9 {
+            let (step, begin_s) = (self.session.step_count(), self.session.time_s());
+            if let Some(second) = &self.second {
+                let pose = Command { tool: SECOND_TOOL, ..self.pose(second.place_m(&self.spot, begin_s)) };
+                self.submit(SECOND_LEASE, vec![pose], begin_s)?;
             }
-        };
-        Some((u32::try_from(number).ok()?, self.told[number].1.clone()))
-    }
-}
-
-/// The exact law under a disc; none if nothing holds the tissue.
-pub(super) fn law_at(model: &Model, disc: Disc) -> Option<Arc<Law>> {
-    let law = force_law::exact_within(model, disc, u64::MAX, &AtomicBool::new(false));
-    law.filter(Law::is_sound).map(Arc::new)
-}
-
-/// A tissue behind a network.
-pub(super) struct Server {
-    tissue: Tissue,
-    pub(super) path: Path,
-    pub(super) laws: PlaceLaws,
-}
-
-impl Server {
-    pub(super) fn new(tissue: Tissue, laws: PlaceLaws) -> Self {
-        let spot = tissue.spot;
-        // A task begins above the place where it is done; of a sheet, that is where a path begins by itself.
-        let is_sheet = tissue.session.model().shape().dimensions() == 2;
-        let path = if is_sheet { Path::default() } else { Path::beginning_at(spot.above_m()) };
-        Server { tissue, path, laws }
-    }
-
-    /// Performs one step; returns its sample while the tool is in use.
-    pub(super) fn step(&mut self, now_s: f64, step_s: f64) -> Result<Option<LocalModel>, String> {
-        let (place_m, time_s) = match self.path.step(now_s, step_s) {
-            Some(Play::Pose(place_m, time_s)) => (Some(place_m), time_s),
-            Some(Play::Release) | None => (None, 0.0),
-        };
-        let feel = self.tissue.step(place_m)?;
-        let Tissue { session, spot, modeller, .. } = &mut self.tissue;
-        if let Some((number, law)) = place_m.and_then(|at_m| self.laws.follow(session.model(), spot.of_tissue(at_m))) {
-            modeller.change_law(number, law);
+            if let Some((_, model)) = self.change.take_if(|change| change.0 <= begin_s + 1e-9) {
+                let changed = self.intake.change(None, &model, None, ns(begin_s));
+                changed.map_err(|refusal| refusal.to_string())?;
+            }
+            if let Some(model) = self.intake.take_change(step) {
+                self.session.change(&model);
+            }
+            self.intake.take_due(step, ns(begin_s), &mut self.due);
+            self.session.advance(&mut self.due, |_| {});
+            if let Some(reason) = self.session.fault() {
+                return Err(reason);
+            }
         }
-        Ok(feel.map(|feel| self.tissue.model(&feel, time_s)))
+        Ok(())
+    }
+
+    /// The force on a tool that is at `place_m` now, without any network, N; and whether it touches the tissue.
+    ///
+    /// # Errors
+    /// As [`Tissue::step`] does.
+    pub(super) fn truth(&mut self, place_m: DVec3, now_s: f64) -> Result<(DVec3, bool), String> {
+        self.submit(LEASE, vec![self.pose(place_m)], now_s)?;
+        self.step(now_s)?;
+        Ok(self.session.tissue().feel(TOOL as usize).map_or((DVec3::ZERO, false), |feel| {
+            (self.spot.direction(feel.force_on_tool_n), feel.contact_state != ContactState::Free)
+        }))
     }
 }
 
-/// The same tissue without a network: its force is the true one.
-pub(super) struct Twin(Tissue);
-
-impl Twin {
-    pub(super) fn new(tissue: Tissue) -> Self {
-        Twin(tissue)
-    }
-
-    /// The force on the tool at `place_m`, N, and whether the tool touches the tissue.
-    pub(super) fn truth(&mut self, place_m: DVec3) -> Result<(DVec3, bool), String> {
-        let feel = self.0.step(Some(place_m))?;
-        Ok(feel.map_or((DVec3::ZERO, false), |feel| (feel.force_on_tool_n, feel.contact_state != ContactState::Free)))
-    }
+/// A time on the server's clock.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+pub(super) fn ns(time_s: f64) -> u64 {
+    (time_s * 1e9).round() as u64
 }

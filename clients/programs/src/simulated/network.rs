@@ -7,6 +7,10 @@
 //!
 //! Losses are independent, or come in bursts (Gilbert 1960): a state in which all is lost, left with 1/length at each
 //! message. An outage loses all that is sent meanwhile; a stream sends it again after its end.
+//!
+//! **A link of limited rate** stands before all that. What is sent waits in its queue for what was sent before. A datagram that
+//! finds the queue full is dropped (the tail of the queue, as most routers do). A stream's sender holds back what does not fit,
+//! so it is only late, until the buffers of its computer are full; then what is sent is dropped, as a server drops samples.
 
 use std::collections::VecDeque;
 
@@ -45,6 +49,45 @@ pub(crate) struct Conditions {
     pub(crate) burst: f64,
     /// Once a second nothing gets through for this long, s.
     pub(crate) outage_s: f64,
+    /// Rate of the link each way, bit/s; 0: without limit.
+    pub(crate) rate_bit_per_s: f64,
+    /// Longest time that a datagram waits for the link, s.
+    pub(crate) queue_s: f64,
+}
+
+/// What the buffers of a stream hold: the socket's at both ends, and the window of HTTP/2, bits.
+const STREAM_BITS: f64 = 8.0 * 1024.0 * 1024.0;
+
+/// A link of limited rate, and its queue.
+struct Link {
+    rate_bit_per_s: f64,
+    longest_s: f64,
+    /// When all that waits has been sent, s.
+    free_s: f64,
+}
+
+impl Link {
+    fn new(conditions: &Conditions) -> Self {
+        let rate_bit_per_s = conditions.rate_bit_per_s;
+        let longest_s = match conditions.transport {
+            Transport::Datagram => conditions.queue_s,
+            Transport::Stream => STREAM_BITS / rate_bit_per_s,
+        };
+        Link { rate_bit_per_s, longest_s, free_s: 0.0 }
+    }
+
+    /// When a message has passed, s; `None` if it is dropped.
+    fn pass(&mut self, now_s: f64, bytes: u64) -> Option<f64> {
+        if self.rate_bit_per_s <= 0.0 {
+            return Some(now_s);
+        }
+        let begins_s = self.free_s.max(now_s);
+        if begins_s - now_s > self.longest_s {
+            return None;
+        }
+        self.free_s = begins_s + 8.0 * bytes as f64 / self.rate_bit_per_s;
+        Some(self.free_s)
+    }
 }
 
 /// Least retransmission timeout of TCP, s (RFC 6298 requires 1 s, Linux uses 200 ms).
@@ -73,16 +116,50 @@ impl Stalls {
     }
 }
 
+/// The outages of a network: both directions have them together.
+pub(crate) struct Outages {
+    stalls: Stalls,
+    ended_s: f64,
+}
+
+impl Outages {
+    /// Those of a seed, the first not before `from_s`.
+    pub(crate) fn new(conditions: &Conditions, seed: u64, from_s: f64) -> Self {
+        let stalls = Stalls::new(conditions.outage_s, from_s, Random::new(seed, 5));
+        Outages { stalls, ended_s: f64::NEG_INFINITY }
+    }
+
+    /// Whether there are any.
+    pub(crate) fn are_any(&self) -> bool {
+        self.stalls.stall_s > 0.0
+    }
+
+    /// The end of the outage at `now_s`, s, if there is one.
+    fn at(&mut self, now_s: f64) -> Option<f64> {
+        self.stalls.at(now_s)
+    }
+
+    /// How long ago the last outage ended, s; 0 in one.
+    pub(crate) fn since_s(&mut self, now_s: f64) -> f64 {
+        if let Some(end_s) = self.at(now_s) {
+            self.ended_s = end_s;
+        }
+        (now_s - self.ended_s).max(0.0)
+    }
+}
+
 /// One direction of a connection.
 pub(crate) struct Direction<T> {
     conditions: Conditions,
     random: Random,
-    outages: Stalls,
+    link: Link,
+    outages: Outages,
     is_bursting: bool,
     /// By arrival.
     under_way: VecDeque<(f64, T)>,
     last_s: f64,
     sent: u64,
+    overflowed: u64,
 }
 
 impl<T> Direction<T> {
@@ -91,11 +168,13 @@ impl<T> Direction<T> {
         Direction {
             conditions,
             random: Random::new(seed, direction),
-            outages: Stalls::new(conditions.outage_s, from_s, Random::new(seed, 5)),
+            link: Link::new(&conditions),
+            outages: Outages::new(&conditions, seed, from_s),
             is_bursting: false,
             under_way: VecDeque::new(),
             last_s: f64::NEG_INFINITY,
             sent: 0,
+            overflowed: 0,
         }
     }
 
@@ -113,12 +192,17 @@ impl<T> Direction<T> {
         self.is_bursting
     }
 
-    pub(crate) fn send(&mut self, now_s: f64, message: T) {
+    /// Sends a message of a size.
+    pub(crate) fn send(&mut self, now_s: f64, bytes: u64, message: T) {
         let Conditions { transport, round_trip_s, jitter_s, .. } = self.conditions;
         self.sent += 1;
-        let mut arrives_s = now_s + round_trip_s / 2.0;
+        let Some(left_s) = self.link.pass(now_s, bytes) else {
+            self.overflowed += 1;
+            return;
+        };
+        let mut arrives_s = left_s + round_trip_s / 2.0;
         if jitter_s > 0.0 {
-            arrives_s = (arrives_s + jitter_s * self.random.normal()).max(now_s);
+            arrives_s = (arrives_s + jitter_s * self.random.normal()).max(left_s);
         }
         let (is_lost, outage) = (self.is_lost(), self.outages.at(now_s));
         match transport {
@@ -157,8 +241,14 @@ impl<T> Direction<T> {
         self.under_way.len()
     }
 
+    /// Messages so far.
     pub(crate) fn sent(&self) -> u64 {
         self.sent
+    }
+
+    /// Messages that found the queue full.
+    pub(crate) fn overflowed(&self) -> u64 {
+        self.overflowed
     }
 }
 
@@ -168,7 +258,7 @@ mod tests {
 
     fn arrivals(conditions: Conditions) -> Vec<u32> {
         let mut direction = Direction::new(conditions, 1, 1, 0.0);
-        (0..20_000).for_each(|number| direction.send(f64::from(number) * 1e-3, number));
+        (0..20_000).for_each(|number| direction.send(f64::from(number) * 1e-3, 125, number));
         std::iter::from_fn(|| direction.receive(1e9)).collect()
     }
 
@@ -194,5 +284,35 @@ mod tests {
         assert!(!arrived.is_sorted());
         // A tenth of the time nothing gets through, and of the rest a hundredth is lost.
         assert!((17_000..18_600).contains(&arrived.len()), "{}", arrived.len());
+    }
+
+    #[test]
+    fn a_link_passes_no_more_than_its_rate_and_a_datagram_waits_no_longer_than_its_queue() {
+        // 1000 messages of 1000 bits a second, of datagrams and of a stream. What still waits at the end arrives, too: 50 ms of
+        // datagrams, and the 1 MiB of a stream.
+        let all = [20_000, 20_000];
+        for (rate_bit_per_s, longest_s, arrive) in [(2e6, 0.0, all), (1e6, 0.0, all), (5e5, 0.05, [10_025, 18_389])] {
+            let conditions = Conditions { rate_bit_per_s, queue_s: 0.05, ..Conditions::default() };
+            for transport in [Transport::Datagram, Transport::Stream] {
+                let mut direction = Direction::new(Conditions { transport, ..conditions }, 1, 1, 0.0);
+                let (mut waited_s, mut arrived) = (0.0_f64, 0);
+                for number in 0..1_000_000_u32 {
+                    let now_s = f64::from(number) * 1e-3;
+                    if number < 20_000 {
+                        direction.send(now_s, 125, now_s);
+                    }
+                    while let Some(sent_s) = direction.receive(now_s) {
+                        (waited_s, arrived) = (waited_s.max(now_s - sent_s), arrived + 1);
+                    }
+                }
+                let is_datagram = transport == Transport::Datagram;
+                let expected = arrive[usize::from(!is_datagram)];
+                assert!(u32::abs_diff(arrived, expected) <= 2, "{transport:?}, {rate_bit_per_s}: {arrived} arrived");
+                assert_eq!(u64::from(20_000 - arrived), direction.overflowed());
+                // Its own time on the link, and the tick.
+                let most_s = longest_s + 0.004;
+                assert!(!is_datagram || waited_s <= most_s, "{rate_bit_per_s}: {waited_s} s");
+            }
+        }
     }
 }

@@ -1,0 +1,81 @@
+//! The client at the device, by how it renders samples.
+
+use glam::DVec3;
+use palpate_touch::envelope::{Envelope, Wanted};
+use palpate_touch::{Law, LocalModel, Renderer};
+
+use super::setup::{Rendering, Setup, TICK_S};
+
+/// The client at the device, by scheme.
+pub(super) enum Client {
+    Raw(Option<LocalModel>),
+    Hold(Option<LocalModel>, Option<f64>, Option<DVec3>, Box<Envelope>),
+    Model(Box<Renderer>),
+}
+
+impl Client {
+    /// Of a setup, enabled.
+    pub(super) fn new(setup: &Setup) -> Self {
+        let envelope = || {
+            let mut envelope = Envelope::new(setup.device, setup.spot.at_m);
+            envelope.enable();
+            envelope
+        };
+        match setup.scheme {
+            Rendering::Raw => Client::Raw(None),
+            Rendering::Hold => Client::Hold(None, None, None, Box::new(envelope())),
+            Rendering::Model => Client::Model(Box::new(Renderer::new((*setup.law).clone(), envelope()))),
+        }
+    }
+
+    /// Takes a further law, which samples may name from now on.
+    pub(super) fn learn(&mut self, number: u32, law: &Law) {
+        if let Client::Model(renderer) = self {
+            renderer.learn(number, law.clone());
+        }
+    }
+
+    /// Takes a sample that has arrived.
+    pub(super) fn receive(&mut self, model: LocalModel, now_s: f64) {
+        match self {
+            Client::Raw(newest) => *newest = Some(model),
+            Client::Hold(newest, arrived_s, ..) => (*newest, *arrived_s) = (Some(model), Some(now_s)),
+            Client::Model(renderer) => renderer.receive(model, now_s),
+        }
+    }
+
+    /// The force that the device holds until the next tick, N.
+    pub(super) fn tick(&mut self, now_s: f64, place_m: DVec3) -> DVec3 {
+        match self {
+            Client::Raw(newest) => newest.map_or(DVec3::ZERO, |model| model.force_n),
+            Client::Hold(newest, arrived_s, before, envelope) => {
+                let moved_m = before.replace(place_m).map_or(DVec3::ZERO, |before_m| place_m - before_m);
+                envelope.render(&Wanted {
+                    now_s,
+                    place_m,
+                    velocity_m_per_s: moved_m / TICK_S,
+                    force_n: newest.map_or(DVec3::ZERO, |model| model.force_n),
+                    age_s: arrived_s.map_or(0.0, |arrived_s| now_s - arrived_s),
+                })
+            }
+            Client::Model(renderer) => renderer.tick(now_s, place_m),
+        }
+    }
+
+    /// The envelope, if there is one.
+    pub(super) fn envelope(&mut self) -> Option<&mut Envelope> {
+        match self {
+            Client::Raw(_) => None,
+            Client::Hold(.., envelope) => Some(envelope),
+            Client::Model(renderer) => Some(&mut renderer.envelope),
+        }
+    }
+
+    /// Time of the newest sample by the client's clock, s.
+    pub(super) fn model_time_s(&self) -> Option<f64> {
+        match self {
+            Client::Raw(newest) | Client::Hold(newest, ..) => newest.map(|model| model.client_time_s),
+            Client::Model(renderer) => renderer.model_time_s(),
+        }
+    }
+}

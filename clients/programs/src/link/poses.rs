@@ -1,0 +1,103 @@
+//! The messages between client and server, and which places of the tool the client tells: all of them, or only what is news.
+//! A datagram repeats what the server may not have yet.
+
+use std::collections::VecDeque;
+
+use glam::DVec3;
+use palpate_touch::deadband::HEARTBEAT_S;
+use palpate_touch::{LocalModel, News, Pulse, Told};
+
+use super::client::Client;
+use crate::simulated::network::{Direction, Transport};
+
+/// A message to the server.
+pub(super) struct Up {
+    pub(super) number: u64,
+    pub(super) sent_s: f64,
+    /// Places by the number of their command, the newest last.
+    pub(super) told: Vec<(u64, Told)>,
+    /// How often the client wants a sample at least, s.
+    pub(super) heartbeat_s: f64,
+}
+
+/// A message to the client.
+pub(super) struct Down {
+    pub(super) number: u64,
+    pub(super) sent_s: f64,
+    /// None of a tool that has let go.
+    pub(super) model: Option<LocalModel>,
+    /// How often the server wants a place at least, s.
+    pub(super) heartbeat_s: f64,
+}
+
+/// Size of a message with one place and its velocity, bytes, and of each that it repeats: what the headers below it take, and
+/// the fields of a pose.
+const FIRST_BYTES: u64 = 66 + 100;
+const FURTHER_BYTES: u64 = 24;
+
+/// Places in a datagram.
+const PLACES: usize = 8;
+
+/// A time that has come back from the server is off by no more than the rounding to nanoseconds, s.
+const ROUNDING_S: f64 = 5e-7;
+
+/// The tool's places on their way to the server.
+pub(super) struct Poses {
+    transport: Transport,
+    /// Part of the force; 0: each place is told.
+    deadband: f64,
+    news: News,
+    /// Commands so far.
+    count: u64,
+    /// What the server may not have yet, the newest last.
+    unanswered: VecDeque<(u64, Told)>,
+    /// Of the samples.
+    pulse: Pulse,
+    heartbeat_s: f64,
+}
+
+impl Poses {
+    pub(super) fn new(transport: Transport, deadband: f64) -> Self {
+        Poses {
+            transport,
+            deadband,
+            news: News::default(),
+            count: 0,
+            unanswered: VecDeque::new(),
+            pulse: Pulse::default(),
+            heartbeat_s: HEARTBEAT_S,
+        }
+    }
+
+    /// Tells a place, if it is news.
+    pub(super) fn tell(&mut self, now_s: f64, place_m: DVec3, client: &Client, up: &mut Direction<Up>) {
+        let told = if self.deadband > 0.0 {
+            let most_m = match client {
+                Client::Model(renderer) => renderer.way_m(self.deadband),
+                Client::Raw(_) | Client::Hold(..) => 0.0,
+            };
+            self.news.tell(now_s, place_m, most_m, self.heartbeat_s)
+        } else {
+            Some(Told { time_s: now_s, place_m, velocity_m_per_s: DVec3::ZERO })
+        };
+        let Some(told) = told else { return };
+        self.count += 1;
+        self.unanswered.push_back((self.count, told));
+        if self.unanswered.len() > if self.transport == Transport::Stream { 1 } else { PLACES } {
+            self.unanswered.pop_front();
+        }
+        let told: Vec<(u64, Told)> = self.unanswered.iter().copied().collect();
+        let bytes = FIRST_BYTES + FURTHER_BYTES * (told.len() as u64 - 1);
+        let heartbeat_s = self.pulse.heartbeat_s(now_s);
+        up.send(now_s, bytes, Up { number: up.sent() + 1, sent_s: now_s, told, heartbeat_s });
+    }
+
+    /// A sample tells what has arrived, and how often the server wants to hear.
+    pub(super) fn answered(&mut self, message: &Down, now_s: f64) {
+        if let Some(model) = &message.model {
+            self.unanswered.retain(|(_, told)| told.time_s > model.client_time_s + ROUNDING_S);
+        }
+        self.pulse.arrive(message.number, message.sent_s, now_s);
+        self.heartbeat_s = message.heartbeat_s;
+    }
+}

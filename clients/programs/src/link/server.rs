@@ -1,0 +1,157 @@
+//! The server's end of the network: its intake gets what arrives, and the sampler of the stream picks what is sent.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use glam::DVec3;
+use palpate::force_law::Disc;
+use palpate::scene::script::Action;
+use palpate::session::command::Command;
+use palpate::session::laws::{FIRST, Laws};
+use palpate::session::sampling::{Deadband, Sampler, Sampling, WantedHeartbeat};
+use palpate_touch::deadband::HEARTBEAT_S;
+use palpate_touch::{Law, LocalModel, Pulse, Told};
+
+use super::laws::PlaceLaws;
+use super::poses::Up;
+use super::setup::{Setup, TICK_S};
+use super::spot::Spot;
+use super::tissue::{LEASE, Tissue, ns};
+use crate::simulated::network::Transport;
+
+/// The law of another tissue is known so long after the tissue has changed, s.
+const LAW_S: f64 = 0.1;
+
+/// The newest commands are remembered, so many of them: a datagram repeats what is not acknowledged.
+const REMEMBERED: usize = 1024;
+
+/// A tissue behind a network.
+pub(super) struct Server {
+    tissue: Tissue,
+    spot: Spot,
+    sampler: Sampler,
+    laws: Arc<Laws>,
+    /// How often the client wants samples.
+    wanted: Arc<WantedHeartbeat>,
+    /// Of the tissue, and where the law of the tool's place is of; those of the tissue to come, and when they are told, s.
+    place_laws: Arc<PlaceLaws>,
+    disc: Disc,
+    next_laws: Option<(f64, Arc<PlaceLaws>)>,
+    /// Whether the stream is to be told of another law, and the number of the newest.
+    is_other: bool,
+    number: u32,
+    transport: Transport,
+    /// Whether places come with velocities.
+    is_moving: bool,
+    known: BTreeSet<u64>,
+    /// Of what arrives.
+    pulse: Pulse,
+    refused: u64,
+}
+
+impl Server {
+    /// # Errors
+    /// Returns why the intake refuses the tools.
+    pub(super) fn new(setup: &Setup) -> Result<Self, String> {
+        let tissue = Tissue::new(setup)?;
+        let laws = Arc::new(Laws::new(setup.law.clone()));
+        let wanted = Arc::new(WantedHeartbeat::default());
+        let rendered = Deadband { rendered_fraction: Some(setup.deadband), ..Deadband::default() };
+        let sampling = Sampling {
+            every: 1,
+            only: Some(vec![super::tissue::TOOL]),
+            deadband: (setup.deadband > 0.0).then_some(rendered),
+            heartbeat_s: HEARTBEAT_S,
+            laws: Some(laws.clone()),
+            touch_stiffness: false,
+            wanted: Some(wanted.clone()),
+        };
+        Ok(Server {
+            tissue,
+            spot: setup.spot,
+            sampler: Sampler::new(sampling, TICK_S.recip()),
+            laws,
+            wanted,
+            place_laws: setup.laws.clone(),
+            disc: setup.disc,
+            next_laws: setup.change.as_ref().map(|change| (change.at_s + LAW_S, change.laws.clone())),
+            is_other: false,
+            number: FIRST,
+            transport: setup.conditions.transport,
+            is_moving: setup.up_deadband > 0.0,
+            known: BTreeSet::new(),
+            pulse: Pulse::default(),
+            refused: 0,
+        })
+    }
+
+    /// Takes a message that has arrived.
+    pub(super) fn receive(&mut self, message: &Up, now_s: f64) {
+        self.pulse.arrive(message.number, message.sent_s, now_s);
+        self.wanted.set(message.heartbeat_s);
+        let mut commands = Vec::new();
+        for (number, told) in &message.told {
+            if self.known.insert(*number) {
+                self.follow(told.place_m);
+                commands.push(self.command(*number, told));
+            }
+        }
+        while self.known.len() > REMEMBERED {
+            self.known.pop_first();
+        }
+        // As a server does it: what is refused has no effect, and is counted.
+        self.refused += u64::from(self.tissue.submit(LEASE, commands, now_s).is_err());
+    }
+
+    fn command(&self, number: u64, told: &Told) -> Command {
+        let mut command = self.tissue.pose(told.place_m);
+        if let Action::Pose { velocity_m_per_s, .. } = &mut command.action {
+            *velocity_m_per_s = self.is_moving.then(|| self.spot.direction_of_tissue(told.velocity_m_per_s));
+        }
+        // The time 0 means none.
+        let client_time_ns = ns(told.time_s).max(1);
+        let by_datagram = self.transport == Transport::Datagram;
+        Command { sequence: Some(number), client_time_ns, by_datagram, ..command }
+    }
+
+    /// Does the step that begins at `now_s`. Returns what the stream gets of it: a sample, which has no local model if the tool
+    /// has let go.
+    ///
+    /// # Errors
+    /// Returns the reason if the guard stops the tissue.
+    pub(super) fn step(&mut self, now_s: f64) -> Result<Option<Option<LocalModel>>, String> {
+        self.tissue.step(now_s)?;
+        let sample = self.sampler.pick(self.tissue.session(), false);
+        let local = |tools: &[palpate::session::ToolSample]| tools.first().and_then(|tool| tool.local);
+        Ok(sample.map(|sample| local(&sample.tools).map(|model| self.spot.of_hand(model))))
+    }
+
+    /// The law is that of the tool's place.
+    fn follow(&mut self, place_m: DVec3) {
+        let disc = self.disc.follow(&self.place_laws.model, self.spot.of_tissue(place_m));
+        self.is_other |= disc != self.disc;
+        self.disc = disc;
+    }
+
+    /// Another law, if the stream is to be told of one: local models name it from now on.
+    pub(super) fn take_law(&mut self, now_s: f64) -> Option<(u32, Arc<Law>)> {
+        if let Some((_, laws)) = self.next_laws.take_if(|next| next.0 <= now_s) {
+            (self.place_laws, self.is_other) = (laws, true);
+        }
+        let law = std::mem::take(&mut self.is_other).then(|| self.place_laws.law(self.disc)).flatten()?;
+        self.number += 1;
+        self.laws.change(self.number, law.clone());
+        Some((self.number, law))
+    }
+
+    /// How often the server wants to hear from the client, s.
+    pub(super) fn heartbeat_s(&self, now_s: f64) -> f64 {
+        self.pulse.heartbeat_s(now_s)
+    }
+
+    /// What the path of the tool has counted; a message that was refused is dropped.
+    pub(super) fn path_counts(&self) -> [u64; 3] {
+        let [limited, dropped, released] = self.tissue.session().path_counts();
+        [limited, dropped + self.refused, released]
+    }
+}
