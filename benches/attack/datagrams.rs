@@ -101,7 +101,7 @@ pub async fn chatter(ground: &Ground) -> Result<(), Status> {
             tool,
             sequence: number,
             client_time_ns: 1_000_000 * number,
-            pose: Some(pose.clone()),
+            pose: Some(pose),
             earlier: vec![pb::EarlierPose { sequences: 1, client_time_ns: 1, ..Default::default() }; 8],
         };
         let message = pb::PosesDatagram { number, tools: (0..5).map(poses).collect(), ..Default::default() };

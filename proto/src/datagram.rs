@@ -111,7 +111,7 @@ pub fn tool_poses<'a>(tool: u32, newest: &Posed, earlier: impl Iterator<Item = &
         tool,
         sequence: newest.sequence,
         client_time_ns: newest.client_time_ns,
-        pose: Some(newest.pose.clone()),
+        pose: Some(newest.pose),
         earlier: earlier.filter_map(difference).take(MOST_EARLIER).collect(),
     }
 }
@@ -129,11 +129,11 @@ pub fn commands(message: &pb::ToolPoses) -> impl Iterator<Item = pb::Command> {
     let place_m = pose.as_ref().map_or(DVec3::ZERO, |pose| from_vector(pose.position_m.as_ref()));
     let before = move |before: &pb::EarlierPose| {
         let away_m = 1e-9 * DVec3::new(before.x_nm as f64, before.y_nm as f64, before.z_nm as f64);
-        let pose = pb::Pose { position_m: vector(place_m - away_m), velocity_m_per_s: None, ..pose.clone()? };
+        let pose = pb::Pose { position_m: vector(place_m - away_m), velocity_m_per_s: None, ..(*pose)? };
         let sequence = sequence.checked_sub(before.sequences.into())?;
         Some(command(sequence, client_time_ns.checked_sub(before.client_time_ns)?, pose))
     };
-    let newest = pose.clone().map(|pose| command(*sequence, *client_time_ns, pose));
+    let newest = pose.map(|pose| command(*sequence, *client_time_ns, pose));
     earlier.iter().take(MOST_EARLIER).rev().filter_map(before).chain(newest)
 }
 

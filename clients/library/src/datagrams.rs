@@ -94,7 +94,7 @@ impl Datagrams {
         if self.connection.is_none() || command.client_time_ns == 0 {
             return false;
         }
-        let newest = Posed { sequence, client_time_ns: command.client_time_ns, pose: pose.clone() };
+        let newest = Posed { sequence, client_time_ns: command.client_time_ns, pose: *pose };
         let recent = self.recent.entry(command.tool).or_default();
         let message = datagram::tool_poses(command.tool, &newest, recent.iter());
         recent.push_front(newest);

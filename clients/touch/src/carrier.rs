@@ -107,12 +107,12 @@ mod tests {
     /// its way and the time, ms. Returns when each end's datagrams carry, one entry a millisecond.
     fn play(every_ms: u32, passes: impl Fn(usize, u32) -> bool) -> [Vec<bool>; 2] {
         let (mut ends, mut carries) = ([Carrier::default(), Carrier::default()], [Vec::new(), Vec::new()]);
-        let mut under_way = Vec::new();
+        let mut under_way: Vec<(u32, usize, (u64, u64))> = Vec::new();
         for now_ms in 0..3000_u32 {
             let now_s = f64::from(now_ms) * 1e-3;
             under_way.retain(|(due_ms, to, (number, acknowledges))| {
                 if *due_ms == now_ms {
-                    ends[*to as usize].arrive(*number, *acknowledges, now_s);
+                    ends[*to].arrive(*number, *acknowledges, now_s);
                 }
                 *due_ms > now_ms
             });
