@@ -160,7 +160,7 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
         let listeners = Listeners::open(&config).await?;
         let shutdown = CancellationToken::new();
         signals::outlive();
-        tokio::spawn(signals::cancel_on(shutdown.clone()));
+        signals::cancel_on(shutdown.clone());
         // The standard output may be closed; that does not stop the server.
         let _ = writeln!(std::io::stdout(), "palpate listens on {}", listeners.url());
         if let Some(url) = listeners.metrics_url() {

@@ -16,23 +16,29 @@ pub fn outlive() {
     }
 }
 
-/// Cancels `shutdown` at Ctrl-C or SIGTERM; a second one ends the process at once.
-pub async fn cancel_on(shutdown: CancellationToken) {
-    for signals in 0.. {
-        #[cfg(unix)]
-        {
-            use tokio::signal::unix::{SignalKind, signal};
-            let Ok(mut terminate) = signal(SignalKind::terminate()) else { return };
+/// Cancels `shutdown` at Ctrl-C or SIGTERM; a second one ends the process at once. Both are caught when this returns: who is told
+/// that the server listens may end it at once. Call it within a runtime.
+pub fn cancel_on(shutdown: CancellationToken) {
+    #[cfg(unix)]
+    let (mut interrupt, mut terminate) = {
+        use tokio::signal::unix::{SignalKind, signal};
+        let caught = (signal(SignalKind::interrupt()), signal(SignalKind::terminate()));
+        let (Ok(interrupt), Ok(terminate)) = caught else { return };
+        (interrupt, terminate)
+    };
+    tokio::spawn(async move {
+        for signals in 0.. {
+            #[cfg(unix)]
             tokio::select! {
-                _ = tokio::signal::ctrl_c() => {}
+                _ = interrupt.recv() => {}
                 _ = terminate.recv() => {}
             }
+            #[cfg(not(unix))]
+            let _ = tokio::signal::ctrl_c().await;
+            if signals > 0 {
+                std::process::exit(130);
+            }
+            shutdown.cancel();
         }
-        #[cfg(not(unix))]
-        let _ = tokio::signal::ctrl_c().await;
-        if signals > 0 {
-            std::process::exit(130);
-        }
-        shutdown.cancel();
-    }
+    });
 }
