@@ -11,6 +11,12 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
+use palpate::limits::Limits;
+use palpate::scene::script::Action;
+use palpate::scene::{BUILT_IN, Scene};
+use palpate::session::Session;
+use palpate::session::command::{Command, Due};
+use palpate::sheet::Model;
 use palpate_client::Credentials;
 use palpate_client::datagrams::Datagrams;
 use palpate_proto::{datagram, pb, touch};
@@ -405,4 +411,63 @@ async fn a_client_that_cant_open_a_stream_has_datagrams_for_its_lease() {
     let request = pb::ReleaseToolRequest { session_id: session.clone(), lease_id };
     haptics.release_tool(request).await.unwrap();
     in_time(connection.closed()).await;
+}
+
+/// Plays commands to tool 0 of liver, those of each step; the forces on the tool after each, N.
+fn played(steps: usize, commands: impl Fn(usize) -> Vec<Command>) -> Vec<f64> {
+    let text = BUILT_IN.iter().find(|scene| scene.0 == "liver").unwrap().1;
+    let scene = Scene::parse("liver", text, &[], &Limits::default()).unwrap();
+    let mut session = Session::new(&Model::compile(&scene, &Limits::default()).unwrap());
+    let forces = (0..steps).map(|step| {
+        let due = |command| Due { command, late: false, late_commands: 0, ends_lease: false };
+        session.advance(&mut commands(step).into_iter().map(due).collect(), |_| {});
+        let contact = session.sample(None).tools.first().and_then(|tool| tool.contact);
+        contact.map_or(0.0, |contact| contact.force_on_tool_n.z)
+    });
+    forces.collect()
+}
+
+/// A pose that presses, 10 mm/s down to 3 mm, sent at that step and played by the client's time.
+fn pressing(step: usize) -> Command {
+    let z_m = 0.001 - 1e-5 * step.min(400) as f64;
+    Command {
+        tool: 0,
+        sequence: Some(1 + step as u64),
+        client_time_ns: 1_000_000_000 + 1_000_000 * step as u64,
+        by_datagram: true,
+        at_step: None,
+        time_to_live_s: None,
+        action: Action::Pose {
+            place_m: glam::DVec3::new(0.0375, 0.0375, z_m),
+            velocity_m_per_s: None,
+            tip: Tip::default(),
+        },
+        arrival_ns: 0,
+    }
+}
+
+#[test]
+fn poses_that_overtake_each_other_press_as_those_in_order_do() {
+    let in_order = played(600, |step| vec![pressing(step)]);
+    // The two of a pair come in the other order, both with the second of them.
+    let in_pairs = played(600, |step| if step % 2 == 1 { vec![pressing(step), pressing(step - 1)] } else { vec![] });
+    let without = played(600, |step| if step % 2 == 1 { vec![pressing(step)] } else { vec![] });
+    let most_n = in_order.iter().copied().fold(0.0, f64::max);
+    assert!(most_n > 0.2, "{most_n} N");
+    for (name, forces) in [("in pairs", in_pairs), ("every second", without)] {
+        // A pair is late by a step.
+        let apart_n = in_order[..598].iter().zip(&forces[1..]).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+        assert!(apart_n < 0.02 * most_n, "{name}: {apart_n} N of {most_n}");
+    }
+}
+
+#[test]
+fn a_pose_that_was_overtaken_by_a_release_begins_no_touch() {
+    let forces = played(900, |step| match step {
+        0..500 => vec![pressing(step)],
+        500 => vec![Command { action: Action::Release, by_datagram: false, ..pressing(501) }],
+        501 => vec![pressing(500), pressing(499)],
+        _ => vec![],
+    });
+    assert!(forces[499] > 0.2 && forces[502..].iter().all(|force_n| force_n.abs() < 0.1 * forces[499]), "{forces:?}");
 }

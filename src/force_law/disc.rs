@@ -2,8 +2,8 @@
 
 use glam::DVec3;
 
-use super::place;
 use crate::sheet::Model;
+use crate::sheet::alike::place_alike;
 
 /// A tool so many radii away from the surface wants no law of the place.
 const NEAR_IN_RADII: f64 = 4.0;
@@ -35,8 +35,42 @@ impl Disc {
         if nearest_m.distance(place_m) > NEAR_IN_RADII * self.radius_m {
             return self;
         }
-        let at_m = place::serving(model, self.radius_m, place_m);
+        let at_m = place_alike(model, self.radius_m, place_m);
         let serves_m = self.radius_m * SERVES_IN_RADII[usize::from(shape.dimensions() > 2)];
         if at_m.distance(self.at_m) <= serves_m { self } else { Disc { at_m, ..self } }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::AtomicBool;
+
+    use glam::DVec2;
+
+    use super::super::exact_within;
+    use super::*;
+
+    const RADIUS_M: f64 = 0.02;
+
+    /// The law at the place that serves is that of the place itself, and at a rim it is another one, as the tissue is.
+    #[test]
+    fn laws_differ_at_a_rim_as_the_tissue_does_and_nowhere_else() {
+        let model = Model::paper(&["sheet.points=[21, 21]", "sheet.spacing_m=0.01", "sheet.fixed=\"edges\""]);
+        let law = |at_m: DVec2| {
+            let disc = Disc { radius_m: RADIUS_M, at_m: at_m.extend(0.0) };
+            exact_within(&model, disc, u64::MAX, &AtomicBool::new(false)).unwrap()
+        };
+        let alike = |at_m: DVec2| place_alike(&model, RADIUS_M, at_m.extend(-0.003)).truncate();
+        let middle = law(DVec2::splat(0.1));
+        // At the first the law of the middle serves.
+        for (x_m, most) in [(0.08, 2e-3), (0.06, 5e-3), (0.03, 5e-3)] {
+            let (own, other) = (law(DVec2::new(x_m, 0.11)), law(alike(DVec2::new(x_m, 0.11))));
+            for depth_m in [0.01, 0.03, 0.06] {
+                let [own_n, other_n] = [&own, &other].map(|law| law.at_depth(depth_m).force_n);
+                assert!((own_n / other_n - 1.0).abs() < most, "{x_m}, {depth_m} m deep: {own_n} {other_n}");
+            }
+        }
+        let rim = law(alike(DVec2::new(RADIUS_M, 0.1)));
+        assert!(rim.at_depth(0.03).force_n > 1.1 * middle.at_depth(0.03).force_n);
     }
 }

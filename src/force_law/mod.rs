@@ -5,7 +5,6 @@
 mod coarse;
 mod disc;
 mod exact;
-mod place;
 
 pub use coarse::first;
 pub use disc::Disc;

@@ -5,6 +5,7 @@
 //! (`integrate`) advances each point. A sheet at rest costs almost nothing: tiles sleep (`tiles`, `rest`).
 
 mod advance;
+pub mod alike;
 mod applied;
 mod around;
 pub mod audit;

@@ -1,4 +1,4 @@
-//! Which place has the law that serves a tool, so that no law is computed that is known from another place.
+//! Which place of a tissue is like another to a disc, so that what is known of the one need not be computed for the other.
 //!
 //! On a mesh that is the nearest vertex. A sheet is the same everywhere but for its rim and its fixed points, so there it is the
 //! place that lies as far from the nearer rim along each side. What a disc does to a rim comes back to the disc, and so
@@ -7,16 +7,16 @@
 
 use glam::{DVec2, DVec3};
 
+use super::model::Model;
+use super::tangent;
 use crate::scene::{Fixed, Sheet};
 use crate::shape::RestShape;
-use crate::sheet::Model;
-use crate::sheet::tangent;
 
 /// Places on a raster of this part of the radius have laws of their own. It has the points of the sheet in it, or some of them.
 const APART_IN_RADII: f64 = 0.5;
 
-/// The place at rest whose law serves a disc of `radius_m` at `at_m`.
-pub(super) fn serving(model: &Model, radius_m: f64, at_m: DVec3) -> DVec3 {
+/// The place at rest that is to a disc of `radius_m` as `at_m` is.
+pub fn place_alike(model: &Model, radius_m: f64, at_m: DVec3) -> DVec3 {
     let Some(sheet) = model.scene.sheet() else {
         let shape = model.shape();
         return shape.rest_m(shape.nearest(at_m));
@@ -71,9 +71,7 @@ fn rounded(sheet: &Sheet, radius_m: f64, at_m: DVec2) -> DVec2 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{Disc, exact_within};
     use super::*;
-    use std::sync::atomic::AtomicBool;
 
     /// A sheet of 31 × 41 points, 10 mm apart, that is noticed over 3 points: its rim counts for 110 mm.
     fn model(fixed: &str) -> std::sync::Arc<Model> {
@@ -84,7 +82,7 @@ mod tests {
     const RADIUS_M: f64 = 0.02;
 
     fn served(model: &Model, x_m: f64, y_m: f64) -> DVec2 {
-        serving(model, RADIUS_M, DVec3::new(x_m, y_m, -0.003)).truncate()
+        place_alike(model, RADIUS_M, DVec3::new(x_m, y_m, -0.003)).truncate()
     }
 
     fn assert_at(found_m: DVec2, x_m: f64, y_m: f64) {
@@ -135,30 +133,9 @@ mod tests {
     fn a_disc_smaller_than_a_cell_feels_where_in_the_cell_it_is() {
         let model = model("sheet.fixed=\"edges\"");
         let places = [(0.15, 0.2), (0.1525, 0.2), (0.155, 0.2025), (0.145, 0.1975), (0.185, 0.2425)];
-        let served = places.map(|(x_m, y_m)| serving(&model, 0.005, DVec3::new(x_m, y_m, 0.0)).truncate());
+        let served = places.map(|(x_m, y_m)| place_alike(&model, 0.005, DVec3::new(x_m, y_m, 0.0)).truncate());
         assert_at(served[0], 0.15, 0.2);
         assert_at(served[1], 0.1475, 0.2);
         served[3..].iter().for_each(|place_m| assert_at(*place_m, served[2].x, served[2].y));
-    }
-
-    /// The law at the place that serves is that of the place itself, and at a rim it is another one, as the tissue is.
-    #[test]
-    fn laws_differ_at_a_rim_as_the_tissue_does_and_nowhere_else() {
-        let model = Model::paper(&["sheet.points=[21, 21]", "sheet.spacing_m=0.01", "sheet.fixed=\"edges\""]);
-        let law = |at_m: DVec2| {
-            let disc = Disc { radius_m: RADIUS_M, at_m: at_m.extend(0.0) };
-            exact_within(&model, disc, u64::MAX, &AtomicBool::new(false)).unwrap()
-        };
-        let middle = law(DVec2::splat(0.1));
-        // At the first the law of the middle serves.
-        for (x_m, most) in [(0.08, 2e-3), (0.06, 5e-3), (0.03, 5e-3)] {
-            let (own, other) = (law(DVec2::new(x_m, 0.11)), law(served(&model, x_m, 0.11)));
-            for depth_m in [0.01, 0.03, 0.06] {
-                let [own_n, other_n] = [&own, &other].map(|law| law.at_depth(depth_m).force_n);
-                assert!((own_n / other_n - 1.0).abs() < most, "{x_m}, {depth_m} m deep: {own_n} {other_n}");
-            }
-        }
-        let rim = law(served(&model, RADIUS_M, 0.1));
-        assert!(rim.at_depth(0.03).force_n > 1.1 * middle.at_depth(0.03).force_n);
     }
 }
