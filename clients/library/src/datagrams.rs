@@ -38,8 +38,11 @@ use wtransport::{ClientConfig, Connection, Endpoint};
 
 use crate::connect::Server;
 
-/// Time for the session to open; the stream carries everything until then.
-const PATIENCE: Duration = Duration::from_secs(5);
+/// Time for the session to open, and how often it is tried: within the ten seconds of a ticket, which is used up only when a session
+/// is open. (HTTP/3 below may wait for ever for settings that were sent again after a loss: wtransport 0.7.) The stream carries
+/// everything until then.
+const PATIENCE: Duration = Duration::from_secs(2);
+const ATTEMPTS: usize = 4;
 
 /// The datagrams of one stream.
 #[derive(Debug)]
@@ -62,7 +65,15 @@ impl Datagrams {
         let mut opening = JoinSet::new();
         if let Some(offer) = offer.cloned() {
             let host = if offer.host.is_empty() { server.host().to_owned() } else { offer.host.clone() };
-            opening.spawn(async move { tokio::time::timeout(PATIENCE, open(&host, &offer)).await.ok().flatten() });
+            opening.spawn(async move {
+                for _ in 0..ATTEMPTS {
+                    if let Ok(opened) = tokio::time::timeout(PATIENCE, open(&host, &offer)).await {
+                        // What was refused stays so.
+                        return opened;
+                    }
+                }
+                None
+            });
         }
         let mut life = interval(Duration::from_secs_f64(0.5 * LIFE_S));
         life.set_missed_tick_behavior(MissedTickBehavior::Delay);
