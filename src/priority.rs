@@ -1,4 +1,4 @@
-//! Threads: heavy work gives way to stepping and to the network; all have a stack that the kernel fits on.
+//! Threads: heavy work, and what strangers send by UDP, give way to stepping and to the network; all have a stack that the kernel fits on.
 
 use std::thread::Builder;
 
@@ -11,13 +11,21 @@ pub(crate) fn thread(name: impl Into<String>) -> Builder {
     Builder::new().name(name.into()).stack_size(STACK_BYTES)
 }
 
-/// About a tenth of what the others get where there is not enough for all: no thread is ever shut out.
-#[cfg(target_os = "linux")]
-const NICENESS: i32 = 10;
-
-/// Makes the calling thread give way to those of the process that step, and to the network's.
+/// Makes the calling thread give way to those of the process that step, and to the network's: where there is not enough for all
+/// it gets about a tenth of what they get. No thread is ever shut out.
 pub(crate) fn give_way() {
-    // Of this thread alone, on Linux; elsewhere it would be the whole process. Best effort.
+    be_nice(10);
+}
+
+/// Makes the calling thread give way, but less: it gets about a third.
+pub(crate) fn give_way_a_little() {
+    be_nice(5);
+}
+
+/// Of this thread alone, on Linux; elsewhere it would be the whole process. Best effort.
+fn be_nice(niceness: i32) {
     #[cfg(target_os = "linux")]
-    let _ = rustix::process::setpriority_process(None, NICENESS);
+    let _ = rustix::process::setpriority_process(None, niceness);
+    #[cfg(not(target_os = "linux"))]
+    let _ = niceness;
 }

@@ -471,3 +471,32 @@ fn a_pose_that_was_overtaken_by_a_release_begins_no_touch() {
     });
     assert!(forces[499] > 0.2 && forces[502..].iter().all(|force_n| force_n.abs() < 0.1 * forces[499]), "{forces:?}");
 }
+
+#[tokio::test]
+async fn an_offer_that_nobody_takes_gives_its_place_among_the_streams_back() {
+    let server = Server::start(&[]);
+    let session = liver(&server).await;
+    let mut haptics = server.haptics().await;
+    let request = pb::AcquireToolRequest {
+        session_id: session.clone(),
+        tool: 0,
+        lease_s: Some(60.0),
+        outlives_connection: true,
+        ..Default::default()
+    };
+    let lease_id = haptics.acquire_tool(request).await.unwrap().into_inner().lease_id;
+    let request = pb::OpenDatagramsRequest { session_id: session.clone(), lease_id, ..Default::default() };
+    haptics.open_datagrams(request).await.unwrap();
+    let mut admin = pb::admin_service_client::AdminServiceClient::new(server.channel().await);
+    let mut streams = async || {
+        let request = pb::ListStreamsRequest { session_id: session.clone() };
+        admin.list_streams(request).await.unwrap().into_inner().streams.len()
+    };
+    assert_eq!(streams().await, 1);
+    let given_back = async {
+        while streams().await > 0 {
+            tokio::time::sleep(Duration::from_millis(200)).await;
+        }
+    };
+    in_time(given_back).await;
+}

@@ -30,12 +30,8 @@ impl Bucket {
     }
 
     /// Takes one. Returns an error if the bucket is empty; its message calls the requests `what`.
-    #[allow(clippy::cast_precision_loss)]
     pub(super) fn take(&mut self, now_ns: u64, what: &str) -> Result<()> {
-        let elapsed_s = now_ns.saturating_sub(self.filled_ns) as f64 * 1e-9;
-        self.left = (self.left + elapsed_s * self.per_s).min(self.most);
-        self.filled_ns = self.filled_ns.max(now_ns);
-        if self.left < 1.0 {
+        if !self.has_one(now_ns) {
             self.refused += 1.0;
             let Bucket { per_s, most, .. } = *self;
             let message = format!("{what} exceed {:.0} a minute, and {most:.0} at once", 60.0 * per_s);
@@ -44,6 +40,19 @@ impl Bucket {
         self.left -= 1.0;
         self.refused = (self.refused - 1.0).max(0.0);
         Ok(())
+    }
+
+    /// Time until there is one, at most a second; `None` if there is one.
+    pub(super) fn time_to_one(&mut self, now_ns: u64) -> Option<Duration> {
+        (!self.has_one(now_ns)).then(|| self.wait())
+    }
+
+    #[allow(clippy::cast_precision_loss)]
+    fn has_one(&mut self, now_ns: u64) -> bool {
+        let elapsed_s = now_ns.saturating_sub(self.filled_ns) as f64 * 1e-9;
+        self.left = (self.left + elapsed_s * self.per_s).min(self.most);
+        self.filled_ns = self.filled_ns.max(now_ns);
+        self.left >= 1.0
     }
 
     /// Time until the next request would be granted, at most a second.

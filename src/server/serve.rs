@@ -16,7 +16,7 @@ use super::authorize::AuthorizeLayer;
 use super::catalog::Catalog;
 use super::config::Config;
 use super::connections::ConnectionSlots;
-use super::datagrams::{self, Datagrams};
+use super::datagrams;
 use super::health::{SERVICES, end_health, report_files, report_workshop};
 use super::listeners::{Listeners, ServeError};
 use super::meshes::Meshes;
@@ -98,9 +98,8 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
     let config = Arc::new(config);
     let meshes = Meshes::new(&limits);
     let textures = Textures::open(&config, &catalog, &pacer, &limits)?;
-    let datagrams = Datagrams::at(socket.as_ref());
     let (pages, counted) = (origins.clone(), traffic.clone());
-    tokio::spawn(datagrams::serve(socket, datagrams.clone(), pages, counted, shutdown.child_token()));
+    let datagrams = datagrams::receive(socket, pages, counted, shutdown.child_token()).await;
     let services = Services {
         datagrams,
         catalog,

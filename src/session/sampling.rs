@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use palpate_touch::news::FASTEST_S;
 use palpate_touch::{Law, LocalModel};
 
 use super::laws::{FIRST, Laws};
@@ -108,13 +109,10 @@ pub struct Sampling {
 #[derive(Debug, Default)]
 pub struct WantedHeartbeat(AtomicU64);
 
-/// The shortest heartbeat that a reader may want at present, s.
-const LEAST_HEARTBEAT_S: f64 = 0.01;
-
 impl WantedHeartbeat {
     /// From now on the reader wants this, s; anything not above 0: nothing of its own.
     pub fn set(&self, heartbeat_s: f64) {
-        let bits = if heartbeat_s > 0.0 { heartbeat_s.max(LEAST_HEARTBEAT_S).to_bits() } else { 0 };
+        let bits = if heartbeat_s > 0.0 { heartbeat_s.max(FASTEST_S).to_bits() } else { 0 };
         self.0.store(bits, Ordering::Relaxed);
     }
 

@@ -29,7 +29,7 @@ use palpate_proto::datagram::{self, MOST_BYTES, MOST_EARLIER, Posed};
 use palpate_proto::pb;
 use palpate_touch::carrier::{Carried, Carrier, LIFE_S};
 use palpate_touch::deadband::HEARTBEAT_S;
-use palpate_touch::news::Pulse;
+use palpate_touch::news::{FASTEST_S, Pulse};
 use prost::Message;
 use tokio::task::JoinSet;
 use tokio::time::{Interval, MissedTickBehavior, interval};
@@ -164,7 +164,7 @@ impl Datagrams {
         self.carrier.arrive(message.number, message.acknowledges, now_s);
         self.pulse.arrive(message.number, message.sent_ns as f64 * 1e-9, now_s);
         if message.heartbeat_s > 0.0 {
-            self.wanted_s = f64::from(message.heartbeat_s).max(0.01);
+            self.wanted_s = f64::from(message.heartbeat_s).max(FASTEST_S);
         }
         message.sample.filter(|sample| self.is_newer(sample))
     }

@@ -2,12 +2,12 @@
 //! how many a network begins.
 
 use std::collections::HashMap;
-use std::net::{IpAddr, SocketAddr};
+use std::net::{IpAddr, SocketAddr, UdpSocket};
 use std::sync::Arc;
 use std::time::Duration;
 
 use http::HeaderValue;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot};
 use tokio::time::{Interval, interval, timeout};
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, warn};
@@ -18,6 +18,7 @@ use super::certificate::{self, ROTATED};
 use super::offers::{Datagrams, Offers, Socket};
 use crate::lock::lock;
 use crate::pace::clock::now_ns;
+use crate::priority::{give_way_a_little, thread};
 use crate::server::address::network;
 use crate::server::authorize::is_own_or_among;
 use crate::server::rate::Bucket;
@@ -36,24 +37,40 @@ const EACH: (f64, f64) = (10.0, 40.0);
 /// Networks whose handshakes are counted. When they are more, all are forgotten: what is left is bounded by [`HANDSHAKES`].
 const NETWORKS: usize = 1024;
 
-/// Receives at `socket` until `shutdown` is cancelled. Without datagrams it only waits for that.
-pub(in crate::server) async fn serve(
+/// Time to tell the clients that the server ends.
+const FAREWELL: Duration = Duration::from_secs(1);
+
+/// Receives at `socket` until `shutdown` is cancelled, and returns what can be offered: nothing without a socket. On a thread of
+/// its own that gives way: whatever comes by UDP, true or not, takes little from those who call by gRPC.
+pub(in crate::server) async fn receive(
     socket: Option<Socket>,
-    datagrams: Datagrams,
     origins: Arc<[HeaderValue]>,
     traffic: Arc<Traffic>,
     shutdown: CancellationToken,
-) {
-    let (Some(socket), Datagrams(Some(offers))) = (socket, datagrams) else { return shutdown.cancelled().await };
-    let listener = match Listener::open(socket, offers, origins, traffic) {
-        Ok(listener) => listener,
-        Err(error) => {
-            warn!(%error, "no datagrams: touch goes by gRPC alone");
-            return shutdown.cancelled().await;
-        }
+) -> Datagrams {
+    let Some(Socket { socket, advertised }) = socket else { return Datagrams::default() };
+    let (ready, is_ready) = oneshot::channel();
+    let receiving = move || -> Result<(), Failure> {
+        give_way_a_little();
+        tokio::runtime::Builder::new_current_thread().enable_all().build()?.block_on(async {
+            let listener = Listener::open(socket, advertised, origins, traffic)?;
+            let _ = ready.send(listener.door.offers.clone());
+            listener.run(shutdown).await;
+            Ok(())
+        })
     };
-    listener.run(shutdown).await;
+    let spawned = thread("datagrams").spawn(move || {
+        if let Err(error) = receiving() {
+            warn!(%error, "no datagrams: touch goes by gRPC alone");
+        }
+    });
+    if let Err(error) = spawned {
+        warn!(%error, "no thread for datagrams: touch goes by gRPC alone");
+    }
+    Datagrams(is_ready.await.ok())
 }
+
+type Failure = Box<dyn std::error::Error + Send + Sync>;
 
 struct Listener {
     endpoint: Endpoint<endpoint_side::Server>,
@@ -72,17 +89,16 @@ struct Door {
 
 impl Listener {
     fn open(
-        socket: Socket,
-        offers: Arc<Offers>,
+        socket: UdpSocket,
+        advertised: (String, u16),
         origins: Arc<[HeaderValue]>,
         traffic: Arc<Traffic>,
-    ) -> Result<Self, Box<dyn std::error::Error + Send + Sync>> {
+    ) -> Result<Self, Failure> {
         let (identity, hash) = certificate::make()?;
-        let config = ServerConfig::builder().with_bind_socket(socket.socket);
+        let config = ServerConfig::builder().with_bind_socket(socket);
         let endpoint = Endpoint::server(settled(config.with_identity(identity).build()))?;
-        *lock(&offers.certificate_sha256) = hash;
-        let handshakes = Arc::new(Semaphore::new(HANDSHAKES));
-        let door = Arc::new(Door { offers, origins, traffic });
+        let offers = Arc::new(Offers::new(advertised, hash));
+        let (door, handshakes) = (Arc::new(Door { offers, origins, traffic }), Arc::new(Semaphore::new(HANDSHAKES)));
         let mut rotation = interval(ROTATED);
         // The first tick is at once.
         rotation.reset();
@@ -94,9 +110,11 @@ impl Listener {
             tokio::select! {
                 incoming = self.endpoint.accept() => self.take(incoming),
                 _ = self.rotation.tick() => self.rotate(),
-                () = shutdown.cancelled() => return self.endpoint.close(VarInt::from_u32(0), b"the server is shutting down"),
+                () = shutdown.cancelled() => break,
             }
         }
+        self.endpoint.close(VarInt::from_u32(0), b"the server is shutting down");
+        let _ = timeout(FAREWELL, self.endpoint.wait_idle()).await;
     }
 
     /// Begins a handshake with a client that has shown that it is where it says: so nobody makes the server answer to others.

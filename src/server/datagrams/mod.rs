@@ -10,7 +10,7 @@ mod offers;
 mod tickets;
 mod way;
 
-pub(super) use endpoint::serve;
+pub(super) use endpoint::receive;
 pub(super) use offers::{Datagrams, Socket, not_available};
-pub(super) use tickets::Arrival;
+pub(super) use tickets::{Arrival, GOOD};
 pub(super) use way::Way;

@@ -15,7 +15,7 @@ use crate::server::config::Config;
 /// Where datagrams are received, if at all.
 pub(in crate::server) struct Socket {
     pub(super) socket: UdpSocket,
-    advertised: (String, u16),
+    pub(super) advertised: (String, u16),
 }
 
 impl Socket {
@@ -47,18 +47,14 @@ pub(super) struct Offers {
     pub(super) certificate_sha256: Mutex<[u8; 32]>,
 }
 
-impl Datagrams {
-    /// Of what `socket` receives.
-    pub(in crate::server) fn at(socket: Option<&Socket>) -> Self {
-        Datagrams(socket.map(|socket| {
-            Arc::new(Offers {
-                advertised: socket.advertised.clone(),
-                tickets: Mutex::default(),
-                certificate_sha256: Mutex::default(),
-            })
-        }))
+impl Offers {
+    /// Of what is received at that host and port, under the certificate of that hash.
+    pub(super) fn new(advertised: (String, u16), certificate_sha256: [u8; 32]) -> Self {
+        Offers { advertised, tickets: Mutex::default(), certificate_sha256: Mutex::new(certificate_sha256) }
     }
+}
 
+impl Datagrams {
     /// An offer for one stream or lease, and the session that takes it. `None` if the server has no datagrams, or too many
     /// tickets are out.
     ///

@@ -1,6 +1,7 @@
 //! Tickets for datagram sessions: 128 random bits, each for one session, within ten seconds.
 
 use std::collections::HashMap;
+use std::time::Duration;
 
 use tokio::sync::oneshot;
 use wtransport::Connection;
@@ -11,8 +12,9 @@ use crate::refusal::Result;
 /// The session that presents a ticket, once it does.
 pub(in crate::server) type Arrival = oneshot::Receiver<Connection>;
 
-/// A ticket is good for so long, ns.
-const GOOD_NS: u64 = 10_000_000_000;
+/// A ticket is good for so long.
+pub(in crate::server) const GOOD: Duration = Duration::from_secs(10);
+const GOOD_NS: u64 = 1_000_000_000 * GOOD.as_secs();
 
 /// The most tickets that are out at a time; each belongs to a stream or a call.
 const MOST: usize = 4096;

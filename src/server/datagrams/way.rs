@@ -13,11 +13,14 @@ use super::tickets::Arrival;
 use crate::lock::lock;
 use crate::pace::clock::now_ns;
 use crate::refusal::{Reason, Refusal, Result};
+use crate::server::rate::Bucket;
 use crate::session::sampling::WantedHeartbeat;
 
 /// The datagrams of a stream, in both directions. Who listens and who tells share it.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(in crate::server) struct Way {
+    /// How often a message is taken in. More of them overflow their buffer, which costs nothing.
+    pace: Mutex<Bucket>,
     inner: Mutex<Inner>,
     wanted: Arc<WantedHeartbeat>,
 }
@@ -34,6 +37,11 @@ fn seconds(ns: u64) -> f64 {
 }
 
 impl Way {
+    /// Messages are taken in at this pace.
+    pub(in crate::server) fn new(pace: Bucket) -> Self {
+        Way { pace: Mutex::new(pace), inner: Mutex::default(), wanted: Arc::default() }
+    }
+
     /// Waits for the session; `None` if nobody takes its ticket.
     pub(in crate::server) async fn arrive(&self, arrival: &mut Option<Arrival>) -> Option<Connection> {
         if let Some(waiting) = arrival {
@@ -44,13 +52,19 @@ impl Way {
         lock(&self.inner).connection.clone()
     }
 
-    /// The next message of the client. Waits for ever if there is no session, or no more.
+    /// The next message of the client, when there is time for it. Waits for ever if there is no session, or no more.
     pub(in crate::server) async fn next(&self, arrival: &mut Option<Arrival>) -> Result<pb::PosesDatagram> {
         let Some(connection) = self.arrive(arrival).await else { return std::future::pending().await };
+        loop {
+            let early = lock(&self.pace).time_to_one(now_ns());
+            let Some(early) = early else { break };
+            tokio::time::sleep(early).await;
+        }
         let Ok(datagram) = connection.receive_datagram().await else {
             lock(&self.inner).connection = None;
             return std::future::pending().await;
         };
+        let _ = lock(&self.pace).take(now_ns(), "datagrams of this stream");
         let bytes = datagram.payload();
         let wrong = |why: String| Refusal::new(Reason::Unreadable, "datagram", why);
         if bytes.len() > MOST_BYTES {

@@ -31,7 +31,6 @@ pub(super) struct Holder {
     place: Option<ToolPlace>,
     traffic: Arc<Traffic>,
     commands: Bucket,
-    datagrams: Bucket,
     /// Of each tool whose poses may come more than once those that have come.
     seen: BTreeMap<u32, Seen>,
 }
@@ -95,7 +94,7 @@ impl Holder {
         let tools = tools.len().max(1) as f64;
         let per_s = limits.commands_per_step * live.model.scene.stepping.rate_hz * tools;
         let commands = Bucket::new(per_s, per_s.max(2.0 * limits.queued_commands_per_tool as f64 * tools));
-        Holder { live, lease, device, place, traffic, datagrams: commands.clone(), commands, seen }
+        Holder { live, lease, device, place, traffic, commands, seen }
     }
 
     /// Takes in a command of the stream. Tells `events` if it is refused.
@@ -111,22 +110,23 @@ impl Holder {
         self.take(command, by_datagram, events)
     }
 
-    /// Takes in the poses of a datagram.
+    /// How often commands may come.
+    pub(super) fn pace(&self) -> Bucket {
+        self.commands.clone()
+    }
+
+    /// Takes in the poses of a datagram. One that can't be read is dropped.
     ///
     /// # Errors
     /// As for a command.
-    pub(super) fn poses(&mut self, message: &pb::PosesDatagram, events: &Writer<Event>) -> Result<()> {
+    pub(super) fn datagram(&mut self, datagram: Result<pb::PosesDatagram>, events: &Writer<Event>) -> Result<()> {
+        let Ok(message) = datagram else { return Ok(()) };
         for command in message.tools.iter().flat_map(datagram::commands) {
             if may_overtake(&command) && self.is_new(&command) {
                 self.take(&command, true, events)?;
             }
         }
         Ok(())
-    }
-
-    /// Whether a datagram comes at a rate that can be borne; else it is dropped unread.
-    pub(super) fn has_time_for_datagram(&mut self) -> bool {
-        self.datagrams.take(now_ns(), "datagrams of this stream").is_ok()
     }
 
     /// Counts something else that came with the commands.

@@ -16,7 +16,7 @@ use crate::budget::Account;
 use crate::pace::StreamKind;
 use crate::pace::queue::{Writer, queue};
 use crate::refusal::{Refusal, Result};
-use crate::server::datagrams::{Arrival, Way, not_available};
+use crate::server::datagrams::{Arrival, GOOD, Way, not_available};
 use crate::server::recovered::Notices;
 use crate::server::services::Services;
 use crate::wire;
@@ -48,7 +48,7 @@ pub(super) fn offer(
     let (offer, arrival) = services.datagrams.offer()?.ok_or_else(not_available)?;
     let (limits, traffic) = (&services.config.limits, services.traffic.clone());
     let holder = Holder::new(live.clone(), lease, &tools, (None, None), true, limits, traffic);
-    let way = Arc::new(Way::default());
+    let way = Arc::new(Way::new(holder.pace()));
     sampling.wanted = Some(way.wanted());
     let (events, heard) = queue(limits.queued_samples);
     let cut = guard.cut().clone();
@@ -69,7 +69,10 @@ impl LeaseSession {
     /// Serves until the lease or the session ends; says why it did.
     async fn serve(self) -> String {
         let LeaseSession { mut holder, mut outlet, way, mut arrival, events } = self;
-        let Some(connection) = way.arrive(&mut arrival).await else { return "nobody took the ticket".to_owned() };
+        // Until then it has a place among the streams of the session.
+        let Ok(Some(connection)) = tokio::time::timeout(GOOD, way.arrive(&mut arrival)).await else {
+            return "nobody took the ticket".to_owned();
+        };
         let telling = async {
             let mut stream = match connection.open_uni().await {
                 Ok(opening) => opening.await.map_err(|error| error.to_string())?,
@@ -93,10 +96,7 @@ impl LeaseSession {
             loop {
                 tokio::select! {
                     datagram = way.next(&mut arrival) => {
-                        if holder.has_time_for_datagram()
-                            && let Ok(poses) = datagram
-                            && let Err(refusal) = holder.poses(&poses, &events)
-                        {
+                        if let Err(refusal) = holder.datagram(datagram, &events) {
                             return refusal.to_string();
                         }
                     }

@@ -24,7 +24,7 @@ use crate::budget::Account;
 use crate::ids::random_bits;
 use crate::pace::clock::now_ns;
 use crate::pace::queue::{Reader, Writer, queue};
-use crate::pace::{Live, PacedSample, StreamGuard, StreamKind};
+use crate::pace::{PacedSample, StreamGuard, StreamKind};
 use crate::refusal::{Reason, Refusal};
 use crate::scene::check::check_tip;
 use crate::server::datagrams::{Arrival, Way};
@@ -32,7 +32,6 @@ use crate::server::force_law::{Computing, Updates};
 use crate::server::recovered::Notices;
 use crate::server::services::Services;
 use crate::session::laws::{FIRST, Laws};
-use crate::session::lease::LeaseId;
 use crate::wire;
 
 /// What the output of a haptic stream begins with.
@@ -48,8 +47,6 @@ struct Opened {
 
 /// The tools of a stream, given back when it ends however it ends.
 struct StreamTools {
-    live: Arc<Live>,
-    lease: LeaseId,
     tools: usize,
     holder: Holder,
     way: Arc<Way>,
@@ -62,7 +59,7 @@ impl Drop for StreamTools {
     fn drop(&mut self) {
         if self.tools > 0 {
             // A lease that has lapsed already has nothing to give back.
-            let _ = self.live.at_intake(|intake, _| intake.release(self.lease));
+            let _ = self.holder.live.at_intake(|intake, _| intake.release(self.holder.lease));
         }
     }
 }
@@ -129,9 +126,8 @@ async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> 
     let tools = open.tools.len();
     let (limits, traffic) = (&services.config.limits, services.traffic.clone());
     let holder = Holder::new(live.clone(), lease, &open.tools, (device, place), open.datagrams, limits, traffic);
-    let way = Arc::new(Way::default());
-    let mut held =
-        StreamTools { live: live.clone(), lease, tools, holder, way: way.clone(), arrival: None, _computing };
+    let way = Arc::new(Way::new(holder.pace()));
+    let mut held = StreamTools { tools, holder, way: way.clone(), arrival: None, _computing };
     let offered = if open.datagrams { services.datagrams.offer()? } else { None };
     let (datagrams, arrival) = offered.unzip();
     held.arrival = arrival;
@@ -203,7 +199,7 @@ async fn listen(
             return;
         }
     };
-    let (live, way) = (held.live.clone(), held.way.clone());
+    let (live, way) = (held.holder.live.clone(), held.way.clone());
     for command in early.dropped.drain(..) {
         let message = "was one of too many that came before the stream was open";
         let refusal = Refusal::new(Reason::QueueFull, "command", message);
@@ -216,10 +212,7 @@ async fn listen(
         let message = tokio::select! {
             message = early.next(&mut inbound) => message,
             datagram = way.next(&mut held.arrival) => {
-                if held.holder.has_time_for_datagram()
-                    && let Ok(poses) = datagram
-                    && let Err(refusal) = held.holder.poses(&poses, &events)
-                {
+                if let Err(refusal) = held.holder.datagram(datagram, &events) {
                     return events.close(refusal);
                 }
                 continue;
@@ -246,7 +239,7 @@ async fn listen(
                     continue;
                 }
                 if held.tools > 0
-                    && let Err(refusal) = live.at_intake(|intake, now| intake.renew(held.lease, now))
+                    && let Err(refusal) = live.at_intake(|intake, now| intake.renew(held.holder.lease, now))
                 {
                     // A lease is not named in a stream.
                     let refusal = Refusal { field: String::new(), ..refusal };

@@ -1,6 +1,5 @@
 //! The server's end of the network: its intake gets what arrives, and the sampler of the stream picks what is sent.
 
-use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use glam::DVec3;
@@ -9,6 +8,7 @@ use palpate::scene::script::Action;
 use palpate::session::command::Command;
 use palpate::session::laws::{FIRST, Laws};
 use palpate::session::sampling::{Deadband, Sampler, Sampling, WantedHeartbeat};
+use palpate_touch::carrier::Seen;
 use palpate_touch::deadband::HEARTBEAT_S;
 use palpate_touch::{Law, LocalModel, Pulse, Told};
 
@@ -21,9 +21,6 @@ use crate::simulated::network::Transport;
 
 /// The law of another tissue is known so long after the tissue has changed, s.
 const LAW_S: f64 = 0.1;
-
-/// The newest commands are remembered, so many of them: a datagram repeats what is not acknowledged.
-const REMEMBERED: usize = 1024;
 
 /// A tissue behind a network.
 pub(super) struct Server {
@@ -43,7 +40,8 @@ pub(super) struct Server {
     transport: Transport,
     /// Whether places come with velocities.
     is_moving: bool,
-    known: BTreeSet<u64>,
+    /// Of the commands: a datagram repeats what is not acknowledged.
+    seen: Seen,
     /// Of what arrives.
     pulse: Pulse,
     refused: u64,
@@ -79,7 +77,7 @@ impl Server {
             number: FIRST,
             transport: setup.conditions.transport,
             is_moving: setup.up_deadband > 0.0,
-            known: BTreeSet::new(),
+            seen: Seen::default(),
             pulse: Pulse::default(),
             refused: 0,
         })
@@ -91,13 +89,10 @@ impl Server {
         self.wanted.set(message.heartbeat_s);
         let mut commands = Vec::new();
         for (number, told) in &message.told {
-            if self.known.insert(*number) {
+            if self.seen.take(*number) {
                 self.follow(told.place_m);
                 commands.push(self.command(*number, told));
             }
-        }
-        while self.known.len() > REMEMBERED {
-            self.known.pop_first();
         }
         // As a server does it: what is refused has no effect, and is counted.
         self.refused += u64::from(self.tissue.submit(LEASE, commands, now_s).is_err());
