@@ -94,7 +94,7 @@ impl SceneFile {
     }
 
     /// The scene of a session that the server has made of this. Of a mesh of the server's own, places at rest are known to
-    /// seven digits only, and all points and springs are those of reference.
+    /// seven digits only, it is as fine as its file, and all points and springs are those of reference.
     ///
     /// # Errors
     /// Returns an error if the server's scene or mesh can't be read.
@@ -106,7 +106,9 @@ impl SceneFile {
             (None, Some(_)) => {
                 let mesh = server_mesh(&session.session_id, channel).await.map_err(Error::Call)?;
                 // The coefficients that follow from a material are told as well.
-                let even = pb::Scene { material: None, inclusions: Vec::new(), ..told.clone() };
+                let mut even = pb::Scene { material: None, inclusions: Vec::new(), ..told.clone() };
+                // Scripts name the vertices of the file. Which point of a coarser mesh each stands for, the server knows.
+                even.mesh.iter_mut().for_each(|mesh| mesh.vertices = None);
                 Ok(wire::scene::from_scene(&even, Some(&mesh))?)
             }
         }
