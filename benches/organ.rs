@@ -11,6 +11,7 @@ use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::scene::profile::Poke;
 use palpate::scene::{BUILT_IN, Named, Scene};
+use palpate::shape::points;
 use palpate::sheet::{Model, Push, Tissue, at_rest, tangent};
 use palpate_touch::{Coupling, Tip};
 use report::chart::{Look, Panel, Series};
@@ -57,9 +58,11 @@ fn main() {
     let mut report = Report::new("organ", "Organs", "make bench-organ");
     report.say("Release build, one thread; times are the least of many, in which the rows of a table take turns.");
     speed(&mut report, rounds);
-    let map = stiffness(&mut report);
+    let model = organ("liver-organ", 0.002, &[]);
+    let across = across_a_lump(&mut report, &model);
+    let map = map(&mut report, &model);
     evenness(&mut report);
-    report.write(1, &[map]);
+    report.write(2, &[across, map]);
 }
 
 fn speed(report: &mut Report, rounds: usize) {
@@ -121,17 +124,23 @@ fn top(model: &Model) -> (DVec3, DVec3) {
     (model.shape().rest_m(point), model.shape().normal(point))
 }
 
+/// The middles of the two lumps of `liver-organ`, and how far each reaches, m.
+const LUMPS_M: [(DVec3, f64); 2] =
+    [(DVec3::new(-0.040, -0.026, 0.037), 0.014), (DVec3::new(0.030, -0.013, 0.028), 0.010)];
+
+/// Held vertices so far from a disc stiffen what it feels, m.
+const NEAR_M: f64 = 0.005;
+
 /// Stiffness of a slow press of 2 mm along a line over the larger lump.
-fn stiffness(report: &mut Report) -> Panel {
+fn across_a_lump(report: &mut Report, model: &Arc<Model>) -> Panel {
     report.heading("A lump is felt where it is");
     report.say("Force of a slow press of `liver-organ`, 1 and 2 mm deep, along a line across its larger lump.");
-    let model = organ("liver-organ", 0.002, &[]);
-    let lump_m = DVec3::new(-0.040, -0.026, 0.037);
+    let lump_m = LUMPS_M[0].0;
     let places: Vec<f64> = (-12..=12).map(|k| 2.5e-3 * f64::from(k)).collect();
     let forces: Vec<[f64; 2]> = places
         .iter()
         .map(|along_m| {
-            let pressed = tangent::press(&model, TIP.radius_m, lump_m + DVec3::X * *along_m, 0.001, 3);
+            let pressed = tangent::press(model, TIP.radius_m, lump_m + DVec3::X * *along_m, 0.001, 3);
             [pressed[1].force_n, pressed[2].force_n]
         })
         .collect();
@@ -154,6 +163,57 @@ fn stiffness(report: &mut Report) -> Panel {
         y: "mN",
         up: 0.0..1.1 * most,
         series: series.into(),
+    }
+}
+
+/// Stiffness of a slow press of 1 mm all over the organ, seen from above. Places are `apart_m` or more from each other.
+fn map(report: &mut Report, model: &Arc<Model>) -> Panel {
+    report.heading("And nowhere else");
+    let apart_m: f64 = if quick() { 0.012 } else { 0.004 };
+    let shape = model.shape();
+    let mut chosen: Vec<DVec3> = Vec::new();
+    for point in points(shape).filter(|point| shape.normal(*point).z > 0.3 && !shape.is_fixed(*point)) {
+        let place_m = shape.rest_m(point);
+        if chosen.iter().all(|other_m| other_m.distance(place_m) >= apart_m) {
+            chosen.push(place_m);
+        }
+    }
+    let stiffness = |place_m: &DVec3| tangent::press(model, TIP.radius_m, *place_m, 0.001, 2)[1].force_n / 0.001;
+    let felt: Vec<(DVec3, f64)> = chosen.iter().map(|place_m| (*place_m, stiffness(place_m))).collect();
+    let held_m: Vec<DVec3> = points(shape).filter(|at| shape.is_fixed(*at)).map(|at| shape.rest_m(at)).collect();
+    let kind = |place_m: DVec3| {
+        let reaches = |other_m: DVec3, reach_m: f64| place_m.distance(other_m) < reach_m + TIP.radius_m;
+        let lump = LUMPS_M.iter().position(|(lump_m, reach_m)| reaches(*lump_m, *reach_m));
+        let is_held = || held_m.iter().any(|held_m| reaches(*held_m, NEAR_M));
+        lump.map_or_else(|| if is_held() { 3 } else { 0 }, |lump| lump + 1)
+    };
+    let kinds: Vec<usize> = chosen.iter().map(|place_m| kind(*place_m)).collect();
+    let rows: Vec<_> = ["elsewhere", "over the larger lump", "over the smaller lump", "near where it is held"]
+        .into_iter()
+        .enumerate()
+        .map(|(which, name)| {
+            let of_kind = felt.iter().zip(&kinds).filter(|(_, kind)| **kind == which);
+            let mut values: Vec<f64> = of_kind.map(|(place, _)| place.1).collect();
+            values.sort_by(f64::total_cmp);
+            let at = |part: f64| values[((values.len() - 1) as f64 * part).round() as usize];
+            let numbers = [0.0, 0.05, 0.5, 0.95, 1.0].map(at);
+            report.figure(name, json!({ "places": values.len(), "stiffness_n_per_m": numbers }));
+            [name.to_owned(), values.len().to_string()].into_iter().chain(numbers.map(digits)).collect()
+        })
+        .collect();
+    report.say(
+        "Force of a slow press of 1 mm over its depth, N/m, wherever the organ faces up and is not held: least, 5 %, median, 95 %, \
+         most. A place is over a lump if the disc reaches it or its soft edge, and near where the organ is held if vertices that never \
+         move are within 5 mm of the disc.",
+    );
+    let header = ["where", "places", "least", "5 %", "median", "95 %", "most"];
+    report.table(&header.map(str::to_owned), &rows);
+    Panel::Places {
+        title: "Stiffness all over the organ, from above".to_owned(),
+        unit: "mm",
+        value: "N/m",
+        size: 1.3e3 * apart_m,
+        places: felt.iter().map(|(place_m, stiffness)| [1e3 * place_m.x, 1e3 * place_m.y, *stiffness]).collect(),
     }
 }
 

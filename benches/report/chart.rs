@@ -40,6 +40,19 @@ pub enum Panel {
         /// Text, and its colour from 0 (green) to 1 (red).
         rows: Vec<Vec<(String, f64)>>,
     },
+    /// Places of a surface with a value each, as colours, seen from above: both axes have the same scale.
+    Places {
+        /// Above the chart.
+        title: String,
+        /// Of the axes.
+        unit: &'static str,
+        /// Of the values.
+        value: &'static str,
+        /// Edge of the square that stands for a place.
+        size: f64,
+        /// Along x and y, and the value.
+        places: Vec<[f64; 3]>,
+    },
 }
 
 /// A line.
@@ -127,6 +140,9 @@ pub fn svg(columns: usize, panels: &[Panel]) -> String {
                 Panel::Lines { title, x, y, series } => draw_lines(area, title, x, y, series),
                 Panel::Curves { title, x, y, up, series } => draw_curves(area, title, x, y, up, series),
                 Panel::Cells { title, x, y, rows } => draw_cells(area, title, x, y, rows),
+                Panel::Places { title, unit, value, size, places } => {
+                    draw_places(area, title, (unit, value), *size, places);
+                }
             }
         }
         root.present().unwrap();
@@ -193,13 +209,14 @@ fn draw_lines(area: &Area<'_>, title: &str, x: &str, y: &str, series: &[Series])
 }
 
 fn draw_curves(area: &Area<'_>, title: &str, x: &str, y: &str, up: &std::ops::Range<f64>, series: &[Series]) {
-    let across = series.iter().flat_map(|line| &line.points).map(|point| point.0).fold(0.0, f64::max);
+    let along = || series.iter().flat_map(|line| &line.points).map(|point| point.0);
+    let across = along().fold(0.0, f64::min)..along().fold(0.0, f64::max);
     let mut chart = ChartBuilder::on(area)
         .caption(title, ("sans-serif", 15))
         .margin(10)
         .x_label_area_size(36)
         .y_label_area_size(56)
-        .build_cartesian_2d(0.0..across, up.clone())
+        .build_cartesian_2d(across, up.clone())
         .unwrap();
     chart
         .configure_mesh()
@@ -257,5 +274,53 @@ fn draw_cells(
             area.draw(&Rectangle::new(corners, colour(*shade).filled())).unwrap();
             write(text, (across(column) + 3, middle), 9);
         }
+    }
+}
+
+/// Colours of a scale beside the chart.
+const SHADES: i32 = 50;
+
+fn draw_places(area: &Area<'_>, title: &str, (unit, value): (&str, &str), size: f64, places: &[[f64; 3]]) {
+    let (width, height) = area.dim_in_pixel();
+    let (chart_area, scale) = area.split_horizontally(width - 70);
+    let range = |axis: usize| {
+        let (from, to) = places
+            .iter()
+            .fold((f64::INFINITY, f64::NEG_INFINITY), |(from, to), place| (from.min(place[axis]), to.max(place[axis])));
+        (from, to)
+    };
+    let (low, high) = range(2);
+    let shade = |value: f64| if high > low { (value - low) / (high - low) } else { 0.0 };
+    // Of the panel, less labels and margins.
+    let (across_px, up_px) = (f64::from(width - 70 - 76), f64::from(height - 82));
+    let [x, y] = [0, 1].map(range);
+    let per_px = ((x.1 - x.0 + size) / across_px).max((y.1 - y.0 + size) / up_px);
+    let around = |(from, to): (f64, f64), px: f64| {
+        let (middle, half) = (0.5 * (from + to), 0.5 * px * per_px);
+        middle - half..middle + half
+    };
+    let mut chart = ChartBuilder::on(&chart_area)
+        .caption(title, ("sans-serif", 15))
+        .margin(10)
+        .x_label_area_size(36)
+        .y_label_area_size(56)
+        .build_cartesian_2d(around(x, across_px), around(y, up_px))
+        .unwrap();
+    chart.configure_mesh().x_desc(unit).y_desc(unit).disable_mesh().draw().unwrap();
+    let half = 0.5 * size;
+    let square = |[x, y, value]: &[f64; 3]| {
+        Rectangle::new([(x - half, y - half), (x + half, y + half)], colour(shade(*value)).filled())
+    };
+    chart.draw_series(places.iter().map(square)).unwrap();
+    let write = |text: String, y: i32| scale.draw(&Text::new(text, (0, y), ("sans-serif", 11))).unwrap();
+    let (top, step) = (50, 4);
+    for index in 0..SHADES {
+        let y = top + step * index;
+        let shade = 1.0 - f64::from(index) / f64::from(SHADES - 1);
+        scale.draw(&Rectangle::new([(0, y), (16, y + step)], colour(shade).filled())).unwrap();
+    }
+    write(value.to_owned(), top - 18);
+    for (value, y) in [(high, top), (0.5 * (low + high), top + step * SHADES / 2), (low, top + step * SHADES)] {
+        scale.draw(&Text::new(format!("{value:.0}"), (20, y - 5), ("sans-serif", 11))).unwrap();
     }
 }
