@@ -21,6 +21,7 @@ use palpate_client::Credentials;
 use palpate_client::datagrams::Datagrams;
 use palpate_proto::{datagram, pb, touch};
 use palpate_touch::{Device, Tip};
+use pb::touch_request::Message as Say;
 use pb::touch_response::Message as Heard;
 use prost::Message;
 use server::{PATIENCE, Server, Touch, open, palpate};
@@ -119,6 +120,8 @@ struct Client {
     poses: u64,
     samples: [u64; 2],
     newest: Option<pb::Sample>,
+    /// How often another session was asked for.
+    asked: u64,
 }
 
 impl Client {
@@ -129,7 +132,7 @@ impl Client {
         assert!(offer.is_some());
         let at = palpate_client::Server::new(&server.url, &Credentials::default()).unwrap();
         let datagrams = Datagrams::dial(offer.as_ref(), &at);
-        Client { touch, datagrams, sequence: 0, poses: 0, samples: [0; 2], newest: None }
+        Client { touch, datagrams, sequence: 0, poses: 0, samples: [0; 2], newest: None, asked: 0 }
     }
 
     /// Touches until `enough`.
@@ -140,6 +143,10 @@ impl Client {
                 tokio::select! {
                     _ = tick.tick() => {
                         self.sequence += 1;
+                        if self.datagrams.asks() {
+                            self.asked += 1;
+                            self.touch.say(Say::Renew(pb::Renew { client_time_ns: 1, datagrams: true })).await;
+                        }
                         let command = pose(0, self.sequence);
                         if self.datagrams.send(&command) {
                             self.poses += 1;
@@ -156,6 +163,7 @@ impl Client {
                             self.samples[1] += 1;
                             self.newest = Some(sample);
                         }
+                        Heard::Renewed(renewed) => self.datagrams.take_offer(&renewed.datagrams.unwrap()),
                         Heard::Rejection(rejection) => panic!("{rejection:?}"),
                         _ => {}
                     },
@@ -200,6 +208,23 @@ async fn touch_goes_by_datagram_while_it_gets_through_and_by_the_stream_else() {
     }
     let carried = client.datagrams.carried();
     assert!(carried.fell_back >= 2 && carried.came > 300, "{carried:?}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_session_that_the_network_has_ended_is_opened_anew() {
+    let (wire, server) = Wire::before_server(&[]).await;
+    let mut client = Client::open(&server).await;
+    client.until("datagrams carry", |client| client.samples[0] > 100 && client.poses > 100).await;
+    [0, 1].map(|way| wire.cut(way, true));
+    client.until("the session is over", |client| client.asked > 0).await;
+    [0, 1].map(|way| wire.cut(way, false));
+    let (poses, [datagrams, _]) = (client.poses, client.samples);
+    client
+        .until("datagrams carry again", |client| {
+            client.samples[0] > datagrams + 100 && client.poses > poses + 100 && client.is_pressed()
+        })
+        .await;
+    assert_eq!(client.asked, 1);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -470,6 +495,62 @@ fn a_pose_that_was_overtaken_by_a_release_begins_no_touch() {
         _ => vec![],
     });
     assert!(forces[499] > 0.2 && forces[502..].iter().all(|force_n| force_n.abs() < 0.1 * forces[499]), "{forces:?}");
+}
+
+/// What a stream answers when it is asked for another session, which is once a second at most.
+async fn another_offer(touch: &mut Touch) -> pb::DatagramOffer {
+    loop {
+        touch.say(Say::Renew(pb::Renew { client_time_ns: 1, datagrams: true })).await;
+        loop {
+            match touch.hear().await.unwrap().unwrap() {
+                Heard::Renewed(pb::Renewed { datagrams: Some(offer), .. }) => return offer,
+                Heard::Renewed(_) => break,
+                _ => {}
+            }
+        }
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+}
+
+#[tokio::test]
+async fn another_session_takes_the_place_of_the_one_before() {
+    let server = Server::start(&[]);
+    let (to, session) = (address(&server), liver(&server).await);
+    let mut touch = Touch::open(&server, by_datagram(&session, &[0])).await.unwrap();
+    let offer = touch.opened.take().unwrap().datagrams.unwrap();
+    let first = in_time(dial(to, &offer.certificate_sha256, &hex(&offer.ticket), None)).await.unwrap();
+    let offer = in_time(another_offer(&mut touch)).await;
+    in_time(first.closed()).await;
+    let second = in_time(dial(to, &offer.certificate_sha256, &hex(&offer.ticket), None)).await.unwrap();
+    second.send_datagram(poses(1, 0, 7)).unwrap();
+    let acknowledged = |sample: &pb::Sample| sample.tools.first().map_or(0, |tool| tool.acknowledged_sequence);
+    in_time(async {
+        let mut number = 1;
+        loop {
+            let datagram = second.receive_datagram().await.unwrap();
+            let message = pb::SampleDatagram::decode(datagram.payload()).unwrap();
+            if message.sample.as_ref().is_some_and(|sample| acknowledged(sample) == 7) {
+                return;
+            }
+            // Until it is confirmed that datagrams come, the stream carries the samples.
+            number += 1;
+            let alive = pb::PosesDatagram { number, acknowledges: message.number, ..Default::default() };
+            second.send_datagram(alive.encode_to_vec()).unwrap();
+        }
+    })
+    .await;
+    // A stream that did not ask for datagrams gets none later.
+    let mut touch = Touch::open(&server, open(&session, &[1])).await.unwrap();
+    touch.say(Say::Renew(pb::Renew { client_time_ns: 5, datagrams: true })).await;
+    let renewed = in_time(async {
+        loop {
+            if let Heard::Renewed(renewed) = touch.hear().await.unwrap().unwrap() {
+                return renewed;
+            }
+        }
+    });
+    let renewed = renewed.await;
+    assert_eq!((renewed.client_time_ns, renewed.datagrams), (5, None));
 }
 
 #[tokio::test]

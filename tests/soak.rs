@@ -69,7 +69,7 @@ async fn life(server: &Server, random: &mut Random) -> Account {
         }
     }
     // What was sent before has been taken in once this is answered.
-    let settled = pb::touch_request::Message::Renew(pb::Renew { client_time_ns: 1 });
+    let settled = pb::touch_request::Message::Renew(pb::Renew { client_time_ns: 1, datagrams: false });
     touch.say(settled).await;
     loop {
         match tokio::time::timeout(PATIENCE, touch.hear()).await.unwrap().unwrap().unwrap() {

@@ -395,7 +395,7 @@ fn request_seeds() -> Vec<Vec<u8>> {
             pb::SendCommandsRequest { commands: pushes.to_vec(), ..Default::default() }.encode_to_vec(),
         ),
         ("TouchRequest", touch(pb::touch_request::Message::Open(open))),
-        ("TouchRequest", touch(pb::touch_request::Message::Renew(pb::Renew { client_time_ns: 7 }))),
+        ("TouchRequest", touch(pb::touch_request::Message::Renew(pb::Renew { client_time_ns: 7, datagrams: false }))),
         (
             "SendCommandsRequest",
             pb::SendCommandsRequest { commands: commands.clone(), ..Default::default() }.encode_to_vec(),

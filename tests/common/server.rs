@@ -282,7 +282,7 @@ impl Touch {
 
     /// All that was said before has been taken in.
     pub async fn settle(&mut self) {
-        self.say(Say::Renew(pb::Renew { client_time_ns: 77 })).await;
+        self.say(Say::Renew(pb::Renew { client_time_ns: 77, datagrams: false })).await;
         loop {
             match self.hear().await.unwrap().unwrap() {
                 Heard::Renewed(renewed) => return assert_eq!(renewed.client_time_ns, 77),

@@ -44,9 +44,16 @@ use crate::connect::Server;
 const PATIENCE: Duration = Duration::from_secs(2);
 const ATTEMPTS: usize = 4;
 
+/// A session that has ended is opened anew as often as this, s: a blocked port costs a few packets each time.
+const AGAIN_S: f64 = 10.0;
+
 /// The datagrams of one stream.
 #[derive(Debug)]
 pub struct Datagrams {
+    /// Of the server, if it has offered a session.
+    host: Option<String>,
+    /// When a session was last asked for, s.
+    asked_s: f64,
     opening: JoinSet<Option<Connection>>,
     connection: Option<Connection>,
     carrier: Carrier,
@@ -62,23 +69,12 @@ pub struct Datagrams {
 impl Datagrams {
     /// Opens the session that a stream was offered, in the background. Without an offer nothing ever goes by datagram.
     pub fn dial(offer: Option<&pb::DatagramOffer>, server: &Server) -> Self {
-        let mut opening = JoinSet::new();
-        if let Some(offer) = offer.cloned() {
-            let host = if offer.host.is_empty() { server.host().to_owned() } else { offer.host.clone() };
-            opening.spawn(async move {
-                for _ in 0..ATTEMPTS {
-                    if let Ok(opened) = tokio::time::timeout(PATIENCE, open(&host, &offer)).await {
-                        // What was refused stays so.
-                        return opened;
-                    }
-                }
-                None
-            });
-        }
         let mut life = interval(Duration::from_secs_f64(0.5 * LIFE_S));
         life.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        Datagrams {
-            opening,
+        let mut datagrams = Datagrams {
+            host: offer.map(|_| server.host().to_owned()),
+            asked_s: 0.0,
+            opening: JoinSet::new(),
             connection: None,
             carrier: Carrier::default(),
             pulse: Pulse::default(),
@@ -87,7 +83,40 @@ impl Datagrams {
             recent: BTreeMap::new(),
             wanted_s: HEARTBEAT_S,
             newest_step: None,
+        };
+        if let Some(offer) = offer {
+            datagrams.take_offer(offer);
         }
+        datagrams
+    }
+
+    /// Opens another session, which a stream was offered in the place of the last ([`Datagrams::asks`]), in the background.
+    pub fn take_offer(&mut self, offer: &pb::DatagramOffer) {
+        let Some(own) = &self.host else { return };
+        let host = if offer.host.is_empty() { own.clone() } else { offer.host.clone() };
+        let offer = offer.clone();
+        (self.connection, self.opening) = (None, JoinSet::new());
+        self.opening.spawn(async move {
+            for _ in 0..ATTEMPTS {
+                if let Ok(opened) = tokio::time::timeout(PATIENCE, open(&host, &offer)).await {
+                    // What was refused stays so.
+                    return opened;
+                }
+            }
+            None
+        });
+    }
+
+    /// Whether the session is over, so that it is time to ask the server for another: by `renew` with `datagrams`, which it
+    /// answers with an offer ([`Datagrams::take_offer`]). True once in ten seconds.
+    pub fn asks(&mut self) -> bool {
+        let now_s = self.now_s();
+        let is_over = self.host.is_some() && self.connection.is_none() && self.opening.is_empty();
+        let asks = is_over && now_s - self.asked_s >= AGAIN_S;
+        if asks {
+            self.asked_s = now_s;
+        }
+        asks
     }
 
     fn now_s(&self) -> f64 {

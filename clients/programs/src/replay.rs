@@ -213,7 +213,7 @@ impl Streamer<'_> {
 
     async fn heartbeat(&mut self) -> Result<(), Failure> {
         self.sent_before.push_back(self.next_step);
-        self.say(Say::Renew(pb::Renew { client_time_ns: self.now_ns() })).await
+        self.say(Say::Renew(pb::Renew { client_time_ns: self.now_ns(), datagrams: false })).await
     }
 
     /// Called for each answered heartbeat; they are answered in order. Returns the step before which the server has all

@@ -98,6 +98,13 @@ impl Way {
         }
     }
 
+    /// Ends the session, if there is one.
+    pub(in crate::server) fn part(&self) {
+        if let Some(connection) = lock(&self.inner).connection.take() {
+            connection.close(VarInt::from_u32(0), b"it is over");
+        }
+    }
+
     /// How often the client wants samples.
     pub(in crate::server) fn wanted(&self) -> Arc<WantedHeartbeat> {
         self.wanted.clone()
@@ -123,8 +130,6 @@ impl Inner {
 
 impl Drop for Way {
     fn drop(&mut self) {
-        if let Some(connection) = lock(&self.inner).connection.take() {
-            connection.close(VarInt::from_u32(0), b"the stream has ended");
-        }
+        self.part();
     }
 }

@@ -81,9 +81,9 @@ impl Outlet {
                         self.dropped_answers = dropped_answers;
                         Some(Ok(Message::Rejection(pb::Rejection { dropped_answers, ..rejection })))
                     }
-                    Ok((Event::Renewed(client_time_ns, arrival_ns), _)) => {
+                    Ok((Event::Renewed { client_time_ns, arrival_ns, datagrams }, _)) => {
                         let server_hold_ns = now_ns().saturating_sub(arrival_ns);
-                        Some(Ok(Message::Renewed(pb::Renewed { client_time_ns, server_hold_ns })))
+                        Some(Ok(Message::Renewed(pb::Renewed { client_time_ns, server_hold_ns, datagrams })))
                     }
                     Ok((Event::Failed(status), _)) => Some(Err(status)),
                     Ok((Event::Finished, _)) => None,

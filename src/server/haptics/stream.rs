@@ -50,9 +50,26 @@ struct StreamTools {
     tools: usize,
     holder: Holder,
     way: Arc<Way>,
+    /// If the client wants datagrams: when a session was last offered, and that session until it has come.
+    offered_ns: Option<u64>,
     arrival: Option<Arrival>,
     /// Computes further laws as long as the stream is there.
     _computing: Option<AbortOnDropHandle<()>>,
+}
+
+/// Time between two offers of datagrams to a stream, ns.
+const BETWEEN_OFFERS_NS: u64 = 1_000_000_000;
+
+impl StreamTools {
+    /// Another session for datagrams in place of the one that there was.
+    fn offer(&mut self, services: &Services, now_ns: u64) -> Option<pb::DatagramOffer> {
+        self.offered_ns.filter(|before_ns| now_ns.saturating_sub(*before_ns) >= BETWEEN_OFFERS_NS)?;
+        // Without random numbers there is no ticket, and the stream goes on.
+        let (offer, arrival) = services.datagrams.offer().ok().flatten()?;
+        self.way.part();
+        (self.offered_ns, self.arrival) = (Some(now_ns), Some(arrival));
+        Some(offer)
+    }
 }
 
 impl Drop for StreamTools {
@@ -127,9 +144,10 @@ async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> 
     let (limits, traffic) = (&services.config.limits, services.traffic.clone());
     let holder = Holder::new(live.clone(), lease, &open.tools, (device, place), open.datagrams, limits, traffic);
     let way = Arc::new(Way::new(holder.pace()));
-    let mut held = StreamTools { tools, holder, way: way.clone(), arrival: None, _computing };
+    let mut held = StreamTools { tools, holder, way: way.clone(), offered_ns: None, arrival: None, _computing };
     let offered = if open.datagrams { services.datagrams.offer()? } else { None };
     let (datagrams, arrival) = offered.unzip();
+    held.offered_ns = arrival.is_some().then(now_ns);
     held.arrival = arrival;
     if datagrams.is_some() {
         sampling.wanted = Some(way.wanted());
@@ -245,7 +263,8 @@ async fn listen(
                     let refusal = Refusal { field: String::new(), ..refusal };
                     events.push(Event::Rejected(wire::sample::rejection(0, 0, &refusal)));
                 }
-                events.push(Event::Renewed(renew.client_time_ns, now));
+                let datagrams = if renew.datagrams { held.offer(&services, now) } else { None };
+                events.push(Event::Renewed { client_time_ns: renew.client_time_ns, arrival_ns: now, datagrams });
             }
             Ok(Some(_)) => {
                 let refusal = Refusal::new(Reason::OutOfTurn, "message", "must be a command or `renew`");

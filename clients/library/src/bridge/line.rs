@@ -307,7 +307,8 @@ async fn connect(
                             return Err(broken("the lease of the tool has lapsed"));
                         }
                     }
-                    Heard::Opened(_) | Heard::Renewed(_) => {}
+                    Heard::Renewed(renewed) => renewed.datagrams.iter().for_each(|offer| datagrams.take_offer(offer)),
+                    Heard::Opened(_) => {}
                 }
             }
             sample = datagrams.next() => take(&sample, &mut datagrams),
@@ -320,6 +321,10 @@ async fn connect(
                 let (tool, sequence) = (target.tool, Some(sequence));
                 let command = pb::Command { tool, sequence, client_time_ns, action, ..Default::default() };
                 shared.inbound().traffic.poses += 1;
+                if datagrams.asks() {
+                    // If it does not get through it is asked again.
+                    let _ = outbound.try_send(Say::Renew(pb::Renew { client_time_ns, datagrams: true }));
+                }
                 if datagrams.send(&command) {
                     continue;
                 }
