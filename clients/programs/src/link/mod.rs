@@ -111,7 +111,7 @@ pub(crate) struct Arguments {
     seed: u64,
     /// Where the task is done, m: the place of the tissue's rest surface that is nearest to this; of a sheet X,Y. The middle,
     /// if absent
-    #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', allow_negative_numbers = true, conflicts_with_all = ["server", "random", "boundary"])]
+    #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', allow_hyphen_values = true, conflicts_with_all = ["server", "random", "boundary"])]
     place: Vec<f64>,
     /// Radius of the tool's tip, m
     #[arg(long, value_name = "M", default_value_t = Tip::default().radius_m)]
