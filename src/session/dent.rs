@@ -93,14 +93,22 @@ pub(super) fn thickness_m(mesh: &Mesh, point: PointId) -> Option<f64> {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
+    use glam::DMat3;
+
     use super::*;
     use crate::limits::Limits;
 
+    fn gallbladder(bed_n_per_m3: &str) -> Scene {
+        let text = format!(
+            "[mesh]\norgan = {{ name = \"gallbladder\", edge_m = 0.0035 }}\n[material]\nyoungs_modulus_pa = 2e4\n\
+             thickness_m = 0.003\nbed_n_per_m3 = {bed_n_per_m3}\n"
+        );
+        Scene::parse("test", &text, &[], &Limits::default()).unwrap()
+    }
+
     #[test]
     fn a_dent_is_as_deep_as_the_bed_lets_it_and_a_ball_as_thick_as_it_is_wide() {
-        let text = "[mesh]\norgan = { name = \"gallbladder\", edge_m = 0.0035 }\n[material]\nyoungs_modulus_pa = 2e4\n\
-                    thickness_m = 0.003\nbed_n_per_m3 = 5e5\n";
-        let scene = Scene::parse("test", text, &[], &Limits::default()).unwrap();
+        let scene = gallbladder("5e5");
         let Body::Mesh(mesh) = &scene.body else { panic!("of another kind") };
         // The middle of the bottom.
         let point = mesh.shape.nearest(DVec3::new(0.02, 0.0, -0.05));
@@ -121,5 +129,69 @@ mod tests {
         // Less than the bed alone would let the point go, which shares the force with its neighbours.
         let alone_m = 0.01 / scene.virtual_stiffness_n_per_m / scene.relative_virtual_stiffness(point);
         assert!(near_m < 1.5 * alone_m, "{near_m} {alone_m}");
+    }
+
+    #[test]
+    fn a_tissue_is_as_thick_as_it_is_far_to_where_straight_in_meets_its_other_side() {
+        let scene = gallbladder("5e6");
+        let Body::Mesh(mesh) = &scene.body else { panic!("of another kind") };
+        let surface = mesh.shape.surface();
+        let points: Vec<PointId> = shape::points(&*mesh.shape).step_by(7).collect();
+        let mut found = 0;
+        for point in &points {
+            let Some(thick_m) = thickness_m(mesh, *point) else { continue };
+            let at_m = mesh.shape.rest_m(*point) - thick_m * mesh.shape.normal(*point);
+            let nearest_m = surface.at_m(&surface.nearest(at_m).unwrap());
+            assert!(nearest_m.distance(at_m) < 1e-9, "{point:?}: {thick_m} m, {} m off", nearest_m.distance(at_m));
+            found += 1;
+        }
+        // A way may leave between two triangles that meet in an edge, by rounding.
+        assert!(found * 10 >= points.len() * 9, "{found} of {}", points.len());
+    }
+
+    #[test]
+    fn a_dent_is_that_in_which_springs_and_bed_balance_the_force_at_every_point() {
+        let scene = gallbladder("5e6");
+        let Body::Mesh(mesh) = &scene.body else { panic!("of another kind") };
+        let shape = &mesh.shape;
+        let point = shape.nearest(DVec3::new(0.02, 0.0, -0.05));
+        let (centre_m, force_n) = (shape.rest_m(point), DVec3::new(0.02, 0.01, 0.03));
+        let poke = Poke { point: None, centre_m, force_n, falloff_per_m: 100.0, falloff_offset: 0.2 };
+        // Point by point, each to where the forces on it balance, until none moves any more.
+        let mut joined: Vec<Vec<(usize, DMat3)>> = vec![Vec::new(); shape.vertices_m().len()];
+        for ([a, b], k) in mesh.springs() {
+            let [a, b] = [a, b].map(|end| end as usize);
+            let along = (shape.vertices_m()[b] - shape.vertices_m()[a]).normalize();
+            let stiffness = k
+                * scene.springs.stiffness_n_per_m
+                * DMat3::from_cols_array_2d(&along.to_array().map(|part| (part * along).to_array()));
+            joined[a].push((b, stiffness));
+            joined[b].push((a, stiffness));
+        }
+        let mut moved_m = vec![DVec3::ZERO; joined.len()];
+        for _ in 0..2000 {
+            let mut change_m = 0.0_f64;
+            for (vertex, joined) in joined.iter().enumerate() {
+                if shape.is_fixed(PointId::new(vertex)) {
+                    continue;
+                }
+                let pull = scene.virtual_stiffness_n_per_m * scene.relative_virtual_stiffness(PointId::new(vertex));
+                let away_m = shape.vertices_m()[vertex].distance(centre_m);
+                let (mut stiffness, mut sum_n) = (DMat3::IDENTITY * pull, force_n * (0.2 - 100.0 * away_m).exp());
+                for (other, of_spring) in joined {
+                    stiffness += *of_spring;
+                    sum_n += *of_spring * moved_m[*other];
+                }
+                let to_m = stiffness.inverse() * sum_n;
+                change_m = change_m.max(to_m.distance(moved_m[vertex]));
+                moved_m[vertex] = to_m;
+            }
+            if change_m < 1e-12 {
+                break;
+            }
+        }
+        let deepest_m = moved_m.iter().map(|moved_m| moved_m.length()).fold(0.0, f64::max);
+        let found_m = depth_m(&scene, &poke).unwrap();
+        assert!((found_m / deepest_m - 1.0).abs() < 1e-4, "{found_m} m, not {deepest_m}");
     }
 }

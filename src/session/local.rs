@@ -247,4 +247,13 @@ mod tests {
             assert!((change_n - 0.2).abs() < 1e-6, "{depth_m} m deep: {valid_m} m, {change_n} N");
         }
     }
+
+    #[test]
+    fn models_are_numbered_from_1_on_and_go_on_after_the_tool_has_let_go() {
+        let mut modeller = modeller();
+        let mut next = |modeller: &mut Modeller| modeller.model(&feel(0.001, 0.0, ContactState::Free), 0, 0.0).sequence;
+        assert_eq!([next(&mut modeller), next(&mut modeller), next(&mut modeller)], [1, 2, 3]);
+        modeller.let_go();
+        assert_eq!(next(&mut modeller), 4);
+    }
 }

@@ -594,3 +594,38 @@ fn point_record(name: PointName, state: &PointState) -> Point {
         constraint_n: state.constraint_n.map(array),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::command::Command;
+    use super::*;
+
+    #[test]
+    fn a_sample_of_a_tool_that_presses_has_how_far_the_tissue_under_it_has_moved() {
+        let model = Model::paper(&["sheet.points=[21, 21]"]);
+        let mut session = Session::new(&model);
+        let spacing_m = model.scene.sheet().unwrap().spacing_m;
+        let place_m = DVec3::new(9.3 * spacing_m, 11.2 * spacing_m, -0.1 * spacing_m);
+        let tip = Tip { radius_m: spacing_m, ..Tip::default() };
+        let pose = Command {
+            tool: 0,
+            sequence: Some(1),
+            client_time_ns: 0,
+            by_datagram: false,
+            at_step: None,
+            time_to_live_s: None,
+            action: Action::Pose { place_m, velocity_m_per_s: None, tip },
+            arrival_ns: 0,
+        };
+        let mut due = vec![Due { command: pose, late: false, late_commands: 0, ends_lease: false }];
+        for _ in 0..100 {
+            session.advance(&mut due, |_| {});
+        }
+        let sample = session.sample(None);
+        let contact = sample.tools[0].contact.unwrap();
+        // The surface is where the tip is: it was pressed straight down.
+        let expected_m = DVec3::new(0.0, 0.0, place_m.z);
+        assert!(contact.displacement_m.distance(expected_m) < 0.2 * place_m.z.abs(), "{contact:?}");
+        assert!(contact.force_on_tool_n.z > 0.0, "{contact:?}");
+    }
+}

@@ -231,4 +231,39 @@ mod tests {
         assert!(!sample(&session, 0).expired);
         assert_eq!(session.paused_commands(), 3);
     }
+
+    #[test]
+    fn a_tool_that_has_not_acted_is_not_ended_by_a_recovery() {
+        let mut session = Session::new(&Model::paper(&["sheet.points=[5, 5]"]));
+        session.advance(&mut vec![grasp(2, 7)], |_| {});
+        assert!(session.recover(blow_up(session.step_count())));
+        let ended = session.recoveries().newest().unwrap().tools.clone();
+        assert_eq!(ended, [Ended { tool: 2, sequence: 7, undone_commands: 1 }]);
+        let expired: Vec<_> = session.sample(Some(&[0, 1, 2])).tools.iter().map(|tool| tool.expired).collect();
+        assert_eq!(expired, [false, false, true]);
+    }
+
+    #[test]
+    fn a_pause_ends_with_the_window_of_the_first_of_the_recoveries_that_cause_it() {
+        let mut recoveries = Recoveries::default();
+        let recovered = |step: u64| Recovered {
+            recovery: Recovery {
+                step,
+                state_of_step: step,
+                at_rest: false,
+                undone_commands: 0,
+                paused_until_step: None,
+                reason: String::new(),
+            },
+            tools: Vec::new(),
+        };
+        for step in [100, 200, 300] {
+            assert_eq!(recoveries.pause_end(step), None);
+            recoveries.add(recovered(step));
+        }
+        let end = 100 + WINDOW_STEPS;
+        assert_eq!([301, end - 1].map(|step| recoveries.pause_end(step)), [Some(end); 2]);
+        // Then the first is no longer within the window.
+        assert_eq!([end, end + 1].map(|step| recoveries.pause_end(step)), [None; 2]);
+    }
 }

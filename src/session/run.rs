@@ -377,4 +377,29 @@ mod tests {
         let late = run_with("[[tissue]]\nat_s = 0.02\nvirtual_stiffness_n_per_m = 50.0\n");
         assert_eq!(plain.final_hash, late.final_hash);
     }
+
+    #[test]
+    fn a_summary_has_the_largest_reaction_of_all_its_records() {
+        let model = model();
+        let back = "[[tool]]\npoint = [7, 7]\nmoves = [{ from_s = 0.0, to_s = 0.01, by_m = [0.0, 0.0, -0.02] }, \
+                    { from_s = 0.01, to_s = 0.02, by_m = [0.0, 0.0, 0.02] }]\n";
+        let text = format!("duration_s = 0.02\nsample_every_s = 0.001\n{back}");
+        let script = Script::parse("test", &text, Path::new(""), &model.scene, &Limits::default()).unwrap();
+        let mut output = Vec::new();
+        let summary = run(&model, &script, false, &Limits::default(), &mut output, &|| 0.0, &mut |_| {}).unwrap();
+        let mut largest_n = 0.0_f64;
+        for line in String::from_utf8(output).unwrap().lines() {
+            let record: serde_json::Value = serde_json::from_str(line).unwrap();
+            for point in record["points"].as_array().into_iter().flatten() {
+                let force_n = point["reaction_n"].as_array().unwrap().iter().map(|part| part.as_f64().unwrap());
+                largest_n = largest_n.max(force_n.map(|part| part * part).sum::<f64>().sqrt());
+            }
+        }
+        assert!(largest_n > 0.1, "{largest_n} N");
+        assert!(
+            (summary.peak_reaction_n - largest_n).abs() < 1e-9 * largest_n,
+            "{} {largest_n}",
+            summary.peak_reaction_n
+        );
+    }
 }

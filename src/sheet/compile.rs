@@ -191,6 +191,14 @@ impl Model {
         let (limits, sets) = (Limits::default(), sets.iter().map(|text| (*text).to_owned()).collect::<Vec<_>>());
         Model::compile(&Scene::parse("paper", crate::scene::PAPER, &sets, &limits).unwrap(), &limits).unwrap()
     }
+
+    /// Of a small organ, in points that are heavy and light: for tests.
+    pub(crate) fn gallbladder(sets: &[&str]) -> Arc<Self> {
+        let (limits, sets) = (Limits::default(), sets.iter().map(|text| (*text).to_owned()).collect::<Vec<_>>());
+        let text = "[mesh]\norgan = { name = \"gallbladder\", edge_m = 0.0035 }\n[material]\nyoungs_modulus_pa = 2e4\n\
+                    thickness_m = 0.003\nbed_n_per_m3 = 5e6\n[stepping]\nsubsteps = 8\n";
+        Model::compile(&Scene::parse("gallbladder", text, &sets, &limits).unwrap(), &limits).unwrap()
+    }
 }
 
 #[cfg(test)]

@@ -341,4 +341,42 @@ mod tests {
             }
         }
     }
+
+    #[test]
+    fn a_disc_is_shifted_along_a_curved_surface_as_far_as_it_is_told() {
+        let model = Model::gallbladder(&[]);
+        let crate::scene::Body::Mesh(mesh) = &model.scene.body else { panic!("of another kind") };
+        let (shape, radius_m, way_m) = (model.shape(), 0.006, 0.003);
+        let first_m = shape.rest_m(shape.nearest(DVec3::new(0.02, 0.0, -0.05)));
+        for turn in 0..8 {
+            let mut footprint = Footprint::new(&model, radius_m, first_m);
+            let (from_m, outward) = (footprint.anchor_m(), footprint.at_rest().1);
+            let (one, other) = outward.any_orthonormal_pair();
+            let angle = f64::from(turn) * std::f64::consts::FRAC_PI_4;
+            let along = angle.cos() * one + angle.sin() * other;
+            let (_, slopes) = footprint.surface(|_| DVec3::ZERO);
+            footprint.shift(&model, way_m * along, &slopes);
+            let moved_m = footprint.anchor_m() - from_m;
+            assert!((0.8 * way_m..1.2 * way_m).contains(&moved_m.dot(along)), "{angle}: {moved_m} m");
+            let surface = mesh.shape.surface();
+            let nearest_m = surface.at_m(&surface.nearest(footprint.anchor_m()).unwrap());
+            assert!(nearest_m.distance(footprint.anchor_m()) < 1e-9, "{angle}: off the surface");
+        }
+    }
+
+    #[test]
+    fn a_surface_is_followed_however_much_it_is_stretched_or_compressed() {
+        let along = [DVec3::new(0.9, 0.1, 0.3), DVec3::new(-0.2, 1.1, 0.2)];
+        let by = DVec2::new(0.3, -0.7);
+        for scale in [1e-4, 1.0, 1e4] {
+            let slopes = along.map(|slope| scale * slope);
+            let beside_m = by.x * slopes[0] + by.y * slopes[1];
+            assert!(within(beside_m, &slopes).distance(by) < 1e-9, "{scale}");
+            // What points out of the surface leads nowhere.
+            let outward_m = slopes[0].cross(slopes[1]);
+            assert!(within(beside_m + outward_m, &slopes).distance(by) < 1e-9, "{scale}");
+        }
+        // Folded into a line, it has no way to go.
+        assert_eq!(within(along[0], &[along[0], -2.0 * along[0]]), DVec2::ZERO);
+    }
 }

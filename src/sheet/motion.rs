@@ -481,3 +481,55 @@ impl<T: Real> Tissue for Sheet<T> {
         Sheet::copy(self)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, clippy::needless_range_loop)]
+    use super::*;
+
+    #[test]
+    fn what_is_shown_of_a_mesh_is_where_its_points_are() {
+        let model = Model::gallbladder(&["stepping.precision=f64"]);
+        let mut sheet = Sheet::<f64>::new(&model);
+        let point = model.shape().nearest(DVec3::new(0.02, 0.0, -0.05));
+        sheet.grasp(0, point, Grasp::Target(DVec3::new(0.001, -0.002, 0.003)));
+        for _ in 0..10 {
+            sheet.step().unwrap();
+        }
+        // What a buffer held before is replaced.
+        let mut shown = [vec![7.0], Vec::new(), vec![1.0; 5000]];
+        sheet.displacements_m(&mut shown);
+        let mut moved = 0;
+        for (place, point) in model.points().enumerate() {
+            let displacement_m = sheet.point(point).displacement_m;
+            for c in 0..3 {
+                assert!((f64::from(shown[c][place]) - displacement_m[c]).abs() < 1e-9, "{place}: {displacement_m}");
+            }
+            moved += usize::from(displacement_m.length() > 1e-6);
+        }
+        assert!(moved > 20 && shown.iter().all(|axis| axis.len() == model.len()), "{moved}");
+    }
+
+    #[test]
+    fn a_grasped_point_pulls_its_neighbours_alike_however_a_step_is_divided() {
+        for integrator in ["rk4", "exponential4"] {
+            let moved_m = |substeps: u32| {
+                let model = Model::paper(&[
+                    "sheet.points=[7, 7]",
+                    "stepping.precision=f64",
+                    &format!("stepping.integrator={integrator}"),
+                    &format!("stepping.substeps={substeps}"),
+                ]);
+                let mut sheet = Sheet::<f64>::new(&model);
+                let [held, beside] = [[3, 3], [3, 4]].map(|place| model.scene.sheet().unwrap().point(place));
+                sheet.grasp(0, held, Grasp::Target(0.005 * DVec3::Z));
+                for _ in 0..3 {
+                    sheet.step().unwrap();
+                }
+                sheet.point(beside).displacement_m.z
+            };
+            let (once, often) = (moved_m(1), moved_m(8));
+            assert!(often > 1e-6 && (once / often - 1.0).abs() < 0.01, "{integrator}: {once} {often} m");
+        }
+    }
+}

@@ -111,7 +111,8 @@ mod tests {
 
     use super::*;
     use crate::scene::profile::Poke;
-    use crate::sheet::{Model, Push, Tissue};
+    use crate::sheet::tiles::CHECK_STEPS;
+    use crate::sheet::{Grasp, Model, Push, Tissue};
 
     fn pushed<T: Real>(sets: &[&str], falloff_per_m: f64) -> Sheet<T> {
         let always = ["stepping.integrator=central", "stepping.substeps=1"];
@@ -150,5 +151,23 @@ mod tests {
         assert!(sheet.is_still());
         let z_m = sheet.point(PointId::new(4)).displacement_m.z;
         assert!((z_m + 1.0 / 500.0).abs() < 1e-5 / 500.0, "{z_m}");
+    }
+
+    #[test]
+    fn a_grasped_point_counts_among_the_displacements_that_a_sleeping_tile_is_measured_by() {
+        // Nothing else moves: the tools' points are seen wherever they are.
+        let sets = ["sheet.points=[20, 20]", "stepping.precision=f64", "springs.stiffness_n_per_m=0.0"];
+        let sets = [&sets[..], &["stepping.integrator=central", "stepping.substeps=1"]].concat();
+        let model = Model::paper(&sets);
+        for [i, j] in [[3, 5], [7, 11], [12, 14], [18, 9]] {
+            let mut sheet = Sheet::<f64>::new(&model);
+            let point = model.scene.sheet().unwrap().point([i, j]);
+            sheet.grasp(0, point, Grasp::Target(DVec3::new(0.0, 0.03, -0.04)));
+            while sheet.steps == 0 || !sheet.steps.is_multiple_of(CHECK_STEPS) {
+                sheet.step().unwrap();
+            }
+            let found_m = sheet.tiles.largest * model.unit_m;
+            assert!((0.045..0.055).contains(&found_m), "{i} {j}: {found_m} m");
+        }
     }
 }

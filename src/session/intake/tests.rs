@@ -306,3 +306,46 @@ fn the_memory_of_commands_that_wait_is_charged_and_given_back_as_they_are_done_o
     due(&mut intake, 13);
     assert_eq!(charged(), 0);
 }
+
+#[test]
+fn of_poses_for_one_step_the_last_counts_and_of_those_played_by_the_clients_time_each_does() {
+    // Sequence, step, and the client's time: a pose with a step is played at that step, whatever its time.
+    let superseded = |at_step: Option<u64>, client_time_ns: u64| {
+        let (mut intake, _) = intake();
+        let pose = |sequence: u64| Command {
+            action: Action::Pose { place_m: glam::DVec3::ZERO, velocity_m_per_s: None, tip: Tip::default() },
+            client_time_ns: client_time_ns * sequence,
+            ..release(sequence, at_step)
+        };
+        intake.submit(LEASE, (1..=3).map(pose).collect(), 0).unwrap();
+        (intake.counts().superseded, intake.counts().waiting)
+    };
+    assert_eq!(superseded(None, 0), (2, 1));
+    assert_eq!(superseded(Some(4), 0), (2, 1));
+    assert_eq!(superseded(Some(4), MS), (2, 1));
+    assert_eq!(superseded(None, MS), (0, 3));
+}
+
+#[test]
+fn as_many_commands_come_at_once_as_a_tool_may_have_waiting_and_no_more() {
+    let limits = Limits { queued_commands_per_tool: 3, ..Limits::default() };
+    let scene = Scene::parse("paper", PAPER, &[], &limits).unwrap();
+    let rules = Rules { scene, limits };
+    let of = |count: u64| rules.check((0..count).map(|sequence| release(sequence, None)).collect());
+    assert!((0..=3).all(|count| of(count).is_ok()));
+    for count in [4, 5, 100] {
+        assert_eq!(of(count).unwrap_err().reason, Reason::QueueFull, "{count} commands");
+    }
+}
+
+#[test]
+fn a_lease_is_neither_shorter_than_10_ms_nor_longer_than_the_limit() {
+    let limits = Limits { lease_s: 5.0, ..Limits::default() };
+    let scene = Scene::parse("paper", PAPER, &[], &limits).unwrap();
+    let of = |lease_s: f64| Intake::new(&scene, &limits).acquire(&[0], "test", lease_s, LEASE, 0).map(|_| ());
+    assert!([0.01, 1.0, 5.0].into_iter().all(|lease_s| of(lease_s).is_ok()));
+    for lease_s in [-1.0, 0.0, 0.0099, 5.01, 1e9] {
+        let refused = of(lease_s).unwrap_err();
+        assert_eq!((refused.reason, refused.field.as_str()), (Reason::OutOfRange, "lease_s"), "{lease_s} s");
+    }
+}

@@ -113,3 +113,16 @@ fn a_change_of_force_on_a_rectangle_is_at_most_its_bound() {
         }
     }
 }
+
+#[test]
+fn the_peak_of_a_new_force_is_the_most_that_it_can_be_on_any_point() {
+    let centre_m = DVec3::new(0.1, 0.2, 0.0);
+    let force_n = DVec3::new(0.3, 0.0, -0.4);
+    let poke = Poke { point: None, centre_m, force_n, falloff_per_m: 50.0, falloff_offset: 0.7 };
+    let change = ForceChange { old: None, new: Some(poke), reached: [[[0, 1]; 2]; 2] };
+    // On a rectangle with its centre, and on one beside it.
+    assert!((change.peak_n() - change.most_n(&[[0.0, 0.15], [0.1, 0.3]])).abs() < 1e-12);
+    assert!((change.peak_n() - 0.5 * 0.7_f64.exp()).abs() < 1e-12, "{} N", change.peak_n());
+    assert!(change.most_n(&[[0.11, 0.15], [0.1, 0.3]]) < 0.7 * change.peak_n());
+    assert_eq!(ForceChange { old: Some(poke), new: None, ..change }.peak_n(), 0.0);
+}

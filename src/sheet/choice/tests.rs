@@ -125,3 +125,20 @@ fn a_step_takes_a_time_of_its_own_and_more_for_each_point_in_each_substep() {
     let each = CANDIDATES.map(|integrator| stability::stable_substeps(integrator, 1e-3, &Oscillator::of(&scene)));
     assert_eq!(Some(least_step(&scene).0), each.into_iter().min());
 }
+
+#[test]
+fn the_time_of_a_point_is_its_schemes_and_its_formats_and_its_lanes_times_each_other() {
+    let scene = scene(&[]);
+    let of = |integrator, precision, lanes| point_substep_ns(&scene, integrator, precision, lanes);
+    let least = of(Integrator::Central, Precision::F32, Lanes::Avx512);
+    assert!((0.1..100.0).contains(&least), "{least} ns");
+    for (precision, format_cost) in FORMATS {
+        for integrator in CANDIDATES {
+            for (lanes, times) in [(Lanes::Avx512, 1.0), (Lanes::Avx2, 1.6)] {
+                let expected = least * entry(integrator).cost * format_cost * times;
+                let found = of(integrator, precision, lanes);
+                assert!((found / expected - 1.0).abs() < 1e-9, "{integrator:?} {precision:?} {lanes:?}: {found}");
+            }
+        }
+    }
+}

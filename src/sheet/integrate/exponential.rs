@@ -311,4 +311,40 @@ mod tests {
             assert!((through(&values, s) - cube(s)).abs() < 1e-12, "{s}");
         }
     }
+
+    /// The displacement and the velocity that a state stands for: it is a prediction, which the springs' force of the
+    /// present completes.
+    fn present<const ORDER: usize>(scheme: &Multistep<ORDER>, state: [f64; 2], springs: &[f64]) -> [f64; 2] {
+        let error = scheme.prediction_error(springs);
+        [0, 1].map(|row| state[row] + scheme.correction[row] * error)
+    }
+
+    /// Values of no polynomial of a low degree: the prediction of the first misses it.
+    const SPRINGS: [f64; 5] = [0.3, -0.8, 0.5, 0.1, -0.4];
+
+    #[test]
+    fn a_point_that_is_released_goes_on_from_where_the_tool_held_it() {
+        let scheme = fit::<3>(0.02, 0.1);
+        let (held, springs) = ([0.7, -0.2], &SPRINGS[..4]);
+        let at = Release { u: held[0], springs, used: 0.0, scale: 1.0, lost_n: 0.0 };
+        let [du, dd] = scheme.release(at).unwrap();
+        let found = present(&scheme, [held[0] + du, held[1] + dd], springs);
+        assert!((0..2).all(|row| (found[row] - held[row]).abs() < 1e-15), "{found:?}");
+        assert!(du.abs() > 1e-3 && dd.abs() > 1e-3, "{du} {dd}");
+    }
+
+    #[test]
+    fn a_state_stands_for_the_same_place_and_velocity_with_another_substep() {
+        for ratio in [0.5, 0.25, 1.0] {
+            let (from, to) = (fit::<4>(0.02, 0.1), fit::<4>(0.02 * ratio * ratio, 0.1 * ratio));
+            let (state, mut springs) = ([0.7, -0.2], SPRINGS);
+            let before = present(&from, state, &springs);
+            let resampled = from.resample(&to, ratio, state, 0.0, &mut springs);
+            // Velocities are in spacings a substep, forces in spacings a substep squared.
+            let after = present(&to, resampled, &springs);
+            assert!((after[0] - before[0]).abs() < 1e-14, "{ratio}: {before:?} {after:?}");
+            assert!((after[1] - ratio * before[1]).abs() < 1e-14, "{ratio}: {before:?} {after:?}");
+            assert!((springs[0] - ratio * ratio * SPRINGS[0]).abs() < 1e-14, "{ratio}: {springs:?}");
+        }
+    }
 }

@@ -148,3 +148,24 @@ impl<T: Real> Arithmetic<T> for Advance<T> {
         (x, d)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_stage_has_the_force_of_the_moment_at_which_it_is() {
+        let scheme = Rk4 { a: 0.01, g: 0.1 };
+        let nodes = scheme.nodes();
+        let mut fraction = 0.0;
+        for (sweep, moment) in [0.0, 0.5, 0.5, 1.0].into_iter().enumerate() {
+            assert_eq!(fraction, moment, "stage {sweep}");
+            // The only node whose force is in the stage's field.
+            let field = scheme.field(sweep);
+            let forces: Vec<f64> =
+                nodes.iter().filter(|node| node.weights[field] != 0.0).map(|node| node.fraction).collect();
+            assert_eq!(forces, [moment], "stage {sweep}");
+            fraction = scheme.fraction_after(sweep).unwrap_or(1.0);
+        }
+    }
+}

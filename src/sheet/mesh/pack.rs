@@ -302,3 +302,27 @@ fn plain_rows(springs: &[&[HalfSpring]; BLOCK]) -> usize {
     let cost = |plain: usize| plain as f64 + beyond(springs, plain).chunks(BLOCK).map(of_row).sum::<f64>();
     (0..=most).min_by(|a, b| cost(*a).total_cmp(&cost(*b))).unwrap_or(0)
 }
+
+#[cfg(test)]
+mod tests {
+    use glam::DVec3;
+
+    use super::*;
+
+    /// Rows of a block of which so many lanes have a first spring, so many a second, and so on.
+    fn plain_rows_of(filled: &[usize]) -> usize {
+        let half = HalfSpring { to: 0, rest: DVec3::X, stiffness: 1.0 };
+        let lanes: [Vec<HalfSpring>; BLOCK] =
+            std::array::from_fn(|lane| vec![half; filled.iter().filter(|count| lane < **count).count()]);
+        plain_rows(&std::array::from_fn(|lane| &lanes[lane][..]))
+    }
+
+    #[test]
+    fn rows_that_most_lanes_fill_are_plain_and_the_springs_that_one_lane_has_beyond_are_packed() {
+        assert_eq!(plain_rows_of(&[16, 16, 16]), 3);
+        // Two springs more: moving them into other rows costs more than a row for them.
+        assert_eq!(plain_rows_of(&[15, 15, 2]), 3);
+        assert_eq!(plain_rows_of(&[16, 16, 1, 1, 1, 1, 1, 1, 1, 1, 1]), 2);
+        assert_eq!(plain_rows_of(&[]), 0);
+    }
+}

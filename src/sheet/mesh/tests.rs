@@ -13,6 +13,7 @@ use super::slots::{MeshSlots, NO_VERTEX};
 use super::sweep::{MeshGrid, MeshSweep, Snapshot, gather};
 use super::trial::FreeMotion;
 use crate::scene::{self, Lanes};
+use crate::sheet::Model;
 use crate::sheet::field::{BLOCK, Field, Layout};
 use crate::sheet::lanes::{Vector, Width, available, run, shape};
 use crate::sheet::real::Real;
@@ -458,4 +459,23 @@ fn a_graph_that_can_not_be_computed_is_refused() {
     let joins = |spring: &MeshSpring| spring.ends.contains(&(a as u32)) && spring.ends.contains(&(b as u32));
     let first = good.springs.iter().position(joins).unwrap();
     assert_eq!(fault(&|graph| graph.rest_m[a] = graph.rest_m[b]), GraphFault::Rest(first));
+}
+
+#[test]
+fn a_spring_is_as_stiff_from_either_end_however_heavy_its_ends_are() {
+    let model = Model::gallbladder(&[]);
+    let graph = model.graph.as_ref().unwrap();
+    let (mut springs, mut uneven) = (0, 0);
+    for slot in model.points().map(|point| graph.slot_of(point)) {
+        for (other, rest, stiffness) in graph.joined(slot) {
+            let back: Vec<_> = graph.joined(other).filter(|(to, ..)| *to == slot).collect();
+            let [(_, back_rest, back_stiffness)] = back[..] else { panic!("{slot} and {other}: {back:?}") };
+            assert_eq!(rest, -back_rest);
+            assert!((stiffness / back_stiffness - 1.0).abs() < 1e-9, "{slot} {other}: {stiffness} {back_stiffness}");
+            springs += 1;
+            let [one, two] = [slot, other].map(|slot| model.relative_mass_at(slot));
+            uneven += usize::from((one / two - 1.0).abs() > 0.05);
+        }
+    }
+    assert!(springs > 1000 && uneven > springs / 10, "{uneven} of {springs}");
 }

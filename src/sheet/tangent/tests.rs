@@ -241,3 +241,23 @@ fn a_sheet_that_stands_in_for_another_has_its_tissue_and_its_fixed_points_as_far
     // Where the sheet is narrower than that, it goes as far as the sheet does.
     assert_eq!(of(&stand_in(&model, 0.02, 0.2)).0.points, [17, 21]);
 }
+
+#[test]
+fn the_points_of_a_window_that_move_are_those_whose_springs_end_in_it() {
+    let model =
+        model(&["sheet.points=[60, 44]", "virtual_springs.stiffness_n_per_m=40", "springs.stiffness_n_per_m=10"]);
+    let spacing_m = model.scene.sheet().unwrap().spacing_m;
+    // Near one side, near another, and in a corner: there the sheet itself ends.
+    for centre in [[30.0, 3.0], [57.0, 22.0], [2.0, 41.0]] {
+        let footprint = Footprint::new(&model, 1.5 * spacing_m, (DVec2::from(centre) * spacing_m).extend(0.0));
+        let window = Window::around(&model, &footprint);
+        let points: Vec<[usize; 2]> = window.points(&model).map(|index| model.point_of(index)).collect();
+        let free = window.free(&model);
+        assert!(free.len() == points.len() && free.iter().any(|free| !free), "{centre:?}: all of the sheet");
+        for ([i, j], free) in points.iter().zip(&free) {
+            let around = points.iter().filter(|[k, l]| k.abs_diff(*i) <= 1 && l.abs_diff(*j) <= 1).count();
+            let [rows, columns] = [(*i, 60), (*j, 44)].map(|(at, count)| 3 - usize::from(at == 0 || at + 1 == count));
+            assert_eq!(*free, around == rows * columns, "{centre:?}: point {i} {j}");
+        }
+    }
+}

@@ -142,3 +142,40 @@ fn tiles_wake_when_the_changes_of_force_since_they_fell_asleep_exceed_the_bound_
         assert_eq!(tiles.region.tiles().len(), awake, "{z_n} N");
     }
 }
+
+#[test]
+fn a_tile_drifts_by_the_force_on_its_nearest_point() {
+    let model = Model::paper(&[
+        &format!("sheet.points={POINTS:?}"),
+        "stepping.integrator=central",
+        "stepping.substeps=1",
+        "stepping.precision=f64",
+    ]);
+    let spacing_m = model.scene.sheet().unwrap().spacing_m;
+    let (mut applied, mut tiles) = (Applied::<f64>::new(), tiles());
+    // Beyond the last tile of each axis.
+    let place = |i: f64, j: f64| spacing_m * DVec3::new(i, j, 0.0);
+    let (centre_m, falloff_per_m) = (place(39.0, 36.0), 0.3 / spacing_m);
+    let poke = Poke { point: None, centre_m, force_n: -DVec3::Z, falloff_per_m, falloff_offset: 0.0 };
+    applied.set(0, Some(Push::Constant(poke)));
+    for change in applied.changes(&model, 0).collect::<Vec<_>>() {
+        tiles.pushed(&change, spacing_m, 1e3);
+    }
+    for tile in [4, 5, 7, 8] {
+        let points = tiles.rows(tile).flat_map(|i| tiles.columns(tile).map(move |j| place(i as f64, j as f64)));
+        let nearest_m = points.map(|point_m| point_m.distance(centre_m)).fold(f64::INFINITY, f64::min);
+        let expected_n = (-falloff_per_m * nearest_m).exp();
+        assert!((tiles.drift_n[tile] - expected_n).abs() < 1e-9, "{tile}: {} N {expected_n}", tiles.drift_n[tile]);
+    }
+}
+
+#[test]
+fn without_virtual_springs_even_a_difference_in_the_last_digit_is_noticed() {
+    let model = |stiffness: f64| Model::paper(&[&format!("virtual_springs.stiffness_n_per_m={stiffness:?}")]);
+    let mut tiles = SleepTiles::<f32>::asleep(layout(), 1e-12, 1, (None, POINTS[0] * POINTS[1]));
+    tiles.largest = 2.0;
+    let last_digit = 2.0 * <f32 as Real>::EPSILON;
+    assert_eq!(tiles.farthest_unnoticed(&model(5.0).scene), last_digit);
+    let unnoticed = tiles.farthest_unnoticed(&model(0.0).scene);
+    assert!(unnoticed > 0.0 && unnoticed < 1e-3 * last_digit, "{unnoticed}");
+}
