@@ -186,4 +186,14 @@ mod tests {
         // Of 5, 6 and 7 intervals, 7 are nearly 4 of 1.75 each.
         assert_eq!(best_half(6, 1.75), 7);
     }
+
+    #[test]
+    fn a_law_of_some_points_of_an_organ_says_that_it_is_coarse() {
+        let model = Model::gallbladder(&[]);
+        let shape = model.shape();
+        let at_m = shape.rest_m(shape.nearest(glam::DVec3::new(0.02, 0.0, -0.05)));
+        let (disc, mut work) = (Disc { radius_m: 0.006, at_m }, WORK);
+        let law = on_mesh(&model, disc, 250, &mut work, &AtomicBool::new(false)).unwrap();
+        assert!(law.is_coarse && law.is_sound() && law.at_depth(0.003).force_n > 0.0 && work < WORK);
+    }
 }

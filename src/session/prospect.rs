@@ -582,6 +582,9 @@ mod tests {
         let Force { total_n, depth_m, .. } = gentle.forces[0];
         let stiffness = total_n / depth_m.unwrap();
         assert!((30.0..120.0).contains(&stiffness), "{stiffness} N/m");
+        // Of a mesh it is a bound; of a sheet it is an estimate.
+        let told = format!("depth: about {}", length(depth_m.unwrap()));
+        assert!(gentle.to_string().contains(&told), "{told}: {gentle}");
     }
 
     #[test]

@@ -310,7 +310,7 @@ mod tests {
     #[test]
     fn a_place_within_a_nanosecond_of_the_played_moment_is_played_as_it_is() {
         let mut path = Path::of_grasp();
-        let places = [(0.0, 0.0), (0.001 + 5e-10, 0.003), (0.0025, 0.007)].map(|(time_s, x)| (time_s, x * DVec3::X));
+        let places = [(0.0, 0.0), (0.001 + 5e-10, 0.0003), (0.0025, 0.0007)].map(|(time_s, x)| (time_s, x * DVec3::X));
         path.receive(places[0].0, places[0].1, 0.0);
         assert_eq!(path.step(0.0, STEP_S), Some(Play::Pose(places[0].1, 0.0)));
         for (time_s, place_m) in &places[1..] {

@@ -142,3 +142,27 @@ fn the_time_of_a_point_is_its_schemes_and_its_formats_and_its_lanes_times_each_o
         }
     }
 }
+
+#[test]
+fn where_rounding_errs_the_best_is_chosen_of_what_was_tried() {
+    let scene = scene(&["stepping.tolerance=1e-4", "springs.stiffness_n_per_m=1000"]);
+    let chooser = Chooser::new(&scene, &Limits::default(), &NEVER);
+    for integrator in [Integrator::Exponential4, Integrator::Exponential3, Integrator::Central] {
+        let Fewest { choice, rounding } = chooser.fewest(integrator, Precision::F32, 1000).unwrap();
+        assert!(rounding && !chooser.keeps(&choice), "{choice:?}");
+        let substeps = choice.substeps;
+        for other in [substeps / 3, substeps / 2, 2 * substeps, 3 * substeps].into_iter().filter(|other| *other > 0) {
+            let other = chooser.tried(integrator, other, Precision::F32);
+            assert!(choice.expected_error <= other.expected_error, "{choice:?}, not {other:?}");
+        }
+    }
+}
+
+#[test]
+fn a_leap_that_went_too_far_is_taken_back() {
+    let scene = scene(&["stepping.tolerance=1e-5", "springs.stiffness_n_per_m=1000"]);
+    let chooser = Chooser::new(&scene, &Limits::default(), &NEVER);
+    let found = chooser.fewest(Integrator::Central, Precision::F64, 1000).unwrap().choice;
+    let fewer = chooser.tried(Integrator::Central, found.substeps - 1, Precision::F64);
+    assert!(chooser.keeps(&found) && !chooser.keeps(&fewer), "{found:?}, {fewer:?}");
+}
