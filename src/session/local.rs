@@ -251,7 +251,7 @@ mod tests {
     #[test]
     fn models_are_numbered_from_1_on_and_go_on_after_the_tool_has_let_go() {
         let mut modeller = modeller();
-        let mut next = |modeller: &mut Modeller| modeller.model(&feel(0.001, 0.0, ContactState::Free), 0, 0.0).sequence;
+        let next = |modeller: &mut Modeller| modeller.model(&feel(0.001, 0.0, ContactState::Free), 0, 0.0).sequence;
         assert_eq!([next(&mut modeller), next(&mut modeller), next(&mut modeller)], [1, 2, 3]);
         modeller.let_go();
         assert_eq!(next(&mut modeller), 4);
