@@ -215,9 +215,9 @@ async fn a_session_that_the_network_has_ended_is_opened_anew() {
     let (wire, server) = Wire::before_server(&[]).await;
     let mut client = Client::open(&server).await;
     client.until("datagrams carry", |client| client.samples[0] > 100 && client.poses > 100).await;
-    [0, 1].map(|way| wire.cut(way, true));
+    [0, 1].iter().for_each(|way| wire.cut(*way, true));
     client.until("the session is over", |client| client.asked > 0).await;
-    [0, 1].map(|way| wire.cut(way, false));
+    [0, 1].iter().for_each(|way| wire.cut(*way, false));
     let (poses, [datagrams, _]) = (client.poses, client.samples);
     client
         .until("datagrams carry again", |client| {

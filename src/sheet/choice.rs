@@ -202,8 +202,11 @@ impl Chooser<'_> {
 
     /// Integrators that the scene leaves open.
     fn integrators(&self) -> impl Iterator<Item = Integrator> + Clone + use<> {
-        let asked = self.stepping.integrator;
-        CANDIDATES.into_iter().filter(move |integrator| asked == Integrator::Auto || asked == *integrator)
+        let (asked, compensates) = (self.stepping.integrator, self.stepping.precision == Precision::Compensated);
+        CANDIDATES.into_iter().filter(move |integrator| match asked {
+            Integrator::Auto => !compensates || entry(*integrator).compensates,
+            asked => asked == *integrator,
+        })
     }
 
     /// One that is asked for by name and is no candidate: as many substeps as it has to have.

@@ -121,15 +121,7 @@ impl Model {
         let asked = self.scene.stepping.clone();
         let mut scene = self.scene.changed(change, first);
         scene.stepping.precision = self.precision;
-        // Compensated is f32 and what its rounding lost: where no exponential scheme will do, f32 goes on alone.
-        let compiled = self.compile_corrected(&scene, limits, stop).or_else(|refusal| {
-            if self.precision != Precision::Compensated || refusal.field != "stepping.precision" {
-                return Err(refusal);
-            }
-            scene.stepping.precision = Precision::F32;
-            self.compile_corrected(&scene, limits, stop)
-        });
-        let mut model = compiled?;
+        let mut model = self.compile_corrected(&scene, limits, stop)?;
         model.scene.stepping = asked;
         Ok(Arc::new(model))
     }
@@ -240,16 +232,16 @@ mod tests {
     }
 
     #[test]
-    fn a_changed_tissue_that_a_scheme_without_compensation_serves_best_goes_on_in_f32_alone() {
-        let sets = ["sheet.points=[5, 5]", "stepping.tolerance=1e-2"];
+    fn in_compensated_f32_only_schemes_that_compensate_are_chosen_also_for_a_changed_tissue() {
+        let sets = ["sheet.points=[5, 5]", "stepping.tolerance=1e-2", "stepping.precision=compensated"];
         let damped = Model::paper(&sets);
-        let model = Model::paper(
-            &[&sets[..], &["damping.coefficient_n_s_per_m=0.0", "stepping.precision=compensated"]].concat(),
-        );
-        assert_eq!(model.precision, Precision::Compensated);
-        // Vibrations that decay leave less of an error: then a simpler scheme does.
+        let model = Model::paper(&[&sets[..], &["damping.coefficient_n_s_per_m=0.0"]].concat());
+        // Vibrations that decay leave less of an error: a simpler scheme would do.
         let change = Change { damping_n_s_per_m: Some(damped.scene.damping_n_s_per_m), ..Change::default() };
         let changed = model.changed(&change, &model.scene, &Limits::default()).unwrap();
-        assert_eq!((changed.plan.integrator, changed.precision), (Integrator::Central, Precision::F32));
+        for model in [&model, &damped, &changed] {
+            assert_eq!(model.precision, Precision::Compensated);
+            assert_ne!(model.plan.integrator, Integrator::Central);
+        }
     }
 }
