@@ -231,12 +231,12 @@ fn a_tip_keeps_to_the_tolerance_of_liver() {
     let scene = scene_with(liver, &[]);
     let tolerance = scene.stepping.tolerance;
     let found = findings(&scene, fingertip, 600, FINER);
-    assert!(found.len() >= 5, "{}", found.len());
+    assert!(found.len() >= 3, "{}", found.len());
     for finding in &found {
-        // Where it slides, forces of points that come under the disc err by a little more.
-        let most = if finding.step < 300 { [0.01, 0.02] } else { [1.0, 3.0] };
+        // A press is far below it.
+        let most = if finding.step < 300 { 0.02 } else { 1.0 } * tolerance;
         let AuditedError { displacement, force } = finding.error;
-        assert!(displacement <= most[0] * tolerance && force <= most[1] * tolerance, "{finding:?}");
+        assert!(displacement <= most && force <= most, "{finding:?}");
     }
 }
 
