@@ -242,14 +242,7 @@ async fn nothing_is_offered_where_there_is_nothing() {
     let session = liver(&server).await;
     let touch = Touch::open(&server, by_datagram(&session, &[0])).await.unwrap();
     assert!(touch.opened.unwrap().datagrams.is_none());
-    let request = pb::AcquireToolRequest {
-        session_id: session.clone(),
-        tool: 1,
-        lease_s: Some(60.0),
-        outlives_connection: true,
-        ..Default::default()
-    };
-    let lease_id = server.haptics().await.acquire_tool(request).await.unwrap().into_inner().lease_id;
+    let lease_id = lease(&server, &session, 1).await;
     let request = pb::OpenDatagramsRequest { session_id: session.clone(), lease_id, ..Default::default() };
     let refused = server.haptics().await.open_datagrams(request).await.unwrap_err();
     assert!(refused.message().contains("no datagrams"), "{refused}");
@@ -261,6 +254,18 @@ async fn nothing_is_offered_where_there_is_nothing() {
     let wrong = palpate(&["serve", "--datagrams-advertise", "nowhere"]);
     assert_eq!(wrong.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&wrong.stderr).contains("datagrams_advertise"));
+}
+
+/// A lease of a tool that no stream holds.
+async fn lease(server: &Server, session: &str, tool: u32) -> String {
+    let request = pb::AcquireToolRequest {
+        session_id: session.to_owned(),
+        tool,
+        lease_s: Some(60.0),
+        outlives_connection: true,
+        ..Default::default()
+    };
+    server.haptics().await.acquire_tool(request).await.unwrap().into_inner().lease_id
 }
 
 /// Opens a session by hand, with a ticket and an origin.
@@ -386,14 +391,7 @@ async fn a_client_that_cant_open_a_stream_has_datagrams_for_its_lease() {
     let server = Server::start(&[]);
     let session = liver(&server).await;
     let mut haptics = server.haptics().await;
-    let request = pb::AcquireToolRequest {
-        session_id: session.clone(),
-        tool: 0,
-        lease_s: Some(60.0),
-        outlives_connection: true,
-        ..Default::default()
-    };
-    let lease_id = haptics.acquire_tool(request).await.unwrap().into_inner().lease_id;
+    let lease_id = lease(&server, &session, 0).await;
     let request = |lease_id: &str| pb::OpenDatagramsRequest {
         session_id: session.clone(),
         lease_id: lease_id.to_owned(),
@@ -558,14 +556,7 @@ async fn an_offer_that_nobody_takes_gives_its_place_among_the_streams_back() {
     let server = Server::start(&[]);
     let session = liver(&server).await;
     let mut haptics = server.haptics().await;
-    let request = pb::AcquireToolRequest {
-        session_id: session.clone(),
-        tool: 0,
-        lease_s: Some(60.0),
-        outlives_connection: true,
-        ..Default::default()
-    };
-    let lease_id = haptics.acquire_tool(request).await.unwrap().into_inner().lease_id;
+    let lease_id = lease(&server, &session, 0).await;
     let request = pb::OpenDatagramsRequest { session_id: session.clone(), lease_id, ..Default::default() };
     haptics.open_datagrams(request).await.unwrap();
     let mut admin = pb::admin_service_client::AdminServiceClient::new(server.channel().await);

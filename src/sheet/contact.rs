@@ -19,8 +19,9 @@
 //! A touch is unilateral: with n the outward normal of the surface under the disc, N = −F·n must be positive, or the
 //! tool is free; |F_t| may be at most μN, or the disc slides: F_t is shortened, and c follows the tool. With μ = 0 it
 //! always follows. While it slides, the force acts half where the disc was and half where it is, along the mean of both
-//! normals: with either alone the error would fall with the first power of the substep. So c is the proxy: the place of the tool on the surface. n = ∂s/∂c_x × ∂s/∂c_y is the only choice
-//! whose work equals what the sheet gets when the disc slides over a slope.
+//! normals: with either alone the error would fall with the first power of the substep. So c is the proxy: the place of the
+//! tool on the surface. n = ∂s/∂c_x × ∂s/∂c_y is the only choice whose work equals what the sheet gets when the disc slides
+//! over a slope.
 //!
 //! The force felt under a constraint is that of springs, virtual springs and damping on the disc, Σ w·f/Σ w²: F without
 //! the points' own inertia, which a hand would feel as a knock at each command.
@@ -336,7 +337,8 @@ impl Tool {
         let pressing_n = -(thrust.force_n() + spread_n).dot(self.normal).min(0.0);
         // What acts over the substep is along the mean normal; a spring's force is that at its end.
         let mean = match (self.tip.coupling, before) {
-            (Coupling::Constraint, Some(before)) => (before + self.normal).normalize_or(self.normal),
+            // Of normals that have turned over there is no mean.
+            (Coupling::Constraint, Some(before)) if before.dot(self.normal) > 0.0 => (before + self.normal).normalize(),
             _ => self.normal,
         };
         let across = (across_n - across_n.dot(mean) * mean).normalize_or_zero();
