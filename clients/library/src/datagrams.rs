@@ -44,8 +44,8 @@ use crate::connect::Server;
 const PATIENCE: Duration = Duration::from_secs(2);
 const ATTEMPTS: usize = 4;
 
-/// A session that has ended is opened anew as often as this, s: a blocked port costs a few packets each time.
-const AGAIN_S: f64 = 10.0;
+/// A session that has ended, or did not open, is opened anew as often as this, s: a blocked port costs a few packets each time.
+const AGAIN_S: f64 = 4.0;
 
 /// The datagrams of one stream.
 #[derive(Debug)]
@@ -108,7 +108,7 @@ impl Datagrams {
     }
 
     /// Whether the session is over, so that it is time to ask the server for another: by `renew` with `datagrams`, which it
-    /// answers with an offer ([`Datagrams::take_offer`]). True once in ten seconds.
+    /// answers with an offer ([`Datagrams::take_offer`]). True once in four seconds.
     pub fn asks(&mut self) -> bool {
         let now_s = self.now_s();
         let is_over = self.host.is_some() && self.connection.is_none() && self.opening.is_empty();
