@@ -4,7 +4,7 @@ use glam::DVec3;
 
 use palpate_touch::ContactState;
 
-use super::contact::{Feel, Surroundings, Thrust, Tool, displacement_m, movement_m, push, within_cone};
+use super::contact::{Feel, Surroundings, Tool, displacement_m, movement_m, push, within_cone};
 use super::footprint::Reached;
 use super::motion::Sheet;
 use super::real::Real;
@@ -23,37 +23,20 @@ impl<T: Real> Sheet<T> {
                 tiles.wake_under(tool.points());
                 push(model, plan, layout, state, &tool.footprint, before_n, plan.scheme.constant());
             }
-            let leg = tool.leg(model, plan, fraction);
-            if leg.jump_n != DVec3::ZERO {
-                push(model, plan, layout, state, &tool.footprint, leg.jump_n, plan.scheme.kick());
-            }
-            let thrust = tool.meet(model, plan, layout, state, leg);
-            tool.force_n = thrust.force_n();
-            tool.steady_n = if met { thrust.goes_on_n } else { DVec3::ZERO };
-            if tool.contact_state == ContactState::Free {
-                // The tool has let go: undo what acted in this substep.
+            tool.force_n = tool.meet(model, plan, layout, state, fraction);
+            tool.steady_n = if met { tool.force_n } else { DVec3::ZERO };
+            if tool.force_n == DVec3::ZERO {
                 if before_n != DVec3::ZERO {
+                    // The tool has let go: undo the force of this substep.
                     push(model, plan, layout, state, &tool.footprint, -before_n, plan.scheme.constant());
                 }
-                if leg.jump_n != DVec3::ZERO {
-                    push(model, plan, layout, state, &tool.footprint, -leg.jump_n, plan.scheme.kick());
-                }
-                continue;
-            }
-            if thrust == Thrust::default() && before_n == DVec3::ZERO && leg.jump_n == DVec3::ZERO {
                 continue;
             }
             // Tiles that slept were at rest in this substep, as if they had been computed.
             tiles.wake_under(tool.points());
-            work.add(leg.jump_n.dot(movement_m(model, layout, state, &tool.footprint)));
-            let change_n = thrust.steady_n - before_n;
-            for (acts_n, by_n, how) in [
-                (thrust.kick_n, thrust.kick_n, plan.scheme.kick()),
-                (thrust.steady_n, change_n, plan.scheme.constant()),
-            ] {
-                push(model, plan, layout, state, &tool.footprint, by_n, how);
-                work.add(acts_n.dot(movement_m(model, layout, state, &tool.footprint)));
-            }
+            push(model, plan, layout, state, &tool.footprint, tool.force_n - before_n, plan.scheme.kick());
+            work.add(tool.force_n.dot(movement_m(model, layout, state, &tool.footprint)));
+            tool.follow(model, layout, state, fraction);
         }
     }
 
