@@ -62,6 +62,11 @@ fn words(text: &str) -> Vec<String> {
     text.split_whitespace().map(str::to_owned).collect()
 }
 
+/// The same run with each of so many seeds.
+fn by_seed(run: &str, seeds: u64) -> Vec<Vec<String>> {
+    (1..=seeds).map(|seed| words(&format!("{run} --seed {seed}"))).collect()
+}
+
 fn number(value: &Value) -> f64 {
     value.as_f64().unwrap_or(f64::NAN)
 }
@@ -243,10 +248,7 @@ fn delays(report: &mut Report, seeds: u64) -> Vec<Panel> {
 
 fn others(report: &mut Report, seeds: u64) {
     let table = |report: &mut Report, name: &str, labels: &[&str], runs: Vec<(Vec<String>, String)>| {
-        let all: Vec<_> = runs
-            .iter()
-            .flat_map(|(_, run)| (1..=seeds).map(move |seed| words(&format!("{run} --seed {seed}"))))
-            .collect();
+        let all: Vec<_> = runs.iter().flat_map(|(_, run)| by_seed(run, seeds)).collect();
         let found = links(&all);
         let rows: Vec<_> =
             runs.iter().zip(found.chunks(seeds as usize)).map(|((label, _), runs)| row(label, runs)).collect();
@@ -355,8 +357,7 @@ fn beside(report: &mut Report, name: &str, label: &str, runs: &[(String, String)
     for tissue in tissues {
         for (_, run) in runs {
             for transport in transports {
-                let run = format!("--scene {tissue} --transport {transport} {run}");
-                all.extend((1..=seeds).map(|seed| words(&format!("{run} --seed {seed}"))));
+                all.extend(by_seed(&format!("--scene {tissue} --transport {transport} {run}"), seeds));
             }
         }
     }
@@ -457,8 +458,7 @@ fn organs(report: &mut Report, seeds: u64) {
     let all: Vec<_> = runs
         .iter()
         .flat_map(|(_, scene, place)| {
-            let run = format!("--scene {scene} --transport datagram --rtt-ms 50 {place}");
-            (1..=seeds).map(move |seed| words(&format!("{run} --seed {seed}")))
+            by_seed(&format!("--scene {scene} --transport datagram --rtt-ms 50 {place}"), seeds)
         })
         .collect();
     let found = links(&all);

@@ -312,15 +312,15 @@ fn draw_places(area: &Area<'_>, title: &str, (unit, value): (&str, &str), size: 
         Rectangle::new([(x - half, y - half), (x + half, y + half)], colour(shade(*value)).filled())
     };
     chart.draw_series(places.iter().map(square)).unwrap();
-    let write = |text: String, y: i32| scale.draw(&Text::new(text, (0, y), ("sans-serif", 11))).unwrap();
+    let write = |text: String, at: (i32, i32)| scale.draw(&Text::new(text, at, ("sans-serif", 11))).unwrap();
     let (top, step) = (50, 4);
     for index in 0..SHADES {
         let y = top + step * index;
         let shade = 1.0 - f64::from(index) / f64::from(SHADES - 1);
         scale.draw(&Rectangle::new([(0, y), (16, y + step)], colour(shade).filled())).unwrap();
     }
-    write(value.to_owned(), top - 18);
+    write(value.to_owned(), (0, top - 18));
     for (value, y) in [(high, top), (0.5 * (low + high), top + step * SHADES / 2), (low, top + step * SHADES)] {
-        scale.draw(&Text::new(format!("{value:.0}"), (20, y - 5), ("sans-serif", 11))).unwrap();
+        write(format!("{value:.0}"), (20, y - 5));
     }
 }

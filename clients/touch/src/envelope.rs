@@ -13,9 +13,10 @@
 //! **Passivity.** The port's energy is exact for a held force: E −= f·Δx at each tick. A force f that moves with the
 //! hand at v, and that slew lets fall no faster than S, still gives f²·v/2S before it is zero. So it is limited to
 //! f ≤ √(2·S·E/v): a spring of K, pressed in and released at v, is not limited as long as its force falls no faster than
-//! the slew allows, K·v ≤ S. A hand at rest may start at any moment, so v counts as at least `LEAST_SPEED_M_PER_S`. A device that
-//! nobody holds gets faster by a while the force falls, in proportion to it: that gives f²/2S · a·f/4S more, so a·f/4S is added to
-//! v. A hand hardly gets faster within a few hundredths of a second, so for a hand nothing changes.
+//! the slew allows, K·v ≤ S. A hand at rest may start at any moment, so v counts as at least `LEAST_SPEED_M_PER_S`. A device
+//! that nobody holds gets faster while the force falls: with an acceleration a, which falls with the force, it gets
+//! f²/2S · a·f/4S more, so a·f/4S is added to v. A hand hardly gets faster within a few hundredths of a second, so for a hand
+//! nothing changes.
 //! To allow a first force before any energy has entered, the tank begins with `CREDIT_J`, and `FIRST_N` against a
 //! hand that presses on is always allowed.
 
@@ -324,8 +325,9 @@ impl Envelope {
 
     /// The largest force along `force_n` whose energy the tank can cover until slew has reduced it to zero, N.
     fn bearable_n(&self, velocity_m_per_s: DVec3, force_n: DVec3) -> f64 {
-        let along_m_per_s = velocity_m_per_s.dot(force_n.normalize_or_zero());
-        let faster_m_per_s2 = self.acceleration_m_per_s2.dot(force_n.normalize_or_zero()).max(0.0);
+        let along = force_n.normalize_or_zero();
+        let along_m_per_s = velocity_m_per_s.dot(along);
+        let faster_m_per_s2 = self.acceleration_m_per_s2.dot(along).max(0.0);
         let gained_m_per_s = faster_m_per_s2 * force_n.length() / (4.0 * SLEW_N_PER_S);
         let speed = (SPEED_MARGIN * along_m_per_s).max(LEAST_SPEED_M_PER_S) + gained_m_per_s;
         let most_n = (2.0 * SLEW_N_PER_S * self.tank_j.max(0.0) / speed).sqrt();
