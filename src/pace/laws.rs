@@ -38,6 +38,7 @@ pub(crate) fn have_same_laws(a: &Model, b: &Model) -> bool {
     a.springs == b.springs
         && a.virtual_stiffness_n_per_m == b.virtual_stiffness_n_per_m
         && a.damping_n_s_per_m == b.damping_n_s_per_m
+        && a.volume_stiffness_pa == b.volume_stiffness_pa
 }
 
 impl KeptLaws {

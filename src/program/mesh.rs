@@ -143,7 +143,7 @@ impl Display for Told {
         row("area", &format!("{:.3} cm²", report.area_m2 * 1e4))?;
         match report.volume_m3 {
             Some(volume) => row("volume", &format!("{:.3} ml", volume * 1e6))?,
-            None => row("volume", &"not closed")?,
+            None => row("volume", &"not closed: [volume] of a scene needs a mesh that is")?,
         }
         row("edges", &spread(&report.edge_m, 1e3, "mm"))?;
         row("triangle areas", &spread(&report.triangle_m2, 1e6, "mm²"))?;

@@ -36,7 +36,7 @@ impl Kind {
     /// Keys that the other does not have.
     fn keys(self) -> &'static [&'static str] {
         match self {
-            Kind::Scene => &["sheet", "mesh", "springs", "virtual_springs", "damping", "stepping"],
+            Kind::Scene => &["sheet", "mesh", "springs", "virtual_springs", "damping", "volume", "stepping"],
             Kind::Script => &["scenes", "duration_s", "sample_every_s", "sample_points", "force", "tool", "tissue"],
         }
     }

@@ -13,6 +13,7 @@ use super::check::physical;
 use super::document::{Fields, Item};
 use super::shown::{Shown, coarser};
 use super::source::Files;
+use super::volume::Volume;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, did_you_mean, excerpt, finite, positive};
 use crate::shape::{Extent, PointId, PointName, RestShape};
@@ -30,6 +31,8 @@ pub struct Mesh {
     pub differences: Arc<Differences>,
     /// The largest stiffness of its springs.
     pub stiffest: Stiffest,
+    /// What it encloses, if that resists.
+    pub volume: Option<Arc<Volume>>,
 }
 
 /// How points and springs of a mesh differ from those of reference. A list is empty where none does. C/m is the same at every
@@ -167,9 +170,21 @@ impl Mesh {
     /// The same where points and springs differ.
     pub fn uneven(point_mass_kg: f64, flexion: f64, shape: Arc<MeshShape>, differences: Differences) -> Self {
         let stiffest = Stiffest { bound: 0.0, vertex: 0, usual: 0.0, extra_virtual: 0.0 };
-        let mut mesh = Mesh { point_mass_kg, flexion, shape, differences: Arc::new(differences), stiffest };
+        let differences = Arc::new(differences);
+        let mut mesh = Mesh { point_mass_kg, flexion, shape, differences, stiffest, volume: None };
         mesh.stiffest = mesh.find_stiffest();
         mesh
+    }
+
+    /// The same mesh, closed, with the volume that it encloses.
+    ///
+    /// # Errors
+    /// Refuses a mesh that encloses no volume, or several.
+    pub fn enclosing(mut self) -> Result<Self> {
+        let volume = Volume::of(&self.shape.vertices_m, &self.shape.triangles)?;
+        let volume = volume.among(self.springs(), |vertex| self.relative_mass(PointId::new(vertex)));
+        self.volume = Some(Arc::new(volume));
+        Ok(self)
     }
 
     /// The mass of a point over that of reference.
@@ -244,7 +259,12 @@ impl Mesh {
                     edges: of_springs(&known.edges, &shape.edges, &part.edges),
                     flexion: of_springs(&known.flexion, &shape.opposite, &part.opposite),
                 };
-                (Mesh::uneven(self.point_mass_kg, self.flexion, Arc::new(part), differences), looked_at)
+                let mut part = Mesh::uneven(self.point_mass_kg, self.flexion, Arc::new(part), differences);
+                part.volume = self.volume.as_ref().and_then(|volume| {
+                    let areas_m2 = found.iter().map(|vertex| turn * volume.areas_m2[*vertex]).collect();
+                    volume.part(areas_m2, |vertex| part.relative_mass(PointId::new(vertex))).map(Arc::new)
+                });
+                (part, looked_at)
             }
             // Parts of a mesh that is sound are sound.
             Err(_) => (self.clone(), [PointId::new(first); 3]),

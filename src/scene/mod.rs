@@ -18,12 +18,13 @@ pub mod sent;
 mod sheet;
 mod shown;
 mod source;
+mod volume;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::limits::Limits;
-use crate::refusal::{Reason, Refusal, Result, did_you_mean, excerpt, not_negative, number};
+use crate::refusal::{Reason, Refusal, Result, did_you_mean, excerpt, not_negative, number, positive};
 use crate::shape::{PointId, RestShape};
 use check::physical;
 use document::{Document, Fields, Item};
@@ -33,6 +34,7 @@ pub use mesh::{Differences, Fixed as FixedVertices, Mesh, MeshShape, Stiffest, T
 pub use sheet::{Fixed, LEAST_WIDTH, PointSet, Sheet};
 pub use shown::{BoundPlace, Shown};
 use source::Files;
+pub use volume::{Swelling, Volume};
 
 /// The scene of the paper's figures, built in.
 pub const PAPER: &str = include_str!("../../scenes/paper.toml");
@@ -65,6 +67,8 @@ pub struct Scene {
     pub virtual_stiffness_n_per_m: f64,
     /// C of the damping force −C·v, N·s/m.
     pub damping_n_s_per_m: f64,
+    /// κ of the pressure −κ·ΔV/V0 on a mesh that encloses a volume, Pa; 0 on any other tissue.
+    pub volume_stiffness_pa: f64,
     /// How time advances.
     pub stepping: Stepping,
     /// Error that leaving out regions at rest may cost, relative to the largest displacement; 0 leaves out nothing. Not
@@ -155,12 +159,14 @@ pub struct Change {
     pub damping_n_s_per_m: Option<f64>,
     /// K″, N/m.
     pub virtual_stiffness_n_per_m: Option<f64>,
+    /// κ of a tissue that encloses a volume, Pa.
+    pub volume_stiffness_pa: Option<f64>,
 }
 
 impl Change {
     /// Why one that changes nothing is refused.
-    pub const NOTHING: &str =
-        "names nothing to change: stiffness_n_per_m, damping_n_s_per_m or virtual_stiffness_n_per_m";
+    pub const NOTHING: &str = "names nothing to change: stiffness_n_per_m, damping_n_s_per_m, virtual_stiffness_n_per_m or \
+                               volume_stiffness_pa";
 }
 
 /// Springs between neighbours: the force on a from a spring a–b is k (L − L0)(x_b − x_a)/L.
@@ -338,6 +344,7 @@ impl Scene {
                 springs: substance.springs,
                 virtual_stiffness_n_per_m: substance.virtual_stiffness_n_per_m,
                 damping_n_s_per_m: substance.damping_n_s_per_m,
+                volume_stiffness_pa: substance.volume_stiffness_pa,
                 stepping: fields.item("stepping").map_or(Ok(Stepping::default()), |item| read_stepping(&item))?,
                 sleep_tolerance: match fields.item("sleep") {
                     Some(item) => item.table(|fields| fields.number("tolerance"))?,
@@ -369,6 +376,7 @@ impl Scene {
         }
         scene.damping_n_s_per_m = change.damping_n_s_per_m.unwrap_or(scene.damping_n_s_per_m);
         scene.virtual_stiffness_n_per_m = change.virtual_stiffness_n_per_m.unwrap_or(scene.virtual_stiffness_n_per_m);
+        scene.volume_stiffness_pa = change.volume_stiffness_pa.unwrap_or(scene.volume_stiffness_pa);
         scene
     }
 
@@ -394,6 +402,24 @@ impl Scene {
             Body::Sheet(sheet) => Some(sheet),
             Body::Mesh(_) => None,
         }
+    }
+
+    /// What the tissue encloses, if that resists.
+    pub fn volume(&self) -> Option<&Volume> {
+        match &self.body {
+            Body::Sheet(_) => None,
+            Body::Mesh(mesh) => mesh.volume.as_deref(),
+        }
+    }
+
+    /// Whether nothing vibrates as fast as a volume that swells and shrinks.
+    pub fn volume_is_fastest(&self) -> bool {
+        let Body::Mesh(mesh) = &self.body else { return false };
+        let fastest = |Swelling { by_pressure_m, by_springs, .. }: Swelling| {
+            let k = self.springs.stiffness_n_per_m;
+            self.volume_stiffness_pa * by_pressure_m + k * by_springs > k * mesh.stiffest.bound
+        };
+        mesh.volume.as_ref().is_some_and(|volume| fastest(volume.swelling))
     }
 
     /// The mass of each point, or on a mesh that of reference, kg.
@@ -453,11 +479,15 @@ impl Scene {
             ("springs.shear_stiffness_n_per_m", self.springs.shear_stiffness_n_per_m),
             ("virtual_springs.stiffness_n_per_m", self.virtual_stiffness_n_per_m),
             ("damping.coefficient_n_s_per_m", self.damping_n_s_per_m),
+            ("volume.stiffness_pa", self.volume_stiffness_pa),
         ];
         for (field, value) in coefficients {
             if not_negative(field, value)? > 0.0 {
                 physical(field, value)?;
             }
+        }
+        if self.volume_stiffness_pa > 0.0 && self.volume().is_none() {
+            return Err(Refusal::new(Reason::WrongKind, "volume.stiffness_pa", Volume::FROM_THE_BEGINNING));
         }
         let stepping = &self.stepping;
         number("stepping.rate_hz", stepping.rate_hz, "from 1e-3 to 1e7", |v| (1e-3..=1e7).contains(&v))?;
@@ -488,6 +518,8 @@ pub struct Substance {
     pub virtual_stiffness_n_per_m: f64,
     /// C, N·s/m.
     pub damping_n_s_per_m: f64,
+    /// κ, Pa; 0 without a volume.
+    pub volume_stiffness_pa: f64,
 }
 
 impl Substance {
@@ -505,6 +537,7 @@ impl Substance {
             springs: Springs { stiffness_n_per_m, shear_stiffness_n_per_m: stiffness_n_per_m, flexion: false },
             virtual_stiffness_n_per_m: made.virtual_stiffness_n_per_m,
             damping_n_s_per_m: made.damping_n_s_per_m,
+            volume_stiffness_pa: 0.0,
         })
     }
 
@@ -519,12 +552,26 @@ impl Substance {
         }
         Ok(self)
     }
+
+    /// The same with the volume that it encloses, if it is a mesh.
+    ///
+    /// # Errors
+    /// Refuses a stiffness that is not above 0, and a mesh that encloses no volume, or several.
+    pub fn enclosing(mut self, stiffness_pa: f64) -> Result<Self> {
+        physical("volume.stiffness_pa", positive("volume.stiffness_pa", stiffness_pa)?)?;
+        self.volume_stiffness_pa = stiffness_pa;
+        self.body = match self.body {
+            Body::Mesh(mesh) => Body::Mesh(mesh.enclosing()?),
+            Body::Sheet(_) => return Err(Refusal::new(Reason::WrongKind, "volume", Volume::OF_A_MESH)),
+        };
+        Ok(self)
+    }
 }
 
 /// Reads the section `[sheet]` or `[mesh]`, and what says how stiff, heavy and damped it is.
 fn read_substance(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) -> Result<Substance> {
     let (sheet, mesh) = (fields.item("sheet"), fields.item("mesh"));
-    let (material, inclusions) = (fields.item("material"), fields.item("inclusion"));
+    let (material, inclusions, volume) = (fields.item("material"), fields.item("inclusion"), fields.item("volume"));
     match (&sheet, &mesh) {
         (Some(_), Some(mesh)) => {
             return Err(mesh.refuse(Reason::WrongKind, "does not go with [sheet]: a tissue is one of them"));
@@ -532,6 +579,9 @@ fn read_substance(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) ->
         (_, None) => {
             if let Some(item) = material.or(inclusions) {
                 return Err(item.refuse(Reason::WrongKind, Material::OF_A_MESH));
+            }
+            if let Some(item) = volume {
+                return Err(item.refuse(Reason::WrongKind, Volume::OF_A_MESH));
             }
             let body = Body::Sheet(fields.required("sheet")?.table(Sheet::read)?);
             return read_coefficients(fields, body);
@@ -547,9 +597,15 @@ fn read_substance(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) ->
         None => read_coefficients(fields, Body::Mesh(mesh))?,
         Some(item) => read_material(fields, &item, &mesh)?,
     };
-    let Some(inclusions) = inclusions else { return Ok(substance) };
-    let inclusions = inclusions.tables()?.iter().map(Inclusion::read).collect::<Result<_>>()?;
-    substance.with(inclusions, "inclusion")
+    let substance = match inclusions {
+        Some(inclusions) => {
+            let inclusions = inclusions.tables()?.iter().map(Inclusion::read).collect::<Result<_>>()?;
+            substance.with(inclusions, "inclusion")?
+        }
+        None => substance,
+    };
+    let Some(volume) = volume else { return Ok(substance) };
+    substance.enclosing(volume.table(|fields| fields.required_number("stiffness_pa"))?)
 }
 
 /// Reads the sections that give the coefficients as in the paper.
@@ -565,6 +621,7 @@ fn read_coefficients(fields: &mut Fields<'_>, mut body: Body) -> Result<Substanc
         damping_n_s_per_m: fields
             .required("damping")?
             .table(|fields| fields.required_number("coefficient_n_s_per_m"))?,
+        volume_stiffness_pa: 0.0,
     })
 }
 

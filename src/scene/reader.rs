@@ -187,6 +187,7 @@ impl Binding<'_> {
                     stiffness_n_per_m: fields.number("stiffness_n_per_m")?,
                     damping_n_s_per_m: fields.number("damping_n_s_per_m")?,
                     virtual_stiffness_n_per_m: fields.number("virtual_stiffness_n_per_m")?,
+                    volume_stiffness_pa: fields.number("volume_stiffness_pa")?,
                 };
                 Ok((at, change))
             })?;

@@ -160,6 +160,7 @@ impl SessionService for Sessions {
             stiffness_n_per_m = model.scene.springs.stiffness_n_per_m,
             damping_n_s_per_m = model.scene.damping_n_s_per_m,
             virtual_stiffness_n_per_m = model.scene.virtual_stiffness_n_per_m,
+            volume_stiffness_pa = model.scene.volume_stiffness_pa,
             "tissue changed"
         );
         for warning in &model.warnings {

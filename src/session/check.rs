@@ -106,13 +106,28 @@ impl fmt::Display for Report {
         if let Body::Mesh(mesh) = &scene.body {
             let Stiffest { bound, usual, vertex, .. } = mesh.stiffest;
             let point = PointId::new(vertex as usize);
+            let is_volume = scene.volume_is_fastest();
             writeln!(
                 f,
-                "fastest       {} at {:.4} m: {:.2} times as fast as at half of the springs; it decides the substeps",
+                "fastest       {} at {:.4} m: {:.2} times as fast as at half of the springs; it decides {}the substeps",
                 model.shape().name(point),
                 model.shape().rest_m(point),
-                (bound / usual).sqrt()
+                (bound / usual).sqrt(),
+                if is_volume { "less than the volume " } else { "" }
             )?;
+            if let Some(volume) = &mesh.volume {
+                let swelling = volume.swelling;
+                let stiffness_n_per_m = scene.volume_stiffness_pa * swelling.by_pressure_m
+                    + scene.springs.stiffness_n_per_m * swelling.by_springs;
+                writeln!(
+                    f,
+                    "volume        {:.3} ml, which swells and shrinks with at most {:.3} Hz{}; the pressure rises by {:.4} Pa a ml",
+                    volume.volume_m3 * 1e6,
+                    ((stiffness_n_per_m + sheet.virtual_stiffness_n_per_m) / sheet.mass_kg).sqrt() / TAU,
+                    if is_volume { " and decides the substeps" } else { "" },
+                    scene.volume_stiffness_pa / volume.volume_m3 * 1e-6
+                )?;
+            }
         }
         let decay_s = 2.0 * sheet.mass_kg / sheet.damping_n_s_per_m;
         if decay_s.is_finite() {

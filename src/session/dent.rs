@@ -34,6 +34,11 @@ pub(super) fn depth_m(scene: &Scene, poke: &Poke) -> Option<f64> {
         diagonal[*a] += *k * *along * *along;
         diagonal[*b] += *k * *along * *along;
     }
+    // The pressure of a volume.
+    let (areas_m2, pa_per_m3) = mesh.volume.as_ref().map_or((&[][..], 0.0), |volume| {
+        (&volume.areas_m2[..], scene.volume_stiffness_pa / volume.volume_m3)
+    });
+    diagonal.iter_mut().zip(areas_m2).for_each(|(diagonal, area)| *diagonal += pa_per_m3 * *area * *area);
     let free = |vertex: usize| !shape.is_fixed(PointId::new(vertex));
     let force_n = |vertex: usize| {
         let away_m = shape.vertices_m()[vertex].distance(poke.centre_m);
@@ -57,6 +62,8 @@ pub(super) fn depth_m(scene: &Scene, poke: &Poke) -> Option<f64> {
             product[*a] -= force;
             product[*b] += force;
         }
+        let pushed_pa = pa_per_m3 * areas_m2.iter().zip(&direction).map(|(area, d)| area.dot(*d)).sum::<f64>();
+        product.iter_mut().zip(areas_m2).for_each(|(product, area)| *product += pushed_pa * *area);
         product.iter_mut().enumerate().filter(|(vertex, _)| !free(*vertex)).for_each(|(_, value)| *value = zero);
         let far = left / dot(&direction, &product);
         moved_m.iter_mut().zip(&direction).for_each(|(moved, direction)| *moved += far * *direction);

@@ -283,7 +283,9 @@ impl<T: Real> Sheet<T> {
         // The present force as an acceleration; the scheme's own terms may be the mean of both sides of a jump.
         self.applied.terms = self.present_terms();
         let springs = springs_of(&self.model, &was);
-        convert(&self.tables.layout, &springs, &was, &plan, &self.applied, &mut self.state);
+        let growth = self.growth();
+        convert(&self.tables.layout, &springs, [&was, &plan], &self.applied, growth, &mut self.state);
+        self.known_growth.set(None);
         self.applied.forget();
         self.model = model.clone();
         self.tables.springs = springs_of(model, &plan);

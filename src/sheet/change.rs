@@ -52,7 +52,9 @@ impl<T: Real> Sheet<T> {
         let tissue = |model: &Model| {
             let scene = &model.scene;
             let springs = scene.springs.clone();
-            (springs, scene.virtual_stiffness_n_per_m, scene.damping_n_s_per_m, model.plan.integrator)
+            let coefficients =
+                [scene.virtual_stiffness_n_per_m, scene.damping_n_s_per_m, scene.volume_stiffness_pa];
+            (springs, coefficients, model.plan.integrator)
         };
         tissue(&self.model) == tissue(model)
     }
@@ -85,6 +87,7 @@ impl<T: Real> Sheet<T> {
     /// Rewrites the whole state.
     fn write(&mut self, write: Write) {
         let terms = self.present_terms();
+        self.press();
         let Sheet { plan, tables, state, tiles, .. } = self;
         let forces = Forces { terms: &terms, field: 0, part: 1.0, pull: 0.0 };
         with_arithmetic!(&plan.scheme, T, |scheme| Survey::write(tables, scheme, state, forces, &tiles.region, write));

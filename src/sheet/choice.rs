@@ -87,6 +87,8 @@ fn rounding(precision: Precision, sheet: &Oscillator, substep_s: f64) -> f64 {
 struct Chooser<'a> {
     stepping: &'a Stepping,
     sheet: Oscillator,
+    /// The same without the pressure of a volume, which lets nothing creep less.
+    unpressed: Oscillator,
     rehearsal: Rehearsal<'a>,
     most_substeps: u32,
 }
@@ -102,7 +104,10 @@ struct Fewest {
 impl Chooser<'_> {
     fn new<'a>(scene: &'a Scene, limits: &Limits, stop: &'a AtomicBool) -> Chooser<'a> {
         let rehearsal = Rehearsal::new(scene, scene.stepping.tolerance, limits.rehearsal_work, stop);
-        Chooser { stepping: &scene.stepping, sheet: Oscillator::of(scene), rehearsal, most_substeps: limits.substeps }
+        let sheet = Oscillator::of(scene);
+        let spring_stiffness_n_per_m = stability::stiffness_of_springs_n_per_m(scene);
+        let unpressed = Oscillator { spring_stiffness_n_per_m, ..sheet.clone() };
+        Chooser { stepping: &scene.stepping, sheet, unpressed, rehearsal, most_substeps: limits.substeps }
     }
 
     /// A choice is never less accurate for want of work: it is refused. Whoever gives the number of substeps answers for
@@ -135,7 +140,7 @@ impl Chooser<'_> {
     fn rests(&self, precision: Precision, substeps: u32) -> bool {
         let substep_s = (self.stepping.rate_hz * f64::from(substeps)).recip();
         self.stepping.precision != Precision::Auto
-            || rounding(precision, &self.sheet, substep_s) <= RESTING_PART * self.stepping.tolerance
+            || rounding(precision, &self.unpressed, substep_s) <= RESTING_PART * self.stepping.tolerance
     }
 
     /// Formats that the scene leaves open to an integrator.

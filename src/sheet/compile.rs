@@ -8,6 +8,7 @@ use super::choice::{self, Choice};
 use super::integrate::{Oscillator, entry};
 use super::lanes;
 use super::model::{Model, Plan};
+use super::tangent;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result};
 use crate::scene::{Body, Change, Integrator, Named, Precision, Scene};
@@ -37,7 +38,11 @@ impl Model {
                 "would need {substeps} substeps a step for stability, above the limit of {}: the springs are too stiff \
                  for points so light at this rate{}",
                 limits.substeps,
-                if let Body::Mesh(mesh) = &scene.body { mesh.fastest_place() } else { String::new() }
+                match &scene.body {
+                    Body::Mesh(_) if scene.volume_is_fastest() => " (volume.stiffness_pa most of all)".to_owned(),
+                    Body::Mesh(mesh) => mesh.fastest_place(),
+                    Body::Sheet(_) => String::new(),
+                }
             );
             Refusal::new(Reason::TooLarge, "stepping.substeps", message)
         };
@@ -92,7 +97,8 @@ impl Model {
             (sheet.damping_n_s_per_m, sheet.virtual_stiffness_n_per_m);
         let model = Model::planned(scene, plan, precision, lanes)
             .map_err(|fault| Refusal::new(Reason::OutOfRange, "mesh.file", fault.to_string()))?;
-        Ok(Arc::new(Model { expected_error, sleep_tolerance, warnings, rehearsed, ..model }))
+        let yields = tangent::yields(&model, stop).into();
+        Ok(Arc::new(Model { expected_error, sleep_tolerance, warnings, rehearsed, yields, ..model }))
     }
 
     /// The same sheet with another tissue: integrator and substeps as its tolerance asks for, in the number format that a

@@ -4,6 +4,7 @@
 //! copied. So it is made in one go, between two steps. What takes long is worked out from the copy: forces take hundreds
 //! of nanoseconds a point, and a hash takes tens.
 
+use std::cell::Cell;
 use std::ops::Range;
 
 use xxhash_rust::xxh3::Xxh3;
@@ -43,6 +44,7 @@ impl<T: Real> Sheet<T> {
             guard_events: self.guard_events,
             substeps_done: self.substeps_done,
             points_done: self.points_done,
+            known_growth: Cell::new(Some(self.growth())),
         }))
     }
 

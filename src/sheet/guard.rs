@@ -123,6 +123,7 @@ impl<T: Real> Sheet<T> {
         self.steps = checkpoint.steps;
         self.tiles.wake_all();
         self.state.copy_from(&checkpoint.state);
+        self.known_growth.set(None);
         self.applied.clone_from(&checkpoint.applied);
         self.prescribed.clone_from(&checkpoint.prescribed);
         self.contacts.clone_from(&checkpoint.contacts);
@@ -137,7 +138,9 @@ impl<T: Real> Sheet<T> {
     pub(super) fn halve(&mut self, was: u32, halvings: u32) {
         let [was, plan] = [was, halvings].map(|halvings| self.model.plan.divided(&self.model.scene, 1 << halvings));
         let springs = springs_of(&self.model, &was);
-        convert(&self.tables.layout, &springs, &was, &plan, &self.applied, &mut self.state);
+        let growth = self.growth();
+        convert(&self.tables.layout, &springs, [&was, &plan], &self.applied, growth, &mut self.state);
+        self.known_growth.set(None);
         self.applied.forget();
         self.tables.springs = springs_of(&self.model, &plan);
         (self.halvings, self.plan) = (halvings, plan);
@@ -202,19 +205,20 @@ pub(super) fn broken_point<T: Real>(model: &Model, layout: &Layout, state: &Stat
     })
 }
 
-/// Converts a state from one substep to another: `from` and `to` are plans of the same scheme, `springs` of `from`.
+/// Converts a state from one substep to another: `from` and `to` are plans of the same scheme, `springs` of `from`; `growth` is
+/// that of the volume.
 pub(super) fn convert<T: Real>(
     layout: &Layout,
     springs: &Elastic<T>,
-    from: &Plan,
-    to: &Plan,
+    [from, to]: [&Plan; 2],
     applied: &Applied<T>,
+    growth: f64,
     state: &mut State<T>,
 ) {
     let ratio = to.substep_s / from.substep_s;
     let points = layout.rows * layout.columns;
     // Compute all forces first: points are converted one by one, in place.
-    let force = |index| springs.gather(layout, &state.u, [index / layout.columns, index % layout.columns]);
+    let force = |index| springs.gather(layout, &state.u, growth, [index / layout.columns, index % layout.columns]);
     let forces: Vec<[T; 3]> = memory::collected((0..points).map(force), "the forces of a sheet");
     for (index, force) in forces.iter().enumerate() {
         let pushed = applied.force_at(layout, 0, [index / layout.columns, index % layout.columns]);

@@ -40,6 +40,9 @@ pub struct Model {
     pub corrected: Option<(Integrator, u32)>,
     /// Points × substeps of the rehearsals by which it was chosen: at most `limits.rehearsal_work`.
     pub rehearsed: u64,
+    /// By how much each place in memory lets a volume grow under a pressure, m³/Pa; empty if nobody has found out, or without a
+    /// volume.
+    pub(super) yields: Arc<[f64]>,
 }
 
 /// A scheme with its substep.
@@ -128,6 +131,7 @@ impl Model {
             warnings: Vec::new(),
             corrected: None,
             rehearsed: 0,
+            yields: Arc::default(),
             scene,
         })
     }
@@ -151,12 +155,14 @@ impl Model {
     fn mesh_bytes(&self) -> u64 {
         const OF_A_VERTEX: usize = 256;
         const OF_A_SPRING: usize = 192;
+        const ENCLOSING: usize = 104;
         match &self.scene.body {
             Body::Sheet(_) => 0,
             Body::Mesh(mesh) => {
                 let springs = mesh.shape.edges().len() + mesh.shape.opposite().len();
                 let shown = mesh.shape.shown().map_or(0, |shown| shown.places.len());
-                (OF_A_VERTEX * (self.len() + shown) + OF_A_SPRING * springs) as u64
+                let enclosing = if mesh.volume.is_some() { ENCLOSING * self.len() } else { 0 };
+                (OF_A_VERTEX * (self.len() + shown) + OF_A_SPRING * springs + enclosing) as u64
             }
         }
     }

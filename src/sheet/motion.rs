@@ -1,5 +1,6 @@
 //! A sheet in motion: its state, the step that advances it, and what can be read of it.
 
+use std::cell::Cell;
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -60,6 +61,8 @@ pub(super) struct Sheet<T: Real> {
     pub(super) substeps_done: u64,
     /// Points computed, summed over all substeps.
     pub(super) points_done: u64,
+    /// By how much a volume has grown, if that was asked for since the last change of the state.
+    pub(super) known_growth: Cell<Option<f64>>,
 }
 
 impl<T: Real> Sheet<T> {
@@ -84,6 +87,7 @@ impl<T: Real> Sheet<T> {
             guard_events: 0,
             substeps_done: 0,
             points_done: 0,
+            known_growth: Cell::new(None),
             plan,
         }
     }
@@ -92,6 +96,7 @@ impl<T: Real> Sheet<T> {
         if self.is_still() {
             return self.skip_steps(1);
         }
+        self.known_growth.set(None);
         let substeps = self.plan.substeps;
         self.substeps_done += u64::from(substeps);
         self.wake_what_is_pushed();
@@ -112,6 +117,10 @@ impl<T: Real> Sheet<T> {
     fn substep(&mut self, moment: Moment, end: f64) {
         let far = self.tiles.farthest_unnoticed(&self.model.scene);
         self.tiles.wake_beside_moved(&self.state.u, far);
+        if self.tables.pressure.is_some() {
+            let growth = self.press();
+            self.wake_what_is_pressed(growth, far);
+        }
         self.points_done += self.tiles.awake_points as u64;
         let Sheet { model, plan, tables, applied, .. } = self;
         applied.prepare(model, plan, &tables.layout, moment, end - moment.fraction);
@@ -126,6 +135,9 @@ impl<T: Real> Sheet<T> {
             released.iter().for_each(|(index, change)| self.shift(*index, change));
         }
         for sweep in 0..self.plan.scheme.sweeps() {
+            if self.tables.pressure.is_some() && (sweep > 0 || !released.is_empty()) {
+                self.press();
+            }
             self.sweep(sweep);
             if let Some(far) = self.plan.scheme.fraction_after(sweep) {
                 self.hold(moment.step, moment.fraction + far * (end - moment.fraction), false);
@@ -190,7 +202,7 @@ impl<T: Real> Sheet<T> {
     fn change_at_release(&self, index: usize, velocity_m_per_s: DVec3, moment: Moment) -> Option<[[f64; 2]; 3]> {
         let Sheet { model, plan, tables, state, applied, .. } = self;
         let (point, scene) = (model.point_of(index), &model.scene);
-        let springs = tables.springs.gather(&tables.layout, &state.u, point).map(Real::wide);
+        let springs = tables.springs.gather(&tables.layout, &state.u, self.growth(), point).map(Real::wide);
         let scale = plan.force_scale(scene);
         let applied_n = applied.from(model, index, moment);
         let (used, mass) = (applied.force_at(&tables.layout, 0, point), model.relative_mass_at(index));
@@ -229,7 +241,7 @@ impl<T: Real> Sheet<T> {
         let Sheet { model, plan, tables, state, .. } = self;
         let (spacing_m, scale) = (model.unit_m, plan.force_scale(&model.scene));
         let unit = plan.scheme.spring_scale() * scale;
-        let springs = tables.springs.gather(&tables.layout, &state.u, model.point_of(index));
+        let springs = tables.springs.gather(&tables.layout, &state.u, self.growth(), model.point_of(index));
         let [i, j] = model.point_of(index);
         let (mass, extra) = (model.relative_mass_at(index), model.extra_virtual_at(index));
         let still = self.steps == 0 || !self.tiles.region.is_awake(i, j);
@@ -287,6 +299,7 @@ pub(super) fn springs_of<T: Real>(model: &Model, plan: &Plan) -> Elastic<T> {
             graph.clone(),
             Kind::new(unit * model.scene.springs.stiffness_n_per_m, 1.0),
             T::of(unit * model.scene.virtual_stiffness_n_per_m),
+            graph.volume.as_ref().map_or(0.0, |volume| unit * model.scene.volume_stiffness_pa * volume.stretch_m),
         ),
     }
 }
@@ -341,7 +354,9 @@ impl<T: Real> Tissue for Sheet<T> {
     }
 
     fn change(&mut self, model: &Arc<Model>) {
+        self.known_growth.set(None);
         Sheet::change(self, model);
+        self.known_growth.set(None);
     }
 
     fn request_audit(&mut self, inputs: Inputs) {
@@ -376,11 +391,15 @@ impl<T: Real> Tissue for Sheet<T> {
         if self.checkpoint.is_some() && self.is_still() {
             self.forget_checkpoint();
         }
+        self.known_growth.set(None);
         Ok(())
     }
 
     fn recover(&mut self, step: u64, to_rest: bool) -> Released {
-        Sheet::recover(self, step, to_rest)
+        self.known_growth.set(None);
+        let released = Sheet::recover(self, step, to_rest);
+        self.known_growth.set(None);
+        released
     }
 
     fn surface_displacement_m(&self, place_m: DVec3) -> DVec3 {
@@ -392,6 +411,7 @@ impl<T: Real> Tissue for Sheet<T> {
     }
 
     fn point(&self, point: PointId) -> PointState {
+        self.keep_growth();
         let index = self.model.place_of(point);
         let scene = &self.model.scene;
         let applied_n = match self.steps {

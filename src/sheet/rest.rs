@@ -3,6 +3,7 @@
 use super::integrate::{Oscillator, with_arithmetic};
 use super::motion::Sheet;
 use super::real::Real;
+use super::stability;
 use super::survey::{Forces, Survey, Write};
 use super::tissue::Energy;
 use crate::scene::Precision;
@@ -33,6 +34,8 @@ impl<T: Real> Sheet<T> {
         let mut region = tiles.no_region();
         for (tile, known) in tiles.sleeping() {
             let [spring_j, virtual_j] = known.unwrap_or_else(|| {
+                // By the pressure that it rests under, which does not change while it sleeps.
+                tables.press(tiles.growth_then(tile));
                 tiles.cover(&mut region, std::iter::once(tile));
                 let survey =
                     with_arithmetic!(&plan.scheme, T, |scheme| Survey::of(tables, scheme, state, forces, &region));
@@ -51,6 +54,7 @@ impl<T: Real> Sheet<T> {
         if !self.tiles.may_sleep() || self.tiles.region.tiles().is_empty() {
             return;
         }
+        let growth = self.press();
         let Sheet { model, plan, tables, state, tiles, prescribed, contacts, applied, .. } = self;
         let spacing_m = model.unit_m;
         // Tiles under a tool that holds or touches stay awake.
@@ -68,7 +72,8 @@ impl<T: Real> Sheet<T> {
         // all of it may matter.)
         let half_digit = if virtual_stiffness > 0.0 { 0.5 * T::EPSILON } else { 0.0 };
         let creep = if model.precision == Precision::Compensated { 0.0 } else { half_digit };
-        let unknown = half_digit * sheet.scaled_spring_stiffness(plan.substep_s) + creep * drag;
+        let rough = Oscillator { spring_stiffness_n_per_m: stability::rough_stiffness_n_per_m(&model.scene), ..sheet };
+        let unknown = half_digit * rough.scaled_spring_stiffness(plan.substep_s) + creep * drag;
         let creep = creep * tiles.largest;
         let slow = |epsilon: f64| (epsilon * virtual_stiffness.sqrt()).max(creep);
         let calm = tiles.glance(&state.u, &state.d, slow);
@@ -99,7 +104,9 @@ impl<T: Real> Sheet<T> {
         tiles.cover(&mut region, sleepers.iter().map(|(tile, _)| *tile));
         with_arithmetic!(&plan.scheme, T, |scheme| Survey::write(tables, scheme, state, forces, &region, Write::Rest));
         let sleepers: Vec<_> = sleepers.into_iter().map(|(tile, survey)| (tile, self.energy_of(&survey).1)).collect();
-        self.tiles.sleep(&sleepers, &self.state.u);
+        // What they add to the volume is summed up for the last time.
+        self.tables.growth(&self.state.u, self.tiles.region.tiles());
+        self.tiles.sleep(&sleepers, &self.state.u, growth);
     }
 }
 

@@ -27,9 +27,34 @@ pub fn largest_stiffness_n_per_m(scene: &Scene) -> f64 {
         // What pulls back beyond the K″ of reference counts among the springs.
         Body::Mesh(mesh) => {
             let Stiffest { bound, extra_virtual, .. } = mesh.stiffest;
-            scene.springs.stiffness_n_per_m * bound + scene.virtual_stiffness_n_per_m * extra_virtual
+            let k = scene.springs.stiffness_n_per_m;
+            let elastic = match &mesh.volume {
+                None => k * bound,
+                Some(volume) => volume.swelling.bound_n_per_m(scene.volume_stiffness_pa, bound, k),
+            };
+            elastic + scene.virtual_stiffness_n_per_m * extra_virtual
         }
     }
+}
+
+/// The same without the pressure of a volume, N/m.
+pub fn stiffness_of_springs_n_per_m(scene: &Scene) -> f64 {
+    match &scene.body {
+        Body::Mesh(mesh) if mesh.volume.is_some() => {
+            let Stiffest { bound, extra_virtual, .. } = mesh.stiffest;
+            scene.springs.stiffness_n_per_m * bound + scene.virtual_stiffness_n_per_m * extra_virtual
+        }
+        _ => largest_stiffness_n_per_m(scene),
+    }
+}
+
+/// What turns the rounding of displacements into force, N/m. That of many points hardly adds up to a change of the volume.
+#[allow(clippy::cast_precision_loss)]
+pub fn rough_stiffness_n_per_m(scene: &Scene) -> f64 {
+    let of_springs = stiffness_of_springs_n_per_m(scene);
+    let points = scene.shape().point_count() as f64;
+    let of_pressure = |swelling_m: f64| scene.volume_stiffness_pa * swelling_m / points.sqrt();
+    of_springs + scene.volume().map_or(0.0, |volume| of_pressure(volume.swelling.by_pressure_m))
 }
 
 /// The same of the springs of a sheet, N/m.

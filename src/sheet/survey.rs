@@ -306,13 +306,16 @@ impl<T: Real> Sheet<T> {
         self.applied.until_now(model, &tables.layout, plan.scheme.spring_scale() * plan.force_scale(&model.scene))
     }
 
-    /// Surveys part of the sheet. Returns the survey, the energies, and the energy that the scheme conserves.
+    /// Surveys part of the sheet. Returns the survey, the energies, and the energy that the scheme conserves; both with that of
+    /// the pressure, which is of the whole.
     pub(super) fn survey(&self, over: &Region) -> (Survey, Energy, f64) {
         let Sheet { model, plan, tables, state, .. } = self;
         let terms = self.present_terms();
         let forces = Forces { terms: &terms, field: 0, part: 1.0, pull: 0.0 };
+        let pressure_j = self.pressure_j(self.press());
         let survey = with_arithmetic!(&plan.scheme, T, |scheme| Survey::of(tables, scheme, state, forces, over));
         let (mut energy, kept_j) = self.energy_of(&survey);
+        energy.spring_j += pressure_j;
         // A grasped point moves with its tool, not as the scheme would move it.
         let own = self.prescribed.grasped().map(|(index, motion)| {
             let [_, free, _] = self.free_point(index, self.applied.until(model, index));
@@ -320,7 +323,7 @@ impl<T: Real> Sheet<T> {
         });
         let grasped_j = 0.5 * model.scene.point_mass_kg() * own.sum::<f64>();
         energy.kinetic_j += grasped_j;
-        (survey, energy, kept_j + grasped_j)
+        (survey, energy, kept_j + grasped_j + pressure_j)
     }
 
     /// The energies of a survey, and the energy that the scheme conserves.

@@ -12,6 +12,7 @@ use super::integrate::arithmetic::{Arithmetic, MAX_KEPT};
 use super::lanes::{self, Width};
 use super::mesh::{self, MeshGrid, MeshPlaces, MeshSprings, MeshSweep, Snapshot};
 use super::model::Model;
+use super::pressure::{Pressure, push_of};
 use super::real::Real;
 use super::region::Region;
 use super::springs::{Kind, Springs};
@@ -26,18 +27,22 @@ const FEW: usize = 4;
 pub(super) enum Elastic<T> {
     Sheet(Springs<T>),
     /// The places of a mesh; a spring of length 1 with the k of reference, of which those of the mesh are multiples; and what
-    /// the extra virtual stiffness multiplies.
-    Mesh(Arc<MeshPlaces>, Kind<T>, T),
+    /// the extra virtual stiffness multiplies; and what the growth of a volume multiplies.
+    Mesh(Arc<MeshPlaces>, Kind<T>, T, f64),
 }
 
 impl<T: Real> Elastic<T> {
-    /// The force of all springs, and of the extra virtual stiffness, on a point, over its relative mass; gathered: for the few
-    /// points that a caller asks about.
-    pub(super) fn gather(&self, layout: &Layout, u: &[T], point: [usize; 2]) -> [T; 3] {
+    /// The force of all springs, of the extra virtual stiffness and of the pressure on a point, over its relative mass; gathered:
+    /// for the few points that a caller asks about. `growth`: by how much the volume has grown.
+    pub(super) fn gather(&self, layout: &Layout, u: &[T], growth: f64, point: [usize; 2]) -> [T; 3] {
         match self {
             Elastic::Sheet(springs) => springs.gather(layout, u, point),
-            Elastic::Mesh(places, unit, pull) => {
-                mesh::gather(&places.slots, unit, *pull, u, point[0] * BLOCK + point[1])
+            Elastic::Mesh(places, unit, pull, factor) => {
+                let slot = point[0] * BLOCK + point[1];
+                let pressed = places.volume.as_ref().map(|volume| {
+                    (push_of(*factor, growth), volume.over_mass(&places.slots, slot).to_array().map(T::of))
+                });
+                mesh::gather(&places.slots, unit, *pull, pressed, u, slot)
             }
         }
     }
@@ -58,6 +63,8 @@ pub(super) struct SweepTables<T> {
     pub(super) springs: Elastic<T>,
     /// None of a sheet.
     mesh: Option<MeshTables<T>>,
+    /// None without a volume.
+    pub(super) pressure: Option<Pressure<T>>,
     /// 1 where a point moves, 0 where it is fixed: one plane. `None` if every point moves.
     pub(super) free: Option<Field<T>>,
     /// Only the first rows of each plane are used. Planes of the layout's length need no extra address registers.
@@ -84,6 +91,7 @@ impl<T: Real> SweepTables<T> {
                 springs: MeshSprings::new(&graph.slots, lanes::shape::<T>(Width::of(model.lanes))),
                 snapshot: RefCell::new(Snapshot::of(&graph.slots)),
             }),
+            pressure: model.graph.as_ref().and_then(|graph| Pressure::new(graph, &layout)),
             free,
             carry: RefCell::new(carry),
             probe: zero,
@@ -98,6 +106,7 @@ impl<T: Real> SweepTables<T> {
             layout: self.layout,
             springs: self.springs.clone(),
             mesh: None,
+            pressure: None,
             free: None,
             carry: RefCell::new(Field::of_length(0)),
             probe: self.probe,
@@ -108,6 +117,19 @@ impl<T: Real> SweepTables<T> {
     /// The relative mass of each place, and its extra K″/m; null if all are 1, or 0.
     pub(super) fn masses_and_extra(&self) -> [*const T; 2] {
         self.mesh.as_ref().map_or([std::ptr::null(); 2], |mesh| mesh.springs.masses_and_extra())
+    }
+
+    /// By how much the volume has grown, in cubes of the unit of length, after the points of `tiles` have moved to `u`; 0 without
+    /// a volume.
+    pub(super) fn growth(&self, u: &Field<T>, tiles: &[usize]) -> f64 {
+        self.pressure.as_ref().map_or(0.0, |pressure| pressure.growth(self.width, &self.layout, u, tiles))
+    }
+
+    /// Sets the pressure of the coming sweeps by how much the volume has grown.
+    pub(super) fn press(&self, growth: f64) {
+        if let (Some(pressure), Elastic::Mesh(.., factor)) = (&self.pressure, &self.springs) {
+            pressure.set(push_of(*factor, growth));
+        }
     }
 
     /// Advances every point with `scheme`. The tools' force is read from field `field` on.
@@ -174,8 +196,9 @@ impl<T: Real> SweepTables<T> {
     unsafe fn run<S: Stage<T>>(&self, x: *const T, over: &Region, stage: S) {
         let layout = self.layout;
         match (&self.springs, &self.mesh) {
-            (Elastic::Mesh(places, unit, pull), Some(MeshTables { springs, snapshot })) => {
-                let grid = MeshGrid { layout, slots: &places.slots, springs, unit, pull: *pull, x, snapshot };
+            (Elastic::Mesh(places, unit, pull, _), Some(MeshTables { springs, snapshot })) => {
+                let push = self.pressure.as_ref().map_or((T::default(), std::ptr::null()), Pressure::at_hand);
+                let grid = MeshGrid { layout, slots: &places.slots, springs, unit, pull: *pull, push, x, snapshot };
                 // SAFETY: the caller's promise; the springs and the snapshot were made for these slots and this width.
                 unsafe { lanes::run(self.width, &MeshSweep { grid, over, stage }) };
             }

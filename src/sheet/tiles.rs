@@ -8,7 +8,7 @@
 //! **Waking.** A sleeping tile remembers where the points around it were when it fell asleep, and wakes when one of
 //! them is more than ε_w from there. (A comparison with the step before would miss a slow creep.) ε_w is ε, or less
 //! where springs are much stiffer than the virtual ones and so pass on more of an omitted force. A tile also wakes when
-//! the tools' force on it may have changed by more than ε_w·K″ since (`rest`), when a point of it is grasped (`motion`), and
+//! the tools' force on it may have changed by more than ε_w·K″ since (`rest`), or the pressure (`swelling`), when a point of it is grasped (`motion`), and
 //! when a position-controlled tool pushes on it (`touch`). All tiles wake when the tissue changes (`change`), after a
 //! recovery (`recovery`), and when the guard goes back to a checkpoint (`guard`).
 //!
@@ -98,6 +98,8 @@ pub(super) struct SleepTiles<T> {
     pub(super) asleep_j: f64,
     /// The elastic energies of each tile, cached until it, or a tile that its springs reach, wakes.
     elastic_j: Vec<Cell<Option<[f64; 2]>>>,
+    /// By how much the volume had grown when each tile fell asleep; empty until one does, and without a volume.
+    growth: Vec<f64>,
     /// Positions of the points around each tile; allocated when the first tile sleeps.
     snapshots: Vec<T>,
     /// The comparisons of the sleeping tiles next to awake ones, on a sheet.
@@ -137,6 +139,7 @@ impl<T: Real> SleepTiles<T> {
             energy_j: memory::zeroed(count, TABLES),
             asleep_j: 0.0,
             elastic_j: memory::filled(count, Cell::new(None), TABLES),
+            growth: Vec::new(),
             snapshots: Vec::new(),
             watches: Vec::new(),
             watched: Vec::new(),
@@ -158,6 +161,7 @@ impl<T: Real> SleepTiles<T> {
             drift_n: Vec::new(),
             energy_j: Vec::new(),
             elastic_j: Vec::new(),
+            growth: Vec::new(),
             snapshots: Vec::new(),
             watches: Vec::new(),
             watched: Vec::new(),
@@ -352,6 +356,22 @@ impl<T: Real> SleepTiles<T> {
         self.wake(waking);
     }
 
+    /// Wakes tiles on which the pressure has changed too much since they fell asleep: `stiffness` times the change of the volume's
+    /// growth, times the reach of the tile, is more than `least`.
+    pub(super) fn wake_pressed(&mut self, growth: f64, reaches: &[f64], stiffness: f64, least: f64) {
+        let pressed = |tile: &usize| {
+            !self.region.awake.has[*tile]
+                && stiffness * (growth - self.growth_then(*tile)).abs() * reaches[*tile] > least
+        };
+        let waking: Vec<usize> = (0..reaches.len()).filter(pressed).collect();
+        self.wake(waking);
+    }
+
+    /// By how much the volume had grown when a tile fell asleep.
+    pub(super) fn growth_then(&self, tile: usize) -> f64 {
+        self.growth.get(tile).copied().unwrap_or(0.0)
+    }
+
     /// Allocates the snapshots. Before the first sleep, all points were at 0.
     fn remember(&mut self) {
         if self.snapshots.is_empty() {
@@ -457,10 +477,16 @@ impl<T: Real> SleepTiles<T> {
         }
     }
 
-    /// Puts tiles to sleep, and stores their energies.
-    pub(super) fn sleep(&mut self, which: &[(usize, f64)], u: &Field<T>) {
+    /// Puts tiles to sleep, and stores their energies. `growth`: by how much the volume has grown.
+    pub(super) fn sleep(&mut self, which: &[(usize, f64)], u: &Field<T>, growth: f64) {
         self.remember();
+        if self.growth.is_empty() && growth != 0.0 {
+            self.growth = memory::filled(self.calm.len(), 0.0, TABLES);
+        }
         for &(tile, energy_j) in which {
+            if let Some(then) = self.growth.get_mut(tile) {
+                *then = growth;
+            }
             self.region.awake.has[tile] = false;
             self.energy_j[tile] = energy_j;
             self.asleep_j += energy_j;

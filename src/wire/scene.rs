@@ -11,7 +11,7 @@ use super::required;
 use crate::refusal::{Reason, Refusal, Result, finite, number, positive};
 use crate::scene::{
     Appearance, Body, Change, Fixed, FixedVertices, Inclusion, Integrator, Lanes, Material, Mesh, Named, PointSet,
-    Precision, Region, Scene, Sheet, Springs, Stepping, Substance, simulated,
+    Precision, Region, Scene, Sheet, Springs, Stepping, Substance, Volume, simulated,
 };
 use crate::shape::RestShape;
 
@@ -37,6 +37,7 @@ pub fn from_scene(message: &pb::Scene, mesh: Option<&TriangleMesh>) -> Result<Sc
         springs: substance.springs,
         virtual_stiffness_n_per_m: substance.virtual_stiffness_n_per_m,
         damping_n_s_per_m: substance.damping_n_s_per_m,
+        volume_stiffness_pa: substance.volume_stiffness_pa,
         stepping: message.stepping.as_ref().map_or(Ok(Stepping::default()), from_stepping)?,
         sleep_tolerance: message.sleep.as_ref().and_then(|sleep| sleep.tolerance),
         appearance: Appearance::default(),
@@ -60,6 +61,7 @@ fn from_coefficients(message: &pb::Scene, body: Body) -> Result<Substance> {
         },
         virtual_stiffness_n_per_m: required("virtual_springs.stiffness_n_per_m", virtual_springs.stiffness_n_per_m)?,
         damping_n_s_per_m: required("damping.coefficient_n_s_per_m", damping.coefficient_n_s_per_m)?,
+        volume_stiffness_pa: 0.0,
     })
 }
 
@@ -67,6 +69,9 @@ fn from_sheet(message: &pb::Scene) -> Result<Substance> {
     let for_a_mesh = [("material", message.material.is_some()), ("inclusions", !message.inclusions.is_empty())];
     if let Some((field, _)) = for_a_mesh.iter().find(|(_, is_there)| *is_there) {
         return Err(Refusal::new(Reason::WrongKind, *field, Material::OF_A_MESH));
+    }
+    if message.volume.is_some() {
+        return Err(Refusal::new(Reason::WrongKind, "volume", Volume::OF_A_MESH));
     }
     if message.springs.is_some_and(|springs| springs.flexion_factor.is_some()) {
         let message = "is for meshes: a sheet has springs of flexion (`flexion`) or none";
@@ -126,7 +131,12 @@ fn from_mesh(message: &pb::Scene, of_mesh: &pb::Mesh, mesh: &TriangleMesh) -> Re
         None if flexion > 0.0 => from_coefficients(message, Body::Mesh(Mesh::new(point_mass_kg, flexion, made.shape)))?,
         None => from_coefficients(message, Body::Mesh(made))?,
     };
-    substance.with(message.inclusions.iter().enumerate().map(from_inclusion).collect::<Result<_>>()?, "inclusions")
+    let inclusions = message.inclusions.iter().enumerate().map(from_inclusion).collect::<Result<_>>()?;
+    let substance = substance.with(inclusions, "inclusions")?;
+    match &message.volume {
+        Some(volume) => substance.enclosing(required("volume.stiffness_pa", volume.stiffness_pa)?),
+        None => Ok(substance),
+    }
 }
 
 fn from_material(message: &pb::Material) -> Result<Material> {
@@ -208,6 +218,7 @@ pub fn from_change(message: &pb::UpdateTissueRequest) -> Change {
         stiffness_n_per_m: message.stiffness_n_per_m,
         damping_n_s_per_m: message.damping_n_s_per_m,
         virtual_stiffness_n_per_m: message.virtual_stiffness_n_per_m,
+        volume_stiffness_pa: message.volume_stiffness_pa,
     }
 }
 
@@ -218,6 +229,7 @@ pub fn update_tissue(session_id: &str, change: &Change, step: u64) -> pb::Update
         stiffness_n_per_m: change.stiffness_n_per_m,
         damping_n_s_per_m: change.damping_n_s_per_m,
         virtual_stiffness_n_per_m: change.virtual_stiffness_n_per_m,
+        volume_stiffness_pa: change.volume_stiffness_pa,
         at_step: Some(step),
     }
 }
@@ -257,6 +269,7 @@ pub fn scene(scene: &Scene) -> pb::Scene {
         }),
         virtual_springs: Some(pb::VirtualSprings { stiffness_n_per_m: Some(scene.virtual_stiffness_n_per_m) }),
         damping: Some(pb::Damping { coefficient_n_s_per_m: Some(scene.damping_n_s_per_m) }),
+        volume: scene.volume().map(|_| pb::Volume { stiffness_pa: Some(scene.volume_stiffness_pa) }),
         stepping: Some(pb::Stepping {
             rate_hz: Some(scene.stepping.rate_hz),
             tolerance: Some(scene.stepping.tolerance),

@@ -30,6 +30,45 @@ pub(in crate::sheet) struct MeshPlaces {
     /// The least extra K″/m of any point, at most 0; and the largest relative mass.
     pub(in crate::sheet) least_extra: f64,
     pub(in crate::sheet) largest_mass: f64,
+    /// What the mesh encloses, if that resists.
+    pub(in crate::sheet) volume: Option<VolumePlaces>,
+}
+
+/// A volume by slots.
+#[derive(Debug)]
+pub(in crate::sheet) struct VolumePlaces {
+    /// a of each slot, in squares of the unit of length.
+    pub(in crate::sheet) areas: Vec<DVec3>,
+    /// The fourth power of the unit of length over the volume, m: times κ the stiffness of the growth of the volume.
+    pub(in crate::sheet) stretch_m: f64,
+    /// For each tile, the largest a of a point that moves over its K″ over that of reference.
+    pub(in crate::sheet) reaches: Vec<f64>,
+}
+
+impl VolumePlaces {
+    fn of(mesh: &Mesh, slots: &MeshSlots) -> Option<Self> {
+        let volume = mesh.volume.as_deref()?;
+        let unit_m = mesh.shape.edge_m();
+        let vertices = slots.vertex_of();
+        let area = |vertex: &u32| {
+            if *vertex == NO_VERTEX { DVec3::ZERO } else { volume.areas_m2[*vertex as usize] / (unit_m * unit_m) }
+        };
+        let areas: Vec<DVec3> = memory::collected(vertices.iter().map(area), TABLES);
+        let reach = |slot: usize| {
+            let moves = vertices[slot] != NO_VERTEX && !mesh.shape.is_fixed(PointId::new(vertices[slot] as usize));
+            let pull = slots.mass(slot) * (1.0 + slots.extra_at(slot));
+            if moves { areas[slot].length() / pull } else { 0.0 }
+        };
+        let of_tile = |tile: usize| tile * TILE_SLOTS..((tile + 1) * TILE_SLOTS).min(areas.len());
+        let reaches = (0..slots.tiles()).map(|tile| of_tile(tile).map(reach).fold(0.0, f64::max)).collect();
+        Some(VolumePlaces { stretch_m: unit_m.powi(4) / volume.volume_m3, reaches, areas })
+    }
+
+    /// a of a slot over its relative mass, in squares of the unit of length.
+    pub(in crate::sheet) fn over_mass(&self, slots: &MeshSlots, slot: usize) -> DVec3 {
+        let area = self.areas[slot];
+        if area == DVec3::ZERO { area } else { area / slots.mass(slot) }
+    }
 }
 
 impl MeshPlaces {
@@ -82,7 +121,8 @@ impl MeshPlaces {
         let least_extra = slots.extra().iter().copied().fold(0.0, f64::min);
         let largest_mass = slots.masses().iter().copied().reduce(f64::max).unwrap_or(1.0);
         let (balls, boxes) = ((0..slots.blocks()).map(ball).collect(), (0..slots.tiles()).map(box_of).collect());
-        Ok(MeshPlaces { balls, boxes, around, firsts_around, least_pulls, least_extra, largest_mass, slots, rest_m })
+        let volume = VolumePlaces::of(mesh, &slots);
+        Ok(MeshPlaces { volume, balls, boxes, around, firsts_around, least_pulls, least_extra, largest_mass, slots, rest_m })
     }
 
     /// Rows of memory.

@@ -167,6 +167,11 @@ impl MeshSlots {
         &self.masses
     }
 
+    /// Whether masses differ.
+    pub(in crate::sheet) fn has_masses(&self) -> bool {
+        !self.masses.is_empty()
+    }
+
     /// The mass of a slot over that of reference; 0 without a point, if not all are 1.
     pub(in crate::sheet) fn mass(&self, slot: usize) -> f64 {
         self.masses.get(slot).copied().unwrap_or(1.0)

@@ -42,6 +42,9 @@ pub(in crate::sheet) struct MeshGrid<'a, T> {
     pub(in crate::sheet) unit: &'a Kind<T>,
     /// a in the scheme's units of force: what the extra virtual stiffness multiplies.
     pub(in crate::sheet) pull: T,
+    /// What times three planes is taken from the force, over the relative mass: the pressure. The planes are null if there is
+    /// none.
+    pub(in crate::sheet) push: (T, *const T),
     /// Displacements: three planes, spacings.
     pub(in crate::sheet) x: *const T,
     /// Room of this mesh's size.
@@ -83,6 +86,10 @@ pub(in crate::sheet) struct MeshSweep<'a, T, S> {
 struct AtHand<T> {
     unit: Kind<T>,
     pull: T,
+    /// As in [`MeshGrid`].
+    push: T,
+    areas: *const T,
+    plane: usize,
     /// Values of the slots, null if all are the same ([`MeshSprings`]).
     extra: *const T,
     masses: *const T,
@@ -100,7 +107,7 @@ struct Sum<V> {
 impl<T: Real, S: Stage<T>> Run<T> for MeshSweep<'_, T, S> {
     #[inline(always)]
     unsafe fn run<V: Vector<Real = T>>(&self) {
-        let MeshGrid { layout, slots, springs, unit, pull, snapshot, .. } = &self.grid;
+        let MeshGrid { layout, slots, springs, unit, pull, push, snapshot, .. } = &self.grid;
         let mut snapshot = snapshot.borrow_mut();
         let Snapshot { records, copied } = &mut *snapshot;
         copied.fill(false);
@@ -108,7 +115,9 @@ impl<T: Real, S: Stage<T>> Run<T> for MeshSweep<'_, T, S> {
         assert!(springs.shape == Shape::of::<V>() && springs.slots == slot_count && slots.blocks() == layout.rows);
         assert!(records.len() == record_place(slot_count) && copied.len() == slots.tiles());
         let of = |field: &Option<Field<T>>| field.as_ref().map_or(std::ptr::null(), |field| field.as_ptr());
-        let at_hand = AtHand { unit: **unit, pull: *pull, extra: of(&springs.extra), masses: of(&springs.masses) };
+        let ((push, areas), plane) = (*push, layout.plane);
+        let (extra, masses) = (of(&springs.extra), of(&springs.masses));
+        let at_hand = AtHand { unit: **unit, pull: *pull, push, areas, plane, extra, masses };
         let records = records.as_mut_ptr();
         // SAFETY: the caller's promise, and the springs and records are those of the slots.
         unsafe {
@@ -207,6 +216,12 @@ impl<T: Real, S: Stage<T>> MeshSweep<'_, T, S> {
                 let pull = x[0].splat(at_hand.pull).mul(V::load(at_hand.extra.add(at)));
                 for c in 0..3 {
                     sum.force[c] = sum.force[c].minus(pull, x[c]);
+                }
+            }
+            if !at_hand.areas.is_null() {
+                let push = x[0].splat(at_hand.push);
+                for c in 0..3 {
+                    sum.force[c] = sum.force[c].minus(push, V::load(at_hand.areas.add(c * at_hand.plane + at)));
                 }
             }
             if S::ENERGY {
@@ -548,9 +563,16 @@ impl<V: Vector> Strain<V> {
     }
 }
 
-/// The force of the springs and of the extra virtual stiffness on one slot, for the few that a caller asks about. `unit`
-/// and `pull` as in [`MeshGrid`].
-pub(in crate::sheet) fn gather<T: Real>(slots: &MeshSlots, unit: &Kind<T>, pull: T, u: &[T], slot: usize) -> [T; 3] {
+/// The force of the springs and of the extra virtual stiffness on one slot, for the few that a caller asks about, minus
+/// `pressed`. `unit` and `pull` as in [`MeshGrid`].
+pub(in crate::sheet) fn gather<T: Real>(
+    slots: &MeshSlots,
+    unit: &Kind<T>,
+    pull: T,
+    pressed: Option<(T, [T; 3])>,
+    u: &[T],
+    slot: usize,
+) -> [T; 3] {
     let plane = slots.layout::<T>().plane;
     let at = |slot: usize| std::array::from_fn(|c| Plain::one(u[c * plane + slot]));
     let own: [Plain<T, 1>; 3] = at(slot);
@@ -567,6 +589,11 @@ pub(in crate::sheet) fn gather<T: Real>(slots: &MeshSlots, unit: &Kind<T>, pull:
         let pull = Plain::one(pull * T::of(slots.extra()[slot]));
         for c in 0..3 {
             sum.force[c] = sum.force[c].minus(pull, own[c]);
+        }
+    }
+    if let Some((push, areas)) = pressed {
+        for c in 0..3 {
+            sum.force[c] = sum.force[c].minus(Plain::one(push), Plain::one(areas[c]));
         }
     }
     sum.force.map(Plain::value)

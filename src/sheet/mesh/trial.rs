@@ -53,7 +53,7 @@ impl Trial {
     pub fn force(&self, vertex: usize) -> DVec3 {
         let FreeMotion { slots, unit, pull, state, .. } = &self.0;
         let slot = slots.slot_of()[vertex] as usize;
-        DVec3::from_array(gather(slots, unit, *pull, &state.u, slot).map(f64::from))
+        DVec3::from_array(gather(slots, unit, *pull, None, &state.u, slot).map(f64::from))
     }
 }
 
@@ -132,6 +132,7 @@ impl<T: Real> FreeMotion<T> {
             springs: &self.springs,
             unit: &self.unit,
             pull: self.pull,
+            push: (T::default(), std::ptr::null()),
             x: u.cast_const(),
             snapshot: &self.snapshot,
         };
