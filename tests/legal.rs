@@ -48,6 +48,7 @@ fn legal(seed: u64, limits: &Limits) -> Scene {
         springs: Springs { stiffness_n_per_m, shear_stiffness_n_per_m, flexion: random.bool() },
         virtual_stiffness_n_per_m: or_zero(&mut random),
         damping_n_s_per_m: or_zero(&mut random),
+        volume_stiffness_pa: 0.0,
         stepping: Stepping {
             rate_hz: decades(&mut random, -3.0, limits.session_rate_hz.log10()),
             tolerance: decades(&mut random, -16.0, 0.0),

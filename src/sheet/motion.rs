@@ -342,6 +342,7 @@ impl<T: Real> Tissue for Sheet<T> {
     }
 
     fn feel(&self, tool: usize) -> Option<Feel> {
+        self.keep_growth();
         Sheet::feel(self, tool)
     }
 
@@ -407,6 +408,7 @@ impl<T: Real> Tissue for Sheet<T> {
     }
 
     fn reaction_around_n(&self, poke: &Poke) -> DVec3 {
+        self.keep_growth();
         self.reaction_around(poke)
     }
 

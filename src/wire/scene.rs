@@ -414,6 +414,7 @@ mod tests {
                 },
             ],
             springs: Some(pb::Springs { flexion_factor: Some(0.2), ..Default::default() }),
+            volume: Some(pb::Volume { stiffness_pa: Some(300.0) }),
             ..Default::default()
         }
     }
@@ -427,6 +428,7 @@ mod tests {
         assert!(edges.len() == 6 && flexion.len() == 6 && mesh.flexion == 0.2, "{mesh:?}");
         assert_eq!(mesh.differences.extra_virtual[1], 3.0);
         assert_eq!(read(&sent(&made)), made);
+        assert_eq!((made.volume_stiffness_pa, mesh.volume.is_some()), (300.0, true));
         let told = scene(&made);
         let material = told.material.unwrap();
         assert_eq!((material.density_kg_per_m3, material.damping_ratio), (Some(1060.0), Some(0.5)));
@@ -436,6 +438,8 @@ mod tests {
         let change = Change { stiffness_n_per_m: Some(1.0), ..Change::default() };
         let changed = scene(&made.changed(&change, &made));
         assert_eq!((changed.springs.unwrap().stiffness_n_per_m, changed.material), (Some(1.0), Some(material)));
+        let softer = Change { volume_stiffness_pa: Some(0.0), ..Change::default() };
+        assert_eq!(scene(&made.changed(&softer, &made)).volume, Some(pb::Volume { stiffness_pa: Some(0.0) }));
         // Inclusions alone go with coefficients.
         let even = pb::Scene { material: None, ..told };
         assert_eq!(scene(&read(&even)), even);
@@ -444,7 +448,7 @@ mod tests {
     #[test]
     fn what_is_wrong_with_a_material_or_an_inclusion_is_named() {
         type Change = fn(&mut pb::Scene);
-        let changes: [(Change, &str, Reason, &str); 33] = [
+        let changes: [(Change, &str, Reason, &str); 38] = [
             (|s| material_of(s).youngs_modulus_pa = None, "material.youngs_modulus_pa", Reason::Missing, ""),
             (|s| material_of(s).thickness_m = None, "material.thickness_m", Reason::Missing, ""),
             (|s| material_of(s).bed_n_per_m3 = None, "material.bed_n_per_m3", Reason::Missing, ""),
@@ -479,6 +483,16 @@ mod tests {
             (|s| s.virtual_springs = scene(&paper()).virtual_springs, "virtual_springs", Reason::WrongKind, "follows"),
             (|s| s.material = None, "mesh.point_mass_kg", Reason::Missing, ""),
             (|s| s.mesh = None, "material", Reason::WrongKind, "is for a mesh"),
+            (|s| s.volume = Some(pb::Volume::default()), "volume.stiffness_pa", Reason::Missing, ""),
+            (|s| resists(s, 0.0), "volume.stiffness_pa", Reason::OutOfRange, "above 0"),
+            (|s| resists(s, f64::NAN), "volume.stiffness_pa", Reason::NotFinite, ""),
+            (|s| resists(s, 1e13), "volume.stiffness_pa", Reason::OutOfRange, "1e12"),
+            (
+                |s| (s.mesh, s.material, s.inclusions) = (None, None, vec![]),
+                "volume",
+                Reason::WrongKind,
+                "is for a closed mesh",
+            ),
             (|s| (s.mesh, s.material) = (None, None), "inclusions", Reason::WrongKind, "is for a mesh"),
             (|s| s.inclusions[0].radius_m = None, "inclusions[0].radius_m", Reason::Missing, ""),
             (|s| s.inclusions[0].radius_m = Some(0.0), "inclusions[0].radius_m", Reason::OutOfRange, "above 0"),
@@ -544,6 +558,10 @@ mod tests {
 
     fn material_of(scene: &mut pb::Scene) -> &mut pb::Material {
         scene.material.as_mut().unwrap()
+    }
+
+    fn resists(scene: &mut pb::Scene, stiffness_pa: f64) {
+        scene.volume = Some(pb::Volume { stiffness_pa: Some(stiffness_pa) });
     }
 
     fn mesh_of(scene: &mut pb::Scene) -> &mut pb::Mesh {

@@ -37,7 +37,12 @@ fn changed(model: &Model, change: Change) -> Arc<Model> {
 }
 
 fn other(k: f64, c: f64, virtual_k: f64) -> Change {
-    Change { stiffness_n_per_m: Some(k), damping_n_s_per_m: Some(c), virtual_stiffness_n_per_m: Some(virtual_k) }
+    Change {
+        stiffness_n_per_m: Some(k),
+        damping_n_s_per_m: Some(c),
+        virtual_stiffness_n_per_m: Some(virtual_k),
+        volume_stiffness_pa: None,
+    }
 }
 
 /// A tissue with a push and a grasp.
@@ -276,6 +281,7 @@ fn update(session_id: &str, change: Change, at_step: Option<u64>) -> pb::UpdateT
         stiffness_n_per_m: change.stiffness_n_per_m,
         damping_n_s_per_m: change.damping_n_s_per_m,
         virtual_stiffness_n_per_m: change.virtual_stiffness_n_per_m,
+        volume_stiffness_pa: change.volume_stiffness_pa,
         at_step,
     }
 }

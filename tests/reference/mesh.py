@@ -1,9 +1,10 @@
 """Solves a small closed mesh by other means than Palpate's: dense arrays and the classical Runge-Kutta scheme in NumPy, with
-half the step until nothing changes. Writes icosphere.obj and icosphere.json beside itself: python mesh.py
+half the step until nothing changes. Writes icosphere.obj, icosphere.json and filled.json beside itself: python mesh.py
 
 The model is that of the paper (README, docs/paper.md): mass points at the vertices, springs along the edges (force
 k (L - L0) along the spring), a spring of zero rest length from each point to its rest, damping, and forces
-F exp(-c r + c'), r the distance at rest from the control point. One vertex is moved by a tool.
+F exp(-c r + c'), r the distance at rest from the control point. One vertex is moved by a tool. In filled.json the sphere
+encloses a volume V0 that resists: a pressure -kappa/V0 (a u), with a the slope of the volume at rest, pushes each vertex by its a.
 """
 
 import json
@@ -60,10 +61,16 @@ def smooth(move, t):
 
 
 class Tissue:
-    def __init__(self, scene, rest, edges):
+    def __init__(self, scene, rest, edges, triangles):
         self.scene, self.rest = scene, rest
         self.a, self.b = np.array(edges).T
         self.length = np.linalg.norm(rest[self.b] - rest[self.a], axis=1)
+        # The volume is a sum of x0 (x1 x x2)/6 over the triangles, and its slope that of each corner.
+        self.volume, self.slopes = 0.0, np.zeros_like(rest)
+        for corners in triangles:
+            for a, b, c in (corners, corners[1:] + corners[:1], corners[2:] + corners[:2]):
+                self.slopes[a] += np.cross(rest[b], rest[c]) / 6
+            self.volume += np.dot(rest[a], np.cross(rest[b], rest[c])) / 6
         self.fields = []
         for force in scene["forces"]:
             away = np.linalg.norm(rest - rest[force["point"]], axis=1)
@@ -76,7 +83,8 @@ class Tissue:
         force = np.zeros_like(u)
         np.add.at(force, self.a, pull)
         np.add.at(force, self.b, -pull)
-        return force
+        growth = float((self.slopes * u).sum())
+        return force - self.scene.get("kappa", 0.0) * growth / self.volume * self.slopes
 
     def applied(self, t, before):
         total = np.zeros_like(self.rest)
@@ -143,7 +151,8 @@ class Tissue:
             "watch": watch,
             "energy": {
                 "kinetic": 0.5 * scene["mass"] * float((v * v).sum()),
-                "spring": 0.5 * scene["k"] * float(((now - self.length) ** 2).sum()),
+                "spring": 0.5 * scene["k"] * float(((now - self.length) ** 2).sum())
+                + 0.5 * scene.get("kappa", 0.0) * float((self.slopes * u).sum()) ** 2 / self.volume,
                 "virtual": 0.5 * scene["K"] * float((u * u).sum()),
             },
         }
@@ -155,7 +164,6 @@ def main():
     lines = ["v " + " ".join(repr(float(x)) for x in vertex) for vertex in rest]
     lines += ["f " + " ".join(str(vertex + 1) for vertex in triangle) for triangle in triangles]
     (HERE / "icosphere.obj").write_text("\n".join(lines) + "\n")
-    # As the file has them.
     scene = {
         "name": "icosphere",
         "about": "a sphere of 162 vertices: a pulse and a constant push from two sides, and a vertex moved in, aside and back",
@@ -174,7 +182,13 @@ def main():
         "samples": [0, 3, 12, 47, 77, 100, 161], "watch": [3, 47, 100],
     }
     scene["times"] = [round(time, 2) for time in scene["times"]]
-    tissue = Tissue(scene, rest, edges)
+    solve(scene, rest, edges, triangles)
+    about = "the same sphere, which encloses a volume that resists more than anything else"
+    solve({**scene, "name": "filled", "about": about, "kappa": 20000.0}, rest, edges, triangles)
+
+
+def solve(scene, rest, edges, triangles):
+    tissue = Tissue(scene, rest, edges, triangles)
     steps, before = 100, None
     while True:
         states = tissue.course(steps)
@@ -188,7 +202,7 @@ def main():
         before, steps = states, 2 * steps
     frames = [tissue.frame(t, state) for t, state in zip(scene["times"], states)]
     checks = {"steps_an_interval": steps, "error": error, "largest_displacement": largest}
-    (HERE / "icosphere.json").write_text(json.dumps({"scene": scene, "frames": frames, "checks": checks}) + "\n")
+    (HERE / f"{scene['name']}.json").write_text(json.dumps({"scene": scene, "frames": frames, "checks": checks}) + "\n")
 
 
 if __name__ == "__main__":

@@ -79,6 +79,7 @@ fn sweep<T: Real, const ENERGY: bool>(
         springs: &springs,
         unit: &unit,
         pull: T::of(pull),
+        push: (T::default(), std::ptr::null()),
         x: u.as_ptr(),
         snapshot: &snapshot,
     };
@@ -184,7 +185,7 @@ fn pulls_as_the_reference<T: Real>() {
                 let near = (found - force).abs().cmple(within).all();
                 assert!(near, "{count} {valence} {strain} {vertex}: {found} {force} ± {within}");
                 let slot = slots.slot_of()[vertex] as usize;
-                let alone = gather(&slots, &Kind::<T>::new(SCALE, 1.0), T::of(PULL), &u, slot);
+                let alone = gather(&slots, &Kind::<T>::new(SCALE, 1.0), T::of(PULL), None, &u, slot);
                 let swept = std::array::from_fn(|c| n[c * slots.layout::<T>().plane + slot]);
                 assert_eq!(alone, swept, "{count} {valence} {strain} {vertex}");
             }

@@ -65,7 +65,7 @@ fn a_tile_wakes_when_a_point_beside_it_is_too_far_from_where_it_was_as_it_fell_a
     }
     let mut tiles = tiles();
     tiles.wake_all();
-    tiles.sleep(&[(MIDDLE, 0.0)], &u);
+    tiles.sleep(&[(MIDDLE, 0.0)], &u, 0.0);
     assert_eq!(tiles.region.tiles(), [0, 1, 2, 3, 5, 6, 7, 8]);
     tiles.wake_beside_moved(&u, 0.01);
     assert!(!tiles.region.awake.has[MIDDLE], "nothing has moved");
@@ -81,7 +81,7 @@ fn a_tile_wakes_when_a_point_beside_it_is_too_far_from_where_it_was_as_it_fell_a
                 tiles.wake_beside_moved(&u, 0.01);
                 assert_eq!(tiles.region.awake.has[MIDDLE], expected, "{point:?} {c} {far}");
                 u[at] -= far;
-                tiles.sleep(&[(MIDDLE, 0.0)], &u);
+                tiles.sleep(&[(MIDDLE, 0.0)], &u, 0.0);
             }
         }
     }
