@@ -201,7 +201,8 @@ fn each_scheme_has_its_order() {
                 // Damping that takes five times a point's momentum in a step reaches the fifth order only at finer
                 // steps.
                 // The third derivative of a tool's move jumps where it begins and ends, which a fifth order notices.
-                let order = if ["overdamped19", "icosphere", "filled"].contains(&name) { f64::min(order, 4.0) } else { order };
+                let order =
+                    if ["overdamped19", "icosphere", "filled"].contains(&name) { f64::min(order, 4.0) } else { order };
                 assert!(gain.log2() / 2.0 > order - 0.75, "{integrator}, {name}: {gain}");
             }
         }

@@ -135,7 +135,8 @@ const TIP: Tip = Tip { radius_m: 0.02, friction: 0.2, grasps: false, coupling: C
 /// The same pressed in from above, by 10 % of its size, until all is steady.
 fn pressed(stiffness_pa: &str) -> Box<dyn Tissue> {
     let stiffness = format!("volume.stiffness_pa={stiffness_pa}");
-    let mut tissue = at_rest(&model(&ball(&[&stiffness, "damping.coefficient_n_s_per_m=0.4", "stepping.tolerance=1e-3"])));
+    let mut tissue =
+        at_rest(&model(&ball(&[&stiffness, "damping.coefficient_n_s_per_m=0.4", "stepping.tolerance=1e-3"])));
     for step in 0..1500 {
         tissue.pose(0, DVec3::new(0.0, 0.0, 0.052 - 0.012 * (f64::from(step) / 500.0).min(1.0)), TIP);
         tissue.step().unwrap();
@@ -153,14 +154,17 @@ fn the_stiffer_its_volume_the_better_a_pressed_ball_keeps_it_and_the_more_its_ot
         let lost = -growth_m3(&*tissue) / tissue.model().scene.volume().unwrap().volume_m3;
         let bulges_m = -tissue.point(far).displacement_m.z;
         let force_n = tissue.feel(0).unwrap().force_on_tool_n.z;
-        println!("{stiffness_pa} Pa: {lost:.2e} lost, {:.2e} truly; {bulges_m:.2e} m, {force_n:.3} N", -true_growth(&*tissue));
+        println!(
+            "{stiffness_pa} Pa: {lost:.2e} lost, {:.2e} truly; {bulges_m:.2e} m, {force_n:.3} N",
+            -true_growth(&*tissue)
+        );
         if let Some((lost_before, bulges_before_m, force_before_n)) = before {
             assert!(lost > 0.0 && lost < lost_before, "{stiffness_pa}: {lost} {lost_before}");
             assert!(bulges_m > bulges_before_m && force_n > force_before_n, "{stiffness_pa}: {bulges_m} {force_n}");
         }
         before = Some((lost, bulges_m, force_n));
         // What first order leaves out.
-        assert!((-true_growth(&*tissue) - lost).abs() < 0.02, "{stiffness_pa}");
+        assert!((-true_growth(&*tissue) - lost).abs() < 3e-4, "{stiffness_pa}");
     }
     assert!(before.unwrap().0 < 1e-3);
 }
@@ -173,7 +177,7 @@ fn a_force_is_felt_as_the_tangent_and_the_force_law_say_also_where_only_a_part_i
     let shape = model.shape();
     let top = shape.nearest(DVec3::new(0.02, 0.0, -0.05));
     let (at_m, outward) = (shape.rest_m(top), shape.normal(top));
-    let tip = Tip { radius_m: 0.006, friction: 0.0, ..TIP };
+    let tip = Tip { radius_m: 0.006, friction: 10.0, ..TIP };
     let law = tangent::press(&model, tip.radius_m, at_m, 0.0005, 7);
     for three in law.windows(3) {
         let slope = (three[2].force_n - three[0].force_n) / 0.001;
@@ -182,21 +186,28 @@ fn a_force_is_felt_as_the_tangent_and_the_force_law_say_also_where_only_a_part_i
         assert!((found / slope - 1.0).abs() < 0.03, "{found} {slope}");
     }
     let softer = tangent::press(&common::model(&without), tip.radius_m, at_m, 0.0005, 7);
-    assert!(law[6].force_n > 1.02 * softer[6].force_n, "{:?} {:?}", law[6], softer[6]);
-    let mut tissue = at_rest(&model);
-    for step in 0..1200 {
-        let depth_m = 0.003 * (f64::from(step) / 400.0).min(1.0);
-        tissue.pose(0, at_m + (0.001 - (depth_m / 0.003) * 0.004) * outward, tip);
-        tissue.step().unwrap();
-    }
-    let feel = tissue.feel(0).unwrap();
-    let depth_m = (feel.surface_m - at_m).dot(-outward);
-    let row = ((depth_m / 0.0005) as usize).min(5);
-    let part = depth_m / 0.0005 - row as f64;
-    let by_law_n = law[row].force_n * (1.0 - part) + law[row + 1].force_n * part;
-    let felt_n = feel.force_on_tool_n.length();
-    println!("felt {felt_n} N, by the law {by_law_n} N, {depth_m} m deep; without a volume {} N", softer[6].force_n);
-    assert!((felt_n / by_law_n - 1.0).abs() < 0.05, "{felt_n} {by_law_n}");
+    assert!(law[6].force_n > 1.005 * softer[6].force_n, "{:?} {:?}", law[6], softer[6]);
+    // Beside a control without a volume: a law of discrete points, whose border is held, is not exact itself.
+    let felt = |model: &Arc<Model>, law: &[tangent::Pressed]| {
+        let mut tissue = at_rest(model);
+        for step in 0..1200 {
+            let part = (f64::from(step) / 400.0).min(1.0);
+            tissue.pose(0, at_m + (0.001 - part * 0.004) * outward, tip);
+            tissue.step().unwrap();
+        }
+        let feel = tissue.feel(0).unwrap();
+        let depth_m = (feel.surface_m - at_m).dot(-outward);
+        let row = ((depth_m / 0.0005) as usize).min(5);
+        let part = depth_m / 0.0005 - row as f64;
+        let by_law_n = law[row].force_n * (1.0 - part) + law[row + 1].force_n * part;
+        let felt_n = feel.force_on_tool_n.dot(outward);
+        println!("felt {felt_n} N, by the law {by_law_n} N, {depth_m} m deep");
+        (felt_n, felt_n / by_law_n)
+    };
+    let (with, control) = (felt(&model, &law), felt(&common::model(&without), &softer));
+    assert!(with.0 > 1.005 * control.0, "{with:?} {control:?}");
+    assert!((with.1 / control.1 - 1.0).abs() < 0.005, "{with:?} {control:?}");
+    assert!((control.1 - 1.0).abs() < 0.05, "{control:?}");
 }
 
 #[test]
@@ -272,15 +283,32 @@ fn the_bits_are_the_same_at_every_width_and_a_copy_has_them() {
 }
 
 #[test]
+fn an_audit_in_f64_finds_the_error_within_the_tolerance_also_of_what_sleeps() {
+    for scene in [ball(&[]), gallbladder(&[])] {
+        let text = "duration_s = 0.6\nsample_every_s = 0.1\n[[force]]\nvertex = 40\nforce_n = [-0.004, 0.002, 0.01]\n\
+                    falloff_per_m = 60.0\nfalloff_offset = 0.0\nprofile = { type = \"pulse\", on_s = 0.05, off_s = 0.3 }\n";
+        let (script, limits) = (common::script(text, &scene), Limits::default());
+        let mut output = Vec::new();
+        let summary =
+            palpate::session::run::audited(&model(&scene), &script, false, &limits, &mut output, &|| 0.0, &mut |_| {});
+        let summary = summary.unwrap();
+        let found = summary.audited_error.unwrap();
+        println!("{found:?}, {:e} asked for", scene.stepping.tolerance);
+        assert!(found.largest() <= scene.stepping.tolerance, "{}: {found:?}", scene.name);
+    }
+}
+
+#[test]
 fn its_stiffness_changes_under_way_and_other_tissue_gets_none() {
     let (limits, softer) = (Limits::default(), |stiffness_pa: f64| Change {
         volume_stiffness_pa: Some(stiffness_pa),
         ..Change::default()
     });
-    let first = model(&ball(&["stepping.integrator=exponential3"]));
+    let damped = "damping.coefficient_n_s_per_m=0.4";
+    let first = model(&ball(&["stepping.integrator=exponential3", damped]));
     let mut tissue = at_rest(&first);
     tissue.push(0, poke(DVec3::new(0.05, 0.0, 0.0), DVec3::new(-0.2, 0.0, 0.1), 40.0));
-    (0..200).for_each(|_| tissue.step().unwrap());
+    (0..600).for_each(|_| tissue.step().unwrap());
     let mut grown = vec![growth_m3(&*tissue)];
     for stiffness_pa in [1e3, 0.0, 2e4] {
         let next = tissue.model().changed(&softer(stiffness_pa), &first.scene, &limits).unwrap();
@@ -294,10 +322,9 @@ fn its_stiffness_changes_under_way_and_other_tissue_gets_none() {
         (0..600).for_each(|_| tissue.step().unwrap());
         grown.push(growth_m3(&*tissue));
     }
-    // As before the changes.
+    // At last as before the changes.
     assert!(grown[0] < 0.0 && grown[1] < 2.0 * grown[0] && grown[2] < 1.05 * grown[1], "{grown:?}");
-    (0..1000).for_each(|_| tissue.step().unwrap());
-    assert!((growth_m3(&*tissue) / grown[3] - 1.0).abs() < 0.2, "{grown:?}");
+    assert!((grown[3] / grown[0] - 1.0).abs() < 0.05, "{grown:?}");
     assert_eq!(tissue.guard_events(), 0);
     // The guard's last resort.
     tissue.recover(tissue.step_count(), false);
@@ -319,7 +346,7 @@ fn a_scene_that_encloses_nothing_or_says_it_wrongly_is_refused_with_its_line() {
     let coefficients = "[springs]\nstiffness_n_per_m = 10.0\n[virtual_springs]\nstiffness_n_per_m = 5.0\n[damping]\n\
                         coefficient_n_s_per_m = 0.1\n";
     let mesh = "[mesh]\nfile = \"icosphere.obj\"\nunit = \"m\"\npoint_mass_kg = 0.01\n";
-    let colon = "[mesh]\norgan = { name = \"colon\", edge_m = 0.01 }\npoint_mass_kg = 0.01\n";
+    let colon = "[mesh]\norgan = { name = \"colon\", edge_m = 0.005 }\npoint_mass_kg = 0.01\n";
     let sheet = "[sheet]\npoints = [3, 3]\nspacing_m = 0.1\npoint_mass_kg = 0.01\n";
     for (body, volume, words) in [
         (mesh, "stiffness_pa = 0.0", "above 0"),
@@ -334,7 +361,7 @@ fn a_scene_that_encloses_nothing_or_says_it_wrongly_is_refused_with_its_line() {
         assert!(refused.contains(words) && refused.contains("volume"), "{refused}");
     }
     // So stiff that no limit of substeps suffices: what decides is named.
-    let scene = ball(&["volume.stiffness_pa=1e12"]);
+    let scene = ball(&["volume.stiffness_pa=1e12", "stepping.rate_hz=10"]);
     let refused = Model::compile(&scene, &Limits::default()).unwrap_err();
     assert!(refused.message.contains("volume.stiffness_pa most of all"), "{refused}");
 }

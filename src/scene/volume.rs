@@ -61,10 +61,13 @@ impl Volume {
     /// Refuses a mesh with a hole, with triangles that do not agree on what is outside, of several parts, and a flat one.
     pub(super) fn of(vertices_m: &[DVec3], triangles: &[[u32; 3]]) -> Result<Self> {
         let refuse = |what: &str| {
-            let message = format!("needs a closed mesh, of one part: {what} (`palpate mesh FILE` tells more, --repair may mend it)");
+            let message = format!(
+                "needs a closed mesh, of one part: {what} (`palpate mesh FILE` tells more, --repair may mend it)"
+            );
             Err(Refusal::new(Reason::WrongKind, "volume", message))
         };
-        let at = |[a, b]: [u32; 2]| format!("at the edge between vertices {a} and {b}, {:.4} m", vertices_m[a as usize]);
+        let at =
+            |[a, b]: [u32; 2]| format!("at the edge between vertices {a} and {b}, {:.4} m", vertices_m[a as usize]);
         let sides = || triangles.iter().flat_map(|[a, b, c]| [[*a, *b], [*b, *c], [*c, *a]]);
         // Each edge, and whether a triangle goes along it from its lower vertex: once it should, and once not.
         let mut ways: Vec<([u32; 2], bool)> = sides().map(|[a, b]| ([a.min(b), a.max(b)], a < b)).collect();
@@ -119,11 +122,7 @@ impl Volume {
 
     /// The same with what bounds its stiffness: by springs (their ends, and k over that of reference), and by masses over that
     /// of reference.
-    pub(super) fn among(
-        mut self,
-        springs: impl Iterator<Item = ([u32; 2], f64)>,
-        mass: impl Fn(usize) -> f64,
-    ) -> Self {
+    pub(super) fn among(mut self, springs: impl Iterator<Item = ([u32; 2], f64)>, mass: impl Fn(usize) -> f64) -> Self {
         let along = |vertex: usize| self.areas_m2[vertex] / mass(vertex);
         let square: f64 = self.areas_m2.iter().enumerate().map(|(vertex, area)| area.dot(along(vertex))).sum();
         // L·v times √m, and v·L·v.
@@ -135,7 +134,8 @@ impl Volume {
             pulled[b] -= pull;
         }
         let by_springs = pulled.iter().enumerate().map(|(vertex, pull)| pull.dot(along(vertex))).sum::<f64>() / square;
-        let whole = pulled.iter().enumerate().map(|(vertex, pull)| pull.length_squared() / mass(vertex)).sum::<f64>() / square;
+        let whole =
+            pulled.iter().enumerate().map(|(vertex, pull)| pull.length_squared() / mass(vertex)).sum::<f64>() / square;
         self.swelling = Swelling {
             by_pressure_m: square / self.volume_m3,
             by_springs,
@@ -203,7 +203,8 @@ mod tests {
         let mut turned = triangles.clone();
         turned[5].swap(0, 1);
         refused(&vertices_m, &turned, "do not agree on what is outside at the edge");
-        let both: Vec<DVec3> = vertices_m.iter().copied().chain(vertices_m.iter().map(|m| *m + 2.0 * DVec3::X)).collect();
+        let both: Vec<DVec3> =
+            vertices_m.iter().copied().chain(vertices_m.iter().map(|m| *m + 2.0 * DVec3::X)).collect();
         let shifted: Vec<[u32; 3]> = triangles.iter().map(|triangle| triangle.map(|vertex| vertex + 8)).collect();
         refused(&both, &[triangles.clone(), shifted].concat(), "several parts, another one at");
         let (flat_m, _) = cuboid(DVec3::new(1.0, 1.0, 1e-6));
@@ -241,7 +242,8 @@ mod tests {
         };
         let springs_alone = largest(1.0, 0.0);
         for pressure_pa in [0.0, 0.1, 1.0, 3.0, 30.0, 1000.0] {
-            let (truth, bound) = (largest(1.0, pressure_pa), found.swelling.bound_n_per_m(pressure_pa, springs_alone, 1.0));
+            let (truth, bound) =
+                (largest(1.0, pressure_pa), found.swelling.bound_n_per_m(pressure_pa, springs_alone, 1.0));
             assert!(truth <= bound * (1.0 + 1e-9) && bound < 1.6 * truth, "{pressure_pa}: {truth} {bound}");
         }
         let (truth, bound) = (largest(0.0, 2.0), found.swelling.bound_n_per_m(2.0, springs_alone, 0.0));

@@ -35,9 +35,10 @@ pub(super) fn depth_m(scene: &Scene, poke: &Poke) -> Option<f64> {
         diagonal[*b] += *k * *along * *along;
     }
     // The pressure of a volume.
-    let (areas_m2, pa_per_m3) = mesh.volume.as_ref().map_or((&[][..], 0.0), |volume| {
-        (&volume.areas_m2[..], scene.volume_stiffness_pa / volume.volume_m3)
-    });
+    let (areas_m2, pa_per_m3) = mesh
+        .volume
+        .as_ref()
+        .map_or((&[][..], 0.0), |volume| (&volume.areas_m2[..], scene.volume_stiffness_pa / volume.volume_m3));
     diagonal.iter_mut().zip(areas_m2).for_each(|(diagonal, area)| *diagonal += pa_per_m3 * *area * *area);
     let free = |vertex: usize| !shape.is_fixed(PointId::new(vertex));
     let force_n = |vertex: usize| {

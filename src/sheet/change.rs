@@ -52,8 +52,7 @@ impl<T: Real> Sheet<T> {
         let tissue = |model: &Model| {
             let scene = &model.scene;
             let springs = scene.springs.clone();
-            let coefficients =
-                [scene.virtual_stiffness_n_per_m, scene.damping_n_s_per_m, scene.volume_stiffness_pa];
+            let coefficients = [scene.virtual_stiffness_n_per_m, scene.damping_n_s_per_m, scene.volume_stiffness_pa];
             (springs, coefficients, model.plan.integrator)
         };
         tissue(&self.model) == tissue(model)

@@ -56,8 +56,7 @@ impl<T: Real> Pressure<T> {
         let mut known = self.tiles.borrow_mut();
         debug_assert!(u.len() == 3 * layout.plane && self.areas.len() == u.len());
         assert!(layout.stride == BLOCK && tiles.iter().all(|tile| *tile < known.len()));
-        let sums =
-            Sums { layout: *layout, areas: self.areas.as_ptr(), u: u.as_ptr(), tiles, into: known.as_mut_ptr() };
+        let sums = Sums { layout: *layout, areas: self.areas.as_ptr(), u: u.as_ptr(), tiles, into: known.as_mut_ptr() };
         // SAFETY: both fields have the layout, and each tile a sum.
         unsafe { lanes::run(width, &sums) };
         known.iter().sum()

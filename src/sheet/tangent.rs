@@ -118,7 +118,8 @@ impl SharedPressure {
         let volume = model.scene.volume()?;
         let unit_m2 = model.unit_m * model.unit_m;
         let pa_per_m3 = model.scene.volume_stiffness_pa / volume.volume_m3;
-        let of_point = |(index, free): (usize, &bool)| if *free { *turn * places.areas[index] * unit_m2 } else { DVec3::ZERO };
+        let of_point =
+            |(index, free): (usize, &bool)| if *free { *turn * places.areas[index] * unit_m2 } else { DVec3::ZERO };
         let within = window.points(model).zip(free).filter(|(_, free)| **free);
         let within: f64 = within.map(|(index, _)| model.yields.get(index).copied().unwrap_or(0.0)).sum();
         let beyond = (model.yields.iter().sum::<f64>() - within).max(0.0);
@@ -178,13 +179,7 @@ impl<'m> Patch<'m> {
     }
 
     /// The same with the weights of the points.
-    fn weighted(
-        model: &'m Model,
-        weights: Vec<f64>,
-        window: Window,
-        displacement_m: Vec<DVec3>,
-        turn: &DMat3,
-    ) -> Self {
+    fn weighted(model: &'m Model, weights: Vec<f64>, window: Window, displacement_m: Vec<DVec3>, turn: &DMat3) -> Self {
         let free = window.free(model);
         let springs = window.springs(model, &free, turn);
         let masses = window.points(model).map(|index| model.relative_mass_at(index)).collect();

@@ -122,7 +122,18 @@ impl MeshPlaces {
         let largest_mass = slots.masses().iter().copied().reduce(f64::max).unwrap_or(1.0);
         let (balls, boxes) = ((0..slots.blocks()).map(ball).collect(), (0..slots.tiles()).map(box_of).collect());
         let volume = VolumePlaces::of(mesh, &slots);
-        Ok(MeshPlaces { volume, balls, boxes, around, firsts_around, least_pulls, least_extra, largest_mass, slots, rest_m })
+        Ok(MeshPlaces {
+            volume,
+            balls,
+            boxes,
+            around,
+            firsts_around,
+            least_pulls,
+            least_extra,
+            largest_mass,
+            slots,
+            rest_m,
+        })
     }
 
     /// Rows of memory.
