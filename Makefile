@@ -256,9 +256,13 @@ bench-load: build
 # How long, s.
 SECONDS ?= 1800
 KILLS ?= 50
+JOURNAL_KILLS ?= 200
 soak: need-rust
 	PALPATE_SOAK_S=$(SECONDS) $(CARGO) test --release --test soak -- --include-ignored --nocapture
 	PALPATE_KILLS=$(KILLS) $(CARGO) test --release --test kill -- --nocapture
+	PALPATE_JOURNAL_KILLS=$(JOURNAL_KILLS) PALPATE_JOURNAL_SESSIONS=20 \
+		$(CARGO) test --release --test journal_kill -- --nocapture
+	PALPATE_LONG=1 $(CARGO) test --release --test journal -- --nocapture
 
 # Each seed is another siege; the first failure is said as it is found, all of them at the end.
 SEED ?= 16

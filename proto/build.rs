@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::error::Error;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 fn main() -> Result<(), Box<dyn Error>> {
     const FILES: [&str; 4] =
@@ -10,6 +10,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     println!("cargo::rerun-if-changed=palpate");
     let descriptors = protox::compile(FILES, ["."])?;
     let out = PathBuf::from(std::env::var("OUT_DIR")?);
+    compile_journal(&out)?;
     std::fs::write(out.join("palpate.bin"), prost::Message::encode_to_vec(&descriptors))?;
     let requests = descriptors.file.iter().flat_map(|file| &file.service).flat_map(|service| &service.method);
     let names: BTreeSet<_> = requests.filter_map(|method| method.input_type().rsplit('.').next()).collect();
@@ -32,5 +33,21 @@ fn main() -> Result<(), Box<dyn Error>> {
         .build_transport(false)
         .codec_path("crate::codec::BoundedCodec")
         .compile_fds_with_config(descriptors, named)?;
+    Ok(())
+}
+
+/// The messages of journals, in a folder of their own: they use those of the protocol, which are generated once.
+fn compile_journal(out: &Path) -> Result<(), Box<dyn Error>> {
+    println!("cargo::rerun-if-changed=foxglove");
+    const FILES: [&str; 3] =
+        ["palpate/journal/v1/header.proto", "palpate/journal/v1/curves.proto", "foxglove/PointCloud.proto"];
+    let mut descriptors = protox::compile(FILES, ["."])?;
+    let own = out.join("journal");
+    std::fs::create_dir_all(&own)?;
+    let mut config = prost_build::Config::new();
+    config.out_dir(&own).extern_path(".palpate.v1", "crate::pb").compile_fds(descriptors.clone())?;
+    // Journals have the schemas in them, without their comments.
+    descriptors.file.iter_mut().for_each(|file| file.source_code_info = None);
+    std::fs::write(own.join("journal.bin"), prost::Message::encode_to_vec(&descriptors))?;
     Ok(())
 }

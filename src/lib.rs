@@ -8,6 +8,7 @@
 pub mod budget;
 pub mod force_law;
 mod ids;
+pub mod journal;
 pub mod limits;
 mod lock;
 pub mod memory;

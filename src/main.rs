@@ -6,7 +6,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use program::{
-    Failure, certificate, check, client, mesh, organ, render, run, say, serve, texture, token, within_memory,
+    Failure, certificate, check, client, journal, mesh, organ, render, run, say, serve, texture, token, within_memory,
 };
 
 /// A server for touching soft tissue over a network.
@@ -97,6 +97,22 @@ enum Command {
         to new connections and calls. Invalid files are logged and the old ones stay in use; for tokens, the health \
         service `palpate.tokens` reports it.")]
     Serve(Box<serve::ServeArguments>),
+    /// Work with the journals of sessions that `palpate serve --journal DIR` writes: list, show, verify, replay, draw, export,
+    /// cut and recover them
+    #[command(after_help = "Examples:\n  \
+        palpate journal list journals\n  \
+        palpate journal verify journals/*.mcap\n  \
+        palpate journal show journals/SESSION.1.mcap\n  \
+        palpate journal replay journals/SESSION.1.mcap --point 15,15 --output records.jsonl\n  \
+        palpate journal render journals/SESSION.1.mcap --output film.gif\n  \
+        palpate journal export journals/SESSION.1.mcap --format mcap --output foxglove.mcap\n  \
+        palpate journal cut journals/SESSION.1.mcap --from 20000 --to 30000 --output case.mcap\n  \
+        palpate journal recover journals/SESSION.1.mcap\n\n\
+        A journal is an MCAP file, SESSION.RUN.mcap, one for each run of the server. It has the scene, every input with the step \
+        at which it acted, hashes, snapshots, and what the tools felt. The same inputs give the same bits, so `verify` proves \
+        that nothing in it is other than it was.\n\n\
+        Exit status: 0; 1 when a journal differs or a file can't be written; 2 when an input was refused.")]
+    Journal(journal::JournalArguments),
     /// Create a token for clients of a server; prints the token once and stores only its hash
     #[command(after_help = "Examples:\n  \
         palpate token --name ann --role create,touch --tokens tokens.toml > ann.token\n  \
@@ -137,6 +153,7 @@ fn main() -> ExitCode {
         Command::Mesh(arguments) => within_memory(|| mesh::mesh(&arguments)),
         Command::Organ(arguments) => within_memory(|| organ::organ(&arguments)),
         Command::Serve(arguments) => serve::serve(&arguments),
+        Command::Journal(arguments) => within_memory(|| journal::journal(&arguments)),
         Command::Token(arguments) => token::token(&arguments),
         Command::Certificate(arguments) => certificate::certificate(&arguments),
         Command::Top { arguments } => return client::client("top", &arguments),

@@ -153,7 +153,7 @@ macro_rules! decoders {
     };
 }
 
-decoders! { scene script request datagram sample record frame config }
+decoders! { journal scene script request datagram sample record frame config snapshot }
 
 #[test]
 fn every_request_of_the_protocol_is_tried() {

@@ -57,7 +57,9 @@ async fn metrics_tell_what_was_done_and_name_no_session() {
 
 #[test]
 fn the_dashboard_shows_what_is_there_and_asks_for_nothing_else() {
-    let mut server = Server::start(&["--metrics", "127.0.0.1:0"]);
+    let folder = tempfile::tempdir().unwrap();
+    let journals = folder.path().to_str().unwrap();
+    let mut server = Server::start(&["--metrics", "127.0.0.1:0", "--journal", journals]);
     let url = metrics::url(&mut server.out);
     let told = scrape(&url);
     let names: BTreeSet<&str> = told.keys().map(|name| name.split('{').next().unwrap()).collect();

@@ -13,17 +13,21 @@ use std::path::Path;
 use std::sync::{Arc, OnceLock};
 
 use glam::DVec3;
+use palpate::journal::records::{self, Chunk};
+use palpate::journal::{Reader, Topic, message as of_journal, pb as journal_pb, verify};
 use palpate::limits::Limits;
 use palpate::scene::check::check_tip;
+use palpate::scene::profile::Poke;
 use palpate::scene::record::{Record, write_line};
 use palpate::scene::script::{Action, Script};
 use palpate::scene::{FixedVertices, Mesh, MeshShape, PAPER, Scene};
 use palpate::server::config::Config;
 use palpate::server::identity::{self, Credentials, Role};
 use palpate::session::Session;
-use palpate::session::command::Command;
+use palpate::session::command::{Command, Due};
 use palpate::session::intake::Intake;
 use palpate::session::sampling::Sampler;
+use palpate::session::saved::{self, Saved};
 use palpate::shape::RestShape;
 use palpate::sheet::Model;
 use palpate::surface::Refinement;
@@ -44,7 +48,8 @@ pub struct Target {
     pub seeds: fn() -> Vec<Vec<u8>>,
 }
 
-pub const TARGETS: [Target; 8] = [
+pub const TARGETS: [Target; 10] = [
+    Target { name: "journal", run: journal, seeds: journal_seeds },
     Target { name: "scene", run: scene, seeds: scene_seeds },
     Target { name: "script", run: script, seeds: script_seeds },
     Target { name: "request", run: request, seeds: request_seeds },
@@ -53,6 +58,7 @@ pub const TARGETS: [Target; 8] = [
     Target { name: "record", run: record, seeds: record_seeds },
     Target { name: "frame", run: frame, seeds: frame_seeds },
     Target { name: "config", run: config, seeds: config_seeds },
+    Target { name: "snapshot", run: snapshot, seeds: snapshot_seeds },
 ];
 
 /// What is read at all is read under these; what is compiled is smaller still.
@@ -632,4 +638,209 @@ fn config_seeds() -> Vec<Vec<u8>> {
     let token = identity::entry("somebody", &[Role::Touch, Role::Create], "palpate_00").expect("is an entry");
     let certificate = "[[certificate]]\nname = \"bench-3\"\nroles = [\"touch\"]\n";
     vec![config.into(), format!("{token}{certificate}").into()]
+}
+
+/// Messages of a journal, around which a file is made whose checksums are right: what is behind them is to be tried.
+#[derive(Clone, PartialEq, Message)]
+struct JournalParts {
+    #[prost(bytes = "vec", tag = "1")]
+    header: Vec<u8>,
+    #[prost(bytes = "vec", repeated, tag = "2")]
+    inputs: Vec<Vec<u8>>,
+    #[prost(bytes = "vec", tag = "3")]
+    hash: Vec<u8>,
+    #[prost(bytes = "vec", tag = "4")]
+    snapshot: Vec<u8>,
+    #[prost(bytes = "vec", tag = "5")]
+    end: Vec<u8>,
+    /// What is appended to the file as it is.
+    #[prost(bytes = "vec", tag = "6")]
+    more: Vec<u8>,
+}
+
+impl JournalParts {
+    fn file(&self) -> Vec<u8> {
+        let mut file = records::beginning("fuzz");
+        let mut channels = Vec::new();
+        for topic in Topic::ALL {
+            records::record(&mut channels, records::CHANNEL, |body| {
+                body.extend(topic.channel().to_le_bytes());
+                body.extend([0; 2]);
+                records::string(body, topic.name());
+                records::string(body, "protobuf");
+                body.extend([0; 4]);
+            });
+        }
+        for (number, inputs) in self.inputs.iter().enumerate() {
+            let mut chunk = Chunk::new(7, number as u32, if number == 0 { &channels } else { &[] });
+            if number == 0 {
+                chunk.add(Topic::Header.channel(), &self.header);
+            }
+            chunk.add(Topic::Inputs.channel(), inputs);
+            for (topic, bytes) in
+                [(Topic::Hashes, &self.hash), (Topic::Snapshots, &self.snapshot), (Topic::End, &self.end)]
+            {
+                if number + 1 == self.inputs.len() && !bytes.is_empty() {
+                    chunk.add(topic.channel(), bytes);
+                }
+            }
+            file.extend(chunk.finish());
+        }
+        file.extend(&self.more);
+        file
+    }
+}
+
+/// A journal is simulated if it has no more steps than this.
+const SIMULATED_STEPS: u64 = 50;
+
+/// A file as it is, or after a 1 the parts of one.
+pub fn journal(bytes: &[u8]) -> bool {
+    let made;
+    let file = match bytes.split_first() {
+        Some((1, parts)) => {
+            let Ok(parts) = JournalParts::decode(parts) else { return false };
+            made = parts.file();
+            &made
+        }
+        _ => bytes,
+    };
+    let open = || Reader::new("fuzz", std::io::Cursor::new(file));
+    let Ok(mut reader) = open() else { return false };
+    let Ok(survey) = reader.survey(&mut |_| {}) else { return false };
+    assert!(survey.whole_bytes + survey.torn_bytes <= file.len() as u64);
+    let header = reader.header();
+    let steps = survey.until_step.saturating_sub(header.begin_step);
+    let small = Limits { points: COMPILED_POINTS, substeps: 20, mesh_vertices: COMPILED_POINTS, ..limits() };
+    let Ok(model) = of_journal::model(header, &small) else { return true };
+    if steps <= SIMULATED_STEPS && model.len() <= COMPILED_POINTS {
+        let _ = open().and_then(|reader| verify(reader, &small, &mut |_, _| {}));
+    }
+    true
+}
+
+fn journal_seeds() -> Vec<Vec<u8>> {
+    use journal_pb::input::What;
+    let header = |scene: Option<pb::Scene>| journal_pb::Header {
+        session_id: "a".to_owned(),
+        run: 1,
+        replays: palpate::journal::REPLAYS,
+        rate_hz: 1000.0,
+        running: true,
+        scene,
+        appearance: Some(journal_pb::Appearance { surface: "mucosa".to_owned(), ..Default::default() }),
+        tissue: Some(of_journal::tissue(model())),
+        ..Default::default()
+    };
+    let vector = |z: f64| Some(pb::Vector3 { x: 0.02, y: 0.02, z });
+    let command = |action: journal_pb::command::Action| {
+        What::Command(journal_pb::Command { sequence: Some(3), action: Some(action), ..Default::default() })
+    };
+    let tip = Some(journal_pb::Tip { radius_m: 0.005, friction: 0.2, ..Default::default() });
+    let pose = journal_pb::Pose { place_m: vector(-0.001), velocity_m_per_s: None, tip };
+    let push =
+        journal_pb::Push { centre_m: vector(0.0), force_n: vector(-0.1), falloff_per_m: 200.0, ..Default::default() };
+    let all = [
+        command(journal_pb::command::Action::Pose(pose)),
+        command(journal_pb::command::Action::Push(push)),
+        command(journal_pb::command::Action::Release(journal_pb::Release {})),
+        What::Tissue(of_journal::tissue(model())),
+        What::Start(journal_pb::Start { until_step: Some(40) }),
+        What::Pause(journal_pb::Pause {}),
+        What::DroppedSteps(journal_pb::DroppedSteps { steps: 3 }),
+        What::Hold(journal_pb::Hold { reason: "a test".to_owned() }),
+        What::Revive(journal_pb::Revive {}),
+    ];
+    let inputs =
+        all.into_iter().enumerate().map(|(step, what)| journal_pb::Input { step: step as u64, what: Some(what) });
+    let inputs: Vec<_> = inputs.collect();
+    let batch = |batch: u64, until_step: u64, inputs: &[journal_pb::Input]| {
+        let first_input = if batch == 0 { 0 } else { 5 };
+        journal_pb::Inputs { batch, until_step, durable_batches: batch, first_input, inputs: inputs.to_vec() }
+            .encode_to_vec()
+    };
+    let hash = journal_pb::Hash { step: 8, hash: "0".repeat(32), after_inputs: 9 };
+    let parts = JournalParts {
+        header: header(Some(wire::scene::scene(&model().scene))).encode_to_vec(),
+        inputs: vec![batch(0, 5, &inputs[..5]), batch(1, 20, &inputs[5..])],
+        hash: hash.encode_to_vec(),
+        snapshot: Vec::new(),
+        end: journal_pb::End { why: 1, message: "deleted".to_owned() }.encode_to_vec(),
+        more: Vec::new(),
+    };
+    let torn = JournalParts { inputs: vec![batch(0, 3, &inputs[..3])], more: vec![6; 30], ..parts.clone() };
+    let bytes = |parts: &JournalParts| [vec![1], parts.encode_to_vec()].concat();
+    vec![parts.file(), bytes(&parts), bytes(&torn)]
+}
+
+/// A snapshot, with the checksum that goes with its bytes: what is behind that is tried. What is restored steps on, and all of
+/// it stays finite.
+pub fn snapshot(bytes: &[u8]) -> bool {
+    let mut bytes = bytes.to_vec();
+    saved::seal(&mut bytes);
+    let Ok(saved) = Saved::from_bytes(&bytes, &limits()) else { return false };
+    let _ = Model::resumed(&model().scene, saved.tissue(), &limits());
+    let Ok(mut session) = Session::restore(model(), &saved) else { return false };
+    let is_finite = |session: &Session| {
+        model().points().all(|point| {
+            let point = session.tissue().point(point);
+            point.displacement_m.is_finite() && point.velocity_m_per_s.is_finite()
+        })
+    };
+    assert!(is_finite(&session));
+    // What was read is written, and read again as the same.
+    let again = session.save().to_bytes();
+    let same = Saved::from_bytes(&again, &limits()).and_then(|saved| Session::restore(model(), &saved));
+    assert_eq!(same.expect("what was restored can be saved").save().to_bytes(), again);
+    for _ in 0..3 {
+        session.advance(&mut Vec::new(), |_| {});
+        assert!(is_finite(&session));
+        let _ = session.sample(None);
+    }
+    session.let_go();
+    session.advance(&mut Vec::new(), |_| {});
+    assert!(is_finite(&session));
+    true
+}
+
+fn snapshot_seeds() -> Vec<Vec<u8>> {
+    let at_rest = Session::new(model()).save().to_bytes();
+    let mut session = Session::new(model());
+    let command = |tool: u32, sequence: u64, action: Action| Command {
+        tool,
+        sequence: Some(sequence),
+        client_time_ns: if tool == 2 { sequence * 1_000_000 } else { 0 },
+        by_datagram: false,
+        at_step: None,
+        time_to_live_s: (tool == 0).then_some(0.5),
+        action,
+        arrival_ns: 5,
+    };
+    let (shape, tip) = (model().shape(), palpate_touch::Tip { radius_m: 0.03, ..Default::default() });
+    let middle_m = shape.rest_m(shape.nearest(shape.extent().middle_m()));
+    let poke = Poke {
+        point: None,
+        centre_m: middle_m,
+        force_n: DVec3::new(0.1, 0.0, -0.5),
+        falloff_per_m: 20.0,
+        falloff_offset: 0.1,
+    };
+    let mut seeds = vec![at_rest];
+    for step in 1..80 {
+        let place_m = middle_m - 1e-4 * f64::from(step as u32) * DVec3::Z;
+        let pose = Action::Pose { place_m, velocity_m_per_s: None, tip };
+        let grasp = Action::Grasp { point: shape.nearest(DVec3::ZERO), displacement_m: 1e-3 * DVec3::Z };
+        let actions = [(0, Action::Push(poke)), (1, grasp), (2, pose)];
+        let due = actions.into_iter().filter(|(tool, _)| *tool == 2 || step % 20 == 1).map(|(tool, action)| Due {
+            command: command(tool, step, action),
+            late: false,
+            late_commands: 0,
+            ends_lease: false,
+        });
+        session.advance(&mut due.collect(), |_| {});
+        if [1, 30, 79].contains(&step) {
+            seeds.push(session.save().to_bytes());
+        }
+    }
+    seeds
 }

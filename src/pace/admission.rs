@@ -9,22 +9,43 @@ use tokio::sync::watch;
 use super::audited::Audited;
 use super::clock::{Dilation, now_ns};
 use super::cost::{Cost, check_asked, check_work};
+use super::feed::Playback;
 use super::laws::KeptLaws;
 use super::live::Live;
 use super::pacer::Pacer;
 use super::running::{Running, beat_ns};
 use super::slots::StreamSlots;
 use super::status::{RunState, Status};
-use crate::budget::{Account, Purpose, Resource};
+use super::tape::{About, Tape};
+use crate::budget::{Account, Purpose, Resource, Taken};
 use crate::ids::random_id;
 use crate::lock::lock;
 use crate::memory;
 use crate::refusal::{Reason, Refusal, Result, number};
 use crate::scene::{Change, Scene};
+use crate::session::Session;
 use crate::session::intake::Intake;
 use crate::session::schedule::Schedule;
 use crate::sheet::{Model, choice};
 use crate::surface::Skin;
+
+/// How a session begins.
+pub struct Begin {
+    /// Its ID.
+    pub id: String,
+    /// The tissue that it began with.
+    pub first: Arc<Model>,
+    /// Whether its time goes on.
+    pub running: bool,
+    /// The step at which it pauses.
+    pub until: Option<u64>,
+    /// Time without use after which it is deleted, s.
+    pub idle_timeout_s: f64,
+    /// Steps that were dropped so far.
+    pub overrun_count: u64,
+    /// What it plays, in place of what clients tell it.
+    pub playback: Option<Playback>,
+}
 
 impl Pacer {
     /// Makes a session for `owner`, unless `stop` is set before it is there.
@@ -46,11 +67,54 @@ impl Pacer {
         number("stepping.rate_hz", scene.stepping.rate_hz, &format!("at most {most_hz}"), |v| v <= most_hz)?;
         check_asked(scene, &self.limits)?;
         let model = memory::attempt("sheet.points", || self.compile(scene, stop))?;
-        let id = random_id()?;
-        check_work(&model, &self.limits)?;
-        let skin = memory::attempt("sheet.points", || Ok(Skin::of(&model)))?;
-        let bytes = model.session_bytes() + skin.as_ref().map_or(0, |skin| skin.bytes());
+        let begin = Begin {
+            id: random_id()?,
+            first: model.clone(),
+            running: !paused,
+            until: None,
+            idle_timeout_s,
+            overrun_count: 0,
+            playback: None,
+        };
+        self.admit(begin, owner, slot, || Ok(Session::new(&model)), stop)
+    }
+
+    /// Makes a session that continues one that was kept: `session` gives it, whose tissue at its beginning was `begin.first`.
+    ///
+    /// # Errors
+    /// Refuses an ID that is taken, what `session` refuses, and as [`Pacer::create`] does.
+    pub fn resume(
+        &self,
+        begin: Begin,
+        owner: &Account,
+        session: impl FnOnce() -> Result<Session>,
+        stop: &AtomicBool,
+    ) -> Result<Arc<Live>> {
+        let slot = owner.take(Resource::Sessions, 1, "")?;
+        if lock(&self.sessions).contains_key(&begin.id) {
+            return Err(Refusal::new(Reason::OutOfTurn, "session_id", "is that of a session that is there already"));
+        }
+        self.admit(begin, owner, slot, session, stop)
+    }
+
+    fn admit(
+        &self,
+        begin: Begin,
+        owner: &Account,
+        slot: Taken,
+        session: impl FnOnce() -> Result<Session>,
+        stop: &AtomicBool,
+    ) -> Result<Arc<Live>> {
+        let Begin { id, first, running, until, idle_timeout_s, overrun_count, playback } = begin;
+        let speed = playback.as_ref().map_or(1.0, |playback| playback.speed);
+        check_work(&first, &self.limits)?;
+        let skin = memory::attempt("sheet.points", || Ok(Skin::of(&first)))?;
+        let bytes = first.session_bytes() + skin.as_ref().map_or(0, |skin| skin.bytes());
         let memory = owner.take(Resource::Memory(Purpose::Session), bytes, "sheet.points")?;
+        // Laid out before the lock is taken, on which all calls wait.
+        let session = memory::attempt("sheet.points", session)?;
+        let (model, step) = (session.model().clone(), session.step_count());
+        let running = running && session.hold_reason().is_none();
         let number = {
             let mut numbers = lock(&self.numbers);
             *numbers += 1;
@@ -58,13 +122,13 @@ impl Pacer {
         };
         let begin_ns = beat_ns(now_ns());
         let status = Status {
-            state: if paused { RunState::Paused } else { RunState::Running },
-            step: 0,
+            state: if running { RunState::Running } else { RunState::Paused },
+            step,
             resting: false,
             rested_steps: 0,
-            overrun_count: 0,
-            dilation: Dilation::new(begin_ns, 0),
-            schedule: Schedule::new(0, begin_ns, scene.stepping.rate_hz),
+            overrun_count,
+            dilation: Dilation::new(begin_ns, step),
+            schedule: Schedule::new(step, begin_ns, speed * first.scene.stepping.rate_hz),
             late_commands: 0,
             paused_commands: 0,
             hold_reason: None,
@@ -76,11 +140,32 @@ impl Pacer {
             lapsed_leases: 0,
             model: model.clone(),
         };
-        let (cost, thread) = self.place(&model, paused, owner)?;
+        let (cost, thread) = self.place(&model, !running, owner)?;
         let stepper = &self.steppers[thread];
+        let changed_to = (!Arc::ptr_eq(&model, &first)).then(|| model.clone());
+        let mut intake = Intake::new(&first.scene, &self.limits).charged_to(owner).continued_at(step, changed_to);
+        if let Some(reason) = session.hold_reason() {
+            drop(intake.close(Refusal::new(Reason::SessionHeld, "", reason)));
+        }
+        if playback.is_some() {
+            let message =
+                "this session plays what was recorded; to touch the tissue, go on from a moment of it (CreateSession)";
+            drop(intake.close(Refusal::new(Reason::NotAvailable, "session_id", message)));
+        }
+        let about = || About {
+            id: id.clone(),
+            owner: owner.name().to_owned(),
+            idle_timeout_s,
+            first: first.clone(),
+            begin_step: step,
+            running,
+            until_step: until,
+        };
+        // What is played is recorded already.
+        let tape = self.tapes.get().filter(|_| playback.is_none()).map(|queue| Tape::new(queue, about()));
         let live = Arc::new(Live {
             id: id.clone(),
-            intake: Mutex::new(Intake::new(&model.scene, &self.limits).charged_to(owner)),
+            intake: Mutex::new(intake),
             owner: owner.clone(),
             idle_timeout_s,
             asked_ns: AtomicU64::new(now_ns()),
@@ -90,18 +175,22 @@ impl Pacer {
             streams: Mutex::new(StreamSlots::new(&self.limits)),
             refused: AtomicU64::new(0),
             laws: KeptLaws::default(),
-            tissue: watch::Sender::new((0, model.clone())),
+            tissue: watch::Sender::new((step, model)),
             audited: Mutex::new(Audited::default()),
-            model,
+            model: first,
             skin,
             cost,
             thread,
             inbox: stepper.inbox.clone(),
+            tape,
+            playback,
             slot: Mutex::new(slot),
             _memory: memory,
         });
-        // Laid out before the lock is taken, on which all calls wait.
-        let running = memory::attempt("sheet.points", || Ok(Box::new(Running::new(live.clone(), !paused))))?;
+        let mut running =
+            memory::attempt("sheet.points", || Ok(Box::new(Running::new(live.clone(), session, running))))?;
+        running.until = until;
+        running.publish_status();
         if stop.load(Ordering::Relaxed) {
             return Err(choice::given_up());
         }

@@ -9,6 +9,7 @@ use tokio::sync::oneshot;
 
 use super::clock::now_ns;
 use super::frames::Viewer;
+use super::paced::Present;
 use super::reading::HashReply;
 use super::tally::Tally;
 use super::taps::{ProbeTap, SampleTap};
@@ -36,6 +37,8 @@ pub(super) enum Request {
     Samples(SampleTap),
     Probe(ProbeTap),
     View(Arc<Viewer>),
+    /// A copy of the session as it is.
+    Save(oneshot::Sender<Result<Present>>),
     /// To have a window of steps audited.
     Audit(Inputs, SyncSender<Mark>),
     Hash {

@@ -8,14 +8,16 @@ use tokio::sync::{oneshot, watch};
 use super::audited::Audited;
 use super::clock::now_ns;
 use super::cost::{Cost, check_work};
+use super::feed::Playback;
 use super::frames::Viewer;
 use super::inbox::{Inbox, Request};
 use super::laws::{KeptLaws, SoughtLaw};
-use super::paced::{PacedSample, SharedRecord};
+use super::paced::{PacedSample, Present, SharedRecord};
 use super::queue::{Reader, queue};
 use super::reading::Recipient;
 use super::slots::StreamSlots;
 use super::status::Status;
+use super::tape::Tape;
 use super::taps::{ProbeTap, SampleTap};
 use crate::budget::{Account, Taken};
 use crate::force_law::Disc;
@@ -62,6 +64,10 @@ pub struct Live {
     pub(super) thread: usize,
     /// The inbox of that thread.
     pub(super) inbox: Arc<Inbox>,
+    /// What it plays, if it plays what was recorded.
+    pub playback: Option<Playback>,
+    /// What a journal is told of it, if the server keeps journals.
+    pub tape: Option<Arc<Tape>>,
     /// Its place among the sessions: given back when it is deleted, while others may still read it.
     pub(super) slot: Mutex<Taken>,
     /// Its memory, until nobody reads it any more.
@@ -84,6 +90,11 @@ impl Live {
     }
 
     #[allow(clippy::cast_precision_loss)]
+    /// How fast time goes on: other than 1 only of what is played.
+    pub(super) fn speed(&self) -> f64 {
+        self.playback.as_ref().map_or(1.0, |playback| playback.speed)
+    }
+
     pub(super) fn is_idle(&self, now_ns: u64) -> bool {
         let unused_s = now_ns.saturating_sub(self.asked_ns.load(Ordering::Relaxed)) as f64 * 1e-9;
         unused_s > self.idle_timeout_s
@@ -189,6 +200,14 @@ impl Live {
     /// Refuses a session that is not held, or that is deleted.
     pub async fn revive(&self) -> Result<u64> {
         self.ask(|reply| Request::Revive { reply }).await
+    }
+
+    /// The session as it is, to continue from.
+    ///
+    /// # Errors
+    /// Refuses a session that is deleted, and if the system has no memory for it.
+    pub async fn save(&self) -> Result<Present> {
+        self.ask(Request::Save).await
     }
 
     /// Stops time.

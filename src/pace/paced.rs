@@ -5,6 +5,8 @@ use std::sync::Arc;
 use crate::budget::Taken;
 use crate::scene::record::Record;
 use crate::session::Sample;
+use crate::session::saved::Saved;
+use crate::sheet::SheetCopy;
 
 /// A sample, and how the session keeps time.
 #[derive(Debug, Clone, PartialEq)]
@@ -17,6 +19,8 @@ pub struct PacedSample {
     pub overrun_count: u64,
     /// Of the last second or so.
     pub time_dilation: f64,
+    /// What happened before this step is on disk; `None` if no journal is kept.
+    pub durable_step: Option<u64>,
     /// Steps were dropped since the stream's last sample.
     pub overrun: bool,
 }
@@ -33,4 +37,16 @@ pub struct Recorded {
     pub record: Record,
     /// Its memory.
     pub(super) _taken: Taken,
+}
+
+/// A session as it is, to continue from.
+pub struct Present {
+    /// Everything that the next step depends on.
+    pub saved: Box<Saved>,
+    /// The state, to be hashed.
+    pub copy: SheetCopy,
+    /// Whether time goes on.
+    pub running: bool,
+    /// The step at which it pauses.
+    pub until_step: Option<u64>,
 }

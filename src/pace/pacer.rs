@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::atomic::Ordering;
-use std::sync::{Arc, Mutex, Weak};
+use std::sync::{Arc, Mutex, OnceLock, Weak};
 use std::thread::JoinHandle;
 
 use super::audited::AuditTally;
@@ -13,6 +13,7 @@ use super::inbox::Request;
 use super::live::{Live, deleted};
 use super::reading::{Piece, Reading};
 use super::tally::Tally;
+use super::tape::TapeQueue;
 use super::thread::{self, Stepper};
 use crate::budget::Budget;
 use crate::limits::Limits;
@@ -38,6 +39,7 @@ pub struct Pacer {
     auditor: Arc<Auditor>,
     viewers: Mutex<BTreeMap<String, Weak<Viewer>>>,
     pub(super) numbers: Mutex<u64>,
+    pub(super) tapes: OnceLock<Arc<TapeQueue>>,
 }
 
 impl Pacer {
@@ -93,7 +95,13 @@ impl Pacer {
             auditor,
             viewers: Mutex::new(BTreeMap::new()),
             numbers: Mutex::new(0),
+            tapes: OnceLock::new(),
         }))
+    }
+
+    /// From now on new sessions tell a tape what happens to them. Who calls this takes it off.
+    pub fn keep_tapes(&self) -> Arc<TapeQueue> {
+        self.tapes.get_or_init(Arc::default).clone()
     }
 
     /// The session of that id.
@@ -104,6 +112,13 @@ impl Pacer {
         let live = lock(&self.sessions).get(id).cloned().ok_or_else(|| unknown_session(id))?;
         live.asked_ns.store(now_ns(), Ordering::Relaxed);
         Ok(live)
+    }
+
+    /// Whether a session is there, and this run of its journal is being written.
+    pub fn is_recording(&self, id: &str, run: u32) -> bool {
+        let sessions = lock(&self.sessions);
+        let tape = sessions.get(id).and_then(|live| live.tape.as_ref());
+        tape.is_some_and(|tape| tape.progress().borrow().run == run)
     }
 
     /// All sessions, oldest first.

@@ -55,7 +55,9 @@ impl Running {
         let overrun = self.overrun_count > tap.overrun_count;
         tap.overrun_count = self.overrun_count;
         let Running { overrun_count, due_ns, .. } = *self;
-        let paced = PacedSample { sample, due_ns, overrun_count, time_dilation: self.dilation.value, overrun };
+        let durable_step = self.live.tape.as_ref().and_then(|tape| tape.durable_step());
+        let time_dilation = self.dilation.value;
+        let paced = PacedSample { sample, due_ns, overrun_count, time_dilation, durable_step, overrun };
         tap.writer.push_quietly(paced, wakes);
     }
 

@@ -59,7 +59,10 @@ impl Rota {
 
     /// Ends all sessions.
     pub(super) fn end(&mut self, why: &Refusal) {
-        self.sessions.values_mut().for_each(|running| running.end(why));
+        for running in self.sessions.values_mut() {
+            running.note_the_end();
+            running.end(why);
+        }
     }
 
     /// The session that is due first, and when.
@@ -75,6 +78,7 @@ mod tests {
     use crate::limits::Limits;
     use crate::pace::Pacer;
     use crate::scene::{PAPER, Scene};
+    use crate::session::Session;
     use crate::session::schedule::Schedule;
     use crate::sheet::choice::NEVER;
 
@@ -91,7 +95,7 @@ mod tests {
             let owner = if index == 40 { &one } else { &many };
             let live = pacer.create(&scene, true, 60.0, owner, &NEVER).unwrap();
             (0..1000).for_each(|_| live.cost.observe(50_000));
-            let mut running = Running::new(live, true);
+            let mut running = Running::new(live.clone(), Session::new(&live.model), true);
             running.schedule = Schedule::new(0, 1_000_000, 1000.0);
             (running.running, running.next_step) = (false, 1);
             rota.sessions.insert(index, Box::new(running));

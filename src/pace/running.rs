@@ -11,20 +11,26 @@ use std::sync::Arc;
 use std::sync::mpsc::SyncSender;
 
 use super::clock::{Dilation, now_ns};
+use super::feed::Next;
 use super::frames::Encoder;
 use super::inbox::Request;
 use super::live::Live;
+use super::paced::Present;
 use super::policy::{Backlog, Longest, Turn};
 use super::queue::Wakes;
 use super::reading::{Copies, Hashed, Reading};
+use super::recorder::Recorder;
+use super::tape::Event;
 use super::taps::{Taps, ViewTap};
 use crate::lock::lock;
 use crate::memory;
 use crate::refusal::{Reason, Refusal, Result};
 use crate::session::Session;
 use crate::session::command::Due;
+use crate::session::input::Input;
 use crate::session::local::StiffnessJob;
 use crate::session::schedule::Schedule;
+use crate::sheet::Model;
 use crate::sheet::audit::Mark;
 
 /// Sessions begin on the same beat, whose length this is, ns: a thread wakes once for all of a rate, and so does who
@@ -36,6 +42,9 @@ const STEPS_PER_SPAN: u64 = 1024;
 
 /// How often the stiffness under tools is computed anew, Hz.
 const REFINED_HZ: f64 = 50.0;
+
+/// A session that plays waits so long for what has not been read, s.
+const RECORD_WAIT_S: f64 = 0.01;
 
 /// A session and its schedule.
 pub(super) struct Running {
@@ -57,12 +66,14 @@ pub(super) struct Running {
     pub(super) overrun_count: u64,
     pub(super) lapsed_leases: u64,
     pub(super) dilation: Dilation,
-    due: Vec<Due>,
+    pub(super) due: Vec<Due>,
     pub(super) hashed: Hashed,
     pub(super) copies: Copies,
     pub(super) taps: Taps,
     /// Who is to be told of the window that the session was asked for.
     pub(super) audit: Option<SyncSender<Mark>>,
+    /// Tells the journal, if there is one.
+    pub(super) recorder: Option<Recorder>,
     deleted: bool,
 }
 
@@ -81,23 +92,24 @@ pub(super) fn beat_ns(now_ns: u64) -> u64 {
 }
 
 impl Running {
-    pub(super) fn new(live: Arc<Live>, running: bool) -> Self {
-        let (schedule, dilation) = {
+    pub(super) fn new(live: Arc<Live>, session: Session, running: bool) -> Self {
+        let (schedule, dilation, overrun_count) = {
             let status = lock(&live.status);
-            (status.schedule, status.dilation)
+            (status.schedule, status.dilation, status.overrun_count)
         };
         Running {
-            session: Session::new(&live.model),
+            recorder: live.tape.as_ref().map(|tape| Recorder::new(tape, &session)),
             running,
             until: None,
             schedule,
-            next_step: 0,
+            next_step: session.step_count(),
             due_ns: 0,
             not_before_ns: 0,
             backlog: Backlog::default(),
-            still_since: Some(0),
+            still_since: session.rests_until().map(|_| session.step_count()),
+            session,
             rested_steps: 0,
-            overrun_count: 0,
+            overrun_count,
             lapsed_leases: 0,
             dilation,
             due: Vec::new(),
@@ -154,6 +166,7 @@ impl Running {
         };
         tracing::error!(session = %self.live.id, reason, "session held");
         self.session.hold(reason.clone());
+        self.note_input(Input::Hold(reason.clone()));
         self.end(&Refusal::new(Reason::SessionHeld, "", reason));
         self.live.cost.set_awake(false);
         self.publish_status();
@@ -167,7 +180,8 @@ impl Running {
             self.until.map_or(wanted, |until| wanted.min(until - 1))
         };
         let rests_until = self.session.rests_until().filter(|_| self.running);
-        let until = rests_until.map_or(step, |until| until.min(wanted()));
+        let played = || self.live.playback.as_ref().map_or(u64::MAX, |playback| playback.feed.next_step().max(step));
+        let until = rests_until.map_or(step, |until| until.min(wanted()).min(played()));
         {
             let mut intake = lock(&self.live.intake);
             self.next_step = intake.rest(step, until, &self.schedule);
@@ -188,6 +202,7 @@ impl Running {
     fn skip_to(&mut self, step: u64) {
         self.rested_steps += step.saturating_sub(self.session.step_count());
         self.session.skip_to(step);
+        self.note_rest();
     }
 
     pub(super) fn serve(&mut self, request: Request, context: &mut ThreadContext<'_>) {
@@ -199,6 +214,9 @@ impl Running {
             Request::Adopt | Request::Wake => {}
             Request::Start { until, reply } => {
                 let started = self.start(until);
+                if started.is_ok() {
+                    self.note_input(Input::Start { until });
+                }
                 self.plan();
                 self.publish_status();
                 let _ = reply.send(started);
@@ -207,6 +225,7 @@ impl Running {
                 let _ = reply.send(self.revive());
             }
             Request::Pause { reply } => {
+                self.note_input(Input::Pause);
                 self.stand(context);
                 let _ = reply.send(Ok(()));
             }
@@ -220,6 +239,13 @@ impl Running {
                 } else if self.running || !tap.once {
                     self.taps.samples.push(tap);
                 }
+            }
+            Request::Save(reply) => {
+                let (running, until_step) = (self.running, self.until);
+                let _ = reply.send(memory::attempt("", || {
+                    let (saved, copy) = (Box::new(self.session.save()), self.session.copy());
+                    Ok(Present { saved, copy, running, until_step })
+                }));
             }
             Request::Audit(inputs, marks) => {
                 self.session.request_audit(inputs);
@@ -246,6 +272,7 @@ impl Running {
                 }
             }
             Request::Delete(why) => {
+                self.note(Event::Deleted);
                 self.end(&why);
                 self.deleted = true;
             }
@@ -260,6 +287,7 @@ impl Running {
     /// Time stands from now on. Who reads samples gets the present one.
     fn stand(&mut self, context: &mut ThreadContext<'_>) {
         self.running = false;
+        self.note_standstill();
         self.plan();
         self.publish_status();
         self.tell_all(true, &mut context.wakes);
@@ -285,7 +313,7 @@ impl Running {
         if !self.running {
             let now = beat_ns(now_ns());
             self.running = true;
-            self.schedule = Schedule::new(step, now, self.live.model.scene.stepping.rate_hz);
+            self.schedule = Schedule::new(step, now, self.live.speed() * self.live.model.scene.stepping.rate_hz);
             self.schedule.delay(1.0);
             self.backlog = Backlog::default();
             self.dilation = Dilation::new(now, step);
@@ -306,6 +334,7 @@ impl Running {
         (self.running, self.until, self.still_since) = (false, None, Some(step));
         lock(&self.live.intake).reopen();
         lock(&self.live.status).forget_hold();
+        self.note_input(Input::Revive);
         tracing::info!(session = %self.live.id, step, "session revived");
         Ok(step)
     }
@@ -318,6 +347,7 @@ impl Running {
         if dropped > 0 {
             self.schedule.delay(dropped as f64);
             self.overrun_count += dropped;
+            self.note_input(Input::DroppedSteps(dropped));
             tracing::debug!(session = %self.live.id, dropped, "steps dropped");
         }
     }
@@ -336,11 +366,8 @@ impl Running {
             self.skip_to(self.next_step);
         }
         let step = self.session.step_count();
-        let change = {
-            let mut intake = lock(&self.live.intake);
-            intake.take_due(step, begun_ns, &mut self.due);
-            intake.take_change(step)
-        };
+        let Some(change) = self.take_inputs(step, begun_ns) else { return self.wait_for_record(context) };
+        self.note_inputs(change.as_ref());
         if let Some(model) = change {
             self.session.change(&model);
             self.live.tissue.send_replace((step, model));
@@ -352,6 +379,7 @@ impl Running {
         session.advance(due, |session| taps.record(session, copies, reading, wakes));
         self.tell_auditor();
         self.log_recovery();
+        self.note_state();
         if let Some(reason) = self.session.hold_reason() {
             tracing::warn!(session = %self.live.id, reason, "session held");
             self.running = false;
@@ -367,6 +395,7 @@ impl Running {
         }
         if self.until.is_some_and(|until| self.session.step_count() >= until) {
             self.running = false;
+            self.note_standstill();
         }
         let step = self.session.step_count();
         self.still_since = self.session.rests_until().map(|_| self.still_since.unwrap_or(step));
@@ -377,6 +406,44 @@ impl Running {
         let every = (self.live.model.scene.stepping.rate_hz / REFINED_HZ).max(1.0) as u64;
         if self.session.step_count().is_multiple_of(every) {
             self.refine(context.refiner);
+        }
+        self.plan();
+    }
+
+    /// What acts in the coming step: commands are in `due`, and a change of the tissue is returned. `None` if that can't be played,
+    /// because it has not been read, or was not recorded.
+    fn take_inputs(&mut self, step: u64, now_ns: u64) -> Option<Option<Arc<Model>>> {
+        let mut intake = lock(&self.live.intake);
+        intake.take_due(step, now_ns, &mut self.due);
+        let change = intake.take_change(step);
+        drop(intake);
+        let Some(playback) = &self.live.playback else { return Some(change) };
+        let fetched = match playback.feed.take(step, &mut self.due) {
+            Next::Step(fetched) => fetched,
+            Next::Late => return None,
+            Next::Over => {
+                self.running = false;
+                return None;
+            }
+        };
+        if fetched.is_revived
+            && let Ok(mut session) = memory::attempt("", || Ok(Session::new(self.session.model())))
+        {
+            session.skip_to(step);
+            self.session = session;
+        }
+        if let Some(reason) = fetched.hold {
+            self.session.hold(reason);
+        }
+        Some(fetched.change)
+    }
+
+    /// What is to be played is not there: a little later, or never.
+    fn wait_for_record(&mut self, context: &mut ThreadContext<'_>) {
+        self.schedule.delay(RECORD_WAIT_S * self.live.speed() * self.live.model.scene.stepping.rate_hz);
+        self.publish_status();
+        if !self.running {
+            self.tell_all(true, &mut context.wakes);
         }
         self.plan();
     }

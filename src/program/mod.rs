@@ -3,6 +3,7 @@
 pub(crate) mod certificate;
 pub(crate) mod check;
 pub(crate) mod client;
+pub(crate) mod journal;
 pub(crate) mod mesh;
 pub(crate) mod organ;
 pub(crate) mod render;
@@ -67,13 +68,13 @@ fn clock_s() -> f64 {
     now_ns() as f64 * 1e-9
 }
 
-/// Runs `work` and, unless `quiet`, shows its progress; `work` reports the steps that it has done.
-fn with_progress<T>(steps: u64, quiet: bool, work: impl FnOnce(&mut dyn FnMut(u64)) -> T) -> T {
+/// Runs `work` and, unless `quiet`, shows its progress; `work` reports the steps that it has done, or what else `unit` says.
+fn with_progress<T>(unit: &str, steps: u64, quiet: bool, work: impl FnOnce(&mut dyn FnMut(u64)) -> T) -> T {
     let (begun_s, watched) = (clock_s(), !quiet && std::io::stderr().is_terminal());
     let done = work(&mut |step| {
         // Only on a terminal, and after a second.
         if watched && clock_s() - begun_s > 1.0 {
-            eprint!("\rstep {step} of {steps} ");
+            eprint!("\r{unit} {step} of {steps} ");
         }
     });
     if watched && clock_s() - begun_s > 1.0 {

@@ -86,7 +86,7 @@ pub(crate) fn render(arguments: &RenderArguments) -> Result<(), Failure> {
     };
     if moves {
         let mut file = Vec::new();
-        with_progress(script.steps, false, |progress| {
+        with_progress("step", script.steps, false, |progress| {
             render::gif(&model, &script, &view, &limits, arguments.frames_hz, &mut file, progress).map_err(failed)
         })?;
         return write_file(&arguments.output, &file);

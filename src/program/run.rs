@@ -45,7 +45,7 @@ pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     }
     let mut output = record::output(arguments.output.as_deref(), arguments.plot)?;
     let run = if arguments.audit { run::audited } else { run::run };
-    let ended = with_progress(script.steps, arguments.quiet, |progress| {
+    let ended = with_progress("step", script.steps, arguments.quiet, |progress| {
         run(&model, &script, arguments.held, &limits, &mut output, &clock_s, progress)
     });
     let ended = ended.and_then(|summary| output.flush().map(|()| summary).map_err(run::Failure::Output));

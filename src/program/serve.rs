@@ -62,6 +62,13 @@ pub(crate) struct ServeArguments {
     /// Fraction of a core for measuring the errors of live sessions; 0 disables that [default: 0.02]
     #[arg(long, value_name = "FRACTION")]
     audit_share: Option<f64>,
+    /// Keep a journal of each session in this folder: after a crash or an upgrade the server continues them [default: off]
+    #[arg(long, value_name = "DIR")]
+    journal: Option<PathBuf>,
+    /// How long to keep the journals of sessions that have ended, and how many bytes all journals may take before the oldest of
+    /// these are removed: 30d, 12h, 10GiB, both, or 0 to keep none [default: 30d,10GiB]
+    #[arg(long, value_name = "AGE,BYTES", requires = "journal")]
+    journal_keep: Option<palpate::server::Keep>,
     /// Time that streams get to end at shutdown before they are cut, s [default: 5]
     #[arg(long, value_name = "SECONDS")]
     shutdown_deadline_s: Option<f64>,
@@ -122,6 +129,12 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     }
     if let Some(deadline_s) = arguments.shutdown_deadline_s {
         config.shutdown_deadline_s = deadline_s;
+    }
+    if arguments.journal.is_some() {
+        config.journal.clone_from(&arguments.journal);
+    }
+    if let Some(keep) = arguments.journal_keep {
+        config.journal_keep = keep;
     }
     if let Some(bytes) = arguments.memory {
         config.limits.memory_bytes = bytes;

@@ -78,8 +78,6 @@ impl<'a> Film<'a> {
     /// Returns a failure if the guard stops the run or a change of the tissue is refused.
     pub fn at(&mut self, step: u64) -> Result<Still, Failure> {
         self.advance(step)?;
-        let mut displacement_m = std::array::from_fn(|_| Vec::new());
-        self.session.tissue().shown_displacements_m(&mut displacement_m);
         let model = self.session.model();
         // The force until now: at a jump, the one just before it.
         let before = step.saturating_sub(1);
@@ -87,8 +85,7 @@ impl<'a> Film<'a> {
         let pokes = self.script.forces.iter().map(|profile| profile.at(moment, model.scene.stepping.rate_hz));
         let arrow = |poke: Poke| Arrow { point: model.shape().nearest(poke.centre_m), towards: poke.force_n };
         let arrows = pokes.filter(|poke| poke.force_n.length() > 0.0).map(arrow).collect();
-        let snapshot = Snapshot::new(&model.scene, step, self.session.time_s(), displacement_m);
-        Ok(Still { snapshot: snapshot.with_skin(self.shown.as_ref()), shown: self.shown.clone(), arrows })
+        Ok(Still::of(&self.session, self.shown.as_ref(), arrows))
     }
 
     /// The tissue at the script's sample time with the largest displacement.
@@ -112,6 +109,15 @@ impl<'a> Film<'a> {
 }
 
 impl Still {
+    /// The tissue of a session as it stands; `shown` is what is shown of a mesh.
+    pub fn of(session: &Session, shown: Option<&Arc<Skin>>, arrows: Vec<Arrow>) -> Self {
+        let mut displacement_m = std::array::from_fn(|_| Vec::new());
+        session.tissue().shown_displacements_m(&mut displacement_m);
+        let snapshot = Snapshot::new(&session.model().scene, session.step_count(), session.time_s(), displacement_m)
+            .with_skin(shown);
+        Still { snapshot, shown: shown.cloned(), arrows }
+    }
+
     /// Simulated time, s.
     pub fn time_s(&self) -> f64 {
         self.snapshot.simulation_time_s
@@ -120,6 +126,48 @@ impl Still {
     /// Draws it.
     pub fn picture(&self, model: &Model, view: &View) -> Image {
         picture(model.shape(), self.shown.as_deref(), &self.snapshot, &self.arrows, view)
+    }
+}
+
+/// A GIF that is being written, at the speed of simulated time.
+pub struct Gif<W: Write> {
+    encoder: gif::Encoder<W>,
+    size: [u16; 2],
+    delay: f64,
+    steps_a_frame: f64,
+}
+
+fn broken(e: &gif::EncodingError) -> Failure {
+    Failure::Output(e.to_string())
+}
+
+impl<W: Write> Gif<W> {
+    /// Begins a film of `frames_hz` pictures a second of simulated time, of a session with `rate_hz` steps a second.
+    ///
+    /// # Errors
+    /// Returns a failure if the output can't be written.
+    pub fn new(output: W, view: &View, frames_hz: f64, rate_hz: f64) -> Result<Self, Failure> {
+        let size = view.size.map(|pixels| pixels as u16);
+        let mut encoder = gif::Encoder::new(output, size[0], size[1], &[]).map_err(|e| broken(&e))?;
+        encoder.set_repeat(gif::Repeat::Infinite).map_err(|e| broken(&e))?;
+        // A GIF counts in hundredths of a second.
+        let delay = (100.0 / frames_hz).round().max(1.0);
+        Ok(Gif { encoder, size, delay, steps_a_frame: 0.01 * delay * rate_hz })
+    }
+
+    /// The step of a frame, from the step of the first one.
+    pub fn step(&self, frame: u64) -> u64 {
+        (frame as f64 * self.steps_a_frame).round() as u64
+    }
+
+    /// Adds a picture.
+    ///
+    /// # Errors
+    /// Returns a failure if the output can't be written.
+    pub fn add(&mut self, image: &Image) -> Result<(), Failure> {
+        let mut picture = gif::Frame::from_rgb_speed(self.size[0], self.size[1], &image.rgb, 10);
+        picture.delay = self.delay as u16;
+        self.encoder.write_frame(&picture).map_err(|e| broken(&e))
     }
 }
 
@@ -137,23 +185,14 @@ pub fn gif(
     output: impl Write,
     progress: &mut dyn FnMut(u64),
 ) -> Result<(), Failure> {
-    let broken = |e: gif::EncodingError| Failure::Output(e.to_string());
-    let [width, height] = view.size.map(|pixels| pixels as u16);
-    let mut encoder = gif::Encoder::new(output, width, height, &[]).map_err(broken)?;
-    encoder.set_repeat(gif::Repeat::Infinite).map_err(broken)?;
+    let mut file = Gif::new(output, view, frames_hz, model.scene.stepping.rate_hz)?;
     let mut film = Film::new(model, script, limits)?;
-    // A GIF counts in hundredths of a second.
-    let delay = (100.0 / frames_hz).round().max(1.0);
-    let steps_a_frame = 0.01 * delay * model.scene.stepping.rate_hz;
     for frame in 0_u64.. {
-        let step = (frame as f64 * steps_a_frame).round() as u64;
+        let step = file.step(frame);
         if step > script.steps {
             break;
         }
-        let image = film.at(step)?.picture(model, view);
-        let mut picture = gif::Frame::from_rgb_speed(width, height, &image.rgb, 10);
-        picture.delay = delay as u16;
-        encoder.write_frame(&picture).map_err(broken)?;
+        file.add(&film.at(step)?.picture(model, view))?;
         progress(step);
     }
     Ok(())

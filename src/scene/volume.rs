@@ -111,7 +111,8 @@ impl Volume {
         }
         let ball_m3 = whole_m2 * (whole_m2 / (36.0 * std::f64::consts::PI)).sqrt();
         // Also if it is no number.
-        if !(volume_m3.abs() > FLAT * ball_m3) {
+        let is_flat = volume_m3.abs() <= FLAT * ball_m3 || !(volume_m3 * ball_m3).is_finite();
+        if is_flat {
             return refuse("it encloses nothing");
         }
         if volume_m3 < 0.0 {

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 
 use super::address::host_and_port;
+use super::journals::keep::Keep;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, number, positive};
 use crate::scene::document::read_text;
@@ -54,6 +55,12 @@ pub struct Config {
     pub lease_s: f64,
     /// A session is deleted after this time without a call, a held tool or a stream, s.
     pub idle_session_s: f64,
+    /// Folder of the journals: what happens to sessions is kept there, and a server that is started again continues them. `None`
+    /// keeps nothing.
+    pub journal: Option<PathBuf>,
+    /// How long the journals of sessions that have ended are kept, and how many bytes all journals may take before the oldest
+    /// of these are removed: `30d`, `10GiB`, `30d,10GiB`, or `0` to keep none.
+    pub journal_keep: Keep,
     /// The log filter: `info`, `debug`, `palpate=debug,tonic=warn`, …
     pub log: String,
     /// Upper bounds.
@@ -82,6 +89,8 @@ impl Default for Config {
             shutdown_deadline_s: 5.0,
             lease_s: 2.0,
             idle_session_s: 900.0,
+            journal: None,
+            journal_keep: Keep::default(),
             log: "info".to_owned(),
             limits: Limits::default(),
         }

@@ -88,14 +88,18 @@ pub const CALLS: &[(&str, Access)] = &[
     ("/palpate.v1.HapticService/WatchSamples", Access::Role(Role::Watch)),
     ("/palpate.v1.SessionService/CreateSession", Access::Role(Role::Create)),
     ("/palpate.v1.SessionService/DeleteSession", Access::Role(Role::Create)),
+    ("/palpate.v1.SessionService/GetJournal", Access::Role(Role::Watch)),
     ("/palpate.v1.SessionService/GetScript", Access::Role(Role::Watch)),
     ("/palpate.v1.SessionService/GetSession", Access::Role(Role::Watch)),
     ("/palpate.v1.SessionService/GetStateHash", Access::Role(Role::Watch)),
+    // Like ListSessions, it reveals IDs.
+    ("/palpate.v1.SessionService/ListJournals", Access::Role(Role::Administer)),
     ("/palpate.v1.SessionService/ListScenes", Access::Role(Role::Watch)),
     ("/palpate.v1.SessionService/ListScripts", Access::Role(Role::Watch)),
     // It reveals the IDs of all sessions, and whoever knows an ID can use that session.
     ("/palpate.v1.SessionService/ListSessions", Access::Role(Role::Administer)),
     ("/palpate.v1.SessionService/PauseSession", Access::Role(Role::Create)),
+    ("/palpate.v1.SessionService/SaveSnapshot", Access::Role(Role::Watch)),
     ("/palpate.v1.SessionService/StartSession", Access::Role(Role::Create)),
     ("/palpate.v1.SessionService/UpdateTissue", Access::Role(Role::Touch)),
     ("/palpate.v1.SessionService/UploadMesh", Access::Role(Role::Create)),

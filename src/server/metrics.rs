@@ -3,6 +3,7 @@
 
 use std::net::SocketAddr;
 use std::pin::Pin;
+use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex};
 use std::{fmt, io};
 
@@ -20,6 +21,7 @@ use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 
 use super::connections::{self, Connection, ConnectionSlots};
+use super::journals::{Journals, KeeperTally};
 use super::traffic::Traffic;
 use super::workshop::Workshop;
 use crate::budget::{Budget, Purpose, Resource};
@@ -30,7 +32,12 @@ use crate::pace::{Pacer, RunState};
 use crate::scene::record::AuditedError;
 
 /// Everything, as it is when it is asked for.
-pub(super) fn registry(pacer: &Arc<Pacer>, traffic: &Traffic, workshop: &Workshop) -> Registry {
+pub(super) fn registry(
+    pacer: &Arc<Pacer>,
+    traffic: &Traffic,
+    workshop: &Workshop,
+    journals: Option<&Journals>,
+) -> Registry {
     let mut registry = Registry::with_prefix("palpate");
     let connections = "Connections that are open";
     registry.register("connections", connections, traffic.connections.clone());
@@ -56,7 +63,32 @@ pub(super) fn registry(pacer: &Arc<Pacer>, traffic: &Traffic, workshop: &Worksho
     registry.register("refusals", refusals, traffic.refusals.clone());
     registry.register_collector(Box::new(Stepping(pacer.clone())));
     registry.register_collector(Box::new(Heavy(workshop.clone())));
+    if let Some(journals) = journals {
+        registry.register_collector(Box::new(Kept(journals.tally.clone())));
+    }
     registry
+}
+
+/// The journals.
+#[derive(Debug)]
+struct Kept(Arc<KeeperTally>);
+
+impl Collector for Kept {
+    #[allow(clippy::cast_precision_loss)]
+    fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> fmt::Result {
+        let KeeperTally { bytes, rounds, broken, lag_ns } = &*self.0;
+        for (name, help, unit, count) in [
+            ("journal_written", "What was written to journals", Some(&Unit::Bytes), bytes),
+            ("journal_rounds", "How often what was written was brought to the disk", None, rounds),
+            ("journal_broken", "Sessions whose journal can't be written any more", None, broken),
+        ] {
+            let counter = ConstCounter::new(count.load(Ordering::Relaxed));
+            counter.encode(encoder.encode_descriptor(name, help, unit, MetricType::Counter)?)?;
+        }
+        let help = "From the newest of what happened to its being on the disk, in the last round";
+        let lag = ConstGauge::new(lag_ns.load(Ordering::Relaxed) as f64 * 1e-9);
+        lag.encode(encoder.encode_descriptor("journal_lag", help, Some(&Unit::Seconds), MetricType::Gauge)?)
+    }
 }
 
 /// What waits in the workshop.

@@ -15,6 +15,7 @@ mod force_law;
 mod haptics;
 mod health;
 pub mod identity;
+mod journals;
 mod leases;
 mod listeners;
 mod mesh_parts;
@@ -41,5 +42,6 @@ mod validity;
 mod views;
 mod workshop;
 
+pub use journals::Keep;
 pub use listeners::{Listeners, ServeError};
 pub use serve::serve;

@@ -18,6 +18,7 @@ use super::config::Config;
 use super::connections::ConnectionSlots;
 use super::datagrams;
 use super::health::{SERVICES, end_health, report_files, report_workshop};
+use super::journals::Journals;
 use super::listeners::{Listeners, ServeError};
 use super::meshes::Meshes;
 use super::revocation::Calls;
@@ -75,8 +76,12 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
     limits.connections =
         descriptors::connections(limits.connections, metrics.as_ref().map_or(0, |_| metrics::SCRAPERS));
     let workshop = Workshop::open("workshop", &limits)?;
+    // Sessions of the server before this one go on before anybody is let in.
+    let (continued, kept) = (pacer.clone(), config.clone());
+    let opened = tokio::task::spawn_blocking(move || Journals::open(&kept, &continued)).await;
+    let journals = opened.map_err(std::io::Error::other)??;
     if let Some(listener) = metrics {
-        let registry = metrics::registry(&pacer, &traffic, &workshop);
+        let registry = metrics::registry(&pacer, &traffic, &workshop, journals.as_deref());
         let (limits, shutdown) = (limits.clone(), shutdown.clone());
         tokio::spawn(async move { metrics::serve(listener, &limits, registry, shutdown).await });
     }
@@ -109,6 +114,7 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
         meshes: meshes.clone(),
         workshop: workshop.clone(),
         traffic: traffic.clone(),
+        journals: journals.clone(),
     };
 
     let (health, health_service) = tonic_health::server::health_reporter();
@@ -192,7 +198,11 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
         end_health(health).await;
         drain.cancel();
         // Waits for the running steps. Every stream then reads its end from its queue.
-        let _ = tokio::task::spawn_blocking(move || stopping.stop()).await;
+        let last = move || {
+            stopping.stop();
+            journals.iter().for_each(|journals| journals.finish());
+        };
+        let _ = tokio::task::spawn_blocking(last).await;
     };
     let deadline_passed = async {
         shutdown.cancelled().await;

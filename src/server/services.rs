@@ -5,6 +5,7 @@ use std::sync::Arc;
 use super::catalog::Catalog;
 use super::config::Config;
 use super::datagrams::Datagrams;
+use super::journals::Journals;
 use super::meshes::Meshes;
 use super::textures::Textures;
 use super::traffic::Traffic;
@@ -23,4 +24,6 @@ pub(crate) struct Services {
     /// Creates and changes sessions, reads meshes and scripts and computes force laws.
     pub(crate) workshop: Workshop,
     pub(crate) traffic: Arc<Traffic>,
+    /// `None` if no journals are kept.
+    pub(super) journals: Option<Arc<Journals>>,
 }

@@ -13,11 +13,12 @@ use tracing::{info, warn};
 use super::charged_caller::ChargedCaller;
 use super::connections::Peer;
 use super::cut::until_cut;
+use super::journals;
 use super::meshes;
 use super::services::Services;
 use super::status;
 use super::workshop::CancelFlag;
-use crate::budget::Work;
+use crate::budget::{Purpose, Resource, Work};
 use crate::pace::StreamKind;
 use crate::pace::clock::now_ns;
 use crate::refusal::{Reason, Refusal, number};
@@ -26,8 +27,17 @@ use crate::wire;
 
 pub(super) struct Sessions(pub(super) Services);
 
+/// Bytes of a snapshot that go in one message.
+const SNAPSHOT_PART_BYTES: usize = 64 << 10;
+
+fn no_journals(field: &str) -> Refusal {
+    let message = "this server keeps no journals: `palpate serve --journal DIR` does";
+    Refusal::new(Reason::NotAvailable, field, message)
+}
+
 #[tonic::async_trait]
 impl SessionService for Sessions {
+    type SaveSnapshotStream = Pin<Box<dyn Stream<Item = Result<pb::SaveSnapshotResponse, Status>> + Send>>;
     type GetScriptStream = Pin<Box<dyn Stream<Item = Result<pb::GetScriptResponse, Status>> + Send>>;
 
     async fn list_scenes(&self, _: Request<pb::ListScenesRequest>) -> Result<Response<pb::ListScenesResponse>, Status> {
@@ -63,7 +73,7 @@ impl SessionService for Sessions {
             }
             _ => None,
         };
-        let (catalog, config) = (self.0.catalog.clone(), self.0.config.clone());
+        let (catalog, config, journals) = (self.0.catalog.clone(), self.0.config.clone(), self.0.journals.clone());
         let create = move |cancel: &CancelFlag| {
             let scene = match &source {
                 Some(Source::SceneName(name)) => catalog.load(name, &[], &config.limits)?,
@@ -71,16 +81,28 @@ impl SessionService for Sessions {
                     let made = wire::scene::from_scene(scene, mesh.as_deref());
                     made.map_err(|refusal| refusal.within("scene"))?
                 }
-                None => return Err(Refusal::new(Reason::Missing, "source", "scene_name or scene is missing")),
+                Some(Source::Journal(moment)) => {
+                    let journals = journals.as_ref().ok_or_else(|| no_journals("journal"))?;
+                    return journals.begin(moment, (request.paused, idle_timeout_s), &payer, &pacer, &config.limits);
+                }
+                None => {
+                    return Err(Refusal::new(Reason::Missing, "source", "scene_name, scene or journal is missing"));
+                }
             };
             pacer.create(&scene, request.paused, idle_timeout_s, &payer, cancel.flag())
         };
         let live = self.0.workshop.work(&account, create).await??;
         info!(session = %live.id, scene = %live.model.scene.name, points = live.model.len(), "session created");
+        let not_kept = journals::until_durable(&live).await;
         for warning in &live.model.warnings {
             warn!(session = %live.id, warning);
         }
-        Ok(Response::new(pb::CreateSessionResponse { session: Some(status::session(&live)) }))
+        let mut session = status::session(&live);
+        if let (Some(why), Some(journal)) = (not_kept, &mut session.journal) {
+            warn!(session = %live.id, why, "session created, but not kept");
+            journal.fault = why;
+        }
+        Ok(Response::new(pb::CreateSessionResponse { session: Some(session) }))
     }
 
     async fn upload_mesh(
@@ -106,6 +128,48 @@ impl SessionService for Sessions {
         Ok(Response::new(answer))
     }
 
+    async fn list_journals(
+        &self,
+        request: Request<pb::ListJournalsRequest>,
+    ) -> Result<Response<pb::ListJournalsResponse>, Status> {
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
+        let Some(journals) = self.0.journals.clone() else {
+            return Ok(Response::new(pb::ListJournalsResponse::default()));
+        };
+        let pacer = self.0.pacer.clone();
+        Ok(Response::new(self.0.workshop.work(&account, move |_: &CancelFlag| journals.list(&pacer)).await??))
+    }
+
+    async fn get_journal(
+        &self,
+        request: Request<pb::GetJournalRequest>,
+    ) -> Result<Response<pb::GetJournalResponse>, Status> {
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
+        let journals = self.0.journals.clone().ok_or_else(|| no_journals("session_id"))?;
+        let (pacer, request) = (self.0.pacer.clone(), request.into_inner());
+        let tell = move |_: &CancelFlag| journals.told(&request, &pacer);
+        Ok(Response::new(self.0.workshop.work(&account, tell).await??))
+    }
+
+    async fn save_snapshot(
+        &self,
+        request: Request<pb::SaveSnapshotRequest>,
+    ) -> Result<Response<Self::SaveSnapshotStream>, Status> {
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
+        let live = self.0.pacer.get(&request.get_ref().session_id)?;
+        let bytes = 4 * live.model.state_bytes() + live.model.bytes();
+        let taken = account.take(Resource::Memory(Purpose::Records), bytes, "session_id")?;
+        let present = live.save().await?;
+        let encode = move |_: &CancelFlag| journals::recorded::snapshot(&live, &present);
+        let file = self.0.workshop.work(&account, encode).await??;
+        let parts = stream::unfold((file, 0, taken), |(file, from, taken)| async move {
+            let end = file.len().min(from + SNAPSHOT_PART_BYTES);
+            let part = (from < end).then(|| file[from..end].to_vec())?;
+            Some((Ok(pb::SaveSnapshotResponse { part }), (file, end, taken)))
+        });
+        Ok(Response::new(Box::pin(parts)))
+    }
+
     async fn get_session(
         &self,
         request: Request<pb::GetSessionRequest>,
@@ -128,9 +192,11 @@ impl SessionService for Sessions {
         request: Request<pb::DeleteSessionRequest>,
     ) -> Result<Response<pb::DeleteSessionResponse>, Status> {
         let id = &request.get_ref().session_id;
+        let live = self.0.pacer.get(id)?;
         self.0.pacer.delete(id)?;
         info!(session = %id, "session deleted");
-        Ok(Response::new(pb::DeleteSessionResponse {}))
+        let journal_fault = journals::until_complete(&live).await.unwrap_or_default();
+        Ok(Response::new(pb::DeleteSessionResponse { journal_fault }))
     }
 
     async fn start_session(

@@ -1,5 +1,7 @@
 //! A session as a message: its state, counts, audits and tissue.
 
+use crate::pace::feed::Playback;
+use crate::pace::tape::Tape;
 use crate::pace::{Live, RunState};
 use crate::scene::Named;
 use crate::scene::record::AuditedError;
@@ -56,9 +58,33 @@ pub(super) fn session(live: &Live) -> pb::Session {
         points: count(model.len()),
         extent: Some(wire::extent(&model.shape().extent())),
         audit: audit(live),
+        journal: live.tape.as_deref().map(journal),
+        playback: live.playback.as_ref().map(playback),
         ..Default::default()
     };
     with_model(session, model)
+}
+
+/// What a session plays.
+fn playback(playback: &Playback) -> pb::Playback {
+    pb::Playback {
+        session_id: playback.session_id.clone(),
+        run: u32::try_from(playback.run).unwrap_or(u32::MAX),
+        begin_step: playback.steps[0],
+        end_step: playback.steps[1],
+        speed: playback.speed,
+    }
+}
+
+/// How far a session is kept on disk.
+fn journal(tape: &Tape) -> pb::Journal {
+    let progress = tape.progress().borrow().clone();
+    pb::Journal {
+        durable_step: progress.durable_step,
+        lag_s: progress.lag_s,
+        fault: progress.broken.map(|why| why.to_string()).unwrap_or_default(),
+        run: progress.run,
+    }
 }
 
 /// The results of a session's audits; `None` before the first.

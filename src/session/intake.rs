@@ -61,7 +61,7 @@ impl Intake {
     /// An intake for a session of `scene` that has not begun.
     pub fn new(scene: &Scene, limits: &Limits) -> Self {
         Intake {
-            rules: Arc::new(Rules { scene: scene.clone(), limits: limits.clone() }),
+            rules: Arc::new(Rules::new(scene, limits)),
             leases: Leases::default(),
             queue: Queue::default(),
             coming: 0,
@@ -83,6 +83,12 @@ impl Intake {
     #[must_use]
     pub fn charged_to(self, account: &Account) -> Self {
         Intake { account: Some(account.clone()), ..self }
+    }
+
+    /// Of a session that has done `step` steps, whose tissue is `changed_to` unless it is still the first.
+    #[must_use]
+    pub fn continued_at(self, step: u64, changed_to: Option<Arc<Model>>) -> Self {
+        Intake { next_step: step, changed_to, ..self }
     }
 
     /// Has the memory of `more` commands beside those that wait, or refuses.

@@ -16,6 +16,7 @@ pub mod batch;
 pub mod check;
 pub mod command;
 mod dent;
+pub mod input;
 pub mod intake;
 pub mod laws;
 pub mod lease;
@@ -26,6 +27,7 @@ pub mod recovery;
 pub mod rules;
 pub mod run;
 pub mod sampling;
+pub mod saved;
 pub mod schedule;
 
 use std::sync::Arc;
@@ -362,9 +364,7 @@ impl Session {
             return;
         }
         if ends_lease {
-            let Tool { control_point, around, paused_until, .. } = *tool;
-            *tool = Tool { control_point, around, paused_until, expired: true, ..Tool::default() };
-            return self.tissue.release(index);
+            return self.end_lease(index);
         }
         // Commands with a step may take effect in another order than they were sent in.
         if let Some(sequence) = command.sequence.filter(|sequence| *sequence >= tool.acknowledged_sequence) {
@@ -437,6 +437,14 @@ impl Session {
                 self.tissue.release(index);
             }
         }
+    }
+
+    /// Ends all that the holder of a tool did with it.
+    fn end_lease(&mut self, index: usize) {
+        let tool = self.tool(index);
+        let Tool { control_point, around, paused_until, .. } = *tool;
+        *tool = Tool { control_point, around, paused_until, expired: true, ..Tool::default() };
+        self.tissue.release(index);
     }
 
     /// Ends actions whose time to live is over.

@@ -48,22 +48,22 @@ pub struct Recovered {
 
 /// Commands of one tool that took effect at one step.
 #[derive(Debug, Clone, Copy)]
-struct Acts {
-    step: u64,
-    tool: u32,
-    count: u64,
+pub(super) struct Acts {
+    pub(super) step: u64,
+    pub(super) tool: u32,
+    pub(super) count: u64,
 }
 
 /// The recoveries of a session, and the commands that the next one would undo.
 #[derive(Debug, Default)]
 pub struct Recoveries {
-    count: u64,
+    pub(super) count: u64,
     /// The newest, at most [`MOST`], by ascending step.
-    newest: VecDeque<Arc<Recovered>>,
+    pub(super) newest: VecDeque<Arc<Recovered>>,
     /// The commands since the guard's checkpoint, by step. The guard brings the checkpoint forward when there are many.
-    acts: VecDeque<Acts>,
+    pub(super) acts: VecDeque<Acts>,
     /// Whether anything has acted on the tissue since it was at rest. A session begins at rest.
-    disturbed: bool,
+    pub(super) disturbed: bool,
 }
 
 impl Recoveries {

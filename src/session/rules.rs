@@ -19,6 +19,11 @@ pub struct Rules {
 pub struct Checked(pub(super) Vec<Command>);
 
 impl Rules {
+    /// Those of a session of `scene`.
+    pub(crate) fn new(scene: &Scene, limits: &Limits) -> Self {
+        Rules { scene: scene.clone(), limits: limits.clone() }
+    }
+
     /// All of `commands`, if each keeps to the rules.
     ///
     /// # Errors
@@ -32,7 +37,11 @@ impl Rules {
         Ok(Checked(commands))
     }
 
-    fn check_one(&self, command: &Command) -> Result<()> {
+    /// Whether a command keeps to the rules.
+    ///
+    /// # Errors
+    /// Refuses a command that does not.
+    pub(crate) fn check_one(&self, command: &Command) -> Result<()> {
         if let Some(seconds) = command.time_to_live_s {
             positive("time_to_live_s", seconds)?;
         }

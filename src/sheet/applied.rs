@@ -22,6 +22,10 @@ use super::lanes::{self, Run, Vector, Width};
 use super::mesh::MeshPlaces;
 use super::model::{Model, Plan};
 use super::real::Real;
+use super::saved::{
+    Checks, SavedForces, SavedLoad, SavedPoke, SavedPush, SavedSlot, SavedTerm, Vector as SavedVector, ensure,
+};
+use crate::refusal::Result;
 use crate::scene::profile::{LoadProfile, Moment, Poke};
 
 /// The force of a tool.
@@ -34,6 +38,20 @@ pub enum Push {
 }
 
 impl Push {
+    pub(super) fn saved(&self) -> SavedPush {
+        match self {
+            Push::Constant(poke) => SavedPush::Constant(SavedPoke::of(poke)),
+            Push::Profile(profile) => SavedPush::Profile(SavedLoad::of(profile)),
+        }
+    }
+
+    pub(super) fn restored(saved: &SavedPush, checks: &Checks<'_>) -> Result<Self> {
+        Ok(match saved {
+            SavedPush::Constant(poke) => Push::Constant(poke.restored(checks)?),
+            SavedPush::Profile(profile) => Push::Profile(profile.restored(checks)?),
+        })
+    }
+
     fn at(&self, moment: Moment, rate_hz: f64) -> Poke {
         match self {
             Push::Constant(poke) => *poke,
@@ -50,6 +68,12 @@ pub(super) struct Slot {
     /// The force that the sleeping tiles were last compared with.
     compared: Option<Poke>,
 }
+
+/// A scheme weighs the forces of a tool at the moments of a substep by less than this in all.
+const MOST_WEIGHT: f64 = 100.0;
+
+/// Most terms that the force of one tool becomes: two at each moment at which a scheme asks for it.
+const MOST_TERMS: usize = 8;
 
 /// A change of a tool's force.
 #[derive(Debug, Clone, Copy)]
@@ -459,6 +483,60 @@ impl<T: Real> Applied<T> {
     /// The same forces, taken from a sheet of either format.
     pub(super) fn like<S: Real>(other: &Applied<S>) -> Self {
         Applied { slots: other.slots.clone(), settled: false, ..Applied::new() }
+    }
+
+    /// As plain data, without tables.
+    pub(super) fn saved(&self) -> SavedForces {
+        let slot = |Slot { push, before, compared }: &Slot| SavedSlot {
+            push: push.as_ref().map(Push::saved),
+            before: before.as_ref().map(SavedPoke::of),
+            compared: compared.as_ref().map(SavedPoke::of),
+        };
+        let term = |term: &Term<T>| SavedTerm {
+            poke: SavedPoke::of(&term.wanted.poke),
+            forces_n: term.wanted.forces_n.map(SavedVector::from),
+        };
+        SavedForces {
+            slots: self.slots.iter().map(slot).collect(),
+            terms: self.terms.iter().map(term).collect(),
+            settled: self.settled,
+        }
+    }
+
+    /// The forces of a sheet whose plan has the scale of forces `scale`, with their tables.
+    pub(super) fn restored(
+        saved: &SavedForces,
+        model: &Model,
+        layout: &Layout,
+        scale: f64,
+        checks: &Checks<'_>,
+    ) -> Result<Self> {
+        if let Some(last) = saved.slots.len().checked_sub(1) {
+            checks.tool(last as u64)?;
+        }
+        ensure(saved.terms.len() <= MOST_TERMS * saved.slots.len(), "more forces than its tools exert")?;
+        let poke = |poke: &Option<SavedPoke>| poke.as_ref().map(|poke| poke.restored(checks)).transpose();
+        let slot = |slot: &SavedSlot| {
+            let push = slot.push.as_ref().map(|push| Push::restored(push, checks)).transpose()?;
+            Ok(Slot { push, before: poke(&slot.before)?, compared: poke(&slot.compared)? })
+        };
+        let slots = saved.slots.iter().map(slot).collect::<Result<_>>()?;
+        let mut terms = Vec::new();
+        for saved in &saved.terms {
+            let wanted = Wanted { poke: saved.poke.restored(checks)?, forces_n: saved.forces_n.map(DVec3::from) };
+            let gain = libm::exp(wanted.poke.falloff_offset);
+            let is_sound = |force_n: &DVec3| {
+                let force = T::of(gain * scale * force_n.length());
+                let most_n = MOST_WEIGHT * checks.limits.point_force_n;
+                force_n.is_finite() && force.is_finite() && gain * force_n.length() <= most_n
+            };
+            ensure(gain.is_finite() && wanted.forces_n.iter().all(is_sound), "a force that is not finite")?;
+            let mut term = Term::new();
+            term.place(&wanted.poke, model, layout);
+            term.set(wanted, scale);
+            terms.push(term);
+        }
+        Ok(Applied { slots, terms, wanted: Vec::new(), settled: saved.settled })
     }
 
     /// From the coming step on `tool` exerts `push`.

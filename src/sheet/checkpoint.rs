@@ -7,8 +7,11 @@ use glam::DVec3;
 use super::applied::{Applied, Push};
 use super::contact::Contacts;
 use super::field::State;
-use super::prescribed::{Grasp, Prescribed};
+use super::model::Model;
+use super::prescribed::{Grasp, Prescribed, restored_index};
 use super::real::Real;
+use super::saved::{Checks, SavedInput, SavedTip, SavedWork, ensure};
+use crate::refusal::Result;
 use crate::shape::PointName;
 use palpate_touch::Tip;
 
@@ -66,6 +69,26 @@ pub(super) enum Input {
     Pose(DVec3, Tip),
 }
 
+impl Input {
+    pub(super) fn saved(&self) -> SavedInput {
+        match self {
+            Input::Push(push) => SavedInput::Push(push.as_ref().map(Push::saved)),
+            Input::Grasp(index, grasp) => SavedInput::Grasp(*index as u64, grasp.saved()),
+            Input::Pose(place_m, tip) => SavedInput::Pose((*place_m).into(), SavedTip::of(tip)),
+        }
+    }
+
+    pub(super) fn restored(saved: &SavedInput, model: &Model, checks: &Checks<'_>) -> Result<Self> {
+        Ok(match saved {
+            SavedInput::Push(push) => Input::Push(push.as_ref().map(|push| Push::restored(push, checks)).transpose()?),
+            SavedInput::Grasp(index, grasp) => {
+                Input::Grasp(restored_index(model, *index, checks)?, Grasp::restored(grasp, checks)?)
+            }
+            SavedInput::Pose(place_m, tip) => Input::Pose(checks.near(*place_m)?, tip.restored(checks)?),
+        })
+    }
+}
+
 /// The complete state that a sheet goes back to.
 #[derive(Debug)]
 pub(super) struct Checkpoint<T: Real> {
@@ -99,6 +122,17 @@ impl Work {
         self.done_j += work_j;
     }
 
+    pub(super) fn saved(&self) -> SavedWork {
+        let Work { done_j, energy_j, largest_j } = *self;
+        SavedWork { done_j, energy_j, largest_j }
+    }
+
+    pub(super) fn restored(saved: &SavedWork) -> Result<Self> {
+        let SavedWork { done_j, energy_j, largest_j } = *saved;
+        ensure(done_j.is_finite() && energy_j.is_finite() && largest_j.is_finite(), "an energy that is not finite")?;
+        Ok(Work { done_j, energy_j, largest_j })
+    }
+
     /// An account that begins with the given energy.
     pub(super) fn begun(energy_j: f64, present_j: f64) -> Self {
         Work { done_j: present_j, energy_j, largest_j: energy_j }
@@ -106,7 +140,12 @@ impl Work {
 
     /// Checks an energy; a rise by `noise` of the largest does not count. `present_j` is subtracted from the work so
     /// far and belongs to the next interval. The account begins anew.
-    pub(super) fn survey(&mut self, energy_j: f64, present_j: f64, noise: f64) -> Result<(), CheckFailure> {
+    pub(super) fn survey(
+        &mut self,
+        energy_j: f64,
+        present_j: f64,
+        noise: f64,
+    ) -> std::result::Result<(), CheckFailure> {
         let (work_j, before_j) = (self.done_j - present_j, self.energy_j);
         let allowed_j = work_j + MARGIN * (before_j + work_j.abs()) + noise * self.largest_j;
         if energy_j - before_j > allowed_j {

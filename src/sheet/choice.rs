@@ -106,7 +106,7 @@ impl Chooser<'_> {
         let rehearsal = Rehearsal::new(scene, scene.stepping.tolerance, limits.rehearsal_work, stop);
         let sheet = Oscillator::of(scene);
         let spring_stiffness_n_per_m = stability::stiffness_of_springs_n_per_m(scene);
-        let unpressed = Oscillator { spring_stiffness_n_per_m, ..sheet.clone() };
+        let unpressed = Oscillator { spring_stiffness_n_per_m, ..sheet };
         Chooser { stepping: &scene.stepping, sheet, unpressed, rehearsal, most_substeps: limits.substeps }
     }
 

@@ -8,13 +8,29 @@ use super::choice::{self, Choice};
 use super::integrate::{Oscillator, entry};
 use super::lanes;
 use super::model::{Model, Plan};
+use super::saved::{CorrectedPlan, TissueState};
 use super::tangent;
 use crate::limits::Limits;
-use crate::refusal::{Reason, Refusal, Result};
+use crate::refusal::{Reason, Refusal, Result, number};
 use crate::scene::{Body, Change, Integrator, Named, Precision, Scene};
 
 /// What sleeping tiles may add to the error, by default, as a part of it.
 const SLEEP_PART: f64 = 0.1;
+
+/// The refusal of a scene that needs more substeps than there may be.
+fn too_many(scene: &Scene, substeps: u32, limits: &Limits) -> Refusal {
+    let message = format!(
+        "would need {substeps} substeps a step for stability, above the limit of {}: the springs are too stiff \
+         for points so light at this rate{}",
+        limits.substeps,
+        match &scene.body {
+            Body::Mesh(_) if scene.volume_is_fastest() => " (volume.stiffness_pa most of all)".to_owned(),
+            Body::Mesh(mesh) => mesh.fastest_place(),
+            Body::Sheet(_) => String::new(),
+        }
+    );
+    Refusal::new(Reason::TooLarge, "stepping.substeps", message)
+}
 
 impl Model {
     /// Compiles a scene, after checking it.
@@ -33,32 +49,26 @@ impl Model {
         scene.check(limits)?;
         let sheet = Oscillator::of(scene);
         let step_s = scene.stepping.rate_hz.recip();
-        let too_many = |substeps: u32| {
-            let message = format!(
-                "would need {substeps} substeps a step for stability, above the limit of {}: the springs are too stiff \
-                 for points so light at this rate{}",
-                limits.substeps,
-                match &scene.body {
-                    Body::Mesh(_) if scene.volume_is_fastest() => " (volume.stiffness_pa most of all)".to_owned(),
-                    Body::Mesh(mesh) => mesh.fastest_place(),
-                    Body::Sheet(_) => String::new(),
-                }
-            );
-            Refusal::new(Reason::TooLarge, "stepping.substeps", message)
-        };
         // Nothing is rehearsed that no scheme could do.
         let least = choice::least_substeps(scene.stepping.integrator, step_s, &sheet);
         if scene.stepping.substeps.is_none() && least > limits.substeps {
-            return Err(too_many(least));
+            return Err(too_many(scene, least, limits));
         }
         let (choice, rehearsed) = choice::choose(scene, limits, stop)?;
+        Model::chosen(scene, choice, rehearsed, limits, stop)
+    }
+
+    /// Compiles a scene with a choice that was made.
+    fn chosen(scene: &Scene, choice: Choice, rehearsed: u64, limits: &Limits, stop: &AtomicBool) -> Result<Arc<Self>> {
+        let sheet = Oscillator::of(scene);
+        let step_s = scene.stepping.rate_hz.recip();
         let Choice { integrator, substeps, precision, expected_error } = choice;
         if precision == Precision::Compensated && !entry(integrator).compensates {
             let message = format!("is for exponential schemes; `{}` has f32 and f64", integrator.name());
             return Err(Refusal::new(Reason::WrongKind, "stepping.precision", message));
         }
         if substeps > limits.substeps {
-            return Err(too_many(substeps));
+            return Err(too_many(scene, substeps, limits));
         }
         let plan = Plan::new(integrator, substeps, step_s, &sheet);
         let omega_bound_per_s = sheet.omega_bound_per_s();
@@ -130,6 +140,54 @@ impl Model {
         let mut model = self.compile_corrected(&scene, limits, stop)?;
         model.scene.stepping = asked;
         Ok(Arc::new(model))
+    }
+
+    /// How this model is stepped, and its coefficients: all that [`Model::resumed`] needs beside the scene that the session
+    /// began with.
+    pub fn tissue_state(&self) -> TissueState {
+        let Model { scene, plan, precision, expected_error, sleep_tolerance, corrected, .. } = self;
+        TissueState {
+            stiffness_n_per_m: scene.springs.stiffness_n_per_m,
+            shear_stiffness_n_per_m: scene.springs.shear_stiffness_n_per_m,
+            virtual_stiffness_n_per_m: scene.virtual_stiffness_n_per_m,
+            damping_n_s_per_m: scene.damping_n_s_per_m,
+            volume_stiffness_pa: scene.volume_stiffness_pa,
+            integrator: plan.integrator,
+            substeps: plan.substeps,
+            precision: *precision,
+            sleep_tolerance: *sleep_tolerance,
+            sleep_tolerance_of_scene: scene.sleep_tolerance,
+            expected_error: *expected_error,
+            corrected: corrected.map(|(integrator, least_substeps)| CorrectedPlan { integrator, least_substeps }),
+        }
+    }
+
+    /// The model that changes and corrections had made of the scene `first`, with which a session began: the same plan and
+    /// the same bits. Nothing is chosen anew.
+    ///
+    /// # Errors
+    /// Refuses what no model has, and as [`Model::compile`] does.
+    pub fn resumed(first: &Scene, state: &TissueState, limits: &Limits) -> Result<Arc<Self>> {
+        let TissueState { integrator, substeps, precision, sleep_tolerance, expected_error, .. } = *state;
+        let mut scene = first.clone();
+        scene.springs.stiffness_n_per_m = state.stiffness_n_per_m;
+        scene.springs.shear_stiffness_n_per_m = state.shear_stiffness_n_per_m;
+        scene.virtual_stiffness_n_per_m = state.virtual_stiffness_n_per_m;
+        scene.damping_n_s_per_m = state.damping_n_s_per_m;
+        scene.volume_stiffness_pa = state.volume_stiffness_pa;
+        scene.sleep_tolerance = state.sleep_tolerance_of_scene;
+        scene.check(limits)?;
+        number("sleep.tolerance", sleep_tolerance, "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
+        let is_one = integrator != Integrator::Auto && precision != Precision::Auto && substeps > 0;
+        if !is_one || expected_error.is_nan() || state.corrected.is_some_and(|plan| plan.integrator == Integrator::Auto)
+        {
+            let message = "is of no model: it has no scheme, format, substeps or expected error";
+            return Err(Refusal::new(Reason::OutOfRange, "stepping", message));
+        }
+        let made = Choice { integrator, substeps, precision, expected_error };
+        let model = Model::chosen(&scene, made, 0, limits, &choice::NEVER)?;
+        let corrected = state.corrected.map(|plan| (plan.integrator, plan.least_substeps));
+        Ok(Arc::new(Model { sleep_tolerance, corrected, ..Arc::unwrap_or_clone(model) }))
     }
 
     /// What a script's changes make of this, each out of the one before it.

@@ -28,7 +28,9 @@ use super::field::{Layout, State};
 use super::footprint::{Footprint, Reached, RestSurface};
 use super::model::{Model, Plan};
 use super::real::Real;
+use super::saved::{Checks, SavedContact, SavedTip, ensure};
 use super::tangent::{Patch, Tangent, Window};
+use crate::refusal::Result;
 use palpate_touch::{ContactState, Coupling, Tip};
 
 /// The motion of a tool and the force on it at the end of a step.
@@ -93,6 +95,10 @@ pub(super) struct Tool {
     pub(super) velocity_m_per_s: DVec3,
 }
 
+/// The states of contact, in the order of their numbers in snapshots.
+const CONTACT_STATES: [ContactState; 4] =
+    [ContactState::Free, ContactState::Sticking, ContactState::Sliding, ContactState::Holding];
+
 /// All position-controlled tools.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Contacts {
@@ -130,6 +136,16 @@ impl Contacts {
             velocity_m_per_s: DVec3::ZERO,
         };
         self.tools.insert(index, tool);
+    }
+
+    pub(super) fn saved(&self) -> Vec<SavedContact> {
+        self.tools.iter().map(Tool::saved).collect()
+    }
+
+    pub(super) fn restored(saved: &[SavedContact], model: &Model, checks: &Checks<'_>) -> Result<Self> {
+        let tools: Vec<Tool> = saved.iter().map(|tool| Tool::restored(tool, model, checks)).collect::<Result<_>>()?;
+        ensure(tools.is_sorted_by(|a, b| a.number < b.number), "tools out of order")?;
+        Ok(Contacts { tools })
     }
 
     pub(super) fn is_empty(&self) -> bool {
@@ -201,6 +217,53 @@ pub(super) fn movement_m<T: Real>(model: &Model, layout: &Layout, state: &State<
 }
 
 impl Tool {
+    #[allow(clippy::cast_possible_truncation)]
+    fn saved(&self) -> SavedContact {
+        SavedContact {
+            number: self.number as u64,
+            tip: SavedTip::of(&self.tip),
+            ground: self.footprint.saved(),
+            from_m: self.from_m.into(),
+            to_m: self.to_m.into(),
+            contact_state: CONTACT_STATES.iter().position(|state| *state == self.contact_state).unwrap_or(0) as u8,
+            normal: self.normal.into(),
+            side: self.side,
+            offset_m: self.offset_m.into(),
+            force_n: self.force_n.into(),
+            steady_n: self.steady_n.into(),
+            velocity_m_per_s: self.velocity_m_per_s.into(),
+        }
+    }
+
+    fn restored(saved: &SavedContact, model: &Model, checks: &Checks<'_>) -> Result<Self> {
+        let tip = saved.tip.restored(checks)?;
+        let contact_state = CONTACT_STATES.get(usize::from(saved.contact_state)).copied();
+        ensure(contact_state.is_some(), "a state of contact that there is not")?;
+        let normal = checks.vector(saved.normal)?;
+        ensure((normal.length() - 1.0).abs() < 1e-6, "a normal that is not of length 1")?;
+        // What it would move a point by in a substep.
+        let moves_m_per_n = model.plan.force_scale(&model.scene) * model.unit_m;
+        let force = |force_n: [f64; 3]| {
+            let force_n = DVec3::from(force_n);
+            checks.movement(moves_m_per_n * force_n).map(|_| force_n)
+        };
+        ensure(saved.side.is_none_or(|side| side.abs() == 1.0), "a side of the tissue that there is not")?;
+        Ok(Tool {
+            number: checks.tool(saved.number)?,
+            tip,
+            footprint: Footprint::restored(model, tip.radius_m, &saved.ground)?,
+            from_m: checks.near(saved.from_m)?,
+            to_m: checks.near(saved.to_m)?,
+            contact_state: contact_state.unwrap_or(ContactState::Free),
+            normal,
+            side: saved.side,
+            offset_m: checks.movement(DVec3::from(saved.offset_m))?,
+            force_n: force(saved.force_n)?,
+            steady_n: force(saved.steady_n)?,
+            velocity_m_per_s: checks.vector(saved.velocity_m_per_s)?,
+        })
+    }
+
     /// The points of the disc.
     pub(super) fn points(&self) -> impl Iterator<Item = [usize; 2]> {
         self.footprint.reached().iter().map(|reached| reached.point)

@@ -16,6 +16,8 @@ mod mesh;
 use glam::{DMat3, DVec2, DVec3};
 
 use super::model::Model;
+use super::saved::{SavedGround, ensure, unsound};
+use crate::refusal::Result;
 use crate::scene::Body;
 use grid::GridDisc;
 use mesh::MeshDisc;
@@ -76,6 +78,48 @@ impl Footprint {
         };
         footprint.move_to(model, at_m);
         footprint
+    }
+
+    /// Its place.
+    pub(super) fn saved(&self) -> SavedGround {
+        match &self.ground {
+            Ground::Grid(disc) => SavedGround::Grid(disc.centre_m.to_array()),
+            Ground::Mesh(disc) => disc.saved(),
+        }
+    }
+
+    /// A disc at a place of another.
+    pub(super) fn restored(model: &Model, radius_m: f64, saved: &SavedGround) -> Result<Self> {
+        match (saved, &model.scene.body) {
+            (SavedGround::Grid(centre_m), Body::Sheet(sheet)) => {
+                let centre_m = DVec2::from(*centre_m);
+                let is_on_it = centre_m.cmpge(DVec2::ZERO).all() && centre_m.cmple(sheet.extent_m()).all();
+                ensure(is_on_it, "a tool that is not on the tissue")?;
+                Ok(Footprint::new(model, radius_m, centre_m.extend(0.0)))
+            }
+            (SavedGround::Mesh { .. }, Body::Mesh(mesh)) => {
+                let mut disc = MeshDisc::new(&mesh.shape, radius_m);
+                disc.restore(saved)?;
+                let mut footprint = Footprint {
+                    radius_m,
+                    ground: Ground::Mesh(Box::new(disc)),
+                    reached: Vec::new(),
+                    rest_m: DVec3::ZERO,
+                    along: [DVec3::X, DVec3::Y],
+                    mobility: 0.0,
+                };
+                footprint.lay(model);
+                ensure(footprint.is_sound(), "a tool that is nowhere on the tissue")?;
+                Ok(footprint)
+            }
+            _ => Err(unsound("a tool on a tissue of another kind")),
+        }
+    }
+
+    /// Whether all of it is finite.
+    fn is_sound(&self) -> bool {
+        let is_sound = |point: &Reached| point.weight.is_finite() && point.gradient.is_finite();
+        self.rest_m.is_finite() && self.mobility.is_finite() && self.reached.iter().all(is_sound)
     }
 
     /// The radius, m.

@@ -121,6 +121,8 @@ impl<T: Real> Sheet<T> {
         let Some(checkpoint) = &self.checkpoint else { return };
         self.audit_window.give_up();
         self.steps = checkpoint.steps;
+        // Those of a repetition that failed: the next one gives them again.
+        self.inputs.clear();
         self.tiles.wake_all();
         self.state.copy_from(&checkpoint.state);
         self.known_growth.set(None);
@@ -336,6 +338,25 @@ mod tests {
             (0..20).for_each(|_| sheet.step().unwrap());
             assert_eq!(sheet.guard_events(), 0);
         }
+    }
+
+    #[test]
+    fn a_repetition_that_fails_leaves_no_inputs_behind() {
+        // Three halvings are needed: the first repetitions fail as well.
+        let sets = ["stepping.substeps=1", "springs.stiffness_n_per_m=100000"];
+        let model = Model::paper(&[&["sheet.points=[9, 9]", "stepping.integrator=central"][..], &sets].concat());
+        let mut sheet = Sheet::<f32>::new(&model);
+        let place_m = |step: u32| DVec3::new(0.13, 0.13, 0.01 - 1e-3 * f64::from(step));
+        let mut mended = 0;
+        for step in 0..120 {
+            sheet.pose(0, place_m(step), palpate_touch::Tip { radius_m: 0.03, ..Default::default() });
+            sheet.step().unwrap();
+            let from = sheet.checkpoint.as_ref().unwrap().steps;
+            let inputs: Vec<u64> = sheet.inputs.iter().map(|input| input.0).collect();
+            assert_eq!(inputs, (from..sheet.steps).collect::<Vec<_>>(), "step {step}");
+            mended = mended.max(sheet.halvings);
+        }
+        assert!(mended >= 3, "{mended} halvings");
     }
 
     #[test]

@@ -19,6 +19,7 @@ use super::lanes::Plain;
 use super::model::{Model, Plan};
 use super::prescribed::{Grasp, Prescribed};
 use super::real::Real;
+use super::saved::SavedTissue;
 use super::springs::{Kind, Springs};
 use super::tables::{Elastic, SweepTables};
 use super::tiles::{CHECK_STEPS, SleepTiles};
@@ -497,6 +498,10 @@ impl<T: Real> Tissue for Sheet<T> {
 
     fn hash_blocks(&self, blocks: Range<usize>, hasher: &mut Xxh3) {
         Sheet::hash_blocks(self, blocks, hasher);
+    }
+
+    fn save(&self) -> SavedTissue {
+        Sheet::save(self)
     }
 
     fn copy(&self) -> SheetCopy {

@@ -3,6 +3,12 @@
 use glam::DVec3;
 
 use super::model::Model;
+use super::saved::{
+    Checks, SavedGrasp, SavedGrasped, SavedPrescribed, Vector, ensure, restored_motion, restored_moves,
+    restored_velocity, saved_motion, saved_moves,
+};
+use crate::refusal::Result;
+use crate::scene::check::check_free;
 use crate::scene::profile::{Motion, MotionProfile};
 
 /// How a tool moves its grasped point.
@@ -12,6 +18,33 @@ pub enum Grasp {
     Target(DVec3),
     /// A function of time, exact within the step.
     Profile(MotionProfile),
+}
+
+impl Grasp {
+    pub(super) fn saved(&self) -> SavedGrasp {
+        match self {
+            Grasp::Target(displacement_m) => SavedGrasp::Target((*displacement_m).into()),
+            Grasp::Profile(profile) => saved_moves(profile),
+        }
+    }
+
+    pub(super) fn restored(saved: &SavedGrasp, checks: &Checks<'_>) -> Result<Self> {
+        Ok(match saved {
+            SavedGrasp::Target(displacement_m) => Grasp::Target(checks.movement(DVec3::from(*displacement_m))?),
+            SavedGrasp::Profile { point, moves } => Grasp::Profile(restored_moves(checks, *point, moves)?),
+        })
+    }
+}
+
+/// The place in memory of a point that a snapshot says is grasped.
+#[allow(clippy::cast_possible_truncation)]
+pub(super) fn restored_index(model: &Model, index: u64, checks: &Checks<'_>) -> Result<usize> {
+    ensure(index < model.places() as u64, "a grasped point that the tissue has not")?;
+    let index = index as usize;
+    let point = model.point_at(index);
+    ensure(model.place_of(point) == index, "a grasped point that the tissue has not")?;
+    check_free("snapshot", checks.shape, point)?;
+    Ok(index)
 }
 
 /// One grasped point.
@@ -37,6 +70,34 @@ pub(super) struct Prescribed {
 impl Prescribed {
     pub(super) fn new() -> Self {
         Prescribed { grasped: Vec::new(), released: Vec::new() }
+    }
+
+    pub(super) fn saved(&self) -> SavedPrescribed {
+        let grasped = self.grasped.iter().map(|Grasped { tool, index, grasp, now, held }| SavedGrasped {
+            tool: *tool as u64,
+            index: *index as u64,
+            grasp: grasp.saved(),
+            now: saved_motion(now),
+            held: *held,
+        });
+        let released = self.released.iter().map(|(index, velocity)| (*index as u64, Vector::from(*velocity)));
+        SavedPrescribed { grasped: grasped.collect(), released: released.collect() }
+    }
+
+    pub(super) fn restored(saved: &SavedPrescribed, model: &Model, checks: &Checks<'_>) -> Result<Self> {
+        let rate_hz = model.scene.stepping.rate_hz;
+        let mut grasped: Vec<Grasped> = Vec::new();
+        for SavedGrasped { tool, index, grasp, now, held } in &saved.grasped {
+            let (tool, index) = (checks.tool(*tool)?, restored_index(model, *index, checks)?);
+            let is_new = grasped.iter().all(|other| other.tool != tool && other.index != index);
+            ensure(is_new, "a tool that grasps twice, or a point that is grasped twice")?;
+            let (grasp, now) = (Grasp::restored(grasp, checks)?, restored_motion(checks, now, rate_hz)?);
+            grasped.push(Grasped { tool, index, grasp, now, held: *held });
+        }
+        let released = saved.released.iter().map(|(index, velocity)| {
+            Ok((restored_index(model, *index, checks)?, restored_velocity(checks, *velocity, rate_hz)?))
+        });
+        Ok(Prescribed { grasped, released: released.collect::<Result<_>>()? })
     }
 
     /// Whether no point is grasped and none was released just now.

@@ -84,6 +84,8 @@ pub(super) trait Real:
     fn is_finite(self) -> bool;
     /// Writes the value's bytes, little-endian, to `bytes`, which has the value's size.
     fn write(self, bytes: &mut [u8]);
+    /// The value of bytes that [`Real::write`] wrote; 0 of any other number of bytes.
+    fn read(bytes: &[u8]) -> Self;
 }
 
 macro_rules! real {
@@ -140,6 +142,9 @@ macro_rules! real {
             }
             fn write(self, bytes: &mut [u8]) {
                 bytes.copy_from_slice(&self.to_le_bytes());
+            }
+            fn read(bytes: &[u8]) -> Self {
+                bytes.try_into().map_or(0.0, Self::from_le_bytes)
             }
         }
     };

@@ -29,7 +29,9 @@ use super::mesh::MeshPlaces;
 use super::model::Model;
 use super::real::Real;
 use super::region::{Marks, Region, TILE, tiles};
+use super::saved::{SavedTile, SavedTiles, ensure, unsound};
 use crate::memory;
+use crate::refusal::Result;
 use crate::scene::{Body, Scene};
 
 /// Steps between two checks whether tiles may sleep.
@@ -59,6 +61,54 @@ const SNAPSHOT: usize = NEIGHBOURS.len() * 3 * TILE;
 
 /// The name of the tables in messages.
 const TABLES: &str = "the tiles of a sheet";
+
+/// A copy of what a snapshot has of the tiles.
+#[derive(Debug)]
+pub(super) struct TakenTiles<T> {
+    awake: Vec<bool>,
+    /// In the order in which their energies are added.
+    pub(super) moved: Vec<usize>,
+    calm: Vec<u8>,
+    drift_n: Vec<f64>,
+    energy_j: Vec<f64>,
+    growth: Vec<f64>,
+    asleep_j: f64,
+    largest: f64,
+    /// What sleeping tiles that have moved remember, in their order.
+    pub(super) remembered: Vec<T>,
+}
+
+impl<T: Real> TakenTiles<T> {
+    /// As plain data, without what is remembered.
+    #[allow(clippy::cast_possible_truncation)]
+    pub(super) fn plain(&self) -> SavedTiles {
+        let each = (0..self.calm.len()).map(|tile| SavedTile {
+            tile: tile as u32,
+            awake: self.awake[tile],
+            calm: self.calm[tile],
+            drift_n: self.drift_n[tile],
+            energy_j: self.energy_j[tile],
+            growth: self.growth.get(tile).copied().unwrap_or(0.0),
+        });
+        let is_new = |tile: &SavedTile| {
+            let numbers = [tile.drift_n, tile.energy_j, tile.growth];
+            !tile.awake && tile.calm == 0 && numbers == [0.0; 3]
+        };
+        SavedTiles {
+            moved: self.moved.iter().map(|tile| *tile as u32).collect(),
+            each: each.filter(|tile| !is_new(tile)).collect(),
+            asleep_j: self.asleep_j,
+            largest: self.largest,
+        }
+    }
+}
+
+/// The rows and columns of a tile.
+pub(super) fn sides_of(layout: &Layout, tile: usize) -> [Range<usize>; 2] {
+    let columns = tiles(layout.columns);
+    let side = |from: usize, points: usize| from..(from + TILE).min(points);
+    [side(tile / columns * TILE, layout.rows), side(tile % columns * TILE, layout.columns)]
+}
 
 /// Points next to a sleeping tile of a sheet, in an awake tile.
 #[derive(Debug, Clone, Copy)]
@@ -170,6 +220,99 @@ impl<T: Real> SleepTiles<T> {
             graph: self.graph.clone(),
             ..*self
         }
+    }
+
+    /// A copy for a snapshot.
+    pub(super) fn taken(&self) -> TakenTiles<T> {
+        let mut remembered = Vec::new();
+        for range in self.places_remembered() {
+            match self.snapshots.get(range.clone()) {
+                Some(values) => remembered.extend_from_slice(values),
+                // Nothing has slept yet since anything moved.
+                None => remembered.resize(remembered.len() + range.len(), T::default()),
+            }
+        }
+        TakenTiles {
+            awake: self.region.awake.has.clone(),
+            moved: self.moved.members.clone(),
+            calm: self.calm.clone(),
+            drift_n: self.drift_n.clone(),
+            energy_j: self.energy_j.clone(),
+            growth: self.growth.clone(),
+            asleep_j: self.asleep_j,
+            largest: self.largest,
+            remembered,
+        }
+    }
+
+    /// Where sleeping tiles that have moved remember what was around them, in their order.
+    fn places_remembered(&self) -> impl Iterator<Item = Range<usize>> + '_ {
+        let asleep = self.moved.members.iter().filter(|tile| !self.region.awake.has[**tile]);
+        asleep.map(|tile| match &self.graph {
+            Some(graph) => {
+                let (slots, first) = graph.around(*tile);
+                3 * first..3 * (first + slots.len())
+            }
+            None => tile * SNAPSHOT..(tile + 1) * SNAPSHOT,
+        })
+    }
+
+    /// Tiles in all.
+    pub(super) fn tile_count(&self) -> usize {
+        self.calm.len()
+    }
+
+    /// Becomes what was saved; `self` is new. What is remembered follows ([`SleepTiles::remember_again`]).
+    pub(super) fn restore(&mut self, saved: &SavedTiles) -> Result<()> {
+        let count = self.calm.len();
+        let is_tile = |tile: u32| ensure((tile as usize) < count, "a tile that the tissue has not");
+        self.moved.clear();
+        self.region.awake.clear();
+        for tile in &saved.moved {
+            is_tile(*tile)?;
+            ensure(self.moved.add(*tile as usize), "a tile twice")?;
+        }
+        ensure(saved.each.is_sorted_by(|a, b| a.tile < b.tile), "tiles out of order")?;
+        for SavedTile { tile, awake, calm, drift_n, energy_j, growth } in &saved.each {
+            is_tile(*tile)?;
+            let tile = *tile as usize;
+            let is_finite = drift_n.is_finite() && energy_j.is_finite() && growth.is_finite();
+            ensure(is_finite, "a tile whose energy is not finite")?;
+            if *growth != 0.0 {
+                self.growth.resize(count, 0.0);
+                self.growth[tile] = *growth;
+            }
+            (self.calm[tile], self.drift_n[tile], self.energy_j[tile]) = (*calm, *drift_n, *energy_j);
+            if *awake {
+                self.region.awake.add(tile);
+            }
+        }
+        let has_moved = |tile: &usize| self.pulling(*tile).chain([*tile]).all(|other| self.moved.has[other]);
+        ensure(self.region.awake.members.iter().all(has_moved), "a tile that is awake and has never moved")?;
+        ensure(self.may_sleep() || self.region.awake.is_full(), "a tile that sleeps where none may")?;
+        ensure(
+            saved.asleep_j.is_finite() && (0.0..f64::INFINITY).contains(&saved.largest),
+            "an energy that is not finite",
+        )?;
+        (self.asleep_j, self.largest) = (saved.asleep_j, saved.largest);
+        self.settle();
+        self.touch_all();
+        Ok(())
+    }
+
+    /// Restores what sleeping tiles remember. Returns how many values that were.
+    pub(super) fn remember_again(&mut self, values: &mut impl Iterator<Item = T>) -> Result<()> {
+        let places: Vec<Range<usize>> = self.places_remembered().collect();
+        if places.iter().any(|place| !place.is_empty()) {
+            self.remember();
+        }
+        for place in places {
+            for value in &mut self.snapshots[place] {
+                *value = values.next().ok_or_else(|| unsound("too few values"))?;
+                ensure(value.is_finite(), "a value that is not finite")?;
+            }
+        }
+        Ok(())
     }
 
     pub(super) fn may_sleep(&self) -> bool {

@@ -13,6 +13,7 @@ use super::contact::{Feel, Surroundings};
 use super::field::BLOCK;
 use super::model::{Model, Plan};
 use super::prescribed::Grasp;
+use super::saved::SavedTissue;
 use crate::scene::profile::Poke;
 use crate::shape::PointId;
 use palpate_touch::Tip;
@@ -150,6 +151,8 @@ pub trait Tissue: Send {
     fn state_hash(&self) -> u128 {
         Hashing::default().add(self, usize::MAX).unwrap_or_default()
     }
+    /// A copy of all that the next steps depend on, from which another thread makes a snapshot. An audit under way is left out.
+    fn save(&self) -> SavedTissue;
     /// A copy of the sheet as it is now, to be read by another thread.
     fn copy(&self) -> SheetCopy;
 }
@@ -171,6 +174,11 @@ impl SheetCopy {
     /// A point.
     pub fn point(&self, point: PointId) -> PointState {
         self.0.point(point)
+    }
+
+    /// XXH3-128 of the state of every point.
+    pub fn state_hash(&self) -> u128 {
+        self.0.state_hash()
     }
 
     /// Adds so many points, or a few more, to the hash. Returns it when all are in.

@@ -63,6 +63,7 @@ pub fn sample(paced: &PacedSample, shape: &dyn RestShape, dropped: u64, now_ns: 
         late_commands: sample.late_commands,
         dropped_samples: dropped,
         recovery_count: sample.recoveries,
+        durable_step: paced.durable_step,
         tools: sample.tools.iter().map(|tool| tool_sample(tool, shape, paced.due_ns, now_ns)).collect(),
     }
 }

@@ -137,6 +137,9 @@ fn as_json(rows: &[Row]) -> Value {
             "overrun_count": session.overrun_count, "overruns_per_s": overruns_per_s,
             "late_commands": session.late_commands, "guard_events": session.guard_events,
             "recoveries": session.recovery_count,
+            "durable_step": session.journal.as_ref().and_then(|journal| journal.durable_step),
+            "journal_lag_s": session.journal.as_ref().map(|journal| journal.lag_s),
+            "journal_fault": session.journal.as_ref().map(|journal| &journal.fault),
             "audit": session.audit.as_ref().map(audit), "streams": session.streams, "held_tools": holders.collect::<Vec<_>>(), "hold_reason": session.hold_reason,
         })
     };

@@ -38,6 +38,9 @@ const LATE_S: f64 = 0.002;
 const CATCH_UP: f64 = 0.1;
 /// Before it catches up, something newer must have been available for this long, s.
 const WATCHED_S: f64 = 0.25;
+/// No time of a path is longer, s, and no place farther, m.
+const LONGEST_S: f64 = 1e12;
+const FARTHEST_M: f64 = 1e12;
 /// Most places in the queue.
 const MOST: usize = 1024;
 
@@ -71,7 +74,89 @@ pub struct Path {
     released: u64,
 }
 
+/// All that the course of a path depends on, as numbers: of a path that goes on elsewhere.
+#[derive(Debug, Clone, PartialEq)]
+#[allow(missing_docs)]
+pub struct PathState {
+    pub at_once: bool,
+    pub begins_m: Option<DVec3>,
+    /// Client times, s, and places, m.
+    pub waiting: Vec<(f64, DVec3)>,
+    pub heading: Option<(f64, DVec3, DVec3)>,
+    pub played: Option<(f64, DVec3)>,
+    pub place_m: Option<DVec3>,
+    pub arrived_s: f64,
+    pub spare_s: f64,
+    pub watched_s: f64,
+    /// [`Path::counts`].
+    pub counts: [u64; 3],
+}
+
+impl PathState {
+    /// Whether a path may have these.
+    fn is_sound(&self) -> bool {
+        let is_time = |time_s: f64| time_s.abs() < LONGEST_S;
+        // The largest component of some that are not numbers may be one.
+        let is_place = |place_m: &DVec3| place_m.is_finite() && place_m.abs().max_element() < FARTHEST_M;
+        let is_passed = |(time_s, place_m): &(f64, DVec3)| is_time(*time_s) && is_place(place_m);
+        let is_heading = |(time_s, place_m, velocity): &(f64, DVec3, DVec3)| {
+            is_passed(&(*time_s, *place_m)) && velocity.length() <= 2.0 * SPEED_M_PER_S
+        };
+        self.waiting.len() <= MOST
+            && self.waiting.iter().chain(&self.played).all(is_passed)
+            && self.waiting.is_sorted_by(|a, b| a.0 < b.0)
+            && self.heading.iter().all(is_heading)
+            && self.begins_m.iter().chain(&self.place_m).all(is_place)
+            // A tool that went to its place at once has arrived for good, and what was never measured is without end.
+            && (is_time(self.arrived_s) || self.arrived_s == f64::INFINITY)
+            && (is_time(self.spare_s) || self.spare_s == f64::INFINITY)
+            && is_time(self.watched_s)
+            && self.counts.iter().all(|count| *count < 1 << 48)
+    }
+}
+
 impl Path {
+    /// All that its course depends on.
+    pub fn state(&self) -> PathState {
+        let Path { at_once, begins_m, waiting, heading, played, place_m, arrived_s, spare_s, watched_s, .. } = self;
+        PathState {
+            at_once: *at_once,
+            begins_m: *begins_m,
+            waiting: waiting.iter().copied().collect(),
+            heading: *heading,
+            played: *played,
+            place_m: *place_m,
+            arrived_s: *arrived_s,
+            spare_s: *spare_s,
+            watched_s: *watched_s,
+            counts: self.counts(),
+        }
+    }
+
+    /// A path that goes on from there; none from what no path has.
+    pub fn restored(state: PathState) -> Option<Self> {
+        if !state.is_sound() {
+            return None;
+        }
+        let PathState { at_once, begins_m, waiting, heading, played, place_m, arrived_s, spare_s, watched_s, counts } =
+            state;
+        let (waiting, [limited, dropped, released]) = (waiting.into(), counts);
+        Some(Path {
+            at_once,
+            begins_m,
+            waiting,
+            heading,
+            played,
+            place_m,
+            arrived_s,
+            spare_s,
+            watched_s,
+            limited,
+            dropped,
+            released,
+        })
+    }
+
     /// Of a grasp, which takes hold where its first place is. (The tool of another path comes from above: it meets the
     /// tissue as a hand does, not from within.)
     pub fn of_grasp() -> Self {

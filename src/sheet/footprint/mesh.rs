@@ -5,9 +5,11 @@ use std::sync::Arc;
 use glam::{DMat3, DVec2, DVec3};
 use palpate_mesh::surface::{Covered, Disc, Place};
 
+use crate::refusal::Result;
 use crate::scene::MeshShape;
 use crate::shape::PointId;
 use crate::sheet::model::Model;
+use crate::sheet::saved::{SavedGround, ensure};
 
 /// A tool that touches nothing goes over to another place of the surface if that is nearer by this part of the radius: it
 /// must not hop to and fro between two.
@@ -28,6 +30,36 @@ impl MeshDisc {
         let nowhere = Place { triangle: 0, barycentric: [1.0 / 3.0; 3], frame: [DVec3::X, DVec3::Y] };
         let place = surface.nearest(DVec3::ZERO).unwrap_or(nowhere);
         MeshDisc { shape: shape.clone(), disc: Disc::new(radius_m, surface.edge_m()), place }
+    }
+
+    /// Its place.
+    pub(super) fn saved(&self) -> SavedGround {
+        let Place { triangle, barycentric, frame } = self.place;
+        SavedGround::Mesh { triangle, barycentric, frame: frame.map(Into::into) }
+    }
+
+    /// Takes the place of another.
+    pub(super) fn restore(&mut self, saved: &SavedGround) -> Result<()> {
+        let SavedGround::Mesh { triangle, barycentric, frame } = saved else { return Ok(()) };
+        let place = Place { triangle: *triangle, barycentric: *barycentric, frame: frame.map(DVec3::from) };
+        let triangles = self.shape.triangles().len();
+        ensure((place.triangle as usize) < triangles, "a tool on a triangle that the tissue has not")?;
+        let hats = place.barycentric;
+        let is_inside =
+            hats.iter().all(|hat| (0.0..=1.0).contains(hat)) && (hats.iter().sum::<f64>() - 1.0).abs() < 1e-6;
+        ensure(is_inside, "a tool beside its triangle")?;
+        let corners_m = self.shape.surface().triangle(&place).map(|vertex| self.shape.vertices_m()[vertex as usize]);
+        let normal = (corners_m[1] - corners_m[0]).cross(corners_m[2] - corners_m[0]).normalize_or_zero();
+        let [along, across] = place.frame;
+        let is_square = |a: DVec3, b: DVec3| a.dot(b).abs() < 1e-6;
+        let is_frame = (along.length() - 1.0).abs() < 1e-6
+            && (across.length() - 1.0).abs() < 1e-6
+            && is_square(along, across)
+            && is_square(along, normal)
+            && is_square(across, normal);
+        ensure(is_frame, "a tool whose directions are not those of its triangle")?;
+        self.place = place;
+        Ok(())
     }
 
     /// Where the place rests, m.

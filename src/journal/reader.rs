@@ -1,0 +1,714 @@
+//! Reads a journal batch by batch, whatever has happened to its file.
+//!
+//! A record that is not as a writer makes it is looked at in the light of what follows it. If a later batch says that the
+//! one here was on the disk for certain, the file is damaged: that is an error, which names the place. Otherwise the file is
+//! torn here: what follows had not reached the disk, and the journal ends with the batch before.
+//!
+//! A chunk's checksum finds every single bit that is other than it was written. What is outside chunks (records' lengths, indexes,
+//! the summary) decides nothing but where chunks are, and their numbers have no gap.
+
+use std::fs::File;
+use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::ops::Range;
+use std::path::Path;
+
+use palpate_proto::journal as pb;
+use prost::Message;
+
+use super::format::{MOST_BYTES, MOST_INPUTS, Topic};
+use super::message::fill_tips;
+use super::records::{
+    CHANNEL, CHUNK, CHUNK_HEAD, DATA_END, HEAD, HEADER, MAGIC, MESSAGE, MESSAGE_HEAD, MESSAGE_INDEX, SCHEMA, number,
+};
+use crate::refusal::{Reason, Refusal, Result};
+
+/// A batch, whose messages are decoded when they are asked for.
+#[derive(Debug, Clone)]
+pub struct Batch {
+    /// Its number.
+    pub number: u64,
+    /// Where its chunk begins in the file.
+    pub offset: u64,
+    /// The file is complete up to this step.
+    pub until_step: u64,
+    /// Batches that were on the disk for certain when it was written.
+    pub durable_batches: u64,
+    /// Inputs in the batches before.
+    pub first_input: u64,
+    /// Inputs in it.
+    pub input_count: u64,
+    /// Time at which it was written.
+    pub unix_ns: u64,
+    place: String,
+    data: Vec<u8>,
+    messages: Vec<(Topic, Range<usize>)>,
+    /// Channel, time and place of each message, also of those that are not known here.
+    places: Vec<(u16, u64, u64)>,
+}
+
+impl Batch {
+    /// Each message of a topic, decoded.
+    fn all<M: Message + Default>(&self, topic: Topic) -> impl Iterator<Item = Result<M>> + '_ {
+        let of_topic = self.messages.iter().filter(move |message| message.0 == topic);
+        of_topic.map(move |(_, range)| {
+            M::decode(&self.data[range.clone()])
+                .map_err(|e| self.refuse(format!("a message {} can't be decoded: {e}", topic.name())))
+        })
+    }
+
+    /// The content of its chunk.
+    pub(super) fn data(&self) -> &[u8] {
+        &self.data
+    }
+
+    /// The index of its chunk.
+    pub(super) fn places(&self) -> &[(u16, u64, u64)] {
+        &self.places
+    }
+
+    /// A refusal of something in it.
+    pub(super) fn refuse(&self, message: String) -> Refusal {
+        self.placed(Refusal::new(Reason::Unreadable, "", message))
+    }
+
+    /// A refusal with the place of this batch.
+    pub(super) fn placed(&self, refusal: Refusal) -> Refusal {
+        let Batch { number, offset, until_step, .. } = self;
+        let field = if refusal.field.is_empty() { String::new() } else { format!("{}: ", refusal.field) };
+        let message = format!("batch {number} at byte {offset}, up to step {until_step}: {field}{}", refusal.message);
+        Refusal { place: Some(self.place.clone()), message, field: String::new(), ..refusal }
+    }
+
+    /// Its inputs, in order.
+    ///
+    /// # Errors
+    /// Refuses what can't be decoded.
+    pub fn inputs(&self) -> Result<Vec<pb::Input>> {
+        let mut inputs = Vec::new();
+        for message in self.all::<pb::Inputs>(Topic::Inputs) {
+            inputs = message?.inputs;
+        }
+        fill_tips(&mut inputs).map_err(|refusal| self.placed(refusal))?;
+        Ok(inputs)
+    }
+
+    /// Its hashes, in order.
+    ///
+    /// # Errors
+    /// Refuses what can't be decoded.
+    pub fn hashes(&self) -> Result<Vec<pb::Hash>> {
+        self.all(Topic::Hashes).collect()
+    }
+
+    /// Its snapshots, in order.
+    ///
+    /// # Errors
+    /// Refuses what can't be decoded.
+    pub fn snapshots(&self) -> Result<Vec<pb::Snapshot>> {
+        self.all(Topic::Snapshots).collect()
+    }
+
+    /// What tools felt.
+    ///
+    /// # Errors
+    /// Refuses what can't be decoded.
+    pub fn felt(&self) -> Result<Vec<pb::Moment>> {
+        let messages: Result<Vec<pb::Felt>> = self.all(Topic::Felt).collect();
+        Ok(messages?.into_iter().flat_map(|felt| felt.moments).collect())
+    }
+
+    /// The end of the journal, if it is in this batch.
+    ///
+    /// # Errors
+    /// Refuses what can't be decoded.
+    pub fn end(&self) -> Result<Option<pb::End>> {
+        self.all(Topic::End).next().transpose()
+    }
+
+    /// The header, which is in the first batch.
+    fn header(&self) -> Result<pb::Header> {
+        self.all(Topic::Header).next().unwrap_or_else(|| Err(self.refuse("the header is missing".to_owned())))
+    }
+
+    /// Whether it has messages of a topic.
+    pub fn has(&self, topic: Topic) -> bool {
+        self.messages.iter().any(|message| message.0 == topic)
+    }
+}
+
+/// Where a snapshot is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SnapshotAt {
+    /// Steps done.
+    pub step: u64,
+    /// Where its chunk begins.
+    pub offset: u64,
+    /// The number of its batch.
+    pub batch: u64,
+}
+
+/// What a journal has, after one pass over it.
+#[derive(Debug, Clone, Default)]
+pub struct Survey {
+    /// Batches.
+    pub batches: u64,
+    /// The file is complete up to this step: the last durable one.
+    pub until_step: u64,
+    /// Inputs.
+    pub inputs: u64,
+    /// Hashes.
+    pub hashes: u64,
+    /// Snapshots, by ascending step.
+    pub snapshots: Vec<SnapshotAt>,
+    /// Times of the first and the last batch.
+    pub unix_ns: [u64; 2],
+    /// The end, if it was written.
+    pub end: Option<pb::End>,
+    /// Bytes up to the end of the last whole batch.
+    pub whole_bytes: u64,
+    /// Bytes after that which belong to no whole batch.
+    pub torn_bytes: u64,
+    /// Whether the file has a summary, so that every tool opens it.
+    pub sealed: bool,
+}
+
+/// An index is read over, not sought over, if it has no more bytes.
+const SHORT: usize = 4096;
+
+/// What comes next in a file.
+enum Next {
+    Chunk(u64),
+    DataEnd,
+    End,
+    /// What is wrong.
+    Wrong(String),
+}
+
+/// Reads a journal. It takes the memory of one batch.
+pub struct Reader<R> {
+    place: String,
+    source: R,
+    length: u64,
+    /// Where the next record begins, and the number of the next batch and input.
+    at: u64,
+    batch: u64,
+    input: u64,
+    header: pb::Header,
+    /// Where the first chunk begins.
+    begin: u64,
+    /// Channel numbers of the topics.
+    channels: Vec<(u16, Topic)>,
+    torn_bytes: u64,
+    sealed: bool,
+    ended: bool,
+    /// Where the source stands: to seek empties its buffer.
+    stands: u64,
+    /// The newest head of a record that was read, and where it is.
+    peeked: Option<(u64, (u8, u64))>,
+}
+
+impl Reader<BufReader<File>> {
+    /// Opens a file.
+    ///
+    /// # Errors
+    /// Refuses a file that can't be read, and as [`Reader::new`] does.
+    pub fn open(path: &Path) -> Result<Self> {
+        let place = path.display().to_string();
+        let unreadable = |e: std::io::Error| Refusal {
+            place: Some(place.clone()),
+            ..Refusal::new(Reason::Unreadable, "", format!("can't be read: {e}"))
+        };
+        let file = File::open(path).map_err(unreadable)?;
+        if file.metadata().map_err(unreadable)?.is_dir() {
+            return Err(unreadable(std::io::Error::other("it is a folder")));
+        }
+        Reader::new(&place, BufReader::with_capacity(1 << 16, file))
+    }
+}
+
+impl<R: Read + Seek> Reader<R> {
+    /// Reads the beginning of a journal; `place` is what refusals call it.
+    ///
+    /// # Errors
+    /// Refuses what is no journal, and one without a whole batch ([`Reason::Missing`]): then its session was never told to be
+    /// durable.
+    pub fn new(place: &str, mut source: R) -> Result<Self> {
+        let length = source.seek(SeekFrom::End(0)).map_err(|e| unreadable(place, &e.to_string()))?;
+        let mut reader = Reader {
+            place: place.to_owned(),
+            source,
+            length,
+            at: 0,
+            batch: 0,
+            input: 0,
+            header: pb::Header::default(),
+            begin: 0,
+            channels: Vec::new(),
+            torn_bytes: 0,
+            sealed: false,
+            ended: false,
+            stands: length,
+            peeked: None,
+        };
+        let mut magic = [0; 8];
+        let head = if length >= 17 { reader.read_at(0, &mut magic).and_then(|()| reader.head(8))? } else { (0, 0) };
+        if magic != MAGIC || head.0 != HEADER || head.1 > 1 << 16 {
+            let what = if length < 17 { "it is too short" } else { "it does not begin as an MCAP file" };
+            let reason = if length < 17 { Reason::Missing } else { Reason::Unreadable };
+            return Err(Refusal { reason, ..unreadable(place, &format!("no journal: {what}")) });
+        }
+        reader.at = 8 + HEAD + head.1;
+        reader.begin = reader.at;
+        let begin = reader.at;
+        let Some(first) = reader.next_batch()? else {
+            let message = "has no whole batch: the server ended before the journal's beginning was on the disk";
+            return Err(Refusal { place: Some(place.to_owned()), ..Refusal::new(Reason::Missing, "", message) });
+        };
+        reader.header = first.header()?;
+        (reader.at, reader.batch, reader.input, reader.torn_bytes, reader.ended) = (begin, 0, 0, 0, false);
+        Ok(reader)
+    }
+
+    /// The header.
+    pub fn header(&self) -> &pb::Header {
+        &self.header
+    }
+
+    /// What refusals call the file.
+    pub fn place(&self) -> &str {
+        &self.place
+    }
+
+    /// Length of the file, bytes.
+    pub fn length(&self) -> u64 {
+        self.length
+    }
+
+    /// How much of it was read, bytes.
+    pub fn position(&self) -> u64 {
+        self.at
+    }
+
+    /// Bytes at the end that belong to no whole batch; known after the last batch.
+    pub fn torn_bytes(&self) -> u64 {
+        self.torn_bytes
+    }
+
+    /// A refusal of something in the file.
+    pub(super) fn refuse(&self, message: &str) -> Refusal {
+        unreadable(&self.place, message)
+    }
+
+    /// Where a batch is that holds a snapshot: the next batch will be that one.
+    pub fn go_to(&mut self, snapshot: &SnapshotAt) {
+        (self.at, self.batch, self.ended, self.torn_bytes) = (snapshot.offset, snapshot.batch, false, 0);
+        self.input = u64::MAX;
+    }
+
+    /// Goes back to the first batch.
+    pub fn rewind(&mut self) {
+        (self.at, self.batch, self.input, self.ended, self.torn_bytes) = (self.begin, 0, 0, false, 0);
+    }
+
+    /// The bytes before the first batch.
+    ///
+    /// # Errors
+    /// Refuses a file that can't be read.
+    pub(super) fn beginning(&mut self) -> Result<Vec<u8>> {
+        let mut bytes = self.buffer(self.begin)?;
+        self.read_at(0, &mut bytes)?;
+        Ok(bytes)
+    }
+
+    /// One pass over the file, from its beginning, which is where it is afterwards. `progress` gets the bytes that are read.
+    ///
+    /// # Errors
+    /// Refuses a file that is damaged in the middle.
+    pub fn survey(&mut self, progress: &mut dyn FnMut(u64)) -> Result<Survey> {
+        self.rewind();
+        let mut survey = Survey { whole_bytes: self.begin, ..Survey::default() };
+        while let Some(batch) = self.next_batch()? {
+            survey.batches += 1;
+            survey.until_step = batch.until_step;
+            survey.inputs += batch.input_count;
+            survey.hashes += batch.messages.iter().filter(|message| message.0 == Topic::Hashes).count() as u64;
+            if batch.has(Topic::Snapshots) {
+                for message in batch.all::<SnapshotStep>(Topic::Snapshots) {
+                    let step = message?.step;
+                    survey.snapshots.push(SnapshotAt { step, offset: batch.offset, batch: batch.number });
+                }
+            }
+            let first = if survey.batches == 1 { batch.unix_ns } else { survey.unix_ns[0] };
+            survey.unix_ns = [first, batch.unix_ns];
+            survey.end = batch.end()?.or(survey.end);
+            survey.whole_bytes = self.at;
+            progress(self.at);
+        }
+        (survey.torn_bytes, survey.sealed) = (self.torn_bytes, self.sealed);
+        self.rewind();
+        Ok(survey)
+    }
+
+    /// The next batch; `None` after the last whole one.
+    ///
+    /// # Errors
+    /// Refuses a file that is damaged before its end.
+    pub fn next_batch(&mut self) -> Result<Option<Batch>> {
+        while !self.ended {
+            let wrong = match self.next_record()? {
+                Next::End | Next::DataEnd => {
+                    self.ended = true;
+                    break;
+                }
+                Next::Wrong(what) => what,
+                Next::Chunk(size) => {
+                    let mut data = self.buffer(size)?;
+                    self.read_at(self.at + HEAD, &mut data)?;
+                    match self.batch(data) {
+                        Ok(batch) => {
+                            self.at += HEAD + size;
+                            self.batch += 1;
+                            self.input = batch.first_input + batch.input_count;
+                            self.skip_indexes()?;
+                            return Ok(Some(batch));
+                        }
+                        Err(what) => what,
+                    }
+                }
+            };
+            self.ended = true;
+            self.judge(&wrong)?;
+        }
+        Ok(None)
+    }
+
+    /// Memory for so many bytes of the file, which has them.
+    fn buffer(&self, size: u64) -> Result<Vec<u8>> {
+        let mut data: Vec<u8> = Vec::new();
+        let size = usize::try_from(size).ok().filter(|size| data.try_reserve_exact(*size).is_ok());
+        let size = size.ok_or_else(|| self.refuse("there is no memory for a batch of it"))?;
+        data.resize(size, 0);
+        Ok(data)
+    }
+
+    fn read_at(&mut self, at: u64, into: &mut [u8]) -> Result<()> {
+        let sought = if self.stands == at { Ok(at) } else { self.source.seek(SeekFrom::Start(at)) };
+        self.stands = u64::MAX;
+        let read = sought.and_then(|_| self.source.read_exact(into));
+        read.map_err(|e| unreadable(&self.place, &format!("can't be read at byte {at}: {e}")))?;
+        self.stands = at + into.len() as u64;
+        Ok(())
+    }
+
+    /// Kind and length of the record at a place.
+    fn head(&mut self, at: u64) -> Result<(u8, u64)> {
+        if let Some((_, head)) = self.peeked.filter(|peeked| peeked.0 == at) {
+            // What follows is read next.
+            return Ok(head);
+        }
+        let mut bytes = [0; HEAD as usize];
+        self.read_at(at, &mut bytes)?;
+        let head = (bytes[0], number::<8>(&bytes, 1).unwrap_or_default());
+        self.peeked = Some((at, head));
+        Ok(head)
+    }
+
+    fn next_record(&mut self) -> Result<Next> {
+        let left = self.length.saturating_sub(self.at);
+        if left == 0 {
+            return Ok(Next::End);
+        }
+        if left < HEAD {
+            return Ok(Next::Wrong("a record is cut off".to_owned()));
+        }
+        let (kind, length) = self.head(self.at)?;
+        Ok(match kind {
+            CHUNK if length > left - HEAD => Next::Wrong("a chunk is cut off".to_owned()),
+            CHUNK if length > MOST_BYTES => Next::Wrong(format!("a chunk has {length} bytes, more than {MOST_BYTES}")),
+            CHUNK if length < CHUNK_HEAD => Next::Wrong("a chunk is too short".to_owned()),
+            CHUNK => Next::Chunk(length),
+            DATA_END if length == 4 => {
+                // The last record is the footer, and the file ends as it began.
+                let mut magic = [0; 8];
+                if left > HEAD + 4 + 8 {
+                    self.read_at(self.length - 8, &mut magic)?;
+                }
+                self.sealed = magic == MAGIC;
+                Next::DataEnd
+            }
+            kind => Next::Wrong(format!("there is a record of kind {kind}, where a chunk should be")),
+        })
+    }
+
+    /// Skips the indexes after a chunk, as far as they are whole.
+    fn skip_indexes(&mut self) -> Result<()> {
+        while self.length.saturating_sub(self.at) >= HEAD {
+            let (kind, length) = self.head(self.at)?;
+            if kind != MESSAGE_INDEX || length > self.length - self.at - HEAD {
+                break;
+            }
+            if length <= SHORT as u64 {
+                let mut index = [0; SHORT];
+                self.read_at(self.at + HEAD, &mut index[..length as usize])?;
+            }
+            self.at += HEAD + length;
+        }
+        Ok(())
+    }
+
+    /// What a chunk has, or what is wrong with it.
+    fn batch(&mut self, data: Vec<u8>) -> std::result::Result<Batch, String> {
+        let messages = messages_of(&data, if self.batch == 0 { None } else { Some(&self.channels) })?;
+        if let Some(channels) = messages.channels {
+            self.channels = channels;
+        }
+        let head = messages.head.ok_or("a chunk has no inputs")?;
+        if head.batch != self.batch {
+            return Err(format!("there is batch {}, where batch {} should be", head.batch, self.batch));
+        }
+        if self.input != u64::MAX && head.first_input != self.input {
+            return Err(format!("there is input {}, where input {} should be", head.first_input, self.input));
+        }
+        if head.first_input.checked_add(head.input_count).is_none() {
+            return Err("the number of an input is too large".to_owned());
+        }
+        Ok(Batch {
+            number: head.batch,
+            offset: self.at,
+            until_step: head.until_step,
+            durable_batches: head.durable_batches,
+            first_input: head.first_input,
+            input_count: head.input_count,
+            unix_ns: messages.unix_ns,
+            place: self.place.clone(),
+            data,
+            messages: messages.found,
+            places: messages.places,
+        })
+    }
+
+    /// Decides what is wrong: damage, which is an error, or a torn end.
+    fn judge(&mut self, what: &str) -> Result<()> {
+        let (at, batch) = (self.at, self.batch);
+        let later = self.find_durable(at + 1, batch)?;
+        if batch == 0 && self.channels.is_empty() && self.find_any(at + 1)? {
+            return Err(self.refuse(&format!("damaged at byte {at}, in its header: {what}")));
+        }
+        if let Some(found) = later {
+            let message = format!(
+                "damaged at byte {at}, in batch {batch}: {what}; batch {} at byte {} says that it had been on the disk",
+                found.0, found.1
+            );
+            return Err(self.refuse(&message));
+        }
+        self.torn_bytes = self.length - at;
+        Ok(())
+    }
+
+    /// A later batch which says that batch `wanted` was on the disk for certain: its number, and where it is.
+    fn find_durable(&mut self, from: u64, wanted: u64) -> Result<Option<(u64, u64)>> {
+        let channels = std::mem::take(&mut self.channels);
+        let found = self.find_chunk(from, &mut |data| {
+            let head = messages_of(data, Some(&channels)).ok().and_then(|messages| messages.head)?;
+            (head.batch > wanted && head.durable_batches > wanted).then_some(head.batch)
+        });
+        self.channels = channels;
+        found
+    }
+
+    /// Whether there is any whole chunk.
+    fn find_any(&mut self, from: u64) -> Result<bool> {
+        Ok(self.find_chunk(from, &mut |_| Some(0))?.is_some())
+    }
+
+    /// The first whole chunk at or after `from` that `wanted` accepts, with its place.
+    fn find_chunk(&mut self, from: u64, wanted: &mut dyn FnMut(&[u8]) -> Option<u64>) -> Result<Option<(u64, u64)>> {
+        const WINDOW: u64 = 1 << 16;
+        let mut window = vec![0; (WINDOW + HEAD + CHUNK_HEAD) as usize];
+        // What looks like chunks and is none is not read for ever.
+        let mut budget = 4 * (self.length - from.min(self.length)) + (1 << 20);
+        let mut at = from;
+        while at + HEAD + CHUNK_HEAD <= self.length {
+            let size = (self.length - at).min(window.len() as u64) as usize;
+            self.read_at(at, &mut window[..size])?;
+            let most = (size as u64 - HEAD - CHUNK_HEAD).min(WINDOW - 1);
+            let mut next = at + most + 1;
+            for place in 0..=most {
+                let head = &window[place as usize..][..(HEAD + CHUNK_HEAD) as usize];
+                let Some(length) = plain_chunk(head).filter(|length| *length <= self.length - at - place - HEAD) else {
+                    continue;
+                };
+                if length > budget.min(MOST_BYTES) {
+                    continue;
+                }
+                budget -= length;
+                let mut data = self.buffer(length)?;
+                self.read_at(at + place + HEAD, &mut data)?;
+                if is_sound(&data) {
+                    if let Some(found) = wanted(&data) {
+                        return Ok(Some((found, at + place)));
+                    }
+                    next = at + place + HEAD + length;
+                    break;
+                }
+            }
+            at = next;
+        }
+        Ok(None)
+    }
+}
+
+/// The step of a snapshot, without the rest of it.
+#[derive(Clone, PartialEq, Message)]
+struct SnapshotStep {
+    #[prost(uint64, tag = "1")]
+    step: u64,
+}
+
+fn unreadable(place: &str, message: &str) -> Refusal {
+    Refusal { place: Some(place.to_owned()), ..Refusal::new(Reason::Unreadable, "", message) }
+}
+
+/// The length of a chunk that is not compressed, if `head` begins one.
+fn plain_chunk(head: &[u8]) -> Option<u64> {
+    if head[0] != CHUNK {
+        return None;
+    }
+    let length = number::<8>(head, 1)?;
+    let size = length.checked_sub(CHUNK_HEAD)?;
+    let [plain, packed] = [25, 41].map(|at| number::<8>(head, at));
+    (plain == Some(size) && packed == Some(size) && number::<4>(head, 37) == Some(0)).then_some(length)
+}
+
+/// Whether the checksum of a chunk is that of its messages.
+fn is_sound(data: &[u8]) -> bool {
+    number::<4>(data, 24) == Some(u64::from(crc32fast::hash(&data[CHUNK_HEAD as usize..])))
+}
+
+/// The beginning of a message `Inputs`.
+#[derive(Debug, Default)]
+struct InputsHead {
+    batch: u64,
+    until_step: u64,
+    durable_batches: u64,
+    first_input: u64,
+    input_count: u64,
+}
+
+impl InputsHead {
+    /// Reads the numbers, and counts the inputs: so their memory is known before they are decoded.
+    fn read(mut bytes: &[u8]) -> Option<Self> {
+        let mut head = InputsHead::default();
+        while !bytes.is_empty() {
+            let key = varint(&mut bytes)?;
+            match (key >> 3, key & 7) {
+                (field @ 1..=4, 0) => {
+                    let value = varint(&mut bytes)?;
+                    match field {
+                        1 => head.batch = value,
+                        2 => head.until_step = value,
+                        3 => head.durable_batches = value,
+                        _ => head.first_input = value,
+                    }
+                }
+                (5, 2) => {
+                    let length = usize::try_from(varint(&mut bytes)?).ok()?;
+                    bytes = bytes.get(length..)?;
+                    head.input_count += 1;
+                }
+                _ => return None,
+            }
+        }
+        (head.input_count <= MOST_INPUTS as u64).then_some(head)
+    }
+}
+
+/// Takes a number as protobuf writes it.
+fn varint(bytes: &mut &[u8]) -> Option<u64> {
+    let mut value = 0_u64;
+    for shift in (0..64).step_by(7) {
+        let (byte, rest) = bytes.split_first()?;
+        *bytes = rest;
+        value |= u64::from(byte & 0x7F) << shift;
+        if *byte < 0x80 {
+            return Some(value);
+        }
+    }
+    None
+}
+
+/// What is in a chunk.
+struct Messages {
+    found: Vec<(Topic, Range<usize>)>,
+    places: Vec<(u16, u64, u64)>,
+    head: Option<InputsHead>,
+    unix_ns: u64,
+    /// The channels that it defines.
+    channels: Option<Vec<(u16, Topic)>>,
+}
+
+/// Most messages of a chunk, and records: a writer makes few.
+const MOST_MESSAGES: usize = 1 << 16;
+
+/// The messages of a chunk; `channels` are those that are known, if it does not define them itself.
+fn messages_of(data: &[u8], channels: Option<&[(u16, Topic)]>) -> std::result::Result<Messages, String> {
+    let cut_off = || "a record within a chunk is cut off".to_owned();
+    let size = (data.len() as u64).saturating_sub(CHUNK_HEAD);
+    let sizes = [number::<8>(data, 16), number::<8>(data, 32)];
+    if number::<4>(data, 28) != Some(0) {
+        return Err("a chunk is compressed; `mcap decompress` of the MCAP tools makes it readable".to_owned());
+    }
+    if sizes != [Some(size); 2] {
+        return Err("a chunk has another size than it says".to_owned());
+    }
+    if !is_sound(data) {
+        return Err("the checksum of a chunk is wrong".to_owned());
+    }
+    let (mut found, mut head, mut unix_ns, mut defined) = (Vec::new(), None, 0, Vec::new());
+    let mut places = Vec::new();
+    let mut at = CHUNK_HEAD as usize;
+    while at < data.len() {
+        let kind = data[at];
+        let length = number::<8>(data, at + 1).ok_or_else(cut_off)?;
+        let begin = at + HEAD as usize;
+        let end = usize::try_from(length).ok().and_then(|length| begin.checked_add(length));
+        let end = end.filter(|end| *end <= data.len()).ok_or_else(cut_off)?;
+        match kind {
+            SCHEMA => {}
+            CHANNEL => {
+                let body = mcap::parse_record(CHANNEL, &data[begin..end]);
+                let Ok(mcap::records::Record::Channel(channel)) = body else {
+                    return Err("a channel can't be read".to_owned());
+                };
+                let topic = Topic::ALL.into_iter().find(|topic| topic.name() == channel.topic);
+                defined.extend(topic.map(|topic| (channel.id, topic)));
+            }
+            MESSAGE => {
+                let channel = number::<2>(data, begin).filter(|_| begin + MESSAGE_HEAD <= end).ok_or_else(cut_off)?;
+                let known = channels.unwrap_or(&defined);
+                let topic = known.iter().find(|known| u64::from(known.0) == channel).map(|known| known.1);
+                unix_ns = number::<8>(data, begin + 6).unwrap_or_default();
+                #[allow(clippy::cast_possible_truncation)]
+                places.push((channel as u16, unix_ns, at as u64 - CHUNK_HEAD));
+                // Channels of later versions are passed over.
+                if let Some(topic) = topic {
+                    let range = begin + MESSAGE_HEAD..end;
+                    if topic == Topic::Inputs {
+                        let read = InputsHead::read(&data[range.clone()]);
+                        if head.replace(read.ok_or("inputs can't be decoded")?).is_some() {
+                            return Err("a chunk has inputs twice".to_owned());
+                        }
+                    }
+                    found.push((topic, range));
+                }
+            }
+            kind => return Err(format!("a chunk has a record of kind {kind}")),
+        }
+        if places.len() + defined.len() > MOST_MESSAGES {
+            return Err("a chunk has too many messages".to_owned());
+        }
+        at = end;
+    }
+    places.sort_by_key(|(channel, ..)| *channel);
+    Ok(Messages { found, places, head, unix_ns, channels: channels.is_none().then_some(defined) })
+}

@@ -1,0 +1,81 @@
+//! What a session tells its tape, from its stepping thread.
+
+use std::sync::Arc;
+
+use super::running::Running;
+use super::tape::Event;
+use crate::session::input::Input;
+use crate::sheet::Model;
+
+impl Running {
+    /// Tells what happens now.
+    pub(super) fn note(&self, event: Event) {
+        if let Some(recorder) = &self.recorder {
+            recorder.tape.note(self.session.step_count(), event);
+        }
+    }
+
+    /// Tells what acts on the session now.
+    pub(super) fn note_input(&self, input: Input) {
+        self.note(Event::Input(input));
+    }
+
+    /// Tells what acts in the coming step.
+    pub(super) fn note_inputs(&self, change: Option<&Arc<Model>>) {
+        let Some(recorder) = &self.recorder else { return };
+        let step = self.session.step_count();
+        if let Some(model) = change {
+            recorder.tape.note(step, Event::Input(Input::Tissue(model.clone())));
+        }
+        for due in &self.due {
+            recorder.tape.note(step, Event::Input(Input::Command(due.clone())));
+        }
+    }
+
+    /// Tells how the tissue is after a step.
+    pub(super) fn note_state(&mut self) {
+        let Some(recorder) = &mut self.recorder else { return };
+        let (session, tape) = (&self.session, &recorder.tape);
+        let step = session.step_count();
+        if session.hold_reason().is_some() {
+            // The guard has held it, as it does wherever the same inputs act.
+            return tape.is_told_until(step, true);
+        }
+        let is_at_rest = session.rests_until().is_some();
+        let comes_to_rest = is_at_rest && !std::mem::replace(&mut recorder.was_at_rest, is_at_rest);
+        if recorder.cadence.wants_felt(step) {
+            let felt = session.felt();
+            if !felt.is_empty() {
+                tape.note(step, Event::Felt(felt));
+            }
+        }
+        if recorder.cadence.wants_hash(step) {
+            tape.note(step, Event::Hash(session.copy()));
+        }
+        if recorder.cadence.wants_snapshot(step, comes_to_rest) {
+            recorder.snapshot(session);
+        }
+        recorder.tape.is_told_until(step, is_at_rest);
+    }
+
+    /// Tells that steps were passed over at rest.
+    pub(super) fn note_rest(&self) {
+        if let Some(recorder) = &self.recorder {
+            recorder.tape.is_told_until(self.session.step_count(), true);
+        }
+    }
+
+    /// Time stands: what is told so far goes to the disk.
+    pub(super) fn note_standstill(&self) {
+        if let Some(recorder) = &self.recorder {
+            recorder.tape.hurry();
+        }
+    }
+
+    /// The server ends: its successor continues from the state as it is now.
+    pub(super) fn note_the_end(&mut self) {
+        let Some(recorder) = &self.recorder else { return };
+        recorder.snapshot(&self.session);
+        recorder.tape.is_told_until(self.session.step_count(), true);
+    }
+}

@@ -1,0 +1,40 @@
+//! `palpate journal cut`: a part of a journal, as a journal.
+
+use std::path::PathBuf;
+
+use palpate::journal::Reader;
+use palpate::journal::mend;
+
+use super::super::Failure;
+use super::Source;
+use super::output::{new_file, unwritten};
+
+#[derive(clap::Args)]
+pub(super) struct CutArguments {
+    #[command(flatten)]
+    source: Source,
+    /// The step that it begins with
+    #[arg(long, value_name = "STEP")]
+    from: u64,
+    /// The step that it ends with
+    #[arg(long, value_name = "STEP")]
+    to: u64,
+    /// The new journal
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+}
+
+/// Cuts a journal.
+pub(super) fn cut(arguments: &CutArguments) -> Result<(), Failure> {
+    let CutArguments { source, from, to, output } = arguments;
+    let limits = source.limits()?;
+    source.open()?;
+    let mut file = new_file(output)?;
+    let cut = mend::cut(|| Reader::open(&source.file), [*from, *to], &limits, &mut file);
+    if let Err(refusal) = cut {
+        // What is half of a journal helps nobody.
+        let _ = std::fs::remove_file(output);
+        return Err(refusal.into());
+    }
+    file.sync_all().map_err(|e| unwritten(output, &e))
+}

@@ -1,0 +1,148 @@
+//! `palpate journal list`: the journals of a folder.
+
+use std::fmt::Write as _;
+use std::path::PathBuf;
+
+use palpate::journal::file::{self, JournalFile};
+use palpate::journal::{Reader, Survey, pb};
+use serde::Serialize;
+
+use super::super::Failure;
+use super::output::{output, utc, written};
+
+#[derive(clap::Args)]
+pub(super) struct ListArguments {
+    /// The folder: that of `palpate serve --journal`
+    dir: PathBuf,
+    /// Write JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// How a journal ends.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+enum State {
+    /// The session was deleted.
+    Deleted,
+    /// The server ended, and the session goes on in the next run.
+    Drained,
+    /// It is a part of another.
+    Cut,
+    /// It was recovered.
+    Recovered,
+    /// A server writes it, or was killed.
+    Unfinished,
+    /// The same, and there are bytes of no whole batch at its end.
+    Torn,
+    /// It can't be read, or is damaged in the middle.
+    Damaged,
+}
+
+#[derive(Serialize)]
+struct Row {
+    session_id: String,
+    run: u64,
+    file: PathBuf,
+    bytes: u64,
+    state: State,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    problem: Option<String>,
+    #[serde(flatten, skip_serializing_if = "Option::is_none")]
+    more: Option<More>,
+}
+
+#[derive(Serialize)]
+struct More {
+    scene: String,
+    owner: String,
+    version: String,
+    begun: String,
+    ended: String,
+    begin_step: u64,
+    /// The last step up to which it is complete.
+    durable_step: u64,
+    rate_hz: f64,
+    inputs: u64,
+    hashes: u64,
+    snapshots: usize,
+    torn_bytes: u64,
+    sealed: bool,
+}
+
+fn state(survey: &Survey) -> State {
+    match survey.end.as_ref().map(pb::End::why) {
+        Some(pb::Why::Deleted) => State::Deleted,
+        Some(pb::Why::Drained | pb::Why::Unspecified) => State::Drained,
+        Some(pb::Why::Cut) => State::Cut,
+        Some(pb::Why::Recovered) => State::Recovered,
+        None if survey.torn_bytes > 0 => State::Torn,
+        None => State::Unfinished,
+    }
+}
+
+fn row(JournalFile { session_id, run, path }: JournalFile) -> Row {
+    let bytes = std::fs::metadata(&path).map_or(0, |metadata| metadata.len());
+    let read = Reader::open(&path).and_then(|mut reader| {
+        let survey = reader.survey(&mut |_| {})?;
+        let header = reader.header();
+        let more = More {
+            scene: header.scene.as_ref().map(|scene| scene.name.clone()).unwrap_or_default(),
+            owner: header.owner.clone(),
+            version: header.version.clone(),
+            begun: utc(survey.unix_ns[0]),
+            ended: utc(survey.unix_ns[1]),
+            begin_step: header.begin_step,
+            durable_step: survey.until_step,
+            rate_hz: header.rate_hz,
+            inputs: survey.inputs,
+            hashes: survey.hashes,
+            snapshots: survey.snapshots.len(),
+            torn_bytes: survey.torn_bytes,
+            sealed: survey.sealed,
+        };
+        Ok((state(&survey), more))
+    });
+    let (state, problem, more) = match read {
+        Ok((state, more)) => (state, None, Some(more)),
+        Err(refusal) => (State::Damaged, Some(refusal.message), None),
+    };
+    Row { session_id, run, file: path, bytes, state, problem, more }
+}
+
+/// Lists the journals of a folder.
+pub(super) fn list(arguments: &ListArguments) -> Result<(), Failure> {
+    let ListArguments { dir, json } = arguments;
+    let files = file::list(dir).map_err(|e| {
+        Failure::Refused(format!("{}: can't be read: {e}; give the folder of `palpate serve --journal`", dir.display()))
+    })?;
+    let rows = files.into_iter().map(row);
+    let mut text = String::new();
+    if *json {
+        let rows: Vec<Row> = rows.collect();
+        text = serde_json::to_string_pretty(&rows).map_err(|e| Failure::Failed(e.to_string()))? + "\n";
+    } else {
+        let head = ["session", "run", "state", "begun (UTC)", "from step", "durable step", "kB", "scene"];
+        let [session, run, state, begun, from, durable, size, scene] = head;
+        let _ =
+            writeln!(text, "{session:<32} {run:>4} {state:<10} {begun:<19} {from:>10} {durable:>12} {size:>9} {scene}");
+        for row in rows {
+            let state = serde_json::to_value(row.state).ok().and_then(|name| name.as_str().map(str::to_owned));
+            let _ = write!(text, "{:<32} {:>4} {:<10} ", row.session_id, row.run, state.unwrap_or_default());
+            let _ = match (&row.more, &row.problem) {
+                (Some(more), _) => writeln!(
+                    text,
+                    "{:<19} {:>10} {:>12} {:>9} {}",
+                    &more.begun[..19.min(more.begun.len())],
+                    more.begin_step,
+                    more.durable_step,
+                    row.bytes.div_ceil(1000),
+                    more.scene
+                ),
+                (None, problem) => writeln!(text, "{}", problem.as_deref().unwrap_or_default()),
+            };
+        }
+    }
+    let mut out = output(None)?;
+    written(out.write_all(text.as_bytes()).and_then(|()| out.flush()))
+}

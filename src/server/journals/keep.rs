@@ -1,0 +1,96 @@
+//! How long journals are kept.
+
+use std::str::FromStr;
+use std::time::Duration;
+
+use serde::Deserialize;
+
+use crate::budget::parse_bytes;
+
+/// How long the journals of sessions that have ended are kept, and how many bytes all journals may take before the oldest of these
+/// are removed. The newest of a session that goes on, and those that nobody has continued, are never removed.
+#[derive(Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(try_from = "String")]
+pub struct Keep {
+    /// The age from which one is removed.
+    pub age: Duration,
+    /// All together take at most so much.
+    pub bytes: u64,
+}
+
+impl std::fmt::Debug for Keep {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{} s, {} bytes", self.age.as_secs(), self.bytes)
+    }
+}
+
+impl Default for Keep {
+    fn default() -> Self {
+        Keep { age: Duration::from_secs(30 * DAY_S), bytes: 10 << 30 }
+    }
+}
+
+const DAY_S: u64 = 24 * 3600;
+
+impl FromStr for Keep {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        if text.trim() == "0" {
+            return Ok(Keep { age: Duration::ZERO, bytes: 0 });
+        }
+        let (mut age, mut bytes) = (None, None);
+        for part in text.split(',').map(str::trim) {
+            let is_told_twice = match age_of(part) {
+                Some(found) => age.replace(found).is_some(),
+                None => bytes
+                    .replace(parse_bytes(part).map_err(|_| {
+                        format!("`{part}` is neither an age (30d, 12h, 90m) nor a size (10GiB, 500MiB)")
+                    })?)
+                    .is_some(),
+            };
+            if is_told_twice {
+                return Err(format!("`{text}` has two ages or two sizes"));
+            }
+        }
+        // What is not told has no bound.
+        Ok(Keep { age: age.unwrap_or(Duration::MAX), bytes: bytes.unwrap_or(u64::MAX) })
+    }
+}
+
+impl TryFrom<String> for Keep {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        text.parse()
+    }
+}
+
+fn age_of(text: &str) -> Option<Duration> {
+    let unit_s = match text.chars().last()? {
+        'd' => DAY_S,
+        'h' => 3600,
+        'm' => 60,
+        's' => 1,
+        _ => return None,
+    };
+    let count: u64 = text[..text.len() - 1].trim().parse().ok()?;
+    Some(Duration::from_secs(count.checked_mul(unit_s)?))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_age_a_size_or_both() {
+        let hour = Duration::from_secs(3600);
+        assert_eq!("12h".parse(), Ok(Keep { age: 12 * hour, bytes: u64::MAX }));
+        assert_eq!("2d, 1GiB".parse(), Ok(Keep { age: 48 * hour, bytes: 1 << 30 }));
+        assert_eq!("500MiB".parse(), Ok(Keep { age: Duration::MAX, bytes: 500 << 20 }));
+        assert_eq!("0".parse(), Ok(Keep { age: Duration::ZERO, bytes: 0 }));
+        for wrong in ["", "12x", "1d,2d", "1GiB,2GiB", "d", "-1d", "99999999999999999999d"] {
+            assert!(wrong.parse::<Keep>().is_err(), "{wrong}");
+        }
+    }
+}

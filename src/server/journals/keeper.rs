@@ -1,0 +1,274 @@
+//! The thread that writes journals (`journal`): it takes what the tapes of all sessions hold, appends it to their files, and syncs
+//! all of them at once. No session waits for it.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use super::folder::{Folder, Grown};
+use super::keep::Keep;
+use super::old;
+use crate::journal::{self, Opening, Writer, pb};
+use crate::pace::clock::now_ns;
+use crate::pace::tape::{About, Event, Noted, Tape, TapeQueue};
+
+/// A round of syncs begins so long after the one before at the earliest: what happens meanwhile goes with it.
+const ROUND: Duration = Duration::from_millis(20);
+
+/// Old journals are looked for so often.
+const SWEEP: Duration = Duration::from_secs(60);
+
+/// What the thread counts of itself, for the metrics.
+#[derive(Debug, Default)]
+pub(crate) struct KeeperTally {
+    /// Bytes that were written.
+    pub(crate) bytes: AtomicU64,
+    /// Rounds of syncs.
+    pub(crate) rounds: AtomicU64,
+    /// Journals that broke.
+    pub(crate) broken: AtomicU64,
+    /// From the newest of what happened to its being on disk, in the last round, ns.
+    pub(crate) lag_ns: AtomicU64,
+}
+
+/// The journal of a session, while it is written.
+struct Entry {
+    tape: Arc<Tape>,
+    /// `None` when it is complete.
+    writer: Option<Writer>,
+    file: Grown,
+}
+
+pub(super) struct Keeper {
+    folder: Arc<Folder>,
+    keep: Keep,
+    queue: Arc<TapeQueue>,
+    tally: Arc<KeeperTally>,
+    /// The newest run of each session that was found in the folder, or has begun.
+    runs: BTreeMap<String, u64>,
+    /// Journals that nobody could continue: they are left as they are.
+    left_alone: BTreeSet<PathBuf>,
+    entries: BTreeMap<String, Entry>,
+}
+
+/// What a folder held at the beginning.
+#[derive(Debug, Default)]
+pub(super) struct Found {
+    /// The newest run of each session.
+    pub(super) runs: BTreeMap<String, u64>,
+    /// Journals of sessions that were not continued, though they have not ended.
+    pub(super) left_alone: BTreeSet<PathBuf>,
+}
+
+/// What was written for a session in a round.
+struct Written {
+    id: String,
+    until_step: u64,
+    batches: u64,
+    noted_ns: u64,
+    is_still: bool,
+}
+
+impl Keeper {
+    pub(super) fn new(
+        folder: Arc<Folder>,
+        keep: Keep,
+        queue: Arc<TapeQueue>,
+        tally: Arc<KeeperTally>,
+        found: Found,
+    ) -> Self {
+        let Found { runs, left_alone } = found;
+        Keeper { folder, keep, queue, tally, runs, left_alone, entries: BTreeMap::new() }
+    }
+
+    /// Works until the queue is stopped, and everything in it is written.
+    pub(super) fn work(mut self) {
+        let (mut swept_ns, mut begun_ns) = (0, 0);
+        while let Some(mut tapes) = self.queue.wait(Some(SWEEP)) {
+            let now = now_ns();
+            if let Some(rest) = ROUND.checked_sub(Duration::from_nanos(now.saturating_sub(begun_ns)))
+                && !self.queue.is_stopped()
+            {
+                std::thread::sleep(rest);
+                tapes.extend(self.queue.take());
+            }
+            begun_ns = now_ns();
+            self.round(&tapes);
+            if swept_ns == 0 || begun_ns > swept_ns + SWEEP.as_nanos() as u64 {
+                swept_ns = begun_ns;
+                self.sweep();
+            }
+        }
+        self.finish();
+    }
+
+    /// Writes what these tapes hold, and gets it to the disk.
+    fn round(&mut self, tapes: &[Arc<Tape>]) {
+        let written: Vec<Written> = tapes.iter().filter_map(|tape| self.write(tape)).collect();
+        if written.is_empty() {
+            return;
+        }
+        let is_first =
+            |written: &Written| self.entries.get(&written.id).is_some_and(|entry| entry.tape.durable_step().is_none());
+        let is_new = written.iter().any(is_first);
+        let files: Vec<_> = written.iter().filter_map(|written| self.entries.get(&written.id)?.file.file()).collect();
+        let synced = self.folder.sync(files.into_iter(), is_new);
+        self.tally.rounds.fetch_add(1, Ordering::Relaxed);
+        let now = now_ns();
+        for Written { id, until_step, batches, noted_ns, is_still } in written {
+            if let Err(error) = &synced {
+                self.break_off(&id, &format!("what was written can't be brought to the disk: {error}"));
+                continue;
+            }
+            let Some(entry) = self.entries.get_mut(&id) else { continue };
+            if let Some(writer) = &mut entry.writer {
+                writer.durable(batches);
+            }
+            let lag_ns = now.saturating_sub(noted_ns);
+            self.tally.lag_ns.store(lag_ns, Ordering::Relaxed);
+            #[allow(clippy::cast_precision_loss)]
+            entry.tape.is_durable(until_step, lag_ns as f64 * 1e-9);
+            if is_still {
+                entry.file.close();
+            }
+            if entry.writer.is_none() {
+                self.complete(&id);
+            }
+        }
+    }
+
+    /// Writes what a tape holds. `None` if that is nothing, or can't be.
+    fn write(&mut self, tape: &Arc<Tape>) -> Option<Written> {
+        let taken = tape.take();
+        let id = tape.about.id.clone();
+        if !self.entries.contains_key(&id) {
+            self.begin(tape);
+        }
+        let entry = self.entries.get_mut(&id)?;
+        let mut writer = entry.writer.take()?;
+        let noted_ns = taken.events.last().map_or_else(now_ns, |noted| noted.at_ns);
+        let mut is_deleted = false;
+        for Noted { step, event, .. } in taken.events {
+            match event {
+                Event::Input(input) => writer.input(step, &input),
+                Event::Hash(copy) => writer.hash(step, copy.state_hash()),
+                Event::Snapshot(saved, copy) => {
+                    writer.snapshot(step, copy.state_hash(), copy.model(), saved.to_bytes());
+                }
+                Event::Felt(felt) => writer.felt(step, &felt),
+                Event::Deleted => is_deleted = true,
+            }
+        }
+        let bytes = if is_deleted {
+            writer.finish(pb::Why::Deleted, "the session was deleted", taken.until_step, unix_ns())
+        } else {
+            let bytes = writer.flush(taken.until_step, unix_ns());
+            entry.writer = Some(writer);
+            bytes
+        };
+        let (until_step, batches) =
+            entry.writer.as_ref().map_or((taken.until_step, 0), |w| (w.until_step(), w.batches()));
+        if bytes.is_empty() {
+            return None;
+        }
+        self.append(&id, &bytes)?;
+        Some(Written { id, until_step, batches, noted_ns, is_still: taken.is_still })
+    }
+
+    fn append(&mut self, id: &str, bytes: &[u8]) -> Option<()> {
+        self.tally.bytes.fetch_add(bytes.len() as u64, Ordering::Relaxed);
+        let entry = self.entries.get_mut(id)?;
+        if let Err(error) = entry.file.append(bytes) {
+            self.break_off(id, &format!("the journal can't be written: {error}"));
+            return None;
+        }
+        Some(())
+    }
+
+    /// Begins the journal of a session.
+    fn begin(&mut self, tape: &Arc<Tape>) {
+        let About { id, owner, idle_timeout_s, first, begin_step, running, until_step } = &tape.about;
+        let run = self.runs.entry(id.clone()).and_modify(|run| *run += 1).or_insert(1);
+        let opening = Opening {
+            session_id: id,
+            run: *run,
+            owner,
+            idle_timeout_s: *idle_timeout_s,
+            first,
+            begin_step: *begin_step,
+            running: *running,
+            until_step: *until_step,
+        };
+        let file = Grown::new(self.folder.path().join(journal::file::name(id, *run)));
+        let entry = Entry { tape: tape.clone(), writer: Some(Writer::new(&opening, unix_ns())), file };
+        self.entries.insert(id.clone(), entry);
+        tape.begins(u32::try_from(*run).unwrap_or(u32::MAX));
+    }
+
+    /// The journal of a session that is deleted is whole.
+    fn complete(&mut self, id: &str) {
+        let Some(mut entry) = self.entries.remove(id) else { return };
+        self.runs.remove(id);
+        if self.keep.age.is_zero() {
+            old::remove(entry.file.path());
+        } else {
+            seal(&mut entry.file);
+        }
+        entry.tape.is_complete();
+    }
+
+    /// Removes journals that are too old, or too much, and forgets those that have broken.
+    fn sweep(&mut self) {
+        self.entries.retain(|_, entry| entry.tape.progress().borrow().broken.is_none());
+        let current = |path: &Path| self.entries.values().any(|entry| entry.file.path() == path);
+        old::sweep(self.folder.path(), self.keep, |path| current(path) || self.left_alone.contains(path));
+    }
+
+    /// The server ends: says so at the end of every journal.
+    fn finish(&mut self) {
+        let mut ended = Vec::new();
+        for (id, entry) in &mut self.entries {
+            let Some(writer) = entry.writer.take() else { continue };
+            let until_step = writer.until_step();
+            ended.push((
+                id.clone(),
+                until_step,
+                writer.finish(pb::Why::Drained, "the server ended", until_step, unix_ns()),
+            ));
+        }
+        ended.retain(|(id, _, bytes)| self.append(id, bytes).is_some());
+        let files: Vec<_> = ended.iter().filter_map(|(id, ..)| self.entries.get(id)?.file.file()).collect();
+        if let Err(error) = self.folder.sync(files.into_iter(), false) {
+            tracing::error!(%error, "the last of the journals can't be brought to the disk");
+        }
+        for (id, until_step, _) in ended {
+            if let Some(entry) = self.entries.get_mut(&id) {
+                entry.tape.is_durable(until_step, 0.0);
+                seal(&mut entry.file);
+            }
+        }
+    }
+
+    fn break_off(&mut self, id: &str, reason: &str) {
+        self.tally.broken.fetch_add(1, Ordering::Relaxed);
+        if let Some(entry) = self.entries.remove(id) {
+            entry.tape.break_off(reason);
+        }
+    }
+}
+
+/// Indexes a journal that is complete. Without an index, it is read from its beginning.
+fn seal(file: &mut Grown) {
+    if let Err(error) = file.seal() {
+        tracing::warn!(path = %file.path().display(), %error, "a journal is complete, but can't be indexed");
+    }
+}
+
+/// The time of day, ns since 1970.
+#[allow(clippy::disallowed_methods)]
+pub(super) fn unix_ns() -> u64 {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    u64::try_from(since.as_nanos()).unwrap_or(u64::MAX)
+}

@@ -1,0 +1,114 @@
+//! Continues sessions from their journals, each at its last durable step: with the same ID, its tools let go, running if it ran.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use super::keeper::Found;
+use crate::journal::file::JournalFile;
+use crate::journal::{self, Reader, pb, replay};
+use crate::limits::Limits;
+use crate::lock::lock;
+use crate::pace::{Begin, Pacer};
+use crate::refusal::{Reason, Refusal, Result};
+use crate::sheet::choice::NEVER;
+
+/// What became of a session's journals.
+enum Outcome {
+    /// It goes on.
+    Continued,
+    /// It was deleted, or there was nothing yet to continue.
+    Ended,
+    /// It can't be continued.
+    Refused(Refusal),
+}
+
+/// Continues all sessions whose journals are in `folder`, and have not ended. Those that can't be continued are logged.
+///
+/// # Errors
+/// Refuses a folder that can't be read.
+pub(super) fn all(folder: &Path, pacer: &Pacer, limits: &Limits) -> Result<Found> {
+    let listed = journal::file::list(folder).map_err(|error| {
+        Refusal::new(Reason::Unreadable, "journal", format!("{}: can't be read: {error}", folder.display()))
+    })?;
+    let mut by_session: BTreeMap<String, Vec<JournalFile>> = BTreeMap::new();
+    for file in listed {
+        by_session.entry(file.session_id.clone()).or_default().push(file);
+    }
+    let sessions: Vec<_> = by_session.into_iter().collect();
+    let (next, found) = (AtomicUsize::new(0), Mutex::new(Found::default()));
+    let work = || {
+        while let Some((id, files)) = sessions.get(next.fetch_add(1, Ordering::Relaxed)) {
+            let (outcome, newest) = one(files, pacer, limits);
+            let mut found = lock(&found);
+            found.runs.insert(id.clone(), files.last().map_or(0, |file| file.run));
+            match outcome {
+                Outcome::Continued | Outcome::Ended => {}
+                Outcome::Refused(refusal) => {
+                    let path = newest.path.display();
+                    tracing::error!(session = %id, %path, "not continued: {refusal}; the file stays as it is");
+                    found.left_alone.insert(newest.path.clone());
+                }
+            }
+        }
+    };
+    let threads = std::thread::available_parallelism().map_or(1, std::num::NonZero::get).min(sessions.len());
+    std::thread::scope(|scope| {
+        for index in 0..threads {
+            let builder = crate::priority::thread(format!("resume-{index}"));
+            if builder.spawn_scoped(scope, work).is_err() {
+                break;
+            }
+        }
+        // If no thread could be started, this one does it all.
+        work();
+    });
+    let found = found.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner);
+    Ok(found)
+}
+
+/// Continues a session of which these are the journals, by ascending run.
+fn one<'f>(files: &'f [JournalFile], pacer: &Pacer, limits: &Limits) -> (Outcome, &'f JournalFile) {
+    let mut newest = &files[files.len() - 1];
+    for file in files.iter().rev() {
+        newest = file;
+        match continued(file, pacer, limits) {
+            Ok(outcome) => return (outcome, newest),
+            // The server ended before anything of this run was on the disk: the run before has all.
+            Err(refusal) if refusal.reason == Reason::Missing => {}
+            Err(refusal) => return (Outcome::Refused(refusal), newest),
+        }
+    }
+    (Outcome::Ended, newest)
+}
+
+fn continued(file: &JournalFile, pacer: &Pacer, limits: &Limits) -> Result<Outcome> {
+    let mut reader = Reader::open(&file.path)?;
+    let survey = reader.survey(&mut |_| {})?;
+    if survey.end.as_ref().is_some_and(|end| end.why() == pb::Why::Deleted) {
+        return Ok(Outcome::Ended);
+    }
+    let mut resumed = replay::resume(reader, limits)?;
+    let begin = Begin {
+        id: file.session_id.clone(),
+        first: resumed.first.clone(),
+        running: resumed.running,
+        until: resumed.until_step,
+        idle_timeout_s: resumed.header.idle_timeout_s,
+        overrun_count: 0,
+        playback: None,
+    };
+    let owner = pacer.budget.account(&resumed.header.owner);
+    let (step, torn_bytes) = (resumed.session.step_count(), resumed.survey.torn_bytes);
+    let session = || {
+        if let Some(model) = &resumed.pending {
+            resumed.session.change(model);
+        }
+        resumed.session.let_go();
+        Ok(resumed.session)
+    };
+    pacer.resume(begin, &owner, session, &NEVER)?;
+    tracing::info!(session = %file.session_id, step, torn_bytes, run = file.run, "session continued");
+    Ok(Outcome::Continued)
+}

@@ -1,0 +1,383 @@
+//! Journals: what is written is read again, whatever happens to the file, and gives the same bits.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::cast_possible_truncation)]
+
+use std::io::Cursor;
+use std::path::Path;
+use std::sync::Arc;
+
+use glam::DVec3;
+use palpate::journal::replay::{Item, items};
+use palpate::journal::{self, Opening, Reader, Seen, Writer, mend, pb};
+use palpate::limits::Limits;
+use palpate::refusal::Reason;
+use palpate::scene::script::Action;
+use palpate::scene::{Change, PAPER, Scene};
+use palpate::session::Session;
+use palpate::session::command::{Command, Due};
+use palpate::session::input::Input;
+use palpate::sheet::Model;
+use palpate_touch::Tip;
+
+/// 2026-01-01.
+const BEGUN_NS: u64 = 1_767_225_600_000_000_000;
+
+fn model(sets: &[&str]) -> Arc<Model> {
+    let (limits, sets) = (Limits::default(), sets.iter().map(|text| (*text).to_owned()).collect::<Vec<_>>());
+    Model::compile(&Scene::parse("paper", PAPER, &sets, &limits).unwrap(), &limits).unwrap()
+}
+
+fn due(tool: u32, sequence: u64, action: Action) -> Due {
+    let command = Command {
+        tool,
+        sequence: Some(sequence),
+        client_time_ns: sequence * 1_000_000,
+        by_datagram: false,
+        at_step: None,
+        time_to_live_s: None,
+        action,
+        arrival_ns: 0,
+    };
+    Due { command, late: false, late_commands: 0, ends_lease: false }
+}
+
+/// A pose of a tip that strokes over the middle.
+fn pose(model: &Model, sequence: u64) -> Action {
+    let middle_m = model.shape().extent().middle_m();
+    let deep_m = 0.2 * model.shape().edge_m() * (1.0 - libm::cos(sequence as f64 * 0.01));
+    let place_m = middle_m + DVec3::new(1e-5 * sequence as f64, 0.0, -deep_m);
+    Action::Pose { place_m, velocity_m_per_s: None, tip: Tip { radius_m: model.shape().edge_m(), ..Tip::default() } }
+}
+
+fn opening(first: &Arc<Model>) -> Opening<'_> {
+    Opening {
+        session_id: "0123456789abcdef",
+        run: 1,
+        owner: "ann",
+        idle_timeout_s: 60.0,
+        first,
+        begin_step: 0,
+        running: true,
+        until_step: None,
+    }
+}
+
+/// Steps of a session in each batch, and in all.
+const BATCH_STEPS: u64 = 20;
+
+/// A session that is written as it goes: a tool that strokes, another tissue, a release. Each batch is durable when the next one is
+/// written. Tells the file, and where each batch ends.
+fn written(first: &Arc<Model>, steps: u64, ends: bool) -> (Vec<u8>, Vec<(u64, u64)>) {
+    let mut writer = Writer::new(&opening(first), BEGUN_NS);
+    let mut session = Session::new(first);
+    let (mut file, mut ends_at) = (Vec::new(), Vec::new());
+    let snapshot = |writer: &mut Writer, session: &Session| {
+        let (hash, saved) = (session.tissue().state_hash(), session.save().to_bytes());
+        writer.snapshot(session.step_count(), hash, session.model(), saved);
+    };
+    snapshot(&mut writer, &session);
+    writer.hash(0, session.tissue().state_hash());
+    for step in 0..steps {
+        let mut acting = Vec::new();
+        if step % 97 == 50 {
+            let change = Change { stiffness_n_per_m: Some(100.0 + step as f64), ..Change::default() };
+            let changed = session.model().changed(&change, &first.scene, &Limits::default()).unwrap();
+            writer.input(step, &Input::Tissue(changed.clone()));
+            session.change(&changed);
+        }
+        match step % 200 {
+            150 => acting.push(due(0, step + 1, Action::Release)),
+            151..200 => {}
+            _ => acting.push(due(0, step + 1, pose(first, step + 1))),
+        }
+        acting.iter().for_each(|due| writer.input(step, &Input::Command(due.clone())));
+        session.advance(&mut acting, |_| {});
+        let done = session.step_count();
+        if done.is_multiple_of(10) {
+            writer.felt(done, &session.felt());
+        }
+        if done.is_multiple_of(50) {
+            writer.hash(done, session.tissue().state_hash());
+        }
+        if done % 500 == 90 {
+            snapshot(&mut writer, &session);
+        }
+        if done.is_multiple_of(BATCH_STEPS) {
+            writer.durable(writer.batches());
+            file.extend(writer.flush(done, BEGUN_NS + done * 1_000_000));
+            ends_at.push((file.len() as u64, done));
+        }
+    }
+    if ends {
+        writer.durable(writer.batches());
+        file.extend(writer.finish(pb::Why::Drained, "the server ended", steps, BEGUN_NS + steps * 1_000_000));
+        ends_at.push((file.len() as u64, steps));
+    }
+    (file, ends_at)
+}
+
+fn small() -> Arc<Model> {
+    model(&["sheet.points=[7, 7]"])
+}
+
+fn survey(bytes: &[u8]) -> palpate::refusal::Result<palpate::journal::Survey> {
+    Reader::new("test", Cursor::new(bytes))?.survey(&mut |_| {})
+}
+
+#[test]
+fn what_is_written_is_read_again() {
+    let first = small();
+    let (file, ends) = written(&first, 400, true);
+    let found = survey(&file).unwrap();
+    assert_eq!((found.until_step, found.batches, found.torn_bytes, found.sealed), (400, ends.len() as u64, 0, false));
+    assert_eq!((found.hashes, found.whole_bytes), (9, file.len() as u64));
+    assert_eq!(found.end.unwrap().why(), pb::Why::Drained);
+    let mut reader = Reader::new("test", Cursor::new(&file)).unwrap();
+    assert_eq!((reader.header().session_id.as_str(), reader.header().run), ("0123456789abcdef", 1));
+    let (mut inputs, mut moments) = (Vec::new(), 0);
+    while let Some(batch) = reader.next_batch().unwrap() {
+        assert_eq!(batch.first_input, inputs.len() as u64);
+        inputs.extend(batch.inputs().unwrap());
+        moments += batch.felt().unwrap().len();
+    }
+    assert_eq!((inputs.len() as u64, moments), (found.inputs, 40));
+    assert!(inputs.is_sorted_by_key(|input| input.step));
+    // Every pose has its tip, though most are written without one.
+    let tips = inputs.iter().filter(|input| {
+        let Some(pb::input::What::Command(command)) = &input.what else { return false };
+        matches!(&command.action, Some(pb::command::Action::Pose(pose)) if pose.tip.is_some())
+    });
+    assert_eq!(tips.count(), 300);
+}
+
+#[test]
+fn a_file_that_is_cut_anywhere_is_read_up_to_its_last_whole_batch() {
+    let first = small();
+    let (file, ends) = written(&first, 200, true);
+    // Up to the end of the chunk itself: its index may be cut.
+    for length in 0..file.len() {
+        let found = match survey(&file[..length]) {
+            Ok(found) => found,
+            Err(refusal) => {
+                assert!((length as u64) < ends[0].0, "{length}");
+                assert!(length < 100 || refusal.reason == Reason::Missing, "{length}: {refusal}");
+                continue;
+            }
+        };
+        let before = ends.iter().rev().find(|end| end.0 <= length as u64);
+        let after = ends.iter().find(|end| end.0 > length as u64).unwrap();
+        assert!(
+            found.until_step == before.map_or(0, |end| end.1) || found.until_step == after.1,
+            "{length}: {found:?}"
+        );
+        assert!(found.whole_bytes <= length as u64 && found.end.is_none() || length as u64 > ends[ends.len() - 2].0);
+        assert_eq!(found.whole_bytes + found.torn_bytes, length as u64, "{length}: {found:?}");
+    }
+}
+
+#[test]
+fn a_bit_that_is_other_is_found_or_harmless() {
+    let first = small();
+    let (file, _) = written(&first, 200, true);
+    let whole = survey(&file).unwrap();
+    let inputs = |bytes: &[u8]| {
+        let mut reader = Reader::new("test", Cursor::new(bytes)).unwrap();
+        let mut all = Vec::new();
+        while let Some(batch) = reader.next_batch().unwrap() {
+            all.extend(batch.inputs().unwrap());
+        }
+        all
+    };
+    let all = inputs(&file);
+    let (mut refused, mut torn, mut harmless) = (0, 0, 0);
+    let mut rng = fastrand::Rng::with_seed(1);
+    let count = if std::env::var_os("PALPATE_LONG").is_some() { 100_000 } else { 3000 };
+    for _ in 0..count {
+        let mut bent = file.clone();
+        let (at, bit) = (rng.usize(..bent.len()), rng.u8(..8));
+        bent[at] ^= 1 << bit;
+        match survey(&bent) {
+            Err(refusal) => {
+                refused += 1;
+                assert!(!refusal.message.is_empty() && refusal.place.is_some());
+            }
+            Ok(found) => {
+                let read = inputs(&bent);
+                assert_eq!(read, all[..read.len()], "byte {at}, bit {bit}");
+                if found.until_step == whole.until_step && found.inputs == whole.inputs {
+                    harmless += 1;
+                } else {
+                    torn += 1;
+                    // Only what was not known to be on the disk is taken for torn.
+                    assert!(found.batches + 2 >= whole.batches, "byte {at}, bit {bit}: {found:?}");
+                }
+            }
+        }
+    }
+    assert!(refused > 20 * torn && harmless > 0, "{refused} refused, {torn} torn, {harmless} harmless");
+}
+
+#[test]
+fn a_sealed_file_opens_with_the_reader_of_mcap() {
+    let first = small();
+    let (mut file, ends) = written(&first, 200, true);
+    let mut sealed = Cursor::new(std::mem::take(&mut file));
+    palpate::journal::seal::seal(&mut sealed).unwrap();
+    let file = sealed.into_inner();
+    let found = survey(&file).unwrap();
+    assert!(found.sealed && found.torn_bytes == 0 && found.batches == ends.len() as u64, "{found:?}");
+    let summary = mcap::Summary::read(&file).unwrap().unwrap();
+    let statistics = summary.stats.as_ref().unwrap();
+    assert_eq!((statistics.chunk_count, statistics.channel_count), (ends.len() as u32, 6));
+    assert_eq!(statistics.message_count, mcap::MessageStream::new(&file).unwrap().map(Result::unwrap).count() as u64);
+    assert_eq!(summary.chunk_indexes.len(), ends.len());
+    for index in &summary.chunk_indexes {
+        let indexes = summary.read_message_indexes(&file, index).unwrap();
+        assert_eq!(indexes.len(), index.message_index_offsets.len());
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join(palpate::journal::file::name("abc", 3));
+    std::fs::write(&path, &file).unwrap();
+    assert_eq!(palpate::journal::file::list(folder.path()).unwrap()[0].run, 3);
+    assert!(Reader::open(&path).is_ok());
+    assert!(Reader::open(Path::new("nowhere.1.mcap")).is_err());
+}
+
+fn reader(bytes: &[u8]) -> Reader<Cursor<&[u8]>> {
+    Reader::new("test", Cursor::new(bytes)).unwrap()
+}
+
+#[test]
+fn a_journal_gives_the_same_bits_again_and_a_difference_is_named() {
+    for sets in [&["sheet.points=[7, 7]"][..], &["sheet.points=[9, 5]", "stepping.precision=f64"]] {
+        let first = model(sets);
+        let (file, _) = written(&first, 700, true);
+        let verdict = journal::verify(reader(&file), &Limits::default(), &mut |_, _| {}).unwrap();
+        assert_eq!((verdict.steps, verdict.difference), ([0, 700], None));
+        // Hashes at 50, 100 and so on; snapshots at 0, 90 and 590.
+        assert_eq!(verdict.compared, [14, 3]);
+    }
+    // The tissue of another session: as if one bit of the arithmetic were other.
+    let sets = ["sheet.points=[7, 7]", "stepping.integrator=central", "stepping.substeps=2", "stepping.precision=f32"];
+    let first = model(&sets);
+    let other = model(&[&sets[..], &["damping.coefficient_n_s_per_m=0.06"]].concat());
+    let mut writer = Writer::new(&opening(&other), BEGUN_NS);
+    let mut inputs = Vec::new();
+    let (file, _) = written(&first, 200, true);
+    let mut read = reader(&file);
+    while let Some(batch) = read.next_batch().unwrap() {
+        inputs.extend(items(&batch).unwrap());
+    }
+    for item in inputs {
+        match item {
+            Item::Hash(hash) => writer.hash(hash.step, u128::from_str_radix(&hash.hash, 16).unwrap()),
+            Item::Input(pb::Input { step, what: Some(pb::input::What::Command(command)) }) => {
+                let Some(pb::command::Action::Pose(_)) = command.action else { continue };
+                writer.input(step, &Input::Command(due(0, step + 1, pose(&first, step + 1))));
+            }
+            _ => {}
+        }
+    }
+    let bent = writer.finish(pb::Why::Drained, "", 200, BEGUN_NS);
+    let difference = journal::verify(reader(&bent), &Limits::default(), &mut |_, _| {}).unwrap().difference.unwrap();
+    assert_eq!((difference.step, difference.equal_until), (50, Some(0)), "{difference}");
+    assert!(difference.to_string().contains("at step 0 they were equal"), "{difference}");
+}
+
+#[test]
+fn a_session_goes_on_from_a_torn_journal_at_its_last_whole_batch() {
+    let first = small();
+    let (file, ends) = written(&first, 700, false);
+    let hash_at = |step: u64| {
+        let (session, _) = journal::session_at(reader(&file), &Limits::default(), step).unwrap();
+        assert_eq!(session.step_count(), step);
+        session.tissue().state_hash()
+    };
+    for (end, step) in [ends[1], ends[4], ends[29], ends[34]] {
+        let resumed = journal::resume(reader(&file[..file.len().min(end as usize + 3)]), &Limits::default());
+        let resumed = resumed.unwrap_or_else(|refusal| panic!("{refusal}"));
+        assert_eq!((resumed.session.step_count(), resumed.running), (step, true));
+        assert_eq!(resumed.session.tissue().state_hash(), hash_at(step), "{step}");
+        assert_eq!(resumed.first.scene, first.scene);
+    }
+    assert!(journal::session_at(reader(&file), &Limits::default(), 701).is_err());
+}
+
+#[test]
+fn a_part_of_a_journal_and_a_recovered_one_verify_alone() {
+    let first = small();
+    let (file, ends) = written(&first, 700, false);
+    let limits = Limits::default();
+    for [from, to] in [[0, 700], [90, 91], [333, 512], [699, 700]] {
+        let mut part = Cursor::new(Vec::new());
+        mend::cut(|| Ok(reader(&file)), [from, to], &limits, &mut part).unwrap();
+        let part = part.into_inner();
+        let verdict = journal::verify(reader(&part), &limits, &mut |_, _| {}).unwrap();
+        assert_eq!((verdict.steps, verdict.difference), ([from, to], None));
+        let found = survey(&part).unwrap();
+        assert!(found.sealed && found.end.unwrap().why() == pb::Why::Cut);
+        let at = |bytes: &[u8]| journal::session_at(reader(bytes), &limits, to).unwrap().0.tissue().state_hash();
+        assert_eq!(at(&part), at(&file));
+    }
+    assert!(mend::cut(|| Ok(reader(&file)), [5, 5], &limits, &mut Cursor::new(Vec::new())).is_err());
+    let torn = &file[..ends[20].0 as usize - 1];
+    let mut whole = Cursor::new(Vec::new());
+    // The last index is cut off, and no message with it.
+    let lost = mend::recover(reader(torn), &mut whole, &mut |_| {}).unwrap();
+    let whole = whole.into_inner();
+    let found = survey(&whole).unwrap();
+    assert_eq!((found.until_step, found.torn_bytes, lost.until_step), (ends[20].1, 0, ends[20].1));
+    assert!(found.sealed && found.end.unwrap().why() == pb::Why::Recovered);
+    assert_eq!(journal::verify(reader(&whole), &limits, &mut |_, _| {}).unwrap().difference, None);
+    let count = mcap::MessageStream::new(&whole).unwrap().map(Result::unwrap).count() as u64;
+    assert_eq!(mcap::Summary::read(&whole).unwrap().unwrap().stats.unwrap().message_count, count);
+}
+
+#[test]
+fn steps_at_rest_are_skipped_and_seen_where_somebody_wants_to() {
+    let first = small();
+    let mut writer = Writer::new(&opening(&first), BEGUN_NS);
+    writer.input(1000, &Input::Pause);
+    writer.input(1000, &Input::Start { until: Some(100_000) });
+    let file = writer.finish(pb::Why::Drained, "", 5000, BEGUN_NS);
+    let mut read = reader(&file);
+    let survey = read.survey(&mut |_| {}).unwrap();
+    let mut seen = Vec::new();
+    let mut replay = journal::Replay::new(read, survey, &Limits::default()).unwrap().stopping_every(1500);
+    let see: &mut dyn FnMut(Seen<'_>) -> palpate::refusal::Result<()> = &mut |what| {
+        if let Seen::Step(session) = what {
+            seen.push(session.step_count());
+        }
+        Ok(())
+    };
+    replay.advance(u64::MAX, see).unwrap();
+    assert_eq!(seen, [1000, 1500, 3000, 4500, 5000]);
+    assert_eq!(replay.running(), (true, Some(100_000)));
+}
+
+const GOLDEN: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/journal/golden.1.mcap");
+
+/// The golden file is of the first version with journals, and stays as it is: while `REPLAYS` is what it was then, every later
+/// version gives its bits.
+#[test]
+fn the_journal_of_an_older_version_gives_the_same_bits_or_is_refused_with_both_versions() {
+    let mut read = Reader::open(Path::new(GOLDEN)).unwrap();
+    let survey = read.survey(&mut |_| {}).unwrap();
+    assert_eq!((survey.until_step, survey.snapshots.len(), survey.sealed), (1000, 3, true));
+    let verified = journal::verify(read, &Limits::default(), &mut |_, _| {});
+    if journal::REPLAYS == 1 {
+        assert_eq!(verified.unwrap().difference, None);
+    } else {
+        let message = verified.unwrap_err().to_string();
+        assert!(message.contains("written by Palpate 0.1.0"), "{message}");
+    }
+}
+
+/// For the first time only.
+#[test]
+#[ignore = "writes the golden file"]
+fn write_the_golden_file() {
+    let mut file = Cursor::new(written(&small(), 1000, true).0);
+    journal::seal::seal(&mut file).unwrap();
+    std::fs::create_dir_all(Path::new(GOLDEN).parent().unwrap()).unwrap();
+    std::fs::write(GOLDEN, file.into_inner()).unwrap();
+}

@@ -1,0 +1,322 @@
+//! Journals of a real server: what is on the disk goes on after a kill, with the same bits; and what happens when the disk fails.
+#![cfg(unix)]
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
+
+#[path = "common/server.rs"]
+mod server;
+
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use palpate::limits::Limits;
+use palpate_proto::pb;
+use server::{PATIENCE, Server, Touch, force};
+
+fn start(folder: &Path) -> Server {
+    Server::start(&["--log", "info", "--journal", folder.to_str().unwrap()])
+}
+
+/// The journals of a session, by run.
+fn files(folder: &Path, session_id: &str) -> Vec<PathBuf> {
+    let listed = palpate::journal::file::list(folder).unwrap();
+    listed.into_iter().filter(|file| file.session_id == session_id).map(|file| file.path).collect()
+}
+
+fn verifies(files: &[PathBuf]) {
+    for path in files {
+        let reader = palpate::journal::Reader::open(path).unwrap();
+        let verdict = palpate::journal::replay::verify(reader, &Limits::default(), &mut |_, _| {}).unwrap();
+        assert_eq!(verdict.difference, None, "{}", path.display());
+    }
+}
+
+async fn durable_at(server: &Server, session_id: &str, step: u64) -> u64 {
+    let waited = tokio::time::timeout(PATIENCE, async {
+        loop {
+            let journal = server.status(session_id).await.journal.unwrap();
+            assert_eq!(journal.fault, "");
+            if let Some(durable) = journal.durable_step.filter(|durable| *durable >= step) {
+                return durable;
+            }
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+    });
+    waited.await.unwrap()
+}
+
+async fn pause(server: &Server, session_id: &str) -> pb::Session {
+    let request = pb::PauseSessionRequest { session_id: session_id.into() };
+    server.sessions().await.pause_session(request).await.unwrap();
+    server.status(session_id).await
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_killed_server_goes_on_with_its_sessions_from_their_durable_step() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut before = start(folder.path());
+    let (pressed, stopped) = (before.paper(false).await, before.paper(true).await);
+    before.start_until(&stopped, 120).await;
+    let hash_at_120 = before.hash_at(&stopped, 120).await;
+    let mut touch = Touch::hold(&before, &pressed).await;
+    let mut told = 0;
+    for sequence in 1..=200_u16 {
+        touch.command(force(0, u64::from(sequence), -1e-3 * f64::from(sequence))).await;
+        told = touch.sample().await.durable_step.unwrap_or(told).max(told);
+        if sequence == 100 {
+            let mut change = pb::UpdateTissueRequest { session_id: pressed.clone(), ..Default::default() };
+            change.damping_n_s_per_m = Some(0.35);
+            before.sessions().await.update_tissue(change).await.unwrap();
+        }
+    }
+    let acted = touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == 200).await.step;
+    told = told.max(durable_at(&before, &pressed, acted).await);
+    durable_at(&before, &stopped, 120).await;
+    before.child.kill().unwrap();
+    before.child.wait().unwrap();
+
+    let after = start(folder.path());
+    let listed = after.sessions().await.list_sessions(pb::ListSessionsRequest {}).await.unwrap().into_inner().sessions;
+    let ids: Vec<_> = listed.iter().map(|session| session.session_id.as_str()).collect();
+    assert_eq!(ids.len(), 2, "{ids:?}");
+    durable_at(&after, &pressed, told).await;
+    let session = after.status(&pressed).await;
+    assert!(session.step >= told, "{} < {told}", session.step);
+    assert!(session.held_tools.is_empty());
+    assert_eq!((session.journal.as_ref().unwrap().run, session.state()), (2, pb::SessionState::Running));
+    assert_eq!(session.scene.unwrap().damping.unwrap().coefficient_n_s_per_m, Some(0.35));
+    let session = after.status(&stopped).await;
+    assert_eq!((session.step, session.state()), (120, pb::SessionState::Paused));
+    assert_eq!(after.hash_at(&stopped, 120).await, hash_at_120);
+    // Leases are void, sequence numbers begin anew.
+    let mut touch = Touch::hold(&after, &pressed).await;
+    touch.command(force(0, 1, -0.1)).await;
+    touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == 1).await;
+    drop(touch);
+    let session = pause(&after, &pressed).await;
+    durable_at(&after, &pressed, session.step).await;
+    verifies(&[files(folder.path(), &pressed), files(folder.path(), &stopped)].concat());
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_server_that_is_told_to_end_hands_its_sessions_over() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut before = start(folder.path());
+    let id = before.paper(false).await;
+    let touch = Touch::hold(&before, &id).await;
+    touch.command(force(0, 1, -0.2)).await;
+    before.until_applied("paper", 0).await;
+    let pid = rustix::process::Pid::from_child(&before.child);
+    rustix::process::kill_process(pid, rustix::process::Signal::TERM).unwrap();
+    before.child.wait().unwrap();
+    let first = files(folder.path(), &id);
+    verifies(&first);
+    let after = start(folder.path());
+    durable_at(&after, &id, 0).await;
+    let session = pause(&after, &id).await;
+    assert_eq!(session.journal.unwrap().run, 2);
+    assert!(session.step > 0);
+    // Deleted, it is not continued, and what happened stays on the disk.
+    let deleted = pb::DeleteSessionRequest { session_id: id.clone() };
+    let answer = after.sessions().await.delete_session(deleted).await.unwrap().into_inner();
+    assert_eq!(answer.journal_fault, "");
+    drop(after);
+    let last = start(folder.path());
+    assert!(
+        last.sessions().await.list_sessions(pb::ListSessionsRequest {}).await.unwrap().into_inner().sessions.is_empty()
+    );
+    let kept = files(folder.path(), &id);
+    assert_eq!(kept.len(), 2);
+    verifies(&kept);
+    let mode = |path: &Path| std::fs::metadata(path).unwrap().permissions().mode() & 0o777;
+    assert!(kept.iter().all(|path| mode(path) == 0o600));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn nothing_is_kept_where_it_is_not_wanted() {
+    let folder = tempfile::tempdir().unwrap();
+    let server =
+        Server::start(&["--log", "error", "--journal", folder.path().to_str().unwrap(), "--journal-keep", "0"]);
+    let id = server.paper(false).await;
+    assert_eq!(files(folder.path(), &id).len(), 1);
+    server.sessions().await.delete_session(pb::DeleteSessionRequest { session_id: id.clone() }).await.unwrap();
+    assert!(files(folder.path(), &id).is_empty());
+    // Another server has its own folder.
+    let mut second = Command::new(env!("CARGO_BIN_EXE_palpate"))
+        .args(["serve", "--listen", "127.0.0.1:0", "--journal", folder.path().to_str().unwrap()])
+        .stdout(Stdio::null())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut said = String::new();
+    std::io::Read::read_to_string(&mut second.stderr.take().unwrap(), &mut said).unwrap();
+    assert_eq!(second.wait().unwrap().code(), Some(2), "{said}");
+    assert!(said.contains("another server keeps its journals here"), "{said}");
+    // Without a journal nothing is told of one.
+    let without = Server::start(&["--log", "error"]);
+    let id = without.paper(false).await;
+    assert_eq!(without.status(&id).await.journal, None);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_full_disk_breaks_the_journal_and_not_the_session() {
+    let folder = tempfile::tempdir().unwrap();
+    // No file may have more than 200 KiB.
+    let script = format!(
+        "trap '' XFSZ; ulimit -f 400; exec {} serve --listen 127.0.0.1:0 --log error --journal {}",
+        env!("CARGO_BIN_EXE_palpate"),
+        folder.path().display()
+    );
+    let child = Command::new("sh")
+        .args(["-c", &script])
+        .current_dir(env!("CARGO_MANIFEST_DIR"))
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let server = Server::of(child);
+    let id = server.paper(false).await;
+    let mut touch = Touch::hold(&server, &id).await;
+    let mut sequence = 0;
+    let fault = tokio::time::timeout(PATIENCE, async {
+        loop {
+            for _ in 0..100 {
+                sequence += 1;
+                touch.command(force(0, sequence, -0.1)).await;
+                touch.sample().await;
+            }
+            let fault = server.status(&id).await.journal.unwrap().fault;
+            if !fault.is_empty() {
+                return fault;
+            }
+        }
+    });
+    let fault = fault.await.unwrap();
+    assert!(fault.contains("can't be written"), "{fault}");
+    // The session goes on, and what was told to be durable is there.
+    let durable = server.status(&id).await.journal.unwrap().durable_step.unwrap();
+    sequence += 1;
+    touch.command(force(0, sequence, -0.2)).await;
+    touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == sequence).await;
+    drop(server);
+    verifies(&files(folder.path(), &id));
+    let after = start(folder.path());
+    assert!(after.status(&id).await.step >= durable);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_journal_that_is_damaged_in_its_middle_is_left_alone_and_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut before = start(folder.path());
+    let (broken, whole) = (before.paper(false).await, before.paper(false).await);
+    for id in [&broken, &whole] {
+        let mut touch = Touch::hold(&before, id).await;
+        for sequence in 1..=300 {
+            touch.command(force(0, sequence, -0.1)).await;
+            touch.sample().await;
+        }
+        let step = before.status(id).await.step;
+        durable_at(&before, id, step).await;
+    }
+    before.child.kill().unwrap();
+    before.child.wait().unwrap();
+    let path = files(folder.path(), &broken).remove(0);
+    let mut bytes = std::fs::read(&path).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 16;
+    std::fs::write(&path, &bytes).unwrap();
+    let after = start(folder.path());
+    let listed = after.sessions().await.list_sessions(pb::ListSessionsRequest {}).await.unwrap().into_inner().sessions;
+    assert_eq!(listed.len(), 1);
+    assert_eq!(listed[0].session_id, whole);
+    let log = after.log();
+    assert!(log.contains(path.to_str().unwrap()) && log.contains("step"), "{log}");
+    assert_eq!(std::fs::read(&path).unwrap(), bytes);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_was_recorded_is_played_with_the_same_bits_and_gone_on_from() {
+    use pb::create_session_request::Source;
+    let folder = tempfile::tempdir().unwrap();
+    let server = start(folder.path());
+    let id = server.paper(true).await;
+    let mut touch = Touch::hold(&server, &id).await;
+    let mut hashes = Vec::new();
+    for (sequence, step) in (1..).zip([40, 80, 120, 160, 200]) {
+        touch.command(force(0, sequence, -0.05 * step as f64)).await;
+        touch.settle().await;
+        server.start_until(&id, step).await;
+        hashes.push((step, server.hash_at(&id, step).await));
+    }
+    durable_at(&server, &id, 200).await;
+    let moment =
+        |step, plays, speed| Source::Journal(pb::JournalMoment { session_id: id.clone(), run: 0, step, plays, speed });
+    // Played from its beginning and from its middle: the same hashes. At the end time stands.
+    for (from, speed) in [(0, Some(8.0)), (100, Some(0.5)), (160, None)] {
+        let played = server.create(moment(Some(from), true, speed), true).await.unwrap();
+        let playback = played.playback.clone().unwrap();
+        assert_eq!((played.step, playback.end_step, playback.speed), (from, 200, speed.unwrap_or(1.0)));
+        let played = played.session_id;
+        for (step, hash) in hashes.iter().filter(|(step, _)| *step > from) {
+            server.start_until(&played, *step).await;
+            assert_eq!(server.hash_at(&played, *step).await, *hash, "step {step} of what is played from {from}");
+        }
+        server.start_until(&played, 1000).await;
+        let waited = tokio::time::timeout(PATIENCE, async {
+            while server.status(&played).await.state() != pb::SessionState::Paused {
+                tokio::time::sleep(Duration::from_millis(5)).await;
+            }
+        });
+        waited.await.unwrap();
+        assert_eq!(server.status(&played).await.step, 200);
+        let held = Touch::open(&server, server::open(&played, &[0])).await;
+        assert!(held.err().unwrap().message().contains("plays what was recorded"));
+    }
+    // Gone on from: a live session, at whose beginning the tissue is as it was, and nothing presses any more.
+    let live = server.create(moment(Some(120), false, None), true).await.unwrap();
+    assert!(live.playback.is_none() && live.journal.is_some() && live.step == 120);
+    assert_eq!(server.hash_at(&live.session_id, 120).await, hashes[2].1);
+    let mut other = Touch::hold(&server, &live.session_id).await;
+    other.command(force(0, 1, -0.2)).await;
+    other.settle().await;
+    server.start_until(&live.session_id, 160).await;
+    assert_ne!(server.hash_at(&live.session_id, 160).await, hashes[3].1);
+    // The curve of the whole, and what can't be.
+    let mut sessions = server.sessions().await;
+    let listed = sessions.list_journals(pb::ListJournalsRequest {}).await.unwrap().into_inner().journals;
+    assert_eq!(listed.len(), 2, "what is played is not recorded again: {listed:?}");
+    assert!(listed.iter().all(|info| info.live && info.fault.is_empty() && info.scene_name == "paper"));
+    let request = pb::GetJournalRequest { session_id: id.clone(), run: 0 };
+    let told = sessions.get_journal(request).await.unwrap().into_inner();
+    assert_eq!((told.begin_step, told.end_step, told.rate_hz), (0, 200, 1000.0));
+    assert!(told.forces.iter().any(|moment| moment.force_n > 0.01), "{:?}", told.forces);
+    for (step, speed, wrong) in [(Some(201), None, "step"), (None, Some(9.0), "speed")] {
+        let refused = server.create(moment(step, true, speed), true).await.unwrap_err();
+        assert!(refused.message().contains(wrong), "{refused}");
+    }
+    for unknown in ["../lock", "nothing"] {
+        let request = pb::GetJournalRequest { session_id: unknown.into(), run: 0 };
+        assert_eq!(sessions.get_journal(request).await.unwrap_err().code(), tonic::Code::NotFound);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_snapshot_is_a_journal_of_one_moment() {
+    let server = Server::start(&["--log", "error"]);
+    let id = server.paper(true).await;
+    let mut touch = Touch::hold(&server, &id).await;
+    touch.command(force(0, 1, -0.3)).await;
+    touch.settle().await;
+    server.start_until(&id, 77).await;
+    let hash = server.hash_at(&id, 77).await;
+    let request = pb::SaveSnapshotRequest { session_id: id };
+    let mut parts = server.sessions().await.save_snapshot(request).await.unwrap().into_inner();
+    let mut bytes = Vec::new();
+    while let Some(message) = parts.message().await.unwrap() {
+        bytes.extend_from_slice(&message.part);
+    }
+    let reader = palpate::journal::Reader::new("snapshot", std::io::Cursor::new(bytes)).unwrap();
+    let (session, _) = palpate::journal::replay::session_at(reader, &Limits::default(), 77).unwrap();
+    assert_eq!(format!("{:032x}", session.tissue().state_hash()), hash);
+}
