@@ -10,15 +10,17 @@ const MARGIN = { top: 14, bottom: 46, side: 12 };
 /** The same of a body, which is all in sight, with its tool. */
 const AROUND = { top: 26, bottom: 52, side: 24 };
 
-/** The picture, pixels. */
+/** The picture, and what is covered at its bottom, pixels. */
 interface Size {
   width: number;
   height: number;
+  coveredPx: number;
 }
 
 /** Finds the distance from which all `places` around `target` are in the picture, and puts the camera there, at `away`. */
-function fit(camera: PerspectiveCamera, target: Vector3, away: Vector3, places: Vector3[], margin: typeof MARGIN, size: Size): void {
+function fit(camera: PerspectiveCamera, target: Vector3, away: Vector3, places: Vector3[], around: typeof MARGIN, size: Size): void {
   const { width, height } = size;
+  const margin = { ...around, bottom: around.bottom + size.coveredPx };
   const tangent = Math.tan(((camera.fov / 2) * Math.PI) / 180);
   const part = { x: 1 - (2 * margin.side) / width, y: 1 - (margin.top + margin.bottom) / height };
   const right = new Vector3().crossVectors(camera.up, away).normalize();
@@ -52,7 +54,7 @@ function fit(camera: PerspectiveCamera, target: Vector3, away: Vector3, places: 
 export function homeOfSheet({ box, flank }: Surface, camera: PerspectiveCamera, target: Vector3, size: Size): void {
   const { x: w, y: l } = box.max;
   const { roundM, heightM } = flank ?? { roundM: 0, heightM: 0 };
-  const aspect = (size.width - 2 * MARGIN.side) / Math.max(size.height - MARGIN.top - MARGIN.bottom, 1);
+  const aspect = (size.width - 2 * MARGIN.side) / Math.max(size.height - MARGIN.top - MARGIN.bottom - size.coveredPx, 1);
   const elevation = Math.asin(Math.min(Math.max((0.98 * w) / Math.max(l, 1e-9) / aspect, 0.64), 0.9));
   target.set(w / 2, l / 2, 0);
   const places: Vector3[] = [];

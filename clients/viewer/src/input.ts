@@ -56,7 +56,8 @@ export class Input {
   private down(event: PointerEvent): void {
     if (event.pointerType === "touch") this.fingers.add(event.pointerId);
     const { hand } = this.touched() ?? {};
-    if (!hand) return;
+    // What can't be touched is turned by any drag.
+    if (!hand) return this.stage.turnByDrag(true);
     // A second finger turns the view instead.
     if (this.fingers.size > 1) return this.finish();
     if (event.button !== 0 || this.dragging !== undefined) return;

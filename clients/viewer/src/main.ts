@@ -11,15 +11,18 @@ import type { MessageInitShape } from "@bufbuild/protobuf";
 import type { CreateSessionRequestSchema, Session } from "./gen/palpate/v1/session_pb";
 import { SessionState } from "./gen/palpate/v1/session_pb";
 import type { Mode } from "./hand";
+import { Choices } from "./choices";
 import { Input } from "./input";
+import type { JournalName } from "./journal";
 import { Latency } from "./latency";
 import { depthText, Overlay } from "./overlay";
-import { asked, askedNumber, holderName, part, writeAddress } from "./page";
-import { entryOf, keepPicture, pictureOf } from "./pictures";
+import { addressed, asked, askedNumber, holderName, part, writeAddress, writeMoment } from "./page";
+import { keepPicture } from "./pictures";
+import { BACK_S, discard, type Opened, Player } from "./player";
 import { Plots, quantity } from "./plot";
 import { norm, type Vec3 } from "./samples";
 import { playScript } from "./script";
-import { backoffMs, describe, type Failure, isGone, PATIENCE_MS, reasonOf, received, sessions, sleep } from "./server";
+import { backoffMs, describe, type Failure, isGone, isPassing, leave as leavePage, PATIENCE_MS, reasonOf, received, sessions, sleep } from "./server";
 import { Stage } from "./stage";
 import { Sheet } from "./sheet";
 import { Status } from "./status";
@@ -53,7 +56,23 @@ const holder = holderName();
 let visit: Visit | undefined;
 let playing: AbortController | undefined;
 
-new Input(canvas, stage, latency, () => visit);
+const choices = new Choices((choice) => {
+  if (choice.kind === "scene") void open({ source: named(choice.scene) });
+  else if (choice.kind === "live") void open({ sessionId: choice.sessionId, isNew: true });
+  else void open({ moment: choice, isNew: true });
+});
+const player = new Player({
+  present: () => visit,
+  exchange: (session, step) => show(session, { keeps: true, step }),
+  goLive: async (session) => {
+    if (await show(session, { keeps: true, isNew: true })) canvas.focus({ preventScroll: true });
+  },
+  notice,
+  over,
+});
+
+// What is recorded can be looked at only.
+new Input(canvas, stage, latency, () => (visit?.session.playback ? undefined : visit));
 
 let noticed: ReturnType<typeof setTimeout> | undefined;
 /** Shows a message for `seconds`; permanently if 0. */
@@ -71,30 +90,54 @@ let made: Source = { case: "sceneName", value: DEFAULT_SCENE };
 
 const named = (value: string | undefined): Source => ({ case: "sceneName", value: value || DEFAULT_SCENE });
 
-/** Opens a session: an existing one, or a new one. */
-async function open(sessionId: string | undefined, source: Source): Promise<void> {
+/** What to open: a session that is there, a new one, or what was recorded, from a step on. `isNew`: by a choice on this page. */
+type Target = { isNew?: boolean } & ({ sessionId: string } | { source: Source } | { moment: JournalName & { step?: number } });
+
+/** How often what is shown was left: who waits for something to be shown then waits in vain. */
+let left = 0;
+/** Leaves what is shown. */
+function leave(): void {
+  left += 1;
   visit?.leave();
   visit = undefined;
   playing?.abort();
-  made = source;
-  for (let failures = 0; ; failures++) {
+  player.close();
+}
+
+/** Opens a session. */
+async function open(target: Target): Promise<void> {
+  leave();
+  const begun = left;
+  if ("source" in target) made = target.source;
+  const moment = "moment" in target ? target.moment : undefined;
+  let sessionId = "sessionId" in target ? target.sessionId : undefined;
+  for (let failures = 0; begun === left; failures++) {
     try {
+      if (moment) {
+        const opened = await player.begin(moment, (of) => moment.step ?? of.begin);
+        if (begun === left) await showOpened(opened, { isNew: target.isNew });
+        else discard(opened.session);
+        return;
+      }
       const session = sessionId
         ? (await sessions.getSession({ sessionId }, { timeoutMs: PATIENCE_MS })).session
-        : (await sessions.createSession({ source }, {})).session;
+        : (await sessions.createSession({ source: made }, {})).session;
       if (!session) continue;
-      const isNew = sessionId === undefined;
+      // Another window's playback: this one gets its own.
+      if (session.playback) return await open({ moment: { ...session.playback, step: Number(session.step) } });
+      const isNew = target.isNew ?? sessionId === undefined;
       // If what follows fails, the session is there all the same.
       sessionId = session.sessionId;
-      return await show(session, isNew);
+      if (begun === left) await show(session, { isNew });
+      return;
     } catch (error) {
+      if (begun !== left) return;
       const refused = describe(error);
-      if (isGone(error)) return over("This session no longer exists.");
+      if (isGone(error)) return over(moment ? "There is no such recording." : "This session no longer exists.");
       if (reasonOf(error) === "UNAUTHENTICATED") {
         return over(`The server asks who you are (${refused}). Put your token behind the address, as in #token=…`);
       }
-      // A refusal with any other reason would be repeated.
-      if (!["", "SHUTTING_DOWN", "TOO_MANY"].includes(reasonOf(error))) return over(`${refused}.`);
+      if (!isPassing(error)) return over(`${refused}.`);
       const waitMs = backoffMs(failures);
       status.lose();
       status.say(`Unexpected answer from the server (${refused}). Trying again in ${(waitMs / 1000).toFixed(1)} s.`);
@@ -105,8 +148,8 @@ async function open(sessionId: string | undefined, source: Source): Promise<void
 
 /** A session has ended: the user decides what to do. */
 function over(why: string): void {
-  visit?.leave();
-  visit = undefined;
+  leave();
+  part("what-was-that", HTMLButtonElement).hidden = true;
   status.lose();
   status.say(why);
   notice(`${why} `, 0);
@@ -114,25 +157,54 @@ function over(why: string): void {
   again.textContent = "Start a new session";
   again.addEventListener("click", () => {
     notice("", 0);
-    void open(undefined, made);
+    void open({ source: made });
   });
   part("notice", HTMLElement).append(again);
 }
 
 /** How many sessions were opened: of several that are asked for one after the other the last counts. */
 let opening = 0;
+/** How many tissues were shown, one after the other. */
+let showing = 0;
 
-async function show(session: Session, isNew: boolean): Promise<void> {
-  writeAddress(session.sessionId, isNew && new URLSearchParams(location.search).has("session"));
+/** How a session is shown. */
+interface Showing {
+  /** The page's address before can be gone back to. */
+  isNew?: boolean;
+  /** In place of the present one, which has the same tissue: surface, camera and texture stay. */
+  keeps?: boolean;
+  /** The step from which it plays what was recorded. */
+  step?: number;
+}
+
+/** Shows a playback that was just made. */
+async function showOpened(opened: Opened, how: Showing): Promise<void> {
+  if (await show(opened.session, { ...how, step: opened.step })) player.attach(opened);
+  else discard(opened.session);
+}
+
+/** Shows a session. Returns false if another one has been asked for since. */
+async function show(session: Session, { isNew = false, keeps = false, step }: Showing): Promise<boolean> {
+  const isPlayback = session.playback !== undefined;
   const wanted = (opening += 1);
-  const next = await Visit.to(session, holder, askedNumber("refinement", 0, 10), {
+  const former = keeps ? visit : undefined;
+  const told = {
     onSession: heard,
-    onTrouble: trouble,
+    onTrouble: (failure: Failure, waitMs: number) => visit === next && trouble(failure, waitMs),
     onWell: () => visit === next && status.found(wellText(next.session)),
-  });
-  if (wanted !== opening) return;
+  };
+  const next = await Visit.to(session, holder, askedNumber("refinement", 0, 10), told, former);
+  if (wanted !== opening) return false;
+  const before = visit?.session;
+  visit?.leave();
   visit = next;
-  void listScripts(session.sessionId);
+  if (session.playback) writeMoment(session.playback, step ?? Number(session.step), isNew);
+  else writeAddress(session.sessionId, isNew && new URLSearchParams(location.search).size > 0);
+  if (!isPlayback) player.close();
+  if (!isPlayback) void listScripts(session.sessionId);
+  part("view", HTMLElement).classList.toggle("plays", isPlayback);
+  for (const id of ["tool", "tissue-values"]) part(id, HTMLFieldSetElement).disabled = isPlayback;
+  part("scripts", HTMLElement).hidden ||= isPlayback;
   next.hand.mode = chosenMode();
   next.hand.strength = Number(part("strength", HTMLInputElement).value);
   next.hand.onRefused = notice;
@@ -145,33 +217,67 @@ async function show(session: Session, isNew: boolean): Promise<void> {
   part("fineness", HTMLElement).hidden = next.mostRefinement === 0;
   tellControls();
   tissue.begin(session);
-  mark(session.scene?.name ?? "");
-  // Shaded by its shape at once; the texture comes when it is painted.
-  stage.show(next.surface, false);
-  stage.setTools([], 1);
+  const name = session.scene?.name ?? "";
+  if (session.playback) choices.markRecorded(session.playback, name);
+  else choices.markScene(name, session.sessionId);
+  if (!former) {
+    showing += 1;
+    if (isPlayback) player.makeRoom();
+    // Shaded by its shape at once; the texture comes when it is painted.
+    stage.show(next.surface, false, player.heightPx);
+    stage.setTools([], 1);
+  }
   part("arriving", HTMLElement).hidden = true;
+  // What tells of the session before is no longer true.
+  if (before?.sessionId !== session.sessionId) heard(session);
   next.begin();
   if (document.hidden) next.lookAway();
-  const texture = await tissueTexture(session.sessionId);
-  if (visit !== next) texture?.dispose();
+  if (!former || !stage.isTextured) void dress(session.sessionId);
+  if (!isPlayback && !former) setTimeout(() => visit === next && takePicture(next), PICTURE_MS);
+  return true;
+}
+
+/** Puts the session's texture on the tissue, if that is still shown when it comes. */
+async function dress(sessionId: string): Promise<void> {
+  const shown = showing;
+  const texture = await tissueTexture(sessionId);
+  if (shown !== showing) texture?.dispose();
   else if (texture) stage.setTexture(texture);
-  setTimeout(() => visit === next && takePicture(next), PICTURE_MS);
+}
+
+/** Plays what has just happened in the session that is shown. */
+async function whatWasThat(): Promise<void> {
+  const of = visit;
+  const run = of?.session.journal?.run;
+  if (!of || run === undefined) return;
+  const button = part("what-was-that", HTMLButtonElement);
+  button.disabled = true;
+  try {
+    void of.hand.letGo();
+    const { sessionId } = of.session;
+    const opened = await player.begin({ sessionId, run }, (recording) => recording.after(recording.end, -BACK_S));
+    if (visit !== of) return discard(opened.session);
+    await showOpened(opened, { keeps: true, isNew: true });
+    player.focus();
+  } catch (error) {
+    notice(`What was cannot be shown: ${describe(error)}.`);
+  } finally {
+    button.disabled = false;
+  }
 }
 
 /** Takes a picture of a scene that has none in the list, if nobody has touched it or turned the view. */
 function takePicture(of: Visit): void {
   const scene = of.session.scene?.name ?? "";
-  const entry = [...part("scene", HTMLSelectElement).options].find(({ value, disabled }) => value === scene && !disabled);
-  if (!entry || pictureOf(scene) || document.hidden || of.samples.history.length > 0 || !stage.isAtHome) return;
+  const entry = choices.withoutPicture(scene);
+  if (!entry || document.hidden || of.samples.history.length > 0 || !stage.isAtHome) return;
   stage.snap((drawn) => keepPicture(scene, drawn));
-  const { selected } = entry;
-  const pictured = entryOf(scene);
-  entry.replaceWith(pictured);
-  pictured.selected = selected;
+  choices.refresh(entry);
 }
 
 function wellText(session: Session): string {
   const name = session.scene?.name ?? "";
+  if (session.playback) return `Connected to a recording of ${name}.`;
   if (session.state === SessionState.HELD) return `The session is held: ${session.holdReason}`;
   const paused = session.state === SessionState.PAUSED ? ", which is paused" : "";
   return `Connected to ${name}${paused}.${recoveredText(session)}`;
@@ -188,6 +294,7 @@ function recoveredText({ recoveryCount, recoveries }: Session): string {
 }
 
 function trouble(failure: Failure, waitMs: number): void {
+  if (failure.isGone && player.isOpen) return player.revive();
   if (failure.isGone) return over("The session has ended.");
   status.lose();
   status.say(`Connection lost (${failure.text}). Trying again in ${(waitMs / 1000).toFixed(1)} s.`);
@@ -197,12 +304,18 @@ function trouble(failure: Failure, waitMs: number): void {
 function heard(session: Session): void {
   if (session.sessionId !== visit?.session.sessionId) return;
   visit.session = session;
+  player.heard(session);
   tissue.show(session);
+  part("what-was-that", HTMLButtonElement).hidden = session.journal?.durableStep === undefined;
   holding();
 }
 
 function holding(): void {
   if (!visit) return;
+  if (visit.session.playback) {
+    part("holder", HTMLElement).textContent = "Recorded: to touch it, go on from here";
+    return;
+  }
   const mine = visit.hand.holds;
   const others = visit.session.heldTools.filter((tool) => !mine || tool.tool !== 0);
   const names = others.map((tool) => `${tool.holder || "Somebody"} holds ${tool.tool === 0 ? "the tool" : `tool ${tool.tool}`}`);
@@ -283,23 +396,20 @@ part("refinement", HTMLInputElement).addEventListener("input", (event) => {
   stage.show(surface, true);
   tellControls();
 });
-part("scene", HTMLSelectElement).addEventListener("change", (event) => {
-  void open(undefined, named((event.target as HTMLSelectElement).value));
-});
+part("what-was-that", HTMLButtonElement).addEventListener("click", () => void whatWasThat());
 part("share", HTMLButtonElement).addEventListener("click", () => {
+  if (player.moment) writeMoment(player.moment, player.moment.step, false);
   // Browsers offer the clipboard only to pages from a secure origin or from this machine.
   const failed = () => notice("The link could not be copied. Copy the address of this page instead.");
   if (!isSecureContext) return failed();
-  const copied = () => notice("Link copied. Anyone who opens it sees this session.");
+  const copied = () => notice(`Link copied. Anyone who opens it sees this ${player.isOpen ? "recording" : "session"}.`);
   void navigator.clipboard.writeText(location.href).then(copied, failed);
 });
 part("play", HTMLButtonElement).addEventListener("click", () => void play());
 new FileOpener((session, scene) => {
-  visit?.leave();
-  visit = undefined;
-  playing?.abort();
+  leave();
   made = { case: "scene", value: scene };
-  show(session, true).catch((error: unknown) => over(`${describe(error)}.`));
+  show(session, { isNew: true }).catch((error: unknown) => over(`${describe(error)}.`));
 });
 
 async function play(): Promise<void> {
@@ -340,11 +450,23 @@ stage.onDrawn = () => {
 };
 
 // A hidden window releases its connections for visible ones.
-document.addEventListener("visibilitychange", () => (document.hidden ? visit?.lookAway() : visit?.look()));
-addEventListener("pagehide", () => void visit?.hand.letGo());
+document.addEventListener("visibilitychange", () => {
+  player.look(!document.hidden);
+  if (document.hidden) visit?.lookAway();
+  else visit?.look();
+});
+addEventListener("pagehide", () => {
+  leavePage();
+  void visit?.hand.letGo();
+  player.close();
+});
+// What was kept of a page that was left has no session of its own any more.
+addEventListener("pageshow", ({ persisted }) => persisted && location.reload());
 addEventListener("popstate", () => {
-  const sessionId = new URLSearchParams(location.search).get("session") ?? undefined;
-  if (sessionId !== visit?.session.sessionId) void open(sessionId, made);
+  const { sessionId, moment } = addressed();
+  if (moment) void open({ moment });
+  else if (sessionId === undefined) void open({ source: made });
+  else if (sessionId !== visit?.session.sessionId) void open({ sessionId });
 });
 
 // Ten times a second for values read as they change, once a second for figures.
@@ -376,6 +498,7 @@ setInterval(() => {
     framesDrawn: stage.drawn,
     framesSkipped: frames.skipped,
     picture: stage.describe(),
+    speed: visit.speed,
     overruns: newest?.overrunCount ?? session.overrunCount,
     dilation: newest?.timeDilation ?? session.timeDilation,
     awakePoints: newest?.awakePoints,
@@ -399,31 +522,6 @@ async function listScripts(sessionId: string): Promise<void> {
   }
 }
 
-async function lists(): Promise<void> {
-  for (let failures = 0; ; failures++) {
-    try {
-      const { sceneNames } = await sessions.listScenes({}, { timeoutMs: PATIENCE_MS });
-      part("scene", HTMLSelectElement).replaceChildren(...sceneNames.map(entryOf));
-      mark(visit?.session.scene?.name ?? asked.get("scene") ?? DEFAULT_SCENE);
-      return;
-    } catch {
-      await sleep(backoffMs(failures));
-    }
-  }
-}
-
-/** Selects a scene in the list; one that the server does not have, such as a file of one's own, joins the list. */
-function mark(scene: string): void {
-  const list = part("scene", HTMLSelectElement);
-  for (const option of [...list.options]) if (option.disabled) option.remove();
-  list.value = scene;
-  if (list.value === scene) return;
-  const own = new Option(scene, scene);
-  own.disabled = true;
-  list.add(own);
-  list.value = scene;
-}
-
 /** Datagrams belong to a lease. */
 function wayText({ hand }: Visit): string {
   if (!hand.holds) return "no tool is held";
@@ -433,14 +531,15 @@ function wayText({ hand }: Visit): string {
 /** Age of the newest frame here. */
 function frameAgeMs(): number | undefined {
   const [now, newest] = [visit?.nowS(), visit?.frames.newest];
-  return now === undefined || !newest ? undefined : Math.max(0, 1000 * (now - newest.timeS));
+  return now === undefined || !newest ? undefined : Math.max(0, (1000 * (now - newest.timeS)) / (visit?.speed ?? 1));
 }
 
 /** Whether no frame is due: the server sends none while nothing moves, and samples go on. */
-function isStill({ frames, samples, session }: Visit): boolean {
+function isStill({ frames, samples, session, speed }: Visit): boolean {
   const { newest } = samples;
+  if (session.state !== SessionState.RUNNING) return true;
   if (newest?.asleep ?? session.resting) return true;
-  return newest !== undefined && frames.newest !== undefined && newest.simulationTimeS - frames.newest.timeS > STILL_S;
+  return newest !== undefined && frames.newest !== undefined && newest.simulationTimeS - frames.newest.timeS > STILL_S * speed;
 }
 
 /** The page's state as numbers, for tests and measurements. */
@@ -470,6 +569,14 @@ const inside = {
   },
   get holds() {
     return visit?.hand.holds ?? false;
+  },
+  /** What is played, if anything is. */
+  get recording() {
+    return player.moment;
+  },
+  /** Where the camera is. */
+  get camera() {
+    return stage.camera.matrixWorld.toArray();
   },
   /** Whether datagrams get through, and how many were sent and came in this session; poses and samples in them. */
   get datagrams() {
@@ -511,5 +618,9 @@ const mode = asked.get("tool");
 for (const choice of document.querySelectorAll<HTMLInputElement>("input[name=mode]")) {
   if (choice.value === mode) choice.checked = true;
 }
-void open(asked.get("session") ?? undefined, named(asked.get("scene") ?? undefined));
-void lists();
+const first = addressed();
+choices.markScene(asked.get("scene") ?? DEFAULT_SCENE);
+if (first.moment) void open({ moment: first.moment });
+else if (first.sessionId) void open({ sessionId: first.sessionId });
+else void open({ source: named(asked.get("scene") ?? undefined) });
+void choices.fill();

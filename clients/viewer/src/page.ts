@@ -1,5 +1,6 @@
 // Elements of the page by id, and the parameters in its address (README, "The page").
 
+import type { JournalName } from "./journal";
 import { caller } from "./server";
 
 export function part<T extends HTMLElement>(id: string, kind: new () => T): T {
@@ -17,13 +18,35 @@ export function askedNumber(key: string, least: number, most: number): number | 
   return text !== null && text !== "" && value >= least && value <= most ? value : undefined;
 }
 
-/** Writes the session into the address, so that reloading and sharing work. */
-export function writeAddress(sessionId: string, isNew: boolean): void {
+/** What the address names: a session, or a moment of what was recorded (`journal=ID`, and `run` and `step` if they are known). */
+export function addressed(): { sessionId?: string; moment?: JournalName & { step?: number } } {
+  const address = new URLSearchParams(location.search);
+  const sessionId = address.get("journal");
+  if (!sessionId) return { sessionId: address.get("session") ?? undefined };
+  const whole = (key: string) => {
+    const value = Number(address.get(key) ?? "");
+    return Number.isSafeInteger(value) && value > 0 ? value : undefined;
+  };
+  return { moment: { sessionId, run: whole("run") ?? 0, step: whole("step") } };
+}
+
+/** Writes what is shown into the address, so that reloading and sharing work. */
+function write(values: Record<string, string>, isNew: boolean): void {
   const address = new URL(location.href);
-  address.searchParams.set("session", sessionId);
-  address.searchParams.delete("scene");
+  for (const key of ["session", "scene", "journal", "run", "step"]) address.searchParams.delete(key);
+  for (const [key, value] of Object.entries(values)) address.searchParams.set(key, value);
   if (isNew) history.pushState(null, "", address);
   else history.replaceState(null, "", address);
+}
+
+/** Writes the session into the address. */
+export function writeAddress(session: string, isNew: boolean): void {
+  write({ session }, isNew);
+}
+
+/** Writes a moment of what was recorded into the address. */
+export function writeMoment({ sessionId, run }: JournalName, step: number, isNew: boolean): void {
+  write({ journal: sessionId, run: String(run), step: String(step) }, isNew);
 }
 
 /** The name that others see: from the address, or generated for this window. */

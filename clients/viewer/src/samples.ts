@@ -86,6 +86,12 @@ export class Samples {
     return { deepM: -along(u), asideM: across(u), outN: share * along(f), acrossN: share * across(f), allN: share * norm(f) };
   }
 
+  /** Goes on from those of another session, which had the same history up to a time. */
+  follow({ tools, history }: Samples, timeS: number): void {
+    this.tools = tools;
+    this.history.push(...history.filter((moment) => moment.timeS <= timeS && moment.timeS > timeS - HISTORY_S));
+  }
+
   /** Reads until `signal` aborts. */
   run(
     sessionId: string,

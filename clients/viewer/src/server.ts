@@ -10,9 +10,15 @@ import { ViewService } from "./gen/palpate/v1/view_pb";
 /** Bytes received from the server in response bodies, without HTTP headers. */
 export const received = { bytes: 0 };
 
+/** Whether the window is being left: what is sent then still arrives. */
+let isLeft = false;
+export function leave(): void {
+  isLeft = true;
+}
+
 /** Counts the bytes that pass. */
 const counted: typeof fetch = async (input, init) => {
-  const answer = await fetch(input, init);
+  const answer = await fetch(input, isLeft ? { ...init, keepalive: true } : init);
   if (!answer.body) return answer;
   const count = new TransformStream<Uint8Array, Uint8Array>({
     transform(chunk, out) {
@@ -60,6 +66,11 @@ export function describe(error: unknown): string {
 /** Whether the session is over for good. */
 export function isGone(error: unknown): boolean {
   return ["UNKNOWN_SESSION", "SESSION_DELETED"].includes(reasonOf(error));
+}
+
+/** Whether the same call may be answered later: a refusal with any other reason would be repeated. */
+export function isPassing(error: unknown): boolean {
+  return ["", "SHUTTING_DOWN", "TOO_MANY"].includes(reasonOf(error));
 }
 
 export function isUnimplemented(error: unknown): boolean {

@@ -84,6 +84,8 @@ export class Stage {
   private aim: Place | undefined;
   /** Whether the camera is where the page put it. */
   private isHome = true;
+  /** Pixels at the bottom of the picture that something covers. */
+  private coveredPx = 0;
   private wanted = false;
   private before = 0;
   /** Time that the last picture of what moves took, ms. */
@@ -131,8 +133,9 @@ export class Stage {
     this.colours();
   }
 
-  /** Shows a surface. `keepView` keeps the camera and the texture. */
-  show(surface: Surface, keepView: boolean): void {
+  /** Shows a surface. `keepView` keeps the camera and the texture; else the tissue is seen above what is covered. */
+  show(surface: Surface, keepView: boolean, coveredPx = 0): void {
+    if (!keepView) this.coveredPx = coveredPx;
     for (const old of [this.mesh, this.flank, this.lines, this.ground?.mesh]) if (old) this.scene.remove(old);
     this.surface?.dispose();
     this.ground?.dispose();
@@ -187,7 +190,7 @@ export class Stage {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     const surface = this.surface;
     if (!surface || width === 0 || height === 0) return;
-    const home = [this.camera, this.orbit.target, { width, height }] as const;
+    const home = [this.camera, this.orbit.target, { width, height, coveredPx: this.coveredPx }] as const;
     if (surface instanceof Body) homeOfBody(surface, ...home);
     else homeOfSheet(surface, ...home);
     this.orbit.update();

@@ -18,6 +18,8 @@ export interface Figures {
   framesSkipped: bigint;
   /** What is reduced in the picture. */
   picture: string;
+  /** How fast what was recorded is played; 1 otherwise. */
+  speed: number;
   overruns: bigint;
   dilation: number;
   awakePoints?: number;
@@ -116,7 +118,7 @@ export class Status {
     this.set("picture", figures.picture);
     this.set("received", bytes >= 1e6 ? `${(bytes / 1e6).toFixed(2)} MB/s` : `${(bytes / 1e3).toFixed(1)} kB/s`);
     this.set("overruns", String(figures.overruns));
-    this.set("time", `${figures.dilation.toFixed(2)} × real`);
+    this.set("time", `${(figures.speed * figures.dilation).toFixed(2)} × real`);
     this.set("tissue", figures.isAsleep ? "asleep" : `${figures.awakePoints ?? "–"} points awake`);
     if (figures.auditedError !== undefined) {
       const asked = figures.tolerance === undefined ? "" : ` (tolerance ${figures.tolerance.toExponential(0)})`;

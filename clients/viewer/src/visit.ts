@@ -40,18 +40,27 @@ export class Visit {
   roundTripMs: number | undefined;
   /** When the server last answered, of this window's clock. */
   heardMs = performance.now();
+  /** When its newest answer was asked for. */
+  askedMs = -Infinity;
   /** Points of a sheet along its sides; vertices and 1 of a body. */
   private readonly points: [number, number];
   private readonly ended = new AbortController();
   private seen = new AbortController();
   private watching = new AbortController();
-  /** Simulated time minus local time, s, from the fastest recent answer, and that answer's round trip. */
-  private clock: { offsetS: number; roundTripMs: number; atMs: number; overruns: bigint } | undefined;
+  /** Simulated and local time, s, from the fastest recent answer, and that answer's round trip. */
+  private clock: { timeS: number; localS: number; roundTripMs: number; atMs: number; overruns: bigint } | undefined;
+  private readonly mesh: MeshData | undefined;
 
-  /** Finds out what the session shows, which for a body is its mesh. */
-  static async to(session: Session, holder: string, refinement: number | undefined, told: Told): Promise<Visit> {
-    const mesh = session.scene?.mesh && (await fetchMesh(session.sessionId));
-    return new Visit(session, holder, refinement, told, mesh);
+  /** Finds out what the session shows, which for a body is its mesh. It takes over the surface of one with the same tissue. */
+  static async to(
+    session: Session,
+    holder: string,
+    refinement: number | undefined,
+    told: Told,
+    former?: Visit,
+  ): Promise<Visit> {
+    const mesh = former ? former.mesh : session.scene?.mesh && (await fetchMesh(session.sessionId));
+    return new Visit(session, holder, refinement, told, mesh, former);
   }
 
   private constructor(
@@ -60,7 +69,9 @@ export class Visit {
     refinement: number | undefined,
     private readonly told: Told,
     mesh: MeshData | undefined,
+    former: Visit | undefined,
   ) {
+    this.mesh = mesh;
     const sheet = session.scene?.sheet;
     const count = mesh ? mesh.restM.length / 3 : 1;
     this.points = mesh ? [count, 1] : [sheet?.pointsX ?? 1, sheet?.pointsY ?? 1];
@@ -72,7 +83,7 @@ export class Visit {
       const lengthM = fingerM(sizeM, mesh.edgeM);
       // Springs across carry the less of a push, the more points share it.
       const aPointN = 2 * lengthM * (virtual + 2 * k * Math.min(1, (mesh.edgeM / lengthM) ** 2));
-      this.surface = new Body(mesh, lengthM, session.points);
+      this.surface = former?.surface ?? new Body(mesh, lengthM, session.points);
       const { sum } = this.surface.push(this.surface.middle(), lengthM);
       // Of a tissue whose springs are not all alike nothing is told.
       const mostN = rounded(sum * aPointN || 2);
@@ -91,10 +102,12 @@ export class Visit {
     if (!mesh) {
       let chosen = 3;
       while (chosen > 0 && this.vertices(chosen) > CHOSEN_VERTICES) chosen -= 1;
-      this.refinement = Math.min(refinement ?? chosen, this.mostRefinement);
+      this.refinement = former?.refinement ?? Math.min(refinement ?? chosen, this.mostRefinement);
     }
-    this.surface ??= this.newSheet();
+    this.surface ??= former?.surface ?? this.newSheet();
     this.samples = new Samples(this.reach.pointN, (tool) => this.sense(tool));
+    // Until its own come, those of the other are what is seen.
+    if (former) this.samples.follow(former.samples, session.simulationTimeS);
     this.hand = new Hand(session.sessionId, holder, this.reach, () => this.surface, sampleEvery(this.rateHz));
     this.hand.datagrams.onSample = (sample) => this.samples.takeOwn(sample);
   }
@@ -128,7 +141,7 @@ export class Visit {
     this.seen.abort();
     this.seen = new AbortController();
     const { signal } = this.seen;
-    void this.samples.run(this.session.sessionId, this.rateHz, signal, this.told.onTrouble);
+    void this.samples.run(this.session.sessionId, this.rateHz * this.speed, signal, this.told.onTrouble);
     this.watch();
   }
 
@@ -160,9 +173,14 @@ export class Visit {
     this.seen.abort();
   }
 
+  /** How fast its time goes on: other than 1 only of what is played. */
+  get speed(): number {
+    return this.session.playback?.speed ?? 1;
+  }
+
   /** Estimate of the simulated time now, s. */
   nowS(): number | undefined {
-    return this.clock && performance.now() / 1000 + this.clock.offsetS;
+    return this.clock && this.clock.timeS + this.speed * (performance.now() / 1000 - this.clock.localS);
   }
 
   private ask(): Promise<void> {
@@ -191,6 +209,7 @@ export class Visit {
   private heard(session: Session, begunMs: number, endedMs: number): void {
     this.session = session;
     this.heardMs = endedMs;
+    this.askedMs = begunMs;
     const roundTripMs = endedMs - begunMs;
     this.roundTripMs = roundTripMs;
     // The fastest answer gives the most exact time. After a while slower ones count again, because clocks drift, and
@@ -199,8 +218,8 @@ export class Visit {
     const overruns = session.overrunCount;
     const isOld = clock && (endedMs - clock.atMs > 10_000 || overruns !== clock.overruns);
     if (!clock || isOld || roundTripMs <= clock.roundTripMs) {
-      const middleS = (begunMs + endedMs) / 2000;
-      this.clock = { offsetS: session.simulationTimeS - middleS, roundTripMs, atMs: endedMs, overruns };
+      const localS = (begunMs + endedMs) / 2000;
+      this.clock = { timeS: session.simulationTimeS, localS, roundTripMs, atMs: endedMs, overruns };
     }
     this.told.onSession(session);
     this.told.onWell();

@@ -78,6 +78,35 @@ export function makeOrgan(organ, edgeMm, file) {
   if (made.status !== 0) throw new Error(made.stderr);
 }
 
+/** Elements that are seen and reach beyond the window's sides, or whose text does not fit. @param {Page} page @returns {Promise<string[]>} */
+export function cut(page) {
+  return page.page.evaluate(`[...document.body.querySelectorAll("*")].filter((element) => {
+    if (!element.checkVisibility() || element.closest("option") || element.tagName === "INPUT") return false;
+    const { left, right, width } = element.getBoundingClientRect();
+    if (width === 0) return false;
+    const fits = element.tagName === "SELECT" || element.id === "view" || element.scrollWidth <= element.clientWidth + 1 || getComputedStyle(element).display === "inline";
+    return left < -0.5 || right > innerWidth + 0.5 || !fits;
+  }).map((element) => element.tagName + "#" + element.id + ": " + element.textContent.slice(0, 40))`);
+}
+
+/**
+ * A call of the session service that names a session and nothing else. Returns the reason of a refusal, or nothing.
+ * @param {Server} server @param {string} method @param {string} sessionId
+ */
+export async function callSession({ url }, method, sessionId) {
+  const id = Buffer.from(sessionId);
+  // A frame of gRPC-web: no flags, the length, and field 1 of the request.
+  const body = Buffer.concat([Buffer.from([0, 0, 0, 0, id.length + 2, 0x0a, id.length]), id]);
+  const headers = { "content-type": "application/grpc-web+proto", "x-grpc-web": "1" };
+  const answer = await fetch(`${url}/palpate.v1.SessionService/${method}`, { method: "POST", headers, body });
+  const told = Buffer.from(await answer.arrayBuffer()).toString("latin1");
+  const [status, message] = [
+    answer.headers.get("grpc-status") ?? /grpc-status:\s*(\d+)/.exec(told)?.[1] ?? "none",
+    answer.headers.get("grpc-message") ?? /grpc-message:\s*([^\r\n]*)/.exec(told)?.[1] ?? "",
+  ];
+  return status === "0" ? undefined : `${status} ${message}`;
+}
+
 /** Red, green and blue of a pixel of a screenshot. @param {import("playwright-core").Page} page @param {number} x @param {number} y */
 export async function colourAt(page, x, y) {
   const png = await page.screenshot({ clip: { x: Math.round(x), y: Math.round(y), width: 1, height: 1 } });
@@ -126,6 +155,8 @@ export class Server {
  * @typedef {{
  *   frames: { taken: number, skipped: number, drawn: number, timeS: number }, received: number, largestM: number, deepestM: number, forceN: number[],
  *   clear: number | undefined, cameraHeight: number, widthM: number, drawing: { isDrawn: boolean, isTextured: boolean, hasTexture: boolean },
+ *   recording: { sessionId: string, run: number, begin: number, end: number, step: number, isPlaying: boolean, isBusy: boolean, speed: number, playback: string } | undefined,
+ *   camera: number[],
  *   datagrams: { carries: boolean, sent: number, came: number, poses: number, samples: number, fellBack: number },
  *   ageMs: number | undefined, picture: string, holds: boolean, at: (x: number, y: number) => [number, number], pixelAfterPress: (x: number, y: number) => Promise<number>,
  * }} Inside What the page tells of itself (src/main.ts).
@@ -176,7 +207,7 @@ export class Page {
    * Waits until what the page tells of itself satisfies a condition. (Asked from here: the page's own policy lets no text
    * become a program.)
    * @template T
-   * @param {(inside: Inside, argument: T) => boolean} condition
+   * @param {(inside: Inside, argument: T) => boolean | undefined} condition
    * @param {T} [argument]
    */
   async until(condition, argument) {

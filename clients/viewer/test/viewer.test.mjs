@@ -5,7 +5,7 @@ import { mkdtempSync, readFileSync, writeFileSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { after, before, describe, test } from "node:test";
-import { colourAt, launch, makeOrgan, makeToken, Page, pageProcesses, ROOT, Server } from "./harness.mjs";
+import { colourAt, cut, launch, makeOrgan, makeToken, Page, pageProcesses, ROOT, Server } from "./harness.mjs";
 import { Lossy } from "./lossy.mjs";
 
 /** @type {import("playwright-core").Browser} */
@@ -434,17 +434,6 @@ describe("touch", () => {
 async function across(page, part) {
   const [from, to] = [await page.at(0.5 - part / 2, 0.5), await page.at(0.5 + part / 2, 0.5)];
   return Math.hypot(to[0] - from[0], to[1] - from[1]);
-}
-
-/** Elements that are seen and reach beyond the window's sides, or whose text does not fit. @param {Page} page @returns {Promise<string[]>} */
-function cut(page) {
-  return page.page.evaluate(`[...document.body.querySelectorAll("*")].filter((element) => {
-    if (!element.checkVisibility() || element.closest("option") || element.tagName === "INPUT") return false;
-    const { left, right, width } = element.getBoundingClientRect();
-    if (width === 0) return false;
-    const fits = element.tagName === "SELECT" || element.id === "view" || element.scrollWidth <= element.clientWidth + 1 || getComputedStyle(element).display === "inline";
-    return left < -0.5 || right > innerWidth + 0.5 || !fits;
-  }).map((element) => element.tagName + "#" + element.id + ": " + element.textContent.slice(0, 40))`);
 }
 
 /** Nobody presses. @param {Page} page */

@@ -1,0 +1,127 @@
+// The list of what can be opened: the server's scenes, and what it has recorded, live sessions apart.
+
+import { type JournalName, lengthText, type Listed, listJournals, whenText } from "./journal";
+import { part } from "./page";
+import { entryOf, pictureOf } from "./pictures";
+import { backoffMs, PATIENCE_MS, sessions, sleep } from "./server";
+
+/** What somebody chose. */
+export type Choice = { kind: "scene"; scene: string } | ({ kind: "live" | "recorded" } & JournalName);
+
+/** So many of each group are listed, the newest. */
+const MOST_LISTED = 40;
+/** A list this old is asked for again when somebody turns to it. */
+const OLD_MS = 3000;
+
+const keyOf = ({ sessionId, run }: JournalName, kind: "live" | "recorded") => `${kind} ${sessionId} ${run}`;
+
+export class Choices {
+  private readonly list = part("scene", HTMLSelectElement);
+  private readonly live = group("Live");
+  private readonly recorded = group("Recorded");
+  private readonly choices = new Map<HTMLOptionElement, Choice>();
+  private marked = { value: "", name: "" };
+  /** The session that the page is in, which is no choice. */
+  private present = "";
+  private askedMs = -Infinity;
+
+  constructor(onChoice: (choice: Choice) => void) {
+    this.list.addEventListener("change", () => {
+      const chosen = this.list.selectedOptions[0];
+      if (chosen) onChoice(this.choices.get(chosen) ?? { kind: "scene", scene: chosen.value });
+    });
+    for (const turn of ["pointerenter", "focus"] as const) {
+      this.list.addEventListener(turn, () => {
+        if (performance.now() - this.askedMs > OLD_MS) void this.ask();
+      });
+    }
+  }
+
+  /** Fills the list, however long it takes the server to be there. */
+  async fill(): Promise<void> {
+    for (let failures = 0; ; failures++) {
+      try {
+        const { sceneNames } = await sessions.listScenes({}, { timeoutMs: PATIENCE_MS });
+        this.list.replaceChildren(...sceneNames.map(entryOf), this.live, this.recorded);
+        this.mark(this.marked.value, this.marked.name);
+        break;
+      } catch {
+        await sleep(backoffMs(failures));
+      }
+    }
+    await this.ask();
+  }
+
+  /** Asks what is recorded. Call when that may have changed. */
+  async ask(): Promise<void> {
+    this.askedMs = performance.now();
+    const listed = await listJournals();
+    this.choices.clear();
+    const groups = [
+      [this.live, listed.filter(({ isLive, sessionId }) => isLive && sessionId !== this.present), "live"],
+      [this.recorded, listed.filter(({ isLive }) => !isLive), "recorded"],
+    ] as const;
+    for (const [group, journals, kind] of groups) {
+      group.replaceChildren(...journals.slice(0, MOST_LISTED).map((journal) => this.entry(journal, kind)));
+      group.hidden = journals.length === 0;
+    }
+    this.mark(this.marked.value, this.marked.name);
+  }
+
+  private entry(journal: Listed, kind: "live" | "recorded"): HTMLOptionElement {
+    const { sceneName, begun, lengthS, sessionId, run } = journal;
+    const entry = new Option(`${sceneName}, ${whenText(begun)}, ${lengthText(lengthS)}`, keyOf(journal, kind));
+    this.choices.set(entry, { kind, sessionId, run });
+    return entry;
+  }
+
+  /** The page shows a live session. */
+  markScene(scene: string, sessionId = ""): void {
+    const isOther = sessionId !== this.present;
+    this.present = sessionId;
+    this.mark(scene, scene);
+    if (isOther && this.askedMs > 0) void this.ask();
+  }
+
+  /** The page shows what was recorded. */
+  markRecorded(journal: JournalName, sceneName: string): void {
+    const value = keyOf(journal, "recorded");
+    const isOther = value !== this.marked.value;
+    this.present = "";
+    this.mark(value, `${sceneName}, recorded`);
+    if (isOther && this.askedMs > 0) void this.ask();
+  }
+
+  /** Selects an entry; what the list does not have, such as a file of one's own, joins it. */
+  private mark(value: string, name: string): void {
+    this.marked = { value, name };
+    for (const option of [...this.list.options]) if (option.disabled) option.remove();
+    this.list.value = value;
+    if (this.list.value === value) return;
+    const own = new Option(name, value);
+    own.disabled = true;
+    this.list.prepend(own);
+    this.list.value = value;
+  }
+
+  /** The entry of a scene that has no picture. */
+  withoutPicture(scene: string): HTMLOptionElement | undefined {
+    if (pictureOf(scene)) return undefined;
+    return [...this.list.options].find(({ value, disabled }) => value === scene && !disabled);
+  }
+
+  /** A scene has got its picture. */
+  refresh(entry: HTMLOptionElement): void {
+    const { selected } = entry;
+    const pictured = entryOf(entry.value);
+    entry.replaceWith(pictured);
+    pictured.selected = selected;
+  }
+}
+
+function group(label: string): HTMLOptGroupElement {
+  const made = document.createElement("optgroup");
+  made.label = label;
+  made.hidden = true;
+  return made;
+}
