@@ -11,25 +11,31 @@ SCRIPT ?= scripts/press.toml
 VENV := target/venv
 
 # The page: its sources, what npm installs for it, and what is built.
+# Its connection is the package of clients/typescript.
 VIEWER := clients/viewer
+TYPESCRIPT := clients/typescript
 PAGE := $(VIEWER)/dist/index.html
-MODULES := $(VIEWER)/node_modules/.package-lock.json
-PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/*.yaml $(VIEWER)/index.html $(VIEWER)/src/*.ts \
-	$(VIEWER)/src/*.css $(VIEWER)/public/* proto/palpate/v1/*.proto)
+MODULES := clients/node_modules/.package-lock.json
+PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/index.html $(VIEWER)/src/*.ts $(VIEWER)/src/*.css \
+	$(VIEWER)/public/* $(TYPESCRIPT)/*.json $(TYPESCRIPT)/*.yaml $(TYPESCRIPT)/src/*.ts proto/palpate/v1/*.proto)
 
-.PHONY: help run build release viewer page-if-node test test-viewer test-arm test-asan test-valgrind test-debug test-mutants need-arm stress libfuzzer lint picture figures screenshot bench-roundtrip bench-duty \
+.PHONY: help run install header test-abi bench-tick build release viewer page-if-node test test-viewer test-python bench-python test-arm test-asan test-valgrind test-debug test-mutants need-arm stress libfuzzer lint picture figures screenshot bench-roundtrip bench-duty \
 	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-rest bench-link bench-viewer bench-load soak siege fuzz need-rust \
-	need-python need-node
+	need-python need-node chaos
 
 help:
 	@echo 'make run             build, serve on $(LISTEN), poke the tissue, draw what it felt, go on serving: see it in a browser'
 	@echo 'make release         static server, client, container image and checksums in target/release-files; says what it can not make'
+	@echo 'make install         libpalpate for C, C++ and C#, and the programs, below PREFIX=/usr/local'
+	@echo 'make header          clients/c/include/palpate.h from its sources'
 	@echo 'make viewer          the page that shows the tissue, clients/viewer/dist (Node.js; make run does it by itself)'
 	@echo 'make test            every test (Rust, Python 3, and the page in a browser)'
 	@echo 'make test-viewer     the page alone; its screenshots are in target/viewer'
+	@echo 'make test-python     the Python package alone: installed with pip in target/venv, and its tests'
 	@echo 'make test-arm        the same bits on ARM (NEON): tests/determinism under qemu-user; says what it needs'
 	@echo 'make test-asan       the kernel under the address sanitizer'
 	@echo 'make test-valgrind   the kernel under memcheck of valgrind, plain and AVX2'
+	@echo 'make test-abi        libpalpate from C under valgrind and the address sanitizer; its interface beside the one kept'
 	@echo 'make test-debug      the kernel with debug assertions'
 	@echo 'make test-mutants    how many of 300 mutants of the kernel, touch and sessions the tests catch (an hour or two)'
 	@echo 'make stress          ten thousand random scenes, a million steps on 200 meshes, ten million steps (some minutes)'
@@ -47,11 +53,13 @@ help:
 	@echo 'make bench-tolerance is the tolerance kept? Random scenes against f64 at 1e-10: docs/benchmarks/tolerance.md'
 	@echo 'make bench-kernel    the time of a step beside the machine'"'"'s limits, numba, Taichi and NumPy'
 	@echo 'make bench-link      touch over a network in virtual time, by delay, tissue, hand and scheme: docs/benchmarks/link.md'
+	@echo 'make bench-tick      the time of a tick of the touch thread while others are busy'
 	@echo 'make bench-viewer    331 × 331 points at 60 frames a second in a browser, and from a press to its pixel'
 	@echo 'make bench-stability the largest stable step, predicted and observed'
 	@echo 'make bench-skip      what it saves to leave out what is at rest, and its error'
 	@echo 'make bench-mesh      the time of a step on meshes, at every width'
 	@echo 'make bench-organ     organs: time of a step, sleep, tips, and how even touch is: docs/benchmarks/organ.md'
+	@echo 'make bench-python    a run in Python beside the program, and a study of 1000 tissues beside numba and NumPy'
 	@echo 'make bench-load      sessions that one core bears, with clients and without: docs/benchmarks/load.md'
 	@echo '                     ATTACK=all: what a client notices of 41 attacks (an hour): docs/benchmarks/attacks.md;'
 	@echo '                     one attack alone: make bench-load ATTACK=endless-scene'
@@ -59,6 +67,8 @@ help:
 	@echo '                     clients and servers killed KILLS=50 times'
 	@echo 'make siege           eight attackers at random against four honest clients for SECONDS=1800, by SEED=16: their times,'
 	@echo '                     memory, and whether all is given back; make test does it for 30 s'
+	@echo 'make chaos           a fleet in virtual time for SECONDS=1000000, with crashes, pauses and partitions, from SEED=16 on;'
+	@echo '                     then ROUNDS=200 of real servers that are killed, frozen and cut off from etcd'
 
 need-rust:
 	@command -v $(CARGO) >/dev/null || { echo 'Rust is missing: install it from https://rustup.rs' >&2; exit 1; }
@@ -74,11 +84,20 @@ need-node:
 build: need-rust
 	$(CARGO) build --release --workspace
 
+# Below PREFIX: include, lib (with pkg-config and CMake), bin. As a package: DESTDIR=….
+PREFIX ?= /usr/local
+BUILT := $(or $(CARGO_TARGET_DIR),target)/release
+install: build
+	sh contrib/install.sh '$(PREFIX)' $(BUILT)
+
+header: need-rust
+	PALPATE_WRITE_HEADER=1 $(CARGO) test --release --package palpate-c --test header
+
 release: need-rust page-if-node
 	CARGO=$(CARGO) sh contrib/release.sh
 
-$(MODULES): $(VIEWER)/package-lock.json | need-node
-	cd $(VIEWER) && $(NPM) ci
+$(MODULES): clients/package-lock.json | need-node
+	cd clients && $(NPM) ci
 	@touch $@
 
 $(PAGE): $(MODULES) $(PAGE_SOURCES)
@@ -106,23 +125,34 @@ run:
 	echo; echo "    $$url"; echo; \
 	wait $$server
 
-$(VENV)/ready: tests/python/requirements.txt | need-python
+$(VENV)/ready: tests/python/requirements.txt clients/python/tests/requirements.txt | need-python
 	$(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/pip install --quiet --disable-pip-version-check -r tests/python/requirements.txt
+	$(VENV)/bin/pip install --quiet --disable-pip-version-check -r tests/python/requirements.txt \
+		-r clients/python/tests/requirements.txt
 	touch $@
 
 # The same random cases every time, so that the result is that of the change. `cargo test` alone draws others each time,
 # and `make stress` many.
-test: build $(VENV)/ready test-viewer
+test: build $(VENV)/ready test-viewer test-python
 	PROPTEST_RNG_SEED=20261122 $(CARGO) test --release --workspace
 	$(VENV)/bin/python -m unittest discover -s tests/python -v
 
 test-viewer: build viewer
 	cd $(VIEWER) && $(NPM) test
+	cd $(TYPESCRIPT) && $(NPM) test
+
+# As a user installs it, from what `build` has compiled: the tools for building are those of the environment, so that pip makes
+# none of its own.
+INSTALL_PYTHON = PATH="$(CURDIR)/$(VENV)/bin:$$PATH" $(VENV)/bin/pip install --quiet --disable-pip-version-check \
+	--no-build-isolation --no-deps --force-reinstall ./clients/python
+test-python: build $(VENV)/ready
+	$(INSTALL_PYTHON)
+	$(VENV)/bin/python -m unittest discover -s clients/python/tests -v
 
 lint: need-rust $(MODULES)
 	$(CARGO) fmt --all --check
 	$(CARGO) clippy --release --workspace --all-targets -- -D warnings
+	cd $(TYPESCRIPT) && $(NPM) run lint
 	cd $(VIEWER) && $(NPM) run lint
 
 picture: build
@@ -169,8 +199,10 @@ test-arm: need-arm
 		/usr/bin/cargo test --release --target $(ARM) --target-dir target/arm $(ARM_TESTS)
 
 # The sanitizer's runtime comes with the stable compiler, its switch does not.
+# Less optimization, because the checks make the code several times as long.
 test-asan: need-rust
-	RUSTC_BOOTSTRAP=1 RUSTFLAGS=-Zsanitizer=address $(CARGO) test --release --target $(shell uname -m)-unknown-linux-gnu \
+	CARGO_PROFILE_RELEASE_OPT_LEVEL=1 CARGO_PROFILE_RELEASE_CODEGEN_UNITS=16 CARGO_PROFILE_RELEASE_DEBUG=false \
+		RUSTC_BOOTSTRAP=1 RUSTFLAGS=-Zsanitizer=address $(CARGO) test --release --target $(shell uname -m)-unknown-linux-gnu \
 		--target-dir target/asan --lib --test determinism -- sheet:: bits hash
 
 # Memcheck does not know AVX-512: `auto` becomes AVX2.
@@ -178,6 +210,10 @@ test-valgrind: need-rust
 	@command -v valgrind >/dev/null || { echo 'valgrind is missing (Debian: apt-get install valgrind)' >&2; exit 1; }
 	CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_RUNNER='valgrind --error-exitcode=1 --quiet' \
 		$(CARGO) test --release --lib --test determinism -- every_operation region:: a_plan_gives the_golden_hash --test-threads=1
+
+# tests/abi/check.sh says what it leaves out because a tool is missing.
+test-abi: build
+	sh tests/abi/check.sh $(BUILT)
 
 test-debug: need-rust
 	CARGO_PROFILE_RELEASE_DEBUG_ASSERTIONS=true $(CARGO) test --release --target-dir target/assertions --lib \
@@ -240,6 +276,9 @@ bench-mesh: need-rust
 bench-organ: need-rust
 	$(CARGO) bench --quiet --bench organ -- $(ARGUMENTS)
 
+bench-tick: need-rust
+	$(CARGO) bench --quiet --package palpate-client --bench tick
+
 # `make bench-viewer SECONDS=60 PRESSES=500`: these are the environment's.
 bench-viewer: build viewer
 	@cd $(VIEWER) && $(NPM) --silent run bench
@@ -252,6 +291,13 @@ bench-link: build
 # (ARGUMENTS='--runs 1').
 bench-load: build
 	$(CARGO) bench --quiet --bench load -- $(if $(ATTACK),attacks $(ATTACK)) $(ARGUMENTS)
+
+# With numba beside it, if that installs: PEERS of bench-kernel.
+bench-python: build $(VENV)/ready
+	-$(VENV)/bin/pip install --quiet --disable-pip-version-check numba
+	$(INSTALL_PYTHON)
+	$(VENV)/bin/python clients/python/benches/run.py
+	$(VENV)/bin/python clients/python/benches/study.py
 
 # How long, s.
 SECONDS ?= 1800
@@ -268,3 +314,11 @@ soak: need-rust
 SEED ?= 16
 siege: need-rust
 	PALPATE_SIEGE_S=$(SECONDS) PALPATE_SIEGE_SEED=$(SEED) $(CARGO) test --release --test siege -- --nocapture
+
+# The fleet's histories, simulated s; a seed that fails is told with its last events. Then real servers on a real etcd.
+ROUNDS ?= 200
+chaos: SECONDS = 1000000
+chaos: need-rust
+	PALPATE_FLEET_SECONDS=$(SECONDS) PALPATE_FLEET_SEED=$(SEED) $(CARGO) test --release --test fleet_model -- --nocapture
+	PALPATE_FLEET_ROUNDS=$(ROUNDS) PALPATE_FLEET_SESSIONS=12 PALPATE_FLEET_RESTING=48 PALPATE_SEED=$(SEED) \
+		$(CARGO) test --release --test fleet -- --nocapture sessions_come_back

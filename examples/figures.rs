@@ -1,5 +1,5 @@
-//! `make figures`: generates the figures and experiments of docs/paper.md in docs/figures. Every run gives the same
-//! bytes.
+//! `make figures`: generates the figures and experiments of docs/paper.md and docs/organs.md in docs/figures. Every run gives
+//! the same bytes.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 #![allow(dead_code, unreachable_pub)] // The chart module is shared.
 
@@ -10,12 +10,13 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use chart::{Look, Panel, Series, svg};
+use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::render::{Camera, Film, View};
 use palpate::scene::script::Script;
-use palpate::scene::{PAPER, Scene};
+use palpate::scene::{BUILT_IN, PAPER, Scene};
 use palpate::session::{Session, run};
-use palpate::sheet::Model;
+use palpate::sheet::{Model, tangent};
 use palpate::surface::Refinement;
 use palpate::texture;
 
@@ -84,6 +85,74 @@ fn curves(title: &str, (key, name): (&str, &str), values: &[f64], up: std::ops::
     Panel::Curves { title: title.to_owned(), x: "time, s", y: "depth, mm", up, series }
 }
 
+/// An organ, and where a fingertip presses it.
+struct Pressed {
+    name: &'static str,
+    /// Near the place; the surface is pressed where it is nearest.
+    at_m: [f64; 3],
+    deep_m: f64,
+    /// Azimuth and elevation, degrees.
+    camera: [f64; 2],
+}
+
+const ORGANS: [Pressed; 3] = [
+    Pressed { name: "liver-organ", at_m: [-0.040, -0.060, 0.050], deep_m: 0.006, camera: [0.0, 30.0] },
+    Pressed { name: "gallbladder", at_m: [0.0, -0.05, 0.02], deep_m: 0.008, camera: [20.0, 35.0] },
+    Pressed { name: "colon", at_m: [0.07, 0.0, -0.02], deep_m: 0.006, camera: [75.0, 25.0] },
+];
+
+/// A scene of an organ, compiled.
+fn organ(name: &str) -> Arc<Model> {
+    let (_, text) = BUILT_IN.iter().find(|scene| scene.0 == name).unwrap();
+    let limits = Limits::default();
+    Model::compile(&Scene::parse(name, text, &[], &limits).unwrap(), &limits).unwrap()
+}
+
+/// An organ at rest, and under a fingertip that comes from outside (of the colon, whose wall faces inward, from inside).
+fn pressed(organ_pressed: &Pressed) {
+    let Pressed { name, at_m, deep_m, camera: [azimuth_deg, elevation_deg] } = organ_pressed;
+    let (model, limits) = (organ(name), Limits::default());
+    let point = model.shape().nearest(DVec3::from_array(*at_m));
+    let (place_m, outward) = (model.shape().rest_m(point), model.shape().normal(point));
+    let pose = |at_s: f64, out_m: f64| {
+        let [x, y, z] = (place_m + outward * out_m).to_array();
+        format!("{{ at_s = {at_s:?}, place_m = [{x:?}, {y:?}, {z:?}] }}")
+    };
+    let poses = [pose(0.0, 0.004), pose(0.4, -deep_m), pose(0.6, -deep_m)].join(", ");
+    let text = format!(
+        "name = \"press\"\nduration_s = 0.6\nsample_every_s = 0.1\n[[tool]]\ntip = {{ radius_m = 0.005, friction = 0.2 }}\nposes = [{poses}]\nuntil_s = 0.6\n"
+    );
+    let script = Script::parse("press", &text, Path::new("."), &model.scene, &limits).unwrap();
+    let refinement = Refinement::new(&model.scene, 0, &limits).unwrap();
+    let camera = Camera { azimuth_deg: *azimuth_deg, elevation_deg: *elevation_deg, distance: 1.6 };
+    let skin = texture::image(&model.scene.appearance, &limits).unwrap();
+    let view = View { camera, size: SIZE, refinement, texture: Some(skin) };
+    let mut film = Film::new(&model, &script, &limits).unwrap();
+    for (what, step) in [("rest", 0), ("pressed", 590)] {
+        let still = film.at(step).unwrap();
+        write(&format!("organ-{name}-{what}.png"), &still.picture(&model, &view).png().unwrap());
+    }
+}
+
+/// Force over depth of a slow press of `liver-organ`, over its lumps and away from them.
+fn lumps() {
+    let model = organ("liver-organ");
+    let line = |(hue, (name, place_m)): (usize, (&str, DVec3))| {
+        let pressed = tangent::press(&model, 0.005, place_m, 0.0005, 11);
+        let points = pressed.iter().map(|at| (1e3 * at.depth_m, at.force_n)).collect();
+        Series { name: name.to_owned(), hue, look: Look::Full, points }
+    };
+    let places = [
+        ("over the larger lump", DVec3::new(-0.040, -0.026, 0.037)),
+        ("over the smaller lump", DVec3::new(0.030, -0.013, 0.028)),
+        ("away from them", DVec3::new(-0.034, 0.004, 0.05)),
+    ];
+    let series = places.into_iter().enumerate().map(line).collect();
+    let title = "Force of a slow press by a disc of 5 mm radius".to_owned();
+    let panel = Panel::Curves { title, x: "depth, mm", y: "force, N", up: 0.0..3.0, series };
+    write("organ-lumps.svg", svg(1, &[panel]).as_bytes());
+}
+
 /// Keys of a scene and their labels in a picture.
 const K: (&str, &str) = ("springs.stiffness_n_per_m", "k");
 const C: (&str, &str) = ("damping.coefficient_n_s_per_m", "C");
@@ -99,6 +168,9 @@ fn main() {
     figure(6, 10, false, "vertical-60", poked);
     figure(7, 10, false, "oblique-60", poked);
     figure(8, 10, false, "oblique-100", poked);
+
+    ORGANS.iter().for_each(pressed);
+    lumps();
 
     let sweep = |file: &str, panels: &[Panel]| write(file, svg(panels.len(), panels).as_bytes());
     let one = |title, what, values: &[f64], up| [curves(title, what, values, up, &[])];

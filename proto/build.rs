@@ -5,12 +5,28 @@ use std::error::Error;
 use std::path::{Path, PathBuf};
 
 fn main() -> Result<(), Box<dyn Error>> {
-    const FILES: [&str; 4] =
-        ["palpate/v1/session.proto", "palpate/v1/haptic.proto", "palpate/v1/view.proto", "palpate/v1/admin.proto"];
+    const FILES: [&str; 5] = [
+        "palpate/v1/session.proto",
+        "palpate/v1/haptic.proto",
+        "palpate/v1/view.proto",
+        "palpate/v1/admin.proto",
+        "palpate/v1/node.proto",
+    ];
     println!("cargo::rerun-if-changed=palpate");
     let descriptors = protox::compile(FILES, ["."])?;
     let out = PathBuf::from(std::env::var("OUT_DIR")?);
     compile_journal(&out)?;
+    let has = |feature: &str| std::env::var_os(format!("CARGO_FEATURE_{feature}")).is_some();
+    if has("ETCD") {
+        compile_etcd(&out)?;
+    }
+    if std::env::var_os("CARGO_FEATURE_AGONES").is_some() {
+        println!("cargo::rerun-if-changed=agones");
+        // With its server: tests imitate the SDK.
+        tonic_prost_build::configure()
+            .build_transport(false)
+            .compile_fds(protox::compile(["agones/sdk.proto", "agones/beta.proto"], ["."])?)?;
+    }
     std::fs::write(out.join("palpate.bin"), prost::Message::encode_to_vec(&descriptors))?;
     let requests = descriptors.file.iter().flat_map(|file| &file.service).flat_map(|service| &service.method);
     let names: BTreeSet<_> = requests.filter_map(|method| method.input_type().rsplit('.').next()).collect();
@@ -25,7 +41,6 @@ fn main() -> Result<(), Box<dyn Error>> {
     // Requests are bounded before they are decoded (`codec`), which recognizes them by their names.
     let mut named = tonic_prost_build::Config::new();
     named.enable_type_names();
-    let has = |feature: &str| std::env::var_os(format!("CARGO_FEATURE_{feature}")).is_some();
     configured
         .build_client(has("CLIENT"))
         .build_server(has("SERVER"))
@@ -49,5 +64,16 @@ fn compile_journal(out: &Path) -> Result<(), Box<dyn Error>> {
     // Journals have the schemas in them, without their comments.
     descriptors.file.iter_mut().for_each(|file| file.source_code_info = None);
     std::fs::write(own.join("journal.bin"), prost::Message::encode_to_vec(&descriptors))?;
+    Ok(())
+}
+
+/// The calls of etcd, of which we are a client only.
+fn compile_etcd(out: &Path) -> Result<(), Box<dyn Error>> {
+    println!("cargo::rerun-if-changed=etcd");
+    let descriptors = protox::compile(["etcd/rpc.proto"], ["."])?;
+    let own = out.join("etcd");
+    std::fs::create_dir_all(&own)?;
+    let configured = tonic_prost_build::configure().build_server(false).build_transport(false).out_dir(own);
+    configured.compile_fds(descriptors)?;
     Ok(())
 }

@@ -6,6 +6,7 @@
 //! over displacements and increments of all points; `tests/determinism.rs` keeps golden values.
 
 pub mod budget;
+pub mod cluster;
 pub mod force_law;
 mod ids;
 pub mod journal;

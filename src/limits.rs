@@ -27,6 +27,12 @@ pub struct Limits {
     pub meshes_per_caller: usize,
     /// A mesh that a client has sent is forgotten so long after its last part, s.
     pub mesh_s: f64,
+    /// Bytes of a journal that a client sends.
+    pub journal_bytes: u64,
+    /// Journals that a caller has sent, and that have not expired.
+    pub journals_per_caller: usize,
+    /// A journal that a client has sent is forgotten so long after it was last used, s.
+    pub journal_s: f64,
     /// Tools of a session: their numbers are below this.
     pub tools: u32,
     /// Commands that wait for their step, per tool.
@@ -121,6 +127,9 @@ impl Default for Limits {
             mesh_vertices: 500_000,
             meshes_per_caller: 8,
             mesh_s: 600.0,
+            journal_bytes: 128 << 20,
+            journals_per_caller: 2,
+            journal_s: 600.0,
             tools: 64,
             queued_commands_per_tool: 4096,
             queued_samples: 64,
@@ -159,5 +168,17 @@ impl Default for Limits {
             sessions_per_minute: 600.0,
             calls_per_s: 2000.0,
         }
+    }
+}
+
+/// Factor by which compiling a scene may take more work for one user alone than on a server: reference solutions need a
+/// tolerance of 1e-10.
+const OFFLINE_WORK: u64 = 32;
+
+impl Limits {
+    /// For a process in which no other caller waits.
+    #[must_use]
+    pub fn offline(self) -> Self {
+        Limits { rehearsal_work: self.rehearsal_work.saturating_mul(OFFLINE_WORK), ..self }
     }
 }

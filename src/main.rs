@@ -104,6 +104,7 @@ enum Command {
         palpate journal verify journals/*.mcap\n  \
         palpate journal show journals/SESSION.1.mcap\n  \
         palpate journal replay journals/SESSION.1.mcap --point 15,15 --output records.jsonl\n  \
+        palpate journal replay journals/SESSION.1.mcap --server http://127.0.0.1:7117 --speed 2\n  \
         palpate journal render journals/SESSION.1.mcap --output film.gif\n  \
         palpate journal export journals/SESSION.1.mcap --format mcap --output foxglove.mcap\n  \
         palpate journal cut journals/SESSION.1.mcap --from 20000 --to 30000 --output case.mcap\n  \
@@ -142,6 +143,13 @@ enum Command {
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         arguments: Vec<std::ffi::OsString>,
     },
+    /// Show the servers and sessions of a fleet, and move sessions between servers (`palpate-client cluster`)
+    #[command(disable_help_flag = true, disable_help_subcommand = true)]
+    Cluster {
+        /// See `palpate-client cluster --help`
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        arguments: Vec<std::ffi::OsString>,
+    },
 }
 
 fn main() -> ExitCode {
@@ -156,13 +164,15 @@ fn main() -> ExitCode {
         Command::Journal(arguments) => within_memory(|| journal::journal(&arguments)),
         Command::Token(arguments) => token::token(&arguments),
         Command::Certificate(arguments) => certificate::certificate(&arguments),
-        Command::Top { arguments } => return client::client("top", &arguments),
-        Command::Admin { arguments } => return client::client("admin", &arguments),
+        Command::Top { arguments } => client::client("top", &arguments),
+        Command::Admin { arguments } => client::client("admin", &arguments),
+        Command::Cluster { arguments } => client::client("cluster", &arguments),
     };
     let (status, message) = match ended {
         Ok(()) => return ExitCode::SUCCESS,
         Err(Failure::Failed(message)) => (1, message),
         Err(Failure::Refused(message)) => (2, message),
+        Err(Failure::Told(status)) => return ExitCode::from(status),
     };
     say!("palpate: {message}");
     ExitCode::from(status)

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// Each module of `palpate` may use those before it.
-const MODULES: [&str; 19] = [
+const MODULES: [&str; 20] = [
     "refusal",
     "limits",
     "lock",
@@ -24,12 +24,13 @@ const MODULES: [&str; 19] = [
     "pace",
     "wire",
     "journal",
+    "cluster",
     "server",
     "render",
 ];
 
 /// The crates: folder, name, the other crates that it may use, and what must not be in its tree of dependencies.
-const CRATES: [(&str, &str, &[&str], &[&str]); 6] = [
+const CRATES: [(&str, &str, &[&str], &[&str]); 8] = [
     ("mesh", "palpate-mesh", &[], &["axum", "clap", "prost", "tokio", "tonic"]),
     ("clients/touch", "palpate-touch", &[], &["axum", "prost", "tokio", "tonic"]),
     ("proto", "palpate-proto", &["palpate-touch"], &["axum", "clap", "hyper", "tokio-rustls"]),
@@ -40,23 +41,36 @@ const CRATES: [(&str, &str, &[&str], &[&str]); 6] = [
         &["palpate-proto", "palpate-touch"],
         &["axum", "clap", "indicatif", "tower-http"],
     ),
+    ("clients/c", "palpate-c", &["palpate", "palpate-client", "palpate-proto", "palpate-touch"], &[]),
     (
         "clients/programs",
         "palpate-programs",
         &["palpate", "palpate-client", "palpate-mesh", "palpate-proto", "palpate-touch"],
         &[],
     ),
+    (
+        "clients/python",
+        "palpate-python",
+        &["palpate", "palpate-client", "palpate-proto", "palpate-touch"],
+        &["indicatif"],
+    ),
 ];
 
 /// The modules of `palpate` that a module of the programs may use. `link` simulates the far end; the others read files.
-const FOR_PROGRAMS: [(&str, &[&str]); 3] = [
+const FOR_PROGRAMS: [(&str, &[&str]); 5] = [
     ("link", &["force_law", "limits", "memory", "scene", "session", "sheet"]),
+    ("load", &["scene"]),
+    ("placement", &["scene"]),
     ("replay", &["limits", "scene", "shape", "wire"]),
     ("scene_file", &["limits", "scene", "wire"]),
 ];
 
+/// The modules of `palpate` that libpalpate may use: `server` reads the text of a scene.
+const FOR_LIBPALPATE: [&str; 3] = ["limits", "scene", "wire"];
+
 /// The subcommands: none uses another.
-const SUBCOMMANDS: [&str; 8] = ["admin", "bridge", "health", "link", "load", "proxy", "replay", "top"];
+const SUBCOMMANDS: [&str; 11] =
+    ["admin", "bridge", "cluster", "devices", "health", "link", "load", "play", "proxy", "replay", "top"];
 
 fn rust_files(folder: &Path) -> Vec<PathBuf> {
     let mut files = Vec::new();
@@ -259,7 +273,7 @@ fn the_protocol_enters_at_the_wire() {
     let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
     for path in rust_files(&source) {
         let text = std::fs::read_to_string(&path).unwrap();
-        let may = ["wire", "journal", "server", "lib"].contains(&module(&source, &path));
+        let may = ["wire", "journal", "cluster", "server", "lib"].contains(&module(&source, &path));
         assert!(may || !text.contains("palpate_proto"), "{} uses the protocol", path.display());
     }
 }
@@ -275,6 +289,19 @@ fn programs_use_the_library_and_not_each_other() {
         }
         for used in named(&text, "crate::") {
             assert!(used == own || !SUBCOMMANDS.contains(&used), "{} uses `{used}`", path.display());
+        }
+    }
+}
+
+#[test]
+fn libpalpate_has_no_more_of_the_server_than_how_scenes_are_read() {
+    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/c/src");
+    for path in rust_files(&source) {
+        let text = std::fs::read_to_string(&path).unwrap();
+        let allowed: &[&str] = if module(&source, &path) == "server" { &FOR_LIBPALPATE } else { &[] };
+        // `palpate_touch::` and the like are other crates.
+        for used in named(&text, " palpate::").iter().chain(&named(&text, "(palpate::")) {
+            assert!(allowed.contains(used), "{} uses `{used}`", path.display());
         }
     }
 }

@@ -16,6 +16,7 @@ use palpate::session::Session;
 use palpate::session::command::{Command, Due};
 use palpate::session::input::Input;
 use palpate::sheet::Model;
+use palpate::sheet::choice::NEVER;
 use palpate_touch::Tip;
 
 /// 2026-01-01.
@@ -27,17 +28,8 @@ fn model(sets: &[&str]) -> Arc<Model> {
 }
 
 fn due(tool: u32, sequence: u64, action: Action) -> Due {
-    let command = Command {
-        tool,
-        sequence: Some(sequence),
-        client_time_ns: sequence * 1_000_000,
-        by_datagram: false,
-        at_step: None,
-        time_to_live_s: None,
-        action,
-        arrival_ns: 0,
-    };
-    Due { command, late: false, late_commands: 0, ends_lease: false }
+    let client_time_ns = sequence * 1_000_000;
+    Due::in_time(Command { client_time_ns, ..Command::new(tool, Some(sequence), action) })
 }
 
 /// A pose of a tip that strokes over the middle.
@@ -58,6 +50,7 @@ fn opening(first: &Arc<Model>) -> Opening<'_> {
         begin_step: 0,
         running: true,
         until_step: None,
+        ownership_revision: 0,
     }
 }
 
@@ -78,7 +71,7 @@ fn written(first: &Arc<Model>, steps: u64, ends: bool) -> (Vec<u8>, Vec<(u64, u6
     writer.hash(0, session.tissue().state_hash());
     for step in 0..steps {
         let mut acting = Vec::new();
-        if step % 97 == 50 {
+        if step % 97 == 50 && step < 1000 {
             let change = Change { stiffness_n_per_m: Some(100.0 + step as f64), ..Change::default() };
             let changed = session.model().changed(&change, &first.scene, &Limits::default()).unwrap();
             writer.input(step, &Input::Tissue(changed.clone()));
@@ -121,6 +114,17 @@ fn small() -> Arc<Model> {
 
 fn survey(bytes: &[u8]) -> palpate::refusal::Result<palpate::journal::Survey> {
     Reader::new("test", Cursor::new(bytes))?.survey(&mut |_| {})
+}
+
+#[test]
+fn a_journal_of_a_stranger_names_no_file_of_this_machine() {
+    let mut scene = Scene::parse("paper", PAPER, &["sheet.points=[7, 7]".to_owned()], &Limits::default()).unwrap();
+    scene.appearance.texture = Some("/etc/passwd".into());
+    let (file, _) = written(&Model::compile(&scene, &Limits::default()).unwrap(), 40, true);
+    let texture = |reader: Reader<Cursor<&[u8]>>| reader.header().appearance.clone().unwrap().texture;
+    let open = || Reader::new("a journal", Cursor::new(&file[..])).unwrap();
+    assert_eq!(texture(open()), "/etc/passwd");
+    assert_eq!(texture(open().without_files()), "");
 }
 
 #[test]
@@ -242,6 +246,20 @@ fn a_sealed_file_opens_with_the_reader_of_mcap() {
     assert!(Reader::open(Path::new("nowhere.1.mcap")).is_err());
 }
 
+/// Ten minutes with PALPATE_LONG, and then it tells how long that took: of a journal with more hashes and snapshots than a
+/// server writes.
+#[test]
+#[allow(clippy::disallowed_methods)] // The time is told, and decides nothing.
+fn a_long_touch_verifies() {
+    let steps = if std::env::var_os("PALPATE_LONG").is_some() { 600_000 } else { 3000 };
+    let (file, _) = written(&model(&["sheet.points=[31, 31]"]), steps, true);
+    let begun = std::time::Instant::now();
+    let verdict = journal::verify(reader(&file), &Limits::default(), &mut |_, _| {}).unwrap();
+    assert_eq!((verdict.steps, verdict.difference), ([0, steps], None));
+    let seconds = begun.elapsed().as_secs_f64();
+    println!("{steps} steps, {} bytes: verified in {seconds:.2} s", file.len());
+}
+
 fn reader(bytes: &[u8]) -> Reader<Cursor<&[u8]>> {
     Reader::new("test", Cursor::new(bytes)).unwrap()
 }
@@ -288,7 +306,7 @@ fn a_session_goes_on_from_a_torn_journal_at_its_last_whole_batch() {
     let first = small();
     let (file, ends) = written(&first, 700, false);
     let hash_at = |step: u64| {
-        let (session, _) = journal::session_at(reader(&file), &Limits::default(), step).unwrap();
+        let (session, _) = journal::session_at(reader(&file), &Limits::default(), step, &NEVER).unwrap();
         assert_eq!(session.step_count(), step);
         session.tissue().state_hash()
     };
@@ -299,7 +317,7 @@ fn a_session_goes_on_from_a_torn_journal_at_its_last_whole_batch() {
         assert_eq!(resumed.session.tissue().state_hash(), hash_at(step), "{step}");
         assert_eq!(resumed.first.scene, first.scene);
     }
-    assert!(journal::session_at(reader(&file), &Limits::default(), 701).is_err());
+    assert!(journal::session_at(reader(&file), &Limits::default(), 701, &NEVER).is_err());
 }
 
 #[test]
@@ -309,16 +327,17 @@ fn a_part_of_a_journal_and_a_recovered_one_verify_alone() {
     let limits = Limits::default();
     for [from, to] in [[0, 700], [90, 91], [333, 512], [699, 700]] {
         let mut part = Cursor::new(Vec::new());
-        mend::cut(|| Ok(reader(&file)), [from, to], &limits, &mut part).unwrap();
+        mend::cut(reader(&file), [from, to], &limits, &mut part).unwrap();
         let part = part.into_inner();
         let verdict = journal::verify(reader(&part), &limits, &mut |_, _| {}).unwrap();
         assert_eq!((verdict.steps, verdict.difference), ([from, to], None));
         let found = survey(&part).unwrap();
         assert!(found.sealed && found.end.unwrap().why() == pb::Why::Cut);
-        let at = |bytes: &[u8]| journal::session_at(reader(bytes), &limits, to).unwrap().0.tissue().state_hash();
+        let at =
+            |bytes: &[u8]| journal::session_at(reader(bytes), &limits, to, &NEVER).unwrap().0.tissue().state_hash();
         assert_eq!(at(&part), at(&file));
     }
-    assert!(mend::cut(|| Ok(reader(&file)), [5, 5], &limits, &mut Cursor::new(Vec::new())).is_err());
+    assert!(mend::cut(reader(&file), [5, 5], &limits, &mut Cursor::new(Vec::new())).is_err());
     let torn = &file[..ends[20].0 as usize - 1];
     let mut whole = Cursor::new(Vec::new());
     // The last index is cut off, and no message with it.

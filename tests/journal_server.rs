@@ -11,6 +11,7 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use palpate::limits::Limits;
+use palpate::sheet::choice::NEVER;
 use palpate_proto::pb;
 use server::{PATIENCE, Server, Touch, force};
 
@@ -250,8 +251,9 @@ async fn what_was_recorded_is_played_with_the_same_bits_and_gone_on_from() {
         hashes.push((step, server.hash_at(&id, step).await));
     }
     durable_at(&server, &id, 200).await;
-    let moment =
-        |step, plays, speed| Source::Journal(pb::JournalMoment { session_id: id.clone(), run: 0, step, plays, speed });
+    let moment = |step, plays, speed| {
+        Source::Journal(pb::JournalMoment { session_id: id.clone(), step, plays, speed, ..Default::default() })
+    };
     // Played from its beginning and from its middle: the same hashes. At the end time stands.
     for (from, speed) in [(0, Some(8.0)), (100, Some(0.5)), (160, None)] {
         let played = server.create(moment(Some(from), true, speed), true).await.unwrap();
@@ -301,8 +303,18 @@ async fn what_was_recorded_is_played_with_the_same_bits_and_gone_on_from() {
     }
 }
 
+/// What a client sends in parts; the answer to the last one.
+async fn send(server: &Server, bytes: &[u8]) -> Result<pb::UploadJournalResponse, tonic::Status> {
+    let at = palpate_client::Server::new(&server.url, &palpate_client::Credentials::default()).unwrap();
+    let (channel, mut sent) = (at.connect().await.unwrap(), 0);
+    let answer = palpate_client::upload::upload_journal(channel, bytes, |bytes| sent = bytes).await?;
+    assert_eq!(sent, bytes.len() as u64);
+    Ok(answer)
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_snapshot_is_a_journal_of_one_moment() {
+async fn a_snapshot_is_a_journal_of_one_moment_and_goes_on_at_another_server() {
+    use pb::create_session_request::Source;
     let server = Server::start(&["--log", "error"]);
     let id = server.paper(true).await;
     let mut touch = Touch::hold(&server, &id).await;
@@ -310,13 +322,88 @@ async fn a_snapshot_is_a_journal_of_one_moment() {
     touch.settle().await;
     server.start_until(&id, 77).await;
     let hash = server.hash_at(&id, 77).await;
-    let request = pb::SaveSnapshotRequest { session_id: id };
+    let request = pb::SaveSnapshotRequest { session_id: id.clone() };
     let mut parts = server.sessions().await.save_snapshot(request).await.unwrap().into_inner();
     let mut bytes = Vec::new();
     while let Some(message) = parts.message().await.unwrap() {
         bytes.extend_from_slice(&message.part);
     }
-    let reader = palpate::journal::Reader::new("snapshot", std::io::Cursor::new(bytes)).unwrap();
-    let (session, _) = palpate::journal::replay::session_at(reader, &Limits::default(), 77).unwrap();
+    let reader = palpate::journal::Reader::new("snapshot", std::io::Cursor::new(&bytes)).unwrap();
+    let (session, _) = palpate::journal::session_at(reader, &Limits::default(), 77, &NEVER).unwrap();
     assert_eq!(format!("{:032x}", session.tissue().state_hash()), hash);
+
+    let other = Server::start(&["--log", "error"]);
+    let answer = send(&other, &bytes).await.unwrap();
+    let told = answer.journal.unwrap();
+    assert_eq!((told.begin_step, told.end_step, told.info.unwrap().session_id), (77, 77, id.clone()));
+    let moment = |upload_id: &str, step| {
+        Source::Journal(pb::JournalMoment { upload_id: upload_id.into(), step, ..Default::default() })
+    };
+    let live = other.create(moment(&answer.upload_id, None), true).await.unwrap();
+    assert_ne!(live.session_id, id);
+    assert_eq!((live.step, other.hash_at(&live.session_id, 77).await), (77, hash.clone()));
+    other.start_until(&live.session_id, 100).await;
+    // Twice, and not what it has not.
+    assert_eq!(other.create(moment(&answer.upload_id, Some(77)), true).await.unwrap().step, 77);
+    let refused = other.create(moment(&answer.upload_id, Some(78)), true).await.unwrap_err();
+    assert!(refused.message().contains("step"), "{refused}");
+    // Nobody else's, and nothing else.
+    let refused = server.create(moment(&answer.upload_id, None), true).await.unwrap_err();
+    assert_eq!(refused.code(), tonic::Code::NotFound, "{refused}");
+    let both = pb::JournalMoment { upload_id: answer.upload_id.clone(), session_id: id, ..Default::default() };
+    assert!(other.create(Source::Journal(both), true).await.is_err());
+    let mut bent = bytes.clone();
+    let middle = bent.len() / 2;
+    bent[middle] ^= 1;
+    for wrong in [&bytes[..20], b"solid", &bent] {
+        let refused = send(&other, wrong).await.unwrap_err();
+        assert_eq!(refused.code(), tonic::Code::InvalidArgument, "{refused}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_journal_is_replayed_through_a_server_that_keeps_none() {
+    let folder = tempfile::tempdir().unwrap();
+    let (id, hash, file) = {
+        let server = start(folder.path());
+        let id = server.paper(true).await;
+        let mut touch = Touch::hold(&server, &id).await;
+        touch.command(force(0, 1, -0.3)).await;
+        touch.settle().await;
+        server.start_until(&id, 150).await;
+        let hash = server.hash_at(&id, 150).await;
+        durable_at(&server, &id, 150).await;
+        let file = files(folder.path(), &id).remove(0);
+        (id, hash, file)
+    };
+    let server = Server::start(&["--log", "error"]);
+    let run = |program: PathBuf, arguments: &[&str]| {
+        let ran = Command::new(program).args(arguments).arg(&file).args(["--server", &server.url]).output().unwrap();
+        (
+            ran.status.code(),
+            String::from_utf8_lossy(&ran.stdout).into_owned(),
+            String::from_utf8_lossy(&ran.stderr).into_owned(),
+        )
+    };
+    let (status, out, told) = run(server::client_program(), &["play", "--json", "--speed", "8"]);
+    assert_eq!(status, Some(0), "{told}");
+    let played: serde_json::Value = serde_json::from_str(&out).unwrap();
+    assert_eq!((played["begin_step"].as_u64(), played["end_step"].as_u64()), (Some(0), Some(150)));
+    assert_eq!(played["state_hash"], hash.as_str());
+    assert_ne!(played["session_id"], id.as_str());
+    let palpate = || PathBuf::from(env!("CARGO_BIN_EXE_palpate"));
+    let (status, out, told) = run(palpate(), &["journal", "replay", "--from", "100", "--to", "120"]);
+    assert!(status == Some(0) && out.contains("100 to 120"), "{out}{told}");
+    let (status, _, told) = run(palpate(), &["journal", "replay", "--from", "151"]);
+    assert!(status == Some(2) && told.contains("--from: must be from 0 to 150"), "{told}");
+    // Nothing is left behind, except what goes on live.
+    let (status, out, told) = run(server::client_program(), &["play", "--live", "--json"]);
+    assert_eq!(status, Some(0), "{told}");
+    let live: serde_json::Value = serde_json::from_str(&out).unwrap();
+    let listed = server.sessions().await.list_sessions(pb::ListSessionsRequest {}).await.unwrap().into_inner().sessions;
+    assert_eq!(listed.len(), 1);
+    assert_eq!(
+        (listed[0].session_id.as_str(), listed[0].state()),
+        (live["session_id"].as_str().unwrap(), pb::SessionState::Running)
+    );
 }

@@ -142,3 +142,125 @@ async fn clients_that_are_killed_leave_no_tool_held_and_no_session() {
     });
     waited.await.expect("the sessions of a load that was killed stay");
 }
+
+/// Every part that a plan may have. Who is far away waits 20 ms at least.
+const PLAN: &str = r#"
+name = "<all> & more"
+seed = 5
+objective = "p50<60s,rejected<1000000"
+[[scene]]
+name = "liver"
+[[scene]]
+name = "fibrotic"
+[[hand]]
+hand = "medium"
+device = "omega3"
+deadband = 0.1
+up_deadband = 0.05
+[[hand]]
+hand = "push"
+[[network]]
+name = "far"
+delay_ms = 10
+jitter_ms = 0.5
+[[viewers]]
+number = 0
+[[viewers]]
+number = 1
+rate_hz = 30
+[[phase]]
+name = "steady"
+seconds = 3
+arrivals = "steady"
+rate_per_s = 1
+stays_s = 2.5
+[[phase]]
+name = "random"
+seconds = 3
+arrivals = "poisson"
+rate_per_s = 1
+stays_s = 1
+[[phase]]
+name = "spike"
+seconds = 3
+arrivals = "spike"
+users = 3
+stays_s = 60
+[[phase]]
+name = "after"
+seconds = 1
+"#;
+
+fn planned(server: &Server, folder: &std::path::Path, plan: &str, more: &[&str]) -> Output {
+    let path = folder.join("plan.toml");
+    std::fs::write(&path, plan).unwrap();
+    let mut program = Command::new(client_program());
+    let server = if more.contains(&"--server") { vec![] } else { vec!["--server", &server.url] };
+    program.args(["load", "--quiet", "--plan", path.to_str().unwrap()]).args(server);
+    program.args(more).output().unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_plan_is_played_by_its_users_and_told_by_second_phase_and_page() {
+    let (server, folder) = (Server::start(&[]), tempfile::tempdir().unwrap());
+    let page = folder.path().join("load.html");
+    let output = planned(&server, folder.path(), PLAN, &["--json", "--report", page.to_str().unwrap()]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let told: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(told["kept"], true);
+    let phases: Vec<&str> =
+        told["phases"].as_array().unwrap().iter().map(|phase| phase["name"].as_str().unwrap()).collect();
+    assert_eq!(phases, ["steady", "random", "spike", "after"]);
+    let sum = |key: &str| told["phases"].as_array().unwrap().iter().map(|phase| number(phase, key)).sum::<f64>();
+    let users = number(&told, "/all/users_arrived");
+    // Everybody who came has gone, and their sessions with them.
+    let away: f64 = told["all"]["turned_away"].as_object().unwrap().values().map(|count| count.as_f64().unwrap()).sum();
+    let gone = number(&told, "/all/users_left") + away;
+    assert!(users >= 6.0 && users == sum("/users_arrived") && users == gone, "{told}");
+    assert_eq!((number(&told, "/phases/0/users_arrived"), number(&told, "/phases/2/users_arrived")), (3.0, 3.0));
+    assert!(sessions(&server).await.is_empty());
+    for kind in ["scenes", "hands", "networks", "viewers"] {
+        let drawn: f64 = told["mix"][kind].as_object().unwrap().values().map(|count| count.as_f64().unwrap()).sum();
+        assert_eq!(drawn, users, "{kind}");
+    }
+    assert!(number(&told, "/all/commands") > 100.0 && number(&told, "/all/frames") > 0.0, "{told}");
+    assert_eq!(sum("/samples"), number(&told, "/all/samples"));
+    // What the proxy adds is there at least: 10 ms each way, give or take the jitter.
+    assert!(number(&told, "/all/round_trip_us/p50") > 18_000.0, "{told}");
+    assert!(number(&told, "/all/dilation_min") > 0.0 && number(&told, "/all/start_us/p50") > 0.0);
+    assert_eq!(told["seconds"].as_array().unwrap().len(), 11);
+    let page = std::fs::read_to_string(page).unwrap();
+    assert!(page.matches("<svg").count() == 4 && page.matches("</svg>").count() == 4);
+    assert!(page.contains("&lt;all&gt; &amp; more") && !page.contains("<all>"));
+    assert!(page.contains("All objectives were kept."));
+    // Plots have numbers only, and nothing comes from elsewhere.
+    let paths: Vec<&str> = page.split("<path d=\"").skip(1).map(|rest| rest.split('"').next().unwrap()).collect();
+    assert!(paths.len() > 5 && paths.iter().all(|path| !path.contains("NaN") && !path.contains("inf")), "{paths:?}");
+    assert!(!page.contains("http:") && !page.contains("https:") && !page.contains("<script"));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_plan_that_misses_an_objective_or_is_wrong_says_so_by_its_status() {
+    let (server, folder) = (Server::start(&[]), tempfile::tempdir().unwrap());
+    let short = "[[phase]]\nname = \"brief\"\nseconds = 1.5\narrivals = \"spike\"\nusers = 1\n";
+    let missed = planned(&server, folder.path(), &format!("{short}objective = \"p50<1us\"\n"), &[]);
+    let said = String::from_utf8_lossy(&missed.stderr);
+    assert_eq!(missed.status.code(), Some(1), "{said}");
+    assert!(said.contains("`brief` misses p50<1us"), "{said}");
+    assert!(String::from_utf8_lossy(&missed.stdout).contains("misses p50<1us"));
+    // The server has no such scene: nobody comes in, and why is told.
+    let nowhere = planned(&server, folder.path(), &format!("{short}[[scene]]\nname = \"nowhere\"\n"), &[]);
+    let said = String::from_utf8_lossy(&nowhere.stderr);
+    assert_eq!(nowhere.status.code(), Some(1), "{said}");
+    assert!(said.contains("no user could touch") && said.contains("UNKNOWN_SCENE"), "{said}");
+    let wrong = planned(&server, folder.path(), &format!("{short}stay_s = 3\n"), &[]);
+    let said = String::from_utf8_lossy(&wrong.stderr);
+    assert_eq!(wrong.status.code(), Some(2), "{said}");
+    assert!(said.contains("plan.toml:6") && said.contains("phase[0].stay_s"), "{said}");
+    assert!(sessions(&server).await.is_empty());
+    // The plan that the guide begins with can be read: its server is nowhere.
+    let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
+    let plan = std::fs::read_to_string(root.join("contrib/plan.toml")).unwrap();
+    let nobody = planned(&server, folder.path(), &plan, &["--server", "http://127.0.0.1:9"]);
+    assert_ne!(nobody.status.code(), Some(2), "{}", String::from_utf8_lossy(&nobody.stderr));
+}

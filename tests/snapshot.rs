@@ -131,17 +131,7 @@ fn vector(random: &mut Rng, size: f64) -> DVec3 {
 }
 
 fn command(tool: u32, sequence: u64, action: Action) -> Due {
-    let command = Command {
-        tool,
-        sequence: Some(sequence),
-        client_time_ns: 0,
-        by_datagram: false,
-        at_step: None,
-        time_to_live_s: None,
-        action,
-        arrival_ns: 17 * sequence,
-    };
-    Due { command, late: false, late_commands: 0, ends_lease: false }
+    Due::in_time(Command { arrival_ns: 17 * sequence, ..Command::new(tool, Some(sequence), action) })
 }
 
 /// A random session.

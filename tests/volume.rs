@@ -6,7 +6,7 @@ mod common;
 use std::path::Path;
 use std::sync::Arc;
 
-use common::schemes;
+use common::{model, scene_with, schemes};
 use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::refusal::Reason;
@@ -16,17 +16,14 @@ use palpate::shape::{PointId, RestShape};
 use palpate::sheet::{Model, Push, Tissue, at_rest, tangent};
 use palpate_touch::{Coupling, Tip};
 
-fn set(sets: &[&str]) -> Vec<String> {
-    sets.iter().map(|set| (*set).to_owned()).collect()
-}
-
 /// A ball of 162 vertices and 0.1 m.
 fn ball(sets: &[&str]) -> Scene {
     let text = "[mesh]\nfile = \"icosphere.obj\"\nunit = \"m\"\npoint_mass_kg = 0.01\n[springs]\nstiffness_n_per_m = 10.0\n\
                 [virtual_springs]\nstiffness_n_per_m = 5.0\n[damping]\ncoefficient_n_s_per_m = 0.1\n\
                 [volume]\nstiffness_pa = 2e4\n";
     let folder = format!("{}/tests/reference", env!("CARGO_MANIFEST_DIR"));
-    Scene::parse_in(Path::new(&folder), "ball", text, &set(sets), &Limits::default()).unwrap()
+    let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
+    Scene::parse_in(Path::new(&folder), "ball", text, &sets, &Limits::default()).unwrap()
 }
 
 /// A gallbladder of several tiles, its points heavy and light, part of it fixed.
@@ -34,11 +31,7 @@ fn gallbladder(sets: &[&str]) -> Scene {
     let text = "[mesh]\norgan = { name = \"gallbladder\", edge_m = 0.0025 }\nfixed = { group = \"bed\" }\n[material]\n\
                 youngs_modulus_pa = 15e3\nthickness_m = 0.001\nbed_n_per_m3 = 2e6\n[volume]\nstiffness_pa = 2e4\n\
                 [stepping]\ntolerance = 1e-4\n";
-    Scene::parse("gallbladder", text, &set(sets), &Limits::default()).unwrap()
-}
-
-fn model(scene: &Scene) -> Arc<Model> {
-    Model::compile(scene, &Limits::default()).unwrap()
+    scene_with(text, sets)
 }
 
 fn poke(centre_m: DVec3, force_n: DVec3, falloff_per_m: f64) -> Option<Push> {
@@ -324,7 +317,7 @@ fn its_stiffness_changes_under_way_and_other_tissue_gets_none() {
     // The guard's last resort.
     tissue.recover(tissue.step_count(), false);
     tissue.step().unwrap();
-    let refused = common::model(&common::scene(palpate::scene::PAPER)).changed(&softer(5.0), &first.scene, &limits);
+    let refused = model(&common::scene(palpate::scene::PAPER)).changed(&softer(5.0), &first.scene, &limits);
     let refused = refused.unwrap_err();
     assert_eq!((refused.reason, refused.field.as_str()), (Reason::WrongKind, "volume.stiffness_pa"));
     for bad in [-1.0, f64::NAN, 1e13] {

@@ -14,7 +14,7 @@ use std::sync::{Arc, OnceLock};
 
 use glam::DVec3;
 use palpate::journal::records::{self, Chunk};
-use palpate::journal::{Reader, Topic, message as of_journal, pb as journal_pb, verify};
+use palpate::journal::{Reader, Replay, Topic, message as of_journal, pb as journal_pb};
 use palpate::limits::Limits;
 use palpate::scene::check::check_tip;
 use palpate::scene::profile::Poke;
@@ -323,6 +323,7 @@ fn request_seeds() -> Vec<Vec<u8>> {
         tip: Some(pb::Tip { radius_m: 0.02, friction: Some(0.2), ..Default::default() }),
         touch_stiffness: true,
         datagrams: true,
+        lease_id: "0123456789abcdef0123456789abcdef".into(),
     };
     let touch = |message| pb::TouchRequest { message: Some(message) }.encode_to_vec();
     let scene = pb::create_session_request::Source::Scene(wire::scene::scene(&model().scene));
@@ -705,8 +706,7 @@ pub fn journal(bytes: &[u8]) -> bool {
         }
         _ => bytes,
     };
-    let open = || Reader::new("fuzz", std::io::Cursor::new(file));
-    let Ok(mut reader) = open() else { return false };
+    let Ok(mut reader) = Reader::new("fuzz", std::io::Cursor::new(file)) else { return false };
     let Ok(survey) = reader.survey(&mut |_| {}) else { return false };
     assert!(survey.whole_bytes + survey.torn_bytes <= file.len() as u64);
     let header = reader.header();
@@ -714,7 +714,7 @@ pub fn journal(bytes: &[u8]) -> bool {
     let small = Limits { points: COMPILED_POINTS, substeps: 20, mesh_vertices: COMPILED_POINTS, ..limits() };
     let Ok(model) = of_journal::model(header, &small) else { return true };
     if steps <= SIMULATED_STEPS && model.len() <= COMPILED_POINTS {
-        let _ = open().and_then(|reader| verify(reader, &small, &mut |_, _| {}));
+        let _ = Replay::new(reader, survey, &small).and_then(|replay| replay.verify(&mut |_, _| {}));
     }
     true
 }
@@ -807,14 +807,10 @@ fn snapshot_seeds() -> Vec<Vec<u8>> {
     let at_rest = Session::new(model()).save().to_bytes();
     let mut session = Session::new(model());
     let command = |tool: u32, sequence: u64, action: Action| Command {
-        tool,
-        sequence: Some(sequence),
         client_time_ns: if tool == 2 { sequence * 1_000_000 } else { 0 },
-        by_datagram: false,
-        at_step: None,
         time_to_live_s: (tool == 0).then_some(0.5),
-        action,
         arrival_ns: 5,
+        ..Command::new(tool, Some(sequence), action)
     };
     let (shape, tip) = (model().shape(), palpate_touch::Tip { radius_m: 0.03, ..Default::default() });
     let middle_m = shape.rest_m(shape.nearest(shape.extent().middle_m()));
@@ -831,12 +827,10 @@ fn snapshot_seeds() -> Vec<Vec<u8>> {
         let pose = Action::Pose { place_m, velocity_m_per_s: None, tip };
         let grasp = Action::Grasp { point: shape.nearest(DVec3::ZERO), displacement_m: 1e-3 * DVec3::Z };
         let actions = [(0, Action::Push(poke)), (1, grasp), (2, pose)];
-        let due = actions.into_iter().filter(|(tool, _)| *tool == 2 || step % 20 == 1).map(|(tool, action)| Due {
-            command: command(tool, step, action),
-            late: false,
-            late_commands: 0,
-            ends_lease: false,
-        });
+        let due = actions
+            .into_iter()
+            .filter(|(tool, _)| *tool == 2 || step % 20 == 1)
+            .map(|(tool, action)| Due::in_time(command(tool, step, action)));
         session.advance(&mut due.collect(), |_| {});
         if [1, 30, 79].contains(&step) {
             seeds.push(session.save().to_bytes());

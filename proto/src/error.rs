@@ -10,6 +10,15 @@ use crate::refusal::{Reason, Refusal};
 /// The domain of every `ErrorInfo`.
 pub const DOMAIN: &str = "palpate";
 
+/// Key of the metadata of `ErrorInfo` under which a refusal as ELSEWHERE has the URL of the server that has the session.
+pub const ENDPOINT: &str = "endpoint";
+
+/// The server that has the session, if a call was refused because it is not the one that was called.
+pub fn elsewhere(status: &Status) -> Option<String> {
+    let info = status.get_details_error_info()?;
+    (info.reason == Reason::Elsewhere.as_str()).then(|| info.metadata.get(ENDPOINT).cloned())?
+}
+
 /// The status code of a reason.
 pub fn code(reason: Reason) -> Code {
     match reason {
@@ -29,16 +38,19 @@ pub fn code(reason: Reason) -> Code {
         Reason::UnknownScene
         | Reason::UnknownScript
         | Reason::UnknownMesh
+        | Reason::UnknownJournal
         | Reason::UnknownSession
         | Reason::SessionDeleted
         | Reason::UnknownViewer => Code::NotFound,
-        Reason::SessionHeld | Reason::StaleSequence | Reason::NotAvailable => Code::FailedPrecondition,
+        Reason::SessionHeld | Reason::StaleSequence | Reason::NotAvailable | Reason::Elsewhere => {
+            Code::FailedPrecondition
+        }
         Reason::ToolHeld => Code::AlreadyExists,
         Reason::NotHolder | Reason::RoleMissing | Reason::OriginNotAllowed => Code::PermissionDenied,
         Reason::Unauthenticated => Code::Unauthenticated,
         Reason::StepPassed => Code::OutOfRange,
         Reason::Cut | Reason::Recovered => Code::Aborted,
-        Reason::ShuttingDown => Code::Unavailable,
+        Reason::ShuttingDown | Reason::Fenced => Code::Unavailable,
     }
 }
 
@@ -47,6 +59,9 @@ impl From<Refusal> for Status {
         let mut metadata = HashMap::new();
         if !refusal.field.is_empty() {
             metadata.insert("field".to_owned(), refusal.field.clone());
+        }
+        if refusal.reason == Reason::Elsewhere {
+            metadata.extend(refusal.place.iter().map(|endpoint| (ENDPOINT.to_owned(), endpoint.clone())));
         }
         let mut details = ErrorDetails::with_error_info(refusal.reason.as_str(), DOMAIN, metadata);
         if code(refusal.reason) == Code::InvalidArgument && !refusal.field.is_empty() {

@@ -4,7 +4,9 @@
 //!   features `client` and `server` choose what is generated besides the messages. To connect, use `tonic::transport` or
 //!   the crate `palpate-client`.
 //! - [`journal`]: the messages of journals, from `palpate/journal/v1/*.proto`.
+//! - `agones` (feature `agones`): the calls of the SDK of Agones that servers of a fleet use, from `agones/*.proto`.
 //! - [`refusal`]: the reasons for which inputs are refused, and [`error`]: refusals as gRPC statuses.
+//! - `etcd` (feature `etcd`): messages and clients of etcd, from `etcd/*.proto`, which have what a fleet of servers uses.
 //! - [`codec`]: decodes messages, requests within bounds.
 //! - `datagram` (feature `datagrams`): what both ends of datagrams agree on.
 //! - [`geometry`] and [`touch`]: conversion of vectors, and of the types of the crate `palpate-touch`.
@@ -29,6 +31,18 @@ pub mod pb {
     pub const DECODERS: &[(&str, fn(&[u8]) -> bool)] = include!(concat!(env!("OUT_DIR"), "/decoders.rs"));
 }
 
+/// The generated messages, clients and servers of the SDK of Agones, from `agones/*.proto`: those that servers of a fleet use.
+#[cfg(feature = "agones")]
+#[allow(missing_docs, clippy::all, clippy::pedantic, clippy::unwrap_used, unreachable_pub, rust_2018_idioms)]
+pub mod agones {
+    tonic::include_proto!("agones.dev.sdk");
+
+    /// What is not stable yet: counters.
+    pub mod beta {
+        tonic::include_proto!("agones.dev.sdk.beta");
+    }
+}
+
 /// The generated messages of package `palpate.journal.v1`: what is in the journal of a session.
 #[allow(missing_docs, clippy::all, clippy::pedantic, clippy::unwrap_used, unreachable_pub, rust_2018_idioms)]
 pub mod journal {
@@ -41,4 +55,17 @@ pub mod journal {
 
     /// Their files and those that they import, each after its own imports.
     pub const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/journal/journal.bin"));
+}
+
+/// The generated messages and clients of etcd, by its own names of packages: `etcdserverpb` uses `mvccpb`.
+#[cfg(feature = "etcd")]
+#[allow(missing_docs, clippy::all, clippy::pedantic, clippy::unwrap_used, unreachable_pub, rust_2018_idioms)]
+pub mod etcd {
+    pub mod mvccpb {
+        include!(concat!(env!("OUT_DIR"), "/etcd/mvccpb.rs"));
+    }
+
+    pub mod etcdserverpb {
+        include!(concat!(env!("OUT_DIR"), "/etcd/etcdserverpb.rs"));
+    }
 }

@@ -54,6 +54,8 @@ reasons! {
     Recovered = "RECOVERED",
     /// No mesh of that id, of this caller; or it has expired.
     UnknownMesh = "UNKNOWN_MESH",
+    /// No journal of that id was sent by this caller; or it has expired.
+    UnknownJournal = "UNKNOWN_JOURNAL",
     /// No viewer of that id.
     UnknownViewer = "UNKNOWN_VIEWER",
     /// Another holds the tool.
@@ -88,6 +90,10 @@ reasons! {
     NotAvailable = "NOT_AVAILABLE",
     /// The server is going down.
     ShuttingDown = "SHUTTING_DOWN",
+    /// Another server of the fleet has the session; [`Refusal::place`] is its endpoint.
+    Elsewhere = "ELSEWHERE",
+    /// The server may not speak for its sessions: it has not heard from etcd for too long.
+    Fenced = "FENCED",
 }
 
 /// What was refused and why. It changed nothing.

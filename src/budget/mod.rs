@@ -44,11 +44,13 @@ pub enum Purpose {
     Laws,
     /// Meshes that clients have sent.
     Meshes,
+    /// Journals that clients have sent.
+    Journals,
 }
 
 impl Purpose {
     /// All of them.
-    pub const ALL: [Purpose; 9] = [
+    pub const ALL: [Purpose; 10] = [
         Purpose::Session,
         Purpose::Change,
         Purpose::Frames,
@@ -58,6 +60,7 @@ impl Purpose {
         Purpose::Connections,
         Purpose::Laws,
         Purpose::Meshes,
+        Purpose::Journals,
     ];
 
     /// The name that metrics give it.
@@ -72,6 +75,7 @@ impl Purpose {
             Purpose::Connections => "connections",
             Purpose::Laws => "laws",
             Purpose::Meshes => "meshes",
+            Purpose::Journals => "journals",
         }
     }
 }

@@ -7,12 +7,13 @@ use palpate_proto::journal as pb;
 use super::format::Topic;
 use super::reader::{Reader, Survey};
 use super::records::{self, CHUNK};
-use super::replay::{Item, items, session_at};
+use super::replay::{Item, Replay, items};
 use super::seal::seal;
 use super::writer::Writer;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result};
 use crate::session::Session;
+use crate::sheet::choice::NEVER;
 
 fn unwritten(e: &io::Error) -> Refusal {
     Refusal::new(Reason::Unreadable, "", format!("the new journal can't be written: {e}"))
@@ -54,19 +55,19 @@ pub fn recover<R: Read + Seek>(
 /// # Errors
 /// Refuses steps that the journal has not, a journal that can't be simulated, and an output that can't be written.
 pub fn cut<R: Read + Seek>(
-    mut open: impl FnMut() -> Result<Reader<R>>,
+    mut reader: Reader<R>,
     [from, to]: [u64; 2],
     limits: &Limits,
     output: &mut (impl Read + Write + Seek),
 ) -> Result<()> {
-    let mut reader = open()?;
     let survey = reader.survey(&mut |_| {})?;
-    if to <= from || to > survey.until_step {
-        let message =
-            format!("must be above --from and at most {}, which the journal has, but is {to}", survey.until_step);
+    let end = survey.until_step;
+    if to <= from || to > end {
+        let message = format!("must be above --from and at most {end}, which the journal has, but is {to}");
         return Err(Refusal::new(Reason::OutOfRange, "to", message));
     }
-    let (session, _) = session_at(open()?, limits, from)?;
+    let (session, _, mut reader) = Replay::near(reader, survey, limits, from)?.reach(from, &NEVER)?;
+    reader.rewind();
     let (mut running, mut until_step) = (reader.header().running, reader.header().until_step);
     let mut kept: Option<Writer> = None;
     let begin = |running: bool, until_step: Option<u64>, header: &pb::Header, unix_ns: u64| {
@@ -115,7 +116,7 @@ pub fn cut<R: Read + Seek>(
         }
     }
     let writer = kept.unwrap_or_else(|| begin(running, until_step, &header, unix_ns));
-    let message = format!("steps {from} to {to} of a journal up to step {}", survey.until_step);
+    let message = format!("steps {from} to {to} of a journal up to step {end}");
     let bytes = writer.finish(pb::Why::Cut, &message, to, unix_ns);
     output.write_all(&bytes).and_then(|()| seal(output)).map_err(|e| unwritten(&e))
 }

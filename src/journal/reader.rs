@@ -213,17 +213,25 @@ impl Reader<BufReader<File>> {
     /// # Errors
     /// Refuses a file that can't be read, and as [`Reader::new`] does.
     pub fn open(path: &Path) -> Result<Self> {
-        let place = path.display().to_string();
-        let unreadable = |e: std::io::Error| Refusal {
-            place: Some(place.clone()),
-            ..Refusal::new(Reason::Unreadable, "", format!("can't be read: {e}"))
-        };
-        let file = File::open(path).map_err(unreadable)?;
-        if file.metadata().map_err(unreadable)?.is_dir() {
-            return Err(unreadable(std::io::Error::other("it is a folder")));
-        }
-        Reader::new(&place, BufReader::with_capacity(1 << 16, file))
+        Reader::new(&path.display().to_string(), file(path)?)
     }
+}
+
+/// A file to read a journal from.
+///
+/// # Errors
+/// Refuses one that can't be read.
+pub fn file(path: &Path) -> Result<BufReader<File>> {
+    let place = path.display().to_string();
+    let unreadable = |e: std::io::Error| Refusal {
+        place: Some(place.clone()),
+        ..Refusal::new(Reason::Unreadable, "", format!("can't be read: {e}"))
+    };
+    let file = File::open(path).map_err(unreadable)?;
+    if file.metadata().map_err(unreadable)?.is_dir() {
+        return Err(unreadable(std::io::Error::other("it is a folder")));
+    }
+    Ok(BufReader::with_capacity(1 << 16, file))
 }
 
 impl<R: Read + Seek> Reader<R> {
@@ -272,6 +280,15 @@ impl<R: Read + Seek> Reader<R> {
     /// The header.
     pub fn header(&self) -> &pb::Header {
         &self.header
+    }
+
+    /// For a journal of a stranger: what it names of this machine is left out.
+    #[must_use]
+    pub fn without_files(mut self) -> Self {
+        if let Some(appearance) = &mut self.header.appearance {
+            appearance.texture.clear();
+        }
+        self
     }
 
     /// What refusals call the file.

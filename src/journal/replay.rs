@@ -3,6 +3,7 @@
 use std::collections::VecDeque;
 use std::io::{Read, Seek};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use palpate_proto::journal as pb;
 
@@ -15,6 +16,7 @@ use crate::session::command::Due;
 use crate::session::rules::Rules;
 use crate::session::saved::Saved;
 use crate::sheet::Model;
+use crate::sheet::choice::given_up;
 
 /// What a journal has in its order.
 #[derive(Debug, Clone)]
@@ -112,7 +114,7 @@ impl<R: Read + Seek> Replay<R> {
         let header = reader.header();
         let begins = |at: &&SnapshotAt| at.step == header.begin_step && at.batch == 0;
         let at = survey.snapshots.iter().find(begins).copied();
-        Replay::from_snapshot(reader, survey, limits, at.as_ref())
+        Replay::from_snapshot(reader, survey, limits, at.as_ref(), None)
     }
 
     /// From the newest snapshot that is not after `step`.
@@ -120,6 +122,11 @@ impl<R: Read + Seek> Replay<R> {
     /// # Errors
     /// As for [`Replay::new`]; refuses a step before the beginning of the journal, or after its end.
     pub fn near(reader: Reader<R>, survey: Survey, limits: &Limits, step: u64) -> Result<Self> {
+        Replay::near_with(reader, survey, limits, step, None)
+    }
+
+    /// The same. If `known` is of a journal of the same session, its tissue is not made again.
+    fn near_with(reader: Reader<R>, survey: Survey, limits: &Limits, step: u64, known: Option<Known>) -> Result<Self> {
         let begin = reader.header().begin_step;
         if !(begin..=survey.until_step).contains(&step) {
             let message =
@@ -129,15 +136,23 @@ impl<R: Read + Seek> Replay<R> {
         }
         let before = survey.snapshots.partition_point(|at| at.step <= step);
         let at = before.checked_sub(1).map(|index| survey.snapshots[index]);
-        Replay::from_snapshot(reader, survey, limits, at.as_ref())
+        Replay::from_snapshot(reader, survey, limits, at.as_ref(), known)
     }
 
-    fn from_snapshot(mut reader: Reader<R>, survey: Survey, given: &Limits, at: Option<&SnapshotAt>) -> Result<Self> {
+    fn from_snapshot(
+        mut reader: Reader<R>,
+        survey: Survey,
+        given: &Limits,
+        at: Option<&SnapshotAt>,
+        known: Option<Known>,
+    ) -> Result<Self> {
         let limits = message::limits(given);
         let place = reader.place().to_owned();
         let placed = |refusal: Refusal| Refusal { place: Some(place.clone()), ..refusal };
         check_replays(reader.header()).map_err(placed)?;
-        let first = message::model(reader.header(), &limits).map_err(placed)?;
+        let known = known.filter(|(header, _)| is_same_tissue(header, reader.header()));
+        let first =
+            known.map_or_else(|| message::model(reader.header(), &limits).map_err(placed), |known| Ok(known.1))?;
         let rules = Rules::new(&first.scene, &limits);
         let mut items = VecDeque::new();
         let begin_step = reader.header().begin_step;
@@ -279,6 +294,7 @@ impl<R: Read + Seek> Replay<R> {
                 self.differ(step, what);
                 break;
             }
+            self.check_work()?;
             let rests = self.session.rests_until().filter(|until| self.commands.is_empty() && *until > step);
             if let Some(rests) = rests {
                 let stop = (step + 1).checked_next_multiple_of(self.stops_every).unwrap_or(u64::MAX);
@@ -295,6 +311,20 @@ impl<R: Read + Seek> Replay<R> {
             seen?;
         }
         Ok(())
+    }
+
+    /// Refuses steps that no server would do: the journal may be a stranger's.
+    fn check_work(&self) -> Result<()> {
+        let (model, most) = (self.session.model(), self.limits.point_substeps_per_step);
+        let (points, substeps) = (model.swept_points(), model.plan.substeps);
+        if (points as u64).saturating_mul(u64::from(substeps)) <= most {
+            return Ok(());
+        }
+        let message = format!(
+            "a step would compute {points} points {substeps} times, above the limit of {most} in all \
+             (limits.point_substeps_per_step)"
+        );
+        Err(Refusal { reason: Reason::TooLarge, ..self.reader.refuse(&message) })
     }
 
     fn differ(&mut self, step: u64, what: String) {
@@ -366,6 +396,36 @@ impl<R: Read + Seek> Replay<R> {
         Ok(())
     }
 
+    /// Goes on to `step`. Gives the session there, the tissue with which it began, and the reader, for what follows.
+    ///
+    /// # Errors
+    /// As for [`Replay::advance`]; refuses a journal whose hashes are others, and when `stop` is set.
+    pub fn reach(mut self, step: u64, stop: &AtomicBool) -> Result<(Session, Arc<Model>, Reader<R>)> {
+        self.advance(step, &mut |_| if stop.load(Ordering::Relaxed) { Err(given_up()) } else { Ok(()) })?;
+        match self.difference {
+            Some(difference) => Err(self.reader.refuse(&difference.to_string())),
+            None => Ok((self.session, self.first, self.reader)),
+        }
+    }
+
+    /// Goes on to the end of the journal, and tells what was compared. `progress` gets the steps done and the last one, from time
+    /// to time.
+    ///
+    /// # Errors
+    /// As for [`Replay::advance`].
+    pub fn verify(mut self, progress: &mut dyn FnMut(u64, u64)) -> Result<Verdict> {
+        let (begin, end) = (self.reader.header().begin_step, self.survey.until_step);
+        self.advance(u64::MAX, &mut |seen| {
+            if let Seen::Step(session) = seen
+                && session.step_count().is_multiple_of(1024)
+            {
+                progress(session.step_count(), end);
+            }
+            Ok(())
+        })?;
+        Ok(Verdict { steps: [begin, end], compared: self.compared(), difference: self.difference })
+    }
+
     /// Goes on to the end of the journal, for a server that goes on with the session: commands for the step after its end
     /// have no effect, because their leases are over; what else was written does.
     ///
@@ -410,13 +470,16 @@ impl std::fmt::Display for Difference {
 }
 
 /// The session in a snapshot.
-fn restored(snapshot: &pb::Snapshot, first: &Model, limits: &Limits) -> Result<Session> {
+fn restored(snapshot: &pb::Snapshot, first: &Arc<Model>, limits: &Limits) -> Result<Session> {
     let saved = Saved::from_bytes(&snapshot.saved, limits)?;
     if saved.step() != snapshot.step {
         let message = format!("is of step {}, where one of step {} should be", saved.step(), snapshot.step);
         return Err(Refusal::new(Reason::Unreadable, "snapshot", message));
     }
-    Session::restore(&Model::resumed(&first.scene, saved.tissue(), limits)?, &saved)
+    // Most sessions have the tissue that they began with.
+    let is_first = *saved.tissue() == first.tissue_state();
+    let model = if is_first { first.clone() } else { Model::resumed(&first.scene, saved.tissue(), limits)? };
+    Session::restore(&model, &saved)
 }
 
 /// A session at the end of its journal.
@@ -441,24 +504,40 @@ pub struct Resumed {
 ///
 /// # Errors
 /// Refuses a journal that is damaged in the middle, is of another generation, or gives other hashes.
-pub fn resume<R: Read + Seek>(mut reader: Reader<R>, limits: &Limits) -> Result<Resumed> {
+pub fn resume<R: Read + Seek>(reader: Reader<R>, limits: &Limits) -> Result<Resumed> {
+    resume_as(reader, limits, None)
+}
+
+/// The header of a journal, and the tissue that it begins with.
+pub type Known = (pb::Header, Arc<Model>);
+
+/// The same. If `known` is of a journal of the same session, its tissue is not made again.
+///
+/// # Errors
+/// As for [`resume`].
+pub fn resume_as<R: Read + Seek>(mut reader: Reader<R>, limits: &Limits, known: Option<Known>) -> Result<Resumed> {
     let survey = reader.survey(&mut |_| {})?;
     let until = survey.until_step;
-    Replay::near(reader, survey, limits, until)?.resume()
+    Replay::near_with(reader, survey, limits, until, known)?.resume()
+}
+
+fn is_same_tissue(a: &pb::Header, b: &pb::Header) -> bool {
+    a.session_id == b.session_id && a.scene == b.scene && a.mesh == b.mesh && a.tissue == b.tissue
 }
 
 /// The session after `step` steps, computed from the newest snapshot before.
 ///
 /// # Errors
-/// Refuses a step that the journal has not, and as [`resume`] does.
-pub fn session_at<R: Read + Seek>(mut reader: Reader<R>, limits: &Limits, step: u64) -> Result<(Session, Arc<Model>)> {
+/// Refuses a step that the journal has not, and as [`resume`] does; also when `stop` is set.
+pub fn session_at<R: Read + Seek>(
+    mut reader: Reader<R>,
+    limits: &Limits,
+    step: u64,
+    stop: &AtomicBool,
+) -> Result<(Session, Arc<Model>)> {
     let survey = reader.survey(&mut |_| {})?;
-    let mut replay = Replay::near(reader, survey, limits, step)?;
-    replay.advance(step, &mut |_| Ok(()))?;
-    match replay.difference {
-        Some(difference) => Err(replay.reader.refuse(&difference.to_string())),
-        None => Ok((replay.session, replay.first)),
-    }
+    let (session, first, _) = Replay::near(reader, survey, limits, step)?.reach(step, stop)?;
+    Ok((session, first))
 }
 
 /// The result of a verification.
@@ -483,15 +562,5 @@ pub fn verify<R: Read + Seek>(
     progress: &mut dyn FnMut(u64, u64),
 ) -> Result<Verdict> {
     let survey = reader.survey(&mut |_| {})?;
-    let (begin, end) = (reader.header().begin_step, survey.until_step);
-    let mut replay = Replay::new(reader, survey, limits)?;
-    replay.advance(u64::MAX, &mut |seen| {
-        if let Seen::Step(session) = seen
-            && session.step_count().is_multiple_of(1024)
-        {
-            progress(session.step_count(), end);
-        }
-        Ok(())
-    })?;
-    Ok(Verdict { steps: [begin, end], compared: replay.compared(), difference: replay.difference })
+    Replay::new(reader, survey, limits)?.verify(progress)
 }

@@ -29,6 +29,8 @@ pub struct Opening<'a> {
     pub running: bool,
     /// The step at which it pauses, if it runs to one.
     pub until_step: Option<u64>,
+    /// The revision at which the server became the session's owner; 0 without a fleet.
+    pub ownership_revision: u64,
 }
 
 impl Opening<'_> {
@@ -49,6 +51,7 @@ impl Opening<'_> {
             mesh,
             appearance: Some(appearance),
             tissue: Some(message::tissue(self.first)),
+            ownership_revision: self.ownership_revision,
         }
     }
 }

@@ -41,10 +41,33 @@ pub struct Begin {
     pub until: Option<u64>,
     /// Time without use after which it is deleted, s.
     pub idle_timeout_s: f64,
-    /// Steps that were dropped so far.
-    pub overrun_count: u64,
     /// What it plays, in place of what clients tell it.
     pub playback: Option<Playback>,
+    /// The run of the journal that it continues; 0 if there is none.
+    pub after_run: u64,
+    /// The revision at which this server became its owner; 0 without a fleet.
+    pub revision: u64,
+    /// It begins frozen, and is not served till [`Live::arrive`].
+    pub frozen: bool,
+}
+
+/// The name of a new session.
+#[derive(Debug, Clone)]
+pub struct Birth {
+    /// Its ID.
+    pub id: String,
+    /// The revision at which this server became its owner; 0 without a fleet.
+    pub revision: u64,
+}
+
+impl Birth {
+    /// Without a fleet.
+    ///
+    /// # Errors
+    /// Refuses if the system has no random numbers.
+    pub fn new() -> Result<Self> {
+        Ok(Birth { id: random_id()?, revision: 0 })
+    }
 }
 
 impl Pacer {
@@ -61,6 +84,21 @@ impl Pacer {
         owner: &Account,
         stop: &AtomicBool,
     ) -> Result<Arc<Live>> {
+        self.create_as(Birth::new()?, scene, (paused, idle_timeout_s), owner, stop)
+    }
+
+    /// The same, under a name that was made before.
+    ///
+    /// # Errors
+    /// As for [`Pacer::create`].
+    pub fn create_as(
+        &self,
+        Birth { id, revision }: Birth,
+        scene: &Scene,
+        (paused, idle_timeout_s): (bool, f64),
+        owner: &Account,
+        stop: &AtomicBool,
+    ) -> Result<Arc<Live>> {
         // Before anything is done for it.
         let slot = owner.take(Resource::Sessions, 1, "")?;
         let most_hz = self.limits.session_rate_hz;
@@ -68,13 +106,15 @@ impl Pacer {
         check_asked(scene, &self.limits)?;
         let model = memory::attempt("sheet.points", || self.compile(scene, stop))?;
         let begin = Begin {
-            id: random_id()?,
+            id,
             first: model.clone(),
             running: !paused,
             until: None,
             idle_timeout_s,
-            overrun_count: 0,
             playback: None,
+            after_run: 0,
+            revision,
+            frozen: false,
         };
         self.admit(begin, owner, slot, || Ok(Session::new(&model)), stop)
     }
@@ -105,7 +145,7 @@ impl Pacer {
         session: impl FnOnce() -> Result<Session>,
         stop: &AtomicBool,
     ) -> Result<Arc<Live>> {
-        let Begin { id, first, running, until, idle_timeout_s, overrun_count, playback } = begin;
+        let Begin { id, first, running, until, idle_timeout_s, playback, after_run, revision, frozen } = begin;
         let speed = playback.as_ref().map_or(1.0, |playback| playback.speed);
         check_work(&first, &self.limits)?;
         let skin = memory::attempt("sheet.points", || Ok(Skin::of(&first)))?;
@@ -126,7 +166,7 @@ impl Pacer {
             step,
             resting: false,
             rested_steps: 0,
-            overrun_count,
+            overrun_count: 0,
             dilation: Dilation::new(begin_ns, step),
             schedule: Schedule::new(step, begin_ns, speed * first.scene.stepping.rate_hz),
             late_commands: 0,
@@ -160,6 +200,8 @@ impl Pacer {
             begin_step: step,
             running,
             until_step: until,
+            after_run,
+            revision,
         };
         // What is played is recorded already.
         let tape = self.tapes.get().filter(|_| playback.is_none()).map(|queue| Tape::new(queue, about()));
@@ -168,6 +210,8 @@ impl Pacer {
             intake: Mutex::new(intake),
             owner: owner.clone(),
             idle_timeout_s,
+            revision: AtomicU64::new(revision),
+            is_coming: AtomicBool::new(frozen),
             asked_ns: AtomicU64::new(now_ns()),
             number,
             limits: self.limits.clone(),
@@ -190,6 +234,7 @@ impl Pacer {
         let mut running =
             memory::attempt("sheet.points", || Ok(Box::new(Running::new(live.clone(), session, running))))?;
         running.until = until;
+        running.frozen = frozen;
         running.publish_status();
         if stop.load(Ordering::Relaxed) {
             return Err(choice::given_up());

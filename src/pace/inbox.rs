@@ -18,6 +18,15 @@ use crate::lock::lock;
 use crate::refusal::{Refusal, Result};
 use crate::sheet::audit::{Inputs, Mark};
 
+/// Why a session leaves its server.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Leaving {
+    /// It is deleted.
+    Deleted,
+    /// Another server has it.
+    Moved,
+}
+
 /// What a stepping thread is asked for.
 pub(super) enum Request {
     /// New sessions wait for the thread.
@@ -39,6 +48,11 @@ pub(super) enum Request {
     View(Arc<Viewer>),
     /// A copy of the session as it is.
     Save(oneshot::Sender<Result<Present>>),
+    /// The same, and then no step until [`Request::Thaw`].
+    Freeze(oneshot::Sender<Result<Present>>),
+    Thaw,
+    /// Every stream ends; the session stays.
+    Silence(Refusal),
     /// To have a window of steps audited.
     Audit(Inputs, SyncSender<Mark>),
     Hash {
@@ -47,7 +61,8 @@ pub(super) enum Request {
         account: Account,
         reply: HashReply,
     },
-    Delete(Refusal),
+    /// The session leaves this server: it is deleted, or has another owner.
+    Leave(Refusal, Leaving),
     /// A fault of the program, to see what comes of it.
     #[cfg(test)]
     Panic,

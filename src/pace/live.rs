@@ -50,6 +50,10 @@ pub struct Live {
     pub(super) intake: Mutex<Intake>,
     /// Time without calls, held tools or streams after which the session is deleted, s.
     pub idle_timeout_s: f64,
+    /// The revision at which this server became its owner; 0 without a fleet.
+    pub(super) revision: AtomicU64,
+    /// It is handed over to this server, which is not its owner yet.
+    pub(super) is_coming: AtomicBool,
     pub(super) asked_ns: AtomicU64,
     pub(super) number: u64,
     pub(super) limits: Limits,
@@ -89,12 +93,12 @@ impl Live {
         status
     }
 
-    #[allow(clippy::cast_precision_loss)]
     /// How fast time goes on: other than 1 only of what is played.
     pub(super) fn speed(&self) -> f64 {
         self.playback.as_ref().map_or(1.0, |playback| playback.speed)
     }
 
+    #[allow(clippy::cast_precision_loss)]
     pub(super) fn is_idle(&self, now_ns: u64) -> bool {
         let unused_s = now_ns.saturating_sub(self.asked_ns.load(Ordering::Relaxed)) as f64 * 1e-9;
         unused_s > self.idle_timeout_s
@@ -129,6 +133,16 @@ impl Live {
             let goes_on = intake.go_on(&mut batch);
             Ok(Accepted { live: self, batch, goes_on })
         })
+    }
+
+    /// The revision at which this server became the session's owner, or last said so; 0 without a fleet.
+    pub fn revision(&self) -> u64 {
+        self.revision.load(Ordering::Acquire)
+    }
+
+    /// This server has become the session's owner, or has said so, at that revision.
+    pub fn is_owned_since(&self, revision: u64) {
+        self.revision.fetch_max(revision, Ordering::AcqRel);
     }
 
     /// So many commands were refused.
@@ -208,6 +222,31 @@ impl Live {
     /// Refuses a session that is deleted, and if the system has no memory for it.
     pub async fn save(&self) -> Result<Present> {
         self.ask(Request::Save).await
+    }
+
+    /// The session as it is, after which no step is done until [`Live::thaw`]. It changes no bits.
+    ///
+    /// # Errors
+    /// As for [`Live::save`].
+    pub async fn freeze(&self) -> Result<Present> {
+        self.ask(Request::Freeze).await
+    }
+
+    /// This server is its owner since that revision: a session that began frozen goes on, and is served.
+    pub fn arrive(&self, revision: u64) {
+        self.is_owned_since(revision);
+        self.is_coming.store(false, Ordering::Release);
+        self.thaw();
+    }
+
+    /// Its share of its stepping thread, measured.
+    pub fn share(&self) -> f64 {
+        self.cost.share()
+    }
+
+    /// Steps are done again.
+    pub fn thaw(&self) {
+        self.inbox.send(self.number, Request::Thaw);
     }
 
     /// Stops time.

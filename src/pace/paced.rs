@@ -21,6 +21,8 @@ pub struct PacedSample {
     pub time_dilation: f64,
     /// What happened before this step is on disk; `None` if no journal is kept.
     pub durable_step: Option<u64>,
+    /// The revision at which this server became the session's owner; 0 without a fleet.
+    pub ownership_revision: u64,
     /// Steps were dropped since the stream's last sample.
     pub overrun: bool,
 }

@@ -8,8 +8,9 @@ use std::thread::JoinHandle;
 use super::audited::AuditTally;
 use super::auditor::{Auditor, Sessions};
 use super::clock::now_ns;
+use super::fence::Fence;
 use super::frames::{Encoder, Viewer};
-use super::inbox::Request;
+use super::inbox::{Leaving, Request};
 use super::live::{Live, deleted};
 use super::reading::{Piece, Reading};
 use super::tally::Tally;
@@ -40,6 +41,8 @@ pub struct Pacer {
     viewers: Mutex<BTreeMap<String, Weak<Viewer>>>,
     pub(super) numbers: Mutex<u64>,
     pub(super) tapes: OnceLock<Arc<TapeQueue>>,
+    /// Until when the server may step and speak for its sessions.
+    pub fence: Arc<Fence>,
 }
 
 impl Pacer {
@@ -51,7 +54,7 @@ impl Pacer {
     /// Returns an error if a thread can't be started.
     pub fn start(threads: usize, audit_share: f64, limits: &Limits, budget: Arc<Budget>) -> std::io::Result<Arc<Self>> {
         let (encoder, reading) = (Arc::new(Encoder::default()), Arc::new(Reading::default()));
-        let mut handles = Vec::new();
+        let (mut handles, fence) = (Vec::new(), Arc::new(Fence::default()));
         let mut steppers = Vec::new();
         // It ends when the stepping threads have ended, and nobody sends any more.
         let (refiner, refinements) = std::sync::mpsc::sync_channel::<StiffnessJob>(WAITING_REFINEMENTS);
@@ -64,8 +67,8 @@ impl Pacer {
             let stepper = Arc::new(Stepper::default());
             steppers.push(stepper.clone());
             let (encoder, refiner, reading) = (encoder.clone(), refiner.clone(), reading.clone());
-            let builder = priority::thread(format!("step-{index}"));
-            handles.push(builder.spawn(move || thread::work(&stepper, &encoder, &refiner, &reading))?);
+            let (builder, fence) = (priority::thread(format!("step-{index}")), fence.clone());
+            handles.push(builder.spawn(move || thread::work(&stepper, &fence, &encoder, &refiner, &reading))?);
         }
         let (worker, shared) = (encoder.clone(), budget.clone());
         handles.push(priority::thread("frames").spawn(move || worker.work(&shared))?);
@@ -96,6 +99,7 @@ impl Pacer {
             viewers: Mutex::new(BTreeMap::new()),
             numbers: Mutex::new(0),
             tapes: OnceLock::new(),
+            fence,
         }))
     }
 
@@ -104,12 +108,21 @@ impl Pacer {
         self.tapes.get_or_init(Arc::default).clone()
     }
 
+    /// Whether there is a session of that ID, served or not.
+    pub fn has(&self, id: &str) -> bool {
+        lock(&self.sessions).contains_key(id)
+    }
+
     /// The session of that id.
     ///
     /// # Errors
-    /// Refuses an unknown ID.
+    /// Refuses an unknown ID, and all while the server may not speak for its sessions.
     pub fn get(&self, id: &str) -> Result<Arc<Live>> {
-        let live = lock(&self.sessions).get(id).cloned().ok_or_else(|| unknown_session(id))?;
+        let live = lock(&self.sessions).get(id).cloned();
+        let live = live.filter(|live| !live.is_coming.load(Ordering::Acquire)).ok_or_else(|| unknown_session(id))?;
+        if !self.fence.may_act() {
+            return Err(fenced());
+        }
         live.asked_ns.store(now_ns(), Ordering::Relaxed);
         Ok(live)
     }
@@ -148,15 +161,35 @@ impl Pacer {
     /// # Errors
     /// Refuses an unknown ID.
     pub fn delete(&self, id: &str) -> Result<()> {
+        self.part_with(id, deleted(), Leaving::Deleted)
+    }
+
+    /// A session has another owner: ends all its streams here with `why`. Its journal says so.
+    ///
+    /// # Errors
+    /// Refuses an unknown ID.
+    pub fn leave(&self, id: &str, why: Refusal) -> Result<()> {
+        self.part_with(id, why, Leaving::Moved)
+    }
+
+    fn part_with(&self, id: &str, why: Refusal, leaving: Leaving) -> Result<()> {
         let live = lock(&self.sessions).remove(id).ok_or_else(|| unknown_session(id))?;
         lock(&live.slot).shrink_to(0);
-        let waited = lock(&live.intake).close(deleted());
+        let waited = lock(&live.intake).close(why.clone());
         if !waited.is_empty() {
             // To free many takes longer than other calls may wait.
             self.reading.post(&live.owner, Piece::Remains(Box::new(waited)));
         }
-        live.inbox.send(live.number, Request::Delete(deleted()));
+        live.inbox.send(live.number, Request::Leave(why, leaving));
         Ok(())
+    }
+
+    /// The server may not speak for its sessions any more: ends all streams, and lets all tools go at the next step.
+    pub fn fall_silent(&self) {
+        for live in self.list() {
+            live.at_intake(|intake, _| intake.free(|_, _| true));
+            live.inbox.send(live.number, Request::Silence(fenced()));
+        }
     }
 
     /// Deletes the sessions that nobody uses any more; tells which.
@@ -200,6 +233,13 @@ impl Pacer {
             let _ = thread.join();
         }
     }
+}
+
+/// The refusal of what a server is asked that may not speak for its sessions.
+pub fn fenced() -> Refusal {
+    let message = "the server has not heard from etcd for so long that another server may have this session; it goes on here, or \
+                   there, when they have";
+    Refusal::new(Reason::Fenced, "", message)
 }
 
 fn unknown_session(id: &str) -> Refusal {

@@ -56,8 +56,9 @@ impl Running {
         tap.overrun_count = self.overrun_count;
         let Running { overrun_count, due_ns, .. } = *self;
         let durable_step = self.live.tape.as_ref().and_then(|tape| tape.durable_step());
-        let time_dilation = self.dilation.value;
-        let paced = PacedSample { sample, due_ns, overrun_count, time_dilation, durable_step, overrun };
+        let (time_dilation, ownership_revision) = (self.dilation.value, self.live.revision());
+        let paced =
+            PacedSample { sample, due_ns, overrun_count, time_dilation, durable_step, ownership_revision, overrun };
         tap.writer.push_quietly(paced, wakes);
     }
 

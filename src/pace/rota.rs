@@ -24,7 +24,7 @@ impl Rota {
     }
 
     /// Does something with session `number`, if it is there still, which may change when it is due. Returns the session if
-    /// that has deleted it.
+    /// it has left the server.
     pub(super) fn with(&mut self, number: u64, act: impl FnOnce(&mut Running)) -> Option<Box<Running>> {
         let Entry::Occupied(mut session) = self.sessions.entry(number) else { return None };
         let running = session.get_mut();
@@ -43,7 +43,7 @@ impl Rota {
             self.due.insert((due_ns, number));
             *self.awake.entry(owner).or_default() += 1;
         }
-        running.is_deleted().then(|| session.remove())
+        running.has_left().then(|| session.remove())
     }
 
     /// The number of equal parts of the thread of which one belongs to session `number` ([`policy::parts`]).

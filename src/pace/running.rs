@@ -12,8 +12,9 @@ use std::sync::mpsc::SyncSender;
 
 use super::clock::{Dilation, now_ns};
 use super::feed::Next;
+use super::fence::Fence;
 use super::frames::Encoder;
-use super::inbox::Request;
+use super::inbox::{Leaving, Request};
 use super::live::Live;
 use super::paced::Present;
 use super::policy::{Backlog, Longest, Turn};
@@ -74,11 +75,14 @@ pub(super) struct Running {
     pub(super) audit: Option<SyncSender<Mark>>,
     /// Tells the journal, if there is one.
     pub(super) recorder: Option<Recorder>,
-    deleted: bool,
+    /// It is handed over: no step, until that has failed.
+    pub(super) frozen: bool,
+    left: bool,
 }
 
 /// What all sessions of a thread use.
 pub(super) struct ThreadContext<'t> {
+    pub(super) fence: &'t Fence,
     pub(super) encoder: &'t Encoder,
     pub(super) refiner: &'t SyncSender<StiffnessJob>,
     pub(super) reading: &'t Reading,
@@ -93,9 +97,9 @@ pub(super) fn beat_ns(now_ns: u64) -> u64 {
 
 impl Running {
     pub(super) fn new(live: Arc<Live>, session: Session, running: bool) -> Self {
-        let (schedule, dilation, overrun_count) = {
+        let (schedule, dilation) = {
             let status = lock(&live.status);
-            (status.schedule, status.dilation, status.overrun_count)
+            (status.schedule, status.dilation)
         };
         Running {
             recorder: live.tape.as_ref().map(|tape| Recorder::new(tape, &session)),
@@ -109,7 +113,7 @@ impl Running {
             still_since: session.rests_until().map(|_| session.step_count()),
             session,
             rested_steps: 0,
-            overrun_count,
+            overrun_count: 0,
             lapsed_leases: 0,
             dilation,
             due: Vec::new(),
@@ -117,14 +121,16 @@ impl Running {
             copies: Copies::default(),
             taps: Taps::default(),
             audit: None,
-            deleted: false,
+            frozen: false,
+            left: false,
             live,
         }
     }
 
     /// When its next step is due, if time goes on and one is wanted.
     pub(super) fn due_ns(&self) -> Option<u64> {
-        let due_ns = (self.running && self.next_step < u64::MAX).then(|| self.schedule.due_ns(self.next_step))?;
+        let due_ns = (self.running && !self.frozen && self.next_step < u64::MAX)
+            .then(|| self.schedule.due_ns(self.next_step))?;
         Some(due_ns.max(self.not_before_ns))
     }
 
@@ -148,9 +154,9 @@ impl Running {
         self.live.owner.number()
     }
 
-    /// Whether it was deleted, and is to leave the thread.
-    pub(super) fn is_deleted(&self) -> bool {
-        self.deleted
+    /// Whether it has left the server, and is to leave the thread.
+    pub(super) fn has_left(&self) -> bool {
+        self.left
     }
 
     /// Does something with it. A panic ends this session, and no other; so does memory that can't be had.
@@ -191,10 +197,10 @@ impl Running {
     }
 
     /// At rest, time has gone on without a step: brings the session to where it stands now.
-    fn catch_up(&mut self) {
+    fn catch_up(&mut self, fence: &Fence) {
         // Something may have come since that must not be skipped.
         self.plan();
-        if self.running {
+        if self.running && !self.frozen && fence.may_act() {
             self.skip_to(self.schedule.next_step(now_ns()).min(self.next_step));
         }
     }
@@ -206,7 +212,7 @@ impl Running {
     }
 
     pub(super) fn serve(&mut self, request: Request, context: &mut ThreadContext<'_>) {
-        self.catch_up();
+        self.catch_up(context.fence);
         let step = self.session.step_count();
         // Also while time stands, when no step does it.
         self.taps.forget_the_gone();
@@ -240,13 +246,14 @@ impl Running {
                     self.taps.samples.push(tap);
                 }
             }
-            Request::Save(reply) => {
-                let (running, until_step) = (self.running, self.until);
-                let _ = reply.send(memory::attempt("", || {
-                    let (saved, copy) = (Box::new(self.session.save()), self.session.copy());
-                    Ok(Present { saved, copy, running, until_step })
-                }));
+            Request::Save(reply) => _ = reply.send(self.present()),
+            Request::Freeze(reply) => {
+                let present = self.present();
+                self.frozen = present.is_ok();
+                let _ = reply.send(present);
             }
+            Request::Thaw => self.frozen = false,
+            Request::Silence(why) => self.silence(&why),
             Request::Audit(inputs, marks) => {
                 self.session.request_audit(inputs);
                 self.audit = Some(marks);
@@ -271,10 +278,13 @@ impl Running {
                     let _ = reply.send(Err(self.passed(at)));
                 }
             }
-            Request::Delete(why) => {
-                self.note(Event::Deleted);
+            Request::Leave(why, leaving) => {
+                if leaving == Leaving::Moved {
+                    self.note_the_end();
+                }
+                self.note(Event::Left(leaving));
                 self.end(&why);
-                self.deleted = true;
+                self.left = true;
             }
             #[cfg(test)]
             #[allow(clippy::panic)]
@@ -282,6 +292,14 @@ impl Running {
         }
         self.plan();
         self.publish_status();
+    }
+
+    fn present(&self) -> Result<Present> {
+        let (running, until_step) = (self.running, self.until);
+        memory::attempt("", || {
+            let (saved, copy) = (Box::new(self.session.save()), self.session.copy());
+            Ok(Present { saved, copy, running, until_step })
+        })
     }
 
     /// Time stands from now on. Who reads samples gets the present one.
@@ -452,6 +470,11 @@ impl Running {
     pub(super) fn end(&mut self, why: &Refusal) {
         self.running = false;
         drop(lock(&self.live.intake).close(why.clone()));
+        self.silence(why);
+    }
+
+    /// Ends every stream, and what waits for a step.
+    fn silence(&mut self, why: &Refusal) {
         let taps = std::mem::take(&mut self.taps);
         taps.samples.iter().for_each(|tap| tap.writer.close(why.clone()));
         taps.probes.iter().for_each(|tap| tap.recipient.writer().close(why.clone()));

@@ -4,13 +4,14 @@
 //! A tape that nobody empties is full one day. Then it breaks: what it holds is forgotten, the reason stays, and the session
 //! goes on without a journal.
 
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::Duration;
 
 use tokio::sync::watch;
 
 use super::clock::now_ns;
+use super::inbox::Leaving;
 use crate::lock::lock;
 use crate::session::input::{Felt, Input};
 use crate::session::saved::Saved;
@@ -19,7 +20,7 @@ use crate::sheet::{Model, SheetCopy};
 /// Events that a tape holds at most: half a minute of a tool at 1 kHz.
 const MOST_EVENTS: usize = 1 << 15;
 
-/// Bytes of copies of the tissue that a tape holds at most, beside the newest.
+/// Bytes of copies of the tissue that a tape holds at most, beside the first: further ones are left out while the disk is slow.
 const MOST_COPIED_BYTES: u64 = 64 << 20;
 
 /// A copy of the tissue is made for a journal so often, s: of its state, to continue from, and to be hashed.
@@ -42,8 +43,8 @@ pub enum Event {
     Snapshot(Box<Saved>, SheetCopy),
     /// What tools feel.
     Felt(Vec<Felt>),
-    /// The session is deleted: nothing follows.
-    Deleted,
+    /// The session leaves this server: nothing follows.
+    Left(Leaving),
 }
 
 /// An event, the steps that were done before it, and when it was noted by the clock of stepping.
@@ -80,15 +81,19 @@ struct Held {
 /// How far a journal has come.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Progress {
-    /// What happened before this step is on disk; `None` if nothing is yet.
+    /// What happened before this step is durable: on disk, or on two if that is asked for; `None` if nothing is yet.
     pub durable_step: Option<u64>,
+    /// What happened before this step is on the disk of this server.
+    pub local_step: Option<u64>,
     /// How long ago the newest of that happened when it was on disk, s.
     pub lag_s: f64,
     /// The run of the server that writes; 0 before it has begun.
     pub run: u32,
     /// Why nothing more is written.
     pub broken: Option<Arc<str>>,
-    /// All is on disk, and nothing follows: the session is deleted.
+    /// What happened before this step is on the disk of the server that stands by too.
+    pub mirrored_step: Option<u64>,
+    /// All is on disk, and nothing follows: the session has left.
     pub is_complete: bool,
 }
 
@@ -109,6 +114,10 @@ pub struct About {
     pub running: bool,
     /// The step at which it pauses.
     pub until_step: Option<u64>,
+    /// The run of the journal that this one continues; 0 if there is none.
+    pub after_run: u64,
+    /// [`Begin::revision`](super::Begin).
+    pub revision: u64,
 }
 
 /// The events of one session, and how far they are on disk.
@@ -117,6 +126,8 @@ pub struct Tape {
     pub about: About,
     held: Mutex<Held>,
     queue: Arc<TapeQueue>,
+    /// Only what is mirrored is durable.
+    needs_mirror: bool,
     /// One more than the durable step, so that 0 is none.
     durable: AtomicU64,
     progress: watch::Sender<Progress>,
@@ -128,6 +139,7 @@ impl Tape {
             about,
             held: Mutex::new(Held::default()),
             queue: queue.clone(),
+            needs_mirror: queue.needs_mirror.load(Ordering::Relaxed),
             durable: AtomicU64::new(0),
             progress: watch::Sender::new(Progress::default()),
         })
@@ -145,8 +157,29 @@ impl Tape {
 
     /// Tells that everything before `step` is on disk since now; the newest of it is `lag_s` old.
     pub fn is_durable(&self, step: u64, lag_s: f64) {
-        self.durable.store(step + 1, Ordering::Release);
-        self.progress.send_modify(|progress| (progress.durable_step, progress.lag_s) = (Some(step), lag_s));
+        self.progress.send_modify(|progress| {
+            (progress.local_step, progress.lag_s) = (Some(step), lag_s);
+            self.tell_durable(progress);
+        });
+    }
+
+    /// Tells that everything before `step` is on the disk of the server that stands by.
+    pub fn is_mirrored(&self, step: u64) {
+        self.progress.send_modify(|progress| {
+            progress.mirrored_step = progress.mirrored_step.max(Some(step));
+            self.tell_durable(progress);
+        });
+    }
+
+    fn tell_durable(&self, progress: &mut Progress) {
+        let on_two = progress.local_step.min(progress.mirrored_step);
+        progress.durable_step = if self.needs_mirror { on_two } else { progress.local_step };
+        self.durable.store(progress.durable_step.map_or(0, |step| step + 1), Ordering::Release);
+    }
+
+    /// It is written here: what happened before this step is on the disk of this server.
+    pub fn local_step(&self) -> Option<u64> {
+        self.progress.borrow().local_step
     }
 
     /// It is written in this run of the server.
@@ -185,9 +218,11 @@ impl Tape {
         if held.broken.is_some() {
             return;
         }
-        let is_full = held.events.len() >= MOST_EVENTS
-            || (held.copied_bytes > 0 && held.copied_bytes + bytes > MOST_COPIED_BYTES);
-        if is_full {
+        // A journal is whole without a copy, and tells less often how the tissue was. The first it needs to begin with.
+        if bytes > 0 && held.copied_bytes > 0 && held.copied_bytes + bytes > MOST_COPIED_BYTES {
+            return;
+        }
+        if held.events.len() >= MOST_EVENTS {
             drop(held);
             return self.break_off("the disk did not keep up: what waited to be written reached its bound");
         }
@@ -221,10 +256,13 @@ impl Tape {
 
     /// Takes everything off it.
     pub fn take(&self) -> Taken {
+        // Room for as many again, made here: the stepping thread only writes into it.
+        let room = lock(&self.held).events.len();
+        let mut events = Vec::with_capacity(room);
         let mut held = lock(&self.held);
         held.is_queued = false;
         held.copied_bytes = 0;
-        let events = std::mem::take(&mut held.events);
+        std::mem::swap(&mut events, &mut held.events);
         Taken { events, until_step: held.until_step, is_still: held.is_still }
     }
 }
@@ -234,6 +272,7 @@ impl Tape {
 pub struct TapeQueue {
     state: Mutex<Queued>,
     wake: Condvar,
+    needs_mirror: AtomicBool,
 }
 
 #[derive(Default)]
@@ -243,6 +282,11 @@ struct Queued {
 }
 
 impl TapeQueue {
+    /// From now on only what is mirrored counts as durable, of new tapes.
+    pub fn needs_mirror(&self) {
+        self.needs_mirror.store(true, Ordering::Relaxed);
+    }
+
     fn push(&self, tape: Arc<Tape>) {
         let mut state = lock(&self.state);
         state.tapes.push(tape);

@@ -9,6 +9,7 @@ use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Mutex};
 
 use super::clock::now_ns;
+use super::fence::Fence;
 use super::frames::Encoder;
 use super::inbox::{Inbox, Request};
 use super::policy::Longest;
@@ -38,19 +39,31 @@ impl Stepper {
 const MOST_WAKES: usize = 32;
 const MOST_ROUND_NS: u64 = 200_000;
 
+/// A thread that may not step looks so often whether it may again, ns.
+const FENCED_NS: u64 = 5_000_000;
+
 /// The thread's work.
-pub(super) fn work(stepper: &Stepper, encoder: &Encoder, refiner: &SyncSender<StiffnessJob>, reading: &Reading) {
+pub(super) fn work(
+    stepper: &Stepper,
+    fence: &Fence,
+    encoder: &Encoder,
+    refiner: &SyncSender<StiffnessJob>,
+    reading: &Reading,
+) {
     // The default slack of 50 µs would be the larger part of each step's lateness. Best effort.
     #[cfg(target_os = "linux")]
     let _ = rustix::thread::set_current_timer_slack(std::num::NonZeroU64::new(1));
     let inbox = &*stepper.inbox;
     let mut rota = Rota::default();
     let mut requests = VecDeque::new();
-    let mut context = ThreadContext { encoder, refiner, reading, wakes: Wakes::default(), longest: Longest::default() };
+    let (wakes, longest) = (Wakes::default(), Longest::default());
+    let mut context = ThreadContext { fence, encoder, refiner, reading, wakes, longest };
     let mut begun_round_ns = 0;
     loop {
-        let next_ns = rota.first().map(|first| first.0);
         let now = now_ns();
+        // Behind the fence no session is stepped, however late it is.
+        let not_before_ns = if fence.may_act() { 0 } else { now + FENCED_NS };
+        let next_ns = rota.first().map(|first| first.0.max(not_before_ns));
         let is_round_over = next_ns.is_none_or(|next_ns| next_ns > now) || now > begun_round_ns + MOST_ROUND_NS;
         if is_round_over || context.wakes.len() >= MOST_WAKES {
             context.wakes.wake();
@@ -66,9 +79,8 @@ pub(super) fn work(stepper: &Stepper, encoder: &Encoder, refiner: &SyncSender<St
                 let newcomers = std::mem::take(&mut *lock(&stepper.newcomers));
                 newcomers.into_iter().for_each(|(number, running)| rota.adopt(number, running));
             } else {
-                let deleted =
-                    rota.with(number, |running| running.guarded(|running| running.serve(request, &mut context)));
-                if let Some(running) = deleted {
+                let left = rota.with(number, |running| running.guarded(|running| running.serve(request, &mut context)));
+                if let Some(running) = left {
                     // To free what a session has takes longer than a step may wait.
                     let owner = running.live.owner.clone();
                     reading.post(&owner, Piece::Remains(running));
@@ -81,6 +93,7 @@ pub(super) fn work(stepper: &Stepper, encoder: &Encoder, refiner: &SyncSender<St
         let begun_ns = now_ns();
         if let Some((due_ns, number)) = rota.first()
             && due_ns <= begun_ns
+            && fence.may_act()
         {
             if context.wakes.is_empty() {
                 begun_round_ns = begun_ns;

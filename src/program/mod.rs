@@ -35,6 +35,8 @@ pub(crate) enum Failure {
     Failed(String),
     /// Exit status 2.
     Refused(String),
+    /// A program that was run in its place ended with this exit status, and has told why.
+    Told(u8),
 }
 
 impl From<Refusal> for Failure {

@@ -25,15 +25,9 @@ pub(crate) struct SceneArguments {
     config: Option<PathBuf>,
 }
 
-/// Factor by which compiling a scene may take more work here than on a server: reference solutions need a tolerance of
-/// 1e-10.
-const OFFLINE_WORK: u64 = 32;
-
 /// Compiles the scene that the arguments name; returns it with the limits in force.
 pub(super) fn compile(arguments: &SceneArguments) -> Result<(Arc<Model>, Limits), Failure> {
-    let mut limits: Limits = load_config(arguments.config.as_deref())?.limits;
-    // No other caller waits here.
-    limits.rehearsal_work = limits.rehearsal_work.saturating_mul(OFFLINE_WORK);
+    let limits = load_config(arguments.config.as_deref())?.limits.offline();
     let path = &arguments.scene;
     let scene = find_scene(path, &arguments.scenes, &arguments.set, &limits)?;
     // An error of compilation belongs to no single line.

@@ -69,6 +69,27 @@ pub(crate) struct ServeArguments {
     /// these are removed: 30d, 12h, 10GiB, both, or 0 to keep none [default: 30d,10GiB]
     #[arg(long, value_name = "AGE,BYTES", requires = "journal")]
     journal_keep: Option<palpate::server::Keep>,
+    /// Be one of a fleet: URLs of the members of etcd, such as http://etcd:2379. Needs --journal and --advertise
+    #[arg(long, value_name = "URL", value_delimiter = ',', requires = "advertise")]
+    cluster: Vec<String>,
+    /// URL under which clients and the other servers of the fleet reach this one
+    #[arg(long, value_name = "URL")]
+    advertise: Option<String>,
+    /// Name of this server in its fleet [default: host and port of --advertise]
+    #[arg(long, value_name = "NAME")]
+    node: Option<String>,
+    /// Name of the fleet [default: default]
+    #[arg(long, value_name = "NAME")]
+    cluster_name: Option<String>,
+    /// Certificate authorities (PEM) of the other servers of the fleet
+    #[arg(long, value_name = "FILE")]
+    cluster_ca: Option<PathBuf>,
+    /// What `durable_step` means in a fleet: on the disk of the server, or also on that of the one that stands by [default: one]
+    #[arg(long, value_name = "SERVERS")]
+    durable: Option<palpate::server::Durable>,
+    /// Tell Agones how the server stands: ready, its sessions, drained. For a server of a fleet in a pod of Agones
+    #[arg(long)]
+    agones: bool,
     /// Time that streams get to end at shutdown before they are cut, s [default: 5]
     #[arg(long, value_name = "SECONDS")]
     shutdown_deadline_s: Option<f64>,
@@ -135,6 +156,25 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     }
     if let Some(keep) = arguments.journal_keep {
         config.journal_keep = keep;
+    }
+    let cluster = &mut config.cluster;
+    if !arguments.cluster.is_empty() {
+        cluster.etcd.clone_from(&arguments.cluster);
+    }
+    if arguments.advertise.is_some() {
+        cluster.advertise.clone_from(&arguments.advertise);
+    }
+    if arguments.cluster_ca.is_some() {
+        cluster.ca.clone_from(&arguments.cluster_ca);
+    }
+    for (given, configured) in [(&arguments.node, &mut cluster.node), (&arguments.cluster_name, &mut cluster.name)] {
+        if let Some(given) = given {
+            configured.clone_from(given);
+        }
+    }
+    cluster.agones |= arguments.agones;
+    if let Some(durable) = arguments.durable {
+        cluster.durable = durable;
     }
     if let Some(bytes) = arguments.memory {
         config.limits.memory_bytes = bytes;

@@ -1,7 +1,9 @@
 //! `AdminService`: shows what callers use, and takes it back.
 
+use std::pin::Pin;
 use std::sync::Arc;
 
+use futures_util::stream::{self, Stream, StreamExt};
 use tonic::{Request, Response, Status};
 use tracing::info;
 
@@ -14,6 +16,9 @@ use crate::refusal::{Reason, Refusal, excerpt};
 use palpate_proto::pb;
 use palpate_proto::pb::admin_service_server::AdminService;
 
+/// Sessions of a fleet in one message.
+const FLEET_SESSIONS_PER_PART: usize = 1000;
+
 pub(super) struct Admin {
     pub(super) services: Services,
     pub(super) register: Arc<Register>,
@@ -22,6 +27,9 @@ pub(super) struct Admin {
 #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
 #[tonic::async_trait]
 impl AdminService for Admin {
+    type ListFleetSessionsStream = Pin<Box<dyn Stream<Item = Result<pb::ListFleetSessionsResponse, Status>> + Send>>;
+    type DrainNodeStream = Pin<Box<dyn Stream<Item = Result<pb::DrainNodeResponse, Status>> + Send>>;
+
     async fn list_callers(
         &self,
         _: Request<pb::ListCallersRequest>,
@@ -43,7 +51,7 @@ impl AdminService for Admin {
         &self,
         request: Request<pb::ListStreamsRequest>,
     ) -> Result<Response<pb::ListStreamsResponse>, Status> {
-        let live = self.services.pacer.get(&request.get_ref().session_id)?;
+        let live = self.services.session(&request.get_ref().session_id).await?;
         let streams = live.list_streams().into_iter().map(|stream| pb::StreamUse {
             number: stream.number,
             call: stream.what.to_owned(),
@@ -56,7 +64,7 @@ impl AdminService for Admin {
 
     async fn free_tool(&self, request: Request<pb::FreeToolRequest>) -> Result<Response<pb::FreeToolResponse>, Status> {
         let pb::FreeToolRequest { session_id, tool } = request.into_inner();
-        let live = self.services.pacer.get(&session_id)?;
+        let live = self.services.session(&session_id).await?;
         if live.at_intake(|intake, _| intake.free(|other, _| other == tool)) == 0 {
             return Err(Refusal::new(Reason::OutOfRange, "tool", format!("nobody holds tool {tool}")).into());
         }
@@ -69,7 +77,7 @@ impl AdminService for Admin {
         request: Request<pb::CutStreamRequest>,
     ) -> Result<Response<pb::CutStreamResponse>, Status> {
         let pb::CutStreamRequest { session_id, number } = request.into_inner();
-        let live = self.services.pacer.get(&session_id)?;
+        let live = self.services.session(&session_id).await?;
         if live.cut_streams(|other, _| other == number) == 0 {
             let message = format!("the session has no stream {number}");
             return Err(Refusal::new(Reason::OutOfRange, "number", message).into());
@@ -107,7 +115,42 @@ impl AdminService for Admin {
         &self,
         request: Request<pb::ReviveSessionRequest>,
     ) -> Result<Response<pb::ReviveSessionResponse>, Status> {
-        let step = self.services.pacer.get(&request.get_ref().session_id)?.revive().await?;
+        let step = self.services.session(&request.get_ref().session_id).await?.revive().await?;
         Ok(Response::new(pb::ReviveSessionResponse { step }))
+    }
+
+    async fn list_nodes(&self, _: Request<pb::ListNodesRequest>) -> Result<Response<pb::ListNodesResponse>, Status> {
+        Ok(Response::new(pb::ListNodesResponse { nodes: self.services.fleet()?.nodes() }))
+    }
+
+    async fn list_fleet_sessions(
+        &self,
+        _: Request<pb::ListFleetSessionsRequest>,
+    ) -> Result<Response<Self::ListFleetSessionsStream>, Status> {
+        let sessions = self.services.fleet()?.sessions().await?;
+        let parts: Vec<_> = sessions
+            .chunks(FLEET_SESSIONS_PER_PART)
+            .map(|sessions| Ok(pb::ListFleetSessionsResponse { sessions: sessions.to_vec() }))
+            .collect();
+        Ok(Response::new(Box::pin(stream::iter(parts))))
+    }
+
+    async fn move_session(
+        &self,
+        request: Request<pb::MoveSessionRequest>,
+    ) -> Result<Response<pb::MoveSessionResponse>, Status> {
+        let request = request.into_inner();
+        let fleet = self.services.fleet()?;
+        let live = self.services.session(&request.session_id).await?;
+        let (ownership, gap_s) = fleet.clone().move_session(live, &request.node).await?;
+        Ok(Response::new(pb::MoveSessionResponse { ownership: Some(ownership), gap_s }))
+    }
+
+    async fn drain_node(
+        &self,
+        request: Request<pb::DrainNodeRequest>,
+    ) -> Result<Response<Self::DrainNodeStream>, Status> {
+        let drained = self.services.fleet()?.clone().drain(!request.get_ref().stop);
+        Ok(Response::new(Box::pin(drained.map(Ok))))
     }
 }

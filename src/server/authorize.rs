@@ -13,6 +13,7 @@ use tracing::{Instrument, info, info_span};
 
 use super::charged_caller::ChargedCaller;
 use super::connections::Peer;
+use super::fleet::FencedBody;
 use super::identity::{Access, Caller, Credentials, PresentedCredentials, access};
 use super::price::Price;
 use super::reload::Reloaded;
@@ -20,6 +21,7 @@ use super::request::{RequestBody, TimeLimit};
 use super::revocation::Calls;
 use super::traffic::Traffic;
 use crate::budget::Budget;
+use crate::pace::fence::Fence;
 use crate::refusal::{Reason, Refusal, Result, excerpt};
 
 /// Puts a [`CallAuthorizer`] in front of a service.
@@ -36,6 +38,8 @@ pub(super) struct AuthorizeLayer {
     pub(super) local_only: bool,
     /// Origins whose pages may call.
     pub(super) origins: Arc<[HeaderValue]>,
+    /// In a fleet: until when this server may speak for its sessions.
+    pub(super) fence: Option<Arc<Fence>>,
 }
 
 impl<S> Layer<S> for AuthorizeLayer {
@@ -62,8 +66,14 @@ type Identified = (Caller, Option<(PresentedCredentials, u64)>);
 /// Calls of this server's own protocol.
 const OWN: &str = "/palpate.";
 
+/// Calls of this server's own protocol that do not speak for sessions.
+const OF_THE_FLEET: [&str; 3] = [NODES, "/palpate.v1.AdminService/List", "/palpate.v1.SessionService/LocateSession"];
+
 /// Its messages arrive for as long as the client holds a tool; the call sets the deadline for the first.
 const TOUCH: &str = "/palpate.v1.HapticService/Touch";
+
+/// Streams of other servers of the fleet, for as long as these are there.
+const NODES: &str = "/palpate.v1.NodeService/";
 
 /// Calls without authentication and with many messages.
 const REFLECTION: &str = "/grpc.reflection.";
@@ -191,6 +201,7 @@ where
                 let (gate, from) = (peer.map(|peer| peer.gate.clone()), peer.cloned());
                 let limit = match request.uri().path() {
                     TOUCH => TimeLimit::None,
+                    path if path.starts_with(NODES) => TimeLimit::None,
                     path if path.starts_with(REFLECTION) => TimeLimit::EachMessage(self.layer.message_timeout),
                     _ => TimeLimit::WholeBody(self.layer.message_timeout),
                 };
@@ -204,6 +215,10 @@ where
                 let request = request.map(|body| RequestBody::wrap(body, call.clone(), gate, limit));
                 // The span adds path and client to every line that the call logs.
                 let span = info_span!("call", path = request.uri().path(), client = &*caller.name);
+                // Behind the fence no session is spoken for; of the fleet itself may be spoken.
+                let path = request.uri().path();
+                let is_of_sessions = path.starts_with(OWN) && !OF_THE_FLEET.iter().any(|of| path.starts_with(of));
+                let fence = self.layer.fence.clone().filter(|_| is_of_sessions);
                 let answer = self.inner.call(request).instrument(span);
                 let traffic = self.layer.traffic.clone();
                 Box::pin(async move {
@@ -216,6 +231,10 @@ where
                                 return Ok(Status::from(refusal).into_http());
                             }
                         },
+                    };
+                    let answer = match fence {
+                        Some(fence) => answer.map(|body| FencedBody::wrap(body, fence)),
+                        None => answer,
                     };
                     Ok(match call {
                         Some(call) => answer.map(|body| call.answer(body)),

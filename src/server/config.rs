@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 
 use super::address::host_and_port;
+use super::cluster_config::{Beside, ClusterConfig};
 use super::journals::keep::Keep;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, number, positive};
@@ -61,6 +62,8 @@ pub struct Config {
     /// How long the journals of sessions that have ended are kept, and how many bytes all journals may take before the oldest
     /// of these are removed: `30d`, `10GiB`, `30d,10GiB`, or `0` to keep none.
     pub journal_keep: Keep,
+    /// The fleet that the server is of.
+    pub cluster: ClusterConfig,
     /// The log filter: `info`, `debug`, `palpate=debug,tonic=warn`, …
     pub log: String,
     /// Upper bounds.
@@ -91,6 +94,7 @@ impl Default for Config {
             idle_session_s: 900.0,
             journal: None,
             journal_keep: Keep::default(),
+            cluster: ClusterConfig::default(),
             log: "info".to_owned(),
             limits: Limits::default(),
         }
@@ -142,7 +146,8 @@ impl Config {
             ($($limit:ident)*) => { [$((concat!("limits.", stringify!($limit)), self.limits.$limit == 0),)*] };
         }
         let whole = whole!(
-            points substeps file_bytes trace_bytes mesh_bytes mesh_vertices meshes_per_caller tools queued_commands_per_tool queued_samples queued_records
+            points substeps file_bytes trace_bytes mesh_bytes mesh_vertices meshes_per_caller
+            journal_bytes journals_per_caller tools queued_commands_per_tool queued_samples queued_records
             queued_bytes sessions points_in_all point_substeps_per_step streams_per_session frame_vertices texture_side
             probe_points connections connections_per_address streams_per_connection message_bytes
             connection_window_bytes queued_changes rehearsal_work law_work queued_work streams leases
@@ -182,11 +187,17 @@ impl Config {
             ("limits.keepalive_s", self.limits.keepalive_s),
             ("limits.work_s", self.limits.work_s),
             ("limits.mesh_s", self.limits.mesh_s),
+            ("limits.journal_s", self.limits.journal_s),
         ] {
             number(field, value, "above 0 and at most a day", within(day_s))?;
         }
         number("shutdown_deadline_s", self.shutdown_deadline_s, "above 0 and at most a day", within(day_s))?;
         number("audit_share", self.audit_share, "from 0 to 1", |share| (0.0..=1.0).contains(&share))?;
+        self.cluster.check(Beside {
+            journal: self.journal.is_some(),
+            tls_client_ca: self.tls_client_ca.is_some(),
+            insecure: self.insecure,
+        })?;
         number("idle_session_s", self.idle_session_s, "above 0", |value| value > 0.0)?;
         Ok(())
     }

@@ -17,7 +17,7 @@ use subtle::ConstantTimeEq;
 use crate::ids::random_bits;
 use crate::refusal::{Reason, Refusal, Result, label};
 
-/// What a caller may do. Every role includes `Watch`, and `Administer` includes every role.
+/// What a caller may do. Every role includes `Watch`, and `Administer` includes every role but `Node`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Role {
@@ -27,13 +27,15 @@ pub enum Role {
     Touch,
     /// Create, start, pause and delete sessions.
     Create,
-    /// List all sessions of the server, and everything else.
+    /// List all sessions of the server, and everything else but what nodes do.
     Administer,
+    /// A server of the same fleet: create sessions for callers of its own, mirror journals, hand sessions over.
+    Node,
 }
 
 impl Role {
     /// All roles.
-    pub const ALL: [Role; 4] = [Role::Watch, Role::Touch, Role::Create, Role::Administer];
+    pub const ALL: [Role; 5] = [Role::Watch, Role::Touch, Role::Create, Role::Administer, Role::Node];
 
     /// The role's name in files and on the command line.
     pub fn name(self) -> &'static str {
@@ -42,6 +44,7 @@ impl Role {
             Role::Touch => "touch",
             Role::Create => "create",
             Role::Administer => "administer",
+            Role::Node => "node",
         }
     }
 
@@ -51,7 +54,7 @@ impl Role {
     /// Returns an error if there is no such role.
     pub fn named(name: &str) -> Result<Role> {
         Role::ALL.into_iter().find(|role| role.name() == name).ok_or_else(|| {
-            let message = format!("must be one of watch, touch, create, administer, but is `{name}`");
+            let message = format!("must be one of watch, touch, create, administer, node, but is `{name}`");
             Refusal::new(Reason::WrongKind, "role", message)
         })
     }
@@ -75,9 +78,13 @@ pub const CALLS: &[(&str, Access)] = &[
     ("/grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo", Access::Open),
     ("/palpate.v1.AdminService/CutCaller", Access::Role(Role::Administer)),
     ("/palpate.v1.AdminService/CutStream", Access::Role(Role::Administer)),
+    ("/palpate.v1.AdminService/DrainNode", Access::Role(Role::Administer)),
     ("/palpate.v1.AdminService/FreeTool", Access::Role(Role::Administer)),
     ("/palpate.v1.AdminService/ListCallers", Access::Role(Role::Administer)),
+    ("/palpate.v1.AdminService/ListFleetSessions", Access::Role(Role::Administer)),
+    ("/palpate.v1.AdminService/ListNodes", Access::Role(Role::Administer)),
     ("/palpate.v1.AdminService/ListStreams", Access::Role(Role::Administer)),
+    ("/palpate.v1.AdminService/MoveSession", Access::Role(Role::Administer)),
     ("/palpate.v1.AdminService/ReviveSession", Access::Role(Role::Administer)),
     ("/palpate.v1.HapticService/AcquireTool", Access::Role(Role::Touch)),
     ("/palpate.v1.HapticService/OpenDatagrams", Access::Role(Role::Touch)),
@@ -86,6 +93,9 @@ pub const CALLS: &[(&str, Access)] = &[
     ("/palpate.v1.HapticService/SendCommands", Access::Role(Role::Touch)),
     ("/palpate.v1.HapticService/Touch", Access::Role(Role::Touch)),
     ("/palpate.v1.HapticService/WatchSamples", Access::Role(Role::Watch)),
+    ("/palpate.v1.NodeService/CreateHere", Access::Role(Role::Node)),
+    ("/palpate.v1.NodeService/Mirror", Access::Role(Role::Node)),
+    ("/palpate.v1.NodeService/TakeSession", Access::Role(Role::Node)),
     ("/palpate.v1.SessionService/CreateSession", Access::Role(Role::Create)),
     ("/palpate.v1.SessionService/DeleteSession", Access::Role(Role::Create)),
     ("/palpate.v1.SessionService/GetJournal", Access::Role(Role::Watch)),
@@ -98,10 +108,12 @@ pub const CALLS: &[(&str, Access)] = &[
     ("/palpate.v1.SessionService/ListScripts", Access::Role(Role::Watch)),
     // It reveals the IDs of all sessions, and whoever knows an ID can use that session.
     ("/palpate.v1.SessionService/ListSessions", Access::Role(Role::Administer)),
+    ("/palpate.v1.SessionService/LocateSession", Access::Role(Role::Watch)),
     ("/palpate.v1.SessionService/PauseSession", Access::Role(Role::Create)),
     ("/palpate.v1.SessionService/SaveSnapshot", Access::Role(Role::Watch)),
     ("/palpate.v1.SessionService/StartSession", Access::Role(Role::Create)),
     ("/palpate.v1.SessionService/UpdateTissue", Access::Role(Role::Touch)),
+    ("/palpate.v1.SessionService/UploadJournal", Access::Role(Role::Create)),
     ("/palpate.v1.SessionService/UploadMesh", Access::Role(Role::Create)),
     ("/palpate.v1.ViewService/AcknowledgeFrames", Access::Role(Role::Watch)),
     ("/palpate.v1.ViewService/GetMesh", Access::Role(Role::Watch)),
@@ -125,7 +137,7 @@ pub struct Caller {
 impl Caller {
     /// The caller where authentication is disabled: it may do everything.
     fn unrestricted() -> Self {
-        Caller { name: "anonymous".into(), roles: vec![Role::Administer] }
+        Caller { name: "anonymous".into(), roles: vec![Role::Administer, Role::Node] }
     }
 
     /// The caller of a call that requires nothing: it has no role.
@@ -138,7 +150,8 @@ impl Caller {
     /// # Errors
     /// Returns an error if the caller lacks the role.
     pub fn needs(&self, role: Role) -> Result<()> {
-        if role == Role::Watch || self.roles.contains(&role) || self.roles.contains(&Role::Administer) {
+        let includes_it = self.roles.contains(&Role::Administer) && role != Role::Node;
+        if role == Role::Watch || self.roles.contains(&role) || includes_it {
             return Ok(());
         }
         let message = format!("`{}` lacks the role `{}`, which this call requires", self.name, role.name());

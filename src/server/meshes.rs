@@ -1,7 +1,7 @@
-//! Meshes that clients send: in parts, kept in memory for a while, each for the caller who has sent it.
+//! Meshes that clients send.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex};
 
 use palpate_mesh::repair::{Repair, repair};
 use palpate_mesh::report::{Finding, report_within};
@@ -9,12 +9,10 @@ use palpate_mesh::{Element, MeshError, ReadLimits, TriangleMesh, Unit};
 use palpate_proto::geometry::vector;
 use palpate_proto::pb;
 
-use crate::budget::{Account, Purpose, Resource, Taken};
-use crate::ids::random_id;
+use super::uploads::{Kind, Part, Received, Uploads};
+use crate::budget::{Account, Purpose};
 use crate::limits::Limits;
-use crate::lock::lock;
 use crate::memory;
-use crate::pace::clock::now_ns;
 use crate::refusal::{Reason, Refusal, Result, excerpt};
 use crate::shape::Extent;
 use crate::sheet::choice::given_up;
@@ -29,36 +27,12 @@ const READING: u64 = 12;
 /// Groups whose names a report tells.
 const GROUPS_TOLD: usize = 1000;
 
-/// A mesh that a client is sending or has sent.
-struct Upload {
-    id: String,
-    name: String,
-    state: State,
-    /// When the last part came, or the mesh was used last.
-    touched_ns: u64,
-    taken: Taken,
-}
-
-enum State {
-    /// What has come so far.
-    Receiving(Vec<u8>),
-    /// A job reads it.
-    Reading,
-    /// It can be used.
-    Ready(Arc<TriangleMesh>),
-}
-
-struct Shared {
-    uploads: Mutex<Vec<Upload>>,
-    most_bytes: u64,
-    vertices: usize,
-    most_each: usize,
-    kept_ns: u64,
-}
-
 /// The meshes of all clients.
 #[derive(Clone)]
-pub(crate) struct Meshes(Arc<Shared>);
+pub(crate) struct Meshes {
+    uploads: Uploads<TriangleMesh>,
+    vertices: usize,
+}
 
 /// The unit in a request.
 ///
@@ -77,88 +51,37 @@ pub(super) fn unit(text: &str) -> Result<Unit> {
 
 impl Meshes {
     /// None yet.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub(super) fn new(limits: &Limits) -> Self {
-        Meshes(Arc::new(Shared {
-            uploads: Mutex::default(),
-            most_bytes: limits.mesh_bytes,
-            vertices: limits.mesh_vertices.min(limits.points),
-            most_each: limits.meshes_per_caller,
-            kept_ns: (limits.mesh_s * 1e9) as u64,
-        }))
+        let uploads = Uploads::new(Kind {
+            names: ["mesh", "meshes"],
+            id: "mesh_id",
+            unknown: Reason::UnknownMesh,
+            purpose: Purpose::Meshes,
+            most_bytes: (limits.mesh_bytes, "limits.mesh_bytes"),
+            most_each: (limits.meshes_per_caller, "limits.meshes_per_caller"),
+            kept_s: limits.mesh_s,
+        });
+        Meshes { uploads, vertices: limits.mesh_vertices.min(limits.points) }
     }
 
-    /// Adds a part of a file, the first of a new one if it names no mesh.
+    /// Adds a part of a file, as [`Uploads::add`] does.
     ///
     /// # Errors
-    /// Refuses a part that does not follow what has come before, a mesh that this caller is not sending, and more than the
-    /// limits or the caller's part of the memory allow.
+    /// As for [`Uploads::add`].
     pub(super) fn add(&self, request: &pb::UploadMeshRequest, account: &Account) -> Result<pb::UploadMeshResponse> {
-        let now = now_ns();
-        self.forget_expired(now);
-        let mut uploads = lock(&self.0.uploads);
-        let index = if request.mesh_id.is_empty() {
-            self.make_room(&mut uploads, account)?;
-            let taken = account.take(Resource::Memory(Purpose::Meshes), 0, "part")?;
-            let (id, name, state) = (random_id()?, name_of(&request.file_name), State::Receiving(Vec::new()));
-            uploads.push(Upload { id, name, state, touched_ns: now, taken });
-            uploads.len() - 1
-        } else {
-            find(&uploads, &request.mesh_id, account)?
-        };
-        let upload = &mut uploads[index];
-        let added = upload.add(request, self.0.most_bytes);
-        upload.touched_ns = now;
-        match added {
-            Ok(received_bytes) => {
-                Ok(pb::UploadMeshResponse { mesh_id: upload.id.clone(), received_bytes, report: None })
-            }
-            Err(refusal) => {
-                // One that has not begun well can't be named by its client.
-                if request.mesh_id.is_empty() || refusal.reason == Reason::TooLarge {
-                    uploads.swap_remove(index);
-                }
-                Err(refusal)
-            }
-        }
+        let pb::UploadMeshRequest { mesh_id, offset, part, last, .. } = request;
+        let part = Part { id: mesh_id, offset: *offset, bytes: part, last: *last };
+        let (mesh_id, received_bytes) = self.uploads.add(&part, account)?;
+        Ok(pb::UploadMeshResponse { mesh_id, received_bytes, report: None })
     }
 
-    /// Makes room for a further mesh of a caller: its oldest one that has come in full gives way.
-    fn make_room(&self, uploads: &mut Vec<Upload>, account: &Account) -> Result<()> {
-        let of_caller = || uploads.iter().enumerate().filter(|(_, upload)| upload.is_of(account));
-        if of_caller().count() < self.0.most_each {
-            return Ok(());
-        }
-        let ready = of_caller().filter(|(_, upload)| matches!(upload.state, State::Ready(_)));
-        let Some((oldest, _)) = ready.min_by_key(|(_, upload)| upload.touched_ns) else {
-            let message = format!(
-                "this caller is sending {} meshes already (limits.meshes_per_caller); finish one, or wait until one has \
-                 expired",
-                self.0.most_each
-            );
-            return Err(Refusal::new(Reason::TooMany, "", message));
-        };
-        uploads.swap_remove(oldest);
-        Ok(())
-    }
-
-    /// Takes a file that has come in full, to read it. If what this returns is dropped, the file is gone.
+    /// Takes a file that has come in full, to read it. If what this returns is dropped, the file is gone. Refusals call it
+    /// `file_name`.
     ///
     /// # Errors
     /// Refuses a mesh that this caller is not sending.
-    pub(super) fn read(&self, id: &str, account: &Account) -> Result<Reading> {
-        let mut uploads = lock(&self.0.uploads);
-        let index = find(&uploads, id, account)?;
-        let upload = &mut uploads[index];
-        match std::mem::replace(&mut upload.state, State::Reading) {
-            State::Receiving(bytes) => {
-                Ok(Reading { meshes: self.clone(), id: id.to_owned(), name: upload.name.clone(), bytes })
-            }
-            state => {
-                upload.state = state;
-                Err(complete())
-            }
-        }
+    pub(super) fn read(&self, id: &str, file_name: &str, account: &Account) -> Result<Reading> {
+        Ok(Reading { received: self.uploads.take(id, account)?, name: name_of(file_name), limits: self.limits() })
     }
 
     /// A mesh that this caller has sent.
@@ -170,40 +93,19 @@ impl Meshes {
             let message = "is missing: a client sends its mesh with UploadMesh, which tells its mesh_id";
             return Err(Refusal::new(Reason::Missing, "scene.mesh.mesh_id", message));
         }
-        self.forget_expired(now_ns());
-        let mut uploads = lock(&self.0.uploads);
-        let index = find(&uploads, id, account).map_err(|refusal| refusal.within("scene.mesh"))?;
-        uploads[index].touched_ns = now_ns();
-        match &uploads[index].state {
-            State::Ready(mesh) => Ok(mesh.clone()),
-            State::Receiving(_) | State::Reading => {
-                let message = "has not come in full: its last part is missing, or is being read";
-                Err(Refusal::new(Reason::OutOfTurn, "scene.mesh.mesh_id", message))
-            }
-        }
+        self.uploads.get(id, account).map_err(|refusal| refusal.within("scene.mesh"))
     }
 
     /// Forgets the meshes whose last part came too long ago.
     pub(super) fn forget_expired(&self, now_ns: u64) {
-        lock(&self.0.uploads).retain(|upload| now_ns.saturating_sub(upload.touched_ns) < self.0.kept_ns);
+        self.uploads.forget_expired(now_ns);
     }
 
     fn limits(&self) -> ReadLimits {
         ReadLimits {
-            bytes: usize::try_from(self.0.most_bytes).unwrap_or(usize::MAX),
-            vertices: self.0.vertices,
-            triangles: self.0.vertices.saturating_mul(TRIANGLES_PER_VERTEX),
-        }
-    }
-
-    /// Takes more memory for a mesh, or gives some back.
-    fn charge(&self, id: &str, bytes: u64) -> Result<()> {
-        match lock(&self.0.uploads).iter_mut().find(|upload| upload.id == id) {
-            Some(upload) => {
-                upload.taken.shrink_to(bytes);
-                upload.taken.grow_to(bytes, "part")
-            }
-            None => Err(unknown()),
+            bytes: usize::try_from(self.uploads.kind().most_bytes.0).unwrap_or(usize::MAX),
+            vertices: self.vertices,
+            triangles: self.vertices.saturating_mul(TRIANGLES_PER_VERTEX),
         }
     }
 }
@@ -216,65 +118,11 @@ fn name_of(file_name: &str) -> String {
     if end.is_empty() { "the mesh".to_owned() } else { end }
 }
 
-/// The upload of that id and caller.
-fn find(uploads: &[Upload], id: &str, account: &Account) -> Result<usize> {
-    uploads.iter().position(|upload| upload.id == id && upload.is_of(account)).ok_or_else(unknown)
-}
-
-fn unknown() -> Refusal {
-    let message =
-        "is of no mesh that this caller has sent, or it has expired: send the mesh again, from its first part";
-    Refusal::new(Reason::UnknownMesh, "mesh_id", message)
-}
-
-fn complete() -> Refusal {
-    Refusal::new(Reason::OutOfTurn, "mesh_id", "has come in full already: no further part follows")
-}
-
-impl Upload {
-    fn is_of(&self, account: &Account) -> bool {
-        self.taken.account().number() == account.number()
-    }
-
-    /// Adds a part; returns how many bytes there are now.
-    fn add(&mut self, request: &pb::UploadMeshRequest, most_bytes: u64) -> Result<u64> {
-        let State::Receiving(bytes) = &mut self.state else { return Err(complete()) };
-        let length = bytes.len() as u64;
-        if request.offset != length {
-            let message = format!("must be {length}, the bytes that have come so far, but is {}", request.offset);
-            return Err(Refusal::new(Reason::OutOfTurn, "offset", message));
-        }
-        let sum = length + request.part.len() as u64;
-        if sum > most_bytes {
-            let message = format!("makes {sum} bytes, above the limit of {most_bytes} (limits.mesh_bytes)");
-            return Err(Refusal::new(Reason::TooLarge, "part", message));
-        }
-        if request.part.is_empty() && !request.last {
-            return Err(Refusal::new(Reason::Missing, "part", "is empty, and is not the last"));
-        }
-        // What a vector takes that grows.
-        self.taken.grow_to(2 * sum, "part")?;
-        if bytes.try_reserve(request.part.len()).is_err() {
-            return Err(Refusal::new(Reason::Overloaded, "part", "the system has no memory for it"));
-        }
-        bytes.extend_from_slice(&request.part);
-        Ok(sum)
-    }
-}
-
 /// A file that is being read.
 pub(super) struct Reading {
-    meshes: Meshes,
-    id: String,
+    received: Received<TriangleMesh>,
     name: String,
-    bytes: Vec<u8>,
-}
-
-impl Drop for Reading {
-    fn drop(&mut self) {
-        let is_given_up = |upload: &Upload| upload.id == self.id && matches!(upload.state, State::Reading);
-        lock(&self.meshes.0.uploads).retain(|upload| !is_given_up(upload));
-    }
+    limits: ReadLimits,
 }
 
 impl Reading {
@@ -288,10 +136,10 @@ impl Reading {
 
     fn finished(&mut self, unit: Unit, mends: bool, stop: &AtomicBool) -> Result<pb::MeshReport> {
         let go_on = || if stop.load(Ordering::Relaxed) { Err(given_up()) } else { Ok(()) };
-        let limits = self.meshes.limits();
-        self.meshes.charge(&self.id, self.bytes.len() as u64 * READING)?;
-        let bytes = std::mem::take(&mut self.bytes);
-        let read = palpate_mesh::read(&self.name, &bytes, unit, &|_| None, &limits).map_err(refuse)?;
+        let limits = &self.limits;
+        let bytes = std::mem::take(&mut self.received.bytes);
+        self.received.charge(bytes.len() as u64 * READING)?;
+        let read = palpate_mesh::read(&self.name, &bytes, unit, &|_| None, limits).map_err(refuse)?;
         drop(bytes);
         go_on()?;
         let (mut mesh, mut problems) = (read.mesh, read.notes.into_iter().map(note).collect::<Vec<_>>());
@@ -301,7 +149,7 @@ impl Reading {
             problems.extend(repaired.told.into_iter().map(note));
             go_on()?;
         }
-        let found = report_within(&mesh, &limits);
+        let found = report_within(&mesh, limits);
         go_on()?;
         let refused = found.refusal().is_some();
         // What is refused comes first.
@@ -322,11 +170,8 @@ impl Reading {
             refused,
         };
         if !refused {
-            self.meshes.charge(&self.id, bytes_of(&mesh))?;
-            if let Some(upload) = lock(&self.meshes.0.uploads).iter_mut().find(|upload| upload.id == self.id) {
-                upload.state = State::Ready(Arc::new(mesh));
-                upload.touched_ns = now_ns();
-            }
+            let bytes = bytes_of(&mesh);
+            self.received.finish(mesh, bytes)?;
         }
         Ok(report)
     }
@@ -360,7 +205,8 @@ fn refuse(error: MeshError) -> Refusal {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::budget::Budget;
+    use crate::budget::{Budget, Resource};
+    use crate::pace::clock::now_ns;
 
     const TETRAHEDRON: &str = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n";
 
@@ -376,7 +222,7 @@ mod tests {
 
     fn sent(meshes: &Meshes, account: &Account) -> String {
         let id = meshes.add(&part("", 0, TETRAHEDRON.as_bytes()), account).unwrap().mesh_id;
-        let reading = meshes.read(&id, account).unwrap();
+        let reading = meshes.read(&id, "organ.obj", account).unwrap();
         let report = reading.finish(unit("mm").unwrap(), false, &AtomicBool::new(false)).unwrap();
         assert!(!report.refused && report.vertices == 4 && report.volume_m3.is_some(), "{report:?}");
         id
@@ -432,7 +278,7 @@ mod tests {
         let (meshes, [one, _]) = meshes(&Limits { mesh_vertices: 4, ..Limits::default() });
         let finish = |text: &str, mends: bool, stop: bool| {
             let id = meshes.add(&part("", 0, text.as_bytes()), &one).unwrap().mesh_id;
-            let reading = meshes.read(&id, &one).unwrap();
+            let reading = meshes.read(&id, "organ.obj", &one).unwrap();
             let report = reading.finish(unit("m").unwrap(), mends, &AtomicBool::new(stop));
             (meshes.get(&id, &one).is_ok(), report)
         };

@@ -21,6 +21,7 @@ use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 
 use super::connections::{self, Connection, ConnectionSlots};
+use super::fleet::{Fleet, Standing};
 use super::journals::{Journals, KeeperTally};
 use super::traffic::Traffic;
 use super::workshop::Workshop;
@@ -37,6 +38,7 @@ pub(super) fn registry(
     traffic: &Traffic,
     workshop: &Workshop,
     journals: Option<&Journals>,
+    fleet: Option<Arc<Fleet>>,
 ) -> Registry {
     let mut registry = Registry::with_prefix("palpate");
     let connections = "Connections that are open";
@@ -66,7 +68,54 @@ pub(super) fn registry(
     if let Some(journals) = journals {
         registry.register_collector(Box::new(Kept(journals.tally.clone())));
     }
+    if let Some(fleet) = fleet {
+        registry.register_collector(Box::new(InFleet(move || fleet.standing())));
+    }
     registry
+}
+
+/// The server in its fleet.
+struct InFleet<F>(F);
+
+impl<F> fmt::Debug for InFleet<F> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("InFleet")
+    }
+}
+
+impl<F: Fn() -> Standing + Send + Sync + 'static> Collector for InFleet<F> {
+    #[allow(clippy::cast_precision_loss)]
+    fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> fmt::Result {
+        let now = (self.0)();
+        for (name, help, unit, value) in [
+            ("acts", "1 while the server may step and speak for its sessions", None, f64::from(u8::from(now.acts))),
+            ("fence", "For how long it may, if etcd confirms nothing more", Some(&Unit::Seconds), now.to_fence_s),
+            ("nodes", "Servers of the fleet that this one sees", None, now.nodes as f64),
+            ("load", "The part of the stepping threads that its sessions take, 0 to 1", None, now.load),
+            ("sessions", "Sessions that it owns", None, now.sessions as f64),
+            ("sessions_without_standby", "Of those, the ones for which no server stands by", None, {
+                now.without_standby as f64
+            }),
+            ("unmirrored", "Of its journals, what is on no second disk", Some(&Unit::Bytes), {
+                now.unmirrored_bytes as f64
+            }),
+        ] {
+            let gauge = ConstGauge::new(value);
+            let name = format!("fleet_{name}");
+            gauge.encode(encoder.encode_descriptor(&name, help, unit, MetricType::Gauge)?)?;
+        }
+        for (name, help, unit, count) in [
+            ("mirrored", "Of its journals, what came onto a second disk", Some(&Unit::Bytes), now.mirrored_bytes),
+            ("taken_over", "Sessions whose owner was gone, and that go on here", None, now.taken_over),
+            ("moved", "Sessions that were moved from here to another server", None, now.moved),
+            ("lost", "Sessions that another server had when this one came back", None, now.lost),
+        ] {
+            let counter = ConstCounter::new(count);
+            let name = format!("fleet_{name}");
+            counter.encode(encoder.encode_descriptor(&name, help, unit, MetricType::Counter)?)?;
+        }
+        Ok(())
+    }
 }
 
 /// The journals.
@@ -302,4 +351,45 @@ pub(super) async fn serve(
     let router = Router::new().route("/metrics", get(told));
     let serving = axum::serve(Scrapers(address, Box::pin(connections)), router);
     serving.with_graceful_shutdown(shutdown.cancelled_owned()).await
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+
+    #[test]
+    fn the_dashboard_and_the_alerts_know_the_metrics_of_a_fleet() {
+        let standing = || Standing {
+            acts: true,
+            to_fence_s: 2.5,
+            nodes: 3,
+            load: 0.25,
+            sessions: 12,
+            without_standby: 1,
+            mirrored_bytes: 1 << 40,
+            unmirrored_bytes: 7,
+            taken_over: 2,
+            moved: 3,
+            lost: 4,
+        };
+        let mut registry = Registry::with_prefix("palpate");
+        registry.register_collector(Box::new(InFleet(standing)));
+        let mut told = String::new();
+        text::encode(&mut told, &registry).unwrap();
+        for line in ["palpate_fleet_acts 1.0", "palpate_fleet_fence_seconds 2.5", "palpate_fleet_lost_total 4"] {
+            assert!(told.lines().any(|told| told == line), "{line} is not in {told}");
+        }
+        let is_part = |c: char| c.is_ascii_alphanumeric() || c == '_';
+        let names = |text: &str| -> BTreeSet<String> {
+            let found = text.split(|c| !is_part(c)).filter(|word| word.starts_with("palpate_fleet_"));
+            found.map(str::to_owned).collect()
+        };
+        let samples = told.lines().filter(|line| !line.starts_with('#'));
+        let there: BTreeSet<String> = samples.flat_map(&names).collect();
+        assert_eq!(there, names(include_str!("../../contrib/grafana.json")));
+        let alerted = names(include_str!("../../contrib/prometheus-rules.yaml"));
+        assert!(alerted.len() > 4 && alerted.is_subset(&there), "{alerted:?} are not all of {there:?}");
+    }
 }

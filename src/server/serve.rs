@@ -17,8 +17,10 @@ use super::catalog::Catalog;
 use super::config::Config;
 use super::connections::ConnectionSlots;
 use super::datagrams;
+use super::fleet::{self, Fleet};
 use super::health::{SERVICES, end_health, report_files, report_workshop};
 use super::journals::Journals;
+use super::journals::recorded::Recorded;
 use super::listeners::{Listeners, ServeError};
 use super::meshes::Meshes;
 use super::revocation::Calls;
@@ -26,13 +28,14 @@ use super::services::Services;
 use super::textures::Textures;
 use super::traffic::Traffic;
 use super::workshop::Workshop;
-use super::{admin, connections, descriptors, haptics, metrics, page, sessions, textures, views};
+use super::{admin, connections, descriptors, haptics, metrics, nodes, page, sessions, textures, views};
 use crate::budget::{Budget, give_back_to_the_system};
 use crate::pace::Pacer;
 use crate::pace::clock::now_ns;
 use palpate_proto::pb;
 use palpate_proto::pb::admin_service_server::AdminServiceServer;
 use palpate_proto::pb::haptic_service_server::HapticServiceServer;
+use palpate_proto::pb::node_service_server::NodeServiceServer;
 use palpate_proto::pb::session_service_server::SessionServiceServer;
 use palpate_proto::pb::view_service_server::ViewServiceServer;
 
@@ -76,12 +79,24 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
     limits.connections =
         descriptors::connections(limits.connections, metrics.as_ref().map_or(0, |_| metrics::SCRAPERS));
     let workshop = Workshop::open("workshop", &limits)?;
+    let config = Arc::new(config);
+    let fleet = match config.cluster.is_on() {
+        true => Some(Fleet::join(&config, &pacer).await?),
+        false => None,
+    };
+    let own = match &fleet {
+        Some(fleet) => Some((fleet.own_sessions().await?, fleet.growth())),
+        None => None,
+    };
     // Sessions of the server before this one go on before anybody is let in.
     let (continued, kept) = (pacer.clone(), config.clone());
-    let opened = tokio::task::spawn_blocking(move || Journals::open(&kept, &continued)).await;
+    let opened = tokio::task::spawn_blocking(move || Journals::open(&kept, &continued, own)).await;
     let journals = opened.map_err(std::io::Error::other)??;
+    if let (Some(fleet), Some(journals)) = (&fleet, &journals) {
+        fleet.begin(journals);
+    }
     if let Some(listener) = metrics {
-        let registry = metrics::registry(&pacer, &traffic, &workshop, journals.as_deref());
+        let registry = metrics::registry(&pacer, &traffic, &workshop, journals.as_deref(), fleet.clone());
         let (limits, shutdown) = (limits.clone(), shutdown.clone());
         tokio::spawn(async move { metrics::serve(listener, &limits, registry, shutdown).await });
     }
@@ -99,9 +114,10 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
         budget: budget.clone(),
         local_only: open && !config.insecure,
         origins: origins.clone(),
+        fence: fleet.is_some().then(|| pacer.fence.clone()),
     };
-    let config = Arc::new(config);
     let meshes = Meshes::new(&limits);
+    let recorded = Recorded::new(journals.as_deref(), &limits)?;
     let textures = Textures::open(&config, &catalog, &pacer, &limits)?;
     let (pages, counted) = (origins.clone(), traffic.clone());
     let datagrams = datagrams::receive(socket, pages, counted, shutdown.child_token()).await;
@@ -114,7 +130,8 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
         meshes: meshes.clone(),
         workshop: workshop.clone(),
         traffic: traffic.clone(),
-        journals: journals.clone(),
+        recorded: recorded.clone(),
+        fleet: fleet.clone(),
     };
 
     let (health, health_service) = tonic_health::server::health_reporter();
@@ -129,7 +146,7 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
     };
 
     let reporting_work = report_workshop(workshop, health.clone());
-    let (unused, memory) = (pacer.clone(), budget.clone());
+    let (unused, memory, sent) = (pacer.clone(), budget.clone(), recorded.clone());
     let mut most_bytes = 0;
     let sweeping = async move {
         let mut sweep = tokio::time::interval(Duration::from_secs(1));
@@ -139,6 +156,7 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
                 info!(session, "session deleted: it was idle");
             }
             meshes.forget_expired(now_ns());
+            sent.forget_expired(now_ns());
             let bytes = memory.bytes_taken();
             most_bytes = most_bytes.max(bytes);
             if most_bytes - bytes >= WORTH_GIVING_BACK {
@@ -163,6 +181,10 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
     let haptics = HapticServiceServer::new(haptics::Haptics(services.clone())).max_decoding_message_size(bytes);
     let admin =
         AdminServiceServer::new(admin::Admin { services: services.clone(), register }).max_decoding_message_size(bytes);
+    let node_calls = fleet.clone().map(|fleet| {
+        let sessions = sessions::Sessions(services.clone());
+        NodeServiceServer::new(nodes::Nodes { sessions, fleet }).max_decoding_message_size(fleet::MOST_MESSAGE_BYTES)
+    });
     let views = ViewServiceServer::new(views::Views(services)).max_decoding_message_size(bytes);
     let routes = Routes::new(health_service)
         .add_service(reflection().build_v1()?)
@@ -170,7 +192,12 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
         .add_service(sessions)
         .add_service(haptics)
         .add_service(views)
-        .add_service(admin)
+        .add_service(admin);
+    let routes = match node_calls {
+        Some(calls) => routes.add_service(calls),
+        None => routes,
+    };
+    let routes = routes
         .into_axum_router()
         // Not for the routes below: the layer refuses what is not gRPC.
         .route_layer(GrpcWebLayer::new())
@@ -200,9 +227,13 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
         // Waits for the running steps. Every stream then reads its end from its queue.
         let last = move || {
             stopping.stop();
+            recorded.finish();
             journals.iter().for_each(|journals| journals.finish());
         };
         let _ = tokio::task::spawn_blocking(last).await;
+        if let Some(fleet) = fleet {
+            fleet.leave().await;
+        }
     };
     let deadline_passed = async {
         shutdown.cancelled().await;

@@ -5,12 +5,16 @@ use std::sync::Arc;
 use super::catalog::Catalog;
 use super::config::Config;
 use super::datagrams::Datagrams;
-use super::journals::Journals;
+use super::fleet::Fleet;
+use super::journals::recorded::Recorded;
 use super::meshes::Meshes;
+use super::status;
 use super::textures::Textures;
 use super::traffic::Traffic;
 use super::workshop::Workshop;
-use crate::pace::Pacer;
+use crate::pace::{Live, Pacer};
+use crate::refusal::{Reason, Refusal, Result};
+use palpate_proto::pb;
 
 /// What every service needs.
 #[derive(Clone)]
@@ -24,6 +28,39 @@ pub(crate) struct Services {
     /// Creates and changes sessions, reads meshes and scripts and computes force laws.
     pub(crate) workshop: Workshop,
     pub(crate) traffic: Arc<Traffic>,
-    /// `None` if no journals are kept.
-    pub(super) journals: Option<Arc<Journals>>,
+    pub(super) recorded: Arc<Recorded>,
+    /// The fleet that this server is of, if it is of one.
+    pub(super) fleet: Option<Arc<Fleet>>,
+}
+
+impl Services {
+    /// The session of that ID.
+    ///
+    /// # Errors
+    /// Refuses an unknown ID, a session that another server of the fleet has, and all while this server may not speak for its
+    /// sessions.
+    pub(super) async fn session(&self, id: &str) -> Result<Arc<Live>> {
+        match (self.pacer.get(id), &self.fleet) {
+            (Err(unknown), Some(fleet)) if unknown.reason == Reason::UnknownSession => {
+                Err(fleet.refuse(id, unknown).await)
+            }
+            (found, _) => found,
+        }
+    }
+
+    /// A session as clients are told of it.
+    pub(super) fn told(&self, live: &Live) -> pb::Session {
+        let ownership = self.fleet.as_ref().map(|fleet| fleet.own(live));
+        pb::Session { ownership, ..status::session(live) }
+    }
+
+    /// The fleet that this server is of.
+    ///
+    /// # Errors
+    /// Refuses if it is of none.
+    pub(super) fn fleet(&self) -> Result<&Arc<Fleet>> {
+        self.fleet.as_ref().ok_or_else(|| {
+            Refusal::new(Reason::NotAvailable, "", "this server is of no fleet (`palpate serve --cluster`)")
+        })
+    }
 }

@@ -18,9 +18,9 @@ use super::meshes;
 use super::services::Services;
 use super::status;
 use super::workshop::CancelFlag;
-use crate::budget::{Purpose, Resource, Work};
-use crate::pace::StreamKind;
+use crate::budget::{Account, Purpose, Resource, Work};
 use crate::pace::clock::now_ns;
+use crate::pace::{Birth, StreamKind};
 use crate::refusal::{Reason, Refusal, number};
 use crate::scene::script::Script;
 use crate::wire;
@@ -30,9 +30,71 @@ pub(super) struct Sessions(pub(super) Services);
 /// Bytes of a snapshot that go in one message.
 const SNAPSHOT_PART_BYTES: usize = 64 << 10;
 
-fn no_journals(field: &str) -> Refusal {
-    let message = "this server keeps no journals: `palpate serve --journal DIR` does";
-    Refusal::new(Reason::NotAvailable, field, message)
+impl Sessions {
+    /// Creates a session on this server, for `account`.
+    ///
+    /// # Errors
+    /// Refuses what no session can be made of.
+    pub(super) async fn create_here(
+        &self,
+        request: pb::CreateSessionRequest,
+        account: Account,
+    ) -> Result<pb::Session, Status> {
+        use pb::create_session_request::Source;
+        let most_s = self.0.config.idle_session_s;
+        let idle_timeout_s = request.idle_timeout_s.unwrap_or(most_s);
+        let range = format!("above 0 and at most {most_s}");
+        number("idle_timeout_s", idle_timeout_s, &range, |value| value > 0.0 && value <= most_s)?;
+        // A large tissue takes a while to read and to compile.
+        let pacer = self.0.pacer.clone();
+        let payer = account.clone();
+        let source = request.source;
+        let mesh = match &source {
+            Some(Source::Scene(pb::Scene { mesh: Some(mesh), .. })) => {
+                Some(self.0.meshes.get(&mesh.mesh_id, &account)?)
+            }
+            _ => None,
+        };
+        let (catalog, config, recorded) = (self.0.catalog.clone(), self.0.config.clone(), self.0.recorded.clone());
+        let birth = match &self.0.fleet {
+            Some(fleet) => fleet.birth().await?,
+            None => Birth::new()?,
+        };
+        let named = birth.clone();
+        let create = move |cancel: &CancelFlag| {
+            let scene = match &source {
+                Some(Source::SceneName(name)) => catalog.load(name, &[], &config.limits)?,
+                Some(Source::Scene(scene)) => {
+                    let made = wire::scene::from_scene(scene, mesh.as_deref());
+                    made.map_err(|refusal| refusal.within("scene"))?
+                }
+                Some(Source::Journal(moment)) => {
+                    let how = (request.paused, idle_timeout_s);
+                    return recorded.begin(moment, named, how, (&payer, &pacer), &config.limits, cancel.flag());
+                }
+                None => {
+                    return Err(Refusal::new(Reason::Missing, "source", "scene_name, scene or journal is missing"));
+                }
+            };
+            pacer.create_as(named, &scene, (request.paused, idle_timeout_s), &payer, cancel.flag())
+        };
+        let made = self.0.workshop.work(&account, create).await.and_then(|made| Ok(made?));
+        if let Some(fleet) = &self.0.fleet {
+            fleet.born(&birth, made.is_ok()).await;
+        }
+        let live = made?;
+        info!(session = %live.id, scene = %live.model.scene.name, points = live.model.len(), "session created");
+        let not_kept = journals::until_durable(&live).await;
+        for warning in &live.model.warnings {
+            warn!(session = %live.id, warning);
+        }
+        let mut session = self.0.told(&live);
+        if let (Some(why), Some(journal)) = (not_kept, &mut session.journal) {
+            warn!(session = %live.id, why, "session created, but not kept");
+            journal.fault = why;
+        }
+        Ok(session)
+    }
 }
 
 #[tonic::async_trait]
@@ -48,7 +110,6 @@ impl SessionService for Sessions {
         &self,
         request: Request<pb::CreateSessionRequest>,
     ) -> Result<Response<pb::CreateSessionResponse>, Status> {
-        use pb::create_session_request::Source;
         if let Some(peer) = request.extensions().get::<Peer>()
             && let Err((refusal, wait)) = peer.creations.pass()
         {
@@ -59,50 +120,13 @@ impl SessionService for Sessions {
         }
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let most_s = self.0.config.idle_session_s;
-        let idle_timeout_s = request.idle_timeout_s.unwrap_or(most_s);
-        let range = format!("above 0 and at most {most_s}");
-        number("idle_timeout_s", idle_timeout_s, &range, |value| value > 0.0 && value <= most_s)?;
-        // A large tissue takes a while to read and to compile.
-        let pacer = self.0.pacer.clone();
-        let payer = account.clone();
-        let source = request.source;
-        let mesh = match &source {
-            Some(Source::Scene(pb::Scene { mesh: Some(mesh), .. })) => {
-                Some(self.0.meshes.get(&mesh.mesh_id, &account)?)
-            }
-            _ => None,
-        };
-        let (catalog, config, journals) = (self.0.catalog.clone(), self.0.config.clone(), self.0.journals.clone());
-        let create = move |cancel: &CancelFlag| {
-            let scene = match &source {
-                Some(Source::SceneName(name)) => catalog.load(name, &[], &config.limits)?,
-                Some(Source::Scene(scene)) => {
-                    let made = wire::scene::from_scene(scene, mesh.as_deref());
-                    made.map_err(|refusal| refusal.within("scene"))?
-                }
-                Some(Source::Journal(moment)) => {
-                    let journals = journals.as_ref().ok_or_else(|| no_journals("journal"))?;
-                    return journals.begin(moment, (request.paused, idle_timeout_s), &payer, &pacer, &config.limits);
-                }
-                None => {
-                    return Err(Refusal::new(Reason::Missing, "source", "scene_name, scene or journal is missing"));
-                }
-            };
-            pacer.create(&scene, request.paused, idle_timeout_s, &payer, cancel.flag())
-        };
-        let live = self.0.workshop.work(&account, create).await??;
-        info!(session = %live.id, scene = %live.model.scene.name, points = live.model.len(), "session created");
-        let not_kept = journals::until_durable(&live).await;
-        for warning in &live.model.warnings {
-            warn!(session = %live.id, warning);
+        if let Some(fleet) = &self.0.fleet
+            && let Some(created) = fleet.create_elsewhere(&request, &account).await
+        {
+            return created.map(|session| Response::new(pb::CreateSessionResponse { session: Some(session) }));
         }
-        let mut session = status::session(&live);
-        if let (Some(why), Some(journal)) = (not_kept, &mut session.journal) {
-            warn!(session = %live.id, why, "session created, but not kept");
-            journal.fault = why;
-        }
-        Ok(Response::new(pb::CreateSessionResponse { session: Some(session) }))
+        let session = Some(self.create_here(request, account).await?);
+        Ok(Response::new(pb::CreateSessionResponse { session }))
     }
 
     async fn upload_mesh(
@@ -114,7 +138,7 @@ impl SessionService for Sessions {
         let unit = if request.last { Some(meshes::unit(&request.unit)?) } else { None };
         let mut answer = self.0.meshes.add(&request, &account)?;
         let Some(unit) = unit else { return Ok(Response::new(answer)) };
-        let reading = self.0.meshes.read(&answer.mesh_id, &account)?;
+        let reading = self.0.meshes.read(&answer.mesh_id, &request.file_name, &account)?;
         let read = move |cancel: &CancelFlag| reading.finish(unit, request.repair, cancel.flag());
         let report = self.0.workshop.work(&account, read).await??;
         info!(
@@ -128,16 +152,30 @@ impl SessionService for Sessions {
         Ok(Response::new(answer))
     }
 
+    async fn upload_journal(
+        &self,
+        request: Request<pb::UploadJournalRequest>,
+    ) -> Result<Response<pb::UploadJournalResponse>, Status> {
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
+        let request = request.into_inner();
+        let mut answer = self.0.recorded.add(&request, &account)?;
+        if request.last {
+            let (recorded, payer, id) = (self.0.recorded.clone(), account.clone(), answer.upload_id.clone());
+            let read = move |cancel: &CancelFlag| recorded.read(&id, &payer, cancel.flag());
+            let told = self.0.workshop.work(&account, read).await??;
+            info!(caller = account.name(), bytes = answer.received_bytes, steps = told.end_step, "journal received");
+            answer.journal = Some(told);
+        }
+        Ok(Response::new(answer))
+    }
+
     async fn list_journals(
         &self,
         request: Request<pb::ListJournalsRequest>,
     ) -> Result<Response<pb::ListJournalsResponse>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
-        let Some(journals) = self.0.journals.clone() else {
-            return Ok(Response::new(pb::ListJournalsResponse::default()));
-        };
-        let pacer = self.0.pacer.clone();
-        Ok(Response::new(self.0.workshop.work(&account, move |_: &CancelFlag| journals.list(&pacer)).await??))
+        let (recorded, pacer) = (self.0.recorded.clone(), self.0.pacer.clone());
+        Ok(Response::new(self.0.workshop.work(&account, move |_: &CancelFlag| recorded.list(&pacer)).await??))
     }
 
     async fn get_journal(
@@ -145,9 +183,8 @@ impl SessionService for Sessions {
         request: Request<pb::GetJournalRequest>,
     ) -> Result<Response<pb::GetJournalResponse>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
-        let journals = self.0.journals.clone().ok_or_else(|| no_journals("session_id"))?;
-        let (pacer, request) = (self.0.pacer.clone(), request.into_inner());
-        let tell = move |_: &CancelFlag| journals.told(&request, &pacer);
+        let (recorded, pacer, request) = (self.0.recorded.clone(), self.0.pacer.clone(), request.into_inner());
+        let tell = move |_: &CancelFlag| recorded.told(&request, &pacer);
         Ok(Response::new(self.0.workshop.work(&account, tell).await??))
     }
 
@@ -156,7 +193,7 @@ impl SessionService for Sessions {
         request: Request<pb::SaveSnapshotRequest>,
     ) -> Result<Response<Self::SaveSnapshotStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
-        let live = self.0.pacer.get(&request.get_ref().session_id)?;
+        let live = self.0.session(&request.get_ref().session_id).await?;
         let bytes = 4 * live.model.state_bytes() + live.model.bytes();
         let taken = account.take(Resource::Memory(Purpose::Records), bytes, "session_id")?;
         let present = live.save().await?;
@@ -174,15 +211,15 @@ impl SessionService for Sessions {
         &self,
         request: Request<pb::GetSessionRequest>,
     ) -> Result<Response<pb::GetSessionResponse>, Status> {
-        let live = self.0.pacer.get(&request.get_ref().session_id)?;
-        Ok(Response::new(pb::GetSessionResponse { session: Some(status::session(&live)) }))
+        let live = self.0.session(&request.get_ref().session_id).await?;
+        Ok(Response::new(pb::GetSessionResponse { session: Some(self.0.told(&live)) }))
     }
 
     async fn list_sessions(
         &self,
         _: Request<pb::ListSessionsRequest>,
     ) -> Result<Response<pb::ListSessionsResponse>, Status> {
-        let without_scene = |live: &Arc<_>| pb::Session { scene: None, ..status::session(live) };
+        let without_scene = |live: &Arc<_>| pb::Session { scene: None, ..self.0.told(live) };
         let sessions = self.0.pacer.list().iter().map(without_scene).collect();
         Ok(Response::new(pb::ListSessionsResponse { sessions }))
     }
@@ -192,10 +229,13 @@ impl SessionService for Sessions {
         request: Request<pb::DeleteSessionRequest>,
     ) -> Result<Response<pb::DeleteSessionResponse>, Status> {
         let id = &request.get_ref().session_id;
-        let live = self.0.pacer.get(id)?;
+        let live = self.0.session(id).await?;
         self.0.pacer.delete(id)?;
         info!(session = %id, "session deleted");
         let journal_fault = journals::until_complete(&live).await.unwrap_or_default();
+        if let Some(fleet) = &self.0.fleet {
+            fleet.forget_the_deleted().await;
+        }
         Ok(Response::new(pb::DeleteSessionResponse { journal_fault }))
     }
 
@@ -204,7 +244,7 @@ impl SessionService for Sessions {
         request: Request<pb::StartSessionRequest>,
     ) -> Result<Response<pb::StartSessionResponse>, Status> {
         let request = request.into_inner();
-        let live = self.0.pacer.get(&request.session_id)?;
+        let live = self.0.session(&request.session_id).await?;
         let step = self.0.pacer.start_session(&live, request.until_step).await?;
         Ok(Response::new(pb::StartSessionResponse { step }))
     }
@@ -215,7 +255,7 @@ impl SessionService for Sessions {
     ) -> Result<Response<pb::UpdateTissueResponse>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let live = self.0.pacer.get(&request.session_id)?;
+        let live = self.0.session(&request.session_id).await?;
         let (change, to_change, pacer) = (wire::scene::from_change(&request), live.clone(), self.0.pacer.clone());
         let change =
             move |cancel: &CancelFlag| pacer.change_tissue(&to_change, &change, request.at_step, cancel.flag());
@@ -232,7 +272,7 @@ impl SessionService for Sessions {
         for warning in &model.warnings {
             warn!(session = %live.id, warning);
         }
-        let session = Some(status::with_model(status::session(&live), &model));
+        let session = Some(status::with_model(self.0.told(&live), &model));
         Ok(Response::new(pb::UpdateTissueResponse { step, session }))
     }
 
@@ -240,7 +280,7 @@ impl SessionService for Sessions {
         &self,
         request: Request<pb::PauseSessionRequest>,
     ) -> Result<Response<pb::PauseSessionResponse>, Status> {
-        self.0.pacer.get(&request.get_ref().session_id)?.pause().await?;
+        self.0.session(&request.get_ref().session_id).await?.pause().await?;
         Ok(Response::new(pb::PauseSessionResponse {}))
     }
 
@@ -250,7 +290,7 @@ impl SessionService for Sessions {
     ) -> Result<Response<pb::GetStateHashResponse>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let live = self.0.pacer.get(&request.session_id)?;
+        let live = self.0.session(&request.session_id).await?;
         // A request for the current hash waits for its caller's share. A request for a later step must reach that step.
         let wait_ns = account.must_wait_ns(Work::Reading, now_ns());
         if request.at_step.is_none() && wait_ns > 0 {
@@ -258,6 +298,14 @@ impl SessionService for Sessions {
         }
         let (step, hash) = live.hash_at(request.at_step, &account).await?;
         Ok(Response::new(pb::GetStateHashResponse { step, state_hash: format!("{hash:032x}") }))
+    }
+
+    async fn locate_session(
+        &self,
+        request: Request<pb::LocateSessionRequest>,
+    ) -> Result<Response<pb::LocateSessionResponse>, Status> {
+        let ownership = self.0.fleet()?.locate(&request.get_ref().session_id).await?;
+        Ok(Response::new(pb::LocateSessionResponse { ownership: Some(ownership) }))
     }
 
     async fn list_scripts(
@@ -268,7 +316,7 @@ impl SessionService for Sessions {
         let script_names = if session_id.is_empty() {
             self.0.catalog.script_names()
         } else {
-            let live = self.0.pacer.get(&session_id)?;
+            let live = self.0.session(&session_id).await?;
             self.0.catalog.script_names_for(&live.model.scene.name, &self.0.config.limits)
         };
         Ok(Response::new(pb::ListScriptsResponse { script_names }))
@@ -280,7 +328,7 @@ impl SessionService for Sessions {
     ) -> Result<Response<Self::GetScriptStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let live = self.0.pacer.get(&request.session_id)?;
+        let live = self.0.session(&request.session_id).await?;
         let guard = live.open_stream("GetScript", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
         let (catalog, config) = (self.0.catalog.clone(), self.0.config.clone());

@@ -84,6 +84,7 @@ fn journal(tape: &Tape) -> pb::Journal {
         lag_s: progress.lag_s,
         fault: progress.broken.map(|why| why.to_string()).unwrap_or_default(),
         run: progress.run,
+        mirrored_step: progress.mirrored_step,
     }
 }
 

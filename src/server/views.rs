@@ -72,7 +72,7 @@ impl ViewService for Views {
     async fn get_mesh(&self, request: Request<pb::GetMeshRequest>) -> Result<Response<Self::GetMeshStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let live = self.0.pacer.get(&request.session_id)?;
+        let live = self.0.session(&request.session_id).await?;
         let grid = Refinement::new(&live.model.scene, request.refinement, &self.0.config.limits)?;
         let guard = live.open_stream("GetMesh", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
@@ -90,7 +90,7 @@ impl ViewService for Views {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
         let guard =
-            self.0.pacer.get(&request.session_id)?.open_stream("GetTexture", StreamKind::ReadsOnly, &account)?;
+            self.0.session(&request.session_id).await?.open_stream("GetTexture", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
         let Texture { png, etag } = self.0.textures.texture(&request.session_id).await?;
         let png = if etag == request.known_etag { Bytes::new() } else { png };
@@ -112,7 +112,7 @@ impl ViewService for Views {
     ) -> Result<Response<Self::WatchFramesStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let live = self.0.pacer.get(&request.session_id)?;
+        let live = self.0.session(&request.session_id).await?;
         let grid = Refinement::new(&live.model.scene, request.refinement, &self.0.config.limits)?;
         let encoding = wire::sample::from_encoding(request.encoding)?;
         let most_hz = live.model.scene.stepping.rate_hz;

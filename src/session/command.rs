@@ -24,6 +24,22 @@ pub struct Command {
     pub arrival_ns: u64,
 }
 
+impl Command {
+    /// A command that takes effect at once, and until the next one.
+    pub fn new(tool: u32, sequence: Option<u64>, action: Action) -> Self {
+        Command {
+            tool,
+            sequence,
+            client_time_ns: 0,
+            by_datagram: false,
+            at_step: None,
+            time_to_live_s: None,
+            action,
+            arrival_ns: 0,
+        }
+    }
+}
+
 /// A command whose step has come.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Due {
@@ -35,4 +51,11 @@ pub struct Due {
     pub late_commands: u64,
     /// Not a client's command: it ends a lease and all actions of its holder with the tool.
     pub ends_lease: bool,
+}
+
+impl Due {
+    /// A client's command that came in time.
+    pub fn in_time(command: Command) -> Self {
+        Due { command, late: false, late_commands: 0, ends_lease: false }
+    }
 }

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use super::command::{Command, Due};
-use super::lease::{LeaseId, Leases, QueueKey, not_held};
+use super::lease::{HandedLease, LeaseId, Leases, QueueKey, not_held};
 use super::queue::{Discarded, Queue};
 use super::rules::{Rules, tip_radius_m};
 use super::schedule::Schedule;
@@ -150,17 +150,7 @@ impl Intake {
     fn end(&mut self, tool: u32) {
         self.leases.remove(tool);
         self.counts.dropped += self.queue.discard(tool) as u64;
-        let command = Command {
-            tool,
-            sequence: None,
-            client_time_ns: 0,
-            by_datagram: false,
-            at_step: None,
-            time_to_live_s: None,
-            action: Action::Release,
-            arrival_ns: 0,
-        };
-        self.enqueue(command, true);
+        self.enqueue(Command::new(tool, None, Action::Release), true);
     }
 
     /// Ends the leases that have expired at `now_ns`. In a resting session, time passes without computed steps, but
@@ -367,6 +357,16 @@ impl Intake {
         let tools = self.leases.chosen(chosen);
         tools.iter().for_each(|tool| self.end(*tool));
         tools.len()
+    }
+
+    /// Each held tool with its lease, for a server that goes on with the session.
+    pub fn handed(&self) -> Vec<HandedLease> {
+        self.leases.handed()
+    }
+
+    /// Goes on with the leases of another server.
+    pub fn adopt(&mut self, leases: Vec<HandedLease>, now_ns: u64) {
+        leases.into_iter().for_each(|lease| self.leases.adopt(lease, now_ns));
     }
 
     /// Charges the tools of a lease to who took them, one of `charges` each.

@@ -27,6 +27,21 @@ pub(super) struct LeasedTool {
     charge: Option<Taken>,
 }
 
+/// A tool that somebody holds, as a server hands it over with its session.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct HandedLease {
+    /// The tool's number.
+    pub tool: u32,
+    /// Its lease.
+    pub id: LeaseId,
+    /// Who holds it, for people.
+    pub holder: String,
+    /// The lease lapses after this time without a command or renewal, ns.
+    pub duration_ns: u64,
+    /// Name of the account that pays for it; empty if none does.
+    pub owner: String,
+}
+
 /// Key of a command in the queue: step, then order of arrival.
 pub(super) type QueueKey = (u64, u64);
 
@@ -163,6 +178,35 @@ impl Leases {
         let payer = |lease: &LeasedTool| lease.charge.as_ref().map(Taken::account).cloned();
         let is_chosen = |(tool, lease): &(&u32, &LeasedTool)| chosen(**tool, payer(lease).as_ref());
         self.held.iter().filter(is_chosen).map(|lease| *lease.0).collect()
+    }
+
+    /// Each held tool with its lease, for a server that goes on with the session.
+    pub(super) fn handed(&self) -> Vec<HandedLease> {
+        let of = |(tool, lease): (&u32, &LeasedTool)| HandedLease {
+            tool: *tool,
+            id: lease.id,
+            holder: lease.holder.clone(),
+            duration_ns: lease.duration_ns,
+            owner: lease.charge.as_ref().map(|charge| charge.account().name().to_owned()).unwrap_or_default(),
+        };
+        self.held.iter().map(of).collect()
+    }
+
+    /// Goes on with a lease of another server. Its commands are numbered anew.
+    pub(super) fn adopt(&mut self, lease: HandedLease, now_ns: u64) {
+        let HandedLease { tool, id, holder, duration_ns, .. } = lease;
+        let leased = LeasedTool {
+            id,
+            holder,
+            duration_ns,
+            expires_ns: now_ns.saturating_add(duration_ns),
+            last_sequence: None,
+            tip_radius_m: None,
+            last_key: None,
+            batch_since: None,
+            charge: None,
+        };
+        self.held.insert(tool, leased);
     }
 
     /// Charges the tools of a lease to who took them, one of `charges` each.

@@ -615,17 +615,8 @@ mod tests {
         let spacing_m = model.scene.sheet().unwrap().spacing_m;
         let place_m = DVec3::new(9.3 * spacing_m, 11.2 * spacing_m, -0.1 * spacing_m);
         let tip = Tip { radius_m: spacing_m, ..Tip::default() };
-        let pose = Command {
-            tool: 0,
-            sequence: Some(1),
-            client_time_ns: 0,
-            by_datagram: false,
-            at_step: None,
-            time_to_live_s: None,
-            action: Action::Pose { place_m, velocity_m_per_s: None, tip },
-            arrival_ns: 0,
-        };
-        let mut due = vec![Due { command: pose, late: false, late_commands: 0, ends_lease: false }];
+        let pose = Action::Pose { place_m, velocity_m_per_s: None, tip };
+        let mut due = vec![Due::in_time(Command::new(0, Some(1), pose))];
         for _ in 0..100 {
             session.advance(&mut due, |_| {});
         }

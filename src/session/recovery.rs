@@ -165,18 +165,7 @@ mod tests {
 
     fn grasp(tool: u32, sequence: u64) -> Due {
         let action = Action::Grasp { point: PointId::new(12), displacement_m: glam::DVec3::Z * 1e-3 };
-        let (at_step, time_to_live_s) = (None, None);
-        let command = Command {
-            tool,
-            sequence: Some(sequence),
-            client_time_ns: 0,
-            by_datagram: false,
-            at_step,
-            time_to_live_s,
-            action,
-            arrival_ns: 0,
-        };
-        Due { command, late: false, late_commands: 0, ends_lease: false }
+        Due::in_time(Command::new(tool, Some(sequence), action))
     }
 
     #[test]

@@ -46,18 +46,10 @@ pub fn header(model: &Model, script: &str) -> Run {
 
 /// The command of a script's action, as a client streams it.
 pub fn command(tool: usize, step: u64, action: Action) -> Command {
-    Command {
-        #[allow(clippy::cast_possible_truncation)]
-        tool: tool as u32,
-        // At most one command per step, so steps serve as sequence numbers.
-        sequence: Some(step + 1),
-        client_time_ns: 0,
-        by_datagram: false,
-        at_step: Some(step),
-        time_to_live_s: None,
-        action,
-        arrival_ns: 0,
-    }
+    #[allow(clippy::cast_possible_truncation)]
+    let tool = tool as u32;
+    // At most one command per step, so steps serve as sequence numbers.
+    Command { at_step: Some(step), ..Command::new(tool, Some(step + 1), action) }
 }
 
 /// Sets the forces and moves of a script in a session that has not begun, as continuous profiles.
@@ -122,6 +114,18 @@ pub fn change(session: &mut Session, changes: &mut VecDeque<(u64, Arc<Model>)>) 
     }
 }
 
+/// What a run tells on its way.
+pub enum Told<'t> {
+    /// It begins.
+    Run(&'t Run),
+    /// A record.
+    Record(Record),
+    /// So many steps are done: told after each.
+    Steps(u64),
+    /// It is over.
+    Summary(&'t Summary),
+}
+
 /// Plays `script` and writes its records, as JSON Lines, to `output`. `clock_s` returns the time, for the summary;
 /// `progress` gets the number of steps done from time to time.
 ///
@@ -136,7 +140,7 @@ pub fn run(
     clock_s: &dyn Fn() -> f64,
     progress: &mut dyn FnMut(u64),
 ) -> std::result::Result<Summary, Failure> {
-    Playing { model, script, held, limits, twin: None, corrections: Vec::new() }.play(output, clock_s, progress)
+    self::told(model, script, [held, false], limits, clock_s, &mut |told| write(output, progress, told))
 }
 
 /// The same, with a twin in f64 with a quarter of the substep beside it: the summary has the differences. With
@@ -153,8 +157,39 @@ pub fn audited(
     clock_s: &dyn Fn() -> f64,
     progress: &mut dyn FnMut(u64),
 ) -> std::result::Result<Summary, Failure> {
-    let twin = Some(Twin::new(model));
-    Playing { model, script, held, limits, twin, corrections: Vec::new() }.play(output, clock_s, progress)
+    self::told(model, script, [held, true], limits, clock_s, &mut |told| write(output, progress, told))
+}
+
+/// The same for a program that takes the records as they are. `tell` ends the run by an error.
+///
+/// # Errors
+/// As for [`run`]; an error of `tell` is one of the output.
+pub fn told(
+    model: &Arc<Model>,
+    script: &Script,
+    [held, audit]: [bool; 2],
+    limits: &Limits,
+    clock_s: &dyn Fn() -> f64,
+    tell: &mut dyn FnMut(Told<'_>) -> std::io::Result<()>,
+) -> std::result::Result<Summary, Failure> {
+    let twin = audit.then(|| Twin::new(model));
+    Playing { model, script, held, limits, twin, corrections: Vec::new() }.play(clock_s, tell)
+}
+
+/// Writes what a run tells, as JSON Lines.
+fn write(output: &mut dyn Write, progress: &mut dyn FnMut(u64), told: Told<'_>) -> std::io::Result<()> {
+    match told {
+        Told::Run(run) => write_line(output, &Line::Run(run)),
+        Told::Record(record) => write_line(output, &record),
+        Told::Summary(summary) => write_line(output, &Line::Summary(summary)),
+        Told::Steps(steps) => {
+            // The first of so many.
+            if steps % 1024 == 1 {
+                progress(steps - 1);
+            }
+            Ok(())
+        }
+    }
 }
 
 /// A script being played.
@@ -170,9 +205,8 @@ struct Playing<'p> {
 impl Playing<'_> {
     fn play(
         mut self,
-        output: &mut dyn Write,
         clock_s: &dyn Fn() -> f64,
-        progress: &mut dyn FnMut(u64),
+        tell: &mut dyn FnMut(Told<'_>) -> std::io::Result<()>,
     ) -> std::result::Result<Summary, Failure> {
         let Playing { model, script, held, limits, .. } = self;
         let mut session = Session::new(model);
@@ -180,7 +214,7 @@ impl Playing<'_> {
         let mut player = Player::new(model, script, held, limits)?;
         player.begin(&mut session);
         self.twin.iter_mut().for_each(|twin| player.begin(twin.session()));
-        write_line(output, &Line::Run(&header(model, &script.name)))?;
+        tell(Told::Run(&header(model, &script.name)))?;
         let mut due = Vec::new();
         let mut written: std::io::Result<()> = Ok(());
         let mut windows = (self.twin.is_some() && model.scene.stepping.correct).then(Windows::default);
@@ -220,7 +254,7 @@ impl Playing<'_> {
                             curves.add(record.time_s, displacement_m[2], force_n[2]);
                         }
                         self.twin.iter_mut().for_each(|twin| twin.compare(&record));
-                        written = write_line(output, &record);
+                        written = tell(Told::Record(record));
                     }
                     resumed_s = clock_s();
                 }
@@ -231,9 +265,7 @@ impl Playing<'_> {
             if let Some(reason) = ended {
                 return Err(Failure::Held(reason));
             }
-            if step.is_multiple_of(1024) {
-                progress(step);
-            }
+            tell(Told::Steps(step + 1))?;
         }
         stepping_s += clock_s() - resumed_s;
         let audited_error = self.twin.as_ref().map(Twin::error);
@@ -249,7 +281,7 @@ impl Playing<'_> {
             curves,
             ..summary(session.tissue(), stepping_s)
         };
-        write_line(output, &Line::Summary(&summary))?;
+        tell(Told::Summary(&summary))?;
         Ok(summary)
     }
 

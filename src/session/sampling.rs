@@ -302,19 +302,8 @@ mod tests {
     }
 
     fn tell(session: &mut Session, sequence: u64, action: Action) {
-        let (at_step, time_to_live_s) = (None, None);
-        let (sequence, client_time_ns, arrival_ns) = (Some(sequence), 0, 1);
-        let command = Command {
-            tool: 0,
-            sequence,
-            client_time_ns,
-            by_datagram: false,
-            at_step,
-            time_to_live_s,
-            action,
-            arrival_ns,
-        };
-        session.advance(&mut vec![Due { command, late: false, late_commands: 0, ends_lease: false }], |_| {});
+        let command = Command { arrival_ns: 1, ..Command::new(0, Some(sequence), action) };
+        session.advance(&mut vec![Due::in_time(command)], |_| {});
     }
 
     fn grasp(session: &mut Session, sequence: u64, z_m: f64) {

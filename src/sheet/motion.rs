@@ -476,6 +476,16 @@ impl<T: Real> Tissue for Sheet<T> {
         }
     }
 
+    fn whole_displacements_m(&self, into: &mut Vec<f64>) {
+        let layout = self.tables.layout;
+        let of = |point| {
+            let at = layout.offset(self.model.place_of(point));
+            std::array::from_fn::<_, 3, _>(|c| self.state.u[c * layout.plane + at].wide() * self.model.unit_m)
+        };
+        into.clear();
+        into.extend(self.model.points().flat_map(of));
+    }
+
     fn shown_displacements_m(&self, into: &mut [Vec<f32>; 3]) {
         let Layout { rows, columns, stride, plane } = self.tables.layout;
         let spacing = T::of(self.model.unit_m);

@@ -300,7 +300,7 @@ impl<T: Real> SleepTiles<T> {
         Ok(())
     }
 
-    /// Restores what sleeping tiles remember. Returns how many values that were.
+    /// Restores what sleeping tiles remember.
     pub(super) fn remember_again(&mut self, values: &mut impl Iterator<Item = T>) -> Result<()> {
         let places: Vec<Range<usize>> = self.places_remembered().collect();
         if places.iter().any(|place| !place.is_empty()) {

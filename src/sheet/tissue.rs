@@ -140,7 +140,9 @@ pub trait Tissue: Send {
     fn largest_displacement_m(&self) -> f64;
     /// Writes the displacements, m, with x, y and z in separate vectors, in the order of the points.
     fn displacements_m(&self, into: &mut [Vec<f32>; 3]);
-    /// The same in the order in which frames show them ([`Model::shown_order`]), with zeros where a frame of a mesh has
+    /// The same in full, x, y and z of each point after the other.
+    fn whole_displacements_m(&self, into: &mut Vec<f64>);
+    /// Displacements in the order in which frames show them ([`Model::shown_order`]), with x, y and z in separate vectors and zeros where a frame of a mesh has
     /// places without a vertex.
     fn shown_displacements_m(&self, into: &mut [Vec<f32>; 3]);
     /// Blocks of at most 16 points, in the order in which they are hashed.

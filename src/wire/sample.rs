@@ -64,6 +64,7 @@ pub fn sample(paced: &PacedSample, shape: &dyn RestShape, dropped: u64, now_ns: 
         dropped_samples: dropped,
         recovery_count: sample.recoveries,
         durable_step: paced.durable_step,
+        ownership_revision: paced.ownership_revision,
         tools: sample.tools.iter().map(|tool| tool_sample(tool, shape, paced.due_ns, now_ns)).collect(),
     }
 }

@@ -74,12 +74,17 @@ pub struct Server {
 
 impl Server {
     pub fn start(arguments: &[&str]) -> Self {
+        Server::start_at("127.0.0.1:0", arguments)
+    }
+
+    /// The same, at that address.
+    pub fn start_at(listen: &str, arguments: &[&str]) -> Self {
         let child = Command::new(env!("CARGO_BIN_EXE_palpate"))
-            .args(["serve", "--listen", "127.0.0.1:0"])
+            .args(["serve", "--listen", listen])
             .args(arguments)
             .current_dir(env!("CARGO_MANIFEST_DIR"))
             .stdout(Stdio::piped())
-            .stderr(Stdio::piped())
+            .stderr(if std::env::var_os("PALPATE_SHOW_LOGS").is_some() { Stdio::inherit() } else { Stdio::piped() })
             .spawn()
             .unwrap();
         Server::of(child)

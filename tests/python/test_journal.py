@@ -10,9 +10,8 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
 
-from server import ROOT
+from server import PROGRAM, ROOT
 
-PROGRAM = ROOT / "target/release/palpate"
 GOLDEN = ROOT / "tests/journal/golden.1.mcap"
 MESSAGES = {
     "/header": "Header",

@@ -78,6 +78,8 @@ pub struct Server {
     url: String,
     endpoint: Endpoint,
     bearer: Bearer,
+    /// For other servers of its fleet.
+    credentials: Credentials,
     /// Time limit for the connection and the first answer.
     patience: Duration,
     is_secure: bool,
@@ -136,7 +138,41 @@ impl Server {
             return Err(refuse(why));
         }
         let bearer = Bearer(credentials.token.clone());
-        Ok(Server { url: url_text, endpoint, bearer, patience: PATIENCE, is_secure: secure, host: (host, port) })
+        Ok(Server {
+            url: url_text.trim_end_matches('/').to_owned(),
+            endpoint,
+            bearer,
+            credentials: credentials.clone(),
+            patience: PATIENCE,
+            is_secure: secure,
+            host: (host, port),
+        })
+    }
+
+    /// Another server of its fleet, with the same credentials and time limit.
+    ///
+    /// # Errors
+    /// Returns an error as [`Server::new`] does; and if this server is reached by TLS, but the other is not to be.
+    pub fn at(&self, url: &str) -> Result<Self, Error> {
+        if url.trim_end_matches('/') == self.url {
+            return Ok(self.clone());
+        }
+        let other = Server::new(url, &self.credentials)?;
+        if self.is_secure && !other.is_secure {
+            let why = "has no TLS, but the server that names it has; the fleet's servers must advertise https://";
+            return Err(Error::Argument(format!("{url}: {why}")));
+        }
+        Ok(other.within(self.patience))
+    }
+
+    /// Its URL.
+    pub fn url(&self) -> &str {
+        &self.url
+    }
+
+    /// The time limit for connecting.
+    pub(crate) fn patience(&self) -> Duration {
+        self.patience
     }
 
     /// Its host, as in the URL, without brackets.
@@ -268,4 +304,27 @@ fn tls(credentials: &Credentials) -> ClientTlsConfig {
         tls = tls.identity(Identity::from_pem(cert, key));
     }
     tls
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn another_server_is_called_with_the_same_credentials_but_never_in_the_clear() {
+        let token = Some(Token::new("secret").unwrap());
+        let trusted = Credentials { token, ..Credentials::default() };
+        let here = Server::new("http://127.0.0.1:7117/", &trusted).unwrap().within(Duration::from_secs(3));
+        let there = here.at("http://localhost:7118").unwrap();
+        assert_eq!((there.url(), there.patience()), ("http://localhost:7118", Duration::from_secs(3)));
+        assert!(there.bearer.0.is_some());
+        assert!(here.at("https://far.example:7117").is_ok());
+        assert!(here.at("http://far.example:7117").unwrap_err().to_string().contains("in the clear"));
+        // Nobody who is called by TLS sends a client to where there is none.
+        for credentials in [trusted, Credentials::default()] {
+            let secure = Server::new("https://far.example:7117", &credentials).unwrap();
+            assert!(secure.at("http://127.0.0.1:7117").unwrap_err().is_refusal());
+            assert_eq!(secure.at("https://far.example:7117/").unwrap().url(), "https://far.example:7117");
+        }
+    }
 }

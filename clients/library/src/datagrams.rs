@@ -63,7 +63,8 @@ pub struct Datagrams {
     /// Of each tool the newest poses, newest first: what was lost goes out again with the next.
     recent: BTreeMap<u32, VecDeque<Posed>>,
     wanted_s: f64,
-    newest_step: Option<u64>,
+    /// Revision of the session's owner, and step.
+    newest: Option<(u64, u64)>,
 }
 
 impl Datagrams {
@@ -82,7 +83,7 @@ impl Datagrams {
             life,
             recent: BTreeMap::new(),
             wanted_s: HEARTBEAT_S,
-            newest_step: None,
+            newest: None,
         };
         if let Some(offer) = offer {
             datagrams.take_offer(offer);
@@ -200,9 +201,11 @@ impl Datagrams {
 
     /// Whether a sample is newer than all that came by here and that were shown to this before: by whichever way they come.
     pub fn is_newer(&mut self, sample: &pb::Sample) -> bool {
-        let is_newer = self.newest_step.is_none_or(|newest| sample.step >= newest);
+        // Whoever took a session over may continue it at an earlier step; who had it before has no say.
+        let this = (sample.ownership_revision, sample.step);
+        let is_newer = self.newest.is_none_or(|newest| this >= newest);
         if is_newer {
-            self.newest_step = Some(sample.step);
+            self.newest = Some(this);
         }
         is_newer
     }

@@ -3,18 +3,13 @@
 //! Implement [`HapticDevice`] with your manufacturer's library and pass it to [`crate::bridge::run`], which calls it at 1 kHz
 //! on a thread of its own. Positions are in metres and forces in newtons, in the device's frame: its origin is the middle of
 //! the device's workspace, x points right, y away from the operator, and z up. The bridge places the origin on the middle of
-//! the sheet, whose z points out of the tissue. Forces act on the hand. Convert the library's units (OpenHaptics uses mm, and
-//! degrees for joints) and axes in your adapter:
-//!
-//! - OpenHaptics: `read` is `hdBeginFrame`, `hdGetDoublev(HD_CURRENT_POSITION)`·1e-3, `HD_CURRENT_BUTTONS`; `write` is
-//!   `hdSetDoublev(HD_CURRENT_FORCE)`, `hdEndFrame`; `descriptor` is `HD_NOMINAL_MAX_FORCE`, `HD_NOMINAL_MAX_STIFFNESS`.
-//! - Force Dimension: `read` is `dhdGetPosition`, `dhdGetButton`; `write` is `dhdSetForce`. Do not call
-//!   `dhdEnableExpertMode`.
-//! - Haply Inverse3: `read` is the newest `cursor_position` of its stream; `write` is `set_cursor_force`. Its z axis points
-//!   up, like ours.
+//! the sheet, whose z points out of the tissue. Forces act on the hand. Convert the library's units and axes in your adapter.
+//! [`crate::devices`] has adapters for the devices of some makers, and lays a workspace over the tissue elsewhere.
 
 use glam::DVec3;
 use palpate_touch::Device;
+
+use crate::bridge::Tick;
 
 /// What a device reports at a tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -88,4 +83,40 @@ pub trait HapticDevice: Send {
     /// # Errors
     /// Returns an error if the force can't be set.
     fn write(&mut self, force_n: DVec3) -> std::io::Result<()>;
+    /// The buttons that were pressed at the newest reading, as bits. By default none is told of.
+    fn buttons(&self) -> u32 {
+        0
+    }
+    /// How many buttons [`HapticDevice::buttons`] may tell of.
+    fn button_count(&self) -> u32 {
+        0
+    }
+    /// Is told of each tick after `write`; for displays. It must not wait.
+    fn ticked(&mut self, _tick: &Tick) {}
+}
+
+impl HapticDevice for Box<dyn HapticDevice> {
+    fn descriptor(&self) -> Device {
+        (**self).descriptor()
+    }
+
+    fn read(&mut self) -> std::io::Result<Reading> {
+        (**self).read()
+    }
+
+    fn write(&mut self, force_n: DVec3) -> std::io::Result<()> {
+        (**self).write(force_n)
+    }
+
+    fn buttons(&self) -> u32 {
+        (**self).buttons()
+    }
+
+    fn button_count(&self) -> u32 {
+        (**self).button_count()
+    }
+
+    fn ticked(&mut self, tick: &Tick) {
+        (**self).ticked(tick);
+    }
 }

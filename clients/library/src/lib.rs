@@ -1,9 +1,13 @@
 //! Clients of a Palpate server.
 //!
 //! - [`connect`]: connections, plain or TLS, with the caller's credentials, deadlines, and errors in words.
+//! - [`fleet`]: which server of a fleet has a session, and calls that go there.
 //! - [`touch`]: the haptic stream, for programs that send commands and render forces themselves.
 //! - [`datagrams`]: the datagrams of such a stream, which no lost packet holds up.
 //! - [`device`] and [`bridge`]: the trait of haptic devices, and the loop that connects one to a server at 1 kHz.
+//! - [`devices`]: devices of makers, loaded at run time, and where their workspace is laid over the tissue.
+//! - [`shown`]: the surface of a session as an engine shows it: positions, normals, triangles.
+//! - [`os`]: what is of the operating system.
 //! - [`watch`]: the samples of a session, without a tool.
 //! - [`view`]: the frames of a session: how its surface moves.
 //!
@@ -43,6 +47,12 @@ pub mod bridge;
 pub mod connect;
 pub mod datagrams;
 pub mod device;
+pub mod devices;
+mod exchange;
+pub mod fleet;
+pub mod os;
+pub mod shown;
+mod sync;
 pub mod touch;
 pub mod upload;
 pub mod view;
@@ -73,6 +83,12 @@ pub enum Error {
 }
 
 impl Error {
+    /// Whether the server does not let the caller in.
+    pub(crate) fn is_denied(&self) -> bool {
+        use tonic::Code::{PermissionDenied, Unauthenticated};
+        matches!(self, Error::Call(status) if [Unauthenticated, PermissionDenied].contains(&status.code()))
+    }
+
     /// Whether an input was refused, by this library or by the server: the same call would be refused again.
     pub fn is_refusal(&self) -> bool {
         match self {

@@ -1,4 +1,4 @@
-//! Sends a mesh of your own to the server, in parts, for sessions on it.
+//! Sends a mesh or a journal of your own to the server, in parts, for sessions that it makes from them.
 
 use palpate_proto::pb;
 use pb::session_service_client::SessionServiceClient;
@@ -8,6 +8,15 @@ use crate::connect::Channel;
 
 /// Bytes of a part: other calls of the connection wait for one part at most.
 const PART_BYTES: usize = 256 << 10;
+
+/// The parts of a file: where each begins, its bytes, and whether it is the last. An empty file has one.
+fn parts(file: &[u8]) -> impl Iterator<Item = (u64, Vec<u8>, bool)> {
+    let count = file.len().div_ceil(PART_BYTES).max(1);
+    (0..count).map(move |number| {
+        let rest = &file[number * PART_BYTES..];
+        ((number * PART_BYTES) as u64, rest[..rest.len().min(PART_BYTES)].to_vec(), number + 1 == count)
+    })
+}
 
 /// Sends the file of a mesh; `unit` is what a length of 1 in it is: "m", "cm", "mm" or so many metres. The answer has the
 /// `mesh_id` for `Scene.mesh`, and a report that tells whether the mesh can be used.
@@ -23,23 +32,30 @@ pub async fn upload_mesh(
 ) -> Result<pb::UploadMeshResponse, Status> {
     let mut sessions = SessionServiceClient::new(channel);
     let mut answer = pb::UploadMeshResponse::default();
-    let mut rest = file;
-    loop {
-        let offset = (file.len() - rest.len()) as u64;
-        let (part, after) = rest.split_at(rest.len().min(PART_BYTES));
-        rest = after;
-        let request = pb::UploadMeshRequest {
-            mesh_id: answer.mesh_id,
-            file_name: file_name.to_owned(),
-            offset,
-            part: part.to_vec(),
-            last: rest.is_empty(),
-            unit: unit.to_owned(),
-            repair,
-        };
+    for (offset, part, last) in parts(file) {
+        let (mesh_id, file_name, unit) = (answer.mesh_id, file_name.to_owned(), unit.to_owned());
+        let request = pb::UploadMeshRequest { mesh_id, file_name, offset, part, last, unit, repair };
         answer = sessions.upload_mesh(request).await?.into_inner();
-        if rest.is_empty() {
-            return Ok(answer);
-        }
     }
+    Ok(answer)
+}
+
+/// Sends a journal or a snapshot (MCAP). The answer has the `upload_id` for `JournalMoment`, and what is in the journal. `sent`
+/// gets the bytes that have arrived after each part.
+///
+/// # Errors
+/// Returns the server's refusal, or how the connection broke.
+pub async fn upload_journal(
+    channel: Channel,
+    file: &[u8],
+    mut sent: impl FnMut(u64),
+) -> Result<pb::UploadJournalResponse, Status> {
+    let mut sessions = SessionServiceClient::new(channel);
+    let mut answer = pb::UploadJournalResponse::default();
+    for (offset, part, last) in parts(file) {
+        let request = pb::UploadJournalRequest { upload_id: answer.upload_id, offset, part, last };
+        answer = sessions.upload_journal(request).await?.into_inner();
+        sent(answer.received_bytes);
+    }
+    Ok(answer)
 }

@@ -24,7 +24,7 @@ pub struct Surface {
 }
 
 /// The largest number of vertices that a viewer keeps: 200 MB.
-const MOST_VERTICES: usize = 1 << 24;
+pub(crate) const MOST_VERTICES: usize = 1 << 24;
 
 impl Frames {
     /// Begins to watch. With `max_frames_in_flight`, acknowledge frames by `ViewServiceClient::acknowledge_frames`.

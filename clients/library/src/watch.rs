@@ -8,7 +8,11 @@ use crate::connect::Channel;
 
 /// The samples of a session. The stream ends when this is dropped.
 #[derive(Debug)]
-pub struct Samples(Streaming<pb::WatchSamplesResponse>);
+pub struct Samples {
+    samples: Streaming<pb::WatchSamplesResponse>,
+    /// The largest revision of an owner of the session that was seen.
+    revision: u64,
+}
 
 impl Samples {
     /// Begins to watch.
@@ -16,17 +20,20 @@ impl Samples {
     /// # Errors
     /// Returns the server's refusal, or how the connection broke.
     pub async fn open(channel: Channel, request: pb::WatchSamplesRequest) -> Result<Self, Status> {
-        Ok(Samples(HapticServiceClient::new(channel).watch_samples(request).await?.into_inner()))
+        let samples = HapticServiceClient::new(channel).watch_samples(request).await?.into_inner();
+        Ok(Samples { samples, revision: 0 })
     }
 
-    /// The next sample; `None` after the last. A sample is not lost if you drop the future.
+    /// The next sample; `None` after the last. Samples of who does not serve the session any more are left out. A sample is not lost if you drop the future.
     ///
     /// # Errors
     /// Returns why the server ended the stream, or how the connection broke.
     pub async fn next(&mut self) -> Result<Option<pb::Sample>, Status> {
-        while let Some(response) = self.0.message().await? {
-            if response.sample.is_some() {
-                return Ok(response.sample);
+        while let Some(response) = self.samples.message().await? {
+            let Some(sample) = response.sample else { continue };
+            if sample.ownership_revision >= self.revision {
+                self.revision = sample.ownership_revision;
+                return Ok(Some(sample));
             }
         }
         Ok(None)

@@ -1,6 +1,6 @@
 //! `palpate-client admin`: shows what callers use of a server, and frees it.
 
-use palpate_client::{Channel, describe};
+use palpate_client::{Channel, fleet};
 use palpate_proto::pb;
 use pb::admin_service_client::AdminServiceClient;
 use pb::session_service_client::SessionServiceClient;
@@ -65,9 +65,12 @@ enum Act {
 
 /// Performs the action and prints the result.
 pub(crate) async fn admin(arguments: &Arguments) -> Result<(), Failure> {
-    let channel = arguments.credentials.server(&arguments.server)?.connect().await?;
-    let text = act(&arguments.act, channel).await.map_err(|status| Failure::Failed(describe(&status)))?;
-    crate::tell!("{text}");
+    let server = arguments.credentials.server(&arguments.server)?;
+    let channel = server.connect().await?;
+    // Another server of the fleet may have the session.
+    let done = fleet::follow_from(&server, channel, |channel| act(&arguments.act, channel)).await;
+    let done = done.map_err(|error| Failure::Failed(error.to_string()))?;
+    crate::tell!("{}", done.answer);
     Ok(())
 }
 

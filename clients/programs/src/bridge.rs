@@ -1,13 +1,16 @@
-//! `palpate-client bridge`: connects a haptic device to a server at 1 kHz; so far a simulated one.
+//! `palpate-client bridge`: connects a haptic device, simulated or real, to a server at 1 kHz.
 
 use std::time::Duration;
 
 use glam::DVec3;
+use palpate_client::HapticDevice;
 use palpate_client::bridge::{Options, Report, Session, Target, Tick, Traffic, run};
+use palpate_client::devices::{self, Kind, Placed};
 use palpate_touch::{LimitCause, RenderingState, Tip};
 use serde_json::json;
 
 use crate::credentials::CredentialOptions;
+use crate::placement::PlacementOptions;
 use crate::simulated::random::Random;
 use crate::simulated::task::{LEAD_S, Task};
 use crate::simulated::{Simulated, device_named, hand_named};
@@ -28,10 +31,16 @@ pub(crate) struct Arguments {
     /// The tool's number
     #[arg(long, default_value_t = 0)]
     tool: u32,
-    /// The simulated device: touch, omni, desktop, falcon, omega3, delta3, sigma7, lambda7, inverse3 or undeclared
-    #[arg(long, default_value = "omega3")]
+    /// The device: force-dimension, openhaptics, haply, spacemouse or gamepad (`palpate-client devices` tells which are there);
+    /// or a simulated one: touch, omni, desktop, falcon, omega3, delta3, sigma7, lambda7, inverse3 or undeclared
+    #[arg(long, value_name = "NAME", default_value = "omega3")]
     device: String,
-    /// The simulated hand that holds the device: light, medium, firm or none
+    /// The library of the device's maker, if it is not where the system looks for libraries
+    #[arg(long, value_name = "FILE")]
+    library: Option<std::path::PathBuf>,
+    #[command(flatten)]
+    placement: PlacementOptions,
+    /// The simulated hand that holds a simulated device: light, medium, firm or none
     #[arg(long, default_value = "medium")]
     hand: String,
     /// Receive a sample only when the rendered force would be off by more than this fraction; 0: one per step
@@ -65,15 +74,28 @@ pub(crate) struct Arguments {
 /// Scale of the depths of the simulated hand's presses.
 const SCALE: f64 = 0.2;
 
-/// Runs a simulated device and prints the results.
-///
-/// # Errors
-/// Returns an error if an argument is refused, no connection succeeds or none stands at the end, or the course can't be
-/// written.
-pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
-    let (hand, device) = (hand_named(&arguments.hand)?, device_named(&arguments.device)?);
+/// Opens a real device, or makes a simulated one.
+fn device(arguments: &Arguments) -> Result<Box<dyn HapticDevice>, Failure> {
+    if Kind::of(&arguments.device).is_some() {
+        return Ok(devices::open(&arguments.device, arguments.library.as_deref())?);
+    }
+    let hand = hand_named(&arguments.hand)?;
+    let device = device_named(&arguments.device).map_err(|refusal| {
+        let real: Vec<&str> = Kind::ALL.iter().map(|kind| kind.1).collect();
+        Failure::Refused(format!("{refusal}; or a real device: {}", real.join(", ")))
+    })?;
     let seconds = arguments.seconds.unwrap_or(3600.0);
     let task = Task::new(DVec3::ZERO, LEAD_S, seconds, SCALE, &mut Random::new(arguments.seed, 0));
+    Ok(Box::new(Simulated::new(device, hand, task, false)))
+}
+
+/// Runs a device and prints the results.
+///
+/// # Errors
+/// Returns an error if an argument is refused, the device is missing or fails, no connection succeeds or none stands at the end, or the course can't be
+/// written.
+pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
+    let placement = arguments.placement.placement()?;
     let target = Target {
         server: arguments.credentials.server(&arguments.server)?,
         session: match &arguments.session {
@@ -89,9 +111,11 @@ pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
     };
     let lasts = arguments.seconds.map(Duration::try_from_secs_f64).transpose();
     let lasts = lasts.map_err(|error| Failure::Refused(format!("--seconds: {error}")))?;
+    // Last, so that what is refused is refused before a device moves.
+    let device = Placed::new(device(arguments)?, placement)?;
     let (remembers, keeps_session) = (arguments.course.is_some(), arguments.keep_session);
-    let options = Options { lasts, remembers, keeps_session, warn: Some(Box::new(warn)) };
-    let (_, served) = run(Simulated::new(device, hand, task, false), target, options, interrupted()).await?;
+    let options = Options { lasts, remembers, keeps_session, warn: Some(Box::new(warn)), ..Options::default() };
+    let (_, served) = run(device, target, options, interrupted()).await?;
     if let Some(path) = &arguments.course {
         write_course(path, &served.course)?;
     }

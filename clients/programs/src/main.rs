@@ -22,10 +22,14 @@ pub(crate) use {say, tell};
 
 mod admin;
 mod bridge;
+mod cluster;
 mod credentials;
+mod devices;
 mod health;
 mod link;
 mod load;
+mod placement;
+mod play;
 mod proxy;
 mod replay;
 mod scene_file;
@@ -57,6 +61,15 @@ enum Command {
         final hash equals that of `palpate run --held`, whatever the network did, unless late commands are reported.\n\n\
         Exit status: 0; 1 when the replay failed; 2 when an input was refused.")]
     Replay(replay::Arguments),
+    /// Send a journal or a snapshot to a server, and play it there for others to see, or go on live from one of its moments
+    #[command(after_help = "Examples:\n  \
+        palpate-client play 3f0c….1.mcap --speed 2\n  \
+        palpate-client play training.mcap --live --from 12000\n\n\
+        Viewers see the session as any other (its id is told at the beginning). Nobody can hold a tool of a session that \
+        plays; a live one is there for everybody, and stays. `palpate journal replay` without a server writes records \
+        instead.\n\n\
+        Exit status: 0; 1 when the connection broke or the session was held; 2 when an input was refused.")]
+    Play(play::Arguments),
     /// Simulate hand, device, network and tissue in one loop in virtual time; report how accurate and safe the touch is
     #[command(after_help = "Examples:\n  \
         palpate-client link --scene fibrotic --hand medium --device omega3 --rtt-ms 50\n  \
@@ -71,15 +84,28 @@ enum Command {
         task's amplitude. The loop runs the code of the server and of `bridge` itself.\n\n\
         Exit status: 0; 1 when a run failed; 2 when an input was refused, or the system has no memory for the sheet.")]
     Link(Box<link::Arguments>),
-    /// Connect a haptic device to a server at 1 kHz; so far a simulated device in a simulated hand
+    /// Connect a haptic device to a server at 1 kHz: one of your own, or a simulated one in a simulated hand
     #[command(after_help = "Examples:\n  \
         palpate-client bridge --server http://127.0.0.1:7117 --scene liver --seconds 10\n  \
-        palpate-client bridge --scene fibrotic --device touch --deadband 0.1\n\n\
-        It reconnects by itself when the connection breaks; forces return when the operator asks for them. It deletes the \
-        session that it made when it ends. For a real device, implement `HapticDevice` of the crate palpate-client \
-        (clients/library).\n\n\
-        Exit status: 0; 1 when no connection succeeded or none stood at the end; 2 when an input was refused.")]
-    Bridge(bridge::Arguments),
+        palpate-client bridge --scene fibrotic --device touch --deadband 0.1\n  \
+        palpate-client bridge --device force-dimension --scale 0.5 --rotation-deg 0,0,90\n  \
+        palpate-client bridge --device gamepad --placement my-desk.toml\n\n\
+        A name may say which one: force-dimension:1, openhaptics:'Left Device', haply:ws://localhost:10001, \
+        gamepad:/dev/input/event5. It reconnects by itself when the connection breaks; forces return when the operator asks \
+        for them, by the device's first button. It deletes the session that it made when it ends. For another device, \
+        implement `HapticDevice` of the crate palpate-client (clients/library).\n\n\
+        Exit status: 0; 1 when the device is missing or fails, when no connection succeeded or none stood at the end; 2 when \
+        an input was refused.")]
+    Bridge(Box<bridge::Arguments>),
+    /// Tell which haptic devices are there; read one for some seconds, and tell how well it keeps time
+    #[command(after_help = "Examples:\n  \
+        palpate-client devices\n  \
+        palpate-client devices --test force-dimension\n  \
+        palpate-client devices --test haply --seconds 20 --json\n\n\
+        The test sets no force. Move the device while it runs: positions that changed tell how often the device itself \
+        measures.\n\n\
+        Exit status: 0; 1 when the device to test is missing or fails; 2 when an input was refused.")]
+    Devices(devices::Arguments),
     /// A bad network on this machine: relay TCP and UDP to a server with delay, jitter, loss and outages
     #[command(after_help = "Examples:\n  \
         palpate-client proxy 127.0.0.1:7200 127.0.0.1:7117 --delay-ms 25 --loss 0.01\n  \
@@ -125,6 +151,19 @@ enum Command {
         the token file first.\n\n\
         Exit status: 0; 1 when the server can't be reached or refuses; 2 when an input was refused.")]
     Admin(admin::Arguments),
+    /// Show the servers and sessions of a fleet; move sessions between servers, and drain a server for an upgrade
+    #[command(after_help = "Examples:\n  \
+        palpate-client cluster nodes\n  \
+        palpate-client cluster sessions --json | jq '.[] | select(.standby == \"\")'\n  \
+        palpate-client cluster move 0123456789abcdef0123456789abcdef node-b\n  \
+        palpate-client cluster drain node-a --server https://node-b:7117 --token-file admin.token\n  \
+        palpate-client cluster drain node-a --stop\n\n\
+        Ask any server of the fleet; a call that another must answer goes there with the same credentials. If the servers \
+        authenticate clients, your token needs the role `administer`. A session that moves goes on at once, and its clients \
+        follow by themselves. A server that is drained takes no new sessions until you say --stop, or start it again.\n\n\
+        Exit status: 0; 1 when a server can't be reached or refuses, or when sessions could not be moved; 2 when an input was \
+        refused.")]
+    Cluster(cluster::Arguments),
 }
 
 /// Why a program ends early.
@@ -154,6 +193,13 @@ pub(crate) fn warn(message: &str) {
     say!("palpate-client: warning: {message}");
 }
 
+/// An option's number, within a range.
+pub(crate) fn within(text: &str, range: std::ops::RangeInclusive<f64>) -> Result<f64, String> {
+    let value: f64 = text.parse().map_err(|_| "is no number".to_owned())?;
+    let wrong = || format!("must be from {} to {}", range.start(), range.end());
+    if range.contains(&value) { Ok(value) } else { Err(wrong()) }
+}
+
 /// Completes at Ctrl-C.
 pub(crate) async fn interrupted() {
     let _ = tokio::signal::ctrl_c().await;
@@ -164,13 +210,16 @@ pub(crate) async fn interrupted() {
 async fn main() -> ExitCode {
     let ended = match Arguments::parse().command {
         Command::Replay(arguments) => replay::replay(&arguments).await,
+        Command::Play(arguments) => play::play(&arguments).await,
         Command::Link(arguments) => link::link(&arguments).await,
         Command::Bridge(arguments) => bridge::bridge(&arguments).await,
+        Command::Devices(arguments) => devices::devices(&arguments).await,
         Command::Proxy(arguments) => proxy::proxy(&arguments).await,
         Command::Load(arguments) => load::load(&arguments).await,
         Command::Health(arguments) => health::health(&arguments).await,
         Command::Top(arguments) => top::top(&arguments).await,
         Command::Admin(arguments) => admin::admin(&arguments).await,
+        Command::Cluster(arguments) => cluster::cluster(&arguments).await,
     };
     let (status, message) = match ended {
         Ok(()) | Err(Failure::Unread) => return ExitCode::SUCCESS,

@@ -3,19 +3,18 @@
 mod measured;
 
 use std::collections::VecDeque;
-use std::io::{IsTerminal, Write};
+use std::io::Write;
 use std::path::PathBuf;
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use indicatif::{ProgressBar, ProgressStyle};
 use palpate::limits::Limits;
 use palpate::scene::collection::{find_script, scenes_of};
 use palpate::scene::record::{Line, Network, Percentiles, Record, Run, Summary, far_warning, output, write_line};
 use palpate::scene::script::Script;
 use palpate::shape;
 use palpate::wire;
-use palpate_client::{Channel, Error, Touch, describe};
+use palpate_client::{Channel, Error, Touch, describe, fleet};
 use palpate_proto::pb;
 use palpate_proto::refusal::Reason;
 use pb::haptic_service_client::HapticServiceClient;
@@ -30,6 +29,7 @@ use tonic::Status;
 use crate::Failure;
 use crate::credentials::CredentialOptions;
 use crate::scene_file::{SceneFile, with_hint};
+use crate::table::progress_bar;
 use measured::{Measured, percentiles_us};
 
 /// How far ahead of the server's step commands are sent, s: a network may stall for about as long before the session has to
@@ -155,6 +155,9 @@ pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
     let created = tokio::time::timeout(PATIENCE, client.create_session(request)).await.map_err(silent)?;
     let created = created.map_err(|status| with_hint(&scene, refused_or_failed(status)))?.into_inner().session;
     let created = created.ok_or_else(|| Failure::Failed("the server's answer has no session".into()))?;
+    let home = fleet::home(&server, &created)?;
+    let channel = if home.url() == server.url() { channel } else { home.connect().await? };
+    let client = SessionServiceClient::new(channel.clone());
     let mut session = Session { client, id: created.session_id.clone() };
     let sessions = session.client.clone();
     let heard = LastHeard::new(Instant::now());
@@ -341,7 +344,7 @@ async fn play(
     let mut until = commands_until;
     let (mut running, mut is_answered) = (run_until(&sessions, session_id, until), false);
 
-    let progress = progress_bar(script.steps, arguments.quiet);
+    let progress = progress_bar("{elapsed_precise} [{wide_bar}] step {pos} of {len}", script.steps, arguments.quiet);
     let mut heartbeat = tokio::time::interval(HEARTBEAT);
     heartbeat.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
     let mut record = Record::default();
@@ -469,14 +472,6 @@ fn rejection_text(rejection: &pb::Rejection) -> String {
 
 fn rejected(rejection: &pb::Rejection) -> Failure {
     Failure::Refused(rejection_text(rejection))
-}
-
-fn progress_bar(steps: u64, quiet: bool) -> ProgressBar {
-    if quiet || !std::io::stderr().is_terminal() {
-        return ProgressBar::hidden();
-    }
-    let style = ProgressStyle::with_template("{elapsed_precise} [{wide_bar}] step {pos} of {len}");
-    ProgressBar::new(steps).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
 }
 
 /// Prints the summary as a table, on the output that the records do not go to.

@@ -1,4 +1,17 @@
-//! Tables for people: a name and a value with its unit on each line.
+//! Tables for people: a name and a value with its unit on each line. And bars of progress.
+
+use std::io::IsTerminal;
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+/// A bar on the terminal, in indicatif's words; hidden if there is none or it is not wanted.
+pub(crate) fn progress_bar(template: &str, length: u64, quiet: bool) -> ProgressBar {
+    if quiet || !std::io::stderr().is_terminal() {
+        return ProgressBar::hidden();
+    }
+    let style = ProgressStyle::with_template(template);
+    ProgressBar::new(length).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
+}
 
 /// Prints rows of name and value.
 pub(crate) fn print(rows: &[(&str, String)]) {

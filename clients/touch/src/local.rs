@@ -83,13 +83,20 @@ pub fn valid_m(force_n: f64, least_n: f64, change_n_per_m2: f64) -> f64 {
 }
 
 /// The newest places of a tool, by the client's own clock.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 pub struct Track {
     places: VecDeque<(f64, DVec3)>,
 }
 
 /// Number of places kept: two seconds at 1 kHz.
 const KEPT: usize = 2048;
+
+impl Default for Track {
+    /// An empty one, with room for all that it will keep: a tick must not ask for memory.
+    fn default() -> Self {
+        Track { places: VecDeque::with_capacity(KEPT) }
+    }
+}
 
 impl Track {
     /// Adds the newest place.

@@ -64,11 +64,21 @@ const MOST_TRANSITS: usize = 512;
 /// The velocity of a tool is that over this time: a device counts in steps, and its noise is not a movement.
 const LOOK_BACK_S: f64 = 0.004;
 
+/// Places that are looked back on, at most: of a tool that is asked for more often than usual, the oldest are left out.
+const MOST_RECENT: usize = 64;
+
 /// Decides which places of a tool are news.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 pub struct News {
     sent: Option<Told>,
     recent: VecDeque<(f64, DVec3)>,
+}
+
+impl Default for News {
+    /// Nothing is known yet. It has room for all that it will keep: a tick must not ask for memory.
+    fn default() -> Self {
+        News { sent: None, recent: VecDeque::with_capacity(MOST_RECENT) }
+    }
 }
 
 /// A place of a tool, and how it moves.
@@ -93,6 +103,9 @@ impl News {
     /// What to tell of a tool that is at `place_m` at `now_s`; `None` while the server is wrong by no more than `most_m` and
     /// has heard something within `heartbeat_s`.
     pub fn tell(&mut self, now_s: f64, place_m: DVec3, most_m: f64, heartbeat_s: f64) -> Option<Told> {
+        if self.recent.len() == MOST_RECENT {
+            self.recent.pop_front();
+        }
         self.recent.push_back((now_s, place_m));
         while self.recent.get(1).is_some_and(|before| before.0 <= now_s - LOOK_BACK_S + 1e-9) {
             self.recent.pop_front();

@@ -57,8 +57,11 @@ pub struct Renderer {
 impl Renderer {
     /// A renderer for a tissue with `law`, which must be sound and is number 0, behind `envelope`.
     pub fn new(law: Law, envelope: Envelope) -> Self {
+        // Room for all that are ever kept.
+        let mut laws = Vec::with_capacity(MOST_LAWS);
+        laws.push((0, law));
         Renderer {
-            laws: vec![(0, law)],
+            laws,
             newest: None,
             arrived: None,
             arrived_s: None,
@@ -74,20 +77,35 @@ impl Renderer {
 
     /// Restarts with another server, whose models start from the beginning. The envelope keeps its state.
     pub fn begin(&mut self, law: Law) {
-        (self.laws, self.newest, self.arrived, self.arrived_s) = (vec![(0, law)], None, None, None);
+        self.begin_with(law, drop);
+    }
+
+    /// Like [`Renderer::begin`], without asking for memory or giving any back: `used` gets the laws of before, at most
+    /// [`MOST_LAWS`], which are to be dropped elsewhere.
+    pub fn begin_with(&mut self, law: Law, mut used: impl FnMut(Law)) {
+        self.laws.drain(..).for_each(|known| used(known.1));
+        self.laws.push((0, law));
+        (self.newest, self.arrived, self.arrived_s) = (None, None, None);
     }
 
     /// Takes a further law, which models may name from now on. False: it is not sound, or its number is known already. Of
     /// [`MOST_LAWS`] it takes the place of the oldest that no model at hand names. Models that name a law which is not known
     /// are rendered with the oldest.
     pub fn learn(&mut self, number: u32, law: Law) -> bool {
-        if !law.is_sound() || self.laws.iter().any(|known| known.0 == number) {
+        law.is_sound() && self.learn_with(number, law, drop)
+    }
+
+    /// Like [`Renderer::learn`] of a law that is sound, without asking for memory or giving any back: `used` gets the law that is
+    /// not needed any more, if there is one, which is to be dropped elsewhere.
+    pub fn learn_with(&mut self, number: u32, law: Law, used: impl FnOnce(Law)) -> bool {
+        if self.laws.iter().any(|known| known.0 == number) {
+            used(law);
             return false;
         }
         if self.laws.len() == MOST_LAWS {
             let in_use = [self.newest.map(|newest| newest.0.law), self.arrived.map(|model| model.law)];
             let oldest = self.laws.iter().position(|known| !in_use.contains(&Some(known.0)));
-            self.laws.remove(oldest.unwrap_or(0));
+            used(self.laws.remove(oldest.unwrap_or(0)).1);
         }
         self.laws.push((number, law));
         true

@@ -3,11 +3,10 @@
 // so are triangles. The same blocks make a ray quick.
 
 import { Box3, BufferAttribute, BufferGeometry, DynamicDrawUsage, type Ray, Vector3 } from "three";
-import { Field } from "./field";
-import type { MeshData } from "./geometry";
+import { Field, type MeshData, type Vec3 } from "palpate";
 import { Looks, type Openness } from "./openness";
 import { edgesOf, type Lists, lists, opening, touching } from "./topology";
-import type { Felt, Vec3 } from "./samples";
+import type { Felt } from "./samples";
 import type { Centre, Place, Point, Push, Surface } from "./surface";
 
 /** Vertices of a block: 2 to this power. */

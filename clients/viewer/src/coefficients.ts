@@ -2,8 +2,7 @@
 // and any number of vertices gives way alike under a finger.
 
 import type { MessageInitShape } from "@bufbuild/protobuf";
-import type { SceneSchema } from "./gen/palpate/v1/scene_pb";
-import type { MeshReport } from "./gen/palpate/v1/session_pb";
+import type { MeshReport, SceneSchema } from "palpate/v1";
 
 /** A finger's push falls off over this part of the tissue's size (the diagonal of the box around it); 5 mm on a liver. */
 const FINGER = 0.02;

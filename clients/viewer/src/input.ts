@@ -3,7 +3,7 @@
 import { Vector3 } from "three";
 import type { Hand, Reach } from "./hand";
 import type { Latency } from "./latency";
-import type { Vec3 } from "./samples";
+import type { Vec3 } from "palpate";
 import type { Stage } from "./stage";
 import type { Place, Surface } from "./surface";
 

@@ -1,6 +1,6 @@
 // What the server has recorded: the journals that it lists, and what is in one, as the page shows it.
 
-import type { ForceMoment, GetJournalResponse } from "./gen/palpate/v1/session_pb";
+import type { ForceMoment, GetJournalResponse } from "palpate/v1";
 import { PATIENCE_MS, sessions } from "./server";
 
 /** A journal: of a session, in one run of the server. 0 is the newest. */

@@ -8,21 +8,20 @@
 // acknowledgement at a time.
 
 import type { MessageInitShape } from "@bufbuild/protobuf";
-import type { CreateSessionRequestSchema, Session } from "./gen/palpate/v1/session_pb";
-import { SessionState } from "./gen/palpate/v1/session_pb";
+import { norm, type Vec3 } from "palpate";
+import { type CreateSessionRequestSchema, type Session, SessionState } from "palpate/v1";
 import type { Mode } from "./hand";
 import { Choices } from "./choices";
 import { Input } from "./input";
 import type { JournalName } from "./journal";
 import { Latency } from "./latency";
 import { depthText, Overlay } from "./overlay";
-import { addressed, asked, askedNumber, holderName, part, writeAddress, writeMoment } from "./page";
+import { addressed, asked, askedNumber, holderName, part, seekAt, writeAddress, writeMoment } from "./page";
 import { keepPicture } from "./pictures";
 import { BACK_S, discard, type Opened, Player } from "./player";
 import { Plots, quantity } from "./plot";
-import { norm, type Vec3 } from "./samples";
 import { playScript } from "./script";
-import { backoffMs, describe, type Failure, isGone, isPassing, leave as leavePage, PATIENCE_MS, reasonOf, received, sessions, sleep } from "./server";
+import { backoffMs, describe, type Failure, isGone, isPassing, PATIENCE_MS, reasonOf, received, server, sessions, sleep } from "./server";
 import { Stage } from "./stage";
 import { Sheet } from "./sheet";
 import { Status } from "./status";
@@ -39,6 +38,9 @@ const PICTURE_MS = 1500;
 
 /** When samples are so much newer than the newest frame, nothing moves: frames come 60 times a second. */
 const STILL_S = 0.25;
+
+/** A server of a fleet that has not answered for so long may be gone: another takes its sessions over within 4 s. */
+const GONE_MS = 3000;
 
 const canvas = part("tissue", HTMLCanvasElement);
 const stage = new Stage(canvas, asked.get("quality") === "high");
@@ -293,11 +295,17 @@ function recoveredText({ recoveryCount, recoveries }: Session): string {
   return ` The tissue recovered ${times}, the last time because after step ${newest.step} ${newest.reason}.${pause}`;
 }
 
+/** Asking whether another server of the fleet is there. */
+let seeking: Promise<void> | undefined;
+
 function trouble(failure: Failure, waitMs: number): void {
   if (failure.isGone && player.isOpen) return player.revive();
   if (failure.isGone) return over("The session has ended.");
   status.lose();
   status.say(`Connection lost (${failure.text}). Trying again in ${(waitMs / 1000).toFixed(1)} s.`);
+  const { session, heardMs } = visit ?? {};
+  if (!session?.ownership || session.playback || performance.now() - (heardMs ?? Infinity) < GONE_MS) return;
+  seeking ??= seekAt(session.ownership.others, session.sessionId).finally(() => (seeking = undefined));
 }
 
 /** Handles the session's status. */
@@ -456,7 +464,7 @@ document.addEventListener("visibilitychange", () => {
   else visit?.look();
 });
 addEventListener("pagehide", () => {
-  leavePage();
+  server.leave();
   void visit?.hand.letGo();
   player.close();
 });
@@ -489,7 +497,7 @@ setInterval(() => {
   const audited = session.audit?.newestError;
   status.show({
     roundTripMs: visit.roundTripMs,
-    networkMs: visit.hand.networkMs,
+    networkMs: visit.hand.tool.networkMs,
     way: wayText(visit),
     frameAgeMs: frameAgeMs(),
     isStill: isStill(visit),
@@ -525,7 +533,7 @@ async function listScripts(sessionId: string): Promise<void> {
 /** Datagrams belong to a lease. */
 function wayText({ hand }: Visit): string {
   if (!hand.holds) return "no tool is held";
-  return hand.datagrams.carries ? "datagrams" : "gRPC-web";
+  return hand.tool.datagrams.carries ? "datagrams" : "gRPC-web";
 }
 
 /** Age of the newest frame here. */
@@ -580,7 +588,7 @@ const inside = {
   },
   /** Whether datagrams get through, and how many were sent and came in this session; poses and samples in them. */
   get datagrams() {
-    const { carries, counts } = visit?.hand.datagrams ?? {};
+    const { carries, counts } = visit?.hand.tool.datagrams ?? {};
     return { carries: carries ?? false, sent: 0, came: 0, poses: 0, samples: 0, fellBack: 0, ...counts };
   },
   /** The least room between a tool and the tissue as drawn, of the width of the tissue; undefined without a tool. */

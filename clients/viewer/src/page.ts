@@ -1,7 +1,7 @@
 // Elements of the page by id, and the parameters in its address (README, "The page").
 
 import type { JournalName } from "./journal";
-import { caller } from "./server";
+import { server } from "./server";
 
 export function part<T extends HTMLElement>(id: string, kind: new () => T): T {
   const element = document.getElementById(id);
@@ -75,6 +75,40 @@ function keepToken(): boolean {
 }
 
 keepToken();
-caller.token = sessionStorage.getItem("token") ?? "";
+server.token = sessionStorage.getItem("token") ?? "";
 // Adding a token to the address of an open page does not reload it by itself.
 addEventListener("hashchange", () => keepToken() && location.reload());
+
+/** Goes to the page of another server of the fleet, with the token behind `#`, where `keepToken` takes it from. */
+function moveTo(endpoint: string, sessionId: string): void {
+  const address = new URL(endpoint);
+  // A token never goes in the clear. And the page of this server would send it on without end.
+  const isHere = ["localhost", "127.0.0.1", "[::1]"].includes(address.hostname);
+  const isSafe = address.protocol === "https:" || (location.protocol === "http:" && (isHere || !server.token));
+  if (!isSafe || address.origin === location.origin) return;
+  address.search = location.search;
+  for (const key of ["scene", "journal", "run", "step"]) address.searchParams.delete(key);
+  address.searchParams.set("session", sessionId);
+  address.searchParams.set("name", holderName());
+  if (server.token) address.hash = new URLSearchParams({ token: server.token }).toString();
+  location.replace(address);
+}
+
+/** Whether a server answers at all. */
+async function isThere(endpoint: string): Promise<boolean> {
+  try {
+    await fetch(endpoint, { mode: "no-cors", cache: "no-store", signal: AbortSignal.timeout(2000) });
+    return true;
+  } catch {
+    return false;
+  }
+}
+
+// The whole page moves, so that what it calls is where it came from: no browser keeps it from that.
+server.follows = false;
+server.onElsewhere = moveTo;
+
+/** The session's server can't be reached. Another of its fleet may have taken it over, and knows where it is. */
+export async function seekAt(others: readonly string[], sessionId: string): Promise<void> {
+  for (const endpoint of others) if (await isThere(endpoint)) return moveTo(endpoint, sessionId);
+}

@@ -1,8 +1,7 @@
 // The player: shows what was recorded, like a film. A playback is a session that the server makes for this window alone. Another
 // moment or speed is another playback, which takes the place of the one before.
 
-import type { Session } from "./gen/palpate/v1/session_pb";
-import { SessionState } from "./gen/palpate/v1/session_pb";
+import { type Session, SessionState } from "palpate/v1";
 import { clockText, type JournalName, Recording, whenText } from "./journal";
 import { part } from "./page";
 import { backoffMs, describe, isGone, isPassing, PATIENCE_MS, sessions, sleep } from "./server";

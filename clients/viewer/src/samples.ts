@@ -1,18 +1,8 @@
 // The samples of the tools: the newest, and those of the last seconds.
 
-import type { GridPoint, Vector3 } from "./gen/palpate/v1/geometry_pb";
-import type { Sample, ToolSample } from "./gen/palpate/v1/haptic_pb";
-import { type Failure, haptics, keepOpen } from "./server";
-
-export type Vec3 = [number, number, number];
-
-export function vec(v: Vector3 | undefined): Vec3 {
-  return v ? [v.x, v.y, v.z] : [0, 0, 0];
-}
-
-export function norm([x, y, z]: Vec3): number {
-  return Math.hypot(x, y, z);
-}
+import type { GridPoint, Sample, ToolSample } from "palpate/v1";
+import { norm, vec, type Vec3, watchSamples } from "palpate";
+import { type Failure, server } from "./server";
 
 /** The sample of a tool at the end of a step. */
 export interface Felt {
@@ -99,19 +89,11 @@ export class Samples {
     signal: AbortSignal,
     onFailure: (failure: Failure, waitMs: number) => void,
   ): Promise<void> {
-    const sampleEverySteps = sampleEvery(stepRateHz);
-    return keepOpen(
-      async (signal, alive) => {
-        for await (const { sample } of haptics.watchSamples({ sessionId, sampleEverySteps }, { signal })) {
-          alive();
-          if (!sample) continue;
-          this.all = sample.tools;
-          this.take(sample, sample.tools);
-        }
-      },
-      signal,
-      onFailure,
-    );
+    const take = (sample: Sample) => {
+      this.all = sample.tools;
+      this.take(sample, sample.tools);
+    };
+    return watchSamples(server, sessionId, sampleEvery(stepRateHz), take, signal, onFailure);
   }
 
   /** Takes a sample of the own tool alone, which came another way. */

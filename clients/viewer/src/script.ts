@@ -1,7 +1,7 @@
 // Plays a script from the server in a session: its commands, stamped with the steps at which they take effect.
 
 import { create } from "@bufbuild/protobuf";
-import { type Command, CommandSchema } from "./gen/palpate/v1/haptic_pb";
+import { type Command, CommandSchema } from "palpate/v1";
 import { haptics, PATIENCE_MS, sessions, sleep } from "./server";
 
 /** Delay from the start to the first command's step, and how far ahead the others are sent, s. */

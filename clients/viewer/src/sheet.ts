@@ -2,7 +2,7 @@
 // flank of the tissue, as high as the body that is drawn.
 
 import { Box3, BufferAttribute, BufferGeometry, DynamicDrawUsage, Plane, type Ray, Vector3 } from "three";
-import { Field, type Rectangle } from "./field";
+import { Field, type Rectangle } from "palpate";
 import { Flank } from "./flank";
 import type { Felt } from "./samples";
 import type { Centre, Place, Point, Push, Surface } from "./surface";

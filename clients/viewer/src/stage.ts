@@ -27,7 +27,7 @@ import { Effort, isDrawnBySoftware } from "./effort";
 import { Ground } from "./ground";
 import { homeOfBody, homeOfSheet } from "./home";
 import { light, Skin, SHADOWS } from "./material";
-import type { Vec3 } from "./samples";
+import type { Vec3 } from "palpate";
 import type { Place, Surface } from "./surface";
 import { type Seen, type ShownTool, ToolMark } from "./tool";
 

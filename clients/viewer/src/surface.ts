@@ -3,10 +3,10 @@
 
 import type { MessageInitShape } from "@bufbuild/protobuf";
 import type { Box3, BufferGeometry, Ray, Vector3 } from "three";
-import type { Field } from "./field";
+import type { Field, Vec3 } from "palpate";
 import type { Flank } from "./flank";
-import type { ForceSchema, PositionSchema } from "./gen/palpate/v1/haptic_pb";
-import type { Felt, Vec3 } from "./samples";
+import type { ForceSchema, PositionSchema } from "palpate/v1";
+import type { Felt } from "./samples";
 
 /** A place on the tissue. */
 export interface Place {

@@ -2,8 +2,7 @@
 
 import { part } from "./page";
 import { quantity } from "./plot";
-import type { Scene } from "./gen/palpate/v1/scene_pb";
-import type { Session } from "./gen/palpate/v1/session_pb";
+import type { Scene, Session } from "palpate/v1";
 import { describe, isUnimplemented, PATIENCE_MS, sessions } from "./server";
 
 interface Values {

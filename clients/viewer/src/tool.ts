@@ -12,7 +12,7 @@ import {
   Vector3,
 } from "three";
 import { light, SHADOWS, Steel } from "./material";
-import { norm, type Vec3 } from "./samples";
+import { norm, type Vec3 } from "palpate";
 import type { Place, Surface } from "./surface";
 
 /** A tool in the state of the server's sample. */

@@ -5,8 +5,7 @@
 
 import type { MessageInitShape } from "@bufbuild/protobuf";
 import { MOST_VERTICES, sceneOf } from "./coefficients";
-import type { SceneSchema } from "./gen/palpate/v1/scene_pb";
-import type { MeshProblem, MeshReport, Session } from "./gen/palpate/v1/session_pb";
+import type { MeshProblem, MeshReport, SceneSchema, Session } from "palpate/v1";
 import { part } from "./page";
 import { describe, PATIENCE_MS, sessions } from "./server";
 

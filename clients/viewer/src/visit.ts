@@ -2,12 +2,11 @@
 
 import { Body } from "./body";
 import { fingerM } from "./coefficients";
-import { Frames } from "./frames";
-import type { Session } from "./gen/palpate/v1/session_pb";
-import { fetchMesh, type MeshData } from "./geometry";
+import { fetchMesh, Frames, type MeshData, norm } from "palpate";
+import type { Session } from "palpate/v1";
 import { Hand, type Reach } from "./hand";
-import { type Felt, norm, sampleEvery, Samples, type Sense } from "./samples";
-import { type Failure, keepOpen, PATIENCE_MS, sessions, sleep } from "./server";
+import { type Felt, sampleEvery, Samples, type Sense } from "./samples";
+import { type Failure, keepOpen, PATIENCE_MS, server, sessions, sleep } from "./server";
 import { Sheet } from "./sheet";
 import type { Surface } from "./surface";
 
@@ -27,7 +26,7 @@ export interface Told {
 }
 
 export class Visit {
-  readonly frames = new Frames();
+  readonly frames = new Frames(server);
   readonly samples: Samples;
   readonly hand: Hand;
   readonly reach: Reach;
@@ -59,7 +58,7 @@ export class Visit {
     told: Told,
     former?: Visit,
   ): Promise<Visit> {
-    const mesh = former ? former.mesh : session.scene?.mesh && (await fetchMesh(session.sessionId));
+    const mesh = former ? former.mesh : session.scene?.mesh && (await fetchMesh(server, session.sessionId));
     return new Visit(session, holder, refinement, told, mesh, former);
   }
 
@@ -109,7 +108,7 @@ export class Visit {
     // Until its own come, those of the other are what is seen.
     if (former) this.samples.follow(former.samples, session.simulationTimeS);
     this.hand = new Hand(session.sessionId, holder, this.reach, () => this.surface, sampleEvery(this.rateHz));
-    this.hand.datagrams.onSample = (sample) => this.samples.takeOwn(sample);
+    this.hand.tool.datagrams.onSample = (sample) => this.samples.takeOwn(sample);
   }
 
   /** Vertices of refinement n: M = (m − 1)·n + m along a side of a sheet. */
@@ -150,7 +149,7 @@ export class Visit {
     this.watching = new AbortController();
     const { signal } = this.watching;
     this.seen.signal.addEventListener("abort", () => this.watching.abort());
-    this.frames.run(this.session.sessionId, this.refinement, this.surface, signal, this.told.onTrouble);
+    this.frames.run(this.session.sessionId, this.refinement, this.surface.field, signal, this.told.onTrouble);
   }
 
   /** Closes the streams and leaves the session unchanged. */

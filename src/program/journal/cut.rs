@@ -2,7 +2,6 @@
 
 use std::path::PathBuf;
 
-use palpate::journal::Reader;
 use palpate::journal::mend;
 
 use super::super::Failure;
@@ -28,9 +27,9 @@ pub(super) struct CutArguments {
 pub(super) fn cut(arguments: &CutArguments) -> Result<(), Failure> {
     let CutArguments { source, from, to, output } = arguments;
     let limits = source.limits()?;
-    source.open()?;
+    let reader = source.open()?;
     let mut file = new_file(output)?;
-    let cut = mend::cut(|| Reader::open(&source.file), [*from, *to], &limits, &mut file);
+    let cut = mend::cut(reader, [*from, *to], &limits, &mut file);
     if let Err(refusal) = cut {
         // What is half of a journal helps nobody.
         let _ = std::fs::remove_file(output);

@@ -31,6 +31,8 @@ enum State {
     Cut,
     /// It was recovered.
     Recovered,
+    /// Another server of the fleet has the session.
+    Moved,
     /// A server writes it, or was killed.
     Unfinished,
     /// The same, and there are bytes of no whole batch at its end.
@@ -76,6 +78,7 @@ fn state(survey: &Survey) -> State {
         Some(pb::Why::Drained | pb::Why::Unspecified) => State::Drained,
         Some(pb::Why::Cut) => State::Cut,
         Some(pb::Why::Recovered) => State::Recovered,
+        Some(pb::Why::Moved) => State::Moved,
         None if survey.torn_bytes > 0 => State::Torn,
         None => State::Unfinished,
     }

@@ -38,7 +38,7 @@ enum Command {
         written by a version whose bits are others."
     )]
     Verify(verify::VerifyArguments),
-    /// Simulate a journal again, and write records as `palpate run` does
+    /// Simulate a journal again, and write records as `palpate run` does; or play it on a server
     Replay(records::ReplayArguments),
     /// Draw a session: a PNG image of one moment, or a GIF of all of it
     Render(draw::RenderArguments),

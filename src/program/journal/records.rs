@@ -10,6 +10,7 @@ use palpate::session::Session;
 use palpate::session::run::{header, summary};
 use palpate::shape::{PointId, PointName};
 
+use super::super::client::client;
 use super::super::{Failure, clock_s, say, with_progress};
 use super::Source;
 use super::output::{output, written};
@@ -33,9 +34,12 @@ pub(super) struct ReplayArguments {
     /// The step to end at [default: that of the journal]
     #[arg(long, value_name = "STEP")]
     to: Option<u64>,
-    /// Play at so many times real time; else as fast as it goes
+    /// Play at so many times real time; else as fast as it goes, on a server in real time
     #[arg(long, value_name = "FACTOR")]
     speed: Option<f64>,
+    /// Send the journal to this server and play it there, for others to see; `palpate-client play --help` shows more options
+    #[arg(long, value_name = "URL", conflicts_with_all = ["output", "point", "every", "config"])]
+    server: Option<String>,
     /// Show no progress
     #[arg(short, long)]
     quiet: bool,
@@ -76,8 +80,27 @@ impl Recorder<'_> {
     }
 }
 
-/// Simulates a journal again and writes its records.
+/// Plays a journal on a server.
+fn through_server(arguments: &ReplayArguments, url: &str) -> Result<(), Failure> {
+    let mut passed = vec![arguments.source.file.clone().into_os_string(), "--server".into(), url.into()];
+    let steps = |step: Option<u64>| step.map(|step| step.to_string());
+    let speed = arguments.speed.map(|speed| speed.to_string());
+    for (option, value) in [("--from", steps(arguments.from)), ("--to", steps(arguments.to)), ("--speed", speed)] {
+        if let Some(value) = value {
+            passed.extend([option.into(), value.into()]);
+        }
+    }
+    if arguments.quiet {
+        passed.push("--quiet".into());
+    }
+    client("play", &passed)
+}
+
+/// Simulates a journal again and writes its records, or plays it on a server.
 pub(super) fn replay(arguments: &ReplayArguments) -> Result<(), Failure> {
+    if let Some(url) = &arguments.server {
+        return through_server(arguments, url);
+    }
     let ReplayArguments { source, every, from, to, speed, quiet, .. } = arguments;
     if let Some(speed) = speed.filter(|speed| !(1e-3..=1e6).contains(speed)) {
         return Err(Failure::Refused(format!("--speed: must be from 0.001 to 1000000, but is {speed}")));

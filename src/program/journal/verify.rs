@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use palpate::journal::{self, Reader, Verdict};
+use palpate::journal::{Reader, Replay, Verdict};
 
 use super::super::{Failure, clock_s, say, with_progress};
 use super::limits;
@@ -24,10 +24,10 @@ pub(super) fn verify(arguments: &VerifyArguments) -> Result<(), Failure> {
     for path in &arguments.files {
         let (name, begun_s) = (path.display(), clock_s());
         let verdict = Reader::open(path).and_then(|mut reader| {
-            let last = reader.survey(&mut |_| {})?.until_step;
-            with_progress("step", last, false, |progress| {
-                journal::verify(reader, &limits, &mut |step, _| progress(step))
-            })
+            let survey = reader.survey(&mut |_| {})?;
+            let last = survey.until_step;
+            let replay = Replay::new(reader, survey, &limits)?;
+            with_progress("step", last, false, |progress| replay.verify(&mut |step, _| progress(step)))
         });
         match verdict {
             Err(refusal) => unread.push(refusal.to_string()),

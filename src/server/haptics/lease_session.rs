@@ -31,12 +31,12 @@ struct LeaseSession {
 }
 
 /// Offers datagrams for the tools of a lease.
-pub(super) fn offer(
+pub(super) async fn offer(
     services: &Services,
     request: &pb::OpenDatagramsRequest,
     account: &Account,
 ) -> Result<pb::DatagramOffer> {
-    let live = services.pacer.get(&request.session_id)?;
+    let live = services.session(&request.session_id).await?;
     let lease = lease_id(&request.lease_id)?;
     let (every, deadband) = (request.sample_every_steps, request.deadband.as_ref());
     let (tools, step) = live.at_intake(|intake, now| {

@@ -75,7 +75,7 @@ impl HapticService for Haptics {
         let (peer, tenure) =
             (request.extensions().get::<Peer>().cloned(), request.extensions().get::<Tenure>().cloned());
         let request = request.into_inner();
-        let live = self.0.pacer.get(&request.session_id)?;
+        let live = self.0.session(&request.session_id).await?;
         let mut lease_s = request.lease_s.unwrap_or(self.0.config.lease_s);
         if may_vanish && !request.outlives_connection {
             lease_s = lease_s.min(self.0.config.limits.browser_lease_s);
@@ -101,7 +101,7 @@ impl HapticService for Haptics {
         request: Request<pb::ReleaseToolRequest>,
     ) -> Result<Response<pb::ReleaseToolResponse>, Status> {
         let request = request.into_inner();
-        let live = self.0.pacer.get(&request.session_id)?;
+        let live = self.0.session(&request.session_id).await?;
         let lease = lease_id(&request.lease_id)?;
         live.at_intake(|intake, _| intake.release(lease))?;
         Ok(Response::new(pb::ReleaseToolResponse {}))
@@ -113,7 +113,7 @@ impl HapticService for Haptics {
     ) -> Result<Response<pb::SendCommandsResponse>, Status> {
         let now = now_ns();
         let request = request.into_inner();
-        let live = self.0.pacer.get(&request.session_id)?;
+        let live = self.0.session(&request.session_id).await?;
         let lease = lease_id(&request.lease_id)?;
         let shape = live.model.shape();
         let read = |(index, command): (usize, &pb::Command)| {
@@ -138,7 +138,7 @@ impl HapticService for Haptics {
         request: Request<pb::OpenDatagramsRequest>,
     ) -> Result<Response<pb::OpenDatagramsResponse>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
-        let offer = lease_session::offer(&self.0, &request.into_inner(), &account)?;
+        let offer = lease_session::offer(&self.0, &request.into_inner(), &account).await?;
         Ok(Response::new(pb::OpenDatagramsResponse { offer: Some(offer) }))
     }
 
@@ -148,7 +148,7 @@ impl HapticService for Haptics {
     ) -> Result<Response<Self::WatchSamplesStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let live = self.0.pacer.get(&request.session_id)?;
+        let live = self.0.session(&request.session_id).await?;
         let (every, deadband) = (request.sample_every_steps, request.deadband.as_ref());
         let sampling = wire::sample::sampling(every, None, deadband, request.heartbeat_s, false)?;
         let guard = live.open_stream("WatchSamples", StreamKind::ReadsOnly, &account)?;
@@ -170,7 +170,7 @@ impl HapticService for Haptics {
     async fn probe(&self, request: Request<pb::ProbeRequest>) -> Result<Response<Self::ProbeStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let live = self.0.pacer.get(&request.session_id)?;
+        let live = self.0.session(&request.session_id).await?;
         let every = wire::every("every_steps", request.every_steps)?;
         let points = match wire::from_probed(request.r#where.as_ref())? {
             Some((field, names)) => Some(self.probed(field, live.model.shape(), names)?),

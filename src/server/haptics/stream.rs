@@ -103,7 +103,7 @@ impl Life {
 
 /// Answers the first message of a haptic stream.
 async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> Result<(Opened, StreamTools), Status> {
-    let live = services.pacer.get(&open.session_id)?;
+    let live = services.session(&open.session_id).await?;
     let device = open.device.as_ref().map(touch::from_device).transpose()?;
     let tip = touch::from_tip(open.tip.as_ref());
     // A stream that neither renders nor says anything of a tip may push with forces on any tissue.
@@ -128,10 +128,19 @@ async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> 
     let laws = law.clone().map(|law| Arc::new(Laws::new(law)));
     sampling.laws.clone_from(&laws);
     let lease_s = open.lease_s.unwrap_or(services.config.lease_s);
-    let lease = random_bits()?;
+    let goes_on = !open.lease_id.is_empty() && !open.tools.is_empty();
+    let lease = if goes_on { super::tools::lease_id(&open.lease_id)? } else { random_bits()? };
     let charges = charges(account, open.tools.len())?;
     let step = live.at_intake(|intake, now| {
-        intake.acquire(&open.tools, &open.holder, lease_s, lease, now)?;
+        if goes_on {
+            intake.renew(lease, now)?;
+            if !open.tools.iter().all(|tool| intake.tools_of(lease).any(|held| held == *tool)) {
+                let message = "is not the lease of these tools";
+                return Err(Refusal::new(Reason::NotHolder, "lease_id", message));
+            }
+        } else {
+            intake.acquire(&open.tools, &open.holder, lease_s, lease, now)?;
+        }
         intake.charge(lease, charges);
         Ok::<_, Refusal>(intake.next_step())
     })?;
@@ -162,6 +171,7 @@ async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> 
         warnings: device.zip(law).map_or(Vec::new(), |(device, law)| device.warnings(law)),
         max_force_n: device.map_or(UNDECLARED_FORCE_N, |device| device.most_n()),
         datagrams,
+        lease_id: if open.tools.is_empty() { String::new() } else { format!("{lease:032x}") },
     };
     let samples = live.samples(sampling, open.tools.is_empty().then_some(account));
     info!(session = %live.id, tools = ?open.tools, holder = ?open.holder, "haptic stream opened");

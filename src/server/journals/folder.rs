@@ -102,6 +102,11 @@ impl Grown {
         &self.path
     }
 
+    /// How many bytes it has.
+    pub(super) fn bytes(&self) -> u64 {
+        self.bytes
+    }
+
     /// Adds to its end. What can't be written whole is taken back.
     ///
     /// # Errors

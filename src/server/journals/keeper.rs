@@ -8,9 +8,11 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use super::folder::{Folder, Grown};
+use super::growth::Growth;
 use super::keep::Keep;
 use super::old;
 use crate::journal::{self, Opening, Writer, pb};
+use crate::pace::Leaving;
 use crate::pace::clock::now_ns;
 use crate::pace::tape::{About, Event, Noted, Tape, TapeQueue};
 
@@ -51,6 +53,8 @@ pub(super) struct Keeper {
     /// Journals that nobody could continue: they are left as they are.
     left_alone: BTreeSet<PathBuf>,
     entries: BTreeMap<String, Entry>,
+    /// Who mirrors journals is told of what was written.
+    growth: Option<Arc<Growth>>,
 }
 
 /// What a folder held at the beginning.
@@ -78,9 +82,10 @@ impl Keeper {
         queue: Arc<TapeQueue>,
         tally: Arc<KeeperTally>,
         found: Found,
+        growth: Option<Arc<Growth>>,
     ) -> Self {
         let Found { runs, left_alone } = found;
-        Keeper { folder, keep, queue, tally, runs, left_alone, entries: BTreeMap::new() }
+        Keeper { folder, keep, queue, tally, runs, left_alone, entries: BTreeMap::new(), growth }
     }
 
     /// Works until the queue is stopped, and everything in it is written.
@@ -111,7 +116,7 @@ impl Keeper {
             return;
         }
         let is_first =
-            |written: &Written| self.entries.get(&written.id).is_some_and(|entry| entry.tape.durable_step().is_none());
+            |written: &Written| self.entries.get(&written.id).is_some_and(|entry| entry.tape.local_step().is_none());
         let is_new = written.iter().any(is_first);
         let files: Vec<_> = written.iter().filter_map(|written| self.entries.get(&written.id)?.file.file()).collect();
         let synced = self.folder.sync(files.into_iter(), is_new);
@@ -149,7 +154,7 @@ impl Keeper {
         let entry = self.entries.get_mut(&id)?;
         let mut writer = entry.writer.take()?;
         let noted_ns = taken.events.last().map_or_else(now_ns, |noted| noted.at_ns);
-        let mut is_deleted = false;
+        let mut left = None;
         for Noted { step, event, .. } in taken.events {
             match event {
                 Event::Input(input) => writer.input(step, &input),
@@ -158,11 +163,15 @@ impl Keeper {
                     writer.snapshot(step, copy.state_hash(), copy.model(), saved.to_bytes());
                 }
                 Event::Felt(felt) => writer.felt(step, &felt),
-                Event::Deleted => is_deleted = true,
+                Event::Left(leaving) => left = Some(leaving),
             }
         }
-        let bytes = if is_deleted {
-            writer.finish(pb::Why::Deleted, "the session was deleted", taken.until_step, unix_ns())
+        let bytes = if let Some(leaving) = left {
+            let (why, message) = match leaving {
+                Leaving::Deleted => (pb::Why::Deleted, "the session was deleted"),
+                Leaving::Moved => (pb::Why::Moved, "another server of the fleet has the session"),
+            };
+            writer.finish(why, message, taken.until_step, unix_ns())
         } else {
             let bytes = writer.flush(taken.until_step, unix_ns());
             entry.writer = Some(writer);
@@ -174,6 +183,9 @@ impl Keeper {
             return None;
         }
         self.append(&id, &bytes)?;
+        if let (Some(growth), Some(entry)) = (&self.growth, self.entries.get(&id)) {
+            growth.grew(&entry.tape, self.runs.get(&id).copied().unwrap_or_default(), &entry.file, until_step);
+        }
         Some(Written { id, until_step, batches, noted_ns, is_still: taken.is_still })
     }
 
@@ -189,8 +201,10 @@ impl Keeper {
 
     /// Begins the journal of a session.
     fn begin(&mut self, tape: &Arc<Tape>) {
-        let About { id, owner, idle_timeout_s, first, begin_step, running, until_step } = &tape.about;
-        let run = self.runs.entry(id.clone()).and_modify(|run| *run += 1).or_insert(1);
+        let About { id, owner, idle_timeout_s, first, begin_step, running, until_step, after_run, revision } =
+            &tape.about;
+        let run = self.runs.entry(id.clone()).or_default();
+        *run = (*run).max(*after_run) + 1;
         let opening = Opening {
             session_id: id,
             run: *run,
@@ -200,6 +214,7 @@ impl Keeper {
             begin_step: *begin_step,
             running: *running,
             until_step: *until_step,
+            ownership_revision: *revision,
         };
         let file = Grown::new(self.folder.path().join(journal::file::name(id, *run)));
         let entry = Entry { tape: tape.clone(), writer: Some(Writer::new(&opening, unix_ns())), file };

@@ -1,13 +1,16 @@
 //! Journals of a server's sessions: written while they go on, and continued from when the server is started again.
 
 mod folder;
+pub(super) mod growth;
 pub(super) mod keep;
 mod keeper;
 mod old;
 mod player;
-pub(in crate::server) mod recorded;
+pub(super) mod recorded;
 mod resume;
 
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
@@ -15,15 +18,16 @@ use std::time::Duration;
 pub use keep::Keep;
 
 use super::config::Config;
+use crate::limits::Limits;
 use crate::lock::lock;
 use crate::pace::tape::{Progress, TapeQueue};
 use crate::pace::{Live, Pacer};
 use crate::priority::{give_way_a_little, thread};
 use crate::refusal::{Reason, Refusal, Result};
 use folder::Folder;
+use growth::Growth;
 use keeper::Keeper;
 pub(crate) use keeper::KeeperTally;
-use player::Player;
 
 /// So long a call waits until a session is on the disk, or all of it.
 const PATIENCE: Duration = Duration::from_secs(5);
@@ -32,9 +36,10 @@ const PATIENCE: Duration = Duration::from_secs(5);
 pub(super) struct Journals {
     folder: Arc<Folder>,
     queue: Arc<TapeQueue>,
-    player: Arc<Player>,
-    threads: std::sync::Mutex<Vec<JoinHandle<()>>>,
+    thread: std::sync::Mutex<Option<JoinHandle<()>>>,
     pub(super) tally: Arc<KeeperTally>,
+    /// Sessions that could not be continued.
+    left_alone: BTreeSet<String>,
 }
 
 impl Journals {
@@ -44,12 +49,21 @@ impl Journals {
     /// # Errors
     /// Refuses a folder that can't be used, or that another server uses. A journal that can't be continued is no error: that is
     /// logged, and the file stays as it is.
-    pub(super) fn open(config: &Config, pacer: &Arc<Pacer>) -> Result<Option<Arc<Self>>> {
+    ///
+    /// In a fleet only the sessions in `own` are continued, each with its revision, and `growth` is told what is written.
+    pub(super) fn open(
+        config: &Config,
+        pacer: &Arc<Pacer>,
+        fleet: Option<(BTreeMap<String, u64>, Arc<Growth>)>,
+    ) -> Result<Option<Arc<Self>>> {
         let Some(path) = &config.journal else { return Ok(None) };
+        let (own, growth) = fleet.unzip();
         let folder = Arc::new(Folder::open(path)?);
         let (queue, tally) = (pacer.keep_tapes(), Arc::new(KeeperTally::default()));
-        let found = resume::all(folder.path(), pacer, &config.limits)?;
-        let keeper = Keeper::new(folder.clone(), config.journal_keep, queue.clone(), tally.clone(), found);
+        let found = resume::all(folder.path(), own.as_ref(), pacer, &config.limits)?;
+        let name = |path: &PathBuf| crate::journal::file::parse(path.file_name()?.to_str()?);
+        let left_alone = found.left_alone.iter().filter_map(|path| Some(name(path)?.0)).collect();
+        let keeper = Keeper::new(folder.clone(), config.journal_keep, queue.clone(), tally.clone(), found, growth);
         let work = move || {
             give_way_a_little();
             keeper.work();
@@ -58,17 +72,31 @@ impl Journals {
             Refusal::new(Reason::Overloaded, "journal", format!("no thread can be started for the journals: {error}"))
         };
         let keeping = thread("journal").spawn(work).map_err(refused)?;
-        let player = Arc::new(Player::default());
-        let reader = player.clone();
-        let playing = thread("player").spawn(move || reader.work()).map_err(refused)?;
-        Ok(Some(Arc::new(Journals { folder, queue, player, threads: vec![keeping, playing].into(), tally })))
+        Ok(Some(Arc::new(Journals { folder, queue, thread: Some(keeping).into(), tally, left_alone })))
+    }
+
+    /// Whether a session could not be continued when the server began.
+    pub(super) fn has_left_alone(&self, id: &str) -> bool {
+        self.left_alone.contains(id)
+    }
+
+    /// Where they are.
+    pub(super) fn folder(&self) -> &Path {
+        self.folder.path()
+    }
+
+    /// Goes on with a session whose journal has come into the folder. Its owner is this server since `revision`.
+    ///
+    /// # Errors
+    /// Refuses what can't be continued.
+    pub(super) fn resume(&self, id: &str, revision: u64, pacer: &Pacer, limits: &Limits) -> Result<()> {
+        resume::session(self.folder.path(), id, revision, pacer, limits)
     }
 
     /// Writes what there still is, and ends. The stepping threads have ended before.
     pub(super) fn finish(&self) {
         self.queue.stop();
-        self.player.stop();
-        for thread in lock(&self.threads).drain(..) {
+        if let Some(thread) = lock(&self.thread).take() {
             let _ = thread.join();
         }
     }

@@ -1,7 +1,6 @@
 //! The thread that reads ahead for sessions that play what was recorded (`player`).
 
-use std::fs::File;
-use std::io::BufReader;
+use std::io::{Read, Seek};
 use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
 use std::time::Duration;
 
@@ -14,10 +13,15 @@ use crate::refusal::Result;
 /// It looks so often whether a session has played much of what was read.
 const LOOK: Duration = Duration::from_millis(100);
 
+/// What a journal is read from.
+pub(super) trait Source: Read + Seek + Send {}
+
+impl<T: Read + Seek + Send> Source for T {}
+
 struct Played {
     live: Weak<Live>,
     feed: Arc<Feed>,
-    inputs: Inputs<BufReader<File>>,
+    inputs: Inputs<Box<dyn Source>>,
 }
 
 /// What it reads for.
@@ -35,7 +39,7 @@ struct State {
 
 impl Player {
     /// Reads on for `live` until it is deleted.
-    pub(super) fn play(&self, live: &Arc<Live>, feed: &Arc<Feed>, inputs: Inputs<BufReader<File>>) {
+    pub(super) fn play(&self, live: &Arc<Live>, feed: &Arc<Feed>, inputs: Inputs<Box<dyn Source>>) {
         lock(&self.state).new.push(Played { live: Arc::downgrade(live), feed: feed.clone(), inputs });
         self.wake.notify_one();
     }
@@ -75,7 +79,7 @@ impl Player {
 }
 
 /// Reads ahead of a session that has done `step` steps.
-pub(super) fn read_ahead(feed: &Feed, inputs: &mut Inputs<BufReader<File>>, step: u64) -> Result<()> {
+pub(super) fn read_ahead(feed: &Feed, inputs: &mut Inputs<Box<dyn Source>>, step: u64) -> Result<()> {
     while feed.wants_more(step) == Some(true) {
         match inputs.next_batch()? {
             Some(piece) => feed.add(piece.inputs, piece.until_step),

@@ -1,31 +1,37 @@
-//! What the journals of a server hold, for calls: which there are, what is in one, and sessions that begin at a moment of one.
+//! What was recorded, for calls: which journals there are, what is in one, those that clients send, and sessions that begin at a
+//! moment of one.
 
-use std::io::Cursor;
+use std::io::{Cursor, Read, Seek};
 use std::path::Path;
-use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
 use std::time::UNIX_EPOCH;
 
 use palpate_proto::pb;
 
+use super::super::uploads::{Kind, Part, Uploads};
 use super::Journals;
+use super::folder::Folder;
 use super::keeper::unix_ns;
-use super::player::read_ahead;
-use crate::budget::Account;
-use crate::ids::random_id;
+use super::player::{Player, Source, read_ahead};
+use crate::budget::{Account, Purpose, Resource, Taken};
 use crate::journal::file::{self, JournalFile};
 use crate::journal::inputs::Inputs;
-use crate::journal::{Opening, Reader, Writer, pb as kept, replay, seal};
+use crate::journal::{self, Opening, Reader, Replay, Writer, pb as kept, seal};
 use crate::limits::Limits;
+use crate::lock::lock;
 use crate::pace::feed::{Feed, Playback};
-use crate::pace::{Begin, Live, Pacer, Present};
+use crate::pace::{Begin, Birth, Live, Pacer, Present};
+use crate::priority::thread;
 use crate::refusal::{Reason, Refusal, Result, number};
-use crate::sheet::choice::NEVER;
+use crate::sheet::choice::{NEVER, given_up};
 
 /// Moments of a curve of forces.
 const MOST_MOMENTS: usize = 2000;
 
-/// The journal of a run of a session; of its newest if `run` is 0.
-fn find(folder: &Path, session_id: &str, run: u32) -> Result<JournalFile> {
+/// The journal of a run of a session, open; of its newest if `run` is 0.
+fn find(folder: &Path, session_id: &str, run: u32) -> Result<(JournalFile, Reader<Box<dyn Source>>)> {
     let unknown = |message: &str| Refusal::new(Reason::UnknownSession, "session_id", message.to_owned());
     // A name that is none would be a path.
     if file::parse(&file::name(session_id, 1)).is_none() {
@@ -35,19 +41,26 @@ fn find(folder: &Path, session_id: &str, run: u32) -> Result<JournalFile> {
         Refusal::new(Reason::Unreadable, "journal", format!("the folder of the journals can't be read: {error}"))
     })?;
     let is_it = |file: &JournalFile| file.session_id == session_id && (run == 0 || file.run == u64::from(run));
-    // The newest run may have been cut off before anything of it was on the disk.
-    let is_begun = |file: &JournalFile| {
-        run != 0 || !Reader::open(&file.path).is_err_and(|refusal| refusal.reason == Reason::Missing)
-    };
-    listed
-        .into_iter()
-        .rev()
-        .filter(is_it)
-        .find(is_begun)
-        .ok_or_else(|| unknown("there is no journal of this session and run; ListJournals tells which there are"))
+    for file in listed.into_iter().rev().filter(is_it) {
+        match open(&file) {
+            // The newest run may have been cut off before anything of it was on the disk.
+            Err(refusal) if run == 0 && refusal.reason == Reason::Missing => {}
+            opened => return opened.map(|reader| (file, reader)),
+        }
+    }
+    Err(unknown("there is no journal of this session and run; ListJournals tells which there are"))
 }
 
-fn info(file: &JournalFile, pacer: &Pacer) -> pb::JournalInfo {
+fn open(file: &JournalFile) -> Result<Reader<Box<dyn Source>>> {
+    Reader::new(&file.path.display().to_string(), Box::new(journal::reader::file(&file.path)?))
+}
+
+/// A journal in a list: `reader` is it, open, or why it can't be opened.
+fn info(
+    file: &JournalFile,
+    reader: std::result::Result<&mut Reader<Box<dyn Source>>, String>,
+    pacer: &Pacer,
+) -> pb::JournalInfo {
     let metadata = std::fs::metadata(&file.path).ok();
     let written = metadata.as_ref().and_then(|metadata| metadata.modified().ok()?.duration_since(UNIX_EPOCH).ok());
     let run = u32::try_from(file.run).unwrap_or(u32::MAX);
@@ -59,25 +72,81 @@ fn info(file: &JournalFile, pacer: &Pacer) -> pb::JournalInfo {
         live: pacer.is_recording(&file.session_id, run),
         ..Default::default()
     };
-    let begun = Reader::open(&file.path).and_then(|mut reader| {
-        let begin_unix_ns = reader.next_batch()?.map_or(0, |batch| batch.unix_ns);
+    let begun = reader.and_then(|reader| {
+        let batch = reader.next_batch().map_err(|refusal| refusal.to_string())?;
+        let begin_unix_ns = batch.map_or(0, |batch| batch.unix_ns);
         let header = reader.header();
         let scene_name = header.scene.as_ref().map(|scene| scene.name.clone()).unwrap_or_default();
         Ok(pb::JournalInfo { scene_name, owner: header.owner.clone(), begin_unix_ns, ..known.clone() })
     });
-    begun.unwrap_or_else(|refusal| pb::JournalInfo { fault: refusal.to_string(), ..known })
+    begun.unwrap_or_else(|fault| pb::JournalInfo { fault, ..known })
 }
 
-impl Journals {
-    /// All journals, by session and run.
+/// What the server can play: the journals of its folder, and those that clients have sent.
+pub(in crate::server) struct Recorded {
+    /// `None` if no journals are kept.
+    folder: Option<Arc<Folder>>,
+    sent: Uploads<Vec<u8>>,
+    player: Arc<Player>,
+    thread: Mutex<Option<JoinHandle<()>>>,
+}
+
+impl Recorded {
+    /// Starts the thread that reads ahead for sessions that play.
+    ///
+    /// # Errors
+    /// Refuses if no thread can be started.
+    pub(in crate::server) fn new(journals: Option<&Journals>, limits: &Limits) -> Result<Arc<Self>> {
+        let player = Arc::new(Player::default());
+        let reader = player.clone();
+        let playing = thread("player").spawn(move || reader.work()).map_err(|error| {
+            Refusal::new(Reason::Overloaded, "journal", format!("no thread can be started to play journals: {error}"))
+        })?;
+        let sent = Uploads::new(Kind {
+            names: ["journal", "journals"],
+            id: "upload_id",
+            unknown: Reason::UnknownJournal,
+            purpose: Purpose::Journals,
+            most_bytes: (limits.journal_bytes, "limits.journal_bytes"),
+            most_each: (limits.journals_per_caller, "limits.journals_per_caller"),
+            kept_s: limits.journal_s,
+        });
+        let folder = journals.map(|journals| journals.folder.clone());
+        Ok(Arc::new(Recorded { folder, sent, player, thread: Some(playing).into() }))
+    }
+
+    /// Ends. The stepping threads have ended before.
+    pub(in crate::server) fn finish(&self) {
+        self.player.stop();
+        if let Some(thread) = lock(&self.thread).take() {
+            let _ = thread.join();
+        }
+    }
+
+    /// Forgets the journals of clients that were not used for long.
+    pub(in crate::server) fn forget_expired(&self, now_ns: u64) {
+        self.sent.forget_expired(now_ns);
+    }
+
+    fn folder(&self, field: &str) -> Result<&Path> {
+        let none = || {
+            let message = "this server keeps no journals: `palpate serve --journal DIR` does";
+            Refusal::new(Reason::NotAvailable, field, message)
+        };
+        self.folder.as_ref().map(|folder| folder.path()).ok_or_else(none)
+    }
+
+    /// All journals of the folder, by session and run; none if there is no folder.
     ///
     /// # Errors
     /// Refuses if the folder can't be read.
     pub(in crate::server) fn list(&self, pacer: &Pacer) -> Result<pb::ListJournalsResponse> {
-        let listed = file::list(self.folder.path()).map_err(|error| {
+        let Some(folder) = &self.folder else { return Ok(pb::ListJournalsResponse::default()) };
+        let listed = file::list(folder.path()).map_err(|error| {
             Refusal::new(Reason::Unreadable, "journal", format!("the folder of the journals can't be read: {error}"))
         })?;
-        Ok(pb::ListJournalsResponse { journals: listed.iter().map(|file| info(file, pacer)).collect() })
+        let info = |file: &JournalFile| info(file, open(file).as_mut().map_err(|refusal| refusal.to_string()), pacer);
+        Ok(pb::ListJournalsResponse { journals: listed.iter().map(info).collect() })
     }
 
     /// What is in a journal: a pass over it.
@@ -89,61 +158,109 @@ impl Journals {
         request: &pb::GetJournalRequest,
         pacer: &Pacer,
     ) -> Result<pb::GetJournalResponse> {
-        let file = find(self.folder.path(), &request.session_id, request.run)?;
-        let mut reader = Reader::open(&file.path)?;
-        let survey = reader.survey(&mut |_| {})?;
-        let mut forces = Forces::default();
-        while let Some(batch) = reader.next_batch()? {
-            for moment in batch.felt()? {
-                let of = |tool: &kept::FeltTool| {
-                    let kept::Vector { x, y, z } = tool.force_n.unwrap_or_default();
-                    glam::Vec3::new(x, y, z).length()
-                };
-                forces.add(moment.step, f64::from(moment.tools.iter().map(of).fold(0.0, f32::max)));
-            }
+        let (file, mut reader) = find(self.folder("session_id")?, &request.session_id, request.run)?;
+        let info = info(&file, Ok(&mut reader), pacer);
+        tell(reader, info, &NEVER)
+    }
+
+    /// Adds a part of a journal that a client sends.
+    ///
+    /// # Errors
+    /// As for [`Uploads::add`].
+    pub(in crate::server) fn add(
+        &self,
+        request: &pb::UploadJournalRequest,
+        account: &Account,
+    ) -> Result<pb::UploadJournalResponse> {
+        let pb::UploadJournalRequest { upload_id, offset, part, last } = request;
+        let part = Part { id: upload_id, offset: *offset, bytes: part, last: *last };
+        let (upload_id, received_bytes) = self.sent.add(&part, account)?;
+        Ok(pb::UploadJournalResponse { upload_id, received_bytes, journal: None })
+    }
+
+    /// Reads a journal of which all parts have come. It can be used from then on.
+    ///
+    /// # Errors
+    /// Refuses a journal that this caller is not sending, one that can't be read, and when `stop` is set.
+    pub(in crate::server) fn read(
+        &self,
+        id: &str,
+        account: &Account,
+        stop: &AtomicBool,
+    ) -> Result<pb::GetJournalResponse> {
+        let mut received = self.sent.take(id, account)?;
+        let bytes = std::mem::take(&mut received.bytes);
+        let reader = Reader::new(SENT, Cursor::new(&bytes)).map_err(within_upload)?;
+        let header = reader.header();
+        let known = pb::JournalInfo {
+            session_id: header.session_id.clone(),
+            run: u32::try_from(header.run).unwrap_or(u32::MAX),
+            scene_name: header.scene.as_ref().map(|scene| scene.name.clone()).unwrap_or_default(),
+            bytes: bytes.len() as u64,
+            ..Default::default()
+        };
+        let told = tell(reader, known, stop).map_err(within_upload)?;
+        let length = bytes.len() as u64;
+        received.finish(bytes, length)?;
+        Ok(told)
+    }
+
+    /// The journal of a moment, and the session and run that it is of.
+    fn open(&self, moment: &pb::JournalMoment, payer: &Account) -> Result<Opened> {
+        if moment.upload_id.is_empty() {
+            let (file, reader) = find(self.folder("journal")?, &moment.session_id, moment.run)?;
+            return Ok((reader, file.session_id, file.run));
         }
-        Ok(pb::GetJournalResponse {
-            info: Some(info(&file, pacer)),
-            rate_hz: reader.header().rate_hz,
-            begin_step: reader.header().begin_step,
-            end_step: survey.until_step,
-            forces: forces.moments,
-            snapshot_steps: survey.snapshots.iter().map(|at| at.step).collect(),
-        })
+        if !moment.session_id.is_empty() || moment.run != 0 {
+            let message = "names a session's journal, and upload_id one that was sent: leave one of them out";
+            return Err(Refusal::new(Reason::WrongKind, "session_id", message));
+        }
+        let bytes = self.sent.get(&moment.upload_id, payer)?;
+        // A session that plays it keeps it, also when the upload has expired.
+        let taken = payer.take(Resource::Memory(Purpose::Journals), bytes.len() as u64, "upload_id")?;
+        let source: Box<dyn Source> = Box::new(Cursor::new(Sent { bytes, _taken: taken }));
+        let reader = Reader::new(SENT, source)?.without_files();
+        let (session_id, run) = (reader.header().session_id.clone(), reader.header().run);
+        Ok((reader, session_id, run))
     }
 
     /// A session that begins at a moment of a journal, and goes on live or plays what was recorded.
     ///
     /// # Errors
     /// Refuses a journal that is not there, can't be read or simulated again here, a step that it does not have, a speed out of
-    /// range, and as [`Pacer::create`] does.
+    /// range, and as [`Pacer::resume`] does; also when `stop` is set.
     pub(in crate::server) fn begin(
         &self,
         moment: &pb::JournalMoment,
+        Birth { id, revision }: Birth,
         (paused, idle_timeout_s): (bool, f64),
-        payer: &Account,
-        pacer: &Pacer,
+        (payer, pacer): (&Account, &Pacer),
         limits: &Limits,
+        stop: &AtomicBool,
     ) -> Result<Arc<Live>> {
         let speed = moment.speed.unwrap_or(1.0);
         number("journal.speed", speed, "from 0.1 to 8", |speed| (0.1..=8.0).contains(&speed))?;
-        let file = find(self.folder.path(), &moment.session_id, moment.run)?;
-        let mut reader = Reader::open(&file.path)?;
-        let survey = reader.survey(&mut |_| {})?;
+        let within = |refusal: Refusal| refusal.within("journal");
+        let (mut reader, session_id, run) = self.open(moment, payer).map_err(within)?;
+        let survey = reader.survey(&mut |_| {}).map_err(within)?;
         let step = moment.step.unwrap_or(survey.until_step);
         let steps = [reader.header().begin_step, survey.until_step];
-        let (mut session, first) =
-            replay::session_at(Reader::open(&file.path)?, limits, step).map_err(|refusal| refusal.within("journal"))?;
+        let replay = Replay::near(reader, survey.clone(), limits, step).map_err(within)?;
+        let (mut session, first, reader) = replay.reach(step, stop).map_err(within)?;
         let mut begin = Begin {
-            id: random_id()?,
+            id,
             first: first.clone(),
             running: !paused,
             until: None,
             idle_timeout_s,
-            overrun_count: 0,
             playback: None,
+            after_run: 0,
+            revision,
+            frozen: false,
         };
         if !moment.plays {
+            // With the memory that is taken for a journal which was sent.
+            drop(reader);
             return pacer.resume(
                 begin,
                 payer,
@@ -151,18 +268,70 @@ impl Journals {
                     session.let_go();
                     Ok(session)
                 },
-                &NEVER,
+                stop,
             );
         }
         let feed = Arc::new(Feed::default());
         let mut inputs = Inputs::new(reader, &survey, &first, limits, step);
         read_ahead(&feed, &mut inputs, step)?;
-        let (session_id, run) = (file.session_id, file.run);
         begin.playback = Some(Playback { session_id, run, steps, speed, feed: feed.clone() });
-        let live = pacer.resume(begin, payer, || Ok(session), &NEVER)?;
+        let live = pacer.resume(begin, payer, || Ok(session), stop)?;
         self.player.play(&live, &feed, inputs);
         Ok(live)
     }
+}
+
+/// A journal, and the session and run that it is of.
+type Opened = (Reader<Box<dyn Source>>, String, u64);
+
+/// What refusals call a journal that a client has sent.
+const SENT: &str = "the journal";
+
+/// A refusal of a journal that a client has sent.
+fn within_upload(refusal: Refusal) -> Refusal {
+    if refusal.field.is_empty() { Refusal { field: "part".to_owned(), ..refusal } } else { refusal }
+}
+
+/// A journal that a client has sent.
+struct Sent {
+    bytes: Arc<Vec<u8>>,
+    _taken: Taken,
+}
+
+impl AsRef<[u8]> for Sent {
+    fn as_ref(&self) -> &[u8] {
+        &self.bytes
+    }
+}
+
+/// What is in a journal, of which `info` is known.
+fn tell<R: Read + Seek>(
+    mut reader: Reader<R>,
+    info: pb::JournalInfo,
+    stop: &AtomicBool,
+) -> Result<pb::GetJournalResponse> {
+    let survey = reader.survey(&mut |_| {})?;
+    let mut forces = Forces::default();
+    while let Some(batch) = reader.next_batch()? {
+        if stop.load(Ordering::Relaxed) {
+            return Err(given_up());
+        }
+        for moment in batch.felt()? {
+            let of = |tool: &kept::FeltTool| {
+                let kept::Vector { x, y, z } = tool.force_n.unwrap_or_default();
+                glam::Vec3::new(x, y, z).length()
+            };
+            forces.add(moment.step, f64::from(moment.tools.iter().map(of).fold(0.0, f32::max)));
+        }
+    }
+    Ok(pb::GetJournalResponse {
+        info: Some(info),
+        rate_hz: reader.header().rate_hz,
+        begin_step: reader.header().begin_step,
+        end_step: survey.until_step,
+        forces: forces.moments,
+        snapshot_steps: survey.snapshots.iter().map(|at| at.step).collect(),
+    })
 }
 
 /// A curve of forces with at most [`MOST_MOMENTS`] moments, the largest of each while.
@@ -197,15 +366,17 @@ impl Forces {
 pub(in crate::server) fn snapshot(live: &Live, present: &Present) -> Result<Vec<u8>> {
     let Present { saved, copy, running, until_step } = present;
     let step = saved.step();
+    let run = live.tape.as_ref().map_or(0, |tape| tape.progress().borrow().run);
     let opening = Opening {
         session_id: &live.id,
-        run: 1,
+        run: u64::from(run.max(1)),
         owner: live.owner.name(),
         idle_timeout_s: live.idle_timeout_s,
         first: &live.model,
         begin_step: step,
         running: *running,
         until_step: *until_step,
+        ownership_revision: live.revision(),
     };
     let now = unix_ns();
     let mut writer = Writer::new(&opening, now);

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use super::keeper::Found;
 use crate::journal::file::JournalFile;
-use crate::journal::{self, Reader, pb, replay};
+use crate::journal::{self, Reader, Replay, pb};
 use crate::limits::Limits;
 use crate::lock::lock;
 use crate::pace::{Begin, Pacer};
@@ -18,7 +18,7 @@ use crate::sheet::choice::NEVER;
 enum Outcome {
     /// It goes on.
     Continued,
-    /// It was deleted, or there was nothing yet to continue.
+    /// It was deleted, went to another server, or there was nothing yet to continue.
     Ended,
     /// It can't be continued.
     Refused(Refusal),
@@ -28,10 +28,10 @@ enum Outcome {
 ///
 /// # Errors
 /// Refuses a folder that can't be read.
-pub(super) fn all(folder: &Path, pacer: &Pacer, limits: &Limits) -> Result<Found> {
-    let listed = journal::file::list(folder).map_err(|error| {
-        Refusal::new(Reason::Unreadable, "journal", format!("{}: can't be read: {error}", folder.display()))
-    })?;
+///
+/// In a fleet, `own` has those that are still this server's, and the revision of each; others are left as they are.
+pub(super) fn all(folder: &Path, own: Option<&BTreeMap<String, u64>>, pacer: &Pacer, limits: &Limits) -> Result<Found> {
+    let listed = list(folder)?;
     let mut by_session: BTreeMap<String, Vec<JournalFile>> = BTreeMap::new();
     for file in listed {
         by_session.entry(file.session_id.clone()).or_default().push(file);
@@ -40,9 +40,11 @@ pub(super) fn all(folder: &Path, pacer: &Pacer, limits: &Limits) -> Result<Found
     let (next, found) = (AtomicUsize::new(0), Mutex::new(Found::default()));
     let work = || {
         while let Some((id, files)) = sessions.get(next.fetch_add(1, Ordering::Relaxed)) {
-            let (outcome, newest) = one(files, pacer, limits);
+            let revision = own.map_or(Some(0), |own| own.get(id).copied());
+            let ended = (revision.map(|revision| one(files, revision, pacer, limits)), files.last());
             let mut found = lock(&found);
-            found.runs.insert(id.clone(), files.last().map_or(0, |file| file.run));
+            found.runs.insert(id.clone(), ended.1.map_or(0, |file| file.run));
+            let Some((outcome, newest)) = ended.0 else { continue };
             match outcome {
                 Outcome::Continued | Outcome::Ended => {}
                 Outcome::Refused(refusal) => {
@@ -68,12 +70,37 @@ pub(super) fn all(folder: &Path, pacer: &Pacer, limits: &Limits) -> Result<Found
     Ok(found)
 }
 
+fn list(folder: &Path) -> Result<Vec<JournalFile>> {
+    journal::file::list(folder).map_err(|error| {
+        Refusal::new(Reason::Unreadable, "journal", format!("{}: can't be read: {error}", folder.display()))
+    })
+}
+
+/// Continues one session whose journals are in `folder`.
+///
+/// # Errors
+/// Refuses if it can't be continued.
+pub(super) fn session(folder: &Path, id: &str, revision: u64, pacer: &Pacer, limits: &Limits) -> Result<()> {
+    let mut files = list(folder)?;
+    files.retain(|file| file.session_id == id);
+    if files.is_empty() {
+        return Err(Refusal::new(Reason::UnknownSession, "session_id", "there is no journal of this session"));
+    }
+    match one(&files, revision, pacer, limits).0 {
+        Outcome::Continued => Ok(()),
+        Outcome::Ended => {
+            Err(Refusal::new(Reason::SessionDeleted, "session_id", "its journal says that it is deleted"))
+        }
+        Outcome::Refused(refusal) => Err(refusal),
+    }
+}
+
 /// Continues a session of which these are the journals, by ascending run.
-fn one<'f>(files: &'f [JournalFile], pacer: &Pacer, limits: &Limits) -> (Outcome, &'f JournalFile) {
+fn one<'f>(files: &'f [JournalFile], revision: u64, pacer: &Pacer, limits: &Limits) -> (Outcome, &'f JournalFile) {
     let mut newest = &files[files.len() - 1];
     for file in files.iter().rev() {
         newest = file;
-        match continued(file, pacer, limits) {
+        match continued(file, revision, pacer, limits) {
             Ok(outcome) => return (outcome, newest),
             // The server ended before anything of this run was on the disk: the run before has all.
             Err(refusal) if refusal.reason == Reason::Missing => {}
@@ -83,21 +110,24 @@ fn one<'f>(files: &'f [JournalFile], pacer: &Pacer, limits: &Limits) -> (Outcome
     (Outcome::Ended, newest)
 }
 
-fn continued(file: &JournalFile, pacer: &Pacer, limits: &Limits) -> Result<Outcome> {
+fn continued(file: &JournalFile, revision: u64, pacer: &Pacer, limits: &Limits) -> Result<Outcome> {
     let mut reader = Reader::open(&file.path)?;
     let survey = reader.survey(&mut |_| {})?;
-    if survey.end.as_ref().is_some_and(|end| end.why() == pb::Why::Deleted) {
+    if survey.end.as_ref().is_some_and(|end| [pb::Why::Deleted, pb::Why::Moved].contains(&end.why())) {
         return Ok(Outcome::Ended);
     }
-    let mut resumed = replay::resume(reader, limits)?;
+    let until_step = survey.until_step;
+    let mut resumed = Replay::near(reader, survey, limits, until_step)?.resume()?;
     let begin = Begin {
         id: file.session_id.clone(),
         first: resumed.first.clone(),
         running: resumed.running,
         until: resumed.until_step,
         idle_timeout_s: resumed.header.idle_timeout_s,
-        overrun_count: 0,
         playback: None,
+        after_run: file.run,
+        revision,
+        frozen: false,
     };
     let owner = pacer.budget.account(&resumed.header.owner);
     let (step, torn_bytes) = (resumed.session.step_count(), resumed.survey.torn_bytes);

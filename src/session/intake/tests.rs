@@ -20,18 +20,7 @@ fn intake() -> (Intake, Schedule) {
 }
 
 fn release(sequence: u64, at_step: Option<u64>) -> Command {
-    let (client_time_ns, time_to_live_s, arrival_ns) = (0, None, 0);
-    let sequence = Some(sequence);
-    Command {
-        tool: 0,
-        sequence,
-        client_time_ns,
-        by_datagram: false,
-        at_step,
-        time_to_live_s,
-        action: Action::Release,
-        arrival_ns,
-    }
+    Command { at_step, ..Command::new(0, Some(sequence), Action::Release) }
 }
 
 fn steps(intake: &Intake) -> Vec<u64> {

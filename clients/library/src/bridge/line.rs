@@ -1,54 +1,52 @@
 //! The network side of a bridge: connects, opens a haptic stream, and passes commands and models on. When the connection
-//! breaks, it connects again.
+//! breaks, it connects again; in a fleet to whichever server has the session then.
 
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use glam::DVec3;
+use palpate_proto::error::elsewhere;
 use palpate_proto::geometry::{from_vector, vector};
 use palpate_proto::refusal::Reason;
 use palpate_proto::{pb, touch};
+use palpate_touch::Device;
 use palpate_touch::carrier::Carried;
 use palpate_touch::deadband::HEARTBEAT_S;
-use palpate_touch::renderer::MOST_LAWS;
-use palpate_touch::{Device, Law, LocalModel};
 use pb::command::Action;
 use pb::session_service_client::SessionServiceClient;
 use pb::touch_request::Message as Say;
 use pb::touch_response::Message as Heard;
-use tokio::sync::mpsc;
+use tokio::sync::{Notify, mpsc};
 use tokio_stream::wrappers::ReceiverStream;
+use tonic_types::StatusExt;
 
+use super::ticker::{Command, Feed};
 use super::{Session, Target};
 use crate::Error;
-use crate::connect::{Channel, Server};
+use crate::connect::Server;
 use crate::datagrams::Datagrams;
+use crate::exchange::Reader;
+use crate::fleet::{AGAIN, At, Trail, follow};
 use crate::touch::Touch;
 
-/// The data that the network passes to the device's loop. Only the newest counts; neither waits for the other.
+/// What a bridge tells of itself. The loop of a device has no part in it.
 #[derive(Default)]
 pub(super) struct Shared {
     inbound: Mutex<Inbound>,
+    /// A connection has been opened.
+    pub(super) opened: Notify,
 }
 
-/// What has arrived since it was last asked for.
+/// How the network's side stands.
 #[derive(Default)]
 pub(super) struct Inbound {
-    /// The law of a new connection.
-    pub(super) law: Option<Law>,
-    /// Further laws of the newest connection, and their numbers, at most [`MOST_LAWS`].
-    pub(super) further: Vec<(u32, Law)>,
-    /// The middle of the sheet, m.
-    pub(super) middle_m: DVec3,
-    /// Of the newest connection.
-    pub(super) newest: Option<LocalModel>,
     pub(super) traffic: Traffic,
-    /// The longest time between two poses that the server wants, s; 0 before it has said so.
-    pub(super) wanted_s: f64,
     /// Why the newest connection broke, or never came to be; `None` while one stands.
     pub(super) failure: Option<Error>,
     /// The session that was made for the target.
     pub(super) made: Option<String>,
+    /// Who had the session at last.
+    at: Option<Server>,
 }
 
 /// What went over the network, in all.
@@ -76,48 +74,84 @@ impl Shared {
     }
 }
 
-/// Where a tool was.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Command {
-    /// By the client's clock.
-    pub(super) client_time_ns: u64,
-    /// m.
-    pub(super) place_m: DVec3,
-    /// How it moved, m/s, if the server is to go on like that.
-    pub(super) velocity_m_per_s: Option<DVec3>,
+/// The commands of a loop, for the network.
+pub(super) struct Commands {
+    pub(super) queue: Reader<Command>,
+    /// Told when something is in the queue, or the loop is over.
+    pub(super) news: Arc<Notify>,
+}
+
+impl Commands {
+    /// The next; `None` after the last. None is lost if you drop the future.
+    async fn recv(&mut self) -> Option<Command> {
+        loop {
+            let is_over = self.queue.is_over();
+            if let Some(command) = self.queue.pop() {
+                return Some(command);
+            }
+            if is_over {
+                return None;
+            }
+            self.news.notified().await;
+        }
+    }
 }
 
 /// First and longest pause before it connects again.
 const PAUSES: [Duration; 2] = [Duration::from_millis(100), Duration::from_secs(2)];
 
+/// A session that is sent on more often than this, with no sample in between, waits as after a break.
+const MOST_MOVES: u32 = 8;
+
 /// A connection on which the server is silent for longer than this is given up.
 const SILENCE: Duration = Duration::from_secs(2);
 
-/// Largest number of commands on their way to the network: more would be a backlog.
-pub(super) const COMMANDS: usize = 64;
+/// Largest number of commands that wait for the stream.
+const COMMANDS: usize = 64;
 
 /// Keeps a connection until `commands` ends.
 pub(super) async fn keep(
     target: Target,
     device: Device,
     shared: &Shared,
-    mut commands: mpsc::Receiver<Command>,
+    mut feed: Feed,
+    mut commands: Commands,
     warn: &(impl Fn(&str) + Sync),
 ) {
     let mut pause = PAUSES[0];
     // Attempts in a row.
     let mut attempts = 0_u64;
+    // How often the session was elsewhere, in a row.
+    let mut moves = 0;
+    let mut trail = Trail::new(target.server.clone().within(SILENCE));
     loop {
         let before = shared.inbound().traffic;
-        let ended = connect(&target, &device, shared, &mut commands, warn).await;
+        let ended = connect(&target, &mut trail, &device, shared, &mut feed, &mut commands, warn).await;
         let Err(error) = ended else { return };
+        // After a move the tool is still in the tissue, and goes on by its lease; not after anything else.
+        let went_on = moved_to(&error).is_none() && !std::mem::take(&mut trail.lease_id).is_empty();
+        if went_on && is_of(&error, Reason::NotHolder) {
+            continue;
+        }
+        if shared.inbound().traffic.samples > before.samples {
+            moves = 0;
+        }
+        if let Some(endpoint) = moved_to(&error).filter(|_| moves < MOST_MOVES)
+            && trail.go(&endpoint).is_ok()
+        {
+            moves += 1;
+            let moved = format!("the session is at {endpoint} now");
+            warn(&moved);
+            shared.inbound().failure = Some(Error::Connection(moved));
+            continue;
+        }
         let traffic = {
             let mut inbound = shared.inbound();
             inbound.traffic.failed += 1;
             inbound.traffic
         };
         // Another attempt would be refused too.
-        if traffic.connections == 0 && (error.is_refusal() || is_denied(&error)) {
+        if traffic.connections == 0 && (error.is_refusal() || error.is_denied()) {
             shared.inbound().failure = Some(error);
             return;
         }
@@ -126,6 +160,9 @@ pub(super) async fn keep(
             pause = PAUSES[0];
         }
         let tried = if attempts == 1 { "1 attempt".to_owned() } else { format!("{attempts} attempts") };
+        if trail.is_awaited() {
+            pause = pause.min(AGAIN);
+        }
         let since = match (traffic.connections, attempts) {
             (0, _) => format!("never connected, in {tried}"),
             (_, 0) => "the connection was lost".to_owned(),
@@ -150,50 +187,72 @@ pub(super) async fn keep(
     }
 }
 
-/// Whether the server does not let the caller in.
-fn is_denied(error: &Error) -> bool {
-    use tonic::Code::{PermissionDenied, Unauthenticated};
-    matches!(error, Error::Call(status) if [Unauthenticated, PermissionDenied].contains(&status.code()))
+/// The server that has the session, if another said so.
+fn moved_to(error: &Error) -> Option<String> {
+    let Error::Call(status) = error else { return None };
+    elsewhere(status)
+}
+
+fn is_of(error: &Error, reason: Reason) -> bool {
+    let Error::Call(status) = error else { return false };
+    status.get_details_error_info().is_some_and(|info| info.reason == reason.as_str())
 }
 
 /// Deletes the session that was made for the target, if there is one. A server that can't be reached deletes it later by
 /// itself.
-pub(super) async fn delete_made(server: Server, shared: &Shared) {
-    let made = shared.inbound().made.take();
-    let Some(session_id) = made else { return };
-    let deleting = async {
-        let mut sessions = SessionServiceClient::new(server.within(SILENCE).connect().await?);
-        sessions.delete_session(pb::DeleteSessionRequest { session_id }).await?;
-        Ok::<(), Error>(())
+pub(super) async fn delete_made(server: &Server, shared: &Shared) {
+    let (made, at) = {
+        let mut inbound = shared.inbound();
+        (inbound.made.take(), inbound.at.take())
     };
+    let Some(session_id) = made else { return };
+    let request = pb::DeleteSessionRequest { session_id };
+    let server = at.unwrap_or_else(|| server.clone()).within(SILENCE);
+    let deleting = follow(&server, |channel| {
+        let request = request.clone();
+        async move { SessionServiceClient::new(channel).delete_session(request).await }
+    });
     let _ = tokio::time::timeout(SILENCE, deleting).await;
 }
 
-/// The session of a target.
-async fn session(target: &Target, shared: &Shared, channel: Channel) -> Result<pb::Session, Error> {
-    let mut sessions = SessionServiceClient::new(channel);
+/// The session of a target, and who has it.
+async fn session(target: &Target, trail: &mut Trail, shared: &Shared) -> Result<At<pb::Session>, Error> {
     let made = shared.inbound().made.clone();
     let (id, scene) = match &target.session {
         Session::Existing(id) => (Some(id), None),
         Session::New { scene } => (made.as_ref(), Some(scene)),
     };
+    let is_unknown = |error: &Error| matches!(error, Error::Call(status) if status.code() == tonic::Code::NotFound);
     let mut known = None;
     if let Some(id) = id {
-        let request = pb::GetSessionRequest { session_id: id.clone() };
-        known = match sessions.get_session(request).await {
-            Ok(answer) => answer.into_inner().session,
+        known = match trail.seek(id).await {
+            Ok(at) => Some(at),
             // The server was restarted and no longer has the session.
-            Err(status) if status.code() == tonic::Code::NotFound && scene.is_some() => None,
-            Err(status) => return Err(status.into()),
+            Err(error) if is_unknown(&error) && scene.is_some() => None,
+            Err(error) => return Err(error),
         };
     }
     if let (None, Some(scene)) = (&known, scene) {
+        let server = trail.server().clone();
+        let channel = server.connect().await?;
         let source = pb::create_session_request::Source::SceneName(scene.clone());
         let request = pb::CreateSessionRequest { source: Some(source), ..Default::default() };
-        known = sessions.create_session(request).await?.into_inner().session;
-        shared.inbound().made = known.as_ref().map(|session| session.session_id.clone());
+        let created = SessionServiceClient::new(channel.clone()).create_session(request).await?.into_inner().session;
+        let created = created.ok_or_else(|| broken("the server sent no session"))?;
+        {
+            let mut inbound = shared.inbound();
+            inbound.made = Some(created.session_id.clone());
+            inbound.at = Some(server.clone());
+        }
+        known = Some(match &created.ownership {
+            // A fleet may have made it at another server.
+            Some(_) => trail.seek(&created.session_id).await?,
+            None => At { server, channel, answer: created },
+        });
     }
-    known.ok_or_else(|| broken("the server sent no session"))
+    let known = known.ok_or_else(|| broken("the server sent no session"))?;
+    shared.inbound().at = Some(known.server.clone());
+    Ok(known)
 }
 
 /// The middle of a session's tissue at rest, m.
@@ -206,21 +265,17 @@ fn broken(why: &str) -> Error {
     Error::Connection(why.to_owned())
 }
 
-/// The law in a message.
-fn law(message: &pb::ForceLaw) -> Result<Law, Error> {
-    touch::from_law(message).map_err(|refusal| Error::Connection(refusal.to_string()))
-}
-
 /// One connection, until it breaks or `commands` ends.
 async fn connect(
     target: &Target,
+    trail: &mut Trail,
     device: &Device,
     shared: &Shared,
-    commands: &mut mpsc::Receiver<Command>,
+    feed: &mut Feed,
+    commands: &mut Commands,
     warn: &(impl Fn(&str) + Sync),
 ) -> Result<(), Error> {
-    let channel = target.server.clone().within(SILENCE).connect().await?;
-    let session = session(target, shared, channel.clone()).await?;
+    let At { server, channel, answer: session } = session(target, trail, shared).await?;
     let middle_m = middle_m(&session)?;
     let (outbound, messages) = mpsc::channel(COMMANDS);
     let open = pb::TouchOpen {
@@ -235,58 +290,48 @@ async fn connect(
         // A bridge that hangs must not hold a tool for long.
         lease_s: Some(SILENCE.as_secs_f64()),
         datagrams: target.datagrams,
+        lease_id: trail.lease_id.clone(),
         ..Default::default()
     };
     let silent = |_| broken("the server is silent");
     let opening = Touch::open(channel, open, ReceiverStream::new(messages));
     let mut stream = tokio::time::timeout(SILENCE, opening).await.map_err(silent)??;
+    trail.lease_id.clone_from(&stream.opened().lease_id);
     stream.opened().warnings.iter().for_each(|warning| warn(warning));
     let first = stream.opened().law.as_ref().ok_or_else(|| broken("the server sent no force law"))?;
-    let first = law(first)?;
+    feed.begin(first, middle_m)?;
     {
         let mut inbound = shared.inbound();
         inbound.traffic.connections += 1;
         inbound.failure = None;
-        (inbound.law, inbound.further) = (Some(first), Vec::new());
-        (inbound.newest, inbound.middle_m) = (None, middle_m);
     }
+    shared.opened.notify_one();
     // Commands that waited while the stream was opened are old.
-    while commands.try_recv().is_ok() {}
+    while commands.queue.pop().is_some() {}
     let mut sequence = 0;
-    let mut datagrams = Datagrams::dial(stream.opened().datagrams.as_ref(), &target.server);
+    let mut datagrams = Datagrams::dial(stream.opened().datagrams.as_ref(), &server);
     // Those of earlier connections.
     let before = shared.inbound().traffic.carried;
-    let take = |sample: &pb::Sample, datagrams: &mut Datagrams| {
+    let take = |sample: &pb::Sample, datagrams: &mut Datagrams, feed: &mut Feed| {
         let now = datagrams.carried();
-        let mut inbound = shared.inbound();
-        inbound.traffic.samples += 1;
-        inbound.traffic.bytes += touch::wire_bytes(sample);
-        inbound.traffic.carried = Carried {
-            sent: before.sent + now.sent,
-            came: before.came + now.came,
-            fell_back: before.fell_back + now.fell_back,
-        };
-        inbound.wanted_s = datagrams.wanted_s();
-        if let Some(model) = sample.tools.first().and_then(|tool| tool.local_model.as_ref()) {
-            let model = touch::from_local_model(model, sample.step);
-            if inbound.newest.as_ref().is_none_or(|newest| newest.sequence < model.sequence) {
-                inbound.newest = Some(model);
-            }
+        {
+            let mut inbound = shared.inbound();
+            inbound.traffic.samples += 1;
+            inbound.traffic.bytes += touch::wire_bytes(sample);
+            inbound.traffic.carried = Carried {
+                sent: before.sent + now.sent,
+                came: before.came + now.came,
+                fell_back: before.fell_back + now.fell_back,
+            };
         }
+        feed.receive(sample, datagrams.wanted_s());
     };
     loop {
         tokio::select! {
             heard = tokio::time::timeout(SILENCE, stream.next()) => {
                 match heard.map_err(silent)??.ok_or_else(|| broken("the server has ended the stream"))? {
                     Heard::ForceLaw(update) => match update.law {
-                        Some(message) => {
-                            let law = law(&message)?;
-                            let further = &mut shared.inbound().further;
-                            if further.len() == MOST_LAWS {
-                                further.remove(0);
-                            }
-                            further.push((message.number, law));
-                        }
+                        Some(message) => feed.learn(&message)?,
                         None => {
                             let stays = if update.tissue_step.is_some() { "that of the old tissue" } else { "a coarse one" };
                             warn(&format!("the force law stays {stays}: {} ({})", update.message, update.reason));
@@ -296,8 +341,8 @@ async fn connect(
                         if sample.held {
                             return Err(broken("the session was stopped by its guard"));
                         }
-                        if datagrams.is_newer(&sample) {
-                            take(&sample, &mut datagrams);
+                        if trail.is_current(sample.ownership_revision) && datagrams.is_newer(&sample) {
+                            take(&sample, &mut datagrams, feed);
                         }
                     }
                     Heard::Rejection(rejection) => {
@@ -311,7 +356,11 @@ async fn connect(
                     Heard::Opened(_) => {}
                 }
             }
-            sample = datagrams.next() => take(&sample, &mut datagrams),
+            sample = datagrams.next() => {
+                if trail.is_current(sample.ownership_revision) {
+                    take(&sample, &mut datagrams, feed);
+                }
+            }
             command = commands.recv() => {
                 let Some(Command { client_time_ns, place_m, velocity_m_per_s }) = command else { return Ok(()) };
                 sequence += 1;

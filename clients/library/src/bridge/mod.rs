@@ -1,26 +1,34 @@
-//! Connects a haptic device to a server: a loop at 1 kHz on a thread of its own, and the network beside it.
+//! Connects a haptic device to a server: a loop at 1 kHz, and the network beside it.
+//!
+//! [`run`] has the loop on a thread of its own. Code that has such a thread gets the same as [`Ticker`] from [`begin`]; and
+//! [`Offline`] renders what was recorded, without a network.
 //!
 //! When the connection breaks, the network side connects again. Forces return when the operator asks for them. Commands that
 //! were not sent by then are dropped: nothing old is replayed.
 
 mod line;
+mod offline;
 mod tick;
+mod ticker;
 
 use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
-use palpate_touch::{Envelope, Tip};
-use tokio::sync::{mpsc, oneshot};
+use palpate_touch::{Device, Envelope, Tip};
+use tokio::sync::{Notify, oneshot};
 use tokio::task::JoinSet;
 
 use crate::Error;
 use crate::connect::Server;
 use crate::device::HapticDevice;
-use line::Shared;
+use crate::os::{self, Priority};
+use line::{Commands, Shared};
 
 pub use line::Traffic;
+pub use offline::{Offline, Record};
 pub use tick::{TICK_S, Tick};
+pub use ticker::{Origin, Ticker};
 
 /// What a device is connected to.
 #[derive(Debug, Clone)]
@@ -58,25 +66,33 @@ pub enum Session {
 /// A function that shows a text to people.
 pub type Warn = Box<dyn Fn(&str) + Send + Sync>;
 
-/// Options of [`run`].
+/// A function that is told the priority of a loop.
+pub type Begun = Box<dyn FnOnce(&Priority) + Send>;
+
+/// Options of [`run`] and [`begin`].
 #[derive(Default)]
 pub struct Options {
-    /// Time after which it ends; `None`: no limit.
+    /// Time after which [`run`] ends; `None`: no limit.
     pub lasts: Option<Duration>,
-    /// Keeps the course and the ages of the models, of at most an hour.
+    /// [`run`] keeps the course and the ages of the models, of at most an hour.
     pub remembers: bool,
+    /// The loop of [`run`] asks the system for real-time priority. [`Report::priority`] and `warn` tell what came of it.
+    pub real_time: bool,
     /// Keeps the session that was made for the target, for others; the server deletes it when nobody has used it for long.
     pub keeps_session: bool,
     /// Called when the connection breaks, and with the server's warnings.
     pub warn: Option<Warn>,
+    /// Called by the loop of [`run`] before its first tick, with its priority.
+    pub begun: Option<Begun>,
 }
 
 impl fmt::Debug for Options {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Options { lasts, remembers, keeps_session, warn } = self;
+        let Options { lasts, remembers, real_time, keeps_session, warn, begun } = self;
         let mut fields = f.debug_struct("Options");
-        fields.field("lasts", lasts).field("remembers", remembers).field("keeps_session", keeps_session);
-        fields.field("warn", &warn.is_some()).finish()
+        fields.field("lasts", lasts).field("remembers", remembers).field("real_time", real_time);
+        fields.field("keeps_session", keeps_session);
+        fields.field("warn", &warn.is_some()).field("begun", &begun.is_some()).finish()
     }
 }
 
@@ -93,6 +109,8 @@ pub struct Report {
     pub late_ticks: u64,
     /// Number of ticks that were skipped.
     pub missed_ticks: u64,
+    /// With which priority the loop ran.
+    pub priority: Priority,
     /// What went over the network.
     pub traffic: Traffic,
     /// Why there was no connection any more at the end.
@@ -111,46 +129,154 @@ pub async fn run<D: HapticDevice + 'static>(
     options: Options,
     stop: impl Future<Output = ()> + Send + 'static,
 ) -> Result<(D, Report), Error> {
-    let Options { lasts, remembers, keeps_session, warn } = options;
-    let server = target.server.clone();
-    let shared = Arc::new(Shared::default());
-    let (commands, received) = mpsc::channel(line::COMMANDS);
+    let Options { lasts, remembers, real_time, keeps_session, warn, begun } = options;
     let descriptor = device.descriptor();
-    let up_deadband = target.up_deadband;
-    // If this future is dropped, the task is aborted; the loop then finds its channel closed and ends.
+    let warn = Arc::new(warn);
+    let (ticker, mut line) = line(target, descriptor, Origin::Workspace, keeps_session, warn.clone(), stop);
+    let news = line.news.clone();
+    let (tell, ended) = oneshot::channel();
+    std::thread::Builder::new().name("device".to_owned()).spawn(move || {
+        let priority = if real_time { os::take_real_time_priority() } else { Priority::Usual };
+        if let (Priority::Refused(why), Some(warn)) = (&priority, &*warn) {
+            warn(&format!("the loop has no real-time priority, so other programs may delay it: {why}"));
+        }
+        if let Some(begun) = begun {
+            begun(&priority);
+        }
+        let served = tick::serve(&mut device, ticker, &news, lasts, remembers);
+        let _ = tell.send((device, served, priority));
+    })?;
+    let (device, served, priority) =
+        ended.await.map_err(|_| Error::Internal("the device's loop panicked".to_owned()))?;
+    line.close().await;
+    let tick::Served { course, envelope, late_ticks, missed_ticks, ages_s } = served?;
+    let mut inbound = line.shared.inbound();
+    let (traffic, lost) = (inbound.traffic, inbound.failure.take());
+    if traffic.connections == 0 {
+        return Err(lost.unwrap_or_else(silent));
+    }
+    Ok((device, Report { course, ages_s, envelope, late_ticks, missed_ticks, priority, traffic, lost }))
+}
+
+fn silent() -> Error {
+    Error::Connection("never connected: the server did not answer in time".to_owned())
+}
+
+/// Begins to connect.
+fn line(
+    target: Target,
+    device: Device,
+    origin: Origin,
+    keeps_session: bool,
+    warn: Arc<Option<Warn>>,
+    stop: impl Future<Output = ()> + Send + 'static,
+) -> (Ticker, Connection) {
+    let server = target.server.clone();
+    let (ticker, feed, queue) = ticker::ticker(device, origin, target.up_deadband);
+    let (shared, news) = (Arc::new(Shared::default()), Arc::new(Notify::new()));
+    let commands = Commands { queue, news: news.clone() };
     let mut network = JoinSet::new();
     network.spawn({
         let shared = shared.clone();
         async move {
             let warn = |message: &str| warn.iter().for_each(|warn| warn(message));
             tokio::select! {
-                () = line::keep(target, descriptor, &shared, received, &warn) => {}
-                // The loop then finds its channel closed.
+                () = line::keep(target, device, &shared, feed, commands, &warn) => {}
+                // The loop then finds that it is over.
                 () = stop => {}
             }
         }
     });
-    let (tell, ended) = oneshot::channel();
-    std::thread::Builder::new().name("device".to_owned()).spawn({
-        let shared = shared.clone();
-        move || {
-            let served = tick::serve(&mut device, &shared, &commands, up_deadband, lasts, remembers);
-            drop(commands);
-            let _ = tell.send((device, served));
+    (ticker, Connection { network, shared, news, server, keeps_session })
+}
+
+/// How often the courier of [`begin`] looks whether there is something to send.
+const ROUND: Duration = Duration::from_micros(250);
+
+/// Connects a loop of your own. Waits for the first connection; later ones are made without you. `device` is what the forces
+/// are limited to, and the server is told of it.
+///
+/// A tick wakes nobody, because that would be a call of the system. A thread, the courier, sees within a quarter of a
+/// millisecond that a tick has something to send.
+///
+/// # Errors
+/// Returns the server's refusal, or why it can't be reached.
+pub async fn begin(
+    target: Target,
+    device: Device,
+    origin: Origin,
+    options: Options,
+) -> Result<(Ticker, Connection), Error> {
+    let Options { keeps_session, warn, .. } = options;
+    let (ticker, mut line) = line(target, device, origin, keeps_session, Arc::new(warn), std::future::pending());
+    let (peek, news) = (ticker.peek(), line.news.clone());
+    std::thread::Builder::new().name("courier".to_owned()).spawn(move || {
+        while !peek.is_over() {
+            if peek.is_waiting() {
+                news.notify_one();
+            }
+            std::thread::sleep(ROUND);
         }
+        news.notify_one();
     })?;
-    let (device, served) = ended.await.map_err(|_| Error::Internal("the device's loop panicked".to_owned()))?;
-    // The task may wait for an answer that never arrives.
-    network.shutdown().await;
-    if !keeps_session {
-        line::delete_made(server, &shared).await;
+    let is_open = tokio::select! {
+        () = line.shared.opened.notified() => true,
+        _ = line.network.join_next() => false,
+        // A server that can't be reached may be so for long.
+        () = tokio::time::sleep(PATIENCE) => false,
+    };
+    if is_open {
+        return Ok((ticker, line));
     }
-    let tick::Served { course, envelope, late_ticks, missed_ticks, ages_s } = served?;
-    let mut inbound = shared.inbound();
-    let (traffic, lost) = (inbound.traffic, inbound.failure.take());
-    if traffic.connections == 0 {
-        let silent = || Error::Connection("never connected: the server did not answer in time".to_owned());
-        return Err(lost.unwrap_or_else(silent));
+    let error = line.shared.inbound().failure.take().unwrap_or_else(silent);
+    line.close().await;
+    Err(error)
+}
+
+/// Time for the first connection of [`begin`].
+const PATIENCE: Duration = Duration::from_secs(10);
+
+/// The network's side of a [`Ticker`]. When this is dropped, the forces of the ticker fade.
+pub struct Connection {
+    /// If this is dropped, the task is aborted; the loop then finds that it is over.
+    network: JoinSet<()>,
+    shared: Arc<Shared>,
+    /// Told when the loop has something to send.
+    news: Arc<Notify>,
+    server: Server,
+    keeps_session: bool,
+}
+
+impl Connection {
+    /// What went over the network.
+    pub fn traffic(&self) -> Traffic {
+        self.shared.inbound().traffic
     }
-    Ok((device, Report { course, ages_s, envelope, late_ticks, missed_ticks, traffic, lost }))
+
+    /// Why there is no connection now; `None` while one stands.
+    pub fn lost(&self) -> Option<String> {
+        self.shared.inbound().failure.as_ref().map(ToString::to_string)
+    }
+
+    /// Lets go of the tool, and deletes the session that was made for the target unless it was to be kept.
+    pub async fn end(mut self) {
+        self.close().await;
+    }
+
+    async fn close(&mut self) {
+        // The task may wait for an answer that never arrives.
+        self.network.shutdown().await;
+        if !self.keeps_session {
+            line::delete_made(&self.server, &self.shared).await;
+        }
+    }
+}
+
+impl fmt::Debug for Connection {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Connection")
+            .field("server", &self.server)
+            .field("traffic", &self.traffic())
+            .finish_non_exhaustive()
+    }
 }

@@ -4,6 +4,7 @@ use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use glam::DVec3;
 use palpate_client::{Channel, Touch, describe};
 use palpate_proto::pb;
 use pb::touch_request::Message as Say;
@@ -14,7 +15,7 @@ use tokio_stream::wrappers::WatchStream;
 
 use super::stroke::Stroke;
 use super::tally::Tally;
-use super::tip::{self, Deadbands, Led};
+use super::tip::{self, Lead, Led};
 
 pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
@@ -57,7 +58,7 @@ pub(crate) struct Common {
     /// Commands per second.
     pub(crate) rate_hz: f64,
     /// Clients lead tools with a tip.
-    pub(crate) touches: Option<Deadbands>,
+    pub(crate) touches: Option<Lead>,
 }
 
 impl Common {
@@ -106,6 +107,8 @@ struct Heartbeat {
     first: Option<(u64, u64)>,
     last: (u64, u64),
     last_arrival_ns: u64,
+    /// Server's time, ns, and step at which the present second of the measurement began.
+    second: Option<(u64, u64)>,
     /// Samples that were dropped before the measurement.
     dropped_before: Option<u64>,
     dropped: u64,
@@ -138,6 +141,8 @@ pub(crate) struct Client {
     pub(crate) tool: u32,
     pub(crate) rate_hz: f64,
     pub(crate) stroke: Stroke,
+    /// The middle of the tissue, m.
+    pub(crate) middle_m: DVec3,
     /// Present if the session has viewers.
     pub(crate) arrivals: Option<Arc<Mutex<Arrivals>>>,
 }
@@ -147,6 +152,9 @@ const PATIENCE: Duration = Duration::from_secs(2);
 
 /// A session that was silent for longer than this at the end of the measurement had stopped, ns.
 const SILENCE_NS: u64 = 50_000_000;
+
+/// A second, ns.
+const SECOND_NS: u64 = 1_000_000_000;
 
 impl Client {
     /// Opens the stream; `ticks` tells when to send. The returned future is the client's life.
@@ -163,10 +171,10 @@ impl Client {
             ..Default::default()
         };
         let touches = self.common.touches;
-        if touches.is_some() && self.stroke.place_m(0.0).is_none() {
+        if touches.is_some_and(|lead| lead.hand.is_none()) && self.stroke.place_m(0.0).is_none() {
             return Err(tonic::Status::invalid_argument("--touch is for sheets: this scene has a mesh"));
         }
-        let open = touches.map_or(open.clone(), |deadbands| tip::opening(open, deadbands));
+        let open = touches.map_or(open.clone(), |lead| tip::opening(open, &lead));
         let at_ns = Box::new([0; OUTSTANDING]);
         let sent =
             Sent { sequence: 0, at_ns, acknowledged: 0, last_tick: None, is_open: false, led: None, newest: (0, 0) };
@@ -178,7 +186,7 @@ impl Client {
         let inbound = Touch::open(channel, open, commands.map(Say::Command)).await?;
         {
             let mut sent = lock(&sent);
-            sent.led = touches.and_then(|deadbands| Led::new(inbound.opened(), deadbands));
+            sent.led = touches.and_then(|lead| Led::new(inbound.opened(), &lead, self.middle_m));
             if touches.is_some() && sent.led.is_none() {
                 return Err(tonic::Status::failed_precondition("the server tells no force law for --touch"));
             }
@@ -260,6 +268,14 @@ impl Client {
         if let Some(tally) = &mut tally {
             if heartbeat.first.is_some() {
                 tally.sample_gap_ns.saturating_record(now_ns - heartbeat.last_arrival_ns);
+            }
+            let (from_ns, from_step) = *heartbeat.second.get_or_insert((sample.server_time_ns, sample.step));
+            let passed_ns = sample.server_time_ns.saturating_sub(from_ns);
+            if passed_ns >= SECOND_NS {
+                #[allow(clippy::cast_precision_loss)]
+                let simulated_s = sample.step.saturating_sub(from_step) as f64 / self.rate_hz;
+                tally.dilation_s_min = tally.dilation_s_min.min(simulated_s / (passed_ns as f64 * 1e-9));
+                heartbeat.second = Some((sample.server_time_ns, sample.step));
             }
             tally.samples += 1;
             tally.awake_points += u64::from(sample.awake_points);

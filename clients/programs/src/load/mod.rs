@@ -1,28 +1,34 @@
 //! `palpate-client load`: loads a server with sessions, clients and viewers, and measures how it copes.
 
 mod client;
+mod course;
 mod objective;
+mod plan;
+mod report;
 mod stroke;
 mod swarm;
 mod tally;
 mod tip;
 
 use std::io::IsTerminal;
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use palpate_client::Server;
 use palpate_proto::pb::create_session_request::Source;
+use palpate_touch::Device;
 use tokio::sync::watch;
 
 use crate::Failure;
 use crate::credentials::CredentialOptions;
 use crate::scene_file::SceneFile;
+use crate::within;
 use client::{Common, Stage, lock};
 use objective::Objective;
 use swarm::{Orders, Stopped, Swarm};
 use tally::{Outcome, Tally};
-use tip::Deadbands;
+use tip::{DEVICE, Deadbands, Lead};
 
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
@@ -73,6 +79,13 @@ pub(crate) struct Arguments {
     /// max (round trip), gap_p99, gap_max, frame_age_p99, dilation, lost and rejected, such as 'p99<2ms,dilation>0.999'
     #[arg(long, value_name = "OBJECTIVE")]
     find_limit: Option<Objective>,
+    /// Load the server by this plan (TOML): phases, arrivals, mixes and objectives, in place of the numbers above
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["sessions", "clients_per_session", "viewers", "scene", "seconds",
+        "ramp_s", "rate_hz", "frame_rate_hz", "touch", "find_limit", "clients_per_connection", "threads"])]
+    plan: Option<PathBuf>,
+    /// With --plan: write a page with plots to this file (HTML)
+    #[arg(long, value_name = "FILE", requires = "plan")]
+    report: Option<PathBuf>,
     /// Print one JSON object instead of a table
     #[arg(long)]
     json: bool,
@@ -84,18 +97,15 @@ pub(crate) struct Arguments {
 }
 
 fn seconds(text: &str) -> Result<f64, String> {
-    let value: f64 = text.parse().map_err(|_| "is no number".to_owned())?;
-    if (0.0..=36_000.0).contains(&value) { Ok(value) } else { Err("must be from 0 to 36000".to_owned()) }
+    within(text, 0.0..=36_000.0)
 }
 
 fn fraction(text: &str) -> Result<f64, String> {
-    let value: f64 = text.parse().map_err(|_| "is no number".to_owned())?;
-    if (0.0..=1.0).contains(&value) { Ok(value) } else { Err("must be from 0 to 1".to_owned()) }
+    within(text, 0.0..=1.0)
 }
 
 fn rate(text: &str) -> Result<f64, String> {
-    let value: f64 = text.parse().map_err(|_| "is no number".to_owned())?;
-    if (0.1..=20_000.0).contains(&value) { Ok(value) } else { Err("must be from 0.1 to 20000".to_owned()) }
+    within(text, 0.1..=20_000.0)
 }
 
 /// Clients send at this many moments of a period: not all at once, and without a wake-up for each.
@@ -115,6 +125,9 @@ const AGREE: usize = 2;
 const MOST_SESSIONS: usize = 1 << 16;
 
 pub(crate) async fn load(arguments: &Arguments) -> Result<(), Failure> {
+    if let Some(path) = &arguments.plan {
+        return course::load(path, arguments).await;
+    }
     let server = arguments.credentials.server(&arguments.server)?;
     let file = SceneFile::read(&arguments.scene)?;
     let source = file.source(server.connect().await.map_err(Failure::from)?).await?;
@@ -242,7 +255,8 @@ async fn trial(arguments: &Arguments, server: &Server, source: &Source, sessions
             lasts_s: (arguments.ramp_s + arguments.seconds + 30.0).min(600.0),
         };
         let deadbands = Deadbands { down: arguments.deadband, up: arguments.up_deadband };
-        let touches = arguments.touch.then_some(deadbands);
+        let device = Device::named(DEVICE).filter(|_| arguments.touch);
+        let touches = device.map(|device| Lead { deadbands, device, hand: None });
         let common = Common { clock, stage: stage.clone(), tally, rate_hz: arguments.rate_hz, touches };
         let (phases, ready, told) = (phases.clone(), ready.clone(), told.clone());
         workers.push(std::thread::spawn(move || work(&orders, &common, &phases, &ready, told)));
@@ -297,7 +311,7 @@ async fn trial(arguments: &Arguments, server: &Server, source: &Source, sessions
     progress.end();
     let mut all = Tally::new();
     for tally in &tallies {
-        all.add(std::mem::replace(&mut *lock(tally), Tally::new()));
+        all.add(&lock(tally));
     }
     if let Some(why) = &all.first_break {
         crate::say!("palpate-client: warning: {} streams broke, the first because {why}", all.broken);

@@ -20,10 +20,13 @@ const QUANTITIES: &[(&str, Quantity)] = &[
     ("dilation", |outcome| outcome.dilation_min),
     ("lost", |outcome| outcome.lost as f64),
     ("rejected", |outcome| outcome.rejected as f64),
+    // Of plans.
+    ("start_p99", |outcome| outcome.start_us.p99 * 1e-6),
+    ("turned_away", |outcome| outcome.turned_away as f64),
 ];
 
 /// One bound.
-#[derive(Clone)]
+#[derive(Debug, Clone)]
 struct Bound {
     text: String,
     quantity: Quantity,
@@ -33,7 +36,7 @@ struct Bound {
 }
 
 /// Bounds that must all hold.
-#[derive(Clone)]
+#[derive(Debug, Clone)]
 pub(crate) struct Objective(Vec<Bound>);
 
 impl FromStr for Objective {
@@ -60,7 +63,7 @@ impl FromStr for Bound {
             .iter()
             .find_map(|(unit, factor)| bound.strip_suffix(unit).map(|number| (number, *factor)))
             .unwrap_or((bound, 1.0));
-        let is_time = !["dilation", "lost", "rejected"].contains(&name);
+        let is_time = !["dilation", "lost", "rejected", "turned_away"].contains(&name);
         if is_time == (number.len() == bound.len()) {
             return Err(format!("`{bound}` is not a valid bound of {name}: {example}"));
         }

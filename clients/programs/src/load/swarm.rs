@@ -1,10 +1,13 @@
 //! The sessions, clients and viewers of one thread of a load.
 
+use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use glam::DVec3;
 use palpate_client::view::Frames;
-use palpate_client::{Channel, Error, Server, describe};
+use palpate_client::{Channel, Error, Server, describe, fleet};
+use palpate_proto::geometry::from_vector;
 use palpate_proto::pb;
 use pb::create_session_request::Source;
 use pb::haptic_service_client::HapticServiceClient;
@@ -54,6 +57,8 @@ impl From<Status> for Stopped {
 /// A session that this thread created.
 struct Made {
     id: String,
+    /// The server that has made it: of a fleet, any.
+    server: Server,
     rate_hz: f64,
     /// Step and our time, ns, at which the measurement began.
     begin: Option<(u64, u64)>,
@@ -62,28 +67,29 @@ struct Made {
 /// Connections that several clients share.
 struct Connections<'o> {
     orders: &'o Orders,
-    newest: Option<(Channel, usize)>,
+    /// By the server.
+    newest: BTreeMap<String, (Channel, usize)>,
 }
 
 impl Connections<'_> {
-    async fn next(&mut self) -> Result<Channel, Stopped> {
-        match &mut self.newest {
-            Some((channel, users)) if *users < self.orders.clients_per_connection => {
-                *users += 1;
-                Ok(channel.clone())
-            }
-            newest => {
-                let channel = self.orders.server.connect().await?;
-                *newest = Some((channel.clone(), 1));
-                Ok(channel)
-            }
+    async fn next(&mut self, server: &Server) -> Result<Channel, Stopped> {
+        if let Some((channel, users)) = self.newest.get_mut(server.url())
+            && *users < self.orders.clients_per_connection
+        {
+            *users += 1;
+            return Ok(channel.clone());
         }
+        let channel = server.connect().await?;
+        self.newest.insert(server.url().to_owned(), (channel.clone(), 1));
+        Ok(channel)
     }
 }
 
 /// The sessions and clients of a thread.
 pub(crate) struct Swarm {
     client: SessionServiceClient<Channel>,
+    /// Connections to the servers that have made sessions.
+    hosts: BTreeMap<String, Channel>,
     made: Vec<Made>,
     tasks: JoinSet<()>,
     common: Common,
@@ -91,15 +97,17 @@ pub(crate) struct Swarm {
 
 impl Swarm {
     pub(crate) async fn new(server: &Server, common: &Common) -> Result<Self, Stopped> {
-        let client = SessionServiceClient::new(server.connect().await?);
-        Ok(Swarm { client, made: Vec::new(), tasks: JoinSet::new(), common: common.clone() })
+        let channel = server.connect().await?;
+        let hosts = BTreeMap::from([(server.url().to_owned(), channel.clone())]);
+        let client = SessionServiceClient::new(channel);
+        Ok(Swarm { client, hosts, made: Vec::new(), tasks: JoinSet::new(), common: common.clone() })
     }
 
     /// Creates the sessions and opens the streams of their clients and viewers.
     pub(crate) async fn gather(&mut self, orders: &Orders, phases: &[watch::Receiver<u64>]) -> Result<(), Stopped> {
-        let mut connections = Connections { orders, newest: None };
+        let mut connections = Connections { orders, newest: BTreeMap::new() };
         // Separate connections: on a shared one, frames would delay samples.
-        let mut viewing = Connections { orders, newest: None };
+        let mut viewing = Connections { orders, newest: BTreeMap::new() };
         let begun = tokio::time::Instant::now();
         for (place, number) in orders.sessions.iter().enumerate() {
             #[allow(clippy::cast_possible_truncation)]
@@ -111,11 +119,14 @@ impl Swarm {
                 idle_timeout_s: Some(10.0),
             };
             let created = self.client.create_session(request).await?.into_inner().session.unwrap_or_default();
-            let scene = created.scene.clone().unwrap_or_default();
+            let server = fleet::home(&orders.server, &created)?;
             let whole = Stroke::new(&created, 0.0);
+            let (middle_m, rate_hz) = (middle_m(&created), rate_hz(&created));
             let (id, step) = (created.session_id, created.step);
-            let rate_hz = scene.stepping.as_ref().and_then(|stepping| stepping.rate_hz).unwrap_or(1000.0);
-            self.made.push(Made { id: id.clone(), rate_hz, begin: None });
+            self.made.push(Made { id: id.clone(), server: server.clone(), rate_hz, begin: None });
+            if !self.hosts.contains_key(server.url()) {
+                self.hosts.insert(server.url().to_owned(), server.connect().await?);
+            }
             let arrivals = (orders.viewers_per_session > 0).then(|| Arc::new(Mutex::new(Arrivals::new())));
             for tool in 0..orders.clients_per_session {
                 let client = Client {
@@ -125,25 +136,20 @@ impl Swarm {
                     rate_hz,
                     #[allow(clippy::cast_precision_loss)]
                     stroke: whole.beginning(0.618 * (number + tool as usize) as f64),
+                    middle_m,
                     arrivals: arrivals.clone(),
                 };
                 let ticks = phases[(number + tool as usize) % phases.len()].clone();
-                self.tasks.spawn(client.open(connections.next().await?, ticks).await?);
+                self.tasks.spawn(client.open(connections.next(&server).await?, ticks).await?);
             }
             if orders.clients_per_session == 0 {
-                let channel = connections.next().await?;
+                let channel = connections.next(&server).await?;
                 keep_awake(channel, &id, whole, rate_hz, step, orders.lasts_s).await?;
             }
             for _ in 0..orders.viewers_per_session {
-                let request = pb::WatchFramesRequest {
-                    session_id: id.clone(),
-                    encoding: pb::Encoding::I16.into(),
-                    rate_hz: Some(orders.frame_rate_hz.min(rate_hz)),
-                    ..Default::default()
-                };
-                let channel = viewing.next().await?;
-                let frames = Frames::open(channel, request).await?;
-                self.tasks.spawn(watch(self.common.clone(), frames, arrivals.clone()));
+                let (channel, frames_hz) = (viewing.next(&server).await?, orders.frame_rate_hz.min(rate_hz));
+                let viewer = view(self.common.clone(), channel, id.clone(), frames_hz, arrivals.clone());
+                self.tasks.spawn(viewer.await?);
             }
         }
         Ok(())
@@ -156,7 +162,12 @@ impl Swarm {
         }
         for made in &mut self.made {
             let request = pb::GetSessionRequest { session_id: made.id.clone() };
-            let answer = self.client.get_session(request).await;
+            let Some(channel) = self.hosts.get(made.server.url()) else { continue };
+            let answer = fleet::follow_from(&made.server, channel.clone(), |channel| {
+                let request = request.clone();
+                async move { SessionServiceClient::new(channel).get_session(request).await }
+            });
+            let answer = answer.await.map(|at| at.answer);
             let now_ns = self.common.now_ns();
             let mut tally = lock(&self.common.tally);
             match answer.map(|answer| answer.into_inner().session.unwrap_or_default()) {
@@ -172,7 +183,7 @@ impl Swarm {
                         }
                     }
                 },
-                Err(status) => tally.broke(describe(&status)),
+                Err(error) => tally.broke(error.to_string()),
             }
         }
     }
@@ -186,8 +197,14 @@ impl Swarm {
     pub(crate) async fn disperse(&mut self) {
         self.tasks.abort_all();
         for made in self.made.drain(..) {
-            let deleted = self.client.delete_session(pb::DeleteSessionRequest { session_id: made.id });
-            if !matches!(tokio::time::timeout(Duration::from_secs(2), deleted).await, Ok(Ok(_))) {
+            let Some(channel) = self.hosts.get(made.server.url()) else { continue };
+            let request = pb::DeleteSessionRequest { session_id: made.id };
+            let deleted = fleet::follow_from(&made.server, channel.clone(), |channel| {
+                let request = request.clone();
+                async move { SessionServiceClient::new(channel).delete_session(request).await }
+            });
+            let is_deleted = matches!(tokio::time::timeout(Duration::from_secs(2), deleted).await, Ok(Ok(_)));
+            if !is_deleted && self.hosts.len() == 1 {
                 // The server is gone, and its sessions with it.
                 return;
             }
@@ -229,6 +246,30 @@ async fn keep_awake(
     let commands = (0..steps.div_ceil(apart)).map(command).collect();
     haptics.send_commands(pb::SendCommandsRequest { session_id: id.to_owned(), lease_id, commands }).await?;
     Ok(())
+}
+
+/// The middle of a session's tissue, m.
+pub(crate) fn middle_m(session: &pb::Session) -> DVec3 {
+    from_vector(session.extent.as_ref().and_then(|extent| extent.middle_m.as_ref()))
+}
+
+/// Steps a second of a session.
+pub(crate) fn rate_hz(session: &pb::Session) -> f64 {
+    let stepping = session.scene.as_ref().and_then(|scene| scene.stepping.as_ref());
+    stepping.and_then(|stepping| stepping.rate_hz).unwrap_or(1000.0)
+}
+
+/// Begins to watch a session. The returned future is the viewer's life.
+pub(crate) async fn view(
+    common: Common,
+    channel: Channel,
+    session_id: String,
+    rate_hz: f64,
+    arrivals: Option<Arc<Mutex<Arrivals>>>,
+) -> Result<impl Future<Output = ()>, Status> {
+    let (encoding, rate_hz) = (pb::Encoding::I16.into(), Some(rate_hz));
+    let request = pb::WatchFramesRequest { session_id, encoding, rate_hz, ..Default::default() };
+    Ok(watch(common, Frames::open(channel, request).await?, arrivals))
 }
 
 /// Counts a viewer's frames until the measurement is over.

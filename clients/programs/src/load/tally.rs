@@ -31,6 +31,12 @@ pub(crate) struct Tally {
     pub(crate) awake_points: u64,
     /// Smallest dilation of all sessions.
     pub(crate) dilation_min: f64,
+    /// Smallest dilation of a session within a second.
+    pub(crate) dilation_s_min: f64,
+    /// From the arrival of a user of a plan until the streams are open.
+    pub(crate) start_ns: Histogram<u64>,
+    /// Users of a plan that could not start, by reason.
+    pub(crate) turned_away: BTreeMap<String, u64>,
     /// Number of streams that broke.
     pub(crate) broken: u64,
     /// Why the first of them broke.
@@ -54,16 +60,20 @@ impl Tally {
             rejected: BTreeMap::new(),
             awake_points: 0,
             dilation_min: f64::INFINITY,
+            dilation_s_min: f64::INFINITY,
+            start_ns: histogram(),
+            turned_away: BTreeMap::new(),
             broken: 0,
             first_break: None,
         }
     }
 
-    pub(crate) fn add(&mut self, other: Tally) {
+    pub(crate) fn add(&mut self, other: &Tally) {
         for (all, one) in [
             (&mut self.round_trip_ns, &other.round_trip_ns),
             (&mut self.sample_gap_ns, &other.sample_gap_ns),
             (&mut self.frame_age_ns, &other.frame_age_ns),
+            (&mut self.start_ns, &other.start_ns),
         ] {
             // Can't fail: both have the same bounds.
             let _ = all.add(one);
@@ -74,13 +84,17 @@ impl Tally {
         self.unsent += other.unsent;
         self.lost_commands += other.lost_commands;
         self.lost_samples += other.lost_samples;
-        for (reason, count) in other.rejected {
-            *self.rejected.entry(reason).or_default() += count;
+        for (reason, count) in &other.rejected {
+            *self.rejected.entry(reason.clone()).or_default() += count;
         }
         self.awake_points += other.awake_points;
         self.dilation_min = self.dilation_min.min(other.dilation_min);
+        self.dilation_s_min = self.dilation_s_min.min(other.dilation_s_min);
+        for (reason, count) in &other.turned_away {
+            *self.turned_away.entry(reason.clone()).or_default() += count;
+        }
         self.broken += other.broken;
-        self.first_break = self.first_break.take().or(other.first_break);
+        self.first_break = self.first_break.take().or_else(|| other.first_break.clone());
     }
 
     pub(crate) fn broke(&mut self, why: String) {
@@ -108,6 +122,8 @@ impl Tally {
             round_trip_us: Quantiles::of(&self.round_trip_ns),
             sample_gap_us: Quantiles::of(&self.sample_gap_ns),
             frame_age_us: Quantiles::of(&self.frame_age_ns),
+            start_us: Quantiles::of(&self.start_ns),
+            turned_away: self.turned_away.values().sum(),
             generator_cores: f64::NAN,
         }
     }
@@ -130,16 +146,21 @@ impl Quantiles {
         Quantiles { p50: at(0.5), p99: at(0.99), p999: at(0.999), max: us(histogram.max()) }
     }
 
-    fn json(self) -> Value {
+    pub(crate) fn json(self) -> Value {
         json!({ "p50": self.p50, "p99": self.p99, "p999": self.p999, "max": self.max })
     }
 
-    fn text(self) -> String {
+    pub(crate) fn text(self) -> String {
         if self.p50.is_nan() {
             return "–".to_owned();
         }
         format!("{:.0} / {:.0} / {:.0} / {:.0} µs", self.p50, self.p99, self.p999, self.max)
     }
+}
+
+/// Counts by reason, for people.
+pub(crate) fn listed(reasons: &BTreeMap<String, u64>) -> String {
+    reasons.iter().map(|(reason, count)| format!("{reason} {count}")).collect::<Vec<_>>().join(", ")
 }
 
 /// Summary of one load.
@@ -161,6 +182,9 @@ pub(crate) struct Outcome {
     pub(crate) round_trip_us: Quantiles,
     pub(crate) sample_gap_us: Quantiles,
     pub(crate) frame_age_us: Quantiles,
+    /// Of a plan alone.
+    pub(crate) start_us: Quantiles,
+    pub(crate) turned_away: u64,
     /// Processor time of this generator per second, cores.
     pub(crate) generator_cores: f64,
 }
@@ -195,14 +219,13 @@ impl Outcome {
 
     /// As a table for a terminal.
     pub(crate) fn table(&self, limit_sessions: Option<usize>) -> String {
-        let reasons: Vec<String> = self.reasons.iter().map(|(reason, count)| format!("{reason} {count}")).collect();
         let mut rows = vec![
             ("sessions", self.sessions.to_string()),
             (
                 "commands",
                 format!("{} sent, {} lost, {} not sent in time", self.commands, self.lost_commands, self.unsent),
             ),
-            ("rejected", format!("{} {}", self.rejected, reasons.join(", ")).trim_end().to_owned()),
+            ("rejected", format!("{} {}", self.rejected, listed(&self.reasons)).trim_end().to_owned()),
             ("samples", format!("{}, {} lost", self.samples, self.lost_samples)),
             ("frames", self.frames.to_string()),
             ("awake points, mean", format!("{:.1}", self.awake_points_mean)),

@@ -5,11 +5,14 @@ use glam::DVec3;
 use palpate_proto::geometry::vector;
 use palpate_proto::{pb, touch};
 use palpate_touch::deadband::HEARTBEAT_S;
+use palpate_touch::hand::{Hand, HandState};
 use palpate_touch::news::News;
-use palpate_touch::{Device, Envelope, Renderer, Tip};
+use palpate_touch::{Device, Envelope, Renderer, RenderingState, Tip};
 use pb::command::Action;
 
 use super::stroke::Stroke;
+use crate::simulated::random::Random;
+use crate::simulated::task::{LEAD_S, Task};
 
 /// What clients leave out because the other end can do without.
 #[derive(Debug, Clone, Copy)]
@@ -20,18 +23,73 @@ pub(crate) struct Deadbands {
     pub(crate) up: f64,
 }
 
-/// The device of all clients.
-const DEVICE: &str = "omega3";
+/// What leads the tool of a client.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Lead {
+    pub(crate) deadbands: Deadbands,
+    pub(crate) device: Device,
+    /// The hand that holds the device, and the seed of its movements; `None`: the tool follows the stroke exactly.
+    pub(crate) hand: Option<(Hand, u64)>,
+}
+
+/// The device of clients that are told of none.
+pub(crate) const DEVICE: &str = "omega3";
+
+/// Scale of the depths of a hand's presses, and how long it has something to do, s.
+const SCALE: f64 = 0.2;
+const LASTS_S: f64 = 3600.0;
+
+/// A hand asks for forces with this period, s, as long as it has none.
+const ASKS_EVERY_S: f64 = 0.3;
+
+/// Longest time that a hand moves between two ticks, s.
+const MOST_S: f64 = 0.02;
 
 /// What a haptic stream of such a client asks for.
-pub(crate) fn opening(open: pb::TouchOpen, deadbands: Deadbands) -> pb::TouchOpen {
+pub(crate) fn opening(open: pb::TouchOpen, lead: &Lead) -> pb::TouchOpen {
     pb::TouchOpen {
-        device: Device::named(DEVICE).map(|device| touch::device(&device)),
+        device: Some(touch::device(&lead.device)),
         tip: Some(touch::tip(&Tip::default())),
-        deadband: (deadbands.down > 0.0)
-            .then(|| pb::Deadband { rendered_fraction: Some(deadbands.down), ..Default::default() }),
+        deadband: (lead.deadbands.down > 0.0)
+            .then(|| pb::Deadband { rendered_fraction: Some(lead.deadbands.down), ..Default::default() }),
         heartbeat_s: Some(HEARTBEAT_S),
         ..open
+    }
+}
+
+/// A hand that holds a device.
+struct Holding {
+    hand: Hand,
+    task: Task,
+    held: HandState,
+    force_n: DVec3,
+    /// The time of the first tick and of the last, s.
+    began_s: f64,
+    last_s: f64,
+    asked_s: f64,
+}
+
+impl Holding {
+    fn new((hand, seed): (Hand, u64), middle_m: DVec3) -> Self {
+        let task = Task::new(middle_m, LEAD_S, LASTS_S, SCALE, &mut Random::new(seed, 0));
+        let held = HandState { place_m: task.start_m(), velocity_m_per_s: DVec3::ZERO };
+        let never = f64::NEG_INFINITY;
+        Holding { hand, task, held, force_n: DVec3::ZERO, began_s: f64::NAN, last_s: never, asked_s: never }
+    }
+
+    /// Where the hand has the tool now, m.
+    fn place_m(&mut self, now_s: f64) -> DVec3 {
+        if self.began_s.is_nan() {
+            (self.began_s, self.last_s) = (now_s, now_s);
+        }
+        let (passed_s, from_s) = ((now_s - self.last_s).clamp(0.0, MOST_S), self.last_s - self.began_s);
+        if passed_s > 0.0 {
+            let (from_m, to_m) = (self.task.at(from_s), self.task.at(from_s + passed_s));
+            let string_n = self.hand.string_n(from_m, self.held.place_m);
+            self.held = self.hand.advance(self.held, from_m, to_m, self.force_n + string_n, passed_s);
+        }
+        self.last_s = now_s;
+        self.held.place_m
     }
 }
 
@@ -40,14 +98,16 @@ pub(crate) struct Led {
     up: f64,
     renderer: Renderer,
     news: News,
+    holding: Option<Holding>,
 }
 
 impl Led {
-    /// Of a stream that was opened; `None` if the server tells no law.
-    pub(crate) fn new(opened: &pb::TouchOpened, deadbands: Deadbands) -> Option<Self> {
+    /// Of a stream that was opened, on a tissue with this middle; `None` if the server tells no law.
+    pub(crate) fn new(opened: &pb::TouchOpened, lead: &Lead, middle_m: DVec3) -> Option<Self> {
         let law = touch::from_law(opened.law.as_ref()?).ok()?;
-        let renderer = Renderer::new(law, Envelope::new(Device::named(DEVICE)?, DVec3::ZERO));
-        Some(Led { up: deadbands.up, renderer, news: News::default() })
+        let renderer = Renderer::new(law, Envelope::new(lead.device, middle_m));
+        let holding = lead.hand.map(|hand| Holding::new(hand, middle_m));
+        Some(Led { up: lead.deadbands.up, renderer, news: News::default(), holding })
     }
 
     /// A further law.
@@ -68,8 +128,21 @@ impl Led {
 
     /// One tick of the device: renders, and tells what is to be said of the tool.
     pub(crate) fn tick(&mut self, stroke: &Stroke, time_s: f64, now_s: f64) -> Option<Action> {
-        let place_m = stroke.place_m(time_s)?;
-        self.renderer.tick(now_s, place_m);
+        let place_m = match &mut self.holding {
+            None => stroke.place_m(time_s)?,
+            Some(holding) => {
+                if self.renderer.state() != RenderingState::Enabled && now_s - holding.asked_s > ASKS_EVERY_S {
+                    self.renderer.envelope.reset();
+                    self.renderer.envelope.enable();
+                    holding.asked_s = now_s;
+                }
+                holding.place_m(now_s)
+            }
+        };
+        let force_n = self.renderer.tick(now_s, place_m);
+        if let Some(holding) = &mut self.holding {
+            holding.force_n = force_n;
+        }
         let velocity_m_per_s = if self.up > 0.0 {
             let told = self.news.tell(now_s, place_m, self.renderer.way_m(self.up), HEARTBEAT_S)?;
             vector(told.velocity_m_per_s)

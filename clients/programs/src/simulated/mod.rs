@@ -2,6 +2,7 @@
 
 pub(crate) mod network;
 pub(crate) mod random;
+pub(crate) mod relay;
 pub(crate) mod task;
 
 use std::time::Instant;

@@ -1,0 +1,97 @@
+//! Frames of engines: which way axes point, and how long a unit is.
+
+use glam::DVec3;
+
+use crate::error::Fault;
+
+/// Axes and unit of positions, normals and forces.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum palpate_axes {
+    /// Palpate's own: right-handed, x to the right, y away, z up; metres.
+    #[default]
+    PALPATE_AXES_OWN = 0,
+    /// Unity's: left-handed, x to the right, y up, z away; metres. Triangles are clockwise from outside.
+    PALPATE_AXES_UNITY = 1,
+    /// Unreal's: left-handed, x away, y to the right, z up; centimetres. Textures begin at the top.
+    PALPATE_AXES_UNREAL = 2,
+}
+
+pub use palpate_axes::*;
+
+/// Three components, in the axes that were asked for.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct palpate_vector {
+    /// The first component.
+    pub x: f64,
+    /// The second.
+    pub y: f64,
+    /// The third.
+    pub z: f64,
+}
+
+impl palpate_vector {
+    pub(crate) fn own(v: DVec3) -> Self {
+        palpate_vector { x: v.x, y: v.y, z: v.z }
+    }
+
+    pub(crate) fn vector(self) -> DVec3 {
+        DVec3::new(self.x, self.y, self.z)
+    }
+}
+
+impl palpate_axes {
+    /// The axes of a number from outside.
+    pub(crate) fn of(number: u32) -> Result<Self, Fault> {
+        match number {
+            0 => Ok(PALPATE_AXES_OWN),
+            1 => Ok(PALPATE_AXES_UNITY),
+            2 => Ok(PALPATE_AXES_UNREAL),
+            _ => Err(Fault::argument("axes: must be one of palpate_axes")),
+        }
+    }
+
+    /// The same direction in these axes. Each is its own inverse.
+    pub(crate) fn turn<T>(self, [x, y, z]: [T; 3]) -> [T; 3] {
+        match self {
+            PALPATE_AXES_OWN => [x, y, z],
+            PALPATE_AXES_UNITY => [x, z, y],
+            PALPATE_AXES_UNREAL => [y, x, z],
+        }
+    }
+
+    fn turned(self, v: DVec3) -> DVec3 {
+        self.turn(v.to_array()).into()
+    }
+
+    /// Units a metre.
+    pub(crate) fn units_per_m(self) -> f64 {
+        if self == PALPATE_AXES_UNREAL { 100.0 } else { 1.0 }
+    }
+
+    /// A position in these axes.
+    pub(crate) fn position(self, place_m: DVec3) -> palpate_vector {
+        palpate_vector::own(self.units_per_m() * self.turned(place_m))
+    }
+
+    /// A position of these axes, m.
+    pub(crate) fn to_m(self, place: palpate_vector) -> DVec3 {
+        self.turned(place.vector()) / self.units_per_m()
+    }
+
+    /// A force in these axes, N.
+    pub(crate) fn force(self, force_n: DVec3) -> palpate_vector {
+        palpate_vector::own(self.turned(force_n))
+    }
+
+    /// Whether the corners of a triangle go the other way round.
+    pub(crate) fn is_clockwise(self) -> bool {
+        self == PALPATE_AXES_UNITY
+    }
+
+    /// Whether v of a texture begins at the top.
+    pub(crate) fn has_top_first(self) -> bool {
+        self == PALPATE_AXES_UNREAL
+    }
+}

@@ -1,0 +1,290 @@
+//! Our loop: a device of the caller's by three functions, on a real-time thread of the library.
+
+use std::ffi::c_void;
+use std::io;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use glam::DVec3;
+use palpate_client::bridge::{Options, Origin, Report, Tick, run};
+use palpate_client::os::Priority;
+use palpate_client::{Error, HapticDevice, Reading};
+use palpate_touch::Device;
+use tokio::sync::Notify;
+use tokio::task::JoinHandle;
+
+use crate::axes::{palpate_axes, palpate_vector};
+use crate::error::{Fault, PALPATE_CONNECTION, PALPATE_INTERNAL, at, at_mut, guard, palpate_result};
+use crate::options::{options_at, palpate_limits, palpate_touch_options};
+use crate::server::{CONNECTING, Connected, palpate_session};
+use crate::touch::{palpate_reading, palpate_state, state_of};
+
+/// A device of your own. The functions are called by one thread of the library, a thousand times a second: first `read`, then
+/// `write`. Both must return within a fraction of a millisecond, and return 0, or anything else if the device fails, which
+/// ends the loop. At its end, whatever the cause, `write` gets a force of zero.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct palpate_device {
+    /// Is handed to the functions.
+    pub user: *mut c_void,
+    /// Writes what the device can bear. Called once, before the loop begins, by the thread that begins it.
+    pub descriptor: Option<unsafe extern "C" fn(user: *mut c_void, limits: *mut palpate_limits) -> i32>,
+    /// Writes where the device is, in the axes of the options; its origin is the middle of its workspace.
+    pub read: Option<unsafe extern "C" fn(user: *mut c_void, reading: *mut palpate_reading) -> i32>,
+    /// Renders a force until the next tick, N, in the axes of the options.
+    pub write: Option<unsafe extern "C" fn(user: *mut c_void, force_n: *const palpate_vector) -> i32>,
+}
+
+/// The loop of a device.
+pub struct palpate_bridge {
+    shared: Arc<Connected>,
+    seen: Arc<Mutex<Seen>>,
+    stop: Arc<Notify>,
+    task: JoinHandle<Result<Report, Error>>,
+    axes: palpate_axes,
+}
+
+/// With which priority the loop runs.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum palpate_priority {
+    /// As all threads.
+    #[default]
+    PALPATE_PRIORITY_USUAL = 0,
+    /// Before all that are not of real time.
+    PALPATE_PRIORITY_REAL_TIME = 1,
+    /// Real time was asked for and the system did not allow it; `warn` said why.
+    PALPATE_PRIORITY_REFUSED = 2,
+}
+
+pub use palpate_priority::*;
+
+/// How a loop stands.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct palpate_bridge_state {
+    /// Ticks so far.
+    pub ticks: u64,
+    /// Where the tool was at the last tick, in the tissue's frame, in the axes of the options.
+    pub position: palpate_vector,
+    /// The force that was rendered, N.
+    pub force_n: palpate_vector,
+    /// One of `palpate_state`.
+    pub state: u32,
+    /// One of `palpate_priority`.
+    pub priority: u32,
+    /// 1 if the loop has ended: `palpate_bridge_end` says why.
+    pub is_over: u32,
+}
+
+/// What a loop has done.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct palpate_bridge_report {
+    /// Ticks.
+    pub ticks: u64,
+    /// Ticks that began more than a millisecond late.
+    pub late_ticks: u64,
+    /// Ticks that were left out.
+    pub missed_ticks: u64,
+    /// Connections that were opened.
+    pub connections: u64,
+    /// Samples that came.
+    pub samples: u64,
+    /// Positions that went.
+    pub positions: u64,
+    /// One of `palpate_priority`.
+    pub priority: u32,
+}
+
+/// What the loop shows of itself.
+#[derive(Default)]
+struct Seen {
+    ticks: u64,
+    newest: Option<Tick>,
+    priority: palpate_priority,
+}
+
+fn seen_of(seen: &Mutex<Seen>) -> MutexGuard<'_, Seen> {
+    seen.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// The caller's functions as a device.
+struct Called {
+    device: palpate_device,
+    limits: Device,
+    axes: palpate_axes,
+    ticks: u64,
+    seen: Arc<Mutex<Seen>>,
+}
+
+// SAFETY: the header says that a thread of the library calls the functions.
+unsafe impl Send for Called {}
+
+fn checked(name: &str, code: i32) -> io::Result<()> {
+    if code == 0 { Ok(()) } else { Err(io::Error::other(format!("`{name}` returned {code}"))) }
+}
+
+impl HapticDevice for Called {
+    fn descriptor(&self) -> Device {
+        self.limits
+    }
+
+    fn read(&mut self) -> io::Result<Reading> {
+        let mut reading = palpate_reading::default();
+        let read = self.device.read.ok_or(io::ErrorKind::InvalidInput)?;
+        // SAFETY: the caller's promise.
+        checked("read", unsafe { read(self.device.user, &mut reading) })?;
+        Ok(Reading { place_m: self.axes.to_m(reading.position), enable: reading.enable != 0 })
+    }
+
+    fn write(&mut self, force_n: DVec3) -> io::Result<()> {
+        let write = self.device.write.ok_or(io::ErrorKind::InvalidInput)?;
+        // SAFETY: the caller's promise.
+        checked("write", unsafe { write(self.device.user, &self.axes.force(force_n)) })
+    }
+
+    fn ticked(&mut self, tick: &Tick) {
+        self.ticks += 1;
+        // Who looks must not delay a tick.
+        if let Ok(mut seen) = self.seen.try_lock() {
+            (seen.ticks, seen.newest) = (self.ticks, Some(*tick));
+        }
+    }
+}
+
+/// Connects a device of your own to a session, on a thread of the library at 1 kHz, with real-time priority where the system
+/// allows it. `options` may be null; its `limits` are not used: `descriptor` tells them. Waits for the first connection. Writes a
+/// handle for `palpate_bridge_end`. What `device` points at is copied; its `user` must be valid until the end. Any thread;
+/// waits for the server.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_bridge_begin(
+    session: *const palpate_session,
+    device: *const palpate_device,
+    options: *const palpate_touch_options,
+    bridge: *mut *mut palpate_bridge,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promises.
+        let (session, device, options, out) = unsafe {
+            (
+                at(session, "session is null")?,
+                *at(device, "device is null")?,
+                options_at(options)?.checked()?,
+                at_mut(bridge, "bridge is null")?,
+            )
+        };
+        *out = std::ptr::null_mut();
+        if options.origin != Origin::Workspace {
+            return Err(Fault::argument(
+                "in_tissue_frame is not for devices: their origin lies on the middle of the tissue",
+            ));
+        }
+        let (Some(descriptor), Some(_), Some(_)) = (device.descriptor, device.read, device.write) else {
+            return Err(Fault::argument("device: all three functions must be there"));
+        };
+        let mut limits = palpate_limits::from(palpate_touch::device::UNDECLARED);
+        // SAFETY: the caller's promise.
+        checked("descriptor", unsafe { descriptor(device.user, &mut limits) }).map_err(Error::Device)?;
+        let seen = Arc::new(Mutex::new(Seen::default()));
+        let called = Called { device, limits: limits.device()?, axes: options.axes, ticks: 0, seen: seen.clone() };
+        let shared = session.shared.clone();
+        let target = session.target(&options);
+        let told = seen.clone();
+        let begun = move |priority: &Priority| {
+            seen_of(&told).priority = match priority {
+                Priority::Usual => PALPATE_PRIORITY_USUAL,
+                Priority::RealTime => PALPATE_PRIORITY_REAL_TIME,
+                Priority::Refused(_) => PALPATE_PRIORITY_REFUSED,
+            };
+        };
+        let of_run = Options {
+            real_time: options.real_time,
+            keeps_session: true,
+            warn: options.warn,
+            begun: Some(Box::new(begun)),
+            ..Options::default()
+        };
+        let stop = Arc::new(Notify::new());
+        let stopped = stop.clone();
+        let task = shared.runtime.spawn(async move {
+            let ended = run(called, target, of_run, async move { stopped.notified().await }).await;
+            ended.map(|(_, report)| report)
+        });
+        let bridge = palpate_bridge { shared, seen, stop, task, axes: options.axes };
+        let until = Instant::now() + bridge.shared.timeout.min(CONNECTING);
+        while !bridge.task.is_finished() && Instant::now() < until {
+            if seen_of(&bridge.seen).newest.is_some_and(|tick| tick.state.is_some()) {
+                *out = Box::into_raw(Box::new(bridge));
+                return Ok(());
+            }
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        // It never connected, so there is an error.
+        Err(bridge.end().err().unwrap_or_else(|| Fault::new(PALPATE_CONNECTION, "the server does not answer")))
+    })
+}
+
+impl palpate_bridge {
+    /// Ends the loop, and waits for that.
+    fn end(self) -> Result<palpate_bridge_report, Fault> {
+        self.stop.notify_one();
+        let ended = self.shared.runtime.block_on(self.task);
+        let report = ended.map_err(|_| Fault::new(PALPATE_INTERNAL, "the loop panicked"))??;
+        let seen = seen_of(&self.seen);
+        Ok(palpate_bridge_report {
+            ticks: seen.ticks,
+            late_ticks: report.late_ticks,
+            missed_ticks: report.missed_ticks,
+            connections: report.traffic.connections,
+            samples: report.traffic.samples,
+            positions: report.traffic.poses,
+            priority: seen.priority as u32,
+        })
+    }
+}
+
+/// Writes how the loop stands. Any thread.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_bridge_look(
+    bridge: *const palpate_bridge,
+    state: *mut palpate_bridge_state,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promises.
+        let (bridge, out) = unsafe { (at(bridge, "bridge is null")?, at_mut(state, "state is null")?) };
+        let seen = seen_of(&bridge.seen);
+        let state: palpate_state = state_of(seen.newest.and_then(|tick| tick.state));
+        *out = palpate_bridge_state {
+            ticks: seen.ticks,
+            position: seen.newest.map_or_else(palpate_vector::default, |tick| bridge.axes.position(tick.place_m)),
+            force_n: seen.newest.map_or_else(palpate_vector::default, |tick| bridge.axes.force(tick.force_n)),
+            state: state as u32,
+            priority: seen.priority as u32,
+            is_over: u32::from(bridge.task.is_finished()),
+        };
+        Ok(())
+    })
+}
+
+/// Ends the loop, waits for that, and writes what it has done; `report` may be null. `PALPATE_DEVICE` if the device has failed:
+/// `palpate_last_error` tells how. The handle is given back in any case. Any thread, once; not from a function of the device.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_bridge_end(
+    bridge: *mut palpate_bridge,
+    report: *mut palpate_bridge_report,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promise.
+        let out = unsafe { report.as_mut() };
+        if bridge.is_null() {
+            return Err(Fault::argument("bridge is null"));
+        }
+        // SAFETY: the caller's promise.
+        let told = unsafe { Box::from_raw(bridge) }.end()?;
+        if let Some(out) = out {
+            *out = told;
+        }
+        Ok(())
+    })
+}

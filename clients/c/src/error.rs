@@ -1,0 +1,180 @@
+//! Errors: codes for programs, words for people, and the guard around every entry.
+
+use std::borrow::Cow;
+use std::cell::Cell;
+use std::ffi::{CStr, c_char};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+use palpate_client::Error;
+
+/// Why a function did nothing.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum palpate_result {
+    /// It did what it says.
+    PALPATE_OK = 0,
+    /// An argument is not valid: a null pointer, a number that is not finite or out of range, a text that is no UTF-8.
+    PALPATE_ARGUMENT = 1,
+    /// The server can't be reached, or the connection broke.
+    PALPATE_CONNECTION = 2,
+    /// The server refused the call: no such scene, no right to it, a value out of its range.
+    PALPATE_REFUSED = 3,
+    /// The device can't be read or written.
+    PALPATE_DEVICE = 4,
+    /// The buffer is too small.
+    PALPATE_BUFFER = 5,
+    /// Another thread is in a function that only one thread at a time may call.
+    PALPATE_BUSY = 6,
+    /// A fault of the library, or of the code that it called. The handle may be unusable from now on.
+    PALPATE_INTERNAL = 7,
+}
+
+pub use palpate_result::*;
+
+/// Bytes of the longest message, with the zero at its end.
+const LONGEST: usize = 1024;
+
+thread_local! {
+    /// Without a request for memory: ticks fail too.
+    static WORDS: Cell<[u8; LONGEST]> = const { Cell::new([0; LONGEST]) };
+}
+
+/// Keeps the words of an error of this thread, shortened to what fits.
+fn keep(text: &str) {
+    WORDS.with(|words| {
+        let mut end = text.len().min(LONGEST - 1);
+        while !text.is_char_boundary(end) {
+            end -= 1;
+        }
+        // SAFETY: only this thread has this place, and nobody reads it during the call.
+        let words = unsafe { &mut *words.as_ptr() };
+        words[..end].copy_from_slice(&text.as_bytes()[..end]);
+        words[end] = 0;
+    });
+}
+
+/// The words of this thread's last error; empty before the first. They stay until another call of this thread fails.
+#[unsafe(no_mangle)]
+pub extern "C" fn palpate_last_error() -> *const c_char {
+    WORDS.try_with(|words| words.as_ptr().cast_const().cast()).unwrap_or(c"".as_ptr())
+}
+
+/// An error with a code.
+pub(crate) struct Fault {
+    code: palpate_result,
+    /// Those of a tick are there already: it asks for no memory.
+    words: Cow<'static, str>,
+}
+
+impl Fault {
+    pub(crate) fn argument(words: impl Into<Cow<'static, str>>) -> Self {
+        Fault::new(PALPATE_ARGUMENT, words)
+    }
+
+    pub(crate) fn new(code: palpate_result, words: impl Into<Cow<'static, str>>) -> Self {
+        Fault { code, words: words.into() }
+    }
+}
+
+impl From<Error> for Fault {
+    fn from(error: Error) -> Self {
+        let code = match &error {
+            Error::Argument(_) => PALPATE_ARGUMENT,
+            Error::Connection(_) => PALPATE_CONNECTION,
+            Error::Call(status) if std::error::Error::source(status).is_some() => PALPATE_CONNECTION,
+            Error::Call(_) => PALPATE_REFUSED,
+            Error::Device(_) => PALPATE_DEVICE,
+            Error::Internal(_) => PALPATE_INTERNAL,
+        };
+        Fault::new(code, error.to_string())
+    }
+}
+
+impl From<tonic::Status> for Fault {
+    fn from(status: tonic::Status) -> Self {
+        Error::from(status).into()
+    }
+}
+
+/// Runs an entry: keeps the words of its error, and lets no panic out. It asks for no memory itself.
+pub(crate) fn guard(entry: impl FnOnce() -> Result<(), Fault>) -> palpate_result {
+    match catch_unwind(AssertUnwindSafe(entry)) {
+        Ok(Ok(())) => PALPATE_OK,
+        Ok(Err(Fault { code, words })) => {
+            keep(&words);
+            code
+        }
+        Err(_) => {
+            keep("a fault of the library (its words are on the standard error)");
+            PALPATE_INTERNAL
+        }
+    }
+}
+
+/// What a pointer points at.
+///
+/// # Safety
+/// It is null or valid.
+pub(crate) unsafe fn at<'a, T>(pointer: *const T, words: &'static str) -> Result<&'a T, Fault> {
+    // SAFETY: the caller's promise.
+    unsafe { pointer.as_ref() }.ok_or_else(|| Fault::argument(words))
+}
+
+/// The same, to be written.
+///
+/// # Safety
+/// It is null or valid, and nobody else uses it meanwhile.
+pub(crate) unsafe fn at_mut<'a, T>(pointer: *mut T, words: &'static str) -> Result<&'a mut T, Fault> {
+    // SAFETY: the caller's promise.
+    unsafe { pointer.as_mut() }.ok_or_else(|| Fault::argument(words))
+}
+
+/// A text.
+///
+/// # Safety
+/// It is null or ends with a zero byte.
+pub(crate) unsafe fn text<'a>(pointer: *const c_char, name: &'static str) -> Result<&'a str, Fault> {
+    // SAFETY: the caller's promise.
+    unsafe { optional_text(pointer, name) }?.ok_or_else(|| Fault::argument(format!("{name} is null")))
+}
+
+/// A text that may be absent.
+///
+/// # Safety
+/// It is null or ends with a zero byte.
+pub(crate) unsafe fn optional_text<'a>(pointer: *const c_char, name: &'static str) -> Result<Option<&'a str>, Fault> {
+    if pointer.is_null() {
+        return Ok(None);
+    }
+    // SAFETY: the caller's promise.
+    let text = unsafe { CStr::from_ptr(pointer) };
+    text.to_str().map(Some).map_err(|_| Fault::argument(format!("{name} is not UTF-8")))
+}
+
+/// Writes a text into a buffer of the caller's, with a zero byte, and how many bytes it takes.
+///
+/// # Safety
+/// The pointers are null or valid, `buffer` for `capacity` bytes.
+pub(crate) unsafe fn write_text(
+    text: &str,
+    buffer: *mut c_char,
+    capacity: usize,
+    needed: *mut usize,
+) -> Result<(), Fault> {
+    // SAFETY: the caller's promise.
+    if let Some(needed) = unsafe { needed.as_mut() } {
+        *needed = text.len() + 1;
+    }
+    if buffer.is_null() {
+        return if needed.is_null() { Err(Fault::argument("both `text` and `needed` are null")) } else { Ok(()) };
+    }
+    if capacity <= text.len() {
+        return Err(Fault::new(PALPATE_BUFFER, format!("the text takes {} bytes", text.len() + 1)));
+    }
+    // SAFETY: the caller's promise; it fits.
+    unsafe {
+        std::ptr::copy_nonoverlapping(text.as_ptr(), buffer.cast(), text.len());
+        *buffer.add(text.len()) = 0;
+    }
+    Ok(())
+}

@@ -1,0 +1,389 @@
+//! Servers and sessions: connect, list scenes, create, join, change, delete.
+
+use std::ffi::c_char;
+use std::sync::Arc;
+use std::time::Duration;
+
+use palpate::limits::Limits;
+use palpate::scene::{Body, Scene};
+use palpate_client::bridge::{Session, Target};
+use palpate_client::{Channel, Credentials, Server, Token, fleet};
+use palpate_proto::geometry::from_vector;
+use palpate_proto::pb;
+use pb::create_session_request::Source;
+use pb::session_service_client::SessionServiceClient;
+use tokio::runtime::Runtime;
+
+use crate::axes::palpate_vector;
+use crate::error::{
+    Fault, PALPATE_CONNECTION, PALPATE_INTERNAL, at, at_mut, guard, optional_text, palpate_result, text, write_text,
+};
+use crate::options::{TouchOptions, options_at, palpate_connect_options};
+
+/// A connection to a server. Any thread, also several at once.
+pub struct palpate_server {
+    pub(crate) shared: Arc<Connected>,
+}
+
+/// What a server's handle and all that was made from it share.
+pub(crate) struct Connected {
+    pub(crate) runtime: Runtime,
+    pub(crate) server: Server,
+    pub(crate) channel: Channel,
+    pub(crate) timeout: Duration,
+}
+
+/// A session: one tissue in use. Any thread, also several at once.
+pub struct palpate_session {
+    pub(crate) shared: Arc<Connected>,
+    pub(crate) session_id: String,
+    extent: palpate_extent,
+}
+
+/// The box around a tissue at rest, in Palpate's own axes, m.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct palpate_extent {
+    /// Its corner with the least coordinates.
+    pub least_m: palpate_vector,
+    /// Its corner with the greatest.
+    pub most_m: palpate_vector,
+    /// Its middle.
+    pub middle_m: palpate_vector,
+}
+
+/// A change of the tissue under way. Not a number: it stays as it is.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct palpate_change {
+    /// Of structural springs, N/m.
+    pub stiffness_n_per_m: f64,
+    /// N·s/m.
+    pub damping_n_s_per_m: f64,
+    /// Of virtual springs, N/m.
+    pub virtual_stiffness_n_per_m: f64,
+    /// Of the volume of a closed mesh, Pa.
+    pub volume_stiffness_pa: f64,
+}
+
+impl Connected {
+    /// Waits for a call, for no longer than the time for calls.
+    pub(crate) fn wait<T, E: Into<Fault>>(&self, call: impl Future<Output = Result<T, E>>) -> Result<T, Fault> {
+        let limited = async { tokio::time::timeout(self.timeout, call).await };
+        match self.runtime.block_on(limited) {
+            Ok(answer) => answer.map_err(Into::into),
+            Err(_) => {
+                let why = format!("the server has not answered within {} s", self.timeout.as_secs_f64());
+                Err(Fault::new(PALPATE_CONNECTION, why))
+            }
+        }
+    }
+
+    /// A call for a session: of a fleet, another server may have it.
+    pub(crate) fn follow<T, F>(&self, call: impl Fn(SessionServiceClient<Channel>) -> F) -> Result<T, Fault>
+    where
+        F: Future<Output = Result<T, tonic::Status>>,
+    {
+        let call = |channel| call(SessionServiceClient::new(channel));
+        let at = self.wait(fleet::follow_from(&self.server, self.channel.clone(), call))?;
+        Ok(at.answer)
+    }
+
+    pub(crate) fn sessions(&self) -> SessionServiceClient<Channel> {
+        SessionServiceClient::new(self.channel.clone())
+    }
+}
+
+impl palpate_session {
+    /// What a tool with these options is connected to.
+    pub(crate) fn target(&self, options: &TouchOptions) -> Target {
+        Target {
+            server: self.shared.server.clone(),
+            session: Session::Existing(self.session_id.clone()),
+            tool: options.tool,
+            tip: options.tip,
+            deadband: options.deadband,
+            up_deadband: options.up_deadband,
+            datagrams: options.datagrams,
+            holder: options.holder.clone(),
+        }
+    }
+}
+
+/// Longest time for a connection.
+pub(crate) const CONNECTING: Duration = Duration::from_secs(10);
+
+/// Connects to the server at `url`, such as "http://127.0.0.1:7117". `options` may be null. Waits for its first answer, for 10 s
+/// at most. Writes a handle for `palpate_server_free`. Any thread.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_connect(
+    url: *const c_char,
+    options: *const palpate_connect_options,
+    server: *mut *mut palpate_server,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promises.
+        let (url, options, out) =
+            unsafe { (text(url, "url")?, options_at(options)?, at_mut(server, "server is null")?) };
+        *out = std::ptr::null_mut();
+        // SAFETY: the caller's promises.
+        let [token, ca, tls_name, certificate, key] = unsafe {
+            [
+                optional_text(options.token, "token")?,
+                optional_text(options.ca_pem, "ca_pem")?,
+                optional_text(options.tls_name, "tls_name")?,
+                optional_text(options.certificate_pem, "certificate_pem")?,
+                optional_text(options.key_pem, "key_pem")?,
+            ]
+        };
+        let cert_and_key = match (certificate, key) {
+            (Some(certificate), Some(key)) => Some((certificate.to_owned(), key.to_owned())),
+            (None, None) => None,
+            _ => return Err(Fault::argument("certificate_pem and key_pem go together")),
+        };
+        let credentials = Credentials {
+            token: token.map(Token::new).transpose()?,
+            ca: ca.map(str::to_owned),
+            tls_name: tls_name.map(str::to_owned),
+            cert_and_key,
+        };
+        let timeout = Duration::try_from_secs_f64(options.timeout_s).ok().filter(|time| !time.is_zero());
+        let timeout = timeout.ok_or_else(|| Fault::argument("timeout_s must be above 0"))?;
+        let server = Server::new(url, &credentials)?.within(timeout.min(CONNECTING));
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(2)
+            .thread_name("palpate")
+            .enable_all()
+            .build()
+            .map_err(|error| Fault::new(PALPATE_INTERNAL, format!("threads can't be started: {error}")))?;
+        let channel = runtime.block_on(server.connect())?;
+        let shared = Arc::new(Connected { runtime, server, channel, timeout });
+        *out = Box::into_raw(Box::new(palpate_server { shared }));
+        Ok(())
+    })
+}
+
+/// Closes a connection when nothing that was made from it is left. Null is allowed. Any thread, once.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_server_free(server: *mut palpate_server) {
+    // SAFETY: the caller's promise.
+    guard(|| unsafe { free(server) });
+}
+
+/// # Safety
+/// It is null or from `Box::into_raw`.
+pub(crate) unsafe fn free<T>(handle: *mut T) -> Result<(), Fault> {
+    if !handle.is_null() {
+        // SAFETY: the caller's promise.
+        drop(unsafe { Box::from_raw(handle) });
+    }
+    Ok(())
+}
+
+/// Writes the names of the server's scenes into `names`, a line each, and into `needed` how many bytes that takes; either may be
+/// null. `PALPATE_BUFFER` if `capacity` bytes are too few. Any thread; waits for the server.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_scenes(
+    server: *const palpate_server,
+    names: *mut c_char,
+    capacity: usize,
+    needed: *mut usize,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promise.
+        let shared = &unsafe { at(server, "server is null") }?.shared;
+        let answer = shared.wait(shared.sessions().list_scenes(pb::ListScenesRequest {}))?;
+        let lines = answer.into_inner().scene_names.join("\n");
+        // SAFETY: the caller's promise.
+        unsafe { write_text(&lines, names, capacity, needed) }
+    })
+}
+
+fn handle(shared: &Arc<Connected>, session: Option<pb::Session>) -> Result<*mut palpate_session, Fault> {
+    let session = session.ok_or_else(|| Fault::new(PALPATE_CONNECTION, "the server sent no session"))?;
+    let extent = session.extent.unwrap_or_default();
+    let place = |place: Option<pb::Vector3>| palpate_vector::own(from_vector(place.as_ref()));
+    let [least_m, most_m, middle_m] = [extent.least_m, extent.most_m, extent.middle_m].map(place);
+    let extent = palpate_extent { least_m, most_m, middle_m };
+    let handle = palpate_session { shared: shared.clone(), session_id: session.session_id, extent };
+    Ok(Box::into_raw(Box::new(handle)))
+}
+
+fn create(shared: &Arc<Connected>, source: Source) -> Result<*mut palpate_session, Fault> {
+    let request = pb::CreateSessionRequest { source: Some(source), ..Default::default() };
+    let answer = shared.wait(shared.sessions().create_session(request))?;
+    handle(shared, answer.into_inner().session)
+}
+
+/// Makes a session of a scene that the server has. It runs at once. Nobody deletes it but `palpate_session_delete`, and the
+/// server when nobody has used it for long. Writes a handle for `palpate_session_free`. Any thread; waits for the server.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_session_create(
+    server: *const palpate_server,
+    scene_name: *const c_char,
+    session: *mut *mut palpate_session,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promises.
+        let (shared, name, out) = unsafe {
+            (
+                &at(server, "server is null")?.shared,
+                text(scene_name, "scene_name")?,
+                at_mut(session, "session is null")?,
+            )
+        };
+        *out = std::ptr::null_mut();
+        *out = create(shared, Source::SceneName(name.to_owned()))?;
+        Ok(())
+    })
+}
+
+/// The same of a scene of your own: the text of a scene file (TOML) of a sheet. A scene that names files, or that is of a mesh, has
+/// to be one of the server's. Any thread; waits for the server.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_session_create_from_text(
+    server: *const palpate_server,
+    scene_text: *const c_char,
+    session: *mut *mut palpate_session,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promises.
+        let (shared, scene, out) = unsafe {
+            (
+                &at(server, "server is null")?.shared,
+                text(scene_text, "scene_text")?,
+                at_mut(session, "session is null")?,
+            )
+        };
+        *out = std::ptr::null_mut();
+        let scene = Scene::parse("scene_text", scene, &[], &Limits::default());
+        let scene = scene.map_err(|refusal| Fault::argument(refusal.to_string()))?;
+        if matches!(scene.body, Body::Mesh(_)) {
+            return Err(Fault::argument(
+                "scene_text is of a mesh: give the scene to the server, and create it by name",
+            ));
+        }
+        *out = create(shared, Source::Scene(palpate::wire::scene::sent(&scene)))?;
+        Ok(())
+    })
+}
+
+/// A session that is there already, by its id. Writes a handle for `palpate_session_free`. Any thread; waits for the server.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_session_join(
+    server: *const palpate_server,
+    session_id: *const c_char,
+    session: *mut *mut palpate_session,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promises.
+        let (shared, id, out) = unsafe {
+            (
+                &at(server, "server is null")?.shared,
+                text(session_id, "session_id")?,
+                at_mut(session, "session is null")?,
+            )
+        };
+        *out = std::ptr::null_mut();
+        let request = pb::GetSessionRequest { session_id: id.to_owned() };
+        let answer = shared.follow(|mut sessions| {
+            let request = request.clone();
+            async move { sessions.get_session(request).await }
+        })?;
+        *out = handle(shared, answer.into_inner().session)?;
+        Ok(())
+    })
+}
+
+/// Writes the session's id, by which others join it, and how many bytes it takes, as `palpate_scenes` does. Any thread.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_session_id(
+    session: *const palpate_session,
+    id: *mut c_char,
+    capacity: usize,
+    needed: *mut usize,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promises.
+        unsafe { write_text(&at(session, "session is null")?.session_id, id, capacity, needed) }
+    })
+}
+
+/// Writes where the tissue rests. Any thread.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_session_extent(
+    session: *const palpate_session,
+    extent: *mut palpate_extent,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promises.
+        let (session, out) = unsafe { (at(session, "session is null")?, at_mut(extent, "extent is null")?) };
+        *out = session.extent;
+        Ok(())
+    })
+}
+
+/// A change that changes nothing. Any thread.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_change_init(change: *mut palpate_change) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promise.
+        let change = unsafe { at_mut(change, "change is null") }?;
+        let stays = f64::NAN;
+        *change = palpate_change {
+            stiffness_n_per_m: stays,
+            damping_n_s_per_m: stays,
+            virtual_stiffness_n_per_m: stays,
+            volume_stiffness_pa: stays,
+        };
+        Ok(())
+    })
+}
+
+/// Changes the tissue from the next step on; whoever touches it feels the change. Any thread; waits for the server.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_session_change(
+    session: *const palpate_session,
+    change: *const palpate_change,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promises.
+        let (session, change) = unsafe { (at(session, "session is null")?, at(change, "change is null")?) };
+        let given = |value: f64| Some(value).filter(|value| !value.is_nan());
+        let request = pb::UpdateTissueRequest {
+            session_id: session.session_id.clone(),
+            stiffness_n_per_m: given(change.stiffness_n_per_m),
+            damping_n_s_per_m: given(change.damping_n_s_per_m),
+            virtual_stiffness_n_per_m: given(change.virtual_stiffness_n_per_m),
+            volume_stiffness_pa: given(change.volume_stiffness_pa),
+            at_step: None,
+        };
+        session.shared.follow(|mut sessions| {
+            let request = request.clone();
+            async move { sessions.update_tissue(request).await }
+        })?;
+        Ok(())
+    })
+}
+
+/// Deletes the session on the server, for everybody. The handle is still to be freed. Any thread; waits for the server.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_session_delete(session: *const palpate_session) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promise.
+        let session = unsafe { at(session, "session is null") }?;
+        let request = pb::DeleteSessionRequest { session_id: session.session_id.clone() };
+        session.shared.follow(|mut sessions| {
+            let request = request.clone();
+            async move { sessions.delete_session(request).await }
+        })?;
+        Ok(())
+    })
+}
+
+/// Gives a handle back. The session goes on. Null is allowed. Any thread, once.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_session_free(session: *mut palpate_session) {
+    // SAFETY: the caller's promise.
+    guard(|| unsafe { free(session) });
+}

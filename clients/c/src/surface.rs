@@ -1,0 +1,279 @@
+//! The newest surface, in buffers of the caller's.
+
+use std::sync::Arc;
+
+use palpate_client::fleet;
+use palpate_client::shown::Shown;
+use palpate_proto::pb;
+use pb::session_service_client::SessionServiceClient;
+
+use crate::axes::palpate_axes;
+use crate::error::{Fault, PALPATE_BUFFER, PALPATE_CONNECTION, at, at_mut, guard, palpate_result};
+use crate::options::{options_at, palpate_surface_options};
+use crate::server::{Connected, free, palpate_session};
+use crate::touch::Exclusive;
+
+/// The surface of a session.
+pub struct palpate_surface {
+    axes: palpate_axes,
+    vertices: usize,
+    seen: Exclusive<Seen>,
+    // After what runs on it.
+    _shared: Arc<Connected>,
+}
+
+/// What the caller has seen.
+struct Seen {
+    shown: Shown,
+    position_m: Vec<[f32; 3]>,
+    normal: Vec<[f32; 3]>,
+}
+
+/// How large a surface is.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct palpate_surface_size {
+    /// Vertices; they never become others.
+    pub vertices: usize,
+    /// Indices: three for each triangle.
+    pub indices: usize,
+    /// 1 if the vertices have texture coordinates.
+    pub has_uv: u32,
+}
+
+/// Where to write a surface.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct palpate_buffers {
+    /// x, y, z of the first vertex; null: they are not wanted.
+    pub positions: *mut f32,
+    /// Bytes from one vertex to the next: 12 or more.
+    pub positions_stride: usize,
+    /// x, y, z of the first vertex' normal; null: they are not wanted.
+    pub normals: *mut f32,
+    /// Bytes from one to the next: 12 or more.
+    pub normals_stride: usize,
+    /// For how many vertices there is room.
+    pub vertices: usize,
+    /// Write every vertex; 0: only those that have changed since the last time, for buffers that keep the others.
+    pub everything: u32,
+}
+
+/// What was written.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct palpate_dirty {
+    /// The first vertex that was written.
+    pub first: usize,
+    /// How many from there on; 0 if nothing has changed.
+    pub count: usize,
+    /// Frames that have come from the server; 0: the surface at rest.
+    pub frames: u64,
+    /// Steps that the session had done.
+    pub step: u64,
+    /// Its time, s.
+    pub simulation_time_s: f64,
+}
+
+/// Gets the surface of a session and begins to watch it. `options` may be null. Writes a handle for `palpate_surface_free`.
+/// Any thread; waits for the server.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_surface_open(
+    session: *const palpate_session,
+    options: *const palpate_surface_options,
+    surface: *mut *mut palpate_surface,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promises.
+        let (session, options, out) =
+            unsafe { (at(session, "session is null")?, options_at(options)?, at_mut(surface, "surface is null")?) };
+        *out = std::ptr::null_mut();
+        let axes = palpate_axes::of(options.axes)?;
+        if !(options.rate_hz > 0.0 && options.rate_hz.is_finite()) {
+            return Err(Fault::argument("rate_hz must be above 0"));
+        }
+        let shared = session.shared.clone();
+        let opening = async {
+            let request = pb::GetSessionRequest { session_id: session.session_id.clone() };
+            // Of a fleet, another server may have the session.
+            let at = fleet::follow_from(&shared.server, shared.channel.clone(), |channel| {
+                let request = request.clone();
+                async move { SessionServiceClient::new(channel).get_session(request).await }
+            });
+            Shown::open(at.await?.channel, &session.session_id, options.refinement, options.rate_hz).await
+        };
+        let shown = shared.wait(opening)?;
+        let (position_m, normal) = shown.read(|moment| (moment.position_m.clone(), moment.normal.clone()));
+        let vertices = position_m.len();
+        let seen = Exclusive::new(Seen { shown, position_m, normal });
+        *out = Box::into_raw(Box::new(palpate_surface { axes, vertices, seen, _shared: shared }));
+        Ok(())
+    })
+}
+
+/// Writes how large the surface is. One thread at a time. Never waits.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_surface_size_of(
+    surface: *const palpate_surface,
+    size: *mut palpate_surface_size,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promises.
+        let (surface, out) = unsafe { (at(surface, "surface is null")?, at_mut(size, "size is null")?) };
+        *out = surface.seen.with(|seen| {
+            let mesh = seen.shown.mesh();
+            palpate_surface_size {
+                vertices: mesh.rest_m.len(),
+                indices: 3 * mesh.triangles.len(),
+                has_uv: u32::from(!mesh.texture.is_empty()),
+            }
+        })?;
+        Ok(())
+    })
+}
+
+/// Writes all indices, three for each triangle, in the order that the axes' engine takes for the front. They never change. One
+/// thread at a time. Never waits.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_surface_indices(
+    surface: *const palpate_surface,
+    indices: *mut u32,
+    capacity: usize,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promises.
+        let surface = unsafe { at(surface, "surface is null") }?;
+        // SAFETY: the caller's promises.
+        unsafe { at(indices, "indices is null") }?;
+        surface.seen.with(|seen| {
+            let triangles = &seen.shown.mesh().triangles;
+            if capacity < 3 * triangles.len() {
+                return Err(Fault::new(PALPATE_BUFFER, "there are more indices: see palpate_surface_size_of"));
+            }
+            for (k, [a, b, c]) in triangles.iter().copied().enumerate() {
+                let corners = if surface.axes.is_clockwise() { [a, c, b] } else { [a, b, c] };
+                // SAFETY: it fits.
+                unsafe { indices.add(3 * k).cast::<[u32; 3]>().write_unaligned(corners) };
+            }
+            Ok(())
+        })?
+    })
+}
+
+/// Writes u and v of each vertex, `stride` bytes (8 or more) from one to the next. They never change. `PALPATE_ARGUMENT` if the
+/// surface has none. One thread at a time. Never waits.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_surface_uv(
+    surface: *const palpate_surface,
+    uv: *mut f32,
+    stride: usize,
+    vertices: usize,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promises.
+        let surface = unsafe { at(surface, "surface is null") }?;
+        // SAFETY: the caller's promises.
+        unsafe { at(uv, "uv is null") }?;
+        surface.seen.with(|seen| {
+            let texture = &seen.shown.mesh().texture;
+            if texture.is_empty() {
+                return Err(Fault::argument("the surface has no texture coordinates"));
+            }
+            if stride < 8 {
+                return Err(Fault::argument("stride must be 8 bytes or more"));
+            }
+            if vertices < texture.len() {
+                return Err(Fault::new(PALPATE_BUFFER, "there are more vertices: see palpate_surface_size_of"));
+            }
+            for (k, [u, v]) in texture.iter().copied().enumerate() {
+                let v = if surface.axes.has_top_first() { 1.0 - v } else { v };
+                // SAFETY: it fits.
+                unsafe { uv.cast::<u8>().add(stride * k).cast::<[f32; 2]>().write_unaligned([u, v]) };
+            }
+            Ok(())
+        })?
+    })
+}
+
+/// Writes the newest positions and normals that have come, and which vertices these are. Never waits: not for the server, nor for
+/// another thread. `PALPATE_CONNECTION` if no more will come: the last are written all the same, and `palpate_last_error`
+/// says why. One thread at a time.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_surface_read(
+    surface: *const palpate_surface,
+    buffers: *const palpate_buffers,
+    dirty: *mut palpate_dirty,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promises.
+        let (surface, buffers, dirty) = unsafe {
+            (at(surface, "surface is null")?, at(buffers, "buffers is null")?, at_mut(dirty, "dirty is null")?)
+        };
+        *dirty = palpate_dirty::default();
+        for (buffer, stride) in
+            [(buffers.positions, buffers.positions_stride), (buffers.normals, buffers.normals_stride)]
+        {
+            if !buffer.is_null() && stride < 12 {
+                return Err(Fault::argument("a stride must be 12 bytes or more"));
+            }
+        }
+        if buffers.vertices < surface.vertices {
+            return Err(Fault::new(PALPATE_BUFFER, format!("the surface has {} vertices", surface.vertices)));
+        }
+        surface.seen.with(|seen| {
+            *dirty = seen.take(buffers.everything != 0);
+            for k in dirty.first..dirty.first + dirty.count {
+                #[allow(clippy::cast_possible_truncation)]
+                let units_per_m = surface.axes.units_per_m() as f32;
+                let position = surface.axes.turn(seen.position_m[k]).map(|part| units_per_m * part);
+                let normal = surface.axes.turn(seen.normal[k]);
+                for (buffer, stride, value) in [
+                    (buffers.positions, buffers.positions_stride, position),
+                    (buffers.normals, buffers.normals_stride, normal),
+                ] {
+                    if !buffer.is_null() {
+                        // SAFETY: it fits.
+                        unsafe { buffer.cast::<u8>().add(stride * k).cast::<[f32; 3]>().write_unaligned(value) };
+                    }
+                }
+            }
+            seen.shown.lost().map_or(Ok(()), |why| Err(Fault::new(PALPATE_CONNECTION, why.to_owned())))
+        })?
+    })
+}
+
+impl Seen {
+    /// Takes the newest moment; tells which vertices are to be written.
+    fn take(&mut self, everything: bool) -> palpate_dirty {
+        let is_new = self.shown.refresh();
+        let Seen { shown, position_m, normal, .. } = self;
+        shown.read(|moment| {
+            let (mut first, mut end) = (position_m.len(), 0);
+            if is_new {
+                for k in 0..position_m.len() {
+                    if position_m[k] != moment.position_m[k] || normal[k] != moment.normal[k] {
+                        (first, end) = (first.min(k), k + 1);
+                        (position_m[k], normal[k]) = (moment.position_m[k], moment.normal[k]);
+                    }
+                }
+            }
+            if everything {
+                (first, end) = (0, position_m.len());
+            }
+            palpate_dirty {
+                first: first.min(end),
+                count: end.saturating_sub(first),
+                frames: moment.frames,
+                step: moment.step,
+                simulation_time_s: moment.simulation_time_s,
+            }
+        })
+    }
+}
+
+/// Gives a handle back. Null is allowed. Any thread, once, when no other is in a function of this handle.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_surface_free(surface: *mut palpate_surface) {
+    // SAFETY: the caller's promise.
+    guard(|| unsafe { free(surface) });
+}

@@ -1,0 +1,287 @@
+//! Your loop: a handle whose tick a thread of the caller's calls a thousand times a second; also of what was recorded.
+
+use std::cell::UnsafeCell;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use ::palpate_touch::RenderingState;
+use palpate_client::bridge::{self, Connection, Offline, Options, Record, Ticker};
+use palpate_client::{Error, Reading};
+
+use crate::axes::{palpate_axes, palpate_vector};
+use crate::error::{Fault, PALPATE_BUSY, at, at_mut, guard, palpate_result};
+use crate::options::{options_at, palpate_touch_options};
+use crate::server::{Connected, palpate_session};
+
+/// A tool that your loop leads.
+pub struct palpate_touch {
+    ticker: Exclusive<Ticker>,
+    axes: palpate_axes,
+    far: Far,
+}
+
+/// The other end.
+#[allow(clippy::large_enum_variant)] // One a tool.
+enum Far {
+    // In this order: the connection ends on the runtime.
+    Server { connection: Connection, shared: Arc<Connected> },
+    Record(Exclusive<Record>),
+}
+
+/// Whether forces are rendered.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum palpate_state {
+    /// There was no connection yet.
+    #[default]
+    PALPATE_STATE_WAITING = 0,
+    /// Nothing is rendered until `enable` goes from 0 to 1.
+    PALPATE_STATE_DISABLED = 1,
+    /// Rendering, or beginning to.
+    PALPATE_STATE_ENABLED = 2,
+    /// Nothing came from the server for too long, or no tick came. Nothing is rendered until `enable` goes from 0 to 1.
+    PALPATE_STATE_PAUSED = 3,
+    /// The tool was outside the workspace, or a number was not finite. Nothing is rendered until `enable` goes from 0 to 1.
+    PALPATE_STATE_FAULT = 4,
+}
+
+pub use palpate_state::*;
+
+/// What a device reports.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct palpate_reading {
+    /// In the axes and frame of `palpate_touch_options`.
+    pub position: palpate_vector,
+    /// The operator asks for forces, by a button or pedal. Only a change from 0 to another value enables them.
+    pub enable: u32,
+}
+
+/// What a tick tells.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct palpate_felt {
+    /// The force on the hand until the next tick, N.
+    pub force_n: palpate_vector,
+    /// One of `palpate_state`.
+    pub state: u32,
+    /// 1 if the connection has ended for good.
+    pub is_over: u32,
+    /// How old the newest news of the tissue is, s; negative before the first.
+    pub age_s: f64,
+}
+
+/// What went over the network.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct palpate_traffic {
+    /// Connections that were opened.
+    pub connections: u64,
+    /// Attempts that failed, and connections that broke.
+    pub failed: u64,
+    /// Samples that came.
+    pub samples: u64,
+    /// Positions that went.
+    pub positions: u64,
+    /// 1 while a connection stands.
+    pub is_connected: u32,
+}
+
+/// A value that one thread at a time may change; another is sent away, and does not wait.
+pub(crate) struct Exclusive<T> {
+    is_busy: AtomicBool,
+    value: UnsafeCell<T>,
+}
+
+// SAFETY: `with` lets one thread in.
+unsafe impl<T: Send> Sync for Exclusive<T> {}
+
+impl<T> Exclusive<T> {
+    pub(crate) fn new(value: T) -> Self {
+        Exclusive { is_busy: AtomicBool::new(false), value: UnsafeCell::new(value) }
+    }
+
+    pub(crate) fn with<R>(&self, change: impl FnOnce(&mut T) -> R) -> Result<R, Fault> {
+        /// Also if `change` panics.
+        struct Leave<'a>(&'a AtomicBool);
+        impl Drop for Leave<'_> {
+            fn drop(&mut self) {
+                self.0.store(false, Ordering::Release);
+            }
+        }
+        if self.is_busy.swap(true, Ordering::Acquire) {
+            return Err(Fault::new(PALPATE_BUSY, "another thread is in a function of this handle"));
+        }
+        let _leave = Leave(&self.is_busy);
+        // SAFETY: nobody else is here.
+        Ok(change(unsafe { &mut *self.value.get() }))
+    }
+}
+
+pub(crate) fn state_of(state: Option<RenderingState>) -> palpate_state {
+    match state {
+        None => PALPATE_STATE_WAITING,
+        Some(RenderingState::Disabled) => PALPATE_STATE_DISABLED,
+        Some(RenderingState::Enabled) => PALPATE_STATE_ENABLED,
+        Some(RenderingState::Paused) => PALPATE_STATE_PAUSED,
+        Some(RenderingState::Fault) => PALPATE_STATE_FAULT,
+    }
+}
+
+/// Takes a tool of a session for a loop of your own, such as that of an engine's haptic thread, and waits until it may be used.
+/// `options` may be null. From then on call `palpate_touch_tick` a thousand times a second. When the connection breaks, the
+/// library connects again. Writes a handle for `palpate_touch_end`. Any thread; waits for the server.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_touch_begin(
+    session: *const palpate_session,
+    options: *const palpate_touch_options,
+    touch: *mut *mut palpate_touch,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promises.
+        let (session, options, out) = unsafe {
+            (at(session, "session is null")?, options_at(options)?.checked()?, at_mut(touch, "touch is null")?)
+        };
+        *out = std::ptr::null_mut();
+        let shared = session.shared.clone();
+        let target = session.target(&options);
+        let of_run = Options { keeps_session: true, warn: options.warn, ..Options::default() };
+        let beginning = bridge::begin(target, options.device, options.origin, of_run);
+        let (ticker, connection) = shared.runtime.block_on(beginning)?;
+        let far = Far::Server { connection, shared };
+        *out = Box::into_raw(Box::new(palpate_touch { ticker: Exclusive::new(ticker), axes: options.axes, far }));
+        Ok(())
+    })
+}
+
+/// A loop over what was recorded, without a server: the same messages, positions and times give the same forces, bit by bit.
+/// `options` may be null; `middle_m` is the middle of the tissue, in Palpate's own axes. Writes a handle for
+/// `palpate_touch_end`. Any thread.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_touch_begin_offline(
+    options: *const palpate_touch_options,
+    middle_m: palpate_vector,
+    touch: *mut *mut palpate_touch,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promises.
+        let (options, out) = unsafe { (options_at(options)?.checked()?, at_mut(touch, "touch is null")?) };
+        *out = std::ptr::null_mut();
+        let middle_m = middle_m.vector();
+        if !middle_m.is_finite() {
+            return Err(Fault::argument("middle_m must be finite"));
+        }
+        let Offline { ticker, record } = Offline::new(options.device, options.origin, middle_m, options.up_deadband);
+        let far = Far::Record(Exclusive::new(record));
+        *out = Box::into_raw(Box::new(palpate_touch { ticker: Exclusive::new(ticker), axes: options.axes, far }));
+        Ok(())
+    })
+}
+
+/// A recorded message arrives now: the bytes of a `palpate.v1.TouchResponse`. The next tick knows it. Only of a handle of
+/// `palpate_touch_begin_offline`. One thread at a time; it may be another than that of the ticks.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_touch_arrive(
+    touch: *const palpate_touch,
+    bytes: *const u8,
+    count: usize,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promise.
+        let Far::Record(record) = &unsafe { at(touch, "touch is null") }?.far else {
+            return Err(Fault::argument("touch has a server, which sends it messages"));
+        };
+        if bytes.is_null() && count > 0 || count > isize::MAX as usize {
+            return Err(Fault::argument("bytes is null, or count too large"));
+        }
+        // SAFETY: the caller's promise.
+        let bytes = if count == 0 { &[] } else { unsafe { std::slice::from_raw_parts(bytes, count) } };
+        record.with(|record| record.arrive(bytes))?.map_err(Fault::from)
+    })
+}
+
+/// Gives the force to render from now on, for a device that reports `reading` at `time_s`: seconds of any origin, by a clock that
+/// goes on between ticks. Takes a bounded time: no lock, no call of the system, no memory asked for or given back. It may be
+/// late, early or left out: forces then fade, and return within the safety envelope. After an error, `felt` has a force of
+/// zero. One thread at a time.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_touch_tick(
+    touch: *const palpate_touch,
+    reading: *const palpate_reading,
+    time_s: f64,
+    felt: *mut palpate_felt,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promises.
+        let felt = unsafe { at_mut(felt, "felt is null") }?;
+        *felt = palpate_felt { age_s: -1.0, ..palpate_felt::default() };
+        // SAFETY: the caller's promises.
+        let (touch, reading) = unsafe { (at(touch, "touch is null")?, at(reading, "reading is null")?) };
+        let reading = Reading { place_m: touch.axes.to_m(reading.position), enable: reading.enable != 0 };
+        let (force_n, state, is_over, age_s) = touch.ticker.with(|ticker| {
+            let force_n = ticker.tick(reading, time_s);
+            (force_n, ticker.state(), ticker.is_over(), ticker.model_age_s())
+        })?;
+        *felt = palpate_felt {
+            force_n: touch.axes.force(force_n),
+            state: state_of(state) as u32,
+            // A record never ends.
+            is_over: u32::from(is_over),
+            age_s: age_s.unwrap_or(-1.0),
+        };
+        if !(reading.place_m.is_finite() && time_s.is_finite()) {
+            return Err(Fault::argument("the position or the time is not finite: the force falls to zero"));
+        }
+        Ok(())
+    })
+}
+
+/// Stops rendering until `enable` goes from 0 to 1 again; the force falls within the next ticks. One thread at a time, as for
+/// `palpate_touch_tick`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_touch_disable(touch: *const palpate_touch) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promise.
+        unsafe { at(touch, "touch is null") }?.ticker.with(Ticker::disable)
+    })
+}
+
+/// Writes what went over the network. `PALPATE_CONNECTION` while there is no connection: `palpate_last_error` says why. Any
+/// thread; not for the thread of the ticks, as it takes a lock.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_touch_traffic(
+    touch: *const palpate_touch,
+    traffic: *mut palpate_traffic,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promises.
+        let (touch, out) = unsafe { (at(touch, "touch is null")?, at_mut(traffic, "traffic is null")?) };
+        *out = palpate_traffic::default();
+        let Far::Server { connection, .. } = &touch.far else { return Ok(()) };
+        let (traffic, lost) = (connection.traffic(), connection.lost());
+        *out = palpate_traffic {
+            connections: traffic.connections,
+            failed: traffic.failed,
+            samples: traffic.samples,
+            positions: traffic.poses,
+            is_connected: u32::from(lost.is_none()),
+        };
+        lost.map_or(Ok(()), |why| Err(Error::Connection(why).into()))
+    })
+}
+
+/// Gives the tool and the handle back. Null is allowed. Any thread, once, when no other is in a function of this handle.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_touch_end(touch: *mut palpate_touch) {
+    guard(|| {
+        if touch.is_null() {
+            return Ok(());
+        }
+        // SAFETY: the caller's promise.
+        let touch = unsafe { Box::from_raw(touch) };
+        if let Far::Server { connection, shared } = touch.far {
+            shared.runtime.block_on(connection.end());
+        }
+        Ok(())
+    });
+}

@@ -1,0 +1,218 @@
+/* What is wrong is an error with words, and never more than that: `errors URL`. */
+#include <math.h>
+#include <palpate.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+static int failures = 0;
+
+/* `code` is what `call` must return; its words must contain `words`. */
+static void expect(int line, palpate_result got, palpate_result code, const char *words) {
+    const char *said = code == PALPATE_OK ? "" : palpate_last_error();
+    if (got != code || (words && !strstr(said, words))) {
+        fprintf(stderr, "line %d: code %d, not %d: %s\n", line, (int)got, (int)code, said);
+        failures++;
+    }
+}
+#define EXPECT(call, code, words) expect(__LINE__, call, code, words)
+
+static int limits_ok(void *user, palpate_limits *limits) {
+    (void)user, (void)limits;
+    return 0;
+}
+static int limits_wrong(void *user, palpate_limits *limits) {
+    (void)user;
+    limits->max_force_n = NAN;
+    return 0;
+}
+static int read_fails(void *user, palpate_reading *reading) {
+    (void)reading;
+    /* After it has been connected for a while. */
+    return ++*(int *)user > 2000 ? 7 : 0;
+}
+static int zero_at_end = 0;
+static int write_ok(void *user, const palpate_vector *force_n) {
+    (void)user;
+    zero_at_end = force_n->x == 0.0 && force_n->y == 0.0 && force_n->z == 0.0;
+    return 0;
+}
+
+int main(int count, char **arguments) {
+    if (count != 2) return 2;
+    const char *url = arguments[1];
+    palpate_server *server = NULL;
+    palpate_session *session = NULL;
+    palpate_touch *touch = NULL;
+    palpate_bridge *bridge = NULL;
+    palpate_surface *surface = NULL;
+    char text[256];
+    size_t needed = 0;
+
+    /* Null pointers. */
+    EXPECT(palpate_connect(NULL, NULL, &server), PALPATE_ARGUMENT, "url is null");
+    EXPECT(palpate_connect(url, NULL, NULL), PALPATE_ARGUMENT, "server is null");
+    EXPECT(palpate_scenes(NULL, text, sizeof text, &needed), PALPATE_ARGUMENT, "server is null");
+    EXPECT(palpate_session_create(NULL, "liver", &session), PALPATE_ARGUMENT, "server is null");
+    EXPECT(palpate_session_delete(NULL), PALPATE_ARGUMENT, "session is null");
+    EXPECT(palpate_session_extent(NULL, NULL), PALPATE_ARGUMENT, "session is null");
+    EXPECT(palpate_session_change(NULL, NULL), PALPATE_ARGUMENT, "session is null");
+    EXPECT(palpate_touch_begin(NULL, NULL, &touch), PALPATE_ARGUMENT, "session is null");
+    EXPECT(palpate_touch_tick(NULL, NULL, 0.0, NULL), PALPATE_ARGUMENT, "felt is null");
+    EXPECT(palpate_touch_disable(NULL), PALPATE_ARGUMENT, "touch is null");
+    EXPECT(palpate_touch_arrive(NULL, NULL, 0), PALPATE_ARGUMENT, "touch is null");
+    EXPECT(palpate_touch_traffic(NULL, NULL), PALPATE_ARGUMENT, "touch is null");
+    EXPECT(palpate_bridge_begin(NULL, NULL, NULL, &bridge), PALPATE_ARGUMENT, "session is null");
+    EXPECT(palpate_bridge_look(NULL, NULL), PALPATE_ARGUMENT, "bridge is null");
+    EXPECT(palpate_bridge_end(NULL, NULL), PALPATE_ARGUMENT, "bridge is null");
+    EXPECT(palpate_surface_open(NULL, NULL, &surface), PALPATE_ARGUMENT, "session is null");
+    EXPECT(palpate_surface_read(NULL, NULL, NULL), PALPATE_ARGUMENT, "surface is null");
+    EXPECT(palpate_surface_size_of(NULL, NULL), PALPATE_ARGUMENT, "surface is null");
+    EXPECT(palpate_surface_indices(NULL, NULL, 0), PALPATE_ARGUMENT, "surface is null");
+    EXPECT(palpate_surface_uv(NULL, NULL, 8, 0), PALPATE_ARGUMENT, "surface is null");
+    EXPECT(palpate_touch_options_init(NULL, 8), PALPATE_ARGUMENT, "options is null");
+    EXPECT(palpate_change_init(NULL), PALPATE_ARGUMENT, "change is null");
+    EXPECT(palpate_limits_of(NULL, NULL), PALPATE_ARGUMENT, "name is null");
+    palpate_server_free(NULL);
+    palpate_session_free(NULL);
+    palpate_surface_free(NULL);
+    palpate_touch_end(NULL);
+
+    /* Addresses and texts. */
+    EXPECT(palpate_connect("ftp://nowhere", NULL, &server), PALPATE_ARGUMENT, "must begin with http");
+    EXPECT(palpate_connect("http://\xff", NULL, &server), PALPATE_ARGUMENT, "not UTF-8");
+    EXPECT(palpate_connect("http://127.0.0.1:1", NULL, &server), PALPATE_CONNECTION, "can't reach");
+    palpate_connect_options how;
+    EXPECT(palpate_connect_options_init(&how, sizeof how), PALPATE_OK, NULL);
+    how.token = "two words";
+    EXPECT(palpate_connect(url, &how, &server), PALPATE_ARGUMENT, "no token");
+    EXPECT(palpate_connect_options_init(&how, sizeof how), PALPATE_OK, NULL);
+    how.key_pem = "alone";
+    EXPECT(palpate_connect(url, &how, &server), PALPATE_ARGUMENT, "go together");
+    EXPECT(palpate_connect_options_init(&how, sizeof how), PALPATE_OK, NULL);
+    how.timeout_s = NAN;
+    EXPECT(palpate_connect(url, &how, &server), PALPATE_ARGUMENT, "timeout_s");
+    how.size = 0;
+    EXPECT(palpate_connect(url, &how, &server), PALPATE_ARGUMENT, "_init");
+    EXPECT(palpate_connect_options_init(&how, 10000), PALPATE_ARGUMENT, "another version");
+    palpate_limits limits;
+    EXPECT(palpate_limits_of("spoon", &limits), PALPATE_ARGUMENT, "spoon");
+
+    /* Sessions. */
+    EXPECT(palpate_connect(url, NULL, &server), PALPATE_OK, NULL);
+    EXPECT(palpate_scenes(server, NULL, 0, NULL), PALPATE_ARGUMENT, "needed");
+    EXPECT(palpate_scenes(server, text, 3, &needed), PALPATE_BUFFER, "bytes");
+    EXPECT(palpate_scenes(server, NULL, 0, &needed), PALPATE_OK, NULL);
+    char *names = malloc(needed);
+    EXPECT(palpate_scenes(server, names, needed, &needed), PALPATE_OK, NULL);
+    if (!strstr(names, "liver") || strlen(names) + 1 != needed) failures++, fprintf(stderr, "scenes: %s\n", names);
+    free(names);
+    EXPECT(palpate_session_create(server, "nowhere", &session), PALPATE_REFUSED, "nowhere");
+    if (session) failures++;
+    EXPECT(palpate_session_join(server, "00000000000000000000000000000000", &session), PALPATE_REFUSED, NULL);
+    EXPECT(palpate_session_create_from_text(server, "sheet = 7", &session), PALPATE_ARGUMENT, "scene_text:1");
+    EXPECT(palpate_session_create_from_text(server, "", &session), PALPATE_ARGUMENT, NULL);
+    EXPECT(palpate_session_create(server, "liver", &session), PALPATE_OK, NULL);
+    EXPECT(palpate_session_id(session, text, sizeof text, &needed), PALPATE_OK, NULL);
+    palpate_session *same = NULL;
+    EXPECT(palpate_session_join(server, text, &same), PALPATE_OK, NULL);
+    palpate_change change;
+    EXPECT(palpate_change_init(&change), PALPATE_OK, NULL);
+    EXPECT(palpate_session_change(same, &change), PALPATE_REFUSED, NULL);
+    change.stiffness_n_per_m = -1.0;
+    EXPECT(palpate_session_change(same, &change), PALPATE_REFUSED, "stiffness");
+    change.stiffness_n_per_m = INFINITY;
+    EXPECT(palpate_session_change(same, &change), PALPATE_REFUSED, "stiffness");
+    change.stiffness_n_per_m = 20.0;
+    EXPECT(palpate_session_change(same, &change), PALPATE_OK, NULL);
+    palpate_session_free(same);
+
+    /* Touch. */
+    palpate_touch_options options;
+    EXPECT(palpate_touch_options_init(&options, sizeof options), PALPATE_OK, NULL);
+    options.axes = 9;
+    EXPECT(palpate_touch_begin(session, &options, &touch), PALPATE_ARGUMENT, "axes");
+    options.axes = PALPATE_AXES_UNITY;
+    options.limits.max_force_n = -1.0;
+    EXPECT(palpate_touch_begin(session, &options, &touch), PALPATE_ARGUMENT, "max_force_n");
+    options.limits.max_force_n = 3.0;
+    options.tip_radius_m = NAN;
+    EXPECT(palpate_touch_begin(session, &options, &touch), PALPATE_ARGUMENT, "tip_radius_m");
+    options.tip_radius_m = 0.005;
+    options.tool = 1000000;
+    EXPECT(palpate_touch_begin(session, &options, &touch), PALPATE_REFUSED, NULL);
+    options.tool = 0;
+    EXPECT(palpate_touch_begin(session, &options, &touch), PALPATE_OK, NULL);
+    palpate_reading reading = {{0.0, 0.01, 0.0}, 1};
+    palpate_felt felt;
+    EXPECT(palpate_touch_tick(touch, NULL, 0.0, &felt), PALPATE_ARGUMENT, "reading is null");
+    EXPECT(palpate_touch_tick(touch, &reading, 0.0, &felt), PALPATE_OK, NULL);
+    if (felt.state != PALPATE_STATE_ENABLED || felt.is_over) failures++, fprintf(stderr, "state %u\n", felt.state);
+    reading.position.x = NAN;
+    EXPECT(palpate_touch_tick(touch, &reading, 0.001, &felt), PALPATE_ARGUMENT, "not finite");
+    if (felt.state != PALPATE_STATE_FAULT || felt.force_n.z != 0.0) failures++, fprintf(stderr, "fault %u\n", felt.state);
+    reading.position.x = 0.0;
+    EXPECT(palpate_touch_tick(touch, &reading, INFINITY, &felt), PALPATE_ARGUMENT, "not finite");
+    EXPECT(palpate_touch_tick(touch, &reading, -5.0, &felt), PALPATE_OK, NULL);
+    EXPECT(palpate_touch_arrive(touch, (const uint8_t *)"", 0), PALPATE_ARGUMENT, "has a server");
+    palpate_traffic traffic;
+    EXPECT(palpate_touch_traffic(touch, &traffic), PALPATE_OK, NULL);
+    if (traffic.connections != 1 || !traffic.is_connected) failures++, fprintf(stderr, "traffic\n");
+
+    /* The surface. */
+    palpate_surface_options look;
+    EXPECT(palpate_surface_options_init(&look, sizeof look), PALPATE_OK, NULL);
+    look.rate_hz = 0.0;
+    EXPECT(palpate_surface_open(session, &look, &surface), PALPATE_ARGUMENT, "rate_hz");
+    look.rate_hz = 60.0;
+    look.refinement = 99;
+    EXPECT(palpate_surface_open(session, &look, &surface), PALPATE_REFUSED, "refinement");
+    EXPECT(palpate_surface_open(session, NULL, &surface), PALPATE_OK, NULL);
+    palpate_surface_size size;
+    EXPECT(palpate_surface_size_of(surface, &size), PALPATE_OK, NULL);
+    float *positions = calloc(3 * size.vertices, sizeof(float));
+    uint32_t *indices = calloc(size.indices, sizeof(uint32_t));
+    palpate_buffers buffers = {positions, 12, NULL, 0, size.vertices, 1};
+    palpate_dirty dirty;
+    buffers.positions_stride = 11;
+    EXPECT(palpate_surface_read(surface, &buffers, &dirty), PALPATE_ARGUMENT, "stride");
+    buffers.positions_stride = 12;
+    buffers.vertices--;
+    EXPECT(palpate_surface_read(surface, &buffers, &dirty), PALPATE_BUFFER, "vertices");
+    buffers.vertices++;
+    EXPECT(palpate_surface_read(surface, &buffers, &dirty), PALPATE_OK, NULL);
+    if (dirty.first != 0 || dirty.count != size.vertices) failures++, fprintf(stderr, "dirty %zu\n", dirty.count);
+    EXPECT(palpate_surface_indices(surface, indices, size.indices - 1), PALPATE_BUFFER, NULL);
+    EXPECT(palpate_surface_indices(surface, indices, size.indices), PALPATE_OK, NULL);
+    for (size_t k = 0; k < size.indices; k++) failures += indices[k] >= size.vertices;
+    free(positions);
+    free(indices);
+
+    /* Devices. */
+    int reads = 0;
+    palpate_device device = {&reads, limits_ok, read_fails, NULL};
+    EXPECT(palpate_bridge_begin(session, &device, NULL, &bridge), PALPATE_ARGUMENT, "all three");
+    device.write = write_ok;
+    device.descriptor = limits_wrong;
+    EXPECT(palpate_bridge_begin(session, &device, NULL, &bridge), PALPATE_ARGUMENT, "max_force_n");
+    device.descriptor = limits_ok;
+    palpate_touch_end(touch);
+    EXPECT(palpate_bridge_begin(session, &device, NULL, &bridge), PALPATE_OK, NULL);
+    palpate_bridge_state state;
+    do palpate_bridge_look(bridge, &state);
+    while (!state.is_over);
+    EXPECT(palpate_bridge_end(bridge, NULL), PALPATE_DEVICE, "`read` returned 7");
+    if (!zero_at_end) failures++, fprintf(stderr, "a device that failed is left with a force\n");
+
+    /* What is deleted is gone; handles stay usable, in any order. */
+    EXPECT(palpate_session_delete(session), PALPATE_OK, NULL);
+    EXPECT(palpate_session_delete(session), PALPATE_REFUSED, NULL);
+    palpate_server_free(server);
+    EXPECT(palpate_touch_begin(session, NULL, &touch), PALPATE_REFUSED, NULL);
+    palpate_session_free(session);
+    palpate_surface_free(surface);
+
+    if (strcmp(palpate_version(), "0.1.0") != 0 || palpate_abi() != PALPATE_ABI) failures++;
+    printf("%d failures\n", failures);
+    return failures ? 1 : 0;
+}

@@ -1,0 +1,313 @@
+// C++17 over libpalpate: handles that free themselves, and results in place of exceptions. Header only; link palpate.
+// The rules of palpate.h hold: which thread may call what, and what waits.
+#ifndef PALPATE_HPP
+#define PALPATE_HPP
+
+#include <palpate.h>
+
+#include <cstdint>
+#include <memory>
+#include <optional>
+#include <sstream>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace palpate {
+
+using Vector = palpate_vector;
+using Extent = palpate_extent;
+using Reading = palpate_reading;
+using Felt = palpate_felt;
+using Limits = palpate_limits;
+using Traffic = palpate_traffic;
+using Report = palpate_bridge_report;
+
+/// What went wrong.
+struct Error {
+    palpate_result code = PALPATE_OK;
+    std::string words;
+};
+
+/// A value, or why there is none.
+template <class T>
+class Result {
+public:
+    Result(T value) : value_(std::move(value)) {}
+    Result(Error error) : error_(std::move(error)) {}
+    explicit operator bool() const { return value_.has_value(); }
+    T& operator*() { return *value_; }
+    T* operator->() { return &*value_; }
+    /// Only if there is no value.
+    const Error& error() const { return error_; }
+
+private:
+    std::optional<T> value_;
+    Error error_;
+};
+
+namespace detail {
+template <auto Free>
+struct Freed {
+    template <class T>
+    void operator()(T* handle) const {
+        Free(handle);
+    }
+};
+template <class T, auto Free>
+using Handle = std::unique_ptr<T, Freed<Free>>;
+
+inline Error error(palpate_result code) { return Error{code, palpate_last_error()}; }
+
+inline void end_bridge(palpate_bridge* bridge) { palpate_bridge_end(bridge, nullptr); }
+
+/// A text of the library, of which it tells the size first.
+template <class Write>
+Result<std::string> text(Write write) {
+    std::size_t needed = 0;
+    if (auto code = write(nullptr, 0, &needed)) return error(code);
+    std::string text(needed, '\0');
+    if (auto code = write(text.data(), text.size(), &needed)) return error(code);
+    text.resize(needed - 1);
+    return text;
+}
+}  // namespace detail
+
+/// How to touch. Fields as in palpate_touch_options.
+struct TouchOptions : palpate_touch_options {
+    TouchOptions() { palpate_touch_options_init(this, sizeof(palpate_touch_options)); }
+};
+
+/// Which surface to show. Fields as in palpate_surface_options.
+struct SurfaceOptions : palpate_surface_options {
+    SurfaceOptions() { palpate_surface_options_init(this, sizeof(palpate_surface_options)); }
+};
+
+/// How to connect. Fields as in palpate_connect_options.
+struct ConnectOptions : palpate_connect_options {
+    ConnectOptions() { palpate_connect_options_init(this, sizeof(palpate_connect_options)); }
+};
+
+/// A change of the tissue. Fields as in palpate_change; what you do not set stays.
+struct Change : palpate_change {
+    Change() { palpate_change_init(this); }
+};
+
+/// A tool that a loop of your own leads.
+class Touch {
+public:
+    /// The force until the next tick, for a thread of your own, a thousand times a second. Never waits. After an error it is zero.
+    Felt tick(const Reading& reading, double time_s) noexcept {
+        Felt felt{};
+        palpate_touch_tick(touch_.get(), &reading, time_s, &felt);
+        return felt;
+    }
+    /// Stops rendering until `enable` goes from 0 to 1 again.
+    void disable() noexcept { palpate_touch_disable(touch_.get()); }
+    /// What went over the network.
+    Traffic traffic() const noexcept {
+        Traffic traffic{};
+        palpate_touch_traffic(touch_.get(), &traffic);
+        return traffic;
+    }
+    /// A recorded message arrives; see palpate_touch_arrive.
+    std::optional<Error> arrive(const std::uint8_t* bytes, std::size_t count) {
+        if (auto code = palpate_touch_arrive(touch_.get(), bytes, count)) return detail::error(code);
+        return std::nullopt;
+    }
+    /// A loop over what was recorded; see palpate_touch_begin_offline.
+    static Result<Touch> offline(const TouchOptions& options, Vector middle_m) {
+        palpate_touch* touch = nullptr;
+        if (auto code = palpate_touch_begin_offline(&options, middle_m, &touch)) return detail::error(code);
+        return Touch(touch);
+    }
+    explicit Touch(palpate_touch* touch) : touch_(touch) {}
+
+private:
+    detail::Handle<palpate_touch, palpate_touch_end> touch_;
+};
+
+/// A device of your own: derive from it. A thread of the library calls it, a thousand times a second.
+class Device {
+public:
+    virtual ~Device() = default;
+    /// What the device can bear.
+    virtual Limits limits() = 0;
+    /// Where it is; false if it fails.
+    virtual bool read(Reading& reading) = 0;
+    /// Renders a force until the next tick, N; false if it fails.
+    virtual bool write(const Vector& force_n) = 0;
+
+    /// As the library wants it.
+    palpate_device called() {
+        palpate_device device{};
+        device.user = this;
+        device.descriptor = [](void* user, palpate_limits* limits) noexcept {
+            *limits = static_cast<Device*>(user)->limits();
+            return 0;
+        };
+        device.read = [](void* user, palpate_reading* reading) noexcept {
+            return static_cast<Device*>(user)->read(*reading) ? 0 : 1;
+        };
+        device.write = [](void* user, const palpate_vector* force_n) noexcept {
+            return static_cast<Device*>(user)->write(*force_n) ? 0 : 1;
+        };
+        return device;
+    }
+};
+
+/// The loop of a device, on a thread of the library. It ends with this.
+class Bridge {
+public:
+    /// How it stands.
+    palpate_bridge_state look() const noexcept {
+        palpate_bridge_state state{};
+        palpate_bridge_look(bridge_.get(), &state);
+        return state;
+    }
+    /// Ends the loop and tells what it has done, or how the device failed.
+    Result<Report> end() {
+        Report report{};
+        if (auto code = palpate_bridge_end(bridge_.release(), &report)) return detail::error(code);
+        return report;
+    }
+    explicit Bridge(palpate_bridge* bridge) : bridge_(bridge) {}
+
+private:
+    detail::Handle<palpate_bridge, detail::end_bridge> bridge_;
+};
+
+/// The surface of a session, in vectors of its own.
+class Surface {
+public:
+    /// x, y, z of each vertex, one after the other.
+    const std::vector<float>& positions() const { return positions_; }
+    /// The same of their normals.
+    const std::vector<float>& normals() const { return normals_; }
+    /// Three for each triangle.
+    const std::vector<std::uint32_t>& indices() const { return indices_; }
+    /// u and v of each vertex; empty if it has none.
+    const std::vector<float>& uv() const { return uv_; }
+    /// Brings positions and normals up to date; tells which vertices have changed. Never waits.
+    palpate_dirty read() {
+        palpate_dirty dirty{};
+        lost_ = palpate_surface_read(surface_.get(), &buffers_, &dirty) != PALPATE_OK;
+        buffers_.everything = 0;
+        return dirty;
+    }
+    /// Whether no more will come.
+    bool lost() const { return lost_; }
+
+    explicit Surface(palpate_surface* surface) : surface_(surface) {
+        palpate_surface_size size{};
+        palpate_surface_size_of(surface, &size);
+        positions_.resize(3 * size.vertices);
+        normals_.resize(3 * size.vertices);
+        indices_.resize(size.indices);
+        palpate_surface_indices(surface, indices_.data(), indices_.size());
+        if (size.has_uv) {
+            uv_.resize(2 * size.vertices);
+            palpate_surface_uv(surface, uv_.data(), 2 * sizeof(float), size.vertices);
+        }
+        const std::size_t stride = 3 * sizeof(float);
+        buffers_ = {positions_.data(), stride, normals_.data(), stride, size.vertices, 1};
+    }
+
+private:
+    detail::Handle<palpate_surface, palpate_surface_free> surface_;
+    std::vector<float> positions_, normals_, uv_;
+    std::vector<std::uint32_t> indices_;
+    palpate_buffers buffers_{};
+    bool lost_ = false;
+};
+
+/// A session: one tissue in use.
+class Session {
+public:
+    /// By which others join it.
+    std::string id() const {
+        auto id = detail::text([&](auto... place) { return palpate_session_id(session_.get(), place...); });
+        return id ? *id : std::string();
+    }
+    /// Where the tissue rests, in Palpate's own axes, m.
+    Extent extent() const {
+        Extent extent{};
+        palpate_session_extent(session_.get(), &extent);
+        return extent;
+    }
+    /// Takes a tool for a loop of your own. Waits for the server.
+    Result<Touch> touch(const TouchOptions& options = {}) const {
+        palpate_touch* touch = nullptr;
+        if (auto code = palpate_touch_begin(session_.get(), &options, &touch)) return detail::error(code);
+        return Touch(touch);
+    }
+    /// Connects a device, which must outlive the bridge. Waits for the server.
+    Result<Bridge> bridge(Device& device, const TouchOptions& options = {}) const {
+        palpate_bridge* bridge = nullptr;
+        const palpate_device called = device.called();
+        if (auto code = palpate_bridge_begin(session_.get(), &called, &options, &bridge)) return detail::error(code);
+        return Bridge(bridge);
+    }
+    /// Gets the surface. Waits for the server.
+    Result<Surface> surface(const SurfaceOptions& options = {}) const {
+        palpate_surface* surface = nullptr;
+        if (auto code = palpate_surface_open(session_.get(), &options, &surface)) return detail::error(code);
+        return Surface(surface);
+    }
+    /// Changes the tissue. Waits for the server.
+    std::optional<Error> change(const Change& change) const {
+        if (auto code = palpate_session_change(session_.get(), &change)) return detail::error(code);
+        return std::nullopt;
+    }
+    /// Deletes it on the server, for everybody. Waits for the server.
+    std::optional<Error> remove() const {
+        if (auto code = palpate_session_delete(session_.get())) return detail::error(code);
+        return std::nullopt;
+    }
+    explicit Session(palpate_session* session) : session_(session) {}
+
+private:
+    detail::Handle<palpate_session, palpate_session_free> session_;
+};
+
+/// A connection to a server.
+class Server {
+public:
+    /// Connects. Waits for the server.
+    static Result<Server> connect(const std::string& url, const ConnectOptions& options = {}) {
+        palpate_server* server = nullptr;
+        if (auto code = palpate_connect(url.c_str(), &options, &server)) return detail::error(code);
+        return Server(server);
+    }
+    /// The names of its scenes. Waits for the server.
+    Result<std::vector<std::string>> scenes() const {
+        auto lines = detail::text([&](auto... place) { return palpate_scenes(server_.get(), place...); });
+        if (!lines) return lines.error();
+        std::vector<std::string> names;
+        std::istringstream text(*lines);
+        for (std::string name; std::getline(text, name);) names.push_back(name);
+        return names;
+    }
+    /// Makes a session of a scene that the server has. Waits for the server.
+    Result<Session> create(const std::string& scene) const { return made(palpate_session_create, scene); }
+    /// Makes a session of the text of a scene. Waits for the server.
+    Result<Session> create_from_text(const std::string& text) const {
+        return made(palpate_session_create_from_text, text);
+    }
+    /// Joins a session by its id. Waits for the server.
+    Result<Session> join(const std::string& id) const { return made(palpate_session_join, id); }
+    explicit Server(palpate_server* server) : server_(server) {}
+
+private:
+    template <class Make>
+    Result<Session> made(Make make, const std::string& text) const {
+        palpate_session* session = nullptr;
+        if (auto code = make(server_.get(), text.c_str(), &session)) return detail::error(code);
+        return Session(session);
+    }
+    detail::Handle<palpate_server, palpate_server_free> server_;
+};
+
+}  // namespace palpate
+
+#endif

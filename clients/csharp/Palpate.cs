@@ -1,0 +1,496 @@
+// Palpate for C#: libpalpate by P/Invoke, and a small interface over it. One file: copy it into your project, and put
+// libpalpate.so (Windows: palpate.dll) where your program finds native libraries. C# 7, .NET Standard 2.0, Mono, Unity.
+// The rules of palpate.h hold: which thread may call what, and what waits.
+using System;
+using System.Runtime.InteropServices;
+using System.Text;
+
+namespace Palpate
+{
+    /// <summary>Three components, in the axes that were asked for.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct Vector
+    {
+        public double X, Y, Z;
+        public Vector(double x, double y, double z) { X = x; Y = y; Z = z; }
+        public double Length { get { return Math.Sqrt(X * X + Y * Y + Z * Z); } }
+    }
+
+    /// <summary>Axes and unit of positions, normals and forces; see palpate_axes.</summary>
+    public enum Axes : uint { Own = 0, Unity = 1, Unreal = 2 }
+
+    /// <summary>Whether forces are rendered; see palpate_state.</summary>
+    public enum State : uint { Waiting = 0, Disabled = 1, Enabled = 2, Paused = 3, Fault = 4 }
+
+    /// <summary>With which priority a loop runs; see palpate_priority.</summary>
+    public enum Priority : uint { Usual = 0, RealTime = 1, Refused = 2 }
+
+    /// <summary>Why a call did nothing; see palpate_result.</summary>
+    public enum Code { Ok = 0, Argument = 1, Connection = 2, Refused = 3, Device = 4, Buffer = 5, Busy = 6, Internal = 7 }
+
+    /// <summary>The box around a tissue at rest, in Palpate's own axes, m.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct Extent { public Vector Least, Most, Middle; }
+
+    /// <summary>What a device reports.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct Reading
+    {
+        public Vector Position;
+        uint enable;
+        public Reading(Vector position, bool enabled) { Position = position; enable = enabled ? 1u : 0u; }
+        public bool Enable { get { return enable != 0; } set { enable = value ? 1u : 0u; } }
+    }
+
+    /// <summary>What a tick tells.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct Felt
+    {
+        public Vector Force;
+        uint state, isOver;
+        /// <summary>How old the newest news of the tissue is, s; negative before the first.</summary>
+        public double Age;
+        public State State { get { return (State)state; } }
+        public bool IsOver { get { return isOver != 0; } }
+    }
+
+    /// <summary>What a haptic device can bear; see palpate_limits.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct Limits
+    {
+        public double MaxForce, ContinuousForce, MaxStiffness, MaxDamping, WorkspaceRadius;
+        public static Limits Of(string device)
+        {
+            Limits limits;
+            Native.Check(Native.palpate_limits_of(Native.Utf8(device), out limits));
+            return limits;
+        }
+    }
+
+    /// <summary>What went over the network; see palpate_traffic.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct Traffic { public ulong Connections, Failed, Samples, Positions; uint connected, unused; public bool IsConnected { get { return connected != 0; } } }
+
+    /// <summary>How a loop stands; see palpate_bridge_state.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct BridgeState
+    {
+        public ulong Ticks;
+        public Vector Position, Force;
+        uint state, priority, isOver, unused;
+        public State State { get { return (State)state; } }
+        public Priority Priority { get { return (Priority)priority; } }
+        public bool IsOver { get { return isOver != 0; } }
+    }
+
+    /// <summary>What a loop has done; see palpate_bridge_report.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct Report
+    {
+        public ulong Ticks, LateTicks, MissedTicks, Connections, Samples, Positions;
+        uint priority, unused;
+        public Priority Priority { get { return (Priority)priority; } }
+    }
+
+    /// <summary>A change of the tissue; what is not a number stays.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct Change
+    {
+        public double Stiffness, Damping, VirtualStiffness, VolumeStiffness;
+        public static Change None { get { double n = double.NaN; return new Change { Stiffness = n, Damping = n, VirtualStiffness = n, VolumeStiffness = n }; } }
+    }
+
+    /// <summary>What was written of a surface; see palpate_dirty.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct Dirty
+    {
+        UIntPtr first, count;
+        public ulong Frames, Step;
+        public double SimulationTime;
+        public int First { get { return (int)first; } }
+        public int Count { get { return (int)count; } }
+    }
+
+    /// <summary>How to touch; see palpate_touch_options.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct TouchOptions
+    {
+        UIntPtr size;
+        public uint Tool;
+        public Axes Axes;
+        uint inTissueFrame, grasps;
+        public double TipRadius, Friction;
+        public Limits Limits;
+        public double Deadband, UpDeadband;
+        uint datagrams, realTime;
+        IntPtr holder, warn, warnUser;
+        public bool InTissueFrame { get { return inTissueFrame != 0; } set { inTissueFrame = value ? 1u : 0u; } }
+        public bool Grasps { get { return grasps != 0; } set { grasps = value ? 1u : 0u; } }
+        public bool Datagrams { get { return datagrams != 0; } set { datagrams = value ? 1u : 0u; } }
+        public bool RealTime { get { return realTime != 0; } set { realTime = value ? 1u : 0u; } }
+        public static TouchOptions Default
+        {
+            get
+            {
+                TouchOptions options;
+                Native.Check(Native.palpate_touch_options_init(out options, (UIntPtr)Marshal.SizeOf(typeof(TouchOptions))));
+                return options;
+            }
+        }
+    }
+
+    [StructLayout(LayoutKind.Sequential)]
+    struct SurfaceOptions { public UIntPtr Size; public Axes Axes; public uint Refinement; public double Rate; }
+
+    [StructLayout(LayoutKind.Sequential)]
+    struct SurfaceSize { public UIntPtr Vertices, Indices; public uint HasUv; }
+
+    [StructLayout(LayoutKind.Sequential)]
+    struct Buffers { public IntPtr Positions; public UIntPtr PositionsStride; public IntPtr Normals; public UIntPtr NormalsStride, Vertices; public uint Everything; }
+
+    [StructLayout(LayoutKind.Sequential)]
+    struct ConnectOptions { public UIntPtr Size; public IntPtr Token, Ca, TlsName, Certificate, Key; public double Timeout; }
+
+    [StructLayout(LayoutKind.Sequential)]
+    struct DeviceCalls { public IntPtr User, Descriptor, Read, Write; }
+
+    /// <summary>An error of the library.</summary>
+    public class PalpateException : Exception
+    {
+        public Code Code { get; private set; }
+        public PalpateException(Code code, string words) : base(words) { Code = code; }
+    }
+
+    [UnmanagedFunctionPointer(CallingConvention.Cdecl)] delegate int Descriptor(IntPtr user, out Limits limits);
+    [UnmanagedFunctionPointer(CallingConvention.Cdecl)] delegate int Read(IntPtr user, out Reading reading);
+    [UnmanagedFunctionPointer(CallingConvention.Cdecl)] delegate int Write(IntPtr user, ref Vector force);
+    delegate Code WriteText(byte[] text, UIntPtr capacity, out UIntPtr needed);
+
+    static class Native
+    {
+        const string Library = "palpate";
+        const CallingConvention C = CallingConvention.Cdecl;
+        [DllImport(Library, CallingConvention = C)] internal static extern IntPtr palpate_version();
+        [DllImport(Library, CallingConvention = C)] internal static extern IntPtr palpate_last_error();
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_connect_options_init(out ConnectOptions options, UIntPtr size);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_touch_options_init(out TouchOptions options, UIntPtr size);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_surface_options_init(out SurfaceOptions options, UIntPtr size);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_limits_of(byte[] name, out Limits limits);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_connect(byte[] url, ref ConnectOptions options, out IntPtr server);
+        [DllImport(Library, CallingConvention = C)] internal static extern void palpate_server_free(IntPtr server);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_scenes(IntPtr server, byte[] names, UIntPtr capacity, out UIntPtr needed);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_create(IntPtr server, byte[] scene, out IntPtr session);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_create_from_text(IntPtr server, byte[] scene, out IntPtr session);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_join(IntPtr server, byte[] id, out IntPtr session);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_id(IntPtr session, byte[] id, UIntPtr capacity, out UIntPtr needed);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_extent(IntPtr session, out Extent extent);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_change(IntPtr session, ref Change change);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_delete(IntPtr session);
+        [DllImport(Library, CallingConvention = C)] internal static extern void palpate_session_free(IntPtr session);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_touch_begin(IntPtr session, ref TouchOptions options, out IntPtr touch);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_touch_begin_offline(ref TouchOptions options, Vector middle, out IntPtr touch);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_touch_arrive(IntPtr touch, byte[] bytes, UIntPtr count);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_touch_tick(IntPtr touch, ref Reading reading, double time, out Felt felt);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_touch_disable(IntPtr touch);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_touch_traffic(IntPtr touch, out Traffic traffic);
+        [DllImport(Library, CallingConvention = C)] internal static extern void palpate_touch_end(IntPtr touch);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_bridge_begin(IntPtr session, ref DeviceCalls device, ref TouchOptions options, out IntPtr bridge);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_bridge_look(IntPtr bridge, out BridgeState state);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_bridge_end(IntPtr bridge, out Report report);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_surface_open(IntPtr session, ref SurfaceOptions options, out IntPtr surface);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_surface_size_of(IntPtr surface, out SurfaceSize size);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_surface_indices(IntPtr surface, int[] indices, UIntPtr capacity);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_surface_uv(IntPtr surface, float[] uv, UIntPtr stride, UIntPtr vertices);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_surface_read(IntPtr surface, ref Buffers buffers, out Dirty dirty);
+        [DllImport(Library, CallingConvention = C)] internal static extern void palpate_surface_free(IntPtr surface);
+
+        internal static void Check(Code code)
+        {
+            if (code != Code.Ok) throw new PalpateException(code, Text(palpate_last_error()));
+        }
+
+        internal static byte[] Utf8(string text)
+        {
+            return text == null ? null : Encoding.UTF8.GetBytes(text + "\0");
+        }
+
+        internal static string Text(IntPtr text)
+        {
+            int length = 0;
+            while (Marshal.ReadByte(text, length) != 0) length++;
+            var bytes = new byte[length];
+            Marshal.Copy(text, bytes, 0, length);
+            return Encoding.UTF8.GetString(bytes);
+        }
+
+        internal static string Text(WriteText write)
+        {
+            UIntPtr needed;
+            Check(write(null, UIntPtr.Zero, out needed));
+            var bytes = new byte[(int)needed];
+            Check(write(bytes, needed, out needed));
+            return Encoding.UTF8.GetString(bytes, 0, bytes.Length - 1);
+        }
+    }
+
+    /// <summary>Something of the library that is to be given back.</summary>
+    public abstract class Handle : IDisposable
+    {
+        internal IntPtr Pointer;
+        internal abstract void Free(IntPtr pointer);
+        public void Dispose()
+        {
+            var pointer = System.Threading.Interlocked.Exchange(ref Pointer, IntPtr.Zero);
+            if (pointer != IntPtr.Zero) Free(pointer);
+            GC.SuppressFinalize(this);
+        }
+        ~Handle() { Dispose(); }
+    }
+
+    /// <summary>A connection to a server.</summary>
+    public sealed class Server : Handle
+    {
+        /// <summary>The library's version.</summary>
+        public static string Version { get { return Native.Text(Native.palpate_version()); } }
+
+        /// <summary>Connects. Waits for the server.</summary>
+        public Server(string url, string token = null, string caPem = null, double timeout = 60.0)
+        {
+            ConnectOptions options;
+            Native.Check(Native.palpate_connect_options_init(out options, (UIntPtr)Marshal.SizeOf(typeof(ConnectOptions))));
+            byte[] ofToken = Native.Utf8(token), ofCa = Native.Utf8(caPem);
+            GCHandle one = GCHandle.Alloc(ofToken, GCHandleType.Pinned), two = GCHandle.Alloc(ofCa, GCHandleType.Pinned);
+            try
+            {
+                options.Token = one.AddrOfPinnedObject();
+                options.Ca = two.AddrOfPinnedObject();
+                options.Timeout = timeout;
+                Native.Check(Native.palpate_connect(Native.Utf8(url), ref options, out Pointer));
+            }
+            finally { one.Free(); two.Free(); }
+        }
+
+        /// <summary>The names of its scenes. Waits for the server.</summary>
+        public string[] Scenes()
+        {
+            return Native.Text((byte[] text, UIntPtr capacity, out UIntPtr needed) => Native.palpate_scenes(Pointer, text, capacity, out needed)).Split('\n');
+        }
+
+        /// <summary>Makes a session of a scene that the server has. Waits for the server.</summary>
+        public Session Create(string scene)
+        {
+            IntPtr session;
+            Native.Check(Native.palpate_session_create(Pointer, Native.Utf8(scene), out session));
+            return new Session(session);
+        }
+
+        /// <summary>Makes a session of the text of a scene. Waits for the server.</summary>
+        public Session CreateFromText(string scene)
+        {
+            IntPtr session;
+            Native.Check(Native.palpate_session_create_from_text(Pointer, Native.Utf8(scene), out session));
+            return new Session(session);
+        }
+
+        /// <summary>Joins a session by its id. Waits for the server.</summary>
+        public Session Join(string id)
+        {
+            IntPtr session;
+            Native.Check(Native.palpate_session_join(Pointer, Native.Utf8(id), out session));
+            return new Session(session);
+        }
+
+        internal override void Free(IntPtr pointer) { Native.palpate_server_free(pointer); }
+    }
+
+    /// <summary>A session: one tissue in use.</summary>
+    public sealed class Session : Handle
+    {
+        internal Session(IntPtr pointer) { Pointer = pointer; }
+
+        public string Id
+        {
+            get { return Native.Text((byte[] text, UIntPtr capacity, out UIntPtr needed) => Native.palpate_session_id(Pointer, text, capacity, out needed)); }
+        }
+
+        public Extent Extent
+        {
+            get { Extent extent; Native.Check(Native.palpate_session_extent(Pointer, out extent)); return extent; }
+        }
+
+        /// <summary>Changes the tissue. Waits for the server.</summary>
+        public void Apply(Change change) { Native.Check(Native.palpate_session_change(Pointer, ref change)); }
+
+        /// <summary>Deletes it on the server, for everybody. Waits for the server.</summary>
+        public void Delete() { Native.Check(Native.palpate_session_delete(Pointer)); }
+
+        /// <summary>Takes a tool for a loop of your own. Waits for the server.</summary>
+        public Touch Touch(TouchOptions options)
+        {
+            IntPtr touch;
+            Native.Check(Native.palpate_touch_begin(Pointer, ref options, out touch));
+            return new Touch(touch);
+        }
+
+        /// <summary>Connects a device, on a thread of the library. Waits for the server.</summary>
+        public Bridge Bridge(IDevice device, TouchOptions options) { return new Bridge(Pointer, device, options); }
+
+        /// <summary>Gets the surface. Waits for the server.</summary>
+        public Surface Surface(Axes axes, int refinement = 0, double rate = 60.0) { return new Surface(Pointer, axes, refinement, rate); }
+
+        internal override void Free(IntPtr pointer) { Native.palpate_session_free(pointer); }
+    }
+
+    /// <summary>A tool that a loop of your own leads.</summary>
+    public sealed class Touch : Handle
+    {
+        internal Touch(IntPtr pointer) { Pointer = pointer; }
+
+        /// <summary>A loop over what was recorded; see palpate_touch_begin_offline.</summary>
+        public static Touch Offline(TouchOptions options, Vector middle)
+        {
+            IntPtr touch;
+            Native.Check(Native.palpate_touch_begin_offline(ref options, middle, out touch));
+            return new Touch(touch);
+        }
+
+        /// <summary>A recorded message arrives; see palpate_touch_arrive.</summary>
+        public void Arrive(byte[] bytes) { Native.Check(Native.palpate_touch_arrive(Pointer, bytes, (UIntPtr)bytes.Length)); }
+
+        /// <summary>The force until the next tick, for a thread of your own, a thousand times a second. Never waits, and throws
+        /// nothing: after an error the force is zero.</summary>
+        public Felt Tick(Reading reading, double time)
+        {
+            Felt felt;
+            Native.palpate_touch_tick(Pointer, ref reading, time, out felt);
+            return felt;
+        }
+
+        /// <summary>Stops rendering until Enable goes from false to true again.</summary>
+        public void Disable() { Native.Check(Native.palpate_touch_disable(Pointer)); }
+
+        public Traffic Traffic
+        {
+            get { Traffic traffic; Native.palpate_touch_traffic(Pointer, out traffic); return traffic; }
+        }
+
+        internal override void Free(IntPtr pointer) { Native.palpate_touch_end(pointer); }
+    }
+
+    /// <summary>A device of your own. A thread of the library calls Read and Write, a thousand times a second; an exception ends the
+    /// loop. Keep them short and free of garbage: a collection stops them.</summary>
+    public interface IDevice
+    {
+        Limits Limits { get; }
+        Reading Read();
+        void Write(Vector force);
+    }
+
+    /// <summary>The loop of a device.</summary>
+    public sealed class Bridge : Handle
+    {
+        // The library calls these until the end.
+        readonly Descriptor descriptor;
+        readonly Read read;
+        readonly Write write;
+        string thrown;
+
+        internal Bridge(IntPtr session, IDevice device, TouchOptions options)
+        {
+            descriptor = (IntPtr user, out Limits limits) => { limits = default(Limits); try { limits = device.Limits; return 0; } catch (Exception e) { thrown = e.Message; return 1; } };
+            read = (IntPtr user, out Reading reading) => { reading = default(Reading); try { reading = device.Read(); return 0; } catch (Exception e) { thrown = e.Message; return 1; } };
+            write = (IntPtr user, ref Vector force) => { try { device.Write(force); return 0; } catch (Exception e) { thrown = e.Message; return 1; } };
+            var calls = new DeviceCalls
+            {
+                Descriptor = Marshal.GetFunctionPointerForDelegate(descriptor),
+                Read = Marshal.GetFunctionPointerForDelegate(read),
+                Write = Marshal.GetFunctionPointerForDelegate(write),
+            };
+            Check(Native.palpate_bridge_begin(session, ref calls, ref options, out Pointer));
+        }
+
+        void Check(Code code)
+        {
+            if (code == Code.Device && thrown != null) throw new PalpateException(code, thrown);
+            Native.Check(code);
+        }
+
+        public BridgeState Look()
+        {
+            BridgeState state;
+            Native.Check(Native.palpate_bridge_look(Pointer, out state));
+            return state;
+        }
+
+        /// <summary>Ends the loop and tells what it has done, or how the device failed.</summary>
+        public Report End()
+        {
+            Report report;
+            var pointer = System.Threading.Interlocked.Exchange(ref Pointer, IntPtr.Zero);
+            Check(Native.palpate_bridge_end(pointer, out report));
+            GC.KeepAlive(this);
+            return report;
+        }
+
+        internal override void Free(IntPtr pointer) { Report report; Native.palpate_bridge_end(pointer, out report); }
+    }
+
+    /// <summary>The surface of a session, in arrays of its own.</summary>
+    public sealed class Surface : Handle
+    {
+        /// <summary>x, y, z of each vertex, one after the other.</summary>
+        public readonly float[] Positions;
+        /// <summary>The same of their normals.</summary>
+        public readonly float[] Normals;
+        /// <summary>Three for each triangle.</summary>
+        public readonly int[] Indices;
+        /// <summary>u, v of each vertex; null if it has none.</summary>
+        public readonly float[] Uv;
+        /// <summary>Whether no more will come.</summary>
+        public bool IsLost { get; private set; }
+        bool isRead;
+
+        internal Surface(IntPtr session, Axes axes, int refinement, double rate)
+        {
+            SurfaceOptions options;
+            Native.Check(Native.palpate_surface_options_init(out options, (UIntPtr)Marshal.SizeOf(typeof(SurfaceOptions))));
+            options.Axes = axes;
+            options.Refinement = (uint)refinement;
+            options.Rate = rate;
+            Native.Check(Native.palpate_surface_open(session, ref options, out Pointer));
+            SurfaceSize size;
+            Native.Check(Native.palpate_surface_size_of(Pointer, out size));
+            Positions = new float[3 * (int)size.Vertices];
+            Normals = new float[Positions.Length];
+            Indices = new int[(int)size.Indices];
+            Native.Check(Native.palpate_surface_indices(Pointer, Indices, size.Indices));
+            if (size.HasUv == 0) return;
+            Uv = new float[2 * (int)size.Vertices];
+            Native.Check(Native.palpate_surface_uv(Pointer, Uv, (UIntPtr)8, size.Vertices));
+        }
+
+        /// <summary>Brings positions and normals up to date; tells which vertices have changed. Never waits.</summary>
+        public Dirty Read()
+        {
+            GCHandle positions = GCHandle.Alloc(Positions, GCHandleType.Pinned), normals = GCHandle.Alloc(Normals, GCHandleType.Pinned);
+            try
+            {
+                var buffers = new Buffers
+                {
+                    Positions = positions.AddrOfPinnedObject(), PositionsStride = (UIntPtr)12,
+                    Normals = normals.AddrOfPinnedObject(), NormalsStride = (UIntPtr)12,
+                    Vertices = (UIntPtr)(Positions.Length / 3), Everything = isRead ? 0u : 1u,
+                };
+                Dirty dirty;
+                var code = Native.palpate_surface_read(Pointer, ref buffers, out dirty);
+                IsLost = code == Code.Connection;
+                if (!IsLost) Native.Check(code);
+                isRead = true;
+                return dirty;
+            }
+            finally { positions.Free(); normals.Free(); }
+        }
+
+        internal override void Free(IntPtr pointer) { Native.palpate_surface_free(pointer); }
+    }
+}

@@ -1,0 +1,61 @@
+// What is wrong is an exception with words: `Errors.exe URL`.
+using System;
+using System.Linq;
+using Palpate;
+
+static class Errors
+{
+    static int failures;
+
+    static void Expect(Code code, string words, Action call)
+    {
+        try { call(); }
+        catch (PalpateException e) when (e.Code == code && e.Message.Contains(words)) { return; }
+        catch (Exception e) { Console.Error.WriteLine(e); }
+        Console.Error.WriteLine("no " + code + " with the words: " + words);
+        failures++;
+    }
+
+    class Failing : IDevice
+    {
+        int reads;
+        public Limits Limits { get { return Limits.Of("touch"); } }
+        public Reading Read() { if (++reads > 2000) throw new Exception("the cable is out"); return default(Reading); }
+        public void Write(Vector force) { }
+    }
+
+    static int Main(string[] arguments)
+    {
+        Expect(Code.Argument, "must begin with", () => new Server("ftp://nowhere"));
+        Expect(Code.Connection, "can't reach", () => new Server("http://127.0.0.1:1"));
+        Expect(Code.Argument, "spoon", () => Limits.Of("spoon"));
+        Expect(Code.Argument, "no token", () => new Server(arguments[0], token: "two words"));
+        using (var server = new Server(arguments[0]))
+        {
+            if (!server.Scenes().Contains("liver") || Server.Version != "0.1.0") failures++;
+            Expect(Code.Refused, "nowhere", () => server.Create("nowhere"));
+            using (var session = server.Create("liver"))
+            using (var joined = server.Join(session.Id))
+            {
+                Expect(Code.Refused, "", () => joined.Apply(Change.None));
+                if (joined.Extent.Middle.X != session.Extent.Middle.X) failures++;
+                // The fields of structures lie where the library has them.
+                if (TouchOptions.Default.Friction != 0.2 || TouchOptions.Default.Limits.WorkspaceRadius != 0.075 || !TouchOptions.Default.RealTime) failures++;
+                using (var surface = session.Surface(Axes.Own))
+                {
+                    var dirty = surface.Read();
+                    if (dirty.First != 0 || dirty.Count != surface.Positions.Length / 3 || surface.IsLost) failures++;
+                    if (surface.Uv == null || surface.Indices.Any(k => k < 0 || k >= dirty.Count)) failures++;
+                }
+                var bridge = session.Bridge(new Failing(), TouchOptions.Default);
+                while (!bridge.Look().IsOver) System.Threading.Thread.Sleep(10);
+                if (bridge.Look().Ticks < 2000) failures++;
+                Expect(Code.Device, "the cable is out", () => bridge.End());
+                session.Delete();
+                Expect(Code.Refused, "", () => session.Touch(TouchOptions.Default));
+            }
+        }
+        Console.WriteLine(failures + " failures");
+        return failures == 0 ? 0 : 1;
+    }
+}

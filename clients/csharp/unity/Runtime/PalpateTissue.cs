@@ -1,0 +1,70 @@
+// The tissue of a session as a Mesh. Not built by Palpate's tests: they have no Unity.
+using System.Collections.Generic;
+using UnityEngine;
+
+namespace Palpate
+{
+    /// <summary>Makes a session, and shows its surface as the mesh of this object, in its local coordinates.</summary>
+    [RequireComponent(typeof(MeshFilter))]
+    public sealed class PalpateTissue : MonoBehaviour
+    {
+        public string url = "http://127.0.0.1:7117";
+        public string scene = "liver";
+        [Range(0, 10)] public int refinement = 1;
+
+        /// <summary>The session; null while there is none.</summary>
+        public Session Session { get; private set; }
+
+        Server server;
+        Surface surface;
+        Mesh mesh;
+        Vector3[] positions, normals;
+
+        void Awake()
+        {
+            server = new Server(url);
+            Session = server.Create(scene);
+            surface = Session.Surface(Axes.Unity, refinement);
+            int vertices = surface.Positions.Length / 3;
+            positions = new Vector3[vertices];
+            normals = new Vector3[vertices];
+            mesh = new Mesh { name = scene, indexFormat = UnityEngine.Rendering.IndexFormat.UInt32 };
+            mesh.MarkDynamic();
+            Show(surface.Read());
+            mesh.triangles = surface.Indices;
+            if (surface.Uv != null)
+            {
+                var uv = new List<Vector2>(vertices);
+                for (int k = 0; k < vertices; k++) uv.Add(new Vector2(surface.Uv[2 * k], surface.Uv[2 * k + 1]));
+                mesh.SetUVs(0, uv);
+            }
+            GetComponent<MeshFilter>().sharedMesh = mesh;
+        }
+
+        // Never waits for the server.
+        void Update()
+        {
+            var dirty = surface.Read();
+            if (dirty.Count > 0) Show(dirty);
+        }
+
+        void Show(Dirty dirty)
+        {
+            for (int k = dirty.First; k < dirty.First + dirty.Count; k++)
+            {
+                positions[k] = new Vector3(surface.Positions[3 * k], surface.Positions[3 * k + 1], surface.Positions[3 * k + 2]);
+                normals[k] = new Vector3(surface.Normals[3 * k], surface.Normals[3 * k + 1], surface.Normals[3 * k + 2]);
+            }
+            mesh.SetVertices(positions);
+            mesh.SetNormals(normals);
+            mesh.RecalculateBounds();
+        }
+
+        void OnDestroy()
+        {
+            if (surface != null) surface.Dispose();
+            if (Session != null) { Session.Delete(); Session.Dispose(); }
+            if (server != null) server.Dispose();
+        }
+    }
+}

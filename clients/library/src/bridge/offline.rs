@@ -1,0 +1,67 @@
+//! Rendering of what was recorded, without a network: the same laws, samples and places give the same forces, bit by bit.
+
+use glam::DVec3;
+use palpate_proto::pb;
+use palpate_touch::Device;
+use pb::touch_response::Message as Heard;
+use prost::Message;
+
+use super::ticker::{self, Command, Feed, Origin, Ticker};
+use crate::Error;
+use crate::exchange::Reader;
+
+/// A loop whose server is a record.
+#[derive(Debug)]
+pub struct Offline {
+    /// The half of the loop.
+    pub ticker: Ticker,
+    /// The half of the network. It may be on another thread.
+    pub record: Record,
+}
+
+/// The half of the network, of a record.
+pub struct Record {
+    feed: Feed,
+    commands: Reader<Command>,
+    middle_m: DVec3,
+}
+
+impl std::fmt::Debug for Record {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Record").field("middle_m", &self.middle_m).finish_non_exhaustive()
+    }
+}
+
+impl Offline {
+    /// A loop of a device whose forces stay within its limits, over a tissue with its middle at `middle_m`. `up_deadband` as in
+    /// [`super::Target`]: it changes no force.
+    pub fn new(device: Device, origin: Origin, middle_m: DVec3, up_deadband: f64) -> Self {
+        let (ticker, feed, commands) = ticker::ticker(device, origin, up_deadband);
+        Offline { ticker, record: Record { feed, commands, middle_m } }
+    }
+}
+
+impl Record {
+    /// What a server has sent on a haptic stream arrives now: the bytes of a `TouchResponse`. The next tick knows it. An
+    /// `opened` begins another connection. What the ticks had to send until now goes nowhere.
+    ///
+    /// # Errors
+    /// Returns an error if the bytes are not a message, or if a force law can't be used.
+    pub fn arrive(&mut self, bytes: &[u8]) -> Result<(), Error> {
+        while self.commands.pop().is_some() {}
+        let response = pb::TouchResponse::decode(bytes)
+            .map_err(|error| Error::Argument(format!("the bytes are not a TouchResponse: {error}")))?;
+        match response.message {
+            Some(Heard::Opened(opened)) => {
+                let law = opened.law.ok_or_else(|| Error::Argument("`opened` has no force law".to_owned()))?;
+                self.feed.begin(&law, self.middle_m)
+            }
+            Some(Heard::ForceLaw(update)) => update.law.iter().try_for_each(|law| self.feed.learn(law)),
+            Some(Heard::Sample(sample)) => {
+                self.feed.receive(&sample, 0.0);
+                Ok(())
+            }
+            _ => Ok(()),
+        }
+    }
+}

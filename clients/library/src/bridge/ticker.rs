@@ -1,0 +1,350 @@
+//! Rendering for a thread that ticks a thousand times a second, and what passes between it and the network.
+//!
+//! A tick does not wait: laws come by a queue, of models the newest, and places leave by a queue, each of a fixed length
+//! (`exchange`). It asks for no memory and gives none back: laws that are not needed any more go back to the network's side.
+
+use glam::DVec3;
+use palpate_proto::{pb, touch};
+use palpate_touch::deadband::HEARTBEAT_S;
+use palpate_touch::news::News;
+use palpate_touch::renderer::MOST_LAWS;
+use palpate_touch::{Device, Envelope, Law, LocalModel, Renderer, RenderingState};
+use std::collections::VecDeque;
+
+use crate::Error;
+use crate::device::Reading;
+use crate::exchange::{Listener, Peek, Reader, Teller, Writer, newest, queue};
+
+/// Where a tool was.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Command {
+    /// By the client's clock.
+    pub(super) client_time_ns: u64,
+    /// m.
+    pub(super) place_m: DVec3,
+    /// How it moved, m/s, if the server is to go on like that.
+    pub(super) velocity_m_per_s: Option<DVec3>,
+}
+
+/// What a tick learns, in order.
+enum Told {
+    /// A new connection, its first law and the middle of the tissue, m.
+    Begin { connection: u64, law: Law, middle_m: DVec3 },
+    /// A further law of this connection, which is sound, and its number.
+    Learn { number: u32, law: Law },
+}
+
+/// What of a connection only counts as it is now.
+#[derive(Clone, Copy)]
+struct Newest {
+    connection: u64,
+    model: Option<LocalModel>,
+    /// The longest time between two poses that the server wants, s; 0 before it has said so.
+    wanted_s: f64,
+}
+
+/// Largest number of commands on their way to the network: more would be a backlog.
+const COMMANDS: usize = 64;
+/// Largest number of laws on their way to a tick. What does not fit waits on the network's side.
+const LAWS: usize = 2 * MOST_LAWS;
+/// Largest number of laws on their way back: with as many as a renderer has, a tick can always take one more.
+const USED: usize = 4 * MOST_LAWS;
+/// A clock that jumps ahead by more than this did not do so because of a late tick, s.
+const MOST_AHEAD_S: f64 = 3600.0;
+
+/// What positions of a device mean.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Origin {
+    /// They are in the device's frame, whose origin is the middle of its workspace. That is laid on the middle of the tissue.
+    #[default]
+    Workspace,
+    /// They are in the tissue's frame.
+    Tissue,
+}
+
+/// The half that a loop at 1 kHz owns, on whichever thread that runs.
+pub struct Ticker {
+    told: Reader<Told>,
+    newest: Listener<Newest>,
+    /// The newest was not shown to the renderer.
+    is_fresh: bool,
+    used: Writer<Law>,
+    commands: Writer<Command>,
+    has_spoken: bool,
+    device: Device,
+    origin: Origin,
+    up_deadband: f64,
+    /// Of [`Told::Begin`]; 0 before the first.
+    connection: u64,
+    middle_m: DVec3,
+    renderer: Renderer,
+    was_asked: bool,
+    news: News,
+    clock: Clock,
+    place_m: DVec3,
+}
+
+/// The other half, of the network.
+pub(super) struct Feed {
+    told: Writer<Told>,
+    newest: Teller<Newest>,
+    used: Reader<Law>,
+    connection: u64,
+    /// What did not fit yet.
+    waiting: VecDeque<Told>,
+    model: Option<LocalModel>,
+    wanted_s: f64,
+}
+
+/// Both halves, and the commands that the ticks send. The device is what the forces are limited to.
+pub(super) fn ticker(device: Device, origin: Origin, up_deadband: f64) -> (Ticker, Feed, Reader<Command>) {
+    let (to_learn, told) = queue(LAWS);
+    let (used, back) = queue(USED);
+    let (commands, received) = queue(COMMANDS);
+    let (teller, listener) = newest(Newest { connection: 0, model: None, wanted_s: 0.0 });
+    let ticker = Ticker {
+        told,
+        newest: listener,
+        is_fresh: false,
+        used,
+        commands,
+        has_spoken: false,
+        device,
+        origin,
+        up_deadband,
+        connection: 0,
+        middle_m: DVec3::ZERO,
+        // Until the first connection this law is not used.
+        renderer: Renderer::new(Law::linear(0.0, 0.0), Envelope::new(device, DVec3::ZERO)),
+        was_asked: false,
+        news: News::default(),
+        clock: Clock::default(),
+        place_m: DVec3::ZERO,
+    };
+    let feed = Feed {
+        told: to_learn,
+        newest: teller,
+        used: back,
+        connection: 0,
+        waiting: VecDeque::new(),
+        model: None,
+        wanted_s: 0.0,
+    };
+    (ticker, feed, received)
+}
+
+/// The times of a caller, made such that they never go back.
+#[derive(Default)]
+struct Clock {
+    /// The caller's time at which this clock has 1 s; 0 means "no time" in the protocol.
+    origin_s: Option<f64>,
+    now_s: f64,
+}
+
+impl Clock {
+    /// The time now. A caller's clock that goes back, or ahead by more than an hour, was set: this one goes on from where it is.
+    fn at(&mut self, time_s: f64) -> f64 {
+        if !time_s.is_finite() {
+            return f64::NAN;
+        }
+        let origin_s = *self.origin_s.get_or_insert(time_s);
+        let now_s = 1.0 + (time_s - origin_s);
+        // Also before the first tick, when `now_s` is 0.
+        if now_s < self.now_s || now_s - self.now_s > MOST_AHEAD_S {
+            self.now_s = if now_s < self.now_s { self.now_s } else { self.now_s + MOST_AHEAD_S };
+            self.origin_s = Some(time_s - (self.now_s - 1.0));
+        } else {
+            self.now_s = now_s;
+        }
+        self.now_s
+    }
+}
+
+impl Ticker {
+    /// The force to render from now on, N, for a device that reports `reading` at `time_s`, a time of any origin that goes on
+    /// between ticks. Returns zero before the first connection.
+    ///
+    /// It takes a bounded time: no lock, no call of the system, no memory asked for or given back. Ticks may be late, early or
+    /// left out: the envelope knows how long ago the last one was.
+    pub fn tick(&mut self, reading: Reading, time_s: f64) -> DVec3 {
+        let now_s = self.clock.at(time_s);
+        self.is_fresh |= self.newest.refresh();
+        self.learn();
+        self.has_spoken = false;
+        self.place_m = match self.origin {
+            Origin::Workspace => reading.place_m + self.middle_m,
+            Origin::Tissue => reading.place_m,
+        };
+        let (was_asked, place_m) = (std::mem::replace(&mut self.was_asked, reading.enable), self.place_m);
+        // Before the first connection it is not known where the tissue is.
+        if self.connection == 0 {
+            return DVec3::ZERO;
+        }
+        let renderer = &mut self.renderer;
+        if reading.enable && !was_asked {
+            renderer.envelope.reset();
+            renderer.envelope.enable();
+        }
+        let (connection, model, wanted_s) =
+            self.newest.read(|newest| (newest.connection, newest.model, newest.wanted_s));
+        if self.is_fresh && connection == self.connection {
+            self.is_fresh = false;
+            model.into_iter().for_each(|model| renderer.receive(model, now_s));
+        }
+        let force_n = renderer.tick(now_s, place_m);
+        if !(place_m.is_finite() && now_s.is_finite()) {
+            return force_n;
+        }
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+        let client_time_ns = (now_s * 1e9) as u64;
+        let command = if self.up_deadband > 0.0 {
+            let heartbeat_s = if connection == self.connection && wanted_s > 0.0 { wanted_s } else { HEARTBEAT_S };
+            let told = self.news.tell(now_s, place_m, renderer.way_m(self.up_deadband), heartbeat_s);
+            told.map(|told| Command { client_time_ns, place_m, velocity_m_per_s: Some(told.velocity_m_per_s) })
+        } else {
+            Some(Command { client_time_ns, place_m, velocity_m_per_s: None })
+        };
+        // If the network does not keep up, this position is dropped; the next one replaces it.
+        self.has_spoken = command.is_some_and(|command| self.commands.push(command).is_ok());
+        force_n
+    }
+
+    /// Takes what was told since the last tick, as far as there is room for what it takes the place of.
+    fn learn(&mut self) {
+        for _ in 0..LAWS {
+            if self.used.room() <= MOST_LAWS {
+                return;
+            }
+            let Some(told) = self.told.pop() else { return };
+            let used = &mut self.used;
+            // There is room.
+            let mut give_back = |law: Law| drop(used.push(law));
+            match told {
+                Told::Begin { connection, law, middle_m } => {
+                    self.renderer.begin_with(law, give_back);
+                    if self.connection == 0 {
+                        self.renderer.envelope = Envelope::new(self.device, middle_m);
+                    }
+                    // The envelope of an earlier connection stays: what was paused stays paused, and a rendered force falls
+                    // at the slew limit.
+                    (self.connection, self.middle_m) = (connection, middle_m);
+                }
+                Told::Learn { number, law } => {
+                    self.renderer.learn_with(number, law, &mut give_back);
+                }
+            }
+        }
+    }
+
+    /// Stops rendering until it is enabled again. The force falls within a few ticks.
+    pub fn disable(&mut self) {
+        self.renderer.envelope.disable();
+    }
+
+    /// Whether forces are rendered; `None` before the first connection.
+    pub fn state(&self) -> Option<RenderingState> {
+        (self.connection > 0).then(|| self.renderer.state())
+    }
+
+    /// Where the tool was at the last tick, in the tissue's frame, m; before the first connection in the device's.
+    pub fn place_m(&self) -> DVec3 {
+        self.place_m
+    }
+
+    /// How old the newest local model was at the last tick, s: how long ago the tool was at the place that it tells of.
+    pub fn model_age_s(&self) -> Option<f64> {
+        self.renderer.model_time_s().filter(|_| self.connection > 0).map(|time_s| self.clock.now_s - time_s)
+    }
+
+    /// The limits that act on the forces; `None` before the first connection.
+    pub fn envelope(&self) -> Option<&Envelope> {
+        (self.connection > 0).then_some(&self.renderer.envelope)
+    }
+
+    /// Whether the network's side has ended for good. Forces then fade.
+    pub fn is_over(&self) -> bool {
+        self.commands.is_over()
+    }
+
+    /// Whether the last tick had something to send.
+    pub(super) fn has_spoken(&self) -> bool {
+        self.has_spoken
+    }
+
+    /// To see from another thread whether something is to be sent.
+    pub(super) fn peek(&self) -> Peek<Command> {
+        self.commands.peek()
+    }
+}
+
+impl std::fmt::Debug for Ticker {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Ticker")
+            .field("connection", &self.connection)
+            .field("state", &self.state())
+            .finish_non_exhaustive()
+    }
+}
+
+/// The law in a message.
+fn law(message: &pb::ForceLaw) -> Result<Law, Error> {
+    touch::from_law(message).map_err(|refusal| Error::Connection(refusal.to_string()))
+}
+
+impl Feed {
+    /// A new connection to a tissue with its middle at `middle_m`.
+    ///
+    /// # Errors
+    /// Returns an error if the law can't be used.
+    pub(super) fn begin(&mut self, message: &pb::ForceLaw, middle_m: DVec3) -> Result<(), Error> {
+        let law = law(message)?;
+        self.connection += 1;
+        (self.model, self.wanted_s) = (None, 0.0);
+        // What a tick has not learned of the connection before.
+        self.waiting.clear();
+        self.waiting.push_back(Told::Begin { connection: self.connection, law, middle_m });
+        self.pass_on();
+        Ok(())
+    }
+
+    /// A further law.
+    ///
+    /// # Errors
+    /// Returns an error if the law can't be used.
+    pub(super) fn learn(&mut self, message: &pb::ForceLaw) -> Result<(), Error> {
+        let law = law(message)?;
+        self.waiting.push_back(Told::Learn { number: message.number, law });
+        if self.waiting.len() > MOST_LAWS {
+            // The first may be the beginning.
+            let first = self.waiting.iter().position(|told| matches!(told, Told::Learn { .. }));
+            first.and_then(|first| self.waiting.remove(first));
+        }
+        self.pass_on();
+        Ok(())
+    }
+
+    /// What a sample tells of the tool, and how often the server wants to hear of it, s.
+    pub(super) fn receive(&mut self, sample: &pb::Sample, wanted_s: f64) {
+        self.wanted_s = wanted_s;
+        if let Some(model) = sample.tools.first().and_then(|tool| tool.local_model.as_ref()) {
+            let model = touch::from_local_model(model, sample.step);
+            if self.model.is_none_or(|newest| newest.sequence < model.sequence) {
+                self.model = Some(model);
+            }
+        }
+        self.pass_on();
+    }
+
+    /// Passes on what fits. A model goes after the laws that were there before it.
+    fn pass_on(&mut self) {
+        while self.used.pop().is_some() {}
+        while let Some(told) = self.waiting.pop_front() {
+            if let Err(told) = self.told.push(told) {
+                self.waiting.push_front(told);
+                return;
+            }
+        }
+        let newest = Newest { connection: self.connection, model: self.model, wanted_s: self.wanted_s };
+        self.newest.tell(|place| *place = newest);
+    }
+}

@@ -1,0 +1,250 @@
+//! Devices of Force Dimension, and the Falcon, by `libdhd` of its SDK (version 3).
+//!
+//! The base's frame has x towards the operator, y to the right and z up, in metres and newtons; its origin is the middle of
+//! the workspace. A call returns a negative number when it failed. 1 (the time guard: the value is the one before) and 2 (a
+//! motor is at its limit) are no failures. Every call names the device: without it the SDK takes the one used last.
+
+// Functions of a library that was written in C.
+#![allow(unsafe_code)]
+
+use std::ffi::{c_char, c_int, c_uchar};
+use std::io;
+use std::path::Path;
+
+use glam::DVec3;
+use palpate_touch::Device;
+use palpate_touch::device::UNDECLARED;
+
+use super::loaded::{Loaded, text_of};
+use crate::device::{HapticDevice, Reading};
+
+#[cfg(windows)]
+const NAMES: [&str; 1] = ["dhd64.dll"];
+#[cfg(target_os = "macos")]
+const NAMES: [&str; 2] = ["libdhd.3.dylib", "libdhd.dylib"];
+#[cfg(not(any(windows, target_os = "macos")))]
+const NAMES: [&str; 2] = ["libdhd.so.3", "libdhd.so"];
+
+/// The version of the SDK that is known here.
+const MAJOR: c_int = 3;
+
+/// `DHD_ON`, `DHD_OFF`.
+const ON: c_uchar = 1;
+const OFF: c_uchar = 0;
+
+/// Systems by the numbers of `dhdc.h`, as devices of our table.
+const SYSTEMS: [(c_int, &str); 14] = [
+    (33, "omega3"),
+    (34, "omega3"),
+    (35, "omega3"),
+    (36, "omega3"),
+    (37, "omega3"),
+    (60, "falcon"),
+    (63, "delta3"),
+    (64, "delta3"),
+    (104, "sigma7"),
+    (105, "sigma7"),
+    (106, "sigma7"),
+    (107, "sigma7"),
+    (108, "lambda7"),
+    (109, "lambda7"),
+];
+
+/// Buttons that are asked for at each tick.
+const BUTTONS: c_int = 2;
+
+type ByDevice = unsafe extern "system" fn(c_char) -> c_int;
+type Text = unsafe extern "system" fn(c_char) -> *const c_char;
+type Get3 = unsafe extern "system" fn(*mut f64, *mut f64, *mut f64, c_char) -> c_int;
+type Set3 = unsafe extern "system" fn(f64, f64, f64, c_char) -> c_int;
+
+/// The functions in use.
+#[derive(Debug, Clone, Copy)]
+struct Calls {
+    count: unsafe extern "system" fn() -> c_int,
+    open: unsafe extern "system" fn() -> c_int,
+    open_id: ByDevice,
+    close: ByDevice,
+    enable_force: unsafe extern "system" fn(c_uchar, c_char) -> c_int,
+    system_type: ByDevice,
+    system_name: Text,
+    position: Get3,
+    button: unsafe extern "system" fn(c_int, c_char) -> c_int,
+    set_force: Set3,
+    last_error: unsafe extern "system" fn() -> *const c_char,
+    /// Since SDK 3.9.
+    get_most: Option<unsafe extern "system" fn(c_char) -> f64>,
+    set_most: Option<unsafe extern "system" fn(f64, c_char) -> c_int>,
+    version: Option<unsafe extern "system" fn(*mut c_int, *mut c_int, *mut c_int, *mut c_int)>,
+}
+
+impl Calls {
+    fn load(library: Option<&Path>) -> io::Result<(Self, Loaded)> {
+        let loaded = Loaded::find(library, &NAMES, "libdhd", "Install the Force Dimension SDK")?;
+        // SAFETY: the types are those of dhdc.h.
+        let calls = unsafe {
+            Calls {
+                count: loaded.function("dhdGetDeviceCount")?,
+                open: loaded.function("dhdOpen")?,
+                open_id: loaded.function("dhdOpenID")?,
+                close: loaded.function("dhdClose")?,
+                enable_force: loaded.function("dhdEnableForce")?,
+                system_type: loaded.function("dhdGetSystemType")?,
+                system_name: loaded.function("dhdGetSystemName")?,
+                position: loaded.function("dhdGetPosition")?,
+                button: loaded.function("dhdGetButton")?,
+                set_force: loaded.function("dhdSetForce")?,
+                last_error: loaded.function("dhdErrorGetLastStr")?,
+                get_most: loaded.optional("dhdGetMaxForce"),
+                set_most: loaded.optional("dhdSetMaxForce"),
+                version: loaded.optional("dhdGetSDKVersion"),
+            }
+        };
+        Ok((calls, loaded))
+    }
+
+    /// The SDK's version, if it tells; it must be one that is known here.
+    fn version(&self, loaded: &Loaded) -> io::Result<String> {
+        let Some(version) = self.version else { return Ok("of an unknown version".to_owned()) };
+        let (mut major, mut minor, mut release, mut revision) = (0, 0, 0, 0);
+        // SAFETY: four numbers that live during the call.
+        unsafe { version(&raw mut major, &raw mut minor, &raw mut release, &raw mut revision) };
+        let text = format!("{major}.{minor}.{release}");
+        if major != MAJOR {
+            let message = format!("{} is of SDK {text}: Palpate knows SDK {MAJOR}", loaded.name());
+            return Err(io::Error::new(io::ErrorKind::Unsupported, message));
+        }
+        Ok(text)
+    }
+
+    /// What went wrong last, in the SDK's words.
+    fn last(&self) -> String {
+        // SAFETY: the SDK's texts are constants.
+        unsafe { text_of((self.last_error)()) }.unwrap_or_else(|| "no reason given".to_owned())
+    }
+}
+
+/// An open device.
+#[derive(Debug)]
+pub(super) struct ForceDimension {
+    calls: Calls,
+    id: c_char,
+    model: String,
+    descriptor: Device,
+    buttons: u32,
+}
+
+impl ForceDimension {
+    /// Opens the device of that number, or the first one.
+    ///
+    /// # Errors
+    /// Returns an error if library or device are missing, or of another version.
+    pub(super) fn open(which: Option<&str>, library: Option<&Path>) -> io::Result<Self> {
+        let number = which.map(|text| {
+            text.parse::<c_char>().ok().filter(|number| *number >= 0).ok_or_else(|| {
+                io::Error::new(
+                    io::ErrorKind::InvalidInput,
+                    format!("force-dimension:{text}: which one is a number, 0 to 127"),
+                )
+            })
+        });
+        let number = number.transpose()?;
+        let (calls, loaded) = Calls::load(library)?;
+        calls.version(&loaded)?;
+        // SAFETY: these functions take a number, or nothing.
+        let opened = unsafe { number.map_or_else(|| (calls.open)(), |number| (calls.open_id)(number)) };
+        let id = c_char::try_from(opened).ok().filter(|id| *id >= 0).ok_or_else(|| {
+            let message = format!(
+                "no Force Dimension device: {}. Is it on, is it plugged in, may you open it, and does no other program have it?",
+                calls.last()
+            );
+            io::Error::new(io::ErrorKind::NotFound, message)
+        })?;
+        // SAFETY: the device is open.
+        let (system, model) = unsafe { ((calls.system_type)(id), text_of((calls.system_name)(id))) };
+        let known = SYSTEMS.iter().find(|entry| entry.0 == system).and_then(|entry| Device::named(entry.1));
+        let mut descriptor = known.unwrap_or(UNDECLARED);
+        // SAFETY: as above. A negative number means that there is no limit.
+        let told_n =
+            calls.get_most.map(|most| unsafe { most(id) }).filter(|most_n| most_n.is_finite() && *most_n > 0.0);
+        if let Some(most_n) = told_n {
+            descriptor.force_n = descriptor.force_n.min(most_n);
+            descriptor.continuous_n = descriptor.continuous_n.min(most_n);
+        }
+        let model = model.unwrap_or_else(|| format!("system {system}"));
+        let mut device = ForceDimension { calls, id, model, descriptor, buttons: 0 };
+        // A second limit, in the SDK, behind our envelope.
+        // SAFETY: as above.
+        calls.set_most.map(|set| unsafe { set(descriptor.most_n(), id) });
+        // From here on, dropping the device takes the force away and closes it.
+        // SAFETY: as above.
+        device.hold(unsafe { (calls.enable_force)(ON, id) }, "its forces can't be enabled")?;
+        device.write(DVec3::ZERO)?;
+        Ok(device)
+    }
+
+    /// An error if a call failed.
+    fn hold(&self, returned: c_int, what: &str) -> io::Result<()> {
+        if returned >= 0 {
+            return Ok(());
+        }
+        let message = format!("{} (device {} of the SDK): {what}: {}", self.model, self.id, self.calls.last());
+        Err(io::Error::new(io::ErrorKind::NotConnected, message))
+    }
+}
+
+impl HapticDevice for ForceDimension {
+    fn descriptor(&self) -> Device {
+        self.descriptor
+    }
+
+    fn read(&mut self) -> io::Result<Reading> {
+        let (mut x, mut y, mut z) = (0.0, 0.0, 0.0);
+        // SAFETY: three numbers that live during the call, and the device is open.
+        let returned = unsafe { (self.calls.position)(&raw mut x, &raw mut y, &raw mut z, self.id) };
+        self.hold(returned, "its position can't be read")?;
+        // A device without that button returns an error, which is no button pressed.
+        // SAFETY: as above.
+        let pressed = |index| unsafe { (self.calls.button)(index, self.id) } == 1;
+        self.buttons = (0..BUTTONS).filter(|index| pressed(*index)).map(|index| 1 << index).sum();
+        Ok(Reading { place_m: DVec3::new(y, -x, z), enable: self.buttons & 1 != 0 })
+    }
+
+    fn write(&mut self, force_n: DVec3) -> io::Result<()> {
+        // SAFETY: the device is open.
+        let returned = unsafe { (self.calls.set_force)(-force_n.y, force_n.x, force_n.z, self.id) };
+        self.hold(returned, "its force can't be set")
+    }
+
+    fn buttons(&self) -> u32 {
+        self.buttons
+    }
+
+    fn button_count(&self) -> u32 {
+        BUTTONS.unsigned_abs()
+    }
+}
+
+impl Drop for ForceDimension {
+    fn drop(&mut self) {
+        let Calls { set_force, enable_force, close, .. } = self.calls;
+        // SAFETY: the device is open, and nobody uses it after this.
+        unsafe {
+            set_force(0.0, 0.0, 0.0, self.id);
+            enable_force(OFF, self.id);
+            close(self.id);
+        }
+    }
+}
+
+/// Whether there are devices, and what is there.
+///
+/// # Errors
+/// Returns an error if the library is missing, or of another version.
+pub(super) fn tell(library: Option<&Path>) -> io::Result<(bool, String)> {
+    let (calls, loaded) = Calls::load(library)?;
+    let version = calls.version(&loaded)?;
+    // SAFETY: a function without arguments.
+    let count = unsafe { (calls.count)() };
+    Ok((count > 0, format!("{} {version}: {} devices", loaded.name(), count.max(0))))
+}

@@ -1,0 +1,393 @@
+//! Haply's Inverse3, by the Inverse Service: JSON over a WebSocket, one state for each message sent.
+//!
+//! The service sends all that it knows when it is connected to, and from then on one state for each message. So each tick
+//! sends a force, and reads what has come since, without waiting for it. Positions are in metres from the device's base, x to
+//! the right, y forward and z up. Since version 3.5 the force is in the field `vector`, before that in `values`.
+
+use std::io::{self, ErrorKind, Read, Write};
+use std::net::{TcpStream, ToSocketAddrs};
+use std::time::{Duration, Instant};
+
+use glam::DVec3;
+use palpate_touch::Device;
+use palpate_touch::device::UNDECLARED;
+use serde_json::{Map, Value, json};
+use tungstenite::protocol::WebSocketConfig;
+use tungstenite::{Message, WebSocket};
+
+use crate::device::{HapticDevice, Reading};
+
+/// Where the service is unless it is told.
+const ADDRESS: &str = "ws://localhost:10001";
+
+/// How long the service may take to answer at first.
+const PATIENCE: Duration = Duration::from_secs(2);
+
+/// A service that leaves a message unanswered for longer has stopped; a device of which it says nothing for longer has gone.
+const SILENCE: Duration = Duration::from_millis(500);
+
+/// While a message is unanswered for longer, no force is asked for: the position is not known.
+const STALE: Duration = Duration::from_millis(50);
+
+/// Messages that may be unanswered: a service that falls behind is not sent more.
+const UNANSWERED: u32 = 4;
+
+/// Largest message that is read, bytes.
+const MOST_BYTES: usize = 1 << 20;
+
+/// The versions of the service that are known here: from the first, before the last.
+const VERSIONS: [(u32, u32); 2] = [(3, 1), (4, 0)];
+
+/// The version since which a force is a `vector`.
+const VECTOR_SINCE: (u32, u32) = (3, 5);
+
+/// About the middle of the workspace, m from the base; not measured on a device.
+const MIDDLE_M: DVec3 = DVec3::new(0.0, -0.12, 0.16);
+
+/// An Inverse3.
+pub(super) struct Inverse3 {
+    socket: WebSocket<TcpStream>,
+    id: String,
+    /// The field of a force.
+    field: &'static str,
+    place_m: DVec3,
+    buttons: u32,
+    unanswered: u32,
+    /// When the service last said anything, and when it last told of the device.
+    heard: Instant,
+    told: Instant,
+    /// The force that was sent last.
+    sent_n: DVec3,
+}
+
+/// An address as host and port.
+fn host_of(address: &str) -> io::Result<&str> {
+    let host = address.strip_prefix("ws://").map(|rest| rest.split('/').next().unwrap_or(rest));
+    host.filter(|host| host.contains(':')).ok_or_else(|| {
+        let message = format!("haply:{address}: an address is like {ADDRESS}");
+        io::Error::new(ErrorKind::InvalidInput, message)
+    })
+}
+
+/// Connects, with a limit to every answer.
+fn connect(host: &str) -> io::Result<TcpStream> {
+    let mut last = io::Error::new(ErrorKind::NotFound, "no address");
+    for address in host.to_socket_addrs()? {
+        match TcpStream::connect_timeout(&address, PATIENCE) {
+            Ok(stream) => {
+                stream.set_nodelay(true)?;
+                stream.set_read_timeout(Some(PATIENCE))?;
+                stream.set_write_timeout(Some(PATIENCE))?;
+                return Ok(stream);
+            }
+            Err(error) => last = error,
+        }
+    }
+    Err(last)
+}
+
+fn missing(host: &str, error: &io::Error) -> io::Error {
+    let message =
+        format!("Haply's Inverse Service does not answer at {host}: {error}. Start it, or Haply Hub, which has it");
+    io::Error::new(ErrorKind::NotFound, message)
+}
+
+/// The service's version by its own word, if it has one; asked by HTTP at the same port.
+fn version(host: &str) -> io::Result<Option<String>> {
+    let mut stream = connect(host).map_err(|error| missing(host, &error))?;
+    let request = format!("GET /version HTTP/1.0\r\nHost: {host}\r\nAccept: application/json\r\n\r\n");
+    stream.write_all(request.as_bytes())?;
+    let mut answer = Vec::new();
+    // A service that keeps the connection, or resets it, has answered all the same.
+    let _ = stream.take(1 << 16).read_to_end(&mut answer);
+    let answer = String::from_utf8_lossy(&answer);
+    let body = answer.split_once("\r\n\r\n").map_or("", |parts| parts.1);
+    let told = serde_json::from_str::<Value>(body.trim()).ok();
+    Ok(told.and_then(|told| Some(told.get("project_version")?.as_str()?.to_owned())))
+}
+
+/// The first two numbers of a version.
+fn numbers(version: &str) -> Option<(u32, u32)> {
+    let mut parts = version.trim_start_matches('v').split(|c: char| !c.is_ascii_digit());
+    Some((parts.next()?.parse().ok()?, parts.next().and_then(|part| part.parse().ok()).unwrap_or(0)))
+}
+
+/// The field of a force in messages to a service: by its version, or if it tells none, by its first message.
+fn field(version: Option<&str>, first: &Value) -> io::Result<&'static str> {
+    let known = match version.and_then(numbers) {
+        Some(numbers) if numbers < VERSIONS[0] || numbers >= VERSIONS[1] => {
+            let version = version.unwrap_or_default();
+            let message = format!("Haply's Inverse Service is of version {version}: Palpate knows 3.1 up to 3.x");
+            return Err(io::Error::new(ErrorKind::Unsupported, message));
+        }
+        Some(numbers) => numbers >= VECTOR_SINCE,
+        // A number of the session is in the first message since then.
+        None => first.get("session_id").is_some(),
+    };
+    Ok(if known { "vector" } else { "values" })
+}
+
+/// The devices of a kind in a message.
+fn devices<'v>(message: &'v Value, kind: &str) -> impl Iterator<Item = &'v Value> {
+    message.get(kind).and_then(Value::as_array).into_iter().flatten()
+}
+
+fn id_of(device: &Value) -> Option<&str> {
+    device.get("device_id").and_then(Value::as_str)
+}
+
+/// A vector of a message.
+fn vector(value: &Value) -> Option<DVec3> {
+    let part = |name: &str| value.get(name).and_then(Value::as_f64);
+    Some(DVec3::new(part("x")?, part("y")?, part("z")?))
+}
+
+/// The buttons in a message, if it tells of any: those of a wireless grip, or the one of a wired grip.
+fn buttons(message: &Value) -> Option<u32> {
+    let pressed = |state: &Value, name: &str| state.get(name).and_then(Value::as_bool);
+    let wireless = devices(message, "wireless_verse_grip").filter_map(|grip| {
+        let buttons = grip.get("state")?.get("buttons")?;
+        Some(
+            ["a", "b", "c"]
+                .iter()
+                .enumerate()
+                .map(|(bit, name)| u32::from(pressed(buttons, name) == Some(true)) << bit)
+                .sum(),
+        )
+    });
+    let wired =
+        devices(message, "verse_grip").filter_map(|grip| Some(u32::from(pressed(grip.get("state")?, "button")?)));
+    wireless.chain(wired).reduce(|all: u32, one| all | one)
+}
+
+/// The state in a message; none in those of the WebSocket itself.
+fn state(message: &Message) -> io::Result<Option<Value>> {
+    let text = match message {
+        Message::Text(text) => text,
+        Message::Binary(_) => return Err(garbage("binary data")),
+        _ => return Ok(None),
+    };
+    let told = serde_json::from_str(text).ok().filter(Value::is_object);
+    told.map(Some).ok_or_else(|| garbage(text))
+}
+
+fn garbage(text: &str) -> io::Error {
+    let shown: String = text.chars().take(60).collect();
+    io::Error::new(ErrorKind::InvalidData, format!("Haply's Inverse Service sent what is no state: `{shown}`"))
+}
+
+fn broken(error: &tungstenite::Error) -> io::Error {
+    io::Error::new(ErrorKind::NotConnected, format!("Haply's Inverse Service is gone: {error}"))
+}
+
+/// Whether an error says that nothing is there yet.
+fn waits(error: &tungstenite::Error) -> bool {
+    matches!(error, tungstenite::Error::Io(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut))
+}
+
+/// Connects to a service; returns its first message, and the field of a force.
+fn begin(address: &str) -> io::Result<(WebSocket<TcpStream>, Value, &'static str)> {
+    let host = host_of(address)?;
+    let version = version(host)?;
+    // Before it is spoken to in words of a version that is not known here.
+    field(version.as_deref(), &Value::Null)?;
+    let stream = connect(host).map_err(|error| missing(host, &error))?;
+    let bounds = WebSocketConfig::default().max_message_size(Some(MOST_BYTES)).max_frame_size(Some(MOST_BYTES));
+    let (mut socket, _) = tungstenite::client::client_with_config(format!("ws://{host}/"), stream, Some(bounds))
+        .map_err(|error| missing(host, &io::Error::other(error.to_string())))?;
+    let first = loop {
+        match socket.read() {
+            Ok(message) => {
+                if let Some(told) = state(&message)? {
+                    break told;
+                }
+            }
+            Err(error) if waits(&error) => {
+                return Err(missing(host, &io::Error::new(ErrorKind::TimedOut, "it says nothing")));
+            }
+            Err(error) => return Err(broken(&error)),
+        }
+    };
+    let field = field(version.as_deref(), &first)?;
+    Ok((socket, first, field))
+}
+
+impl Inverse3 {
+    /// Opens the first Inverse3 of the service at an address.
+    ///
+    /// # Errors
+    /// Returns an error if the service or the device is missing, or of another version.
+    pub(super) fn open(which: Option<&str>) -> io::Result<Self> {
+        let (socket, first, field) = begin(which.unwrap_or(ADDRESS))?;
+        let id = devices(&first, "inverse3").find_map(id_of).ok_or_else(|| {
+            let message = "Haply's Inverse Service has no Inverse3: is it plugged in and on?";
+            io::Error::new(ErrorKind::NotFound, message)
+        })?;
+        let id = id.to_owned();
+        socket.get_ref().set_nonblocking(true)?;
+        let now = Instant::now();
+        let mut device = Inverse3 {
+            socket,
+            id,
+            field,
+            place_m: DVec3::ZERO,
+            buttons: 0,
+            unanswered: 0,
+            heard: now,
+            told: now,
+            sent_n: DVec3::ZERO,
+        };
+        device.take(&first);
+        device.send(DVec3::ZERO, true)?;
+        Ok(device)
+    }
+
+    /// Takes what a message tells. A value that is not told is as it was.
+    fn take(&mut self, message: &Value) {
+        if let Some(ours) = devices(message, "inverse3").find(|device| id_of(device) == Some(&self.id)) {
+            self.told = Instant::now();
+            if let Some(place_m) = ours.get("state").and_then(|state| vector(state.get("cursor_position")?)) {
+                self.place_m = place_m - MIDDLE_M;
+            }
+        }
+        if let Some(buttons) = buttons(message) {
+            self.buttons = buttons;
+        }
+    }
+
+    /// Sends a force; the first message tells who we are.
+    fn send(&mut self, force_n: DVec3, is_first: bool) -> io::Result<()> {
+        let DVec3 { x, y, z } = force_n;
+        let mut command = Map::new();
+        command.insert(self.field.to_owned(), json!({ "x": x, "y": y, "z": z }));
+        let mut message =
+            json!({ "inverse3": [{ "device_id": self.id, "commands": { "set_cursor_force": command } }] });
+        if is_first && self.field == "vector" {
+            message["session"] = json!({ "configure": { "profile": { "name": "palpate" } } });
+        }
+        match self.socket.send(Message::text(message.to_string())) {
+            // What does not fit now goes with the next.
+            Err(error) if !waits(&error) => Err(broken(&error)),
+            _ => {
+                if self.unanswered == 0 {
+                    self.heard = Instant::now();
+                }
+                self.unanswered += 1;
+                self.sent_n = force_n;
+                Ok(())
+            }
+        }
+    }
+}
+
+impl HapticDevice for Inverse3 {
+    fn descriptor(&self) -> Device {
+        Device::named("inverse3").unwrap_or(UNDECLARED)
+    }
+
+    fn read(&mut self) -> io::Result<Reading> {
+        loop {
+            match self.socket.read() {
+                Ok(message) => {
+                    if let Some(told) = state(&message)? {
+                        self.heard = Instant::now();
+                        self.unanswered = self.unanswered.saturating_sub(1);
+                        self.take(&told);
+                    }
+                }
+                Err(error) if waits(&error) => break,
+                Err(error) => return Err(broken(&error)),
+            }
+        }
+        let gone = |message: &str| Err(io::Error::new(ErrorKind::NotConnected, message.to_owned()));
+        if self.unanswered > 0 && self.heard.elapsed() > SILENCE {
+            return gone("Haply's Inverse Service does not answer any more");
+        }
+        if self.told.elapsed() > SILENCE && self.heard > self.told {
+            return gone("Haply's Inverse Service tells of the Inverse3 no more: is it unplugged?");
+        }
+        Ok(Reading { place_m: self.place_m, enable: self.buttons & 1 != 0 })
+    }
+
+    fn write(&mut self, force_n: DVec3) -> io::Result<()> {
+        let is_stale = self.unanswered > 0 && self.heard.elapsed() > STALE;
+        let force_n = if is_stale { DVec3::ZERO } else { force_n };
+        // That there is to be no force is said to a service that is behind, too.
+        let must = force_n == DVec3::ZERO && self.sent_n != DVec3::ZERO;
+        if self.unanswered < UNANSWERED || must { self.send(force_n, false) } else { Ok(()) }
+    }
+
+    fn buttons(&self) -> u32 {
+        self.buttons
+    }
+
+    fn button_count(&self) -> u32 {
+        3
+    }
+}
+
+impl Drop for Inverse3 {
+    fn drop(&mut self) {
+        // Once more, and this time waiting for room.
+        let _ = self.socket.get_ref().set_nonblocking(false);
+        let _ = self.socket.get_ref().set_write_timeout(Some(SILENCE));
+        let _ = self.send(DVec3::ZERO, false);
+        let _ = self.socket.close(None);
+        let _ = self.socket.flush();
+    }
+}
+
+/// Whether there is an Inverse3, and what is there.
+///
+/// # Errors
+/// Returns an error if the service does not answer, or is of another version.
+pub(super) fn tell() -> io::Result<(bool, String)> {
+    let (_socket, first, field) = begin(ADDRESS)?;
+    let ids: Vec<&str> = devices(&first, "inverse3").filter_map(id_of).collect();
+    Ok((!ids.is_empty(), format!("Inverse Service (forces as `{field}`): {} Inverse3 {}", ids.len(), ids.join(", "))))
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_spelling_of_a_force_follows_the_version() {
+        let (old, new) = (json!({ "inverse3": [] }), json!({ "session_id": 7, "inverse3": [] }));
+        for (version, first, expected) in [
+            (Some("3.1.1"), &old, "values"),
+            (Some("3.4.9"), &new, "values"),
+            (Some("3.5.0"), &old, "vector"),
+            (Some("v3.10"), &old, "vector"),
+            (None, &old, "values"),
+            (None, &new, "vector"),
+            (Some("develop"), &new, "vector"),
+        ] {
+            assert_eq!(field(version, first).unwrap(), expected, "{version:?}");
+        }
+        for version in ["3.0.7", "2.9", "4.0.0"] {
+            let said = field(Some(version), &new).unwrap_err().to_string();
+            assert!(said.contains(version) && said.contains("3.1"), "{said}");
+        }
+    }
+
+    #[test]
+    fn buttons_are_those_of_whichever_grip_there_is() {
+        let wireless =
+            |a, b| json!({ "wireless_verse_grip": [{ "state": { "buttons": { "a": a, "b": b, "c": false } } }] });
+        assert_eq!(buttons(&wireless(true, false)), Some(1));
+        assert_eq!(buttons(&wireless(false, true)), Some(2));
+        assert_eq!(buttons(&json!({ "verse_grip": [{ "state": { "button": true } }] })), Some(1));
+        assert_eq!(buttons(&json!({ "inverse3": [], "verse_grip": [] })), None);
+        assert_eq!(buttons(&json!({ "wireless_verse_grip": 3 })), None);
+    }
+
+    #[test]
+    fn an_address_needs_a_host_and_a_port() {
+        assert_eq!(host_of("ws://localhost:10001/x").unwrap(), "localhost:10001");
+        for wrong in ["localhost:10001", "http://localhost:10001", "ws://localhost", ""] {
+            assert!(host_of(wrong).is_err(), "{wrong}");
+        }
+    }
+}

@@ -1,0 +1,116 @@
+//! Devices of makers, found and loaded at run time: no maker's kit is needed to build this library.
+//!
+//! [`open`] gives a device by its name, for [`crate::bridge::run`]. [`list`] tells what is there, [`check`] whether it keeps
+//! time. [`Placed`] lays the workspace of any device over the tissue.
+//!
+//! | name | what it is | how it is reached |
+//! |---|---|---|
+//! | `force-dimension` | omega, delta, sigma, lambda, Falcon | `libdhd` of the Force Dimension SDK |
+//! | `openhaptics` | 3D Systems Touch, Omni, Desktop | `libHD` of OpenHaptics |
+//! | `haply` | Inverse3 | Haply's Inverse Service, by WebSocket |
+//! | `spacemouse`, `gamepad` | position by rate, force by rumble | events of Linux |
+//!
+//! A name may be followed by `:` and which one: the number of a Force Dimension device, the name of an OpenHaptics
+//! configuration, the address of Haply's service, the path of events.
+
+mod check;
+mod force_dimension;
+mod haply;
+#[cfg(target_os = "linux")]
+mod input;
+mod loaded;
+mod open_haptics;
+mod placement;
+
+use std::path::Path;
+
+use crate::Error;
+use crate::device::HapticDevice;
+
+pub use check::{Checked, check};
+pub use placement::{ENGAGED_N, Enables, Placed, Placement};
+
+/// A kind of device.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// By `libdhd`.
+    ForceDimension,
+    /// By `libHD`.
+    OpenHaptics,
+    /// By Haply's service.
+    Haply,
+    /// A 3D mouse.
+    SpaceMouse,
+    /// A gamepad.
+    Gamepad,
+}
+
+impl Kind {
+    /// All kinds, with their names.
+    pub const ALL: [(Kind, &'static str); 5] = [
+        (Kind::ForceDimension, "force-dimension"),
+        (Kind::OpenHaptics, "openhaptics"),
+        (Kind::Haply, "haply"),
+        (Kind::SpaceMouse, "spacemouse"),
+        (Kind::Gamepad, "gamepad"),
+    ];
+
+    /// The kind that a name begins with, and what follows its `:`.
+    pub fn of(name: &str) -> Option<(Kind, Option<&str>)> {
+        let (kind, which) = name.split_once(':').map_or((name, None), |(kind, which)| (kind, Some(which)));
+        Kind::ALL.iter().find(|entry| entry.1 == kind).map(|entry| (entry.0, which))
+    }
+}
+
+/// Opens a device by its name. `library` is the maker's library, if it is not where the system looks for libraries.
+///
+/// # Errors
+/// Returns [`Error::Argument`] if there is no such kind of device, and [`Error::Device`] with what to do if the library, the
+/// service or the device is missing, or of a version that is not known here.
+pub fn open(name: &str, library: Option<&Path>) -> Result<Box<dyn HapticDevice>, Error> {
+    let Some((kind, which)) = Kind::of(name) else {
+        let names: Vec<&str> = Kind::ALL.iter().map(|entry| entry.1).collect();
+        return Err(Error::Argument(format!("no device `{name}`: known are {}", names.join(", "))));
+    };
+    Ok(match kind {
+        Kind::ForceDimension => Box::new(force_dimension::ForceDimension::open(which, library)?),
+        Kind::OpenHaptics => Box::new(open_haptics::OpenHaptics::open(which, library)?),
+        Kind::Haply => Box::new(haply::Inverse3::open(which)?),
+        #[cfg(target_os = "linux")]
+        Kind::SpaceMouse => Box::new(input::Input::open(input::Map::SpaceMouse, which)?),
+        #[cfg(target_os = "linux")]
+        Kind::Gamepad => Box::new(input::Input::open(input::Map::Gamepad, which)?),
+        #[cfg(not(target_os = "linux"))]
+        Kind::SpaceMouse | Kind::Gamepad => {
+            let message = "a SpaceMouse and a gamepad are read on Linux only";
+            return Err(std::io::Error::new(std::io::ErrorKind::Unsupported, message).into());
+        }
+    })
+}
+
+/// What [`list`] found of a kind of device.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Found {
+    /// The name for [`open`].
+    pub name: String,
+    /// Whether it can be tried: the library or service answers, and does not say that there is no device.
+    pub is_there: bool,
+    /// For people: version and model, or what is missing and what to do.
+    pub about: String,
+}
+
+/// What devices of all kinds are there. Opens none of them. `library` is tried as the library of each kind that needs one.
+pub fn list(library: Option<&Path>) -> Vec<Found> {
+    let told = |name: &str, told: std::io::Result<(bool, String)>| {
+        let (is_there, about) = told.unwrap_or_else(|error| (false, error.to_string()));
+        Found { name: name.to_owned(), is_there, about }
+    };
+    let mut found = vec![
+        told("force-dimension", force_dimension::tell(library)),
+        told("openhaptics", open_haptics::tell(library)),
+        told("haply", haply::tell()),
+    ];
+    #[cfg(target_os = "linux")]
+    found.extend(input::list().into_iter().map(|(name, is_there, about)| Found { name, is_there, about }));
+    found
+}

@@ -1,0 +1,420 @@
+//! The Touch of 3D Systems, and its forerunners, by `libHD` of OpenHaptics (version 3).
+//!
+//! The library calls a function of ours a thousand times a second on a thread of its own: one frame reads the position and
+//! sets the force. It measures in millimetres, with x to the right, y up and z towards the operator. If our loop stands
+//! still, the frame takes the force away. The library is never unloaded.
+
+// Functions of a library that was written in C.
+#![allow(unsafe_code)]
+
+use std::ffi::{CString, c_char, c_int, c_uint, c_ulong, c_ushort, c_void};
+use std::io;
+use std::path::Path;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use glam::DVec3;
+use palpate_touch::Device;
+
+use super::loaded::{Loaded, text_of};
+use crate::device::{HapticDevice, Reading};
+
+#[cfg(windows)]
+const NAMES: [&str; 1] = ["hd.dll"];
+#[cfg(not(windows))]
+const NAMES: [&str; 3] = ["libHD.so", "libHD.so.3.4", "libHD.so.3"];
+
+// Of hdDefines.h.
+const INVALID_HANDLE: c_uint = 0xFFFF_FFFF;
+const CURRENT_BUTTONS: c_uint = 0x2000;
+const CURRENT_POSITION: c_uint = 0x2050;
+const CURRENT_FORCE: c_uint = 0x2700;
+const VERSION: c_uint = 0x2500;
+const MODEL: c_uint = 0x2501;
+const MAX_WORKSPACE: c_uint = 0x2550;
+const USABLE_WORKSPACE: c_uint = 0x2551;
+const MAX_STIFFNESS: c_uint = 0x2602;
+const MAX_FORCE: c_uint = 0x2603;
+const MAX_CONTINUOUS_FORCE: c_uint = 0x2604;
+const MAX_DAMPING: c_uint = 0x2609;
+const FORCE_OUTPUT: c_uint = 0x4000;
+const NEEDS_INKWELL: c_uint = 0x5002;
+const CALLBACK_DONE: c_uint = 0;
+const CALLBACK_CONTINUE: c_uint = 1;
+/// Errors of forces: warm motors, or a force or speed above the device's own limits. The device goes on.
+const FORCE_ERRORS: std::ops::Range<c_uint> = 0x0200..0x0300;
+/// Errors that are asked for at a time.
+const MOST_ERRORS: u32 = 16;
+/// `HD_MAX_SCHEDULER_PRIORITY`.
+const PRIORITY: c_ushort = c_ushort::MAX;
+
+/// When our loop has not written for so long, the frame sets no force.
+const STILL: Duration = Duration::from_millis(50);
+
+/// When no frame came for so long, the device has gone.
+const GONE: Duration = Duration::from_millis(500);
+
+/// How long closing waits for frames that set no force.
+const CLOSES: Duration = Duration::from_millis(250);
+
+/// How long the first frame may take.
+const FIRST: Duration = Duration::from_secs(2);
+
+/// `HDErrorInfo`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+struct ErrorInfo {
+    code: c_uint,
+    internal: c_int,
+    handle: c_uint,
+}
+
+type Frame = unsafe extern "system" fn(*mut c_void) -> c_uint;
+type OfHandle = unsafe extern "system" fn(c_uint);
+type Bare = unsafe extern "system" fn();
+
+/// The functions in use.
+#[derive(Debug, Clone, Copy)]
+struct Calls {
+    init: unsafe extern "system" fn(*const c_char) -> c_uint,
+    disable_device: OfHandle,
+    make_current: OfHandle,
+    begin: OfHandle,
+    end: OfHandle,
+    get_numbers: unsafe extern "system" fn(c_uint, *mut f64),
+    get_whole: unsafe extern "system" fn(c_uint, *mut c_int),
+    set_numbers: unsafe extern "system" fn(c_uint, *const f64),
+    get_text: unsafe extern "system" fn(c_uint) -> *const c_char,
+    enable: OfHandle,
+    error: unsafe extern "system" fn() -> ErrorInfo,
+    error_text: unsafe extern "system" fn(c_uint) -> *const c_char,
+    start: Bare,
+    stop: Bare,
+    schedule: unsafe extern "system" fn(Frame, *mut c_void, c_ushort) -> c_ulong,
+    unschedule: unsafe extern "system" fn(c_ulong),
+    calibration: Option<unsafe extern "system" fn() -> c_uint>,
+}
+
+impl Calls {
+    fn load(library: Option<&Path>) -> io::Result<(Self, Loaded)> {
+        let loaded = Loaded::find(library, &NAMES, "libHD", "Install OpenHaptics and the driver of the device")?;
+        // SAFETY: the types are those of hd.h and hdDevice.h.
+        let calls = unsafe {
+            Calls {
+                init: loaded.function("hdInitDevice")?,
+                disable_device: loaded.function("hdDisableDevice")?,
+                make_current: loaded.function("hdMakeCurrentDevice")?,
+                begin: loaded.function("hdBeginFrame")?,
+                end: loaded.function("hdEndFrame")?,
+                get_numbers: loaded.function("hdGetDoublev")?,
+                get_whole: loaded.function("hdGetIntegerv")?,
+                set_numbers: loaded.function("hdSetDoublev")?,
+                get_text: loaded.function("hdGetString")?,
+                enable: loaded.function("hdEnable")?,
+                error: loaded.function("hdGetError")?,
+                error_text: loaded.function("hdGetErrorString")?,
+                start: loaded.function("hdStartScheduler")?,
+                stop: loaded.function("hdStopScheduler")?,
+                schedule: loaded.function("hdScheduleAsynchronous")?,
+                unschedule: loaded.function("hdUnschedule")?,
+                calibration: loaded.optional("hdCheckCalibration"),
+            }
+        };
+        Ok((calls, loaded))
+    }
+
+    /// An error's name in the library's words.
+    fn words(&self, code: c_uint) -> String {
+        // SAFETY: the library's texts are constants.
+        let words = unsafe { text_of((self.error_text)(code)) }.unwrap_or_default();
+        format!("{words} (0x{code:04X})")
+    }
+
+    /// An error since it was last asked for, if there is one other than of forces.
+    fn failure(&self) -> Option<c_uint> {
+        // The library keeps errors until they are asked for, one by one.
+        // SAFETY: a function without arguments.
+        let errors = (0..MOST_ERRORS).map(|_| unsafe { (self.error)() }.code).take_while(|code| *code != 0);
+        errors.fold(None, |found, code| found.or(Some(code).filter(|code| !FORCE_ERRORS.contains(code))))
+    }
+
+    /// Numbers of the current device; 0 where it does not tell.
+    fn numbers<const N: usize>(&self, parameter: c_uint) -> [f64; N] {
+        // More than any parameter has.
+        let mut numbers = [0.0; 16];
+        // SAFETY: room for as many numbers as any parameter has.
+        unsafe { (self.get_numbers)(parameter, numbers.as_mut_ptr()) };
+        // What a device does not have is an error that is no failure.
+        let _ = self.failure();
+        std::array::from_fn(|index| numbers[index])
+    }
+
+    /// The version, which must be one that is known here.
+    fn version(&self, loaded: &Loaded) -> io::Result<String> {
+        // SAFETY: the library's texts are constants.
+        let version = unsafe { text_of((self.get_text)(VERSION)) }.unwrap_or_default();
+        let _ = self.failure();
+        let major = version.split(['.', ' ']).next().and_then(|major| major.parse::<u32>().ok());
+        if major.is_some_and(|major| major != 3) {
+            let message = format!("{} is of OpenHaptics {version}: Palpate knows OpenHaptics 3", loaded.name());
+            return Err(io::Error::new(io::ErrorKind::Unsupported, message));
+        }
+        Ok(if version.is_empty() { "of an unknown version".to_owned() } else { version })
+    }
+}
+
+/// What frames and our loop tell each other.
+#[derive(Debug, Clone, Copy)]
+struct Exchange {
+    /// Millimetres, in the library's axes.
+    place_mm: [f64; 3],
+    buttons: c_int,
+    /// N, in the library's axes.
+    force_n: [f64; 3],
+    written: Instant,
+    /// When the newest frame came; `None` before the first.
+    came: Option<Instant>,
+    frames: u64,
+    /// The error that ended the frames.
+    fault: Option<c_uint>,
+}
+
+#[derive(Debug)]
+struct Shared {
+    calls: Calls,
+    handle: c_uint,
+    exchange: Mutex<Exchange>,
+}
+
+impl Shared {
+    fn exchange(&self) -> MutexGuard<'_, Exchange> {
+        self.exchange.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// All of it, without the lock: the library may call us meanwhile.
+    fn seen(&self) -> Exchange {
+        *self.exchange()
+    }
+}
+
+/// One frame, on the library's thread.
+unsafe extern "system" fn frame(shared: *mut c_void) -> c_uint {
+    // SAFETY: `open` passes a `Shared` that is never freed.
+    let shared = unsafe { &*shared.cast::<Shared>() };
+    let Shared { calls, handle, .. } = shared;
+    let mut place_mm = [0.0; 16];
+    let mut buttons = 0;
+    // SAFETY: the device is open; there is room for the numbers.
+    unsafe {
+        (calls.begin)(*handle);
+        (calls.get_numbers)(CURRENT_POSITION, place_mm.as_mut_ptr());
+        (calls.get_whole)(CURRENT_BUTTONS, &raw mut buttons);
+    }
+    let force_n = {
+        let mut exchange = shared.exchange();
+        exchange.place_mm = [place_mm[0], place_mm[1], place_mm[2]];
+        exchange.buttons = buttons;
+        exchange.came = Some(Instant::now());
+        exchange.frames += 1;
+        if exchange.written.elapsed() > STILL { [0.0; 3] } else { exchange.force_n }
+    };
+    // SAFETY: as above.
+    unsafe {
+        (calls.set_numbers)(CURRENT_FORCE, force_n.as_ptr());
+        (calls.end)(*handle);
+    }
+    match calls.failure() {
+        None => CALLBACK_CONTINUE,
+        Some(code) => {
+            // If it hears anything at all, then that there is to be no force.
+            // SAFETY: as above.
+            unsafe {
+                (calls.begin)(*handle);
+                (calls.set_numbers)(CURRENT_FORCE, [0.0; 3].as_ptr());
+                (calls.end)(*handle);
+            }
+            let _ = calls.failure();
+            shared.exchange().fault = Some(code);
+            CALLBACK_DONE
+        }
+    }
+}
+
+/// An open device.
+#[derive(Debug)]
+pub(super) struct OpenHaptics {
+    shared: &'static Shared,
+    task: c_ulong,
+    descriptor: Device,
+    /// Middle of the workspace, mm, in the library's axes.
+    middle_mm: DVec3,
+    buttons: u32,
+}
+
+impl OpenHaptics {
+    /// Opens the device of that configuration, or the default one.
+    ///
+    /// # Errors
+    /// Returns an error if library or device are missing, or of another version.
+    pub(super) fn open(which: Option<&str>, library: Option<&Path>) -> io::Result<Self> {
+        let (calls, loaded) = Calls::load(library)?;
+        calls.version(&loaded)?;
+        let name = which.map(CString::new).transpose()?;
+        // SAFETY: null is the default device.
+        let handle = unsafe { (calls.init)(name.as_ref().map_or(std::ptr::null(), |name| name.as_ptr())) };
+        let failure = calls.failure();
+        if handle == INVALID_HANDLE || failure.is_some() {
+            let why = failure.map_or_else(|| "no reason given".to_owned(), |code| calls.words(code));
+            let message = format!(
+                "no device of OpenHaptics: {why}. Is it plugged in, was it set up by the maker's tool, and does no other program have it?"
+            );
+            return Err(io::Error::new(io::ErrorKind::NotFound, message));
+        }
+        // SAFETY: the device is open.
+        unsafe { (calls.make_current)(handle) };
+        if calls.calibration.is_some_and(|check| unsafe { check() } == NEEDS_INKWELL) {
+            // SAFETY: as above.
+            unsafe { (calls.disable_device)(handle) };
+            let message = "the device is not calibrated: put the stylus into its inkwell, and try again";
+            return Err(io::Error::other(message));
+        }
+        let (descriptor, middle_mm) = describe(&calls);
+        let exchange = Exchange {
+            place_mm: [0.0; 3],
+            buttons: 0,
+            force_n: [0.0; 3],
+            written: Instant::now(),
+            came: None,
+            frames: 0,
+            fault: None,
+        };
+        // Never freed: a frame of the library may be under way for as long as the program runs.
+        let shared: &'static Shared = Box::leak(Box::new(Shared { calls, handle, exchange: Mutex::new(exchange) }));
+        // SAFETY: the function has the type of a frame, and `shared` lives for ever.
+        let task = unsafe {
+            let task = (calls.schedule)(frame, std::ptr::from_ref(shared).cast_mut().cast(), PRIORITY);
+            (calls.enable)(FORCE_OUTPUT);
+            (calls.start)();
+            task
+        };
+        let device = OpenHaptics { shared, task, descriptor, middle_mm, buttons: 0 };
+        let begun = Instant::now();
+        loop {
+            let seen = device.shared.seen();
+            if seen.came.is_some() {
+                return Ok(device);
+            }
+            device.alive(&seen, begun, FIRST)?;
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+
+    /// An error if frames have ended, or if none came for `most` since `came`.
+    fn alive(&self, seen: &Exchange, came: Instant, most: Duration) -> io::Result<()> {
+        let gone = |message: String| io::Error::new(io::ErrorKind::NotConnected, message);
+        if let Some(code) = seen.fault {
+            return Err(gone(format!("openhaptics: the device failed: {}", self.shared.calls.words(code))));
+        }
+        if came.elapsed() > most {
+            return Err(gone("openhaptics: the library's loop stands still".to_owned()));
+        }
+        Ok(())
+    }
+}
+
+/// The limits of the current device as it tells them, and the middle of its workspace, mm.
+fn describe(calls: &Calls) -> (Device, DVec3) {
+    // SAFETY: the library's texts are constants.
+    let model = unsafe { text_of((calls.get_text)(MODEL)) }.unwrap_or_default().to_lowercase();
+    let _ = calls.failure();
+    let name = if model.contains("desktop") {
+        "desktop"
+    } else if model.contains("omni") {
+        "omni"
+    } else {
+        "touch"
+    };
+    let table = Device::named(name).unwrap_or(palpate_touch::device::UNDECLARED);
+    let told = |parameter, factor: f64, instead: f64| {
+        let [number] = calls.numbers(parameter);
+        if number.is_finite() && number > 0.0 { factor * number } else { instead }
+    };
+    let corners = |parameter| {
+        let [a, b, c, d, e, f] = calls.numbers(parameter);
+        (DVec3::new(a, b, c), DVec3::new(d, e, f))
+    };
+    let (least_mm, most_mm) = corners(USABLE_WORKSPACE);
+    let whole_mm = corners(MAX_WORKSPACE);
+    let reach_m = 0.5e-3 * (whole_mm.1 - whole_mm.0).length();
+    let descriptor = Device {
+        name: table.name,
+        force_n: told(MAX_FORCE, 1.0, table.force_n),
+        continuous_n: told(MAX_CONTINUOUS_FORCE, 1.0, table.continuous_n),
+        stiffness_n_per_m: told(MAX_STIFFNESS, 1e3, table.stiffness_n_per_m),
+        damping_n_s_per_m: told(MAX_DAMPING, 1e3, table.damping_n_s_per_m),
+        workspace_m: if reach_m.is_finite() && reach_m > 0.0 { reach_m } else { table.workspace_m },
+    };
+    let middle_mm = 0.5 * (least_mm + most_mm);
+    (descriptor, if middle_mm.is_finite() { middle_mm } else { DVec3::ZERO })
+}
+
+impl HapticDevice for OpenHaptics {
+    fn descriptor(&self) -> Device {
+        self.descriptor
+    }
+
+    fn read(&mut self) -> io::Result<Reading> {
+        let seen = self.shared.seen();
+        self.alive(&seen, seen.came.unwrap_or_else(Instant::now), GONE)?;
+        self.buttons = seen.buttons.unsigned_abs();
+        let DVec3 { x, y, z } = 1e-3 * (DVec3::from_array(seen.place_mm) - self.middle_mm);
+        Ok(Reading { place_m: DVec3::new(x, -z, y), enable: self.buttons & 1 != 0 })
+    }
+
+    fn write(&mut self, force_n: DVec3) -> io::Result<()> {
+        let mut exchange = self.shared.exchange();
+        exchange.force_n = [force_n.x, force_n.z, -force_n.y];
+        exchange.written = Instant::now();
+        Ok(())
+    }
+
+    fn buttons(&self) -> u32 {
+        self.buttons
+    }
+
+    fn button_count(&self) -> u32 {
+        2
+    }
+}
+
+impl Drop for OpenHaptics {
+    fn drop(&mut self) {
+        let _ = self.write(DVec3::ZERO);
+        let (begun, before) = (Instant::now(), self.shared.seen().frames);
+        loop {
+            let Exchange { frames, fault, .. } = self.shared.seen();
+            // Two more frames: one of them is whole, and has set that force.
+            if frames >= before + 2 || fault.is_some() || begun.elapsed() > CLOSES {
+                break;
+            }
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        let Calls { stop, unschedule, disable_device, .. } = self.shared.calls;
+        // SAFETY: the device is open, and nobody uses it after this.
+        unsafe {
+            stop();
+            unschedule(self.task);
+            disable_device(self.shared.handle);
+        }
+    }
+}
+
+/// Whether the library is there. It tells of devices only when they are opened.
+///
+/// # Errors
+/// Returns an error if the library is missing, or of another version.
+pub(super) fn tell(library: Option<&Path>) -> io::Result<(bool, String)> {
+    let (calls, loaded) = Calls::load(library)?;
+    let version = calls.version(&loaded)?;
+    Ok((true, format!("{} {version}: it finds out about devices when one is opened", loaded.name())))
+}

@@ -1,0 +1,353 @@
+//! Where a device's workspace is laid over the tissue, and the clutch.
+//!
+//! A position p of the device, from the middle of its workspace, becomes `offset + scale·R·p` from the middle of the tissue. A
+//! force f of the tissue goes back as `force_scale·R⁻¹·f`. So the work at the device is `force_scale/scale` of the work at the
+//! tissue: what the envelope keeps passive there is passive here, whatever the scale. A spring of the tissue is felt
+//! `scale·force_scale` times as stiff, and the device's limits are declared to the server divided by that. As `force_scale` is at
+//! most 1, the envelope's largest force is never exceeded.
+
+use std::time::Instant;
+
+use glam::{DQuat, DVec3, EulerRot};
+use palpate_proto::refusal::{Reason, Refusal, Result, finite_vector, number};
+use palpate_touch::Device;
+
+use crate::bridge::Tick;
+use crate::device::{HapticDevice, Reading};
+
+/// How far the clutch may shift the workspace, m.
+const SHIFT_M: f64 = 1.0;
+
+/// Largest offset, m.
+const OFFSET_M: f64 = 10.0;
+
+/// After a clutch the device gets forces again when the envelope's force has once been below this, N.
+pub const ENGAGED_N: f64 = 0.01;
+
+/// Forces that return by themselves are asked for with this period, s.
+const ASKS_EVERY_S: f64 = 0.3;
+
+/// Who asks for forces.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Enables {
+    /// The operator, by the device's button of this number.
+    Button(u32),
+    /// They return by themselves: for devices without a button.
+    Always,
+    /// The operator, by whatever the device takes for that.
+    #[default]
+    Device,
+}
+
+/// Where a device is laid over the tissue.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Placement {
+    /// The middle of the workspace, from the middle of the tissue, m.
+    pub offset_m: DVec3,
+    /// The device is turned about the tissue's x, then y, then z axis by so much, degrees.
+    pub rotation_deg: DVec3,
+    /// Metres of the tissue for each metre of the device.
+    pub scale: f64,
+    /// Newtons at the device for each newton of the tissue.
+    pub force_scale: f64,
+    /// Who asks for forces.
+    pub enable: Enables,
+    /// The number of the button that, while it is held, lets the device move without the tool; `None`: none.
+    pub clutch_button: Option<u32>,
+}
+
+impl Default for Placement {
+    fn default() -> Self {
+        Placement {
+            offset_m: DVec3::ZERO,
+            rotation_deg: DVec3::ZERO,
+            scale: 1.0,
+            force_scale: 1.0,
+            enable: Enables::Device,
+            clutch_button: Some(1),
+        }
+    }
+}
+
+impl Placement {
+    /// Refuses a value that is out of its range, by the name of its field.
+    ///
+    /// # Errors
+    /// Returns the first refusal.
+    pub fn check(&self) -> Result<()> {
+        let Placement { offset_m, rotation_deg, scale, force_scale, enable, clutch_button } = *self;
+        finite_vector("offset_m", offset_m)?;
+        if offset_m.length() > OFFSET_M {
+            let message =
+                format!("must be within {OFFSET_M} m of the middle of the tissue, but is {} m off", offset_m.length());
+            return Err(Refusal::new(Reason::OutOfRange, "offset_m", message));
+        }
+        finite_vector("rotation_deg", rotation_deg)?;
+        if rotation_deg.abs().max_element() > 360.0 {
+            return Err(Refusal::new(Reason::OutOfRange, "rotation_deg", "must be from -360 to 360 about each axis"));
+        }
+        number("scale", scale, "from 0.01 to 100", |scale| (0.01..=100.0).contains(&scale))?;
+        number("force_scale", force_scale, "from 0.01 to 1", |scale| (0.01..=1.0).contains(&scale))?;
+        let enables = if let Enables::Button(button) = enable { Some(button) } else { None };
+        for (field, button) in [("enable_button", enables), ("clutch_button", clutch_button)] {
+            if let Some(button) = button.filter(|button| *button > 31) {
+                return Err(Refusal::new(Reason::OutOfRange, field, format!("must be from 0 to 31, but is {button}")));
+            }
+        }
+        if enables.is_some() && enables == clutch_button {
+            let message = "must be another button than the one that asks for forces";
+            return Err(Refusal::new(Reason::OutOfRange, "clutch_button", message));
+        }
+        Ok(())
+    }
+
+    fn rotation(&self) -> DQuat {
+        let [x, y, z] = (self.rotation_deg * (std::f64::consts::PI / 180.0)).to_array();
+        // The axes are the tissue's, which stand still: x first is the rightmost factor.
+        DQuat::from_euler(EulerRot::ZYX, z, y, x)
+    }
+}
+
+/// A device that is laid over the tissue somewhere, turned and scaled, with a clutch.
+///
+/// While the clutch is held the tool stays where it is and the device gets no force. When it is let go, the tool goes on from
+/// there, and forces come back once the tool is out of the tissue: none begins within it.
+#[derive(Debug)]
+pub struct Placed<D> {
+    device: D,
+    placement: Placement,
+    rotation: DQuat,
+    /// What the clutch has shifted, m, of the tissue.
+    shift_m: DVec3,
+    /// The tool while the clutch is held, m.
+    held_m: Option<DVec3>,
+    /// Whether the clutch is held, or was let go and the envelope's force has not been small since.
+    is_shut: bool,
+    begun: Option<Instant>,
+}
+
+impl<D: HapticDevice> Placed<D> {
+    /// Lays a device over the tissue.
+    ///
+    /// # Errors
+    /// Refuses a placement that [`Placement::check`] refuses.
+    pub fn new(device: D, placement: Placement) -> Result<Self> {
+        placement.check()?;
+        let rotation = placement.rotation();
+        let (shift_m, held_m, is_shut, begun) = (DVec3::ZERO, None, false, None);
+        Ok(Placed { device, placement, rotation, shift_m, held_m, is_shut, begun })
+    }
+
+    /// The device itself.
+    pub fn device(&self) -> &D {
+        &self.device
+    }
+
+    fn asks(&mut self, reading: Reading, buttons: u32) -> bool {
+        match self.placement.enable {
+            Enables::Device => reading.enable,
+            Enables::Button(button) => buttons >> button & 1 != 0,
+            Enables::Always => {
+                let passed_s = self.begun.get_or_insert_with(Instant::now).elapsed().as_secs_f64();
+                passed_s % ASKS_EVERY_S < ASKS_EVERY_S / 2.0
+            }
+        }
+    }
+}
+
+impl<D: HapticDevice> HapticDevice for Placed<D> {
+    fn descriptor(&self) -> Device {
+        let (device, Placement { scale, force_scale, offset_m, clutch_button, .. }) =
+            (self.device.descriptor(), self.placement);
+        let shift_m =
+            if clutch_button.is_some_and(|button| button < self.device.button_count()) { SHIFT_M } else { 0.0 };
+        Device {
+            stiffness_n_per_m: device.stiffness_n_per_m / (scale * force_scale),
+            damping_n_s_per_m: device.damping_n_s_per_m / (scale * force_scale),
+            workspace_m: scale * device.workspace_m + offset_m.length() + shift_m,
+            ..device
+        }
+    }
+
+    fn read(&mut self) -> std::io::Result<Reading> {
+        let reading = self.device.read()?;
+        let buttons = self.device.buttons();
+        let enable = self.asks(reading, buttons);
+        let laid_m = self.placement.offset_m + self.placement.scale * (self.rotation * reading.place_m);
+        let is_held = self.placement.clutch_button.is_some_and(|button| buttons >> button & 1 != 0);
+        let place_m = match (is_held, self.held_m) {
+            (true, held_m) => {
+                self.is_shut = true;
+                *self.held_m.insert(held_m.unwrap_or(laid_m + self.shift_m))
+            }
+            (false, Some(held_m)) => {
+                // It goes on from where it stood.
+                self.shift_m = (held_m - laid_m).clamp_length_max(SHIFT_M);
+                self.held_m = None;
+                laid_m + self.shift_m
+            }
+            (false, None) => laid_m + self.shift_m,
+        };
+        Ok(Reading { place_m, enable })
+    }
+
+    fn write(&mut self, force_n: DVec3) -> std::io::Result<()> {
+        if self.held_m.is_none() && force_n.length() < ENGAGED_N {
+            self.is_shut = false;
+        }
+        let passed_n =
+            if self.is_shut { DVec3::ZERO } else { self.placement.force_scale * (self.rotation.inverse() * force_n) };
+        self.device.write(passed_n)
+    }
+
+    fn buttons(&self) -> u32 {
+        self.device.buttons()
+    }
+
+    fn button_count(&self) -> u32 {
+        self.device.button_count()
+    }
+
+    fn ticked(&mut self, tick: &Tick) {
+        self.device.ticked(tick);
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use palpate_touch::device::UNDECLARED;
+
+    use super::*;
+
+    #[derive(Default)]
+    struct Fake {
+        place_m: DVec3,
+        buttons: u32,
+        force_n: DVec3,
+    }
+
+    impl HapticDevice for Fake {
+        fn descriptor(&self) -> Device {
+            UNDECLARED
+        }
+
+        fn read(&mut self) -> std::io::Result<Reading> {
+            Ok(Reading { place_m: self.place_m, enable: self.buttons & 1 != 0 })
+        }
+
+        fn write(&mut self, force_n: DVec3) -> std::io::Result<()> {
+            self.force_n = force_n;
+            Ok(())
+        }
+
+        fn buttons(&self) -> u32 {
+            self.buttons
+        }
+    }
+
+    fn near(a: DVec3, b: DVec3) -> bool {
+        (a - b).length() < 1e-12
+    }
+
+    #[test]
+    fn a_place_is_turned_scaled_and_shifted_and_a_force_goes_back() {
+        let placement = Placement {
+            offset_m: DVec3::new(0.01, 0.0, 0.0),
+            rotation_deg: DVec3::new(0.0, 0.0, 90.0),
+            scale: 0.5,
+            force_scale: 0.8,
+            ..Placement::default()
+        };
+        let mut placed = Placed::new(Fake::default(), placement).unwrap();
+        placed.device.place_m = 0.02 * DVec3::X;
+        // The device's x is the tissue's y.
+        assert!(near(placed.read().unwrap().place_m, DVec3::new(0.01, 0.01, 0.0)));
+        placed.write(DVec3::new(0.0, 2.0, 1.0)).unwrap();
+        assert!(near(placed.device.force_n, DVec3::new(1.6, 0.0, 0.8)), "{}", placed.device.force_n);
+        let descriptor = placed.descriptor();
+        assert!((descriptor.stiffness_n_per_m - UNDECLARED.stiffness_n_per_m / 0.4).abs() < 1e-9);
+        assert_eq!(descriptor.force_n, UNDECLARED.force_n);
+        // About x, then y, then z, of axes that stand still: z goes to -y by the first, and on to x by the last.
+        let turned = Placement { rotation_deg: DVec3::new(90.0, 0.0, 90.0), ..Placement::default() };
+        assert!(near(turned.rotation() * DVec3::Z, DVec3::X), "{}", turned.rotation() * DVec3::Z);
+    }
+
+    #[test]
+    fn the_work_at_the_device_is_that_at_the_tissue_by_one_factor() {
+        let placement = Placement {
+            rotation_deg: DVec3::new(20.0, -50.0, 130.0),
+            scale: 3.0,
+            force_scale: 0.25,
+            ..Placement::default()
+        };
+        let mut placed = Placed::new(Fake::default(), placement).unwrap();
+        let (mut at_device, mut at_tissue) = (0.0, 0.0);
+        let mut before = (DVec3::ZERO, DVec3::ZERO);
+        for tick in 0..200 {
+            let t = 0.05 * f64::from(tick);
+            placed.device.place_m = 0.01 * DVec3::new(t.sin(), (1.3 * t).cos() - 1.0, (0.7 * t).sin());
+            let place_m = placed.read().unwrap().place_m;
+            let force_n = DVec3::new((2.0 * t).cos(), 0.5, -(t.sin()));
+            at_device += placed.device.force_n.dot(placed.device.place_m - before.0);
+            if tick > 0 {
+                let last_n = placement.rotation() * placed.device.force_n / placement.force_scale;
+                at_tissue += last_n.dot(place_m - before.1);
+            }
+            placed.write(force_n).unwrap();
+            before = (placed.device.place_m, place_m);
+        }
+        assert!(
+            at_tissue.abs() > 1e-3 && (at_device - at_tissue * 0.25 / 3.0).abs() < 1e-12,
+            "{at_device} {at_tissue}"
+        );
+    }
+
+    #[test]
+    fn the_clutch_holds_the_tool_and_takes_the_force_until_the_tool_is_out_of_the_tissue() {
+        let mut placed = Placed::new(Fake::default(), Placement::default()).unwrap();
+        let mut tick = |place_m: DVec3, buttons: u32, force_n: DVec3| {
+            (placed.device.place_m, placed.device.buttons) = (place_m, buttons);
+            let reading = placed.read().unwrap();
+            placed.write(force_n).unwrap();
+            (reading, placed.device.force_n)
+        };
+        assert!(tick(DVec3::ZERO, 1, DVec3::Z).0.enable);
+        assert_eq!(tick(-0.001 * DVec3::Z, 0, DVec3::Z).1, DVec3::Z);
+        // Held: the device moves, the tool stays where it was when the button was pressed.
+        let held_m = DVec3::new(0.002, 0.0, -0.001);
+        for moved in 1..10 {
+            let place_m = DVec3::new(0.002 * f64::from(moved), 0.0, -0.001);
+            let (reading, force_n) = tick(place_m, 2, DVec3::Z);
+            assert!(near(reading.place_m, held_m) && force_n == DVec3::ZERO);
+        }
+        // Let go: it goes on from where it stood, without a force for as long as it is in the tissue.
+        for _ in 0..4 {
+            let (reading, force_n) = tick(DVec3::new(0.018, 0.0, -0.001), 0, DVec3::Z);
+            assert!(near(reading.place_m, held_m) && force_n == DVec3::ZERO, "{reading:?}");
+        }
+        let (reading, force_n) = tick(DVec3::new(0.018, 0.0, 0.001), 0, DVec3::ZERO);
+        assert!(near(reading.place_m, held_m + 0.002 * DVec3::Z) && force_n == DVec3::ZERO);
+        // From then on the device gets what the envelope says.
+        assert_eq!(tick(DVec3::new(0.018, 0.0, -0.001), 0, 0.3 * DVec3::Z).1, 0.3 * DVec3::Z);
+    }
+
+    #[test]
+    fn what_is_out_of_range_is_refused_by_the_name_of_its_field() {
+        let good = Placement::default();
+        let cases = [
+            ("offset_m", Placement { offset_m: DVec3::splat(8.0), ..good }),
+            ("offset_m", Placement { offset_m: DVec3::NAN, ..good }),
+            ("rotation_deg", Placement { rotation_deg: 400.0 * DVec3::X, ..good }),
+            ("scale", Placement { scale: 0.0, ..good }),
+            ("scale", Placement { scale: f64::NAN, ..good }),
+            ("force_scale", Placement { force_scale: 1.5, ..good }),
+            ("clutch_button", Placement { clutch_button: Some(32), ..good }),
+            ("clutch_button", Placement { enable: Enables::Button(1), ..good }),
+            ("enable_button", Placement { enable: Enables::Button(40), ..good }),
+        ];
+        for (field, placement) in cases {
+            assert_eq!(Placed::new(Fake::default(), placement).err().unwrap().field, field, "{placement:?}");
+        }
+    }
+}

@@ -1,0 +1,405 @@
+//! Which server of a fleet has a session, and calls that go there.
+//!
+//! A server that does not have a session names the one that has it (`ELSEWHERE`), or asks for patience while another takes the
+//! session over (`FENCED`). A server that is of no fleet does neither: everything here then is one call more, or none.
+
+use std::time::Duration;
+
+use palpate_proto::error::elsewhere;
+use palpate_proto::pb;
+use palpate_proto::refusal::Reason;
+use pb::session_service_client::SessionServiceClient;
+use tokio::sync::mpsc;
+use tokio::task::JoinSet;
+use tokio::time::Instant;
+use tonic::Status;
+use tonic_types::StatusExt;
+
+use crate::Error;
+use crate::connect::{Channel, Server};
+
+/// The answer to a call, and who gave it.
+#[derive(Debug, Clone)]
+pub struct At<T> {
+    /// The server.
+    pub server: Server,
+    /// The connection to it.
+    pub channel: Channel,
+    /// The answer.
+    pub answer: T,
+}
+
+/// Time between two questions to a server while the fleet has nobody who serves the session.
+pub(crate) const AGAIN: Duration = Duration::from_millis(250);
+
+/// The largest number of servers that are asked for one session.
+const MOST_SERVERS: usize = 16;
+
+/// The largest number of servers that a call is sent on by, one after the other.
+const MOST_HOPS: u32 = 8;
+
+/// Whether a server of a fleet asks for patience: another is about to have the session, or it has lost touch with the fleet.
+pub fn is_fenced(status: &Status) -> bool {
+    status.get_details_error_info().is_some_and(|info| info.reason == Reason::Fenced.as_str())
+}
+
+/// The server that has a session, and what it tells of it. `server` may be any of the fleet. Waits while another server takes the
+/// session over, as long as it may take to connect ([`Server::within`]).
+///
+/// # Errors
+/// Returns the refusal of whoever has the session, or why nobody can be reached.
+pub async fn locate(server: &Server, session_id: &str) -> Result<At<pb::Session>, Error> {
+    Trail::new(server.clone()).seek(session_id).await
+}
+
+/// Calls a server, or the one that has the session that the call is for: where that server is told in a refusal, and the call is made
+/// again there. While the session is being taken over it is made again every quarter of a second, as long as it may take to connect.
+///
+/// ```no_run
+/// use palpate_client::watch::Samples;
+/// use palpate_client::{Error, Server, fleet};
+/// use palpate_proto::pb;
+///
+/// # async fn example(server: &Server, request: pb::WatchSamplesRequest) -> Result<(), Error> {
+/// let mut samples = fleet::follow(server, |channel| Samples::open(channel, request.clone())).await?.answer;
+/// println!("{:?}", samples.next().await?);
+/// # Ok(())
+/// # }
+/// ```
+///
+/// # Errors
+/// Returns the refusal of whoever has the session, or why it can't be reached.
+pub async fn follow<T, F>(server: &Server, call: impl Fn(Channel) -> F) -> Result<At<T>, Error>
+where
+    F: Future<Output = Result<T, Status>>,
+{
+    follow_from(server, server.connect().await?, call).await
+}
+
+/// As [`follow`], with a connection to `server`.
+///
+/// # Errors
+/// Returns an error as [`follow`] does.
+pub async fn follow_from<T, F>(server: &Server, channel: Channel, call: impl Fn(Channel) -> F) -> Result<At<T>, Error>
+where
+    F: Future<Output = Result<T, Status>>,
+{
+    let (mut server, mut channel, mut hops) = (server.clone(), channel, 0);
+    let until = Instant::now() + server.patience();
+    loop {
+        let status = match call(channel.clone()).await {
+            Ok(answer) => return Ok(At { server, channel, answer }),
+            Err(status) => status,
+        };
+        match elsewhere(&status) {
+            Some(endpoint) if hops < MOST_HOPS => {
+                hops += 1;
+                server = server.at(&endpoint)?;
+                channel = server.connect().await?;
+            }
+            None if is_fenced(&status) && Instant::now() < until => tokio::time::sleep(AGAIN).await,
+            _ => return Err(status.into()),
+        }
+    }
+}
+
+/// The server that has a session that `server` has created: a fleet may have made it at another.
+///
+/// # Errors
+/// Returns an error if the credentials can't be used there.
+pub fn home(server: &Server, created: &pb::Session) -> Result<Server, Error> {
+    match &created.ownership {
+        Some(ownership) if ownership.endpoint.trim_end_matches('/') != server.url() => server.at(&ownership.endpoint),
+        _ => Ok(server.clone()),
+    }
+}
+
+/// Who to ask for a session.
+#[derive(Debug)]
+pub(crate) struct Trail {
+    /// The first server, to which whoever calls has the URL.
+    first: Server,
+    /// The last that had the session, or was said to have it.
+    server: Server,
+    /// URLs of others.
+    others: Vec<String>,
+    /// The largest revision of an owner that was seen.
+    revision: u64,
+    /// The fleet answers, but nobody serves the session yet.
+    is_awaited: bool,
+    /// Of the newest stream: after a move its tool is still in the tissue, and goes on by this lease at the next server. Empty if it
+    /// does not.
+    pub(crate) lease_id: String,
+}
+
+impl Trail {
+    pub(crate) fn new(server: Server) -> Self {
+        Trail {
+            first: server.clone(),
+            server,
+            others: Vec::new(),
+            revision: 0,
+            is_awaited: false,
+            lease_id: String::new(),
+        }
+    }
+
+    /// The server to ask first.
+    pub(crate) fn server(&self) -> &Server {
+        &self.server
+    }
+
+    /// Whether, when [`Trail::seek`] last failed, the fleet answered, but nobody served the session yet.
+    pub(crate) fn is_awaited(&self) -> bool {
+        self.is_awaited
+    }
+
+    /// The session is said to be there.
+    ///
+    /// # Errors
+    /// Returns an error if the credentials can't be used there.
+    pub(crate) fn go(&mut self, endpoint: &str) -> Result<(), Error> {
+        let next = self.server.at(endpoint)?;
+        let before = std::mem::replace(&mut self.server, next).url().to_owned();
+        self.others.retain(|url| *url != before);
+        self.others.insert(0, before);
+        self.others.truncate(MOST_SERVERS);
+        Ok(())
+    }
+
+    /// Whether who says this revision still speaks for the session.
+    pub(crate) fn is_current(&mut self, revision: u64) -> bool {
+        let is_current = revision >= self.revision;
+        self.revision = self.revision.max(revision);
+        is_current
+    }
+
+    /// Finds who has the session. Servers are asked one after the other: the next as soon as one can't be reached, asks for patience,
+    /// or is silent for a quarter of a second; and whoever is said to have it at once. Those that have it not are asked again.
+    ///
+    /// # Errors
+    /// Returns any other refusal at once; and the last answer when nobody of all can be reached, or it takes longer than a server
+    /// may take to connect.
+    pub(crate) async fn seek(&mut self, session_id: &str) -> Result<At<pb::Session>, Error> {
+        self.is_awaited = false;
+        let mut round = Round::new(session_id, self.server.clone(), self.first.clone());
+        round.rest = self.others.clone();
+        round.rest.push(self.first.url().to_owned());
+        let over = tokio::time::sleep(self.first.patience() + 2 * AGAIN);
+        tokio::pin!(over);
+        loop {
+            let (server, answer) = tokio::select! {
+                () = &mut over => return Err(round.last.unwrap_or_else(silent)),
+                Some(told) = round.answers.recv() => told,
+                () = tokio::time::sleep_until(round.turn), if !round.rest.is_empty() => {
+                    round.ask_next();
+                    continue;
+                }
+            };
+            let error = match answer {
+                Ok((_, session)) if session.ownership.as_ref().is_some_and(|own| own.revision < self.revision) => {
+                    Error::Connection(format!("{}: it does not serve the session any more", server.url()))
+                }
+                Ok((channel, session)) => {
+                    self.learn(server.clone(), session.ownership.as_ref());
+                    return Ok(At { server, channel, answer: session });
+                }
+                Err(error) => error,
+            };
+            match &error {
+                Error::Call(status) => match elsewhere(status) {
+                    Some(endpoint) => {
+                        self.is_awaited = true;
+                        let next = server.at(&endpoint)?;
+                        let why = format!("the server at {endpoint} has the session, but can't be reached");
+                        round.last = Some(Error::Connection(why));
+                        round.ask(next);
+                    }
+                    None if is_fenced(status) => {
+                        self.is_awaited = true;
+                        round.last = Some(error);
+                        round.ask_next();
+                    }
+                    None if is_broken(status) => round.fail(&server, error, self.is_awaited),
+                    // Whoever says this knows the session's fate.
+                    None => {
+                        self.server = server;
+                        return Err(error);
+                    }
+                },
+                Error::Argument(_) => return Err(error),
+                _ => round.fail(&server, error, self.is_awaited),
+            }
+            if !self.is_awaited && round.is_lost() {
+                return Err(round.last.unwrap_or_else(silent));
+            }
+        }
+    }
+
+    fn learn(&mut self, server: Server, ownership: Option<&pb::Ownership>) {
+        self.server = server;
+        (self.others, self.revision) = match ownership {
+            Some(ownership) => {
+                let others = ownership.others.iter().take(MOST_SERVERS).cloned().collect();
+                (others, ownership.revision)
+            }
+            None => (Vec::new(), 0),
+        };
+    }
+}
+
+fn silent() -> Error {
+    Error::Connection("no server answers".to_owned())
+}
+
+/// Whether a call has not come to a server, or its answer not back.
+fn is_broken(status: &Status) -> bool {
+    std::error::Error::source(status).is_some() || status.code() == tonic::Code::Unavailable
+}
+
+/// What a server says.
+type Told = (Server, Result<(Channel, pb::Session), Error>);
+
+/// Servers as they are asked.
+struct Round {
+    session_id: String,
+    /// With the credentials for all.
+    first: Server,
+    /// URLs of those that are not asked yet.
+    rest: Vec<String>,
+    /// URLs of those that are asked, and whether they can't be reached.
+    asked: Vec<(String, bool)>,
+    asking: JoinSet<()>,
+    tell: mpsc::Sender<Told>,
+    answers: mpsc::Receiver<Told>,
+    /// When the next one is asked.
+    turn: Instant,
+    last: Option<Error>,
+}
+
+impl Round {
+    fn new(session_id: &str, server: Server, first: Server) -> Self {
+        let (tell, answers) = mpsc::channel(MOST_SERVERS);
+        let mut round = Round {
+            session_id: session_id.to_owned(),
+            first,
+            rest: Vec::new(),
+            asked: Vec::new(),
+            asking: JoinSet::new(),
+            tell,
+            answers,
+            turn: Instant::now(),
+            last: None,
+        };
+        round.ask(server);
+        round
+    }
+
+    /// Asks a server again and again, unless it is asked already.
+    fn ask(&mut self, server: Server) {
+        if self.asked.len() >= MOST_SERVERS || self.asked.iter().any(|(url, _)| url == server.url()) {
+            return;
+        }
+        self.asked.push((server.url().to_owned(), false));
+        self.turn = Instant::now() + AGAIN;
+        self.asking.spawn(ask(server, self.session_id.clone(), self.tell.clone()));
+    }
+
+    fn ask_next(&mut self) {
+        let before = self.asked.len();
+        while !self.rest.is_empty() && self.asked.len() == before {
+            let next = self.rest.remove(0);
+            // Where the credentials can't be used nobody is asked.
+            if let Ok(next) = self.first.at(&next) {
+                self.ask(next);
+            }
+        }
+    }
+
+    /// A server can't be reached. What the fleet has answered says more.
+    fn fail(&mut self, server: &Server, error: Error, has_answer: bool) {
+        if !has_answer {
+            self.last = Some(error);
+        }
+        self.asked.iter_mut().filter(|(url, _)| url == server.url()).for_each(|(_, is_lost)| *is_lost = true);
+        self.ask_next();
+    }
+
+    /// Whether none of all can be reached.
+    fn is_lost(&self) -> bool {
+        self.rest.is_empty() && self.asked.iter().all(|(_, is_lost)| *is_lost)
+    }
+}
+
+/// Asks a server for a session until nobody listens.
+async fn ask(server: Server, session_id: String, tell: mpsc::Sender<Told>) {
+    let mut channel = None;
+    loop {
+        let request = pb::GetSessionRequest { session_id: session_id.clone() };
+        let asking = async {
+            let open = match channel.take() {
+                Some(open) => open,
+                None => server.connect().await?,
+            };
+            let answer = SessionServiceClient::new(open.clone()).get_session(request).await;
+            channel =
+                answer.as_ref().is_err_and(|status| !is_broken(status) || is_fenced(status)).then(|| open.clone());
+            let session = answer?.into_inner().session;
+            let session = session.ok_or_else(|| Error::Connection("the server sent no session".to_owned()))?;
+            Ok((open, session))
+        };
+        let asked = tokio::time::timeout(server.patience() + AGAIN, asking).await;
+        let late = |_| Err(Error::Connection(format!("{} is silent", server.url())));
+        if tell.send((server.clone(), asked.unwrap_or_else(late))).await.is_err() {
+            return;
+        }
+        tokio::time::sleep(AGAIN).await;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Credentials;
+
+    fn server(url: &str) -> Server {
+        Server::new(url, &Credentials::default()).unwrap()
+    }
+
+    #[test]
+    fn a_smaller_revision_does_not_speak_for_the_session() {
+        let mut trail = Trail::new(server("http://127.0.0.1:1"));
+        let seen = [3, 3, 5, 4, 5].map(|revision| trail.is_current(revision));
+        assert_eq!(seen, [true, true, true, false, true]);
+        // A server that is of no fleet has no revisions.
+        trail.learn(server("http://127.0.0.1:1"), None);
+        assert!(trail.is_current(0));
+    }
+
+    #[test]
+    fn whoever_had_the_session_is_asked_after_who_is_said_to_have_it() {
+        let mut trail = Trail::new(server("http://127.0.0.1:1"));
+        let others = ["http://127.0.0.1:3/", "http://127.0.0.1:4"].map(str::to_owned).to_vec();
+        let ownership = pb::Ownership { revision: 7, others, ..Default::default() };
+        trail.learn(server("http://127.0.0.1:2"), Some(&ownership));
+        trail.go("http://127.0.0.1:4").unwrap();
+        assert_eq!(trail.server().url(), "http://127.0.0.1:4");
+        assert_eq!(trail.others[0], "http://127.0.0.1:2");
+        assert!(!trail.is_current(6));
+        assert!(trail.go("ftp://127.0.0.1").is_err());
+        assert_eq!(trail.server().url(), "http://127.0.0.1:4");
+    }
+
+    #[test]
+    fn a_session_is_where_its_creator_says() {
+        let near = server("http://127.0.0.1:1");
+        let made_at = |endpoint: &str| {
+            let ownership = pb::Ownership { endpoint: endpoint.to_owned(), ..Default::default() };
+            let created = pb::Session { ownership: Some(ownership), ..Default::default() };
+            home(&near, &created).unwrap().url().to_owned()
+        };
+        assert_eq!(home(&near, &pb::Session::default()).unwrap().url(), near.url());
+        assert_eq!(made_at("http://127.0.0.1:1/"), near.url());
+        assert_eq!(made_at("http://127.0.0.1:2"), "http://127.0.0.1:2");
+    }
+}

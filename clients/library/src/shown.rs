@@ -1,0 +1,215 @@
+//! The surface of a session as an engine shows it: positions and normals of its vertices, and what of it stays.
+
+use std::sync::{Arc, OnceLock};
+
+use palpate_proto::pb;
+use pb::view_service_client::ViewServiceClient;
+use tokio::task::JoinSet;
+
+use crate::Error;
+use crate::connect::Channel;
+use crate::exchange::{Listener, Teller, newest};
+use crate::view::{Frames, MOST_VERTICES, Surface};
+
+/// What of a surface stays.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Mesh {
+    /// Where each vertex rests, m.
+    pub rest_m: Vec<[f32; 3]>,
+    /// u, v of each vertex, from the lower left; empty if the surface has none.
+    pub texture: Vec<[f32; 2]>,
+    /// Vertices of each triangle, counter-clockwise from outside.
+    pub triangles: Vec<[u32; 3]>,
+}
+
+/// A surface at one moment.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Moment {
+    /// Frames so far, counted from 1; 0 at rest, before the first.
+    pub frames: u64,
+    /// Steps done.
+    pub step: u64,
+    /// s.
+    pub simulation_time_s: f64,
+    /// Of each vertex, m.
+    pub position_m: Vec<[f32; 3]>,
+    /// Of each vertex, outward, of length 1; 0 of a vertex without a triangle.
+    pub normal: Vec<[f32; 3]>,
+}
+
+/// The newest moment of a session's surface. It ends when this is dropped.
+pub struct Shown {
+    mesh: Arc<Mesh>,
+    newest: Listener<Moment>,
+    lost: Arc<OnceLock<String>>,
+    _watching: JoinSet<()>,
+}
+
+impl std::fmt::Debug for Shown {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Mesh { rest_m, triangles, .. } = &*self.mesh;
+        f.debug_struct("Shown")
+            .field("vertices", &rest_m.len())
+            .field("triangles", &triangles.len())
+            .finish_non_exhaustive()
+    }
+}
+
+impl Shown {
+    /// Gets the mesh and begins to watch. Positions and normals are computed on the tasks of the runtime; set a time limit around
+    /// this call.
+    ///
+    /// # Errors
+    /// Returns the server's refusal, how the connection broke, or that the mesh can't be used.
+    pub async fn open(channel: Channel, session_id: &str, refinement: u32, rate_hz: f64) -> Result<Self, Error> {
+        let mesh = Arc::new(mesh(channel.clone(), session_id, refinement).await?);
+        let request = pb::WatchFramesRequest {
+            session_id: session_id.to_owned(),
+            refinement,
+            encoding: pb::Encoding::I16.into(),
+            rate_hz: Some(rate_hz),
+            ..Default::default()
+        };
+        let frames = Frames::open(channel, request).await?;
+        let at_rest = Moment {
+            position_m: mesh.rest_m.clone(),
+            normal: normals(&mesh.rest_m, &mesh.triangles),
+            ..Moment::default()
+        };
+        let (teller, newest) = newest(at_rest);
+        let lost = Arc::new(OnceLock::new());
+        let mut watching = JoinSet::new();
+        let (of_task, told) = (mesh.clone(), lost.clone());
+        watching.spawn(async move {
+            let _ = told.set(watch(frames, &of_task, teller).await);
+        });
+        Ok(Shown { mesh, newest, lost, _watching: watching })
+    }
+
+    /// What of it stays.
+    pub fn mesh(&self) -> &Mesh {
+        &self.mesh
+    }
+
+    /// Whether there is a newer moment than before. Never waits.
+    pub fn refresh(&mut self) -> bool {
+        self.newest.refresh()
+    }
+
+    /// Shows the moment of the last [`Shown::refresh`]. Never waits.
+    pub fn read<R>(&self, read: impl FnOnce(&Moment) -> R) -> R {
+        self.newest.read(read)
+    }
+
+    /// Why no newer moment comes any more.
+    pub fn lost(&self) -> Option<&str> {
+        self.lost.get().map(String::as_str)
+    }
+}
+
+/// Takes frames until there are no more; returns why.
+async fn watch(mut frames: Frames, mesh: &Mesh, mut teller: Teller<Moment>) -> String {
+    let mut count = 0;
+    loop {
+        match frames.next().await {
+            Ok(Some((last, surface))) => {
+                count += 1;
+                teller.tell(|moment| {
+                    (moment.frames, moment.step) = (count, last.step);
+                    moment.simulation_time_s = last.simulation_time_s;
+                    place(mesh, surface, moment);
+                });
+            }
+            Ok(None) => return "the server has ended the frames".to_owned(),
+            Err(status) => return crate::describe(&status),
+        }
+    }
+}
+
+/// Writes positions and normals.
+fn place(mesh: &Mesh, surface: &Surface, moment: &mut Moment) {
+    // A frame may have places beyond the last vertex.
+    for ((position_m, rest_m), moved_m) in moment.position_m.iter_mut().zip(&mesh.rest_m).zip(&surface.displacement_m) {
+        *position_m = [rest_m[0] + moved_m[0], rest_m[1] + moved_m[1], rest_m[2] + moved_m[2]];
+    }
+    write_normals(&moment.position_m, &mesh.triangles, &mut moment.normal);
+}
+
+fn normals(position_m: &[[f32; 3]], triangles: &[[u32; 3]]) -> Vec<[f32; 3]> {
+    let mut normals = vec![[0.0; 3]; position_m.len()];
+    write_normals(position_m, triangles, &mut normals);
+    normals
+}
+
+/// The mean of the triangles around a vertex, each by its area.
+fn write_normals(position_m: &[[f32; 3]], triangles: &[[u32; 3]], normals: &mut [[f32; 3]]) {
+    normals.fill([0.0; 3]);
+    for corners in triangles {
+        let [a, b, c] = corners.map(|corner| position_m[corner as usize]);
+        let (u, v) = ([b[0] - a[0], b[1] - a[1], b[2] - a[2]], [c[0] - a[0], c[1] - a[1], c[2] - a[2]]);
+        let area = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
+        for corner in corners {
+            for (sum, part) in normals[*corner as usize].iter_mut().zip(area) {
+                *sum += part;
+            }
+        }
+    }
+    for normal in normals {
+        let length = normal.iter().map(|part| part * part).sum::<f32>().sqrt();
+        let scale = if length > 0.0 { length.recip() } else { 0.0 };
+        *normal = normal.map(|part| part * scale);
+    }
+}
+
+/// The mesh of a session, refined.
+///
+/// # Errors
+/// Returns the server's refusal, how the connection broke, or that the mesh can't be used.
+pub async fn mesh(channel: Channel, session_id: &str, refinement: u32) -> Result<Mesh, Error> {
+    let request = pb::GetMeshRequest { session_id: session_id.to_owned(), refinement };
+    let mut parts = ViewServiceClient::new(channel).get_mesh(request).await?.into_inner();
+    let mut mesh = Mesh::default();
+    while let Some(part) = parts.message().await? {
+        mesh.rest_m.extend_from_slice(part.rest_position_m.as_chunks().0);
+        mesh.texture.extend_from_slice(part.texture_coordinates.as_chunks().0);
+        mesh.triangles.extend_from_slice(part.triangles.as_chunks().0);
+        if mesh.rest_m.len() > MOST_VERTICES || mesh.triangles.len() > 4 * MOST_VERTICES {
+            return Err(Error::Connection("the server's mesh is too large to be shown".to_owned()));
+        }
+    }
+    let is_beyond = |corner: &u32| *corner as usize >= mesh.rest_m.len();
+    if mesh.triangles.iter().flatten().any(is_beyond) {
+        return Err(Error::Connection("the server's mesh has a triangle beyond its last vertex".to_owned()));
+    }
+    if mesh.texture.len() != mesh.rest_m.len() {
+        mesh.texture.clear();
+    }
+    Ok(mesh)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn normals_point_out_of_triangles_and_have_length_one() {
+        // Two triangles of a millimetre at a right angle, with an edge along y; and a vertex without a triangle.
+        let corners = [[0.0, 0.0, 0.0], [0.0, 1e-3, 0.0], [-1e-3, 0.0, 0.0], [0.0, 0.0, -1e-3], [1.0; 3]];
+        let normals = normals(&corners, &[[0, 1, 2], [0, 3, 1]]);
+        let half = 0.5_f32.sqrt();
+        for (normal, expected) in
+            normals.iter().zip([[half, 0.0, half], [half, 0.0, half], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0; 3]])
+        {
+            assert!(normal.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{normal:?}, {expected:?}");
+        }
+    }
+
+    #[test]
+    fn a_frame_moves_vertices_and_what_it_has_beyond_the_last_is_left_out() {
+        let mesh = Mesh { rest_m: vec![[1.0, 2.0, 3.0]; 3], ..Mesh::default() };
+        let surface = Surface { vertices: [1, 4], displacement_m: vec![[0.5, 0.0, -1.0]; 4] };
+        let mut moment = Moment { position_m: mesh.rest_m.clone(), normal: vec![[0.0; 3]; 3], ..Moment::default() };
+        place(&mesh, &surface, &mut moment);
+        assert_eq!(moment.position_m, [[1.5, 2.0, 2.0]; 3]);
+    }
+}

@@ -1,0 +1,452 @@
+//! A plan of a load: phases with arrivals of users, what the users are made of, and what is to be kept.
+
+use std::path::Path;
+
+use palpate::scene::document::{Document, Fields, Item, read_text};
+use palpate_proto::refusal::{Reason, Refusal, Result, number};
+use palpate_touch::Device;
+use palpate_touch::device::{DEVICES, UNDECLARED};
+use palpate_touch::hand::{HANDS, Hand};
+
+use super::objective::Objective;
+use super::tip::Deadbands;
+use crate::simulated::network::Conditions;
+use crate::simulated::random::Random;
+
+/// Largest plan, bytes.
+const MOST_BYTES: u64 = 1 << 20;
+
+/// Most users of a plan, in all.
+const MOST_USERS: usize = 10_000;
+
+/// Most entries of a list.
+const MOST_ENTRIES: usize = 64;
+
+/// One of several things, and how often it is taken.
+#[derive(Debug, Clone)]
+pub(crate) struct Part<T> {
+    share: f64,
+    pub(crate) what: T,
+}
+
+/// The index of one of several parts, by their shares.
+fn draw<T>(parts: &[Part<T>], random: &mut Random) -> usize {
+    let mut left = random.between(0.0, parts.iter().map(|part| part.share).sum());
+    let found = parts.iter().position(|part| {
+        left -= part.share;
+        left < 0.0
+    });
+    // A part without a share is never taken, also if rounding left something.
+    found.or_else(|| parts.iter().rposition(|part| part.share > 0.0)).unwrap_or(0)
+}
+
+/// What moves a tool.
+#[derive(Debug, Clone)]
+pub(crate) enum Mover {
+    /// Forces on the tissue, along a stroke.
+    Push,
+    /// A simulated device in a simulated hand, which feels the tissue.
+    Hand { hand: Hand, device: Device, deadbands: Deadbands },
+}
+
+/// A network between users and the server.
+#[derive(Debug, Clone)]
+pub(crate) struct Wire {
+    pub(crate) name: String,
+    /// `None`: the server as it is reached.
+    pub(crate) conditions: Option<Conditions>,
+}
+
+/// Who watches a session.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Viewers {
+    pub(crate) number: u32,
+    pub(crate) rate_hz: f64,
+}
+
+/// How users arrive.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum Arrivals {
+    /// At even distances, users a second.
+    Steady(f64),
+    /// At random, as many a second on average.
+    Poisson(f64),
+    /// So many at once.
+    Spike(u32),
+    /// None: those who are there stay.
+    None,
+}
+
+/// A part of a plan.
+#[derive(Debug, Clone)]
+pub(crate) struct Phase {
+    pub(crate) name: String,
+    pub(crate) seconds: f64,
+    pub(crate) arrivals: Arrivals,
+    /// How long a user stays; with random arrivals on average.
+    stays_s: f64,
+    pub(crate) objective: Option<Objective>,
+}
+
+/// A plan.
+#[derive(Debug, Clone)]
+pub(crate) struct Plan {
+    pub(crate) name: String,
+    seed: u64,
+    /// Commands a second of each hand.
+    pub(crate) rate_hz: f64,
+    pub(crate) scenes: Vec<Part<String>>,
+    pub(crate) movers: Vec<Part<Mover>>,
+    pub(crate) wires: Vec<Part<Wire>>,
+    pub(crate) viewers: Vec<Part<Viewers>>,
+    pub(crate) phases: Vec<Phase>,
+    /// Of the whole.
+    pub(crate) objective: Option<Objective>,
+}
+
+/// One user: a session of its own, with a tool, and perhaps viewers.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct User {
+    /// Since the plan began, s.
+    pub(crate) at_s: f64,
+    pub(crate) stays_s: f64,
+    // Indices in the lists of the plan.
+    pub(crate) scene: usize,
+    pub(crate) mover: usize,
+    pub(crate) wire: usize,
+    pub(crate) viewers: usize,
+    /// Of its hand.
+    pub(crate) seed: u64,
+}
+
+impl Plan {
+    /// Reads a plan from a file.
+    ///
+    /// # Errors
+    /// Refuses a file that can't be read, and what is wrong in it, by line and key.
+    pub(crate) fn read(path: &Path) -> Result<Self> {
+        Plan::parse(&path.display().to_string(), &read_text(path, MOST_BYTES)?)
+    }
+
+    fn parse(name: &str, text: &str) -> Result<Self> {
+        let document = Document::parse(name, text)?;
+        let plan = document.read(plan)?;
+        if plan.users().len() > MOST_USERS {
+            return Err(document.locate(Refusal::new(
+                Reason::TooLarge,
+                "phase",
+                format!("more than {MOST_USERS} users would arrive: lower the rates, or shorten the phases"),
+            )));
+        }
+        Ok(plan)
+    }
+
+    /// How long the phases take together, s.
+    pub(crate) fn lasts_s(&self) -> f64 {
+        self.phases.iter().map(|phase| phase.seconds).sum()
+    }
+
+    /// All users, by arrival: the same for the same plan. At most one more than [`MOST_USERS`].
+    pub(crate) fn users(&self) -> Vec<User> {
+        let (mut times, mut mix) = (Random::new(self.seed, 1), Random::new(self.seed, 2));
+        let (mut users, mut from_s) = (Vec::new(), 0.0);
+        for phase in &self.phases {
+            let mut moments = Vec::new();
+            let mut at_s = 0.0;
+            while at_s < phase.seconds && users.len() + moments.len() <= MOST_USERS {
+                match phase.arrivals {
+                    Arrivals::Steady(rate) => {
+                        moments.push((at_s, phase.stays_s));
+                        at_s += 1.0 / rate;
+                    }
+                    Arrivals::Poisson(rate) => {
+                        let waits = |random: &mut Random| -(1.0 - random.between(0.0, 1.0)).ln();
+                        at_s += waits(&mut times) / rate;
+                        if at_s < phase.seconds {
+                            moments.push((at_s, phase.stays_s * waits(&mut times)));
+                        }
+                    }
+                    Arrivals::Spike(number) => {
+                        moments = vec![(0.0, phase.stays_s); number as usize];
+                        break;
+                    }
+                    Arrivals::None => break,
+                }
+            }
+            for (at_s, stays_s) in moments {
+                let (at_s, seed) = (from_s + at_s, self.seed.wrapping_add(users.len() as u64));
+                let (scene, mover) = (draw(&self.scenes, &mut mix), draw(&self.movers, &mut mix));
+                let (wire, viewers) = (draw(&self.wires, &mut mix), draw(&self.viewers, &mut mix));
+                users.push(User { at_s, stays_s, scene, mover, wire, viewers, seed });
+            }
+            from_s += phase.seconds;
+        }
+        users
+    }
+}
+
+/// A number within a range, if present.
+fn within(fields: &mut Fields<'_>, key: &'static str, range: &str, least: f64, most: f64) -> Result<Option<f64>> {
+    let Some(value) = fields.number(key)? else { return Ok(None) };
+    number(&fields.path(key), value, range, |value| (least..=most).contains(&value)).map(Some)
+}
+
+fn share(fields: &mut Fields<'_>) -> Result<f64> {
+    Ok(within(fields, "share", "from 0 to 1000000", 0.0, 1e6)?.unwrap_or(1.0))
+}
+
+/// A whole number up to a limit.
+fn count(item: &Item<'_>, most: u32) -> Result<u32> {
+    let whole = item.whole()?;
+    u32::try_from(whole)
+        .ok()
+        .filter(|count| *count <= most)
+        .ok_or_else(|| item.refuse(Reason::OutOfRange, format!("must be at most {most}, but is {whole}")))
+}
+
+fn objective(fields: &mut Fields<'_>) -> Result<Option<Objective>> {
+    let Some(item) = fields.item("objective") else { return Ok(None) };
+    let text = item.text()?;
+    text.parse().map(Some).map_err(|why: String| item.refuse(Reason::WrongKind, why))
+}
+
+/// A list of tables with shares; what is said if there is none.
+fn parts<T>(
+    fields: &mut Fields<'_>,
+    key: &'static str,
+    instead: T,
+    read: impl Fn(&mut Fields<'_>) -> Result<T>,
+) -> Result<Vec<Part<T>>> {
+    let Some(item) = fields.item(key) else { return Ok(vec![Part { share: 1.0, what: instead }]) };
+    let tables = item.tables()?;
+    if tables.len() > MOST_ENTRIES {
+        return Err(item.refuse(Reason::TooLarge, format!("has more than {MOST_ENTRIES} entries")));
+    }
+    let entry = |table: &Item<'_>| table.table(|fields| Ok(Part { share: share(fields)?, what: read(fields)? }));
+    let parts = tables.iter().map(entry).collect::<Result<Vec<_>>>()?;
+    if parts.iter().all(|part| part.share <= 0.0) {
+        return Err(item.refuse(Reason::OutOfRange, "needs at least one entry with a share above 0"));
+    }
+    Ok(parts)
+}
+
+fn plan(fields: &mut Fields<'_>) -> Result<Plan> {
+    let name = fields.text("name")?.unwrap_or_else(|| "load".to_owned());
+    let seed = fields.item("seed").map_or(Ok(1), |item| item.whole())?;
+    let rate_hz = within(fields, "rate_hz", "from 1 to 4000", 1.0, 4000.0)?.unwrap_or(1000.0);
+    let scenes = parts(fields, "scene", "liver".to_owned(), |fields| fields.required("name")?.text())?;
+    let movers = parts(fields, "hand", Mover::Push, mover)?;
+    let direct = Wire { name: "direct".to_owned(), conditions: None };
+    let wires = parts(fields, "network", direct, wire)?;
+    let viewers = parts(fields, "viewers", Viewers { number: 0, rate_hz: 60.0 }, |fields| {
+        let number = count(&fields.required("number")?, 16)?;
+        let rate_hz = within(fields, "rate_hz", "from 0.1 to 1000", 0.1, 1000.0)?.unwrap_or(60.0);
+        Ok(Viewers { number, rate_hz })
+    })?;
+    let objective = objective(fields)?;
+    let item = fields.required("phase")?;
+    let tables = item.tables()?;
+    if tables.is_empty() || tables.len() > MOST_ENTRIES {
+        return Err(item.refuse(Reason::OutOfRange, format!("needs 1 to {MOST_ENTRIES} entries")));
+    }
+    let phases = tables.iter().enumerate().map(|(index, table)| table.table(|fields| phase(fields, index)));
+    let phases = phases.collect::<Result<Vec<_>>>()?;
+    Ok(Plan { name, seed, rate_hz, scenes, movers, wires, viewers, phases, objective })
+}
+
+/// One of several names, quoted for people.
+fn quoted<'n>(names: impl Iterator<Item = &'n str>) -> String {
+    let names: Vec<String> = names.map(|name| format!("\"{name}\"")).collect();
+    names.join(", ")
+}
+
+fn mover(fields: &mut Fields<'_>) -> Result<Mover> {
+    let item = fields.required("hand")?;
+    let name = item.text()?;
+    let hand = Hand::named(&name);
+    if hand.is_none() && name != "push" {
+        return Err(item.wrong(&format!("one of \"push\", {}", quoted(HANDS.iter().map(|hand| hand.name)))));
+    }
+    let item = fields.item("device");
+    let device = item.as_ref().map(|item| {
+        let found = item
+            .as_text()
+            .and_then(|name| if name == UNDECLARED.name { Some(UNDECLARED) } else { Device::named(name) });
+        let names = DEVICES.iter().map(|device| device.name).chain([UNDECLARED.name]);
+        found.ok_or_else(|| item.wrong(&format!("one of {}", quoted(names))))
+    });
+    let device = device.transpose()?;
+    let fraction = |fields: &mut Fields<'_>, key| within(fields, key, "from 0 to 1", 0.0, 1.0);
+    let (down, up) = (fraction(fields, "deadband")?, fraction(fields, "up_deadband")?);
+    let Some(hand) = hand else {
+        let given = [("device", device.is_some()), ("deadband", down.is_some()), ("up_deadband", up.is_some())];
+        return match given.iter().find(|key| key.1) {
+            Some((key, _)) => {
+                Err(fields.refuse(Reason::WrongKind, key, "is for a hand: this one pushes, and feels nothing"))
+            }
+            None => Ok(Mover::Push),
+        };
+    };
+    let deadbands = Deadbands { down: down.unwrap_or(0.0), up: up.unwrap_or(0.0) };
+    Ok(Mover::Hand {
+        hand,
+        device: device.or_else(|| Device::named(super::tip::DEVICE)).unwrap_or(UNDECLARED),
+        deadbands,
+    })
+}
+
+fn wire(fields: &mut Fields<'_>) -> Result<Wire> {
+    let name = fields.required("name")?.text()?;
+    let mut part = |key, range: &str, least: f64, most: f64| within(fields, key, range, least, most);
+    let delay_ms = part("delay_ms", "from 0 to 10000", 0.0, 1e4)?;
+    let jitter_ms = part("jitter_ms", "from 0 to 10000", 0.0, 1e4)?;
+    let loss = part("loss", "from 0 to 0.5", 0.0, 0.5)?;
+    let burst = part("loss_burst", "from 1 to 1000", 1.0, 1e3)?;
+    let outage_ms = part("outage_ms", "from 0 to 900", 0.0, 900.0)?;
+    let is_direct = [delay_ms, jitter_ms, loss, burst, outage_ms].iter().all(Option::is_none);
+    let conditions = Conditions {
+        round_trip_s: 2e-3 * delay_ms.unwrap_or(0.0),
+        jitter_s: 1e-3 * jitter_ms.unwrap_or(0.0),
+        loss: loss.unwrap_or(0.0),
+        burst: burst.unwrap_or(1.0),
+        outage_s: 1e-3 * outage_ms.unwrap_or(0.0),
+        ..Conditions::default()
+    };
+    Ok(Wire { name, conditions: (!is_direct).then_some(conditions) })
+}
+
+fn phase(fields: &mut Fields<'_>, index: usize) -> Result<Phase> {
+    let name = fields.text("name")?.unwrap_or_else(|| format!("phase {}", index + 1));
+    let item = fields.required("seconds")?;
+    let seconds = number("seconds", item.number()?, "from 0.5 to 86400", |value| (0.5..=86_400.0).contains(&value));
+    let seconds = seconds.map_err(|refusal| Refusal { field: fields.path("seconds"), ..refusal })?;
+    let item = fields.item("arrivals");
+    let kind = item.as_ref().map_or("none", |item| item.as_text().unwrap_or_default());
+    let rate = within(fields, "rate_per_s", "from 0.001 to 1000", 0.001, 1000.0)?;
+    let users = fields.item("users").map(|item| count(&item, 10_000)).transpose()?;
+    let needs = |fields: &Fields<'_>, key, value: Option<f64>| {
+        value.ok_or_else(|| fields.refuse(Reason::Missing, key, format!("is missing: arrivals are `{kind}`")))
+    };
+    let arrivals = match (kind, &item) {
+        ("steady", _) => Arrivals::Steady(needs(fields, "rate_per_s", rate)?),
+        ("poisson", _) => Arrivals::Poisson(needs(fields, "rate_per_s", rate)?),
+        ("spike", _) => {
+            needs(fields, "users", users.map(f64::from))?;
+            Arrivals::Spike(users.unwrap_or(0))
+        }
+        ("none", _) | (_, None) => Arrivals::None,
+        (_, Some(item)) => return Err(item.wrong("one of \"steady\", \"poisson\", \"spike\", \"none\"")),
+    };
+    let useless = match arrivals {
+        Arrivals::Steady(_) | Arrivals::Poisson(_) => users.map(|_| "users"),
+        Arrivals::Spike(_) => rate.map(|_| "rate_per_s"),
+        Arrivals::None => users.map(|_| "users").or(rate.map(|_| "rate_per_s")),
+    };
+    if let Some(key) = useless {
+        return Err(fields.refuse(Reason::WrongKind, key, format!("has no meaning where arrivals are `{kind}`")));
+    }
+    let stays_s = within(fields, "stays_s", "from 0.1 to 86400", 0.1, 86_400.0)?.unwrap_or(86_400.0);
+    let objective = objective(fields)?;
+    Ok(Phase { name, seconds, arrivals, stays_s, objective })
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    const PLAN: &str = r#"
+name = "a morning"
+seed = 3
+objective = "p99<1s"
+[[scene]]
+name = "liver"
+share = 3
+[[scene]]
+name = "fibrotic"
+[[hand]]
+hand = "push"
+[[hand]]
+hand = "firm"
+device = "touch"
+deadband = 0.1
+[[network]]
+name = "near"
+[[network]]
+name = "far"
+delay_ms = 20
+[[viewers]]
+number = 2
+rate_hz = 30
+[[phase]]
+seconds = 10
+arrivals = "steady"
+rate_per_s = 4
+stays_s = 3
+[[phase]]
+name = "noon"
+seconds = 100
+arrivals = "poisson"
+rate_per_s = 5
+stays_s = 2
+[[phase]]
+seconds = 2
+arrivals = "spike"
+users = 7
+[[phase]]
+seconds = 5
+"#;
+
+    #[test]
+    fn a_plan_says_who_comes_when_and_says_it_again_the_same() {
+        let plan = Plan::parse("plan.toml", PLAN).unwrap();
+        let users = plan.users();
+        assert_eq!(users, Plan::parse("plan.toml", PLAN).unwrap().users());
+        assert!((plan.lasts_s() - 117.0).abs() < 1e-9 && users.is_sorted_by(|a, b| a.at_s <= b.at_s));
+        let of = |from: f64, to: f64| users.iter().filter(|user| (from..to).contains(&user.at_s)).collect::<Vec<_>>();
+        assert!(of(0.0, 10.0).len() == 40 && of(0.0, 10.0).iter().all(|user| user.stays_s == 3.0));
+        // Five a second, each for 2 s on average: with four standard deviations to spare.
+        let random = of(10.0, 110.0);
+        let mean_s = random.iter().map(|user| user.stays_s).sum::<f64>() / random.len() as f64;
+        assert!((410..590).contains(&random.len()) && (1.6..2.4).contains(&mean_s), "{} {mean_s}", random.len());
+        assert!(of(110.0, 111.0).len() == 7 && of(112.0, 200.0).is_empty());
+        // Three of four are in the first scene.
+        let first = users.iter().filter(|user| user.scene == 0).count() as f64 / users.len() as f64;
+        assert!((0.68..0.82).contains(&first), "{first}");
+        assert!(matches!(&plan.movers[1].what, Mover::Hand { hand, device, deadbands }
+            if hand.name == "firm" && device.name == "touch" && deadbands.down == 0.1));
+        assert!(plan.wires[0].what.conditions.is_none());
+        assert!((plan.wires[1].what.conditions.unwrap().round_trip_s - 0.04).abs() < 1e-12);
+    }
+
+    #[test]
+    fn what_is_wrong_in_a_plan_is_named_by_line_and_key() {
+        let phase = "[[phase]]\nseconds = 1\n";
+        for (text, place, field, says) in [
+            ("", ":1", "phase", "is missing"),
+            ("phase = 3", ":1", "phase", "a list"),
+            ("[[phase]]\nname = \"x\"", ":1", "phase[0].seconds", "is missing"),
+            ("[[phase]]\nseconds = 0.1", ":2", "phase[0].seconds", "from 0.5"),
+            ("[[phase]]\nseconds = 1\narrivals = \"stedy\"", ":3", "phase[0].arrivals", "steady"),
+            ("[[phase]]\nseconds = 1\narrivals = \"steady\"", "", "phase[0].rate_per_s", "is missing"),
+            ("[[phase]]\nseconds = 1\narrivals = \"spike\"", "", "phase[0].users", "is missing"),
+            ("[[phase]]\nseconds = 1\nusers = 3", ":3", "phase[0].users", "no meaning"),
+            ("[[phase]]\nseconds = 1\nsecond = 3", ":3", "phase[0].second", "unknown key"),
+            ("[[phase]]\nseconds = 1\nobjective = \"p98<2ms\"", ":3", "phase[0].objective", "unknown quantity"),
+            (&format!("{phase}[[hand]]\nhand = \"frim\""), ":4", "hand[0].hand", "firm"),
+            (&format!("{phase}[[hand]]\nhand = \"firm\"\ndevice = \"omega\""), ":5", "hand[0].device", "omega3"),
+            (&format!("{phase}[[hand]]\nhand = \"push\"\ndeadband = 0.1"), ":5", "hand[0].deadband", "feels nothing"),
+            (&format!("{phase}[[network]]\nname = \"x\"\nloss = 2"), ":5", "network[0].loss", "from 0 to 0.5"),
+            (&format!("{phase}[[network]]\nname = \"x\"\ndelay = 2"), ":5", "network[0].delay", "delay_ms"),
+            (&format!("{phase}[[viewers]]\nnumber = 99"), ":4", "viewers[0].number", "at most 16"),
+            (&format!("{phase}[[scene]]\nname = \"x\"\nshare = 0"), "", "scene", "share above 0"),
+            ("[[phase]]\nseconds = 80000\narrivals = \"steady\"\nrate_per_s = 1", "", "phase", "10000 users"),
+        ] {
+            let refusal = Plan::parse("plan.toml", text).unwrap_err();
+            assert_eq!(refusal.field, field, "{text}: {refusal}");
+            assert!(refusal.to_string().contains(says), "{text}: {refusal}");
+            let found = refusal.place.as_deref().unwrap_or_default();
+            assert!(found.starts_with("plan.toml:") && found.ends_with(place), "{text}: {refusal}");
+        }
+    }
+}

@@ -1,0 +1,300 @@
+from collections.abc import Callable, Iterable, Iterator
+from os import PathLike
+from typing import Any, Literal, Optional, Union, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import aio as aio
+from ._errors import Disconnected as Disconnected
+from ._errors import Error as Error
+from ._errors import Failed as Failed
+from ._errors import Refused as Refused
+from ._journal import Commands as Commands
+from ._journal import Course as _ToolCourse
+from ._journal import Verdict as Verdict
+from ._run import Run as Run
+from ._touch import Course as Course
+from ._touch import Frame as Frame
+from ._touch import Sampled as Sampled
+from ._touch import ToolState as ToolState
+from ._touch import Touched as Touched
+from ._touch import press as press
+
+__version__: str
+
+Source = Union[str, PathLike[str]]
+Vector = Union[tuple[float, float, float], list[float], NDArray[np.float64]]
+Point = Union[tuple[int, int], list[int], int]
+Settings = Union[dict[str, Any], list[str]]
+Vectors = NDArray[np.float64]
+
+class Scene:
+    """A scene that was read and checked: from TOML text, a file, or the name of one (`scenes()`).
+
+    `set` overrides keys: {"springs.stiffness_n_per_m": 50}. `folder` is where scenes are that are given by name. With `plan` it is
+    stepped as that tissue is (integrator, substeps, precision, sleep), without the search for what its own tolerance asks for: that
+    saves most of the time of a short run, and nothing is then known of the error (`run(..., audit=True)` measures it).
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        *,
+        set: Optional[Settings] = None,
+        folder: Source = "scenes",
+        plan: Optional[Tissue] = None,
+    ) -> None: ...
+    @property
+    def name(self) -> str: ...
+    @property
+    def points(self) -> int: ...
+    @property
+    def rate_hz(self) -> float: ...
+
+class Script:
+    """Forces and movements over time: from TOML text, a file, or a name (`scripts()`). `folder` is where a text's traces are."""
+
+    def __init__(self, source: Source, *, folder: Source = "") -> None: ...
+    def check(self, scene: Union[Scene, Source]) -> dict[str, Any]:
+        """Binds it to a scene: name, steps, sample_every_steps, tools, warnings. Raises Refused if it does not fit."""
+
+class Tissue:
+    """A compiled scene: what is simulated, and how. Making one may take some tenths of a second, and a Scene does it once."""
+
+    def __init__(self, scene: Union[Scene, Source]) -> None: ...
+    def __len__(self) -> int: ...
+    @property
+    def name(self) -> str: ...
+    @property
+    def rate_hz(self) -> float: ...
+    @property
+    def integrator(self) -> str: ...
+    @property
+    def substeps(self) -> int: ...
+    @property
+    def precision(self) -> str: ...
+    @property
+    def lanes(self) -> str: ...
+    @property
+    def expected_error(self) -> float: ...
+    @property
+    def warnings(self) -> list[str]: ...
+    @property
+    def grid(self) -> Optional[tuple[int, int]]:
+        """Points along x and y of a sheet: rest_m.reshape(*grid, 3); None of a mesh."""
+    @property
+    def rest_m(self) -> Vectors: ...
+    @property
+    def normals(self) -> Vectors: ...
+    @property
+    def fixed(self) -> NDArray[np.bool_]: ...
+    @property
+    def mass_kg(self) -> NDArray[np.float64]: ...
+    @property
+    def triangles(self) -> NDArray[np.uint32]: ...
+    @property
+    def middle_m(self) -> tuple[float, float, float]: ...
+    def index(self, point: Point) -> int:
+        """The row of a point: (i, j) of a sheet, the number of a vertex of a mesh."""
+    def point(self, index: int) -> Union[tuple[int, int], int]:
+        """The name of the point of a row."""
+    def nearest(self, place_m: Vector) -> int:
+        """The row of the point that rests nearest to a place."""
+
+class Tip:
+    """The tip of a tool: a disc that touches, or with `grasps` holds. With a stiffness it is coupled by a spring."""
+
+    def __init__(
+        self,
+        radius_m: float = 0.005,
+        *,
+        friction: float = 0.2,
+        grasps: bool = False,
+        stiffness_n_per_m: Optional[float] = None,
+        damping_n_s_per_m: float = 0.0,
+    ) -> None: ...
+    @property
+    def radius_m(self) -> float: ...
+    @property
+    def friction(self) -> float: ...
+    @property
+    def grasps(self) -> bool: ...
+
+class Session:
+    """A tissue in use. What tools are told acts from the next step on, until they are told something else. Several threads may use
+    one session; the interpreter's lock is free while it steps."""
+
+    def __init__(self, tissue: Union[Tissue, Scene, Source]) -> None: ...
+    @staticmethod
+    def restore(scene: Union[Scene, Tissue, Source], snapshot: bytes) -> Session:
+        """Goes on from `save()`, of a session that began with `scene`. Poses have to be told again."""
+    def step(self, steps: int = 1) -> None: ...
+    @property
+    def steps(self) -> int: ...
+    @property
+    def time_s(self) -> float: ...
+    @property
+    def tissue(self) -> Tissue: ...
+    @property
+    def awake_points(self) -> int: ...
+    @property
+    def guard_events(self) -> int: ...
+    @property
+    def fault(self) -> Optional[str]: ...
+    @property
+    def hash(self) -> str: ...
+    def push(
+        self,
+        tool: int,
+        force_n: Vector,
+        *,
+        point: Optional[Point] = None,
+        at_m: Optional[Vector] = None,
+        falloff_per_m: float = 200.0,
+        falloff_offset: float = 0.0,
+    ) -> None:
+        """Pushes at a point or a place; at a distance r from there by force_n * exp(-falloff_per_m * r + falloff_offset)."""
+    def grasp(self, tool: int, point: Point, displacement_m: Vector) -> None:
+        """Holds a point, and brings it this far from where it rests by the end of the step."""
+    def pose(self, tool: int, place_m: Vector, tip: Optional[Tip] = None) -> None:
+        """Brings a tool with a tip here by the end of the step. It stays here until it is told something else."""
+    def release(self, tool: int) -> None: ...
+    def tool(self, tool: int) -> Optional[ToolState]:
+        """What a tool does and feels; None if it does nothing."""
+    def change(
+        self,
+        *,
+        stiffness_n_per_m: Optional[float] = None,
+        damping_n_s_per_m: Optional[float] = None,
+        virtual_stiffness_n_per_m: Optional[float] = None,
+        volume_stiffness_pa: Optional[float] = None,
+    ) -> None: ...
+    def displacements(self, out: Optional[Vectors] = None) -> Vectors:
+        """How far each point is from where it rests, with the digits of f32 at least; `records` has them all. `out` is an array to
+        write into."""
+    def positions(self, out: Optional[Vectors] = None) -> Vectors: ...
+    def velocities(self, out: Optional[Vectors] = None) -> Vectors: ...
+    def records(self, points: Optional[Iterable[Point]] = None) -> NDArray[Any]:
+        """Points with all that is known of them, as in `Run.points`; all points if none is named."""
+    @property
+    def energy_j(self) -> dict[str, float]: ...
+    def save(self) -> bytes: ...
+
+class Journal:
+    """A recorded session: a file of `palpate serve --journal`."""
+
+    def __init__(self, path: Source) -> None: ...
+    @property
+    def info(self) -> dict[str, Any]: ...
+    def tools(self) -> dict[int, _ToolCourse]: ...
+    def commands(self) -> Commands: ...
+    def verify(self) -> Verdict:
+        """Simulates it again, and compares every hash and snapshot."""
+    def session(self, step: Optional[int] = None) -> Session:
+        """The session when so many steps were done; at the end if None."""
+
+class Samples(Iterator[dict[str, Any]]):
+    def take(self, count: int) -> Sampled:
+        """The next samples, as arrays."""
+    def __next__(self) -> dict[str, Any]: ...
+
+class Frames(Iterator[Frame]):
+    def __next__(self) -> Frame: ...
+
+class RemoteSession:
+    """A session of a server. `with` deletes it at the end."""
+
+    @property
+    def id(self) -> str: ...
+    def status(self) -> dict[str, Any]: ...
+    def start(self, *, until_step: Optional[int] = None) -> int: ...
+    def pause(self) -> None: ...
+    def change(
+        self,
+        *,
+        stiffness_n_per_m: Optional[float] = None,
+        damping_n_s_per_m: Optional[float] = None,
+        virtual_stiffness_n_per_m: Optional[float] = None,
+        volume_stiffness_pa: Optional[float] = None,
+        at_step: Optional[int] = None,
+    ) -> int: ...
+    def hash(self, *, at_step: Optional[int] = None) -> tuple[int, str]: ...
+    def save(self) -> bytes:
+        """A journal of this moment (MCAP), for `Journal`."""
+    def delete(self) -> None: ...
+    def samples(self, *, every_steps: int = 1, heartbeat_s: Optional[float] = None) -> Samples: ...
+    def frames(self, *, rate_hz: float = 60.0, refinement: int = 0, precise: bool = True) -> Frames: ...
+    def mesh(self, *, refinement: int = 0) -> dict[str, Any]:
+        """What of the surface stays: grid, rest_m, uv, triangles, file_vertex."""
+    def touch(
+        self,
+        device: Any,
+        *,
+        seconds: Optional[float] = None,
+        tool: int = 0,
+        tip: Optional[Tip] = None,
+        deadband: float = 0.0,
+        up_deadband: float = 0.0,
+        datagrams: bool = True,
+        holder: str = "python",
+        remember: bool = True,
+    ) -> Touched:
+        """Touches with a device at 1 kHz, on a thread of its own, by the rendering law and within the safety envelope.
+
+        `device` is a Course, or an object with `read()`, which returns ((x, y, z), enable), and `write(force_n)`, and perhaps
+        `limits`, as a Course has them. A change of enable from False to True asks for forces.
+        """
+    def __enter__(self) -> RemoteSession: ...
+    def __exit__(self, *raised: object) -> None: ...
+
+class Client:
+    """A connection to a server."""
+
+    def scenes(self) -> list[str]: ...
+    def sessions(self) -> list[dict[str, Any]]: ...
+    def create_session(
+        self, scene: Union[str, Scene], *, paused: bool = False, idle_timeout_s: Optional[float] = None
+    ) -> RemoteSession: ...
+    def session(self, session_id: str) -> RemoteSession: ...
+
+def connect(
+    url: str,
+    *,
+    token: Optional[str] = None,
+    ca: Optional[str] = None,
+    tls_name: Optional[str] = None,
+    cert: Optional[str] = None,
+    key: Optional[str] = None,
+    within_s: float = 10.0,
+) -> Client: ...
+def run(
+    scene: Union[Scene, Tissue, Source], script: Union[Script, Source], *, held: bool = False, audit: bool = False
+) -> Run:
+    """Plays a script, with the numbers and the hash of `palpate run`. `held` holds forces within each step, as a client does;
+    `audit` plays it a second time in f64 with a quarter of the substep, and tells the difference (summary["audited_error"])."""
+
+@overload
+def study(
+    cases: Iterable[tuple[Union[Scene, Tissue, Source], Union[Script, Source]]],
+    *,
+    held: bool = False,
+    threads: Optional[int] = None,
+    errors: Literal["raise"] = "raise",
+    progress: Optional[Callable[[int, int], object]] = None,
+) -> list[Run]: ...
+@overload
+def study(
+    cases: Iterable[tuple[Union[Scene, Tissue, Source], Union[Script, Source]]],
+    *,
+    held: bool = False,
+    threads: Optional[int] = None,
+    errors: Literal["return"],
+    progress: Optional[Callable[[int, int], object]] = None,
+) -> list[Union[Run, Exception]]:
+    """Runs of many cases (scene, script) over threads, in their order; by default as many threads as there are processors.
+    `progress` is called with how many are done and how many there are."""
+
+def scenes(folder: Source = "scenes") -> list[str]: ...
+def scripts(folder: Source = "scripts") -> list[str]: ...
+def devices() -> list[str]: ...

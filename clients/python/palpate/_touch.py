@@ -1,0 +1,91 @@
+"""Touching: courses to play, and what came of it."""
+
+import dataclasses
+from typing import Optional, Union
+
+import numpy as np
+
+
+@dataclasses.dataclass(eq=False)
+class ToolState:
+    """A tool in a session of this process: how the tissue under it is displaced, and the forces there."""
+
+    displacement_m: np.ndarray
+    surface_displacement_m: np.ndarray
+    velocity_m_per_s: np.ndarray
+    force_on_tool_n: np.ndarray
+    applied_force_n: np.ndarray
+
+
+@dataclasses.dataclass(eq=False)
+class Course:
+    """A device that is led along `places_m`, a row for each millisecond, from the middle of the tissue, z out of it.
+
+    `limits` is the name of a device (`palpate.devices()`), or a dict with force_n, continuous_n, stiffness_n_per_m,
+    damping_n_s_per_m, workspace_m.
+    """
+
+    places_m: np.ndarray
+    limits: Union[str, dict] = "omega3"
+
+
+def press(depth_m=0.003, *, seconds=2.0, hover_m=0.005, at_m=(0.0, 0.0), limits="omega3"):
+    """A course that comes down from `hover_m` above the tissue, presses `depth_m` deep, holds, and goes up again: smooth, a third of
+    `seconds` each. `at_m` is beside the middle of the tissue."""
+    moments = np.arange(max(1, round(1000 * seconds))) / max(1, round(1000 * seconds))
+    down = np.clip(3 * moments, 0, 1) - np.clip(3 * moments - 2, 0, 1)
+    smooth = down * down * (3 - 2 * down)
+    heights = hover_m - (hover_m + depth_m) * smooth
+    x, y = at_m
+    return Course(np.column_stack([np.full_like(heights, x), np.full_like(heights, y), heights]), limits)
+
+
+@dataclasses.dataclass(eq=False)
+class Touched:
+    """What came of a touch: time, place and force of each tick of the device's loop, and counts."""
+
+    time_s: np.ndarray
+    place_m: np.ndarray
+    force_n: np.ndarray
+    enabled: np.ndarray
+    ages_s: np.ndarray
+    late_ticks: int
+    missed_ticks: int
+    connections: int
+    failed_attempts: int
+    samples: int
+    poses: int
+    refused: int
+    datagrams_up: int
+    datagrams_down: int
+    limits: dict
+    energy_j: float
+    lost: Optional[str]
+
+
+@dataclasses.dataclass(eq=False)
+class Sampled:
+    """Samples of a session: a row for each tool of each. `felt` has displacement_m, surface_displacement_m, velocity_m_per_s,
+    force_on_tool_n and applied_force_n."""
+
+    step: np.ndarray
+    time_s: np.ndarray
+    tool: np.ndarray
+    awake_points: np.ndarray
+    asleep: np.ndarray
+    felt: np.ndarray
+
+    def __len__(self):
+        return len(self.step)
+
+
+@dataclasses.dataclass(eq=False)
+class Frame:
+    """The surface at one moment: how far each vertex is displaced, as an array [x, y, 3] on a sheet. On a mesh its first two axes
+    together are the vertices of `RemoteSession.mesh()`, and some at the end may stand for none."""
+
+    step: int
+    time_s: float
+    frame_id: int
+    skipped: int
+    displacement_m: np.ndarray

@@ -1,0 +1,144 @@
+//! Haptic devices: objects of Python, and courses that are played.
+
+use std::io::{Error, ErrorKind, Result};
+use std::time::Instant;
+
+use glam::DVec3;
+use palpate_client::{HapticDevice, Reading};
+use palpate_proto::refusal::did_you_mean;
+use palpate_touch::Device;
+use palpate_touch::device::{DEVICES, UNDECLARED};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use crate::error::{refused, wrong};
+
+/// The names of the devices that are known.
+#[pyfunction]
+pub(crate) fn devices() -> Vec<&'static str> {
+    DEVICES.iter().map(|device| device.name).chain([UNDECLARED.name]).collect()
+}
+
+/// What a device can bear: by its name, or as a dict of its limits.
+fn descriptor(value: Option<Bound<'_, PyAny>>) -> PyResult<Device> {
+    let Some(value) = value.filter(|value| !value.is_none()) else { return Ok(UNDECLARED) };
+    if let Ok(limits) = value.cast::<PyDict>() {
+        let mut device = Device { name: "python", ..UNDECLARED };
+        for (key, value) in limits.iter() {
+            let key: String = key.extract()?;
+            let number = value.extract().ok().filter(|number: &f64| number.is_finite() && *number >= 0.0);
+            let number = number.ok_or_else(|| wrong("limits", format!("{key} must be a number, 0 or more")))?;
+            match key.as_str() {
+                "force_n" => device.force_n = number,
+                "continuous_n" => device.continuous_n = number,
+                "stiffness_n_per_m" => device.stiffness_n_per_m = number,
+                "damping_n_s_per_m" => device.damping_n_s_per_m = number,
+                "workspace_m" => device.workspace_m = number,
+                _ => {
+                    let keys = ["force_n", "continuous_n", "stiffness_n_per_m", "damping_n_s_per_m", "workspace_m"];
+                    let message = format!("`{key}` is none of {}{}", keys.join(", "), did_you_mean(&key, keys));
+                    return Err(wrong("limits", message));
+                }
+            }
+        }
+        return Ok(device);
+    }
+    let name: String = value.extract().map_err(|_| wrong("limits", "must be the name of a device, or a dict"))?;
+    if name == UNDECLARED.name {
+        return Ok(UNDECLARED);
+    }
+    Device::named(&name).ok_or_else(|| {
+        let message =
+            format!("must be one of {}, but is `{name}`{}", devices().join(", "), did_you_mean(&name, devices()));
+        refused(palpate::refusal::Refusal::new(palpate::refusal::Reason::WrongKind, "limits", message))
+    })
+}
+
+/// A device of Python's making.
+pub(crate) enum Given {
+    /// An object with `read()` and `write(force_n)`.
+    Object { device: Device, read: Py<PyAny>, write: Py<PyAny> },
+    /// Places at 1 kHz.
+    Course { device: Device, places_m: Vec<DVec3>, begun: Option<Instant> },
+}
+
+/// A course asks for forces with this period, s: the envelope may refuse or stop them.
+const ASKS_EVERY_S: f64 = 0.3;
+
+/// Places of a course in a second.
+const RATE_HZ: f64 = 1000.0;
+
+impl Given {
+    /// An object, or a `palpate.Course`.
+    pub(crate) fn of(value: &Bound<'_, PyAny>) -> PyResult<Self> {
+        let device = descriptor(value.getattr_opt("limits")?)?;
+        if let Some(places_m) = value.getattr_opt("places_m")? {
+            let places_m: Vec<[f64; 3]> =
+                places_m.extract().map_err(|_| wrong("places_m", "must be rows of three numbers, x, y and z"))?;
+            if places_m.is_empty() || places_m.iter().flatten().any(|number| !number.is_finite()) {
+                return Err(wrong("places_m", "must have at least one row, and finite numbers"));
+            }
+            let places_m = places_m.into_iter().map(DVec3::from_array).collect();
+            return Ok(Given::Course { device, places_m, begun: None });
+        }
+        let method = |name: &str| -> PyResult<Py<PyAny>> {
+            let method = value.getattr_opt(name)?.filter(|found| found.is_callable());
+            method
+                .map(Bound::unbind)
+                .ok_or_else(|| wrong("device", format!("has no method `{name}`: it needs read() and write(force_n)")))
+        };
+        Ok(Given::Object { device, read: method("read")?, write: method("write")? })
+    }
+
+    /// How long it lasts, s, if it ends.
+    #[allow(clippy::cast_precision_loss)]
+    pub(crate) fn lasts_s(&self) -> Option<f64> {
+        match self {
+            Given::Object { .. } => None,
+            Given::Course { places_m, .. } => Some(places_m.len() as f64 / RATE_HZ),
+        }
+    }
+}
+
+/// With the interpreter, unless it is going down.
+fn attached<T>(work: impl FnOnce(Python<'_>) -> PyResult<T>) -> Result<T> {
+    Python::try_attach(work)
+        .unwrap_or_else(|| Err(pyo3::exceptions::PyRuntimeError::new_err("Python is ending")))
+        .map_err(Error::other)
+}
+
+impl HapticDevice for Given {
+    fn descriptor(&self) -> Device {
+        match self {
+            Given::Object { device, .. } | Given::Course { device, .. } => *device,
+        }
+    }
+
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn read(&mut self) -> Result<Reading> {
+        match self {
+            Given::Object { read, .. } => attached(|py| {
+                let (place_m, enable): ([f64; 3], bool) = read.bind(py).call0()?.extract().map_err(|_| {
+                    wrong("device", "read() must return a place and whether forces are asked for: ((x, y, z), True)")
+                })?;
+                Ok(Reading { place_m: DVec3::from_array(place_m), enable })
+            }),
+            Given::Course { places_m, begun, .. } => {
+                let now_s = begun.get_or_insert_with(Instant::now).elapsed().as_secs_f64();
+                // By the time that has passed: a late tick does not make it longer.
+                let place_m = places_m.get((now_s * RATE_HZ) as usize).or(places_m.last()).copied();
+                let place_m = place_m.ok_or(ErrorKind::InvalidInput)?;
+                Ok(Reading { place_m, enable: now_s % ASKS_EVERY_S < ASKS_EVERY_S / 2.0 })
+            }
+        }
+    }
+
+    fn write(&mut self, force_n: DVec3) -> Result<()> {
+        match self {
+            Given::Object { write, .. } => {
+                attached(|py| write.bind(py).call1((<(f64, f64, f64)>::from(force_n),)).map(drop))
+            }
+            Given::Course { .. } => Ok(()),
+        }
+    }
+}

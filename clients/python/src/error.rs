@@ -1,0 +1,73 @@
+//! Refusals and failures as the exceptions of `palpate._errors`.
+
+use palpate::refusal::Refusal;
+use palpate::session::run::Failure;
+use pyo3::exceptions::{PyKeyboardInterrupt, PyOSError};
+use pyo3::prelude::*;
+use pyo3::types::PyType;
+use tonic::Status;
+use tonic_types::StatusExt;
+
+/// An exception of the package, made with `arguments`.
+fn raised<'py>(py: Python<'py>, name: &str, arguments: impl pyo3::call::PyCallArgs<'py>) -> PyErr {
+    let made = || -> PyResult<Bound<'py, PyAny>> {
+        py.import("palpate._errors")?.getattr(name)?.cast_into::<PyType>()?.call1(arguments)
+    };
+    made().map_or_else(|error| error, PyErr::from_value)
+}
+
+/// `palpate.Refused`.
+pub(crate) fn refused(refusal: Refusal) -> PyErr {
+    let Refusal { reason, field, message, place } = refusal;
+    Python::attach(|py| raised(py, "Refused", (reason.as_str(), field, message, place)))
+}
+
+/// `palpate.Refused` for an argument of the wrong kind.
+pub(crate) fn wrong(field: &str, message: impl Into<String>) -> PyErr {
+    refused(Refusal::new(palpate::refusal::Reason::WrongKind, field, message))
+}
+
+/// `palpate.Failed`: the tissue could not go on.
+pub(crate) fn failed(message: &str) -> PyErr {
+    Python::attach(|py| raised(py, "Failed", (message,)))
+}
+
+/// Why a run ended early.
+pub(crate) fn of_run(failure: Failure) -> PyErr {
+    match failure {
+        Failure::Refused(refusal) => refused(refusal),
+        Failure::Held(message) => failed(&message),
+        Failure::Output(error) if error.kind() == std::io::ErrorKind::Interrupted => PyKeyboardInterrupt::new_err(()),
+        Failure::Output(error) => PyOSError::new_err(error.to_string()),
+    }
+}
+
+/// A refusal of the server, or a connection that broke.
+pub(crate) fn of_status(status: Status) -> PyErr {
+    Python::attach(|py| match status.get_details_error_info() {
+        Some(info) => {
+            let field = info.metadata.get("field").cloned().unwrap_or_default();
+            // The server's text begins with the field.
+            let message = status.message().strip_prefix(&format!("{field}: ")).unwrap_or(status.message());
+            raised(py, "Refused", (info.reason, field, message, None::<String>))
+        }
+        None => raised(py, "Disconnected", (palpate_client::describe(&status),)),
+    })
+}
+
+/// An error of the client library.
+pub(crate) fn of_client(error: palpate_client::Error) -> PyErr {
+    use palpate_client::Error;
+    let text = error.to_string();
+    match error {
+        Error::Call(status) => of_status(status),
+        Error::Argument(message) => refused(Refusal::new(palpate::refusal::Reason::OutOfRange, "", message)),
+        Error::Connection(_) => Python::attach(|py| raised(py, "Disconnected", (text,))),
+        // What a device in Python raised comes back as itself.
+        Error::Device(error) => match error.downcast::<PyErr>() {
+            Ok(error) => error,
+            Err(error) => PyOSError::new_err(format!("the device: {error}")),
+        },
+        Error::Internal(_) => Python::attach(|py| raised(py, "Failed", (text,))),
+    }
+}

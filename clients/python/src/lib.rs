@@ -1,0 +1,45 @@
+//! Palpate from Python: the module `palpate._native`, which the package `palpate` wraps.
+//!
+//! Whatever takes long runs without the interpreter's lock, and Ctrl-C ends it. Arrays are handed to NumPy as they are: their
+//! memory is allocated here, filled, and owned by the array.
+
+// Programs of one user live in real time; the rule is for what a server computes.
+#![allow(clippy::disallowed_methods)]
+// What Python sees is documented in palpate/__init__.pyi.
+#![allow(clippy::needless_pass_by_value)]
+// A method of a type with a lifetime is for one lifetime, a closure for all.
+#![allow(clippy::redundant_closure_for_method_calls)]
+
+mod arrays;
+mod client;
+mod device;
+mod error;
+mod journal;
+mod run;
+mod scene;
+mod session;
+mod tip;
+mod waiting;
+
+use pyo3::prelude::*;
+
+#[pymodule(name = "_native")]
+fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add("__version__", env!("CARGO_PKG_VERSION"))?;
+    module.add_class::<scene::Scene>()?;
+    module.add_class::<scene::Script>()?;
+    module.add_class::<scene::Tissue>()?;
+    module.add_class::<session::Session>()?;
+    module.add_class::<tip::Tip>()?;
+    module.add_class::<journal::Journal>()?;
+    module.add_class::<client::Server>()?;
+    module.add_class::<client::RemoteSession>()?;
+    module.add_class::<client::Samples>()?;
+    module.add_class::<client::Frames>()?;
+    module.add_function(wrap_pyfunction!(scene::scenes, module)?)?;
+    module.add_function(wrap_pyfunction!(scene::scripts, module)?)?;
+    module.add_function(wrap_pyfunction!(run::run, module)?)?;
+    module.add_function(wrap_pyfunction!(run::study, module)?)?;
+    module.add_function(wrap_pyfunction!(device::devices, module)?)?;
+    Ok(())
+}

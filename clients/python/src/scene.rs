@@ -1,0 +1,422 @@
+//! Scenes, scripts and compiled tissues.
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use palpate::limits::Limits;
+use palpate::refusal::{Reason, Refusal};
+use palpate::scene::collection::{Collection, find_scene, find_script};
+use palpate::scene::kind::Kind;
+use palpate::scene::{self, Body, Named};
+use palpate::shape::{PointId, PointName};
+use palpate::sheet::Model;
+use palpate::sheet::saved::TissueState;
+use pyo3::prelude::*;
+use pyo3::types::{PyBool, PyDict, PyFloat, PyInt, PyString};
+
+use crate::arrays::{column, rows, shaped, vector};
+use crate::error::{refused, wrong};
+use crate::waiting::work;
+
+/// What refusals call a text that comes from no file.
+const TEXT: &str = "<text>";
+
+/// The limits of a process with one user.
+pub(crate) fn limits() -> Limits {
+    Limits::default().offline()
+}
+
+/// Where a scene or script is from.
+#[derive(Debug, Clone)]
+enum Source {
+    Text(String),
+    /// A file, or a name.
+    Path(PathBuf),
+}
+
+impl Source {
+    fn of(value: &Bound<'_, PyAny>) -> PyResult<Self> {
+        if let Ok(text) = value.cast::<PyString>() {
+            let text: String = text.extract()?;
+            // Neither is in a name, and who means a file of such a name gives a pathlib.Path.
+            let is_text = text.contains('\n') || text.contains('=');
+            return Ok(if is_text { Source::Text(text) } else { Source::Path(text.into()) });
+        }
+        let path: PyResult<PathBuf> = value.extract();
+        path.map(Source::Path).map_err(|_| wrong("source", "must be TOML text, a path, or a name"))
+    }
+}
+
+/// A value as TOML.
+fn toml(value: &Bound<'_, PyAny>) -> PyResult<String> {
+    if value.is_instance_of::<PyBool>() {
+        return Ok(if value.extract()? { "true" } else { "false" }.to_owned());
+    }
+    if value.is_instance_of::<PyInt>() {
+        return Ok(value.str()?.to_string());
+    }
+    if value.is_instance_of::<PyFloat>() {
+        let value: f64 = value.extract()?;
+        return Ok(if value.is_nan() { "nan".to_owned() } else { format!("{value:?}") });
+    }
+    if let Ok(text) = value.cast::<PyString>() {
+        return Ok(serde_json::Value::from(text.extract::<String>()?).to_string());
+    }
+    if let Ok(table) = value.cast::<PyDict>() {
+        let pairs: PyResult<Vec<String>> =
+            table.iter().map(|(key, value)| Ok(format!("{} = {}", key.str()?, toml(&value)?))).collect();
+        return Ok(format!("{{ {} }}", pairs?.join(", ")));
+    }
+    if value.hasattr("tolist")? {
+        return toml(&value.call_method0("tolist")?);
+    }
+    let items = value.try_iter().map_err(|_| wrong("set", format!("can't write {value} as TOML")))?;
+    let items: PyResult<Vec<String>> = items.map(|item| toml(&item?)).collect();
+    Ok(format!("[{}]", items?.join(", ")))
+}
+
+/// `{"springs.stiffness_n_per_m": 50}` as assignments.
+fn assignments(set: Option<&Bound<'_, PyAny>>) -> PyResult<Vec<String>> {
+    let Some(set) = set else { return Ok(Vec::new()) };
+    if let Ok(table) = set.cast::<PyDict>() {
+        return table.iter().map(|(key, value)| Ok(format!("{}={}", key.str()?, toml(&value)?))).collect();
+    }
+    set.extract().map_err(|_| wrong("set", "must be a dict of keys and values, or a list of \"key=value\""))
+}
+
+/// A scene that was read and checked.
+#[pyclass(frozen, module = "palpate")]
+pub(crate) struct Scene {
+    pub(crate) scene: scene::Scene,
+    /// What refusals call it.
+    place: String,
+    /// Stepped as this one, without a search for what its tolerance asks for.
+    plan: Option<Arc<Model>>,
+    model: Mutex<Option<Arc<Model>>>,
+}
+
+impl Scene {
+    /// Read from what Python gave: a scene, or what one is made from.
+    pub(crate) fn given<'py>(value: &Bound<'py, PyAny>) -> PyResult<Bound<'py, Scene>> {
+        if let Ok(scene) = value.cast::<Scene>() {
+            return Ok(scene.clone());
+        }
+        Bound::new(value.py(), Scene::new(value, None, "scenes".into(), None)?)
+    }
+
+    /// The tissue, compiled once.
+    pub(crate) fn compiled(&self, stop: &AtomicBool) -> Result<Arc<Model>, Refusal> {
+        let mut model = self.model.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(model) = &*model {
+            return Ok(model.clone());
+        }
+        // As the programs do: an error of compilation belongs to no single line.
+        let in_scene = |refusal: Refusal| Refusal { place: Some(self.place.clone()), ..refusal };
+        let made = match &self.plan {
+            Some(plan) => Model::resumed(&self.scene, &planned(&self.scene, plan), &limits()),
+            None => Model::compile_until(&self.scene, &limits(), stop),
+        };
+        let made = made.map_err(in_scene)?;
+        Ok(model.insert(made).clone())
+    }
+}
+
+/// The coefficients of a scene with the plan of a model. Nothing is known of its error.
+fn planned(scene: &scene::Scene, plan: &Model) -> TissueState {
+    TissueState {
+        stiffness_n_per_m: scene.springs.stiffness_n_per_m,
+        shear_stiffness_n_per_m: scene.springs.shear_stiffness_n_per_m,
+        virtual_stiffness_n_per_m: scene.virtual_stiffness_n_per_m,
+        damping_n_s_per_m: scene.damping_n_s_per_m,
+        volume_stiffness_pa: scene.volume_stiffness_pa,
+        sleep_tolerance: scene.sleep_tolerance.unwrap_or(plan.sleep_tolerance),
+        sleep_tolerance_of_scene: scene.sleep_tolerance,
+        expected_error: f64::INFINITY,
+        corrected: None,
+        ..plan.tissue_state()
+    }
+}
+
+#[pymethods]
+impl Scene {
+    #[new]
+    #[pyo3(signature = (source, *, set=None, folder="scenes".into(), plan=None))]
+    fn new(
+        source: &Bound<'_, PyAny>,
+        set: Option<&Bound<'_, PyAny>>,
+        folder: PathBuf,
+        plan: Option<&Bound<'_, Tissue>>,
+    ) -> PyResult<Self> {
+        let (source, sets, limits) = (Source::of(source)?, assignments(set)?, limits());
+        let read = source_scene(&source, &sets, &folder, &limits).map_err(refused)?;
+        Ok(Scene { plan: plan.map(|plan| plan.get().model.clone()), ..read })
+    }
+
+    #[getter]
+    fn name(&self) -> &str {
+        &self.scene.name
+    }
+
+    #[getter]
+    fn points(&self) -> usize {
+        self.scene.shape().point_count()
+    }
+
+    #[getter]
+    fn rate_hz(&self) -> f64 {
+        self.scene.stepping.rate_hz
+    }
+
+    fn __repr__(&self) -> String {
+        format!("<palpate.Scene {:?}: {}>", self.scene.name, self.scene.shape().describe())
+    }
+}
+
+fn source_scene(source: &Source, sets: &[String], folder: &Path, limits: &Limits) -> Result<Scene, Refusal> {
+    let (scene, place) = match source {
+        Source::Text(text) => (scene::Scene::parse_in(Path::new(""), TEXT, text, sets, limits)?, TEXT.to_owned()),
+        Source::Path(path) => (find_scene(path, folder, sets, limits)?, path.display().to_string()),
+    };
+    Ok(Scene { scene, place, plan: None, model: Mutex::new(None) })
+}
+
+/// A script that is not bound to a scene yet.
+#[pyclass(frozen, module = "palpate")]
+#[derive(Debug, Clone)]
+pub(crate) struct Script {
+    source: Source,
+    folder: PathBuf,
+}
+
+impl Script {
+    /// Made from what Python gave: a script, or what one is made from.
+    pub(crate) fn given(value: &Bound<'_, PyAny>) -> PyResult<Self> {
+        match value.cast::<Script>() {
+            Ok(script) => Ok(script.get().clone()),
+            Err(_) => Script::new(value, PathBuf::new()),
+        }
+    }
+
+    /// Bound to a scene.
+    pub(crate) fn bound(&self, scene: &scene::Scene) -> Result<scene::script::Script, Refusal> {
+        match &self.source {
+            Source::Text(text) => scene::script::Script::parse(TEXT, text, &self.folder, scene, &limits()),
+            Source::Path(path) => find_script(path, scene, &limits()),
+        }
+    }
+}
+
+#[pymethods]
+impl Script {
+    #[new]
+    #[pyo3(signature = (source, *, folder=PathBuf::new()))]
+    fn new(source: &Bound<'_, PyAny>, folder: PathBuf) -> PyResult<Self> {
+        Ok(Script { source: Source::of(source)?, folder })
+    }
+
+    fn check<'py>(&self, py: Python<'py>, scene: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyDict>> {
+        let scene = Scene::given(scene)?;
+        let script = self.bound(&scene.get().scene).map_err(refused)?;
+        let found = PyDict::new(py);
+        found.set_item("name", &script.name)?;
+        found.set_item("steps", script.steps)?;
+        found.set_item("sample_every_steps", script.sample_every)?;
+        found.set_item("tools", script.tools())?;
+        found.set_item("warnings", &script.warnings)?;
+        Ok(found)
+    }
+
+    fn __repr__(&self) -> String {
+        match &self.source {
+            Source::Text(_) => "<palpate.Script>".to_owned(),
+            Source::Path(path) => format!("<palpate.Script {:?}>", path.display().to_string()),
+        }
+    }
+}
+
+/// A compiled scene: points, springs, and how they are stepped.
+#[pyclass(frozen, module = "palpate")]
+pub(crate) struct Tissue {
+    pub(crate) model: Arc<Model>,
+}
+
+impl Tissue {
+    /// Compiled from what Python gave: a tissue, a scene, or what one is made from.
+    pub(crate) fn given(py: Python<'_>, value: &Bound<'_, PyAny>) -> PyResult<Arc<Model>> {
+        if let Ok(tissue) = value.cast::<Tissue>() {
+            return Ok(tissue.get().model.clone());
+        }
+        let scene = Scene::given(value)?;
+        let scene = scene.get();
+        work(py, |stop| scene.compiled(stop))?.map_err(refused)
+    }
+}
+
+/// The point that Python names: (i, j) of a sheet, the number of a vertex of a mesh.
+pub(crate) fn point(model: &Model, value: &Bound<'_, PyAny>) -> PyResult<PointId> {
+    let name = match value.extract::<u32>() {
+        Ok(vertex) => PointName::Vertex(vertex),
+        Err(_) => PointName::Point(value.extract().map_err(|_| {
+            wrong("point", "must be (i, j) on a sheet, or the number of a vertex on a mesh; none below 0")
+        })?),
+    };
+    model.shape().find("point", name).map_err(refused)
+}
+
+/// What Python calls a point.
+pub(crate) fn named<'py>(py: Python<'py>, name: PointName) -> PyResult<Bound<'py, PyAny>> {
+    match name {
+        PointName::Point([i, j]) => Ok((i, j).into_pyobject(py)?.into_any()),
+        PointName::Vertex(vertex) => Ok(vertex.into_pyobject(py)?.into_any()),
+    }
+}
+
+#[pymethods]
+impl Tissue {
+    #[new]
+    fn new(py: Python<'_>, scene: &Bound<'_, PyAny>) -> PyResult<Self> {
+        Ok(Tissue { model: Tissue::given(py, scene)? })
+    }
+
+    #[getter]
+    fn name(&self) -> &str {
+        &self.model.scene.name
+    }
+
+    fn __len__(&self) -> usize {
+        self.model.len()
+    }
+
+    #[getter]
+    fn rate_hz(&self) -> f64 {
+        self.model.scene.stepping.rate_hz
+    }
+
+    #[getter]
+    fn integrator(&self) -> &'static str {
+        self.model.plan.integrator.name()
+    }
+
+    #[getter]
+    fn substeps(&self) -> u32 {
+        self.model.plan.substeps
+    }
+
+    #[getter]
+    fn precision(&self) -> &'static str {
+        self.model.precision.name()
+    }
+
+    #[getter]
+    fn lanes(&self) -> &'static str {
+        self.model.lanes.name()
+    }
+
+    #[getter]
+    fn expected_error(&self) -> f64 {
+        self.model.expected_error
+    }
+
+    #[getter]
+    fn warnings(&self) -> Vec<String> {
+        self.model.warnings.clone()
+    }
+
+    #[getter]
+    fn grid(&self) -> Option<(usize, usize)> {
+        self.model.scene.sheet().map(|sheet| (sheet.points[0], sheet.points[1]))
+    }
+
+    #[getter]
+    fn rest_m<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let shape = self.model.shape();
+        rows(py, self.model.points().flat_map(|point| shape.rest_m(point).to_array()).collect())
+    }
+
+    #[getter]
+    fn normals<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let shape = self.model.shape();
+        rows(py, self.model.points().flat_map(|point| shape.normal(point).to_array()).collect())
+    }
+
+    #[getter]
+    fn fixed<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let shape = self.model.shape();
+        let fixed: Vec<bool> = self.model.points().map(|point| shape.is_fixed(point)).collect();
+        column(py, fixed)
+    }
+
+    #[getter]
+    fn mass_kg<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let masses: Vec<f64> = self.model.points().map(|point| self.model.mass_kg(point)).collect();
+        column(py, masses)
+    }
+
+    #[getter]
+    #[allow(clippy::cast_possible_truncation)]
+    fn triangles<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let corners: Vec<u32> = match &self.model.scene.body {
+            Body::Mesh(mesh) => mesh.shape.triangles().iter().flatten().copied().collect(),
+            Body::Sheet(sheet) => {
+                let [nx, ny] = sheet.points.map(|points| points as u32);
+                let cells = (0..nx.saturating_sub(1)).flat_map(|i| (0..ny.saturating_sub(1)).map(move |j| i * ny + j));
+                // Counter-clockwise from above.
+                cells.flat_map(|at| [at, at + ny, at + ny + 1, at, at + ny + 1, at + 1]).collect()
+            }
+        };
+        shaped(py, corners, &[3])
+    }
+
+    fn index(&self, point: &Bound<'_, PyAny>) -> PyResult<usize> {
+        Ok(self::point(&self.model, point)?.index())
+    }
+
+    fn point<'py>(&self, py: Python<'py>, index: usize) -> PyResult<Bound<'py, PyAny>> {
+        if index >= self.model.len() {
+            let message = format!("must be below {}, the number of points, but is {index}", self.model.len());
+            return Err(refused(Refusal::new(Reason::OutOfRange, "index", message)));
+        }
+        named(py, self.model.shape().name(PointId::new(index)))
+    }
+
+    fn nearest(&self, place_m: &Bound<'_, PyAny>) -> PyResult<usize> {
+        let place_m = vector("place_m", place_m)?;
+        palpate::refusal::finite_vector("place_m", place_m).map_err(refused)?;
+        Ok(self.model.shape().nearest(place_m).index())
+    }
+
+    #[getter]
+    fn middle_m(&self) -> (f64, f64, f64) {
+        let middle_m = self.model.shape().extent().middle_m();
+        (middle_m.x, middle_m.y, middle_m.z)
+    }
+
+    fn __repr__(&self) -> String {
+        let Model { scene, plan, precision, .. } = &*self.model;
+        let (name, shape, rate_hz) = (&scene.name, scene.shape().describe(), scene.stepping.rate_hz);
+        let (integrator, substeps) = (plan.integrator.name(), plan.substeps);
+        format!(
+            "<palpate.Tissue {name:?}: {shape}, {rate_hz} Hz, {integrator}, {substeps} substeps, {}>",
+            precision.name()
+        )
+    }
+}
+
+fn names(kind: Kind, folder: &Path) -> Vec<String> {
+    Collection::new(kind, folder).names()
+}
+
+/// The names of the scenes that are shipped, and of the files in a folder.
+#[pyfunction]
+#[pyo3(signature = (folder="scenes".into()))]
+pub(crate) fn scenes(folder: PathBuf) -> Vec<String> {
+    names(Kind::Scene, &folder)
+}
+
+/// The same of scripts.
+#[pyfunction]
+#[pyo3(signature = (folder="scripts".into()))]
+pub(crate) fn scripts(folder: PathBuf) -> Vec<String> {
+    names(Kind::Script, &folder)
+}

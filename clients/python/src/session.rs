@@ -1,0 +1,349 @@
+//! A session in this process: a tissue and its tools, stepped as fast as the machine can.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::{Mutex, PoisonError};
+use std::time::Instant;
+
+use glam::DVec3;
+use palpate::refusal::Refusal;
+use palpate::scene::profile::Poke;
+use palpate::scene::script::Action;
+use palpate::scene::{self, Change};
+use palpate::session::command::{Command, Due};
+use palpate::session::intake::Intake;
+use palpate::session::saved::Saved;
+use palpate::session::{self, run};
+use palpate::shape::PointId;
+use palpate::sheet::Model;
+use pyo3::prelude::*;
+use pyo3::types::{PyBytes, PyDict};
+
+use crate::arrays::{OF_POINT, add_point, records, rows, vector, write_into};
+use crate::error::{failed, refused, wrong};
+use crate::scene::{Scene, Tissue, limits, point};
+use crate::tip::Tip;
+use crate::waiting::LOOK;
+
+/// What is led by a pose, until it is released or does something else.
+#[derive(Debug, Clone, Copy)]
+struct Led {
+    place_m: DVec3,
+    tip: palpate_touch::Tip,
+}
+
+/// A session and what a client has beside it.
+pub(crate) struct Inner {
+    session: session::Session,
+    /// The scene with which it began: changes are made of that.
+    first: scene::Scene,
+    intake: Intake,
+    held: BTreeSet<u32>,
+    led: BTreeMap<u32, Led>,
+    due: Vec<Due>,
+}
+
+impl Inner {
+    pub(crate) fn of(session: session::Session, first: scene::Scene) -> Self {
+        let intake = Intake::new(&first, &limits()).continued_at(session.step_count(), None);
+        Inner { session, first, intake, held: BTreeSet::new(), led: BTreeMap::new(), due: Vec::new() }
+    }
+
+    /// A tool does something from the next step on.
+    fn submit(&mut self, tool: u32, action: Action) -> Result<(), Refusal> {
+        let lease = 1 + u128::from(tool);
+        if !self.held.contains(&tool) {
+            self.intake.acquire(&[tool], "python", limits().lease_s, lease, 0)?;
+            self.held.insert(tool);
+        }
+        let step = self.session.step_count();
+        // Several commands may come for one step: their sequence is the intake's matter.
+        let command = Command { sequence: None, ..run::command(tool as usize, step, action.clone()) };
+        self.intake.submit(lease, vec![command], 0)?;
+        match action {
+            Action::Pose { place_m, tip, .. } => self.led.insert(tool, Led { place_m, tip }),
+            _ => self.led.remove(&tool),
+        };
+        Ok(())
+    }
+
+    fn step(&mut self) -> Result<(), Refusal> {
+        let step = self.session.step_count();
+        // A tool of which nothing is heard lets go; these are to stay.
+        let led: Vec<(u32, Led)> = self.led.iter().map(|(tool, led)| (*tool, *led)).collect();
+        for (tool, Led { place_m, tip }) in led {
+            self.submit(tool, Action::Pose { place_m, velocity_m_per_s: None, tip })?;
+        }
+        self.intake.take_due(step, 0, &mut self.due);
+        let recoveries = self.session.recoveries().count();
+        self.session.advance(&mut self.due, |_| {});
+        if self.session.recoveries().count() > recoveries {
+            self.led.clear();
+        }
+        Ok(())
+    }
+}
+
+/// A session in this process.
+#[pyclass(frozen, module = "palpate")]
+pub(crate) struct Session {
+    inner: Mutex<Inner>,
+}
+
+impl Session {
+    pub(crate) fn of(inner: Inner) -> Self {
+        Session { inner: Mutex::new(inner) }
+    }
+
+    /// Does something with the session, without the interpreter's lock: another thread may have it for long.
+    fn with<T: Send>(&self, py: Python<'_>, work: impl FnOnce(&mut Inner) -> T + Send) -> T {
+        py.detach(|| work(&mut self.inner.lock().unwrap_or_else(PoisonError::into_inner)))
+    }
+
+    fn submit(&self, py: Python<'_>, tool: u32, action: Action) -> PyResult<()> {
+        self.with(py, |inner| inner.submit(tool, action)).map_err(refused)
+    }
+}
+
+#[pymethods]
+impl Session {
+    #[new]
+    fn new(py: Python<'_>, tissue: &Bound<'_, PyAny>) -> PyResult<Self> {
+        let model = Tissue::given(py, tissue)?;
+        Ok(Session::of(py.detach(|| Inner::of(session::Session::new(&model), model.scene.clone()))))
+    }
+
+    #[staticmethod]
+    fn restore(py: Python<'_>, scene: &Bound<'_, PyAny>, snapshot: &[u8]) -> PyResult<Self> {
+        let scene = match scene.cast::<Tissue>() {
+            Ok(tissue) => tissue.get().model.scene.clone(),
+            Err(_) => Scene::given(scene)?.get().scene.clone(),
+        };
+        let restored = py.detach(|| {
+            let saved = Saved::from_bytes(snapshot, &limits())?;
+            let model = Model::resumed(&scene, saved.tissue(), &limits())?;
+            Ok(Inner::of(session::Session::restore(&model, &saved)?, scene))
+        });
+        restored.map(Session::of).map_err(refused)
+    }
+
+    #[pyo3(signature = (steps=1))]
+    fn step(&self, py: Python<'_>, steps: u64) -> PyResult<()> {
+        let mut left = steps;
+        loop {
+            let reason = self.with(py, |inner| {
+                let begun = Instant::now();
+                while left > 0 && inner.session.hold_reason().is_none() && begun.elapsed() < LOOK {
+                    inner.step()?;
+                    left -= 1;
+                }
+                Ok(inner.session.hold_reason().map(str::to_owned))
+            });
+            if let Some(reason) = reason.map_err(refused)? {
+                return Err(failed(&reason));
+            }
+            if left == 0 {
+                return Ok(());
+            }
+            py.check_signals()?;
+        }
+    }
+
+    #[getter]
+    fn steps(&self, py: Python<'_>) -> u64 {
+        self.with(py, |inner| inner.session.step_count())
+    }
+
+    #[getter]
+    fn time_s(&self, py: Python<'_>) -> f64 {
+        self.with(py, |inner| inner.session.time_s())
+    }
+
+    #[getter]
+    fn tissue(&self, py: Python<'_>) -> Tissue {
+        self.with(py, |inner| Tissue { model: inner.session.model().clone() })
+    }
+
+    #[getter]
+    fn awake_points(&self, py: Python<'_>) -> usize {
+        self.with(py, |inner| inner.session.tissue().awake_points())
+    }
+
+    #[getter]
+    fn guard_events(&self, py: Python<'_>) -> u64 {
+        self.with(py, |inner| inner.session.tissue().guard_events())
+    }
+
+    #[getter]
+    fn fault(&self, py: Python<'_>) -> Option<String> {
+        self.with(py, |inner| inner.session.fault())
+    }
+
+    #[getter]
+    fn hash(&self, py: Python<'_>) -> String {
+        self.with(py, |inner| format!("{:032x}", inner.session.tissue().state_hash()))
+    }
+
+    #[pyo3(signature = (tool, force_n, *, point=None, at_m=None, falloff_per_m=200.0, falloff_offset=0.0))]
+    #[allow(clippy::too_many_arguments)]
+    fn push(
+        &self,
+        py: Python<'_>,
+        tool: u32,
+        force_n: &Bound<'_, PyAny>,
+        point: Option<&Bound<'_, PyAny>>,
+        at_m: Option<&Bound<'_, PyAny>>,
+        falloff_per_m: f64,
+        falloff_offset: f64,
+    ) -> PyResult<()> {
+        let model = self.with(py, |inner| inner.session.model().clone());
+        let force_n = vector("force_n", force_n)?;
+        let (point, centre_m) = match (point, at_m) {
+            (Some(point), None) => {
+                let point = self::point(&model, point)?;
+                (Some(point), model.shape().rest_m(point))
+            }
+            (None, Some(at_m)) => (None, vector("at_m", at_m)?),
+            _ => return Err(wrong("point", "give either a point or a place, at_m")),
+        };
+        self.submit(py, tool, Action::Push(Poke { point, centre_m, force_n, falloff_per_m, falloff_offset }))
+    }
+
+    fn grasp(
+        &self,
+        py: Python<'_>,
+        tool: u32,
+        point: &Bound<'_, PyAny>,
+        displacement_m: &Bound<'_, PyAny>,
+    ) -> PyResult<()> {
+        let model = self.with(py, |inner| inner.session.model().clone());
+        let point = self::point(&model, point)?;
+        let displacement_m = vector("displacement_m", displacement_m)?;
+        self.submit(py, tool, Action::Grasp { point, displacement_m })
+    }
+
+    #[pyo3(signature = (tool, place_m, tip=None))]
+    fn pose(&self, py: Python<'_>, tool: u32, place_m: &Bound<'_, PyAny>, tip: Option<Tip>) -> PyResult<()> {
+        let place_m = vector("place_m", place_m)?;
+        let known = self.with(py, |inner| inner.led.get(&tool).map(|led| led.tip));
+        let tip = tip.map(|tip| tip.0).or(known).unwrap_or_default();
+        self.submit(py, tool, Action::Pose { place_m, velocity_m_per_s: None, tip })
+    }
+
+    fn release(&self, py: Python<'_>, tool: u32) -> PyResult<()> {
+        self.submit(py, tool, Action::Release)
+    }
+
+    fn tool<'py>(&self, py: Python<'py>, tool: u32) -> PyResult<Option<Bound<'py, PyAny>>> {
+        let sample = self.with(py, |inner| inner.session.sample(Some(&[tool])));
+        let Some(contact) = sample.tools.first().and_then(|tool| tool.contact) else { return Ok(None) };
+        let numbers = [
+            contact.displacement_m,
+            contact.surface_displacement_m,
+            contact.velocity_m_per_s,
+            contact.force_on_tool_n,
+            contact.applied_force_n,
+        ];
+        let made = py.import("palpate._arrays")?.getattr("tool_state")?;
+        // −0 is 0, as in records.
+        let numbers: Vec<f64> = numbers.iter().flat_map(|v| (*v + DVec3::ZERO).to_array()).collect();
+        made.call1((rows(py, numbers)?,)).map(Some)
+    }
+
+    #[pyo3(signature = (*, stiffness_n_per_m=None, damping_n_s_per_m=None, virtual_stiffness_n_per_m=None, volume_stiffness_pa=None))]
+    fn change(
+        &self,
+        py: Python<'_>,
+        stiffness_n_per_m: Option<f64>,
+        damping_n_s_per_m: Option<f64>,
+        virtual_stiffness_n_per_m: Option<f64>,
+        volume_stiffness_pa: Option<f64>,
+    ) -> PyResult<()> {
+        let change = Change { stiffness_n_per_m, damping_n_s_per_m, virtual_stiffness_n_per_m, volume_stiffness_pa };
+        let changed = self.with(py, |inner| {
+            let model = inner.session.model().changed(&change, &inner.first, &limits())?;
+            inner.session.change(&model);
+            Ok(())
+        });
+        changed.map_err(refused)
+    }
+
+    #[pyo3(signature = (out=None))]
+    fn displacements<'py>(&self, py: Python<'py>, out: Option<Bound<'py, PyAny>>) -> PyResult<Bound<'py, PyAny>> {
+        let read = |inner: &mut Inner, into: &mut Vec<f64>| inner.session.tissue().whole_displacements_m(into);
+        self.read(py, out, &read)
+    }
+
+    #[pyo3(signature = (out=None))]
+    fn positions<'py>(&self, py: Python<'py>, out: Option<Bound<'py, PyAny>>) -> PyResult<Bound<'py, PyAny>> {
+        let read = |inner: &mut Inner, into: &mut Vec<f64>| {
+            inner.session.tissue().whole_displacements_m(into);
+            let model = inner.session.model();
+            let shape = model.shape();
+            let rest_m = model.points().flat_map(|point| shape.rest_m(point).to_array());
+            into.iter_mut().zip(rest_m).for_each(|(to, rest_m)| *to += rest_m);
+        };
+        self.read(py, out, &read)
+    }
+
+    #[pyo3(signature = (out=None))]
+    fn velocities<'py>(&self, py: Python<'py>, out: Option<Bound<'py, PyAny>>) -> PyResult<Bound<'py, PyAny>> {
+        let read = |inner: &mut Inner, into: &mut Vec<f64>| {
+            let (tissue, points) = (inner.session.tissue(), inner.session.model().points());
+            into.clear();
+            into.extend(points.flat_map(|point| (tissue.point(point).velocity_m_per_s + DVec3::ZERO).to_array()));
+        };
+        self.read(py, out, &read)
+    }
+
+    #[pyo3(signature = (points=None))]
+    fn records<'py>(&self, py: Python<'py>, points: Option<Vec<Bound<'py, PyAny>>>) -> PyResult<Bound<'py, PyAny>> {
+        let model = self.with(py, |inner| inner.session.model().clone());
+        let points =
+            points.map(|points| points.iter().map(|name| point(&model, name)).collect::<PyResult<Vec<PointId>>>());
+        let points = points.transpose()?;
+        let numbers = self.with(py, |inner| {
+            let record = inner.session.record(points.as_deref());
+            let mut numbers = Vec::with_capacity(record.points.len() * OF_POINT);
+            record.points.iter().for_each(|point| add_point(&mut numbers, point));
+            numbers
+        });
+        let count = numbers.len() / OF_POINT;
+        records(py, numbers, "POINT", &[count])
+    }
+
+    #[getter]
+    fn energy_j<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let energy = self.with(py, |inner| inner.session.energy());
+        let found = PyDict::new(py);
+        found.set_item("kinetic", energy.kinetic)?;
+        found.set_item("spring", energy.spring)?;
+        found.set_item("virtual", energy.virtual_springs)?;
+        Ok(found)
+    }
+
+    fn save<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
+        let bytes = self.with(py, |inner| inner.session.save().to_bytes());
+        PyBytes::new(py, &bytes)
+    }
+
+    fn __repr__(&self, py: Python<'_>) -> String {
+        let (name, steps) = self.with(py, |inner| (inner.first.name.clone(), inner.session.step_count()));
+        format!("<palpate.Session of {name:?}: {steps} steps>")
+    }
+}
+
+impl Session {
+    /// Vectors of all points, in the caller's array or in a new one.
+    fn read<'py>(
+        &self,
+        py: Python<'py>,
+        out: Option<Bound<'py, PyAny>>,
+        read: &(dyn Fn(&mut Inner, &mut Vec<f64>) + Sync),
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let mut numbers = Vec::new();
+        self.with(py, |inner| read(inner, &mut numbers));
+        let Some(out) = out else { return rows(py, numbers) };
+        write_into(py, &out, numbers)?;
+        Ok(out)
+    }
+}

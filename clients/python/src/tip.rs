@@ -1,0 +1,42 @@
+//! The tip of a tool, as Python sees it.
+
+use palpate_touch::Coupling;
+use pyo3::prelude::*;
+
+/// A tip.
+#[pyclass(frozen, module = "palpate", from_py_object)]
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Tip(pub(crate) palpate_touch::Tip);
+
+#[pymethods]
+impl Tip {
+    #[new]
+    #[pyo3(signature = (radius_m=0.005, *, friction=0.2, grasps=false, stiffness_n_per_m=None, damping_n_s_per_m=0.0))]
+    fn new(radius_m: f64, friction: f64, grasps: bool, stiffness_n_per_m: Option<f64>, damping_n_s_per_m: f64) -> Self {
+        let coupling = stiffness_n_per_m.map_or(Coupling::Constraint, |stiffness_n_per_m| Coupling::Spring {
+            stiffness_n_per_m,
+            damping_n_s_per_m,
+        });
+        Tip(palpate_touch::Tip { radius_m, friction, grasps, coupling })
+    }
+
+    #[getter]
+    fn radius_m(&self) -> f64 {
+        self.0.radius_m
+    }
+
+    #[getter]
+    fn friction(&self) -> f64 {
+        self.0.friction
+    }
+
+    #[getter]
+    fn grasps(&self) -> bool {
+        self.0.grasps
+    }
+
+    fn __repr__(&self) -> String {
+        let palpate_touch::Tip { radius_m, friction, grasps, .. } = self.0;
+        format!("Tip({radius_m}, friction={friction}, grasps={})", if grasps { "True" } else { "False" })
+    }
+}

@@ -1,0 +1,117 @@
+//! Work that takes long: without the interpreter's lock, and ended by Ctrl-C.
+
+use std::future::Future;
+use std::sync::OnceLock;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{RecvTimeoutError, channel};
+use std::time::Duration;
+
+use pyo3::BoundObject;
+use pyo3::exceptions::PyRuntimeError;
+use pyo3::prelude::*;
+use tokio::runtime::Runtime;
+use tokio::sync::oneshot;
+
+/// So often signals are looked at.
+pub(crate) const LOOK: Duration = Duration::from_millis(50);
+
+/// Stack of a thread that computes, as a main thread has.
+pub(crate) const STACK_BYTES: usize = 8 << 20;
+
+/// Does `work` on a thread of its own and looks for signals meanwhile. At a signal whose handler raises, as Ctrl-C does,
+/// `work` is told to stop, and the exception is raised when it has.
+pub(crate) fn work<T: Send>(py: Python<'_>, work: impl FnOnce(&AtomicBool) -> T + Send) -> PyResult<T> {
+    let stop = AtomicBool::new(false);
+    py.detach(|| {
+        std::thread::scope(|scope| {
+            let (tell, told) = channel();
+            let worker = std::thread::Builder::new().name("palpate".to_owned()).stack_size(STACK_BYTES);
+            let stop = &stop;
+            let worker = worker.spawn_scoped(scope, move || {
+                let done = work(stop);
+                let _ = tell.send(());
+                done
+            })?;
+            let mut raised = None;
+            while told.recv_timeout(LOOK) == Err(RecvTimeoutError::Timeout) {
+                if raised.is_none() {
+                    raised = Python::attach(|py| py.check_signals()).err();
+                    stop.store(raised.is_some(), Ordering::Relaxed);
+                }
+            }
+            let done = worker.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
+            raised.map_or(Ok(done), Err)
+        })
+    })
+}
+
+/// The runtime of all connections.
+pub(crate) fn runtime() -> PyResult<&'static Runtime> {
+    static RUNTIME: OnceLock<Option<Runtime>> = OnceLock::new();
+    let made = RUNTIME.get_or_init(|| {
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(2)
+            .thread_name("palpate-net")
+            .enable_all()
+            .build()
+            .ok()?;
+        Some(runtime)
+    });
+    let runtime = made.as_ref().ok_or_else(|| PyRuntimeError::new_err("no threads for the network"))?;
+    // Only the first call counts; the runtime is the same each time.
+    let _ = pyo3_async_runtimes::tokio::init_with_runtime(runtime);
+    Ok(runtime)
+}
+
+/// The result of a future, now or as an awaitable of asyncio. A wait that a signal ends drops the future, and so does a task that
+/// is cancelled.
+pub(crate) fn answer<'py, T>(
+    py: Python<'py>,
+    awaited: bool,
+    future: impl Future<Output = PyResult<T>> + Send + 'static,
+) -> PyResult<Bound<'py, PyAny>>
+where
+    T: for<'a> IntoPyObject<'a> + Send + 'static,
+{
+    answer_in_order(py, awaited, None, future)
+}
+
+/// The same of a future that ends in order when `end` is dropped: a signal drops that, and what the future gives is lost.
+pub(crate) fn answer_in_order<'py, T>(
+    py: Python<'py>,
+    awaited: bool,
+    mut end: Option<oneshot::Sender<()>>,
+    future: impl Future<Output = PyResult<T>> + Send + 'static,
+) -> PyResult<Bound<'py, PyAny>>
+where
+    T: for<'a> IntoPyObject<'a> + Send + 'static,
+{
+    let runtime = runtime()?;
+    if awaited {
+        return pyo3_async_runtimes::tokio::future_into_py(py, async move {
+            let _end = end;
+            future.await
+        });
+    }
+    let found = py.detach(|| {
+        runtime.block_on(async {
+            let mut future = std::pin::pin!(future);
+            let mut raised = None;
+            loop {
+                match tokio::time::timeout(LOOK, &mut future).await {
+                    Ok(found) => return raised.map_or(found, Err),
+                    // It has been told to end.
+                    Err(_) if raised.is_some() => {}
+                    Err(_) => {
+                        let looked = Python::attach(|py| py.check_signals());
+                        match end.take_if(|_| looked.is_err()) {
+                            Some(_) => raised = looked.err(),
+                            None => looked?,
+                        }
+                    }
+                }
+            }
+        })
+    })?;
+    found.into_pyobject(py).map(|found| found.into_any().into_bound()).map_err(Into::into)
+}

@@ -1,0 +1,188 @@
+"""A real server, touched and looked at, with and without asyncio."""
+
+import asyncio
+import tempfile
+import threading
+import unittest
+from pathlib import Path
+
+import numpy as np
+
+import palpate
+from common import Served
+
+
+class Hand:
+    """A device of Python's making, that presses 2 mm deep. `fails_at` counts its readings."""
+
+    limits = {"force_n": 3.0, "continuous_n": 1.0, "workspace_m": 0.1}
+
+    def __init__(self, fails_at=None, height_m=-0.002):
+        self.readings, self.forces, self.fails_at, self.height_m = 0, [], fails_at, height_m
+        self.threads = set()
+
+    def read(self):
+        self.readings += 1
+        self.threads.add(threading.get_ident())
+        if self.readings == self.fails_at:
+            raise OverflowError("the arm is off its hinge")
+        return (0.0, 0.0, max(0.003 - 2e-5 * self.readings, self.height_m)), self.readings % 300 < 150
+
+    def write(self, force_n):
+        self.forces.append(force_n)
+
+
+def felt(touch):
+    """What came of a touch in which something was felt. A busy machine may connect only when the device's time is over."""
+    for _ in range(20):
+        touched = touch()
+        if touched.force_n.size and np.abs(touched.force_n).max() > 0.0:
+            return touched
+    raise AssertionError("nothing was felt")
+
+
+class Clients(Served, unittest.TestCase):
+    def test_a_session_runs_pauses_changes_and_ends(self):
+        server = palpate.connect(self.url)
+        self.assertIn("paper", server.scenes())
+        with server.create_session("paper", paused=True) as session:
+            status = session.status()
+            self.assertEqual((status["state"], status["step"], status["points"]), ("paused", 0, 961))
+            self.assertEqual(session.change(stiffness_n_per_m=20.0), 0)
+            session.start(until_step=50)
+            step, digest = session.hash(at_step=50)
+            self.assertEqual((step, session.status()["state"]), (50, "paused"))
+            self.assertEqual(server.session(session.id).hash(), (50, digest))
+            self.assertIn(session.id, [other["session_id"] for other in server.sessions()])
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / "moment.mcap"
+                path.write_bytes(session.save())
+                here = palpate.Journal(path).session()
+            self.assertEqual((here.steps, here.hash), (50, digest))
+        with self.assertRaises(palpate.Refused) as raised:
+            session.status()
+        self.assertEqual(raised.exception.reason, "UNKNOWN_SESSION")
+
+    def test_a_scene_of_ones_own_has_the_bits_of_this_process(self):
+        scene = palpate.Scene("paper", set={"sheet.points": [20, 24], "springs.stiffness_n_per_m": 15.0})
+        with palpate.connect(self.url).create_session(scene, paused=True) as session:
+            self.assertEqual(session.status()["points"], 480)
+            self.assertEqual(session.hash()[1], palpate.Session(scene).hash)
+
+    def test_a_course_is_felt_and_seen(self):
+        with palpate.connect(self.url).create_session("liver") as session:
+            frames, samples = session.frames(rate_hz=30), session.samples()
+            first = next(frames)
+            touched = felt(lambda: session.touch(palpate.press(depth_m=0.003, seconds=2.0)))
+            self.assertIsNone(touched.lost)
+            self.assertGreater(len(touched.time_s), 300)
+            # It pushes the hand up, and only where there is tissue.
+            self.assertGreater(touched.force_n[:, 2].max(), 0.0)
+            self.assertEqual(np.abs(touched.force_n[~touched.enabled]).max(initial=0.0), 0.0)
+            self.assertLess(np.linalg.norm(touched.force_n, axis=1).max(), 3.3 + 1e-9)
+            self.assertGreater(touched.poses, 10)
+            self.assertGreater(touched.samples, 3)
+            sampled = samples.take(500)
+            self.assertTrue((np.diff(sampled.step.astype(np.int64)) > 0).all())
+            self.assertEqual(set(sampled.tool), {0})
+            self.assertGreater(sampled.felt["force_on_tool_n"][:, 2].max(), 0.0)
+            # Each one that comes is newer, and of the whole surface.
+            self.assertGreater(next(frames).step, first.step)
+            mesh = session.mesh()
+            self.assertEqual(mesh["rest_m"].shape[0], np.prod(mesh["grid"]))
+            self.assertEqual(first.displacement_m.shape[:2], mesh["grid"])
+            self.assertLess(mesh["triangles"].max(), mesh["rest_m"].shape[0])
+
+    def test_a_device_in_python_is_called_by_one_thread_and_left_without_force(self):
+        with palpate.connect(self.url).create_session("liver") as session:
+            for _ in range(20):
+                hand = Hand()
+                touched = session.touch(hand, seconds=1.5, remember=False)
+                if any(any(force) for force in hand.forces):
+                    break
+        self.assertEqual(hand.readings + 1, len(hand.forces))
+        self.assertGreater(max(force[2] for force in hand.forces), 0.0)
+        self.assertEqual(hand.forces[-1], (0.0, 0.0, 0.0))
+        self.assertEqual(len(hand.threads), 1)
+        self.assertNotEqual(hand.threads, {threading.get_ident()})
+        self.assertEqual(len(touched.time_s), 0)
+
+    def test_an_exception_of_a_device_comes_back_as_itself(self):
+        hand = Hand(fails_at=200)
+        with palpate.connect(self.url).create_session("liver") as session:
+            with self.assertRaisesRegex(OverflowError, "off its hinge"):
+                session.touch(hand, seconds=5.0)
+        self.assertEqual((hand.readings, hand.forces[-1]), (200, (0.0, 0.0, 0.0)))
+        with palpate.connect(self.url).create_session("liver") as session:
+            for device in (object(), palpate.Course([[0, 0, float("inf")]]), palpate.Course([[0, 0, 0]], "omega4")):
+                with self.assertRaises(palpate.Refused):
+                    session.touch(device, seconds=0.1)
+
+    def test_refusals_and_broken_connections_are_told_apart(self):
+        server = palpate.connect(self.url)
+        for refused, reason in [
+            (lambda: server.create_session("no-such-scene"), "UNKNOWN_SCENE"),
+            (lambda: server.session("0" * 16), "UNKNOWN_SESSION"),
+            (lambda: server.create_session(palpate.Scene("gallbladder")), "WRONG_KIND"),
+            (lambda: palpate.connect("ftp://here"), "OUT_OF_RANGE"),
+        ]:
+            with self.assertRaises(palpate.Refused) as raised:
+                refused()
+            self.assertEqual(raised.exception.reason, reason, raised.exception)
+        with self.assertRaises(palpate.Disconnected):
+            palpate.connect("http://127.0.0.1:1", within_s=2.0)
+        with self.assertRaises(ConnectionError):
+            palpate.connect("http://127.0.0.1:1", within_s=2.0)
+
+
+class Awaiting(Served, unittest.IsolatedAsyncioTestCase):
+    async def test_several_sessions_are_touched_and_watched_at_once(self):
+        server = await palpate.aio.connect(self.url)
+        self.assertIn("liver", await server.scenes())
+
+        async def one(depth_m):
+            async with await server.create_session("liver") as session:
+                frames = await session.frames(rate_hz=20)
+                touching = asyncio.ensure_future(session.touch(palpate.press(depth_m, seconds=2.0)))
+                # The first frame comes at once; others only while something moves.
+                first = await frames.__anext__()
+                more = asyncio.ensure_future(frames.__anext__())
+                touched = await touching
+                more.cancel()
+                return first.displacement_m.shape, touched
+
+        found = await asyncio.gather(*(one(depth_m) for depth_m in (0.001, 0.004)))
+        for shape, touched in found:
+            self.assertEqual(shape, (31, 31, 3))
+            self.assertIsNone(touched.lost)
+            self.assertGreater(len(touched.time_s), 0)
+        with self.assertRaises(palpate.Refused):
+            await server.session("0" * 16)
+
+    async def test_a_stream_ends_with_its_session_and_a_wait_can_be_cancelled(self):
+        server = await palpate.aio.connect(self.url)
+        session = await server.create_session("liver", paused=True)
+        samples = await session.samples()
+        waiting = asyncio.ensure_future(session.hash(at_step=10**6))
+        await asyncio.sleep(0.1)
+        waiting.cancel()
+        with self.assertRaises(asyncio.CancelledError):
+            await waiting
+        hand = Hand()
+        touching = asyncio.ensure_future(session.touch(hand))
+        while len(hand.forces) < 50 and not touching.done():
+            await asyncio.sleep(0.02)
+        touching.cancel()
+        with self.assertRaises(asyncio.CancelledError):
+            await touching
+        while hand.readings == len(hand.forces) or hand.forces[-1] != (0.0, 0.0, 0.0):
+            await asyncio.sleep(0.02)
+        await session.delete()
+        with self.assertRaises(palpate.Refused) as raised:
+            async for _ in samples:
+                pass
+        self.assertEqual(raised.exception.reason, "SESSION_DELETED")
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -1,0 +1,144 @@
+// The datagrams of a lease: poses and samples by WebTransport (courier.ts), where browser, server and network let them
+// through. Nothing depends on that: calls carry everything else, and everything if there are none.
+
+import type { Counts, Heard, Led, Order, Word } from "./courier.js";
+import type { DatagramOffer, Sample } from "./gen/palpate/v1/haptic_pb.js";
+import { isUnimplemented, PATIENCE_MS, reasonOf, type Server } from "./server.js";
+
+/** Longest wait before a session is tried again: a network that blocks it still will. */
+const AVOID_MS = 60_000;
+/** First wait for another session where one has worked. A browser gives one up that hears nothing for some seconds. */
+const AGAIN_MS = 1000;
+
+/** When sessions are tried again; never where the browser has none. */
+let avoidedMs = typeof WebTransport === "undefined" ? Infinity : 0;
+/** The wait after the next failure. */
+let waitMs = AVOID_MS;
+
+export class Datagrams {
+  onSample: (sample: Sample) => void = () => {};
+  onRejected: (reason: string, message: string) => void = () => {};
+  /** The way changed. */
+  onChange: () => void = () => {};
+  networkMs: number | undefined;
+  /** Whether they get through. */
+  carries = false;
+  private worker: Worker | undefined;
+  private leaseId = "";
+  private again: ReturnType<typeof setTimeout> | undefined;
+  /** The largest revision of an owner of the session that was seen. */
+  private revision = 0n;
+  private now = none();
+  private before = none();
+
+  constructor(
+    private readonly server: Server,
+    private readonly sessionId: string,
+    private readonly tool: number,
+    private readonly sampleEverySteps: number,
+  ) {}
+
+  /** What was carried, over all leases. */
+  get counts(): Counts {
+    return sum(this.before, this.now);
+  }
+
+  /** Opens a session for a lease, as soon as it can, and another if it fails; until `close`. */
+  open(leaseId: string): void {
+    this.close();
+    this.leaseId = leaseId;
+    const dueMs = avoidedMs - performance.now();
+    if (dueMs === Infinity) return;
+    if (dueMs > 0) this.again = setTimeout(() => void this.ask(leaseId), dueMs);
+    else void this.ask(leaseId);
+  }
+
+  private async ask(leaseId: string): Promise<void> {
+    const { sessionId, sampleEverySteps } = this;
+    try {
+      const { offer } = await this.server.haptics.openDatagrams({ sessionId, leaseId, sampleEverySteps }, { timeoutMs: PATIENCE_MS });
+      if (offer && leaseId === this.leaseId) this.start(offer);
+    } catch (error) {
+      // The server has none, or is older than they are. Any other refusal is of this lease, or of the moment.
+      if (reasonOf(error) === "NOT_AVAILABLE" || isUnimplemented(error)) avoidedMs = performance.now() + AVOID_MS;
+    }
+  }
+
+  /** A session has ended by itself. */
+  private failed(worked: boolean): void {
+    if (worked) waitMs = AGAIN_MS;
+    avoidedMs = performance.now() + waitMs;
+    waitMs = Math.min(AVOID_MS, 2 * waitMs);
+    this.open(this.leaseId);
+    this.onChange();
+  }
+
+  private start(offer: DatagramOffer): void {
+    const host = offer.host || new URL(this.server.urlOf(this.sessionId)).hostname;
+    const ticket = [...offer.ticket].map((byte) => byte.toString(16).padStart(2, "0")).join("");
+    const worker = new Worker(new URL("./courier.js", import.meta.url), { type: "module", name: "datagrams" });
+    this.worker = worker;
+    worker.onmessage = ({ data }: MessageEvent<Heard>) => {
+      if (this.worker === worker) this.heard(data);
+    };
+    worker.onerror = () => this.worker === worker && this.failed(false);
+    const url = `https://${host}:${offer.port}/touch/${ticket}`;
+    worker.postMessage({ url, certificateSha256: offer.certificateSha256.slice(), tool: this.tool } satisfies Order);
+  }
+
+  private heard({ carries, counts, networkMs, sample, rejection, isOver }: Heard): void {
+    this.now = counts;
+    this.networkMs = networkMs;
+    if (isOver) return this.failed(counts.came > 0);
+    if (sample) this.take(sample);
+    if (rejection) this.onRejected(rejection.reason, rejection.message);
+    if (carries === this.carries) return;
+    this.carries = carries;
+    this.onChange();
+  }
+
+  /** A server that does not have the session any more has no say. */
+  private take(sample: Sample): void {
+    if (sample.ownershipRevision < this.revision) return;
+    this.revision = sample.ownershipRevision;
+    this.onSample(sample);
+  }
+
+  /** Leads the tip, until `rest`. Sequences rise from `from` on. */
+  lead(led: Led): void {
+    this.worker?.postMessage(led);
+  }
+
+  rest(): void {
+    this.say("rest");
+  }
+
+  /** Closes the session. */
+  close(): void {
+    clearTimeout(this.again);
+    this.leaseId = "";
+    this.say("close");
+    this.worker = undefined;
+    this.carries = false;
+    this.networkMs = undefined;
+    [this.before, this.now] = [this.counts, none()];
+  }
+
+  private say(word: Word): void {
+    this.worker?.postMessage(word);
+  }
+}
+
+function none(): Counts {
+  return { sent: 0, came: 0, poses: 0, samples: 0, fellBack: 0 };
+}
+
+function sum(a: Counts, b: Counts): Counts {
+  return {
+    sent: a.sent + b.sent,
+    came: a.came + b.came,
+    poses: a.poses + b.poses,
+    samples: a.samples + b.samples,
+    fellBack: a.fellBack + b.fellBack,
+  };
+}

@@ -1,0 +1,64 @@
+// The mesh of a session, as `GetMesh` tells it: what does not change while the tissue moves.
+
+import type { GetMeshResponse } from "./gen/palpate/v1/view_pb.js";
+import { PATIENCE_MS, type Server } from "./server.js";
+
+export interface MeshData {
+  /** Vertices of a frame along x and along y; a frame's last places may stand for no vertex. */
+  places: [number, number];
+  /** x, y, z of each vertex, m. */
+  restM: Float32Array<ArrayBuffer>;
+  /** u, v of each vertex; empty if there are none. */
+  uv: Float32Array<ArrayBuffer>;
+  /** Three vertices each, counter-clockwise from outside. */
+  triangles: Uint32Array<ArrayBuffer>;
+  /** The number of each vertex as forces and samples name it. */
+  fileVertex: Uint32Array<ArrayBuffer>;
+  /** The usual length of an edge, m. */
+  edgeM: number;
+}
+
+/** Parts of an array, one after the other. */
+function joined<A extends Float32Array<ArrayBuffer> | Uint32Array<ArrayBuffer>>(parts: number[][], make: (length: number) => A): A {
+  const whole = make(parts.reduce((sum, part) => sum + part.length, 0));
+  let at = 0;
+  for (const part of parts) {
+    whole.set(part, at);
+    at += part.length;
+  }
+  return whole;
+}
+
+/** What is read of a part. */
+type Part = Pick<
+  GetMeshResponse,
+  "restPositionM" | "textureCoordinates" | "triangles" | "fileVertex" | "verticesX" | "verticesY" | "vertexSpacingM"
+>;
+
+/** Puts the parts together. Throws if a triangle has a vertex that is not there. */
+export function meshOf(parts: Part[]): MeshData {
+  const floats = (length: number) => new Float32Array(length);
+  const whole = (length: number) => new Uint32Array(length);
+  const restM = joined(parts.map((part) => part.restPositionM), floats);
+  const count = restM.length / 3;
+  const uv = joined(parts.map((part) => part.textureCoordinates), floats);
+  const triangles = joined(parts.map((part) => part.triangles), whole);
+  const named = joined(parts.map((part) => part.fileVertex), whole);
+  const first = parts[0];
+  if (!first || triangles.some((vertex) => vertex >= count)) throw new RangeError("the server's mesh is not whole");
+  return {
+    places: [first.verticesX, first.verticesY],
+    restM,
+    uv: uv.length === 2 * count ? uv : floats(0),
+    triangles,
+    fileVertex: named.length === count ? named : Uint32Array.from({ length: count }, (_, i) => i),
+    edgeM: first.vertexSpacingM,
+  };
+}
+
+/** Asks for the mesh of a session. */
+export async function fetchMesh(server: Server, sessionId: string): Promise<MeshData> {
+  const parts: GetMeshResponse[] = [];
+  for await (const part of server.views.getMesh({ sessionId }, { timeoutMs: PATIENCE_MS })) parts.push(part);
+  return meshOf(parts);
+}

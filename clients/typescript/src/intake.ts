@@ -1,0 +1,141 @@
+// A worker that receives frames and returns credit, however long the page takes to draw. The page gets the newest state
+// in one buffer that is passed back and forth: while the page has it, changes accumulate here, and nothing queues.
+
+import { Field, type Rectangle } from "./field.js";
+import { Encoding, type WatchFramesResponse } from "./gen/palpate/v1/view_pb.js";
+import { type Failure, keepOpen, PATIENCE_MS, Server } from "./server.js";
+
+/** Frames in flight: a round trip of 60 ms at 60 frames a second. */
+const IN_FLIGHT = 4;
+
+/** The stream to receive: the page's first message. Each later message returns the buffer. */
+export interface Order {
+  url: string;
+  token: string;
+  sessionId: string;
+  refinement: number;
+  vertices: [number, number];
+}
+
+/** The newest frame, and the changes since the last message. */
+export interface News {
+  changed: Rectangle;
+  /** Displacements of the rectangle, at the beginning of the buffer. */
+  values: Float32Array<ArrayBuffer>;
+  step: bigint;
+  timeS: number;
+  /** Frames received, frames that the server skipped in all of this stream, and bytes. */
+  taken: number;
+  skipped: bigint;
+  bytes: number;
+}
+
+export interface Trouble {
+  failure: Failure;
+  waitMs: number;
+}
+
+// TypeScript can't load the type libraries for workers and for pages together.
+const page = self as unknown as {
+  onmessage: (event: MessageEvent<Order | Float32Array<ArrayBuffer>>) => void;
+  postMessage: (message: News | Trouble, transfer?: Transferable[]) => void;
+};
+
+class Intake {
+  private readonly field: Field;
+  private buffer: Float32Array<ArrayBuffer> | undefined;
+  private taken = 0;
+  private last: WatchFramesResponse | undefined;
+  /** Frames skipped by the server: in the earlier streams, and in total. */
+  private skipped = { before: 0n, now: 0n };
+
+  private readonly server: Server;
+
+  constructor(private readonly order: Order) {
+    this.server = new Server(order.url, order.token);
+    this.field = new Field(...order.vertices);
+    this.buffer = new Float32Array(this.field.displacementM.length);
+    // The stream ends with the worker.
+    const { signal } = new AbortController();
+    void keepOpen(
+      (signal, alive) => this.read(signal, alive),
+      signal,
+      (failure, waitMs) => page.postMessage({ failure, waitMs }),
+    );
+  }
+
+  private async read(signal: AbortSignal, alive: () => void): Promise<void> {
+    const { sessionId, refinement } = this.order;
+    const request = { sessionId, refinement, encoding: Encoding.I16, maxFramesInFlight: IN_FLIGHT };
+    const credit = new Credit(this.server, signal);
+    this.skipped.before = this.skipped.now;
+    let parts: WatchFramesResponse[] = [];
+    for await (const part of this.server.views.watchFrames(request, { signal })) {
+      alive();
+      parts.push(part);
+      if (!part.last) continue;
+      // Apply all parts at once, so that half a frame is never visible.
+      for (const each of parts) each.patches.forEach((patch) => this.field.write(each, patch));
+      parts = [];
+      credit.giveBack(part.viewerId, part.frameId);
+      this.taken += 1;
+      this.skipped.now = this.skipped.before + part.skippedFrames;
+      this.last = part;
+      this.tell();
+    }
+  }
+
+  /** The page has finished with the buffer. */
+  reuse(buffer: Float32Array<ArrayBuffer>): void {
+    this.buffer = buffer;
+    this.tell();
+  }
+
+  private tell(): void {
+    const { buffer: values, last } = this;
+    if (!values || !last || this.taken === 0) return;
+    const changed = this.field.takeChanged() ?? { a0: 0, a1: -1, b0: 0, b1: -1 };
+    this.field.copyTo(values, changed);
+    const { step, simulationTimeS: timeS } = last;
+    const { received } = this.server;
+    const news = { changed, values, step, timeS, taken: this.taken, skipped: this.skipped.now, bytes: received.bytes };
+    [this.buffer, this.taken, received.bytes] = [undefined, 0, 0];
+    page.postMessage(news, [values.buffer]);
+  }
+}
+
+/** Acknowledges frames, one message at a time, always the newest. */
+class Credit {
+  private due: [string, bigint] | undefined;
+  private underWay = false;
+
+  constructor(
+    private readonly server: Server,
+    private readonly signal: AbortSignal,
+  ) {}
+
+  giveBack(viewerId: string, frameId: bigint): void {
+    this.due = [viewerId, frameId];
+    if (!this.underWay) void this.send();
+  }
+
+  private async send(): Promise<void> {
+    this.underWay = true;
+    while (this.due && !this.signal.aborted) {
+      const [viewerId, frameId] = this.due;
+      this.due = undefined;
+      try {
+        await this.server.views.acknowledgeFrames({ viewerId, frameId }, { signal: this.signal, timeoutMs: PATIENCE_MS });
+      } catch {
+        // The stream fails as well and reports it; or the next acknowledgement covers this one.
+      }
+    }
+    this.underWay = false;
+  }
+}
+
+let intake: Intake | undefined;
+page.onmessage = ({ data }) => {
+  if (data instanceof Float32Array) return intake?.reuse(data);
+  intake = new Intake(data);
+};

@@ -1,0 +1,235 @@
+// A tool of a session, held by a lease.
+//
+// Commands go by calls. Poses of a tip go by datagram while datagrams get through (datagrams.ts); they have times, by which
+// the server plays them. Poses that go by calls have none, and act when they come: a page can't promise one every 50 ms.
+
+import type { MessageInitShape } from "@bufbuild/protobuf";
+import { Datagrams } from "./datagrams.js";
+import type { CommandSchema, Sample } from "./gen/palpate/v1/haptic_pb.js";
+import { type Lead, poseOf } from "./poses.js";
+import { describe, isGone, PATIENCE_MS, reasonOf, type Server } from "./server.js";
+
+type Command = MessageInitShape<typeof CommandSchema>;
+
+/** What a tool does: a force or a position, as the protocol has them. */
+export type Action = NonNullable<Command["action"]>;
+
+/** What a tool is to do now: lead its tip, or another action. `isMoving`: it will be another in a moment, unasked. */
+export type Wanted = ({ lead: Lead } | { action: Action }) & { isMoving?: boolean };
+
+/** In the tissue's own time, without a newer command: a page that vanishes does not keep pressing. */
+const TIME_TO_LIVE_S = 2;
+/** Interval between identical commands: well within the time to live. */
+const REPEAT_MS = 100;
+/** Interval between checks for something to send. */
+const TICK_MS = 15;
+const LEASE_S = 4;
+/** After this time at rest the tool is released. */
+const IDLE_MS = 5000;
+/** Between sequences of what goes different ways: datagrams count on from theirs. */
+const APART = 1n << 32n;
+/** Batches in flight: a round trip does not slow the hand down, and connections stay free for other calls. */
+const IN_FLIGHT = 2;
+
+export class Tool {
+  /** It was taken or lost. */
+  onChange: () => void = () => {};
+  onRefused: (message: string, reason: string) => void = () => {};
+  /** Poses and samples that go by datagram. */
+  readonly datagrams: Datagrams;
+  /** Round trip of the last batch minus the time that the server held it, ms. */
+  private callMs: number | undefined;
+  private leaseId: string | undefined;
+  private taking: Promise<boolean> | undefined;
+  private sequence = 0n;
+  /** The sequence from which datagrams count, while poses go by them. */
+  private from: bigint | undefined;
+  private wanted: ((nowMs: number) => Wanted) | undefined;
+  private released = true;
+  private fresh = false;
+  private underWay = 0;
+  private sentMs = 0;
+  private touchedMs = 0;
+  private timer: ReturnType<typeof setInterval> | undefined;
+
+  /** Tool number `tool` of a session; `holder` is the name that others see. Nothing is taken yet. */
+  constructor(
+    private readonly server: Server,
+    readonly sessionId: string,
+    private readonly holder: string,
+    sampleEverySteps = 10,
+    readonly tool = 0,
+  ) {
+    this.datagrams = new Datagrams(server, sessionId, tool, sampleEverySteps);
+    this.datagrams.onChange = () => this.changed();
+    this.datagrams.onRejected = (reason, message) => {
+      if (!["STALE_SEQUENCE", "NOT_HOLDER"].includes(reason)) this.onRefused(message, reason);
+    };
+  }
+
+  /** Round trip of commands minus the time that the server held them, ms. */
+  get networkMs(): number | undefined {
+    return this.datagrams.networkMs ?? this.callMs;
+  }
+
+  get holds(): boolean {
+    return this.leaseId !== undefined;
+  }
+
+  get touches(): boolean {
+    return this.wanted !== undefined;
+  }
+
+  /** Takes the tool if it is free. */
+  take(): Promise<boolean> {
+    if (this.leaseId) return Promise.resolve(true);
+    this.taking ??= this.acquire().finally(() => (this.taking = undefined));
+    return this.taking;
+  }
+
+  private async acquire(): Promise<boolean> {
+    const { sessionId, tool, holder } = this;
+    try {
+      const call = { timeoutMs: PATIENCE_MS };
+      const { leaseId } = await this.server.haptics.acquireTool({ sessionId, tool, leaseS: LEASE_S, holder }, call);
+      this.leaseId = leaseId;
+      this.sequence = 0n;
+      this.from = undefined;
+      this.datagrams.open(leaseId);
+      this.touchedMs = performance.now();
+      this.timer ??= setInterval(() => this.tick(), TICK_MS);
+      this.onChange();
+      return true;
+    } catch (error) {
+      this.wanted = undefined;
+      this.onRefused(describe(error), reasonOf(error));
+      this.onChange();
+      return false;
+    }
+  }
+
+  /** Touches from now on: takes the tool if need be, and asks `wanted` at each time what it is to do. */
+  async touch(wanted: (nowMs: number) => Wanted): Promise<boolean> {
+    this.wanted = wanted;
+    this.released = false;
+    this.touchedMs = performance.now();
+    this.fresh = true;
+    const holds = await this.take();
+    if (holds) this.tick();
+    return holds;
+  }
+
+  /** Leads the tip of the tool to a place, where it stays until it is told another or to rest. */
+  lead(lead: Lead): Promise<boolean> {
+    return this.touch(() => ({ lead }));
+  }
+
+  /** What it is to do has changed. */
+  changed(): void {
+    if (this.wanted) this.touchedMs = performance.now();
+    this.fresh = true;
+    this.tick();
+  }
+
+  /** Ends the touch; the tool is kept for a while. */
+  rest(): void {
+    if (!this.wanted) return;
+    this.wanted = undefined;
+    this.datagrams.rest();
+    this.touchedMs = performance.now();
+    this.fresh = true;
+    this.tick();
+  }
+
+  /** Releases the tool. */
+  async letGo(): Promise<void> {
+    const { leaseId, sessionId } = this;
+    this.wanted = undefined;
+    this.lost();
+    if (!leaseId) return;
+    try {
+      await this.server.haptics.releaseTool({ sessionId, leaseId }, { timeoutMs: PATIENCE_MS });
+    } catch {
+      // The lease lapses by itself, and the tool's action ends with it.
+    }
+  }
+
+  private lost(): void {
+    this.leaseId = undefined;
+    this.datagrams.close();
+    clearInterval(this.timer);
+    this.timer = undefined;
+    this.onChange();
+  }
+
+  /** Sends what it is to do, if that is due. */
+  private tick(): void {
+    if (!this.leaseId) return;
+    const now = performance.now();
+    const wanted = this.wanted?.(now);
+    if (wanted && "lead" in wanted && this.datagrams.carries) return this.leadOn(wanted.lead, now);
+    if (this.underWay >= IN_FLIGHT) return;
+    const isRest = !wanted && this.released;
+    if (isRest && now - this.touchedMs > IDLE_MS) return void this.letGo();
+    // At rest, send just often enough to keep the lease.
+    if (!this.fresh && now - this.sentMs < (isRest ? (LEASE_S * 1000) / 4 : REPEAT_MS)) return;
+    this.fresh = wanted?.isMoving ?? false;
+    this.sentMs = now;
+    const commands = isRest ? [] : [this.command(wanted, now)];
+    this.released = !wanted;
+    void this.send(this.leaseId, commands);
+  }
+
+  private leadOn(lead: Lead, now: number): void {
+    this.from ??= this.sequence += APART;
+    this.datagrams.lead({ lead, from: this.from });
+    // They keep the lease.
+    this.sentMs = now;
+    this.fresh = false;
+  }
+
+  private command(wanted: Wanted | undefined, now: number): Command {
+    this.datagrams.rest();
+    this.sequence += this.from === undefined ? 1n : APART;
+    this.from = undefined;
+    const { tool, sequence } = this;
+    const command = { tool, sequence, clientTimeNs: BigInt(Math.round(now * 1e6)) };
+    if (!wanted) return { ...command, action: { case: "release", value: {} } };
+    const timeToLiveS = TIME_TO_LIVE_S;
+    if ("lead" in wanted) {
+      return { ...command, clientTimeNs: 0n, timeToLiveS, action: { case: "pose", value: poseOf(wanted.lead) } };
+    }
+    return { ...command, timeToLiveS, action: wanted.action };
+  }
+
+  private async send(leaseId: string, commands: Command[]): Promise<void> {
+    const begun = performance.now();
+    this.underWay += 1;
+    try {
+      const request = { sessionId: this.sessionId, leaseId, commands };
+      const { sample } = await this.server.haptics.sendCommands(request, { timeoutMs: PATIENCE_MS });
+      if (sample && commands.length > 0) this.measure(sample, performance.now() - begun);
+    } catch (error) {
+      // Two batches may overtake each other: the newer one counts.
+      if (reasonOf(error) !== "STALE_SEQUENCE" && this.leaseId === leaseId) this.failed(error);
+    } finally {
+      this.underWay -= 1;
+    }
+    this.tick();
+  }
+
+  private measure(sample: Sample, tookMs: number): void {
+    const tool = sample.tools[0];
+    if (tool && tool.acknowledgedSequence === this.sequence) {
+      this.callMs = Math.max(0, tookMs - Number(tool.serverHoldNs) / 1e6);
+    }
+  }
+
+  private failed(error: unknown): void {
+    if (isGone(error)) this.wanted = undefined;
+    if (reasonOf(error) !== "NOT_HOLDER" && !isGone(error)) return this.onRefused(describe(error), reasonOf(error));
+    // The server ended the lease because no command came for too long. A user who still presses takes the tool again.
+    this.lost();
+    if (this.wanted) void this.take().then((holds) => holds && this.tick());
+  }
+}

@@ -1,0 +1,7 @@
+// The messages and services of the protocol, palpate.v1, as generated.
+
+export * from "./gen/palpate/v1/geometry_pb.js";
+export * from "./gen/palpate/v1/haptic_pb.js";
+export * from "./gen/palpate/v1/scene_pb.js";
+export * from "./gen/palpate/v1/session_pb.js";
+export * from "./gen/palpate/v1/view_pb.js";

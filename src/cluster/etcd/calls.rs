@@ -1,0 +1,201 @@
+//! One call at whichever member answers: which are tried, for how long, and when not again.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::time::Duration;
+
+use palpate_proto::etcd::etcdserverpb::ResponseHeader;
+use tokio::time::{Instant, sleep, timeout};
+use tonic::metadata::MetadataValue;
+use tonic::transport::Channel;
+use tonic::{Request, Status};
+
+use super::error::{EtcdError, Result, Verdict, advice, is_of_transport, judge, text};
+use super::login::{Login, Token};
+use super::member::{BACK_OFF, Member};
+use super::options::EtcdOptions;
+
+/// The first wait between two rounds of attempts; it doubles up to [`BACK_OFF`].
+const FIRST_WAIT: Duration = Duration::from_millis(25);
+
+/// All members, and what calls know of them.
+pub(super) struct Calls {
+    pub(super) members: Vec<Member>,
+    /// Time limit of an attempt.
+    pub(super) limit: Duration,
+    login: Login,
+    /// The member that answered last.
+    preferred: AtomicUsize,
+    /// The latest term of etcd's leaders that we have heard of.
+    term: AtomicU64,
+}
+
+/// An attempt at a member.
+pub(super) struct Way {
+    pub(super) member: usize,
+    /// The number of the connection.
+    pub(super) number: u64,
+    pub(super) channel: Channel,
+    token: Option<Token>,
+}
+
+impl Way {
+    /// A request with our token, which only a member with a leader takes.
+    pub(super) fn request<M>(&self, message: M) -> Request<M> {
+        let mut request = Request::new(message);
+        request.metadata_mut().insert("hasleader", MetadataValue::from_static("true"));
+        if let Some(token) = &self.token {
+            request.metadata_mut().insert("token", token.value.clone());
+        }
+        request
+    }
+}
+
+/// Whether a call may be done twice.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Repeat {
+    /// Twice is as good as once.
+    Freely,
+    /// Only if it was certainly not done.
+    Never,
+}
+
+/// What came of an attempt at one member.
+enum Attempt<T> {
+    Done(T),
+    Refused(String),
+    NotDone(String),
+    Lost(String),
+}
+
+impl Calls {
+    pub(super) fn new(options: EtcdOptions, limit: Duration) -> Result<Self> {
+        let uris = options.checked()?;
+        let options = Arc::new(options);
+        // Many clients begin at different members.
+        let mut random = [0; 4];
+        let first = getrandom::fill(&mut random).map_or(0, |()| u32::from_le_bytes(random) as usize % uris.len());
+        let members = uris.into_iter().map(|uri| Member::new(uri, options.clone(), limit)).collect();
+        let (preferred, term) = (AtomicUsize::new(first), AtomicU64::new(0));
+        Ok(Calls { members, limit, login: Login::new(options), preferred, term })
+    }
+
+    /// The member that answered last.
+    pub(super) fn preferred(&self) -> usize {
+        self.preferred.load(Ordering::Relaxed)
+    }
+
+    /// Has calls begin at the next member, unless they already begin at another.
+    pub(super) fn pass_over(&self, member: usize) {
+        let next = (member + 1) % self.members.len();
+        let _ = self.preferred.compare_exchange(member, next, Ordering::Relaxed, Ordering::Relaxed);
+    }
+
+    /// Takes note of the term in an answer; whether it is the latest that we have heard of. An older one comes from a member
+    /// that has not yet heard of the present leader.
+    pub(super) fn is_latest(&self, header: Option<&ResponseHeader>) -> bool {
+        let term = header.map_or(0, |header| header.raft_term);
+        self.term.fetch_max(term, Ordering::Relaxed) <= term
+    }
+
+    /// Does a call at the first member that can. It is tried for as long as all members together have time for an attempt, then
+    /// the attempt that is under way ends.
+    pub(super) async fn call<T, F, A>(&self, what: &str, repeat: Repeat, attempt: F) -> Result<T>
+    where
+        F: Fn(Way) -> A,
+        A: Future<Output = std::result::Result<T, Status>>,
+    {
+        let count = self.members.len();
+        let end = Instant::now() + self.limit * u32::try_from(count).unwrap_or(1);
+        let mut reasons = BTreeMap::new();
+        let mut wait = FIRST_WAIT;
+        loop {
+            let first = self.preferred();
+            for member in (first..first + count).map(|index| index % count) {
+                let url = self.members[member].url();
+                match self.attempt(member, &attempt).await {
+                    Attempt::Done(answer) => {
+                        self.preferred.store(member, Ordering::Relaxed);
+                        return Ok(answer);
+                    }
+                    Attempt::Refused(why) => {
+                        let todo = advice(&why);
+                        return Err(EtcdError::Refused(format!("etcd at {url} refuses to {what}: {why}; {todo}")));
+                    }
+                    Attempt::Lost(why) if repeat == Repeat::Never => {
+                        self.pass_over(member);
+                        let todo = "read its keys again before you repeat it";
+                        let why = format!("etcd at {url} may or may not have done this: {what}: {why}; {todo}");
+                        return Err(EtcdError::Unknown(why));
+                    }
+                    Attempt::NotDone(why) | Attempt::Lost(why) => {
+                        self.pass_over(member);
+                        reasons.insert(url, why);
+                    }
+                }
+                if Instant::now() >= end {
+                    break;
+                }
+            }
+            if Instant::now() + wait >= end {
+                let reasons: Vec<String> = reasons.iter().map(|(url, why)| format!("{url}: {why}")).collect();
+                let todo =
+                    "check that most members run, that they reach each other, and that this machine reaches them";
+                let why = format!("no member of etcd can {what} ({}); {todo}", reasons.join("; "));
+                return Err(EtcdError::Unreachable(why));
+            }
+            sleep(wait).await;
+            wait = (2 * wait).min(BACK_OFF);
+        }
+    }
+
+    async fn attempt<T, F, A>(&self, index: usize, attempt: &F) -> Attempt<T>
+    where
+        F: Fn(Way) -> A,
+        A: Future<Output = std::result::Result<T, Status>>,
+    {
+        let member = &self.members[index];
+        let (number, channel) = match member.line().await {
+            Ok(line) => line,
+            Err(why) => return Attempt::NotDone(why),
+        };
+        let mut stale = None;
+        loop {
+            let token = match timeout(self.limit, self.login.token(&channel, stale)).await {
+                Ok(Ok(token)) => token,
+                Ok(Err(status)) if judge(&status) == Verdict::Refused => return Attempt::Refused(text(&status)),
+                Ok(Err(status)) => {
+                    if is_of_transport(&status) {
+                        member.give_up(number).await;
+                    }
+                    return Attempt::NotDone(text(&status));
+                }
+                Err(_) => {
+                    member.give_up(number).await;
+                    return Attempt::NotDone(member.silent());
+                }
+            };
+            let used = token.as_ref().map(|token| token.number);
+            let way = Way { member: index, number, channel: channel.clone(), token };
+            let status = match timeout(self.limit, attempt(way)).await {
+                Ok(Ok(answer)) => return Attempt::Done(answer),
+                Ok(Err(status)) => status,
+                Err(_) => {
+                    member.give_up(number).await;
+                    return Attempt::Lost(member.silent());
+                }
+            };
+            if is_of_transport(&status) {
+                member.give_up(number).await;
+            }
+            match judge(&status) {
+                // Once: a new token that is not taken either is a refusal.
+                Verdict::Stale if used.is_some() && stale.is_none() => stale = used,
+                Verdict::Stale | Verdict::Refused => return Attempt::Refused(text(&status)),
+                Verdict::Elsewhere => return Attempt::NotDone(text(&status)),
+                Verdict::Lost => return Attempt::Lost(text(&status)),
+            }
+        }
+    }
+}

@@ -1,0 +1,159 @@
+//! What makes a server one of a fleet: the section `[cluster]` of the configuration.
+
+use std::path::PathBuf;
+
+use serde::Deserialize;
+
+use crate::cluster::key::{Keys, check_name};
+use crate::refusal::{Reason, Refusal, Result};
+
+/// The section `[cluster]`.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ClusterConfig {
+    /// URLs of the members of etcd. Empty: the server is of no fleet.
+    pub etcd: Vec<String>,
+    /// Name of the fleet: servers of one name share their sessions.
+    pub name: String,
+    /// URL under which clients and other servers of the fleet reach this one.
+    pub advertise: Option<String>,
+    /// Name of this server in the fleet; empty: host and port of `advertise`.
+    pub node: String,
+    /// Time to live of the server's lease, s: so long after its death others may take over.
+    pub ttl_s: u64,
+    /// What `durable_step` means: `one`, on the disk of this server; `two`, also on that of the server that stands by.
+    pub durable: Durable,
+    /// Tells Agones how the server stands, by the SDK at `localhost:$AGONES_SDK_GRPC_PORT` (9357).
+    pub agones: bool,
+    /// Certificate authorities (PEM) of the other servers of the fleet. This one shows them its own certificate, `tls_cert`.
+    pub ca: Option<PathBuf>,
+    /// Certificate authorities (PEM) of etcd.
+    pub etcd_ca: Option<PathBuf>,
+    /// This server's certificate for etcd, PEM.
+    pub etcd_cert: Option<PathBuf>,
+    /// Its key, PEM.
+    pub etcd_key: Option<PathBuf>,
+    /// User of etcd, if it asks for a password.
+    pub etcd_user: Option<String>,
+    /// File of that user's password.
+    pub etcd_password_file: Option<PathBuf>,
+}
+
+/// What the rest of the configuration has.
+pub(super) struct Beside {
+    pub(super) journal: bool,
+    pub(super) tls_client_ca: bool,
+    pub(super) insecure: bool,
+}
+
+/// Where what is called durable is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "snake_case")]
+pub enum Durable {
+    /// On the disk of the server.
+    #[default]
+    One,
+    /// Also on that of the server that stands by.
+    Two,
+}
+
+impl Default for ClusterConfig {
+    fn default() -> Self {
+        ClusterConfig {
+            etcd: Vec::new(),
+            name: "default".to_owned(),
+            advertise: None,
+            node: String::new(),
+            ttl_s: 3,
+            durable: Durable::One,
+            agones: false,
+            ca: None,
+            etcd_ca: None,
+            etcd_cert: None,
+            etcd_key: None,
+            etcd_user: None,
+            etcd_password_file: None,
+        }
+    }
+}
+
+impl ClusterConfig {
+    /// Whether the server is of a fleet.
+    pub fn is_on(&self) -> bool {
+        !self.etcd.is_empty()
+    }
+
+    /// The URL for others; that of a server that is of a fleet.
+    pub(super) fn endpoint(&self) -> &str {
+        self.advertise.as_deref().unwrap_or_default().trim_end_matches('/')
+    }
+
+    /// This server's name in its fleet.
+    pub(super) fn node(&self) -> String {
+        if self.node.is_empty() {
+            self.endpoint().split_once("://").map_or("", |(_, rest)| rest).replace(['[', ']'], "")
+        } else {
+            self.node.clone()
+        }
+    }
+
+    /// Checks the section, and that the rest of the configuration fits it.
+    ///
+    /// # Errors
+    /// Names the first key that is missing or wrong.
+    pub(super) fn check(&self, beside: Beside) -> Result<()> {
+        if !self.is_on() {
+            if self.advertise.is_some() || !self.node.is_empty() || self.agones {
+                let message = "is missing: without the URLs of etcd the server is of no fleet";
+                return Err(Refusal::new(Reason::Missing, "cluster.etcd", message));
+            }
+            return Ok(());
+        }
+        let missing = |field: &str, why: &str| Err(Refusal::new(Reason::Missing, field, format!("is missing: {why}")));
+        let Some(advertise) = &self.advertise else {
+            return missing(
+                "cluster.advertise",
+                "clients and other servers must know under which URL they reach this one",
+            );
+        };
+        let uri = advertise.parse::<http::Uri>().ok().filter(|uri| uri.scheme().is_some() && uri.host().is_some());
+        let Some(uri) = uri.filter(|uri| uri.path() == "/") else {
+            let message = format!("must be http://host:port or https://host:port, but is `{advertise}`");
+            return Err(Refusal::new(Reason::WrongKind, "cluster.advertise", message));
+        };
+        if !beside.journal {
+            return missing("journal", "other servers of the fleet continue sessions from their journals");
+        }
+        Keys::of(&self.name)?;
+        check_name("cluster.node", &self.node())?;
+        if !(2..=60).contains(&self.ttl_s) {
+            let message = format!("must be from 2 to 60 s, but is {}", self.ttl_s);
+            return Err(Refusal::new(Reason::OutOfRange, "cluster.ttl_s", message));
+        }
+        let host = uri.host().unwrap_or_default().trim_matches(['[', ']']);
+        let is_here = host == "localhost" || host.parse::<std::net::IpAddr>().is_ok_and(|at| at.is_loopback());
+        let is_secure = uri.scheme_str() == Some("https") && self.ca.is_some() && beside.tls_client_ca;
+        if !is_here && !is_secure && !beside.insecure {
+            let message = "other machines can reach this server: its fleet needs TLS on both sides. Give --tls-cert, --tls-key, \
+                           --tls-client-ca and --cluster-ca, and an https:// URL (see docs/fleet.md), or pass --insecure: then \
+                           everyone who can reach it may do everything";
+            return Err(Refusal::new(Reason::Missing, "cluster.ca", message));
+        }
+        let pairs = [
+            ("cluster.etcd_cert", self.etcd_cert.is_some(), "cluster.etcd_key", self.etcd_key.is_some()),
+            ("cluster.etcd_key", self.etcd_key.is_some(), "cluster.etcd_cert", self.etcd_cert.is_some()),
+            (
+                "cluster.etcd_user",
+                self.etcd_user.is_some(),
+                "cluster.etcd_password_file",
+                self.etcd_password_file.is_some(),
+            ),
+        ];
+        for (field, given, needs, there) in pairs {
+            if given && !there {
+                return missing(needs, &format!("{field} requires it"));
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,52 @@
+//! Answers of a server of a fleet: behind the fence nothing more is said. A frozen server that thaws has samples and answers that
+//! waited to be sent; another server may have the session by then.
+
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+
+use bytes::Bytes;
+use http::HeaderMap;
+use http_body::Frame;
+use tonic::Status;
+use tonic::body::Body;
+
+use crate::pace::fence::Fence;
+use crate::pace::fenced;
+
+/// The body of an answer, until the fence is passed.
+pub(in crate::server) struct FencedBody {
+    body: Body,
+    fence: Arc<Fence>,
+    is_over: bool,
+}
+
+impl FencedBody {
+    pub(in crate::server) fn wrap(body: Body, fence: Arc<Fence>) -> Body {
+        Body::new(FencedBody { body, fence, is_over: false })
+    }
+}
+
+impl http_body::Body for FencedBody {
+    type Data = Bytes;
+    type Error = Status;
+
+    fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+        if self.is_over {
+            return Poll::Ready(None);
+        }
+        let frame = Pin::new(&mut self.body).poll_frame(context);
+        // After the frame was made, so that no freeze lies between.
+        if !self.fence.may_act() {
+            self.is_over = true;
+            let mut trailers = HeaderMap::new();
+            let _ = Status::from(fenced()).add_header(&mut trailers);
+            return Poll::Ready(Some(Ok(Frame::trailers(trailers))));
+        }
+        frame
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.is_over || self.body.is_end_stream()
+    }
+}

@@ -1,0 +1,209 @@
+//! Moves sessions of this server to others while they go on.
+//!
+//! The other server first gets the session's state while it goes on, and makes its tissue of that: the longer part. Then the session
+//! stands here, the other gets its last state, and etcd says in one transaction that it is the owner. If anything fails before that,
+//! the session goes on here.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use futures_util::stream::{self, Stream};
+use palpate_proto::pb;
+use pb::take_session_request::Message as Say;
+use tokio::sync::mpsc;
+use tokio::time::timeout;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::Streaming;
+use tracing::{info, warn};
+
+use super::{Fleet, elsewhere};
+use crate::cluster::key::SessionValue;
+use crate::cluster::{placement, rules};
+use crate::lock::lock;
+use crate::pace::clock::now_ns;
+use crate::pace::{Live, Present};
+use crate::refusal::{Reason, Refusal, Result, excerpt};
+use crate::server::journals::recorded;
+use crate::session::lease::HandedLease;
+
+/// The other server makes the tissue within this time, or the session stays.
+const PREPARATION: Duration = Duration::from_secs(30);
+
+/// The session stands for no longer than this.
+const STANDSTILL: Duration = Duration::from_secs(2);
+
+/// Bytes in one message.
+const PART_BYTES: usize = 256 << 10;
+
+pub(super) fn broken(why: &str) -> Refusal {
+    Refusal::new(Reason::NotAvailable, "node", format!("the session stays here: {why}"))
+}
+
+/// One stream to the server that is to take a session.
+struct Handing {
+    say: mpsc::Sender<pb::TakeSessionRequest>,
+    heard: Streaming<pb::TakeSessionResponse>,
+}
+
+impl Handing {
+    async fn send(&self, message: Say) -> Result<()> {
+        let message = pb::TakeSessionRequest { message: Some(message) };
+        self.say.send(message).await.map_err(|_| broken("the other server has ended the stream"))
+    }
+
+    /// Sends a state, and waits until the other server has made a session of it.
+    async fn state(&mut self, bytes: &[u8]) -> Result<()> {
+        for part in bytes.chunks(PART_BYTES) {
+            self.send(Say::Part(part.to_vec())).await?;
+        }
+        self.send(Say::Part(Vec::new())).await?;
+        self.answered().await
+    }
+
+    async fn answered(&mut self) -> Result<()> {
+        match self.heard.message().await {
+            Ok(Some(_)) => Ok(()),
+            Ok(None) => Err(broken("the other server has ended the stream")),
+            Err(status) => Err(broken(status.message())),
+        }
+    }
+}
+
+#[allow(clippy::cast_precision_loss)]
+fn held_lease(lease: HandedLease) -> pb::HeldLease {
+    let HandedLease { tool, id, holder, duration_ns, owner } = lease;
+    pb::HeldLease { tool, lease_id: format!("{id:032x}"), holder, lease_s: duration_ns as f64 * 1e-9, owner }
+}
+
+impl Fleet {
+    /// Moves a session of this server to `node`, or, if that is empty, to the one with the most room. Tells who has it then, and for
+    /// how long no step was done, s.
+    ///
+    /// # Errors
+    /// Refuses an unknown node, one that gives other bits, and if the other does not take it: then the session goes on here.
+    pub(in crate::server) async fn move_session(
+        self: Arc<Self>,
+        live: Arc<Live>,
+        node: &str,
+    ) -> Result<(pb::Ownership, f64)> {
+        let (name, there) = {
+            let nodes = self.nodes.borrow();
+            let own = lock(&self.own).replays;
+            let mut others = (**nodes).clone();
+            others.retain(|name, there| *name != self.node && there.replays == own);
+            let name = if node.is_empty() {
+                placement::roomiest(&others).unwrap_or_default().to_owned()
+            } else {
+                node.to_owned()
+            };
+            let Some(there) = others.remove(&name) else {
+                let message = if node.is_empty() {
+                    "no other server of the fleet takes sessions of this release".to_owned()
+                } else {
+                    format!("`{}` is none of the other servers of the fleet that give the same bits", excerpt(node))
+                };
+                return Err(Refusal::new(Reason::OutOfRange, "node", message));
+            };
+            (name, there)
+        };
+        if live.playback.is_some() {
+            return Err(Refusal::new(
+                Reason::NotAvailable,
+                "session_id",
+                "a session that plays what was recorded can't be moved",
+            ));
+        }
+        let (say, said) = mpsc::channel(16);
+        let opening = self.peers.at(&there.endpoint)?.take_session(ReceiverStream::new(said)).await;
+        let heard = opening.map_err(|status| broken(status.message()))?.into_inner();
+        let mut handing = Handing { say, heard };
+        let first = self.state_of(&live, live.save().await?).await?;
+        timeout(PREPARATION, handing.state(&first)).await.map_err(|_| broken("the other server is too slow"))??;
+        let present = live.freeze().await?;
+        let begun_ns = now_ns();
+        let handed = timeout(STANDSTILL, self.hand_over(&live, present, &name, &mut handing)).await;
+        let revision = match handed.unwrap_or_else(|_| Err(broken("the other server or etcd is too slow"))) {
+            Ok(revision) => revision,
+            Err(refusal) => match self.settled(&live.id).await {
+                Some((value, revision)) if value.node == name => revision,
+                _ => {
+                    live.thaw();
+                    return Err(refusal);
+                }
+            },
+        };
+        #[allow(clippy::cast_precision_loss)]
+        let gap_s = now_ns().saturating_sub(begun_ns) as f64 * 1e-9;
+        self.lose(&live.id, elsewhere(&name, there.endpoint.clone()));
+        self.tally.moved.one_more();
+        info!(session = %live.id, node = name, revision, gap_s, "session moved");
+        let value = SessionValue { node: name, standby: String::new() };
+        Ok((self.ownership(&value, revision), gap_s))
+    }
+
+    /// The last part: the session stands.
+    async fn hand_over(&self, live: &Arc<Live>, present: Present, to: &str, handing: &mut Handing) -> Result<u64> {
+        let last = self.state_of(live, present).await?;
+        handing.state(&last).await?;
+        let revision = self.revision(&live.id).unwrap_or_else(|| live.revision());
+        let over = |revision| rules::hand_over(&self.keys, &live.id, revision, [&self.node, to]);
+        let is_done = |found: Option<&SessionValue>| found.is_some_and(|value| value.node == to);
+        let made = self.change(&live.id, revision, over, is_done).await?;
+        let revision = made.map_err(|_| broken("etcd has another owner, or one of the servers has lost its lease"))?;
+        // From here on the session is the other's, whatever becomes of this stream.
+        let leases = live.at_intake(|intake, _| intake.handed()).into_iter().map(held_lease).collect();
+        if handing.send(Say::TakeOver(pb::TakeOver { revision, leases })).await.is_err()
+            || handing.answered().await.is_err()
+        {
+            warn!(session = %live.id, "the other server has the session, but has not said so");
+        }
+        Ok(revision)
+    }
+
+    /// Who has the session, after a transaction that may still be done: this server says once more that it has it, after which the
+    /// other can't be done any more. However long that takes, the session stands.
+    async fn settled(&self, id: &str) -> Option<(SessionValue, u64)> {
+        let is_own = |found: Option<&SessionValue>| found.is_some_and(|value| value.node == self.node);
+        loop {
+            let revision = self.revision(id)?;
+            let keep = |revision| rules::keep(&self.keys, id, revision, &self.node, "");
+            match self.change(id, revision, keep, is_own).await {
+                Ok(Ok(now)) => {
+                    lock(&self.standbys).remove(id);
+                    if let Some(owned) = lock(&self.owned).get_mut(id) {
+                        owned.revision = now;
+                    }
+                    return Some((SessionValue { node: self.node.clone(), standby: String::new() }, now));
+                }
+                Ok(Err(found)) => return found,
+                Err(refusal) => warn!(session = %id, "who has this session is not known: {refusal}"),
+            }
+            tokio::time::sleep(Duration::from_millis(100)).await;
+        }
+    }
+
+    async fn state_of(&self, live: &Arc<Live>, present: Present) -> Result<Vec<u8>> {
+        let live = live.clone();
+        let encoded = tokio::task::spawn_blocking(move || recorded::snapshot(&live, &present)).await;
+        encoded.map_err(|error| broken(&error.to_string()))?
+    }
+
+    /// Takes no new sessions, and moves all to others; or takes sessions again. Tells what became of each.
+    pub(in crate::server) fn drain(self: Arc<Self>, is_on: bool) -> impl Stream<Item = pb::DrainNodeResponse> {
+        self.set_draining(is_on);
+        let sessions = if is_on { self.pacer.list() } else { Vec::new() };
+        let left: Vec<Arc<Live>> = sessions.into_iter().rev().collect();
+        stream::unfold((self, left), |(fleet, mut left)| async move {
+            let live = left.pop()?;
+            let session_id = live.id.clone();
+            let moved = fleet.clone().move_session(live, "").await;
+            let (node, fault) = match moved {
+                Ok((ownership, _)) => (ownership.node, String::new()),
+                Err(refusal) => (String::new(), refusal.to_string()),
+            };
+            let told =
+                pb::DrainNodeResponse { session_id, node, fault, left: u32::try_from(left.len()).unwrap_or(u32::MAX) };
+            Some((told, (fleet, left)))
+        })
+    }
+}

@@ -1,0 +1,120 @@
+//! What a server has sent is recorded, with the places of a hand: Rust, C and C# make the same forces of it, bit by bit.
+
+use std::time::Duration;
+
+use glam::DVec3;
+use palpate_client::Reading;
+use palpate_client::bridge::{Offline, Origin};
+use palpate_proto::{pb, touch};
+use palpate_touch::{Device, Tip};
+use pb::command::Action;
+use pb::touch_response::Message as Heard;
+use prost::Message;
+
+use crate::server::{PATIENCE, Server, Touch, open};
+use crate::{ALONE, compiled, compiled_cs, done, folder, has_mono, mono, ours, told};
+
+/// What happened at the client, in order.
+enum Event {
+    Arrived(Vec<u8>),
+    Ticked { time_s: f64, place_m: DVec3, enable: bool },
+}
+
+/// A hand that goes down, slides and comes back, m from the middle.
+fn place_m(time_s: f64) -> DVec3 {
+    let press_m = 0.004 * (3.0 * (time_s - 0.4)).clamp(0.0, 1.0) * (4.0 * (1.4 - time_s)).clamp(0.0, 1.0);
+    let slide_m = 0.006 * (2.0 * (time_s - 0.8)).clamp(0.0, 1.0);
+    DVec3::new(slide_m, -0.3 * slide_m, 0.001 - press_m)
+}
+
+/// A second and a half of touch of a real server, as it came.
+async fn recorded(server: &Server) -> (DVec3, Vec<Event>) {
+    let source = pb::create_session_request::Source::SceneName("liver".into());
+    let session = server.create(source, false).await.unwrap();
+    let middle_m = palpate_proto::geometry::from_vector(session.extent.unwrap().middle_m.as_ref());
+    let request = pb::TouchOpen {
+        device: Some(touch::device(&Device::named("omega3").unwrap())),
+        tip: Some(touch::tip(&Tip::default())),
+        ..open(&session.session_id, &[0])
+    };
+    let mut stream = Touch::open(server, request).await.unwrap();
+    let bytes = |message: Heard| Event::Arrived(pb::TouchResponse { message: Some(message) }.encode_to_vec());
+    let mut events = vec![bytes(Heard::Opened(stream.opened.clone().unwrap()))];
+    for tick in 0..1500_u32 {
+        let time_s = 1e-3 * f64::from(tick);
+        let place_m = middle_m + place_m(time_s);
+        events.push(Event::Ticked { time_s, place_m, enable: tick > 5 });
+        let command = pb::Command {
+            sequence: Some(1 + u64::from(tick)),
+            // The clock of a ticker begins at 1 s.
+            client_time_ns: 1_000_000_000 + 1_000_000 * u64::from(tick),
+            action: Some(Action::Pose(touch::pose(place_m, &Tip::default()))),
+            ..Default::default()
+        };
+        stream.command(command).await;
+        // Everything that comes within a millisecond.
+        let until = tokio::time::Instant::now() + Duration::from_millis(1);
+        while let Ok(heard) = tokio::time::timeout_at(until, stream.hear()).await {
+            events.push(bytes(heard.unwrap().unwrap()));
+        }
+    }
+    (middle_m, events)
+}
+
+/// The file of `replay.c`.
+fn written(middle_m: DVec3, events: &[Event]) -> Vec<u8> {
+    let mut file = Vec::new();
+    let numbers = |file: &mut Vec<u8>, numbers: &[f64]| numbers.iter().for_each(|x| file.extend(x.to_le_bytes()));
+    numbers(&mut file, &middle_m.to_array());
+    for event in events {
+        match event {
+            Event::Arrived(bytes) => {
+                file.extend(0_u32.to_le_bytes());
+                file.extend(u32::try_from(bytes.len()).unwrap().to_le_bytes());
+                file.extend(bytes);
+            }
+            Event::Ticked { time_s, place_m, enable } => {
+                file.extend(1_u32.to_le_bytes());
+                numbers(&mut file, &[*time_s, place_m.x, place_m.y, place_m.z, f64::from(u8::from(*enable))]);
+            }
+        }
+    }
+    file
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_force_course_is_the_same_in_every_language() {
+    let _alone = ALONE.lock().await;
+    let server = Server::start(&[]);
+    let (middle_m, events) = tokio::time::timeout(PATIENCE, recorded(&server)).await.expect("the server is silent");
+    let device = Device::named("omega3").unwrap();
+    let Offline { mut ticker, mut record } = Offline::new(device, Origin::Tissue, middle_m, 0.0);
+    let (mut forces, mut most_n) = (Vec::new(), 0.0_f64);
+    for event in &events {
+        match event {
+            Event::Arrived(bytes) => record.arrive(bytes).unwrap(),
+            Event::Ticked { time_s, place_m, enable } => {
+                let force_n = ticker.tick(Reading { place_m: *place_m, enable: *enable }, *time_s);
+                most_n = most_n.max(force_n.length());
+                force_n.to_array().iter().for_each(|part| forces.extend(part.to_le_bytes()));
+            }
+        }
+    }
+    assert_eq!(forces.len(), 1500 * 24);
+    assert!(most_n > 0.1, "{most_n} N: the record shows no touch");
+    let replay = compiled("clients/c/tests/replay.c", &[]);
+    let (recorded, by_c, by_cs) = (folder().join("record"), folder().join("c.forces"), folder().join("cs.forces"));
+    std::fs::write(&recorded, written(middle_m, &events)).unwrap();
+    done(ours(&replay).args([&recorded, &by_c]));
+    assert!(std::fs::read(&by_c).unwrap() == forces, "C renders other forces");
+    // Glibc lets a program have these functions of its own.
+    if cfg!(target_env = "gnu") {
+        let counted = told(&done(ours(&compiled("clients/c/tests/counted.c", &["-ldl"])).arg(&recorded)));
+        let expected = serde_json::json!({ "ticks": 1500, "memory": 0, "locks": 0, "system_calls": 0 });
+        assert_eq!(counted, expected, "what ticks ask of the system");
+    }
+    if has_mono() {
+        done(mono(&compiled_cs("clients/csharp/tests/Replay.cs")).args([&recorded, &by_cs]));
+        assert!(std::fs::read(&by_cs).unwrap() == forces, "C# renders other forces");
+    }
+}
