@@ -5,6 +5,8 @@
 #![cfg(target_os = "linux")]
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
+#[path = "common/authority.rs"]
+mod authority;
 #[path = "common/fleet.rs"]
 mod fleet;
 #[path = "common/proxy.rs"]
@@ -18,6 +20,7 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use authority::Authority;
 use fleet::{Etcd, Node, owner, until, until_stood_by};
 use palpate::journal::{Reader, file, replay};
 use palpate::limits::Limits;
@@ -268,7 +271,19 @@ async fn a_session_moves_with_its_tools_and_the_same_bits() {
     let mut at = owner(&nodes, &id).await.unwrap();
     let mut touch = Touch::hold(nodes[at].there(), &id).await;
     touch.command(force(0, 1, -0.1)).await;
-    touch.sample_with(|sample| sample.tools.first().is_some_and(|tool| tool.acknowledged_sequence == 1)).await;
+    let pressed =
+        touch.sample_with(|sample| sample.tools.first().is_some_and(|tool| tool.acknowledged_sequence == 1)).await;
+    // Their step comes when another server has the session.
+    let harder_at = pressed.step + 1000;
+    touch.command(pb::Command { at_step: Some(harder_at), ..force(0, 2, -0.3) }).await;
+    let request = pb::UpdateTissueRequest {
+        session_id: id.clone(),
+        at_step: Some(harder_at + 200),
+        stiffness_n_per_m: Some(40.0),
+        ..pb::UpdateTissueRequest::default()
+    };
+    nodes[at].there().sessions().await.update_tissue(request).await.unwrap();
+    until("the command waits", async || nodes[at].session(&id).await.unwrap().commands.unwrap().waiting == 1).await;
     for _ in 0..4 {
         let to = (at + 1) % 3;
         let lease_id = touch.opened.as_ref().unwrap().lease_id.clone();
@@ -292,6 +307,13 @@ async fn a_session_moves_with_its_tools_and_the_same_bits() {
         goes_on(&nodes, &id, &nodes[to], false).await;
         at = to;
     }
+    let harder = touch.sample_with(|sample| force_n(sample) > 0.2).await;
+    assert!(harder.step > harder_at, "{harder:?}");
+    until("the tissue has changed", async || {
+        let session = nodes[at].session(&id).await.unwrap();
+        session.scene.unwrap().springs.unwrap().stiffness_n_per_m == Some(40.0)
+    })
+    .await;
     // A lease that is none, and an unknown server.
     let open = pb::TouchOpen { lease_id: "0".repeat(32), ..server::open(&id, &[0]) };
     assert_eq!(Touch::open(nodes[at].there(), open).await.err().unwrap().code(), Code::PermissionDenied);
@@ -493,4 +515,91 @@ async fn owner_of(nodes: &[Node], among: &[usize], id: &str) -> usize {
         }
     }
     panic!("nobody has {id}")
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn servers_know_each_other_by_certificates_and_clients_by_tokens() {
+    if !fleet::is_there() {
+        return;
+    }
+    let _one = ONE.lock().await;
+    let folder = tempfile::tempdir().unwrap();
+    let etcd = Etcd::start(folder.path(), 1);
+    let authority = Authority::new();
+    let write = |name: &str, text: &str| {
+        let path = folder.path().join(name);
+        std::fs::write(&path, text).unwrap();
+        path.display().to_string()
+    };
+    let known = "[[certificate]]\nname = \"node-0\"\nroles = [\"node\"]\n[[certificate]]\nname = \"node-1\"\nroles = [\"node\"]\n";
+    let (ca, tokens) = (write("ca.pem", &authority.pem), write("tokens.toml", known));
+    let roles = "create,touch,administer";
+    let made = server::palpate(&["token", "--name", "ann", "--role", roles, "--tokens", &tokens]);
+    let token = String::from_utf8(made.stdout).unwrap().trim().to_owned();
+    let urls = [(); 2].map(|()| format!("https://127.0.0.1:{}", fleet::port()));
+    let serve = |at: usize| {
+        let (cert, key) = authority.sign_node(&format!("node-{at}"));
+        let (cert, key) = (write(&format!("{at}.pem"), &cert), write(&format!("{at}.key"), &key));
+        let journal = folder.path().join(format!("journal-{at}")).display().to_string();
+        let of_the_fleet =
+            ["--cluster", &etcd.urls[0], "--advertise", &urls[at], "--cluster-ca", &ca, "--journal", &journal];
+        let of_tls = ["--tls-cert", &cert, "--tls-key", &key, "--tokens", &tokens, "--threads", "1"];
+        Server::start_at(urls[at].trim_start_matches("https://"), &[&of_the_fleet[..], &of_tls].concat())
+    };
+    let _servers = [serve(0), serve(1)];
+    let bearer = format!("Bearer {token}");
+    let authorized = |mut request: tonic::Request<()>| {
+        request.metadata_mut().insert("authorization", bearer.parse().unwrap());
+        Ok::<_, tonic::Status>(request)
+    };
+    let to = async |at: usize, identity: Option<tonic::transport::Identity>| {
+        let trust = identity.into_iter().fold(authority.trust(), tonic::transport::ClientTlsConfig::identity);
+        let endpoint = tonic::transport::Channel::from_shared(urls[at].clone()).unwrap();
+        endpoint.tls_config(trust).unwrap().connect().await.unwrap()
+    };
+    // A client needs no certificate.
+    let there = to(0, None).await;
+    let mut admin = pb::admin_service_client::AdminServiceClient::with_interceptor(there.clone(), authorized);
+    until("both are of the fleet", async || {
+        let listed = admin.list_nodes(pb::ListNodesRequest {}).await;
+        listed.is_ok_and(|listed| listed.get_ref().nodes.iter().filter(|node| !node.draining).count() == 2)
+    })
+    .await;
+    let mut sessions = pb::session_service_client::SessionServiceClient::with_interceptor(there.clone(), authorized);
+    let source = pb::create_session_request::Source::SceneName("paper".into());
+    let request = pb::CreateSessionRequest { source: Some(source), ..pb::CreateSessionRequest::default() };
+    let session = sessions.create_session(request).await.unwrap().into_inner().session.unwrap();
+    let id = session.session_id;
+    // One server sends the other its journals, and hands sessions over.
+    let mut ownership = session.ownership.unwrap();
+    until("a session has a standby", async || {
+        let request = pb::LocateSessionRequest { session_id: id.clone() };
+        ownership = sessions.locate_session(request).await.unwrap().into_inner().ownership.unwrap();
+        !ownership.standby.is_empty()
+    })
+    .await;
+    let owner = urls.iter().position(|url| *url == ownership.endpoint).unwrap();
+    let mut admin = pb::admin_service_client::AdminServiceClient::with_interceptor(to(owner, None).await, authorized);
+    let node = ownership.standby.clone();
+    let request = pb::MoveSessionRequest { session_id: id.clone(), node };
+    let moved = admin.move_session(request).await.unwrap().into_inner().ownership.unwrap();
+    assert_eq!(moved.node, ownership.standby);
+    // What is between servers is for servers: neither a token that administers is enough, nor a client without one.
+    let create_here = || pb::CreateHereRequest::default();
+    let mut calls = pb::node_service_client::NodeServiceClient::with_interceptor(there.clone(), authorized);
+    let refused = calls.create_here(create_here()).await.unwrap_err();
+    assert_eq!(server::told(&refused).1, "ROLE_MISSING");
+    let mut calls = pb::node_service_client::NodeServiceClient::new(there);
+    assert_eq!(calls.create_here(create_here()).await.unwrap_err().code(), Code::Unauthenticated);
+    // A certificate of these authorities whose name has no role is as good as none; one of others is not let in.
+    let of = |(cert, key): (String, String)| Some(tonic::transport::Identity::from_pem(cert, key));
+    let mut calls = pb::node_service_client::NodeServiceClient::new(to(0, of(authority.sign_node("node-9"))).await);
+    assert_eq!(calls.create_here(create_here()).await.unwrap_err().code(), Code::Unauthenticated);
+    let trust = authority.trust().identity(of(Authority::new().sign_node("node-1")).unwrap());
+    let endpoint = tonic::transport::Channel::from_shared(urls[0].clone()).unwrap();
+    // TLS 1.3 tells a client of its certificate only after the handshake.
+    if let Ok(channel) = endpoint.tls_config(trust).unwrap().connect().await {
+        let mut calls = pb::node_service_client::NodeServiceClient::new(channel);
+        assert!(calls.create_here(create_here()).await.is_err());
+    }
 }

@@ -1,6 +1,8 @@
 //! Who may do what: TLS, tokens, certificates, and what a server does not start without.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
+#[path = "common/authority.rs"]
+mod authority;
 #[path = "common/server.rs"]
 mod server;
 
@@ -10,10 +12,11 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::{Arc, mpsc};
 
+use authority::Authority;
 use palpate::server::identity::{self, Access, CALLS, Role, access};
 use palpate_proto::pb;
 use prost::Message;
-use rcgen::{BasicConstraints, CertificateParams, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair, SanType};
+use rcgen::{CertificateParams, KeyPair};
 use server::{PATIENCE, Server, force, palpate, told};
 use tokio::io::AsyncReadExt;
 use tokio_rustls::TlsConnector;
@@ -22,7 +25,7 @@ use tokio_rustls::rustls::pki_types::CertificateDer;
 use tokio_rustls::rustls::pki_types::pem::PemObject;
 use tokio_rustls::rustls::{ClientConfig, RootCertStore};
 use tonic::metadata::MetadataValue;
-use tonic::transport::{Certificate, Channel, ClientTlsConfig, Identity};
+use tonic::transport::{Channel, ClientTlsConfig, Identity};
 use tonic::{Code, Request, Status};
 use tonic_types::StatusExt;
 
@@ -454,39 +457,6 @@ fn start_logged(arguments: &[&str]) -> (Server, Log) {
     let stderr = BufReader::new(server.child.stderr.take().unwrap());
     std::thread::spawn(move || stderr.lines().map_while(Result::ok).try_for_each(|line| lines.send(line)));
     (server, Log(log))
-}
-
-/// A certification authority and what it signs.
-struct Authority {
-    issuer: Issuer<'static, KeyPair>,
-    pem: String,
-}
-
-impl Authority {
-    fn new() -> Self {
-        let mut params = CertificateParams::default();
-        params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
-        let key = KeyPair::generate().unwrap();
-        let pem = params.self_signed(&key).unwrap().pem();
-        Authority { issuer: Issuer::new(params, key), pem }
-    }
-
-    /// Certificate and key of a server at 127.0.0.1, or of a client of that name.
-    fn sign(&self, client: Option<&str>) -> (String, String) {
-        let mut params = CertificateParams::default();
-        let (name, purpose) = match client {
-            Some(name) => (SanType::DnsName(name.try_into().unwrap()), ExtendedKeyUsagePurpose::ClientAuth),
-            None => (SanType::IpAddress([127, 0, 0, 1].into()), ExtendedKeyUsagePurpose::ServerAuth),
-        };
-        params.subject_alt_names.push(name);
-        params.extended_key_usages.push(purpose);
-        let key = KeyPair::generate().unwrap();
-        (params.signed_by(&key, &self.issuer).unwrap().pem(), key.serialize_pem())
-    }
-
-    fn trust(&self) -> ClientTlsConfig {
-        ClientTlsConfig::new().ca_certificate(Certificate::from_pem(&self.pem))
-    }
 }
 
 /// Writes files of a folder; tells their paths.

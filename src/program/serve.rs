@@ -81,7 +81,7 @@ pub(crate) struct ServeArguments {
     /// Name of the fleet [default: default]
     #[arg(long, value_name = "NAME")]
     cluster_name: Option<String>,
-    /// Certificate authorities (PEM) of the other servers of the fleet
+    /// Certificate authorities (PEM) of the servers of the fleet, which show each other --tls-cert; other clients need none
     #[arg(long, value_name = "FILE")]
     cluster_ca: Option<PathBuf>,
     /// What `durable_step` means in a fleet: on the disk of the server, or also on that of the one that stands by [default: one]

@@ -25,7 +25,8 @@ pub struct ClusterConfig {
     pub durable: Durable,
     /// Tells Agones how the server stands, by the SDK at `localhost:$AGONES_SDK_GRPC_PORT` (9357).
     pub agones: bool,
-    /// Certificate authorities (PEM) of the other servers of the fleet. This one shows them its own certificate, `tls_cert`.
+    /// Certificate authorities (PEM) of the servers of the fleet, for both ends of a connection between two. Each shows the others
+    /// its own certificate, `tls_cert`. Other clients need none.
     pub ca: Option<PathBuf>,
     /// Certificate authorities (PEM) of etcd.
     pub etcd_ca: Option<PathBuf>,
@@ -42,7 +43,7 @@ pub struct ClusterConfig {
 /// What the rest of the configuration has.
 pub(super) struct Beside {
     pub(super) journal: bool,
-    pub(super) tls_client_ca: bool,
+    pub(super) tls: bool,
     pub(super) insecure: bool,
 }
 
@@ -132,10 +133,10 @@ impl ClusterConfig {
         }
         let host = uri.host().unwrap_or_default().trim_matches(['[', ']']);
         let is_here = host == "localhost" || host.parse::<std::net::IpAddr>().is_ok_and(|at| at.is_loopback());
-        let is_secure = uri.scheme_str() == Some("https") && self.ca.is_some() && beside.tls_client_ca;
+        let is_secure = uri.scheme_str() == Some("https") && self.ca.is_some() && beside.tls;
         if !is_here && !is_secure && !beside.insecure {
             let message = "other machines can reach this server: its fleet needs TLS on both sides. Give --tls-cert, --tls-key, \
-                           --tls-client-ca and --cluster-ca, and an https:// URL (see docs/fleet.md), or pass --insecure: then \
+                           --tokens and --cluster-ca, and an https:// URL (see docs/fleet.md), or pass --insecure: then \
                            everyone who can reach it may do everything";
             return Err(Refusal::new(Reason::Missing, "cluster.ca", message));
         }

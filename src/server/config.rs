@@ -193,11 +193,7 @@ impl Config {
         }
         number("shutdown_deadline_s", self.shutdown_deadline_s, "above 0 and at most a day", within(day_s))?;
         number("audit_share", self.audit_share, "from 0 to 1", |share| (0.0..=1.0).contains(&share))?;
-        self.cluster.check(Beside {
-            journal: self.journal.is_some(),
-            tls_client_ca: self.tls_client_ca.is_some(),
-            insecure: self.insecure,
-        })?;
+        self.cluster.check(Beside { journal: self.journal.is_some(), tls: cert, insecure: self.insecure })?;
         number("idle_session_s", self.idle_session_s, "above 0", |value| value > 0.0)?;
         Ok(())
     }

@@ -24,7 +24,10 @@ impl Protection {
     pub(super) fn load(config: &Config, address: SocketAddr) -> Result<Self> {
         config.check()?;
         let tls = match (&config.tls_cert, &config.tls_key) {
-            (Some(cert), Some(key)) => Some(Arc::new(tls::load(cert, key, config.tls_client_ca.as_deref())?)),
+            (Some(cert), Some(key)) => {
+                let node_ca = config.cluster.ca.as_deref().filter(|_| config.cluster.is_on());
+                Some(Arc::new(tls::load(cert, key, config.tls_client_ca.as_deref(), node_ca)?))
+            }
             _ => None,
         };
         let certified = config.tls_client_ca.is_some();

@@ -43,16 +43,17 @@ impl Tls {
 }
 
 /// Loads the certificate chain `cert` and its key. With `client_ca`, clients must present a certificate that one of its
-/// authorities has signed.
-pub(super) fn load(cert: &Path, key: &Path, client_ca: Option<&Path>) -> Result<Reloaded<Tls>> {
+/// authorities has signed, or one of `node_ca`: those of the other servers of a fleet. With `node_ca` alone clients need none.
+pub(super) fn load(cert: &Path, key: &Path, client_ca: Option<&Path>, node_ca: Option<&Path>) -> Result<Reloaded<Tls>> {
     warn_if_readable(key, "the private key");
     let mut paths = vec![cert.to_owned(), key.to_owned()];
-    paths.extend(client_ca.map(Path::to_owned));
-    let named = paths.clone();
-    Reloaded::load("TLS", paths, move |texts| configure(&named, texts))
+    paths.extend(client_ca.into_iter().chain(node_ca).map(Path::to_owned));
+    let (named, everyone) = (paths.clone(), client_ca.is_some());
+    Reloaded::load("TLS", paths, move |texts| configure(&named, texts, everyone))
 }
 
-fn configure(paths: &[PathBuf], texts: &[String]) -> Result<Tls> {
+/// Of certificate, key and authorities. `everyone` needs a certificate of these, or only who wants to show one.
+fn configure(paths: &[PathBuf], texts: &[String], everyone: bool) -> Result<Tls> {
     let unreadable = |what: &str| Refusal::new(Reason::Unreadable, "", what.to_owned());
     let chain = certificates(&paths[0], &texts[0])?;
     let mut expiries: Vec<_> = chain.iter().filter_map(|c| Some((paths[0].clone(), validity::expires_s(c)?))).collect();
@@ -63,18 +64,19 @@ fn configure(paths: &[PathBuf], texts: &[String]) -> Result<Tls> {
     let builder = ServerConfig::builder_with_provider(provider.clone())
         .with_safe_default_protocol_versions()
         .map_err(|e| unreadable(&e.to_string()))?;
-    let builder = match (paths.get(2), texts.get(2)) {
-        (Some(path), Some(text)) => {
-            let refuse = |why: String| of_file(path)(unreadable(&why));
-            let mut roots = RootCertStore::empty();
-            for certificate in certificates(path, text)? {
-                expiries.extend(validity::expires_s(&certificate).map(|expires_s| (path.clone(), expires_s)));
-                roots.add(certificate).map_err(|e| refuse(e.to_string()))?;
-            }
-            let verifier = WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider).build();
-            builder.with_client_cert_verifier(verifier.map_err(|e| refuse(e.to_string()))?)
+    let mut roots = RootCertStore::empty();
+    for (path, text) in paths.iter().zip(texts).skip(2) {
+        for certificate in certificates(path, text)? {
+            expiries.extend(validity::expires_s(&certificate).map(|expires_s| (path.clone(), expires_s)));
+            roots.add(certificate).map_err(|e| of_file(path)(unreadable(&e.to_string())))?;
         }
-        _ => builder.with_no_client_auth(),
+    }
+    let builder = if roots.is_empty() {
+        builder.with_no_client_auth()
+    } else {
+        let verifier = WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider);
+        let verifier = if everyone { verifier } else { verifier.allow_unauthenticated() };
+        builder.with_client_cert_verifier(verifier.build().map_err(|e| unreadable(&e.to_string()))?)
     };
     let mut config = builder.with_single_cert(chain, key).map_err(|e| {
         let both = format!("can't be used with the key {}: {e}", paths[1].display());
