@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use super::command::{Command, Due};
-use super::lease::{HandedLease, LeaseId, Leases, QueueKey, not_held};
+use super::lease::{LeaseId, Leases, QueueKey, not_held};
 use super::queue::{Discarded, Queue};
 use super::rules::{Rules, tip_radius_m};
 use super::schedule::Schedule;
@@ -39,14 +39,14 @@ pub struct Intake {
     /// Commands of batches that are not in the queue yet.
     pub(super) coming: usize,
     /// Changes of tissue that wait for their step, by ascending step, and the memory of each.
-    changes: VecDeque<(u64, Arc<Model>, Option<Taken>)>,
+    pub(super) changes: VecDeque<(u64, Arc<Model>, Option<Taken>)>,
     /// Who pays for what waits here, and what was taken for commands.
-    account: Option<Account>,
+    pub(super) account: Option<Account>,
     taken: Option<Taken>,
     /// The last change accepted, if there was one.
-    changed_to: Option<Arc<Model>>,
+    pub(super) changed_to: Option<Arc<Model>>,
     pub(super) arrivals: u64,
-    next_step: u64,
+    pub(super) next_step: u64,
     /// The session rests: its steps up to this one are skipped, not computed.
     resting: Option<(Schedule, u64)>,
     /// A command or change has arrived that may take effect earlier, and the session's thread was woken for it.
@@ -357,16 +357,6 @@ impl Intake {
         let tools = self.leases.chosen(chosen);
         tools.iter().for_each(|tool| self.end(*tool));
         tools.len()
-    }
-
-    /// Each held tool with its lease, for a server that goes on with the session.
-    pub fn handed(&self) -> Vec<HandedLease> {
-        self.leases.handed()
-    }
-
-    /// Goes on with the leases of another server.
-    pub fn adopt(&mut self, leases: Vec<HandedLease>, now_ns: u64) {
-        leases.into_iter().for_each(|lease| self.leases.adopt(lease, now_ns));
     }
 
     /// Charges the tools of a lease to who took them, one of `charges` each.

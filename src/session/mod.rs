@@ -16,6 +16,7 @@ pub mod batch;
 pub mod check;
 pub mod command;
 mod dent;
+pub mod handing;
 pub mod input;
 pub mod intake;
 pub mod laws;

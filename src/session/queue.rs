@@ -137,7 +137,6 @@ impl Queue {
     }
 
     /// Everything that waits, in order.
-    #[cfg(test)]
     pub(super) fn in_order(&self) -> Vec<(QueueKey, &Due)> {
         let all = self.by_tool.values().chain([&self.endings]);
         let mut all: Vec<_> = all.flatten().map(|(key, due)| (*key, due)).collect();

@@ -19,11 +19,13 @@ use tracing::{info, warn};
 use super::{Fleet, elsewhere};
 use crate::cluster::key::SessionValue;
 use crate::cluster::{placement, rules};
+use crate::journal::inputs;
 use crate::lock::lock;
 use crate::pace::clock::now_ns;
 use crate::pace::{Live, Present};
 use crate::refusal::{Reason, Refusal, Result, excerpt};
 use crate::server::journals::recorded;
+use crate::session::handing::Handed;
 use crate::session::lease::HandedLease;
 
 /// The other server makes the tissue within this time, or the session stays.
@@ -73,6 +75,16 @@ impl Handing {
 fn held_lease(lease: HandedLease) -> pb::HeldLease {
     let HandedLease { tool, id, holder, duration_ns, owner } = lease;
     pb::HeldLease { tool, lease_id: format!("{id:032x}"), holder, lease_s: duration_ns as f64 * 1e-9, owner }
+}
+
+/// Tells the other server that it has the session, and what was in its intake.
+async fn hand(handing: &mut Handing, revision: u64, handed: Handed) -> Result<()> {
+    for piece in inputs::encoded(&handed.waiting) {
+        handing.send(Say::Waiting(piece)).await?;
+    }
+    let leases = handed.leases.into_iter().map(held_lease).collect();
+    handing.send(Say::TakeOver(pb::TakeOver { revision, leases })).await?;
+    handing.answered().await
 }
 
 impl Fleet {
@@ -151,10 +163,9 @@ impl Fleet {
         let made = self.change(&live.id, revision, over, is_done).await?;
         let revision = made.map_err(|_| broken("etcd has another owner, or one of the servers has lost its lease"))?;
         // From here on the session is the other's, whatever becomes of this stream.
-        let leases = live.at_intake(|intake, _| intake.handed()).into_iter().map(held_lease).collect();
-        if handing.send(Say::TakeOver(pb::TakeOver { revision, leases })).await.is_err()
-            || handing.answered().await.is_err()
-        {
+        let endpoint = self.nodes.borrow().get(to).map(|node| node.endpoint.clone()).unwrap_or_default();
+        let (handed, _) = live.at_intake(|intake, _| intake.hand_over(elsewhere(to, endpoint)));
+        if hand(handing, revision, handed).await.is_err() {
             warn!(session = %live.id, "the other server has the session, but has not said so");
         }
         Ok(revision)

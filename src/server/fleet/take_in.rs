@@ -8,20 +8,26 @@ use palpate_proto::pb;
 use pb::take_session_request::Message;
 use tokio::sync::mpsc;
 use tonic::{Status, Streaming};
-use tracing::info;
+use tracing::{info, warn};
 
 use super::{Fleet, Owned};
 use crate::budget::Resource;
-use crate::journal::Reader;
 use crate::journal::replay::{self, Known, Resumed};
+use crate::journal::{Reader, inputs};
 use crate::lock::lock;
 use crate::pace::{Begin, Live};
 use crate::refusal::{Reason, Refusal};
+use crate::session::handing::Handed;
+use crate::session::input::Input;
 use crate::session::lease::{HandedLease, LeaseId};
+use crate::sheet::Model;
 use crate::sheet::choice::NEVER;
 
 /// Bytes of a session's state, at most.
 const MOST_STATE_BYTES: usize = 1 << 30;
+
+/// Bytes of the inputs that wait, at most; what is beyond is dropped.
+const MOST_WAITING_BYTES: usize = 64 << 20;
 
 type Tell = mpsc::Sender<Result<pb::TakeSessionResponse, Status>>;
 
@@ -49,6 +55,22 @@ async fn state(inbound: &mut Streaming<pb::TakeSessionRequest>) -> Result<Vec<u8
     }
 }
 
+/// What says that the session has come, and before that the inputs that wait, in pieces.
+async fn what_it_had(inbound: &mut Streaming<pb::TakeSessionRequest>) -> (Option<Message>, Vec<Vec<u8>>) {
+    let (mut pieces, mut bytes) = (Vec::new(), 0);
+    loop {
+        match inbound.message().await.ok().flatten().and_then(|message| message.message) {
+            Some(Message::Waiting(piece)) => {
+                bytes += piece.len();
+                if bytes <= MOST_WAITING_BYTES {
+                    pieces.push(piece);
+                }
+            }
+            message => return (message, pieces),
+        }
+    }
+}
+
 impl Fleet {
     /// Takes a session, as the stream tells it.
     pub(in crate::server) async fn take_in(
@@ -73,13 +95,15 @@ impl Fleet {
         // Of the first state the tissue is made, which takes the longest.
         let before = self.restored(state(inbound).await?, None).await?;
         let _ = answer().await;
+        let first = before.first.clone();
         let known = Some((before.header, before.first));
         let live = self.admit(self.restored(state(inbound).await?, known).await?).await?;
         let _ = answer().await;
-        let message = inbound.message().await.ok().flatten().and_then(|message| message.message);
+        let (message, pieces) = what_it_had(inbound).await;
         let revision = match message {
             Some(Message::TakeOver(over)) => {
-                self.adopt(&live, over.leases);
+                let waiting = self.waiting(&live.id, pieces, first).await;
+                self.adopt(&live, over.leases, waiting);
                 over.revision
             }
             // Nobody says so any more: etcd knows.
@@ -97,6 +121,24 @@ impl Fleet {
         info!(session = %live.id, revision, "session taken");
         let _ = answer().await;
         Ok(())
+    }
+
+    /// The inputs that wait. What can't be read is left out: the session is this server's, and goes on.
+    async fn waiting(&self, id: &str, pieces: Vec<Vec<u8>>, first: Arc<Model>) -> Vec<(u64, Input)> {
+        let limits = self.config.limits.clone();
+        let read = move || -> crate::refusal::Result<Vec<(u64, Input)>> {
+            let mut waiting = Vec::new();
+            for piece in pieces {
+                waiting.extend(inputs::decoded(&piece, &first, &limits)?);
+            }
+            Ok(waiting)
+        };
+        match tokio::task::spawn_blocking(read).await {
+            Ok(Ok(waiting)) => return waiting,
+            Ok(Err(refusal)) => warn!(session = id, "what waited there can't be read: {refusal}"),
+            Err(error) => warn!(session = id, "what waited there can't be read: {error}"),
+        }
+        Vec::new()
     }
 
     /// The session, which stands and is not served yet. Whether there is room for it shows before the other server gives it up. Its
@@ -121,7 +163,7 @@ impl Fleet {
 
     /// The tools that are held go on being held.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    fn adopt(&self, live: &Live, leases: Vec<pb::HeldLease>) {
+    fn adopt(&self, live: &Live, leases: Vec<pb::HeldLease>, waiting: Vec<(u64, Input)>) {
         let longest_s = self.config.limits.lease_s;
         let mut by_lease: BTreeMap<LeaseId, Vec<HandedLease>> = BTreeMap::new();
         for pb::HeldLease { tool, lease_id, holder, lease_s, owner } in leases {
@@ -135,9 +177,14 @@ impl Fleet {
             let charge = |_: &HandedLease| account.as_ref()?.take(Resource::Leases, 1, "tools").ok();
             let charges = leases.iter().filter_map(charge).collect();
             live.at_intake(|intake, now| {
-                intake.adopt(leases, now);
+                intake.adopt(Handed { leases, waiting: Vec::new() }, now);
                 intake.charge(id, charges);
             });
+        }
+        // The leases are there: so what waits belongs to them.
+        let dropped = live.at_intake(|intake, now| intake.adopt(Handed { leases: Vec::new(), waiting }, now));
+        if dropped > 0 {
+            warn!(session = %live.id, dropped, "no memory for all commands that waited");
         }
     }
 }
