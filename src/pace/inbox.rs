@@ -25,6 +25,8 @@ pub enum Leaving {
     Deleted,
     /// Another server has it.
     Moved,
+    /// It was being handed to this server, and does not come.
+    Withdrawn,
 }
 
 /// What a stepping thread is asked for.

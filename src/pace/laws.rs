@@ -74,6 +74,19 @@ impl KeptLaws {
     }
 }
 
+impl KeptLaws {
+    /// The laws of `model` that are known, exact where they can be; the newest is the last.
+    pub(crate) fn known(&self, model: &Model) -> Vec<(Disc, Arc<Law>)> {
+        let kept = lock(&self.0);
+        let kept = kept.as_ref().filter(|kept| have_same_laws(&kept.model, model));
+        let known = |law: &Arc<SoughtLaw>| {
+            let exact = law.exact.get().and_then(|exact| exact.as_ref().ok());
+            Some((law.disc, exact.or(law.coarse.get())?.clone()))
+        };
+        kept.map_or_else(Vec::new, |kept| kept.laws.iter().filter_map(known).collect())
+    }
+}
+
 /// The law of a tissue under a tip: a coarse one at once, the exact one when it is computed.
 #[derive(Debug)]
 pub(crate) struct SoughtLaw {
@@ -90,6 +103,16 @@ impl SoughtLaw {
     /// The exact law, or why it can't be had, if that is known.
     pub(crate) fn exact(&self) -> Option<Result<Arc<Law>>> {
         self.exact.get().cloned()
+    }
+
+    /// The law as somebody else has computed it.
+    pub(crate) fn is_known(&self, law: Law) {
+        // What is there already is the same.
+        let _ = if law.is_coarse {
+            self.coarse.set(Arc::new(law)).is_ok()
+        } else {
+            self.exact.set(Ok(Arc::new(law))).is_ok()
+        };
     }
 
     /// The law to begin with, at most 50 ms of work: the exact one if it is known or takes no longer, else a coarse one.
@@ -182,6 +205,14 @@ mod tests {
         (2..100).for_each(|radius| _ = of(radius, &soft).unwrap());
         assert_eq!(taken(), soft.bytes() + MOST_LAWS as u64 * LAW_BYTES);
         assert!(!Arc::ptr_eq(&first, &of(1, &soft).unwrap()), "the oldest went");
+        // What is known of a tissue serves another session of the same, and none of another.
+        let law = |is_coarse| Law { is_coarse, ..crate::force_law::exact(&soft, 0.002) };
+        of(98, &soft).unwrap().is_known(law(true));
+        of(99, &soft).unwrap().is_known(law(true));
+        of(99, &soft).unwrap().is_known(law(false));
+        let known: Vec<_> = kept.known(&soft).into_iter().map(|(disc, law)| (disc, law.is_coarse)).collect();
+        assert_eq!(known, [(disc(98.0), true), (disc(99.0), false)]);
+        assert!(kept.known(&hard).is_empty());
         // Another tissue.
         of(1, &hard).unwrap();
         assert_eq!(taken(), hard.bytes() + LAW_BYTES);

@@ -35,6 +35,7 @@ use crate::session::sampling::{HEARTBEAT_S, Sampler, Sampling};
 use crate::shape::PointId;
 use crate::sheet::Model;
 use crate::surface::Skin;
+use palpate_touch::Law;
 
 /// A session as the server sees it.
 pub struct Live {
@@ -239,6 +240,11 @@ impl Live {
         self.thaw();
     }
 
+    /// Whether it is being handed over to this server, which is not its owner yet.
+    pub fn is_coming(&self) -> bool {
+        self.is_coming.load(Ordering::Acquire)
+    }
+
     /// Its share of its stepping thread, measured.
     pub fn share(&self) -> f64 {
         self.cost.share()
@@ -338,6 +344,23 @@ impl Live {
     /// Refuses if the session's owner can't have the memory of a further law.
     pub(crate) fn law(&self, model: &Arc<Model>, disc: Disc) -> Result<Arc<SoughtLaw>> {
         self.laws.of(disc, model, self.limits.law_work, &self.owner)
+    }
+
+    /// The force laws of the session's tissue that are known.
+    pub(crate) fn known_laws(&self) -> Vec<(Disc, Arc<Law>)> {
+        let model = self.tissue.borrow().1.clone();
+        self.laws.known(&model)
+    }
+
+    /// Another server has computed these laws of the session's tissue. Those for which there is no memory are computed anew when they
+    /// are wanted.
+    pub(crate) fn adopt_laws(&self, known: Vec<(Disc, Law)>) {
+        let model = self.tissue.borrow().1.clone();
+        for (disc, law) in known {
+            if let Ok(sought) = self.law(&model, disc) {
+                sought.is_known(law);
+            }
+        }
     }
 
     /// Frames for a viewer.

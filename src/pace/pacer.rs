@@ -119,7 +119,7 @@ impl Pacer {
     /// Refuses an unknown ID, and all while the server may not speak for its sessions.
     pub fn get(&self, id: &str) -> Result<Arc<Live>> {
         let live = lock(&self.sessions).get(id).cloned();
-        let live = live.filter(|live| !live.is_coming.load(Ordering::Acquire)).ok_or_else(|| unknown_session(id))?;
+        let live = live.filter(|live| !live.is_coming()).ok_or_else(|| unknown_session(id))?;
         if !self.fence.may_act() {
             return Err(fenced());
         }
@@ -170,6 +170,14 @@ impl Pacer {
     /// Refuses an unknown ID.
     pub fn leave(&self, id: &str, why: Refusal) -> Result<()> {
         self.part_with(id, why, Leaving::Moved)
+    }
+
+    /// A session that was being handed to this server does not come. Nothing of it is kept.
+    ///
+    /// # Errors
+    /// Refuses an unknown ID.
+    pub fn withdraw(&self, id: &str, why: Refusal) -> Result<()> {
+        self.part_with(id, why, Leaving::Withdrawn)
     }
 
     fn part_with(&self, id: &str, why: Refusal, leaving: Leaving) -> Result<()> {

@@ -220,7 +220,8 @@ impl SessionService for Sessions {
         _: Request<pb::ListSessionsRequest>,
     ) -> Result<Response<pb::ListSessionsResponse>, Status> {
         let without_scene = |live: &Arc<_>| pb::Session { scene: None, ..self.0.told(live) };
-        let sessions = self.0.pacer.list().iter().map(without_scene).collect();
+        let served = self.0.pacer.list().into_iter().filter(|live| !live.is_coming());
+        let sessions = served.map(|live| without_scene(&live)).collect();
         Ok(Response::new(pb::ListSessionsResponse { sessions }))
     }
 
@@ -234,7 +235,7 @@ impl SessionService for Sessions {
         info!(session = %id, "session deleted");
         let journal_fault = journals::until_complete(&live).await.unwrap_or_default();
         if let Some(fleet) = &self.0.fleet {
-            fleet.forget_the_deleted().await;
+            fleet.until_deleted(id).await?;
         }
         Ok(Response::new(pb::DeleteSessionResponse { journal_fault }))
     }

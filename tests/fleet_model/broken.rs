@@ -51,6 +51,8 @@ pub(crate) enum Broken {
     CountsBoth,
     /// The owner ends the old standby as soon as there is a better one.
     EndSoon,
+    /// What a standby said before it heard that it shall forget a session counts.
+    CountsEnded,
     /// A deletion is confirmed whether or not etcd has done it.
     DeleteUnsure,
     /// A node that joins deletes what it has not got, also what came since.

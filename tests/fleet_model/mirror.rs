@@ -63,6 +63,7 @@ impl World {
                 if let Some(stream) = self.nodes[n].memory.streams.get_mut(&to) {
                     stream.sent.remove(sid);
                     stream.confirmed.remove(sid);
+                    *stream.ending.entry(*sid).or_default() += 1;
                 }
                 self.say(n, to, stream.id, Say::Forget(*sid));
             }
@@ -127,9 +128,18 @@ impl World {
             }
             Say::Part(sid, run, at, to) => self.take_part(n, (from, stream), sid, run, (at, to)),
             Say::Confirm(sid, run, bytes) => {
+                let counts_ended = self.is(Broken::CountsEnded);
                 let Some(known) = self.nodes[n].memory.streams.get_mut(&from).filter(|known| known.id == stream) else {
                     return;
                 };
+                // What it said before it heard that it shall forget the session is not so any more.
+                if let Some(left) = known.ending.get_mut(&sid).filter(|_| bytes == 0 || !counts_ended) {
+                    *left -= u32::from(bytes == 0);
+                    if *left == 0 {
+                        known.ending.remove(&sid);
+                    }
+                    return;
+                }
                 known.confirmed.insert(sid, (run, bytes));
                 self.is_mirrored(n, from, sid, run, bytes);
             }
@@ -137,6 +147,7 @@ impl World {
                 if self.nodes[n].kept.get(&sid).is_some_and(|kept| kept.sender == from) {
                     self.nodes[n].kept.remove(&sid);
                 }
+                self.say(n, from, stream, Say::Confirm(sid, 0, 0));
             }
             Say::Close => {
                 self.doomed.insert(stream);

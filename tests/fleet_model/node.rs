@@ -69,6 +69,8 @@ pub(crate) struct Stream {
     pub(crate) sent: BTreeMap<S, (u32, u64)>,
     /// What it has confirmed.
     pub(crate) confirmed: BTreeMap<S, (u32, u64)>,
+    /// How often it was told to forget a session, and has not said yet that it has.
+    pub(crate) ending: BTreeMap<S, u32>,
 }
 
 /// A session that is being handed over, here and there.

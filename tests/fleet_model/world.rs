@@ -107,6 +107,7 @@ pub(crate) enum Say {
     /// Session, run, from and to which byte.
     Part(S, u32, u64, u64),
     Confirm(S, u32, u64),
+    /// Confirmed with no bytes.
     Forget(S),
     State(S, Move, u64, u32, u64),
     Stated(Move),

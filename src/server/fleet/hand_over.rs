@@ -8,7 +8,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use futures_util::stream::{self, Stream};
-use palpate_proto::pb;
+use palpate_proto::geometry::vector;
+use palpate_proto::{pb, touch};
+use palpate_touch::Law;
 use pb::take_session_request::Message as Say;
 use tokio::sync::mpsc;
 use tokio::time::timeout;
@@ -16,9 +18,11 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::Streaming;
 use tracing::{info, warn};
 
+use super::owned::Found;
 use super::{Fleet, elsewhere};
 use crate::cluster::key::SessionValue;
 use crate::cluster::{placement, rules};
+use crate::force_law::Disc;
 use crate::journal::inputs;
 use crate::lock::lock;
 use crate::pace::clock::now_ns;
@@ -77,14 +81,32 @@ fn held_lease(lease: HandedLease) -> pb::HeldLease {
     pb::HeldLease { tool, lease_id: format!("{id:032x}"), holder, lease_s: duration_ns as f64 * 1e-9, owner }
 }
 
-/// Tells the other server that it has the session, and what was in its intake.
-async fn hand(handing: &mut Handing, revision: u64, handed: Handed) -> Result<()> {
+/// Tells the other server that it has the session, what was in its intake, and what is known of its tissue.
+async fn hand(handing: &mut Handing, revision: u64, handed: Handed, laws: Vec<(Disc, Arc<Law>)>) -> Result<()> {
     for piece in inputs::encoded(&handed.waiting) {
         handing.send(Say::Waiting(piece)).await?;
     }
     let leases = handed.leases.into_iter().map(held_lease).collect();
-    handing.send(Say::TakeOver(pb::TakeOver { revision, leases })).await?;
+    let known = |(disc, law): &(Disc, Arc<Law>)| pb::KnownLaw {
+        radius_m: disc.radius_m,
+        at_m: vector(disc.at_m),
+        law: Some(touch::law(law, 0)),
+    };
+    let laws = laws.iter().map(known).collect();
+    handing.send(Say::TakeOver(pb::TakeOver { revision, leases, laws })).await?;
     handing.answered().await
+}
+
+/// A session that is being handed over, till this is dropped.
+struct Moving<'f> {
+    fleet: &'f Fleet,
+    id: String,
+}
+
+impl Drop for Moving<'_> {
+    fn drop(&mut self) {
+        lock(&self.fleet.moving).remove(&self.id);
+    }
 }
 
 impl Fleet {
@@ -98,6 +120,13 @@ impl Fleet {
         live: Arc<Live>,
         node: &str,
     ) -> Result<(pb::Ownership, f64)> {
+        // Also if nobody waits for the answer any more: a session must not be left standing.
+        let (fleet, node) = (self.clone(), node.to_owned());
+        let moved = tokio::spawn(async move { fleet.move_to(&live, &node).await });
+        moved.await.map_err(|error| broken(&error.to_string()))?
+    }
+
+    async fn move_to(&self, live: &Arc<Live>, node: &str) -> Result<(pb::Ownership, f64)> {
         let (name, there) = {
             let nodes = self.nodes.borrow();
             let own = lock(&self.own).replays;
@@ -125,47 +154,73 @@ impl Fleet {
                 "a session that plays what was recorded can't be moved",
             ));
         }
+        let _moving = self.begins_to_move(&live.id)?;
         let (say, said) = mpsc::channel(16);
         let opening = self.peers.at(&there.endpoint)?.take_session(ReceiverStream::new(said)).await;
         let heard = opening.map_err(|status| broken(status.message()))?.into_inner();
         let mut handing = Handing { say, heard };
-        let first = self.state_of(&live, live.save().await?).await?;
+        let first = self.state_of(live, live.save().await?).await?;
         timeout(PREPARATION, handing.state(&first)).await.map_err(|_| broken("the other server is too slow"))??;
         let present = live.freeze().await?;
         let begun_ns = now_ns();
-        let handed = timeout(STANDSTILL, self.hand_over(&live, present, &name, &mut handing)).await;
+        let handed = timeout(STANDSTILL, self.hand_over(live, present, &name, &mut handing)).await;
         let revision = match handed.unwrap_or_else(|_| Err(broken("the other server or etcd is too slow"))) {
             Ok(revision) => revision,
             Err(refusal) => match self.settled(&live.id).await {
                 Some((value, revision)) if value.node == name => revision,
-                _ => {
+                Some((value, _)) if value.node == self.node => {
                     live.thaw();
+                    return Err(refusal);
+                }
+                found => {
+                    // Else who found that out has done so.
+                    if self.revision(&live.id).is_some() {
+                        self.lose(&live.id, self.is_lost(found));
+                    }
                     return Err(refusal);
                 }
             },
         };
         #[allow(clippy::cast_precision_loss)]
         let gap_s = now_ns().saturating_sub(begun_ns) as f64 * 1e-9;
+        let standby = lock(&self.standbys).remove(&live.id).unwrap_or_default();
         self.lose(&live.id, elsewhere(&name, there.endpoint.clone()));
+        self.tell_past(&live.id, standby);
         self.tally.moved.one_more();
         info!(session = %live.id, node = name, revision, gap_s, "session moved");
         let value = SessionValue { node: name, standby: String::new() };
         Ok((self.ownership(&value, revision), gap_s))
     }
 
+    /// A session begins to be handed over, till what is returned is dropped.
+    ///
+    /// # Errors
+    /// Refuses one that is not this server's, or is being handed over.
+    fn begins_to_move(&self, id: &str) -> Result<Moving<'_>> {
+        if !lock(&self.moving).insert(id.to_owned()) {
+            return Err(Refusal::new(Reason::OutOfTurn, "session_id", "the session is being moved already"));
+        }
+        let moving = Moving { fleet: self, id: id.to_owned() };
+        self.revision(id).map(|_| moving).ok_or_else(|| broken("it is not this server's"))
+    }
+
     /// The last part: the session stands.
     async fn hand_over(&self, live: &Arc<Live>, present: Present, to: &str, handing: &mut Handing) -> Result<u64> {
+        // The other server is told the revision at which it is handed over, and goes by that: at another it is not.
+        let revision = self.revision(&live.id).ok_or_else(|| broken("it is not this server's"))?;
+        live.is_owned_since(revision);
         let last = self.state_of(live, present).await?;
         handing.state(&last).await?;
-        let revision = self.revision(&live.id).unwrap_or_else(|| live.revision());
-        let over = |revision| rules::hand_over(&self.keys, &live.id, revision, [&self.node, to]);
-        let is_done = |found: Option<&SessionValue>| found.is_some_and(|value| value.node == to);
-        let made = self.change(&live.id, revision, over, is_done).await?;
+        if !self.pacer.has(&live.id) {
+            return Err(broken("it is deleted"));
+        }
+        let over = rules::hand_over(&self.keys, &live.id, revision, [&self.node, to]);
+        let made = self.transact(over, &live.id, |found| found.is_some_and(|value| value.node == to)).await?;
         let revision = made.map_err(|_| broken("etcd has another owner, or one of the servers has lost its lease"))?;
         // From here on the session is the other's, whatever becomes of this stream.
         let endpoint = self.nodes.borrow().get(to).map(|node| node.endpoint.clone()).unwrap_or_default();
         let (handed, _) = live.at_intake(|intake, _| intake.hand_over(elsewhere(to, endpoint)));
-        if hand(handing, revision, handed).await.is_err() {
+        if hand(handing, revision, handed, live.known_laws()).await.is_err() {
             warn!(session = %live.id, "the other server has the session, but has not said so");
         }
         Ok(revision)
@@ -173,19 +228,24 @@ impl Fleet {
 
     /// Who has the session, after a transaction that may still be done: this server says once more that it has it, after which the
     /// other can't be done any more. However long that takes, the session stands.
-    async fn settled(&self, id: &str) -> Option<(SessionValue, u64)> {
-        let is_own = |found: Option<&SessionValue>| found.is_some_and(|value| value.node == self.node);
+    async fn settled(&self, id: &str) -> Found {
         loop {
             let revision = self.revision(id)?;
-            let keep = |revision| rules::keep(&self.keys, id, revision, &self.node, "");
-            match self.change(id, revision, keep, is_own).await {
+            // Who certainly stands by goes on to do so.
+            let named = lock(&self.standbys).get(id).filter(|standby| standby.naming.is_none()).cloned();
+            let standby = named.unwrap_or_default().named;
+            let keep = |revision| rules::keep(&self.keys, id, revision, &self.node, &standby);
+            match self.change(id, revision, keep, |found| self.is_own(found, &standby)).await {
                 Ok(Ok(now)) => {
-                    lock(&self.standbys).remove(id);
-                    if let Some(owned) = lock(&self.owned).get_mut(id) {
-                        owned.revision = now;
+                    if standby.is_empty() {
+                        self.names_nobody(id);
                     }
-                    return Some((SessionValue { node: self.node.clone(), standby: String::new() }, now));
+                    self.owns_since(id, now);
+                    self.pacer.list().iter().filter(|live| live.id == id).for_each(|live| live.is_owned_since(now));
+                    return Some((SessionValue { node: self.node.clone(), standby }, now));
                 }
+                // Its lease has ended: what was asked for may still be done when it has another.
+                Ok(Err(Some((value, _)))) if value.node == self.node => {}
                 Ok(Err(found)) => return found,
                 Err(refusal) => warn!(session = %id, "who has this session is not known: {refusal}"),
             }
@@ -203,7 +263,7 @@ impl Fleet {
     pub(in crate::server) fn drain(self: Arc<Self>, is_on: bool) -> impl Stream<Item = pb::DrainNodeResponse> {
         self.set_draining(is_on);
         let sessions = if is_on { self.pacer.list() } else { Vec::new() };
-        let left: Vec<Arc<Live>> = sessions.into_iter().rev().collect();
+        let left: Vec<Arc<Live>> = sessions.into_iter().rev().filter(|live| !live.is_coming()).collect();
         stream::unfold((self, left), |(fleet, mut left)| async move {
             let live = left.pop()?;
             let session_id = live.id.clone();

@@ -9,8 +9,9 @@ use tokio::task::AbortHandle;
 use tokio::time::{Instant, sleep, sleep_until};
 use tracing::{error, info, warn};
 
+use super::owned::Found;
 use super::tally::Standing;
-use super::{Fleet, Nodes, elsewhere};
+use super::{Fleet, Held, Nodes, elsewhere};
 use crate::cluster::etcd::{Compare, EtcdError, Op, Txn, WatchError, WatchEvent};
 use crate::cluster::key::{NodeValue, decode, encode};
 use crate::cluster::rules;
@@ -30,6 +31,9 @@ const LOOK: Duration = Duration::from_millis(20);
 
 /// What the server tells of itself is told so often, if it has changed.
 const TELL: Duration = Duration::from_millis(500);
+
+/// No more often than this times the number of servers: etcd then gets at most a hundred such writes a second, however many there are.
+const TELL_EACH: Duration = Duration::from_millis(10);
 
 /// Transactions at once.
 const AT_ONCE: usize = 16;
@@ -73,21 +77,22 @@ impl Fleet {
             found.map_or(Compare::Absent(key.clone()), |found| Compare::ModRevision(key.clone(), found.mod_revision));
         let put = Op::Put { key: key.clone(), value: encode(&own), lease: Some(lease.id) };
         let txn = Txn { if_all: vec![as_seen], then: vec![put], otherwise: vec![] };
-        let is_there = match self.etcd.transact(txn).await {
-            Ok(outcome) => outcome.succeeded,
+        let written = match self.etcd.transact(txn).await {
+            Ok(outcome) => outcome.succeeded.then_some(outcome.revision),
             Err(EtcdError::Unknown(_)) => {
-                self.etcd.get(&key).await.map_err(within)?.0.is_some_and(|found| found.lease == lease.id)
+                let (found, _) = self.etcd.get(&key).await.map_err(within)?;
+                found.filter(|found| found.lease == lease.id).map(|found| found.mod_revision)
             }
             Err(error) => return Err(within(error)),
         };
-        if !is_there {
+        let Some(key_revision) = written else {
             return Err(Refusal::new(
                 Reason::OutOfTurn,
                 "cluster.node",
                 "is being taken by another server at this moment",
             ));
-        }
-        self.lease.store(lease.id, Ordering::Release);
+        };
+        *lock(&self.held) = Held { lease: lease.id, key_revision };
         info!(node = self.node, lease = lease.id, ttl_s = lease.ttl_s, "this server is of the fleet");
         Ok(())
     }
@@ -98,14 +103,19 @@ impl Fleet {
         // Those that can't be continued stay as they are, in etcd too. Others that are not here are deleted.
         lock(&self.owned).retain(|id, owned| {
             owned.was_here = true;
-            self.pacer.has(id) || !journals.has_left_alone(id)
+            let stays = self.pacer.has(id) || !journals.has_left_alone(id);
+            if !stays {
+                lock(&self.left_alone).insert(id.clone());
+            }
+            stays
         });
-        self.spawn(self.clone().keep_alive());
+        self.pacer.fence.set(self.confirmed_ns.load(Ordering::Acquire));
         self.spawn(self.clone().watch_fence());
         self.spawn(self.clone().watch_nodes());
         self.spawn(self.clone().tell());
         self.spawn(self.clone().mirror());
         self.spawn(self.clone().take_over());
+        self.spawn(self.clone().settle());
         self.spawn(self.clone().tell_agones());
     }
 
@@ -116,18 +126,22 @@ impl Fleet {
 
     /// Keeps the lease, for ever; moves the fence on. When the lease has ended, gets another, and takes back the sessions that nobody
     /// has claimed.
-    async fn keep_alive(self: Arc<Self>) {
-        let every = Duration::from_millis(self.ttl_s * 1000 / 6);
+    pub(super) async fn keep_alive(self: Arc<Self>) {
+        let every = self.between_keepalives();
         let mut is_well = true;
         loop {
             let begun = Instant::now();
             let sent_ns = boot_ns();
-            let lease = self.lease.load(Ordering::Acquire);
+            let lease = lock(&self.held).lease;
             match self.etcd.keep_alive(lease).await {
                 Ok(Some(ttl_s)) => {
                     is_well = true;
                     let was_fenced = !self.pacer.fence.may_act();
-                    self.pacer.fence.set(rules::fence_ns(sent_ns, ttl_s));
+                    self.confirmed_ns.store(rules::fence_ns(sent_ns, ttl_s), Ordering::Release);
+                    // Nothing is stepped or said before this server's own sessions are here.
+                    if self.journals.get().is_some() {
+                        self.pacer.fence.set(self.confirmed_ns.load(Ordering::Acquire));
+                    }
                     if was_fenced && self.pacer.fence.may_act() {
                         info!("etcd has confirmed the lease: sessions go on here");
                     }
@@ -148,42 +162,74 @@ impl Fleet {
         }
     }
 
-    /// Gets another lease, and takes back what nobody has claimed. Nothing is stepped or said till the next keepalive.
-    async fn rejoin(self: &Arc<Self>) {
-        self.pacer.fence.set(0);
-        while let Err(refusal) = self.register().await {
-            warn!("{refusal}");
-            sleep(PAUSE).await;
-        }
-        let owned: Vec<(String, u64)> =
-            lock(&self.owned).iter().map(|(id, owned)| (id.clone(), owned.revision)).collect();
-        stream::iter(owned).for_each_concurrent(AT_ONCE, |(id, revision)| self.take_back(id, revision)).await;
+    fn between_keepalives(&self) -> Duration {
+        Duration::from_millis(self.ttl_s * 1000 / 6)
     }
 
-    /// Says that this server still owns a session, or lets it go if another does.
-    async fn take_back(&self, id: String, revision: u64) {
+    /// Gets another lease, and takes back what nobody has claimed. Nothing is stepped or said till the next keepalive. If the new lease
+    /// ends before all is taken back, it begins anew.
+    async fn rejoin(self: &Arc<Self>) {
+        self.confirmed_ns.store(0, Ordering::Release);
+        self.pacer.fence.set(0);
         loop {
-            let keep = |revision| rules::keep(&self.keys, &id, revision, &self.node, "");
-            let is_own =
-                |found: Option<&crate::cluster::key::SessionValue>| found.is_some_and(|value| value.node == self.node);
-            match self.change(&id, revision, keep, is_own).await {
-                Ok(Ok(now)) => {
-                    if let Some(owned) = lock(&self.owned).get_mut(&id) {
-                        owned.revision = now;
-                    }
-                    lock(&self.standbys).remove(&id);
-                    self.pacer.list().iter().filter(|live| live.id == id).for_each(|live| live.is_owned_since(now));
+            while let Err(refusal) = self.register().await {
+                warn!("{refusal}");
+                sleep(PAUSE).await;
+            }
+            tokio::select! {
+                is_done = self.take_all_back() => if is_done {
                     return;
+                },
+                () = self.until_lease_ends() => {}
+            }
+            warn!("the lease has ended again before all sessions were taken back");
+            sleep(PAUSE).await;
+        }
+    }
+
+    /// Keeps the lease, and leaves the fence where it is, till it has ended.
+    async fn until_lease_ends(&self) {
+        let lease = lock(&self.held).lease;
+        while !matches!(self.etcd.keep_alive(lease).await, Ok(None)) {
+            sleep(self.between_keepalives()).await;
+        }
+    }
+
+    /// Whether it is known of all sessions whether they still are this server's. If not, its lease has ended.
+    async fn take_all_back(&self) -> bool {
+        let owned: Vec<(String, u64)> =
+            lock(&self.owned).iter().map(|(id, owned)| (id.clone(), owned.revision)).collect();
+        let mut taken = stream::iter(owned)
+            .map(|(id, revision)| async move { self.take_back(&id, revision).await })
+            .buffer_unordered(AT_ONCE);
+        while let Some(is_known) = taken.next().await {
+            if !is_known {
+                return false;
+            }
+        }
+        true
+    }
+
+    /// Says that this server still owns a session, or lets it go if another does. Tells whether it could find out: it can't if its
+    /// lease has ended.
+    async fn take_back(&self, id: &str, revision: u64) -> bool {
+        loop {
+            let keep = |revision| rules::keep(&self.keys, id, revision, &self.node, "");
+            match self.change(id, revision, keep, |found| self.is_own(found, "")).await {
+                Ok(Ok(now)) => {
+                    if self.owns_since(id, now) {
+                        self.names_nobody(id);
+                    }
+                    self.pacer.list().iter().filter(|live| live.id == id).for_each(|live| live.is_owned_since(now));
+                    return true;
                 }
+                Ok(Err(Some((value, _)))) if value.node == self.node => return false,
                 Ok(Err(found)) => {
-                    let (node, endpoint) = found.map_or_else(Default::default, |(value, _)| {
-                        let endpoint = self.nodes.borrow().get(&value.node).map(|node| node.endpoint.clone());
-                        (value.node, endpoint.unwrap_or_default())
-                    });
+                    let node = found.as_ref().map_or("", |(value, _)| &value.node);
                     info!(session = %id, node, "another server has taken over");
                     self.tally.lost.one_more();
-                    self.lose(&id, elsewhere(&node, endpoint));
-                    return;
+                    self.lose(id, self.is_lost(found));
+                    return true;
                 }
                 Err(refusal) => {
                     warn!(session = %id, "{refusal}");
@@ -191,6 +237,13 @@ impl Fleet {
                 }
             }
         }
+    }
+
+    /// The refusal of a session that is found to be another server's.
+    pub(super) fn is_lost(&self, found: Found) -> Refusal {
+        let node = found.map_or_else(String::new, |(value, _)| value.node);
+        let endpoint = self.nodes.borrow().get(&node).map(|there| there.endpoint.clone());
+        elsewhere(&node, endpoint.unwrap_or_default())
     }
 
     /// A session of this server has another owner.
@@ -268,25 +321,47 @@ impl Fleet {
         }
     }
 
-    /// Tells what this server has to do, when that has changed; forgets deleted sessions.
+    /// Tells what this server has to do, when that has changed; forgets deleted sessions. In a large fleet it tells that less often.
     async fn tell(self: Arc<Self>) {
         let mut told = None;
         loop {
-            sleep(TELL).await;
+            let count = u32::try_from(self.nodes.borrow().len()).unwrap_or(u32::MAX);
+            sleep(TELL.max(TELL_EACH * count)).await;
             self.forget_the_deleted().await;
             let own = self.measure();
             if told.as_ref() == Some(&own) && self.nodes.borrow().get(&self.node) == Some(&own) {
                 continue;
             }
-            let lease = Some(self.lease.load(Ordering::Acquire));
-            let key = self.keys.node(&self.node);
-            let put = Op::Put { key: key.clone(), value: encode(&own), lease };
-            // Without its lease the key would come back for ever, or under a lease that has ended.
-            let txn = Txn { if_all: vec![Compare::Present(key)], then: vec![put], otherwise: vec![] };
-            if self.etcd.transact(txn).await.is_ok() {
-                told = Some(own);
-            }
+            told = self.tell_once(&own).await.then_some(own);
         }
+    }
+
+    /// Writes the server's key, as this process has left it: so an older process, or one that waited, can't bring it under an older
+    /// lease.
+    async fn tell_once(&self, own: &NodeValue) -> bool {
+        let Held { lease, key_revision } = *lock(&self.held);
+        let key = self.keys.node(&self.node);
+        let put = Op::Put { key: key.clone(), value: encode(own), lease: Some(lease) };
+        let as_left = Compare::ModRevision(key.clone(), key_revision);
+        let written = match self.etcd.transact(Txn { if_all: vec![as_left], then: vec![put], otherwise: vec![] }).await
+        {
+            Ok(outcome) if outcome.succeeded => Some(outcome.revision),
+            _ => None,
+        };
+        let now = match written {
+            Some(revision) => Some(revision),
+            // It may have been written all the same.
+            None => match self.etcd.get(&key).await {
+                Ok((found, _)) => found.filter(|found| found.lease == lease).map(|found| found.mod_revision),
+                Err(_) => None,
+            },
+        };
+        let mut held = lock(&self.held);
+        // Not if it has a new lease by now.
+        if let Some(now) = now.filter(|_| held.lease == lease) {
+            held.key_revision = held.key_revision.max(now);
+        }
+        written.is_some()
     }
 
     /// What this server has to do.
@@ -333,7 +408,7 @@ impl Fleet {
         }
         self.pacer.fence.set(0);
         self.ended.cancel();
-        let lease = self.lease.load(Ordering::Acquire);
+        let lease = lock(&self.held).lease;
         let _ = tokio::time::timeout(Duration::from_secs(1), self.etcd.revoke(lease)).await;
     }
 }

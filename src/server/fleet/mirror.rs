@@ -31,11 +31,56 @@ const LOOK: Duration = Duration::from_millis(200);
 /// Bytes of journals in one message, about.
 const MESSAGE_BYTES: u64 = 1 << 20;
 
+/// Sessions that are deleted or were moved, of which a server is still to be told; it finds the others out by itself when the stream ends.
+const MOST_PAST: usize = 10_000;
+
 /// Messages that wait for the network.
 const WAITING: usize = 2;
 
 /// What a server that stands by has been sent: of each session the run and its bytes.
 type Sent = BTreeMap<String, (u32, u64)>;
+
+/// What a server that stands by has said of its disk, over one stream.
+#[derive(Debug, Default)]
+struct Heard {
+    /// How far it has each journal.
+    confirmed: BTreeMap<String, pb::Mirrored>,
+    /// How often it was told to forget a session, and has not said yet that it has. What it says of the session meanwhile it said
+    /// before it heard that: it is not so any more.
+    ending: BTreeMap<String, u32>,
+}
+
+impl Heard {
+    /// All that it has when the stream begins.
+    fn new(there: &[pb::Mirrored]) -> Self {
+        let confirmed = there.iter().map(|at| (at.session_id.clone(), at.clone())).collect();
+        Heard { confirmed, ending: BTreeMap::new() }
+    }
+
+    /// It is told to forget a session.
+    fn end(&mut self, id: &str) {
+        self.confirmed.remove(id);
+        *self.ending.entry(id.to_owned()).or_default() += 1;
+    }
+
+    /// It says how far it has a journal. Tells whether that counts.
+    fn hear(&mut self, at: &pb::Mirrored) -> bool {
+        if let Some(left) = self.ending.get_mut(&at.session_id) {
+            *left -= u32::from(at.durable_bytes == 0);
+            if *left == 0 {
+                self.ending.remove(&at.session_id);
+            }
+            return false;
+        }
+        self.confirmed.insert(at.session_id.clone(), at.clone());
+        true
+    }
+
+    /// How far it has that run of a session.
+    fn of(&self, id: &str, run: u32) -> Option<pb::Mirrored> {
+        self.confirmed.get(id).filter(|at| at.run == run).cloned()
+    }
+}
 
 impl Fleet {
     /// Sends for ever.
@@ -51,6 +96,7 @@ impl Fleet {
                 }
                 stays
             });
+            lock(&self.past).retain(|name, _| there.contains_key(name));
             for name in there.keys().filter(|name| **name != self.node) {
                 tasks.entry(name.clone()).or_insert_with(|| self.spawn(self.clone().mirror_to(name.clone())));
             }
@@ -92,12 +138,8 @@ impl Fleet {
         let _ = say.send(message(Say::Open(open))).await;
         let mut heard = peer.mirror(ReceiverStream::new(said)).await.map_err(told)?.into_inner();
         let there = heard.message().await.map_err(told)?.ok_or("it has ended the stream")?;
-        // How far it has each journal on its disk.
-        let known = there.mirrored.iter().map(|at| (at.session_id.clone(), at.clone()));
-        let acked: Mutex<BTreeMap<String, pb::Mirrored>> = Mutex::new(known.collect());
+        let of_disk = Mutex::new(Heard::new(&there.mirrored));
         let mut sent: Sent = there.mirrored.into_iter().map(|at| (at.session_id, (at.run, at.durable_bytes))).collect();
-        // What it has of sessions that it need not stand by for, it may forget; also of those that are deleted.
-        let mut forgotten: Vec<String> = Vec::new();
         let closed = || "the stream is closed".to_owned();
         let sending = async {
             loop {
@@ -113,17 +155,20 @@ impl Fleet {
                     self.revision(id).is_some() && (is_named(id) || self.standby_of(id).as_deref() == Some(name))
                 };
                 let grown = self.growth.chosen(is_wanted);
+                // What it has of sessions for which etcd certainly names another, it may forget; also of those that are deleted.
                 let gone = sent.keys().filter(|id| !grown.iter().any(|grown| grown.session_id == **id));
-                let is_own = |id: &&String| self.revision(id).is_some();
-                forgotten.extend(gone.filter(is_own).cloned());
-                for session_id in forgotten.drain(..) {
+                let mut forgotten: Vec<String> =
+                    gone.filter(|id| self.has_another_standby(id, name)).cloned().collect();
+                forgotten.extend(lock(&self.past).remove(name).unwrap_or_default());
+                for session_id in forgotten {
                     sent.remove(&session_id);
+                    lock(&of_disk).end(&session_id);
                     say.send(message(Say::End(pb::MirrorEnd { session_id }))).await.map_err(|_| closed())?;
                 }
                 // It has all, and etcd does not say so: that was not done before, or was undone.
                 for grown in grown.iter().filter(|grown| !is_told(&grown.session_id)) {
-                    let at = lock(&acked).get(&grown.session_id).cloned();
-                    if let Some(at) = at.filter(|at| at.run == grown.run) {
+                    let at = lock(&of_disk).of(&grown.session_id, grown.run);
+                    if let Some(at) = at {
                         self.is_mirrored(name, &at).await;
                     }
                 }
@@ -149,8 +194,9 @@ impl Fleet {
         let hearing = async {
             while let Some(answer) = heard.message().await.map_err(told)? {
                 for at in answer.mirrored {
-                    self.is_mirrored(name, &at).await;
-                    lock(&acked).insert(at.session_id.clone(), at);
+                    if lock(&of_disk).hear(&at) {
+                        self.is_mirrored(name, &at).await;
+                    }
                 }
             }
             Err::<(), String>("it has ended the stream".to_owned())
@@ -161,45 +207,92 @@ impl Fleet {
         }
     }
 
+    /// Whether etcd certainly says that another than `name` stands by for a session of this server.
+    fn has_another_standby(&self, id: &str, name: &str) -> bool {
+        let is_another =
+            |standby: &Standby| standby.naming.is_none() && !standby.named.is_empty() && standby.named != name;
+        self.revision(id).is_some() && lock(&self.standbys).get(id).is_some_and(is_another)
+    }
+
+    /// etcd names nobody any more who stands by for a session. Who did has what it had, and may be named again.
+    pub(super) fn names_nobody(&self, id: &str) {
+        if let Some(standby) = lock(&self.standbys).get_mut(id) {
+            let named = std::mem::take(&mut standby.named);
+            standby.naming = standby.naming.take().or((!named.is_empty()).then_some(named));
+        }
+    }
+
+    /// A session is deleted, or certainly another's, at whose key nobody stands by: who stood by for it may forget it.
+    pub(super) fn tell_past(&self, id: &str, standby: Standby) {
+        let stood_by = [Some(standby.named), standby.naming].into_iter().flatten();
+        for name in stood_by.filter(|name| self.is_there(name)) {
+            let mut past = lock(&self.past);
+            let of_it = past.entry(name).or_default();
+            if of_it.len() < MOST_PAST {
+                of_it.push(id.to_owned());
+            }
+        }
+    }
+
+    /// Whether etcd is to be told that a server stands by for a session, because it has all up to `step`. From then on nothing counts
+    /// as mirrored till etcd has said so.
+    fn begins_to_name(&self, id: &str, name: &str, step: u64, mirrored_step: Option<u64>) -> bool {
+        // Nobody else changes its key meanwhile.
+        if lock(&self.moving).contains(id) {
+            return false;
+        }
+        let is_chosen = self.standby_of(id).as_deref() == Some(name);
+        let mut standbys = lock(&self.standbys);
+        let standby = standbys.entry(id.to_owned()).or_default();
+        let is_free = match &standby.naming {
+            Some(other) => other == name || is_chosen,
+            None => is_chosen,
+        };
+        // The one before has more: it stays until this one has as much.
+        if !is_free || mirrored_step.is_some_and(|mirrored| step < mirrored) {
+            return false;
+        }
+        standby.naming = Some(name.to_owned());
+        true
+    }
+
+    /// etcd has said that a server stands by. Tells whether that is so still: another may be about to be named by now.
+    fn is_named_now(&self, id: &str, name: &str) -> bool {
+        let mut standbys = lock(&self.standbys);
+        let Some(standby) = standbys.get_mut(id).filter(|standby| standby.naming.as_deref() == Some(name)) else {
+            return false;
+        };
+        *standby = Standby { named: name.to_owned(), naming: None };
+        true
+    }
+
     /// A server has so much of a journal on its disk. The first time, etcd is told who stands by.
     async fn is_mirrored(&self, name: &str, at: &pb::Mirrored) {
-        let Some((tape, step)) = self.growth.mirrored(&at.session_id, at.run, at.durable_bytes) else { return };
         let id = &at.session_id;
-        let is_named = {
-            let mut standbys = lock(&self.standbys);
-            let standby = standbys.entry(id.clone()).or_default();
-            match &standby.naming {
-                Some(other) if other != name && self.is_there(other) => return,
-                None if standby.named == name => true,
-                _ => {
-                    // The one before has more: it stays until this one has as much.
-                    if tape.progress().borrow().mirrored_step.is_some_and(|mirrored| step < mirrored) {
-                        return;
-                    }
-                    standby.naming = Some(name.to_owned());
-                    false
-                }
-            }
-        };
+        let Some((tape, step)) = self.growth.mirrored(id, at.run, at.durable_bytes) else { return };
+        let is_named = lock(&self.standbys).get(id).is_some_and(|standby| standby.is(name));
         if !is_named {
             let Some(revision) = self.revision(id) else { return };
-            let keep = |revision| rules::keep(&self.keys, id, revision, &self.node, name);
-            let is_done = |found: Option<&crate::cluster::key::SessionValue>| {
-                found.is_some_and(|value| value.node == self.node && value.standby == name)
-            };
-            match self.change(id, revision, keep, is_done).await {
-                Ok(Ok(now)) => {
-                    if let Some(owned) = lock(&self.owned).get_mut(id) {
-                        owned.revision = now;
-                    }
-                    lock(&self.standbys).insert(id.clone(), Standby { named: name.to_owned(), naming: None });
+            let mirrored_step = tape.progress().borrow().mirrored_step;
+            if !self.begins_to_name(id, name, step, mirrored_step) {
+                return;
+            }
+            let keep = rules::keep(&self.keys, id, revision, &self.node, name);
+            match self.transact(keep, id, |found| self.is_own(found, name)).await {
+                // An answer that came late says nothing: the key has been written since.
+                Ok(Ok(now)) if self.owns_since(id, now) && self.is_named_now(id, name) => {
                     if let Ok(live) = self.pacer.get(id) {
                         live.is_owned_since(now);
                     }
                     info!(session = %id, node = name, "this server stands by");
                 }
+                // This server has written it itself, and has not heard so. It is tried again.
+                Ok(Err(Some((value, now)))) if value.node == self.node => {
+                    self.owns_since(id, now);
+                    return;
+                }
                 // Another has the session, or etcd does not answer: that is for the lease to find out. It is tried again.
-                Ok(Err(_)) | Err(_) => return,
+                Ok(_) | Err(_) => return,
             }
         }
         tape.is_mirrored(step);
@@ -237,4 +330,29 @@ fn parts(behind: &[Grown], sent: &Sent) -> Vec<Vec<pb::MirrorPart>> {
         messages.push(parts);
     }
     messages
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(id: &str, run: u32, durable_bytes: u64) -> pb::Mirrored {
+        pb::Mirrored { session_id: id.to_owned(), run, durable_bytes }
+    }
+
+    #[test]
+    fn what_a_server_said_before_it_heard_that_it_shall_forget_does_not_count() {
+        let mut heard = Heard::new(&[at("s", 1, 9)]);
+        assert_eq!((heard.of("s", 1), heard.of("s", 2)), (Some(at("s", 1, 9)), None));
+        heard.end("s");
+        assert_eq!(heard.of("s", 1), None);
+        // It was under way; others are heard as ever.
+        assert!(!heard.hear(&at("s", 1, 20)) && heard.hear(&at("t", 1, 3)));
+        // Sent anew, and ended again before the first end was confirmed.
+        heard.end("s");
+        assert!(!heard.hear(&at("s", 0, 0)) && !heard.hear(&at("s", 1, 30)) && !heard.hear(&at("s", 0, 0)));
+        assert_eq!(heard.of("s", 1), None);
+        assert!(heard.hear(&at("s", 1, 4)));
+        assert_eq!(heard.of("s", 1), Some(at("s", 1, 4)));
+    }
 }

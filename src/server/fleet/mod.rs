@@ -1,6 +1,7 @@
 //! This server as one of a fleet. `member` keeps its lease, and with it the fence; `mirror` sends journals to the servers that
 //! stand by, `receive` takes in those of others, which `stand_by` keeps; `take_over` claims sessions whose owner is gone,
-//! `hand_over` moves those of this server, and `take_in` takes those of others.
+//! `hand_over` moves those of this server, and `take_in` takes those of others. `owned` keeps the keys of this server's sessions, and
+//! `settle` puts right what etcd says of it and is not so.
 //!
 //! Clients connect to the owner of a session. No call is passed on but the creation of a session.
 
@@ -9,19 +10,21 @@ mod fenced;
 mod hand_over;
 mod member;
 mod mirror;
+mod owned;
 mod peers;
 mod receive;
+mod settle;
 mod stand_by;
 mod take_in;
 mod take_over;
 mod tally;
 
-use std::collections::BTreeMap;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 
 use palpate_proto::pb;
-use tokio::sync::watch;
+use tokio::sync::{Notify, watch};
 use tokio_util::sync::CancellationToken;
 
 pub(super) use fenced::FencedBody;
@@ -32,13 +35,12 @@ use super::config::Config;
 use super::journals::Journals;
 use super::journals::growth::Growth;
 use crate::budget::Account;
-use crate::cluster::etcd::{Etcd, EtcdError, EtcdOptions, KeyValue, Outcome, Txn};
+use crate::cluster::etcd::{Etcd, EtcdError, EtcdOptions, KeyValue};
 use crate::cluster::key::{Keys, NodeValue, SessionValue, decode};
-use crate::cluster::{placement, rules};
-use crate::ids::random_id;
+use crate::cluster::placement;
 use crate::lock::lock;
 use crate::pace::clock::now_ns;
-use crate::pace::{Birth, Live, Pacer};
+use crate::pace::{Live, Pacer};
 use crate::refusal::{Reason, Refusal, Result, excerpt};
 use peers::Peers;
 use stand_by::StandBy;
@@ -66,17 +68,37 @@ pub(super) struct Fleet {
     peers: Peers,
     /// The sessions of which this server is the owner in etcd.
     owned: Mutex<BTreeMap<String, Owned>>,
+    /// Sessions that are coming to this server: handed over, claimed, or found again. They are not its own yet.
+    coming: Mutex<BTreeSet<String>>,
+    /// Sessions that this server is handing over: it names nobody who stands by for them meanwhile.
+    moving: Mutex<BTreeSet<String>>,
+    /// Sessions that can't go on here: their journals and their keys stay as they are.
+    left_alone: Mutex<BTreeSet<String>>,
+    /// The end of a transaction is unknown: etcd may say of this server what is not so.
+    unsettled: Notify,
     growth: Arc<Growth>,
     tally: tally::FleetTally,
     stand_by: StandBy,
     /// Who stands by for each session.
     standbys: Mutex<BTreeMap<String, Standby>>,
+    /// Sessions that are deleted or were moved, and that servers need not stand by for any more, by the server.
+    past: Mutex<BTreeMap<String, Vec<String>>>,
     journals: OnceLock<Arc<Journals>>,
-    /// The lease of this server; 0 before it has one.
-    lease: std::sync::atomic::AtomicI64,
+    held: Mutex<Held>,
+    /// The fence that etcd has confirmed, also before this server acts for sessions.
+    confirmed_ns: AtomicU64,
     is_draining: AtomicBool,
     /// It is no more of the fleet.
     ended: CancellationToken,
+}
+
+/// What this server holds in etcd.
+#[derive(Debug, Clone, Copy, Default)]
+struct Held {
+    /// Its lease; 0 before it has one.
+    lease: i64,
+    /// The revision at which this process has last written the server's key.
+    key_revision: u64,
 }
 
 /// Who stands by for a session.
@@ -115,9 +137,6 @@ impl Owned {
         Owned { revision, was_here: false, since_ns: now_ns() }
     }
 }
-
-/// A session that does not come within this time, ns, was given up by who wanted it.
-const COMES_NS: u64 = 300_000_000_000;
 
 /// A refusal because etcd does not answer, or not as asked.
 fn of_etcd(error: EtcdError) -> Refusal {
@@ -166,18 +185,26 @@ impl Fleet {
             sent: Mutex::default(),
             peers: Peers::new(config)?,
             owned: Mutex::default(),
+            coming: Mutex::default(),
+            moving: Mutex::default(),
+            left_alone: Mutex::default(),
+            unsettled: Notify::new(),
             growth: Arc::default(),
             tally: tally::FleetTally::default(),
             stand_by,
             standbys: Mutex::default(),
+            past: Mutex::default(),
             journals: OnceLock::new(),
-            lease: 0.into(),
+            held: Mutex::default(),
+            confirmed_ns: 0.into(),
             is_draining: false.into(),
             ended: CancellationToken::new(),
         });
         // Nothing is stepped or said before the lease is there.
         pacer.fence.set(0);
         fleet.register_first().await?;
+        // Also while its own sessions are looked for, which may take longer than the lease.
+        fleet.spawn(fleet.clone().keep_alive());
         // From then on they are watched: a list that came late would hide what that has told.
         fleet.list_nodes().await?;
         Ok(fleet)
@@ -195,104 +222,6 @@ impl Fleet {
 
     fn is_there(&self, node: &str) -> bool {
         self.nodes.borrow().contains_key(node)
-    }
-
-    /// A transaction whose end may be unknown: if so, what etcd has is read. `is_done` tells by that whether it took place. Tells the
-    /// revision that it made, or what is there instead.
-    async fn transact(
-        &self,
-        txn: Txn,
-        id: &str,
-        is_done: impl Fn(Option<&SessionValue>) -> bool,
-    ) -> Result<std::result::Result<u64, Option<(SessionValue, u64)>>> {
-        let key = self.keys.session(id);
-        let outcome = self.etcd.transact(txn).await;
-        match outcome {
-            Ok(Outcome { succeeded: true, revision, .. }) => return Ok(Ok(revision)),
-            Ok(_) | Err(EtcdError::Unknown(_)) => {}
-            Err(error) => return Err(of_etcd(error)),
-        }
-        let was_unknown = outcome.is_err();
-        let (found, _) = self.etcd.get(&key).await.map_err(of_etcd)?;
-        let found = found.and_then(|found| Some((decode::<SessionValue>(&found.value)?, found.mod_revision)));
-        if was_unknown && is_done(found.as_ref().map(|found| &found.0)) {
-            return Ok(Ok(found.map_or(0, |found| found.1)));
-        }
-        Ok(Err(found))
-    }
-
-    /// Changes the key of a session of this server: `make` gives the transaction for the revision that the key has. This server may
-    /// have changed the key itself since it looked: then it is made anew. Tells the revision, or what is there if that is another's.
-    async fn change(
-        &self,
-        id: &str,
-        mut revision: u64,
-        make: impl Fn(u64) -> Txn,
-        is_done: impl Fn(Option<&SessionValue>) -> bool,
-    ) -> Result<std::result::Result<u64, Option<(SessionValue, u64)>>> {
-        loop {
-            match self.transact(make(revision), id, &is_done).await? {
-                Err(Some((value, now))) if value.node == self.node && now > revision => revision = now,
-                ended => return Ok(ended),
-            }
-        }
-    }
-
-    /// Makes this server the owner of a new session.
-    ///
-    /// # Errors
-    /// Refuses while etcd can't be reached, and if this server has lost its lease.
-    pub(super) async fn birth(&self) -> Result<Birth> {
-        let id = random_id()?;
-        let made = self.transact(rules::create(&self.keys, &id, &self.node), &id, |found| found.is_some()).await?;
-        let revision = made.map_err(|_| crate::pace::fenced())?;
-        lock(&self.owned).insert(id.clone(), Owned::since(revision));
-        Ok(Birth { id, revision })
-    }
-
-    /// The session of a birth is there; or, if `is_there` is false, will not come.
-    pub(super) async fn born(&self, birth: &Birth, is_there: bool) {
-        if let Some(owned) = lock(&self.owned).get_mut(&birth.id) {
-            owned.was_here = true;
-        }
-        if !is_there {
-            self.forget_the_deleted().await;
-        }
-    }
-
-    /// Sessions that this server has no more, because they are deleted, are no more in etcd either.
-    pub(super) async fn forget_the_deleted(&self) {
-        let mut gone = Vec::new();
-        for (id, owned) in lock(&self.owned).iter_mut() {
-            let is_here = self.pacer.has(id);
-            if !is_here && (owned.was_here || now_ns().saturating_sub(owned.since_ns) > COMES_NS) {
-                gone.push((id.clone(), owned.revision));
-            }
-            owned.was_here |= is_here;
-        }
-        for (id, revision) in gone {
-            let delete = |revision| rules::delete(&self.keys, &id, revision);
-            if self.change(&id, revision, delete, |found| found.is_none()).await.is_ok() {
-                lock(&self.owned).remove(&id);
-                lock(&self.standbys).remove(&id);
-                self.growth.ended(&id);
-            }
-        }
-    }
-
-    /// The revision at which this server owns a session.
-    fn revision(&self, id: &str) -> Option<u64> {
-        lock(&self.owned).get(id).map(|owned| owned.revision)
-    }
-
-    /// The session's key in etcd.
-    async fn session_value(&self, id: &str) -> Result<Option<(SessionValue, u64)>> {
-        // What is no ID would be another key.
-        if id.len() != 32 || !id.bytes().all(|byte| byte.is_ascii_hexdigit()) {
-            return Ok(None);
-        }
-        let (found, _) = self.etcd.get(&self.keys.session(id)).await.map_err(of_etcd)?;
-        Ok(found.and_then(|found| Some((decode(&found.value)?, found.mod_revision))))
     }
 
     fn ownership(&self, value: &SessionValue, revision: u64) -> pb::Ownership {

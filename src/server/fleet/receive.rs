@@ -15,9 +15,9 @@ type Tell = mpsc::Sender<Result<pb::MirrorResponse, Status>>;
 impl Fleet {
     /// Receives the journals of a server, until its stream ends.
     pub(in crate::server) async fn receive(self: Arc<Self>, mut inbound: Streaming<pb::MirrorRequest>, tell: Tell) {
-        let mut node = String::new();
-        let why = self.receive_from(&mut node, &mut inbound, &tell).await;
-        self.stand_by.ended_from(&node);
+        let stream = self.stand_by.new_stream();
+        let why = self.receive_from(stream, &mut inbound, &tell).await;
+        self.stand_by.stream_ended(stream);
         if let Err(status) = why {
             let _ = tell.send(Err(status)).await;
         }
@@ -25,24 +25,32 @@ impl Fleet {
 
     async fn receive_from(
         self: &Arc<Self>,
-        node: &mut String,
+        stream: u64,
         inbound: &mut Streaming<pb::MirrorRequest>,
         tell: &Tell,
     ) -> Result<(), Status> {
+        let mut node = String::new();
         while let Some(pb::MirrorRequest { message }) = inbound.message().await? {
             match message {
                 Some(Message::Open(open)) => {
-                    *node = open.node;
-                    let _ = tell.send(Ok(pb::MirrorResponse { mirrored: self.stand_by.list() })).await;
+                    node = open.node;
+                    let mirrored = self.stand_by.stream_begins(&node, stream);
+                    let _ = tell.send(Ok(pb::MirrorResponse { mirrored })).await;
                 }
                 _ if node.is_empty() => return Err(Refusal::new(Reason::OutOfTurn, "open", "must come first").into()),
                 Some(Message::Parts(parts)) => {
                     let (fleet, from) = (self.clone(), node.clone());
-                    let taken = tokio::task::spawn_blocking(move || fleet.stand_by.take(&from, &parts.parts)).await;
+                    let taken =
+                        tokio::task::spawn_blocking(move || fleet.stand_by.take((&from, stream), &parts.parts)).await;
                     let mirrored = taken.map_err(|error| Status::internal(error.to_string()))??;
                     let _ = tell.send(Ok(pb::MirrorResponse { mirrored })).await;
                 }
-                Some(Message::End(end)) => self.stand_by.forget(&end.session_id),
+                Some(Message::End(end)) => {
+                    self.stand_by.forget_from(&node, &end.session_id);
+                    // So that what was said before is known from what is said after.
+                    let forgotten = pb::Mirrored { session_id: end.session_id, run: 0, durable_bytes: 0 };
+                    let _ = tell.send(Ok(pb::MirrorResponse { mirrored: vec![forgotten] })).await;
+                }
                 None => {}
             }
         }

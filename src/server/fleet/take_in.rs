@@ -3,20 +3,27 @@
 use std::collections::BTreeMap;
 use std::io::Cursor;
 use std::sync::Arc;
+use std::time::Duration;
 
-use palpate_proto::pb;
+use palpate_proto::geometry::from_vector;
+use palpate_proto::{pb, touch};
+use palpate_touch::Law;
 use pb::take_session_request::Message;
 use tokio::sync::mpsc;
+use tokio::time::{sleep, timeout};
 use tonic::{Status, Streaming};
 use tracing::{info, warn};
 
 use super::{Fleet, Owned};
 use crate::budget::Resource;
+use crate::cluster::rules;
+use crate::force_law::Disc;
 use crate::journal::replay::{self, Known, Resumed};
 use crate::journal::{Reader, inputs};
 use crate::lock::lock;
-use crate::pace::{Begin, Live};
+use crate::pace::{Begin, Live, fenced};
 use crate::refusal::{Reason, Refusal};
+use crate::server::journals::{until_complete, until_on_disk};
 use crate::session::handing::Handed;
 use crate::session::input::Input;
 use crate::session::lease::{HandedLease, LeaseId};
@@ -28,6 +35,15 @@ const MOST_STATE_BYTES: usize = 1 << 30;
 
 /// Bytes of the inputs that wait, at most; what is beyond is dropped.
 const MOST_WAITING_BYTES: usize = 64 << 20;
+
+/// When the other server has said nothing for so long, etcd is asked who has the session.
+const SILENCE: Duration = Duration::from_secs(1);
+
+/// And again so often.
+const ASK: Duration = Duration::from_millis(250);
+
+/// Force laws that are taken over, at most.
+const MOST_LAWS: usize = 64;
 
 type Tell = mpsc::Sender<Result<pb::TakeSessionResponse, Status>>;
 
@@ -55,20 +71,42 @@ async fn state(inbound: &mut Streaming<pb::TakeSessionRequest>) -> Result<Vec<u8
     }
 }
 
-/// What says that the session has come, and before that the inputs that wait, in pieces.
-async fn what_it_had(inbound: &mut Streaming<pb::TakeSessionRequest>) -> (Option<Message>, Vec<Vec<u8>>) {
-    let (mut pieces, mut bytes) = (Vec::new(), 0);
-    loop {
-        match inbound.message().await.ok().flatten().and_then(|message| message.message) {
-            Some(Message::Waiting(piece)) => {
-                bytes += piece.len();
-                if bytes <= MOST_WAITING_BYTES {
-                    pieces.push(piece);
+/// What the other server has said since its last state.
+#[derive(Default)]
+struct Told {
+    leases: Vec<pb::HeldLease>,
+    laws: Vec<pb::KnownLaw>,
+    /// Inputs that wait, as `inputs::decoded` reads them.
+    pieces: Vec<Vec<u8>>,
+    bytes: usize,
+}
+
+impl Told {
+    /// Hears on until it says since which revision the session is this server's. `None`: it says no more.
+    async fn hear(&mut self, inbound: &mut Streaming<pb::TakeSessionRequest>) -> Option<u64> {
+        loop {
+            match inbound.message().await.ok().flatten()?.message? {
+                Message::Waiting(piece) => {
+                    self.bytes += piece.len();
+                    if self.bytes <= MOST_WAITING_BYTES {
+                        self.pieces.push(piece);
+                    }
                 }
+                Message::TakeOver(over) => {
+                    (self.leases, self.laws) = (over.leases, over.laws);
+                    return Some(over.revision);
+                }
+                Message::Part(_) => return None,
             }
-            message => return (message, pieces),
         }
     }
+}
+
+/// A law that a client can use, and its tip.
+fn known_law(known: &pb::KnownLaw) -> Option<(Disc, Law)> {
+    let disc = Disc { radius_m: known.radius_m, at_m: from_vector(known.at_m.as_ref()) };
+    let is_sound = disc.radius_m > 0.0 && disc.radius_m.is_finite() && disc.at_m.is_finite();
+    touch::from_law(known.law.as_ref()?).ok().filter(|_| is_sound).map(|law| (disc, law))
 }
 
 impl Fleet {
@@ -90,35 +128,46 @@ impl Fleet {
         Ok(tokio::task::spawn_blocking(restore).await.map_err(internal)??)
     }
 
-    async fn take(&self, inbound: &mut Streaming<pb::TakeSessionRequest>, tell: &Tell) -> Result<(), Status> {
+    async fn take(
+        self: &Arc<Self>,
+        inbound: &mut Streaming<pb::TakeSessionRequest>,
+        tell: &Tell,
+    ) -> Result<(), Status> {
         let answer = || tell.send(Ok(pb::TakeSessionResponse {}));
         // Of the first state the tissue is made, which takes the longest.
         let before = self.restored(state(inbound).await?, None).await?;
         let _ = answer().await;
         let first = before.first.clone();
         let known = Some((before.header, before.first));
-        let live = self.admit(self.restored(state(inbound).await?, known).await?).await?;
+        let resumed = self.restored(state(inbound).await?, known).await?;
+        let offered = resumed.header.ownership_revision;
+        let id = resumed.header.session_id.clone();
+        let here =
+            || Refusal::new(Reason::OutOfTurn, "session_id", "is that of a session that is here, or comes already");
+        let _coming = self.comes(&id).ok_or_else(here)?;
+        if !self.pacer.fence.may_act() {
+            return Err(fenced().into());
+        }
+        let live = self.admit(resumed).await?;
+        // Not before it is on the disk: from then on a crash of this server does not lose it.
+        if let Some(why) = until_on_disk(&live).await {
+            self.withdraw(&live).await;
+            return Err(Refusal::new(Reason::NotAvailable, "", why).into());
+        }
         let _ = answer().await;
-        let (message, pieces) = what_it_had(inbound).await;
-        let revision = match message {
-            Some(Message::TakeOver(over)) => {
-                let waiting = self.waiting(&live.id, pieces, first).await;
-                self.adopt(&live, over.leases, waiting);
-                over.revision
-            }
-            // Nobody says so any more: etcd knows.
-            _ => match self.session_value(&live.id).await {
-                Ok(Some((value, revision))) if value.node == self.node => revision,
-                _ => {
-                    let _ = self.pacer.leave(&live.id, ended());
-                    return Err(ended().into());
-                }
-            },
+        let mut told = Told::default();
+        let Some(revision) = self.until_certain(&id, offered, inbound, &mut told).await else {
+            info!(session = %id, "a session that was being handed over does not come");
+            self.withdraw(&live).await;
+            return Err(ended().into());
         };
-        lock(&self.owned).insert(live.id.clone(), Owned::since(revision));
-        self.stand_by.forget(&live.id);
+        let waiting = self.waiting(&id, told.pieces, first).await;
+        self.adopt(&live, told.leases, waiting);
+        live.adopt_laws(told.laws.iter().take(MOST_LAWS).filter_map(known_law).collect());
+        lock(&self.owned).insert(id.clone(), Owned::since(revision));
+        self.stand_by.forget(&id);
         live.arrive(revision);
-        info!(session = %live.id, revision, "session taken");
+        info!(session = %id, revision, "session taken");
         let _ = answer().await;
         Ok(())
     }
@@ -139,6 +188,51 @@ impl Fleet {
             Err(error) => warn!(session = id, "what waited there can't be read: {error}"),
         }
         Vec::new()
+    }
+
+    /// Waits until it is certain whose the session is: the other server says that it is this one's, or etcd does. As long as its key is
+    /// as it was when it was `offered`, the other's transaction may still come. `None`: it does not come.
+    async fn until_certain(
+        &self,
+        id: &str,
+        offered: u64,
+        inbound: &mut Streaming<pb::TakeSessionRequest>,
+        told: &mut Told,
+    ) -> Option<u64> {
+        if let Ok(Some(revision)) = timeout(SILENCE, told.hear(inbound)).await {
+            return Some(revision);
+        }
+        loop {
+            match self.session_value(id).await {
+                Ok(Some((value, revision))) if value.node == self.node => return Some(revision),
+                // Its owner is gone: this server claims it from its journal, and so finds out.
+                Ok(Some((value, _))) if rules::may_claim(&value, &self.node, |node| self.is_there(node)) => {
+                    return None;
+                }
+                Ok(Some((_, revision))) if revision == offered => {}
+                Ok(_) => return None,
+                Err(refusal) => warn!(session = %id, "who has this session is not known: {refusal}"),
+            }
+            // It may say so yet. If the stream has ended, etcd is asked.
+            let wait = sleep(ASK);
+            tokio::pin!(wait);
+            tokio::select! {
+                revision = told.hear(inbound) => match revision {
+                    Some(revision) => return Some(revision),
+                    None => wait.await,
+                },
+                () = &mut wait => {}
+            }
+        }
+    }
+
+    /// A session does not come: nothing of it is kept. Its journal is of a course that was not taken.
+    async fn withdraw(&self, live: &Live) {
+        if self.pacer.withdraw(&live.id, ended()).is_ok() {
+            let _ = until_complete(live).await;
+        }
+        self.growth.ended(&live.id);
+        self.unsettled.notify_one();
     }
 
     /// The session, which stands and is not served yet. Whether there is room for it shows before the other server gives it up. Its

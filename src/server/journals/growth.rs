@@ -77,6 +77,14 @@ impl Growth {
         self.news.notify_waiters();
     }
 
+    /// Nothing more comes of that run.
+    pub(super) fn is_complete(&self, session_id: &str, run: u32) {
+        let mut files = lock(&self.files);
+        if files.get(session_id).is_some_and(|file| file.run == run) {
+            files.remove(session_id);
+        }
+    }
+
     /// Of what grew after this was called.
     pub(in crate::server) fn news(&self) -> tokio::sync::futures::Notified<'_> {
         self.news.notified()

@@ -53,6 +53,8 @@ pub(super) struct Keeper {
     /// Journals that nobody could continue: they are left as they are.
     left_alone: BTreeSet<PathBuf>,
     entries: BTreeMap<String, Entry>,
+    /// Tapes of sessions that have come back before the journal of when they left is complete.
+    waiting: Vec<Arc<Tape>>,
     /// Who mirrors journals is told of what was written.
     growth: Option<Arc<Growth>>,
 }
@@ -85,7 +87,7 @@ impl Keeper {
         growth: Option<Arc<Growth>>,
     ) -> Self {
         let Found { runs, left_alone } = found;
-        Keeper { folder, keep, queue, tally, runs, left_alone, entries: BTreeMap::new(), growth }
+        Keeper { folder, keep, queue, tally, runs, left_alone, entries: BTreeMap::new(), waiting: Vec::new(), growth }
     }
 
     /// Works until the queue is stopped, and everything in it is written.
@@ -109,9 +111,32 @@ impl Keeper {
         self.finish();
     }
 
-    /// Writes what these tapes hold, and gets it to the disk.
+    /// Writes what these tapes hold, and gets it to the disk: those of a session one after the other.
     fn round(&mut self, tapes: &[Arc<Tape>]) {
-        let written: Vec<Written> = tapes.iter().filter_map(|tape| self.write(tape)).collect();
+        let mut left = std::mem::take(&mut self.waiting);
+        left.extend_from_slice(tapes);
+        loop {
+            let mut now: BTreeMap<String, Arc<Tape>> = BTreeMap::new();
+            for tape in std::mem::take(&mut left) {
+                let id = &tape.about.id;
+                let is_another = |of: &Arc<Tape>| !Arc::ptr_eq(of, &tape);
+                let others = [now.get(id), self.entries.get(id).map(|entry| &entry.tape)];
+                if others.into_iter().flatten().any(is_another) {
+                    left.push(tape);
+                } else {
+                    now.insert(id.clone(), tape);
+                }
+            }
+            if now.is_empty() {
+                self.waiting = left;
+                return;
+            }
+            self.write_all(now.values());
+        }
+    }
+
+    fn write_all<'t>(&mut self, tapes: impl Iterator<Item = &'t Arc<Tape>>) {
+        let written: Vec<Written> = tapes.filter_map(|tape| self.write(tape)).collect();
         if written.is_empty() {
             return;
         }
@@ -166,10 +191,14 @@ impl Keeper {
                 Event::Left(leaving) => left = Some(leaving),
             }
         }
+        if left == Some(Leaving::Withdrawn) {
+            self.withdraw(&id);
+            return None;
+        }
         let bytes = if let Some(leaving) = left {
             let (why, message) = match leaving {
                 Leaving::Deleted => (pb::Why::Deleted, "the session was deleted"),
-                Leaving::Moved => (pb::Why::Moved, "another server of the fleet has the session"),
+                Leaving::Moved | Leaving::Withdrawn => (pb::Why::Moved, "another server of the fleet has the session"),
             };
             writer.finish(why, message, taken.until_step, unix_ns())
         } else {
@@ -226,11 +255,22 @@ impl Keeper {
     fn complete(&mut self, id: &str) {
         let Some(mut entry) = self.entries.remove(id) else { return };
         self.runs.remove(id);
+        if let Some(growth) = &self.growth {
+            growth.is_complete(id, entry.tape.progress().borrow().run);
+        }
         if self.keep.age.is_zero() {
             old::remove(entry.file.path());
         } else {
             seal(&mut entry.file);
         }
+        entry.tape.is_complete();
+    }
+
+    /// A session that was coming does not: nothing of it is kept. Its run is not used again.
+    fn withdraw(&mut self, id: &str) {
+        let Some(mut entry) = self.entries.remove(id) else { return };
+        entry.file.close();
+        old::remove(entry.file.path());
         entry.tape.is_complete();
     }
 

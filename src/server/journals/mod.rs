@@ -85,12 +85,33 @@ impl Journals {
         self.folder.path()
     }
 
-    /// Goes on with a session whose journal has come into the folder. Its owner is this server since `revision`.
+    /// Goes on with a session whose journal has come into the folder: from that run, or from the newest. Its owner is this server since
+    /// `revision`.
     ///
     /// # Errors
     /// Refuses what can't be continued.
-    pub(super) fn resume(&self, id: &str, revision: u64, pacer: &Pacer, limits: &Limits) -> Result<()> {
-        resume::session(self.folder.path(), id, revision, pacer, limits)
+    pub(super) fn resume(
+        &self,
+        (id, run): (&str, Option<u64>),
+        revision: u64,
+        pacer: &Pacer,
+        limits: &Limits,
+    ) -> Result<()> {
+        resume::session(self.folder.path(), (id, run), revision, pacer, limits)
+    }
+
+    /// Whether there is a journal from which a session, which is not here, can go on.
+    pub(super) fn can_go_on(&self, id: &str) -> bool {
+        resume::can_go_on(self.folder.path(), id)
+    }
+
+    /// Removes the journals of a session, which is not here, from a run on.
+    pub(super) fn remove_from(&self, id: &str, run: u64) {
+        for file in crate::journal::file::list(self.folder.path()).unwrap_or_default() {
+            if file.session_id == id && file.run >= run {
+                old::remove(&file.path);
+            }
+        }
     }
 
     /// Writes what there still is, and ends. The stepping threads have ended before.
@@ -105,6 +126,11 @@ impl Journals {
 /// Waits until a session is on the disk; if that takes too long, tells why.
 pub(super) async fn until_durable(live: &Live) -> Option<String> {
     until(live, |progress| progress.durable_step.is_some(), "the session is").await
+}
+
+/// Waits until a session is on the disk of this server, whatever others have; if that takes too long, tells why.
+pub(super) async fn until_on_disk(live: &Live) -> Option<String> {
+    until(live, |progress| progress.local_step.is_some(), "the session is").await
 }
 
 /// Waits until all of a session that is deleted is on the disk; if that takes too long, tells why.

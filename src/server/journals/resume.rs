@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use super::keeper::Found;
 use crate::journal::file::JournalFile;
-use crate::journal::{self, Reader, Replay, pb};
+use crate::journal::{self, Reader, Replay, Survey, pb};
 use crate::limits::Limits;
 use crate::lock::lock;
 use crate::pace::{Begin, Pacer};
@@ -76,13 +76,37 @@ fn list(folder: &Path) -> Result<Vec<JournalFile>> {
     })
 }
 
-/// Continues one session whose journals are in `folder`.
+/// Whether a session has a journal in `folder` from which it can go on. One that can't be read may be such.
+pub(super) fn can_go_on(folder: &Path, id: &str) -> bool {
+    let files = list(folder).unwrap_or_default().into_iter().rev().filter(|file| file.session_id == id);
+    for file in files {
+        match Reader::open(&file.path).and_then(|mut reader| reader.survey(&mut |_| {})) {
+            Ok(survey) => return !has_ended(&survey),
+            Err(refusal) if refusal.reason == Reason::Missing => {}
+            Err(_) => return true,
+        }
+    }
+    false
+}
+
+/// Whether the session was deleted, or went to another server.
+fn has_ended(survey: &Survey) -> bool {
+    survey.end.as_ref().is_some_and(|end| [pb::Why::Deleted, pb::Why::Moved].contains(&end.why()))
+}
+
+/// Continues one session whose journals are in `folder`: from that run, or from the newest.
 ///
 /// # Errors
 /// Refuses if it can't be continued.
-pub(super) fn session(folder: &Path, id: &str, revision: u64, pacer: &Pacer, limits: &Limits) -> Result<()> {
+pub(super) fn session(
+    folder: &Path,
+    (id, run): (&str, Option<u64>),
+    revision: u64,
+    pacer: &Pacer,
+    limits: &Limits,
+) -> Result<()> {
     let mut files = list(folder)?;
-    files.retain(|file| file.session_id == id);
+    files.retain(|file| file.session_id == id && run.is_none_or(|run| file.run == run));
     if files.is_empty() {
         return Err(Refusal::new(Reason::UnknownSession, "session_id", "there is no journal of this session"));
     }
@@ -113,7 +137,7 @@ fn one<'f>(files: &'f [JournalFile], revision: u64, pacer: &Pacer, limits: &Limi
 fn continued(file: &JournalFile, revision: u64, pacer: &Pacer, limits: &Limits) -> Result<Outcome> {
     let mut reader = Reader::open(&file.path)?;
     let survey = reader.survey(&mut |_| {})?;
-    if survey.end.as_ref().is_some_and(|end| [pb::Why::Deleted, pb::Why::Moved].contains(&end.why())) {
+    if has_ended(&survey) {
         return Ok(Outcome::Ended);
     }
     let until_step = survey.until_step;

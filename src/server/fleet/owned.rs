@@ -1,0 +1,250 @@
+//! The sessions of which this server is the owner in etcd: made, kept, and deleted; and how it is told what became of a transaction.
+
+use std::result::Result as Made;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::time::{Instant, sleep};
+use tracing::warn;
+
+use super::{Fleet, Owned, of_etcd};
+use crate::cluster::etcd::{Compare, EtcdError, Outcome, Txn};
+use crate::cluster::key::{SessionValue, decode};
+use crate::cluster::rules;
+use crate::ids::random_id;
+use crate::lock::lock;
+use crate::pace::Birth;
+use crate::pace::clock::now_ns;
+use crate::refusal::{Reason, Refusal, Result};
+
+/// A session that does not come within this time, ns, was given up by who wanted it.
+const COMES_NS: u64 = 300_000_000_000;
+
+/// A deletion waits so long for etcd.
+const PATIENCE: Duration = Duration::from_secs(5);
+
+/// etcd is asked again so soon.
+const PAUSE: Duration = Duration::from_millis(100);
+
+/// What is at a session's key, and since which revision.
+pub(super) type Found = Option<(SessionValue, u64)>;
+
+/// A session that is coming to this server, till this is dropped: nobody else here claims it, takes it in or settles it.
+pub(super) struct Coming {
+    fleet: Arc<Fleet>,
+    id: String,
+}
+
+impl Drop for Coming {
+    fn drop(&mut self) {
+        lock(&self.fleet.coming).remove(&self.id);
+    }
+}
+
+/// The revision that a transaction finds at `key`, or fails; 0 if it finds none.
+fn found_at(txn: &Txn, key: &str) -> u64 {
+    let at = |compare: &Compare| match compare {
+        Compare::ModRevision(of, revision) if of == key => Some(*revision),
+        _ => None,
+    };
+    txn.if_all.iter().find_map(at).unwrap_or_default()
+}
+
+impl Fleet {
+    /// A transaction whose end may be unknown: if so, what etcd has is read. `is_done` tells by that whether it took place. Tells the
+    /// revision that it made, or what is there instead.
+    ///
+    /// # Errors
+    /// Refuses while etcd can't be reached, and if it can't be told yet: what was asked for may still come.
+    pub(super) async fn transact(
+        &self,
+        txn: Txn,
+        id: &str,
+        is_done: impl Fn(Option<&SessionValue>) -> bool,
+    ) -> Result<Made<u64, Found>> {
+        let key = self.keys.session(id);
+        let before = found_at(&txn, &key);
+        let outcome = self.etcd.transact(txn).await;
+        let unknown = match outcome {
+            Ok(Outcome { succeeded: true, revision, .. }) => return Ok(Ok(revision)),
+            Ok(_) => None,
+            Err(error @ EtcdError::Unknown(_)) => Some(error),
+            Err(error) => return Err(of_etcd(error)),
+        };
+        if unknown.is_some() {
+            self.unsettled.notify_one();
+        }
+        let (found, _) = self.etcd.get(&key).await.map_err(of_etcd)?;
+        let found = found.and_then(|found| Some((decode::<SessionValue>(&found.value)?, found.mod_revision)));
+        let Some(unknown) = unknown else { return Ok(Err(found)) };
+        // A key that is as it was proves nothing, also if it has what was asked for: that may have been so before.
+        let now = found.as_ref().map_or(0, |found| found.1);
+        if now == before {
+            return Err(of_etcd(unknown));
+        }
+        Ok(if is_done(found.as_ref().map(|found| &found.0)) { Ok(now) } else { Err(found) })
+    }
+
+    /// Changes the key of a session of this server: `make` gives the transaction for the revision that the key has. This server may
+    /// have changed the key itself since it looked: then it is made anew. Tells the revision, or what is there if that is another's.
+    ///
+    /// # Errors
+    /// As for [`Fleet::transact`].
+    pub(super) async fn change(
+        &self,
+        id: &str,
+        mut revision: u64,
+        make: impl Fn(u64) -> Txn,
+        is_done: impl Fn(Option<&SessionValue>) -> bool,
+    ) -> Result<Made<u64, Found>> {
+        loop {
+            match self.transact(make(revision), id, &is_done).await? {
+                Err(Some((value, now))) if value.node == self.node && now > revision => revision = now,
+                ended => return Ok(ended),
+            }
+        }
+    }
+
+    /// Whether a key says that this server is the owner, and who stands by.
+    pub(super) fn is_own(&self, found: Option<&SessionValue>, standby: &str) -> bool {
+        found.is_some_and(|value| value.node == self.node && value.standby == standby)
+    }
+
+    /// The session's key has been written at that revision: whether that is its newest, so far as this server knows. An answer may
+    /// come late.
+    pub(super) fn owns_since(&self, id: &str, revision: u64) -> bool {
+        let mut all = lock(&self.owned);
+        let Some(owned) = all.get_mut(id).filter(|owned| owned.revision <= revision) else { return false };
+        owned.revision = revision;
+        true
+    }
+
+    /// A session begins to come to this server. `None` if it does already, or is here.
+    pub(super) fn comes(self: &Arc<Self>, id: &str) -> Option<Coming> {
+        let is_new = lock(&self.coming).insert(id.to_owned());
+        let coming = is_new.then(|| Coming { fleet: self.clone(), id: id.to_owned() })?;
+        (self.revision(id).is_none() && !self.pacer.has(id)).then_some(coming)
+    }
+
+    /// Makes this server the owner of a new session.
+    ///
+    /// # Errors
+    /// Refuses while etcd can't be reached, and if this server has lost its lease.
+    pub(in crate::server) async fn birth(&self) -> Result<Birth> {
+        let id = random_id()?;
+        let made = self.transact(rules::create(&self.keys, &id, &self.node), &id, |found| found.is_some()).await?;
+        let revision = made.map_err(|_| crate::pace::fenced())?;
+        lock(&self.owned).insert(id.clone(), Owned::since(revision));
+        Ok(Birth { id, revision })
+    }
+
+    /// The session of a birth is there; or, if `is_there` is false, will not come.
+    pub(in crate::server) async fn born(&self, birth: &Birth, is_there: bool) {
+        if let Some(owned) = lock(&self.owned).get_mut(&birth.id) {
+            owned.was_here = true;
+        }
+        if !is_there {
+            self.forget_the_deleted().await;
+        }
+    }
+
+    /// Sessions that this server has no more, because they are deleted, are no more in etcd either.
+    pub(super) async fn forget_the_deleted(&self) {
+        let mut gone = Vec::new();
+        for (id, owned) in lock(&self.owned).iter_mut() {
+            let is_here = self.pacer.has(id);
+            if !is_here && (owned.was_here || now_ns().saturating_sub(owned.since_ns) > COMES_NS) {
+                gone.push((id.clone(), owned.revision));
+            }
+            owned.was_here |= is_here;
+        }
+        for (id, revision) in gone {
+            if let Err(refusal) = self.forget(&id, revision).await {
+                warn!(session = %id, "not deleted in etcd yet: {refusal}");
+            }
+        }
+    }
+
+    /// Deletes the key of a session of this server. Tells who has the session, if that is another.
+    async fn forget(&self, id: &str, revision: u64) -> Result<Option<SessionValue>> {
+        let delete = |revision| rules::delete(&self.keys, id, revision);
+        let found = match self.change(id, revision, delete, |found| found.is_none()).await? {
+            Ok(_) | Err(None) => None,
+            Err(Some((value, _))) => Some(value),
+        };
+        lock(&self.owned).remove(id);
+        let standby = lock(&self.standbys).remove(id).unwrap_or_default();
+        self.growth.ended(id);
+        if found.is_none() {
+            self.tell_past(id, standby);
+        }
+        Ok(found)
+    }
+
+    /// Waits until a session that was deleted here is deleted in etcd too.
+    ///
+    /// # Errors
+    /// Refuses if etcd does not confirm that in time: then the deletion goes on later. Refuses if another server has the session by
+    /// now.
+    pub(in crate::server) async fn until_deleted(&self, id: &str) -> Result<()> {
+        let until = Instant::now() + PATIENCE;
+        loop {
+            let Some(revision) = self.revision(id) else {
+                // Somebody else here was quicker.
+                return match self.session_value(id).await {
+                    Ok(None) => Ok(()),
+                    Ok(Some((value, _))) => Err(not_deleted(&format!("the server `{}` has the session", value.node))),
+                    Err(refusal) => Err(not_deleted(&refusal.message)),
+                };
+            };
+            let why = match tokio::time::timeout_at(until, self.forget(id, revision)).await {
+                Ok(Ok(None)) => return Ok(()),
+                Ok(Ok(Some(value))) => return Err(not_deleted(&format!("the server `{}` has it now", value.node))),
+                Ok(Err(refusal)) => refusal.message,
+                Err(_) => "etcd does not answer".to_owned(),
+            };
+            if Instant::now() + PAUSE >= until {
+                return Err(not_deleted(&why));
+            }
+            sleep(PAUSE).await;
+        }
+    }
+
+    /// The revision at which this server owns a session.
+    pub(super) fn revision(&self, id: &str) -> Option<u64> {
+        lock(&self.owned).get(id).map(|owned| owned.revision)
+    }
+
+    /// The session's key in etcd.
+    pub(super) async fn session_value(&self, id: &str) -> Result<Found> {
+        // What is no ID would be another key.
+        if id.len() != 32 || !id.bytes().all(|byte| byte.is_ascii_hexdigit()) {
+            return Ok(None);
+        }
+        let (found, _) = self.etcd.get(&self.keys.session(id)).await.map_err(of_etcd)?;
+        Ok(found.and_then(|found| Some((decode(&found.value)?, found.mod_revision))))
+    }
+}
+
+/// The refusal of a deletion that etcd has not confirmed.
+fn not_deleted(why: &str) -> Refusal {
+    let message =
+        format!("the session is deleted on this server, but whether the fleet has it no more is not sure yet: {why}");
+    Refusal::new(Reason::Fenced, "session_id", message)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cluster::key::Keys;
+
+    #[test]
+    fn a_transaction_tells_the_revision_that_it_builds_on() {
+        let keys = Keys::of("f").unwrap();
+        let key = keys.session("s");
+        assert_eq!(found_at(&rules::create(&keys, "s", "a"), &key), 0);
+        assert_eq!(found_at(&rules::keep(&keys, "s", 7, "a", "b"), &key), 7);
+        assert_eq!(found_at(&rules::delete(&keys, "s", 9), &key), 9);
+        assert_eq!(found_at(&rules::hand_over(&keys, "s", 8, ["a", "b"]), &key), 8);
+    }
+}
