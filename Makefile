@@ -20,7 +20,7 @@ PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/index.html 
 	$(VIEWER)/public/* $(TYPESCRIPT)/*.json $(TYPESCRIPT)/*.yaml $(TYPESCRIPT)/src/*.ts proto/palpate/v1/*.proto)
 
 .PHONY: help run install header test-abi bench-tick build release viewer page-if-node test test-viewer test-python bench-python test-arm test-asan test-valgrind test-debug test-mutants need-arm stress libfuzzer lint picture figures screenshot bench-roundtrip bench-duty \
-	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-rest bench-link bench-viewer bench-load soak siege fuzz need-rust \
+	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-rest bench-link bench-viewer bench-load bench-fleet soak siege fuzz need-rust \
 	need-python need-node chaos
 
 help:
@@ -63,12 +63,15 @@ help:
 	@echo 'make bench-load      sessions that one core bears, with clients and without: docs/benchmarks/load.md'
 	@echo '                     ATTACK=all: what a client notices of 41 attacks (an hour): docs/benchmarks/attacks.md;'
 	@echo '                     one attack alone: make bench-load ATTACK=endless-scene'
+	@echo 'make bench-fleet     a fleet beside one server, and what etcd bears: docs/benchmarks/fleet.md;'
+	@echo '                     one part alone: ARGUMENTS=calls (or spread, steps, etcd)'
 	@echo 'make soak            random clients for SECONDS=1800: memory, handles, threads, and every command accounted for; then'
 	@echo '                     clients and servers killed KILLS=50 times'
 	@echo 'make siege           eight attackers at random against four honest clients for SECONDS=1800, by SEED=16: their times,'
 	@echo '                     memory, and whether all is given back; make test does it for 30 s'
 	@echo 'make chaos           a fleet in virtual time for SECONDS=1000000, with crashes, pauses and partitions, from SEED=16 on;'
-	@echo '                     then ROUNDS=200 of real servers that are killed, frozen and cut off from etcd'
+	@echo '                     then ROUNDS=200 of real servers that are killed, frozen and cut off from etcd, etcd without'
+	@echo '                     its leader (LEADERS=10) and gone (GONE_S=60), MOVES=200 under a tool: an hour or more'
 
 need-rust:
 	@command -v $(CARGO) >/dev/null || { echo 'Rust is missing: install it from https://rustup.rs' >&2; exit 1; }
@@ -135,6 +138,7 @@ $(VENV)/ready: tests/python/requirements.txt clients/python/tests/requirements.t
 # and `make stress` many.
 test: build $(VENV)/ready test-viewer test-python
 	PROPTEST_RNG_SEED=20261122 $(CARGO) test --release --workspace
+	sh tests/abi/check.sh $(BUILT) interface
 	$(VENV)/bin/python -m unittest discover -s tests/python -v
 
 test-viewer: build viewer
@@ -292,6 +296,10 @@ bench-link: build
 bench-load: build
 	$(CARGO) bench --quiet --bench load -- $(if $(ATTACK),attacks $(ATTACK)) $(ARGUMENTS)
 
+# `make bench-fleet ARGUMENTS=steps` prints one part alone; `ARGUMENTS=--quick` does all with small numbers.
+bench-fleet: build
+	$(CARGO) bench --quiet --bench fleet -- $(ARGUMENTS)
+
 # With numba beside it, if that installs: PEERS of bench-kernel.
 bench-python: build $(VENV)/ready
 	-$(VENV)/bin/pip install --quiet --disable-pip-version-check numba
@@ -317,8 +325,16 @@ siege: need-rust
 
 # The fleet's histories, simulated s; a seed that fails is told with its last events. Then real servers on a real etcd.
 ROUNDS ?= 200
+LEADERS ?= 10
+GONE_S ?= 60
+MOVES ?= 200
+CHAOS := $(CURDIR)/target/chaos.txt
 chaos: SECONDS = 1000000
 chaos: need-rust
 	PALPATE_FLEET_SECONDS=$(SECONDS) PALPATE_FLEET_SEED=$(SEED) $(CARGO) test --release --test fleet_model -- --nocapture
-	PALPATE_FLEET_ROUNDS=$(ROUNDS) PALPATE_FLEET_SESSIONS=12 PALPATE_FLEET_RESTING=48 PALPATE_SEED=$(SEED) \
-		$(CARGO) test --release --test fleet -- --nocapture sessions_come_back
+	@mkdir -p $(dir $(CHAOS)); rm -f $(CHAOS)
+	PALPATE_FLEET_ROUNDS=$(ROUNDS) PALPATE_FLEET_SESSIONS=12 PALPATE_FLEET_RESTING=48 PALPATE_FLEET_FROZEN_S=10 \
+		PALPATE_FLEET_LEADERS=$(LEADERS) PALPATE_FLEET_GONE_S=$(GONE_S) PALPATE_FLEET_MOVES=$(MOVES) \
+		PALPATE_FLEET_SEED=$(SEED) PALPATE_FLEET_SUMMARY=$(CHAOS) \
+		$(CARGO) test --release --test fleet_chaos -- --include-ignored --nocapture --test-threads=1; \
+		ended=$$?; echo; cat $(CHAOS); exit $$ended

@@ -28,7 +28,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use attack::Kind;
-use cores::kept_to;
+use cores::{kept_to, thread_times};
 use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::scene::profile::Poke;
@@ -44,24 +44,6 @@ use serde_json::{Value, json};
 use server::{Server, client_program};
 
 const OBJECTIVE: &str = "p99<2ms,dilation>0.999";
-
-/// Time of a server's threads so far, s: by the beginning of their names, in user mode and in the system.
-fn times(server: &Server) -> Vec<(String, [f64; 2])> {
-    let mut times: Vec<(String, [f64; 2])> = Vec::new();
-    for task in std::fs::read_dir(format!("/proc/{}/task", server.child.id())).unwrap() {
-        // A thread may have ended since.
-        let Ok(stat) = std::fs::read_to_string(task.unwrap().path().join("stat")) else { continue };
-        let (begin, end) = (stat.find('(').unwrap(), stat.rfind(')').unwrap());
-        let name = stat[begin + 1..end].split('-').next().unwrap().to_owned();
-        let ticks = stat[end + 2..].split_whitespace().skip(11).take(2).map(|field| field.parse::<f64>().unwrap());
-        let seconds: Vec<f64> = ticks.map(|ticks| ticks / 100.0).collect();
-        match times.iter_mut().find(|thread| thread.0 == name) {
-            Some((_, sum)) => *sum = [sum[0] + seconds[0], sum[1] + seconds[1]],
-            None => times.push((name, [seconds[0], seconds[1]])),
-        }
-    }
-    times
-}
 
 /// One run of the generator.
 struct Load {
@@ -95,9 +77,9 @@ fn load(server: &Server, seconds: f64, arguments: &[&str]) -> Load {
     let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
     // The first word comes a second after all clients are there.
     let first = lines.next();
-    let (begun, before) = (Instant::now(), times(server));
+    let (begun, before) = (Instant::now(), thread_times(server.child.id()));
     std::thread::sleep(Duration::from_secs_f64((seconds - 1.5).max(0.1)));
-    let (elapsed_s, after) = (begun.elapsed().as_secs_f64(), times(server));
+    let (elapsed_s, after) = (begun.elapsed().as_secs_f64(), thread_times(server.child.id()));
     let resident_mib = resident_mib(server);
     let rest: Vec<String> = lines.map_while(Result::ok).collect();
     let mut text = String::new();

@@ -55,3 +55,21 @@ pub fn processor_s(process: u32) -> f64 {
     let ticks = stat[end + 1..].split_whitespace().skip(11).take(2);
     ticks.filter_map(|field| field.parse::<f64>().ok()).sum::<f64>() / 100.0
 }
+
+/// Time of a process's threads so far, s: by the beginning of their names, in user mode and in the system.
+pub fn thread_times(process: u32) -> Vec<(String, [f64; 2])> {
+    let mut times: Vec<(String, [f64; 2])> = Vec::new();
+    for task in std::fs::read_dir(format!("/proc/{process}/task")).unwrap() {
+        // A thread may have ended since.
+        let Ok(stat) = std::fs::read_to_string(task.unwrap().path().join("stat")) else { continue };
+        let (begin, end) = (stat.find('(').unwrap(), stat.rfind(')').unwrap());
+        let name = stat[begin + 1..end].split('-').next().unwrap().to_owned();
+        let ticks = stat[end + 2..].split_whitespace().skip(11).take(2).map(|field| field.parse::<f64>().unwrap());
+        let seconds: Vec<f64> = ticks.map(|ticks| ticks / 100.0).collect();
+        match times.iter_mut().find(|thread| thread.0 == name) {
+            Some((_, sum)) => *sum = [sum[0] + seconds[0], sum[1] + seconds[1]],
+            None => times.push((name, [seconds[0], seconds[1]])),
+        }
+    }
+    times
+}

@@ -109,6 +109,17 @@ impl Etcd {
         self.members.iter().map(|member| format!("{scheme}://{}", member.client)).collect()
     }
 
+    /// A member's process, if it runs.
+    pub fn process(&self, index: usize) -> Option<u32> {
+        self.members[index].child.as_ref().map(Child::id)
+    }
+
+    /// A metric without labels of a member that runs.
+    pub fn metric(&self, index: usize, name: &str) -> Option<f64> {
+        let told = get(self.members[index].metrics, "/metrics");
+        told.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' ')?.parse().ok())
+    }
+
     /// Which member has this address.
     pub fn index(&self, endpoint: &str) -> usize {
         self.endpoints().iter().position(|own| own == endpoint).unwrap()

@@ -1,4 +1,4 @@
-//! Etcd and servers of a fleet, each a process of its own.
+//! Servers of a fleet, each a process of its own, and what must hold for the journals of their sessions.
 #![allow(
     dead_code,
     unreachable_pub,
@@ -8,11 +8,13 @@
     clippy::disallowed_methods
 )]
 
+use std::collections::BTreeMap;
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
+use palpate::journal::{Reader, file, replay};
+use palpate::limits::Limits;
 use palpate_proto::pb;
 use pb::admin_service_client::AdminServiceClient;
 use rustix::process::{Pid, Signal, kill_process};
@@ -23,85 +25,6 @@ use crate::server::{PATIENCE, Server};
 /// A port that is free now.
 pub fn port() -> u16 {
     TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
-}
-
-/// Whether etcd is on this machine. Where CI says that it must be, its absence is an error.
-pub fn is_there() -> bool {
-    let found = Command::new("etcd").arg("--version").stdout(Stdio::null()).stderr(Stdio::null()).status().is_ok();
-    if !found {
-        assert!(std::env::var_os("CI").is_none(), "etcd is missing (Debian: apt-get install etcd-server)");
-        eprintln!("left out: etcd is missing (Debian: apt-get install etcd-server)");
-    }
-    found
-}
-
-/// Members of etcd.
-pub struct Etcd {
-    arguments: Vec<Vec<String>>,
-    members: Vec<Option<Child>>,
-    pub urls: Vec<String>,
-    log: PathBuf,
-}
-
-impl Etcd {
-    pub fn start(folder: &Path, count: usize) -> Self {
-        let ports: Vec<(u16, u16)> = (0..count).map(|_| (port(), port())).collect();
-        let peer = |at: usize| format!("http://127.0.0.1:{}", ports[at].1);
-        let cluster: Vec<String> = (0..count).map(|at| format!("m{at}={}", peer(at))).collect();
-        let of = |at: usize| {
-            let client = format!("http://127.0.0.1:{}", ports[at].0);
-            let data = folder.join(format!("etcd-{at}")).display().to_string();
-            let options = [
-                ("name", format!("m{at}")),
-                ("data-dir", data),
-                ("listen-client-urls", client.clone()),
-                ("advertise-client-urls", client),
-                ("listen-peer-urls", peer(at)),
-                ("initial-advertise-peer-urls", peer(at)),
-                ("initial-cluster", cluster.join(",")),
-                ("log-level", "error".to_owned()),
-            ];
-            options.iter().flat_map(|(name, value)| [format!("--{name}"), value.clone()]).collect()
-        };
-        let urls = ports.iter().map(|(client, _)| format!("http://127.0.0.1:{client}")).collect();
-        let mut etcd = Etcd {
-            arguments: (0..count).map(of).collect(),
-            members: (0..count).map(|_| None).collect(),
-            urls,
-            log: folder.join("etcd.log"),
-        };
-        etcd.start_all();
-        etcd
-    }
-
-    pub fn start_all(&mut self) {
-        for at in 0..self.members.len() {
-            self.restart(at);
-        }
-    }
-
-    pub fn restart(&mut self, at: usize) {
-        let log = std::fs::File::options().create(true).append(true).open(&self.log).unwrap();
-        let child = Command::new("etcd").args(&self.arguments[at]).stdout(Stdio::null()).stderr(log).spawn().unwrap();
-        self.members[at] = Some(child);
-    }
-
-    pub fn kill(&mut self, at: usize) {
-        if let Some(mut child) = self.members[at].take() {
-            let _ = child.kill();
-            let _ = child.wait();
-        }
-    }
-
-    pub fn kill_all(&mut self) {
-        (0..self.members.len()).for_each(|at| self.kill(at));
-    }
-}
-
-impl Drop for Etcd {
-    fn drop(&mut self) {
-        self.kill_all();
-    }
 }
 
 /// A server of a fleet, which may be gone.
@@ -158,6 +81,15 @@ impl Node {
         self.server = None;
     }
 
+    /// Ends it as a user does, and waits until it has.
+    pub fn end(&mut self) {
+        self.signal(Signal::TERM);
+        if let Some(server) = &mut self.server {
+            server.child.wait().unwrap();
+        }
+        self.server = None;
+    }
+
     pub fn freeze(&self) {
         self.signal(Signal::STOP);
     }
@@ -179,6 +111,30 @@ impl Node {
         Ok(answer.into_inner().session.unwrap())
     }
 
+    /// The sessions of the fleet, as etcd says; nothing if this server does not tell.
+    pub async fn fleet_sessions(&self) -> BTreeMap<String, pb::FleetSession> {
+        let mut found = BTreeMap::new();
+        let mut admin = self.admin().await;
+        let Ok(listed) = admin.list_fleet_sessions(pb::ListFleetSessionsRequest {}).await else { return found };
+        let mut listed = listed.into_inner();
+        while let Ok(Some(part)) = listed.message().await {
+            found.extend(part.sessions.into_iter().map(|session| (session.session_id.clone(), session)));
+        }
+        found
+    }
+
+    /// The IDs of the sessions that this server serves; nothing if it does not answer.
+    pub async fn served(&self) -> Option<Vec<String>> {
+        let asked = async { self.there().sessions().await.list_sessions(pb::ListSessionsRequest {}).await };
+        let answer = tokio::time::timeout(Duration::from_secs(2), asked).await.ok()?.ok()?.into_inner();
+        Some(answer.sessions.into_iter().map(|session| session.session_id).collect())
+    }
+
+    /// The journals of a session that are here, by ascending run.
+    pub fn runs(&self, id: &str) -> Vec<file::JournalFile> {
+        file::list(&self.journals).unwrap().into_iter().filter(|file| file.session_id == id).collect()
+    }
+
     /// Waits until the fleet has so many servers.
     pub async fn until_nodes(&self, count: usize) {
         until("the fleet is whole", async || {
@@ -188,6 +144,20 @@ impl Node {
         })
         .await;
     }
+}
+
+/// Three servers, each of which says of a step that it is durable when it is on two disks.
+pub async fn three(folder: &Path, etcd: &[String]) -> Vec<Node> {
+    let nodes: Vec<Node> =
+        (0..3).map(|at| Node::start(folder, &format!("n{at}"), etcd, &["--durable", "two", "--log", "warn"])).collect();
+    nodes[0].until_nodes(3).await;
+    nodes
+}
+
+/// A session of the paper's scene, wherever the fleet makes it.
+pub async fn create(node: &Node) -> pb::Session {
+    let source = pb::create_session_request::Source::SceneName("paper".into());
+    node.there().create(source, false).await.unwrap()
 }
 
 /// Waits until `holds`. Tells how long that took.
@@ -222,4 +192,48 @@ pub async fn until_stood_by(nodes: &[Node], id: &str) -> (usize, pb::Session) {
     })
     .await;
     found.unwrap()
+}
+
+/// The bits with which the run of a session at `after` begins are those of an offline run of the journal before it, wherever that is.
+pub async fn goes_on(nodes: &[Node], id: &str, after: &Node, lets_go: bool) {
+    // It is written a little after the session goes on.
+    let mut begun = None;
+    until("the journal has begun", async || {
+        let session = after.session(id).await.ok();
+        let run = session.and_then(|session| session.journal).map_or(0, |journal| u64::from(journal.run));
+        let path = after.journals.join(file::name(id, run));
+        let batch = Reader::open(&path).ok().and_then(|mut reader| reader.next_batch().ok().flatten());
+        let first = batch.and_then(|batch| batch.snapshots().ok()?.into_iter().next());
+        begun = first.map(|first| (run, first));
+        begun.is_some()
+    })
+    .await;
+    let (run, first) = begun.unwrap();
+    let before = || nodes.iter().flat_map(|node| node.runs(id)).filter(|file| file.run == run - 1);
+    // A server that died may have more on its own disk than the one that has taken over got.
+    let fits = |path: &std::path::Path| {
+        let mut survey = Reader::open(path).unwrap();
+        let end = survey.survey(&mut |_| {}).unwrap().until_step;
+        if end < first.step {
+            return false;
+        }
+        let (mut session, _) =
+            replay::session_at(Reader::open(path).unwrap(), &Limits::default(), first.step, &false.into()).unwrap();
+        if lets_go {
+            session.let_go();
+        }
+        first.hash == format!("{:032x}", session.tissue().state_hash())
+    };
+    // The last of it is written a little later, too.
+    until(&format!("{id} goes on from its run {} at step {}", run - 1, first.step), async || {
+        before().any(|file| fits(&file.path))
+    })
+    .await;
+}
+
+/// All hashes and snapshots of a journal are those of an offline run of its inputs. Tells how many were compared.
+pub fn verify(path: &Path) -> u64 {
+    let verdict = replay::verify(Reader::open(path).unwrap(), &Limits::default(), &mut |_, _| {}).unwrap();
+    assert_eq!(verdict.difference, None, "{}", path.display());
+    verdict.compared.iter().sum()
 }

@@ -1,8 +1,8 @@
-//! A wire that delays: what goes in at one end comes out at the other so much later, in order. And it can be cut.
+//! A wire that delays: what goes in at one end comes out at the other so much later, in order. And it can be cut, or fall silent.
 #![allow(dead_code, unreachable_pub, clippy::unwrap_used, clippy::disallowed_methods)]
 
 use std::net::SocketAddr;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -10,10 +10,17 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::mpsc;
 
+/// Carries all.
+const WHOLE: u8 = 0;
+/// Connections break, none are made.
+const CUT: u8 = 1;
+/// Connections stay, and carry nothing.
+const SILENT: u8 = 2;
+
 pub struct Proxy {
     address: SocketAddr,
     target: Arc<Mutex<String>>,
-    whole: Arc<AtomicBool>,
+    state: Arc<AtomicU8>,
     connections: Arc<AtomicU64>,
 }
 
@@ -22,13 +29,13 @@ impl Proxy {
     pub async fn start(target: String, delay: Duration) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();
-        let (whole, connections) = (Arc::new(AtomicBool::new(true)), Arc::new(AtomicU64::new(0)));
+        let (state, connections) = (Arc::new(AtomicU8::new(WHOLE)), Arc::new(AtomicU64::new(0)));
         let target = Arc::new(Mutex::new(target));
         tokio::spawn({
-            let (target, whole, connections) = (target.clone(), whole.clone(), connections.clone());
+            let (target, state, connections) = (target.clone(), state.clone(), connections.clone());
             async move {
                 while let Ok((near, _)) = listener.accept().await {
-                    if !whole.load(Ordering::Relaxed) {
+                    if state.load(Ordering::Relaxed) == CUT {
                         continue;
                     }
                     let target = target.lock().unwrap().clone();
@@ -37,12 +44,12 @@ impl Proxy {
                     near.set_nodelay(true).unwrap();
                     far.set_nodelay(true).unwrap();
                     let ((near_in, near_out), (far_in, far_out)) = (near.into_split(), far.into_split());
-                    tokio::spawn(carry(near_in, far_out, delay, whole.clone()));
-                    tokio::spawn(carry(far_in, near_out, delay, whole.clone()));
+                    tokio::spawn(carry(near_in, far_out, delay, state.clone()));
+                    tokio::spawn(carry(far_in, near_out, delay, state.clone()));
                 }
             }
         });
-        Proxy { address, target, whole, connections }
+        Proxy { address, target, state, connections }
     }
 
     pub fn url(&self) -> String {
@@ -56,11 +63,16 @@ impl Proxy {
 
     /// Cuts it: connections break, none are made.
     pub fn cut(&self) {
-        self.whole.store(false, Ordering::Relaxed);
+        self.state.store(CUT, Ordering::Relaxed);
+    }
+
+    /// Loses all that comes, and nobody is told: as when a switch dies. Connections of which something was lost end when it is mended.
+    pub fn silence(&self) {
+        self.state.store(SILENT, Ordering::Relaxed);
     }
 
     pub fn mend(&self) {
-        self.whole.store(true, Ordering::Relaxed);
+        self.state.store(WHOLE, Ordering::Relaxed);
     }
 
     /// Made so far.
@@ -73,29 +85,45 @@ async fn carry(
     mut from: tokio::net::tcp::OwnedReadHalf,
     mut to: tokio::net::tcp::OwnedWriteHalf,
     delay: Duration,
-    whole: Arc<AtomicBool>,
+    state: Arc<AtomicU8>,
 ) {
     let (sender, mut waiting) = mpsc::unbounded_channel::<(Instant, Vec<u8>)>();
+    let has_lost = AtomicBool::new(false);
+    // Whether what has come is to go on; `None` if the connection ends.
+    let passes = || match state.load(Ordering::Relaxed) {
+        WHOLE => (!has_lost.load(Ordering::Relaxed)).then_some(true),
+        SILENT => {
+            has_lost.store(true, Ordering::Relaxed);
+            Some(false)
+        }
+        _ => None,
+    };
     let reading = async {
         let mut buffer = vec![0; 1 << 16];
         while let Ok(count @ 1..) = from.read(&mut buffer).await {
-            if !whole.load(Ordering::Relaxed)
-                || sender.send((Instant::now() + delay, buffer[..count].to_vec())).is_err()
-            {
-                return;
+            match passes() {
+                Some(true) if sender.send((Instant::now() + delay, buffer[..count].to_vec())).is_ok() => {}
+                Some(false) => {}
+                _ => return,
             }
         }
     };
     let writing = async {
         while let Some((due, bytes)) = waiting.recv().await {
             tokio::time::sleep_until(due.into()).await;
-            if !whole.load(Ordering::Relaxed) || to.write_all(&bytes).await.is_err() {
-                return;
+            match passes() {
+                Some(true) if to.write_all(&bytes).await.is_ok() => {}
+                Some(false) => {}
+                _ => return,
             }
         }
     };
-    let cut = async {
-        while whole.load(Ordering::Relaxed) {
+    let ended = async {
+        loop {
+            let state = state.load(Ordering::Relaxed);
+            if state == CUT || state == WHOLE && has_lost.load(Ordering::Relaxed) {
+                return;
+            }
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
     };
@@ -103,6 +131,6 @@ async fn carry(
     tokio::select! {
         () = reading => {}
         () = writing => {}
-        () = cut => {}
+        () = ended => {}
     }
 }
