@@ -51,7 +51,7 @@ const CRATES: [(&str, &str, &[&str], &[&str]); 8] = [
     (
         "clients/python",
         "palpate-python",
-        &["palpate", "palpate-client", "palpate-proto", "palpate-touch"],
+        &["palpate", "palpate-client", "palpate-mesh", "palpate-proto", "palpate-touch"],
         &["indicatif"],
     ),
 ];

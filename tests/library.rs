@@ -5,16 +5,19 @@
 mod server;
 
 use std::f64::consts::TAU;
-use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
 
 use glam::DVec3;
-use palpate_client::bridge::{Options, Session, Target, run};
+use palpate_client::bridge::{Options, Session, Target, Tick, run};
+use palpate_client::devices::{Enables, Placed, Placement};
 use palpate_client::view::Frames;
 use palpate_client::watch::Samples;
 use palpate_client::{Channel, Credentials, Error, HapticDevice, Reading, Touch};
 use palpate_proto::geometry::from_vector;
 use palpate_proto::pb;
-use palpate_touch::{Device, Tip};
+use palpate_touch::{Device, RenderingState, Tip};
 use pb::create_session_request::Source;
 use pb::session_service_client::SessionServiceClient;
 use pb::touch_request::Message as Say;
@@ -139,4 +142,117 @@ async fn what_a_server_refuses_at_first_ends_the_bridge() {
         let error = tokio::time::timeout(PATIENCE, serving).await.expect("it goes on").err().unwrap();
         assert!(error.is_refusal() && matches!(&error, Error::Call(_)), "{error}");
     }
+}
+
+/// Presses into the tissue, and has buttons: 0 asks for forces, 1 is the clutch.
+struct Clutched {
+    orders: Arc<Orders>,
+    place_m: DVec3,
+}
+
+/// What the hand is told to do, and what became of it.
+#[derive(Default)]
+struct Orders {
+    goal_m: Mutex<DVec3>,
+    buttons: AtomicU32,
+    newest: Mutex<Option<Tick>>,
+    /// The force that the device itself was told.
+    force_n: Mutex<DVec3>,
+}
+
+impl Orders {
+    fn go(&self, place_m: DVec3) {
+        *self.goal_m.lock().unwrap() = place_m;
+    }
+
+    async fn until(&self, what: &str, holds: impl Fn(&Tick, DVec3) -> bool) -> Tick {
+        let waited = tokio::time::timeout(PATIENCE, async {
+            loop {
+                let (newest, force_n) = (*self.newest.lock().unwrap(), *self.force_n.lock().unwrap());
+                if let Some(tick) = newest.filter(|tick| tick.state.is_some() && holds(tick, force_n)) {
+                    return tick;
+                }
+                tokio::time::sleep(Duration::from_millis(2)).await;
+            }
+        });
+        waited.await.unwrap_or_else(|_| panic!("never: {what}"))
+    }
+}
+
+impl HapticDevice for Clutched {
+    fn descriptor(&self) -> Device {
+        Device::named("omega3").unwrap()
+    }
+
+    fn read(&mut self) -> std::io::Result<Reading> {
+        let way_m = *self.orders.goal_m.lock().unwrap() - self.place_m;
+        self.place_m += way_m.clamp_length_max(2e-5);
+        Ok(Reading { place_m: self.place_m, enable: false })
+    }
+
+    fn write(&mut self, force_n: DVec3) -> std::io::Result<()> {
+        *self.orders.force_n.lock().unwrap() = force_n;
+        Ok(())
+    }
+
+    fn buttons(&self) -> u32 {
+        self.orders.buttons.load(Ordering::Relaxed)
+    }
+
+    fn button_count(&self) -> u32 {
+        2
+    }
+
+    fn ticked(&mut self, tick: &Tick) {
+        *self.orders.newest.lock().unwrap() = Some(*tick);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_clutch_leaves_the_tool_in_the_tissue_and_takes_the_force_off_the_hand() {
+    const ENABLE: u32 = 1;
+    const CLUTCH: u32 = 2;
+    let server = Server::start(&[]);
+    let session_id = create(at(&server).connect().await.unwrap(), "liver").await;
+    let orders = Arc::new(Orders::default());
+    let (out_m, in_m) = (0.004 * DVec3::Z, -0.003 * DVec3::Z);
+    orders.go(out_m);
+    let hand = Clutched { orders: orders.clone(), place_m: out_m };
+    let placement = Placement { enable: Enables::Button(0), ..Placement::default() };
+    let placed = Placed::new(hand, placement).unwrap();
+    let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
+    let target = target(&server, Session::Existing(session_id.clone()));
+    let serving = tokio::spawn(run(placed, target, Options::default(), async { drop(stopped.await) }));
+    orders.until("it is connected", |tick, _| tick.place_m.z > 0.0039).await;
+    orders.buttons.store(ENABLE, Ordering::Relaxed);
+    orders.until("it renders", |tick, _| tick.state == Some(RenderingState::Enabled)).await;
+    orders.go(in_m);
+    let held = orders.until("it presses", |tick, force_n| tick.place_m.z < -0.00299 && force_n.z > 0.05).await;
+    // The clutch: the hand goes up and aside, the tool stays.
+    orders.buttons.store(ENABLE | CLUTCH, Ordering::Relaxed);
+    orders.until("the force is off", |_, force_n| force_n == DVec3::ZERO).await;
+    orders.go(DVec3::new(0.005, 0.0, 0.004));
+    let request = pb::WatchSamplesRequest { session_id, ..Default::default() };
+    let mut samples = Samples::open(at(&server).connect().await.unwrap(), request).await.unwrap();
+    let begun = held.time_s;
+    let after = orders.until("the hand has moved", |tick, _| tick.time_s > begun + 1.0).await;
+    assert!((after.place_m - held.place_m).length() < 1e-4, "{after:?}, but it was {held:?}");
+    assert_eq!(*orders.force_n.lock().unwrap(), DVec3::ZERO);
+    let sample = samples.next().await.unwrap().expect("samples go on");
+    let pushed_m = from_vector(sample.tools[0].displacement_m.as_ref()).z;
+    assert!(pushed_m < -0.002, "the tool has left the tissue: {pushed_m} m");
+    // It goes on from where it stood: what was 4 mm above the tissue for the hand is where the tool is.
+    orders.buttons.store(ENABLE, Ordering::Relaxed);
+    orders.go(DVec3::new(0.005, 0.0, 0.003));
+    let lower = orders.until("it goes on", |tick, _| tick.place_m.z < after.place_m.z - 9e-4).await;
+    assert!((lower.place_m.x - after.place_m.x).abs() < 1e-4, "{lower:?}");
+    assert_eq!(*orders.force_n.lock().unwrap(), DVec3::ZERO, "a force begins within the tissue");
+    orders.go(DVec3::new(0.005, 0.0, 0.012));
+    orders.until("it is out of the tissue", |tick, _| tick.place_m.z > 0.002).await;
+    orders.go(DVec3::new(0.005, 0.0, 0.004));
+    orders.until("it is felt again", |tick, force_n| tick.place_m.z < 0.0 && force_n.z > 0.05).await;
+    drop(stop);
+    let (placed, report) = tokio::time::timeout(PATIENCE, serving).await.expect("it goes on").unwrap().unwrap();
+    assert_eq!(*placed.device().orders.force_n.lock().unwrap(), DVec3::ZERO);
+    assert_eq!(report.lost.map(|error| error.to_string()), None);
 }

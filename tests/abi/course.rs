@@ -12,7 +12,7 @@ use pb::touch_response::Message as Heard;
 use prost::Message;
 
 use crate::server::{PATIENCE, Server, Touch, open};
-use crate::{ALONE, compiled, compiled_cs, done, folder, has_mono, mono, ours, told};
+use crate::{ALONE, compiled, compiled_cs, done, folder, has_mono, mono, ours, root, told};
 
 /// What happened at the client, in order.
 enum Event {
@@ -27,14 +27,15 @@ fn place_m(time_s: f64) -> DVec3 {
     DVec3::new(slide_m, -0.3 * slide_m, 0.001 - press_m)
 }
 
-/// A second and a half of touch of a real server, as it came.
-async fn recorded(server: &Server) -> (DVec3, Vec<Event>) {
+/// A second and a half of touch of a real server, as it came, with a sample every so many steps.
+async fn recorded(server: &Server, every: u32) -> (DVec3, Vec<Event>) {
     let source = pb::create_session_request::Source::SceneName("liver".into());
     let session = server.create(source, false).await.unwrap();
     let middle_m = palpate_proto::geometry::from_vector(session.extent.unwrap().middle_m.as_ref());
     let request = pb::TouchOpen {
         device: Some(touch::device(&Device::named("omega3").unwrap())),
         tip: Some(touch::tip(&Tip::default())),
+        sample_every_steps: Some(every),
         ..open(&session.session_id, &[0])
     };
     let mut stream = Touch::open(server, request).await.unwrap();
@@ -82,15 +83,37 @@ fn written(middle_m: DVec3, events: &[Event]) -> Vec<u8> {
     file
 }
 
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_force_course_is_the_same_in_every_language() {
-    let _alone = ALONE.lock().await;
-    let server = Server::start(&[]);
-    let (middle_m, events) = tokio::time::timeout(PATIENCE, recorded(&server)).await.expect("the server is silent");
+/// What [`written`] has written.
+fn read(file: &[u8]) -> (DVec3, Vec<Event>) {
+    fn take<'f, const N: usize>(rest: &mut &'f [u8]) -> &'f [u8; N] {
+        let (taken, left) = rest.split_first_chunk().expect("the record ends within an event");
+        *rest = left;
+        taken
+    }
+    let number = |rest: &mut &[u8]| f64::from_le_bytes(*take(rest));
+    let vector = |rest: &mut &[u8]| DVec3::new(number(rest), number(rest), number(rest));
+    let mut rest = file;
+    let (middle_m, mut events) = (vector(&mut rest), Vec::new());
+    while !rest.is_empty() {
+        events.push(if u32::from_le_bytes(*take(&mut rest)) == 0 {
+            let length = u32::from_le_bytes(*take(&mut rest)) as usize;
+            let (bytes, left) = rest.split_at(length);
+            rest = left;
+            Event::Arrived(bytes.to_vec())
+        } else {
+            let time_s = number(&mut rest);
+            Event::Ticked { time_s, place_m: vector(&mut rest), enable: number(&mut rest) != 0.0 }
+        });
+    }
+    (middle_m, events)
+}
+
+/// The forces of Rust, as `replay.c` writes them; those of C and C# are the same.
+fn assert_same_forces(name: &str, middle_m: DVec3, events: &[Event]) {
     let device = Device::named("omega3").unwrap();
     let Offline { mut ticker, mut record } = Offline::new(device, Origin::Tissue, middle_m, 0.0);
     let (mut forces, mut most_n) = (Vec::new(), 0.0_f64);
-    for event in &events {
+    for event in events {
         match event {
             Event::Arrived(bytes) => record.arrive(bytes).unwrap(),
             Event::Ticked { time_s, place_m, enable } => {
@@ -103,8 +126,9 @@ async fn the_force_course_is_the_same_in_every_language() {
     assert_eq!(forces.len(), 1500 * 24);
     assert!(most_n > 0.1, "{most_n} N: the record shows no touch");
     let replay = compiled("clients/c/tests/replay.c", &[]);
-    let (recorded, by_c, by_cs) = (folder().join("record"), folder().join("c.forces"), folder().join("cs.forces"));
-    std::fs::write(&recorded, written(middle_m, &events)).unwrap();
+    let file = |ending: &str| folder().join(format!("{name}.{ending}"));
+    let (recorded, by_c, by_cs) = (file("record"), file("c.forces"), file("cs.forces"));
+    std::fs::write(&recorded, written(middle_m, events)).unwrap();
     done(ours(&replay).args([&recorded, &by_c]));
     assert!(std::fs::read(&by_c).unwrap() == forces, "C renders other forces");
     // Glibc lets a program have these functions of its own.
@@ -117,4 +141,28 @@ async fn the_force_course_is_the_same_in_every_language() {
         done(mono(&compiled_cs("clients/csharp/tests/Replay.cs")).args([&recorded, &by_cs]));
         assert!(std::fs::read(&by_cs).unwrap() == forces, "C# renders other forces");
     }
+}
+
+/// The record that the tests of Python render too. PALPATE_RECORD=1 makes it anew.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_kept_record_gives_the_same_forces_in_every_language() {
+    let _alone = ALONE.lock().await;
+    let kept = root().join("tests/abi/touch.record");
+    if std::env::var_os("PALPATE_RECORD").is_some() {
+        let server = Server::start(&[]);
+        let (middle_m, events) = recorded(&server, 20).await;
+        std::fs::write(&kept, written(middle_m, &events)).unwrap();
+    }
+    let file = std::fs::read(&kept).unwrap();
+    let (middle_m, events) = read(&file);
+    assert!(written(middle_m, &events) == file);
+    assert_same_forces("kept", middle_m, &events);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_force_course_is_the_same_in_every_language() {
+    let _alone = ALONE.lock().await;
+    let server = Server::start(&[]);
+    let (middle_m, events) = tokio::time::timeout(PATIENCE, recorded(&server, 1)).await.expect("the server is silent");
+    assert_same_forces("fresh", middle_m, &events);
 }

@@ -130,6 +130,8 @@ pub(crate) struct Trail {
     /// Of the newest stream: after a move its tool is still in the tissue, and goes on by this lease at the next server. Empty if it
     /// does not.
     pub(crate) lease_id: String,
+    /// Of the newest command. It rises over all streams: where a lease goes on, what has a smaller one is old.
+    pub(crate) sequence: u64,
 }
 
 impl Trail {
@@ -141,6 +143,7 @@ impl Trail {
             revision: 0,
             is_awaited: false,
             lease_id: String::new(),
+            sequence: 0,
         }
     }
 

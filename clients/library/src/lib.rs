@@ -1,7 +1,7 @@
 //! Clients of a Palpate server.
 //!
 //! - [`connect`]: connections, plain or TLS, with the caller's credentials, deadlines, and errors in words.
-//! - [`fleet`]: which server of a fleet has a session, and calls that go there.
+//! - [`fleet`]: which server of a fleet has a session, and calls that go there; [`followed`]: one session, from server to server.
 //! - [`touch`]: the haptic stream, for programs that send commands and render forces themselves.
 //! - [`datagrams`]: the datagrams of such a stream, which no lost packet holds up.
 //! - [`device`] and [`bridge`]: the trait of haptic devices, and the loop that connects one to a server at 1 kHz.
@@ -50,6 +50,7 @@ pub mod device;
 pub mod devices;
 mod exchange;
 pub mod fleet;
+pub mod followed;
 pub mod os;
 pub mod shown;
 mod sync;
@@ -60,6 +61,7 @@ pub mod watch;
 
 pub use connect::{Channel, Credentials, Server, Token, describe};
 pub use device::{HapticDevice, Reading};
+pub use followed::Followed;
 pub use touch::Touch;
 
 /// An error of this library.

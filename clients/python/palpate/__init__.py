@@ -1,7 +1,8 @@
 """Soft tissue to touch: in this process at full speed, over a network, and as it was recorded.
 
 In this process, `run` plays a script on a scene, `study` many of them over threads, and a `Session` is a tissue that you step
-and touch yourself. `connect` (and `palpate.aio.connect`) leads to a server. A `Journal` is a recorded session.
+and touch yourself. `connect` (and `palpate.aio.connect`) leads to a server. A `Journal` is a recorded session, and `Offline` renders the forces of a
+recorded touch.
 
 SI units; the unit of a value is in its name. Arrays have one row for each point, in the order of `Tissue.rest_m`.
 """
@@ -17,6 +18,7 @@ from ._journal import Commands, Verdict
 from ._native import (
     Frames,
     Journal,
+    Offline,
     RemoteSession,
     Samples,
     Scene,
@@ -45,6 +47,7 @@ __all__ = [
     "Frame",
     "Frames",
     "Journal",
+    "Offline",
     "Refused",
     "RemoteSession",
     "Run",

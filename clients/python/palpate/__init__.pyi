@@ -194,6 +194,37 @@ class Journal:
     def session(self, step: Optional[int] = None) -> Session:
         """The session when so many steps were done; at the end if None."""
 
+class Offline:
+    """A touch loop without a network: the same messages, places and times give the same forces, bit by bit, as in every other language.
+
+    `limits` are those of a device, as of a Course. Places are from the middle of the device's workspace, which is laid on `middle_m`, the
+    middle of the tissue; or, `in_tissue_frame`, in the tissue's own frame.
+    """
+
+    def __init__(
+        self,
+        limits: Union[str, dict[str, float], None] = None,
+        *,
+        middle_m: Optional[Vector] = None,
+        in_tissue_frame: bool = False,
+        up_deadband: float = 0.0,
+    ) -> None: ...
+    def arrive(self, message: bytes) -> None:
+        """A message of the server arrives now: the bytes of a `palpate.v1.TouchResponse`. The next tick knows it."""
+    def tick(self, place_m: Vector, time_s: float, enable: bool = True) -> tuple[float, float, float]:
+        """The force to render from now on, N, for a device that is here at `time_s`, a time of any origin. A change of enable from False to
+        True asks for forces. Without a connection (an `opened` that has arrived) there are none."""
+    def disable(self) -> None:
+        """Stops rendering until it is enabled again."""
+    @property
+    def state(self) -> Literal["waiting", "disabled", "enabled", "paused", "fault"]: ...
+    @property
+    def place_m(self) -> tuple[float, float, float]:
+        """Where the tool was at the last tick, in the tissue's frame."""
+    @property
+    def age_s(self) -> Optional[float]:
+        """How old the newest news of the tissue is; None before the first."""
+
 class Samples(Iterator[dict[str, Any]]):
     def take(self, count: int) -> Sampled:
         """The next samples, as arrays."""
@@ -203,10 +234,14 @@ class Frames(Iterator[Frame]):
     def __next__(self) -> Frame: ...
 
 class RemoteSession:
-    """A session of a server. `with` deletes it at the end."""
+    """A session of a server. `with` deletes it at the end. In a fleet it is followed to whichever server has it: calls and streams go on
+    there."""
 
     @property
     def id(self) -> str: ...
+    @property
+    def server(self) -> str:
+        """URL of the server that had it at last."""
     def status(self) -> dict[str, Any]: ...
     def start(self, *, until_step: Optional[int] = None) -> int: ...
     def pause(self) -> None: ...
@@ -245,6 +280,26 @@ class RemoteSession:
         `device` is a Course, or an object with `read()`, which returns ((x, y, z), enable), and `write(force_n)`, and perhaps
         `limits`, as a Course has them. A change of enable from False to True asks for forces.
         """
+    def pose(self, tool: int, place_m: Vector, tip: Optional[Tip] = None) -> None:
+        """Brings a tool with a tip here by the end of the next step, and takes the tool first if that is needed. It stays here until it
+        is told something else, also when the session moves. Raises Refused, reason TOOL_HELD, if another has the tool."""
+    def push(
+        self,
+        tool: int,
+        force_n: Vector,
+        *,
+        point: Optional[Point] = None,
+        at_m: Optional[Vector] = None,
+        falloff_per_m: float = 200.0,
+        falloff_offset: float = 0.0,
+    ) -> None: ...
+    def grasp(self, tool: int, point: Point, displacement_m: Vector) -> None: ...
+    def release(self, tool: int) -> None:
+        """Ends what a tool does, and gives it back."""
+    def play(self, script: Union[Script, Source], *, scene: Optional[Union[Scene, Source]] = None) -> Run:
+        """Plays a script in real time, each command at its exact step, from the session's step on. The session must stand, and stands at
+        the end. From step 0 on the records are those of `run(..., held=True)`. A session on a mesh needs its `scene`, unless you made it
+        from one."""
     def __enter__(self) -> RemoteSession: ...
     def __exit__(self, *raised: object) -> None: ...
 

@@ -4,24 +4,28 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use palpate::wire;
-use palpate_client::bridge::{self, Options, Report, Target};
-use palpate_client::{Channel, Credentials, Token, view, watch};
-use palpate_proto::geometry::from_vector;
-use palpate_proto::pb;
-use palpate_touch::{LimitCause, RenderingState};
+use glam::DVec3;
+use palpate::scene;
+use palpate::shape::PointName;
+use palpate_client::bridge::{self, Options, Target};
+use palpate_client::{Channel, Credentials, Followed, Token};
+use palpate_proto::{pb, touch};
+use pb::command::Action;
 use pb::session_service_client::SessionServiceClient;
 use pb::view_service_client::ViewServiceClient;
-use pyo3::exceptions::{PyStopAsyncIteration, PyStopIteration};
 use pyo3::prelude::*;
-use pyo3::types::{PyBytes, PyDict};
 use tokio::sync::{Mutex, oneshot};
 
-use crate::arrays::{column, records, rows, shaped};
+use crate::arrays::vector;
 use crate::device::Given;
-use crate::error::{of_client, of_status, wrong};
-use crate::scene::Scene;
+use crate::error::{of_client, of_status, refused, wrong};
+use crate::held::Held;
+use crate::play::play;
+use crate::scene::{Scene, Script, point_name};
+use crate::sent::Sent;
+use crate::streams::{self, Following, Frames, Samples};
 use crate::tip::Tip;
+use crate::told::{Bytes, Mesh, Status, Touched};
 use crate::waiting::{answer, answer_in_order};
 
 /// What a call gives that gives nothing: `None`.
@@ -35,6 +39,7 @@ fn duration(field: &str, seconds: f64) -> PyResult<Duration> {
 
 /// A connection to a server.
 #[pyclass(frozen, module = "palpate")]
+#[derive(Clone)]
 pub(crate) struct Server {
     server: palpate_client::Server,
     channel: Channel,
@@ -46,8 +51,10 @@ impl Server {
         SessionServiceClient::new(self.channel.clone())
     }
 
-    fn session_of(&self, id: String) -> RemoteSession {
-        RemoteSession { id, server: self.server.clone(), channel: self.channel.clone(), awaited: self.awaited }
+    /// The session of this ID, wherever in the fleet it is.
+    async fn found(self, id: String, scene: Option<Arc<scene::Scene>>) -> PyResult<RemoteSession> {
+        let found = Followed::find(self.server, self.channel, id).await.map_err(of_client)?;
+        Ok(RemoteSession { session: found.0.into(), held: Arc::default(), scene, awaited: self.awaited })
     }
 }
 
@@ -107,36 +114,35 @@ impl Server {
         paused: bool,
         idle_timeout_s: Option<f64>,
     ) -> PyResult<Bound<'py, PyAny>> {
-        use pb::create_session_request::Source;
-        let source = match scene.cast::<Scene>() {
-            Ok(scene) => {
-                let scene = &scene.get().scene;
-                if scene.sheet().is_none() {
-                    return Err(wrong("scene", "is of a mesh: give the name of a scene that the server has"));
-                }
-                Source::Scene(wire::scene::sent(scene))
+        let (source, own) = match scene.cast::<Scene>() {
+            Ok(scene) => (Sent::of(scene.get()).map_err(refused)?, Some(Arc::new(scene.get().scene.clone()))),
+            Err(_) => {
+                let name = scene.extract().map_err(|_| {
+                    wrong("scene", "must be the name of a scene that the server has, or a palpate.Scene")
+                })?;
+                (Sent::Name(name), None)
             }
-            Err(_) => Source::SceneName(scene.extract().map_err(|_| {
-                wrong("scene", "must be the name of a scene that the server has, or a palpate.Scene of a sheet")
-            })?),
         };
-        let request = pb::CreateSessionRequest { source: Some(source), paused, idle_timeout_s };
-        let mut sessions = self.sessions();
-        let made = self.session_of(String::new());
-        answer(py, self.awaited, async move {
-            let found = sessions.create_session(request).await.map_err(of_status)?;
-            let id = found.into_inner().session.map(|session| session.session_id).unwrap_or_default();
-            Ok(RemoteSession { id, ..made })
+        let (server, awaited) = (self.clone(), self.awaited);
+        answer(py, awaited, async move {
+            let source = Some(source.source(server.channel.clone()).await?);
+            let request = pb::CreateSessionRequest { source, paused, idle_timeout_s };
+            let made = server.sessions().create_session(request).await.map_err(of_status)?.into_inner().session;
+            let made = made.unwrap_or_default();
+            // Another server of the fleet may have made it.
+            match &made.ownership {
+                Some(_) => server.found(made.session_id, own).await,
+                None => {
+                    let session = Followed::new(server.server, server.channel, made.session_id).into();
+                    Ok(RemoteSession { session, held: Arc::default(), scene: own, awaited })
+                }
+            }
         })
     }
 
     fn session<'py>(&self, py: Python<'py>, session_id: String) -> PyResult<Bound<'py, PyAny>> {
-        let (mut sessions, made) = (self.sessions(), self.session_of(session_id.clone()));
-        answer(py, self.awaited, async move {
-            // Refused if there is none.
-            sessions.get_session(pb::GetSessionRequest { session_id }).await.map_err(of_status)?;
-            Ok(made)
-        })
+        // Refused if there is none.
+        answer(py, self.awaited, self.clone().found(session_id, None))
     }
 
     fn __repr__(&self) -> String {
@@ -144,75 +150,48 @@ impl Server {
     }
 }
 
-/// How a session stands.
-#[derive(IntoPyObject)]
-struct Status {
-    session_id: String,
-    scene: String,
-    state: &'static str,
-    step: u64,
-    time_s: f64,
-    points: u32,
-    integrator: String,
-    substeps: u32,
-    precision: String,
-    time_dilation: f64,
-    overrun_steps: u64,
-    late_commands: u64,
-    recoveries: u64,
-    awake_points: u32,
-    resting: bool,
-    hold_reason: String,
-    held_tools: Vec<(u32, String)>,
-    middle_m: (f64, f64, f64),
-    warnings: Vec<String>,
+fn grid_point(point: [usize; 2]) -> pb::GridPoint {
+    let [x, y] = point.map(|number| number.try_into().unwrap_or(u32::MAX));
+    pb::GridPoint { x, y }
 }
 
-impl Status {
-    fn of(session: pb::Session) -> Self {
-        let state = match session.state() {
-            pb::SessionState::Running => "running",
-            pb::SessionState::Paused => "paused",
-            pb::SessionState::Held => "held",
-            pb::SessionState::Unspecified => "unknown",
-        };
-        let middle_m = from_vector(session.extent.as_ref().and_then(|extent| extent.middle_m.as_ref()));
-        Status {
-            session_id: session.session_id,
-            scene: session.scene_name,
-            state,
-            step: session.step,
-            time_s: session.simulation_time_s,
-            points: session.points,
-            integrator: session.integrator,
-            substeps: session.substeps,
-            precision: session.precision,
-            time_dilation: session.time_dilation,
-            overrun_steps: session.overrun_count,
-            late_commands: session.late_commands,
-            recoveries: session.recovery_count,
-            awake_points: session.awake_points,
-            resting: session.resting,
-            hold_reason: session.hold_reason,
-            held_tools: session.held_tools.into_iter().map(|held| (held.tool, held.holder)).collect(),
-            middle_m: (middle_m.x, middle_m.y, middle_m.z),
-            warnings: session.warnings,
-        }
-    }
+/// A vector as it is: what is not finite the server refuses, with its field.
+fn numbers(DVec3 { x, y, z }: DVec3) -> pb::Vector3 {
+    pb::Vector3 { x, y, z }
 }
 
 /// A session of a server.
 #[pyclass(frozen, module = "palpate")]
 pub(crate) struct RemoteSession {
-    id: String,
-    server: palpate_client::Server,
-    channel: Channel,
-    awaited: bool,
+    pub(crate) session: Arc<Followed>,
+    pub(crate) held: Arc<Held>,
+    /// The scene that the caller has sent.
+    pub(crate) scene: Option<Arc<scene::Scene>>,
+    pub(crate) awaited: bool,
 }
 
+/// Calls whichever server has the session.
+macro_rules! called {
+    ($session:expr, $client:ident . $call:ident ( $request:expr )) => {{
+        let request = $request;
+        let called = $session.call(|channel| {
+            let request = request.clone();
+            async move { $client::new(channel).$call(request).await }
+        });
+        called.await.map_err(of_client).map(tonic::Response::into_inner)
+    }};
+}
+pub(crate) use called;
+
 impl RemoteSession {
-    fn sessions(&self) -> SessionServiceClient<Channel> {
-        SessionServiceClient::new(self.channel.clone())
+    /// The session, to be moved into a future; and its ID.
+    fn own(&self) -> (Arc<Followed>, String) {
+        (self.session.clone(), self.session.session_id().to_owned())
+    }
+
+    fn tell<'py>(&self, py: Python<'py>, tool: u32, action: Action) -> PyResult<Bound<'py, PyAny>> {
+        let told = self.held.clone().tell(self.session.clone(), tool, action);
+        answer(py, self.awaited, async move { told.await.map(|()| NOTHING).map_err(of_client) })
     }
 }
 
@@ -220,32 +199,36 @@ impl RemoteSession {
 impl RemoteSession {
     #[getter]
     fn id(&self) -> &str {
-        &self.id
+        self.session.session_id()
+    }
+
+    #[getter]
+    fn server(&self) -> String {
+        self.session.server().url().to_owned()
     }
 
     fn status<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        let (mut sessions, session_id) = (self.sessions(), self.id.clone());
+        let (session, session_id) = self.own();
         answer(py, self.awaited, async move {
-            let found = sessions.get_session(pb::GetSessionRequest { session_id }).await;
-            let found = found.map_err(of_status)?.into_inner();
+            let found = called!(session, SessionServiceClient.get_session(pb::GetSessionRequest { session_id }))?;
             Ok(Status::of(found.session.unwrap_or_default()))
         })
     }
 
     #[pyo3(signature = (*, until_step=None))]
     fn start<'py>(&self, py: Python<'py>, until_step: Option<u64>) -> PyResult<Bound<'py, PyAny>> {
-        let (mut sessions, session_id) = (self.sessions(), self.id.clone());
+        let (session, session_id) = self.own();
         answer(py, self.awaited, async move {
-            let found = sessions.start_session(pb::StartSessionRequest { session_id, until_step }).await;
-            Ok(found.map_err(of_status)?.into_inner().step)
+            let request = pb::StartSessionRequest { session_id, until_step };
+            Ok(called!(session, SessionServiceClient.start_session(request))?.step)
         })
     }
 
     fn pause<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        let (mut sessions, session_id) = (self.sessions(), self.id.clone());
+        let (session, session_id) = self.own();
         answer(py, self.awaited, async move {
-            let found = sessions.pause_session(pb::PauseSessionRequest { session_id }).await;
-            found.map(|_| NOTHING).map_err(of_status)
+            let request = pb::PauseSessionRequest { session_id };
+            called!(session, SessionServiceClient.pause_session(request)).map(|_| NOTHING)
         })
     }
 
@@ -260,7 +243,7 @@ impl RemoteSession {
         volume_stiffness_pa: Option<f64>,
         at_step: Option<u64>,
     ) -> PyResult<Bound<'py, PyAny>> {
-        let (mut sessions, session_id) = (self.sessions(), self.id.clone());
+        let (session, session_id) = self.own();
         let request = pb::UpdateTissueRequest {
             session_id,
             stiffness_n_per_m,
@@ -269,27 +252,24 @@ impl RemoteSession {
             volume_stiffness_pa,
             at_step,
         };
-        answer(py, self.awaited, async move {
-            let found = sessions.update_tissue(request).await;
-            Ok(found.map_err(of_status)?.into_inner().step)
-        })
+        answer(py, self.awaited, async move { Ok(called!(session, SessionServiceClient.update_tissue(request))?.step) })
     }
 
     #[pyo3(signature = (*, at_step=None))]
     fn hash<'py>(&self, py: Python<'py>, at_step: Option<u64>) -> PyResult<Bound<'py, PyAny>> {
-        let (mut sessions, session_id) = (self.sessions(), self.id.clone());
+        let (session, session_id) = self.own();
         answer(py, self.awaited, async move {
-            let found = sessions.get_state_hash(pb::GetStateHashRequest { session_id, at_step }).await;
-            let found = found.map_err(of_status)?.into_inner();
+            let request = pb::GetStateHashRequest { session_id, at_step };
+            let found = called!(session, SessionServiceClient.get_state_hash(request))?;
             Ok((found.step, found.state_hash))
         })
     }
 
     fn save<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        let (mut sessions, session_id) = (self.sessions(), self.id.clone());
+        let (session, session_id) = self.own();
         answer(py, self.awaited, async move {
-            let parts = sessions.save_snapshot(pb::SaveSnapshotRequest { session_id }).await;
-            let mut parts = parts.map_err(of_status)?.into_inner();
+            let request = pb::SaveSnapshotRequest { session_id };
+            let mut parts = called!(session, SessionServiceClient.save_snapshot(request))?;
             let mut bytes = Vec::new();
             while let Some(part) = parts.message().await.map_err(of_status)? {
                 bytes.extend_from_slice(&part.part);
@@ -299,25 +279,25 @@ impl RemoteSession {
     }
 
     fn delete<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        let (mut sessions, session_id) = (self.sessions(), self.id.clone());
+        let (session, session_id) = self.own();
         answer(py, self.awaited, async move {
-            let found = sessions.delete_session(pb::DeleteSessionRequest { session_id }).await;
-            found.map(|_| NOTHING).map_err(of_status)
+            let request = pb::DeleteSessionRequest { session_id };
+            called!(session, SessionServiceClient.delete_session(request)).map(|_| NOTHING)
         })
     }
 
     #[pyo3(signature = (*, every_steps=1, heartbeat_s=None))]
     fn samples<'py>(&self, py: Python<'py>, every_steps: u32, heartbeat_s: Option<f64>) -> PyResult<Bound<'py, PyAny>> {
         let request = pb::WatchSamplesRequest {
-            session_id: self.id.clone(),
+            session_id: self.session.session_id().to_owned(),
             sample_every_steps: Some(every_steps),
             heartbeat_s,
             ..Default::default()
         };
-        let (channel, awaited) = (self.channel.clone(), self.awaited);
+        let (session, awaited) = (self.session.clone(), self.awaited);
         answer(py, awaited, async move {
-            let samples = watch::Samples::open(channel, request).await.map_err(of_status)?;
-            Ok(Samples { stream: Arc::new(Mutex::new(samples)), awaited })
+            let samples = streams::samples(&session, &request).await?;
+            Ok(Samples { stream: Arc::new(Mutex::new(Following::new(session, request, samples))), awaited })
         })
     }
 
@@ -330,25 +310,25 @@ impl RemoteSession {
         precise: bool,
     ) -> PyResult<Bound<'py, PyAny>> {
         let request = pb::WatchFramesRequest {
-            session_id: self.id.clone(),
+            session_id: self.session.session_id().to_owned(),
             refinement,
             encoding: if precise { pb::Encoding::F32 } else { pb::Encoding::I16 }.into(),
             rate_hz: Some(rate_hz),
             ..Default::default()
         };
-        let (channel, awaited) = (self.channel.clone(), self.awaited);
+        let (session, awaited) = (self.session.clone(), self.awaited);
         answer(py, awaited, async move {
-            let frames = view::Frames::open(channel, request).await.map_err(of_status)?;
-            Ok(Frames { stream: Arc::new(Mutex::new(frames)), awaited })
+            let frames = streams::frames(&session, &request).await?;
+            Ok(Frames { stream: Arc::new(Mutex::new(Following::new(session, request, frames))), awaited })
         })
     }
 
     #[pyo3(signature = (*, refinement=0))]
     fn mesh<'py>(&self, py: Python<'py>, refinement: u32) -> PyResult<Bound<'py, PyAny>> {
-        let (mut views, session_id) = (ViewServiceClient::new(self.channel.clone()), self.id.clone());
+        let (session, session_id) = self.own();
         answer(py, self.awaited, async move {
-            let parts = views.get_mesh(pb::GetMeshRequest { session_id, refinement }).await;
-            let mut parts = parts.map_err(of_status)?.into_inner();
+            let request = pb::GetMeshRequest { session_id, refinement };
+            let mut parts = called!(session, ViewServiceClient.get_mesh(request))?;
             let mut mesh = Mesh::default();
             while let Some(part) = parts.message().await.map_err(of_status)? {
                 mesh.grid = (part.vertices_x, part.vertices_y);
@@ -380,8 +360,8 @@ impl RemoteSession {
         let device = Given::of(device)?;
         let lasts = seconds.or(device.lasts_s()).map(|seconds| duration("seconds", seconds)).transpose()?;
         let target = Target {
-            server: self.server.clone(),
-            session: bridge::Session::Existing(self.id.clone()),
+            server: self.session.server(),
+            session: bridge::Session::Existing(self.session.session_id().to_owned()),
             tool,
             tip: tip.map(|tip| tip.0).unwrap_or_default(),
             deadband,
@@ -399,6 +379,80 @@ impl RemoteSession {
             let (_, report) = bridge::run(device, target, options, stop).await.map_err(of_client)?;
             Ok(Touched(report))
         })
+    }
+
+    #[pyo3(signature = (tool, place_m, tip=None))]
+    fn pose<'py>(
+        &self,
+        py: Python<'py>,
+        tool: u32,
+        place_m: &Bound<'py, PyAny>,
+        tip: Option<Tip>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let tip = tip.map(|tip| tip.0).unwrap_or_default();
+        self.tell(py, tool, Action::Pose(touch::pose(vector("place_m", place_m)?, &tip)))
+    }
+
+    #[pyo3(signature = (tool, force_n, *, point=None, at_m=None, falloff_per_m=200.0, falloff_offset=0.0))]
+    #[allow(clippy::too_many_arguments)]
+    fn push<'py>(
+        &self,
+        py: Python<'py>,
+        tool: u32,
+        force_n: &Bound<'py, PyAny>,
+        point: Option<&Bound<'py, PyAny>>,
+        at_m: Option<&Bound<'py, PyAny>>,
+        falloff_per_m: f64,
+        falloff_offset: f64,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let centre = match (point, at_m) {
+            (Some(point), None) => match point_name(point)? {
+                PointName::Point(at) => pb::force::Centre::Point(grid_point(at)),
+                PointName::Vertex(vertex) => pb::force::Centre::Vertex(vertex),
+            },
+            (None, Some(at_m)) => pb::force::Centre::AtM(numbers(vector("at_m", at_m)?)),
+            _ => return Err(wrong("point", "give either a point or a place, at_m")),
+        };
+        let force = pb::Force {
+            centre: Some(centre),
+            force_n: Some(numbers(vector("force_n", force_n)?)),
+            falloff_per_m: Some(falloff_per_m),
+            falloff_offset: Some(falloff_offset),
+        };
+        self.tell(py, tool, Action::Force(force))
+    }
+
+    fn grasp<'py>(
+        &self,
+        py: Python<'py>,
+        tool: u32,
+        point: &Bound<'py, PyAny>,
+        displacement_m: &Bound<'py, PyAny>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let (point, vertex) = match point_name(point)? {
+            PointName::Point(at) => (Some(grid_point(at)), None),
+            PointName::Vertex(vertex) => (None, Some(vertex)),
+        };
+        let displacement_m = numbers(vector("displacement_m", displacement_m)?);
+        let target = Some(pb::position::Target::DisplacementM(displacement_m));
+        self.tell(py, tool, Action::Position(pb::Position { point, vertex, target }))
+    }
+
+    fn release<'py>(&self, py: Python<'py>, tool: u32) -> PyResult<Bound<'py, PyAny>> {
+        let released = self.held.clone().release(self.session.clone(), tool);
+        answer(py, self.awaited, async move { released.await.map(|()| NOTHING).map_err(of_client) })
+    }
+
+    #[pyo3(signature = (script, *, scene=None))]
+    fn play<'py>(
+        &self,
+        py: Python<'py>,
+        script: &Bound<'py, PyAny>,
+        scene: Option<&Bound<'py, PyAny>>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let given = scene.map(Scene::given).transpose()?.map(|scene| Arc::new(scene.get().scene.clone()));
+        let played = play(self.session.clone(), given.or(self.scene.clone()), Script::given(script)?);
+        answer(py, self.awaited, played)
     }
 
     fn __enter__(slf: Bound<'_, Self>) -> Bound<'_, Self> {
@@ -421,309 +475,6 @@ impl RemoteSession {
     }
 
     fn __repr__(&self) -> String {
-        format!("<palpate.RemoteSession {} of {:?}>", self.id, self.server)
-    }
-}
-
-/// Bytes for Python.
-struct Bytes(Vec<u8>);
-
-impl<'py> IntoPyObject<'py> for Bytes {
-    type Target = PyBytes;
-    type Output = Bound<'py, PyBytes>;
-    type Error = PyErr;
-
-    fn into_pyobject(self, py: Python<'py>) -> PyResult<Self::Output> {
-        Ok(PyBytes::new(py, &self.0))
-    }
-}
-
-/// What of a surface stays.
-#[derive(Default)]
-struct Mesh {
-    grid: (u32, u32),
-    rest_m: Vec<f32>,
-    uv: Vec<f32>,
-    triangles: Vec<u32>,
-    file_vertex: Vec<u32>,
-}
-
-impl<'py> IntoPyObject<'py> for Mesh {
-    type Target = PyDict;
-    type Output = Bound<'py, PyDict>;
-    type Error = PyErr;
-
-    fn into_pyobject(self, py: Python<'py>) -> PyResult<Self::Output> {
-        let found = PyDict::new(py);
-        found.set_item("grid", self.grid)?;
-        found.set_item("rest_m", shaped(py, self.rest_m, &[3])?)?;
-        found.set_item("uv", shaped(py, self.uv, &[2])?)?;
-        found.set_item("triangles", shaped(py, self.triangles, &[3])?)?;
-        found.set_item("file_vertex", column(py, self.file_vertex)?)?;
-        Ok(found)
-    }
-}
-
-/// What came of a touch.
-struct Touched(Report);
-
-impl<'py> IntoPyObject<'py> for Touched {
-    type Target = PyAny;
-    type Output = Bound<'py, PyAny>;
-    type Error = PyErr;
-
-    fn into_pyobject(self, py: Python<'py>) -> PyResult<Self::Output> {
-        let Report { course, ages_s, envelope, late_ticks, missed_ticks, traffic, lost, .. } = self.0;
-        let found = PyDict::new(py);
-        let place_m = course.iter().flat_map(|tick| tick.place_m.to_array()).collect();
-        let force_n = course.iter().flat_map(|tick| tick.force_n.to_array()).collect();
-        let enabled: Vec<bool> = course.iter().map(|tick| tick.state == Some(RenderingState::Enabled)).collect();
-        let time_s: Vec<f64> = course.iter().map(|tick| tick.time_s).collect();
-        found.set_item("time_s", column(py, time_s)?)?;
-        found.set_item("place_m", rows(py, place_m)?)?;
-        found.set_item("force_n", rows(py, force_n)?)?;
-        found.set_item("enabled", column(py, enabled)?)?;
-        found.set_item("ages_s", column(py, ages_s)?)?;
-        found.set_item("late_ticks", late_ticks)?;
-        found.set_item("missed_ticks", missed_ticks)?;
-        found.set_item("connections", traffic.connections)?;
-        found.set_item("failed_attempts", traffic.failed)?;
-        found.set_item("samples", traffic.samples)?;
-        found.set_item("poses", traffic.poses)?;
-        found.set_item("refused", traffic.refused)?;
-        found.set_item("datagrams_up", traffic.carried.sent)?;
-        found.set_item("datagrams_down", traffic.carried.came)?;
-        let limits = PyDict::new(py);
-        for (cause, name) in LimitCause::ALL.iter().filter(|_| envelope.is_some()) {
-            limits.set_item(*name, envelope.as_ref().map_or(0, |envelope| envelope.count(*cause).0))?;
-        }
-        found.set_item("limits", limits)?;
-        found.set_item("energy_j", envelope.as_ref().map_or(0.0, palpate_touch::Envelope::energy_j))?;
-        found.set_item("lost", lost.map(|error| error.to_string()))?;
-        py.import("palpate._touch")?.getattr("Touched")?.call((), Some(&found))
-    }
-}
-
-/// The end of a stream.
-fn at_end(awaited: bool) -> PyErr {
-    if awaited { PyStopAsyncIteration::new_err(()) } else { PyStopIteration::new_err(()) }
-}
-
-/// The samples of a session.
-#[pyclass(frozen, module = "palpate")]
-pub(crate) struct Samples {
-    stream: Arc<Mutex<watch::Samples>>,
-    awaited: bool,
-}
-
-/// Samples, one row for each tool of each.
-#[derive(Default)]
-struct Sampled {
-    step: Vec<u64>,
-    time_s: Vec<f64>,
-    tool: Vec<u32>,
-    numbers: Vec<f64>,
-    awake_points: Vec<u32>,
-    asleep: Vec<bool>,
-}
-
-impl Sampled {
-    fn add(&mut self, sample: &pb::Sample) {
-        for tool in &sample.tools {
-            self.step.push(sample.step);
-            self.time_s.push(sample.simulation_time_s);
-            self.tool.push(tool.tool);
-            self.awake_points.push(sample.awake_points);
-            self.asleep.push(sample.asleep);
-            for vector in [
-                &tool.displacement_m,
-                &tool.surface_displacement_m,
-                &tool.velocity_m_per_s,
-                &tool.force_on_tool_n,
-                &tool.applied_force_n,
-            ] {
-                self.numbers.extend(from_vector(vector.as_ref()).to_array());
-            }
-        }
-    }
-}
-
-impl<'py> IntoPyObject<'py> for Sampled {
-    type Target = PyAny;
-    type Output = Bound<'py, PyAny>;
-    type Error = PyErr;
-
-    fn into_pyobject(self, py: Python<'py>) -> PyResult<Self::Output> {
-        let (given, rows) = (PyDict::new(py), self.step.len());
-        given.set_item("step", column(py, self.step)?)?;
-        given.set_item("time_s", column(py, self.time_s)?)?;
-        given.set_item("tool", column(py, self.tool)?)?;
-        given.set_item("awake_points", column(py, self.awake_points)?)?;
-        given.set_item("asleep", column(py, self.asleep)?)?;
-        given.set_item("felt", records(py, self.numbers, "FELT", &[rows])?)?;
-        py.import("palpate._touch")?.getattr("Sampled")?.call((), Some(&given))
-    }
-}
-
-/// A sample, whether it has tools or not.
-#[derive(IntoPyObject)]
-struct Sample {
-    step: u64,
-    time_s: f64,
-    awake_points: u32,
-    asleep: bool,
-    held: bool,
-    overruns: u64,
-    time_dilation: f64,
-    late_commands: u64,
-    dropped_samples: u64,
-    tools: std::collections::BTreeMap<u32, ToolSample>,
-}
-
-/// A tool in a sample.
-#[derive(IntoPyObject)]
-struct ToolSample {
-    displacement_m: (f64, f64, f64),
-    surface_displacement_m: (f64, f64, f64),
-    velocity_m_per_s: (f64, f64, f64),
-    force_on_tool_n: (f64, f64, f64),
-    applied_force_n: (f64, f64, f64),
-    late: bool,
-    expired: bool,
-    stale: bool,
-}
-
-impl Sample {
-    fn of(sample: &pb::Sample) -> Self {
-        let numbers = |v: Option<&pb::Vector3>| from_vector(v).into();
-        let tools = sample.tools.iter().map(|tool| {
-            let sampled = ToolSample {
-                displacement_m: numbers(tool.displacement_m.as_ref()),
-                surface_displacement_m: numbers(tool.surface_displacement_m.as_ref()),
-                velocity_m_per_s: numbers(tool.velocity_m_per_s.as_ref()),
-                force_on_tool_n: numbers(tool.force_on_tool_n.as_ref()),
-                applied_force_n: numbers(tool.applied_force_n.as_ref()),
-                late: tool.late,
-                expired: tool.expired,
-                stale: tool.stale,
-            };
-            (tool.tool, sampled)
-        });
-        Sample {
-            step: sample.step,
-            time_s: sample.simulation_time_s,
-            awake_points: sample.awake_points,
-            asleep: sample.asleep,
-            held: sample.held,
-            overruns: sample.overrun_count,
-            time_dilation: sample.time_dilation,
-            late_commands: sample.late_commands,
-            dropped_samples: sample.dropped_samples,
-            tools: tools.collect(),
-        }
-    }
-}
-
-#[pymethods]
-impl Samples {
-    fn take<'py>(&self, py: Python<'py>, count: usize) -> PyResult<Bound<'py, PyAny>> {
-        let stream = self.stream.clone();
-        answer(py, self.awaited, async move {
-            let (mut stream, mut sampled) = (stream.lock().await, Sampled::default());
-            for _ in 0..count {
-                match stream.next().await.map_err(of_status)? {
-                    Some(sample) => sampled.add(&sample),
-                    None => break,
-                }
-            }
-            Ok(sampled)
-        })
-    }
-
-    fn __iter__(slf: Bound<'_, Self>) -> Bound<'_, Self> {
-        slf
-    }
-
-    fn __next__<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        let (stream, awaited) = (self.stream.clone(), self.awaited);
-        answer(py, awaited, async move {
-            let sample = stream.lock().await.next().await.map_err(of_status)?;
-            sample.map(|sample| Sample::of(&sample)).ok_or_else(|| at_end(awaited))
-        })
-    }
-
-    fn __aiter__(slf: Bound<'_, Self>) -> Bound<'_, Self> {
-        slf
-    }
-
-    fn __anext__<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        self.__next__(py)
-    }
-}
-
-/// The frames of a session.
-#[pyclass(frozen, module = "palpate")]
-pub(crate) struct Frames {
-    stream: Arc<Mutex<view::Frames>>,
-    awaited: bool,
-}
-
-/// A frame: the whole surface.
-struct Frame {
-    step: u64,
-    time_s: f64,
-    frame_id: u64,
-    skipped: u64,
-    vertices: [usize; 2],
-    displacement_m: Vec<[f32; 3]>,
-}
-
-impl<'py> IntoPyObject<'py> for Frame {
-    type Target = PyAny;
-    type Output = Bound<'py, PyAny>;
-    type Error = PyErr;
-
-    fn into_pyobject(self, py: Python<'py>) -> PyResult<Self::Output> {
-        let given = PyDict::new(py);
-        given.set_item("step", self.step)?;
-        given.set_item("time_s", self.time_s)?;
-        given.set_item("frame_id", self.frame_id)?;
-        given.set_item("skipped", self.skipped)?;
-        let numbers = self.displacement_m.into_flattened();
-        given.set_item("displacement_m", shaped(py, numbers, &[self.vertices[1].max(1), 3])?)?;
-        py.import("palpate._touch")?.getattr("Frame")?.call((), Some(&given))
-    }
-}
-
-#[pymethods]
-impl Frames {
-    fn __iter__(slf: Bound<'_, Self>) -> Bound<'_, Self> {
-        slf
-    }
-
-    fn __next__<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        let (stream, awaited) = (self.stream.clone(), self.awaited);
-        answer(py, awaited, async move {
-            let mut stream = stream.lock().await;
-            let Some((part, surface)) = stream.next().await.map_err(of_status)? else {
-                return Err(at_end(awaited));
-            };
-            Ok(Frame {
-                step: part.step,
-                time_s: part.simulation_time_s,
-                frame_id: part.frame_id,
-                skipped: part.skipped_frames,
-                vertices: surface.vertices,
-                displacement_m: surface.displacement_m.clone(),
-            })
-        })
-    }
-
-    fn __aiter__(slf: Bound<'_, Self>) -> Bound<'_, Self> {
-        slf
-    }
-
-    fn __anext__<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        self.__next__(py)
+        format!("<palpate.RemoteSession {} of {:?}>", self.session.session_id(), self.session.server())
     }
 }

@@ -20,7 +20,7 @@ pub(crate) fn devices() -> Vec<&'static str> {
 }
 
 /// What a device can bear: by its name, or as a dict of its limits.
-fn descriptor(value: Option<Bound<'_, PyAny>>) -> PyResult<Device> {
+pub(crate) fn descriptor(value: Option<Bound<'_, PyAny>>) -> PyResult<Device> {
     let Some(value) = value.filter(|value| !value.is_none()) else { return Ok(UNDECLARED) };
     if let Ok(limits) = value.cast::<PyDict>() {
         let mut device = Device { name: "python", ..UNDECLARED };

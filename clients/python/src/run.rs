@@ -7,6 +7,7 @@ use std::sync::mpsc::channel;
 use std::time::Instant;
 
 use palpate::refusal::{Reason, Refusal};
+use palpate::scene;
 use palpate::scene::record::{Record, Run, Summary};
 use palpate::session::run::{Failure, Told, told};
 use palpate::shape::PointName;
@@ -22,7 +23,7 @@ use crate::waiting::{LOOK, STACK_BYTES, work};
 
 /// What a run told, as numbers.
 #[derive(Default)]
-struct Recorded {
+pub(crate) struct Recorded {
     header: Option<Run>,
     summary: Option<Summary>,
     point_names: Vec<PointName>,
@@ -36,7 +37,22 @@ struct Recorded {
 }
 
 impl Recorded {
-    fn add(&mut self, record: &Record) {
+    /// Nothing yet, of a script.
+    #[allow(clippy::cast_possible_truncation)]
+    pub(crate) fn of(script: &scene::script::Script) -> Self {
+        let point_names = script.sample_points.iter().map(|point| script.shape.name(*point)).collect();
+        // Those with a tip follow the others.
+        let tools = script.first_tip().map_or_else(Vec::new, |first| (first as u32..script.tools() as u32).collect());
+        Recorded { point_names, tools, ..Recorded::default() }
+    }
+
+    /// How it was played, and what came of it.
+    pub(crate) fn finish(&mut self, run: Run, summary: Summary) {
+        self.warnings = summary.warnings.iter().cloned().chain(summary.fault()).collect();
+        (self.header, self.summary) = (Some(run), Some(summary));
+    }
+
+    pub(crate) fn add(&mut self, record: &Record) {
         self.time_s.push(record.time_s);
         record.points.iter().for_each(|point| add_point(&mut self.points, point));
         for number in &self.tools {
@@ -78,14 +94,7 @@ impl Recorded {
 /// Plays a script. `stop` ends it.
 fn play(model: &Arc<Model>, script: &Script, how: [bool; 2], stop: &AtomicBool) -> Result<Recorded, Failure> {
     let script = script.bound(&model.scene)?;
-    let shape = model.shape();
-    let point_names = script.sample_points.iter().map(|point| shape.name(*point)).collect();
-    let mut recorded = Recorded { point_names, ..Recorded::default() };
-    // Those with a tip follow the others.
-    #[allow(clippy::cast_possible_truncation)]
-    if let Some(first) = script.first_tip() {
-        recorded.tools = (first as u32..script.tools() as u32).collect();
-    }
+    let mut recorded = Recorded::of(&script);
     let records = usize::try_from(script.steps / script.sample_every).unwrap_or(0).saturating_add(1).min(1 << 16);
     recorded.points.reserve(records.saturating_mul(script.sample_points.len() * OF_POINT).min(1 << 24));
     let begun = Instant::now();
@@ -103,6 +112,16 @@ fn play(model: &Arc<Model>, script: &Script, how: [bool; 2], stop: &AtomicBool) 
     recorded.warnings = warnings.cloned().chain(summary.fault()).collect();
     recorded.summary = Some(summary);
     Ok(recorded)
+}
+
+impl<'py> IntoPyObject<'py> for Recorded {
+    type Target = PyAny;
+    type Output = Bound<'py, PyAny>;
+    type Error = PyErr;
+
+    fn into_pyobject(self, py: Python<'py>) -> PyResult<Self::Output> {
+        self.given(py)
+    }
 }
 
 /// A tissue that is compiled, or is to be.

@@ -90,7 +90,7 @@ fn assignments(set: Option<&Bound<'_, PyAny>>) -> PyResult<Vec<String>> {
 pub(crate) struct Scene {
     pub(crate) scene: scene::Scene,
     /// What refusals call it.
-    place: String,
+    pub(crate) place: String,
     /// Stepped as this one, without a search for what its tolerance asks for.
     plan: Option<Arc<Model>>,
     model: Mutex<Option<Arc<Model>>>,
@@ -255,13 +255,16 @@ impl Tissue {
 
 /// The point that Python names: (i, j) of a sheet, the number of a vertex of a mesh.
 pub(crate) fn point(model: &Model, value: &Bound<'_, PyAny>) -> PyResult<PointId> {
-    let name = match value.extract::<u32>() {
-        Ok(vertex) => PointName::Vertex(vertex),
-        Err(_) => PointName::Point(value.extract().map_err(|_| {
-            wrong("point", "must be (i, j) on a sheet, or the number of a vertex on a mesh; none below 0")
-        })?),
-    };
-    model.shape().find("point", name).map_err(refused)
+    model.shape().find("point", point_name(value)?).map_err(refused)
+}
+
+/// What a caller calls a point.
+pub(crate) fn point_name(value: &Bound<'_, PyAny>) -> PyResult<PointName> {
+    if let Ok(vertex) = value.extract::<u32>() {
+        return Ok(PointName::Vertex(vertex));
+    }
+    let message = "must be (i, j) on a sheet, or the number of a vertex on a mesh; none below 0";
+    value.extract().map(PointName::Point).map_err(|_| wrong("point", message))
 }
 
 /// What Python calls a point.

@@ -123,7 +123,7 @@ class Clients(Served, unittest.TestCase):
         for refused, reason in [
             (lambda: server.create_session("no-such-scene"), "UNKNOWN_SCENE"),
             (lambda: server.session("0" * 16), "UNKNOWN_SESSION"),
-            (lambda: server.create_session(palpate.Scene("gallbladder")), "WRONG_KIND"),
+            (lambda: server.create_session(17), "WRONG_KIND"),
             (lambda: palpate.connect("ftp://here"), "OUT_OF_RANGE"),
         ]:
             with self.assertRaises(palpate.Refused) as raised:

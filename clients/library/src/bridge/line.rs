@@ -308,7 +308,6 @@ async fn connect(
     shared.opened.notify_one();
     // Commands that waited while the stream was opened are old.
     while commands.queue.pop().is_some() {}
-    let mut sequence = 0;
     let mut datagrams = Datagrams::dial(stream.opened().datagrams.as_ref(), &server);
     // Those of earlier connections.
     let before = shared.inbound().traffic.carried;
@@ -363,11 +362,11 @@ async fn connect(
             }
             command = commands.recv() => {
                 let Some(Command { client_time_ns, place_m, velocity_m_per_s }) = command else { return Ok(()) };
-                sequence += 1;
+                trail.sequence += 1;
                 let velocity_m_per_s = velocity_m_per_s.and_then(vector);
                 let pose = pb::Pose { velocity_m_per_s, ..touch::pose(place_m, &target.tip) };
                 let action = Some(Action::Pose(pose));
-                let (tool, sequence) = (target.tool, Some(sequence));
+                let (tool, sequence) = (target.tool, Some(trail.sequence));
                 let command = pb::Command { tool, sequence, client_time_ns, action, ..Default::default() };
                 shared.inbound().traffic.poses += 1;
                 if datagrams.asks() {
@@ -379,9 +378,23 @@ async fn connect(
                 }
                 // If the network does not keep up, this command is dropped; the next is newer.
                 if let Err(mpsc::error::TrySendError::Closed(_)) = outbound.try_send(Say::Command(command)) {
-                    return Err(broken("the stream is closed"));
+                    return Err(end_of(&mut stream).await);
                 }
             }
         }
     }
+}
+
+/// Why the server has ended a stream that it does not listen to any more: the reason comes after what it has sent before.
+async fn end_of(stream: &mut Touch) -> Error {
+    let reason = async {
+        loop {
+            match stream.next().await {
+                Ok(Some(_)) => {}
+                Ok(None) => return broken("the server has ended the stream"),
+                Err(status) => return status.into(),
+            }
+        }
+    };
+    tokio::time::timeout(SILENCE, reason).await.unwrap_or_else(|_| broken("the stream is closed"))
 }

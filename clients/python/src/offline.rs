@@ -1,0 +1,83 @@
+//! A touch loop without a network: the caller says what arrives, and when the ticks are.
+
+use std::sync::{Mutex, PoisonError};
+
+use glam::DVec3;
+use palpate::refusal::finite_vector;
+use palpate_client::Reading;
+use palpate_client::bridge::{self, Origin};
+use palpate_touch::RenderingState;
+use pyo3::prelude::*;
+
+use crate::arrays::vector;
+use crate::device::descriptor;
+use crate::error::{of_client, refused};
+
+/// A loop whose server is a record.
+#[pyclass(frozen, module = "palpate")]
+pub(crate) struct Offline {
+    inner: Mutex<bridge::Offline>,
+}
+
+impl Offline {
+    fn with<T>(&self, work: impl FnOnce(&mut bridge::Offline) -> T) -> T {
+        work(&mut self.inner.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+}
+
+#[pymethods]
+impl Offline {
+    #[new]
+    #[pyo3(signature = (limits=None, *, middle_m=None, in_tissue_frame=false, up_deadband=0.0))]
+    fn new(
+        limits: Option<Bound<'_, PyAny>>,
+        middle_m: Option<&Bound<'_, PyAny>>,
+        in_tissue_frame: bool,
+        up_deadband: f64,
+    ) -> PyResult<Self> {
+        let middle_m = middle_m.map(|place| vector("middle_m", place)).transpose()?.unwrap_or(DVec3::ZERO);
+        finite_vector("middle_m", middle_m).map_err(refused)?;
+        let origin = if in_tissue_frame { Origin::Tissue } else { Origin::Workspace };
+        let inner = bridge::Offline::new(descriptor(limits)?, origin, middle_m, up_deadband);
+        Ok(Offline { inner: Mutex::new(inner) })
+    }
+
+    fn arrive(&self, message: &[u8]) -> PyResult<()> {
+        self.with(|offline| offline.record.arrive(message)).map_err(of_client)
+    }
+
+    #[pyo3(signature = (place_m, time_s, enable=true))]
+    fn tick(&self, place_m: [f64; 3], time_s: f64, enable: bool) -> (f64, f64, f64) {
+        let reading = Reading { place_m: DVec3::from_array(place_m), enable };
+        self.with(|offline| offline.ticker.tick(reading, time_s)).into()
+    }
+
+    fn disable(&self) {
+        self.with(|offline| offline.ticker.disable());
+    }
+
+    #[getter]
+    fn state(&self) -> &'static str {
+        match self.with(|offline| offline.ticker.state()) {
+            None => "waiting",
+            Some(RenderingState::Disabled) => "disabled",
+            Some(RenderingState::Enabled) => "enabled",
+            Some(RenderingState::Paused) => "paused",
+            Some(RenderingState::Fault) => "fault",
+        }
+    }
+
+    #[getter]
+    fn place_m(&self) -> (f64, f64, f64) {
+        self.with(|offline| offline.ticker.place_m()).into()
+    }
+
+    #[getter]
+    fn age_s(&self) -> Option<f64> {
+        self.with(|offline| offline.ticker.model_age_s())
+    }
+
+    fn __repr__(&self) -> String {
+        format!("<palpate.Offline: {}>", self.state())
+    }
+}

@@ -1,0 +1,76 @@
+//! Scenes as a server takes them. The mesh of a scene is sent before it.
+
+use std::path::Path;
+
+use palpate::refusal::{Reason, Refusal};
+use palpate::scene::sent::mesh_file;
+use palpate::scene::{Body, Mesh};
+use palpate::wire;
+use palpate_client::Channel;
+use palpate_client::upload::upload_mesh;
+use palpate_mesh::TriangleMesh;
+use palpate_mesh::write::{Format, write};
+use palpate_proto::pb;
+use pb::create_session_request::Source;
+use pyo3::PyResult;
+
+use crate::error::{of_status, refused};
+use crate::scene::{Scene, limits};
+
+/// What a session is to be made of.
+pub(crate) enum Sent {
+    /// A scene of the server's.
+    Name(String),
+    Scene {
+        scene: Box<pb::Scene>,
+        /// The file of its mesh, in metres.
+        mesh: Option<Vec<u8>>,
+    },
+}
+
+impl Sent {
+    /// Of a scene that was read here.
+    pub(crate) fn of(scene: &Scene) -> Result<Self, Refusal> {
+        let mut message = Box::new(wire::scene::sent(&scene.scene));
+        let Body::Mesh(mesh) = &scene.scene.body else { return Ok(Sent::Scene { scene: message, mesh: None }) };
+        let file = Path::new(&scene.place);
+        // As many vertices as were asked for, of which there may be some fewer.
+        if file.is_file()
+            && let Some(told) = &mut message.mesh
+            && let Some(said) = mesh_file(file, &limits())?
+        {
+            told.vertices = said.vertices.map(|vertices| vertices.try_into().unwrap_or(u32::MAX));
+        }
+        Ok(Sent::Scene { scene: message, mesh: Some(write(&written(mesh), Format::Obj)) })
+    }
+
+    /// What a session is to be made of; sends the mesh, if there is one.
+    pub(crate) async fn source(self, channel: Channel) -> PyResult<Source> {
+        let (mut scene, mesh) = match self {
+            Sent::Name(name) => return Ok(Source::SceneName(name)),
+            Sent::Scene { scene, mesh } => (scene, mesh),
+        };
+        if let (Some(file), Some(of_scene)) = (mesh, &mut scene.mesh) {
+            let sent = upload_mesh(channel, "mesh.obj", &file, "m", false).await.map_err(of_status)?;
+            if let Some(report) = sent.report.filter(|report| report.refused) {
+                let what = report.problems.first().map(|problem| format!("{}: {}", problem.element, problem.what));
+                return Err(refused(Refusal::new(Reason::OutOfRange, "scene", what.unwrap_or_default())));
+            }
+            of_scene.mesh_id = sent.mesh_id;
+        }
+        Ok(Source::Scene(*scene))
+    }
+}
+
+/// The mesh of a scene, before it was made coarser.
+fn written(mesh: &Mesh) -> TriangleMesh {
+    if let Some(shown) = mesh.shape.shown() {
+        return shown.mesh.clone();
+    }
+    TriangleMesh {
+        vertices_m: mesh.shape.vertices_m().to_vec(),
+        triangles: mesh.shape.triangles().to_vec(),
+        uv: None,
+        groups: mesh.shape.told().groups.clone(),
+    }
+}

@@ -1,0 +1,146 @@
+//! What a server tells of a session, as Python sees it.
+
+use palpate_client::bridge::Report;
+use palpate_proto::geometry::from_vector;
+use palpate_proto::pb;
+use palpate_touch::{LimitCause, RenderingState};
+use pyo3::prelude::*;
+use pyo3::types::{PyBytes, PyDict};
+
+use crate::arrays::{column, rows, shaped};
+
+/// How a session stands.
+#[derive(IntoPyObject)]
+pub(crate) struct Status {
+    session_id: String,
+    scene: String,
+    state: &'static str,
+    step: u64,
+    time_s: f64,
+    points: u32,
+    integrator: String,
+    substeps: u32,
+    precision: String,
+    time_dilation: f64,
+    overrun_steps: u64,
+    late_commands: u64,
+    recoveries: u64,
+    awake_points: u32,
+    resting: bool,
+    hold_reason: String,
+    held_tools: Vec<(u32, String)>,
+    middle_m: (f64, f64, f64),
+    warnings: Vec<String>,
+}
+
+impl Status {
+    pub(crate) fn of(session: pb::Session) -> Self {
+        let state = match session.state() {
+            pb::SessionState::Running => "running",
+            pb::SessionState::Paused => "paused",
+            pb::SessionState::Held => "held",
+            pb::SessionState::Unspecified => "unknown",
+        };
+        let middle_m = from_vector(session.extent.as_ref().and_then(|extent| extent.middle_m.as_ref()));
+        Status {
+            session_id: session.session_id,
+            scene: session.scene_name,
+            state,
+            step: session.step,
+            time_s: session.simulation_time_s,
+            points: session.points,
+            integrator: session.integrator,
+            substeps: session.substeps,
+            precision: session.precision,
+            time_dilation: session.time_dilation,
+            overrun_steps: session.overrun_count,
+            late_commands: session.late_commands,
+            recoveries: session.recovery_count,
+            awake_points: session.awake_points,
+            resting: session.resting,
+            hold_reason: session.hold_reason,
+            held_tools: session.held_tools.into_iter().map(|held| (held.tool, held.holder)).collect(),
+            middle_m: (middle_m.x, middle_m.y, middle_m.z),
+            warnings: session.warnings,
+        }
+    }
+}
+
+/// Bytes for Python.
+pub(crate) struct Bytes(pub(crate) Vec<u8>);
+
+impl<'py> IntoPyObject<'py> for Bytes {
+    type Target = PyBytes;
+    type Output = Bound<'py, PyBytes>;
+    type Error = PyErr;
+
+    fn into_pyobject(self, py: Python<'py>) -> PyResult<Self::Output> {
+        Ok(PyBytes::new(py, &self.0))
+    }
+}
+
+/// What of a surface stays.
+#[derive(Default)]
+pub(crate) struct Mesh {
+    pub(crate) grid: (u32, u32),
+    pub(crate) rest_m: Vec<f32>,
+    pub(crate) uv: Vec<f32>,
+    pub(crate) triangles: Vec<u32>,
+    pub(crate) file_vertex: Vec<u32>,
+}
+
+impl<'py> IntoPyObject<'py> for Mesh {
+    type Target = PyDict;
+    type Output = Bound<'py, PyDict>;
+    type Error = PyErr;
+
+    fn into_pyobject(self, py: Python<'py>) -> PyResult<Self::Output> {
+        let found = PyDict::new(py);
+        found.set_item("grid", self.grid)?;
+        found.set_item("rest_m", shaped(py, self.rest_m, &[3])?)?;
+        found.set_item("uv", shaped(py, self.uv, &[2])?)?;
+        found.set_item("triangles", shaped(py, self.triangles, &[3])?)?;
+        found.set_item("file_vertex", column(py, self.file_vertex)?)?;
+        Ok(found)
+    }
+}
+
+/// What came of a touch.
+pub(crate) struct Touched(pub(crate) Report);
+
+impl<'py> IntoPyObject<'py> for Touched {
+    type Target = PyAny;
+    type Output = Bound<'py, PyAny>;
+    type Error = PyErr;
+
+    fn into_pyobject(self, py: Python<'py>) -> PyResult<Self::Output> {
+        let Report { course, ages_s, envelope, late_ticks, missed_ticks, traffic, lost, .. } = self.0;
+        let found = PyDict::new(py);
+        let place_m = course.iter().flat_map(|tick| tick.place_m.to_array()).collect();
+        let force_n = course.iter().flat_map(|tick| tick.force_n.to_array()).collect();
+        let enabled: Vec<bool> = course.iter().map(|tick| tick.state == Some(RenderingState::Enabled)).collect();
+        let time_s: Vec<f64> = course.iter().map(|tick| tick.time_s).collect();
+        found.set_item("time_s", column(py, time_s)?)?;
+        found.set_item("place_m", rows(py, place_m)?)?;
+        found.set_item("force_n", rows(py, force_n)?)?;
+        found.set_item("enabled", column(py, enabled)?)?;
+        found.set_item("ages_s", column(py, ages_s)?)?;
+        found.set_item("late_ticks", late_ticks)?;
+        found.set_item("missed_ticks", missed_ticks)?;
+        found.set_item("connections", traffic.connections)?;
+        found.set_item("failed_attempts", traffic.failed)?;
+        found.set_item("samples", traffic.samples)?;
+        found.set_item("poses", traffic.poses)?;
+        found.set_item("refused", traffic.refused)?;
+        found.set_item("datagrams_up", traffic.carried.sent)?;
+        found.set_item("datagrams_down", traffic.carried.came)?;
+        let limits = PyDict::new(py);
+        for (cause, name) in LimitCause::ALL.iter().filter(|_| envelope.is_some()) {
+            limits.set_item(*name, envelope.as_ref().map_or(0, |envelope| envelope.count(*cause).0))?;
+        }
+        found.set_item("limits", limits)?;
+        found.set_item("energy_j", envelope.as_ref().map_or(0.0, palpate_touch::Envelope::energy_j))?;
+        found.set_item("lost", lost.map(|error| error.to_string()))?;
+        py.import("palpate._touch")?.getattr("Touched")?.call((), Some(&found))
+    }
+}
