@@ -11,6 +11,7 @@ use palpate_touch::device::{DEVICES, UNDECLARED};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
+use crate::ending;
 use crate::error::{refused, wrong};
 
 /// The names of the devices that are known.
@@ -102,9 +103,7 @@ impl Given {
 
 /// With the interpreter, unless it is going down.
 fn attached<T>(work: impl FnOnce(Python<'_>) -> PyResult<T>) -> Result<T> {
-    Python::try_attach(work)
-        .unwrap_or_else(|| Err(pyo3::exceptions::PyRuntimeError::new_err("Python is ending")))
-        .map_err(Error::other)
+    ending::attached(work).unwrap_or_else(|| Err(ending::ended())).map_err(Error::other)
 }
 
 impl HapticDevice for Given {

@@ -8,18 +8,21 @@ use pyo3::types::PyType;
 use tonic::Status;
 use tonic_types::StatusExt;
 
-/// An exception of the package, made with `arguments`.
-fn raised<'py>(py: Python<'py>, name: &str, arguments: impl pyo3::call::PyCallArgs<'py>) -> PyErr {
-    let made = || -> PyResult<Bound<'py, PyAny>> {
-        py.import("palpate._errors")?.getattr(name)?.cast_into::<PyType>()?.call1(arguments)
+use crate::ending;
+
+/// An exception of the package, made with `arguments`, by any thread.
+fn raised(name: &str, arguments: impl for<'py> pyo3::call::PyCallArgs<'py>) -> PyErr {
+    let made = |py: Python<'_>| {
+        let made = || py.import("palpate._errors")?.getattr(name)?.cast_into::<PyType>()?.call1(arguments);
+        made().map_or_else(|error| error, PyErr::from_value)
     };
-    made().map_or_else(|error| error, PyErr::from_value)
+    ending::attached(made).unwrap_or_else(ending::ended)
 }
 
 /// `palpate.Refused`.
 pub(crate) fn refused(refusal: Refusal) -> PyErr {
     let Refusal { reason, field, message, place } = refusal;
-    Python::attach(|py| raised(py, "Refused", (reason.as_str(), field, message, place)))
+    raised("Refused", (reason.as_str(), field, message, place))
 }
 
 /// `palpate.Refused` for an argument of the wrong kind.
@@ -29,7 +32,7 @@ pub(crate) fn wrong(field: &str, message: impl Into<String>) -> PyErr {
 
 /// `palpate.Failed`: the tissue could not go on.
 pub(crate) fn failed(message: &str) -> PyErr {
-    Python::attach(|py| raised(py, "Failed", (message,)))
+    raised("Failed", (message,))
 }
 
 /// Why a run ended early.
@@ -44,15 +47,15 @@ pub(crate) fn of_run(failure: Failure) -> PyErr {
 
 /// A refusal of the server, or a connection that broke.
 pub(crate) fn of_status(status: Status) -> PyErr {
-    Python::attach(|py| match status.get_details_error_info() {
+    match status.get_details_error_info() {
         Some(info) => {
             let field = info.metadata.get("field").cloned().unwrap_or_default();
             // The server's text begins with the field.
             let message = status.message().strip_prefix(&format!("{field}: ")).unwrap_or(status.message());
-            raised(py, "Refused", (info.reason, field, message, None::<String>))
+            raised("Refused", (info.reason, field, message, None::<String>))
         }
-        None => raised(py, "Disconnected", (palpate_client::describe(&status),)),
-    })
+        None => raised("Disconnected", (palpate_client::describe(&status),)),
+    }
 }
 
 /// An error of the client library.
@@ -62,12 +65,12 @@ pub(crate) fn of_client(error: palpate_client::Error) -> PyErr {
     match error {
         Error::Call(status) => of_status(status),
         Error::Argument(message) => refused(Refusal::new(palpate::refusal::Reason::OutOfRange, "", message)),
-        Error::Connection(_) => Python::attach(|py| raised(py, "Disconnected", (text,))),
+        Error::Connection(_) => raised("Disconnected", (text,)),
         // What a device in Python raised comes back as itself.
         Error::Device(error) => match error.downcast::<PyErr>() {
             Ok(error) => error,
             Err(error) => PyOSError::new_err(format!("the device: {error}")),
         },
-        Error::Internal(_) => Python::attach(|py| raised(py, "Failed", (text,))),
+        Error::Internal(_) => raised("Failed", (text,)),
     }
 }

@@ -13,6 +13,7 @@
 mod arrays;
 mod client;
 mod device;
+mod ending;
 mod error;
 mod held;
 mod journal;
@@ -32,6 +33,7 @@ use pyo3::prelude::*;
 #[pymodule(name = "_native")]
 fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("__version__", env!("CARGO_PKG_VERSION"))?;
+    ending::register(module)?;
     module.add_class::<scene::Scene>()?;
     module.add_class::<scene::Script>()?;
     module.add_class::<scene::Tissue>()?;

@@ -9,8 +9,11 @@ use std::time::Duration;
 use pyo3::BoundObject;
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
+use pyo3_async_runtimes::generic::future_into_py;
 use tokio::runtime::Runtime;
 use tokio::sync::oneshot;
+
+use crate::ending::Network;
 
 /// So often signals are looked at.
 pub(crate) const LOOK: Duration = Duration::from_millis(50);
@@ -49,18 +52,10 @@ pub(crate) fn work<T: Send>(py: Python<'_>, work: impl FnOnce(&AtomicBool) -> T 
 pub(crate) fn runtime() -> PyResult<&'static Runtime> {
     static RUNTIME: OnceLock<Option<Runtime>> = OnceLock::new();
     let made = RUNTIME.get_or_init(|| {
-        let runtime = tokio::runtime::Builder::new_multi_thread()
-            .worker_threads(2)
-            .thread_name("palpate-net")
-            .enable_all()
-            .build()
-            .ok()?;
-        Some(runtime)
+        let mut threads = tokio::runtime::Builder::new_multi_thread();
+        threads.worker_threads(2).thread_name("palpate-net").enable_all().build().ok()
     });
-    let runtime = made.as_ref().ok_or_else(|| PyRuntimeError::new_err("no threads for the network"))?;
-    // Only the first call counts; the runtime is the same each time.
-    let _ = pyo3_async_runtimes::tokio::init_with_runtime(runtime);
-    Ok(runtime)
+    made.as_ref().ok_or_else(|| PyRuntimeError::new_err("no threads for the network"))
 }
 
 /// The result of a future, now or as an awaitable of asyncio. A wait that a signal ends drops the future, and so does a task that
@@ -88,7 +83,7 @@ where
 {
     let runtime = runtime()?;
     if awaited {
-        return pyo3_async_runtimes::tokio::future_into_py(py, async move {
+        return future_into_py::<Network, _, _>(py, async move {
             let _end = end;
             future.await
         });

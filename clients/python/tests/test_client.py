@@ -1,6 +1,8 @@
 """A real server, touched and looked at, with and without asyncio."""
 
 import asyncio
+import subprocess
+import sys
 import tempfile
 import threading
 import unittest
@@ -32,6 +34,24 @@ class Hand:
         self.forces.append(force_n)
 
 
+# Ends while samples come, which nobody awaits any more.
+ENDING = """
+import asyncio, sys
+import palpate
+
+async def main(url):
+    server = await palpate.aio.connect(url)
+    async with await server.create_session("paper") as session:
+        streams = [await session.samples() for _ in range(8)]
+        await streams[0].__anext__()
+        for stream in streams:
+            asyncio.ensure_future(stream.__anext__())
+        await asyncio.sleep(0.001)
+
+asyncio.run(main(sys.argv[1]))
+"""
+
+
 def felt(touch):
     """What came of a touch in which something was felt. A busy machine may connect only when the device's time is over."""
     for _ in range(20):
@@ -42,6 +62,11 @@ def felt(touch):
 
 
 class Clients(Served, unittest.TestCase):
+    def test_a_program_may_end_while_something_comes(self):
+        for _ in range(12):
+            done = subprocess.run([sys.executable, "-c", ENDING, self.url], capture_output=True, text=True, timeout=60)
+            self.assertEqual(done.returncode, 0, done.stderr)
+
     def test_a_session_runs_pauses_changes_and_ends(self):
         server = palpate.connect(self.url)
         self.assertIn("paper", server.scenes())
