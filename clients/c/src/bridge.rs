@@ -16,6 +16,7 @@ use tokio::task::JoinHandle;
 use crate::axes::{palpate_axes, palpate_vector};
 use crate::error::{Fault, PALPATE_CONNECTION, PALPATE_INTERNAL, at, at_mut, guard, palpate_result};
 use crate::options::{options_at, palpate_limits, palpate_touch_options};
+use crate::os;
 use crate::server::{CONNECTING, Connected, palpate_session};
 use crate::touch::{palpate_reading, palpate_state, state_of};
 
@@ -229,7 +230,7 @@ impl palpate_bridge {
     /// Ends the loop, and waits for that.
     fn end(self) -> Result<palpate_bridge_report, Fault> {
         self.stop.notify_one();
-        let ended = self.shared.runtime.block_on(self.task);
+        let ended = os::block_on(&self.shared.runtime, self.task);
         let report = ended.map_err(|_| Fault::new(PALPATE_INTERNAL, "the loop panicked"))??;
         let seen = seen_of(&self.seen);
         Ok(palpate_bridge_report {

@@ -11,6 +11,7 @@ mod axes;
 mod bridge;
 mod error;
 mod options;
+mod os;
 mod server;
 mod surface;
 mod touch;

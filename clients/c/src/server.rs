@@ -19,6 +19,7 @@ use crate::error::{
     Fault, PALPATE_CONNECTION, PALPATE_INTERNAL, at, at_mut, guard, optional_text, palpate_result, text, write_text,
 };
 use crate::options::{TouchOptions, options_at, palpate_connect_options};
+use crate::os;
 
 /// A connection to a server. Any thread, also several at once.
 pub struct palpate_server {
@@ -70,7 +71,7 @@ impl Connected {
     /// Waits for a call, for no longer than the time for calls.
     pub(crate) fn wait<T, E: Into<Fault>>(&self, call: impl Future<Output = Result<T, E>>) -> Result<T, Fault> {
         let limited = async { tokio::time::timeout(self.timeout, call).await };
-        match self.runtime.block_on(limited) {
+        match os::block_on(&self.runtime, limited) {
             Ok(answer) => answer.map_err(Into::into),
             Err(_) => {
                 let why = format!("the server has not answered within {} s", self.timeout.as_secs_f64());
@@ -150,13 +151,9 @@ pub unsafe extern "C" fn palpate_connect(
         let timeout = Duration::try_from_secs_f64(options.timeout_s).ok().filter(|time| !time.is_zero());
         let timeout = timeout.ok_or_else(|| Fault::argument("timeout_s must be above 0"))?;
         let server = Server::new(url, &credentials)?.within(timeout.min(CONNECTING));
-        let runtime = tokio::runtime::Builder::new_multi_thread()
-            .worker_threads(2)
-            .thread_name("palpate")
-            .enable_all()
-            .build()
+        let runtime = os::runtime()
             .map_err(|error| Fault::new(PALPATE_INTERNAL, format!("threads can't be started: {error}")))?;
-        let channel = runtime.block_on(server.connect())?;
+        let channel = os::block_on(&runtime, server.connect())?;
         let shared = Arc::new(Connected { runtime, server, channel, timeout });
         *out = Box::into_raw(Box::new(palpate_server { shared }));
         Ok(())

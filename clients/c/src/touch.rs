@@ -11,6 +11,7 @@ use palpate_client::{Error, Reading};
 use crate::axes::{palpate_axes, palpate_vector};
 use crate::error::{Fault, PALPATE_BUSY, at, at_mut, guard, palpate_result};
 use crate::options::{options_at, palpate_touch_options};
+use crate::os;
 use crate::server::{Connected, palpate_session};
 
 /// A tool that your loop leads.
@@ -147,7 +148,7 @@ pub unsafe extern "C" fn palpate_touch_begin(
         let target = session.target(&options);
         let of_run = Options { keeps_session: true, warn: options.warn, ..Options::default() };
         let beginning = bridge::begin(target, options.device, options.origin, of_run);
-        let (ticker, connection) = shared.runtime.block_on(beginning)?;
+        let (ticker, connection) = os::block_on(&shared.runtime, beginning)?;
         let far = Far::Server { connection, shared };
         *out = Box::into_raw(Box::new(palpate_touch { ticker: Exclusive::new(ticker), axes: options.axes, far }));
         Ok(())
@@ -280,7 +281,7 @@ pub unsafe extern "C" fn palpate_touch_end(touch: *mut palpate_touch) {
         // SAFETY: the caller's promise.
         let touch = unsafe { Box::from_raw(touch) };
         if let Far::Server { connection, shared } = touch.far {
-            shared.runtime.block_on(connection.end());
+            os::block_on(&shared.runtime, connection.end());
         }
         Ok(())
     });

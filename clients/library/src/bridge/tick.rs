@@ -81,19 +81,26 @@ fn tick(
     let (mut late_ticks, mut missed_ticks) = (0, 0);
     let start = Instant::now();
     let mut due = start;
-    while lasts.is_none_or(|lasts| due.duration_since(start) < lasts) && !ticker.is_over() {
-        wait_until(due);
+    // If it is much too late, the beat begins anew.
+    let mut catch_up = |due: &mut Instant| {
         let now = Instant::now();
-        let late = now.duration_since(due);
-        late_ticks += u64::from(late.as_secs_f64() > TICK_S);
+        let late = now.saturating_duration_since(*due);
         if late > MOST_LATE {
             #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
             let missed = (late.as_secs_f64() / TICK_S) as u64;
             missed_ticks += missed;
-            due = now;
+            *due = now;
         }
-        due += Duration::from_secs_f64(TICK_S);
+        (now, late)
+    };
+    while lasts.is_none_or(|lasts| due.duration_since(start) < lasts) && !ticker.is_over() {
+        wait_until(due);
+        late_ticks += u64::from(catch_up(&mut due).1.as_secs_f64() > TICK_S);
         let reading = device.read()?;
+        // A device may have waited for its next position. The time that counts is that of the force: what came late must not be
+        // made up for by a step at the next tick.
+        let (now, _) = catch_up(&mut due);
+        due += Duration::from_secs_f64(TICK_S);
         let time_s = now.duration_since(start).as_secs_f64();
         let force_n = ticker.tick(reading, time_s);
         device.write(force_n)?;
@@ -156,6 +163,46 @@ mod tests {
         fn write(&mut self, force_n: DVec3) -> std::io::Result<()> {
             self.force_n = force_n;
             Ok(())
+        }
+    }
+
+    /// Presses 2 mm deep, and its 40th reading takes a fifth of a second; ends soon after.
+    struct Slow {
+        ticks: u32,
+        forces: Vec<(Instant, f64)>,
+    }
+
+    impl HapticDevice for Slow {
+        fn descriptor(&self) -> Device {
+            Device { workspace_m: 0.1, ..UNDECLARED }
+        }
+
+        fn read(&mut self) -> std::io::Result<Reading> {
+            self.ticks += 1;
+            if self.ticks == 40 {
+                std::thread::sleep(Duration::from_millis(200));
+            }
+            Ok(Reading { place_m: DVec3::new(0.0, 0.0, -0.002 - 1e-5 * f64::from(self.ticks)), enable: true })
+        }
+
+        fn write(&mut self, force_n: DVec3) -> std::io::Result<()> {
+            self.forces.push((Instant::now(), force_n.length()));
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn a_slow_reading_is_no_reason_for_a_step_at_the_next_tick() {
+        let mut device = Slow { ticks: 0, forces: Vec::new() };
+        let (ticker, mut feed, _commands) = ticker(device.descriptor(), Origin::Workspace, 0.0);
+        feed.begin(&palpate_proto::touch::law(&Law::linear(400.0, 0.5), 0), DVec3::ZERO).unwrap();
+        let served = serve(&mut device, ticker, &Notify::new(), Some(Duration::from_millis(300)), true).unwrap();
+        assert!(served.missed_ticks >= 199, "{}", served.missed_ticks);
+        // Between two times of the loop no more time has passed than between the writes of their forces.
+        for (ticks, writes) in served.course.windows(2).zip(device.forces.windows(2)) {
+            let told_s = ticks[1].time_s - ticks[0].time_s;
+            let took_s = writes[1].0.duration_since(writes[0].0).as_secs_f64();
+            assert!(told_s < took_s + 0.15, "{told_s} {took_s}");
         }
     }
 

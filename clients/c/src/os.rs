@@ -1,0 +1,135 @@
+//! What differs between operating systems: on Unix a write to a connection that the other end has closed sends SIGPIPE, which ends a
+//! program that does not expect it. Programs in Rust ignore it from their start; those in C do not, and their disposition is theirs. So
+//! the library blocks it in its own threads, and in the caller's while that waits for the network.
+
+use std::future::Future;
+
+use tokio::runtime::{Builder, Runtime};
+
+/// Threads for the network, which no closed connection ends.
+pub(crate) fn runtime() -> std::io::Result<Runtime> {
+    Builder::new_multi_thread()
+        .worker_threads(2)
+        .thread_name("palpate")
+        .on_thread_start(|| _ = sigpipe::block())
+        .enable_all()
+        .build()
+}
+
+/// Waits for `future` in this thread, which no closed connection ends meanwhile.
+pub(crate) fn block_on<F: Future>(runtime: &Runtime, future: F) -> F::Output {
+    let _blocked = sigpipe::Blocked::new();
+    runtime.block_on(future)
+}
+
+#[cfg(unix)]
+mod sigpipe {
+    use std::mem::MaybeUninit;
+
+    use libc::{SIG_BLOCK, SIG_SETMASK, SIGPIPE, sigset_t};
+
+    fn only() -> sigset_t {
+        let mut set = MaybeUninit::uninit();
+        // SAFETY: `sigemptyset` initializes the set.
+        unsafe {
+            libc::sigemptyset(set.as_mut_ptr());
+            let mut set = set.assume_init();
+            libc::sigaddset(&raw mut set, SIGPIPE);
+            set
+        }
+    }
+
+    fn is_in(set: &sigset_t) -> bool {
+        // SAFETY: the set is initialized.
+        unsafe { libc::sigismember(set, SIGPIPE) == 1 }
+    }
+
+    fn is_pending() -> bool {
+        let mut set = MaybeUninit::uninit();
+        // SAFETY: `sigpending` initializes the set if it returns 0.
+        unsafe { libc::sigpending(set.as_mut_ptr()) == 0 && is_in(&set.assume_init()) }
+    }
+
+    /// Blocks it in this thread; tells which signals were blocked before.
+    pub(super) fn block() -> Option<sigset_t> {
+        let mut before = MaybeUninit::uninit();
+        // SAFETY: both sets are valid; the second is initialized if it returns 0.
+        unsafe { (libc::pthread_sigmask(SIG_BLOCK, &only(), before.as_mut_ptr()) == 0).then(|| before.assume_init()) }
+    }
+
+    /// It is blocked in this thread as long as this is there.
+    pub(super) struct Blocked {
+        before: Option<sigset_t>,
+        was_pending: bool,
+    }
+
+    impl Blocked {
+        pub(super) fn new() -> Self {
+            let was_pending = is_pending();
+            Blocked { before: block(), was_pending }
+        }
+    }
+
+    impl Drop for Blocked {
+        fn drop(&mut self) {
+            let Some(before) = self.before.filter(|before| !is_in(before)) else { return };
+            // What came meanwhile was this library's.
+            if !self.was_pending && is_pending() {
+                let mut signal = 0;
+                // SAFETY: both are valid; it is pending, so this does not wait.
+                unsafe { libc::sigwait(&only(), &raw mut signal) };
+            }
+            // SAFETY: the set is what the system gave.
+            unsafe { libc::pthread_sigmask(SIG_SETMASK, &raw const before, std::ptr::null_mut()) };
+        }
+    }
+
+    #[cfg(test)]
+    mod tests {
+        use super::*;
+
+        #[test]
+        fn a_signal_of_the_library_does_not_reach_its_caller() {
+            let blocked = || is_in(&block().unwrap());
+            std::thread::spawn(move || {
+                // SAFETY: the default would end the process.
+                unsafe { libc::signal(SIGPIPE, libc::SIG_DFL) };
+                let raise = || {
+                    // SAFETY: to this thread, where it is blocked.
+                    unsafe { libc::pthread_kill(libc::pthread_self(), SIGPIPE) };
+                };
+                {
+                    let _blocked = Blocked::new();
+                    raise();
+                    assert!(is_pending());
+                }
+                // This process goes on, and nothing is left.
+                assert!(!is_pending());
+                assert!(!blocked());
+                // Who has blocked it has it blocked, and keeps what came.
+                raise();
+                drop(Blocked::new());
+                assert!(is_pending() && blocked());
+                let mut signal = 0;
+                // SAFETY: it is pending.
+                unsafe { libc::sigwait(&only(), &raw mut signal) };
+            })
+            .join()
+            .unwrap();
+        }
+    }
+}
+
+#[cfg(not(unix))]
+mod sigpipe {
+    pub(super) fn block() {}
+
+    /// There is no such signal.
+    pub(super) struct Blocked;
+
+    impl Blocked {
+        pub(super) fn new() -> Self {
+            Blocked
+        }
+    }
+}
