@@ -1,5 +1,6 @@
-//! The inputs of a journal from a step on, batch by batch, for a session that plays them; and inputs that are in no journal yet, as
-//! bytes: a session that goes to another server takes along what waits for its step.
+//! The inputs of a journal from a step on, batch by batch; and inputs that are in none yet, as bytes.
+//!
+//! A session that plays a journal reads batches. One that goes to another server takes along what waits for its step.
 
 use std::collections::VecDeque;
 use std::io::{Read, Seek};
