@@ -215,6 +215,31 @@ fn a_window_agrees_with_one_of_a_much_shorter_substep() {
     }
 }
 
+/// A fingertip that presses into the liver for 0.2 s, and glides from then on, at up to 0.1 m/s.
+fn fingertip(step: u64) -> Vec<(usize, Action)> {
+    let smooth =
+        |t: f64| t.clamp(0.0, 1.0).powi(3) * (10.0 - 15.0 * t.clamp(0.0, 1.0) + 6.0 * t.clamp(0.0, 1.0).powi(2));
+    let t = (step + 1) as f64 / 1000.0;
+    let way_m = 0.015 * smooth((t - 0.3) / 0.3);
+    let place_m = DVec3::new(0.028 + way_m, 0.035 + 0.2 * way_m, 0.001 - 0.004 * smooth(t / 0.2));
+    vec![(0, Action::Pose { place_m, velocity_m_per_s: None, tip: Tip::default() })]
+}
+
+#[test]
+fn a_tip_keeps_to_the_tolerance_of_liver() {
+    let liver = BUILT_IN.into_iter().find(|scene| scene.0 == "liver").unwrap().1;
+    let scene = scene_with(liver, &[]);
+    let tolerance = scene.stepping.tolerance;
+    let found = findings(&scene, fingertip, 600, FINER);
+    assert!(found.len() >= 3, "{}", found.len());
+    for finding in &found {
+        // A press is far below it.
+        let most = if finding.step < 300 { 0.02 } else { 1.0 } * tolerance;
+        let AuditedError { displacement, force } = finding.error;
+        assert!(displacement <= most && force <= most, "{finding:?}");
+    }
+}
+
 #[test]
 fn the_audit_changes_no_bit() {
     let tools: [Told; 3] = [pushing, grasping, |step| touching(false, step)];

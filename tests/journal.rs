@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::cast_possible_truncation)]
 
 use std::io::Cursor;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use glam::DVec3;
@@ -373,30 +373,34 @@ fn steps_at_rest_are_skipped_and_seen_where_somebody_wants_to() {
     assert_eq!(replay.running(), (true, Some(100_000)));
 }
 
-const GOLDEN: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/journal/golden.1.mcap");
+/// The golden file of the versions with that number of [`journal::REPLAYS`].
+fn golden(replays: u32) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/journal/golden.{replays}.mcap"))
+}
 
-/// The golden file is of the first version with journals, and stays as it is: while `REPLAYS` is what it was then, every later
-/// version gives its bits.
+/// Each golden file is of the first version with its number, and stays as it is: until bits change, every later version gives its
+/// bits, and then it is refused.
 #[test]
 fn the_journal_of_an_older_version_gives_the_same_bits_or_is_refused_with_both_versions() {
-    let mut read = Reader::open(Path::new(GOLDEN)).unwrap();
-    let survey = read.survey(&mut |_| {}).unwrap();
-    assert_eq!((survey.until_step, survey.snapshots.len(), survey.sealed), (1000, 3, true));
-    let verified = journal::verify(read, &Limits::default(), &mut |_, _| {});
-    if journal::REPLAYS == 1 {
-        assert_eq!(verified.unwrap().difference, None);
-    } else {
-        let message = verified.unwrap_err().to_string();
-        assert!(message.contains("written by Palpate 0.1.0"), "{message}");
+    for replays in 1..=journal::REPLAYS {
+        let mut read = Reader::open(&golden(replays)).unwrap();
+        let survey = read.survey(&mut |_| {}).unwrap();
+        assert_eq!((survey.until_step, survey.snapshots.len(), survey.sealed), (1000, 3, true), "{replays}");
+        let verified = journal::verify(read, &Limits::default(), &mut |_, _| {});
+        if replays == journal::REPLAYS {
+            assert_eq!(verified.unwrap().difference, None);
+        } else {
+            let message = verified.unwrap_err().to_string();
+            assert!(message.contains(&format!("written by Palpate 0.1.0 (replays {replays})")), "{message}");
+        }
     }
 }
 
-/// For the first time only.
+/// Once after each change of `REPLAYS`.
 #[test]
 #[ignore = "writes the golden file"]
 fn write_the_golden_file() {
     let mut file = Cursor::new(written(&small(), 1000, true).0);
     journal::seal::seal(&mut file).unwrap();
-    std::fs::create_dir_all(Path::new(GOLDEN).parent().unwrap()).unwrap();
-    std::fs::write(GOLDEN, file.into_inner()).unwrap();
+    std::fs::write(golden(journal::REPLAYS), file.into_inner()).unwrap();
 }

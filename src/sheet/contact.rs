@@ -1,21 +1,27 @@
 //! Position-controlled tools of finite size: a touch, which only pushes, and a grasp, which holds.
 //!
 //! A tool meets the sheet with a disc (`footprint`), whose place s(c) = Σ w·x follows from the material place c under
-//! the tool. In each substep the sheet first moves under the force F₀ of the last. Then the step finds the force F that
-//! takes s to the tool (or, with a spring as coupling, the force that the spring then has); the difference is applied
-//! as an impulse at the substep's beginning. That changes s by A·(F − F₀), where A follows from Σ w²·dt²/m and the
-//! scheme's damping. So this is a division, not an iteration, and stable however stiff the coupling:
+//! the tool. In each substep the sheet first moves under the force F₀ of the last. Then the step finds an impulse P at the
+//! substep's beginning and a force F over it that take s to the tool, as fast as the tool: two unknowns for place and speed,
+//! with what a kick and a constant force do to both (`Scheme::kick`, `Scheme::constant`) and Σ w²·dt²/m. So this is a
+//! division, not an iteration, and stable however stiff the coupling. (A force alone rings: a disc that must be at its place
+//! at the end of each substep oscillates within them. Its speed, and with it the damping that is felt, then err by what
+//! the tool's speed changes in a step.)
 //!
-//! gap g = x_tool − s + A·F₀,  F = (Kc·g + Bc·(v_tool − ṡ))/(1 + A·(Kc + Bc/dt)),  for a constraint F = g/A.
+//! With a spring as coupling, F is its force at the substep's end, F = (Kc·g + Bc·(v_tool − ṡ))/(1 + A·(Kc + Bc/dt)), with the
+//! gap g = x_tool − s + A·F₀, and F − F₀ is an impulse. A two-step scheme moves a point by what it changes its speed by: under a
+//! constraint it has one unknown, F = g/A.
 //!
-//! (A steady force alone would ring: a mass that must be at rest at the end of each substep oscillates within them for
-//! ever. An impulse alone leaves half of its speed at each end. With both, an error in F or in speed is halved in each
-//! substep.)
+//! Between steps the tool's speed jumps, since its path is known at their ends alone. Such a jump is an impulse m·Δv where
+//! the disc then is. Whether a tool lets go, and how much friction it has, is judged as if it lasted for the step: else
+//! shorter substeps would see a tool that jumps off at every step ([`Leg`]).
 //!
 //! A touch is unilateral: with n the outward normal of the surface under the disc, N = −F·n must be positive, or the
 //! tool is free; |F_t| may be at most μN, or the disc slides: F_t is shortened, and c follows the tool. With μ = 0 it
-//! always follows. So c is the proxy: the place of the tool on the surface. n = ∂s/∂c_x × ∂s/∂c_y is the only choice
-//! whose work equals what the sheet gets when the disc slides over a slope.
+//! always follows. While it slides, the force acts half where the disc was and half where it is, along the mean of both
+//! normals: with either alone the error would fall with the first power of the substep. So c is the proxy: the place of the
+//! tool on the surface. n = ∂s/∂c_x × ∂s/∂c_y is the only choice whose work equals what the sheet gets when the disc slides
+//! over a slope.
 //!
 //! The force felt under a constraint is that of springs, virtual springs and damping on the disc, Σ w·f/Σ w²: F without
 //! the points' own inertia, which a hand would feel as a knock at each command.
@@ -32,6 +38,9 @@ use super::saved::{Checks, SavedContact, SavedTip, ensure};
 use super::tangent::{Patch, Tangent, Window};
 use crate::refusal::Result;
 use palpate_touch::{ContactState, Coupling, Tip};
+
+/// Below this determinant of its kick and its constant force a scheme has one unknown, not two.
+const LEAST_DETERMINANT: f64 = 1e-6;
 
 /// The motion of a tool and the force on it at the end of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -162,6 +171,15 @@ impl Contacts {
         self.tools.iter().filter(|tool| tool.contact_state != ContactState::Free).flat_map(Tool::points)
     }
 
+    /// The force that goes on on a point, N.
+    pub(super) fn steady_on(&self, point: [usize; 2]) -> DVec3 {
+        let of = |tool: &Tool| {
+            let reached = tool.footprint.reached().iter().find(|reached| reached.point == point);
+            reached.map_or(DVec3::ZERO, |reached| reached.weight * tool.steady_n)
+        };
+        self.tools.iter().map(of).sum()
+    }
+
     pub(super) fn release(&mut self, number: usize) {
         self.tools.retain(|tool| tool.number != number);
     }
@@ -273,21 +291,21 @@ impl Tool {
         if fraction >= 1.0 { self.to_m } else { self.from_m.lerp(self.to_m, fraction) }
     }
 
-    /// Finds the state of contact, and the force of the tool on the sheet, N.
+    /// Finds the state of contact, and the force of the tool on the sheet, N. `state` already has the effect of the steady
+    /// force; where the disc slides, half of that goes with it.
     pub(super) fn meet<T: Real>(
         &mut self,
         model: &Model,
         plan: &Plan,
         layout: &Layout,
-        state: &State<T>,
-        fraction: f64,
-    ) -> DVec3 {
-        let place_m = self.place_m(fraction);
-        let displacement = |point| displacement_m(model, layout, state, point);
+        state: &mut State<T>,
+        leg: Leg,
+    ) -> Thrust {
+        let Leg { place_m, spread_n, .. } = leg;
         if self.contact_state == ContactState::Free {
-            self.footprint.seek(model, place_m, displacement);
+            self.footprint.seek(model, place_m, |point| displacement_m(model, layout, state, point));
         }
-        let (surface_m, along) = self.footprint.surface(displacement);
+        let (surface_m, along) = self.footprint.surface(|point| displacement_m(model, layout, state, point));
         let outward = self.footprint.outward(&along);
         let mut gap_m = place_m - surface_m;
         let side = self.side.unwrap_or_else(|| self.footprint.side(gap_m.dot(outward)));
@@ -298,13 +316,13 @@ impl Tool {
                 let is_beside = self.footprint.is_beside(gap_m, outward);
                 self.side = (!is_beside).then_some(side);
                 if is_beside {
-                    return DVec3::ZERO;
+                    return Thrust::default();
                 }
                 if self.tip.grasps {
                     (self.contact_state, self.offset_m) = (ContactState::Holding, gap_m);
                     gap_m = DVec3::ZERO;
                 } else if gap_m.dot(self.normal) >= 0.0 {
-                    return DVec3::ZERO;
+                    return Thrust::default();
                 } else {
                     self.contact_state = ContactState::Sticking;
                 }
@@ -312,51 +330,186 @@ impl Tool {
             ContactState::Holding => gap_m -= self.offset_m,
             ContactState::Sticking | ContactState::Sliding => {}
         }
-        let force_n = self.force(model, plan, layout, state, gap_m);
+        let thrust = self.thrust(model, plan, layout, state, gap_m, DVec3::ZERO);
         if self.contact_state == ContactState::Holding {
-            return force_n;
+            return thrust;
         }
-        let pressure_n = -force_n.dot(self.normal);
+        let felt_n = thrust.force_n() + spread_n;
+        let pressure_n = -felt_n.dot(self.normal);
         if pressure_n <= 0.0 || self.footprint.mobility() == 0.0 {
             self.contact_state = ContactState::Free;
-            return DVec3::ZERO;
+            return Thrust::default();
         }
-        let (inside, force_n) = within_cone(force_n, self.normal, self.tip.friction);
-        self.contact_state = if inside { ContactState::Sticking } else { ContactState::Sliding };
-        force_n
+        let (inside, felt_n) = within_cone(felt_n, self.normal, self.tip.friction);
+        if inside {
+            self.contact_state = ContactState::Sticking;
+            return thrust;
+        }
+        self.contact_state = ContactState::Sliding;
+        self.slide(model, plan, layout, state, leg, felt_n)
     }
 
-    /// The force that closes a gap, N.
-    fn force<T: Real>(&self, model: &Model, plan: &Plan, layout: &Layout, state: &State<T>, gap_m: DVec3) -> DVec3 {
-        let spacing_m = model.unit_m;
-        let moves_m_per_n =
-            plan.scheme.kick()[0] * plan.force_scale(&model.scene) * spacing_m * self.footprint.mobility();
-        let gap_m = gap_m + moves_m_per_n * self.steady_n;
+    /// The tool's way in the substep that ends at `fraction` of the step.
+    pub(super) fn leg(&self, model: &Model, plan: &Plan, fraction: f64) -> Leg {
+        let moves_m_per_n = self.moves_m_per_n(model, plan);
+        let met = self.contact_state != ContactState::Free;
+        let mut leg = Leg {
+            place_m: self.place_m(fraction),
+            normal: met.then_some(self.normal),
+            jump_n: DVec3::ZERO,
+            spread_n: DVec3::ZERO,
+        };
+        if self.tip.coupling != Coupling::Constraint || moves_m_per_n == 0.0 {
+            return leg;
+        }
+        let [of_u, of_d] = plan.scheme.kick();
+        let own_m_per_s = (self.to_m - self.from_m) * model.scene.stepping.rate_hz;
+        let jump_m = (own_m_per_s - self.velocity_m_per_s) * plan.substep_s;
+        let jump_n = of_u / (of_d * moves_m_per_n) * jump_m;
+        let pressing_n = jump_n.dot(self.normal) * self.normal;
+        let (across_n, substeps) = (jump_n - pressing_n, f64::from(plan.substeps));
+        let is_first = fraction * substeps < 1.5;
+        leg.spread_n = pressing_n / substeps;
+        // A disc that slides takes no more of the part along the surface than friction gives it.
+        if self.contact_state == ContactState::Sticking {
+            leg.spread_n += if is_first { across_n / substeps - across_n } else { across_n / substeps };
+        }
+        if is_first && matches!(self.contact_state, ContactState::Sticking | ContactState::Sliding) {
+            leg.jump_n = pressing_n;
+        }
+        leg
+    }
+
+    /// Moves the disc to where it is under the tool once `force_n` has acted, and finds the force there.
+    fn slide<T: Real>(
+        &mut self,
+        model: &Model,
+        plan: &Plan,
+        layout: &Layout,
+        state: &mut State<T>,
+        Leg { place_m, normal: before, spread_n, .. }: Leg,
+        force_n: DVec3,
+    ) -> Thrust {
+        let moves_m_per_n = self.moves_m_per_n(model, plan);
+        let (surface_m, along) = self.footprint.surface(|point| displacement_m(model, layout, state, point));
+        let mut beside_m = place_m - surface_m - moves_m_per_n * (force_n - self.steady_n);
+        let across_n = force_n - force_n.dot(self.normal) * self.normal;
+        if let Coupling::Spring { stiffness_n_per_m, .. } = self.tip.coupling {
+            beside_m -= across_n / stiffness_n_per_m;
+        }
+        beside_m -= beside_m.dot(self.normal) * self.normal;
+        // Of a force that travels, half acts where it was, and half where it is.
+        let half = plan.scheme.constant().map(|of| 0.5 * of);
+        push(model, plan, layout, state, &self.footprint, -self.steady_n, half);
+        let stayed_m = movement_m(model, layout, state, &self.footprint);
+        self.footprint.shift(model, beside_m, &along);
+        // Without the half that travels at both places: where it acts, it moves the points by the same.
+        let travelled_j = 0.5 * self.steady_n.dot(stayed_m - movement_m(model, layout, state, &self.footprint));
+        push(model, plan, layout, state, &self.footprint, self.steady_n, half);
+        let (surface_m, along) = self.footprint.surface(|point| displacement_m(model, layout, state, point));
+        self.normal = self.side.unwrap_or(1.0) * self.footprint.outward(&along);
+        let gap_m = place_m - surface_m;
+        // Where the disc can't follow, at the tissue's end, the tool is beside it, and its distance from the surface changes as
+        // that turns.
+        let turned = before.map_or(DVec3::ZERO, |before| self.normal - before);
+        let thrust = self.thrust(model, plan, layout, state, gap_m, gap_m.dot(turned) * self.normal);
+        let pressing_n = -(thrust.force_n() + spread_n).dot(self.normal).min(0.0);
+        // What acts over the substep is along the mean normal; a spring's force is that at its end.
+        let mean = match (self.tip.coupling, before) {
+            // Of normals that have turned over there is no mean.
+            (Coupling::Constraint, Some(before)) if before.dot(self.normal) > 0.0 => (before + self.normal).normalize(),
+            _ => self.normal,
+        };
+        let across = (across_n - across_n.dot(mean) * mean).normalize_or_zero();
+        let friction_n = self.tip.friction * pressing_n * across;
+        let along_mean = |normal_n: f64| normal_n / mean.dot(self.normal) * mean;
+        let kick_n = along_mean(thrust.kick_n.dot(self.normal));
+        let steady_n = along_mean((thrust.steady_n - friction_n).dot(self.normal)) + friction_n;
+        let goes_on_n = if thrust.goes_on_n == thrust.steady_n { steady_n } else { kick_n + steady_n };
+        Thrust { kick_n, steady_n, goes_on_n, travelled_j }
+    }
+
+    /// How far the disc moves in the substep under an impulse of 1 N times the substep.
+    fn moves_m_per_n(&self, model: &Model, plan: &Plan) -> f64 {
+        plan.scheme.kick()[0] * plan.force_scale(&model.scene) * model.unit_m * self.footprint.mobility()
+    }
+
+    /// What closes a gap, and makes the disc as fast as the tool, and by `more_m` in the substep faster, if the scheme can do
+    /// both.
+    fn thrust<T: Real>(
+        &self,
+        model: &Model,
+        plan: &Plan,
+        layout: &Layout,
+        state: &State<T>,
+        gap_m: DVec3,
+        more_m: DVec3,
+    ) -> Thrust {
+        let moves_m_per_n = self.moves_m_per_n(model, plan);
+        if moves_m_per_n == 0.0 {
+            return Thrust::default();
+        }
+        let own_m = (self.to_m - self.from_m) * (model.scene.stepping.rate_hz * plan.substep_s);
+        let moved_m = movement_m(model, layout, state, &self.footprint);
+        let ([kick_u, kick_d], [of_u, of_d]) = (plan.scheme.kick(), plan.scheme.constant());
         match self.tip.coupling {
-            _ if moves_m_per_n == 0.0 => DVec3::ZERO,
-            Coupling::Constraint => gap_m / moves_m_per_n,
+            Coupling::Constraint => {
+                let determinant = kick_u * of_d - kick_d * of_u;
+                // A two-step scheme moves a point by what it changes its speed by: it can only close the gap.
+                if determinant.abs() < LEAST_DETERMINANT {
+                    let force_n = self.steady_n + gap_m / moves_m_per_n;
+                    return Thrust { kick_n: force_n - self.steady_n, steady_n: self.steady_n, goes_on_n: force_n, travelled_j: 0.0 };
+                }
+                let unit = kick_u / (moves_m_per_n * determinant);
+                let faster_m = own_m + more_m - moved_m;
+                let steady_n = self.steady_n + unit * (kick_u * faster_m - kick_d * gap_m);
+                let kick_n = unit * (of_d * gap_m - of_u * faster_m);
+                Thrust { kick_n, steady_n, goes_on_n: steady_n, travelled_j: 0.0 }
+            }
             Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } => {
-                let own_m = (self.to_m - self.from_m) * (model.scene.stepping.rate_hz * plan.substep_s);
-                let moved_m = movement_m(model, layout, state, &self.footprint) - moves_m_per_n * self.steady_n;
-                let apart_m_per_s = (own_m - moved_m) / plan.substep_s;
+                let gap_m = gap_m + moves_m_per_n * self.steady_n;
+                let apart_m_per_s = (own_m - (moved_m - moves_m_per_n * self.steady_n)) / plan.substep_s;
                 let held = stiffness_n_per_m + damping_n_s_per_m / plan.substep_s;
-                (stiffness_n_per_m * gap_m + damping_n_s_per_m * apart_m_per_s) / (1.0 + moves_m_per_n * held)
+                let force_n =
+                    (stiffness_n_per_m * gap_m + damping_n_s_per_m * apart_m_per_s) / (1.0 + moves_m_per_n * held);
+                Thrust { kick_n: force_n - self.steady_n, steady_n: self.steady_n, goes_on_n: force_n, travelled_j: 0.0 }
             }
         }
     }
+}
 
-    /// After the force has acted: a sliding disc stays under the tool.
-    pub(super) fn follow<T: Real>(&mut self, model: &Model, layout: &Layout, state: &State<T>, fraction: f64) {
-        if self.contact_state != ContactState::Sliding {
-            return;
-        }
-        let (surface_m, along) = self.footprint.surface(|point| displacement_m(model, layout, state, point));
-        let mut beside_m = self.place_m(fraction) - surface_m;
-        beside_m -= beside_m.dot(self.normal) * self.normal;
-        if let Coupling::Spring { stiffness_n_per_m, .. } = self.tip.coupling {
-            beside_m -= (self.force_n - self.force_n.dot(self.normal) * self.normal) / stiffness_n_per_m;
-        }
-        self.footprint.shift(model, beside_m, &along);
+/// A tool's way in a substep. Its speed jumps at the beginning of a step, because its path is known at the ends of steps alone.
+/// Forces are impulses over the substep.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Leg {
+    /// Where it ends, m.
+    place_m: DVec3,
+    /// The normal of the surface where it begins, if the tool touches there.
+    normal: Option<DVec3>,
+    /// What the jump of speed takes across the surface, in the first substep: it acts where the disc is then, N.
+    pub(super) jump_n: DVec3,
+    /// What to add to the force of the substep, so that a jump counts as spread over the step. Then whether the tool lets go or
+    /// slides does not depend on the length of a substep, N.
+    spread_n: DVec3,
+}
+
+/// What a tool does to its disc in a substep, N.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(super) struct Thrust {
+    /// An impulse at the substep's beginning, over the substep.
+    pub(super) kick_n: DVec3,
+    /// A force throughout.
+    pub(super) steady_n: DVec3,
+    /// The force with which the next substep begins.
+    pub(super) goes_on_n: DVec3,
+    /// The work, J, of the half of the force that acted where the disc was, beyond what it would do where the disc is.
+    pub(super) travelled_j: f64,
+}
+
+impl Thrust {
+    /// Both together.
+    pub(super) fn force_n(&self) -> DVec3 {
+        self.kick_n + self.steady_n
     }
 }
 

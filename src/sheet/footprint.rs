@@ -150,9 +150,8 @@ impl Footprint {
     /// ([`Footprint::surface`]).
     pub(super) fn shift(&mut self, model: &Model, beside_m: DVec3, along: &[DVec3; 2]) {
         match &mut self.ground {
-            // A sheet is hardly turned within its plane.
             Ground::Grid(disc) => {
-                let centre_m = disc.centre_m + beside_m.truncate();
+                let centre_m = disc.centre_m + within(beside_m, along);
                 self.move_on_grid(model, centre_m);
             }
             Ground::Mesh(disc) => {

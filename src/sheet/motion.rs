@@ -237,7 +237,7 @@ impl<T: Real> Sheet<T> {
         model.unit_m / (plan.scheme.impulse() * plan.force_scale(&model.scene))
     }
 
-    /// Displacement, velocity and springs' force of a free point, under the applied force `applied_n`.
+    /// Displacement, velocity and springs' force of a free point, under the applied force `applied_n` and that of tips.
     pub(super) fn free_point(&self, index: usize, applied_n: DVec3) -> [DVec3; 3] {
         let Sheet { model, plan, tables, state, .. } = self;
         let (spacing_m, scale) = (model.unit_m, plan.force_scale(&model.scene));
@@ -246,6 +246,9 @@ impl<T: Real> Sheet<T> {
         let [i, j] = model.point_of(index);
         let (mass, extra) = (model.relative_mass_at(index), model.extra_virtual_at(index));
         let still = self.steps == 0 || !self.tiles.region.is_awake(i, j);
+        // Without all forces of the present a two-step scheme would tell a velocity of a point that rests under a tip.
+        let tips_n = if plan.scheme.takes_means() { self.contacts.steady_on([i, j]) } else { DVec3::ZERO };
+        let pushed_n = applied_n + tips_n;
         let mut found = [DVec3::ZERO; 3];
         for (c, n) in springs.into_iter().enumerate() {
             let at = c * tables.layout.plane + tables.layout.offset(index);
@@ -253,7 +256,7 @@ impl<T: Real> Sheet<T> {
             let mut kept = [one(0.0); MAX_KEPT];
             kept.iter_mut().zip(&state.kept).for_each(|(value, field)| *value = one(field[at].wide()));
             let (u, d, n) = (one(state.u[at].wide()), one(state.d[at].wide()), one(n.wide()));
-            let force = one(unit * applied_n[c] / mass);
+            let force = one(unit * pushed_n[c] / mass);
             let (u, w) = with_arithmetic!(&plan.scheme, f64, |scheme| scheme.observe(u, d, n, &kept, Some(force)));
             found[0][c] = u.value() * spacing_m;
             found[1][c] = if still { 0.0 } else { w.value() * spacing_m / plan.substep_s };

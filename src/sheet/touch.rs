@@ -4,7 +4,7 @@ use glam::DVec3;
 
 use palpate_touch::ContactState;
 
-use super::contact::{Feel, Surroundings, Tool, displacement_m, movement_m, push, within_cone};
+use super::contact::{Feel, Surroundings, Thrust, Tool, displacement_m, movement_m, push, within_cone};
 use super::footprint::Reached;
 use super::motion::Sheet;
 use super::real::Real;
@@ -23,20 +23,38 @@ impl<T: Real> Sheet<T> {
                 tiles.wake_under(tool.points());
                 push(model, plan, layout, state, &tool.footprint, before_n, plan.scheme.constant());
             }
-            tool.force_n = tool.meet(model, plan, layout, state, fraction);
-            tool.steady_n = if met { tool.force_n } else { DVec3::ZERO };
-            if tool.force_n == DVec3::ZERO {
+            let leg = tool.leg(model, plan, fraction);
+            if leg.jump_n != DVec3::ZERO {
+                push(model, plan, layout, state, &tool.footprint, leg.jump_n, plan.scheme.kick());
+            }
+            let thrust = tool.meet(model, plan, layout, state, leg);
+            tool.force_n = thrust.force_n();
+            tool.steady_n = if met { thrust.goes_on_n } else { DVec3::ZERO };
+            if tool.contact_state == ContactState::Free {
+                // The tool has let go: undo what acted in this substep.
                 if before_n != DVec3::ZERO {
-                    // The tool has let go: undo the force of this substep.
                     push(model, plan, layout, state, &tool.footprint, -before_n, plan.scheme.constant());
                 }
+                if leg.jump_n != DVec3::ZERO {
+                    push(model, plan, layout, state, &tool.footprint, -leg.jump_n, plan.scheme.kick());
+                }
+                continue;
+            }
+            if thrust == Thrust::default() && before_n == DVec3::ZERO && leg.jump_n == DVec3::ZERO {
                 continue;
             }
             // Tiles that slept were at rest in this substep, as if they had been computed.
             tiles.wake_under(tool.points());
-            push(model, plan, layout, state, &tool.footprint, tool.force_n - before_n, plan.scheme.kick());
-            work.add(tool.force_n.dot(movement_m(model, layout, state, &tool.footprint)));
-            tool.follow(model, layout, state, fraction);
+            work.add(leg.jump_n.dot(movement_m(model, layout, state, &tool.footprint)));
+            work.add(thrust.travelled_j);
+            let change_n = thrust.steady_n - before_n;
+            for (acts_n, by_n, how) in [
+                (thrust.kick_n, thrust.kick_n, plan.scheme.kick()),
+                (thrust.steady_n, change_n, plan.scheme.constant()),
+            ] {
+                push(model, plan, layout, state, &tool.footprint, by_n, how);
+                work.add(acts_n.dot(movement_m(model, layout, state, &tool.footprint)));
+            }
         }
     }
 
@@ -111,12 +129,44 @@ impl<T: Real> Sheet<T> {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::sheet::{Model, Tissue};
+    use crate::sheet::{Energy, Model, Tissue};
     use palpate_touch::Tip;
 
     fn sheet(sets: &[&str]) -> Sheet<f64> {
         let always = ["stepping.precision=f64", "stepping.integrator=central", "stepping.substeps=1"];
         Sheet::new(&Model::paper(&[&always[..], &["sheet.points=[9, 9]", "sleep.tolerance=0.0"], sets].concat()))
+    }
+
+    /// Without damping and friction, all energy is work that a tip has done: also of the force that travels with its disc.
+    #[test]
+    fn the_work_of_a_tip_that_slides_is_the_energy_of_the_sheet() {
+        for friction in [0.0, 0.4] {
+            let mut sheet = sheet(&[
+                "sheet.points=[31, 21]",
+                "damping.coefficient_n_s_per_m=0",
+                "stepping.integrator=exponential3",
+                "stepping.substeps=4",
+            ]);
+            let tip = Tip { radius_m: 0.07, friction, ..Tip::default() };
+            let smooth = |t: f64| {
+                let t = t.clamp(0.0, 1.0);
+                t * t * t * (10.0 - 15.0 * t + 6.0 * t * t)
+            };
+            let mut worst = 0.0_f64;
+            for step in 0..900 {
+                let t = f64::from(step) * 1e-3;
+                let along_m = 0.5 * smooth((t - 0.2) / 0.7);
+                let place_m = DVec3::new(0.25 + along_m, 0.33 + 0.1 * along_m, 0.001 - 0.05 * smooth(t / 0.2));
+                sheet.pose(0, place_m, tip);
+                sheet.do_step();
+                let Energy { kinetic_j, spring_j, virtual_j } = sheet.energies();
+                let (energy_j, work_j) = (kinetic_j + spring_j + virtual_j, sheet.work.done_j);
+                worst = worst.max((work_j - energy_j).abs());
+                assert!(step < 200 || energy_j > 0.004, "{step}: {energy_j} J");
+                println!("{step} {energy_j:.5e} {work_j:.5e}");
+            }
+            assert!(worst < 1.0, "{friction}: {worst} J");
+        }
     }
 
     #[test]
