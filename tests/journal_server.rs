@@ -407,3 +407,77 @@ async fn a_journal_is_replayed_through_a_server_that_keeps_none() {
         (live["session_id"].as_str().unwrap(), pb::SessionState::Running)
     );
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_a_server_plays_is_compared_with_the_journal_and_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let (id, file) = {
+        let server = start(folder.path());
+        let id = server.paper(true).await;
+        let mut touch = Touch::hold(&server, &id).await;
+        // It does not come to rest before a second is over, when its hash is written.
+        for (sequence, step) in (1..).zip([450, 900, 1200]) {
+            touch.command(force(0, sequence, -3e-4 * step as f64)).await;
+            touch.settle().await;
+            server.start_until(&id, step).await;
+            server.hash_at(&id, step).await;
+        }
+        durable_at(&server, &id, 1200).await;
+        (id.clone(), files(folder.path(), &id).remove(0))
+    };
+    server::client_program();
+    let server = Server::start(&["--log", "error"]);
+    let replay = |file: &Path, arguments: &[&str]| {
+        let ran = server::palpate(&[&["journal", "replay", file.to_str().unwrap()], arguments].concat());
+        let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+        (ran.status.code(), text(ran.stdout), text(ran.stderr))
+    };
+    let on_server = ["--server", server.url.as_str(), "--speed", "4"];
+    let [here, there] = ["here.jsonl", "there.jsonl"].map(|name| folder.path().join(name).display().to_string());
+    let records = |output: &'_ str| {
+        ["--every", "100", "--point", "15,15", "--point", "3,4", "--output"]
+            .map(str::to_owned)
+            .into_iter()
+            .chain([output.to_owned()])
+            .collect::<Vec<_>>()
+    };
+    let told = |output: &str, more: &[&str]| {
+        let records = records(output);
+        let arguments: Vec<&str> = records.iter().map(String::as_str).chain(more.iter().copied()).collect();
+        replay(&file, &arguments)
+    };
+    assert_eq!(told(&here, &[]).0, Some(0));
+    let (status, out, err) = told(&there, &on_server);
+    assert!(status == Some(0) && out.contains("recorded hashes  1 equal"), "{out}{err}");
+    // The same lines, but for the record of the beginning and the summary of what was computed here.
+    let lines = |path: &str| std::fs::read_to_string(path).unwrap().lines().map(str::to_owned).collect::<Vec<_>>();
+    let (mut here, there) = (lines(&here), lines(&there));
+    assert!(here.pop().unwrap().contains("summary") && here.remove(1).contains("\"time_s\":0.0"));
+    assert!(here.len() == 13 && here == there, "{there:?}");
+    let (status, _, err) = replay(&file, &[&on_server[..], &["--point", "1,1"]].concat());
+    assert!(status == Some(2) && err.contains("--output"), "{err}");
+    // A journal that has another hash than its inputs give.
+    let mut reader = palpate::journal::Reader::open(&file).unwrap();
+    let survey = reader.survey(&mut |_| {}).unwrap();
+    let first = palpate::journal::Replay::new(reader, survey, &Limits::default()).unwrap().first().clone();
+    let opening = palpate::journal::Opening {
+        session_id: &id,
+        run: 1,
+        owner: "ann",
+        idle_timeout_s: 60.0,
+        first: &first,
+        begin_step: 0,
+        running: true,
+        until_step: None,
+        ownership_revision: 0,
+    };
+    let mut writer = palpate::journal::Writer::new(&opening, 1);
+    writer.hash(100, 7);
+    let wrong = folder.path().join("wrong.mcap");
+    std::fs::write(&wrong, writer.finish(palpate::journal::pb::Why::Deleted, "", 200, 2)).unwrap();
+    let (status, out, err) = replay(&wrong, &on_server);
+    assert!(
+        status == Some(1) && err.contains("differs: the state at step 100 was 00000000000000000000000000000007"),
+        "{out}{err}"
+    );
+}
