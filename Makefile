@@ -317,6 +317,7 @@ soak: need-rust
 	PALPATE_JOURNAL_KILLS=$(JOURNAL_KILLS) PALPATE_JOURNAL_SESSIONS=20 \
 		$(CARGO) test --release --test journal_kill -- --nocapture
 	PALPATE_LONG=1 $(CARGO) test --release --test journal -- --nocapture
+	PALPATE_LONG=1 $(CARGO) test --release --test journal_server -- stalls --nocapture
 
 # Each seed is another siege; the first failure is said as it is found, all of them at the end.
 SEED ?= 16

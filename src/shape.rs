@@ -2,6 +2,7 @@
 //! tissue this way and no other, so that it does not matter whether its points form a grid.
 
 use std::fmt;
+use std::str::FromStr;
 
 use glam::DVec3;
 use serde::Serialize;
@@ -40,6 +41,18 @@ impl fmt::Display for PointName {
             PointName::Point([i, j]) => write!(f, "[{i}, {j}]"),
             PointName::Vertex(vertex) => write!(f, "vertex {vertex}"),
         }
+    }
+}
+
+impl FromStr for PointName {
+    type Err = &'static str;
+
+    fn from_str(text: &str) -> std::result::Result<Self, Self::Err> {
+        let name = match text.split_once(',') {
+            Some((i, j)) => i.trim().parse().ok().zip(j.trim().parse().ok()).map(|(i, j)| PointName::Point([i, j])),
+            None => text.trim().parse().ok().map(PointName::Vertex),
+        };
+        name.ok_or("must be X,Y or the number of a vertex")
     }
 }
 

@@ -57,10 +57,11 @@ const CRATES: [(&str, &str, &[&str], &[&str]); 8] = [
 ];
 
 /// The modules of `palpate` that a module of the programs may use. `link` simulates the far end; the others read files.
-const FOR_PROGRAMS: [(&str, &[&str]); 5] = [
+const FOR_PROGRAMS: [(&str, &[&str]); 6] = [
     ("link", &["force_law", "limits", "memory", "scene", "session", "sheet"]),
     ("load", &["scene"]),
     ("placement", &["scene"]),
+    ("play", &["journal", "scene", "shape", "wire"]),
     ("replay", &["limits", "scene", "shape", "wire"]),
     ("scene_file", &["limits", "scene", "wire"]),
 ];

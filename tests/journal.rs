@@ -74,6 +74,7 @@ fn written(first: &Arc<Model>, steps: u64, ends: bool) -> (Vec<u8>, Vec<(u64, u6
         if step % 97 == 50 && step < 1000 {
             let change = Change { stiffness_n_per_m: Some(100.0 + step as f64), ..Change::default() };
             let changed = session.model().changed(&change, &first.scene, &Limits::default()).unwrap();
+            writer.waiting(&[(step, changed.clone())]);
             writer.input(step, &Input::Tissue(changed.clone()));
             session.change(&changed);
         }
@@ -231,7 +232,8 @@ fn a_sealed_file_opens_with_the_reader_of_mcap() {
     assert!(found.sealed && found.torn_bytes == 0 && found.batches == ends.len() as u64, "{found:?}");
     let summary = mcap::Summary::read(&file).unwrap().unwrap();
     let statistics = summary.stats.as_ref().unwrap();
-    assert_eq!((statistics.chunk_count, statistics.channel_count), (ends.len() as u32, 6));
+    assert_eq!((statistics.chunk_count, statistics.channel_count), (ends.len() as u32, 7));
+    assert_eq!(found.waiting.iter().map(|input| input.step).collect::<Vec<_>>(), [147]);
     assert_eq!(statistics.message_count, mcap::MessageStream::new(&file).unwrap().map(Result::unwrap).count() as u64);
     assert_eq!(summary.chunk_indexes.len(), ends.len());
     for index in &summary.chunk_indexes {

@@ -100,6 +100,59 @@ async fn a_killed_server_goes_on_with_its_sessions_from_their_durable_step() {
     verifies(&[files(folder.path(), &pressed), files(folder.path(), &stopped)].concat());
 }
 
+/// Waits until the journal of a run has changes of the tissue that wait for these steps.
+async fn until_waits(folder: &Path, session_id: &str, run: usize, steps: &[u64]) {
+    let waits = |path: &PathBuf| {
+        let survey = palpate::journal::Reader::open(path).and_then(|mut reader| reader.survey(&mut |_| {}));
+        survey.is_ok_and(|survey| survey.waiting.iter().map(|input| input.step).eq(steps.iter().copied()))
+    };
+    let waited = tokio::time::timeout(PATIENCE, async {
+        while !files(folder, session_id).get(run - 1).is_some_and(waits) {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    });
+    waited.await.unwrap_or_else(|_| panic!("run {run} never has what waits for {steps:?}"));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn changes_of_the_tissue_that_wait_for_their_step_outlive_a_kill() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut server = start(folder.path());
+    let id = server.paper(true).await;
+    for (step, stiffness) in [(100, 40.0), (200, 50.0)] {
+        let mut change = pb::UpdateTissueRequest { session_id: id.clone(), at_step: Some(step), ..Default::default() };
+        change.stiffness_n_per_m = Some(stiffness);
+        server.sessions().await.update_tissue(change).await.unwrap();
+    }
+    // Before the first step, after the first change, and when all have acted.
+    let stiffness = [(0, [100, 200].as_slice(), None), (150, &[100, 200], Some(40.0)), (300, &[200], Some(50.0))];
+    for (run, (until, waits, stiffness)) in (1..).zip(stiffness) {
+        until_waits(folder.path(), &id, run, waits).await;
+        if until > 0 {
+            server.start_until(&id, until).await;
+            server.hash_at(&id, until).await;
+            durable_at(&server, &id, until).await;
+            let springs = server.status(&id).await.scene.unwrap().springs.unwrap();
+            assert_eq!(springs.stiffness_n_per_m, stiffness, "at step {until}");
+        }
+        server.child.kill().unwrap();
+        server.child.wait().unwrap();
+        server = start(folder.path());
+    }
+    assert_eq!(server.status(&id).await.step, 300);
+    let kept = files(folder.path(), &id);
+    let mut acted = Vec::new();
+    for path in &kept {
+        let mut reader = palpate::journal::Reader::open(path).unwrap();
+        while let Some(batch) = reader.next_batch().unwrap() {
+            let is_tissue = |what: &Option<_>| matches!(what, Some(palpate::journal::pb::input::What::Tissue(_)));
+            acted.extend(batch.inputs().unwrap().iter().filter(|input| is_tissue(&input.what)).map(|input| input.step));
+        }
+    }
+    assert_eq!(acted, [100, 200]);
+    verifies(&kept);
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_server_that_is_told_to_end_hands_its_sessions_over() {
     let folder = tempfile::tempdir().unwrap();
@@ -406,4 +459,171 @@ async fn a_journal_is_replayed_through_a_server_that_keeps_none() {
         (listed[0].session_id.as_str(), listed[0].state()),
         (live["session_id"].as_str().unwrap(), pb::SessionState::Running)
     );
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_a_server_plays_is_compared_with_the_journal_and_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let (id, file) = {
+        let server = start(folder.path());
+        let id = server.paper(true).await;
+        let mut touch = Touch::hold(&server, &id).await;
+        // It does not come to rest before a second is over, when its hash is written.
+        for (sequence, step) in (1..).zip([450, 900, 1200]) {
+            touch.command(force(0, sequence, -3e-4 * step as f64)).await;
+            touch.settle().await;
+            server.start_until(&id, step).await;
+            server.hash_at(&id, step).await;
+        }
+        durable_at(&server, &id, 1200).await;
+        (id.clone(), files(folder.path(), &id).remove(0))
+    };
+    server::client_program();
+    let server = Server::start(&["--log", "error"]);
+    let replay = |file: &Path, arguments: &[&str]| {
+        let ran = server::palpate(&[&["journal", "replay", file.to_str().unwrap()], arguments].concat());
+        let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+        (ran.status.code(), text(ran.stdout), text(ran.stderr))
+    };
+    let on_server = ["--server", server.url.as_str(), "--speed", "4"];
+    let [here, there] = ["here.jsonl", "there.jsonl"].map(|name| folder.path().join(name).display().to_string());
+    let records = |output: &'_ str| {
+        ["--every", "100", "--point", "15,15", "--point", "3,4", "--output"]
+            .map(str::to_owned)
+            .into_iter()
+            .chain([output.to_owned()])
+            .collect::<Vec<_>>()
+    };
+    let told = |output: &str, more: &[&str]| {
+        let records = records(output);
+        let arguments: Vec<&str> = records.iter().map(String::as_str).chain(more.iter().copied()).collect();
+        replay(&file, &arguments)
+    };
+    assert_eq!(told(&here, &[]).0, Some(0));
+    let (status, out, err) = told(&there, &on_server);
+    assert!(status == Some(0) && out.contains("recorded hashes  1 equal"), "{out}{err}");
+    // The same lines, but for the record of the beginning and the summary of what was computed here.
+    let lines = |path: &str| std::fs::read_to_string(path).unwrap().lines().map(str::to_owned).collect::<Vec<_>>();
+    let (mut here, there) = (lines(&here), lines(&there));
+    assert!(here.pop().unwrap().contains("summary") && here.remove(1).contains("\"time_s\":0.0"));
+    assert!(here.len() == 13 && here == there, "{there:?}");
+    let (status, _, err) = replay(&file, &[&on_server[..], &["--point", "1,1"]].concat());
+    assert!(status == Some(2) && err.contains("--output"), "{err}");
+    // A journal that has another hash than its inputs give.
+    let mut reader = palpate::journal::Reader::open(&file).unwrap();
+    let survey = reader.survey(&mut |_| {}).unwrap();
+    let first = palpate::journal::Replay::new(reader, survey, &Limits::default()).unwrap().first().clone();
+    let opening = palpate::journal::Opening {
+        session_id: &id,
+        run: 1,
+        owner: "ann",
+        idle_timeout_s: 60.0,
+        first: &first,
+        begin_step: 0,
+        running: true,
+        until_step: None,
+        ownership_revision: 0,
+    };
+    let mut writer = palpate::journal::Writer::new(&opening, 1);
+    writer.hash(100, 7);
+    let wrong = folder.path().join("wrong.mcap");
+    std::fs::write(&wrong, writer.finish(palpate::journal::pb::Why::Deleted, "", 200, 2)).unwrap();
+    let (status, out, err) = replay(&wrong, &on_server);
+    assert!(
+        status == Some(1) && err.contains("differs: the state at step 100 was 00000000000000000000000000000007"),
+        "{out}{err}"
+    );
+}
+
+/// A file system of its own, in a file of `folder`. It is gone with this.
+#[cfg(target_os = "linux")]
+struct Disk(PathBuf);
+
+#[cfg(target_os = "linux")]
+impl Disk {
+    /// `None` if nobody may mount one here.
+    fn mount(folder: &Path) -> Option<Self> {
+        let [image, at] = ["disk", "mounted"].map(|name| folder.join(name));
+        std::fs::create_dir(&at).unwrap();
+        std::fs::File::create(&image).unwrap().set_len(64 << 20).unwrap();
+        let is_there = run("mkfs.ext4", &["-q".as_ref(), &image])
+            && run("fsfreeze", &["--version".as_ref()])
+            && run("mount", &["-o".as_ref(), "loop".as_ref(), &image, &at]);
+        is_there.then_some(Disk(at))
+    }
+
+    /// Whoever writes to it waits, till what is returned is dropped.
+    fn freeze(&self) -> Frozen<'_> {
+        assert!(run("fsfreeze", &["-f".as_ref(), &self.0]));
+        Frozen(&self.0)
+    }
+}
+
+#[cfg(target_os = "linux")]
+struct Frozen<'d>(&'d Path);
+
+#[cfg(target_os = "linux")]
+impl Drop for Frozen<'_> {
+    fn drop(&mut self) {
+        run("fsfreeze", &["-u".as_ref(), self.0]);
+    }
+}
+
+#[cfg(target_os = "linux")]
+impl Drop for Disk {
+    fn drop(&mut self) {
+        run("umount", &[&self.0]);
+    }
+}
+
+#[cfg(target_os = "linux")]
+fn run(program: &str, arguments: &[&Path]) -> bool {
+    let ran = Command::new(program).args(arguments).stdout(Stdio::null()).stderr(Stdio::null()).status();
+    ran.is_ok_and(|status| status.success())
+}
+
+/// Presses for so long, each command after the one before has acted. Tells the steps that were done and those that were dropped.
+#[cfg(target_os = "linux")]
+async fn pressed(server: &Server, id: &str, touch: &mut Touch, sequence: &mut u64, longest: Duration) -> [u64; 2] {
+    let (before, begun) = (server.status(id).await, std::time::Instant::now());
+    while begun.elapsed() < longest {
+        *sequence += 1;
+        touch.command(force(0, *sequence, -0.1 - 1e-3 * (*sequence % 100) as f64)).await;
+        let newest = *sequence;
+        touch.sample_with(|sample| sample.tools.first().is_some_and(|tool| tool.acknowledged_sequence == newest)).await;
+    }
+    let after = server.status(id).await;
+    [after.step - before.step, after.overrun_count - before.overrun_count]
+}
+
+#[cfg(target_os = "linux")]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn no_step_waits_for_a_disk_that_stalls() {
+    if std::env::var_os("PALPATE_LONG").is_none() {
+        return eprintln!("SKIPPED: a disk that stalls for 5 s; PALPATE_LONG=1 does it");
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let Some(disk) = Disk::mount(folder.path()) else {
+        return eprintln!("SKIPPED: a disk that stalls needs root, mkfs.ext4, mount with a loop device, and fsfreeze");
+    };
+    let journals = disk.0.join("journals");
+    let server = start(&journals);
+    let id = server.paper(false).await;
+    let (mut touch, mut sequence, stall) = (Touch::hold(&server, &id).await, 0, Duration::from_secs(5));
+    let usual = pressed(&server, &id, &mut touch, &mut sequence, stall).await;
+    durable_at(&server, &id, usual[0]).await;
+    let frozen = disk.freeze();
+    let stalled = pressed(&server, &id, &mut touch, &mut sequence, stall).await;
+    let told = server.status(&id).await;
+    let journal = told.journal.unwrap();
+    drop(frozen);
+    eprintln!("5 s each: {usual:?} steps done and dropped with the disk, {stalled:?} while it stalled");
+    // What was done meanwhile is not on the disk, and comes there afterwards: nothing is lost.
+    assert!(journal.fault.is_empty() && journal.durable_step.unwrap() + stalled[0] / 2 < told.step, "{journal:?}");
+    let after = pressed(&server, &id, &mut touch, &mut sequence, Duration::from_millis(500)).await;
+    assert!(after[0] > 0);
+    let session = pause(&server, &id).await;
+    durable_at(&server, &id, session.step).await;
+    drop((touch, server));
+    verifies(&files(&journals, &id));
 }

@@ -657,6 +657,8 @@ struct JournalParts {
     /// What is appended to the file as it is.
     #[prost(bytes = "vec", tag = "6")]
     more: Vec<u8>,
+    #[prost(bytes = "vec", tag = "7")]
+    waiting: Vec<u8>,
 }
 
 impl JournalParts {
@@ -678,9 +680,12 @@ impl JournalParts {
                 chunk.add(Topic::Header.channel(), &self.header);
             }
             chunk.add(Topic::Inputs.channel(), inputs);
-            for (topic, bytes) in
-                [(Topic::Hashes, &self.hash), (Topic::Snapshots, &self.snapshot), (Topic::End, &self.end)]
-            {
+            for (topic, bytes) in [
+                (Topic::Hashes, &self.hash),
+                (Topic::Snapshots, &self.snapshot),
+                (Topic::Waiting, &self.waiting),
+                (Topic::End, &self.end),
+            ] {
                 if number + 1 == self.inputs.len() && !bytes.is_empty() {
                     chunk.add(topic.channel(), bytes);
                 }
@@ -767,6 +772,7 @@ fn journal_seeds() -> Vec<Vec<u8>> {
         snapshot: Vec::new(),
         end: journal_pb::End { why: 1, message: "deleted".to_owned() }.encode_to_vec(),
         more: Vec::new(),
+        waiting: journal_pb::Waiting { inputs: vec![inputs[3].clone()] }.encode_to_vec(),
     };
     let torn = JournalParts { inputs: vec![batch(0, 3, &inputs[..3])], more: vec![6; 30], ..parts.clone() };
     let bytes = |parts: &JournalParts| [vec![1], parts.encode_to_vec()].concat();

@@ -35,12 +35,14 @@ pub enum Topic {
     Felt = 5,
     /// `End`.
     End = 6,
+    /// `Waiting`.
+    Waiting = 7,
 }
 
 impl Topic {
     /// All of them.
-    pub const ALL: [Topic; 6] =
-        [Topic::Header, Topic::Inputs, Topic::Hashes, Topic::Snapshots, Topic::Felt, Topic::End];
+    pub const ALL: [Topic; 7] =
+        [Topic::Header, Topic::Inputs, Topic::Hashes, Topic::Snapshots, Topic::Felt, Topic::End, Topic::Waiting];
 
     /// The topic of its channel.
     pub fn name(self) -> &'static str {
@@ -51,6 +53,7 @@ impl Topic {
             Topic::Snapshots => "/snapshots",
             Topic::Felt => "/felt",
             Topic::End => "/end",
+            Topic::Waiting => "/waiting",
         }
     }
 
@@ -63,6 +66,7 @@ impl Topic {
             Topic::Snapshots => "Snapshot",
             Topic::Felt => "Felt",
             Topic::End => "End",
+            Topic::Waiting => "Waiting",
         }
     }
 

@@ -117,6 +117,14 @@ impl Batch {
         Ok(messages?.into_iter().flat_map(|felt| felt.moments).collect())
     }
 
+    /// The newest message of it that tells which changes of the tissue wait.
+    ///
+    /// # Errors
+    /// Refuses what can't be decoded.
+    pub fn waiting(&self) -> Result<Option<pb::Waiting>> {
+        self.all(Topic::Waiting).last().transpose()
+    }
+
     /// The end of the journal, if it is in this batch.
     ///
     /// # Errors
@@ -160,6 +168,8 @@ pub struct Survey {
     pub hashes: u64,
     /// Snapshots, by ascending step.
     pub snapshots: Vec<SnapshotAt>,
+    /// Changes of the tissue that had been accepted at its end, and may have acted by then.
+    pub waiting: Vec<pb::Input>,
     /// Times of the first and the last batch.
     pub unix_ns: [u64; 2],
     /// The end, if it was written.
@@ -358,6 +368,7 @@ impl<R: Read + Seek> Reader<R> {
             let first = if survey.batches == 1 { batch.unix_ns } else { survey.unix_ns[0] };
             survey.unix_ns = [first, batch.unix_ns];
             survey.end = batch.end()?.or(survey.end);
+            survey.waiting = batch.waiting()?.map_or(survey.waiting, |waiting| waiting.inputs);
             survey.whole_bytes = self.at;
             progress(self.at);
         }

@@ -13,6 +13,7 @@ use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result};
 use crate::session::Session;
 use crate::session::command::Due;
+use crate::session::input::Input;
 use crate::session::rules::Rules;
 use crate::session::saved::Saved;
 use crate::sheet::Model;
@@ -446,15 +447,33 @@ impl<R: Read + Seek> Replay<R> {
             return Err(self.reader.refuse(&difference.to_string()));
         }
         let (running, until_step) = self.running();
+        let waiting = self.waiting()?;
         Ok(Resumed {
             header: self.reader.header().clone(),
             first: self.first,
             session: self.session,
             pending: self.change,
+            waiting,
             running,
             until_step,
             survey: self.survey,
         })
+    }
+
+    /// The changes of the tissue that wait for a step after this one; none of a session that is held.
+    fn waiting(&self) -> Result<Vec<(u64, Input)>> {
+        let next = self.session.step_count() + u64::from(self.change.is_some());
+        let is_held = self.session.hold_reason().is_some();
+        let left = self.survey.waiting.iter().filter(|input| !is_held && input.step >= next);
+        let mut waiting = Vec::new();
+        for input in left.take(self.limits.queued_changes) {
+            let Some(pb::input::What::Tissue(tissue)) = &input.what else { continue };
+            let model = from_tissue(tissue, &self.first, &self.limits)
+                .map_err(|refusal| self.reader.refuse(&format!("what waits for step {}: {refusal}", input.step)))?;
+            waiting.push((input.step, Input::Tissue(model)));
+        }
+        waiting.sort_by_key(|(step, _)| *step);
+        Ok(waiting)
     }
 }
 
@@ -492,6 +511,8 @@ pub struct Resumed {
     pub session: Session,
     /// The tissue from this step on, if it changes here: for `Session::change`.
     pub pending: Option<Arc<Model>>,
+    /// Changes of the tissue that wait for a later step, each with that step.
+    pub waiting: Vec<(u64, Input)>,
     /// Whether time goes on.
     pub running: bool,
     /// The step at which it pauses.

@@ -159,6 +159,14 @@ impl Writer {
         self.message(Topic::Snapshots, snapshot.encode_to_vec());
     }
 
+    /// All changes of the tissue that wait for their step, each with that step: these instead of those told before.
+    pub fn waiting(&mut self, changes: &[(u64, Arc<Model>)]) {
+        let input =
+            |(step, model): &(u64, Arc<Model>)| message::input(*step, &Input::Tissue(model.clone()), &mut Tips::new());
+        let waiting = pb::Waiting { inputs: changes.iter().map(input).collect() };
+        self.message(Topic::Waiting, waiting.encode_to_vec());
+    }
+
     /// What the tools feel after `step` steps.
     pub fn felt(&mut self, step: u64, felt: &[Felt]) {
         if !felt.is_empty() {

@@ -24,6 +24,7 @@ use crate::memory;
 use crate::refusal::{Reason, Refusal, Result, number};
 use crate::scene::{Change, Scene};
 use crate::session::Session;
+use crate::session::input::Input;
 use crate::session::intake::Intake;
 use crate::session::schedule::Schedule;
 use crate::sheet::{Model, choice};
@@ -47,6 +48,8 @@ pub struct Begin {
     pub after_run: u64,
     /// The revision at which this server became its owner; 0 without a fleet.
     pub revision: u64,
+    /// Changes of the tissue that wait for a later step, each with that step.
+    pub waiting: Vec<(u64, Input)>,
     /// It begins frozen, and is not served till [`Live::arrive`].
     pub frozen: bool,
 }
@@ -114,6 +117,7 @@ impl Pacer {
             playback: None,
             after_run: 0,
             revision,
+            waiting: Vec::new(),
             frozen: false,
         };
         self.admit(begin, owner, slot, || Ok(Session::new(&model)), stop)
@@ -145,7 +149,7 @@ impl Pacer {
         session: impl FnOnce() -> Result<Session>,
         stop: &AtomicBool,
     ) -> Result<Arc<Live>> {
-        let Begin { id, first, running, until, idle_timeout_s, playback, after_run, revision, frozen } = begin;
+        let Begin { id, first, running, until, idle_timeout_s, playback, after_run, revision, waiting, frozen } = begin;
         let speed = playback.as_ref().map_or(1.0, |playback| playback.speed);
         check_work(&first, &self.limits)?;
         let skin = memory::attempt("sheet.points", || Ok(Skin::of(&first)))?;
@@ -231,6 +235,10 @@ impl Pacer {
             slot: Mutex::new(slot),
             _memory: memory,
         });
+        // The first that its journal is told.
+        if !waiting.is_empty() {
+            live.adopt_waiting(waiting);
+        }
         let mut running =
             memory::attempt("sheet.points", || Ok(Box::new(Running::new(live.clone(), session, running))))?;
         running.until = until;

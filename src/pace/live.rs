@@ -17,7 +17,7 @@ use super::queue::{Reader, queue};
 use super::reading::Recipient;
 use super::slots::StreamSlots;
 use super::status::Status;
-use super::tape::Tape;
+use super::tape::{Event, Tape};
 use super::taps::{ProbeTap, SampleTap};
 use crate::budget::{Account, Taken};
 use crate::force_law::Disc;
@@ -29,6 +29,8 @@ use crate::scene::Change;
 use crate::scene::record::{Point, ToolRecord};
 use crate::session::batch::Batch;
 use crate::session::command::Command;
+use crate::session::handing::Handed;
+use crate::session::input::Input;
 use crate::session::intake::Intake;
 use crate::session::lease::LeaseId;
 use crate::session::sampling::{HEARTBEAT_S, Sampler, Sampling};
@@ -202,9 +204,36 @@ impl Live {
                 admit(self.cost.awake_share() * f64::from(after) / f64::from(before))?;
             }
             // Somebody may have been quicker; then it is made out of theirs.
-            if let Some(step) = self.at_intake(|intake, now| intake.change(base.as_ref(), &model, at_step, now))? {
+            let accepted = self.at_intake(|intake, now| {
+                let accepted = intake.change(base.as_ref(), &model, at_step, now)?;
+                if accepted.is_some() {
+                    self.note_waiting(intake);
+                }
+                Ok(accepted)
+            })?;
+            if let Some(step) = accepted {
                 return Ok((step, model));
             }
+        }
+    }
+
+    /// What waited for its step where the session was before waits here.
+    pub fn adopt_waiting(&self, waiting: Vec<(u64, Input)>) {
+        let handed = Handed { leases: Vec::new(), waiting };
+        let dropped = self.at_intake(|intake, now| {
+            let dropped = intake.adopt(handed, now);
+            self.note_waiting(intake);
+            dropped
+        });
+        if dropped > 0 {
+            tracing::warn!(session = %self.id, dropped, "no memory for all that waited");
+        }
+    }
+
+    /// Tells the journal which changes of the tissue wait: a session that goes on after a crash still has them.
+    pub(super) fn note_waiting(&self, intake: &Intake) {
+        if let Some(tape) = &self.tape {
+            tape.note(intake.next_step(), Event::Waiting(intake.waiting_changes()));
         }
     }
 

@@ -350,7 +350,11 @@ impl Running {
         (self.session, self.hashed, self.audit) = (session, Hashed::default(), None);
         self.copies.forget();
         (self.running, self.until, self.still_since) = (false, None, Some(step));
-        lock(&self.live.intake).reopen();
+        {
+            let mut intake = lock(&self.live.intake);
+            intake.reopen();
+            self.live.note_waiting(&intake);
+        }
         lock(&self.live.status).forget_hold();
         self.note_input(Input::Revive);
         tracing::info!(session = %self.live.id, step, "session revived");

@@ -43,6 +43,8 @@ pub enum Event {
     Snapshot(Box<Saved>, SheetCopy),
     /// What tools feel.
     Felt(Vec<Felt>),
+    /// All changes of the tissue that wait for their step, each with that step.
+    Waiting(Vec<(u64, Arc<Model>)>),
     /// The session leaves this server: nothing follows.
     Left(Leaving),
 }

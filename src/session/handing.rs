@@ -23,7 +23,7 @@ impl Intake {
     /// never been accepted: it counts where the session goes on. Of a batch that is being taken in the rest is dropped.
     pub fn hand_over(&mut self, refusal: Refusal) -> (Handed, Discarded) {
         let leases = self.leases.handed();
-        let changes = self.changes.iter().map(|(step, model, _)| (*step, Input::Tissue(model.clone())));
+        let changes = self.waiting_changes().into_iter().map(|(step, model)| (step, Input::Tissue(model)));
         let commands = self.queue.in_order().into_iter().map(|(key, due)| (key.0, Input::Command(due.clone())));
         let waiting: Vec<(u64, Input)> = changes.chain(commands).collect();
         let moved = self.queue.waiting() as u64;

@@ -267,6 +267,11 @@ impl Intake {
         Ok(Some(step))
     }
 
+    /// The changes that wait, each with its step, by ascending step.
+    pub fn waiting_changes(&self) -> Vec<(u64, Arc<Model>)> {
+        self.changes.iter().map(|(step, model, _)| (*step, model.clone())).collect()
+    }
+
     /// The last tissue that is due at the beginning of step `step`, if there is one.
     pub fn take_change(&mut self, step: u64) -> Option<Arc<Model>> {
         let due = self.changes.partition_point(|change| change.0 <= step);

@@ -1,5 +1,6 @@
 //! What becomes of a session when something ends in the middle: a move whose target can't keep it, or dies; a deletion without etcd.
 
+use std::path::Path;
 use std::time::Duration;
 
 use palpate::journal::file;
@@ -45,6 +46,96 @@ async fn a_session_stays_if_the_other_server_can_not_write_its_journal() {
     std::fs::remove_dir(&taken).unwrap();
     until("it moves", async || move_to(&nodes[at], &id, &nodes[to]).await.is_ok()).await;
     assert_eq!(owner(&nodes, &id).await, Some(to));
+}
+
+/// Servers whose leases outlast a silence of etcd.
+async fn patient(folder: &Path, etcd: &Etcd) -> Vec<Node> {
+    let config = folder.join("palpate.toml");
+    std::fs::write(&config, "[cluster]\nttl_s = 60\n").unwrap();
+    let more = ["--config", config.to_str().unwrap(), "--log", "warn"];
+    let nodes: Vec<Node> = (0..3).map(|at| Node::start(folder, &format!("n{at}"), &etcd.endpoints(), &more)).collect();
+    nodes[0].until_nodes(3).await;
+    nodes
+}
+
+/// A new session, and which server has it. etcd is silent since it was created, and is about to be told who stands by for it.
+async fn being_named(nodes: &[Node], etcd: &Etcd) -> (String, usize) {
+    let session = create(&nodes[0]).await;
+    etcd.pause(0);
+    let (id, name) = (session.session_id, session.ownership.unwrap().node);
+    until("its journal is mirrored", async || {
+        let kept = nodes.iter().flat_map(|node| file::list(&node.journals.join("standby")).unwrap_or_default());
+        kept.into_iter().any(|file| file.session_id == id)
+    })
+    .await;
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    (id, nodes.iter().position(|node| node.name == name).unwrap())
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_session_moves_also_while_its_standby_is_being_named() {
+    if !Etcd::is_there() {
+        return;
+    }
+    let _one = ONE.lock().await;
+    let folder = tempfile::tempdir().unwrap();
+    let etcd = Etcd::start(1);
+    let nodes = patient(folder.path(), &etcd).await;
+    for _ in 0..4 {
+        let (id, at) = being_named(&nodes, &etcd).await;
+        let (from, to) = (nodes[at].admin().await, &nodes[(at + 1) % 3]);
+        let request = pb::MoveSessionRequest { session_id: id.clone(), node: to.name.clone() };
+        let moving = tokio::spawn(async move { { from }.move_session(request).await });
+        tokio::time::sleep(Duration::from_millis(500)).await;
+        etcd.resume(0);
+        let moved = moving.await.unwrap().unwrap().into_inner();
+        assert_eq!(moved.ownership.unwrap().node, to.name);
+        until("it goes on there", async || to.session(&id).await.is_ok_and(|session| session.step > 0)).await;
+    }
+    let (id, at) = being_named(&nodes, &etcd).await;
+    let mut from = nodes[at].admin().await;
+    let mut draining = from.drain_node(pb::DrainNodeRequest { stop: false }).await.unwrap().into_inner();
+    tokio::time::sleep(Duration::from_millis(500)).await;
+    etcd.resume(0);
+    let mut drained = Vec::new();
+    while let Some(told) = draining.message().await.unwrap() {
+        assert_eq!(told.fault, "");
+        drained.push(told.session_id);
+    }
+    assert!(drained.contains(&id) && nodes[at].served().await == Some(Vec::new()), "{drained:?}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_move_is_refused_with_the_reason_if_etcd_does_not_say_who_stands_by() {
+    if !Etcd::is_there() {
+        return;
+    }
+    let _one = ONE.lock().await;
+    let folder = tempfile::tempdir().unwrap();
+    let etcd = Etcd::start(1);
+    let nodes = patient(folder.path(), &etcd).await;
+    let mut refused = None;
+    for _ in 0..5 {
+        let (id, at) = being_named(&nodes, &etcd).await;
+        let before = nodes[at].session(&id).await.unwrap();
+        let (from, to) = (nodes[at].admin().await, nodes[(at + 1) % 3].name.clone());
+        let request = pb::MoveSessionRequest { session_id: id.clone(), node: to };
+        let mut moving = tokio::spawn(async move { { from }.move_session(request).await });
+        let early = tokio::time::timeout(Duration::from_secs(10), &mut moving).await;
+        etcd.resume(0);
+        let Ok(moved) = early else {
+            // The one that stands by was named before etcd was silent: the session stands till etcd is back.
+            let _ = moving.await.unwrap();
+            continue;
+        };
+        refused = Some(moved.unwrap().unwrap_err());
+        let after = nodes[at].session(&id).await.unwrap();
+        assert!(after.step > before.step, "it has stood: {after:?}");
+        until("it moves", async || move_to(&nodes[at], &id, &nodes[(at + 1) % 3]).await.is_ok()).await;
+        break;
+    }
+    let told = "the session stays here: etcd has not said within 5 s who stands by for it";
+    assert!(refused.as_ref().is_some_and(|refused| refused.message().contains(told)), "{refused:?}");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -66,9 +66,9 @@ enum Command {
         palpate-client play 3f0c….1.mcap --speed 2\n  \
         palpate-client play training.mcap --live --from 12000\n\n\
         Viewers see the session as any other (its id is told at the beginning). Nobody can hold a tool of a session that \
-        plays; a live one is there for everybody, and stays. `palpate journal replay` without a server writes records \
-        instead.\n\n\
-        Exit status: 0; 1 when the connection broke or the session was held; 2 when an input was refused.")]
+        plays; a live one is there for everybody, and stays. Each hash that the journal has is compared with that of what is \
+        played. `palpate journal replay` without a server writes records as fast as it goes.\n\n\
+        Exit status: 0; 1 when a hash differs, the connection broke or the session was held; 2 when an input was refused.")]
     Play(play::Arguments),
     /// Simulate hand, device, network and tissue in one loop in virtual time; report how accurate and safe the touch is
     #[command(after_help = "Examples:\n  \

@@ -1,20 +1,29 @@
-//! `palpate-client play`: sends a journal to a server, and begins a session at a moment of it, played or live.
+//! `palpate-client play`: sends a journal to a server, and begins a session at a moment of it, played or live. What is played is
+//! compared with the hashes of the journal, and recorded if that is wanted.
 
+mod recorded;
+
+use std::io::Write;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use indicatif::ProgressBar;
+use palpate::scene::record::{Line, Record, Run, output, write_line};
+use palpate::shape::PointName;
+use palpate::wire;
 use palpate_client::fleet::At;
 use palpate_client::upload::upload_journal;
 use palpate_client::{Channel, Error, fleet};
 use palpate_proto::pb;
 use pb::create_session_request::Source;
+use pb::haptic_service_client::HapticServiceClient;
 use pb::session_service_client::SessionServiceClient;
-use tonic::Status;
+use tonic::{Status, Streaming};
 
 use crate::credentials::CredentialOptions;
 use crate::table::progress_bar;
 use crate::{Failure, interrupted, table};
+use recorded::Compared;
 
 /// Arguments of `play`.
 #[derive(clap::Args)]
@@ -37,6 +46,15 @@ pub(crate) struct Arguments {
     /// Begin a live session there, for anybody to touch, and leave it to the server
     #[arg(long)]
     live: bool,
+    /// Write what is played to this file, as `palpate run` does: records of the steps after the first, as JSON Lines
+    #[arg(short, long, value_name = "FILE", conflicts_with = "live")]
+    output: Option<PathBuf>,
+    /// A record every so many steps
+    #[arg(long, value_name = "STEPS", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..), requires = "output")]
+    every: u32,
+    /// A point in the records: X,Y of a sheet, or the number of a vertex; may be repeated. Tools are always in them
+    #[arg(long, value_name = "POINT", requires = "output")]
+    point: Vec<PointName>,
     /// Keep the session at the end, for others: the server deletes it when nobody has used it for long
     #[arg(long)]
     keep_session: bool,
@@ -57,13 +75,81 @@ fn refused(status: Status) -> Failure {
     Error::Call(status).into()
 }
 
+/// Records of a session, on their way to a file.
+struct Records {
+    stream: Streaming<pb::ProbeResponse>,
+    output: Box<dyn Write>,
+    left: u64,
+}
+
+impl Records {
+    /// Of the steps from `begin` to `end` of a session that stands.
+    async fn open(
+        arguments: &Arguments,
+        channel: Channel,
+        session: &pb::Session,
+        [begin, end]: [u64; 2],
+    ) -> Result<Option<Self>, Failure> {
+        let Some(path) = &arguments.output else { return Ok(None) };
+        let every = u64::from(arguments.every);
+        let mut output = output(Some(path), false)?;
+        let stepping = session.scene.as_ref().and_then(|scene| scene.stepping.as_ref());
+        let run = Run {
+            scene: session.scene_name.clone(),
+            script: arguments.file.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
+            integrator: session.integrator.clone(),
+            substeps: session.substeps,
+            precision: session.precision.clone(),
+            rate_hz: stepping.and_then(|stepping| stepping.rate_hz).unwrap_or_default(),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+        };
+        write_line(&mut *output, &Line::Run(&run)).map_err(unwritten)?;
+        let probe = pb::ProbeRequest {
+            session_id: session.session_id.clone(),
+            r#where: Some(wire::probed(arguments.point.iter().copied())),
+            every_steps: Some(arguments.every),
+            energy: true,
+            tools: true,
+        };
+        let stream = HapticServiceClient::new(channel).probe(probe).await.map_err(refused)?.into_inner();
+        let left = end / every - begin / every;
+        Ok(Some(Records { stream, output, left }))
+    }
+
+    /// Writes them, to the last.
+    async fn write(mut self) -> Result<(), Failure> {
+        let mut record = Record::default();
+        while self.left > 0 {
+            let message = self.stream.message().await.map_err(refused)?;
+            let message = message.ok_or_else(|| Failure::Failed("the server has ended the records".to_owned()))?;
+            if message.dropped_records > 0 {
+                let why = "records were lost: this client can't keep up with so many points at this rate";
+                return Err(Failure::Failed(why.to_owned()));
+            }
+            // Of the beginning there is one only at step 0.
+            if wire::sample::add_to_record(&mut record, &message) && message.step == 0 {
+                record = Record::default();
+            } else if message.last {
+                write_line(&mut *self.output, &std::mem::take(&mut record)).map_err(unwritten)?;
+                self.left -= 1;
+            }
+        }
+        self.output.flush().map_err(unwritten)
+    }
+}
+
+fn unwritten(error: std::io::Error) -> Failure {
+    Failure::Failed(format!("the records can't be written: {error}"))
+}
+
 /// Sends the journal, and plays it to its end.
 ///
 /// # Errors
-/// Returns an error if the file can't be read, the server refuses it, or the connection breaks.
+/// Returns an error if the file can't be read, the server refuses it, the connection breaks, or a hash differs from the journal's.
 pub(crate) async fn play(arguments: &Arguments) -> Result<(), Failure> {
     let Arguments { file, from, to, speed, live, quiet, .. } = arguments;
     let bytes = std::fs::read(file).map_err(|e| Failure::Refused(format!("{}: {e}", file.display())))?;
+    let mut recorded = recorded::hashes(&file.display().to_string(), &bytes)?;
     let server = arguments.credentials.server(&arguments.server)?;
     let channel = server.connect().await?;
     let sending =
@@ -92,30 +178,43 @@ pub(crate) async fn play(arguments: &Arguments) -> Result<(), Failure> {
     let request =
         pb::CreateSessionRequest { source: Some(Source::Journal(moment)), paused: true, ..Default::default() };
     let session = sessions.create_session(request).await.map_err(refused)?.into_inner().session.unwrap_or_default();
-    let id = session.session_id;
+    let id = session.session_id.clone();
     if !arguments.json {
         crate::say!("palpate-client: session {id}, {}, from step {begin}", session.scene_name);
     }
+    // The hash of a moment that is left at once is told by the server that makes it.
+    recorded.retain(|step, _| (begin + 1..=end).contains(step) || (begin == end && *step == begin));
     let started = pb::StartSessionRequest { session_id: id.clone(), until_step: (!live).then_some(end) };
-    // Another server of the fleet may have the session by now, here and below.
-    let mut at = At { server, channel, answer: () };
-    let started = call(&mut at, |channel| {
-        let request = started.clone();
-        async move { SessionServiceClient::new(channel).start_session(request).await }
-    });
-    let played = match started.await {
-        Err(failure) => Err(failure),
-        Ok(_) if *live => Ok(begin),
-        Ok(_) => {
-            let bar = progress_bar("{elapsed_precise} [{wide_bar}] step {pos} of {len}", end, *quiet);
-            let followed = tokio::select! {
-                followed = follow(&mut at, &id, end, &bar) => followed,
-                () = interrupted() => Err(Failure::Failed("interrupted".to_owned())),
-            };
-            bar.finish_and_clear();
-            followed
+    // Another server of the fleet may have a live session by now, here and below.
+    let mut at = At { server, channel: channel.clone(), answer: () };
+    let bar = progress_bar("{elapsed_precise} [{wide_bar}] step {pos} of {len}", end, *quiet);
+    let run = async {
+        let records = Records::open(arguments, channel.clone(), &session, [begin, end]).await?;
+        if *live || begin < end {
+            let started = call(&mut at, |channel| {
+                let request = started.clone();
+                async move { SessionServiceClient::new(channel).start_session(request).await }
+            });
+            started.await?;
         }
+        if *live {
+            return Ok((begin, Compared::default()));
+        }
+        let written = async {
+            match records {
+                Some(records) => records.write().await,
+                None => Ok(()),
+            }
+        };
+        let compared = recorded::compare(&channel, &id, recorded);
+        let (step, compared, ()) = tokio::try_join!(follow(&mut at, &id, end, &bar), compared, written)?;
+        Ok((step, compared))
     };
+    let played = tokio::select! {
+        played = run => played,
+        () = interrupted() => Err(Failure::Failed("interrupted".to_owned())),
+    };
+    bar.finish_and_clear();
     let hash = match (&played, live) {
         (Ok(_), false) => {
             let asked = pb::GetStateHashRequest { session_id: id.clone(), at_step: None };
@@ -137,19 +236,23 @@ pub(crate) async fn play(arguments: &Arguments) -> Result<(), Failure> {
             crate::warn(&format!("session {id} was not deleted: {why}"));
         }
     }
-    let (step, hash) = (played?, hash?);
+    let ((step, compared), hash) = (played?, hash?);
     if arguments.json {
         let hash = (!hash.is_empty()).then_some(hash);
-        crate::tell!(
-            "{}",
-            serde_json::json!({ "session_id": id, "begin_step": begin, "end_step": step, "state_hash": hash })
-        );
+        let told = serde_json::json!({ "session_id": id, "begin_step": begin, "end_step": step, "state_hash": hash,
+            "equal_hashes": compared.equal, "difference": compared.difference });
+        crate::tell!("{told}");
     } else if *live {
         table::print(&[("session", id), ("live from step", step.to_string())]);
     } else {
-        table::print(&[("session", id), ("steps", format!("{begin} to {step}")), ("state hash", hash)]);
+        let steps = format!("{begin} to {step}");
+        let rows = [("session", id), ("steps", steps), ("state hash", hash), ("recorded hashes", compared.told())];
+        table::print(&rows);
     }
-    Ok(())
+    match compared.difference {
+        Some(difference) => Err(Failure::Failed(format!("{}: differs: {difference}", file.display()))),
+        None => Ok(()),
+    }
 }
 
 /// A call to whichever server of a fleet has the session.

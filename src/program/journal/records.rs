@@ -27,7 +27,7 @@ pub(super) struct ReplayArguments {
     every: u64,
     /// A point in the records: X,Y of a sheet, or the number of a vertex; may be repeated. Tools are always in them
     #[arg(long, value_name = "POINT")]
-    point: Vec<String>,
+    point: Vec<PointName>,
     /// The step to begin at [default: that of the journal]
     #[arg(long, value_name = "STEP")]
     from: Option<u64>,
@@ -37,20 +37,13 @@ pub(super) struct ReplayArguments {
     /// Play at so many times real time; else as fast as it goes, on a server in real time
     #[arg(long, value_name = "FACTOR")]
     speed: Option<f64>,
-    /// Send the journal to this server and play it there, for others to see; `palpate-client play --help` shows more options
-    #[arg(long, value_name = "URL", conflicts_with_all = ["output", "point", "every", "config"])]
+    /// Send the journal to this server and play it there, for others to see; compare its hashes; with --output write the records
+    /// that the server sends; `palpate-client play --help` shows more options
+    #[arg(long, value_name = "URL", conflicts_with = "config")]
     server: Option<String>,
     /// Show no progress
     #[arg(short, long)]
     quiet: bool,
-}
-
-fn point(text: &str) -> Result<PointName, Failure> {
-    let name = match text.split_once(',') {
-        Some((x, y)) => x.trim().parse().ok().zip(y.trim().parse().ok()).map(|(x, y)| PointName::Point([x, y])),
-        None => text.trim().parse().ok().map(PointName::Vertex),
-    };
-    name.ok_or_else(|| Failure::Refused(format!("--point: must be X,Y or the number of a vertex, but is `{text}`")))
 }
 
 /// Records of a session that is replayed.
@@ -90,6 +83,17 @@ fn through_server(arguments: &ReplayArguments, url: &str) -> Result<(), Failure>
             passed.extend([option.into(), value.into()]);
         }
     }
+    for point in &arguments.point {
+        let text = match point {
+            PointName::Point([x, y]) => format!("{x},{y}"),
+            PointName::Vertex(vertex) => vertex.to_string(),
+        };
+        passed.extend(["--point".into(), text.into()]);
+    }
+    if let Some(output) = &arguments.output {
+        passed.extend(["--every".into(), arguments.every.to_string().into()]);
+        passed.extend(["--output".into(), output.clone().into_os_string()]);
+    }
     if arguments.quiet {
         passed.push("--quiet".into());
     }
@@ -112,8 +116,7 @@ pub(super) fn replay(arguments: &ReplayArguments) -> Result<(), Failure> {
         let refusal = Refusal::new(Reason::OutOfRange, "--to", format!("is {to}, before the step {from} to begin at"));
         return Err(refusal.into());
     }
-    let names = arguments.point.iter().map(|text| point(text)).collect::<Result<Vec<_>, _>>()?;
-    let points = names.into_iter().map(|name| model.shape().find("--point", name));
+    let points = arguments.point.iter().map(|name| model.shape().find("--point", *name));
     let points = points.collect::<Result<Vec<_>, Refusal>>()?;
     let mut out = output(arguments.output.as_deref())?;
     let script = source.file.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();

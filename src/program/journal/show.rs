@@ -203,10 +203,13 @@ fn write(
     }
     let rate_hz = if header.rate_hz > 0.0 { header.rate_hz } else { 1.0 };
     let mut shown = Shown { out, rate_hz, rows: BTreeMap::new() };
-    let mut last = (header.begin_step, 0, None);
+    let (mut last, mut waiting) = ((header.begin_step, 0, None), Vec::new());
     loop {
         let read = reader.next_batch().and_then(|batch| match batch {
-            Some(batch) => Ok(Some((items(&batch)?, batch.end()?, batch.until_step, batch.unix_ns))),
+            Some(batch) => {
+                waiting = batch.waiting()?.map_or(std::mem::take(&mut waiting), |newest| newest.inputs);
+                Ok(Some((items(&batch)?, batch.end()?, batch.until_step, batch.unix_ns)))
+            }
             None => Ok(None),
         });
         let (items, end, until_step, unix_ns) = match read {
@@ -247,6 +250,18 @@ fn write(
     }
     shown.end_all()?;
     let (step, unix_ns, end) = last;
+    waiting.retain(|input| input.step >= step);
+    for input in &waiting {
+        if arguments.json {
+            writeln!(
+                shown.out,
+                "{}",
+                json!({ "step": input.step, "waiting": name(input), "text": self::input(input) })
+            )?;
+        } else {
+            shown.line(input.step, &format!("waits for this step at the end: {}", self::input(input)))?;
+        }
+    }
     let ended = end.as_ref().map_or("unfinished: a server writes it, or was killed".to_owned(), |end| {
         let why = end.why().as_str_name().trim_start_matches("WHY_").to_lowercase();
         format!("{why}: {}", end.message)

@@ -35,6 +35,9 @@ use crate::session::lease::HandedLease;
 /// The other server makes the tissue within this time, or the session stays.
 const PREPARATION: Duration = Duration::from_secs(30);
 
+/// etcd says within this time what is at the session's key, or the session stays.
+const CERTAINTY: Duration = Duration::from_secs(5);
+
 /// The session stands for no longer than this.
 const STANDSTILL: Duration = Duration::from_secs(2);
 
@@ -155,6 +158,7 @@ impl Fleet {
             ));
         }
         let _moving = self.begins_to_move(&live.id)?;
+        self.ends_naming(&live.id).await?;
         let (say, said) = mpsc::channel(16);
         let opening = self.peers.at(&there.endpoint)?.take_session(ReceiverStream::new(said)).await;
         let heard = opening.map_err(|status| broken(status.message()))?.into_inner();
@@ -204,6 +208,33 @@ impl Fleet {
         self.revision(id).map(|_| moving).ok_or_else(|| broken("it is not this server's"))
     }
 
+    /// Waits until etcd says for certain who stands by for a session that begins to move. One that has just been created is about to
+    /// be told of its first: with that its key changes, and what was asked for at the revision before fails.
+    ///
+    /// # Errors
+    /// Refuses if etcd does not say so in time, and if another server has the session.
+    async fn ends_naming(&self, id: &str) -> Result<()> {
+        if lock(&self.standbys).get(id).is_none_or(|standby| standby.naming.is_none()) {
+            return Ok(());
+        }
+        let told = timeout(CERTAINTY, self.settled(id)).await;
+        let late = format!("etcd has not said within {} s who stands by for it", CERTAINTY.as_secs());
+        match told.map_err(|_| broken(&late))? {
+            Some((value, _)) if value.node == self.node => Ok(()),
+            found => Err(broken(&self.why_not(found.as_ref(), 0))),
+        }
+    }
+
+    /// Why a transaction for a session of this server at `revision` was not done, by what is at the session's key instead.
+    fn why_not(&self, found: Option<&(SessionValue, u64)>, revision: u64) -> String {
+        match found {
+            None => "it is not this server's any more".to_owned(),
+            Some((value, _)) if value.node != self.node => format!("etcd says that the server `{}` has it", value.node),
+            Some((_, now)) if *now == revision => "this server or the other has lost its lease".to_owned(),
+            Some(_) => "this server has just taken it back; try again".to_owned(),
+        }
+    }
+
     /// The last part: the session stands.
     async fn hand_over(&self, live: &Arc<Live>, present: Present, to: &str, handing: &mut Handing) -> Result<u64> {
         // The other server is told the revision at which it is handed over, and goes by that: at another it is not.
@@ -216,7 +247,7 @@ impl Fleet {
         }
         let over = rules::hand_over(&self.keys, &live.id, revision, [&self.node, to]);
         let made = self.transact(over, &live.id, |found| found.is_some_and(|value| value.node == to)).await?;
-        let revision = made.map_err(|_| broken("etcd has another owner, or one of the servers has lost its lease"))?;
+        let revision = made.map_err(|found| broken(&self.why_not(found.as_ref(), revision)))?;
         // From here on the session is the other's, whatever becomes of this stream.
         let endpoint = self.nodes.borrow().get(to).map(|node| node.endpoint.clone()).unwrap_or_default();
         let (handed, _) = live.at_intake(|intake, _| intake.hand_over(elsewhere(to, endpoint)));

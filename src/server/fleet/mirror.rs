@@ -237,8 +237,9 @@ impl Fleet {
     /// Whether etcd is to be told that a server stands by for a session, because it has all up to `step`. From then on nothing counts
     /// as mirrored till etcd has said so.
     fn begins_to_name(&self, id: &str, name: &str, step: u64, mirrored_step: Option<u64>) -> bool {
-        // Nobody else changes its key meanwhile.
-        if lock(&self.moving).contains(id) {
+        // Nobody else changes its key meanwhile: who begins to move it sees that it is being named.
+        let moving = lock(&self.moving);
+        if moving.contains(id) {
             return false;
         }
         let is_chosen = self.standby_of(id).as_deref() == Some(name);

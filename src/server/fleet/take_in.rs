@@ -247,6 +247,8 @@ impl Fleet {
             playback: None,
             after_run: resumed.header.run,
             revision: resumed.header.ownership_revision,
+            // They come with the commands that wait.
+            waiting: Vec::new(),
             frozen: true,
         };
         let (owner, pacer) = (self.account(&resumed.header.owner), self.pacer.clone());
@@ -276,9 +278,6 @@ impl Fleet {
             });
         }
         // The leases are there: so what waits belongs to them.
-        let dropped = live.at_intake(|intake, now| intake.adopt(Handed { leases: Vec::new(), waiting }, now));
-        if dropped > 0 {
-            warn!(session = %live.id, dropped, "no memory for all commands that waited");
-        }
+        live.adopt_waiting(waiting);
     }
 }

@@ -188,6 +188,7 @@ impl Keeper {
                     writer.snapshot(step, copy.state_hash(), copy.model(), saved.to_bytes());
                 }
                 Event::Felt(felt) => writer.felt(step, &felt),
+                Event::Waiting(changes) => writer.waiting(&changes),
                 Event::Left(leaving) => left = Some(leaving),
             }
         }

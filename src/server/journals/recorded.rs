@@ -256,6 +256,7 @@ impl Recorded {
             playback: None,
             after_run: 0,
             revision,
+            waiting: Vec::new(),
             frozen: false,
         };
         if !moment.plays {

@@ -151,6 +151,7 @@ fn continued(file: &JournalFile, revision: u64, pacer: &Pacer, limits: &Limits) 
         playback: None,
         after_run: file.run,
         revision,
+        waiting: std::mem::take(&mut resumed.waiting),
         frozen: false,
     };
     let owner = pacer.budget.account(&resumed.header.owner);
