@@ -49,7 +49,7 @@ help:
 	@echo 'make bench-duty      a minute of 1 kHz touch and 60 frames a second: time kept, commands lost'
 	@echo 'make bench-rest      a thousand sessions at rest: their share of a core, and the memory of each'
 	@echo 'make bench-frames    a frame beside a plain copy of its bytes, and the bytes of a poke: docs/benchmarks/frames.md'
-	@echo 'make bench-error     run time against error, every scheme on seven scenes: docs/benchmarks/error.md'
+	@echo 'make bench-error     run time against error, every scheme on seven sheets and two organs: docs/benchmarks/error.md'
 	@echo 'make bench-tolerance is the tolerance kept? Random scenes against f64 at 1e-10: docs/benchmarks/tolerance.md'
 	@echo 'make bench-kernel    the time of a step beside the machine'"'"'s limits, numba, Taichi and NumPy'
 	@echo 'make bench-link      touch over a network in virtual time, by delay, tissue, hand and scheme: docs/benchmarks/link.md'
@@ -57,7 +57,8 @@ help:
 	@echo 'make bench-viewer    331 × 331 points at 60 frames a second in a browser, and from a press to its pixel'
 	@echo 'make bench-stability the largest stable step, predicted and observed'
 	@echo 'make bench-skip      what it saves to leave out what is at rest, and its error'
-	@echo 'make bench-mesh      the time of a step on meshes, at every width'
+	@echo 'make bench-mesh      the time of a step on meshes, at every width, beside numba, Taichi and a plain loop:'
+	@echo '                     docs/benchmarks/mesh.md'
 	@echo 'make bench-organ     organs: time of a step, sleep, tips, and how even touch is: docs/benchmarks/organ.md'
 	@echo 'make bench-python    a run in Python beside the program, and a study of 1000 tissues beside numba and NumPy'
 	@echo 'make bench-load      sessions that one core bears, with clients and without: docs/benchmarks/load.md'
@@ -274,8 +275,8 @@ bench-stability: need-rust
 bench-skip: need-rust
 	$(CARGO) bench --quiet --bench skip -- $(ARGUMENTS)
 
-bench-mesh: need-rust
-	$(CARGO) bench --quiet --bench mesh -- $(ARGUMENTS)
+bench-mesh: need-rust $(PEERS)/ready
+	PEERS=$(PEERS)/bin/python $(CARGO) bench --quiet --bench mesh -- $(ARGUMENTS)
 
 bench-organ: need-rust
 	$(CARGO) bench --quiet --bench organ -- $(ARGUMENTS)

@@ -1,4 +1,4 @@
-//! The cost of accuracy: every scheme, number format and step on seven scenes, run time against error. Writes
+//! The cost of accuracy: every scheme, number format and step on seven sheets and two organs, run time against error. Writes
 //! docs/benchmarks/error.{md,json,svg}; `-- --quick` tries fewer steps and measures each once.
 
 #![allow(
@@ -54,7 +54,7 @@ struct Run {
 impl Run {
     /// `None` where the settings are refused, or are known to be unstable.
     fn new(case: &Case, assignments: &[String]) -> Option<Self> {
-        let model = subject::model(&case.with(assignments)).ok()?;
+        let model = subject::model_of(case.scene, &case.with(assignments)).ok()?;
         let script =
             Script::parse(case.name, &case.script(), Path::new("."), &model.scene, &Limits::default()).unwrap();
         assert!(script.warnings.is_empty(), "{}: {:?}", case.name, script.warnings);
@@ -120,9 +120,9 @@ fn step_of(halvings: u32) -> (f64, Vec<String>) {
 /// steps, extrapolated to step zero: unlike any of the schemes measured. The other is Runge–Kutta at a small step or,
 /// in a build without it, the extrapolation from twice the steps.
 fn truth(case: &Case, knows_rk4: bool) -> (Trace, [f64; 2], &'static str) {
-    let one_step = subject::model(&case.with(&[])).unwrap();
+    let one_step = subject::model_of(case.scene, &case.with(&[])).unwrap();
     let scene = &one_step.scene;
-    let fastest_per_s = one_step.omega_bound_per_s.max(scene.damping_n_s_per_m / scene.sheet().unwrap().point_mass_kg);
+    let fastest_per_s = one_step.omega_bound_per_s.max(scene.damping_n_s_per_m / scene.point_mass_kg());
     // Even, for the coarser extrapolation.
     let substeps = 2 * (64.0 * fastest_per_s / 1000.0).ceil().max(32.0) as u32;
     let trace = |integrator: &str, substeps: u32| {

@@ -11,6 +11,7 @@
     missing_docs
 )]
 
+mod peers;
 mod report;
 mod subject;
 
@@ -104,27 +105,6 @@ fn kernels() -> Vec<(String, Vec<String>)> {
     kernels
 }
 
-/// The lines that a peer's script prints as JSON; empty if it does not run.
-fn peer(python: &str, script: &str, sides: &[usize]) -> Vec<Value> {
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/peers").join(script);
-    let mut command = Command::new(python);
-    command.arg(&script).args(sides.iter().map(ToString::to_string));
-    command.env("OMP_NUM_THREADS", "1").env("NUMBA_NUM_THREADS", "1").env("PYTHONDONTWRITEBYTECODE", "1");
-    let output = match command.output() {
-        Ok(output) if output.status.success() => output.stdout,
-        Ok(output) => {
-            let error = String::from_utf8_lossy(&output.stderr);
-            eprintln!("left out: {}: {}", script.display(), error.lines().last().unwrap_or(""));
-            return Vec::new();
-        }
-        Err(error) => {
-            eprintln!("left out: {python}: {error}");
-            return Vec::new();
-        }
-    };
-    String::from_utf8_lossy(&output).lines().filter_map(|line| serde_json::from_str(line).ok()).collect()
-}
-
 /// Compiles the limits for this processor, and measures them.
 fn machine_limits(sides: &[usize]) -> Option<Value> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
@@ -143,10 +123,7 @@ fn machine_limits(sides: &[usize]) -> Option<Value> {
 
 /// Runs `rounds` rounds in which the kernels, the peers and the limits take turns.
 fn measure_all(rounds: usize, sides: &[usize], kernels: &[(String, Vec<String>)]) -> (Rounds, Vec<Value>) {
-    let python = std::env::var("PEERS").ok().filter(|path| Path::new(path).exists());
-    if python.is_none() {
-        eprintln!("left out: the peers, as PEERS names no Python (make bench-kernel installs one)");
-    }
+    let python = peers::python();
     let mut measured = Rounds::new();
     let mut limits = Vec::new();
     for round in 1..=rounds {
@@ -159,7 +136,8 @@ fn measure_all(rounds: usize, sides: &[usize], kernels: &[(String, Vec<String>)]
         for script in ["numba_sheet.py", "taichi_sheet.py", "numpy_sheet.py"] {
             let Some(python) = &python else { continue };
             eprintln!("round {round} of {rounds}: {script}");
-            for line in peer(python, script, sides) {
+            let sides: Vec<String> = sides.iter().map(ToString::to_string).collect();
+            for line in peers::lines(python, script, &sides) {
                 let key = (line["peer"].as_str().unwrap().to_owned(), line["side"].as_u64().unwrap() as usize);
                 let [least_ns, median_ns] = ["least_ns", "median_ns"].map(|name| line[name].as_f64().unwrap());
                 measured.entry(key).or_default().push(Windows { least_ns, median_ns });

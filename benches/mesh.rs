@@ -1,21 +1,42 @@
 //! The time of a step on triangle meshes: `central` in f32, all awake, at every width, on spheres of even and of uneven
-//! triangles. Prints a page. `-- --quick` measures the two smaller sizes, with fewer rounds.
+//! triangles; beside it a plain loop, implementations in numba and Taichi, and a sheet of as many points. Writes
+//! docs/benchmarks/mesh.{md,json,svg}. The peers run if PEERS names a Python that has them, as `make bench-mesh` ensures.
+//! `-- --quick` measures the two smaller sizes, with fewer rounds.
 
-#![allow(clippy::unwrap_used, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
+#![allow(
+    clippy::unwrap_used,
+    clippy::disallowed_methods,
+    clippy::cast_precision_loss,
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    missing_docs
+)]
 
+mod peers;
 mod report;
 mod subject;
 
+use std::cell::RefCell;
 use std::collections::BTreeMap;
+use std::path::Path;
 
 use glam::DVec3;
+use palpate::scene::profile::Poke;
 use palpate::scene::{Lanes, Named};
 use palpate::sheet::mesh::{MeshGraph, MeshSpring, Trial};
+use palpate::sheet::{Push, Tissue, at_rest};
+use report::chart::{Look, Panel, Series};
 use report::{Report, digits, least, quick, seconds};
-use subject::{LANE_NAMES, LANES, known};
+use serde_json::json;
+use subject::{INTEGRATOR, LANE_NAMES, LANES, PRECISION, known, set};
 
 /// Steps of one timing: the first of them bring the mesh into the caches.
 const STEPS: usize = 6;
+
+/// The phase per step of a point's virtual spring alone, rad, and (k/m)·dt²: of all that is measured on a mesh
+/// (benches/peers/common.py has the squares).
+const TURN: f64 = 0.1;
+const PULL: f64 = 0.03;
 
 /// Kinds of meshes: name, and the part of the edges that are considered for a flip. Those with flips are jittered.
 const KINDS: [(&str, f64); 3] = [("regular", 0.0), ("mild", 0.1), ("irregular", 0.5)];
@@ -127,44 +148,234 @@ impl Sphere {
     }
 }
 
+/// Where the motion of a vertex begins, spacings.
+fn displaced(graph: &MeshGraph, vertex: usize) -> DVec3 {
+    0.01 * DVec3::from_array((graph.rest_m[vertex] / graph.spacing_m).to_array().map(f64::sin))
+}
+
+/// What somebody writes first: springs in compressed rows, each evaluated from both ends, one vertex after the other.
+/// Lengths are in spacings.
+struct PlainLoop {
+    starts: Vec<u32>,
+    to: Vec<u32>,
+    /// The vector of each spring at rest, and 1 over its square.
+    rest: Vec<[f32; 4]>,
+    u: Vec<[f32; 3]>,
+    last: Vec<[f32; 3]>,
+}
+
+impl PlainLoop {
+    fn new(graph: &MeshGraph) -> Self {
+        let count = graph.rest_m.len();
+        let mut around = vec![Vec::new(); count];
+        for spring in &graph.springs {
+            let [a, b] = spring.ends;
+            around[a as usize].push(b);
+            around[b as usize].push(a);
+        }
+        let mut plain =
+            PlainLoop { starts: vec![0], to: Vec::new(), rest: Vec::new(), u: Vec::new(), last: Vec::new() };
+        for (vertex, others) in around.iter_mut().enumerate() {
+            others.sort_unstable();
+            for other in others {
+                let span = (graph.rest_m[*other as usize] - graph.rest_m[vertex]) / graph.spacing_m;
+                plain.to.push(*other);
+                plain.rest.push([span.x, span.y, span.z, 1.0 / span.length_squared()].map(|value| value as f32));
+            }
+            plain.starts.push(plain.to.len() as u32);
+            plain.u.push(displaced(graph, vertex).as_vec3().to_array());
+        }
+        plain.last.clone_from(&plain.u);
+        plain
+    }
+
+    fn step(&mut self, steps: usize) {
+        let (turn, pull) = ((TURN * TURN) as f32, PULL as f32);
+        for _ in 0..steps {
+            for (vertex, last) in self.last.iter_mut().enumerate() {
+                let own = self.u[vertex];
+                let mut force = own.map(|u| -turn * u);
+                let springs = self.starts[vertex] as usize..self.starts[vertex + 1] as usize;
+                for (other, rest) in self.to[springs.clone()].iter().zip(&self.rest[springs]) {
+                    let other = self.u[*other as usize];
+                    let apart: [f32; 3] = std::array::from_fn(|c| other[c] - own[c]);
+                    let excess: f32 = (0..3).map(|c| apart[c] * (2.0 * rest[c] + apart[c])).sum();
+                    let q = excess * rest[3];
+                    let root = (1.0 + q).sqrt();
+                    let weight = pull * q / (root * (1.0 + root));
+                    (0..3).for_each(|c| force[c] += weight * (rest[c] + apart[c]));
+                }
+                *last = std::array::from_fn(|c| own[c] + (own[c] - last[c]) + force[c]);
+            }
+            std::mem::swap(&mut self.u, &mut self.last);
+        }
+    }
+
+    /// What `Mesh` of benches/peers/common.py reads.
+    fn write(&self, graph: &MeshGraph, path: &Path) {
+        let places = graph.rest_m.iter().flat_map(|place| (*place / graph.spacing_m).as_vec3().to_array());
+        let head = [graph.rest_m.len() as u32, self.to.len() as u32];
+        let words = head.into_iter().chain(places.map(f32::to_bits));
+        let words = words.chain(self.starts.iter().copied()).chain(self.to.iter().copied());
+        std::fs::write(path, words.flat_map(u32::to_le_bytes).collect::<Vec<u8>>()).unwrap();
+    }
+}
+
+/// The fastest kernel on a square sheet of about so many points, all of it in motion.
+fn sheet(points: usize) -> Box<dyn Tissue> {
+    let side = (points as f64).sqrt().round() as usize;
+    let settings = [
+        set(INTEGRATOR, "central"),
+        set(PRECISION, "f32"),
+        set("stepping.substeps", 1),
+        set("sheet.points", format!("[{side}, {side}]")),
+    ];
+    let model = subject::model(&settings).unwrap();
+    let mut tissue = at_rest(&model);
+    let centre_m = model.shape().extent().middle_m();
+    let force_n = 0.01 * DVec3::new(0.3, 0.0, -1.0);
+    let push = Poke { point: None, centre_m, force_n, falloff_per_m: 0.0, falloff_offset: 0.0 };
+    tissue.push(0, Some(Push::Constant(push)));
+    tissue
+}
+
+/// What is measured on a mesh.
+enum Subject {
+    Kernel(Trial),
+    Plain(PlainLoop),
+    Sheet(Box<dyn Tissue>),
+}
+
+impl Subject {
+    fn step(&mut self, steps: usize) {
+        match self {
+            Subject::Kernel(trial) => trial.step(steps),
+            Subject::Plain(plain) => plain.step(steps),
+            Subject::Sheet(tissue) => (0..steps).for_each(|_| tissue.step().unwrap()),
+        }
+    }
+
+    /// Points, where these are not those of the mesh.
+    fn points(&self, vertices: usize) -> usize {
+        if let Subject::Sheet(tissue) = self { tissue.model().len() } else { vertices }
+    }
+}
+
+/// Names beside those of the widths.
+const PLAIN: &str = "plain loop";
+const SHEET: &str = "sheet";
+const PEERS: [(&str, &str); 2] = [("numba", "numba_mesh.py"), ("Taichi", "taichi_mesh.py")];
+
+/// ns a vertex and step of each name, of a mesh; none where it was left out.
+struct Measured {
+    kind: &'static str,
+    vertices: usize,
+    ns: BTreeMap<String, f64>,
+}
+
+impl Measured {
+    fn cell(&self, name: &str) -> String {
+        self.ns.get(name).map_or("–".to_owned(), |ns| digits(*ns))
+    }
+}
+
+fn measure(kind: &'static str, graph: &MeshGraph, widths: &[&str], rounds: usize) -> Measured {
+    let lanes_of = |name: &str| Lanes::NAMES.iter().find(|entry| entry.0 == name).unwrap().1;
+    let vertices = graph.rest_m.len();
+    let mut subjects: Vec<(String, RefCell<Subject>)> = widths
+        .iter()
+        .map(|name| {
+            let mut trial = Trial::new(graph, TURN, PULL, lanes_of(name)).unwrap();
+            trial.displace(|vertex| displaced(graph, vertex));
+            ((*name).to_owned(), RefCell::new(Subject::Kernel(trial)))
+        })
+        .collect();
+    let plain = PlainLoop::new(graph);
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("mesh");
+    plain.write(graph, &file);
+    subjects.push((PLAIN.to_owned(), RefCell::new(Subject::Plain(plain))));
+    subjects.push((SHEET.to_owned(), RefCell::new(Subject::Sheet(sheet(vertices)))));
+    let times = least(rounds, &subjects, |(_, subject)| {
+        let mut subject = subject.borrow_mut();
+        subject.step(2);
+        seconds(|| subject.step(STEPS)).0
+    });
+    let of = |((name, subject), time_s): (&(String, RefCell<Subject>), f64)| {
+        (name.clone(), time_s * 1e9 / (STEPS * subject.borrow().points(vertices)) as f64)
+    };
+    let mut ns: BTreeMap<String, f64> = subjects.iter().zip(times).map(of).collect();
+    if let Some(python) = peers::python() {
+        for (name, script) in PEERS {
+            let lines = peers::lines(&python, script, &[&file]);
+            ns.extend(lines.iter().filter_map(|line| Some((name.to_owned(), line["least_ns"].as_f64()?))));
+        }
+    }
+    Measured { kind, vertices, ns }
+}
+
 fn main() {
     let (rounds, sizes): (_, &[u32]) = if quick() { (20, &[4, 5]) } else { (80, &[4, 5, 6]) };
-    let names = known(LANES, &LANE_NAMES);
-    let lanes_of = |name: &str| Lanes::NAMES.iter().find(|entry| entry.0 == name).unwrap().1;
-    let mut report = Report::new("mesh", "The time of a step on a mesh", "cargo bench --bench mesh");
-    report.say(
-        "ns a vertex and step of `central` in f32, one thread, all awake, without the checks of a session: the least of \
-         many timings in which the widths take turns. Spheres with three springs a vertex: regular (divided \
-         icosahedra), and jittered by 0.3 edges with some (mild) or many (irregular) edges flipped at random.",
-    );
-    let header = ["mesh", "vertices"].into_iter().chain(names.iter().copied()).map(str::to_owned);
-    let mut rows = Vec::new();
+    let widths = known(LANES, &LANE_NAMES);
+    let mut measured = Vec::new();
     for (kind, flips) in KINDS {
         for times in sizes {
             let mut sphere = Sphere::icosphere(*times);
             if flips > 0.0 {
                 sphere.disturb(flips, &mut fastrand::Rng::with_seed(5));
             }
-            let graph = sphere.graph();
-            let vertices = graph.rest_m.len();
-            let at = |vertex: usize| graph.rest_m[vertex] / graph.spacing_m;
-            let trials: Vec<_> = names
-                .iter()
-                .map(|name| {
-                    let mut trial = Trial::new(&graph, 0.1, 0.03, lanes_of(name)).unwrap();
-                    trial.displace(|vertex| 0.01 * DVec3::from_array(at(vertex).to_array().map(f64::sin)));
-                    std::cell::RefCell::new(trial)
-                })
-                .collect();
-            let times = least(rounds, &trials, |trial| {
-                let mut trial = trial.borrow_mut();
-                trial.step(2);
-                seconds(|| trial.step(STEPS)).0
-            });
-            let ns = times.into_iter().map(|time| digits(time * 1e9 / (STEPS * vertices) as f64));
-            rows.push([kind.to_owned(), vertices.to_string()].into_iter().chain(ns).collect());
+            measured.push(measure(kind, &sphere.graph(), &widths, rounds));
         }
     }
-    report.table(&header.collect::<Vec<_>>(), &rows);
-    report.print();
+    let mut names = widths.clone();
+    names.push(PLAIN);
+    names.extend(PEERS.map(|(name, _)| name).into_iter().filter(|name| measured[0].ns.contains_key(*name)));
+
+    let mut report = Report::new("mesh", "The time of a step on a mesh", "make bench-mesh");
+    report.say(
+        "ns a vertex and step of `central` in f32, one thread, all awake, without the checks of a session: the least of \
+         many timings in which the widths take turns. Spheres with three springs a vertex: regular (divided \
+         icosahedra), and jittered by 0.3 edges with some (mild) or many (irregular) edges flipped at random. Beside the \
+         widths of the kernel: the plain loop of a compiled program (benches/mesh.rs), and the same arithmetic in numba and \
+         Taichi (benches/peers), all three with springs in compressed rows. Last, a step of a square sheet of as many \
+         points, ns a point, which has four springs a point and the checks of a session.",
+    );
+    let header: Vec<&str> = ["mesh", "vertices"].into_iter().chain(names.iter().copied()).chain([SHEET]).collect();
+    let row = |of: &Measured| {
+        let cells = names.iter().chain([&SHEET]).map(|name| of.cell(name));
+        [of.kind.to_owned(), of.vertices.to_string()].into_iter().chain(cells).collect()
+    };
+    report.table(&report::cells(&header), &measured.iter().map(row).collect::<Vec<_>>());
+    report.heading("How many times faster");
+    report.say("The time of the others over that of the fastest width.");
+    let others: Vec<&str> = names.iter().copied().filter(|name| !widths.contains(name)).collect();
+    let header: Vec<&str> = ["mesh", "vertices"].into_iter().chain(others.iter().copied()).collect();
+    let ratios = |of: &Measured| {
+        let fastest = widths.iter().map(|width| of.ns[*width]).fold(f64::INFINITY, f64::min);
+        let ratio = |name: &&str| of.ns.get(*name).map_or("–".to_owned(), |ns| digits(ns / fastest));
+        [of.kind.to_owned(), of.vertices.to_string()].into_iter().chain(others.iter().map(ratio)).collect()
+    };
+    report.table(&report::cells(&header), &measured.iter().map(ratios).collect::<Vec<_>>());
+    let figures = measured.iter().map(|of| json!({ "mesh": of.kind, "vertices": of.vertices, "ns": of.ns }));
+    report.figure("ns_per_vertex_step", figures.collect());
+
+    let panels = KINDS.map(|(kind, _)| Panel::Lines {
+        title: format!("A step on a mesh: {kind}"),
+        x: "vertices",
+        y: "ns a vertex and step",
+        series: names
+            .iter()
+            .chain([&SHEET])
+            .enumerate()
+            .map(|(hue, name)| Series {
+                name: (*name).to_owned(),
+                hue,
+                look: if widths.contains(name) { Look::Full } else { Look::Hollow },
+                points: (measured.iter().filter(|of| of.kind == kind))
+                    .filter_map(|of| Some((of.vertices as f64, *of.ns.get(*name)?)))
+                    .collect(),
+            })
+            .collect(),
+    });
+    report.write(2, &panels);
 }

@@ -1,5 +1,5 @@
 //! The largest stable step: the predicted and the observed limit for every scheme, by stiffness and damping; and the
-//! effect of a large force near it. Writes docs/benchmarks/stability.{md,json,svg}.
+//! effect of a large force near it; and the same limit of organs. Writes docs/benchmarks/stability.{md,json,svg}.
 
 #![allow(
     clippy::unwrap_used,
@@ -12,9 +12,14 @@
 mod report;
 mod subject;
 
+use std::sync::Arc;
+
 use glam::{DVec2, DVec3};
+use palpate::limits::Limits;
 use palpate::scene::profile::{CentreProfile, LoadProfile, Poke, Profile, StrengthProfile};
+use palpate::scene::{Body, Integrator, Mesh, Named, Scene};
 use palpate::session::Session;
+use palpate::shape::PointId;
 use palpate::sheet::{Model, Push, at_rest};
 use report::chart::Panel;
 use report::{Report, cells, digits};
@@ -43,7 +48,7 @@ struct Tissue {
 }
 
 impl Tissue {
-    fn model(self, step_s: f64) -> palpate::refusal::Result<std::sync::Arc<Model>> {
+    fn model(self, step_s: f64) -> palpate::refusal::Result<Arc<Model>> {
         let varied = [
             set(INTEGRATOR, self.integrator),
             set("springs.stiffness_n_per_m", self.spring_n_per_m),
@@ -73,37 +78,7 @@ impl Tissue {
     /// The failure after a small kick, if there is one.
     fn after_kick(self, step_s: f64) -> Option<&'static str> {
         let model = self.model(step_s).unwrap();
-        let sheet = model.scene.sheet().unwrap();
-        let small_m = 1e-9 * sheet.spacing_m;
-        let push = Poke {
-            point: None,
-            centre_m: model.shape().rest_m(sheet.point([3, 4])),
-            force_n: sheet.point_mass_kg * small_m / (step_s * step_s) * DVec3::new(1.0, 0.6, 0.3),
-            falloff_per_m: 0.7 / sheet.spacing_m,
-            falloff_offset: 0.0,
-        };
-        let mut tissue = at_rest(&model);
-        tissue.push(0, Some(Push::Constant(push)));
-        let mut largest_m = 0.0;
-        for step in 0..STEPS {
-            if tissue.step().is_err() {
-                return Some("grows");
-            }
-            if step == 0 {
-                tissue.push(0, None);
-            }
-            // A check costs as much as a step.
-            if step % 16 == 0 {
-                largest_m = tissue.largest_displacement_m();
-            }
-            if largest_m > GROWTH * small_m {
-                return Some("grows");
-            }
-            if tissue.guard_events() > 0 {
-                return Some("guard acts");
-            }
-        }
-        None
+        after_kick(&model, model.scene.sheet().unwrap().point([3, 4]))
     }
 
     /// The index in [`FATES`] of the outcome at this force, given that the sheet should move no farther than about
@@ -139,6 +114,41 @@ impl Tissue {
         }
         Some((largest_m, session.tissue().guard_events()))
     }
+}
+
+/// The failure of a tissue after a small kick at a point, if there is one.
+fn after_kick(model: &Arc<Model>, at: PointId) -> Option<&'static str> {
+    let (spacing_m, step_s) = (model.shape().edge_m(), model.scene.stepping.rate_hz.recip());
+    let small_m = 1e-9 * spacing_m;
+    let push = Poke {
+        point: None,
+        centre_m: model.shape().rest_m(at),
+        force_n: model.scene.point_mass_kg() * small_m / (step_s * step_s) * DVec3::new(1.0, 0.6, 0.3),
+        falloff_per_m: 0.7 / spacing_m,
+        falloff_offset: 0.0,
+    };
+    let mut tissue = at_rest(model);
+    tissue.push(0, Some(Push::Constant(push)));
+    let mut largest_m = 0.0;
+    for step in 0..STEPS {
+        if tissue.step().is_err() {
+            return Some("grows");
+        }
+        if step == 0 {
+            tissue.push(0, None);
+        }
+        // A check costs as much as a step.
+        if step % 16 == 0 {
+            largest_m = tissue.largest_displacement_m();
+        }
+        if largest_m > GROWTH * small_m {
+            return Some("grows");
+        }
+        if tissue.guard_events() > 0 {
+            return Some("guard acts");
+        }
+    }
+    None
 }
 
 /// The largest step for which `holds`, by bisection between 1/64 and 64 times `about_s`. `None` if it holds for all, 0
@@ -181,17 +191,39 @@ fn fastest_per_s(model: &Model) -> f64 {
         }
         force
     };
-    let length = |u: &[DVec2]| u.iter().map(|u| u.length_squared()).sum::<f64>().sqrt();
     // A start vector with a part of every vibration.
-    let mut u: Vec<DVec2> = (0..model.len()).map(|n| DVec2::new((n as f64).sin(), (1.7 * n as f64).cos())).collect();
+    let start = (0..model.len()).map(|n| DVec2::new((n as f64).sin(), (1.7 * n as f64).cos())).collect();
+    (largest_eigenvalue(start, stiffness_of) / scene.sheet().unwrap().point_mass_kg).sqrt()
+}
+
+/// A vector of a point.
+trait Moved: Copy + std::ops::MulAssign<f64> {
+    fn squared(self) -> f64;
+}
+
+impl Moved for DVec2 {
+    fn squared(self) -> f64 {
+        self.length_squared()
+    }
+}
+
+impl Moved for DVec3 {
+    fn squared(self) -> f64 {
+        self.length_squared()
+    }
+}
+
+/// The largest eigenvalue of a linear map, by the power method.
+fn largest_eigenvalue<V: Moved>(mut u: Vec<V>, map: impl Fn(&[V]) -> Vec<V>) -> f64 {
+    let length = |u: &[V]| u.iter().map(|u| u.squared()).sum::<f64>().sqrt();
     let mut eigenvalue = 0.0;
     for _ in 0..20_000 {
         let scale = 1.0 / length(&u);
         u.iter_mut().for_each(|u| *u *= scale);
-        u = stiffness_of(&u);
+        u = map(&u);
         eigenvalue = length(&u);
     }
-    (eigenvalue / scene.sheet().unwrap().point_mass_kg).sqrt()
+    eigenvalue
 }
 
 /// dt·ω at the limit by the textbook, for the schemes that it covers.
@@ -266,6 +298,129 @@ impl Limit {
     }
 }
 
+/// Organs that are built in, with longer edges.
+const ORGANS: [(&str, &str); 2] =
+    [("gallbladder", "mesh.organ.edge_m=0.004"), ("liver-organ", "mesh.organ.edge_m=0.008")];
+
+/// An organ, any scheme.
+struct Organ {
+    name: &'static str,
+    scene: Scene,
+    omega_per_s: f64,
+}
+
+impl Organ {
+    fn new(name: &'static str, edge: &str) -> Self {
+        let sets = [edge, "stepping.substeps=1", "stepping.precision=f64"].map(str::to_owned);
+        let scene = subject::scene_of(name, &sets).unwrap();
+        let Body::Mesh(mesh) = &scene.body else { panic!("{name} is on a mesh") };
+        let omega_per_s = fastest_of_mesh_per_s(&scene, mesh);
+        Organ { name, scene, omega_per_s }
+    }
+
+    fn model(&self, integrator: &str, step_s: f64) -> Arc<Model> {
+        let mut scene = self.scene.clone();
+        scene.stepping.rate_hz = step_s.recip();
+        scene.stepping.integrator = Integrator::NAMES.iter().find(|entry| entry.0 == integrator).unwrap().1;
+        // The error of such a step is of no interest.
+        Model::compile(&scene, &Limits { rehearsal_work: 0, ..Limits::default() }).unwrap()
+    }
+
+    /// What the scheme promises by the bound of the graph, and what is observed.
+    fn limit(&self, integrator: &'static str) -> OrganLimit {
+        let Body::Mesh(mesh) = &self.scene.body else { panic!("{} is on a mesh", self.name) };
+        let kicked = PointId::new(mesh.stiffest.vertex as usize);
+        let about_s = 1.0 / self.omega_per_s;
+        let fails = |step_s: f64| after_kick(&self.model(integrator, step_s), kicked);
+        let observed_s = largest_s(about_s, |step_s| fails(step_s).is_none());
+        let model = self.model(integrator, about_s);
+        OrganLimit {
+            organ: self.name,
+            integrator,
+            vertices: model.len(),
+            bound_per_s: model.omega_bound_per_s,
+            omega_per_s: self.omega_per_s,
+            predicted_s: largest_s(about_s, |step_s| self.model(integrator, step_s).plan.stable),
+            observed_s,
+            beyond: observed_s.and_then(|step_s| fails(1.001 * step_s)),
+        }
+    }
+}
+
+/// The fastest vibration of a mesh at rest, rad/s: of its springs along themselves and its virtual springs, by the power method.
+fn fastest_of_mesh_per_s(scene: &Scene, mesh: &Mesh) -> f64 {
+    let shape = scene.shape();
+    let mass_kg = |vertex: usize| mesh.point_mass_kg * mesh.relative_mass(PointId::new(vertex));
+    let springs: Vec<([usize; 2], DVec3, f64)> = (mesh.springs())
+        .map(|(ends, part)| {
+            let [a, b] = ends.map(|end| end as usize);
+            let along = shape.rest_m(PointId::new(b)) - shape.rest_m(PointId::new(a));
+            ([a, b], along.normalize(), part * scene.springs.stiffness_n_per_m)
+        })
+        .collect();
+    let held_per_s2 = |vertex: usize| {
+        scene.virtual_stiffness_n_per_m / mesh.point_mass_kg * (1.0 + mesh.extra_virtual(PointId::new(vertex)))
+    };
+    let accelerations = |u: &[DVec3]| {
+        let mut forces_n = vec![DVec3::ZERO; u.len()];
+        for ([a, b], along, stiffness) in &springs {
+            let pull = stiffness * along.dot(u[*b] - u[*a]) * *along;
+            forces_n[*a] -= pull;
+            forces_n[*b] += pull;
+        }
+        let moved = |(vertex, force_n): (usize, DVec3)| {
+            let is_fixed = shape.is_fixed(PointId::new(vertex));
+            if is_fixed { DVec3::ZERO } else { force_n / mass_kg(vertex) + held_per_s2(vertex) * u[vertex] }
+        };
+        forces_n.into_iter().enumerate().map(moved).collect::<Vec<_>>()
+    };
+    let start = |n: usize| DVec3::new((n as f64).sin(), (1.7 * n as f64).cos(), (2.3 * n as f64).sin());
+    largest_eigenvalue((0..shape.point_count()).map(start).collect(), accelerations).sqrt()
+}
+
+/// The largest step of an organ, s.
+struct OrganLimit {
+    organ: &'static str,
+    integrator: &'static str,
+    vertices: usize,
+    /// ω_b, and the fastest vibration at rest.
+    bound_per_s: f64,
+    omega_per_s: f64,
+    predicted_s: Option<f64>,
+    observed_s: Option<f64>,
+    beyond: Option<&'static str>,
+}
+
+impl OrganLimit {
+    fn difference(&self) -> Option<f64> {
+        Some(100.0 * (self.observed_s? / self.predicted_s? - 1.0))
+    }
+
+    fn row(&self) -> Vec<String> {
+        let us = |step_s: Option<f64>| step_s.map_or("any".to_owned(), |step_s| digits(1e6 * step_s));
+        let difference = self.difference().map_or("–".to_owned(), |percent| format!("{percent:+.1}"));
+        cells([
+            self.organ,
+            &self.vertices.to_string(),
+            self.integrator,
+            &digits(self.bound_per_s),
+            &digits(self.omega_per_s),
+            &us(self.predicted_s),
+            &us(self.observed_s),
+            &difference,
+            self.beyond.unwrap_or(""),
+        ])
+    }
+
+    fn figures(&self) -> Value {
+        json!({
+            "organ": self.organ, "vertices": self.vertices, "integrator": self.integrator,
+            "omega_bound_per_s": self.bound_per_s, "omega_per_s": self.omega_per_s, "predicted_s": self.predicted_s,
+            "observed_s": self.observed_s, "difference_percent": self.difference(), "beyond": self.beyond,
+        })
+    }
+}
+
 /// The observed limits of one scheme, over k and C.
 fn limit_panel(integrator: &str, limits: &[Limit]) -> Panel {
     let of = |damping: f64, spring: f64| {
@@ -334,6 +489,15 @@ fn main() {
         fates.extend(figures);
     }
 
+    let organs = ORGANS.map(|(name, edge)| Organ::new(name, edge));
+    let mut organ_limits = Vec::new();
+    for organ in &organs {
+        for integrator in known(INTEGRATOR, &integrators()) {
+            eprintln!("{}: {integrator}", organ.name);
+            organ_limits.push(organ.limit(integrator));
+        }
+    }
+
     let mut report = Report::new("stability", "The largest stable step", "make bench-stability");
     report.say(&format!(
         "The sheet: 9 × 9 points of 10 g, K″ = {VIRTUAL_N_PER_M} N/m, f64, one substep a step. ω is its fastest vibration at \
@@ -357,6 +521,25 @@ fn main() {
         "beyond",
     ];
     report.table(&cells(header), &limits.iter().map(Limit::row).collect::<Vec<_>>());
+    report.heading("Organs");
+    report.say(
+        "The built-in organs with longer edges, in f64, one substep a step. ω_b is the bound by the graph of their springs, under any \
+         deformation, and ω the fastest vibration at rest, by the power method. The plan goes by ω_b, so *predicted* is its \
+         largest stable step; *observed* is as above, after a kick at the vertex that decides the bound.",
+    );
+    let organ_header = [
+        "organ",
+        "vertices",
+        "scheme",
+        "ω_b, rad/s",
+        "ω, rad/s",
+        "predicted, µs",
+        "observed, µs",
+        "difference, %",
+        "beyond",
+    ];
+    report.table(&cells(organ_header), &organ_limits.iter().map(OrganLimit::row).collect::<Vec<_>>());
+    report.figure("organs", organ_limits.iter().map(OrganLimit::figures).collect());
     report.heading("Large forces");
     let promised = fates.iter().filter(|fate| fate["promised"] == true);
     let broken: Vec<String> = promised

@@ -91,14 +91,18 @@ struct Pressed {
     /// Near the place; the surface is pressed where it is nearest.
     at_m: [f64; 3],
     deep_m: f64,
-    /// Azimuth and elevation, degrees.
-    camera: [f64; 2],
+    camera: Camera,
+}
+
+/// A camera at an azimuth and an elevation, degrees, and a distance in longest sides.
+const fn from(azimuth_deg: f64, elevation_deg: f64, distance: f64) -> Camera {
+    Camera { azimuth_deg, elevation_deg, distance }
 }
 
 const ORGANS: [Pressed; 3] = [
-    Pressed { name: "liver-organ", at_m: [-0.040, -0.060, 0.050], deep_m: 0.006, camera: [0.0, 30.0] },
-    Pressed { name: "gallbladder", at_m: [0.0, -0.05, 0.02], deep_m: 0.008, camera: [20.0, 35.0] },
-    Pressed { name: "colon", at_m: [0.07, 0.0, -0.02], deep_m: 0.006, camera: [75.0, 25.0] },
+    Pressed { name: "liver-organ", at_m: [-0.040, -0.060, 0.050], deep_m: 0.006, camera: from(0.0, 30.0, 1.6) },
+    Pressed { name: "gallbladder", at_m: [0.0, -0.05, 0.02], deep_m: 0.008, camera: from(20.0, 35.0, 1.6) },
+    Pressed { name: "colon", at_m: [0.10, 0.012, 0.022], deep_m: 0.009, camera: from(190.0, 15.0, 1.5) },
 ];
 
 /// A scene of an organ, compiled.
@@ -110,7 +114,7 @@ fn organ(name: &str) -> Arc<Model> {
 
 /// An organ at rest, and under a fingertip that comes from outside (of the colon, whose wall faces inward, from inside).
 fn pressed(organ_pressed: &Pressed) {
-    let Pressed { name, at_m, deep_m, camera: [azimuth_deg, elevation_deg] } = organ_pressed;
+    let Pressed { name, at_m, deep_m, camera } = organ_pressed;
     let (model, limits) = (organ(name), Limits::default());
     let point = model.shape().nearest(DVec3::from_array(*at_m));
     let (place_m, outward) = (model.shape().rest_m(point), model.shape().normal(point));
@@ -124,9 +128,8 @@ fn pressed(organ_pressed: &Pressed) {
     );
     let script = Script::parse("press", &text, Path::new("."), &model.scene, &limits).unwrap();
     let refinement = Refinement::new(&model.scene, 0, &limits).unwrap();
-    let camera = Camera { azimuth_deg: *azimuth_deg, elevation_deg: *elevation_deg, distance: 1.6 };
     let skin = texture::image(&model.scene.appearance, &limits).unwrap();
-    let view = View { camera, size: SIZE, refinement, texture: Some(skin) };
+    let view = View { camera: *camera, size: SIZE, refinement, texture: Some(skin) };
     let mut film = Film::new(&model, &script, &limits).unwrap();
     for (what, step) in [("rest", 0), ("pressed", 590)] {
         let still = film.at(step).unwrap();

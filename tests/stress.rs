@@ -5,8 +5,11 @@
 //! meshes of a random material there are 4 for 250 steps each, and 200 for 5,000 (`PALPATE_STRESS_MESHES`).
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
+#[path = "common/closed_mesh.rs"]
+mod closed_mesh;
 mod common;
 
+use closed_mesh::closed_mesh;
 use common::{SMALL, model, scene_with};
 use glam::DVec3;
 use palpate::limits::Limits;
@@ -163,42 +166,6 @@ fn random_scenes_stay_finite_and_take_no_energy_from_nowhere() {
     }
 }
 
-/// A closed mesh as an OBJ file: rings between two poles, stretched, each vertex off its place by up to a quarter of an edge.
-fn closed_mesh(dice: &mut fastrand::Rng) -> String {
-    let (rings, around) = (dice.u32(2..9), dice.u32(4..16));
-    let radius_m = 10_f64.powf(-2.5 + 1.5 * dice.f64());
-    let stretched = [(); 3].map(|()| radius_m * (0.3 + 0.7 * dice.f64()));
-    let off = 0.25 * std::f64::consts::PI / f64::from(rings.max(around / 2) + 1);
-    let mut text = String::new();
-    let mut vertex = |place: [f64; 3], dice: &mut fastrand::Rng| {
-        let place: Vec<String> =
-            (0..3).map(|c| (stretched[c] * (place[c] + off * (2.0 * dice.f64() - 1.0))).to_string()).collect();
-        text += &format!("v {}\n", place.join(" "));
-    };
-    for ring in 0..rings {
-        for k in 0..around {
-            let down = std::f64::consts::PI * f64::from(ring + 1) / f64::from(rings + 1);
-            let turn = std::f64::consts::TAU * f64::from(k) / f64::from(around);
-            vertex([down.sin() * turn.cos(), down.sin() * turn.sin(), down.cos()], dice);
-        }
-    }
-    vertex([0.0, 0.0, 1.0], dice);
-    vertex([0.0, 0.0, -1.0], dice);
-    let [top, bottom] = [rings * around + 1, rings * around + 2];
-    for k in 0..around {
-        let next = (k + 1) % around;
-        text += &format!("f {top} {} {}\n", k + 1, next + 1);
-        let last = (rings - 1) * around + 1;
-        text += &format!("f {bottom} {} {}\n", last + next, last + k);
-        for ring in 1..rings {
-            let [above, below] = [ring - 1, ring].map(|ring| ring * around + 1);
-            let (a, b, c, d) = (above + k, above + next, below + k, below + next);
-            text += &format!("f {a} {c} {d}\nf {a} {d} {b}\n");
-        }
-    }
-    text
-}
-
 #[test]
 fn closed_meshes_of_any_material_stay_finite() {
     let meshes = std::env::var("PALPATE_STRESS_MESHES").map_or(4, |meshes| meshes.parse().unwrap());
@@ -207,7 +174,7 @@ fn closed_meshes_of_any_material_stay_finite() {
     let mut played = 0;
     for seed in 0..meshes {
         let dice = &mut fastrand::Rng::with_seed(seed);
-        std::fs::write(folder.path().join("mesh.obj"), closed_mesh(dice)).unwrap();
+        std::fs::write(folder.path().join("mesh.obj"), closed_mesh(dice).obj()).unwrap();
         let mut decades = |from: f64, to: f64| 10_f64.powf(from + (to - from) * dice.f64());
         let text = format!(
             "[mesh]\nfile = \"mesh.obj\"\nunit = \"m\"\n[material]\nyoungs_modulus_pa = {:e}\nthickness_m = {:e}\n\

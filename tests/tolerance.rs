@@ -1,4 +1,5 @@
-//! Schemes chosen for a scene's tolerance keep it, also on random scenes. `make bench-tolerance` tries a thousand.
+//! Schemes chosen for a scene's tolerance keep it, also on random scenes. `make bench-tolerance` tries a thousand; of random
+//! meshes there are 8 here, and more by `PALPATE_TOLERANCE_MESHES`.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 #[path = "common/random_scenes.rs"]
@@ -8,27 +9,35 @@ use palpate::limits::Limits;
 use palpate::refusal::Reason;
 use palpate::scene::{PAPER, Precision, Scene};
 use palpate::sheet::Model;
-use random_scenes::{case, errors, play, truth};
+use random_scenes::{Case, case, errors, mesh_case, play, truth};
+
+/// With the scheme that is chosen for each.
+fn keeps_every_tolerance(case: &Case) {
+    let truth = truth(case).unwrap().course;
+    for tolerance in [1e-2, 1e-3, 1e-4, 1e-5, 1e-6] {
+        let played = play(case, &[format!("stepping.tolerance={tolerance:e}")], &|| 0.0).unwrap();
+        let [displacement, force] = errors(&truth, &played.course);
+        let model = &played.model;
+        assert!(
+            displacement.max(force) <= tolerance,
+            "{}: displacement {displacement:.1e}, force {force:.1e} with {:?} × {} {:?}, asked for {tolerance:.0e}",
+            case.about,
+            model.plan.integrator,
+            model.plan.substeps,
+            model.precision
+        );
+    }
+}
 
 #[test]
 fn every_tolerance_is_kept_on_random_scenes() {
-    for seed in 0..16 {
-        let case = case(seed);
-        let truth = truth(&case).unwrap().course;
-        for tolerance in [1e-2, 1e-3, 1e-4, 1e-5, 1e-6] {
-            let played = play(&case, &[format!("stepping.tolerance={tolerance:e}")], &|| 0.0).unwrap();
-            let [displacement, force] = errors(&truth, &played.course);
-            let model = &played.model;
-            assert!(
-                displacement.max(force) <= tolerance,
-                "{}: displacement {displacement:.1e}, force {force:.1e} with {:?} × {} {:?}, asked for {tolerance:.0e}",
-                case.about,
-                model.plan.integrator,
-                model.plan.substeps,
-                model.precision
-            );
-        }
-    }
+    (0..16).for_each(|seed| keeps_every_tolerance(&case(seed)));
+}
+
+#[test]
+fn every_tolerance_is_kept_on_random_meshes() {
+    let meshes = std::env::var("PALPATE_TOLERANCE_MESHES").map_or(8, |meshes| meshes.parse().unwrap());
+    (0..meshes).for_each(|seed| keeps_every_tolerance(&mesh_case(seed)));
 }
 
 fn paper_with(assignments: &[&str]) -> palpate::refusal::Result<std::sync::Arc<Model>> {

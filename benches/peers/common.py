@@ -5,7 +5,8 @@ spring -K u to the rest position; damping -C v; a constant applied force. Centra
 d <- p d + q F(u), u <- u + d, u from rest, d the increment of the last step. f32, one thread.
 
 Each peer prints, for each size given as an argument, a JSON line: {"peer", "side", "least_ns", "median_ns"}, per point
-and step, of many windows of some milliseconds.
+and step, of many windows of some milliseconds. On meshes, whose files are the arguments, "mesh" is the file in place of
+"side".
 """
 
 import json
@@ -42,20 +43,56 @@ def forces(side):
     return np.stack([0.03 * strength, 0.0 * strength, -0.1 * strength]).astype(np.float32)
 
 
+def windows(run, points):
+    """The least and the median time a point and step, ns; `run` does so many steps before it returns."""
+    run(50)  # compiles, and sets everything in motion
+    begin = time.perf_counter()
+    run(10)
+    # Even, for peers that swap two states.
+    steps = 2 * max(1, round(2e-3 / ((time.perf_counter() - begin) / 10)))
+    times = []
+    end = time.perf_counter() + 1.0
+    while len(times) < 5 or time.perf_counter() < end:
+        begin = time.perf_counter()
+        run(steps)
+        times.append((time.perf_counter() - begin) / (steps * points) * 1e9)
+    return {"least_ns": min(times), "median_ns": statistics.median(times)}
+
+
 def measure(peer, make):
     """For each size: `make(side)` returns a function that does some steps, all of them before it returns."""
     for side in [int(argument) for argument in sys.argv[1:]]:
-        run = make(side)
-        run(50)  # compiles, and sets the sheet in motion
-        begin = time.perf_counter()
-        run(10)
-        # Even, for peers that swap two grids.
-        steps = 2 * max(1, round(2e-3 / ((time.perf_counter() - begin) / 10)))
-        windows = []
-        end = time.perf_counter() + 1.0
-        while len(windows) < 5 or time.perf_counter() < end:
-            begin = time.perf_counter()
-            run(steps)
-            windows.append((time.perf_counter() - begin) / (steps * side * side) * 1e9)
-        line = {"peer": peer, "side": side, "least_ns": min(windows), "median_ns": statistics.median(windows)}
-        print(json.dumps(line), flush=True)
+        print(json.dumps({"peer": peer, "side": side, **windows(make(side), side * side)}), flush=True)
+
+
+class Mesh:
+    """A file of benches/mesh.rs, all of it little-endian and of 32 bits: how many vertices and ends of springs there are,
+    where each vertex rests, where the springs of each vertex begin, and to which vertex each leads. Lengths are in mean
+    edges, times in steps."""
+
+    TURN = np.float32(0.01)  # (K/m) dt²
+    PULL = np.float32(0.03)  # (k/m) dt²
+
+    def __init__(self, path):
+        data = np.fromfile(path, "<u4")
+        count, ends = map(int, data[:2])
+        rest, starts, to = np.split(data[2:], [3 * count, 4 * count + 1])
+        self.rest = rest.view("<f4").reshape(count, 3)
+        self.starts, self.to = starts.astype(np.int32), to.astype(np.int32)
+        assert self.to.size == ends
+
+    def spans(self):
+        """The vector of each spring at rest, from the vertex that it belongs to."""
+        owner = np.repeat(np.arange(len(self.rest)), np.diff(self.starts))
+        return self.rest[self.to] - self.rest[owner]
+
+    def displaced(self):
+        """Where the motion begins."""
+        return np.float32(0.01) * np.sin(self.rest)
+
+
+def measure_meshes(peer, make):
+    """The same for each mesh."""
+    for path in sys.argv[1:]:
+        mesh = Mesh(path)
+        print(json.dumps({"peer": peer, "mesh": path, **windows(make(mesh), len(mesh.rest))}), flush=True)

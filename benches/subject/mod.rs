@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use palpate::limits::Limits;
 use palpate::refusal::Result;
-use palpate::scene::{Integrator, Named, PAPER, Scene};
+use palpate::scene::{BUILT_IN, Integrator, Named, Scene};
 use palpate::sheet::Model;
 
 /// The key of each name below.
@@ -36,13 +36,24 @@ pub fn set(key: &str, value: impl std::fmt::Display) -> String {
 
 /// The paper's scene with everything awake, and the assignments.
 pub fn scene(assignments: &[String]) -> Result<Scene> {
-    let all: Vec<String> = std::iter::once(set("sleep.tolerance", 0)).chain(assignments.iter().cloned()).collect();
-    Scene::parse("paper", PAPER, &all, &Limits { points: 10_000_000, ..Limits::default() })
+    scene_of("paper", assignments)
 }
 
-/// The same scene, compiled.
+/// The same of any scene that is built in.
+pub fn scene_of(name: &str, assignments: &[String]) -> Result<Scene> {
+    let (_, text) = BUILT_IN.iter().find(|scene| scene.0 == name).unwrap();
+    let all: Vec<String> = std::iter::once(set("sleep.tolerance", 0)).chain(assignments.iter().cloned()).collect();
+    Scene::parse(name, text, &all, &Limits { points: 10_000_000, ..Limits::default() })
+}
+
+/// The paper's scene, compiled.
 pub fn model(assignments: &[String]) -> Result<Arc<Model>> {
-    Model::compile(&scene(assignments)?, &Limits::default())
+    model_of("paper", assignments)
+}
+
+/// Any scene that is built in, compiled.
+pub fn model_of(name: &str, assignments: &[String]) -> Result<Arc<Model>> {
+    Model::compile(&scene_of(name, assignments)?, &Limits::default())
 }
 
 /// The names that this build, on this machine, accepts for a key. Reports the ones it refuses.

@@ -224,11 +224,13 @@ impl<'a> Skin<'a> {
     }
 
     /// The texture's colour. The middles of its corner pixels lie on the sheet's corners, so an image of as many pixels
-    /// as the sheet has vertices puts one on each. Row 0 is at the far side (y largest).
+    /// as the sheet has vertices puts one on each. Row 0 is at the far side (y largest). Beyond its sides it goes on as in a
+    /// mirror.
     fn albedo(&self, share: DVec2) -> DVec3 {
         let Image { width, height, rgb } = self.image;
-        let x = share.x.clamp(0.0, 1.0) * (width - 1) as f64;
-        let y = (1.0 - share.y.clamp(0.0, 1.0)) * (height - 1) as f64;
+        let mirrored = |x: f64| if (0.0..=1.0).contains(&x) { x } else { 1.0 - (1.0 - x.rem_euclid(2.0)).abs() };
+        let x = mirrored(share.x) * (width - 1) as f64;
+        let y = (1.0 - mirrored(share.y)) * (height - 1) as f64;
         let (column, row) = (x as usize, y as usize);
         let at = |column: usize, row: usize| {
             let from = 3 * (row.min(height - 1) * width + column.min(width - 1));

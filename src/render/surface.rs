@@ -5,6 +5,9 @@ use glam::{DVec2, DVec3};
 use crate::shape::RestShape;
 use crate::surface::{Encoding, Refinement, Skin, Snapshot, encode};
 
+/// A triangle that shows so many times as much of the texture along its sides as half of all do is across a seam.
+const SEAM: f64 = 6.0;
+
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Vertex {
     /// Position, m.
@@ -75,7 +78,33 @@ impl Surface {
         lines.sort_unstable();
         lines.dedup();
         let along = (longest_m / skin.edge_m()).ceil() as usize;
-        Surface { vertices: (0..places_m.len()).map(vertex).collect(), triangles, lines, along }
+        let mut surface = Surface { vertices: (0..places_m.len()).map(vertex).collect(), triangles, lines, along };
+        surface.part_at_seams(|place| at_rest[place].abs());
+        surface
+    }
+
+    /// A vertex at a seam has the texture coordinates of one side, so a triangle across would show much of the texture, squeezed.
+    /// It gets vertices of its own, without texture coordinates, that face as told.
+    fn part_at_seams(&mut self, facing: impl Fn(usize) -> DVec3) {
+        let squeeze = |triangle: &[usize; 3]| {
+            let [a, b, c] = triangle.map(|vertex| self.vertices[vertex]);
+            let sides = [(a, b), (b, c), (c, a)];
+            let longest = |of: &dyn Fn(&(Vertex, Vertex)) -> f64| sides.iter().map(of).fold(0.0, f64::max);
+            longest(&|(a, b)| a.share.distance(b.share)) / longest(&|(a, b)| a.rest.distance(b.rest))
+        };
+        let squeezes: Vec<f64> = self.triangles.iter().map(squeeze).collect();
+        let mut sorted = squeezes.clone();
+        sorted.sort_unstable_by(f64::total_cmp);
+        let Some(usual) = sorted.get(sorted.len() / 2).copied() else { return };
+        for (triangle, squeeze) in self.triangles.iter_mut().zip(squeezes) {
+            if squeeze > SEAM * usual {
+                for corner in triangle {
+                    let parted = Vertex { facing: facing(*corner), ..self.vertices[*corner] };
+                    *corner = self.vertices.len();
+                    self.vertices.push(parted);
+                }
+            }
+        }
     }
 
     fn of_sheet(snapshot: &Snapshot, refinement: Refinement) -> Self {

@@ -5,6 +5,7 @@ pub mod action;
 pub mod check;
 pub mod collection;
 pub mod document;
+mod eigenvalue;
 pub mod kind;
 mod material;
 mod membrane;

@@ -5,8 +5,9 @@
 //! 10,000 times the true error. So the scheme itself is run, on at most [`SIDE`]² points for half a second, under a few
 //! loads that are harder than most scripts ([`LOADS`]). The truth is the same in f64 with a substep so short that half of it
 //! changes nothing. The true error of a script on the whole sheet is then at most [`MARGIN`] times the rehearsed one
-//! (`make tables-tolerance`). Forces that change smoothly err by 10 to 1000 times less than those that jump, and a choice
-//! that is made before the script is known can't use that.
+//! (`make bench-tolerance`), and on a whole mesh [`MARGIN_OF_MESH`] times (`tests/tolerance.rs`). Forces that change
+//! smoothly err by 10 to 1000 times less than those that jump, and a choice that is made before the script is known can't
+//! use that.
 
 use std::cell::Cell;
 use std::sync::Arc;
@@ -43,6 +44,10 @@ pub(super) const LASTING_S: f64 = 2.0;
 
 /// By how much the true error of a script may exceed the rehearsed one.
 const MARGIN: f64 = 5.0;
+
+/// The same on a mesh, where the vertex that vibrates fastest is pushed: all others err less. (56 random meshes at 5 tolerances:
+/// at most 1.4 times, half of them 0.05 times.)
+const MARGIN_OF_MESH: f64 = 2.0;
 
 /// For so long after a force jumps its error may be [`ALLOWANCE`] times the tolerance, s: a jump starts the fastest
 /// vibrations, which no substep follows exactly and which are over before anybody feels them.
@@ -189,7 +194,8 @@ impl<'s> Rehearsal<'s> {
         };
         // The first that can't be followed is enough.
         let largest = LOADS.iter().zip(&self.truth).try_fold(0.0, |largest: f64, pair| Some(largest.max(error(pair)?)));
-        MARGIN * largest.unwrap_or(f64::INFINITY)
+        let margin = if self.scene.sheet().is_some() { MARGIN } else { MARGIN_OF_MESH };
+        margin * largest.unwrap_or(f64::INFINITY)
     }
 
     /// How many substeps a scheme takes in whole rehearsed steps: no fewer than `substeps`.

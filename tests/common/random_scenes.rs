@@ -11,10 +11,17 @@ use palpate::scene::script::Script;
 use palpate::session::{Session, run};
 use palpate::sheet::Model;
 
+#[path = "closed_mesh.rs"]
+mod closed_mesh;
+
+use closed_mesh::closed_mesh;
+
 /// A scene and a script as files say them, and what they are in short.
 pub struct Case {
     pub scene: String,
     pub script: String,
+    /// The file `mesh.obj` of the scene, if it has one.
+    pub mesh: Option<String>,
     pub about: String,
 }
 
@@ -67,6 +74,7 @@ pub fn case(seed: u64) -> Case {
     }
     let watched: Vec<String> = watched.iter().map(|[i, j]| format!("[{i}, {j}]")).collect();
     Case {
+        mesh: None,
         scene: format!(
             "name = \"random {seed}\"\n[sheet]\npoints = [{nx}, {ny}]\nspacing_m = {spacing:?}\npoint_mass_kg = {mass:?}\n{fixed}\
              [springs]\nstiffness_n_per_m = {stiffness:?}\nflexion = {flexion}\n\
@@ -87,6 +95,61 @@ pub fn case(seed: u64) -> Case {
     }
 }
 
+/// The same on closed meshes of uneven triangles: fastest vibration × 1 ms from about 0.02 to 1.5, k/K″ of an even edge from 0.3
+/// to 200; forces inward that strain its
+/// springs by 1 to 50 %.
+pub fn mesh_case(seed: u64) -> Case {
+    let mut random = fastrand::Rng::with_seed(seed);
+    let mesh = closed_mesh(&mut random);
+    let edge_m = mesh.edge_m();
+    let mut uniform = |from: f64, to: f64| from + (to - from) * random.f64();
+    let mut decades = |from: f64, to: f64| uniform(from.ln(), to.ln()).exp();
+    let (turn, ratio, zeta, strain, falloff) =
+        (decades(0.02, 1.5), decades(0.3, 200.0), decades(0.02, 5.0), decades(0.01, 0.5), decades(0.3, 3.0));
+    let (density, depth_m) = (1000.0, 0.03);
+    // The fastest vibration of even triangles has (10k + K″)/m.
+    let mass_kg_per_m2 = density * depth_m / 3.0;
+    let bed_n_per_m3 = mass_kg_per_m2 * (turn / 1e-3_f64).powi(2) / (10.0 * ratio + 1.0);
+    let area_m2 = 0.75_f64.sqrt() * edge_m * edge_m;
+    let (thickness_m, virtual_n_per_m) = (1e-3, bed_n_per_m3 * area_m2);
+    let stiffness_n_per_m = ratio * virtual_n_per_m;
+    let modulus_pa = stiffness_n_per_m / (0.75_f64.sqrt() * thickness_m);
+    let flexion = [0.0, 0.1, 0.5][uniform(0.0, 3.0) as usize];
+    let vertex = uniform(0.0, mesh.places_m.len() as f64) as usize;
+    let place_m = mesh.places_m[vertex];
+    let profile = match uniform(0.0, 4.0) as usize {
+        0 => "{ type = \"constant\" }".to_owned(),
+        1 => "{ type = \"pulse\", on_s = 0.1, off_s = 0.4 }".to_owned(),
+        2 => "{ type = \"ramp\", from_s = 0.05, to_s = 0.25 }".to_owned(),
+        _ => format!("{{ type = \"sine\", frequency_hz = {:?} }}", uniform(0.5, 20.0)),
+    };
+    let away_m = place_m.iter().map(|c| c * c).sum::<f64>().sqrt();
+    let force_n = strain * edge_m * (virtual_n_per_m + 0.3 * stiffness_n_per_m);
+    let towards = [(); 3].map(|()| uniform(-1.0, 1.0));
+    let force_n = [0, 1, 2].map(|c| force_n * (0.3 * towards[c] - place_m[c] / away_m));
+    let others = mesh.triangles.iter().find(|triangle| triangle.contains(&(vertex as u32)));
+    let watched: Vec<u32> = others.into_iter().flatten().copied().collect();
+    Case {
+        mesh: Some(mesh.obj()),
+        scene: format!(
+            "name = \"random {seed}\"\n[mesh]\nfile = \"mesh.obj\"\nunit = \"m\"\n[material]\nyoungs_modulus_pa = {modulus_pa:?}\n\
+             thickness_m = {thickness_m:?}\ndensity_kg_per_m3 = {density:?}\ndepth_m = {depth_m:?}\nbed_n_per_m3 = {bed_n_per_m3:?}\n\
+             damping_ratio = {zeta:?}\n[springs]\nflexion = {flexion}\n"
+        ),
+        about: format!(
+            "mesh of seed {seed}: {} vertices, k/K″ {ratio:.3}, ω·1 ms {turn:.2}, ζ {zeta:.2}, strain {strain:.2}, falloff \
+             {falloff:.2} an edge, flexion {flexion}, {}",
+            mesh.places_m.len(),
+            profile.replace("type = ", "")
+        ),
+        script: format!(
+            "name = \"random {seed}\"\nduration_s = 0.5\nsample_every_s = 0.025\nsample_points = {watched:?}\n[[force]]\n\
+             vertex = {vertex}\nforce_n = {force_n:?}\nfalloff_per_m = {:?}\nfalloff_offset = 0.0\nprofile = {profile}\n",
+            falloff / edge_m
+        ),
+    }
+}
+
 /// Displacement and reaction, each x, y and z, of every watched point at each sample time.
 pub type Course = Vec<Vec<[[f64; 3]; 2]>>;
 
@@ -103,7 +166,18 @@ pub fn compile(case: &Case, assignments: &[String]) -> Result<(Arc<Model>, Scrip
     // Offline, as `palpate run`: the truth takes more than a server would do.
     let limits = Limits { rehearsal_work: 1 << 32, ..Limits::default() };
     let text = |refusal: palpate::refusal::Refusal| refusal.to_string();
-    let scene = Scene::parse("random", &case.scene, assignments, &limits).map_err(text)?;
+    let scene = match &case.mesh {
+        None => Scene::parse("random", &case.scene, assignments, &limits),
+        Some(mesh) => {
+            let folder = tempfile::tempdir().map_err(|error| error.to_string())?;
+            let path = folder.path().join("random.toml");
+            let written =
+                std::fs::write(folder.path().join("mesh.obj"), mesh).and_then(|()| std::fs::write(&path, &case.scene));
+            written.map_err(|error| error.to_string())?;
+            Scene::load(&path, assignments, &limits)
+        }
+    };
+    let scene = scene.map_err(text)?;
     let script = Script::parse("random", &case.script, Path::new("."), &scene, &limits).map_err(text)?;
     Ok((Model::compile(&scene, &limits).map_err(text)?, script))
 }
