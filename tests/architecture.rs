@@ -30,7 +30,7 @@ const MODULES: [&str; 20] = [
 ];
 
 /// The crates: folder, name, the other crates that it may use, and what must not be in its tree of dependencies.
-const CRATES: [(&str, &str, &[&str], &[&str]); 8] = [
+const CRATES: [(&str, &str, &[&str], &[&str]); 9] = [
     ("mesh", "palpate-mesh", &[], &["axum", "clap", "prost", "tokio", "tonic"]),
     ("clients/touch", "palpate-touch", &[], &["axum", "prost", "tokio", "tonic"]),
     ("proto", "palpate-proto", &["palpate-touch"], &["axum", "clap", "hyper", "tokio-rustls"]),
@@ -43,28 +43,35 @@ const CRATES: [(&str, &str, &[&str], &[&str]); 8] = [
     ),
     ("clients/c", "palpate-c", &["palpate", "palpate-client", "palpate-proto", "palpate-touch"], &[]),
     (
+        "clients/simulated",
+        "palpate-simulated",
+        &["palpate", "palpate-client", "palpate-mesh", "palpate-proto", "palpate-touch"],
+        &["indicatif"],
+    ),
+    (
         "clients/programs",
         "palpate-programs",
-        &["palpate", "palpate-client", "palpate-mesh", "palpate-proto", "palpate-touch"],
+        &["palpate", "palpate-client", "palpate-proto", "palpate-simulated", "palpate-touch"],
         &[],
     ),
     (
         "clients/python",
         "palpate-python",
-        &["palpate", "palpate-client", "palpate-mesh", "palpate-proto", "palpate-touch"],
+        &["palpate", "palpate-client", "palpate-mesh", "palpate-proto", "palpate-simulated", "palpate-touch"],
         &["indicatif"],
     ),
 ];
 
 /// The modules of `palpate` that a module of the programs may use. `link` simulates the far end; the others read files.
-const FOR_PROGRAMS: [(&str, &[&str]); 6] = [
+const FOR_PROGRAMS: [(&str, &[&str]); 4] = [
     ("link", &["force_law", "limits", "memory", "scene", "session", "sheet"]),
-    ("load", &["scene"]),
     ("placement", &["scene"]),
     ("play", &["journal", "scene", "shape", "wire"]),
     ("replay", &["limits", "scene", "shape", "wire"]),
-    ("scene_file", &["limits", "scene", "wire"]),
 ];
+
+/// The same of simulated users: both read files.
+const FOR_SIMULATED: [(&str, &[&str]); 2] = [("load", &["scene"]), ("scene_file", &["limits", "scene", "wire"])];
 
 /// The modules of `palpate` that libpalpate may use: `server` reads the text of a scene.
 const FOR_LIBPALPATE: [&str; 3] = ["limits", "scene", "wire"];
@@ -281,13 +288,20 @@ fn the_protocol_enters_at_the_wire() {
 
 #[test]
 fn programs_use_the_library_and_not_each_other() {
-    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/programs/src");
-    let allowed: BTreeMap<&str, &[&str]> = FOR_PROGRAMS.into();
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    for (folder, allowed) in [("clients/programs/src", &FOR_PROGRAMS[..]), ("clients/simulated/src", &FOR_SIMULATED)] {
+        let (source, allowed) = (root.join(folder), BTreeMap::from_iter(allowed.iter().copied()));
+        for path in rust_files(&source) {
+            let (text, own) = (std::fs::read_to_string(&path).unwrap(), module(&source, &path));
+            for used in named(&text, "palpate::") {
+                let may = allowed.get(own).is_some_and(|may: &&[&str]| may.contains(&used));
+                assert!(may, "{} uses `{used}`", path.display());
+            }
+        }
+    }
+    let source = root.join("clients/programs/src");
     for path in rust_files(&source) {
         let (text, own) = (std::fs::read_to_string(&path).unwrap(), module(&source, &path));
-        for used in named(&text, "palpate::") {
-            assert!(allowed.get(own).is_some_and(|may| may.contains(&used)), "{} uses `{used}`", path.display());
-        }
         for used in named(&text, "crate::") {
             assert!(used == own || !SUBCOMMANDS.contains(&used), "{} uses `{used}`", path.display());
         }

@@ -9,6 +9,7 @@ mod inverse_service;
 mod server;
 
 use std::fs::OpenOptions;
+use std::future::pending;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
@@ -22,7 +23,7 @@ use palpate_client::bridge::{Options, Report, Session, Target, run};
 use palpate_client::devices::{Enables, Placed, Placement, open};
 use palpate_client::{Credentials, HapticDevice, Reading};
 use palpate_touch::device::SAFE_FORCE_N;
-use palpate_touch::{Device, Tip};
+use palpate_touch::{Device, RenderingState, Tip};
 use server::{PATIENCE, Server, client_program};
 
 /// The middle of the scene `liver`.
@@ -75,13 +76,8 @@ impl Log {
     }
 }
 
-/// Runs the bridge of the library until the device has felt a press for some ticks.
-async fn touch(
-    device: impl HapticDevice + 'static,
-    server: &Server,
-    felt: impl Fn() -> bool + Send + 'static,
-) -> Report {
-    let target = Target {
+fn target(server: &Server) -> Target {
+    Target {
         server: palpate_client::Server::new(&server.url, &Credentials::default()).unwrap(),
         session: Session::New { scene: "liver".to_owned() },
         tool: 0,
@@ -90,14 +86,22 @@ async fn touch(
         up_deadband: 0.0,
         datagrams: true,
         holder: "test".to_owned(),
-    };
+    }
+}
+
+/// Runs the bridge of the library until the device has felt a press for some ticks.
+async fn touch(
+    device: impl HapticDevice + 'static,
+    server: &Server,
+    felt: impl Fn() -> bool + Send + 'static,
+) -> Report {
     let options = Options { remembers: true, ..Options::default() };
     let stop = async move {
         while !felt() {
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     };
-    let serving = run(device, target, options, stop);
+    let serving = run(device, target(server), options, stop);
     let (device, report) = tokio::time::timeout(PATIENCE, serving).await.expect("no force").unwrap();
     drop(device);
     report
@@ -283,11 +287,13 @@ fn pipe(folder: &Path) -> PathBuf {
     path
 }
 
-/// Writes events into a pipe for as long as they are wanted: a press of the button every now and then, and down or up.
+/// Writes events into a pipe for as long as they are wanted: a press of the button every now and then, and down or up. `last` is
+/// what it says at the end.
 fn play(
     path: &Path,
     kind: u16,
     over: std::sync::mpsc::Receiver<()>,
+    last: &'static [u8],
     goes_down: impl Fn(u32) -> bool + Send + 'static,
 ) -> std::thread::JoinHandle<()> {
     let path = path.to_owned();
@@ -301,7 +307,11 @@ fn play(
             said.extend(event(0, 0, 0));
             let is_over =
                 over.recv_timeout(Duration::from_millis(20)) != Err(std::sync::mpsc::RecvTimeoutError::Timeout);
-            if is_over || events.write_all(&said).is_err() {
+            if is_over {
+                let _ = events.write_all(last);
+                return;
+            }
+            if events.write_all(&said).is_err() {
                 return;
             }
         }
@@ -320,7 +330,7 @@ async fn recorded_events_of_a_knob_and_of_a_stick_touch_the_tissue() {
         let (stop, over) = std::sync::mpsc::channel();
         // Down to 4 mm in the tissue, and up to 4 mm above it.
         let was_down = AtomicBool::new(true);
-        let playing = play(&path, kind, over, move |_| {
+        let playing = play(&path, kind, over, &[], move |_| {
             let z_m = seen.lock().unwrap().0.z;
             let is_down = if z_m > 0.004 { true } else { z_m > -0.004 && was_down.load(Ordering::Relaxed) };
             was_down.store(is_down, Ordering::Relaxed);
@@ -368,9 +378,14 @@ fn ends(server: &Server, case: &Case) {
     }
 }
 
-/// Everything that was set lies within the envelope, and the last is no force.
-fn is_safe(forces: &[DVec3]) {
+/// Everything that was set lies within the envelope.
+fn is_bounded(forces: &[DVec3]) {
     assert!(forces.iter().all(|force_n| force_n.length() <= SAFE_FORCE_N), "a force beyond the envelope");
+}
+
+/// The same, and the last is no force.
+fn is_safe(forces: &[DVec3]) {
+    is_bounded(forces);
     assert!(forces.last().is_none_or(|force_n| *force_n == DVec3::ZERO), "{:?} is left", forces.last());
 }
 
@@ -397,8 +412,10 @@ fn what_goes_wrong_with_a_loaded_library_ends_the_bridge_without_a_force() {
         ends(&server, &Case { device: device.to_owned(), library: Some(imitation.library.clone()), status, says });
         let forces = imitation.log.vectors("force");
         assert_eq!(is_felt(&forces), is_touched, "{device} {wrong:?}");
-        if wrong != ["STILL"] {
-            is_safe(&forces);
+        match wrong {
+            // Its own loop would have to let go.
+            ["STILL"] => is_bounded(&forces),
+            _ => is_safe(&forces),
         }
     }
     for (device, library, status, says) in [
@@ -415,25 +432,36 @@ fn what_goes_wrong_with_a_loaded_library_ends_the_bridge_without_a_force() {
     }
 }
 
+/// Felt, and after that nothing for a while.
+fn is_let_go(forces: &[DVec3]) -> bool {
+    let pushes: Vec<bool> = forces.iter().map(|force_n| force_n.abs().max_element() > 0.05).collect();
+    pushes.iter().filter(|pushes| **pushes).count() > 50 && pushes.iter().rev().take(200).all(|pushes| !pushes)
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn positions_that_are_no_numbers_give_no_force_and_do_not_end_the_touch() {
+async fn positions_that_no_arm_has_give_no_force_and_do_not_end_the_touch() {
     let server = Server::start(&[]);
+    let is_wrong = |report: &Report| {
+        let last = report.course.last().unwrap();
+        assert!(!(last.place_m.length() < 1e3) && last.state == Some(RenderingState::Fault), "{last:?}");
+    };
     for (name, device) in [("dhd", "force-dimension"), ("hd", "openhaptics")] {
-        let imitation = Imitation::build(name, &["GARBAGE"]);
-        let device = open(device, Some(&imitation.library)).unwrap();
-        let log = imitation.log.clone();
-        // Felt, and after that nothing for a while.
-        let silent = move || {
-            let forces = log.vectors("force");
-            let forces: Vec<bool> = forces.iter().map(|force_n| force_n.abs().max_element() > 0.05).collect();
-            forces.iter().filter(|pushes| **pushes).count() > 50 && forces.iter().rev().take(200).all(|pushes| !pushes)
-        };
-        let report = touch(device, &server, silent).await;
-        assert!(report.course.iter().any(|tick| tick.place_m.is_nan()));
-        let forces = imitation.log.vectors("force");
-        assert!(forces.iter().all(|force_n| force_n.is_finite()), "{name}");
-        is_safe(&forces);
+        for garbage in ["GARBAGE=NAN", "GARBAGE=1e9"] {
+            let imitation = Imitation::build(name, &[garbage]);
+            let device = open(device, Some(&imitation.library)).unwrap();
+            let log = imitation.log.clone();
+            is_wrong(&touch(device, &server, move || is_let_go(&log.vectors("force"))).await);
+            let forces = imitation.log.vectors("force");
+            assert!(forces.iter().all(|force_n| force_n.is_finite()), "{name} {garbage}");
+            is_safe(&forces);
+        }
     }
+    let service = InverseService::start(Some("3.5.0"), Wrong::Far);
+    let heard = service.heard();
+    let device = open(&format!("haply:{}", service.url), None).unwrap();
+    is_wrong(&touch(device, &server, move || is_let_go(&heard.forces_n())).await);
+    is_bounded(&service.heard().forces_n());
+    until("no force at the end", || service.heard().forces_n().last() == Some(&DVec3::ZERO));
 }
 
 #[test]
@@ -468,6 +496,44 @@ fn what_goes_wrong_with_haplys_service_ends_the_bridge_within_the_envelope() {
     ends(&server, &Case { device: "haply:here".to_owned(), library: None, status: 1, says });
 }
 
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_knob_or_stick_that_fails_while_it_is_pressed_is_left_without_a_force() {
+    let server = Server::start(&[]);
+    for (name, kind) in [("spacemouse", REL), ("gamepad", ABS)] {
+        for (last, says) in [(&[][..], "it was unplugged"), (&[0xa5; 480], "no event of an input device")] {
+            let folder = tempfile::tempdir().unwrap();
+            let path = pipe(folder.path());
+            let device = open(&format!("{name}:{}", path.display()), None).unwrap();
+            let noted = Arc::new(Mutex::new((DVec3::ZERO, Vec::new())));
+            // Down until it is felt, which some presses of the button later it is; up again if it went too deep.
+            let (seen, felt) = (noted.clone(), noted.clone());
+            let (stop, over) = std::sync::mpsc::channel();
+            let was_down = AtomicBool::new(true);
+            let playing = play(&path, kind, over, last, move |_| {
+                let z_m = seen.lock().unwrap().0.z;
+                let is_down = if z_m > 0.004 { true } else { z_m > -0.004 && was_down.load(Ordering::Relaxed) };
+                was_down.store(is_down, Ordering::Relaxed);
+                is_down
+            });
+            let ending = std::thread::spawn(move || {
+                until("it is not felt", || {
+                    let (_, forces) = &*felt.lock().unwrap();
+                    is_felt(forces) && forces.last().is_some_and(|force_n| force_n.length() > 0.05)
+                });
+                drop(stop);
+            });
+            let serving = run(Noting { device, noted: noted.clone() }, target(&server), Options::default(), pending());
+            let failed = tokio::time::timeout(PATIENCE, serving).await.expect("it goes on").err().unwrap();
+            assert!(failed.to_string().contains(says), "{name}: {failed}");
+            ending.join().unwrap();
+            playing.join().unwrap();
+            let forces = &noted.lock().unwrap().1;
+            assert!(is_felt(forces), "{name}: {says}");
+            is_safe(forces);
+        }
+    }
+}
+
 #[test]
 fn what_goes_wrong_with_events_ends_the_bridge() {
     let server = Server::start(&[]);
@@ -476,7 +542,7 @@ fn what_goes_wrong_with_events_ends_the_bridge() {
     let device = format!("gamepad:{}", path.display());
     // Unplugged while it is pressed.
     let (stop, over) = std::sync::mpsc::channel();
-    let playing = play(&path, ABS, over, |moment| moment % 60 < 25);
+    let playing = play(&path, ABS, over, &[], |moment| moment % 60 < 25);
     let ending = std::thread::spawn(move || {
         std::thread::sleep(Duration::from_secs(3));
         drop(stop);
@@ -524,7 +590,7 @@ fn devices_are_listed_and_tested_without_a_force() {
     assert!(told["ticks"].as_u64().unwrap() > 10 && told["failure"].is_null() && told["model"] == "omega3", "{told}");
     let forces = imitation.log.vectors("force");
     assert!(forces.len() > 10 && forces.iter().all(|force_n| *force_n == DVec3::ZERO));
-    let broken = Imitation::build("dhd", &["GARBAGE", "PRESSED=51"]);
+    let broken = Imitation::build("dhd", &["GARBAGE=NAN", "PRESSED=51"]);
     let arguments =
         ["devices", "--library", broken.library.to_str().unwrap(), "--test", "force-dimension", "--seconds", "2"];
     let output = client(&arguments);

@@ -88,8 +88,10 @@ namespace Palpate
     public struct Report
     {
         public ulong Ticks, LateTicks, MissedTicks, Connections, Samples, Positions;
-        uint priority, unused;
+        uint priority, result;
         public Priority Priority { get { return (Priority)priority; } }
+        /// <summary>Why the loop has ended: Ok if you have ended it.</summary>
+        public Code Result { get { return (Code)result; } }
     }
 
     /// <summary>A change of the tissue; what is not a number stays.</summary>
@@ -196,6 +198,7 @@ namespace Palpate
         [DllImport(Library, CallingConvention = C)] internal static extern void palpate_touch_end(IntPtr touch);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_bridge_begin(IntPtr session, ref DeviceCalls device, ref TouchOptions options, out IntPtr bridge);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_bridge_look(IntPtr bridge, out BridgeState state);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_bridge_disable(IntPtr bridge);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_bridge_end(IntPtr bridge, out Report report);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_surface_open(IntPtr session, ref SurfaceOptions options, out IntPtr surface);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_surface_size_of(IntPtr surface, out SurfaceSize size);
@@ -422,14 +425,24 @@ namespace Palpate
             return state;
         }
 
+        /// <summary>Stops rendering until Enable goes from false to true again. Any thread.</summary>
+        public void Disable() { Native.Check(Native.palpate_bridge_disable(Pointer)); }
+
         /// <summary>Ends the loop and tells what it has done, or how the device failed.</summary>
         public Report End()
         {
             Report report;
-            var pointer = System.Threading.Interlocked.Exchange(ref Pointer, IntPtr.Zero);
-            Check(Native.palpate_bridge_end(pointer, out report));
-            GC.KeepAlive(this);
+            End(out report);
             return report;
+        }
+
+        /// <summary>The same; the report is there also if it throws because the device has failed.</summary>
+        public void End(out Report report)
+        {
+            var pointer = System.Threading.Interlocked.Exchange(ref Pointer, IntPtr.Zero);
+            var code = Native.palpate_bridge_end(pointer, out report);
+            GC.KeepAlive(this);
+            Check(code);
         }
 
         internal override void Free(IntPtr pointer) { Report report; Native.palpate_bridge_end(pointer, out report); }

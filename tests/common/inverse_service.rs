@@ -33,6 +33,8 @@ pub enum Wrong {
     Killed,
     Silent,
     Garbage,
+    /// A position that no arm reaches.
+    Far,
 }
 
 /// What it was told.
@@ -165,6 +167,11 @@ fn serve(mut stream: TcpStream, version: Option<&str>, wrong: Wrong, told: &Hear
             Wrong::Silent if is_wrong => continue,
             Wrong::Garbage if is_wrong => "{{{".to_owned(),
             Wrong::Unplugged if is_wrong => message(tick, false).to_string(),
+            Wrong::Far if is_wrong => {
+                let mut message = message(tick, true);
+                message["inverse3"][0]["state"]["cursor_position"]["z"] = json!(-1e9);
+                message.to_string()
+            }
             _ => message(tick, true).to_string(),
         };
         if socket.send(Message::text(answer)).is_err() {

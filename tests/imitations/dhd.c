@@ -1,8 +1,8 @@
 /* An imitation of libdhd: its symbols, and a simulated arm that presses and comes back without end.
  *
  * LOG is the file that gets what is asked of it. What goes wrong is chosen when it is compiled: NO_DEVICE, VERSION=2,
- * UNPLUGGED (while it is pressed), SATURATED (the returns 1 and 2, which are no errors), GARBAGE (positions that are
- * not numbers, from then on; PRESSED=51: at once), MISSING (a function). */
+ * UNPLUGGED (while it is pressed), SATURATED (the returns 1 and 2, which are no errors), GARBAGE=NAN (positions that are
+ * not numbers, from then on, or 1e9; PRESSED=51: at once), MISSING (a function). */
 #include <math.h>
 #include <stdio.h>
 
@@ -88,7 +88,7 @@ int dhdGetPosition(double *x, double *y, double *z, char id) {
   *y = 0.006;
   *z = -0.001 + 0.004 * cos(2.0 * M_PI * tick / 2000.0);
 #ifdef GARBAGE
-  if (pressed > 50) *x = *y = *z = NAN;
+  if (pressed > 50) *x = *y = *z = GARBAGE;
 #endif
   fprintf(file, "place %.17g %.17g %.17g\n", *x, *y, *z);
 #ifdef SATURATED

@@ -1,8 +1,8 @@
 /* An imitation of libHD: its symbols, a loop at about 1 kHz that calls what is scheduled, and a simulated arm.
  *
  * LOG is the file that gets what is asked of it. What goes wrong is chosen when it is compiled: NO_DEVICE, OLD (another
- * version), UNPLUGGED (while it is pressed), SATURATED (errors of forces, which end nothing), GARBAGE (positions that are not
- * numbers), STILL (the loop stops while it is pressed), MISSING (a function), INKWELL (not calibrated). */
+ * version), UNPLUGGED (while it is pressed), SATURATED (errors of forces, which end nothing), GARBAGE=NAN (positions that are not
+ * numbers, or 1e9), STILL (the loop stops while it is pressed), MISSING (a function), INKWELL (not calibrated). */
 #include <math.h>
 #include <pthread.h>
 #include <stdio.h>
@@ -83,7 +83,7 @@ void hdGetDoublev(unsigned int name, double *to) {
       to[1] = 20.0 + up;
       to[2] = 30.0 + 4.0;
 #ifdef GARBAGE
-      if (pressed > 50) to[0] = to[1] = to[2] = NAN;
+      if (pressed > 50) to[0] = to[1] = to[2] = GARBAGE;
 #endif
       break;
     }

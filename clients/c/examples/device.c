@@ -74,7 +74,7 @@ int main(int count, char **arguments) {
         if (state.is_over) break;
         nanosleep(&(struct timespec){0, 100000000L}, NULL);
     }
-    palpate_bridge_report report = {0, 0, 0, 0, 0, 0, 0};
+    palpate_bridge_report report = {0};
     if (bridge && palpate_bridge_end(bridge, &report)) status = failed("device");
     const char *priorities[] = {"usual", "real time", "refused"};
     if (status == 0)

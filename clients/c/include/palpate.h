@@ -89,7 +89,7 @@ typedef enum palpate_state {
    */
   PALPATE_STATE_WAITING = 0,
   /**
-   * Nothing is rendered until `enable` goes from 0 to 1.
+   * Nothing is rendered until `enable` goes from 0 to 1. Also if it has, until the first news of the tissue.
    */
   PALPATE_STATE_DISABLED = 1,
   /**
@@ -366,6 +366,10 @@ typedef struct palpate_bridge_report {
    * One of `palpate_priority`.
    */
   uint32_t priority;
+  /**
+   * Why it has ended, one of `palpate_result`: 0 if you have ended it.
+   */
+  uint32_t result;
 } palpate_bridge_report;
 
 /**
@@ -617,8 +621,14 @@ enum palpate_result palpate_bridge_begin(const struct palpate_session *session,
 enum palpate_result palpate_bridge_look(const struct palpate_bridge *bridge, struct palpate_bridge_state *state);
 
 /**
- * Ends the loop, waits for that, and writes what it has done; `report` may be null. `PALPATE_DEVICE` if the device has failed:
- * `palpate_last_error` tells how. The handle is given back in any case. Any thread, once; not from a function of the device.
+ * Stops rendering until `enable` of a reading goes from 0 to 1 again; the force falls within the next ticks. Any thread, also from
+ * a function of the device.
+ */
+enum palpate_result palpate_bridge_disable(const struct palpate_bridge *bridge);
+
+/**
+ * Ends the loop, waits for that, and writes what it has done, also if it has failed; `report` may be null. `PALPATE_DEVICE` if the
+ * device has failed: `palpate_last_error` tells how. The handle is given back in any case. Any thread, once; not from a function of the device.
  */
 enum palpate_result palpate_bridge_end(struct palpate_bridge *bridge,
                                        struct palpate_bridge_report *report);

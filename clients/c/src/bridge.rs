@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use glam::DVec3;
-use palpate_client::bridge::{Options, Origin, Report, Tick, run};
+use palpate_client::bridge::{Disable, Options, Origin, Report, Tick, run_told};
 use palpate_client::os::Priority;
 use palpate_client::{Error, HapticDevice, Reading};
 use palpate_touch::Device;
@@ -14,7 +14,7 @@ use tokio::sync::Notify;
 use tokio::task::JoinHandle;
 
 use crate::axes::{palpate_axes, palpate_vector};
-use crate::error::{Fault, PALPATE_CONNECTION, PALPATE_INTERNAL, at, at_mut, guard, palpate_result};
+use crate::error::{Fault, PALPATE_CONNECTION, PALPATE_INTERNAL, PALPATE_OK, at, at_mut, guard, palpate_result};
 use crate::options::{options_at, palpate_limits, palpate_touch_options};
 use crate::os;
 use crate::server::{CONNECTING, Connected, palpate_session};
@@ -40,6 +40,7 @@ pub struct palpate_device {
 pub struct palpate_bridge {
     shared: Arc<Connected>,
     seen: Arc<Mutex<Seen>>,
+    disable: Disable,
     stop: Arc<Notify>,
     task: JoinHandle<Result<Report, Error>>,
     axes: palpate_axes,
@@ -96,6 +97,8 @@ pub struct palpate_bridge_report {
     pub positions: u64,
     /// One of `palpate_priority`.
     pub priority: u32,
+    /// Why it has ended, one of `palpate_result`: 0 if you have ended it.
+    pub result: u32,
 }
 
 /// What the loop shows of itself.
@@ -206,13 +209,14 @@ pub unsafe extern "C" fn palpate_bridge_begin(
             begun: Some(Box::new(begun)),
             ..Options::default()
         };
+        let disable = of_run.disable.clone();
         let stop = Arc::new(Notify::new());
         let stopped = stop.clone();
         let task = shared.runtime.spawn(async move {
-            let ended = run(called, target, of_run, async move { stopped.notified().await }).await;
+            let ended = run_told(called, target, of_run, async move { stopped.notified().await }).await;
             ended.map(|(_, report)| report)
         });
-        let bridge = palpate_bridge { shared, seen, stop, task, axes: options.axes };
+        let bridge = palpate_bridge { shared, seen, disable, stop, task, axes: options.axes };
         let until = Instant::now() + bridge.shared.timeout.min(CONNECTING);
         while !bridge.task.is_finished() && Instant::now() < until {
             if seen_of(&bridge.seen).newest.is_some_and(|tick| tick.state.is_some()) {
@@ -222,26 +226,35 @@ pub unsafe extern "C" fn palpate_bridge_begin(
             std::thread::sleep(Duration::from_millis(2));
         }
         // It never connected, so there is an error.
-        Err(bridge.end().err().unwrap_or_else(|| Fault::new(PALPATE_CONNECTION, "the server does not answer")))
+        Err(bridge.end().1.unwrap_or_else(|| Fault::new(PALPATE_CONNECTION, "the server does not answer")))
     })
 }
 
 impl palpate_bridge {
-    /// Ends the loop, and waits for that.
-    fn end(self) -> Result<palpate_bridge_report, Fault> {
+    /// Ends the loop, and waits for that. What it has done, and why it could not go on, if it couldn't.
+    fn end(self) -> (palpate_bridge_report, Option<Fault>) {
         self.stop.notify_one();
-        let ended = os::block_on(&self.shared.runtime, self.task);
-        let report = ended.map_err(|_| Fault::new(PALPATE_INTERNAL, "the loop panicked"))??;
+        let (report, fault) = match os::block_on(&self.shared.runtime, self.task) {
+            Ok(Ok(mut report)) => {
+                let failure = report.failure.take();
+                (Some(report), failure.map(Fault::from))
+            }
+            Ok(Err(error)) => (None, Some(error.into())),
+            Err(_) => (None, Some(Fault::new(PALPATE_INTERNAL, "the loop panicked"))),
+        };
         let seen = seen_of(&self.seen);
-        Ok(palpate_bridge_report {
+        let traffic = report.as_ref().map(|report| report.traffic).unwrap_or_default();
+        let told = palpate_bridge_report {
             ticks: seen.ticks,
-            late_ticks: report.late_ticks,
-            missed_ticks: report.missed_ticks,
-            connections: report.traffic.connections,
-            samples: report.traffic.samples,
-            positions: report.traffic.poses,
+            late_ticks: report.as_ref().map_or(0, |report| report.late_ticks),
+            missed_ticks: report.as_ref().map_or(0, |report| report.missed_ticks),
+            connections: traffic.connections,
+            samples: traffic.samples,
+            positions: traffic.poses,
             priority: seen.priority as u32,
-        })
+            result: fault.as_ref().map_or(PALPATE_OK, Fault::code) as u32,
+        };
+        (told, fault)
     }
 }
 
@@ -268,8 +281,19 @@ pub unsafe extern "C" fn palpate_bridge_look(
     })
 }
 
-/// Ends the loop, waits for that, and writes what it has done; `report` may be null. `PALPATE_DEVICE` if the device has failed:
-/// `palpate_last_error` tells how. The handle is given back in any case. Any thread, once; not from a function of the device.
+/// Stops rendering until `enable` of a reading goes from 0 to 1 again; the force falls within the next ticks. Any thread, also from
+/// a function of the device.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_bridge_disable(bridge: *const palpate_bridge) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promise.
+        unsafe { at(bridge, "bridge is null") }?.disable.disable();
+        Ok(())
+    })
+}
+
+/// Ends the loop, waits for that, and writes what it has done, also if it has failed; `report` may be null. `PALPATE_DEVICE` if the
+/// device has failed: `palpate_last_error` tells how. The handle is given back in any case. Any thread, once; not from a function of the device.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_bridge_end(
     bridge: *mut palpate_bridge,
@@ -282,10 +306,10 @@ pub unsafe extern "C" fn palpate_bridge_end(
             return Err(Fault::argument("bridge is null"));
         }
         // SAFETY: the caller's promise.
-        let told = unsafe { Box::from_raw(bridge) }.end()?;
+        let (told, fault) = unsafe { Box::from_raw(bridge) }.end();
         if let Some(out) = out {
             *out = told;
         }
-        Ok(())
+        fault.map_or(Ok(()), Err)
     })
 }

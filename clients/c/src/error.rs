@@ -71,6 +71,10 @@ impl Fault {
         Fault::new(PALPATE_ARGUMENT, words)
     }
 
+    pub(crate) fn code(&self) -> palpate_result {
+        self.code
+    }
+
     pub(crate) fn new(code: palpate_result, words: impl Into<Cow<'static, str>>) -> Self {
         Fault { code, words: words.into() }
     }

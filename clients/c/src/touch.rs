@@ -36,7 +36,7 @@ pub enum palpate_state {
     /// There was no connection yet.
     #[default]
     PALPATE_STATE_WAITING = 0,
-    /// Nothing is rendered until `enable` goes from 0 to 1.
+    /// Nothing is rendered until `enable` goes from 0 to 1. Also if it has, until the first news of the tissue.
     PALPATE_STATE_DISABLED = 1,
     /// Rendering, or beginning to.
     PALPATE_STATE_ENABLED = 2,

@@ -1,9 +1,11 @@
 /* What is wrong is an error with words, and never more than that: `errors URL`. */
+#define _POSIX_C_SOURCE 200112L
 #include <math.h>
 #include <palpate.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <time.h>
 
 static int failures = 0;
 
@@ -30,6 +32,13 @@ static int read_fails(void *user, palpate_reading *reading) {
     (void)reading;
     /* After it has been connected for a while. */
     return ++*(int *)user > 2000 ? 7 : 0;
+}
+/* Above the tissue. Asks for forces again and again, or goes on as it was. */
+static volatile int holds = 0;
+static int read_asks(void *user, palpate_reading *reading) {
+    reading->position.z = 0.01;
+    reading->enable = holds || ++*(int *)user / 50 % 2;
+    return 0;
 }
 static int zero_at_end = 0;
 static int write_ok(void *user, const palpate_vector *force_n) {
@@ -147,7 +156,14 @@ int main(int count, char **arguments) {
     palpate_felt felt;
     EXPECT(palpate_touch_tick(touch, NULL, 0.0, &felt), PALPATE_ARGUMENT, "reading is null");
     EXPECT(palpate_touch_tick(touch, &reading, 0.0, &felt), PALPATE_OK, NULL);
-    if (felt.state != PALPATE_STATE_ENABLED || felt.is_over) failures++, fprintf(stderr, "state %u\n", felt.state);
+    /* Enabled as soon as there is news of the tissue, and not before. */
+    for (int tick = 1; felt.state != PALPATE_STATE_ENABLED && !felt.is_over; tick++) {
+        if (felt.state != PALPATE_STATE_DISABLED || felt.age_s >= 0.0) break;
+        nanosleep(&(struct timespec){0, 1000000}, NULL);
+        EXPECT(palpate_touch_tick(touch, &reading, tick * 0.001, &felt), PALPATE_OK, NULL);
+    }
+    if (felt.state != PALPATE_STATE_ENABLED || felt.age_s < 0.0 || felt.is_over)
+        failures++, fprintf(stderr, "state %u, age %g s\n", felt.state, felt.age_s);
     reading.position.x = NAN;
     EXPECT(palpate_touch_tick(touch, &reading, 0.001, &felt), PALPATE_ARGUMENT, "not finite");
     if (felt.state != PALPATE_STATE_FAULT || felt.force_n.z != 0.0) failures++, fprintf(stderr, "fault %u\n", felt.state);
@@ -201,8 +217,33 @@ int main(int count, char **arguments) {
     palpate_bridge_state state;
     do palpate_bridge_look(bridge, &state);
     while (!state.is_over);
-    EXPECT(palpate_bridge_end(bridge, NULL), PALPATE_DEVICE, "`read` returned 7");
+    palpate_bridge_report report;
+    EXPECT(palpate_bridge_end(bridge, &report), PALPATE_DEVICE, "`read` returned 7");
     if (!zero_at_end) failures++, fprintf(stderr, "a device that failed is left with a force\n");
+    if (report.result != PALPATE_DEVICE || report.ticks == 0 || report.connections == 0)
+        failures++, fprintf(stderr, "result %u, %u ticks\n", report.result, (unsigned)report.ticks);
+    EXPECT(palpate_bridge_disable(NULL), PALPATE_ARGUMENT, "bridge is null");
+    reads = 0;
+    device.read = read_asks;
+    EXPECT(palpate_bridge_begin(session, &device, NULL, &bridge), PALPATE_OK, NULL);
+    do palpate_bridge_look(bridge, &state);
+    while (state.state != PALPATE_STATE_ENABLED && !state.is_over);
+    holds = 1;
+    uint64_t from = state.ticks;
+    do palpate_bridge_look(bridge, &state);
+    while (state.ticks < from + 10 && !state.is_over);
+    EXPECT(palpate_bridge_disable(bridge), PALPATE_OK, NULL);
+    do palpate_bridge_look(bridge, &state);
+    while (state.state != PALPATE_STATE_DISABLED && !state.is_over);
+    from = state.ticks;
+    do palpate_bridge_look(bridge, &state);
+    while (state.state == PALPATE_STATE_DISABLED && state.ticks < from + 200 && !state.is_over);
+    if (state.state != PALPATE_STATE_DISABLED) failures++, fprintf(stderr, "enabled by a button that was held\n");
+    holds = 0;
+    do palpate_bridge_look(bridge, &state);
+    while (state.state != PALPATE_STATE_ENABLED && !state.is_over);
+    EXPECT(palpate_bridge_end(bridge, &report), PALPATE_OK, NULL);
+    if (report.result != PALPATE_OK) failures++, fprintf(stderr, "result %u\n", report.result);
 
     /* What is deleted is gone; handles stay usable, in any order. */
     EXPECT(palpate_session_delete(session), PALPATE_OK, NULL);

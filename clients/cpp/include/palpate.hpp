@@ -165,11 +165,18 @@ public:
         palpate_bridge_look(bridge_.get(), &state);
         return state;
     }
+    /// Stops rendering until `enable` goes from 0 to 1 again. Any thread.
+    void disable() noexcept { palpate_bridge_disable(bridge_.get()); }
     /// Ends the loop and tells what it has done, or how the device failed.
     Result<Report> end() {
         Report report{};
-        if (auto code = palpate_bridge_end(bridge_.release(), &report)) return detail::error(code);
+        if (auto error = end(report)) return *error;
         return report;
+    }
+    /// The same, and what a device has done that failed.
+    std::optional<Error> end(Report& report) {
+        if (auto code = palpate_bridge_end(bridge_.release(), &report)) return detail::error(code);
+        return std::nullopt;
     }
     explicit Bridge(palpate_bridge* bridge) : bridge_(bridge) {}
 

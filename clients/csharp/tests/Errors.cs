@@ -50,7 +50,10 @@ static class Errors
                 var bridge = session.Bridge(new Failing(), TouchOptions.Default);
                 while (!bridge.Look().IsOver) System.Threading.Thread.Sleep(10);
                 if (bridge.Look().Ticks < 2000) failures++;
-                Expect(Code.Device, "the cable is out", () => bridge.End());
+                bridge.Disable();
+                var report = default(Report);
+                Expect(Code.Device, "the cable is out", () => bridge.End(out report));
+                if (report.Result != Code.Device || report.Ticks == 0 || report.Connections == 0) failures++;
                 session.Delete();
                 Expect(Code.Refused, "", () => session.Touch(TouchOptions.Default));
             }

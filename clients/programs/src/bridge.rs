@@ -6,13 +6,13 @@ use glam::DVec3;
 use palpate_client::HapticDevice;
 use palpate_client::bridge::{Options, Report, Session, Target, Tick, Traffic, run};
 use palpate_client::devices::{self, Kind, Placed};
+use palpate_simulated::random::Random;
+use palpate_simulated::task::{LEAD_S, Task};
 use palpate_touch::{LimitCause, RenderingState, Tip};
 use serde_json::json;
 
 use crate::credentials::CredentialOptions;
 use crate::placement::PlacementOptions;
-use crate::simulated::random::Random;
-use crate::simulated::task::{LEAD_S, Task};
 use crate::simulated::{Simulated, device_named, hand_named};
 use crate::{Failure, interrupted, table, warn};
 

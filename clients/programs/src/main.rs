@@ -32,7 +32,6 @@ mod placement;
 mod play;
 mod proxy;
 mod replay;
-mod scene_file;
 mod simulated;
 mod table;
 mod top;

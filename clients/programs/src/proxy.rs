@@ -1,12 +1,13 @@
 //! `palpate-client proxy`: a bad network on this machine, between clients and a server.
 
 use std::net::SocketAddr;
+use std::sync::Arc;
 
 use palpate_proto::refusal::{Refusal, number};
+use palpate_simulated::network::Conditions;
+use palpate_simulated::relay::{MOST_FLOWS, Network, Passed};
 use serde_json::json;
 
-use crate::simulated::network::Conditions;
-use crate::simulated::relay::{MOST_FLOWS, Network, Passed};
 use crate::{Failure, interrupted, table};
 
 /// Arguments of `proxy`.
@@ -52,13 +53,14 @@ pub(crate) struct Arguments {
 /// # Errors
 /// Returns an error if an argument is refused or the address is not free.
 pub(crate) async fn proxy(arguments: &Arguments) -> Result<(), Failure> {
-    let network = Network::new(conditions(arguments)?, arguments.seed, MOST_FLOWS);
+    let network = Network::new(conditions(arguments)?, arguments.seed, MOST_FLOWS, Arc::new(Box::new(crate::warn)));
     let mut listen = arguments.listen;
+    let unheard = |error: std::io::Error| Failure::Failed(error.to_string());
     if !arguments.udp {
-        listen = network.relay_tcp(listen, arguments.to)?;
+        listen = network.relay_tcp(listen, arguments.to).map_err(unheard)?;
     }
     if !arguments.tcp {
-        listen = network.relay_udp(listen, arguments.to)?;
+        listen = network.relay_udp(listen, arguments.to).map_err(unheard)?;
     }
     crate::say!("palpate-client proxy: {listen} leads to {}", arguments.to);
     interrupted().await;

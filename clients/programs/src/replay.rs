@@ -17,6 +17,7 @@ use palpate::wire;
 use palpate_client::{Channel, Error, Touch, describe, fleet};
 use palpate_proto::pb;
 use palpate_proto::refusal::Reason;
+use palpate_simulated::scene_file::SceneFile;
 use pb::haptic_service_client::HapticServiceClient;
 use pb::session_service_client::SessionServiceClient;
 use pb::touch_request::Message as Say;
@@ -28,7 +29,6 @@ use tonic::Status;
 
 use crate::Failure;
 use crate::credentials::CredentialOptions;
-use crate::scene_file::{SceneFile, with_hint};
 use crate::table::progress_bar;
 use measured::{Measured, percentiles_us};
 
@@ -170,6 +170,23 @@ pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
     let deleted = session.client.delete_session(pb::DeleteSessionRequest { session_id: session.id });
     let _ = tokio::time::timeout(Duration::from_secs(2), deleted).await;
     ended
+}
+
+/// The failure of a session with this scene. If the server does not know the name, it may be meant as a file: the message
+/// says how to give one.
+fn with_hint(scene: &str, failure: Failure) -> Failure {
+    let file = format!("{scene}.toml");
+    match failure {
+        Failure::Refused(why) if why.contains(Reason::UnknownScene.as_str()) => {
+            let hint = if std::path::Path::new(&file).is_file() {
+                format!("did you mean the file `{file}`?")
+            } else {
+                "give your own scene by its path, --scene FILE.toml".to_owned()
+            };
+            Failure::Refused(format!("{why}; {hint}"))
+        }
+        failure => failure,
+    }
 }
 
 fn failed(status: Status) -> Failure {

@@ -1,8 +1,8 @@
 """Soft tissue to touch: in this process at full speed, over a network, and as it was recorded.
 
 In this process, `run` plays a script on a scene, `study` many of them over threads, and a `Session` is a tissue that you step
-and touch yourself. `connect` (and `palpate.aio.connect`) leads to a server. A `Journal` is a recorded session, and `Offline` renders the forces of a
-recorded touch.
+and touch yourself. `connect` (and `palpate.aio.connect`) leads to a server, and `load` finds out what it bears. A `Journal` is a
+recorded session, and `Offline` renders the forces of a recorded touch.
 
 SI units; the unit of a value is in its name. Arrays have one row for each point, in the order of `Tissue.rest_m`.
 """
@@ -65,6 +65,7 @@ __all__ = [
     "aio",
     "connect",
     "devices",
+    "load",
     "press",
     "run",
     "scenes",
@@ -78,3 +79,9 @@ def connect(url, *, token=None, ca=None, tls_name=None, cert=None, key=None, wit
     return Client.connect(
         url, token=token, ca=ca, tls_name=tls_name, cert=cert, key=key, within_s=within_s, awaited=False
     )
+
+
+def load(plan, server="http://127.0.0.1:7117", *, report=None):
+    """Loads a server with users by a plan, and gives the report: `Client.load` of a connection, or of a URL."""
+    client = connect(server) if isinstance(server, str) else server
+    return client.load(plan, report=report)

@@ -46,11 +46,14 @@ class Scene:
         plan: Optional[Tissue] = None,
     ) -> None: ...
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Its name."""
     @property
-    def points(self) -> int: ...
+    def points(self) -> int:
+        """The number of its points."""
     @property
-    def rate_hz(self) -> float: ...
+    def rate_hz(self) -> float:
+        """Steps a second."""
 
 class Script:
     """Forces and movements over time: from TOML text, a file, or a name (`scripts()`). `folder` is where a text's traces are."""
@@ -65,36 +68,51 @@ class Tissue:
     def __init__(self, scene: Union[Scene, Source]) -> None: ...
     def __len__(self) -> int: ...
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """The name of its scene."""
     @property
-    def rate_hz(self) -> float: ...
+    def rate_hz(self) -> float:
+        """Steps a second."""
     @property
-    def integrator(self) -> str: ...
+    def integrator(self) -> str:
+        """The integrator that it is stepped with."""
     @property
-    def substeps(self) -> int: ...
+    def substeps(self) -> int:
+        """Substeps of each step."""
     @property
-    def precision(self) -> str: ...
+    def precision(self) -> str:
+        """The number format of the points."""
     @property
-    def lanes(self) -> str: ...
+    def lanes(self) -> str:
+        """The vectors of the machine that it is stepped with. They change no bit."""
     @property
-    def expected_error(self) -> float: ...
+    def expected_error(self) -> float:
+        """The error that is expected of displacement and force, relative to the largest of each; infinite if nothing is
+        known of it."""
     @property
-    def warnings(self) -> list[str]: ...
+    def warnings(self) -> list[str]:
+        """What a user should know of the scene, in words."""
     @property
     def grid(self) -> Optional[tuple[int, int]]:
         """Points along x and y of a sheet: rest_m.reshape(*grid, 3); None of a mesh."""
     @property
-    def rest_m(self) -> Vectors: ...
+    def rest_m(self) -> Vectors:
+        """Where each point rests."""
     @property
-    def normals(self) -> Vectors: ...
+    def normals(self) -> Vectors:
+        """The normal of the surface at rest at each point, out of the tissue."""
     @property
-    def fixed(self) -> NDArray[np.bool_]: ...
+    def fixed(self) -> NDArray[np.bool_]:
+        """Whether each point is fixed."""
     @property
-    def mass_kg(self) -> NDArray[np.float64]: ...
+    def mass_kg(self) -> NDArray[np.float64]:
+        """The mass of each point."""
     @property
-    def triangles(self) -> NDArray[np.uint32]: ...
+    def triangles(self) -> NDArray[np.uint32]:
+        """The triangles of the surface, each the rows of its three points, counter-clockwise from outside."""
     @property
-    def middle_m(self) -> tuple[float, float, float]: ...
+    def middle_m(self) -> tuple[float, float, float]:
+        """The middle of the tissue at rest. Devices have their origin there."""
     def index(self, point: Point) -> int:
         """The row of a point: (i, j) of a sheet, the number of a vertex of a mesh."""
     def point(self, index: int) -> Union[tuple[int, int], int]:
@@ -115,11 +133,14 @@ class Tip:
         damping_n_s_per_m: float = 0.0,
     ) -> None: ...
     @property
-    def radius_m(self) -> float: ...
+    def radius_m(self) -> float:
+        """The radius of the disc."""
     @property
-    def friction(self) -> float: ...
+    def friction(self) -> float:
+        """The coefficient of friction."""
     @property
-    def grasps(self) -> bool: ...
+    def grasps(self) -> bool:
+        """Whether it holds the tissue under it, in place of touching it."""
 
 class Session:
     """A tissue in use. What tools are told acts from the next step on, until they are told something else. Several threads may use
@@ -129,21 +150,29 @@ class Session:
     @staticmethod
     def restore(scene: Union[Scene, Tissue, Source], snapshot: bytes) -> Session:
         """Goes on from `save()`, of a session that began with `scene`. Poses have to be told again."""
-    def step(self, steps: int = 1) -> None: ...
+    def step(self, steps: int = 1) -> None:
+        """Does so many steps. Raises Failed if the tissue can't go on. Ctrl-C ends it between two steps."""
     @property
-    def steps(self) -> int: ...
+    def steps(self) -> int:
+        """Steps so far."""
     @property
-    def time_s(self) -> float: ...
+    def time_s(self) -> float:
+        """Simulated time so far."""
     @property
-    def tissue(self) -> Tissue: ...
+    def tissue(self) -> Tissue:
+        """The tissue, with the coefficients that it has now."""
     @property
-    def awake_points(self) -> int: ...
+    def awake_points(self) -> int:
+        """Points that the last step computed; the others are at rest."""
     @property
-    def guard_events(self) -> int: ...
+    def guard_events(self) -> int:
+        """How often the guard went back and halved the substep."""
     @property
-    def fault(self) -> Optional[str]: ...
+    def fault(self) -> Optional[str]:
+        """Why the tissue is not what its tools made of it, in words: it is held, or has recovered. None if it is."""
     @property
-    def hash(self) -> str: ...
+    def hash(self) -> str:
+        """The hash of the state: equal for equal bits."""
     def push(
         self,
         tool: int,
@@ -159,7 +188,8 @@ class Session:
         """Holds a point, and brings it this far from where it rests by the end of the step."""
     def pose(self, tool: int, place_m: Vector, tip: Optional[Tip] = None) -> None:
         """Brings a tool with a tip here by the end of the step. It stays here until it is told something else."""
-    def release(self, tool: int) -> None: ...
+    def release(self, tool: int) -> None:
+        """Ends what a tool does."""
     def tool(self, tool: int) -> Optional[ToolState]:
         """What a tool does and feels; None if it does nothing."""
     def change(
@@ -169,26 +199,34 @@ class Session:
         damping_n_s_per_m: Optional[float] = None,
         virtual_stiffness_n_per_m: Optional[float] = None,
         volume_stiffness_pa: Optional[float] = None,
-    ) -> None: ...
+    ) -> None:
+        """Makes the tissue softer or stiffer from the next step on. What is not named stays as it is."""
     def displacements(self, out: Optional[Vectors] = None) -> Vectors:
         """How far each point is from where it rests, with the digits of f32 at least; `records` has them all. `out` is an array to
         write into."""
-    def positions(self, out: Optional[Vectors] = None) -> Vectors: ...
-    def velocities(self, out: Optional[Vectors] = None) -> Vectors: ...
+    def positions(self, out: Optional[Vectors] = None) -> Vectors:
+        """Where each point is. `out` is an array to write into."""
+    def velocities(self, out: Optional[Vectors] = None) -> Vectors:
+        """The velocity of each point, m/s. `out` is an array to write into."""
     def records(self, points: Optional[Iterable[Point]] = None) -> NDArray[Any]:
         """Points with all that is known of them, as in `Run.points`; all points if none is named."""
     @property
-    def energy_j(self) -> dict[str, float]: ...
-    def save(self) -> bytes: ...
+    def energy_j(self) -> dict[str, float]:
+        """The energy of the tissue: kinetic, spring and virtual."""
+    def save(self) -> bytes:
+        """A snapshot, for `restore`."""
 
 class Journal:
     """A recorded session: a file of `palpate serve --journal`."""
 
     def __init__(self, path: Source) -> None: ...
     @property
-    def info(self) -> dict[str, Any]: ...
-    def tools(self) -> dict[int, _ToolCourse]: ...
-    def commands(self) -> Commands: ...
+    def info(self) -> dict[str, Any]:
+        """What it is of: scene, first and last step, and more, by name."""
+    def tools(self) -> dict[int, _ToolCourse]:
+        """What each tool did and felt, by its number."""
+    def commands(self) -> Commands:
+        """Every command, by the step at which it acted."""
     def verify(self) -> Verdict:
         """Simulates it again, and compares every hash and snapshot."""
     def session(self, step: Optional[int] = None) -> Session:
@@ -217,7 +255,9 @@ class Offline:
     def disable(self) -> None:
         """Stops rendering until it is enabled again."""
     @property
-    def state(self) -> Literal["waiting", "disabled", "enabled", "paused", "fault"]: ...
+    def state(self) -> Literal["waiting", "disabled", "enabled", "paused", "fault"]:
+        """Whether forces are rendered: "waiting" before a connection, "disabled" until forces are asked for, "enabled",
+        "paused" after a silence, "fault" after a position that is not finite or outside the workspace."""
     @property
     def place_m(self) -> tuple[float, float, float]:
         """Where the tool was at the last tick, in the tissue's frame."""
@@ -226,11 +266,15 @@ class Offline:
         """How old the newest news of the tissue is; None before the first."""
 
 class Samples(Iterator[dict[str, Any]]):
+    """The samples of a session, one after the other: what tools feel."""
+
     def take(self, count: int) -> Sampled:
         """The next samples, as arrays."""
     def __next__(self) -> dict[str, Any]: ...
 
 class Frames(Iterator[Frame]):
+    """The frames of a session, one after the other: the moving surface."""
+
     def __next__(self) -> Frame: ...
 
 class RemoteSession:
@@ -238,13 +282,17 @@ class RemoteSession:
     there."""
 
     @property
-    def id(self) -> str: ...
+    def id(self) -> str:
+        """The id of the session, for `Client.session`."""
     @property
     def server(self) -> str:
         """URL of the server that had it at last."""
-    def status(self) -> dict[str, Any]: ...
-    def start(self, *, until_step: Optional[int] = None) -> int: ...
-    def pause(self) -> None: ...
+    def status(self) -> dict[str, Any]:
+        """How the session stands: state, step, points, held tools, and more."""
+    def start(self, *, until_step: Optional[int] = None) -> int:
+        """Lets it run, until a step if one is named; gives the step that comes next."""
+    def pause(self) -> None:
+        """Holds it after the step that is under way."""
     def change(
         self,
         *,
@@ -253,13 +301,21 @@ class RemoteSession:
         virtual_stiffness_n_per_m: Optional[float] = None,
         volume_stiffness_pa: Optional[float] = None,
         at_step: Optional[int] = None,
-    ) -> int: ...
-    def hash(self, *, at_step: Optional[int] = None) -> tuple[int, str]: ...
+    ) -> int:
+        """Makes the tissue softer or stiffer, from a step on if one is named; gives that step. What is not named stays
+        as it is."""
+    def hash(self, *, at_step: Optional[int] = None) -> tuple[int, str]:
+        """How many steps were done and the hash of the state then: after so many, or now."""
     def save(self) -> bytes:
         """A journal of this moment (MCAP), for `Journal`."""
-    def delete(self) -> None: ...
-    def samples(self, *, every_steps: int = 1, heartbeat_s: Optional[float] = None) -> Samples: ...
-    def frames(self, *, rate_hz: float = 60.0, refinement: int = 0, precise: bool = True) -> Frames: ...
+    def delete(self) -> None:
+        """Ends it for everybody."""
+    def samples(self, *, every_steps: int = 1, heartbeat_s: Optional[float] = None) -> Samples:
+        """The samples of all tools from now on: of every step, or of every so many. `heartbeat_s` is how often one
+        comes of a tissue at rest."""
+    def frames(self, *, rate_hz: float = 60.0, refinement: int = 0, precise: bool = True) -> Frames:
+        """The surface from now on, at most `rate_hz` times a second. `refinement` puts so many vertices between two of
+        the tissue; not `precise` halves the bytes."""
     def mesh(self, *, refinement: int = 0) -> dict[str, Any]:
         """What of the surface stays: grid, rest_m, uv, triangles, file_vertex."""
     def touch(
@@ -292,8 +348,11 @@ class RemoteSession:
         at_m: Optional[Vector] = None,
         falloff_per_m: float = 200.0,
         falloff_offset: float = 0.0,
-    ) -> None: ...
-    def grasp(self, tool: int, point: Point, displacement_m: Vector) -> None: ...
+    ) -> None:
+        """Pushes at a point or a place; at a distance r from there by force_n * exp(-falloff_per_m * r +
+        falloff_offset)."""
+    def grasp(self, tool: int, point: Point, displacement_m: Vector) -> None:
+        """Holds a point, and brings it this far from where it rests."""
     def release(self, tool: int) -> None:
         """Ends what a tool does, and gives it back."""
     def play(self, script: Union[Script, Source], *, scene: Optional[Union[Scene, Source]] = None) -> Run:
@@ -306,12 +365,24 @@ class RemoteSession:
 class Client:
     """A connection to a server."""
 
-    def scenes(self) -> list[str]: ...
-    def sessions(self) -> list[dict[str, Any]]: ...
+    def scenes(self) -> list[str]:
+        """The names of the scenes that the server has."""
+    def sessions(self) -> list[dict[str, Any]]:
+        """How each of its sessions stands, as `RemoteSession.status` tells."""
     def create_session(
         self, scene: Union[str, Scene], *, paused: bool = False, idle_timeout_s: Optional[float] = None
-    ) -> RemoteSession: ...
-    def session(self, session_id: str) -> RemoteSession: ...
+    ) -> RemoteSession:
+        """A session of a scene that the server has, by its name, or of one of yours. A session that nobody uses for
+        `idle_timeout_s` is deleted."""
+    def load(
+        self, plan: Union[Source, dict[str, Any]], *, report: Optional[Union[str, PathLike[str]]] = None
+    ) -> dict[str, Any]:
+        """Loads the server with users by a plan, as `palpate-client load --plan` does, and gives the report. `plan` is
+        a file (TOML), its text, or a dict with the same keys. `report` is a file to write a page with plots to (HTML).
+        "kept" of the report tells whether all objectives were met and no stream broke, "why" what was not; see
+        docs/operating.md. Ctrl-C ends it, and deletes its sessions."""
+    def session(self, session_id: str) -> RemoteSession:
+        """The session of an id. Raises Refused if there is none."""
 
 def connect(
     url: str,
@@ -323,6 +394,12 @@ def connect(
     key: Optional[str] = None,
     within_s: float = 10.0,
 ) -> Client: ...
+def load(
+    plan: Union[Source, dict[str, Any]],
+    server: Union[str, Client] = "http://127.0.0.1:7117",
+    *,
+    report: Optional[Union[str, PathLike[str]]] = None,
+) -> dict[str, Any]: ...
 def run(
     scene: Union[Scene, Tissue, Source], script: Union[Script, Source], *, held: bool = False, audit: bool = False
 ) -> Run:
@@ -350,6 +427,9 @@ def study(
     """Runs of many cases (scene, script) over threads, in their order; by default as many threads as there are processors.
     `progress` is called with how many are done and how many there are."""
 
-def scenes(folder: Source = "scenes") -> list[str]: ...
-def scripts(folder: Source = "scripts") -> list[str]: ...
-def devices() -> list[str]: ...
+def scenes(folder: Source = "scenes") -> list[str]:
+    """The names of the scenes that are shipped, and of the files in a folder."""
+def scripts(folder: Source = "scripts") -> list[str]:
+    """The names of the scripts that are shipped, and of the files in a folder."""
+def devices() -> list[str]:
+    """The names of the devices whose limits are known."""

@@ -1,4 +1,5 @@
 from collections.abc import AsyncIterator
+from os import PathLike
 from typing import Any, Optional, Union
 
 from . import Frame, Point, Run, Sampled, Scene, Script, Source, Tip, Touched, Vector
@@ -69,6 +70,9 @@ class Client:
     async def create_session(
         self, scene: Union[str, Scene], *, paused: bool = False, idle_timeout_s: Optional[float] = None
     ) -> RemoteSession: ...
+    async def load(
+        self, plan: Union[Source, dict[str, Any]], *, report: Optional[Union[str, PathLike[str]]] = None
+    ) -> dict[str, Any]: ...
     async def session(self, session_id: str) -> RemoteSession: ...
 
 async def connect(

@@ -1,6 +1,7 @@
 //! A client of a server. Each call gives its result at once, or something to await: `awaited` says which, and is handed on from
 //! the connection to what it makes.
 
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -20,6 +21,7 @@ use crate::arrays::vector;
 use crate::device::Given;
 use crate::error::{of_client, of_status, refused, wrong};
 use crate::held::Held;
+use crate::load::load;
 use crate::play::play;
 use crate::scene::{Scene, Script, point_name};
 use crate::sent::Sent;
@@ -60,6 +62,7 @@ impl Server {
 
 #[pymethods]
 impl Server {
+    /// What `palpate.connect` and `palpate.aio.connect` call.
     #[staticmethod]
     #[pyo3(signature = (url, *, token=None, ca=None, tls_name=None, cert=None, key=None, within_s=10.0, awaited=false))]
     #[allow(clippy::too_many_arguments)]
@@ -89,6 +92,7 @@ impl Server {
         })
     }
 
+    /// The names of the scenes that the server has.
     fn scenes<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let mut sessions = self.sessions();
         answer(py, self.awaited, async move {
@@ -97,6 +101,7 @@ impl Server {
         })
     }
 
+    /// How each of its sessions stands, as `RemoteSession.status` tells.
     #[pyo3(name = "sessions")]
     fn sessions_there<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let mut sessions = self.sessions();
@@ -106,6 +111,8 @@ impl Server {
         })
     }
 
+    /// A session of a scene that the server has, by its name, or of one of yours. A session that nobody uses for
+    /// `idle_timeout_s` is deleted.
     #[pyo3(signature = (scene, *, paused=false, idle_timeout_s=None))]
     fn create_session<'py>(
         &self,
@@ -140,6 +147,21 @@ impl Server {
         })
     }
 
+    /// Loads the server with users by a plan, as `palpate-client load --plan` does, and gives the report. `plan` is a
+    /// file (TOML), its text, or a dict with the same keys. `report` is a file to write a page with plots to (HTML).
+    /// "kept" of the report tells whether all objectives were met and no stream broke, "why" what was not; see
+    /// docs/operating.md. Ctrl-C ends it, and deletes its sessions.
+    #[pyo3(signature = (plan, *, report=None))]
+    fn load<'py>(
+        &self,
+        py: Python<'py>,
+        plan: &Bound<'py, PyAny>,
+        report: Option<PathBuf>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        load(py, self.server.clone(), plan, report, self.awaited)
+    }
+
+    /// The session of an id. Raises Refused if there is none.
     fn session<'py>(&self, py: Python<'py>, session_id: String) -> PyResult<Bound<'py, PyAny>> {
         // Refused if there is none.
         answer(py, self.awaited, self.clone().found(session_id, None))
@@ -160,7 +182,8 @@ fn numbers(DVec3 { x, y, z }: DVec3) -> pb::Vector3 {
     pb::Vector3 { x, y, z }
 }
 
-/// A session of a server.
+/// A session of a server. `with` deletes it at the end. In a fleet it is followed to whichever server has it: calls and
+/// streams go on there.
 #[pyclass(frozen, module = "palpate")]
 pub(crate) struct RemoteSession {
     pub(crate) session: Arc<Followed>,
@@ -197,16 +220,19 @@ impl RemoteSession {
 
 #[pymethods]
 impl RemoteSession {
+    /// The id of the session, for `Client.session`.
     #[getter]
     fn id(&self) -> &str {
         self.session.session_id()
     }
 
+    /// URL of the server that had it at last.
     #[getter]
     fn server(&self) -> String {
         self.session.server().url().to_owned()
     }
 
+    /// How the session stands: state, step, points, held tools, and more.
     fn status<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let (session, session_id) = self.own();
         answer(py, self.awaited, async move {
@@ -215,6 +241,7 @@ impl RemoteSession {
         })
     }
 
+    /// Lets it run, until a step if one is named; gives the step that comes next.
     #[pyo3(signature = (*, until_step=None))]
     fn start<'py>(&self, py: Python<'py>, until_step: Option<u64>) -> PyResult<Bound<'py, PyAny>> {
         let (session, session_id) = self.own();
@@ -224,6 +251,7 @@ impl RemoteSession {
         })
     }
 
+    /// Holds it after the step that is under way.
     fn pause<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let (session, session_id) = self.own();
         answer(py, self.awaited, async move {
@@ -232,6 +260,8 @@ impl RemoteSession {
         })
     }
 
+    /// Makes the tissue softer or stiffer, from a step on if one is named; gives that step. What is not named stays as
+    /// it is.
     #[pyo3(signature = (*, stiffness_n_per_m=None, damping_n_s_per_m=None, virtual_stiffness_n_per_m=None,
         volume_stiffness_pa=None, at_step=None))]
     fn change<'py>(
@@ -255,6 +285,7 @@ impl RemoteSession {
         answer(py, self.awaited, async move { Ok(called!(session, SessionServiceClient.update_tissue(request))?.step) })
     }
 
+    /// How many steps were done and the hash of the state then: after so many, or now.
     #[pyo3(signature = (*, at_step=None))]
     fn hash<'py>(&self, py: Python<'py>, at_step: Option<u64>) -> PyResult<Bound<'py, PyAny>> {
         let (session, session_id) = self.own();
@@ -265,6 +296,7 @@ impl RemoteSession {
         })
     }
 
+    /// A journal of this moment (MCAP), for `Journal`.
     fn save<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let (session, session_id) = self.own();
         answer(py, self.awaited, async move {
@@ -278,6 +310,7 @@ impl RemoteSession {
         })
     }
 
+    /// Ends it for everybody.
     fn delete<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let (session, session_id) = self.own();
         answer(py, self.awaited, async move {
@@ -286,6 +319,8 @@ impl RemoteSession {
         })
     }
 
+    /// The samples of all tools from now on: of every step, or of every so many. `heartbeat_s` is how often one comes
+    /// of a tissue at rest.
     #[pyo3(signature = (*, every_steps=1, heartbeat_s=None))]
     fn samples<'py>(&self, py: Python<'py>, every_steps: u32, heartbeat_s: Option<f64>) -> PyResult<Bound<'py, PyAny>> {
         let request = pb::WatchSamplesRequest {
@@ -301,6 +336,8 @@ impl RemoteSession {
         })
     }
 
+    /// The surface from now on, at most `rate_hz` times a second. `refinement` puts so many vertices between two of the
+    /// tissue; not `precise` halves the bytes.
     #[pyo3(signature = (*, rate_hz=60.0, refinement=0, precise=true))]
     fn frames<'py>(
         &self,
@@ -323,6 +360,7 @@ impl RemoteSession {
         })
     }
 
+    /// What of the surface stays: grid, rest_m, uv, triangles, file_vertex.
     #[pyo3(signature = (*, refinement=0))]
     fn mesh<'py>(&self, py: Python<'py>, refinement: u32) -> PyResult<Bound<'py, PyAny>> {
         let (session, session_id) = self.own();
@@ -341,6 +379,10 @@ impl RemoteSession {
         })
     }
 
+    /// Touches with a device at 1 kHz, on a thread of its own, by the rendering law and within the safety envelope.
+    ///
+    /// `device` is a Course, or an object with `read()`, which returns ((x, y, z), enable), and `write(force_n)`, and
+    /// perhaps `limits`, as a Course has them. A change of enable from False to True asks for forces.
     #[pyo3(signature = (device, *, seconds=None, tool=0, tip=None, deadband=0.0, up_deadband=0.0, datagrams=true,
         holder="python", remember=true))]
     #[allow(clippy::too_many_arguments)]
@@ -381,6 +423,9 @@ impl RemoteSession {
         })
     }
 
+    /// Brings a tool with a tip here by the end of the next step, and takes the tool first if that is needed. It stays
+    /// here until it is told something else, also when the session moves. Raises Refused, reason TOOL_HELD, if another
+    /// has the tool.
     #[pyo3(signature = (tool, place_m, tip=None))]
     fn pose<'py>(
         &self,
@@ -393,6 +438,7 @@ impl RemoteSession {
         self.tell(py, tool, Action::Pose(touch::pose(vector("place_m", place_m)?, &tip)))
     }
 
+    /// Pushes at a point or a place; at a distance r from there by force_n * exp(-falloff_per_m * r + falloff_offset).
     #[pyo3(signature = (tool, force_n, *, point=None, at_m=None, falloff_per_m=200.0, falloff_offset=0.0))]
     #[allow(clippy::too_many_arguments)]
     fn push<'py>(
@@ -422,6 +468,7 @@ impl RemoteSession {
         self.tell(py, tool, Action::Force(force))
     }
 
+    /// Holds a point, and brings it this far from where it rests.
     fn grasp<'py>(
         &self,
         py: Python<'py>,
@@ -438,11 +485,15 @@ impl RemoteSession {
         self.tell(py, tool, Action::Position(pb::Position { point, vertex, target }))
     }
 
+    /// Ends what a tool does, and gives it back.
     fn release<'py>(&self, py: Python<'py>, tool: u32) -> PyResult<Bound<'py, PyAny>> {
         let released = self.held.clone().release(self.session.clone(), tool);
         answer(py, self.awaited, async move { released.await.map(|()| NOTHING).map_err(of_client) })
     }
 
+    /// Plays a script in real time, each command at its exact step, from the session's step on. The session must stand,
+    /// and stands at the end. From step 0 on the records are those of `run(..., held=True)`. A session on a mesh needs
+    /// its `scene`, unless you made it from one.
     #[pyo3(signature = (script, *, scene=None))]
     fn play<'py>(
         &self,

@@ -14,7 +14,7 @@ use pyo3::types::PyDict;
 use crate::ending;
 use crate::error::{refused, wrong};
 
-/// The names of the devices that are known.
+/// The names of the devices whose limits are known.
 #[pyfunction]
 pub(crate) fn devices() -> Vec<&'static str> {
     DEVICES.iter().map(|device| device.name).chain([UNDECLARED.name]).collect()

@@ -19,7 +19,7 @@ use crate::scene::limits;
 use crate::session::{Inner, Session};
 use crate::waiting::work;
 
-/// A journal.
+/// A recorded session: a file of `palpate serve --journal`.
 #[pyclass(frozen, module = "palpate")]
 pub(crate) struct Journal {
     path: PathBuf,
@@ -104,6 +104,7 @@ impl Journal {
         Ok(Journal { path, header, survey })
     }
 
+    /// What it is of: scene, first and last step, and more, by name.
     #[getter]
     fn info<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let Journal { header, survey, .. } = self;
@@ -126,6 +127,7 @@ impl Journal {
         Ok(found)
     }
 
+    /// What each tool did and felt, by its number.
     fn tools<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let read = py.detach(|| {
             let mut courses: BTreeMap<u32, Course> = BTreeMap::new();
@@ -157,6 +159,7 @@ impl Journal {
         Ok(found)
     }
 
+    /// Every command, by the step at which it acted.
     fn commands<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let read = py.detach(|| {
             let (mut commands, mut reader) = (Commands::default(), self.open()?);
@@ -183,6 +186,7 @@ impl Journal {
         py.import("palpate._journal")?.getattr("Commands")?.call((), Some(&given))
     }
 
+    /// Simulates it again, and compares every hash and snapshot.
     fn verify<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let verified = work(py, |stop| {
             let mut reader = self.open()?;
@@ -199,6 +203,7 @@ impl Journal {
         made.call1((begin, end, hashes, snapshots, step, text))
     }
 
+    /// The session when so many steps were done; at the end if None.
     #[pyo3(signature = (step=None))]
     fn session(&self, py: Python<'_>, step: Option<u64>) -> PyResult<Session> {
         let step = step.unwrap_or(self.survey.until_step);

@@ -5,7 +5,7 @@
 
 // Programs of one user live in real time; the rule is for what a server computes.
 #![allow(clippy::disallowed_methods)]
-// What Python sees is documented in palpate/__init__.pyi.
+// What Python sees is documented for `help` here, and in the same words for editors in palpate/__init__.pyi.
 #![allow(clippy::needless_pass_by_value)]
 // A method of a type with a lifetime is for one lifetime, a closure for all.
 #![allow(clippy::redundant_closure_for_method_calls)]
@@ -17,6 +17,7 @@ mod ending;
 mod error;
 mod held;
 mod journal;
+mod load;
 mod offline;
 mod play;
 mod run;

@@ -13,7 +13,11 @@ use crate::arrays::vector;
 use crate::device::descriptor;
 use crate::error::{of_client, refused};
 
-/// A loop whose server is a record.
+/// A touch loop without a network: the same messages, places and times give the same forces, bit by bit, as in every
+/// other language.
+///
+/// `limits` are those of a device, as of a Course. Places are from the middle of the device's workspace, which is laid
+/// on `middle_m`, the middle of the tissue; or, `in_tissue_frame`, in the tissue's own frame.
 #[pyclass(frozen, module = "palpate")]
 pub(crate) struct Offline {
     inner: Mutex<bridge::Offline>,
@@ -42,20 +46,26 @@ impl Offline {
         Ok(Offline { inner: Mutex::new(inner) })
     }
 
+    /// A message of the server arrives now: the bytes of a `palpate.v1.TouchResponse`. The next tick knows it.
     fn arrive(&self, message: &[u8]) -> PyResult<()> {
         self.with(|offline| offline.record.arrive(message)).map_err(of_client)
     }
 
+    /// The force to render from now on, N, for a device that is here at `time_s`, a time of any origin. A change of
+    /// enable from False to True asks for forces. Without a connection (an `opened` that has arrived) there are none.
     #[pyo3(signature = (place_m, time_s, enable=true))]
     fn tick(&self, place_m: [f64; 3], time_s: f64, enable: bool) -> (f64, f64, f64) {
         let reading = Reading { place_m: DVec3::from_array(place_m), enable };
         self.with(|offline| offline.ticker.tick(reading, time_s)).into()
     }
 
+    /// Stops rendering until it is enabled again.
     fn disable(&self) {
         self.with(|offline| offline.ticker.disable());
     }
 
+    /// Whether forces are rendered: "waiting" before a connection, "disabled" until forces are asked for, "enabled",
+    /// "paused" after a silence, "fault" after a position that is not finite or outside the workspace.
     #[getter]
     fn state(&self) -> &'static str {
         match self.with(|offline| offline.ticker.state()) {
@@ -67,11 +77,13 @@ impl Offline {
         }
     }
 
+    /// Where the tool was at the last tick, in the tissue's frame.
     #[getter]
     fn place_m(&self) -> (f64, f64, f64) {
         self.with(|offline| offline.ticker.place_m()).into()
     }
 
+    /// How old the newest news of the tissue is; None before the first.
     #[getter]
     fn age_s(&self) -> Option<f64> {
         self.with(|offline| offline.ticker.model_age_s())

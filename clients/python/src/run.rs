@@ -146,6 +146,9 @@ impl Given {
     }
 }
 
+/// Plays a script, with the numbers and the hash of `palpate run`. `held` holds forces within each step, as a client
+/// does; `audit` plays it a second time in f64 with a quarter of the substep, and tells the difference
+/// (summary["audited_error"]).
 #[pyfunction]
 #[pyo3(signature = (scene, script, *, held=false, audit=false))]
 pub(crate) fn run<'py>(
@@ -160,6 +163,8 @@ pub(crate) fn run<'py>(
     played.map_err(of_run)?.given(py)
 }
 
+/// Runs of many cases (scene, script) over threads, in their order; by default as many threads as there are processors.
+/// `progress` is called with how many are done and how many there are.
 #[pyfunction]
 #[pyo3(signature = (cases, *, held=false, threads=None, errors="raise", progress=None))]
 pub(crate) fn study<'py>(

@@ -20,23 +20,23 @@ use crate::error::{refused, wrong};
 use crate::waiting::work;
 
 /// What refusals call a text that comes from no file.
-const TEXT: &str = "<text>";
+pub(crate) const TEXT: &str = "<text>";
 
 /// The limits of a process with one user.
 pub(crate) fn limits() -> Limits {
     Limits::default().offline()
 }
 
-/// Where a scene or script is from.
+/// Where a scene, a script or a plan is from.
 #[derive(Debug, Clone)]
-enum Source {
+pub(crate) enum Source {
     Text(String),
     /// A file, or a name.
     Path(PathBuf),
 }
 
 impl Source {
-    fn of(value: &Bound<'_, PyAny>) -> PyResult<Self> {
+    pub(crate) fn of(field: &str, value: &Bound<'_, PyAny>) -> PyResult<Self> {
         if let Ok(text) = value.cast::<PyString>() {
             let text: String = text.extract()?;
             // Neither is in a name, and who means a file of such a name gives a pathlib.Path.
@@ -44,12 +44,12 @@ impl Source {
             return Ok(if is_text { Source::Text(text) } else { Source::Path(text.into()) });
         }
         let path: PyResult<PathBuf> = value.extract();
-        path.map(Source::Path).map_err(|_| wrong("source", "must be TOML text, a path, or a name"))
+        path.map(Source::Path).map_err(|_| wrong(field, "must be TOML text, a path, or a name"))
     }
 }
 
-/// A value as TOML.
-fn toml(value: &Bound<'_, PyAny>) -> PyResult<String> {
+/// The value of an argument as TOML.
+pub(crate) fn toml(field: &str, value: &Bound<'_, PyAny>) -> PyResult<String> {
     if value.is_instance_of::<PyBool>() {
         return Ok(if value.extract()? { "true" } else { "false" }.to_owned());
     }
@@ -65,14 +65,14 @@ fn toml(value: &Bound<'_, PyAny>) -> PyResult<String> {
     }
     if let Ok(table) = value.cast::<PyDict>() {
         let pairs: PyResult<Vec<String>> =
-            table.iter().map(|(key, value)| Ok(format!("{} = {}", key.str()?, toml(&value)?))).collect();
+            table.iter().map(|(key, value)| Ok(format!("{} = {}", key.str()?, toml(field, &value)?))).collect();
         return Ok(format!("{{ {} }}", pairs?.join(", ")));
     }
     if value.hasattr("tolist")? {
-        return toml(&value.call_method0("tolist")?);
+        return toml(field, &value.call_method0("tolist")?);
     }
-    let items = value.try_iter().map_err(|_| wrong("set", format!("can't write {value} as TOML")))?;
-    let items: PyResult<Vec<String>> = items.map(|item| toml(&item?)).collect();
+    let items = value.try_iter().map_err(|_| wrong(field, format!("can't write {value} as TOML")))?;
+    let items: PyResult<Vec<String>> = items.map(|item| toml(field, &item?)).collect();
     Ok(format!("[{}]", items?.join(", ")))
 }
 
@@ -80,12 +80,17 @@ fn toml(value: &Bound<'_, PyAny>) -> PyResult<String> {
 fn assignments(set: Option<&Bound<'_, PyAny>>) -> PyResult<Vec<String>> {
     let Some(set) = set else { return Ok(Vec::new()) };
     if let Ok(table) = set.cast::<PyDict>() {
-        return table.iter().map(|(key, value)| Ok(format!("{}={}", key.str()?, toml(&value)?))).collect();
+        return table.iter().map(|(key, value)| Ok(format!("{}={}", key.str()?, toml("set", &value)?))).collect();
     }
     set.extract().map_err(|_| wrong("set", "must be a dict of keys and values, or a list of \"key=value\""))
 }
 
-/// A scene that was read and checked.
+/// A scene that was read and checked: from TOML text, a file, or the name of one (`scenes()`).
+///
+/// `set` overrides keys: {"springs.stiffness_n_per_m": 50}. `folder` is where scenes are that are given by name. With
+/// `plan` it is stepped as that tissue is (integrator, substeps, precision, sleep), without the search for what its own
+/// tolerance asks for: that saves most of the time of a short run, and nothing is then known of the error (`run(...,
+/// audit=True)` measures it).
 #[pyclass(frozen, module = "palpate")]
 pub(crate) struct Scene {
     pub(crate) scene: scene::Scene,
@@ -148,21 +153,24 @@ impl Scene {
         folder: PathBuf,
         plan: Option<&Bound<'_, Tissue>>,
     ) -> PyResult<Self> {
-        let (source, sets, limits) = (Source::of(source)?, assignments(set)?, limits());
+        let (source, sets, limits) = (Source::of("source", source)?, assignments(set)?, limits());
         let read = source_scene(&source, &sets, &folder, &limits).map_err(refused)?;
         Ok(Scene { plan: plan.map(|plan| plan.get().model.clone()), ..read })
     }
 
+    /// Its name.
     #[getter]
     fn name(&self) -> &str {
         &self.scene.name
     }
 
+    /// The number of its points.
     #[getter]
     fn points(&self) -> usize {
         self.scene.shape().point_count()
     }
 
+    /// Steps a second.
     #[getter]
     fn rate_hz(&self) -> f64 {
         self.scene.stepping.rate_hz
@@ -181,7 +189,8 @@ fn source_scene(source: &Source, sets: &[String], folder: &Path, limits: &Limits
     Ok(Scene { scene, place, plan: None, model: Mutex::new(None) })
 }
 
-/// A script that is not bound to a scene yet.
+/// Forces and movements over time: from TOML text, a file, or a name (`scripts()`). `folder` is where a text's traces
+/// are.
 #[pyclass(frozen, module = "palpate")]
 #[derive(Debug, Clone)]
 pub(crate) struct Script {
@@ -212,9 +221,10 @@ impl Script {
     #[new]
     #[pyo3(signature = (source, *, folder=PathBuf::new()))]
     fn new(source: &Bound<'_, PyAny>, folder: PathBuf) -> PyResult<Self> {
-        Ok(Script { source: Source::of(source)?, folder })
+        Ok(Script { source: Source::of("source", source)?, folder })
     }
 
+    /// Binds it to a scene: name, steps, sample_every_steps, tools, warnings. Raises Refused if it does not fit.
     fn check<'py>(&self, py: Python<'py>, scene: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyDict>> {
         let scene = Scene::given(scene)?;
         let script = self.bound(&scene.get().scene).map_err(refused)?;
@@ -235,7 +245,7 @@ impl Script {
     }
 }
 
-/// A compiled scene: points, springs, and how they are stepped.
+/// A compiled scene: what is simulated, and how. Making one may take some tenths of a second, and a Scene does it once.
 #[pyclass(frozen, module = "palpate")]
 pub(crate) struct Tissue {
     pub(crate) model: Arc<Model>,
@@ -282,6 +292,7 @@ impl Tissue {
         Ok(Tissue { model: Tissue::given(py, scene)? })
     }
 
+    /// The name of its scene.
     #[getter]
     fn name(&self) -> &str {
         &self.model.scene.name
@@ -291,58 +302,70 @@ impl Tissue {
         self.model.len()
     }
 
+    /// Steps a second.
     #[getter]
     fn rate_hz(&self) -> f64 {
         self.model.scene.stepping.rate_hz
     }
 
+    /// The integrator that it is stepped with.
     #[getter]
     fn integrator(&self) -> &'static str {
         self.model.plan.integrator.name()
     }
 
+    /// Substeps of each step.
     #[getter]
     fn substeps(&self) -> u32 {
         self.model.plan.substeps
     }
 
+    /// The number format of the points.
     #[getter]
     fn precision(&self) -> &'static str {
         self.model.precision.name()
     }
 
+    /// The vectors of the machine that it is stepped with. They change no bit.
     #[getter]
     fn lanes(&self) -> &'static str {
         self.model.lanes.name()
     }
 
+    /// The error that is expected of displacement and force, relative to the largest of each; infinite if nothing is
+    /// known of it.
     #[getter]
     fn expected_error(&self) -> f64 {
         self.model.expected_error
     }
 
+    /// What a user should know of the scene, in words.
     #[getter]
     fn warnings(&self) -> Vec<String> {
         self.model.warnings.clone()
     }
 
+    /// Points along x and y of a sheet: rest_m.reshape(*grid, 3); None of a mesh.
     #[getter]
     fn grid(&self) -> Option<(usize, usize)> {
         self.model.scene.sheet().map(|sheet| (sheet.points[0], sheet.points[1]))
     }
 
+    /// Where each point rests.
     #[getter]
     fn rest_m<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let shape = self.model.shape();
         rows(py, self.model.points().flat_map(|point| shape.rest_m(point).to_array()).collect())
     }
 
+    /// The normal of the surface at rest at each point, out of the tissue.
     #[getter]
     fn normals<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let shape = self.model.shape();
         rows(py, self.model.points().flat_map(|point| shape.normal(point).to_array()).collect())
     }
 
+    /// Whether each point is fixed.
     #[getter]
     fn fixed<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let shape = self.model.shape();
@@ -350,12 +373,14 @@ impl Tissue {
         column(py, fixed)
     }
 
+    /// The mass of each point.
     #[getter]
     fn mass_kg<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let masses: Vec<f64> = self.model.points().map(|point| self.model.mass_kg(point)).collect();
         column(py, masses)
     }
 
+    /// The triangles of the surface, each the rows of its three points, counter-clockwise from outside.
     #[getter]
     #[allow(clippy::cast_possible_truncation)]
     fn triangles<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
@@ -371,10 +396,12 @@ impl Tissue {
         shaped(py, corners, &[3])
     }
 
+    /// The row of a point: (i, j) of a sheet, the number of a vertex of a mesh.
     fn index(&self, point: &Bound<'_, PyAny>) -> PyResult<usize> {
         Ok(self::point(&self.model, point)?.index())
     }
 
+    /// The name of the point of a row.
     fn point<'py>(&self, py: Python<'py>, index: usize) -> PyResult<Bound<'py, PyAny>> {
         if index >= self.model.len() {
             let message = format!("must be below {}, the number of points, but is {index}", self.model.len());
@@ -383,12 +410,14 @@ impl Tissue {
         named(py, self.model.shape().name(PointId::new(index)))
     }
 
+    /// The row of the point that rests nearest to a place.
     fn nearest(&self, place_m: &Bound<'_, PyAny>) -> PyResult<usize> {
         let place_m = vector("place_m", place_m)?;
         palpate::refusal::finite_vector("place_m", place_m).map_err(refused)?;
         Ok(self.model.shape().nearest(place_m).index())
     }
 
+    /// The middle of the tissue at rest. Devices have their origin there.
     #[getter]
     fn middle_m(&self) -> (f64, f64, f64) {
         let middle_m = self.model.shape().extent().middle_m();
@@ -417,7 +446,7 @@ pub(crate) fn scenes(folder: PathBuf) -> Vec<String> {
     names(Kind::Scene, &folder)
 }
 
-/// The same of scripts.
+/// The names of the scripts that are shipped, and of the files in a folder.
 #[pyfunction]
 #[pyo3(signature = (folder="scripts".into()))]
 pub(crate) fn scripts(folder: PathBuf) -> Vec<String> {

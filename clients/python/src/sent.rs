@@ -4,13 +4,13 @@ use std::path::Path;
 
 use palpate::refusal::{Reason, Refusal};
 use palpate::scene::sent::mesh_file;
-use palpate::scene::{Body, Mesh};
+use palpate::scene::Body;
 use palpate::wire;
 use palpate_client::Channel;
 use palpate_client::upload::upload_mesh;
-use palpate_mesh::TriangleMesh;
 use palpate_mesh::write::{Format, write};
 use palpate_proto::pb;
+use palpate_simulated::scene_file::written;
 use pb::create_session_request::Source;
 use pyo3::PyResult;
 
@@ -59,18 +59,5 @@ impl Sent {
             of_scene.mesh_id = sent.mesh_id;
         }
         Ok(Source::Scene(*scene))
-    }
-}
-
-/// The mesh of a scene, before it was made coarser.
-fn written(mesh: &Mesh) -> TriangleMesh {
-    if let Some(shown) = mesh.shape.shown() {
-        return shown.mesh.clone();
-    }
-    TriangleMesh {
-        vertices_m: mesh.shape.vertices_m().to_vec(),
-        triangles: mesh.shape.triangles().to_vec(),
-        uv: None,
-        groups: mesh.shape.told().groups.clone(),
     }
 }

@@ -83,7 +83,8 @@ impl Inner {
     }
 }
 
-/// A session in this process.
+/// A tissue in use. What tools are told acts from the next step on, until they are told something else. Several threads
+/// may use one session; the interpreter's lock is free while it steps.
 #[pyclass(frozen, module = "palpate")]
 pub(crate) struct Session {
     inner: Mutex<Inner>,
@@ -112,6 +113,7 @@ impl Session {
         Ok(Session::of(py.detach(|| Inner::of(session::Session::new(&model), model.scene.clone()))))
     }
 
+    /// Goes on from `save()`, of a session that began with `scene`. Poses have to be told again.
     #[staticmethod]
     fn restore(py: Python<'_>, scene: &Bound<'_, PyAny>, snapshot: &[u8]) -> PyResult<Self> {
         let scene = match scene.cast::<Tissue>() {
@@ -126,6 +128,7 @@ impl Session {
         restored.map(Session::of).map_err(refused)
     }
 
+    /// Does so many steps. Raises Failed if the tissue can't go on. Ctrl-C ends it between two steps.
     #[pyo3(signature = (steps=1))]
     fn step(&self, py: Python<'_>, steps: u64) -> PyResult<()> {
         let mut left = steps;
@@ -148,41 +151,49 @@ impl Session {
         }
     }
 
+    /// Steps so far.
     #[getter]
     fn steps(&self, py: Python<'_>) -> u64 {
         self.with(py, |inner| inner.session.step_count())
     }
 
+    /// Simulated time so far.
     #[getter]
     fn time_s(&self, py: Python<'_>) -> f64 {
         self.with(py, |inner| inner.session.time_s())
     }
 
+    /// The tissue, with the coefficients that it has now.
     #[getter]
     fn tissue(&self, py: Python<'_>) -> Tissue {
         self.with(py, |inner| Tissue { model: inner.session.model().clone() })
     }
 
+    /// Points that the last step computed; the others are at rest.
     #[getter]
     fn awake_points(&self, py: Python<'_>) -> usize {
         self.with(py, |inner| inner.session.tissue().awake_points())
     }
 
+    /// How often the guard went back and halved the substep.
     #[getter]
     fn guard_events(&self, py: Python<'_>) -> u64 {
         self.with(py, |inner| inner.session.tissue().guard_events())
     }
 
+    /// Why the tissue is not what its tools made of it, in words: it is held, or has recovered. None if it is.
     #[getter]
     fn fault(&self, py: Python<'_>) -> Option<String> {
         self.with(py, |inner| inner.session.fault())
     }
 
+    /// The hash of the state: equal for equal bits.
     #[getter]
     fn hash(&self, py: Python<'_>) -> String {
         self.with(py, |inner| format!("{:032x}", inner.session.tissue().state_hash()))
     }
 
+    /// Pushes at a point or a place; at a distance r from there by force_n * exp(-falloff_per_m * r + falloff_offset).
     #[pyo3(signature = (tool, force_n, *, point=None, at_m=None, falloff_per_m=200.0, falloff_offset=0.0))]
     #[allow(clippy::too_many_arguments)]
     fn push(
@@ -208,6 +219,7 @@ impl Session {
         self.submit(py, tool, Action::Push(Poke { point, centre_m, force_n, falloff_per_m, falloff_offset }))
     }
 
+    /// Holds a point, and brings it this far from where it rests by the end of the step.
     fn grasp(
         &self,
         py: Python<'_>,
@@ -221,6 +233,7 @@ impl Session {
         self.submit(py, tool, Action::Grasp { point, displacement_m })
     }
 
+    /// Brings a tool with a tip here by the end of the step. It stays here until it is told something else.
     #[pyo3(signature = (tool, place_m, tip=None))]
     fn pose(&self, py: Python<'_>, tool: u32, place_m: &Bound<'_, PyAny>, tip: Option<Tip>) -> PyResult<()> {
         let place_m = vector("place_m", place_m)?;
@@ -229,10 +242,12 @@ impl Session {
         self.submit(py, tool, Action::Pose { place_m, velocity_m_per_s: None, tip })
     }
 
+    /// Ends what a tool does.
     fn release(&self, py: Python<'_>, tool: u32) -> PyResult<()> {
         self.submit(py, tool, Action::Release)
     }
 
+    /// What a tool does and feels; None if it does nothing.
     fn tool<'py>(&self, py: Python<'py>, tool: u32) -> PyResult<Option<Bound<'py, PyAny>>> {
         let sample = self.with(py, |inner| inner.session.sample(Some(&[tool])));
         let Some(contact) = sample.tools.first().and_then(|tool| tool.contact) else { return Ok(None) };
@@ -249,6 +264,7 @@ impl Session {
         made.call1((rows(py, numbers)?,)).map(Some)
     }
 
+    /// Makes the tissue softer or stiffer from the next step on. What is not named stays as it is.
     #[pyo3(signature = (*, stiffness_n_per_m=None, damping_n_s_per_m=None, virtual_stiffness_n_per_m=None, volume_stiffness_pa=None))]
     fn change(
         &self,
@@ -267,12 +283,15 @@ impl Session {
         changed.map_err(refused)
     }
 
+    /// How far each point is from where it rests, with the digits of f32 at least; `records` has them all. `out` is an
+    /// array to write into.
     #[pyo3(signature = (out=None))]
     fn displacements<'py>(&self, py: Python<'py>, out: Option<Bound<'py, PyAny>>) -> PyResult<Bound<'py, PyAny>> {
         let read = |inner: &mut Inner, into: &mut Vec<f64>| inner.session.tissue().whole_displacements_m(into);
         self.read(py, out, &read)
     }
 
+    /// Where each point is. `out` is an array to write into.
     #[pyo3(signature = (out=None))]
     fn positions<'py>(&self, py: Python<'py>, out: Option<Bound<'py, PyAny>>) -> PyResult<Bound<'py, PyAny>> {
         let read = |inner: &mut Inner, into: &mut Vec<f64>| {
@@ -285,6 +304,7 @@ impl Session {
         self.read(py, out, &read)
     }
 
+    /// The velocity of each point, m/s. `out` is an array to write into.
     #[pyo3(signature = (out=None))]
     fn velocities<'py>(&self, py: Python<'py>, out: Option<Bound<'py, PyAny>>) -> PyResult<Bound<'py, PyAny>> {
         let read = |inner: &mut Inner, into: &mut Vec<f64>| {
@@ -295,6 +315,7 @@ impl Session {
         self.read(py, out, &read)
     }
 
+    /// Points with all that is known of them, as in `Run.points`; all points if none is named.
     #[pyo3(signature = (points=None))]
     fn records<'py>(&self, py: Python<'py>, points: Option<Vec<Bound<'py, PyAny>>>) -> PyResult<Bound<'py, PyAny>> {
         let model = self.with(py, |inner| inner.session.model().clone());
@@ -311,6 +332,7 @@ impl Session {
         records(py, numbers, "POINT", &[count])
     }
 
+    /// The energy of the tissue: kinetic, spring and virtual.
     #[getter]
     fn energy_j<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let energy = self.with(py, |inner| inner.session.energy());
@@ -321,6 +343,7 @@ impl Session {
         Ok(found)
     }
 
+    /// A snapshot, for `restore`.
     fn save<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
         let bytes = self.with(py, |inner| inner.session.save().to_bytes());
         PyBytes::new(py, &bytes)

@@ -101,7 +101,7 @@ fn at_end(awaited: bool) -> PyErr {
     if awaited { PyStopAsyncIteration::new_err(()) } else { PyStopIteration::new_err(()) }
 }
 
-/// The samples of a session.
+/// The samples of a session, one after the other: what tools feel.
 #[pyclass(frozen, module = "palpate")]
 pub(crate) struct Samples {
     pub(crate) stream: Arc<Mutex<Following<watch::Samples, pb::WatchSamplesRequest>>>,
@@ -218,6 +218,7 @@ impl Sample {
 
 #[pymethods]
 impl Samples {
+    /// The next samples, as arrays.
     fn take<'py>(&self, py: Python<'py>, count: usize) -> PyResult<Bound<'py, PyAny>> {
         let stream = self.stream.clone();
         answer(py, self.awaited, async move {
@@ -253,7 +254,7 @@ impl Samples {
     }
 }
 
-/// The frames of a session.
+/// The frames of a session, one after the other: the moving surface.
 #[pyclass(frozen, module = "palpate")]
 pub(crate) struct Frames {
     pub(crate) stream: Arc<Mutex<Following<view::Frames, pb::WatchFramesRequest>>>,

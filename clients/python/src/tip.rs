@@ -3,7 +3,7 @@
 use palpate_touch::Coupling;
 use pyo3::prelude::*;
 
-/// A tip.
+/// The tip of a tool: a disc that touches, or with `grasps` holds. With a stiffness it is coupled by a spring.
 #[pyclass(frozen, module = "palpate", from_py_object)]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Tip(pub(crate) palpate_touch::Tip);
@@ -20,16 +20,19 @@ impl Tip {
         Tip(palpate_touch::Tip { radius_m, friction, grasps, coupling })
     }
 
+    /// The radius of the disc.
     #[getter]
     fn radius_m(&self) -> f64 {
         self.0.radius_m
     }
 
+    /// The coefficient of friction.
     #[getter]
     fn friction(&self) -> f64 {
         self.0.friction
     }
 
+    /// Whether it holds the tissue under it, in place of touching it.
     #[getter]
     fn grasps(&self) -> bool {
         self.0.grasps

@@ -44,6 +44,8 @@ pub struct Renderer {
     /// A newer model that has arrived since.
     arrived: Option<LocalModel>,
     arrived_s: Option<f64>,
+    /// A model has come, of whatever connection.
+    has_heard: bool,
     bias_n: DVec3,
     biased_s: f64,
     track: Track,
@@ -65,6 +67,7 @@ impl Renderer {
             newest: None,
             arrived: None,
             arrived_s: None,
+            has_heard: false,
             bias_n: DVec3::ZERO,
             biased_s: 0.0,
             track: Track::default(),
@@ -116,9 +119,12 @@ impl Renderer {
         self.refused
     }
 
-    /// Whether forces are rendered.
+    /// Whether forces are rendered. Before the first model there are none, also if they were asked for.
     pub fn state(&self) -> RenderingState {
-        self.envelope.state()
+        match self.envelope.state() {
+            RenderingState::Enabled if !self.has_heard => RenderingState::Disabled,
+            state => state,
+        }
     }
 
     /// The time of the newest model by the client's clock, s.
@@ -150,6 +156,7 @@ impl Renderer {
             touching.move_to(&model, law, place_m);
         }
         self.newest = Some((model, touching));
+        self.has_heard = true;
         (self.biased_s, self.bias_n) = (now_s, DVec3::ZERO);
         if let Some(before_n) = before_n {
             self.bias_n = before_n - self.wanted_n(now_s);
@@ -257,6 +264,24 @@ mod tests {
             let wanted_n = renderer.wanted_n(now_s);
             assert!((wanted_n - expected_n * DVec3::Z).length() < 1e-9, "{tick}: {wanted_n}");
         }
+    }
+
+    #[test]
+    fn nothing_is_enabled_before_the_first_model() {
+        let (mut renderer, place_m) = (renderer(), 0.001 * DVec3::Z);
+        renderer.envelope.enable();
+        for tick in 0..800 {
+            assert_eq!(renderer.tick(f64::from(tick) * 1e-3, place_m), DVec3::ZERO);
+            assert_eq!(renderer.state(), RenderingState::Disabled);
+        }
+        renderer.receive(model(1, 0.8, place_m, 0.0), 0.8);
+        assert_eq!(renderer.state(), RenderingState::Disabled);
+        renderer.tick(0.8, place_m);
+        assert_eq!(renderer.state(), RenderingState::Enabled);
+        // Another connection begins, and nothing was asked for anew.
+        renderer.begin(Law::linear(400.0, 0.5));
+        renderer.tick(0.801, place_m);
+        assert_eq!(renderer.state(), RenderingState::Enabled);
     }
 
     #[test]

@@ -13,6 +13,7 @@ mod ticker;
 
 use std::fmt;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use palpate_touch::{Device, Envelope, Tip};
@@ -69,6 +70,22 @@ pub type Warn = Box<dyn Fn(&str) + Send + Sync>;
 /// A function that is told the priority of a loop.
 pub type Begun = Box<dyn FnOnce(&Priority) + Send>;
 
+/// Stops the forces of a loop, from any thread, until the operator asks for them again. Clones are of the same loop.
+#[derive(Debug, Clone, Default)]
+pub struct Disable(Arc<AtomicBool>);
+
+impl Disable {
+    /// Stops rendering from the next tick on. The force falls within a few ticks.
+    pub fn disable(&self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+
+    /// Whether it was called for since the last time.
+    fn take(&self) -> bool {
+        self.0.swap(false, Ordering::Relaxed)
+    }
+}
+
 /// Options of [`run`] and [`begin`].
 #[derive(Default)]
 pub struct Options {
@@ -84,11 +101,13 @@ pub struct Options {
     pub warn: Option<Warn>,
     /// Called by the loop of [`run`] before its first tick, with its priority.
     pub begun: Option<Begun>,
+    /// Keep a clone to stop the forces of [`run`]; of [`begin`], [`Ticker::disable`] does it.
+    pub disable: Disable,
 }
 
 impl fmt::Debug for Options {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Options { lasts, remembers, real_time, keeps_session, warn, begun } = self;
+        let Options { lasts, remembers, real_time, keeps_session, warn, begun, disable: _ } = self;
         let mut fields = f.debug_struct("Options");
         fields.field("lasts", lasts).field("remembers", remembers).field("real_time", real_time);
         fields.field("keeps_session", keeps_session);
@@ -115,6 +134,8 @@ pub struct Report {
     pub traffic: Traffic,
     /// Why there was no connection any more at the end.
     pub lost: Option<Error>,
+    /// How the device failed, which has ended the loop; of [`run_told`] alone.
+    pub failure: Option<Error>,
 }
 
 /// Connects a device until its time is over or `stop` completes. Returns the device and the results. The last force written
@@ -124,12 +145,26 @@ pub struct Report {
 /// Returns an error if the device fails, if the server refuses the session or the tool at first, or if no connection
 /// succeeds.
 pub async fn run<D: HapticDevice + 'static>(
+    device: D,
+    target: Target,
+    options: Options,
+    stop: impl Future<Output = ()> + Send + 'static,
+) -> Result<(D, Report), Error> {
+    let (device, mut report) = run_told(device, target, options, stop).await?;
+    report.failure.take().map_or(Ok((device, report)), Err)
+}
+
+/// Like [`run`], but of a device that fails it tells what was done until then: [`Report::failure`].
+///
+/// # Errors
+/// Returns an error if the server refuses the session or the tool at first, or if no connection succeeds.
+pub async fn run_told<D: HapticDevice + 'static>(
     mut device: D,
     target: Target,
     options: Options,
     stop: impl Future<Output = ()> + Send + 'static,
 ) -> Result<(D, Report), Error> {
-    let Options { lasts, remembers, real_time, keeps_session, warn, begun } = options;
+    let Options { lasts, remembers, real_time, keeps_session, warn, begun, disable } = options;
     let descriptor = device.descriptor();
     let warn = Arc::new(warn);
     let (ticker, mut line) = line(target, descriptor, Origin::Workspace, keeps_session, warn.clone(), stop);
@@ -143,19 +178,20 @@ pub async fn run<D: HapticDevice + 'static>(
         if let Some(begun) = begun {
             begun(&priority);
         }
-        let served = tick::serve(&mut device, ticker, &news, lasts, remembers);
+        let served = tick::serve(&mut device, ticker, &news, &disable, lasts, remembers);
         let _ = tell.send((device, served, priority));
     })?;
     let (device, served, priority) =
         ended.await.map_err(|_| Error::Internal("the device's loop panicked".to_owned()))?;
     line.close().await;
-    let tick::Served { course, envelope, late_ticks, missed_ticks, ages_s } = served?;
+    let tick::Served { course, envelope, late_ticks, missed_ticks, ages_s, failure } = served;
+    let failure = failure.map(Error::Device);
     let mut inbound = line.shared.inbound();
     let (traffic, lost) = (inbound.traffic, inbound.failure.take());
     if traffic.connections == 0 {
-        return Err(lost.unwrap_or_else(silent));
+        return Err(failure.or(lost).unwrap_or_else(silent));
     }
-    Ok((device, Report { course, ages_s, envelope, late_ticks, missed_ticks, priority, traffic, lost }))
+    Ok((device, Report { course, ages_s, envelope, late_ticks, missed_ticks, priority, traffic, lost, failure }))
 }
 
 fn silent() -> Error {

@@ -6,6 +6,7 @@ use glam::DVec3;
 use palpate_touch::{Envelope, RenderingState};
 use tokio::sync::Notify;
 
+use super::Disable;
 use super::ticker::Ticker;
 use crate::device::HapticDevice;
 
@@ -31,7 +32,8 @@ pub struct Tick {
     pub state: Option<RenderingState>,
 }
 
-/// The results of a device's loop.
+/// The results of a device's loop, until its end or until the device failed.
+#[derive(Default)]
 pub(super) struct Served {
     /// The remembered ticks; empty unless the loop was to remember them.
     pub(super) course: Vec<Tick>,
@@ -43,42 +45,43 @@ pub(super) struct Served {
     pub(super) missed_ticks: u64,
     /// Age of the local model at each tick, s; empty unless the loop was to remember.
     pub(super) ages_s: Vec<f64>,
+    /// How the device failed, if it has.
+    pub(super) failure: Option<std::io::Error>,
 }
 
 /// Runs the loop of a device for a time, or until the network's side is over, and then sets its force to zero, also after an
 /// error. `remember`: keeps the course and the models' ages. `news` is told when there is something to send.
-///
-/// # Errors
-/// Returns the device's error if it can't be read or written.
 pub(super) fn serve(
     device: &mut dyn HapticDevice,
     mut ticker: Ticker,
     news: &Notify,
+    disable: &Disable,
     lasts: Option<Duration>,
     remember: bool,
-) -> std::io::Result<Served> {
-    let mut served = Served { course: Vec::new(), envelope: None, late_ticks: 0, missed_ticks: 0, ages_s: Vec::new() };
-    let ended = tick(device, &mut ticker, news, lasts, remember.then_some(&mut served.course), &mut served.ages_s);
+) -> Served {
+    let mut served = Served::default();
+    served.failure = tick(device, &mut ticker, news, disable, lasts, remember, &mut served).err();
     // A device holds its last force until it is told another.
     let _ = device.write(DVec3::ZERO);
     served.envelope = ticker.envelope().cloned();
     drop(ticker);
     // The network's side waits for the next place, or for the end.
     news.notify_one();
-    (served.late_ticks, served.missed_ticks) = ended?;
-    Ok(served)
+    served
 }
 
-/// Returns the numbers of late and of skipped ticks.
+/// # Errors
+/// Returns the device's error if it can't be read or written.
 fn tick(
     device: &mut dyn HapticDevice,
     ticker: &mut Ticker,
     news: &Notify,
+    disable: &Disable,
     lasts: Option<Duration>,
-    mut course: Option<&mut Vec<Tick>>,
-    ages_s: &mut Vec<f64>,
-) -> std::io::Result<(u64, u64)> {
-    let (mut late_ticks, mut missed_ticks) = (0, 0);
+    remember: bool,
+    served: &mut Served,
+) -> std::io::Result<()> {
+    let Served { course, late_ticks, missed_ticks, ages_s, .. } = served;
     let start = Instant::now();
     let mut due = start;
     // If it is much too late, the beat begins anew.
@@ -88,20 +91,23 @@ fn tick(
         if late > MOST_LATE {
             #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
             let missed = (late.as_secs_f64() / TICK_S) as u64;
-            missed_ticks += missed;
+            *missed_ticks += missed;
             *due = now;
         }
         (now, late)
     };
     while lasts.is_none_or(|lasts| due.duration_since(start) < lasts) && !ticker.is_over() {
         wait_until(due);
-        late_ticks += u64::from(catch_up(&mut due).1.as_secs_f64() > TICK_S);
+        *late_ticks += u64::from(catch_up(&mut due).1.as_secs_f64() > TICK_S);
         let reading = device.read()?;
         // A device may have waited for its next position. The time that counts is that of the force: what came late must not be
         // made up for by a step at the next tick.
         let (now, _) = catch_up(&mut due);
         due += Duration::from_secs_f64(TICK_S);
         let time_s = now.duration_since(start).as_secs_f64();
+        if disable.take() {
+            ticker.disable();
+        }
         let force_n = ticker.tick(reading, time_s);
         device.write(force_n)?;
         if ticker.has_spoken() {
@@ -109,14 +115,14 @@ fn tick(
         }
         let tick = Tick { time_s, place_m: ticker.place_m(), force_n, state: ticker.state() };
         device.ticked(&tick);
-        if let Some(course) = &mut course {
+        if remember {
             ages_s.extend(ticker.model_age_s());
             if course.len() < MOST_REMEMBERED {
                 course.push(tick);
             }
         }
     }
-    Ok((late_ticks, missed_ticks))
+    Ok(())
 }
 
 /// Sleeps until shortly before `due`, then polls the clock.
@@ -196,7 +202,8 @@ mod tests {
         let mut device = Slow { ticks: 0, forces: Vec::new() };
         let (ticker, mut feed, _commands) = ticker(device.descriptor(), Origin::Workspace, 0.0);
         feed.begin(&palpate_proto::touch::law(&Law::linear(400.0, 0.5), 0), DVec3::ZERO).unwrap();
-        let served = serve(&mut device, ticker, &Notify::new(), Some(Duration::from_millis(300)), true).unwrap();
+        let lasts = Some(Duration::from_millis(300));
+        let served = serve(&mut device, ticker, &Notify::new(), &Disable::default(), lasts, true);
         assert!(served.missed_ticks >= 199, "{}", served.missed_ticks);
         // Between two times of the loop no more time has passed than between the writes of their forces.
         for (ticks, writes) in served.course.windows(2).zip(device.forces.windows(2)) {
@@ -211,8 +218,10 @@ mod tests {
         let mut device = Failing { ticks: 0, force_n: DVec3::X };
         let (ticker, mut feed, _commands) = ticker(device.descriptor(), Origin::Workspace, 0.0);
         feed.begin(&palpate_proto::touch::law(&Law::linear(400.0, 0.5), 0), DVec3::ZERO).unwrap();
-        let ended = serve(&mut device, ticker, &Notify::new(), None, false);
-        assert!(ended.is_err());
+        let served = serve(&mut device, ticker, &Notify::new(), &Disable::default(), None, true);
+        assert_eq!(served.failure.map(|error| error.kind()), Some(std::io::ErrorKind::BrokenPipe));
+        // What was done until then is told.
+        assert_eq!((served.course.len(), served.envelope.is_some()), (19, true));
         assert_eq!((device.ticks, device.force_n), (20, DVec3::ZERO));
     }
 }

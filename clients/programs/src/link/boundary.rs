@@ -2,12 +2,12 @@
 //! and a spring in place of the tissue, and predicted by theory. This validates the loop.
 
 use glam::DVec3;
+use palpate_simulated::network::{Conditions, Direction};
 use palpate_touch::hand::{HANDS, Hand, HandState};
 use serde_json::{Value, json};
 
 use super::setup::TICK_S;
 use crate::Failure;
-use crate::simulated::network::{Conditions, Direction};
 
 /// Stiffnesses to try, N/m.
 pub(super) const STIFFNESSES_N_PER_M: [f64; 9] = [150.0, 250.0, 300.0, 400.0, 500.0, 700.0, 1000.0, 1500.0, 3000.0];

@@ -5,10 +5,10 @@ use palpate_touch::hand::HandState;
 
 use super::setup::{Setup, TICK_S, ticks};
 use super::tissue::Tissue;
-use crate::simulated::random::Random;
-use crate::simulated::task::{self, Task};
 
 use glam::DVec3;
+use palpate_simulated::random::Random;
+use palpate_simulated::task::{self, Task};
 
 /// Least scale: a smaller task would hardly touch the tissue.
 const LEAST_SCALE: f64 = 0.01;

@@ -1,11 +1,11 @@
 //! The figures of a run as they are printed: a table for people, and JSON.
 
+use palpate_simulated::network::Conditions;
 use palpate_touch::carrier::Carried;
 use serde_json::{Value, json};
 
 use super::measure::Outcome;
 use super::setup::Setup;
-use crate::simulated::network::Conditions;
 use crate::table;
 
 /// The figures of a run for people; `server` is that of a run in real time.

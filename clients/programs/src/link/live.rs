@@ -7,15 +7,15 @@ use std::time::Duration;
 use glam::DVec3;
 use palpate_client::Server;
 use palpate_client::bridge::{self, Options, Session, Target};
+use palpate_simulated::network::Transport;
+use palpate_simulated::random::Random;
+use palpate_simulated::task::Task;
 
 use super::direct::Direct;
 use super::measure::{Outcome, Tick, Totals};
 use super::setup::{Setup, TICK_S};
 use super::tissue::Tissue;
 use super::with_tissue;
-use crate::simulated::network::Transport;
-use crate::simulated::random::Random;
-use crate::simulated::task::Task;
 use crate::simulated::{Part, Simulated};
 use crate::{Failure, interrupted, warn};
 

@@ -5,11 +5,10 @@
 //! network.
 
 use glam::DVec3;
+use palpate_simulated::network::Outages;
 use palpate_touch::carrier::Carried;
 use palpate_touch::envelope::Envelope;
 use palpate_touch::{LimitCause, RenderingState};
-
-use crate::simulated::network::Outages;
 
 /// A run is unstable if the energy that the port has received falls below this, J.
 const UNSTABLE_J: f64 = -0.1;
@@ -254,7 +253,7 @@ fn percentile(values: &mut [f64], part: f64) -> Option<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simulated::network::Conditions;
+    use palpate_simulated::network::Conditions;
 
     /// A tick in contact under a true force along the normal.
     fn tick(now_s: f64, true_n: f64, force_n: f64, apart_m: f64) -> Tick {

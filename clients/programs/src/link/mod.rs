@@ -29,11 +29,11 @@ use palpate::scene::check::check_tip;
 use palpate::scene::collection::find_scene;
 use palpate::sheet::Model;
 use palpate_proto::refusal::{Reason, Refusal, number};
+use palpate_simulated::network::{Conditions, Transport};
 use palpate_touch::{Law, Tip};
 
 use crate::Failure;
 use crate::credentials::CredentialOptions;
-use crate::simulated::network::{Conditions, Transport};
 use crate::simulated::{device_named, hand_named};
 use crate::table;
 use figures::{figures, rows};
@@ -63,7 +63,7 @@ pub(crate) struct Arguments {
     /// Fraction of the packets that are lost. A stream sends them again, which delays all later ones
     #[arg(long, value_name = "FRACTION", conflicts_with = "profile")]
     loss: Option<f64>,
-    /// How samples and poses travel
+    /// How samples and poses travel: stream (TCP: a lost packet holds up all that follow it) or datagram (UDP: it is lost alone)
     #[arg(long, default_value = "stream", conflicts_with_all = ["random", "boundary"])]
     transport: Transport,
     /// Mean number of packets that are lost in a row; 1: each by itself

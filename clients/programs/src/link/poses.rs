@@ -4,11 +4,11 @@
 use std::collections::VecDeque;
 
 use glam::DVec3;
+use palpate_simulated::network::{Direction, Transport};
 use palpate_touch::deadband::HEARTBEAT_S;
 use palpate_touch::{LocalModel, News, Pulse, Told};
 
 use super::client::Client;
-use crate::simulated::network::{Direction, Transport};
 
 /// A message to the server.
 pub(super) struct Up {

@@ -9,6 +9,8 @@ use palpate::limits::Limits;
 use palpate::scene::{BUILT_IN, Scene};
 use palpate::sheet::Model;
 use palpate_proto::refusal::Refusal;
+use palpate_simulated::network::{Conditions, Transport};
+use palpate_simulated::random::Random;
 use palpate_touch::device::DEVICES;
 use palpate_touch::hand::HANDS;
 use palpate_touch::{Law, Tip};
@@ -22,8 +24,6 @@ use super::setup::{Setup, TissueChange};
 use super::spot::Spot;
 use super::{Arguments, changed, law_of};
 use crate::Failure;
-use crate::simulated::network::{Conditions, Transport};
-use crate::simulated::random::Random;
 use crate::table;
 
 /// Tissues of the random runs.

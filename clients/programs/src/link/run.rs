@@ -4,6 +4,9 @@ use std::sync::Arc;
 
 use glam::DVec3;
 use palpate_proto::touch::sample_bytes;
+use palpate_simulated::network::{Conditions, Direction, Outages, Stalls, Transport};
+use palpate_simulated::random::Random;
+use palpate_simulated::task::{self, Task};
 use palpate_touch::envelope::Envelope;
 use palpate_touch::hand::HandState;
 use palpate_touch::{Law, RenderingState};
@@ -15,9 +18,6 @@ use super::poses::{Down, Poses, Up};
 use super::server::Server;
 use super::setup::{Setup, TICK_S, ticks};
 use super::tissue::Tissue;
-use crate::simulated::network::{Conditions, Direction, Outages, Stalls, Transport};
-use crate::simulated::random::Random;
-use crate::simulated::task::{self, Task};
 
 /// A run is unstable, too, if the tool moves away farther than this many times the task's amplitude.
 const UNSTABLE_AMPLITUDES: f64 = 3.0;

@@ -8,6 +8,7 @@ use palpate::scene::script::Action;
 use palpate::session::command::Command;
 use palpate::session::laws::{FIRST, Laws};
 use palpate::session::sampling::{Deadband, Sampler, Sampling, WantedHeartbeat};
+use palpate_simulated::network::Transport;
 use palpate_touch::carrier::Seen;
 use palpate_touch::deadband::HEARTBEAT_S;
 use palpate_touch::{Law, LocalModel, Pulse, Told};
@@ -17,7 +18,6 @@ use super::poses::Up;
 use super::setup::{Setup, TICK_S};
 use super::spot::Spot;
 use super::tissue::{LEASE, Tissue, ns};
-use crate::simulated::network::Transport;
 
 /// The law of another tissue is known so long after the tissue has changed, s.
 const LAW_S: f64 = 0.1;

@@ -4,12 +4,12 @@ use std::sync::Arc;
 
 use palpate::force_law::Disc;
 use palpate::sheet::Model;
+use palpate_simulated::network::Conditions;
 use palpate_touch::hand::Hand;
 use palpate_touch::{Device, Law, Tip};
 
 use super::laws::PlaceLaws;
 use super::spot::Spot;
-use crate::simulated::network::Conditions;
 
 /// How the client renders samples.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]

@@ -12,12 +12,12 @@ use palpate::session::command::{Command, Due};
 use palpate::session::intake::Intake;
 use palpate::session::lease::LeaseId;
 use palpate::sheet::Model;
+use palpate_simulated::random::Random;
+use palpate_simulated::task::{self, Task};
 use palpate_touch::{ContactState, Tip};
 
 use super::setup::{Setup, TICK_S};
 use super::spot::Spot;
-use crate::simulated::random::Random;
-use crate::simulated::task::{self, Task};
 
 /// The hand's tool and the second one, with their leases.
 pub(super) const TOOL: u32 = 0;

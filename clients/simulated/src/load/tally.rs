@@ -124,6 +124,7 @@ impl Tally {
             frame_age_us: Quantiles::of(&self.frame_age_ns),
             start_us: Quantiles::of(&self.start_ns),
             turned_away: self.turned_away.values().sum(),
+            first_break: self.first_break.clone(),
             generator_cores: f64::NAN,
         }
     }
@@ -165,18 +166,22 @@ pub(crate) fn listed(reasons: &BTreeMap<String, u64>) -> String {
 
 /// Summary of one load.
 #[derive(Debug, Clone)]
-pub(crate) struct Outcome {
+pub struct Outcome {
     pub(crate) sessions: usize,
-    pub(crate) samples: u64,
+    /// Samples that came.
+    pub samples: u64,
     pub(crate) frames: u64,
-    pub(crate) commands: u64,
-    pub(crate) unsent: u64,
+    /// Commands that were sent.
+    pub commands: u64,
+    /// Ticks at which this generator was too late to send.
+    pub unsent: u64,
     pub(crate) lost: u64,
     pub(crate) lost_commands: u64,
     pub(crate) lost_samples: u64,
     pub(crate) rejected: u64,
     pub(crate) reasons: BTreeMap<String, u64>,
-    pub(crate) broken: u64,
+    /// Streams that broke.
+    pub broken: u64,
     pub(crate) awake_points_mean: f64,
     pub(crate) dilation_min: f64,
     pub(crate) round_trip_us: Quantiles,
@@ -185,13 +190,15 @@ pub(crate) struct Outcome {
     /// Of a plan alone.
     pub(crate) start_us: Quantiles,
     pub(crate) turned_away: u64,
+    /// Why the first of the streams broke.
+    pub first_break: Option<String>,
     /// Processor time of this generator per second, cores.
     pub(crate) generator_cores: f64,
 }
 
 impl Outcome {
     /// As one JSON object; what was not measured is `null`.
-    pub(crate) fn json(&self, limit_sessions: Option<usize>) -> Value {
+    pub fn json(&self, limit_sessions: Option<usize>) -> Value {
         let mut object = json!({
             "sessions": self.sessions,
             "samples": self.samples,
@@ -218,7 +225,7 @@ impl Outcome {
     }
 
     /// As a table for a terminal.
-    pub(crate) fn table(&self, limit_sessions: Option<usize>) -> String {
+    pub fn table(&self, limit_sessions: Option<usize>) -> String {
         let mut rows = vec![
             ("sessions", self.sessions.to_string()),
             (

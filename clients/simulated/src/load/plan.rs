@@ -10,8 +10,8 @@ use palpate_touch::hand::{HANDS, Hand};
 
 use super::objective::Objective;
 use super::tip::Deadbands;
-use crate::simulated::network::Conditions;
-use crate::simulated::random::Random;
+use crate::network::Conditions;
+use crate::random::Random;
 
 /// Largest plan, bytes.
 const MOST_BYTES: u64 = 1 << 20;
@@ -90,7 +90,7 @@ pub(crate) struct Phase {
 
 /// A plan.
 #[derive(Debug, Clone)]
-pub(crate) struct Plan {
+pub struct Plan {
     pub(crate) name: String,
     seed: u64,
     /// Commands a second of each hand.
@@ -124,11 +124,15 @@ impl Plan {
     ///
     /// # Errors
     /// Refuses a file that can't be read, and what is wrong in it, by line and key.
-    pub(crate) fn read(path: &Path) -> Result<Self> {
+    pub fn read(path: &Path) -> Result<Self> {
         Plan::parse(&path.display().to_string(), &read_text(path, MOST_BYTES)?)
     }
 
-    fn parse(name: &str, text: &str) -> Result<Self> {
+    /// Reads a plan from text (TOML); refusals call it `name`.
+    ///
+    /// # Errors
+    /// Refuses what is wrong in it, by line and key.
+    pub fn parse(name: &str, text: &str) -> Result<Self> {
         let document = Document::parse(name, text)?;
         let plan = document.read(plan)?;
         if plan.users().len() > MOST_USERS {

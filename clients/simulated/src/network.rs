@@ -14,12 +14,12 @@
 
 use std::collections::VecDeque;
 
-use super::random::Random;
+use crate::random::Random;
 
 /// How messages travel.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
-pub(crate) enum Transport {
-    /// A gRPC stream over TCP: a lost packet holds up all that follow it
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Transport {
+    /// A gRPC stream over TCP: a lost packet holds up all that follow it.
     #[default]
     Stream,
     /// Datagrams over UDP: a lost packet is lost alone.
@@ -27,7 +27,8 @@ pub(crate) enum Transport {
 }
 
 impl Transport {
-    pub(crate) fn name(self) -> &'static str {
+    /// Its name, as options have it.
+    pub fn name(self) -> &'static str {
         match self {
             Transport::Stream => "stream",
             Transport::Datagram => "datagram",
@@ -35,24 +36,34 @@ impl Transport {
     }
 }
 
+impl std::str::FromStr for Transport {
+    type Err = String;
+
+    fn from_str(name: &str) -> Result<Self, String> {
+        let found = [Transport::Stream, Transport::Datagram].into_iter().find(|transport| transport.name() == name);
+        found.ok_or_else(|| "must be stream or datagram".to_owned())
+    }
+}
+
 /// The conditions of a network.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(crate) struct Conditions {
-    pub(crate) transport: Transport,
+pub struct Conditions {
+    /// How messages travel.
+    pub transport: Transport,
     /// Round-trip time without jitter, s.
-    pub(crate) round_trip_s: f64,
+    pub round_trip_s: f64,
     /// Standard deviation of the delay each way, s.
-    pub(crate) jitter_s: f64,
+    pub jitter_s: f64,
     /// Fraction of the packets that are lost.
-    pub(crate) loss: f64,
+    pub loss: f64,
     /// Mean number of packets lost in a row; up to 1, each is lost by itself.
-    pub(crate) burst: f64,
+    pub burst: f64,
     /// Once a second nothing gets through for this long, s.
-    pub(crate) outage_s: f64,
+    pub outage_s: f64,
     /// Rate of the link each way, bit/s; 0: without limit.
-    pub(crate) rate_bit_per_s: f64,
+    pub rate_bit_per_s: f64,
     /// Longest time that a datagram waits for the link, s.
-    pub(crate) queue_s: f64,
+    pub queue_s: f64,
 }
 
 /// What the buffers of a stream hold: the socket's at both ends, and the window of HTTP/2, bits.
@@ -94,7 +105,7 @@ impl Link {
 const LEAST_RTO_S: f64 = 0.2;
 
 /// The moments at which something stands still, once a second.
-pub(crate) struct Stalls {
+pub struct Stalls {
     stall_s: f64,
     random: Random,
     begin_s: f64,
@@ -102,13 +113,13 @@ pub(crate) struct Stalls {
 
 impl Stalls {
     /// Each of `stall_s`, the first not before `from_s`.
-    pub(crate) fn new(stall_s: f64, from_s: f64, mut random: Random) -> Self {
+    pub fn new(stall_s: f64, from_s: f64, mut random: Random) -> Self {
         let begin_s = from_s + random.between(0.0, 1.0);
         Stalls { stall_s, random, begin_s }
     }
 
     /// The end of the stall at `now_s`, s, if there is one.
-    pub(crate) fn at(&mut self, now_s: f64) -> Option<f64> {
+    pub fn at(&mut self, now_s: f64) -> Option<f64> {
         while now_s >= self.begin_s + self.stall_s {
             self.begin_s = self.begin_s.ceil() + self.random.between(0.0, 1.0);
         }
@@ -117,20 +128,20 @@ impl Stalls {
 }
 
 /// The outages of a network: both directions have them together.
-pub(crate) struct Outages {
+pub struct Outages {
     stalls: Stalls,
     ended_s: f64,
 }
 
 impl Outages {
     /// Those of a seed, the first not before `from_s`.
-    pub(crate) fn new(conditions: &Conditions, seed: u64, from_s: f64) -> Self {
+    pub fn new(conditions: &Conditions, seed: u64, from_s: f64) -> Self {
         let stalls = Stalls::new(conditions.outage_s, from_s, Random::new(seed, 5));
         Outages { stalls, ended_s: f64::NEG_INFINITY }
     }
 
     /// Whether there are any.
-    pub(crate) fn are_any(&self) -> bool {
+    pub fn are_any(&self) -> bool {
         self.stalls.stall_s > 0.0
     }
 
@@ -140,7 +151,7 @@ impl Outages {
     }
 
     /// How long ago the last outage ended, s; 0 in one.
-    pub(crate) fn since_s(&mut self, now_s: f64) -> f64 {
+    pub fn since_s(&mut self, now_s: f64) -> f64 {
         if let Some(end_s) = self.at(now_s) {
             self.ended_s = end_s;
         }
@@ -149,7 +160,7 @@ impl Outages {
 }
 
 /// One direction of a connection.
-pub(crate) struct Direction<T> {
+pub struct Direction<T> {
     conditions: Conditions,
     random: Random,
     link: Link,
@@ -164,7 +175,7 @@ pub(crate) struct Direction<T> {
 
 impl<T> Direction<T> {
     /// One of the directions of a seed, which have their outages together; the first of these not before `from_s`.
-    pub(crate) fn new(conditions: Conditions, seed: u64, direction: u64, from_s: f64) -> Self {
+    pub fn new(conditions: Conditions, seed: u64, direction: u64, from_s: f64) -> Self {
         Direction {
             conditions,
             random: Random::new(seed, direction),
@@ -193,7 +204,7 @@ impl<T> Direction<T> {
     }
 
     /// Sends a message of a size.
-    pub(crate) fn send(&mut self, now_s: f64, bytes: u64, message: T) {
+    pub fn send(&mut self, now_s: f64, bytes: u64, message: T) {
         let Conditions { transport, round_trip_s, jitter_s, .. } = self.conditions;
         self.sent += 1;
         let Some(left_s) = self.link.pass(now_s, bytes) else {
@@ -223,7 +234,7 @@ impl<T> Direction<T> {
     }
 
     /// The next message that has arrived.
-    pub(crate) fn receive(&mut self, now_s: f64) -> Option<T> {
+    pub fn receive(&mut self, now_s: f64) -> Option<T> {
         // The nanosecond allows for rounding: times are sums of milliseconds.
         if self.under_way.front()?.0 > now_s + 1e-9 {
             return None;
@@ -232,22 +243,22 @@ impl<T> Direction<T> {
     }
 
     /// When the next message arrives, s.
-    pub(crate) fn next_s(&self) -> Option<f64> {
+    pub fn next_s(&self) -> Option<f64> {
         self.under_way.front().map(|entry| entry.0)
     }
 
     /// Messages that are under way.
-    pub(crate) fn under_way(&self) -> usize {
+    pub fn under_way(&self) -> usize {
         self.under_way.len()
     }
 
     /// Messages so far.
-    pub(crate) fn sent(&self) -> u64 {
+    pub fn sent(&self) -> u64 {
         self.sent
     }
 
     /// Messages that found the queue full.
-    pub(crate) fn overflowed(&self) -> u64 {
+    pub fn overflowed(&self) -> u64 {
         self.overflowed
     }
 }

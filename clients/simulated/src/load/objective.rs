@@ -37,7 +37,7 @@ struct Bound {
 
 /// Bounds that must all hold.
 #[derive(Debug, Clone)]
-pub(crate) struct Objective(Vec<Bound>);
+pub struct Objective(Vec<Bound>);
 
 impl FromStr for Objective {
     type Err = String;
@@ -74,7 +74,7 @@ impl FromStr for Bound {
 
 impl Objective {
     /// The bounds that a run does not meet.
-    pub(crate) fn missed(&self, outcome: &Outcome) -> Vec<&str> {
+    pub fn missed(&self, outcome: &Outcome) -> Vec<&str> {
         let misses = |bound: &&Bound| {
             let value = (bound.quantity)(outcome);
             // NaN, which means not measured, meets no bound.

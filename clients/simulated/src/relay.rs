@@ -6,11 +6,12 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use super::network::{Conditions, Direction, Transport};
-use crate::{Failure, warn};
+use palpate_client::bridge::Warn;
+
+use crate::network::{Conditions, Direction, Transport};
 
 /// Connections, and senders of datagrams, at a time.
-pub(crate) const MOST_FLOWS: u64 = 64;
+pub const MOST_FLOWS: u64 = 64;
 
 /// Packets of a flow that are under way each way; beyond, TCP waits and datagrams are lost.
 const MOST_UNDER_WAY: usize = 4096;
@@ -30,35 +31,40 @@ struct Counts {
 }
 
 /// What went through a network, each way: to the server, and back.
-pub(crate) struct Passed {
-    pub(crate) flows: u64,
-    pub(crate) packets: [u64; 2],
-    pub(crate) bytes: [u64; 2],
+pub struct Passed {
+    /// Connections, and senders of datagrams.
+    pub flows: u64,
+    /// Packets.
+    pub packets: [u64; 2],
+    /// Their bytes.
+    pub bytes: [u64; 2],
 }
 
 /// The network of all flows.
-pub(crate) struct Network {
+pub struct Network {
     conditions: [Conditions; 2],
     most_flows: u64,
     seed: u64,
     begun: Instant,
     counts: Counts,
+    warn: Arc<Warn>,
 }
 
 impl Network {
-    /// A network under these conditions, whatever the transport in them, for so many flows at a time.
-    pub(crate) fn new(conditions: Conditions, seed: u64, most_flows: u64) -> Arc<Self> {
+    /// A network under these conditions, whatever the transport in them, for so many flows at a time. `warn`
+    /// shows people what is not relayed.
+    pub fn new(conditions: Conditions, seed: u64, most_flows: u64, warn: Arc<Warn>) -> Arc<Self> {
         let of = |transport| Conditions { transport, ..conditions };
         let conditions = [of(Transport::Stream), of(Transport::Datagram)];
-        Arc::new(Network { conditions, most_flows, seed, begun: Instant::now(), counts: Counts::default() })
+        Arc::new(Network { conditions, most_flows, seed, begun: Instant::now(), counts: Counts::default(), warn })
     }
 
     /// Relays connections to an address here, on threads of its own, until the program ends. Returns the address.
     ///
     /// # Errors
     /// Returns an error if the address is not free.
-    pub(crate) fn relay_tcp(self: &Arc<Self>, listen: SocketAddr, to: SocketAddr) -> Result<SocketAddr, Failure> {
-        let refused = |error: io::Error| Failure::Failed(format!("can't listen on {listen}: {error}"));
+    pub fn relay_tcp(self: &Arc<Self>, listen: SocketAddr, to: SocketAddr) -> io::Result<SocketAddr> {
+        let refused = |error: io::Error| io::Error::new(error.kind(), format!("can't listen on {listen}: {error}"));
         let listener = TcpListener::bind(listen).map_err(refused)?;
         let bound = listener.local_addr().map_err(refused)?;
         let network = self.clone();
@@ -70,8 +76,8 @@ impl Network {
     ///
     /// # Errors
     /// Returns an error if the address is not free.
-    pub(crate) fn relay_udp(self: &Arc<Self>, listen: SocketAddr, to: SocketAddr) -> Result<SocketAddr, Failure> {
-        let refused = |error: io::Error| Failure::Failed(format!("can't listen on {listen}: {error}"));
+    pub fn relay_udp(self: &Arc<Self>, listen: SocketAddr, to: SocketAddr) -> io::Result<SocketAddr> {
+        let refused = |error: io::Error| io::Error::new(error.kind(), format!("can't listen on {listen}: {error}"));
         let socket = UdpSocket::bind(listen).map_err(refused)?;
         let bound = socket.local_addr().map_err(refused)?;
         let network = self.clone();
@@ -80,18 +86,16 @@ impl Network {
     }
 
     /// What went through so far.
-    pub(crate) fn passed(&self) -> Passed {
+    pub fn passed(&self) -> Passed {
         let Counts { flows, packets, bytes, .. } = &self.counts;
         let read = |counts: &[AtomicU64; 2]| [0, 1].map(|way| counts[way].load(Ordering::Relaxed));
         Passed { flows: flows.load(Ordering::Relaxed), packets: read(packets), bytes: read(bytes) }
     }
 }
 
-fn thread(work: impl FnOnce() + Send + 'static) -> Result<(), Failure> {
-    std::thread::Builder::new()
-        .spawn(work)
-        .map(drop)
-        .map_err(|error| Failure::Failed(format!("can't start a thread: {error}")))
+fn thread(work: impl FnOnce() + Send + 'static) -> io::Result<()> {
+    let begun = std::thread::Builder::new().spawn(work).map(drop);
+    begun.map_err(|error| io::Error::new(error.kind(), format!("can't start a thread: {error}")))
 }
 
 /// One direction of a flow: what was read and has not arrived.
@@ -175,7 +179,7 @@ impl Flow {
         let Counts { open, flows, .. } = &network.counts;
         if open.fetch_add(1, Ordering::Relaxed) >= network.most_flows {
             open.fetch_sub(1, Ordering::Relaxed);
-            warn("too many connections at a time: one was refused");
+            (network.warn)("too many connections at a time: one was refused");
             return None;
         }
         Some(Flow(network.clone(), flows.fetch_add(1, Ordering::Relaxed)))
@@ -208,7 +212,7 @@ fn accept(listener: &TcpListener, to: SocketAddr, network: &Arc<Network>) {
             Ok(())
         });
         if let Err(error) = relayed {
-            warn(&format!("a connection was not relayed: {error}"));
+            (network.warn)(&format!("a connection was not relayed: {error}"));
         }
     }
 }
@@ -251,7 +255,7 @@ fn receive(near: &UdpSocket, to: SocketAddr, network: &Arc<Network>) {
                 }
                 Ok(None) => continue,
                 Err(error) => {
-                    warn(&format!("datagrams of {from} are not relayed: {error}"));
+                    (network.warn)(&format!("datagrams of {from} are not relayed: {error}"));
                     continue;
                 }
             },
@@ -274,7 +278,6 @@ fn begin_sender(
     let [up, down] = [0, 1].map(|way| Way::new(network, Transport::Datagram, flow.1, way));
     let (near, back, answers) = (near.try_clone()?, far.try_clone()?, down.clone());
     let gone = up.clone();
-    let wrong = |_| io::Error::other("no thread");
     // A server that is not there yet answers by an error, and may come.
     thread(move || {
         let mut packet = vec![0; PACKET_BYTES[1]];
@@ -287,14 +290,12 @@ fn begin_sender(
         }
         answers.end();
         gone.end();
-    })
-    .map_err(wrong)?;
+    })?;
     thread(move || {
         while let Some(packet) = down.next() {
             let _ = near.send_to(&packet, from);
         }
-    })
-    .map_err(wrong)?;
+    })?;
     thread({
         let up = up.clone();
         move || {
@@ -303,7 +304,6 @@ fn begin_sender(
             }
             drop(flow);
         }
-    })
-    .map_err(wrong)?;
+    })?;
     Ok(Some(up))
 }

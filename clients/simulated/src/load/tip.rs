@@ -11,16 +11,16 @@ use palpate_touch::{Device, Envelope, Renderer, RenderingState, Tip};
 use pb::command::Action;
 
 use super::stroke::Stroke;
-use crate::simulated::random::Random;
-use crate::simulated::task::{LEAD_S, Task};
+use crate::random::Random;
+use crate::task::{LEAD_S, Task};
 
 /// What clients leave out because the other end can do without.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Deadbands {
+pub struct Deadbands {
     /// Of samples: fraction of the force that is rendered; 0: one a step.
-    pub(crate) down: f64,
+    pub down: f64,
     /// Of poses; 0: one a tick.
-    pub(crate) up: f64,
+    pub up: f64,
 }
 
 /// What leads the tool of a client.

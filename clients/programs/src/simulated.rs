@@ -1,20 +1,14 @@
-//! Simulated devices in simulated hands, in real time, and the tasks that the hands perform.
-
-pub(crate) mod network;
-pub(crate) mod random;
-pub(crate) mod relay;
-pub(crate) mod task;
+//! Simulated devices in simulated hands, in real time.
 
 use std::time::Instant;
 
 use glam::DVec3;
 use palpate_client::{HapticDevice, Reading};
 use palpate_proto::refusal::{Reason, Refusal, did_you_mean};
+use palpate_simulated::task::Task;
 use palpate_touch::Device;
 use palpate_touch::device::{DEVICES, UNDECLARED};
 use palpate_touch::hand::{HANDS, Hand, HandState};
-
-use task::Task;
 
 /// The value found for a name, or an error that lists the names.
 fn named<T>(field: &str, name: &str, found: Option<T>, names: &[&str]) -> Result<T, Refusal> {
@@ -142,8 +136,8 @@ impl HapticDevice for Simulated {
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod tests {
-    use super::random::Random;
     use super::*;
+    use palpate_simulated::random::Random;
 
     fn simulated(remember: bool) -> Simulated {
         let task = Task::new(DVec3::ZERO, 0.0, 2.0, 1.0, &mut Random::new(1, 0));

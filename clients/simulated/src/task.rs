@@ -5,10 +5,10 @@ use glam::DVec3;
 use palpate_touch::Law;
 use palpate_touch::hand::Hand;
 
-use super::random::Random;
+use crate::random::Random;
 
 /// Time before the first press, s: longer than the soft engage.
-pub(crate) const LEAD_S: f64 = 0.7;
+pub const LEAD_S: f64 = 0.7;
 
 /// Range of the target's depths, m.
 const DEPTH_M: [f64; 2] = [0.005, 0.015];
@@ -28,7 +28,7 @@ const PARTS: [f64; 3] = [0.3, 0.4, 0.3];
 const PEAK: f64 = 1.875;
 
 /// Fraction of the device's largest force that the true force must not exceed.
-pub(crate) const FORCE_SHARE: f64 = 0.8;
+pub const FORCE_SHARE: f64 = 0.8;
 
 /// One movement, relative to the end of the one before.
 struct Leg {
@@ -38,16 +38,16 @@ struct Leg {
 }
 
 /// A moving target.
-pub(crate) struct Task {
+pub struct Task {
     start_m: DVec3,
     legs: Vec<Leg>,
     /// Largest distance from the start, m.
-    pub(crate) amplitude_m: f64,
+    pub amplitude_m: f64,
 }
 
 impl Task {
     /// Presses around `middle_m` from `lead_s` until `duration_s`. Their depth is scaled by `scale`.
-    pub(crate) fn new(middle_m: DVec3, lead_s: f64, duration_s: f64, scale: f64, random: &mut Random) -> Self {
+    pub fn new(middle_m: DVec3, lead_s: f64, duration_s: f64, scale: f64, random: &mut Random) -> Self {
         let mut height_m = random.between(HEIGHT_M[0], HEIGHT_M[1]);
         let start_m = middle_m + height_m * DVec3::Z;
         let mut legs: Vec<Leg> = Vec::new();
@@ -82,12 +82,12 @@ impl Task {
     }
 
     /// The target's position at the start, m.
-    pub(crate) fn start_m(&self) -> DVec3 {
+    pub fn start_m(&self) -> DVec3 {
         self.start_m
     }
 
     /// The target's position at `time_s`, m.
-    pub(crate) fn at(&self, time_s: f64) -> DVec3 {
+    pub fn at(&self, time_s: f64) -> DVec3 {
         self.legs.iter().take_while(|leg| leg.from_s < time_s).fold(self.start_m, |place_m, leg| {
             let x = ((time_s - leg.from_s) / (leg.to_s - leg.from_s)).min(1.0);
             place_m + leg.by_m * (x * x * x * (10.0 + x * (6.0 * x - 15.0)))
@@ -97,7 +97,7 @@ impl Task {
 
 /// The scale of depths at which the deepest press of a hand at rest meets [`FORCE_SHARE`] of the largest force: there the
 /// hand's spring and the tissue are in balance.
-pub(crate) fn scale(hand: &Hand, law: &Law, most_n: f64) -> f64 {
+pub fn scale(hand: &Hand, law: &Law, most_n: f64) -> f64 {
     let force_n = FORCE_SHARE * MARGIN * most_n;
     let yields_m = if hand.stiffness_n_per_m > 0.0 { force_n / hand.stiffness_n_per_m } else { f64::INFINITY };
     ((law.depth_of(force_n) + yields_m) / DEPTH_M[1]).min(1.0)

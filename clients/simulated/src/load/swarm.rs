@@ -35,25 +35,6 @@ pub(crate) struct Orders {
     pub(crate) lasts_s: f64,
 }
 
-/// Why a load could not run.
-pub(crate) struct Stopped {
-    pub(crate) message: String,
-    /// Whether an input was refused; otherwise the server failed.
-    pub(crate) is_refusal: bool,
-}
-
-impl From<Error> for Stopped {
-    fn from(error: Error) -> Self {
-        Stopped { message: error.to_string(), is_refusal: error.is_refusal() }
-    }
-}
-
-impl From<Status> for Stopped {
-    fn from(status: Status) -> Self {
-        Error::Call(status).into()
-    }
-}
-
 /// A session that this thread created.
 struct Made {
     id: String,
@@ -72,7 +53,7 @@ struct Connections<'o> {
 }
 
 impl Connections<'_> {
-    async fn next(&mut self, server: &Server) -> Result<Channel, Stopped> {
+    async fn next(&mut self, server: &Server) -> Result<Channel, Error> {
         if let Some((channel, users)) = self.newest.get_mut(server.url())
             && *users < self.orders.clients_per_connection
         {
@@ -96,7 +77,7 @@ pub(crate) struct Swarm {
 }
 
 impl Swarm {
-    pub(crate) async fn new(server: &Server, common: &Common) -> Result<Self, Stopped> {
+    pub(crate) async fn new(server: &Server, common: &Common) -> Result<Self, Error> {
         let channel = server.connect().await?;
         let hosts = BTreeMap::from([(server.url().to_owned(), channel.clone())]);
         let client = SessionServiceClient::new(channel);
@@ -104,7 +85,7 @@ impl Swarm {
     }
 
     /// Creates the sessions and opens the streams of their clients and viewers.
-    pub(crate) async fn gather(&mut self, orders: &Orders, phases: &[watch::Receiver<u64>]) -> Result<(), Stopped> {
+    pub(crate) async fn gather(&mut self, orders: &Orders, phases: &[watch::Receiver<u64>]) -> Result<(), Error> {
         let mut connections = Connections { orders, newest: BTreeMap::new() };
         // Separate connections: on a shared one, frames would delay samples.
         let mut viewing = Connections { orders, newest: BTreeMap::new() };
@@ -222,7 +203,7 @@ async fn keep_awake(
     rate_hz: f64,
     step: u64,
     lasts_s: f64,
-) -> Result<(), Stopped> {
+) -> Result<(), Error> {
     /// Fewer than a session queues.
     const MOST_COMMANDS: u64 = 4000;
     const APART_S: f64 = 0.05;

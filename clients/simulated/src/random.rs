@@ -1,28 +1,28 @@
 //! Random numbers that are the same on every machine.
 
 /// A random number generator with the same results on every machine.
-pub(crate) struct Random(fastrand::Rng);
+pub struct Random(fastrand::Rng);
 
 impl Random {
     /// One of the independent streams of a seed.
-    pub(crate) fn new(seed: u64, stream: u64) -> Self {
+    pub fn new(seed: u64, stream: u64) -> Self {
         // The odd factor spreads neighbouring seeds and streams.
         Random(fastrand::Rng::with_seed((seed ^ stream.rotate_left(32)).wrapping_mul(0x9e37_79b9_7f4a_7c15)))
     }
 
     /// A uniformly distributed number from `low` to `high`.
-    pub(crate) fn between(&mut self, low: f64, high: f64) -> f64 {
+    pub fn between(&mut self, low: f64, high: f64) -> f64 {
         low + (high - low) * self.0.f64()
     }
 
     /// A number of the standard normal distribution (Box and Muller).
-    pub(crate) fn normal(&mut self) -> f64 {
+    pub fn normal(&mut self) -> f64 {
         let radius = (-2.0 * (1.0 - self.between(0.0, 1.0)).ln()).sqrt();
         radius * (std::f64::consts::TAU * self.between(0.0, 1.0)).cos()
     }
 
     /// A random element of a list.
-    pub(crate) fn one_of<'t, T>(&mut self, list: &'t [T]) -> &'t T {
+    pub fn one_of<'t, T>(&mut self, list: &'t [T]) -> &'t T {
         &list[self.0.usize(..list.len())]
     }
 }

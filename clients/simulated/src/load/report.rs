@@ -10,7 +10,7 @@ use super::plan::{Mover, Plan, User};
 use super::tally::{Outcome, Tally, listed};
 
 /// What was counted within a second.
-pub(crate) struct Second {
+pub struct Second {
     /// Its end, since the plan began, s.
     pub(crate) at_s: f64,
     /// Users at its end.
@@ -22,7 +22,7 @@ pub(crate) struct Second {
 
 impl Second {
     /// For people who watch.
-    pub(crate) fn line(&self) -> String {
+    pub fn line(&self) -> String {
         let outcome = outcome(&self.tally, 0);
         format!(
             "{:.0} s  {} users  {} samples/s  round trip p99 {}  turned away {}",
@@ -55,7 +55,7 @@ struct Stretch {
 }
 
 /// The report of a plan.
-pub(crate) struct Report {
+pub struct Report {
     name: String,
     points: Vec<Point>,
     phases: Vec<Stretch>,
@@ -188,7 +188,7 @@ impl Report {
     }
 
     /// Why the load failed; `None` if it did not.
-    pub(crate) fn verdict(&self) -> Option<String> {
+    pub fn verdict(&self) -> Option<String> {
         let whole = self.whole.outcome();
         if self.is_interrupted {
             return Some("the plan was interrupted".to_owned());
@@ -210,7 +210,8 @@ impl Report {
         (!whys.is_empty()).then(|| whys.join("; "))
     }
 
-    pub(crate) fn json(&self) -> Value {
+    /// As JSON: the whole, its phases and seconds; what was not measured is `null`.
+    pub fn json(&self) -> Value {
         let finite = |value: f64| if value.is_finite() { json!(value) } else { Value::Null };
         let points = self.points.iter().map(|Point { at_s, users, outcome }| {
             json!({
@@ -227,8 +228,13 @@ impl Report {
         })
     }
 
+    /// As a page with plots (HTML) that needs nothing else.
+    pub fn page(&self) -> String {
+        page(self)
+    }
+
     /// As a table for a terminal.
-    pub(crate) fn table(&self) -> String {
+    pub fn table(&self) -> String {
         let head = "phase               users  arrived  turned away  round trip p50 / p99      start p99    dilation   objective\n";
         let rows = self.stretches().map(|stretch| {
             let outcome = stretch.outcome();
@@ -312,7 +318,9 @@ fn plot(report: &Report, title: &str, courses: &[Course<'_>]) -> String {
             escaped(&phase.name),
         );
     }
+    #[allow(clippy::cast_possible_truncation)]
     for part in 0..=4 {
+        // In f32, so that the sum of roundings is not shown.
         let value = most * f64::from(part) / 4.0;
         let at = y(value);
         let _ = writeln!(
@@ -321,7 +329,7 @@ fn plot(report: &Report, title: &str, courses: &[Course<'_>]) -> String {
             width - right,
             left - 6.0,
             at + 4.0,
-            crate::table::rounded(value),
+            value as f32,
         );
     }
     for part in 0..=6 {
@@ -349,7 +357,7 @@ fn plot(report: &Report, title: &str, courses: &[Course<'_>]) -> String {
 }
 
 /// The report as one page that needs nothing else.
-pub(crate) fn page(report: &Report) -> String {
+fn page(report: &Report) -> String {
     let of = |value: fn(&Outcome) -> f64| report.points.iter().map(|point| value(&point.outcome)).collect::<Vec<f64>>();
     #[allow(clippy::cast_precision_loss)]
     let users = report.points.iter().map(|point| point.users as f64).collect();

@@ -12,15 +12,13 @@ use palpate_client::{Channel, Error};
 use palpate_mesh::write::{Format, write};
 use palpate_mesh::{Group, TriangleMesh};
 use palpate_proto::pb;
-use palpate_proto::refusal::Reason;
+use palpate_proto::refusal::{Reason, Refusal};
 use pb::create_session_request::Source;
 use pb::view_service_client::ViewServiceClient;
 use tonic::Status;
 
-use crate::Failure;
-
 /// The scene of a session.
-pub(crate) struct SceneFile {
+pub struct SceneFile {
     source: Source,
     /// The scene of a file of our own.
     own: Option<Scene>,
@@ -39,7 +37,7 @@ impl SceneFile {
     ///
     /// # Errors
     /// Returns an error if the file can't be read, or if its scene is invalid.
-    pub(crate) fn read(scene: &str) -> Result<Self, Failure> {
+    pub fn read(scene: &str) -> Result<Self, Refusal> {
         let file = Path::new(scene);
         if file.extension().is_none_or(|extension| extension != "toml") {
             return Ok(SceneFile { source: Source::SceneName(scene.to_owned()), own: None, mesh: None });
@@ -58,7 +56,10 @@ impl SceneFile {
                 let whole = said.path.filter(|path| path.extension().is_none_or(|extension| extension != "gltf"));
                 Some(match whole {
                     Some(path) => {
-                        let unread = |e| Failure::Refused(format!("{}: can't be read: {e}", path.display()));
+                        let unread = |e| Refusal {
+                            place: Some(path.display().to_string()),
+                            ..Refusal::new(Reason::Unreadable, "", format!("can't be read: {e}"))
+                        };
                         let bytes = std::fs::read(&path).map_err(unread)?;
                         let name = path.file_name().map(|name| name.to_string_lossy().into_owned());
                         MeshToSend { name: name.unwrap_or_default(), bytes, unit: said.unit }
@@ -78,13 +79,13 @@ impl SceneFile {
     ///
     /// # Errors
     /// Returns the server's refusal, or how the connection broke.
-    pub(crate) async fn source(&self, channel: Channel) -> Result<Source, Failure> {
+    pub async fn source(&self, channel: Channel) -> Result<Source, Error> {
         let mut source = self.source.clone();
         if let (Source::Scene(scene), Some(MeshToSend { name, bytes, unit })) = (&mut source, &self.mesh) {
-            let sent = upload_mesh(channel, name, bytes, unit, false).await.map_err(Error::Call)?;
+            let sent = upload_mesh(channel, name, bytes, unit, false).await?;
             if let Some(report) = sent.report.filter(|report| report.refused) {
                 let what = report.problems.first().map(|problem| format!("{}: {}", problem.element, problem.what));
-                return Err(Failure::Refused(format!("{name}: {}", what.unwrap_or_default())));
+                return Err(Error::Argument(format!("{name}: {}", what.unwrap_or_default())));
             }
             if let Some(mesh) = &mut scene.mesh {
                 mesh.mesh_id = sent.mesh_id;
@@ -98,25 +99,26 @@ impl SceneFile {
     ///
     /// # Errors
     /// Returns an error if the server's scene or mesh can't be read.
-    pub(crate) async fn scene(&self, session: &pb::Session, channel: Channel) -> Result<Scene, Failure> {
-        let told = session.scene.as_ref().ok_or_else(|| Failure::Failed("the server sent no scene".into()))?;
+    pub async fn scene(&self, session: &pb::Session, channel: Channel) -> Result<Scene, Error> {
+        let told = session.scene.as_ref().ok_or_else(|| Error::Connection("the server sent no scene".to_owned()))?;
+        let wrong = |refusal: Refusal| Error::Argument(refusal.to_string());
         match (&self.own, &told.mesh) {
-            (_, None) => Ok(wire::scene::from_scene(told, None)?),
+            (_, None) => wire::scene::from_scene(told, None).map_err(wrong),
             (Some(own), Some(_)) => Ok(own.clone()),
             (None, Some(_)) => {
-                let mesh = server_mesh(&session.session_id, channel).await.map_err(Error::Call)?;
+                let mesh = server_mesh(&session.session_id, channel).await?;
                 // The coefficients that follow from a material are told as well.
                 let mut even = pb::Scene { material: None, inclusions: Vec::new(), ..told.clone() };
                 // Scripts name the vertices of the file. Which point of a coarser mesh each stands for, the server knows.
                 even.mesh.iter_mut().for_each(|mesh| mesh.vertices = None);
-                Ok(wire::scene::from_scene(&even, Some(&mesh))?)
+                wire::scene::from_scene(&even, Some(&mesh)).map_err(wrong)
             }
         }
     }
 }
 
 /// The mesh of a scene, before it was made coarser.
-fn written(mesh: &Mesh) -> TriangleMesh {
+pub fn written(mesh: &Mesh) -> TriangleMesh {
     if let Some(shown) = mesh.shape.shown() {
         return shown.mesh.clone();
     }
@@ -155,21 +157,4 @@ async fn server_mesh(session_id: &str, channel: Channel) -> Result<TriangleMesh,
         mesh.triangles.push([number(a)?, number(b)?, number(c)?]);
     }
     Ok(mesh)
-}
-
-/// The failure of a session with this scene. If the server does not know the name, it may be meant as a file: the message
-/// says how to give one.
-pub(crate) fn with_hint(scene: &str, failure: Failure) -> Failure {
-    let file = format!("{scene}.toml");
-    match failure {
-        Failure::Refused(why) if why.contains(Reason::UnknownScene.as_str()) => {
-            let hint = if Path::new(&file).is_file() {
-                format!("did you mean the file `{file}`?")
-            } else {
-                "give your own scene by its path, --scene FILE.toml".to_owned()
-            };
-            Failure::Refused(format!("{why}; {hint}"))
-        }
-        failure => failure,
-    }
 }

@@ -1,14 +1,14 @@
 //! A plan as it runs: users arrive, stay and leave, and every second is counted by itself.
 
 use std::net::{SocketAddr, ToSocketAddrs};
-use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use palpate_client::bridge::Warn;
 use palpate_client::{Channel, Error, Server, describe, fleet};
 use palpate_proto::pb;
-use palpate_proto::refusal::{Reason, Refusal};
+use palpate_proto::refusal::Refusal;
 use pb::create_session_request::Source;
 use pb::session_service_client::SessionServiceClient;
 use tokio::sync::watch;
@@ -16,15 +16,14 @@ use tokio::task::JoinSet;
 
 use super::client::{Arrivals, Client, Common, Stage, lock};
 use super::plan::{Mover, Plan, User, Viewers};
-use super::report::{Report, Second, page};
+use super::report::{Report, Second};
 use super::stroke::Stroke;
 use super::swarm::{middle_m, rate_hz, view};
 use super::tally::Tally;
 use super::tip::Lead;
 use super::{PHASES, tick};
-use crate::Failure;
+use crate::relay::Network;
 use crate::scene_file::SceneFile;
-use crate::simulated::relay::Network;
 
 /// Flows of one network at a time.
 const MOST_FLOWS: u64 = 20_000;
@@ -58,80 +57,97 @@ struct World {
     over: watch::Receiver<bool>,
 }
 
-/// Loads a server by a plan, and prints or writes the report.
-///
-/// # Errors
-/// Returns an error if the plan is refused, if the server can't be reached, if streams broke, or if an objective was missed.
-pub(super) async fn load(path: &Path, arguments: &super::Arguments) -> Result<(), Failure> {
-    let plan = Plan::read(path)?;
-    let direct = arguments.credentials.server(&arguments.server)?;
-    let files = plan.scenes.iter().map(|scene| SceneFile::read(&scene.what)).collect::<Result<Vec<_>, _>>()?;
-    let channel = direct.connect().await?;
-    let mut sources = Vec::new();
-    for file in files {
-        sources.push(file.source(channel.clone()).await?);
+/// A plan with its scenes, ready to be run.
+pub struct Course {
+    plan: Plan,
+    scenes: Vec<SceneFile>,
+}
+
+impl Course {
+    /// Reads the scene files that a plan names.
+    ///
+    /// # Errors
+    /// Refuses a scene that can't be read.
+    pub fn new(plan: Plan) -> Result<Self, Refusal> {
+        let scenes = plan.scenes.iter().map(|scene| SceneFile::read(&scene.what)).collect::<Result<_, _>>()?;
+        Ok(Course { plan, scenes })
     }
-    drop(channel);
-    let mut servers = Vec::new();
-    for (index, wire) in plan.wires.iter().enumerate() {
-        servers.push(match wire.what.conditions {
-            None => direct.clone(),
-            Some(conditions) => {
-                let to = address(&arguments.server)?;
-                let network = Network::new(conditions, 100 + index as u64, MOST_FLOWS);
-                let near = network.relay_tcp(SocketAddr::from(([127, 0, 0, 1], 0)), to)?;
-                arguments.credentials.server(&format!("http://{near}"))?
-            }
+
+    /// Loads a server by the plan, until its end or until `stop` completes; then all users leave. `told` is told of each second,
+    /// and `warn` what goes wrong with a network.
+    ///
+    /// # Errors
+    /// Returns an error if the server can't be reached or refuses a scene, or if a network can't stand before it.
+    pub async fn run(
+        self,
+        server: &Server,
+        told: impl FnMut(&Second) + Send + 'static,
+        warn: impl Fn(&str) + Send + Sync + 'static,
+        stop: impl Future<Output = ()> + Send + 'static,
+    ) -> Result<Report, Error> {
+        let Course { plan, scenes } = self;
+        let channel = server.connect().await?;
+        let mut sources = Vec::new();
+        for scene in scenes {
+            sources.push(scene.source(channel.clone()).await?);
+        }
+        drop(channel);
+        let warn: Arc<Warn> = Arc::new(Box::new(warn));
+        let mut servers = Vec::new();
+        for (index, wire) in plan.wires.iter().enumerate() {
+            servers.push(match wire.what.conditions {
+                None => server.clone(),
+                Some(conditions) => {
+                    let to = address(server.url())?;
+                    let network = Network::new(conditions, 100 + index as u64, MOST_FLOWS, warn.clone());
+                    let near = network.relay_tcp(SocketAddr::from(([127, 0, 0, 1], 0)), to);
+                    let near = near.map_err(|error| Error::Internal(error.to_string()))?;
+                    server.at(&format!("http://{near}"))?
+                }
+            });
+        }
+        // A thread of its own, so that what the users do is measured by who does nothing else.
+        let ran = tokio::task::spawn_blocking(move || {
+            let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
+            let runtime = runtime.map_err(|error| Error::Internal(format!("can't start a thread: {error}")))?;
+            Ok::<_, Error>(runtime.block_on(run(plan, servers, sources, told, stop)))
         });
+        ran.await.map_err(|error| Error::Internal(error.to_string()))?
     }
-    let is_quiet = arguments.quiet;
-    // A thread of its own, so that what the users do is measured by who does nothing else.
-    let ran = tokio::task::spawn_blocking(move || {
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
-        let runtime = runtime.map_err(|error| Failure::Failed(format!("can't start a thread: {error}")))?;
-        Ok::<_, Failure>(runtime.block_on(run(plan, servers, sources, is_quiet)))
-    });
-    let report = ran.await.map_err(|error| Failure::Failed(error.to_string()))??;
-    if let Some(file) = &arguments.report {
-        let written = std::fs::write(file, page(&report));
-        written.map_err(|error| Failure::Failed(format!("{}: {error}", file.display())))?;
-    }
-    if arguments.json {
-        crate::tell!("{}", report.json());
-    } else {
-        print!("{}", report.table());
-    }
-    report.verdict().map_or(Ok(()), |why| Err(Failure::Failed(why)))
 }
 
 /// The address of a server, for a network before it.
-fn address(url: &str) -> Result<SocketAddr, Failure> {
-    let refuse = |message: String| Failure::from(Refusal::new(Reason::WrongKind, "--server", message));
+fn address(url: &str) -> Result<SocketAddr, Error> {
+    let refuse = |why: String| Error::Argument(format!("{url}: {why}"));
     let host = url.strip_prefix("http://").ok_or_else(|| {
-        refuse(
-            "must begin with http:// for a plan with networks: a certificate is not for what stands before it"
-                .to_owned(),
-        )
+        let why = "must begin with http:// for a plan with networks: a certificate is not for what stands before it";
+        refuse(why.to_owned())
     })?;
     let host = host.split('/').next().unwrap_or(host);
     let host = if host.contains(':') { host.to_owned() } else { format!("{host}:80") };
-    let mut found = host.to_socket_addrs().map_err(|error| refuse(format!("{host}: {error}")))?;
-    found.next().ok_or_else(|| refuse(format!("{host} has no address")))
+    let mut found = host.to_socket_addrs().map_err(|error| refuse(error.to_string()))?;
+    found.next().ok_or_else(|| refuse("has no address".to_owned()))
 }
 
 /// What a loop waits for next.
 enum Next {
     User(User),
     Second,
-    Interrupted,
+    Stop,
 }
 
-async fn run(plan: Plan, servers: Vec<Server>, sources: Vec<Source>, is_quiet: bool) -> Report {
+async fn run(
+    plan: Plan,
+    servers: Vec<Server>,
+    sources: Vec<Source>,
+    mut told: impl FnMut(&Second),
+    stop: impl Future<Output = ()>,
+) -> Report {
     let (senders, phases): (Vec<_>, Vec<_>) = (0..PHASES).map(|_| watch::channel(0)).unzip();
-    let (stop, stopped) = watch::channel(());
+    let (beating, beats) = watch::channel(());
     let (leave, over) = watch::channel(false);
     let rate_hz = plan.rate_hz;
-    let ticker = std::thread::spawn(move || tick(&senders, rate_hz, &stopped));
+    let ticker = std::thread::spawn(move || tick(&senders, rate_hz, &beats));
     let tally = Arc::new(Mutex::new(Tally::new()));
     let (users, lasts_s) = (plan.users(), plan.lasts_s());
     let mut report = Report::new(&plan, &users);
@@ -140,7 +156,7 @@ async fn run(plan: Plan, servers: Vec<Server>, sources: Vec<Source>, is_quiet: b
     let world = Arc::new(World { plan, servers, sources, clock, tally, counts, phases, over });
     let mut tasks = JoinSet::new();
     let mut coming = users.into_iter().peekable();
-    let mut interrupted = std::pin::pin!(tokio::signal::ctrl_c());
+    let mut stop = std::pin::pin!(stop);
     let begun = tokio::time::Instant::now();
     let mut second = 1.0_f64;
     while second <= lasts_s.ceil() {
@@ -148,7 +164,7 @@ async fn run(plan: Plan, servers: Vec<Server>, sources: Vec<Source>, is_quiet: b
         let due_s = user_s.min(second);
         let next = tokio::select! {
             biased;
-            _ = &mut interrupted => Next::Interrupted,
+            () = &mut stop => Next::Stop,
             () = tokio::time::sleep_until(begun + Duration::from_secs_f64(due_s)) => {
                 coming.next_if(|user| user.at_s < second).map_or(Next::Second, Next::User)
             }
@@ -160,14 +176,11 @@ async fn run(plan: Plan, servers: Vec<Server>, sources: Vec<Source>, is_quiet: b
             }
             Next::Second => {
                 let counted = count(&world, second);
-                if !is_quiet {
-                    crate::say!("{}", counted.line());
-                }
+                told(&counted);
                 report.add(counted);
                 second += 1.0;
             }
-            Next::Interrupted => {
-                crate::say!("palpate-client: interrupted: deleting the sessions");
+            Next::Stop => {
                 report.is_interrupted = true;
                 break;
             }
@@ -179,7 +192,7 @@ async fn run(plan: Plan, servers: Vec<Server>, sources: Vec<Source>, is_quiet: b
     while tasks.join_next().await.is_some() {}
     // What came after the last second counts in the last phase.
     report.add(count(&world, second));
-    drop(stop);
+    drop(beating);
     let _ = ticker.join();
     report
 }

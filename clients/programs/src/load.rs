@@ -1,0 +1,314 @@
+//! `palpate-client load`: loads a server with sessions, clients and viewers, and measures how it copes.
+
+use std::io::IsTerminal;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use palpate_client::{Error, Server};
+use palpate_proto::pb::create_session_request::Source;
+use palpate_simulated::load::{Course, Deadbands, Objective, Outcome, Plan, Progress, Second, Trial, trial};
+use palpate_simulated::scene_file::SceneFile;
+
+use crate::credentials::CredentialOptions;
+use crate::{Failure, interrupted, within};
+
+#[derive(clap::Args)]
+pub(crate) struct Arguments {
+    /// The server
+    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7117")]
+    server: String,
+    /// Number of sessions; with --find-limit, where the search begins
+    #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..))]
+    sessions: u32,
+    /// Haptic clients of each session, with one tool each. With 0, commands sent beforehand keep each session awake
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(0..=64))]
+    clients_per_session: u32,
+    /// Viewers of each session
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=64))]
+    viewers: u32,
+    /// Name of a scene of the server, or a scene file of your own (ends in .toml)
+    #[arg(long, value_name = "NAME", default_value = "paper")]
+    scene: String,
+    /// Duration of the measurement, once all clients are connected
+    #[arg(long, value_name = "SECONDS", default_value_t = 10.0, value_parser = seconds)]
+    seconds: f64,
+    /// Time over which sessions and clients start [default: as fast as the server creates them]
+    #[arg(long, value_name = "SECONDS", default_value_t = 0.0, value_parser = seconds)]
+    ramp_s: f64,
+    /// Commands per second of each client
+    #[arg(long, value_name = "HZ", default_value_t = 1000.0, value_parser = rate)]
+    rate_hz: f64,
+    /// Frames per second of each viewer
+    #[arg(long, value_name = "HZ", default_value_t = 60.0, value_parser = rate)]
+    frame_rate_hz: f64,
+    /// Clients lead tools with a tip and render forces, as devices do, in place of pushing. Of a round trip, the wait for the step
+    /// of the sample does not count: that is what a deadband is for. Sheets only, such as --scene liver
+    #[arg(long)]
+    touch: bool,
+    /// With --touch: clients get a sample only when the rendered force would be off by more than this fraction
+    #[arg(long, value_name = "FRACTION", default_value_t = 0.0, requires = "touch", value_parser = fraction)]
+    deadband: f64,
+    /// With --touch: clients send a pose only when the server would be wrong about the tool by more than this fraction of the force
+    #[arg(long, value_name = "FRACTION", default_value_t = 0.0, requires = "touch", value_parser = fraction)]
+    up_deadband: f64,
+    /// Clients that share a connection. With 1 each client has its own, like clients on separate machines
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    clients_per_connection: u32,
+    /// Threads of this generator
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
+    threads: u32,
+    /// Find the largest number of sessions that meets this objective in two of three trials: bounds on p50, p99, p999,
+    /// max (round trip), gap_p99, gap_max, frame_age_p99, dilation, lost and rejected, such as 'p99<2ms,dilation>0.999'
+    #[arg(long, value_name = "OBJECTIVE")]
+    find_limit: Option<Objective>,
+    /// Load the server by this plan (TOML): phases, arrivals, mixes and objectives, in place of the numbers above
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["sessions", "clients_per_session", "viewers", "scene", "seconds",
+        "ramp_s", "rate_hz", "frame_rate_hz", "touch", "find_limit", "clients_per_connection", "threads"])]
+    plan: Option<PathBuf>,
+    /// With --plan: write a page with plots to this file (HTML)
+    #[arg(long, value_name = "FILE", requires = "plan")]
+    report: Option<PathBuf>,
+    /// Print one JSON object instead of a table
+    #[arg(long)]
+    json: bool,
+    /// No progress
+    #[arg(short, long)]
+    quiet: bool,
+    #[command(flatten)]
+    credentials: CredentialOptions,
+}
+
+fn seconds(text: &str) -> Result<f64, String> {
+    within(text, 0.0..=36_000.0)
+}
+
+fn fraction(text: &str) -> Result<f64, String> {
+    within(text, 0.0..=1.0)
+}
+
+fn rate(text: &str) -> Result<f64, String> {
+    within(text, 0.1..=20_000.0)
+}
+
+/// The search ends when the bracket is narrower than this fraction of the limit (1/40).
+const RESOLUTION: usize = 40;
+
+/// Number of trials that must agree: two of three, because one stall of the machine can spoil a trial, and one lucky trial
+/// proves nothing.
+const AGREE: usize = 2;
+
+/// The largest number that is tried.
+const MOST_SESSIONS: usize = 1 << 16;
+
+pub(crate) async fn load(arguments: &Arguments) -> Result<(), Failure> {
+    if let Some(path) = &arguments.plan {
+        return by_plan(path, arguments).await;
+    }
+    let server = arguments.credentials.server(&arguments.server)?;
+    let file = SceneFile::read(&arguments.scene)?;
+    let source = file.source(server.connect().await.map_err(Failure::from)?).await?;
+    let sessions = arguments.sessions as usize;
+    let ended = async {
+        match &arguments.find_limit {
+            None => measured(arguments, &server, &source, sessions).await.map(|outcome| (outcome, None)),
+            Some(objective) => find_limit(arguments, &server, &source, sessions, objective)
+                .await
+                .map(|(outcome, limit)| (outcome, Some(limit))),
+        }
+    };
+    let (outcome, limit) = ended.await?;
+    if arguments.json {
+        crate::tell!("{}", outcome.json(limit));
+    } else {
+        print!("{}", outcome.table(limit));
+    }
+    if limit.is_none() && outcome.samples == 0 && arguments.clients_per_session > 0 && arguments.seconds > 0.0 {
+        return Err(Failure::Failed("no sample arrived".to_owned()));
+    }
+    if limit.is_none() && outcome.broken > 0 {
+        return Err(Failure::Failed(format!("{} streams broke", outcome.broken)));
+    }
+    Ok(())
+}
+
+/// Repeats a trial until `AGREE` of them agree on whether the objective is met. Returns that, and the outcome of the last of
+/// them, if it had one.
+async fn agreed<T, E>(mut trial: impl AsyncFnMut() -> Result<(T, bool), E>) -> Result<(T, bool), E> {
+    let mut counts = [0; 2];
+    loop {
+        let (outcome, keeps) = trial().await?;
+        counts[usize::from(keeps)] += 1;
+        if counts[usize::from(keeps)] == AGREE {
+            return Ok((outcome, keeps));
+        }
+    }
+}
+
+/// The largest number of sessions that meets the objective, and its outcome: doubled until it fails, then bisected.
+async fn find_limit(
+    arguments: &Arguments,
+    server: &Server,
+    source: &Source,
+    first: usize,
+    objective: &Objective,
+) -> Result<(Outcome, usize), Error> {
+    // 0 sessions meet every objective.
+    let (mut best, mut low, mut high) = (None, 0, None);
+    let mut next = first;
+    loop {
+        let found = agreed(async || {
+            let (outcome, why) = match measured(arguments, server, source, next).await {
+                Ok(outcome) => {
+                    let mut missed = objective.missed(&outcome).join(", ");
+                    if outcome.broken > 0 {
+                        missed = format!("{} streams broke", outcome.broken);
+                    }
+                    (Some(outcome), missed)
+                }
+                Err(error) if error.is_refusal() || low == 0 && next == 1 => return Err(error),
+                Err(error) => (None, error.to_string()),
+            };
+            if !arguments.quiet {
+                let verdict = if why.is_empty() { "within the objective".to_owned() } else { format!("misses {why}") };
+                crate::say!("{next} sessions: {verdict}");
+            }
+            Ok((outcome, why.is_empty()))
+        });
+        match found.await? {
+            (outcome, true) => (best, low) = (outcome, next),
+            (outcome, false) => {
+                high = Some(next);
+                if best.is_none() && next == 1 {
+                    best = outcome;
+                }
+            }
+        }
+        next = match high {
+            None if low >= MOST_SESSIONS => break,
+            None => 2 * low,
+            Some(high) if high - low <= (low / RESOLUTION).max(1) => break,
+            Some(high) => usize::midpoint(low, high),
+        };
+    }
+    best.map(|outcome| (outcome, low)).ok_or_else(|| Error::Connection("the server gave not one session".to_owned()))
+}
+
+/// Completes at Ctrl-C, and says so.
+async fn called_off() {
+    interrupted().await;
+    crate::say!("palpate-client: interrupted: deleting the sessions");
+}
+
+/// A trial, with its progress and warnings.
+async fn measured(arguments: &Arguments, server: &Server, source: &Source, sessions: usize) -> Result<Outcome, Error> {
+    let of_all = Trial {
+        clients_per_session: arguments.clients_per_session,
+        viewers: arguments.viewers,
+        seconds: arguments.seconds,
+        ramp_s: arguments.ramp_s,
+        rate_hz: arguments.rate_hz,
+        frame_rate_hz: arguments.frame_rate_hz,
+        touch: arguments.touch.then_some(Deadbands { down: arguments.deadband, up: arguments.up_deadband }),
+        clients_per_connection: arguments.clients_per_connection,
+        threads: arguments.threads,
+    };
+    let mut shown = Shown::new(arguments, sessions);
+    let outcome = trial(&of_all, server, source, sessions, |progress| shown.tell(progress), called_off()).await?;
+    shown.end();
+    if let Some(why) = &outcome.first_break {
+        crate::warn(&format!("{} streams broke, the first because {why}", outcome.broken));
+    }
+    if outcome.unsent > outcome.commands / 100 {
+        let share = 100.0 * outcome.unsent as f64 / (outcome.unsent + outcome.commands) as f64;
+        crate::warn(&format!("this generator was too slow for {share:.0} % of its commands"));
+    }
+    Ok(outcome)
+}
+
+/// Loads a server by a plan, and prints and writes the report.
+async fn by_plan(path: &Path, arguments: &Arguments) -> Result<(), Failure> {
+    let course = Course::new(Plan::read(path)?)?;
+    let server = arguments.credentials.server(&arguments.server)?;
+    let quiet = arguments.quiet;
+    let told = move |second: &Second| {
+        if !quiet {
+            crate::say!("{}", second.line());
+        }
+    };
+    let report = course.run(&server, told, crate::warn, called_off()).await?;
+    if let Some(file) = &arguments.report {
+        let written = std::fs::write(file, report.page());
+        written.map_err(|error| Failure::Failed(format!("{}: {error}", file.display())))?;
+    }
+    if arguments.json {
+        crate::tell!("{}", report.json());
+    } else {
+        print!("{}", report.table());
+    }
+    report.verdict().map_or(Ok(()), |why| Err(Failure::Failed(why)))
+}
+
+/// Prints the progress of a trial.
+struct Shown {
+    quiet: bool,
+    sessions: usize,
+    /// Number of samples at the last report, and its time.
+    last: (u64, Instant),
+}
+
+impl Shown {
+    fn new(arguments: &Arguments, sessions: usize) -> Self {
+        Shown { quiet: arguments.quiet, sessions, last: (0, Instant::now()) }
+    }
+
+    fn tell(&mut self, progress: &Progress) {
+        if self.quiet {
+            return;
+        }
+        let Progress { at_s, samples, rejected, round_trip_p99_s } = *progress;
+        let elapsed_s = self.last.1.elapsed().as_secs_f64();
+        let text = format!(
+            "{at_s:.0} s  {} sessions  {:.0} samples/s  round trip p99 {:.2} ms  rejected {rejected}",
+            self.sessions,
+            (samples - self.last.0) as f64 / elapsed_s,
+            1e3 * round_trip_p99_s,
+        );
+        self.last = (samples, Instant::now());
+        if std::io::stderr().is_terminal() {
+            eprint!("\r\x1b[K{text}");
+        } else {
+            crate::say!("{text}");
+        }
+    }
+
+    fn end(&self) {
+        if !self.quiet && std::io::stderr().is_terminal() {
+            eprint!("\r\x1b[K");
+        }
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_number_keeps_to_the_objective_in_two_of_three_trials() {
+        for (trials, keeps, needed) in [
+            (&[true, true][..], true, 2),
+            (&[false, false], false, 2),
+            // One stall of the machine, and one lucky trial.
+            (&[false, true, true], true, 3),
+            (&[false, true, false], false, 3),
+            (&[true, false, false], false, 3),
+        ] {
+            let mut done = 0;
+            let found = agreed(async || {
+                done += 1;
+                Ok::<_, ()>((done, trials[done - 1]))
+            });
+            assert_eq!(found.await, Ok((needed, keeps)), "{trials:?}");
+        }
+    }
+}
