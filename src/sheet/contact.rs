@@ -458,7 +458,12 @@ impl Tool {
                 // A two-step scheme moves a point by what it changes its speed by: it can only close the gap.
                 if determinant.abs() < LEAST_DETERMINANT {
                     let force_n = self.steady_n + gap_m / moves_m_per_n;
-                    return Thrust { kick_n: force_n - self.steady_n, steady_n: self.steady_n, goes_on_n: force_n, travelled_j: 0.0 };
+                    return Thrust {
+                        kick_n: force_n - self.steady_n,
+                        steady_n: self.steady_n,
+                        goes_on_n: force_n,
+                        travelled_j: 0.0,
+                    };
                 }
                 let unit = kick_u / (moves_m_per_n * determinant);
                 let faster_m = own_m + more_m - moved_m;
@@ -472,7 +477,12 @@ impl Tool {
                 let held = stiffness_n_per_m + damping_n_s_per_m / plan.substep_s;
                 let force_n =
                     (stiffness_n_per_m * gap_m + damping_n_s_per_m * apart_m_per_s) / (1.0 + moves_m_per_n * held);
-                Thrust { kick_n: force_n - self.steady_n, steady_n: self.steady_n, goes_on_n: force_n, travelled_j: 0.0 }
+                Thrust {
+                    kick_n: force_n - self.steady_n,
+                    steady_n: self.steady_n,
+                    goes_on_n: force_n,
+                    travelled_j: 0.0,
+                }
             }
         }
     }

@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use palpate::refusal::{Reason, Refusal};
-use palpate::scene::sent::mesh_file;
 use palpate::scene::Body;
+use palpate::scene::sent::mesh_file;
 use palpate::wire;
 use palpate_client::Channel;
 use palpate_client::upload::upload_mesh;
