@@ -152,7 +152,6 @@ mod tests {
                 let t = t.clamp(0.0, 1.0);
                 t * t * t * (10.0 - 15.0 * t + 6.0 * t * t)
             };
-            let mut worst = 0.0_f64;
             for step in 0..900 {
                 let t = f64::from(step) * 1e-3;
                 let along_m = 0.5 * smooth((t - 0.2) / 0.7);
@@ -161,11 +160,10 @@ mod tests {
                 sheet.do_step();
                 let Energy { kinetic_j, spring_j, virtual_j } = sheet.energies();
                 let (energy_j, work_j) = (kinetic_j + spring_j + virtual_j, sheet.work.done_j);
-                worst = worst.max((work_j - energy_j).abs());
-                assert!(step < 200 || energy_j > 0.004, "{step}: {energy_j} J");
-                println!("{step} {energy_j:.5e} {work_j:.5e}");
+                // The work of an impulse is counted by the speed after it, so a little too high.
+                let part = work_j / energy_j;
+                assert!(step < 200 || (1.0..1.03).contains(&part), "{friction}, {step}: {work_j} J for {energy_j} J");
             }
-            assert!(worst < 1.0, "{friction}: {worst} J");
         }
     }
 
