@@ -87,8 +87,9 @@ class Sessions(unittest.TestCase):
                 records, rest_m = session.records(), tissue.rest_m
                 self.assertEqual((records.shape, rest_m.shape), ((len(tissue),), (len(tissue), 3)))
                 self.assertGreater(np.abs(records["displacement_m"]).max(), 1e-4)
+                # Records complete what a multistep scheme has predicted: far within the tolerance, and more than f32 rounds.
                 largest_m = np.abs(records["displacement_m"]).max()
-                np.testing.assert_allclose(session.displacements(), records["displacement_m"], rtol=0, atol=2e-7 * largest_m)
+                np.testing.assert_allclose(session.displacements(), records["displacement_m"], rtol=0, atol=1e-6 * largest_m)
                 np.testing.assert_array_equal(session.velocities(), records["velocity_m_per_s"])
                 np.testing.assert_array_equal(session.positions(), rest_m + session.displacements())
                 self.assertEqual(np.isfinite(records["constraint_n"]).all(axis=1).sum(), 1 + tissue.fixed.sum())
