@@ -19,6 +19,7 @@ MESSAGES = {
     "/hashes": "Hash",
     "/snapshots": "Snapshot",
     "/felt": "Felt",
+    "/waiting": "Waiting",
     "/end": "End",
 }
 
