@@ -240,6 +240,8 @@ fn sheet(points: usize) -> Box<dyn Tissue> {
 }
 
 /// What is measured on a mesh.
+// There are three of them.
+#[allow(clippy::large_enum_variant)]
 enum Subject {
     Kernel(Trial),
     Plain(PlainLoop),
