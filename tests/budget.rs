@@ -14,9 +14,13 @@ use palpate_proto::pb;
 use server::{PATIENCE, Server, sheet, told};
 use tonic::Code;
 
-/// A server with so much memory, and where its metrics are.
+/// A server with so much memory, and where its metrics are. It refuses nothing because its machine is slow.
 fn small(memory: &str) -> (Server, String) {
-    let mut server = Server::start(&["--memory", memory, "--metrics", "127.0.0.1:0", "--log", "error"]);
+    let config = tempfile::NamedTempFile::new().unwrap();
+    std::fs::write(&config, "[limits]\nperiods_per_step = 1000.0\n").unwrap();
+    let path = config.path().to_str().unwrap();
+    let mut server =
+        Server::start(&["--config", path, "--memory", memory, "--metrics", "127.0.0.1:0", "--log", "error"]);
     let metrics = metrics::url(&mut server.out);
     (server, metrics)
 }

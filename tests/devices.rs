@@ -318,6 +318,17 @@ fn play(
     })
 }
 
+/// Goes down to 4 mm in the tissue, and up to 4 mm above it, by where the device is.
+fn down_and_up(z_m: impl Fn() -> f64 + Send + 'static) -> impl Fn(u32) -> bool + Send + 'static {
+    let was_down = AtomicBool::new(true);
+    move |_| {
+        let z_m = z_m();
+        let is_down = if z_m > 0.004 { true } else { z_m > -0.004 && was_down.load(Ordering::Relaxed) };
+        was_down.store(is_down, Ordering::Relaxed);
+        is_down
+    }
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn recorded_events_of_a_knob_and_of_a_stick_touch_the_tissue() {
     let server = Server::start(&[]);
@@ -328,14 +339,7 @@ async fn recorded_events_of_a_knob_and_of_a_stick_touch_the_tissue() {
         let noted = Arc::new(Mutex::new((DVec3::ZERO, Vec::new())));
         let (seen, felt) = (noted.clone(), noted.clone());
         let (stop, over) = std::sync::mpsc::channel();
-        // Down to 4 mm in the tissue, and up to 4 mm above it.
-        let was_down = AtomicBool::new(true);
-        let playing = play(&path, kind, over, &[], move |_| {
-            let z_m = seen.lock().unwrap().0.z;
-            let is_down = if z_m > 0.004 { true } else { z_m > -0.004 && was_down.load(Ordering::Relaxed) };
-            was_down.store(is_down, Ordering::Relaxed);
-            is_down
-        });
+        let playing = play(&path, kind, over, &[], down_and_up(move || seen.lock().unwrap().0.z));
         let report = touch(Noting { device, noted }, &server, move || is_felt(&felt.lock().unwrap().1)).await;
         drop(stop);
         playing.join().unwrap();
@@ -470,12 +474,13 @@ async fn positions_that_no_arm_has_give_no_force_and_do_not_end_the_touch() {
 #[test]
 fn what_goes_wrong_with_haplys_service_ends_the_bridge_within_the_envelope() {
     let server = Server::start(&[]);
-    let table: [(Option<&str>, Wrong, bool, &[&str]); 8] = [
+    let table: [(Option<&str>, Wrong, bool, &[&str]); 9] = [
         (Some("3.0.7"), Wrong::Nothing, false, &["version 3.0.7", "knows 3.1 up to 3.x"]),
         (Some("4.0.0"), Wrong::Nothing, false, &["version 4.0.0"]),
         (Some("3.5.0"), Wrong::NoDevice, false, &["no Inverse3", "plugged in"]),
         (Some("3.5.0"), Wrong::GarbageAtFirst, false, &["sent what is no state", "hello"]),
-        (Some("3.5.0"), Wrong::Unplugged, true, &["tells of the Inverse3 no more"]),
+        (Some("3.5.0"), Wrong::Unplugged, true, &["does not tell where the Inverse3 is any more"]),
+        (Some("3.5.0"), Wrong::Placeless, true, &["does not tell where the Inverse3 is any more"]),
         (Some("3.1.0"), Wrong::Killed, true, &["Haply's Inverse Service is gone"]),
         (Some("3.5.0"), Wrong::Silent, true, &["does not answer any more"]),
         (Some("3.5.0"), Wrong::Garbage, true, &["sent what is no state", "{{{"]),
@@ -511,13 +516,7 @@ async fn a_knob_or_stick_that_fails_while_it_is_pressed_is_left_without_a_force(
             // Down until it is felt, which some presses of the button later it is; up again if it went too deep.
             let (seen, felt) = (noted.clone(), noted.clone());
             let (stop, over) = std::sync::mpsc::channel();
-            let was_down = AtomicBool::new(true);
-            let playing = play(&path, kind, over, last, move |_| {
-                let z_m = seen.lock().unwrap().0.z;
-                let is_down = if z_m > 0.004 { true } else { z_m > -0.004 && was_down.load(Ordering::Relaxed) };
-                was_down.store(is_down, Ordering::Relaxed);
-                is_down
-            });
+            let playing = play(&path, kind, over, last, down_and_up(move || seen.lock().unwrap().0.z));
             let ending = std::thread::spawn(move || {
                 until("it is not felt", || {
                     let (_, forces) = &*felt.lock().unwrap();

@@ -64,8 +64,11 @@ async fn assert_is_held(server: &Server, session: &str, mut touch: Touch) {
 async fn without_address_space_requests_are_refused_sessions_end_and_others_are_served() {
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("palpate.toml");
-    std::fs::write(&config, "[limits]\npoints_in_all = 1000000000\nwork_s = 600\nsessions_per_minute = 100000\n")
-        .unwrap();
+    std::fs::write(
+        &config,
+        "[limits]\npoints_in_all = 1000000000\nperiods_per_step = 1000.0\nwork_s = 600\nsessions_per_minute = 100000\n",
+    )
+    .unwrap();
     // The budget is no bound here.
     let server = Server::start(&["--config", config.to_str().unwrap(), "--memory", "1024GiB", "--log", "error"]);
     let mut sessions = server.sessions().await;

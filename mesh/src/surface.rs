@@ -433,6 +433,14 @@ impl Disc {
         &self.covered
     }
 
+    /// The weight of a vertex where the disc is: 0 of one that it does not cover. Takes the same time however many it covers.
+    pub fn weight_of(&self, vertex: u32) -> f64 {
+        match self.found[slot_of(vertex, &self.found)] {
+            (NONE, _) => 0.0,
+            (_, number) => self.covered[number as usize].weight,
+        }
+    }
+
     /// Lays the disc on a place.
     pub fn lay(&mut self, surface: &Surface, place: &Place) {
         self.trace(surface, place);
@@ -557,6 +565,15 @@ impl Disc {
     }
 }
 
+/// Where a vertex stands in `found`, or would stand.
+fn slot_of(vertex: u32, found: &[(u32, u32)]) -> usize {
+    let mut slot = (vertex.wrapping_mul(0x9E37_79B1) >> 7) as usize & (found.len() - 1);
+    while found[slot].0 != NONE && found[slot].0 != vertex {
+        slot = (slot + 1) & (found.len() - 1);
+    }
+    slot
+}
+
 /// The place of a vertex among those that are covered; a new one, if it has none yet.
 #[allow(clippy::cast_possible_truncation)]
 fn number(
@@ -566,13 +583,9 @@ fn number(
     areas_m2: &mut Vec<f64>,
     found: &mut Vec<(u32, u32)>,
 ) -> u32 {
-    let slot_of = |vertex: u32, slots: usize| (vertex.wrapping_mul(0x9E37_79B1) >> 7) as usize & (slots - 1);
-    let mut slot = slot_of(vertex, found.len());
-    while found[slot].0 != NONE {
-        if found[slot].0 == vertex {
-            return found[slot].1;
-        }
-        slot = (slot + 1) & (found.len() - 1);
+    let slot = slot_of(vertex, found);
+    if found[slot].0 == vertex {
+        return found[slot].1;
     }
     let number = covered.len() as u32;
     found[slot] = (vertex, number);
@@ -582,10 +595,7 @@ fn number(
         let before = std::mem::take(found);
         *found = vec![(NONE, 0); 2 * before.len()];
         for entry in before.into_iter().filter(|entry| entry.0 != NONE) {
-            let mut slot = slot_of(entry.0, found.len());
-            while found[slot].0 != NONE {
-                slot = (slot + 1) & (found.len() - 1);
-            }
+            let slot = slot_of(entry.0, found);
             found[slot] = entry;
         }
     }

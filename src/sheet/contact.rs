@@ -172,12 +172,9 @@ impl Contacts {
     }
 
     /// The force that goes on on a point, N.
-    pub(super) fn steady_on(&self, point: [usize; 2]) -> DVec3 {
-        let of = |tool: &Tool| {
-            let reached = tool.footprint.reached().iter().find(|reached| reached.point == point);
-            reached.map_or(DVec3::ZERO, |reached| reached.weight * tool.steady_n)
-        };
-        self.tools.iter().map(of).sum()
+    pub(super) fn steady_on(&self, model: &Model, index: usize) -> DVec3 {
+        let pressing = self.tools.iter().filter(|tool| tool.steady_n != DVec3::ZERO);
+        pressing.map(|tool| tool.footprint.weight_of(model, index) * tool.steady_n).sum()
     }
 
     pub(super) fn release(&mut self, number: usize) {
@@ -434,6 +431,11 @@ impl Tool {
         plan.scheme.kick()[0] * plan.force_scale(&model.scene) * model.unit_m * self.footprint.mobility()
     }
 
+    /// The steady force, and an impulse for what `force_n` is beyond it; the next substep begins with that force.
+    fn kicked_to(&self, force_n: DVec3) -> Thrust {
+        Thrust { kick_n: force_n - self.steady_n, steady_n: self.steady_n, goes_on_n: force_n, travelled_j: 0.0 }
+    }
+
     /// What closes a gap, and makes the disc as fast as the tool, and by `more_m` in the substep faster, if the scheme can do
     /// both.
     fn thrust<T: Real>(
@@ -457,13 +459,7 @@ impl Tool {
                 let determinant = kick_u * of_d - kick_d * of_u;
                 // A two-step scheme moves a point by what it changes its speed by: it can only close the gap.
                 if determinant.abs() < LEAST_DETERMINANT {
-                    let force_n = self.steady_n + gap_m / moves_m_per_n;
-                    return Thrust {
-                        kick_n: force_n - self.steady_n,
-                        steady_n: self.steady_n,
-                        goes_on_n: force_n,
-                        travelled_j: 0.0,
-                    };
+                    return self.kicked_to(self.steady_n + gap_m / moves_m_per_n);
                 }
                 let unit = kick_u / (moves_m_per_n * determinant);
                 let faster_m = own_m + more_m - moved_m;
@@ -475,14 +471,8 @@ impl Tool {
                 let gap_m = gap_m + moves_m_per_n * self.steady_n;
                 let apart_m_per_s = (own_m - (moved_m - moves_m_per_n * self.steady_n)) / plan.substep_s;
                 let held = stiffness_n_per_m + damping_n_s_per_m / plan.substep_s;
-                let force_n =
-                    (stiffness_n_per_m * gap_m + damping_n_s_per_m * apart_m_per_s) / (1.0 + moves_m_per_n * held);
-                Thrust {
-                    kick_n: force_n - self.steady_n,
-                    steady_n: self.steady_n,
-                    goes_on_n: force_n,
-                    travelled_j: 0.0,
-                }
+                let sought_n = stiffness_n_per_m * gap_m + damping_n_s_per_m * apart_m_per_s;
+                self.kicked_to(sought_n / (1.0 + moves_m_per_n * held))
             }
         }
     }

@@ -225,6 +225,19 @@ impl Footprint {
         &self.reached
     }
 
+    /// w of a point: 0 of one that the disc does not cover. Does not go through all that it covers: a tip may be as large as
+    /// the tissue, and this is asked of each of its points.
+    pub(super) fn weight_of(&self, model: &Model, index: usize) -> f64 {
+        match &self.ground {
+            Ground::Grid(_) => {
+                // They are by rows.
+                let found = self.reached.binary_search_by_key(&model.point_of(index), |reached| reached.point);
+                found.map_or(0.0, |place| self.reached[place].weight)
+            }
+            Ground::Mesh(disc) => disc.weight_of(model.point_at(index)),
+        }
+    }
+
     /// Σ w²/mass over the points that can move: the movement of s per unit force, relative to that of one free point.
     pub fn mobility(&self) -> f64 {
         self.mobility
@@ -321,6 +334,26 @@ mod tests {
 
     /// Radii, in spacings.
     const RADII: [f64; 4] = [0.2, 1.0, 1.7, 3.2];
+
+    #[test]
+    fn a_point_has_the_weight_with_which_the_disc_covers_it() {
+        for (model, at_m, radius_m) in [
+            (model(&["sheet.points=[13, 17]"]), DVec3::new(0.11, 0.17, 0.0), 0.05),
+            (model(&["sheet.points=[13, 17]"]), DVec3::ZERO, 0.3),
+            (Model::gallbladder(&[]), DVec3::new(0.02, 0.0, -0.05), 0.006),
+        ] {
+            let footprint = Footprint::new(&model, radius_m, at_m);
+            let mut weights = vec![0.0; model.places()];
+            for reached in footprint.reached() {
+                weights[model.index_of(reached.point)] = reached.weight;
+            }
+            assert!(footprint.reached().len() > 9, "{}", footprint.reached().len());
+            for point in model.points() {
+                let index = model.place_of(point);
+                assert_eq!(footprint.weight_of(&model, index), weights[index], "{index}");
+            }
+        }
+    }
 
     #[test]
     fn a_disc_gives_way_like_its_own_area_of_a_foundation() {

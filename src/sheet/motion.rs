@@ -247,7 +247,7 @@ impl<T: Real> Sheet<T> {
         let (mass, extra) = (model.relative_mass_at(index), model.extra_virtual_at(index));
         let still = self.steps == 0 || !self.tiles.region.is_awake(i, j);
         // Without all forces of the present a two-step scheme would tell a velocity of a point that rests under a tip.
-        let tips_n = if plan.scheme.takes_means() { self.contacts.steady_on([i, j]) } else { DVec3::ZERO };
+        let tips_n = if plan.scheme.takes_means() { self.contacts.steady_on(model, index) } else { DVec3::ZERO };
         let pushed_n = applied_n + tips_n;
         let mut found = [DVec3::ZERO; 3];
         for (c, n) in springs.into_iter().enumerate() {

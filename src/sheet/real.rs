@@ -121,6 +121,8 @@ macro_rules! real {
             const TERMS: usize = $terms;
             const SERIES: [f64; 14] = $series;
             const NEGLIGIBLE_EXPONENT: f64 = $negligible;
+            // The kernel asks for its constants here; a call within a loop costs 6 %.
+            #[inline(always)]
             #[allow(clippy::cast_possible_truncation)]
             fn of(value: f64) -> Self {
                 value as $t

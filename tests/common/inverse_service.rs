@@ -30,6 +30,8 @@ pub enum Wrong {
     NoGrip,
     // The others happen while it is pressed.
     Unplugged,
+    /// The device is told of, and not where it is.
+    Placeless,
     Killed,
     Silent,
     Garbage,
@@ -167,6 +169,11 @@ fn serve(mut stream: TcpStream, version: Option<&str>, wrong: Wrong, told: &Hear
             Wrong::Silent if is_wrong => continue,
             Wrong::Garbage if is_wrong => "{{{".to_owned(),
             Wrong::Unplugged if is_wrong => message(tick, false).to_string(),
+            Wrong::Placeless if is_wrong => {
+                let mut message = message(tick, true);
+                message["inverse3"][0]["state"] = json!({});
+                message.to_string()
+            }
             Wrong::Far if is_wrong => {
                 let mut message = message(tick, true);
                 message["inverse3"][0]["state"]["cursor_position"]["z"] = json!(-1e9);

@@ -4,8 +4,8 @@
 //!    no change; up to [`STALE_S`] the force fades to a half; beyond, it decays with [`DECAY_S`]; beyond [`PAUSE_S`] the
 //!    state is PAUSED, as it is after a gap of more than [`PAUSE_S`] between two ticks. A model that arrives before brings
 //!    the force back within `RETURN_S`;
-//! 2. soft engage: after `enable` nothing is rendered until the wanted force is below [`ENGAGE_BELOW_N`]; then the
-//!    force ramps in over [`ENGAGE_S`];
+//! 2. soft engage: after `enable` nothing is rendered until a model is known and the force by it is below
+//!    [`ENGAGE_BELOW_N`]; then the force ramps in over [`ENGAGE_S`];
 //! 3. the norm of the force (clamping its components would turn it), and the device's continuous force;
 //! 4. passivity: no more energy leaves the port than has entered it;
 //! 5. slew: at most [`SLEW_N_PER_S`], up and down, in every state.
@@ -117,8 +117,8 @@ pub struct Wanted {
     pub velocity_m_per_s: DVec3,
     /// Wanted force, N.
     pub force_n: DVec3,
-    /// Time since the newest model arrived, s.
-    pub age_s: f64,
+    /// Time since the newest model arrived, s. `None`: no model of the tissue is known.
+    pub age_s: Option<f64>,
 }
 
 /// One device's envelope.
@@ -181,6 +181,11 @@ impl Envelope {
     /// The number of ticks in which `reason` changed the force, and of all ticks.
     pub fn count(&self, reason: LimitCause) -> (u64, u64) {
         (self.counts[reason as usize], self.ticks)
+    }
+
+    /// Whether the ramp after `enable` has begun.
+    pub fn is_engaged(&self) -> bool {
+        self.engaged_s.is_some()
     }
 
     /// Leaves DISABLED or PAUSED. A FAULT must be reset first.
@@ -252,7 +257,7 @@ impl Envelope {
             self.fail();
         }
         force_n = self.fade(wanted, elapsed_s, force_n);
-        force_n = self.engage(wanted.now_s, force_n);
+        force_n = self.engage(wanted, force_n);
         force_n = self.clamp(elapsed_s, force_n);
         force_n = self.keep_passive(wanted.velocity_m_per_s, force_n);
         force_n = self.slew(elapsed_s, wanted.velocity_m_per_s, force_n);
@@ -262,10 +267,12 @@ impl Envelope {
 
     /// Reduces the force by the model's age.
     fn fade(&mut self, wanted: &Wanted, elapsed_s: f64, force_n: DVec3) -> DVec3 {
-        if wanted.age_s > PAUSE_S && self.state == RenderingState::Enabled {
+        // Without a model there is no force, and so nothing is stale.
+        let age_s = wanted.age_s.unwrap_or(0.0);
+        if age_s > PAUSE_S && self.state == RenderingState::Enabled {
             self.state = RenderingState::Paused;
         }
-        let share = match wanted.age_s {
+        let share = match age_s {
             age_s if age_s <= FRESH_S => 1.0,
             age_s if age_s <= STALE_S => 1.0 - (1.0 - STALE_SHARE) * (age_s - FRESH_S) / (STALE_S - FRESH_S),
             age_s => STALE_SHARE * ((STALE_S - age_s) / DECAY_S).exp(),
@@ -277,7 +284,7 @@ impl Envelope {
         self.share * force_n
     }
 
-    fn engage(&mut self, now_s: f64, force_n: DVec3) -> DVec3 {
+    fn engage(&mut self, wanted: &Wanted, force_n: DVec3) -> DVec3 {
         match self.state {
             RenderingState::Enabled => {}
             // While no model arrives, `fade` reduces the force. Here the rest of it is released.
@@ -288,10 +295,11 @@ impl Envelope {
                 return self.force_n.clamp_length_max(force_n.length()) * decay;
             }
         }
-        if self.engaged_s.is_none() && force_n.length() < ENGAGE_BELOW_N {
-            self.engaged_s = Some(now_s);
+        // That there is no force before the first model says nothing about the tissue: the tip may be deep in it.
+        if self.engaged_s.is_none() && wanted.age_s.is_some() && force_n.length() < ENGAGE_BELOW_N {
+            self.engaged_s = Some(wanted.now_s);
         }
-        let share = self.engaged_s.map_or(0.0, |since_s| ((now_s - since_s) / ENGAGE_S).clamp(0.0, 1.0));
+        let share = self.engaged_s.map_or(0.0, |since_s| ((wanted.now_s - since_s) / ENGAGE_S).clamp(0.0, 1.0));
         if share < 1.0 {
             self.acted(LimitCause::Engage);
         }
@@ -381,7 +389,7 @@ mod tests {
                 place_m: self.height_m * DVec3::Z,
                 velocity_m_per_s: velocity_m_per_s * DVec3::Z,
                 force_n: force_n * DVec3::Z,
-                age_s: 0.0,
+                age_s: Some(0.0),
             };
             self.tick += 1;
             self.height_m += velocity_m_per_s * 1e-3;
@@ -486,7 +494,7 @@ mod tests {
     /// What is rendered of `FAINT_N`, told at a moment by a model of an age: a share of it.
     fn share(envelope: &mut Envelope, now_s: f64, age_s: f64) -> f64 {
         let (place_m, velocity_m_per_s, force_n) = (DVec3::ZERO, DVec3::ZERO, FAINT_N * DVec3::Z);
-        envelope.render(&Wanted { now_s, place_m, velocity_m_per_s, force_n, age_s }).z / FAINT_N
+        envelope.render(&Wanted { now_s, place_m, velocity_m_per_s, force_n, age_s: Some(age_s) }).z / FAINT_N
     }
 
     #[test]

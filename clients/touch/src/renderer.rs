@@ -43,6 +43,7 @@ pub struct Renderer {
     newest: Option<(LocalModel, Touching)>,
     /// A newer model that has arrived since.
     arrived: Option<LocalModel>,
+    /// When the newest model arrived, of whatever connection.
     arrived_s: Option<f64>,
     /// A model has come, of whatever connection.
     has_heard: bool,
@@ -88,7 +89,7 @@ impl Renderer {
     pub fn begin_with(&mut self, law: Law, mut used: impl FnMut(Law)) {
         self.laws.drain(..).for_each(|known| used(known.1));
         self.laws.push((0, law));
-        (self.newest, self.arrived, self.arrived_s) = (None, None, None);
+        (self.newest, self.arrived) = (None, None);
     }
 
     /// Takes a further law, which models may name from now on. False: it is not sound, or its number is known already. Of
@@ -206,8 +207,9 @@ impl Renderer {
             }
         }
         let force_n = self.wanted_n(now_s);
-        // Before the first model nothing is stale.
-        let age_s = self.arrived_s.map_or(0.0, |arrived_s| now_s - arrived_s);
+        // A hand that was feeling forces waits no longer for another server's first model than for the next of the same.
+        let counts = self.newest.is_some() || self.envelope.is_engaged();
+        let age_s = self.arrived_s.filter(|_| counts).map(|arrived_s| now_s - arrived_s);
         let wanted = Wanted { now_s, place_m, velocity_m_per_s: self.velocity_m_per_s, force_n, age_s };
         self.envelope.render(&wanted)
     }
@@ -224,6 +226,7 @@ mod tests {
 
     use super::*;
     use crate::device::UNDECLARED;
+    use crate::envelope::ENGAGE_BELOW_N;
 
     /// Of a tool at rest at `place_m`, on a surface at `height_m` with a spring of 400 N/m.
     fn model(sequence: u64, time_s: f64, place_m: DVec3, height_m: f64) -> LocalModel {
@@ -282,6 +285,44 @@ mod tests {
         renderer.begin(Law::linear(400.0, 0.5));
         renderer.tick(0.801, place_m);
         assert_eq!(renderer.state(), RenderingState::Enabled);
+    }
+
+    #[test]
+    fn a_tip_that_the_first_model_finds_in_the_tissue_feels_nothing_until_it_is_out() {
+        // 4 mm deep: 1.6 N by every model.
+        let (mut renderer, deep_m, out_m) = (renderer(), -0.004, 0.001);
+        let (mut tick, mut height_m) = (0_u32, deep_m);
+        // The largest force of half a second. The tip goes there at 0.05 m/s, so that its work pays for what it feels.
+        let mut run = |renderer: &mut Renderer, to_m: f64, hears: bool| {
+            let mut largest_n: f64 = 0.0;
+            for _ in 0..500 {
+                height_m += (to_m - height_m).clamp(-5e-5, 5e-5);
+                let (now_s, place_m) = (f64::from(tick) * 1e-3, height_m * DVec3::Z);
+                if hears {
+                    renderer.receive(model(u64::from(tick), now_s, place_m, 0.0), now_s);
+                }
+                largest_n = largest_n.max(renderer.tick(now_s, place_m).length());
+                tick += 1;
+            }
+            largest_n
+        };
+        renderer.envelope.enable();
+        assert_eq!(run(&mut renderer, deep_m, false), 0.0);
+        assert_eq!(run(&mut renderer, deep_m, true), 0.0);
+        assert!(run(&mut renderer, out_m, true) < ENGAGE_BELOW_N);
+        run(&mut renderer, out_m, true);
+        assert!(run(&mut renderer, deep_m, true) > 1.5);
+        // Another server goes on at once, and so does what was felt.
+        renderer.begin(Law::linear(400.0, 0.5));
+        assert!(run(&mut renderer, deep_m, true) > 1.5);
+        // The first model of another takes too long: paused, and as at the beginning once it is enabled.
+        renderer.begin(Law::linear(400.0, 0.5));
+        run(&mut renderer, deep_m, false);
+        assert_eq!(renderer.state(), RenderingState::Paused);
+        renderer.envelope.enable();
+        assert!(run(&mut renderer, deep_m, false) < 1e-3);
+        assert_eq!(renderer.state(), RenderingState::Enabled);
+        assert!(run(&mut renderer, deep_m, true) < 1e-3);
     }
 
     #[test]

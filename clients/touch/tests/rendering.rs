@@ -164,7 +164,7 @@ fn the_norm_is_clamped_not_the_components() {
             // Pressed further and further in, so that energy is not a limit.
             let place_m = -direction * (f64::from(tick) * 1e-5);
             let force_n = if tick < 600 { DVec3::ZERO } else { 50.0 * direction };
-            let wanted = Wanted { now_s, place_m, velocity_m_per_s: -0.01 * direction, force_n, age_s: 0.0 };
+            let wanted = Wanted { now_s, place_m, velocity_m_per_s: -0.01 * direction, force_n, age_s: Some(0.0) };
             force = envelope.render(&wanted);
         }
         let most_n = device.most_n().min(device.continuous_n);
@@ -182,7 +182,7 @@ fn outside_the_workspace_is_a_fault() {
         place_m: DVec3::new(x, 0.0, 0.0),
         velocity_m_per_s: DVec3::ZERO,
         force_n: DVec3::Z,
-        age_s: 0.0,
+        age_s: Some(0.0),
     };
     envelope.render(&wanted(0.07));
     assert_eq!(envelope.state(), RenderingState::Enabled);
@@ -410,7 +410,7 @@ proptest! {
                 place_m,
                 velocity_m_per_s: velocity,
                 force_n: if tick < 5 { DVec3::ZERO } else { DVec3::from(forces[part % 8]) },
-                age_s: ages[part % 8],
+                age_s: Some(ages[part % 8]),
             };
             let force = envelope.render(&wanted);
             prop_assert!(force.is_finite() && force.length() <= device.most_n() + 1e-9);

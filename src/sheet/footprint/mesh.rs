@@ -117,6 +117,12 @@ impl MeshDisc {
         is_nearer
     }
 
+    /// The weight of a vertex.
+    #[allow(clippy::cast_possible_truncation)]
+    pub(super) fn weight_of(&self, vertex: PointId) -> f64 {
+        self.disc.weight_of(vertex.index() as u32)
+    }
+
     /// The vertices that the disc covers, their weights, how these change with the place, and where they rest.
     pub(super) fn cover(&mut self) -> impl Iterator<Item = (PointId, f64, DVec2, DVec3)> + '_ {
         let surface = self.shape.surface();

@@ -53,9 +53,11 @@ pub(super) struct Inverse3 {
     place_m: DVec3,
     buttons: u32,
     unanswered: u32,
-    /// When the service last said anything, and when it last told of the device.
+    /// When the service last said anything, and when it last told where the device is.
     heard: Instant,
     told: Instant,
+    /// Whether the newest message tells that.
+    is_told: bool,
     /// The force that was sent last.
     sent_n: DVec3,
 }
@@ -235,6 +237,7 @@ impl Inverse3 {
             unanswered: 0,
             heard: now,
             told: now,
+            is_told: false,
             sent_n: DVec3::ZERO,
         };
         device.take(&first);
@@ -244,11 +247,11 @@ impl Inverse3 {
 
     /// Takes what a message tells. A value that is not told is as it was.
     fn take(&mut self, message: &Value) {
-        if let Some(ours) = devices(message, "inverse3").find(|device| id_of(device) == Some(&self.id)) {
-            self.told = Instant::now();
-            if let Some(place_m) = ours.get("state").and_then(|state| vector(state.get("cursor_position")?)) {
-                self.place_m = place_m - MIDDLE_M;
-            }
+        let ours = devices(message, "inverse3").find(|device| id_of(device) == Some(&self.id));
+        let place_m = ours.and_then(|ours| vector(ours.get("state")?.get("cursor_position")?));
+        self.is_told = place_m.is_some();
+        if let Some(place_m) = place_m {
+            (self.told, self.place_m) = (Instant::now(), place_m - MIDDLE_M);
         }
         if let Some(buttons) = buttons(message) {
             self.buttons = buttons;
@@ -303,14 +306,15 @@ impl HapticDevice for Inverse3 {
         if self.unanswered > 0 && self.heard.elapsed() > SILENCE {
             return gone("Haply's Inverse Service does not answer any more");
         }
-        if self.told.elapsed() > SILENCE && self.heard > self.told {
-            return gone("Haply's Inverse Service tells of the Inverse3 no more: is it unplugged?");
+        if !self.is_told && self.told.elapsed() > SILENCE {
+            return gone("Haply's Inverse Service does not tell where the Inverse3 is any more: is it unplugged?");
         }
         Ok(Reading { place_m: self.place_m, enable: self.buttons & 1 != 0 })
     }
 
     fn write(&mut self, force_n: DVec3) -> io::Result<()> {
-        let is_stale = self.unanswered > 0 && self.heard.elapsed() > STALE;
+        let is_lost = !self.is_told && self.told.elapsed() > STALE;
+        let is_stale = is_lost || self.unanswered > 0 && self.heard.elapsed() > STALE;
         let force_n = if is_stale { DVec3::ZERO } else { force_n };
         // That there is to be no force is said to a service that is behind, too.
         let must = force_n == DVec3::ZERO && self.sent_n != DVec3::ZERO;

@@ -55,7 +55,7 @@ impl Client {
                     place_m,
                     velocity_m_per_s: moved_m / TICK_S,
                     force_n: newest.map_or(DVec3::ZERO, |model| model.force_n),
-                    age_s: arrived_s.map_or(0.0, |arrived_s| now_s - arrived_s),
+                    age_s: arrived_s.map(|arrived_s| now_s - arrived_s),
                 })
             }
             Client::Model(renderer) => renderer.tick(now_s, place_m),
