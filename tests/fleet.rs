@@ -274,6 +274,43 @@ async fn a_session_moves_with_its_tools_and_the_same_bits() {
     assert_ne!(owner(&nodes, &id).await, Some(at));
 }
 
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_change_of_the_tissue_that_waits_goes_on_at_the_server_that_takes_over() {
+    if !Etcd::is_there() {
+        return;
+    }
+    let _one = ONE.lock().await;
+    let folder = tempfile::tempdir().unwrap();
+    let etcd = Etcd::start(1);
+    let mut nodes = three(folder.path(), &etcd.endpoints()).await;
+    let paper = pb::create_session_request::Source::SceneName("paper".into());
+    let id = nodes[0].there().create(paper, true).await.unwrap().session_id;
+    let (at, session) = until_stood_by(&nodes, &id).await;
+    let standby = session.ownership.unwrap().standby;
+    let request = pb::UpdateTissueRequest {
+        session_id: id.clone(),
+        at_step: Some(100),
+        stiffness_n_per_m: Some(40.0),
+        ..pb::UpdateTissueRequest::default()
+    };
+    nodes[at].there().sessions().await.update_tissue(request).await.unwrap();
+    let there = nodes.iter().position(|node| node.name == standby).unwrap();
+    until("it is mirrored", async || {
+        let kept = file::list(&nodes[there].journals.join("standby")).unwrap().into_iter();
+        kept.filter(|file| file.session_id == id).any(|file| {
+            let survey = palpate::journal::Reader::open(&file.path).and_then(|mut reader| reader.survey(&mut |_| {}));
+            survey.is_ok_and(|survey| survey.waiting.len() == 1)
+        })
+    })
+    .await;
+    nodes[at].kill();
+    until("it is taken over", async || nodes[there].session(&id).await.is_ok()).await;
+    nodes[there].there().start_until(&id, 150).await;
+    nodes[there].there().hash_at(&id, 150).await;
+    let springs = nodes[there].session(&id).await.unwrap().scene.unwrap().springs.unwrap();
+    assert_eq!(springs.stiffness_n_per_m, Some(40.0));
+}
+
 fn force_n(sample: &pb::Sample) -> f64 {
     let force = sample.tools.first().and_then(|tool| tool.force_on_tool_n);
     force.map_or(0.0, |force| (force.x * force.x + force.y * force.y + force.z * force.z).sqrt())
