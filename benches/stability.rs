@@ -301,7 +301,7 @@ impl Limit {
 
 /// Organs that are built in, with longer edges.
 const ORGANS: [(&str, &str); 2] =
-    [("gallbladder", "mesh.organ.edge_m=0.004"), ("liver-organ", "mesh.organ.edge_m=0.008")];
+    [("gallbladder", "mesh.organ.edge_m=0.0035"), ("liver-organ", "mesh.organ.edge_m=0.008")];
 
 /// An organ, any scheme.
 struct Organ {

@@ -58,7 +58,9 @@ impl World {
         }
         let is_fenced = !self.nodes[n].is_within_fence(self.now);
         let memory = &mut self.nodes[n].memory;
-        if is_fenced || memory.live.contains_key(&sid) || memory.owned.contains_key(&sid) {
+        // What is claimed comes already, until the answer of etcd is certain.
+        let is_here = memory.live.contains_key(&sid) || memory.owned.contains_key(&sid);
+        if is_fenced || is_here || memory.claiming.contains(&sid) {
             memory.coming.remove(&id);
             return self.say(n, from, id, Say::Close);
         }
