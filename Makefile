@@ -85,11 +85,8 @@ need-node:
 	@$(NODE) -e 'const [major, minor] = process.versions.node.split("."); process.exit(major > 20 || major == 20 && minor >= 19 ? 0 : 1)' 2>/dev/null || \
 		{ echo 'Node.js 20.19 or later is missing: install it from https://nodejs.org' >&2; exit 1; }
 
-# With the tests, dependencies have features that they lack without, and the tissue would be compiled twice.
-KINDS =
-test: KINDS = --lib --bins --tests
 build: need-rust
-	$(CARGO) build --release --workspace $(KINDS)
+	$(CARGO) build --release --workspace
 
 # Below PREFIX: include, lib (with pkg-config and CMake), bin. As a package: DESTDIR=….
 PREFIX ?= /usr/local
