@@ -179,6 +179,11 @@ impl Tape {
         self.durable.store(progress.durable_step.map_or(0, |step| step + 1), Ordering::Release);
     }
 
+    /// What happened before this step is on the disk of the server that stands by too.
+    pub fn mirrored_step(&self) -> Option<u64> {
+        self.progress.borrow().mirrored_step
+    }
+
     /// It is written here: what happened before this step is on the disk of this server.
     pub fn local_step(&self) -> Option<u64> {
         self.progress.borrow().local_step

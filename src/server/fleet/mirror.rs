@@ -20,6 +20,7 @@ use tracing::{info, warn};
 use super::{Fleet, Standby};
 use crate::cluster::{placement, rules};
 use crate::lock::lock;
+use crate::pace::tape::Tape;
 use crate::server::journals::growth::Grown;
 
 /// A server that can't be reached is tried again so soon.
@@ -236,7 +237,7 @@ impl Fleet {
 
     /// Whether etcd is to be told that a server stands by for a session, because it has all up to `step`. From then on nothing counts
     /// as mirrored till etcd has said so.
-    fn begins_to_name(&self, id: &str, name: &str, step: u64, mirrored_step: Option<u64>) -> bool {
+    fn begins_to_name(&self, id: &str, name: &str, tape: &Tape, step: u64) -> bool {
         // Nobody else changes its key meanwhile: who begins to move it sees that it is being named.
         let moving = lock(&self.moving);
         if moving.contains(id) {
@@ -249,8 +250,9 @@ impl Fleet {
             Some(other) => other == name || is_chosen,
             None => is_chosen,
         };
-        // The one before has more: it stays until this one has as much.
-        if !is_free || mirrored_step.is_some_and(|mirrored| step < mirrored) {
+        // The one before has more: it stays until this one has as much. With the lock, so that it can't have still more by the time
+        // that it does not count any more.
+        if !is_free || tape.mirrored_step().is_some_and(|mirrored| step < mirrored) {
             return false;
         }
         standby.naming = Some(name.to_owned());
@@ -267,36 +269,43 @@ impl Fleet {
         true
     }
 
+    /// Counts what a server has on its disk, if etcd says that it stands by, and no other is about to be named. That other was told of
+    /// when it had all that counted: nothing may be added after that.
+    fn counts(&self, id: &str, name: &str, tape: &Tape, step: u64) -> bool {
+        let standbys = lock(&self.standbys);
+        let counts = standbys.get(id).is_some_and(|standby| standby.is(name));
+        if counts {
+            tape.is_mirrored(step);
+        }
+        counts
+    }
+
     /// A server has so much of a journal on its disk. The first time, etcd is told who stands by.
     async fn is_mirrored(&self, name: &str, at: &pb::Mirrored) {
         let id = &at.session_id;
         let Some((tape, step)) = self.growth.mirrored(id, at.run, at.durable_bytes) else { return };
-        let is_named = lock(&self.standbys).get(id).is_some_and(|standby| standby.is(name));
-        if !is_named {
-            let Some(revision) = self.revision(id) else { return };
-            let mirrored_step = tape.progress().borrow().mirrored_step;
-            if !self.begins_to_name(id, name, step, mirrored_step) {
-                return;
-            }
-            let keep = rules::keep(&self.keys, id, revision, &self.node, name);
-            match self.transact(keep, id, |found| self.is_own(found, name)).await {
-                // An answer that came late says nothing: the key has been written since.
-                Ok(Ok(now)) if self.owns_since(id, now) && self.is_named_now(id, name) => {
-                    if let Ok(live) = self.pacer.get(id) {
-                        live.is_owned_since(now);
-                    }
-                    info!(session = %id, node = name, "this server stands by");
-                }
-                // This server has written it itself, and has not heard so. It is tried again.
-                Ok(Err(Some((value, now)))) if value.node == self.node => {
-                    self.owns_since(id, now);
-                    return;
-                }
-                // Another has the session, or etcd does not answer: that is for the lease to find out. It is tried again.
-                Ok(_) | Err(_) => return,
-            }
+        if self.counts(id, name, &tape, step) {
+            return;
         }
-        tape.is_mirrored(step);
+        let Some(revision) = self.revision(id) else { return };
+        if !self.begins_to_name(id, name, &tape, step) {
+            return;
+        }
+        let keep = rules::keep(&self.keys, id, revision, &self.node, name);
+        match self.transact(keep, id, |found| self.is_own(found, name)).await {
+            // An answer that came late says nothing: the key has been written since.
+            Ok(Ok(now)) if self.owns_since(id, now) && self.is_named_now(id, name) => {
+                if let Ok(live) = self.pacer.get(id) {
+                    live.is_owned_since(now);
+                }
+                info!(session = %id, node = name, "this server stands by");
+                self.counts(id, name, &tape, step);
+            }
+            // This server has written it itself, and has not heard so. It is tried again.
+            Ok(Err(Some((value, now)))) if value.node == self.node => _ = self.owns_since(id, now),
+            // Another has the session, or etcd does not answer: that is for the lease to find out. It is tried again.
+            Ok(_) | Err(_) => {}
+        }
     }
 }
 
