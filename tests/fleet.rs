@@ -26,20 +26,25 @@ use palpate::journal::file;
 use palpate_proto::error::elsewhere;
 use palpate_proto::pb;
 use pb::touch_response::Message as Heard;
-use server::{Server, Touch, force};
+use server::{Server, Touch, force, waiting};
+use tempfile::TempDir;
+use tokio::sync::MutexGuard;
 use tonic::Code;
 
 /// One test at a time: each has several processes.
 static ONE: tokio::sync::Mutex<()> = tokio::sync::Mutex::const_new(());
 
+/// A folder and an etcd, while no other test runs. `None` where etcd is not installed.
+async fn alone() -> Option<(MutexGuard<'static, ()>, TempDir, Etcd)> {
+    if !Etcd::is_there() {
+        return None;
+    }
+    Some((ONE.lock().await, tempfile::tempdir().unwrap(), Etcd::start(1)))
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn any_server_creates_sessions_and_tells_where_they_are() {
-    if !Etcd::is_there() {
-        return;
-    }
-    let _one = ONE.lock().await;
-    let folder = tempfile::tempdir().unwrap();
-    let etcd = Etcd::start(1);
+    let Some((_one, folder, etcd)) = alone().await else { return };
     let nodes = three(folder.path(), &etcd.endpoints()).await;
     let mut made = BTreeMap::new();
     for index in 0..9 {
@@ -111,12 +116,7 @@ async fn a_server_of_no_fleet_says_so() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_frozen_server_says_nothing_for_its_sessions_when_it_thaws() {
-    if !Etcd::is_there() {
-        return;
-    }
-    let _one = ONE.lock().await;
-    let folder = tempfile::tempdir().unwrap();
-    let etcd = Etcd::start(1);
+    let Some((_one, folder, etcd)) = alone().await else { return };
     let nodes = three(folder.path(), &etcd.endpoints()).await;
     let id = create(&nodes[0]).await.session_id;
     let (at, session) = until_stood_by(&nodes, &id).await;
@@ -163,12 +163,7 @@ async fn a_frozen_server_says_nothing_for_its_sessions_when_it_thaws() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn without_etcd_all_stands_and_then_goes_on_in_place() {
-    if !Etcd::is_there() {
-        return;
-    }
-    let _one = ONE.lock().await;
-    let folder = tempfile::tempdir().unwrap();
-    let mut etcd = Etcd::start(1);
+    let Some((_one, folder, mut etcd)) = alone().await else { return };
     let nodes = three(folder.path(), &etcd.endpoints()).await;
     let id = create(&nodes[0]).await.session_id;
     let (at, before) = until_stood_by(&nodes, &id).await;
@@ -205,12 +200,7 @@ async fn without_etcd_all_stands_and_then_goes_on_in_place() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_session_moves_with_its_tools_and_the_same_bits() {
-    if !Etcd::is_there() {
-        return;
-    }
-    let _one = ONE.lock().await;
-    let folder = tempfile::tempdir().unwrap();
-    let etcd = Etcd::start(1);
+    let Some((_one, folder, etcd)) = alone().await else { return };
     let nodes = three(folder.path(), &etcd.endpoints()).await;
     let id = create(&nodes[0]).await.session_id;
     let mut at = owner(&nodes, &id).await.unwrap();
@@ -276,12 +266,7 @@ async fn a_session_moves_with_its_tools_and_the_same_bits() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_change_of_the_tissue_that_waits_goes_on_at_the_server_that_takes_over() {
-    if !Etcd::is_there() {
-        return;
-    }
-    let _one = ONE.lock().await;
-    let folder = tempfile::tempdir().unwrap();
-    let etcd = Etcd::start(1);
+    let Some((_one, folder, etcd)) = alone().await else { return };
     let mut nodes = three(folder.path(), &etcd.endpoints()).await;
     let paper = pb::create_session_request::Source::SceneName("paper".into());
     let id = nodes[0].there().create(paper, true).await.unwrap().session_id;
@@ -297,10 +282,7 @@ async fn a_change_of_the_tissue_that_waits_goes_on_at_the_server_that_takes_over
     let there = nodes.iter().position(|node| node.name == standby).unwrap();
     until("it is mirrored", async || {
         let kept = file::list(&nodes[there].journals.join("standby")).unwrap().into_iter();
-        kept.filter(|file| file.session_id == id).any(|file| {
-            let survey = palpate::journal::Reader::open(&file.path).and_then(|mut reader| reader.survey(&mut |_| {}));
-            survey.is_ok_and(|survey| survey.waiting.len() == 1)
-        })
+        kept.filter(|file| file.session_id == id).any(|file| waiting(&file.path) == Some(vec![100]))
     })
     .await;
     nodes[at].kill();
@@ -318,12 +300,7 @@ fn force_n(sample: &pb::Sample) -> f64 {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn servers_know_each_other_by_certificates_and_clients_by_tokens() {
-    if !Etcd::is_there() {
-        return;
-    }
-    let _one = ONE.lock().await;
-    let folder = tempfile::tempdir().unwrap();
-    let etcd = Etcd::start(1);
+    let Some((_one, folder, etcd)) = alone().await else { return };
     let authority = Authority::new();
     let write = |name: &str, text: &str| {
         let path = folder.path().join(name);

@@ -13,7 +13,7 @@ use std::time::Duration;
 use palpate::limits::Limits;
 use palpate::sheet::choice::NEVER;
 use palpate_proto::pb;
-use server::{PATIENCE, Server, Touch, force};
+use server::{PATIENCE, Server, Touch, force, waiting};
 
 fn start(folder: &Path) -> Server {
     Server::start(&["--log", "info", "--journal", folder.to_str().unwrap()])
@@ -102,10 +102,7 @@ async fn a_killed_server_goes_on_with_its_sessions_from_their_durable_step() {
 
 /// Waits until the journal of a run has changes of the tissue that wait for these steps.
 async fn until_waits(folder: &Path, session_id: &str, run: usize, steps: &[u64]) {
-    let waits = |path: &PathBuf| {
-        let survey = palpate::journal::Reader::open(path).and_then(|mut reader| reader.survey(&mut |_| {}));
-        survey.is_ok_and(|survey| survey.waiting.iter().map(|input| input.step).eq(steps.iter().copied()))
-    };
+    let waits = |path: &PathBuf| waiting(path).as_deref() == Some(steps);
     let waited = tokio::time::timeout(PATIENCE, async {
         while !files(folder, session_id).get(run - 1).is_some_and(waits) {
             tokio::time::sleep(Duration::from_millis(5)).await;

@@ -47,13 +47,13 @@ url=$(grep -o 'http.*' "$work/serving")
 if command -v valgrind >/dev/null; then
     compile errors clients/c/tests/errors.c
     compile touch clients/c/examples/touch.c
-    memcheck='valgrind --quiet --fair-sched=try --error-exitcode=9 --leak-check=full --errors-for-leak-kinds=definite,indirect
-        --show-leak-kinds=definite,indirect'
+    valgrind='valgrind --quiet --fair-sched=try --error-exitcode=9'
+    memcheck="$valgrind --leak-check=full --errors-for-leak-kinds=definite,indirect --show-leak-kinds=definite,indirect"
     $memcheck --suppressions=tests/abi/memcheck.supp "$work/errors" "$url"
     $memcheck --suppressions=tests/abi/memcheck.supp "$work/touch" "$url" liver 3
     say 'memcheck has found nothing'
     # helgrind.supp says what it can judge.
-    valgrind --quiet --fair-sched=try --tool=helgrind --error-exitcode=9 --suppressions=tests/abi/helgrind.supp \
+    $valgrind --tool=helgrind --suppressions=tests/abi/helgrind.supp \
         "$work/touch" "$url" liver 3
     say 'helgrind has found nothing'
 else

@@ -9,7 +9,7 @@
 )]
 
 use std::io::{BufRead, BufReader, Read};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdout, Command, Output, Stdio};
 use std::sync::OnceLock;
 use std::time::Duration;
@@ -335,6 +335,12 @@ pub fn sheet(nx: u32, ny: u32) -> pb::create_session_request::Source {
     let points = format!("sheet.points=[{nx}, {ny}]");
     let scene = palpate::scene::Scene::parse("paper", palpate::scene::PAPER, &[points], &limits).unwrap();
     pb::create_session_request::Source::Scene(palpate::wire::scene::scene(&scene))
+}
+
+/// The steps of the changes of the tissue that wait, as a journal has them. `None`: it can't be read yet.
+pub fn waiting(journal: &Path) -> Option<Vec<u64>> {
+    let survey = palpate::journal::Reader::open(journal).and_then(|mut reader| reader.survey(&mut |_| {}));
+    Some(survey.ok()?.waiting.iter().map(|input| input.step).collect())
 }
 
 /// Code, reason and field of an error.

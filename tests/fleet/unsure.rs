@@ -7,7 +7,7 @@ use palpate::journal::file;
 use palpate_proto::pb;
 use tonic::Code;
 
-use crate::ONE;
+use crate::alone;
 use crate::etcd::Etcd;
 use crate::fleet::{Node, create, owner, three, until, until_stood_by};
 use crate::random::Random;
@@ -23,12 +23,7 @@ fn run(session: &pb::Session) -> u64 {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_session_stays_if_the_other_server_can_not_write_its_journal() {
-    if !Etcd::is_there() {
-        return;
-    }
-    let _one = ONE.lock().await;
-    let folder = tempfile::tempdir().unwrap();
-    let etcd = Etcd::start(1);
+    let Some((_one, folder, etcd)) = alone().await else { return };
     let nodes = three(folder.path(), &etcd.endpoints()).await;
     let id = create(&nodes[0]).await.session_id;
     let (at, before) = until_stood_by(&nodes, &id).await;
@@ -74,12 +69,7 @@ async fn being_named(nodes: &[Node], etcd: &Etcd) -> (String, usize) {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_session_moves_also_while_its_standby_is_being_named() {
-    if !Etcd::is_there() {
-        return;
-    }
-    let _one = ONE.lock().await;
-    let folder = tempfile::tempdir().unwrap();
-    let etcd = Etcd::start(1);
+    let Some((_one, folder, etcd)) = alone().await else { return };
     let nodes = patient(folder.path(), &etcd).await;
     for _ in 0..4 {
         let (id, at) = being_named(&nodes, &etcd).await;
@@ -107,12 +97,7 @@ async fn a_session_moves_also_while_its_standby_is_being_named() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_move_is_refused_with_the_reason_if_etcd_does_not_say_who_stands_by() {
-    if !Etcd::is_there() {
-        return;
-    }
-    let _one = ONE.lock().await;
-    let folder = tempfile::tempdir().unwrap();
-    let etcd = Etcd::start(1);
+    let Some((_one, folder, etcd)) = alone().await else { return };
     let nodes = patient(folder.path(), &etcd).await;
     let mut refused = None;
     for _ in 0..5 {
@@ -140,12 +125,7 @@ async fn a_move_is_refused_with_the_reason_if_etcd_does_not_say_who_stands_by() 
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_session_has_one_server_whenever_the_one_that_takes_it_dies() {
-    if !Etcd::is_there() {
-        return;
-    }
-    let _one = ONE.lock().await;
-    let folder = tempfile::tempdir().unwrap();
-    let etcd = Etcd::start(1);
+    let Some((_one, folder, etcd)) = alone().await else { return };
     let mut nodes = three(folder.path(), &etcd.endpoints()).await;
     let id = create(&nodes[0]).await.session_id;
     let (mut random, mut revision, mut durable_step) = (Random(7), 0, 0);
@@ -176,12 +156,7 @@ async fn a_session_has_one_server_whenever_the_one_that_takes_it_dies() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_deletion_is_confirmed_only_when_etcd_has_done_it() {
-    if !Etcd::is_there() {
-        return;
-    }
-    let _one = ONE.lock().await;
-    let folder = tempfile::tempdir().unwrap();
-    let mut etcd = Etcd::start(1);
+    let Some((_one, folder, mut etcd)) = alone().await else { return };
     let nodes = three(folder.path(), &etcd.endpoints()).await;
     let id = create(&nodes[0]).await.session_id;
     let (at, _) = until_stood_by(&nodes, &id).await;
