@@ -41,12 +41,10 @@ pub struct Renderer {
     laws: Vec<(u32, Law)>,
     /// The newest model, and the touch that follows from it.
     newest: Option<(LocalModel, Touching)>,
-    /// A newer model that has arrived since.
-    arrived: Option<LocalModel>,
-    /// When the newest model arrived, of whatever connection.
-    arrived_s: Option<f64>,
-    /// A model has come, of whatever connection.
-    has_heard: bool,
+    /// A newer model that has arrived since, and when.
+    arrived: Option<(LocalModel, f64)>,
+    /// When the newest model arrived, of whatever connection: `None` before the first of all.
+    newest_s: Option<f64>,
     bias_n: DVec3,
     biased_s: f64,
     track: Track,
@@ -67,8 +65,7 @@ impl Renderer {
             laws,
             newest: None,
             arrived: None,
-            arrived_s: None,
-            has_heard: false,
+            newest_s: None,
             bias_n: DVec3::ZERO,
             biased_s: 0.0,
             track: Track::default(),
@@ -107,7 +104,7 @@ impl Renderer {
             return false;
         }
         if self.laws.len() == MOST_LAWS {
-            let in_use = [self.newest.map(|newest| newest.0.law), self.arrived.map(|model| model.law)];
+            let in_use = [self.newest.map(|newest| newest.0.law), self.arrived.map(|arrived| arrived.0.law)];
             let oldest = self.laws.iter().position(|known| !in_use.contains(&Some(known.0)));
             used(self.laws.remove(oldest.unwrap_or(0)).1);
         }
@@ -123,7 +120,7 @@ impl Renderer {
     /// Whether forces are rendered. Before the first model there are none, also if they were asked for.
     pub fn state(&self) -> RenderingState {
         match self.envelope.state() {
-            RenderingState::Enabled if !self.has_heard => RenderingState::Disabled,
+            RenderingState::Enabled if self.newest_s.is_none() => RenderingState::Disabled,
             state => state,
         }
     }
@@ -135,7 +132,8 @@ impl Renderer {
 
     /// Takes a model that has just arrived. It takes effect at the next tick.
     pub fn receive(&mut self, model: LocalModel, now_s: f64) {
-        let newest = self.arrived.as_ref().or(self.newest.as_ref().map(|newest| &newest.0));
+        let arrived = self.arrived.as_ref().map(|arrived| &arrived.0);
+        let newest = arrived.or(self.newest.as_ref().map(|newest| &newest.0));
         let late = newest.is_some_and(|newest| model.sequence <= newest.sequence);
         if late || !model.is_sound() {
             self.refused += 1;
@@ -144,7 +142,7 @@ impl Renderer {
         // By number, so that a law that is forgotten changes nothing.
         let is_known = self.laws.iter().any(|known| known.0 == model.law);
         let law = if is_known { model.law } else { self.laws[0].0 };
-        (self.arrived, self.arrived_s) = (Some(LocalModel { law, ..model }), Some(now_s));
+        self.arrived = Some((LocalModel { law, ..model }, now_s));
     }
 
     /// Switches to a model that has arrived: repeats the tool's path since, and keeps the difference from the last
@@ -157,7 +155,6 @@ impl Renderer {
             touching.move_to(&model, law, place_m);
         }
         self.newest = Some((model, touching));
-        self.has_heard = true;
         (self.biased_s, self.bias_n) = (now_s, DVec3::ZERO);
         if let Some(before_n) = before_n {
             self.bias_n = before_n - self.wanted_n(now_s);
@@ -202,14 +199,15 @@ impl Renderer {
             if let Some((model, touching)) = &mut self.newest {
                 touching.move_to(model, law_of(&self.laws, model), place_m);
             }
-            if let Some(model) = self.arrived.take() {
+            if let Some((model, arrived_s)) = self.arrived.take() {
+                self.newest_s = Some(arrived_s);
                 self.adopt(model, now_s);
             }
         }
         let force_n = self.wanted_n(now_s);
         // A hand that was feeling forces waits no longer for another server's first model than for the next of the same.
         let counts = self.newest.is_some() || self.envelope.is_engaged();
-        let age_s = self.arrived_s.filter(|_| counts).map(|arrived_s| now_s - arrived_s);
+        let age_s = self.newest_s.filter(|_| counts).map(|newest_s| now_s - newest_s);
         let wanted = Wanted { now_s, place_m, velocity_m_per_s: self.velocity_m_per_s, force_n, age_s };
         self.envelope.render(&wanted)
     }
