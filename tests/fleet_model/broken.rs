@@ -57,7 +57,7 @@ pub(crate) enum Broken {
     DeleteUnsure,
     /// A node that joins deletes what it has not got, also what came since.
     SettleAll,
-    /// A list of the nodes counts though the watch has told newer things.
+    /// A node that has another lease lists the nodes anew, beside its watch.
     ListOverWatch,
     /// Who stands by takes journals of older runs than it has.
     OlderRuns,

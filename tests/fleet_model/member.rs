@@ -134,11 +134,7 @@ impl World {
                 let prefix = self.keys.nodes();
                 let name = |key: &str| key.strip_prefix(&prefix).map(str::to_owned);
                 let view = found.iter().filter_map(|found| Some((name(&found.key)?, decode(&found.value)?))).collect();
-                // The watch may have told newer things than this answer, which came late.
-                let memory = &mut self.nodes[n].memory;
-                if !is_first || revision >= memory.view_revision || self.broken == Broken::ListOverWatch {
-                    (memory.view, memory.view_revision) = (view, revision);
-                }
+                self.nodes[n].memory.view = view;
                 if is_first {
                     return self.is_of_the_fleet(n);
                 }
@@ -186,6 +182,10 @@ impl World {
         let memory = &mut self.nodes[n].memory;
         (memory.lease, memory.key_revision) = (lease, revision);
         self.note(|| format!("n{n} has lease {lease}"));
+        // A list that comes late would undo what the watch has told since, for ever.
+        if self.nodes[n].memory.rejoining && !self.is(Broken::ListOverWatch) {
+            return self.is_of_the_fleet(n);
+        }
         let prefix = self.keys.nodes();
         self.ask(n, Ask::List(prefix), Then::ListedFirst);
     }
@@ -262,9 +262,7 @@ impl World {
     fn see(&mut self, n: N, change: &Change) {
         let prefix = self.keys.nodes();
         let Some(name) = change.key.strip_prefix(&prefix) else { return };
-        let memory = &mut self.nodes[n].memory;
-        memory.view_revision = change.revision;
-        let view = &mut memory.view;
+        let view = &mut self.nodes[n].memory.view;
         match change.value.as_deref().and_then(decode::<NodeValue>) {
             Some(value) => _ = view.insert(name.to_owned(), value),
             None => _ = view.remove(name),

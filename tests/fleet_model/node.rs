@@ -105,8 +105,6 @@ pub(crate) struct Memory {
     /// The revision of the node's own key.
     pub(crate) key_revision: u64,
     pub(crate) view: BTreeMap<String, NodeValue>,
-    /// The store's revision that the view is of.
-    pub(crate) view_revision: u64,
     pub(crate) watch: u64,
     pub(crate) live: BTreeMap<S, Live>,
     pub(crate) owned: BTreeMap<S, Owned>,
