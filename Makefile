@@ -138,7 +138,7 @@ $(VENV)/ready: tests/python/requirements.txt clients/python/tests/requirements.t
 # The same random cases every time, so that the result is that of the change. `cargo test` alone draws others each time,
 # and `make stress` many.
 test: build $(VENV)/ready test-viewer test-python
-	PROPTEST_RNG_SEED=20261122 $(CARGO) test --release --workspace
+	PROPTEST_RNG_SEED=20261122 $(CARGO) test --release --workspace --no-fail-fast
 	sh tests/abi/check.sh $(BUILT) interface
 	$(VENV)/bin/python -m unittest discover -s tests/python -v
 

@@ -73,7 +73,7 @@ fn speed(report: &mut Report, rounds: usize) {
          later: a force that does not change lets all of it sleep by then, a tip keeps what is around it awake. Asleep: nothing \
          touches it.",
     );
-    let sizes: &[f64] = if quick() { &[0.002] } else { &[0.002, 0.00177, 0.00124] };
+    let sizes: &[f64] = if quick() { &[0.002] } else { &[0.002, 0.00167, 0.00124] };
     let mut rows = Vec::new();
     for edge_m in sizes {
         let model = organ("liver-organ", *edge_m, &[]);
