@@ -102,6 +102,14 @@ fn over_a_curved_organ_the_force_turns_with_the_surface() {
 
 /// Over a stream the same losses cost a third of the force.
 #[test]
+fn a_deep_press_goes_by_the_law_of_what_it_presses_not_of_what_is_nearest() {
+    // From inside, 11 mm deep in the wall: the flank of a fold is nearer, and half as stiff again.
+    let found = link("--scene colon --rtt-ms 50 --seconds 7");
+    let error_percent = number(&found, "force_error_rms_percent");
+    assert!(error_percent < 2.0, "{error_percent} %");
+}
+
+#[test]
 fn over_datagrams_a_lost_packet_costs_nothing() {
     for (scene, network) in [
         ("liver", "--rtt-ms 50 --loss 0.1"),

@@ -2,14 +2,14 @@
 
 use glam::DVec3;
 
-use crate::sheet::Model;
 use crate::sheet::alike::place_alike;
+use crate::sheet::{Feel, Model};
 
 /// A tool so many radii away from the surface wants no law of the place.
 const NEAR_IN_RADII: f64 = 4.0;
 
-/// The law of a place serves a tool as far as this from it: on a sheet, and on a mesh, whose vertices lie wider.
-const SERVES_IN_RADII: [f64; 2] = [0.5, 1.0];
+/// The law of a place serves a tool as far as this from it.
+const SERVES_IN_RADII: f64 = 0.5;
 
 /// What a tissue is pressed with, and where.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -26,18 +26,19 @@ impl Disc {
         Disc { radius_m, at_m: model.shape().extent().middle_m() }
     }
 
-    /// The disc whose law serves a tool at `place_m`: this one still, unless the tool is near the surface, at a place with
-    /// another law. What moves to and fro between two places has the law of the first.
+    /// Where the tissue rests that a tool with this disc presses, or is about to press, m; none if it is far from the tissue. That is
+    /// not the place nearest to the tool: deep in a tissue that is curved or folded, another part of it may be nearer.
+    pub fn pressed_m(&self, feel: &Feel) -> Option<DVec3> {
+        let is_near = feel.place_m.distance(feel.surface_m) <= NEAR_IN_RADII * self.radius_m;
+        is_near.then_some(feel.anchor_m)
+    }
+
+    /// The disc whose law serves a tool that presses what rests at `rest_m`: this one still, unless the law there is another. What
+    /// moves to and fro between two places has the law of the first.
     #[must_use]
-    pub fn follow(self, model: &Model, place_m: DVec3) -> Self {
-        let shape = model.shape();
-        let nearest_m = shape.rest_m(shape.nearest(place_m));
-        if nearest_m.distance(place_m) > NEAR_IN_RADII * self.radius_m {
-            return self;
-        }
-        let at_m = place_alike(model, self.radius_m, place_m);
-        let serves_m = self.radius_m * SERVES_IN_RADII[usize::from(shape.dimensions() > 2)];
-        if at_m.distance(self.at_m) <= serves_m { self } else { Disc { at_m, ..self } }
+    pub fn follow(self, model: &Model, rest_m: DVec3) -> Self {
+        let at_m = place_alike(model, self.radius_m, rest_m);
+        if at_m.distance(self.at_m) <= SERVES_IN_RADII * self.radius_m { self } else { Disc { at_m, ..self } }
     }
 }
 

@@ -19,6 +19,7 @@ use crate::budget::Account;
 use crate::force_law::Disc;
 use crate::pace::Live;
 use crate::pace::laws::{SoughtLaw, have_same_laws};
+use crate::session::Sample;
 use crate::session::laws::{FIRST, Laws};
 use crate::sheet::Model;
 use palpate_proto::{pb, touch};
@@ -27,6 +28,9 @@ use palpate_touch::Law;
 /// After the laws of a place so many times as long passes until those of another are begun, but not longer than this.
 const PAUSES: u32 = 3;
 const LONGEST_PAUSE: Duration = Duration::from_secs(2);
+
+/// Places nearer than this to the one told last are no news: their law is the same, or nearly so.
+const NEWS_IN_RADII: f64 = 0.25;
 
 /// A law for a stream, or why there is none.
 struct LawUpdate {
@@ -41,9 +45,28 @@ struct LawUpdate {
 pub(super) struct Updates {
     told: mpsc::Receiver<LawUpdate>,
     laws: Arc<Laws>,
+    /// The tool that the laws are for, of several the first.
+    tool: Option<u32>,
+    tip: Disc,
+    /// What it presses, where that rests, m.
+    place_m: watch::Sender<Option<DVec3>>,
 }
 
 impl Updates {
+    /// Further laws are of where the tool is in this sample.
+    pub(super) fn follow(&self, sample: &Sample) {
+        let of_tool = sample.tools.iter().find(|tool| Some(tool.tool) == self.tool);
+        let feel = of_tool.and_then(|tool| tool.feel.as_ref());
+        let Some(rest_m) = feel.and_then(|feel| self.tip.pressed_m(feel)) else { return };
+        self.place_m.send_if_modified(|told| {
+            let is_news = told.is_none_or(|told_m| told_m.distance(rest_m) > NEWS_IN_RADII * self.tip.radius_m);
+            if is_news {
+                *told = Some(rest_m);
+            }
+            is_news
+        });
+    }
+
     /// The next message. Samples use its law from then on: so none that names it can come before the message. `None`: no
     /// message will follow.
     pub(super) fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<pb::ForceLawUpdate>> {
@@ -179,14 +202,11 @@ impl Computing {
         Ok((law, Computing { maker, tissue, known }))
     }
 
-    /// Goes on until the handle is dropped: tells the exact law, and those of other tissues and of other places, as `places`
-    /// tells them. A computation ends when a newer tissue acts.
-    pub(super) fn go_on(
-        self,
-        laws: Arc<Laws>,
-        mut places: watch::Receiver<Option<DVec3>>,
-    ) -> (Updates, AbortOnDropHandle<()>) {
+    /// Goes on until the handle is dropped: tells the exact law, and those of other tissues and of the places of `tool`. A
+    /// computation ends when a newer tissue acts.
+    pub(super) fn go_on(self, laws: Arc<Laws>, tool: Option<u32>) -> (Updates, AbortOnDropHandle<()>) {
         let Computing { maker, mut tissue, mut known } = self;
+        let (tip, (place_m, mut places)) = (known.disc, watch::channel(None));
         let (tell, told) = mpsc::channel(1);
         let work = async move {
             loop {
@@ -217,7 +237,7 @@ impl Computing {
                 }
             }
         };
-        (Updates { told, laws }, AbortOnDropHandle::new(tokio::spawn(work.in_current_span())))
+        (Updates { told, laws, tool, tip, place_m }, AbortOnDropHandle::new(tokio::spawn(work.in_current_span())))
     }
 }
 
@@ -277,11 +297,6 @@ mod tests {
         }
     }
 
-    /// Of a stream whose tool is nowhere.
-    fn nowhere() -> watch::Receiver<Option<DVec3>> {
-        watch::channel(None).1
-    }
-
     async fn told(updates: &mut Updates) -> pb::ForceLawUpdate {
         std::future::poll_fn(|context| updates.poll(context)).await.unwrap()
     }
@@ -292,7 +307,7 @@ mod tests {
         let (first, laws, computing) = course.begin().await;
         let sought = course.sought();
         assert!(first.is_coarse && sought.exact().is_none());
-        let (mut updates, _computing) = computing.go_on(laws.clone(), nowhere());
+        let (mut updates, _computing) = computing.go_on(laws.clone(), None);
         // Local models refer to it when it was told, not before.
         while sought.exact().is_none() {
             tokio::task::yield_now().await;
@@ -314,7 +329,7 @@ mod tests {
         let course = Course::new(&Limits { law_work: 1 << 20, ..Limits::default() });
         for _ in 0..2 {
             let (_, laws, computing) = course.begin().await;
-            let (mut updates, _computing) = computing.go_on(laws.clone(), nowhere());
+            let (mut updates, _computing) = computing.go_on(laws.clone(), None);
             let update = told(&mut updates).await;
             assert_eq!((update.law, update.reason.as_str()), (None, "NOT_AVAILABLE"));
             assert!(update.message.contains("limits.law_work"), "{}", update.message);
@@ -327,7 +342,7 @@ mod tests {
         let course = Course::new(&Limits::default());
         let (_, laws, computing) = course.begin().await;
         let sought = course.sought();
-        let (mut updates, handle) = computing.go_on(laws.clone(), nowhere());
+        let (mut updates, handle) = computing.go_on(laws.clone(), None);
         // It is under way when its turn is taken.
         while sought.is_free() {
             tokio::task::yield_now().await;
@@ -338,7 +353,7 @@ mod tests {
         drop(sought.turn().await);
         assert!(sought.exact().is_none() && laws.newest().0 == FIRST);
         let (_, laws, computing) = course.begin().await;
-        let (mut updates, _computing) = computing.go_on(laws, nowhere());
+        let (mut updates, _computing) = computing.go_on(laws, None);
         assert!(told(&mut updates).await.law.is_some());
     }
 
@@ -346,7 +361,7 @@ mod tests {
     async fn another_tissue_has_its_laws_told_when_it_acts() {
         let course = Course::new(&Limits::default());
         let (_, laws, computing) = course.begin().await;
-        let (mut updates, _computing) = computing.go_on(laws.clone(), nowhere());
+        let (mut updates, _computing) = computing.go_on(laws.clone(), None);
         assert_eq!(told(&mut updates).await.law.unwrap().number, 1);
         let (step, model) = course.change(1.5, None);
         let first = told(&mut updates).await;
@@ -368,7 +383,7 @@ mod tests {
         let course = Course::new(&Limits::default());
         let (_, laws, computing) = course.begin().await;
         let old = course.sought();
-        let (mut updates, _computing) = computing.go_on(laws.clone(), nowhere());
+        let (mut updates, _computing) = computing.go_on(laws.clone(), None);
         while old.is_free() {
             tokio::task::yield_now().await;
         }

@@ -266,10 +266,13 @@ async fn a_tool_that_goes_to_the_rim_gets_the_law_of_the_rim_and_none_on_the_way
     let mut touch = Touch::open(&server, with_device(&session, &[0])).await.unwrap();
     let mut laws = vec![touch::from_law(&touch.opened.take().unwrap().law.unwrap()).unwrap()];
     let mut lead = Lead { touch, begun: Instant::now(), sequence: 0 };
+    let at_rim = in_middle.follow(&model, DVec3::new(0.005, 0.0375, 0.0));
+    let [middle, rim] = [in_middle, at_rim]
+        .map(|disc| force_law::exact_within(&model, disc, u64::MAX, &AtomicBool::new(false)).unwrap());
     // The middle, a place that is as the middle, one radius from the fixed rim, and a place with that distance elsewhere.
     // The tool is above them: the law comes before it touches.
-    let course = [(0.0375, 0.0375, 1), (0.03, 0.045, 1), (0.005, 0.0375, 2), (0.045, 0.07, 2)];
-    for (x_m, y_m, law) in course {
+    let course = [(0.0375, 0.0375, &middle), (0.03, 0.045, &middle), (0.005, 0.0375, &rim), (0.045, 0.07, &rim)];
+    for (at, (x_m, y_m, law)) in course.into_iter().enumerate() {
         let mut named = 0_u32;
         tokio::time::timeout(10 * PATIENCE, async {
             let from = lead.sequence + 1;
@@ -283,17 +286,15 @@ async fn a_tool_that_goes_to_the_rim_gets_the_law_of_the_rim_and_none_on_the_way
                     }
                     Heard::Sample(sample) => {
                         let Some(of_model) = law_of(&sample, &laws) else { continue };
-                        named += u32::from(of_model == law && sample.tools[0].acknowledged_sequence >= from);
+                        named += u32::from(laws[of_model] == *law && sample.tools[0].acknowledged_sequence >= from);
                     }
                     _ => {}
                 }
             }
         })
         .await
-        .unwrap_or_else(|_| panic!("({x_m}, {y_m}): {named} models named law {law} of {}", laws.len()));
+        .unwrap_or_else(|_| panic!("({x_m}, {y_m}): {named} models named its law, of {}", laws.len()));
+        // The coarse one and the exact one of the middle. Places between the middle and the rim may have others.
+        assert!(at > 1 || laws.len() == 2, "{} laws", laws.len());
     }
-    let at_rim = in_middle.follow(&model, DVec3::new(0.005, 0.0375, 0.0));
-    let expected =
-        [in_middle, at_rim].map(|disc| force_law::exact_within(&model, disc, u64::MAX, &AtomicBool::new(false)));
-    assert_eq!(laws[1..], expected.map(Option::unwrap));
 }

@@ -3,11 +3,9 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use glam::DVec3;
 use palpate_proto::{datagram, pb};
 use palpate_touch::carrier::Seen;
 use palpate_touch::device::Device;
-use tokio::sync::watch;
 use tracing::{debug, info};
 
 use super::event::Event;
@@ -28,36 +26,10 @@ pub(super) struct Holder {
     pub(super) live: Arc<Live>,
     pub(super) lease: LeaseId,
     device: Option<Device>,
-    place: Option<ToolPlace>,
     traffic: Arc<Traffic>,
     commands: Bucket,
     /// Of each tool whose poses may come more than once those that have come.
     seen: BTreeMap<u32, Seen>,
-}
-
-/// Where the tool of a stream is, of several the first, as the computation of its laws is told.
-pub(super) struct ToolPlace {
-    pub(super) tool: u32,
-    /// Of the tip, m.
-    pub(super) radius_m: f64,
-    pub(super) told: watch::Sender<Option<DVec3>>,
-}
-
-impl ToolPlace {
-    /// Tells the place of a pose that is half a radius away from the last that was told.
-    fn follow(&self, command: &Command) {
-        let Action::Pose { place_m, .. } = command.action else { return };
-        if command.tool != self.tool {
-            return;
-        }
-        self.told.send_if_modified(|told| {
-            let is_news = told.is_none_or(|told_m| told_m.distance(place_m) > 0.5 * self.radius_m);
-            if is_news {
-                *told = Some(place_m);
-            }
-            is_news
-        });
-    }
 }
 
 /// A command, unless its pose is outside the declared workspace.
@@ -84,7 +56,7 @@ impl Holder {
         live: Arc<Live>,
         lease: LeaseId,
         tools: &[u32],
-        (device, place): (Option<Device>, Option<ToolPlace>),
+        device: Option<Device>,
         by_datagram: bool,
         limits: &Limits,
         traffic: Arc<Traffic>,
@@ -94,7 +66,7 @@ impl Holder {
         let tools = tools.len().max(1) as f64;
         let per_s = limits.commands_per_step * live.model.scene.stepping.rate_hz * tools;
         let commands = Bucket::new(per_s, per_s.max(2.0 * limits.queued_commands_per_tool as f64 * tools));
-        Holder { live, lease, device, place, traffic, commands, seen }
+        Holder { live, lease, device, traffic, commands, seen }
     }
 
     /// Takes in a command of the stream. Tells `events` if it is refused.
@@ -150,7 +122,6 @@ impl Holder {
             .take(now, "commands of this stream")
             .and_then(|()| wire::command::from_command(message, live.model.shape(), now))
             .and_then(|command| within_reach(command, live, self.device.as_ref()))
-            .inspect(|command| self.place.iter().for_each(|place| place.follow(command)))
             .and_then(|command| live.submit(self.lease, vec![Command { by_datagram, ..command }]).map(drop));
         self.traffic.commanded(usize::from(taken.is_ok()));
         let Err(refusal) = taken else { return Ok(()) };

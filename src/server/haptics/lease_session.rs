@@ -47,7 +47,7 @@ pub(super) async fn offer(
     let guard = live.open_stream("OpenDatagrams", StreamKind::HoldsTools, account)?;
     let (offer, arrival) = services.datagrams.offer()?.ok_or_else(not_available)?;
     let (limits, traffic) = (&services.config.limits, services.traffic.clone());
-    let holder = Holder::new(live.clone(), lease, &tools, (None, None), true, limits, traffic);
+    let holder = Holder::new(live.clone(), lease, &tools, None, true, limits, traffic);
     let way = Arc::new(Way::new(holder.pace()));
     sampling.wanted = Some(way.wanted());
     let (events, heard) = queue(limits.queued_samples);

@@ -94,6 +94,7 @@ impl Outlet {
                 Ok(popped) => popped,
                 Err(refusal) => return Poll::Ready(Some(Err(refusal.into()))),
             };
+            self.updates.iter().for_each(|updates| updates.follow(&paced.sample));
             let dropped_answers = self.dropped_answers;
             let told = |rejection| Message::Rejection(pb::Rejection { dropped_answers, ..rejection });
             self.ready.extend(self.notices.of(&paced.sample).into_iter().map(told));

@@ -9,7 +9,7 @@ use futures_util::stream::Stream;
 use palpate_proto::{pb, touch};
 use palpate_touch::carrier::LIFE_S;
 use palpate_touch::device::UNDECLARED_FORCE_N;
-use tokio::sync::{oneshot, watch};
+use tokio::sync::oneshot;
 use tokio::time::{Interval, MissedTickBehavior};
 use tokio_util::task::AbortOnDropHandle;
 use tonic::{Status, Streaming};
@@ -17,7 +17,7 @@ use tracing::{Instrument, debug, info};
 
 use super::early::Early;
 use super::event::Event;
-use super::holder::{Holder, ToolPlace};
+use super::holder::Holder;
 use super::outlet::Outlet;
 use super::tools::charges;
 use crate::budget::Account;
@@ -144,14 +144,12 @@ async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> 
         intake.charge(lease, charges);
         Ok::<_, Refusal>(intake.next_step())
     })?;
-    let (told, places) = watch::channel(None);
-    let (updates, _computing) = computing.zip(laws).map(|(computing, laws)| computing.go_on(laws, places)).unzip();
-    let led = open.tools.first().filter(|_| device.is_some());
-    let place = led.map(|tool| ToolPlace { tool: *tool, radius_m: tip.radius_m, told });
+    let led = open.tools.first().copied();
+    let (updates, _computing) = computing.zip(laws).map(|(computing, laws)| computing.go_on(laws, led)).unzip();
     // Held from here on: what fails below gives the tools back.
     let tools = open.tools.len();
     let (limits, traffic) = (&services.config.limits, services.traffic.clone());
-    let holder = Holder::new(live.clone(), lease, &open.tools, (device, place), open.datagrams, limits, traffic);
+    let holder = Holder::new(live.clone(), lease, &open.tools, device, open.datagrams, limits, traffic);
     let way = Arc::new(Way::new(holder.pace()));
     let mut held = StreamTools { tools, holder, way: way.clone(), offered_ns: None, arrival: None, _computing };
     let offered = if open.datagrams { services.datagrams.offer()? } else { None };

@@ -45,7 +45,8 @@ use spot::Spot;
 /// Arguments of `link`.
 #[derive(Args)]
 pub(crate) struct Arguments {
-    /// A scene file, or the name of a scene in ./scenes or built in (fibrotic, liver, paper, stomach)
+    /// A scene file, or the name of a scene in ./scenes or built in (colon, fibrotic, gallbladder, liver, liver-organ, paper,
+    /// stomach)
     #[arg(long, default_value = "liver")]
     scene: PathBuf,
     /// The hand that holds the device: light, medium or firm; or none: a weak string leads the device

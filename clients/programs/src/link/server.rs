@@ -90,7 +90,6 @@ impl Server {
         let mut commands = Vec::new();
         for (number, told) in &message.told {
             if self.seen.take(*number) {
-                self.follow(told.place_m);
                 commands.push(self.command(*number, told));
             }
         }
@@ -117,13 +116,17 @@ impl Server {
     pub(super) fn step(&mut self, now_s: f64) -> Result<Option<Option<LocalModel>>, String> {
         self.tissue.step(now_s)?;
         let sample = self.sampler.pick(self.tissue.session(), false);
+        let feel = sample.as_ref().and_then(|sample| sample.tools.first()).and_then(|tool| tool.feel);
+        if let Some(rest_m) = feel.and_then(|feel| self.disc.pressed_m(&feel)) {
+            self.follow(rest_m);
+        }
         let local = |tools: &[palpate::session::ToolSample]| tools.first().and_then(|tool| tool.local);
         Ok(sample.map(|sample| local(&sample.tools).map(|model| self.spot.of_hand(model))))
     }
 
-    /// The law is that of the tool's place.
-    fn follow(&mut self, place_m: DVec3) {
-        let disc = self.disc.follow(&self.place_laws.model, self.spot.of_tissue(place_m));
+    /// The law is that of what the tool presses.
+    fn follow(&mut self, rest_m: DVec3) {
+        let disc = self.disc.follow(&self.place_laws.model, rest_m);
         self.is_other |= disc != self.disc;
         self.disc = disc;
     }
