@@ -30,7 +30,7 @@ const PAUSE: Duration = Duration::from_millis(250);
 const LOOK: Duration = Duration::from_millis(200);
 
 /// Bytes of journals in one message, about.
-const MESSAGE_BYTES: u64 = 1 << 14;
+const MESSAGE_BYTES: u64 = 1 << 20;
 
 /// Sessions that are deleted or were moved, of which a server is still to be told; it finds the others out by itself when the stream ends.
 const MOST_PAST: usize = 10_000;
