@@ -100,7 +100,6 @@ fn over_a_curved_organ_the_force_turns_with_the_surface() {
     assert_eq!(found["unstable"], false);
 }
 
-/// Over a stream the same losses cost a third of the force.
 #[test]
 fn a_deep_press_goes_by_the_law_of_what_it_presses_not_of_what_is_nearest() {
     // From inside, 11 mm deep in the wall: the flank of a fold is nearer, and half as stiff again.
@@ -109,6 +108,7 @@ fn a_deep_press_goes_by_the_law_of_what_it_presses_not_of_what_is_nearest() {
     assert!(error_percent < 2.0, "{error_percent} %");
 }
 
+/// Over a stream the same losses cost a third of the force.
 #[test]
 fn over_datagrams_a_lost_packet_costs_nothing() {
     for (scene, network) in [

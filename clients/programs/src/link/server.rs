@@ -115,13 +115,12 @@ impl Server {
     /// Returns the reason if the guard stops the tissue.
     pub(super) fn step(&mut self, now_s: f64) -> Result<Option<Option<LocalModel>>, String> {
         self.tissue.step(now_s)?;
-        let sample = self.sampler.pick(self.tissue.session(), false);
-        let feel = sample.as_ref().and_then(|sample| sample.tools.first()).and_then(|tool| tool.feel);
-        if let Some(rest_m) = feel.and_then(|feel| self.disc.pressed_m(&feel)) {
+        let Some(sample) = self.sampler.pick(self.tissue.session(), false) else { return Ok(None) };
+        let tool = sample.tools.first();
+        if let Some(rest_m) = tool.and_then(|tool| self.disc.pressed_m(tool.feel.as_ref()?)) {
             self.follow(rest_m);
         }
-        let local = |tools: &[palpate::session::ToolSample]| tools.first().and_then(|tool| tool.local);
-        Ok(sample.map(|sample| local(&sample.tools).map(|model| self.spot.of_hand(model))))
+        Ok(Some(tool.and_then(|tool| tool.local).map(|model| self.spot.of_hand(model))))
     }
 
     /// The law is that of what the tool presses.
