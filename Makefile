@@ -20,7 +20,7 @@ PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/index.html 
 	$(VIEWER)/public/* $(TYPESCRIPT)/*.json $(TYPESCRIPT)/*.yaml $(TYPESCRIPT)/src/*.ts proto/palpate/v1/*.proto)
 
 .PHONY: help run install header test-abi bench-tick build release viewer page-if-node test test-viewer test-python bench-python test-arm test-asan test-valgrind test-debug test-mutants need-arm stress libfuzzer lint picture figures screenshot bench-roundtrip bench-duty \
-	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-rest bench-link bench-viewer bench-load bench-fleet soak siege fuzz need-rust \
+	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-rest bench-link bench-prediction bench-viewer bench-load bench-fleet soak siege fuzz need-rust \
 	need-python need-node chaos
 
 help:
@@ -53,6 +53,7 @@ help:
 	@echo 'make bench-tolerance is the tolerance kept? Random scenes against f64 at 1e-10: docs/benchmarks/tolerance.md'
 	@echo 'make bench-kernel    the time of a step beside the machine'"'"'s limits, numba, Taichi and NumPy'
 	@echo 'make bench-link      touch over a network in virtual time, by delay, tissue, hand and scheme: docs/benchmarks/link.md'
+	@echo 'make bench-prediction  touch on organs from a copy of the tissue, beside local models: docs/benchmarks/prediction.md'
 	@echo 'make bench-tick      the time of a tick of the touch thread while others are busy'
 	@echo 'make bench-viewer    331 × 331 points at 60 frames a second in a browser, and from a press to its pixel'
 	@echo 'make bench-stability the largest stable step, predicted and observed'
@@ -291,6 +292,10 @@ bench-viewer: build viewer
 # `make bench-link ARGUMENTS=--quick` for a minute's worth; the whole takes about half an hour.
 bench-link: build
 	$(CARGO) bench --quiet --bench link -- $(ARGUMENTS)
+
+# `make bench-prediction ARGUMENTS=--quick` with one seed; the whole takes about a quarter of an hour.
+bench-prediction: build
+	$(CARGO) bench --quiet --bench prediction -- $(ARGUMENTS)
 
 # `make bench-load ATTACK=unread-probes` is one row of the table of attacks, ATTACK=all all of that table, each three times
 # (ARGUMENTS='--runs 1').

@@ -446,7 +446,8 @@ fn organs(report: &mut Report, seeds: u64) {
     report.heading("Organs: 50 ms, medium hand, omega3, datagrams");
     report.say(
         "A model tells the surface under the tip with its curvature; a tip that strokes over a rim, a fold or a lump meets another \
-         within the round trip. A wall that is touched from inside (`colon`) has folds on all sides.",
+         within the round trip. A wall that is touched from inside (`colon`) has folds on all sides. These are of local models alone: \
+         prediction.md has them beside a copy of the tissue.",
     );
     let runs = [
         ("liver-organ, away from lumps", "liver-organ", ""),
@@ -458,7 +459,7 @@ fn organs(report: &mut Report, seeds: u64) {
     let all: Vec<_> = runs
         .iter()
         .flat_map(|(_, scene, place)| {
-            by_seed(&format!("--scene {scene} --transport datagram --rtt-ms 50 {place}"), seeds)
+            by_seed(&format!("--scene {scene} --scheme model --transport datagram --rtt-ms 50 {place}"), seeds)
         })
         .collect();
     let found = links(&all);

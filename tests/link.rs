@@ -95,7 +95,7 @@ fn what_a_client_gives_that_stands_still_is_counted() {
 /// A plane in place of the curved surface would be off by four times the bound.
 #[test]
 fn over_a_curved_organ_the_force_turns_with_the_surface() {
-    let found = link("--scene liver-organ --rtt-ms 50 --seconds 8");
+    let found = link("--scene liver-organ --scheme model --rtt-ms 50 --seconds 8");
     assert!(number(&found, "force_error_rms_percent") <= 1.0, "{found}");
     assert_eq!(found["unstable"], false);
 }
@@ -103,9 +103,66 @@ fn over_a_curved_organ_the_force_turns_with_the_surface() {
 #[test]
 fn a_deep_press_goes_by_the_law_of_what_it_presses_not_of_what_is_nearest() {
     // From inside, 11 mm deep in the wall: the flank of a fold is nearer, and half as stiff again.
-    let found = link("--scene colon --rtt-ms 50 --seconds 7");
+    let found = link("--scene colon --scheme model --rtt-ms 50 --seconds 7");
     let error_percent = number(&found, "force_error_rms_percent");
     assert!(error_percent < 2.0, "{error_percent} %");
+}
+
+/// Local models are off by 6 % here: over the edge of a lump the force changes faster than a round trip.
+#[test]
+fn a_copy_of_the_tissue_knows_the_lump_that_comes_next() {
+    let over_a_lump = "--scene liver-organ --place 0.030,-0.013,0.028 --seconds 5 --seed 2";
+    // Places that come late or not at all make the server's tool go another way than the copy's.
+    for network in ["--rtt-ms 50", "--profile bad-wan --transport datagram"] {
+        let found = link(&format!("{over_a_lump} {network}"));
+        let error_percent = number(&found, "force_error_rms_percent");
+        assert!(error_percent < 0.3, "{network}: {error_percent} %");
+        assert_eq!(found["scheme"], "prediction", "the usual one on a mesh");
+        // From when the first sample has met it.
+        assert!(number(&found, "predicted_ticks") > 4800.0, "{found}");
+        assert!(number(&found, "energy_min_j") >= -1e-6, "{found}");
+    }
+    let found = link(&format!("{over_a_lump} --rtt-ms 50 --scheme model"));
+    assert_eq!(number(&found, "predicted_ticks"), 0.0);
+    assert!(number(&found, "force_error_rms_percent") > 3.0, "{found}");
+}
+
+/// What only the server knows comes by samples, and where that makes the copy worse than the local model, that is rendered.
+#[test]
+fn a_copy_that_is_not_the_whole_truth_does_no_harm() {
+    for (what, most_percent) in [
+        ("--second-tool-mm 10", 5.0),
+        // For 100 ms nobody at the client knows of it.
+        ("--tissue-change-s 3 --tissue-change-factor 1.5", 10.0),
+        ("--deadband 0.1 --up-deadband 0.05", 2.0),
+    ] {
+        let run = |scheme| link(&format!("--scene fibrotic --rtt-ms 50 {what} --seconds 6 --scheme {scheme}"));
+        let (copy, models) = (run("prediction"), run("model"));
+        let [copy_percent, models_percent] = [&copy, &models].map(|found| number(found, "force_error_rms_percent"));
+        assert!(
+            copy_percent < most_percent && copy_percent < 1.5 * models_percent + 0.5,
+            "{what}: {copy_percent} {models_percent}"
+        );
+        assert!(number(&copy, "predicted_ticks") > 1000.0 && copy["unstable"] == false, "{copy}");
+    }
+}
+
+/// With a real server's snapshot.
+#[test]
+fn a_bridge_renders_from_a_copy_of_a_mesh_and_of_a_sheet_only_when_asked_to() {
+    let server = Server::start(&[]);
+    let predicted = |scene: &str, more: &str, seconds: u32| {
+        let url = &server.url;
+        let output = client(&format!("bridge --json --server {url} --scene {scene} --seconds {seconds} {more}"));
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        serde_json::from_slice::<Value>(&output.stdout).unwrap()["predicted_ticks"].as_u64().unwrap()
+    };
+    assert_eq!(predicted("paper", "", 1), 0);
+    assert_eq!(predicted("gallbladder", "--prediction never", 1), 0);
+    // A copy is there when it is made: on a busy machine that may take more than a few seconds.
+    for (scene, more) in [("paper", "--prediction always"), ("gallbladder", "")] {
+        assert!([3, 30].iter().any(|seconds| predicted(scene, more, *seconds) > 0), "{scene}");
+    }
 }
 
 /// Over a stream the same losses cost a third of the force.

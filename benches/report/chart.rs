@@ -75,6 +75,8 @@ pub enum Look {
     Full,
     /// A thin line with hollow markers.
     Hollow,
+    /// A line without markers.
+    Plain,
     /// A broad pale line without markers, drawn below others.
     Broad,
 }
@@ -102,7 +104,7 @@ impl Series {
     fn style(&self) -> ShapeStyle {
         let colour = HUES[self.hue % HUES.len()];
         match self.look {
-            Look::Full => ShapeStyle::from(&colour).stroke_width(2),
+            Look::Full | Look::Plain => ShapeStyle::from(&colour).stroke_width(2),
             Look::Hollow => ShapeStyle::from(&colour).stroke_width(1),
             Look::Broad => ShapeStyle::from(&colour.mix(0.25)).stroke_width(9),
         }
@@ -160,7 +162,7 @@ fn draw_marker<C>(series: &Series, at: C, draw: impl FnOnce(Circle<C, i32>)) {
     match series.look {
         Look::Full => draw(Circle::new(at, 3, series.style().filled())),
         Look::Hollow => draw(Circle::new(at, 3, series.style())),
-        Look::Broad => {}
+        Look::Plain | Look::Broad => {}
     }
 }
 

@@ -126,6 +126,8 @@ namespace Palpate
         public double Deadband, UpDeadband;
         uint datagrams, realTime;
         IntPtr holder, warn, warnUser;
+        /// <summary>Of which tissues to keep a copy: 0 none, 1 meshes, 2 any; see palpate_touch_options.</summary>
+        public uint Prediction;
         public bool InTissueFrame { get { return inTissueFrame != 0; } set { inTissueFrame = value ? 1u : 0u; } }
         public bool Grasps { get { return grasps != 0; } set { grasps = value ? 1u : 0u; } }
         public bool Datagrams { get { return datagrams != 0; } set { datagrams = value ? 1u : 0u; } }

@@ -34,7 +34,7 @@ pub mod writer;
 
 pub use format::{REPLAYS, Topic};
 pub use reader::{Batch, Reader, SnapshotAt, Survey};
-pub use replay::{Difference, Replay, Resumed, Seen, Verdict, resume, session_at, verify};
+pub use replay::{Difference, Replay, Resumed, Seen, Verdict, prediction, resume, session_at, verify};
 pub use writer::{Opening, Writer};
 
 pub use palpate_proto::journal as pb;

@@ -1,19 +1,22 @@
 //! Simulates a journal again: from its beginning or from a snapshot, up to a step, comparing every hash on the way.
 
 use std::collections::VecDeque;
-use std::io::{Read, Seek};
+use std::io::{Cursor, Read, Seek};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use palpate_proto::journal as pb;
+use palpate_touch::{Predictor, Tip};
 
 use super::message::{self, check_replays, from_command, from_hash, from_tissue};
 use super::reader::{Batch, Reader, SnapshotAt, Survey};
 use crate::limits::Limits;
+use crate::memory;
 use crate::refusal::{Reason, Refusal, Result};
 use crate::session::Session;
 use crate::session::command::Due;
 use crate::session::input::Input;
+use crate::session::prediction::{Prediction, TICK_POINT_SUBSTEPS};
 use crate::session::rules::Rules;
 use crate::session::saved::Saved;
 use crate::sheet::Model;
@@ -527,6 +530,21 @@ pub struct Resumed {
 /// Refuses a journal that is damaged in the middle, is of another generation, or gives other hashes.
 pub fn resume<R: Read + Seek>(reader: Reader<R>, limits: &Limits) -> Result<Resumed> {
     resume_as(reader, limits, None)
+}
+
+/// A copy of the tissue in the bytes of a snapshot, as it was then but at rest, for a client's tool with this tip: such as a loop
+/// at 1 kHz can bear, within the usual limits.
+///
+/// # Errors
+/// Tells what [`resume`] refuses, or that there is no memory.
+pub fn prediction(bytes: &[u8], tip: Tip) -> std::result::Result<Box<dyn Predictor>, String> {
+    let session = || {
+        // It came from a server: what it names of the machine there is not for this one.
+        let reader = Reader::new("the snapshot", Cursor::new(bytes))?.without_files();
+        Ok(resume(reader, &Limits::default())?.session)
+    };
+    let session = memory::attempt("snapshot", session).map_err(|refusal| refusal.to_string())?;
+    Ok(Box::new(Prediction::new(session.model(), tip).within(TICK_POINT_SUBSTEPS)))
 }
 
 /// The header of a journal, and the tissue that it begins with.

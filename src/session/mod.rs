@@ -22,6 +22,7 @@ pub mod intake;
 pub mod laws;
 pub mod lease;
 pub mod local;
+pub mod prediction;
 mod prospect;
 pub mod queue;
 pub mod recovery;

@@ -302,6 +302,12 @@ typedef struct palpate_touch_options {
    * Is handed to `warn`.
    */
   void *warn_user;
+  /**
+   * Of which tissues to keep a copy, which the loop simulates, so that forces come without the delay of the network; samples
+   * correct them. 0: none; 1: meshes, over whose rims, folds and lumps nothing else knows what comes next; 2: any. With a copy
+   * a tick also does the copy's step: a tenth of a millisecond is usual, and it may ask for memory. 0.
+   */
+  uint32_t prediction;
 } palpate_touch_options;
 
 /**
@@ -809,8 +815,8 @@ enum palpate_result palpate_touch_arrive(const struct palpate_touch *touch,
 
 /**
  * Gives the force to render from now on, for a device that reports `reading` at `time_s`: seconds of any origin, by a clock that
- * goes on between ticks. Takes a bounded time: no lock, no call of the system, no memory asked for or given back. It may be
- * late, early or left out: forces then fade, and return within the safety envelope. After an error, `felt` has a force of
+ * goes on between ticks. Takes a bounded time: no lock, no call of the system, no memory asked for or given back, unless
+ * `prediction` of its options asks for a copy of the tissue, whose step it then does. It may be late, early or left out: forces then fade, and return within the safety envelope. After an error, `felt` has a force of
  * zero. One thread at a time.
  */
 enum palpate_result palpate_touch_tick(const struct palpate_touch *touch,

@@ -1,8 +1,10 @@
 //! What callers choose: structures that begin with their size, so that later versions can add to them.
 
 use std::ffi::{c_char, c_void};
+use std::sync::Arc;
 
-use palpate_client::bridge::{Origin, Warn};
+use palpate::journal;
+use palpate_client::bridge::{Origin, Prediction, Warn};
 use palpate_proto::{pb, touch};
 use palpate_touch::{Device, Tip};
 
@@ -84,6 +86,10 @@ pub struct palpate_touch_options {
     pub warn: palpate_warn,
     /// Is handed to `warn`.
     pub warn_user: *mut c_void,
+    /// Of which tissues to keep a copy, which the loop simulates, so that forces come without the delay of the network; samples
+    /// correct them. 0: none; 1: meshes, over whose rims, folds and lumps nothing else knows what comes next; 2: any. With a copy
+    /// a tick also does the copy's step: a tenth of a millisecond is usual, and it may ask for memory. 0.
+    pub prediction: u32,
 }
 
 /// Which surface to show.
@@ -216,6 +222,7 @@ unsafe impl Versioned for palpate_touch_options {
             holder: std::ptr::null(),
             warn: None,
             warn_user: std::ptr::null_mut(),
+            prediction: 0,
         }
     }
 }
@@ -282,6 +289,15 @@ pub(crate) struct TouchOptions {
     pub(crate) real_time: bool,
     pub(crate) holder: String,
     pub(crate) warn: Option<Warn>,
+    pub(crate) prediction: Option<Prediction>,
+}
+
+/// By the number of `palpate_touch_options`.
+fn prediction(number: u32) -> Result<Option<Prediction>, Fault> {
+    if number > 2 {
+        return Err(Fault::argument(format!("prediction is {number}: must be 0, 1 or 2")));
+    }
+    Ok((number > 0).then(|| Prediction { make: Arc::new(journal::prediction), of_sheets: number == 2 }))
 }
 
 /// A caller's function for texts.
@@ -336,6 +352,7 @@ impl palpate_touch_options {
             real_time: self.real_time != 0,
             holder,
             warn: self.warn.map(warn),
+            prediction: prediction(self.prediction)?,
         })
     }
 }

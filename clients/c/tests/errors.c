@@ -87,6 +87,10 @@ int main(int count, char **arguments) {
     EXPECT(palpate_surface_uv(NULL, NULL, 8, 0), PALPATE_ARGUMENT, "surface is null");
     EXPECT(palpate_touch_options_init(NULL, 8), PALPATE_ARGUMENT, "options is null");
     EXPECT(palpate_change_init(NULL), PALPATE_ARGUMENT, "change is null");
+    palpate_touch_options unknown;
+    EXPECT(palpate_touch_options_init(&unknown, sizeof unknown), PALPATE_OK, NULL);
+    unknown.prediction = 3;
+    EXPECT(palpate_touch_begin_offline(&unknown, (palpate_vector){0}, &touch), PALPATE_ARGUMENT, "prediction is 3");
     EXPECT(palpate_limits_of(NULL, NULL), PALPATE_ARGUMENT, "name is null");
     palpate_server_free(NULL);
     palpate_session_free(NULL);

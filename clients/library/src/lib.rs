@@ -6,6 +6,7 @@
 //! - [`datagrams`]: the datagrams of such a stream, which no lost packet holds up.
 //! - [`device`] and [`bridge`]: the trait of haptic devices, and the loop that connects one to a server at 1 kHz.
 //! - [`devices`]: devices of makers, loaded at run time, and where their workspace is laid over the tissue.
+//! - [`snapshot`]: snapshots of sessions, as servers send them.
 //! - [`shown`]: the surface of a session as an engine shows it: positions, normals, triangles.
 //! - [`os`]: what is of the operating system.
 //! - [`watch`]: the samples of a session, without a tool.
@@ -53,6 +54,7 @@ pub mod fleet;
 pub mod followed;
 pub mod os;
 pub mod shown;
+pub mod snapshot;
 mod sync;
 pub mod touch;
 pub mod upload;

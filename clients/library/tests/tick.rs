@@ -8,7 +8,7 @@ use glam::{DMat3, DVec3};
 use palpate_client::Reading;
 use palpate_client::bridge::{Offline, Origin};
 use palpate_proto::{pb, touch};
-use palpate_touch::{ContactState, Device, Law, LocalModel, RenderingState};
+use palpate_touch::{ContactState, Device, Law, LocalModel, Predicted, Predictor, RenderingState};
 use pb::touch_response::Message as Heard;
 use prost::Message;
 
@@ -84,6 +84,16 @@ fn z_m(time_s: f64) -> f64 {
     0.001 - 0.004 * (std::f64::consts::TAU * (time_s - 0.5)).sin().max(0.0)
 }
 
+/// A copy of the tissue: a spring, N/m.
+struct Spring(f64);
+
+impl Predictor for Spring {
+    fn feel(&mut self, _: f64, place_m: DVec3) -> Option<Predicted> {
+        let contact_state = if place_m.z < 0.0 { ContactState::Sticking } else { ContactState::Free };
+        Some(Predicted { force_n: self.0 * (-place_m.z).max(0.0) * DVec3::Z, contact_state })
+    }
+}
+
 #[test]
 fn a_tick_asks_for_no_memory_and_gives_none_back() {
     for up_deadband in [0.0, 0.1] {
@@ -98,6 +108,10 @@ fn a_tick_asks_for_no_memory_and_gives_none_back() {
             if tick % 7 == 0 {
                 record.arrive(&further(1 + tick)).unwrap();
             }
+            // Copies come, take each other's place, and go with their connection. None is freed in a tick.
+            if tick % 1000 == 300 {
+                record.predict(Box::new(Spring(400.0)));
+            }
             let sent_s = time_s - 0.02;
             record.arrive(&sample(1 + u64::from(tick), 1.0 + sent_s, z_m(sent_s), 1 + tick / 7 * 7)).unwrap();
             let reading = Reading { place_m: z_m(time_s) * DVec3::Z, enable: tick % 1000 > 150 };
@@ -108,6 +122,7 @@ fn a_tick_asks_for_no_memory_and_gives_none_back() {
         }
         assert_eq!(requests, 0, "deadband {up_deadband}");
         assert!(most_n > 0.8, "{most_n} N: nothing was rendered");
+        assert!((3000..5000).contains(&ticker.predicted()), "{}", ticker.predicted());
         assert_eq!(ticker.state(), Some(RenderingState::Enabled));
     }
 }
@@ -191,7 +206,8 @@ fn a_tick_takes_no_lock() {
     let source = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
     let touch = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../touch/src");
     let files = ["bridge/ticker.rs", "exchange.rs", "sync.rs"].map(|name| source.join(name));
-    let rules = ["renderer.rs", "envelope.rs", "local.rs", "law.rs", "news.rs"].map(|name| touch.join(name));
+    let rules =
+        ["renderer.rs", "envelope.rs", "local.rs", "law.rs", "news.rs", "prediction.rs"].map(|name| touch.join(name));
     for file in files.iter().chain(&rules) {
         let text = std::fs::read_to_string(file).unwrap();
         for word in ["Mutex", "RwLock", "Condvar", "OnceLock", "Instant", "SystemTime", "park()", "mpsc"] {

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use glam::DVec3;
 use palpate_client::HapticDevice;
-use palpate_client::bridge::{Options, Report, Session, Target, Tick, Traffic, run};
+use palpate_client::bridge::{Options, Report, Session, Target, Tick, Traffic, Warn, run};
 use palpate_client::devices::{self, Kind, Placed};
 use palpate_simulated::random::Random;
 use palpate_simulated::task::{LEAD_S, Task};
@@ -13,6 +13,7 @@ use serde_json::json;
 
 use crate::credentials::CredentialOptions;
 use crate::placement::PlacementOptions;
+use crate::prediction::When;
 use crate::simulated::{Simulated, device_named, hand_named};
 use crate::{Failure, interrupted, table, warn};
 
@@ -49,6 +50,10 @@ pub(crate) struct Arguments {
     /// Send a pose only when the server would be wrong about the tool by more than this fraction of the force; 0: one per tick
     #[arg(long, value_name = "FRACTION", default_value_t = 0.0)]
     up_deadband: f64,
+    /// Of which tissues to keep a copy, which the device's loop simulates: forces then come without the delay of the network, and
+    /// samples correct them
+    #[arg(long, value_name = "WHEN", default_value = "auto")]
+    prediction: When,
     /// Touch by the stream alone, also where the server has datagrams
     #[arg(long)]
     no_datagrams: bool,
@@ -114,7 +119,9 @@ pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
     // Last, so that what is refused is refused before a device moves.
     let device = Placed::new(device(arguments)?, placement)?;
     let (remembers, keeps_session) = (arguments.course.is_some(), arguments.keep_session);
-    let options = Options { lasts, remembers, keeps_session, warn: Some(Box::new(warn)), ..Options::default() };
+    let prediction = arguments.prediction.prediction();
+    let warn: Option<Warn> = Some(Box::new(warn));
+    let options = Options { lasts, remembers, keeps_session, warn, prediction, ..Options::default() };
     let (_, served) = run(device, target, options, interrupted()).await?;
     if let Some(path) = &arguments.course {
         write_course(path, &served.course)?;
@@ -134,6 +141,7 @@ fn as_json(served: &Report) -> serde_json::Value {
         "connections": traffic.connections, "samples": traffic.samples, "commands_refused": traffic.refused,
         "failed_attempts": traffic.failed, "poses": traffic.poses, "datagrams_up": traffic.carried.sent,
         "datagrams_down": traffic.carried.came, "fell_back": traffic.carried.fell_back, "late_ticks": served.late_ticks, "missed_ticks": served.missed_ticks,
+        "predicted_ticks": served.predicted_ticks,
     });
     if let Some(envelope) = &served.envelope {
         report["energy_j"] = json!(envelope.energy_j());
@@ -160,6 +168,7 @@ fn rows(served: &Report) -> Vec<(&'static str, String)> {
         ),
         ("commands refused", refused.to_string()),
         ("late ticks", format!("{} (skipped: {})", served.late_ticks, served.missed_ticks)),
+        ("from a copy of the tissue", format!("{} ticks", served.predicted_ticks)),
     ];
     if let Some(envelope) = &served.envelope {
         let is_on = envelope.state() == RenderingState::Enabled;

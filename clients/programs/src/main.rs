@@ -30,6 +30,7 @@ mod link;
 mod load;
 mod placement;
 mod play;
+mod prediction;
 mod proxy;
 mod replay;
 mod simulated;

@@ -328,13 +328,15 @@ class RemoteSession:
         deadband: float = 0.0,
         up_deadband: float = 0.0,
         datagrams: bool = True,
+        prediction: Literal["auto", "always", "never"] = "auto",
         holder: str = "python",
         remember: bool = True,
     ) -> Touched:
         """Touches with a device at 1 kHz, on a thread of its own, by the rendering law and within the safety envelope.
 
         `device` is a Course, or an object with `read()`, which returns ((x, y, z), enable), and `write(force_n)`, and perhaps
-        `limits`, as a Course has them. A change of enable from False to True asks for forces.
+        `limits`, as a Course has them. A change of enable from False to True asks for forces. `prediction` says of which tissues
+        the loop simulates a copy, so that forces come without the delay of the network: "auto", of meshes; "always"; "never".
         """
     def pose(self, tool: int, place_m: Vector, tip: Optional[Tip] = None) -> None:
         """Brings a tool with a tip here by the end of the next step, and takes the tool first if that is needed. It stays here until it

@@ -51,6 +51,7 @@ class Touched:
     ages_s: np.ndarray
     late_ticks: int
     missed_ticks: int
+    predicted_ticks: int
     connections: int
     failed_attempts: int
     samples: int

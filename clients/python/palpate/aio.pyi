@@ -1,6 +1,6 @@
 from collections.abc import AsyncIterator
 from os import PathLike
-from typing import Any, Optional, Union
+from typing import Any, Literal, Optional, Union
 
 from . import Frame, Point, Run, Sampled, Scene, Script, Source, Tip, Touched, Vector
 
@@ -44,6 +44,7 @@ class RemoteSession:
         deadband: float = 0.0,
         up_deadband: float = 0.0,
         datagrams: bool = True,
+        prediction: Literal["auto", "always", "never"] = "auto",
         holder: str = "python",
         remember: bool = True,
     ) -> Touched: ...

@@ -6,10 +6,11 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use glam::DVec3;
+use palpate::journal;
 use palpate::scene;
 use palpate::shape::PointName;
-use palpate_client::bridge::{self, Options, Target};
-use palpate_client::{Channel, Credentials, Followed, Token};
+use palpate_client::bridge::{self, Options, Prediction, Target};
+use palpate_client::{Channel, Credentials, Followed, Token, snapshot};
 use palpate_proto::{pb, touch};
 use pb::command::Action;
 use pb::session_service_client::SessionServiceClient;
@@ -301,12 +302,8 @@ impl RemoteSession {
         let (session, session_id) = self.own();
         answer(py, self.awaited, async move {
             let request = pb::SaveSnapshotRequest { session_id };
-            let mut parts = called!(session, SessionServiceClient.save_snapshot(request))?;
-            let mut bytes = Vec::new();
-            while let Some(part) = parts.message().await.map_err(of_status)? {
-                bytes.extend_from_slice(&part.part);
-            }
-            Ok(Bytes(bytes))
+            let parts = called!(session, SessionServiceClient.save_snapshot(request))?;
+            snapshot::collect(parts).await.map(Bytes).map_err(of_status)
         })
     }
 
@@ -382,9 +379,11 @@ impl RemoteSession {
     /// Touches with a device at 1 kHz, on a thread of its own, by the rendering law and within the safety envelope.
     ///
     /// `device` is a Course, or an object with `read()`, which returns ((x, y, z), enable), and `write(force_n)`, and
-    /// perhaps `limits`, as a Course has them. A change of enable from False to True asks for forces.
+    /// perhaps `limits`, as a Course has them. A change of enable from False to True asks for forces. `prediction` says of which
+    /// tissues the loop simulates a copy, so that forces come without the delay of the network: "auto", of meshes; "always";
+    /// "never".
     #[pyo3(signature = (device, *, seconds=None, tool=0, tip=None, deadband=0.0, up_deadband=0.0, datagrams=true,
-        holder="python", remember=true))]
+        prediction="auto", holder="python", remember=true))]
     #[allow(clippy::too_many_arguments)]
     fn touch<'py>(
         &self,
@@ -396,9 +395,20 @@ impl RemoteSession {
         deadband: f64,
         up_deadband: f64,
         datagrams: bool,
+        prediction: &str,
         holder: &str,
         remember: bool,
     ) -> PyResult<Bound<'py, PyAny>> {
+        let of_sheets = match prediction {
+            "always" => Some(true),
+            "auto" => Some(false),
+            "never" => None,
+            _ => {
+                let message = format!("must be \"auto\", \"always\" or \"never\", but is {prediction:?}");
+                return Err(wrong("prediction", message));
+            }
+        };
+        let prediction = of_sheets.map(|of_sheets| Prediction { make: Arc::new(journal::prediction), of_sheets });
         let device = Given::of(device)?;
         let lasts = seconds.or(device.lasts_s()).map(|seconds| duration("seconds", seconds)).transpose()?;
         let target = Target {
@@ -411,7 +421,7 @@ impl RemoteSession {
             datagrams,
             holder: holder.to_owned(),
         };
-        let options = Options { lasts, remembers: remember, keeps_session: true, ..Options::default() };
+        let options = Options { lasts, remembers: remember, keeps_session: true, prediction, ..Options::default() };
         let (end, ended) = oneshot::channel();
         answer_in_order(py, self.awaited, Some(end), async move {
             let stop = async {

@@ -114,7 +114,7 @@ impl<'py> IntoPyObject<'py> for Touched {
     type Error = PyErr;
 
     fn into_pyobject(self, py: Python<'py>) -> PyResult<Self::Output> {
-        let Report { course, ages_s, envelope, late_ticks, missed_ticks, traffic, lost, .. } = self.0;
+        let Report { course, ages_s, envelope, late_ticks, missed_ticks, predicted_ticks, traffic, lost, .. } = self.0;
         let found = PyDict::new(py);
         let place_m = course.iter().flat_map(|tick| tick.place_m.to_array()).collect();
         let force_n = course.iter().flat_map(|tick| tick.force_n.to_array()).collect();
@@ -127,6 +127,7 @@ impl<'py> IntoPyObject<'py> for Touched {
         found.set_item("ages_s", column(py, ages_s)?)?;
         found.set_item("late_ticks", late_ticks)?;
         found.set_item("missed_ticks", missed_ticks)?;
+        found.set_item("predicted_ticks", predicted_ticks)?;
         found.set_item("connections", traffic.connections)?;
         found.set_item("failed_attempts", traffic.failed)?;
         found.set_item("samples", traffic.samples)?;

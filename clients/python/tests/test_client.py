@@ -118,6 +118,13 @@ class Clients(Served, unittest.TestCase):
             self.assertEqual(first.displacement_m.shape[:2], mesh["grid"])
             self.assertLess(mesh["triangles"].max(), mesh["rest_m"].shape[0])
 
+    def test_a_copy_of_the_tissue_is_made_when_it_is_asked_for(self):
+        with palpate.connect(self.url).create_session("liver") as session:
+            press = palpate.press(depth_m=0.003, seconds=2.0)
+            self.assertEqual(session.touch(press).predicted_ticks, 0)
+            # A busy machine may have it only when the device's time is over.
+            self.assertTrue(any(session.touch(press, prediction="always").predicted_ticks for _ in range(20)))
+
     def test_a_device_in_python_is_called_by_one_thread_and_left_without_force(self):
         with palpate.connect(self.url).create_session("liver") as session:
             for _ in range(20):
@@ -142,6 +149,8 @@ class Clients(Served, unittest.TestCase):
             for device in (object(), palpate.Course([[0, 0, float("inf")]]), palpate.Course([[0, 0, 0]], "omega4")):
                 with self.assertRaises(palpate.Refused):
                     session.touch(device, seconds=0.1)
+            with self.assertRaisesRegex(palpate.Refused, "prediction"):
+                session.touch(palpate.press(0.003), prediction="maybe")
 
     def test_refusals_and_broken_connections_are_told_apart(self):
         server = palpate.connect(self.url)

@@ -10,7 +10,9 @@
 //! sample tells where on that law the tissue was, and the client repeats pressure, damping, sticking and sliding along its own
 //! path since (`local`). The error is then what the law does not know (other tools, the grain of the grid, inertia) over some
 //! milliseconds, and stays at a few tenths of a per cent up to 200 ms of round trip. The safety envelope acts last.
-
+//!
+//! **Ahead.** Where the tissue is another within the way of a round trip (a rim, a fold, the edge of a lump) no sample knows what
+//! comes next. A client that has a copy of the tissue renders from that ([`prediction`]).
 //!
 //! # Example
 //!
@@ -61,6 +63,7 @@ pub mod law;
 pub mod local;
 pub mod news;
 pub mod path;
+pub mod prediction;
 pub mod renderer;
 pub mod tip;
 
@@ -70,5 +73,6 @@ pub use envelope::{Envelope, LimitCause, RenderingState};
 pub use law::Law;
 pub use local::{ContactState, LocalModel, Touching, Track};
 pub use news::{News, Pulse, Told};
+pub use prediction::{Predicted, Predictor};
 pub use renderer::Renderer;
 pub use tip::{Coupling, Tip};

@@ -109,8 +109,7 @@ impl Track {
 
     /// All places after a time, in order.
     pub fn after(&self, time_s: f64) -> impl Iterator<Item = DVec3> {
-        // Half a microsecond of tolerance: times return from the wire in whole nanoseconds.
-        let from = self.places.partition_point(|place| place.0 <= time_s + 5e-7);
+        let from = self.places.partition_point(|place| !is_after(place.0, time_s));
         self.places.range(from..).map(|place| place.1)
     }
 
@@ -118,6 +117,12 @@ impl Track {
     pub fn clear(&mut self) {
         self.places.clear();
     }
+}
+
+/// Whether one time of the client is after another, with half a microsecond of tolerance: times return from the wire in whole
+/// nanoseconds.
+pub(crate) fn is_after(time_s: f64, other_s: f64) -> bool {
+    time_s > other_s + 5e-7
 }
 
 /// A client's usual tick, s.

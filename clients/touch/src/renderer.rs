@@ -14,6 +14,9 @@
 //! difference of the laws' forces, but that of their slopes over the way since the sample: for a coarse law whose slope is
 //! within a tenth of K, and a way s, that is at most 0.1·K·s.
 //!
+//! **A copy of the tissue** ([`crate::prediction`]) tells the force in place of the local model, if the client has one and it has
+//! been the better one. What changes over between the two is a bias as well.
+//!
 //! The bias is not the force of a passive spring: it may give energy, at most |b|·v·τ when the tool moves at v. The
 //! envelope counts it like all other work at the port, and its limits act on the sum: so a change of law can't make the
 //! port active, nor the force faster than the slew.
@@ -23,6 +26,7 @@ use glam::DVec3;
 use crate::envelope::{Envelope, RenderingState, Wanted};
 use crate::law::Law;
 use crate::local::{ContactState, LocalModel, Touching, Track};
+use crate::prediction::{Prediction, Predictor};
 
 /// Time constant with which the error of the last model decays, s.
 pub const BIAS_S: f64 = 0.02;
@@ -35,7 +39,7 @@ const LEAST_WAY_M: f64 = 2e-5;
 const MOST_WAY_M: f64 = 1e-3;
 
 /// One tool's renderer.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 pub struct Renderer {
     /// With their numbers, the oldest first.
     laws: Vec<(u32, Law)>,
@@ -51,6 +55,11 @@ pub struct Renderer {
     before: Option<(f64, DVec3)>,
     velocity_m_per_s: DVec3,
     refused: u64,
+    prediction: Option<Prediction>,
+    /// Ticks that were rendered from a copy of the tissue.
+    predicted: u64,
+    /// Whether the last tick was, and what it wanted, N.
+    last: (bool, DVec3),
     /// The limits between the law and the device.
     pub envelope: Envelope,
 }
@@ -72,8 +81,23 @@ impl Renderer {
             before: None,
             velocity_m_per_s: DVec3::ZERO,
             refused: 0,
+            prediction: None,
+            predicted: 0,
+            last: (false, DVec3::ZERO),
             envelope,
         }
+    }
+
+    /// Renders from a copy of the tissue from when a sample has met it. `None`: from local models alone, as at the beginning.
+    /// Returns the copy of before, which is to be dropped elsewhere than in a tick: it may be large.
+    pub fn predict(&mut self, predictor: Option<Box<dyn Predictor>>) -> Option<Box<dyn Predictor>> {
+        let before = std::mem::replace(&mut self.prediction, predictor.map(Prediction::new));
+        before.map(Prediction::into_predictor)
+    }
+
+    /// How many ticks were rendered from a copy of the tissue.
+    pub fn predicted(&self) -> u64 {
+        self.predicted
     }
 
     /// Restarts with another server, whose models start from the beginning. The envelope keeps its state.
@@ -155,21 +179,42 @@ impl Renderer {
             touching.move_to(&model, law, place_m);
         }
         self.newest = Some((model, touching));
+        if let Some(prediction) = &mut self.prediction {
+            prediction.compare(model.client_time_s, |place_m| {
+                let mut then = Touching::at_sample(&model, law);
+                then.move_to(&model, law, place_m);
+                then.force_n(&model, law, model.velocity_m_per_s)
+            });
+        }
         (self.biased_s, self.bias_n) = (now_s, DVec3::ZERO);
         if let Some(before_n) = before_n {
             self.bias_n = before_n - self.wanted_n(now_s);
         }
     }
 
-    /// The force that the law asks for, before the envelope, N.
+    /// The force to render before the envelope, N: of the copy of the tissue or of the local model, with the bias.
     fn wanted_n(&self, now_s: f64) -> DVec3 {
-        let Some((model, touching)) = &self.newest else { return DVec3::ZERO };
-        let force_n = touching.force_n(model, law_of(&self.laws, model), self.velocity_m_per_s)
-            + self.bias_n * ((self.biased_s - now_s) / BIAS_S).exp();
+        let Some((model, _)) = &self.newest else { return DVec3::ZERO };
+        let bias_n = self.bias_n * ((self.biased_s - now_s) / BIAS_S).exp();
+        if let Some(predicted_n) = self.predicted_n() {
+            return predicted_n + bias_n;
+        }
+        let force_n = self.modelled_n() + bias_n;
         if model.contact_state == ContactState::Holding {
             return force_n;
         }
         force_n - force_n.dot(model.normal).min(0.0) * model.normal
+    }
+
+    fn predicted_n(&self) -> Option<DVec3> {
+        self.prediction.as_ref()?.wanted_n()
+    }
+
+    /// The force of the law and the newest model, N.
+    fn modelled_n(&self) -> DVec3 {
+        self.newest.as_ref().map_or(DVec3::ZERO, |(model, touching)| {
+            touching.force_n(model, law_of(&self.laws, model), self.velocity_m_per_s)
+        })
     }
 
     /// The way by which a server may be wrong about the tool so that the force is off by no more than `share` of itself, m. Above
@@ -199,12 +244,22 @@ impl Renderer {
             if let Some((model, touching)) = &mut self.newest {
                 touching.move_to(model, law_of(&self.laws, model), place_m);
             }
+            self.prediction.iter_mut().for_each(|prediction| prediction.move_to(now_s, place_m));
             if let Some((model, arrived_s)) = self.arrived.take() {
                 self.newest_s = Some(arrived_s);
                 self.adopt(model, now_s);
             }
         }
+        let is_predicted = self.predicted_n().is_some();
+        if is_predicted != self.last.0 {
+            (self.biased_s, self.bias_n) = (now_s, DVec3::ZERO);
+            self.bias_n = self.last.1 - self.wanted_n(now_s);
+        }
         let force_n = self.wanted_n(now_s);
+        self.last = (is_predicted, force_n);
+        self.predicted += u64::from(is_predicted);
+        let modelled_n = self.modelled_n();
+        self.prediction.iter_mut().filter(|_| known).for_each(|prediction| prediction.keep(now_s, place_m, modelled_n));
         // A hand that was feeling forces waits no longer for another server's first model than for the next of the same.
         let counts = self.newest.is_some() || self.envelope.is_engaged();
         let age_s = self.newest_s.filter(|_| counts).map(|newest_s| now_s - newest_s);

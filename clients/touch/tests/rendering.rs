@@ -287,27 +287,30 @@ fn a_change_of_law_is_no_jump_of_force() {
 
 #[test]
 fn laws_are_bounded_and_one_that_is_not_known_changes_nothing() {
-    let (mut renderer, tick) = pressed(0.005);
-    assert!(!renderer.learn(0, Law::linear(800.0, 0.5)), "the first stays what it is");
-    assert!(!renderer.learn(1, Law { step_m: f64::NAN, ..law() }));
-    let (now_s, place_m) = (f64::from(tick) * TICK_S, DVec3::new(0.0, 0.0, -0.005));
-    renderer.receive(LocalModel { law: 7, ..model(u64::from(tick) + 1, now_s, place_m) }, now_s);
-    assert!((renderer.tick(now_s, place_m).z - 2.0).abs() < 1e-6);
-    // The newest model's law is kept, whatever comes; others go when there are too many.
-    let stiff = Law::linear(800.0, 0.5);
-    assert!(renderer.learn(8, stiff.clone()));
-    let surface_m = -0.0025 * DVec3::Z;
-    let newest = model(u64::from(tick) + 2, now_s + TICK_S, place_m);
-    renderer.receive(LocalModel { law: 8, surface_m, ..newest }, now_s + TICK_S);
-    let deeper_n = |renderer: &Renderer| {
-        let mut renderer = renderer.clone();
-        renderer.tick(now_s + TICK_S, place_m - 1e-5 * DVec3::Z).z
+    let place_m = DVec3::new(0.0, 0.0, -0.005);
+    // The newest model's law is stiffer than the first.
+    let met = || {
+        let (mut renderer, tick) = pressed(0.005);
+        assert!(!renderer.learn(0, Law::linear(800.0, 0.5)), "the first stays what it is");
+        assert!(!renderer.learn(1, Law { step_m: f64::NAN, ..law() }));
+        let now_s = f64::from(tick) * TICK_S;
+        renderer.receive(LocalModel { law: 7, ..model(u64::from(tick) + 1, now_s, place_m) }, now_s);
+        assert!((renderer.tick(now_s, place_m).z - 2.0).abs() < 1e-6);
+        assert!(renderer.learn(8, Law::linear(800.0, 0.5)));
+        let surface_m = -0.0025 * DVec3::Z;
+        let newest = model(u64::from(tick) + 2, now_s + TICK_S, place_m);
+        renderer.receive(LocalModel { law: 8, surface_m, ..newest }, now_s + TICK_S);
+        (renderer, now_s)
     };
-    let before_n = deeper_n(&renderer);
+    let deeper_n = |renderer: &mut Renderer, now_s: f64| renderer.tick(now_s + TICK_S, place_m - 1e-5 * DVec3::Z).z;
+    let (mut before, now_s) = met();
+    let before_n = deeper_n(&mut before, now_s);
+    // It is kept, whatever comes; others go when there are too many.
+    let (mut renderer, now_s) = met();
     let most = u32::try_from(MOST_LAWS).unwrap();
     assert!((100..100 + 2 * most).all(|number| renderer.learn(number, law())));
     assert!(renderer.learn(1, law()) && !renderer.learn(8, law()), "a law that was forgotten is new");
-    assert_eq!(deeper_n(&renderer), before_n);
+    assert_eq!(deeper_n(&mut renderer, now_s), before_n);
     // Another server begins with its own.
     renderer.begin(law());
     assert!(renderer.learn(1, law()));

@@ -20,8 +20,9 @@ use tokio::sync::{Notify, mpsc};
 use tokio_stream::wrappers::ReceiverStream;
 use tonic_types::StatusExt;
 
+use super::copying::Copying;
 use super::ticker::{Command, Feed};
-use super::{Session, Target};
+use super::{Prediction, Session, Target};
 use crate::Error;
 use crate::connect::Server;
 use crate::datagrams::Datagrams;
@@ -112,6 +113,7 @@ const COMMANDS: usize = 64;
 /// Keeps a connection until `commands` ends.
 pub(super) async fn keep(
     target: Target,
+    prediction: Option<Prediction>,
     device: Device,
     shared: &Shared,
     mut feed: Feed,
@@ -126,7 +128,8 @@ pub(super) async fn keep(
     let mut trail = Trail::new(target.server.clone().within(SILENCE));
     loop {
         let before = shared.inbound().traffic;
-        let ended = connect(&target, &mut trail, &device, shared, &mut feed, &mut commands, warn).await;
+        let ended =
+            connect(&target, prediction.as_ref(), &mut trail, &device, shared, &mut feed, &mut commands, warn).await;
         let Err(error) = ended else { return };
         // After a move the tool is still in the tissue, and goes on by its lease; not after anything else.
         let went_on = moved_to(&error).is_none() && !std::mem::take(&mut trail.lease_id).is_empty();
@@ -266,8 +269,10 @@ fn broken(why: &str) -> Error {
 }
 
 /// One connection, until it breaks or `commands` ends.
+#[allow(clippy::too_many_arguments)] // One caller, which has them all.
 async fn connect(
     target: &Target,
+    prediction: Option<&Prediction>,
     trail: &mut Trail,
     device: &Device,
     shared: &Shared,
@@ -277,6 +282,7 @@ async fn connect(
 ) -> Result<(), Error> {
     let At { server, channel, answer: session } = session(target, trail, shared).await?;
     let middle_m = middle_m(&session)?;
+    let mut copying = Copying::begin(prediction, &session, channel.clone(), target.tip);
     let (outbound, messages) = mpsc::channel(COMMANDS);
     let open = pb::TouchOpen {
         session_id: session.session_id,
@@ -329,13 +335,19 @@ async fn connect(
         tokio::select! {
             heard = tokio::time::timeout(SILENCE, stream.next()) => {
                 match heard.map_err(silent)??.ok_or_else(|| broken("the server has ended the stream"))? {
-                    Heard::ForceLaw(update) => match update.law {
-                        Some(message) => feed.learn(&message)?,
-                        None => {
-                            let stays = if update.tissue_step.is_some() { "that of the old tissue" } else { "a coarse one" };
-                            warn(&format!("the force law stays {stays}: {} ({})", update.message, update.reason));
+                    Heard::ForceLaw(update) => {
+                        if update.tissue_step.is_some() {
+                            copying.again();
                         }
-                    },
+                        match update.law {
+                            Some(message) => feed.learn(&message)?,
+                            None => {
+                                let stays =
+                                    if update.tissue_step.is_some() { "that of the old tissue" } else { "a coarse one" };
+                                warn(&format!("the force law stays {stays}: {} ({})", update.message, update.reason));
+                            }
+                        }
+                    }
                     Heard::Sample(sample) => {
                         if sample.held {
                             return Err(broken("the session was stopped by its guard"));
@@ -355,6 +367,10 @@ async fn connect(
                     Heard::Opened(_) => {}
                 }
             }
+            made = copying.next() => match made {
+                Ok(copy) => feed.predict(copy),
+                Err(error) => warn(&format!("forces come from local models alone, without a copy of the tissue: {error}")),
+            },
             sample = datagrams.next() => {
                 if trail.is_current(sample.ownership_revision) {
                     take(&sample, &mut datagrams, feed);

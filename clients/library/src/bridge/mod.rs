@@ -6,6 +6,7 @@
 //! When the connection breaks, the network side connects again. Forces return when the operator asks for them. Commands that
 //! were not sent by then are dropped: nothing old is replayed.
 
+mod copying;
 mod line;
 mod offline;
 mod tick;
@@ -16,7 +17,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use palpate_touch::{Device, Envelope, Tip};
+use palpate_touch::{Device, Envelope, Predictor, Tip};
 use tokio::sync::{Notify, oneshot};
 use tokio::task::JoinSet;
 
@@ -70,6 +71,18 @@ pub type Warn = Box<dyn Fn(&str) + Send + Sync>;
 /// A function that is told the priority of a loop.
 pub type Begun = Box<dyn FnOnce(&Priority) + Send>;
 
+/// Makes a copy of a tissue for a tool with this tip, out of the bytes of a snapshot (`SaveSnapshot`); or says why it can't.
+pub type MakeCopy = Arc<dyn Fn(&[u8], Tip) -> Result<Box<dyn Predictor>, String> + Send + Sync>;
+
+/// Of which tissues a loop keeps a copy, from which it renders without the delay of the network ([`palpate_touch::prediction`]).
+#[derive(Clone)]
+pub struct Prediction {
+    /// Makes it.
+    pub make: MakeCopy,
+    /// Also of sheets, which a local model knows well; otherwise of meshes alone.
+    pub of_sheets: bool,
+}
+
 /// Stops the forces of a loop, from any thread, until the operator asks for them again. Clones are of the same loop.
 #[derive(Debug, Clone, Default)]
 pub struct Disable(Arc<AtomicBool>);
@@ -103,15 +116,19 @@ pub struct Options {
     pub begun: Option<Begun>,
     /// Keep a clone to stop the forces of [`run`]; of [`begin`], [`Ticker::disable`] does it.
     pub disable: Disable,
+    /// Renders from a copy of the tissue, if it is of a kind that this says, as soon as the copy is there: a tick then takes the
+    /// time of the copy's step. `None`: from local models alone.
+    pub prediction: Option<Prediction>,
 }
 
 impl fmt::Debug for Options {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Options { lasts, remembers, real_time, keeps_session, warn, begun, disable: _ } = self;
+        let Options { lasts, remembers, real_time, keeps_session, warn, begun, disable: _, prediction } = self;
         let mut fields = f.debug_struct("Options");
         fields.field("lasts", lasts).field("remembers", remembers).field("real_time", real_time);
         fields.field("keeps_session", keeps_session);
-        fields.field("warn", &warn.is_some()).field("begun", &begun.is_some()).finish()
+        fields.field("warn", &warn.is_some()).field("begun", &begun.is_some());
+        fields.field("prediction", &prediction.is_some()).finish()
     }
 }
 
@@ -128,6 +145,8 @@ pub struct Report {
     pub late_ticks: u64,
     /// Number of ticks that were skipped.
     pub missed_ticks: u64,
+    /// Number of ticks that were rendered from a copy of the tissue.
+    pub predicted_ticks: u64,
     /// With which priority the loop ran.
     pub priority: Priority,
     /// What went over the network.
@@ -164,10 +183,10 @@ pub async fn run_told<D: HapticDevice + 'static>(
     options: Options,
     stop: impl Future<Output = ()> + Send + 'static,
 ) -> Result<(D, Report), Error> {
-    let Options { lasts, remembers, real_time, keeps_session, warn, begun, disable } = options;
+    let Options { lasts, remembers, real_time, keeps_session, warn, begun, disable, prediction } = options;
     let descriptor = device.descriptor();
     let warn = Arc::new(warn);
-    let (ticker, mut line) = line(target, descriptor, Origin::Workspace, keeps_session, warn.clone(), stop);
+    let (ticker, mut line) = line(target, prediction, descriptor, Origin::Workspace, keeps_session, warn.clone(), stop);
     let news = line.news.clone();
     let (tell, ended) = oneshot::channel();
     std::thread::Builder::new().name("device".to_owned()).spawn(move || {
@@ -184,14 +203,26 @@ pub async fn run_told<D: HapticDevice + 'static>(
     let (device, served, priority) =
         ended.await.map_err(|_| Error::Internal("the device's loop panicked".to_owned()))?;
     line.close().await;
-    let tick::Served { course, envelope, late_ticks, missed_ticks, ages_s, failure } = served;
+    let tick::Served { course, envelope, late_ticks, missed_ticks, predicted_ticks, ages_s, failure } = served;
     let failure = failure.map(Error::Device);
     let mut inbound = line.shared.inbound();
     let (traffic, lost) = (inbound.traffic, inbound.failure.take());
     if traffic.connections == 0 {
         return Err(failure.or(lost).unwrap_or_else(silent));
     }
-    Ok((device, Report { course, ages_s, envelope, late_ticks, missed_ticks, priority, traffic, lost, failure }))
+    let report = Report {
+        course,
+        ages_s,
+        envelope,
+        late_ticks,
+        missed_ticks,
+        predicted_ticks,
+        priority,
+        traffic,
+        lost,
+        failure,
+    };
+    Ok((device, report))
 }
 
 fn silent() -> Error {
@@ -201,6 +232,7 @@ fn silent() -> Error {
 /// Begins to connect.
 fn line(
     target: Target,
+    prediction: Option<Prediction>,
     device: Device,
     origin: Origin,
     keeps_session: bool,
@@ -217,7 +249,7 @@ fn line(
         async move {
             let warn = |message: &str| warn.iter().for_each(|warn| warn(message));
             tokio::select! {
-                () = line::keep(target, device, &shared, feed, commands, &warn) => {}
+                () = line::keep(target, prediction, device, &shared, feed, commands, &warn) => {}
                 // The loop then finds that it is over.
                 () = stop => {}
             }
@@ -243,8 +275,9 @@ pub async fn begin(
     origin: Origin,
     options: Options,
 ) -> Result<(Ticker, Connection), Error> {
-    let Options { keeps_session, warn, .. } = options;
-    let (ticker, mut line) = line(target, device, origin, keeps_session, Arc::new(warn), std::future::pending());
+    let Options { keeps_session, warn, prediction, .. } = options;
+    let (ticker, mut line) =
+        line(target, prediction, device, origin, keeps_session, Arc::new(warn), std::future::pending());
     let (peek, news) = (ticker.peek(), line.news.clone());
     std::thread::Builder::new().name("courier".to_owned()).spawn(move || {
         while !peek.is_over() {

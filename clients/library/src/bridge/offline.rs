@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 use palpate_proto::pb;
-use palpate_touch::Device;
+use palpate_touch::{Device, Predictor};
 use pb::touch_response::Message as Heard;
 use prost::Message;
 
@@ -42,6 +42,11 @@ impl Offline {
 }
 
 impl Record {
+    /// A copy of the tissue arrives now, until another connection begins.
+    pub fn predict(&mut self, copy: Box<dyn Predictor>) {
+        self.feed.predict(copy);
+    }
+
     /// What a server has sent on a haptic stream arrives now: the bytes of a `TouchResponse`. The next tick knows it. An
     /// `opened` begins another connection. What the ticks had to send until now goes nowhere.
     ///

@@ -43,6 +43,8 @@ pub(super) struct Served {
     pub(super) late_ticks: u64,
     /// Number of ticks that were skipped.
     pub(super) missed_ticks: u64,
+    /// Number of ticks that were rendered from a copy of the tissue.
+    pub(super) predicted_ticks: u64,
     /// Age of the local model at each tick, s; empty unless the loop was to remember.
     pub(super) ages_s: Vec<f64>,
     /// How the device failed, if it has.
@@ -64,6 +66,7 @@ pub(super) fn serve(
     // A device holds its last force until it is told another.
     let _ = device.write(DVec3::ZERO);
     served.envelope = ticker.envelope().cloned();
+    served.predicted_ticks = ticker.predicted();
     drop(ticker);
     // The network's side waits for the next place, or for the end.
     news.notify_one();

@@ -8,7 +8,7 @@ use palpate_proto::{pb, touch};
 use palpate_touch::deadband::HEARTBEAT_S;
 use palpate_touch::news::News;
 use palpate_touch::renderer::MOST_LAWS;
-use palpate_touch::{Device, Envelope, Law, LocalModel, Renderer, RenderingState};
+use palpate_touch::{Device, Envelope, Law, LocalModel, Predictor, Renderer, RenderingState};
 use std::collections::VecDeque;
 
 use crate::Error;
@@ -32,6 +32,16 @@ enum Told {
     Begin { connection: u64, law: Law, middle_m: DVec3 },
     /// A further law of this connection, which is sound, and its number.
     Learn { number: u32, law: Law },
+    /// A copy of this connection's tissue.
+    Copy(Box<dyn Predictor>),
+}
+
+/// What a tick does not need any more, to be dropped elsewhere.
+enum Used {
+    #[allow(dead_code)] // Dropped.
+    Law(Law),
+    #[allow(dead_code)] // Dropped.
+    Copy(Box<dyn Predictor>),
 }
 
 /// What of a connection only counts as it is now.
@@ -47,7 +57,7 @@ struct Newest {
 const COMMANDS: usize = 64;
 /// Largest number of laws on their way to a tick. What does not fit waits on the network's side.
 const LAWS: usize = 2 * MOST_LAWS;
-/// Largest number of laws on their way back: with as many as a renderer has, a tick can always take one more.
+/// Largest number of laws and copies on their way back: with as many as a renderer has, a tick can always take one more.
 const USED: usize = 4 * MOST_LAWS;
 /// A clock that jumps ahead by more than this did not do so because of a late tick, s.
 const MOST_AHEAD_S: f64 = 3600.0;
@@ -68,7 +78,7 @@ pub struct Ticker {
     newest: Listener<Newest>,
     /// The newest was not shown to the renderer.
     is_fresh: bool,
-    used: Writer<Law>,
+    used: Writer<Used>,
     commands: Writer<Command>,
     has_spoken: bool,
     device: Device,
@@ -88,7 +98,7 @@ pub struct Ticker {
 pub(super) struct Feed {
     told: Writer<Told>,
     newest: Teller<Newest>,
-    used: Reader<Law>,
+    used: Reader<Used>,
     connection: u64,
     /// What did not fit yet.
     waiting: VecDeque<Told>,
@@ -164,7 +174,8 @@ impl Ticker {
     /// The force to render from now on, N, for a device that reports `reading` at `time_s`, a time of any origin that goes on
     /// between ticks. Returns zero before the first connection.
     ///
-    /// It takes a bounded time: no lock, no call of the system, no memory asked for or given back. Ticks may be late, early or
+    /// It takes a bounded time: no lock, no call of the system, no memory asked for or given back. With a copy of the tissue a tick
+    /// also does the copy's step. Ticks may be late, early or
     /// left out: the envelope knows how long ago the last one was.
     pub fn tick(&mut self, reading: Reading, time_s: f64) -> DVec3 {
         let now_s = self.clock.at(time_s);
@@ -218,10 +229,11 @@ impl Ticker {
             let Some(told) = self.told.pop() else { return };
             let used = &mut self.used;
             // There is room.
-            let mut give_back = |law: Law| drop(used.push(law));
+            let mut give_back = |law: Law| drop(used.push(Used::Law(law)));
             match told {
                 Told::Begin { connection, law, middle_m } => {
                     self.renderer.begin_with(law, give_back);
+                    self.renderer.predict(None).map(|copy| used.push(Used::Copy(copy)));
                     if self.connection == 0 {
                         self.renderer.envelope = Envelope::new(self.device, middle_m);
                     }
@@ -232,8 +244,16 @@ impl Ticker {
                 Told::Learn { number, law } => {
                     self.renderer.learn_with(number, law, &mut give_back);
                 }
+                Told::Copy(copy) => {
+                    self.renderer.predict(Some(copy)).map(|copy| used.push(Used::Copy(copy)));
+                }
             }
         }
+    }
+
+    /// How many ticks were rendered from a copy of the tissue ([`super::Options::prediction`]).
+    pub fn predicted(&self) -> u64 {
+        self.renderer.predicted()
     }
 
     /// Stops rendering until it is enabled again. The force falls within a few ticks.
@@ -321,6 +341,12 @@ impl Feed {
         }
         self.pass_on();
         Ok(())
+    }
+
+    /// A copy of the connection's tissue.
+    pub(super) fn predict(&mut self, copy: Box<dyn Predictor>) {
+        self.waiting.push_back(Told::Copy(copy));
+        self.pass_on();
     }
 
     /// What a sample tells of the tool, and how often the server wants to hear of it, s.

@@ -1,16 +1,40 @@
 //! The client at the device, by how it renders samples.
 
+use std::sync::Arc;
+
 use glam::DVec3;
+use palpate::session::prediction::Prediction;
+use palpate::sheet::Model;
 use palpate_touch::envelope::{Envelope, Wanted};
-use palpate_touch::{Law, LocalModel, Renderer};
+use palpate_touch::{Law, LocalModel, Predicted, Predictor, Renderer, Tip};
 
 use super::setup::{Rendering, Setup, TICK_S};
+use super::spot::Spot;
 
 /// The client at the device, by scheme.
 pub(super) enum Client {
     Raw(Option<LocalModel>),
     Hold(Option<LocalModel>, Option<f64>, Option<DVec3>, Box<Envelope>),
     Model(Box<Renderer>),
+}
+
+/// A copy of the tissue, as the hand sees it.
+struct Copied {
+    tissue: Prediction,
+    spot: Spot,
+}
+
+impl Copied {
+    fn new(model: &Arc<Model>, tip: Tip, spot: Spot) -> Self {
+        Copied { tissue: Prediction::new(model, tip), spot }
+    }
+}
+
+impl Predictor for Copied {
+    fn feel(&mut self, now_s: f64, place_m: DVec3) -> Option<Predicted> {
+        let felt = self.tissue.feel(now_s, self.spot.of_tissue(place_m))?;
+        Some(Predicted { force_n: self.spot.direction(felt.force_n), ..felt })
+    }
 }
 
 impl Client {
@@ -24,7 +48,18 @@ impl Client {
         match setup.scheme {
             Rendering::Raw => Client::Raw(None),
             Rendering::Hold => Client::Hold(None, None, None, Box::new(envelope())),
-            Rendering::Model => Client::Model(Box::new(Renderer::new((*setup.law).clone(), envelope()))),
+            Rendering::Model | Rendering::Prediction => {
+                let mut client = Client::Model(Box::new(Renderer::new((*setup.law).clone(), envelope())));
+                client.copy(setup, &setup.model);
+                client
+            }
+        }
+    }
+
+    /// Takes a copy of a tissue, if it renders from one.
+    pub(super) fn copy(&mut self, setup: &Setup, model: &Arc<Model>) {
+        if let (Client::Model(renderer), Rendering::Prediction) = (self, setup.scheme) {
+            renderer.predict(Some(Box::new(Copied::new(model, setup.tip, setup.spot))));
         }
     }
 
@@ -59,6 +94,14 @@ impl Client {
                 })
             }
             Client::Model(renderer) => renderer.tick(now_s, place_m),
+        }
+    }
+
+    /// How many ticks were rendered from a copy of the tissue.
+    pub(super) fn predicted(&self) -> u64 {
+        match self {
+            Client::Model(renderer) => renderer.predicted(),
+            _ => 0,
         }
     }
 

@@ -5,7 +5,7 @@ use palpate_touch::carrier::Carried;
 use serde_json::{Value, json};
 
 use super::measure::Outcome;
-use super::setup::Setup;
+use super::setup::{Rendering, Setup};
 use crate::table;
 
 /// The figures of a run for people; `server` is that of a run in real time.
@@ -132,6 +132,9 @@ pub(super) fn rows(setup: &Setup, outcome: &Outcome, server: Option<&str>) -> Ve
     if setup.conditions.rate_bit_per_s > 0.0 {
         rows.push(("dropped by the queues", outcome.overflowed.to_string()));
     }
+    if setup.scheme == Rendering::Prediction {
+        rows.push(("from the copy of the tissue", format!("{} ticks", outcome.predicted_ticks)));
+    }
     if let Some(late) = outcome.late_ticks {
         rows.push(("late ticks", late.to_string()));
     }
@@ -213,6 +216,7 @@ fn found(outcome: &Outcome) -> Value {
         "commands_dropped": dropped,
         "releases": released,
         "interventions_ticks": interventions,
+        "predicted_ticks": outcome.predicted_ticks,
         "late_ticks": outcome.late_ticks,
     })
 }

@@ -5,30 +5,58 @@
 use std::time::Duration;
 
 use glam::DVec3;
-use palpate_client::Server;
-use palpate_client::bridge::{self, Options, Session, Target};
+use palpate_client::bridge::{self, Options, Session, Target, Warn};
+use palpate_client::{HapticDevice, Reading, Server};
 use palpate_simulated::network::Transport;
 use palpate_simulated::random::Random;
 use palpate_simulated::task::Task;
+use palpate_touch::Device;
 
 use super::direct::Direct;
 use super::measure::{Outcome, Tick, Totals};
-use super::setup::{Setup, TICK_S};
+use super::setup::{Rendering, Setup, TICK_S};
+use super::spot::Spot;
 use super::tissue::Tissue;
 use super::with_tissue;
+use crate::prediction::When;
 use crate::simulated::{Part, Simulated};
 use crate::{Failure, interrupted, warn};
 
 /// Time before the first press, s: the server computes its force law first.
 const LEAD_S: f64 = 3.0;
 
+/// A simulated device, laid on the tissue with the middle of its workspace at a spot.
+struct Laid {
+    device: Simulated,
+    spot: Spot,
+    /// Where a bridge lays that middle, m: the middle of the tissue.
+    middle_m: DVec3,
+}
+
+impl HapticDevice for Laid {
+    fn descriptor(&self) -> Device {
+        let device = self.device.descriptor();
+        // A bridge measures the workspace from the middle of the tissue.
+        Device { workspace_m: device.workspace_m + self.spot.at_m.distance(self.middle_m), ..device }
+    }
+
+    fn read(&mut self) -> std::io::Result<Reading> {
+        let reading = self.device.read()?;
+        Ok(Reading { place_m: self.spot.of_tissue(self.spot.at_m + reading.place_m) - self.middle_m, ..reading })
+    }
+
+    fn write(&mut self, force_n: DVec3) -> std::io::Result<()> {
+        self.device.write(self.spot.direction(force_n))
+    }
+}
+
 /// Performs the run at a server, which must know the scene by its name.
 pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failure> {
     let Setup { model, tip, spot, hand, device, deadband, up_deadband, conditions, duration_s, seed, .. } = setup;
-    let middle_m = spot.at_m;
     let direct = with_tissue(|| Direct::new(setup, LEAD_S))?;
     let task = Task::new(DVec3::ZERO, LEAD_S, *duration_s, direct.scale, &mut Random::new(*seed, 0));
-    let simulated = Simulated::new(*device, *hand, task, true);
+    let device = Simulated::new(*device, *hand, task, true);
+    let laid = Laid { device, spot: *spot, middle_m: model.shape().extent().middle_m() };
     let target = Target {
         server,
         session: Session::New { scene: model.scene.name.clone() },
@@ -40,8 +68,11 @@ pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failur
         holder: "palpate-client link".to_owned(),
     };
     let lasts = Some(Duration::from_secs_f64(*duration_s));
-    let options = Options { lasts, remembers: true, warn: Some(Box::new(warn)), ..Options::default() };
-    let (simulated, mut served) = bridge::run(simulated, target, options, interrupted()).await?;
+    let when = if setup.scheme == Rendering::Prediction { When::Always } else { When::Never };
+    let warn_all: Option<Warn> = Some(Box::new(warn));
+    let options =
+        Options { lasts, remembers: true, warn: warn_all, prediction: when.prediction(), ..Options::default() };
+    let (Laid { device: simulated, .. }, mut served) = bridge::run(laid, target, options, interrupted()).await?;
     if let Some(error) = &served.lost {
         warn(&error.to_string());
     }
@@ -50,8 +81,8 @@ pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failur
         let mut twin = Tissue::new(setup)?;
         for (tick, part) in (0_u32..).zip(steps(simulated.course())) {
             let Part { time_s: now_s, place_m, force_n } = part;
-            // The device's place is relative to the middle of the sheet.
-            let (true_n, touches) = twin.truth(place_m + middle_m, f64::from(tick) * TICK_S)?;
+            // The hand's place is relative to the spot.
+            let (true_n, touches) = twin.truth(place_m + spot.at_m, f64::from(tick) * TICK_S)?;
             totals.moved(place_m);
             let (depth_m, direct_m) = (-place_m.z, direct.depth_m(tick + 1));
             totals.rendered(&Tick { now_s, depth_m, direct_m, force_n, true_n, touches, age_s: None }, None);
@@ -71,6 +102,7 @@ pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failur
     outcome.commands_per_s = served.traffic.poses as f64 / duration_s;
     outcome.carried = Some(served.traffic.carried);
     outcome.late_ticks = Some(served.late_ticks);
+    outcome.predicted_ticks = served.predicted_ticks;
     Ok(outcome)
 }
 

@@ -52,6 +52,8 @@ pub(super) struct Outcome {
     pub(super) overflowed: u64,
     pub(super) model_age_ms_p99: Option<f64>,
     pub(super) peak_ratio: Option<f64>,
+    /// Ticks that were rendered from a copy of the tissue.
+    pub(super) predicted_ticks: u64,
     pub(super) true_force_max_n: f64,
     pub(super) force_max_n: f64,
     pub(super) unstable_at_s: Option<f64>,

@@ -94,9 +94,9 @@ pub(crate) struct Arguments {
     /// A network by name, instead of the three options above
     #[arg(long)]
     profile: Option<Profile>,
-    /// How the client renders samples
-    #[arg(long, default_value = "model")]
-    scheme: Rendering,
+    /// How the client renders samples [default: prediction on a mesh, model on a sheet, as `bridge` does]
+    #[arg(long)]
+    scheme: Option<Rendering>,
     /// Send a sample only when the force that the client renders is off by more than this fraction; 0 sends one per step
     #[arg(long, value_name = "FRACTION", default_value_t = 0.0, conflicts_with = "random")]
     deadband: f64,
@@ -112,7 +112,7 @@ pub(crate) struct Arguments {
     seed: u64,
     /// Where the task is done, m: the place of the tissue's rest surface that is nearest to this; of a sheet X,Y. The middle,
     /// if absent
-    #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', allow_hyphen_values = true, conflicts_with_all = ["server", "random", "boundary"])]
+    #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', allow_hyphen_values = true, conflicts_with_all = ["random", "boundary"])]
     place: Vec<f64>,
     /// Radius of the tool's tip, m
     #[arg(long, value_name = "M", default_value_t = Tip::default().radius_m)]
@@ -257,10 +257,6 @@ fn setup(arguments: &Arguments) -> Result<Setup, Refusal> {
         }
     };
     model.shape().check_place("--place", near_m)?;
-    if arguments.server.is_some() && model.shape().dimensions() > 2 {
-        let message = "works on sheets only: on a mesh leave it out, and the loop runs in virtual time";
-        return Err(Refusal::new(Reason::NotAvailable, "--server", message));
-    }
     let spot = Spot::new(&model, near_m, tip.radius_m);
     // With a server the first law is that of the middle, but before the first press it tells that of the place.
     let disc = Disc::in_middle(&model, tip.radius_m).follow(&model, spot.at_m);
@@ -278,7 +274,8 @@ fn setup(arguments: &Arguments) -> Result<Setup, Refusal> {
         changed(&model, at_s, factor)
     });
     let change = change.transpose()?;
-    let (scheme, seed) = (arguments.scheme, arguments.seed);
+    let usual = if model.shape().dimensions() > 2 { Rendering::Prediction } else { Rendering::Model };
+    let (scheme, seed) = (arguments.scheme.unwrap_or(usual), arguments.seed);
     Ok(Setup {
         model,
         laws,

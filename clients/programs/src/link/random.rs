@@ -20,7 +20,7 @@ use super::figures::figures;
 use super::laws::PlaceLaws;
 use super::measure::Outcome;
 use super::run::run;
-use super::setup::{Setup, TissueChange};
+use super::setup::{Rendering, Setup, TissueChange};
 use super::spot::Spot;
 use super::{Arguments, changed, law_of};
 use crate::Failure;
@@ -162,7 +162,8 @@ fn drawn(arguments: &Arguments, tissues: &BTreeMap<&str, Choice>, tip: Tip, seed
         device,
         conditions,
         stall_s: 0.0,
-        scheme: arguments.scheme,
+        // All are sheets.
+        scheme: arguments.scheme.unwrap_or(Rendering::Model),
         deadband,
         up_deadband,
         second_m,

@@ -1,21 +1,19 @@
 //! One run in virtual time, tick by tick: hand, device, network, tissue, and the tissue's twin without a network.
 
-use std::sync::Arc;
-
 use glam::DVec3;
 use palpate_proto::touch::sample_bytes;
 use palpate_simulated::network::{Conditions, Direction, Outages, Stalls, Transport};
 use palpate_simulated::random::Random;
 use palpate_simulated::task::{self, Task};
+use palpate_touch::RenderingState;
 use palpate_touch::envelope::Envelope;
 use palpate_touch::hand::HandState;
-use palpate_touch::{Law, RenderingState};
 
 use super::client::Client;
 use super::direct::Direct;
 use super::measure::{Outcome, Tick, Totals};
 use super::poses::{Down, Poses, Up};
-use super::server::Server;
+use super::server::{Other, Server};
 use super::setup::{Setup, TICK_S, ticks};
 use super::tissue::Tissue;
 
@@ -33,7 +31,7 @@ struct Network {
     up: Direction<Up>,
     down: Direction<Down>,
     /// A law must not be lost, so it comes by stream in any case.
-    laws: Direction<(u32, Arc<Law>)>,
+    laws: Direction<Other>,
 }
 
 impl Network {
@@ -80,8 +78,9 @@ pub(super) fn run(setup: &Setup) -> Result<Outcome, String> {
         bytes += serve(&mut server, &mut network, now_s)?;
         // While the client is stalled, the device holds the last force, and what arrives waits.
         if !is_stalled {
-            while let Some((number, law)) = network.laws.receive(now_s) {
+            while let Some(Other { number, law, changed }) = network.laws.receive(now_s) {
                 client.learn(number, &law);
+                changed.iter().for_each(|model| client.copy(setup, model));
             }
             while let Some(message) = network.down.receive(now_s) {
                 poses.answered(&message, now_s);
@@ -108,6 +107,7 @@ pub(super) fn run(setup: &Setup) -> Result<Outcome, String> {
     if let Some(envelope) = client.envelope() {
         totals.limited(envelope);
     }
+    totals.outcome.predicted_ticks = client.predicted();
     let mut outcome = totals.close();
     let lasted_s = outcome.unstable_at_s.unwrap_or(*duration_s).max(TICK_S);
     let Network { up, down, .. } = network;

@@ -8,6 +8,7 @@ use palpate::scene::script::Action;
 use palpate::session::command::Command;
 use palpate::session::laws::{FIRST, Laws};
 use palpate::session::sampling::{Deadband, Sampler, Sampling, WantedHeartbeat};
+use palpate::sheet::Model;
 use palpate_simulated::network::Transport;
 use palpate_touch::carrier::Seen;
 use palpate_touch::deadband::HEARTBEAT_S;
@@ -21,6 +22,13 @@ use super::tissue::{LEASE, Tissue, ns};
 
 /// The law of another tissue is known so long after the tissue has changed, s.
 const LAW_S: f64 = 0.1;
+
+/// Another law, and of which tissue, if that has changed.
+pub(super) struct Other {
+    pub(super) number: u32,
+    pub(super) law: Arc<Law>,
+    pub(super) changed: Option<Arc<Model>>,
+}
 
 /// A tissue behind a network.
 pub(super) struct Server {
@@ -131,14 +139,16 @@ impl Server {
     }
 
     /// Another law, if the stream is to be told of one: local models name it from now on.
-    pub(super) fn take_law(&mut self, now_s: f64) -> Option<(u32, Arc<Law>)> {
+    pub(super) fn take_law(&mut self, now_s: f64) -> Option<Other> {
+        let mut changed = None;
         if let Some((_, laws)) = self.next_laws.take_if(|next| next.0 <= now_s) {
+            changed = Some(laws.model.clone());
             (self.place_laws, self.is_other) = (laws, true);
         }
         let law = std::mem::take(&mut self.is_other).then(|| self.place_laws.law(self.disc)).flatten()?;
         self.number += 1;
         self.laws.change(self.number, law.clone());
-        Some((self.number, law))
+        Some(Other { number: self.number, law, changed })
     }
 
     /// How often the server wants to hear from the client, s.

@@ -20,6 +20,9 @@ pub(super) enum Rendering {
     Hold,
     /// The local model, evaluated along the tool's path, within the safety envelope
     Model,
+    /// A copy of the tissue that the client simulates, corrected by samples, or the local model while that has been nearer to
+    /// them; within the safety envelope
+    Prediction,
 }
 
 /// The setup of a run.

@@ -1,0 +1,292 @@
+//! Touch on organs over a network, from local models and from a copy of the tissue that the client simulates: in virtual time and
+//! through a real server; and what a copy costs. Writes docs/benchmarks/prediction.{md,json}. `-- --quick` measures less.
+
+#![allow(clippy::unwrap_used, clippy::panic, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
+
+#[path = "../tests/common/proxy.rs"]
+mod proxy;
+mod report;
+#[path = "../tests/common/server.rs"]
+mod server;
+
+use std::path::PathBuf;
+use std::process::Command;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use glam::DVec3;
+use palpate::limits::Limits;
+use palpate::scene::{BUILT_IN, Scene};
+use palpate::session::prediction::Prediction;
+use palpate::sheet::{Footprint, Model};
+use palpate_proto::pb;
+use palpate_touch::{Predictor, Tip};
+use report::chart::{Look, Panel, Series};
+use report::{Report, cells, digits, quick};
+use serde_json::{Value, json};
+
+/// Round trip, ms.
+const ROUND_TRIP_MS: u32 = 50;
+
+const SCHEMES: [&str; 2] = ["prediction", "model"];
+
+/// What is touched: a title, a scene, and where.
+const PLACES: [(&str, &str, &str); 5] = [
+    ("liver-organ, away from lumps", "liver-organ", ""),
+    ("liver-organ, over the larger lump", "liver-organ", "--place -0.040,-0.026,0.037"),
+    ("liver-organ, over the smaller lump", "liver-organ", "--place 0.030,-0.013,0.028"),
+    ("gallbladder", "gallbladder", ""),
+    ("colon", "colon", ""),
+];
+
+fn link(arguments: &str) -> Value {
+    let program = PathBuf::from(env!("CARGO_BIN_EXE_palpate")).with_file_name("palpate-client");
+    let output = Command::new(program).arg("link").args(arguments.split_whitespace()).arg("--json").output().unwrap();
+    let told = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "link {arguments}: {told}");
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+fn number(found: &Value, name: &str) -> f64 {
+    found[name].as_f64().unwrap_or(f64::NAN)
+}
+
+/// What of a run the tables show.
+const COLUMNS: [(&str, &str); 6] = [
+    ("force error, % RMS", "force_error_rms_percent"),
+    ("p99, N", "force_error_p99_n"),
+    ("largest true force, N", "true_force_max_n"),
+    ("of the depth, %", "depth_error_percent"),
+    ("least energy, J", "energy_min_j"),
+    ("largest jump, N", "jump_max_n"),
+];
+
+fn header(label: &[&str]) -> Vec<String> {
+    let mut header = cells(label);
+    header.extend(COLUMNS.iter().map(|(title, _)| (*title).to_owned()));
+    header.push("ticks from the copy".to_owned());
+    header
+}
+
+/// Means over seeds, of energy and jump the worst.
+fn row(label: &[&str], runs: &[Value]) -> Vec<String> {
+    let mut row = cells(label);
+    for (_, name) in COLUMNS {
+        let values = runs.iter().map(|run| number(run, name));
+        row.push(digits(match name {
+            "energy_min_j" => values.fold(f64::INFINITY, f64::min),
+            "jump_max_n" => values.fold(0.0, f64::max),
+            _ => values.sum::<f64>() / runs.len() as f64,
+        }));
+    }
+    let [predicted, all] = [
+        runs.iter().map(|run| number(run, "predicted_ticks")).sum::<f64>(),
+        runs.iter().map(|run| 1e3 * number(run, "seconds")).sum::<f64>(),
+    ];
+    row.push(format!("{:.0} %", 100.0 * predicted / all));
+    row
+}
+
+fn main() {
+    let mut report = Report::new("prediction", "Touch on organs from a copy of the tissue", "make bench-prediction");
+    report.say(
+        "`model` renders the local model along the tool's own way. `prediction` renders from a copy of the tissue that the client \
+         simulates, corrected by samples, or from the local model while that has been nearer to them. Medium hand, omega3, runs of \
+         20 s in virtual time, means over the seeds 1 to 3, of energies and jumps the worst (`palpate-client link --help`).",
+    );
+    report.say(
+        "**What virtual time shows.** The truth is a twin of the tissue at the tool's own place. The copy has the same tissue and the \
+         same places, so without anybody else it is the twin, bit by bit: 0 there says that nothing is lost on the way, not that a \
+         network costs nothing. What is left shows where something is not the same: places that the server got late or not at all, \
+         a second tool, a tissue that changes, real time.",
+    );
+    // Before anything else is busy.
+    cost(&mut report);
+    live(&mut report);
+    let seeds = if quick() { 1 } else { 3 };
+    places(&mut report, seeds);
+    disturbed(&mut report, seeds);
+    let panels = [panel("colon", "colon", ""), panel("over the smaller lump", "liver-organ", PLACES[2].2)];
+    report.write(2, &panels);
+}
+
+fn runs(arguments: &str, seeds: u64) -> Vec<Value> {
+    (1..=seeds).map(|seed| link(&format!("{arguments} --seed {seed}"))).collect()
+}
+
+fn places(report: &mut Report, seeds: u64) {
+    report.heading("A constant delay of 50 ms, datagrams");
+    let (mut rows, mut figures) = (Vec::new(), Vec::new());
+    for (title, scene, place) in PLACES {
+        for scheme in SCHEMES {
+            let arguments =
+                format!("--scene {scene} {place} --transport datagram --rtt-ms {ROUND_TRIP_MS} --scheme {scheme}");
+            let found = runs(&arguments, seeds);
+            rows.push(row(&[title, scheme], &found));
+            figures.extend(found);
+        }
+    }
+    report.table(&header(&["where", "scheme"]), &rows);
+    report.figure("places", Value::Array(figures));
+}
+
+/// What makes the copy another tissue than the server's.
+fn disturbed(report: &mut Report, seeds: u64) {
+    report.heading("Where the copy is not the whole truth: liver-organ");
+    report.say(
+        "A second tool presses by a task of its own. The tissue changes after 10 s to springs of half as much stiffness again; its \
+         law and a copy of it reach the client 100 ms and one way later.",
+    );
+    let conditions = [
+        ("± 40 ms, datagrams", "--rtt-ms 50 --jitter-ms 40 --transport datagram"),
+        ("120 ± 40 ms, 1 % lost, datagrams", "--profile bad-wan --transport datagram"),
+        ("50 ± 10 ms, 0.1 % lost, stream", "--profile wan"),
+        ("200 ms, datagrams", "--rtt-ms 200 --transport datagram"),
+        ("both deadbands (0.1, 0.05), datagrams", "--rtt-ms 50 --transport datagram --deadband 0.1 --up-deadband 0.05"),
+        ("second tool 10 mm away", "--rtt-ms 50 --second-tool-mm 10"),
+        ("second tool 5 mm away", "--rtt-ms 50 --second-tool-mm 5"),
+        ("changing tissue", "--rtt-ms 50 --tissue-change-s 10 --tissue-change-factor 1.5"),
+    ];
+    let (mut rows, mut figures) = (Vec::new(), Vec::new());
+    for (title, condition) in conditions {
+        for scheme in SCHEMES {
+            let found = runs(&format!("--scene liver-organ {condition} --scheme {scheme}"), seeds);
+            rows.push(row(&[title, scheme], &found));
+            figures.extend(found);
+        }
+    }
+    report.table(&header(&["network, or what else", "scheme"]), &rows);
+    report.figure("disturbed", Value::Array(figures));
+}
+
+/// True and rendered force around the moment at which local models are farthest off.
+fn panel(title: &str, scene: &str, place: &str) -> Panel {
+    let courses = SCHEMES.map(|scheme| {
+        let file = std::env::temp_dir().join(format!("palpate-prediction-{}.csv", std::process::id()));
+        let path = file.display();
+        link(&format!(
+            "--scene {scene} {place} --transport datagram --rtt-ms {ROUND_TRIP_MS} --scheme {scheme} --course {path}"
+        ));
+        let text = std::fs::read_to_string(&file).unwrap();
+        std::fs::remove_file(&file).unwrap();
+        text.lines().skip(1).map(|line| line.split(',').map(|value| value.parse().unwrap()).collect()).collect()
+    });
+    let [predicted, modelled]: [Vec<Vec<f64>>; 2] = courses;
+    let off_n = |row: &Vec<f64>| (row[2] - row[3]).abs();
+    let worst = modelled.iter().max_by(|a, b| off_n(a).total_cmp(&off_n(b))).unwrap()[0];
+    let of = |rows: &[Vec<f64>], column: usize| -> Vec<(f64, f64)> {
+        let near = rows.iter().filter(|row| (row[0] - worst).abs() < 0.4);
+        near.map(|row| (1e3 * (row[0] - worst), 1e3 * row[column])).collect()
+    };
+    let series = |name: &str, hue, look, points| Series { name: name.to_owned(), hue, look, points };
+    let all = [
+        series("true", 2, Look::Broad, of(&modelled, 3)),
+        series("local models", 0, Look::Plain, of(&modelled, 2)),
+        series("copy, its own course", 1, Look::Plain, of(&predicted, 2)),
+    ];
+    let most = all.iter().flat_map(|series| series.points.iter().map(|point| point.1)).fold(0.0, f64::max);
+    Panel::Curves {
+        title: format!("Force at {ROUND_TRIP_MS} ms: {title}"),
+        x: "ms",
+        y: "mN",
+        up: 0.0..1.1 * most,
+        series: all.into(),
+    }
+}
+
+fn live(report: &mut Report) {
+    report.heading("In real time, 50 ms");
+    report.say(
+        "The same hand and task over gRPC to a real server through a proxy that delays by 25 ms each way. The copy is made of a \
+         snapshot that the server sends. Ticks and steps are late now and then, each by the clock of its own end.",
+    );
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let server = server::Server::start(&["--log", "warn"]);
+    let seconds = if quick() { 8 } else { 20 };
+    let (mut rows, mut figures) = (Vec::new(), Vec::new());
+    for (title, scene, place) in PLACES.iter().filter(|place| place.1 != "gallbladder") {
+        for scheme in SCHEMES {
+            let delay = Duration::from_millis(u64::from(ROUND_TRIP_MS) / 2);
+            let target = server.url.trim_start_matches("http://").to_owned();
+            let proxy = runtime.block_on(proxy::Proxy::start(target, delay));
+            let url = proxy.url();
+            let found = link(&format!("--scene {scene} {place} --seconds {seconds} --server {url} --scheme {scheme}"));
+            let mut row = row(&[title, scheme], std::slice::from_ref(&found));
+            row.push(found["late_ticks"].to_string());
+            rows.push(row);
+            figures.push(found);
+        }
+    }
+    let mut header = header(&["where", "scheme"]);
+    header.push("late ticks".to_owned());
+    report.table(&header, &rows);
+    report.figure("real time", Value::Array(figures));
+}
+
+/// What a copy takes of a tick, in memory, and to be made.
+fn cost(report: &mut Report) {
+    report.heading("What a copy costs");
+    report.say(
+        "A tip of 5 mm strokes over the tissue, 3 mm deep, at 1 kHz: the time of a tick's step of the copy, one thread. The snapshot is \
+         what the server sends; to make a copy of it takes the time of the last column, beside the loop.",
+    );
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let server = server::Server::start(&["--log", "warn"]);
+    let (mut rows, mut figures) = (Vec::new(), Vec::new());
+    for name in ["liver-organ", "gallbladder", "colon", "liver"] {
+        let text = BUILT_IN.iter().find(|scene| scene.0 == name).unwrap().1;
+        let limits = Limits::default();
+        let model = Model::compile(&Scene::parse(name, text, &[], &limits).unwrap(), &limits).unwrap();
+        let mut times_us = times_us(&model);
+        times_us.sort_by(f64::total_cmp);
+        let at = |part: f64| times_us[((times_us.len() - 1) as f64 * part) as usize];
+        let snapshot = runtime.block_on(snapshot(&server, name));
+        let began = Instant::now();
+        drop(palpate::journal::prediction(&snapshot, Tip::default()).unwrap());
+        let made_ms = 1e3 * began.elapsed().as_secs_f64();
+        let (points, megabytes) = (model.shape().point_count(), 1e-6 * snapshot.len() as f64);
+        let values = [at(0.5), at(0.99), at(1.0), megabytes, made_ms];
+        let mut row = cells([name.to_owned(), points.to_string()]);
+        row.extend(values.map(digits));
+        rows.push(row);
+        figures.push(json!({
+            "scene": name, "points": points, "p50_us": values[0], "p99_us": values[1], "most_us": values[2],
+            "snapshot_megabytes": megabytes, "made_ms": made_ms,
+        }));
+    }
+    let titles = ["tissue", "points", "p50, µs", "p99, µs", "most, µs", "snapshot, MB", "made in, ms"];
+    report.table(&cells(titles), &rows);
+    report.figure("cost", Value::Array(figures));
+}
+
+/// The time of each tick while the tip strokes to and fro, µs.
+fn times_us(model: &Arc<Model>) -> Vec<f64> {
+    let tip = Tip::default();
+    let near_m = model.shape().extent().middle_m();
+    let (at_m, outward) = Footprint::new(model, tip.radius_m, near_m).at_rest();
+    let along = outward.any_orthonormal_vector();
+    let mut copy = Prediction::new(model, tip);
+    let times = (0..4000_u32).map(|tick| {
+        let time_s = 1e-3 * f64::from(tick);
+        let depth_m = 0.003 * (time_s / 0.2).min(1.0) - 0.002 * (1.0 - (time_s / 0.2).min(1.0));
+        let stroke_m = 0.008 * (3.0 * (time_s - 0.2).max(0.0)).sin();
+        let place_m: DVec3 = at_m - depth_m * outward + stroke_m * along;
+        let began = Instant::now();
+        std::hint::black_box(copy.feel(time_s, place_m));
+        1e6 * began.elapsed().as_secs_f64()
+    });
+    // From when it touches on.
+    times.skip(200).collect()
+}
+
+async fn snapshot(server: &server::Server, scene: &str) -> Vec<u8> {
+    let source = pb::create_session_request::Source::SceneName(scene.to_owned());
+    let request = pb::CreateSessionRequest { source: Some(source), ..Default::default() };
+    let session = server.sessions().await.create_session(request).await.unwrap().into_inner().session.unwrap();
+    let session_id = session.session_id;
+    let request = pb::SaveSnapshotRequest { session_id: session_id.clone() };
+    let parts = server.sessions().await.save_snapshot(request).await.unwrap().into_inner();
+    let bytes = palpate_client::snapshot::collect(parts).await.unwrap();
+    server.sessions().await.delete_session(pb::DeleteSessionRequest { session_id }).await.unwrap();
+    bytes
+}

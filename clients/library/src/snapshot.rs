@@ -1,0 +1,22 @@
+//! Snapshots of sessions, as servers send them.
+
+use palpate_proto::pb;
+use tonic::{Status, Streaming};
+
+/// No snapshot is larger, bytes: more would fill the memory.
+const MOST_BYTES: usize = 1 << 31;
+
+/// The bytes of a snapshot (`SaveSnapshot`): a journal of one moment.
+///
+/// # Errors
+/// Returns the server's refusal, or how the connection broke; refuses a snapshot of more than 2 GiB.
+pub async fn collect(mut parts: Streaming<pb::SaveSnapshotResponse>) -> Result<Vec<u8>, Status> {
+    let mut bytes = Vec::new();
+    while let Some(message) = parts.message().await? {
+        if bytes.len() + message.part.len() > MOST_BYTES {
+            return Err(Status::resource_exhausted(format!("the snapshot has more than {MOST_BYTES} bytes")));
+        }
+        bytes.extend_from_slice(&message.part);
+    }
+    Ok(bytes)
+}

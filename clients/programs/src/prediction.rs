@@ -1,0 +1,25 @@
+//! Copies of tissues, from which a device's forces are rendered without the delay of the network.
+
+use std::sync::Arc;
+
+use palpate::journal;
+use palpate_client::bridge::Prediction;
+
+/// Of which tissues a device's loop keeps a copy.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub(crate) enum When {
+    /// Of meshes: over a rim, a fold or a lump a local model does not know what comes next
+    Auto,
+    /// Of any tissue
+    Always,
+    /// Of none: forces come from local models alone, which take the least time and no memory
+    Never,
+}
+
+impl When {
+    /// For the options of a bridge.
+    pub(crate) fn prediction(self) -> Option<Prediction> {
+        (self != When::Never)
+            .then(|| Prediction { make: Arc::new(journal::prediction), of_sheets: self == When::Always })
+    }
+}

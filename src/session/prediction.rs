@@ -1,0 +1,163 @@
+//! A copy of a session's tissue for one tool, which a client leads without a delay ([`palpate_touch::prediction`]).
+
+use std::sync::Arc;
+
+use glam::DVec3;
+use palpate_touch::{ContactState, Predicted, Predictor, Tip};
+
+use super::Session;
+use super::command::{Command, Due};
+use crate::scene::script::Action;
+use crate::sheet::Model;
+
+/// The tool of a copy.
+const TOOL: u32 = 0;
+
+/// What a step may take in a tick of 1 ms, in points times substeps: some 0.3 ms.
+pub const TICK_POINT_SUBSTEPS: u64 = 100_000;
+
+/// A copy that has more than this to catch up goes on from now, s: the client was not there for so long.
+const MOST_BEHIND_S: f64 = 0.02;
+
+/// A tissue with one tool.
+pub struct Prediction {
+    session: Session,
+    tip: Tip,
+    due: Vec<Due>,
+    /// The client's time less the copy's, s; none before the first tick.
+    ahead_s: Option<f64>,
+    place_m: DVec3,
+    /// Points times substeps that a step may take.
+    most_point_substeps: u64,
+}
+
+impl Prediction {
+    /// A copy at rest, for a tool with this tip.
+    pub fn new(model: &Arc<Model>, tip: Tip) -> Self {
+        let (session, due) = (Session::new(model), Vec::with_capacity(1));
+        Prediction { session, tip, due, ahead_s: None, place_m: DVec3::ZERO, most_point_substeps: u64::MAX }
+    }
+
+    /// A copy that tells nothing any more once so many points are awake that a step takes more than this, in points times substeps:
+    /// the loop that it is in must not be late.
+    #[must_use]
+    pub fn within(self, most_point_substeps: u64) -> Self {
+        Prediction { most_point_substeps, ..self }
+    }
+
+    /// Steps until `now_s`, with the tool on a straight way to `place_m`. Steps are done up to the nearest, so that ticks that
+    /// come a little early or late have one each.
+    fn step_to(&mut self, now_s: f64, place_m: DVec3) {
+        let step_s = self.session.model().scene.stepping.rate_hz.recip();
+        let ahead_s = *self.ahead_s.get_or_insert_with(|| {
+            self.place_m = place_m;
+            now_s - step_s
+        });
+        let behind_s = now_s - ahead_s - self.session.time_s();
+        if behind_s > MOST_BEHIND_S {
+            // The tool goes there at once; no tool leaps further than its largest speed lets it.
+            (self.ahead_s, self.place_m) = (Some(now_s - step_s - self.session.time_s()), place_m);
+            return self.step_to(now_s, place_m);
+        }
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+        let steps = (behind_s / step_s).round() as u32;
+        for step in 1..=steps {
+            let on_way_m = self.place_m.lerp(place_m, f64::from(step) / f64::from(steps));
+            let action = Action::Pose { place_m: on_way_m, velocity_m_per_s: None, tip: self.tip };
+            self.due.push(Due::in_time(Command::new(TOOL, None, action)));
+            self.session.advance(&mut self.due, |_| {});
+        }
+        if steps > 0 {
+            self.place_m = place_m;
+        }
+    }
+
+    /// Whether the next step takes more than it may.
+    fn is_too_much(&self) -> bool {
+        let substeps = u64::from(self.session.model().plan.substeps);
+        self.session.tissue().awake_points() as u64 * substeps > self.most_point_substeps
+    }
+}
+
+impl Predictor for Prediction {
+    fn feel(&mut self, now_s: f64, place_m: DVec3) -> Option<Predicted> {
+        if self.is_too_much() || self.session.hold_reason().is_some() {
+            return None;
+        }
+        self.step_to(now_s, place_m);
+        let felt = self.session.tissue().feel(TOOL as usize);
+        let free = Predicted { force_n: DVec3::ZERO, contact_state: ContactState::Free };
+        Some(felt.map_or(free, |feel| Predicted { force_n: feel.force_on_tool_n, contact_state: feel.contact_state }))
+    }
+}
+
+impl std::fmt::Debug for Prediction {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Prediction { ahead_s, place_m, most_point_substeps, .. } = self;
+        let mut fields = f.debug_struct("Prediction");
+        fields.field("ahead_s", ahead_s).field("place_m", place_m).field("most_point_substeps", most_point_substeps);
+        fields.finish_non_exhaustive()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TICK_S: f64 = 1e-3;
+
+    /// A press of 3 mm and a stroke.
+    fn place_m(tick: u32) -> DVec3 {
+        let time_s = f64::from(tick) * TICK_S;
+        let down = (time_s / 0.1).min(1.0);
+        DVec3::new(0.05 + 0.02 * (time_s - 0.1).max(0.0), 0.05, 0.002 - 0.005 * down)
+    }
+
+    fn model() -> Arc<Model> {
+        Model::paper(&["sheet.points=[21, 21]", "sheet.spacing_m=0.005", "sheet.fixed=\"edges\""])
+    }
+
+    /// The same poses at the same steps, in a session.
+    fn truth_n(model: &Arc<Model>, ticks: u32) -> Vec<DVec3> {
+        let (mut session, tip) = (Session::new(model), Tip::default());
+        let felt = (0..ticks).map(|tick| {
+            let action = Action::Pose { place_m: place_m(tick), velocity_m_per_s: None, tip };
+            session.advance(&mut vec![Due::in_time(Command::new(0, None, action))], |_| {});
+            session.tissue().feel(0).map_or(DVec3::ZERO, |feel| feel.force_on_tool_n)
+        });
+        felt.collect()
+    }
+
+    #[test]
+    fn a_copy_feels_what_a_session_does_at_the_same_places_also_when_ticks_are_early_and_late() {
+        let model = model();
+        let truth_n = truth_n(&model, 300);
+        assert!(truth_n[299].length() > 0.01, "{}", truth_n[299]);
+        let mut copy = Prediction::new(&model, Tip::default());
+        for (tick, truth_n) in (0..300).zip(truth_n) {
+            let early_s = [0.0, -3e-4, 4e-4, 1e-4][tick as usize % 4];
+            let felt = copy.feel(17.0 + f64::from(tick) * TICK_S + early_s, place_m(tick)).unwrap();
+            assert_eq!(felt.force_n, truth_n, "{tick}");
+        }
+    }
+
+    #[test]
+    fn a_copy_does_the_steps_of_ticks_that_were_left_out_and_goes_on_after_a_pause() {
+        let model = model();
+        let mut copy = Prediction::new(&model, Tip::default());
+        let steps = |copy: &Prediction| copy.session.step_count();
+        for (tick, expected) in [(0, 1), (1, 2), (5, 6), (15, 16), (15, 16), (16, 17), (5000, 18), (5001, 19)] {
+            let felt = copy.feel(f64::from(tick) * TICK_S, place_m(tick.min(200))).unwrap();
+            assert!(felt.force_n.is_finite() && steps(&copy) == expected, "{tick}: {} steps", steps(&copy));
+        }
+    }
+
+    #[test]
+    fn a_copy_with_too_much_to_compute_tells_nothing() {
+        let model = model();
+        let mut copy = Prediction::new(&model, Tip::default()).within(50);
+        let felt: Vec<_> = (0..200).map(|tick| copy.feel(f64::from(tick) * TICK_S, place_m(tick))).collect();
+        // It takes nothing at rest.
+        assert!(felt[0].is_some() && felt[199].is_none());
+    }
+}
