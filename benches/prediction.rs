@@ -11,13 +11,14 @@ mod server;
 
 use std::path::PathBuf;
 use std::process::Command;
-use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::scene::{BUILT_IN, Scene};
-use palpate::session::prediction::Prediction;
+use palpate::session::prediction::TissueCopy;
 use palpate::sheet::{Footprint, Model};
 use palpate_proto::pb;
 use palpate_touch::{Predictor, Tip};
@@ -110,28 +111,47 @@ fn main() {
     report.write(2, &panels);
 }
 
-fn runs(arguments: &str, seeds: u64) -> Vec<Value> {
-    (1..=seeds).map(|seed| link(&format!("{arguments} --seed {seed}"))).collect()
+/// Each of these runs with so many seeds, on all processors: it is virtual time.
+fn all(runs: &[String], seeds: usize) -> Vec<Vec<Value>> {
+    let wanted: Vec<String> =
+        runs.iter().flat_map(|run| (1..=seeds).map(move |seed| format!("{run} --seed {seed}"))).collect();
+    let (next, found) = (AtomicUsize::new(0), Mutex::new(vec![Value::Null; wanted.len()]));
+    std::thread::scope(|scope| {
+        for _ in 0..std::thread::available_parallelism().map_or(1, usize::from) {
+            scope.spawn(|| {
+                while let Some((at, run)) = {
+                    let at = next.fetch_add(1, Ordering::Relaxed);
+                    wanted.get(at).map(|run| (at, run))
+                } {
+                    let figures = link(run);
+                    found.lock().unwrap()[at] = figures;
+                }
+            });
+        }
+    });
+    found.into_inner().unwrap().chunks(seeds).map(<[Value]>::to_vec).collect()
 }
 
-fn places(report: &mut Report, seeds: u64) {
+/// A table of what was run by each scheme.
+fn table(report: &mut Report, label: &str, name: &'static str, runs: &[(&str, String)], seeds: usize) {
+    let of = |run: &(&str, String)| SCHEMES.map(|scheme| format!("{} --scheme {scheme}", run.1));
+    let found = all(&runs.iter().flat_map(of).collect::<Vec<_>>(), seeds);
+    let labels = runs.iter().flat_map(|(title, _)| SCHEMES.map(|scheme| [*title, scheme]));
+    let rows: Vec<_> = labels.zip(&found).map(|(label, found)| row(&label, found)).collect();
+    report.table(&header(&[label, "scheme"]), &rows);
+    report.figure(name, Value::Array(found.into_iter().flatten().collect()));
+}
+
+fn places(report: &mut Report, seeds: usize) {
     report.heading("A constant delay of 50 ms, datagrams");
-    let (mut rows, mut figures) = (Vec::new(), Vec::new());
-    for (title, scene, place) in PLACES {
-        for scheme in SCHEMES {
-            let arguments =
-                format!("--scene {scene} {place} --transport datagram --rtt-ms {ROUND_TRIP_MS} --scheme {scheme}");
-            let found = runs(&arguments, seeds);
-            rows.push(row(&[title, scheme], &found));
-            figures.extend(found);
-        }
-    }
-    report.table(&header(&["where", "scheme"]), &rows);
-    report.figure("places", Value::Array(figures));
+    let run = |(title, scene, place): &(&'static str, &str, &str)| {
+        (*title, format!("--scene {scene} {place} --transport datagram --rtt-ms {ROUND_TRIP_MS}"))
+    };
+    table(report, "where", "places", &PLACES.iter().map(run).collect::<Vec<_>>(), seeds);
 }
 
 /// What makes the copy another tissue than the server's.
-fn disturbed(report: &mut Report, seeds: u64) {
+fn disturbed(report: &mut Report, seeds: usize) {
     report.heading("Where the copy is not the whole truth: liver-organ");
     report.say(
         "A second tool presses by a task of its own. The tissue changes after 10 s to springs of half as much stiffness again; its \
@@ -147,16 +167,8 @@ fn disturbed(report: &mut Report, seeds: u64) {
         ("second tool 5 mm away", "--rtt-ms 50 --second-tool-mm 5"),
         ("changing tissue", "--rtt-ms 50 --tissue-change-s 10 --tissue-change-factor 1.5"),
     ];
-    let (mut rows, mut figures) = (Vec::new(), Vec::new());
-    for (title, condition) in conditions {
-        for scheme in SCHEMES {
-            let found = runs(&format!("--scene liver-organ {condition} --scheme {scheme}"), seeds);
-            rows.push(row(&[title, scheme], &found));
-            figures.extend(found);
-        }
-    }
-    report.table(&header(&["network, or what else", "scheme"]), &rows);
-    report.figure("disturbed", Value::Array(figures));
+    let runs = conditions.map(|(title, condition)| (title, format!("--scene liver-organ {condition}")));
+    table(report, "network, or what else", "disturbed", &runs, seeds);
 }
 
 /// True and rendered force around the moment at which local models are farthest off.
@@ -265,7 +277,7 @@ fn times_us(model: &Arc<Model>) -> Vec<f64> {
     let near_m = model.shape().extent().middle_m();
     let (at_m, outward) = Footprint::new(model, tip.radius_m, near_m).at_rest();
     let along = outward.any_orthonormal_vector();
-    let mut copy = Prediction::new(model, tip);
+    let mut copy = TissueCopy::new(model, tip);
     let times = (0..4000_u32).map(|tick| {
         let time_s = 1e-3 * f64::from(tick);
         let depth_m = 0.003 * (time_s / 0.2).min(1.0) - 0.002 * (1.0 - (time_s / 0.2).min(1.0));

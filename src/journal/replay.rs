@@ -16,7 +16,7 @@ use crate::refusal::{Reason, Refusal, Result};
 use crate::session::Session;
 use crate::session::command::Due;
 use crate::session::input::Input;
-use crate::session::prediction::{Prediction, TICK_POINT_SUBSTEPS};
+use crate::session::prediction::{TICK_POINT_SUBSTEPS, TissueCopy};
 use crate::session::rules::Rules;
 use crate::session::saved::Saved;
 use crate::sheet::Model;
@@ -544,7 +544,7 @@ pub fn prediction(bytes: &[u8], tip: Tip) -> std::result::Result<Box<dyn Predict
         Ok(resume(reader, &Limits::default())?.session)
     };
     let session = memory::attempt("snapshot", session).map_err(|refusal| refusal.to_string())?;
-    Ok(Box::new(Prediction::new(session.model(), tip).within(TICK_POINT_SUBSTEPS)))
+    Ok(Box::new(TissueCopy::new(session.model(), tip).within(TICK_POINT_SUBSTEPS)))
 }
 
 /// The header of a journal, and the tissue that it begins with.

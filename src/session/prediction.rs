@@ -13,55 +13,58 @@ use crate::sheet::Model;
 /// The tool of a copy.
 const TOOL: u32 = 0;
 
-/// What a step may take in a tick of 1 ms, in points times substeps: some 0.3 ms.
+/// What a copy's steps may take in a millisecond, in points times substeps: some 0.3 ms.
 pub const TICK_POINT_SUBSTEPS: u64 = 100_000;
 
+/// A client's usual tick, s.
+const TICK_S: f64 = 1e-3;
+
 /// A copy that has more than this to catch up goes on from now, s: the client was not there for so long.
-const MOST_BEHIND_S: f64 = 0.02;
+const MOST_BEHIND_S: f64 = 0.005;
 
 /// A tissue with one tool.
-pub struct Prediction {
+pub struct TissueCopy {
     session: Session,
     tip: Tip,
     due: Vec<Due>,
     /// The client's time less the copy's, s; none before the first tick.
     ahead_s: Option<f64>,
     place_m: DVec3,
-    /// Points times substeps that a step may take.
+    /// Points times substeps that may be computed in a tick.
     most_point_substeps: u64,
 }
 
-impl Prediction {
+impl TissueCopy {
     /// A copy at rest, for a tool with this tip.
     pub fn new(model: &Arc<Model>, tip: Tip) -> Self {
         let (session, due) = (Session::new(model), Vec::with_capacity(1));
-        Prediction { session, tip, due, ahead_s: None, place_m: DVec3::ZERO, most_point_substeps: u64::MAX }
+        TissueCopy { session, tip, due, ahead_s: None, place_m: DVec3::ZERO, most_point_substeps: u64::MAX }
     }
 
-    /// A copy that tells nothing any more once so many points are awake that a step takes more than this, in points times substeps:
-    /// the loop that it is in must not be late.
+    /// A copy that tells nothing any more, for good, once so many points are awake that a tick takes more than this, in points times
+    /// substeps: the loop that it is in must not be late.
     #[must_use]
     pub fn within(self, most_point_substeps: u64) -> Self {
-        Prediction { most_point_substeps, ..self }
+        TissueCopy { most_point_substeps, ..self }
     }
 
     /// Steps until `now_s`, with the tool on a straight way to `place_m`. Steps are done up to the nearest, so that ticks that
-    /// come a little early or late have one each.
-    fn step_to(&mut self, now_s: f64, place_m: DVec3) {
+    /// come a little early or late have one each. None: too much is awake for that.
+    fn step_to(&mut self, now_s: f64, place_m: DVec3) -> Option<()> {
         let step_s = self.session.model().scene.stepping.rate_hz.recip();
-        let ahead_s = *self.ahead_s.get_or_insert_with(|| {
-            self.place_m = place_m;
-            now_s - step_s
-        });
-        let behind_s = now_s - ahead_s - self.session.time_s();
-        if behind_s > MOST_BEHIND_S {
-            // The tool goes there at once; no tool leaps further than its largest speed lets it.
-            (self.ahead_s, self.place_m) = (Some(now_s - step_s - self.session.time_s()), place_m);
-            return self.step_to(now_s, place_m);
+        let begins_s = now_s - step_s - self.session.time_s();
+        let ahead_s = *self.ahead_s.get_or_insert(begins_s);
+        let mut behind_s = now_s - ahead_s - self.session.time_s();
+        if self.session.step_count() == 0 || behind_s > MOST_BEHIND_S.max(2.0 * step_s) {
+            // The tool goes there at once; no tool leaps farther than its largest speed lets it.
+            (self.ahead_s, self.place_m, behind_s) = (Some(begins_s), place_m, step_s);
         }
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
         let steps = (behind_s / step_s).round() as u32;
         for step in 1..=steps {
+            if self.is_too_much(step_s) {
+                return None;
+            }
             let on_way_m = self.place_m.lerp(place_m, f64::from(step) / f64::from(steps));
             let action = Action::Pose { place_m: on_way_m, velocity_m_per_s: None, tip: self.tip };
             self.due.push(Due::in_time(Command::new(TOOL, None, action)));
@@ -70,31 +73,33 @@ impl Prediction {
         if steps > 0 {
             self.place_m = place_m;
         }
+        Some(())
     }
 
-    /// Whether the next step takes more than it may.
-    fn is_too_much(&self) -> bool {
-        let substeps = u64::from(self.session.model().plan.substeps);
-        self.session.tissue().awake_points() as u64 * substeps > self.most_point_substeps
+    /// Whether a tick's steps take more than they may.
+    #[allow(clippy::cast_precision_loss)]
+    fn is_too_much(&self, step_s: f64) -> bool {
+        let substeps = f64::from(self.session.model().plan.substeps) * (TICK_S / step_s).max(1.0);
+        self.session.tissue().awake_points() as f64 * substeps > self.most_point_substeps as f64
     }
 }
 
-impl Predictor for Prediction {
+impl Predictor for TissueCopy {
     fn feel(&mut self, now_s: f64, place_m: DVec3) -> Option<Predicted> {
-        if self.is_too_much() || self.session.hold_reason().is_some() {
+        if self.session.hold_reason().is_some() {
             return None;
         }
-        self.step_to(now_s, place_m);
+        self.step_to(now_s, place_m)?;
         let felt = self.session.tissue().feel(TOOL as usize);
         let free = Predicted { force_n: DVec3::ZERO, contact_state: ContactState::Free };
         Some(felt.map_or(free, |feel| Predicted { force_n: feel.force_on_tool_n, contact_state: feel.contact_state }))
     }
 }
 
-impl std::fmt::Debug for Prediction {
+impl std::fmt::Debug for TissueCopy {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Prediction { ahead_s, place_m, most_point_substeps, .. } = self;
-        let mut fields = f.debug_struct("Prediction");
+        let TissueCopy { ahead_s, place_m, most_point_substeps, .. } = self;
+        let mut fields = f.debug_struct("TissueCopy");
         fields.field("ahead_s", ahead_s).field("place_m", place_m).field("most_point_substeps", most_point_substeps);
         fields.finish_non_exhaustive()
     }
@@ -103,8 +108,6 @@ impl std::fmt::Debug for Prediction {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    const TICK_S: f64 = 1e-3;
 
     /// A press of 3 mm and a stroke.
     fn place_m(tick: u32) -> DVec3 {
@@ -133,7 +136,7 @@ mod tests {
         let model = model();
         let truth_n = truth_n(&model, 300);
         assert!(truth_n[299].length() > 0.01, "{}", truth_n[299]);
-        let mut copy = Prediction::new(&model, Tip::default());
+        let mut copy = TissueCopy::new(&model, Tip::default());
         for (tick, truth_n) in (0..300).zip(truth_n) {
             let early_s = [0.0, -3e-4, 4e-4, 1e-4][tick as usize % 4];
             let felt = copy.feel(17.0 + f64::from(tick) * TICK_S + early_s, place_m(tick)).unwrap();
@@ -144,18 +147,33 @@ mod tests {
     #[test]
     fn a_copy_does_the_steps_of_ticks_that_were_left_out_and_goes_on_after_a_pause() {
         let model = model();
-        let mut copy = Prediction::new(&model, Tip::default());
-        let steps = |copy: &Prediction| copy.session.step_count();
-        for (tick, expected) in [(0, 1), (1, 2), (5, 6), (15, 16), (15, 16), (16, 17), (5000, 18), (5001, 19)] {
+        let mut copy = TissueCopy::new(&model, Tip::default());
+        let steps = |copy: &TissueCopy| copy.session.step_count();
+        for (tick, expected) in [(0, 1), (1, 2), (5, 6), (15, 7), (15, 7), (16, 8), (5000, 9), (5001, 10)] {
             let felt = copy.feel(f64::from(tick) * TICK_S, place_m(tick.min(200))).unwrap();
             assert!(felt.force_n.is_finite() && steps(&copy) == expected, "{tick}: {} steps", steps(&copy));
         }
     }
 
     #[test]
+    fn a_copy_with_slow_or_fast_steps_keeps_to_the_time() {
+        for rate_hz in [1.0, 10.0, 50.0, 499.0, 1000.0, 5000.0] {
+            let rate = format!("stepping.rate_hz={rate_hz}");
+            let model = Model::paper(&["sheet.points=[9, 9]", "sheet.fixed=\"edges\"", &rate]);
+            let mut copy = TissueCopy::new(&model, Tip::default());
+            for tick in 0..2000 {
+                let felt = copy.feel(3.0 + f64::from(tick) * TICK_S, DVec3::new(0.1, 0.1, 0.01)).unwrap();
+                assert!(felt.force_n.is_finite());
+            }
+            let apart_s = (copy.session.time_s() - 2.0).abs();
+            assert!(apart_s <= 2.0 / rate_hz + TICK_S, "{rate_hz} Hz: {} s", copy.session.time_s());
+        }
+    }
+
+    #[test]
     fn a_copy_with_too_much_to_compute_tells_nothing() {
         let model = model();
-        let mut copy = Prediction::new(&model, Tip::default()).within(50);
+        let mut copy = TissueCopy::new(&model, Tip::default()).within(50);
         let felt: Vec<_> = (0..200).map(|tick| copy.feel(f64::from(tick) * TICK_S, place_m(tick))).collect();
         // It takes nothing at rest.
         assert!(felt[0].is_some() && felt[199].is_none());

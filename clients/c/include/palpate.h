@@ -798,7 +798,7 @@ enum palpate_result palpate_touch_begin(const struct palpate_session *session,
 
 /**
  * A loop over what was recorded, without a server: the same messages, positions and times give the same forces, bit by bit.
- * `options` may be null; `middle_m` is the middle of the tissue, in Palpate's own axes. Writes a handle for
+ * It has no copy of the tissue, whatever `prediction` says. `options` may be null; `middle_m` is the middle of the tissue, in Palpate's own axes. Writes a handle for
  * `palpate_touch_end`. Any thread.
  */
 enum palpate_result palpate_touch_begin_offline(const struct palpate_touch_options *options,
@@ -815,9 +815,10 @@ enum palpate_result palpate_touch_arrive(const struct palpate_touch *touch,
 
 /**
  * Gives the force to render from now on, for a device that reports `reading` at `time_s`: seconds of any origin, by a clock that
- * goes on between ticks. Takes a bounded time: no lock, no call of the system, no memory asked for or given back, unless
- * `prediction` of its options asks for a copy of the tissue, whose step it then does. It may be late, early or left out: forces then fade, and return within the safety envelope. After an error, `felt` has a force of
- * zero. One thread at a time.
+ * goes on between ticks. Takes a bounded time: no lock, no call of the system, no memory asked for or given back; but with a copy
+ * of the tissue (`prediction` of its options) it does the copy's step as well, which may ask for memory. It may be late, early or
+ * left out: forces then fade, and return within the safety envelope. After an error, `felt` has a force of zero. One thread at a
+ * time.
  */
 enum palpate_result palpate_touch_tick(const struct palpate_touch *touch,
                                        const struct palpate_reading *reading,

@@ -206,7 +206,7 @@ pub unsafe extern "C" fn palpate_bridge_begin(
             real_time: options.real_time,
             keeps_session: true,
             warn: options.warn,
-            prediction: options.prediction,
+            copies: options.copies,
             begun: Some(Box::new(begun)),
             ..Options::default()
         };

@@ -4,7 +4,7 @@ use std::ffi::{c_char, c_void};
 use std::sync::Arc;
 
 use palpate::journal;
-use palpate_client::bridge::{Origin, Prediction, Warn};
+use palpate_client::bridge::{Copies, Origin, Warn};
 use palpate_proto::{pb, touch};
 use palpate_touch::{Device, Tip};
 
@@ -289,15 +289,15 @@ pub(crate) struct TouchOptions {
     pub(crate) real_time: bool,
     pub(crate) holder: String,
     pub(crate) warn: Option<Warn>,
-    pub(crate) prediction: Option<Prediction>,
+    pub(crate) copies: Option<Copies>,
 }
 
 /// By the number of `palpate_touch_options`.
-fn prediction(number: u32) -> Result<Option<Prediction>, Fault> {
+fn copies(number: u32) -> Result<Option<Copies>, Fault> {
     if number > 2 {
         return Err(Fault::argument(format!("prediction is {number}: must be 0, 1 or 2")));
     }
-    Ok((number > 0).then(|| Prediction { make: Arc::new(journal::prediction), of_sheets: number == 2 }))
+    Ok((number > 0).then(|| Copies { make: Arc::new(journal::prediction), of_sheets: number == 2 }))
 }
 
 /// A caller's function for texts.
@@ -352,7 +352,7 @@ impl palpate_touch_options {
             real_time: self.real_time != 0,
             holder,
             warn: self.warn.map(warn),
-            prediction: prediction(self.prediction)?,
+            copies: copies(self.prediction)?,
         })
     }
 }

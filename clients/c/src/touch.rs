@@ -146,8 +146,8 @@ pub unsafe extern "C" fn palpate_touch_begin(
         *out = std::ptr::null_mut();
         let shared = session.shared.clone();
         let target = session.target(&options);
-        let (warn, prediction) = (options.warn, options.prediction);
-        let of_run = Options { keeps_session: true, warn, prediction, ..Options::default() };
+        let (warn, copies) = (options.warn, options.copies);
+        let of_run = Options { keeps_session: true, warn, copies, ..Options::default() };
         let beginning = bridge::begin(target, options.device, options.origin, of_run);
         let (ticker, connection) = os::block_on(&shared.runtime, beginning)?;
         let far = Far::Server { connection, shared };
@@ -157,7 +157,7 @@ pub unsafe extern "C" fn palpate_touch_begin(
 }
 
 /// A loop over what was recorded, without a server: the same messages, positions and times give the same forces, bit by bit.
-/// `options` may be null; `middle_m` is the middle of the tissue, in Palpate's own axes. Writes a handle for
+/// It has no copy of the tissue, whatever `prediction` says. `options` may be null; `middle_m` is the middle of the tissue, in Palpate's own axes. Writes a handle for
 /// `palpate_touch_end`. Any thread.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_touch_begin_offline(
@@ -204,8 +204,9 @@ pub unsafe extern "C" fn palpate_touch_arrive(
 
 /// Gives the force to render from now on, for a device that reports `reading` at `time_s`: seconds of any origin, by a clock that
 /// goes on between ticks. Takes a bounded time: no lock, no call of the system, no memory asked for or given back; but with a copy
-/// of the tissue (`prediction` of its options) it does the copy's step as well. It may be late, early or left out: forces then
-/// fade, and return within the safety envelope. After an error, `felt` has a force of zero. One thread at a time.
+/// of the tissue (`prediction` of its options) it does the copy's step as well, which may ask for memory. It may be late, early or
+/// left out: forces then fade, and return within the safety envelope. After an error, `felt` has a force of zero. One thread at a
+/// time.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_touch_tick(
     touch: *const palpate_touch,

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use palpate::journal;
-use palpate_client::bridge::Prediction;
+use palpate_client::bridge::Copies;
 
 /// Of which tissues a device's loop keeps a copy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -18,8 +18,7 @@ pub(crate) enum When {
 
 impl When {
     /// For the options of a bridge.
-    pub(crate) fn prediction(self) -> Option<Prediction> {
-        (self != When::Never)
-            .then(|| Prediction { make: Arc::new(journal::prediction), of_sheets: self == When::Always })
+    pub(crate) fn copies(self) -> Option<Copies> {
+        (self != When::Never).then(|| Copies { make: Arc::new(journal::prediction), of_sheets: self == When::Always })
     }
 }

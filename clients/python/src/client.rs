@@ -9,7 +9,7 @@ use glam::DVec3;
 use palpate::journal;
 use palpate::scene;
 use palpate::shape::PointName;
-use palpate_client::bridge::{self, Options, Prediction, Target};
+use palpate_client::bridge::{self, Copies, Options, Target};
 use palpate_client::{Channel, Credentials, Followed, Token, snapshot};
 use palpate_proto::{pb, touch};
 use pb::command::Action;
@@ -408,7 +408,7 @@ impl RemoteSession {
                 return Err(wrong("prediction", message));
             }
         };
-        let prediction = of_sheets.map(|of_sheets| Prediction { make: Arc::new(journal::prediction), of_sheets });
+        let copies = of_sheets.map(|of_sheets| Copies { make: Arc::new(journal::prediction), of_sheets });
         let device = Given::of(device)?;
         let lasts = seconds.or(device.lasts_s()).map(|seconds| duration("seconds", seconds)).transpose()?;
         let target = Target {
@@ -421,7 +421,7 @@ impl RemoteSession {
             datagrams,
             holder: holder.to_owned(),
         };
-        let options = Options { lasts, remembers: remember, keeps_session: true, prediction, ..Options::default() };
+        let options = Options { lasts, remembers: remember, keeps_session: true, copies, ..Options::default() };
         let (end, ended) = oneshot::channel();
         answer_in_order(py, self.awaited, Some(end), async move {
             let stop = async {

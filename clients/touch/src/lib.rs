@@ -73,6 +73,6 @@ pub use envelope::{Envelope, LimitCause, RenderingState};
 pub use law::Law;
 pub use local::{ContactState, LocalModel, Touching, Track};
 pub use news::{News, Pulse, Told};
-pub use prediction::{Predicted, Predictor};
+pub use prediction::{Predicted, Prediction, Predictor};
 pub use renderer::Renderer;
 pub use tip::{Coupling, Tip};

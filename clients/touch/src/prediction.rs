@@ -6,7 +6,8 @@
 //! copy of the tissue, without a delay ([`Predictor`]).
 //!
 //! **Samples decide.** Each tells how far the copy was off at the sample's own moment t0: e = f(t0) − c(t0), where c is the
-//! copy's force. Rendered is c(now) + e. What only the server knows, such as another user's tool, so comes in a round trip late.
+//! copy's force. Rendered is c(now) + e, and of e no larger part than c(now) is of c(t0): a tip that leaves the tissue is let go of
+//! smoothly. What only the server knows, such as another user's tool, so comes in a round trip late.
 //! Where the server's tool was a little beside the client's at t0 (a place was lost, or was no news), the local model tells f at
 //! the client's.
 //!
@@ -70,16 +71,19 @@ impl Forecast {
     }
 }
 
+/// A forecast for a moment is one of no more than this before and after it, s.
+const GAP_S: f64 = 0.02;
+
 /// Forecasts that are kept: two seconds at 1 kHz.
 const KEPT: usize = 2048;
 
-/// A predictor at work.
-pub(crate) struct Prediction {
+/// A copy at work, for [`crate::Renderer::predict`].
+pub struct Prediction {
     predictor: Box<dyn Predictor>,
     now: Option<Predicted>,
     past: VecDeque<Forecast>,
-    /// e: the force of the newest sample less that of the copy then, N; none before the first.
-    error_n: Option<DVec3>,
+    /// e: the force of the newest sample less that of the copy then, and the size of that, N; none before the first.
+    error_n: Option<(DVec3, f64)>,
     /// When the sample was taken that was compared last, s.
     compared_s: f64,
     /// Squares of the errors of the copy and of the local models, and of the force, N², which count less the older they are.
@@ -88,7 +92,8 @@ pub(crate) struct Prediction {
 }
 
 impl Prediction {
-    pub(crate) fn new(predictor: Box<dyn Predictor>) -> Self {
+    /// From a copy. Asks for the memory that ticks need.
+    pub fn new(predictor: Box<dyn Predictor>) -> Self {
         Prediction {
             predictor,
             now: None,
@@ -99,11 +104,6 @@ impl Prediction {
             squared: [0.0; 3],
             is_worse: false,
         }
-    }
-
-    /// The predictor, to be dropped elsewhere.
-    pub(crate) fn into_predictor(self) -> Box<dyn Predictor> {
-        self.predictor
     }
 
     /// Moves the tool in the copy.
@@ -126,34 +126,47 @@ impl Prediction {
         let after = self.past.partition_point(|past| !is_after(past.time_s, time_s));
         // A sample of before the copy's time, or of long ago.
         let Some(before) = after.checked_sub(1).and_then(|at| self.past.get(at)) else { return };
-        let then = self.past.get(after).map_or(*before, |next| before.towards(next, time_s));
+        let next = self.past.get(after).unwrap_or(before);
+        if time_s - before.time_s > GAP_S || next.time_s - time_s > GAP_S {
+            return;
+        }
+        let then = before.towards(next, time_s);
         let truth_n = truth_n(then.place_m);
-        let memory = ((self.compared_s - time_s) / MEMORY_S).min(0.0).exp();
+        self.error_n = Some((truth_n - then.copy_n, then.copy_n.length()));
+        // A server that hears nothing tells of the same moment again.
+        if time_s <= self.compared_s {
+            return;
+        }
+        let memory = ((self.compared_s - time_s) / MEMORY_S).exp();
         let values_n = [then.predicted_n - truth_n, then.modelled_n - truth_n, truth_n];
         for (squared, value_n) in self.squared.iter_mut().zip(values_n) {
             *squared = memory * *squared + value_n.length_squared();
         }
         self.compared_s = time_s;
-        self.error_n = Some(truth_n - then.copy_n);
         let [copy, models, force] = self.squared;
         let is_farther = if self.is_worse { BETTER * copy > models } else { copy > BETTER * models };
         self.is_worse = is_farther && copy > NEAR * NEAR * force;
     }
 
-    /// The force that the copy and the newest sample tell for now, N; none while the local model is to be rendered.
-    pub(crate) fn wanted_n(&self) -> Option<DVec3> {
+    /// The force that the copy and the newest sample tell for now, N; none while the local model is to be rendered. And where out
+    /// of the tissue is, against which nothing may pull: none if the tool holds the tissue, `normal` while the copy is not touched.
+    pub(crate) fn wanted_n(&self, normal: DVec3) -> Option<(DVec3, Option<DVec3>)> {
         let felt = self.now.filter(|_| self.error_n.is_some() && !self.is_worse)?;
-        Some(self.sum_n(felt))
+        let outward = match felt.contact_state {
+            ContactState::Holding => None,
+            _ => Some(felt.force_n.try_normalize().unwrap_or(normal)),
+        };
+        Some((self.sum_n(felt), outward))
     }
 
-    /// c + e. A tip that is out of the copy feels nothing; one that touches is not pulled.
+    /// c + e. A tip that is out of the copy feels nothing.
     fn sum_n(&self, felt: Predicted) -> DVec3 {
-        let sum_n = felt.force_n + self.error_n.unwrap_or_default();
+        let (error_n, size_n) = self.error_n.unwrap_or_default();
         match felt.contact_state {
             ContactState::Free => DVec3::ZERO,
-            ContactState::Holding => sum_n,
-            _ if sum_n.dot(felt.force_n) < 0.0 => DVec3::ZERO,
-            _ => sum_n,
+            ContactState::Holding => felt.force_n + error_n,
+            _ if size_n > 0.0 => felt.force_n + error_n * (felt.force_n.length() / size_n).min(1.0),
+            _ => felt.force_n,
         }
     }
 }

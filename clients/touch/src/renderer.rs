@@ -26,7 +26,7 @@ use glam::DVec3;
 use crate::envelope::{Envelope, RenderingState, Wanted};
 use crate::law::Law;
 use crate::local::{ContactState, LocalModel, Touching, Track};
-use crate::prediction::{Prediction, Predictor};
+use crate::prediction::Prediction;
 
 /// Time constant with which the error of the last model decays, s.
 pub const BIAS_S: f64 = 0.02;
@@ -90,9 +90,8 @@ impl Renderer {
 
     /// Renders from a copy of the tissue from when a sample has met it. `None`: from local models alone, as at the beginning.
     /// Returns the copy of before, which is to be dropped elsewhere than in a tick: it may be large.
-    pub fn predict(&mut self, predictor: Option<Box<dyn Predictor>>) -> Option<Box<dyn Predictor>> {
-        let before = std::mem::replace(&mut self.prediction, predictor.map(Prediction::new));
-        before.map(Prediction::into_predictor)
+    pub fn predict(&mut self, prediction: Option<Prediction>) -> Option<Prediction> {
+        std::mem::replace(&mut self.prediction, prediction)
     }
 
     /// How many ticks were rendered from a copy of the tissue.
@@ -100,13 +99,16 @@ impl Renderer {
         self.predicted
     }
 
-    /// Restarts with another server, whose models start from the beginning. The envelope keeps its state.
+    /// Restarts with another server, whose models start from the beginning. The envelope keeps its state, a copy of the tissue is
+    /// dropped.
     pub fn begin(&mut self, law: Law) {
+        self.prediction = None;
         self.begin_with(law, drop);
     }
 
     /// Like [`Renderer::begin`], without asking for memory or giving any back: `used` gets the laws of before, at most
-    /// [`MOST_LAWS`], which are to be dropped elsewhere.
+    /// [`MOST_LAWS`], which are to be dropped elsewhere. So is what [`Renderer::predict`] gives back, which is to be called with
+    /// `None`: the copy is of another tissue.
     pub fn begin_with(&mut self, law: Law, mut used: impl FnMut(Law)) {
         self.laws.drain(..).for_each(|known| used(known.1));
         self.laws.push((0, law));
@@ -195,19 +197,17 @@ impl Renderer {
     /// The force to render before the envelope, N: of the copy of the tissue or of the local model, with the bias.
     fn wanted_n(&self, now_s: f64) -> DVec3 {
         let Some((model, _)) = &self.newest else { return DVec3::ZERO };
-        let bias_n = self.bias_n * ((self.biased_s - now_s) / BIAS_S).exp();
-        if let Some(predicted_n) = self.predicted_n() {
-            return predicted_n + bias_n;
-        }
-        let force_n = self.modelled_n() + bias_n;
-        if model.contact_state == ContactState::Holding {
-            return force_n;
-        }
-        force_n - force_n.dot(model.normal).min(0.0) * model.normal
+        let outward = (model.contact_state != ContactState::Holding).then_some(model.normal);
+        let (force_n, outward) = self.predicted_n().unwrap_or_else(|| (self.modelled_n(), outward));
+        let force_n = force_n + self.bias_n * ((self.biased_s - now_s) / BIAS_S).exp();
+        // A touch never pulls.
+        outward.map_or(force_n, |outward| force_n - force_n.dot(outward).min(0.0) * outward)
     }
 
-    fn predicted_n(&self) -> Option<DVec3> {
-        self.prediction.as_ref()?.wanted_n()
+    /// The force from the copy of the tissue, if that is to be rendered, and where out of the tissue is.
+    fn predicted_n(&self) -> Option<(DVec3, Option<DVec3>)> {
+        let (model, _) = self.newest.as_ref()?;
+        self.prediction.as_ref()?.wanted_n(model.normal)
     }
 
     /// The force of the law and the newest model, N.
@@ -390,6 +390,44 @@ mod tests {
         for (later_s, expected_n) in [(0.0, 1.6), (BIAS_S, 1.2 + 0.4 / std::f64::consts::E), (1.0, 1.2)] {
             let wanted_n = renderer.wanted_n(0.001 + later_s);
             assert!((wanted_n - expected_n * DVec3::Z).length() < 1e-9, "{later_s} s: {wanted_n}");
+        }
+    }
+
+    /// A copy of the spring that is so many times as stiff.
+    struct Copy(f64);
+
+    impl crate::Predictor for Copy {
+        fn feel(&mut self, _: f64, place_m: DVec3) -> Option<crate::Predicted> {
+            let contact_state = if place_m.z < 0.0 { ContactState::Sticking } else { ContactState::Free };
+            Some(crate::Predicted { force_n: -400.0 * self.0 * place_m.z.min(0.0) * DVec3::Z, contact_state })
+        }
+    }
+
+    #[test]
+    fn a_hand_that_lifts_off_a_copy_that_is_off_is_let_go_of_without_a_knock_and_is_not_pulled() {
+        const LATE: u32 = 50;
+        for factor in [0.8, 1.25] {
+            let mut renderer = renderer();
+            renderer.predict(Some(Prediction::new(Box::new(Copy(factor)))));
+            // 7.5 mm deep, and up with 40 mm/s.
+            let at = |tick: u32| (-0.0075 + 4e-5 * f64::from(tick.max(300) - 300)) * DVec3::Z;
+            let mut before_n = DVec3::ZERO;
+            for tick in 0..600 {
+                let now_s = 1e-3 * f64::from(tick);
+                if tick >= LATE {
+                    renderer
+                        .receive(model(u64::from(tick), now_s - 1e-3 * f64::from(LATE), at(tick - LATE), 0.0), now_s);
+                }
+                renderer.tick(now_s, at(tick));
+                let (wanted_n, true_n) = (renderer.wanted_n(now_s), -400.0 * at(tick).z.min(0.0));
+                if tick > 200 {
+                    // The spring itself falls by 16 mN a tick.
+                    assert!((before_n - wanted_n).length() < 0.04, "{factor}, {tick}: {before_n} {wanted_n}");
+                    assert!(wanted_n.z >= 0.0 && (wanted_n.z - true_n).abs() < 0.2, "{factor}, {tick}: {wanted_n}");
+                }
+                before_n = wanted_n;
+            }
+            assert!(renderer.predicted() > 500 && before_n == DVec3::ZERO, "{}", renderer.predicted());
         }
     }
 

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use glam::{DMat3, DVec3};
 use palpate_touch::envelope::ENGAGE_S;
 use palpate_touch::renderer::BIAS_S;
-use palpate_touch::{ContactState, Device, Envelope, Law, LocalModel, Predicted, Predictor, Renderer};
+use palpate_touch::{ContactState, Device, Envelope, Law, LocalModel, Predicted, Prediction, Predictor, Renderer};
 
 const TICK_S: f64 = 1e-3;
 /// Round trip, ticks.
@@ -84,7 +84,9 @@ fn course(factor: Option<f64>, comes: u32, goes: u32) -> Found {
     for tick in 0..4000 {
         let now_s = f64::from(tick) * TICK_S;
         if let Some(factor) = factor.filter(|_| tick == comes) {
-            assert!(renderer.predict(Some(Box::new(Copy { factor, is_off: is_off.clone() }))).is_none());
+            assert!(
+                renderer.predict(Some(Prediction::new(Box::new(Copy { factor, is_off: is_off.clone() })))).is_none()
+            );
         }
         is_off.store(tick >= goes, Ordering::Relaxed);
         if tick >= ROUND_TRIP {

@@ -5,7 +5,7 @@ use palpate_touch::{Predictor, Tip};
 use pb::session_service_client::SessionServiceClient;
 use tokio::task::JoinSet;
 
-use super::{MakeCopy, Prediction};
+use super::{Copies, MakeCopy};
 use crate::Error;
 use crate::connect::Channel;
 use crate::snapshot;
@@ -19,26 +19,25 @@ pub(super) struct Copying {
     tip: Tip,
     /// None: this tissue is not copied.
     make: Option<MakeCopy>,
-    /// At most one. What is under way ends when this is dropped.
+    /// At most one, which ends when this is dropped.
     under_way: JoinSet<Made>,
+    /// What is under way is of a tissue that has changed since.
+    is_old: bool,
 }
 
 impl Copying {
-    /// Begins to make a copy, if the tissue is of a kind to be copied.
-    pub(super) fn begin(prediction: Option<&Prediction>, session: &pb::Session, channel: Channel, tip: Tip) -> Self {
+    /// Of a session's tissue, if that is of a kind to be copied.
+    pub(super) fn new(copies: Option<&Copies>, session: &pb::Session, channel: Channel, tip: Tip) -> Self {
         let is_mesh = session.scene.as_ref().is_some_and(|scene| scene.mesh.is_some());
-        let make =
-            prediction.filter(|prediction| is_mesh || prediction.of_sheets).map(|prediction| prediction.make.clone());
+        let make = copies.filter(|copies| is_mesh || copies.of_sheets).map(|copies| copies.make.clone());
         let session_id = session.session_id.clone();
-        let mut copying = Copying { channel, session_id, tip, make, under_way: JoinSet::new() };
-        copying.again();
-        copying
+        Copying { channel, session_id, tip, make, under_way: JoinSet::new(), is_old: false }
     }
 
-    /// Makes another copy: the tissue has changed.
-    pub(super) fn again(&mut self) {
-        let Some(make) = self.make.clone() else { return };
-        self.under_way.abort_all();
+    /// Begins to make a copy of the tissue as it is now, after the one that is under way: nothing stops that once it is being made.
+    pub(super) fn begin(&mut self) {
+        self.is_old = !self.under_way.is_empty();
+        let Some(make) = self.make.clone().filter(|_| !self.is_old) else { return };
         let (channel, session_id, tip) = (self.channel.clone(), self.session_id.clone(), self.tip);
         self.under_way.spawn(async move {
             let request = pb::SaveSnapshotRequest { session_id };
@@ -54,9 +53,11 @@ impl Copying {
     pub(super) async fn next(&mut self) -> Made {
         loop {
             match self.under_way.join_next().await {
-                Some(Ok(made)) => return made,
-                // One that was given up for a newer one.
-                Some(Err(_)) => {}
+                Some(_) if self.is_old => self.begin(),
+                Some(made) => {
+                    let panicked = |_| Error::Internal("fetching the tissue panicked".to_owned());
+                    return made.map_err(panicked).flatten();
+                }
                 None => std::future::pending().await,
             }
         }

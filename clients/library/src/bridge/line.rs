@@ -22,7 +22,7 @@ use tonic_types::StatusExt;
 
 use super::copying::Copying;
 use super::ticker::{Command, Feed};
-use super::{Prediction, Session, Target};
+use super::{Copies, Session, Target};
 use crate::Error;
 use crate::connect::Server;
 use crate::datagrams::Datagrams;
@@ -113,7 +113,7 @@ const COMMANDS: usize = 64;
 /// Keeps a connection until `commands` ends.
 pub(super) async fn keep(
     target: Target,
-    prediction: Option<Prediction>,
+    copies: Option<Copies>,
     device: Device,
     shared: &Shared,
     mut feed: Feed,
@@ -129,7 +129,7 @@ pub(super) async fn keep(
     loop {
         let before = shared.inbound().traffic;
         let ended =
-            connect(&target, prediction.as_ref(), &mut trail, &device, shared, &mut feed, &mut commands, warn).await;
+            connect(&target, copies.as_ref(), &mut trail, &device, shared, &mut feed, &mut commands, warn).await;
         let Err(error) = ended else { return };
         // After a move the tool is still in the tissue, and goes on by its lease; not after anything else.
         let went_on = moved_to(&error).is_none() && !std::mem::take(&mut trail.lease_id).is_empty();
@@ -272,7 +272,7 @@ fn broken(why: &str) -> Error {
 #[allow(clippy::too_many_arguments)] // One caller, which has them all.
 async fn connect(
     target: &Target,
-    prediction: Option<&Prediction>,
+    copies: Option<&Copies>,
     trail: &mut Trail,
     device: &Device,
     shared: &Shared,
@@ -282,7 +282,7 @@ async fn connect(
 ) -> Result<(), Error> {
     let At { server, channel, answer: session } = session(target, trail, shared).await?;
     let middle_m = middle_m(&session)?;
-    let mut copying = Copying::begin(prediction, &session, channel.clone(), target.tip);
+    let mut copying = Copying::new(copies, &session, channel.clone(), target.tip);
     let (outbound, messages) = mpsc::channel(COMMANDS);
     let open = pb::TouchOpen {
         session_id: session.session_id,
@@ -306,6 +306,8 @@ async fn connect(
     stream.opened().warnings.iter().for_each(|warning| warn(warning));
     let first = stream.opened().law.as_ref().ok_or_else(|| broken("the server sent no force law"))?;
     feed.begin(first, middle_m)?;
+    // The stream tells of every change of the tissue from now on.
+    copying.begin();
     {
         let mut inbound = shared.inbound();
         inbound.traffic.connections += 1;
@@ -337,7 +339,8 @@ async fn connect(
                 match heard.map_err(silent)??.ok_or_else(|| broken("the server has ended the stream"))? {
                     Heard::ForceLaw(update) => {
                         if update.tissue_step.is_some() {
-                            copying.again();
+                            feed.predict(None);
+                            copying.begin();
                         }
                         match update.law {
                             Some(message) => feed.learn(&message)?,
@@ -368,7 +371,7 @@ async fn connect(
                 }
             }
             made = copying.next() => match made {
-                Ok(copy) => feed.predict(copy),
+                Ok(copy) => feed.predict(Some(copy)),
                 Err(error) => warn(&format!("forces come from local models alone, without a copy of the tissue: {error}")),
             },
             sample = datagrams.next() => {

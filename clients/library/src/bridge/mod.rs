@@ -76,7 +76,7 @@ pub type MakeCopy = Arc<dyn Fn(&[u8], Tip) -> Result<Box<dyn Predictor>, String>
 
 /// Of which tissues a loop keeps a copy, from which it renders without the delay of the network ([`palpate_touch::prediction`]).
 #[derive(Clone)]
-pub struct Prediction {
+pub struct Copies {
     /// Makes it.
     pub make: MakeCopy,
     /// Also of sheets, which a local model knows well; otherwise of meshes alone.
@@ -116,19 +116,19 @@ pub struct Options {
     pub begun: Option<Begun>,
     /// Keep a clone to stop the forces of [`run`]; of [`begin`], [`Ticker::disable`] does it.
     pub disable: Disable,
-    /// Renders from a copy of the tissue, if it is of a kind that this says, as soon as the copy is there: a tick then takes the
-    /// time of the copy's step. `None`: from local models alone.
-    pub prediction: Option<Prediction>,
+    /// Keeps a copy of these tissues, and renders from it as soon as it is there: a tick then takes the time of the copy's step as
+    /// well. `None`: from local models alone.
+    pub copies: Option<Copies>,
 }
 
 impl fmt::Debug for Options {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Options { lasts, remembers, real_time, keeps_session, warn, begun, disable: _, prediction } = self;
+        let Options { lasts, remembers, real_time, keeps_session, warn, begun, disable: _, copies } = self;
         let mut fields = f.debug_struct("Options");
         fields.field("lasts", lasts).field("remembers", remembers).field("real_time", real_time);
         fields.field("keeps_session", keeps_session);
         fields.field("warn", &warn.is_some()).field("begun", &begun.is_some());
-        fields.field("prediction", &prediction.is_some()).finish()
+        fields.field("copies", &copies.is_some()).finish()
     }
 }
 
@@ -183,10 +183,10 @@ pub async fn run_told<D: HapticDevice + 'static>(
     options: Options,
     stop: impl Future<Output = ()> + Send + 'static,
 ) -> Result<(D, Report), Error> {
-    let Options { lasts, remembers, real_time, keeps_session, warn, begun, disable, prediction } = options;
+    let Options { lasts, remembers, real_time, keeps_session, warn, begun, disable, copies } = options;
     let descriptor = device.descriptor();
     let warn = Arc::new(warn);
-    let (ticker, mut line) = line(target, prediction, descriptor, Origin::Workspace, keeps_session, warn.clone(), stop);
+    let (ticker, mut line) = line(target, copies, descriptor, Origin::Workspace, keeps_session, warn.clone(), stop);
     let news = line.news.clone();
     let (tell, ended) = oneshot::channel();
     std::thread::Builder::new().name("device".to_owned()).spawn(move || {
@@ -232,7 +232,7 @@ fn silent() -> Error {
 /// Begins to connect.
 fn line(
     target: Target,
-    prediction: Option<Prediction>,
+    copies: Option<Copies>,
     device: Device,
     origin: Origin,
     keeps_session: bool,
@@ -249,7 +249,7 @@ fn line(
         async move {
             let warn = |message: &str| warn.iter().for_each(|warn| warn(message));
             tokio::select! {
-                () = line::keep(target, prediction, device, &shared, feed, commands, &warn) => {}
+                () = line::keep(target, copies, device, &shared, feed, commands, &warn) => {}
                 // The loop then finds that it is over.
                 () = stop => {}
             }
@@ -275,9 +275,9 @@ pub async fn begin(
     origin: Origin,
     options: Options,
 ) -> Result<(Ticker, Connection), Error> {
-    let Options { keeps_session, warn, prediction, .. } = options;
+    let Options { keeps_session, warn, copies, .. } = options;
     let (ticker, mut line) =
-        line(target, prediction, device, origin, keeps_session, Arc::new(warn), std::future::pending());
+        line(target, copies, device, origin, keeps_session, Arc::new(warn), std::future::pending());
     let (peek, news) = (ticker.peek(), line.news.clone());
     std::thread::Builder::new().name("courier".to_owned()).spawn(move || {
         while !peek.is_over() {

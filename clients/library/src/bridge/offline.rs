@@ -44,7 +44,7 @@ impl Offline {
 impl Record {
     /// A copy of the tissue arrives now, until another connection begins.
     pub fn predict(&mut self, copy: Box<dyn Predictor>) {
-        self.feed.predict(copy);
+        self.feed.predict(Some(copy));
     }
 
     /// What a server has sent on a haptic stream arrives now: the bytes of a `TouchResponse`. The next tick knows it. An

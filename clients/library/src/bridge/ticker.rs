@@ -8,7 +8,7 @@ use palpate_proto::{pb, touch};
 use palpate_touch::deadband::HEARTBEAT_S;
 use palpate_touch::news::News;
 use palpate_touch::renderer::MOST_LAWS;
-use palpate_touch::{Device, Envelope, Law, LocalModel, Predictor, Renderer, RenderingState};
+use palpate_touch::{Device, Envelope, Law, LocalModel, Prediction, Predictor, Renderer, RenderingState};
 use std::collections::VecDeque;
 
 use crate::Error;
@@ -32,8 +32,8 @@ enum Told {
     Begin { connection: u64, law: Law, middle_m: DVec3 },
     /// A further law of this connection, which is sound, and its number.
     Learn { number: u32, law: Law },
-    /// A copy of this connection's tissue.
-    Copy(Box<dyn Predictor>),
+    /// A copy of this connection's tissue; none if that has become another.
+    Copy(Option<Prediction>),
 }
 
 /// What a tick does not need any more, to be dropped elsewhere.
@@ -41,7 +41,7 @@ enum Used {
     #[allow(dead_code)] // Dropped.
     Law(Law),
     #[allow(dead_code)] // Dropped.
-    Copy(Box<dyn Predictor>),
+    Copy(Prediction),
 }
 
 /// What of a connection only counts as it is now.
@@ -175,8 +175,8 @@ impl Ticker {
     /// between ticks. Returns zero before the first connection.
     ///
     /// It takes a bounded time: no lock, no call of the system, no memory asked for or given back. With a copy of the tissue a tick
-    /// also does the copy's step. Ticks may be late, early or
-    /// left out: the envelope knows how long ago the last one was.
+    /// also does the copy's step, which may ask for memory. Ticks may be late, early or left out: the envelope knows how long ago the
+    /// last one was.
     pub fn tick(&mut self, reading: Reading, time_s: f64) -> DVec3 {
         let now_s = self.clock.at(time_s);
         self.is_fresh |= self.newest.refresh();
@@ -229,11 +229,11 @@ impl Ticker {
             let Some(told) = self.told.pop() else { return };
             let used = &mut self.used;
             // There is room.
-            let mut give_back = |law: Law| drop(used.push(Used::Law(law)));
+            let mut give_back = |value: Used| drop(used.push(value));
             match told {
                 Told::Begin { connection, law, middle_m } => {
-                    self.renderer.begin_with(law, give_back);
-                    self.renderer.predict(None).map(|copy| used.push(Used::Copy(copy)));
+                    self.renderer.begin_with(law, |law| give_back(Used::Law(law)));
+                    self.renderer.predict(None).into_iter().for_each(|copy| give_back(Used::Copy(copy)));
                     if self.connection == 0 {
                         self.renderer.envelope = Envelope::new(self.device, middle_m);
                     }
@@ -242,16 +242,16 @@ impl Ticker {
                     (self.connection, self.middle_m) = (connection, middle_m);
                 }
                 Told::Learn { number, law } => {
-                    self.renderer.learn_with(number, law, &mut give_back);
+                    self.renderer.learn_with(number, law, |law| give_back(Used::Law(law)));
                 }
                 Told::Copy(copy) => {
-                    self.renderer.predict(Some(copy)).map(|copy| used.push(Used::Copy(copy)));
+                    self.renderer.predict(copy).into_iter().for_each(|copy| give_back(Used::Copy(copy)));
                 }
             }
         }
     }
 
-    /// How many ticks were rendered from a copy of the tissue ([`super::Options::prediction`]).
+    /// How many ticks were rendered from a copy of the tissue ([`super::Options::copies`]).
     pub fn predicted(&self) -> u64 {
         self.renderer.predicted()
     }
@@ -334,18 +334,20 @@ impl Feed {
     pub(super) fn learn(&mut self, message: &pb::ForceLaw) -> Result<(), Error> {
         let law = law(message)?;
         self.waiting.push_back(Told::Learn { number: message.number, law });
-        if self.waiting.len() > MOST_LAWS {
-            // The first may be the beginning.
-            let first = self.waiting.iter().position(|told| matches!(told, Told::Learn { .. }));
+        let is_law = |told: &Told| matches!(told, Told::Learn { .. });
+        if self.waiting.iter().filter(|told| is_law(told)).count() > MOST_LAWS {
+            let first = self.waiting.iter().position(is_law);
             first.and_then(|first| self.waiting.remove(first));
         }
         self.pass_on();
         Ok(())
     }
 
-    /// A copy of the connection's tissue.
-    pub(super) fn predict(&mut self, copy: Box<dyn Predictor>) {
-        self.waiting.push_back(Told::Copy(copy));
+    /// A copy of the connection's tissue; none if that has become another.
+    pub(super) fn predict(&mut self, copy: Option<Box<dyn Predictor>>) {
+        // Only the newest counts.
+        self.waiting.retain(|told| !matches!(told, Told::Copy(_)));
+        self.waiting.push_back(Told::Copy(copy.map(Prediction::new)));
         self.pass_on();
     }
 

@@ -3,10 +3,10 @@
 use std::sync::Arc;
 
 use glam::DVec3;
-use palpate::session::prediction::Prediction;
+use palpate::session::prediction::TissueCopy;
 use palpate::sheet::Model;
 use palpate_touch::envelope::{Envelope, Wanted};
-use palpate_touch::{Law, LocalModel, Predicted, Predictor, Renderer, Tip};
+use palpate_touch::{Law, LocalModel, Predicted, Prediction, Predictor, Renderer, Tip};
 
 use super::setup::{Rendering, Setup, TICK_S};
 use super::spot::Spot;
@@ -20,13 +20,13 @@ pub(super) enum Client {
 
 /// A copy of the tissue, as the hand sees it.
 struct Copied {
-    tissue: Prediction,
+    tissue: TissueCopy,
     spot: Spot,
 }
 
 impl Copied {
     fn new(model: &Arc<Model>, tip: Tip, spot: Spot) -> Self {
-        Copied { tissue: Prediction::new(model, tip), spot }
+        Copied { tissue: TissueCopy::new(model, tip), spot }
     }
 }
 
@@ -59,7 +59,7 @@ impl Client {
     /// Takes a copy of a tissue, if it renders from one.
     pub(super) fn copy(&mut self, setup: &Setup, model: &Arc<Model>) {
         if let (Client::Model(renderer), Rendering::Prediction) = (self, setup.scheme) {
-            renderer.predict(Some(Box::new(Copied::new(model, setup.tip, setup.spot))));
+            renderer.predict(Some(Prediction::new(Box::new(Copied::new(model, setup.tip, setup.spot)))));
         }
     }
 

@@ -70,8 +70,7 @@ pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failur
     let lasts = Some(Duration::from_secs_f64(*duration_s));
     let when = if setup.scheme == Rendering::Prediction { When::Always } else { When::Never };
     let warn_all: Option<Warn> = Some(Box::new(warn));
-    let options =
-        Options { lasts, remembers: true, warn: warn_all, prediction: when.prediction(), ..Options::default() };
+    let options = Options { lasts, remembers: true, warn: warn_all, copies: when.copies(), ..Options::default() };
     let (Laid { device: simulated, .. }, mut served) = bridge::run(laid, target, options, interrupted()).await?;
     if let Some(error) = &served.lost {
         warn(&error.to_string());
