@@ -97,8 +97,8 @@ fn main() {
     );
     report.say(
         "**What virtual time shows.** The truth is a twin of the tissue at the tool's own place. The copy has the same tissue and the \
-         same places, so without anybody else it is the twin, bit by bit: 0 there says that nothing is lost on the way, not that a \
-         network costs nothing. What is left shows where something is not the same: places that the server got late or not at all, \
+         same places, so without anybody else it is the twin, bit by bit: what is left there is of the corrections, not what a \
+         network costs. What is left shows where something is not the same: places that the server got late or not at all, \
          a second tool, a tissue that changes, real time.",
     );
     // Before anything else is busy.

@@ -13,7 +13,7 @@ use crate::sheet::Model;
 /// The tool of a copy.
 const TOOL: u32 = 0;
 
-/// What a copy's steps may take in a millisecond, in points times substeps: some 0.3 ms.
+/// What a copy's steps may take in a millisecond, in points times substeps: up to 1 ms with a tip on it.
 pub const TICK_POINT_SUBSTEPS: u64 = 100_000;
 
 /// A client's usual tick, s.

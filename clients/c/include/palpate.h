@@ -305,7 +305,7 @@ typedef struct palpate_touch_options {
   /**
    * Of which tissues to keep a copy, which the loop simulates, so that forces come without the delay of the network; samples
    * correct them. 0: none; 1: meshes, over whose rims, folds and lumps nothing else knows what comes next; 2: any. With a copy
-   * a tick also does the copy's step: a tenth of a millisecond is usual, and it may ask for memory. 0.
+   * a tick also does the copy's step: some tenths of a millisecond are usual, and it may ask for memory. 0.
    */
   uint32_t prediction;
 } palpate_touch_options;

@@ -82,7 +82,7 @@ enum Command {
         Errors are taken over the ticks in which either is in contact. Energies are measured at the device's port: below 0 \
         the port has given energy. A run is unstable, and ends, when the port gave 0.1 J or the tool left three times the \
         task's amplitude. The loop runs the code of the server and of `bridge` itself.\n\n\
-        With `prediction` the client's copy is that same tissue. Where nothing else acts and nothing is lost, its error is 0 \
+        With `prediction` the client's copy is that same tissue. Where nothing else acts and nothing is lost, it hardly errs \
         by that; loss, jitter, a second tool, a change of the tissue and --server show what it is worth.\n\n\
         Exit status: 0; 1 when a run failed; 2 when an input was refused, or the system has no memory for the sheet.")]
     Link(Box<link::Arguments>),
