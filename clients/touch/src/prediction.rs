@@ -31,6 +31,9 @@ const BETTER: f64 = 2.0;
 /// A copy that is off by no more than this part of the force is rendered in any case.
 const NEAR: f64 = 0.05;
 
+/// A forecast for a moment is one of no more than this before and after it, s.
+const GAP_S: f64 = 0.02;
+
 /// What a tool feels in a copy of the tissue.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Predicted {
@@ -70,9 +73,6 @@ impl Forecast {
         }
     }
 }
-
-/// A forecast for a moment is one of no more than this before and after it, s.
-const GAP_S: f64 = 0.02;
 
 /// Forecasts that are kept: two seconds at 1 kHz.
 const KEPT: usize = 2048;
@@ -126,11 +126,12 @@ impl Prediction {
         let after = self.past.partition_point(|past| !is_after(past.time_s, time_s));
         // A sample of before the copy's time, or of long ago.
         let Some(before) = after.checked_sub(1).and_then(|at| self.past.get(at)) else { return };
-        let next = self.past.get(after).unwrap_or(before);
-        if time_s - before.time_s > GAP_S || next.time_s - time_s > GAP_S {
+        let next = self.past.get(after);
+        if time_s - before.time_s > GAP_S || next.is_some_and(|next| next.time_s - time_s > GAP_S) {
             return;
         }
-        let then = before.towards(next, time_s);
+        // Of the newest moment there is nothing later.
+        let then = next.map_or(*before, |next| before.towards(next, time_s));
         let truth_n = truth_n(then.place_m);
         self.error_n = Some((truth_n - then.copy_n, then.copy_n.length()));
         // A server that hears nothing tells of the same moment again.
