@@ -5,17 +5,14 @@
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
 
+mod links;
 #[path = "../tests/common/proxy.rs"]
 mod proxy;
 mod report;
 #[path = "../tests/common/server.rs"]
 mod server;
 
-use std::path::PathBuf;
-use std::process::Command;
-use std::sync::Mutex;
-use std::sync::atomic::{AtomicUsize, Ordering};
-
+use links::{by_seed, link, links, number};
 use palpate::limits::Limits;
 use palpate::scene::{BUILT_IN, Scene};
 use palpate::sheet::{Model, tangent};
@@ -25,51 +22,6 @@ use serde_json::{Value, json};
 
 const SCHEMES: [&str; 3] = ["model", "hold", "raw"];
 const ROUND_TRIPS_MS: [f64; 7] = [0.5, 2.0, 10.0, 20.0, 50.0, 100.0, 200.0];
-
-/// The program that `make bench-link` has built.
-fn program() -> PathBuf {
-    PathBuf::from(env!("CARGO_BIN_EXE_palpate")).with_file_name("palpate-client")
-}
-
-fn link(arguments: &[String]) -> Value {
-    let output = Command::new(program()).arg("link").args(arguments).arg("--json").output().unwrap();
-    let told = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "link {arguments:?}: {told}");
-    serde_json::from_slice(&output.stdout).unwrap()
-}
-
-/// Performs all runs on all processors; results are in order.
-fn links(runs: &[Vec<String>]) -> Vec<Value> {
-    let next = AtomicUsize::new(0);
-    let results = Mutex::new(vec![Value::Null; runs.len()]);
-    std::thread::scope(|scope| {
-        for _ in 0..std::thread::available_parallelism().map_or(1, usize::from) {
-            scope.spawn(|| {
-                while let Some((at, run)) = {
-                    let at = next.fetch_add(1, Ordering::Relaxed);
-                    runs.get(at).map(|run| (at, run))
-                } {
-                    let found = link(run);
-                    results.lock().unwrap()[at] = found;
-                }
-            });
-        }
-    });
-    results.into_inner().unwrap()
-}
-
-fn words(text: &str) -> Vec<String> {
-    text.split_whitespace().map(str::to_owned).collect()
-}
-
-/// The same run with each of so many seeds.
-fn by_seed(run: &str, seeds: u64) -> Vec<Vec<String>> {
-    (1..=seeds).map(|seed| words(&format!("{run} --seed {seed}"))).collect()
-}
-
-fn number(value: &Value) -> f64 {
-    value.as_f64().unwrap_or(f64::NAN)
-}
 
 /// Merges several seeds: means, and the worst case where a mean says little.
 fn merged(runs: &[Value], name: &str) -> f64 {
@@ -143,7 +95,7 @@ fn main() {
 }
 
 fn boundary(report: &mut Report) {
-    let found = link(&words("--boundary"));
+    let found = link("--boundary");
     let rows = found.as_array().unwrap();
     let apart = |row: &Value| (number(&row["predicted_ms"]) - number(&row["observed_ms"])).abs();
     let most = rows.iter().map(apart).fold(0.0, f64::max);
@@ -216,7 +168,7 @@ fn delays(report: &mut Report, seeds: u64) -> Vec<Panel> {
         for rtt in ROUND_TRIPS_MS {
             for scheme in SCHEMES {
                 for seed in 1..=seeds {
-                    runs.push(words(&format!("--scene {scene} --rtt-ms {rtt} --scheme {scheme} --seed {seed}")));
+                    runs.push(format!("--scene {scene} --rtt-ms {rtt} --scheme {scheme} --seed {seed}"));
                 }
             }
         }
@@ -319,7 +271,7 @@ fn live(report: &mut Report) {
             let proxy = runtime.block_on(proxy::Proxy::start(target, delay));
             let ways = [("real", format!("--server {}", proxy.url())), ("virtual", format!("--rtt-ms {rtt_ms}"))];
             for (time, way) in ways {
-                let found = link(&words(&format!("--scene {scene} --seconds {seconds} --seed 1 {way}")));
+                let found = link(&format!("--scene {scene} --seconds {seconds} --seed 1 {way}"));
                 let mut row =
                     row(&cells([scene.to_owned(), rtt_ms.to_string(), time.to_owned()]), std::slice::from_ref(&found));
                 row.push(found["late_ticks"].as_u64().map_or("–".to_owned(), |ticks| ticks.to_string()));
@@ -489,7 +441,7 @@ const ORGANS: [(&str, &str); 5] = [
 fn random(report: &mut Report) {
     let runs = if quick() { 20 } else { 1000 };
     report.heading("Random combinations");
-    let found = link(&words(&format!("--random {runs} --seconds 5")));
+    let found = link(&format!("--random {runs} --seconds 5"));
     report.say(&format!(
         "`palpate-client link --random {runs} --seconds 5`: scene, hand, device, task and place, network and transport, deadbands, \
          a second tool and a change of the tissue drawn by seed, {} unstable. Worst of each figure, and whose it is:",

@@ -3,19 +3,18 @@
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
 
+mod links;
 #[path = "../tests/common/proxy.rs"]
 mod proxy;
 mod report;
 #[path = "../tests/common/server.rs"]
 mod server;
 
-use std::path::PathBuf;
-use std::process::Command;
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use glam::DVec3;
+use links::{by_seed, link, links, number};
 use palpate::limits::Limits;
 use palpate::scene::{BUILT_IN, Scene};
 use palpate::session::prediction::TissueCopy;
@@ -40,18 +39,6 @@ const PLACES: [(&str, &str, &str); 5] = [
     ("colon", "colon", ""),
 ];
 
-fn link(arguments: &str) -> Value {
-    let program = PathBuf::from(env!("CARGO_BIN_EXE_palpate")).with_file_name("palpate-client");
-    let output = Command::new(program).arg("link").args(arguments.split_whitespace()).arg("--json").output().unwrap();
-    let told = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "link {arguments}: {told}");
-    serde_json::from_slice(&output.stdout).unwrap()
-}
-
-fn number(found: &Value, name: &str) -> f64 {
-    found[name].as_f64().unwrap_or(f64::NAN)
-}
-
 /// What of a run the tables show.
 const COLUMNS: [(&str, &str); 6] = [
     ("force error, % RMS", "force_error_rms_percent"),
@@ -73,7 +60,7 @@ fn header(label: &[&str]) -> Vec<String> {
 fn row(label: &[&str], runs: &[Value]) -> Vec<String> {
     let mut row = cells(label);
     for (_, name) in COLUMNS {
-        let values = runs.iter().map(|run| number(run, name));
+        let values = runs.iter().map(|run| number(&run[name]));
         row.push(digits(match name {
             "energy_min_j" => values.fold(f64::INFINITY, f64::min),
             "jump_max_n" => values.fold(0.0, f64::max),
@@ -81,8 +68,8 @@ fn row(label: &[&str], runs: &[Value]) -> Vec<String> {
         }));
     }
     let [predicted, all] = [
-        runs.iter().map(|run| number(run, "predicted_ticks")).sum::<f64>(),
-        runs.iter().map(|run| 1e3 * number(run, "seconds")).sum::<f64>(),
+        runs.iter().map(|run| number(&run["predicted_ticks"])).sum::<f64>(),
+        runs.iter().map(|run| 1e3 * number(&run["seconds"])).sum::<f64>(),
     ];
     row.push(format!("{:.0} %", 100.0 * predicted / all));
     row
@@ -111,38 +98,17 @@ fn main() {
     report.write(2, &panels);
 }
 
-/// Each of these runs with so many seeds, on all processors: it is virtual time.
-fn all(runs: &[String], seeds: usize) -> Vec<Vec<Value>> {
-    let wanted: Vec<String> =
-        runs.iter().flat_map(|run| (1..=seeds).map(move |seed| format!("{run} --seed {seed}"))).collect();
-    let (next, found) = (AtomicUsize::new(0), Mutex::new(vec![Value::Null; wanted.len()]));
-    std::thread::scope(|scope| {
-        for _ in 0..std::thread::available_parallelism().map_or(1, usize::from) {
-            scope.spawn(|| {
-                while let Some((at, run)) = {
-                    let at = next.fetch_add(1, Ordering::Relaxed);
-                    wanted.get(at).map(|run| (at, run))
-                } {
-                    let figures = link(run);
-                    found.lock().unwrap()[at] = figures;
-                }
-            });
-        }
-    });
-    found.into_inner().unwrap().chunks(seeds).map(<[Value]>::to_vec).collect()
-}
-
 /// A table of what was run by each scheme.
-fn table(report: &mut Report, label: &str, name: &'static str, runs: &[(&str, String)], seeds: usize) {
-    let of = |run: &(&str, String)| SCHEMES.map(|scheme| format!("{} --scheme {scheme}", run.1));
-    let found = all(&runs.iter().flat_map(of).collect::<Vec<_>>(), seeds);
-    let labels = runs.iter().flat_map(|(title, _)| SCHEMES.map(|scheme| [*title, scheme]));
-    let rows: Vec<_> = labels.zip(&found).map(|(label, found)| row(&label, found)).collect();
-    report.table(&header(&[label, "scheme"]), &rows);
-    report.figure(name, Value::Array(found.into_iter().flatten().collect()));
+fn table(report: &mut Report, label: &str, name: &'static str, runs: &[(&str, String)], seeds: u64) {
+    let each = || runs.iter().flat_map(|(title, run)| SCHEMES.map(|scheme| (*title, run, scheme)));
+    let all: Vec<_> = each().flat_map(|(_, run, scheme)| by_seed(&format!("{run} --scheme {scheme}"), seeds)).collect();
+    let found = links(&all);
+    let rows = each().zip(found.chunks(seeds as usize)).map(|((title, _, scheme), runs)| row(&[title, scheme], runs));
+    report.table(&header(&[label, "scheme"]), &rows.collect::<Vec<_>>());
+    report.figure(name, Value::Array(found));
 }
 
-fn places(report: &mut Report, seeds: usize) {
+fn places(report: &mut Report, seeds: u64) {
     report.heading("A constant delay of 50 ms, datagrams");
     let run = |(title, scene, place): &(&'static str, &str, &str)| {
         (*title, format!("--scene {scene} {place} --transport datagram --rtt-ms {ROUND_TRIP_MS}"))
@@ -151,7 +117,7 @@ fn places(report: &mut Report, seeds: usize) {
 }
 
 /// What makes the copy another tissue than the server's.
-fn disturbed(report: &mut Report, seeds: usize) {
+fn disturbed(report: &mut Report, seeds: u64) {
     report.heading("Where the copy is not the whole truth: liver-organ");
     report.say(
         "A second tool presses by a task of its own. The tissue changes after 10 s to springs of half as much stiffness again; its \

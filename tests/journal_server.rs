@@ -373,11 +373,8 @@ async fn a_snapshot_is_a_journal_of_one_moment_and_goes_on_at_another_server() {
     server.start_until(&id, 77).await;
     let hash = server.hash_at(&id, 77).await;
     let request = pb::SaveSnapshotRequest { session_id: id.clone() };
-    let mut parts = server.sessions().await.save_snapshot(request).await.unwrap().into_inner();
-    let mut bytes = Vec::new();
-    while let Some(message) = parts.message().await.unwrap() {
-        bytes.extend_from_slice(&message.part);
-    }
+    let parts = server.sessions().await.save_snapshot(request).await.unwrap().into_inner();
+    let bytes = palpate_client::snapshot::collect(parts).await.unwrap();
     let reader = palpate::journal::Reader::new("snapshot", std::io::Cursor::new(&bytes)).unwrap();
     let (session, _) = palpate::journal::session_at(reader, &Limits::default(), 77, &NEVER).unwrap();
     assert_eq!(format!("{:032x}", session.tissue().state_hash()), hash);

@@ -15,6 +15,7 @@ use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::scene::profile::Poke;
 use palpate::scene::{Integrator, Named, Scene};
+use palpate::sheet::guard::INTERVAL_SUBSTEPS;
 use palpate::sheet::{self, Grasp, Model, Push, Tissue};
 use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
@@ -23,9 +24,6 @@ use proptest::test_runner::{Config, TestRunner};
 /// work: the margin of the guard, which checks every 256 substeps, and the error of estimating the work of held
 /// positions.
 const MARGIN: f64 = 0.1;
-
-/// The guard looks once in so many substeps, so at least once in so many steps.
-const GUARD_SUBSTEPS: u32 = 256;
 
 /// Ten to the power of something in a range.
 fn decades(from: f64, to: f64) -> impl Strategy<Value = f64> {
@@ -145,9 +143,10 @@ fn play(text: &str, acts: &[Act]) -> Result<(), TestCaseError> {
         prop_assert!(all_finite(&*tissue), "after, window {window}");
         let most_j = before_j * (1.0 + MARGIN) + 1e-18;
         let mut now_j = energy_j(&*tissue);
-        // Since the guard has looked last, energy may have appeared. It does not outlast the next look: the guard goes back.
+        // Since the guard has looked last, energy may have appeared. It does not outlast the next look, which comes within as many
+        // steps: the guard goes back.
         if now_j > most_j {
-            for _ in 0..GUARD_SUBSTEPS {
+            for _ in 0..INTERVAL_SUBSTEPS {
                 if tissue.step().is_err() {
                     prop_assert!(all_finite(&*tissue));
                     return Ok(());

@@ -52,13 +52,13 @@ impl TissueCopy {
     /// come a little early or late have one each. None: too much is awake for that.
     fn step_to(&mut self, now_s: f64, place_m: DVec3) -> Option<()> {
         let step_s = self.session.model().scene.stepping.rate_hz.recip();
-        let begins_s = now_s - step_s - self.session.time_s();
-        let ahead_s = *self.ahead_s.get_or_insert(begins_s);
-        let mut behind_s = now_s - ahead_s - self.session.time_s();
-        if self.session.step_count() == 0 || behind_s > MOST_BEHIND_S.max(2.0 * step_s) {
+        let time_s = self.session.time_s();
+        let behind_s = self.ahead_s.map(|ahead_s| now_s - ahead_s - time_s);
+        let behind_s = behind_s.filter(|behind_s| *behind_s <= MOST_BEHIND_S.max(2.0 * step_s)).unwrap_or_else(|| {
             // The tool goes there at once; no tool leaps farther than its largest speed lets it.
-            (self.ahead_s, self.place_m, behind_s) = (Some(begins_s), place_m, step_s);
-        }
+            (self.ahead_s, self.place_m) = (Some(now_s - step_s - time_s), place_m);
+            step_s
+        });
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
         let steps = (behind_s / step_s).round() as u32;
         for step in 1..=steps {

@@ -798,8 +798,8 @@ enum palpate_result palpate_touch_begin(const struct palpate_session *session,
 
 /**
  * A loop over what was recorded, without a server: the same messages, positions and times give the same forces, bit by bit.
- * It has no copy of the tissue, whatever `prediction` says. `options` may be null; `middle_m` is the middle of the tissue, in Palpate's own axes. Writes a handle for
- * `palpate_touch_end`. Any thread.
+ * It has no copy of the tissue, whatever `prediction` says. `options` may be null; `middle_m` is the middle of the tissue, in
+ * Palpate's own axes. Writes a handle for `palpate_touch_end`. Any thread.
  */
 enum palpate_result palpate_touch_begin_offline(const struct palpate_touch_options *options,
                                                 struct palpate_vector middle_m,

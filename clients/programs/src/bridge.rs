@@ -119,8 +119,7 @@ pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
     // Last, so that what is refused is refused before a device moves.
     let device = Placed::new(device(arguments)?, placement)?;
     let (remembers, keeps_session) = (arguments.course.is_some(), arguments.keep_session);
-    let copies = arguments.prediction.copies();
-    let warn: Option<Warn> = Some(Box::new(warn));
+    let (warn, copies) = (Some(Box::new(warn) as Warn), arguments.prediction.copies());
     let options = Options { lasts, remembers, keeps_session, warn, copies, ..Options::default() };
     let (_, served) = run(device, target, options, interrupted()).await?;
     if let Some(path) = &arguments.course {

@@ -338,15 +338,15 @@ async fn connect(
             heard = tokio::time::timeout(SILENCE, stream.next()) => {
                 match heard.map_err(silent)??.ok_or_else(|| broken("the server has ended the stream"))? {
                     Heard::ForceLaw(update) => {
-                        if update.tissue_step.is_some() {
+                        let is_other_tissue = update.tissue_step.is_some();
+                        if is_other_tissue {
                             feed.predict(None);
                             copying.begin();
                         }
                         match update.law {
                             Some(message) => feed.learn(&message)?,
                             None => {
-                                let stays =
-                                    if update.tissue_step.is_some() { "that of the old tissue" } else { "a coarse one" };
+                                let stays = if is_other_tissue { "that of the old tissue" } else { "a coarse one" };
                                 warn(&format!("the force law stays {stays}: {} ({})", update.message, update.reason));
                             }
                         }

@@ -6,7 +6,7 @@ use glam::DVec3;
 use palpate::session::prediction::TissueCopy;
 use palpate::sheet::Model;
 use palpate_touch::envelope::{Envelope, Wanted};
-use palpate_touch::{Law, LocalModel, Predicted, Prediction, Predictor, Renderer, Tip};
+use palpate_touch::{Law, LocalModel, Predicted, Prediction, Predictor, Renderer};
 
 use super::setup::{Rendering, Setup, TICK_S};
 use super::spot::Spot;
@@ -22,12 +22,6 @@ pub(super) enum Client {
 struct Copied {
     tissue: TissueCopy,
     spot: Spot,
-}
-
-impl Copied {
-    fn new(model: &Arc<Model>, tip: Tip, spot: Spot) -> Self {
-        Copied { tissue: TissueCopy::new(model, tip), spot }
-    }
 }
 
 impl Predictor for Copied {
@@ -59,7 +53,8 @@ impl Client {
     /// Takes a copy of a tissue, if it renders from one.
     pub(super) fn copy(&mut self, setup: &Setup, model: &Arc<Model>) {
         if let (Client::Model(renderer), Rendering::Prediction) = (self, setup.scheme) {
-            renderer.predict(Some(Prediction::new(Box::new(Copied::new(model, setup.tip, setup.spot)))));
+            let copied = Copied { tissue: TissueCopy::new(model, setup.tip), spot: setup.spot };
+            renderer.predict(Some(Prediction::new(Box::new(copied))));
         }
     }
 

@@ -69,8 +69,8 @@ pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failur
     };
     let lasts = Some(Duration::from_secs_f64(*duration_s));
     let when = if setup.scheme == Rendering::Prediction { When::Always } else { When::Never };
-    let warn_all: Option<Warn> = Some(Box::new(warn));
-    let options = Options { lasts, remembers: true, warn: warn_all, copies: when.copies(), ..Options::default() };
+    let (told, copies) = (Some(Box::new(warn) as Warn), when.copies());
+    let options = Options { lasts, remembers: true, warn: told, copies, ..Options::default() };
     let (Laid { device: simulated, .. }, mut served) = bridge::run(laid, target, options, interrupted()).await?;
     if let Some(error) = &served.lost {
         warn(&error.to_string());
