@@ -118,6 +118,7 @@ impl<T: Real> Sheet<T> {
     fn substep(&mut self, moment: Moment, end: f64) {
         let far = self.tiles.farthest_unnoticed(&self.model.scene);
         self.tiles.wake_beside_moved(&self.state.u, far);
+        self.wake_what_is_moved(moment, end, far);
         if self.tables.pressure.is_some() {
             let growth = self.press();
             self.wake_what_is_pressed(growth, far);

@@ -7,6 +7,7 @@ use super::stability;
 use super::survey::{Forces, Survey, Write};
 use super::tissue::Energy;
 use crate::scene::Precision;
+use crate::scene::profile::Moment;
 
 impl<T: Real> Sheet<T> {
     /// Wakes tiles whose force changes in the coming step.
@@ -22,6 +23,20 @@ impl<T: Real> Sheet<T> {
             }
             let least_n = model.scene.virtual_stiffness_n_per_m * tiles.farthest_unnoticed(&model.scene) * spacing_m;
             tiles.pushed(&change, spacing_m, least_n);
+        }
+    }
+
+    /// Wakes tiles around grasped points that tools move by more than `far` spacings in the substep from `moment` to the fraction
+    /// `end` of the step. The points beside a sleeping tile are compared between substeps only (`tiles`): a scheme of several
+    /// sweeps would pull at it where the tool was before.
+    pub(super) fn wake_what_is_moved(&mut self, moment: Moment, end: f64, far: f64) {
+        let Sheet { model, tables, state, prescribed, tiles, .. } = self;
+        for (index, displacement_m, _) in prescribed.at(model, moment.step, end) {
+            let at = tables.layout.offset(index);
+            let moves = |c: usize| displacement_m[c] / model.unit_m - state.u[c * tables.layout.plane + at].wide();
+            if (0..3).any(|c| moves(c).abs() > far) {
+                tiles.wake_around(model.point_of(index));
+            }
         }
     }
 

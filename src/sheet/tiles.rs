@@ -8,8 +8,9 @@
 //! **Waking.** A sleeping tile remembers where the points around it were when it fell asleep, and wakes when one of
 //! them is more than ε_w from there. (A comparison with the step before would miss a slow creep.) ε_w is ε, or less
 //! where springs are much stiffer than the virtual ones and so pass on more of an omitted force. A tile also wakes when
-//! the tools' force on it may have changed by more than ε_w·K″ since (`rest`), or the pressure (`swelling`), when a point of it is grasped (`motion`), and
-//! when a position-controlled tool pushes on it (`touch`). All tiles wake when the tissue changes (`change`), after a
+//! the tools' force on it may have changed by more than ε_w·K″ since (`rest`), or the pressure (`swelling`), when a point of it is
+//! grasped (`motion`), or one that its springs reach is moved by its tool by more than ε_w in a substep (`rest`; a scheme of several
+//! sweeps sees that within the substep), and when a position-controlled tool pushes on it (`touch`). All tiles wake when the tissue changes (`change`), after a
 //! recovery (`recovery`), and when the guard goes back to a checkpoint (`guard`).
 //!
 //! **Cost.** A step's cost follows what is awake, not the size of the sheet: sets of tiles are lists, memory that nothing has
@@ -448,6 +449,18 @@ impl<T: Real> SleepTiles<T> {
     pub(super) fn wake_under(&mut self, points: impl IntoIterator<Item = [usize; 2]>) {
         let columns = self.counts[1];
         self.wake(points.into_iter().map(|[i, j]| i / TILE * columns + j / TILE));
+    }
+
+    /// Wakes the tile of a point and those that its springs reach into.
+    pub(super) fn wake_around(&mut self, point: [usize; 2]) {
+        if let Some(graph) = self.graph.clone() {
+            let tile = self.of(point);
+            return self.wake(graph.beside(tile).chain([tile]));
+        }
+        let Layout { rows, columns, .. } = self.layout;
+        let [i, j] = [(point[0], rows), (point[1], columns)]
+            .map(|(at, count)| [at.saturating_sub(self.reach), (at + self.reach).min(count - 1)]);
+        self.wake_under([[i[0], j[0]], [i[0], j[1]], [i[1], j[0]], [i[1], j[1]]]);
     }
 
     pub(super) fn wake_all(&mut self) {
