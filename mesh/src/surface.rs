@@ -343,8 +343,27 @@ pub struct Covered {
 const WAYS: [usize; 2] = [48, 192];
 const WAYS_PER_EDGE: f64 = 32.0;
 
-/// The radius of the disc that hats are averaged over is at least this part of the disc's own.
+/// The radius of the disc that hats are averaged over is at least this part of the disc's own, where it is matched to its area.
 const LEAST_PART: f64 = 0.05;
+
+/// A disc that folds so much that its middle moves less than this part of the area that its place moves over has no normal to
+/// rely on. A cylinder's is 0.72 where the disc reaches half around it, 0.18 where it meets itself, and turns over beyond; a
+/// sphere's is 0.41 at the equator.
+const LEAST_SPAN: f64 = 0.25;
+
+/// A disc may cover this part of its area a second time: more, and it meets itself, or wraps an end. (On a sphere, straight ways
+/// crowd: 8 % at an angle of 1, 17 % at 1.5.)
+const MOST_OVERLAP: f64 = 0.2;
+
+/// Ways that are farther apart at the rim than this part of an edge can't tell how often they cover a vertex.
+const DENSE: f64 = 0.4;
+
+/// A disc of a larger radius, in edges, is first tried at half of it, and so on down.
+const STAGE_EDGES: f64 = 4.0;
+const MOST_STAGES: u32 = 20;
+
+/// Times that the search for the largest plain disc halves its interval.
+const HALVINGS: u32 = 16;
 
 /// A disc of given radius that can be laid anywhere on a surface.
 ///
@@ -352,9 +371,16 @@ const LEAST_PART: f64 = 0.05;
 /// area that matters is 1/Σ(w²/A): a foundation of k N/m³ resists with k times that area. So the hats are averaged over a
 /// smaller disc whose area in that sense is πa², found anew for each place. Along a way, hats change linearly within each
 /// triangle and are integrated exactly; over the directions of the ways the sum is a mean of equal parts.
+///
+/// On a part that is thinner than the disc, straight ways lead around it: they meet on its far side, or wrap its end. Such a
+/// disc has no place and no normal. It is made smaller until it is plain: it covers hardly anything twice, and its middle
+/// moves with its place ([`LEAST_SPAN`]). On the end of a thread that is next to a point.
 #[derive(Debug, Clone)]
 pub struct Disc {
     radius_m: f64,
+    edge_m: f64,
+    /// ρ, that of the disc that hats are averaged over where it lies.
+    drawn_m: f64,
     directions: Vec<DVec2>,
     /// The crossings of all ways, with places in `covered` for vertices; and where those of each way end.
     crossings: Vec<Part>,
@@ -413,6 +439,8 @@ impl Disc {
         };
         Disc {
             radius_m,
+            edge_m,
+            drawn_m: radius_m,
             directions: (0..count).map(direction).collect(),
             crossings: Vec::new(),
             ends: Vec::new(),
@@ -441,9 +469,29 @@ impl Disc {
         }
     }
 
+    /// How far it may move at once, so that its normal turns little on the way, m: half the radius of the disc that hats are
+    /// averaged over, or a quarter of an edge.
+    pub fn stride_m(&self) -> f64 {
+        0.5 * self.drawn_m.max(0.5 * self.edge_m)
+    }
+
     /// Lays the disc on a place.
     pub fn lay(&mut self, surface: &Surface, place: &Place) {
-        self.trace(surface, place);
+        // Around a thin part ways go on and on: a large disc is tried from a small one on.
+        let mut stages = 0;
+        while self.radius_m / f64::from(1 << stages) > STAGE_EDGES * self.edge_m && stages < MOST_STAGES {
+            stages += 1;
+        }
+        for stage in (1..=stages).rev() {
+            let reach_m = self.radius_m / f64::from(1 << stage);
+            self.trace(surface, place, reach_m);
+            self.weigh(reach_m, 1.0);
+            self.incline(reach_m);
+            if !self.is_plain(surface, reach_m) {
+                return self.shrink(surface, reach_m);
+            }
+        }
+        self.trace(surface, place, self.radius_m);
         let target_m2 = std::f64::consts::PI * self.radius_m * self.radius_m;
         // The radius ρ at which Σ(w²/A)·πa² is 1. It falls with ρ; Newton's method, kept between two bounds.
         let (mut low, mut high) = (LEAST_PART * self.radius_m, self.radius_m);
@@ -475,6 +523,10 @@ impl Disc {
             }
         }
         self.incline(rho_m);
+        self.drawn_m = rho_m;
+        if !self.is_plain(surface, rho_m) {
+            return self.shrink(surface, rho_m);
+        }
         if is_matched && slope < 0.0 {
             // ρ changes with the place as well.
             let mut change = DVec2::ZERO;
@@ -488,16 +540,48 @@ impl Disc {
         }
     }
 
-    /// Follows all ways to the full radius.
-    fn trace(&mut self, surface: &Surface, place: &Place) {
+    /// Whether the disc of radius ρ, as it is weighed and inclined, covers hardly anything twice, and moves with its place.
+    fn is_plain(&self, surface: &Surface, rho_m: f64) -> bool {
+        let (mut along, mut twice_m2) = ([DVec3::ZERO; 2], 0.0);
+        let area_m2 = std::f64::consts::PI * rho_m * rho_m;
+        for (covered, of_vertex_m2) in self.covered.iter().zip(&self.areas_m2) {
+            let at_m = surface.vertices_m[covered.vertex as usize];
+            along[0] += covered.gradient.x * at_m;
+            along[1] += covered.gradient.y * at_m;
+            twice_m2 += (covered.weight * area_m2 - of_vertex_m2).max(0.0);
+        }
+        #[allow(clippy::cast_precision_loss)]
+        let apart_m = std::f64::consts::TAU * rho_m / self.directions.len() as f64;
+        let is_told = apart_m < DENSE * self.edge_m;
+        along[0].cross(along[1]).length() >= LEAST_SPAN && !(is_told && twice_m2 > MOST_OVERLAP * area_m2)
+    }
+
+    /// Makes the disc the largest plain one below ρ: a point, next to, if there is none.
+    fn shrink(&mut self, surface: &Surface, rho_m: f64) {
+        let (mut low, mut high) = (0.0, rho_m);
+        for _ in 0..HALVINGS {
+            let middle = 0.5 * (low + high);
+            self.weigh(middle, 1.0);
+            self.incline(middle);
+            if self.is_plain(surface, middle) { low = middle } else { high = middle }
+        }
+        // Half of the shortest interval is a plain disc within its triangle, as good as a point.
+        let rho_m = if low > 0.0 { low } else { high };
+        self.weigh(rho_m, 1.0);
+        self.incline(rho_m);
+        self.drawn_m = rho_m;
+    }
+
+    /// Follows all ways to a radius.
+    fn trace(&mut self, surface: &Surface, place: &Place, reach_m: f64) {
         self.crossings.clear();
         self.ends.clear();
         self.covered.clear();
         self.areas_m2.clear();
         self.found.fill((NONE, 0));
-        let Disc { radius_m, directions, crossings, ends, covered, areas_m2, found, .. } = self;
+        let Disc { directions, crossings, ends, covered, areas_m2, found, .. } = self;
         for direction in directions.iter() {
-            surface.trace(place, *direction, *radius_m, |Crossing { vertices, from_m, to_m, hats }| {
+            surface.trace(place, *direction, reach_m, |Crossing { vertices, from_m, to_m, hats }| {
                 let covered = vertices.map(|vertex| number(vertex, surface, covered, areas_m2, found));
                 crossings.push(Part { covered, from_m, to_m, hats });
             });

@@ -173,6 +173,7 @@ mod tests {
             normal: DVec3::Z,
             rest: None,
             friction: 0.2,
+            is_on_fixed: false,
         }
     }
 

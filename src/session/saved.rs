@@ -40,7 +40,7 @@ use palpate_touch::path::{Path, PathState};
 pub const MAGIC: [u8; 8] = *b"PALPSNAP";
 
 /// The version of the format, of the arithmetic too: what reads another would go on with other bits.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 
 /// The bytes before the parts: magic, version, length, checksum.
 const HEADER: usize = 8 + 4 + 8 + 16;

@@ -39,7 +39,7 @@ impl<T: Real> Sheet<T> {
         self.tables.is_calm(0.0);
         self.tables.take_work();
         let (survey, _, energy_j) = self.survey(&self.tiles.region);
-        self.work = Work::begun(energy_j, self.present_work_j(&survey));
+        self.work = Work::begun(energy_j + self.coupling_j(), self.present_work_j(&survey));
         self.checkpoint = None;
         self.take_checkpoint();
         if let Some(checkpoint) = self.checkpoint.as_mut().and_then(Arc::get_mut) {

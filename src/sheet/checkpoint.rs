@@ -114,6 +114,8 @@ pub(super) struct Work {
     energy_j: f64,
     /// The largest energy at any survey.
     largest_j: f64,
+    /// What the energy has risen by beyond the work since the tools touch or hold, less what it has lost since.
+    excess_j: f64,
 }
 
 impl Work {
@@ -123,35 +125,39 @@ impl Work {
     }
 
     pub(super) fn saved(&self) -> SavedWork {
-        let Work { done_j, energy_j, largest_j } = *self;
-        SavedWork { done_j, energy_j, largest_j }
+        let Work { done_j, energy_j, largest_j, excess_j } = *self;
+        SavedWork { done_j, energy_j, largest_j, excess_j }
     }
 
     pub(super) fn restored(saved: &SavedWork) -> Result<Self> {
-        let SavedWork { done_j, energy_j, largest_j } = *saved;
-        ensure(done_j.is_finite() && energy_j.is_finite() && largest_j.is_finite(), "an energy that is not finite")?;
-        Ok(Work { done_j, energy_j, largest_j })
+        let SavedWork { done_j, energy_j, largest_j, excess_j } = *saved;
+        let is_finite = [done_j, energy_j, largest_j, excess_j].iter().all(|energy_j| energy_j.is_finite());
+        ensure(is_finite, "an energy that is not finite")?;
+        Ok(Work { done_j, energy_j, largest_j, excess_j })
     }
 
     /// An account that begins with the given energy.
     pub(super) fn begun(energy_j: f64, present_j: f64) -> Self {
-        Work { done_j: present_j, energy_j, largest_j: energy_j }
+        Work { done_j: present_j, energy_j, largest_j: energy_j, excess_j: 0.0 }
     }
 
     /// Checks an energy; a rise by `noise` of the largest does not count. `present_j` is subtracted from the work so
-    /// far and belongs to the next interval. The account begins anew.
+    /// far and belongs to the next interval. The account begins anew, but for what was too much while tools touch or hold
+    /// (`is_touched`): what gains a little in every interval must not go on for ever.
     pub(super) fn survey(
         &mut self,
         energy_j: f64,
         present_j: f64,
         noise: f64,
+        is_touched: bool,
     ) -> std::result::Result<(), CheckFailure> {
         let (work_j, before_j) = (self.done_j - present_j, self.energy_j);
-        let allowed_j = work_j + MARGIN * (before_j + work_j.abs()) + noise * self.largest_j;
-        if energy_j - before_j > allowed_j {
+        let excess_j = if is_touched { self.excess_j } else { 0.0 } + energy_j - before_j - work_j;
+        if excess_j > MARGIN * (before_j + work_j.abs()) + noise * self.largest_j {
             return Err(CheckFailure::Energy { energy_j, before_j, work_j });
         }
-        *self = Work { done_j: present_j, energy_j, largest_j: self.largest_j.max(energy_j) };
+        let largest_j = self.largest_j.max(energy_j);
+        *self = Work { done_j: present_j, energy_j, largest_j, excess_j: excess_j.max(0.0) };
         Ok(())
     }
 }
@@ -164,16 +170,23 @@ mod tests {
     fn energy_comes_from_work_alone() {
         let begun = Work::begun(1.0, 0.0);
         // Up to the margin.
-        assert_eq!({ begun }.survey(1.04, 0.0, 0.0), Ok(()));
+        assert_eq!({ begun }.survey(1.04, 0.0, 0.0, false), Ok(()));
         let found = CheckFailure::Energy { energy_j: 1.2, before_j: 1.0, work_j: 0.0 };
-        assert_eq!({ begun }.survey(1.2, 0.0, 0.0), Err(found));
+        assert_eq!({ begun }.survey(1.2, 0.0, 0.0, false), Err(found));
         let mut worked = begun;
         worked.add(0.25);
         // Work that belongs to the next interval does not count in this one.
-        assert!({ worked }.survey(1.25, 0.2, 0.0).is_err());
-        assert_eq!(worked.survey(1.2, 0.05, 0.0), Ok(()));
-        assert_eq!(worked, Work { done_j: 0.05, energy_j: 1.2, largest_j: 1.2 });
+        assert!({ worked }.survey(1.25, 0.2, 0.0, false).is_err());
+        assert_eq!(worked.survey(1.2, 0.05, 0.0, false), Ok(()));
+        assert_eq!(worked, Work { done_j: 0.05, energy_j: 1.2, largest_j: 1.2, excess_j: 0.0 });
+        // A gain within the margin counts against the next while a tool touches, until it is lost again.
+        let mut touched = begun;
+        assert_eq!(touched.survey(1.04, 0.0, 0.0, true), Ok(()));
+        assert!({ touched }.survey(1.06, 0.0, 0.0, true).is_err());
+        assert_eq!({ touched }.survey(1.06, 0.0, 0.0, false), Ok(()));
+        assert_eq!(touched.survey(1.0, 0.0, 0.0, true), Ok(()));
+        assert_eq!(touched.survey(1.04, 0.0, 0.0, true), Ok(()));
         // It goes as it likes.
-        assert_eq!(worked.survey(0.01, 0.0, 0.0), Ok(()));
+        assert_eq!(worked.survey(0.01, 0.0, 0.0, false), Ok(()));
     }
 }

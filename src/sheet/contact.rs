@@ -23,6 +23,19 @@
 //! tool on the surface. n = ∂s/∂c_x × ∂s/∂c_y is the only choice whose work equals what the sheet gets when the disc slides
 //! over a slope.
 //!
+//! **No energy from nowhere.** The tool's work is F·ẋ of the tool alone, and the guard counts that (`touch`). So what a disc
+//! does must agree with it, whatever the surface is like:
+//! - While it slides from w₀ to w₁, the points move by x̄ in the mean and the tool by Δs = Σ w̄·Δx + Δs̄ with
+//!   Δs̄ = Σ (w₁ − w₀)·x̄. What pushes must not do work along Δs̄, else the tissue gets F·Δs̄ more than the tool gives. So the
+//!   mean normal is taken perpendicular to Δs̄. On a smooth surface it is nearly so already; on one that is coarse, folded or
+//!   thin it is not. Friction may only take.
+//! - A tool that meets the tissue presses it as deep as both have come together in this substep. If it is deeper, because its
+//!   disc has come over to another part of the tissue in which it already is, the rest stays as an offset. A new tool has no
+//!   way yet: it presses as deep as it is put.
+//! - A disc that lags behind its tool is pressed by no more than what the tool moves along the normal ([`Tool::balance`]), and
+//!   it moves by no more than half its radius at once.
+//! - Where the disc would come over an edge so that its way leads along its normal, it stays, and pushes along its normal alone.
+//!
 //! The force felt under a constraint is that of springs, virtual springs and damping on the disc, Σ w·f/Σ w²: F without
 //! the points' own inertia, which a hand would feel as a knock at each command.
 
@@ -41,6 +54,12 @@ use palpate_touch::{ContactState, Coupling, Tip};
 
 /// Below this determinant of its kick and its constant force a scheme has one unknown, not two.
 const LEAST_DETERMINANT: f64 = 1e-6;
+
+/// The offset of a disc that slides vanishes by this part of the tool's way.
+const RELAXATION: f64 = 1.0 / 64.0;
+
+/// A disc slides on while its mean normal, taken perpendicular to its way, has at least this part along the normal where it is.
+const LEAST_STRAIGHTNESS: f64 = 0.9;
 
 /// The motion of a tool and the force on it at the end of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -63,6 +82,8 @@ pub struct Feel {
     pub rest: Option<RestSurface>,
     /// μ of the tool's tip.
     pub friction: f64,
+    /// Whether the disc is almost wholly on fixed points ([`Footprint::is_on_fixed`]): its force is not that of free tissue.
+    pub is_on_fixed: bool,
 }
 
 /// A copy of the data from which the stiffness under a tool is computed, for another thread.
@@ -95,8 +116,12 @@ pub(super) struct Tool {
     pub(super) normal: DVec3,
     /// That side: 1 outside, -1 inside; none while the tool is beside the tissue.
     pub(super) side: Option<f64>,
-    /// The offset that a grasp keeps between the tool and the surface, m.
+    /// The offset that a grasp, or a touch that began within the tissue, keeps between the tool and the surface, m.
     pub(super) offset_m: DVec3,
+    /// The gap between the tool and its disc at the end of a substep in which that slid, m: a disc may lag behind.
+    pub(super) gap_m: DVec3,
+    /// Whether it has not yet been compared with the surface, with this tip.
+    pub(super) is_new: bool,
     /// Force on the sheet in the last substep, N.
     pub(super) force_n: DVec3,
     /// The part of that force that continues in the next substep, without the impulse of meeting.
@@ -124,7 +149,7 @@ impl Contacts {
                 tool.footprint = Footprint::new(model, tip.radius_m, tool.footprint.anchor_m());
             }
             if is_other || tool.tip.grasps != tip.grasps {
-                (tool.contact_state, tool.steady_n) = (ContactState::Free, DVec3::ZERO);
+                (tool.contact_state, tool.steady_n, tool.is_new) = (ContactState::Free, DVec3::ZERO, true);
             }
             (tool.to_m, tool.tip) = (to_m, tip);
             return;
@@ -140,6 +165,8 @@ impl Contacts {
             normal: DVec3::Z,
             side: None,
             offset_m: DVec3::ZERO,
+            gap_m: DVec3::ZERO,
+            is_new: true,
             force_n: DVec3::ZERO,
             steady_n: DVec3::ZERO,
             velocity_m_per_s: DVec3::ZERO,
@@ -244,6 +271,8 @@ impl Tool {
             normal: self.normal.into(),
             side: self.side,
             offset_m: self.offset_m.into(),
+            gap_m: self.gap_m.into(),
+            is_new: self.is_new,
             force_n: self.force_n.into(),
             steady_n: self.steady_n.into(),
             velocity_m_per_s: self.velocity_m_per_s.into(),
@@ -273,6 +302,8 @@ impl Tool {
             normal,
             side: saved.side,
             offset_m: checks.movement(DVec3::from(saved.offset_m))?,
+            gap_m: checks.movement(DVec3::from(saved.gap_m))?,
+            is_new: saved.is_new,
             force_n: force(saved.force_n)?,
             steady_n: force(saved.steady_n)?,
             velocity_m_per_s: checks.vector(saved.velocity_m_per_s)?,
@@ -284,7 +315,7 @@ impl Tool {
         self.footprint.reached().iter().map(|reached| reached.point)
     }
 
-    fn place_m(&self, fraction: f64) -> DVec3 {
+    pub(super) fn place_m(&self, fraction: f64) -> DVec3 {
         if fraction >= 1.0 { self.to_m } else { self.from_m.lerp(self.to_m, fraction) }
     }
 
@@ -298,7 +329,7 @@ impl Tool {
         state: &mut State<T>,
         leg: Leg,
     ) -> Thrust {
-        let Leg { place_m, spread_n, .. } = leg;
+        let Leg { mut place_m, spread_n, .. } = leg;
         if self.contact_state == ContactState::Free {
             self.footprint.seek(model, place_m, |point| displacement_m(model, layout, state, point));
         }
@@ -315,19 +346,25 @@ impl Tool {
                 if is_beside {
                     return Thrust::default();
                 }
+                let depth_m = -gap_m.dot(self.normal);
                 if self.tip.grasps {
                     (self.contact_state, self.offset_m) = (ContactState::Holding, gap_m);
-                    gap_m = DVec3::ZERO;
-                } else if gap_m.dot(self.normal) >= 0.0 {
+                } else if depth_m <= 0.0 {
+                    self.is_new = false;
                     return Thrust::default();
                 } else {
                     self.contact_state = ContactState::Sticking;
+                    let approach_m =
+                        movement_m(model, layout, state, &self.footprint) - self.own_movement_m(model, plan);
+                    let within_m = if self.is_new { 0.0 } else { depth_m - approach_m.dot(self.normal).max(0.0) };
+                    self.offset_m = -within_m.max(0.0) * self.normal;
                 }
             }
-            ContactState::Holding => gap_m -= self.offset_m,
-            ContactState::Sticking | ContactState::Sliding => {}
+            ContactState::Holding | ContactState::Sticking | ContactState::Sliding => {}
         }
-        let thrust = self.thrust(model, plan, layout, state, gap_m, DVec3::ZERO);
+        gap_m -= self.offset_m;
+        place_m -= self.offset_m;
+        let thrust = self.thrust(model, plan, layout, state, gap_m);
         if self.contact_state == ContactState::Holding {
             return thrust;
         }
@@ -343,7 +380,30 @@ impl Tool {
             return thrust;
         }
         self.contact_state = ContactState::Sliding;
-        self.slide(model, plan, layout, state, leg, felt_n)
+        // What its normal was when the gap was what it is kept as.
+        let reference = if self.is_new { None } else { leg.normal.or(Some(self.normal)) };
+        if leg.normal.is_none() {
+            self.gap_m = gap_m;
+        }
+        let leg = Leg { place_m, ..leg };
+        let thrust = match self.slide(model, plan, layout, state, leg, reference, felt_n) {
+            Slide::Went(thrust) => return thrust,
+            Slide::Stays => {
+                self.balance(&mut gap_m, self.normal, reference, self.own_movement_m(model, plan));
+                self.thrust(model, plan, layout, state, gap_m).along(self.normal)
+            }
+            Slide::Leaves => Thrust::default(),
+        };
+        if (thrust.force_n() + spread_n).dot(self.normal) >= 0.0 {
+            self.contact_state = ContactState::Free;
+            return Thrust::default();
+        }
+        thrust
+    }
+
+    /// The movement of the tool in a substep, m.
+    pub(super) fn own_movement_m(&self, model: &Model, plan: &Plan) -> DVec3 {
+        (self.to_m - self.from_m) * (model.scene.stepping.rate_hz * plan.substep_s)
     }
 
     /// The tool's way in the substep that ends at `fraction` of the step.
@@ -385,8 +445,9 @@ impl Tool {
         layout: &Layout,
         state: &mut State<T>,
         Leg { place_m, normal: before, spread_n, .. }: Leg,
+        reference: Option<DVec3>,
         force_n: DVec3,
-    ) -> Thrust {
+    ) -> Slide {
         let moves_m_per_n = self.moves_m_per_n(model, plan);
         let (surface_m, along) = self.footprint.surface(|point| displacement_m(model, layout, state, point));
         let mut beside_m = place_m - surface_m - moves_m_per_n * (force_n - self.steady_n);
@@ -395,35 +456,92 @@ impl Tool {
             beside_m -= across_n / stiffness_n_per_m;
         }
         beside_m -= beside_m.dot(self.normal) * self.normal;
+        let beside_m = beside_m.clamp_length_max(self.footprint.stride_m());
         // Of a force that travels, half acts where it was, and half where it is.
         let half = plan.scheme.constant().map(|of| 0.5 * of);
-        push(model, plan, layout, state, &self.footprint, -self.steady_n, half);
-        let stayed_m = movement_m(model, layout, state, &self.footprint);
-        self.footprint.shift(model, beside_m, &along);
-        // Without the half that travels at both places: where it acts, it moves the points by the same.
-        let travelled_j = 0.5 * self.steady_n.dot(stayed_m - movement_m(model, layout, state, &self.footprint));
-        push(model, plan, layout, state, &self.footprint, self.steady_n, half);
-        let (surface_m, along) = self.footprint.surface(|point| displacement_m(model, layout, state, point));
-        self.normal = self.side.unwrap_or(1.0) * self.footprint.outward(&along);
-        let gap_m = place_m - surface_m;
-        // Where the disc can't follow, at the tissue's end, the tool is beside it, and its distance from the surface changes as
-        // that turns.
-        let turned = before.map_or(DVec3::ZERO, |before| self.normal - before);
-        let thrust = self.thrust(model, plan, layout, state, gap_m, gap_m.dot(turned) * self.normal);
-        let pressing_n = -(thrust.force_n() + spread_n).dot(self.normal).min(0.0);
-        // What acts over the substep is along the mean normal; a spring's force is that at its end.
-        let mean = match (self.tip.coupling, before) {
-            // Of normals that have turned over there is no mean.
-            (Coupling::Constraint, Some(before)) if before.dot(self.normal) > 0.0 => (before + self.normal).normalize(),
-            _ => self.normal,
+        let place_of = |footprint: &Footprint, state: &State<T>| {
+            let (surface_m, _) = footprint.surface(|point| displacement_m(model, layout, state, point));
+            surface_m - 0.5 * movement_m(model, layout, state, footprint)
         };
+        push(model, plan, layout, state, &self.footprint, -self.steady_n, half);
+        let (stayed_m, ground) = (place_of(&self.footprint, state), self.footprint.saved());
+        self.footprint.shift(model, beside_m, &along);
+        let travelled_m = place_of(&self.footprint, state) - stayed_m;
+        let (_, along) = self.footprint.surface(|point| displacement_m(model, layout, state, point));
+        let normal = self.side.unwrap_or(1.0) * self.footprint.outward(&along);
+        // What acts over the substep is along the mean normal, and does no work along the way of the disc; a spring's force is that
+        // at its end.
+        let mean = match (self.tip.coupling, before) {
+            (Coupling::Constraint, Some(before)) => before + normal,
+            _ => normal,
+        };
+        let way = travelled_m.normalize_or_zero();
+        let mean = (mean - mean.dot(way) * way).normalize_or_zero();
+        if mean.dot(normal) < LEAST_STRAIGHTNESS {
+            self.footprint.return_to(model, &ground);
+            push(model, plan, layout, state, &self.footprint, self.steady_n, half);
+            return Slide::Stays;
+        }
+        let mean = if self.tip.coupling == Coupling::Constraint { mean } else { normal };
+        let straightness = mean.dot(normal);
+        push(model, plan, layout, state, &self.footprint, self.steady_n, half);
+        self.normal = normal;
+        let (surface_m, _) = self.footprint.surface(|point| displacement_m(model, layout, state, point));
+        let mut gap_m = place_m - surface_m;
+        self.balance(&mut gap_m, mean, reference, self.own_movement_m(model, plan));
+        let thrust = self.thrust(model, plan, layout, state, gap_m);
+        let pressing_n = -(thrust.force_n() + spread_n).dot(self.normal);
+        if pressing_n <= 0.0 {
+            // There is nothing to press where it would come to. What acts in this substep is all where it was.
+            push(model, plan, layout, state, &self.footprint, -self.steady_n, half);
+            self.footprint.return_to(model, &ground);
+            push(model, plan, layout, state, &self.footprint, self.steady_n, half);
+            return Slide::Leaves;
+        }
         let across = (across_n - across_n.dot(mean) * mean).normalize_or_zero();
-        let friction_n = self.tip.friction * pressing_n * across;
-        let along_mean = |normal_n: f64| normal_n / mean.dot(self.normal) * mean;
+        // Friction takes energy from a disc that moves: it does not drive one against the tool's way, farther than that.
+        let is_driven = across.dot(travelled_m) < -self.own_movement_m(model, plan).length();
+        let friction_n = if is_driven { 0.0 } else { self.tip.friction * pressing_n } * across;
+        let along_mean = |normal_n: f64| normal_n / straightness * mean;
         let kick_n = along_mean(thrust.kick_n.dot(self.normal));
         let steady_n = along_mean((thrust.steady_n - friction_n).dot(self.normal)) + friction_n;
         let goes_on_n = if thrust.goes_on_n == thrust.steady_n { steady_n } else { kick_n + steady_n };
-        Thrust { kick_n, steady_n, goes_on_n, travelled_j }
+        Slide::Went(Thrust { kick_n, steady_n, goes_on_n })
+    }
+
+    /// Keeps the offset such that closing the gap along the mean normal moves the surface as far as the tool has moved along it,
+    /// `own_m` in this substep.
+    ///
+    /// With q the gap along the normal (0 under a constraint), a disc that follows its tool closes q₀ + n̄·(g₁ − g₀). Where it lags
+    /// behind, or the surface is not smooth, the turning of the normal alone changes what is to be closed, as if the tool had moved.
+    /// That goes into the offset, which vanishes again by a small part of the tool's way: so what a smooth surface leaves of second
+    /// order never counts, and a tool at rest gives nothing.
+    fn balance(&mut self, gap_m: &mut DVec3, mean: DVec3, reference: Option<DVec3>, own_m: DVec3) {
+        let Some(before) = reference else { return };
+        let along_m = gap_m.dot(self.normal) / mean.dot(self.normal);
+        let explained_m = self.gap_m.dot(before) + mean.dot(*gap_m - self.gap_m);
+        let offset_m = -self.offset_m.dot(mean);
+        let balanced_m = offset_m + explained_m - along_m;
+        let kept_m = balanced_m - balanced_m.clamp(-RELAXATION * own_m.length(), RELAXATION * own_m.length());
+        self.offset_m -= (kept_m - offset_m) * mean;
+        *gap_m += (kept_m - offset_m) * mean;
+    }
+
+    /// Whether a spring couples it to the tissue at present.
+    pub(super) fn is_coupled(&self) -> bool {
+        self.contact_state != ContactState::Free && matches!(self.tip.coupling, Coupling::Spring { .. })
+    }
+
+    /// The energy of that spring while the disc is at `surface_m` and the tool at `place_m`, J.
+    pub(super) fn stored_j(&self, surface_m: DVec3, place_m: DVec3) -> f64 {
+        match self.tip.coupling {
+            Coupling::Spring { stiffness_n_per_m, .. } if self.is_coupled() => {
+                let stretched_j = 0.5 * stiffness_n_per_m * (place_m - self.offset_m - surface_m).length_squared();
+                // A disc that lags behind stretches nothing along its way.
+                stretched_j.min(0.5 * self.force_n.length_squared() / stiffness_n_per_m)
+            }
+            _ => 0.0,
+        }
     }
 
     /// How far the disc moves in the substep under an impulse of 1 N times the substep.
@@ -433,25 +551,16 @@ impl Tool {
 
     /// The steady force, and an impulse for what `force_n` is beyond it; the next substep begins with that force.
     fn kicked_to(&self, force_n: DVec3) -> Thrust {
-        Thrust { kick_n: force_n - self.steady_n, steady_n: self.steady_n, goes_on_n: force_n, travelled_j: 0.0 }
+        Thrust { kick_n: force_n - self.steady_n, steady_n: self.steady_n, goes_on_n: force_n }
     }
 
-    /// What closes a gap, and makes the disc as fast as the tool, and by `more_m` in the substep faster, if the scheme can do
-    /// both.
-    fn thrust<T: Real>(
-        &self,
-        model: &Model,
-        plan: &Plan,
-        layout: &Layout,
-        state: &State<T>,
-        gap_m: DVec3,
-        more_m: DVec3,
-    ) -> Thrust {
+    /// What closes a gap, and makes the disc as fast as the tool, if the scheme can do both.
+    fn thrust<T: Real>(&self, model: &Model, plan: &Plan, layout: &Layout, state: &State<T>, gap_m: DVec3) -> Thrust {
         let moves_m_per_n = self.moves_m_per_n(model, plan);
         if moves_m_per_n == 0.0 {
             return Thrust::default();
         }
-        let own_m = (self.to_m - self.from_m) * (model.scene.stepping.rate_hz * plan.substep_s);
+        let own_m = self.own_movement_m(model, plan);
         let moved_m = movement_m(model, layout, state, &self.footprint);
         let ([kick_u, kick_d], [of_u, of_d]) = (plan.scheme.kick(), plan.scheme.constant());
         match self.tip.coupling {
@@ -462,10 +571,10 @@ impl Tool {
                     return self.kicked_to(self.steady_n + gap_m / moves_m_per_n);
                 }
                 let unit = kick_u / (moves_m_per_n * determinant);
-                let faster_m = own_m + more_m - moved_m;
+                let faster_m = own_m - moved_m;
                 let steady_n = self.steady_n + unit * (kick_u * faster_m - kick_d * gap_m);
                 let kick_n = unit * (of_d * gap_m - of_u * faster_m);
-                Thrust { kick_n, steady_n, goes_on_n: steady_n, travelled_j: 0.0 }
+                Thrust { kick_n, steady_n, goes_on_n: steady_n }
             }
             Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } => {
                 let gap_m = gap_m + moves_m_per_n * self.steady_n;
@@ -493,6 +602,16 @@ pub(super) struct Leg {
     spread_n: DVec3,
 }
 
+/// What becomes of a disc that friction does not hold.
+enum Slide {
+    /// It follows the tool.
+    Went(Thrust),
+    /// It stays: its way would lead along its normal.
+    Stays,
+    /// It stays, and the tool lets go: where it would come to, nothing presses.
+    Leaves,
+}
+
 /// What a tool does to its disc in a substep, N.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct Thrust {
@@ -502,11 +621,15 @@ pub(super) struct Thrust {
     pub(super) steady_n: DVec3,
     /// The force with which the next substep begins.
     pub(super) goes_on_n: DVec3,
-    /// The work, J, of the half of the force that acted where the disc was, beyond what it would do where the disc is.
-    pub(super) travelled_j: f64,
 }
 
 impl Thrust {
+    /// What of it is along a normal.
+    fn along(&self, normal: DVec3) -> Self {
+        let along = |force_n: DVec3| force_n.dot(normal) * normal;
+        Thrust { kick_n: along(self.kick_n), steady_n: along(self.steady_n), goes_on_n: along(self.goes_on_n) }
+    }
+
     /// Both together.
     pub(super) fn force_n(&self) -> DVec3 {
         self.kick_n + self.steady_n

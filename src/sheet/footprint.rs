@@ -26,12 +26,21 @@ use mesh::MeshDisc;
 /// and the tool is off its place by no more than this.
 const LEAST_PART: f64 = 1e-6;
 
+/// The points that can move bear at least this part of a disc. Where fewer do, near what is fixed, they would have to move
+/// farther than the tool by one over their part, and the stiffness would grow with its square.
+const LEAST_FREE_PART: f64 = 0.25;
+
+/// A disc of which the points that can move bear less than this part lies on what is fixed, and moves nothing.
+const FIXED_PART: f64 = 0.02;
+
 /// A disc on a tissue, at a place. Lengths in m.
 #[derive(Debug, Clone)]
 pub struct Footprint {
     radius_m: f64,
     ground: Ground,
     reached: Vec<Reached>,
+    /// What the weights of points that can move were multiplied with ([`LEAST_FREE_PART`]).
+    free_factor: f64,
     /// Where the disc rests: Σ w·X, and how that changes with the place.
     rest_m: DVec3,
     along: [DVec3; 2],
@@ -72,6 +81,7 @@ impl Footprint {
             radius_m,
             ground,
             reached: Vec::new(),
+            free_factor: 1.0,
             rest_m: DVec3::ZERO,
             along: [DVec3::X, DVec3::Y],
             mobility: 0.0,
@@ -104,6 +114,7 @@ impl Footprint {
                     radius_m,
                     ground: Ground::Mesh(Box::new(disc)),
                     reached: Vec::new(),
+                    free_factor: 1.0,
                     rest_m: DVec3::ZERO,
                     along: [DVec3::X, DVec3::Y],
                     mobility: 0.0,
@@ -113,6 +124,18 @@ impl Footprint {
                 Ok(footprint)
             }
             _ => Err(unsound("a tool on a tissue of another kind")),
+        }
+    }
+
+    /// Goes back to a place where it was ([`Footprint::saved`]).
+    pub(super) fn return_to(&mut self, model: &Model, place: &SavedGround) {
+        match (&mut self.ground, place) {
+            (Ground::Grid(_), SavedGround::Grid(centre_m)) => self.move_on_grid(model, DVec2::from(*centre_m)),
+            (Ground::Mesh(disc), SavedGround::Mesh { .. }) => {
+                disc.go_to(place);
+                self.lay(model);
+            }
+            _ => {}
         }
     }
 
@@ -164,6 +187,14 @@ impl Footprint {
         }
     }
 
+    /// How far a disc that touches may move at once, m. A sheet is a plane at rest.
+    pub(super) fn stride_m(&self) -> f64 {
+        match &self.ground {
+            Ground::Grid(_) => f64::INFINITY,
+            Ground::Mesh(disc) => disc.stride_m(),
+        }
+    }
+
     /// Moves the disc of a tool that touches nothing to the place of the moved surface nearest to `place_m`, or towards it.
     /// A contraction, as long as the surface is not folded.
     pub(super) fn seek(&mut self, model: &Model, place_m: DVec3, displacement_m: impl Fn([usize; 2]) -> DVec3) {
@@ -187,7 +218,7 @@ impl Footprint {
     }
 
     fn move_on_grid(&mut self, model: &Model, centre_m: DVec2) {
-        let Footprint { ground: Ground::Grid(disc), reached, rest_m, .. } = self else { return };
+        let Footprint { ground: Ground::Grid(disc), reached, rest_m, along, .. } = self else { return };
         let Some(sheet) = model.scene.sheet() else { return };
         let Some(covered) = disc.move_to(sheet, centre_m) else { return };
         reached.clear();
@@ -195,8 +226,8 @@ impl Footprint {
             let free = is_free(model, model.index_of(point));
             Reached { point, free, mass: 1.0, weight, gradient }
         }));
-        *rest_m = disc.centre_m.extend(0.0);
-        self.weigh();
+        (*rest_m, *along) = (disc.centre_m.extend(0.0), [DVec3::X, DVec3::Y]);
+        self.weigh(model);
     }
 
     /// Takes what the disc covers on a mesh.
@@ -212,12 +243,53 @@ impl Footprint {
             self.along[0] += gradient.x * at_m;
             self.along[1] += gradient.y * at_m;
         }
-        self.weigh();
+        self.weigh(model);
     }
 
-    fn weigh(&mut self) {
+    /// Finds how the disc moves under a force, and makes it lean on the points that can move if these are few.
+    fn weigh(&mut self, model: &Model) {
+        self.lean(model);
         let of = |point: &Reached| point.weight * point.weight / point.mass;
-        self.mobility = self.reached.iter().filter(|point| point.free).map(of).sum();
+        let moves = self.free_factor > 0.0;
+        self.mobility = if moves { self.reached.iter().filter(|point| point.free).map(of).sum() } else { 0.0 };
+    }
+
+    /// Gives the points that can move at least [`LEAST_FREE_PART`] of the disc: with p their part and q that which they get,
+    /// w becomes w·q/p for them and w·(1 − q)/(1 − p) for the others, and ∂w what that changes by.
+    fn lean(&mut self, model: &Model) {
+        let (mut part, mut change) = (0.0, DVec2::ZERO);
+        for point in self.reached.iter().filter(|point| point.free) {
+            part += point.weight;
+            change += point.gradient;
+        }
+        self.free_factor = match part {
+            LEAST_FREE_PART.. => 1.0,
+            FIXED_PART.. => LEAST_FREE_PART / part,
+            _ => 0.0,
+        };
+        if self.free_factor == 1.0 || self.free_factor == 0.0 {
+            return;
+        }
+        let of_fixed = (1.0 - LEAST_FREE_PART) / (1.0 - part);
+        (self.rest_m, self.along) = (DVec3::ZERO, [DVec3::ZERO; 2]);
+        for point in &mut self.reached {
+            let (factor, by) = if point.free {
+                (self.free_factor, -self.free_factor / part * change)
+            } else {
+                (of_fixed, of_fixed / (1.0 - part) * change)
+            };
+            point.gradient = factor * point.gradient + point.weight * by;
+            point.weight *= factor;
+            let rest_m = model.shape().rest_m(model.point_at(model.index_of(point.point)));
+            self.rest_m += point.weight * rest_m;
+            self.along[0] += point.gradient.x * rest_m;
+            self.along[1] += point.gradient.y * rest_m;
+        }
+    }
+
+    /// Whether the disc lies so much on what is fixed that it leans on the few points that can move, or moves nothing.
+    pub fn is_on_fixed(&self) -> bool {
+        self.free_factor != 1.0
     }
 
     /// The points that the disc covers.
@@ -234,7 +306,8 @@ impl Footprint {
                 let found = self.reached.binary_search_by_key(&model.point_of(index), |reached| reached.point);
                 found.map_or(0.0, |place| self.reached[place].weight)
             }
-            Ground::Mesh(disc) => disc.weight_of(model.point_at(index)),
+            // Asked of points that can move.
+            Ground::Mesh(disc) => self.free_factor * disc.weight_of(model.point_at(index)),
         }
     }
 

@@ -67,7 +67,8 @@ impl<T: Real> Sheet<T> {
             return Err(CheckFailure::Prediction { part: survey.prediction_error / survey.largest });
         }
         let present_j = self.present_work_j(&survey);
-        self.work.survey(energy_j, present_j, NOISE.max((10.0 * self.model.sleep_tolerance).powi(2)))?;
+        let noise = NOISE.max((10.0 * self.model.sleep_tolerance).powi(2));
+        self.work.survey(energy_j + self.coupling_j(), present_j, noise, !self.contacts.is_empty())?;
         self.take_checkpoint();
         Ok(())
     }

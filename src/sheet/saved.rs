@@ -162,6 +162,7 @@ pub(super) struct SavedWork {
     pub(super) done_j: f64,
     pub(super) energy_j: f64,
     pub(super) largest_j: f64,
+    pub(super) excess_j: f64,
 }
 
 /// Which tiles sleep, and what is kept for waking them.
@@ -249,6 +250,8 @@ pub(super) struct SavedContact {
     pub(super) normal: Vector,
     pub(super) side: Option<f64>,
     pub(super) offset_m: Vector,
+    pub(super) gap_m: Vector,
+    pub(super) is_new: bool,
     pub(super) force_n: Vector,
     pub(super) steady_n: Vector,
     pub(super) velocity_m_per_s: Vector,

@@ -19,6 +19,7 @@ impl<T: Real> Sheet<T> {
         let layout = &tables.layout;
         for tool in &mut contacts.tools {
             let (before_n, met) = (tool.steady_n, tool.contact_state != ContactState::Free);
+            let is_new = tool.is_new;
             if before_n != DVec3::ZERO {
                 tiles.wake_under(tool.points());
                 push(model, plan, layout, state, &tool.footprint, before_n, plan.scheme.constant());
@@ -28,6 +29,8 @@ impl<T: Real> Sheet<T> {
                 push(model, plan, layout, state, &tool.footprint, leg.jump_n, plan.scheme.kick());
             }
             let thrust = tool.meet(model, plan, layout, state, leg);
+            // Whether it touches or not, it has been compared with the surface, unless it is beside that.
+            tool.is_new &= tool.side.is_none();
             tool.force_n = thrust.force_n();
             tool.steady_n = if met { thrust.goes_on_n } else { DVec3::ZERO };
             if tool.contact_state == ContactState::Free {
@@ -45,17 +48,34 @@ impl<T: Real> Sheet<T> {
             }
             // Tiles that slept were at rest in this substep, as if they had been computed.
             tiles.wake_under(tool.points());
-            work.add(leg.jump_n.dot(movement_m(model, layout, state, &tool.footprint)));
-            work.add(thrust.travelled_j);
             let change_n = thrust.steady_n - before_n;
-            for (acts_n, by_n, how) in [
-                (thrust.kick_n, thrust.kick_n, plan.scheme.kick()),
-                (thrust.steady_n, change_n, plan.scheme.constant()),
-            ] {
-                push(model, plan, layout, state, &tool.footprint, by_n, how);
-                work.add(acts_n.dot(movement_m(model, layout, state, &tool.footprint)));
+            push(model, plan, layout, state, &tool.footprint, thrust.kick_n, plan.scheme.kick());
+            push(model, plan, layout, state, &tool.footprint, change_n, plan.scheme.constant());
+            let surface_m = || tool.footprint.surface(|point| displacement_m(model, layout, state, point)).0;
+            tool.gap_m = match tool.contact_state {
+                ContactState::Sliding => tool.place_m(fraction) - tool.offset_m - surface_m(),
+                _ => DVec3::ZERO,
+            };
+            let all_n = leg.jump_n + thrust.kick_n + thrust.steady_n;
+            if is_new && !met {
+                // Who puts a tool into the tissue presses it as deep.
+                work.add(all_n.dot(movement_m(model, layout, state, &tool.footprint)));
+                work.add(tool.stored_j(surface_m(), tool.place_m(fraction)));
+            } else {
+                // By the tool's own way, and not by that of the disc: what a disc does wrong is not the tool's work.
+                work.add(all_n.dot(tool.own_movement_m(model, plan)));
             }
         }
+    }
+
+    /// The energy of couplings by springs, J.
+    pub(super) fn coupling_j(&self) -> f64 {
+        let Sheet { model, tables, state, contacts, .. } = self;
+        let stored_j = |tool: &Tool| {
+            let (surface_m, _) = tool.footprint.surface(|point| displacement_m(model, &tables.layout, state, point));
+            tool.stored_j(surface_m, tool.from_m)
+        };
+        contacts.tools.iter().filter(|tool| tool.is_coupled()).map(stored_j).sum()
     }
 
     /// The motion of a position-controlled tool and the force on it.
@@ -88,6 +108,7 @@ impl<T: Real> Sheet<T> {
             normal: tool.normal,
             rest: tool.footprint.rest_surface(tool.side.unwrap_or(1.0)),
             friction: tool.tip.friction,
+            is_on_fixed: tool.footprint.is_on_fixed(),
         })
     }
 

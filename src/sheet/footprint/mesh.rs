@@ -62,6 +62,13 @@ impl MeshDisc {
         Ok(())
     }
 
+    /// Goes to a place where it was.
+    pub(super) fn go_to(&mut self, saved: &SavedGround) {
+        if let SavedGround::Mesh { triangle, barycentric, frame } = saved {
+            self.place = Place { triangle: *triangle, barycentric: *barycentric, frame: frame.map(DVec3::from) };
+        }
+    }
+
     /// Where the place rests, m.
     pub(super) fn anchor_m(&self) -> DVec3 {
         self.shape.surface().at_m(&self.place)
@@ -88,6 +95,11 @@ impl MeshDisc {
     /// Goes to the place of the rest surface that is nearest to `at_m`.
     pub(super) fn put(&mut self, at_m: DVec3) {
         self.place = self.shape.surface().nearest(at_m).unwrap_or(self.place);
+    }
+
+    /// How far it may move at once, m.
+    pub(super) fn stride_m(&self) -> f64 {
+        self.disc.stride_m()
     }
 
     /// Walks by `by_m` in the directions of the place.

@@ -1,0 +1,125 @@
+//! Random tips on random meshes with thin parts: everything stays finite, and no energy comes from nowhere.
+//!
+//! 36 in every test run; `make stress` does ten thousand (`PALPATE_STRESS_THIN`).
+#![allow(
+    clippy::cast_possible_truncation,
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::disallowed_methods
+)]
+
+#[path = "common/thin_mesh.rs"]
+mod thin_mesh;
+
+use glam::DVec3;
+use palpate::limits::Limits;
+use palpate::scene::Scene;
+use palpate::sheet::{self, Model, Tissue};
+use palpate_touch::{Coupling, Tip};
+use thin_mesh::{ThinMesh, thin_mesh};
+
+/// A scene on a mesh, of a random material.
+fn scene(folder: &std::path::Path, mesh: &ThinMesh, dice: &mut fastrand::Rng, limits: &Limits) -> Option<Scene> {
+    std::fs::write(folder.join("mesh.obj"), mesh.obj()).unwrap();
+    let fixed = ["\"none\"", "\"rim\"", "[{ centre_m = [0, 0, 0], radius_m = 0.001 }]"][dice.usize(0..3)];
+    let mut decades = |from: f64, to: f64| 10_f64.powf(from + (to - from) * dice.f64());
+    let text = format!(
+        "[mesh]\nfile = \"mesh.obj\"\nunit = \"m\"\nfixed = {fixed}\n[material]\nyoungs_modulus_pa = {:e}\nthickness_m = {:e}\n\
+         depth_m = {:e}\nbed_n_per_m3 = {:e}\ndamping_ratio = {:e}\n[stepping]\ntolerance = 1e-2\n",
+        decades(3.0, 4.7),
+        decades(-3.5, -2.5),
+        decades(-2.0, -1.3),
+        decades(5.0, 6.5),
+        decades(-1.5, 0.3),
+    );
+    Scene::parse_in(folder, "random", &text, &[], limits).ok()
+}
+
+/// A tip that comes, presses, goes along, jumps, and leaves.
+fn tip(dice: &mut fastrand::Rng) -> Tip {
+    let coupling = match dice.u8(0..5) {
+        0 => Coupling::Spring { stiffness_n_per_m: 200.0, damping_n_s_per_m: 0.5 },
+        _ => Coupling::Constraint,
+    };
+    let radius_m = 10_f64.powf(-3.3 + 1.3 * dice.f64());
+    let friction = [0.0, 0.2, 0.8][dice.usize(0..3)];
+    Tip { radius_m, friction, grasps: dice.u8(0..6) == 0, coupling }
+}
+
+fn energy_j(tissue: &dyn Tissue) -> f64 {
+    let energy = tissue.energy();
+    energy.kinetic_j + energy.spring_j + energy.virtual_j
+}
+
+/// The most of a run.
+#[derive(Debug, Default, Clone, Copy)]
+struct Course {
+    blow_ups: u64,
+    force_n: f64,
+    energy_j: f64,
+    displacement_m: f64,
+}
+
+fn play(seed: u64, steps: u64) -> Option<(Course, &'static str)> {
+    let dice = &mut fastrand::Rng::with_seed(seed);
+    let folder = tempfile::tempdir().unwrap();
+    let limits = Limits { substeps: 20, ..Limits::default() };
+    let mesh = thin_mesh(dice, seed as usize);
+    let scene = scene(folder.path(), &mesh, dice, &limits)?;
+    let model = Model::compile(&scene, &limits).ok()?;
+    let mut tissue = sheet::at_rest(&model);
+    let shape = scene.shape();
+    let mut course = Course::default();
+    let (mut place_m, mut way_m, mut now) = (DVec3::ZERO, DVec3::ZERO, tip(dice));
+    for step in 0..steps {
+        if step % 40 == 0 {
+            let point = palpate::shape::PointId::new(dice.usize(0..shape.point_count()));
+            let mut random = || DVec3::from_array([(); 3].map(|()| 2.0 * dice.f64() - 1.0));
+            let target_m = shape.rest_m(point) + 0.5 * now.radius_m * random();
+            let from_m = target_m + 2.0 * now.radius_m * random();
+            match if step == 0 { 0 } else { dice.u8(0..8) } {
+                0 => {
+                    tissue.release(0);
+                    (place_m, now) = (from_m, tip(dice));
+                    way_m = (target_m - place_m) / 40.0;
+                }
+                // A jump.
+                1 => (place_m, way_m) = (target_m, DVec3::ZERO),
+                2 | 3 => way_m = DVec3::ZERO,
+                _ => way_m = (target_m - place_m) / 40.0,
+            }
+        }
+        place_m += way_m;
+        tissue.pose(0, place_m, now);
+        if let Err(blow_up) = tissue.step() {
+            course.blow_ups += 1;
+            tissue.recover(blow_up.step, false);
+            continue;
+        }
+        let felt_n = tissue.feel(0).unwrap().force_on_tool_n.length();
+        course.force_n = course.force_n.max(felt_n);
+        course.energy_j = course.energy_j.max(energy_j(&*tissue));
+        course.displacement_m = course.displacement_m.max(tissue.largest_displacement_m());
+        assert!(course.energy_j.is_finite() && felt_n.is_finite(), "{seed} {}, step {step}: {course:?}", mesh.kind);
+    }
+    Some((course, mesh.kind))
+}
+
+/// Before contact was balanced, one in ten of these reached joules to megajoules, and up to kilometres.
+#[test]
+fn tips_on_thin_meshes_get_no_energy_from_nowhere() {
+    let all = std::env::var("PALPATE_STRESS_THIN").ok().map(|count| count.parse::<u64>().unwrap());
+    let (count, steps) = (all.unwrap_or(36), if all.is_some() { 400 } else { 160 });
+    let (mut played, mut blew_up) = (0, 0);
+    for seed in 0..count {
+        let Some((course, kind)) = play(seed, steps) else { continue };
+        played += 1;
+        blew_up += u64::from(course.blow_ups > 0);
+        // Tissue of a few millimetres, under tips that come at most 5 cm away from it.
+        let is_bounded = course.force_n < 20.0 && course.energy_j < 0.1 && course.displacement_m < 0.1;
+        assert!(is_bounded, "{seed} {kind}: {course:?}");
+    }
+    assert!(2 * played > count, "{played} of {count} were played");
+    eprintln!("of {played} meshes {blew_up} made the guard stop at least once");
+}
