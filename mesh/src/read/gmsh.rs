@@ -4,8 +4,9 @@
 
 use std::collections::{BTreeMap, HashMap};
 
-use super::draft::{Cell, Draft};
+use super::draft::Draft;
 use super::source::{Order, Scalar, Source, named, parsed, shown};
+use super::volume::Cell;
 use crate::{MeshError, Problem};
 
 /// Physical tags of an entity that count.
@@ -79,6 +80,8 @@ pub(super) fn read(source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), Mesh
         names: BTreeMap::new(),
         physical: BTreeMap::new(),
     };
+    // An element of several physical groups is there once for each of them.
+    file.draft.drops_repeated = true;
     let mut version = 1.0;
     let (mut has_nodes, mut has_elements) = (false, false);
     while let Some(word) = file.source.word() {
