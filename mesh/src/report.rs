@@ -103,16 +103,24 @@ pub struct Border {
     pub edges: usize,
     /// How long it is, m.
     pub length_m: f64,
+    /// Whether it is as long as the diagonal of the box around the mesh: rather the rim of an open surface than a hole in one.
+    pub is_rim: bool,
     /// The middle of its vertices, m.
     pub place_m: [f64; 3],
 }
 
 impl Border {
+    /// What it is: a hole, or a rim.
+    #[must_use]
+    pub fn name(&self) -> &'static str {
+        if self.is_rim { "rim" } else { "hole" }
+    }
+
     /// The border in words, with its place in a unit.
     #[must_use]
     pub fn text(&self, unit: Unit) -> String {
         let (length, place) = (format::length(self.length_m, unit), format::place(self.place_m, unit));
-        format!("{} edges, {length} around, at {place}", self.edges)
+        format!("{} of {} edges, {length} around, at {place}", self.name(), self.edges)
     }
 }
 
@@ -255,12 +263,14 @@ pub(crate) fn extent(vertices: &[DVec3], triangles: &[[u32; 3]]) -> DVec3 {
 }
 
 /// The borders of a surface, the longest first.
-fn borders(vertices: &[DVec3], holes: &[Vec<u32>], noise_m: f64) -> Vec<Border> {
+fn borders(vertices: &[DVec3], holes: &[Vec<u32>], extent: DVec3) -> Vec<Border> {
+    let noise_m = NOISE * extent.max_element();
     let of = |hole: &Vec<u32>| {
         let at = || hole.iter().map(|vertex| vertices[*vertex as usize]);
-        let length_m = at().zip(at().cycle().skip(1)).map(|(from, to)| from.distance(to)).sum();
+        let length_m: f64 = at().zip(at().cycle().skip(1)).map(|(from, to)| from.distance(to)).sum();
         let middle = at().sum::<DVec3>() / hole.len() as f64;
-        Border { edges: hole.len(), length_m, place_m: without_noise(middle, noise_m) }
+        let is_rim = length_m >= extent.length();
+        Border { edges: hole.len(), length_m, is_rim, place_m: without_noise(middle, noise_m) }
     };
     let mut borders: Vec<Border> = holes.iter().map(of).collect();
     borders.sort_by(|a, b| b.length_m.total_cmp(&a.length_m));
@@ -306,7 +316,7 @@ fn examine(mesh: &TriangleMesh, report: &mut Report, findings: &mut Findings) {
     report.components = topology.components;
     let holes = topology.holes();
     report.holes = holes.len();
-    report.borders = borders(vertices, &holes, findings.noise_m);
+    report.borders = borders(vertices, &holes, extent);
     if topology.components > 1 {
         findings.add(Problem::Components { count: topology.components }, Element::Whole, None);
     }

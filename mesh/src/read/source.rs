@@ -102,8 +102,9 @@ impl<'a> Source<'a> {
         let element = if self.is_binary {
             Element::Byte(self.at as u64)
         } else {
-            // What was read last ends here; its line counts, not the one that begins.
-            let mut source = Source { bytes: &self.bytes[..self.at], at: 0, ..self.clone() };
+            // What was read last ends here; its line counts, not the one that begins. A row is the last line of its bytes.
+            let end = if self.is_row { self.bytes.len() } else { self.at };
+            let mut source = Source { bytes: &self.bytes[..end], at: 0, ..self.clone() };
             let mut line = 0;
             while source.line().is_some() {
                 line += 1;
@@ -230,7 +231,8 @@ pub(super) fn words(line: &[u8]) -> impl Iterator<Item = &[u8]> {
 pub(super) fn no_number(word: &[u8], what: &str) -> Problem {
     let text = shown(word);
     // 0,5 and 1.234,5: some programs write numbers as people do.
-    let pointed = text.rsplit_once(',').map(|(whole, part)| format!("{}.{part}", whole.replace('.', "")));
+    let parts = text.rsplit_once(',').filter(|(_, part)| part.starts_with(|digit: char| digit.is_ascii_digit()));
+    let pointed = parts.map(|(whole, part)| format!("{}.{part}", whole.replace('.', "")));
     let message = match pointed.filter(|pointed| pointed.parse::<f64>().is_ok()) {
         Some(pointed) => format!("`{text}` has a decimal comma: export the file with decimal points, here {pointed}"),
         None => format!("`{text}` is no number: {what} is expected"),

@@ -244,8 +244,11 @@ fn skip_array(source: &mut Source<'_>, is_binary: bool) -> Result<(), MeshError>
         }
         b"bit" if is_binary => {
             begin_data(source, is_binary);
-            let bytes = source.count(count / 8 + i64::from(count % 8 != 0), 1, what)?;
-            source.take(bytes, what)?;
+            // VTK packs all values, but writes a bit for each tuple only. What it writes ends a line.
+            let packed = |count: i64| usize::try_from(count / 8 + i64::from(count % 8 != 0)).unwrap_or(usize::MAX);
+            let ends = |bytes: &usize| source.rest().get(*bytes) == Some(&b'\n');
+            let bytes = Some(packed(tuples)).filter(|bytes| !ends(&packed(count)) && ends(bytes));
+            source.take(bytes.unwrap_or(packed(count)), what)?;
         }
         _ => {
             let numbers = if kind == b"bit" { Some(Scalar::U8) } else { scalar(&kind) };
