@@ -437,6 +437,9 @@ fn gltf_names_what_it_needs() {
     // Before the buffer is missed that only the extension fills.
     let empty = r#"{"extensionsRequired":["EXT_meshopt_compression"],"buffers":[{"byteLength":100}]}"#;
     assert!(refusal("a.gltf", empty).contains("needs EXT_meshopt_compression"));
+    let unsaid = r#"{"buffers":[{"byteLength":9,"extensions":{"EXT_meshopt_compression":{"fallback":true}}}]}"#;
+    assert!(refusal("a.gltf", unsaid).contains("buffer 0: needs EXT_meshopt_compression"));
+    assert!(refusal("a.gltf", r#"{"buffers":[{"byteLength":9}]}"#).contains("its content is missing"));
     // Compressed, though it does not say so.
     let draco = gltf().replacen("\"indices\":1", r#""indices":1,"extensions":{"KHR_draco_mesh_compression":{}}"#, 1);
     assert_eq!(report_of("a.gltf", &draco).triangles, 8);

@@ -109,8 +109,13 @@ pub(super) fn read(
     for (number, buffer) in file.root.buffers.0.iter().enumerate() {
         let fail = |problem| file.fail("buffer", number, problem);
         let content = match &buffer.uri {
+            None if buffer.extensions.meshopt.is_some() => {
+                return Err(fail(other_extension("EXT_meshopt_compression")));
+            }
+            // The binary part of a GLB file is the first buffer.
             None => {
-                Cow::Borrowed(binary.ok_or_else(|| fail(Problem::Truncated { missing: "its content".to_owned() }))?)
+                let content = binary.filter(|_| number == 0);
+                Cow::Borrowed(content.ok_or_else(|| fail(Problem::Truncated { missing: "its content".to_owned() }))?)
             }
             Some(uri) => Cow::Owned(match uri.strip_prefix("data:").and_then(|data| data.split_once("base64,")) {
                 Some((_, text)) => {
