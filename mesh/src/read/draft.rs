@@ -164,8 +164,9 @@ impl<'l> Draft<'l> {
 
     /// Adds a strip of triangles: each vertex makes one with the two before it, and every other triangle is the other way round.
     /// Where a vertex is repeated, to go on elsewhere, there is none.
-    pub(super) fn strip(&mut self, corners: &[i64], uv: &[[f32; 2]], groups: &[usize]) -> Result<(), Problem> {
-        self.assign(corners, groups)?;
+    pub(super) fn strip(&mut self, corners: &[i64], uv: &[[f32; 2]]) -> Result<(), Problem> {
+        // Also those of triangles that are none.
+        self.assign(corners, &[])?;
         for first in 0..corners.len().saturating_sub(2) {
             let places = if first % 2 == 0 { [first, first + 1, first + 2] } else { [first + 1, first, first + 2] };
             let [a, b, c] = places.map(|place| corners[place]);

@@ -284,7 +284,7 @@ fn strips(corners: &[i64], uv_of: &[[f32; 2]], draft: &mut Draft<'_>) -> Result<
     for strip in corners.split(is_end) {
         let of_vertex = |corner: &i64| uv_of.get(usize::try_from(*corner).ok()?).copied();
         let uv: Vec<[f32; 2]> = strip.iter().filter_map(of_vertex).collect();
-        draft.strip(strip, &uv, &[])?;
+        draft.strip(strip, &uv)?;
     }
     Ok(())
 }

@@ -72,7 +72,7 @@ impl Faces {
         for (number, list) in self.strips.lists() {
             corners.clear();
             corners.extend(list.map_err(|problem| fail(number, problem))?.iter().map(|at| at.saturating_add(first)));
-            draft.strip(&corners, &[], &[]).map_err(|problem| fail(number, problem))?;
+            draft.strip(&corners, &[]).map_err(|problem| fail(number, problem))?;
         }
         for ((number, list), kind) in self.grid.lists().zip(&self.types) {
             corners.clear();
@@ -107,7 +107,7 @@ fn cell(kind: i64, corners: &mut [i64], draft: &mut Draft<'_>) -> Result<(), Pro
         23 | 28 | 30 | 70 | 77 => face(corners, 4),
         // Of a polygon with curved sides, the corners come first.
         36 => face(corners, corners.len() / 2),
-        6 => draft.strip(corners, &[], &[]),
+        6 => draft.strip(corners, &[]),
         10 | 24 | 71 | 78 => draft.cell(Cell::Tetrahedron, corners, &[]),
         11 if corners.len() == 8 => {
             corners.swap(2, 3);

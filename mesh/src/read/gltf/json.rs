@@ -178,9 +178,10 @@ impl<'de, const N: usize> Deserialize<'de> for Numbers<N> {
                     *number = entry.ok_or_else(|| serde::de::Error::invalid_length(place, &self))?;
                 }
                 if entries.next_element::<IgnoredAny>()?.is_some() {
-                    let message = "more than {N} numbers: if one with a decimal comma has become two, export the file with decimal \
-                                   points";
-                    return Err(serde::de::Error::custom(message.replace("{N}", &N.to_string())));
+                    let message = format!(
+                        "more than {N} numbers: if decimal commas made two of one, export the file with decimal points"
+                    );
+                    return Err(serde::de::Error::custom(message));
                 }
                 Ok(Numbers(numbers))
             }
