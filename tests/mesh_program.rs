@@ -97,5 +97,8 @@ fn holes_and_what_is_wrong_are_told_with_their_place_in_the_unit_of_the_file() {
     let (status, table, told) = palpate(folder.path(), &["organ.obj", "--unit", "mm"]);
     assert_eq!(status, 2, "{told}");
     assert!(told.contains("edge 0-2 at (25, 25, 0) mm: "), "{told}");
-    assert!(table.contains("100.00 × 100.00 × 100.00 mm") && table.contains("vertex 6 at (0, 0, 100000) mm"), "{table}");
+    assert!(
+        table.contains("100.00 × 100.00 × 100.00 mm") && table.contains("vertex 6 at (0, 0, 100000) mm"),
+        "{table}"
+    );
 }

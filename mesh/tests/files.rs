@@ -203,9 +203,18 @@ fn a_row_of_ply_is_a_line() {
         ),
         ("a face of two vertices", ply_of(CORNERS, &faces.replace("3 0 1 5", "3 0 1"), list), "line 22: the row ends"),
         ("a longer list", ply_of(CORNERS, &faces.replace("3 0 1 5", "9 0 1 5"), list), "line 22: the row ends early"),
+        (
+            "faces without their length",
+            ply_of(CORNERS, &triangles(|[a, b, c]| format!("{a} {b} {c}\n")), list),
+            "line 18: a face of 0 vertices in a longer row",
+        ),
         ("half a vertex", ply_of(CORNERS, &faces.replace("3 0 1 5", "3 0 1.5 5"), list), "line 22: `1.5` is no whole"),
         ("a word", ply_of(CORNERS, &faces.replace("3 0 1 5", "3 0 one 5"), list), "line 22: `one` is no number"),
-        ("a vertex too many", ply_of(&format!("{CORNERS}1 1 1\n"), &faces, list), "a row more than the header counts"),
+        (
+            "a vertex too many",
+            ply_of(&format!("{CORNERS}1 1 1\n"), &faces, list),
+            "line 18: a face of 1 vertices in a longer row",
+        ),
         ("a face too many", ply_of(CORNERS, &format!("{faces}3 0 1 2\n"), list), "line 30: a row more"),
         (
             "a face too few",

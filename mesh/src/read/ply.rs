@@ -243,7 +243,15 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
                 let mut line = next_row(&mut source)
                     .ok_or_else(|| source.truncated(format!("row {number} of {count} of `{}`", element.name)))?;
                 row.read(&mut line, element, corners, encoding)?;
-                wider += usize::from(line.word().is_some());
+                let is_wider = line.word().is_some();
+                // As of a row that does not begin with the length of its list.
+                if is_wider && role == Role::Face && row.corners.len() < 3 {
+                    return Err(line.syntax(format!(
+                        "a face of {} vertices in a longer row: the length of its list is wrong, or a count of the header",
+                        row.corners.len()
+                    )));
+                }
+                wider += usize::from(is_wider);
             }
             let of_vertex = |corner: &i64| uv_of.get(usize::try_from(*corner).ok()?).copied();
             if row.corner_uv.len() != row.corners.len() {
